@@ -1,0 +1,61 @@
+//! What grinding left on the part: a smooth random error along the normal.
+
+use rand::RngExt;
+use rand_distr::{Distribution, StandardNormal};
+
+/// A Gaussian random surface error with a Gaussian autocovariance, as a sum of plane waves.
+///
+/// Many waves of random direction, phase and (Gaussian) wave number give heights that are Gaussian to the eye and exact
+/// derivatives everywhere. The correlation length l is the lag at which the autocovariance has fallen to 1/e:
+/// C(s) = exp(-(s/l)^2), whose wave numbers have the standard deviation sqrt(2)/l on each axis.
+#[derive(Clone, Debug)]
+pub struct FormError {
+    /// Wave vector, phase and amplitude of each wave.
+    waves: Vec<[f64; 4]>,
+}
+
+impl FormError {
+    /// Draws an error of a given correlation length and peak to valley over the rectangle centred on the origin.
+    pub fn new(seed: u64, correlation_length_mm: f64, pv_mm: f64, width_mm: f64, depth_mm: f64) -> Self {
+        let mut rng = crate::rng(seed);
+        let sigma = 2f64.sqrt() / correlation_length_mm;
+        let waves = (0..96)
+            .map(|_| {
+                let [kx, ky]: [f64; 2] = std::array::from_fn(|_| StandardNormal.sample(&mut rng));
+                [sigma * kx, sigma * ky, rng.random_range(0.0..std::f64::consts::TAU), 1.0]
+            })
+            .collect();
+        let mut error = Self { waves };
+        let (low, high) = error.extremes(width_mm, depth_mm);
+        for wave in &mut error.waves {
+            wave[3] = pv_mm / (high - low);
+        }
+        error
+    }
+
+    /// No error at all.
+    pub fn none() -> Self {
+        Self { waves: Vec::new() }
+    }
+
+    /// Returns the error at (x, y), in millimetres, positive where material stands proud.
+    pub fn height(&self, x: f64, y: f64) -> f64 {
+        self.waves.iter().map(|[kx, ky, phase, a]| a * (kx * x + ky * y + phase).cos()).sum()
+    }
+
+    /// Returns the derivatives of the error with respect to x and y.
+    pub fn gradient(&self, x: f64, y: f64) -> [f64; 2] {
+        self.waves.iter().fold([0.0, 0.0], |[p, q], [kx, ky, phase, a]| {
+            let s = -a * (kx * x + ky * y + phase).sin();
+            [p + kx * s, q + ky * s]
+        })
+    }
+
+    fn extremes(&self, width_mm: f64, depth_mm: f64) -> (f64, f64) {
+        let at = |i: i32, size: f64| size * (f64::from(i) / 100.0 - 0.5);
+        (0..=100)
+            .flat_map(|j| (0..=100).map(move |i| (i, j)))
+            .map(|(i, j)| self.height(at(i, width_mm), at(j, depth_mm)))
+            .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), h| (low.min(h), high.max(h)))
+    }
+}

@@ -1,0 +1,30 @@
+//! The truth behind a simulated grinding cell.
+//!
+//! This crate knows no type of the controller, so that the truth cannot leak into it and no error of the controller's
+//! geometry can hide by being made twice. Surfaces are closed forms with their own derivatives, contact is solved exactly,
+//! and everything random comes from one seed.
+//!
+//! ```text
+//!  shape   what the part should be: height, gradient, curvature in closed form
+//!  form    what grinding left on it: a smooth random error along the normal
+//!  probe   a ball that touches the part, in a frame of its own, with noise and outliers
+//! ```
+//!
+//! Units: millimetres and radians throughout. Frames: `shape` and `form` live in the model frame, the points a probe reports
+//! in the frame of the measuring machine.
+
+pub mod form;
+pub mod probe;
+pub mod shape;
+
+/// A position or a direction in space.
+pub type Vec3 = [f64; 3];
+
+/// The generator behind every random number here: portable across machines and releases.
+pub type Rng = rand_chacha::ChaCha8Rng;
+
+/// Returns the generator for a seed.
+pub fn rng(seed: u64) -> Rng {
+    use rand::SeedableRng;
+    Rng::seed_from_u64(seed)
+}

@@ -1,0 +1,145 @@
+//! A ball that touches the part.
+
+use rand::RngExt;
+use rand_distr::{Distribution, StandardNormal};
+
+use crate::form::FormError;
+use crate::shape::Shape;
+use crate::{Rng, Vec3};
+
+/// A rigid motion given by its rotation matrix (rows) and its translation.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Placement {
+    /// The rotation, row by column.
+    pub rotation: [[f64; 3]; 3],
+    /// The translation in millimetres, applied after the rotation.
+    pub translation_mm: Vec3,
+}
+
+impl Placement {
+    /// The part's frame and the machine's are one.
+    pub const IDENTITY: Self =
+        Self { rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], translation_mm: [0.0; 3] };
+
+    /// Returns the placement that turns about x, then y, then z (fixed axes), then shifts.
+    pub fn new(translation_mm: Vec3, angles_deg: Vec3) -> Self {
+        let [(sx, cx), (sy, cy), (sz, cz)] = angles_deg.map(|a| a.to_radians().sin_cos());
+        Self {
+            rotation: [
+                [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx],
+                [sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx],
+                [-sy, cy * sx, cy * cx],
+            ],
+            translation_mm,
+        }
+    }
+
+    /// Draws a rotation uniformly from all rotations, and a translation of up to `reach_mm` in any direction.
+    pub fn random(rng: &mut Rng, reach_mm: f64) -> Self {
+        let q = unit::<4>(rng);
+        let [w, x, y, z] = q;
+        let direction = unit::<3>(rng);
+        let reach = reach_mm * rng.random::<f64>();
+        Self {
+            rotation: [
+                [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+                [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+                [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+            ],
+            translation_mm: direction.map(|d| d * reach),
+        }
+    }
+
+    /// Moves a point from the part's frame to the machine's.
+    pub fn apply(&self, p: Vec3) -> Vec3 {
+        std::array::from_fn(|i| {
+            let r = &self.rotation[i];
+            r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + self.translation_mm[i]
+        })
+    }
+}
+
+/// A unit vector drawn uniformly from the sphere in N dimensions.
+fn unit<const N: usize>(rng: &mut Rng) -> [f64; N] {
+    let v: [f64; N] = std::array::from_fn(|_| StandardNormal.sample(&mut *rng));
+    let norm = v.iter().map(|c: &f64| c * c).sum::<f64>().sqrt();
+    v.map(|c| c / norm)
+}
+
+/// Returns the centre of a ball that touches the ground surface where it lies along the nominal normal at (x, y).
+///
+/// The ground surface is S + e n; its own normal, not the nominal one, carries the ball. With the nominal normal n and the
+/// surface gradient of e the offset is exact, so the second-order term of the paper's eq. (6) is in the data.
+pub fn centre(shape: &dyn Shape, form: &FormError, radius_mm: f64, x: f64, y: f64) -> Vec3 {
+    let (s, n, e) = (shape.point(x, y), shape.normal(x, y), form.height(x, y));
+    let [p, q] = shape.gradient(x, y);
+    let [ex, ey] = form.gradient(x, y);
+    // Tangents of the ground surface r(x, y) = S + e n, with dn by central differences of the exact normal.
+    let h = 1e-4;
+    let dn = |dx: f64, dy: f64| -> Vec3 {
+        let (a, b) = (shape.normal(x + dx, y + dy), shape.normal(x - dx, y - dy));
+        std::array::from_fn(|i| (a[i] - b[i]) / (2.0 * h))
+    };
+    let (nx, ny) = (dn(h, 0.0), dn(0.0, h));
+    let tx: Vec3 = std::array::from_fn(|i| [1.0, 0.0, p][i] + ex * n[i] + e * nx[i]);
+    let ty: Vec3 = std::array::from_fn(|i| [0.0, 1.0, q][i] + ey * n[i] + e * ny[i]);
+    let m = [tx[1] * ty[2] - tx[2] * ty[1], tx[2] * ty[0] - tx[0] * ty[2], tx[0] * ty[1] - tx[1] * ty[0]];
+    let norm = (m[0] * m[0] + m[1] * m[1] + m[2] * m[2]).sqrt();
+    std::array::from_fn(|i| s[i] + e * n[i] + radius_mm * m[i] / norm)
+}
+
+/// Adds Gaussian noise of a standard deviation per axis to every point.
+pub fn add_noise(rng: &mut Rng, points: &mut [Vec3], sigma_mm: f64) {
+    for c in points.iter_mut().flatten() {
+        let z: f64 = StandardNormal.sample(&mut *rng);
+        *c += sigma_mm * z;
+    }
+}
+
+/// Moves a share of the points by `least_mm` to `most_mm` in random directions and returns which, in rising order.
+pub fn add_outliers(rng: &mut Rng, points: &mut [Vec3], share: f64, least_mm: f64, most_mm: f64) -> Vec<usize> {
+    let mut moved = Vec::new();
+    for (index, point) in points.iter_mut().enumerate() {
+        if rng.random::<f64>() < share {
+            let direction = unit::<3>(rng);
+            let by = rng.random_range(least_mm..most_mm);
+            for (c, d) in point.iter_mut().zip(direction) {
+                *c += by * d;
+            }
+            moved.push(index);
+        }
+    }
+    moved
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::shape::{FreeForm, Sphere};
+
+    #[test]
+    fn a_ball_on_a_sphere_has_its_centre_on_the_concentric_sphere() {
+        let sphere = Sphere { radius_mm: -50.0 };
+        for (x, y) in [(0.0, 0.0), (10.0, -20.0), (-30.0, 5.0)] {
+            let c = centre(&sphere, &FormError::none(), 1.5, x, y);
+            let distance = (c[0] * c[0] + c[1] * c[1] + (c[2] + 50.0).powi(2)).sqrt();
+            assert!((distance - 51.5).abs() < 1e-13, "{distance}");
+        }
+    }
+
+    #[test]
+    fn the_ball_touches_and_does_not_cut() {
+        let (shape, form) = (FreeForm::default(), FormError::new(7, 30.0, 6.657e-3, 102.0, 62.0));
+        let c = centre(&shape, &form, 1.5, 12.0, -8.0);
+        let mut nearest = f64::INFINITY;
+        for i in -200..=200 {
+            for j in -200..=200 {
+                let (x, y) = (c[0] + f64::from(i) * 0.005, c[1] + f64::from(j) * 0.005);
+                let (s, n, e) = (shape.point(x, y), shape.normal(x, y), form.height(x, y));
+                let d2: f64 = (0..3).map(|k| (s[k] + e * n[k] - c[k]).powi(2)).sum();
+                nearest = nearest.min(d2.sqrt());
+            }
+        }
+        assert!((1.5..1.5 + 1e-5).contains(&nearest), "{nearest}");
+    }
+}

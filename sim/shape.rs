@@ -1,0 +1,215 @@
+//! What the part should be: closed-form surfaces z(x, y) with exact derivatives.
+
+use crate::Vec3;
+
+/// A surface that is a height over the plane.
+///
+/// Units: millimetres; `gradient` is dimensionless, `hessian` in 1/mm.
+pub trait Shape: Sync {
+    /// Returns z at (x, y).
+    fn height(&self, x: f64, y: f64) -> f64;
+    /// Returns dz/dx and dz/dy.
+    fn gradient(&self, x: f64, y: f64) -> [f64; 2];
+
+    /// Returns the point of the surface above (x, y).
+    fn point(&self, x: f64, y: f64) -> Vec3 {
+        [x, y, self.height(x, y)]
+    }
+
+    /// Returns the unit normal on the side of +z.
+    fn normal(&self, x: f64, y: f64) -> Vec3 {
+        let [p, q] = self.gradient(x, y);
+        let w = 1.0 / (1.0 + p * p + q * q).sqrt();
+        [-p * w, -q * w, w]
+    }
+
+    /// Returns the points of a grid, row by row, x fastest, over the rectangle centred on the origin.
+    fn grid(&self, width_mm: f64, depth_mm: f64, columns: usize, rows: usize) -> Vec<Vec3> {
+        let at = |i: usize, n: usize, size: f64| size * (i as f64 / (n - 1) as f64 - 0.5);
+        (0..rows)
+            .flat_map(|j| (0..columns).map(move |i| (i, j)))
+            .map(|(i, j)| self.point(at(i, columns, width_mm), at(j, rows, depth_mm)))
+            .collect()
+    }
+}
+
+/// The free-form mirror of the trials: about 102 x 62 mm, slopes to 30 degrees, curvature of both signs, no symmetry.
+#[derive(Clone, Copy, Debug)]
+pub struct FreeForm {
+    /// Multiplies the height; 1 for the part of the trials.
+    pub scale: f64,
+}
+
+impl FreeForm {
+    /// Width in x, in millimetres.
+    pub const WIDTH_MM: f64 = 102.0;
+    /// Depth in y, in millimetres.
+    pub const DEPTH_MM: f64 = 62.0;
+    /// Columns and rows of the nominal cloud of the paper's size, 451,401 points.
+    pub const PAPER_GRID: (usize, usize) = (901, 501);
+}
+
+impl Default for FreeForm {
+    fn default() -> Self {
+        Self { scale: 1.0 }
+    }
+}
+
+/// Wave vector, phase and amplitude of each ripple of the free form.
+const RIPPLES: [[f64; 4]; 3] = [[0.055, 0.021, 0.4, 4.3], [-0.024, 0.083, 1.1, 2.0], [0.093, -0.047, 2.3, 0.55]];
+
+impl Shape for FreeForm {
+    fn height(&self, x: f64, y: f64) -> f64 {
+        let bowl = x * x / 420.0 - y * y / 310.0 + 6e-6 * x * x * x - 1.1e-5 * x * x * y;
+        let ripples: f64 = RIPPLES.iter().map(|[kx, ky, phase, a]| a * (kx * x + ky * y + phase).sin()).sum();
+        self.scale * (bowl + ripples)
+    }
+
+    fn gradient(&self, x: f64, y: f64) -> [f64; 2] {
+        let mut p = x / 210.0 + 1.8e-5 * x * x - 2.2e-5 * x * y;
+        let mut q = -y / 155.0 - 1.1e-5 * x * x;
+        for [kx, ky, phase, a] in RIPPLES {
+            let c = a * (kx * x + ky * y + phase).cos();
+            p += kx * c;
+            q += ky * c;
+        }
+        [self.scale * p, self.scale * q]
+    }
+}
+
+/// A cap of a sphere about the z axis, its vertex at the origin; a positive radius opens towards +z.
+#[derive(Clone, Copy, Debug)]
+pub struct Sphere {
+    /// Radius of curvature in millimetres, signed.
+    pub radius_mm: f64,
+}
+
+impl Shape for Sphere {
+    fn height(&self, x: f64, y: f64) -> f64 {
+        let h2 = x * x + y * y;
+        h2 / (self.radius_mm * (1.0 + (1.0 - h2 / (self.radius_mm * self.radius_mm)).sqrt()))
+    }
+
+    fn gradient(&self, x: f64, y: f64) -> [f64; 2] {
+        let root = (self.radius_mm * self.radius_mm - x * x - y * y).sqrt() * self.radius_mm.signum();
+        [x / root, y / root]
+    }
+}
+
+/// A conic with different radii and conic constants in x and y.
+#[derive(Clone, Copy, Debug)]
+pub struct Biconic {
+    /// Radii of curvature in x and y, in millimetres.
+    pub radius_mm: [f64; 2],
+    /// Conic constants in x and y.
+    pub conic: [f64; 2],
+}
+
+impl Shape for Biconic {
+    fn height(&self, x: f64, y: f64) -> f64 {
+        let c = self.radius_mm.map(|r| 1.0 / r);
+        let s = 1.0 - (1.0 + self.conic[0]) * (c[0] * x).powi(2) - (1.0 + self.conic[1]) * (c[1] * y).powi(2);
+        (c[0] * x * x + c[1] * y * y) / (1.0 + s.sqrt())
+    }
+
+    fn gradient(&self, x: f64, y: f64) -> [f64; 2] {
+        let c = self.radius_mm.map(|r| 1.0 / r);
+        let k = self.conic.map(|k| 1.0 + k);
+        let root = (1.0 - k[0] * (c[0] * x).powi(2) - k[1] * (c[1] * y).powi(2)).sqrt();
+        let (numerator, denominator) = (c[0] * x * x + c[1] * y * y, 1.0 + root);
+        let along = |c: f64, k: f64, t: f64| {
+            2.0 * c * t / denominator + numerator * k * c * c * t / (root * denominator.powi(2))
+        };
+        [along(c[0], k[0], x), along(c[1], k[1], y)]
+    }
+}
+
+/// The off-axis section of an even asphere: the parent's surface about (`shift_mm`, 0), in parent coordinates moved so
+/// that the section's centre is the origin.
+#[derive(Clone, Copy, Debug)]
+pub struct OffAxisAsphere {
+    /// Vertex radius of the parent in millimetres.
+    pub radius_mm: f64,
+    /// Conic constant of the parent.
+    pub conic: f64,
+    /// Coefficient of the fourth power of the parent's radius, in mm^-3.
+    pub fourth: f64,
+    /// Distance of the section's centre from the parent's axis, in millimetres.
+    pub shift_mm: f64,
+}
+
+impl OffAxisAsphere {
+    fn parent(&self, h2: f64) -> (f64, f64) {
+        let c = 1.0 / self.radius_mm;
+        let root = (1.0 - (1.0 + self.conic) * c * c * h2).sqrt();
+        (c * h2 / (1.0 + root) + self.fourth * h2 * h2, c / root + 4.0 * self.fourth * h2)
+    }
+}
+
+impl Shape for OffAxisAsphere {
+    fn height(&self, x: f64, y: f64) -> f64 {
+        self.parent((x + self.shift_mm).powi(2) + y * y).0
+    }
+
+    fn gradient(&self, x: f64, y: f64) -> [f64; 2] {
+        let u = x + self.shift_mm;
+        let slope_over_h = self.parent(u * u + y * y).1;
+        [slope_over_h * u, slope_over_h * y]
+    }
+}
+
+/// A shallow wave on a nearly flat part.
+#[derive(Clone, Copy, Debug)]
+pub struct Wave {
+    /// Peak to valley of the wave in millimetres.
+    pub height_mm: f64,
+}
+
+impl Shape for Wave {
+    fn height(&self, x: f64, y: f64) -> f64 {
+        let a = self.height_mm / 4.0;
+        a * (0.21 * x + 0.3).sin() + a * (0.17 * y - 0.08 * x + 1.0).sin()
+    }
+
+    fn gradient(&self, x: f64, y: f64) -> [f64; 2] {
+        let a = self.height_mm / 4.0;
+        let (first, second) = ((0.21 * x + 0.3).cos(), (0.17 * y - 0.08 * x + 1.0).cos());
+        [a * (0.21 * first - 0.08 * second), a * 0.17 * second]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gradients_are_the_derivatives_of_the_heights() {
+        let shapes: [&dyn Shape; 5] = [
+            &FreeForm::default(),
+            &Sphere { radius_mm: -80.0 },
+            &Biconic { radius_mm: [90.0, -140.0], conic: [-0.7, 1.2] },
+            &OffAxisAsphere { radius_mm: 200.0, conic: -1.1, fourth: 2e-8, shift_mm: 60.0 },
+            &Wave { height_mm: 0.01 },
+        ];
+        for (which, shape) in shapes.iter().enumerate() {
+            for (x, y) in [(0.0, 0.0), (13.0, -7.0), (-41.0, 22.0)] {
+                let h = 1e-4;
+                let [p, q] = shape.gradient(x, y);
+                let fd = |dx: f64, dy: f64| (shape.height(x + dx, y + dy) - shape.height(x - dx, y - dy)) / (2.0 * h);
+                assert!((p - fd(h, 0.0)).abs() < 1e-8, "shape {which} at ({x}, {y}): {p}");
+                assert!((q - fd(0.0, h)).abs() < 1e-8, "shape {which} at ({x}, {y}): {q}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_free_form_has_slopes_to_about_thirty_degrees() {
+        let steepest = FreeForm::default()
+            .grid(102.0, 62.0, 205, 125)
+            .iter()
+            .map(|p| FreeForm::default().gradient(p[0], p[1]))
+            .map(|[p, q]| p.hypot(q).atan().to_degrees())
+            .fold(0.0, f64::max);
+        assert!((28.0..32.0).contains(&steepest), "{steepest}");
+    }
+}

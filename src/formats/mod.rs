@@ -1,0 +1,1 @@
+//! Files in and out: point clouds, meshes, and what a registration leaves behind.

@@ -1,0 +1,1 @@
+//! Regular grids among unordered points.

@@ -1,0 +1,15 @@
+//! Poses, apertures and grids: the words every other room speaks in.
+//!
+//! Pure: no file, no clock, no randomness. Lengths are millimetres, angles radians.
+
+pub mod aperture;
+pub mod grid;
+pub mod pose;
+
+pub use pose::{Pose, PoseError, Twist};
+
+/// A position in space, in millimetres.
+pub type Point = nalgebra::Point3<f64>;
+
+/// A direction or a displacement in space.
+pub type Vector = nalgebra::Vector3<f64>;

@@ -1,0 +1,1 @@
+//! Surfaces given by a formula.

@@ -1,0 +1,3 @@
+//! Nominal surfaces: what the part should be.
+
+pub mod analytic;
