@@ -11,4 +11,5 @@
 
 pub mod formats;
 pub mod geometry;
+pub mod registration;
 pub mod surface;

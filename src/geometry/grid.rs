@@ -1,1 +1,181 @@
-//! Regular grids among unordered points.
+//! Regular grids among points that come in any order.
+
+use super::Point;
+
+/// How far a point may stand from its node, in spacings: rounding in a file is far below, scatter far above.
+const NODE_TOLERANCE: f64 = 0.02;
+
+/// A node that no point fills.
+pub const NO_POINT: u32 = u32::MAX;
+
+/// A cloud seen as a grid over the xy plane: which point stands at each node.
+#[derive(Clone, Debug, PartialEq)]
+pub struct GridOrder {
+    /// Number of nodes along x.
+    pub columns: usize,
+    /// Number of nodes along y.
+    pub rows: usize,
+    /// Index of the point at each node, row by row with x fastest; [`NO_POINT`] where there is none.
+    pub point_at: Vec<u32>,
+    /// Number of nodes without a point.
+    pub holes: usize,
+}
+
+impl GridOrder {
+    /// Whether the points already come row by row, x fastest, without a hole.
+    pub fn is_in_order(&self) -> bool {
+        self.holes == 0 && self.point_at.iter().enumerate().all(|(node, &point)| node as u32 == point)
+    }
+}
+
+/// Recognises a regular grid in x and y, whatever the order of the points and with nodes missing.
+///
+/// Shapes: at least 3 nodes on each axis, at most one node in four filled by chance is no grid. Returns `None` for
+/// scattered points, for two points at one node, and for anything that is not finite.
+pub fn recognise_grid(points: &[Point]) -> Option<GridOrder> {
+    if points.len() < 9 || points.len() >= NO_POINT as usize {
+        return None;
+    }
+    let x = Axis::find(points, |p| p.x)?;
+    let y = Axis::find(points, |p| p.y)?;
+    let nodes = x.count.checked_mul(y.count)?;
+    if x.count < 3 || y.count < 3 || nodes > 4 * points.len() {
+        return None;
+    }
+    let mut point_at = vec![NO_POINT; nodes];
+    for (index, p) in points.iter().enumerate() {
+        let node = y.node(p.y)? * x.count + x.node(p.x)?;
+        if std::mem::replace(&mut point_at[node], index as u32) != NO_POINT {
+            return None;
+        }
+    }
+    Some(GridOrder { columns: x.count, rows: y.count, point_at, holes: nodes - points.len() })
+}
+
+/// Equally spaced coordinates along one axis.
+struct Axis {
+    first: f64,
+    per_mm: f64,
+    count: usize,
+}
+
+impl Axis {
+    /// Finds the spacing as the least gap between sorted coordinates of a sample that no order of the points can fool.
+    fn find(points: &[Point], coordinate: impl Fn(&Point) -> f64) -> Option<Self> {
+        let (low, high) = points.iter().map(&coordinate).fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), c| {
+            if c.is_nan() { (f64::NAN, f64::NAN) } else { (low.min(c), high.max(c)) }
+        });
+        let extent = high - low;
+        if !extent.is_finite() || extent <= 0.0 {
+            return None;
+        }
+        let mut sample = sampled(points).map(&coordinate).collect::<Vec<_>>();
+        sample.sort_unstable_by(f64::total_cmp);
+        let gap = sample.windows(2).map(|w| w[1] - w[0]).filter(|gap| *gap > 1e-6 * extent).fold(extent, f64::min);
+        let steps = (extent / gap).round();
+        (steps < 1e6).then_some(Self { first: low, per_mm: steps / extent, count: steps as usize + 1 })
+    }
+
+    /// Returns the number of the node at a coordinate, if there is one.
+    #[inline]
+    fn node(&self, coordinate: f64) -> Option<usize> {
+        let at = (coordinate - self.first) * self.per_mm;
+        let node = (at + 0.5).floor();
+        ((at - node).abs() <= NODE_TOLERANCE).then_some(node as usize)
+    }
+}
+
+/// The first points and a scatter over all of them: a grid in order shows its spacing in the first, a shuffled one in the
+/// second.
+fn sampled(points: &[Point]) -> impl Iterator<Item = &Point> {
+    const SAMPLE: usize = 4096;
+    let n = points.len();
+    let scattered = (0..SAMPLE.min(n) as u64).map(move |k| (k.wrapping_mul(0x9E37_79B9_7F4A_7C15) % n as u64) as usize);
+    points.iter().take(SAMPLE).chain(scattered.map(|i| &points[i]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn grid(columns: usize, rows: usize, dx: f64, dy: f64) -> Vec<Point> {
+        (0..rows)
+            .flat_map(|j| {
+                (0..columns).map(move |i| Point::new(i as f64 * dx - 7.3, j as f64 * dy + 1.1, (i * j) as f64))
+            })
+            .collect()
+    }
+
+    /// A fixed shuffle: multiplication by a number coprime to the length.
+    fn shuffled(points: &[Point]) -> Vec<Point> {
+        let n = points.len();
+        let step = (n / 3..).find(|s| num_gcd(*s, n) == 1).unwrap();
+        (0..n).map(|i| points[(i * step + 5) % n]).collect()
+    }
+
+    fn num_gcd(a: usize, b: usize) -> usize {
+        if b == 0 { a } else { num_gcd(b, a % b) }
+    }
+
+    #[test]
+    fn a_grid_in_order_and_the_same_grid_shuffled() {
+        let points = grid(101, 57, 0.1133, 0.124);
+        let order = recognise_grid(&points).unwrap();
+        assert_eq!((order.columns, order.rows, order.holes), (101, 57, 0));
+        assert!(order.is_in_order());
+
+        let mixed = shuffled(&points);
+        let order = recognise_grid(&mixed).unwrap();
+        assert!(!order.is_in_order());
+        for (node, &index) in order.point_at.iter().enumerate() {
+            assert_eq!(mixed[index as usize], points[node]);
+        }
+    }
+
+    #[test]
+    fn columns_first_is_a_grid_too() {
+        let mut points = grid(40, 30, 1.0, 2.0);
+        points.sort_by(|a, b| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
+        let order = recognise_grid(&points).unwrap();
+        assert_eq!((order.columns, order.rows), (40, 30));
+    }
+
+    #[test]
+    fn a_round_aperture_leaves_holes() {
+        let points: Vec<_> =
+            grid(81, 81, 0.5, 0.5).into_iter().filter(|p| (p.x - 12.7).hypot(p.y - 21.1) <= 20.001).collect();
+        let order = recognise_grid(&points).unwrap();
+        assert_eq!((order.columns, order.rows), (81, 81));
+        assert_eq!(order.holes, 81 * 81 - points.len());
+    }
+
+    #[test]
+    fn rounding_to_a_file_does_not_hide_the_grid() {
+        let mut points = grid(333, 222, 102.0 / 332.0, 62.0 / 221.0);
+        for p in &mut points {
+            p.x = (p.x * 1e4).round() / 1e4;
+            p.y = (p.y * 1e4).round() / 1e4;
+        }
+        assert!(recognise_grid(&points).is_some());
+    }
+
+    #[test]
+    fn what_is_no_grid_is_not_taken_for_one() {
+        let mut scattered = grid(50, 50, 1.0, 1.0);
+        for (k, p) in scattered.iter_mut().enumerate() {
+            p.x += 0.3 * (k as f64 * 1.7).sin();
+        }
+        assert_eq!(recognise_grid(&scattered), None);
+        let line: Vec<_> = (0..100).map(|i| Point::new(f64::from(i), 0.0, 0.0)).collect();
+        assert_eq!(recognise_grid(&line), None);
+        let mut doubled = grid(10, 10, 1.0, 1.0);
+        doubled.push(doubled[17]);
+        assert_eq!(recognise_grid(&doubled), None);
+        let mut broken = grid(10, 10, 1.0, 1.0);
+        broken[3].x = f64::NAN;
+        assert_eq!(recognise_grid(&broken), None);
+        broken[3].x = 1e300;
+        assert_eq!(recognise_grid(&broken), None);
+        assert_eq!(recognise_grid(&[]), None);
+    }
+}

@@ -6,6 +6,8 @@ pub mod aperture;
 pub mod grid;
 pub mod pose;
 
+pub use aperture::Aperture;
+pub use grid::{GridOrder, recognise_grid};
 pub use pose::{Pose, PoseError, Twist};
 
 /// A position in space, in millimetres.

@@ -1,3 +1,332 @@
-//! Nominal surfaces: what the part should be.
+//! Nominal surfaces: what the part should be, as a net of points with normals, and the surface at a probe's radius from it.
+//!
+//! ```text
+//!  points --+-- regular grid? ----------------> grid lattice   (no triangulation; normals from the grid lines)
+//!           +-- projection -> Delaunay -------> mesh lattice   (flat arrays; normals fitted where touched)
+//!  mesh ----------------------------------------^
+//!  formula -> sampled, exact normals -> grid lattice
+//!                                                    \
+//!                                                     OffsetSurface: foot, distance, normal of any point
+//! ```
+//!
+//! Pure: no file, no clock, no randomness. Frame: everything here is in the model frame {M}. Units: millimetres.
 
 pub mod analytic;
+mod delaunay;
+mod feature;
+mod fold;
+mod grid;
+mod mesh;
+mod normals;
+mod offset;
+mod patch;
+mod projection;
+
+use std::sync::OnceLock;
+
+use thiserror::Error;
+
+use crate::geometry::{Aperture, Point, Vector, recognise_grid};
+
+pub(crate) use feature::{Feature, features};
+use grid::{GridLattice, grid_normals, in_grid_order};
+use mesh::MeshLattice;
+pub use offset::{Distance, Foot, Lookup, OffsetSurface, Place, Side};
+use patch::{Lattice, Patch};
+pub use projection::Projection;
+pub(crate) use projection::{centroid, principal_axes};
+
+/// A nominal surface: one or several patches of points with normals, ready for distances.
+#[derive(Debug)]
+pub struct Nominal {
+    patches: Vec<Patch>,
+    kind: NominalKind,
+    outline: Option<Aperture>,
+    /// Where it bends how, worked out when a pose is searched for.
+    features: OnceLock<Vec<Feature>>,
+}
+
+/// What a nominal surface was made from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum NominalKind {
+    /// Points on a regular grid, or a grid of (u, v) parameters.
+    Grid {
+        /// Nodes along the first direction.
+        columns: usize,
+        /// Nodes along the second direction.
+        rows: usize,
+    },
+    /// Scattered points, triangulated in a projection.
+    Scattered {
+        /// The projection, never `Auto`.
+        projection: Projection,
+    },
+    /// A mesh that came with its triangles.
+    Mesh,
+    /// Several patches.
+    Patches {
+        /// How many.
+        count: usize,
+    },
+}
+
+/// Why a nominal surface or its offset cannot be had.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[allow(missing_docs)]
+pub enum SurfaceError {
+    #[error("the nominal surface has {points} points and needs at least {least}; give a denser nominal")]
+    TooFewPoints { points: usize, least: usize },
+    #[error("nominal point {} is not finite; remove it or correct it", index + 1)]
+    NotFinite { index: usize },
+    #[error("all {points} nominal points lie on one line; a surface needs points off it")]
+    Collinear { points: usize },
+    #[error(
+        "nominal points {} and {} share one place at ({:.6}, {:.6}, {:.6}) mm; remove the duplicate",
+        first + 1, second + 1, at[0], at[1], at[2]
+    )]
+    DuplicatePoints { first: usize, second: usize, at: [f64; 3] },
+    #[error(
+        "no projection of the nominal points is one-to-one: {tried}; divide the surface into patches, or give a mesh"
+    )]
+    NoProjection { tried: String },
+    #[error("the nominal mesh has no triangle; give a file with faces")]
+    NoTriangles,
+    #[error("a triangle of the nominal mesh names vertex {vertex}, but there are {points} (counted from 0)")]
+    VertexOutOfRange { vertex: u32, points: usize },
+    #[error(
+        "{triangles} triangles of the nominal mesh share one edge at ({:.6}, {:.6}, {:.6}) mm; a surface has two at most",
+        at[0], at[1], at[2]
+    )]
+    NonManifold { at: [f64; 3], triangles: usize },
+    #[error(
+        "neighbouring triangles of the nominal mesh turn opposite ways at ({:.6}, {:.6}, {:.6}) mm; orient them alike",
+        at[0], at[1], at[2]
+    )]
+    Orientation { at: [f64; 3] },
+    #[error("a grid of {columns} x {rows} nodes was announced and {points} points were given")]
+    GridSize { columns: usize, rows: usize, points: usize },
+    #[error("a patch list is empty; give at least one patch")]
+    NoPatches,
+    #[error("the probe radius is {radius_mm} mm; it must be a finite number, 0 or above")]
+    ProbeRadius { radius_mm: f64 },
+    #[error(
+        "the offset surface folds at ({:.3}, {:.3}, {:.3}) mm: the nominal surface is concave there with a radius of \
+         {concave_radius_mm:.4} mm, and a probe of radius {probe_radius_mm} mm does not fit; use a smaller probe",
+        at[0], at[1], at[2]
+    )]
+    OffsetFolds { at: [f64; 3], concave_radius_mm: f64, probe_radius_mm: f64 },
+}
+
+impl Nominal {
+    /// Makes a surface from points in any order: a regular grid in xy is used as it is, anything else is triangulated.
+    ///
+    /// Shapes: at least 9 points. The order of the points does not matter.
+    ///
+    /// # Errors
+    /// Too few points, a coordinate that is not finite, two points at one place, points on one line, or no projection that
+    /// is one-to-one.
+    pub fn from_points(points: Vec<Point>, projection: Projection) -> Result<Self, SurfaceError> {
+        const LEAST: usize = 9;
+        if points.len() < LEAST {
+            return Err(SurfaceError::TooFewPoints { points: points.len(), least: LEAST });
+        }
+        if let Some(index) = points.iter().position(|p| !(p.x + p.y + p.z).is_finite()) {
+            return Err(SurfaceError::NotFinite { index });
+        }
+        if matches!(projection, Projection::Auto | Projection::Xy)
+            && let Some(order) = recognise_grid(&points)
+        {
+            let (columns, rows) = (order.columns, order.rows);
+            return Ok(Self::grid(columns, rows, in_grid_order(points, &order), true));
+        }
+        Self::scattered(points, projection)
+    }
+
+    /// Makes a surface from points by triangulation, even where they would make a grid.
+    ///
+    /// # Errors
+    /// As [`Nominal::from_points`].
+    pub fn scattered(points: Vec<Point>, projection: Projection) -> Result<Self, SurfaceError> {
+        if points.len() > 3 && is_line(&points) {
+            return Err(SurfaceError::Collinear { points: points.len() });
+        }
+        let (projection, map) = projection.prepare(&points)?;
+        let triangles = delaunay::triangulate(&points, &map)?;
+        let lattice = MeshLattice::from_parts(&points, triangles.corners, triangles.neighbours)?;
+        Ok(Self::of(Patch::mesh(points, lattice), NominalKind::Scattered { projection }))
+    }
+
+    /// Makes a surface from a structured grid of points, one for each pair of parameters (u, v).
+    ///
+    /// Shapes: `columns * rows` points, row by row with u fastest; a NaN point is a hole. The normal is on the side where
+    /// u, v and normal are right-handed.
+    ///
+    /// # Errors
+    /// A number of points other than announced, or fewer than 3 nodes on an axis.
+    pub fn from_parameter_grid(columns: usize, rows: usize, points: Vec<Point>) -> Result<Self, SurfaceError> {
+        check_grid(columns, rows, points.len())?;
+        Ok(Self::grid(columns, rows, points, false))
+    }
+
+    /// Makes a surface from a regular xy grid of points whose unit normals are known.
+    ///
+    /// # Errors
+    /// As [`Nominal::from_parameter_grid`].
+    pub fn from_grid_with_normals(
+        columns: usize,
+        rows: usize,
+        points: Vec<Point>,
+        normals: Vec<Vector>,
+    ) -> Result<Self, SurfaceError> {
+        check_grid(columns, rows, points.len().min(normals.len()))?;
+        let lattice = GridLattice::new(columns, rows, &points, true);
+        Ok(Self::of(Patch::grid(points, normals, lattice), NominalKind::Grid { columns, rows }))
+    }
+
+    /// Makes a surface from a mesh; the normals are on the side from which its triangles turn counter-clockwise.
+    ///
+    /// # Errors
+    /// No triangle, an index out of range, more than two triangles at an edge, neighbours that turn opposite ways.
+    pub fn from_mesh(points: Vec<Point>, triangles: Vec<[u32; 3]>) -> Result<Self, SurfaceError> {
+        if let Some(index) = points.iter().position(|p| !(p.x + p.y + p.z).is_finite()) {
+            return Err(SurfaceError::NotFinite { index });
+        }
+        let lattice = MeshLattice::new(&points, triangles)?;
+        Ok(Self::of(Patch::mesh(points, lattice), NominalKind::Mesh))
+    }
+
+    /// Joins several surfaces into one of several patches; a point belongs to the patch that its foot lies on.
+    ///
+    /// # Errors
+    /// An empty list.
+    pub fn from_patches(surfaces: Vec<Nominal>) -> Result<Self, SurfaceError> {
+        let patches: Vec<Patch> = surfaces.into_iter().flat_map(|s| s.patches).collect();
+        if patches.is_empty() {
+            return Err(SurfaceError::NoPatches);
+        }
+        let kind = NominalKind::Patches { count: patches.len() };
+        Ok(Self { patches, kind, outline: None, features: OnceLock::new() })
+    }
+
+    /// States the outline of the part in xy: a point whose foot lies outside it is off the part.
+    pub fn with_outline(self, outline: Aperture) -> Self {
+        Self { outline: Some(outline), ..self }
+    }
+
+    fn grid(columns: usize, rows: usize, points: Vec<Point>, regular_in_xy: bool) -> Self {
+        let lattice = GridLattice::new(columns, rows, &points, regular_in_xy);
+        let normals = grid_normals(&points, &lattice);
+        Self::of(Patch::grid(points, normals, lattice), NominalKind::Grid { columns, rows })
+    }
+
+    fn of(patch: Patch, kind: NominalKind) -> Self {
+        Self { patches: vec![patch], kind, outline: None, features: OnceLock::new() }
+    }
+
+    /// Returns what the surface was made from.
+    pub fn kind(&self) -> NominalKind {
+        self.kind
+    }
+
+    /// Returns the outline of the part, where one was stated.
+    pub fn outline(&self) -> Option<&Aperture> {
+        self.outline.as_ref()
+    }
+
+    pub(crate) fn patches(&self) -> &[Patch] {
+        &self.patches
+    }
+
+    /// Returns every point of the surface, holes left out.
+    pub fn points(&self) -> impl Iterator<Item = &Point> {
+        self.patches.iter().flat_map(|p| &p.points).filter(|p| p.x.is_finite())
+    }
+
+    /// Returns the number of points, holes left out.
+    pub fn len(&self) -> usize {
+        self.points().count()
+    }
+
+    /// Whether there is no point; never so for a surface that was made.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Returns some vertices and their normals, spread over the surface.
+    fn sampled_vertices(&self, count: usize) -> Vec<(Point, Vector)> {
+        let share = count / self.patches.len();
+        self.patches
+            .iter()
+            .flat_map(|patch| patch.sample(share.max(1)).map(|v| (patch.points[v as usize], patch.normal(v))))
+            .collect()
+    }
+
+    /// Returns some points spread over the surface.
+    pub(crate) fn sample(&self, count: usize) -> Vec<Point> {
+        let share = (count / self.patches.len()).max(1);
+        self.patches.iter().flat_map(|patch| patch.sample(share).map(|v| patch.points[v as usize])).collect()
+    }
+
+    /// Returns the rms distance of the points from their middle, in millimetres.
+    pub fn size_mm(&self) -> f64 {
+        let sample = self.sample(SAMPLE);
+        let middle = centroid(&sample);
+        (sample.iter().map(|p| (p - middle).norm_squared()).sum::<f64>() / sample.len() as f64).sqrt()
+    }
+
+    /// Returns the rms distance of the points from their best plane, in millimetres: how much shape there is to register by.
+    pub fn relief_mm(&self) -> f64 {
+        let sample = self.sample(SAMPLE);
+        let (_, eigen) = principal_axes(&sample);
+        (eigen.eigenvalues.min().max(0.0) / sample.len() as f64).sqrt()
+    }
+
+    /// Returns the mean of the normals, of unit length; z for a closed surface, which has none.
+    pub(crate) fn mean_normal(&self) -> Vector {
+        let sum: Vector = self.sampled_vertices(512).iter().map(|(_, n)| n).sum();
+        if sum.norm() > 1e-6 { sum.normalize() } else { Vector::z() }
+    }
+
+    /// Returns how wrong fitted normals may be, in radians: 0 for a grid and for normals that are given.
+    ///
+    /// Estimated as the rms change of the normal when a quarter of the neighbours is left out of its fit.
+    pub(crate) fn normal_error(&self) -> f64 {
+        let (mut sum, mut count) = (0.0, 0);
+        for patch in self.patches.iter().filter(|p| p.has_scattered_normals()) {
+            let Lattice::Mesh(mesh) = &patch.lattice else { continue };
+            for vertex in patch.sample(256) {
+                let fewer = normals::fit_to_ring(&patch.points, mesh, vertex, normals::NEIGHBOURS * 3 / 4);
+                sum += (fewer.normal - patch.normal(vertex)).norm_squared();
+                count += 1;
+            }
+        }
+        if count == 0 { 0.0 } else { (sum / f64::from(count)).sqrt() }
+    }
+
+    /// Returns how the surface bends at some places spread over it.
+    pub(crate) fn features(&self) -> &[Feature] {
+        self.features.get_or_init(|| {
+            let (points, normals): (Vec<_>, Vec<_>) = self.sampled_vertices(FEATURES).into_iter().unzip();
+            features(&points, Some(&normals))
+        })
+    }
+}
+
+/// Points that a size is taken from, and places that a pose is searched by.
+const SAMPLE: usize = 4096;
+const FEATURES: usize = 3000;
+
+fn check_grid(columns: usize, rows: usize, points: usize) -> Result<(), SurfaceError> {
+    if columns < 3 || rows < 3 || columns.checked_mul(rows) != Some(points) {
+        return Err(SurfaceError::GridSize { columns, rows, points });
+    }
+    Ok(())
+}
+
+/// Whether points lie on one line to rounding.
+pub(crate) fn is_line(points: &[Point]) -> bool {
+    let (_, eigen) = principal_axes(points);
+    let mut spread: [f64; 3] = eigen.eigenvalues.into();
+    spread.sort_by(f64::total_cmp);
+    spread[1] <= 1e-18 * spread[2]
+}

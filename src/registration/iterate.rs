@@ -1,0 +1,163 @@
+//! The alternating iteration of section 2.3 of the paper: feet, ball-constrained step, feet again.
+
+use nalgebra::Matrix6;
+
+use crate::geometry::{Point, Pose};
+use crate::surface::OffsetSurface;
+
+use super::RegistrationError;
+use super::correspond::{Reading, Track, correspond, middle_and_size};
+use super::linearize::{Lever, Sums};
+use super::solve::Spectrum;
+
+/// One turn of the iteration.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct Iteration {
+    /// The objective after the step, in mm^2: the sum of the squared distances, eq. (7), or of the robust loss of them.
+    pub objective_mm2: f64,
+    /// Length of the step in scaled coordinates: radians, and translations in units of the cloud's rms size.
+    pub step: f64,
+    /// Radius of the ball that the step was kept in, alpha in eq. (15).
+    pub ball_radius: f64,
+    /// Whether the step was taken; one that raises the objective is taken back.
+    pub taken: bool,
+    /// Number of points that took part.
+    pub points: usize,
+}
+
+/// What the iteration is to do, and when to stop.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Problem<'a> {
+    pub(crate) surface: OffsetSurface<'a>,
+    pub(crate) reading: Reading,
+    pub(crate) measured: &'a [Point],
+    /// Locked coordinates of the twist: x, y, z, rx, ry, rz of the model frame.
+    pub(crate) locked: [bool; 6],
+    /// Singular values below this share of the largest are directions that the surface cannot see.
+    pub(crate) least_share: f64,
+    /// Stop when 1 - f(l+1) / f(l) falls to this, the paper's epsilon.
+    pub(crate) tolerance: f64,
+    /// The first radius of the ball.
+    pub(crate) ball_radius: f64,
+    pub(crate) most_iterations: usize,
+}
+
+/// Where a descent ended.
+#[derive(Clone, Debug)]
+pub(crate) struct Descent {
+    pub(crate) cmm_from_model: Pose,
+    pub(crate) objective_mm2: f64,
+    pub(crate) lever: Lever,
+    pub(crate) sums: Sums,
+    pub(crate) rank: usize,
+    pub(crate) converged: bool,
+}
+
+/// A step this short moves no point by more than rounding.
+const STILL: f64 = 1e-14;
+
+/// A step this short that raises the objective is the noise of rounding or of one triangle's edge, not a wrong way.
+const SETTLED: f64 = 1e-7;
+
+impl Problem<'_> {
+    /// Descends from a pose to the nearest minimum of the objective; the objective of steps taken never rises, eq. (14).
+    pub(crate) fn descend(
+        &self,
+        start: Pose,
+        tracks: &mut [Track],
+        trace: &mut Vec<Iteration>,
+    ) -> Result<Descent, RegistrationError> {
+        let (middle, size_mm) = middle_and_size(self.measured);
+        let lever_at = |pose: &Pose| Lever { centre: pose.inverse().point(&middle), size_mm };
+        let mut pose = start;
+        let mut lever = lever_at(&pose);
+        let mut sums = self.feet(tracks, &pose, &lever);
+        let mut ball_radius = self.ball_radius;
+        let mut rank = 0;
+        let mut converged = false;
+        for _ in 0..self.most_iterations {
+            if sums.points < 6 {
+                return Err(RegistrationError::TooFewUsed { used: sums.points, points: self.measured.len() });
+            }
+            let free = free_directions(&self.locked, &lever);
+            let spectrum = Spectrum::new(&(free * sums.gram() * free));
+            rank = spectrum.rank(self.least_share);
+            let m = spectrum.step(&(free * sums.right()), rank, ball_radius); // eq. (15)
+            let step = m.norm();
+            if step < STILL || sums.objective_mm2 == 0.0 {
+                converged = true;
+                break;
+            }
+            let candidate = (pose * Pose::exp(&lever.twist(&m))).orthonormalised(); // eq. (10), left side
+            let candidate_lever = lever_at(&candidate);
+            let candidate_sums = self.feet(tracks, &candidate, &candidate_lever);
+            let taken = candidate_sums.objective_mm2 <= sums.objective_mm2;
+            trace.push(Iteration {
+                objective_mm2: candidate_sums.objective_mm2,
+                step,
+                ball_radius,
+                taken,
+                points: candidate_sums.points,
+            });
+            if !taken {
+                // Back to the last pose; what the tracks say of this one is found anew below or at the end.
+                ball_radius = step.min(ball_radius) * 0.25;
+                converged = step < SETTLED;
+                if converged {
+                    break;
+                }
+                continue;
+            }
+            let gain = 1.0 - candidate_sums.objective_mm2 / sums.objective_mm2;
+            if step > 0.99 * ball_radius {
+                ball_radius *= 2.0;
+            }
+            (pose, lever, sums) = (candidate, candidate_lever, candidate_sums);
+            if gain <= self.tolerance {
+                converged = true;
+                break;
+            }
+        }
+        Ok(Descent { cmm_from_model: pose, objective_mm2: sums.objective_mm2, lever, sums, rank, converged })
+    }
+
+    /// Finds the feet under a pose and sums the linear problem.
+    pub(crate) fn feet(&self, tracks: &mut [Track], pose: &Pose, lever: &Lever) -> Sums {
+        correspond(&self.surface, &self.reading, self.measured, tracks, pose, lever)
+    }
+}
+
+/// Returns the projector onto the scaled steps that leave the locked coordinates of the twist at zero.
+pub(crate) fn free_directions(locked: &[bool; 6], lever: &Lever) -> Matrix6<f64> {
+    let to_twist = lever.to_twist();
+    let mut projector = Matrix6::identity();
+    // Gram-Schmidt over the locked rows.
+    for k in (0..6).filter(|&k| locked[k]) {
+        let row = projector * to_twist.row(k).transpose();
+        let norm2 = row.norm_squared();
+        if norm2 > 0.0 {
+            projector -= row * row.transpose() / norm2;
+        }
+    }
+    projector
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn free_steps_leave_the_locked_coordinates_alone() {
+        let lever = Lever { centre: Point::new(10.0, 20.0, -5.0), size_mm: 30.0 };
+        let locked = [true, false, false, false, true, true];
+        let free = free_directions(&locked, &lever);
+        assert!((free * free - free).amax() < 1e-12);
+        for k in 0..6 {
+            let twist = lever.twist(&free.column(k).into());
+            for (c, _) in locked.iter().enumerate().filter(|(_, l)| **l) {
+                assert!(twist[c].abs() < 1e-12 * 30.0, "{twist}");
+            }
+        }
+        assert!((free.trace() - 3.0).abs() < 1e-12);
+    }
+}

@@ -1,0 +1,154 @@
+//! One row of the linear problem A m = b a point, summed into its normal matrix.
+
+use nalgebra::{Matrix6, Vector6};
+
+use crate::geometry::{Point, Twist, Vector};
+
+/// Where the twist of a step is taken: about the middle of the cloud, translations in units of its size.
+///
+/// About the origin of the model frame a far part would make every rotation look like a translation; about its middle the
+/// columns are as independent as the surface allows. In units of its size a ball |m| <= alpha means the same motion of the
+/// rim for a translation as for a rotation, whatever the size of the part.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Lever {
+    pub(crate) centre: Point,
+    pub(crate) size_mm: f64,
+}
+
+impl Lever {
+    /// Returns the twist in the model frame, millimetres and radians, of scaled coordinates about the centre.
+    pub(crate) fn twist(&self, scaled: &Vector6<f64>) -> Twist {
+        let omega: Vector = scaled.fixed_rows::<3>(3).into();
+        let shift: Vector = scaled.fixed_rows::<3>(0) * self.size_mm;
+        let v = shift - omega.cross(&self.centre.coords);
+        Twist::new(v.x, v.y, v.z, omega.x, omega.y, omega.z)
+    }
+
+    /// Returns the matrix that takes scaled coordinates about the centre to a twist in the model frame.
+    pub(crate) fn to_twist(self) -> Matrix6<f64> {
+        Matrix6::from_columns(&std::array::from_fn::<_, 6, _>(|k| {
+            let mut unit = Vector6::zeros();
+            unit[k] = 1.0;
+            self.twist(&unit)
+        }))
+    }
+
+    /// Returns the row of A for a point with a normal, eq. (12): how the distance falls with each coordinate of the step.
+    #[inline]
+    pub(crate) fn row(&self, p: &Point, normal: &Vector) -> [f64; 6] {
+        let arm = (p - self.centre).cross(normal);
+        let s = self.size_mm;
+        [s * normal.x, s * normal.y, s * normal.z, arm.x, arm.y, arm.z]
+    }
+}
+
+/// The normal equations of the linear problem: A^T A, A^T b and what was summed along.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Sums {
+    /// Lower triangle of A^T W A, row by row.
+    gram: [f64; 21],
+    /// A^T W b, eq. (13).
+    right: [f64; 6],
+    /// The objective: sum of the squared distances, or of the robust loss of them; eq. (7).
+    pub(crate) objective_mm2: f64,
+    /// Number of points that were counted.
+    pub(crate) points: usize,
+}
+
+impl Sums {
+    pub(crate) fn zero() -> Self {
+        Self { gram: [0.0; 21], right: [0.0; 6], objective_mm2: 0.0, points: 0 }
+    }
+
+    /// Adds one point of a weight and its share of the objective.
+    #[inline]
+    pub(crate) fn add(&mut self, row: &[f64; 6], distance: f64, weight: f64, loss_mm2: f64) {
+        let mut k = 0;
+        for i in 0..6 {
+            let weighted = weight * row[i];
+            for other in &row[..=i] {
+                self.gram[k] += weighted * other;
+                k += 1;
+            }
+            self.right[i] += weighted * distance;
+        }
+        self.objective_mm2 += loss_mm2;
+        self.points += 1;
+    }
+
+    /// Adds another sum; in a fixed order, so that a result does not depend on the number of threads.
+    pub(crate) fn merge(mut self, other: &Self) -> Self {
+        for (a, b) in self.gram.iter_mut().zip(&other.gram) {
+            *a += b;
+        }
+        for (a, b) in self.right.iter_mut().zip(&other.right) {
+            *a += b;
+        }
+        self.objective_mm2 += other.objective_mm2;
+        self.points += other.points;
+        self
+    }
+
+    /// Returns A^T A.
+    pub(crate) fn gram(&self) -> Matrix6<f64> {
+        Matrix6::from_fn(|i, j| {
+            let (i, j) = (i.max(j), i.min(j));
+            self.gram[i * (i + 1) / 2 + j]
+        })
+    }
+
+    /// Returns A^T b.
+    pub(crate) fn right(&self) -> Vector6<f64> {
+        Vector6::from(self.right)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Pose;
+
+    /// The row is the derivative of the distance to a fixed plane, with the sign of eq. (11), as the equation states it.
+    #[test]
+    fn the_row_is_the_derivative_of_the_distance() {
+        let lever = Lever { centre: Point::new(30.0, -20.0, 7.0), size_mm: 40.0 };
+        let (p, normal) = (Point::new(55.0, 12.0, -3.0), Vector::new(0.2, -0.5, 0.9).normalize());
+        let anchor = Point::new(54.0, 12.0, -2.0);
+        let row = lever.row(&p, &normal);
+        for k in 0..6 {
+            let distance = |step: f64| {
+                let mut m = Vector6::zeros();
+                m[k] = step;
+                let moved = Pose::exp(&lever.twist(&m)).inverse().point(&p);
+                (moved - anchor).dot(&normal)
+            };
+            let slope = (distance(1e-6) - distance(-1e-6)) / 2e-6;
+            assert!((row[k] + slope).abs() < 1e-7, "coordinate {k}: {} against {slope}", row[k]);
+        }
+    }
+
+    #[test]
+    fn sliding_in_the_plane_changes_nothing() {
+        let lever = Lever { centre: Point::origin(), size_mm: 1.0 };
+        let normal = Vector::new(1.0, 1.0, 1.0).normalize();
+        let row = lever.row(&Point::new(3.0, 4.0, 5.0), &normal);
+        let slide = Vector::new(1.0, -1.0, 0.0);
+        assert!((row[0] * slide.x + row[1] * slide.y + row[2] * slide.z).abs() < 1e-15);
+    }
+
+    #[test]
+    fn sums_are_the_normal_equations() {
+        let rows = [[1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0.5, -1.0, 0.0, 2.0, 1.0, -3.0]];
+        let b = [0.25, -0.75];
+        let mut halves = [Sums::zero(), Sums::zero()];
+        for k in 0..2 {
+            halves[k].add(&rows[k], b[k], 2.0, b[k] * b[k]);
+        }
+        let [first, second] = halves;
+        let sums = first.merge(&second);
+        let a = nalgebra::Matrix2x6::from_row_slice(&rows.concat());
+        assert_eq!(sums.gram(), a.transpose() * a * 2.0);
+        assert_eq!(sums.right(), a.transpose() * nalgebra::Vector2::from(b) * 2.0);
+        assert_eq!((sums.points, sums.objective_mm2), (2, 0.25 * 0.25 + 0.75 * 0.75));
+    }
+}

@@ -1,0 +1,481 @@
+//! Where is the part? Registers measured probe centres to the offset of the nominal surface.
+//!
+//! ```text
+//!  start  ------->  correspond -> linearize -> solve  ------->  verdict
+//!  (search,         (feet)        (A, b)       (ball)           (covariance, weak directions, outliers)
+//!   or given)          ^                          |
+//!                      +------ iterate -----------+
+//! ```
+//!
+//! The method is section 2 of the paper: alternate between the feet of the points on the offset surface and a
+//! ball-constrained least-squares step of the pose, until the objective no longer falls.
+//!
+//! Pure: no file, no clock, no randomness; the same input gives the same bits on any number of threads. Frames: measured
+//! points are in the CMM frame {W}, the nominal surface in the model frame {M}. Units: millimetres and radians.
+
+mod correspond;
+mod iterate;
+mod linearize;
+mod robust;
+mod solve;
+mod start;
+mod verdict;
+
+use thiserror::Error;
+
+use crate::geometry::{Point, Pose, Vector};
+use crate::surface::{Distance, Lookup, Nominal, OffsetSurface, Side, SurfaceError};
+
+use correspond::{Reading, Track, feet, middle_and_size};
+pub use iterate::Iteration;
+use iterate::{Descent, Problem};
+pub use robust::Loss;
+use robust::{ScaledLoss, robust_sigma};
+pub use verdict::{Verdict, WeakDirection};
+
+/// What the measured points are taken for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Method {
+    /// Probe centres, registered to the offset surface: the method of the paper.
+    #[default]
+    Offset,
+    /// Contact points, registered to the nominal surface itself; the probe radius is not used (paper, fig. 12a).
+    Contact,
+    /// Probe centres, registered to the nominal surface with the radius subtracted from every distance, the facet looked up
+    /// below the centre (Xiong and Li; paper, fig. 12b). Wrong by micrometres on curved parts; for comparison.
+    SubtractRadius,
+}
+
+/// Where to begin.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub enum Start {
+    /// Nowhere in particular: several poses are tried, chosen by the shape of the surface.
+    #[default]
+    Search,
+    /// At a pose `cmm_from_model`.
+    Pose(Pose),
+}
+
+/// On which side of the nominal surface the probe centres lie.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ProbeSide {
+    /// The side on which the measured points fit; the side of the normals where both fit alike.
+    #[default]
+    Auto,
+    /// This side; refused if the points fit the other one much better.
+    Known(Side),
+}
+
+/// How to register.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Options {
+    /// Radius of the probe in millimetres.
+    pub probe_radius_mm: f64,
+    /// What the measured points are taken for.
+    pub method: Method,
+    /// How the nominal surface runs between its points.
+    pub distance: Distance,
+    /// Where to begin.
+    pub start: Start,
+    /// On which side of the nominal surface the probe centres lie.
+    pub side: ProbeSide,
+    /// Coordinates that every step leaves alone: x, y, z, rx, ry, rz of the model frame.
+    pub locked: [bool; 6],
+    /// How a distance counts.
+    pub loss: Loss,
+    /// A point farther from the surface than this many robust sigmas, and from what its neighbours say, is an outlier;
+    /// infinity keeps every point.
+    pub outlier_sigmas: f64,
+    /// Stop when 1 - f(l+1) / f(l) falls to this: the paper's epsilon.
+    pub tolerance: f64,
+    /// The first radius of the ball, in radians and in units of the cloud's rms size: alpha in eq. (15).
+    pub ball_radius: f64,
+    /// Give up after this many iterations.
+    pub most_iterations: usize,
+    /// Refuse a fit whose rms deviation is above this; `None` for 0.2 mm and one part in ten thousand of the cloud's rms size.
+    pub rms_limit_mm: Option<f64>,
+}
+
+impl Options {
+    /// Returns the defaults for a probe radius in millimetres.
+    pub fn new(probe_radius_mm: f64) -> Self {
+        Self {
+            probe_radius_mm,
+            method: Method::default(),
+            distance: Distance::default(),
+            start: Start::default(),
+            side: ProbeSide::default(),
+            locked: [false; 6],
+            loss: Loss::default(),
+            outlier_sigmas: 6.0,
+            tolerance: 1e-9,
+            ball_radius: 0.6,
+            most_iterations: 100,
+            rms_limit_mm: None,
+        }
+    }
+}
+
+/// What a registration found.
+#[derive(Clone, Debug)]
+pub struct Registration {
+    /// Takes model coordinates to CMM coordinates: the paper's g.
+    pub cmm_from_model: Pose,
+    /// One for each measured point, in the order given.
+    pub deviations: Vec<Deviation>,
+    /// The trace of the iteration, steps taken back included.
+    pub trace: Vec<Iteration>,
+    /// The side on which the probe was.
+    pub side: Side,
+    /// How well the pose is known, and what to think of it.
+    pub verdict: Verdict,
+}
+
+/// One measured point against the nominal surface.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Deviation {
+    /// The contact point in the model frame: the centre moved back by the probe radius along the normal.
+    pub point: Point,
+    /// Unit normal of the nominal surface at the foot, towards the probe.
+    pub normal: Vector,
+    /// Signed distance in millimetres, positive where material stands proud.
+    pub deviation_mm: f64,
+    /// Standard uncertainty of the deviation in millimetres: the residual noise and the pose together.
+    pub uncertainty_mm: f64,
+    /// What became of the point.
+    pub status: PointStatus,
+}
+
+/// What became of a measured point.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PointStatus {
+    /// It took part in the fit.
+    Used,
+    /// It is far from the surface and from its neighbours.
+    Outlier,
+    /// Its foot lies beyond the edge of the nominal surface.
+    OffPart,
+}
+
+/// Why a registration cannot be had.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[allow(missing_docs)]
+pub enum RegistrationError {
+    #[error(transparent)]
+    Surface(#[from] SurfaceError),
+    #[error(
+        "the probe radius is {radius_mm} mm; it must be above 0 and below {limit_mm:.3} mm, half the size of the part"
+    )]
+    ProbeRadius { radius_mm: f64, limit_mm: f64 },
+    #[error("there are {points} measured points and at least {least} are needed; measure more")]
+    TooFewPoints { points: usize, least: usize },
+    #[error("measured point {} is not finite; remove it or correct it", index + 1)]
+    NotFinite { index: usize },
+    #[error("all {points} measured points lie on one line; a pose needs points off it")]
+    Collinear { points: usize },
+    #[error("{doubled} of {points} measured points repeat another one exactly; was a file joined to itself?")]
+    Repeated { doubled: usize, points: usize },
+    #[error(
+        "the measured cloud is {ratio:.4} times the size of the nominal surface ({measured_mm:.4} mm against {nominal_mm:.4} \
+         mm); {remedy}"
+    )]
+    Size { ratio: f64, measured_mm: f64, nominal_mm: f64, remedy: &'static str },
+    #[error(
+        "only {used} of {points} measured points lie on the part; check that the cloud belongs to it, and the start pose"
+    )]
+    TooFewUsed { used: usize, points: usize },
+    #[error(
+        "no minimum within {iterations} iterations; the objective is at {objective_mm2:.3e} mm^2; allow more, or give a start pose"
+    )]
+    NotConverged { iterations: usize, objective_mm2: f64 },
+    #[error(
+        "the measured points do not fit the nominal surface: rms {rms_mm:.4} mm, limit {limit_mm:.4} mm; check part, units and \
+         probe radius, or raise the limit"
+    )]
+    DoesNotFit { rms_mm: f64, limit_mm: f64 },
+    #[error(
+        "the measured cloud is a mirror image of the part: as measured it fits to {rms_mm:.4} mm, mirrored to \
+         {mirrored_rms_mm:.4} mm rms; one axis of the CMM file is reversed"
+    )]
+    Mirrored { rms_mm: f64, mirrored_rms_mm: f64 },
+    #[error(
+        "the probe lies on the other side of the nominal surface: rms {other_rms_mm:.4} mm there, {rms_mm:.4} mm on the side \
+         given; turn the normals or the side"
+    )]
+    WrongSide { rms_mm: f64, other_rms_mm: f64 },
+    #[error("no direction of the pose is free or visible; unlock one, or give a surface with more shape")]
+    Undetermined,
+}
+
+/// Registers measured points to a nominal surface.
+///
+/// Shapes: at least 7 measured points, in any order; the deviations come back in the same order. Frames: the points are in the
+/// CMM frame, the surface in the model frame, and the pose takes the latter to the former. Units: millimetres. Equations: (3),
+/// (7) to (15) of the paper.
+///
+/// # Errors
+/// Input that cannot be registered, a cloud that does not fit the surface, and an iteration that does not converge.
+pub fn register(nominal: &Nominal, measured: &[Point], options: &Options) -> Result<Registration, RegistrationError> {
+    let part = Part::check(nominal, measured, options)?;
+    let seed = start::begin(&part, measured, options)?;
+    let problem = part.problem(measured, options, seed.side);
+    if let Some(fold) = problem.surface.fold(std::iter::empty()) {
+        return Err(fold.into());
+    }
+    let mut trace = Vec::new();
+    let mut tracks = vec![Track::NEW; measured.len()];
+    let descent = settle(&problem, &seed, options, &mut tracks, &mut trace)?;
+    let registration = conclude(&part, &problem, descent, tracks, trace, &seed, options)?;
+    part.confirm(&registration, measured, options)?;
+    Ok(registration)
+}
+
+/// The nominal surface and the sizes that limits are stated in.
+pub(crate) struct Part<'a> {
+    nominal: &'a Nominal,
+    /// Radius of the offset surface: the probe's, or 0 where the points are registered to the nominal surface itself.
+    offset_mm: f64,
+    /// Subtracted from each distance.
+    subtract_mm: f64,
+    /// Rms size of the measured cloud.
+    size_mm: f64,
+    /// Singular values below this share of the largest count as unseen.
+    least_share: f64,
+}
+
+impl<'a> Part<'a> {
+    /// Checks what can be checked before anything is computed.
+    fn check(nominal: &'a Nominal, measured: &[Point], options: &Options) -> Result<Self, RegistrationError> {
+        const LEAST: usize = 7;
+        if measured.len() < LEAST {
+            return Err(RegistrationError::TooFewPoints { points: measured.len(), least: LEAST });
+        }
+        if let Some(index) = measured.iter().position(|p| !(p.x + p.y + p.z).is_finite()) {
+            return Err(RegistrationError::NotFinite { index });
+        }
+        if crate::surface::is_line(measured) {
+            return Err(RegistrationError::Collinear { points: measured.len() });
+        }
+        check_repeats(measured)?;
+        let (_, size_mm) = middle_and_size(measured);
+        let nominal_mm = nominal.size_mm();
+        check_sizes(size_mm, nominal_mm)?;
+        let radius_mm = options.probe_radius_mm;
+        let limit_mm = 0.5 * nominal_mm;
+        if options.method != Method::Contact && !(radius_mm > 0.0 && radius_mm < limit_mm) {
+            return Err(RegistrationError::ProbeRadius { radius_mm, limit_mm });
+        }
+        let (offset_mm, subtract_mm) = match options.method {
+            Method::Offset => (radius_mm, 0.0),
+            Method::Contact => (0.0, 0.0),
+            Method::SubtractRadius => (0.0, radius_mm),
+        };
+        let least_share = 1e-6_f64.max(3.0 * nominal.normal_error());
+        Ok(Self { nominal, offset_mm, subtract_mm, size_mm, least_share })
+    }
+
+    fn surface(&self, options: &Options, side: Side) -> OffsetSurface<'a> {
+        let lookup = if options.method == Method::SubtractRadius { Lookup::Projection } else { Lookup::Foot };
+        OffsetSurface::new(self.nominal, self.offset_mm, side)
+            .expect("the radius was checked")
+            .with_distance(options.distance)
+            .with_lookup(lookup)
+    }
+
+    fn problem<'b>(&self, measured: &'b [Point], options: &Options, side: Side) -> Problem<'b>
+    where
+        'a: 'b,
+    {
+        Problem {
+            surface: self.surface(options, side),
+            reading: Reading { subtract_mm: self.subtract_mm, loss: ScaledLoss::new(Loss::None, 1.0) },
+            measured,
+            locked: options.locked,
+            least_share: self.least_share,
+            tolerance: options.tolerance,
+            ball_radius: options.ball_radius,
+            most_iterations: options.most_iterations,
+        }
+    }
+
+    fn rms_limit_mm(&self, options: &Options) -> f64 {
+        options.rms_limit_mm.unwrap_or(0.2 + 1e-4 * self.size_mm)
+    }
+
+    /// Refuses a fit that is none: a cloud of another part, or a mirror image.
+    fn confirm(&self, found: &Registration, measured: &[Point], options: &Options) -> Result<(), RegistrationError> {
+        let rms_mm = found.verdict.rms_mm;
+        let limit_mm = self.rms_limit_mm(options);
+        let doubtful = rms_mm > limit_mm || rms_mm > 0.02 * self.nominal.relief_mm();
+        if doubtful && let Some(mirrored_rms_mm) = start::mirrored_rms(self, measured, options, found) {
+            if mirrored_rms_mm < 0.3 * rms_mm && mirrored_rms_mm <= limit_mm {
+                return Err(RegistrationError::Mirrored { rms_mm, mirrored_rms_mm });
+            }
+        }
+        if rms_mm > limit_mm {
+            return Err(RegistrationError::DoesNotFit { rms_mm, limit_mm });
+        }
+        Ok(())
+    }
+}
+
+fn check_repeats(measured: &[Point]) -> Result<(), RegistrationError> {
+    let mut bits: Vec<[u64; 3]> = measured.iter().map(|p| [p.x, p.y, p.z].map(f64::to_bits)).collect();
+    rayon::slice::ParallelSliceMut::par_sort_unstable(bits.as_mut_slice());
+    let doubled = bits.windows(2).filter(|w| w[0] == w[1]).count();
+    if doubled * 100 > measured.len() {
+        return Err(RegistrationError::Repeated { doubled, points: measured.len() });
+    }
+    Ok(())
+}
+
+fn check_sizes(measured_mm: f64, nominal_mm: f64) -> Result<(), RegistrationError> {
+    let ratio = measured_mm / nominal_mm;
+    let remedy = match ratio {
+        r if !(r > 0.0 && r.is_finite()) => "a size must be above 0",
+        r if r > 500.0 => {
+            "are the nominal points in metres, or the measured ones in micrometres? give both in millimetres"
+        }
+        r if r > 15.0 => "are the nominal points in inches? give both in millimetres",
+        r if r > 3.0 => "is this the nominal surface of this part?",
+        r if r < 0.002 => "are the measured points in metres? give both in millimetres",
+        r if r < 0.06 => "are the measured points in inches or centimetres, or on a small part of the surface only?",
+        _ => return Ok(()),
+    };
+    Err(RegistrationError::Size { ratio, measured_mm, nominal_mm, remedy })
+}
+
+/// Descends, drops what is off the part or an outlier, and descends again until nothing changes.
+fn settle(
+    problem: &Problem,
+    seed: &start::Seed,
+    options: &Options,
+    tracks: &mut [Track],
+    trace: &mut Vec<Iteration>,
+) -> Result<Descent, RegistrationError> {
+    /// Rounds after which points are only dropped and no longer taken back, so that the sets cannot alternate for ever.
+    const BOTH_WAYS: usize = 8;
+    const MOST_ROUNDS: usize = 16;
+    let mut problem = *problem;
+    let mut pose = seed.cmm_from_model;
+    if seed.near {
+        problem.ball_radius = problem.ball_radius.min(0.05);
+        evaluate(&problem, tracks, &pose);
+        screen(&problem, options, tracks, true);
+    }
+    let mut round = 0;
+    loop {
+        rescale(&mut problem, options, tracks, round > 0 || seed.near);
+        let descent = problem.descend(pose, tracks, trace)?;
+        if !descent.converged {
+            let (iterations, objective_mm2) = (options.most_iterations, descent.objective_mm2);
+            return Err(RegistrationError::NotConverged { iterations, objective_mm2 });
+        }
+        pose = descent.cmm_from_model;
+        evaluate(&problem, tracks, &pose);
+        round += 1;
+        let changed = screen(&problem, options, tracks, round < BOTH_WAYS);
+        let robust_settling = options.loss != Loss::None && round < 4;
+        if (changed == 0 && !robust_settling) || round == MOST_ROUNDS {
+            return finish(&problem, descent, tracks);
+        }
+    }
+}
+
+/// Sums the linear problem at the final pose, over the points that were used there.
+fn finish(problem: &Problem, descent: Descent, tracks: &mut [Track]) -> Result<Descent, RegistrationError> {
+    let sums = problem.feet(tracks, &descent.cmm_from_model, &descent.lever);
+    if sums.points * 2 < tracks.len() {
+        return Err(RegistrationError::TooFewUsed { used: sums.points, points: tracks.len() });
+    }
+    if descent.rank == 0 {
+        return Err(RegistrationError::Undetermined);
+    }
+    Ok(Descent { sums, ..descent })
+}
+
+fn evaluate(problem: &Problem, tracks: &mut [Track], pose: &Pose) {
+    let (middle, size_mm) = middle_and_size(problem.measured);
+    let lever = linearize::Lever { centre: pose.inverse().point(&middle), size_mm };
+    problem.feet(tracks, pose, &lever);
+}
+
+/// Gives a robust loss the scale of the distances as they are now.
+fn rescale(problem: &mut Problem, options: &Options, tracks: &[Track], known: bool) {
+    if options.loss != Loss::None {
+        let sigma = if known { sigma_of(tracks).1 } else { f64::INFINITY };
+        problem.reading.loss = ScaledLoss::new(options.loss, sigma);
+    }
+}
+
+/// No CMM repeats better than this, and rounding in a file may be all the scatter there is.
+const LEAST_SIGMA_MM: f64 = 1e-5;
+
+fn sigma_of(tracks: &[Track]) -> (f64, f64) {
+    let on_part = tracks.iter().filter(|t| t.beyond_steps <= 0.5).map(|t| t.distance_mm);
+    let (median, sigma) = robust_sigma(on_part);
+    (median, sigma.max(LEAST_SIGMA_MM))
+}
+
+/// Decides which points take part; returns how many changed.
+///
+/// An outlier is far from the surface and from its neighbours: a smooth form error, however large, is neither noise nor a
+/// mistake of the probe. Beyond four times the limit its neighbours are no longer asked.
+fn screen(problem: &Problem, options: &Options, tracks: &mut [Track], both_ways: bool) -> usize {
+    let (median, sigma) = sigma_of(tracks);
+    let limit = options.outlier_sigmas * sigma;
+    let far = |t: &Track| (t.distance_mm - median).abs() > limit;
+    let suspects: Vec<usize> = (0..tracks.len()).filter(|&k| far(&tracks[k])).collect();
+    let lonely =
+        if suspects.is_empty() { Vec::new() } else { lonely(problem.measured, tracks, &suspects, 0.5 * limit) };
+    let mut outlier = vec![false; if suspects.is_empty() { 0 } else { tracks.len() }];
+    for (&k, lonely) in suspects.iter().zip(lonely) {
+        outlier[k] = lonely || (tracks[k].distance_mm - median).abs() > 4.0 * limit;
+    }
+    let mut changed = 0;
+    for (k, track) in tracks.iter_mut().enumerate() {
+        let fits = track.beyond_steps <= 0.5 && !outlier.get(k).copied().unwrap_or(false);
+        if fits != track.used && (both_ways || !fits) {
+            track.used = fits;
+            changed += 1;
+        }
+    }
+    changed
+}
+
+/// For each suspect, whether its distance departs from the median of its eight nearest neighbours by more than a limit.
+fn lonely(measured: &[Point], tracks: &[Track], suspects: &[usize], limit_mm: f64) -> Vec<bool> {
+    const NEIGHBOURS: std::num::NonZero<usize> = std::num::NonZero::new(9).expect("nine is not zero");
+    let coordinates: Vec<[f64; 3]> = measured.iter().map(|p| (*p).into()).collect();
+    let Ok(tree) = kiddo::ImmutableKdTree::<f64, 3>::new_from_slice(&coordinates) else {
+        return vec![true; suspects.len()];
+    };
+    let is_lonely = |&k: &usize| {
+        let nearest = tree.query(&coordinates[k]).nearest_n::<kiddo::SquaredEuclidean<f64>>(NEIGHBOURS).execute();
+        let mut around: Vec<f64> =
+            nearest.iter().map(|n| n.item as usize).filter(|&n| n != k).map(|n| tracks[n].distance_mm).collect();
+        around.sort_unstable_by(f64::total_cmp);
+        (tracks[k].distance_mm - around[around.len() / 2]).abs() > limit_mm
+    };
+    suspects.iter().map(is_lonely).collect()
+}
+
+/// Turns the end of the iteration into what is reported.
+fn conclude(
+    part: &Part,
+    problem: &Problem,
+    descent: Descent,
+    tracks: Vec<Track>,
+    trace: Vec<Iteration>,
+    seed: &start::Seed,
+    options: &Options,
+) -> Result<Registration, RegistrationError> {
+    if let Some(fold) = problem.surface.fold(tracks.iter().map(|t| t.place)) {
+        return Err(fold.into());
+    }
+    let finals = feet(&problem.surface, problem.measured, &tracks, &descent.cmm_from_model, &descent.lever);
+    let verdict = verdict::judge(problem, &descent, &tracks, &finals, seed, trace.len());
+    let deviations = verdict::deviations(part, &tracks, &finals, &descent.lever, &verdict, options);
+    Ok(Registration { cmm_from_model: descent.cmm_from_model, deviations, trace, side: seed.side, verdict })
+}

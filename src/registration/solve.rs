@@ -1,0 +1,126 @@
+//! The ball-constrained linear least-squares problem, eq. (15): A m = b subject to |m| <= alpha.
+
+use nalgebra::{Matrix6, SymmetricEigen, Vector6};
+
+/// The singular values and right singular vectors of A, from its normal matrix.
+#[derive(Clone, Debug)]
+pub(crate) struct Spectrum {
+    /// Squared singular values, in falling order.
+    pub(crate) squares: Vector6<f64>,
+    /// Right singular vectors, a column each.
+    pub(crate) directions: Matrix6<f64>,
+}
+
+impl Spectrum {
+    /// Decomposes A^T A = V S^2 V^T.
+    ///
+    /// The columns of A are centred and scaled beforehand, so squaring loses no more than the surface itself hides.
+    pub(crate) fn new(gram: &Matrix6<f64>) -> Self {
+        let eigen = SymmetricEigen::new(*gram);
+        let mut order: [usize; 6] = std::array::from_fn(|k| k);
+        order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
+        Self {
+            squares: Vector6::from_fn(|k, _| eigen.eigenvalues[order[k]].max(0.0)),
+            directions: Matrix6::from_fn(|i, k| eigen.eigenvectors[(i, order[k])]),
+        }
+    }
+
+    /// Returns how many directions the surface sees: singular values above a share of the largest.
+    pub(crate) fn rank(&self, least_share: f64) -> usize {
+        let limit = self.squares[0] * least_share * least_share;
+        (0..6).take_while(|&k| self.squares[k] > limit).count()
+    }
+
+    /// Minimises |A m - b| over |m| <= alpha within the leading `rank` directions.
+    ///
+    /// Equation: m(mu) = sum_k v_k (v_k . A^T b) / (s_k^2 + mu), with mu = 0 where that lies in the ball and else the root of
+    /// the secular equation |m(mu)| = alpha (Golub and Van Loan, Matrix Computations, 12.1.2).
+    pub(crate) fn step(&self, right: &Vector6<f64>, rank: usize, alpha: f64) -> Vector6<f64> {
+        let along = self.directions.transpose() * right;
+        let step = |mu: f64| {
+            let mut m = Vector6::zeros();
+            for k in 0..rank {
+                m += self.directions.column(k) * (along[k] / (self.squares[k] + mu));
+            }
+            m
+        };
+        let free = step(0.0);
+        if free.norm() <= alpha {
+            return free;
+        }
+        step(self.multiplier(&along, rank, alpha))
+    }
+
+    /// Solves 1/|m(mu)| = 1/alpha by Newton's method; in this form the function is nearly straight and the iteration rises to
+    /// the root from below without overshooting.
+    fn multiplier(&self, along: &Vector6<f64>, rank: usize, alpha: f64) -> f64 {
+        let mut mu = 0.0;
+        for _ in 0..60 {
+            let (mut norm2, mut slope) = (0.0, 0.0);
+            for k in 0..rank {
+                let s = self.squares[k] + mu;
+                let part = (along[k] / s).powi(2);
+                norm2 += part;
+                slope += part / s;
+            }
+            let norm = norm2.sqrt();
+            let change = (norm - alpha) / alpha * norm2 / slope;
+            mu += change;
+            if change <= 1e-14 * mu {
+                break;
+            }
+        }
+        mu
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn problem() -> (Matrix6<f64>, Vector6<f64>) {
+        let a = Matrix6::from_fn(|i, j| ((i * 7 + j * 3) as f64 * 0.77).sin() + if i == j { 2.0 } else { 0.0 });
+        let b = Vector6::from_fn(|i, _| (i as f64 * 1.3).cos());
+        (a.transpose() * a, a.transpose() * b)
+    }
+
+    #[test]
+    fn a_wide_ball_gives_the_least_squares_solution() {
+        let (gram, right) = problem();
+        let m = Spectrum::new(&gram).step(&right, 6, 1e6);
+        assert!((gram * m - right).norm() < 1e-12);
+    }
+
+    #[test]
+    fn a_narrow_ball_is_reached_and_the_step_is_optimal_on_it() {
+        let (gram, right) = problem();
+        let spectrum = Spectrum::new(&gram);
+        let free = spectrum.step(&right, 6, 1e6).norm();
+        for share in [1e-9, 1e-3, 0.3, 0.999_999] {
+            let alpha = share * free;
+            let m = spectrum.step(&right, 6, alpha);
+            assert!((m.norm() / alpha - 1.0).abs() < 1e-10, "{share}: {}", m.norm() / alpha);
+            // Stationary on the sphere: the residual gradient points along m.
+            let gradient = right - gram * m;
+            assert!((gradient.normalize() - m.normalize()).norm() < 1e-6 && gradient.dot(&m) > 0.0);
+        }
+    }
+
+    #[test]
+    fn a_direction_that_is_not_seen_is_not_moved_in() {
+        let mut gram = Matrix6::from_diagonal(&Vector6::new(4.0, 3.0, 2.0, 1.0, 0.5, 1e-14));
+        gram[(0, 1)] = 0.5;
+        gram[(1, 0)] = 0.5;
+        let spectrum = Spectrum::new(&gram);
+        assert_eq!(spectrum.rank(1e-6), 5);
+        let m = spectrum.step(&Vector6::repeat(1.0), 5, 10.0);
+        assert!(m[5].abs() < 1e-12);
+    }
+
+    #[test]
+    fn nothing_to_do_is_no_step() {
+        let (gram, _) = problem();
+        assert_eq!(Spectrum::new(&gram).step(&Vector6::zeros(), 6, 0.5).norm(), 0.0);
+        assert_eq!(Spectrum::new(&Matrix6::zeros()).rank(1e-6), 0);
+    }
+}

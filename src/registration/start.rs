@@ -1,0 +1,339 @@
+//! Where to begin when nobody knows where the part is.
+//!
+//! A free-form surface is told from itself by its curvature. Some measured points are fitted locally; each is laid on the places
+//! of the offset surface that bend alike, in the two ways in which principal directions can be matched. With the principal axes
+//! of the whole clouds laid on each other in all ways, and the identity, these are the candidates. Each is scored on a few
+//! points, the best are refined on some hundred, and the best of those wins; others that fit as well are reported.
+
+use rayon::prelude::*;
+
+use crate::geometry::{Point, Pose, Vector};
+use crate::surface::{Feature, OffsetSurface, Place, Side, features, principal_axes};
+
+use super::correspond::{Reading, Track};
+use super::iterate::Problem;
+use super::robust::{Loss, ScaledLoss, robust_sigma};
+use super::{Options, Part, ProbeSide, Registration, RegistrationError, Start};
+
+/// Where the registration begins.
+#[derive(Clone, Debug)]
+pub(crate) struct Seed {
+    pub(crate) cmm_from_model: Pose,
+    pub(crate) side: Side,
+    /// Whether the pose was refined already, so that outliers can be told at once.
+    pub(crate) near: bool,
+    /// Poses that are different and fit about as well.
+    pub(crate) alternatives: Vec<Candidate>,
+}
+
+/// A pose and how well some points fit under it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Candidate {
+    pub(crate) cmm_from_model: Pose,
+    /// Root mean square of the truncated distances, in millimetres.
+    pub(crate) rms_mm: f64,
+    side: Side,
+}
+
+/// Points that a candidate is scored on, refined on, and compared on.
+const SCORED: usize = 40;
+const REFINED: usize = 160;
+const COMPARED: usize = 640;
+/// Measured places that are laid on the surface, and places of the surface that each is laid on.
+const LAID: usize = 24;
+const PLACES: usize = 36;
+/// Candidates that are refined.
+const KEPT: usize = 24;
+
+/// A side fits better only if its rms is this many times smaller; the part's own form error keeps the two apart by less.
+const SIDE_RATIO: f64 = 2.0;
+
+/// Chooses the pose to begin from and the side of the probe.
+pub(crate) fn begin(part: &Part, measured: &[Point], options: &Options) -> Result<Seed, RegistrationError> {
+    let search = Search::new(part, measured, options);
+    match options.start {
+        Start::Pose(pose) => search.side_at(pose),
+        Start::Search => search.search(),
+    }
+}
+
+/// Returns the rms to which the mirrored cloud fits; `None` if it cannot be registered at all.
+pub(crate) fn mirrored_rms(part: &Part, measured: &[Point], options: &Options, found: &Registration) -> Option<f64> {
+    // Mirrored in the plane x = 0 of the CMM frame: which plane does not matter to a search over all poses.
+    let mirrored: Vec<Point> = spread(measured, 4 * COMPARED).map(|p| Point::new(-p.x, p.y, p.z)).collect();
+    let options = Options { side: ProbeSide::Known(found.side), ..*options };
+    let search = Search::new(part, &mirrored, &options);
+    search.candidates(found.side).first().map(|c| c.rms_mm)
+}
+
+/// Some of the points, evenly along their order; jittered, so that the choice does not run along one column of a grid.
+fn spread(points: &[Point], count: usize) -> impl Iterator<Item = &Point> {
+    let n = points.len();
+    let take = count.min(n);
+    let jitter = move |k: usize| (k.wrapping_mul(0x9E37_79B9) >> 7) % (n / take.max(1)).max(1);
+    (0..take).map(move |k| &points[k * n / take + jitter(k)])
+}
+
+struct Search<'a> {
+    part: &'a Part<'a>,
+    options: &'a Options,
+    measured: &'a [Point],
+    few: Vec<Point>,
+    some: Vec<Point>,
+    many: Vec<Point>,
+}
+
+impl<'a> Search<'a> {
+    fn new(part: &'a Part, measured: &'a [Point], options: &'a Options) -> Self {
+        let sample = |count| spread(measured, count).copied().collect();
+        Self { part, options, measured, few: sample(SCORED), some: sample(REFINED), many: sample(COMPARED) }
+    }
+
+    /// Takes a pose as given and finds the side on which the points fit.
+    fn side_at(&self, pose: Pose) -> Result<Seed, RegistrationError> {
+        let at = |side: Side| {
+            let start = if side == Side::Normal { pose } else { self.across(pose) };
+            self.refine(start, side, &self.many, 12)
+        };
+        let (side, _) = self.choose_side(at(Side::Normal), at(Side::Opposite))?;
+        Ok(Seed { cmm_from_model: pose, side, near: false, alternatives: Vec::new() })
+    }
+
+    /// Tries many poses and takes the best.
+    fn search(&self) -> Result<Seed, RegistrationError> {
+        let best = |side| {
+            let found = self.candidates(side);
+            found.first().copied().map(|best| (best, found))
+        };
+        let (normal, opposite) = match self.options.side {
+            ProbeSide::Known(Side::Normal) => (best(Side::Normal), None),
+            ProbeSide::Known(Side::Opposite) => (None, best(Side::Opposite)),
+            ProbeSide::Auto => (best(Side::Normal), best(Side::Opposite)),
+        };
+        let candidate =
+            |found: &Option<(Candidate, Vec<Candidate>)>, other: &Option<(Candidate, Vec<Candidate>)>, side| {
+                found.as_ref().map(|f| f.0).or_else(|| {
+                    // The other side of a known one: from the same pose, shifted through the surface.
+                    other.as_ref().map(|f| self.refine(self.across_to(f.0.cmm_from_model, side), side, &self.many, 12))
+                })
+            };
+        let sides = (candidate(&normal, &opposite, Side::Normal), candidate(&opposite, &normal, Side::Opposite));
+        let (Some(at_normal), Some(at_opposite)) = sides else { return Err(RegistrationError::Undetermined) };
+        let (side, best) = self.choose_side(at_normal, at_opposite)?;
+        let all = if side == Side::Normal { normal } else { opposite }.map_or(Vec::new(), |f| f.1);
+        let alternatives = self.alternatives(&best, &all);
+        Ok(Seed { cmm_from_model: best.cmm_from_model, side, near: true, alternatives })
+    }
+
+    /// Decides between the best fits on the two sides.
+    fn choose_side(&self, normal: Candidate, opposite: Candidate) -> Result<(Side, Candidate), RegistrationError> {
+        match self.options.side {
+            ProbeSide::Auto if opposite.rms_mm * SIDE_RATIO < normal.rms_mm => Ok((Side::Opposite, opposite)),
+            ProbeSide::Auto => Ok((Side::Normal, normal)),
+            ProbeSide::Known(side) => {
+                let (given, other) = if side == Side::Normal { (normal, opposite) } else { (opposite, normal) };
+                // Clearly better there, and by more than a form error could explain.
+                if other.rms_mm * 4.0 * SIDE_RATIO < given.rms_mm && self.part.offset_mm > 0.0 {
+                    return Err(RegistrationError::WrongSide { rms_mm: given.rms_mm, other_rms_mm: other.rms_mm });
+                }
+                Ok((side, given))
+            }
+        }
+    }
+
+    /// A pose for the opposite side from one for the side of the normals, the surface shifted by the two radii.
+    fn across(&self, pose: Pose) -> Pose {
+        self.across_to(pose, Side::Opposite)
+    }
+
+    fn across_to(&self, pose: Pose, side: Side) -> Pose {
+        let mean = self.part.nominal.mean_normal();
+        let shift = mean * (-2.0 * self.part.offset_mm * side.sign());
+        pose * Pose { translation_mm: -shift, ..Pose::identity() }
+    }
+
+    /// Returns refined candidates on one side, the best first, each pose once.
+    fn candidates(&self, side: Side) -> Vec<Candidate> {
+        let surface = self.part.surface(self.options, side);
+        let mut starts = vec![Pose::identity()];
+        starts.extend(self.by_principal_axes(side));
+        starts.extend(self.by_curvature(side));
+        let mut scored: Vec<(f64, Pose)> =
+            starts.into_par_iter().map(|p| (self.score(&surface, &p, &self.few), p)).collect();
+        scored.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let mut kept: Vec<Pose> = Vec::new();
+        for (_, pose) in scored {
+            if kept.iter().all(|k| self.apart(k, &pose) > 0.1) {
+                kept.push(pose);
+            }
+            if kept.len() == KEPT {
+                break;
+            }
+        }
+        let mut refined: Vec<Candidate> =
+            kept.into_par_iter().map(|pose| self.refine(pose, side, &self.some, 10)).collect();
+        refined.sort_by(|a, b| a.rms_mm.total_cmp(&b.rms_mm));
+        let best = refined.iter().take(6).copied().collect::<Vec<_>>();
+        let mut compared: Vec<Candidate> =
+            best.into_par_iter().map(|c| self.refine(c.cmm_from_model, side, &self.many, 10)).collect();
+        compared.sort_by(|a, b| a.rms_mm.total_cmp(&b.rms_mm));
+        let mut distinct: Vec<Candidate> = Vec::new();
+        for c in compared {
+            if distinct.iter().all(|d| self.apart(&d.cmm_from_model, &c.cmm_from_model) > 0.01) {
+                distinct.push(c);
+            }
+        }
+        distinct
+    }
+
+    /// How far two poses carry the cloud apart, in units of its size.
+    fn apart(&self, a: &Pose, b: &Pose) -> f64 {
+        let between = a.inverse() * *b;
+        let centre = self.few.iter().map(|p| p.coords).sum::<Vector>() / self.few.len() as f64;
+        let shift = (a.inverse().point(&Point::from(centre)) - b.inverse().point(&Point::from(centre))).norm();
+        between.angle_rad() + shift / self.part.size_mm
+    }
+
+    /// Distances beyond this no longer make a candidate worse.
+    fn truncation_mm(&self) -> f64 {
+        0.1 * self.part.size_mm
+    }
+
+    /// Root mean square of the truncated distances from the part itself, not from its continuation.
+    fn score(&self, surface: &OffsetSurface, cmm_from_model: &Pose, points: &[Point]) -> f64 {
+        let limit2 = self.truncation_mm().powi(2);
+        let model_from_cmm = cmm_from_model.inverse();
+        let sum: f64 = points
+            .iter()
+            .map(|p| {
+                let foot = surface.foot(&model_from_cmm.point(p), Place::UNKNOWN);
+                let d = foot.distance_mm - self.part.subtract_mm;
+                (d * d + foot.beyond_mm * foot.beyond_mm).min(limit2)
+            })
+            .sum();
+        (sum / points.len() as f64).sqrt()
+    }
+
+    /// Descends under a loss that forgets gross outliers, its scale following the distances down.
+    fn refine(&self, start: Pose, side: Side, points: &[Point], iterations: usize) -> Candidate {
+        let surface = self.part.surface(self.options, side);
+        let mut problem = Problem {
+            surface,
+            reading: Reading { subtract_mm: self.part.subtract_mm, loss: ScaledLoss::new(Loss::None, 1.0) },
+            measured: points,
+            locked: self.options.locked,
+            least_share: self.part.least_share,
+            tolerance: 1e-6,
+            ball_radius: 0.4,
+            most_iterations: iterations,
+        };
+        let mut pose = start;
+        let mut tracks = vec![Track::NEW; points.len()];
+        let mut trace = Vec::new();
+        for round in 0..4 {
+            if round > 0 {
+                let (_, sigma) = robust_sigma(tracks.iter().map(|t| t.distance_mm));
+                problem.reading.loss = ScaledLoss::new(Loss::Tukey, sigma.max(1e-4));
+            }
+            match problem.descend(pose, &mut tracks, &mut trace) {
+                Ok(descent) => pose = descent.cmm_from_model,
+                Err(_) => break,
+            }
+        }
+        Candidate { cmm_from_model: pose, rms_mm: self.score(&surface, &pose, points), side }
+    }
+
+    /// Other poses that fit nearly as well as the best.
+    fn alternatives(&self, best: &Candidate, all: &[Candidate]) -> Vec<Candidate> {
+        all.iter()
+            .filter(|c| c.rms_mm < 1.5 * best.rms_mm + 1e-6 && c.side == best.side)
+            .filter(|c| self.apart(&c.cmm_from_model, &best.cmm_from_model) > 0.05)
+            .copied()
+            .collect()
+    }
+
+    /// The principal axes of the two clouds on each other: both faces, in steps of 15 degrees about the least axis.
+    fn by_principal_axes(&self, side: Side) -> Vec<Pose> {
+        const TURNS: usize = 24;
+        let frame = |points: &[Point]| {
+            let (centre, eigen) = principal_axes(points);
+            let (least, most) = (eigen.eigenvalues.imin(), eigen.eigenvalues.imax());
+            let normal: Vector = eigen.eigenvectors.column(least).into();
+            let first: Vector = eigen.eigenvectors.column(most).into();
+            (centre, normal, first)
+        };
+        let nominal: Vec<Point> = self.part.nominal.sample(4096);
+        let (m_centre, m_normal, m_first) = frame(&nominal);
+        let m_centre = m_centre + self.part.nominal.mean_normal() * (side.sign() * self.part.offset_mm);
+        let (w_centre, w_normal, w_first) = frame(&self.many);
+        let model = Frame::new(m_centre, m_normal, m_first);
+        let mut starts = Vec::with_capacity(2 * TURNS);
+        for face in [1.0, -1.0] {
+            for turn in 0..TURNS {
+                let angle = std::f64::consts::TAU * turn as f64 / TURNS as f64;
+                let second = w_normal.cross(&w_first);
+                let first = w_first * angle.cos() + second * angle.sin();
+                starts.push(Frame::new(w_centre, w_normal * face, first).from(&model));
+            }
+        }
+        starts
+    }
+
+    /// Measured places laid on places of the offset surface that bend alike.
+    fn by_curvature(&self, side: Side) -> Vec<Pose> {
+        let on_nominal = self.part.nominal.features();
+        if on_nominal.len() < PLACES {
+            return Vec::new();
+        }
+        let offset: Vec<Feature> = on_nominal.iter().filter_map(|f| f.offset(self.part.offset_mm, side)).collect();
+        let sample: Vec<Point> = spread(self.measured, 2000).copied().collect();
+        let measured = most_telling(features(&sample, None));
+        measured.iter().flat_map(|m| [*m, m.turned_over()]).flat_map(|m| laid_on(&m, &offset)).collect()
+    }
+}
+
+/// The features whose two curvatures differ most, so that their directions are sure; half of them, spread over all.
+fn most_telling(mut features: Vec<Feature>) -> Vec<Feature> {
+    features.sort_by(|a, b| b.anisotropy().total_cmp(&a.anisotropy()));
+    features.truncate((features.len() / 2).max(LAID));
+    let stride = features.len().div_ceil(LAID).max(1);
+    features.into_iter().step_by(stride).collect()
+}
+
+/// Lays a measured feature on the places of the surface that bend most alike, in both ways.
+fn laid_on(measured: &Feature, offset: &[Feature]) -> Vec<Pose> {
+    let unlike = |f: &Feature| {
+        (f.curvatures[0] - measured.curvatures[0]).powi(2) + (f.curvatures[1] - measured.curvatures[1]).powi(2)
+    };
+    let mut places: Vec<(f64, &Feature)> = offset.iter().map(|f| (unlike(f), f)).collect();
+    let count = PLACES.min(places.len());
+    if count < places.len() {
+        places.select_nth_unstable_by(count, |a, b| a.0.total_cmp(&b.0));
+    }
+    places[..count]
+        .iter()
+        .flat_map(|(_, f)| {
+            let model = Frame::new(f.point, f.normal, f.direction);
+            [1.0, -1.0].map(|way| Frame::new(measured.point, measured.normal, measured.direction * way).from(&model))
+        })
+        .collect()
+}
+
+/// An origin and a right-handed set of axes.
+struct Frame {
+    origin: Point,
+    axes: nalgebra::Matrix3<f64>,
+}
+
+impl Frame {
+    fn new(origin: Point, normal: Vector, first: Vector) -> Self {
+        let second = normal.cross(&first);
+        Self { origin, axes: nalgebra::Matrix3::from_columns(&[first, second, normal]) }
+    }
+
+    /// The pose that lays another frame on this one.
+    fn from(&self, other: &Frame) -> Pose {
+        let rotation = self.axes * other.axes.transpose();
+        Pose { rotation, translation_mm: self.origin.coords - rotation * other.origin.coords }.orthonormalised()
+    }
+}

@@ -1,0 +1,300 @@
+//! How well the pose is known, which way it is not, and what each deviation is worth.
+
+use std::collections::HashSet;
+
+use nalgebra::{DMatrix, Matrix6, Vector6};
+
+use crate::geometry::{Point, Pose, Vector};
+
+use super::correspond::{Final, Track};
+use super::iterate::{Descent, Problem, free_directions};
+use super::linearize::Lever;
+use super::solve::Spectrum;
+use super::start::Seed;
+use super::{Deviation, Method, Options, Part, PointStatus};
+
+/// What to think of a registration.
+#[derive(Clone, Debug)]
+pub struct Verdict {
+    /// Number of points that took part in the fit.
+    pub used: usize,
+    /// Sum of the squared deviations of the points used, in mm^2; eq. (7).
+    pub objective_mm2: f64,
+    /// Root mean square of the deviations of the points used, in millimetres.
+    pub rms_mm: f64,
+    /// Largest less least deviation of the points used, in millimetres.
+    pub pv_mm: f64,
+    /// Standard deviation of the residuals, with the degrees of freedom counted, in millimetres.
+    pub residual_sigma_mm: f64,
+    /// Covariance of the pose: of the twist [v; omega] in the model frame that takes the true pose to the one found by
+    /// multiplication on the right. Units mm^2, mm rad, rad^2. Directions that are held or locked have no variance here.
+    ///
+    /// Equation: s^2 (A^T A)^-1 with s^2 the residual variance (GUM, F.1; Golub and Van Loan, 5.5).
+    pub covariance: Matrix6<f64>,
+    /// Largest singular value of A over the least that is free, with lengths in units of the cloud's rms size.
+    pub condition: f64,
+    /// Directions that the surface cannot see, and those it sees worse than a single point is measured.
+    pub weak_directions: Vec<WeakDirection>,
+    /// Share of the nominal surface that points which were used lie on, from 0 to 1.
+    pub coverage: f64,
+    /// Other poses that fit about as well, with their rms over some hundred points in millimetres.
+    pub alternatives: Vec<(Pose, f64)>,
+    /// Turns of the iteration, steps taken back included.
+    pub iterations: usize,
+    /// Whether the last descent converged; a registration that did not is an error.
+    pub converged: bool,
+}
+
+/// A direction in which the pose is badly known.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub struct WeakDirection {
+    /// In words: "x and y shift: known to 3.4 mm only".
+    pub words: String,
+    /// Whether the direction could not be seen at all and was held where it began.
+    pub held: bool,
+    /// Standard uncertainty of a shift in millimetres, or of the rim for a rotation; absent where it is held.
+    pub sigma_mm: Option<f64>,
+}
+
+/// Judges the end of an iteration.
+pub(crate) fn judge(
+    problem: &Problem,
+    descent: &Descent,
+    tracks: &[Track],
+    finals: &[Final],
+    seed: &Seed,
+    iterations: usize,
+) -> Verdict {
+    let used: Vec<f64> = tracks.iter().filter(|t| t.used).map(|t| t.distance_mm).collect();
+    let n = used.len();
+    let objective_mm2 = used.iter().map(|d| d * d).sum::<f64>();
+    let (low, high) = used.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), d| (l.min(*d), h.max(*d)));
+    let free = free_directions(&problem.locked, &descent.lever);
+    let spectrum = Spectrum::new(&(free * descent.sums.gram() * free));
+    let rank = descent.rank;
+    // The weights of a robust loss leave out what the outliers would add.
+    let residual2 = descent.sums.objective_mm2 / n.saturating_sub(rank).max(1) as f64;
+    let scaled = scaled_covariance(&spectrum, rank, residual2);
+    let to_twist = descent.lever.to_twist();
+    let locked = problem.locked.iter().filter(|l| **l).count();
+    let held = spectrum.directions.columns(rank, 6 - rank).into_owned();
+    let mut weak_directions = held_directions(&(free * held), 6 - rank - locked.min(6 - rank), &descent.lever);
+    weak_directions.extend(weakly_seen(&scaled, residual2.sqrt(), &descent.lever, !weak_directions.is_empty()));
+    Verdict {
+        used: n,
+        objective_mm2,
+        rms_mm: (objective_mm2 / n as f64).sqrt(),
+        pv_mm: high - low,
+        residual_sigma_mm: residual2.sqrt(),
+        covariance: to_twist * scaled * to_twist.transpose(),
+        condition: (spectrum.squares[0] / spectrum.squares[rank - 1]).sqrt(),
+        weak_directions,
+        coverage: coverage(problem, tracks, finals),
+        alternatives: seed.alternatives.iter().map(|c| (c.cmm_from_model, c.rms_mm)).collect(),
+        iterations,
+        converged: descent.converged,
+    }
+}
+
+/// s^2 (A^T A)^-1 over the directions that are seen, in scaled coordinates.
+fn scaled_covariance(spectrum: &Spectrum, rank: usize, variance: f64) -> Matrix6<f64> {
+    (0..rank)
+        .map(|k| {
+            let v = spectrum.directions.column(k);
+            v * v.transpose() * (variance / spectrum.squares[k])
+        })
+        .sum()
+}
+
+/// Tells in words which motions leave every distance as it is.
+fn held_directions(basis: &nalgebra::Matrix6xX<f64>, count: usize, lever: &Lever) -> Vec<WeakDirection> {
+    if count == 0 {
+        return Vec::new();
+    }
+    // Locked directions were projected to nothing; what remains spans the held ones.
+    let svd = DMatrix::from_column_slice(6, basis.ncols(), basis.as_slice()).svd(true, false);
+    let span = svd.u.expect("asked for").columns(0, count).into_owned();
+    let omega = span.rows(3, 3).into_owned();
+    let turn = omega.svd(false, true);
+    let v_t = turn.v_t.expect("asked for");
+    let combined = |k: usize| -> Vector6<f64> {
+        let c = &span * v_t.row(k).transpose();
+        Vector6::from_iterator(c.iter().copied())
+    };
+    let turns = turn.singular_values.iter().filter(|s| **s > 1e-3).count();
+    let rotations: Vec<Vector6<f64>> = (0..turns).map(combined).collect();
+    // An orthonormal complement for the shifts: v_t may have fewer rows than the span has columns.
+    let shifts = shifts(&span, &rotations);
+    let mut words = Vec::new();
+    if !shifts.is_empty() {
+        let names: Vec<String> = shifts.iter().map(|s| direction_name(&Vector::new(s[0], s[1], s[2]))).collect();
+        words.push(format!("shift along {}", names.join(" and along ")));
+    }
+    if rotations.len() == 3 {
+        let c = common_centre(&rotations, lever);
+        words.push(format!("every rotation about ({:.3}, {:.3}, {:.3}) mm", c.x, c.y, c.z));
+    } else {
+        words.extend(rotations.iter().map(|r| axis_name(r, lever)));
+    }
+    words
+        .into_iter()
+        .map(|w| WeakDirection {
+            words: format!("{w}: the surface cannot see it, it is held where it began"),
+            held: true,
+            sigma_mm: None,
+        })
+        .collect()
+}
+
+/// An orthonormal basis of the pure shifts within a span of scaled motions.
+fn shifts(span: &DMatrix<f64>, rotations: &[Vector6<f64>]) -> Vec<Vector6<f64>> {
+    let mut basis: Vec<Vector6<f64>> = rotations.to_vec();
+    let mut found = Vec::new();
+    for column in span.column_iter() {
+        let mut rest = Vector6::from_iterator(column.iter().copied());
+        for _ in 0..2 {
+            for b in &basis {
+                rest -= b * b.dot(&rest);
+            }
+        }
+        if rest.norm() > 1e-3 && basis.len() < span.ncols() {
+            let unit = rest.normalize();
+            basis.push(unit);
+            found.push(unit);
+        }
+    }
+    found
+}
+
+/// The point that rotations about three independent axes leave where it is.
+fn common_centre(rotations: &[Vector6<f64>], lever: &Lever) -> Point {
+    let (mut gram, mut right) = (nalgebra::Matrix3::zeros(), Vector::zeros());
+    for r in rotations {
+        let (v, omega) = parts(r, lever);
+        // v + omega x q = 0.
+        let hat = omega.cross_matrix();
+        gram += hat.transpose() * hat;
+        right -= hat.transpose() * v;
+    }
+    lever.centre + gram.lu().solve(&right).unwrap_or_default()
+}
+
+fn parts(scaled: &Vector6<f64>, lever: &Lever) -> (Vector, Vector) {
+    let v: Vector = scaled.fixed_rows::<3>(0) * lever.size_mm;
+    (v, scaled.fixed_rows::<3>(3).into())
+}
+
+fn axis_name(rotation: &Vector6<f64>, lever: &Lever) -> String {
+    let (v, omega) = parts(rotation, lever);
+    let through = lever.centre + omega.cross(&v) / omega.norm_squared();
+    let name = direction_name(&omega.normalize());
+    format!("rotation about {name} through ({:.3}, {:.3}, {:.3}) mm", through.x, through.y, through.z)
+}
+
+fn direction_name(v: &Vector) -> String {
+    for (k, name) in ["x", "y", "z"].into_iter().enumerate() {
+        if v[k].abs() > 0.9999 * v.norm() {
+            return name.into();
+        }
+    }
+    let u = v.normalize() * if v[v.iamax()] < 0.0 { -1.0 } else { 1.0 };
+    format!("({:.3}, {:.3}, {:.3})", u.x, u.y, u.z)
+}
+
+/// Tells which shifts and rotations are known less well than a single point: about the middle of the cloud, on the model's axes.
+fn weakly_seen(scaled: &Matrix6<f64>, sigma_mm: f64, lever: &Lever, some_held: bool) -> Vec<WeakDirection> {
+    let at_rim: [f64; 6] = std::array::from_fn(|k| scaled[(k, k)].sqrt() * lever.size_mm);
+    let weak = |k: &usize| at_rim[*k] > sigma_mm && !some_held;
+    let mut found = Vec::new();
+    for (first, kind) in [(0, "shift"), (3, "rotation")] {
+        let mut rest: Vec<usize> = (first..first + 3).filter(weak).collect();
+        // Those within a factor of two are named together.
+        while let Some(&worst) = rest.iter().max_by(|a, b| at_rim[**a].total_cmp(&at_rim[**b])) {
+            let (group, others): (Vec<usize>, Vec<usize>) =
+                rest.iter().partition(|k| at_rim[**k] * 2.0 > at_rim[worst]);
+            let names: Vec<&str> = group.iter().map(|k| ["x", "y", "z"][k % 3]).collect();
+            let names = names.join(" and ");
+            let words = if kind == "shift" {
+                format!("{names} shift: known to {} only", length(at_rim[worst]))
+            } else {
+                let angle = at_rim[worst] / lever.size_mm;
+                format!(
+                    "rotation about {names}: known to {:.2} mrad only, {} at the rim",
+                    1e3 * angle,
+                    length(at_rim[worst])
+                )
+            };
+            found.push(WeakDirection { words, held: false, sigma_mm: Some(at_rim[worst]) });
+            rest = others;
+        }
+    }
+    found
+}
+
+/// A length with two digits in the unit that suits it.
+fn length(mm: f64) -> String {
+    match mm {
+        l if l >= 10.0 => format!("{l:.0} mm"),
+        l if l >= 1.0 => format!("{l:.1} mm"),
+        l if l >= 0.1 => format!("{l:.2} mm"),
+        l if l >= 0.01 => format!("{:.0} um", 1e3 * l),
+        l if l >= 1e-3 => format!("{:.1} um", 1e3 * l),
+        l => format!("{:.2} um", 1e3 * l),
+    }
+}
+
+/// Returns the share of the surface's cells that hold a point which was used.
+///
+/// A cell is a cube with an edge of a thirtieth of the surface's size, or three times the mean distance of the points where
+/// these are sparser: small enough to see a missing corner, large enough that a full pattern leaves no cell empty.
+fn coverage(problem: &Problem, tracks: &[Track], finals: &[Final]) -> f64 {
+    const MOST: usize = 50_000;
+    let nominal = problem.surface.nominal();
+    let size = nominal.size_mm();
+    let used = tracks.iter().filter(|t| t.used).count().min(MOST) as f64;
+    let edge = (size / 15.0).max(3.0 * 3.5 * size / used.sqrt());
+    let cell = |p: &Point| [p.x, p.y, p.z].map(|c| (c / edge).floor() as i32);
+    let radius_mm = problem.surface.radius_mm() + problem.reading.subtract_mm;
+    let stride = tracks.len().div_ceil(MOST);
+    let touched: HashSet<[i32; 3]> = tracks
+        .iter()
+        .zip(finals)
+        .step_by(stride)
+        .filter(|(t, _)| t.used)
+        .map(|(t, f)| cell(&(f.centre - f.foot.normal * (t.distance_mm + radius_mm))))
+        .collect();
+    let sample = nominal.sample(20_000);
+    sample.iter().filter(|p| touched.contains(&cell(p))).count() as f64 / sample.len() as f64
+}
+
+/// Returns the deviations of all points, in the order given.
+pub(crate) fn deviations(
+    part: &Part,
+    tracks: &[Track],
+    finals: &[Final],
+    lever: &Lever,
+    verdict: &Verdict,
+    options: &Options,
+) -> Vec<Deviation> {
+    let to_scaled = lever.to_twist().try_inverse().unwrap_or_default();
+    let scaled = to_scaled * verdict.covariance * to_scaled.transpose();
+    let variance = verdict.residual_sigma_mm.powi(2);
+    let back_mm = if options.method == Method::Contact { 0.0 } else { options.probe_radius_mm };
+    let outline = part.nominal.outline();
+    tracks
+        .iter()
+        .zip(finals)
+        .map(|(track, f)| {
+            let point = f.centre - f.foot.normal * back_mm;
+            let beyond_outline = outline.is_some_and(|o| !o.contains(point.x, point.y));
+            let status = if beyond_outline { PointStatus::OffPart } else { track.status() };
+            Deviation {
+                point,
+                normal: f.foot.normal,
+                deviation_mm: track.distance_mm,
+                uncertainty_mm: (variance + f.row.dot(&(scaled * f.row)).max(0.0)).sqrt(),
+                status,
+            }
+        })
+        .collect()
+}

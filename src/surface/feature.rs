@@ -1,0 +1,151 @@
+//! What tells one place of a surface from another whatever its pose: how it bends.
+
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use rayon::prelude::*;
+
+use crate::geometry::{Point, Vector};
+
+use super::normals::fit;
+use super::offset::Side;
+use super::projection::principal_axes;
+
+/// A place of a surface with its normal and the way it bends there.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Feature {
+    pub(crate) point: Point,
+    pub(crate) normal: Vector,
+    /// Principal curvatures in 1/mm, the smaller first; positive where the surface bends towards its normal.
+    pub(crate) curvatures: [f64; 2],
+    /// Unit direction of the first principal curvature.
+    pub(crate) direction: Vector,
+}
+
+impl Feature {
+    /// Returns the difference of the principal curvatures.
+    pub(crate) fn anisotropy(&self) -> f64 {
+        self.curvatures[1] - self.curvatures[0]
+    }
+
+    /// Returns the same place seen from the other side of the surface.
+    pub(crate) fn turned_over(&self) -> Self {
+        Self {
+            point: self.point,
+            normal: -self.normal,
+            curvatures: [-self.curvatures[1], -self.curvatures[0]],
+            direction: self.normal.cross(&self.direction),
+        }
+    }
+
+    /// Returns the place on the offset surface, its normal towards that side; `None` where the offset folds.
+    ///
+    /// Equation: a normal curvature k towards the offset's side becomes k / (1 - r k); the directions stay.
+    pub(crate) fn offset(&self, radius_mm: f64, side: Side) -> Option<Self> {
+        let seen = if side == Side::Normal { *self } else { self.turned_over() };
+        let room = seen.curvatures.map(|k| 1.0 - radius_mm * k);
+        (room[0] > 0.0 && room[1] > 0.0).then(|| Self {
+            point: seen.point + seen.normal * radius_mm,
+            curvatures: [seen.curvatures[0] / room[0], seen.curvatures[1] / room[1]],
+            ..seen
+        })
+    }
+}
+
+/// Neighbours of a local fit.
+const NEIGHBOURS: std::num::NonZero<usize> = std::num::NonZero::new(25).expect("not zero");
+
+/// Fits the curvature at each of some scattered points; with their normals where these are known.
+///
+/// Neighbours that a first fit contradicts are left out of the second, so that an outlier spoils itself and not the places
+/// around it. Points whose own neighbours are not a surface are left out altogether.
+pub(crate) fn features(points: &[Point], normals: Option<&[Vector]>) -> Vec<Feature> {
+    let coordinates: Vec<[f64; 3]> = points.iter().map(|p| (*p).into()).collect();
+    let Ok(tree) = ImmutableKdTree::<f64, 3>::new_from_slice(&coordinates) else { return Vec::new() };
+    (0..points.len())
+        .into_par_iter()
+        .with_min_len(64)
+        .filter_map(|k| {
+            let nearest = tree.query(&coordinates[k]).nearest_n::<SquaredEuclidean<f64>>(NEIGHBOURS).execute();
+            let around: Vec<Point> =
+                nearest.iter().map(|n| points[n.item as usize]).filter(|p| *p != points[k]).collect();
+            feature(points[k], &around, normals.map(|n| n[k]))
+        })
+        .collect()
+}
+
+fn feature(at: Point, around: &[Point], known: Option<Vector>) -> Option<Feature> {
+    if around.len() < 9 {
+        return None;
+    }
+    let mean = known.unwrap_or_else(|| {
+        let (_, eigen) = principal_axes(around);
+        eigen.eigenvectors.column(eigen.eigenvalues.imin()).into()
+    });
+    let first = fit(at, mean, around.iter().copied());
+    let distance = |p: &Point| {
+        let d = p - at;
+        let slope = d - first.normal * d.dot(&first.normal);
+        let k = first.curvatures;
+        let (a, b) = (slope.dot(&first.direction), slope.dot(&first.normal.cross(&first.direction)));
+        (d.dot(&first.normal) - 0.5 * (k[0] * a * a + k[1] * b * b)).abs()
+    };
+    let mut residuals: Vec<f64> = around.iter().map(distance).collect();
+    let middle = residuals.len() / 2;
+    let median = *residuals.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let good = around.iter().filter(|p| distance(p) <= 6.0 * median).copied();
+    let second = fit(at, mean, good);
+    let finite = second.curvatures.iter().all(|k| k.is_finite()) && second.direction.iter().all(|c| c.is_finite());
+    finite.then_some(Feature {
+        point: at,
+        normal: known.unwrap_or(second.normal),
+        curvatures: second.curvatures,
+        direction: second.direction,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A saddle z = x^2/80 - y^2/50 sampled on a grid.
+    fn saddle() -> Vec<Point> {
+        (-15..=15)
+            .flat_map(|j| (-15..=15).map(move |i| (f64::from(i) * 0.7, f64::from(j) * 0.7)))
+            .map(|(x, y)| Point::new(x, y, x * x / 80.0 - y * y / 50.0))
+            .collect()
+    }
+
+    fn middle(features: &[Feature]) -> Feature {
+        *features.iter().find(|f| f.point.coords.norm() < 1e-9).unwrap()
+    }
+
+    #[test]
+    fn a_saddle_bends_as_it_should_and_seen_from_below_the_other_way() {
+        let points = saddle();
+        let f = middle(&features(&points, Some(&vec![Vector::z(); points.len()])));
+        assert!((f.curvatures[0] + 1.0 / 25.0).abs() < 1e-9 && (f.curvatures[1] - 1.0 / 40.0).abs() < 1e-9);
+        assert!(f.direction.y.abs() > 1.0 - 1e-9);
+        let below = f.turned_over();
+        assert!((below.curvatures[0] + 1.0 / 40.0).abs() < 1e-9 && below.direction.x.abs() > 1.0 - 1e-9);
+    }
+
+    #[test]
+    fn an_offset_bends_less_on_its_outer_side_and_ends_where_it_folds() {
+        let points = saddle();
+        let f = middle(&features(&points, Some(&vec![Vector::z(); points.len()])));
+        let up = f.offset(10.0, Side::Normal).unwrap();
+        assert!((1.0 / up.curvatures[1] - 30.0).abs() < 1e-6 && (1.0 / up.curvatures[0] + 35.0).abs() < 1e-6);
+        assert_eq!(f.offset(40.5, Side::Normal), None);
+        assert_eq!(f.offset(25.5, Side::Opposite), None);
+    }
+
+    #[test]
+    fn an_outlier_spoils_only_itself() {
+        let mut points = saddle();
+        let beside = points.iter().position(|p| (p.x - 0.7).abs() < 1e-9 && p.y.abs() < 1e-9).unwrap();
+        points[beside].z += 3.0;
+        let f = middle(&features(&points, None));
+        let mut k = f.curvatures.map(f64::abs);
+        k.sort_by(f64::total_cmp);
+        assert!((k[0] - 1.0 / 40.0).abs() < 2e-3 && (k[1] - 1.0 / 25.0).abs() < 2e-3, "{k:?}");
+    }
+}

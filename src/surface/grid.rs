@@ -1,0 +1,301 @@
+//! A grid of nodes as a surface: two triangles a cell, by arithmetic, without any triangulation.
+
+use rayon::prelude::*;
+
+use crate::geometry::grid::{GridOrder, NO_POINT};
+use crate::geometry::{Point, Vector};
+
+use super::patch::Facets;
+
+/// The triangles of a structured grid, row by row with the column fastest.
+///
+/// Facet 2c is the half of cell c at its lower right (nodes 00, 10, 11), facet 2c + 1 the half at its upper left (00, 11, 01).
+#[derive(Clone, Debug)]
+pub(crate) struct GridLattice {
+    columns: u32,
+    rows: u32,
+    /// Which nodes exist; empty when all do.
+    present: Vec<bool>,
+    /// Corner and nodes per millimetre of a grid that is regular in x and y, to begin a search near its end.
+    regular: Option<([f64; 2], [f64; 2])>,
+}
+
+/// Returns the points in grid order, NaN where a node has none.
+pub(crate) fn in_grid_order(points: Vec<Point>, order: &GridOrder) -> Vec<Point> {
+    if order.is_in_order() {
+        return points;
+    }
+    let hole = Point::new(f64::NAN, f64::NAN, f64::NAN);
+    order.point_at.par_iter().map(|&i| if i == NO_POINT { hole } else { points[i as usize] }).collect()
+}
+
+impl GridLattice {
+    /// Lays triangles over points that stand row by row, column fastest; NaN points are holes.
+    pub(crate) fn new(columns: usize, rows: usize, points: &[Point], regular_in_xy: bool) -> Self {
+        let holes = points.par_iter().any(|p| p.x.is_nan());
+        let present = if holes { points.iter().map(|p| p.x.is_finite()).collect() } else { Vec::new() };
+        let regular = regular_in_xy.then(|| {
+            let (low, high) = extremes(points);
+            let per_mm = |k: usize, n: usize| (n - 1) as f64 / (high[k] - low[k]);
+            (low, [per_mm(0, columns), per_mm(1, rows)])
+        });
+        Self { columns: columns as u32, rows: rows as u32, present, regular }
+    }
+
+    pub(crate) fn columns(&self) -> usize {
+        self.columns as usize
+    }
+
+    pub(crate) fn rows(&self) -> usize {
+        self.rows as usize
+    }
+
+    pub(crate) fn facet_count(&self) -> u32 {
+        2 * (self.columns - 1) * (self.rows - 1)
+    }
+
+    pub(crate) fn is_present(&self, node: usize) -> bool {
+        self.present.is_empty() || self.present[node]
+    }
+
+    fn cell_is_whole(&self, i: u32, j: u32) -> bool {
+        let node = (j * self.columns + i) as usize;
+        let above = node + self.columns as usize;
+        self.present.is_empty()
+            || (self.present[node] && self.present[node + 1] && self.present[above] && self.present[above + 1])
+    }
+
+    fn facet_at(&self, i: u32, j: u32, half: u32) -> u32 {
+        2 * (j * (self.columns - 1) + i) + half
+    }
+
+    fn cell_of(&self, facet: u32) -> (u32, u32) {
+        let cell = facet / 2;
+        (cell % (self.columns - 1), cell / (self.columns - 1))
+    }
+
+    /// Returns the cell at (u, v) steps from a cell, kept within the grid, and as far towards it as there are whole cells.
+    fn cell_towards(&self, (i, j): (u32, u32), u: f64, v: f64) -> Option<(u32, u32)> {
+        let clamp =
+            |from: u32, step: f64, cells: u32| (f64::from(from) + step).floor().clamp(0.0, f64::from(cells - 1));
+        let mut share = 1.0;
+        loop {
+            let target = (clamp(i, u * share, self.columns - 1) as u32, clamp(j, v * share, self.rows - 1) as u32);
+            if self.cell_is_whole(target.0, target.1) {
+                return Some(target);
+            }
+            if target == (i, j) || share < 1e-4 {
+                return None;
+            }
+            share *= 0.5;
+        }
+    }
+
+    /// Returns the whole cell nearest to a cell, by rings of growing size.
+    fn nearest_whole_cell(&self, i: u32, j: u32) -> (u32, u32) {
+        if self.cell_is_whole(i, j) {
+            return (i, j);
+        }
+        let (cells_i, cells_j) = (i64::from(self.columns - 1), i64::from(self.rows - 1));
+        let ring = |r: i64| {
+            let (i, j) = (i64::from(i), i64::from(j));
+            (-r..=r).flat_map(move |d| [(i + d, j - r), (i + d, j + r), (i - r, j + d), (i + r, j + d)])
+        };
+        (1..cells_i.max(cells_j))
+            .flat_map(ring)
+            .filter(|&(i, j)| (0..cells_i).contains(&i) && (0..cells_j).contains(&j))
+            .map(|(i, j)| (i as u32, j as u32))
+            .find(|&(i, j)| self.cell_is_whole(i, j))
+            .unwrap_or((0, 0))
+    }
+}
+
+impl Facets for GridLattice {
+    #[inline]
+    fn corners(&self, facet: u32) -> [u32; 3] {
+        let (i, j) = self.cell_of(facet);
+        let node = j * self.columns + i;
+        let far = node + self.columns + 1;
+        if facet & 1 == 0 { [node, node + 1, far] } else { [node, far, far - 1] }
+    }
+
+    /// Jumps straight to the cell that the affine continuation of this one points at.
+    #[inline]
+    fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32> {
+        let (u, v) =
+            if facet & 1 == 0 { (weights[1] + weights[2], weights[2]) } else { (weights[1], weights[1] + weights[2]) };
+        let here = self.cell_of(facet);
+        let cell = self.cell_towards(here, u, v)?;
+        let (du, dv) = (u + f64::from(here.0) - f64::from(cell.0), v + f64::from(here.1) - f64::from(cell.1));
+        let next = self.facet_at(cell.0, cell.1, u32::from(dv > du));
+        (next != facet).then_some(next)
+    }
+
+    fn start(&self, p: &Point) -> u32 {
+        let cell = |at: f64, cells: u32| at.clamp(0.0, f64::from(cells - 1)) as u32;
+        let (i, j) = match &self.regular {
+            Some((first, per_mm)) => (
+                cell((p.x - first[0]) * per_mm[0], self.columns - 1),
+                cell((p.y - first[1]) * per_mm[1], self.rows - 1),
+            ),
+            None => ((self.columns - 1) / 2, (self.rows - 1) / 2),
+        };
+        let (i, j) = self.nearest_whole_cell(i, j);
+        self.facet_at(i, j, 0)
+    }
+}
+
+fn extremes(points: &[Point]) -> ([f64; 2], [f64; 2]) {
+    let merge = |a: ([f64; 2], [f64; 2]), b: ([f64; 2], [f64; 2])| {
+        ([a.0[0].min(b.0[0]), a.0[1].min(b.0[1])], [a.1[0].max(b.1[0]), a.1[1].max(b.1[1])])
+    };
+    let none = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
+    points.par_iter().map(|p| ([p.x, p.y], [p.x, p.y])).reduce(|| none, merge)
+}
+
+/// Weights of the first derivative at each place of a window of equally spaced nodes, for windows of 2 to 5 nodes.
+///
+/// Each row differentiates the polynomial through its window exactly: five nodes a quartic, so that a bi-cubic patch of
+/// surface has its exact normal at every node, at the border too.
+#[rustfmt::skip]
+const DERIVATIVES: [&[&[f64]]; 6] = [
+    &[],
+    &[],
+    &[&[-1.0, 1.0], &[-1.0, 1.0]],
+    &[&[-1.5, 2.0, -0.5], &[-0.5, 0.0, 0.5], &[0.5, -2.0, 1.5]],
+    &[
+        &[-11.0 / 6.0, 3.0, -1.5, 1.0 / 3.0], &[-1.0 / 3.0, -0.5, 1.0, -1.0 / 6.0],
+        &[1.0 / 6.0, -1.0, 0.5, 1.0 / 3.0], &[-1.0 / 3.0, 1.5, -3.0, 11.0 / 6.0],
+    ],
+    &[
+        &[-25.0 / 12.0, 4.0, -3.0, 4.0 / 3.0, -0.25], &[-0.25, -5.0 / 6.0, 1.5, -0.5, 1.0 / 12.0],
+        &[1.0 / 12.0, -2.0 / 3.0, 0.0, 2.0 / 3.0, -1.0 / 12.0], &[-1.0 / 12.0, 0.5, -1.5, 5.0 / 6.0, 0.25],
+        &[0.25, -4.0 / 3.0, 3.0, -4.0, 25.0 / 12.0],
+    ],
+];
+
+/// Fits the unit normals of a structured grid, on the side where column x row is right-handed.
+///
+/// Shapes: one normal a node, in grid order; NaN at holes and at nodes that have no neighbour along one of the two lines.
+/// Equation: the tangents are the derivatives of the bi-quartic through five nodes along each grid line, central inside and
+/// one-sided at the border; the normal is their cross product.
+pub(crate) fn grid_normals(points: &[Point], lattice: &GridLattice) -> Vec<Vector> {
+    let columns = lattice.columns();
+    let mut normals = vec![Vector::zeros(); points.len()];
+    normals.par_chunks_mut(columns).enumerate().for_each(|(j, row)| {
+        let inner = (2..lattice.rows() - 2.min(lattice.rows())).contains(&j) && lattice.present.is_empty();
+        for (i, normal) in row.iter_mut().enumerate() {
+            let node = j * columns + i;
+            let inner = inner && i >= 2 && i + 2 < columns;
+            let [u, v] = if inner {
+                [central_derivative(points, node, 1), central_derivative(points, node, columns)]
+            } else {
+                [
+                    line_derivative(points, lattice, node, 1, i, columns),
+                    line_derivative(points, lattice, node, columns, j, lattice.rows()),
+                ]
+            };
+            let n = u.cross(&v);
+            *normal = n / n.norm();
+        }
+    });
+    normals
+}
+
+/// The derivative of the quartic through five nodes at the middle one.
+#[inline]
+fn central_derivative(points: &[Point], node: usize, stride: usize) -> Vector {
+    let near = points[node + stride] - points[node - stride];
+    let far = points[node + 2 * stride] - points[node - 2 * stride];
+    near * (2.0 / 3.0) - far * (1.0 / 12.0)
+}
+
+/// The derivative along one grid line at its `at`-th node of `count`, from the window of present nodes around it.
+fn line_derivative(
+    points: &[Point],
+    lattice: &GridLattice,
+    node: usize,
+    stride: usize,
+    at: usize,
+    count: usize,
+) -> Vector {
+    let nan = Vector::repeat(f64::NAN);
+    if !lattice.is_present(node) {
+        return nan;
+    }
+    let before = (1..=at.min(4)).take_while(|k| lattice.is_present(node - k * stride)).count();
+    let after = (1..=(count - 1 - at).min(4)).take_while(|k| lattice.is_present(node + k * stride)).count();
+    let width = (before + after + 1).min(5);
+    if width < 2 {
+        return nan;
+    }
+    let first = before.min(2.max((width - 1).saturating_sub(after)));
+    let weights = DERIVATIVES[width][first];
+    let start = node - first * stride;
+    weights.iter().enumerate().map(|(k, w)| points[start + k * stride].coords * *w).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn lattice(columns: usize, rows: usize, z: impl Fn(f64, f64) -> f64) -> (Vec<Point>, GridLattice) {
+        let points: Vec<_> = (0..rows)
+            .flat_map(|j| (0..columns).map(move |i| (i as f64 * 0.5 - 2.0, j as f64 * 0.25 + 1.0)))
+            .map(|(x, y)| Point::new(x, y, z(x, y)))
+            .collect();
+        let lattice = GridLattice::new(columns, rows, &points, true);
+        (points, lattice)
+    }
+
+    #[test]
+    fn normals_of_a_bi_cubic_are_exact_to_the_border() {
+        let z = |x: f64, y: f64| 0.01 * x * x * x * y * y * y - 0.2 * x * y * y + 0.3 * x;
+        let gradient =
+            |x: f64, y: f64| [0.03 * x * x * y.powi(3) - 0.2 * y * y + 0.3, 0.03 * x.powi(3) * y * y - 0.4 * x * y];
+        for (columns, rows) in [(9, 8), (5, 5), (6, 12)] {
+            let (points, lattice) = lattice(columns, rows, z);
+            for (p, n) in points.iter().zip(grid_normals(&points, &lattice)) {
+                let [a, b] = gradient(p.x, p.y);
+                assert!((n - Vector::new(-a, -b, 1.0).normalize()).norm() < 1e-13, "{p} {n}");
+            }
+        }
+    }
+
+    #[test]
+    fn short_lines_and_holes_fall_back_to_the_nodes_there_are() {
+        let (mut points, _) = lattice(7, 4, |x, y| 0.3 * x - 0.1 * y);
+        points[9] = Point::new(f64::NAN, f64::NAN, f64::NAN);
+        let lattice = GridLattice::new(7, 4, &points, true);
+        let expected = Vector::new(-0.3, 0.1, 1.0).normalize();
+        for (node, n) in grid_normals(&points, &lattice).iter().enumerate() {
+            // Node 2 lies in no whole cell: the node above it is the hole.
+            if node == 9 || node == 2 {
+                assert!(n.x.is_nan());
+            } else {
+                assert!((n - expected).norm() < 1e-14, "node {node}: {n}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_jump_lands_in_the_cell_pointed_at_and_stops_at_the_edge() {
+        let (_, lattice) = lattice(9, 8, |_, _| 0.0);
+        let from = lattice.facet_at(1, 1, 0);
+        // u = 3.6, v = 2.2 from the lower left of cell (1, 1): cell (4, 3), the half at its lower right.
+        assert_eq!(lattice.advance(from, &[1.0 - 3.6, 3.6 - 2.2, 2.2]), Some(lattice.facet_at(4, 3, 0)));
+        let corner = lattice.facet_at(7, 6, 0);
+        assert_eq!(lattice.advance(corner, &[-4.0, 3.0, 2.0]), None);
+    }
+
+    #[test]
+    fn a_search_begins_at_a_whole_cell() {
+        let (mut points, _) = lattice(9, 8, |_, _| 0.0);
+        for node in 0..4 * 9 {
+            points[node] = Point::new(f64::NAN, f64::NAN, f64::NAN);
+        }
+        let lattice = GridLattice::new(9, 8, &points, true);
+        let facet = lattice.start(&Point::new(-2.0, 1.0, 0.0));
+        assert!(lattice.corners(facet).iter().all(|&c| lattice.is_present(c as usize)));
+    }
+}

@@ -1,0 +1,210 @@
+//! Triangles in flat arrays: corners, neighbours, and a way round a vertex.
+
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+
+use crate::geometry::{Point, Vector};
+
+use super::SurfaceError;
+use super::patch::Facets;
+
+/// No neighbour: the surface ends at this edge.
+pub(crate) const BORDER: u32 = u32::MAX;
+
+/// At most this many facets are entered in the tree that a search without a past begins from.
+const STARTS: usize = 1 << 16;
+
+/// A triangle mesh whose facets know their neighbours.
+#[derive(Debug)]
+pub(crate) struct MeshLattice {
+    corners: Vec<[u32; 3]>,
+    /// Across the edge opposite to corner k; [`BORDER`] where there is none.
+    neighbours: Vec<[u32; 3]>,
+    /// One facet at each vertex, the first one counter-clockwise where the vertex lies on the border.
+    facet_of: Vec<u32>,
+    starts: ImmutableKdTree<f64, 3>,
+    start_facets: Vec<u32>,
+}
+
+impl MeshLattice {
+    /// Joins triangles edge to edge.
+    ///
+    /// # Errors
+    /// An index out of range, an edge shared by three triangles, neighbours of opposite orientation, no triangle at all.
+    pub(crate) fn new(points: &[Point], corners: Vec<[u32; 3]>) -> Result<Self, SurfaceError> {
+        if corners.is_empty() {
+            return Err(SurfaceError::NoTriangles);
+        }
+        if let Some(&vertex) = corners.iter().flatten().find(|&&c| c as usize >= points.len()) {
+            return Err(SurfaceError::VertexOutOfRange { vertex, points: points.len() });
+        }
+        let neighbours = neighbours(&corners, points)?;
+        Self::from_parts(points, corners, neighbours)
+    }
+
+    /// Takes over triangles whose neighbours are known.
+    pub(crate) fn from_parts(
+        points: &[Point],
+        corners: Vec<[u32; 3]>,
+        neighbours: Vec<[u32; 3]>,
+    ) -> Result<Self, SurfaceError> {
+        if corners.is_empty() {
+            return Err(SurfaceError::NoTriangles);
+        }
+        let facet_of = first_facets(points.len(), &corners, &neighbours);
+        let stride = corners.len().div_ceil(STARTS);
+        let start_facets: Vec<u32> = (0..corners.len() as u32).step_by(stride).collect();
+        let centres: Vec<[f64; 3]> = start_facets
+            .iter()
+            .map(|&f| {
+                let sum: Vector = corners[f as usize].iter().map(|&c| points[c as usize].coords).sum();
+                (sum / 3.0).into()
+            })
+            .collect();
+        let starts = ImmutableKdTree::new_from_slice(&centres).map_err(|_| SurfaceError::NoTriangles)?;
+        Ok(Self { corners, neighbours, facet_of, starts, start_facets })
+    }
+
+    pub(crate) fn facet_count(&self) -> u32 {
+        self.corners.len() as u32
+    }
+
+    /// Calls `visit` with each facet around a vertex and the place of the vertex in it, counter-clockwise.
+    pub(crate) fn around(&self, vertex: u32, mut visit: impl FnMut(u32, usize)) {
+        let first = self.facet_of[vertex as usize];
+        let mut facet = first;
+        // A fan is finite, but a mesh from a file may close on itself in strange ways.
+        for _ in 0..1024 {
+            if facet == BORDER {
+                return;
+            }
+            let Some(k) = self.corners[facet as usize].iter().position(|&c| c == vertex) else { return };
+            visit(facet, k);
+            // Counter-clockwise round corner k lies the edge from k to k + 2, opposite to corner k + 1.
+            facet = self.neighbours[facet as usize][(k + 1) % 3];
+            if facet == first {
+                return;
+            }
+        }
+    }
+}
+
+impl Facets for MeshLattice {
+    #[inline]
+    fn corners(&self, facet: u32) -> [u32; 3] {
+        self.corners[facet as usize]
+    }
+
+    /// Crosses the edge that the point lies farthest beyond, of those that can be crossed.
+    #[inline]
+    fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32> {
+        let across = &self.neighbours[facet as usize];
+        (0..3)
+            .filter(|&k| weights[k] < 0.0 && across[k] != BORDER)
+            .min_by(|&a, &b| weights[a].total_cmp(&weights[b]))
+            .map(|k| across[k])
+    }
+
+    fn start(&self, p: &Point) -> u32 {
+        let nearest = self.starts.query(&[p.x, p.y, p.z]).nearest_one::<SquaredEuclidean<f64>>().execute();
+        self.start_facets[nearest.item as usize]
+    }
+}
+
+/// Finds the facet across each edge by sorting the edges.
+fn neighbours(corners: &[[u32; 3]], points: &[Point]) -> Result<Vec<[u32; 3]>, SurfaceError> {
+    let mut edges: Vec<(u32, u32, u32)> = Vec::with_capacity(3 * corners.len());
+    for (facet, c) in corners.iter().enumerate() {
+        for k in 0..3 {
+            let (a, b) = (c[(k + 1) % 3], c[(k + 2) % 3]);
+            edges.push((a.min(b), a.max(b), (facet * 3 + k) as u32));
+        }
+    }
+    rayon::slice::ParallelSliceMut::par_sort_unstable(edges.as_mut_slice());
+    let mut neighbours = vec![[BORDER; 3]; corners.len()];
+    for shared in edges.chunk_by(|a, b| (a.0, a.1) == (b.0, b.1)) {
+        let at = points[shared[0].0 as usize];
+        match shared {
+            [_] => {}
+            [(.., e), (.., f)] => {
+                let [(fe, ke), (ff, kf)] = [e, f].map(|e| ((e / 3) as usize, (e % 3) as usize));
+                if corners[fe][(ke + 1) % 3] == corners[ff][(kf + 1) % 3] {
+                    return Err(SurfaceError::Orientation { at: at.into() });
+                }
+                neighbours[fe][ke] = ff as u32;
+                neighbours[ff][kf] = fe as u32;
+            }
+            more => return Err(SurfaceError::NonManifold { at: at.into(), triangles: more.len() }),
+        }
+    }
+    Ok(neighbours)
+}
+
+/// One facet at each vertex; at a border the one from which going counter-clockwise meets all the others.
+fn first_facets(vertices: usize, corners: &[[u32; 3]], neighbours: &[[u32; 3]]) -> Vec<u32> {
+    let mut first = vec![BORDER; vertices];
+    for (facet, c) in corners.iter().enumerate() {
+        for k in 0..3 {
+            // Clockwise of this facet round corner k lies the edge opposite to corner k + 2.
+            let at_border = neighbours[facet][(k + 2) % 3] == BORDER;
+            if first[c[k] as usize] == BORDER || at_border {
+                first[c[k] as usize] = facet as u32;
+            }
+        }
+    }
+    first
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A square of four points and its centre, as a fan.
+    fn fan() -> (Vec<Point>, Vec<[u32; 3]>) {
+        let points = [[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0], [1.0, 1.0]].map(|[x, y]| Point::new(x, y, 0.0));
+        (points.to_vec(), vec![[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    }
+
+    #[test]
+    fn neighbours_lie_across_the_opposite_edge() {
+        let (points, corners) = fan();
+        let mesh = MeshLattice::new(&points, corners).unwrap();
+        assert_eq!(mesh.neighbours[0], [1, 3, BORDER]);
+        assert_eq!(mesh.neighbours[2], [3, 1, BORDER]);
+    }
+
+    #[test]
+    fn the_way_round_a_vertex_meets_every_facet_inside_and_at_the_border() {
+        let (points, corners) = fan();
+        let mesh = MeshLattice::new(&points, corners).unwrap();
+        let met = |vertex| {
+            let mut facets = Vec::new();
+            mesh.around(vertex, |f, _| facets.push(f));
+            facets.sort_unstable();
+            facets
+        };
+        assert_eq!(met(4), [0, 1, 2, 3]);
+        assert_eq!(met(0), [0, 3]);
+        assert_eq!(met(2), [1, 2]);
+    }
+
+    #[test]
+    fn a_walk_crosses_the_worst_edge_and_stops_at_the_border() {
+        let (points, corners) = fan();
+        let mesh = MeshLattice::new(&points, corners).unwrap();
+        assert_eq!(mesh.advance(0, &[-0.5, 0.9, 0.6]), Some(1));
+        assert_eq!(mesh.advance(0, &[-0.2, -0.5, 1.7]), Some(3));
+        assert_eq!(mesh.advance(0, &[0.6, 0.6, -0.2]), None);
+    }
+
+    #[test]
+    fn meshes_that_are_no_surface_are_refused() {
+        let (points, mut corners) = fan();
+        corners[1] = [2, 1, 4];
+        assert!(matches!(MeshLattice::new(&points, corners.clone()), Err(SurfaceError::Orientation { .. })));
+        corners[1] = [0, 1, 4];
+        corners[2] = [1, 0, 4];
+        assert!(matches!(MeshLattice::new(&points, corners), Err(SurfaceError::NonManifold { .. })));
+        assert!(matches!(MeshLattice::new(&points, vec![[0, 1, 9]]), Err(SurfaceError::VertexOutOfRange { .. })));
+        assert!(matches!(MeshLattice::new(&points, Vec::new()), Err(SurfaceError::NoTriangles)));
+    }
+}

@@ -1,0 +1,256 @@
+//! Normals of scattered points: a local cubic through each vertex, fitted to its neighbours in the triangulation.
+
+use nalgebra::{SMatrix, SVector};
+
+use crate::geometry::{Point, Vector};
+
+use super::mesh::MeshLattice;
+use super::patch::Facets;
+
+/// How many neighbours a fit asks for: nine unknowns, and enough to spare for one-sided places.
+pub(crate) const NEIGHBOURS: usize = 24;
+
+/// Most neighbours a fit takes in.
+const MOST: usize = 64;
+
+/// A pivot this much smaller than the first marks neighbours that do not determine the cubic.
+const WEAK_PIVOT: f64 = 1e-9;
+
+/// What a local fit finds out about the surface at a vertex.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct LocalFit {
+    /// Unit normal on the side from which the triangles turn counter-clockwise.
+    pub(crate) normal: Vector,
+    /// Principal curvatures in 1/mm, the smaller first; positive where the surface bends towards its normal (a bowl).
+    pub(crate) curvatures: [f64; 2],
+    /// Direction of the first principal curvature.
+    pub(crate) direction: Vector,
+}
+
+/// Fits w = p u + q v + cubic terms through a vertex, by weighted least squares over its rings of neighbours.
+///
+/// Frame: the mean normal of the facets around the vertex and two tangents. Weights fall with distance as
+/// 1/(1 + (s/h)^2) with h the mean distance, so that a far neighbour of an uneven ring bends the fit less. Neighbours that do
+/// not determine a cubic (a border, a line) get a quadric, then a plane.
+pub(crate) fn fit_to_ring(points: &[Point], mesh: &MeshLattice, vertex: u32, wanted: usize) -> LocalFit {
+    let mut ring = [0u32; MOST];
+    let found = neighbours(mesh, vertex, wanted, &mut ring);
+    let mean = mean_facet_normal(points, mesh, vertex);
+    fit(points[vertex as usize], mean, ring[..found].iter().map(|&i| points[i as usize]))
+}
+
+/// The fit of [`fit_to_ring`] for neighbours found by other means, about an approximate normal.
+pub(crate) fn fit(at: Point, mean: Vector, neighbours: impl Iterator<Item = Point>) -> LocalFit {
+    let [tu, tv] = tangents(&mean);
+    let mut local = [[0.0; 3]; MOST];
+    let mut count = 0;
+    let mut spread = 0.0;
+    for p in neighbours.take(MOST) {
+        let d = p - at;
+        local[count] = [d.dot(&tu), d.dot(&tv), d.dot(&mean)];
+        spread += (local[count][0].powi(2) + local[count][1].powi(2)).sqrt();
+        count += 1;
+    }
+    let h = spread / count.max(1) as f64;
+    let local = &mut local[..count];
+    for c in local.iter_mut().flatten() {
+        *c /= h;
+    }
+    let solved = solve::<9>(local).or_else(|| solve::<5>(local)).or_else(|| solve::<2>(local));
+    let c = solved.unwrap_or([0.0; 9]);
+    LocalFit::new(&mean, &tu, &tv, &[c[0], c[1], c[2] / h, c[3] / h, c[4] / h])
+}
+
+impl LocalFit {
+    /// Reads normal and curvature off w = p u + q v + a u^2 + b uv + c v^2.
+    fn new(mean: &Vector, tu: &Vector, tv: &Vector, [p, q, a, b, c]: &[f64; 5]) -> Self {
+        let root = (1.0 + p * p + q * q).sqrt();
+        let normal = (mean - tu * *p - tv * *q) / root;
+        // First and second fundamental forms; the shape operator's eigenvalues are the principal curvatures.
+        let (e, f, g) = (1.0 + p * p, p * q, 1.0 + q * q);
+        let (l, m, n) = (2.0 * a / root, b / root, 2.0 * c / root);
+        let det = e * g - f * f;
+        let mean_curvature = (e * n - 2.0 * f * m + g * l) / (2.0 * det);
+        let gauss = (l * n - m * m) / det;
+        let half = (mean_curvature * mean_curvature - gauss).max(0.0).sqrt();
+        let k = mean_curvature - half;
+        let (x, y) = null_direction(l - k * e, m - k * f, n - k * g);
+        let along = (tu + mean * *p) * x + (tv + mean * *q) * y;
+        Self { normal, curvatures: [k, mean_curvature + half], direction: along.normalize() }
+    }
+}
+
+/// Returns the direction (x, y) that the symmetric singular matrix [[a, b], [b, c]] sends to nothing.
+fn null_direction(a: f64, b: f64, c: f64) -> (f64, f64) {
+    let (x, y) = if a.abs() > c.abs() { (-b, a) } else { (c, -b) };
+    let norm = x.hypot(y);
+    if norm > 0.0 { (x / norm, y / norm) } else { (1.0, 0.0) }
+}
+
+/// Two unit vectors at right angles to a unit vector and to each other, right-handed.
+pub(crate) fn tangents(n: &Vector) -> [Vector; 2] {
+    let axis = if n.x.abs() < 0.6 { Vector::x() } else { Vector::y() };
+    let tu = (axis - n * n.dot(&axis)).normalize();
+    [tu, n.cross(&tu)]
+}
+
+/// Solves the weighted normal equations of the first N monomials; `None` where the neighbours do not determine them.
+fn solve<const N: usize>(local: &[[f64; 3]]) -> Option<[f64; 9]> {
+    if local.len() < N {
+        return None;
+    }
+    let mut gram = SMatrix::<f64, N, N>::zeros();
+    let mut right = SVector::<f64, N>::zeros();
+    for &[u, v, w] in local {
+        let weight = 1.0 / (1.0 + u * u + v * v);
+        let terms = [u, v, u * u, u * v, v * v, u * u * u, u * u * v, u * v * v, v * v * v];
+        for i in 0..N {
+            let scaled = weight * terms[i];
+            for j in 0..=i {
+                gram[(i, j)] += scaled * terms[j];
+            }
+            right[i] += scaled * w;
+        }
+    }
+    let scale = (0..N).map(|i| gram[(i, i)]).fold(0.0, f64::max);
+    let factor = cholesky(gram, WEAK_PIVOT * scale)?;
+    let mut solution = [0.0; 9];
+    solution[..N].copy_from_slice(substitute(&factor, right).as_slice());
+    Some(solution)
+}
+
+/// The lower factor of a symmetric matrix given by its lower half; `None` at a pivot below the limit.
+#[inline]
+fn cholesky<const N: usize>(mut m: SMatrix<f64, N, N>, least_pivot: f64) -> Option<SMatrix<f64, N, N>> {
+    for j in 0..N {
+        for i in j..N {
+            let mut sum = m[(i, j)];
+            for k in 0..j {
+                sum -= m[(i, k)] * m[(j, k)];
+            }
+            if i == j {
+                // Written so that NaN is refused too.
+                if !(sum > least_pivot) {
+                    return None;
+                }
+                m[(j, j)] = sum.sqrt();
+            } else {
+                m[(i, j)] = sum / m[(j, j)];
+            }
+        }
+    }
+    Some(m)
+}
+
+fn substitute<const N: usize>(l: &SMatrix<f64, N, N>, mut x: SVector<f64, N>) -> SVector<f64, N> {
+    for i in 0..N {
+        for k in 0..i {
+            x[i] -= l[(i, k)] * x[k];
+        }
+        x[i] /= l[(i, i)];
+    }
+    for i in (0..N).rev() {
+        for k in i + 1..N {
+            x[i] -= l[(k, i)] * x[k];
+        }
+        x[i] /= l[(i, i)];
+    }
+    x
+}
+
+/// Collects rings of neighbours round a vertex until there are as many as wanted; returns how many.
+fn neighbours(mesh: &MeshLattice, vertex: u32, wanted: usize, ring: &mut [u32; MOST]) -> usize {
+    let mut count = 0;
+    let mut begin = 0;
+    let mut add = |ring: &mut [u32; MOST], count: &mut usize, candidate: u32| {
+        if candidate != vertex && *count < MOST && !ring[..*count].contains(&candidate) {
+            ring[*count] = candidate;
+            *count += 1;
+        }
+    };
+    let collect =
+        |of: u32, ring: &mut [u32; MOST], count: &mut usize, add: &mut dyn FnMut(&mut [u32; MOST], &mut usize, u32)| {
+            mesh.around(of, |facet, k| {
+                let corners = mesh.corners(facet);
+                add(ring, count, corners[(k + 1) % 3]);
+                add(ring, count, corners[(k + 2) % 3]);
+            });
+        };
+    collect(vertex, ring, &mut count, &mut add);
+    while count < wanted && begin < count {
+        let end = count;
+        for k in begin..end {
+            collect(ring[k], ring, &mut count, &mut add);
+        }
+        begin = end;
+    }
+    count
+}
+
+/// The unit mean of the normals of the facets round a vertex, each counted by its area.
+fn mean_facet_normal(points: &[Point], mesh: &MeshLattice, vertex: u32) -> Vector {
+    let mut sum = Vector::zeros();
+    mesh.around(vertex, |facet, _| {
+        let [a, b, c] = mesh.corners(facet).map(|i| points[i as usize]);
+        sum += (b - a).cross(&(c - a));
+    });
+    let norm = sum.norm();
+    if norm > 0.0 && norm.is_finite() { sum / norm } else { Vector::z() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn around(at: Point, z: impl Fn(f64, f64) -> f64, count: usize) -> Vec<Point> {
+        (0..count)
+            .map(|k| {
+                let (r, phi) = (0.3 + 0.05 * k as f64, 2.399_963 * k as f64);
+                let (x, y) = (at.x + r * phi.cos(), at.y + r * phi.sin());
+                Point::new(x, y, z(x, y))
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_cubic_is_fitted_exactly_whatever_the_frame_leans() {
+        let z = |x: f64, y: f64| 0.4 * x - 0.2 * y + 0.05 * x * x - 0.02 * x * y + 0.01 * y * y * y;
+        let at = Point::new(1.0, 2.0, z(1.0, 2.0));
+        let exact = Vector::new(-(0.4 + 0.1 - 0.04), -(-0.2 - 0.02 + 0.12), 1.0).normalize();
+        let fitted = fit(at, Vector::z(), around(at, z, 24).into_iter());
+        assert!((fitted.normal - exact).norm() < 1e-12, "{}", fitted.normal);
+    }
+
+    #[test]
+    fn a_bowl_has_the_curvature_of_its_sphere_towards_the_normal() {
+        let radius = 40.0f64;
+        let z = |x: f64, y: f64| radius - (radius * radius - x * x - y * y).sqrt();
+        let at = Point::new(6.0, -3.0, z(6.0, -3.0));
+        let fitted = fit(at, Vector::z(), around(at, z, 24).into_iter());
+        for k in fitted.curvatures {
+            assert!((k - 1.0 / radius).abs() < 2e-5, "{k}");
+        }
+        assert!((fitted.normal - Vector::new(-6.0, 3.0, radius - at.z) / radius).norm() < 1e-5);
+    }
+
+    #[test]
+    fn the_first_direction_of_a_cylinder_is_its_axis_when_it_bulges_towards_the_normal_least() {
+        // A gutter along x: it bends towards +z in y (curvature 1/20) and not at all in x.
+        let z = |_x: f64, y: f64| y * y / 40.0;
+        let fitted = fit(Point::origin(), Vector::z(), around(Point::origin(), z, 24).into_iter());
+        assert!(fitted.curvatures[0].abs() < 1e-12 && (fitted.curvatures[1] - 0.05).abs() < 1e-12);
+        assert!(fitted.direction.x.abs() > 1.0 - 1e-12);
+    }
+
+    #[test]
+    fn neighbours_that_do_not_determine_a_cubic_get_less() {
+        // Points on a line: not even a plane; the mean normal stands.
+        let line = (1..30).map(|k| Point::new(f64::from(k) * 0.1, 0.0, 0.0));
+        assert_eq!(fit(Point::origin(), Vector::z(), line).normal, Vector::z());
+        // Six points: a quadric.
+        let z = |x: f64, y: f64| 0.1 * x + 0.02 * x * y;
+        let few = fit(Point::origin(), Vector::z(), around(Point::origin(), z, 6).into_iter());
+        assert!((few.normal - Vector::new(-0.1, 0.0, 1.0).normalize()).norm() < 1e-12);
+        assert_eq!(fit(Point::origin(), Vector::z(), std::iter::empty()).normal, Vector::z());
+    }
+}

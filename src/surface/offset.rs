@@ -1,0 +1,347 @@
+//! The surface on which the centre of a probe travels, and the signed distance of a point from it.
+//!
+//! A corner of a facet is offset along its normal, S_e = S + r n, eq. (3). The flat distance is that of the paper,
+//! eq. (1) and (2). The curved distance knows that the surface bulges between its corners: with barycentric weights b and the
+//! slope of the surface along each edge at each of its ends, the height over the flat facet is the cubic
+//!
+//! ```text
+//! h(b) = sum over i != j of g_ij b_i^2 b_j + 1/2 b_0 b_1 b_2 sum over i != j of g_ij,   g_ij = -n_i.(p_j - p_i) / n_i.N
+//! ```
+//!
+//! which is the cubic triangle with quadratic precision (Vlachos et al., Curved PN triangles, 2001) written as a height.
+
+use crate::geometry::{Point, Vector};
+
+use super::patch::{Facets, Lattice, Patch};
+use super::{Nominal, SurfaceError};
+
+/// How the surface runs between the corners of a facet.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Distance {
+    /// As the cubic that its corners and normals define.
+    #[default]
+    Curved,
+    /// Flat, eq. (2).
+    Triangle,
+}
+
+/// Which facet a point belongs to.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Lookup {
+    /// The one that holds the foot of its perpendicular.
+    #[default]
+    Foot,
+    /// The one above or below which it lies along z, as in section 2.1 of the paper.
+    Projection,
+}
+
+/// On which side of the nominal surface the probe travels.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Side {
+    /// Where the normals of the nominal surface point: +z for a height over the plane, outwards for a mesh.
+    #[default]
+    Normal,
+    /// The other one.
+    Opposite,
+}
+
+impl Side {
+    /// Returns +1 on the side of the normals and -1 on the other.
+    pub fn sign(self) -> f64 {
+        match self {
+            Self::Normal => 1.0,
+            Self::Opposite => -1.0,
+        }
+    }
+
+    /// Returns the other side.
+    pub fn other(self) -> Self {
+        match self {
+            Self::Normal => Self::Opposite,
+            Self::Opposite => Self::Normal,
+        }
+    }
+}
+
+/// The offset of a nominal surface: a view that holds no points of its own.
+#[derive(Clone, Copy, Debug)]
+pub struct OffsetSurface<'a> {
+    nominal: &'a Nominal,
+    /// Distance from the nominal surface along the outward normal, in millimetres.
+    radius_mm: f64,
+    side: Side,
+    distance: Distance,
+    lookup: Lookup,
+}
+
+/// Where a search for a foot begins: the facet where the last one ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Place {
+    patch: u32,
+    facet: u32,
+}
+
+impl Place {
+    /// Nothing known yet.
+    pub const UNKNOWN: Self = Self { patch: 0, facet: u32::MAX };
+
+    pub(crate) fn patch(self) -> u32 {
+        self.patch
+    }
+
+    pub(crate) fn facet(self) -> u32 {
+        self.facet
+    }
+}
+
+/// The foot of a point on the offset surface.
+#[derive(Clone, Copy, Debug)]
+pub struct Foot {
+    /// The facet that holds it.
+    pub place: Place,
+    /// Signed distance of the point from the offset surface, in millimetres; positive on the probe's side.
+    pub distance_mm: f64,
+    /// Unit normal at the foot, towards the probe's side.
+    pub normal: Vector,
+    /// How far the foot lies beyond the edge of the surface, in millimetres; 0 on the part.
+    pub beyond_mm: f64,
+    /// Length that counts as one step of the nominal sampling here, in millimetres.
+    pub spacing_mm: f64,
+}
+
+/// A foot this many steps of the sampling beyond the edge is still on the part: the curved facet continues that far.
+const EDGE_REACH: f64 = 0.5;
+
+/// Steps after which a search gives up and takes the facet it is at: far more than any search that converges needs.
+const MOST_STEPS: usize = 4096;
+
+/// Weights that far below zero count as inside.
+const INSIDE: f64 = -1e-10;
+
+impl<'a> OffsetSurface<'a> {
+    /// Offsets a nominal surface by a probe radius.
+    ///
+    /// Units: millimetres. A radius of 0 is the nominal surface itself.
+    ///
+    /// # Errors
+    /// A radius that is negative or not finite.
+    pub fn new(nominal: &'a Nominal, radius_mm: f64, side: Side) -> Result<Self, SurfaceError> {
+        if !(radius_mm >= 0.0 && radius_mm.is_finite()) {
+            return Err(SurfaceError::ProbeRadius { radius_mm });
+        }
+        Ok(Self { nominal, radius_mm, side, distance: Distance::default(), lookup: Lookup::default() })
+    }
+
+    /// Chooses how the surface runs between the corners.
+    pub fn with_distance(self, distance: Distance) -> Self {
+        Self { distance, ..self }
+    }
+
+    /// Chooses which facet a point belongs to.
+    pub fn with_lookup(self, lookup: Lookup) -> Self {
+        Self { lookup, ..self }
+    }
+
+    /// Chooses the side of the nominal surface.
+    pub fn with_side(self, side: Side) -> Self {
+        Self { side, ..self }
+    }
+
+    /// Returns the nominal surface that is offset.
+    pub fn nominal(&self) -> &'a Nominal {
+        self.nominal
+    }
+
+    /// Returns the offset in millimetres.
+    pub fn radius_mm(&self) -> f64 {
+        self.radius_mm
+    }
+
+    /// Returns the side of the nominal surface.
+    pub fn side(&self) -> Side {
+        self.side
+    }
+
+    /// Finds the foot of a point given in the model frame, starting from where the last search for it ended.
+    ///
+    /// Beyond the edge the surface is continued: by its own facet for half a step of the sampling, then by the tangent plane
+    /// at the nearest place of the edge.
+    #[inline]
+    pub fn foot(&self, p: &Point, start: Place) -> Foot {
+        match self.nominal.patches() {
+            [only] => self.foot_on(only, 0, p, start),
+            patches => self.nearest_foot(patches, p, start),
+        }
+    }
+
+    /// The foot on the patch that a point belongs to: the nearest one that has it inside, else the one it is least beyond.
+    fn nearest_foot(&self, patches: &[Patch], p: &Point, start: Place) -> Foot {
+        let rank = |f: &Foot| {
+            let beyond = if f.beyond_mm <= EDGE_REACH * f.spacing_mm { 0.0 } else { f.beyond_mm };
+            (beyond, f.distance_mm.abs())
+        };
+        patches
+            .iter()
+            .enumerate()
+            .map(|(k, patch)| self.foot_on(patch, k as u32, p, start))
+            .min_by(|a, b| {
+                let (a, b) = (rank(a), rank(b));
+                a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1))
+            })
+            .expect("a nominal surface has at least one patch")
+    }
+
+    #[inline]
+    fn foot_on(&self, patch: &Patch, number: u32, p: &Point, start: Place) -> Foot {
+        let start = if start.patch == number { start.facet } else { u32::MAX };
+        match &patch.lattice {
+            Lattice::Grid(grid) => self.search(patch, grid, number, p, start),
+            Lattice::Mesh(mesh) => self.search(patch, mesh, number, p, start),
+        }
+    }
+
+    /// Walks from facet to facet until one holds the foot, then measures there.
+    #[inline]
+    fn search<F: Facets>(&self, patch: &Patch, facets: &F, number: u32, p: &Point, start: u32) -> Foot {
+        let mut facet = if start == u32::MAX { facets.start(p) } else { start };
+        let mut before = u32::MAX;
+        for _ in 0..MOST_STEPS {
+            let corner = OffsetFacet::new(self, patch, facets.corners(facet));
+            let weights = corner.weights(p, self.lookup);
+            let inside = weights[0].min(weights[1]).min(weights[2]) >= INSIDE;
+            let next = if inside { None } else { facets.advance(facet, &weights) };
+            match next {
+                // Two facets that point at each other: the foot lies on their common edge, in the gap that prisms over a
+                // convex edge leave.
+                Some(next) if next != before => {
+                    before = facet;
+                    facet = next;
+                }
+                _ => return corner.foot(p, weights, inside || next.is_some(), self.distance, number, facet),
+            }
+        }
+        let corner = OffsetFacet::new(self, patch, facets.corners(facet));
+        let weights = corner.weights(p, self.lookup);
+        corner.foot(p, weights, true, self.distance, number, facet)
+    }
+}
+
+/// A facet with its corners on the offset surface.
+struct OffsetFacet {
+    x: [Vector; 3],
+    n: [Vector; 3],
+    /// Normal of the flat facet, not of unit length, in the sense in which the corners turn.
+    turned: Vector,
+    /// The same of unit length, towards the probe's side; eq. (1).
+    flat: Vector,
+    per_turned_squared: f64,
+}
+
+impl OffsetFacet {
+    #[inline(always)]
+    fn new(surface: &OffsetSurface, patch: &Patch, corners: [u32; 3]) -> Self {
+        let sign = surface.side.sign();
+        let n = corners.map(|c| patch.normal(c) * sign);
+        let x: [Vector; 3] =
+            std::array::from_fn(|k| patch.points[corners[k] as usize].coords + n[k] * surface.radius_mm); // eq. (3)
+        let turned = (x[1] - x[0]).cross(&(x[2] - x[0]));
+        let squared = turned.norm_squared();
+        let flat = turned * (sign / squared.sqrt());
+        Self { x, n, turned, flat, per_turned_squared: 1.0 / squared }
+    }
+
+    /// Barycentric weights of the foot on the plane of the flat facet.
+    #[inline(always)]
+    fn weights(&self, p: &Point, lookup: Lookup) -> [f64; 3] {
+        let mut w = p.coords - self.x[0];
+        if lookup == Lookup::Projection {
+            w.z -= w.dot(&self.turned) / self.turned.z;
+        }
+        let b1 = w.cross(&(self.x[2] - self.x[0])).dot(&self.turned) * self.per_turned_squared;
+        let b2 = (self.x[1] - self.x[0]).cross(&w).dot(&self.turned) * self.per_turned_squared;
+        [1.0 - b1 - b2, b1, b2]
+    }
+
+    #[inline(always)]
+    fn foot(&self, p: &Point, weights: [f64; 3], inside: bool, distance: Distance, patch: u32, facet: u32) -> Foot {
+        let place = Place { patch, facet };
+        let spacing_mm = self.turned.norm_squared().sqrt().sqrt();
+        let mut beyond_mm = 0.0;
+        if !inside {
+            let clamped = self.clamped(p, &weights);
+            beyond_mm = (self.at(&clamped) - self.at(&weights)).norm();
+            if beyond_mm > EDGE_REACH * spacing_mm {
+                return self.tangent_foot(p, &clamped, distance, place, beyond_mm, spacing_mm);
+            }
+        }
+        let flat_mm = (p.coords - self.x[0]).dot(&self.flat); // eq. (2)
+        let (distance_mm, normal) = match distance {
+            Distance::Triangle => (flat_mm, self.flat),
+            Distance::Curved => {
+                let normal = self.normal(&weights);
+                // The foot of the flat facet is off by the distance times the lean of the surface against the facet, which
+                // lengthens the perpendicular by 1 / cos.
+                ((flat_mm - self.height(&weights)) * normal.dot(&self.flat), normal)
+            }
+        };
+        Foot { place, distance_mm, normal, beyond_mm, spacing_mm }
+    }
+
+    /// The distance from the tangent plane at a place of the edge.
+    #[cold]
+    fn tangent_foot(
+        &self,
+        p: &Point,
+        clamped: &[f64; 3],
+        distance: Distance,
+        place: Place,
+        beyond_mm: f64,
+        spacing_mm: f64,
+    ) -> Foot {
+        let (anchor, normal) = match distance {
+            Distance::Triangle => (self.at(clamped), self.flat),
+            Distance::Curved => (self.at(clamped) + self.flat * self.height(clamped), self.normal(clamped)),
+        };
+        Foot { place, distance_mm: (p.coords - anchor).dot(&normal), normal, beyond_mm, spacing_mm }
+    }
+
+    #[inline(always)]
+    fn at(&self, b: &[f64; 3]) -> Vector {
+        self.x[0] * b[0] + self.x[1] * b[1] + self.x[2] * b[2]
+    }
+
+    #[inline(always)]
+    fn normal(&self, b: &[f64; 3]) -> Vector {
+        let n = self.n[0] * b[0] + self.n[1] * b[1] + self.n[2] * b[2];
+        n / n.norm_squared().sqrt()
+    }
+
+    /// Height of the curved surface over the flat facet, positive on the probe's side.
+    #[inline(always)]
+    fn height(&self, b: &[f64; 3]) -> f64 {
+        let slope = self.n.map(|n| -1.0 / n.dot(&self.flat));
+        let edge = |i: usize, j: usize| {
+            let e = self.x[j] - self.x[i];
+            (self.n[i].dot(&e) * slope[i], -self.n[j].dot(&e) * slope[j])
+        };
+        let mut sum = 0.0;
+        let mut total = 0.0;
+        for (i, j) in [(0, 1), (1, 2), (2, 0)] {
+            let (at_i, at_j) = edge(i, j);
+            sum += b[i] * b[j] * (b[i] * at_i + b[j] * at_j);
+            total += at_i + at_j;
+        }
+        sum + 0.5 * total * b[0] * b[1] * b[2]
+    }
+
+    /// Weights of the nearest place of the facet for a point that lies beyond its most negative edge.
+    fn clamped(&self, p: &Point, b: &[f64; 3]) -> [f64; 3] {
+        let k = (0..3).min_by(|&i, &j| b[i].total_cmp(&b[j])).expect("three weights");
+        let (i, j) = ((k + 1) % 3, (k + 2) % 3);
+        let edge = self.x[j] - self.x[i];
+        let t = ((p.coords - self.x[i]).dot(&edge) / edge.norm_squared()).clamp(0.0, 1.0);
+        let mut clamped = [0.0; 3];
+        (clamped[i], clamped[j]) = (1.0 - t, t);
+        clamped
+    }
+}

@@ -1,0 +1,143 @@
+//! One patch of a nominal surface: points, unit normals, and the triangles between them.
+//!
+//! A grid has its triangles by arithmetic and its normals ready; a mesh keeps its triangles in flat arrays and fits a normal
+//! when a triangle is first touched, so that the work done is that of the measured region, not of the whole cloud.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use crate::geometry::{Point, Vector};
+
+use super::grid::GridLattice;
+use super::mesh::MeshLattice;
+use super::normals;
+
+/// A smooth piece of surface that one lattice of triangles covers.
+#[derive(Debug)]
+pub(crate) struct Patch {
+    pub(crate) points: Vec<Point>,
+    pub(crate) lattice: Lattice,
+    normals: Normals,
+}
+
+/// How the triangles of a patch are known.
+#[derive(Debug)]
+pub(crate) enum Lattice {
+    /// Two triangles a cell, by arithmetic.
+    Grid(GridLattice),
+    /// Triangles and their neighbours in flat arrays.
+    Mesh(MeshLattice),
+}
+
+/// What a point location needs of the triangles; counter-clockwise seen from the side of the normals.
+pub(crate) trait Facets: Sync {
+    /// Returns the three corners of a facet.
+    fn corners(&self, facet: u32) -> [u32; 3];
+
+    /// Returns the facet to look at next for a point with these barycentric weights; `None` where the surface ends.
+    fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32>;
+
+    /// Returns a facet to start from.
+    fn start(&self, p: &Point) -> u32;
+}
+
+#[derive(Debug)]
+enum Normals {
+    Ready(Vec<Vector>),
+    WhenTouched(Vec<NormalCell>),
+}
+
+impl Patch {
+    /// Joins a grid with normals that are known at every node.
+    pub(crate) fn grid(points: Vec<Point>, normals: Vec<Vector>, lattice: GridLattice) -> Self {
+        Self { points, lattice: Lattice::Grid(lattice), normals: Normals::Ready(normals) }
+    }
+
+    /// Joins a mesh with normals that are fitted when a triangle is first touched.
+    pub(crate) fn mesh(points: Vec<Point>, lattice: MeshLattice) -> Self {
+        let cells = points.iter().map(|_| NormalCell::unknown()).collect();
+        Self { points, lattice: Lattice::Mesh(lattice), normals: Normals::WhenTouched(cells) }
+    }
+
+    /// Returns the unit normal at a vertex; NaN at a hole of a grid.
+    #[inline]
+    pub(crate) fn normal(&self, vertex: u32) -> Vector {
+        match &self.normals {
+            Normals::Ready(normals) => normals[vertex as usize],
+            Normals::WhenTouched(cells) => {
+                let cell = &cells[vertex as usize];
+                cell.get().unwrap_or_else(|| cell.set(self.fitted_normal(vertex)))
+            }
+        }
+    }
+
+    /// Returns about so many vertices, spread over the patch, holes left out.
+    pub(crate) fn sample(&self, count: usize) -> impl Iterator<Item = u32> {
+        let n = self.points.len();
+        let (columns, step_i, step_j) = match &self.lattice {
+            Lattice::Grid(grid) => {
+                let step = ((n as f64 / count as f64).sqrt() as usize).clamp(1, grid.columns().min(grid.rows()) / 3);
+                (grid.columns(), step, step)
+            }
+            Lattice::Mesh(_) => (n, n.div_ceil(count), 1),
+        };
+        (0..n / columns)
+            .step_by(step_j)
+            .flat_map(move |j| (0..columns).step_by(step_i).map(move |i| (j * columns + i) as u32))
+            .filter(|&v| self.points[v as usize].x.is_finite() && self.normal(v).x.is_finite())
+    }
+
+    /// Whether normals were given or exact rather than fitted to scattered neighbours.
+    pub(crate) fn has_scattered_normals(&self) -> bool {
+        matches!(self.normals, Normals::WhenTouched(_))
+    }
+
+    #[cold]
+    fn fitted_normal(&self, vertex: u32) -> Vector {
+        match &self.lattice {
+            Lattice::Mesh(mesh) => normals::fit_to_ring(&self.points, mesh, vertex, normals::NEIGHBOURS).normal,
+            Lattice::Grid(_) => unreachable!("a grid has its normals ready"),
+        }
+    }
+
+    /// Returns the number of facets, those over holes included.
+    pub(crate) fn facet_count(&self) -> u32 {
+        match &self.lattice {
+            Lattice::Grid(grid) => grid.facet_count(),
+            Lattice::Mesh(mesh) => mesh.facet_count(),
+        }
+    }
+
+    /// Returns the corners of a facet, or `None` where a grid has a hole.
+    pub(crate) fn facet(&self, facet: u32) -> Option<[u32; 3]> {
+        let corners = match &self.lattice {
+            Lattice::Grid(grid) => grid.corners(facet),
+            Lattice::Mesh(mesh) => mesh.corners(facet),
+        };
+        corners.iter().all(|&c| self.points[c as usize].x.is_finite()).then_some(corners)
+    }
+}
+
+/// A normal that is worked out once, by whichever thread first needs it.
+///
+/// Every thread that finds it unknown computes the same value, so a race costs time and changes nothing; NaN means unknown.
+#[derive(Debug)]
+struct NormalCell([AtomicU64; 3]);
+
+impl NormalCell {
+    fn unknown() -> Self {
+        Self(std::array::from_fn(|_| AtomicU64::new(f64::NAN.to_bits())))
+    }
+
+    #[inline]
+    fn get(&self) -> Option<Vector> {
+        let [x, y, z] = [0, 1, 2].map(|k| f64::from_bits(self.0[k].load(Ordering::Relaxed)));
+        (!(x + y + z).is_nan()).then(|| Vector::new(x, y, z))
+    }
+
+    fn set(&self, normal: Vector) -> Vector {
+        for (cell, c) in self.0.iter().zip(normal.iter()) {
+            cell.store(c.to_bits(), Ordering::Relaxed);
+        }
+        normal
+    }
+}

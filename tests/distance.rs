@@ -1,0 +1,48 @@
+//! The distance of a probe centre from the offset surface, against the exact one.
+
+use regrind::geometry::Point;
+use regrind::surface::{Distance, Nominal, OffsetSurface, Place, Projection, Side};
+use regrind_sim::form::FormError;
+use regrind_sim::shape::{FreeForm, Shape};
+
+const RADIUS_MM: f64 = 1.5;
+
+fn nominal(columns: usize, rows: usize) -> Nominal {
+    let points = FreeForm::default().grid(FreeForm::WIDTH_MM, FreeForm::DEPTH_MM, columns, rows);
+    Nominal::from_points(points.into_iter().map(Point::from).collect(), Projection::Auto).unwrap()
+}
+
+/// Largest and least error of the distance over points whose exact distance is known, inside and within two steps of the edge.
+fn errors_nm(nominal: &Nominal, distance: Distance, step: [f64; 2]) -> [f64; 2] {
+    let shape = FreeForm::default();
+    let form = FormError::new(3, 30.0, 6.657e-3, 102.0, 62.0);
+    let surface = OffsetSurface::new(nominal, RADIUS_MM, Side::Normal).unwrap().with_distance(distance);
+    let mut range = [[f64::INFINITY, f64::NEG_INFINITY]; 2];
+    let at = |i: usize, n: usize, size: f64| size * ((i as f64 + 0.37) / n as f64 - 0.5);
+    for j in 0..331 {
+        for i in 0..517 {
+            let (x, y) = (at(i, 517, 102.0), at(j, 331, 62.0));
+            let (s, n, e) = (shape.point(x, y), shape.normal(x, y), form.height(x, y));
+            let p = Point::from(std::array::from_fn::<f64, 3, _>(|k| s[k] + (RADIUS_MM + e) * n[k]));
+            let foot = surface.foot(&p, Place::UNKNOWN);
+            let error = (foot.distance_mm - e) * 1e6;
+            let border = 51.0 - x.abs() < 2.0 * step[0] || 31.0 - y.abs() < 2.0 * step[1];
+            let r = &mut range[usize::from(border)];
+            *r = [r[0].min(error), r[1].max(error)];
+        }
+    }
+    range.map(|[low, high]| high - low)
+}
+
+#[test]
+fn print_errors() {
+    for (c, r) in [(1021, 1241), (901, 501), (128, 156)] {
+        let nominal = nominal(c, r);
+        let step = [102.0 / (c - 1) as f64, 62.0 / (r - 1) as f64];
+        println!(
+            "{c}x{r} flat {:?} curved {:?}",
+            errors_nm(&nominal, Distance::Triangle, step),
+            errors_nm(&nominal, Distance::Curved, step)
+        );
+    }
+}
