@@ -51,7 +51,13 @@ pub(super) fn coordinate(field: &[u8], decimal: Decimal) -> Result<f64, NumberFa
             return Err(if plain(field).is_ok() { NumberFault::OtherMark } else { NumberFault::Text });
         }
     };
-    if value.abs() <= LIMIT_MM { Ok(value) } else { Err(NumberFault::OutOfRange) }
+    if is_believable(value) { Ok(value) } else { Err(NumberFault::OutOfRange) }
+}
+
+/// Returns whether a value may be a coordinate: not NaN, not infinite, not astronomical.
+#[inline]
+pub(super) fn is_believable(value: f64) -> bool {
+    value.abs() <= LIMIT_MM
 }
 
 /// Reads a number that may be NaN or infinite, for columns whose values are not used.
@@ -139,9 +145,15 @@ mod tests {
             assert_eq!(comma(text), Ok(value), "{text}");
         }
         let text = ["", "-", ".", "abc", "0x10", "1_0", "1e", "1 2", "12,34.5", "1,2,3", "1.2.3", "0,123.4"];
-        text.map(|text| assert_eq!(point(text), Err(NumberFault::Text), "{text}"));
-        for text in ["nan", "-NaN", "inf", "-Infinity"] { assert_eq!(point(text), Err(NumberFault::NotFinite), "{text}"); }
-        ["1e300", "1e400", "-10000001"].map(|text| assert_eq!(point(text), Err(NumberFault::OutOfRange), "{text}"));
+        for text in text {
+            assert_eq!(point(text), Err(NumberFault::Text), "{text}");
+        }
+        for text in ["nan", "-NaN", "inf", "-Infinity"] {
+            assert_eq!(point(text), Err(NumberFault::NotFinite), "{text}");
+        }
+        for text in ["1e300", "1e400", "-10000001"] {
+            assert_eq!(point(text), Err(NumberFault::OutOfRange), "{text}");
+        }
         assert_eq!(point("2,512"), Err(NumberFault::AmbiguousComma));
         assert_eq!(point("2,5"), Err(NumberFault::OtherMark));
         assert_eq!(comma("2.5"), Err(NumberFault::OtherMark));

@@ -7,7 +7,7 @@
 use std::path::Path;
 
 use super::error::{FormatError, excerpt};
-use super::number::{LIMIT_MM, any_number};
+use super::number::{any_number, is_believable};
 use super::whole::{is_degenerate, open};
 use crate::geometry::{Point, Vector};
 
@@ -281,6 +281,8 @@ impl Header {
     }
 }
 
+/// Longest beginning of a number that a cut may leave.
+const LONGEST_WORD: usize = 64;
 /// Longest line of a header.
 const LONGEST_LINE: usize = 4096;
 /// Longest header; less than what is read of a file at first.
@@ -362,12 +364,12 @@ impl Reading<'_> {
             source,
             |at, value, source| {
                 if let Some(axis) = position.iter().position(|&p| p == at) {
-                    if !(value.abs() <= LIMIT_MM) {
+                    if !is_believable(value) {
                         return Err(self.bad(source, ["x", "y", "z"][axis], value));
                     }
                     put(&xyz, axis, value);
                 } else if let Some(axis) = direction.and_then(|d| d.iter().position(|&p| p == at)) {
-                    if !(value.abs() <= LIMIT_MM) {
+                    if !is_believable(value) {
                         return Err(self.bad(source, ["nx", "ny", "nz"][axis], value));
                     }
                     put(&normal, axis, value);
@@ -530,12 +532,14 @@ struct Words<'a> {
     rest: &'a [u8],
     /// What is left of this line.
     line: &'a [u8],
+    /// Whether this line has its newline.
+    ended: bool,
     number: u64,
 }
 
 impl<'a> Words<'a> {
     fn new(rest: &'a [u8], header_lines: u64) -> Self {
-        Self { rest, line: &[], number: header_lines }
+        Self { rest, line: &[], ended: true, number: header_lines }
     }
 
     /// Goes to the next line with words in it; returns whether there is one.
@@ -543,6 +547,7 @@ impl<'a> Words<'a> {
         while !self.rest.is_empty() {
             let end = self.rest.iter().position(|&b| b == b'\n').unwrap_or(self.rest.len());
             self.line = self.rest[..end].trim_ascii();
+            self.ended = end < self.rest.len();
             self.rest = self.rest.get(end + 1..).unwrap_or_default();
             self.number += 1;
             if !self.line.is_empty() {
@@ -569,7 +574,11 @@ impl Source for Words<'_> {
             return Err(Fault { place: self.place(), found: None });
         }
         let value = any_number(word).filter(|v| !scalar.is_integer() || v.fract() == 0.0);
-        let value = value.ok_or_else(|| self.fault(word))?;
+        // Half a word at the end of a file is a cut, not somebody's text.
+        let cut = || Fault { place: self.place(), found: None };
+        let value = value.ok_or_else(|| {
+            if rest.is_empty() && !self.ended && end < LONGEST_WORD { cut() } else { self.fault(word) }
+        })?;
         self.line = rest.trim_ascii_start();
         Ok(value)
     }

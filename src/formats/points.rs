@@ -12,7 +12,7 @@ use rayon::prelude::*;
 
 use super::error::{FormatError, excerpt};
 use super::layout::{Layout, Preamble, Separator, is_comment};
-use super::number::{Decimal, LIMIT_MM, NumberFault, coordinate};
+use super::number::{Decimal, NumberFault, coordinate, is_believable};
 use crate::geometry::Point;
 
 /// Largest text file that is read.
@@ -50,7 +50,7 @@ pub fn read_points(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> {
 ///
 /// # Errors
 /// Those of [`read_points`].
-pub fn parse_points(path: impl AsRef<Path>, reader: impl Read) -> Result<Vec<Point>, FormatError> {
+pub fn parse_points(path: impl AsRef<Path>, reader: impl Read + Send) -> Result<Vec<Point>, FormatError> {
     Cloud::new(path.as_ref(), 0).read(reader)
 }
 
@@ -64,6 +64,25 @@ struct Cloud<'p> {
     /// Lines done.
     lines: u64,
     points: Vec<Point>,
+}
+
+/// A piece of the file in memory.
+struct Batch {
+    bytes: Vec<u8>,
+    /// What of the bytes is in use.
+    begin: usize,
+    end: usize,
+}
+
+impl Batch {
+    /// Fills the batch with what was left over of the one before and with more of the stream; returns how much more.
+    fn read(&mut self, left_over: &[u8], reader: &mut impl Read) -> std::io::Result<usize> {
+        self.bytes.resize(BATCH, 0);
+        self.bytes[..left_over.len()].copy_from_slice(left_over);
+        let read = fill(reader, &mut self.bytes[left_over.len()..])?;
+        (self.begin, self.end) = (0, left_over.len() + read);
+        Ok(read)
+    }
 }
 
 /// What one thread made of its share of a batch.
@@ -80,36 +99,42 @@ impl<'p> Cloud<'p> {
         Self { path, length, preamble: Preamble::new(path), layout: None, lines: 0, points: Vec::new() }
     }
 
-    fn read(mut self, mut reader: impl Read) -> Result<Vec<Point>, FormatError> {
-        let unreadable = |source| FormatError::Unreadable { path: self.path.to_owned(), source };
+    fn read(mut self, mut reader: impl Read + Send) -> Result<Vec<Point>, FormatError> {
+        let path = self.path;
+        let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
         self.check_size(self.length)?;
-        let mut buffer = vec![0; BATCH];
-        let mut filled = fill(&mut reader, &mut buffer[..HEAD]).map_err(unreadable)?;
-        if filled == 0 {
-            return Err(FormatError::Empty { path: self.path.to_owned(), expected: "points" });
-        }
-        self.check_head(&buffer[..filled])?;
-        let mut begin = if buffer.starts_with(b"\xef\xbb\xbf") { 3 } else { 0 };
-        let mut total = filled as u64;
-        loop {
-            let read = fill(&mut reader, &mut buffer[filled..])
-                .map_err(|source| FormatError::Unreadable { path: self.path.to_owned(), source })?;
-            filled += read;
-            total += read as u64;
+        let mut batch = Batch { bytes: vec![0; BATCH], begin: 0, end: 0 };
+        batch.end = fill(&mut reader, &mut batch.bytes[..HEAD]).map_err(unreadable)?;
+        self.check_head(&batch.bytes[..batch.end])?;
+        batch.end += fill(&mut reader, &mut batch.bytes[batch.end..]).map_err(unreadable)?;
+        batch.begin = if batch.bytes.starts_with(b"\xef\xbb\xbf") { 3 } else { 0 };
+        let mut next = Batch { bytes: Vec::new(), begin: 0, end: 0 };
+        let mut total = batch.end as u64;
+        while batch.end == BATCH {
+            // One thread reads on while the others parse.
+            let lines = self.whole_lines(&batch)?;
+            let (text, tail) = batch.bytes[batch.begin..].split_at(lines);
+            let (taken, read) = rayon::join(|| self.take(text, total), || next.read(tail, &mut reader));
+            taken?;
+            total += read.map_err(unreadable)? as u64;
             self.check_size(total)?;
-            if filled < BATCH {
-                self.take(&buffer[begin..filled], total)?;
-                return self.finish();
-            }
-            let end = buffer.iter().rposition(|&b| b == b'\n').map_or(0, |at| at + 1);
-            self.take(&buffer[begin.min(end)..end], total)?;
-            if filled - end > LONGEST_LINE {
-                return Err(self.too_long(self.lines + 1));
-            }
-            buffer.copy_within(end.., 0);
-            filled -= end;
-            begin = 0;
+            std::mem::swap(&mut batch, &mut next);
         }
+        self.take(&batch.bytes[batch.begin..batch.end], total)?;
+        self.finish()
+    }
+
+    /// Returns the length of the whole lines in a full batch, unless the last one goes on for too long.
+    fn whole_lines(&mut self, batch: &Batch) -> Result<usize, FormatError> {
+        let text = &batch.bytes[batch.begin..];
+        let lines = text.iter().rposition(|&b| b == b'\n').map_or(0, |at| at + 1);
+        if text.len() - lines <= LONGEST_LINE {
+            return Ok(lines);
+        }
+        // The lines before it may hold an earlier fault, and give the line its number.
+        self.take(&text[..lines], BATCH as u64)?;
+        let line = self.lines + 1;
+        Err(FormatError::LineTooLong { path: self.path.to_owned(), line, limit_bytes: LONGEST_LINE })
     }
 
     /// Takes whole lines, of which only the very last of the file may lack its end.
@@ -184,10 +209,6 @@ impl<'p> Cloud<'p> {
         let Some(at) = head.iter().position(|&b| b < b' ' && !b.is_ascii_whitespace()) else { return Ok(()) };
         let line = 1 + head[..at].iter().filter(|&&b| b == b'\n').count() as u64;
         Err(FormatError::NotText { path: self.path.to_owned(), line, value: head[at] })
-    }
-
-    fn too_long(&self, line: u64) -> FormatError {
-        FormatError::LineTooLong { path: self.path.to_owned(), line, limit_bytes: LONGEST_LINE }
     }
 }
 
@@ -270,8 +291,7 @@ fn quick_line(text: &[u8], layout: &Layout) -> Option<(Point, usize)> {
             at = skip_separator(text, at, separator)?;
         }
         let (number, used) = fast_float2::parse_partial::<f64, _>(text.get(at..)?).ok()?;
-        // NaN and infinity fail this comparison too.
-        if !(number.abs() <= LIMIT_MM) {
+        if !is_believable(number) {
             return None;
         }
         *value = number;

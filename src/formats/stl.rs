@@ -7,7 +7,7 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use super::error::{FormatError, excerpt};
-use super::number::{LIMIT_MM, any_number};
+use super::number::{any_number, is_believable};
 use super::whole::{MOST_BYTES, is_degenerate, open};
 use crate::geometry::Point;
 
@@ -119,7 +119,7 @@ fn parse_binary(path: &Path, bytes: &[u8]) -> Result<StlFile, FormatError> {
         // Twelve bytes of normal come first; two of attributes last.
         for (k, four) in record[12..48].chunks_exact(4).enumerate() {
             let value = f64::from(f32::from_le_bytes([four[0], four[1], four[2], four[3]]));
-            if !(value.abs() <= LIMIT_MM) {
+            if !is_believable(value) {
                 let place = format!("byte {}", BINARY_HEADER + facet * BINARY_FACET + 12 + 4 * k);
                 let what = ["x", "y", "z"][k % 3];
                 return Err(FormatError::BadCoordinate { path: path.to_owned(), place, what, value });
@@ -226,7 +226,7 @@ impl<'a> Words<'a> {
         let (path, place) = (|| self.path.to_owned(), format!("line {}", self.line));
         let begun = |w: &[u8]| w.iter().all(|b| matches!(b, b'+' | b'-' | b'.' | b'0'..=b'9' | b'e' | b'E'));
         match any_number(word) {
-            Some(value) if value.abs() <= LIMIT_MM => Ok(value),
+            Some(value) if is_believable(value) => Ok(value),
             Some(value) => Err(FormatError::BadCoordinate { path: path(), place, what, value }),
             None if self.rest.is_empty() && begun(word) => {
                 Err(FormatError::Cut { path: path(), place, expected: "a coordinate".to_owned() })

@@ -55,8 +55,7 @@ impl Opened {
         parse: impl Fn(&Path, &[u8]) -> Result<T, FormatError>,
     ) -> Result<T, FormatError> {
         if self.head.len() == HEAD {
-            let lines = self.head.iter().rposition(|&b| b == b'\n').map_or(HEAD, |at| at + 1);
-            match parse(path, &self.head[..lines]) {
+            match parse(path, &self.head) {
                 Err(error) if !error.is_cut() => return Err(error),
                 _ => {}
             }
