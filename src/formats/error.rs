@@ -362,3 +362,16 @@ fn printable(c: char) -> impl Iterator<Item = char> {
     let plain = if c.is_control() { None } else { Some(c) };
     escaped.into_iter().flatten().chain(plain)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_piece_of_a_file_cannot_disturb_a_terminal() {
+        assert_eq!(excerpt(b"abc \r\n"), "abc");
+        assert_eq!(excerpt(b"\x1b[2J\xff"), "\\u{1b}[2J\u{fffd}");
+        assert_eq!(excerpt(&[b'a'; 1000]).len(), 43);
+        assert_eq!(quoted(""), "nothing");
+    }
+}

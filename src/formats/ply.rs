@@ -4,6 +4,7 @@
 //! vertex indices. Counts in the header are never believed further than the bytes that are there.
 //! Format: G. Turk, The PLY Polygon File Format, 1994.
 
+use std::cell::{Cell, RefCell};
 use std::path::Path;
 
 use super::error::{FormatError, excerpt};
@@ -151,55 +152,51 @@ impl Header {
         let mut header = Self { encoding: Encoding::Ascii, elements: Vec::new(), length: 0, lines: 0 };
         let mut encoding = None;
         loop {
-            let rest = &bytes[header.length..];
-            let place = format!("line {}", header.lines + 1);
-            let fault = |expected: &str, found: &[u8]| FormatError::Unexpected {
-                path: path.to_owned(),
-                place: place.clone(),
-                expected: expected.to_owned(),
-                found: excerpt(found),
-            };
-            if header.length > LONGEST_HEADER {
-                return Err(fault("a header of at most 32 KiB", b"a longer one"));
-            }
-            let end = rest.iter().take(LONGEST_LINE).position(|&b| b == b'\n');
-            let line = rest[..end.unwrap_or(rest.len().min(LONGEST_LINE))].trim_ascii();
-            if header.lines == 0 && line != b"ply" && !(end.is_none() && b"ply".starts_with(line)) {
-                return Err(fault("`ply` in a line of its own", line));
-            }
-            let Some(end) = end else {
-                return Err(if rest.len() < LONGEST_LINE {
-                    let expected = "the rest of the header, up to `end_header`".to_owned();
-                    FormatError::Cut { path: path.to_owned(), place, expected }
-                } else {
-                    fault("a short line of a PLY header", line)
-                });
-            };
-            header.length += end + 1;
-            header.lines += 1;
+            let line = header.next_line(path, &bytes[header.length..])?;
+            let number = header.lines;
+            let fault = |expected: &str| header_fault(path, number, expected, line);
             let words: Vec<&[u8]> = line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty()).collect();
             match words[..] {
-                [b"ply"] if header.lines == 1 => {}
+                [b"ply"] if number == 1 => {}
+                _ if number == 1 => return Err(fault("`ply` in a line of its own")),
                 [b"format", name, b"1.0"] if encoding.is_none() => {
-                    encoding = Some(
-                        Encoding::named(name)
-                            .ok_or_else(|| fault("format ascii, binary_little_endian or binary_big_endian", line))?,
-                    );
+                    let known = "format ascii, binary_little_endian or binary_big_endian";
+                    encoding = Some(Encoding::named(name).ok_or_else(|| fault(known))?);
                 }
                 [b"comment" | b"obj_info", ..] | [] => {}
+                _ if encoding.is_none() => return Err(fault("`format ascii 1.0` or another format")),
                 [b"end_header"] => break,
-                _ if encoding.is_none() => return Err(fault("`format ascii 1.0` or another format", line)),
-                _ => header.declare(&words).map_err(|expected| fault(expected, line))?,
+                _ => header.declare(&words).map_err(fault)?,
             }
         }
-        header.encoding = encoding.ok_or_else(|| FormatError::Unexpected {
-            path: path.to_owned(),
-            place: format!("line {}", header.lines),
-            expected: "a line `format` before the end of the header".to_owned(),
-            found: "end_header".to_owned(),
-        })?;
+        header.encoding = encoding.unwrap_or(Encoding::Ascii);
         header.check(path)?;
         Ok(header)
+    }
+
+    /// Takes the next line of the header, which must have its end.
+    fn next_line<'b>(&mut self, path: &Path, rest: &'b [u8]) -> Result<&'b [u8], FormatError> {
+        let most = rest.len().min(LONGEST_LINE);
+        let end = rest[..most].iter().position(|&b| b == b'\n');
+        let line = rest[..end.unwrap_or(most)].trim_ascii();
+        let number = self.lines + 1;
+        let Some(end) = end else {
+            let may_be_ply = number > 1 || b"ply".starts_with(line);
+            return Err(if most < LONGEST_LINE && may_be_ply {
+                let expected = "the rest of the header, up to `end_header`".to_owned();
+                FormatError::Cut { path: path.to_owned(), place: format!("line {number}"), expected }
+            } else if may_be_ply {
+                header_fault(path, number, "a short line of a PLY header", line)
+            } else {
+                header_fault(path, number, "`ply` in a line of its own", line)
+            });
+        };
+        self.length += end + 1;
+        self.lines = number;
+        if self.length > LONGEST_HEADER {
+            return Err(header_fault(path, number, "a header of at most 32 KiB", b"a longer one"));
+        }
+        Ok(line)
     }
 
     /// Takes a line that declares an element or a property; the error is what was expected.
@@ -281,6 +278,11 @@ impl Header {
     }
 }
 
+fn header_fault(path: &Path, line: u64, expected: &str, found: &[u8]) -> FormatError {
+    let (path, place) = (path.to_owned(), format!("line {line}"));
+    FormatError::Unexpected { path, place, expected: expected.to_owned(), found: excerpt(found) }
+}
+
 /// Longest beginning of a number that a cut may leave.
 const LONGEST_WORD: usize = 64;
 /// Longest line of a header.
@@ -353,33 +355,28 @@ impl Reading<'_> {
         let direction = self.element.triple(["nx", "ny", "nz"]);
         let mut points = Vec::with_capacity(capacity);
         let mut normals = Vec::with_capacity(if direction.is_some() { capacity } else { 0 });
-        let xyz = std::cell::Cell::new([0.0; 3]);
-        let normal = std::cell::Cell::new([0.0; 3]);
-        let put = |cell: &std::cell::Cell<[f64; 3]>, axis: usize, value: f64| {
-            let mut all = cell.get();
-            all[axis] = value;
-            cell.set(all);
-        };
+        // x, y, z, nx, ny, nz of the vertex at hand; the normal stays zero where there is none.
+        let columns = [position, direction.unwrap_or([usize::MAX; 3])].concat();
+        let values = Cell::new([0.0; 6]);
         self.each(
             source,
             |at, value, source| {
-                if let Some(axis) = position.iter().position(|&p| p == at) {
-                    if !is_believable(value) {
-                        return Err(self.bad(source, ["x", "y", "z"][axis], value));
-                    }
-                    put(&xyz, axis, value);
-                } else if let Some(axis) = direction.and_then(|d| d.iter().position(|&p| p == at)) {
-                    if !is_believable(value) {
-                        return Err(self.bad(source, ["nx", "ny", "nz"][axis], value));
-                    }
-                    put(&normal, axis, value);
+                let Some(slot) = columns.iter().position(|&column| column == at) else { return Ok(()) };
+                if !is_believable(value) {
+                    let what = ["x", "y", "z", "nx", "ny", "nz"][slot];
+                    let (path, place) = (self.path.to_owned(), source.place());
+                    return Err(FormatError::BadCoordinate { path, place, what, value });
                 }
+                let mut all = values.get();
+                all[slot] = value;
+                values.set(all);
                 Ok(())
             },
             |_, _| {
-                points.push(Point::from(xyz.get()));
+                let [x, y, z, nx, ny, nz] = values.get();
+                points.push(Point::new(x, y, z));
                 if direction.is_some() {
-                    normals.push(Vector::from(normal.get()).try_normalize(0.0).unwrap_or_default());
+                    normals.push(Vector::new(nx, ny, nz).try_normalize(0.0).unwrap_or_default());
                 }
                 Ok(())
             },
@@ -391,7 +388,7 @@ impl Reading<'_> {
 
     fn faces(&self, source: &mut impl Source, triangles: &mut Vec<[u32; 3]>, vertices: u64) -> Result<(), FormatError> {
         let indices = self.element.properties.iter().position(|p| Some(p) == indices_of(self.element));
-        let polygon = std::cell::RefCell::new(Vec::new());
+        let polygon = RefCell::new(Vec::new());
         self.each(
             source,
             |at, value, source| {
@@ -415,10 +412,6 @@ impl Reading<'_> {
                 Ok(())
             },
         )
-    }
-
-    fn bad(&self, source: &impl Source, what: &'static str, value: f64) -> FormatError {
-        FormatError::BadCoordinate { path: self.path.to_owned(), place: source.place(), what, value }
     }
 
     fn unexpected(&self, source: &impl Source, expected: String, found: String) -> FormatError {

@@ -1,8 +1,8 @@
 //! Point clouds as text: one point a line, with or without a header, in whatever separator a machine exports.
 //!
 //! The file is streamed in batches that are parsed in parallel, so that memory holds the points and a few megabytes, whatever
-//! the file. Every line is first tried by [`quick_line`], which knows only the plain case and reports nothing; what it
-//! declines goes through [`careful_line`], which alone decides what is an error.
+//! the file. Every line is first tried by `quick_line`, which knows only the plain case and reports nothing; what it
+//! declines goes through `careful_line`, which alone decides what is an error.
 
 use std::fs::File;
 use std::io::{ErrorKind, Read};
@@ -140,7 +140,7 @@ impl<'p> Cloud<'p> {
     /// Takes whole lines, of which only the very last of the file may lack its end.
     fn take(&mut self, text: &[u8], bytes_so_far: u64) -> Result<(), FormatError> {
         let rest = self.take_preamble(text)?;
-        let Some(layout) = &self.layout else { return Ok(()) };
+        let Some(layout) = &self.layout else { return self.check_preamble(bytes_so_far) };
         let shares: Vec<Share> = if rest.len() <= SHARE {
             vec![read_share(rest, layout)]
         } else {
@@ -193,6 +193,13 @@ impl<'p> Cloud<'p> {
         } else {
             FormatError::Empty { path, expected: "points" }
         })
+    }
+
+    /// Gives up on a file that begins with nothing but comments.
+    fn check_preamble(&self, bytes: u64) -> Result<(), FormatError> {
+        let (path, limit, unit) = (self.path, BATCH as u64 - 1, "bytes before the first point");
+        let too_large = || FormatError::TooLarge { path: path.to_owned(), found: bytes, limit, unit };
+        if bytes > limit { Err(too_large()) } else { Ok(()) }
     }
 
     fn check_size(&self, bytes: u64) -> Result<(), FormatError> {
@@ -261,7 +268,9 @@ fn read_share(text: &[u8], layout: &Layout) -> Share {
     let mut at = 0;
     while at < text.len() {
         let rest = &text[at..];
-        if let Some((point, used)) = if quick { quick_line(rest, layout) } else { None } {
+        if rest[0] == b'\n' {
+            at += 1;
+        } else if let Some((point, used)) = if quick { quick_line(rest, layout) } else { None } {
             share.points.push(point);
             at += used;
         } else {
@@ -403,5 +412,59 @@ fn number_error(
             let expected = if decimal == Decimal::Point { "point" } else { "comma" };
             FormatError::DecimalMark { path, line, column, found, expected }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const COMMAS: Layout =
+        Layout { separator: Separator::Comma, columns: [0, 1, 2], count: 3, decimal: Decimal::Point, first_line: 1 };
+
+    #[test]
+    fn shares_are_whole_lines_and_together_the_text() {
+        for (line, count) in [("1,2,3\n", 200_000), ("\n", 600_000), ("no end", 90_000)] {
+            let text = line.repeat(count).into_bytes();
+            let shares = split_at_lines(&text);
+            assert_eq!(shares.concat(), text);
+            assert!(shares[..shares.len() - 1].iter().all(|share| share.ends_with(b"\n")));
+        }
+    }
+
+    #[test]
+    fn the_quick_way_declines_what_is_not_plain() {
+        let quick = |line: &str| quick_line(line.as_bytes(), &COMMAS);
+        assert_eq!(quick(" 1,2 , 3\r\nrest"), Some((Point::new(1.0, 2.0, 3.0), 10)));
+        let others = [
+            "1,2,3",
+            "1,2\n",
+            "1,2,3,4\n",
+            "1,2,nan\n",
+            "1,2,1e8\n",
+            "#1,2,3\n",
+            "1,2,3x\n",
+            "\"1\",2,3\n",
+            "",
+            "1,2,\n",
+        ];
+        for line in others {
+            assert_eq!(quick(line), None, "{line:?}");
+        }
+        let five = Layout { separator: Separator::Blank, count: 5, ..COMMAS };
+        let quick = |line: &str| quick_line(line.as_bytes(), &five);
+        assert_eq!(quick("1 2 3 a  b \n").map(|(_, used)| used), Some(12));
+        for line in ["1 2 3 a \n", "1 2 3 a b c\n", "1 2 3\n", "1 2 3 \"a b\" c\n"] {
+            assert_eq!(quick(line), None, "{line:?}");
+        }
+    }
+
+    #[test]
+    fn a_file_of_comments_is_given_up() {
+        let comments = "# nothing but comments\n".repeat(200_000);
+        assert!(matches!(parse_points("c", comments.as_bytes()), Err(FormatError::TooLarge { .. })));
+        let mut blank = vec![b'\n'; 5 << 20];
+        blank[..6].copy_from_slice(b"1,2,3\n");
+        assert_eq!(parse_points("b", &blank[..]).unwrap().len(), 1);
     }
 }
