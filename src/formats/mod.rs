@@ -1,1 +1,146 @@
 //! Files in and out: point clouds, meshes, and what a registration leaves behind.
+//!
+//! No file is trusted. Whatever is wrong with one comes back as a [`FormatError`] that names the file, the place, what was
+//! found, what was expected and what to do; nothing here panics, and time and memory are bounded by the size of the file.
+
+mod error;
+mod layout;
+mod number;
+pub mod ply;
+pub mod points;
+pub mod registration;
+pub mod stl;
+mod whole;
+
+use std::path::Path;
+
+pub use error::FormatError;
+pub use number::LIMIT_MM;
+pub use ply::{PlyFile, parse_ply, read_ply};
+pub use points::{parse_points, read_points};
+pub use registration::{DeviationRow, write_deviations, write_json_atomic, write_points};
+pub use stl::{StlFile, parse_stl, read_stl};
+
+use crate::geometry::Point;
+
+/// Largest surface definition that is read.
+const MOST_DEFINITION_BYTES: u64 = 1 << 20;
+
+/// What a nominal surface may come as.
+#[derive(Clone, Debug, PartialEq)]
+pub enum NominalFile {
+    /// Points on the surface, in millimetres, in the order of the file.
+    Points(Vec<Point>),
+    /// A triangle mesh.
+    Mesh {
+        /// The vertices in millimetres.
+        points: Vec<Point>,
+        /// Corner indices.
+        triangles: Vec<[u32; 3]>,
+    },
+    /// The text of a TOML file that defines the surface by its equation; parsed elsewhere.
+    Definition(String),
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Kind {
+    Text,
+    Ply,
+    Stl,
+    Toml,
+}
+
+/// Reads a nominal surface: points as text or PLY, a mesh as PLY or STL, or a TOML definition.
+///
+/// The content decides which it is; the extension only where the content does not tell.
+///
+/// # Errors
+/// Those of the format found.
+pub fn read_nominal(path: impl AsRef<Path>) -> Result<NominalFile, FormatError> {
+    let path = path.as_ref();
+    Ok(match kind(path)? {
+        Kind::Text => NominalFile::Points(read_points(path)?),
+        Kind::Toml => NominalFile::Definition(read_definition(path)?),
+        Kind::Stl => {
+            let StlFile { points, triangles, .. } = read_stl(path)?;
+            NominalFile::Mesh { points, triangles }
+        }
+        Kind::Ply => {
+            let PlyFile { points, triangles, .. } = read_ply(path)?;
+            if triangles.is_empty() { NominalFile::Points(points) } else { NominalFile::Mesh { points, triangles } }
+        }
+    })
+}
+
+/// Reads measured points, in millimetres and in the order of the file, from text or the vertices of a PLY file.
+///
+/// # Errors
+/// Those of the format found, and a file that is STL or TOML.
+pub fn read_measured(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> {
+    let path = path.as_ref();
+    let wrong = |found, remedy| {
+        let expected = "measured points as text or PLY";
+        Err(FormatError::WrongKind { path: path.to_owned(), expected, found, remedy })
+    };
+    match kind(path)? {
+        Kind::Text => read_points(path),
+        Kind::Ply => read_ply(path).map(|file| file.points),
+        Kind::Stl => wrong("an STL mesh", "export the points, or give the mesh as the nominal"),
+        Kind::Toml => wrong("a TOML file", "give the definition as the nominal"),
+    }
+}
+
+/// Tells the kind of a file by its beginning, and by its extension where that leaves it open.
+fn kind(path: &Path) -> Result<Kind, FormatError> {
+    let opened = whole::open(path)?;
+    let (head, length) = (&opened.head[..], opened.length);
+    if ply::is_ply(head) {
+        return Ok(Kind::Ply);
+    }
+    if stl::is_stl(head, length) {
+        return Ok(Kind::Stl);
+    }
+    if is_toml(head) {
+        return Ok(Kind::Toml);
+    }
+    let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
+    let is_data = first_words(head).is_some_and(|line| line.first().is_some_and(|b| b"+-.0123456789".contains(b)));
+    Ok(match extension.as_deref() {
+        // Numbers under a wrong name are points all the same.
+        _ if is_data && !head.contains(&0) => Kind::Text,
+        Some("ply") => Kind::Ply,
+        Some("stl") => Kind::Stl,
+        Some("toml") => Kind::Toml,
+        _ => Kind::Text,
+    })
+}
+
+/// Returns the first line that is neither blank nor a comment.
+fn first_words(head: &[u8]) -> Option<&[u8]> {
+    let head = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(head);
+    head.split(|&b| b == b'\n').map(<[u8]>::trim_ascii).find(|line| !line.is_empty() && !line.starts_with(b"#"))
+}
+
+/// Returns whether a file begins with `[table]` or `key = value`.
+fn is_toml(head: &[u8]) -> bool {
+    let Some(line) = first_words(head) else { return false };
+    let is_key = |b: &u8| b.is_ascii_alphanumeric() || b"_-.\"' ".contains(b);
+    let table = line.strip_prefix(b"[").and_then(|rest| rest.split(|&b| b == b']').next());
+    let key = line.iter().position(|&b| b == b'=').map(|at| &line[..at]);
+    let opens_table = line.contains(&b']')
+        && table.is_some_and(|name| !name.is_empty() && name.iter().all(|b| is_key(b) || *b == b'['));
+    opens_table || key.is_some_and(|key| !key.is_empty() && key.iter().all(is_key))
+}
+
+fn read_definition(path: &Path) -> Result<String, FormatError> {
+    let bytes = whole::open(path)?.read_all(path, MOST_DEFINITION_BYTES)?;
+    if bytes.trim_ascii().is_empty() {
+        return Err(FormatError::Empty { path: path.to_owned(), expected: "a surface definition" });
+    }
+    String::from_utf8(bytes).map_err(|error| {
+        let at = error.utf8_error().valid_up_to();
+        let bytes = error.as_bytes();
+        let line = 1 + bytes[..at].iter().filter(|&&b| b == b'\n').count() as u64;
+        FormatError::NotText { path: path.to_owned(), line, value: bytes[at] }
+    })
+}

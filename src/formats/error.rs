@@ -1,0 +1,377 @@
+//! What can be wrong with a file, said so that the reader of the message can mend it.
+
+use std::io;
+use std::path::PathBuf;
+
+use thiserror::Error;
+
+use super::number::LIMIT_MM;
+
+/// Why a file could not be read or written. Lines and columns count from 1, bytes from 0.
+#[derive(Debug, Error)]
+pub enum FormatError {
+    /// The file could not be opened or read.
+    #[error("{path}: cannot be read: {source}; check the name and the permissions")]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// The file is larger than what is read at all.
+    #[error("{path}: {found} is more than the limit of {limit} {unit}; thin the file out or split it")]
+    TooLarge {
+        /// The file.
+        path: PathBuf,
+        /// How many there are, or are said to be.
+        found: u64,
+        /// How many are read at most.
+        limit: u64,
+        /// What is counted: bytes, points, triangles.
+        unit: &'static str,
+    },
+    /// The file has no content at all.
+    #[error("{path}: the file is empty, expected {expected}; export it again")]
+    Empty {
+        /// The file.
+        path: PathBuf,
+        /// What was expected.
+        expected: &'static str,
+    },
+    /// The file is well formed and holds nothing.
+    #[error("{path}: a header but no {expected} after it; export the file again with its data")]
+    NoData {
+        /// The file.
+        path: PathBuf,
+        /// What was expected: points, triangles.
+        expected: &'static str,
+    },
+    /// A byte that no text file holds.
+    #[error(
+        "{path}, line {line}: expected text, found byte 0x{value:02x}: the file is binary or damaged; export the points as \
+         text, one point a line, or as PLY"
+    )]
+    NotText {
+        /// The file.
+        path: PathBuf,
+        /// Line of the byte.
+        line: u64,
+        /// The byte.
+        value: u8,
+    },
+    /// Text of two bytes a character.
+    #[error("{path}: expected plain text, found UTF-16; save the file as UTF-8")]
+    Utf16 {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A line so long that it cannot be a point.
+    #[error("{path}, line {line}: longer than {limit_bytes} bytes; expected one point a line")]
+    LineTooLong {
+        /// The file.
+        path: PathBuf,
+        /// The line.
+        line: u64,
+        /// The limit.
+        limit_bytes: usize,
+    },
+    /// Text where a number should be.
+    #[error(
+        "{path}, line {line}, column {column}: expected a number in millimetres, found {}; remove the text or give the \
+         column a header",
+        quoted(found)
+    )]
+    NotANumber {
+        /// The file.
+        path: PathBuf,
+        /// Line.
+        line: u64,
+        /// Column.
+        column: usize,
+        /// What stands there.
+        found: String,
+    },
+    /// NaN or an infinity.
+    #[error(
+        "{path}, line {line}, column {column}: expected a finite number in millimetres, found `{found}`; remove the line"
+    )]
+    NotFinite {
+        /// The file.
+        path: PathBuf,
+        /// Line.
+        line: u64,
+        /// Column.
+        column: usize,
+        /// What stands there.
+        found: String,
+    },
+    /// A number no part is large enough for.
+    #[error(
+        "{path}, line {line}, column {column}: expected at most {LIMIT_MM:e} mm in size, found `{found}`; correct the number \
+         or the unit"
+    )]
+    OutOfRange {
+        /// The file.
+        path: PathBuf,
+        /// Line.
+        line: u64,
+        /// Column.
+        column: usize,
+        /// What stands there.
+        found: String,
+    },
+    /// A comma that may separate decimals or thousands.
+    #[error(
+        "{path}, line {line}, column {column}: `{found}` may have a decimal comma or a thousands comma; write all numbers with a \
+         decimal point and without thousands separators"
+    )]
+    AmbiguousComma {
+        /// The file.
+        path: PathBuf,
+        /// Line.
+        line: u64,
+        /// Column.
+        column: usize,
+        /// What stands there.
+        found: String,
+    },
+    /// Decimal points and decimal commas in one file.
+    #[error(
+        "{path}, line {line}, column {column}: expected a number with a decimal {expected} like those before it, found \
+         `{found}`; write all numbers with a decimal point"
+    )]
+    DecimalMark {
+        /// The file.
+        path: PathBuf,
+        /// Line.
+        line: u64,
+        /// Column.
+        column: usize,
+        /// What stands there.
+        found: String,
+        /// Point or comma.
+        expected: &'static str,
+    },
+    /// Too few columns for a point.
+    #[error(
+        "{path}, line {line}: expected three columns x, y, z separated by comma, semicolon, tab or blank, found {columns}: \
+         {}; export the points with one of these separators",
+        quoted(found)
+    )]
+    TooFewColumns {
+        /// The file.
+        path: PathBuf,
+        /// Line.
+        line: u64,
+        /// How many there are.
+        columns: usize,
+        /// The line, shortened.
+        found: String,
+    },
+    /// A line with another number of columns than the first one.
+    #[error(
+        "{path}, line {line}: expected {expected} columns separated by {separator} as in line {first_line}, found {found}; \
+         correct or remove the line"
+    )]
+    ColumnCount {
+        /// The file.
+        path: PathBuf,
+        /// Line.
+        line: u64,
+        /// Columns of this line.
+        found: usize,
+        /// Columns of the first data line.
+        expected: usize,
+        /// Name of the separator.
+        separator: &'static str,
+        /// The first data line.
+        first_line: u64,
+    },
+    /// A header that does not fit the data under it.
+    #[error(
+        "{path}, line {line}: the header has {found} columns separated by {separator}, the data under it has {expected}; \
+         give every column one name"
+    )]
+    HeaderColumns {
+        /// The file.
+        path: PathBuf,
+        /// Line of the header.
+        line: u64,
+        /// Columns of the header.
+        found: usize,
+        /// Columns of the data.
+        expected: usize,
+        /// Name of the separator.
+        separator: &'static str,
+    },
+    /// A header from which the three coordinates cannot be told.
+    #[error("{path}, line {line}: the header {reason}; name exactly one column each x, y and z")]
+    HeaderNames {
+        /// The file.
+        path: PathBuf,
+        /// Line of the header.
+        line: u64,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A unit other than the millimetre.
+    #[error(
+        "{path}, line {line}: expected coordinates in mm, found the unit {}; convert the file to mm",
+        quoted(found)
+    )]
+    Unit {
+        /// The file.
+        path: PathBuf,
+        /// Line of the statement.
+        line: u64,
+        /// The unit as written.
+        found: String,
+    },
+    /// A text file that stops in the middle.
+    #[error(
+        "{path}, line {line}: the file is cut in the middle of a line, found {}; copy or export it again",
+        quoted(found)
+    )]
+    CutLine {
+        /// The file.
+        path: PathBuf,
+        /// The last line.
+        line: u64,
+        /// What there is of it, shortened.
+        found: String,
+    },
+    /// A file that stops before what it announced.
+    #[error("{path}, {place}: the file is cut, expected {expected}; copy or export it again")]
+    Cut {
+        /// The file.
+        path: PathBuf,
+        /// Line or byte.
+        place: String,
+        /// What should have followed.
+        expected: String,
+    },
+    /// Something else than the format asks for.
+    #[error("{path}, {place}: expected {expected}, found {}; export the file again", quoted(found))]
+    Unexpected {
+        /// The file.
+        path: PathBuf,
+        /// Line or byte.
+        place: String,
+        /// What the format asks for.
+        expected: String,
+        /// What stands there.
+        found: String,
+    },
+    /// A face that names a vertex which is not there.
+    #[error(
+        "{path}, {place}: face names vertex {index}, but there are {vertices}, counted from 0; export the mesh again"
+    )]
+    IndexOutOfRange {
+        /// The file.
+        path: PathBuf,
+        /// Line or byte.
+        place: String,
+        /// The index as it stands there.
+        index: f64,
+        /// Number of vertices.
+        vertices: u64,
+    },
+    /// A vertex that is no position.
+    #[error(
+        "{path}, {place}: expected {what} as a finite number of at most {LIMIT_MM:e} mm, found {value}; repair the mesh or the \
+         unit"
+    )]
+    BadCoordinate {
+        /// The file.
+        path: PathBuf,
+        /// Line or byte.
+        place: String,
+        /// Which coordinate.
+        what: &'static str,
+        /// What stands there.
+        value: f64,
+    },
+    /// The file is a good one of another kind.
+    #[error("{path}: expected {expected}, found {found}; {remedy}")]
+    WrongKind {
+        /// The file.
+        path: PathBuf,
+        /// What is wanted here.
+        expected: &'static str,
+        /// What the file is.
+        found: &'static str,
+        /// What to do.
+        remedy: &'static str,
+    },
+    /// A file could not be written; nothing of that name was changed.
+    #[error("{path}: cannot be written, {action}: {source}")]
+    Unwritable {
+        /// The file.
+        path: PathBuf,
+        /// What was being done.
+        action: &'static str,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// A row to be written holds NaN or an infinity.
+    #[error("{path}: row {row} of the result holds {value}, which is not a finite number; nothing was written")]
+    RowNotFinite {
+        /// The file.
+        path: PathBuf,
+        /// The row, from 1.
+        row: usize,
+        /// The value.
+        value: f64,
+    },
+    /// A value has no form in JSON.
+    #[error("{path}: cannot be written as JSON: {source}")]
+    Json {
+        /// The file.
+        path: PathBuf,
+        /// The reason.
+        source: serde_json::Error,
+    },
+}
+
+impl FormatError {
+    /// Returns whether the file merely ended too early: all there is of it is good.
+    pub fn is_cut(&self) -> bool {
+        matches!(self, Self::Cut { .. } | Self::CutLine { .. } | Self::Empty { .. })
+    }
+}
+
+/// Puts a piece of a file in backquotes; nothing there is called nothing.
+fn quoted(found: &str) -> String {
+    if found.is_empty() { "nothing".to_owned() } else { format!("`{found}`") }
+}
+
+/// Returns the beginning of a piece of a file, fit for a message: at most 40 characters, nothing unprintable.
+pub(super) fn excerpt(bytes: &[u8]) -> String {
+    const LONGEST: usize = 40;
+    let text = String::from_utf8_lossy(&bytes[..bytes.len().min(4 * LONGEST)]);
+    let mut short: String = text.trim_end().chars().take(LONGEST).flat_map(printable).collect();
+    if text.chars().count() > LONGEST {
+        short.push_str("...");
+    }
+    short
+}
+
+/// Returns a character as it is, or escaped if it would disturb a terminal.
+fn printable(c: char) -> impl Iterator<Item = char> {
+    let escaped = if c.is_control() { Some(c.escape_default()) } else { None };
+    let plain = if c.is_control() { None } else { Some(c) };
+    escaped.into_iter().flatten().chain(plain)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_piece_of_a_file_cannot_disturb_a_terminal() {
+        assert_eq!(excerpt(b"abc \r\n"), "abc");
+        assert_eq!(excerpt(b"\x1b[2J\xff"), "\\u{1b}[2J\u{fffd}");
+        assert_eq!(excerpt(&[b'a'; 1000]).len(), 43);
+        assert_eq!(quoted(""), "nothing");
+    }
+}

@@ -1,0 +1,406 @@
+//! How a text cloud is laid out: separator, columns, decimal mark, units. Found in its first lines, then enforced.
+
+use std::path::Path;
+
+use super::error::{FormatError, excerpt};
+use super::number::{Decimal, Evidence, evidence, looks_numeric};
+
+/// What stands between two columns.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Separator {
+    Comma,
+    Semicolon,
+    Tab,
+    /// Any run of blanks and tabs.
+    Blank,
+}
+
+impl Separator {
+    /// In the order in which they are tried: a semicolon or a tab is hardly ever anything else.
+    const ALL: [Self; 4] = [Self::Tab, Self::Semicolon, Self::Comma, Self::Blank];
+
+    /// Returns the byte that separates; for blanks one of the two.
+    pub(super) fn byte(self) -> u8 {
+        match self {
+            Self::Comma => b',',
+            Self::Semicolon => b';',
+            Self::Tab => b'\t',
+            Self::Blank => b' ',
+        }
+    }
+
+    /// Returns whether a byte may surround a field without belonging to it.
+    pub(super) fn pads(self, byte: u8) -> bool {
+        byte == b' ' || (byte == b'\t' && self != Self::Tab)
+    }
+
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::Comma => "comma",
+            Self::Semicolon => "semicolon",
+            Self::Tab => "tab",
+            Self::Blank => "blank",
+        }
+    }
+
+    fn separates(self, byte: u8) -> bool {
+        byte == self.byte() || (self == Self::Blank && byte == b'\t')
+    }
+}
+
+/// The columns of one line, trimmed and out of their quotes.
+pub(super) struct Fields<'a> {
+    rest: Option<&'a [u8]>,
+    separator: Separator,
+}
+
+impl<'a> Fields<'a> {
+    pub(super) fn of(line: &'a [u8], separator: Separator) -> Self {
+        let rest = if separator == Separator::Blank { line.trim_ascii() } else { line };
+        Self { rest: Some(rest), separator }
+    }
+}
+
+impl<'a> Iterator for Fields<'a> {
+    type Item = &'a [u8];
+
+    fn next(&mut self) -> Option<&'a [u8]> {
+        let rest = self.rest?;
+        let padding = rest.iter().take_while(|&&b| self.separator.pads(b)).count();
+        let start = &rest[padding..];
+        // A separator inside quotes does not count; a quote that is never closed is left in the field and found out there.
+        let closing = match start {
+            [b'"', inside @ ..] => inside.iter().position(|&b| b == b'"').map_or(0, |at| at + 1),
+            _ => 0,
+        };
+        let end = start[closing..].iter().position(|&b| self.separator.separates(b)).map(|at| at + closing);
+        self.rest = end.map(|at| &start[at + 1..]);
+        let field = start[..end.unwrap_or(start.len())].trim_ascii();
+        if self.separator == Separator::Blank {
+            self.rest = self.rest.map(<[u8]>::trim_ascii_start);
+        }
+        Some(field.strip_prefix(b"\"").and_then(|f| f.strip_suffix(b"\"")).map_or(field, <[u8]>::trim_ascii))
+    }
+}
+
+/// How to read every line of a cloud.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Layout {
+    pub(super) separator: Separator,
+    /// Where x, y and z stand, from 0.
+    pub(super) columns: [usize; 3],
+    /// How many columns every line has.
+    pub(super) count: usize,
+    pub(super) decimal: Decimal,
+    /// The first line with data, from 1.
+    pub(super) first_line: u64,
+}
+
+impl Layout {
+    /// Returns the x, y and z fields of a line and how many columns it has.
+    pub(super) fn pick<'a>(&self, line: &'a [u8]) -> ([&'a [u8]; 3], usize) {
+        let mut picked = [&line[..0]; 3];
+        let mut count = 0;
+        for field in Fields::of(line, self.separator) {
+            if let Some(axis) = self.columns.iter().position(|&column| column == count) {
+                picked[axis] = field;
+            }
+            count += 1;
+        }
+        (picked, count)
+    }
+
+    /// Settles the decimal mark by the first lines that tell it.
+    ///
+    /// Errors: the first number with a comma, if nothing tells what the commas mean.
+    pub(super) fn settle_decimal(&mut self, path: &Path, text: &[u8]) -> Result<(), FormatError> {
+        if self.separator == Separator::Comma && !text.contains(&b'"') {
+            return Ok(());
+        }
+        let mut doubtful = None;
+        for (number, line) in (self.first_line..).zip(text.split(|&b| b == b'\n')) {
+            if is_comment(line) {
+                continue;
+            }
+            let (fields, _) = self.pick(line);
+            for (field, column) in fields.iter().zip(self.columns) {
+                match evidence(field) {
+                    Evidence::Says(decimal) => {
+                        self.decimal = decimal;
+                        return Ok(());
+                    }
+                    Evidence::Ambiguous => doubtful = doubtful.or(Some((number, column + 1, *field))),
+                    Evidence::Nothing => {}
+                }
+            }
+        }
+        doubtful.map_or(Ok(()), |(line, column, field)| {
+            Err(FormatError::AmbiguousComma { path: path.to_owned(), line, column, found: excerpt(field) })
+        })
+    }
+}
+
+/// Returns whether a line is a comment.
+pub(super) fn is_comment(line: &[u8]) -> bool {
+    let line = line.trim_ascii_start();
+    line.starts_with(b"#") || line.starts_with(b"//")
+}
+
+/// What stands above the data, gathered line by line until the first point shows the layout.
+#[derive(Debug)]
+pub(super) struct Preamble<'p> {
+    path: &'p Path,
+    /// The last comment that names x, y and z: many programs comment their header out.
+    comment: Option<(u64, Vec<u8>)>,
+    header: Option<(u64, Vec<u8>)>,
+}
+
+impl<'p> Preamble<'p> {
+    pub(super) fn new(path: &'p Path) -> Self {
+        Self { path, comment: None, header: None }
+    }
+
+    /// Returns whether there was a header.
+    pub(super) fn has_header(&self) -> bool {
+        self.header.is_some()
+    }
+
+    /// Takes the next line and returns the layout if it is the first with data.
+    pub(super) fn take(&mut self, line: &[u8], number: u64) -> Result<Option<Layout>, FormatError> {
+        let content = line.trim_ascii();
+        if content.is_empty() {
+            return Ok(None);
+        }
+        if is_comment(content) {
+            self.take_comment(content, number)?;
+            return Ok(None);
+        }
+        let Some(separator) = data_separator(line) else {
+            return self.take_words(line, number).map(|()| None);
+        };
+        let count = Fields::of(line, separator).count();
+        let columns = self.columns(separator, count, number)?;
+        Ok(Some(Layout { separator, columns, count, decimal: Decimal::Point, first_line: number }))
+    }
+
+    /// Takes a line without a point in it: the header, or an error.
+    fn take_words(&mut self, line: &[u8], number: u64) -> Result<(), FormatError> {
+        let likely = likely_separator(line);
+        let fields: Vec<&[u8]> = Fields::of(line, likely).collect();
+        let is_header = self.header.is_none() && !fields.iter().any(|field| looks_numeric(field));
+        if is_header {
+            self.header = Some((number, line.to_vec()));
+            return Ok(());
+        }
+        let path = self.path.to_owned();
+        if fields.len() < 3 {
+            return Err(FormatError::TooFewColumns { path, line: number, columns: fields.len(), found: excerpt(line) });
+        }
+        let wrong = fields.iter().position(|field| !looks_numeric(field)).unwrap_or(0);
+        Err(FormatError::NotANumber { path, line: number, column: wrong + 1, found: excerpt(fields[wrong]) })
+    }
+
+    fn take_comment(&mut self, comment: &[u8], number: u64) -> Result<(), FormatError> {
+        let text = comment.trim_ascii_start();
+        let text = text.strip_prefix(b"//").unwrap_or(text).trim_ascii_start();
+        let start = text.iter().position(|&b| b != b'#').unwrap_or(text.len());
+        let text = text[start..].trim_ascii();
+        if let Some(unit) = unit_statement(text) {
+            return Err(FormatError::Unit { path: self.path.to_owned(), line: number, found: unit });
+        }
+        if named_axes(&names(text, likely_separator(text))).iter().all(|found| found.len() == 1) {
+            self.comment = Some((number, text.to_vec()));
+        }
+        Ok(())
+    }
+
+    /// Returns which columns hold x, y and z: those the header names, else the first three.
+    fn columns(&self, separator: Separator, count: usize, data_line: u64) -> Result<[usize; 3], FormatError> {
+        let path = || self.path.to_owned();
+        let (line, names) = match (&self.header, &self.comment) {
+            (Some((line, header)), _) => (*line, names(header, separator)),
+            (None, Some((line, comment))) => {
+                let own = if comment.contains(&separator.byte()) { separator } else { Separator::Blank };
+                (*line, Some(names(comment, own)).filter(|names| names.len() == count).unwrap_or_default())
+            }
+            (None, None) => (data_line, Vec::new()),
+        };
+        if self.header.is_some() && names.len() != count {
+            let separator = separator.name();
+            return Err(FormatError::HeaderColumns {
+                path: path(),
+                line,
+                found: names.len(),
+                expected: count,
+                separator,
+            });
+        }
+        let axes = named_axes(&names);
+        let columns =
+            chosen_columns(&axes).map_err(|reason| FormatError::HeaderNames { path: path(), line, reason })?;
+        for name in columns.iter().filter_map(|&column| names.get(column)) {
+            if let (_, Some(unit)) = split_unit(name)
+                && !is_millimetre(&unit)
+            {
+                return Err(FormatError::Unit { path: path(), line, found: unit });
+            }
+        }
+        Ok(columns)
+    }
+}
+
+/// Returns the separator under which a line is a point: three numbers first, or else three numbers anywhere.
+fn data_separator(line: &[u8]) -> Option<Separator> {
+    let numbers =
+        |separator, first: usize| Fields::of(line, separator).take(first).filter(|f| looks_numeric(f)).count();
+    let first_three = Separator::ALL.into_iter().find(|&separator| numbers(separator, 3) == 3);
+    first_three.or_else(|| Separator::ALL.into_iter().find(|&separator| numbers(separator, usize::MAX) >= 3))
+}
+
+/// Returns the separator a line of words seems to have.
+fn likely_separator(line: &[u8]) -> Separator {
+    let there = |separator: &Separator| line.contains(&separator.byte());
+    Separator::ALL.into_iter().find(there).unwrap_or(Separator::Blank)
+}
+
+/// Returns the names of the columns in lower case; a unit set off by a blank belongs to the name before it.
+fn names(header: &[u8], separator: Separator) -> Vec<String> {
+    let mut names: Vec<String> = Vec::new();
+    for field in Fields::of(header, separator) {
+        let name = String::from_utf8_lossy(field).to_lowercase();
+        match names.last_mut() {
+            Some(last) if separator == Separator::Blank && name.starts_with(['[', '(']) => *last += &name,
+            _ => names.push(name),
+        }
+    }
+    names
+}
+
+/// Returns, for x, y and z, the columns that bear the name.
+fn named_axes(names: &[String]) -> [Vec<usize>; 3] {
+    ["x", "y", "z"].map(|axis| {
+        let is_axis = |name: &String| {
+            let (base, _) = split_unit(name);
+            base.strip_prefix(axis).is_some_and(|rest| {
+                let rest = rest.trim_start_matches([' ', '_', '-', '.']);
+                ["", "coord", "coordinate", "pos", "position"].contains(&rest)
+            })
+        };
+        (0..names.len()).filter(|&column| is_axis(&names[column])).collect()
+    })
+}
+
+/// Chooses one column for each axis, or says what is wrong with the names.
+fn chosen_columns(axes: &[Vec<usize>; 3]) -> Result<[usize; 3], String> {
+    for (axis, found) in ["x", "y", "z"].iter().zip(axes) {
+        if found.len() > 1 {
+            return Err(format!("names {} columns {axis}", found.len()));
+        }
+    }
+    if let [[x], [y], [z]] = [&axes[0][..], &axes[1], &axes[2]] {
+        return Ok([*x, *y, *z]);
+    }
+    // Some are named: the first three columns are right only if the named ones stand where they belong.
+    for (place, (axis, found)) in ["x", "y", "z"].iter().zip(axes).enumerate() {
+        if found.first().is_some_and(|&column| column != place) {
+            return Err(format!("names column {} {axis} but not all of x, y and z", found[0] + 1));
+        }
+    }
+    Ok([0, 1, 2])
+}
+
+/// Splits a column's name in lower case into the name proper and the unit it states.
+fn split_unit(name: &str) -> (&str, Option<String>) {
+    let name = name.trim();
+    for (open, close) in [('[', ']'), ('(', ')')] {
+        if let (Some(at), true) = (name.rfind(open), name.ends_with(close)) {
+            let unit = name[at + 1..name.len() - 1].trim();
+            // Square brackets hold units by custom, round ones hold anything.
+            let states = open == '[' || is_millimetre(unit) || OTHER_UNITS.contains(&unit);
+            return if states { (base_of(&name[..at]), Some(unit.to_owned())) } else { (name, None) };
+        }
+    }
+    match name.rfind(['_', '/', ' ']) {
+        Some(at) if is_millimetre(&name[at + 1..]) || OTHER_UNITS.contains(&&name[at + 1..]) => {
+            (base_of(&name[..at]), Some(name[at + 1..].to_owned()))
+        }
+        _ => (name, None),
+    }
+}
+
+fn base_of(name: &str) -> &str {
+    name.trim_end_matches([' ', '_', '-', '.', '/'])
+}
+
+/// Returns the unit a comment such as "units: inch" states, if it is not the millimetre.
+fn unit_statement(comment: &[u8]) -> Option<String> {
+    let text = String::from_utf8_lossy(comment).to_lowercase();
+    let after = &text[text.find("unit")? + 4..];
+    let after = after.strip_prefix('s').unwrap_or(after).trim_start().strip_prefix([':', '='])?.trim_start();
+    let end = after.find(|c: char| !c.is_alphabetic()).unwrap_or(after.len());
+    OTHER_UNITS.contains(&&after[..end]).then(|| after[..end].to_owned())
+}
+
+fn is_millimetre(unit: &str) -> bool {
+    ["mm", "millimetre", "millimetres", "millimeter", "millimeters"].contains(&unit)
+}
+
+/// Units of length that are not the millimetre, in lower case.
+#[rustfmt::skip]
+const OTHER_UNITS: [&str; 34] = [
+    "m", "metre", "metres", "meter", "meters", "dm", "cm", "centimetre", "centimetres", "centimeter", "centimeters", "km", "um", "\u{b5}m", "\u{3bc}m", "micron", "microns",
+    "micrometre", "micrometres", "micrometer", "micrometers", "nm", "nanometre", "nanometres", "nanometer", "nanometers", "in", "inch", "inches", "ft", "feet", "mil", "mils", "thou",
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn fields(line: &str, separator: Separator) -> Vec<String> {
+        Fields::of(line.as_bytes(), separator).map(|f| String::from_utf8_lossy(f).into_owned()).collect()
+    }
+
+    #[test]
+    fn a_line_is_split_at_separators_outside_quotes() {
+        assert_eq!(fields(" 1 , \"2,5\",3", Separator::Comma), ["1", "2,5", "3"]);
+        assert_eq!(fields("\ta b\t\t", Separator::Tab), ["", "a b", "", ""]);
+        assert_eq!(fields("  1 \t 2   3  ", Separator::Blank), ["1", "2", "3"]);
+        assert_eq!(fields("1;\"2;3", Separator::Semicolon), ["1", "\"2", "3"]);
+        assert_eq!(fields("", Separator::Comma), [""]);
+    }
+
+    #[test]
+    fn the_separator_is_the_one_that_gives_a_point() {
+        let cases = [
+            ("1,2,3", Separator::Comma),
+            ("1, 2, 3", Separator::Comma),
+            ("1,5;2,5;3,5", Separator::Semicolon),
+            ("1,5 2,5 3,5", Separator::Blank),
+            ("1,5\t2,5\t3,5", Separator::Tab),
+            ("\t1 2 3", Separator::Blank),
+            ("P1\tok\t2,512.1\t2,217.6\t2,370.7", Separator::Tab),
+            ("nan inf 1", Separator::Blank),
+        ];
+        for (line, separator) in cases {
+            assert_eq!(data_separator(line.as_bytes()), Some(separator), "{line}");
+        }
+        assert_eq!(data_separator(b"x,y,z"), None);
+        assert_eq!(data_separator(b"1,2"), None);
+    }
+
+    #[test]
+    fn names_of_columns_are_understood_with_their_units() {
+        let axes = |header: &str| named_axes(&names(header.as_bytes(), likely_separator(header.as_bytes())));
+        let here = |columns: [usize; 3]| columns.map(|c| vec![c]);
+        assert_eq!(axes("x,y,z"), here([0, 1, 2]));
+        assert_eq!(axes("id;Z_mm;Y [mm];X(mm);x_res"), here([3, 2, 1]));
+        assert_eq!(axes("n x [mm] y [mm] z [mm]"), here([1, 2, 3]));
+        assert_eq!(axes("X coordinate,Y coordinate,Z coordinate"), here([0, 1, 2]));
+        assert_eq!(axes("nx,ny,nz"), here([0; 3]).map(|_| Vec::<usize>::new()));
+        assert_eq!(split_unit("x_inch"), ("x", Some("inch".to_owned())));
+        assert_eq!(split_unit("x (nominal)"), ("x (nominal)", None));
+        assert_eq!(unit_statement(b"Units : Inch, made by hand"), Some("inch".to_owned()));
+        assert_eq!(unit_statement(b"unit = mm"), None);
+        assert_eq!(unit_statement(b"unity"), None);
+    }
+}

@@ -1,0 +1,174 @@
+//! Numbers as people and programs write them: decimal point or comma, thousands separated or not.
+
+/// Largest coordinate that is believed, in millimetres: ten kilometres.
+pub const LIMIT_MM: f64 = 1e7;
+
+/// Longest number with marks to be removed or replaced; plain numbers may be longer.
+const LONGEST_MARKED: usize = 64;
+
+/// The mark between the whole and the fraction.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Decimal {
+    /// 2512.12, or 2,512.12 where the comma does not separate columns.
+    Point,
+    /// 2512,12 or 2.512,12.
+    Comma,
+}
+
+/// Why a field is not a coordinate.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum NumberFault {
+    Text,
+    NotFinite,
+    OutOfRange,
+    AmbiguousComma,
+    OtherMark,
+}
+
+/// What a field tells about the decimal mark of its file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Evidence {
+    Says(Decimal),
+    Ambiguous,
+    Nothing,
+}
+
+/// Returns the value of a field, in millimetres.
+///
+/// Accepted are an optional sign, digits with at most one decimal mark, and an optional exponent of ten; besides, thousands
+/// separated by the other mark if the decimal mark is there too, so that 2,512 is never taken for a number in silence.
+pub(super) fn coordinate(field: &[u8], decimal: Decimal) -> Result<f64, NumberFault> {
+    let value = match (decimal, field.contains(&b','), field.contains(&b'.')) {
+        (Decimal::Point, false, _) | (Decimal::Comma, false, false) => plain(field)?,
+        (Decimal::Comma, true, false) => plain_with_point(field, b',', None)?,
+        (Decimal::Point, true, true) => plain_with_point(field, b'.', Some(b','))?,
+        (Decimal::Comma, true, true) => plain_with_point(field, b',', Some(b'.'))?,
+        (Decimal::Point, true, false) if is_one_group(field) => return Err(NumberFault::AmbiguousComma),
+        (Decimal::Point, true, false) => {
+            return Err(if looks_numeric(field) { NumberFault::OtherMark } else { NumberFault::Text });
+        }
+        (Decimal::Comma, false, true) => {
+            return Err(if plain(field).is_ok() { NumberFault::OtherMark } else { NumberFault::Text });
+        }
+    };
+    if is_believable(value) { Ok(value) } else { Err(NumberFault::OutOfRange) }
+}
+
+/// Returns whether a value may be a coordinate: not NaN, not infinite, not astronomical.
+#[inline]
+pub(super) fn is_believable(value: f64) -> bool {
+    value.abs() <= LIMIT_MM
+}
+
+/// Reads a number that may be NaN or infinite, for columns whose values are not used.
+pub(super) fn any_number(field: &[u8]) -> Option<f64> {
+    fast_float2::parse(field).ok()
+}
+
+/// Returns whether a field is a number in any notation, NaN and infinity included.
+pub(super) fn looks_numeric(field: &[u8]) -> bool {
+    any_number(field).is_some() || plain_with_point(field, b',', None).is_ok() || {
+        let grouped = |mark, group| plain_with_point(field, mark, Some(group)).is_ok();
+        grouped(b'.', b',') || grouped(b',', b'.') || is_one_group(field)
+    }
+}
+
+/// Returns what a field tells about the decimal mark.
+pub(super) fn evidence(field: &[u8]) -> Evidence {
+    let last = |mark: u8| field.iter().rposition(|&b| b == mark);
+    let count = |mark: u8| field.iter().filter(|&&b| b == mark).count();
+    match (last(b'.'), last(b',')) {
+        _ if !looks_numeric(field) => Evidence::Nothing,
+        (None, None) => Evidence::Nothing,
+        (Some(_), None) => Evidence::Says(Decimal::Point),
+        (None, Some(_)) if count(b',') > 1 || is_one_group(field) => Evidence::Ambiguous,
+        (None, Some(_)) => Evidence::Says(Decimal::Comma),
+        (Some(dot), Some(comma)) if dot > comma => Evidence::Says(Decimal::Point),
+        (Some(_), Some(_)) => Evidence::Says(Decimal::Comma),
+    }
+}
+
+/// Reads a number with a decimal point and nothing else in it.
+fn plain(field: &[u8]) -> Result<f64, NumberFault> {
+    let value: f64 = fast_float2::parse(field).map_err(|_| NumberFault::Text)?;
+    let spelt_out = field.iter().any(|b| matches!(b, b'n' | b'N'));
+    // A number of too many digits overflows to infinity; that is a matter of range.
+    if spelt_out { Err(NumberFault::NotFinite) } else { Ok(value) }
+}
+
+/// Reads a number after taking out the thousands separators and putting a point for the decimal mark.
+fn plain_with_point(field: &[u8], mark: u8, group: Option<u8>) -> Result<f64, NumberFault> {
+    let at = field.iter().position(|&b| b == mark).ok_or(NumberFault::Text)?;
+    let (whole, fraction) = (&field[..at], &field[at + 1..]);
+    let grouped_well = group.is_none_or(|g| is_grouped(whole, g));
+    if field.len() > LONGEST_MARKED || !grouped_well || fraction.contains(&b'.') || fraction.contains(&b',') {
+        return Err(NumberFault::Text);
+    }
+    let mut text = [0; LONGEST_MARKED];
+    let mut length = 0;
+    for &byte in field.iter().filter(|&&b| Some(b) != group) {
+        text[length] = if byte == mark { b'.' } else { byte };
+        length += 1;
+    }
+    plain(&text[..length])
+}
+
+/// Returns whether digits come in threes, as in -1,234,567.
+fn is_grouped(whole: &[u8], group: u8) -> bool {
+    let digits = whole.strip_prefix(b"-").or(whole.strip_prefix(b"+")).unwrap_or(whole);
+    let mut parts = digits.split(|&b| b == group);
+    let first = parts.next().unwrap_or_default();
+    let mut rest = parts.peekable();
+    let well_begun = matches!(first.len(), 1..=3) && first[0] != b'0' && first.iter().all(u8::is_ascii_digit);
+    well_begun && rest.peek().is_some() && rest.all(|part| part.len() == 3 && part.iter().all(u8::is_ascii_digit))
+}
+
+/// Returns whether a field such as 2,512 may be read in two ways.
+fn is_one_group(field: &[u8]) -> bool {
+    is_grouped(field, b',')
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_notation_has_one_meaning_or_none() {
+        let point = |text: &str| coordinate(text.as_bytes(), Decimal::Point);
+        let comma = |text: &str| coordinate(text.as_bytes(), Decimal::Comma);
+        for (text, value) in [("1", 1.0), ("+.5", 0.5), ("-3.", -3.0), ("1e3", 1000.0), ("-2,512.1218", -2512.1218)] {
+            assert_eq!(point(text), Ok(value), "{text}");
+        }
+        for (text, value) in
+            [("1", 1.0), ("2,5", 2.5), ("-2,512", -2.512), ("1.234.567,5", 1234567.5), ("1,5e2", 150.0)]
+        {
+            assert_eq!(comma(text), Ok(value), "{text}");
+        }
+        let text = ["", "-", ".", "abc", "0x10", "1_0", "1e", "1 2", "12,34.5", "1,2,3", "1.2.3", "0,123.4"];
+        for text in text {
+            assert_eq!(point(text), Err(NumberFault::Text), "{text}");
+        }
+        for text in ["nan", "-NaN", "inf", "-Infinity"] {
+            assert_eq!(point(text), Err(NumberFault::NotFinite), "{text}");
+        }
+        for text in ["1e300", "1e400", "-10000001"] {
+            assert_eq!(point(text), Err(NumberFault::OutOfRange), "{text}");
+        }
+        assert_eq!(point("2,512"), Err(NumberFault::AmbiguousComma));
+        assert_eq!(point("2,5"), Err(NumberFault::OtherMark));
+        assert_eq!(comma("2.5"), Err(NumberFault::OtherMark));
+    }
+
+    #[test]
+    fn a_field_tells_the_mark_only_if_it_can() {
+        let says = |text: &str| evidence(text.as_bytes());
+        assert_eq!(says("1.5"), Evidence::Says(Decimal::Point));
+        assert_eq!(says("2,512.1"), Evidence::Says(Decimal::Point));
+        assert_eq!(says("2.512,1"), Evidence::Says(Decimal::Comma));
+        assert_eq!(says("0,123"), Evidence::Says(Decimal::Comma));
+        assert_eq!(says("1234,567"), Evidence::Says(Decimal::Comma));
+        assert_eq!(says("12,345"), Evidence::Ambiguous);
+        assert_eq!(says("12"), Evidence::Nothing);
+        assert_eq!(says("a,b"), Evidence::Nothing);
+    }
+}

@@ -1,0 +1,594 @@
+//! Point clouds and meshes in PLY: ascii, binary little endian, binary big endian.
+//!
+//! Of the elements, `vertex` and `face` are read and all others skipped; of their properties, x y z, nx ny nz and the list of
+//! vertex indices. Counts in the header are never believed further than the bytes that are there.
+//! Format: G. Turk, The PLY Polygon File Format, 1994.
+
+use std::cell::{Cell, RefCell};
+use std::path::Path;
+
+use super::error::{FormatError, excerpt};
+use super::number::{any_number, is_believable};
+use super::whole::{is_degenerate, open};
+use crate::geometry::{Point, Vector};
+
+/// What a PLY file holds.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PlyFile {
+    /// The vertices in the order of the file, in millimetres.
+    pub points: Vec<Point>,
+    /// One direction a vertex, of unit length or zero where the file has none, if the file has nx, ny, nz.
+    pub normals: Option<Vec<Vector>>,
+    /// Corner indices of the triangles; a polygon is fanned from its first corner, which suits convex ones.
+    pub triangles: Vec<[u32; 3]>,
+    /// How many triangles were left out because they span no area.
+    pub degenerate: usize,
+}
+
+/// Reads a PLY file of at most 1 GiB.
+///
+/// # Errors
+/// A file that is not readable, no PLY, malformed, cut, or with content after its end; a vertex that is not finite or beyond 1e7
+/// mm; a face with fewer than three corners or with a corner that is no vertex.
+pub fn read_ply(path: impl AsRef<Path>) -> Result<PlyFile, FormatError> {
+    open(path.as_ref())?.parse(path.as_ref(), parse_ply)
+}
+
+/// Parses the bytes of a PLY file; `path` is only what messages call it.
+///
+/// # Errors
+/// Those of [`read_ply`].
+pub fn parse_ply(path: &Path, bytes: &[u8]) -> Result<PlyFile, FormatError> {
+    let header = Header::parse(path, bytes)?;
+    let data = &bytes[header.length..];
+    match header.encoding {
+        Encoding::Ascii => header.read(path, &mut Words::new(data, header.lines)),
+        Encoding::Little => header.read(path, &mut Bytes::<false>::new(data, header.length)),
+        Encoding::Big => header.read(path, &mut Bytes::<true>::new(data, header.length)),
+    }
+}
+
+/// Returns whether a file begins like PLY.
+pub(super) fn is_ply(head: &[u8]) -> bool {
+    head.strip_prefix(b"ply").is_some_and(|rest| rest.trim_ascii_start().len() < rest.len() || rest.is_empty())
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Encoding {
+    Ascii,
+    Little,
+    Big,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Scalar {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    F32,
+    F64,
+}
+
+impl Scalar {
+    fn named(name: &[u8]) -> Option<Self> {
+        Some(match name {
+            b"char" | b"int8" => Self::I8,
+            b"uchar" | b"uint8" => Self::U8,
+            b"short" | b"int16" => Self::I16,
+            b"ushort" | b"uint16" => Self::U16,
+            b"int" | b"int32" => Self::I32,
+            b"uint" | b"uint32" => Self::U32,
+            b"float" | b"float32" => Self::F32,
+            b"double" | b"float64" => Self::F64,
+            _ => return None,
+        })
+    }
+
+    fn size(self) -> usize {
+        match self {
+            Self::I8 | Self::U8 => 1,
+            Self::I16 | Self::U16 => 2,
+            Self::I32 | Self::U32 | Self::F32 => 4,
+            Self::F64 => 8,
+        }
+    }
+
+    fn is_integer(self) -> bool {
+        !matches!(self, Self::F32 | Self::F64)
+    }
+}
+
+/// A property of an element.
+#[derive(Clone, Debug, PartialEq)]
+struct Property {
+    name: String,
+    /// The type of the length, if it is a list.
+    list: Option<Scalar>,
+    scalar: Scalar,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+struct Element {
+    name: String,
+    count: u64,
+    properties: Vec<Property>,
+}
+
+impl Element {
+    fn position(&self, name: &str) -> Option<usize> {
+        self.properties.iter().position(|property| property.name == name)
+    }
+
+    /// Returns where three scalar properties stand, if all are there.
+    fn triple(&self, names: [&str; 3]) -> Option<[usize; 3]> {
+        let found = names.map(|name| self.position(name).filter(|&at| self.properties[at].list.is_none()));
+        if let [Some(a), Some(b), Some(c)] = found { Some([a, b, c]) } else { None }
+    }
+
+    /// Returns the fewest bytes one item takes.
+    fn least_size(&self, encoding: Encoding) -> usize {
+        let size = |p: &Property| if encoding == Encoding::Ascii { 2 } else { p.list.unwrap_or(p.scalar).size() };
+        self.properties.iter().map(size).sum::<usize>().max(1)
+    }
+}
+
+/// The header of a file.
+struct Header {
+    encoding: Encoding,
+    elements: Vec<Element>,
+    /// Bytes and lines of the header.
+    length: usize,
+    lines: u64,
+}
+
+impl Header {
+    fn parse(path: &Path, bytes: &[u8]) -> Result<Self, FormatError> {
+        if bytes.is_empty() {
+            return Err(FormatError::Empty { path: path.to_owned(), expected: "a PLY header" });
+        }
+        let mut header = Self { encoding: Encoding::Ascii, elements: Vec::new(), length: 0, lines: 0 };
+        let mut encoding = None;
+        loop {
+            let line = header.next_line(path, &bytes[header.length..])?;
+            let number = header.lines;
+            let fault = |expected: &str| header_fault(path, number, expected, line);
+            let words: Vec<&[u8]> = line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty()).collect();
+            match words[..] {
+                [b"ply"] if number == 1 => {}
+                _ if number == 1 => return Err(fault("`ply` in a line of its own")),
+                [b"format", name, b"1.0"] if encoding.is_none() => {
+                    let known = "format ascii, binary_little_endian or binary_big_endian";
+                    encoding = Some(Encoding::named(name).ok_or_else(|| fault(known))?);
+                }
+                [b"comment" | b"obj_info", ..] | [] => {}
+                _ if encoding.is_none() => return Err(fault("`format ascii 1.0` or another format")),
+                [b"end_header"] => break,
+                _ => header.declare(&words).map_err(fault)?,
+            }
+        }
+        header.encoding = encoding.unwrap_or(Encoding::Ascii);
+        header.check(path)?;
+        Ok(header)
+    }
+
+    /// Takes the next line of the header, which must have its end.
+    fn next_line<'b>(&mut self, path: &Path, rest: &'b [u8]) -> Result<&'b [u8], FormatError> {
+        let most = rest.len().min(LONGEST_LINE);
+        let end = rest[..most].iter().position(|&b| b == b'\n');
+        let line = rest[..end.unwrap_or(most)].trim_ascii();
+        let number = self.lines + 1;
+        let Some(end) = end else {
+            let may_be_ply = number > 1 || b"ply".starts_with(line);
+            return Err(if most < LONGEST_LINE && may_be_ply {
+                let expected = "the rest of the header, up to `end_header`".to_owned();
+                FormatError::Cut { path: path.to_owned(), place: format!("line {number}"), expected }
+            } else if may_be_ply {
+                header_fault(path, number, "a short line of a PLY header", line)
+            } else {
+                header_fault(path, number, "`ply` in a line of its own", line)
+            });
+        };
+        self.length += end + 1;
+        self.lines = number;
+        if self.length > LONGEST_HEADER {
+            return Err(header_fault(path, number, "a header of at most 32 KiB", b"a longer one"));
+        }
+        Ok(line)
+    }
+
+    /// Takes a line that declares an element or a property; the error is what was expected.
+    fn declare(&mut self, words: &[&[u8]]) -> Result<(), &'static str> {
+        let text = |word: &[u8]| String::from_utf8_lossy(word).into_owned();
+        let (name, list, scalar) = match *words {
+            [b"element", name, count] => {
+                let count = std::str::from_utf8(count).ok().and_then(|c| c.parse().ok());
+                let count = count.ok_or("an element with a count, as `element vertex 100`")?;
+                self.elements.push(Element { name: text(name), count, properties: Vec::new() });
+                return Ok(());
+            }
+            [b"property", b"list", length, scalar, name] => {
+                let length = Scalar::named(length).filter(|l| l.is_integer()).ok_or("a list with an integer length")?;
+                (text(name), Some(length), scalar)
+            }
+            [b"property", scalar, name] => (text(name), None, scalar),
+            _ => return Err("comment, element, property or end_header"),
+        };
+        let scalar = Scalar::named(scalar).ok_or("a type such as float, double, uchar or int")?;
+        let element = self.elements.last_mut().ok_or("an element before its properties")?;
+        if element.position(&name).is_some() {
+            return Err("a property of another name than those before it");
+        }
+        element.properties.push(Property { name, list, scalar });
+        Ok(())
+    }
+
+    /// Checks that there is something to read.
+    fn check(&self, path: &Path) -> Result<(), FormatError> {
+        let fault = |expected: &str, found: &str| FormatError::Unexpected {
+            path: path.to_owned(),
+            place: format!("header of {} lines", self.lines),
+            expected: expected.to_owned(),
+            found: found.to_owned(),
+        };
+        let vertices: Vec<&Element> = self.elements.iter().filter(|e| e.name == "vertex").collect();
+        let [vertex] = vertices[..] else {
+            return Err(fault("one element vertex", &format!("{} of them", vertices.len())));
+        };
+        if vertex.triple(["x", "y", "z"]).is_none() {
+            return Err(fault("scalar properties x, y and z of element vertex", "others only"));
+        }
+        if vertex.count == 0 {
+            return Err(FormatError::NoData { path: path.to_owned(), expected: "vertices" });
+        }
+        let limit = u64::from(u32::MAX);
+        if vertex.count > limit {
+            let (path, found) = (path.to_owned(), vertex.count);
+            return Err(FormatError::TooLarge { path, found, limit, unit: "vertices" });
+        }
+        match self.elements.iter().find(|e| e.name == "face").and_then(indices_of) {
+            Some(indices) if !indices.scalar.is_integer() => {
+                Err(fault("vertex indices of an integer type", "a float type"))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Reads all elements in the order in which they were declared.
+    fn read(&self, path: &Path, source: &mut impl Source) -> Result<PlyFile, FormatError> {
+        let mut file = PlyFile::default();
+        let vertices = self.elements.iter().find(|e| e.name == "vertex").map_or(0, |e| e.count);
+        // An element without properties has no bytes, so that its count bounds nothing.
+        for element in self.elements.iter().filter(|e| !e.properties.is_empty()) {
+            let reading = Reading { path, element, room: source.remaining() / element.least_size(self.encoding) };
+            match element.name.as_str() {
+                "vertex" => reading.vertices(source, &mut file)?,
+                "face" if indices_of(element).is_some() => reading.faces(source, &mut file.triangles, vertices)?,
+                _ => reading.each(source, |_, _, _| Ok(()), |_, _| Ok(()))?,
+            }
+        }
+        source.finish().map_err(|fault| fault.into_error(path, "the end of the file".to_owned()))?;
+        let before = file.triangles.len();
+        let points = &file.points;
+        file.triangles.retain(|t| !is_degenerate(t.map(|corner| &points[corner as usize])));
+        file.degenerate = before - file.triangles.len();
+        Ok(file)
+    }
+}
+
+fn header_fault(path: &Path, line: u64, expected: &str, found: &[u8]) -> FormatError {
+    let (path, place) = (path.to_owned(), format!("line {line}"));
+    FormatError::Unexpected { path, place, expected: expected.to_owned(), found: excerpt(found) }
+}
+
+/// Longest beginning of a number that a cut may leave.
+const LONGEST_WORD: usize = 64;
+/// Longest line of a header.
+const LONGEST_LINE: usize = 4096;
+/// Longest header; less than what is read of a file at first.
+const LONGEST_HEADER: usize = 32 << 10;
+
+impl Encoding {
+    fn named(name: &[u8]) -> Option<Self> {
+        match name {
+            b"ascii" => Some(Self::Ascii),
+            b"binary_little_endian" => Some(Self::Little),
+            b"binary_big_endian" => Some(Self::Big),
+            _ => None,
+        }
+    }
+}
+
+/// Returns the list of vertex indices of an element face.
+fn indices_of(face: &Element) -> Option<&Property> {
+    let is_indices = |p: &&Property| p.list.is_some() && matches!(p.name.as_str(), "vertex_indices" | "vertex_index");
+    face.properties.iter().find(is_indices)
+}
+
+/// One element while it is being read.
+struct Reading<'a> {
+    path: &'a Path,
+    element: &'a Element,
+    /// How many items the bytes left can hold at most.
+    room: usize,
+}
+
+impl Reading<'_> {
+    /// Walks over all items: `value` is told the property, the place in its list and the value; `done` closes the item.
+    fn each<S: Source>(
+        &self,
+        source: &mut S,
+        mut value: impl FnMut(usize, f64, &S) -> Result<(), FormatError>,
+        mut done: impl FnMut(u64, &S) -> Result<(), FormatError>,
+    ) -> Result<(), FormatError> {
+        let Element { name, count, properties } = self.element;
+        for item in 0..*count {
+            let expected = || format!("{name} {} of {count}", item + 1);
+            let lost = |fault: Fault| fault.into_error(self.path, expected());
+            source.begin_item().map_err(lost)?;
+            for (at, property) in properties.iter().enumerate() {
+                let Some(length_type) = property.list else {
+                    value(at, source.scalar(property.scalar).map_err(lost)?, source)?;
+                    continue;
+                };
+                let length = source.scalar(length_type).map_err(lost)?;
+                if !(length >= 0.0 && length.fract() == 0.0) {
+                    let wanted = format!("the length of list {} of {}", property.name, expected());
+                    return Err(self.unexpected(source, wanted, format!("{length}")));
+                }
+                // A list longer than the file ends with the file, so that the length needs no limit.
+                for _ in 0..length as u64 {
+                    value(at, source.scalar(property.scalar).map_err(lost)?, source)?;
+                }
+            }
+            source.end_item().map_err(lost)?;
+            done(item, source)?;
+        }
+        Ok(())
+    }
+
+    fn vertices(&self, source: &mut impl Source, file: &mut PlyFile) -> Result<(), FormatError> {
+        let capacity = self.room.min(self.element.count as usize);
+        let position = self.element.triple(["x", "y", "z"]).unwrap_or_default();
+        let direction = self.element.triple(["nx", "ny", "nz"]);
+        let mut points = Vec::with_capacity(capacity);
+        let mut normals = Vec::with_capacity(if direction.is_some() { capacity } else { 0 });
+        // x, y, z, nx, ny, nz of the vertex at hand; the normal stays zero where there is none.
+        let columns = [position, direction.unwrap_or([usize::MAX; 3])].concat();
+        let values = Cell::new([0.0; 6]);
+        self.each(
+            source,
+            |at, value, source| {
+                let Some(slot) = columns.iter().position(|&column| column == at) else { return Ok(()) };
+                if !is_believable(value) {
+                    let what = ["x", "y", "z", "nx", "ny", "nz"][slot];
+                    let (path, place) = (self.path.to_owned(), source.place());
+                    return Err(FormatError::BadCoordinate { path, place, what, value });
+                }
+                let mut all = values.get();
+                all[slot] = value;
+                values.set(all);
+                Ok(())
+            },
+            |_, _| {
+                let [x, y, z, nx, ny, nz] = values.get();
+                points.push(Point::new(x, y, z));
+                if direction.is_some() {
+                    normals.push(Vector::new(nx, ny, nz).try_normalize(0.0).unwrap_or_default());
+                }
+                Ok(())
+            },
+        )?;
+        file.points = points;
+        file.normals = direction.map(|_| normals);
+        Ok(())
+    }
+
+    fn faces(&self, source: &mut impl Source, triangles: &mut Vec<[u32; 3]>, vertices: u64) -> Result<(), FormatError> {
+        let indices = self.element.properties.iter().position(|p| Some(p) == indices_of(self.element));
+        let polygon = RefCell::new(Vec::new());
+        self.each(
+            source,
+            |at, value, source| {
+                if Some(at) == indices {
+                    if !(value >= 0.0 && value < vertices as f64 && value.fract() == 0.0) {
+                        let (path, place) = (self.path.to_owned(), source.place());
+                        return Err(FormatError::IndexOutOfRange { path, place, index: value, vertices });
+                    }
+                    polygon.borrow_mut().push(value as u32);
+                }
+                Ok(())
+            },
+            |item, source| {
+                let mut corners = polygon.borrow_mut();
+                if corners.len() < 3 {
+                    let wanted = format!("at least 3 corners of face {}", item + 1);
+                    return Err(self.unexpected(source, wanted, format!("{}", corners.len())));
+                }
+                triangles.extend(corners[1..].windows(2).map(|edge| [corners[0], edge[0], edge[1]]));
+                corners.clear();
+                Ok(())
+            },
+        )
+    }
+
+    fn unexpected(&self, source: &impl Source, expected: String, found: String) -> FormatError {
+        FormatError::Unexpected { path: self.path.to_owned(), place: source.place(), expected, found }
+    }
+}
+
+/// Why the next value could not be had.
+struct Fault {
+    place: String,
+    /// What stands there; nothing if the file is at its end.
+    found: Option<String>,
+}
+
+impl Fault {
+    fn into_error(self, path: &Path, expected: String) -> FormatError {
+        let (path, place) = (path.to_owned(), self.place);
+        match self.found {
+            Some(found) => FormatError::Unexpected { path, place, expected, found },
+            None => FormatError::Cut { path, place, expected },
+        }
+    }
+}
+
+/// Where values come from, one after the other.
+trait Source {
+    fn begin_item(&mut self) -> Result<(), Fault>;
+    fn scalar(&mut self, scalar: Scalar) -> Result<f64, Fault>;
+    fn end_item(&mut self) -> Result<(), Fault>;
+    /// Checks that nothing is left.
+    fn finish(&mut self) -> Result<(), Fault>;
+    fn remaining(&self) -> usize;
+    fn place(&self) -> String;
+}
+
+/// Values in binary.
+struct Bytes<'a, const BIG: bool> {
+    data: &'a [u8],
+    at: usize,
+    /// Where the last value began.
+    last: usize,
+    /// Where the data begin in the file.
+    start: usize,
+}
+
+impl<'a, const BIG: bool> Bytes<'a, BIG> {
+    fn new(data: &'a [u8], start: usize) -> Self {
+        Self { data, at: 0, last: 0, start }
+    }
+
+    fn take<const N: usize>(&mut self) -> Result<[u8; N], Fault> {
+        let Some(bytes) = self.data[self.at..].first_chunk::<N>() else {
+            return Err(Fault { place: format!("byte {}", self.start + self.data.len()), found: None });
+        };
+        self.last = self.at;
+        self.at += N;
+        let mut bytes = *bytes;
+        if BIG {
+            bytes.reverse();
+        }
+        Ok(bytes)
+    }
+}
+
+impl<const BIG: bool> Source for Bytes<'_, BIG> {
+    fn begin_item(&mut self) -> Result<(), Fault> {
+        Ok(())
+    }
+
+    #[inline]
+    fn scalar(&mut self, scalar: Scalar) -> Result<f64, Fault> {
+        Ok(match scalar {
+            Scalar::I8 => i8::from_le_bytes(self.take()?).into(),
+            Scalar::U8 => u8::from_le_bytes(self.take()?).into(),
+            Scalar::I16 => i16::from_le_bytes(self.take()?).into(),
+            Scalar::U16 => u16::from_le_bytes(self.take()?).into(),
+            Scalar::I32 => i32::from_le_bytes(self.take()?).into(),
+            Scalar::U32 => u32::from_le_bytes(self.take()?).into(),
+            Scalar::F32 => f32::from_le_bytes(self.take()?).into(),
+            Scalar::F64 => f64::from_le_bytes(self.take()?),
+        })
+    }
+
+    fn end_item(&mut self) -> Result<(), Fault> {
+        Ok(())
+    }
+
+    fn finish(&mut self) -> Result<(), Fault> {
+        // A newline after the data does no harm; anything more means that the counts are wrong.
+        let rest = self.data[self.at..].trim_ascii();
+        let found = format!("{} bytes more", rest.len());
+        if rest.is_empty() {
+            Ok(())
+        } else {
+            Err(Fault { place: format!("byte {}", self.start + self.at), found: Some(found) })
+        }
+    }
+
+    fn remaining(&self) -> usize {
+        self.data.len() - self.at
+    }
+
+    fn place(&self) -> String {
+        format!("byte {}", self.start + self.last)
+    }
+}
+
+/// Values as words, one item a line.
+struct Words<'a> {
+    /// The lines to come.
+    rest: &'a [u8],
+    /// What is left of this line.
+    line: &'a [u8],
+    /// Whether this line has its newline.
+    ended: bool,
+    number: u64,
+}
+
+impl<'a> Words<'a> {
+    fn new(rest: &'a [u8], header_lines: u64) -> Self {
+        Self { rest, line: &[], ended: true, number: header_lines }
+    }
+
+    /// Goes to the next line with words in it; returns whether there is one.
+    fn next_line(&mut self) -> bool {
+        while !self.rest.is_empty() {
+            let end = self.rest.iter().position(|&b| b == b'\n').unwrap_or(self.rest.len());
+            self.line = self.rest[..end].trim_ascii();
+            self.ended = end < self.rest.len();
+            self.rest = self.rest.get(end + 1..).unwrap_or_default();
+            self.number += 1;
+            if !self.line.is_empty() {
+                return true;
+            }
+        }
+        false
+    }
+
+    fn fault(&self, found: &[u8]) -> Fault {
+        Fault { place: self.place(), found: Some(excerpt(found)) }
+    }
+}
+
+impl Source for Words<'_> {
+    fn begin_item(&mut self) -> Result<(), Fault> {
+        if self.next_line() { Ok(()) } else { Err(Fault { place: self.place(), found: None }) }
+    }
+
+    fn scalar(&mut self, scalar: Scalar) -> Result<f64, Fault> {
+        let end = self.line.iter().position(u8::is_ascii_whitespace).unwrap_or(self.line.len());
+        let (word, rest) = self.line.split_at(end);
+        if word.is_empty() && self.rest.is_empty() {
+            return Err(Fault { place: self.place(), found: None });
+        }
+        let value = any_number(word).filter(|v| !scalar.is_integer() || v.fract() == 0.0);
+        // Half a word at the end of a file is a cut, not somebody's text.
+        let cut = || Fault { place: self.place(), found: None };
+        let value = value.ok_or_else(|| {
+            if rest.is_empty() && !self.ended && end < LONGEST_WORD { cut() } else { self.fault(word) }
+        })?;
+        self.line = rest.trim_ascii_start();
+        Ok(value)
+    }
+
+    fn end_item(&mut self) -> Result<(), Fault> {
+        if self.line.is_empty() { Ok(()) } else { Err(self.fault(self.line)) }
+    }
+
+    fn finish(&mut self) -> Result<(), Fault> {
+        if self.next_line() { Err(self.fault(self.line)) } else { Ok(()) }
+    }
+
+    fn remaining(&self) -> usize {
+        self.rest.len()
+    }
+
+    fn place(&self) -> String {
+        format!("line {}", self.number)
+    }
+}

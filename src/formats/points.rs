@@ -1,0 +1,470 @@
+//! Point clouds as text: one point a line, with or without a header, in whatever separator a machine exports.
+//!
+//! The file is streamed in batches that are parsed in parallel, so that memory holds the points and a few megabytes, whatever
+//! the file. Every line is first tried by `quick_line`, which knows only the plain case and reports nothing; what it
+//! declines goes through `careful_line`, which alone decides what is an error.
+
+use std::fs::File;
+use std::io::{ErrorKind, Read};
+use std::path::Path;
+
+use rayon::prelude::*;
+
+use super::error::{FormatError, excerpt};
+use super::layout::{Layout, Preamble, Separator, is_comment};
+use super::number::{Decimal, NumberFault, coordinate, is_believable};
+use crate::geometry::Point;
+
+/// Largest text file that is read.
+const MOST_BYTES: u64 = 2 << 30;
+/// Most points that are read: 2.4 GB of them.
+const MOST_POINTS: u64 = 100_000_000;
+/// Longest line.
+const LONGEST_LINE: usize = 64 << 10;
+/// Bytes looked at before anything is believed.
+const HEAD: usize = 64 << 10;
+/// Bytes read at a time, and the share of them that one thread parses.
+const BATCH: usize = 4 << 20;
+const SHARE: usize = 256 << 10;
+
+/// Reads a point cloud from a text file, in millimetres and in the order of the file.
+///
+/// One point a line; columns separated by comma, semicolon, tab or blanks, which is found in the first point and required of
+/// all. Blank lines and lines that begin with `#` or `//` are skipped. If a header, or a comment that stands for one, names
+/// x, y and z, those columns are taken, else the first three; further columns may hold anything. Decimal commas are understood
+/// where the comma does not separate columns, thousands separators where the number also has its decimal mark.
+///
+/// # Errors
+/// A file that is not readable, not text, empty, too large or cut; a line with another number of columns; anything but a
+/// finite number of at most 1e7 mm where a coordinate should be; a header that states another unit than mm or whose columns
+/// x, y, z are not clear.
+pub fn read_points(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> {
+    let path = path.as_ref();
+    let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
+    let file = File::open(path).map_err(unreadable)?;
+    let length = file.metadata().map_err(unreadable)?.len();
+    Cloud::new(path, length).read(file)
+}
+
+/// Reads a point cloud from a stream of text; `path` is only what messages call it.
+///
+/// # Errors
+/// Those of [`read_points`].
+pub fn parse_points(path: impl AsRef<Path>, reader: impl Read + Send) -> Result<Vec<Point>, FormatError> {
+    Cloud::new(path.as_ref(), 0).read(reader)
+}
+
+/// A cloud while it is being read.
+struct Cloud<'p> {
+    path: &'p Path,
+    /// Expected length of the file, for reserving memory only.
+    length: u64,
+    preamble: Preamble<'p>,
+    layout: Option<Layout>,
+    /// Lines done.
+    lines: u64,
+    points: Vec<Point>,
+}
+
+/// A piece of the file in memory.
+struct Batch {
+    bytes: Vec<u8>,
+    /// What of the bytes is in use.
+    begin: usize,
+    end: usize,
+}
+
+impl Batch {
+    /// Fills the batch with what was left over of the one before and with more of the stream; returns how much more.
+    fn read(&mut self, left_over: &[u8], reader: &mut impl Read) -> std::io::Result<usize> {
+        self.bytes.resize(BATCH, 0);
+        self.bytes[..left_over.len()].copy_from_slice(left_over);
+        let read = fill(reader, &mut self.bytes[left_over.len()..])?;
+        (self.begin, self.end) = (0, left_over.len() + read);
+        Ok(read)
+    }
+}
+
+/// What one thread made of its share of a batch.
+struct Share {
+    points: Vec<Point>,
+    /// Lines done without error.
+    lines: u64,
+    /// Where the first bad line begins, if there is one.
+    bad: Option<usize>,
+}
+
+impl<'p> Cloud<'p> {
+    fn new(path: &'p Path, length: u64) -> Self {
+        Self { path, length, preamble: Preamble::new(path), layout: None, lines: 0, points: Vec::new() }
+    }
+
+    fn read(mut self, mut reader: impl Read + Send) -> Result<Vec<Point>, FormatError> {
+        let path = self.path;
+        let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
+        self.check_size(self.length)?;
+        let mut batch = Batch { bytes: vec![0; BATCH], begin: 0, end: 0 };
+        batch.end = fill(&mut reader, &mut batch.bytes[..HEAD]).map_err(unreadable)?;
+        self.check_head(&batch.bytes[..batch.end])?;
+        batch.end += fill(&mut reader, &mut batch.bytes[batch.end..]).map_err(unreadable)?;
+        batch.begin = if batch.bytes.starts_with(b"\xef\xbb\xbf") { 3 } else { 0 };
+        let mut next = Batch { bytes: Vec::new(), begin: 0, end: 0 };
+        let mut total = batch.end as u64;
+        while batch.end == BATCH {
+            // One thread reads on while the others parse.
+            let lines = self.whole_lines(&batch)?;
+            let (text, tail) = batch.bytes[batch.begin..].split_at(lines);
+            let (taken, read) = rayon::join(|| self.take(text, total), || next.read(tail, &mut reader));
+            taken?;
+            total += read.map_err(unreadable)? as u64;
+            self.check_size(total)?;
+            std::mem::swap(&mut batch, &mut next);
+        }
+        self.take(&batch.bytes[batch.begin..batch.end], total)?;
+        self.finish()
+    }
+
+    /// Returns the length of the whole lines in a full batch, unless the last one goes on for too long.
+    fn whole_lines(&mut self, batch: &Batch) -> Result<usize, FormatError> {
+        let text = &batch.bytes[batch.begin..];
+        let lines = text.iter().rposition(|&b| b == b'\n').map_or(0, |at| at + 1);
+        if text.len() - lines <= LONGEST_LINE {
+            return Ok(lines);
+        }
+        // The lines before it may hold an earlier fault, and give the line its number.
+        self.take(&text[..lines], BATCH as u64)?;
+        let line = self.lines + 1;
+        Err(FormatError::LineTooLong { path: self.path.to_owned(), line, limit_bytes: LONGEST_LINE })
+    }
+
+    /// Takes whole lines, of which only the very last of the file may lack its end.
+    fn take(&mut self, text: &[u8], bytes_so_far: u64) -> Result<(), FormatError> {
+        let rest = self.take_preamble(text)?;
+        let Some(layout) = &self.layout else { return self.check_preamble(bytes_so_far) };
+        let shares: Vec<Share> = if rest.len() <= SHARE {
+            vec![read_share(rest, layout)]
+        } else {
+            split_at_lines(rest).into_par_iter().map(|share| read_share(share, layout)).collect()
+        };
+        let mut offset = 0;
+        for (share, text) in shares.iter().zip(split_at_lines(rest)) {
+            self.lines += share.lines;
+            if let Some(bad) = share.bad {
+                let (line, _, ended) = first_line(&rest[offset + bad..]);
+                return careful_line(self.path, self.lines + 1, line, layout, ended).map(|_| ());
+            }
+            offset += text.len();
+        }
+        if self.points.is_empty() {
+            let found: usize = shares.iter().map(|share| share.points.len()).sum();
+            self.points.reserve(expected_points(found, bytes_so_far, self.length));
+        }
+        shares.iter().for_each(|share| self.points.extend_from_slice(&share.points));
+        let (found, limit) = (self.points.len() as u64, MOST_POINTS);
+        let too_many = || FormatError::TooLarge { path: self.path.to_owned(), found, limit, unit: "points" };
+        if found > limit { Err(too_many()) } else { Ok(()) }
+    }
+
+    /// Takes the lines above the first point and returns the rest, which begins with it.
+    fn take_preamble<'t>(&mut self, text: &'t [u8]) -> Result<&'t [u8], FormatError> {
+        let mut rest = text;
+        while self.layout.is_none() && !rest.is_empty() {
+            let (line, used, _) = first_line(rest);
+            let number = self.lines + 1;
+            check_line(self.path, number, line)?;
+            if let Some(mut layout) = self.preamble.take(line, number)? {
+                layout.settle_decimal(self.path, rest)?;
+                self.layout = Some(layout);
+                break;
+            }
+            self.lines = number;
+            rest = &rest[used..];
+        }
+        Ok(rest)
+    }
+
+    fn finish(self) -> Result<Vec<Point>, FormatError> {
+        if !self.points.is_empty() {
+            return Ok(self.points);
+        }
+        let path = self.path.to_owned();
+        Err(if self.preamble.has_header() {
+            FormatError::NoData { path, expected: "points" }
+        } else {
+            FormatError::Empty { path, expected: "points" }
+        })
+    }
+
+    /// Gives up on a file that begins with nothing but comments.
+    fn check_preamble(&self, bytes: u64) -> Result<(), FormatError> {
+        let (path, limit, unit) = (self.path, BATCH as u64 - 1, "bytes before the first point");
+        let too_large = || FormatError::TooLarge { path: path.to_owned(), found: bytes, limit, unit };
+        if bytes > limit { Err(too_large()) } else { Ok(()) }
+    }
+
+    fn check_size(&self, bytes: u64) -> Result<(), FormatError> {
+        let (path, limit) = (self.path, MOST_BYTES);
+        let too_large = || FormatError::TooLarge { path: path.to_owned(), found: bytes, limit, unit: "bytes" };
+        if bytes > limit { Err(too_large()) } else { Ok(()) }
+    }
+
+    /// Tells text from anything else by the first bytes.
+    fn check_head(&self, head: &[u8]) -> Result<(), FormatError> {
+        if head.starts_with(b"\xff\xfe") || head.starts_with(b"\xfe\xff") {
+            return Err(FormatError::Utf16 { path: self.path.to_owned() });
+        }
+        let Some(at) = head.iter().position(|&b| b < b' ' && !b.is_ascii_whitespace()) else { return Ok(()) };
+        let line = 1 + head[..at].iter().filter(|&&b| b == b'\n').count() as u64;
+        Err(FormatError::NotText { path: self.path.to_owned(), line, value: head[at] })
+    }
+}
+
+/// Reads until the buffer is full or the stream ends; returns how much it read.
+pub(super) fn fill(reader: &mut impl Read, buffer: &mut [u8]) -> std::io::Result<usize> {
+    let mut filled = 0;
+    while filled < buffer.len() {
+        match reader.read(&mut buffer[filled..]) {
+            Ok(0) => break,
+            Ok(read) => filled += read,
+            Err(error) if error.kind() == ErrorKind::Interrupted => {}
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(filled)
+}
+
+/// Returns how many points to make room for, from the share of the file that is read; never more than the file can hold.
+fn expected_points(found: usize, bytes_so_far: u64, length: u64) -> usize {
+    let ratio = length.max(bytes_so_far) as f64 / bytes_so_far.max(1) as f64;
+    // A batch of the smallest points would otherwise reserve many times what a file with a long tail of comments needs.
+    ((found as f64 * ratio * 1.02) as usize).min(MOST_POINTS as usize / 4)
+}
+
+/// Splits text into shares for the threads, each of whole lines.
+fn split_at_lines(text: &[u8]) -> Vec<&[u8]> {
+    let mut shares = Vec::with_capacity(text.len() / SHARE + 1);
+    let mut rest = text;
+    while rest.len() > SHARE {
+        let Some(end) = rest[SHARE..].iter().position(|&b| b == b'\n') else { break };
+        let (share, after) = rest.split_at(SHARE + end + 1);
+        shares.push(share);
+        rest = after;
+    }
+    shares.push(rest);
+    shares
+}
+
+/// Returns the first line without its end, its length with the end, and whether it has one.
+fn first_line(text: &[u8]) -> (&[u8], usize, bool) {
+    match text.iter().position(|&b| b == b'\n') {
+        Some(end) => (text[..end].strip_suffix(b"\r").unwrap_or(&text[..end]), end + 1, true),
+        None => (text, text.len(), false),
+    }
+}
+
+fn read_share(text: &[u8], layout: &Layout) -> Share {
+    let mut share = Share { points: Vec::with_capacity(text.len() / 40), lines: 0, bad: None };
+    let quick = layout.decimal == Decimal::Point && layout.columns == [0, 1, 2];
+    let mut at = 0;
+    while at < text.len() {
+        let rest = &text[at..];
+        if rest[0] == b'\n' {
+            at += 1;
+        } else if let Some((point, used)) = if quick { quick_line(rest, layout) } else { None } {
+            share.points.push(point);
+            at += used;
+        } else {
+            let (line, used, ended) = first_line(rest);
+            match careful_line(Path::new(""), 0, line, layout, ended) {
+                Ok(point) => share.points.extend(point),
+                Err(_) => {
+                    share.bad = Some(at);
+                    break;
+                }
+            }
+            at += used;
+        }
+        share.lines += 1;
+    }
+    share
+}
+
+/// Reads a line of three plain numbers and perhaps more columns, and its end; `None` if it is anything else.
+#[inline]
+fn quick_line(text: &[u8], layout: &Layout) -> Option<(Point, usize)> {
+    let separator = layout.separator;
+    let mut at = skip_padding(text, 0, separator);
+    let mut values = [0.0; 3];
+    for (axis, value) in values.iter_mut().enumerate() {
+        if axis > 0 {
+            at = skip_separator(text, at, separator)?;
+        }
+        let (number, used) = fast_float2::parse_partial::<f64, _>(text.get(at..)?).ok()?;
+        if !is_believable(number) {
+            return None;
+        }
+        *value = number;
+        at += used;
+    }
+    at = if layout.count == 3 { skip_padding(text, at, separator) } else { skip_columns(text, at, layout)? };
+    at += usize::from(text.get(at) == Some(&b'\r'));
+    let ended = text.get(at) == Some(&b'\n') && at <= LONGEST_LINE;
+    ended.then_some((Point::new(values[0], values[1], values[2]), at + 1))
+}
+
+#[inline]
+fn skip_padding(text: &[u8], mut at: usize, separator: Separator) -> usize {
+    while text.get(at).is_some_and(|&b| separator.pads(b)) {
+        at += 1;
+    }
+    at
+}
+
+#[inline]
+fn skip_separator(text: &[u8], at: usize, separator: Separator) -> Option<usize> {
+    let end = skip_padding(text, at, separator);
+    if separator == Separator::Blank {
+        return (end > at).then_some(end);
+    }
+    (text.get(end) == Some(&separator.byte())).then(|| skip_padding(text, end + 1, separator))
+}
+
+/// Returns the end of a line after counting its columns; `None` if the count is wrong or the columns are not plain.
+fn skip_columns(text: &[u8], mut at: usize, layout: &Layout) -> Option<usize> {
+    for _ in 3..layout.count {
+        at = skip_separator(text, at, layout.separator)?;
+        let stop = |&b: &u8| b == layout.separator.byte() || b < b' ' || b == b'"';
+        let width = text[at..].iter().position(stop)?;
+        // Between blanks there is no empty column, only the blanks at the end of the line.
+        if width == 0 && layout.separator == Separator::Blank {
+            return None;
+        }
+        at += width;
+    }
+    Some(skip_padding(text, at, layout.separator))
+}
+
+/// Refuses what no line may be.
+fn check_line(path: &Path, number: u64, line: &[u8]) -> Result<(), FormatError> {
+    if line.len() > LONGEST_LINE {
+        return Err(FormatError::LineTooLong { path: path.to_owned(), line: number, limit_bytes: LONGEST_LINE });
+    }
+    if line.contains(&0) {
+        return Err(FormatError::NotText { path: path.to_owned(), line: number, value: 0 });
+    }
+    Ok(())
+}
+
+/// Reads any line: a point, or nothing in a blank line or a comment, or the error that is to be reported.
+fn careful_line(
+    path: &Path,
+    number: u64,
+    line: &[u8],
+    layout: &Layout,
+    ended: bool,
+) -> Result<Option<Point>, FormatError> {
+    check_line(path, number, line)?;
+    if line.trim_ascii().is_empty() || is_comment(line) {
+        return Ok(None);
+    }
+    let (fields, count) = layout.pick(line);
+    if count != layout.count {
+        return Err(wrong_count(path, number, line, layout, count, ended));
+    }
+    let mut values = [0.0; 3];
+    for ((value, field), column) in values.iter_mut().zip(fields).zip(layout.columns) {
+        *value = coordinate(field, layout.decimal).map_err(|fault| {
+            // The beginning of a number at the very end of a file is a cut, not somebody's text.
+            let begun = field.iter().all(|b| matches!(b, b'0'..=b'9' | b'+' | b'-' | b'.' | b',' | b'e' | b'E'));
+            if !ended && fault == NumberFault::Text && begun {
+                return FormatError::CutLine { path: path.to_owned(), line: number, found: excerpt(line) };
+            }
+            number_error(path, number, column + 1, field, layout.decimal, fault)
+        })?;
+    }
+    Ok(Some(Point::from(values)))
+}
+
+fn wrong_count(path: &Path, line: u64, text: &[u8], layout: &Layout, found: usize, ended: bool) -> FormatError {
+    let path = path.to_owned();
+    if !ended && found < layout.count {
+        return FormatError::CutLine { path, line, found: excerpt(text) };
+    }
+    let (expected, separator, first_line) = (layout.count, layout.separator.name(), layout.first_line);
+    FormatError::ColumnCount { path, line, found, expected, separator, first_line }
+}
+
+fn number_error(
+    path: &Path,
+    line: u64,
+    column: usize,
+    field: &[u8],
+    decimal: Decimal,
+    fault: NumberFault,
+) -> FormatError {
+    let (path, found) = (path.to_owned(), excerpt(field));
+    match fault {
+        NumberFault::Text => FormatError::NotANumber { path, line, column, found },
+        NumberFault::NotFinite => FormatError::NotFinite { path, line, column, found },
+        NumberFault::OutOfRange => FormatError::OutOfRange { path, line, column, found },
+        NumberFault::AmbiguousComma => FormatError::AmbiguousComma { path, line, column, found },
+        NumberFault::OtherMark => {
+            let expected = if decimal == Decimal::Point { "point" } else { "comma" };
+            FormatError::DecimalMark { path, line, column, found, expected }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const COMMAS: Layout =
+        Layout { separator: Separator::Comma, columns: [0, 1, 2], count: 3, decimal: Decimal::Point, first_line: 1 };
+
+    #[test]
+    fn shares_are_whole_lines_and_together_the_text() {
+        for (line, count) in [("1,2,3\n", 200_000), ("\n", 600_000), ("no end", 90_000)] {
+            let text = line.repeat(count).into_bytes();
+            let shares = split_at_lines(&text);
+            assert_eq!(shares.concat(), text);
+            assert!(shares[..shares.len() - 1].iter().all(|share| share.ends_with(b"\n")));
+        }
+    }
+
+    #[test]
+    fn the_quick_way_declines_what_is_not_plain() {
+        let quick = |line: &str| quick_line(line.as_bytes(), &COMMAS);
+        assert_eq!(quick(" 1,2 , 3\r\nrest"), Some((Point::new(1.0, 2.0, 3.0), 10)));
+        let others = [
+            "1,2,3",
+            "1,2\n",
+            "1,2,3,4\n",
+            "1,2,nan\n",
+            "1,2,1e8\n",
+            "#1,2,3\n",
+            "1,2,3x\n",
+            "\"1\",2,3\n",
+            "",
+            "1,2,\n",
+        ];
+        for line in others {
+            assert_eq!(quick(line), None, "{line:?}");
+        }
+        let five = Layout { separator: Separator::Blank, count: 5, ..COMMAS };
+        let quick = |line: &str| quick_line(line.as_bytes(), &five);
+        assert_eq!(quick("1 2 3 a  b \n").map(|(_, used)| used), Some(12));
+        for line in ["1 2 3 a \n", "1 2 3 a b c\n", "1 2 3\n", "1 2 3 \"a b\" c\n"] {
+            assert_eq!(quick(line), None, "{line:?}");
+        }
+    }
+
+    #[test]
+    fn a_file_of_comments_is_given_up() {
+        let comments = "# nothing but comments\n".repeat(200_000);
+        assert!(matches!(parse_points("c", comments.as_bytes()), Err(FormatError::TooLarge { .. })));
+        let mut blank = vec![b'\n'; 5 << 20];
+        blank[..6].copy_from_slice(b"1,2,3\n");
+        assert_eq!(parse_points("b", &blank[..]).unwrap().len(), 1);
+    }
+}

@@ -1,0 +1,176 @@
+//! What a registration leaves behind: deviations, point clouds, JSON.
+//!
+//! Every file is written under a temporary name in the same folder, brought to the disk and renamed: whoever looks sees the old
+//! file or the new one, whole, also after a loss of power.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::error::FormatError;
+use crate::geometry::Point;
+
+/// The first line of `deviations.csv`. These names are a contract.
+pub const DEVIATIONS_HEADER: &str = "x_mm,y_mm,z_mm,nx,ny,nz,deviation_mm,used";
+
+/// Rows that one thread formats at a time, and that are held in memory at a time.
+const SHARE: usize = 4096;
+const BATCH: usize = 16 * SHARE;
+
+/// What the registration says of one measured point.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct DeviationRow {
+    /// Contact point, in the model frame.
+    pub point_mm: [f64; 3],
+    /// Unit normal of the nominal surface there, in the model frame, outward.
+    pub normal: [f64; 3],
+    /// Positive where material stands proud of the nominal surface.
+    pub deviation_mm: f64,
+    /// Whether the point took part in the fit.
+    pub used: bool,
+}
+
+/// Writes `deviations.csv`: [`DEVIATIONS_HEADER`], then a row per measured point in the order given.
+///
+/// Numbers read back to the same bits; `used` is 1 or 0.
+///
+/// # Errors
+/// A row that holds NaN or an infinity; a file that cannot be written. The file of that name is then what it was.
+pub fn write_deviations(path: impl AsRef<Path>, rows: &[DeviationRow]) -> Result<(), FormatError> {
+    write_rows(path.as_ref(), DEVIATIONS_HEADER, rows, |row| {
+        let ([x, y, z], [nx, ny, nz]) = (row.point_mm, row.normal);
+        ([x, y, z, nx, ny, nz, row.deviation_mm], Some(row.used))
+    })
+}
+
+/// Writes a point cloud as comma separated text under the header given, in millimetres; no header if it is empty.
+///
+/// # Errors
+/// Those of [`write_deviations`].
+pub fn write_points(path: impl AsRef<Path>, header: &str, points: &[Point]) -> Result<(), FormatError> {
+    write_rows(path.as_ref(), header, points, |point| ([point.x, point.y, point.z], None))
+}
+
+/// Writes a value as indented JSON.
+///
+/// JSON has no NaN: a field that holds one becomes `null`. See to it that none does.
+///
+/// # Errors
+/// A value that JSON cannot express, such as a map whose keys are not text; a file that cannot be written.
+pub fn write_json_atomic(path: impl AsRef<Path>, value: &impl Serialize) -> Result<(), FormatError> {
+    let path = path.as_ref();
+    let json = |source| FormatError::Json { path: path.to_owned(), source };
+    let mut text = serde_json::to_vec_pretty(value).map_err(json)?;
+    text.push(b'\n');
+    let mut draft = Draft::create(path)?;
+    draft.write(&text)?;
+    draft.publish()
+}
+
+/// Writes rows of N numbers and perhaps a flag.
+fn write_rows<T: Sync, const N: usize>(
+    path: &Path,
+    header: &str,
+    rows: &[T],
+    cells: impl Fn(&T) -> ([f64; N], Option<bool>) + Sync,
+) -> Result<(), FormatError> {
+    let finite = |row: &T| cells(row).0.iter().all(|v| v.is_finite());
+    if let Some(row) = rows.iter().position(|row| !finite(row)) {
+        let value = cells(&rows[row]).0.into_iter().find(|v| !v.is_finite()).unwrap_or(f64::NAN);
+        return Err(FormatError::RowNotFinite { path: path.to_owned(), row: row + 1, value });
+    }
+    let mut draft = Draft::create(path)?;
+    if !header.is_empty() {
+        draft.write(header.as_bytes())?;
+        draft.write(b"\n")?;
+    }
+    for batch in rows.chunks(BATCH) {
+        let texts: Vec<Vec<u8>> = batch.par_chunks(SHARE).map(|share| format_rows(share, &cells)).collect();
+        for text in texts {
+            draft.write(&text)?;
+        }
+    }
+    draft.publish()
+}
+
+fn format_rows<T, const N: usize>(rows: &[T], cells: impl Fn(&T) -> ([f64; N], Option<bool>)) -> Vec<u8> {
+    let mut text = Vec::with_capacity(rows.len() * (N * 22 + 2));
+    let mut number = zmij::Buffer::new();
+    for row in rows {
+        let (values, flag) = cells(row);
+        for value in values {
+            text.extend_from_slice(number.format_finite(value).as_bytes());
+            text.push(b',');
+        }
+        match flag {
+            Some(flag) => text.push(b'0' + u8::from(flag)),
+            None => drop(text.pop()),
+        }
+        text.push(b'\n');
+    }
+    text
+}
+
+/// A file under a temporary name, which goes away unless it is published.
+struct Draft<'p> {
+    path: &'p Path,
+    temporary: PathBuf,
+    file: BufWriter<File>,
+    published: bool,
+}
+
+impl<'p> Draft<'p> {
+    fn create(path: &'p Path) -> Result<Self, FormatError> {
+        static COUNT: AtomicU64 = AtomicU64::new(0);
+        let failed = |source| FormatError::Unwritable { path: path.to_owned(), action: "creating it", source };
+        if path.is_dir() {
+            return Err(failed(io::Error::from(io::ErrorKind::IsADirectory)));
+        }
+        let name = path.file_name().ok_or_else(|| failed(io::Error::from(io::ErrorKind::InvalidFilename)))?;
+        let mut hidden = std::ffi::OsString::from(".");
+        hidden.push(name);
+        hidden.push(format!(".{}-{}.tmp", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed)));
+        let temporary = path.with_file_name(hidden);
+        let file = OpenOptions::new().write(true).create_new(true).open(&temporary).map_err(failed)?;
+        Ok(Self { path, temporary, file: BufWriter::new(file), published: false })
+    }
+
+    fn failed(&self, action: &'static str) -> impl Fn(io::Error) -> FormatError + use<> {
+        let path = self.path.to_owned();
+        move |source| FormatError::Unwritable { path: path.clone(), action, source }
+    }
+
+    fn write(&mut self, bytes: &[u8]) -> Result<(), FormatError> {
+        let failed = self.failed("writing it");
+        self.file.write_all(bytes).map_err(failed)
+    }
+
+    /// Brings the bytes to the disk, then gives the file its name, then brings the name to the disk.
+    fn publish(mut self) -> Result<(), FormatError> {
+        let failed = self.failed("bringing it to the disk");
+        self.file.flush().map_err(&failed)?;
+        self.file.get_ref().sync_all().map_err(&failed)?;
+        fs::rename(&self.temporary, self.path).map_err(self.failed("giving it its name"))?;
+        self.published = true;
+        sync_folder(self.path).map_err(failed)
+    }
+}
+
+impl Drop for Draft<'_> {
+    fn drop(&mut self) {
+        if !self.published {
+            // The error that brought us here is the one to report.
+            let _ = fs::remove_file(&self.temporary);
+        }
+    }
+}
+
+/// Makes a rename last; only Unix lets a folder be opened for it.
+fn sync_folder(path: &Path) -> io::Result<()> {
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    if cfg!(unix) { File::open(folder)?.sync_all() } else { Ok(()) }
+}

@@ -1,0 +1,279 @@
+//! Triangle meshes in STL, ascii and binary.
+//!
+//! STL repeats every vertex in every facet; vertices with the same coordinates, to the last bit, are welded to one. The facet
+//! normals of the file are ignored: they follow from the corners, and many programs write zeros. STL states no unit; mm is meant.
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use super::error::{FormatError, excerpt};
+use super::number::{any_number, is_believable};
+use super::whole::{MOST_BYTES, is_degenerate, open};
+use crate::geometry::Point;
+
+/// Bytes before the first facet, and of one facet, in binary.
+const BINARY_HEADER: usize = 84;
+const BINARY_FACET: usize = 50;
+
+/// What an STL file holds.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct StlFile {
+    /// The welded vertices in the order in which they first occur, in millimetres.
+    pub points: Vec<Point>,
+    /// Corner indices of the triangles.
+    pub triangles: Vec<[u32; 3]>,
+    /// How many facets were left out because they span no area.
+    pub degenerate: usize,
+}
+
+/// Reads an STL file of at most 1 GiB.
+///
+/// A file is binary if its length is the one its facet count asks for, whatever its first word is; else it is ascii if it
+/// begins with `solid` and its beginning is text.
+///
+/// # Errors
+/// A file that is not readable, no STL, malformed or cut; no facet with an area; a vertex that is not finite or beyond 1e7 mm.
+pub fn read_stl(path: impl AsRef<Path>) -> Result<StlFile, FormatError> {
+    let path = path.as_ref();
+    let opened = open(path)?;
+    if opened.length > opened.head.len() as u64 {
+        // Known from the head and the length alone, so that a large file of rubbish is not read.
+        return match kind(path, &opened.head, opened.length)? {
+            Kind::Binary => parse_stl(path, &opened.read_all(path, MOST_BYTES)?),
+            Kind::Ascii => opened.parse(path, parse_ascii),
+        };
+    }
+    parse_stl(path, &opened.read_all(path, MOST_BYTES)?)
+}
+
+/// Parses the bytes of an STL file; `path` is only what messages call it.
+///
+/// # Errors
+/// Those of [`read_stl`].
+pub fn parse_stl(path: &Path, bytes: &[u8]) -> Result<StlFile, FormatError> {
+    match kind(path, bytes, bytes.len() as u64)? {
+        Kind::Binary => parse_binary(path, bytes),
+        Kind::Ascii => parse_ascii(path, bytes),
+    }
+}
+
+/// Returns whether a file of which the beginning and the length are known is STL beyond doubt.
+pub(super) fn is_stl(head: &[u8], length: u64) -> bool {
+    looks_ascii(head) || (facets(head).is_some_and(|n| n > 0) && binary_length(head) == Some(length))
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Kind {
+    Binary,
+    Ascii,
+}
+
+fn kind(path: &Path, head: &[u8], length: u64) -> Result<Kind, FormatError> {
+    if binary_length(head) == Some(length) {
+        return Ok(Kind::Binary);
+    }
+    if looks_ascii(head) {
+        return Ok(Kind::Ascii);
+    }
+    let path = path.to_owned();
+    let Some(facets) = facets(head) else {
+        return Err(if head.is_empty() {
+            FormatError::Empty { path, expected: "an STL mesh" }
+        } else {
+            let expected = format!("`solid`, or a binary header of {BINARY_HEADER} bytes");
+            FormatError::Cut { path, place: format!("byte {length}"), expected }
+        });
+    };
+    let wanted = binary_length(head).unwrap_or(u64::MAX);
+    let expected = format!("{wanted} bytes for the {facets} facets announced at byte 80");
+    Err(if wanted > length {
+        FormatError::Cut { path, place: format!("byte {length}"), expected }
+    } else {
+        FormatError::Unexpected { path, place: "byte 80".to_owned(), expected, found: format!("{length} bytes") }
+    })
+}
+
+/// Returns the number of facets a binary header announces.
+fn facets(head: &[u8]) -> Option<u32> {
+    head.get(80..BINARY_HEADER).and_then(|bytes| bytes.try_into().ok()).map(u32::from_le_bytes)
+}
+
+fn binary_length(head: &[u8]) -> Option<u64> {
+    facets(head).map(|n| BINARY_HEADER as u64 + u64::from(n) * BINARY_FACET as u64)
+}
+
+/// Returns whether a file begins with `solid` and goes on as text.
+fn looks_ascii(head: &[u8]) -> bool {
+    let text = head.trim_ascii_start();
+    let solid = text.get(..5).is_some_and(|word| word.eq_ignore_ascii_case(b"solid"));
+    let set_off = text.get(5).is_none_or(u8::is_ascii_whitespace);
+    let control = |b: &u8| *b < b' ' && !b.is_ascii_whitespace();
+    solid && set_off && !text.iter().take(512).any(control)
+}
+
+fn parse_binary(path: &Path, bytes: &[u8]) -> Result<StlFile, FormatError> {
+    let facets = bytes[BINARY_HEADER..].chunks_exact(BINARY_FACET);
+    let mut mesh = Welder::with_capacity(facets.len());
+    for (facet, record) in facets.enumerate() {
+        let mut corners = [Point::origin(); 3];
+        // Twelve bytes of normal come first; two of attributes last.
+        for (k, four) in record[12..48].chunks_exact(4).enumerate() {
+            let value = f64::from(f32::from_le_bytes([four[0], four[1], four[2], four[3]]));
+            if !is_believable(value) {
+                let place = format!("byte {}", BINARY_HEADER + facet * BINARY_FACET + 12 + 4 * k);
+                let what = ["x", "y", "z"][k % 3];
+                return Err(FormatError::BadCoordinate { path: path.to_owned(), place, what, value });
+            }
+            corners[k / 3][k % 3] = value;
+        }
+        mesh.facet(corners);
+    }
+    mesh.finish(path)
+}
+
+fn parse_ascii(path: &Path, bytes: &[u8]) -> Result<StlFile, FormatError> {
+    let mut words = Words { path, rest: bytes, line: 1 };
+    let mut mesh = Welder::with_capacity(bytes.len() / 250);
+    words.expect("solid")?;
+    words.skip_line();
+    loop {
+        match words.one_of(["facet", "endsolid", "solid"])? {
+            0 => mesh.facet(words.facet()?),
+            1 => {
+                words.skip_line();
+                if words.rest.trim_ascii().is_empty() {
+                    return mesh.finish(path);
+                }
+            }
+            _ => words.skip_line(),
+        }
+    }
+}
+
+/// The words of an ascii file.
+struct Words<'a> {
+    path: &'a Path,
+    rest: &'a [u8],
+    line: u64,
+}
+
+impl<'a> Words<'a> {
+    /// Returns the next word; `expected` is for the message if there is none.
+    fn next(&mut self, expected: &str) -> Result<&'a [u8], FormatError> {
+        let blanks = self.rest.iter().take_while(|b| b.is_ascii_whitespace()).count();
+        self.line += self.rest[..blanks].iter().filter(|&&b| b == b'\n').count() as u64;
+        let word = &self.rest[blanks..];
+        let end = word.iter().position(u8::is_ascii_whitespace).unwrap_or(word.len());
+        self.rest = &word[end..];
+        if end == 0 {
+            let (path, place) = (self.path.to_owned(), format!("line {}", self.line));
+            return Err(FormatError::Cut { path, place, expected: expected.to_owned() });
+        }
+        Ok(&word[..end])
+    }
+
+    /// Takes one of three words and returns which.
+    fn one_of(&mut self, wanted: [&str; 3]) -> Result<usize, FormatError> {
+        let word = self.next(wanted[0])?;
+        let found = wanted.iter().position(|w| word.eq_ignore_ascii_case(w.as_bytes()));
+        found.ok_or_else(|| self.unexpected(&format!("`{}` or `{}`", wanted[0], wanted[1]), word, wanted))
+    }
+
+    fn expect(&mut self, wanted: &str) -> Result<(), FormatError> {
+        let word = self.next(wanted)?;
+        let right = word.eq_ignore_ascii_case(wanted.as_bytes());
+        if right { Ok(()) } else { Err(self.unexpected(&format!("`{wanted}`"), word, [wanted; 3])) }
+    }
+
+    /// A word that merely begins as it should, at the very end, means that the file is cut.
+    fn unexpected(&self, expected: &str, word: &[u8], wanted: [&str; 3]) -> FormatError {
+        let (path, place) = (self.path.to_owned(), format!("line {}", self.line));
+        let begun = |w: &str| w.as_bytes().get(..word.len()).is_some_and(|part| part.eq_ignore_ascii_case(word));
+        if self.rest.is_empty() && wanted.into_iter().any(begun) {
+            return FormatError::Cut { path, place, expected: expected.to_owned() };
+        }
+        FormatError::Unexpected { path, place, expected: expected.to_owned(), found: excerpt(word) }
+    }
+
+    /// Skips the name after `solid` and `endsolid`.
+    fn skip_line(&mut self) {
+        let end = self.rest.iter().position(|&b| b == b'\n').unwrap_or(self.rest.len());
+        self.rest = &self.rest[end..];
+    }
+
+    /// Reads a facet after its first word.
+    fn facet(&mut self) -> Result<[Point; 3], FormatError> {
+        self.expect("normal")?;
+        for _ in 0..3 {
+            self.next("a facet normal")?;
+        }
+        self.expect("outer")?;
+        self.expect("loop")?;
+        let mut corners = [Point::origin(); 3];
+        for corner in &mut corners {
+            self.expect("vertex")?;
+            for (axis, what) in ["x", "y", "z"].into_iter().enumerate() {
+                corner[axis] = self.coordinate(what)?;
+            }
+        }
+        self.expect("endloop")?;
+        self.expect("endfacet")?;
+        Ok(corners)
+    }
+
+    fn coordinate(&mut self, what: &'static str) -> Result<f64, FormatError> {
+        let word = self.next("a coordinate")?;
+        let (path, place) = (|| self.path.to_owned(), format!("line {}", self.line));
+        let begun = |w: &[u8]| w.iter().all(|b| matches!(b, b'+' | b'-' | b'.' | b'0'..=b'9' | b'e' | b'E'));
+        match any_number(word) {
+            Some(value) if is_believable(value) => Ok(value),
+            Some(value) => Err(FormatError::BadCoordinate { path: path(), place, what, value }),
+            None if self.rest.is_empty() && begun(word) => {
+                Err(FormatError::Cut { path: path(), place, expected: "a coordinate".to_owned() })
+            }
+            None => {
+                let expected = format!("coordinate {what} in millimetres");
+                Err(FormatError::Unexpected { path: path(), place, expected, found: excerpt(word) })
+            }
+        }
+    }
+}
+
+/// A mesh that grows facet by facet, its equal vertices made one.
+struct Welder {
+    /// Keyed by the bits of the coordinates. The standard hasher is keyed at random, so that no file can make it slow.
+    known: HashMap<[u64; 3], u32>,
+    mesh: StlFile,
+}
+
+impl Welder {
+    fn with_capacity(facets: usize) -> Self {
+        let mesh = StlFile { triangles: Vec::with_capacity(facets), ..StlFile::default() };
+        Self { known: HashMap::with_capacity(facets / 2 + 3), mesh }
+    }
+
+    fn facet(&mut self, corners: [Point; 3]) {
+        // Adding zero makes -0 to 0, which is the same place.
+        let corners = corners.map(|corner| corner.map(|v| v + 0.0));
+        if is_degenerate(corners.each_ref()) {
+            self.mesh.degenerate += 1;
+            return;
+        }
+        let triangle = corners.map(|corner| {
+            let next = self.mesh.points.len() as u32;
+            let index = *self.known.entry([corner.x, corner.y, corner.z].map(f64::to_bits)).or_insert(next);
+            if index == next {
+                self.mesh.points.push(corner);
+            }
+            index
+        });
+        self.mesh.triangles.push(triangle);
+    }
+
+    fn finish(self, path: &Path) -> Result<StlFile, FormatError> {
+        if self.mesh.triangles.is_empty() {
+            return Err(FormatError::NoData { path: path.to_owned(), expected: "facets with an area" });
+        }
+        Ok(self.mesh)
+    }
+}

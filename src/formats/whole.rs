@@ -1,0 +1,71 @@
+//! Reading a whole file of a structured format into memory, but no more of it than its beginning justifies.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+use super::error::FormatError;
+use super::points::fill;
+use crate::geometry::Point;
+
+/// Largest mesh file that is read.
+pub(super) const MOST_BYTES: u64 = 1 << 30;
+/// Bytes that must be good before the rest is read.
+const HEAD: usize = 64 << 10;
+
+/// The beginning of a file, and the file to read on.
+pub(super) struct Opened {
+    file: File,
+    /// The length the system tells; 0 for a pipe.
+    pub(super) length: u64,
+    /// The first bytes, at most 64 KiB.
+    pub(super) head: Vec<u8>,
+}
+
+/// Opens a file and reads its beginning.
+pub(super) fn open(path: &Path) -> Result<Opened, FormatError> {
+    let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
+    let mut file = File::open(path).map_err(unreadable)?;
+    let length = file.metadata().map_err(unreadable)?.len();
+    let mut head = vec![0; HEAD];
+    let filled = fill(&mut file, &mut head).map_err(unreadable)?;
+    head.truncate(filled);
+    Ok(Opened { file, length, head })
+}
+
+impl Opened {
+    /// Returns all bytes of the file, if there are no more than `limit`.
+    pub(super) fn read_all(mut self, path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
+        let too_large = |found| FormatError::TooLarge { path: path.to_owned(), found, limit, unit: "bytes" };
+        if self.length > limit {
+            return Err(too_large(self.length));
+        }
+        let more = (limit + 1).saturating_sub(self.head.len() as u64);
+        let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
+        self.head.reserve((self.length as usize).saturating_sub(self.head.len()));
+        (&mut self.file).take(more).read_to_end(&mut self.head).map_err(unreadable)?;
+        let found = self.head.len() as u64;
+        if found > limit { Err(too_large(found)) } else { Ok(self.head) }
+    }
+
+    /// Parses the file, but first only its beginning, so that a gigabyte of rubbish costs neither time nor memory.
+    pub(super) fn parse<T>(
+        self,
+        path: &Path,
+        parse: impl Fn(&Path, &[u8]) -> Result<T, FormatError>,
+    ) -> Result<T, FormatError> {
+        if self.head.len() == HEAD {
+            match parse(path, &self.head) {
+                Err(error) if !error.is_cut() => return Err(error),
+                _ => {}
+            }
+        }
+        parse(path, &self.read_all(path, MOST_BYTES)?)
+    }
+}
+
+/// Returns whether three corners span no area.
+pub(super) fn is_degenerate(corners: [&Point; 3]) -> bool {
+    let [a, b, c] = corners;
+    (b - a).cross(&(c - a)).norm_squared() == 0.0
+}
