@@ -6,6 +6,7 @@ pub mod aperture;
 pub mod grid;
 pub mod pose;
 
+pub use aperture::{Aperture, ApertureError};
 pub use pose::{Pose, PoseError, Twist};
 
 /// A position in space, in millimetres.
