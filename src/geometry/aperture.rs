@@ -259,7 +259,7 @@ impl Aperture {
 
 /// Checks the coordinates of a point.
 fn coordinates(key: &'static str, point: &[f64; 2]) -> Result<(), ApertureError> {
-    match point.iter().find(|v| !(v.abs() <= LARGEST_MM)) {
+    match point.iter().find(|v| v.is_nan() || v.abs() > LARGEST_MM) {
         Some(&value) => Err(ApertureError::Coordinate { key, value }),
         None => Ok(()),
     }
