@@ -141,16 +141,18 @@ impl DefinedSurface {
         }
     }
 
-    /// Returns the largest error found in the cell of size h about a place, in millimetres; 0 where the cell has a corner
-    /// without a value, as a sampling has no such cell.
+    /// Returns the largest error found in the cell of size h about a place, in millimetres.
+    ///
+    /// It is infinite where a cell of a sampling that holds the place may have a corner without a value: the place would then
+    /// have no surface at all.
     fn cell_error(&self, [x, y]: [f64; 2], h: f64) -> f64 {
         let corner = |i: f64, j: f64| {
             let place = [x + (i - 0.5) * h, y + (j - 0.5) * h];
             self.formula().sag_and_gradient(place[0], place[1]).map(|(z, gradient)| (place, z, gradient))
         };
-        let Some([a, b, c, d]) = (|| Some([corner(0., 0.)?, corner(1., 0.)?, corner(1., 1.)?, corner(0., 1.)?]))()
-        else {
-            return 0.0;
+        let all = |low, high| Some([corner(low, low)?, corner(high, low)?, corner(high, high)?, corner(low, high)?]);
+        let Some([a, b, c, d]) = all(-0.5, 1.5).and_then(|_| all(0.0, 1.0)) else {
+            return f64::INFINITY;
         };
         // Whichever way the cell is cut in two.
         let triangles = [[a, b, c], [a, c, d], [a, b, d], [b, c, d]];
@@ -375,5 +377,8 @@ mod tests {
         let sampled = dome.sample(0.5).unwrap();
         assert!(sampled.points.iter().all(|p| p.z.is_nan() || p.x.hypot(p.y) < 20.0));
         assert!(sampled.points.iter().filter(|p| p.z.is_finite()).count() > 4900);
+        // A spacing found for an accuracy is so fine that no cell of the aperture lacks a corner.
+        let spacing_mm = dome.spacing_for_accuracy(1e-3).unwrap();
+        assert!(2f64.sqrt() * spacing_mm < 0.1 + 1e-9 && spacing_mm > 0.01, "{spacing_mm}");
     }
 }
