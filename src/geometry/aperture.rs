@@ -1,11 +1,499 @@
-//! The outline of a part in the plane.
+//! The outline of a part in the plane: where its surface counts.
+//!
+//! An aperture is a closed set in the (x, y) plane of the surface's own frame: its boundary belongs to it. Lengths are
+//! millimetres. What is read from outside is checked once by [`Aperture::validate`]; the other functions rely on it.
 
-/// Outline.
-#[derive(Clone, Debug)]
-pub struct Aperture;
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// Largest coordinate or size that is taken for a part, in millimetres.
+const LARGEST_MM: f64 = 1e6;
+
+/// Most corners of a polygon: its check compares every pair of edges.
+const MOST_CORNERS: usize = 4000;
+
+/// The outline of a part in the (x, y) plane.
+///
+/// Units: millimetres. As written in TOML: `kind = "circle"`, `radius_mm = 30.0`; a centre left out is the origin.
+#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum Aperture {
+    /// A rectangle along the axes.
+    Rectangle {
+        /// Its middle.
+        #[serde(default)]
+        centre_mm: [f64; 2],
+        /// Its size along x.
+        width_mm: f64,
+        /// Its size along y.
+        height_mm: f64,
+    },
+    /// A disc.
+    Circle {
+        /// Its middle.
+        #[serde(default)]
+        centre_mm: [f64; 2],
+        /// Its radius.
+        radius_mm: f64,
+    },
+    /// An ellipse along the axes.
+    Ellipse {
+        /// Its middle.
+        #[serde(default)]
+        centre_mm: [f64; 2],
+        /// Half its size along x and along y.
+        semi_axes_mm: [f64; 2],
+    },
+    /// A disc with a round hole in its middle.
+    Annulus {
+        /// Its middle.
+        #[serde(default)]
+        centre_mm: [f64; 2],
+        /// Radius of the hole; 0 for none.
+        inner_radius_mm: f64,
+        /// Radius of the rim.
+        outer_radius_mm: f64,
+    },
+    /// A simple polygon, convex or not, its corners in either sense of turning; the last corner joins the first.
+    Polygon {
+        /// The corners in order, each once.
+        corners_mm: Vec<[f64; 2]>,
+    },
+}
+
+/// Why a set of numbers is no outline.
+#[derive(Clone, Debug, Error, PartialEq)]
+pub enum ApertureError {
+    /// A coordinate is NaN, infinite or absurd.
+    #[error("`{key}` is {value} mm; it must be a number between -{LARGEST_MM:e} and {LARGEST_MM:e} mm")]
+    Coordinate {
+        /// The key as written.
+        key: &'static str,
+        /// What stands there, in millimetres.
+        value: f64,
+    },
+    /// A size is zero, negative, NaN or absurd.
+    #[error("`{key}` is {value} mm; it must be greater than 0 and at most {LARGEST_MM:e} mm")]
+    Size {
+        /// The key as written.
+        key: &'static str,
+        /// What stands there, in millimetres.
+        value: f64,
+    },
+    /// The hole of an annulus leaves nothing.
+    #[error(
+        "`inner_radius_mm` is {inner} mm; it must be at least 0 and less than `outer_radius_mm`, which is {outer} mm"
+    )]
+    Hole {
+        /// The inner radius in millimetres.
+        inner: f64,
+        /// The outer radius in millimetres.
+        outer: f64,
+    },
+    /// Too few or too many corners.
+    #[error("`corners_mm` has {count} corners; a polygon has from 3 to {MOST_CORNERS}")]
+    CornerCount {
+        /// How many there are.
+        count: usize,
+    },
+    /// Two neighbouring corners coincide; often the first is repeated at the end.
+    #[error("corners {first} and {second} of `corners_mm` are the same point; write each corner once")]
+    RepeatedCorner {
+        /// Number of the first, from 1.
+        first: usize,
+        /// Number of the second, from 1.
+        second: usize,
+    },
+    /// Two edges of the polygon meet where they should not.
+    #[error(
+        "the edges after corners {first} and {second} of `corners_mm` cross or touch; give the corners in order around \
+         the outline"
+    )]
+    Crossing {
+        /// Number of the corner the first edge starts from, from 1.
+        first: usize,
+        /// Number of the corner the second edge starts from, from 1.
+        second: usize,
+    },
+}
+
+impl ApertureError {
+    /// Returns the key the error is about, as written in TOML.
+    pub fn key(&self) -> &'static str {
+        match self {
+            Self::Coordinate { key, .. } | Self::Size { key, .. } => key,
+            Self::Hole { .. } => "inner_radius_mm",
+            Self::CornerCount { .. } | Self::RepeatedCorner { .. } | Self::Crossing { .. } => "corners_mm",
+        }
+    }
+}
+
 impl Aperture {
-    /// x
-    pub fn contains(&self, _x: f64, _y: f64) -> bool {
-        true
+    /// Checks that the numbers describe an outline with an inside.
+    ///
+    /// # Errors
+    /// A coordinate or size that is not finite or absurdly large, a size that is not positive, a hole as large as the rim,
+    /// or a polygon that is no simple closed line of at least three corners.
+    pub fn validate(&self) -> Result<(), ApertureError> {
+        match self {
+            Self::Rectangle { centre_mm, width_mm, height_mm } => {
+                coordinates("centre_mm", centre_mm)?;
+                size("width_mm", *width_mm)?;
+                size("height_mm", *height_mm)
+            }
+            Self::Circle { centre_mm, radius_mm } => {
+                coordinates("centre_mm", centre_mm)?;
+                size("radius_mm", *radius_mm)
+            }
+            Self::Ellipse { centre_mm, semi_axes_mm } => {
+                coordinates("centre_mm", centre_mm)?;
+                semi_axes_mm.iter().try_for_each(|&axis| size("semi_axes_mm", axis))
+            }
+            Self::Annulus { centre_mm, inner_radius_mm, outer_radius_mm } => {
+                coordinates("centre_mm", centre_mm)?;
+                size("outer_radius_mm", *outer_radius_mm)?;
+                if (0.0..*outer_radius_mm).contains(inner_radius_mm) {
+                    return Ok(());
+                }
+                Err(ApertureError::Hole { inner: *inner_radius_mm, outer: *outer_radius_mm })
+            }
+            Self::Polygon { corners_mm } => validate_polygon(corners_mm),
+        }
+    }
+
+    /// Tells whether a place lies in the aperture; the boundary does.
+    ///
+    /// Units: millimetres. A NaN lies nowhere.
+    pub fn contains(&self, x: f64, y: f64) -> bool {
+        match self {
+            Self::Rectangle { centre_mm: [cx, cy], width_mm, height_mm } => {
+                (x - cx).abs() <= 0.5 * width_mm && (y - cy).abs() <= 0.5 * height_mm
+            }
+            Self::Circle { centre_mm: [cx, cy], radius_mm } => (x - cx).hypot(y - cy) <= *radius_mm,
+            Self::Ellipse { centre_mm: [cx, cy], semi_axes_mm: [a, b] } => ((x - cx) / a).hypot((y - cy) / b) <= 1.0,
+            Self::Annulus { centre_mm: [cx, cy], inner_radius_mm, outer_radius_mm } => {
+                (*inner_radius_mm..=*outer_radius_mm).contains(&(x - cx).hypot(y - cy))
+            }
+            Self::Polygon { corners_mm } => {
+                let crossings = edges(corners_mm).filter(|[p, q]| crosses_ray(*p, *q, x, y)).count();
+                crossings % 2 == 1 || edges(corners_mm).any(|edge| segment_distance(edge, x, y) == 0.0)
+            }
+        }
+    }
+
+    /// Returns how far a place lies outside the aperture: 0 within it, else the distance to its nearest point.
+    ///
+    /// Units: millimetres.
+    pub fn distance_mm(&self, x: f64, y: f64) -> f64 {
+        match self {
+            Self::Rectangle { centre_mm: [cx, cy], width_mm, height_mm } => {
+                let [over_x, over_y] = [(x - cx).abs() - 0.5 * width_mm, (y - cy).abs() - 0.5 * height_mm];
+                over_x.max(0.0).hypot(over_y.max(0.0))
+            }
+            Self::Circle { centre_mm: [cx, cy], radius_mm } => ((x - cx).hypot(y - cy) - radius_mm).max(0.0),
+            Self::Ellipse { centre_mm: [cx, cy], semi_axes_mm } => ellipse_distance(*semi_axes_mm, x - cx, y - cy),
+            Self::Annulus { centre_mm: [cx, cy], inner_radius_mm, outer_radius_mm } => {
+                let r = (x - cx).hypot(y - cy);
+                (inner_radius_mm - r).max(r - outer_radius_mm).max(0.0)
+            }
+            Self::Polygon { .. } if self.contains(x, y) => 0.0,
+            Self::Polygon { corners_mm } => {
+                edges(corners_mm).map(|edge| segment_distance(edge, x, y)).fold(f64::INFINITY, f64::min)
+            }
+        }
+    }
+
+    /// Returns the smallest rectangle along the axes that holds the aperture: [[x least, y least], [x most, y most]].
+    ///
+    /// Units: millimetres.
+    pub fn bounds(&self) -> [[f64; 2]; 2] {
+        let around = |[x, y]: [f64; 2], a: f64, b: f64| [[x - a, y - b], [x + a, y + b]];
+        match self {
+            Self::Rectangle { centre_mm, width_mm, height_mm } => around(*centre_mm, 0.5 * width_mm, 0.5 * height_mm),
+            Self::Circle { centre_mm, radius_mm } => around(*centre_mm, *radius_mm, *radius_mm),
+            Self::Ellipse { centre_mm, semi_axes_mm: [a, b] } => around(*centre_mm, *a, *b),
+            Self::Annulus { centre_mm, outer_radius_mm, .. } => around(*centre_mm, *outer_radius_mm, *outer_radius_mm),
+            Self::Polygon { corners_mm } => {
+                corners_mm.iter().fold([[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]], |[[x0, y0], [x1, y1]], &[x, y]| {
+                    [[x0.min(x), y0.min(y)], [x1.max(x), y1.max(y)]]
+                })
+            }
+        }
+    }
+
+    /// Returns places along the whole boundary, at least `count` in all; corners are among them.
+    ///
+    /// Units: millimetres. On a round boundary a place may lie outside by rounding.
+    pub fn outline_mm(&self, count: usize) -> Vec<[f64; 2]> {
+        let around = |[x, y]: [f64; 2], a: f64, b: f64| {
+            (0..count).map(move |i| {
+                let (sine, cosine) = (std::f64::consts::TAU * i as f64 / count as f64).sin_cos();
+                [x + a * cosine, y + b * sine]
+            })
+        };
+        match self {
+            Self::Rectangle { .. } => {
+                let [[x0, y0], [x1, y1]] = self.bounds();
+                along_edges(&[[x0, y0], [x1, y0], [x1, y1], [x0, y1]], count)
+            }
+            Self::Circle { centre_mm, radius_mm } => around(*centre_mm, *radius_mm, *radius_mm).collect(),
+            Self::Ellipse { centre_mm, semi_axes_mm: [a, b] } => around(*centre_mm, *a, *b).collect(),
+            Self::Annulus { centre_mm, inner_radius_mm: inner, outer_radius_mm: outer } => {
+                around(*centre_mm, *outer, *outer).chain(around(*centre_mm, *inner, *inner)).collect()
+            }
+            Self::Polygon { corners_mm } => along_edges(corners_mm, count),
+        }
+    }
+
+    /// Returns the distance from the origin to the aperture's farthest point.
+    ///
+    /// Units: millimetres. An ellipse off the origin is measured at 720 places, within 1e-5 of the distance.
+    pub fn reach_mm(&self) -> f64 {
+        match self {
+            Self::Circle { centre_mm: [x, y], radius_mm: r }
+            | Self::Annulus { centre_mm: [x, y], outer_radius_mm: r, .. } => x.hypot(*y) + r,
+            _ => self.outline_mm(720).iter().map(|[x, y]| x.hypot(*y)).fold(0.0, f64::max),
+        }
+    }
+}
+
+/// Checks the coordinates of a point.
+fn coordinates(key: &'static str, point: &[f64; 2]) -> Result<(), ApertureError> {
+    match point.iter().find(|v| v.is_nan() || v.abs() > LARGEST_MM) {
+        Some(&value) => Err(ApertureError::Coordinate { key, value }),
+        None => Ok(()),
+    }
+}
+
+/// Checks a size.
+fn size(key: &'static str, value: f64) -> Result<(), ApertureError> {
+    if value > 0.0 && value <= LARGEST_MM { Ok(()) } else { Err(ApertureError::Size { key, value }) }
+}
+
+/// Checks that corners in order make a simple polygon.
+fn validate_polygon(corners: &[[f64; 2]]) -> Result<(), ApertureError> {
+    let count = corners.len();
+    if !(3..=MOST_CORNERS).contains(&count) {
+        return Err(ApertureError::CornerCount { count });
+    }
+    for corner in corners {
+        coordinates("corners_mm", corner)?;
+    }
+    let edges: Vec<_> = edges(corners).collect();
+    if let Some(i) = edges.iter().position(|[p, q]| p == q) {
+        return Err(ApertureError::RepeatedCorner { first: i + 1, second: (i + 1) % count + 1 });
+    }
+    for i in 0..count {
+        for j in i + 1..count {
+            let meet = if j == i + 1 {
+                folds_back(edges[i], edges[j])
+            } else if i == 0 && j == count - 1 {
+                folds_back(edges[j], edges[i])
+            } else {
+                segments_meet(edges[i], edges[j])
+            };
+            if meet {
+                return Err(ApertureError::Crossing { first: i + 1, second: j + 1 });
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Returns the edges of a closed polygon, the last one back to the first corner.
+fn edges(corners: &[[f64; 2]]) -> impl Iterator<Item = [[f64; 2]; 2]> + '_ {
+    corners.iter().zip(corners.iter().cycle().skip(1)).map(|(p, q)| [*p, *q])
+}
+
+/// Returns places along the edges of a closed polygon, each corner and as many between on every edge.
+fn along_edges(corners: &[[f64; 2]], count: usize) -> Vec<[f64; 2]> {
+    let steps = count.div_ceil(corners.len()).max(1);
+    let places = edges(corners).flat_map(|[p, q]| {
+        (0..steps).map(move |i| {
+            let t = i as f64 / steps as f64;
+            [p[0] + t * (q[0] - p[0]), p[1] + t * (q[1] - p[1])]
+        })
+    });
+    places.collect()
+}
+
+/// Tells whether the ray from a place towards +x crosses an edge; an edge holds its lower end only, so that no corner
+/// counts twice.
+fn crosses_ray(p: [f64; 2], q: [f64; 2], x: f64, y: f64) -> bool {
+    (p[1] > y) != (q[1] > y) && x < p[0] + (y - p[1]) / (q[1] - p[1]) * (q[0] - p[0])
+}
+
+/// Twice the signed area of a triangle.
+fn turn(p: [f64; 2], q: [f64; 2], r: [f64; 2]) -> f64 {
+    (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
+}
+
+/// Tells whether an edge runs back over the one before it.
+fn folds_back([p, q]: [[f64; 2]; 2], [_, r]: [[f64; 2]; 2]) -> bool {
+    let forward = (q[0] - p[0]) * (r[0] - q[0]) + (q[1] - p[1]) * (r[1] - q[1]);
+    turn(p, q, r) == 0.0 && forward < 0.0
+}
+
+/// Tells whether two segments cross or touch.
+fn segments_meet([a, b]: [[f64; 2]; 2], [c, d]: [[f64; 2]; 2]) -> bool {
+    let (c_side, d_side, a_side, b_side) = (turn(a, b, c), turn(a, b, d), turn(c, d, a), turn(c, d, b));
+    if c_side * d_side < 0.0 && a_side * b_side < 0.0 {
+        return true;
+    }
+    let within = |p: [f64; 2], q: [f64; 2], r: [f64; 2]| {
+        (0..2).all(|k| p[k].min(q[k]) <= r[k] && r[k] <= p[k].max(q[k])) && turn(p, q, r) == 0.0
+    };
+    within(a, b, c) || within(a, b, d) || within(c, d, a) || within(c, d, b)
+}
+
+/// Returns the distance from a place to a segment.
+fn segment_distance([p, q]: [[f64; 2]; 2], x: f64, y: f64) -> f64 {
+    let (ex, ey) = (q[0] - p[0], q[1] - p[1]);
+    let t = (((x - p[0]) * ex + (y - p[1]) * ey) / (ex * ex + ey * ey)).clamp(0.0, 1.0);
+    (x - p[0] - t * ex).hypot(y - p[1] - t * ey)
+}
+
+/// Returns how far a place lies outside an ellipse about the origin.
+///
+/// The foot of the perpendicular is (a^2 x / (t + a^2), b^2 y / (t + b^2)) where t >= 0 puts it on the ellipse. That
+/// condition is convex and falls in t, so that Newton's steps from 0 come up to the root and never pass it.
+fn ellipse_distance([a, b]: [f64; 2], x: f64, y: f64) -> f64 {
+    if (x / a).hypot(y / b) <= 1.0 {
+        return 0.0;
+    }
+    let mut t = 0.0;
+    for _ in 0..60 {
+        let (u, v) = (a * x / (t + a * a), b * y / (t + b * b));
+        let step = (u * u + v * v - 1.0) / (2.0 * (u * u / (t + a * a) + v * v / (t + b * b)));
+        t += step.max(0.0);
+        if step <= 1e-15 * t {
+            break;
+        }
+    }
+    (x * t / (t + a * a)).hypot(y * t / (t + b * b))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// An L: the square [0, 4]^2 without its upper right quarter.
+    fn l_shape() -> Aperture {
+        Aperture::Polygon { corners_mm: vec![[0.0, 0.0], [4.0, 0.0], [4.0, 2.0], [2.0, 2.0], [2.0, 4.0], [0.0, 4.0]] }
+    }
+
+    fn all_kinds() -> Vec<Aperture> {
+        vec![
+            Aperture::Rectangle { centre_mm: [1.0, -2.0], width_mm: 3.0, height_mm: 1.0 },
+            Aperture::Circle { centre_mm: [0.5, 0.25], radius_mm: 2.0 },
+            Aperture::Ellipse { centre_mm: [-1.0, 0.0], semi_axes_mm: [4.0, 0.5] },
+            Aperture::Annulus { centre_mm: [0.0, 1.0], inner_radius_mm: 1.0, outer_radius_mm: 2.5 },
+            l_shape(),
+        ]
+    }
+
+    #[test]
+    fn places_by_hand() {
+        let inside = |a: &Aperture, x, y| a.contains(x, y);
+        let [rectangle, circle, ellipse, annulus, l] = &all_kinds()[..] else { panic!() };
+        assert!(inside(rectangle, 2.5, -1.5) && !inside(rectangle, 2.6, -2.0));
+        assert!(inside(circle, 2.5, 0.25) && !inside(circle, 2.0, 2.0));
+        assert!(inside(ellipse, 3.0, 0.0) && inside(ellipse, -1.0, 0.5) && !inside(ellipse, 2.0, 0.4));
+        assert!(inside(annulus, 0.0, 3.5) && inside(annulus, 1.0, 1.0) && !inside(annulus, 0.0, 1.0));
+        assert!(inside(l, 1.0, 3.0) && inside(l, 2.0, 2.0) && inside(l, 4.0, 2.0) && !inside(l, 3.0, 3.0));
+        // The ray from here runs through the corner (2, 2) and along the edge that ends there.
+        assert!(inside(l, 1.0, 2.0) && !inside(l, -1.0, 2.0) && !inside(l, -1.0, 0.0));
+        assert!(all_kinds().iter().all(|a| !a.contains(f64::NAN, 0.0)));
+    }
+
+    #[test]
+    fn distances_by_hand() {
+        let kinds = all_kinds();
+        for (aperture, place, distance) in [
+            (&kinds[0], [5.5, 1.5], 3.0f64.hypot(3.0)),
+            (&kinds[1], [0.5, 5.25], 3.0),
+            (&kinds[2], [5.0, 0.0], 2.0),
+            (&kinds[2], [-1.0, 2.5], 2.0),
+            (&kinds[3], [0.25, 1.0], 0.75),
+            (&kinds[3], [3.5, 1.0], 1.0),
+            (&kinds[4], [3.0, 3.0], 1.0),
+            (&kinds[4], [5.0, 3.0], 2.0f64.sqrt()),
+        ] {
+            let found = aperture.distance_mm(place[0], place[1]);
+            assert!((found - distance).abs() < 1e-14, "{aperture:?} {place:?}: {found}");
+        }
+    }
+
+    #[test]
+    fn the_distance_is_that_to_the_nearest_place_of_the_outline() {
+        for aperture in all_kinds() {
+            let outline = aperture.outline_mm(20_000);
+            assert!(outline.len() >= 20_000);
+            for i in 0..400 {
+                let (x, y) = (-6.0 + 0.6 * (i % 20) as f64, -6.0 + 0.6 * (i / 20) as f64);
+                let nearest = outline.iter().map(|p| (p[0] - x).hypot(p[1] - y)).fold(f64::INFINITY, f64::min);
+                let expected = if aperture.contains(x, y) { 0.0 } else { nearest };
+                assert!((aperture.distance_mm(x, y) - expected).abs() < 1e-3, "{aperture:?} ({x}, {y})");
+            }
+        }
+    }
+
+    #[test]
+    fn bounds_and_reach_hold_the_outline_and_touch_it() {
+        for aperture in all_kinds() {
+            let [least, most] = aperture.bounds();
+            let outline = aperture.outline_mm(4000);
+            for k in 0..2 {
+                let coordinates = || outline.iter().map(|p| p[k]);
+                assert!((coordinates().fold(f64::INFINITY, f64::min) - least[k]).abs() < 1e-5);
+                assert!((coordinates().fold(f64::NEG_INFINITY, f64::max) - most[k]).abs() < 1e-5);
+            }
+            let farthest = outline.iter().map(|p| p[0].hypot(p[1])).fold(0.0, f64::max);
+            assert!((aperture.reach_mm() - farthest).abs() < 1e-4, "{aperture:?}");
+        }
+    }
+
+    #[test]
+    fn degenerate_outlines_are_refused_by_name() {
+        let circle = |radius_mm| Aperture::Circle { centre_mm: [0.0; 2], radius_mm }.validate();
+        for bad in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e7] {
+            assert!(matches!(circle(bad), Err(ApertureError::Size { key: "radius_mm", .. })), "{bad}");
+        }
+        let off = Aperture::Circle { centre_mm: [0.0, f64::NAN], radius_mm: 1.0 };
+        assert!(matches!(off.validate(), Err(ApertureError::Coordinate { key: "centre_mm", .. })));
+        for inner_radius_mm in [2.0, 3.0, -0.1, f64::NAN] {
+            let ring = Aperture::Annulus { centre_mm: [0.0; 2], inner_radius_mm, outer_radius_mm: 2.0 };
+            assert!(matches!(ring.validate(), Err(ApertureError::Hole { .. })));
+        }
+        assert!(all_kinds().iter().all(|a| a.validate().is_ok()));
+    }
+
+    #[test]
+    fn polygons_that_are_not_simple_are_refused() {
+        let polygon = |corners: &[[f64; 2]]| Aperture::Polygon { corners_mm: corners.to_vec() }.validate();
+        assert_eq!(polygon(&[[0.0, 0.0], [1.0, 0.0]]), Err(ApertureError::CornerCount { count: 2 }));
+        let closed = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.0, 0.0]];
+        assert_eq!(polygon(&closed), Err(ApertureError::RepeatedCorner { first: 4, second: 1 }));
+        let bow_tie = [[0.0, 0.0], [1.0, 1.0], [1.0, 0.0], [0.0, 1.0]];
+        assert_eq!(polygon(&bow_tie), Err(ApertureError::Crossing { first: 1, second: 3 }));
+        let flat = [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]];
+        assert!(matches!(polygon(&flat), Err(ApertureError::Crossing { .. })));
+        let spike = [[0.0, 0.0], [4.0, 0.0], [2.0, 0.0], [2.0, 2.0]];
+        assert!(matches!(polygon(&spike), Err(ApertureError::Crossing { .. })));
+        let touching = [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [2.0, 0.0], [0.0, 4.0]];
+        assert!(matches!(polygon(&touching), Err(ApertureError::Crossing { .. })));
+        // Either sense of turning will do, and a corner in a straight side as well.
+        assert_eq!(polygon(&[[0.0, 1.0], [1.0, 0.0], [0.5, 0.0], [0.0, 0.0]]), Ok(()));
+    }
+
+    #[test]
+    fn kinds_are_read_by_name_with_the_centre_left_out() {
+        let read = |text: &str| toml::from_str::<Aperture>(text);
+        let circle = Aperture::Circle { centre_mm: [0.0; 2], radius_mm: 30.0 };
+        assert_eq!(read("kind = 'circle'\nradius_mm = 30").unwrap(), circle);
+        assert!(read("kind = 'circle'\nradius_mm = 30\ndiameter_mm = 1").is_err());
+        for aperture in all_kinds() {
+            assert_eq!(read(&toml::to_string(&aperture).unwrap()).unwrap(), aperture);
+        }
     }
 }

@@ -6,7 +6,7 @@ pub mod aperture;
 pub mod grid;
 pub mod pose;
 
-pub use aperture::Aperture;
+pub use aperture::{Aperture, ApertureError};
 pub use grid::{GridOrder, recognise_grid};
 pub use pose::{Pose, PoseError, Twist};
 

@@ -28,6 +28,7 @@ use thiserror::Error;
 
 use crate::geometry::{Aperture, Point, Vector, recognise_grid};
 
+pub use analytic::{AnalyticSurface, DefinedSurface, DefinitionError, SampledSurface, Sampling, SurfaceDefinition};
 pub(crate) use feature::{Feature, features};
 use grid::{GridLattice, grid_normals, in_grid_order};
 use mesh::MeshLattice;

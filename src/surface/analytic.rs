@@ -1,1 +1,0 @@
-//! Surfaces given by a formula.

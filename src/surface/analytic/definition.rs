@@ -1,0 +1,542 @@
+//! A nominal surface as written in TOML, and checked.
+//!
+//! ```toml
+//! [surface]
+//! kind = "asphere"
+//! radius_mm = 150.0
+//! conic = -1.0
+//! coefficients = { A4 = 1.0e-8 }
+//!
+//! [aperture]
+//! kind = "circle"
+//! radius_mm = 30.0
+//!
+//! [sampling]             # may be left out: accuracy_nm = 0.1
+//! spacing_mm = 0.5       # either the spacing of the nodes,
+//! # accuracy_nm = 0.1    # or how exact the surface between them must be
+//! ```
+
+use std::ops::Range;
+
+use serde::{Deserialize, Serialize};
+use toml::Spanned;
+use toml::de::{DeTable, DeValue, ValueDeserializer};
+
+use super::conic::{Asphere, AsphereDefinition, Conic, ConicDefinition};
+use super::error::{self, DefinitionError};
+use super::forbes::{Qbfs, QbfsDefinition, Qcon, QconDefinition};
+use super::off_axis::{OffAxis, OffAxisDefinition, SectionFrame};
+use super::polynomial::{XyPolynomial, XyPolynomialDefinition};
+use super::toroid::{Biconic, BiconicDefinition, Toroid, ToroidDefinition};
+use super::zernike::{Zernike, ZernikeDefinition};
+use super::{AnalyticSurface, sampling};
+use crate::geometry::Aperture;
+
+/// How exact a sampling is when nothing is said about it, in nanometres.
+const DEFAULT_ACCURACY_NM: f64 = 0.1;
+
+/// A nominal surface as written.
+#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct SurfaceDefinition {
+    /// The formula.
+    pub surface: Formula,
+    /// The outline, in the surface's own frame.
+    pub aperture: Aperture,
+    /// How finely the surface is sampled; 0.1 nm when left out.
+    pub sampling: Option<SamplingDefinition>,
+}
+
+/// A formula as written, told apart by `kind`.
+#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(tag = "kind", rename_all = "kebab-case")]
+pub enum Formula {
+    /// The plane z = 0.
+    Plane(PlaneDefinition),
+    /// A sphere.
+    Sphere(SphereDefinition),
+    /// A conic of revolution.
+    Conic(ConicDefinition),
+    /// A conic and powers of the distance from the axis.
+    Asphere(AsphereDefinition),
+    /// A section of one of the others, away from its axis.
+    OffAxis(OffAxisDefinition),
+    /// A curve turned about a line.
+    Toroid(ToroidDefinition),
+    /// Two conics, one in x and one in y.
+    Biconic(BiconicDefinition),
+    /// Powers of x and y.
+    XyPolynomial(XyPolynomialDefinition),
+    /// Zernike polynomials.
+    Zernike(ZernikeDefinition),
+    /// Forbes' polynomials for strong aspheres.
+    Qcon(QconDefinition),
+    /// Forbes' polynomials for mild aspheres.
+    Qbfs(QbfsDefinition),
+}
+
+/// [`Formula`] with its kind as the key of an inner table. A reader that must look for `kind` first buffers the other keys,
+/// and so loses their places in the text; this one keeps them, for messages with line and column.
+#[derive(Deserialize)]
+#[serde(remote = "Formula", rename_all = "kebab-case")]
+enum FormulaByKind {
+    Plane(PlaneDefinition),
+    Sphere(SphereDefinition),
+    Conic(ConicDefinition),
+    Asphere(AsphereDefinition),
+    OffAxis(OffAxisDefinition),
+    Toroid(ToroidDefinition),
+    Biconic(BiconicDefinition),
+    XyPolynomial(XyPolynomialDefinition),
+    Zernike(ZernikeDefinition),
+    Qcon(QconDefinition),
+    Qbfs(QbfsDefinition),
+}
+
+/// [`Aperture`] with its kind as the key of an inner table.
+#[derive(Deserialize)]
+#[serde(remote = "Aperture", rename_all = "kebab-case", deny_unknown_fields)]
+enum ApertureByKind {
+    Rectangle {
+        #[serde(default)]
+        centre_mm: [f64; 2],
+        width_mm: f64,
+        height_mm: f64,
+    },
+    Circle {
+        #[serde(default)]
+        centre_mm: [f64; 2],
+        radius_mm: f64,
+    },
+    Ellipse {
+        #[serde(default)]
+        centre_mm: [f64; 2],
+        semi_axes_mm: [f64; 2],
+    },
+    Annulus {
+        #[serde(default)]
+        centre_mm: [f64; 2],
+        inner_radius_mm: f64,
+        outer_radius_mm: f64,
+    },
+    Polygon {
+        corners_mm: Vec<[f64; 2]>,
+    },
+}
+
+/// A plane as written: it has no numbers.
+#[derive(Clone, Copy, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct PlaneDefinition {}
+
+/// A sphere as written.
+#[derive(Clone, Copy, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct SphereDefinition {
+    /// Radius in millimetres, positive with the centre at +z.
+    pub radius_mm: f64,
+}
+
+/// How finely a surface is sampled, as written: one of the two.
+#[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct SamplingDefinition {
+    /// Distance between nodes along x and y, in millimetres.
+    pub spacing_mm: Option<f64>,
+    /// Largest error of the surface between the nodes, in nanometres.
+    pub accuracy_nm: Option<f64>,
+}
+
+/// How finely a surface is sampled.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Sampling {
+    /// With nodes at this distance along x and y.
+    Spacing {
+        /// The distance in millimetres.
+        spacing_mm: f64,
+    },
+    /// With nodes so near that the surface between them is this exact.
+    Accuracy {
+        /// The largest error in millimetres.
+        accuracy_mm: f64,
+    },
+}
+
+/// A nominal surface, checked: the formula has a value everywhere in the aperture.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DefinedSurface {
+    formula: AnalyticSurface,
+    aperture: Aperture,
+    sampling: Sampling,
+}
+
+impl SurfaceDefinition {
+    /// Reads a definition as written.
+    ///
+    /// # Errors
+    /// Text that is no TOML, or a key that is missing, unknown or of the wrong type, with line and column.
+    pub fn from_toml(text: &str) -> Result<Self, DefinitionError> {
+        let in_text = |error: toml::de::Error| toml_error(text, error.span(), error.message());
+        let mut tables = DeTable::parse(text).map_err(in_text)?.into_inner();
+        let mut take = |name: &str| tables.remove(name);
+        let missing = |name: &str| toml_error(text, None, &format!("the table [{name}] is missing"));
+        let surface = take("surface").ok_or_else(|| missing("surface"))?;
+        let aperture = take("aperture").ok_or_else(|| missing("aperture"))?;
+        let sampling = take("sampling");
+        if let Some((name, _)) = tables.iter().next() {
+            let message = format!("unknown table `{}`, expected surface, aperture or sampling", name.get_ref());
+            return Err(toml_error(text, Some(name.span()), &message));
+        }
+        Ok(Self {
+            surface: FormulaByKind::deserialize(by_kind(text, "surface", surface)?).map_err(in_text)?,
+            aperture: ApertureByKind::deserialize(by_kind(text, "aperture", aperture)?).map_err(in_text)?,
+            sampling: sampling
+                .map(|table| SamplingDefinition::deserialize(ValueDeserializer::from(table)))
+                .transpose()
+                .map_err(in_text)?,
+        })
+    }
+
+    /// Checks the definition.
+    ///
+    /// # Errors
+    /// Whatever is wrong with a value, by key, with the limit and a remedy.
+    pub fn resolve(&self) -> Result<DefinedSurface, DefinitionError> {
+        let formula = self.surface.resolve().map_err(|error| error.under("surface"))?;
+        let sampling = match &self.sampling {
+            None => Sampling::Accuracy { accuracy_mm: 1e-6 * DEFAULT_ACCURACY_NM },
+            Some(written) => written.resolve().map_err(|error| error.under("sampling"))?,
+        };
+        DefinedSurface::new(formula, self.aperture.clone(), sampling)
+    }
+}
+
+impl Formula {
+    /// Checks the numbers of the formula.
+    ///
+    /// # Errors
+    /// Whatever is wrong with a value, its key relative to the formula's table.
+    pub fn resolve(&self) -> Result<AnalyticSurface, DefinitionError> {
+        Ok(match self {
+            Self::Plane(PlaneDefinition {}) => AnalyticSurface::Conic(Conic::PLANE),
+            Self::Sphere(sphere) => AnalyticSurface::Conic(Conic::new(sphere.radius_mm, 0.0)?),
+            Self::Conic(conic) => AnalyticSurface::Conic(Conic::try_from(conic)?),
+            Self::Asphere(asphere) => AnalyticSurface::Asphere(Asphere::try_from(asphere)?),
+            Self::OffAxis(section) => AnalyticSurface::OffAxis(OffAxis::try_from(section)?),
+            Self::Toroid(toroid) => AnalyticSurface::Toroid(Toroid::try_from(toroid)?),
+            Self::Biconic(biconic) => AnalyticSurface::Biconic(Biconic::try_from(biconic)?),
+            Self::XyPolynomial(polynomial) => AnalyticSurface::XyPolynomial(XyPolynomial::try_from(polynomial)?),
+            Self::Zernike(zernike) => AnalyticSurface::Zernike(Zernike::try_from(zernike)?),
+            Self::Qcon(qcon) => AnalyticSurface::Qcon(Qcon::try_from(qcon)?),
+            Self::Qbfs(qbfs) => AnalyticSurface::Qbfs(Qbfs::try_from(qbfs)?),
+        })
+    }
+}
+
+impl SamplingDefinition {
+    /// Checks the numbers.
+    fn resolve(&self) -> Result<Sampling, DefinitionError> {
+        match (self.spacing_mm, self.accuracy_nm) {
+            (Some(spacing), None) => Ok(Sampling::Spacing { spacing_mm: error::positive("spacing_mm", spacing)? }),
+            (None, Some(nm)) if nm > 0.0 && nm <= 1e6 => Ok(Sampling::Accuracy { accuracy_mm: 1e-6 * nm }),
+            (None, Some(nm)) => {
+                let limit = "greater than 0 and at most 1e6 nm";
+                Err(DefinitionError::out_of_range("accuracy_nm", nm, limit, "0.1 is a good choice"))
+            }
+            (spacing, accuracy) => {
+                let count = usize::from(spacing.is_some()) + usize::from(accuracy.is_some());
+                Err(DefinitionError::Sampling { count })
+            }
+        }
+    }
+}
+
+impl DefinedSurface {
+    /// Joins a formula with its aperture, both in the surface's own frame.
+    ///
+    /// # Errors
+    /// An aperture that is no outline, that reaches beyond the normalisation radius or where the formula has no value, or
+    /// that misses an off-axis section.
+    pub fn new(formula: AnalyticSurface, aperture: Aperture, sampling: Sampling) -> Result<Self, DefinitionError> {
+        aperture.validate()?;
+        if let AnalyticSurface::OffAxis(section) = &formula {
+            let (x_mm, y_mm) = (section.centre().x, section.centre().y);
+            if section.frame() == SectionFrame::Parent && aperture.distance_mm(x_mm, y_mm) > 0.0 {
+                return Err(DefinitionError::SectionOutsideAperture { x_mm, y_mm });
+            }
+        }
+        let undefined = |[x, y]: &[f64; 2]| formula.sag_and_gradient(*x, *y).is_none();
+        if let Some([x_mm, y_mm]) = sampling::places(&aperture).into_iter().find(undefined) {
+            return Err(DefinitionError::NotDefined { x_mm, y_mm });
+        }
+        if let Some(limit_mm) = formula.normalisation_radius_mm() {
+            let reach_mm = formula.reach_mm(&aperture);
+            // An aperture as large as the disc must pass in spite of rounding.
+            if reach_mm > limit_mm * (1.0 + 1e-9) {
+                return Err(DefinitionError::BeyondNormalisation { reach_mm, limit_mm });
+            }
+        }
+        Ok(Self { formula, aperture, sampling })
+    }
+
+    /// Reads and checks a definition.
+    ///
+    /// # Errors
+    /// Whatever is wrong with the text or with a value, with line and column.
+    pub fn from_toml(text: &str) -> Result<Self, DefinitionError> {
+        SurfaceDefinition::from_toml(text)?.resolve().map_err(|error| at_its_place(text, error))
+    }
+
+    /// Returns the formula.
+    pub fn formula(&self) -> &AnalyticSurface {
+        &self.formula
+    }
+
+    /// Returns the outline.
+    pub fn aperture(&self) -> &Aperture {
+        &self.aperture
+    }
+
+    /// Returns how finely the surface is to be sampled.
+    pub fn sampling(&self) -> Sampling {
+        self.sampling
+    }
+}
+
+impl TryFrom<&SurfaceDefinition> for DefinedSurface {
+    type Error = DefinitionError;
+
+    fn try_from(written: &SurfaceDefinition) -> Result<Self, DefinitionError> {
+        written.resolve()
+    }
+}
+
+/// Adds line and column to an error of value, where its key stands in the text; else the error stays as it is.
+fn at_its_place(text: &str, error: DefinitionError) -> DefinitionError {
+    let Some(span) = error.key().and_then(|key| place_of(text, &key)) else { return error };
+    let (line, column) = line_and_column(text, span.start);
+    DefinitionError::At { line, column, source: Box::new(error) }
+}
+
+/// Returns where the value of a key stands; for one that is not in the text, its innermost table that is.
+fn place_of(text: &str, path: &str) -> Option<Range<usize>> {
+    let root = DeTable::parse(text).ok()?;
+    let mut table = root.get_ref();
+    let mut found = None;
+    for name in path.split('.') {
+        let Some((key, value)) = table.get_key_value(name) else { break };
+        found = Some(key.span());
+        match value.get_ref() {
+            DeValue::Table(inner) => table = inner,
+            _ => return Some(value.span()),
+        }
+    }
+    found
+}
+
+/// Turns `{ kind = "a", b = 1 }` into `{ a = { b = 1 } }`, every part at its place in the text.
+fn by_kind<'t>(text: &str, name: &str, table: Spanned<DeValue<'t>>) -> Result<ValueDeserializer<'t>, DefinitionError> {
+    let span = table.span();
+    let DeValue::Table(mut keys) = table.into_inner() else {
+        return Err(toml_error(text, Some(span), &format!("`{name}` must be a table, [{name}]")));
+    };
+    let Some(kind) = keys.remove("kind") else {
+        return Err(toml_error(text, Some(span), &format!("missing key `kind` in [{name}]")));
+    };
+    let kind_span = kind.span();
+    let DeValue::String(kind) = kind.into_inner() else {
+        return Err(toml_error(text, Some(kind_span), "`kind` must be a name in quotes"));
+    };
+    let mut outer = DeTable::new();
+    outer.insert(Spanned::new(kind_span, kind), Spanned::new(span.clone(), DeValue::Table(keys)));
+    Ok(ValueDeserializer::from(Spanned::new(span, DeValue::Table(outer))))
+}
+
+/// Makes an error of the text.
+fn toml_error(text: &str, span: Option<Range<usize>>, message: &str) -> DefinitionError {
+    let (line, column) = line_and_column(text, span.map_or(0, |span| span.start));
+    DefinitionError::Toml { line, column, message: message.to_owned() }
+}
+
+/// Returns line and column of a byte, both from 1, the column in characters.
+fn line_and_column(text: &str, byte: usize) -> (usize, usize) {
+    let before = text.get(..byte).unwrap_or(text);
+    let line_start = before.rfind('\n').map_or(0, |newline| newline + 1);
+    (before.matches('\n').count() + 1, before[line_start..].chars().count() + 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CIRCLE: &str = "[aperture]\nkind = 'circle'\nradius_mm = 20\n";
+
+    const KINDS: [&str; 11] = [
+        "plane",
+        "sphere",
+        "conic",
+        "asphere",
+        "off-axis",
+        "toroid",
+        "biconic",
+        "xy-polynomial",
+        "zernike",
+        "qcon",
+        "qbfs",
+    ];
+
+    /// One definition of every kind.
+    fn every_kind() -> Vec<String> {
+        [
+            "kind = 'plane'",
+            "kind = 'sphere'\nradius_mm = 100",
+            "kind = 'conic'\nradius_mm = -100.0\nconic = -1.5",
+            "kind = 'asphere'\nradius_mm = 150\nconic = -1\ncoefficients = { A4 = 1e-8, 6 = 1e-14 }",
+            "kind = 'off-axis'\ndistance_mm = 60\nazimuth_deg = 30\nframe = 'tilted'\n\
+             parent = { kind = 'conic', radius_mm = 400, conic = -1 }",
+            "kind = 'toroid'\nradius_x_mm = 100\nradius_y_mm = inf\ncoefficients = { A2 = 1e-4 }",
+            "kind = 'biconic'\nradius_x_mm = 100\nradius_y_mm = 80\nconic_x = 1",
+            "kind = 'xy-polynomial'\nnormalisation_radius_mm = 10\nterms = [[1, 1, 0.01], [0, 3, 1]]",
+            "kind = 'zernike'\nnumbering = 'fringe'\nnormalisation_radius_mm = 20\ncoefficients_mm = { Z5 = 0.01, 9 = 1e-3 }\n\
+             base = { radius_mm = 200 }",
+            "kind = 'qcon'\nradius_mm = 100\nconic = -1\nnormalisation_radius_mm = 20\ncoefficients_mm = [0.01, 0.002]",
+            "kind = 'qbfs'\nradius_mm = 100\nnormalisation_radius_mm = 20\ncoefficients_mm = [0.01, 0.002]",
+        ]
+        .map(|surface| format!("{CIRCLE}[surface]\n{surface}\n"))
+        .into()
+    }
+
+    /// A sphere of radius 100 whose definition was changed in one place.
+    fn changed(from: &str, to: &str) -> Result<DefinedSurface, DefinitionError> {
+        let sphere =
+            format!("[surface]\nkind = 'sphere'\nradius_mm = 100.0\n\n{CIRCLE}\n[sampling]\nspacing_mm = 0.5\n");
+        assert!(sphere.contains(from));
+        DefinedSurface::from_toml(&sphere.replace(from, to))
+    }
+
+    fn place(error: &DefinitionError) -> (usize, usize) {
+        match error {
+            DefinitionError::Toml { line, column, .. } | DefinitionError::At { line, column, .. } => (*line, *column),
+            other => panic!("{other} has no place"),
+        }
+    }
+
+    #[test]
+    fn every_kind_is_read_alike_by_both_readers() {
+        let texts = every_kind();
+        assert_eq!(texts.len(), KINDS.len());
+        for (text, kind) in texts.iter().zip(KINDS) {
+            assert!(text.contains(&format!("kind = '{kind}'")));
+            let written = SurfaceDefinition::from_toml(text).unwrap();
+            assert_eq!(toml::from_str::<SurfaceDefinition>(text).unwrap(), written);
+            assert_eq!(SurfaceDefinition::from_toml(&toml::to_string(&written).unwrap()).unwrap(), written);
+            let defined = written.resolve().unwrap();
+            assert_eq!(defined.sampling(), Sampling::Accuracy { accuracy_mm: 1e-7 });
+            assert!(defined.formula().normal(20.0, 0.0).is_some());
+        }
+    }
+
+    #[test]
+    fn the_example_above_is_what_it_says() {
+        let text: String = include_str!("definition.rs")
+            .lines()
+            .skip_while(|line| !line.starts_with("//! ```toml"))
+            .skip(1)
+            .take_while(|line| !line.starts_with("//! ```"))
+            .map(|line| format!("{}\n", &line[3..]))
+            .collect();
+        let defined = DefinedSurface::from_toml(&text).unwrap();
+        assert_eq!(defined.sampling(), Sampling::Spacing { spacing_mm: 0.5 });
+        assert_eq!(defined.aperture(), &Aperture::Circle { centre_mm: [0.0; 2], radius_mm: 30.0 });
+        let expected = 900.0 / 300.0 + 1e-8 * 810_000.0;
+        assert!((defined.formula().sag(0.0, 30.0).unwrap() - expected).abs() < 1e-15);
+    }
+
+    #[test]
+    fn errors_of_the_text_keep_line_and_column() {
+        for (from, to, expected, word) in [
+            ("radius_mm = 100.0", "radius = 100.0", (3, 1), "radius"),
+            ("radius_mm = 100.0", "radius_mm = '100'", (3, 13), "string"),
+            ("radius_mm = 100.0", "radius_mm = ", (3, 13), "value"),
+            ("'sphere'", "'ball'", (2, 8), "off-axis"),
+            ("kind = 'sphere'", "", (1, 1), "kind"),
+            ("radius_mm = 100.0", "", (1, 1), "radius_mm"),
+            ("radius_mm = 20", "radius_cm = 2", (7, 1), "radius_cm"),
+            ("radius_mm = 20", "radius_mm = '20'", (7, 13), "string"),
+            ("'circle'", "'disc'", (6, 8), "annulus"),
+            ("[sampling]", "[sampling_mm]", (9, 2), "sampling_mm"),
+            ("spacing_mm", "grid_mm", (10, 1), "grid_mm"),
+        ] {
+            let error = changed(from, to).unwrap_err();
+            assert!(matches!(error, DefinitionError::Toml { .. }), "{error}");
+            assert_eq!(place(&error), expected, "{error}");
+            assert!(error.to_string().contains(word), "{error}");
+        }
+        let error = DefinedSurface::from_toml(CIRCLE).unwrap_err();
+        assert!(error.to_string().contains("[surface] is missing"));
+    }
+
+    #[test]
+    fn errors_of_value_name_key_value_limit_and_place() {
+        for (from, to, expected, words) in [
+            ("radius_mm = 100.0", "radius_mm = 0", (3, 13), ["surface.radius_mm", "is 0;"]),
+            ("radius_mm = 100.0", "radius_mm = nan", (3, 13), ["surface.radius_mm", "NaN"]),
+            ("radius_mm = 20", "radius_mm = -20", (7, 13), ["radius_mm", "-20"]),
+            ("spacing_mm = 0.5", "spacing_mm = -0.5", (10, 14), ["sampling.spacing_mm", "-0.5"]),
+            ("spacing_mm = 0.5", "accuracy_nm = inf", (10, 15), ["sampling.accuracy_nm", "inf"]),
+            ("spacing_mm = 0.5", "", (9, 2), ["spacing_mm", "accuracy_nm"]),
+            ("spacing_mm = 0.5", "spacing_mm = 0.5\naccuracy_nm = 1", (9, 2), ["has 2", "keep one"]),
+            ("radius_mm = 20", "radius_mm = 100", (5, 2), ["not defined", "aperture"]),
+        ] {
+            let error = changed(from, to).unwrap_err();
+            assert!(matches!(error, DefinitionError::At { .. }), "{error}");
+            assert_eq!(place(&error), expected, "{error}");
+            assert!(words.iter().all(|word| error.to_string().contains(word)), "{error}");
+        }
+    }
+
+    #[test]
+    fn terms_and_nested_tables_are_found_in_the_text() {
+        let read = |surface: &str| DefinedSurface::from_toml(&format!("{CIRCLE}[surface]\n{surface}")).unwrap_err();
+        let error = read("kind = 'asphere'\nradius_mm = 100\n[surface.coefficients]\nA4 = 1\nA1 = 1\n");
+        assert_eq!(place(&error), (9, 6), "{error}");
+        let error = read("kind = 'asphere'\nradius_mm = 100\ncoefficients = { A4 = 1, 4 = 1 }\n");
+        assert!(error.to_string().contains("twice"), "{error}");
+        let error =
+            read("kind = 'zernike'\nnumbering = 'noll'\nnormalisation_radius_mm = 20\ncoefficients_mm = { 0 = 1 }");
+        assert_eq!(place(&error), (8, 25), "{error}");
+        let cut = "kind = 'off-axis'\ndistance_mm = 60\nframe = 'tilted'\n";
+        let error = read(&format!("{cut}[surface.parent]\nkind = 'sphere'\nradius_mm = 0\n"));
+        assert_eq!((place(&error), error.key().as_deref()), ((10, 13), Some("surface.parent.radius_mm")), "{error}");
+        let error = read(&format!("{cut}[surface.parent]\nkind = 'sphere'\nradius_mm = 50\n"));
+        assert_eq!(place(&error), (6, 15), "{error}");
+        let nested = format!("{cut}[surface.parent]\n{cut}[surface.parent.parent]\nkind = 'plane'\n");
+        assert!(matches!(read(&nested), DefinitionError::At { source, .. }
+            if matches!(*source, DefinitionError::NestedSection { .. })));
+    }
+
+    #[test]
+    fn an_aperture_must_fit_the_formula() {
+        let read = |aperture: &str, surface: &str| {
+            DefinedSurface::from_toml(&format!("[aperture]\n{aperture}\n[surface]\n{surface}\n"))
+        };
+        let qbfs = "kind = 'qbfs'\nradius_mm = 100\nnormalisation_radius_mm = 20\ncoefficients_mm = [0.01]";
+        assert!(read("kind = 'circle'\nradius_mm = 20", qbfs).is_ok());
+        let error = read("kind = 'rectangle'\nwidth_mm = 30\nheight_mm = 30", qbfs).unwrap_err();
+        assert!(error.to_string().contains("21.2"), "{error}");
+        let cut = |frame: &str| {
+            format!(
+                "kind = 'off-axis'\ndistance_mm = 12\nframe = '{frame}'\n[surface.parent]\nkind = 'qcon'\nradius_mm = 100\n\
+                 normalisation_radius_mm = 20\ncoefficients_mm = [0.01]"
+            )
+        };
+        for frame in ["shifted", "tilted"] {
+            assert!(read("kind = 'circle'\nradius_mm = 7.99", &cut(frame)).is_ok());
+            let error = read("kind = 'circle'\nradius_mm = 8.4", &cut(frame)).unwrap_err();
+            assert!(error.to_string().contains("reaches 20."), "{error}");
+        }
+        let error = read("kind = 'circle'\nradius_mm = 5", &cut("parent")).unwrap_err();
+        assert!(error.to_string().contains("centre_mm = [12, 0]"), "{error}");
+        assert!(read("kind = 'circle'\nradius_mm = 5\ncentre_mm = [12, 0]", &cut("parent")).is_ok());
+    }
+}

@@ -1,0 +1,193 @@
+//! Surfaces given by a formula: their sag and exact gradient, their definition in TOML, and their sampling.
+//!
+//! **The conventions, said once.** A surface is z = f(x, y) in its own frame, lengths in millimetres; z runs along the optical
+//! axis, and a radius of curvature is positive when its centre lies at +z (ISO 10110-12). The unit normal is the one on the
+//! +z side. Gradients come from closed forms or from the derivatives of the recurrences, never from differences.
+//!
+//! ```text
+//!  text --from_toml--> SurfaceDefinition --resolve--> DefinedSurface --sample--> SampledSurface
+//!                      (as written)                   (checked)                  (nodes on a grid)
+//! ```
+
+mod conic;
+mod definition;
+mod error;
+mod forbes;
+mod jacobi;
+mod off_axis;
+mod polynomial;
+mod sampling;
+mod toroid;
+mod zernike;
+
+pub use conic::{Asphere, AsphereDefinition, Conic, ConicDefinition};
+pub use definition::{
+    DefinedSurface, Formula, PlaneDefinition, Sampling, SamplingDefinition, SphereDefinition, SurfaceDefinition,
+};
+pub use error::DefinitionError;
+pub use forbes::{Qbfs, QbfsDefinition, Qcon, QconDefinition};
+pub use off_axis::{OffAxis, OffAxisDefinition, SectionFrame};
+pub use polynomial::{XyPolynomial, XyPolynomialDefinition};
+pub use sampling::{SampledSurface, curved_triangle_sag};
+pub use toroid::{Biconic, BiconicDefinition, Toroid, ToroidDefinition};
+pub use zernike::{Zernike, ZernikeDefinition, ZernikeNormalisation, ZernikeNumbering};
+
+use crate::geometry::{Aperture, Vector};
+
+/// How far beyond the normalisation radius polynomials on a disc are still evaluated, as a multiple of it: a sampling takes one
+/// ring of nodes beyond the aperture.
+const EXTRAPOLATION: f64 = 1.5;
+
+/// A surface given by a formula, checked.
+#[derive(Clone, Debug, PartialEq)]
+pub enum AnalyticSurface {
+    /// A conic of revolution; a sphere and a plane are conics too.
+    Conic(Conic),
+    /// A conic and powers of the distance from the axis, ISO 10110-12.
+    Asphere(Asphere),
+    /// A section of one of the others, away from its axis.
+    OffAxis(OffAxis),
+    /// A curve turned about a line, or moved along one.
+    Toroid(Toroid),
+    /// Two conics, one in x and one in y.
+    Biconic(Biconic),
+    /// Powers of x and y.
+    XyPolynomial(XyPolynomial),
+    /// Zernike polynomials.
+    Zernike(Zernike),
+    /// Forbes' polynomials for strong aspheres.
+    Qcon(Qcon),
+    /// Forbes' polynomials for mild aspheres.
+    Qbfs(Qbfs),
+}
+
+impl AnalyticSurface {
+    /// Returns the sag and its gradient at a place; none where the formula has no value or no finite slope.
+    ///
+    /// Units: millimetres; the gradient has none.
+    pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
+        let q = x * x + y * y;
+        let around = |(z, slope): (f64, f64)| (z, [2.0 * x * slope, 2.0 * y * slope]);
+        let found = match self {
+            Self::Conic(conic) => conic.along(q).map(around),
+            Self::Asphere(asphere) => asphere.along(q).map(around),
+            Self::Qcon(qcon) => qcon.along(q).map(around),
+            Self::Qbfs(qbfs) => qbfs.along(q).map(around),
+            Self::OffAxis(section) => section.sag_and_gradient(x, y),
+            Self::Toroid(toroid) => toroid.sag_and_gradient(x, y),
+            Self::Biconic(biconic) => biconic.sag_and_gradient(x, y),
+            Self::XyPolynomial(polynomial) => polynomial.sag_and_gradient(x, y),
+            Self::Zernike(zernike) => zernike.sag_and_gradient(x, y),
+        };
+        found.filter(|(z, [gx, gy])| z.is_finite() && gx.is_finite() && gy.is_finite())
+    }
+
+    /// Returns the sag at a place in millimetres; none where the formula has no value.
+    pub fn sag(&self, x: f64, y: f64) -> Option<f64> {
+        self.sag_and_gradient(x, y).map(|(z, _)| z)
+    }
+
+    /// Returns the unit normal on the +z side at a place; none where the formula has no value.
+    pub fn normal(&self, x: f64, y: f64) -> Option<Vector> {
+        self.sag_and_gradient(x, y).map(|(_, gradient)| normal_of(gradient))
+    }
+
+    /// The radius of the disc on which the polynomials are meant, if they are meant on a disc.
+    fn normalisation_radius_mm(&self) -> Option<f64> {
+        match self {
+            Self::Zernike(zernike) => Some(zernike.normalisation_radius_mm()),
+            Self::Qcon(qcon) => Some(qcon.normalisation_radius_mm()),
+            Self::Qbfs(qbfs) => Some(qbfs.normalisation_radius_mm()),
+            Self::OffAxis(section) => section.parent().normalisation_radius_mm(),
+            _ => None,
+        }
+    }
+
+    /// The distance from the axis of the formula to the farthest point of an aperture, in millimetres.
+    fn reach_mm(&self, aperture: &Aperture) -> f64 {
+        let Self::OffAxis(section) = self else { return aperture.reach_mm() };
+        let places = aperture.outline_mm(720).into_iter().filter_map(|[x, y]| section.parent_place(x, y));
+        places.map(|[x, y]| x.hypot(y)).fold(0.0, f64::max)
+    }
+
+    /// How many terms an evaluation sums, as a measure of its time.
+    fn terms(&self) -> usize {
+        match self {
+            Self::Conic(_) | Self::Biconic(_) => 1,
+            Self::Asphere(asphere) => asphere.terms(),
+            Self::Qcon(qcon) => qcon.terms(),
+            Self::Qbfs(qbfs) => qbfs.terms(),
+            Self::OffAxis(section) => section.terms(),
+            Self::Toroid(toroid) => toroid.terms(),
+            Self::XyPolynomial(polynomial) => polynomial.terms(),
+            Self::Zernike(zernike) => zernike.terms(),
+        }
+    }
+}
+
+/// Returns the unit normal on the +z side of a surface with a gradient.
+fn normal_of([gx, gy]: [f64; 2]) -> Vector {
+    Vector::new(-gx, -gy, 1.0).normalize()
+}
+
+#[cfg(test)]
+mod test_support {
+    /// Places on a disc: the axis, rings of 24 in an irregular rhythm, and a last ring near the rim.
+    pub fn disc(radius: f64) -> Vec<[f64; 2]> {
+        let ring = |r: f64| {
+            (0..24).map(move |i| {
+                let (sine, cosine) = (0.1 + std::f64::consts::TAU * f64::from(i) / 24.0).sin_cos();
+                [radius * r * cosine, radius * r * sine]
+            })
+        };
+        let rings = [1e-9, 1e-3, 0.05, 0.21, 0.4, 0.55, 0.7, 0.83, 0.95, 0.99].into_iter().flat_map(ring);
+        std::iter::once([0.0, 0.0]).chain(rings).collect()
+    }
+
+    /// Returns the largest difference between a gradient and the central differences of fourth order of its sag.
+    pub fn gradient_error(surface: &impl Fn(f64, f64) -> Option<(f64, [f64; 2])>, radius: f64) -> f64 {
+        let h = 5e-4 * radius;
+        let difference =
+            |sag: &dyn Fn(f64) -> f64| (8.0 * (sag(h) - sag(-h)) - (sag(2.0 * h) - sag(-2.0 * h))) / (12.0 * h);
+        let errors = disc(radius).into_iter().map(|[x, y]| {
+            let sag = |x, y| surface(x, y).expect("defined on the disc").0;
+            let [gx, gy] = surface(x, y).expect("defined on the disc").1;
+            let by_x = difference(&|t| sag(x + t, y));
+            let by_y = difference(&|t| sag(x, y + t));
+            (gx - by_x).abs().max((gy - by_y).abs())
+        });
+        errors.fold(0.0, f64::max)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_normal_of_a_sphere_points_from_or_to_its_centre_and_up() {
+        for radius_mm in [5.0, -5.0] {
+            let sphere = AnalyticSurface::Conic(Conic::new(radius_mm, 0.0).unwrap());
+            let normal = sphere.normal(3.0, 0.0).unwrap();
+            let expected = Vector::new(-0.6 * radius_mm.signum(), 0.0, 0.8);
+            assert!((normal - expected).norm() < 1e-15, "{normal}");
+            assert_eq!(sphere.normal(5.0, 0.0), None);
+            assert_eq!(sphere.sag(f64::NAN, 0.0), None);
+        }
+    }
+
+    #[test]
+    fn the_gradient_of_a_surface_of_revolution_is_that_of_its_sag() {
+        let asphere = Asphere::new(Conic::new(-120.0, -0.6).unwrap(), &[(3, 1e-6), (4, 1e-8), (10, 1e-18)]).unwrap();
+        for surface in [AnalyticSurface::Asphere(asphere), AnalyticSurface::Conic(Conic::new(80.0, 0.0).unwrap())] {
+            assert!(test_support::gradient_error(&|x, y| surface.sag_and_gradient(x, y), 60.0) < 1e-9);
+        }
+    }
+
+    #[test]
+    fn an_overflow_is_no_value() {
+        let steep = AnalyticSurface::Asphere(Asphere::new(Conic::PLANE, &[(60, 1e300)]).unwrap());
+        assert!(steep.sag(1.0, 0.0).is_some());
+        assert_eq!(steep.sag(10.0, 0.0), None);
+    }
+}

@@ -1,0 +1,284 @@
+//! A section of a larger surface, away from its axis.
+
+use nalgebra::Matrix3;
+use serde::{Deserialize, Serialize};
+
+use super::error::{self, DefinitionError};
+use super::{AnalyticSurface, Formula};
+use crate::geometry::{Point, Vector};
+
+/// Steps of the way from the section's centre, where Newton's method does not come straight to a place.
+const WAY_STEPS: u32 = 64;
+
+/// The frame in which a section and its aperture are described.
+#[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum SectionFrame {
+    /// The parent's own.
+    Parent,
+    /// The parent's, moved without turning so that the origin lies on the surface at the section's centre.
+    Shifted,
+    /// Its origin on the surface at the section's centre and z along the parent's normal there; turned from the parent's
+    /// frame by the smallest rotation, so that x and y stay as near to the parent's as they can.
+    Tilted,
+}
+
+/// A section of a parent surface about a centre away from its axis.
+#[derive(Clone, Debug, PartialEq)]
+pub struct OffAxis {
+    parent: Box<AnalyticSurface>,
+    frame: SectionFrame,
+    /// The section's centre in the parent's frame.
+    centre: Point,
+    /// Takes directions of the tilted frame to the parent's; its columns are the tilted axes.
+    parent_from_tilted: Matrix3<f64>,
+}
+
+/// An off-axis section as written.
+#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct OffAxisDefinition {
+    /// The whole surface, of any other kind.
+    pub parent: Box<Formula>,
+    /// Distance from the parent's axis to the section's centre, measured across the axis, in millimetres.
+    pub distance_mm: f64,
+    /// Azimuth of the section's centre in the parent's frame, from x towards y, in degrees.
+    #[serde(default)]
+    pub azimuth_deg: f64,
+    /// The frame of the section.
+    pub frame: SectionFrame,
+}
+
+impl OffAxis {
+    /// Cuts a section from a parent.
+    ///
+    /// Units: millimetres and radians.
+    ///
+    /// # Errors
+    /// A negative distance, an azimuth that is not finite, or a centre where the parent has no normal.
+    pub fn new(
+        parent: AnalyticSurface,
+        distance_mm: f64,
+        azimuth_rad: f64,
+        frame: SectionFrame,
+    ) -> Result<Self, DefinitionError> {
+        if !(0.0..=1e6).contains(&distance_mm) {
+            let remedy = "turn `azimuth_deg` by 180 for the other side";
+            return Err(DefinitionError::out_of_range("distance_mm", distance_mm, "from 0 to 1e6 mm", remedy));
+        }
+        let (sine, cosine) = error::finite("azimuth_deg", azimuth_rad)?.sin_cos();
+        let (x_mm, y_mm) = (distance_mm * cosine, distance_mm * sine);
+        let Some((z, gradient)) = parent.sag_and_gradient(x_mm, y_mm) else {
+            return Err(DefinitionError::SectionOffParent { x_mm, y_mm });
+        };
+        let parent_from_tilted = smallest_rotation(&super::normal_of(gradient));
+        Ok(Self { parent: Box::new(parent), frame, centre: Point::new(x_mm, y_mm, z), parent_from_tilted })
+    }
+
+    /// Returns the section's centre in the parent's frame, in millimetres.
+    pub fn centre(&self) -> &Point {
+        &self.centre
+    }
+
+    /// Returns the frame of the section.
+    pub fn frame(&self) -> SectionFrame {
+        self.frame
+    }
+
+    /// Returns the whole surface.
+    pub fn parent(&self) -> &AnalyticSurface {
+        &self.parent
+    }
+
+    /// Returns the sag and its gradient in the section's frame; none where the parent has none, and where the surface turns
+    /// away from the tilted z axis.
+    ///
+    /// Units: millimetres; the gradient has none.
+    pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
+        match self.frame {
+            SectionFrame::Parent => self.parent.sag_and_gradient(x, y),
+            SectionFrame::Shifted => {
+                let (z, gradient) = self.parent.sag_and_gradient(self.centre.x + x, self.centre.y + y)?;
+                Some((z - self.centre.z, gradient))
+            }
+            SectionFrame::Tilted => self.newton(x, y, 0.0).or_else(|| self.follow(x, y)),
+        }
+    }
+
+    /// Returns the place in the parent's plane that lies under a place of the section.
+    ///
+    /// Units: millimetres.
+    pub fn parent_place(&self, x: f64, y: f64) -> Option<[f64; 2]> {
+        match self.frame {
+            SectionFrame::Parent => Some([x, y]),
+            SectionFrame::Shifted => Some([self.centre.x + x, self.centre.y + y]),
+            SectionFrame::Tilted => {
+                let (z, _) = self.sag_and_gradient(x, y)?;
+                let place = self.centre + self.parent_from_tilted * Vector::new(x, y, z);
+                Some([place.x, place.y])
+            }
+        }
+    }
+
+    /// Solves p_z = f(p_x, p_y), with p = centre + R (x, y, z), for z by Newton's method.
+    ///
+    /// The gradient follows from the implicit function theorem: with m = R^T (-f_x, -f_y, 1), a normal in the tilted frame,
+    /// it is (-m_x / m_z, -m_y / m_z).
+    fn newton(&self, x: f64, y: f64, start: f64) -> Option<(f64, [f64; 2])> {
+        let mut z = start;
+        let scale = self.centre.coords.amax().max(x.abs()).max(y.abs());
+        for _ in 0..30 {
+            let p = self.centre + self.parent_from_tilted * Vector::new(x, y, z);
+            let (sag, [gx, gy]) = self.parent.sag_and_gradient(p.x, p.y)?;
+            let m = self.parent_from_tilted.tr_mul(&Vector::new(-gx, -gy, 1.0));
+            // A root on the far side of a closed surface has its normal turned away.
+            if m.z <= 1e-9 * m.norm() {
+                return None;
+            }
+            let step = (p.z - sag) / m.z;
+            z -= step;
+            // Newton's method squares the error: after so short a step only rounding is left.
+            if step.abs() <= 1e-13 * scale.max(z.abs()) {
+                return Some((z, [-m.x / m.z, -m.y / m.z]));
+            }
+        }
+        None
+    }
+
+    /// Follows the surface from the section's centre to a place, where the tangent plane there misses the parent.
+    fn follow(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
+        let step = 1.0 / f64::from(WAY_STEPS);
+        let (mut z, mut gradient) = self.newton(0.0, 0.0, 0.0)?;
+        for i in 1..=WAY_STEPS {
+            let t = f64::from(i) * step;
+            let ahead = z + (gradient[0] * x + gradient[1] * y) * step;
+            (z, gradient) = self.newton(t * x, t * y, ahead)?;
+        }
+        Some((z, gradient))
+    }
+
+    /// How many terms an evaluation sums.
+    pub(super) fn terms(&self) -> usize {
+        // Newton's method takes some five steps.
+        self.parent.terms() * if self.frame == SectionFrame::Tilted { 5 } else { 1 }
+    }
+}
+
+impl TryFrom<&OffAxisDefinition> for OffAxis {
+    type Error = DefinitionError;
+
+    fn try_from(written: &OffAxisDefinition) -> Result<Self, DefinitionError> {
+        if matches!(*written.parent, Formula::OffAxis(_)) {
+            return Err(DefinitionError::NestedSection { key: "parent".to_owned() });
+        }
+        let parent = written.parent.resolve().map_err(|error| error.under("parent"))?;
+        Self::new(parent, written.distance_mm, written.azimuth_deg.to_radians(), written.frame)
+    }
+}
+
+/// Returns the rotation about an axis across z that takes z to a unit vector on the +z side.
+fn smallest_rotation(n: &Vector) -> Matrix3<f64> {
+    let s = 1.0 / (1.0 + n.z);
+    Matrix3::new(
+        1.0 - n.x * n.x * s,
+        -n.x * n.y * s,
+        n.x, //
+        -n.x * n.y * s,
+        1.0 - n.y * n.y * s,
+        n.y, //
+        -n.x,
+        -n.y,
+        n.z,
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surface::analytic::conic::{Asphere, Conic};
+    use crate::surface::analytic::test_support::{disc, gradient_error};
+
+    fn sphere(radius_mm: f64) -> AnalyticSurface {
+        AnalyticSurface::Conic(Conic::new(radius_mm, 0.0).unwrap())
+    }
+
+    fn asphere() -> AnalyticSurface {
+        let terms = [(4, 2e-8), (5, -1e-10), (6, 3e-13)];
+        AnalyticSurface::Asphere(Asphere::new(Conic::new(300.0, -1.0).unwrap(), &terms).unwrap())
+    }
+
+    fn section(parent: AnalyticSurface, distance_mm: f64, azimuth_deg: f64, frame: SectionFrame) -> OffAxis {
+        OffAxis::new(parent, distance_mm, f64::to_radians(azimuth_deg), frame).unwrap()
+    }
+
+    #[test]
+    fn a_section_at_no_distance_is_the_parent_in_every_frame() {
+        for frame in [SectionFrame::Parent, SectionFrame::Shifted, SectionFrame::Tilted] {
+            let cut = section(asphere(), 0.0, 30.0, frame);
+            for [x, y] in disc(80.0) {
+                let (z, [gx, gy]) = cut.sag_and_gradient(x, y).unwrap();
+                let (sag, [fx, fy]) = asphere().sag_and_gradient(x, y).unwrap();
+                assert!((z - sag).abs() < 1e-13 && (gx - fx).abs() < 1e-14 && (gy - fy).abs() < 1e-14);
+            }
+        }
+    }
+
+    #[test]
+    fn a_tilted_section_of_a_sphere_is_the_sphere() {
+        // Out to 99 of 100 mm, where the tangent plane at the centre has long left the parent's disc.
+        for (radius_mm, azimuth_deg) in [(100.0, 0.0), (-100.0, 200.0)] {
+            let cut = section(sphere(radius_mm), 60.0, azimuth_deg, SectionFrame::Tilted);
+            let (mut defined, mut worst) = (0, 0.0f64);
+            for [x, y] in disc(99.0) {
+                let Some((z, [gx, gy])) = cut.sag_and_gradient(x, y) else { continue };
+                let (sag, [fx, fy]) = sphere(radius_mm).sag_and_gradient(x, y).unwrap();
+                worst = worst.max((z - sag).abs()).max((gx - fx).abs() * 0.01).max((gy - fy).abs() * 0.01);
+                defined += 1;
+            }
+            assert!(worst < 1e-12, "{worst}");
+            assert!(defined > disc(99.0).len() * 3 / 4, "{defined}");
+        }
+    }
+
+    #[test]
+    fn every_tilted_place_lies_on_the_parent_and_the_origin_is_flat() {
+        for azimuth_deg in [0.0, 77.0, 180.0, 300.0] {
+            let cut = section(asphere(), 120.0, azimuth_deg, SectionFrame::Tilted);
+            let (z, gradient) = cut.sag_and_gradient(0.0, 0.0).unwrap();
+            assert!(z.abs() < 1e-14 && gradient[0].abs() < 1e-15 && gradient[1].abs() < 1e-15);
+            for [x, y] in disc(40.0) {
+                let (z, _) = cut.sag_and_gradient(x, y).unwrap();
+                let p = cut.centre + cut.parent_from_tilted * Vector::new(x, y, z);
+                let (sag, _) = asphere().sag_and_gradient(p.x, p.y).unwrap();
+                assert!((p.z - sag).abs() < 1e-13);
+                assert!((cut.parent_place(x, y).unwrap()[0] - p.x).abs() < 1e-13);
+            }
+        }
+    }
+
+    #[test]
+    fn a_paraboloid_shifted_by_hand() {
+        let parabola = AnalyticSurface::Conic(Conic::new(100.0, -1.0).unwrap());
+        let cut = section(parabola, 30.0, 90.0, SectionFrame::Shifted);
+        // (x^2 + (y + 30)^2 - 900) / 200 at (10, 10).
+        let (z, [gx, gy]) = cut.sag_and_gradient(10.0, 10.0).unwrap();
+        assert!((z - 4.0).abs() < 1e-14 && (gx - 0.1).abs() < 1e-15 && (gy - 0.4).abs() < 1e-15);
+    }
+
+    #[test]
+    fn gradients_are_those_of_the_sag() {
+        for frame in [SectionFrame::Shifted, SectionFrame::Tilted] {
+            let cut = section(asphere(), 90.0, 40.0, frame);
+            assert!(gradient_error(&|x, y| cut.sag_and_gradient(x, y), 45.0) < 1e-11);
+        }
+    }
+
+    #[test]
+    fn bad_sections_are_refused_by_name() {
+        let cut = |distance, azimuth| OffAxis::new(sphere(50.0), distance, azimuth, SectionFrame::Tilted);
+        assert_eq!(cut(-1.0, 0.0).unwrap_err().key().as_deref(), Some("distance_mm"));
+        assert_eq!(cut(f64::NAN, 0.0).unwrap_err().key().as_deref(), Some("distance_mm"));
+        assert_eq!(cut(1.0, f64::INFINITY).unwrap_err().key().as_deref(), Some("azimuth_deg"));
+        assert!(matches!(cut(50.0, 0.0), Err(DefinitionError::SectionOffParent { .. })));
+    }
+}

@@ -1,0 +1,133 @@
+//! The XY polynomial.
+
+use serde::{Deserialize, Serialize};
+
+use super::conic::{Conic, ConicDefinition};
+use super::error::{self, DefinitionError};
+
+/// Largest power of x or y.
+const LARGEST_POWER: u32 = 60;
+
+/// A conic and a sum of products of powers: `z = conic + sum a_ij (x / Rn)^i (y / Rn)^j`, Rn being the normalisation radius.
+///
+/// The normalisation radius is a mere scale: the polynomial is meant everywhere.
+#[derive(Clone, Debug, PartialEq)]
+pub struct XyPolynomial {
+    base: Conic,
+    normalisation_radius_mm: f64,
+    /// Power of x, power of y, coefficient in millimetres.
+    terms: Vec<(u32, u32, f64)>,
+}
+
+/// An XY polynomial as written.
+#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct XyPolynomialDefinition {
+    /// What x and y are divided by, in millimetres; 1 for coefficients in mm^(1 - i - j).
+    pub normalisation_radius_mm: f64,
+    /// Terms [i, j, coefficient in millimetres].
+    pub terms: Vec<(u32, u32, f64)>,
+    /// The conic the polynomial is added to; none for a plane.
+    pub base: Option<ConicDefinition>,
+}
+
+impl XyPolynomial {
+    /// Returns the sag and its gradient; none at the edge of the base conic and beyond.
+    ///
+    /// Units: millimetres; the gradient has none.
+    pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
+        let (sag, slope) = self.base.along(x * x + y * y)?;
+        let scale = 1.0 / self.normalisation_radius_mm;
+        let (u, v) = (x * scale, y * scale);
+        let (mut z, mut gx, mut gy) = (sag, 2.0 * x * slope, 2.0 * y * slope);
+        for &(i, j, a) in &self.terms {
+            let (ui, vj) = (u.powi(i as i32), v.powi(j as i32));
+            z += a * ui * vj;
+            if i > 0 {
+                gx += a * f64::from(i) * u.powi(i as i32 - 1) * vj * scale;
+            }
+            if j > 0 {
+                gy += a * f64::from(j) * v.powi(j as i32 - 1) * ui * scale;
+            }
+        }
+        Some((z, [gx, gy]))
+    }
+
+    /// How many terms an evaluation sums.
+    pub(super) fn terms(&self) -> usize {
+        1 + self.terms.len()
+    }
+}
+
+impl TryFrom<&XyPolynomialDefinition> for XyPolynomial {
+    type Error = DefinitionError;
+
+    fn try_from(written: &XyPolynomialDefinition) -> Result<Self, DefinitionError> {
+        let normalisation_radius_mm = error::positive("normalisation_radius_mm", written.normalisation_radius_mm)?;
+        let mut terms = written.terms.clone();
+        terms.sort_by_key(|term| (term.0, term.1));
+        for (n, &(i, j, coefficient)) in terms.iter().enumerate() {
+            let key = || format!("terms.[{i}, {j}]");
+            if i.max(j) > LARGEST_POWER {
+                let expected = "a term is [i, j, coefficient_mm] with powers from 0 to 60";
+                return Err(DefinitionError::Term { key: key(), expected });
+            }
+            if n > 0 && (terms[n - 1].0, terms[n - 1].1) == (i, j) {
+                return Err(DefinitionError::RepeatedTerm { key: key() });
+            }
+            error::finite(&key(), coefficient)?;
+        }
+        let base = super::conic::base(written.base.as_ref())?;
+        Ok(Self { base, normalisation_radius_mm, terms })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surface::analytic::test_support::{disc, gradient_error};
+
+    fn polynomial(terms: &[(u32, u32, f64)], base: Option<ConicDefinition>) -> Result<XyPolynomial, DefinitionError> {
+        let written = XyPolynomialDefinition { normalisation_radius_mm: 10.0, terms: terms.to_vec(), base };
+        XyPolynomial::try_from(&written)
+    }
+
+    #[test]
+    fn two_terms_by_hand() {
+        // u = 2, v = -1: 0.5 u^2 v + 3 v^3 = -2 - 3; slopes (u v, 0.5 u^2 + 9 v^2) / 10.
+        let (z, [gx, gy]) =
+            polynomial(&[(2, 1, 0.5), (0, 3, 3.0)], None).unwrap().sag_and_gradient(20.0, -10.0).unwrap();
+        assert!((z + 5.0).abs() < 1e-15 && (gx + 0.2).abs() < 1e-16 && (gy - 1.1).abs() < 1e-15);
+    }
+
+    #[test]
+    fn without_terms_it_is_the_base() {
+        let base = ConicDefinition { radius_mm: -70.0, conic: 0.5 };
+        let conic = Conic::try_from(&base).unwrap();
+        for [x, y] in disc(50.0) {
+            let found = polynomial(&[], Some(base)).unwrap().sag_and_gradient(x, y).map(|(z, _)| z);
+            assert_eq!(found, conic.along(x * x + y * y).map(|(z, _)| z));
+        }
+    }
+
+    #[test]
+    fn the_gradient_is_that_of_the_sag() {
+        let terms = [(0, 0, 1.0), (1, 0, 0.2), (0, 1, -0.1), (3, 2, 0.01), (0, 6, -0.004), (5, 5, 1e-4)];
+        let surface = polynomial(&terms, Some(ConicDefinition { radius_mm: 200.0, conic: -1.2 })).unwrap();
+        assert!(gradient_error(&|x, y| surface.sag_and_gradient(x, y), 15.0) < 1e-11);
+    }
+
+    #[test]
+    fn degenerate_values_are_refused_by_name() {
+        assert!(matches!(polynomial(&[(61, 0, 1.0)], None), Err(DefinitionError::Term { .. })));
+        assert!(matches!(polynomial(&[(1, 2, 1.0), (1, 2, 1.0)], None), Err(DefinitionError::RepeatedTerm { .. })));
+        let bad = polynomial(&[(1, 2, f64::NAN)], None).unwrap_err();
+        assert_eq!(bad.key().as_deref(), Some("terms.[1, 2]"));
+        let flat = ConicDefinition { radius_mm: 0.0, conic: 0.0 };
+        assert_eq!(polynomial(&[], Some(flat)).unwrap_err().key().as_deref(), Some("base.radius_mm"));
+        for normalisation_radius_mm in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+            let written = XyPolynomialDefinition { normalisation_radius_mm, terms: vec![], base: None };
+            assert!(XyPolynomial::try_from(&written).is_err());
+        }
+    }
+}

@@ -1,0 +1,384 @@
+//! A nominal surface sampled on a grid, and how fine the grid must be.
+
+use rayon::prelude::*;
+
+use super::definition::{DefinedSurface, Sampling};
+use super::error::{self, DefinitionError};
+use super::normal_of;
+use crate::geometry::{Aperture, Point, Vector};
+
+/// Most nodes of a sampling.
+const MOST_NODES: f64 = 2e7;
+
+/// Most terms and corners evaluated in a sampling; about a minute on one core.
+const MOST_WORK: f64 = 2e10;
+
+/// Nodes farther outside the aperture than this many spacings are left out. A cell that touches the aperture has its corners
+/// within a diagonal, 1.42 spacings.
+const MARGIN: f64 = 1.5;
+
+/// The coarsest spacing that is tried for an accuracy, as a part of the aperture's smaller side.
+const COARSEST: f64 = 1.0 / 8.0;
+
+/// How often the spacing is halved before an accuracy is out of reach.
+const HALVINGS: u32 = 14;
+
+/// A surface sampled on a grid, row by row, x fastest.
+#[derive(Clone, Debug)]
+pub struct SampledSurface {
+    /// Number of nodes along x.
+    pub columns: usize,
+    /// Number of nodes along y.
+    pub rows: usize,
+    /// Place of the first node.
+    pub origin_mm: [f64; 2],
+    /// Distance of the nodes along x and along y.
+    pub spacing_mm: [f64; 2],
+    /// The nodes in the surface's frame, in millimetres; all NaN where there is none.
+    pub points: Vec<Point>,
+    /// The unit normals on the +z side; all NaN where there is no node.
+    pub normals: Vec<Vector>,
+}
+
+impl DefinedSurface {
+    /// Samples the surface on a grid that covers the bounds of the aperture and one ring of nodes around them.
+    ///
+    /// Units: millimetres. The spacing is made a little smaller, along x and along y, so that it divides the bounds. Nodes
+    /// are NaN farther than 1.5 spacings outside the aperture and where the formula has no value.
+    ///
+    /// # Errors
+    /// A spacing that is not positive, more than 2e7 nodes, or a computation of more than about a minute.
+    pub fn sample(&self, spacing_mm: f64) -> Result<SampledSurface, DefinitionError> {
+        error::positive("sampling.spacing_mm", spacing_mm)?;
+        let bounds = self.aperture().bounds();
+        let cells = [0, 1].map(|k| ((bounds[1][k] - bounds[0][k]) / spacing_mm * (1.0 - 1e-12)).ceil().max(1.0));
+        let nodes = (cells[0] + 3.0) * (cells[1] + 3.0);
+        self.refuse_excess(nodes, spacing_mm)?;
+        let spacing = [0, 1].map(|k| (bounds[1][k] - bounds[0][k]) / cells[k]);
+        let [columns, rows] = cells.map(|n| n as usize + 3);
+        let margin = MARGIN * spacing[0].max(spacing[1]);
+        let place = |k: usize, i: usize| bounds[0][k] + (i as f64 - 1.0) * spacing[k];
+        let node = |i: usize| self.node(place(0, i % columns), place(1, i / columns), margin);
+        let (points, normals) = (0..columns * rows).into_par_iter().with_min_len(1024).map(node).unzip();
+        Ok(SampledSurface {
+            columns,
+            rows,
+            origin_mm: [place(0, 0), place(1, 0)],
+            spacing_mm: spacing,
+            points,
+            normals,
+        })
+    }
+
+    /// Returns the spacing the definition asks for, in millimetres.
+    ///
+    /// # Errors
+    /// Those of [`DefinedSurface::spacing_for_accuracy`].
+    pub fn spacing_mm(&self) -> Result<f64, DefinitionError> {
+        match self.sampling() {
+            Sampling::Spacing { spacing_mm } => Ok(spacing_mm),
+            Sampling::Accuracy { accuracy_mm } => self.spacing_for_accuracy(accuracy_mm),
+        }
+    }
+
+    /// Returns a spacing at which the distance to the curved triangles between the nodes is as exact as asked for.
+    ///
+    /// Units: millimetres. The error is measured: in cells about fixed places all over the aperture and along its outline, the
+    /// formula is compared with [`curved_triangle_sag`], along the normal, and the spacing is halved and bisected until
+    /// twice the largest error is within the accuracy.
+    ///
+    /// # Errors
+    /// An accuracy that is not positive, or one that no spacing reaches.
+    pub fn spacing_for_accuracy(&self, accuracy_mm: f64) -> Result<f64, DefinitionError> {
+        error::positive("sampling.accuracy_mm", accuracy_mm)?;
+        let [least, most] = self.aperture().bounds();
+        let places = places(self.aperture());
+        let error = |h: f64| 2.0 * places.par_iter().map(|&place| self.cell_error(place, h)).reduce(|| 0.0, f64::max);
+        let coarsest = COARSEST * (most[0] - least[0]).min(most[1] - least[1]);
+        let mut fine = coarsest;
+        for halving in 0.. {
+            let found = error(fine);
+            if found <= accuracy_mm {
+                break;
+            }
+            if halving == HALVINGS {
+                let [accuracy_nm, reached_nm] = [accuracy_mm, found].map(|mm| 1e6 * mm);
+                return Err(DefinitionError::AccuracyOutOfReach { accuracy_nm, reached_nm, spacing_mm: fine });
+            }
+            fine *= 0.5;
+        }
+        if fine == coarsest {
+            return Ok(fine);
+        }
+        let mut coarse = 2.0 * fine;
+        for _ in 0..6 {
+            let middle = (fine * coarse).sqrt();
+            *(if error(middle) <= accuracy_mm { &mut fine } else { &mut coarse }) = middle;
+        }
+        Ok(fine)
+    }
+
+    /// Refuses a sampling that would be too large or take too long.
+    fn refuse_excess(&self, nodes: f64, spacing_mm: f64) -> Result<(), DefinitionError> {
+        if nodes > MOST_NODES {
+            return Err(DefinitionError::TooManyNodes { spacing_mm, nodes, limit: MOST_NODES });
+        }
+        let corners = if let Aperture::Polygon { corners_mm } = self.aperture() { corners_mm.len() } else { 0 };
+        let terms = self.formula().terms() + corners;
+        let work = nodes * terms as f64;
+        if work > MOST_WORK {
+            return Err(DefinitionError::TooMuchWork { nodes, terms, work, limit: MOST_WORK });
+        }
+        Ok(())
+    }
+
+    /// Returns the node at a place and its normal.
+    fn node(&self, x: f64, y: f64, margin: f64) -> (Point, Vector) {
+        let near = self.aperture().distance_mm(x, y) <= margin;
+        match self.formula().sag_and_gradient(x, y).filter(|_| near) {
+            Some((z, gradient)) => (Point::new(x, y, z), normal_of(gradient)),
+            None => (Point::new(f64::NAN, f64::NAN, f64::NAN), Vector::repeat(f64::NAN)),
+        }
+    }
+
+    /// Returns the largest error found in the cell of size h about a place, in millimetres.
+    ///
+    /// It is infinite where a cell of a sampling that holds the place may have a corner without a value: the place would then
+    /// have no surface at all.
+    fn cell_error(&self, [x, y]: [f64; 2], h: f64) -> f64 {
+        let corner = |i: f64, j: f64| {
+            let place = [x + (i - 0.5) * h, y + (j - 0.5) * h];
+            self.formula().sag_and_gradient(place[0], place[1]).map(|(z, gradient)| (place, z, gradient))
+        };
+        let all = |low, high| Some([corner(low, low)?, corner(high, low)?, corner(high, high)?, corner(low, high)?]);
+        let Some([a, b, c, d]) = all(-0.5, 1.5).and_then(|_| all(0.0, 1.0)) else {
+            return f64::INFINITY;
+        };
+        // Whichever way the cell is cut in two.
+        let triangles = [[a, b, c], [a, c, d], [a, b, d], [b, c, d]];
+        let errors = triangles.iter().flat_map(|corners| {
+            INSIDE.iter().map(|&weights| {
+                let [px, py] = [0, 1].map(|k| (0..3).map(|i| weights[i] * corners[i].0[k]).sum::<f64>());
+                let curved =
+                    curved_triangle_sag(corners.map(|v| v.0), corners.map(|v| v.1), corners.map(|v| v.2), weights);
+                let found = self.formula().sag_and_gradient(px, py);
+                found.map_or(0.0, |(z, gradient)| (curved - z).abs() * normal_of(gradient).z)
+            })
+        });
+        errors.fold(0.0, f64::max)
+    }
+}
+
+/// Where in a triangle the error is looked for: the middles of the edges, the centroid, and three places between.
+const INSIDE: [[f64; 3]; 7] = [
+    [0.5, 0.5, 0.0],
+    [0.0, 0.5, 0.5],
+    [0.5, 0.0, 0.5],
+    [1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0],
+    [0.5, 0.25, 0.25],
+    [0.25, 0.5, 0.25],
+    [0.25, 0.25, 0.5],
+];
+
+/// Returns the sag of the cubic triangle through three corners with given sag and gradient.
+///
+/// Shapes: `places`, `sags` and `gradients` by corner; `weights` are barycentric. Along each edge it is the cubic of
+/// Hermite. The one coefficient that is left in the middle is chosen so that quadratics are exact: in Bernstein's form a
+/// quarter of the sum of the six edge coefficients less a sixth of the sum of the three at the corners. The error is O(h^4)
+/// on the edges and O(h^3) within.
+pub fn curved_triangle_sag(places: [[f64; 2]; 3], sags: [f64; 3], gradients: [[f64; 2]; 3], weights: [f64; 3]) -> f64 {
+    let (mut sag, mut edge_sum) = (0.0, 0.0);
+    for i in 0..3 {
+        sag += weights[i].powi(3) * sags[i];
+        for j in [(i + 1) % 3, (i + 2) % 3] {
+            let [dx, dy] = [0, 1].map(|k| places[j][k] - places[i][k]);
+            let edge = sags[i] + (gradients[i][0] * dx + gradients[i][1] * dy) / 3.0;
+            sag += 3.0 * weights[i] * weights[i] * weights[j] * edge;
+            edge_sum += edge;
+        }
+    }
+    let middle = edge_sum / 4.0 - sags.iter().sum::<f64>() / 6.0;
+    sag + 6.0 * weights[0] * weights[1] * weights[2] * middle
+}
+
+/// Returns fixed places all over an aperture and along its outline.
+///
+/// Within the bounds they follow the additive recurrence of the plastic number, which leaves no gaps and no lattice.
+pub(super) fn places(aperture: &Aperture) -> Vec<[f64; 2]> {
+    let [least, most] = aperture.bounds();
+    let plastic = 1.324_717_957_244_746_f64;
+    let inside = (0..800).map(|i| {
+        [0, 1].map(|k| {
+            let t = (0.5 + f64::from(i) * plastic.powi(-1 - k as i32)).fract();
+            least[k] + t * (most[k] - least[k])
+        })
+    });
+    let inside = inside.filter(|[x, y]| aperture.contains(*x, *y));
+    inside.chain(aperture.outline_mm(240)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn defined(surface: &str, aperture: &str) -> DefinedSurface {
+        DefinedSurface::from_toml(&format!("[surface]\n{surface}\n[aperture]\n{aperture}\n")).unwrap()
+    }
+
+    const ASPHERE: &str = "kind = 'asphere'\nradius_mm = 150\nconic = -1\ncoefficients = { A4 = 1e-7, A6 = -2e-11 }";
+    const L_SHAPE: &str = "kind = 'polygon'\ncorners_mm = [[0, 0], [40, 0], [40, 20], [20, 20], [20, 40], [0, 40]]";
+
+    #[test]
+    fn a_small_grid_by_hand() {
+        let flat = defined("kind = 'plane'", "kind = 'rectangle'\nwidth_mm = 4\nheight_mm = 2");
+        let sampled = flat.sample(1.1).unwrap();
+        // 4 mm in 4 cells and 2 mm in 2, and a ring.
+        assert_eq!((sampled.columns, sampled.rows), (7, 5));
+        assert_eq!((sampled.origin_mm, sampled.spacing_mm), ([-3.0, -2.0], [1.0, 1.0]));
+        assert_eq!(sampled.points[0], Point::new(-3.0, -2.0, 0.0));
+        assert_eq!(sampled.points[1], Point::new(-2.0, -2.0, 0.0));
+        assert_eq!(sampled.points[7], Point::new(-3.0, -1.0, 0.0));
+        assert!(sampled.normals.iter().all(|n| *n == Vector::z()));
+        // A spacing that divides the bounds is kept in spite of rounding.
+        assert_eq!(flat.sample(0.1).unwrap().columns, 43);
+    }
+
+    #[test]
+    fn every_place_of_the_aperture_lies_in_a_complete_cell() {
+        for aperture in [
+            L_SHAPE,
+            "kind = 'circle'\nradius_mm = 25\ncentre_mm = [3, -2]",
+            "kind = 'ellipse'\nsemi_axes_mm = [40, 3]",
+            "kind = 'annulus'\ninner_radius_mm = 15\nouter_radius_mm = 25",
+            "kind = 'rectangle'\nwidth_mm = 40\nheight_mm = 3",
+        ] {
+            let surface = defined(ASPHERE, aperture);
+            let sampled = surface.sample(0.9).unwrap();
+            let mut missing = 0;
+            for [x, y] in places(surface.aperture()).into_iter().chain(surface.aperture().outline_mm(5000)) {
+                let cell = |k: usize, v: f64| ((v - sampled.origin_mm[k]) / sampled.spacing_mm[k]).floor() as usize;
+                let (i, j) = (cell(0, x), cell(1, y));
+                for (di, dj) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+                    let n = (j + dj) * sampled.columns + i + di;
+                    assert!(sampled.points[n].z.is_finite() && sampled.normals[n].z > 0.0, "{aperture} ({x}, {y})");
+                }
+            }
+            for (point, normal) in sampled.points.iter().zip(&sampled.normals) {
+                assert_eq!(point.coords.map(f64::is_nan), normal.map(f64::is_nan));
+                missing += usize::from(point.z.is_nan());
+                let far = surface.aperture().distance_mm(point.x, point.y) > 1.5 * 0.9;
+                assert!(point.z.is_nan() || !far);
+            }
+            assert!(aperture.contains("rectangle") || missing > 0);
+        }
+    }
+
+    #[test]
+    fn a_cubic_triangle_is_exact_for_quadratics_and_on_the_edges_for_cubics() {
+        let places = [[0.0, 0.0], [2.0, 0.5], [-0.5, 1.5]];
+        let quadratic = |[x, y]: [f64; 2]| {
+            (1.0 + x - 2.0 * y + x * x - 3.0 * x * y + 0.5 * y * y, [1.0 + 2.0 * x - 3.0 * y, -2.0 - 3.0 * x + y])
+        };
+        let cubic = |[x, y]: [f64; 2]| (x * x * x - x * y * y, [3.0 * x * x - y * y, -2.0 * x * y]);
+        let at = |weights: [f64; 3]| [0, 1].map(|k| (0..3).map(|i| weights[i] * places[i][k]).sum::<f64>());
+        for weights in INSIDE {
+            let found =
+                curved_triangle_sag(places, places.map(|p| quadratic(p).0), places.map(|p| quadratic(p).1), weights);
+            assert!((found - quadratic(at(weights)).0).abs() < 1e-14);
+        }
+        for weights in [[0.3, 0.7, 0.0], [0.0, 0.9, 0.1], [0.5, 0.0, 0.5]] {
+            let found = curved_triangle_sag(places, places.map(|p| cubic(p).0), places.map(|p| cubic(p).1), weights);
+            assert!((found - cubic(at(weights)).0).abs() < 1e-14);
+        }
+    }
+
+    /// The largest error along the normal at places other than those the spacing was found with.
+    fn true_error(surface: &DefinedSurface, spacing_mm: f64) -> f64 {
+        let s = surface.sample(spacing_mm).unwrap();
+        let corner = |n: usize| (s.points[n], s.normals[n]);
+        let mut worst = 0.0f64;
+        for n in 0..(s.rows - 1) * s.columns {
+            if n % s.columns == s.columns - 1 {
+                continue;
+            }
+            let triangle = [n, n + 1, n + s.columns + 1].map(corner);
+            let middle = (triangle[0].0.coords + triangle[1].0.coords + triangle[2].0.coords) / 3.0;
+            if !surface.aperture().contains(middle.x, middle.y) {
+                continue;
+            }
+            for weights in [[1.0 / 3.0; 3], [0.5, 0.0, 0.5], [0.6, 0.2, 0.2], [0.2, 0.6, 0.2], [0.2, 0.2, 0.6]] {
+                let [x, y] = [0, 1].map(|k| (0..3).map(|i| weights[i] * triangle[i].0[k]).sum::<f64>());
+                let gradients = triangle.map(|(_, n)| [-n.x / n.z, -n.y / n.z]);
+                let curved = curved_triangle_sag(
+                    triangle.map(|(p, _)| [p.x, p.y]),
+                    triangle.map(|(p, _)| p.z),
+                    gradients,
+                    weights,
+                );
+                let (z, gradient) = surface.formula().sag_and_gradient(x, y).unwrap();
+                worst = worst.max((curved - z).abs() * normal_of(gradient).z);
+            }
+        }
+        worst
+    }
+
+    #[test]
+    fn the_spacing_found_is_exact_enough_and_not_much_too_fine() {
+        let qbfs = "kind = 'qbfs'\nradius_mm = 80\nnormalisation_radius_mm = 30\ncoefficients_mm = [0.1, 0.02, -0.01]";
+        let toroid = "kind = 'toroid'\nradius_x_mm = 120\nradius_y_mm = -90";
+        let section = "kind = 'off-axis'\ndistance_mm = 60\nframe = 'tilted'\n\
+                       [surface.parent]\nkind = 'conic'\nradius_mm = 200\nconic = -1";
+        let circle = "kind = 'circle'\nradius_mm = 30";
+        for (surface, aperture, accuracy_mm) in [
+            (ASPHERE, L_SHAPE, 1e-6),
+            (ASPHERE, circle, 1e-5),
+            (qbfs, circle, 1e-5),
+            (toroid, circle, 1e-6),
+            (section, "kind = 'ellipse'\nsemi_axes_mm = [30, 20]", 1e-6),
+        ] {
+            let surface = defined(surface, aperture);
+            let spacing_mm = surface.spacing_for_accuracy(accuracy_mm).unwrap();
+            let error = true_error(&surface, spacing_mm);
+            assert!(error <= accuracy_mm, "{error}");
+            assert!(error >= 0.15 * accuracy_mm, "{error} at {spacing_mm} mm for {accuracy_mm}");
+        }
+    }
+
+    #[test]
+    fn a_quadric_surface_needs_no_fine_grid_and_the_spacing_asked_for_is_kept() {
+        let paraboloid = defined("kind = 'conic'\nradius_mm = 100\nconic = -1", "kind = 'circle'\nradius_mm = 20");
+        assert_eq!(paraboloid.spacing_for_accuracy(1e-9).unwrap(), 5.0);
+        assert_eq!(paraboloid.spacing_mm().unwrap(), 5.0);
+        let asked = defined(ASPHERE, "kind = 'circle'\nradius_mm = 20\n[sampling]\nspacing_mm = 0.3");
+        assert_eq!(asked.spacing_mm().unwrap(), 0.3);
+    }
+
+    #[test]
+    fn excess_is_refused_before_it_begins() {
+        let disc = defined(ASPHERE, "kind = 'circle'\nradius_mm = 20");
+        assert!(matches!(disc.sample(0.001), Err(DefinitionError::TooManyNodes { .. })));
+        assert!(matches!(disc.sample(1e-300), Err(DefinitionError::TooManyNodes { .. })));
+        for bad in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+            assert!(matches!(disc.sample(bad), Err(DefinitionError::OutOfRange { .. })));
+            assert!(matches!(disc.spacing_for_accuracy(bad), Err(DefinitionError::OutOfRange { .. })));
+        }
+        assert!(matches!(disc.spacing_for_accuracy(1e-18), Err(DefinitionError::AccuracyOutOfReach { .. })));
+        let corners: Vec<String> = (0..4000)
+            .map(|i| (f64::from(i) * std::f64::consts::TAU / 4000.0).sin_cos())
+            .map(|(sine, cosine)| format!("[{:.12}, {:.12}]", 20.0 * cosine, 20.0 * sine))
+            .collect();
+        let fringed = defined(ASPHERE, &format!("kind = 'polygon'\ncorners_mm = [{}]", corners.join(", ")));
+        assert!(matches!(fringed.sample(0.01), Err(DefinitionError::TooMuchWork { .. })));
+    }
+
+    #[test]
+    fn the_ring_is_left_out_where_the_formula_ends() {
+        let dome = defined("kind = 'sphere'\nradius_mm = -20", "kind = 'circle'\nradius_mm = 19.9");
+        let sampled = dome.sample(0.5).unwrap();
+        assert!(sampled.points.iter().all(|p| p.z.is_nan() || p.x.hypot(p.y) < 20.0));
+        assert!(sampled.points.iter().filter(|p| p.z.is_finite()).count() > 4900);
+        // A spacing found for an accuracy is so fine that no cell of the aperture lacks a corner.
+        let spacing_mm = dome.spacing_for_accuracy(1e-3).unwrap();
+        assert!(2f64.sqrt() * spacing_mm < 0.1 + 1e-9 && spacing_mm > 0.01, "{spacing_mm}");
+    }
+}

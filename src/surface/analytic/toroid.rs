@@ -1,0 +1,216 @@
+//! Surfaces with two radii: the toroid and the biconic.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::conic::{Asphere, AsphereDefinition};
+use super::error::{self, DefinitionError};
+
+/// A curve in the (y, z) plane turned about a line parallel to y.
+///
+/// The curve g(y) is that of an asphere with |y| for h. The line of rotation meets the z axis at z = R, R being the radius of
+/// rotation; without one (`inf`) the curve is moved along x, which makes a cylinder. With C = 1/R and w = 1 - C g(y)
+/// `z = g + C x^2 / (w + sqrt(w^2 - C^2 x^2))`, which is the near root of (z - R)^2 + x^2 = (R - g)^2.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Toroid {
+    rotation_per_mm: f64,
+    curve: Asphere,
+}
+
+/// A toroid as written.
+#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct ToroidDefinition {
+    /// Radius of rotation in millimetres, which is the radius of the section y = 0; `inf` for a cylinder.
+    pub radius_x_mm: f64,
+    /// Radius of the curve in the (y, z) plane at its vertex, in millimetres; `inf` for none.
+    pub radius_y_mm: f64,
+    /// Conic constant of that curve.
+    #[serde(default)]
+    pub conic_y: f64,
+    /// Coefficients of that curve by power of |y|, as for an asphere, in mm^(1 - power).
+    #[serde(default)]
+    pub coefficients: BTreeMap<String, f64>,
+}
+
+impl Toroid {
+    /// Makes a toroid from its radius of rotation, which may be infinite, and its curve.
+    ///
+    /// # Errors
+    /// A radius that is NaN or less than 1e-6 mm in magnitude.
+    pub fn new(radius_x_mm: f64, curve: Asphere) -> Result<Self, DefinitionError> {
+        Ok(Self { rotation_per_mm: error::curvature("radius_x_mm", radius_x_mm)?, curve })
+    }
+
+    /// Returns the sag and its gradient; none where the line of rotation is too near.
+    ///
+    /// Units: millimetres; the gradient has none.
+    pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
+        let c = self.rotation_per_mm;
+        let (g, slope) = self.curve.along(y * y)?;
+        let w = 1.0 - c * g;
+        let root = w * w - c * c * x * x;
+        if !(w > 0.0 && root > 0.0) {
+            return None;
+        }
+        let root = root.sqrt();
+        Some((g + c * x * x / (w + root), [c * x / root, w * 2.0 * y * slope / root]))
+    }
+
+    /// How many terms an evaluation sums.
+    pub(super) fn terms(&self) -> usize {
+        1 + self.curve.terms()
+    }
+}
+
+impl TryFrom<&ToroidDefinition> for Toroid {
+    type Error = DefinitionError;
+
+    fn try_from(written: &ToroidDefinition) -> Result<Self, DefinitionError> {
+        error::curvature("radius_y_mm", written.radius_y_mm)?;
+        error::finite("conic_y", written.conic_y)?;
+        let curve = AsphereDefinition {
+            radius_mm: written.radius_y_mm,
+            conic: written.conic_y,
+            coefficients: written.coefficients.clone(),
+        };
+        Self::new(written.radius_x_mm, Asphere::try_from(&curve)?)
+    }
+}
+
+/// A conic in x and another in y, joined:
+/// `z = (cx x^2 + cy y^2) / (1 + sqrt(1 - (1 + kx) cx^2 x^2 - (1 + ky) cy^2 y^2))`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Biconic {
+    curvatures_per_mm: [f64; 2],
+    conics: [f64; 2],
+}
+
+/// A biconic as written.
+#[derive(Clone, Copy, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct BiconicDefinition {
+    /// Radius of the section y = 0 at the vertex in millimetres; `inf` for none.
+    pub radius_x_mm: f64,
+    /// Radius of the section x = 0 at the vertex in millimetres; `inf` for none.
+    pub radius_y_mm: f64,
+    /// Conic constant of the section y = 0.
+    #[serde(default)]
+    pub conic_x: f64,
+    /// Conic constant of the section x = 0.
+    #[serde(default)]
+    pub conic_y: f64,
+}
+
+impl Biconic {
+    /// Returns the sag and its gradient; none at the edge and beyond.
+    ///
+    /// Units: millimetres; the gradient has none.
+    pub fn sag_and_gradient(&self, x: f64, y: f64) -> Option<(f64, [f64; 2])> {
+        let [cx, cy] = self.curvatures_per_mm;
+        let [fall_x, fall_y] = [(1.0 + self.conics[0]) * cx * cx * x, (1.0 + self.conics[1]) * cy * cy * y];
+        let root = 1.0 - fall_x * x - fall_y * y;
+        if root.is_nan() || root <= 0.0 {
+            return None;
+        }
+        let root = root.sqrt();
+        let z = (cx * x * x + cy * y * y) / (1.0 + root);
+        let slope = |c: f64, v: f64, fall: f64| (2.0 * c * v + z * fall / root) / (1.0 + root);
+        Some((z, [slope(cx, x, fall_x), slope(cy, y, fall_y)]))
+    }
+}
+
+impl TryFrom<&BiconicDefinition> for Biconic {
+    type Error = DefinitionError;
+
+    fn try_from(written: &BiconicDefinition) -> Result<Self, DefinitionError> {
+        let cx = error::curvature("radius_x_mm", written.radius_x_mm)?;
+        let cy = error::curvature("radius_y_mm", written.radius_y_mm)?;
+        let conics = [error::finite("conic_x", written.conic_x)?, error::finite("conic_y", written.conic_y)?];
+        Ok(Self { curvatures_per_mm: [cx, cy], conics })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surface::analytic::conic::Conic;
+    use crate::surface::analytic::test_support::{disc, gradient_error};
+
+    fn toroid(radius_x_mm: f64, radius_y_mm: f64) -> Toroid {
+        Toroid::new(radius_x_mm, Asphere::new(Conic::new(radius_y_mm, 0.0).unwrap(), &[]).unwrap()).unwrap()
+    }
+
+    #[test]
+    fn a_toroid_by_hand() {
+        // At y = 3 the curve of radius 5 has risen by 1, so 13 - 1 = 12 is left to the line at 13; at x = 7.2 the circle of
+        // radius 12 (3-4-5) stands 9.6 below the line.
+        let (z, [gx, gy]) = toroid(13.0, 5.0).sag_and_gradient(7.2, 3.0).unwrap();
+        assert!((z - 3.4).abs() < 1e-14 && (gx - 0.75).abs() < 1e-14);
+        assert!((gy - 12.0 / 9.6 * 0.75).abs() < 1e-14);
+        assert_eq!(toroid(13.0, 5.0).sag_and_gradient(0.0, 5.0), None);
+        assert_eq!(toroid(13.0, 5.0).sag_and_gradient(12.5, 3.0), None);
+    }
+
+    #[test]
+    fn equal_radii_make_the_sphere_and_an_infinite_one_a_cylinder() {
+        let sphere = Conic::new(-80.0, 0.0).unwrap();
+        for [x, y] in disc(70.0) {
+            let (sag, slope) = sphere.along(x * x + y * y).unwrap();
+            let (z, [gx, gy]) = toroid(-80.0, -80.0).sag_and_gradient(x, y).unwrap();
+            assert!((z - sag).abs() < 1e-13 && (gx - 2.0 * x * slope).abs() < 1e-13);
+            assert!((gy - 2.0 * y * slope).abs() < 1e-13);
+            let (along_x, _) = toroid(80.0, f64::INFINITY).sag_and_gradient(x, y).unwrap();
+            assert!((along_x + sphere.along(x * x).unwrap().0).abs() < 1e-13);
+            let (along_y, _) = toroid(f64::INFINITY, 80.0).sag_and_gradient(x, y).unwrap();
+            assert!((along_y + sphere.along(y * y).unwrap().0).abs() < 1e-13);
+        }
+    }
+
+    #[test]
+    fn a_biconic_with_equal_radii_is_the_conic() {
+        let conic = Conic::new(60.0, -0.7).unwrap();
+        let written = BiconicDefinition { radius_x_mm: 60.0, radius_y_mm: 60.0, conic_x: -0.7, conic_y: -0.7 };
+        let biconic = Biconic::try_from(&written).unwrap();
+        for [x, y] in disc(50.0) {
+            let (sag, slope) = conic.along(x * x + y * y).unwrap();
+            let (z, [gx, gy]) = biconic.sag_and_gradient(x, y).unwrap();
+            assert!((z - sag).abs() < 1e-14 && (gx - 2.0 * x * slope).abs() < 1e-14);
+            assert!((gy - 2.0 * y * slope).abs() < 1e-14);
+        }
+    }
+
+    #[test]
+    fn a_biconic_by_hand() {
+        let written = BiconicDefinition { radius_x_mm: 5.0, radius_y_mm: f64::INFINITY, conic_x: 0.0, conic_y: 3.0 };
+        let biconic = Biconic::try_from(&written).unwrap();
+        let (z, [gx, gy]) = biconic.sag_and_gradient(3.0, 1e5).unwrap();
+        assert!((z - 1.0).abs() < 1e-15 && (gx - 0.75).abs() < 1e-15 && gy == 0.0);
+        assert_eq!(biconic.sag_and_gradient(5.0, 0.0), None);
+    }
+
+    #[test]
+    fn gradients_are_those_of_the_sag() {
+        let curve = Asphere::new(Conic::new(-90.0, -2.0).unwrap(), &[(4, 2e-7), (6, 1e-10)]).unwrap();
+        let toroid = Toroid::new(150.0, curve).unwrap();
+        assert!(gradient_error(&|x, y| toroid.sag_and_gradient(x, y), 40.0) < 1e-11);
+        let written = BiconicDefinition { radius_x_mm: 60.0, radius_y_mm: -95.0, conic_x: 1.5, conic_y: -3.0 };
+        let biconic = Biconic::try_from(&written).unwrap();
+        assert!(gradient_error(&|x, y| biconic.sag_and_gradient(x, y), 30.0) < 1e-11);
+    }
+
+    #[test]
+    fn degenerate_values_are_refused_by_name() {
+        let good = BiconicDefinition { radius_x_mm: 60.0, radius_y_mm: -95.0, conic_x: 1.5, conic_y: -3.0 };
+        for (bad, name) in [
+            (BiconicDefinition { radius_x_mm: 0.0, ..good }, "radius_x_mm"),
+            (BiconicDefinition { radius_y_mm: f64::NAN, ..good }, "radius_y_mm"),
+            (BiconicDefinition { conic_y: f64::INFINITY, ..good }, "conic_y"),
+        ] {
+            assert_eq!(Biconic::try_from(&bad).unwrap_err().key().as_deref(), Some(name));
+        }
+        let curve = Asphere::new(Conic::PLANE, &[]).unwrap();
+        assert_eq!(Toroid::new(0.0, curve).unwrap_err().key().as_deref(), Some("radius_x_mm"));
+    }
+}
