@@ -70,7 +70,7 @@ pub(crate) fn correspond(
             last = foot.place;
             track.place = foot.place;
             track.distance_mm = foot.distance_mm - reading.subtract_mm;
-            track.beyond_steps = (foot.beyond_mm / foot.spacing_mm) as f32;
+            track.beyond_steps = foot.beyond_steps as f32;
             if let Some(outline) = surface.nominal().outline() {
                 let contact = p - foot.normal * (foot.distance_mm + surface.radius_mm());
                 if !outline.contains(contact.x, contact.y) {

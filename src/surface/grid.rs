@@ -9,7 +9,8 @@ use super::patch::Facets;
 
 /// The triangles of a structured grid, row by row with the column fastest.
 ///
-/// Facet 2c is the half of cell c at its lower right (nodes 00, 10, 11), facet 2c + 1 the half at its upper left (00, 11, 01).
+/// Facet 2n is the half at the lower right (nodes 00, 10, 11) of the cell whose first node is n, facet 2n + 1 the half at its
+/// upper left (00, 11, 01): numbered by nodes, so that corners cost no division; those of the last column do not exist.
 #[derive(Clone, Debug)]
 pub(crate) struct GridLattice {
     columns: u32,
@@ -51,7 +52,13 @@ impl GridLattice {
     }
 
     pub(crate) fn facet_count(&self) -> u32 {
-        2 * (self.columns - 1) * (self.rows - 1)
+        2 * self.columns * (self.rows - 1)
+    }
+
+    /// Whether a facet lies between nodes that all exist.
+    pub(crate) fn has_facet(&self, facet: u32) -> bool {
+        let (i, j) = self.cell_of(facet);
+        i + 1 < self.columns && j + 1 < self.rows && self.corners(facet).iter().all(|&c| self.is_present(c as usize))
     }
 
     pub(crate) fn is_present(&self, node: usize) -> bool {
@@ -66,12 +73,12 @@ impl GridLattice {
     }
 
     fn facet_at(&self, i: u32, j: u32, half: u32) -> u32 {
-        2 * (j * (self.columns - 1) + i) + half
+        2 * (j * self.columns + i) + half
     }
 
     fn cell_of(&self, facet: u32) -> (u32, u32) {
-        let cell = facet / 2;
-        (cell % (self.columns - 1), cell / (self.columns - 1))
+        let node = facet / 2;
+        (node % self.columns, node / self.columns)
     }
 
     /// Returns the cell at (u, v) steps from a cell, kept within the grid, and as far towards it as there are whole cells.
@@ -113,8 +120,7 @@ impl GridLattice {
 impl Facets for GridLattice {
     #[inline]
     fn corners(&self, facet: u32) -> [u32; 3] {
-        let (i, j) = self.cell_of(facet);
-        let node = j * self.columns + i;
+        let node = facet / 2;
         let far = node + self.columns + 1;
         if facet & 1 == 0 { [node, node + 1, far] } else { [node, far, far - 1] }
     }

@@ -5,10 +5,13 @@
 //! slope of the surface along each edge at each of its ends, the height over the flat facet is the cubic
 //!
 //! ```text
-//! h(b) = sum over i != j of g_ij b_i^2 b_j + 1/2 b_0 b_1 b_2 sum over i != j of g_ij,   g_ij = -n_i.(p_j - p_i) / n_i.N
+//! h(b) = sum over i != j of g_ij b_i^2 b_j + 1/2 b_0 b_1 b_2 sum over i != j of g_ij,   g_ij = -n_i.(p_j - p_i)
 //! ```
 //!
-//! which is the cubic triangle with quadratic precision (Vlachos et al., Curved PN triangles, 2001) written as a height.
+//! which is the cubic triangle with quadratic precision (Vlachos et al., Curved PN triangles, 2001), its heights taken along
+//! the normals of the surface instead of the normal of the facet. The foot of the perpendicular on the flat facet is off by
+//! the distance times the lean of the surface against the facet, so the distance along the normal n(b) of the surface is
+//! d (N.n(b)) - h(b), with d and N the flat distance and normal: exact to third order in the size of a facet.
 
 use crate::geometry::{Point, Vector};
 
@@ -105,8 +108,8 @@ pub struct Foot {
     pub normal: Vector,
     /// How far the foot lies beyond the edge of the surface, in millimetres; 0 on the part.
     pub beyond_mm: f64,
-    /// Length that counts as one step of the nominal sampling here, in millimetres.
-    pub spacing_mm: f64,
+    /// How far that is in steps of the nominal sampling.
+    pub beyond_steps: f64,
 }
 
 /// A foot this many steps of the sampling beyond the edge is still on the part: the curved facet continues that far.
@@ -177,7 +180,7 @@ impl<'a> OffsetSurface<'a> {
     /// The foot on the patch that a point belongs to: the nearest one that has it inside, else the one it is least beyond.
     fn nearest_foot(&self, patches: &[Patch], p: &Point, start: Place) -> Foot {
         let rank = |f: &Foot| {
-            let beyond = if f.beyond_mm <= EDGE_REACH * f.spacing_mm { 0.0 } else { f.beyond_mm };
+            let beyond = if f.beyond_steps <= EDGE_REACH { 0.0 } else { f.beyond_mm };
             (beyond, f.distance_mm.abs())
         };
         patches
@@ -239,11 +242,11 @@ struct OffsetFacet {
 
 impl OffsetFacet {
     #[inline(always)]
-    fn new(surface: &OffsetSurface, patch: &Patch, corners: [u32; 3]) -> Self {
+    fn new(surface: &OffsetSurface, patch: &Patch, [a, b, c]: [u32; 3]) -> Self {
         let sign = surface.side.sign();
-        let n = corners.map(|c| patch.normal(c) * sign);
-        let x: [Vector; 3] =
-            std::array::from_fn(|k| patch.points[corners[k] as usize].coords + n[k] * surface.radius_mm); // eq. (3)
+        let n = [patch.normal(a) * sign, patch.normal(b) * sign, patch.normal(c) * sign];
+        let offset = |vertex: u32, n: &Vector| patch.points[vertex as usize].coords + n * surface.radius_mm; // eq. (3)
+        let x = [offset(a, &n[0]), offset(b, &n[1]), offset(c, &n[2])];
         let turned = (x[1] - x[0]).cross(&(x[2] - x[0]));
         let squared = turned.norm_squared();
         let flat = turned * (sign / squared.sqrt());
@@ -265,13 +268,14 @@ impl OffsetFacet {
     #[inline(always)]
     fn foot(&self, p: &Point, weights: [f64; 3], inside: bool, distance: Distance, patch: u32, facet: u32) -> Foot {
         let place = Place { patch, facet };
-        let spacing_mm = self.turned.norm_squared().sqrt().sqrt();
-        let mut beyond_mm = 0.0;
+        let (mut beyond_mm, mut beyond_steps) = (0.0, 0.0);
         if !inside {
             let clamped = self.clamped(p, &weights);
             beyond_mm = (self.at(&clamped) - self.at(&weights)).norm();
-            if beyond_mm > EDGE_REACH * spacing_mm {
-                return self.tangent_foot(p, &clamped, distance, place, beyond_mm, spacing_mm);
+            beyond_steps = beyond_mm / self.turned.norm().sqrt();
+            if beyond_steps > EDGE_REACH {
+                let (distance_mm, normal) = self.from_tangent_plane(p, &clamped, distance);
+                return Foot { place, distance_mm, normal, beyond_mm, beyond_steps };
             }
         }
         let flat_mm = (p.coords - self.x[0]).dot(&self.flat); // eq. (2)
@@ -279,30 +283,20 @@ impl OffsetFacet {
             Distance::Triangle => (flat_mm, self.flat),
             Distance::Curved => {
                 let normal = self.normal(&weights);
-                // The foot of the flat facet is off by the distance times the lean of the surface against the facet, which
-                // lengthens the perpendicular by 1 / cos.
-                ((flat_mm - self.height(&weights)) * normal.dot(&self.flat), normal)
+                (flat_mm * normal.dot(&self.flat) - self.height(&weights), normal)
             }
         };
-        Foot { place, distance_mm, normal, beyond_mm, spacing_mm }
+        Foot { place, distance_mm, normal, beyond_mm, beyond_steps }
     }
 
-    /// The distance from the tangent plane at a place of the edge.
+    /// The distance from the tangent plane at a place of the edge, and its normal.
     #[cold]
-    fn tangent_foot(
-        &self,
-        p: &Point,
-        clamped: &[f64; 3],
-        distance: Distance,
-        place: Place,
-        beyond_mm: f64,
-        spacing_mm: f64,
-    ) -> Foot {
+    fn from_tangent_plane(&self, p: &Point, at: &[f64; 3], distance: Distance) -> (f64, Vector) {
         let (anchor, normal) = match distance {
-            Distance::Triangle => (self.at(clamped), self.flat),
-            Distance::Curved => (self.at(clamped) + self.flat * self.height(clamped), self.normal(clamped)),
+            Distance::Triangle => (self.at(at), self.flat),
+            Distance::Curved => (self.at(at) + self.flat * self.height(at), self.normal(at)),
         };
-        Foot { place, distance_mm: (p.coords - anchor).dot(&normal), normal, beyond_mm, spacing_mm }
+        ((p.coords - anchor).dot(&normal), normal)
     }
 
     #[inline(always)]
@@ -319,19 +313,16 @@ impl OffsetFacet {
     /// Height of the curved surface over the flat facet, positive on the probe's side.
     #[inline(always)]
     fn height(&self, b: &[f64; 3]) -> f64 {
-        let slope = self.n.map(|n| -1.0 / n.dot(&self.flat));
-        let edge = |i: usize, j: usize| {
-            let e = self.x[j] - self.x[i];
-            (self.n[i].dot(&e) * slope[i], -self.n[j].dot(&e) * slope[j])
-        };
-        let mut sum = 0.0;
-        let mut total = 0.0;
-        for (i, j) in [(0, 1), (1, 2), (2, 0)] {
-            let (at_i, at_j) = edge(i, j);
-            sum += b[i] * b[j] * (b[i] * at_i + b[j] * at_j);
-            total += at_i + at_j;
-        }
-        sum + 0.5 * total * b[0] * b[1] * b[2]
+        let edges = [self.x[1] - self.x[0], self.x[2] - self.x[1], self.x[0] - self.x[2]];
+        // Slope of the surface along edge k, at its beginning and against its direction at its end.
+        let leaving = |k: usize| -self.n[k].dot(&edges[k]);
+        let arriving = |k: usize, end: usize| self.n[end].dot(&edges[k]);
+        let g = [(leaving(0), arriving(0, 1)), (leaving(1), arriving(1, 2)), (leaving(2), arriving(2, 0))];
+        let along = b[0] * b[1] * (b[0] * g[0].0 + b[1] * g[0].1)
+            + b[1] * b[2] * (b[1] * g[1].0 + b[2] * g[1].1)
+            + b[2] * b[0] * (b[2] * g[2].0 + b[0] * g[2].1);
+        let total = g[0].0 + g[0].1 + g[1].0 + g[1].1 + g[2].0 + g[2].1;
+        along + 0.5 * total * b[0] * b[1] * b[2]
     }
 
     /// Weights of the nearest place of the facet for a point that lies beyond its most negative edge.

@@ -99,7 +99,7 @@ impl Patch {
         }
     }
 
-    /// Returns the number of facets, those over holes included.
+    /// Returns the number of facets, those that do not exist in a grid included.
     pub(crate) fn facet_count(&self) -> u32 {
         match &self.lattice {
             Lattice::Grid(grid) => grid.facet_count(),
@@ -107,13 +107,12 @@ impl Patch {
         }
     }
 
-    /// Returns the corners of a facet, or `None` where a grid has a hole.
+    /// Returns the corners of a facet, or `None` where a grid has none.
     pub(crate) fn facet(&self, facet: u32) -> Option<[u32; 3]> {
-        let corners = match &self.lattice {
-            Lattice::Grid(grid) => grid.corners(facet),
-            Lattice::Mesh(mesh) => mesh.corners(facet),
-        };
-        corners.iter().all(|&c| self.points[c as usize].x.is_finite()).then_some(corners)
+        match &self.lattice {
+            Lattice::Grid(grid) => grid.has_facet(facet).then(|| grid.corners(facet)),
+            Lattice::Mesh(mesh) => Some(mesh.corners(facet)),
+        }
     }
 }
 
