@@ -35,15 +35,20 @@ pub(crate) struct Candidate {
     side: Side,
 }
 
-/// Points that a candidate is scored on, refined on, and compared on.
+/// Points that a candidate is glanced at with, scored on, refined on, and compared on.
+const GLANCED: usize = 10;
 const SCORED: usize = 40;
 const REFINED: usize = 160;
 const COMPARED: usize = 640;
+/// Candidates that a glance leaves.
+const PROMISING: usize = 300;
 /// Measured places that are laid on the surface, and places of the surface that each is laid on.
 const LAID: usize = 24;
 const PLACES: usize = 36;
 /// Candidates that are refined.
 const KEPT: usize = 24;
+/// Candidates that are compared on both sides.
+const COMPARED_AT_MOST: usize = 6;
 
 /// A side fits better only if its rms is this many times smaller; the part's own form error keeps the two apart by less.
 const SIDE_RATIO: f64 = 2.0;
@@ -63,7 +68,7 @@ pub(crate) fn mirrored_rms(part: &Part, measured: &[Point], options: &Options, f
     let mirrored: Vec<Point> = spread(measured, 4 * COMPARED).map(|p| Point::new(-p.x, p.y, p.z)).collect();
     let options = Options { side: ProbeSide::Known(found.side), ..*options };
     let search = Search::new(part, &mirrored, &options);
-    search.candidates(found.side).first().map(|c| c.rms_mm)
+    search.compared(&search.candidates(found.side), found.side).first().map(|c| c.rms_mm)
 }
 
 /// Some of the points, evenly along their order; jittered, so that the choice does not run along one column of a grid.
@@ -92,36 +97,35 @@ impl<'a> Search<'a> {
     /// Takes a pose as given and finds the side on which the points fit.
     fn side_at(&self, pose: Pose) -> Result<Seed, RegistrationError> {
         let at = |side: Side| {
-            let start = if side == Side::Normal { pose } else { self.across(pose) };
-            self.refine(start, side, &self.many, 12)
+            let start = if side == Side::Normal { pose } else { self.across_to(pose, side) };
+            self.refine(start, side, &self.many, 4, 12)
         };
         let (side, _) = self.choose_side(at(Side::Normal), at(Side::Opposite))?;
         Ok(Seed { cmm_from_model: pose, side, near: false, alternatives: Vec::new() })
     }
 
     /// Tries many poses and takes the best.
+    ///
+    /// The candidates are refined on one side of the surface: on the other the probe centres lie two radii away, which is
+    /// little against the differences between right and wrong poses. Only the best are compared on both.
     fn search(&self) -> Result<Seed, RegistrationError> {
-        let best = |side| {
-            let found = self.candidates(side);
-            found.first().copied().map(|best| (best, found))
+        let side = match self.options.side {
+            ProbeSide::Known(side) => side,
+            ProbeSide::Auto => Side::Normal,
         };
-        let (normal, opposite) = match self.options.side {
-            ProbeSide::Known(Side::Normal) => (best(Side::Normal), None),
-            ProbeSide::Known(Side::Opposite) => (None, best(Side::Opposite)),
-            ProbeSide::Auto => (best(Side::Normal), best(Side::Opposite)),
+        let candidates = self.candidates(side);
+        let there = self.compared(&candidates, side);
+        let through: Vec<Candidate> = candidates
+            .iter()
+            .map(|c| Candidate { cmm_from_model: self.across_to(c.cmm_from_model, side.other()), ..*c })
+            .collect();
+        let across = self.compared(&through, side.other());
+        let (normal, opposite) = if side == Side::Normal { (&there, &across) } else { (&across, &there) };
+        let (Some(&at_normal), Some(&at_opposite)) = (normal.first(), opposite.first()) else {
+            return Err(RegistrationError::Undetermined);
         };
-        let candidate =
-            |found: &Option<(Candidate, Vec<Candidate>)>, other: &Option<(Candidate, Vec<Candidate>)>, side| {
-                found.as_ref().map(|f| f.0).or_else(|| {
-                    // The other side of a known one: from the same pose, shifted through the surface.
-                    other.as_ref().map(|f| self.refine(self.across_to(f.0.cmm_from_model, side), side, &self.many, 12))
-                })
-            };
-        let sides = (candidate(&normal, &opposite, Side::Normal), candidate(&opposite, &normal, Side::Opposite));
-        let (Some(at_normal), Some(at_opposite)) = sides else { return Err(RegistrationError::Undetermined) };
         let (side, best) = self.choose_side(at_normal, at_opposite)?;
-        let all = if side == Side::Normal { normal } else { opposite }.map_or(Vec::new(), |f| f.1);
-        let alternatives = self.alternatives(&best, &all);
+        let alternatives = self.alternatives(&best, if side == Side::Normal { normal } else { opposite });
         Ok(Seed { cmm_from_model: best.cmm_from_model, side, near: true, alternatives })
     }
 
@@ -141,41 +145,44 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// A pose for the opposite side from one for the side of the normals, the surface shifted by the two radii.
-    fn across(&self, pose: Pose) -> Pose {
-        self.across_to(pose, Side::Opposite)
-    }
-
+    /// A pose for one side from a pose for the other: the surface is shifted by two radii along its mean normal.
     fn across_to(&self, pose: Pose, side: Side) -> Pose {
         let mean = self.part.nominal.mean_normal();
         let shift = mean * (-2.0 * self.part.offset_mm * side.sign());
         pose * Pose { translation_mm: -shift, ..Pose::identity() }
     }
 
-    /// Returns refined candidates on one side, the best first, each pose once.
+    /// Returns the best of all starts on one side, roughly refined, the best first.
     fn candidates(&self, side: Side) -> Vec<Candidate> {
         let surface = self.part.surface(self.options, side);
         let mut starts = vec![Pose::identity()];
         starts.extend(self.by_principal_axes(side));
         starts.extend(self.by_curvature(side));
-        let mut scored: Vec<(f64, Pose)> =
-            starts.into_par_iter().map(|p| (self.score(&surface, &p, &self.few), p)).collect();
-        scored.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let scored = |poses: Vec<Pose>, points: &[Point]| {
+            let mut scored: Vec<(f64, Pose)> =
+                poses.into_par_iter().with_min_len(16).map(|p| (self.score(&surface, &p, points), p)).collect();
+            scored.sort_by(|a, b| a.0.total_cmp(&b.0));
+            scored.into_iter().map(|(_, pose)| pose)
+        };
+        let glanced = self.few.iter().step_by(self.few.len().div_ceil(GLANCED)).copied().collect::<Vec<_>>();
+        let promising = scored(starts, &glanced).take(PROMISING).collect();
         let mut kept: Vec<Pose> = Vec::new();
-        for (_, pose) in scored {
-            if kept.iter().all(|k| self.apart(k, &pose) > 0.1) {
+        for pose in scored(promising, &self.few) {
+            if kept.len() < KEPT && kept.iter().all(|k| self.apart(k, &pose) > 0.1) {
                 kept.push(pose);
-            }
-            if kept.len() == KEPT {
-                break;
             }
         }
         let mut refined: Vec<Candidate> =
-            kept.into_par_iter().map(|pose| self.refine(pose, side, &self.some, 10)).collect();
+            kept.into_par_iter().map(|pose| self.refine(pose, side, &self.some, 2, 6)).collect();
         refined.sort_by(|a, b| a.rms_mm.total_cmp(&b.rms_mm));
-        let best = refined.iter().take(6).copied().collect::<Vec<_>>();
+        refined
+    }
+
+    /// Refines the best candidates fully on one side; the best first, each pose once.
+    fn compared(&self, candidates: &[Candidate], side: Side) -> Vec<Candidate> {
+        let best = &candidates[..candidates.len().min(COMPARED_AT_MOST)];
         let mut compared: Vec<Candidate> =
-            best.into_par_iter().map(|c| self.refine(c.cmm_from_model, side, &self.many, 10)).collect();
+            best.par_iter().map(|c| self.refine(c.cmm_from_model, side, &self.many, 4, 10)).collect();
         compared.sort_by(|a, b| a.rms_mm.total_cmp(&b.rms_mm));
         let mut distinct: Vec<Candidate> = Vec::new();
         for c in compared {
@@ -215,7 +222,7 @@ impl<'a> Search<'a> {
     }
 
     /// Descends under a loss that forgets gross outliers, its scale following the distances down.
-    fn refine(&self, start: Pose, side: Side, points: &[Point], iterations: usize) -> Candidate {
+    fn refine(&self, start: Pose, side: Side, points: &[Point], rounds: usize, iterations: usize) -> Candidate {
         let surface = self.part.surface(self.options, side);
         let mut problem = Problem {
             surface,
@@ -230,7 +237,7 @@ impl<'a> Search<'a> {
         let mut pose = start;
         let mut tracks = vec![Track::NEW; points.len()];
         let mut trace = Vec::new();
-        for round in 0..4 {
+        for round in 0..rounds {
             if round > 0 {
                 let (_, sigma) = robust_sigma(tracks.iter().map(|t| t.distance_mm));
                 problem.reading.loss = ScaledLoss::new(Loss::Tukey, sigma.max(1e-4));

@@ -1,0 +1,63 @@
+//! What the tests share: clouds from the simulated truth, and how far a pose is from it.
+#![allow(dead_code)]
+
+use regrind::geometry::{Point, Pose};
+use regrind::surface::{Nominal, Projection};
+use regrind_sim::Vec3;
+use regrind_sim::form::FormError;
+use regrind_sim::probe::{Placement, centre};
+use regrind_sim::shape::{FreeForm, Shape};
+
+/// Radius of the probe in millimetres.
+pub const RADIUS_MM: f64 = 1.5;
+
+/// Points of the library from those of the simulator.
+pub fn points(from: &[Vec3]) -> Vec<Point> {
+    from.iter().copied().map(Point::from).collect()
+}
+
+/// The pose of the library for a placement of the simulator.
+pub fn pose(placement: &Placement) -> Pose {
+    let [r, t] = [&placement.rotation, &[placement.translation_mm; 3]];
+    Pose::from_rows([
+        [r[0][0], r[0][1], r[0][2], t[0][0]],
+        [r[1][0], r[1][1], r[1][2], t[0][1]],
+        [r[2][0], r[2][1], r[2][2], t[0][2]],
+        [0.0, 0.0, 0.0, 1.0],
+    ])
+    .unwrap()
+}
+
+/// The free form as a gridded nominal surface.
+pub fn free_form(columns: usize, rows: usize) -> Nominal {
+    let grid = FreeForm::default().grid(FreeForm::WIDTH_MM, FreeForm::DEPTH_MM, columns, rows);
+    Nominal::from_points(points(&grid), Projection::Auto).unwrap()
+}
+
+/// Probe centres over a rectangle of a shape, in the model frame: columns x rows, given by its two corners.
+pub fn centres(
+    shape: &dyn Shape,
+    form: &FormError,
+    [low, high]: [[f64; 2]; 2],
+    [columns, rows]: [usize; 2],
+) -> Vec<Vec3> {
+    let at = |k: usize, n: usize, c: usize| low[c] + (high[c] - low[c]) * k as f64 / (n - 1) as f64;
+    (0..rows)
+        .flat_map(|j| (0..columns).map(move |i| (i, j)))
+        .map(|(i, j)| centre(shape, form, RADIUS_MM, at(i, columns, 0), at(j, rows, 1)))
+        .collect()
+}
+
+/// Moves centres into the CMM frame.
+pub fn placed(placement: &Placement, centres: &[Vec3]) -> Vec<Vec3> {
+    centres.iter().map(|c| placement.apply(*c)).collect()
+}
+
+/// How far a pose carries the corners of the free form from where the truth has them: the largest distance in millimetres.
+pub fn pose_error_mm(found: &Pose, truth: &Pose) -> f64 {
+    [[-50.0, -30.0], [50.0, -30.0], [-50.0, 30.0], [50.0, 30.0]]
+        .iter()
+        .map(|[x, y]| Point::new(*x, *y, FreeForm::default().height(*x, *y)))
+        .map(|p| (found.point(&p) - truth.point(&p)).norm())
+        .fold(0.0, f64::max)
+}
