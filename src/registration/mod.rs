@@ -21,6 +21,7 @@ mod solve;
 mod start;
 mod verdict;
 
+use rayon::prelude::*;
 use thiserror::Error;
 
 use crate::geometry::{Point, Pose, Vector};
@@ -218,11 +219,14 @@ pub enum RegistrationError {
 /// Input that cannot be registered, a cloud that does not fit the surface, and an iteration that does not converge.
 pub fn register(nominal: &Nominal, measured: &[Point], options: &Options) -> Result<Registration, RegistrationError> {
     let part = Part::check(nominal, measured, options)?;
-    let seed = start::begin(&part, measured, options)?;
-    let problem = part.problem(measured, options, seed.side);
-    if let Some(fold) = problem.surface.fold(std::iter::empty()) {
-        return Err(fold.into());
+    if let ProbeSide::Known(side) = options.side {
+        part.check_fold(options, side)?;
     }
+    let seed = start::begin(&part, measured, options)?;
+    if options.side == ProbeSide::Auto {
+        part.check_fold(options, seed.side)?;
+    }
+    let problem = part.problem(measured, options, seed.side);
     let mut trace = Vec::new();
     let mut tracks = vec![Track::NEW; measured.len()];
     let descent = settle(&problem, &seed, options, &mut tracks, &mut trace)?;
@@ -283,6 +287,14 @@ impl<'a> Part<'a> {
             .with_lookup(lookup)
     }
 
+    /// Refuses a probe that does not fit into the surface.
+    fn check_fold(&self, options: &Options, side: Side) -> Result<(), RegistrationError> {
+        match self.surface(options, side).fold(std::iter::empty()) {
+            Some(fold) => Err(fold.into()),
+            None => Ok(()),
+        }
+    }
+
     fn problem<'b>(&self, measured: &'b [Point], options: &Options, side: Side) -> Problem<'b>
     where
         'a: 'b,
@@ -307,7 +319,7 @@ impl<'a> Part<'a> {
     fn confirm(&self, found: &Registration, measured: &[Point], options: &Options) -> Result<(), RegistrationError> {
         let rms_mm = found.verdict.rms_mm;
         let limit_mm = self.rms_limit_mm(options);
-        let doubtful = rms_mm > limit_mm || rms_mm > 0.02 * self.nominal.relief_mm();
+        let doubtful = rms_mm > limit_mm || rms_mm > (0.02 * self.nominal.relief_mm()).max(10.0 * LEAST_SIGMA_MM);
         if doubtful && let Some(mirrored_rms_mm) = start::mirrored_rms(self, measured, options, found) {
             if mirrored_rms_mm < 0.3 * rms_mm && mirrored_rms_mm <= limit_mm {
                 return Err(RegistrationError::Mirrored { rms_mm, mirrored_rms_mm });
@@ -322,7 +334,7 @@ impl<'a> Part<'a> {
 
 fn check_repeats(measured: &[Point]) -> Result<(), RegistrationError> {
     let mut bits: Vec<[u64; 3]> = measured.iter().map(|p| [p.x, p.y, p.z].map(f64::to_bits)).collect();
-    rayon::slice::ParallelSliceMut::par_sort_unstable(bits.as_mut_slice());
+    bits.par_sort_unstable();
     let doubled = bits.windows(2).filter(|w| w[0] == w[1]).count();
     if doubled * 100 > measured.len() {
         return Err(RegistrationError::Repeated { doubled, points: measured.len() });
@@ -444,21 +456,31 @@ fn screen(problem: &Problem, options: &Options, tracks: &mut [Track], both_ways:
     changed
 }
 
-/// For each suspect, whether its distance departs from the median of its eight nearest neighbours by more than a limit.
+/// For each suspect, whether its distance departs by more than a limit from the median of eight neighbours.
+///
+/// Neighbours nearer than half the mean spacing are twins, repeats of the same place that repeat its mistake; they are not
+/// asked. A suspect with nothing but twins around it is alone.
 fn lonely(measured: &[Point], tracks: &[Track], suspects: &[usize], limit_mm: f64) -> Vec<bool> {
-    const NEIGHBOURS: std::num::NonZero<usize> = std::num::NonZero::new(9).expect("nine is not zero");
+    const ASKED: usize = 8;
+    const NEAREST: std::num::NonZero<usize> = std::num::NonZero::new(64).expect("not zero");
     let coordinates: Vec<[f64; 3]> = measured.iter().map(|p| (*p).into()).collect();
     let Ok(tree) = kiddo::ImmutableKdTree::<f64, 3>::new_from_slice(&coordinates) else {
         return vec![true; suspects.len()];
     };
+    // Points spread over a square of rms size s stand s sqrt(6 / n) apart.
+    let twin_mm = 0.5 * middle_and_size(measured).1 * (6.0 / measured.len() as f64).sqrt();
     let is_lonely = |&k: &usize| {
-        let nearest = tree.query(&coordinates[k]).nearest_n::<kiddo::SquaredEuclidean<f64>>(NEIGHBOURS).execute();
-        let mut around: Vec<f64> =
-            nearest.iter().map(|n| n.item as usize).filter(|&n| n != k).map(|n| tracks[n].distance_mm).collect();
+        let nearest = tree.query(&coordinates[k]).nearest_n::<kiddo::SquaredEuclidean<f64>>(NEAREST).execute();
+        let mut around: Vec<f64> = nearest
+            .iter()
+            .filter(|n| n.distance > twin_mm * twin_mm)
+            .take(ASKED)
+            .map(|n| tracks[n.item as usize].distance_mm)
+            .collect();
         around.sort_unstable_by(f64::total_cmp);
-        (tracks[k].distance_mm - around[around.len() / 2]).abs() > limit_mm
+        around.get(around.len() / 2).is_none_or(|median| (tracks[k].distance_mm - median).abs() > limit_mm)
     };
-    suspects.iter().map(is_lonely).collect()
+    suspects.par_iter().map(is_lonely).collect()
 }
 
 /// Turns the end of the iteration into what is reported.

@@ -20,6 +20,8 @@ use super::{Options, Part, ProbeSide, Registration, RegistrationError, Start};
 pub(crate) struct Seed {
     pub(crate) cmm_from_model: Pose,
     pub(crate) side: Side,
+    /// Whether the side was given, or told by the data; else it was assumed.
+    pub(crate) side_known: bool,
     /// Whether the pose was refined already, so that outliers can be told at once.
     pub(crate) near: bool,
     /// Poses that are different and fit about as well.
@@ -30,7 +32,7 @@ pub(crate) struct Seed {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Candidate {
     pub(crate) cmm_from_model: Pose,
-    /// Root mean square of the truncated distances, in millimetres.
+    /// Root mean square of the nearest nine tenths of the distances, in millimetres.
     pub(crate) rms_mm: f64,
     side: Side,
 }
@@ -96,12 +98,24 @@ impl<'a> Search<'a> {
 
     /// Takes a pose as given and finds the side on which the points fit.
     fn side_at(&self, pose: Pose) -> Result<Seed, RegistrationError> {
+        // A given pose may be meant for either side.
         let at = |side: Side| {
-            let start = if side == Side::Normal { pose } else { self.across_to(pose, side) };
-            self.refine(start, side, &self.many, 4, 12)
+            let [as_given, across] =
+                [pose, self.across_to(pose, side)].map(|p| self.refine(p, side, &self.many, 4, 12));
+            if across.rms_mm < as_given.rms_mm { across } else { as_given }
         };
-        let (side, _) = self.choose_side(at(Side::Normal), at(Side::Opposite))?;
-        Ok(Seed { cmm_from_model: pose, side, near: false, alternatives: Vec::new() })
+        let (normal, opposite) = rayon::join(|| at(Side::Normal), || at(Side::Opposite));
+        let (side, _, side_known) = self.choose_side(normal, opposite)?;
+        let side = if side_known { side } else { self.nearer_side(&pose) };
+        Ok(Seed { cmm_from_model: pose, side, side_known, near: false, alternatives: Vec::new() })
+    }
+
+    /// Returns the side of the nominal surface on which most points lie under a pose.
+    fn nearer_side(&self, pose: &Pose) -> Side {
+        let nominal = OffsetSurface::new(self.part.nominal, 0.0, Side::Normal).expect("0 is a radius");
+        let inverse = pose.inverse();
+        let above = self.many.iter().filter(|p| nominal.foot(&inverse.point(p), Place::UNKNOWN).distance_mm >= 0.0);
+        if above.count() * 2 >= self.many.len() { Side::Normal } else { Side::Opposite }
     }
 
     /// Tries many poses and takes the best.
@@ -124,23 +138,33 @@ impl<'a> Search<'a> {
         let (Some(&at_normal), Some(&at_opposite)) = (normal.first(), opposite.first()) else {
             return Err(RegistrationError::Undetermined);
         };
-        let (side, best) = self.choose_side(at_normal, at_opposite)?;
+        let (side, best, side_known) = self.choose_side(at_normal, at_opposite)?;
         let alternatives = self.alternatives(&best, if side == Side::Normal { normal } else { opposite });
-        Ok(Seed { cmm_from_model: best.cmm_from_model, side, near: true, alternatives })
+        Ok(Seed { cmm_from_model: best.cmm_from_model, side, side_known, near: true, alternatives })
     }
 
-    /// Decides between the best fits on the two sides.
-    fn choose_side(&self, normal: Candidate, opposite: Candidate) -> Result<(Side, Candidate), RegistrationError> {
+    /// Decides between the best fits on the two sides, and whether they could be told apart.
+    fn choose_side(
+        &self,
+        normal: Candidate,
+        opposite: Candidate,
+    ) -> Result<(Side, Candidate, bool), RegistrationError> {
+        // Without an offset the two sides are one surface.
+        let told = |better: &Candidate, worse: &Candidate| {
+            self.part.offset_mm == 0.0 || better.rms_mm * SIDE_RATIO < worse.rms_mm
+        };
         match self.options.side {
-            ProbeSide::Auto if opposite.rms_mm * SIDE_RATIO < normal.rms_mm => Ok((Side::Opposite, opposite)),
-            ProbeSide::Auto => Ok((Side::Normal, normal)),
+            ProbeSide::Auto if self.part.offset_mm > 0.0 && told(&opposite, &normal) => {
+                Ok((Side::Opposite, opposite, true))
+            }
+            ProbeSide::Auto => Ok((Side::Normal, normal, told(&normal, &opposite))),
             ProbeSide::Known(side) => {
                 let (given, other) = if side == Side::Normal { (normal, opposite) } else { (opposite, normal) };
                 // Clearly better there, and by more than a form error could explain.
                 if other.rms_mm * 4.0 * SIDE_RATIO < given.rms_mm && self.part.offset_mm > 0.0 {
                     return Err(RegistrationError::WrongSide { rms_mm: given.rms_mm, other_rms_mm: other.rms_mm });
                 }
-                Ok((side, given))
+                Ok((side, given, true))
             }
         }
     }
@@ -149,7 +173,7 @@ impl<'a> Search<'a> {
     fn across_to(&self, pose: Pose, side: Side) -> Pose {
         let mean = self.part.nominal.mean_normal();
         let shift = mean * (-2.0 * self.part.offset_mm * side.sign());
-        pose * Pose { translation_mm: -shift, ..Pose::identity() }
+        pose * Pose { translation_mm: shift, ..Pose::identity() }
     }
 
     /// Returns the best of all starts on one side, roughly refined, the best first.
@@ -209,16 +233,31 @@ impl<'a> Search<'a> {
     /// Root mean square of the truncated distances from the part itself, not from its continuation.
     fn score(&self, surface: &OffsetSurface, cmm_from_model: &Pose, points: &[Point]) -> f64 {
         let limit2 = self.truncation_mm().powi(2);
-        let model_from_cmm = cmm_from_model.inverse();
-        let sum: f64 = points
-            .iter()
-            .map(|p| {
-                let foot = surface.foot(&model_from_cmm.point(p), Place::UNKNOWN);
-                let d = foot.distance_mm - self.part.subtract_mm;
-                (d * d + foot.beyond_mm * foot.beyond_mm).min(limit2)
-            })
-            .sum();
+        let sum: f64 = self.squares(surface, cmm_from_model, points).map(|d2| d2.min(limit2)).sum();
         (sum / points.len() as f64).sqrt()
+    }
+
+    /// Root mean square of the nearest nine tenths of the points: what outliers in the rest do not spoil.
+    fn trimmed_rms(&self, surface: &OffsetSurface, cmm_from_model: &Pose, points: &[Point]) -> f64 {
+        let mut squares: Vec<f64> = self.squares(surface, cmm_from_model, points).collect();
+        squares.sort_unstable_by(f64::total_cmp);
+        let kept = &squares[..(points.len() * 9).div_ceil(10)];
+        (kept.iter().sum::<f64>() / kept.len() as f64).sqrt()
+    }
+
+    /// Squared distances from the part itself, what lies beyond its edge included.
+    fn squares<'b>(
+        &self,
+        surface: &'b OffsetSurface,
+        cmm_from_model: &Pose,
+        points: &'b [Point],
+    ) -> impl Iterator<Item = f64> + 'b {
+        let model_from_cmm = cmm_from_model.inverse();
+        let subtract_mm = self.part.subtract_mm;
+        points.iter().map(move |p| {
+            let foot = surface.foot(&model_from_cmm.point(p), Place::UNKNOWN);
+            (foot.distance_mm - subtract_mm).powi(2) + foot.beyond_mm.powi(2)
+        })
     }
 
     /// Descends under a loss that forgets gross outliers, its scale following the distances down.
@@ -247,7 +286,7 @@ impl<'a> Search<'a> {
                 Err(_) => break,
             }
         }
-        Candidate { cmm_from_model: pose, rms_mm: self.score(&surface, &pose, points), side }
+        Candidate { cmm_from_model: pose, rms_mm: self.trimmed_rms(&surface, &pose, points), side }
     }
 
     /// Other poses that fit nearly as well as the best.

@@ -39,6 +39,8 @@ pub struct Verdict {
     pub coverage: f64,
     /// Other poses that fit about as well, with their rms over some hundred points in millimetres.
     pub alternatives: Vec<(Pose, f64)>,
+    /// What a person should know before trusting the pose, in words; empty when there is nothing to say.
+    pub warnings: Vec<String>,
     /// Turns of the iteration, steps taken back included.
     pub iterations: usize,
     /// Whether the last descent converged; a registration that did not is an error.
@@ -91,9 +93,37 @@ pub(crate) fn judge(
         weak_directions,
         coverage: coverage(problem, tracks, finals),
         alternatives: seed.alternatives.iter().map(|c| (c.cmm_from_model, c.rms_mm)).collect(),
+        warnings: warnings(problem, seed, (objective_mm2 / n as f64).sqrt()),
         iterations,
         converged: descent.converged,
     }
+}
+
+/// Tells what the numbers alone do not.
+fn warnings(problem: &Problem, seed: &Seed, rms_mm: f64) -> Vec<String> {
+    let mut warnings = Vec::new();
+    if !seed.side_known {
+        warnings.push(
+            "the shape does not tell on which side of the surface the probe was; the side is assumed, state it"
+                .to_string(),
+        );
+    }
+    if !seed.alternatives.is_empty() {
+        warnings.push(format!(
+            "{} other {} as well: the part is symmetric, or too little of it was measured",
+            seed.alternatives.len(),
+            if seed.alternatives.len() == 1 { "pose fits about" } else { "poses fit about" },
+        ));
+    }
+    let relief_mm = problem.surface.nominal().relief_mm();
+    if rms_mm > 0.5 * relief_mm {
+        warnings.push(format!(
+            "the deviations, {} rms, are as large as the relief of the part, {} rms: its shape does not confirm the pose",
+            length(rms_mm),
+            length(relief_mm),
+        ));
+    }
+    warnings
 }
 
 /// s^2 (A^T A)^-1 over the directions that are seen, in scaled coordinates.
