@@ -1,5 +1,7 @@
 //! Regular grids among points that come in any order.
 
+use rayon::prelude::*;
+
 use super::Point;
 
 /// How far a point may stand from its node, in spacings: rounding in a file is far below, scatter far above.
@@ -42,10 +44,11 @@ pub fn recognise_grid(points: &[Point]) -> Option<GridOrder> {
     if x.count < 3 || y.count < 3 || nodes > 4 * points.len() {
         return None;
     }
+    let node_of = |p: &Point| Some(y.node(p.y)? as u32 * x.count as u32 + x.node(p.x)? as u32);
+    let node_of: Vec<u32> = points.par_iter().with_min_len(8192).map(node_of).collect::<Option<_>>()?;
     let mut point_at = vec![NO_POINT; nodes];
-    for (index, p) in points.iter().enumerate() {
-        let node = y.node(p.y)? * x.count + x.node(p.x)?;
-        if std::mem::replace(&mut point_at[node], index as u32) != NO_POINT {
+    for (index, node) in node_of.into_iter().enumerate() {
+        if std::mem::replace(&mut point_at[node as usize], index as u32) != NO_POINT {
             return None;
         }
     }
@@ -61,10 +64,18 @@ struct Axis {
 
 impl Axis {
     /// Finds the spacing as the least gap between sorted coordinates of a sample that no order of the points can fool.
-    fn find(points: &[Point], coordinate: impl Fn(&Point) -> f64) -> Option<Self> {
-        let (low, high) = points.iter().map(&coordinate).fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), c| {
-            if c.is_nan() { (f64::NAN, f64::NAN) } else { (low.min(c), high.max(c)) }
-        });
+    fn find(points: &[Point], coordinate: impl Fn(&Point) -> f64 + Sync) -> Option<Self> {
+        let (low, high) = points
+            .par_chunks(8192)
+            .map(|chunk| {
+                chunk.iter().map(&coordinate).fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), c| {
+                    if (c + low).is_nan() { (f64::NAN, f64::NAN) } else { (low.min(c), high.max(c)) }
+                })
+            })
+            .reduce(
+                || (f64::INFINITY, f64::NEG_INFINITY),
+                |a, b| if (a.0 + b.0).is_nan() { (f64::NAN, f64::NAN) } else { (a.0.min(b.0), a.1.max(b.1)) },
+            );
         let extent = high - low;
         if !extent.is_finite() || extent <= 0.0 {
             return None;
@@ -73,15 +84,16 @@ impl Axis {
         sample.sort_unstable_by(f64::total_cmp);
         let gap = sample.windows(2).map(|w| w[1] - w[0]).filter(|gap| *gap > 1e-6 * extent).fold(extent, f64::min);
         let steps = (extent / gap).round();
-        (steps < 1e6).then_some(Self { first: low, per_mm: steps / extent, count: steps as usize + 1 })
+        (steps < 6e4).then_some(Self { first: low, per_mm: steps / extent, count: steps as usize + 1 })
     }
 
     /// Returns the number of the node at a coordinate, if there is one.
     #[inline]
     fn node(&self, coordinate: f64) -> Option<usize> {
         let at = (coordinate - self.first) * self.per_mm;
-        let node = (at + 0.5).floor();
-        ((at - node).abs() <= NODE_TOLERANCE).then_some(node as usize)
+        // Never below zero, so truncation is the floor.
+        let node = (at + 0.5) as u32;
+        ((at - f64::from(node)).abs() <= NODE_TOLERANCE).then_some(node as usize)
     }
 }
 

@@ -61,6 +61,8 @@ const SETTLED: f64 = 1e-7;
 
 impl Problem<'_> {
     /// Descends from a pose to the nearest minimum of the objective; the objective of steps taken never rises, eq. (14).
+    ///
+    /// At the end the tracks and the sums are those of the pose that is returned.
     pub(crate) fn descend(
         &self,
         start: Pose,
@@ -75,6 +77,8 @@ impl Problem<'_> {
         let mut ball_radius = self.ball_radius;
         let mut rank = 0;
         let mut converged = false;
+        // Whether the tracks tell of the pose that stands, or of one that was taken back.
+        let mut current = true;
         for _ in 0..self.most_iterations {
             if sums.points < 6 {
                 return Err(RegistrationError::TooFewUsed { used: sums.points, points: self.measured.len() });
@@ -92,6 +96,7 @@ impl Problem<'_> {
             let candidate_lever = lever_at(&candidate);
             let candidate_sums = self.feet(tracks, &candidate, &candidate_lever);
             let taken = candidate_sums.objective_mm2 <= sums.objective_mm2;
+            current = taken;
             trace.push(Iteration {
                 objective_mm2: candidate_sums.objective_mm2,
                 step,
@@ -100,7 +105,6 @@ impl Problem<'_> {
                 points: candidate_sums.points,
             });
             if !taken {
-                // Back to the last pose; what the tracks say of this one is found anew below or at the end.
                 ball_radius = step.min(ball_radius) * 0.25;
                 converged = step < SETTLED;
                 if converged {
@@ -117,6 +121,9 @@ impl Problem<'_> {
                 converged = true;
                 break;
             }
+        }
+        if !current {
+            sums = self.feet(tracks, &pose, &lever);
         }
         Ok(Descent { cmm_from_model: pose, objective_mm2: sums.objective_mm2, lever, sums, rank, converged })
     }

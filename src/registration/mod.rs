@@ -175,7 +175,10 @@ pub enum RegistrationError {
     NotFinite { index: usize },
     #[error("all {points} measured points lie on one line; a pose needs points off it")]
     Collinear { points: usize },
-    #[error("{doubled} of {points} measured points repeat another one exactly; was a file joined to itself?")]
+    #[error(
+        "{doubled} of {points} measured points that were looked at repeat another one exactly; was a file joined to itself? \
+         remove the repeats"
+    )]
     Repeated { doubled: usize, points: usize },
     #[error(
         "the measured cloud is {ratio:.4} times the size of the nominal surface ({measured_mm:.4} mm against {nominal_mm:.4} \
@@ -332,12 +335,24 @@ impl<'a> Part<'a> {
     }
 }
 
+/// Refuses a cloud of which more than one point in a hundred is there twice.
+///
+/// Looked at are the points whose own bits choose them, some thousand of any number: of two equal points both or neither.
 fn check_repeats(measured: &[Point]) -> Result<(), RegistrationError> {
-    let mut bits: Vec<[u64; 3]> = measured.iter().map(|p| [p.x, p.y, p.z].map(f64::to_bits)).collect();
-    bits.par_sort_unstable();
-    let doubled = bits.windows(2).filter(|w| w[0] == w[1]).count();
-    if doubled * 100 > measured.len() {
-        return Err(RegistrationError::Repeated { doubled, points: measured.len() });
+    const LOOKED_AT: usize = 8192;
+    let mixed = |p: &Point| {
+        let [x, y, z] = [p.x, p.y, p.z].map(|c| (c + 0.0).to_bits());
+        let mixed = x.wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ y.rotate_left(21).wrapping_mul(0xD6E8_FEB8_6659_FD93) ^ z;
+        let mixed = (mixed ^ (mixed >> 32)).wrapping_mul(0xD6E8_FEB8_6659_FD93);
+        mixed ^ (mixed >> 29)
+    };
+    let one_in = measured.len().div_ceil(LOOKED_AT) as u64;
+    let mut chosen: Vec<(u64, usize)> =
+        measured.iter().map(mixed).enumerate().filter(|(_, h)| h % one_in == 0).map(|(k, h)| (h, k)).collect();
+    chosen.sort_unstable();
+    let doubled = chosen.windows(2).filter(|w| w[0].0 == w[1].0 && measured[w[0].1] == measured[w[1].1]).count();
+    if doubled * 100 > chosen.len() {
+        return Err(RegistrationError::Repeated { doubled, points: chosen.len() });
     }
     Ok(())
 }
@@ -385,26 +400,24 @@ fn settle(
             return Err(RegistrationError::NotConverged { iterations, objective_mm2 });
         }
         pose = descent.cmm_from_model;
-        evaluate(&problem, tracks, &pose);
         round += 1;
         let changed = screen(&problem, options, tracks, round < BOTH_WAYS);
         let robust_settling = options.loss != Loss::None && round < 4;
         if (changed == 0 && !robust_settling) || round == MOST_ROUNDS {
-            return finish(&problem, descent, tracks);
+            return finish(descent, tracks.len());
         }
     }
 }
 
-/// Sums the linear problem at the final pose, over the points that were used there.
-fn finish(problem: &Problem, descent: Descent, tracks: &mut [Track]) -> Result<Descent, RegistrationError> {
-    let sums = problem.feet(tracks, &descent.cmm_from_model, &descent.lever);
-    if sums.points * 2 < tracks.len() {
-        return Err(RegistrationError::TooFewUsed { used: sums.points, points: tracks.len() });
+/// Refuses an end that hangs on too few points, or on none of the six directions.
+fn finish(descent: Descent, points: usize) -> Result<Descent, RegistrationError> {
+    if descent.sums.points * 2 < points {
+        return Err(RegistrationError::TooFewUsed { used: descent.sums.points, points });
     }
     if descent.rank == 0 {
         return Err(RegistrationError::Undetermined);
     }
-    Ok(Descent { sums, ..descent })
+    Ok(descent)
 }
 
 fn evaluate(problem: &Problem, tracks: &mut [Track], pose: &Pose) {
