@@ -122,6 +122,19 @@ pub(super) fn three_digits(value: f64) -> String {
     format!("{value:.decimals$}").replace('-', "\u{2212}")
 }
 
+/// Writes a count with a comma between thousands.
+pub(super) fn grouped(count: usize) -> String {
+    let digits = count.to_string();
+    let mut out = String::with_capacity(digits.len() + digits.len() / 3);
+    for (k, digit) in digits.chars().enumerate() {
+        if k > 0 && (digits.len() - k).is_multiple_of(3) {
+            out.push(',');
+        }
+        out.push(digit);
+    }
+    out
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -158,6 +171,11 @@ mod tests {
         assert!((ruler.pixel(1.0) - 30.0).abs() < 1e-12);
         let flat = Ruler::new(Scale::Linear, [2.0, 2.0], [0.0, 1.0]).rounded(4);
         assert!(flat.range[0] < 2.0 && flat.range[1] > 2.0, "{:?}", flat.range);
+    }
+
+    #[test]
+    fn thousands_are_grouped() {
+        assert_eq!(["0", "999", "1,000", "28,476", "1,265,640"], [0, 999, 1000, 28476, 1265640].map(grouped));
     }
 
     #[test]

@@ -7,7 +7,7 @@ use base64::engine::general_purpose::STANDARD;
 
 use crate::registration::{Deviation, PointStatus};
 
-use super::axis::{Ruler, Scale, three_digits};
+use super::axis::{Ruler, Scale, grouped, three_digits};
 use super::colour::ColourMap;
 use super::raster::Raster;
 use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
@@ -203,8 +203,17 @@ impl HeatMap {
     }
 
     fn summary(&self) -> String {
-        let (pv, rms, unit) = (three_digits(self.pv), three_digits(self.rms), &self.unit);
-        format!("PV {pv} {unit}, RMS {rms} {unit}, {} points", self.points)
+        let (unit, points) = (&self.unit, grouped(self.points));
+        match self.colours {
+            ColourMap::Diverging => {
+                let (pv, rms) = (three_digits(self.pv), three_digits(self.rms));
+                format!("PV {pv} {unit}, RMS {rms} {unit}, {points} points")
+            }
+            ColourMap::Sequential => {
+                let [low, high] = self.range.map(three_digits);
+                format!("{low} to {high} {unit}, {points} points")
+            }
+        }
     }
 
     /// Saves the figure.
