@@ -12,4 +12,5 @@
 pub mod formats;
 pub mod geometry;
 pub mod registration;
+pub mod report;
 pub mod surface;

@@ -1,0 +1,97 @@
+//! Colours that everybody can tell apart.
+
+/// How a value becomes a colour.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ColourMap {
+    /// Blue below zero, near white at zero, red above: ColorBrewer's RdBu of 11 classes, turned over and interpolated.
+    ///
+    /// Both arms darken alike and steadily, so that a print in grey still shows the size, and red against blue is told apart
+    /// with every common colour blindness. For signed quantities; the range is symmetric about zero.
+    #[default]
+    Diverging,
+    /// Dark violet to yellow, lightening steadily: nine colours of matplotlib's viridis, interpolated.
+    ///
+    /// For quantities without a sign.
+    Sequential,
+}
+
+const DIVERGING: [u32; 11] = [
+    0x05_3061, 0x21_66ac, 0x43_93c3, 0x92_c5de, 0xd1_e5f0, 0xf7_f7f7, 0xfd_dbc7, 0xf4_a582, 0xd6_604d, 0xb2_182b,
+    0x67_001f,
+];
+
+const SEQUENTIAL: [u32; 9] =
+    [0x44_0154, 0x47_2d7b, 0x3b_528b, 0x2c_728e, 0x21_918c, 0x28_ae80, 0x5e_c962, 0xad_dc30, 0xfd_e725];
+
+impl ColourMap {
+    /// Returns the colour at a share of the range, from 0 to 1; beyond it the colour of the nearer end.
+    ///
+    /// Shape: red, green and blue of sRGB.
+    pub fn at(self, share: f64) -> [u8; 3] {
+        let anchors = self.anchors();
+        let place = share.clamp(0.0, 1.0) * (anchors.len() - 1) as f64;
+        let below = (place as usize).min(anchors.len() - 2);
+        let (low, high) = (channels(anchors[below]), channels(anchors[below + 1]));
+        let t = place - below as f64;
+        std::array::from_fn(|k| (f64::from(low[k]) * (1.0 - t) + f64::from(high[k]) * t).round() as u8)
+    }
+
+    /// The colours between which the map runs straight, at equal distances.
+    pub(super) fn anchors(self) -> &'static [u32] {
+        match self {
+            Self::Diverging => &DIVERGING,
+            Self::Sequential => &SEQUENTIAL,
+        }
+    }
+
+    /// A name that is the same for the same colours, wherever figures are put together in one document.
+    pub(super) fn id(self) -> &'static str {
+        match self {
+            Self::Diverging => "regrind-diverging",
+            Self::Sequential => "regrind-sequential",
+        }
+    }
+}
+
+fn channels(colour: u32) -> [u8; 3] {
+    let [_, r, g, b] = colour.to_be_bytes();
+    [r, g, b]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// CIE L* of an sRGB colour, from 0 to 100.
+    fn lightness(colour: [u8; 3]) -> f64 {
+        let [r, g, b] = colour.map(|c| {
+            let c = f64::from(c) / 255.0;
+            if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
+        });
+        let y = 0.2126 * r + 0.7152 * g + 0.0722 * b;
+        if y > 0.008856 { 116.0 * y.cbrt() - 16.0 } else { 903.3 * y }
+    }
+
+    #[test]
+    fn both_arms_of_the_diverging_map_darken_steadily_and_alike() {
+        let at = |k: i32| lightness(ColourMap::Diverging.at(0.5 + f64::from(k) / 200.0));
+        for k in 0..100 {
+            assert!(at(k + 1) < at(k), "red arm at {k}");
+            assert!(at(-k - 1) < at(-k), "blue arm at {k}");
+            assert!((at(k) - at(-k)).abs() < 5.0, "{k}: {} against {}", at(k), at(-k));
+        }
+    }
+
+    #[test]
+    fn the_sequential_map_lightens_steadily() {
+        let at = |k: i32| lightness(ColourMap::Sequential.at(f64::from(k) / 100.0));
+        assert!((0..100).all(|k| at(k + 1) > at(k)));
+    }
+
+    #[test]
+    fn zero_is_near_white_and_what_lies_beyond_takes_the_end() {
+        assert_eq!(ColourMap::Diverging.at(0.5), [0xf7; 3]);
+        assert_eq!(ColourMap::Diverging.at(7.0), [0x67, 0x00, 0x1f]);
+        assert_eq!(ColourMap::Diverging.at(-1.0), [0x05, 0x30, 0x61]);
+    }
+}

@@ -1,0 +1,335 @@
+//! Maps of a quantity over the part.
+
+use std::path::Path;
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+
+use crate::registration::{Deviation, PointStatus};
+
+use super::axis::{Ruler, Scale, grouped, three_digits};
+use super::colour::ColourMap;
+use super::raster::Raster;
+use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
+use super::{ReportError, save};
+
+/// A map of scattered samples in colours, with its peak to valley and root mean square.
+#[derive(Clone, Debug)]
+pub struct HeatMap {
+    title: String,
+    quantity: String,
+    unit: String,
+    raster: Raster,
+    colours: ColourMap,
+    /// Values at the two ends of the colour bar.
+    range: [f64; 2],
+    pv: f64,
+    rms: f64,
+    points: usize,
+}
+
+impl HeatMap {
+    /// Draws samples of any quantity.
+    ///
+    /// Shapes: two or more samples (x, y, value) in any order. Units: x and y in millimetres, the value in `unit`.
+    ///
+    /// # Errors
+    /// Too few samples, one that is not finite, or all at one place.
+    pub fn new(title: &str, quantity: &str, unit: &str, samples: &[[f64; 3]]) -> Result<Self, ReportError> {
+        let raster = Raster::new(title, samples)?;
+        let (low, high) =
+            samples.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), s| (l.min(s[2]), h.max(s[2])));
+        let squares: f64 = samples.iter().map(|s| s[2] * s[2]).sum();
+        let map = Self {
+            title: title.into(),
+            quantity: quantity.into(),
+            unit: unit.into(),
+            raster,
+            colours: ColourMap::Diverging,
+            range: [low, high],
+            pv: high - low,
+            rms: (squares / samples.len() as f64).sqrt(),
+            points: samples.len(),
+        };
+        Ok(map.with_colours(ColourMap::Diverging))
+    }
+
+    /// Draws lengths given in millimetres, in micrometres or, below a tenth of one from peak to valley, in nanometres.
+    ///
+    /// Shapes: two or more samples (x, y, length) in any order. Units: millimetres.
+    ///
+    /// # Errors
+    /// As [`HeatMap::new`].
+    pub fn of_lengths(title: &str, quantity: &str, samples_mm: &[[f64; 3]]) -> Result<Self, ReportError> {
+        let (low, high) =
+            samples_mm.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), s| (l.min(s[2]), h.max(s[2])));
+        let (per_mm, unit) = if high - low < 1e-4 { (1e6, "nm") } else { (1e3, "µm") };
+        let samples: Vec<[f64; 3]> = samples_mm.iter().map(|&[x, y, value]| [x, y, value * per_mm]).collect();
+        Self::new(title, quantity, unit, &samples)
+    }
+
+    /// Draws the deviations of a registration at their contact points; points that took no part in the fit are left out.
+    ///
+    /// Frame: model. Red is proud of the nominal surface, blue below it.
+    ///
+    /// # Errors
+    /// As [`HeatMap::new`].
+    pub fn of_deviations(title: &str, deviations: &[Deviation]) -> Result<Self, ReportError> {
+        let used = deviations.iter().filter(|d| d.status == PointStatus::Used);
+        let samples: Vec<[f64; 3]> = used.map(|d| [d.point.x, d.point.y, d.deviation_mm]).collect();
+        Self::of_lengths(title, "deviation", &samples)
+    }
+
+    /// Chooses the colours, and with them the range: symmetric about zero, or from the least value to the largest.
+    pub fn with_colours(self, colours: ColourMap) -> Self {
+        let samples = self.raster.values.iter().copied().filter(|v| !v.is_nan());
+        let (low, high) = samples.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
+        let range = match colours {
+            ColourMap::Diverging => [-low.abs().max(high.abs()), low.abs().max(high.abs())],
+            ColourMap::Sequential => [low, high],
+        };
+        // A map of one value has no range of its own.
+        let range = if range[1] > range[0] { range } else { [range[0] - 1.0, range[1] + 1.0] };
+        Self { colours, range, ..self }
+    }
+
+    /// Ends the colour bar at plus and minus a limit, so that several maps can be compared; what lies beyond takes the colour
+    /// of the end.
+    ///
+    /// Units: those of the map.
+    ///
+    /// # Errors
+    /// A limit that is not a finite number above 0.
+    pub fn with_limit(self, limit: f64) -> Result<Self, ReportError> {
+        if !(limit > 0.0 && limit.is_finite()) {
+            return Err(ReportError::ColourLimit { figure: self.title, limit });
+        }
+        Ok(Self { colours: ColourMap::Diverging, range: [-limit, limit], ..self })
+    }
+
+    /// Returns the value at the upper end of the colour bar, in the unit of the map.
+    pub fn limit(&self) -> f64 {
+        self.range[1]
+    }
+
+    /// Returns the largest less the least sample, in the unit of the map.
+    pub fn pv(&self) -> f64 {
+        self.pv
+    }
+
+    /// Returns the root mean square of the samples, in the unit of the map.
+    pub fn rms(&self) -> f64 {
+        self.rms
+    }
+
+    /// Returns the bare pixels as a PNG of 255 colours: one pixel a bin, y upwards, transparent where nothing was measured.
+    ///
+    /// # Errors
+    /// What the encoder says.
+    pub fn to_png(&self) -> Result<Vec<u8>, ReportError> {
+        let mut palette = vec![0; 3];
+        palette.extend((0..LEVELS).flat_map(|k| self.colours.at(f64::from(k) / f64::from(LEVELS - 1))));
+        let rows = self.raster.values.chunks(self.raster.columns).rev();
+        let pixels: Vec<u8> = rows.flatten().map(|&v| self.level(v)).collect();
+        let encoded = || {
+            let mut bytes = Vec::new();
+            let mut encoder = png::Encoder::new(&mut bytes, self.raster.columns as u32, self.raster.rows as u32);
+            encoder.set_color(png::ColorType::Indexed);
+            encoder.set_depth(png::BitDepth::Eight);
+            encoder.set_palette(palette);
+            encoder.set_trns(vec![0]);
+            encoder.set_compression(png::Compression::High);
+            let mut writer = encoder.write_header()?;
+            writer.write_image_data(&pixels)?;
+            writer.finish()?;
+            Ok(bytes)
+        };
+        encoded().map_err(|source| ReportError::Encoding { figure: self.title.clone(), source })
+    }
+
+    /// The place of a value in the palette; 0 is transparent.
+    fn level(&self, value: f64) -> u8 {
+        if value.is_nan() {
+            return 0;
+        }
+        let share = (value - self.range[0]) / (self.range[1] - self.range[0]);
+        1 + (share.clamp(0.0, 1.0) * f64::from(LEVELS - 1)).round() as u8
+    }
+
+    /// Returns the figure: the pixels within axes in millimetres, a colour bar, and a line of PV and RMS.
+    ///
+    /// # Errors
+    /// What the encoder says.
+    pub fn to_svg(&self) -> Result<String, ReportError> {
+        let frame = self.frame();
+        let ([left, top], [width, height]) = (frame.corner, frame.size);
+        let mut svg = Svg::new(left + width + 106.0, top + height + 54.0);
+        svg.text([left, 24.0], Anchor::Start, LARGE, &self.title);
+        svg.text([left, 44.0], Anchor::Start, SMALL, &self.summary());
+        let pixel = width / self.raster.columns as f64;
+        // Few samples are shown as the blocks they are; many are smoothed when the figure is scaled.
+        let rendering = if pixel > 4.0 { "pixelated" } else { "auto" };
+        svg.image(frame.corner, frame.size, &STANDARD.encode(self.to_png()?), rendering);
+        svg.frame(&frame);
+        self.colour_bar(&mut svg, [left + width + 18.0, top], height);
+        Ok(svg.finish())
+    }
+
+    fn frame(&self) -> Frame<'static> {
+        let Raster { columns, rows, first_mm, pixel_mm, .. } = self.raster;
+        let extent = [columns as f64 * pixel_mm[0], rows as f64 * pixel_mm[1]];
+        let scale = (WIDTH / extent[0]).min(HEIGHT / extent[1]);
+        // A part like a strip is drawn out of scale rather than as a line.
+        let size = extent.map(|e| (e * scale).max(90.0));
+        let corner = [66.0, 58.0];
+        let low: [f64; 2] = std::array::from_fn(|k| first_mm[k] - 0.5 * pixel_mm[k]);
+        let x = Ruler::new(Scale::Linear, [low[0], low[0] + extent[0]], [corner[0], corner[0] + size[0]]);
+        let y = Ruler::new(Scale::Linear, [low[1], low[1] + extent[1]], [corner[1] + size[1], corner[1]]);
+        let (x_ticks, y_ticks) = (x.ticks((size[0] / 60.0) as usize), y.ticks((size[1] / 40.0) as usize));
+        Frame { corner, size, x_ticks, y_ticks, x_label: "x / mm", y_label: "y / mm", grid: false }
+    }
+
+    fn colour_bar(&self, svg: &mut Svg, [left, top]: [f64; 2], height: f64) {
+        const BAR: f64 = 16.0;
+        svg.gradient(self.colours.id(), self.colours.anchors());
+        svg.rectangle([left, top], [BAR, height], &format!("url(#{})", self.colours.id()));
+        let ruler = Ruler::new(Scale::Linear, self.range, [top + height, top]);
+        for tick in ruler.ticks((height / 36.0) as usize) {
+            svg.line([left + BAR, tick.pixel], [left + BAR + 4.0, tick.pixel], super::svg::INK);
+            svg.tick_label([left + BAR + 8.0, tick.pixel + 4.0], Anchor::Start, &tick);
+        }
+        let name = format!("{} / {}", self.quantity, self.unit);
+        svg.upright([left + 76.0, top + height / 2.0], &name);
+    }
+
+    fn summary(&self) -> String {
+        let (unit, points) = (&self.unit, grouped(self.points));
+        match self.colours {
+            ColourMap::Diverging => {
+                let (pv, rms) = (three_digits(self.pv), three_digits(self.rms));
+                format!("PV {pv} {unit}, RMS {rms} {unit}, {points} points")
+            }
+            ColourMap::Sequential => {
+                let [low, high] = self.range.map(three_digits);
+                format!("{low} to {high} {unit}, {points} points")
+            }
+        }
+    }
+
+    /// Saves the figure.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub fn save_svg(&self, path: &Path) -> Result<(), ReportError> {
+        save(path, self.to_svg()?.as_bytes())
+    }
+
+    /// Saves the bare pixels.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub fn save_png(&self, path: &Path) -> Result<(), ReportError> {
+        save(path, &self.to_png()?)
+    }
+}
+
+/// Colours of the palette: an odd number, so that zero has one of its own.
+const LEVELS: u8 = 255;
+
+/// The largest map on the page, in pixels of the page.
+const WIDTH: f64 = 600.0;
+const HEIGHT: f64 = 460.0;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn decoded(bytes: &[u8]) -> (png::OutputInfo, Vec<u8>) {
+        let mut decoder = png::Decoder::new(std::io::Cursor::new(bytes));
+        decoder.set_transformations(png::Transformations::EXPAND | png::Transformations::ALPHA);
+        let mut reader = decoder.read_info().unwrap();
+        let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+        let info = reader.next_frame(&mut pixels).unwrap();
+        (info, pixels)
+    }
+
+    /// Three columns and two rows at 1 mm, the upper row last.
+    const SMALL_MAP: [[f64; 3]; 6] =
+        [[0.0, 0.0, -2e-3], [1.0, 0.0, 0.0], [2.0, 0.0, 2e-3], [0.0, 1.0, 1e-3], [1.0, 1.0, 0.0], [2.0, 1.0, -1e-3]];
+
+    #[test]
+    fn a_known_map_has_known_pixels() {
+        let map = HeatMap::of_lengths("known", "height", &SMALL_MAP).unwrap();
+        assert_eq!((map.unit.as_str(), map.range), ("µm", [-2.0, 2.0]));
+        assert!((map.pv() - 4.0).abs() < 1e-12 && (map.rms() - (10f64 / 6.0).sqrt()).abs() < 1e-12);
+        let (info, pixels) = decoded(&map.to_png().unwrap());
+        assert_eq!((info.width, info.height), (3, 2));
+        let pixel = |i: usize, j: usize| <[u8; 4]>::try_from(&pixels[(j * 3 + i) * 4..][..4]).unwrap();
+        // The picture's first row is the one of largest y.
+        assert_eq!(pixel(0, 1), [0x05, 0x30, 0x61, 255]);
+        assert_eq!(pixel(1, 1), [0xf7, 0xf7, 0xf7, 255]);
+        assert_eq!(pixel(2, 1), [0x67, 0x00, 0x1f, 255]);
+        assert!(pixel(0, 0)[0] > pixel(0, 0)[2] && pixel(2, 0)[2] > pixel(2, 0)[0]);
+    }
+
+    #[test]
+    fn nothing_measured_is_transparent() {
+        let ring = |i: i32, j: i32| (100..=400).contains(&((i - 20).pow(2) + (j - 20).pow(2)));
+        let samples: Vec<[f64; 3]> = (0..41)
+            .flat_map(|j| (0..41).map(move |i| (i, j)))
+            .filter(|&(i, j)| ring(i, j))
+            .map(|(i, j)| [f64::from(i), f64::from(j), 1e-6 * f64::from(i)])
+            .collect();
+        let map = HeatMap::of_lengths("ring", "height", &samples).unwrap();
+        assert_eq!(map.unit, "nm");
+        let (info, pixels) = decoded(&map.to_png().unwrap());
+        let alpha = |i: u32, j: u32| pixels[((j * info.width + i) * 4 + 3) as usize];
+        assert_eq!([alpha(0, 0), alpha(info.width / 2, info.height / 2)], [0, 0]);
+        assert_eq!(alpha(1, info.height / 2), 255);
+    }
+
+    #[test]
+    fn the_figure_is_well_formed_and_the_same_each_time() {
+        let map = HeatMap::of_lengths("1 < 2 & more", "height", &SMALL_MAP).unwrap();
+        let svg = map.to_svg().unwrap();
+        assert_eq!(svg, map.to_svg().unwrap());
+        let document = roxmltree::Document::parse(&svg).unwrap();
+        let texts: Vec<_> = document.descendants().filter_map(|n| n.text()).collect();
+        for text in ["1 < 2 & more", "PV 4.00 µm, RMS 1.29 µm, 6 points", "x / mm", "height / µm"] {
+            assert!(texts.contains(&text), "{text} is not in {texts:?}");
+        }
+        let image = document.descendants().find(|n| n.has_tag_name("image")).unwrap();
+        let data = image.attribute("href").unwrap().strip_prefix("data:image/png;base64,").unwrap();
+        assert_eq!(STANDARD.decode(data).unwrap(), map.to_png().unwrap());
+    }
+
+    #[test]
+    fn not_a_number_and_no_limit_are_refused() {
+        let mut samples = SMALL_MAP;
+        samples[4][2] = f64::NAN;
+        let error = HeatMap::of_lengths("map", "height", &samples).unwrap_err();
+        assert!(matches!(error, ReportError::NotFinite { index: 4, what: "value", .. }), "{error}");
+        let map = HeatMap::of_lengths("map", "height", &SMALL_MAP).unwrap();
+        assert!(map.clone().with_limit(0.0).is_err() && map.clone().with_limit(f64::NAN).is_err());
+        assert!(map.with_limit(1.0).is_ok());
+    }
+
+    #[test]
+    fn a_flat_map_is_drawn() {
+        let flat: Vec<[f64; 3]> = SMALL_MAP.iter().map(|&[x, y, _]| [x, y, 0.0]).collect();
+        let map = HeatMap::of_lengths("flat", "height", &flat).unwrap();
+        assert!(map.to_svg().unwrap().contains("PV 0 nm"));
+        assert!(map.with_colours(ColourMap::Sequential).to_svg().is_ok());
+    }
+
+    #[test]
+    fn files_are_written_whole_or_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let map = HeatMap::of_lengths("map", "height", &SMALL_MAP).unwrap();
+        map.save_svg(&folder.path().join("a.svg")).unwrap();
+        map.save_png(&folder.path().join("a.png")).unwrap();
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 2);
+        let error = map.save_png(&folder.path().join("none/a.png")).unwrap_err();
+        assert!(matches!(error, ReportError::Unwritable { .. }), "{error}");
+    }
+}

@@ -1,0 +1,114 @@
+//! Figures for people: heat maps of deviations and line plots, as SVG and PNG.
+//!
+//! ```text
+//!  samples (x, y, value) -> raster -> colours --+-> PNG   one pixel a pixel, nothing else
+//!                                               +-> SVG   the PNG inside axes, with a colour bar
+//!  series of (x, y) --------------> ticks ------+-> SVG
+//! ```
+//!
+//! A figure is a plain value until it is saved, and the same figure gives the same bytes. Frame: maps are drawn over x and y
+//! of the model frame {M}, y upwards. Units: axes in millimetres, deviations in micrometres or nanometres.
+
+mod axis;
+mod colour;
+mod heat_map;
+mod plot;
+mod raster;
+mod svg;
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use thiserror::Error;
+
+pub use axis::Scale;
+pub use colour::ColourMap;
+pub use heat_map::HeatMap;
+pub use plot::{Axis, Plot, Series};
+
+/// Why a figure could not be drawn or saved.
+#[derive(Debug, Error)]
+pub enum ReportError {
+    /// There is nothing to draw.
+    #[error("{figure}: there is nothing to draw; at least {least} points are needed, {found} were given")]
+    TooFewPoints {
+        /// Title of the figure.
+        figure: String,
+        /// How many there are.
+        found: usize,
+        /// How many are needed.
+        least: usize,
+    },
+    /// A number that no figure can show.
+    #[error("{figure}: point {} has the {what} {value}; a figure shows finite numbers only", index + 1)]
+    NotFinite {
+        /// Title of the figure, or name of the series.
+        figure: String,
+        /// Index of the point, from 0.
+        index: usize,
+        /// Which of its numbers.
+        what: &'static str,
+        /// What it is.
+        value: f64,
+    },
+    /// A number that has no logarithm.
+    #[error("{figure}: point {} has the {what} {value}; a logarithmic axis shows numbers above 0 only", index + 1)]
+    NoLogarithm {
+        /// Name of the series.
+        figure: String,
+        /// Index of the point, from 0.
+        index: usize,
+        /// Which of its numbers.
+        what: &'static str,
+        /// What it is.
+        value: f64,
+    },
+    /// All points lie at one place.
+    #[error("{figure}: all {points} points share one place in x and y; a map needs an extent")]
+    NoExtent {
+        /// Title of the figure.
+        figure: String,
+        /// How many points there are.
+        points: usize,
+    },
+    /// The limit of a colour bar is no limit.
+    #[error("{figure}: the colour bar was to end at {limit}; give a finite number above 0")]
+    ColourLimit {
+        /// Title of the figure.
+        figure: String,
+        /// What was given.
+        limit: f64,
+    },
+    /// The pixels could not be encoded.
+    #[error("{figure}: the picture could not be encoded: {source}")]
+    Encoding {
+        /// Title of the figure.
+        figure: String,
+        /// The encoder's reason.
+        source: png::EncodingError,
+    },
+    /// The file could not be written.
+    #[error("{path}: cannot be written: {source}; check the folder, the permissions and the space left")]
+    Unwritable {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+}
+
+/// Writes a whole file under a temporary name and then gives it its own, so that no half figure is ever found.
+fn save(path: &Path, bytes: &[u8]) -> Result<(), ReportError> {
+    let failed = |source| ReportError::Unwritable { path: path.to_owned(), source };
+    let name = path.file_name().ok_or_else(|| failed(io::Error::from(io::ErrorKind::InvalidFilename)))?;
+    let mut hidden = std::ffi::OsString::from(".");
+    hidden.push(name);
+    hidden.push(format!(".{}.tmp", std::process::id()));
+    let temporary = path.with_file_name(hidden);
+    fs::write(&temporary, bytes).and_then(|()| fs::rename(&temporary, path)).map_err(|source| {
+        // The error that brought us here is the one to report.
+        let _ = fs::remove_file(&temporary);
+        failed(source)
+    })
+}

@@ -1,0 +1,147 @@
+//! Lines over a pair of axes.
+
+use std::path::Path;
+
+use super::axis::{Ruler, Scale};
+use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
+use super::{ReportError, save};
+
+/// One axis of a plot.
+#[derive(Clone, Debug, Default)]
+pub struct Axis {
+    /// What stands beside it, with the unit.
+    pub label: String,
+    /// How the coordinate runs along it.
+    pub scale: Scale,
+}
+
+/// One line of a plot.
+#[derive(Clone, Debug, Default)]
+pub struct Series {
+    /// What the legend calls it.
+    pub name: String,
+    /// Its points, joined in this order.
+    pub points: Vec<[f64; 2]>,
+}
+
+/// Several lines over one pair of axes, each with a colour and a marker of its own, and a legend beside them.
+#[derive(Clone, Debug, Default)]
+pub struct Plot {
+    /// What stands above it.
+    pub title: String,
+    /// The axis to the right.
+    pub x: Axis,
+    /// The axis upwards.
+    pub y: Axis,
+    /// The lines, in the order of the legend.
+    pub series: Vec<Series>,
+}
+
+/// Okabe and Ito's colours for every kind of sight, the yellow left out for want of contrast on white.
+const COLOURS: [&str; 7] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000"];
+
+const CORNER: [f64; 2] = [70.0, 44.0];
+const SIZE: [f64; 2] = [520.0, 340.0];
+
+impl Plot {
+    /// Returns the figure.
+    ///
+    /// # Errors
+    /// No points at all, one that is not finite, or one that is not above 0 on a logarithmic axis.
+    pub fn to_svg(&self) -> Result<String, ReportError> {
+        let [x, y] = [self.ruler(0)?, self.ruler(1)?];
+        let longest = self.series.iter().map(|s| s.name.chars().count()).max().unwrap_or(0);
+        let [right, bottom] = [CORNER[0] + SIZE[0], CORNER[1] + SIZE[1]];
+        let mut svg = Svg::new(right + 56.0 + 6.6 * longest as f64, bottom + 54.0);
+        svg.text([CORNER[0], 24.0], Anchor::Start, LARGE, &self.title);
+        svg.frame(&Frame {
+            corner: CORNER,
+            size: SIZE,
+            x_ticks: x.ticks(10),
+            y_ticks: y.ticks(8),
+            x_label: &self.x.label,
+            y_label: &self.y.label,
+            grid: true,
+        });
+        for (k, series) in self.series.iter().enumerate() {
+            let pixels: Vec<[f64; 2]> = series.points.iter().map(|p| [x.pixel(p[0]), y.pixel(p[1])]).collect();
+            draw(&mut svg, k, &pixels);
+            let row = CORNER[1] + 12.0 + 20.0 * k as f64;
+            draw(&mut svg, k, &[[right + 14.0, row], [right + 40.0, row]]);
+            svg.text([right + 48.0, row + 4.0], Anchor::Start, SMALL, &series.name);
+        }
+        Ok(svg.finish())
+    }
+
+    /// Saves the figure.
+    ///
+    /// # Errors
+    /// As [`Plot::to_svg`], and a file that cannot be written.
+    pub fn save_svg(&self, path: &Path) -> Result<(), ReportError> {
+        save(path, self.to_svg()?.as_bytes())
+    }
+
+    /// Checks one coordinate of all points and lays their range on the page.
+    fn ruler(&self, k: usize) -> Result<Ruler, ReportError> {
+        let (axis, what) = if k == 0 { (&self.x, "x") } else { (&self.y, "y") };
+        let [mut low, mut high] = [f64::INFINITY, f64::NEG_INFINITY];
+        for series in &self.series {
+            for (index, value) in series.points.iter().map(|p| p[k]).enumerate() {
+                let figure = || series.name.clone();
+                if !value.is_finite() {
+                    return Err(ReportError::NotFinite { figure: figure(), index, what, value });
+                }
+                if axis.scale == Scale::Log && value <= 0.0 {
+                    return Err(ReportError::NoLogarithm { figure: figure(), index, what, value });
+                }
+                (low, high) = (low.min(value), high.max(value));
+            }
+        }
+        if low > high {
+            return Err(ReportError::TooFewPoints { figure: self.title.clone(), found: 0, least: 1 });
+        }
+        let pixels = if k == 0 { [CORNER[0], CORNER[0] + SIZE[0]] } else { [CORNER[1] + SIZE[1], CORNER[1]] };
+        Ok(Ruler::new(axis.scale, [low, high], pixels).rounded(8))
+    }
+}
+
+/// Draws a line with a marker at each point; colours, markers and dashes differ from line to line.
+fn draw(svg: &mut Svg, k: usize, pixels: &[[f64; 2]]) {
+    let colour = COLOURS[k % COLOURS.len()];
+    let dashes = if k < COLOURS.len() { "none" } else { "6 3" };
+    svg.polyline(pixels, colour, dashes);
+    for &pixel in pixels {
+        svg.marker(pixel, k % 4, colour);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn plot(points: Vec<[f64; 2]>) -> Plot {
+        let lines = (0..9).map(|k| Series { name: format!("case <{k}>"), points: points.clone() }).collect();
+        let log = Axis { label: "objective / mm²".into(), scale: Scale::Log };
+        Plot { title: "a plot".into(), x: Axis { label: "iteration".into(), ..Axis::default() }, y: log, series: lines }
+    }
+
+    #[test]
+    fn a_plot_is_well_formed_and_shows_every_line() {
+        let svg = plot(vec![[0.0, 1e4], [1.0, 1.0], [2.0, 1e-18]]).to_svg().unwrap();
+        let document = roxmltree::Document::parse(&svg).unwrap();
+        assert_eq!(document.descendants().filter(|n| n.has_tag_name("polyline")).count(), 18);
+        let texts: Vec<_> = document.descendants().filter_map(|n| n.text()).collect();
+        for text in ["case <8>", "objective / mm²", "iteration", "a plot"] {
+            assert!(texts.contains(&text), "{text} is not in {texts:?}");
+        }
+    }
+
+    #[test]
+    fn numbers_that_cannot_be_shown_are_refused() {
+        let refused = |point| plot(vec![[0.0, 1.0], point]).to_svg().unwrap_err();
+        assert!(matches!(refused([f64::NAN, 1.0]), ReportError::NotFinite { index: 1, what: "x", .. }));
+        assert!(matches!(refused([1.0, f64::INFINITY]), ReportError::NotFinite { index: 1, what: "y", .. }));
+        assert!(matches!(refused([1.0, 0.0]), ReportError::NoLogarithm { index: 1, what: "y", .. }));
+        assert!(matches!(plot(Vec::new()).to_svg(), Err(ReportError::TooFewPoints { found: 0, .. })));
+    }
+}

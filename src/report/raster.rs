@@ -1,0 +1,231 @@
+//! From scattered samples to pixels.
+
+use super::ReportError;
+
+/// A picture of values: NaN where nothing is known.
+#[derive(Clone, Debug)]
+pub(super) struct Raster {
+    pub(super) columns: usize,
+    pub(super) rows: usize,
+    /// Centre of the first pixel, at the least x and y, in millimetres.
+    pub(super) first_mm: [f64; 2],
+    /// Width and height of a pixel in millimetres.
+    pub(super) pixel_mm: [f64; 2],
+    /// Row by row, x fastest, y rising.
+    pub(super) values: Vec<f64>,
+}
+
+/// Pixels on the longer side: finer than a screen shows a figure, and small enough for a page.
+const MOST_PIXELS: usize = 480;
+
+/// Gaps of up to twice this many pixels within the cloud are filled from their sides.
+const REACH: usize = 2;
+
+/// The same for a cloud in scan lines: dense along them, sparse across.
+const LINES_REACH: usize = 8;
+
+/// A pixel on which less than this share of a sample falls knows nothing of its own.
+const LEAST_WEIGHT: f64 = 1e-3;
+
+impl Raster {
+    /// Shares every sample (x, y, value) among the four pixels around it and takes the mean of each pixel.
+    ///
+    /// A pixel is about as wide as the samples are apart. Gaps within the cloud are filled from their neighbours.
+    pub(super) fn new(title: &str, samples: &[[f64; 3]]) -> Result<Self, ReportError> {
+        check(title, samples)?;
+        let (low, size) = bounds(samples);
+        let points = samples.len();
+        let spacing = spacing(size, points).max(size[0].max(size[1]) / (MOST_PIXELS - 1) as f64);
+        if !(spacing > 0.0 && spacing.is_finite()) {
+            return Err(ReportError::NoExtent { figure: title.into(), points });
+        }
+        let counts = size.map(|s| (s / spacing).round() as usize + 1);
+        let pixel_mm = std::array::from_fn(|k| if counts[k] > 1 { size[k] / (counts[k] - 1) as f64 } else { spacing });
+        let [columns, rows] = counts;
+        let mut raster = Self { columns, rows, first_mm: low, pixel_mm, values: Vec::new() };
+        raster.values = raster.means(samples);
+        raster.fill();
+        Ok(raster)
+    }
+
+    fn means(&self, samples: &[[f64; 3]]) -> Vec<f64> {
+        let mut sums = vec![[0.0; 2]; self.columns * self.rows];
+        for [x, y, value] in samples {
+            let (i, u) = split((x - self.first_mm[0]) / self.pixel_mm[0], self.columns);
+            let (j, v) = split((y - self.first_mm[1]) / self.pixel_mm[1], self.rows);
+            for (di, dj, weight) in
+                [(0, 0, (1.0 - u) * (1.0 - v)), (1, 0, u * (1.0 - v)), (0, 1, (1.0 - u) * v), (1, 1, u * v)]
+            {
+                // A sample on the last column or row has no weight beyond it.
+                if weight > 0.0 {
+                    let [sum, total] = &mut sums[(j + dj) * self.columns + i + di];
+                    *sum += weight * value;
+                    *total += weight;
+                }
+            }
+        }
+        sums.into_iter().map(|[sum, total]| if total >= LEAST_WEIGHT { sum / total } else { f64::NAN }).collect()
+    }
+
+    /// Fills gaps narrower than the reach by the mean of the neighbours, from the sides inwards.
+    fn fill(&mut self) {
+        let known: Vec<bool> = self.values.iter().map(|v| !v.is_nan()).collect();
+        let count = |mask: &[bool]| mask.iter().filter(|&&m| m).count();
+        let mut reach = REACH;
+        let wide = self.closed(&known, LINES_REACH);
+        if count(&known) * 2 < count(&wide) {
+            reach = LINES_REACH;
+        }
+        let within = if reach == LINES_REACH { wide } else { self.closed(&known, reach) };
+        for _ in 0..=reach {
+            let before = self.values.clone();
+            for pixel in 0..before.len() {
+                if within[pixel] && before[pixel].is_nan() {
+                    self.values[pixel] = self.mean_around(&before, pixel);
+                }
+            }
+        }
+    }
+
+    fn mean_around(&self, values: &[f64], pixel: usize) -> f64 {
+        let (i, j) = (pixel % self.columns, pixel / self.columns);
+        let around = |at: usize, count: usize| at.saturating_sub(1)..(at + 2).min(count);
+        let (mut sum, mut total) = (0.0, 0.0);
+        for row in around(j, self.rows) {
+            for value in around(i, self.columns).map(|i| values[row * self.columns + i]).filter(|v| !v.is_nan()) {
+                sum += value;
+                total += 1.0;
+            }
+        }
+        sum / total
+    }
+
+    /// The morphological closing of a mask by a square: grown by a reach, then shrunk by it.
+    fn closed(&self, mask: &[bool], reach: usize) -> Vec<bool> {
+        let (columns, rows) = (self.columns + 2 * reach, self.rows + 2 * reach);
+        let mut wide = vec![false; columns * rows];
+        for j in 0..self.rows {
+            let to = (j + reach) * columns + reach;
+            wide[to..to + self.columns].copy_from_slice(&mask[j * self.columns..(j + 1) * self.columns]);
+        }
+        let grown = spread(&wide, columns, rows, reach, true);
+        let shrunk = spread(&grown, columns, rows, reach, false);
+        let row = |j: usize| (j + reach) * columns + reach;
+        (0..self.rows).flat_map(|j| shrunk[row(j)..row(j) + self.columns].iter().copied()).collect()
+    }
+}
+
+/// Gives every pixel a value if any pixel within reach, along columns and then along rows, has it.
+fn spread(mask: &[bool], columns: usize, rows: usize, reach: usize, value: bool) -> Vec<bool> {
+    let mut along = vec![!value; mask.len()];
+    let mut out = vec![!value; mask.len()];
+    for (pixel, _) in mask.iter().enumerate().filter(|&(_, &m)| m == value) {
+        let (i, j) = (pixel % columns, pixel / columns);
+        along[j * columns + i.saturating_sub(reach)..j * columns + (i + reach + 1).min(columns)].fill(value);
+    }
+    for (pixel, _) in along.iter().enumerate().filter(|&(_, &m)| m == value) {
+        let (i, j) = (pixel % columns, pixel / columns);
+        for row in j.saturating_sub(reach)..(j + reach + 1).min(rows) {
+            out[row * columns + i] = value;
+        }
+    }
+    out
+}
+
+/// The pixel below a place and the share of the way to the next one.
+fn split(place: f64, count: usize) -> (usize, f64) {
+    let below = (place.max(0.0) as usize).min(count - 1);
+    let share = (place - below as f64).clamp(0.0, 1.0);
+    if below + 1 == count { (below, 0.0) } else { (below, share) }
+}
+
+/// The spacing of a square grid of so many points over a rectangle: (n - 1) s^2 = (w + h) s + w h.
+fn spacing([width, height]: [f64; 2], points: usize) -> f64 {
+    let (sum, n) = (width + height, (points - 1) as f64);
+    (sum + (sum * sum + 4.0 * n * width * height).sqrt()) / (2.0 * n)
+}
+
+fn bounds(samples: &[[f64; 3]]) -> ([f64; 2], [f64; 2]) {
+    let axis =
+        |k: usize| samples.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), s| (s[k].min(l), s[k].max(h)));
+    let ((x0, x1), (y0, y1)) = (axis(0), axis(1));
+    ([x0, y0], [x1 - x0, y1 - y0])
+}
+
+fn check(title: &str, samples: &[[f64; 3]]) -> Result<(), ReportError> {
+    const LEAST: usize = 2;
+    if samples.len() < LEAST {
+        return Err(ReportError::TooFewPoints { figure: title.into(), found: samples.len(), least: LEAST });
+    }
+    for (index, sample) in samples.iter().enumerate() {
+        if let Some(k) = sample.iter().position(|c| !c.is_finite()) {
+            let what = ["x", "y", "value"][k];
+            return Err(ReportError::NotFinite { figure: title.into(), index, what, value: sample[k] });
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn grid(columns: i32, rows: i32, keep: impl Fn(i32, i32) -> bool) -> Vec<[f64; 3]> {
+        (0..rows)
+            .flat_map(|j| (0..columns).map(move |i| (i, j)))
+            .filter(|&(i, j)| keep(i, j))
+            .map(|(i, j)| [f64::from(i) * 0.5 - 3.0, f64::from(j) * 0.5, f64::from(i - 2 * j)])
+            .collect()
+    }
+
+    #[test]
+    fn a_grid_of_samples_becomes_its_own_pixels() {
+        let raster = Raster::new("grid", &grid(12, 7, |_, _| true)).unwrap();
+        assert_eq!((raster.columns, raster.rows), (12, 7));
+        assert_eq!(raster.pixel_mm, [0.5, 0.5]);
+        for (pixel, value) in raster.values.iter().enumerate() {
+            let exact = (pixel % 12) as f64 - 2.0 * (pixel / 12) as f64;
+            assert!((value - exact).abs() < 1e-9, "{pixel}: {value} against {exact}");
+        }
+    }
+
+    #[test]
+    fn a_gap_is_filled_from_its_sides_and_a_hole_stays_open() {
+        let lost = |i: i32, j: i32| (i, j) == (3, 3) || (i, j) == (4, 3);
+        let hole = |i: i32, j: i32| (20..30).contains(&i) && (10..20).contains(&j);
+        let raster = Raster::new("holes", &grid(40, 30, |i, j| !lost(i, j) && !hole(i, j))).unwrap();
+        let at = |x: f64, y: f64| {
+            let i = ((x - raster.first_mm[0]) / raster.pixel_mm[0]).round() as usize;
+            raster.values[(y / raster.pixel_mm[1]).round() as usize * raster.columns + i]
+        };
+        // The value changes by 3 from one pixel to the next across the diagonal.
+        assert!((at(-1.5, 1.5) + 3.0).abs() < 3.0, "{}", at(-1.5, 1.5));
+        assert!(at(9.25, 7.25).is_nan());
+    }
+
+    #[test]
+    fn scan_lines_become_an_area() {
+        let samples: Vec<[f64; 3]> =
+            (0..20).flat_map(|j| (0..400).map(move |i| [f64::from(i) * 0.05, f64::from(j), f64::from(j)])).collect();
+        let raster = Raster::new("lines", &samples).unwrap();
+        assert!(raster.values.iter().all(|v| v.is_finite()));
+    }
+
+    #[test]
+    fn a_disc_stays_round() {
+        let raster = Raster::new("disc", &grid(41, 41, |i, j| (i - 20).pow(2) + (j - 20).pow(2) <= 400)).unwrap();
+        assert!(raster.values[0].is_nan() && raster.values.last().unwrap().is_nan());
+        let middle = raster.values[raster.rows / 2 * raster.columns + raster.columns / 2];
+        assert!(middle.is_finite());
+        let known = raster.values.iter().filter(|v| v.is_finite()).count() as f64;
+        assert!((known / raster.values.len() as f64 - 0.785).abs() < 0.06, "{known}");
+    }
+
+    #[test]
+    fn what_cannot_be_shown_is_refused() {
+        assert!(matches!(Raster::new("", &[[0.0; 3]]), Err(ReportError::TooFewPoints { found: 1, .. })));
+        assert!(matches!(Raster::new("", &[[1.0; 3]; 5]), Err(ReportError::NoExtent { points: 5, .. })));
+        let bad = [[0.0; 3], [1.0, 0.0, f64::NAN]];
+        assert!(matches!(Raster::new("", &bad), Err(ReportError::NotFinite { index: 1, what: "value", .. })));
+    }
+}

@@ -1,0 +1,212 @@
+//! The few elements of SVG that figures are made of.
+
+use std::fmt::Write;
+
+use super::axis::Tick;
+
+/// Ink of axes and text.
+pub(super) const INK: &str = "#222222";
+/// Ink of grid lines.
+pub(super) const FAINT: &str = "#dddddd";
+/// Size of labels in pixels.
+pub(super) const SMALL: f64 = 12.0;
+/// Size of titles in pixels.
+pub(super) const LARGE: f64 = 15.0;
+
+/// An SVG document that is being written: pixels, y downwards, two decimals.
+#[derive(Debug)]
+pub(super) struct Svg {
+    text: String,
+}
+
+/// On which side of its place a text stands.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Anchor {
+    Start,
+    Middle,
+    End,
+}
+
+impl Anchor {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Start => "start",
+            Self::Middle => "middle",
+            Self::End => "end",
+        }
+    }
+}
+
+/// A rectangle with ticks on its left and lower side.
+#[derive(Debug)]
+pub(super) struct Frame<'a> {
+    /// The upper left corner.
+    pub(super) corner: [f64; 2],
+    /// Width and height.
+    pub(super) size: [f64; 2],
+    pub(super) x_ticks: Vec<Tick>,
+    pub(super) y_ticks: Vec<Tick>,
+    pub(super) x_label: &'a str,
+    pub(super) y_label: &'a str,
+    /// Whether lines cross the frame at the ticks.
+    pub(super) grid: bool,
+}
+
+impl Svg {
+    /// Begins a document on white paper.
+    pub(super) fn new(width: f64, height: f64) -> Self {
+        let mut svg = Self { text: String::new() };
+        svg.put(format_args!(
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width:.0}\" height=\"{height:.0}\" \
+             viewBox=\"0 0 {width:.0} {height:.0}\" font-family=\"Helvetica, Arial, sans-serif\" font-size=\"{SMALL}\" \
+             fill=\"{INK}\">\n<rect width=\"100%\" height=\"100%\" fill=\"#ffffff\"/>\n"
+        ));
+        svg
+    }
+
+    /// Ends the document.
+    pub(super) fn finish(mut self) -> String {
+        self.text.push_str("</svg>\n");
+        self.text
+    }
+
+    fn put(&mut self, arguments: std::fmt::Arguments) {
+        self.text.write_fmt(arguments).expect("a string takes what it is given");
+    }
+
+    pub(super) fn line(&mut self, [x1, y1]: [f64; 2], [x2, y2]: [f64; 2], colour: &str) {
+        self.put(format_args!(
+            "<line x1=\"{x1:.2}\" y1=\"{y1:.2}\" x2=\"{x2:.2}\" y2=\"{y2:.2}\" stroke=\"{colour}\"/>\n"
+        ));
+    }
+
+    /// An unfilled or filled rectangle with a thin outline.
+    pub(super) fn rectangle(&mut self, [x, y]: [f64; 2], [width, height]: [f64; 2], fill: &str) {
+        self.put(format_args!(
+            "<rect x=\"{x:.2}\" y=\"{y:.2}\" width=\"{width:.2}\" height=\"{height:.2}\" fill=\"{fill}\" stroke=\"{INK}\"/>\n"
+        ));
+    }
+
+    pub(super) fn polyline(&mut self, points: &[[f64; 2]], colour: &str, dashes: &str) {
+        let mut list = String::with_capacity(points.len() * 14);
+        for [x, y] in points {
+            write!(list, "{x:.2},{y:.2} ").expect("a string takes what it is given");
+        }
+        self.put(format_args!(
+            "<polyline points=\"{}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"1.6\" stroke-dasharray=\"{dashes}\"/>\n",
+            list.trim_end()
+        ));
+    }
+
+    /// A marker: shape 0 is a disc, 1 a square, 2 a triangle, 3 a diamond.
+    pub(super) fn marker(&mut self, [x, y]: [f64; 2], shape: usize, colour: &str) {
+        if shape == 0 {
+            return self.put(format_args!("<circle cx=\"{x:.2}\" cy=\"{y:.2}\" r=\"3.5\" fill=\"{colour}\"/>\n"));
+        }
+        let outline = match shape {
+            1 => "m-3.2,-3.2h6.4v6.4h-6.4z",
+            2 => "m0,-4.4l4.2,7.4h-8.4z",
+            _ => "m0,-4.6l4,4.6l-4,4.6l-4,-4.6z",
+        };
+        self.put(format_args!("<path d=\"M{x:.2},{y:.2}{outline}\" fill=\"{colour}\"/>\n"));
+    }
+
+    /// The frame of a figure with its ticks, their labels and the names of both axes; grid lines where wanted.
+    pub(super) fn frame(&mut self, frame: &Frame) {
+        let Frame { corner: [left, top], size: [width, height], .. } = *frame;
+        let (right, bottom) = (left + width, top + height);
+        let end = |grid: bool, far: f64, near: f64| if grid { far } else { near };
+        let ink = if frame.grid { FAINT } else { INK };
+        for tick in &frame.x_ticks {
+            self.line([tick.pixel, bottom], [tick.pixel, end(frame.grid, top, bottom + 5.0)], ink);
+            self.tick_label([tick.pixel, bottom + 19.0], Anchor::Middle, tick);
+        }
+        for tick in &frame.y_ticks {
+            self.line([left, tick.pixel], [end(frame.grid, right, left - 5.0), tick.pixel], ink);
+            self.tick_label([left - 8.0, tick.pixel + 4.0], Anchor::End, tick);
+        }
+        self.rectangle([left, top], [width, height], "none");
+        self.text([left + width / 2.0, bottom + 39.0], Anchor::Middle, SMALL, frame.x_label);
+        self.upright([left - 46.0, top + height / 2.0], frame.y_label);
+    }
+
+    /// A text whose base line passes through a place.
+    pub(super) fn text(&mut self, [x, y]: [f64; 2], anchor: Anchor, size: f64, content: &str) {
+        let (anchor, content) = (anchor.name(), escaped(content));
+        self.put(format_args!(
+            "<text x=\"{x:.2}\" y=\"{y:.2}\" text-anchor=\"{anchor}\" font-size=\"{size}\">{content}</text>\n"
+        ));
+    }
+
+    /// A text that reads upwards, centred on a place.
+    pub(super) fn upright(&mut self, [x, y]: [f64; 2], content: &str) {
+        let content = escaped(content);
+        self.put(format_args!(
+            "<text transform=\"translate({x:.2} {y:.2}) rotate(-90)\" text-anchor=\"middle\">{content}</text>\n"
+        ));
+    }
+
+    /// The label of a tick, its exponent raised.
+    pub(super) fn tick_label(&mut self, at: [f64; 2], anchor: Anchor, tick: &Tick) {
+        let Some(exponent) = tick.exponent else { return self.text(at, anchor, SMALL, &tick.label) };
+        let ([x, y], anchor, exponent) = (at, anchor.name(), exponent.to_string().replace('-', "\u{2212}"));
+        self.put(format_args!(
+            "<text x=\"{x:.2}\" y=\"{y:.2}\" text-anchor=\"{anchor}\">{}<tspan dy=\"-5\" font-size=\"9\">{exponent}</tspan>\
+             </text>\n",
+            escaped(&tick.label)
+        ));
+    }
+
+    /// A PNG, given in base 64, stretched over a rectangle.
+    pub(super) fn image(&mut self, [x, y]: [f64; 2], [width, height]: [f64; 2], base64: &str, rendering: &str) {
+        self.put(format_args!(
+            "<image x=\"{x:.2}\" y=\"{y:.2}\" width=\"{width:.2}\" height=\"{height:.2}\" preserveAspectRatio=\"none\" \
+             style=\"image-rendering:{rendering}\" href=\"data:image/png;base64,{base64}\"/>\n"
+        ));
+    }
+
+    /// A gradient from bottom to top through colours at equal distances, to be used as the fill `url(#id)`.
+    pub(super) fn gradient(&mut self, id: &str, colours: &[u32]) {
+        self.put(format_args!("<defs><linearGradient id=\"{id}\" x1=\"0\" y1=\"1\" x2=\"0\" y2=\"0\">"));
+        for (k, colour) in colours.iter().enumerate() {
+            let offset = k as f64 / (colours.len() - 1) as f64;
+            self.put(format_args!("<stop offset=\"{offset:.4}\" stop-color=\"#{colour:06x}\"/>"));
+        }
+        self.put(format_args!("</linearGradient></defs>\n"));
+    }
+}
+
+/// Replaces what XML reserves or forbids.
+fn escaped(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '&' => out.push_str("&amp;"),
+            c if c.is_control() || ('\u{fffe}'..='\u{ffff}').contains(&c) => out.push('\u{fffd}'),
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_document_is_well_formed_whatever_the_text() {
+        let mut svg = Svg::new(100.0, 50.0);
+        let odd = "a < b & \"c\" > \u{1} \u{ffff} µm";
+        svg.text([1.0, 2.0], Anchor::End, SMALL, odd);
+        svg.upright([3.0, 4.0], odd);
+        svg.gradient("g", &[0, 0xff_ffff]);
+        (0..4).for_each(|shape| svg.marker([5.0, 5.0], shape, INK));
+        svg.tick_label([0.0, 0.0], Anchor::Start, &Tick { pixel: 0.0, label: "10".into(), exponent: Some(-3) });
+        let text = svg.finish();
+        let document = roxmltree::Document::parse(&text).unwrap();
+        let first = document.descendants().find(|n| n.has_tag_name("text")).unwrap();
+        assert_eq!(first.text(), Some("a < b & \"c\" > \u{fffd} \u{fffd} µm"));
+    }
+}
