@@ -62,6 +62,7 @@ impl Failure {
             NotConverged { .. } | TooFewUsed { .. } => " (--initial)",
             WrongSide { .. } => " (--side)",
             Undetermined => " (--lock)",
+            Size { remedy, .. } if !remedy.contains("millimetres") => " (both files must be in millimetres)",
             _ => "",
         };
         let (nominal, measured) = (nominal.to_owned(), measured.to_owned());
