@@ -106,6 +106,17 @@ fn a_spacing_for_a_wanted_figure_gives_it() {
 }
 
 #[test]
+fn a_plane_is_exact_at_any_spacing_that_was_looked_at() {
+    let points: Vec<Point> = free_form(61, 41).iter().map(|p| Point::new(p.x, p.y, 0.1 * p.x)).collect();
+    let found = predicted(&points);
+    for estimate in [&found.flat, &found.curved] {
+        assert_eq!(estimate.trust, Trust::Extrapolated);
+        let spacing_mm = estimate.spacing_for(1e-6).unwrap();
+        assert!((spacing_mm / found.spacing_mm - 6.0).abs() < 1e-6, "{spacing_mm}");
+    }
+}
+
+#[test]
 fn what_makes_no_surface_is_refused() {
     let of = |points: &[Point]| accuracy(Net::Points { points, projection: Projection::Auto }).unwrap_err();
     assert!(matches!(of(&[]), SurfaceError::TooFewPoints { .. }));

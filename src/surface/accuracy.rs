@@ -85,6 +85,8 @@ pub struct Estimate {
     /// How far the estimate may be trusted.
     pub trust: Trust,
     spacing_mm: f64,
+    /// Spacing of the coarsest net looked at.
+    coarsest_mm: f64,
 }
 
 /// Errors of a distance, in millimetres.
@@ -122,12 +124,13 @@ pub enum Trust {
 
 impl Estimate {
     /// Returns the spacing at which the PV error inside is a wanted one, in millimetres; `None` where no spacing brings it
-    /// because the points are not exact enough.
+    /// because the points are not exact enough. It is never coarser than the coarsest net that was looked at.
     pub fn spacing_for(&self, wanted_pv_mm: f64) -> Option<f64> {
         if self.trust == Trust::Rounding {
             return (self.inside.pv_mm <= wanted_pv_mm).then_some(self.spacing_mm);
         }
-        Some(self.spacing_mm * (wanted_pv_mm / self.inside.pv_mm.max(f64::MIN_POSITIVE)).powf(1.0 / self.order))
+        let ratio = wanted_pv_mm / self.inside.pv_mm.max(f64::MIN_POSITIVE);
+        Some((self.spacing_mm * ratio.powf(1.0 / self.order)).min(self.coarsest_mm))
     }
 }
 
@@ -283,7 +286,7 @@ fn estimate(fine: &Errors, coarse: &Errors, kind: usize, factor: f64, spacing_mm
     let [inside_fine, inside_coarse] = [fine, coarse].map(|errors| figures(&errors.inside, kind));
     let [border_fine, border_coarse] = [fine, coarse].map(|errors| figures(&errors.border, kind));
     let observed_order = observed(&inside_fine, &inside_coarse);
-    let trust = trust(observed_order, LEAST_ORDER[kind], inside_fine.rms_mm / spacing_mm);
+    let trust = trust(observed_order, LEAST_ORDER[kind], inside_fine.rms_mm, spacing_mm);
     let order = observed_order.clamp(ORDERS[0], ORDERS[1]);
     let scale = |order: f64| if trust == Trust::Rounding { 1.0 } else { factor.powf(-order) };
     let (inside_scale, border_scale) =
@@ -305,6 +308,7 @@ fn estimate(fine: &Errors, coarse: &Errors, kind: usize, factor: f64, spacing_mm
         observed_order,
         trust,
         spacing_mm,
+        coarsest_mm: coarse.spacing_mm,
     }
 }
 
@@ -314,11 +318,14 @@ fn observed(fine: &Figures, coarse: &Figures) -> f64 {
     if ratio > 0.0 && ratio.is_finite() { ratio.log2() } else { ORDERS[0] }
 }
 
-fn trust(observed_order: f64, least: f64, error_per_spacing: f64) -> Trust {
+fn trust(observed_order: f64, least: f64, rms_mm: f64, spacing_mm: f64) -> Trust {
     /// Rounding and scatter tilt the surface by less than this; features between the points by more.
     const LARGEST_TILT: f64 = 1e-4;
+    /// The arithmetic itself is no more exact on a part of a metre.
+    const EXACT_MM: f64 = 1e-11;
     match observed_order {
-        p if p < least && error_per_spacing < LARGEST_TILT => Trust::Rounding,
+        _ if rms_mm < EXACT_MM => Trust::Extrapolated,
+        p if p < least && rms_mm < LARGEST_TILT * spacing_mm => Trust::Rounding,
         p if p < least || p > ORDERS[1] + 0.5 => Trust::TooCoarse,
         _ => Trust::Extrapolated,
     }
