@@ -47,7 +47,7 @@ pub(super) struct Arguments {
     /// What scattered nominal points are projected onto
     #[arg(long, value_enum, default_value_t)]
     projection: ProjectionName,
-    /// Coordinates of the pose that stay as they are, separated by commas
+    /// Coordinates of the pose that stay as they are in --initial, or at zero, separated by commas; no search is made
     #[arg(long, value_enum, value_delimiter = ',', value_name = "x,y,z,rx,ry,rz")]
     lock: Vec<Coordinate>,
     /// How the distance of a point counts
@@ -257,9 +257,12 @@ fn options(arguments: &Arguments) -> Result<Options, Failure> {
     for &coordinate in &arguments.lock {
         options.locked[coordinate as usize] = true;
     }
-    if let Some(path) = &arguments.initial {
-        options.start = Start::Pose(read_pose(path)?);
-    }
+    options.start = match &arguments.initial {
+        Some(path) => Start::Pose(read_pose(path)?),
+        None if arguments.lock.is_empty() => Start::Search,
+        // A search would choose the locked coordinates at random.
+        None => Start::Pose(Pose::identity()),
+    };
     options.outlier_sigmas = arguments.outlier_sigmas;
     options.rms_limit_mm = arguments.max_rms;
     Ok(options)
