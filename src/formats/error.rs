@@ -304,7 +304,7 @@ pub enum FormatError {
         remedy: &'static str,
     },
     /// A file could not be written; nothing of that name was changed.
-    #[error("{path}: cannot be written, {action}: {source}")]
+    #[error("{path}: cannot be written, {action}: {source}; check the name, the permissions and the space left")]
     Unwritable {
         /// The file.
         path: PathBuf,

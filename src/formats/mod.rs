@@ -4,6 +4,7 @@
 //! found, what was expected and what to do; nothing here panics, and time and memory are bounded by the size of the file.
 
 mod error;
+mod folder;
 mod layout;
 mod number;
 pub mod ply;
@@ -15,10 +16,11 @@ mod whole;
 use std::path::Path;
 
 pub use error::FormatError;
+pub use folder::ResultFolder;
 pub use number::LIMIT_MM;
 pub use ply::{PlyFile, parse_ply, read_ply};
 pub use points::{parse_points, read_points};
-pub use registration::{DeviationRow, write_deviations, write_json_atomic, write_points};
+pub use registration::{DeviationRow, write_column, write_deviations, write_json_atomic, write_points};
 pub use stl::{StlFile, parse_stl, read_stl};
 
 use crate::geometry::Point;

@@ -55,6 +55,14 @@ pub fn write_points(path: impl AsRef<Path>, header: &str, points: &[Point]) -> R
     write_rows(path.as_ref(), header, points, |point| ([point.x, point.y, point.z], None))
 }
 
+/// Writes one column of numbers under the header given.
+///
+/// # Errors
+/// Those of [`write_deviations`].
+pub fn write_column(path: impl AsRef<Path>, header: &str, values: &[f64]) -> Result<(), FormatError> {
+    write_rows(path.as_ref(), header, values, |value| ([*value], None))
+}
+
 /// Writes a value as indented JSON.
 ///
 /// JSON has no NaN: a field that holds one becomes `null`. See to it that none does.
@@ -116,7 +124,7 @@ fn format_rows<T, const N: usize>(rows: &[T], cells: impl Fn(&T) -> ([f64; N], O
 }
 
 /// A file under a temporary name, which goes away unless it is published.
-struct Draft<'p> {
+pub(super) struct Draft<'p> {
     path: &'p Path,
     temporary: PathBuf,
     file: BufWriter<File>,
@@ -124,7 +132,7 @@ struct Draft<'p> {
 }
 
 impl<'p> Draft<'p> {
-    fn create(path: &'p Path) -> Result<Self, FormatError> {
+    pub(super) fn create(path: &'p Path) -> Result<Self, FormatError> {
         static COUNT: AtomicU64 = AtomicU64::new(0);
         let failed = |source| FormatError::Unwritable { path: path.to_owned(), action: "creating it", source };
         if path.is_dir() {

@@ -11,6 +11,7 @@
 //!
 //! Pure: no file, no clock, no randomness. Frame: everything here is in the model frame {M}. Units: millimetres.
 
+pub mod accuracy;
 pub mod analytic;
 mod delaunay;
 mod feature;

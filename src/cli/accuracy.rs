@@ -1,0 +1,183 @@
+//! `regrind accuracy`: how exact distances to a nominal surface will be, and how fine it must be sampled.
+
+use std::fmt::Write as _;
+use std::path::PathBuf;
+
+use clap::Args;
+use regrind::formats::NominalFile;
+use regrind::surface::accuracy::{Accuracy, Estimate, Figures, Net, Trust, accuracy};
+use serde::Serialize;
+
+use super::failure::Failure;
+use super::nominal::{self, ProjectionName};
+use super::words::{counted, three_digits};
+use super::{Outcome, finite_above_zero};
+
+/// Tell from a nominal alone how exact distances to it will be, and how fine it must be for a wanted accuracy
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Most points are left out, twice, and their distance from what is left is measured: they lie on the surface, so that
+the distance is the error. What is told is extrapolated from there.
+
+Example:
+  regrind accuracy --nominal lens.csv --want 1
+
+Exit codes: 0 as exact as wanted, by the curved distance; 1 not so; 2 bad arguments or data; 3 fault.")]
+pub(super) struct Arguments {
+    /// Nominal surface: points as text or PLY, a mesh as STL or PLY, or a TOML definition, in mm
+    #[arg(long, value_name = "FILE")]
+    nominal: PathBuf,
+    /// What scattered points are projected onto
+    #[arg(long, value_enum, default_value_t)]
+    projection: ProjectionName,
+    /// Wanted error of the distance, peak to valley, in nm
+    #[arg(long, value_name = "NM", allow_negative_numbers = true, value_parser = finite_above_zero)]
+    want: Option<f64>,
+    /// Print JSON instead of words
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Serialize)]
+struct Document {
+    points: usize,
+    spacing_mm: f64,
+    wanted_pv_nm: Option<f64>,
+    curved: Kind,
+    triangle: Kind,
+}
+
+#[derive(Serialize)]
+struct Kind {
+    pv_nm: f64,
+    rms_nm: f64,
+    max_nm: f64,
+    border_pv_nm: f64,
+    border_rms_nm: f64,
+    border_max_nm: f64,
+    worst_at_mm: [f64; 3],
+    worst_error_nm: f64,
+    worst_near_border: bool,
+    order: f64,
+    observed_order: f64,
+    trust: &'static str,
+    /// Absent where nothing was wanted, or where no spacing brings it.
+    wanted_spacing_mm: Option<f64>,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let found = judge(arguments)?;
+    let document = Document {
+        points: found.points,
+        spacing_mm: found.spacing_mm,
+        wanted_pv_nm: arguments.want,
+        curved: Kind::new(&found.curved, arguments.want),
+        triangle: Kind::new(&found.flat, arguments.want),
+    };
+    if [&document.curved, &document.triangle].iter().any(|kind| !kind.is_finite()) {
+        return Err(Failure::NotFinite { what: "an error" });
+    }
+    if arguments.json {
+        super::print_json(&document)?;
+    } else {
+        super::print(&summary(&document, arguments))?;
+    }
+    let reached = arguments.want.is_none_or(|want| document.curved.pv_nm <= want);
+    Ok(if reached { Outcome::Accepted } else { Outcome::NotInTolerance })
+}
+
+fn judge(arguments: &Arguments) -> Result<Accuracy, Failure> {
+    let path = &arguments.nominal;
+    let projection = arguments.projection.into();
+    match nominal::read(path, arguments.projection)? {
+        NominalFile::Points(points) | NominalFile::Mesh { points, .. } => {
+            accuracy(Net::Points { points: &points, projection })
+        }
+        NominalFile::Definition(text) => {
+            let (grid, _) = nominal::sampled(path, &text)?;
+            let (columns, rows) = (grid.columns, grid.rows);
+            accuracy(Net::Grid { columns, rows, points: &grid.points, normals: &grid.normals })
+        }
+    }
+    .map_err(|source| Failure::Nominal { path: path.clone(), source })
+}
+
+impl Kind {
+    fn new(estimate: &Estimate, wanted_nm: Option<f64>) -> Self {
+        let nm = |Figures { pv_mm, rms_mm, max_mm }| [pv_mm, rms_mm, max_mm].map(|mm| 1e6 * mm);
+        let [pv_nm, rms_nm, max_nm] = nm(estimate.inside);
+        let [border_pv_nm, border_rms_nm, border_max_nm] = nm(estimate.border);
+        Self {
+            pv_nm,
+            rms_nm,
+            max_nm,
+            border_pv_nm,
+            border_rms_nm,
+            border_max_nm,
+            worst_at_mm: estimate.worst.at.into(),
+            worst_error_nm: 1e6 * estimate.worst.error_mm,
+            worst_near_border: estimate.worst.near_border,
+            order: estimate.order,
+            observed_order: estimate.observed_order,
+            trust: match estimate.trust {
+                Trust::Extrapolated => "extrapolated",
+                Trust::Rounding => "rounding",
+                Trust::TooCoarse => "too-coarse",
+            },
+            wanted_spacing_mm: wanted_nm.and_then(|nm| estimate.spacing_for(1e-6 * nm)).filter(|h| h.is_finite()),
+        }
+    }
+
+    fn is_finite(&self) -> bool {
+        let sum = self.pv_nm + self.rms_nm + self.max_nm + self.worst_error_nm + self.order + self.observed_order;
+        (sum + self.border_pv_nm + self.border_rms_nm + self.border_max_nm).is_finite()
+    }
+}
+
+fn summary(document: &Document, arguments: &Arguments) -> String {
+    let mut text = format!(
+        "nominal     {}: {}, spacing {} mm\n",
+        arguments.nominal.display(),
+        counted(document.points, "point"),
+        three_digits(document.spacing_mm)
+    );
+    for (name, kind) in [("curved", &document.curved), ("triangle", &document.triangle)] {
+        describe(&mut text, name, kind, arguments.want).expect("text grows");
+    }
+    text
+}
+
+fn describe(text: &mut String, name: &str, kind: &Kind, want: Option<f64>) -> std::fmt::Result {
+    let d = three_digits;
+    writeln!(
+        text,
+        "{name:<12}error PV {} nm, rms {} nm, largest {} nm; near the border PV {} nm",
+        d(kind.pv_nm),
+        d(kind.rms_nm),
+        d(kind.max_nm),
+        d(kind.border_pv_nm)
+    )?;
+    let [x, y, z] = kind.worst_at_mm;
+    let place = if kind.worst_near_border { "near the border" } else { "inside" };
+    writeln!(text, "{:<12}worst {} nm at ({x:.3}, {y:.3}, {z:.3}) mm, {place}", "", d(kind.worst_error_nm))?;
+    match kind.trust {
+        "rounding" => writeln!(
+            text,
+            "{:<12}the error hardly falls with the spacing: the points are rounded or scatter by as much; write more decimals",
+            ""
+        )?,
+        "too-coarse" => writeln!(
+            text,
+            "{:<12}too coarse to extrapolate: the surface has features of the size of a few spacings; give a finer nominal",
+            ""
+        )?,
+        _ => {}
+    }
+    match (want, kind.wanted_spacing_mm) {
+        (Some(want), Some(spacing)) => {
+            writeln!(text, "{:<12}a spacing of {} mm gives PV {} nm", "", d(spacing), d(want))
+        }
+        (Some(want), None) => writeln!(text, "{:<12}no spacing of such points gives PV {} nm", "", d(want)),
+        (None, _) => Ok(()),
+    }
+}

@@ -1,0 +1,78 @@
+//! Why a command could not do its work, in one sentence with its remedy, and the exit code for it.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use regrind::formats::FormatError;
+use regrind::registration::RegistrationError;
+use regrind::surface::{DefinitionError, SurfaceError};
+use thiserror::Error;
+
+/// Bad arguments, recipe or data.
+const BAD_INPUT: u8 = 2;
+/// A fault of the machine or of the program.
+pub(super) const FAULT: u8 = 3;
+
+/// Why a command ended without a result.
+#[derive(Debug, Error)]
+pub(super) enum Failure {
+    #[error(transparent)]
+    File(#[from] FormatError),
+    #[error("{path}: {source}")]
+    Definition { path: PathBuf, source: DefinitionError },
+    #[error("{path}: {source}")]
+    Nominal { path: PathBuf, source: SurfaceError },
+    #[error("{path}: {source}")]
+    Measured { path: PathBuf, source: RegistrationError },
+    #[error("{measured} against {nominal}: {source}{hint}")]
+    Registration { measured: PathBuf, nominal: PathBuf, source: RegistrationError, hint: &'static str },
+    #[error("--probe-radius: {source}")]
+    ProbeRadius { source: RegistrationError },
+    #[error("--probe-radius is missing; give the radius of the probe in millimetres, or --method contact")]
+    NoProbeRadius,
+    #[error("{path}: --projection is for points, and this is {what}; leave it out")]
+    Projection { path: PathBuf, what: &'static str },
+    #[error(
+        "{path}: no pose: {reason}; give 16 numbers, row by row, as text or JSON, or the registration.json of an earlier run"
+    )]
+    Initial { path: PathBuf, reason: String },
+    #[error("the result cannot be told: {what} is not a finite number; please report it with the files that led to it")]
+    NotFinite { what: &'static str },
+    /// The input was good and the place was writable before; now it is not.
+    #[error("the result could not be saved: {0}")]
+    NotSaved(FormatError),
+    #[error("the terminal cannot be written to: {0}")]
+    Terminal(io::Error),
+}
+
+impl Failure {
+    /// Returns the exit code of the program.
+    pub(super) fn exit_code(&self) -> u8 {
+        match self {
+            Self::NotFinite { .. } | Self::NotSaved(_) | Self::Terminal(_) => FAULT,
+            _ => BAD_INPUT,
+        }
+    }
+
+    /// Names the file or the argument that a registration failed for.
+    pub(super) fn of_registration(source: RegistrationError, nominal: &Path, measured: &Path) -> Self {
+        use RegistrationError::*;
+        let hint = match source {
+            DoesNotFit { .. } => " (--max-rms)",
+            NotConverged { .. } | TooFewUsed { .. } => " (--initial)",
+            WrongSide { .. } => " (--side)",
+            Undetermined => " (--lock)",
+            Size { remedy, .. } if !remedy.contains("millimetres") => " (both files must be in millimetres)",
+            _ => "",
+        };
+        let (nominal, measured) = (nominal.to_owned(), measured.to_owned());
+        match source {
+            Surface(source) => Self::Nominal { path: nominal, source },
+            ProbeRadius { .. } => Self::ProbeRadius { source },
+            TooFewPoints { .. } | NotFinite { .. } | Collinear { .. } | Repeated { .. } => {
+                Self::Measured { path: measured, source }
+            }
+            _ => Self::Registration { measured, nominal, source, hint },
+        }
+    }
+}

@@ -1,0 +1,107 @@
+//! The command line: one file per command, and the only room that prints or exits.
+
+mod accuracy;
+mod failure;
+mod initial;
+mod nominal;
+mod register;
+mod words;
+
+use std::io::{self, Write};
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+use failure::Failure;
+
+/// Closed-loop grinding: register measured probe centres to the offset of a nominal surface.
+#[derive(Debug, Parser)]
+#[command(name = "regrind", version, after_help = EXIT_CODES)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Register(register::Arguments),
+    Accuracy(accuracy::Arguments),
+}
+
+const EXIT_CODES: &str = "Exit codes: 0 accepted; 1 finished, not in tolerance; 2 bad arguments or data; 3 fault.";
+
+/// How a command that did its work ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Outcome {
+    Accepted,
+    NotInTolerance,
+}
+
+/// Reads the arguments, carries the command out, and returns the exit code.
+pub fn main() -> ExitCode {
+    std::panic::set_hook(Box::new(|panic| {
+        eprintln!("error: a fault of the program itself: {panic}; please report it with the files that led to it");
+    }));
+    std::panic::catch_unwind(run).unwrap_or(ExitCode::from(failure::FAULT))
+}
+
+fn run() -> ExitCode {
+    let arguments = match Arguments::try_parse() {
+        Ok(arguments) => arguments,
+        Err(error) => {
+            // Nobody is left to tell if the terminal itself fails.
+            let _ = error.print();
+            return ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(failure::FAULT));
+        }
+    };
+    let ended = match arguments.command {
+        Command::Register(arguments) => register::run(&arguments),
+        Command::Accuracy(arguments) => accuracy::run(&arguments),
+    };
+    match ended {
+        Ok(Outcome::Accepted) => ExitCode::SUCCESS,
+        Ok(Outcome::NotInTolerance) => ExitCode::from(1),
+        Err(failure) => {
+            let _ = writeln!(io::stderr(), "error: {failure}");
+            ExitCode::from(failure.exit_code())
+        }
+    }
+}
+
+/// Writes text to the terminal; a reader that has gone away is no fault.
+fn print(text: &str) -> Result<(), Failure> {
+    match io::stdout().lock().write_all(text.as_bytes()) {
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(Failure::Terminal(error)),
+        _ => Ok(()),
+    }
+}
+
+/// Writes a value to the terminal as indented JSON.
+fn print_json(value: &impl serde::Serialize) -> Result<(), Failure> {
+    let mut text = serde_json::to_string_pretty(value).map_err(|e| Failure::Terminal(e.into()))?;
+    text.push('\n');
+    print(&text)
+}
+
+/// Reads a number above 0; `inf` is one.
+fn above_zero(text: &str) -> Result<f64, String> {
+    match text.trim().parse::<f64>() {
+        Ok(value) if value > 0.0 => Ok(value),
+        _ => Err("give a number above 0, with a decimal point".into()),
+    }
+}
+
+/// Reads a finite number above 0.
+fn finite_above_zero(text: &str) -> Result<f64, String> {
+    above_zero(text).and_then(|v| if v.is_finite() { Ok(v) } else { Err("give a finite number above 0".into()) })
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_arguments_are_consistent() {
+        super::Arguments::command().debug_assert();
+    }
+}

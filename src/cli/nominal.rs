@@ -1,0 +1,100 @@
+//! The nominal surface of a command: whatever form its file has.
+
+use std::path::Path;
+
+use clap::ValueEnum;
+use regrind::formats::{NominalFile, read_nominal};
+use regrind::geometry::Aperture;
+use regrind::surface::{DefinedSurface, Nominal, NominalKind, Projection, SampledSurface};
+
+use super::failure::Failure;
+use super::words::count;
+
+/// `--projection` as written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub(super) enum ProjectionName {
+    /// The first of the others that is one-to-one
+    #[default]
+    Auto,
+    /// The xy plane
+    Xy,
+    /// The plane that fits the points best
+    BestFit,
+    /// Latitude and longitude, for more than a hemisphere
+    Spherical,
+}
+
+impl From<ProjectionName> for Projection {
+    fn from(name: ProjectionName) -> Self {
+        match name {
+            ProjectionName::Auto => Self::Auto,
+            ProjectionName::Xy => Self::Xy,
+            ProjectionName::BestFit => Self::BestFit,
+            ProjectionName::Spherical => Self::Spherical,
+        }
+    }
+}
+
+/// Reads a nominal file.
+///
+/// # Errors
+/// A file that cannot be read, and a projection for what is no cloud of points.
+pub(super) fn read(path: &Path, projection: ProjectionName) -> Result<NominalFile, Failure> {
+    let file = read_nominal(path)?;
+    let what = match file {
+        NominalFile::Points(_) => return Ok(file),
+        NominalFile::Mesh { .. } => "a mesh",
+        NominalFile::Definition(_) => "a definition",
+    };
+    if projection != ProjectionName::Auto {
+        return Err(Failure::Projection { path: path.to_owned(), what });
+    }
+    Ok(file)
+}
+
+/// Makes the nominal surface from a nominal file.
+///
+/// # Errors
+/// What makes no surface, by file name.
+pub(super) fn surface(path: &Path, file: NominalFile, projection: ProjectionName) -> Result<Nominal, Failure> {
+    let of_surface = |source| Failure::Nominal { path: path.to_owned(), source };
+    match file {
+        NominalFile::Points(points) => Nominal::from_points(points, projection.into()),
+        NominalFile::Mesh { points, triangles } => Nominal::from_mesh(points, triangles),
+        NominalFile::Definition(text) => {
+            let (grid, outline) = sampled(path, &text)?;
+            Nominal::from_grid_with_normals(grid.columns, grid.rows, grid.points, grid.normals)
+                .map(|nominal| nominal.with_outline(outline))
+        }
+    }
+    .map_err(of_surface)
+}
+
+/// Samples a defined surface at its spacing.
+///
+/// # Errors
+/// Whatever is wrong with the definition, by file name.
+pub(super) fn sampled(path: &Path, text: &str) -> Result<(SampledSurface, Aperture), Failure> {
+    let sample = || {
+        let defined = DefinedSurface::from_toml(text)?;
+        Ok((defined.sample(defined.spacing_mm()?)?, defined.aperture().clone()))
+    };
+    sample().map_err(|source| Failure::Definition { path: path.to_owned(), source })
+}
+
+/// Tells in words what a nominal surface was made from.
+pub(super) fn kind_in_words(kind: NominalKind) -> String {
+    match kind {
+        NominalKind::Grid { columns, rows } => format!("grid of {} x {}", count(columns), count(rows)),
+        NominalKind::Scattered { projection } => {
+            let plane = match projection {
+                Projection::Auto | Projection::Xy => "xy",
+                Projection::BestFit => "best-fit",
+                Projection::Spherical => "spherical",
+            };
+            format!("scattered, {plane} projection")
+        }
+        NominalKind::Mesh => "mesh".into(),
+        NominalKind::Patches { count } => format!("{count} patches"),
+    }
+}

@@ -1,0 +1,436 @@
+//! `regrind register`: where is the part, and what is left between it and its nominal surface?
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use rayon::prelude::*;
+use regrind::formats::{
+    DeviationRow, FormatError, ResultFolder, read_measured, write_column, write_deviations, write_json_atomic,
+};
+use regrind::geometry::{Point, Pose};
+use regrind::registration::{
+    Deviation, Iteration, Loss, Method, Options, PointStatus, ProbeSide, Registration, Start, WeakDirection, register,
+};
+use regrind::surface::{Distance, Nominal, NominalKind, Side};
+use serde::Serialize;
+
+use super::failure::Failure;
+use super::initial::read_pose;
+use super::nominal::{self, ProjectionName, kind_in_words};
+use super::words::{count, counted, three_digits};
+use super::{Outcome, above_zero, finite_above_zero};
+
+/// Register measured probe centres to the offset of a nominal surface
+#[derive(Args, Debug)]
+#[command(after_long_help = LONG_HELP, after_help = "Example:\n  regrind register --nominal lens.csv --measured cmm.csv \
+--probe-radius 1.5 --out registered\n\n--help tells more than -h.")]
+pub(super) struct Arguments {
+    /// Nominal surface: points as text or PLY, a mesh as STL or PLY, or a TOML definition, in mm
+    #[arg(long, value_name = "FILE")]
+    nominal: PathBuf,
+    /// Measured points as text or PLY, in mm
+    #[arg(long, value_name = "FILE")]
+    measured: PathBuf,
+    /// Radius of the probe in mm; not needed with --method contact
+    #[arg(long, value_name = "MM", allow_negative_numbers = true, value_parser = finite_above_zero)]
+    probe_radius: Option<f64>,
+    /// Folder for the results; created if absent
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// How the surface runs between the nominal points
+    #[arg(long, value_enum, default_value_t)]
+    distance: DistanceName,
+    /// What the measured points are taken for
+    #[arg(long, value_enum, default_value_t)]
+    method: MethodName,
+    /// What scattered nominal points are projected onto
+    #[arg(long, value_enum, default_value_t)]
+    projection: ProjectionName,
+    /// Coordinates of the pose that stay as they are in --initial, or at zero, separated by commas; no search is made
+    #[arg(long, value_enum, value_delimiter = ',', value_name = "x,y,z,rx,ry,rz")]
+    lock: Vec<Coordinate>,
+    /// How the distance of a point counts
+    #[arg(long, value_enum, default_value_t)]
+    loss: LossName,
+    /// Start at this pose cmm_from_model instead of searching for one
+    #[arg(long, value_name = "FILE")]
+    initial: Option<PathBuf>,
+    /// Side of the nominal surface on which the probe is
+    #[arg(long, value_enum, default_value_t)]
+    side: SideName,
+    /// Refuse a fit with a larger rms deviation
+    #[arg(long, value_name = "MM", allow_negative_numbers = true, value_parser = finite_above_zero)]
+    max_rms: Option<f64>,
+    /// Leave out points farther off than this many robust standard deviations; `inf` keeps all
+    #[arg(long, value_name = "N", default_value_t = 6.0, allow_negative_numbers = true, value_parser = above_zero)]
+    outlier_sigmas: f64,
+    /// Print registration.json instead of a summary
+    #[arg(long)]
+    json: bool,
+}
+
+const LONG_HELP: &str = "\
+Example:
+  regrind register --nominal lens.csv --measured cmm.csv --probe-radius 1.5 --out registered
+
+Writes into the folder:
+  registration.json           the pose cmm_from_model (4 rows of 4, mm), and how well it is known
+  deviations.csv              a row per measured point in the order given: contact point and normal in the
+                              model frame, deviation (positive where material stands proud), used (1 or 0)
+  deviation_uncertainty.csv   standard uncertainty of each deviation in mm, in the same order
+
+`covariance` is 6 x 6 in the order [translation; rotation] of the twist, in mm and rad: of the small motion in
+the model frame that takes the true pose to the one found. Directions that are locked or held have no variance.
+`objective_mm2` is the sum of squared deviations after each step that was taken; `trace` has every step, and how
+many points took part in it. `outliers` and `off_part` count the measured points from 0.
+
+Exit codes: 0 registered; 2 bad arguments or data; 3 fault.";
+
+#[derive(Clone, Copy, Debug, Default, Serialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum DistanceName {
+    /// As the cubic that points and normals define
+    #[default]
+    Curved,
+    /// As flat triangles
+    Triangle,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum MethodName {
+    /// Probe centres, registered to the offset surface
+    #[default]
+    Offset,
+    /// Contact points, registered to the nominal surface
+    Contact,
+    /// Probe centres, the radius subtracted from the distance; wrong by micrometres, for comparison
+    SubtractRadius,
+}
+
+#[derive(Clone, Copy, Debug, Default, Serialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum LossName {
+    /// As its square
+    #[default]
+    None,
+    /// Linearly beyond 1.345 robust standard deviations
+    Huber,
+    /// Not at all beyond 4.685 robust standard deviations
+    Tukey,
+}
+
+#[derive(Clone, Copy, Debug, Default, Serialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum SideName {
+    /// The one that fits
+    #[default]
+    Auto,
+    /// Where the normals point: +z, or outside a mesh
+    Normal,
+    /// The other one
+    Opposite,
+}
+
+#[derive(Clone, Copy, Debug, Serialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum Coordinate {
+    X,
+    Y,
+    Z,
+    Rx,
+    Ry,
+    Rz,
+}
+
+/// `registration.json`.
+#[derive(Serialize)]
+struct Document<'a> {
+    program: Program,
+    nominal: NominalInput<'a>,
+    measured: MeasuredInput<'a>,
+    method: MethodName,
+    distance: DistanceName,
+    loss: LossName,
+    probe_radius_mm: Option<f64>,
+    locked: &'a [Coordinate],
+    cmm_from_model: [[f64; 4]; 4],
+    standard_uncertainty: StandardUncertainty,
+    covariance: [[f64; 6]; 6],
+    condition: f64,
+    weak_directions: &'a [WeakDirection],
+    alternatives: Vec<Alternative>,
+    converged: bool,
+    iterations: usize,
+    objective_mm2: Vec<f64>,
+    points: usize,
+    used: usize,
+    rms_mm: f64,
+    pv_mm: f64,
+    residual_sigma_mm: f64,
+    coverage: f64,
+    side: SideName,
+    outliers: Vec<usize>,
+    off_part: Vec<usize>,
+    trace: &'a [Iteration],
+}
+
+#[derive(Serialize)]
+struct Program {
+    name: &'static str,
+    version: &'static str,
+}
+
+#[derive(Serialize)]
+struct NominalInput<'a> {
+    file: &'a Path,
+    points: usize,
+    kind: String,
+}
+
+#[derive(Serialize)]
+struct MeasuredInput<'a> {
+    file: &'a Path,
+}
+
+#[derive(Serialize)]
+struct Alternative {
+    cmm_from_model: [[f64; 4]; 4],
+    rms_mm: f64,
+}
+
+#[derive(Serialize)]
+struct StandardUncertainty {
+    x_mm: f64,
+    y_mm: f64,
+    z_mm: f64,
+    rx_rad: f64,
+    ry_rad: f64,
+    rz_rad: f64,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let options = options(arguments)?;
+    let folder = ResultFolder::prepare(&arguments.out)?;
+    let (nominal, measured) = read_inputs(arguments)?;
+    let registration = register(&nominal, &measured, &options)
+        .map_err(|e| Failure::of_registration(e, &arguments.nominal, &arguments.measured))?;
+    let document = Document::new(arguments, &nominal, &registration);
+    document.check()?;
+    save(&folder, &document, &registration.deviations).map_err(Failure::NotSaved)?;
+    if arguments.json {
+        super::print_json(&document)?;
+    } else {
+        super::print(&summary(&document, nominal.kind(), folder.path()))?;
+    }
+    folder.keep();
+    Ok(Outcome::Accepted)
+}
+
+fn options(arguments: &Arguments) -> Result<Options, Failure> {
+    let radius_mm = match (arguments.probe_radius, arguments.method) {
+        (Some(radius_mm), _) => radius_mm,
+        (None, MethodName::Contact) => 0.0,
+        (None, _) => return Err(Failure::NoProbeRadius),
+    };
+    let mut options = Options::new(radius_mm);
+    options.method = match arguments.method {
+        MethodName::Offset => Method::Offset,
+        MethodName::Contact => Method::Contact,
+        MethodName::SubtractRadius => Method::SubtractRadius,
+    };
+    options.distance = match arguments.distance {
+        DistanceName::Curved => Distance::Curved,
+        DistanceName::Triangle => Distance::Triangle,
+    };
+    options.loss = match arguments.loss {
+        LossName::None => Loss::None,
+        LossName::Huber => Loss::Huber,
+        LossName::Tukey => Loss::Tukey,
+    };
+    options.side = match arguments.side {
+        SideName::Auto => ProbeSide::Auto,
+        SideName::Normal => ProbeSide::Known(Side::Normal),
+        SideName::Opposite => ProbeSide::Known(Side::Opposite),
+    };
+    for &coordinate in &arguments.lock {
+        options.locked[coordinate as usize] = true;
+    }
+    options.start = match &arguments.initial {
+        Some(path) => Start::Pose(read_pose(path)?),
+        None if arguments.lock.is_empty() => Start::Search,
+        // A search would choose the locked coordinates at random.
+        None => Start::Pose(Pose::identity()),
+    };
+    options.outlier_sigmas = arguments.outlier_sigmas;
+    options.rms_limit_mm = arguments.max_rms;
+    Ok(options)
+}
+
+/// Reads both files at once; the nominal surface is made while the measured points are still read.
+fn read_inputs(arguments: &Arguments) -> Result<(Nominal, Vec<Point>), Failure> {
+    let (path, projection) = (&arguments.nominal, arguments.projection);
+    std::thread::scope(|scope| {
+        let nominal = scope
+            .spawn(move || nominal::read(path, projection).and_then(|file| nominal::surface(path, file, projection)));
+        let measured = read_measured(&arguments.measured);
+        let nominal = nominal.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
+        Ok((nominal, measured?))
+    })
+}
+
+/// Writes the three files; the JSON comes last, so that the others are whole where it is.
+fn save(folder: &ResultFolder, document: &Document, deviations: &[Deviation]) -> Result<(), FormatError> {
+    let at = |name: &str| folder.path().join(name);
+    let (rows, column) = rayon::join(
+        || {
+            let rows: Vec<DeviationRow> = deviations.par_iter().map(row).collect();
+            write_deviations(at("deviations.csv"), &rows)
+        },
+        || {
+            let column: Vec<f64> = deviations.iter().map(|d| d.uncertainty_mm).collect();
+            write_column(at("deviation_uncertainty.csv"), "uncertainty_mm", &column)
+        },
+    );
+    rows.and(column)?;
+    write_json_atomic(at("registration.json"), document)
+}
+
+fn row(deviation: &Deviation) -> DeviationRow {
+    DeviationRow {
+        point_mm: deviation.point.into(),
+        normal: deviation.normal.into(),
+        deviation_mm: deviation.deviation_mm,
+        used: deviation.status == PointStatus::Used,
+    }
+}
+
+impl<'a> Document<'a> {
+    fn new(arguments: &'a Arguments, nominal: &Nominal, registration: &'a Registration) -> Self {
+        let verdict = &registration.verdict;
+        let covariance: [[f64; 6]; 6] = std::array::from_fn(|i| std::array::from_fn(|j| verdict.covariance[(i, j)]));
+        let sigma: [f64; 6] = std::array::from_fn(|k| covariance[k][k].max(0.0).sqrt());
+        let [x_mm, y_mm, z_mm, rx_rad, ry_rad, rz_rad] = sigma;
+        let with = |status| {
+            let deviations = registration.deviations.iter().enumerate();
+            deviations.filter(|(_, d)| d.status == status).map(|(k, _)| k).collect()
+        };
+        let alternative =
+            |(pose, rms_mm): &(Pose, f64)| Alternative { cmm_from_model: pose.to_rows(), rms_mm: *rms_mm };
+        Self {
+            program: Program { name: env!("CARGO_PKG_NAME"), version: env!("CARGO_PKG_VERSION") },
+            nominal: NominalInput {
+                file: &arguments.nominal,
+                points: nominal.len(),
+                kind: kind_in_words(nominal.kind()),
+            },
+            measured: MeasuredInput { file: &arguments.measured },
+            method: arguments.method,
+            distance: arguments.distance,
+            loss: arguments.loss,
+            probe_radius_mm: arguments.probe_radius,
+            locked: &arguments.lock,
+            cmm_from_model: registration.cmm_from_model.to_rows(),
+            standard_uncertainty: StandardUncertainty { x_mm, y_mm, z_mm, rx_rad, ry_rad, rz_rad },
+            covariance,
+            condition: verdict.condition,
+            weak_directions: &verdict.weak_directions,
+            alternatives: verdict.alternatives.iter().map(alternative).collect(),
+            converged: verdict.converged,
+            iterations: verdict.iterations,
+            objective_mm2: registration.trace.iter().filter(|i| i.taken).map(|i| i.objective_mm2).collect(),
+            points: registration.deviations.len(),
+            used: verdict.used,
+            rms_mm: verdict.rms_mm,
+            pv_mm: verdict.pv_mm,
+            residual_sigma_mm: verdict.residual_sigma_mm,
+            coverage: verdict.coverage,
+            side: if registration.side == Side::Normal { SideName::Normal } else { SideName::Opposite },
+            outliers: with(PointStatus::Outlier),
+            off_part: with(PointStatus::OffPart),
+            trace: &registration.trace,
+        }
+    }
+
+    /// JSON has no NaN, and would say `null` where a reader expects a number.
+    fn check(&self) -> Result<(), Failure> {
+        let finite = |numbers: &[f64]| numbers.iter().all(|v| v.is_finite());
+        let step = |i: &Iteration| finite(&[i.objective_mm2, i.step, i.ball_radius]);
+        let checks = [
+            ("the pose", finite(self.cmm_from_model.as_flattened())),
+            ("the covariance", finite(self.covariance.as_flattened())),
+            ("the condition", self.condition.is_finite()),
+            ("a figure of the deviations", finite(&[self.rms_mm, self.pv_mm, self.residual_sigma_mm, self.coverage])),
+            ("the trace", self.trace.iter().all(step)),
+            ("a weak direction", self.weak_directions.iter().all(|w| w.sigma_mm.is_none_or(f64::is_finite))),
+            (
+                "an alternative pose",
+                self.alternatives.iter().all(|a| finite(a.cmm_from_model.as_flattened()) && a.rms_mm.is_finite()),
+            ),
+        ];
+        match checks.into_iter().find(|(_, finite)| !finite) {
+            Some((what, _)) => Err(Failure::NotFinite { what }),
+            None => Ok(()),
+        }
+    }
+}
+
+/// What an operator wants to know, a line each.
+fn summary(document: &Document, kind: NominalKind, folder: &Path) -> String {
+    let um = |mm: f64| three_digits(1e3 * mm);
+    let mut text = String::new();
+    let mut line = |name: &str, words: String| {
+        writeln!(text, "{name:<12}{words}").expect("text grows");
+    };
+    line(
+        "nominal",
+        format!(
+            "{}: {}, {}",
+            document.nominal.file.display(),
+            counted(document.nominal.points, "point"),
+            kind_in_words(kind)
+        ),
+    );
+    line(
+        "measured",
+        format!(
+            "{}: {}, {} used, {}, {} off the part",
+            document.measured.file.display(),
+            counted(document.points, "point"),
+            count(document.used),
+            counted(document.outliers.len(), "outlier"),
+            count(document.off_part.len()),
+        ),
+    );
+    line("deviation", format!("rms {} um, PV {} um", um(document.rms_mm), um(document.pv_mm)));
+    line("pose", pose_in_words(document));
+    line("iterations", format!("{}, converged", document.iterations));
+    line("coverage", format!("{:.0} % of the nominal surface", 100.0 * document.coverage));
+    for weak in document.weak_directions {
+        line("weak", weak.words.clone());
+    }
+    if !document.alternatives.is_empty() {
+        let others = counted(document.alternatives.len(), "other pose");
+        line("warning", format!("{others} fit about as well; compare before you trust this one:"));
+    }
+    for other in &document.alternatives {
+        line("", format!("{} apart, rms {} um over some points", apart(document, other), um(other.rms_mm)));
+    }
+    line("files", format!("registration.json, deviations.csv, deviation_uncertainty.csv in {}", folder.display()));
+    text
+}
+
+fn pose_in_words(document: &Document) -> String {
+    let pose = Pose::from_rows(document.cmm_from_model).expect("a pose that was found is one");
+    let [x, y, z] = pose.translation_mm.into();
+    format!("shift {x:.4}, {y:.4}, {z:.4} mm, turned by {:.4} degrees", pose.angle_rad().to_degrees())
+}
+
+/// How far an alternative is from the pose found.
+fn apart(document: &Document, other: &Alternative) -> String {
+    let read = |rows| Pose::from_rows(rows).expect("a pose that was found is one");
+    let between = read(document.cmm_from_model).inverse() * read(other.cmm_from_model);
+    let (shift, turn) = (between.translation_mm.norm(), between.angle_rad().to_degrees());
+    format!("{} mm and {} degrees", three_digits(shift), three_digits(turn))
+}
