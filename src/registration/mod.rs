@@ -323,10 +323,12 @@ impl<'a> Part<'a> {
         let rms_mm = found.verdict.rms_mm;
         let limit_mm = self.rms_limit_mm(options);
         let doubtful = rms_mm > limit_mm || rms_mm > (0.02 * self.nominal.relief_mm()).max(10.0 * LEAST_SIGMA_MM);
-        if doubtful && let Some(mirrored_rms_mm) = start::mirrored_rms(self, measured, options, found) {
-            if mirrored_rms_mm < 0.3 * rms_mm && mirrored_rms_mm <= limit_mm {
-                return Err(RegistrationError::Mirrored { rms_mm, mirrored_rms_mm });
-            }
+        if doubtful
+            && let Some(mirrored_rms_mm) = start::mirrored_rms(self, measured, options, found)
+            && mirrored_rms_mm < 0.3 * rms_mm
+            && mirrored_rms_mm <= limit_mm
+        {
+            return Err(RegistrationError::Mirrored { rms_mm, mirrored_rms_mm });
         }
         if rms_mm > limit_mm {
             return Err(RegistrationError::DoesNotFit { rms_mm, limit_mm });

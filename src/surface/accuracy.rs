@@ -267,11 +267,12 @@ fn measure(coarse: &Nominal, points: &[Point], left_out: &[bool]) -> Errors {
             return None;
         }
         let errors_mm = [flat.foot(&at, foot.place).distance_mm, foot.distance_mm];
-        let reach = BORDER * foot.spacing_mm;
+        let spacing_mm = curved.spacing_mm(foot.place);
+        let reach = BORDER * spacing_mm;
         let [u, v] = super::normals::tangents(&foot.normal);
         let around = (0..8).map(|k| std::f64::consts::FRAC_PI_4 * f64::from(k)).map(|a| u * a.cos() + v * a.sin());
         let inside = around.into_iter().all(|d| curved.foot(&(at + d * reach), foot.place).beyond_mm == 0.0);
-        Some((inside, foot.spacing_mm, Measured { at, errors_mm }))
+        Some((inside, spacing_mm, Measured { at, errors_mm }))
     };
     let chosen = (0..points.len()).into_par_iter().step_by(stride);
     let measured: Vec<_> = chosen.filter(|&k| left_out[k] && points[k].x.is_finite()).filter_map(one).collect();

@@ -297,9 +297,7 @@ mod tests {
     #[test]
     fn a_search_begins_at_a_whole_cell() {
         let (mut points, _) = lattice(9, 8, |_, _| 0.0);
-        for node in 0..4 * 9 {
-            points[node] = Point::new(f64::NAN, f64::NAN, f64::NAN);
-        }
+        points[..4 * 9].fill(Point::new(f64::NAN, f64::NAN, f64::NAN));
         let lattice = GridLattice::new(9, 8, &points, true);
         let facet = lattice.start(&Point::new(-2.0, 1.0, 0.0));
         assert!(lattice.corners(facet).iter().all(|&c| lattice.is_present(c as usize)));

@@ -129,8 +129,7 @@ fn cholesky<const N: usize>(mut m: SMatrix<f64, N, N>, least_pivot: f64) -> Opti
                 sum -= m[(i, k)] * m[(j, k)];
             }
             if i == j {
-                // Written so that NaN is refused too.
-                if !(sum > least_pivot) {
+                if sum.is_nan() || sum <= least_pivot {
                     return None;
                 }
                 m[(j, j)] = sum.sqrt();

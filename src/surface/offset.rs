@@ -165,6 +165,13 @@ impl<'a> OffsetSurface<'a> {
         self.side
     }
 
+    /// Returns the step of the nominal sampling at a place, in millimetres: the side of a square of two of its facets.
+    pub(crate) fn spacing_mm(&self, place: Place) -> f64 {
+        let patch = &self.nominal.patches()[place.patch as usize];
+        let [a, b, c] = patch.corners(place.facet).map(|v| patch.points[v as usize]);
+        (b - a).cross(&(c - a)).norm().sqrt()
+    }
+
     /// Finds the foot of a point given in the model frame, starting from where the last search for it ended.
     ///
     /// Beyond the edge the surface is continued: by its own facet for half a step of the sampling, then by the tangent plane

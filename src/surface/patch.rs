@@ -107,6 +107,14 @@ impl Patch {
         }
     }
 
+    /// Returns the corners of a facet that exists.
+    pub(crate) fn corners(&self, facet: u32) -> [u32; 3] {
+        match &self.lattice {
+            Lattice::Grid(grid) => grid.corners(facet),
+            Lattice::Mesh(mesh) => mesh.corners(facet),
+        }
+    }
+
     /// Returns the corners of a facet, or `None` where a grid has none.
     pub(crate) fn facet(&self, facet: u32) -> Option<[u32; 3]> {
         match &self.lattice {
