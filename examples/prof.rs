@@ -28,6 +28,29 @@ fn main() {
                 .collect()
         })
         .collect();
+    if let Some(mode) = std::env::args().nth(1) {
+        let k: usize = mode.parse().unwrap();
+        let reps: usize = std::env::args().nth(2).unwrap().parse().unwrap();
+        let n = Nominal::from_points(pts.clone(), Projection::Auto).unwrap();
+        let t = Instant::now();
+        for _ in 0..reps {
+            let mut o = Options::new(1.5);
+            if k < 2 {
+                o.start = Start::Pose(Pose::identity());
+            }
+            std::hint::black_box(register(&n, &sets[k % 2], &o).unwrap());
+        }
+        println!("{:?}", t.elapsed() / reps as u32);
+        let t = Instant::now();
+        for _ in 0..reps {
+            if k < 4 {
+                break;
+            }
+            std::hint::black_box(Nominal::from_points(pts.clone(), Projection::Auto).unwrap());
+        }
+        println!("nominal {:?}", t.elapsed() / reps as u32);
+        return;
+    }
     for _ in 0..3 {
         let p = pts.clone();
         let t = Instant::now();

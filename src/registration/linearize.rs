@@ -3,6 +3,7 @@
 use nalgebra::{Matrix6, Vector6};
 
 use crate::geometry::{Point, Twist, Vector};
+use crate::surface::lanes::{LANES, Lane, Lane3, cross, minus};
 
 /// Where the twist of a step is taken: about the middle of the cloud, translations in units of its size.
 ///
@@ -39,6 +40,63 @@ impl Lever {
         let arm = (p - self.centre).cross(normal);
         let s = self.size_mm;
         [s * normal.x, s * normal.y, s * normal.z, arm.x, arm.y, arm.z]
+    }
+}
+
+impl Lever {
+    /// The rows of four points side by side.
+    #[inline(always)]
+    pub(crate) fn four_rows(&self, p: &Lane3, normal: &Lane3) -> [Lane; 6] {
+        let centre = [Lane::splat(self.centre.x), Lane::splat(self.centre.y), Lane::splat(self.centre.z)];
+        let arm = cross(&minus(p, &centre), normal);
+        let s = Lane::splat(self.size_mm);
+        [s * normal[0], s * normal[1], s * normal[2], arm[0], arm[1], arm[2]]
+    }
+}
+
+/// The sums of points that come in fours, a sum for each of the four.
+#[derive(Clone, Debug)]
+pub(crate) struct FourSums {
+    gram: [Lane; 21],
+    right: [Lane; 6],
+    objective_mm2: Lane,
+    points: usize,
+}
+
+impl FourSums {
+    pub(crate) fn zero() -> Self {
+        let zero = Lane::splat(0.0);
+        Self { gram: [zero; 21], right: [zero; 6], objective_mm2: zero, points: 0 }
+    }
+
+    /// Adds four points, of which those with a weight and a loss of 0 change nothing.
+    #[inline(always)]
+    pub(crate) fn add(&mut self, row: &[Lane; 6], distance: Lane, weight: Lane, loss_mm2: Lane, used: usize) {
+        let mut k = 0;
+        for i in 0..6 {
+            let weighted = weight * row[i];
+            for other in &row[..=i] {
+                self.gram[k] = self.gram[k] + weighted * *other;
+                k += 1;
+            }
+            self.right[i] = self.right[i] + weighted * distance;
+        }
+        self.objective_mm2 = self.objective_mm2 + loss_mm2;
+        self.points += used;
+    }
+
+    /// Adds the four sums, in their order, to another.
+    pub(crate) fn add_to(&self, sums: &mut Sums) {
+        for l in 0..LANES {
+            for (a, b) in sums.gram.iter_mut().zip(&self.gram) {
+                *a += b.0[l];
+            }
+            for (a, b) in sums.right.iter_mut().zip(&self.right) {
+                *a += b.0[l];
+            }
+            sums.objective_mm2 += self.objective_mm2.0[l];
+        }
+        sums.points += self.points;
     }
 }
 

@@ -27,7 +27,7 @@ use thiserror::Error;
 use crate::geometry::{Point, Pose, Vector};
 use crate::surface::{Distance, Lookup, Nominal, OffsetSurface, Side, SurfaceError};
 
-use correspond::{Reading, Track, feet, middle_and_size};
+use correspond::{Reading, Track, at_feet, middle_and_size};
 pub use iterate::Iteration;
 use iterate::{Descent, Problem};
 pub use robust::Loss;
@@ -440,7 +440,9 @@ fn rescale(problem: &mut Problem, options: &Options, tracks: &[Track], known: bo
 const LEAST_SIGMA_MM: f64 = 1e-5;
 
 fn sigma_of(tracks: &[Track]) -> (f64, f64) {
-    let on_part = tracks.iter().filter(|t| t.beyond_steps <= 0.5).map(|t| t.distance_mm);
+    // A sample tells the sigma of many points to a percent.
+    let stride = tracks.len().div_ceil(1 << 16);
+    let on_part = tracks.iter().step_by(stride).filter(|t| t.beyond_steps <= 0.5).map(|t| t.distance_mm);
     let (median, sigma) = robust_sigma(on_part);
     (median, sigma.max(LEAST_SIGMA_MM))
 }
@@ -511,8 +513,11 @@ fn conclude(
     if let Some(fold) = problem.surface.fold(tracks.iter().map(|t| t.place)) {
         return Err(fold.into());
     }
-    let finals = feet(&problem.surface, problem.measured, &tracks, &descent.cmm_from_model, &descent.lever);
-    let verdict = verdict::judge(problem, &descent, &tracks, &finals, seed, trace.len());
-    let deviations = verdict::deviations(part, &tracks, &finals, &descent.lever, &verdict, options);
+    let mut verdict = verdict::judge(problem, &descent, &tracks, seed, trace.len());
+    let reporter = verdict::Reporter::new(part, &descent.lever, &verdict, options);
+    let pose = &descent.cmm_from_model;
+    let report = |track: &Track, at_foot| reporter.deviation(track, at_foot);
+    let deviations = at_feet(&problem.surface, problem.measured, &tracks, pose, &descent.lever, report);
+    verdict.coverage = verdict::coverage(part.nominal, &deviations);
     Ok(Registration { cmm_from_model: descent.cmm_from_model, deviations, trace, side: seed.side, verdict })
 }

@@ -5,6 +5,7 @@ use std::collections::HashSet;
 use nalgebra::{DMatrix, Matrix6, Vector6};
 
 use crate::geometry::{Point, Pose, Vector};
+use crate::surface::Nominal;
 
 use super::correspond::{Final, Track};
 use super::iterate::{Descent, Problem, free_directions};
@@ -59,14 +60,7 @@ pub struct WeakDirection {
 }
 
 /// Judges the end of an iteration.
-pub(crate) fn judge(
-    problem: &Problem,
-    descent: &Descent,
-    tracks: &[Track],
-    finals: &[Final],
-    seed: &Seed,
-    iterations: usize,
-) -> Verdict {
+pub(crate) fn judge(problem: &Problem, descent: &Descent, tracks: &[Track], seed: &Seed, iterations: usize) -> Verdict {
     let used: Vec<f64> = tracks.iter().filter(|t| t.used).map(|t| t.distance_mm).collect();
     let n = used.len();
     let objective_mm2 = used.iter().map(|d| d * d).sum::<f64>();
@@ -91,7 +85,7 @@ pub(crate) fn judge(
         covariance: to_twist * scaled * to_twist.transpose(),
         condition: (spectrum.squares[0] / spectrum.squares[rank - 1]).sqrt(),
         weak_directions,
-        coverage: coverage(problem, tracks, finals),
+        coverage: 0.0,
         alternatives: seed.alternatives.iter().map(|c| (c.cmm_from_model, c.rms_mm)).collect(),
         warnings: warnings(problem, seed, (objective_mm2 / n as f64).sqrt()),
         iterations,
@@ -275,56 +269,52 @@ fn length(mm: f64) -> String {
 
 /// Returns the share of the surface's cells that hold a point which was used.
 ///
-/// A cell is a cube with an edge of a thirtieth of the surface's size, or three times the mean distance of the points where
-/// these are sparser: small enough to see a missing corner, large enough that a full pattern leaves no cell empty.
-fn coverage(problem: &Problem, tracks: &[Track], finals: &[Final]) -> f64 {
+/// A cell is a cube with an edge of a fifteenth of the surface's rms size, or three times the mean distance of the points
+/// where these are sparser: small enough to see a missing corner, large enough that a full pattern leaves no cell empty.
+pub(crate) fn coverage(nominal: &Nominal, deviations: &[Deviation]) -> f64 {
     const MOST: usize = 50_000;
-    let nominal = problem.surface.nominal();
     let size = nominal.size_mm();
-    let used = tracks.iter().filter(|t| t.used).count().min(MOST) as f64;
-    let edge = (size / 15.0).max(3.0 * 3.5 * size / used.sqrt());
+    let stride = deviations.len().div_ceil(MOST);
+    let used: Vec<&Deviation> = deviations.iter().step_by(stride).filter(|d| d.status == PointStatus::Used).collect();
+    let edge = (size / 15.0).max(3.0 * 3.5 * size / (used.len() as f64).sqrt());
     let cell = |p: &Point| [p.x, p.y, p.z].map(|c| (c / edge).floor() as i32);
-    let radius_mm = problem.surface.radius_mm() + problem.reading.subtract_mm;
-    let stride = tracks.len().div_ceil(MOST);
-    let touched: HashSet<[i32; 3]> = tracks
-        .iter()
-        .zip(finals)
-        .step_by(stride)
-        .filter(|(t, _)| t.used)
-        .map(|(t, f)| cell(&(f.centre - f.foot.normal * (t.distance_mm + radius_mm))))
-        .collect();
+    let touched: HashSet<[i32; 3]> = used.iter().map(|d| cell(&d.point)).collect();
     let sample = nominal.sample(20_000);
     sample.iter().filter(|p| touched.contains(&cell(p))).count() as f64 / sample.len() as f64
 }
 
-/// Returns the deviations of all points, in the order given.
-pub(crate) fn deviations(
-    part: &Part,
-    tracks: &[Track],
-    finals: &[Final],
-    lever: &Lever,
-    verdict: &Verdict,
-    options: &Options,
-) -> Vec<Deviation> {
-    let to_scaled = lever.to_twist().try_inverse().unwrap_or_default();
-    let scaled = to_scaled * verdict.covariance * to_scaled.transpose();
-    let variance = verdict.residual_sigma_mm.powi(2);
-    let back_mm = if options.method == Method::Contact { 0.0 } else { options.probe_radius_mm };
-    let outline = part.nominal.outline();
-    tracks
-        .iter()
-        .zip(finals)
-        .map(|(track, f)| {
-            let point = f.centre - f.foot.normal * back_mm;
-            let beyond_outline = outline.is_some_and(|o| !o.contains(point.x, point.y));
-            let status = if beyond_outline { PointStatus::OffPart } else { track.status() };
-            Deviation {
-                point,
-                normal: f.foot.normal,
-                deviation_mm: track.distance_mm,
-                uncertainty_mm: (variance + f.row.dot(&(scaled * f.row)).max(0.0)).sqrt(),
-                status,
-            }
-        })
-        .collect()
+/// What turns a foot into a deviation that is reported.
+pub(crate) struct Reporter<'a> {
+    nominal: &'a Nominal,
+    /// Covariance of the pose in scaled coordinates.
+    scaled: Matrix6<f64>,
+    variance_mm2: f64,
+    subtract_mm: f64,
+    back_mm: f64,
+}
+
+impl<'a> Reporter<'a> {
+    pub(crate) fn new(part: &Part<'a>, lever: &Lever, verdict: &Verdict, options: &Options) -> Self {
+        let to_scaled = lever.to_twist().try_inverse().unwrap_or_default();
+        Self {
+            nominal: part.nominal,
+            scaled: to_scaled * verdict.covariance * to_scaled.transpose(),
+            variance_mm2: verdict.residual_sigma_mm.powi(2),
+            subtract_mm: part.subtract_mm,
+            back_mm: if options.method == Method::Contact { 0.0 } else { options.probe_radius_mm },
+        }
+    }
+
+    /// Returns the deviation of one point.
+    pub(crate) fn deviation(&self, track: &Track, f: Final) -> Deviation {
+        let point = f.centre - f.foot.normal * self.back_mm;
+        let beyond_outline = self.nominal.outline().is_some_and(|o| !o.contains(point.x, point.y));
+        Deviation {
+            point,
+            normal: f.foot.normal,
+            deviation_mm: f.foot.distance_mm - self.subtract_mm,
+            uncertainty_mm: (self.variance_mm2 + f.row.dot(&(self.scaled * f.row)).max(0.0)).sqrt(),
+            status: if beyond_outline { PointStatus::OffPart } else { track.status() },
+        }
+    }
 }

@@ -51,8 +51,10 @@ impl GridLattice {
         self.rows as usize
     }
 
-    pub(crate) fn facet_count(&self) -> u32 {
-        2 * self.columns * (self.rows - 1)
+    /// Returns the lower facets of a row of cells with their corners, holes included.
+    pub(crate) fn row_of_facets(&self, row: usize) -> impl Iterator<Item = (u32, [u32; 3])> {
+        let first = row as u32 * self.columns;
+        (first..first + self.columns - 1).map(|node| (2 * node, [node, node + 1, node + self.columns + 1]))
     }
 
     /// Whether a facet lies between nodes that all exist.

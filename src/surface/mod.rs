@@ -17,6 +17,7 @@ mod delaunay;
 mod feature;
 mod fold;
 mod grid;
+pub(crate) mod lanes;
 mod mesh;
 mod normals;
 mod offset;

@@ -119,7 +119,7 @@ const EDGE_REACH: f64 = 0.5;
 const MOST_STEPS: usize = 4096;
 
 /// Weights that far below zero count as inside.
-const INSIDE: f64 = -1e-10;
+pub(super) const INSIDE: f64 = -1e-10;
 
 impl<'a> OffsetSurface<'a> {
     /// Offsets a nominal surface by a probe radius.
@@ -158,6 +158,14 @@ impl<'a> OffsetSurface<'a> {
     /// Returns the offset in millimetres.
     pub fn radius_mm(&self) -> f64 {
         self.radius_mm
+    }
+
+    pub(crate) fn distance(&self) -> Distance {
+        self.distance
+    }
+
+    pub(crate) fn lookup(&self) -> Lookup {
+        self.lookup
     }
 
     /// Returns the side of the nominal surface.
@@ -281,7 +289,7 @@ impl OffsetFacet {
             beyond_mm = (self.at(&clamped) - self.at(&weights)).norm();
             beyond_steps = beyond_mm / self.turned.norm().sqrt();
             if beyond_steps > EDGE_REACH {
-                let (distance_mm, normal) = self.from_tangent_plane(p, &clamped, distance);
+                let (distance_mm, normal) = self.over_tangent_plane(p, &clamped, distance);
                 return Foot { place, distance_mm, normal, beyond_mm, beyond_steps };
             }
         }
@@ -298,7 +306,7 @@ impl OffsetFacet {
 
     /// The distance from the tangent plane at a place of the edge, and its normal.
     #[cold]
-    fn from_tangent_plane(&self, p: &Point, at: &[f64; 3], distance: Distance) -> (f64, Vector) {
+    fn over_tangent_plane(&self, p: &Point, at: &[f64; 3], distance: Distance) -> (f64, Vector) {
         let (anchor, normal) = match distance {
             Distance::Triangle => (self.at(at), self.flat),
             Distance::Curved => (self.at(at) + self.flat * self.height(at), self.normal(at)),

@@ -59,7 +59,7 @@ impl Patch {
     }
 
     /// Returns the unit normal at a vertex; NaN at a hole of a grid.
-    #[inline]
+    #[inline(always)]
     pub(crate) fn normal(&self, vertex: u32) -> Vector {
         match &self.normals {
             Normals::Ready(normals) => normals[vertex as usize],
@@ -91,6 +91,14 @@ impl Patch {
         matches!(self.normals, Normals::WhenTouched(_))
     }
 
+    /// Returns the normals of a grid, which are all known; of a mesh none.
+    pub(crate) fn known_normals(&self) -> &[Vector] {
+        match &self.normals {
+            Normals::Ready(normals) => normals,
+            Normals::WhenTouched(_) => &[],
+        }
+    }
+
     #[cold]
     fn fitted_normal(&self, vertex: u32) -> Vector {
         match &self.lattice {
@@ -99,27 +107,11 @@ impl Patch {
         }
     }
 
-    /// Returns the number of facets, those that do not exist in a grid included.
-    pub(crate) fn facet_count(&self) -> u32 {
-        match &self.lattice {
-            Lattice::Grid(grid) => grid.facet_count(),
-            Lattice::Mesh(mesh) => mesh.facet_count(),
-        }
-    }
-
     /// Returns the corners of a facet that exists.
     pub(crate) fn corners(&self, facet: u32) -> [u32; 3] {
         match &self.lattice {
             Lattice::Grid(grid) => grid.corners(facet),
             Lattice::Mesh(mesh) => mesh.corners(facet),
-        }
-    }
-
-    /// Returns the corners of a facet, or `None` where a grid has none.
-    pub(crate) fn facet(&self, facet: u32) -> Option<[u32; 3]> {
-        match &self.lattice {
-            Lattice::Grid(grid) => grid.has_facet(facet).then(|| grid.corners(facet)),
-            Lattice::Mesh(mesh) => Some(mesh.corners(facet)),
         }
     }
 }
