@@ -100,8 +100,11 @@ impl<'a> Search<'a> {
     fn side_at(&self, pose: Pose) -> Result<Seed, RegistrationError> {
         // A given pose may be meant for either side.
         let at = |side: Side| {
-            let [as_given, across] =
-                [pose, self.across_to(pose, side)].map(|p| self.refine(p, side, &self.many, 4, 12));
+            let as_given = self.refine(pose, side, &self.some, 2, 8);
+            if as_given.rms_mm <= self.part.rms_limit_mm(self.options) {
+                return as_given;
+            }
+            let across = self.refine(self.across_to(pose, side), side, &self.some, 2, 8);
             if across.rms_mm < as_given.rms_mm { across } else { as_given }
         };
         let (normal, opposite) = rayon::join(|| at(Side::Normal), || at(Side::Opposite));
