@@ -85,7 +85,7 @@ impl Problem<'_> {
             }
             let free = free_directions(&self.locked, &lever);
             let spectrum = Spectrum::new(&(free * sums.gram() * free));
-            rank = spectrum.rank(self.least_share);
+            rank = spectrum.rank(self.least_share, sums.gram().trace());
             let m = spectrum.step(&(free * sums.right()), rank, ball_radius); // eq. (15)
             let step = m.norm();
             if step < STILL || sums.objective_mm2 == 0.0 {

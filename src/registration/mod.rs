@@ -265,6 +265,9 @@ impl<'a> Part<'a> {
             return Err(RegistrationError::Collinear { points: measured.len() });
         }
         check_repeats(measured)?;
+        if options.locked == [true; 6] {
+            return Err(RegistrationError::Undetermined);
+        }
         let (_, size_mm) = middle_and_size(measured);
         let nominal_mm = nominal.size_mm();
         check_sizes(size_mm, nominal_mm)?;
@@ -366,10 +369,12 @@ fn check_sizes(measured_mm: f64, nominal_mm: f64) -> Result<(), RegistrationErro
         r if r > 500.0 => {
             "are the nominal points in metres, or the measured ones in micrometres? give both in millimetres"
         }
-        r if r > 15.0 => "are the nominal points in inches? give both in millimetres",
-        r if r > 3.0 => "is this the nominal surface of this part?",
+        r if r > 15.0 => "are the nominal points in inches or centimetres? give both in millimetres",
+        r if r > 3.0 => "is this the nominal surface of this part, and are both in millimetres?",
         r if r < 0.002 => "are the measured points in metres? give both in millimetres",
-        r if r < 0.06 => "are the measured points in inches or centimetres, or on a small part of the surface only?",
+        r if r < 0.06 => {
+            "are the measured points in inches or centimetres, or on a small part of the surface only? give both in millimetres"
+        }
         _ => return Ok(()),
     };
     Err(RegistrationError::Size { ratio, measured_mm, nominal_mm, remedy })

@@ -25,9 +25,11 @@ impl Spectrum {
         }
     }
 
-    /// Returns how many directions the surface sees: singular values above a share of the largest.
-    pub(crate) fn rank(&self, least_share: f64) -> usize {
-        let limit = self.squares[0] * least_share * least_share;
+    /// Returns how many directions the surface sees: squared singular values above the square of a share of a whole.
+    ///
+    /// The whole is the sum of the squares before any direction was locked; of the rounding that a lock leaves nothing is seen.
+    pub(crate) fn rank(&self, least_share: f64, whole: f64) -> usize {
+        let limit = whole * least_share * least_share;
         (0..6).take_while(|&k| self.squares[k] > limit).count()
     }
 
@@ -112,7 +114,7 @@ mod tests {
         gram[(0, 1)] = 0.5;
         gram[(1, 0)] = 0.5;
         let spectrum = Spectrum::new(&gram);
-        assert_eq!(spectrum.rank(1e-6), 5);
+        assert_eq!(spectrum.rank(1e-6, gram.trace()), 5);
         let m = spectrum.step(&Vector6::repeat(1.0), 5, 10.0);
         assert!(m[5].abs() < 1e-12);
     }
@@ -121,6 +123,6 @@ mod tests {
     fn nothing_to_do_is_no_step() {
         let (gram, _) = problem();
         assert_eq!(Spectrum::new(&gram).step(&Vector6::zeros(), 6, 0.5).norm(), 0.0);
-        assert_eq!(Spectrum::new(&Matrix6::zeros()).rank(1e-6), 0);
+        assert_eq!(Spectrum::new(&Matrix6::zeros()).rank(1e-6, 0.0), 0);
     }
 }

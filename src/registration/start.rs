@@ -34,7 +34,17 @@ pub(crate) struct Candidate {
     pub(crate) cmm_from_model: Pose,
     /// Root mean square of the nearest nine tenths of the distances, in millimetres.
     pub(crate) rms_mm: f64,
+    /// Share of the points whose feet lie beyond the edge.
+    off_part: f64,
     side: Side,
+}
+
+impl Candidate {
+    /// The better fit first; of two that fit alike the one with more points on the part.
+    fn by_fit(&self, other: &Self) -> std::cmp::Ordering {
+        let badness = |c: &Self| c.rms_mm * (1.0 + 4.0 * c.off_part);
+        badness(self).total_cmp(&badness(other))
+    }
 }
 
 /// Points that a candidate is glanced at with, scored on, refined on, and compared on.
@@ -201,7 +211,7 @@ impl<'a> Search<'a> {
         }
         let mut refined: Vec<Candidate> =
             kept.into_par_iter().map(|pose| self.refine(pose, side, &self.some, 2, 6)).collect();
-        refined.sort_by(|a, b| a.rms_mm.total_cmp(&b.rms_mm));
+        refined.sort_by(Candidate::by_fit);
         refined
     }
 
@@ -210,7 +220,7 @@ impl<'a> Search<'a> {
         let best = &candidates[..candidates.len().min(COMPARED_AT_MOST)];
         let mut compared: Vec<Candidate> =
             best.par_iter().map(|c| self.refine(c.cmm_from_model, side, &self.many, 4, 10)).collect();
-        compared.sort_by(|a, b| a.rms_mm.total_cmp(&b.rms_mm));
+        compared.sort_by(Candidate::by_fit);
         let mut distinct: Vec<Candidate> = Vec::new();
         for c in compared {
             if distinct.iter().all(|d| self.apart(&d.cmm_from_model, &c.cmm_from_model) > 0.01) {
@@ -240,12 +250,19 @@ impl<'a> Search<'a> {
         (sum / points.len() as f64).sqrt()
     }
 
-    /// Root mean square of the nearest nine tenths of the points: what outliers in the rest do not spoil.
-    fn trimmed_rms(&self, surface: &OffsetSurface, cmm_from_model: &Pose, points: &[Point]) -> f64 {
-        let mut squares: Vec<f64> = self.squares(surface, cmm_from_model, points).collect();
+    /// Root mean square distance of the nearest nine tenths of the points, which outliers in the rest do not spoil, and the
+    /// share of the points off the part.
+    fn trimmed_rms(&self, surface: &OffsetSurface, cmm_from_model: &Pose, points: &[Point]) -> (f64, f64) {
+        let inverse = cmm_from_model.inverse();
+        let feet = points.iter().map(|p| surface.foot(&inverse.point(p), Place::UNKNOWN));
+        let (mut squares, mut off) = (Vec::with_capacity(points.len()), 0);
+        for foot in feet {
+            squares.push((foot.distance_mm - self.part.subtract_mm).powi(2) + foot.beyond_mm.powi(2));
+            off += usize::from(foot.beyond_steps > 0.5);
+        }
         squares.sort_unstable_by(f64::total_cmp);
         let kept = &squares[..(points.len() * 9).div_ceil(10)];
-        (kept.iter().sum::<f64>() / kept.len() as f64).sqrt()
+        ((kept.iter().sum::<f64>() / kept.len() as f64).sqrt(), off as f64 / points.len() as f64)
     }
 
     /// Squared distances from the part itself, what lies beyond its edge included.
@@ -289,13 +306,16 @@ impl<'a> Search<'a> {
                 Err(_) => break,
             }
         }
-        Candidate { cmm_from_model: pose, rms_mm: self.trimmed_rms(&surface, &pose, points), side }
+        let (rms_mm, off_part) = self.trimmed_rms(&surface, &pose, points);
+        Candidate { cmm_from_model: pose, rms_mm, off_part, side }
     }
 
     /// Other poses that fit nearly as well as the best.
     fn alternatives(&self, best: &Candidate, all: &[Candidate]) -> Vec<Candidate> {
         all.iter()
-            .filter(|c| c.rms_mm < 1.5 * best.rms_mm + 1e-6 && c.side == best.side)
+            .filter(|c| {
+                c.rms_mm < 1.5 * best.rms_mm + 1e-6 && c.side == best.side && c.off_part <= best.off_part + 0.02
+            })
             .filter(|c| self.apart(&c.cmm_from_model, &best.cmm_from_model) > 0.05)
             .copied()
             .collect()

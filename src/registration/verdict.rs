@@ -76,6 +76,10 @@ pub(crate) fn judge(problem: &Problem, descent: &Descent, tracks: &[Track], seed
     let held = spectrum.directions.columns(rank, 6 - rank).into_owned();
     let mut weak_directions = held_directions(&(free * held), 6 - rank - locked.min(6 - rank), &descent.lever);
     weak_directions.extend(weakly_seen(&scaled, residual2.sqrt(), &descent.lever, !weak_directions.is_empty()));
+    // Where a direction is held the surface fits in any pose along it, and that is said already.
+    let all_seen = rank + locked >= 6;
+    let alternatives: Vec<(Pose, f64)> =
+        seed.alternatives.iter().filter(|_| all_seen).map(|c| (c.cmm_from_model, c.rms_mm)).collect();
     Verdict {
         used: n,
         objective_mm2,
@@ -86,15 +90,15 @@ pub(crate) fn judge(problem: &Problem, descent: &Descent, tracks: &[Track], seed
         condition: (spectrum.squares[0] / spectrum.squares[rank - 1]).sqrt(),
         weak_directions,
         coverage: 0.0,
-        alternatives: seed.alternatives.iter().map(|c| (c.cmm_from_model, c.rms_mm)).collect(),
-        warnings: warnings(problem, seed, (objective_mm2 / n as f64).sqrt()),
+        warnings: warnings(problem, seed, &alternatives, (objective_mm2 / n as f64).sqrt()),
+        alternatives,
         iterations,
         converged: descent.converged,
     }
 }
 
 /// Tells what the numbers alone do not.
-fn warnings(problem: &Problem, seed: &Seed, rms_mm: f64) -> Vec<String> {
+fn warnings(problem: &Problem, seed: &Seed, alternatives: &[(Pose, f64)], rms_mm: f64) -> Vec<String> {
     let mut warnings = Vec::new();
     if !seed.side_known {
         warnings.push(
@@ -102,11 +106,11 @@ fn warnings(problem: &Problem, seed: &Seed, rms_mm: f64) -> Vec<String> {
                 .to_string(),
         );
     }
-    if !seed.alternatives.is_empty() {
+    if !alternatives.is_empty() {
         warnings.push(format!(
             "{} other {} as well: the part is symmetric, or too little of it was measured",
-            seed.alternatives.len(),
-            if seed.alternatives.len() == 1 { "pose fits about" } else { "poses fit about" },
+            alternatives.len(),
+            if alternatives.len() == 1 { "pose fits about" } else { "poses fit about" },
         ));
     }
     let relief_mm = problem.surface.nominal().relief_mm();

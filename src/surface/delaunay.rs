@@ -1,5 +1,6 @@
 //! Triangulation of scattered points in the plane of their projection.
 
+use rayon::prelude::*;
 use spade::{DelaunayTriangulation, HasPosition, Point2, Triangulation};
 
 use crate::geometry::Point;
@@ -41,7 +42,7 @@ impl HasPosition for Site {
 /// # Errors
 /// Two points at one place of the plane, or no three points off one line.
 pub(crate) fn triangulate(points: &[Point], map: &Map) -> Result<Triangles, SurfaceError> {
-    let places: Vec<[f64; 2]> = points.iter().map(|p| map.project(p).0).collect();
+    let places: Vec<[f64; 2]> = points.par_iter().map(|p| map.project(p).0).collect();
     let sites = places
         .iter()
         .enumerate()
@@ -56,7 +57,48 @@ pub(crate) fn triangulate(points: &[Point], map: &Map) -> Result<Triangles, Surf
         return Err(SurfaceError::Collinear { points: points.len() });
     }
     let triangles = flat_arrays(&triangulation);
-    Ok(without_bridges_and_needles(triangles, &places))
+    Ok(in_order_of_corners(without_bridges_and_needles(triangles, &places)))
+}
+
+/// Returns an order of the points in which neighbours in the plane are mostly neighbours in memory: along a Z-curve.
+pub(crate) fn neighbourly_order(points: &[Point], map: &Map) -> Vec<u32> {
+    let places: Vec<[f64; 2]> = points.par_iter().map(|p| map.project(p).0).collect();
+    let (low, high) = places.iter().fold(([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]), |(l, h), p| {
+        ([l[0].min(p[0]), l[1].min(p[1])], [h[0].max(p[0]), h[1].max(p[1])])
+    });
+    let cells = |k: usize| 65_535.0 / (high[k] - low[k]);
+    let per_mm = [cells(0), cells(1)];
+    let key = |p: &[f64; 2]| {
+        let [u, v] = [0, 1].map(|k| ((p[k] - low[k]) * per_mm[k]) as u32);
+        spread_bits(u) | spread_bits(v) << 1
+    };
+    let mut keyed: Vec<(u32, u32)> = places.par_iter().enumerate().map(|(i, p)| (key(p), i as u32)).collect();
+    keyed.par_sort_unstable();
+    keyed.into_iter().map(|(_, index)| index).collect()
+}
+
+/// Puts a zero between each two of the lower sixteen bits.
+fn spread_bits(mut bits: u32) -> u32 {
+    bits = (bits | bits << 8) & 0x00FF_00FF;
+    bits = (bits | bits << 4) & 0x0F0F_0F0F;
+    bits = (bits | bits << 2) & 0x3333_3333;
+    (bits | bits << 1) & 0x5555_5555
+}
+
+/// Numbers the triangles in the order of their lowest corners, so that they stand in memory where their points do.
+fn in_order_of_corners(t: Triangles) -> Triangles {
+    let mut order: Vec<(u32, u32)> =
+        t.corners.par_iter().enumerate().map(|(f, c)| (c[0].min(c[1]).min(c[2]), f as u32)).collect();
+    order.par_sort_unstable();
+    let mut number = vec![0; order.len()];
+    for (new, (_, old)) in order.iter().enumerate() {
+        number[*old as usize] = new as u32;
+    }
+    let renumbered = |n: u32| if n == BORDER { BORDER } else { number[n as usize] };
+    Triangles {
+        corners: order.par_iter().map(|(_, old)| t.corners[*old as usize]).collect(),
+        neighbours: order.par_iter().map(|(_, old)| t.neighbours[*old as usize].map(renumbered)).collect(),
+    }
 }
 
 /// Spade refuses coordinates closer to zero than 2^-142; those are zero to us.
@@ -118,12 +160,16 @@ fn drop_facet(t: &mut Triangles, dropped: &mut [bool], facet: u32, open: &mut Ve
 /// Lengths of the edges opposite to each corner.
 fn edge_lengths(corners: &[u32; 3], places: &[[f64; 2]]) -> [f64; 3] {
     let at = corners.map(|c| places[c as usize]);
-    [(1, 2), (2, 0), (0, 1)].map(|(a, b): (usize, usize)| (at[a][0] - at[b][0]).hypot(at[a][1] - at[b][1]))
+    [(1, 2), (2, 0), (0, 1)].map(|(a, b): (usize, usize)| {
+        let (u, v) = (at[a][0] - at[b][0], at[a][1] - at[b][1]);
+        (u * u + v * v).sqrt()
+    })
 }
 
 /// Finds triangles far longer than is usual around their corners.
 fn bridges(t: &Triangles, places: &[[f64; 2]]) -> Vec<u32> {
-    let longest: Vec<f64> = t.corners.iter().map(|c| edge_lengths(c, places).into_iter().fold(0.0, f64::max)).collect();
+    let longest: Vec<f64> =
+        t.corners.par_iter().map(|c| edge_lengths(c, places).into_iter().fold(0.0, f64::max)).collect();
     let usual_everywhere = median(longest.clone());
     let suspects: Vec<u32> =
         (0..t.corners.len() as u32).filter(|&f| longest[f as usize] > BRIDGE * usual_everywhere).collect();

@@ -10,7 +10,7 @@ use super::offset::{OffsetSurface, Place};
 use super::patch::{Facets, Lattice, Patch};
 
 /// Facets of a mesh that are looked at besides those touched: its normals are fitted only where they are needed.
-const LOOKED_AT: usize = 8192;
+const LOOKED_AT: usize = 2048;
 
 /// A grid is first looked over in steps of two nodes with a probe this much larger; only if that one nearly folds anywhere is
 /// every facet looked at. A surface whose curvature changes by a third between neighbouring nodes is not sampled but guessed.

@@ -154,7 +154,16 @@ impl Nominal {
             return Err(SurfaceError::Collinear { points: points.len() });
         }
         let (projection, map) = projection.prepare(&points)?;
-        let triangles = delaunay::triangulate(&points, &map)?;
+        let order = delaunay::neighbourly_order(&points, &map);
+        let points: Vec<Point> = order.iter().map(|&i| points[i as usize]).collect();
+        let as_given = |index: usize| order[index] as usize;
+        let triangles = delaunay::triangulate(&points, &map).map_err(|error| match error {
+            SurfaceError::DuplicatePoints { first, second, at } => {
+                let (a, b) = (as_given(first), as_given(second));
+                SurfaceError::DuplicatePoints { first: a.min(b), second: a.max(b), at }
+            }
+            other => other,
+        })?;
         let lattice = MeshLattice::from_parts(&points, triangles.corners, triangles.neighbours)?;
         Ok(Self::of(Patch::mesh(points, lattice), NominalKind::Scattered { projection }))
     }
@@ -292,14 +301,14 @@ impl Nominal {
 
     /// Returns how wrong fitted normals may be, in radians: 0 for a grid and for normals that are given.
     ///
-    /// Estimated as the rms change of the normal when a quarter of the neighbours is left out of its fit.
+    /// Estimated as the rms change of the normal when its fit takes in one ring of neighbours more.
     pub(crate) fn normal_error(&self) -> f64 {
         let (mut sum, mut count) = (0.0, 0);
         for patch in self.patches.iter().filter(|p| p.has_scattered_normals()) {
             let Lattice::Mesh(mesh) = &patch.lattice else { continue };
             for vertex in patch.sample(256) {
-                let fewer = normals::fit_to_ring(&patch.points, mesh, vertex, normals::NEIGHBOURS * 3 / 4);
-                sum += (fewer.normal - patch.normal(vertex)).norm_squared();
+                let wider = normals::fit_to_ring(&patch.points, mesh, vertex, 2 * normals::NEIGHBOURS);
+                sum += (wider.normal - patch.normal(vertex)).norm_squared();
                 count += 1;
             }
         }

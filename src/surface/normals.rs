@@ -1,14 +1,13 @@
 //! Normals of scattered points: a local cubic through each vertex, fitted to its neighbours in the triangulation.
 
-use nalgebra::{SMatrix, SVector};
-
 use crate::geometry::{Point, Vector};
 
 use super::mesh::MeshLattice;
 use super::patch::Facets;
 
-/// How many neighbours a fit asks for: nine unknowns, and enough to spare for one-sided places.
-pub(crate) const NEIGHBOURS: usize = 24;
+/// How many neighbours a fit asks for: nine unknowns and some to spare. Two rings of a triangulation have eighteen, at a border
+/// about ten, so that a third ring is taken in there.
+pub(crate) const NEIGHBOURS: usize = 14;
 
 /// Most neighbours a fit takes in.
 const MOST: usize = 64;
@@ -95,94 +94,92 @@ pub(crate) fn tangents(n: &Vector) -> [Vector; 2] {
 }
 
 /// Solves the weighted normal equations of the first N monomials; `None` where the neighbours do not determine them.
+///
+/// Plain arrays with fixed bounds: the compiler unrolls and vectorises them, which makes the fit several times faster.
 fn solve<const N: usize>(local: &[[f64; 3]]) -> Option<[f64; 9]> {
     if local.len() < N {
         return None;
     }
-    let mut gram = SMatrix::<f64, N, N>::zeros();
-    let mut right = SVector::<f64, N>::zeros();
+    let mut gram = [[0.0; N]; N];
+    let mut right = [0.0; N];
     for &[u, v, w] in local {
         let weight = 1.0 / (1.0 + u * u + v * v);
-        let terms = [u, v, u * u, u * v, v * v, u * u * u, u * u * v, u * v * v, v * v * v];
+        let all = [u, v, u * u, u * v, v * v, u * u * u, u * u * v, u * v * v, v * v * v];
+        let terms: &[f64; N] = all.first_chunk().expect("N is 9 at most");
         for i in 0..N {
             let scaled = weight * terms[i];
-            for j in 0..=i {
-                gram[(i, j)] += scaled * terms[j];
+            for j in 0..N {
+                gram[i][j] += scaled * terms[j];
             }
             right[i] += scaled * w;
         }
     }
-    let scale = (0..N).map(|i| gram[(i, i)]).fold(0.0, f64::max);
-    let factor = cholesky(gram, WEAK_PIVOT * scale)?;
+    let scale = (0..N).map(|i| gram[i][i]).fold(0.0, f64::max);
+    let inverse_pivots = cholesky(&mut gram, WEAK_PIVOT * scale)?;
+    substitute(&gram, &inverse_pivots, &mut right);
     let mut solution = [0.0; 9];
-    solution[..N].copy_from_slice(substitute(&factor, right).as_slice());
+    solution[..N].copy_from_slice(&right);
     Some(solution)
 }
 
-/// The lower factor of a symmetric matrix given by its lower half; `None` at a pivot below the limit.
-#[inline]
-fn cholesky<const N: usize>(mut m: SMatrix<f64, N, N>, least_pivot: f64) -> Option<SMatrix<f64, N, N>> {
+/// Puts the lower factor of a symmetric matrix into its lower half and returns the inverses of its pivots; `None` at a pivot
+/// below the limit.
+#[inline(always)]
+fn cholesky<const N: usize>(m: &mut [[f64; N]; N], least_pivot: f64) -> Option<[f64; N]> {
+    let mut inverse_pivots = [0.0; N];
     for j in 0..N {
-        for i in j..N {
-            let mut sum = m[(i, j)];
-            for k in 0..j {
-                sum -= m[(i, k)] * m[(j, k)];
-            }
-            if i == j {
-                if sum.is_nan() || sum <= least_pivot {
-                    return None;
-                }
-                m[(j, j)] = sum.sqrt();
-            } else {
-                m[(i, j)] = sum / m[(j, j)];
-            }
+        let row_j = m[j];
+        let pivot = row_j[j] - (0..j).map(|k| row_j[k] * row_j[k]).sum::<f64>();
+        if pivot.is_nan() || pivot <= least_pivot {
+            return None;
+        }
+        inverse_pivots[j] = 1.0 / pivot.sqrt();
+        for row in &mut m[j + 1..] {
+            let sum = row[j] - (0..j).map(|k| row[k] * row_j[k]).sum::<f64>();
+            row[j] = sum * inverse_pivots[j];
         }
     }
-    Some(m)
+    Some(inverse_pivots)
 }
 
-fn substitute<const N: usize>(l: &SMatrix<f64, N, N>, mut x: SVector<f64, N>) -> SVector<f64, N> {
+#[inline(always)]
+fn substitute<const N: usize>(l: &[[f64; N]; N], inverse_pivots: &[f64; N], x: &mut [f64; N]) {
     for i in 0..N {
-        for k in 0..i {
-            x[i] -= l[(i, k)] * x[k];
-        }
-        x[i] /= l[(i, i)];
+        let sum: f64 = (0..i).map(|k| l[i][k] * x[k]).sum();
+        x[i] = (x[i] - sum) * inverse_pivots[i];
     }
     for i in (0..N).rev() {
-        for k in i + 1..N {
-            x[i] -= l[(k, i)] * x[k];
-        }
-        x[i] /= l[(i, i)];
+        let sum: f64 = (i + 1..N).map(|k| l[k][i] * x[k]).sum();
+        x[i] = (x[i] - sum) * inverse_pivots[i];
     }
-    x
 }
 
-/// Collects rings of neighbours round a vertex until there are as many as wanted; returns how many.
+/// Collects whole rings of neighbours round a vertex until there are as many as wanted; returns how many.
 fn neighbours(mesh: &MeshLattice, vertex: u32, wanted: usize, ring: &mut [u32; MOST]) -> usize {
-    let mut count = 0;
+    let mut count = add_around(mesh, vertex, vertex, ring, 0);
     let mut begin = 0;
-    let mut add = |ring: &mut [u32; MOST], count: &mut usize, candidate: u32| {
-        if candidate != vertex && *count < MOST && !ring[..*count].contains(&candidate) {
-            ring[*count] = candidate;
-            *count += 1;
-        }
-    };
-    let collect =
-        |of: u32, ring: &mut [u32; MOST], count: &mut usize, add: &mut dyn FnMut(&mut [u32; MOST], &mut usize, u32)| {
-            mesh.around(of, |facet, k| {
-                let corners = mesh.corners(facet);
-                add(ring, count, corners[(k + 1) % 3]);
-                add(ring, count, corners[(k + 2) % 3]);
-            });
-        };
-    collect(vertex, ring, &mut count, &mut add);
     while count < wanted && begin < count {
         let end = count;
         for k in begin..end {
-            collect(ring[k], ring, &mut count, &mut add);
+            count = add_around(mesh, ring[k], vertex, ring, count);
         }
         begin = end;
     }
+    count
+}
+
+/// Adds the neighbours of one vertex that are not in the ring yet; returns how many there are then.
+#[inline(always)]
+fn add_around(mesh: &MeshLattice, of: u32, vertex: u32, ring: &mut [u32; MOST], mut count: usize) -> usize {
+    mesh.around(of, |facet, k| {
+        let corners = mesh.corners(facet);
+        for candidate in [corners[(k + 1) % 3], corners[(k + 2) % 3]] {
+            if candidate != vertex && count < MOST && !ring[..count].contains(&candidate) {
+                ring[count] = candidate;
+                count += 1;
+            }
+        }
+    });
     count
 }
 

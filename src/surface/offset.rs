@@ -218,10 +218,35 @@ impl<'a> OffsetSurface<'a> {
         }
     }
 
+    /// Walks over the flat facets of the nominal surface to about where the foot is, without a normal having to be fitted on
+    /// the way: the point is brought back to the surface along the normal of each facet.
+    fn approach<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point) -> u32 {
+        let mut facet = facets.start(p);
+        if !patch.has_scattered_normals() {
+            return facet;
+        }
+        let mut before = u32::MAX;
+        for _ in 0..MOST_STEPS {
+            let [a, b, c] = facets.corners(facet).map(|v| patch.points[v as usize]);
+            let (e1, e2) = (b - a, c - a);
+            let turned = e1.cross(&e2);
+            let squared = turned.norm_squared();
+            let w = p - a - turned * (self.radius_mm * self.side.sign() / squared.sqrt());
+            let (b1, b2) = (w.cross(&e2).dot(&turned) / squared, e1.cross(&w).dot(&turned) / squared);
+            let weights = [1.0 - b1 - b2, b1, b2];
+            let inside = weights[0].min(b1).min(b2) >= 0.0;
+            match if inside { None } else { facets.advance(facet, &weights) } {
+                Some(next) if next != before => (before, facet) = (facet, next),
+                _ => break,
+            }
+        }
+        facet
+    }
+
     /// Walks from facet to facet until one holds the foot, then measures there.
     #[inline]
     fn search<F: Facets>(&self, patch: &Patch, facets: &F, number: u32, p: &Point, start: u32) -> Foot {
-        let mut facet = if start == u32::MAX { facets.start(p) } else { start };
+        let mut facet = if start == u32::MAX { self.approach(patch, facets, p) } else { start };
         let mut before = u32::MAX;
         for _ in 0..MOST_STEPS {
             let corner = OffsetFacet::new(self, patch, facets.corners(facet));

@@ -83,7 +83,9 @@ impl Patch {
         (0..n / columns)
             .step_by(step_j)
             .flat_map(move |j| (0..columns).step_by(step_i).map(move |i| (j * columns + i) as u32))
-            .filter(|&v| self.points[v as usize].x.is_finite() && self.normal(v).x.is_finite())
+            .filter(|&v| {
+                self.points[v as usize].x.is_finite() && (self.has_scattered_normals() || self.normal(v).x.is_finite())
+            })
     }
 
     /// Whether normals were given or exact rather than fitted to scattered neighbours.
