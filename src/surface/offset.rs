@@ -220,8 +220,9 @@ impl<'a> OffsetSurface<'a> {
 
     /// Walks over the flat facets of the nominal surface to about where the foot is, without a normal having to be fitted on
     /// the way: the point is brought back to the surface along the normal of each facet.
-    fn approach<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point) -> u32 {
-        let mut facet = facets.start(p);
+    #[inline]
+    fn approach<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: u32) -> u32 {
+        let mut facet = if start == u32::MAX { facets.start(p) } else { start };
         if !patch.has_scattered_normals() {
             return facet;
         }
@@ -246,7 +247,7 @@ impl<'a> OffsetSurface<'a> {
     /// Walks from facet to facet until one holds the foot, then measures there.
     #[inline]
     fn search<F: Facets>(&self, patch: &Patch, facets: &F, number: u32, p: &Point, start: u32) -> Foot {
-        let mut facet = if start == u32::MAX { self.approach(patch, facets, p) } else { start };
+        let mut facet = self.approach(patch, facets, p, start);
         let mut before = u32::MAX;
         for _ in 0..MOST_STEPS {
             let corner = OffsetFacet::new(self, patch, facets.corners(facet));
