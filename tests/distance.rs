@@ -34,15 +34,23 @@ fn errors_nm(nominal: &Nominal, distance: Distance, step: [f64; 2]) -> [f64; 2] 
     range.map(|[low, high]| high - low)
 }
 
+// The bounds are peak to valley in nanometres, inside and within two steps of the border.
+
 #[test]
-fn print_errors() {
-    for (c, r) in [(1021, 1241), (901, 501), (128, 156)] {
-        let nominal = nominal(c, r);
-        let step = [102.0 / (c - 1) as f64, 62.0 / (r - 1) as f64];
-        println!(
-            "{c}x{r} flat {:?} curved {:?}",
-            errors_nm(&nominal, Distance::Triangle, step),
-            errors_nm(&nominal, Distance::Curved, step)
-        );
-    }
+fn on_the_grid_of_the_paper_flat_errs_by_tens_of_nanometres_and_curved_by_hundredths_of_one() {
+    let (nominal, step) = (nominal(1021, 1241), [0.1, 0.05]);
+    let flat = errors_nm(&nominal, Distance::Triangle, step);
+    let curved = errors_nm(&nominal, Distance::Curved, step);
+    println!("flat {flat:.3?} nm, curved {curved:.5?} nm");
+    assert!(flat[0] < 60.0 && flat[0] > 5.0, "{flat:?}");
+    assert!(curved[0] < 0.05 && curved[1] < 1.0, "{curved:?}");
+}
+
+#[test]
+fn on_a_grid_eight_times_coarser_the_curved_distance_errs_by_nanometres() {
+    let (nominal, step) = (nominal(128, 156), [102.0 / 127.0, 62.0 / 155.0]);
+    let flat = errors_nm(&nominal, Distance::Triangle, step);
+    let curved = errors_nm(&nominal, Distance::Curved, step);
+    println!("flat {flat:.1?} nm, curved {curved:.3?} nm");
+    assert!(curved[0] < 5.0 && curved[1] < 5.0, "{curved:?}");
 }

@@ -161,6 +161,7 @@ struct Document<'a> {
     condition: f64,
     weak_directions: &'a [WeakDirection],
     alternatives: Vec<Alternative>,
+    warnings: Vec<String>,
     converged: bool,
     iterations: usize,
     objective_mm2: Vec<f64>,
@@ -337,6 +338,7 @@ impl<'a> Document<'a> {
             condition: verdict.condition,
             weak_directions: &verdict.weak_directions,
             alternatives: verdict.alternatives.iter().map(alternative).collect(),
+            warnings: verdict.warnings.clone(),
             converged: verdict.converged,
             iterations: verdict.iterations,
             objective_mm2: registration.trace.iter().filter(|i| i.taken).map(|i| i.objective_mm2).collect(),
@@ -410,9 +412,8 @@ fn summary(document: &Document, kind: NominalKind, folder: &Path) -> String {
     for weak in document.weak_directions {
         line("weak", weak.words.clone());
     }
-    if !document.alternatives.is_empty() {
-        let others = counted(document.alternatives.len(), "other pose");
-        line("warning", format!("{others} fit about as well; compare before you trust this one:"));
+    for warning in &document.warnings {
+        line("warning", warning.clone());
     }
     for other in &document.alternatives {
         line("", format!("{} apart, rms {} um over some points", apart(document, other), um(other.rms_mm)));
