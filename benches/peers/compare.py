@@ -2,7 +2,7 @@
 
     python3 -m venv target/peers-venv
     target/peers-venv/bin/pip install -r benches/peers/requirements.txt
-    cargo build --release && cargo build --release --bench in_process
+    cargo build --release --bin regrind --bench in_process
     target/peers-venv/bin/python benches/peers/compare.py
 
 What is compared. A free form of 451,401 nominal points on a grid, and probe centres on its ground surface (6.657 um PV form
@@ -10,9 +10,11 @@ error, 0.2 um noise), made here in closed form with numpy and written to target/
 exact least-squares pose: Gauss-Newton with the Newton foot on the closed form, which no one but this script knows. It is not
 the placement, because the form error alone moves the best fit.
 
-What is timed. "time" is without reading files for everybody: making the offset surface ready and registering. Regrind must
-find the grid itself; the peers are told it, and take their normals from differences along it, which is faster than to
-estimate them. "process" is the whole `regrind register`, with the files read and the results written to the disk.
+What is timed. "time" is without reading files for everybody: making the nominal or offset surface ready, which "ready" tells
+alone, and registering. Regrind must find the grid itself; the peers are told it, and take their normals from differences along
+it, which is faster than to estimate them. "process" is the whole `regrind register`, with the files read and the results
+written to the disk. "pose" is the farthest corner of the part from where the exact pose puts it; "map" is the rms of the
+deviations less the exact ones; "x" is a peer's figure over that of regrind from the identity.
 
 A peer that is not installed is left out, and said to be. `--quick` leaves the largest cloud out.
 """
@@ -271,13 +273,11 @@ def by_regrind(tools, nominal_file, measured_file, start, repeats):
 
 def executables():
     """The release program and the clock, built if they are not."""
-    built = []
-    for what in (["--bin", "regrind"], ["--bench", "in_process"]):
-        command = ["cargo", "build", "--release", *what, "--message-format=json"]
-        lines = subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True).stdout.splitlines()
-        found = [m["executable"] for m in map(json.loads, lines) if m.get("executable")]
-        built.append(found[-1])
-    return built
+    names = ["regrind", "in_process"]
+    command = ["cargo", "build", "--release", "--bin", names[0], "--bench", names[1], "--message-format=json"]
+    lines = subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True).stdout.splitlines()
+    built = {m["target"]["name"]: m["executable"] for m in map(json.loads, lines) if m.get("executable")}
+    return [built[name] for name in names]
 
 
 def make_files(folder, quick):
@@ -305,12 +305,12 @@ def save(path, points):
 
 
 def score(result, truth):
-    """Error of the pose in um, the farthest of the part's corners; of the map in nm rms."""
+    """Error of the pose in nm, the farthest of the part's corners; of the map in nm rms."""
     (pose, deviation, *_), (best, exact_deviation) = result, truth
     x, y = np.array([-50.0, 50, -50, 50]), np.array([-30.0, -30, 30, 30])
     corners = np.stack([x, y, height(x, y)], -1)
     off = np.linalg.norm(moved(pose, corners) - moved(best, corners), axis=1).max()
-    return off * 1e3, np.sqrt(np.nanmean((deviation - exact_deviation) ** 2)) * 1e6, int(np.isfinite(deviation).sum())
+    return off * 1e6, np.sqrt(np.nanmean((deviation - exact_deviation) ** 2)) * 1e6, int(np.isfinite(deviation).sum())
 
 
 def contenders(case, nominal, measured, missing):
@@ -324,19 +324,23 @@ def contenders(case, nominal, measured, missing):
 
 
 def print_row(label, result, errors, whole, against):
-    pose_um, map_nm, used = errors
-    total, turns = result[3], result[4] or "-"
+    pose_nm, map_nm, used = errors
+    ready, total, turns = result[2], result[3], result[4] or "-"
     process = f"{whole:9.3f}" if whole else " " * 9
     ratios = ""
     if against:
-        ratios = f"{total / against[0]:8.1f}{pose_um / against[1]:10.0f}{map_nm / against[2]:9.0f}"
-    print(f"  {label:32}{total:9.3f}{process}{pose_um:11.5f}{map_nm:10.4f}{used:9d}{turns:>6}{ratios}", flush=True)
+        ratios = f"{total / against[0]:8.1f}{pose_nm / against[1]:10.0f}{map_nm / against[2]:9.0f}"
+    print(f"  {label:32}{ready:9.3f}{total:9.3f}{process}{pose_nm:11.4f}{map_nm:10.4f}{used:9d}{turns:>6}{ratios}", flush=True)
 
 
 def compare(case, folder, nominal, measured, truth, tools, missing):
     repeats = 3 if case == "dense" else 7
     print(f"\n{case}: {len(measured):,} measured points")
-    print(f"  {'':32}{'time s':>9}{'process s':>9}{'pose um':>11}{'map nm':>10}{'points':>9}{'turns':>6}  x time    x pose    x map")
+    head = (
+        f"{'':32}{'ready s':>9}{'time s':>9}{'process':>9}{'pose nm':>11}{'map nm':>10}{'points':>9}{'turns':>6}"
+        "  x time    x pose    x map"
+    )
+    print(f"  {head}")
     files = folder / "nominal.csv", folder / f"{case}.csv"
     result, whole = by_regrind(tools, *files, "identity", repeats)
     errors = score(result, truth)
