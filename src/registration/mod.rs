@@ -398,6 +398,9 @@ fn settle(
         evaluate(&problem, tracks, &pose);
         screen(&problem, options, tracks, true);
     }
+    if !seed.near && problem.measured.len() >= 2 * PILOT {
+        pose = pilot(&problem, pose, trace)?;
+    }
     let mut round = 0;
     loop {
         rescale(&mut problem, options, tracks, round > 0 || seed.near);
@@ -414,6 +417,17 @@ fn settle(
             return finish(descent, tracks.len());
         }
     }
+}
+
+/// Points that a dense cloud sends ahead.
+const PILOT: usize = 16_384;
+
+/// Descends with a few of many points, from where the rest have a step or two to go; its turns stand in the trace.
+fn pilot(problem: &Problem, pose: Pose, trace: &mut Vec<Iteration>) -> Result<Pose, RegistrationError> {
+    let few: Vec<Point> = start::spread(problem.measured, PILOT).copied().collect();
+    let mut tracks = vec![Track::NEW; few.len()];
+    let ahead = Problem { measured: &few, ..*problem };
+    Ok(ahead.descend(pose, &mut tracks, trace)?.cmm_from_model)
 }
 
 /// Refuses an end that hangs on too few points, or on none of the six directions.

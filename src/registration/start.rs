@@ -84,7 +84,7 @@ pub(crate) fn mirrored_rms(part: &Part, measured: &[Point], options: &Options, f
 }
 
 /// Some of the points, evenly along their order; jittered, so that the choice does not run along one column of a grid.
-fn spread(points: &[Point], count: usize) -> impl Iterator<Item = &Point> {
+pub(super) fn spread(points: &[Point], count: usize) -> impl Iterator<Item = &Point> {
     let n = points.len();
     let take = count.min(n);
     let jitter = move |k: usize| (k.wrapping_mul(0x9E37_79B9) >> 7) % (n / take.max(1)).max(1);
