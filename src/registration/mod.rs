@@ -16,6 +16,7 @@
 mod correspond;
 mod iterate;
 mod linearize;
+mod point_to_point;
 mod robust;
 mod solve;
 mod start;
@@ -30,6 +31,7 @@ use crate::surface::{Distance, Lookup, Nominal, OffsetSurface, Side, SurfaceErro
 use correspond::{Reading, Track, at_feet, middle_and_size};
 pub use iterate::Iteration;
 use iterate::{Descent, Problem};
+pub use point_to_point::{PointToPoint, register_point_to_point};
 pub use robust::Loss;
 use robust::{ScaledLoss, robust_sigma};
 pub use verdict::{Verdict, WeakDirection};

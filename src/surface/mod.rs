@@ -254,6 +254,15 @@ impl Nominal {
         self.patches.iter().flat_map(|p| &p.points).filter(|p| p.x.is_finite())
     }
 
+    /// Returns every point moved along its normal by a length in millimetres, eq. (3); holes left out.
+    pub fn offset_points(&self, by_mm: f64) -> impl Iterator<Item = Point> {
+        let moved = move |patch: &Patch, v: usize| patch.points[v] + patch.normal(v as u32) * by_mm;
+        self.patches
+            .iter()
+            .flat_map(move |patch| (0..patch.points.len()).map(move |v| moved(patch, v)))
+            .filter(|p| p.x.is_finite())
+    }
+
     /// Returns the number of points, holes left out.
     pub fn len(&self) -> usize {
         self.points().count()
