@@ -65,17 +65,6 @@ fn measured((columns, rows): (usize, usize), place: &Placement) -> Vec<Point> {
     centres.into_iter().map(Point::from).collect()
 }
 
-/// The same points in an order that tells nothing of where they lie.
-fn shuffled(points: &[Point]) -> Vec<Point> {
-    let mixed = |k: usize| {
-        let k = (k as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15);
-        (k ^ (k >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9).rotate_left(31).wrapping_mul(0x94D0_49BB_1331_11EB)
-    };
-    let mut order: Vec<usize> = (0..points.len()).collect();
-    order.sort_by_cached_key(|k| mixed(*k));
-    order.into_iter().map(|k| points[k]).collect()
-}
-
 fn gridded(points: Vec<Point>) -> Nominal {
     Nominal::from_points(points, Projection::Auto).expect("the free form is a surface")
 }
@@ -146,9 +135,23 @@ mod far {
 mod without_a_grid {
     use super::*;
 
+    /// As many points as the grid has, evenly strewn without any order (the R2 sequence): no four of them on one circle.
+    fn strewn() -> Vec<Point> {
+        let place = |k: usize, step: f64, size: f64| size * ((0.5 + k as f64 * step).fract() - 0.5);
+        (0..NOMINAL.len())
+            .map(|k| {
+                (
+                    place(k, 0.754_877_666_246_693, FreeForm::WIDTH_MM),
+                    place(k, 0.569_840_290_998_053, FreeForm::DEPTH_MM),
+                )
+            })
+            .map(|(x, y)| Point::from(FreeForm::default().point(x, y)))
+            .collect()
+    }
+
     #[divan::bench]
     fn nominal_and_registration(bencher: Bencher) {
-        let (points, measured) = (shuffled(&NOMINAL), &*SCAN_NEAR);
+        let (points, measured) = (strewn(), &*SCAN_NEAR);
         bencher.with_inputs(|| points.clone()).bench_values(|points| {
             let nominal = scattered(points);
             let registration = found(&nominal, measured, AT_IDENTITY());
@@ -158,7 +161,7 @@ mod without_a_grid {
 
     #[divan::bench]
     fn nominal_alone(bencher: Bencher) {
-        let points = shuffled(&NOMINAL);
+        let points = strewn();
         bencher.with_inputs(|| points.clone()).bench_values(scattered);
     }
 }

@@ -56,7 +56,7 @@ impl Default for FreeForm {
 }
 
 /// Wave vector, phase and amplitude of each ripple of the free form.
-const RIPPLES: [[f64; 4]; 3] = [[0.042, 0.016, 0.4, 6.9], [-0.018, 0.062, 1.1, 3.4], [0.070, -0.035, 2.3, 0.5]];
+const RIPPLES: [[f64; 4]; 3] = [[0.042, 0.016, 0.4, 7.0], [-0.018, 0.062, 1.1, 3.5], [0.070, -0.035, 2.3, 0.5]];
 
 impl Shape for FreeForm {
     fn height(&self, x: f64, y: f64) -> f64 {

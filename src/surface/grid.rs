@@ -211,7 +211,7 @@ pub(crate) fn grid_normals(points: &[Point], lattice: &GridLattice) -> Vec<Vecto
 }
 
 /// The derivative of the quartic through five nodes at the middle one.
-#[inline]
+#[inline(always)]
 fn central_derivative(points: &[Point], node: usize, stride: usize) -> Vector {
     let near = points[node + stride] - points[node - stride];
     let far = points[node + 2 * stride] - points[node - 2 * stride];
