@@ -301,6 +301,21 @@ fn the_same_surface_as_a_formula_and_as_points() {
 }
 
 #[test]
+fn robust_losses_from_a_given_pose() {
+    let shape = regrind_sim::shape::FreeForm::default();
+    let nominal = common::free_form(301, 181);
+    let placement = Placement::new([0.3, -0.2, 0.25], [0.2, 0.1, -0.3]);
+    let cloud = measured(&shape, [50.0, 30.0], [50, 30], &placement, 3e-4);
+    for loss in [regrind::registration::Loss::Huber, regrind::registration::Loss::Tukey] {
+        let options = Options { loss, start: Start::Pose(Pose::identity()), ..Options::new(RADIUS_MM) };
+        let found = register(&nominal, &cloud, &options).unwrap();
+        let error = normal_error_mm(&found.cmm_from_model, &pose(&placement), &shape, [50.0, 30.0]);
+        assert!(error < 1e-4, "{loss:?}: {error} mm");
+        assert!(found.trace.iter().all(|turn| turn.objective_mm2.is_finite()), "{loss:?}");
+    }
+}
+
+#[test]
 fn contact_points_and_the_subtracted_radius() {
     let shape = regrind_sim::shape::FreeForm::default();
     let nominal = common::free_form(451, 251);

@@ -451,9 +451,9 @@ fn evaluate(problem: &Problem, tracks: &mut [Track], pose: &Pose) {
 
 /// Gives a robust loss the scale of the distances as they are now.
 fn rescale(problem: &mut Problem, options: &Options, tracks: &[Track], known: bool) {
-    if options.loss != Loss::None {
-        let sigma = if known { sigma_of(tracks).1 } else { f64::INFINITY };
-        problem.reading.loss = ScaledLoss::new(options.loss, sigma);
+    // Before the first distances are known there is no scale, and every point counts by its square.
+    if known && options.loss != Loss::None {
+        problem.reading.loss = ScaledLoss::new(options.loss, sigma_of(tracks).1);
     }
 }
 
