@@ -13,6 +13,7 @@
 //! Units: millimetres and radians throughout. Frames: `shape` and `form` live in the model frame, the points a probe reports
 //! in the frame of the measuring machine.
 
+pub mod body;
 pub mod form;
 pub mod probe;
 pub mod shape;
