@@ -16,6 +16,7 @@
 pub mod compensation;
 pub mod formats;
 pub mod geometry;
+pub mod measuring;
 pub mod registration;
 pub mod report;
 pub mod surface;

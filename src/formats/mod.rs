@@ -3,6 +3,7 @@
 //! No file is trusted. Whatever is wrong with one comes back as a [`FormatError`] that names the file, the place, what was
 //! found, what was expected and what to do; nothing here panics, and time and memory are bounded by the size of the file.
 
+mod document;
 mod error;
 mod folder;
 mod layout;
@@ -15,6 +16,9 @@ mod whole;
 
 use std::path::Path;
 
+pub use document::{
+    Alternative, MeasuredInput, NominalInput, Program, RegistrationDocument, StandardUncertainty, save_registration,
+};
 pub use error::FormatError;
 pub use folder::ResultFolder;
 pub use number::LIMIT_MM;
