@@ -14,6 +14,7 @@
 //! `cmm_from_model`. A deviation is positive where material stands proud, along the outward normal, the probe's side.
 
 pub mod compensation;
+pub mod device;
 pub mod formats;
 pub mod geometry;
 pub mod measuring;
