@@ -13,8 +13,11 @@
 //! Conventions: millimetres, radians, seconds. Frames are the model's {M} and the CMM's {W}; a pose is named for what it does,
 //! `cmm_from_model`. A deviation is positive where material stands proud, along the outward normal, the probe's side.
 
+pub mod config;
+pub mod document;
 pub mod formats;
 pub mod geometry;
+pub mod recipe;
 pub mod registration;
 pub mod report;
 pub mod surface;
