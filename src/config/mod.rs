@@ -6,9 +6,14 @@
 //!
 //! Everything that is wrong with a file is told at once ([`crate::document::Problems`]), each thing at its line and column.
 
+mod check;
+mod written;
+
 use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
 use std::time::Duration;
 
+use crate::document::{Document, Problems, problem_at, read_text, schema_of, sha256};
 use crate::geometry::{Point, Pose};
 
 /// A cell, checked.
@@ -120,6 +125,8 @@ pub struct FileExchange {
     pub stations: Vec<Station>,
     /// The reference points in the CMM frame, to which the stations are merged.
     pub reference_points: Option<PathBuf>,
+    /// Name of the group of reference points within the file.
+    pub reference_group: Option<String>,
 }
 
 /// How result files are written.
@@ -200,6 +207,26 @@ pub struct RegisterMap {
     pub outbox_header: u16,
     pub outbox_select: u16,
     pub outbox_page: u16,
+}
+
+impl RegisterMap {
+    /// Returns every block: its key in a cell file, its first register, and how many it has.
+    pub fn blocks(&self) -> [(&'static str, u16, u16); 12] {
+        [
+            ("identity", self.identity, 32),
+            ("sync", self.sync, 4),
+            ("beat", self.beat, 1),
+            ("command", self.command, 20),
+            ("status", self.status, 48),
+            ("in_force", self.in_force, 72),
+            ("inbox_header", self.inbox_header, 24),
+            ("inbox_page", self.inbox_page, 120),
+            ("inbox_state", self.inbox_state, 12),
+            ("outbox_header", self.outbox_header, 56),
+            ("outbox_select", self.outbox_select, 2),
+            ("outbox_page", self.outbox_page, 116),
+        ]
+    }
 }
 
 impl Default for RegisterMap {
@@ -307,7 +334,43 @@ pub struct GrinderLimits {
     pub largest_depth_mm: f64,
 }
 
+static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<written::CellFile>);
+
+/// Returns the JSON schema of a cell file.
+pub fn json_schema() -> &'static serde_json::Value {
+    &SCHEMA
+}
+
 impl CellConfig {
+    /// Reads a cell file.
+    ///
+    /// # Errors
+    /// A file that cannot be read, and everything that is wrong with its text.
+    pub fn read(path: &Path) -> Result<Self, Problems> {
+        let text = read_text(path)?;
+        Self::parse(path, &text)
+    }
+
+    /// Reads a cell file from its text; the path is for messages, and relative folders are relative to its folder.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the text.
+    pub fn parse(path: &Path, text: &str) -> Result<Self, Problems> {
+        let mut document = Document::parse(path, text)?;
+        document.hold_against(&SCHEMA);
+        let checked = document.as_written().map(|written| check::check(&written, path, &mut document));
+        document.finish()?;
+        let cell = checked.and_then(|checked| checked.into_cell(path, text, sha256(text)));
+        cell.ok_or_else(|| {
+            Problems::whole(path, text, "something is missing".into(), "compare it with config/sim.toml")
+        })
+    }
+
+    /// Returns a problem with a key of this file that somebody else has found, at its place in the text.
+    pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
+        problem_at(&self.path, &self.text, key, [found, allowed, remedy])
+    }
+
     /// Returns the path that the cell file was read from.
     pub fn path(&self) -> &Path {
         &self.path

@@ -9,8 +9,14 @@
 //!
 //! Micrometres and degrees stand in the file only. Feeds are mm/min, as on every grinder's panel.
 
-use std::path::{Path, PathBuf};
+mod check;
+mod curvature;
+mod written;
 
+use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
+
+use crate::document::{Document, Problems, problem_at, read_text, schema_of, sha256};
 use crate::geometry::{Aperture, Pose};
 use crate::registration::{self, Loss, ProbeSide, Start};
 use crate::surface::{DefinedSurface, Distance, Projection};
@@ -145,7 +151,8 @@ pub struct RegistrationSettings {
 }
 
 /// Where a registration begins.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
+#[serde(rename_all = "kebab-case")]
 pub enum StartAt {
     /// Nowhere in particular.
     Search,
@@ -192,7 +199,7 @@ pub struct Grinding {
     pub track_mm: f64,
     /// Passes without in-feed at the end.
     pub spark_out_passes: u16,
-    /// Level of the first pass over the nominal surface; each further pass goes deeper by the depth of cut, down to 0.
+    /// Level of the first pass over the nominal surface; each further pass goes deeper by the depth of cut.
     pub allowance_mm: f64,
 }
 
@@ -243,7 +250,8 @@ pub struct Cycle {
 }
 
 /// What to do when the part does not get better.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
+#[serde(rename_all = "kebab-case")]
 pub enum OnTrouble {
     /// End the run; the part is not in tolerance.
     Stop,
@@ -251,7 +259,43 @@ pub enum OnTrouble {
     Hold,
 }
 
+static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<written::RecipeFile>);
+
+/// Returns the JSON schema of a recipe.
+pub fn json_schema() -> &'static serde_json::Value {
+    &SCHEMA
+}
+
 impl Recipe {
+    /// Reads a recipe.
+    ///
+    /// # Errors
+    /// A file that cannot be read, and everything that is wrong with its text.
+    pub fn read(path: &Path) -> Result<Self, Problems> {
+        let text = read_text(path)?;
+        Self::parse(path, &text)
+    }
+
+    /// Reads a recipe from its text; the path is for messages, and relative paths are relative to its folder.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the text.
+    pub fn parse(path: &Path, text: &str) -> Result<Self, Problems> {
+        let mut document = Document::parse(path, text)?;
+        document.hold_against(&SCHEMA);
+        let checked = document.as_written().map(|written| check::check(written, path, &mut document));
+        document.finish()?;
+        let recipe = checked.and_then(|checked| checked.into_recipe(path, text, sha256(text)));
+        recipe.ok_or_else(|| {
+            Problems::whole(path, text, "something is missing".into(), "compare it with a shipped recipe")
+        })
+    }
+
+    /// Returns a problem with a key of this recipe that somebody else has found, at its place in the text.
+    pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
+        problem_at(&self.path, &self.text, key, [found, allowed, remedy])
+    }
+
     /// Returns where the nominal surface comes from.
     pub fn nominal_source(&self) -> &NominalSource {
         &self.nominal

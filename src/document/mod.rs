@@ -1,8 +1,21 @@
-//! What is wrong with a file that a person wrote: every problem at once, each at its line and column.
+//! A file that a person wrote, in TOML, and what is wrong with it: every problem at once, each at its line and column.
+//!
+//! ```text
+//!  text -> syntax -> shape (the JSON schema: keys, types, ranges) -> what is left, as written -> the reader's own checks
+//! ```
+//!
+//! The schema that editors complete from is the one that files are held against, so that neither can be wrong alone. What
+//! does not fit it is told and left out, so that the checks of one value against another still run on the rest.
+
+mod read;
+mod schema;
 
 use std::fmt;
 use std::ops::Range;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+
+pub(crate) use read::{Document, problem_at, read_text, sha256};
+pub(crate) use schema::schema_of;
 
 /// Everything that is wrong with one file.
 #[derive(Clone, Debug, PartialEq)]
@@ -31,6 +44,13 @@ pub struct Problem {
 }
 
 impl Problems {
+    /// A file with one problem that has no place in its text.
+    pub(crate) fn whole(file: &Path, text: &str, found: String, remedy: &str) -> Self {
+        let problem =
+            Problem { span: 0..0, key: String::new(), found, allowed: String::new(), remedy: remedy.to_owned() };
+        Self { file: file.to_owned(), text: text.to_owned(), problems: vec![problem] }
+    }
+
     /// Returns line and column of a problem, both from 1, the column in characters.
     pub fn place(&self, problem: &Problem) -> (usize, usize) {
         line_and_column(&self.text, problem.span.start)
