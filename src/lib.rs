@@ -15,10 +15,13 @@
 
 pub mod cell;
 pub mod compensation;
+pub mod config;
 pub mod device;
+pub mod document;
 pub mod formats;
 pub mod geometry;
 pub mod measuring;
+pub mod recipe;
 pub mod registration;
 pub mod report;
 pub mod surface;
