@@ -7,6 +7,7 @@ mod document;
 mod error;
 mod folder;
 mod layout;
+mod map;
 mod number;
 pub mod ply;
 pub mod points;
@@ -20,7 +21,8 @@ pub use document::{
     Alternative, MeasuredInput, NominalInput, Program, RegistrationDocument, StandardUncertainty, save_registration,
 };
 pub use error::FormatError;
-pub use folder::ResultFolder;
+pub use folder::{ResultFolder, remove_socket};
+pub use map::{write_correction, write_error_map};
 pub use number::LIMIT_MM;
 pub use ply::{PlyFile, parse_ply, read_ply};
 pub use points::{parse_points, read_points};
