@@ -3,6 +3,8 @@
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
 
+use crate::Rng;
+
 /// A Gaussian random surface error with a Gaussian autocovariance, as a sum of plane waves.
 ///
 /// Many waves of random direction, phase and (Gaussian) wave number give heights that are Gaussian to the eye and exact
@@ -31,6 +33,21 @@ impl FormError {
             wave[3] = pv_mm / (high - low);
         }
         error
+    }
+
+    /// Draws an error of a given correlation length and RMS (over the endless plane) from a generator.
+    ///
+    /// A wave of amplitude a has the mean square a^2/2.
+    pub fn with_rms(rng: &mut Rng, correlation_length_mm: f64, rms_mm: f64) -> Self {
+        let sigma = 2f64.sqrt() / correlation_length_mm;
+        let amplitude = rms_mm * (2.0 / 96.0f64).sqrt();
+        let waves = (0..96)
+            .map(|_| {
+                let [kx, ky]: [f64; 2] = std::array::from_fn(|_| StandardNormal.sample(&mut *rng));
+                [sigma * kx, sigma * ky, rng.random_range(0.0..std::f64::consts::TAU), amplitude]
+            })
+            .collect();
+        Self { waves }
     }
 
     /// No error at all.

@@ -14,9 +14,14 @@
 //! in the frame of the measuring machine.
 
 pub mod body;
+pub mod cmm;
 pub mod form;
+pub mod part;
+pub mod payload;
 pub mod probe;
+pub mod process;
 pub mod shape;
+pub mod world;
 
 /// A position or a direction in space.
 pub type Vec3 = [f64; 3];
