@@ -177,14 +177,14 @@ pub struct HeightGrid {
 }
 
 impl HeightGrid {
-    /// Lays a grid over a rectangle about the origin, all heights 0.
-    pub fn over(half_mm: [f64; 2]) -> Self {
+    /// Lays a grid over a rectangle about the origin, all at one height.
+    pub fn over(half_mm: [f64; 2], height_mm: f64) -> Self {
         let spacing = NODE_SPACING_MM.max(half_mm[0].max(half_mm[1]) / 200.0);
         let cells = half_mm.map(|half| ((2.0 * half / spacing).ceil() as usize).max(4));
         let step_mm = [0, 1].map(|i| 2.0 * half_mm[i] / cells[i] as f64);
         let first_mm = [0, 1].map(|i| -half_mm[i] - MARGIN_NODES as f64 * step_mm[i]);
         let [columns, rows] = cells.map(|n| n + 1 + 2 * MARGIN_NODES);
-        Self { first_mm, step_mm, columns, rows, heights_mm: vec![0.0; columns * rows] }
+        Self { first_mm, step_mm, columns, rows, heights_mm: vec![height_mm; columns * rows] }
     }
 
     /// Returns the places of the nodes, in the order of the heights.
@@ -194,6 +194,11 @@ impl HeightGrid {
 
     fn node(&self, i: usize, j: usize) -> [f64; 2] {
         [self.first_mm[0] + i as f64 * self.step_mm[0], self.first_mm[1] + j as f64 * self.step_mm[1]]
+    }
+
+    /// Adds a random form to values at the nodes, in millimetres.
+    pub fn add(&self, form: &FormError, values_mm: &mut [f64]) {
+        form.add_to_net(self.first_mm, self.step_mm, self.columns, values_mm);
     }
 
     /// Returns the area of a cell in square millimetres.
@@ -290,7 +295,7 @@ pub struct Part {
 impl Part {
     /// Returns the part with its blank: stock and a form error drawn from a seed.
     pub fn blank(spec: &PartSpec, seed: u64) -> Self {
-        let mut height = HeightGrid::over(spec.aperture.half_mm());
+        let mut height = HeightGrid::over(spec.aperture.half_mm(), spec.stock_um * 1e-3);
         let [half_x, half_y] = spec.aperture.half_mm();
         let form = if spec.form_error_um > 0.0 {
             let (length, pv) = (spec.form_error_correlation_mm, spec.form_error_um * 1e-3);
@@ -298,7 +303,9 @@ impl Part {
         } else {
             FormError::none()
         };
-        height.heights_mm = height.nodes().map(|[x, y]| spec.stock_um * 1e-3 + form.height(x, y)).collect();
+        let mut heights_mm = height.heights_mm.clone();
+        height.add(&form, &mut heights_mm);
+        height.heights_mm = heights_mm;
         Self { shape: spec.shape.build(), aperture: spec.aperture, height }
     }
 

@@ -93,13 +93,13 @@ pub struct GrinderSpec {
 impl Default for GrinderSpec {
     fn default() -> Self {
         Self {
-            wheel_radius_error_um: 60.0,
+            wheel_radius_error_um: 120.0,
             setting_error_um: [12.0, -9.0],
-            straightness_x_um: [3.0, 1.6],
-            straightness_y_um: [-2.0, 1.0],
+            straightness_x_um: [5.6, 3.4],
+            straightness_y_um: [-3.4, 2.0],
             periodic_um: 0.4,
             periodic_pitch_mm: 20.0,
-            waviness_um: 0.6,
+            waviness_um: 0.9,
             waviness_correlation_mm: 18.0,
             following_um: 0.1,
             wear_um: 4.0,
@@ -109,7 +109,7 @@ impl Default for GrinderSpec {
             thermal_um: 4.0,
             thermal_tau_s: 1200.0,
             error_copying: 0.15,
-            repeatability_um: 0.3,
+            repeatability_um: 0.4,
             repeatability_correlation_mm: 14.0,
             travel_mm: [250.0, 250.0],
             feed_most_mm_min: 20_000.0,
@@ -166,7 +166,9 @@ fn finite_or_zero(value: f64) -> f64 {
 /// Returns the systematic error at every node, waviness included and the wheel's radius not, in millimetres.
 pub(crate) fn systematic_mm(spec: &GrinderSpec, part: &Part, seed: u64) -> Vec<f64> {
     let waves = smooth(&mut stream(seed, Source::Waviness, 0), spec.waviness_correlation_mm, spec.waviness_um);
-    part.height.nodes().map(|[x, y]| 1e-3 * spec.systematic_um(part, [x, y]) + waves.height(x, y)).collect()
+    let mut error_mm: Vec<f64> = part.height.nodes().map(|place| 1e-3 * spec.systematic_um(part, place)).collect();
+    part.height.add(&waves, &mut error_mm);
+    error_mm
 }
 
 fn smooth(rng: &mut crate::Rng, correlation_mm: f64, rms_um: f64) -> FormError {
@@ -332,7 +334,7 @@ fn fixed_mm(state: &State, map: &Map, pass: &Pass) -> Vec<f64> {
     let rng = &mut stream(state.spec.seed, Source::Repeatability, state.passes_begun + 1);
     let fresh = smooth(rng, spec.repeatability_correlation_mm, spec.repeatability_um);
     let true_radius_mm = state.true_wheel_radius_mm.unwrap_or(pass.wheel_radius_mm + 1e-3 * spec.wheel_radius_error_um);
-    let [x0, _, y0, _] = grown(pass.extent_mm);
+    let y0 = grown(pass.extent_mm)[2];
     let lag_mm = 1e-3 * spec.following_um * pass.feed_mm_min / 1000.0;
     let nodes = part.height.nodes().zip(&state.systematic_mm);
     let steered = nodes.map(|([x, y], systematic)| {
@@ -343,9 +345,11 @@ fn fixed_mm(state: &State, map: &Map, pass: &Pass) -> Vec<f64> {
         let forth = if ((y - y0) / pass.track_spacing_mm).round() as i64 % 2 == 0 { 1.0 } else { -1.0 };
         let following = forth * lag_mm * p / slope2.sqrt();
         let wanted = pass.level_mm + displaced(state, map, x, y);
-        wanted + systematic + finite_or_zero(wheel + following) + fresh.height(x - x0, y - y0)
+        wanted + systematic + finite_or_zero(wheel + following)
     });
-    steered.collect()
+    let mut steered: Vec<f64> = steered.collect();
+    part.height.add(&fresh, &mut steered);
+    steered
 }
 
 /// Returns what this machine makes of the map at (x, y).

@@ -3,7 +3,6 @@
 mod common;
 
 use common::{best_fit, grind, map_of, net, pass, pv_rms_um};
-use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
 use regrind_sim::payload::Map;
 use regrind_sim::world::{World, WorldSpec};
@@ -36,18 +35,19 @@ fn cycles(spec: WorldSpec, count: u16, gain: f64) -> Vec<(f64, f64)> {
     let mut map: Map = map_of(HALF_MM, 1.0, |_, _| 0.0);
     let mut figures = Vec::new();
     for cycle in 0..count {
-        grind(&mut grinder, 1, cycle, &map, &pass(HALF_MM, -0.02 * f64::from(cycle)));
+        let level_mm = -0.02 * f64::from(cycle);
+        grind(&mut grinder, 1, cycle, &map, &pass(HALF_MM, level_mm));
         let mut seen = world.deviations_mm(&places);
         for value in &mut seen {
             let z: f64 = StandardNormal.sample(&mut rng);
-            *value += 0.3e-3 * z;
+            // A parallel surface is no moved surface: the level that was wanted comes off before the fit.
+            *value += 0.3e-3 * z - level_mm;
         }
         let left = best_fit(&world, &places, &seen);
         figures.push(pv_rms_um(&left));
         let correction = map_of(HALF_MM, 1.0, |x, y| low_passed(&places, &left, x, y));
         map.values_mm.iter_mut().zip(&correction.values_mm).for_each(|(u, c)| *u -= gain * c);
     }
-    let _ = rng.random::<u32>();
     figures
 }
 
