@@ -16,6 +16,7 @@
 pub mod cell;
 pub mod formats;
 pub mod geometry;
+pub mod journal;
 pub mod registration;
 pub mod report;
 pub mod surface;
