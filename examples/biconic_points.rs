@@ -21,7 +21,10 @@ height_mm = 44.0
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let surface = DefinedSurface::from_toml(SURFACE)?;
     let mut out = io::stdout().lock();
-    writeln!(out, "# Biconic of radii 140 and 90 mm, conic constants -0.5 and 0.3; millimetres, to the picometre\nx,y,z")?;
+    writeln!(
+        out,
+        "# Biconic of radii 140 and 90 mm, conic constants -0.5 and 0.3; millimetres, to the picometre\nx,y,z"
+    )?;
     for row in -22..=22 {
         for column in -30..=30 {
             let (x, y) = (f64::from(column), f64::from(row));
