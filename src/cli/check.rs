@@ -1,6 +1,7 @@
 //! `regrind check`: recipes and cell files, with every problem at its place.
 
-use std::io::{self, IsTerminal, Write};
+use std::fs::File;
+use std::io::{self, IsTerminal, Read, Write};
 use std::path::{Path, PathBuf};
 
 use clap::Args;
@@ -93,17 +94,19 @@ fn check(path: &Path) -> (&'static str, Result<String, Problems>) {
 
 /// Tells a cell file by what only it has, even if the rest is broken.
 fn is_cell_file(path: &Path) -> bool {
-    std::fs::read_to_string(path).is_ok_and(|text| {
-        let heads = ["[cell]", "[cmm", "[[cmm", "[grinder]", "[grinder.", "[[grinder"];
-        text.lines().any(|line| heads.iter().any(|head| line.trim_start().starts_with(head)))
-    })
+    const ENOUGH_BYTES: u64 = 1 << 20;
+    let mut bytes = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(ENOUGH_BYTES).read_to_end(&mut bytes));
+    let heads = ["[cell]", "[cmm", "[[cmm", "[grinder]", "[grinder.", "[[grinder"];
+    let text = String::from_utf8_lossy(&bytes);
+    read.is_ok() && text.lines().any(|line| heads.iter().any(|head| line.trim_start().starts_with(head)))
 }
 
 /// Reads the files that a recipe names.
 fn check_files(recipe: &Recipe) -> Result<(), Problems> {
     let mut problems: Option<Problems> = None;
     let mut add = |key: &str, failure: Failure| {
-        let more = recipe.problem(key, &format!("- {failure}"), "", "");
+        let more = recipe.problem(key, &format!("cannot be used: {failure}"), "", "");
         match &mut problems {
             None => problems = Some(more),
             Some(problems) => problems.problems.extend(more.problems),
@@ -132,6 +135,7 @@ pub(super) fn show(problems: &Problems) -> Result<(), Failure> {
             if handler.render_report(&mut text, &Shown::new(problems, problem)).is_err() {
                 text.push_str(&format!("{}: {problem}\n", problems.file.display()));
             }
+            text.push('\n');
         }
     } else {
         text = format!("{problems}\n");

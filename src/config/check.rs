@@ -395,6 +395,7 @@ fn reference_sphere(
 ) -> Option<ReferenceSphere> {
     let (centre_mm, radius_mm) = (written.centre_mm?, written.radius_mm?);
     if let Some((least, most)) = travel.and_then(|travel| travel.least_mm.zip(travel.most_mm))
+        && (0..3).all(|k| least[k] < most[k])
         && (0..3).any(|k| !(least[k]..=most[k]).contains(&centre_mm[k]))
     {
         let [x, y, z] = centre_mm;

@@ -9,10 +9,6 @@ use super::{Decimal, Parity, PointKind, RegisterMap, SignalKind, WordOrder};
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub(super) struct CellFile {
-    /// Schema of this file, for editors; not read.
-    #[serde(rename = "$schema")]
-    #[schemars(length(max = 400))]
-    _schema: Option<String>,
     /// The cell.
     #[schemars(extend("x-required" = true))]
     pub cell: CellTable,

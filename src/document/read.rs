@@ -90,8 +90,13 @@ impl<'t> Document<'t> {
     fn syntax(&mut self, error: &toml::de::Error) {
         let start = error.span().map_or(0, |span| span.start).min(self.text.len());
         let end = error.span().map_or(0, |span| span.end).clamp(start, self.text.len());
-        let nul = self.text.get(start..).is_some_and(|rest| rest.starts_with('\0'));
-        let remedy = if nul { "the file has NUL bytes: save it as plain text" } else { "correct the TOML here" };
+        let (before, rest) = (&self.text.as_bytes()[..start], self.text.as_bytes().get(start..).unwrap_or_default());
+        let after_digit = before.last().is_some_and(u8::is_ascii_digit);
+        let remedy = match rest.first() {
+            Some(0) => "the file has NUL bytes: save it as plain text",
+            Some(b',') if after_digit => "is it a decimal comma? write a decimal point",
+            _ => "correct the TOML here",
+        };
         self.push(start..end, String::new(), format!("no TOML: {}", error.message().trim()), "", remedy);
     }
 
@@ -294,7 +299,10 @@ impl Shape<'_, '_> {
         let empty = serde_json::Map::new();
         let properties = schema.get("properties").and_then(Schema::as_object).unwrap_or(&empty);
         for key in schema.get("required").and_then(Schema::as_array).into_iter().flatten().filter_map(Schema::as_str) {
-            if !table.contains_key(key) {
+            // A key written wrongly is told as that, not once more as missing.
+            let meant = |other: &str| nearest(other, properties.keys().map(String::as_str)) == Some(key);
+            let misspelt = |other: &str| !properties.contains_key(other) && meant(other);
+            if !table.contains_key(key) && !table.keys().take(MOST_PROBLEMS).any(|other| misspelt(other.as_ref())) {
                 self.missing(key, &properties[key]);
             }
         }
@@ -499,16 +507,16 @@ impl Shape<'_, '_> {
     }
 
     fn unknown(&mut self, key: &str, properties: &serde_json::Map<String, Schema>) -> bool {
-        let remedy = if let Some(near) = nearest(key, properties.keys().map(String::as_str)) {
-            format!("did you mean `{near}`?")
-        } else if let Some(table) = home_of(self.root, key, &mut Vec::new()) {
-            format!("it belongs into {table}")
-        } else {
-            "remove it".into()
-        };
-        let known: Vec<&str> = properties.keys().map(String::as_str).collect();
         let span = span_of_name(&self.document.places, &self.path);
-        let allowed = format!("known here are {}", known.join(", "));
+        let list =
+            || format!("known here are {}", properties.keys().map(String::as_str).collect::<Vec<_>>().join(", "));
+        let (allowed, remedy) = if let Some(near) = nearest(key, properties.keys().map(String::as_str)) {
+            ("there is no such key here".into(), format!("did you mean `{near}`?"))
+        } else if let Some(table) = home_of(self.root, key, &mut Vec::new()) {
+            (list(), format!("it belongs into {table}"))
+        } else {
+            (list(), "remove it".into())
+        };
         self.document.push(span, key_of(&self.path), "is unknown".into(), &allowed, &remedy);
         false
     }

@@ -86,6 +86,9 @@ fn beside(folder: &Path, path: &str) -> PathBuf {
 
 fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Option<NominalSource> {
     let from_formula = "keep `file`, or the tables [nominal.surface] and [nominal.aperture]";
+    if !document.is_there("nominal") {
+        return None;
+    }
     let Some(file) = &written.file else {
         if written.projection.is_some() {
             document.report("nominal.projection", "is for points of a file", "", "leave it out");
@@ -113,7 +116,7 @@ fn aperture(table: toml::Table, document: &mut Document) -> Option<Aperture> {
             Ok(()) => return Some(aperture),
             Err(error) => {
                 let key = format!("nominal.aperture.{}", error.key());
-                document.report(&key, error.to_string(), "", "correct the outline");
+                document.report(&key, in_place(error.key(), &error.to_string()), "", "");
             }
         },
     }
@@ -143,13 +146,22 @@ fn formula(written: &NominalTable, document: &mut Document) -> Option<NominalSou
         Ok(definition) => match definition.resolve() {
             Ok(defined) => return Some(NominalSource::Surface(Box::new(defined))),
             Err(error) => {
-                let key = error.key().map_or("nominal.surface".into(), |key| format!("nominal.{key}"));
-                // The sentence of the surface names the key, the limit and the remedy itself.
-                document.report(&key, format!("- {error}"), "", "");
+                let inner = error.key().unwrap_or_else(|| "surface".into());
+                // A term of a list, such as `terms.[0, 1]`, stands nowhere by that name.
+                let key = format!("nominal.{}", inner.split(".[").next().unwrap_or(&inner));
+                document.report(&key, in_place(&inner, &error.to_string()), "", "");
             }
         },
     }
     None
+}
+
+/// Takes the key from the beginning of a sentence that has it there, to stand behind the whole key.
+fn in_place(key: &str, sentence: &str) -> String {
+    match sentence.strip_prefix(&format!("`{key}` ")) {
+        Some(rest) => rest.to_owned(),
+        None => format!("is refused: {sentence}"),
+    }
 }
 
 fn measure(written: &MeasureTable, folder: &Path, document: &mut Document) -> Option<Measure> {
@@ -216,7 +228,10 @@ fn pattern(written: &MeasureTable, folder: &Path, document: &mut Document) -> Op
         _ => None,
     };
     // A key that is there and broken has been told of.
-    if found.is_none() && !takes.iter().any(|key| document.has_problem(&format!("measure.{key}"))) {
+    if found.is_none()
+        && document.is_there("measure")
+        && !takes.iter().any(|key| document.has_problem(&format!("measure.{key}")))
+    {
         let given: Vec<&str> =
             keys.iter().filter(|(key, there)| *there && takes.contains(key)).map(|(key, _)| *key).collect();
         let found = if given.is_empty() {
@@ -270,7 +285,7 @@ fn registration(written: &RegistrationTable, document: &mut Document) -> Registr
 fn acceptance(written: &AcceptanceTable, document: &mut Document) -> Acceptance {
     let broken = ["acceptance.pv_um", "acceptance.rms_um", "acceptance"].iter().any(|key| document.has_problem(key));
     match (written.pv_um, written.rms_um) {
-        (None, None) if !broken => {
+        (None, None) if !broken && document.is_there("acceptance") => {
             let remedy = "add `rms_um = 1.0`, or `pv_um = 7.0`, or both";
             document.report("acceptance", "has no limit", "at least one of `pv_um` and `rms_um` must be given", remedy);
         }
@@ -438,7 +453,9 @@ fn compare_with_size(written: &RecipeFile, size_mm: [f64; 2], document: &mut Doc
     {
         let apart = |size: f64, n: u32| size / f64::from(n.max(2) - 1);
         compare_cutoff(cutoff, apart(left_mm[0], columns).max(apart(left_mm[1], rows)), document);
-    } else if let (Some(spacing), Some(cutoff)) = (measure.spacing_mm, written.compensation.cutoff_mm) {
+    } else if let (Some(spacing), Some(cutoff)) = (measure.spacing_mm, written.compensation.cutoff_mm)
+        && spacing <= left_mm[0].min(left_mm[1])
+    {
         compare_cutoff(cutoff, spacing, document);
     }
 }

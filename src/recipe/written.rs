@@ -13,10 +13,6 @@ use crate::surface::Projection;
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub(super) struct RecipeFile {
-    /// Schema of this file, for editors; not read.
-    #[serde(rename = "$schema")]
-    #[schemars(length(max = 400))]
-    _schema: Option<String>,
     /// The part.
     #[schemars(extend("x-required" = true))]
     pub part: PartTable,
