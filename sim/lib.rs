@@ -8,6 +8,13 @@
 //!  shape   what the part should be: height, gradient, curvature in closed form
 //!  form    what grinding left on it: a smooth random error along the normal
 //!  probe   a ball that touches the part, in a frame of its own, with noise and outliers
+//!
+//!  world   the truth in one table, the two machines that share it, and queries for tests
+//!  part    the part as it really is, and exact contact with it
+//!  process the grinder: what a pass leaves, node by node along its path
+//!  cmm     the measuring machine: what it reports of a plan
+//!  payload the bytes of docs/modbus.md
+//!  body    what a machine's registers ask of its physics
 //! ```
 //!
 //! Units: millimetres and radians throughout. Frames: `shape` and `form` live in the model frame, the points a probe reports
