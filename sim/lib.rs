@@ -8,15 +8,27 @@
 //!  shape   what the part should be: height, gradient, curvature in closed form
 //!  form    what grinding left on it: a smooth random error along the normal
 //!  probe   a ball that touches the part, in a frame of its own, with noise and outliers
+//!
+//!  world   the truth in one table, the two machines that share it, and queries for tests
+//!  part    the part as it really is, and exact contact with it
+//!  process the grinder: what a pass leaves, node by node along its path
+//!  cmm     the measuring machine: what it reports of a plan
+//!  payload the bytes of docs/modbus.md
+//!  body    what a machine's registers ask of its physics
 //! ```
 //!
 //! Units: millimetres and radians throughout. Frames: `shape` and `form` live in the model frame, the points a probe reports
 //! in the frame of the measuring machine.
 
 pub mod body;
+pub mod cmm;
 pub mod form;
+pub mod part;
+pub mod payload;
 pub mod probe;
+pub mod process;
 pub mod shape;
+pub mod world;
 
 /// A position or a direction in space.
 pub type Vec3 = [f64; 3];
