@@ -121,9 +121,7 @@ fn nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> 
             let (file, identity) = formats::read_nominal_with_identity(path)?;
             let nominal = match file {
                 NominalFile::Points(points) => Nominal::from_points(points, *projection).map_err(of_surface)?,
-                NominalFile::Mesh { points, triangles } => {
-                    Nominal::from_mesh(points, triangles).map_err(of_surface)?
-                }
+                NominalFile::Mesh { points, triangles } => Nominal::from_mesh(points, triangles).map_err(of_surface)?,
                 NominalFile::Definition(text) => {
                     let surface = DefinedSurface::from_toml(&text).map_err(of_definition(path))?;
                     sampled(&surface, path)?
@@ -165,14 +163,10 @@ fn lay(recipe: &Recipe, nominal: &Nominal, side: Side) -> Result<Vec<Target>, Se
 fn sphere(recipe: &Recipe, cell: &CellConfig) -> Result<Option<Sphere>, SetupError> {
     match (recipe.measure.qualify, &cell.cmm.reference_sphere) {
         (false, _) => Ok(None),
-        (true, Some(sphere)) => Ok(Some(Sphere {
-            centre: sphere.centre,
-            radius_mm: sphere.radius_mm,
-            points: usize::from(sphere.points),
-        })),
-        (true, None) => {
-            Err(SetupError::NoSphere { recipe: recipe.path().to_owned(), cell: cell.path().to_owned() })
+        (true, Some(sphere)) => {
+            Ok(Some(Sphere { centre: sphere.centre, radius_mm: sphere.radius_mm, points: usize::from(sphere.points) }))
         }
+        (true, None) => Err(SetupError::NoSphere { recipe: recipe.path().to_owned(), cell: cell.path().to_owned() }),
     }
 }
 
@@ -256,9 +250,8 @@ fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
         OnTrouble::Stop => Disposal::Stop,
     };
     // A file that a person brings may take days; a wire answers.
-    let by_hand = [&cell.cmm.link.wire, &cell.grinder.link.wire]
-        .iter()
-        .any(|wire| matches!(wire, config::Wire::FileExchange(_)));
+    let by_hand =
+        [&cell.cmm.link.wire, &cell.grinder.link.wire].iter().any(|wire| matches!(wire, config::Wire::FileExchange(_)));
     let week = Duration::from_secs(7 * 86_400);
     let mut deadlines = Deadlines::default();
     if by_hand {

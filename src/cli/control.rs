@@ -128,11 +128,8 @@ fn show(reply: &Reply, request: &Request, json: bool) -> Result<(), Failure> {
     }
     let text = |key: &str| reply.status.get(key).map(|v| v.as_str().map_or(v.to_string(), str::to_owned));
     let marked = if reply.status["simulation"] == true { "SIMULATION  " } else { "" };
-    let mut words = format!(
-        "{marked}{}, cycle {}\n",
-        text("words").unwrap_or_default(),
-        text("cycle").unwrap_or_default()
-    );
+    let mut words =
+        format!("{marked}{}, cycle {}\n", text("words").unwrap_or_default(), text("cycle").unwrap_or_default());
     for row in reply.status["cycles"].as_array().into_iter().flatten() {
         let figure = |key: &str| row[key].as_f64().unwrap_or(f64::NAN);
         words += &format!("cycle {}: PV {:.2} um, rms {:.3} um\n", row["cycle"], figure("pv_um"), figure("rms_um"));

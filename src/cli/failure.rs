@@ -46,7 +46,9 @@ pub(super) enum Failure {
     Journal(regrind::journal::JournalError),
     #[error("{path}: {wire} cannot be opened: {source}; check the cell file and the machine")]
     Wire { path: PathBuf, wire: String, source: io::Error },
-    #[error("{path}: the two machines are reached in ways that do not go together; give both a Modbus wire, or both file exchange")]
+    #[error(
+        "{path}: the two machines are reached in ways that do not go together; give both a Modbus wire, or both file exchange"
+    )]
     WireKind { path: PathBuf },
     #[error("{path}: no control socket can be made there: {source}; give --runs a local folder with a shorter name")]
     ControlSocket { path: PathBuf, source: io::Error },

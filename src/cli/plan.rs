@@ -8,10 +8,10 @@ use regrind::recipe::Recipe;
 use regrind::setup;
 use serde::Serialize;
 
+use super::Outcome;
 use super::failure::Failure;
 use super::run::or_show;
 use super::words::{counted, three_digits};
-use super::Outcome;
 
 /// Print what a run would command, checked against every limit, without a device
 #[derive(Args, Debug)]

@@ -7,7 +7,8 @@ use regrind::formats::{place_link, remove_link};
 use regrind::recipe::Recipe;
 use regrind_sim::registers::{Layout, Machine, MachineOptions};
 use regrind_sim::wire::rtu::Line;
-use regrind_sim::wire::{Faults, Serving, SharedMachine};
+use regrind_sim::wire::faults::Faults;
+use regrind_sim::wire::{Serving, SharedMachine};
 use regrind_sim::words;
 use regrind_sim::world::{World, WorldSpec};
 use serde::Deserialize;
@@ -40,13 +41,16 @@ impl Drop for SimulatedCell {
 /// # Errors
 /// A recipe without one, and one that cannot be.
 pub(super) fn world_spec(recipe: &Recipe, seed: Option<u64>) -> Result<WorldSpec, Failure> {
-    let none = || Failure::Simulation {
+    let none = || {
+        Failure::Simulation {
         path: recipe.path().to_owned(),
         reason: "it has no table [simulation], which tells the simulator the true shape of the part; add one, or use a cell of real machines".into(),
+    }
     };
     let table = recipe.simulation.clone().ok_or_else(none)?;
     let failed = |reason: String| Failure::Simulation { path: recipe.path().to_owned(), reason };
-    let mut spec = WorldSpec::deserialize(toml::Value::Table(table)).map_err(|e| failed(format!("[simulation]: {e}")))?;
+    let mut spec =
+        WorldSpec::deserialize(toml::Value::Table(table)).map_err(|e| failed(format!("[simulation]: {e}")))?;
     spec.seed = seed.unwrap_or(spec.seed);
     spec.check().map_err(|e| failed(format!("[simulation]: {e}")))?;
     Ok(spec)
@@ -87,9 +91,9 @@ impl SimulatedCell {
         let names: Vec<String> = units.iter().map(|(unit, _)| format!("unit {unit}")).collect();
         match wire {
             Wire::ModbusTcp { host, port, .. } => {
-                let serving = Serving::tcp((host.as_str(), *port), units)
-                    .await
-                    .map_err(|e| format!("{host}:{port} cannot be served: {e}; choose another port, or end what holds it"))?;
+                let serving = Serving::tcp((host.as_str(), *port), units).await.map_err(|e| {
+                    format!("{host}:{port} cannot be served: {e}; choose another port, or end what holds it")
+                })?;
                 let bound = serving.local_addr().map_or(*port, |address| address.port());
                 self.places.push(format!("Modbus TCP {host}:{bound}, {}", names.join(" and ")));
                 self.servings.push(serving);
@@ -100,14 +104,19 @@ impl SimulatedCell {
                     .map_err(|e| format!("no pseudo-terminal can be had for {device}: {e}"))?;
                 let terminal = serving.path().map(Path::to_owned).unwrap_or_default();
                 place_link(&terminal, Path::new(device)).map_err(|e| {
-                    format!("{device} cannot be made a link to {}: {e}; remove what is there, or name another device", terminal.display())
+                    format!(
+                        "{device} cannot be made a link to {}: {e}; remove what is there, or name another device",
+                        terminal.display()
+                    )
                 })?;
                 self.links.push(device.into());
                 self.places.push(format!("Modbus RTU {device} at {baud} baud, {}", names.join(" and ")));
                 self.servings.push(serving);
                 Ok(0)
             }
-            Wire::FileExchange(_) => Err("a machine that is reached by files cannot be simulated; its files are yours to write".into()),
+            Wire::FileExchange(_) => {
+                Err("a machine that is reached by files cannot be simulated; its files are yours to write".into())
+            }
         }
     }
 }
