@@ -3,6 +3,8 @@
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
 
+use crate::Rng;
+
 /// A Gaussian random surface error with a Gaussian autocovariance, as a sum of plane waves.
 ///
 /// Many waves of random direction, phase and (Gaussian) wave number give heights that are Gaussian to the eye and exact
@@ -33,6 +35,21 @@ impl FormError {
         error
     }
 
+    /// Draws an error of a given correlation length and RMS (over the endless plane) from a generator.
+    ///
+    /// A wave of amplitude a has the mean square a^2/2.
+    pub fn with_rms(rng: &mut Rng, correlation_length_mm: f64, rms_mm: f64) -> Self {
+        let sigma = 2f64.sqrt() / correlation_length_mm;
+        let amplitude = rms_mm * (2.0 / 96.0f64).sqrt();
+        let waves = (0..96)
+            .map(|_| {
+                let [kx, ky]: [f64; 2] = std::array::from_fn(|_| StandardNormal.sample(&mut *rng));
+                [sigma * kx, sigma * ky, rng.random_range(0.0..std::f64::consts::TAU), amplitude]
+            })
+            .collect();
+        Self { waves }
+    }
+
     /// No error at all.
     pub fn none() -> Self {
         Self { waves: Vec::new() }
@@ -41,6 +58,28 @@ impl FormError {
     /// Returns the error at (x, y), in millimetres, positive where material stands proud.
     pub fn height(&self, x: f64, y: f64) -> f64 {
         self.waves.iter().map(|[kx, ky, phase, a]| a * (kx * x + ky * y + phase).cos()).sum()
+    }
+
+    /// Adds the error to values on a net, row by row, x fastest.
+    ///
+    /// From node to node a wave turns by the same angle, so each is a rotation of the one before: no cosine is called within
+    /// a row. Rounding adds up to some 1e-14 of the amplitude over a row of hundreds.
+    pub fn add_to_net(&self, first_mm: [f64; 2], step_mm: [f64; 2], columns: usize, values_mm: &mut [f64]) {
+        let turns: Vec<_> = self.waves.iter().map(|[kx, ..]| (kx * step_mm[0]).sin_cos()).collect();
+        for (j, row) in values_mm.chunks_mut(columns).enumerate() {
+            let y = first_mm[1] + j as f64 * step_mm[1];
+            let start = |[kx, ky, phase, a]: &[f64; 4]| {
+                let (sine, cosine) = (kx * first_mm[0] + ky * y + phase).sin_cos();
+                (a * sine, a * cosine)
+            };
+            let (mut sines, mut cosines): (Vec<f64>, Vec<f64>) = self.waves.iter().map(start).unzip();
+            for value in row {
+                *value += cosines.iter().sum::<f64>();
+                for ((sine, cosine), (turn_s, turn_c)) in sines.iter_mut().zip(&mut cosines).zip(&turns) {
+                    (*sine, *cosine) = (*sine * turn_c + *cosine * turn_s, *cosine * turn_c - *sine * turn_s);
+                }
+            }
+        }
     }
 
     /// Returns the derivatives of the error with respect to x and y.
@@ -57,5 +96,23 @@ impl FormError {
             .flat_map(|j| (0..=100).map(move |i| (i, j)))
             .map(|(i, j)| self.height(at(i, width_mm), at(j, depth_mm)))
             .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), h| (low.min(h), high.max(h)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_net_holds_what_the_places_do() {
+        let form = FormError::with_rms(&mut crate::rng(3), 8.0, 0.5);
+        let mut values = vec![1.0; 300 * 7];
+        form.add_to_net([-40.0, 3.0], [0.5, 2.5], 300, &mut values);
+        for (k, value) in values.iter().enumerate() {
+            let (x, y) = (-40.0 + 0.5 * (k % 300) as f64, 3.0 + 2.5 * (k / 300) as f64);
+            assert!((value - 1.0 - form.height(x, y)).abs() < 1e-12, "({x}, {y})");
+        }
+        let mean_square = values.iter().map(|v| (v - 1.0).powi(2)).sum::<f64>() / values.len() as f64;
+        assert!((0.3..0.7).contains(&mean_square.sqrt()), "{mean_square}");
     }
 }

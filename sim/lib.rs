@@ -22,15 +22,20 @@
 //! in the frame of the measuring machine.
 
 pub mod body;
+pub mod cmm;
 pub mod form;
 pub mod handshake;
+pub mod part;
+pub mod payload;
 pub mod probe;
+pub mod process;
 pub mod registers;
 pub mod seen;
 pub mod shape;
 pub mod transfer;
 pub mod wire;
 pub mod words;
+pub mod world;
 
 /// A position or a direction in space.
 pub type Vec3 = [f64; 3];

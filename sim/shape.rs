@@ -5,11 +5,13 @@ use crate::Vec3;
 /// A surface that is a height over the plane.
 ///
 /// Units: millimetres; `gradient` is dimensionless, `hessian` in 1/mm.
-pub trait Shape: Sync {
+pub trait Shape: Send + Sync {
     /// Returns z at (x, y).
     fn height(&self, x: f64, y: f64) -> f64;
     /// Returns dz/dx and dz/dy.
     fn gradient(&self, x: f64, y: f64) -> [f64; 2];
+    /// Returns the second derivatives of z: by x twice, by x and y, by y twice.
+    fn hessian(&self, x: f64, y: f64) -> [f64; 3];
 
     /// Returns the point of the surface above (x, y).
     fn point(&self, x: f64, y: f64) -> Vec3 {
@@ -75,6 +77,17 @@ impl Shape for FreeForm {
         }
         [self.scale * p, self.scale * q]
     }
+
+    fn hessian(&self, x: f64, y: f64) -> [f64; 3] {
+        let mut second = [1.0 / 210.0 + 3.6e-5 * x - 2.2e-5 * y, -2.2e-5 * x, -1.0 / 155.0];
+        for [kx, ky, phase, a] in RIPPLES {
+            let s = -a * (kx * x + ky * y + phase).sin();
+            second[0] += kx * kx * s;
+            second[1] += kx * ky * s;
+            second[2] += ky * ky * s;
+        }
+        second.map(|c| self.scale * c)
+    }
 }
 
 /// A cap of a sphere about the z axis, its vertex at the origin; a positive radius opens towards +z.
@@ -93,6 +106,12 @@ impl Shape for Sphere {
     fn gradient(&self, x: f64, y: f64) -> [f64; 2] {
         let root = (self.radius_mm * self.radius_mm - x * x - y * y).sqrt() * self.radius_mm.signum();
         [x / root, y / root]
+    }
+
+    fn hessian(&self, x: f64, y: f64) -> [f64; 3] {
+        let root2 = self.radius_mm * self.radius_mm - x * x - y * y;
+        let root3 = root2 * root2.sqrt() * self.radius_mm.signum();
+        [(root2 + x * x) / root3, x * y / root3, (root2 + y * y) / root3]
     }
 }
 
@@ -121,6 +140,22 @@ impl Shape for Biconic {
             2.0 * c * t / denominator + numerator * k * c * c * t / (root * denominator.powi(2))
         };
         [along(c[0], k[0], x), along(c[1], k[1], y)]
+    }
+
+    /// With the numerator N = sum c t^2, the root r of 1 - sum k c^2 t^2 and the denominator D = 1 + r, z = N / D.
+    fn hessian(&self, x: f64, y: f64) -> [f64; 3] {
+        let c = self.radius_mm.map(|r| 1.0 / r);
+        let a = [0, 1].map(|i| (1.0 + self.conic[i]) * c[i] * c[i]);
+        let root = (1.0 - a[0] * x * x - a[1] * y * y).sqrt();
+        let (n, d) = (c[0] * x * x + c[1] * y * y, 1.0 + root);
+        let (n1, r1) = ([2.0 * c[0] * x, 2.0 * c[1] * y], [-a[0] * x / root, -a[1] * y / root]);
+        let of = |i: usize, j: usize| {
+            let same = if i == j { 1.0 } else { 0.0 };
+            let n2 = same * 2.0 * c[i];
+            let r2 = (-same * a[i] - r1[i] * r1[j]) / root;
+            (n2 - (n1[i] * r1[j] + n1[j] * r1[i]) / d - n * r2 / d + 2.0 * n * r1[i] * r1[j] / (d * d)) / d
+        };
+        [of(0, 0), of(0, 1), of(1, 1)]
     }
 }
 
@@ -156,6 +191,17 @@ impl Shape for OffAxisAsphere {
         let slope_over_h = self.parent(u * u + y * y).1;
         [slope_over_h * u, slope_over_h * y]
     }
+
+    fn hessian(&self, x: f64, y: f64) -> [f64; 3] {
+        let u = x + self.shift_mm;
+        let h2 = u * u + y * y;
+        let c = 1.0 / self.radius_mm;
+        let root = (1.0 - (1.0 + self.conic) * c * c * h2).sqrt();
+        let slope_over_h = self.parent(h2).1;
+        // The derivative of the slope over h, by h, over h.
+        let bend = (1.0 + self.conic) * c.powi(3) / root.powi(3) + 8.0 * self.fourth;
+        [slope_over_h + bend * u * u, bend * u * y, slope_over_h + bend * y * y]
+    }
 }
 
 /// A shallow wave on a nearly flat part.
@@ -176,6 +222,65 @@ impl Shape for Wave {
         let (first, second) = ((0.21 * x + 0.3).cos(), (0.17 * y - 0.08 * x + 1.0).cos());
         [a * (0.21 * first - 0.08 * second), a * 0.17 * second]
     }
+
+    fn hessian(&self, x: f64, y: f64) -> [f64; 3] {
+        let a = -self.height_mm / 4.0;
+        let (first, second) = ((0.21 * x + 0.3).sin(), (0.17 * y - 0.08 * x + 1.0).sin());
+        [a * (0.21 * 0.21 * first + 0.08 * 0.08 * second), -a * 0.08 * 0.17 * second, a * 0.17 * 0.17 * second]
+    }
+}
+
+/// A sum of powers of x and y.
+#[derive(Clone, Debug)]
+pub struct XyPolynomial {
+    /// What x and y are divided by, in millimetres.
+    pub normalisation_radius_mm: f64,
+    /// The powers of x and of y, and the coefficient in millimetres.
+    pub terms: Vec<(u32, u32, f64)>,
+}
+
+impl XyPolynomial {
+    /// Sums the terms with each power differentiated `dx` and `dy` times.
+    fn derivative(&self, x: f64, y: f64, dx: u32, dy: u32) -> f64 {
+        let power = |t: f64, n: u32, times: u32| {
+            let factor: f64 = (0..times).map(|k| f64::from(n) - f64::from(k)).product();
+            if factor == 0.0 { 0.0 } else { factor * (t / self.normalisation_radius_mm).powi((n - times) as i32) }
+        };
+        let sum: f64 = self.terms.iter().map(|&(i, j, a)| a * power(x, i, dx) * power(y, j, dy)).sum();
+        sum / self.normalisation_radius_mm.powi((dx + dy) as i32)
+    }
+}
+
+impl Shape for XyPolynomial {
+    fn height(&self, x: f64, y: f64) -> f64 {
+        self.derivative(x, y, 0, 0)
+    }
+
+    fn gradient(&self, x: f64, y: f64) -> [f64; 2] {
+        [self.derivative(x, y, 1, 0), self.derivative(x, y, 0, 1)]
+    }
+
+    fn hessian(&self, x: f64, y: f64) -> [f64; 3] {
+        [self.derivative(x, y, 2, 0), self.derivative(x, y, 1, 1), self.derivative(x, y, 0, 2)]
+    }
+}
+
+/// A surface moved along z so that the origin lies on it.
+#[derive(Clone, Debug)]
+pub struct ThroughOrigin<S>(pub S);
+
+impl<S: Shape> Shape for ThroughOrigin<S> {
+    fn height(&self, x: f64, y: f64) -> f64 {
+        self.0.height(x, y) - self.0.height(0.0, 0.0)
+    }
+
+    fn gradient(&self, x: f64, y: f64) -> [f64; 2] {
+        self.0.gradient(x, y)
+    }
+
+    fn hessian(&self, x: f64, y: f64) -> [f64; 3] {
+        self.0.hessian(x, y)
+    }
 }
 
 #[cfg(test)]
@@ -183,13 +288,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gradients_are_the_derivatives_of_the_heights() {
-        let shapes: [&dyn Shape; 5] = [
+    fn gradients_and_hessians_are_the_derivatives_of_the_heights() {
+        let polynomial = XyPolynomial {
+            normalisation_radius_mm: 50.0,
+            terms: vec![(2, 0, 3.0), (1, 1, -0.7), (0, 3, 0.4), (4, 2, 0.2)],
+        };
+        let off_axis = OffAxisAsphere { radius_mm: 200.0, conic: -1.1, fourth: 2e-8, shift_mm: 60.0 };
+        let shapes: [&dyn Shape; 7] = [
             &FreeForm::default(),
             &Sphere { radius_mm: -80.0 },
             &Biconic { radius_mm: [90.0, -140.0], conic: [-0.7, 1.2] },
-            &OffAxisAsphere { radius_mm: 200.0, conic: -1.1, fourth: 2e-8, shift_mm: 60.0 },
+            &off_axis,
             &Wave { height_mm: 0.01 },
+            &polynomial,
+            &ThroughOrigin(off_axis),
         ];
         for (which, shape) in shapes.iter().enumerate() {
             for (x, y) in [(0.0, 0.0), (13.0, -7.0), (-41.0, 22.0)] {
@@ -198,6 +310,15 @@ mod tests {
                 let fd = |dx: f64, dy: f64| (shape.height(x + dx, y + dy) - shape.height(x - dx, y - dy)) / (2.0 * h);
                 assert!((p - fd(h, 0.0)).abs() < 1e-8, "shape {which} at ({x}, {y}): {p}");
                 assert!((q - fd(0.0, h)).abs() < 1e-8, "shape {which} at ({x}, {y}): {q}");
+                let [xx, xy, yy] = shape.hessian(x, y);
+                let second = |dx: f64, dy: f64| {
+                    let (a, b) = (shape.gradient(x + dx, y + dy), shape.gradient(x - dx, y - dy));
+                    [(a[0] - b[0]) / (2.0 * h), (a[1] - b[1]) / (2.0 * h)]
+                };
+                let ([fxx, fxy], [fyx, fyy]) = (second(h, 0.0), second(0.0, h));
+                for (exact, differences) in [(xx, fxx), (xy, fxy), (xy, fyx), (yy, fyy)] {
+                    assert!((exact - differences).abs() < 1e-8, "shape {which} at ({x}, {y}): {exact} {differences}");
+                }
             }
         }
     }

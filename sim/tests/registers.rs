@@ -1,10 +1,10 @@
 //! The handshake, register by register, without a wire and without a clock.
 
-mod common;
+mod counter;
 
 use std::time::Duration;
 
-use common::{Counter, digest, payloads};
+use counter::{Counter, digest, payloads};
 use regrind_sim::body::Kind;
 use regrind_sim::handshake::{Answer, Command, Frame, Mode, State, interlock};
 use regrind_sim::registers::{Exception, Layout, Machine, MachineOptions};

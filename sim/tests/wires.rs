@@ -1,12 +1,12 @@
 //! Both machines over real sockets and a real pseudo-terminal, asked by a client that is not ours; and wires that fail.
 
-mod common;
+mod counter;
 
 use std::future::Future;
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
-use common::{Counter, digest, payloads};
+use counter::{Counter, digest, payloads};
 use regrind_sim::body::Kind;
 use regrind_sim::handshake::{Command, Frame, State};
 use regrind_sim::registers::{Machine, MachineOptions};

@@ -1,134 +1,171 @@
-//! A machine whose physics is a counter, and payloads for it.
+//! A client in a few lines: payloads, whole jobs, and what is left of a deviation when the part may be moved.
 #![allow(dead_code)]
 
-use std::sync::{Arc, Mutex};
+use regrind_sim::body::{Body, Outcome, Payload, Payloads};
+use regrind_sim::cmm::CmmSpec;
+use regrind_sim::part::{Aperture, PartSpec, ShapeSpec};
+use regrind_sim::payload::{Feature, Map, Pass, PassRecord, Plan, PointRecord, Target, decode_points};
+use regrind_sim::process::{Grinder, GrinderSpec};
+use regrind_sim::world::{World, WorldSpec};
 
-use regrind_sim::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
-use regrind_sim::handshake::interlock;
+/// Identity of the part of these tests.
+pub const NOMINAL: [u8; 32] = [7; 32];
 
-/// What the handshake asked of the physics, in order, but for the time that passed.
-pub type Asked = Arc<Mutex<Vec<String>>>;
-
-/// A job is a number of seconds; a payload whose first byte is 0xEE is of another part.
-pub struct Counter {
-    pub kind: Kind,
-    pub length_s: f64,
-    pub done_s: f64,
-    pub fault: Arc<Mutex<u16>>,
-    pub interlocks: Arc<Mutex<u16>>,
-    pub asked: Asked,
-    pub got: Arc<Mutex<Payloads>>,
-    pub duration_s: f64,
-}
-
-impl Counter {
-    pub fn new(kind: Kind, length_s: f64) -> Self {
-        Self {
-            kind,
-            length_s,
-            done_s: 0.0,
-            fault: Arc::default(),
-            interlocks: Arc::new(Mutex::new(interlock::ALL)),
-            asked: Arc::default(),
-            got: Arc::default(),
-            duration_s: f64::NAN,
-        }
-    }
-
-    fn ask(&self, what: impl Into<String>) {
-        self.asked.lock().unwrap().push(what.into());
-    }
-
-    fn progress(&self) -> Progress {
-        Progress {
-            done: (10.0 * self.done_s).round() as u32,
-            total: (10.0 * self.length_s).round() as u32,
-            finished: self.done_s >= self.length_s,
-            fault: *self.fault.lock().unwrap(),
-        }
+/// A small part on which a pass takes no time, ground and measured without error.
+pub fn small_perfect() -> WorldSpec {
+    WorldSpec {
+        part: PartSpec {
+            shape: ShapeSpec::Sphere { radius_mm: 60.0 },
+            aperture: Aperture::Rectangle { half_x_mm: 15.0, half_y_mm: 10.0 },
+            form_error_um: 0.0,
+            ..PartSpec::default()
+        },
+        grinder: GrinderSpec::perfect(),
+        cmm: CmmSpec::perfect(),
+        ..WorldSpec::default()
     }
 }
 
-impl Body for Counter {
-    fn kind(&self) -> Kind {
-        self.kind
-    }
-
-    fn name(&self) -> String {
-        "COUNTER 7 of the simulated cell, serial number 12345".into()
-    }
-
-    fn check(&self, kind: u16, payload: &Payload) -> Result<(), Refusal> {
-        if payload.bytes[0] == 0xEE {
-            return Err(Refusal { answer: 8, reason: format!("payload {kind} is of another part") });
-        }
-        Ok(())
-    }
-
-    fn prepare(&mut self, job: u32, _: u16, payloads: &Payloads) -> Result<Progress, Refusal> {
-        if job == 666 {
-            return Err(Refusal { answer: 10, reason: "the wheel is too large".into() });
-        }
-        self.done_s = 0.0;
-        *self.got.lock().unwrap() = payloads.clone();
-        Ok(self.progress())
-    }
-
-    fn begin(&mut self) {
-        self.duration_s = 0.0;
-        self.ask("begin");
-    }
-
-    fn advance(&mut self, seconds: f64) -> Progress {
-        assert!(seconds > 0.0 && seconds.is_finite(), "{seconds}");
-        self.done_s += seconds;
-        self.duration_s += seconds;
-        self.progress()
-    }
-
-    fn retract(&mut self) {
-        self.ask("retract");
-    }
-
-    fn outcome(&mut self, result: u16) -> Outcome {
-        self.ask(format!("outcome {result}"));
-        let (kind, format, bytes, records) = match self.kind {
-            Kind::Cmm => (4, 2, (0..31 * 20).map(|i| i as u8).collect::<Vec<u8>>(), 31),
-            Kind::Grinder => (5, 1, (100..164).collect(), 1),
-        };
-        Outcome {
-            kind,
-            format,
-            bytes,
-            records,
-            coordinates: u16::from(self.kind == Kind::Cmm),
-            probe_radius_mm: 1.5,
-            scale_mm: 1e-5,
-            temperature_c: 20.25,
-            duration_s: self.duration_s,
-        }
-    }
-
-    fn interlocks(&self) -> u16 {
-        *self.interlocks.lock().unwrap()
-    }
-
-    fn temperature_c(&self) -> f64 {
-        -1.5
+/// A finishing pass over a part of the given half sizes.
+pub fn pass(half_mm: [f64; 2], level_mm: f64) -> Pass {
+    Pass {
+        spark_out: 1,
+        wheel_radius_mm: 40.0,
+        feed_mm_min: 1500.0,
+        track_spacing_mm: 1.0,
+        level_mm,
+        depth_of_cut_mm: 0.02,
+        extent_mm: [-half_mm[0], half_mm[0], -half_mm[1], half_mm[1]],
+        nominal: NOMINAL,
     }
 }
 
-/// Returns the payloads that a kind of machine needs: kind, bytes, identity.
-pub fn payloads(kind: Kind) -> Vec<(u16, Vec<u8>, [u8; 32])> {
-    let bytes = |length: usize| (0..length).map(|i| (i % 251) as u8).collect::<Vec<u8>>();
-    match kind {
-        Kind::Cmm => vec![(1, bytes(64 + 31 * 56), [11; 32])],
-        Kind::Grinder => vec![(2, bytes(96 + 8 * 63), [22; 32]), (3, bytes(128), [33; 32])],
+/// A map on a net about the origin.
+pub fn map_of(half_mm: [f64; 2], spacing_mm: f64, value_mm: impl Fn(f64, f64) -> f64) -> Map {
+    let [columns, rows] = half_mm.map(|half| (2.0 * half / spacing_mm).round() as u32 + 1);
+    let place = |k: u32, half: f64| f64::from(k) * spacing_mm - half;
+    let values_mm = (0..rows)
+        .flat_map(|j| (0..columns).map(move |i| (i, j)))
+        .map(|(i, j)| value_mm(place(i, half_mm[0]), place(j, half_mm[1])))
+        .collect();
+    let first_mm = half_mm.map(|half| -half);
+    Map { columns, rows, first_mm, spacing_mm: [spacing_mm; 2], nominal: NOMINAL, values_mm }
+}
+
+pub fn zero_map(half_mm: [f64; 2]) -> Map {
+    map_of(half_mm, half_mm[0], |_, _| 0.0)
+}
+
+pub fn grinder_payloads(map: &Map, pass: &Pass) -> Payloads {
+    let payload = |bytes: Vec<u8>, kind: u8| Some(Payload { bytes, identity: [kind; 32] });
+    Payloads { plan: None, map: payload(map.encode(), 2), pass: payload(pass.encode(), 3) }
+}
+
+pub fn cmm_payloads(plan: &Plan) -> Payloads {
+    Payloads { plan: Some(Payload { bytes: plan.encode(), identity: [1; 32] }), ..Payloads::default() }
+}
+
+/// Goes on in steps until the machine has finished; panics on a fault.
+pub fn run(machine: &mut impl Body, step_s: f64) {
+    while !{
+        let progress = machine.advance(step_s);
+        assert_eq!(progress.fault, 0);
+        progress.finished
+    } {}
+}
+
+/// A whole pass.
+pub fn grind(grinder: &mut Grinder, job: u32, cycle: u16, map: &Map, pass: &Pass) -> PassRecord {
+    grinder.prepare(job, cycle, &grinder_payloads(map, pass)).unwrap();
+    grinder.begin();
+    run(grinder, 7.0);
+    PassRecord::decode(&grinder.outcome(1).bytes).unwrap()
+}
+
+/// A plan for places over the nominal surface of a world, touched along the normals.
+pub fn plan(world: &World, places_mm: &[[f64; 2]]) -> Plan {
+    let target = |(index, [x, y]): (usize, &[f64; 2])| {
+        let (point_mm, normal) = world.nominal(*x, *y);
+        Target { index: index as u32, feature: Feature::Part, point_mm, normal }
+    };
+    Plan {
+        probe_radius_mm: 1.5,
+        approach_mm: 4.0,
+        search_mm: 4.0,
+        speed_mm_s: 3.0,
+        safe_height_mm: 20.0,
+        targets: places_mm.iter().enumerate().map(target).collect(),
     }
 }
 
-/// Returns the digest of those payloads.
-pub fn digest(kind: Kind) -> u32 {
-    let identities: Vec<u8> = payloads(kind).into_iter().flat_map(|(_, _, identity)| identity).collect();
-    crc32fast::hash(&identities)
+/// A whole measurement.
+pub fn measure(cmm: &mut impl Body, plan: &Plan) -> (Outcome, Vec<PointRecord>) {
+    cmm.prepare(1, 0, &cmm_payloads(plan)).unwrap();
+    cmm.begin();
+    run(cmm, 100.0);
+    let outcome = cmm.outcome(1);
+    let records = decode_points(&outcome.bytes, (outcome.format == 2).then_some(outcome.scale_mm)).unwrap();
+    (outcome, records)
+}
+
+/// Places on a net about the origin.
+pub fn net(half_mm: [f64; 2], spacing_mm: f64) -> Vec<[f64; 2]> {
+    let steps = half_mm.map(|half| (2.0 * half / spacing_mm).floor() as i32);
+    let place = |k: i32, steps: i32| (f64::from(k) - f64::from(steps) / 2.0) * spacing_mm;
+    (0..=steps[1]).flat_map(|j| (0..=steps[0]).map(move |i| [place(i, steps[0]), place(j, steps[1])])).collect()
+}
+
+/// Takes out of deviations what moving the part would: the six rigid motions, by least squares.
+pub fn best_fit(world: &World, places_mm: &[[f64; 2]], deviations_mm: &[f64]) -> Vec<f64> {
+    let rows: Vec<[f64; 6]> = places_mm
+        .iter()
+        .map(|&[x, y]| {
+            let (p, n) = world.nominal(x, y);
+            let turn = [p[1] * n[2] - p[2] * n[1], p[2] * n[0] - p[0] * n[2], p[0] * n[1] - p[1] * n[0]];
+            [n[0], n[1], n[2], turn[0] / 50.0, turn[1] / 50.0, turn[2] / 50.0]
+        })
+        .collect();
+    let mut normal = [[0.0; 7]; 6];
+    for (row, d) in rows.iter().zip(deviations_mm) {
+        for i in 0..6 {
+            for j in 0..6 {
+                normal[i][j] += row[i] * row[j];
+            }
+            normal[i][6] += row[i] * d;
+        }
+    }
+    let motion = eliminate(normal);
+    rows.iter().zip(deviations_mm).map(|(row, d)| d - (0..6).map(|i| row[i] * motion[i]).sum::<f64>()).collect()
+}
+
+/// Gauss and Jordan on a symmetric system; a motion that the surface does not see stays 0.
+fn eliminate(mut a: [[f64; 7]; 6]) -> [f64; 6] {
+    let scale = (0..6).map(|i| a[i][i]).fold(0.0, f64::max);
+    let mut solution = [0.0; 6];
+    for k in 0..6 {
+        if a[k][k] < 1e-12 * scale {
+            a[k] = [0.0; 7];
+            a[k][k] = 1.0;
+        }
+        let pivot = a[k][k];
+        a[k].iter_mut().for_each(|value| *value /= pivot);
+        let row = a[k];
+        for (i, other) in a.iter_mut().enumerate().filter(|(i, _)| *i != k) {
+            let factor = other[k];
+            other.iter_mut().zip(row).for_each(|(value, r)| *value -= factor * r);
+            let _ = i;
+        }
+    }
+    for (k, value) in solution.iter_mut().enumerate() {
+        *value = a[k][6];
+    }
+    solution
+}
+
+/// Peak to valley and root of the mean square, in micrometres.
+pub fn pv_rms_um(deviations_mm: &[f64]) -> (f64, f64) {
+    let (low, high) =
+        deviations_mm.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), d| (d.min(low), d.max(high)));
+    let square = deviations_mm.iter().map(|d| d * d).sum::<f64>() / deviations_mm.len() as f64;
+    (1e3 * (high - low), 1e3 * square.sqrt())
 }

@@ -1,0 +1,432 @@
+//! The measuring machine: it has the part in a place of its own, and touches the real surface exactly.
+//!
+//! A target names a point and a normal in the machine's frame, where the client believes the part to be. The ball comes down
+//! that line and stops where it touches the part as it really lies and is: misplaced, a little shifted at every loading,
+//! grown by its temperature, ground as it was ground, with a ball whose true radius is the stated one plus an error.
+//! What is reported is the centre of the ball at that moment, with
+//!
+//! * noise: Gaussian, independent on each axis of the machine,
+//! * outliers: a share of the points moved by up to the given size in any direction (dust, a false trigger), said to be good,
+//! * points not found: a share of the touches that the probe head misses.
+//!
+//! A ball that touches before the search begins backs off and reports "not reached"; after too many of these the machine
+//! stops with fault 2, for then the part lies quite otherwise than the plan says. The part's rim is not modelled: beyond the aperture nothing is
+//! found. A target beyond the travel is refused before anything moves.
+
+use std::sync::{Arc, Mutex};
+
+use rand::RngExt;
+use rand_distr::{Distribution, StandardNormal};
+use serde::{Deserialize, Serialize};
+
+use crate::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
+use crate::part::{Approach, Contact, touch_sphere};
+use crate::payload::{BROKEN, Feature, INTERLOCK, Plan, PointRecord, Status, Target, encode_points, outside};
+use crate::probe::Placement;
+use crate::process::nothing_done;
+use crate::world::{Faults, Source, State, locked, stream};
+use crate::{Rng, Vec3};
+
+/// Millimetres per count of scaled points: a nanometre.
+pub const COUNT_MM: f64 = 1e-6;
+/// Temperature at which lengths are what drawings say, in degrees Celsius.
+const REFERENCE_C: f64 = 20.0;
+
+/// Where the part lies on the measuring machine, and what is wrong with the machine.
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct CmmSpec {
+    /// Where the origin of the model frame lies in the machine's frame.
+    pub translation_mm: Vec3,
+    /// How the part is turned, about x, then y, then z.
+    pub rotation_deg: Vec3,
+    /// Standard deviation of the part's place from loading to loading, along each axis.
+    pub loading_shift_um: f64,
+    /// The same for its angles.
+    pub loading_turn_deg: f64,
+    /// Standard deviation of a reported coordinate, on each axis.
+    pub noise_um: f64,
+    /// Share of the touches that are outliers.
+    pub outlier_share: f64,
+    /// Largest shift of an outlier.
+    pub outlier_um: f64,
+    /// Share of the touches that are missed.
+    pub not_found_share: f64,
+    /// True radius of the ball less the one that the plan states.
+    pub probe_radius_error_um: f64,
+    /// Temperature of the part while it is measured.
+    pub part_temperature_c: f64,
+    /// Its expansion per kelvin.
+    pub cte_per_k: f64,
+    /// Radius of the reference sphere on the table.
+    pub sphere_radius_mm: f64,
+    /// Its centre in the machine's frame.
+    pub sphere_centre_mm: Vec3,
+    /// Least coordinates that the ball's centre comes to.
+    pub travel_least_mm: Vec3,
+    /// Most.
+    pub travel_most_mm: Vec3,
+    /// Time that a point takes.
+    pub seconds_per_point: f64,
+    /// Touches before the search begins that the machine puts up with in one measurement.
+    pub unexpected_touches_most: u32,
+    /// Points are sent as 32-bit counts of a nanometre (format 2) in place of floats (format 1).
+    pub scaled_points: bool,
+}
+
+impl Default for CmmSpec {
+    fn default() -> Self {
+        Self {
+            translation_mm: [0.8, -0.5, 0.3],
+            rotation_deg: [0.2, -0.15, 0.4],
+            loading_shift_um: 20.0,
+            loading_turn_deg: 0.005,
+            noise_um: 0.3,
+            outlier_share: 0.0,
+            outlier_um: 200.0,
+            not_found_share: 0.0,
+            probe_radius_error_um: 0.0,
+            part_temperature_c: REFERENCE_C,
+            cte_per_k: 0.55e-6,
+            sphere_radius_mm: 12.5,
+            sphere_centre_mm: [0.0, 120.0, 20.0],
+            travel_least_mm: [-500.0, -500.0, -300.0],
+            travel_most_mm: [500.0, 500.0, 400.0],
+            seconds_per_point: 1.0,
+            unexpected_touches_most: 20,
+            scaled_points: false,
+        }
+    }
+}
+
+impl CmmSpec {
+    /// A machine without noise, that has the part where it should be.
+    pub fn perfect() -> Self {
+        Self {
+            translation_mm: [0.0; 3],
+            rotation_deg: [0.0; 3],
+            loading_shift_um: 0.0,
+            loading_turn_deg: 0.0,
+            noise_um: 0.0,
+            ..Self::default()
+        }
+    }
+
+    /// Returns where the part lies after the n-th loading; 0 is where the table says.
+    pub(crate) fn placement(&self, faults: &Faults, seed: u64, loading: u32) -> Placement {
+        let mut rng = stream(seed, Source::Loading, loading);
+        let mut about = |middle: Vec3, sigma: f64| -> Vec3 {
+            middle.map(|c| {
+                let z: f64 = StandardNormal.sample(&mut rng);
+                if loading == 0 { c } else { c + sigma * z }
+            })
+        };
+        let shift = about(self.translation_mm, 1e-3 * self.loading_shift_um);
+        let turn = about(self.rotation_deg, self.loading_turn_deg);
+        let mut placement = Placement::new(shift, turn);
+        if faults.part_turned_180 {
+            for row in &mut placement.rotation {
+                (row[0], row[1]) = (-row[0], -row[1]);
+            }
+        }
+        placement
+    }
+
+    /// Returns the size of the part over its size on the drawing.
+    fn growth(&self) -> f64 {
+        1.0 + self.cte_per_k * (self.part_temperature_c - REFERENCE_C)
+    }
+
+    /// Refuses a plan that leads the probe beyond its travel.
+    fn reaches(&self, plan: &Plan) -> Result<(), Refusal> {
+        let highest = plan.targets.iter().map(|t| t.point_mm[2]).fold(f64::NEG_INFINITY, f64::max);
+        let travel_mm = highest + plan.safe_height_mm;
+        let (least, most) = (self.travel_least_mm, self.travel_most_mm);
+        let check = |name: &str, value: f64, axis: usize| {
+            if (least[axis]..=most[axis]).contains(&value) {
+                return Ok(());
+            }
+            Err(outside(name, value, &format!("{} to {}", least[axis], most[axis])))
+        };
+        check("height of the travel in mm", travel_mm, 2)?;
+        for target in &plan.targets {
+            let way = way(target, plan, plan.probe_radius_mm);
+            for t in [way.from_mm, way.to_mm] {
+                for axis in 0..3 {
+                    let value = way.point_mm[axis] + t * way.direction[axis];
+                    check(&format!("coordinate {axis} of the way to target {} in mm", target.index), value, axis)?;
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Returns the way of the centre of a ball of the given radius to a target; the machine steers by the stated radius.
+fn way(target: &Target, plan: &Plan, radius_mm: f64) -> Approach {
+    Approach {
+        point_mm: target.point_mm,
+        direction: target.normal,
+        radius_mm,
+        from_mm: plan.approach_mm + plan.probe_radius_mm,
+        to_mm: plan.probe_radius_mm - plan.search_mm,
+    }
+}
+
+/// Returns a direction in the part's frame.
+fn turned_back(placement: &Placement, v: Vec3) -> Vec3 {
+    std::array::from_fn(|i| (0..3).map(|k| placement.rotation[k][i] * v[k]).sum())
+}
+
+/// A measurement, made ready or going on.
+struct Run {
+    plan: Plan,
+    placement: Placement,
+    records: Vec<PointRecord>,
+    /// Unexpected touches so far.
+    unexpected: u32,
+    fault: u16,
+    elapsed_s: f64,
+    noise: Rng,
+    outliers: Rng,
+    not_found: Rng,
+}
+
+impl Run {
+    fn new(plan: Plan) -> Self {
+        let rng = || crate::rng(0);
+        let (noise, outliers, not_found) = (rng(), rng(), rng());
+        let placement = Placement::IDENTITY;
+        Self {
+            plan,
+            placement,
+            records: Vec::new(),
+            unexpected: 0,
+            fault: 0,
+            elapsed_s: 0.0,
+            noise,
+            outliers,
+            not_found,
+        }
+    }
+
+    fn begin(&mut self, state: &mut State) {
+        state.measurements_begun += 1;
+        self.placement = state.load_on_table();
+        let draw = |source| stream(state.spec.seed, source, state.measurements_begun);
+        self.noise = draw(Source::Noise);
+        self.outliers = draw(Source::Outliers);
+        self.not_found = draw(Source::NotFound);
+    }
+
+    fn finished(&self) -> bool {
+        self.records.len() == self.plan.targets.len()
+    }
+
+    /// Touches one target.
+    fn measure(&mut self, state: &State, target: &Target) -> PointRecord {
+        let spec = &state.spec.cmm;
+        let shift = self.disturbance(spec);
+        let missed = self.not_found.random::<f64>() < spec.not_found_share;
+        let touched = match self.contact(state, target) {
+            Contact::Unexpected => Err(Status::NotReached),
+            Contact::Missed => Err(Status::NotFound),
+            Contact::Touched { .. } if missed => Err(Status::NotFound),
+            Contact::Touched { centre_mm, .. } => Ok(std::array::from_fn(|i| centre_mm[i] + shift[i])),
+        };
+        match touched {
+            Ok(centre_mm) => {
+                let position_mm = reported(&state.spec.faults, target, self.plan.probe_radius_mm, centre_mm);
+                PointRecord { index: target.index, status: Status::Touched, quality: 0, position_mm }
+            }
+            Err(status) => {
+                self.unexpected += u32::from(status == Status::NotReached);
+                untouched(target, status)
+            }
+        }
+    }
+
+    /// Returns the contact in the machine's frame.
+    fn contact(&self, state: &State, target: &Target) -> Contact {
+        let spec = &state.spec.cmm;
+        let in_machine = way(target, &self.plan, self.plan.probe_radius_mm + 1e-3 * spec.probe_radius_error_um);
+        if target.feature == Feature::ReferenceSphere {
+            return touch_sphere(spec.sphere_centre_mm, spec.sphere_radius_mm, &in_machine);
+        }
+        if state.spec.faults.no_part {
+            return Contact::Missed;
+        }
+        // The grown part touched by the ball is the part of the drawing touched by a ball as much smaller.
+        let growth = spec.growth();
+        let shifted = std::array::from_fn(|i| in_machine.point_mm[i] - self.placement.translation_mm[i]);
+        let in_part = Approach {
+            point_mm: turned_back(&self.placement, shifted).map(|c| c / growth),
+            direction: turned_back(&self.placement, in_machine.direction),
+            radius_mm: in_machine.radius_mm / growth,
+            from_mm: in_machine.from_mm / growth,
+            to_mm: in_machine.to_mm / growth,
+        };
+        match state.part.touch(&in_part) {
+            Contact::Touched { centre_mm, foot_mm } => {
+                Contact::Touched { centre_mm: self.placement.apply(centre_mm.map(|c| c * growth)), foot_mm }
+            }
+            other => other,
+        }
+    }
+
+    /// Draws noise and outlier of a touch; the same numbers whether or not it is used.
+    fn disturbance(&mut self, spec: &CmmSpec) -> Vec3 {
+        let normal = |rng: &mut Rng| -> f64 { StandardNormal.sample(rng) };
+        let noise: Vec3 = std::array::from_fn(|_| 1e-3 * spec.noise_um * normal(&mut self.noise));
+        let is_outlier = self.outliers.random::<f64>() < spec.outlier_share;
+        let size_mm = 1e-3 * spec.outlier_um * self.outliers.random::<f64>();
+        let direction: Vec3 = std::array::from_fn(|_| normal(&mut self.outliers));
+        let norm = direction.iter().map(|c| c * c).sum::<f64>().sqrt();
+        if !is_outlier || norm == 0.0 {
+            return noise;
+        }
+        std::array::from_fn(|i| noise[i] + size_mm * direction[i] / norm)
+    }
+}
+
+fn untouched(target: &Target, status: Status) -> PointRecord {
+    PointRecord { index: target.index, status, quality: 100, position_mm: [0.0; 3] }
+}
+
+/// Returns what this machine says of a centre.
+fn reported(faults: &Faults, target: &Target, stated_radius_mm: f64, centre_mm: Vec3) -> Vec3 {
+    let back = if faults.returns_contact_points { stated_radius_mm } else { 0.0 };
+    let unit = if faults.inches { 25.4 } else { 1.0 };
+    std::array::from_fn(|i| (centre_mm[i] - back * target.normal[i]) / unit)
+}
+
+/// The measuring machine of a world.
+pub struct Cmm {
+    world: Arc<Mutex<State>>,
+    ready: Option<Run>,
+    running: Option<Run>,
+}
+
+impl Cmm {
+    pub(crate) fn new(world: Arc<Mutex<State>>) -> Self {
+        Self { world, ready: None, running: None }
+    }
+}
+
+fn progress(run: &Run) -> Progress {
+    Progress {
+        done: run.records.len() as u32,
+        total: run.plan.targets.len() as u32,
+        finished: run.finished(),
+        fault: run.fault,
+    }
+}
+
+impl Body for Cmm {
+    fn kind(&self) -> Kind {
+        Kind::Cmm
+    }
+
+    fn name(&self) -> String {
+        "SIMULATED CMM 1".to_owned()
+    }
+
+    fn check(&self, kind: u16, payload: &Payload) -> Result<(), Refusal> {
+        if kind != 1 {
+            return Err(Refusal { answer: BROKEN, reason: format!("a CMM has no use for a payload of kind {kind}") });
+        }
+        let plan = Plan::decode(&payload.bytes)?;
+        locked(&self.world).spec.cmm.reaches(&plan)
+    }
+
+    fn prepare(&mut self, _job: u32, _cycle: u16, payloads: &Payloads) -> Result<Progress, Refusal> {
+        self.ready = None;
+        let missing = || Refusal { answer: BROKEN, reason: "there is no plan".to_owned() };
+        let plan = Plan::decode(&payloads.plan.as_ref().ok_or_else(missing)?.bytes)?;
+        let state = locked(&self.world);
+        state.spec.cmm.reaches(&plan)?;
+        if state.taken_by_other(Kind::Cmm) {
+            return Err(Refusal { answer: INTERLOCK, reason: "the part is in the grinder".to_owned() });
+        }
+        let run = Run::new(plan);
+        let first = progress(&run);
+        self.ready = Some(run);
+        Ok(first)
+    }
+
+    fn begin(&mut self) {
+        let Some(mut run) = self.ready.take() else { return };
+        let mut state = locked(&self.world);
+        if state.take(Kind::Cmm) {
+            run.begin(&mut state);
+            self.running = Some(run);
+        }
+    }
+
+    fn advance(&mut self, seconds: f64) -> Progress {
+        let mut state = locked(&self.world);
+        let Some(run) = self.running.as_mut() else {
+            // Nothing was begun: something else has the part.
+            return Progress { done: 0, total: 0, finished: false, fault: 1 };
+        };
+        if seconds > 0.0 && seconds.is_finite() {
+            run.elapsed_s += seconds;
+        }
+        state.engaged = Some(Kind::Cmm);
+        let (each_s, most) = (state.spec.cmm.seconds_per_point, state.spec.cmm.unexpected_touches_most);
+        while run.fault == 0 && !run.finished() && (run.records.len() + 1) as f64 * each_s <= run.elapsed_s {
+            let target = run.plan.targets[run.records.len()];
+            let record = run.measure(&state, &target);
+            run.records.push(record);
+            if run.unexpected > most {
+                run.fault = 2;
+            }
+        }
+        if run.finished() || run.fault != 0 {
+            state.clear(Kind::Cmm);
+        }
+        progress(run)
+    }
+
+    fn retract(&mut self) {
+        locked(&self.world).clear(Kind::Cmm);
+    }
+
+    fn outcome(&mut self, _result: u16) -> Outcome {
+        let mut state = locked(&self.world);
+        self.ready = None;
+        let Some(mut run) = self.running.take() else { return nothing_done(state.spec.cmm.part_temperature_c) };
+        state.release(Kind::Cmm);
+        let (spec, faults) = (&state.spec.cmm, &state.spec.faults);
+        let duration_s = run.elapsed_s.min(run.plan.targets.len() as f64 * spec.seconds_per_point);
+        let rest = run.plan.targets[run.records.len()..].iter();
+        run.records.extend(rest.map(|target| untouched(target, Status::NotReached)));
+        let kept = run.records.len().saturating_sub(faults.missing_records as usize);
+        run.records.truncate(kept);
+        let scale = spec.scaled_points.then_some(COUNT_MM);
+        if let (true, Some(record)) = (faults.non_finite_point, run.records.get_mut(kept / 2)) {
+            record.position_mm[0] = f64::NAN;
+        }
+        let outcome = Outcome {
+            kind: 4,
+            format: if spec.scaled_points { 2 } else { 1 },
+            bytes: encode_points(&run.records, scale),
+            records: kept as u32,
+            coordinates: if faults.returns_contact_points && faults.contact_points_declared { 2 } else { 1 },
+            probe_radius_mm: run.plan.probe_radius_mm,
+            scale_mm: scale.unwrap_or(1.0),
+            temperature_c: spec.part_temperature_c,
+            duration_s,
+        };
+        state.heat *= (-duration_s / state.spec.grinder.thermal_tau_s).exp();
+        outcome
+    }
+
+    fn interlocks(&self) -> u16 {
+        locked(&self.world).interlocks(Kind::Cmm)
+    }
+
+    fn temperature_c(&self) -> f64 {
+        locked(&self.world).spec.cmm.part_temperature_c
+    }
+}

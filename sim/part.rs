@@ -1,0 +1,584 @@
+//! The part as it really is: a closed form plus a height error that grinding changes, and the ball that touches it.
+//!
+//! The height error h stands on a fine grid over the part and a little beyond, in millimetres along the nominal normal,
+//! and is interpolated by bicubic convolution (Catmull-Rom), which has a continuous gradient. That interpolation is the
+//! truth: the real surface is r(x, y) = S(x, y) + h(x, y) n(x, y), and its tangents
+//!
+//! ```text
+//!  r_x = S_x + h_x n + h n_x,    r_y = S_y + h_y n + h n_y
+//! ```
+//!
+//! are exact, with the derivative of n from the second derivatives of the closed form. A ball of radius R travelling along
+//! p + t d touches where r + R m = p + t d, m the unit normal of r: three equations for x, y, t, solved by Newton's method.
+//! The slopes that Newton steps with are differences; what they lead to is the root of the exact equations.
+
+use serde::{Deserialize, Serialize};
+
+use crate::Vec3;
+use crate::form::FormError;
+use crate::shape::{Biconic, FreeForm, OffAxisAsphere, Shape, Sphere, ThroughOrigin, Wave, XyPolynomial};
+
+/// Distance of the grid's nodes in millimetres; more on a part so large that the grid would have over 400 nodes along.
+pub const NODE_SPACING_MM: f64 = 0.5;
+/// Nodes beyond the aperture on every side, so that interpolation at the edge has its neighbours.
+const MARGIN_NODES: usize = 2;
+
+/// The part and its blank, as the world's table says.
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PartSpec {
+    /// What it should be.
+    pub shape: ShapeSpec,
+    /// Where it is.
+    pub aperture: Aperture,
+    /// Height of the blank over the nominal surface before the first pass.
+    pub stock_um: f64,
+    /// Peak to valley of the blank's form error.
+    pub form_error_um: f64,
+    /// Its correlation length.
+    pub form_error_correlation_mm: f64,
+    /// A job number that the grinder has not seen last means that somebody has put in a new blank.
+    pub fresh_per_job: bool,
+}
+
+impl Default for PartSpec {
+    fn default() -> Self {
+        Self {
+            shape: ShapeSpec::FreeForm {},
+            aperture: Aperture::Rectangle { half_x_mm: 51.0, half_y_mm: 31.0 },
+            stock_um: 200.0,
+            form_error_um: 20.0,
+            form_error_correlation_mm: 30.0,
+            fresh_per_job: true,
+        }
+    }
+}
+
+/// A nominal surface by its numbers.
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
+#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum ShapeSpec {
+    /// [`FreeForm`].
+    FreeForm {},
+    /// [`Sphere`].
+    Sphere {
+        /// Signed radius of curvature.
+        radius_mm: f64,
+    },
+    /// [`Biconic`].
+    Biconic {
+        /// Radii of curvature in x and y.
+        radius_mm: [f64; 2],
+        /// Conic constants in x and y.
+        conic: [f64; 2],
+    },
+    /// [`OffAxisAsphere`], moved along z so that the origin lies on the surface at the section's centre.
+    OffAxisAsphere {
+        /// Vertex radius of the parent.
+        radius_mm: f64,
+        /// Conic constant of the parent.
+        conic: f64,
+        /// Coefficient of the fourth power, in mm^-3.
+        #[serde(default)]
+        fourth: f64,
+        /// Distance of the section's centre from the parent's axis, along x.
+        shift_mm: f64,
+    },
+    /// [`Wave`].
+    Wave {
+        /// Peak to valley.
+        height_mm: f64,
+    },
+    /// [`XyPolynomial`].
+    XyPolynomial {
+        /// What x and y are divided by.
+        normalisation_radius_mm: f64,
+        /// The terms.
+        coefficients: Vec<Coefficient>,
+    },
+}
+
+/// A term of an [`XyPolynomial`].
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct Coefficient {
+    /// Power of x.
+    pub i: u32,
+    /// Power of y.
+    pub j: u32,
+    /// What it is multiplied by.
+    pub value_mm: f64,
+}
+
+impl ShapeSpec {
+    /// Returns the surface.
+    pub fn build(&self) -> Box<dyn Shape> {
+        match self.clone() {
+            Self::FreeForm {} => Box::new(FreeForm::default()),
+            Self::Sphere { radius_mm } => Box::new(Sphere { radius_mm }),
+            Self::Biconic { radius_mm, conic } => Box::new(Biconic { radius_mm, conic }),
+            Self::OffAxisAsphere { radius_mm, conic, fourth, shift_mm } => {
+                Box::new(ThroughOrigin(OffAxisAsphere { radius_mm, conic, fourth, shift_mm }))
+            }
+            Self::Wave { height_mm } => Box::new(Wave { height_mm }),
+            Self::XyPolynomial { normalisation_radius_mm, coefficients } => Box::new(XyPolynomial {
+                normalisation_radius_mm,
+                terms: coefficients.iter().map(|c| (c.i, c.j, c.value_mm)).collect(),
+            }),
+        }
+    }
+}
+
+/// The outline of the part over the plane of the model frame, centred on the origin.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize, Serialize)]
+#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum Aperture {
+    /// A rectangle.
+    Rectangle {
+        /// Half the width in x.
+        half_x_mm: f64,
+        /// Half the depth in y.
+        half_y_mm: f64,
+    },
+    /// A circle.
+    Circle {
+        /// Its radius.
+        radius_mm: f64,
+    },
+}
+
+impl Aperture {
+    /// Returns half the width and half the depth of the rectangle about it, in millimetres.
+    pub fn half_mm(&self) -> [f64; 2] {
+        match *self {
+            Self::Rectangle { half_x_mm, half_y_mm } => [half_x_mm, half_y_mm],
+            Self::Circle { radius_mm } => [radius_mm, radius_mm],
+        }
+    }
+
+    /// Says whether (x, y) lies within.
+    pub fn contains(&self, x: f64, y: f64) -> bool {
+        match *self {
+            Self::Rectangle { half_x_mm, half_y_mm } => x.abs() <= half_x_mm && y.abs() <= half_y_mm,
+            Self::Circle { radius_mm } => x.hypot(y) <= radius_mm,
+        }
+    }
+}
+
+/// Heights on a grid, smooth between the nodes and constant beyond the edge.
+#[derive(Clone, Debug)]
+pub struct HeightGrid {
+    first_mm: [f64; 2],
+    step_mm: [f64; 2],
+    columns: usize,
+    rows: usize,
+    /// Row by row, x fastest, in millimetres.
+    pub(crate) heights_mm: Vec<f64>,
+}
+
+impl HeightGrid {
+    /// Lays a grid over a rectangle about the origin, all at one height.
+    pub fn over(half_mm: [f64; 2], height_mm: f64) -> Self {
+        let spacing = NODE_SPACING_MM.max(half_mm[0].max(half_mm[1]) / 200.0);
+        let cells = half_mm.map(|half| ((2.0 * half / spacing).ceil() as usize).max(4));
+        let step_mm = [0, 1].map(|i| 2.0 * half_mm[i] / cells[i] as f64);
+        let first_mm = [0, 1].map(|i| -half_mm[i] - MARGIN_NODES as f64 * step_mm[i]);
+        let [columns, rows] = cells.map(|n| n + 1 + 2 * MARGIN_NODES);
+        Self { first_mm, step_mm, columns, rows, heights_mm: vec![height_mm; columns * rows] }
+    }
+
+    /// Returns the places of the nodes, in the order of the heights.
+    pub fn nodes(&self) -> impl Iterator<Item = [f64; 2]> + '_ {
+        (0..self.rows).flat_map(move |j| (0..self.columns).map(move |i| self.node(i, j)))
+    }
+
+    fn node(&self, i: usize, j: usize) -> [f64; 2] {
+        [self.first_mm[0] + i as f64 * self.step_mm[0], self.first_mm[1] + j as f64 * self.step_mm[1]]
+    }
+
+    /// Adds a random form to values at the nodes, in millimetres.
+    pub fn add(&self, form: &FormError, values_mm: &mut [f64]) {
+        form.add_to_net(self.first_mm, self.step_mm, self.columns, values_mm);
+    }
+
+    /// Returns the area of a cell in square millimetres.
+    pub fn cell_mm2(&self) -> f64 {
+        self.step_mm[0] * self.step_mm[1]
+    }
+
+    /// Returns the height at (x, y) in millimetres, and its gradient.
+    pub fn at(&self, x: f64, y: f64) -> (f64, [f64; 2]) {
+        let (i, wx, dx) = weights(x, self.first_mm[0], self.step_mm[0], self.columns);
+        let (j, wy, dy) = weights(y, self.first_mm[1], self.step_mm[1], self.rows);
+        let (mut h, mut hx, mut hy) = (0.0, 0.0, 0.0);
+        for b in 0..4 {
+            let row = &self.heights_mm[(j + b) * self.columns + i..][..4];
+            let (mut value, mut slope) = (0.0, 0.0);
+            for a in 0..4 {
+                value += wx[a] * row[a];
+                slope += dx[a] * row[a];
+            }
+            h += wy[b] * value;
+            hx += wy[b] * slope;
+            hy += dy[b] * value;
+        }
+        (h, [hx, hy])
+    }
+}
+
+/// Returns the first of the four nodes about a place, their weights, and the derivatives of the weights.
+///
+/// Beyond the innermost cells the place is held at the border, and the derivatives are 0.
+fn weights(t: f64, first: f64, step: f64, nodes: usize) -> (usize, [f64; 4], [f64; 4]) {
+    let place = (t - first) / step;
+    let held = place.clamp(1.0, (nodes - 2) as f64);
+    let cell = (held as usize).min(nodes - 3);
+    let u = held - cell as f64;
+    let w = [
+        u * (-0.5 + u * (1.0 - 0.5 * u)),
+        1.0 + u * u * (-2.5 + 1.5 * u),
+        u * (0.5 + u * (2.0 - 1.5 * u)),
+        u * u * (-0.5 + 0.5 * u),
+    ];
+    let d = [-0.5 + u * (2.0 - 1.5 * u), u * (-5.0 + 4.5 * u), 0.5 + u * (4.0 - 4.5 * u), u * (-1.0 + 1.5 * u)];
+    let inside = if place == held { 1.0 / step } else { 0.0 };
+    (cell - 1, w, d.map(|c| c * inside))
+}
+
+/// What came of moving a ball towards the part.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Contact {
+    /// The ball touches.
+    Touched {
+        /// Its centre in the model frame, in millimetres.
+        centre_mm: Vec3,
+        /// Where it touches, over the plane.
+        foot_mm: [f64; 2],
+    },
+    /// The ball was in the material already where the search should begin.
+    Unexpected,
+    /// The search ended without a touch, or the place is beyond the part's edge.
+    Missed,
+}
+
+/// The way of a ball's centre, in the model frame.
+#[derive(Clone, Copy, Debug)]
+pub struct Approach {
+    /// The target.
+    pub point_mm: Vec3,
+    /// The direction from which the ball comes, of unit length.
+    pub direction: Vec3,
+    /// Radius of the ball.
+    pub radius_mm: f64,
+    /// Distance of the centre from the target, along the direction, where the search begins.
+    pub from_mm: f64,
+    /// The same where it ends.
+    pub to_mm: f64,
+}
+
+impl Approach {
+    fn centre(&self, t: f64) -> Vec3 {
+        std::array::from_fn(|i| self.point_mm[i] + t * self.direction[i])
+    }
+}
+
+/// A part with its real surface.
+pub struct Part {
+    /// What it should be.
+    pub shape: Box<dyn Shape>,
+    /// Where it is.
+    pub aperture: Aperture,
+    /// How far it stands proud, along the nominal normal.
+    pub height: HeightGrid,
+}
+
+impl Part {
+    /// Returns the part with its blank: stock and a form error drawn from a seed.
+    pub fn blank(spec: &PartSpec, seed: u64) -> Self {
+        let mut height = HeightGrid::over(spec.aperture.half_mm(), spec.stock_um * 1e-3);
+        let [half_x, half_y] = spec.aperture.half_mm();
+        let form = if spec.form_error_um > 0.0 {
+            let (length, pv) = (spec.form_error_correlation_mm, spec.form_error_um * 1e-3);
+            FormError::new(seed, length, pv, 2.0 * half_x, 2.0 * half_y)
+        } else {
+            FormError::none()
+        };
+        let mut heights_mm = height.heights_mm.clone();
+        height.add(&form, &mut heights_mm);
+        height.heights_mm = heights_mm;
+        Self { shape: spec.shape.build(), aperture: spec.aperture, height }
+    }
+
+    /// Returns the point of the real surface over (x, y) of the nominal, and the unit normal of the real surface there.
+    pub fn surface(&self, x: f64, y: f64) -> (Vec3, Vec3) {
+        let ([p, q], [zxx, zxy, zyy]) = (self.shape.gradient(x, y), self.shape.hessian(x, y));
+        let (h, [hx, hy]) = self.height.at(x, y);
+        let w = 1.0 / (1.0 + p * p + q * q).sqrt();
+        let n = [-p * w, -q * w, w];
+        // n = N / |N| with N = (-p, -q, 1), so dn = (dN - n (n . dN)) / |N|.
+        let turn = |a: f64, b: f64| -> Vec3 {
+            let along = -(n[0] * a + n[1] * b);
+            [w * (-a - n[0] * along), w * (-b - n[1] * along), -w * n[2] * along]
+        };
+        let (nx, ny) = (turn(zxx, zxy), turn(zxy, zyy));
+        let tx: Vec3 = std::array::from_fn(|i| [1.0, 0.0, p][i] + hx * n[i] + h * nx[i]);
+        let ty: Vec3 = std::array::from_fn(|i| [0.0, 1.0, q][i] + hy * n[i] + h * ny[i]);
+        let m = [tx[1] * ty[2] - tx[2] * ty[1], tx[2] * ty[0] - tx[0] * ty[2], tx[0] * ty[1] - tx[1] * ty[0]];
+        let norm = (m[0] * m[0] + m[1] * m[1] + m[2] * m[2]).sqrt();
+        let [sx, sy, sz] = self.shape.point(x, y);
+        ([sx + h * n[0], sy + h * n[1], sz + h * n[2]], m.map(|c| c / norm))
+    }
+
+    /// Moves a ball along its way until it touches.
+    ///
+    /// A touch whose foot lies beyond the aperture is none: the part's side and rim are not modelled.
+    pub fn touch(&self, way: &Approach) -> Contact {
+        let start = way.centre(way.from_mm);
+        let Some(t) = self.near_contact(way) else { return Contact::Missed };
+        let unexpected = || match self.aperture.contains(start[0], start[1]) {
+            true => Contact::Unexpected,
+            false => Contact::Missed,
+        };
+        match self.exact_contact(way, t) {
+            None if t >= way.from_mm => unexpected(),
+            None => Contact::Missed,
+            Some((_, t)) if t > way.from_mm => unexpected(),
+            Some((foot, t)) if t < way.to_mm || !self.aperture.contains(foot[0], foot[1]) => Contact::Missed,
+            Some((foot_mm, t)) => Contact::Touched { centre_mm: way.centre(t), foot_mm },
+        }
+    }
+
+    /// Returns the distance of a centre from the real surface less the radius, to first order.
+    fn gap(&self, c: Vec3, radius_mm: f64) -> f64 {
+        let [p, q] = self.shape.gradient(c[0], c[1]);
+        let vertical = c[2] - self.shape.height(c[0], c[1]);
+        vertical / (1.0 + p * p + q * q).sqrt() - self.height.at(c[0], c[1]).0 - radius_mm
+    }
+
+    /// Steps down the way by what is free until the ball is near to touching.
+    fn near_contact(&self, way: &Approach) -> Option<f64> {
+        let mut t = way.from_mm;
+        for _ in 0..100 {
+            let gap = self.gap(way.centre(t), way.radius_mm);
+            if !gap.is_finite() || t < way.to_mm - 1.0 {
+                return None;
+            }
+            if gap < 0.02 {
+                return Some(t);
+            }
+            t -= gap;
+        }
+        Some(t)
+    }
+
+    /// Solves r + R m = p + t d from a place nearby; none where that does not converge.
+    fn exact_contact(&self, way: &Approach, t: f64) -> Option<([f64; 2], f64)> {
+        let offset = |x: f64, y: f64| -> Vec3 {
+            let (r, m) = self.surface(x, y);
+            std::array::from_fn(|i| r[i] + way.radius_mm * m[i])
+        };
+        let centre = way.centre(t);
+        let [p, q] = self.shape.gradient(centre[0], centre[1]);
+        let w = way.radius_mm / (1.0 + p * p + q * q).sqrt();
+        let mut at = [centre[0] + p * w, centre[1] + q * w, t];
+        let mut last = f64::INFINITY;
+        for _ in 0..40 {
+            let [x, y, t] = at;
+            let (c, ball) = (offset(x, y), way.centre(t));
+            let miss: Vec3 = std::array::from_fn(|i| c[i] - ball[i]);
+            let size = miss.iter().fold(0.0, |most: f64, e| most.max(e.abs()));
+            // At the rounding of the coordinates the miss ceases to fall.
+            if !size.is_finite() || size < 1e-14 || (size < 1e-11 && size >= last) {
+                last = last.min(size);
+                break;
+            }
+            last = size;
+            const STEP_MM: f64 = 1e-5;
+            let slope = |a: Vec3, b: Vec3| -> Vec3 { std::array::from_fn(|i| (a[i] - b[i]) / (2.0 * STEP_MM)) };
+            let along_x = slope(offset(x + STEP_MM, y), offset(x - STEP_MM, y));
+            let along_y = slope(offset(x, y + STEP_MM), offset(x, y - STEP_MM));
+            let step = solve([along_x, along_y, way.direction.map(|d| -d)], miss)?;
+            let longest = step.iter().fold(0.0, |most: f64, e| most.max(e.abs()));
+            let damping = if longest > 2.0 { 2.0 / longest } else { 1.0 };
+            at = std::array::from_fn(|i| at[i] - damping * step[i]);
+        }
+        (last < 1e-10).then_some(([at[0], at[1]], at[2]))
+    }
+}
+
+fn cross(a: Vec3, b: Vec3) -> Vec3 {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+fn dot(a: Vec3, b: Vec3) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+/// Solves the three equations with the given columns by Cramer's rule.
+fn solve([a, b, c]: [Vec3; 3], right: Vec3) -> Option<Vec3> {
+    let determinant = dot(a, cross(b, c));
+    let x = [dot(right, cross(b, c)), dot(a, cross(right, c)), dot(a, cross(b, right))].map(|d| d / determinant);
+    x.iter().all(|value| value.is_finite()).then_some(x)
+}
+
+/// Returns where a ball's centre comes to rest on a sphere, coming from the outside.
+pub fn touch_sphere(centre_mm: Vec3, sphere_radius_mm: f64, way: &Approach) -> Contact {
+    let from_centre: Vec3 = std::array::from_fn(|i| way.point_mm[i] - centre_mm[i]);
+    let along = dot(from_centre, way.direction);
+    let reach = sphere_radius_mm + way.radius_mm;
+    let beside = dot(from_centre, from_centre) - along * along;
+    if beside >= reach * reach {
+        return Contact::Missed;
+    }
+    let t = (reach * reach - beside).sqrt() - along;
+    if t > way.from_mm {
+        // Coming from the far side, the ball may leave the sphere before the search begins.
+        let inside = t - 2.0 * (t + along) < way.from_mm;
+        return if inside { Contact::Unexpected } else { Contact::Missed };
+    }
+    if t < way.to_mm {
+        return Contact::Missed;
+    }
+    let centre = way.centre(t);
+    Contact::Touched { centre_mm: centre, foot_mm: [centre[0], centre[1]] }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rough_part() -> Part {
+        Part::blank(&PartSpec { stock_um: 120.0, form_error_correlation_mm: 6.0, ..PartSpec::default() }, 11)
+    }
+
+    fn way(part: &Part, x: f64, y: f64, direction: Vec3) -> Approach {
+        let norm = dot(direction, direction).sqrt();
+        let direction = direction.map(|c| c / norm);
+        Approach { point_mm: part.shape.point(x, y), direction, radius_mm: 1.5, from_mm: 4.5, to_mm: -1.5 }
+    }
+
+    /// Returns the distance of a point from the real surface by looking everywhere nearby, ever closer.
+    fn distance_by_search(part: &Part, c: Vec3) -> f64 {
+        let (mut best, mut middle, mut half) = (f64::INFINITY, [c[0], c[1]], 3.0);
+        while half > 1e-7 {
+            let about = middle;
+            for i in -20..=20 {
+                for j in -20..=20 {
+                    let at = [about[0] + half * f64::from(i) / 20.0, about[1] + half * f64::from(j) / 20.0];
+                    let r = part.surface(at[0], at[1]).0;
+                    let d = (0..3).map(|k| (r[k] - c[k]).powi(2)).sum::<f64>().sqrt();
+                    if d < best {
+                        (best, middle) = (d, at);
+                    }
+                }
+            }
+            half *= 0.3;
+        }
+        best
+    }
+
+    #[test]
+    fn contact_on_a_sphere_is_concentric() {
+        let spec = PartSpec {
+            shape: ShapeSpec::Sphere { radius_mm: -80.0 },
+            aperture: Aperture::Circle { radius_mm: 30.0 },
+            stock_um: 50.0,
+            form_error_um: 0.0,
+            ..PartSpec::default()
+        };
+        let part = Part::blank(&spec, 1);
+        for (x, y) in [(0.0, 0.0), (11.3, -20.9), (-28.0, 4.4)] {
+            for direction in [part.shape.normal(x, y), [0.0, 0.0, 1.0], [0.1, -0.2, 1.0]] {
+                let Contact::Touched { centre_mm: c, .. } = part.touch(&way(&part, x, y, direction)) else {
+                    panic!("no touch at ({x}, {y})")
+                };
+                let distance = (c[0] * c[0] + c[1] * c[1] + (c[2] + 80.0).powi(2)).sqrt();
+                assert!((distance - 81.55).abs() < 1e-11, "{distance}");
+            }
+        }
+    }
+
+    #[test]
+    fn contact_agrees_with_a_search_over_the_surface() {
+        let part = rough_part();
+        for (x, y) in [(0.1, 0.2), (37.0, -22.6), (-50.2, 30.1), (12.25, 8.75), (-20.0, -5.0)] {
+            for tilt in [[0.0, 0.0, 0.0], [0.15, -0.1, 0.0]] {
+                let n = part.shape.normal(x, y);
+                let way = way(&part, x, y, std::array::from_fn(|i| n[i] + tilt[i]));
+                let Contact::Touched { centre_mm, .. } = part.touch(&way) else { panic!("no touch at ({x}, {y})") };
+                let distance = distance_by_search(&part, centre_mm);
+                assert!((distance - 1.5).abs() < 1e-10, "{distance} at ({x}, {y})");
+                let off: Vec3 = cross(std::array::from_fn(|i| centre_mm[i] - way.point_mm[i]), way.direction);
+                assert!(dot(off, off).sqrt() < 1e-12, "the centre left its line");
+            }
+        }
+    }
+
+    #[test]
+    fn a_ball_finds_nothing_beyond_the_edge_or_the_search_and_hits_what_stands_in_its_way() {
+        let part = rough_part();
+        let n = part.shape.normal(0.0, 0.0);
+        let plain = way(&part, 0.0, 0.0, n);
+        assert!(matches!(part.touch(&plain), Contact::Touched { .. }));
+        assert_eq!(part.touch(&way(&part, 52.0, 0.0, part.shape.normal(52.0, 0.0))), Contact::Missed);
+        assert_eq!(part.touch(&Approach { to_mm: 1.7, ..plain }), Contact::Missed);
+        assert_eq!(part.touch(&Approach { from_mm: 1.6, ..plain }), Contact::Unexpected);
+        assert_eq!(part.touch(&Approach { from_mm: -5.0, to_mm: -9.0, ..plain }), Contact::Unexpected);
+        assert_eq!(part.touch(&Approach { point_mm: [1e7, 0.0, 0.0], ..plain }), Contact::Missed);
+    }
+
+    #[test]
+    fn a_ball_far_outside_the_domain_of_a_sphere_finds_nothing() {
+        let spec = PartSpec {
+            shape: ShapeSpec::Sphere { radius_mm: 40.0 },
+            aperture: Aperture::Circle { radius_mm: 30.0 },
+            ..PartSpec::default()
+        };
+        let part = Part::blank(&spec, 1);
+        let way = Approach {
+            point_mm: [60.0, 0.0, 10.0],
+            direction: [0.0, 0.0, 1.0],
+            radius_mm: 1.0,
+            from_mm: 4.0,
+            to_mm: -2.0,
+        };
+        assert_eq!(part.touch(&way), Contact::Missed);
+    }
+
+    #[test]
+    fn the_reference_sphere_is_touched_like_a_sphere() {
+        let way = Approach {
+            point_mm: [13.0, 0.5, 0.0],
+            direction: [1.0, 0.0, 0.0],
+            radius_mm: 1.5,
+            from_mm: 5.0,
+            to_mm: -2.0,
+        };
+        let Contact::Touched { centre_mm: c, .. } = touch_sphere([0.5, 0.0, 0.0], 12.5, &way) else {
+            panic!("no touch")
+        };
+        let distance = ((c[0] - 0.5).powi(2) + c[1] * c[1]).sqrt();
+        assert!((distance - 14.0).abs() < 1e-12 && c[1] == 0.5, "{c:?}");
+        assert_eq!(touch_sphere([0.5, 40.0, 0.0], 12.5, &way), Contact::Missed);
+        assert_eq!(touch_sphere([3.5, 0.0, 0.0], 12.5, &Approach { from_mm: 2.0, ..way }), Contact::Unexpected);
+        assert_eq!(touch_sphere([-9.5, 0.0, 0.0], 12.5, &way), Contact::Missed);
+    }
+
+    #[test]
+    fn the_grid_has_a_true_gradient_and_passes_through_its_nodes() {
+        let part = rough_part();
+        let grid = &part.height;
+        for (k, [x, y]) in grid.nodes().enumerate() {
+            if part.aperture.contains(x, y) {
+                assert!((grid.at(x, y).0 - grid.heights_mm[k]).abs() < 1e-14);
+            }
+        }
+        for (x, y) in [(3.3, 4.1), (-50.9, 30.9), (0.5, 0.5), (20.01, -14.99)] {
+            let (_, [hx, hy]) = grid.at(x, y);
+            let e = 1e-5;
+            let fx = (grid.at(x + e, y).0 - grid.at(x - e, y).0) / (2.0 * e);
+            let fy = (grid.at(x, y + e).0 - grid.at(x, y - e).0) / (2.0 * e);
+            assert!((hx - fx).abs() < 1e-8 && (hy - fy).abs() < 1e-8, "({x}, {y}): {hx} {fx} {hy} {fy}");
+        }
+    }
+}

@@ -1,0 +1,490 @@
+//! The payloads of docs/modbus.md as bytes, high word first: plan, map and pass in, points and pass record out.
+//!
+//! What comes in is trusted in nothing: format, length, count, reserved zeros, finite numbers and declared extremes are
+//! checked before anything of that size is set aside, and what does not hold is a [`Refusal`] in words. The other way
+//! round, [`Plan::encode`] and its like exist so that a test can play the client.
+
+use crate::Vec3;
+use crate::body::Refusal;
+
+/// Most targets that a plan may have.
+pub const MOST_TARGETS: u32 = 500_000;
+/// Most columns, and most rows, that a map may have.
+pub const MOST_NODES_ALONG: u32 = 4_000;
+/// Most nodes that a map may have.
+pub const MOST_NODES: u64 = 4_000_000;
+
+/// Answer of docs/modbus.md: a payload is missing, broken or of another part.
+pub const BROKEN: u16 = 8;
+/// Answer of docs/modbus.md: an interlock is open.
+pub const INTERLOCK: u16 = 9;
+/// Answer of docs/modbus.md: a value is outside the machine's limits.
+pub const OUTSIDE: u16 = 10;
+
+/// What a target is on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Feature {
+    /// The ground part.
+    Part = 1,
+    /// The reference sphere on the table.
+    ReferenceSphere = 2,
+}
+
+/// A point to touch, in the frame of the measuring machine.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Target {
+    /// The number by which the client knows it.
+    pub index: u32,
+    /// What it is on.
+    pub feature: Feature,
+    /// The nominal contact point in millimetres.
+    pub point_mm: Vec3,
+    /// The outward unit normal there.
+    pub normal: Vec3,
+}
+
+/// Kind 1: what the measuring machine shall touch, and how.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Plan {
+    /// Radius the probe is said to have, in millimetres.
+    pub probe_radius_mm: f64,
+    /// Distance of the ball's surface from the target where the search begins, in millimetres.
+    pub approach_mm: f64,
+    /// Distance beyond the target where the search ends, in millimetres.
+    pub search_mm: f64,
+    /// Speed of the search in millimetres per second.
+    pub speed_mm_s: f64,
+    /// Height over the highest target at which the probe travels, in millimetres.
+    pub safe_height_mm: f64,
+    /// The targets in the order in which they are touched.
+    pub targets: Vec<Target>,
+}
+
+/// Kind 2: by how much the ground surface is wanted displaced.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Map {
+    /// Nodes along x.
+    pub columns: u32,
+    /// Nodes along y.
+    pub rows: u32,
+    /// Place of the first node in the model frame, in millimetres.
+    pub first_mm: [f64; 2],
+    /// Distance of the nodes along x and y, in millimetres.
+    pub spacing_mm: [f64; 2],
+    /// Identity of the nominal surface it is made for.
+    pub nominal: [u8; 32],
+    /// The displacements in millimetres, row by row, x fastest.
+    pub values_mm: Vec<f64>,
+}
+
+/// Kind 3: how the grinder shall move.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pass {
+    /// Repetitions of the finishing stroke without in-feed.
+    pub spark_out: u16,
+    /// Radius the wheel is said to have, in millimetres.
+    pub wheel_radius_mm: f64,
+    /// Feed along the tracks in millimetres per minute.
+    pub feed_mm_min: f64,
+    /// Distance of the tracks in millimetres.
+    pub track_spacing_mm: f64,
+    /// Height of the wanted surface over the nominal, in millimetres.
+    pub level_mm: f64,
+    /// Most that may be taken off anywhere by one stroke, in millimetres.
+    pub depth_of_cut_mm: f64,
+    /// The part in the model frame, in millimetres: x least, x most, y least, y most.
+    pub extent_mm: [f64; 4],
+    /// Identity of the nominal surface.
+    pub nominal: [u8; 32],
+}
+
+/// What became of a target.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Status {
+    /// The ball touched.
+    Touched = 1,
+    /// The search ended without a touch.
+    NotFound = 2,
+    /// The probe did not come to the place where the search begins.
+    NotReached = 3,
+}
+
+/// One record of kind 4.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PointRecord {
+    /// The target's number.
+    pub index: u32,
+    /// What became of it.
+    pub status: Status,
+    /// 0 good to 100 bad.
+    pub quality: u16,
+    /// The ball's centre in millimetres; zeros where nothing was touched.
+    pub position_mm: Vec3,
+}
+
+/// Kind 5: what a pass did.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PassRecord {
+    /// The part's run.
+    pub job: u32,
+    /// Its cycle.
+    pub cycle: u16,
+    /// 1 complete, 2 stopped, 3 aborted, 4 failed.
+    pub result: u16,
+    /// Path travelled in millimetres.
+    pub path_mm: f64,
+    /// Volume removed in cubic millimetres.
+    pub volume_mm3: f64,
+    /// Largest depth taken off in millimetres.
+    pub depth_mm: f64,
+    /// Share of the path that cut nothing.
+    pub air_share: f64,
+    /// Spindle load of 1.
+    pub spindle_load: f64,
+    /// Radius the wheel is taken to have, in millimetres.
+    pub wheel_radius_mm: f64,
+}
+
+fn broken(reason: impl Into<String>) -> Refusal {
+    Refusal { answer: BROKEN, reason: reason.into() }
+}
+
+pub(crate) fn outside(name: &str, value: f64, limits: &str) -> Refusal {
+    Refusal { answer: OUTSIDE, reason: format!("{name} is {value}, allowed is {limits}") }
+}
+
+/// Reads big-endian values one after the other.
+struct Reader<'a> {
+    rest: &'a [u8],
+}
+
+impl Reader<'_> {
+    fn take<const N: usize>(&mut self) -> Result<[u8; N], Refusal> {
+        let (head, rest) = self.rest.split_first_chunk::<N>().ok_or_else(|| broken("the payload ends too early"))?;
+        self.rest = rest;
+        Ok(*head)
+    }
+
+    fn u16(&mut self) -> Result<u16, Refusal> {
+        self.take().map(u16::from_be_bytes)
+    }
+
+    fn u32(&mut self) -> Result<u32, Refusal> {
+        self.take().map(u32::from_be_bytes)
+    }
+
+    fn f64(&mut self, name: &str) -> Result<f64, Refusal> {
+        let value = f64::from_be_bytes(self.take()?);
+        if value.is_finite() { Ok(value) } else { Err(broken(format!("{name} is not finite"))) }
+    }
+
+    fn vector<const N: usize>(&mut self, name: &str) -> Result<[f64; N], Refusal> {
+        let mut vector = [0.0; N];
+        for value in &mut vector {
+            *value = self.f64(name)?;
+        }
+        Ok(vector)
+    }
+
+    fn format(&mut self) -> Result<(), Refusal> {
+        match self.u16()? {
+            1 => Ok(()),
+            other => Err(broken(format!("format is {other}, known is 1"))),
+        }
+    }
+
+    fn zeros<const N: usize>(&mut self, name: &str) -> Result<(), Refusal> {
+        if self.take::<N>()? == [0; N] { Ok(()) } else { Err(broken(format!("reserved bytes after {name} are not 0"))) }
+    }
+}
+
+/// Refuses bytes that are not exactly a header and so many records.
+fn exact(bytes: &[u8], header: u64, records: u64, size: u64) -> Result<(), Refusal> {
+    let expected = header + records * size;
+    if bytes.len() as u64 == expected {
+        return Ok(());
+    }
+    Err(broken(format!("{} bytes, where {records} records make {expected}", bytes.len())))
+}
+
+fn within(name: &str, value: f64, least: f64, most: f64) -> Result<(), Refusal> {
+    if (least..=most).contains(&value) { Ok(()) } else { Err(outside(name, value, &format!("{least} to {most}"))) }
+}
+
+impl Target {
+    fn decode(reader: &mut Reader) -> Result<Self, Refusal> {
+        let index = reader.u32()?;
+        let feature = match reader.u16()? {
+            1 => Feature::Part,
+            2 => Feature::ReferenceSphere,
+            other => return Err(broken(format!("target {index} is on {other}, known are 1 and 2"))),
+        };
+        reader.zeros::<2>("what")?;
+        let (point_mm, normal) = (reader.vector("point of a target")?, reader.vector::<3>("normal of a target")?);
+        let length = normal.iter().map(|c| c * c).sum::<f64>().sqrt();
+        // Written so that an overflow to infinity is refused too.
+        if (length - 1.0).abs() <= 1e-6 {
+            let normal = normal.map(|c| c / length);
+            return Ok(Self { index, feature, point_mm, normal });
+        }
+        Err(broken(format!("normal of target {index} has the length {length}")))
+    }
+}
+
+impl Plan {
+    /// Reads a plan.
+    ///
+    /// # Errors
+    /// Bytes that are not a plan, and values that no probe has.
+    pub fn decode(bytes: &[u8]) -> Result<Self, Refusal> {
+        let mut reader = Reader { rest: bytes };
+        reader.format()?;
+        reader.zeros::<2>("format")?;
+        let count = reader.u32()?;
+        exact(bytes, 64, count.into(), 56)?;
+        if !(1..=MOST_TARGETS).contains(&count) {
+            return Err(outside("number of targets", count.into(), &format!("1 to {MOST_TARGETS}")));
+        }
+        let [probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm] =
+            reader.vector("header of the plan")?;
+        reader.zeros::<16>("safe height")?;
+        within("probe radius in mm", probe_radius_mm, 0.01, 100.0)?;
+        within("approach in mm", approach_mm, 0.0, 100.0)?;
+        within("search in mm", search_mm, 0.0, 100.0)?;
+        within("speed in mm/s", speed_mm_s, 1e-3, 1000.0)?;
+        within("safe height in mm", safe_height_mm, 0.0, 1000.0)?;
+        let targets = (0..count).map(|_| Target::decode(&mut reader)).collect::<Result<_, _>>()?;
+        Ok(Self { probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, targets })
+    }
+
+    /// Writes a plan.
+    pub fn encode(&self) -> Vec<u8> {
+        let mut bytes = vec![0, 1, 0, 0];
+        bytes.extend((self.targets.len() as u32).to_be_bytes());
+        let header = [self.probe_radius_mm, self.approach_mm, self.search_mm, self.speed_mm_s, self.safe_height_mm];
+        push(&mut bytes, &header);
+        bytes.extend([0; 16]);
+        for target in &self.targets {
+            bytes.extend(target.index.to_be_bytes());
+            bytes.extend((target.feature as u16).to_be_bytes());
+            bytes.extend([0; 2]);
+            push(&mut bytes, &target.point_mm);
+            push(&mut bytes, &target.normal);
+        }
+        bytes
+    }
+}
+
+impl Map {
+    /// Reads a map.
+    ///
+    /// # Errors
+    /// Bytes that are not a map, a size beyond the machine's memory, a declared largest value that is not that of the nodes.
+    pub fn decode(bytes: &[u8]) -> Result<Self, Refusal> {
+        let mut reader = Reader { rest: bytes };
+        reader.format()?;
+        match reader.u16()? {
+            1 => {}
+            other => return Err(broken(format!("sign is {other}, known is 1"))),
+        }
+        let (columns, rows) = (reader.u32()?, reader.u32()?);
+        reader.zeros::<4>("rows")?;
+        let nodes = u64::from(columns) * u64::from(rows);
+        if columns > MOST_NODES_ALONG || rows > MOST_NODES_ALONG || nodes > MOST_NODES {
+            return Err(outside("number of nodes", nodes as f64, &format!("up to {MOST_NODES}")));
+        }
+        if columns < 2 || rows < 2 {
+            return Err(broken(format!("a net of {columns} by {rows} nodes spans no area")));
+        }
+        exact(bytes, 96, nodes, 8)?;
+        let first_mm = reader.vector("place of the first node")?;
+        let spacing_mm = reader.vector::<2>("spacing")?;
+        let largest_mm = reader.f64("largest value")?;
+        reader.zeros::<8>("largest value")?;
+        let nominal = reader.take()?;
+        if !spacing_mm.iter().all(|s| (1e-6..=1e6).contains(s)) {
+            return Err(broken(format!("spacing is {spacing_mm:?} mm")));
+        }
+        let values_mm = (0..nodes).map(|_| reader.f64("a node of the map")).collect::<Result<Vec<_>, _>>()?;
+        let map = Self { columns, rows, first_mm, spacing_mm, nominal, values_mm };
+        if (map.largest_mm() - largest_mm).abs() > 1e-9 {
+            return Err(broken(format!("largest value is {} mm, the header says {largest_mm}", map.largest_mm())));
+        }
+        Ok(map)
+    }
+
+    /// Writes a map.
+    pub fn encode(&self) -> Vec<u8> {
+        let mut bytes = vec![0, 1, 0, 1];
+        bytes.extend(self.columns.to_be_bytes());
+        bytes.extend(self.rows.to_be_bytes());
+        bytes.extend([0; 4]);
+        push(&mut bytes, &self.first_mm);
+        push(&mut bytes, &self.spacing_mm);
+        push(&mut bytes, &[self.largest_mm()]);
+        bytes.extend([0; 8]);
+        bytes.extend(self.nominal);
+        push(&mut bytes, &self.values_mm);
+        bytes
+    }
+
+    /// Returns the largest absolute value in millimetres.
+    pub fn largest_mm(&self) -> f64 {
+        self.values_mm.iter().fold(0.0, |most, value| value.abs().max(most))
+    }
+
+    /// Returns the displacement at (x, y) in millimetres: bilinear, and the value of the nearest edge outside the net.
+    pub fn at(&self, x: f64, y: f64) -> f64 {
+        let along = |t: f64, axis: usize, nodes: u32| {
+            let place = ((t - self.first_mm[axis]) / self.spacing_mm[axis]).clamp(0.0, f64::from(nodes - 1));
+            let cell = (place as usize).min(nodes as usize - 2);
+            (cell, place - cell as f64)
+        };
+        let ((i, u), (j, v)) = (along(x, 0, self.columns), along(y, 1, self.rows));
+        let node = |i: usize, j: usize| self.values_mm[j * self.columns as usize + i];
+        let row = |j: usize| node(i, j) + u * (node(i + 1, j) - node(i, j));
+        row(j) + v * (row(j + 1) - row(j))
+    }
+}
+
+impl Pass {
+    /// Reads a pass.
+    ///
+    /// # Errors
+    /// Bytes that are not a pass, and values that no grinder has.
+    pub fn decode(bytes: &[u8]) -> Result<Self, Refusal> {
+        exact(bytes, 128, 0, 0)?;
+        let mut reader = Reader { rest: bytes };
+        reader.format()?;
+        let spark_out = reader.u16()?;
+        reader.zeros::<4>("spark-out passes")?;
+        let [wheel_radius_mm, feed_mm_min, track_spacing_mm, level_mm, depth_of_cut_mm] =
+            reader.vector("header of the pass")?;
+        let extent_mm = reader.vector::<4>("extent of the part")?;
+        reader.zeros::<16>("extent")?;
+        let nominal = reader.take()?;
+        within("spark-out passes", spark_out.into(), 0.0, 20.0)?;
+        within("wheel radius in mm", wheel_radius_mm, 0.5, 1000.0)?;
+        within("feed in mm/min", feed_mm_min, 1.0, 50_000.0)?;
+        within("track spacing in mm", track_spacing_mm, 0.01, 50.0)?;
+        within("level in mm", level_mm, -10.0, 10.0)?;
+        within("depth of cut in mm", depth_of_cut_mm, 1e-5, 10.0)?;
+        let [x0, x1, y0, y1] = extent_mm;
+        if x0 < x1 && y0 < y1 {
+            let pass = Self {
+                spark_out,
+                wheel_radius_mm,
+                feed_mm_min,
+                track_spacing_mm,
+                level_mm,
+                depth_of_cut_mm,
+                extent_mm,
+                nominal,
+            };
+            return Ok(pass);
+        }
+        Err(broken(format!("the part's extent is x {x0} to {x1}, y {y0} to {y1} mm")))
+    }
+
+    /// Writes a pass.
+    pub fn encode(&self) -> Vec<u8> {
+        let mut bytes = vec![0, 1];
+        bytes.extend(self.spark_out.to_be_bytes());
+        bytes.extend([0; 4]);
+        let header =
+            [self.wheel_radius_mm, self.feed_mm_min, self.track_spacing_mm, self.level_mm, self.depth_of_cut_mm];
+        push(&mut bytes, &header);
+        push(&mut bytes, &self.extent_mm);
+        bytes.extend([0; 16]);
+        bytes.extend(self.nominal);
+        bytes
+    }
+}
+
+/// Writes the records of points: format 1 as floats, format 2 as counts of a scale.
+pub fn encode_points(records: &[PointRecord], scale_mm: Option<f64>) -> Vec<u8> {
+    let mut bytes = Vec::with_capacity(32 * records.len());
+    for record in records {
+        bytes.extend(record.index.to_be_bytes());
+        bytes.extend((record.status as u16).to_be_bytes());
+        bytes.extend(record.quality.to_be_bytes());
+        match scale_mm {
+            None => push(&mut bytes, &record.position_mm),
+            // A cast to an integer saturates and makes 0 of NaN; the travel of the machine lies far within.
+            Some(scale) => {
+                bytes.extend(record.position_mm.iter().flat_map(|c| ((c / scale).round() as i32).to_be_bytes()));
+            }
+        }
+    }
+    bytes
+}
+
+/// Reads the records of points, for tests and truth queries.
+///
+/// # Errors
+/// Bytes that are not such records.
+pub fn decode_points(bytes: &[u8], scale_mm: Option<f64>) -> Result<Vec<PointRecord>, Refusal> {
+    let size = if scale_mm.is_some() { 20 } else { 32 };
+    exact(bytes, 0, (bytes.len() / size) as u64, size as u64)?;
+    let mut reader = Reader { rest: bytes };
+    (0..bytes.len() / size).map(|_| point(&mut reader, scale_mm)).collect()
+}
+
+fn point(reader: &mut Reader, scale_mm: Option<f64>) -> Result<PointRecord, Refusal> {
+    let index = reader.u32()?;
+    let status = match reader.u16()? {
+        1 => Status::Touched,
+        2 => Status::NotFound,
+        3 => Status::NotReached,
+        other => return Err(broken(format!("status of record {index} is {other}"))),
+    };
+    let quality = reader.u16()?;
+    let position_mm = match scale_mm {
+        None => reader.vector("position")?,
+        Some(scale) => {
+            let mut position = [0.0; 3];
+            for c in &mut position {
+                *c = scale * f64::from(i32::from_be_bytes(reader.take()?));
+            }
+            position
+        }
+    };
+    Ok(PointRecord { index, status, quality, position_mm })
+}
+
+impl PassRecord {
+    /// Writes the record.
+    pub fn encode(&self) -> Vec<u8> {
+        let mut bytes = Vec::with_capacity(64);
+        bytes.extend(self.job.to_be_bytes());
+        bytes.extend(self.cycle.to_be_bytes());
+        bytes.extend(self.result.to_be_bytes());
+        let figures = [
+            self.path_mm,
+            self.volume_mm3,
+            self.depth_mm,
+            self.air_share,
+            self.spindle_load,
+            self.wheel_radius_mm,
+            0.0,
+        ];
+        push(&mut bytes, &figures);
+        bytes
+    }
+
+    /// Reads the record, for tests.
+    ///
+    /// # Errors
+    /// Bytes that are not a record.
+    pub fn decode(bytes: &[u8]) -> Result<Self, Refusal> {
+        exact(bytes, 64, 0, 0)?;
+        let mut reader = Reader { rest: bytes };
+        let (job, cycle, result) = (reader.u32()?, reader.u16()?, reader.u16()?);
+        let [path_mm, volume_mm3, depth_mm, air_share, spindle_load, wheel_radius_mm, _] = reader.vector("figures")?;
+        Ok(Self { job, cycle, result, path_mm, volume_mm3, depth_mm, air_share, spindle_load, wheel_radius_mm })
+    }
+}
+
+fn push(bytes: &mut Vec<u8>, values: &[f64]) {
+    bytes.extend(values.iter().flat_map(|value| value.to_be_bytes()));
+}

@@ -1,0 +1,623 @@
+//! The grinder: where the wheel goes, what it leaves, and why not what was wanted.
+//!
+//! At every node of the part's grid, and at the moment when the wheel is there, the surface that a stiff machine would leave
+//! stands over the nominal by
+//!
+//! ```text
+//!  cmd = level + u + S + F + W(t) - T(t) + N
+//!
+//!  level, u   what the client asked for: the pass's level and the map
+//!  S          what comes back in every pass: wheel radius, setting, straightness, screw, waviness
+//!  F          following error: the axes lag, on alternate tracks to alternate sides
+//!  W, T       wear of the wheel (leaves more) and growth of the spindle (leaves less), both along the path
+//!  N          drawn afresh for every pass: what no compensation can take away
+//! ```
+//!
+//! and since machine and part give way, a share mu of what stood proud stays: h becomes mu h + (1 - mu) cmd where h > cmd, and
+//! where h <= cmd the wheel cuts air. Spark-out repeats the stroke.
+//!
+//! **Depth of cut.** What stands higher over cmd than the depth of cut is taken off by roughing strokes first, each by at
+//! most the depth of cut, with ten times the feed and a wheel of their own (no wear, no growth). They leave at most the depth of cut
+//! for the finishing stroke, so a pass ends as one finishing stroke from there. More than [`MOST_STROKES`] are refused.
+//!
+//! **Time.** Tracks run along x, at the track spacing in y, alternately forth and back, with 1.5 mm of overtravel on
+//! every side. A node is ground in the middle of its track's strip; `advance` grinds the nodes whose moment has come, so that a pass that is
+//! broken off leaves a half-ground part. The wheel is dressed and touches off before it finishes: wear and growth count from
+//! there. The heat stays in the spindle from pass to pass and cools while the part is measured.
+
+use std::sync::{Arc, Mutex};
+
+use serde::{Deserialize, Serialize};
+
+use crate::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
+use crate::form::FormError;
+use crate::part::Part;
+use crate::payload::{BROKEN, INTERLOCK, Map, Pass, PassRecord, outside};
+use crate::world::{Mirrored, Source, State, locked, stream};
+
+/// Most strokes of one pass, roughing and finishing.
+pub const MOST_STROKES: u32 = 400;
+/// How far the wheel travels beyond the part on every side, in millimetres.
+pub const OVERTRAVEL_MM: f64 = 1.5;
+/// Feed of a roughing stroke over that of a finishing stroke.
+const ROUGHING_FEED: f64 = 10.0;
+
+/// What is wrong with the grinder.
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct GrinderSpec {
+    /// True radius of the wheel less the radius stated in the first pass; the true one stays.
+    pub wheel_radius_error_um: f64,
+    /// Offset of the wheel in x and y.
+    pub setting_error_um: [f64; 2],
+    /// Straightness along x: amplitudes of the second and third Legendre polynomial over the part.
+    pub straightness_x_um: [f64; 2],
+    /// The same along y.
+    pub straightness_y_um: [f64; 2],
+    /// Amplitude of the screw's error along x.
+    pub periodic_um: f64,
+    /// Its pitch.
+    pub periodic_pitch_mm: f64,
+    /// RMS of a fixed random waviness.
+    pub waviness_um: f64,
+    /// Its correlation length.
+    pub waviness_correlation_mm: f64,
+    /// Lag along the path at 1000 mm/min, proportional to the feed.
+    pub following_um: f64,
+    /// Growth of the surface left by the wearing wheel, over one finishing stroke.
+    pub wear_um: f64,
+    /// Fast wear of the freshly dressed wheel.
+    pub break_in_um: f64,
+    /// Share of a finishing stroke after which all but 1/e of the fast wear is over.
+    pub break_in_share: f64,
+    /// The wheel is dressed before every pass; else its fast wear is over after the first.
+    pub dressed_each_pass: bool,
+    /// Growth of the spindle when it is warm through.
+    pub thermal_um: f64,
+    /// Its time constant.
+    pub thermal_tau_s: f64,
+    /// Share of what stands proud that stays, mu.
+    pub error_copying: f64,
+    /// RMS of the random part drawn for every pass.
+    pub repeatability_um: f64,
+    /// Its correlation length.
+    pub repeatability_correlation_mm: f64,
+    /// How far the wheel reaches from the middle of the machine in x and y.
+    pub travel_mm: [f64; 2],
+    /// Fastest feed.
+    pub feed_most_mm_min: f64,
+    /// Largest displacement that a map may ask for.
+    pub map_most_um: f64,
+}
+
+impl Default for GrinderSpec {
+    fn default() -> Self {
+        Self {
+            wheel_radius_error_um: 120.0,
+            setting_error_um: [12.0, -9.0],
+            straightness_x_um: [5.6, 3.4],
+            straightness_y_um: [-3.4, 2.0],
+            periodic_um: 0.4,
+            periodic_pitch_mm: 20.0,
+            waviness_um: 0.9,
+            waviness_correlation_mm: 18.0,
+            following_um: 0.1,
+            wear_um: 4.0,
+            break_in_um: 2.0,
+            break_in_share: 0.08,
+            dressed_each_pass: true,
+            thermal_um: 4.0,
+            thermal_tau_s: 1200.0,
+            error_copying: 0.15,
+            repeatability_um: 0.4,
+            repeatability_correlation_mm: 14.0,
+            travel_mm: [250.0, 250.0],
+            feed_most_mm_min: 20_000.0,
+            map_most_um: 500.0,
+        }
+    }
+}
+
+impl GrinderSpec {
+    /// A grinder without any error, as stiff as can be.
+    pub fn perfect() -> Self {
+        Self {
+            wheel_radius_error_um: 0.0,
+            setting_error_um: [0.0; 2],
+            straightness_x_um: [0.0; 2],
+            straightness_y_um: [0.0; 2],
+            periodic_um: 0.0,
+            waviness_um: 0.0,
+            following_um: 0.0,
+            wear_um: 0.0,
+            break_in_um: 0.0,
+            thermal_um: 0.0,
+            error_copying: 0.0,
+            repeatability_um: 0.0,
+            ..Self::default()
+        }
+    }
+
+    /// Returns what comes back in every pass but the wheel's radius, at (x, y) of a part, in micrometres.
+    fn systematic_um(&self, part: &Part, [x, y]: [f64; 2]) -> f64 {
+        let [half_x, half_y] = part.aperture.half_mm();
+        let [p, q] = part.shape.gradient(x, y);
+        let nz = 1.0 / (1.0 + p * p + q * q).sqrt();
+        let setting = nz * (p * self.setting_error_um[0] + q * self.setting_error_um[1]);
+        let straight =
+            |t: f64, [second, third]: [f64; 2]| second * (1.5 * t * t - 0.5) + third * (2.5 * t * t * t - 1.5 * t);
+        let straightness = straight(x / half_x, self.straightness_x_um) + straight(y / half_y, self.straightness_y_um);
+        let screw = self.periodic_um * (std::f64::consts::TAU * x / self.periodic_pitch_mm + 0.7).sin();
+        finite_or_zero(setting + straightness + screw)
+    }
+
+    /// Returns the wear of the wheel after so many finishing strokes since it was dressed, in micrometres.
+    fn wear_at_um(&self, strokes: f64) -> f64 {
+        let fast = if self.break_in_share > 0.0 { 1.0 - (-strokes / self.break_in_share).exp() } else { 0.0 };
+        self.wear_um * strokes + self.break_in_um * fast
+    }
+}
+
+/// Corners of a round part's grid may lie where its formula has no value.
+fn finite_or_zero(value: f64) -> f64 {
+    if value.is_finite() { value } else { 0.0 }
+}
+
+/// Returns the systematic error at every node, waviness included and the wheel's radius not, in millimetres.
+pub(crate) fn systematic_mm(spec: &GrinderSpec, part: &Part, seed: u64) -> Vec<f64> {
+    let waves = smooth(&mut stream(seed, Source::Waviness, 0), spec.waviness_correlation_mm, spec.waviness_um);
+    let mut error_mm: Vec<f64> = part.height.nodes().map(|place| 1e-3 * spec.systematic_um(part, place)).collect();
+    part.height.add(&waves, &mut error_mm);
+    error_mm
+}
+
+fn smooth(rng: &mut crate::Rng, correlation_mm: f64, rms_um: f64) -> FormError {
+    if rms_um > 0.0 { FormError::with_rms(rng, correlation_mm, rms_um * 1e-3) } else { FormError::none() }
+}
+
+/// A pass that the grinder began.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GrindEntry {
+    /// The part's run.
+    pub job: u32,
+    /// Its cycle.
+    pub cycle: u16,
+    /// The height that was wanted, in millimetres.
+    pub level_mm: f64,
+    /// Largest value of the map that came with it, in millimetres.
+    pub map_largest_mm: f64,
+    /// Identity of the map.
+    pub map: [u8; 32],
+    /// Strokes to take off what stood above the depth of cut.
+    pub roughing_strokes: u32,
+    /// How it ended as in the pass record; 0 while it goes on.
+    pub result: u16,
+    /// Volume removed in cubic millimetres.
+    pub volume_mm3: f64,
+}
+
+/// One travel over the whole part.
+#[derive(Clone, Copy, Debug)]
+struct Stroke {
+    begin_s: f64,
+    feed_mm_s: f64,
+    /// How much a roughing stroke stays above the finishing one; none for finishing and spark-out.
+    above_mm: Option<f64>,
+}
+
+/// A pass, made ready or going on.
+struct Run {
+    job: u32,
+    cycle: u16,
+    map_identity: [u8; 32],
+    map_largest_mm: f64,
+    pass: Pass,
+    /// Places along one stroke and the nodes ground there, in order.
+    order: Vec<(f64, u32)>,
+    /// What does not change along the path, a value for every node, in millimetres.
+    fixed_mm: Vec<f64>,
+    strokes: Vec<Stroke>,
+    stroke_mm: f64,
+    total_s: f64,
+    finishing_s: f64,
+    heat_at_begin: f64,
+    before_mm: Vec<f64>,
+    stroke: usize,
+    next: usize,
+    elapsed_s: f64,
+    visits: u64,
+    in_air: u64,
+}
+
+impl Run {
+    fn roughing(&self) -> u32 {
+        self.strokes.iter().filter(|s| s.above_mm.is_some()).count() as u32
+    }
+
+    fn finished(&self) -> bool {
+        self.elapsed_s >= self.total_s
+    }
+
+    fn heat_at(&self, spec: &GrinderSpec, seconds: f64) -> f64 {
+        1.0 - (1.0 - self.heat_at_begin) * (-seconds / spec.thermal_tau_s).exp()
+    }
+
+    /// Grinds every node whose moment has come.
+    fn grind(&mut self, state: &mut State) {
+        while let Some(stroke) = self.strokes.get(self.stroke).copied() {
+            while let Some(&(place, node)) = self.order.get(self.next) {
+                let moment = stroke.begin_s + place / stroke.feed_mm_s;
+                if moment > self.elapsed_s {
+                    return;
+                }
+                self.cut(state, stroke, moment, node as usize);
+                self.next += 1;
+            }
+            (self.stroke, self.next) = (self.stroke + 1, 0);
+        }
+    }
+
+    fn cut(&mut self, state: &mut State, stroke: Stroke, moment: f64, node: usize) {
+        let spec = &state.spec.grinder;
+        let drift_mm = stroke.above_mm.unwrap_or_else(|| {
+            let strokes = (moment - self.finishing_s) * stroke.feed_mm_s / self.stroke_mm;
+            let worn = spec.wear_at_um(state.worn_strokes + strokes) - spec.wear_at_um(state.worn_strokes);
+            let grown = self.heat_at(spec, moment) - self.heat_at(spec, self.finishing_s);
+            1e-3 * (worn - spec.thermal_um * grown)
+        });
+        let cmd = self.fixed_mm[node] + drift_mm;
+        let h = &mut state.part.height.heights_mm[node];
+        self.visits += 1;
+        if state.spec.faults.no_part || *h <= cmd {
+            self.in_air += 1;
+        } else {
+            *h = spec.error_copying * *h + (1.0 - spec.error_copying) * cmd;
+        }
+    }
+
+    /// Returns the length of the path travelled so far, in millimetres.
+    fn path_mm(&self) -> f64 {
+        let time = self.elapsed_s.min(self.total_s);
+        self.strokes.iter().map(|s| ((time - s.begin_s).max(0.0) * s.feed_mm_s).min(self.stroke_mm)).sum()
+    }
+
+    fn record(&self, state: &State, result: u16) -> PassRecord {
+        let part = &state.part;
+        let (mut volume_mm3, mut depth_mm) = (0.0, 0.0f64);
+        for (k, [x, y]) in part.height.nodes().enumerate().filter(|(_, [x, y])| part.aperture.contains(*x, *y)) {
+            let depth = self.before_mm[k] - part.height.heights_mm[k];
+            let [p, q] = part.shape.gradient(x, y);
+            volume_mm3 += finite_or_zero(depth * part.height.cell_mm2() * (1.0 + p * p + q * q).sqrt());
+            depth_mm = depth_mm.max(depth);
+        }
+        let air_share = if self.visits == 0 { 1.0 } else { self.in_air as f64 / self.visits as f64 };
+        let each_mm = depth_mm / (self.roughing() + 1) as f64;
+        PassRecord {
+            job: self.job,
+            cycle: self.cycle,
+            result,
+            path_mm: self.path_mm(),
+            volume_mm3,
+            depth_mm,
+            air_share,
+            // Idling takes a tenth, a stroke of the full depth of cut everywhere seven tenths.
+            spindle_load: (0.1 + 0.6 * (1.0 - air_share) * (each_mm / self.pass.depth_of_cut_mm).min(1.0)).min(1.0),
+            wheel_radius_mm: self.pass.wheel_radius_mm,
+        }
+    }
+}
+
+/// Returns the nodes that the wheel comes to, with their places along the path, and the length of the path in millimetres.
+fn raster(part: &Part, pass: &Pass) -> (Vec<(f64, u32)>, f64) {
+    let [x0, x1, y0, y1] = grown(pass.extent_mm);
+    let (length, spacing) = (x1 - x0, pass.track_spacing_mm);
+    let last = ((y1 - y0) / spacing).ceil();
+    let mut order: Vec<(f64, u32)> = Vec::new();
+    for (k, [x, y]) in part.height.nodes().enumerate() {
+        if (x0..=x1).contains(&x) && (y0..=y1).contains(&y) {
+            let track = ((y - y0) / spacing).round().min(last);
+            let along = if track as u64 % 2 == 0 { x - x0 } else { x1 - x };
+            order.push((track * (length + spacing) + along, k as u32));
+        }
+    }
+    order.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    (order, (last + 1.0) * length + last * spacing)
+}
+
+fn grown([x0, x1, y0, y1]: [f64; 4]) -> [f64; 4] {
+    [x0 - OVERTRAVEL_MM, x1 + OVERTRAVEL_MM, y0 - OVERTRAVEL_MM, y1 + OVERTRAVEL_MM]
+}
+
+/// Returns what the machine steers to at every node but for wear and growth, in millimetres.
+fn fixed_mm(state: &State, map: &Map, pass: &Pass) -> Vec<f64> {
+    let (spec, part) = (&state.spec.grinder, &state.part);
+    let rng = &mut stream(state.spec.seed, Source::Repeatability, state.passes_begun + 1);
+    let fresh = smooth(rng, spec.repeatability_correlation_mm, spec.repeatability_um);
+    let true_radius_mm = state.true_wheel_radius_mm.unwrap_or(pass.wheel_radius_mm + 1e-3 * spec.wheel_radius_error_um);
+    let y0 = grown(pass.extent_mm)[2];
+    let lag_mm = 1e-3 * spec.following_um * pass.feed_mm_min / 1000.0;
+    let nodes = part.height.nodes().zip(&state.systematic_mm);
+    let steered = nodes.map(|([x, y], systematic)| {
+        let [p, q] = part.shape.gradient(x, y);
+        let slope2 = 1.0 + p * p + q * q;
+        // A wheel larger than stated cuts deeper on slopes: what it leaves is lower by dR (1/nz - 1).
+        let wheel = (pass.wheel_radius_mm - true_radius_mm) * (slope2.sqrt() - 1.0);
+        let forth = if ((y - y0) / pass.track_spacing_mm).round() as i64 % 2 == 0 { 1.0 } else { -1.0 };
+        let following = forth * lag_mm * p / slope2.sqrt();
+        let wanted = pass.level_mm + displaced(state, map, x, y);
+        wanted + systematic + finite_or_zero(wheel + following)
+    });
+    let mut steered: Vec<f64> = steered.collect();
+    part.height.add(&fresh, &mut steered);
+    steered
+}
+
+/// Returns what this machine makes of the map at (x, y).
+fn displaced(state: &State, map: &Map, x: f64, y: f64) -> f64 {
+    let faults = &state.spec.faults;
+    let (x, y) = match faults.map_mirrored {
+        Mirrored::None => (x, y),
+        Mirrored::X => (-x, y),
+        Mirrored::Y => (x, -y),
+    };
+    let u = if faults.map_ignored { 0.0 } else { map.at(x, y) };
+    if faults.map_sign_flipped { -u } else { u }
+}
+
+/// The grinder of a world.
+pub struct Grinder {
+    world: Arc<Mutex<State>>,
+    ready: Option<Run>,
+    running: Option<Run>,
+}
+
+impl Grinder {
+    pub(crate) fn new(world: Arc<Mutex<State>>) -> Self {
+        Self { world, ready: None, running: None }
+    }
+
+    /// Refuses what this machine cannot reach or move.
+    fn limits(state: &State, pass: &Pass) -> Result<(), Refusal> {
+        let spec = &state.spec.grinder;
+        if pass.feed_mm_min > spec.feed_most_mm_min {
+            return Err(outside("feed in mm/min", pass.feed_mm_min, &format!("up to {}", spec.feed_most_mm_min)));
+        }
+        let [x0, x1, y0, y1] = grown(pass.extent_mm);
+        for (name, value, most) in [("x", x0.abs().max(x1.abs()), 0), ("y", y0.abs().max(y1.abs()), 1)] {
+            let most = spec.travel_mm[most];
+            if value > most {
+                return Err(outside(&format!("travel along {name} in mm"), value, &format!("up to {most}")));
+            }
+        }
+        let tracks = (y1 - y0) / pass.track_spacing_mm;
+        if tracks > 20_000.0 {
+            return Err(outside("number of tracks", tracks, "up to 20000"));
+        }
+        Ok(())
+    }
+
+    fn map_limits(state: &State, map: &Map) -> Result<(), Refusal> {
+        let most = state.spec.grinder.map_most_um;
+        if map.largest_mm() * 1e3 > most {
+            return Err(outside("largest value of the map in um", map.largest_mm() * 1e3, &format!("up to {most}")));
+        }
+        Ok(())
+    }
+
+    fn of_another_part(state: &State, nominal: &[u8; 32], job: Option<u32>) -> Result<(), Refusal> {
+        let same_part = !state.spec.part.fresh_per_job || (job.is_some() && state.job == job);
+        let other = match state.held {
+            Some(held) => same_part && held != *nominal,
+            None => false,
+        };
+        if state.spec.faults.wrong_part || other {
+            let reason = "the payload is for another part than the grinder holds".to_owned();
+            return Err(Refusal { answer: BROKEN, reason });
+        }
+        Ok(())
+    }
+}
+
+fn run(state: &State, (job, cycle): (u32, u16), map_payload: &Payload, map: &Map, pass: Pass) -> Result<Run, Refusal> {
+    let fixed_mm = fixed_mm(state, map, &pass);
+    let (order, stroke_mm) = raster(&state.part, &pass);
+    let within = |&(_, node): &(f64, u32)| state.part.height.heights_mm[node as usize] - fixed_mm[node as usize];
+    let proud_mm = order.iter().map(within).fold(0.0, f64::max);
+    let needed = (proud_mm / pass.depth_of_cut_mm).ceil().max(1.0);
+    if needed + f64::from(pass.spark_out) > f64::from(MOST_STROKES) {
+        let limit = format!("up to {MOST_STROKES}; the part stands {proud_mm:.4} mm proud");
+        return Err(outside("number of strokes", needed + f64::from(pass.spark_out), &limit));
+    }
+    let feed_mm_s = pass.feed_mm_min / 60.0;
+    let roughing = needed as u32 - 1;
+    let mut strokes: Vec<Stroke> = Vec::new();
+    let mut begin_s = 0.0;
+    for k in (1..=roughing).rev() {
+        let above_mm = Some(f64::from(k) * pass.depth_of_cut_mm);
+        strokes.push(Stroke { begin_s, feed_mm_s: ROUGHING_FEED * feed_mm_s, above_mm });
+        begin_s += stroke_mm / (ROUGHING_FEED * feed_mm_s);
+    }
+    let finishing_s = begin_s;
+    for _ in 0..=pass.spark_out {
+        strokes.push(Stroke { begin_s, feed_mm_s, above_mm: None });
+        begin_s += stroke_mm / feed_mm_s;
+    }
+    Ok(Run {
+        job,
+        cycle,
+        map_identity: map_payload.identity,
+        map_largest_mm: map.largest_mm(),
+        pass,
+        order,
+        fixed_mm,
+        strokes,
+        stroke_mm,
+        total_s: begin_s,
+        finishing_s,
+        heat_at_begin: state.heat,
+        before_mm: Vec::new(),
+        stroke: 0,
+        next: 0,
+        elapsed_s: 0.0,
+        visits: 0,
+        in_air: 0,
+    })
+}
+
+/// Progress in thousandths of the path.
+fn progress(run: &Run) -> Progress {
+    let finished = run.finished();
+    let done = if finished { 1000 } else { ((1000.0 * run.elapsed_s / run.total_s) as u32).min(999) };
+    Progress { done, total: 1000, finished, fault: 0 }
+}
+
+impl Body for Grinder {
+    fn kind(&self) -> Kind {
+        Kind::Grinder
+    }
+
+    fn name(&self) -> String {
+        "SIMULATED GRINDER 1".to_owned()
+    }
+
+    fn check(&self, kind: u16, payload: &Payload) -> Result<(), Refusal> {
+        let state = locked(&self.world);
+        match kind {
+            2 => {
+                let map = Map::decode(&payload.bytes)?;
+                Self::map_limits(&state, &map)?;
+                Self::of_another_part(&state, &map.nominal, None)
+            }
+            3 => {
+                let pass = Pass::decode(&payload.bytes)?;
+                Self::limits(&state, &pass)?;
+                Self::of_another_part(&state, &pass.nominal, None)
+            }
+            other => {
+                Err(Refusal { answer: BROKEN, reason: format!("a grinder has no use for a payload of kind {other}") })
+            }
+        }
+    }
+
+    fn prepare(&mut self, job: u32, cycle: u16, payloads: &Payloads) -> Result<Progress, Refusal> {
+        self.ready = None;
+        let mut state = locked(&self.world);
+        let missing = |what: &str| Refusal { answer: BROKEN, reason: format!("there is no {what}") };
+        let map_payload = payloads.map.as_ref().ok_or_else(|| missing("map"))?;
+        let map = Map::decode(&map_payload.bytes)?;
+        let pass = Pass::decode(&payloads.pass.as_ref().ok_or_else(|| missing("pass"))?.bytes)?;
+        if map.nominal != pass.nominal {
+            return Err(Refusal { answer: BROKEN, reason: "map and pass are for different parts".to_owned() });
+        }
+        Self::map_limits(&state, &map)?;
+        Self::limits(&state, &pass)?;
+        Self::of_another_part(&state, &pass.nominal, Some(job))?;
+        if state.taken_by_other(Kind::Grinder) {
+            return Err(Refusal { answer: INTERLOCK, reason: "the part is on the measuring machine".to_owned() });
+        }
+        state.blank_for(job);
+        let run = run(&state, (job, cycle), map_payload, &map, pass)?;
+        let first = progress(&run);
+        self.ready = Some(run);
+        Ok(first)
+    }
+
+    fn begin(&mut self) {
+        let Some(mut run) = self.ready.take() else { return };
+        let mut state = locked(&self.world);
+        if !state.take(Kind::Grinder) {
+            return;
+        }
+        state.held = Some(run.pass.nominal);
+        state.passes_begun += 1;
+        let error_mm = 1e-3 * state.spec.grinder.wheel_radius_error_um;
+        state.true_wheel_radius_mm.get_or_insert(run.pass.wheel_radius_mm + error_mm);
+        state.on_table = false;
+        if state.spec.grinder.dressed_each_pass {
+            state.worn_strokes = 0.0;
+        }
+        let entry = GrindEntry {
+            job: run.job,
+            cycle: run.cycle,
+            level_mm: run.pass.level_mm,
+            map_largest_mm: run.map_largest_mm,
+            map: run.map_identity,
+            roughing_strokes: run.roughing(),
+            result: 0,
+            volume_mm3: 0.0,
+        };
+        state.history.push(entry);
+        run.before_mm = state.part.height.heights_mm.clone();
+        self.running = Some(run);
+    }
+
+    fn advance(&mut self, seconds: f64) -> Progress {
+        let mut state = locked(&self.world);
+        let Some(run) = self.running.as_mut() else {
+            // Nothing was begun: something else has the part.
+            return Progress { done: 0, total: 1000, finished: false, fault: 1 };
+        };
+        if seconds > 0.0 && seconds.is_finite() {
+            run.elapsed_s += seconds;
+        }
+        state.engaged = Some(Kind::Grinder);
+        run.grind(&mut state);
+        if run.finished() {
+            state.clear(Kind::Grinder);
+        }
+        progress(run)
+    }
+
+    fn retract(&mut self) {
+        locked(&self.world).clear(Kind::Grinder);
+    }
+
+    fn outcome(&mut self, result: u16) -> Outcome {
+        let mut state = locked(&self.world);
+        self.ready = None;
+        let Some(run) = self.running.take() else { return nothing_done(state.spec.cmm.part_temperature_c) };
+        let record = run.record(&state, result);
+        let duration_s = run.elapsed_s.min(run.total_s);
+        let spec = &state.spec.grinder;
+        state.heat = run.heat_at(spec, duration_s);
+        state.worn_strokes += (duration_s - run.finishing_s).max(0.0) * run.pass.feed_mm_min / 60.0 / run.stroke_mm;
+        if let Some(entry) = state.history.last_mut() {
+            (entry.result, entry.volume_mm3) = (result, record.volume_mm3);
+        }
+        state.release(Kind::Grinder);
+        Outcome {
+            kind: 5,
+            format: 1,
+            bytes: record.encode(),
+            records: 1,
+            coordinates: 0,
+            probe_radius_mm: 0.0,
+            scale_mm: 1.0,
+            temperature_c: state.spec.cmm.part_temperature_c,
+            duration_s,
+        }
+    }
+
+    fn interlocks(&self) -> u16 {
+        locked(&self.world).interlocks(Kind::Grinder)
+    }
+
+    fn temperature_c(&self) -> f64 {
+        locked(&self.world).spec.cmm.part_temperature_c
+    }
+}
+
+/// The outbox of a job that never began.
+pub(crate) fn nothing_done(temperature_c: f64) -> Outcome {
+    Outcome {
+        kind: 0,
+        format: 1,
+        bytes: Vec::new(),
+        records: 0,
+        coordinates: 0,
+        probe_radius_mm: 0.0,
+        scale_mm: 1.0,
+        temperature_c,
+        duration_s: 0.0,
+    }
+}
