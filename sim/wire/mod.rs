@@ -260,6 +260,19 @@ pub struct Serving {
     machines: Units,
     faults: Faults,
     tasks: JoinSet<io::Result<()>>,
+    /// A link to a pseudo-terminal, and where that is.
+    linked: Option<(PathBuf, PathBuf)>,
+}
+
+impl Drop for Serving {
+    fn drop(&mut self) {
+        if let Some((link, port)) = self.linked.take()
+            && std::fs::read_link(&link).is_ok_and(|to| to == port)
+        {
+            // Nobody is left to be told; a link that stays is replaced by the next simulator.
+            let _ = std::fs::remove_file(link);
+        }
+    }
 }
 
 impl Serving {
@@ -301,6 +314,23 @@ impl Serving {
         Ok(serving)
     }
 
+    /// Gives the serial port another path, that which a client's configuration names, for as long as it is served.
+    ///
+    /// # Errors
+    /// Something that is not a link is there already, or the link cannot be made, or this is not a serial port.
+    #[cfg(unix)]
+    pub fn link(&mut self, at: impl AsRef<Path>) -> io::Result<()> {
+        let at = at.as_ref();
+        let port = self.path.clone().ok_or(io::ErrorKind::Unsupported)?;
+        if std::fs::symlink_metadata(at).is_ok_and(|found| found.is_symlink()) {
+            std::fs::remove_file(at)?;
+        }
+        std::os::unix::fs::symlink(&port, at)?;
+        self.linked = Some((at.to_path_buf(), port));
+        self.path = Some(at.to_path_buf());
+        Ok(())
+    }
+
     /// Serves machines over Modbus RTU on a serial port of this computer: 8 data bits, no parity, 1 stop bit.
     ///
     /// # Errors
@@ -328,7 +358,7 @@ impl Serving {
             live(living).await;
             Ok(())
         });
-        Self { local_addr: None, path: None, machines, faults, tasks }
+        Self { local_addr: None, path: None, machines, faults, tasks, linked: None }
     }
 
     fn spawn_rtu<P>(&mut self, port: P, line: rtu::Line)
