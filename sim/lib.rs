@@ -9,12 +9,19 @@
 //!  form    what grinding left on it: a smooth random error along the normal
 //!  probe   a ball that touches the part, in a frame of its own, with noise and outliers
 //!
-//!  world   the truth in one table, the two machines that share it, and queries for tests
-//!  part    the part as it really is, and exact contact with it
-//!  process the grinder: what a pass leaves, node by node along its path
-//!  cmm     the measuring machine: what it reports of a plan
-//!  payload the bytes of docs/modbus.md
-//!  body    what a machine's registers ask of its physics
+//!  world      the truth in one table, the two machines that share it, and queries for tests
+//!  part       the part as it really is, and exact contact with it
+//!  process    the grinder: what a pass leaves, node by node along its path
+//!  cmm        the measuring machine: what it reports of a plan
+//!  payload    the bytes of docs/modbus.md
+//!
+//!  body       what the physics of one machine must be able to do
+//!  words      how values lie in registers
+//!  transfer   payloads in and results out, a page at a time
+//!  handshake  commands, states, interlocks, silence
+//!  registers  a whole machine: what a Modbus client reads and writes
+//!  seen       what the machine saw and did
+//!  wire       Modbus TCP and RTU servers, a serial line without hardware, and everything that goes wrong on them
 //! ```
 //!
 //! Units: millimetres and radians throughout. Frames: `shape` and `form` live in the model frame, the points a probe reports
@@ -23,11 +30,17 @@
 pub mod body;
 pub mod cmm;
 pub mod form;
+pub mod handshake;
 pub mod part;
 pub mod payload;
 pub mod probe;
 pub mod process;
+pub mod registers;
+pub mod seen;
 pub mod shape;
+pub mod transfer;
+pub mod wire;
+pub mod words;
 pub mod world;
 
 /// A position or a direction in space.

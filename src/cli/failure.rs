@@ -36,6 +36,8 @@ pub(super) enum Failure {
         "{path}: no pose: {reason}; give 16 numbers, row by row, as text or JSON, or the registration.json of an earlier run"
     )]
     Initial { path: PathBuf, reason: String },
+    #[error("{bad} of {files} files {} problems; they are listed above", if *bad == 1 { "has" } else { "have" })]
+    Checked { bad: usize, files: usize },
     #[error("the result cannot be told: {what} is not a finite number; please report it with the files that led to it")]
     NotFinite { what: &'static str },
     /// The input was good and the place was writable before; now it is not.

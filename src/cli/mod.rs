@@ -1,10 +1,12 @@
 //! The command line: one file per command, and the only room that prints or exits.
 
 mod accuracy;
+mod check;
 mod failure;
 mod initial;
 mod nominal;
 mod register;
+mod schema;
 mod words;
 
 use std::io::{self, Write};
@@ -26,6 +28,8 @@ struct Arguments {
 enum Command {
     Register(register::Arguments),
     Accuracy(accuracy::Arguments),
+    Check(check::Arguments),
+    Schema(schema::Arguments),
 }
 
 const EXIT_CODES: &str = "Exit codes: 0 accepted; 1 finished, not in tolerance; 2 bad arguments or data; 3 fault.";
@@ -57,6 +61,8 @@ fn run() -> ExitCode {
     let ended = match arguments.command {
         Command::Register(arguments) => register::run(&arguments),
         Command::Accuracy(arguments) => accuracy::run(&arguments),
+        Command::Check(arguments) => check::run(&arguments),
+        Command::Schema(arguments) => schema::run(&arguments),
     };
     match ended {
         Ok(Outcome::Accepted) => ExitCode::SUCCESS,

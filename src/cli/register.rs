@@ -4,16 +4,12 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
-use rayon::prelude::*;
 use regrind::formats::{
-    DeviationRow, FormatError, ResultFolder, read_measured, write_column, write_deviations, write_json_atomic,
+    Alternative, NominalInput, RegistrationDocument, ResultFolder, read_measured, save_registration,
 };
 use regrind::geometry::{Point, Pose};
-use regrind::registration::{
-    Deviation, Iteration, Loss, Method, Options, PointStatus, ProbeSide, Registration, Start, WeakDirection, register,
-};
+use regrind::registration::{Loss, Method, Options, ProbeSide, Start, register};
 use regrind::surface::{Distance, Nominal, NominalKind, Side};
-use serde::Serialize;
 
 use super::failure::Failure;
 use super::initial::read_pose;
@@ -87,8 +83,7 @@ many points took part in it. `outliers` and `off_part` count the measured points
 
 Exit codes: 0 registered; 2 bad arguments or data; 3 fault.";
 
-#[derive(Clone, Copy, Debug, Default, Serialize, ValueEnum)]
-#[serde(rename_all = "kebab-case")]
+#[derive(Clone, Copy, Debug, Default, ValueEnum)]
 enum DistanceName {
     /// As the cubic that points and normals define
     #[default]
@@ -97,8 +92,7 @@ enum DistanceName {
     Triangle,
 }
 
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, ValueEnum)]
-#[serde(rename_all = "kebab-case")]
+#[derive(Clone, Copy, Debug, Default, PartialEq, ValueEnum)]
 enum MethodName {
     /// Probe centres, registered to the offset surface
     #[default]
@@ -109,8 +103,7 @@ enum MethodName {
     SubtractRadius,
 }
 
-#[derive(Clone, Copy, Debug, Default, Serialize, ValueEnum)]
-#[serde(rename_all = "kebab-case")]
+#[derive(Clone, Copy, Debug, Default, ValueEnum)]
 enum LossName {
     /// As its square
     #[default]
@@ -121,8 +114,7 @@ enum LossName {
     Tukey,
 }
 
-#[derive(Clone, Copy, Debug, Default, Serialize, ValueEnum)]
-#[serde(rename_all = "kebab-case")]
+#[derive(Clone, Copy, Debug, Default, ValueEnum)]
 enum SideName {
     /// The one that fits
     #[default]
@@ -133,8 +125,7 @@ enum SideName {
     Opposite,
 }
 
-#[derive(Clone, Copy, Debug, Serialize, ValueEnum)]
-#[serde(rename_all = "kebab-case")]
+#[derive(Clone, Copy, Debug, ValueEnum)]
 enum Coordinate {
     X,
     Y,
@@ -144,82 +135,17 @@ enum Coordinate {
     Rz,
 }
 
-/// `registration.json`.
-#[derive(Serialize)]
-struct Document<'a> {
-    program: Program,
-    nominal: NominalInput<'a>,
-    measured: MeasuredInput<'a>,
-    method: MethodName,
-    distance: DistanceName,
-    loss: LossName,
-    probe_radius_mm: Option<f64>,
-    locked: &'a [Coordinate],
-    cmm_from_model: [[f64; 4]; 4],
-    standard_uncertainty: StandardUncertainty,
-    covariance: [[f64; 6]; 6],
-    condition: f64,
-    weak_directions: &'a [WeakDirection],
-    alternatives: Vec<Alternative>,
-    warnings: Vec<String>,
-    converged: bool,
-    iterations: usize,
-    objective_mm2: Vec<f64>,
-    points: usize,
-    used: usize,
-    rms_mm: f64,
-    pv_mm: f64,
-    residual_sigma_mm: f64,
-    coverage: f64,
-    side: SideName,
-    outliers: Vec<usize>,
-    off_part: Vec<usize>,
-    trace: &'a [Iteration],
-}
-
-#[derive(Serialize)]
-struct Program {
-    name: &'static str,
-    version: &'static str,
-}
-
-#[derive(Serialize)]
-struct NominalInput<'a> {
-    file: &'a Path,
-    points: usize,
-    kind: String,
-}
-
-#[derive(Serialize)]
-struct MeasuredInput<'a> {
-    file: &'a Path,
-}
-
-#[derive(Serialize)]
-struct Alternative {
-    cmm_from_model: [[f64; 4]; 4],
-    rms_mm: f64,
-}
-
-#[derive(Serialize)]
-struct StandardUncertainty {
-    x_mm: f64,
-    y_mm: f64,
-    z_mm: f64,
-    rx_rad: f64,
-    ry_rad: f64,
-    rz_rad: f64,
-}
-
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let options = options(arguments)?;
     let folder = ResultFolder::prepare(&arguments.out)?;
     let (nominal, measured) = read_inputs(arguments)?;
     let registration = register(&nominal, &measured, &options)
         .map_err(|e| Failure::of_registration(e, &arguments.nominal, &arguments.measured))?;
-    let document = Document::new(arguments, &nominal, &registration);
-    document.check()?;
-    save(&folder, &document, &registration.deviations).map_err(Failure::NotSaved)?;
+    let nominal_file =
+        NominalInput { file: &arguments.nominal, points: nominal.len(), kind: kind_in_words(nominal.kind()) };
+    let document = RegistrationDocument::new(&registration, &options, nominal_file, &arguments.measured);
+    document.check().map_err(|what| Failure::NotFinite { what })?;
+    save_registration(folder.path(), &document, &registration.deviations).map_err(Failure::NotSaved)?;
     if arguments.json {
         super::print_json(&document)?;
     } else {
@@ -281,105 +207,8 @@ fn read_inputs(arguments: &Arguments) -> Result<(Nominal, Vec<Point>), Failure> 
     })
 }
 
-/// Writes the three files; the JSON comes last, so that the others are whole where it is.
-fn save(folder: &ResultFolder, document: &Document, deviations: &[Deviation]) -> Result<(), FormatError> {
-    let at = |name: &str| folder.path().join(name);
-    let (rows, column) = rayon::join(
-        || {
-            let rows: Vec<DeviationRow> = deviations.par_iter().map(row).collect();
-            write_deviations(at("deviations.csv"), &rows)
-        },
-        || {
-            let column: Vec<f64> = deviations.iter().map(|d| d.uncertainty_mm).collect();
-            write_column(at("deviation_uncertainty.csv"), "uncertainty_mm", &column)
-        },
-    );
-    rows.and(column)?;
-    write_json_atomic(at("registration.json"), document)
-}
-
-fn row(deviation: &Deviation) -> DeviationRow {
-    DeviationRow {
-        point_mm: deviation.point.into(),
-        normal: deviation.normal.into(),
-        deviation_mm: deviation.deviation_mm,
-        used: deviation.status == PointStatus::Used,
-    }
-}
-
-impl<'a> Document<'a> {
-    fn new(arguments: &'a Arguments, nominal: &Nominal, registration: &'a Registration) -> Self {
-        let verdict = &registration.verdict;
-        let covariance: [[f64; 6]; 6] = std::array::from_fn(|i| std::array::from_fn(|j| verdict.covariance[(i, j)]));
-        let sigma: [f64; 6] = std::array::from_fn(|k| covariance[k][k].max(0.0).sqrt());
-        let [x_mm, y_mm, z_mm, rx_rad, ry_rad, rz_rad] = sigma;
-        let with = |status| {
-            let deviations = registration.deviations.iter().enumerate();
-            deviations.filter(|(_, d)| d.status == status).map(|(k, _)| k).collect()
-        };
-        let alternative =
-            |(pose, rms_mm): &(Pose, f64)| Alternative { cmm_from_model: pose.to_rows(), rms_mm: *rms_mm };
-        Self {
-            program: Program { name: env!("CARGO_PKG_NAME"), version: env!("CARGO_PKG_VERSION") },
-            nominal: NominalInput {
-                file: &arguments.nominal,
-                points: nominal.len(),
-                kind: kind_in_words(nominal.kind()),
-            },
-            measured: MeasuredInput { file: &arguments.measured },
-            method: arguments.method,
-            distance: arguments.distance,
-            loss: arguments.loss,
-            probe_radius_mm: arguments.probe_radius,
-            locked: &arguments.lock,
-            cmm_from_model: registration.cmm_from_model.to_rows(),
-            standard_uncertainty: StandardUncertainty { x_mm, y_mm, z_mm, rx_rad, ry_rad, rz_rad },
-            covariance,
-            condition: verdict.condition,
-            weak_directions: &verdict.weak_directions,
-            alternatives: verdict.alternatives.iter().map(alternative).collect(),
-            warnings: verdict.warnings.clone(),
-            converged: verdict.converged,
-            iterations: verdict.iterations,
-            objective_mm2: registration.trace.iter().filter(|i| i.taken).map(|i| i.objective_mm2).collect(),
-            points: registration.deviations.len(),
-            used: verdict.used,
-            rms_mm: verdict.rms_mm,
-            pv_mm: verdict.pv_mm,
-            residual_sigma_mm: verdict.residual_sigma_mm,
-            coverage: verdict.coverage,
-            side: if registration.side == Side::Normal { SideName::Normal } else { SideName::Opposite },
-            outliers: with(PointStatus::Outlier),
-            off_part: with(PointStatus::OffPart),
-            trace: &registration.trace,
-        }
-    }
-
-    /// JSON has no NaN, and would say `null` where a reader expects a number.
-    fn check(&self) -> Result<(), Failure> {
-        let finite = |numbers: &[f64]| numbers.iter().all(|v| v.is_finite());
-        let step = |i: &Iteration| finite(&[i.objective_mm2, i.step, i.ball_radius]);
-        let checks = [
-            ("the pose", finite(self.cmm_from_model.as_flattened())),
-            ("the covariance", finite(self.covariance.as_flattened())),
-            ("the condition", self.condition.is_finite()),
-            ("a figure of the deviations", finite(&[self.rms_mm, self.pv_mm, self.residual_sigma_mm, self.coverage])),
-            ("the trace", self.trace.iter().all(step)),
-            ("a weak direction", self.weak_directions.iter().all(|w| w.sigma_mm.is_none_or(f64::is_finite))),
-            (
-                "an alternative pose",
-                self.alternatives.iter().all(|a| finite(a.cmm_from_model.as_flattened()) && a.rms_mm.is_finite()),
-            ),
-        ];
-        match checks.into_iter().find(|(_, finite)| !finite) {
-            Some((what, _)) => Err(Failure::NotFinite { what }),
-            None => Ok(()),
-        }
-    }
-}
-
 /// What an operator wants to know, a line each.
-fn summary(document: &Document, kind: NominalKind, folder: &Path) -> String {
+fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
     let mut text = String::new();
     let mut line = |name: &str, words: String| {
@@ -412,7 +241,7 @@ fn summary(document: &Document, kind: NominalKind, folder: &Path) -> String {
     for weak in document.weak_directions {
         line("weak", weak.words.clone());
     }
-    for warning in &document.warnings {
+    for warning in document.warnings {
         line("warning", warning.clone());
     }
     for other in &document.alternatives {
@@ -422,14 +251,14 @@ fn summary(document: &Document, kind: NominalKind, folder: &Path) -> String {
     text
 }
 
-fn pose_in_words(document: &Document) -> String {
+fn pose_in_words(document: &RegistrationDocument) -> String {
     let pose = Pose::from_rows(document.cmm_from_model).expect("a pose that was found is one");
     let [x, y, z] = pose.translation_mm.into();
     format!("shift {x:.4}, {y:.4}, {z:.4} mm, turned by {:.4} degrees", pose.angle_rad().to_degrees())
 }
 
 /// How far an alternative is from the pose found.
-fn apart(document: &Document, other: &Alternative) -> String {
+fn apart(document: &RegistrationDocument, other: &Alternative) -> String {
     let read = |rows| Pose::from_rows(rows).expect("a pose that was found is one");
     let between = read(document.cmm_from_model).inverse() * read(other.cmm_from_model);
     let (shift, turn) = (between.translation_mm.norm(), between.angle_rad().to_degrees());

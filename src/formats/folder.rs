@@ -55,6 +55,21 @@ impl Drop for ResultFolder {
     }
 }
 
+/// Removes a socket that nobody listens on any more; anything else of that name is left alone.
+///
+/// # Errors
+/// A folder that cannot be written, and a file of that name that is no socket.
+pub fn remove_socket(path: &Path) -> std::io::Result<()> {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::FileTypeExt;
+        if !fs::symlink_metadata(path)?.file_type().is_socket() {
+            return Err(std::io::Error::from(std::io::ErrorKind::AlreadyExists));
+        }
+    }
+    fs::remove_file(path)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

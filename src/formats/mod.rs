@@ -3,9 +3,11 @@
 //! No file is trusted. Whatever is wrong with one comes back as a [`FormatError`] that names the file, the place, what was
 //! found, what was expected and what to do; nothing here panics, and time and memory are bounded by the size of the file.
 
+mod document;
 mod error;
 mod folder;
 mod layout;
+mod map;
 mod number;
 pub mod ply;
 pub mod points;
@@ -15,8 +17,12 @@ mod whole;
 
 use std::path::Path;
 
+pub use document::{
+    Alternative, MeasuredInput, NominalInput, Program, RegistrationDocument, StandardUncertainty, save_registration,
+};
 pub use error::FormatError;
-pub use folder::ResultFolder;
+pub use folder::{ResultFolder, remove_socket};
+pub use map::{write_correction, write_error_map};
 pub use number::LIMIT_MM;
 pub use ply::{PlyFile, parse_ply, read_ply};
 pub use points::{parse_points, read_points};

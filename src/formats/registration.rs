@@ -80,7 +80,7 @@ pub fn write_json_atomic(path: impl AsRef<Path>, value: &impl Serialize) -> Resu
 }
 
 /// Writes rows of N numbers and perhaps a flag.
-fn write_rows<T: Sync, const N: usize>(
+pub(super) fn write_rows<T: Sync, const N: usize>(
     path: &Path,
     header: &str,
     rows: &[T],

@@ -19,7 +19,8 @@ use super::patch::{Facets, Lattice, Patch};
 use super::{Nominal, SurfaceError};
 
 /// How the surface runs between the corners of a facet.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Distance {
     /// As the cubic that its corners and normals define.
     #[default]
@@ -39,7 +40,8 @@ pub enum Lookup {
 }
 
 /// On which side of the nominal surface the probe travels.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Side {
     /// Where the normals of the nominal surface point: +z for a height over the plane, outwards for a mesh.
     #[default]

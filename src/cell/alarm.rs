@@ -1,0 +1,308 @@
+//! The alarms of a cell: what happened, what follows from it, what to do, and who may clear it, in plain language.
+
+use serde::{Deserialize, Serialize};
+
+/// Something that a person must see.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Alarm {
+    /// Which.
+    pub id: AlarmId,
+    /// What happened, with the values of this case.
+    pub what: String,
+    /// What follows from it.
+    pub consequence: String,
+    /// What to do, in this order.
+    pub remedy: Vec<String>,
+    /// Who may clear it.
+    pub clears: Role,
+}
+
+/// Who may clear an alarm.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Role {
+    /// It goes away by itself.
+    Nobody,
+    /// The operator.
+    Operator,
+    /// The process engineer.
+    ProcessEngineer,
+}
+
+macro_rules! catalogue {
+    ($($(#[$doc:meta])* $id:ident { $head:literal, $consequence:literal, $clears:ident, [$($remedy:literal),+ $(,)?] })+) => {
+        /// Every alarm there is.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+        #[serde(rename_all = "snake_case")]
+        pub enum AlarmId {
+            $($(#[$doc])* $id,)+
+        }
+
+        impl AlarmId {
+            /// All alarms, in the order of the catalogue.
+            pub const ALL: &[Self] = &[$(Self::$id),+];
+
+            /// What happened in general, what follows, who clears it, and what to do.
+            fn entry(self) -> (&'static str, &'static str, Role, &'static [&'static str]) {
+                match self {
+                    $(Self::$id => ($head, $consequence, Role::$clears, &[$($remedy),+]),)+
+                }
+            }
+        }
+    };
+}
+
+catalogue! {
+    /// Nothing answers.
+    Unreachable {
+        "A machine cannot be reached", "The run does not begin.", Operator,
+        ["See that the machine is switched on and its control is running.", "Check the cable and the address in the cell file.",
+         "Start the run again."]
+    }
+    /// Another device answers.
+    WrongDevice {
+        "Another device answers than the cell file names", "Nothing was written to it; the run does not begin.", ProcessEngineer,
+        ["Compare the address in the cell file with the machine.", "See that no other device has that address.",
+         "Start the run again."]
+    }
+    /// Scrambled sentinels.
+    WordOrder {
+        "The machine sends its registers in another word order than the cell file says",
+        "Every number would be wrong, so nothing was written; the run does not begin.", ProcessEngineer,
+        ["Change word_order in the cell file to the other of big and little.", "Start the run again."]
+    }
+    /// Inches.
+    Inches {
+        "Lengths are in inches", "Nothing is made of them: Regrind works in millimetres.", ProcessEngineer,
+        ["Set the measuring program and the control to millimetres.", "Resume to measure again, or start the run again."]
+    }
+    /// Another owner.
+    Owned {
+        "Another client has the machine", "The run does not begin.", Operator,
+        ["Find the other program or panel that has the machine and let it release it.", "Start the run again."]
+    }
+    /// Not idle.
+    NotIdle {
+        "A machine is not idle", "The run does not begin; nothing was changed on the machine.", Operator,
+        ["Look at the machine and end or clear what it is doing, at its own panel.",
+         "If it still holds the job of an interrupted run, resume that run.", "Start the run again."]
+    }
+    /// Link lost.
+    LinkLost {
+        "The link to a machine is lost", "Nothing new begins. A machine that was moving holds by itself; the cell asks it what became of its job and goes on when the link is back.", Nobody,
+        ["Check the cable, the switch and whether the control is running.", "Wait: the cell goes on by itself.",
+         "If it cannot be mended, stop or abort the run."]
+    }
+    /// Supplies or temperature.
+    ConditionLost {
+        "A condition for the work is missing", "The cell waits, and goes on by itself when the condition is back.", Nobody,
+        ["Restore air, coolant or temperature.", "Wait: the cell goes on by itself."]
+    }
+    /// Suspended for too long.
+    StaysSuspended {
+        "The cause of the suspension did not go away", "The cell no longer goes on by itself.", Operator,
+        ["Remove the cause.", "Resume, or stop the run."]
+    }
+    /// Fault.
+    MachineFault {
+        "A machine is in fault", "Both machines were told to end by their own safe sequence; the run is over.", Operator,
+        ["Look at the machine before anything else.", "Remove the cause and clear the fault at the machine.",
+         "Inspect the part; what was ground cannot be undone.", "Start a new run that begins with a measurement."]
+    }
+    /// The machine held by itself.
+    MachineHeldItself {
+        "A machine held its job without being told to", "The cell is held with it.", Operator,
+        ["Find out why: feed hold at the panel, silent link, a guard.", "Resume here, not at the machine."]
+    }
+    /// The machine moved by itself.
+    MachineResumedItself {
+        "A held machine was let go at its own panel", "The job goes on, and the cell with it.", Operator,
+        ["Hold and resume here, so that the record names who did it."]
+    }
+    /// The machine said no.
+    MachineRefused {
+        "A machine refused what it was asked for", "The cell is held before that step.", Operator,
+        ["Do what the answer of the machine asks for: mode automatic, guards closed, part clamped, payload within its limits.",
+         "Resume to ask again."]
+    }
+    /// No answer.
+    NoAnswer {
+        "A machine did not answer in time", "The cell is held before that step.", Operator,
+        ["Look at the machine and its panel.", "Resume to ask again."]
+    }
+    /// A job that failed.
+    JobFailed {
+        "A job of a machine ended before it was complete", "Its result is not used. A pass is not repeated: the part is measured as it is.",
+        Operator,
+        ["Look at the machine and the part.", "Resume to measure the part as it is."]
+    }
+    /// Unknown start.
+    StartUnknown {
+        "It is not known whether a job was started", "START is never repeated on a guess. Nothing moves by order of the cell.", Operator,
+        ["Look at the machine: does it stand still and clear of the part? Was the part touched?",
+         "Resume to ask the machine again.", "If it cannot tell: declare the job over with what you saw, and resume to measure the part.",
+         "Or stop the run."]
+    }
+    /// Reboot.
+    MachineRestarted {
+        "A machine was restarted in the middle of the run", "It may not know what it did. Nothing moves by order of the cell.", Operator,
+        ["Look at the machine and the part.", "Resume to ask the machine what became of the job.",
+         "If it cannot tell: declare the job over with what you saw, and resume to measure the part."]
+    }
+    /// The program was started again.
+    ProgramRestarted {
+        "The program was started again in the middle of the run", "The cell is held; what was under way is found out before anything moves.",
+        Operator,
+        ["Look at both machines.", "Resume: the cell first asks what became of an open job."]
+    }
+    /// Interlock.
+    NotClear {
+        "A machine is not clear of the part", "The other machine is not started.", Operator,
+        ["Bring it to its parked place at its own panel.", "Resume."]
+    }
+    /// Coverage gate.
+    Coverage {
+        "Too little of the part was measured", "Nothing is made of this measurement.", Operator,
+        ["Look for coolant, swarf or a clamp on the part, and for a worn or bent stylus.", "Resume to measure again."]
+    }
+    /// No part.
+    NoPart {
+        "No part was found where it should be", "Nothing is made of this measurement.", Operator,
+        ["See whether the part is loaded and clamped, and whether it is the right one.", "Resume to measure again, or stop the run."]
+    }
+    /// Shifted or turned.
+    PartMisplaced {
+        "The part lies further from its expected place than the recipe allows",
+        "No map is made: it would be ground in at the wrong place.", Operator,
+        ["See how the part is loaded: turned round, on swarf, in another seat.", "Stop the run, load the part as drawn, and start a run that begins with a measurement.",
+         "If it lay well all along, resume to measure again."]
+    }
+    /// Qualification.
+    ProbeRadius {
+        "The radius of the probe is not the one in the recipe", "Nothing is made of this measurement: every deviation would be off by it.", ProcessEngineer,
+        ["Clean the ball and the reference sphere.", "Qualify the probe on the machine, or mount the right stylus.",
+         "Resume to measure again; a recipe with another radius needs a new run."]
+    }
+    /// Contacts instead of centres.
+    Contacts {
+        "The machine gives contact points where probe centres are expected",
+        "Nothing is made of this measurement: it would be off by the radius of the probe.", ProcessEngineer,
+        ["Switch the radius compensation of the measuring program off.", "Resume to measure again."]
+    }
+    /// Another part's result.
+    ForeignResult {
+        "The result belongs to another part, plan or cycle", "Nothing is made of it.", ProcessEngineer,
+        ["See which job the machine ran.", "Resume to measure again."]
+    }
+    /// Broken result.
+    BrokenResult {
+        "The result is broken", "Nothing is made of it.", Operator,
+        ["Check the link and the measuring program.", "Resume to measure again."]
+    }
+    /// Temperature gate.
+    Temperature {
+        "The temperature was outside its window during the measurement", "Nothing is made of this measurement.", Operator,
+        ["Let the part and the room settle.", "Resume to measure again."]
+    }
+    /// Registration failed.
+    RegistrationFailed {
+        "The measurement could not be registered to the nominal surface", "Nothing is made of this measurement.", ProcessEngineer,
+        ["See whether the part and the nominal surface in the recipe belong together.", "Look at the points of this cycle in the run folder.",
+         "Resume to measure again, or stop the run."]
+    }
+    /// Computation late.
+    ComputationLate {
+        "A computation takes longer than it may", "The cell is held before it.", ProcessEngineer,
+        ["See whether the computer is overloaded.", "Resume to compute again."]
+    }
+    /// Weak directions.
+    WeakDirections {
+        "The surface does not hold the part in every direction", "No map is made: nobody knows where on the part it would be ground in.", ProcessEngineer,
+        ["Hold the named directions in the recipe (registration, lock), if the fixture holds them well enough.",
+         "Or measure features that hold them: edges, reference marks, a wider aperture.", "Start a new run that begins with a measurement."]
+    }
+    /// No map.
+    CompensationFailed {
+        "There is no map for the next pass", "No further pass is ground.", ProcessEngineer,
+        ["Read the reason and the figures of this cycle.", "Resume to compute again, or stop the run."]
+    }
+    /// Sign.
+    SignFlipped {
+        "The part answered to the map the other way round", "Another pass would make it worse; the cell is held.", ProcessEngineer,
+        ["Check the sign of the map at the grinder: positive leaves material.", "Do not resume before a test pass on a scrap part has shown the right sign.",
+         "Stop the run."]
+    }
+    /// Axis.
+    Mirrored {
+        "The part answered as to a mirrored map", "Another pass would make it worse; the cell is held.", ProcessEngineer,
+        ["Check the direction of x and y at the grinder, and how the part is turned in its fixture.",
+         "Do not resume before a test pass on a scrap part has shown the right direction.", "Stop the run."]
+    }
+    /// No effect.
+    NoEffect {
+        "The part did not answer to the map", "Another pass would change nothing; the cell is held.", ProcessEngineer,
+        ["See whether the wheel reached the part, and whether the grinder used the map.", "Check wheel radius and work offset.",
+         "Resume for another pass, or stop the run."]
+    }
+    /// Diverging.
+    Diverging {
+        "The part is getting worse", "After a second cycle that is worse the run does what the recipe says: hold or stop.", ProcessEngineer,
+        ["Compare the error maps of the last cycles.", "Look for a worn wheel, a loose clamp, a change of temperature.",
+         "Hold the run if you doubt the next pass."]
+    }
+    /// Stalled.
+    Stalled {
+        "The part is no longer getting better", "The run does what the recipe says: hold or stop.", ProcessEngineer,
+        ["Compare what is left with the measuring uncertainty and the repeatability of the grinder.",
+         "Resume for another pass, or stop the run."]
+    }
+    /// Passes spent.
+    MaxCycles {
+        "The recipe allows no further pass", "The run ends, not in tolerance.", ProcessEngineer,
+        ["Look at the figures of the cycles.", "If they were still falling, allow more passes in the recipe and start a run that begins with a measurement."]
+    }
+    /// Budget spent.
+    BudgetSpent {
+        "The material that may be taken off is spent", "No further pass is ground; the run ends, not in tolerance.", ProcessEngineer,
+        ["Let quality decide on the part: what was taken off cannot be put back.", "Begin the next part with more allowance."]
+    }
+    /// Journal.
+    JournalUnwritable {
+        "The journal cannot be written", "Nothing new begins to move: what is not recorded is not done.", ProcessEngineer,
+        ["Check the run folder: permissions, network drive, disk.", "Resume."]
+    }
+    /// Disk full.
+    DiskFull {
+        "The disk is full", "Nothing new begins to move: what is not recorded is not done.", Operator,
+        ["Free space on the disk of the run folder.", "Resume."]
+    }
+    /// Hold not confirmed.
+    HoldNotConfirmed {
+        "A machine did not confirm that it holds", "Both machines are told to end by their own safe sequence.", Operator,
+        ["Look at the machine.", "If it still moves, use the machine's own emergency circuit."]
+    }
+    /// Stop not confirmed.
+    StopNotConfirmed {
+        "Stop not confirmed: a machine did not say that it stands", "It may still be moving.", Operator,
+        ["Use the machine's own emergency circuit.", "Keep away from the machine until you see that it stands.",
+         "Then find out why it does not answer."]
+    }
+    /// The run gave up waiting.
+    WaitedTooLong {
+        "Nobody answered in time", "The run ends in order.", Operator,
+        ["Remove the cause of the hold and start a run that begins with a measurement."]
+    }
+}
+
+impl Alarm {
+    /// Fills an entry of the catalogue with the values of a case.
+    pub(super) fn of(id: AlarmId, case: impl AsRef<str>) -> Self {
+        let (head, consequence, clears, remedy) = id.entry();
+        let what = match case.as_ref() {
+            "" => format!("{head}."),
+            case => format!("{head}: {case}."),
+        };
+        let remedy = remedy.iter().map(|line| (*line).to_owned()).collect();
+        Self { id, what, consequence: consequence.to_owned(), remedy, clears }
+    }
+}

@@ -1,0 +1,194 @@
+//! What is to be done: imperatives. The drive journals each before it carries it out. Big data travels by the number of its
+//! cycle only.
+
+use serde::{Deserialize, Serialize};
+
+use super::alarm::{Alarm, AlarmId};
+use super::event::Event;
+use super::state::{Device, State};
+
+/// An imperative, and the event that answers it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "command", rename_all = "snake_case")]
+pub enum Command {
+    /// Open the link and prove which machine is there: `Connected` or `NotConnected`.
+    Connect {
+        /// The machine.
+        device: Device,
+    },
+    /// Ask a person, or the recipe, for the part: `LoadConfirmed`.
+    AskToLoad,
+    /// Send the pass and the map of this cycle to the grinder, read them back and compare: `PassLoaded` or `Refused`.
+    LoadPass {
+        /// The cycle.
+        cycle: u32,
+    },
+    /// Send the plan of this cycle to the CMM, read it back and compare: `PlanLoaded` or `Refused`.
+    LoadPlan {
+        /// The cycle.
+        cycle: u32,
+    },
+    /// Read a fresh status, moving nothing: `Cleared` or `Obstructed`.
+    VerifyClear {
+        /// The machine.
+        device: Device,
+    },
+    /// Prepare the job; a preparation that still stands is taken back first: `Prepared` or `Refused`.
+    Prepare {
+        /// The machine.
+        device: Device,
+        /// The cycle.
+        cycle: u32,
+    },
+    /// Start the prepared job, at most once: `Started`, `StartUnknown` or, if the machine said no, `Refused`.
+    StartMachine {
+        /// The machine.
+        device: Device,
+        /// The cycle.
+        cycle: u32,
+    },
+    /// Bring the machine to its safe place: `MachineHeld`, or `Ended` if the job was over before.
+    HoldMachine {
+        /// The machine.
+        device: Device,
+    },
+    /// Let the held machine go on: `MachineResumed` or `Refused`.
+    ResumeMachine {
+        /// The machine.
+        device: Device,
+    },
+    /// End the job in order, also one that is only prepared: `Ended`.
+    StopMachine {
+        /// The machine.
+        device: Device,
+    },
+    /// End at once, by the machine's own safe sequence: `AbortConfirmed`.
+    AbortMachine {
+        /// The machine.
+        device: Device,
+    },
+    /// Bring a machine that was aborted or faulted in an earlier run back to idle: `Connected` or `Refused`.
+    ClearMachine {
+        /// The machine.
+        device: Device,
+    },
+    /// Find out what became of the job: `Reconciled`.
+    Reconcile {
+        /// The machine.
+        device: Device,
+        /// The cycle.
+        cycle: u32,
+    },
+    /// Read, check and store the points of this cycle: `Collected`.
+    Collect {
+        /// The cycle.
+        cycle: u32,
+    },
+    /// Compare the probe with the reference sphere: `Qualified`.
+    Qualify {
+        /// The cycle.
+        cycle: u32,
+    },
+    /// Let the machine forget its result, also where it has none: `Acknowledged`.
+    Acknowledge {
+        /// The machine.
+        device: Device,
+    },
+    /// Register the measurement of this cycle: `Registered` or `RegistrationFailed`.
+    Register {
+        /// The cycle.
+        cycle: u32,
+    },
+    /// Compute the map of the next pass from this cycle: `Compensated` or `CompensationRefused`.
+    Compensate {
+        /// The cycle.
+        cycle: u32,
+    },
+    /// Tell how the cycle was judged. No answer.
+    Announce(Judgement),
+    /// Show an alarm. No answer.
+    Raise(Alarm),
+    /// Take an alarm back. No answer.
+    Withdraw {
+        /// Which.
+        alarm: AlarmId,
+    },
+    /// Tell that an event did not fit. No answer.
+    Refuse {
+        /// The event.
+        event: Box<Event>,
+        /// The state in which it came.
+        state: State,
+        /// Why it does not fit, for the person who sent it.
+        why: String,
+    },
+    /// The run is over: the last command. No answer.
+    Finish(Ending),
+}
+
+/// How a cycle was judged.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Judgement {
+    /// The cycle.
+    pub cycle: u32,
+    /// What follows.
+    pub verdict: Verdict,
+    /// Why, for the operator.
+    pub reason: String,
+}
+
+/// What follows from the figures of a cycle.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// In tolerance: the part is done.
+    Accept,
+    /// Another pass.
+    Continue,
+    /// Worse than before.
+    Diverging,
+    /// The part does not answer to the map as it should.
+    WrongResponse,
+    /// No better than before.
+    Stalled,
+    /// No pass is left.
+    MaxCycles,
+    /// No material is left to take off.
+    BudgetSpent,
+}
+
+/// How a run ended.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "ending", rename_all = "snake_case")]
+pub enum Ending {
+    /// The part is accepted.
+    Accepted {
+        /// The last cycle.
+        cycle: u32,
+        /// Why, for the operator.
+        reason: String,
+    },
+    /// The run came to its end in order and the part is not in tolerance, or was never judged to be.
+    NotAccepted {
+        /// The last cycle.
+        cycle: u32,
+        /// Why, for the operator.
+        reason: String,
+    },
+    /// The run could not begin, or a person stopped it.
+    Stopped {
+        /// The last cycle; 0 if none had begun.
+        cycle: u32,
+        /// Why, for the operator.
+        reason: String,
+    },
+    /// The run was aborted.
+    Aborted {
+        /// The last cycle; 0 if none had begun.
+        cycle: u32,
+        /// Whether both machines confirmed that they stand.
+        confirmed: bool,
+        /// Why, for the operator.
+        reason: String,
+    },
+}

@@ -1,0 +1,502 @@
+//! What happened: orders of people, facts from machines, results of computations. Everything the cell ever learns comes
+//! as one of these, so that a run can be replayed from its journal.
+
+use serde::{Deserialize, Serialize};
+use std::fmt;
+
+use super::state::Device;
+
+/// A person, and where the order was given.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Actor {
+    /// The name of the person, or of the program that acts for one.
+    pub name: String,
+    /// The terminal or the computer.
+    pub station: String,
+}
+
+/// A fact, an order or a result.
+///
+/// The number of the cycle travels with everything that belongs to one: what belongs to another cycle is refused.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+pub enum Event {
+    // Orders of people.
+    /// Begin the run.
+    Start {
+        /// Who gave the order.
+        actor: Actor,
+    },
+    /// The right part is loaded and clamped.
+    LoadConfirmed {
+        /// Who gave the order.
+        actor: Actor,
+    },
+    /// Come to the next safe place and wait for a person.
+    Hold {
+        /// Who gave the order.
+        actor: Actor,
+        /// Why, in the words of the person; may be empty.
+        reason: String,
+    },
+    /// Go on from where the cell was held.
+    Resume {
+        /// Who gave the order.
+        actor: Actor,
+        /// Why, in the words of the person; may be empty.
+        reason: String,
+    },
+    /// End in order.
+    Stop {
+        /// Who gave the order.
+        actor: Actor,
+        /// Why, in the words of the person; may be empty.
+        reason: String,
+    },
+    /// End at once: the safe sequence only.
+    Abort {
+        /// Who gave the order.
+        actor: Actor,
+        /// Why, in the words of the person; may be empty.
+        reason: String,
+    },
+    /// A person has looked at a machine that cannot tell what became of its START: the job is over, the machine stands still and
+    /// is clear of the part. The START is never repeated; the part is measured as it is.
+    DeclaredOver {
+        /// Who looked.
+        actor: Actor,
+        /// The machine.
+        device: Device,
+        /// What was seen.
+        evidence: String,
+    },
+    /// The program was started again in the middle of this run; the links are new.
+    Restarted {
+        /// Who started it.
+        actor: Actor,
+    },
+
+    // Facts from machines.
+    /// The machine is the right one, its signature is sound and it is owned. Answers `Connect` and `ClearMachine`.
+    Connected {
+        /// The machine.
+        device: Device,
+        /// The number of this start of its application.
+        boot_id: u32,
+        /// Whether it says that it is a simulation.
+        simulated: bool,
+        /// What it was found doing.
+        found: Found,
+    },
+    /// The machine cannot be used. Answers `Connect`.
+    NotConnected {
+        /// The machine.
+        device: Device,
+        /// Why.
+        why: Mismatch,
+    },
+    /// The machine cannot be reached, or its application stands still.
+    LinkLost {
+        /// The machine.
+        device: Device,
+        /// What was seen, in words.
+        why: String,
+    },
+    /// The link is open again, its signature and its sync are proven.
+    LinkBack {
+        /// The machine.
+        device: Device,
+        /// The number of this start of its application.
+        boot_id: u32,
+    },
+    /// Something that the cell needs from outside is missing. Reported as a level: again after every reconnection.
+    ConditionLost {
+        /// What.
+        condition: Condition,
+        /// In words, with the value and the limit.
+        words: String,
+    },
+    /// It is there again; hysteresis is the business of who reports.
+    ConditionBack {
+        /// What.
+        condition: Condition,
+    },
+    /// The grinder holds the pass and the map of this cycle, read back and compared. Answers `LoadPass`.
+    PassLoaded {
+        /// The cycle.
+        cycle: u32,
+    },
+    /// The CMM holds the plan of this cycle, read back and compared. Answers `LoadPlan`.
+    PlanLoaded {
+        /// The cycle.
+        cycle: u32,
+    },
+    /// The machine is prepared for this cycle. Answers `Prepare`.
+    Prepared {
+        /// The machine.
+        device: Device,
+        /// The cycle.
+        cycle: u32,
+    },
+    /// START was taken. Answers `StartMachine`.
+    Started {
+        /// The machine.
+        device: Device,
+        /// The cycle.
+        cycle: u32,
+    },
+    /// It is not known whether START was taken. Answers `StartMachine`.
+    StartUnknown {
+        /// The machine.
+        device: Device,
+        /// The cycle.
+        cycle: u32,
+        /// What was seen, in words.
+        why: String,
+    },
+    /// The job goes on.
+    Progressed {
+        /// The machine.
+        device: Device,
+        /// Points measured, or thousandths of the path.
+        done: u32,
+        /// Of how many.
+        total: u32,
+    },
+    /// The machine stands in its safe place. Answers `HoldMachine`, also where it was held already, or comes by itself.
+    MachineHeld {
+        /// The machine.
+        device: Device,
+    },
+    /// The machine moves again. Answers `ResumeMachine`, or comes by itself.
+    MachineResumed {
+        /// The machine.
+        device: Device,
+    },
+    /// The job is over; for the grinder its pass record has been read. Answers `StopMachine` too, also where nothing ran.
+    Ended {
+        /// The machine.
+        device: Device,
+        /// The cycle.
+        cycle: u32,
+        /// How.
+        result: JobResult,
+    },
+    /// A fresh status shows the machine standing clear of the part. Answers `VerifyClear`.
+    Cleared {
+        /// The machine.
+        device: Device,
+    },
+    /// A fresh status shows that it is not. Answers `VerifyClear`, or comes by itself.
+    Obstructed {
+        /// The machine.
+        device: Device,
+        /// What was seen, in words.
+        words: String,
+    },
+    /// The machine was asked and said no.
+    Refused {
+        /// The machine.
+        device: Device,
+        /// What it was asked for.
+        what: Asked,
+        /// Its answer in words.
+        why: String,
+    },
+    /// The machine is in FAULTED. (A machine that held itself because the link was silent is `MachineHeld`.)
+    Fault {
+        /// The machine.
+        device: Device,
+        /// The number of the fault.
+        code: u16,
+        /// What it means.
+        words: String,
+    },
+    /// The machine has forgotten its result and is idle. Answers `Acknowledge`.
+    Acknowledged {
+        /// The machine.
+        device: Device,
+    },
+    /// The machine has ended its own safe sequence and stands. Answers `AbortMachine`.
+    AbortConfirmed {
+        /// The machine.
+        device: Device,
+    },
+    /// What became of the job. Answers `Reconcile`.
+    Reconciled {
+        /// The machine.
+        device: Device,
+        /// The cycle.
+        cycle: u32,
+        /// What became of it.
+        outcome: Reconciliation,
+    },
+
+    // Results of computations.
+    /// The points of this cycle are read and stored. Answers `Collect`.
+    Collected {
+        /// The cycle.
+        cycle: u32,
+        /// Points planned.
+        targets: u32,
+        /// Points found.
+        found: u32,
+        /// Whether the measurement may be used.
+        gate: Gate,
+    },
+    /// The radius of the probe was compared with the reference sphere. Answers `Qualify`.
+    Qualified {
+        /// The cycle.
+        cycle: u32,
+        /// The radius found minus the radius in the recipe.
+        radius_error_mm: f64,
+    },
+    /// The measurement is registered. Answers `Register`.
+    Registered {
+        /// The cycle.
+        cycle: u32,
+        /// What came out.
+        figures: Figures,
+    },
+    /// It could not be registered. Answers `Register`.
+    RegistrationFailed {
+        /// The cycle.
+        cycle: u32,
+        /// Why, in words.
+        why: String,
+    },
+    /// The next map is computed and stored. Answers `Compensate`.
+    Compensated {
+        /// The cycle.
+        cycle: u32,
+        /// What it will do.
+        summary: CompensationSummary,
+    },
+    /// There is no next map. Answers `Compensate`.
+    CompensationRefused {
+        /// The cycle.
+        cycle: u32,
+        /// Why.
+        why: CompensationRefusal,
+    },
+
+    /// The journal or the run folder cannot be written: nothing may begin to move.
+    RecordFailed {
+        /// Why.
+        why: RecordFailure,
+    },
+    /// Time has passed; what is due is done.
+    Deadline,
+}
+
+/// What a machine was found doing when it was connected.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Found {
+    /// Idle, as it should be.
+    Idle,
+    /// Aborted or faulted in an earlier run; it can be cleared.
+    ToClear,
+    /// Busy with something that is not this run's, in words.
+    Busy(String),
+}
+
+/// Why a machine cannot be used.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Mismatch {
+    /// Nothing answers there.
+    Unreachable(String),
+    /// Something answers, but it is not this machine.
+    WrongDevice(String),
+    /// Its sentinels are scrambled: the order of words is not the one in the cell file.
+    WordOrder(String),
+    /// Its unit of length is the inch.
+    Inches,
+    /// Another client owns it.
+    Owned(String),
+}
+
+/// Something that the cell needs from outside.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Condition {
+    /// Air, coolant.
+    Supplies,
+    /// The temperature of the part or of a machine is within its window.
+    Temperature,
+}
+
+/// What a machine was asked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Asked {
+    /// To take a payload.
+    Load,
+    /// To prepare.
+    Prepare,
+    /// To start. It says no for certain: nothing moves.
+    Start,
+    /// To hold.
+    Hold,
+    /// To resume.
+    Resume,
+    /// To stop.
+    Stop,
+    /// To abort.
+    Abort,
+    /// To be cleared.
+    Clear,
+    /// To give its result.
+    Collect,
+    /// To forget its result.
+    Acknowledge,
+}
+
+/// How a job of a machine ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum JobResult {
+    /// It was carried out.
+    Complete,
+    /// It was stopped in order.
+    Stopped,
+    /// It was aborted.
+    Aborted,
+    /// It failed.
+    Failed,
+}
+
+/// What became of a job whose machine was out of sight.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Reconciliation {
+    /// It was taken and runs.
+    Running,
+    /// It was taken, and the machine holds.
+    Held,
+    /// It was taken and is over.
+    Ended(JobResult),
+    /// It was proven not to have been taken.
+    NotStarted,
+    /// The machine cannot tell; a person must look. In words.
+    Unknown(String),
+}
+
+/// Whether a measurement may be used.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Gate {
+    /// It may.
+    Passed,
+    /// It may not.
+    Failed(GateFailure),
+}
+
+/// Why a measurement may not be used.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum GateFailure {
+    /// Too few points were found, or too little of the aperture is covered. In words, with the value and the limit.
+    Coverage(String),
+    /// Nothing was touched where the part should be.
+    NoPart,
+    /// The coordinates are contact points, or look like them.
+    Contacts,
+    /// The coordinates are in inches, or look like it.
+    Inches,
+    /// The result is of another part, plan or cycle.
+    Foreign(String),
+    /// The result is broken: its CRC, its count, a number that is none.
+    Broken(String),
+    /// The temperature was outside its window.
+    Temperature(String),
+}
+
+/// What a registration found, as far as the cell decides upon it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Figures {
+    /// Peak to valley of the deviations.
+    pub pv_mm: f64,
+    /// Root mean square of the deviations.
+    pub rms_mm: f64,
+    /// Expanded measuring uncertainty (k = 2) of the peak to valley.
+    pub pv_expanded_mm: f64,
+    /// Expanded measuring uncertainty (k = 2) of the root mean square.
+    pub rms_expanded_mm: f64,
+    /// Share of the aperture that is covered, 0 to 1.
+    pub coverage: f64,
+    /// Points used.
+    pub points: u32,
+    /// Points left out as outliers.
+    pub outliers: u32,
+    /// How far the part lies from where it was expected.
+    pub shift_mm: f64,
+    /// How far it is turned from how it was expected.
+    pub turn_rad: f64,
+    /// The directions in which the surface does not hold the part, in words.
+    pub weak_directions: Vec<String>,
+    /// What else a person should know.
+    pub warnings: Vec<String>,
+    /// How the part answered to the map before; none before the second pass.
+    pub response: Option<Response>,
+    /// The most that was taken off anywhere since the run began; none where nobody knows.
+    pub removed_mm: Option<f64>,
+}
+
+/// How the part answered to the last map.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Response {
+    /// As it should.
+    Expected,
+    /// The map was too small, or its effect too noisy, to tell.
+    Unclear,
+    /// The other way round: the sign of the map is wrong.
+    SignFlipped,
+    /// As to a mirrored map: an axis points the other way.
+    Mirrored,
+    /// Not at all.
+    NoEffect,
+}
+
+/// What the next map will do.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CompensationSummary {
+    /// Largest absolute value of the map.
+    pub largest_mm: f64,
+    /// The most that the next pass takes off anywhere.
+    pub depth_mm: f64,
+    /// The PV that is expected after it.
+    pub predicted_pv_mm: f64,
+    /// What else a person should know.
+    pub warnings: Vec<String>,
+}
+
+/// Why there is no next map.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum CompensationRefusal {
+    /// The next pass would take off more than the recipe allows in all. In words, with the value and the limit.
+    BudgetSpent(String),
+    /// The pose is undetermined along these directions, so a map would be at the wrong place.
+    WeakDirections(Vec<String>),
+    /// Another reason, in words.
+    Failed(String),
+}
+
+/// Why the record cannot be kept.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RecordFailure {
+    /// The disk is full.
+    DiskFull(String),
+    /// The journal or a file cannot be written.
+    Unwritable(String),
+}
+
+impl fmt::Display for Actor {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} at {}", self.name, self.station)
+    }
+}

@@ -1,0 +1,126 @@
+//! What the recipe and the cell file ask of the cell, as far as the cell decides upon it.
+
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+/// The numbers that the cell decides by. Checked by who builds it; a number that is none makes the cell accept nothing.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CellPlan {
+    /// Where the first cycle begins.
+    pub begin_with: Beginning,
+    /// The most passes of the grinder.
+    pub max_cycles: u32,
+    /// What is accepted.
+    pub tolerance: Tolerance,
+    /// Improvement, as a share of the cycle before, below which the run is taken as stalled.
+    pub stall_share: f64,
+    /// What to do when it stalls.
+    pub on_stall: Disposal,
+    /// What to do when it has diverged twice.
+    pub on_divergence: Disposal,
+    /// What to do when there is no next map for another reason than the budget.
+    pub on_refusal: Disposal,
+    /// The limits that a measurement must keep.
+    pub gates: Gates,
+    /// The most material that may be taken off anywhere in the whole run.
+    pub removal_budget_mm: f64,
+    /// The least that a pass takes off anywhere.
+    pub least_depth_mm: f64,
+    /// Whether a machine found aborted or faulted at the start is cleared without asking.
+    pub clear_at_start: bool,
+    /// How long each thing may take.
+    pub deadlines: Deadlines,
+}
+
+/// Where the first cycle begins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Beginning {
+    /// With a pass.
+    Grind,
+    /// With a measurement of the part as it is.
+    Measure,
+}
+
+/// What is accepted.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Tolerance {
+    /// Peak to valley.
+    pub pv_mm: f64,
+    /// Root mean square.
+    pub rms_mm: f64,
+    /// Whether the expanded uncertainty is added to the figures first.
+    pub with_uncertainty: bool,
+}
+
+/// What to do when a run does not get on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Disposal {
+    /// Hold, and let a person decide.
+    Hold,
+    /// End the run in order.
+    Stop,
+}
+
+/// The limits that a measurement must keep before anything is made of it.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Gates {
+    /// Least share of the planned points that must be found, 0 to 1.
+    pub least_found: f64,
+    /// Least share of the aperture that must be covered, 0 to 1.
+    pub least_coverage: f64,
+    /// Most shift of the part from where it is expected.
+    pub most_shift_mm: f64,
+    /// Most turn of the part from how it is expected.
+    pub most_turn_rad: f64,
+    /// Most error of the radius of the probe; none where there is no reference sphere.
+    pub most_radius_error_mm: Option<f64>,
+}
+
+/// How long each thing may take.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Deadlines {
+    /// To connect and check both machines.
+    pub connect: Duration,
+    /// To load the part; none waits for ever.
+    pub load: Option<Duration>,
+    /// To send a payload, and to collect a result.
+    pub transfer: Duration,
+    /// For any other answer of a machine: prepare, start, clear, acknowledge, resume, reconcile.
+    pub answer: Duration,
+    /// Between two signs of progress of a running job.
+    pub progress: Duration,
+    /// From HOLD to the safe place.
+    pub hold: Duration,
+    /// From STOP to the end of the job.
+    pub stop: Duration,
+    /// From ABORT to its confirmation; then the alarm, one repetition, and as long again.
+    pub abort: Duration,
+    /// For a registration or a compensation.
+    pub compute: Duration,
+    /// How long the cell stays suspended before it is held.
+    pub suspended: Duration,
+    /// How long it stays held before it ends in order; none waits for ever.
+    pub held: Option<Duration>,
+}
+
+impl Default for Deadlines {
+    fn default() -> Self {
+        let s = Duration::from_secs;
+        Self {
+            connect: s(20),
+            load: None,
+            transfer: s(120),
+            answer: s(10),
+            progress: s(60),
+            hold: s(30),
+            stop: s(60),
+            abort: s(2),
+            compute: s(600),
+            suspended: s(600),
+            held: None,
+        }
+    }
+}

@@ -1,0 +1,218 @@
+//! Where the cell is: the states of PackML, and inside them the phases of a cycle and the steps of a machine's job.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+/// One of the two machines of a cell.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Device {
+    /// The coordinate measuring machine.
+    Cmm,
+    /// The grinder.
+    Grinder,
+}
+
+impl Device {
+    /// Both, in the order in which they are commanded.
+    pub const BOTH: [Self; 2] = [Self::Cmm, Self::Grinder];
+
+    /// Returns the machine that must be clear of the part while this one moves.
+    pub fn other(self) -> Self {
+        match self {
+            Self::Cmm => Self::Grinder,
+            Self::Grinder => Self::Cmm,
+        }
+    }
+}
+
+impl fmt::Display for Device {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Cmm => "CMM",
+            Self::Grinder => "grinder",
+        })
+    }
+}
+
+/// A step of one job of one machine, named for what is waited for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Step {
+    /// The payload is being sent: the pass and its map to the grinder, the plan to the CMM.
+    Send,
+    /// A fresh status must show that the other machine is clear of the part.
+    Clear,
+    /// The machine checks its payload and interlocks.
+    Prepare,
+    /// START is on its way. From here on the machine may move.
+    Start,
+    /// The machine moves.
+    Run,
+    /// Whether START was taken is not known and is being found out.
+    Reconcile,
+    /// The result is being read and gated (CMM only).
+    Collect,
+    /// The radius of the probe is being compared with the reference sphere (CMM only).
+    Qualify,
+    /// The machine is told that its result may be forgotten.
+    Acknowledge,
+    /// The same for a result that is of no use.
+    Discard,
+}
+
+/// A phase of a cycle. The number of the cycle is kept beside, in [`super::Cell::cycle`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Phase {
+    /// A person, or the recipe, confirms that the right part is loaded.
+    Load,
+    /// A pass of the grinder.
+    Grind(Step),
+    /// The grinder leaves the part to the CMM.
+    Transfer,
+    /// A measurement.
+    Measure(Step),
+    /// The measurement is registered to the nominal surface.
+    Register,
+    /// The figures are judged; at once, unless the cell is held before it.
+    Judge,
+    /// The next map is computed.
+    Compensate,
+}
+
+impl Phase {
+    /// Returns the job of a machine at a step.
+    pub(super) fn of(device: Device, step: Step) -> Self {
+        match device {
+            Device::Cmm => Self::Measure(step),
+            Device::Grinder => Self::Grind(step),
+        }
+    }
+
+    /// Returns the machine whose job this phase is, and the step of it.
+    pub fn job(self) -> Option<(Device, Step)> {
+        match self {
+            Self::Grind(step) => Some((Device::Grinder, step)),
+            Self::Measure(step) => Some((Device::Cmm, step)),
+            _ => None,
+        }
+    }
+
+    /// Returns the machine that may be moving in this phase.
+    pub fn moving(self) -> Option<Device> {
+        self.job()
+            .filter(|(_, step)| matches!(step, Step::Start | Step::Run | Step::Reconcile))
+            .map(|(device, _)| device)
+    }
+
+    /// Returns the name of the phase, without its step.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Load => "Load",
+            Self::Grind(_) => "Grind",
+            Self::Transfer => "Transfer",
+            Self::Measure(_) => "Measure",
+            Self::Register => "Register",
+            Self::Judge => "Judge",
+            Self::Compensate => "Compensate",
+        }
+    }
+}
+
+impl fmt::Display for Phase {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.job() {
+            Some((_, step)) => write!(f, "{}, {step:?}", self.name()),
+            None => f.write_str(self.name()),
+        }
+    }
+}
+
+/// The state of the cell, by PackML's names. A phase beside a state tells where the cycle goes on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum State {
+    /// Nothing has been asked for yet.
+    Idle,
+    /// Both machines are being connected and checked.
+    Starting,
+    /// A cycle runs.
+    Execute(Phase),
+    /// Held from inside or by a person: what runs comes to its safe place first.
+    Holding(Phase),
+    /// Held. A person resumes.
+    Held(Phase),
+    /// The held machine is being resumed.
+    Unholding(Phase),
+    /// Suspended from outside (a link, supplies, temperature): what runs comes to its safe place first.
+    Suspending(Phase),
+    /// Suspended; resumes by itself when the cause is gone.
+    Suspended(Phase),
+    /// The cause is gone: the machine is being asked where it is, or resumed.
+    Unsuspending(Phase),
+    /// An orderly end is under way.
+    Stopping,
+    /// Ended in order, without an accepted part. An end state.
+    Stopped,
+    /// The declared safe sequence runs.
+    Aborting,
+    /// The safe sequence is over. An end state.
+    Aborted,
+    /// Accepted; both machines are seen to be clear of the part.
+    Completing,
+    /// Ended with an accepted part. An end state.
+    Complete,
+}
+
+impl State {
+    /// Returns whether the run is over: from here no command, ever.
+    pub fn is_end(self) -> bool {
+        matches!(self, Self::Stopped | Self::Aborted | Self::Complete)
+    }
+
+    /// Returns the phase in which the cell is, or in which it will go on.
+    pub fn phase(self) -> Option<Phase> {
+        match self {
+            Self::Execute(phase)
+            | Self::Holding(phase)
+            | Self::Held(phase)
+            | Self::Unholding(phase)
+            | Self::Suspending(phase)
+            | Self::Suspended(phase)
+            | Self::Unsuspending(phase) => Some(phase),
+            _ => None,
+        }
+    }
+
+    /// Returns PackML's name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Idle => "Idle",
+            Self::Starting => "Starting",
+            Self::Execute(_) => "Execute",
+            Self::Holding(_) => "Holding",
+            Self::Held(_) => "Held",
+            Self::Unholding(_) => "Unholding",
+            Self::Suspending(_) => "Suspending",
+            Self::Suspended(_) => "Suspended",
+            Self::Unsuspending(_) => "Unsuspending",
+            Self::Stopping => "Stopping",
+            Self::Stopped => "Stopped",
+            Self::Aborting => "Aborting",
+            Self::Aborted => "Aborted",
+            Self::Completing => "Completing",
+            Self::Complete => "Complete",
+        }
+    }
+}
+
+impl fmt::Display for State {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.phase() {
+            Some(phase) => write!(f, "{} ({phase})", self.name()),
+            None => f.write_str(self.name()),
+        }
+    }
+}

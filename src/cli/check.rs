@@ -1,0 +1,196 @@
+//! `regrind check`: recipes and cell files, with every problem at its place.
+
+use std::fs::File;
+use std::io::{self, IsTerminal, Read, Write};
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use miette::{Diagnostic, GraphicalReportHandler, GraphicalTheme, LabeledSpan, NamedSource, SourceCode};
+use regrind::config::CellConfig;
+use regrind::document::{Problem, Problems};
+use regrind::recipe::{NominalSource, Pattern, Recipe};
+use serde::Serialize;
+use thiserror::Error;
+
+use super::Outcome;
+use super::failure::Failure;
+use super::nominal::{self, ProjectionName};
+
+/// Check recipes and cell files: every problem with line, column and remedy
+#[derive(Args, Debug)]
+#[command(after_help = "\
+A file with a table [cell] is a cell file, any other a recipe. Of a recipe the files that it names are read too.
+
+Example:
+  regrind check recipes/*.toml config/*.toml
+
+Exit codes: 0 all are good; 2 one is not; 3 fault.")]
+pub(super) struct Arguments {
+    /// Recipes and cell files
+    #[arg(value_name = "FILE", required = true)]
+    files: Vec<PathBuf>,
+    /// Print JSON instead of words
+    #[arg(long)]
+    json: bool,
+}
+
+/// What was found in one file.
+#[derive(Serialize)]
+struct Found {
+    file: PathBuf,
+    kind: &'static str,
+    good: bool,
+    sha256: Option<String>,
+    problems: Vec<Told>,
+}
+
+/// One problem, for a program.
+#[derive(Serialize)]
+struct Told {
+    line: usize,
+    column: usize,
+    key: String,
+    found: String,
+    allowed: String,
+    remedy: String,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let mut found = Vec::new();
+    for path in &arguments.files {
+        let (kind, checked) = check(path);
+        if !arguments.json {
+            match &checked {
+                Ok(_) => super::print(&format!("{}: a good {kind}\n", path.display()))?,
+                Err(problems) => show(problems)?,
+            }
+        }
+        let (sha256, problems) = match &checked {
+            Ok(sha256) => (Some(sha256.clone()), Vec::new()),
+            Err(problems) => (None, problems.problems.iter().map(|problem| Told::new(problems, problem)).collect()),
+        };
+        found.push(Found { file: path.clone(), kind, good: checked.is_ok(), sha256, problems });
+    }
+    if arguments.json {
+        super::print_json(&found)?;
+    }
+    match found.iter().filter(|found| !found.good).count() {
+        0 => Ok(Outcome::Accepted),
+        bad => Err(Failure::Checked { bad, files: found.len() }),
+    }
+}
+
+/// Checks one file; returns its kind and the SHA-256 of a good one.
+fn check(path: &Path) -> (&'static str, Result<String, Problems>) {
+    if is_cell_file(path) {
+        return ("cell file", CellConfig::read(path).map(|cell| hex(cell.source_sha256())));
+    }
+    let checked = Recipe::read(path).and_then(|recipe| {
+        check_files(&recipe)?;
+        Ok(hex(recipe.source_sha256()))
+    });
+    ("recipe", checked)
+}
+
+/// Tells a cell file by what only it has, even if the rest is broken.
+fn is_cell_file(path: &Path) -> bool {
+    const ENOUGH_BYTES: u64 = 1 << 20;
+    let mut bytes = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(ENOUGH_BYTES).read_to_end(&mut bytes));
+    let heads = ["[cell]", "[cmm", "[[cmm", "[grinder]", "[grinder.", "[[grinder"];
+    let text = String::from_utf8_lossy(&bytes);
+    read.is_ok() && text.lines().any(|line| heads.iter().any(|head| line.trim_start().starts_with(head)))
+}
+
+/// Reads the files that a recipe names.
+fn check_files(recipe: &Recipe) -> Result<(), Problems> {
+    let mut problems: Option<Problems> = None;
+    let mut add = |key: &str, failure: Failure| {
+        let more = recipe.problem(key, &format!("cannot be used: {failure}"), "", "");
+        match &mut problems {
+            None => problems = Some(more),
+            Some(problems) => problems.problems.extend(more.problems),
+        }
+    };
+    if let NominalSource::File { path, .. } = recipe.nominal_source()
+        && let Err(failure) = nominal::read(path, ProjectionName::Auto)
+    {
+        add("nominal.file", failure);
+    }
+    if let Pattern::File { path } = &recipe.measure.pattern
+        && let Err(failure) = regrind::formats::read_points(path)
+    {
+        add("measure.file", failure.into());
+    }
+    problems.map_or(Ok(()), Err)
+}
+
+/// Shows problems: with the lines they stand in on a terminal, one line each elsewhere.
+pub(super) fn show(problems: &Problems) -> Result<(), Failure> {
+    let mut text = String::new();
+    if io::stderr().is_terminal() {
+        let handler = GraphicalReportHandler::new_themed(GraphicalTheme::unicode());
+        for problem in &problems.problems {
+            // A report that cannot be drawn is told in one line.
+            if handler.render_report(&mut text, &Shown::new(problems, problem)).is_err() {
+                text.push_str(&format!("{}: {problem}\n", problems.file.display()));
+            }
+            text.push('\n');
+        }
+    } else {
+        text = format!("{problems}\n");
+    }
+    match io::stderr().lock().write_all(text.as_bytes()) {
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(Failure::Terminal(error)),
+        _ => Ok(()),
+    }
+}
+
+/// One problem as a report with its lines.
+#[derive(Debug, Error)]
+#[error("{message}")]
+struct Shown {
+    message: String,
+    source_code: NamedSource<String>,
+    label: LabeledSpan,
+    remedy: String,
+}
+
+impl Shown {
+    fn new(problems: &Problems, problem: &Problem) -> Self {
+        let key = if problem.key.is_empty() { String::new() } else { format!("`{}` ", problem.key) };
+        let span = problem.span.start..problem.span.end.max(problem.span.start);
+        Self {
+            message: format!("{key}{}", problem.found),
+            source_code: NamedSource::new(problems.file.display().to_string(), problems.text.clone()),
+            label: LabeledSpan::new_with_span(Some(problem.allowed.clone()), span),
+            remedy: problem.remedy.clone(),
+        }
+    }
+}
+
+impl Diagnostic for Shown {
+    fn help<'a>(&'a self) -> Option<Box<dyn std::fmt::Display + 'a>> {
+        (!self.remedy.is_empty()).then(|| Box::new(&self.remedy) as Box<dyn std::fmt::Display>)
+    }
+
+    fn source_code(&self) -> Option<&dyn SourceCode> {
+        Some(&self.source_code)
+    }
+
+    fn labels(&self) -> Option<Box<dyn Iterator<Item = LabeledSpan> + '_>> {
+        Some(Box::new(std::iter::once(self.label.clone())))
+    }
+}
+
+impl Told {
+    fn new(problems: &Problems, problem: &Problem) -> Self {
+        let (line, column) = problems.place(problem);
+        let Problem { key, found, allowed, remedy, .. } = problem.clone();
+        Self { line, column, key, found, allowed, remedy }
+    }
+}
+
+fn hex(bytes: &[u8; 32]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}

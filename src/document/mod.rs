@@ -1,0 +1,94 @@
+//! A file that a person wrote, in TOML, and what is wrong with it: every problem at once, each at its line and column.
+//!
+//! ```text
+//!  text -> syntax -> shape (the JSON schema: keys, types, ranges) -> what is left, as written -> the reader's own checks
+//! ```
+//!
+//! The schema that editors complete from is the one that files are held against, so that neither can be wrong alone. What
+//! does not fit it is told and left out, so that the checks of one value against another still run on the rest.
+
+mod read;
+mod schema;
+
+use std::fmt;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+pub(crate) use read::{Document, problem_at, read_text, sha256};
+pub(crate) use schema::schema_of;
+
+/// Everything that is wrong with one file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Problems {
+    /// The file.
+    pub file: PathBuf,
+    /// Its text; empty if it could not be read.
+    pub text: String,
+    /// What is wrong, in the order of the text. Never empty.
+    pub problems: Vec<Problem>,
+}
+
+/// One thing that is wrong.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Problem {
+    /// Where, in bytes of the text.
+    pub span: Range<usize>,
+    /// The key as a path, such as `measure.probe_radius_mm`; empty for the file as a whole.
+    pub key: String,
+    /// What was found.
+    pub found: String,
+    /// What is allowed there.
+    pub allowed: String,
+    /// What to do.
+    pub remedy: String,
+}
+
+impl Problems {
+    /// A file with one problem that has no place in its text.
+    pub(crate) fn whole(file: &Path, text: &str, found: String, remedy: &str) -> Self {
+        let problem =
+            Problem { span: 0..0, key: String::new(), found, allowed: String::new(), remedy: remedy.to_owned() };
+        Self { file: file.to_owned(), text: text.to_owned(), problems: vec![problem] }
+    }
+
+    /// Returns line and column of a problem, both from 1, the column in characters.
+    pub fn place(&self, problem: &Problem) -> (usize, usize) {
+        line_and_column(&self.text, problem.span.start)
+    }
+}
+
+impl std::error::Error for Problems {}
+
+impl fmt::Display for Problems {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (k, problem) in self.problems.iter().enumerate() {
+            let (line, column) = self.place(problem);
+            let newline = if k > 0 { "\n" } else { "" };
+            write!(out, "{newline}{}:{line}:{column}: {problem}", self.file.display())?;
+        }
+        Ok(())
+    }
+}
+
+impl fmt::Display for Problem {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if !self.key.is_empty() {
+            write!(out, "`{}` ", self.key)?;
+        }
+        write!(out, "{}", self.found)?;
+        if !self.allowed.is_empty() {
+            write!(out, "; {}", self.allowed)?;
+        }
+        if !self.remedy.is_empty() {
+            write!(out, "; {}", self.remedy)?;
+        }
+        Ok(())
+    }
+}
+
+/// Returns line and column of a byte, both from 1, the column in characters.
+fn line_and_column(text: &str, byte: usize) -> (usize, usize) {
+    let before = text.get(..byte).unwrap_or(text);
+    let line_start = before.rfind('\n').map_or(0, |newline| newline + 1);
+    (before.matches('\n').count() + 1, before[line_start..].chars().count() + 1)
+}

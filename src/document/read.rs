@@ -1,0 +1,594 @@
+//! Reads a file and holds it against its schema.
+
+use std::fs::File;
+use std::io::Read;
+use std::ops::Range;
+use std::path::Path;
+
+use serde::de::DeserializeOwned;
+use serde_json::Value as Schema;
+use sha2::{Digest, Sha256};
+use toml::de::{DeTable, DeValue};
+
+use super::schema::choices;
+use super::{Problem, Problems};
+
+/// Far more than a person writes.
+const MOST_BYTES: usize = 256 << 10;
+
+/// More problems than a person reads at once.
+const MOST_PROBLEMS: usize = 200;
+
+/// One step from a table to what stands in it.
+#[derive(Clone, Debug)]
+enum Step {
+    Key(String),
+    Index(usize),
+}
+
+/// A file on its way to what it says.
+pub(crate) struct Document<'t> {
+    file: &'t Path,
+    text: &'t str,
+    places: DeTable<'t>,
+    values: toml::Table,
+    problems: Vec<Problem>,
+}
+
+/// Reads a text file.
+///
+/// # Errors
+/// A file that cannot be read, that is too large or that is not text.
+pub(crate) fn read_text(path: &Path) -> Result<String, Problems> {
+    let failed = |found: String, remedy: &str| Problems::whole(path, "", found, remedy);
+    let mut bytes = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(MOST_BYTES as u64 + 1).read_to_end(&mut bytes));
+    read.map_err(|e| failed(format!("the file cannot be read: {e}"), "check the path and the rights"))?;
+    if bytes.len() > MOST_BYTES {
+        return Err(too_large(path));
+    }
+    String::from_utf8(bytes).map_err(|e| {
+        let line = 1 + e.as_bytes()[..e.utf8_error().valid_up_to()].iter().filter(|&&b| b == b'\n').count();
+        failed(format!("the file is not text: line {line} is not UTF-8"), "save it as UTF-8 text")
+    })
+}
+
+fn too_large(path: &Path) -> Problems {
+    let found = format!("the file is larger than {} KiB", MOST_BYTES >> 10);
+    Problems::whole(path, "", found, "is it a recipe or a cell file at all? put large data into files of their own")
+}
+
+/// Returns the SHA-256 of a text.
+pub(crate) fn sha256(text: &str) -> [u8; 32] {
+    Sha256::digest(text.as_bytes()).into()
+}
+
+impl<'t> Document<'t> {
+    /// Reads the syntax of a text.
+    ///
+    /// # Errors
+    /// Every place where the text is no TOML.
+    pub(crate) fn parse(file: &'t Path, text: &'t str) -> Result<Self, Problems> {
+        if text.len() > MOST_BYTES {
+            return Err(too_large(file));
+        }
+        let (places, errors) = DeTable::parse_recoverable(text);
+        let mut document =
+            Self { file, text, places: places.into_inner(), values: toml::Table::new(), problems: Vec::new() };
+        for error in &errors {
+            document.syntax(error);
+        }
+        if errors.is_empty() {
+            match toml::from_str(text) {
+                Ok(values) => document.values = values,
+                Err(error) => document.syntax(&error),
+            }
+        }
+        if document.problems.is_empty() { Ok(document) } else { Err(document.into_problems()) }
+    }
+
+    fn syntax(&mut self, error: &toml::de::Error) {
+        let start = error.span().map_or(0, |span| span.start).min(self.text.len());
+        let end = error.span().map_or(0, |span| span.end).clamp(start, self.text.len());
+        let (before, rest) = (&self.text.as_bytes()[..start], self.text.as_bytes().get(start..).unwrap_or_default());
+        let after_digit = before.last().is_some_and(u8::is_ascii_digit);
+        let remedy = match rest.first() {
+            Some(0) => "the file has NUL bytes: save it as plain text",
+            Some(b',') if after_digit => "is it a decimal comma? write a decimal point",
+            _ => "correct the TOML here",
+        };
+        self.push(start..end, String::new(), format!("no TOML: {}", error.message().trim()), "", remedy);
+    }
+
+    /// Holds the values against a schema; what does not fit is told and left out.
+    pub(crate) fn hold_against(&mut self, schema: &Schema) {
+        let mut values = toml::Value::Table(std::mem::take(&mut self.values));
+        Shape { document: self, root: schema, path: Vec::new() }.fits(schema, &mut values);
+        if let toml::Value::Table(values) = values {
+            self.values = values;
+        }
+    }
+
+    /// Reads what is left of the values.
+    ///
+    /// # Errors
+    /// Values that fit the schema and still cannot be read; told with the rest.
+    pub(crate) fn as_written<File: DeserializeOwned>(&mut self) -> Option<File> {
+        match self.values.clone().try_into() {
+            Ok(written) => Some(written),
+            Err(error) => {
+                let message = error.message().trim().to_owned();
+                self.push(0..0, String::new(), message, "", "compare the file with the shipped ones");
+                None
+            }
+        }
+    }
+
+    /// Returns whether something is wrong with the value of a key, or within it.
+    pub(crate) fn has_problem(&self, key: &str) -> bool {
+        let within =
+            |found: &str| found.strip_prefix(key).is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', '[']));
+        self.problems.iter().any(|problem| within(&problem.key))
+    }
+
+    /// Returns whether a key stands in the text.
+    pub(crate) fn is_there(&self, key: &str) -> bool {
+        let steps = steps(key);
+        let Some((Step::Key(last), before)) = steps.split_last() else { return false };
+        let mut table = Some(&self.places);
+        for step in before {
+            table = match (step, table) {
+                (Step::Key(name), Some(inside)) => {
+                    inside.get(name.as_str()).and_then(|value| value.get_ref().as_table())
+                }
+                _ => None,
+            };
+        }
+        table.is_some_and(|table| table.contains_key(last.as_str()))
+    }
+
+    /// Tells what is wrong with the value of a key.
+    pub(crate) fn report(&mut self, key: &str, found: impl Into<String>, allowed: &str, remedy: &str) {
+        let span = span_of(&self.places, &steps(key));
+        self.push(span, key.to_owned(), found.into(), allowed, remedy);
+    }
+
+    fn push(&mut self, span: Range<usize>, key: String, found: String, allowed: &str, remedy: &str) {
+        self.problems.push(Problem { span, key, found, allowed: allowed.to_owned(), remedy: remedy.to_owned() });
+    }
+
+    /// Returns everything that was wrong, if anything was.
+    pub(crate) fn finish(self) -> Result<(), Problems> {
+        if self.problems.is_empty() { Ok(()) } else { Err(self.into_problems()) }
+    }
+
+    fn into_problems(self) -> Problems {
+        let mut problems = self.problems;
+        problems.sort_by_key(|problem| problem.span.start);
+        problems.dedup();
+        if let Some(more) = problems.len().checked_sub(MOST_PROBLEMS).filter(|&more| more > 0) {
+            problems.truncate(MOST_PROBLEMS);
+            let last = problems[MOST_PROBLEMS - 1].span.end;
+            problems.push(Problem {
+                span: last..last,
+                key: String::new(),
+                found: format!("there are {more} more problems after this one"),
+                allowed: String::new(),
+                remedy: "correct these first".into(),
+            });
+        }
+        Problems { file: self.file.to_owned(), text: self.text.to_owned(), problems }
+    }
+}
+
+/// Returns one problem with a value of a text that was read before.
+pub(crate) fn problem_at(file: &Path, text: &str, key: &str, [found, allowed, remedy]: [&str; 3]) -> Problems {
+    let (places, _) = DeTable::parse_recoverable(text);
+    let span = span_of(places.get_ref(), &steps(key));
+    let [found, allowed, remedy] = [found, allowed, remedy].map(str::to_owned);
+    let problem = Problem { span, key: key.to_owned(), found, allowed, remedy };
+    Problems { file: file.to_owned(), text: text.to_owned(), problems: vec![problem] }
+}
+
+/// Takes a key such as `cmm.signals[0].address` apart.
+fn steps(key: &str) -> Vec<Step> {
+    let mut steps = Vec::new();
+    for part in key.split('.') {
+        let mut pieces = part.split('[');
+        steps.extend(pieces.next().map(|name| Step::Key(name.to_owned())));
+        steps.extend(pieces.filter_map(|index| index.trim_end_matches(']').parse().ok().map(Step::Index)));
+    }
+    steps
+}
+
+/// Puts a key together.
+fn key_of(steps: &[Step]) -> String {
+    let mut key = String::new();
+    for step in steps {
+        match step {
+            Step::Index(index) => key.push_str(&format!("[{index}]")),
+            Step::Key(name) => {
+                if !key.is_empty() {
+                    key.push('.');
+                }
+                key.push_str(name);
+            }
+        }
+    }
+    key
+}
+
+/// Returns where a value stands, for a table where its name stands; for one that is not there, the innermost that is.
+fn span_of(root: &DeTable, steps: &[Step]) -> Range<usize> {
+    let mut found = 0..0;
+    let mut inside: Option<&DeValue> = None;
+    for step in steps {
+        match (step, inside) {
+            (Step::Key(name), _) => {
+                let table = match inside {
+                    None => Some(root),
+                    Some(value) => value.as_table(),
+                };
+                let Some((key, value)) = table.and_then(|table| table.get_key_value(name.as_str())) else { break };
+                found = if value.get_ref().is_table() { key.span() } else { value.span() };
+                inside = Some(value.get_ref());
+            }
+            (Step::Index(index), Some(DeValue::Array(items))) => {
+                let Some(item) = items.get(*index) else { break };
+                found = item.span();
+                inside = Some(item.get_ref());
+            }
+            (Step::Index(_), _) => break,
+        }
+    }
+    found
+}
+
+/// Returns where the name of a key stands.
+fn span_of_name(root: &DeTable, steps: &[Step]) -> Range<usize> {
+    let Some((Step::Key(last), before)) = steps.split_last() else { return span_of(root, steps) };
+    let mut inside: Option<&DeValue> = None;
+    for step in before {
+        inside = match (step, inside) {
+            (Step::Key(name), None) => root.get(name.as_str()).map(|value| value.get_ref()),
+            (Step::Key(name), Some(value)) => value.get(name.as_str()).map(|value| value.get_ref()),
+            (Step::Index(index), Some(value)) => value.get(*index).map(|value| value.get_ref()),
+            (Step::Index(_), None) => None,
+        };
+        if inside.is_none() {
+            return span_of(root, steps);
+        }
+    }
+    let table = inside.map_or(Some(root), DeValue::as_table);
+    table
+        .and_then(|table| table.get_key_value(last.as_str()))
+        .map_or_else(|| span_of(root, steps), |(key, _)| key.span())
+}
+
+/// A walk through values and their schema at once.
+struct Shape<'d, 't> {
+    document: &'d mut Document<'t>,
+    root: &'d Schema,
+    path: Vec<Step>,
+}
+
+impl Shape<'_, '_> {
+    /// Tells what does not fit, and whether the value itself may stay.
+    fn fits(&mut self, schema: &Schema, value: &mut toml::Value) -> bool {
+        if let Some(words) = choices(schema) {
+            return self.is_one_of(&words, value);
+        }
+        if let Some(variants) = schema.get("oneOf").and_then(Schema::as_array) {
+            return self.fits_variant(variants, value);
+        }
+        match schema.get("type").and_then(Schema::as_str) {
+            Some("object") => self.table(schema, value),
+            Some("array") => self.array(schema, value),
+            Some(kind @ ("number" | "integer")) => self.number(schema, kind, value),
+            Some("string") => self.text(schema, value),
+            Some("boolean") if !value.is_bool() => self.wrong(value, "true or false", "write it without quotes"),
+            _ => true,
+        }
+    }
+
+    fn table(&mut self, schema: &Schema, value: &mut toml::Value) -> bool {
+        let name = key_of(&self.path);
+        let toml::Value::Table(table) = value else {
+            return self.wrong(value, "a table", &format!("write [{name}] and its keys below"));
+        };
+        let empty = serde_json::Map::new();
+        let properties = schema.get("properties").and_then(Schema::as_object).unwrap_or(&empty);
+        for key in schema.get("required").and_then(Schema::as_array).into_iter().flatten().filter_map(Schema::as_str) {
+            // A key written wrongly is told as that, not once more as missing.
+            let meant = |other: &str| nearest(other, properties.keys().map(String::as_str)) == Some(key);
+            let misspelt = |other: &str| !properties.contains_key(other) && meant(other);
+            if !table.contains_key(key) && !table.keys().take(MOST_PROBLEMS).any(|other| misspelt(other.as_ref())) {
+                self.missing(key, &properties[key]);
+            }
+        }
+        let others = schema.get("additionalProperties");
+        table.retain(|key, value| {
+            self.path.push(Step::Key(key.to_string()));
+            let stays = match (properties.get(key), others) {
+                (Some(schema), _) => self.fits(schema, value),
+                (None, Some(Schema::Bool(false))) => self.unknown(key, properties),
+                (None, Some(schema @ Schema::Object(_))) => self.fits(schema, value),
+                (None, _) => true,
+            };
+            self.path.pop();
+            stays
+        });
+        true
+    }
+
+    fn fits_variant(&mut self, variants: &[Schema], value: &mut toml::Value) -> bool {
+        let tag = variants[0].get("properties").and_then(Schema::as_object).and_then(|properties| {
+            properties.iter().find(|(_, schema)| schema.get("const").is_some()).map(|(key, _)| key.as_str())
+        });
+        let Some(tag) = tag else { return true };
+        let word_of = |variant: &Schema| variant["properties"][tag]["const"].as_str().unwrap_or_default().to_owned();
+        let words: Vec<String> = variants.iter().map(word_of).collect();
+        let words: Vec<&str> = words.iter().map(String::as_str).collect();
+        let name = key_of(&self.path);
+        let Some(table) = value.as_table_mut() else {
+            return self.wrong(value, "a table", &format!("write [{name}] and its keys below"));
+        };
+        let Some(kind) = table.get_mut(tag) else {
+            let allowed = format!("one of {}", in_words(&words));
+            self.tell_missing(tag, &allowed, &format!("add `{tag} = \"{}\"`", words[0]));
+            return false;
+        };
+        self.path.push(Step::Key(tag.to_owned()));
+        let known = self.is_one_of(&words, kind);
+        self.path.pop();
+        let variant = variants.iter().find(|variant| kind.as_str() == Some(word_of(variant).as_str()));
+        known && variant.is_some_and(|variant| self.table(variant, value))
+    }
+
+    fn is_one_of(&mut self, words: &[&str], value: &toml::Value) -> bool {
+        let allowed = match words {
+            [only] => format!("\"{only}\""),
+            _ => format!("one of {}", in_words(words)),
+        };
+        let Some(found) = value.as_str() else {
+            return self.wrong(value, &allowed, "write the word in quotes");
+        };
+        if words.contains(&found) {
+            return true;
+        }
+        let remedy = match nearest(found, words.iter().copied()) {
+            Some(word) => format!("did you mean \"{word}\"?"),
+            None => "choose one of them".into(),
+        };
+        self.wrong(value, &allowed, &remedy)
+    }
+
+    fn array(&mut self, schema: &Schema, value: &mut toml::Value) -> bool {
+        let toml::Value::Array(items) = value else {
+            return self.wrong(value, "a list", "write it in square brackets: [ ... ]");
+        };
+        let limit = |key: &str| schema.get(key).and_then(Schema::as_u64).map(|n| n as usize);
+        let (least, most) = (limit("minItems").unwrap_or(0), limit("maxItems").unwrap_or(usize::MAX));
+        if !(least..=most).contains(&items.len()) {
+            let found = format!("has {} entries", items.len());
+            let allowed = match (least, most) {
+                (least, usize::MAX) => format!("there must be at least {least}"),
+                (least, most) if least == most => format!("there must be {least}"),
+                (least, most) => format!("there must be {least} to {most}"),
+            };
+            self.tell(found, &allowed, "add or remove entries");
+            return false;
+        }
+        let mut all = true;
+        for (k, item) in items.iter_mut().enumerate() {
+            let each = schema.get("prefixItems").and_then(|each| each.get(k)).or_else(|| schema.get("items"));
+            if let Some(each) = each {
+                self.path.push(Step::Index(k));
+                all &= self.fits(each, item);
+                self.path.pop();
+            }
+        }
+        all
+    }
+
+    fn number(&mut self, schema: &Schema, kind: &str, value: &toml::Value) -> bool {
+        let allowed = self.allowed_numbers(schema, kind);
+        let number = match value {
+            toml::Value::Integer(number) => *number as f64,
+            toml::Value::Float(number) if kind == "number" => *number,
+            toml::Value::Float(_) => return self.wrong(value, &allowed, "write it without a decimal point"),
+            toml::Value::String(text) if text.trim().parse::<f64>().is_ok() => {
+                return self.wrong(value, &allowed, &format!("remove the quotes: {}", text.trim()));
+            }
+            toml::Value::String(text) if text.replace(',', ".").trim().parse::<f64>().is_ok() => {
+                return self.wrong(value, &allowed, "write it with a decimal point and without quotes");
+            }
+            _ => return self.wrong(value, &allowed, "write a number, without its unit"),
+        };
+        let [least, most] = limits(schema);
+        let finite = number.is_finite() || (schema.get("x-infinite").is_some() && !number.is_nan());
+        if finite && (least..=most).contains(&number) {
+            return true;
+        }
+        let remedy = self.remedy_for(schema, number, [least, most]);
+        self.wrong(value, &allowed, &remedy)
+    }
+
+    fn allowed_numbers(&self, schema: &Schema, kind: &str) -> String {
+        let noun = if kind == "integer" { "a whole number" } else { "a finite number" };
+        let key = self.path.iter().rev().find_map(|step| match step {
+            Step::Key(name) => Some(name.as_str()),
+            Step::Index(_) => None,
+        });
+        let unit = key.and_then(unit_of).map_or(String::new(), |unit| format!(" {unit}"));
+        match limits(schema) {
+            [f64::NEG_INFINITY, f64::INFINITY] => noun.to_owned(),
+            [least, f64::INFINITY] => format!("{noun}, at least {least}{unit}"),
+            [f64::NEG_INFINITY, most] => format!("{noun}, at most {most}{unit}"),
+            [least, most] => format!("{noun} from {least} to {most}{unit}"),
+        }
+    }
+
+    fn remedy_for(&self, schema: &Schema, number: f64, [least, most]: [f64; 2]) -> String {
+        let key = key_of(&self.path);
+        let fits = |scaled: f64| scaled.is_finite() && (least..=most).contains(&scaled);
+        if key.ends_with("_mm") && number > most && fits(number * 1e-3) {
+            return format!("if that is micrometres, write {} millimetres", number * 1e-3);
+        }
+        if key.ends_with("_um") && number > 0.0 && number < least && fits(number * 1e3) {
+            return format!("if that is millimetres, write {} micrometres", number * 1e3);
+        }
+        let usual = schema.get("default").or_else(|| schema.get("examples").and_then(|examples| examples.get(0)));
+        match usual {
+            Some(usual) => format!("{usual} is usual"),
+            None => "correct it".into(),
+        }
+    }
+
+    fn text(&mut self, schema: &Schema, value: &toml::Value) -> bool {
+        let Some(text) = value.as_str() else {
+            return self.wrong(value, "text", "write it in quotes");
+        };
+        let limit = |key: &str, otherwise| schema.get(key).and_then(Schema::as_u64).map_or(otherwise, |n| n as usize);
+        let (least, most) = (limit("minLength", 0), limit("maxLength", 4096));
+        let length = text.chars().count();
+        if text.chars().any(char::is_control) {
+            return self.wrong(value, "text of one line", "remove line breaks and control characters");
+        }
+        if (least..=most).contains(&length) {
+            return true;
+        }
+        let found = format!("has {length} characters");
+        self.tell(found, &format!("it must have {least} to {most}"), "write a shorter or longer text");
+        false
+    }
+
+    fn wrong(&mut self, value: &toml::Value, allowed: &str, remedy: &str) -> bool {
+        self.tell(format!("is {}", shown(value)), &format!("it must be {allowed}"), remedy);
+        false
+    }
+
+    fn tell(&mut self, found: String, allowed: &str, remedy: &str) {
+        let span = span_of(&self.document.places, &self.path);
+        self.document.push(span, key_of(&self.path), found, allowed, remedy);
+    }
+
+    fn missing(&mut self, key: &str, schema: &Schema) {
+        let is_table =
+            schema.get("properties").is_some() || schema.get("oneOf").is_some_and(|_| choices(schema).is_none());
+        if is_table {
+            let mut path = self.path.clone();
+            path.push(Step::Key(key.to_owned()));
+            return self.tell_missing(key, "", &format!("add the table [{}]", key_of(&path)));
+        }
+        let allowed = match schema.get("type").and_then(Schema::as_str) {
+            _ if choices(schema).is_some() => format!("one of {}", in_words(&choices(schema).unwrap_or_default())),
+            Some(kind @ ("number" | "integer")) => {
+                self.path.push(Step::Key(key.to_owned()));
+                let allowed = self.allowed_numbers(schema, kind);
+                self.path.pop();
+                allowed
+            }
+            Some("string") => "text".to_owned(),
+            Some("array") => "a list".to_owned(),
+            _ => String::new(),
+        };
+        let example = schema.get("examples").and_then(|examples| examples.get(0)).map(ToString::to_string);
+        let remedy = example.map_or(format!("add `{key}`"), |example| format!("add `{key} = {example}`"));
+        self.tell_missing(key, &allowed, &remedy);
+    }
+
+    fn tell_missing(&mut self, key: &str, allowed: &str, remedy: &str) {
+        let span = span_of(&self.document.places, &self.path);
+        self.path.push(Step::Key(key.to_owned()));
+        let allowed = if allowed.is_empty() { String::new() } else { format!("it must be {allowed}") };
+        self.document.push(span, key_of(&self.path), "is missing".into(), &allowed, remedy);
+        self.path.pop();
+    }
+
+    fn unknown(&mut self, key: &str, properties: &serde_json::Map<String, Schema>) -> bool {
+        let span = span_of_name(&self.document.places, &self.path);
+        let list =
+            || format!("known here are {}", properties.keys().map(String::as_str).collect::<Vec<_>>().join(", "));
+        let (allowed, remedy) = if let Some(near) = nearest(key, properties.keys().map(String::as_str)) {
+            ("there is no such key here".into(), format!("did you mean `{near}`?"))
+        } else if let Some(table) = home_of(self.root, key, &mut Vec::new()) {
+            (list(), format!("it belongs into {table}"))
+        } else {
+            (list(), "remove it".into())
+        };
+        self.document.push(span, key_of(&self.path), "is unknown".into(), &allowed, &remedy);
+        false
+    }
+}
+
+fn limits(schema: &Schema) -> [f64; 2] {
+    let limit = |key: &str| schema.get(key).and_then(Schema::as_f64);
+    [limit("minimum").unwrap_or(f64::NEG_INFINITY), limit("maximum").unwrap_or(f64::INFINITY)]
+}
+
+/// Returns the word that was probably meant.
+fn nearest<'w>(found: &str, words: impl Iterator<Item = &'w str>) -> Option<&'w str> {
+    let found: String = found.chars().take(64).collect::<String>().to_lowercase().replace('-', "_");
+    let likeness = |word: &str| strsim::normalized_damerau_levenshtein(&found, &word.replace('-', "_"));
+    words
+        .map(|word| (likeness(word), word))
+        .filter(|(alike, _)| *alike >= 0.6)
+        .max_by(|a, b| a.0.total_cmp(&b.0))
+        .map(|(_, word)| word)
+}
+
+/// Returns the table in which a key would be known.
+fn home_of(schema: &Schema, key: &str, path: &mut Vec<String>) -> Option<String> {
+    let variants = schema.get("oneOf").and_then(Schema::as_array).into_iter().flatten();
+    for schema in std::iter::once(schema).chain(variants) {
+        let Some(properties) = schema.get("properties").and_then(Schema::as_object) else { continue };
+        if properties.contains_key(key) {
+            return Some(if path.is_empty() { "the top of the file".into() } else { format!("[{}]", path.join(".")) });
+        }
+        for (name, schema) in properties {
+            path.push(name.clone());
+            let found = home_of(schema, key, path);
+            path.pop();
+            if found.is_some() {
+                return found;
+            }
+        }
+    }
+    None
+}
+
+fn in_words(words: &[&str]) -> String {
+    words.iter().map(|word| format!("\"{word}\"")).collect::<Vec<_>>().join(", ")
+}
+
+/// Returns the unit that a key ends with.
+fn unit_of(key: &str) -> Option<&'static str> {
+    const UNITS: [(&str, &str); 8] = [
+        ("_mm_min", "mm/min"),
+        ("_mm_s", "mm/s"),
+        ("_mm", "mm"),
+        ("_um", "um"),
+        ("_nm", "nm"),
+        ("_deg", "degrees"),
+        ("_ms", "ms"),
+        ("_s", "s"),
+    ];
+    UNITS.iter().find(|(suffix, _)| key.ends_with(suffix)).map(|(_, unit)| *unit)
+}
+
+/// Returns a value as it may stand in a message.
+fn shown(value: &toml::Value) -> String {
+    match value {
+        toml::Value::String(text) => {
+            let short: String = text.chars().take(40).collect();
+            format!("{short:?}")
+        }
+        toml::Value::Integer(number) => number.to_string(),
+        toml::Value::Float(number) => number.to_string(),
+        toml::Value::Boolean(value) => value.to_string(),
+        toml::Value::Datetime(_) => "a date".into(),
+        toml::Value::Array(items) => format!("a list of {}", items.len()),
+        toml::Value::Table(_) => "a table".into(),
+    }
+}

@@ -1,0 +1,86 @@
+//! The JSON schema of a kind of file, made from the structs that it is read into.
+
+use schemars::generate::SchemaSettings;
+use schemars::transform::{RecursiveTransform, Transform};
+use schemars::{JsonSchema, Schema};
+use serde_json::Value;
+
+/// Makes the schema of a file.
+///
+/// A key that may be left out is an `Option`, whose null TOML cannot write: it is taken away. A key that must stand is an
+/// `Option` too, so that what is wrong with it can be told with the rest; it says `x-required`.
+pub(crate) fn schema_of<File: JsonSchema>() -> Value {
+    let settings = SchemaSettings::draft2020_12().with(|settings| settings.inline_subschemas = true);
+    let mut schema = settings.into_generator().into_root_schema_for::<File>();
+    RecursiveTransform(tidy).transform(&mut schema);
+    schema.to_value()
+}
+
+fn tidy(schema: &mut Schema) {
+    without_null(schema);
+    if schema.get("default").is_some_and(Value::is_null) {
+        schema.remove("default");
+    }
+    // A table's keys have their own defaults.
+    if schema.get("default").is_some_and(Value::is_object) {
+        schema.remove("default");
+    }
+    schema.remove("format");
+    schema.remove("title");
+    let Some(properties) = schema.get("properties").and_then(Value::as_object) else { return };
+    let must = |value: &Value| value.get("x-required").is_some() || value.get("const").is_some();
+    let required: Vec<Value> =
+        properties.iter().filter(|(_, value)| must(value)).map(|(key, _)| Value::from(key.as_str())).collect();
+    schema.remove("required");
+    if !required.is_empty() {
+        schema.insert("required".into(), Value::Array(required));
+    }
+    if let Some(properties) = schema.get_mut("properties").and_then(Value::as_object_mut) {
+        properties.values_mut().filter_map(Value::as_object_mut).for_each(|property| {
+            property.remove("x-required");
+        });
+    }
+}
+
+fn without_null(schema: &mut Schema) {
+    if let Some(Value::Array(types)) = schema.get_mut("type") {
+        types.retain(|name| name != "null");
+        if let [only] = types.as_slice() {
+            let only = only.clone();
+            schema.insert("type".into(), only);
+        }
+    }
+    if let Some(Value::Array(values)) = schema.get_mut("enum") {
+        values.retain(|value| !value.is_null());
+    }
+    let Some(Value::Array(of)) = schema.get("anyOf") else { return };
+    let left: Vec<&Value> = of.iter().filter(|one| one.get("type").is_none_or(|name| name != "null")).collect();
+    if let [Value::Object(only)] = left.as_slice() {
+        let only = only.clone();
+        schema.remove("anyOf");
+        for (key, value) in only {
+            // What is said about the key goes before what is said about its type.
+            if schema.get(&key).is_none() {
+                schema.insert(key, value);
+            }
+        }
+    }
+}
+
+/// Returns the words that a schema allows, if it is a choice among words.
+pub(crate) fn choices(schema: &Value) -> Option<Vec<&str>> {
+    if let Some(values) = schema.get("enum").and_then(Value::as_array) {
+        return values.iter().map(Value::as_str).collect();
+    }
+    if let Some(word) = schema.get("const").and_then(Value::as_str) {
+        return Some(vec![word]);
+    }
+    let mut words = Vec::new();
+    for one in schema.get("oneOf")?.as_array()? {
+        if one.get("properties").is_some() {
+            return None;
+        }
+        words.extend(choices(one)?);
+    }
+    Some(words)
+}

@@ -1,0 +1,638 @@
+//! The only room where commands meet machines: one loop, one select.
+//!
+//! ```text
+//!  orders (control socket, Ctrl-C) --+                       +--> stations: a task for each machine
+//!  facts (stations, computations) ---+--> Cell::handle --> commands --> computations, off the asynchronous threads
+//!  the deadline of the cell ---------+       ^      |        +--> notices, for whoever shows the run
+//!                                            |      v
+//!                                        journal: every event before it is handled, every command before it is carried out
+//! ```
+//!
+//! A command that could move a machine is not carried out unless the journal has it. Hold, stop and abort are carried out
+//! whether it can be written or not.
+
+mod control;
+mod notice;
+mod record;
+mod station;
+mod work;
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use tokio::sync::{mpsc, watch};
+use tokio::time::Instant;
+
+use crate::cell::{Actor, Cell, CellPlan, Command, Device, Ending, Event, GateFailure, RecordFailure, State};
+use crate::compensation::{Correction, ErrorMap};
+use crate::device::{Armed, Cmm, Grinder, Interrupt};
+use crate::formats::{ResultFolder, write_json_atomic};
+use crate::journal::{Entry, Journal, Kind};
+use crate::registration::Registration;
+
+use control::{Control, Ordered};
+pub use control::{Reply, Request, SOCKET, ask};
+pub use notice::{CycleRow, Notice};
+use record::{Recorder, entry};
+use station::{Ask, Bench, CmmBench, GrinderBench, Harvest, Intent, Load, Station, Told};
+use work::{Cycle, Points};
+pub use work::{Probing, Sphere, Task};
+
+/// Everything a run needs besides its machines.
+pub struct Run {
+    /// What the cell decides by.
+    pub plan: CellPlan,
+    /// What is computed, and from what.
+    pub task: Task,
+    /// The journal of the run, just created.
+    pub journal: Journal,
+    /// The number of the part's run, for the machines.
+    pub job: u32,
+    /// Who began it.
+    pub actor: Actor,
+    /// Whether loading the part needs nobody's word: the cell is simulated, or the recipe says so.
+    pub loaded: bool,
+    /// Time between two looks at each machine: CMM, grinder.
+    pub poll: [Duration; 2],
+    /// Where notices go.
+    pub notices: mpsc::UnboundedSender<Notice>,
+    /// An interrupted run that is gone on with.
+    pub interrupted: Option<Interrupted>,
+}
+
+/// What the journal of an interrupted run tells.
+#[derive(Default)]
+pub struct Interrupted {
+    /// The events that the cell took in, to be handled again.
+    pub events: Vec<(Duration, Event)>,
+    /// The last intent of a START for each machine: CMM, grinder.
+    pub intents: [Option<Value>; 2],
+}
+
+/// Orders from this process itself: Ctrl-C, a prompt.
+#[derive(Clone)]
+pub struct Orders(mpsc::Sender<Ordered>);
+
+impl Orders {
+    /// Gives an order; it is handled in its turn.
+    pub async fn give(&self, request: Request, actor: Actor) {
+        // A run that is over needs no orders.
+        let _ = self.0.send(Ordered { request, actor, answer: None }).await;
+    }
+}
+
+/// A run that is ready to begin.
+pub struct Drive {
+    cell: Cell,
+    task: Arc<Task>,
+    recorder: Recorder,
+    folder: PathBuf,
+    actor: Actor,
+    loaded: bool,
+    began: Instant,
+    /// Time of the run before it was interrupted.
+    before: Duration,
+    asks: [mpsc::Sender<Ask>; 2],
+    interrupts: [Interrupt; 2],
+    told: mpsc::Receiver<Told>,
+    computed: (mpsc::UnboundedSender<Computed>, mpsc::UnboundedReceiver<Computed>),
+    orders: mpsc::Receiver<Ordered>,
+    status: watch::Sender<Value>,
+    notices: mpsc::UnboundedSender<Notice>,
+    cycles: BTreeMap<u32, Cycle>,
+    armed: [Option<Value>; 2],
+    record_failed: bool,
+    ending: Option<Ending>,
+    stations: Vec<tokio::task::JoinHandle<()>>,
+    _control: Control,
+}
+
+/// What a computation brought.
+enum Computed {
+    Registered(u32, Event, Option<Box<(Registration, Option<ErrorMap>, crate::cell::Figures)>>),
+    Compensated(u32, Event, Option<Correction>),
+    Gated(u32, Event, Option<Points>),
+}
+
+fn index(device: Device) -> usize {
+    match device {
+        Device::Cmm => 0,
+        Device::Grinder => 1,
+    }
+}
+
+impl Drive {
+    /// Makes ready: a task for each machine, the control socket, the thread of the journal. Nothing is commanded yet.
+    ///
+    /// # Errors
+    /// A run folder in which no control socket can be made.
+    pub fn new<C: Cmm + 'static, G: Grinder + 'static>(
+        run: Run,
+        cmm: C,
+        grinder: G,
+    ) -> std::io::Result<(Self, Orders)> {
+        let (told, facts) = mpsc::channel(64);
+        let (orders, ordered) = mpsc::channel(16);
+        let (status, seen) = watch::channel(Value::Null);
+        let recorder = Recorder::new(run.journal);
+        let folder = recorder.folder().to_owned();
+        let control = Control::listen(&folder, orders.clone(), seen)?;
+        let interrupted = run.interrupted.unwrap_or_default();
+        let interrupts = [Interrupt::new(), Interrupt::new()];
+        let armed = interrupted.intents.clone().map(|intent| intent.as_ref().and_then(restored));
+        let [of_cmm, of_grinder] = armed;
+        let [poll_cmm, poll_grinder] = run.poll;
+        let (cmm, cmm_task) = spawn(CmmBench(cmm), run.job, &interrupts[0], &told, of_cmm, poll_cmm);
+        let (grinder, grinder_task) =
+            spawn(GrinderBench(grinder), run.job, &interrupts[1], &told, of_grinder, poll_grinder);
+        let mut drive = Self {
+            cell: Cell::new(run.plan),
+            task: Arc::new(run.task),
+            recorder,
+            folder,
+            actor: run.actor,
+            loaded: run.loaded,
+            began: Instant::now(),
+            before: Duration::ZERO,
+            asks: [cmm, grinder],
+            interrupts,
+            told: facts,
+            computed: mpsc::unbounded_channel(),
+            orders: ordered,
+            status,
+            notices: run.notices,
+            cycles: BTreeMap::new(),
+            armed: interrupted.intents,
+            record_failed: false,
+            ending: None,
+            stations: vec![cmm_task, grinder_task],
+            _control: control,
+        };
+        drive.replay(interrupted.events);
+        Ok((drive, Orders(orders)))
+    }
+
+    /// Takes the cell to where the interrupted run was, carrying nothing out.
+    fn replay(&mut self, events: Vec<(Duration, Event)>) {
+        for (now, event) in events {
+            self.before = self.before.max(now);
+            self.cell.handle(now, event);
+        }
+    }
+
+    fn now(&self) -> Duration {
+        self.before + self.began.elapsed()
+    }
+
+    /// Runs until the cell has come to an end, and returns it.
+    pub async fn run(mut self) -> Ending {
+        let first = match self.cell.state() {
+            State::Idle => Event::Start { actor: self.actor.clone() },
+            _ => Event::Restarted { actor: self.actor.clone() },
+        };
+        self.take(first, None).await;
+        while self.ending.is_none() {
+            let due = self.cell.next_deadline().map(|at| self.began + at.saturating_sub(self.before));
+            let deadline = async {
+                match due {
+                    Some(at) => tokio::time::sleep_until(at).await,
+                    None => std::future::pending().await,
+                }
+            };
+            tokio::select! {
+                biased;
+                Some(ordered) = self.orders.recv() => self.order(ordered).await,
+                Some(computed) = self.computed.1.recv() => self.computed(computed).await,
+                Some(told) = self.told.recv() => self.told(told).await,
+                () = deadline => drop(self.take(Event::Deadline, None).await),
+            }
+        }
+        self.conclude().await
+    }
+
+    /// Writes the end of the run and gives the machines back.
+    async fn conclude(mut self) -> Ending {
+        let ending = self.ending.take().expect("the loop ended with one");
+        let rows: Vec<CycleRow> = self.rows();
+        let result = json!({ "simulation": self.task.simulation, "ending": ending, "cycles": rows });
+        let path = self.folder.join("result.json");
+        let now = self.now();
+        if let Err(error) = write_json_atomic(&path, &result) {
+            self.notify(Notice::RecordFailed { words: error.to_string() });
+        } else {
+            self.adopt(vec!["result.json".into()], self.cell.cycle()).await;
+        }
+        if let Err(failure) = self.recorder.close(now, self.cell.cycle(), result).await {
+            self.notify(Notice::RecordFailed { words: record_words(&failure) });
+        }
+        self.notify(Notice::Finished { ending: ending.clone(), cycles: rows });
+        // No more asks: each station gives its machine back and ends.
+        self.asks = [mpsc::channel(1).0, mpsc::channel(1).0];
+        for station in self.stations.drain(..) {
+            let _ = tokio::time::timeout(Duration::from_secs(2), station).await;
+        }
+        ending
+    }
+
+    /// Handles an order and answers who gave it.
+    async fn order(&mut self, Ordered { request, actor, answer }: Ordered) {
+        let event = match request {
+            Request::Hold { reason } => Event::Hold { actor, reason },
+            Request::Resume { reason } => Event::Resume { actor, reason },
+            Request::Stop { reason } => Event::Stop { actor, reason },
+            Request::Abort { reason } => Event::Abort { actor, reason },
+            Request::Loaded => Event::LoadConfirmed { actor },
+            Request::Over { device, evidence } => Event::DeclaredOver { actor, device, evidence },
+            Request::Status => return,
+        };
+        let refusal = self.take(event, None).await;
+        if let Some(answer) = answer {
+            let words = refusal.clone().unwrap_or_else(|| self.cell.state().to_string());
+            // Who asked may have gone.
+            let _ = answer.send(Reply { accepted: refusal.is_none(), words, status: self.snapshot() });
+        }
+    }
+
+    async fn told(&mut self, Told { event, detail, harvest }: Told) {
+        if let Some(Harvest::Record(record)) = &harvest {
+            let payload = json!({ "pass_record": pass_record(record) });
+            self.note(Kind::Note, ("grinder".into(), "wire".into()), payload).await;
+        }
+        if let Some(Harvest::Points(measurement)) = harvest {
+            return self.gate(measurement);
+        }
+        if let Some(event) = event {
+            if let Event::Prepared { device, .. } = &event {
+                self.armed[index(*device)].clone_from(&detail);
+            }
+            self.take(event, detail).await;
+        }
+    }
+
+    async fn computed(&mut self, computed: Computed) {
+        let (number, event, files): (u32, Event, &[&str]) = match computed {
+            Computed::Gated(number, event, points) => {
+                let sphere = points.as_ref().is_some_and(|p| !p.sphere.is_empty());
+                let usable = points.is_some();
+                if let (Some(points), Some(cycle)) = (points, self.cycles.get_mut(&number)) {
+                    cycle.points = Some(Arc::new(points));
+                }
+                let files: &[&str] = match (usable, sphere) {
+                    (true, true) => &["reference_sphere.csv", "measured.csv"],
+                    (true, false) => &["measured.csv"],
+                    _ => &[],
+                };
+                (number, event, files)
+            }
+            Computed::Registered(number, event, found) => {
+                let any = found.is_some();
+                if let (Some(found), Some(cycle)) = (found, self.cycles.get_mut(&number)) {
+                    let (registration, error, figures) = *found;
+                    cycle.registration = Some(Arc::new(registration));
+                    cycle.error = error.map(Arc::new);
+                    cycle.figures = Some(figures);
+                }
+                let files: &[&str] = &["deviations.csv", "deviation_uncertainty.csv", "registration.json"];
+                (number, event, if any { files } else { &[] })
+            }
+            Computed::Compensated(number, event, correction) => {
+                let any = correction.is_some();
+                if let Some(correction) = correction {
+                    self.cycles.insert(number + 1, new_cycle(correction));
+                }
+                let files: &[&str] = &["error_map.csv", "correction.csv", "error_map.png"];
+                (number, event, if any { files } else { &[] })
+            }
+        };
+        let names = files.iter().map(|name| format!("cycle-{number}/{name}")).collect();
+        self.adopt(names, number).await;
+        self.take(event, None).await;
+    }
+
+    /// Records an event, lets the cell handle it, and carries out what it decides. Returns why it was refused, if it was.
+    async fn take(&mut self, event: Event, detail: Option<Value>) -> Option<String> {
+        let mut refusal = None;
+        let mut events = std::collections::VecDeque::from([(event, detail)]);
+        while let Some((event, detail)) = events.pop_front() {
+            let now = self.now();
+            if let Some(failure) = self.journal_event(now, &event, detail).await {
+                events.push_back((Event::RecordFailed { why: failure }, None));
+            }
+            self.show_event(&event);
+            for command in self.cell.handle(now, event) {
+                if let Command::Refuse { why, .. } = &command {
+                    refusal = Some(why.clone());
+                }
+                if let Some(failure) = self.carry_out(command).await {
+                    events.push_back((Event::RecordFailed { why: failure }, None));
+                }
+            }
+            self.status.send_replace(self.snapshot());
+        }
+        refusal
+    }
+
+    async fn journal_event(&mut self, now: Duration, event: &Event, detail: Option<Value>) -> Option<RecordFailure> {
+        let mut payload = serde_json::to_value(event).unwrap_or(Value::Null);
+        if let (Some(map), Some(detail)) = (payload.as_object_mut(), detail) {
+            map.insert("detail".into(), detail);
+        }
+        let written = self.recorder.append(entry(Kind::Event, now, self.cell.cycle(), actor_of(event), payload)).await;
+        self.settle(written.map(|()| 0))
+    }
+
+    /// Returns a failure to record the first time only; the cell is told once.
+    fn settle(&mut self, written: Result<u32, RecordFailure>) -> Option<RecordFailure> {
+        match written {
+            Ok(_) => None,
+            Err(failure) => {
+                self.notify(Notice::RecordFailed { words: record_words(&failure) });
+                (!std::mem::replace(&mut self.record_failed, true)).then_some(failure)
+            }
+        }
+    }
+
+    async fn note(&mut self, kind: Kind, actor: (String, String), payload: Value) {
+        let written = self.recorder.append(entry(kind, self.now(), self.cell.cycle(), actor, payload)).await;
+        self.settle(written.map(|()| 0));
+    }
+
+    async fn adopt(&mut self, names: Vec<String>, cycle: u32) {
+        if !names.is_empty() {
+            let adopted = self.recorder.adopt(names, self.now(), cycle).await;
+            self.settle(adopted.map(|()| 0));
+        }
+    }
+
+    /// Carries a command out, after it is on record. Returns a failure to record that the cell should hear of.
+    async fn carry_out(&mut self, command: Command) -> Option<RecordFailure> {
+        let mut payload = serde_json::to_value(&command).unwrap_or(Value::Null);
+        if let (Command::StartMachine { device, .. }, Some(map)) = (&command, payload.as_object_mut()) {
+            map.insert("intent".into(), self.armed[index(*device)].clone().unwrap_or(Value::Null));
+        }
+        let record = Entry::new(Kind::Intent, record::nanoseconds(self.now()), self.cell.cycle(), payload);
+        let safe = makes_safe(&command);
+        if safe {
+            // What makes safe does not wait for the disk.
+            self.execute(command).await;
+            return self.settle_intent(record).await;
+        }
+        let failure = self.settle_intent(record).await;
+        if failure.is_none() && !self.record_failed || !moves(&command) {
+            self.execute(command).await;
+        }
+        failure
+    }
+
+    async fn settle_intent(&mut self, record: Entry) -> Option<RecordFailure> {
+        let written = self.recorder.intend(record).await;
+        if written.is_ok() {
+            self.record_failed = false;
+        }
+        self.settle(written)
+    }
+
+    async fn execute(&mut self, command: Command) {
+        match command {
+            Command::Connect { device } => self.ask(device, Ask::Connect).await,
+            Command::AskToLoad => self.ask_to_load().await,
+            Command::LoadPass { cycle } => self.load_pass(cycle).await,
+            Command::LoadPlan { cycle } => self.load_plan(cycle).await,
+            Command::VerifyClear { device } => self.ask(device, Ask::VerifyClear).await,
+            Command::Prepare { device, cycle } => self.ask(device, Ask::Prepare { cycle }).await,
+            Command::StartMachine { device, cycle } => self.ask(device, Ask::Start { cycle }).await,
+            Command::HoldMachine { device } => self.ask_at_once(device, Ask::Hold).await,
+            Command::ResumeMachine { device } => self.ask(device, Ask::Resume).await,
+            Command::StopMachine { device } => self.ask_at_once(device, Ask::Stop).await,
+            Command::AbortMachine { device } => self.ask_at_once(device, Ask::Abort).await,
+            Command::ClearMachine { device } => self.ask(device, Ask::Clear).await,
+            Command::Reconcile { device, cycle } => self.ask(device, Ask::Reconcile { cycle }).await,
+            Command::Collect { cycle } => self.ask(Device::Cmm, Ask::Collect { cycle }).await,
+            Command::Qualify { cycle } => self.qualify(cycle),
+            Command::Acknowledge { device } => self.ask(device, Ask::Acknowledge).await,
+            Command::Register { cycle } => self.register(cycle),
+            Command::Compensate { cycle } => self.compensate(cycle),
+            Command::Announce(judgement) => self.notify(Notice::Judged(judgement)),
+            Command::Raise(alarm) => self.notify(Notice::Alarm(alarm)),
+            Command::Withdraw { alarm } => self.notify(Notice::AlarmGone { alarm }),
+            Command::Refuse { why, .. } => self.notify(Notice::Refused { why }),
+            Command::Finish(ending) => self.ending = Some(ending),
+        }
+    }
+
+    async fn ask(&mut self, device: Device, ask: Ask) {
+        // A station lives as long as the drive; its channel is wide enough for what one cell has under way.
+        let _ = self.asks[index(device)].send(ask).await;
+    }
+
+    async fn ask_at_once(&mut self, device: Device, ask: Ask) {
+        self.interrupts[index(device)].raise();
+        self.ask(device, ask).await;
+    }
+
+    async fn ask_to_load(&mut self) {
+        if self.loaded {
+            let name = if self.task.simulation { "simulation" } else { "recipe" };
+            let actor = Actor { name: name.into(), station: "regrind".into() };
+            let (_, event) = (0, Event::LoadConfirmed { actor });
+            // In its turn, like everything else that the cell hears.
+            let _ = self.computed.0.send(Computed::Gated(0, event, None));
+        } else {
+            self.notify(Notice::LoadPart);
+        }
+    }
+
+    async fn load_pass(&mut self, number: u32) {
+        let task = Arc::clone(&self.task);
+        let cycle = self.cycles.entry(number).or_insert_with(|| new_cycle(task.first_correction()));
+        let correction = Arc::clone(&cycle.correction);
+        let (map, pass) = task.payloads(&correction);
+        let load = Load::Pass(Arc::new(map), Box::new(pass));
+        self.ask(Device::Grinder, Ask::Load { cycle: number, load }).await;
+    }
+
+    async fn load_plan(&mut self, number: u32) {
+        // A part that is measured before any pass, or measured once more, stands as the last pass left it.
+        let last = self.cycles.range(..=number).next_back().map(|(_, c)| Arc::clone(&c.correction));
+        let correction = last.unwrap_or_else(|| Arc::new(self.task.first_correction()));
+        let found = self.cycles.values().rev().find_map(|c| c.registration.as_ref().map(|r| r.cmm_from_model));
+        let pose = found.unwrap_or(self.task.fixture_cmm_from_model);
+        let plan = Arc::new(self.task.plan(correction.level_mm, &pose));
+        let cycle = self.cycles.entry(number).or_insert_with(|| new_cycle((*correction).clone()));
+        cycle.plan = Some(Arc::clone(&plan));
+        self.ask(Device::Cmm, Ask::Load { cycle: number, load: Load::Plan(plan) }).await;
+    }
+
+    /// Looks through the points of a measurement and writes them, off the asynchronous threads.
+    fn gate(&mut self, measurement: Box<crate::device::Measurement>) {
+        let number = u32::from(measurement.cycle);
+        let (task, folder) = (Arc::clone(&self.task), self.cycle_folder(number));
+        let plan = self.cycles.get(&number).and_then(|cycle| cycle.plan.clone());
+        let done = self.computed.0.clone();
+        tokio::task::spawn_blocking(move || {
+            let empty = || {
+                Arc::new(crate::device::Plan { targets: Vec::new(), ..task.plan(0.0, &task.fixture_cmm_from_model) })
+            };
+            let (planned, found, points) = work::gate(&task, &plan.unwrap_or_else(empty), &measurement);
+            let saved = points.and_then(|points| {
+                let made = ResultFolder::prepare(&folder).map(ResultFolder::keep);
+                let saved = made.and_then(|()| work::save_points(&folder, &points));
+                saved.map(|()| points).map_err(|error| GateFailure::Broken(error.to_string()))
+            });
+            let (gate, points) = match saved {
+                Ok(points) => (Ok(()), Some(points)),
+                Err(failure) => (Err(failure), None),
+            };
+            let event = work::collected(number, planned, found, gate);
+            let _ = done.send(Computed::Gated(number, event, points));
+        });
+    }
+
+    fn qualify(&mut self, number: u32) {
+        let stated = self.task.probing.probe_radius_mm;
+        let found = self.cycles.get(&number).and_then(|c| c.points.as_ref()?.radius_mm);
+        let event = Event::Qualified { cycle: number, radius_error_mm: found.map_or(0.0, |radius| radius - stated) };
+        let _ = self.computed.0.send(Computed::Gated(number, event, None));
+    }
+
+    fn register(&mut self, number: u32) {
+        let Some(cycle) = self.cycles.get(&number).cloned() else { return };
+        let before = self.cycles.range(..number).next_back().map(|(_, c)| c.clone());
+        let (task, folder, done) = (Arc::clone(&self.task), self.cycle_folder(number), self.computed.0.clone());
+        tokio::task::spawn_blocking(move || {
+            let (event, found) = work::register_cycle(&task, &folder, number, &cycle, before.as_ref());
+            let _ = done.send(Computed::Registered(number, event, found.map(Box::new)));
+        });
+    }
+
+    fn compensate(&mut self, number: u32) {
+        let Some(cycle) = self.cycles.get(&number).cloned() else { return };
+        let (task, folder, done) = (Arc::clone(&self.task), self.cycle_folder(number), self.computed.0.clone());
+        tokio::task::spawn_blocking(move || {
+            let (event, correction) = work::compensate_cycle(&task, &folder, number, &cycle);
+            let _ = done.send(Computed::Compensated(number, event, correction));
+        });
+    }
+
+    fn cycle_folder(&self, number: u32) -> PathBuf {
+        self.folder.join(format!("cycle-{number}"))
+    }
+
+    fn notify(&self, notice: Notice) {
+        // Whoever showed the run may have gone; the run goes on.
+        let _ = self.notices.send(notice);
+    }
+
+    fn show_event(&self, event: &Event) {
+        let notice = match event {
+            Event::Progressed { device, done, total } => {
+                Notice::Progress { device: *device, cycle: self.cell.cycle(), done: *done, total: *total }
+            }
+            Event::Registered { cycle, figures } => Notice::Figures { cycle: *cycle, figures: figures.clone() },
+            Event::Compensated { cycle, summary } => Notice::Compensated { cycle: *cycle, summary: summary.clone() },
+            event => Notice::State {
+                state: self.cell.state().to_string(),
+                cycle: self.cell.cycle(),
+                event: event_name(event),
+            },
+        };
+        self.notify(notice);
+    }
+
+    fn rows(&self) -> Vec<CycleRow> {
+        let rows = self.cycles.iter().filter_map(|(&cycle, c)| {
+            let figures = c.figures.as_ref()?;
+            Some(CycleRow {
+                cycle,
+                pv_um: 1e3 * figures.pv_mm,
+                rms_um: 1e3 * figures.rms_mm,
+                points: figures.points,
+                outliers: figures.outliers,
+                level_um: 1e3 * c.correction.level_mm,
+            })
+        });
+        rows.collect()
+    }
+
+    /// How the cell is, as the control socket tells it.
+    fn snapshot(&self) -> Value {
+        json!({
+            "simulation": self.task.simulation,
+            "state": self.cell.state().name(),
+            "words": self.cell.state().to_string(),
+            "cycle": self.cell.cycle(),
+            "seconds": self.now().as_secs_f64(),
+            "cycles": self.rows(),
+        })
+    }
+}
+
+fn new_cycle(correction: Correction) -> Cycle {
+    Cycle { correction: Arc::new(correction), plan: None, points: None, registration: None, error: None, figures: None }
+}
+
+fn spawn<B: Bench>(
+    bench: B,
+    job: u32,
+    interrupt: &Interrupt,
+    told: &mpsc::Sender<Told>,
+    armed: Option<(u32, Armed)>,
+    poll: Duration,
+) -> (mpsc::Sender<Ask>, tokio::task::JoinHandle<()>) {
+    let (asks, asked) = mpsc::channel(16);
+    let station = Station::new(bench, job, interrupt.clone(), told.clone()).with_intent(armed);
+    (asks, tokio::spawn(station.attend(asked, poll)))
+}
+
+fn restored(intent: &Value) -> Option<(u32, Armed)> {
+    let intent: Intent = serde_json::from_value(intent.clone()).ok()?;
+    Some((u32::from(intent.cycle), intent.armed()))
+}
+
+/// Commands that may set something in motion.
+fn moves(command: &Command) -> bool {
+    matches!(command, Command::StartMachine { .. } | Command::ResumeMachine { .. })
+}
+
+/// Commands that bring machines to rest.
+fn makes_safe(command: &Command) -> bool {
+    matches!(command, Command::HoldMachine { .. } | Command::StopMachine { .. } | Command::AbortMachine { .. })
+}
+
+fn record_words(failure: &RecordFailure) -> String {
+    match failure {
+        RecordFailure::DiskFull(words) | RecordFailure::Unwritable(words) => words.clone(),
+    }
+}
+
+/// Who is behind an event.
+fn actor_of(event: &Event) -> (String, String) {
+    let cell = || ("cell".to_owned(), "regrind".to_owned());
+    let Ok(Value::Object(map)) = serde_json::to_value(event) else { return cell() };
+    let text = |value: Option<&Value>| value.and_then(Value::as_str).map(str::to_owned);
+    match map.get("actor") {
+        Some(actor) => (text(actor.get("name")).unwrap_or_default(), text(actor.get("station")).unwrap_or_default()),
+        None => text(map.get("device")).map_or_else(cell, |device| (device, "wire".into())),
+    }
+}
+
+fn event_name(event: &Event) -> String {
+    let value = serde_json::to_value(event).unwrap_or(Value::Null);
+    value.get("event").and_then(Value::as_str).unwrap_or_default().to_owned()
+}
+
+fn pass_record(record: &crate::device::PassRecord) -> Value {
+    json!({
+        "path_mm": record.path_mm,
+        "removed_mm3": record.removed_mm3,
+        "deepest_mm": record.deepest_mm,
+        "idle_share": record.idle_share,
+        "spindle_load": record.spindle_load,
+        "wheel_radius_mm": record.wheel_radius_mm,
+        "temperature_c": record.temperature_c,
+        "duration_s": record.duration_s,
+    })
+}

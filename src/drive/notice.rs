@@ -1,0 +1,47 @@
+//! What is shown of a run while it runs.
+
+use serde::Serialize;
+
+use crate::cell::{Alarm, AlarmId, CompensationSummary, Device, Ending, Figures, Judgement};
+
+/// Something that a person, or a program that reads lines of JSON, may want to know.
+#[derive(Clone, Debug, Serialize)]
+#[serde(tag = "notice", rename_all = "snake_case")]
+#[allow(missing_docs)]
+pub enum Notice {
+    /// The cell took an event in.
+    State { state: String, cycle: u32, event: String },
+    /// The right part is to be loaded, and that to be confirmed.
+    LoadPart,
+    /// A job goes on.
+    Progress { device: Device, cycle: u32, done: u32, total: u32 },
+    /// A measurement is registered.
+    Figures { cycle: u32, figures: Figures },
+    /// A cycle is judged.
+    Judged(Judgement),
+    /// The next correction is there.
+    Compensated { cycle: u32, summary: CompensationSummary },
+    /// A person must see this.
+    Alarm(Alarm),
+    /// This is over.
+    AlarmGone { alarm: AlarmId },
+    /// An order or an event did not fit.
+    Refused { why: String },
+    /// The journal or a file could not be written.
+    RecordFailed { words: String },
+    /// The run is over.
+    Finished { ending: Ending, cycles: Vec<CycleRow> },
+}
+
+/// A cycle in the table at the end of a run.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[allow(missing_docs)]
+pub struct CycleRow {
+    pub cycle: u32,
+    pub pv_um: f64,
+    pub rms_um: f64,
+    pub points: u32,
+    pub outliers: u32,
+    /// Height of the surface that was wanted over the nominal one.
+    pub level_um: f64,
+}

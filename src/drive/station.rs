@@ -1,0 +1,664 @@
+//! A task for each machine: it alone talks to it. Orders come in, facts go out; while nothing is asked it looks at the status.
+//!
+//! What is asked is answered in order. A hold, a stop or an abort does not wait for a long transfer: the drive raises the
+//! [`Interrupt`], the transfer ends between two requests, and the order is next.
+
+use std::future::Future;
+use std::sync::Arc;
+use std::time::Duration;
+
+use serde::Serialize;
+use tokio::sync::mpsc;
+use tokio::time::{Instant, MissedTickBehavior, interval};
+
+use crate::cell::{Asked, Condition, Device, Event, Found, JobResult, Mismatch, Reconciliation};
+use crate::device::{
+    Armed, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, Measurement, Outcome,
+    Pass, PassRecord, Plan, Reconciled, State, Status, digest,
+};
+
+/// What a machine is asked. Answers are the events that [`crate::cell::Command`] names.
+pub(super) enum Ask {
+    Connect,
+    Load { cycle: u32, load: Load },
+    VerifyClear,
+    Prepare { cycle: u32 },
+    Start { cycle: u32 },
+    Hold,
+    Resume,
+    Stop,
+    Abort,
+    Clear,
+    Reconcile { cycle: u32 },
+    Collect { cycle: u32 },
+    Acknowledge,
+}
+
+/// A payload for one machine or the other.
+#[derive(Clone)]
+pub(super) enum Load {
+    Plan(Arc<Plan>),
+    Pass(Arc<CorrectionMap>, Box<Pass>),
+}
+
+/// What a job left.
+pub(super) enum Harvest {
+    Points(Box<Measurement>),
+    Record(Box<PassRecord>),
+}
+
+/// A fact, with what the journal should keep beside it.
+pub(super) struct Told {
+    /// `None` where the drive makes the event itself, from the harvest.
+    pub(super) event: Option<Event>,
+    pub(super) detail: Option<serde_json::Value>,
+    pub(super) harvest: Option<Harvest>,
+}
+
+/// The drivers of both kinds, seen alike.
+pub(super) trait Bench: Send + 'static {
+    type Machine: Machine;
+    const DEVICE: Device;
+    fn machine(&mut self) -> &mut Self::Machine;
+    /// Carries the payloads and returns the digest of their identities.
+    fn load(&mut self, load: &Load, interrupt: &Interrupt) -> impl Future<Output = Result<u32, DeviceError>> + Send;
+    fn harvest(&mut self, job: Job, interrupt: &Interrupt)
+    -> impl Future<Output = Result<Harvest, DeviceError>> + Send;
+}
+
+pub(super) struct CmmBench<C>(pub(super) C);
+pub(super) struct GrinderBench<G>(pub(super) G);
+
+impl<C: Cmm + 'static> Bench for CmmBench<C> {
+    type Machine = C;
+    const DEVICE: Device = Device::Cmm;
+
+    fn machine(&mut self) -> &mut C {
+        &mut self.0
+    }
+
+    async fn load(&mut self, load: &Load, interrupt: &Interrupt) -> Result<u32, DeviceError> {
+        let Load::Plan(plan) = load else { unreachable!("the drive gives a CMM plans only") };
+        self.0.load_plan(plan, interrupt).await?;
+        Ok(digest(&[plan.identity()]))
+    }
+
+    async fn harvest(&mut self, job: Job, interrupt: &Interrupt) -> Result<Harvest, DeviceError> {
+        Ok(Harvest::Points(Box::new(self.0.collect(job, interrupt).await?)))
+    }
+}
+
+impl<G: Grinder + 'static> Bench for GrinderBench<G> {
+    type Machine = G;
+    const DEVICE: Device = Device::Grinder;
+
+    fn machine(&mut self) -> &mut G {
+        &mut self.0
+    }
+
+    async fn load(&mut self, load: &Load, interrupt: &Interrupt) -> Result<u32, DeviceError> {
+        let Load::Pass(map, pass) = load else { unreachable!("the drive gives a grinder passes only") };
+        self.0.load_pass(map, pass, interrupt).await?;
+        Ok(digest(&[map.identity(), pass.identity()]))
+    }
+
+    async fn harvest(&mut self, job: Job, interrupt: &Interrupt) -> Result<Harvest, DeviceError> {
+        Ok(Harvest::Record(Box::new(self.0.collect(job, interrupt).await?)))
+    }
+}
+
+/// A task that attends to one machine.
+pub(super) struct Station<B> {
+    bench: B,
+    job: u32,
+    interrupt: Interrupt,
+    told: mpsc::Sender<Told>,
+    /// Digest of the payloads that were loaded last.
+    loaded: Option<u32>,
+    armed: Option<Armed>,
+    /// The cycle of the job that runs.
+    cycle: u32,
+    seen: Seen,
+}
+
+/// What the last look showed, so that only changes are told.
+#[derive(Default)]
+struct Seen {
+    connected: bool,
+    lost: bool,
+    state: Option<State>,
+    progress: Option<(u32, u32)>,
+    told_progress: Option<Instant>,
+    supplies_missing: bool,
+    /// A signal of the cell file is outside its range.
+    signal_out: bool,
+    aborting: bool,
+    stopping: bool,
+    clearing: bool,
+    /// The end of the running job has been told.
+    ended: bool,
+    /// A START was taken and its end has not been told.
+    running: bool,
+    next_try: Option<Instant>,
+    tries: u32,
+}
+
+/// Longest time between two attempts to reach a machine that is lost.
+const LONGEST_PAUSE: Duration = Duration::from_secs(5);
+/// Progress is told at most this often, so that the journal stays readable.
+const PROGRESS_EVERY: Duration = Duration::from_millis(250);
+
+impl<B: Bench> Station<B> {
+    pub(super) fn new(bench: B, job: u32, interrupt: Interrupt, told: mpsc::Sender<Told>) -> Self {
+        Self { bench, job, interrupt, told, loaded: None, armed: None, cycle: 0, seen: Seen::default() }
+    }
+
+    /// Restores the intent of an interrupted run, so that it can be reconciled.
+    pub(super) fn with_intent(mut self, armed: Option<(u32, Armed)>) -> Self {
+        if let Some((cycle, armed)) = armed {
+            (self.cycle, self.armed) = (cycle, Some(armed));
+        }
+        self
+    }
+
+    /// Attends until nobody can ask any more, then gives the machine back.
+    pub(super) async fn attend(mut self, mut asks: mpsc::Receiver<Ask>, poll: Duration) {
+        let mut ticks = interval(poll);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            tokio::select! {
+                biased;
+                ask = asks.recv() => match ask {
+                    Some(ask) => self.act(ask).await,
+                    None => break,
+                },
+                _ = ticks.tick(), if self.seen.connected => self.look().await,
+            }
+        }
+        if self.seen.connected && !self.seen.lost {
+            // Nothing depends on it: a machine whose owner falls silent can be claimed by the next.
+            let _ = self.bench.machine().release().await;
+        }
+    }
+
+    async fn tell(&mut self, event: Event) {
+        self.tell_with(event, None).await;
+    }
+
+    async fn tell_with(&mut self, event: Event, detail: Option<serde_json::Value>) {
+        // The drive hears until it drops the last ask; after that nobody needs to know.
+        let _ = self.told.send(Told { event: Some(event), detail, harvest: None }).await;
+    }
+
+    async fn act(&mut self, ask: Ask) {
+        let urgent = matches!(ask, Ask::Hold | Ask::Stop | Ask::Abort);
+        if urgent {
+            self.interrupt.lower();
+        }
+        match ask {
+            Ask::Connect => self.connect().await,
+            Ask::Load { cycle, load } => self.load(cycle, &load).await,
+            Ask::VerifyClear => self.verify_clear().await,
+            Ask::Prepare { cycle } => self.prepare(cycle).await,
+            Ask::Start { cycle } => self.start(cycle).await,
+            Ask::Hold => self.hold().await,
+            Ask::Resume => self.resume().await,
+            Ask::Stop => self.stop().await,
+            Ask::Abort => self.abort().await,
+            Ask::Clear => self.clear().await,
+            Ask::Reconcile { cycle } => self.reconcile(cycle).await,
+            Ask::Collect { cycle } => self.collect(cycle).await,
+            Ask::Acknowledge => self.acknowledge().await,
+        }
+    }
+
+    async fn connect(&mut self) {
+        let connected = async {
+            let identity = self.bench.machine().connect().await?;
+            let status = self.bench.machine().claim().await?;
+            Ok::<_, DeviceError>((identity, status))
+        };
+        match connected.await {
+            Ok((identity, status)) => {
+                self.seen.connected = true;
+                self.seen.state = Some(status.state);
+                let found = self.found(&status).await;
+                let (device, boot_id, simulated) = (B::DEVICE, identity.boot_id, identity.simulation);
+                let detail = serde_json::json!({ "name": identity.name, "address": self.bench.machine().name() });
+                self.tell_with(Event::Connected { device, boot_id, simulated, found }, Some(detail)).await;
+            }
+            Err(error) => self.tell(Event::NotConnected { device: B::DEVICE, why: mismatch(&error) }).await,
+        }
+    }
+
+    /// Tells what a machine was found doing; a preparation of somebody who is gone is taken back.
+    async fn found(&mut self, status: &Status) -> Found {
+        match status.state {
+            State::Idle => Found::Idle,
+            State::Aborted | State::Faulted => Found::ToClear,
+            State::Prepared => match self.bench.machine().stop().await {
+                Ok(_) => Found::Idle,
+                Err(error) => Found::Busy(error.to_string()),
+            },
+            state => Found::Busy(match status.job {
+                Some(job) => format!("{state} with {job}"),
+                None => state.to_string(),
+            }),
+        }
+    }
+
+    async fn load(&mut self, cycle: u32, load: &Load) {
+        self.loaded = None;
+        match self.bench.load(load, &self.interrupt).await {
+            Ok(digest) => {
+                self.loaded = Some(digest);
+                let event = match load {
+                    Load::Plan(_) => Event::PlanLoaded { cycle },
+                    Load::Pass(..) => Event::PassLoaded { cycle },
+                };
+                let detail = serde_json::json!({ "digest": format!("{digest:08x}") });
+                self.tell_with(event, Some(detail)).await;
+            }
+            Err(error) => self.failed(Asked::Load, error).await,
+        }
+    }
+
+    async fn verify_clear(&mut self) {
+        match self.bench.machine().status().await {
+            Ok(status) if status.interlocks.clear_of_part && !status.state.moves() => {
+                self.tell(Event::Cleared { device: B::DEVICE }).await;
+            }
+            Ok(status) => {
+                let clear = if status.interlocks.clear_of_part { "clear of the part" } else { "not clear of the part" };
+                let words = format!("{} is {} and {clear}", self.bench.machine().name(), status.state);
+                self.tell(Event::Obstructed { device: B::DEVICE, words }).await;
+            }
+            Err(error) => self.lost(&error).await,
+        }
+    }
+
+    async fn prepare(&mut self, cycle: u32) {
+        self.armed = None;
+        let Some(digest) = self.loaded else {
+            let why = "nothing was loaded for it".to_owned();
+            return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Prepare, why }).await;
+        };
+        let job = Job { job: self.job, cycle: cycle as u16, digest };
+        if self.seen.state == Some(State::Prepared)
+            && let Err(error) = self.bench.machine().stop().await
+        {
+            return self.failed(Asked::Prepare, error).await;
+        }
+        match self.bench.machine().prepare(job).await {
+            Ok(armed) => {
+                let detail = intent(&armed);
+                self.armed = Some(armed);
+                self.cycle = cycle;
+                self.seen.state = Some(State::Prepared);
+                self.tell_with(Event::Prepared { device: B::DEVICE, cycle }, Some(detail)).await;
+            }
+            Err(error) => self.failed(Asked::Prepare, error).await,
+        }
+    }
+
+    async fn start(&mut self, cycle: u32) {
+        let armed = self.armed.clone().filter(|armed| u32::from(armed.job.cycle) == cycle);
+        let Some(armed) = armed else {
+            let why = "it is not prepared".to_owned();
+            return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Start, why }).await;
+        };
+        self.seen =
+            Seen { connected: true, running: true, supplies_missing: self.seen.supplies_missing, ..Seen::default() };
+        match self.bench.machine().start(armed).await {
+            Ok(started) => {
+                self.seen.state = Some(State::Execute);
+                let detail = serde_json::json!({ "start_sequence": started.start_sequence });
+                self.tell_with(Event::Started { device: B::DEVICE, cycle }, Some(detail)).await;
+            }
+            Err(error @ (DeviceError::Refused { .. } | DeviceError::Faulted { .. })) => {
+                self.seen.running = false;
+                self.failed(Asked::Start, error).await;
+            }
+            // Whatever else went wrong, the machine may have heard it.
+            Err(error) => {
+                self.tell(Event::StartUnknown { device: B::DEVICE, cycle, why: error.to_string() }).await;
+            }
+        }
+    }
+
+    async fn hold(&mut self) {
+        match self.bench.machine().hold().await {
+            Ok(status) => self.note(&status).await,
+            Err(error) if error.is_link() => self.lost(&error).await,
+            // Not in EXECUTE: the status tells whether it holds already, has ended, or never ran.
+            Err(error) => match self.bench.machine().status().await {
+                Ok(status) if status.state == State::Held => self.tell(Event::MachineHeld { device: B::DEVICE }).await,
+                Ok(status) if status.state == State::Complete => self.note(&status).await,
+                Ok(status) if !status.state.moves() => self.tell(Event::MachineHeld { device: B::DEVICE }).await,
+                Ok(_) => self.failed(Asked::Hold, error).await,
+                Err(error) => self.lost(&error).await,
+            },
+        }
+    }
+
+    async fn resume(&mut self) {
+        match self.bench.machine().resume().await {
+            Ok(status) => self.note(&status).await,
+            Err(error) => self.failed(Asked::Resume, error).await,
+        }
+    }
+
+    async fn stop(&mut self) {
+        self.seen.stopping = true;
+        match self.bench.machine().stop().await {
+            Ok(status) => self.note(&status).await,
+            Err(error) if error.is_link() => self.lost(&error).await,
+            Err(error) => match self.bench.machine().status().await {
+                Ok(status) if !status.state.moves() => self.note(&status).await,
+                _ => self.failed(Asked::Stop, error).await,
+            },
+        }
+    }
+
+    async fn abort(&mut self) {
+        self.seen.aborting = true;
+        match self.bench.machine().abort().await {
+            Ok(status) => self.note(&status).await,
+            Err(error) => self.failed(Asked::Abort, error).await,
+        }
+    }
+
+    async fn clear(&mut self) {
+        self.seen.clearing = true;
+        match self.bench.machine().clear().await {
+            Ok(status) => self.note(&status).await,
+            Err(error) => self.failed(Asked::Clear, error).await,
+        }
+    }
+
+    async fn reconcile(&mut self, cycle: u32) {
+        let Some(armed) = self.armed.clone().filter(|armed| u32::from(armed.job.cycle) == cycle) else {
+            let outcome = Reconciliation::NotStarted;
+            return self.tell(Event::Reconciled { device: B::DEVICE, cycle, outcome }).await;
+        };
+        let outcome = match self.bench.machine().reconcile(&armed).await {
+            Ok(Reconciled::Running(status)) if status.state == State::Held => Reconciliation::Held,
+            Ok(Reconciled::Running(_)) => Reconciliation::Running,
+            Ok(Reconciled::Finished(status)) => {
+                self.seen.ended = true;
+                Reconciliation::Ended(job_result(status.outcome))
+            }
+            Ok(Reconciled::NotStarted(_)) => {
+                self.seen.running = false;
+                Reconciliation::NotStarted
+            }
+            Ok(Reconciled::Unknown { why }) => Reconciliation::Unknown(why),
+            Err(error) if error.is_link() => return self.lost(&error).await,
+            Err(error) => Reconciliation::Unknown(error.to_string()),
+        };
+        if matches!(outcome, Reconciliation::Running | Reconciliation::Held) {
+            self.seen.running = true;
+            self.seen.ended = false;
+        }
+        self.tell(Event::Reconciled { device: B::DEVICE, cycle, outcome }).await;
+    }
+
+    async fn collect(&mut self, cycle: u32) {
+        let armed = self.armed.as_ref().filter(|armed| u32::from(armed.job.cycle) == cycle);
+        let Some(job) = armed.map(|armed| armed.job) else {
+            let why = "no job of this run is known to it".to_owned();
+            return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Collect, why }).await;
+        };
+        match self.bench.harvest(job, &self.interrupt).await {
+            // The drive gates the points and tells the cell; this only hands them over.
+            Ok(harvest) => self.hand_over(harvest).await,
+            Err(error) => self.failed(Asked::Collect, error).await,
+        }
+    }
+
+    async fn hand_over(&mut self, harvest: Harvest) {
+        // The drive hears as long as anybody asks.
+        let _ = self.told.send(Told { event: None, detail: None, harvest: Some(harvest) }).await;
+    }
+
+    async fn acknowledge(&mut self) {
+        let acknowledged = async {
+            let status = self.bench.machine().status().await?;
+            match status.state {
+                State::Complete => self.bench.machine().acknowledge(status.done).await,
+                _ => Ok(status),
+            }
+        };
+        match acknowledged.await {
+            Ok(status) => {
+                self.seen.state = Some(status.state);
+                self.seen.running = false;
+                self.tell(Event::Acknowledged { device: B::DEVICE }).await;
+            }
+            Err(error) => self.failed(Asked::Acknowledge, error).await,
+        }
+    }
+
+    /// Tells that the machine said no, or that it cannot be reached.
+    async fn failed(&mut self, what: Asked, error: DeviceError) {
+        if error.is_link() {
+            self.lost(&error).await;
+        }
+        match error {
+            DeviceError::Faulted { fault, .. } if fault != Fault::None => {
+                let (device, words) = (B::DEVICE, fault.to_string());
+                self.tell(Event::Fault { device, code: fault_code(fault), words }).await;
+            }
+            _ => self.tell(Event::Refused { device: B::DEVICE, what, why: error.to_string() }).await,
+        }
+    }
+
+    async fn lost(&mut self, error: &DeviceError) {
+        if !std::mem::replace(&mut self.seen.lost, true) {
+            self.tell(Event::LinkLost { device: B::DEVICE, why: error.to_string() }).await;
+        }
+    }
+
+    /// Looks at the status, or tries to reach a machine that is lost.
+    async fn look(&mut self) {
+        if self.seen.lost {
+            return self.reach().await;
+        }
+        match self.bench.machine().status().await {
+            Ok(status) => {
+                if std::mem::replace(&mut self.seen.signal_out, false) {
+                    self.tell(Event::ConditionBack { condition: Condition::Temperature }).await;
+                }
+                self.note(&status).await;
+            }
+            Err(error @ DeviceError::OutOfRange { .. }) => {
+                if !std::mem::replace(&mut self.seen.signal_out, true) {
+                    let (condition, words) = (Condition::Temperature, error.to_string());
+                    self.tell(Event::ConditionLost { condition, words }).await;
+                }
+            }
+            Err(error) => self.lost(&error).await,
+        }
+    }
+
+    async fn reach(&mut self) {
+        if self.seen.next_try.is_some_and(|at| Instant::now() < at) {
+            return;
+        }
+        let reached = async {
+            let identity = self.bench.machine().connect().await?;
+            self.bench.machine().claim().await?;
+            Ok::<_, DeviceError>(identity)
+        };
+        match reached.await {
+            Ok(identity) => {
+                self.seen.lost = false;
+                self.seen.tries = 0;
+                self.seen.state = None;
+                self.tell(Event::LinkBack { device: B::DEVICE, boot_id: identity.boot_id }).await;
+            }
+            Err(_) => {
+                let pause = Duration::from_millis(100) * 2u32.saturating_pow(self.seen.tries.min(10));
+                self.seen.tries += 1;
+                self.seen.next_try = Some(Instant::now() + pause.min(LONGEST_PAUSE));
+            }
+        }
+    }
+
+    /// Tells what has changed.
+    async fn note(&mut self, status: &Status) {
+        let before = self.seen.state.replace(status.state);
+        self.note_supplies(status).await;
+        match status.state {
+            State::Execute => {
+                if before == Some(State::Held) {
+                    self.tell(Event::MachineResumed { device: B::DEVICE }).await;
+                }
+                self.note_progress(status).await;
+            }
+            State::Held if before != Some(State::Held) => self.tell(Event::MachineHeld { device: B::DEVICE }).await,
+            State::Complete => self.note_end(status).await,
+            State::Idle if self.seen.stopping => {
+                self.seen.stopping = false;
+                self.seen.running = false;
+                self.end(JobResult::Stopped, None).await;
+            }
+            State::Idle if self.seen.clearing => {
+                self.seen.clearing = false;
+                let (device, boot_id) = (B::DEVICE, status.boot_id);
+                self.tell(Event::Connected { device, boot_id, simulated: false, found: Found::Idle }).await;
+            }
+            State::Aborted => self.note_abort(before).await,
+            State::Faulted if before != Some(State::Faulted) => {
+                let (device, code, words) = (B::DEVICE, fault_code(status.fault), status.fault.to_string());
+                self.tell(Event::Fault { device, code, words }).await;
+            }
+            _ => {}
+        }
+    }
+
+    async fn note_supplies(&mut self, status: &Status) {
+        let missing = !status.interlocks.supplies;
+        if std::mem::replace(&mut self.seen.supplies_missing, missing) == missing {
+            return;
+        }
+        let condition = Condition::Supplies;
+        let event = if missing {
+            let words = format!("{} says that air or coolant is missing", self.bench.machine().name());
+            Event::ConditionLost { condition, words }
+        } else {
+            Event::ConditionBack { condition }
+        };
+        self.tell(event).await;
+    }
+
+    async fn note_progress(&mut self, status: &Status) {
+        let (progress, now) = ((status.progress, status.total), Instant::now());
+        let due = self.seen.told_progress.is_none_or(|at| now - at >= PROGRESS_EVERY);
+        if due && self.seen.progress != Some(progress) {
+            (self.seen.progress, self.seen.told_progress) = (Some(progress), Some(now));
+            let (done, total) = progress;
+            self.tell(Event::Progressed { device: B::DEVICE, done, total }).await;
+        }
+    }
+
+    /// Tells that the job is over; the record of a pass is read first.
+    async fn note_end(&mut self, status: &Status) {
+        if self.seen.ended && !self.seen.stopping {
+            return;
+        }
+        if !self.seen.running && !self.seen.stopping {
+            return;
+        }
+        let record = match (B::DEVICE, self.armed.as_ref().map(|armed| armed.job)) {
+            (Device::Grinder, Some(job)) if !self.seen.ended => match self.bench.harvest(job, &self.interrupt).await {
+                Ok(record) => Some(record),
+                // The next look tries again; a link that is lost is told.
+                Err(error) if error.is_link() => return self.lost(&error).await,
+                Err(_) => None,
+            },
+            _ => None,
+        };
+        self.seen.stopping = false;
+        self.seen.running = false;
+        self.end(job_result(status.outcome), record).await;
+    }
+
+    async fn end(&mut self, result: JobResult, record: Option<Harvest>) {
+        self.seen.ended = true;
+        if let Some(record) = record {
+            self.hand_over(record).await;
+        }
+        self.tell(Event::Ended { device: B::DEVICE, cycle: self.cycle, result }).await;
+    }
+
+    async fn note_abort(&mut self, before: Option<State>) {
+        if std::mem::replace(&mut self.seen.aborting, false) {
+            self.seen.running = false;
+            self.tell(Event::AbortConfirmed { device: B::DEVICE }).await;
+        } else if before != Some(State::Aborted) && self.seen.running
+            || std::mem::replace(&mut self.seen.stopping, false)
+        {
+            self.seen.running = false;
+            self.end(JobResult::Aborted, None).await;
+        }
+    }
+}
+
+fn job_result(outcome: Outcome) -> JobResult {
+    match outcome {
+        Outcome::Complete => JobResult::Complete,
+        Outcome::Stopped => JobResult::Stopped,
+        Outcome::Aborted => JobResult::Aborted,
+        Outcome::None | Outcome::Failed => JobResult::Failed,
+    }
+}
+
+fn fault_code(fault: Fault) -> u16 {
+    match fault {
+        Fault::None => 0,
+        Fault::StopCircuit => 1,
+        Fault::Collision => 2,
+        Fault::Supplies => 3,
+        Fault::TravelLimit => 4,
+        Fault::Drive => 5,
+        Fault::Tool => 6,
+        Fault::ClientSilent => 20,
+        Fault::Other(number) => number,
+    }
+}
+
+fn mismatch(error: &DeviceError) -> Mismatch {
+    let words = error.to_string();
+    match error {
+        DeviceError::WrongWordOrder { .. } => Mismatch::WordOrder(words),
+        DeviceError::Inches { .. } => Mismatch::Inches,
+        DeviceError::Refused { answer: crate::device::Answer::NotOwner, .. } => Mismatch::Owned(words),
+        error if error.is_link() => Mismatch::Unreachable(words),
+        _ => Mismatch::WrongDevice(words),
+    }
+}
+
+/// The intent of a START as the journal keeps it.
+#[derive(Serialize, serde::Deserialize)]
+pub(super) struct Intent {
+    pub(super) job: u32,
+    pub(super) cycle: u16,
+    pub(super) digest: u32,
+    pub(super) start_sequence: u32,
+    pub(super) token: u32,
+    pub(super) boot_id: u32,
+}
+
+impl Intent {
+    /// Puts the preparation together again.
+    pub(super) fn armed(&self) -> Armed {
+        let job = Job { job: self.job, cycle: self.cycle, digest: self.digest };
+        Armed { job, start_sequence: self.start_sequence, token: self.token, boot_id: self.boot_id }
+    }
+}
+
+fn intent(armed: &Armed) -> serde_json::Value {
+    let Armed { job: Job { job, cycle, digest }, start_sequence, token, boot_id } = *armed;
+    serde_json::to_value(Intent { job, cycle, digest, start_sequence, token, boot_id }).expect("numbers are JSON")
+}

@@ -1,0 +1,376 @@
+//! What is computed between a measurement and the next pass: plan, gates, registration, map, correction.
+//!
+//! Everything here blocks and is called off the asynchronous threads; what it needs is shared, what it returns is the event that
+//! the cell gets and the files for the run folder.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use crate::cell::{CompensationRefusal, CompensationSummary, Event, Figures, Gate, GateFailure, Response};
+use crate::compensation::{
+    Correction, CorrectionLimits, ErrorMap, MapOptions, Net, Reading, Sense, StepError, error_map, response,
+};
+use crate::device::{Coordinates, CorrectionMap, Identified, Measurement, Pass, Plan, PointStatus, Target, TargetKind};
+use crate::formats::{
+    FormatError, NominalInput, RegistrationDocument, save_registration, write_correction, write_error_map, write_points,
+};
+use crate::geometry::{Point, Pose};
+use crate::measuring::{self, fit_sphere, sphere_targets};
+use crate::registration::{Options, PointStatus as Fate, Registration, Start, register};
+use crate::report::HeatMap;
+use crate::surface::{Nominal, Side};
+
+/// Everything that does not change during a run.
+#[derive(Debug)]
+pub struct Task {
+    /// The nominal surface.
+    pub nominal: Arc<Nominal>,
+    /// Where it came from, for the record.
+    pub nominal_file: PathBuf,
+    /// SHA-256 of what it came from: the identity of the part.
+    pub part_identity: [u8; 32],
+    /// Where the probe shall touch; none where the machine has no plan of ours.
+    pub targets: Vec<measuring::Target>,
+    /// The side of the nominal surface on which the probe is.
+    pub side: Side,
+    /// How the probe goes about it.
+    pub probing: Probing,
+    /// The sphere on which the probe is checked.
+    pub sphere: Option<Sphere>,
+    /// Where the fixture holds the part.
+    pub fixture_cmm_from_model: Pose,
+    /// How measured points are registered; the start and the level are set for each cycle.
+    pub registration: Options,
+    /// Whether a registration begins where the fixture holds the part.
+    pub start_at_fixture: bool,
+    /// Whether the machine is expected to give contact points.
+    pub contacts_expected: bool,
+    /// How a map is made.
+    pub map: MapOptions,
+    /// What a correction must keep to.
+    pub limits: CorrectionLimits,
+    /// How a pass is ground; level and identity are set for each cycle.
+    pub pass: Pass,
+    /// Least share of the targets that must be touched.
+    pub least_found: f64,
+    /// Largest uncertainty of the place of the map, as an error of the map, that is allowed; weak directions are judged by it.
+    pub simulation: bool,
+}
+
+/// How the probe goes about it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[allow(missing_docs)]
+pub struct Probing {
+    pub probe_radius_mm: f64,
+    pub approach_mm: f64,
+    pub search_mm: f64,
+    pub speed_mm_s: f64,
+    pub safe_height_mm: f64,
+}
+
+/// The reference sphere, in the CMM frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[allow(missing_docs)]
+pub struct Sphere {
+    pub centre: Point,
+    pub radius_mm: f64,
+    pub points: usize,
+}
+
+/// What is known of one cycle.
+#[derive(Clone, Debug)]
+pub(super) struct Cycle {
+    pub(super) correction: Arc<Correction>,
+    pub(super) plan: Option<Arc<Plan>>,
+    pub(super) points: Option<Arc<Points>>,
+    pub(super) registration: Option<Arc<Registration>>,
+    pub(super) error: Option<Arc<ErrorMap>>,
+    pub(super) figures: Option<Figures>,
+}
+
+/// The points of a measurement that may be used.
+#[derive(Debug)]
+pub(super) struct Points {
+    pub(super) part: Vec<Point>,
+    pub(super) sphere: Vec<Point>,
+    /// Radius that the probe really has, where a sphere was touched.
+    pub(super) radius_mm: Option<f64>,
+}
+
+impl Task {
+    /// Returns the correction of the first pass: none.
+    pub(super) fn first_correction(&self) -> Correction {
+        let corners = [[self.pass.x_mm[0], self.pass.y_mm[0]], [self.pass.x_mm[1], self.pass.y_mm[1]]];
+        let net = Net::over(corners.into_iter(), self.map.spacing_mm).unwrap_or(Net {
+            columns: 2,
+            rows: 2,
+            first_mm: corners[0],
+            spacing_mm: [corners[1][0] - corners[0][0], corners[1][1] - corners[0][1]],
+        });
+        Correction::none(net, self.limits.allowance_mm)
+    }
+
+    /// Returns the payloads of a pass.
+    pub(super) fn payloads(&self, correction: &Correction) -> (CorrectionMap, Pass) {
+        let Net { columns, rows, first_mm, spacing_mm } = correction.net;
+        let map = CorrectionMap {
+            columns,
+            rows,
+            first_mm,
+            spacing_mm,
+            values_mm: correction.values_mm.clone(),
+            part_identity: self.part_identity,
+        };
+        (map, Pass { level_mm: correction.level_mm, part_identity: self.part_identity, ..self.pass })
+    }
+
+    /// Lays the plan: the reference sphere first, then the part where it was found last, at the level it was ground to.
+    pub(super) fn plan(&self, level_mm: f64, cmm_from_model: &Pose) -> Plan {
+        let sphere = self.sphere.iter().flat_map(|s| sphere_targets(s.centre, s.radius_mm, s.points));
+        let sphere = sphere.map(|t| (TargetKind::ReferenceSphere, t.point, t.normal));
+        let part = self.targets.iter().map(|t| {
+            let point = cmm_from_model.point(&(t.point + level_mm * t.normal));
+            (TargetKind::Part, point, cmm_from_model.direction(&t.normal))
+        });
+        let targets = sphere.chain(part).enumerate().map(|(index, (what, point, normal))| Target {
+            index: index as u32,
+            what,
+            point_mm: point.into(),
+            normal: normal.into(),
+        });
+        let Probing { probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm } = self.probing;
+        Plan { targets: targets.collect(), probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm }
+    }
+}
+
+/// Looks whether a measurement may be used, and takes its points apart.
+pub(super) fn gate(task: &Task, plan: &Plan, measurement: &Measurement) -> (u32, u32, Result<Points, GateFailure>) {
+    let planned = plan.targets.iter().filter(|t| t.what == TargetKind::Part).count() as u32;
+    let touched = |kind: TargetKind| -> Vec<Point> {
+        let pairs = measurement.points.iter().zip(&plan.targets);
+        pairs
+            .filter(|(p, t)| p.status == PointStatus::Touched && t.what == kind)
+            .map(|(p, _)| Point::from(p.at_mm))
+            .collect()
+    };
+    if let Some(failure) = foreign(task, plan, measurement) {
+        return (planned, 0, Err(failure));
+    }
+    // A machine without a plan of ours gives what the operator took.
+    let part = if planned == 0 {
+        measurement.points.iter().filter(|p| p.status == PointStatus::Touched).map(|p| p.at_mm.into()).collect()
+    } else {
+        touched(TargetKind::Part)
+    };
+    let (sphere, found) = (touched(TargetKind::ReferenceSphere), part.len() as u32);
+    if found == 0 {
+        return (planned, 0, Err(GateFailure::NoPart));
+    }
+    let checked = match radius(task, &sphere) {
+        Ok(radius_mm) => {
+            let share = f64::from(found) / f64::from(planned.max(1));
+            if planned > 0 && share < task.least_found {
+                let limit = 100.0 * task.least_found;
+                Err(GateFailure::Coverage(format!(
+                    "{found} of {planned} points were found, {:.1} %, and the recipe asks for {limit:.1} % (minimum_coverage)",
+                    100.0 * share
+                )))
+            } else {
+                Ok(Points { part, sphere, radius_mm })
+            }
+        }
+        Err(failure) => Err(failure),
+    };
+    (planned, found, checked)
+}
+
+/// A result that belongs to another plan, or whose numbers cannot be.
+fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFailure> {
+    if measurement.plan_identity != plan.identity() {
+        return Some(GateFailure::Foreign("the machine names another plan than the one it was given".into()));
+    }
+    let contacts = measurement.coordinates == Coordinates::Contacts;
+    if contacts != task.contacts_expected {
+        return Some(if contacts {
+            GateFailure::Contacts
+        } else {
+            GateFailure::Broken("the machine gives probe centres where the cell file expects contact points".into())
+        });
+    }
+    if !plan.targets.is_empty() && measurement.points.len() != plan.targets.len() {
+        let (found, planned) = (measurement.points.len(), plan.targets.len());
+        return Some(GateFailure::Broken(format!("{found} points came for {planned} targets")));
+    }
+    let order = measurement.points.iter().zip(&plan.targets).position(|(p, t)| p.index != t.index);
+    if let Some(k) = order {
+        let (found, planned) = (measurement.points[k].index, plan.targets[k].index);
+        return Some(GateFailure::Broken(format!("point {} is of target {found}, and target {planned} is due", k + 1)));
+    }
+    let touched = |p: &&crate::device::MeasuredPoint| p.status == PointStatus::Touched;
+    let wrong = measurement.points.iter().filter(touched).find(|p| !p.at_mm.iter().all(|v| v.is_finite()))?;
+    Some(GateFailure::Broken(format!("the coordinates of target {} are not finite numbers", wrong.index)))
+}
+
+/// Finds the radius of the probe from the reference sphere: it tells contact points and inches from centres in millimetres.
+fn radius(task: &Task, points: &[Point]) -> Result<Option<f64>, GateFailure> {
+    let Some(sphere) = task.sphere else { return Ok(None) };
+    let fit = fit_sphere(points).map_err(|error| GateFailure::Broken(error.to_string()))?;
+    let (stated, found) = (task.probing.probe_radius_mm, fit.radius_mm - sphere.radius_mm);
+    // Contact points lie on the sphere itself; inches make it 25.4 times smaller.
+    if found.abs() < 0.2 * stated {
+        return Err(GateFailure::Contacts);
+    }
+    if (fit.radius_mm * 25.4 / (sphere.radius_mm + stated) - 1.0).abs() < 0.05 {
+        return Err(GateFailure::Inches);
+    }
+    Ok(Some(found))
+}
+
+/// Registers the points of a cycle and writes what was found.
+pub(super) fn register_cycle(
+    task: &Task,
+    folder: &Path,
+    number: u32,
+    cycle: &Cycle,
+    before: Option<&Cycle>,
+) -> (Event, Option<(Registration, Option<ErrorMap>, Figures)>) {
+    let failed = |why: String| (Event::RegistrationFailed { cycle: number, why }, None);
+    let Some(points) = &cycle.points else { return failed("there are no points of this cycle".into()) };
+    // The surface wanted by this pass stands above the nominal one by its level, and the ball rolls on that.
+    let radius_mm = points.radius_mm.unwrap_or(task.probing.probe_radius_mm);
+    let probe_radius_mm = if task.contacts_expected { 0.0 } else { radius_mm } + cycle.correction.level_mm;
+    let start = if task.start_at_fixture { Start::Pose(task.fixture_cmm_from_model) } else { Start::Search };
+    let options = Options { probe_radius_mm, start, ..task.registration };
+    let found = match register(&task.nominal, &points.part, &options) {
+        Ok(found) => found,
+        Err(error) => return failed(error.to_string()),
+    };
+    if let Err(error) = save(task, folder, &found, &options) {
+        return failed(error.to_string());
+    }
+    let error = error_map(&readings(&found), &task.map).ok();
+    let figures = figures(task, cycle, before, &found, error.as_ref());
+    (Event::Registered { cycle: number, figures: figures.clone() }, Some((found, error, figures)))
+}
+
+fn save(task: &Task, folder: &Path, found: &Registration, options: &Options) -> Result<(), FormatError> {
+    let nominal = NominalInput {
+        file: &task.nominal_file,
+        points: task.nominal.len(),
+        kind: format!("{:?}", task.nominal.kind()),
+    };
+    let document = RegistrationDocument::new(found, options, nominal, Path::new("measured.csv"));
+    save_registration(folder, &document, &found.deviations)
+}
+
+fn readings(found: &Registration) -> Vec<Reading> {
+    let used = found.deviations.iter().filter(|d| d.status == Fate::Used);
+    used.map(|d| Reading { at_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect()
+}
+
+fn figures(
+    task: &Task,
+    cycle: &Cycle,
+    before: Option<&Cycle>,
+    found: &Registration,
+    error: Option<&ErrorMap>,
+) -> Figures {
+    let verdict = &found.verdict;
+    let moved = task.fixture_cmm_from_model.inverse() * found.cmm_from_model;
+    let outliers = found.deviations.iter().filter(|d| d.status == Fate::Outlier).count() as u32;
+    // What the filter takes out is what a point scatters by: noise of the probe and the finest texture.
+    let scatter_mm = error.map_or(verdict.residual_sigma_mm, |map| map.rest_sigma_mm);
+    let points = verdict.used.max(1) as f64;
+    Figures {
+        pv_mm: verdict.pv_mm,
+        rms_mm: verdict.rms_mm,
+        // Of two extreme points, each uncertain by the scatter; k = 2.
+        pv_expanded_mm: 2.0 * 2f64.sqrt() * scatter_mm,
+        // The rms of n values that scatter by s is uncertain by s / sqrt(2 n), whatever their form; k = 2.
+        rms_expanded_mm: 2.0 * scatter_mm / (2.0 * points).sqrt(),
+        coverage: verdict.coverage,
+        points: verdict.used as u32,
+        outliers,
+        shift_mm: moved.translation_mm.norm(),
+        turn_rad: moved.angle_rad(),
+        weak_directions: verdict.weak_directions.iter().map(|w| w.words.clone()).collect(),
+        warnings: verdict.warnings.clone(),
+        response: before.and_then(|before| answer(before, cycle, error?)),
+        removed_mm: Some(task.limits.allowance_mm - cycle.correction.level_mm),
+    }
+}
+
+fn answer(before: &Cycle, cycle: &Cycle, error: &ErrorMap) -> Option<Response> {
+    let earlier = before.error.as_ref()?;
+    let scatter_mm = earlier.rest_sigma_mm.hypot(error.rest_sigma_mm);
+    let found = response([earlier, error], [&before.correction, &cycle.correction], scatter_mm);
+    Some(match found.sense {
+        Sense::AsCommanded => Response::Expected,
+        Sense::Flipped => Response::SignFlipped,
+        Sense::MirroredX | Sense::MirroredY | Sense::Turned => Response::Mirrored,
+        Sense::NoEffect => Response::NoEffect,
+        Sense::Unclear => Response::Unclear,
+    })
+}
+
+/// Makes the correction of the next pass and writes map, picture and correction.
+pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &Cycle) -> (Event, Option<Correction>) {
+    let refused = |why| (Event::CompensationRefused { cycle: number, why }, None);
+    let Some(found) = &cycle.registration else {
+        return refused(CompensationRefusal::Failed("the measurement of this cycle is not registered".into()));
+    };
+    let seen: Vec<String> = found.verdict.weak_directions.iter().map(|weak| weak.words.clone()).collect();
+    if !seen.is_empty() {
+        return refused(CompensationRefusal::WeakDirections(seen));
+    }
+    let map = match error_map(&readings(found), &task.map) {
+        Ok(map) => map,
+        Err(error) => return refused(CompensationRefusal::Failed(error.to_string())),
+    };
+    let step = match cycle.correction.next(&map, &task.limits) {
+        Ok(step) => step,
+        Err(error @ StepError::BudgetSpent { .. }) => {
+            return refused(CompensationRefusal::BudgetSpent(error.to_string()));
+        }
+        Err(error) => return refused(CompensationRefusal::Failed(error.to_string())),
+    };
+    if let Err(error) = save_map(task, folder, &map, &step.correction) {
+        return refused(CompensationRefusal::Failed(error));
+    }
+    let largest_mm = step.correction.values_mm.iter().fold(0.0f64, |most, v| most.max(v.abs()));
+    let ratio = found.verdict.pv_mm / found.verdict.rms_mm.max(f64::MIN_POSITIVE);
+    let summary = CompensationSummary {
+        largest_mm,
+        depth_mm: step.depth_mm,
+        predicted_pv_mm: step.predicted_rms_mm * ratio,
+        warnings: Vec::new(),
+    };
+    (Event::Compensated { cycle: number, summary }, Some(step.correction))
+}
+
+fn save_map(task: &Task, folder: &Path, map: &ErrorMap, correction: &Correction) -> Result<(), String> {
+    let words = |error: FormatError| error.to_string();
+    write_error_map(&folder.join("error_map.csv"), map, task.simulation).map_err(words)?;
+    let identity = task.payloads(correction).0.identity();
+    write_correction(&folder.join("correction.csv"), correction, &task.part_identity, &identity, task.simulation)
+        .map_err(words)?;
+    let title =
+        if task.simulation { "Error of the part, filtered (SIMULATION)" } else { "Error of the part, filtered" };
+    HeatMap::of_lengths(title, "deviation", &map.samples_mm())
+        .and_then(|picture| picture.save_png(&folder.join("error_map.png")))
+        .map_err(|error| error.to_string())
+}
+
+/// Writes the points of a measurement, in the CMM frame.
+pub(super) fn save_points(folder: &Path, points: &Points) -> Result<(), FormatError> {
+    if !points.sphere.is_empty() {
+        write_points(folder.join("reference_sphere.csv"), "x_mm,y_mm,z_mm", &points.sphere)?;
+    }
+    write_points(folder.join("measured.csv"), "x_mm,y_mm,z_mm", &points.part)
+}
+
+/// Turns what the gates said into the event that the cell gets.
+pub(super) fn collected(cycle: u32, planned: u32, found: u32, gate: Result<(), GateFailure>) -> Event {
+    let gate = gate.map_or_else(Gate::Failed, |()| Gate::Passed);
+    Event::Collected { cycle, targets: planned.max(found), found, gate }
+}

@@ -1,0 +1,199 @@
+//! `registration.json` and its companions: everything a registration found, for people and machines.
+
+use std::path::Path;
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::error::FormatError;
+use super::registration::{DeviationRow, write_column, write_deviations, write_json_atomic};
+use crate::geometry::Pose;
+use crate::registration::{Deviation, Iteration, Loss, Method, Options, PointStatus, Registration, WeakDirection};
+use crate::surface::{Distance, Side};
+
+/// What stands in `registration.json`. The names are a contract; lengths are millimetres, angles radians.
+#[derive(Serialize)]
+#[allow(missing_docs)]
+pub struct RegistrationDocument<'a> {
+    pub program: Program,
+    pub nominal: NominalInput<'a>,
+    pub measured: MeasuredInput<'a>,
+    pub method: Method,
+    pub distance: Distance,
+    pub loss: Loss,
+    pub probe_radius_mm: Option<f64>,
+    pub locked: Vec<&'static str>,
+    pub cmm_from_model: [[f64; 4]; 4],
+    pub standard_uncertainty: StandardUncertainty,
+    pub covariance: [[f64; 6]; 6],
+    pub condition: f64,
+    pub weak_directions: &'a [WeakDirection],
+    pub alternatives: Vec<Alternative>,
+    pub warnings: &'a [String],
+    pub converged: bool,
+    pub iterations: usize,
+    /// After each step that was taken.
+    pub objective_mm2: Vec<f64>,
+    pub points: usize,
+    pub used: usize,
+    pub rms_mm: f64,
+    pub pv_mm: f64,
+    pub residual_sigma_mm: f64,
+    pub coverage: f64,
+    pub side: Side,
+    /// Indices of the measured points, from 0.
+    pub outliers: Vec<usize>,
+    pub off_part: Vec<usize>,
+    pub trace: &'a [Iteration],
+}
+
+/// The program that wrote it.
+#[derive(Serialize)]
+#[allow(missing_docs)]
+pub struct Program {
+    pub name: &'static str,
+    pub version: &'static str,
+}
+
+/// The nominal surface that was registered to.
+#[derive(Serialize)]
+#[allow(missing_docs)]
+pub struct NominalInput<'a> {
+    pub file: &'a Path,
+    pub points: usize,
+    /// In words.
+    pub kind: String,
+}
+
+/// The points that were registered.
+#[derive(Serialize)]
+#[allow(missing_docs)]
+pub struct MeasuredInput<'a> {
+    pub file: &'a Path,
+}
+
+/// Another pose that fits about as well.
+#[derive(Serialize)]
+#[allow(missing_docs)]
+pub struct Alternative {
+    pub cmm_from_model: [[f64; 4]; 4],
+    pub rms_mm: f64,
+}
+
+/// Square roots of the diagonal of the covariance.
+#[derive(Serialize)]
+#[allow(missing_docs)]
+pub struct StandardUncertainty {
+    pub x_mm: f64,
+    pub y_mm: f64,
+    pub z_mm: f64,
+    pub rx_rad: f64,
+    pub ry_rad: f64,
+    pub rz_rad: f64,
+}
+
+impl<'a> RegistrationDocument<'a> {
+    /// Puts together what a registration found and what it was asked.
+    pub fn new(
+        registration: &'a Registration,
+        options: &Options,
+        nominal: NominalInput<'a>,
+        measured_file: &'a Path,
+    ) -> Self {
+        let verdict = &registration.verdict;
+        let covariance: [[f64; 6]; 6] = std::array::from_fn(|i| std::array::from_fn(|j| verdict.covariance[(i, j)]));
+        let [x_mm, y_mm, z_mm, rx_rad, ry_rad, rz_rad] = std::array::from_fn(|k| covariance[k][k].max(0.0).sqrt());
+        let with = |status| {
+            let deviations = registration.deviations.iter().enumerate();
+            deviations.filter(|(_, d)| d.status == status).map(|(k, _)| k).collect()
+        };
+        let alternative =
+            |(pose, rms_mm): &(Pose, f64)| Alternative { cmm_from_model: pose.to_rows(), rms_mm: *rms_mm };
+        let names = ["x", "y", "z", "rx", "ry", "rz"];
+        Self {
+            program: Program { name: env!("CARGO_PKG_NAME"), version: env!("CARGO_PKG_VERSION") },
+            nominal,
+            measured: MeasuredInput { file: measured_file },
+            method: options.method,
+            distance: options.distance,
+            loss: options.loss,
+            probe_radius_mm: (options.probe_radius_mm > 0.0).then_some(options.probe_radius_mm),
+            locked: names.into_iter().zip(options.locked).filter(|(_, locked)| *locked).map(|(name, _)| name).collect(),
+            cmm_from_model: registration.cmm_from_model.to_rows(),
+            standard_uncertainty: StandardUncertainty { x_mm, y_mm, z_mm, rx_rad, ry_rad, rz_rad },
+            covariance,
+            condition: verdict.condition,
+            weak_directions: &verdict.weak_directions,
+            alternatives: verdict.alternatives.iter().map(alternative).collect(),
+            warnings: &verdict.warnings,
+            converged: verdict.converged,
+            iterations: verdict.iterations,
+            objective_mm2: registration.trace.iter().filter(|i| i.taken).map(|i| i.objective_mm2).collect(),
+            points: registration.deviations.len(),
+            used: verdict.used,
+            rms_mm: verdict.rms_mm,
+            pv_mm: verdict.pv_mm,
+            residual_sigma_mm: verdict.residual_sigma_mm,
+            coverage: verdict.coverage,
+            side: registration.side,
+            outliers: with(PointStatus::Outlier),
+            off_part: with(PointStatus::OffPart),
+            trace: &registration.trace,
+        }
+    }
+
+    /// Makes sure that every number is finite: JSON has no NaN, and would say `null` where a reader expects a number.
+    ///
+    /// # Errors
+    /// What is not, in words.
+    pub fn check(&self) -> Result<(), &'static str> {
+        let finite = |numbers: &[f64]| numbers.iter().all(|v| v.is_finite());
+        let step = |i: &Iteration| finite(&[i.objective_mm2, i.step, i.ball_radius]);
+        let checks = [
+            ("the pose", finite(self.cmm_from_model.as_flattened())),
+            ("the covariance", finite(self.covariance.as_flattened())),
+            ("the condition", self.condition.is_finite()),
+            ("a figure of the deviations", finite(&[self.rms_mm, self.pv_mm, self.residual_sigma_mm, self.coverage])),
+            ("the trace", self.trace.iter().all(step)),
+            ("a weak direction", self.weak_directions.iter().all(|w| w.sigma_mm.is_none_or(f64::is_finite))),
+            (
+                "an alternative pose",
+                self.alternatives.iter().all(|a| finite(a.cmm_from_model.as_flattened()) && a.rms_mm.is_finite()),
+            ),
+        ];
+        checks.into_iter().find(|(_, finite)| !finite).map_or(Ok(()), |(what, _)| Err(what))
+    }
+}
+
+/// Writes `deviations.csv`, `deviation_uncertainty.csv` and `registration.json` into a folder; the JSON comes last, so that the
+/// others are whole where it is.
+///
+/// # Errors
+/// A file that cannot be written, and a deviation that is not finite.
+pub fn save_registration(
+    folder: &Path,
+    document: &RegistrationDocument,
+    deviations: &[Deviation],
+) -> Result<(), FormatError> {
+    let (rows, column) = rayon::join(
+        || {
+            let rows: Vec<DeviationRow> = deviations.par_iter().map(row).collect();
+            write_deviations(folder.join("deviations.csv"), &rows)
+        },
+        || {
+            let column: Vec<f64> = deviations.iter().map(|d| d.uncertainty_mm).collect();
+            write_column(folder.join("deviation_uncertainty.csv"), "uncertainty_mm", &column)
+        },
+    );
+    rows.and(column)?;
+    write_json_atomic(folder.join("registration.json"), document)
+}
+
+fn row(deviation: &Deviation) -> DeviationRow {
+    DeviationRow {
+        point_mm: deviation.point.into(),
+        normal: deviation.normal.into(),
+        deviation_mm: deviation.deviation_mm,
+        used: deviation.status == PointStatus::Used,
+    }
+}

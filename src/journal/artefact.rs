@@ -1,0 +1,86 @@
+//! The files of a run: on the disk first, on record then.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Read, Write};
+use std::path::{Component, Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use super::canonical::hex;
+use super::error::JournalError;
+use super::open::sync_folder;
+use super::{ANCHOR, DATABASE, LOCK};
+
+/// A file of the run folder, as it stands in the journal.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Artefact {
+    /// Its path within the run folder, with `/` between names.
+    pub name: String,
+    /// Its length.
+    pub bytes: u64,
+    /// Its SHA-256 in small hexadecimal digits.
+    pub sha256: String,
+}
+
+/// Returns the path of a file within a run folder, if the name cannot lead out of it and is not one of the journal's own.
+pub(super) fn path_within(folder: &Path, name: &str) -> Result<PathBuf, JournalError> {
+    let plain = Path::new(name).components().all(|part| matches!(part, Component::Normal(_)));
+    let own = [DATABASE, ANCHOR, LOCK].iter().any(|file| name == *file) || name.starts_with(&format!("{DATABASE}-"));
+    if name.is_empty() || name.contains('\\') || name.ends_with('/') || !plain || own {
+        return Err(JournalError::Name { name: name.to_owned() });
+    }
+    Ok(folder.join(name))
+}
+
+/// Brings bytes to the disk under a temporary name, then gives the file its name, then brings the name to the disk.
+pub(super) fn write_file(path: &Path, bytes: &[u8]) -> Result<(), JournalError> {
+    let folder = path.parent().unwrap_or(Path::new("."));
+    fs::create_dir_all(folder).map_err(JournalError::file(folder, "creating the folder"))?;
+    let mut hidden = std::ffi::OsString::from(".");
+    hidden.push(path.file_name().unwrap_or_default());
+    hidden.push(".tmp");
+    let temporary = path.with_file_name(hidden);
+    let written = fill(&temporary, bytes).and_then(|()| fs::rename(&temporary, path));
+    if written.is_err() {
+        // The error that brought us here is the one to report.
+        let _ = fs::remove_file(&temporary);
+    }
+    written.map_err(JournalError::file(path, "writing it"))?;
+    sync_folder(folder)?;
+    // The folder itself may be new.
+    folder.parent().map_or(Ok(()), sync_folder)
+}
+
+fn fill(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    // What an interrupted attempt left is written over: it never had its name.
+    let mut file = OpenOptions::new().write(true).create(true).truncate(true).open(path)?;
+    file.write_all(bytes)?;
+    file.sync_all()
+}
+
+/// Returns what a file holds.
+pub(super) fn describe(path: &Path, name: &str) -> Result<Artefact, JournalError> {
+    let failed = JournalError::file(path, "reading it");
+    let mut file = File::open(path).map_err(&failed)?;
+    let (mut digest, mut bytes, mut block) = (Sha256::new(), 0, vec![0; 64 << 10]);
+    loop {
+        match file.read(&mut block) {
+            Ok(0) => break,
+            Ok(n) => {
+                digest.update(&block[..n]);
+                bytes += n as u64;
+            }
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            Err(error) => return Err(failed(error)),
+        }
+    }
+    Ok(Artefact { name: name.to_owned(), bytes, sha256: hex(&digest.finalize()) })
+}
+
+/// Brings a file that somebody else wrote to the disk.
+pub(super) fn sync_file(path: &Path) -> Result<(), JournalError> {
+    let synced = File::open(path).and_then(|file| file.sync_all());
+    synced.map_err(JournalError::file(path, "bringing it to the disk"))?;
+    path.parent().map_or(Ok(()), sync_folder)
+}

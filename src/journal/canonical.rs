@@ -1,0 +1,77 @@
+//! One text for one value, so that a hash means something.
+
+use std::fmt::Write;
+
+use serde_json::Value;
+use sha2::{Digest, Sha256};
+
+/// What separates this hash from every other use of SHA-256.
+const DOMAIN: &str = "regrind journal record 1\n";
+
+/// Writes a value as JSON with sorted keys and no blanks. Numbers stand as `serde_json` writes them.
+pub fn canonical_json(value: &Value) -> String {
+    let mut text = String::new();
+    write_value(&mut text, value);
+    text
+}
+
+fn write_value(text: &mut String, value: &Value) {
+    match value {
+        Value::Array(items) => {
+            text.push('[');
+            for (i, item) in items.iter().enumerate() {
+                if i > 0 {
+                    text.push(',');
+                }
+                write_value(text, item);
+            }
+            text.push(']');
+        }
+        Value::Object(members) => {
+            // A map may keep the order of insertion if another crate asks serde_json for it.
+            let mut sorted: Vec<_> = members.iter().collect();
+            sorted.sort_by_key(|(key, _)| key.as_str());
+            text.push('{');
+            for (i, (key, item)) in sorted.into_iter().enumerate() {
+                if i > 0 {
+                    text.push(',');
+                }
+                write_string(text, key);
+                text.push(':');
+                write_value(text, item);
+            }
+            text.push('}');
+        }
+        Value::String(string) => write_string(text, string),
+        scalar => {
+            // Writing into a string does not fail.
+            let _ = write!(text, "{scalar}");
+        }
+    }
+}
+
+/// Writes a string as JSON does.
+pub(super) fn write_string(text: &mut String, string: &str) {
+    let _ = write!(text, "{}", Value::from(string));
+}
+
+/// Returns the SHA-256 of bytes in small hexadecimal digits.
+pub fn sha256_hex(bytes: &[u8]) -> String {
+    hex(&Sha256::digest(bytes))
+}
+
+/// Returns the hash that chains a record to the one before.
+pub(super) fn chain(prev_hash: &str, text: &str) -> String {
+    let mut digest = Sha256::new();
+    for part in [DOMAIN, prev_hash, "\n", text] {
+        digest.update(part.as_bytes());
+    }
+    hex(&digest.finalize())
+}
+
+pub(super) fn hex(bytes: &[u8]) -> String {
+    bytes.iter().fold(String::with_capacity(2 * bytes.len()), |mut text, byte| {
+        let _ = write!(text, "{byte:02x}");
+        text
+    })
+}

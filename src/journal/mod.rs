@@ -1,0 +1,75 @@
+//! The record of truth of one run: what was asked, decided and done, in the order in which it became known.
+//!
+//! A run folder holds `journal.sqlite`, and the journal refers to the other files of the folder by their SHA-256. A record that
+//! was acknowledged is on the disk: the database writes ahead (WAL) with `synchronous = FULL`, set and read back. There is one
+//! writer: it holds `.lock` in the folder for as long as it lives.
+//!
+//! Records form a chain. Each holds the hash of the one before, and its own hash is
+//! `SHA-256("regrind journal record 1\n" || prev_hash || "\n" || text)`, with `prev_hash` in 64 small hexadecimal digits and `text` the JSON
+//! object of its other fields with sorted keys and no blanks, the payload as it stands in the database. So any change,
+//! deletion, insertion or reordering is found by [`verify`]. A cut of the tail is found with an [`Anchor`]: the number of records
+//! and the hash of the last, kept in `journal.anchor` and wherever else somebody wrote it down.
+//!
+//! Calls block until the disk has answered; the drive calls from a thread of its own.
+
+mod artefact;
+mod canonical;
+mod error;
+mod open;
+mod record;
+mod verify;
+mod write;
+
+pub use artefact::Artefact;
+pub use canonical::{canonical_json, sha256_hex};
+pub use error::JournalError;
+pub use record::{Entry, Kind, Record, Records};
+pub use verify::{Anchor, Verified, verify, verify_against};
+pub use write::{Header, Journal};
+
+use std::path::Path;
+
+use rusqlite::Connection;
+
+/// The database in a run folder.
+pub const DATABASE: &str = "journal.sqlite";
+/// The anchor in a run folder.
+pub const ANCHOR: &str = "journal.anchor";
+/// The lock in a run folder.
+pub const LOCK: &str = ".lock";
+
+/// A journal that is only read. It may be read while it is written.
+#[derive(Debug)]
+pub struct Reader {
+    connection: Connection,
+    folder: std::path::PathBuf,
+}
+
+impl Reader {
+    /// Opens the journal of a run folder for reading.
+    ///
+    /// # Errors
+    /// No journal there, or a file that is none.
+    pub fn open(folder: impl AsRef<Path>) -> Result<Self, JournalError> {
+        let folder = folder.as_ref().to_owned();
+        Ok(Self { connection: open::read_only(&folder)?, folder })
+    }
+
+    /// Returns the run folder.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Returns the records from a number on, in order.
+    pub fn records(&self, from: u64) -> Records<'_> {
+        Records::new(&self.connection, &self.folder, from)
+    }
+}
+
+/// Opens the journal of a run folder for reading.
+///
+/// # Errors
+/// No journal there, or a file that is none.
+pub fn open_read_only(folder: impl AsRef<Path>) -> Result<Reader, JournalError> {
+    Reader::open(folder)
+}

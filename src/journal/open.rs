@@ -1,0 +1,176 @@
+//! Opening the database: is it ours, and does it keep what it promises?
+
+use std::fs::{self, File};
+use std::io::Read;
+use std::path::Path;
+
+use rusqlite::{Connection, OpenFlags};
+
+use super::DATABASE;
+use super::error::JournalError;
+
+/// `RGrd`: says in the header of the file whose database this is.
+const APPLICATION_ID: u32 = 0x5247_7264;
+/// The layout of the tables.
+const LAYOUT: u32 = 1;
+
+const SCHEMA: &str = "
+CREATE TABLE record (
+    seq INTEGER PRIMARY KEY,
+    utc TEXT NOT NULL,
+    boot_id TEXT NOT NULL,
+    mono_ns INTEGER NOT NULL,
+    actor TEXT NOT NULL,
+    station TEXT NOT NULL,
+    kind TEXT NOT NULL,
+    part TEXT NOT NULL,
+    cycle INTEGER NOT NULL,
+    command_id INTEGER,
+    reason TEXT NOT NULL,
+    payload TEXT NOT NULL,
+    prev_hash TEXT NOT NULL,
+    hash TEXT NOT NULL UNIQUE
+) STRICT;
+CREATE INDEX record_command ON record (command_id, kind) WHERE command_id IS NOT NULL;
+CREATE TRIGGER record_is_not_changed BEFORE UPDATE ON record BEGIN SELECT RAISE(ABORT, 'records are not changed'); END;
+CREATE TRIGGER record_is_not_deleted BEFORE DELETE ON record BEGIN SELECT RAISE(ABORT, 'records are not deleted'); END;
+CREATE TRIGGER record_follows_the_last BEFORE INSERT ON record
+    WHEN NEW.seq IS NOT (SELECT coalesce(max(seq), 0) + 1 FROM record)
+    BEGIN SELECT RAISE(ABORT, 'records follow the last'); END;
+";
+
+/// Makes the database of a new run.
+pub(super) fn create(folder: &Path) -> Result<Connection, JournalError> {
+    let path = folder.join(DATABASE);
+    let failed = JournalError::database(&path);
+    let connection = Connection::open(&path).map_err(&failed)?;
+    let marks = format!("PRAGMA application_id = {APPLICATION_ID}; PRAGMA user_version = {LAYOUT};");
+    connection.execute_batch(&format!("BEGIN IMMEDIATE; {marks} {SCHEMA} COMMIT;")).map_err(&failed)?;
+    settle(&connection, &path)?;
+    Ok(connection)
+}
+
+/// Opens the database of a run for writing.
+pub(super) fn read_write(folder: &Path) -> Result<Connection, JournalError> {
+    let path = folder.join(DATABASE);
+    recognise(folder, &path)?;
+    let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+    let connection = Connection::open_with_flags(&path, flags).map_err(JournalError::database(&path))?;
+    settle(&connection, &path)?;
+    Ok(connection)
+}
+
+/// Opens the database of a run for reading, also where the folder cannot be written.
+pub(super) fn read_only(folder: &Path) -> Result<Connection, JournalError> {
+    let path = folder.join(DATABASE);
+    recognise(folder, &path)?;
+    let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+    let failed = JournalError::database(&path);
+    let tried = Connection::open_with_flags(&path, flags).and_then(|c| reads(&c).map(|()| c));
+    let connection = match tried {
+        Err(error) if is_unopenable(&error) && !folder.join(format!("{DATABASE}-wal")).exists() => {
+            // A write-ahead database wants to make files beside it. Where it cannot, and there is nothing ahead, it is read as it is.
+            let address = address(&path);
+            let flags = flags | OpenFlags::SQLITE_OPEN_URI;
+            Connection::open_with_flags(address, flags).and_then(|c| reads(&c).map(|()| c))
+        }
+        other => other,
+    }
+    .map_err(&failed)?;
+    harden(&connection, &path)?;
+    Ok(connection)
+}
+
+fn reads(connection: &Connection) -> rusqlite::Result<()> {
+    connection.query_row("SELECT count(*) FROM sqlite_schema", [], |_| Ok(()))
+}
+
+fn is_unopenable(error: &rusqlite::Error) -> bool {
+    matches!(
+        error.sqlite_error_code(),
+        Some(rusqlite::ErrorCode::CannotOpen | rusqlite::ErrorCode::ReadOnly | rusqlite::ErrorCode::PermissionDenied)
+    )
+}
+
+/// Returns the address of a file that nobody changes.
+fn address(path: &Path) -> String {
+    let mut address = "file:".to_owned();
+    for byte in path.as_os_str().as_encoded_bytes() {
+        match byte {
+            b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'/' | b'.' | b'-' | b'_' => address.push(char::from(*byte)),
+            byte => address.push_str(&format!("%{byte:02X}")),
+        }
+    }
+    address + "?immutable=1"
+}
+
+/// Looks at the header of the file before SQLite may touch it.
+fn recognise(folder: &Path, path: &Path) -> Result<(), JournalError> {
+    if !path.is_file() {
+        return Err(JournalError::Absent { path: folder.to_owned() });
+    }
+    let failed = JournalError::file(path, "reading it");
+    let mut header = Vec::new();
+    File::open(path).map_err(&failed)?.take(100).read_to_end(&mut header).map_err(&failed)?;
+    let foreign = |what| Err(JournalError::Foreign { path: path.to_owned(), what });
+    if header.len() < 100 || !header.starts_with(b"SQLite format 3\0") {
+        return foreign("it is not an SQLite database");
+    }
+    let word = |at: usize| header[at..at + 4].iter().fold(0, |word: u32, byte| word << 8 | u32::from(*byte));
+    if word(68) != APPLICATION_ID {
+        return foreign("it is a database of another program");
+    }
+    match word(60) {
+        LAYOUT => Ok(()),
+        found => Err(JournalError::Newer { path: path.to_owned(), found, limit: LAYOUT }),
+    }
+}
+
+/// Sets what the promises rest on, and reads it back.
+fn settle(connection: &Connection, path: &Path) -> Result<(), JournalError> {
+    set(connection, path, "journal_mode", "wal")?;
+    // FULL is 2: with less the last records could be lost when the power fails.
+    set(connection, path, "synchronous", "2")?;
+    set(connection, path, "foreign_keys", "1")?;
+    harden(connection, path)
+}
+
+fn harden(connection: &Connection, path: &Path) -> Result<(), JournalError> {
+    set(connection, path, "trusted_schema", "0")?;
+    set(connection, path, "cell_size_check", "1")?;
+    set(connection, path, "mmap_size", "0")
+}
+
+fn set(connection: &Connection, path: &Path, setting: &'static str, wanted: &'static str) -> Result<(), JournalError> {
+    let failed = JournalError::database(path);
+    connection.execute_batch(&format!("PRAGMA {setting} = {wanted};")).map_err(&failed)?;
+    let found =
+        connection.query_row(&format!("PRAGMA {setting}"), [], |row| row.get_ref(0).map(text_of)).map_err(&failed)?;
+    if found == wanted { Ok(()) } else { Err(JournalError::Setting { path: path.to_owned(), setting, wanted, found }) }
+}
+
+fn text_of(value: rusqlite::types::ValueRef<'_>) -> String {
+    match value {
+        rusqlite::types::ValueRef::Integer(number) => number.to_string(),
+        rusqlite::types::ValueRef::Text(text) => String::from_utf8_lossy(text).into_owned(),
+        other => format!("{:?}", other.data_type()),
+    }
+}
+
+/// Makes names in a folder last; only Unix lets a folder be opened for it.
+pub(super) fn sync_folder(folder: &Path) -> Result<(), JournalError> {
+    let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+    if !cfg!(unix) {
+        return Ok(());
+    }
+    File::open(folder).and_then(|f| f.sync_all()).map_err(JournalError::file(folder, "bringing it to the disk"))
+}
+
+/// Returns whether a folder is absent or empty.
+pub(super) fn is_free(folder: &Path) -> Result<bool, JournalError> {
+    match fs::read_dir(folder) {
+        Ok(mut entries) => Ok(entries.next().is_none()),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(true),
+        Err(error) => Err(JournalError::file(folder, "looking into it")(error)),
+    }
+}

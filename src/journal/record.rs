@@ -1,0 +1,245 @@
+//! One record, and the way through all of them.
+
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use rusqlite::{Connection, OptionalExtension, Row, params};
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use super::canonical::{chain, write_string};
+use super::error::JournalError;
+
+/// What a record tells.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Kind {
+    /// The first record of a run.
+    Begin,
+    /// The journal was opened again after a crash or a hold.
+    Reopen,
+    /// A command, before it is carried out. Has a command number.
+    Intent,
+    /// What became of a command. Has the number of its intent.
+    Outcome,
+    /// An event that the cell took in.
+    Event,
+    /// A file of the run folder and its SHA-256.
+    Artefact,
+    /// Anything else that somebody should read.
+    Note,
+    /// The last record of a run, with the number of records before it.
+    End,
+}
+
+impl Kind {
+    /// All kinds.
+    pub const ALL: [Self; 8] =
+        [Self::Begin, Self::Reopen, Self::Intent, Self::Outcome, Self::Event, Self::Artefact, Self::Note, Self::End];
+
+    /// Returns the word in the database.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Begin => "begin",
+            Self::Reopen => "reopen",
+            Self::Intent => "intent",
+            Self::Outcome => "outcome",
+            Self::Event => "event",
+            Self::Artefact => "artefact",
+            Self::Note => "note",
+            Self::End => "end",
+        }
+    }
+}
+
+impl FromStr for Kind {
+    type Err = ();
+
+    fn from_str(word: &str) -> Result<Self, ()> {
+        Self::ALL.into_iter().find(|kind| kind.as_str() == word).ok_or(())
+    }
+}
+
+/// What is to be recorded.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Entry {
+    /// Time since the run began, of a clock that only goes on, in nanoseconds.
+    pub mono_ns: u64,
+    /// Who: a person, a machine or the cell.
+    pub actor: String,
+    /// Where: a terminal, a computer, an address.
+    pub station: String,
+    /// What this record tells.
+    pub kind: Kind,
+    /// The cycle; 0 before the first.
+    pub cycle: u32,
+    /// The number of the command that this belongs to. An intent is given its number by [`super::Journal::intend`].
+    pub command_id: Option<u32>,
+    /// Why, in words; may be empty.
+    pub reason: String,
+    /// The content.
+    pub payload: Value,
+}
+
+impl Entry {
+    /// Returns an entry of the cell itself, with the name of this program as its station.
+    pub fn new(kind: Kind, mono_ns: u64, cycle: u32, payload: Value) -> Self {
+        let (actor, station) = ("cell".to_owned(), "regrind".to_owned());
+        Self { mono_ns, actor, station, kind, cycle, command_id: None, reason: String::new(), payload }
+    }
+}
+
+/// What stands in the journal.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Record {
+    /// The number of the record, from 1.
+    pub seq: u64,
+    /// The time of day, RFC 3339 in UTC. Records are ordered by `seq`, never by this.
+    pub utc: String,
+    /// A random word for each opening of the journal; `mono_ns` compares only within one.
+    pub boot_id: String,
+    /// Time since the run began, in nanoseconds.
+    pub mono_ns: u64,
+    /// Who.
+    pub actor: String,
+    /// Where.
+    pub station: String,
+    /// What this record tells.
+    pub kind: Kind,
+    /// The serial number of the part.
+    pub part: String,
+    /// The cycle; 0 before the first.
+    pub cycle: u32,
+    /// The number of the command that this belongs to.
+    pub command_id: Option<u32>,
+    /// Why, in words.
+    pub reason: String,
+    /// The content, canonical JSON.
+    pub payload: String,
+    /// The hash of the record before; 64 zeros for the first.
+    pub prev_hash: String,
+    /// The hash of this record.
+    pub hash: String,
+}
+
+impl Record {
+    /// Returns the content as a value; null if it is not JSON.
+    pub fn value(&self) -> Value {
+        serde_json::from_str(&self.payload).unwrap_or(Value::Null)
+    }
+
+    /// Returns the text that is hashed: all fields but the hashes, as JSON with sorted keys.
+    pub(super) fn text(&self) -> String {
+        let mut text = String::with_capacity(self.payload.len() + 256);
+        let string = |text: &mut String, key: &str, value: &str| {
+            text.push_str(key);
+            write_string(text, value);
+        };
+        string(&mut text, "{\"actor\":", &self.actor);
+        string(&mut text, ",\"boot_id\":", &self.boot_id);
+        let id = self.command_id.map_or("null".to_owned(), |id| id.to_string());
+        text.push_str(&format!(",\"command_id\":{id},\"cycle\":{}", self.cycle));
+        string(&mut text, ",\"kind\":", self.kind.as_str());
+        text.push_str(&format!(",\"mono_ns\":{}", self.mono_ns));
+        string(&mut text, ",\"part\":", &self.part);
+        text.push_str(",\"payload\":");
+        text.push_str(&self.payload);
+        string(&mut text, ",\"reason\":", &self.reason);
+        text.push_str(&format!(",\"seq\":{}", self.seq));
+        string(&mut text, ",\"station\":", &self.station);
+        string(&mut text, ",\"utc\":", &self.utc);
+        text.push('}');
+        text
+    }
+
+    /// Returns the hash that this record should have.
+    pub(super) fn hash_due(&self) -> String {
+        chain(&self.prev_hash, &self.text())
+    }
+
+    /// Returns the record as one line of JSON: the text that is hashed, and the hashes.
+    pub fn json_line(&self) -> String {
+        let mut line = self.text();
+        line.pop();
+        line.push_str(&format!(",\"prev_hash\":\"{}\",\"hash\":\"{}\"}}", self.prev_hash, self.hash));
+        line
+    }
+}
+
+/// The columns, in the order in which they are read and written.
+pub(super) const COLUMNS: &str =
+    "seq, utc, boot_id, mono_ns, actor, station, kind, part, cycle, command_id, reason, payload, prev_hash, hash";
+
+/// Reads a number that is never negative.
+pub(super) fn whole(row: &Row<'_>, column: usize) -> rusqlite::Result<u64> {
+    let number: i64 = row.get(column)?;
+    u64::try_from(number).map_err(|_| rusqlite::Error::IntegralValueOutOfRange(column, number))
+}
+
+fn record_of(row: &Row<'_>) -> rusqlite::Result<Record> {
+    let word: String = row.get(6)?;
+    let kind = word.parse().map_err(|()| rusqlite::Error::InvalidColumnName(format!("kind {word:?}")))?;
+    Ok(Record {
+        seq: whole(row, 0)?,
+        utc: row.get(1)?,
+        boot_id: row.get(2)?,
+        mono_ns: whole(row, 3)?,
+        actor: row.get(4)?,
+        station: row.get(5)?,
+        kind,
+        part: row.get(7)?,
+        cycle: row.get(8)?,
+        command_id: row.get(9)?,
+        reason: row.get(10)?,
+        payload: row.get(11)?,
+        prev_hash: row.get(12)?,
+        hash: row.get(13)?,
+    })
+}
+
+/// The records of a journal, in order; each is read when it is asked for, so that a writer is never kept waiting.
+#[derive(Debug)]
+pub struct Records<'j> {
+    connection: &'j Connection,
+    folder: PathBuf,
+    next: u64,
+    over: bool,
+}
+
+impl<'j> Records<'j> {
+    pub(super) fn new(connection: &'j Connection, folder: &Path, from: u64) -> Self {
+        Self { connection, folder: folder.to_owned(), next: from, over: false }
+    }
+
+    fn read(&self) -> Result<Option<Record>, JournalError> {
+        let sql = format!("SELECT {COLUMNS} FROM record WHERE seq >= ?1 ORDER BY seq LIMIT 1");
+        let failed = JournalError::database(&self.folder);
+        let mut statement = self.connection.prepare_cached(&sql).map_err(&failed)?;
+        // A number too large for the database is past its end.
+        let from = i64::try_from(self.next).unwrap_or(i64::MAX);
+        statement.query_row(params![from], record_of).optional().map_err(|source| match source {
+            rusqlite::Error::SqliteFailure(..) => failed(source),
+            unreadable => JournalError::Broken {
+                path: self.folder.clone(),
+                seq: self.next,
+                what: format!("a field cannot be read ({unreadable})"),
+            },
+        })
+    }
+}
+
+impl Iterator for Records<'_> {
+    type Item = Result<Record, JournalError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.over {
+            return None;
+        }
+        let found = self.read().transpose();
+        match &found {
+            Some(Ok(record)) => self.next = record.seq.saturating_add(1),
+            _ => self.over = true,
+        }
+        found
+    }
+}

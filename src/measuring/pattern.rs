@@ -1,0 +1,311 @@
+//! Where the probe shall touch the part.
+
+use std::f64::consts::{PI, TAU};
+
+use thiserror::Error;
+
+use crate::geometry::{Point, Vector};
+use crate::surface::{Nominal, OffsetSurface, Place, Side};
+
+/// More targets than a machine measures in a week.
+const MOST_TARGETS: f64 = 1e7;
+/// A place beyond the edge by no more than this, in millimetres, is on it: rounding.
+const ON_PART_MM: f64 = 1e-6;
+/// Turns after which a place is taken not to be on the surface.
+const MOST_TURNS: usize = 50;
+
+/// A place to touch: a point of the nominal surface and its outward unit normal, in the model frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Target {
+    /// The nominal contact point in millimetres.
+    pub point: Point,
+    /// Unit normal towards the probe's side.
+    pub normal: Vector,
+}
+
+/// How targets are laid over x and y of the model frame.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Layout {
+    /// A grid with this spacing in millimetres, run to and fro.
+    GridSpacing(f64),
+    /// A grid of so many columns and rows, run to and fro.
+    GridPoints([u32; 2]),
+    /// A spiral from the middle with this distance of the turns and of the points, in millimetres.
+    SpiralSpacing(f64),
+    /// A spiral from the middle of about so many points.
+    SpiralPoints(u32),
+    /// At the points of the nominal surface nearest to these.
+    Points(Vec<Point>),
+}
+
+/// Why there are no targets.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[allow(missing_docs)]
+pub enum PatternError {
+    #[error("the measuring pattern has a spacing of {spacing_mm} mm; it must be above 0")]
+    Spacing { spacing_mm: f64 },
+    #[error("the measuring pattern has {count:.0} points, more than {MOST_TARGETS:.0}; choose a wider spacing")]
+    TooMany { count: f64 },
+    #[error(
+        "none of the {asked} places of the measuring pattern lies on the part, {margin_mm} mm inside its edge; reduce edge_margin_mm \
+         or the spacing"
+    )]
+    NoneOnPart { asked: usize, margin_mm: f64 },
+}
+
+/// Lays targets over the part, `margin_mm` inside its edge, in the order in which they are measured.
+///
+/// Frames: the model frame. Units: millimetres. A place that is not on the part, or too near its edge, is left out.
+///
+/// # Errors
+/// A spacing that is not above 0, too many places, and none on the part.
+pub fn targets(nominal: &Nominal, side: Side, layout: &Layout, margin_mm: f64) -> Result<Vec<Target>, PatternError> {
+    let surface = OffsetSurface::new(nominal, 0.0, side).expect("a radius of 0 is good");
+    let bounds = bounds(nominal);
+    let places = places(layout, bounds, margin_mm)?;
+    let (mut found, mut walk) = (Vec::with_capacity(places.len()), Walk::new(surface, bounds));
+    for place in &places {
+        let target = match place {
+            Wanted::Over(xy) => walk.over(*xy),
+            Wanted::Near(point) => walk.near(point),
+        };
+        found.extend(target.filter(|target| walk.is_inside(target, margin_mm)));
+    }
+    if found.is_empty() {
+        return Err(PatternError::NoneOnPart { asked: places.len(), margin_mm });
+    }
+    Ok(found)
+}
+
+/// Lays targets on the upper half of a reference sphere, evenly, for a probe that comes from above: centres in the frame of `centre`.
+pub fn sphere_targets(centre: Point, radius_mm: f64, count: usize) -> Vec<Target> {
+    // Equal areas from the pole down to 80 degrees, turned by the golden angle each.
+    let lowest = 80f64.to_radians().cos();
+    (0..count)
+        .map(|k| {
+            let height = 1.0 - (1.0 - lowest) * (k as f64 + 0.5) / count as f64;
+            let (sin, cos) = (k as f64 * PI * (3.0 - 5f64.sqrt())).sin_cos();
+            let around = (1.0 - height * height).sqrt();
+            let normal = Vector::new(around * cos, around * sin, height);
+            Target { point: centre + radius_mm * normal, normal }
+        })
+        .collect()
+}
+
+enum Wanted {
+    Over([f64; 2]),
+    Near(Point),
+}
+
+fn bounds(nominal: &Nominal) -> [[f64; 2]; 2] {
+    let whole = [[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]];
+    let of_points = nominal
+        .points()
+        .fold(whole, |[low, high], p| [[low[0].min(p.x), low[1].min(p.y)], [high[0].max(p.x), high[1].max(p.y)]]);
+    // A nominal sampled a ring beyond its aperture must not put targets there.
+    match nominal.outline() {
+        Some(outline) => {
+            let [low, high] = outline.bounds();
+            [
+                [low[0].max(of_points[0][0]), low[1].max(of_points[0][1])],
+                [high[0].min(of_points[1][0]), high[1].min(of_points[1][1])],
+            ]
+        }
+        None => of_points,
+    }
+}
+
+fn places(layout: &Layout, [low, high]: [[f64; 2]; 2], margin_mm: f64) -> Result<Vec<Wanted>, PatternError> {
+    let [width, depth] = [0, 1].map(|k| (high[k] - low[k] - 2.0 * margin_mm).max(0.0));
+    let middle = [0, 1].map(|k| 0.5 * (low[k] + high[k]));
+    let grid = |columns: f64, rows: f64| {
+        let count = columns * rows;
+        if count > MOST_TARGETS {
+            return Err(PatternError::TooMany { count });
+        }
+        let (columns, rows) = (columns as usize, rows as usize);
+        let at = |i: usize, n: usize, size: f64| if n > 1 { size * (i as f64 / (n - 1) as f64 - 0.5) } else { 0.0 };
+        Ok((0..columns * rows)
+            .map(|k| {
+                let (i, j) = (k % columns, k / columns);
+                // Every other row is run backwards, so that the probe need not fly back.
+                let i = if j % 2 == 0 { i } else { columns - 1 - i };
+                Wanted::Over([middle[0] + at(i, columns, width), middle[1] + at(j, rows, depth)])
+            })
+            .collect())
+    };
+    let check = |spacing_mm: f64| {
+        if spacing_mm > 0.0 && spacing_mm.is_finite() {
+            Ok(spacing_mm)
+        } else {
+            Err(PatternError::Spacing { spacing_mm })
+        }
+    };
+    match layout {
+        Layout::GridSpacing(spacing) => {
+            let spacing = check(*spacing)?;
+            grid((width / spacing).floor() + 1.0, (depth / spacing).floor() + 1.0)
+        }
+        Layout::GridPoints([columns, rows]) => grid(f64::from((*columns).max(1)), f64::from((*rows).max(1))),
+        Layout::SpiralSpacing(spacing) => spiral(check(*spacing)?, middle, [width, depth]),
+        // A spiral covers the whole disc around the rectangle with one point for each square of its spacing.
+        Layout::SpiralPoints(count) => {
+            let area = (width * depth).max(1e-9);
+            spiral((area / f64::from((*count).max(1))).sqrt(), middle, [width, depth])
+        }
+        Layout::Points(points) => Ok(points.iter().map(|p| Wanted::Near(*p)).collect()),
+    }
+}
+
+fn spiral(spacing: f64, middle: [f64; 2], [width, depth]: [f64; 2]) -> Result<Vec<Wanted>, PatternError> {
+    let reach = 0.5 * width.hypot(depth);
+    let count = PI * (reach / spacing).powi(2);
+    if count > MOST_TARGETS {
+        return Err(PatternError::TooMany { count });
+    }
+    // Archimedes' spiral r = spacing * turns; an arc of one spacing from point to point.
+    let (mut angle, mut found) = (0.0f64, Vec::new());
+    loop {
+        let r = spacing * angle / TAU;
+        if r > reach {
+            return Ok(found);
+        }
+        let (sin, cos) = angle.sin_cos();
+        let (x, y) = (r * cos, r * sin);
+        if x.abs() <= 0.5 * width && y.abs() <= 0.5 * depth {
+            found.push(Wanted::Over([middle[0] + x, middle[1] + y]));
+        }
+        angle += spacing / r.max(spacing / TAU).hypot(spacing / TAU);
+    }
+}
+
+/// A walk over the surface from target to target.
+struct Walk<'a> {
+    surface: OffsetSurface<'a>,
+    place: Place,
+    /// Height of the last target, where the next is looked for first.
+    z: f64,
+    /// On a straight line through the part of this length no surface is higher or lower.
+    size_mm: f64,
+}
+
+impl<'a> Walk<'a> {
+    fn new(surface: OffsetSurface<'a>, [low, high]: [[f64; 2]; 2]) -> Self {
+        let z = surface.nominal().points().next().map_or(0.0, |p| p.z);
+        Self { surface, place: Place::UNKNOWN, z, size_mm: (high[0] - low[0]).hypot(high[1] - low[1]) }
+    }
+
+    /// Finds the point of the surface over x and y by Newton's method on the height: the tangent plane at the foot is cut.
+    fn over(&mut self, [x, y]: [f64; 2]) -> Option<Target> {
+        let mut p = Point::new(x, y, self.z);
+        for _ in 0..MOST_TURNS {
+            let foot = self.surface.foot(&p, self.place);
+            self.place = foot.place;
+            let lean = foot.normal.z;
+            if lean.abs() < 1e-3 || !foot.distance_mm.is_finite() {
+                return None;
+            }
+            let step = foot.distance_mm / lean;
+            p.z -= step.clamp(-self.size_mm, self.size_mm);
+            if step.abs() < 1e-9 * (1.0 + self.size_mm) {
+                self.z = p.z;
+                return (foot.beyond_mm <= ON_PART_MM).then_some(Target { point: p, normal: foot.normal });
+            }
+        }
+        None
+    }
+
+    fn near(&mut self, p: &Point) -> Option<Target> {
+        let foot = self.surface.foot(p, self.place);
+        self.place = foot.place;
+        let target = Target { point: p - foot.distance_mm * foot.normal, normal: foot.normal };
+        // A point far away belongs to another part, or to another unit.
+        let near = foot.distance_mm.abs() <= 0.05 * self.size_mm;
+        (foot.beyond_mm <= ON_PART_MM && near).then_some(target)
+    }
+
+    /// Whether the surface goes on for the margin in every direction.
+    fn is_inside(&self, target: &Target, margin_mm: f64) -> bool {
+        let outline = self.surface.nominal().outline();
+        let (u, _) = frame(&target.normal);
+        let v = target.normal.cross(&u);
+        let around = (0..8).map(|k| (f64::from(k) * TAU / 8.0).sin_cos());
+        // Rounding must not cost the points that lie exactly on the margin.
+        let margin_mm = margin_mm * (1.0 - 1e-9);
+        outline.is_none_or(|o| o.contains(target.point.x, target.point.y))
+            && (margin_mm == 0.0
+                || around.map(|(s, c)| target.point + margin_mm * (c * u + s * v)).all(|p| {
+                    self.surface.foot(&p, self.place).beyond_mm <= ON_PART_MM
+                        && outline.is_none_or(|o| o.contains(p.x, p.y))
+                }))
+    }
+}
+
+/// Two directions across a normal; the first as near to x as may be.
+fn frame(normal: &Vector) -> (Vector, Vector) {
+    let x = if normal.x.abs() < 0.9 { Vector::x() } else { Vector::y() };
+    let u = (x - normal * normal.dot(&x)).normalize();
+    (u, normal.cross(&u))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surface::Projection;
+
+    /// A dome z = -(x^2 + y^2) / 200 over 40 x 20 mm, a point every half millimetre.
+    fn dome() -> Nominal {
+        let points = (0..81 * 41).map(|k| [f64::from(k % 81) * 0.5 - 20.0, f64::from(k / 81) * 0.5 - 10.0]);
+        let points = points.map(|[x, y]| Point::new(x, y, -(x * x + y * y) / 200.0)).collect();
+        Nominal::from_points(points, Projection::Auto).unwrap()
+    }
+
+    #[test]
+    fn a_grid_lies_on_the_surface_and_runs_to_and_fro() {
+        let found = targets(&dome(), Side::Normal, &Layout::GridPoints([10, 5]), 1.0).unwrap();
+        assert_eq!(found.len(), 50);
+        for Target { point, normal } in &found {
+            assert!((point.z + (point.x * point.x + point.y * point.y) / 200.0).abs() < 1e-6, "{point}");
+            let true_normal = Vector::new(point.x / 100.0, point.y / 100.0, 1.0).normalize();
+            assert!((normal - true_normal).norm() < 1e-5 && point.x.abs() < 19.001 && point.y.abs() < 9.001);
+        }
+        assert!(found[9].point.x > 18.9 && found[10].point.x > 18.9 && found[0].point.x < -18.9);
+        let below = targets(&dome(), Side::Opposite, &Layout::GridPoints([10, 5]), 1.0).unwrap();
+        assert!(below.iter().all(|t| t.normal.z < 0.0));
+    }
+
+    #[test]
+    fn spacing_spiral_and_points() {
+        let spaced = targets(&dome(), Side::Normal, &Layout::GridSpacing(2.0), 0.0).unwrap();
+        assert_eq!(spaced.len(), 21 * 11);
+        let spiral = targets(&dome(), Side::Normal, &Layout::SpiralPoints(400), 1.0).unwrap();
+        assert!((300..500).contains(&spiral.len()), "{}", spiral.len());
+        let near = Layout::Points(vec![Point::new(3.0, 4.0, 0.5), Point::new(300.0, 0.0, 0.0)]);
+        assert_eq!(targets(&dome(), Side::Normal, &near, 0.0).unwrap().len(), 1);
+    }
+
+    #[test]
+    fn an_outline_and_a_margin_keep_targets_away_from_the_edge() {
+        let round = dome().with_outline(crate::geometry::Aperture::Circle { radius_mm: 8.0, centre_mm: [0.0, 0.0] });
+        let found = targets(&round, Side::Normal, &Layout::GridSpacing(0.5), 2.0).unwrap();
+        let farthest = found.iter().map(|t| t.point.x.hypot(t.point.y)).fold(0.0, f64::max);
+        assert!((5.5..6.05).contains(&farthest), "{farthest}");
+    }
+
+    #[test]
+    fn what_cannot_be_laid_is_said() {
+        let lay = |layout: Layout, margin| targets(&dome(), Side::Normal, &layout, margin);
+        assert!(matches!(lay(Layout::GridSpacing(0.0), 0.0), Err(PatternError::Spacing { .. })));
+        assert!(matches!(lay(Layout::GridSpacing(1e-9), 0.0), Err(PatternError::TooMany { .. })));
+        assert!(matches!(lay(Layout::SpiralSpacing(1e-9), 0.0), Err(PatternError::TooMany { .. })));
+        assert!(matches!(lay(Layout::GridSpacing(1.0), 15.0), Err(PatternError::NoneOnPart { .. })));
+    }
+
+    #[test]
+    fn targets_of_a_sphere_are_on_its_upper_half() {
+        let centre = Point::new(1.0, 2.0, 3.0);
+        for Target { point, normal } in sphere_targets(centre, 12.5, 25) {
+            assert!(((point - centre).norm() - 12.5).abs() < 1e-12 && normal.z > 0.17);
+        }
+    }
+}

@@ -1,0 +1,520 @@
+//! From a recipe as written to a checked one: units, and what one key says against another.
+
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use super::curvature;
+use super::written::{
+    AcceptanceTable, CompensationTable, CoordinateWord, CycleTable, DistanceWord, GrindingTable, MeasureTable,
+    NominalTable, PartTable, PatternWord, RecipeFile, RegistrationTable, SideWord, WheelTable,
+};
+use super::{
+    Acceptance, Compensation, Cycle, Density, Grinding, Measure, NominalSource, Part, Pattern, Recipe,
+    RegistrationSettings, StartAt, Wheel,
+};
+use crate::document::Document;
+use crate::geometry::Aperture;
+use crate::registration::ProbeSide;
+use crate::surface::{DefinedSurface, Distance, Side, SurfaceDefinition};
+
+/// More points than a part is ever measured with.
+const MOST_POINTS: f64 = 1e6;
+
+const MM_PER_UM: f64 = 1e-3;
+
+/// Everything of a recipe but where it came from; `None` where something is missing, which has been told.
+pub(super) struct Checked {
+    part: Option<Part>,
+    nominal: Option<NominalSource>,
+    measure: Option<Measure>,
+    registration: RegistrationSettings,
+    acceptance: Acceptance,
+    compensation: Option<Compensation>,
+    grinding: Option<Grinding>,
+    cycle: Cycle,
+    simulation: Option<toml::Table>,
+}
+
+impl Checked {
+    /// Puts the recipe together, if nothing is missing.
+    pub(super) fn into_recipe(self, path: &Path, text: &str, source_sha256: [u8; 32]) -> Option<Recipe> {
+        Some(Recipe {
+            part: self.part?,
+            nominal: self.nominal?,
+            measure: self.measure?,
+            registration: self.registration,
+            acceptance: self.acceptance,
+            compensation: self.compensation?,
+            grinding: self.grinding?,
+            cycle: self.cycle,
+            simulation: self.simulation,
+            path: path.to_owned(),
+            text: text.to_owned(),
+            source_sha256,
+        })
+    }
+}
+
+/// Checks a recipe as written; what is wrong is told to the document.
+pub(super) fn check(written: RecipeFile, path: &Path, document: &mut Document) -> Checked {
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let nominal = nominal(&written.nominal, folder, document);
+    compare_with_part(&written, nominal.as_ref(), document);
+    compare_tables(&written, document);
+    Checked {
+        part: part(written.part),
+        measure: measure(&written.measure, folder, document),
+        registration: registration(&written.registration, document),
+        acceptance: acceptance(&written.acceptance, document),
+        compensation: compensation(&written.compensation, document),
+        grinding: grinding(&written.grinding, document),
+        cycle: cycle(&written.cycle),
+        simulation: written.simulation,
+        nominal,
+    }
+}
+
+fn part(written: PartTable) -> Option<Part> {
+    Some(Part { name: written.name?, material: written.material, drawing: written.drawing })
+}
+
+/// Joins a path of a recipe to the recipe's folder; an absolute one stays.
+fn beside(folder: &Path, path: &str) -> PathBuf {
+    folder.join(path)
+}
+
+fn nominal(written: &NominalTable, folder: &Path, document: &mut Document) -> Option<NominalSource> {
+    let from_formula = "keep `file`, or the tables [nominal.surface] and [nominal.aperture]";
+    if !document.is_there("nominal") {
+        return None;
+    }
+    let Some(file) = &written.file else {
+        if written.projection.is_some() {
+            document.report("nominal.projection", "is for points of a file", "", "leave it out");
+        }
+        return formula(written, document);
+    };
+    for (key, there) in [("surface", written.surface.is_some()), ("sampling", written.sampling.is_some())] {
+        if there {
+            let key = format!("nominal.{key}");
+            document.report(&key, "stands beside `nominal.file`", "the nominal surface has one source", from_formula);
+        }
+    }
+    let aperture = written.aperture.clone().and_then(|table| aperture(table, document));
+    Some(NominalSource::File {
+        path: beside(folder, file),
+        projection: written.projection.unwrap_or_default(),
+        aperture,
+    })
+}
+
+fn aperture(table: toml::Table, document: &mut Document) -> Option<Aperture> {
+    match toml::Value::Table(table).try_into::<Aperture>() {
+        Err(error) => document.report("nominal.aperture", error.message().trim(), "", "correct the outline"),
+        Ok(aperture) => match aperture.validate() {
+            Ok(()) => return Some(aperture),
+            Err(error) => {
+                let key = format!("nominal.aperture.{}", error.key());
+                document.report(&key, in_place(error.key(), &error.to_string()), "", "");
+            }
+        },
+    }
+    None
+}
+
+/// Reads the tables of a formula as the definition of a surface, whose own checks know best.
+fn formula(written: &NominalTable, document: &mut Document) -> Option<NominalSource> {
+    let tables = [("surface", &written.surface), ("aperture", &written.aperture), ("sampling", &written.sampling)];
+    let missing = tables[..2].iter().filter(|(_, table)| table.is_none());
+    let missing: Vec<&str> = missing.map(|(name, _)| *name).collect();
+    for name in &missing {
+        let key = format!("nominal.{name}");
+        // A table that is there and broken has been told of.
+        if !document.has_problem(&key) {
+            let remedy = format!("add the table [nominal.{name}], or `file = \"...\"` in [nominal]");
+            document.report(&key, "is missing", "", &remedy);
+        }
+    }
+    if !missing.is_empty() || document.has_problem("nominal") {
+        return None;
+    }
+    let entry = |(name, table): (&str, &Option<toml::Table>)| Some((name.to_owned(), table.clone()?.into()));
+    let definition = toml::Value::Table(tables.into_iter().filter_map(entry).collect());
+    match SurfaceDefinition::deserialize(definition) {
+        Err(error) => document.report("nominal.surface", error.message().trim(), "", "correct the formula"),
+        Ok(definition) => match definition.resolve() {
+            Ok(defined) => return Some(NominalSource::Surface(Box::new(defined))),
+            Err(error) => {
+                let inner = error.key().unwrap_or_else(|| "surface".into());
+                // A term of a list, such as `terms.[0, 1]`, stands nowhere by that name.
+                let key = format!("nominal.{}", inner.split(".[").next().unwrap_or(&inner));
+                document.report(&key, in_place(&inner, &error.to_string()), "", "");
+            }
+        },
+    }
+    None
+}
+
+/// Takes the key from the beginning of a sentence that has it there, to stand behind the whole key.
+fn in_place(key: &str, sentence: &str) -> String {
+    match sentence.strip_prefix(&format!("`{key}` ")) {
+        Some(rest) => rest.to_owned(),
+        None => format!("is refused: {sentence}"),
+    }
+}
+
+fn measure(written: &MeasureTable, folder: &Path, document: &mut Document) -> Option<Measure> {
+    if written.safe_height_mm < written.approach_mm {
+        document.report(
+            "measure.safe_height_mm",
+            format!("is {} mm, less than `approach_mm`, {} mm", written.safe_height_mm, written.approach_mm),
+            "the probe must travel above the points it approaches from",
+            "raise it, or approach from nearer",
+        );
+    }
+    let pattern = pattern(written, folder, document);
+    Some(Measure {
+        probe_radius_mm: written.probe_radius_mm?,
+        side: match written.side {
+            SideWord::Auto => ProbeSide::Auto,
+            SideWord::Above => ProbeSide::Known(Side::Normal),
+            SideWord::Below => ProbeSide::Known(Side::Opposite),
+        },
+        pattern: pattern?,
+        edge_margin_mm: written.edge_margin_mm,
+        approach_mm: written.approach_mm,
+        search_mm: written.search_mm,
+        speed_mm_s: written.speed_mm_s,
+        safe_height_mm: written.safe_height_mm,
+        minimum_coverage: written.minimum_coverage,
+        qualify: written.qualify,
+        radius_tolerance_mm: MM_PER_UM * written.radius_tolerance_um,
+    })
+}
+
+fn pattern(written: &MeasureTable, folder: &Path, document: &mut Document) -> Option<Pattern> {
+    let keys = [
+        ("spacing_mm", written.spacing_mm.is_some()),
+        ("columns", written.columns.is_some()),
+        ("rows", written.rows.is_some()),
+        ("points", written.points.is_some()),
+        ("file", written.file.is_some()),
+    ];
+    let (name, takes, needs) = match written.pattern {
+        PatternWord::Grid => ("grid", &["spacing_mm", "columns", "rows"][..], "`spacing_mm`, or `columns` and `rows`"),
+        PatternWord::Spiral => ("spiral", &["spacing_mm", "points"][..], "`spacing_mm` or `points`"),
+        PatternWord::File => ("file", &["file"][..], "`file`"),
+        PatternWord::Free => ("free", &["points"][..], "`points`, the least number of them"),
+    };
+    let allowed = format!("the pattern \"{name}\" takes {needs}");
+    for (key, _) in keys.iter().filter(|(key, there)| *there && !takes.contains(key)) {
+        document.report(
+            &format!("measure.{key}"),
+            "is not for this pattern",
+            &allowed,
+            "leave it out, or change `pattern`",
+        );
+    }
+    let found = match (written.pattern, written.spacing_mm, (written.columns, written.rows), written.points) {
+        (PatternWord::Grid, Some(spacing), (None, None), _) => Some(Pattern::Grid(Density::SpacingMm(spacing))),
+        (PatternWord::Grid, None, (Some(columns), Some(rows)), _) => {
+            Some(Pattern::Grid(Density::Points([columns, rows])))
+        }
+        (PatternWord::Spiral, Some(spacing), _, None) => Some(Pattern::Spiral(Density::SpacingMm(spacing))),
+        (PatternWord::Spiral, None, _, Some(points)) => Some(Pattern::Spiral(Density::Points(points))),
+        (PatternWord::File, ..) => written.file.as_ref().map(|file| Pattern::File { path: beside(folder, file) }),
+        (PatternWord::Free, _, _, Some(least_points)) => Some(Pattern::Free { least_points }),
+        _ => None,
+    };
+    // A key that is there and broken has been told of.
+    if found.is_none()
+        && document.is_there("measure")
+        && !takes.iter().any(|key| document.has_problem(&format!("measure.{key}")))
+    {
+        let given: Vec<&str> =
+            keys.iter().filter(|(key, there)| *there && takes.contains(key)).map(|(key, _)| *key).collect();
+        let found = if given.is_empty() {
+            "has no density or place of its points".into()
+        } else {
+            format!("has {}", given.join(", "))
+        };
+        document.report("measure", found, &allowed, "give just these");
+    }
+    found
+}
+
+fn registration(written: &RegistrationTable, document: &mut Document) -> RegistrationSettings {
+    let mut held = [false; 6];
+    for coordinate in &written.hold {
+        held[match coordinate {
+            CoordinateWord::X => 0,
+            CoordinateWord::Y => 1,
+            CoordinateWord::Z => 2,
+            CoordinateWord::Rx => 3,
+            CoordinateWord::Ry => 4,
+            CoordinateWord::Rz => 5,
+        }] = true;
+    }
+    if !written.hold.is_empty() && written.start == StartAt::Search {
+        document.report(
+            "registration.hold",
+            "holds coordinates while `start` is \"search\"",
+            "a held coordinate stays where the fixture has it",
+            "write `start = \"fixture\"`, or hold nothing",
+        );
+    }
+    if held.iter().all(|held| *held) {
+        document.report("registration.hold", "holds all six coordinates", "at least one must be free", "leave one out");
+    }
+    RegistrationSettings {
+        distance: match written.distance {
+            DistanceWord::Curved => Distance::Curved,
+            DistanceWord::Triangle => Distance::Triangle,
+        },
+        loss: written.loss,
+        outlier_sigmas: written.outlier_sigmas,
+        held,
+        start: written.start,
+        largest_shift_mm: written.largest_shift_mm,
+        largest_turn_rad: written.largest_turn_deg.to_radians(),
+        max_rms_mm: written.max_rms_um.map(|um| MM_PER_UM * um),
+    }
+}
+
+fn acceptance(written: &AcceptanceTable, document: &mut Document) -> Acceptance {
+    let broken = ["acceptance.pv_um", "acceptance.rms_um", "acceptance"].iter().any(|key| document.has_problem(key));
+    match (written.pv_um, written.rms_um) {
+        (None, None) if !broken && document.is_there("acceptance") => {
+            let remedy = "add `rms_um = 1.0`, or `pv_um = 7.0`, or both";
+            document.report("acceptance", "has no limit", "at least one of `pv_um` and `rms_um` must be given", remedy);
+        }
+        (Some(pv), Some(rms)) if pv < rms => document.report(
+            "acceptance.pv_um",
+            format!("is {pv} um, less than `rms_um`, {rms} um"),
+            "a peak to valley is never less than the rms",
+            "raise it, or are the two interchanged?",
+        ),
+        _ => {}
+    }
+    Acceptance {
+        pv_mm: written.pv_um.map(|um| MM_PER_UM * um),
+        rms_mm: written.rms_um.map(|um| MM_PER_UM * um),
+        expanded_uncertainty: written.expanded_uncertainty,
+    }
+}
+
+fn compensation(written: &CompensationTable, document: &mut Document) -> Option<Compensation> {
+    if let Some(budget) = written.removal_budget_um {
+        let parts =
+            [("depth_of_cut_um", written.depth_of_cut_um), ("largest_correction_um", written.largest_correction_um)];
+        for (key, um) in parts {
+            if let Some(um) = um.filter(|um| *um > budget) {
+                document.report(
+                    &format!("compensation.{key}"),
+                    format!("is {um} um, more than `removal_budget_um`, {budget} um"),
+                    "nothing may take off more than the budget",
+                    "lower it, or raise the budget",
+                );
+            }
+        }
+    }
+    if let Some(cutoff) = written.cutoff_mm.filter(|cutoff| *cutoff < 2.0 * written.spacing_mm) {
+        document.report(
+            "compensation.cutoff_mm",
+            format!("is {cutoff} mm, less than two nodes of the map, {} mm", 2.0 * written.spacing_mm),
+            "a wavelength takes two nodes at least",
+            "raise it, or lower `compensation.spacing_mm`",
+        );
+    }
+    Some(Compensation {
+        gain: written.gain,
+        cutoff_mm: written.cutoff_mm?,
+        largest_correction_mm: MM_PER_UM * written.largest_correction_um?,
+        removal_budget_mm: MM_PER_UM * written.removal_budget_um?,
+        depth_of_cut_mm: MM_PER_UM * written.depth_of_cut_um?,
+        spacing_mm: written.spacing_mm,
+    })
+}
+
+fn grinding(written: &GrindingTable, document: &mut Document) -> Option<Grinding> {
+    let wheel = match written.wheel.as_ref()? {
+        WheelTable::Sphere(ball) => Wheel::Sphere { radius_mm: ball.radius_mm? },
+        WheelTable::Torus(rim) => Wheel::Torus { radius_mm: rim.radius_mm?, minor_radius_mm: rim.minor_radius_mm? },
+        WheelTable::Cup(rim) => Wheel::Cup { radius_mm: rim.radius_mm?, minor_radius_mm: rim.minor_radius_mm? },
+    };
+    if let Wheel::Torus { radius_mm, minor_radius_mm } | Wheel::Cup { radius_mm, minor_radius_mm } = wheel
+        && minor_radius_mm > radius_mm
+    {
+        document.report(
+            "grinding.wheel.minor_radius_mm",
+            format!("is {minor_radius_mm} mm, more than `radius_mm`, {radius_mm} mm"),
+            "the rim's own curve is inside the wheel",
+            "are the two interchanged?",
+        );
+    }
+    let track_mm = written.track_mm?;
+    if track_mm > wheel.radius_mm() {
+        document.report(
+            "grinding.track_mm",
+            format!("is {track_mm} mm, more than the wheel's radius, {} mm", wheel.radius_mm()),
+            "tracks must overlap",
+            "lower it",
+        );
+    }
+    Some(Grinding {
+        wheel,
+        feed_mm_min: written.feed_mm_min?,
+        track_mm,
+        spark_out_passes: written.spark_out_passes,
+        allowance_mm: MM_PER_UM * written.allowance_um,
+    })
+}
+
+fn cycle(written: &CycleTable) -> Cycle {
+    Cycle {
+        most_cycles: written.most_cycles,
+        on_stall: written.on_stall,
+        on_divergence: written.on_divergence,
+        stall_mm: MM_PER_UM * written.stall_um,
+    }
+}
+
+/// Compares the tables with each other.
+fn compare_tables(written: &RecipeFile, document: &mut Document) {
+    if let (Some(most), Some(rms)) = (written.registration.max_rms_um, written.acceptance.rms_um)
+        && most < rms
+    {
+        document.report(
+            "registration.max_rms_um",
+            format!("is {most} um, less than `acceptance.rms_um`, {rms} um"),
+            "a good part would be refused",
+            "raise it well above the first cycle's rms, or leave it out",
+        );
+    }
+    let (allowance, cycles) = (written.grinding.allowance_um, written.cycle.most_cycles);
+    if let Some(depth) = written.compensation.depth_of_cut_um
+        && allowance > depth * f64::from(cycles.saturating_sub(1))
+    {
+        document.report(
+            "grinding.allowance_um",
+            format!("is {allowance} um, which {cycles} cycles of {depth} um never take off"),
+            "the last pass must reach the nominal surface",
+            "lower it, or raise `cycle.most_cycles` or `compensation.depth_of_cut_um`",
+        );
+    }
+}
+
+/// Compares lengths with the size and the curvature of the part, where a formula or an outline tells them.
+fn compare_with_part(written: &RecipeFile, nominal: Option<&NominalSource>, document: &mut Document) {
+    let (surface, aperture) = match nominal {
+        Some(NominalSource::Surface(surface)) => (Some(surface.as_ref()), Some(surface.aperture())),
+        Some(NominalSource::File { aperture, .. }) => (None, aperture.as_ref()),
+        None => return,
+    };
+    if let Some(aperture) = aperture {
+        let [[x0, y0], [x1, y1]] = aperture.bounds();
+        compare_with_size(written, [x1 - x0, y1 - y0], document);
+    }
+    if let Some(surface) = surface {
+        compare_with_curvature(written, surface, document);
+    }
+}
+
+fn compare_with_size(written: &RecipeFile, size_mm: [f64; 2], document: &mut Document) {
+    let measure = &written.measure;
+    let smaller_mm = size_mm[0].min(size_mm[1]);
+    let left_mm = size_mm.map(|size| size - 2.0 * measure.edge_margin_mm);
+    if left_mm[0].min(left_mm[1]) <= 0.0 {
+        document.report(
+            "measure.edge_margin_mm",
+            format!("is {} mm on a part of {:.4} x {:.4} mm", measure.edge_margin_mm, size_mm[0], size_mm[1]),
+            "nothing would be left to measure",
+            "lower it",
+        );
+    } else if let Some(spacing) = measure.spacing_mm {
+        compare_spacing(spacing, left_mm, document);
+    }
+    let lengths = [
+        ("measure.probe_radius_mm", measure.probe_radius_mm, 0.5),
+        ("compensation.spacing_mm", Some(written.compensation.spacing_mm), 1.0),
+        ("compensation.cutoff_mm", written.compensation.cutoff_mm, 2.0),
+        ("grinding.track_mm", written.grinding.track_mm, 1.0),
+    ];
+    for (key, length_mm, share) in lengths {
+        let limit_mm = share * smaller_mm;
+        if let Some(length_mm) = length_mm.filter(|length| *length > limit_mm) {
+            let found = format!("is {length_mm} mm on a part of {:.4} x {:.4} mm", size_mm[0], size_mm[1]);
+            document.report(key, found, &format!("it must be at most {limit_mm:.4} mm here"), "lower it");
+        }
+    }
+    if let (PatternWord::Grid, Some(columns), Some(rows), Some(cutoff)) =
+        (measure.pattern, measure.columns, measure.rows, written.compensation.cutoff_mm)
+    {
+        let apart = |size: f64, n: u32| size / f64::from(n.max(2) - 1);
+        compare_cutoff(cutoff, apart(left_mm[0], columns).max(apart(left_mm[1], rows)), document);
+    } else if let (Some(spacing), Some(cutoff)) = (measure.spacing_mm, written.compensation.cutoff_mm)
+        && spacing <= left_mm[0].min(left_mm[1])
+    {
+        compare_cutoff(cutoff, spacing, document);
+    }
+}
+
+fn compare_spacing(spacing_mm: f64, left_mm: [f64; 2], document: &mut Document) {
+    let points = (left_mm[0] / spacing_mm + 1.0) * (left_mm[1] / spacing_mm + 1.0);
+    let found = format!("is {spacing_mm} mm on {:.4} x {:.4} mm", left_mm[0], left_mm[1]);
+    if points > MOST_POINTS {
+        let allowed = format!("that makes {points:.1e} points; at most {MOST_POINTS:.0e} are allowed");
+        document.report("measure.spacing_mm", found, &allowed, "choose a coarser spacing");
+    } else if spacing_mm > left_mm[0].min(left_mm[1]) {
+        let allowed = "it must be less than the part is wide";
+        document.report("measure.spacing_mm", found, allowed, "choose a finer spacing");
+    }
+}
+
+fn compare_cutoff(cutoff_mm: f64, apart_mm: f64, document: &mut Document) {
+    if cutoff_mm < 2.0 * apart_mm {
+        document.report(
+            "compensation.cutoff_mm",
+            format!("is {cutoff_mm} mm where points are measured {apart_mm:.4} mm apart"),
+            &format!("a wavelength takes two points; it must be at least {:.4} mm", 2.0 * apart_mm),
+            "raise it, or measure more points",
+        );
+    }
+}
+
+/// Compares the wheel and the probe with the sharpest hollow of the surface on their side.
+fn compare_with_curvature(written: &RecipeFile, surface: &DefinedSurface, document: &mut Document) {
+    let hollows = curvature::sharpest_hollows_mm(surface);
+    let (radius_mm, place) = match written.measure.side {
+        SideWord::Above => hollows[0],
+        SideWord::Below => hollows[1],
+        // The side is not known before points are; the flatter one is the least that can be said.
+        SideWord::Auto => {
+            if hollows[0].0 > hollows[1].0 {
+                hollows[0]
+            } else {
+                hollows[1]
+            }
+        }
+    };
+    let ball = match &written.grinding.wheel {
+        Some(WheelTable::Sphere(ball)) => ball.radius_mm,
+        _ => None,
+    };
+    for (key, ball_mm) in
+        [("measure.probe_radius_mm", written.measure.probe_radius_mm), ("grinding.wheel.radius_mm", ball)]
+    {
+        if let Some(ball_mm) = ball_mm.filter(|ball| *ball >= radius_mm) {
+            document.report(
+                key,
+                format!(
+                    "is {ball_mm} mm where the surface is hollow with {radius_mm:.4} mm at ({:.3}, {:.3}) mm",
+                    place[0], place[1]
+                ),
+                "a ball must be smaller than the hollow it works in",
+                "take a smaller one, or check the formula",
+            );
+        }
+    }
+}

@@ -1,0 +1,72 @@
+//! The sharpest hollows of a formula: what a ball must fit into.
+
+use crate::surface::DefinedSurface;
+
+/// Places along each axis of the aperture's box that are looked at.
+const PLACES: usize = 61;
+
+/// Returns the smallest radius of a hollow towards +z and towards -z, and where; infinity where there is none.
+///
+/// Curvature is taken from differences of the exact gradient, at a net of places: good to a few percent, as a check of a recipe
+/// needs it. The registration checks the offset surface itself.
+pub(super) fn sharpest_hollows_mm(surface: &DefinedSurface) -> [(f64, [f64; 2]); 2] {
+    let [[x0, y0], [x1, y1]] = surface.aperture().bounds();
+    let at = |least: f64, most: f64, k: usize| least + (most - least) * k as f64 / (PLACES - 1) as f64;
+    let step_mm = 1e-4 * (x1 - x0).min(y1 - y0);
+    let mut sharpest = [(f64::INFINITY, [0.0; 2]); 2];
+    for j in 0..PLACES {
+        for i in 0..PLACES {
+            let place = [at(x0, x1, i), at(y0, y1, j)];
+            if !surface.aperture().contains(place[0], place[1]) {
+                continue;
+            }
+            let Some([least, most]) = principal_curvatures(surface, place, step_mm) else { continue };
+            // A positive curvature opens towards +z.
+            for (side, curvature) in [most, -least].into_iter().enumerate() {
+                if curvature > 0.0 && 1.0 / curvature < sharpest[side].0 {
+                    sharpest[side] = (1.0 / curvature, place);
+                }
+            }
+        }
+    }
+    sharpest
+}
+
+/// Returns the lesser and the larger principal curvature in 1/mm.
+fn principal_curvatures(surface: &DefinedSurface, [x, y]: [f64; 2], step_mm: f64) -> Option<[f64; 2]> {
+    let gradient = |x: f64, y: f64| surface.formula().sag_and_gradient(x, y).map(|(_, gradient)| gradient);
+    let [p, q] = gradient(x, y)?;
+    let slope = |ahead: [f64; 2], behind: [f64; 2], k: usize| (ahead[k] - behind[k]) / (2.0 * step_mm);
+    let (east, west) = (gradient(x + step_mm, y)?, gradient(x - step_mm, y)?);
+    let (north, south) = (gradient(x, y + step_mm)?, gradient(x, y - step_mm)?);
+    let (r, t) = (slope(east, west, 0), slope(north, south, 1));
+    let s = 0.5 * (slope(east, west, 1) + slope(north, south, 0));
+    // Mean and Gaussian curvature of a height over the plane.
+    let w = 1.0 + p * p + q * q;
+    let mean = ((1.0 + q * q) * r - 2.0 * p * q * s + (1.0 + p * p) * t) / (2.0 * w * w.sqrt());
+    let gauss = (r * t - s * s) / (w * w);
+    let spread = (mean * mean - gauss).max(0.0).sqrt();
+    let both = [mean - spread, mean + spread];
+    both.iter().all(|k| k.is_finite()).then_some(both)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn hollows(surface: &str) -> [f64; 2] {
+        let text = format!("[surface]\n{surface}\n[aperture]\nkind = 'circle'\nradius_mm = 20\n");
+        sharpest_hollows_mm(&DefinedSurface::from_toml(&text).unwrap()).map(|(radius, _)| radius)
+    }
+
+    #[test]
+    fn hollows_of_known_surfaces() {
+        let [up, down] = hollows("kind = 'sphere'\nradius_mm = 50");
+        assert!((up - 50.0).abs() < 1e-3 && down.is_infinite(), "{up} {down}");
+        let [up, down] = hollows("kind = 'sphere'\nradius_mm = -50");
+        assert!((down - 50.0).abs() < 1e-3 && up.is_infinite(), "{up} {down}");
+        let [up, down] = hollows("kind = 'biconic'\nradius_x_mm = 60\nradius_y_mm = -80");
+        assert!((up / 60.0 - 1.0).abs() < 0.01 && (down / 80.0 - 1.0).abs() < 0.01, "{up} {down}");
+        assert_eq!(hollows("kind = 'plane'"), [f64::INFINITY; 2]);
+    }
+}

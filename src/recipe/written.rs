@@ -1,0 +1,580 @@
+//! A recipe as written. The comments here are what an editor shows beside a key; the ranges are what a file is held to.
+
+use schemars::{JsonSchema, Schema, json_schema};
+use serde::Deserialize;
+
+use super::{OnTrouble, StartAt};
+use crate::registration::Loss;
+use crate::surface::Projection;
+
+/// A recipe of Regrind: what one part shall become and how a cell gets it there.
+///
+/// Lengths are millimetres where a key ends with `_mm`, micrometres where it ends with `_um`. Paths are relative to the recipe.
+#[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct RecipeFile {
+    /// The part.
+    #[schemars(extend("x-required" = true))]
+    pub part: PartTable,
+    /// What its surface shall be: a file, or a formula in the tables surface and aperture.
+    #[schemars(extend("x-required" = true))]
+    pub nominal: NominalTable,
+    /// How it is measured.
+    #[schemars(extend("x-required" = true))]
+    pub measure: MeasureTable,
+    /// How the measured points are registered.
+    pub registration: RegistrationTable,
+    /// When the part is good. At least one of pv_um and rms_um.
+    #[schemars(extend("x-required" = true))]
+    pub acceptance: AcceptanceTable,
+    /// How what is left is turned into a correction.
+    #[schemars(extend("x-required" = true))]
+    pub compensation: CompensationTable,
+    /// How the part is ground.
+    #[schemars(extend("x-required" = true))]
+    pub grinding: GrindingTable,
+    /// How often, and what to do when it does not get better.
+    pub cycle: CycleTable,
+    /// The truth of a simulated cell; real cells do not look at it.
+    #[schemars(schema_with = "any_table")]
+    pub simulation: Option<toml::Table>,
+}
+
+/// The part.
+#[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct PartTable {
+    /// Its name.
+    #[schemars(length(min = 1, max = 80), extend("x-required" = true), example = "free-form mirror")]
+    pub name: Option<String>,
+    /// What it is made of.
+    #[schemars(length(min = 1, max = 80))]
+    pub material: Option<String>,
+    /// Number of its drawing.
+    #[schemars(length(min = 1, max = 80))]
+    pub drawing: Option<String>,
+}
+
+/// What the surface shall be: `file`, or the tables surface and aperture.
+#[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct NominalTable {
+    /// File of points (CSV, XYZ, PLY), of a mesh (STL, PLY) or of a surface definition (TOML), in mm.
+    #[schemars(length(min = 1, max = 400), example = "mirror.csv")]
+    pub file: Option<String>,
+    /// What scattered points of a file are projected onto.
+    #[schemars(schema_with = "projection")]
+    pub projection: Option<Projection>,
+    /// A formula z(x, y).
+    #[schemars(schema_with = "surface")]
+    pub surface: Option<toml::Table>,
+    /// The outline of the part in x, y.
+    #[schemars(schema_with = "aperture")]
+    pub aperture: Option<toml::Table>,
+    /// How finely a formula is sampled: one of the two.
+    #[schemars(schema_with = "sampling")]
+    pub sampling: Option<toml::Table>,
+}
+
+/// On which side of the nominal surface the probe's centres lie.
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum SideWord {
+    /// The side on which they fit.
+    #[default]
+    Auto,
+    /// Where the normals point: +z for a height over the plane.
+    Above,
+    /// The other side.
+    Below,
+}
+
+/// Where points are taken.
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum PatternWord {
+    /// On a grid: spacing_mm, or columns and rows.
+    #[default]
+    Grid,
+    /// On a spiral from the middle outwards: spacing_mm or points.
+    Spiral,
+    /// At the points of a file.
+    File,
+    /// Where the operator takes them: points is the least number.
+    Free,
+}
+
+/// How the part is measured.
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct MeasureTable {
+    /// Radius of the probe, or of the reflector of a tracker.
+    #[schemars(range(min = 0.05, max = 50.0), extend("x-required" = true), example = 1.5)]
+    pub probe_radius_mm: Option<f64>,
+    /// On which side of the nominal surface the probe's centres lie.
+    pub side: SideWord,
+    /// Where points are taken.
+    pub pattern: PatternWord,
+    /// Distance of the points of a grid or a spiral.
+    #[schemars(range(min = 0.005, max = 10000.0))]
+    pub spacing_mm: Option<f64>,
+    /// Columns of a grid, along x.
+    #[schemars(range(min = 2, max = 2000))]
+    pub columns: Option<u32>,
+    /// Rows of a grid, along y.
+    #[schemars(range(min = 2, max = 2000))]
+    pub rows: Option<u32>,
+    /// Points of a spiral; least number of points of a free measurement.
+    #[schemars(range(min = 10, max = 1000000))]
+    pub points: Option<u32>,
+    /// File of points in the model frame, in mm.
+    #[schemars(length(min = 1, max = 400))]
+    pub file: Option<String>,
+    /// Distance kept from the edge of the part.
+    #[schemars(range(min = 0.0, max = 10000.0))]
+    pub edge_margin_mm: f64,
+    /// From how far the probe approaches a point, ball surface to point.
+    #[schemars(range(min = 0.05, max = 500.0))]
+    pub approach_mm: f64,
+    /// How far beyond a point the probe searches.
+    #[schemars(range(min = 0.01, max = 500.0))]
+    pub search_mm: f64,
+    /// Speed of the probe while it searches.
+    #[schemars(range(min = 0.05, max = 500.0))]
+    pub speed_mm_s: f64,
+    /// How far above the highest target the probe travels.
+    #[schemars(range(min = 0.5, max = 2000.0))]
+    pub safe_height_mm: f64,
+    /// Least share of the points asked for that must be touched.
+    #[schemars(range(min = 0.1, max = 1.0))]
+    pub minimum_coverage: f64,
+    /// Whether the reference sphere is touched before the part.
+    pub qualify: bool,
+    /// How far the radius found on the reference sphere may be from the probe's.
+    #[schemars(range(min = 0.05, max = 1000.0))]
+    pub radius_tolerance_um: f64,
+}
+
+/// How the nominal surface runs between its points.
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum DistanceWord {
+    /// As the cubic that its corners and normals define.
+    #[default]
+    Curved,
+    /// Flat, as in the paper.
+    Triangle,
+}
+
+/// A coordinate of the pose.
+#[derive(Clone, Copy, Debug, Deserialize, JsonSchema, PartialEq)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum CoordinateWord {
+    X,
+    Y,
+    Z,
+    Rx,
+    Ry,
+    Rz,
+}
+
+/// How the measured points are registered.
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct RegistrationTable {
+    /// How the nominal surface runs between its points.
+    pub distance: DistanceWord,
+    /// How a distance counts: as its square, or less when it is large.
+    #[schemars(schema_with = "loss")]
+    pub loss: Loss,
+    /// A point farther away than this many robust sigmas is an outlier.
+    #[schemars(range(min = 3.0, max = 1000.0))]
+    pub outlier_sigmas: f64,
+    /// Coordinates of the model frame that stay as the fixture has them.
+    #[schemars(length(max = 6))]
+    pub hold: Vec<CoordinateWord>,
+    /// Where to begin: anywhere, or where the cell's fixture holds the part.
+    pub start: StartAt,
+    /// The farthest that the part may lie from where the fixture holds it.
+    #[schemars(range(min = 0.001, max = 100000.0))]
+    pub largest_shift_mm: f64,
+    /// The most that the part may be turned from how the fixture holds it.
+    #[schemars(range(min = 0.0001, max = 180.0))]
+    pub largest_turn_deg: f64,
+    /// Refuse a fit whose rms deviation is above this.
+    #[schemars(range(min = 0.01, max = 1000000.0))]
+    pub max_rms_um: Option<f64>,
+}
+
+/// When the part is good.
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct AcceptanceTable {
+    /// Largest peak to valley of the deviations.
+    #[schemars(range(min = 0.001, max = 100000.0))]
+    pub pv_um: Option<f64>,
+    /// Largest rms of the deviations.
+    #[schemars(range(min = 0.001, max = 100000.0))]
+    pub rms_um: Option<f64>,
+    /// Whether the expanded uncertainty (k = 2) is added before the comparison.
+    pub expanded_uncertainty: bool,
+}
+
+/// How what is left is turned into a correction.
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct CompensationTable {
+    /// Share of the deviation that one cycle takes back; 0 measures and judges only.
+    #[schemars(range(min = 0.0, max = 1.2))]
+    pub gain: f64,
+    /// Wavelengths shorter than this are left alone.
+    #[schemars(range(min = 0.05, max = 10000.0), extend("x-required" = true), example = 8.0)]
+    pub cutoff_mm: Option<f64>,
+    /// The correction is nowhere larger than this.
+    #[schemars(range(min = 0.01, max = 10000.0), extend("x-required" = true), example = 60.0)]
+    pub largest_correction_um: Option<f64>,
+    /// The most that may be taken off anywhere, over all passes.
+    #[schemars(range(min = 0.01, max = 100000.0), extend("x-required" = true), example = 300.0)]
+    pub removal_budget_um: Option<f64>,
+    /// The most that one pass may take off anywhere.
+    #[schemars(range(min = 0.01, max = 10000.0), extend("x-required" = true), example = 60.0)]
+    pub depth_of_cut_um: Option<f64>,
+    /// Distance of the nodes of the map.
+    #[schemars(range(min = 0.01, max = 10000.0))]
+    pub spacing_mm: f64,
+}
+
+/// How the part is ground.
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct GrindingTable {
+    /// The wheel.
+    #[schemars(extend("x-required" = true))]
+    pub wheel: Option<WheelTable>,
+    /// Feed along the track.
+    #[schemars(range(min = 0.1, max = 100000.0), extend("x-required" = true), example = 600.0)]
+    pub feed_mm_min: Option<f64>,
+    /// Distance of the tracks.
+    #[schemars(range(min = 0.001, max = 1000.0), extend("x-required" = true), example = 0.5)]
+    pub track_mm: Option<f64>,
+    /// Passes without in-feed at the end.
+    #[schemars(range(max = 20))]
+    pub spark_out_passes: u16,
+    /// Level of the first pass over the nominal surface; each further pass goes deeper by the depth of cut.
+    #[schemars(range(min = 0.0, max = 10000.0))]
+    pub allowance_um: f64,
+}
+
+/// The wheel.
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[serde(tag = "shape", rename_all = "kebab-case")]
+pub(super) enum WheelTable {
+    /// A ball.
+    Sphere(BallTable),
+    /// A disc with a round rim.
+    Torus(RimTable),
+    /// A ring that cuts with its face.
+    Cup(RimTable),
+}
+
+#[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct BallTable {
+    /// Its radius.
+    #[schemars(range(min = 0.1, max = 1000.0), extend("x-required" = true), example = 12.5)]
+    pub radius_mm: Option<f64>,
+}
+
+#[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct RimTable {
+    /// Radius to the outermost point of the rim, or to the middle of the face.
+    #[schemars(range(min = 0.1, max = 1000.0), extend("x-required" = true), example = 75.0)]
+    pub radius_mm: Option<f64>,
+    /// Radius of the rim's or the face's own curve.
+    #[schemars(range(min = 0.05, max = 1000.0), extend("x-required" = true), example = 2.0)]
+    pub minor_radius_mm: Option<f64>,
+}
+
+/// How often, and what to do when it does not get better.
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct CycleTable {
+    /// Most cycles of grinding and measuring.
+    #[schemars(range(min = 1, max = 100))]
+    pub most_cycles: u16,
+    /// What to do when a cycle brings next to nothing.
+    pub on_stall: OnTrouble,
+    /// What to do when a cycle makes it worse.
+    pub on_divergence: OnTrouble,
+    /// An rms that falls by less than this brings next to nothing.
+    #[schemars(range(min = 0.0, max = 10000.0))]
+    pub stall_um: f64,
+}
+
+impl Default for MeasureTable {
+    fn default() -> Self {
+        Self {
+            probe_radius_mm: None,
+            side: SideWord::Auto,
+            pattern: PatternWord::Grid,
+            spacing_mm: None,
+            columns: None,
+            rows: None,
+            points: None,
+            file: None,
+            edge_margin_mm: 0.5,
+            approach_mm: 2.0,
+            search_mm: 2.0,
+            speed_mm_s: 5.0,
+            safe_height_mm: 10.0,
+            minimum_coverage: 0.95,
+            qualify: true,
+            radius_tolerance_um: 2.0,
+        }
+    }
+}
+
+impl Default for RegistrationTable {
+    fn default() -> Self {
+        Self {
+            distance: DistanceWord::Curved,
+            loss: Loss::None,
+            outlier_sigmas: 6.0,
+            hold: Vec::new(),
+            start: StartAt::Search,
+            largest_shift_mm: 5.0,
+            largest_turn_deg: 5.0,
+            max_rms_um: None,
+        }
+    }
+}
+
+impl Default for AcceptanceTable {
+    fn default() -> Self {
+        Self { pv_um: None, rms_um: None, expanded_uncertainty: true }
+    }
+}
+
+impl Default for CompensationTable {
+    fn default() -> Self {
+        Self {
+            gain: 1.0,
+            cutoff_mm: None,
+            largest_correction_um: None,
+            removal_budget_um: None,
+            depth_of_cut_um: None,
+            spacing_mm: 1.0,
+        }
+    }
+}
+
+impl Default for GrindingTable {
+    fn default() -> Self {
+        Self { wheel: None, feed_mm_min: None, track_mm: None, spark_out_passes: 2, allowance_um: 0.0 }
+    }
+}
+
+impl Default for CycleTable {
+    fn default() -> Self {
+        Self { most_cycles: 5, on_stall: OnTrouble::Stop, on_divergence: OnTrouble::Hold, stall_um: 0.1 }
+    }
+}
+
+fn any_table(_: &mut schemars::SchemaGenerator) -> Schema {
+    json_schema!({ "type": "object", "additionalProperties": true })
+}
+
+fn projection(_: &mut schemars::SchemaGenerator) -> Schema {
+    words(["auto", "xy", "best-fit", "spherical"])
+}
+
+fn loss(_: &mut schemars::SchemaGenerator) -> Schema {
+    words(["none", "huber", "tukey"])
+}
+
+fn words<const N: usize>(words: [&str; N]) -> Schema {
+    json_schema!({ "type": "string", "enum": words.as_slice() })
+}
+
+/// What a key of a formula or an outline takes.
+#[derive(Clone, Copy)]
+enum Takes {
+    Number,
+    /// A radius of curvature, infinite where there is no curvature.
+    Radius,
+    Numbers,
+    Pair,
+    /// Coefficients by the name of their term.
+    Named,
+    /// [i, j, coefficient].
+    Terms,
+    Corners,
+    Words(&'static [&'static str]),
+    Conic,
+    Parent,
+}
+
+/// A key: its name, whether it must stand, what it takes.
+type Key = (&'static str, bool, Takes);
+
+const CONIC: [Key; 2] = [("radius_mm", true, Takes::Radius), ("conic", false, Takes::Number)];
+
+/// The keys of every formula.
+const FORMULAS: [(&str, &[Key]); 11] = {
+    use Takes::*;
+    [
+        ("plane", &[]),
+        ("sphere", &[("radius_mm", true, Radius)]),
+        ("conic", &CONIC),
+        ("asphere", &[("radius_mm", true, Radius), ("conic", false, Number), ("coefficients", false, Named)]),
+        (
+            "off-axis",
+            &[
+                ("distance_mm", true, Number),
+                ("azimuth_deg", false, Number),
+                ("frame", true, Words(&["parent", "shifted", "tilted"])),
+                ("parent", true, Parent),
+            ],
+        ),
+        (
+            "toroid",
+            &[
+                ("radius_x_mm", true, Radius),
+                ("radius_y_mm", true, Radius),
+                ("conic_y", false, Number),
+                ("coefficients", false, Named),
+            ],
+        ),
+        (
+            "biconic",
+            &[
+                ("radius_x_mm", true, Radius),
+                ("radius_y_mm", true, Radius),
+                ("conic_x", false, Number),
+                ("conic_y", false, Number),
+            ],
+        ),
+        ("xy-polynomial", &[("normalisation_radius_mm", true, Number), ("terms", true, Terms), ("base", false, Conic)]),
+        (
+            "zernike",
+            &[
+                ("numbering", true, Words(&["noll", "ansi", "fringe"])),
+                ("normalisation_radius_mm", true, Number),
+                ("coefficients_mm", true, Named),
+                ("normalisation", false, Words(&["orthonormal", "unnormalised"])),
+                ("base", false, Conic),
+            ],
+        ),
+        (
+            "qcon",
+            &[
+                ("radius_mm", true, Radius),
+                ("conic", false, Number),
+                ("normalisation_radius_mm", true, Number),
+                ("coefficients_mm", true, Numbers),
+            ],
+        ),
+        (
+            "qbfs",
+            &[
+                ("radius_mm", true, Radius),
+                ("normalisation_radius_mm", true, Number),
+                ("coefficients_mm", true, Numbers),
+            ],
+        ),
+    ]
+};
+
+/// The keys of every outline.
+const OUTLINES: [(&str, &[Key]); 5] = {
+    use Takes::*;
+    [
+        ("rectangle", &[("centre_mm", false, Pair), ("width_mm", true, Number), ("height_mm", true, Number)]),
+        ("circle", &[("centre_mm", false, Pair), ("radius_mm", true, Number)]),
+        ("ellipse", &[("centre_mm", false, Pair), ("semi_axes_mm", true, Pair)]),
+        (
+            "annulus",
+            &[("centre_mm", false, Pair), ("inner_radius_mm", true, Number), ("outer_radius_mm", true, Number)],
+        ),
+        ("polygon", &[("corners_mm", true, Corners)]),
+    ]
+};
+
+fn surface(_: &mut schemars::SchemaGenerator) -> Schema {
+    by_kind(&FORMULAS)
+}
+
+fn aperture(_: &mut schemars::SchemaGenerator) -> Schema {
+    by_kind(&OUTLINES)
+}
+
+fn sampling(_: &mut schemars::SchemaGenerator) -> Schema {
+    object(None, &[("spacing_mm", false, Takes::Number), ("accuracy_nm", false, Takes::Number)])
+}
+
+fn by_kind(kinds: &[(&str, &[Key])]) -> Schema {
+    let variants: Vec<Schema> = kinds.iter().map(|(kind, keys)| object(Some(kind), keys)).collect();
+    json_schema!({ "oneOf": variants })
+}
+
+fn object(kind: Option<&str>, keys: &[Key]) -> Schema {
+    let mut properties = serde_json::Map::new();
+    if let Some(kind) = kind {
+        properties.insert("kind".into(), serde_json::json!({ "type": "string", "const": kind }));
+    }
+    for (name, required, takes) in keys {
+        let mut schema = takes.schema();
+        if *required {
+            schema.insert("x-required".into(), true.into());
+        }
+        properties.insert((*name).to_owned(), schema.to_value());
+    }
+    json_schema!({ "type": "object", "properties": properties, "additionalProperties": false })
+}
+
+impl Takes {
+    fn schema(self) -> Schema {
+        let number = || json_schema!({ "type": "number" });
+        let pair = || json_schema!({ "type": "array", "items": number(), "minItems": 2, "maxItems": 2 });
+        match self {
+            Self::Number => number(),
+            Self::Radius => json_schema!({ "type": "number", "x-infinite": true }),
+            Self::Numbers => json_schema!({ "type": "array", "items": number() }),
+            Self::Pair => pair(),
+            Self::Named => json_schema!({ "type": "object", "additionalProperties": number() }),
+            Self::Corners => json_schema!({ "type": "array", "items": pair(), "minItems": 3 }),
+            Self::Words(words) => json_schema!({ "type": "string", "enum": words }),
+            Self::Conic => object(None, &CONIC),
+            Self::Parent => {
+                let sections = |kinds: &(&str, &[Key])| kinds.0 == "off-axis";
+                by_kind(&FORMULAS.iter().filter(|kind| !sections(kind)).copied().collect::<Vec<_>>())
+            }
+            Self::Terms => {
+                let power = json_schema!({ "type": "integer", "minimum": 0, "maximum": 60 });
+                let term = [power.clone(), power, number()];
+                json_schema!({
+                    "type": "array",
+                    "items": { "type": "array", "prefixItems": term.as_slice(), "minItems": 3, "maxItems": 3 }
+                })
+            }
+        }
+    }
+}
+
+/// Keeps the words that a schema gives by hand the ones that are read.
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_word_given_by_hand_is_read() {
+        let read = |word: &str| toml::Value::String(word.into());
+        for word in ["auto", "xy", "best-fit", "spherical"] {
+            assert!(read(word).try_into::<Projection>().is_ok());
+        }
+        for word in ["none", "huber", "tukey"] {
+            assert!(read(word).try_into::<Loss>().is_ok());
+        }
+    }
+}
