@@ -77,8 +77,8 @@ pub struct CmmSpec {
 impl Default for CmmSpec {
     fn default() -> Self {
         Self {
-            translation_mm: [0.8, -0.5, 0.3],
-            rotation_deg: [0.2, -0.15, 0.4],
+            translation_mm: [0.25, -0.2, 0.15],
+            rotation_deg: [0.1, -0.08, 0.08],
             loading_shift_um: 20.0,
             loading_turn_deg: 0.005,
             noise_um: 0.3,

@@ -9,6 +9,12 @@
 //!  form    what grinding left on it: a smooth random error along the normal
 //!  probe   a ball that touches the part, in a frame of its own, with noise and outliers
 //!
+//!  world      the truth in one table, the two machines that share it, and queries for tests
+//!  part       the part as it really is, and exact contact with it
+//!  process    the grinder: what a pass leaves, node by node along its path
+//!  cmm        the measuring machine: what it reports of a plan
+//!  payload    the bytes of docs/modbus.md
+//!
 //!  body       what the physics of one machine must be able to do
 //!  words      how values lie in registers
 //!  transfer   payloads in and results out, a page at a time

@@ -93,10 +93,10 @@ pub struct GrinderSpec {
 impl Default for GrinderSpec {
     fn default() -> Self {
         Self {
-            wheel_radius_error_um: 120.0,
+            wheel_radius_error_um: 90.0,
             setting_error_um: [12.0, -9.0],
-            straightness_x_um: [5.4, 3.6],
-            straightness_y_um: [-3.4, 2.0],
+            straightness_x_um: [-6.0, -4.5],
+            straightness_y_um: [-4.5, -3.0],
             periodic_um: 0.4,
             periodic_pitch_mm: 20.0,
             waviness_um: 0.8,

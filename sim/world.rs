@@ -43,7 +43,7 @@ impl Default for WorldSpec {
     fn default() -> Self {
         Self {
             seed: 1,
-            speed: 500.0,
+            speed: 1000.0,
             part: PartSpec::default(),
             grinder: GrinderSpec::default(),
             cmm: CmmSpec::default(),

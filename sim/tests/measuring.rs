@@ -223,6 +223,16 @@ fn a_stopped_measurement_says_so_of_every_target() {
 }
 
 #[test]
+fn in_the_default_fixture_all_points_half_a_millimetre_within_the_edge_are_found() {
+    for seed in 1..=5 {
+        let world = world(WorldSpec { seed, ..WorldSpec::default() });
+        let (_, records) = measure(&mut world.cmm(), &plan(&world, &net([50.5, 30.5], 50.5 / 30.0)));
+        let lost = records.iter().filter(|r| r.status != Status::Touched).count();
+        assert_eq!(lost, 0, "of {} at seed {seed}", records.len());
+    }
+}
+
+#[test]
 fn eighteen_hundred_points_are_quick() {
     let world = world(WorldSpec::default());
     let plan = plan(&world, &net([49.0, 29.0], 1.77));
