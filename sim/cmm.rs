@@ -430,3 +430,10 @@ impl Body for Cmm {
         locked(&self.world).spec.cmm.part_temperature_c
     }
 }
+
+impl Drop for Cmm {
+    /// A machine that is taken away keeps nothing.
+    fn drop(&mut self) {
+        locked(&self.world).release(Kind::Cmm);
+    }
+}

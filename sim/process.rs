@@ -95,11 +95,11 @@ impl Default for GrinderSpec {
         Self {
             wheel_radius_error_um: 120.0,
             setting_error_um: [12.0, -9.0],
-            straightness_x_um: [5.6, 3.4],
+            straightness_x_um: [5.4, 3.6],
             straightness_y_um: [-3.4, 2.0],
             periodic_um: 0.4,
             periodic_pitch_mm: 20.0,
-            waviness_um: 0.9,
+            waviness_um: 0.8,
             waviness_correlation_mm: 18.0,
             following_um: 0.1,
             wear_um: 4.0,
@@ -316,7 +316,7 @@ fn raster(part: &Part, pass: &Pass) -> (Vec<(f64, u32)>, f64) {
     for (k, [x, y]) in part.height.nodes().enumerate() {
         if (x0..=x1).contains(&x) && (y0..=y1).contains(&y) {
             let track = ((y - y0) / spacing).round().min(last);
-            let along = if track as u64 % 2 == 0 { x - x0 } else { x1 - x };
+            let along = if (track as u64).is_multiple_of(2) { x - x0 } else { x1 - x };
             order.push((track * (length + spacing) + along, k as u32));
         }
     }
@@ -418,6 +418,23 @@ impl Grinder {
     }
 }
 
+/// Returns the strokes of a pass, and the time they take together.
+fn strokes(roughing: u32, pass: &Pass, stroke_mm: f64) -> (Vec<Stroke>, f64) {
+    let feed_mm_s = pass.feed_mm_min / 60.0;
+    let above = (1..=roughing).rev().map(|k| Some(f64::from(k) * pass.depth_of_cut_mm));
+    let finishing = (0..=pass.spark_out).map(|_| None);
+    let mut begin_s = 0.0;
+    let each = above.chain(finishing).map(|above_mm| {
+        let feed_mm_s = if above_mm.is_some() { ROUGHING_FEED * feed_mm_s } else { feed_mm_s };
+        let stroke = Stroke { begin_s, feed_mm_s, above_mm };
+        begin_s += stroke_mm / feed_mm_s;
+        stroke
+    });
+    let strokes = each.collect();
+    (strokes, begin_s)
+}
+
+/// Makes a pass ready for the part as it stands.
 fn run(state: &State, (job, cycle): (u32, u16), map_payload: &Payload, map: &Map, pass: Pass) -> Result<Run, Refusal> {
     let fixed_mm = fixed_mm(state, map, &pass);
     let (order, stroke_mm) = raster(&state.part, &pass);
@@ -428,20 +445,8 @@ fn run(state: &State, (job, cycle): (u32, u16), map_payload: &Payload, map: &Map
         let limit = format!("up to {MOST_STROKES}; the part stands {proud_mm:.4} mm proud");
         return Err(outside("number of strokes", needed + f64::from(pass.spark_out), &limit));
     }
-    let feed_mm_s = pass.feed_mm_min / 60.0;
-    let roughing = needed as u32 - 1;
-    let mut strokes: Vec<Stroke> = Vec::new();
-    let mut begin_s = 0.0;
-    for k in (1..=roughing).rev() {
-        let above_mm = Some(f64::from(k) * pass.depth_of_cut_mm);
-        strokes.push(Stroke { begin_s, feed_mm_s: ROUGHING_FEED * feed_mm_s, above_mm });
-        begin_s += stroke_mm / (ROUGHING_FEED * feed_mm_s);
-    }
-    let finishing_s = begin_s;
-    for _ in 0..=pass.spark_out {
-        strokes.push(Stroke { begin_s, feed_mm_s, above_mm: None });
-        begin_s += stroke_mm / feed_mm_s;
-    }
+    let (strokes, total_s) = strokes(needed as u32 - 1, &pass, stroke_mm);
+    let finishing_s = strokes.iter().find(|s| s.above_mm.is_none()).map_or(total_s, |s| s.begin_s);
     Ok(Run {
         job,
         cycle,
@@ -452,7 +457,7 @@ fn run(state: &State, (job, cycle): (u32, u16), map_payload: &Payload, map: &Map
         fixed_mm,
         strokes,
         stroke_mm,
-        total_s: begin_s,
+        total_s,
         finishing_s,
         heat_at_begin: state.heat,
         before_mm: Vec::new(),
@@ -604,6 +609,13 @@ impl Body for Grinder {
 
     fn temperature_c(&self) -> f64 {
         locked(&self.world).spec.cmm.part_temperature_c
+    }
+}
+
+impl Drop for Grinder {
+    /// A machine that is taken away keeps nothing.
+    fn drop(&mut self) {
+        locked(&self.world).release(Kind::Grinder);
     }
 }
 

@@ -26,6 +26,7 @@ pub mod measuring;
 pub mod recipe;
 pub mod registration;
 pub mod report;
+pub mod setup;
 pub mod surface;
 
 /// The example of the README is run as a test.

@@ -582,6 +582,22 @@ fn the_command_tells_problems_in_words_and_as_json() {
 }
 
 #[test]
+fn the_truth_of_a_simulated_cell_is_checked_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("recipe.toml");
+    for (to, key, words) in [
+        ("stock_um = -1.0", "`simulation.part.stock_um` is -1", "0 to 10000"),
+        ("stok_um = 200.0", "`simulation`", "stok_um"),
+    ] {
+        fs::write(&path, changed(RECIPE, "stock_um = 200.0", to)).unwrap();
+        let output = Command::new(env!("CARGO_BIN_EXE_regrind")).arg("check").arg(&path).output().unwrap();
+        let error = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{error}");
+        assert!(error.contains(key) && error.contains(words), "{error}");
+    }
+}
+
+#[test]
 fn the_committed_schemas_are_the_ones_in_force() {
     for (name, schema) in [("recipe", regrind::recipe::json_schema()), ("cell", regrind::config::json_schema())] {
         let committed = fs::read_to_string(root().join(format!("docs/{name}.schema.json"))).unwrap();

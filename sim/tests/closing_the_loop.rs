@@ -55,7 +55,6 @@ fn cycles(spec: WorldSpec, count: u16, gain: f64) -> Vec<(f64, f64)> {
 fn one_compensation_does_what_the_trials_did() {
     for seed in 1..=6 {
         let figures = cycles(WorldSpec { seed, ..WorldSpec::default() }, 3, 1.0);
-        println!("seed {seed}: PV/RMS um {figures:.2?}");
         let (first, second) = (figures[0], figures[1]);
         assert!((20.0..35.0).contains(&first.0) && (4.0..6.0).contains(&first.1), "seed {seed}: {figures:.2?}");
         assert!(second.0 <= 7.0 && second.1 <= 1.0, "seed {seed}: {figures:.2?}");

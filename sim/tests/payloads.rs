@@ -220,6 +220,29 @@ fn a_wrong_pass_is_refused_for_its_reason() {
 }
 
 #[test]
+fn bytes_at_random_never_panic() {
+    use rand::RngExt;
+    const SEED: u64 = 20;
+    let mut rng = regrind_sim::rng(SEED);
+    let originals = [plan().1, map().1, pass().1];
+    for round in 0..20_000 {
+        let mut bytes = originals[round % 3].clone();
+        for _ in 0..rng.random_range(1..6) {
+            let at = rng.random_range(0..bytes.len());
+            bytes[at] = rng.random();
+        }
+        bytes.truncate(rng.random_range(0..=bytes.len() * 8).max(1));
+        if let Ok(map) = Map::decode(&bytes) {
+            let value = map.at(rng.random_range(-1e3..1e3), rng.random_range(-1e3..1e3));
+            assert!(value.abs() <= map.largest_mm() * (1.0 + 1e-12), "seed {SEED}, round {round}: {value}");
+        }
+        let finite = |plan: Plan| plan.targets.iter().all(|t| t.normal.iter().all(|c| c.is_finite()));
+        assert!(Plan::decode(&bytes).map_or(true, finite), "seed {SEED}, round {round}");
+        let _ = (Pass::decode(&bytes), PassRecord::decode(&bytes), decode_points(&bytes, None));
+    }
+}
+
+#[test]
 fn a_map_is_bilinear_within_and_flat_beyond() {
     let map = map().0;
     let cases = [

@@ -9,6 +9,7 @@ use miette::{Diagnostic, GraphicalReportHandler, GraphicalTheme, LabeledSpan, Na
 use regrind::config::CellConfig;
 use regrind::document::{Problem, Problems};
 use regrind::recipe::{NominalSource, Pattern, Recipe};
+use regrind_sim::world::WorldSpec;
 use serde::Serialize;
 use thiserror::Error;
 
@@ -19,7 +20,8 @@ use super::nominal::{self, ProjectionName};
 /// Check recipes and cell files: every problem with line, column and remedy
 #[derive(Args, Debug)]
 #[command(after_help = "\
-A file with a table [cell] is a cell file, any other a recipe. Of a recipe the files that it names are read too.
+A file with a table [cell] is a cell file, any other a recipe. Of a recipe the files that it
+names and the truth of a simulated cell are read too.
 
 Example:
   regrind check recipes/*.toml config/*.toml
@@ -87,6 +89,7 @@ fn check(path: &Path) -> (&'static str, Result<String, Problems>) {
     }
     let checked = Recipe::read(path).and_then(|recipe| {
         check_files(&recipe)?;
+        check_simulation(&recipe)?;
         Ok(hex(recipe.source_sha256()))
     });
     ("recipe", checked)
@@ -123,6 +126,19 @@ fn check_files(recipe: &Recipe) -> Result<(), Problems> {
         add("measure.file", failure.into());
     }
     problems.map_or(Ok(()), Err)
+}
+
+/// Reads the truth of a simulated cell as the simulator would.
+fn check_simulation(recipe: &Recipe) -> Result<(), Problems> {
+    let Some(table) = recipe.simulation.clone() else { return Ok(()) };
+    let remedy = "correct it, or leave it out: every key has a usual value";
+    let world: WorldSpec = toml::Value::Table(table)
+        .try_into()
+        .map_err(|error: toml::de::Error| recipe.problem("simulation", error.message().trim(), "", remedy))?;
+    world.check().map_err(|error| {
+        let (key, allowed) = (format!("simulation.{}", error.key), format!("allowed is {}", error.limit));
+        recipe.problem(&key, &format!("is {}", error.value), &allowed, remedy)
+    })
 }
 
 /// Shows problems: with the lines they stand in on a terminal, one line each elsewhere.

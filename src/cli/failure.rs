@@ -38,6 +38,30 @@ pub(super) enum Failure {
     Initial { path: PathBuf, reason: String },
     #[error("{bad} of {files} files {} problems; they are listed above", if *bad == 1 { "has" } else { "have" })]
     Checked { bad: usize, files: usize },
+    #[error(transparent)]
+    Setup(regrind::setup::SetupError),
+    #[error("{path}: {reason}")]
+    Simulation { path: PathBuf, reason: String },
+    #[error(transparent)]
+    Journal(regrind::journal::JournalError),
+    #[error("{path}: {wire} cannot be opened: {source}; check the cell file and the machine")]
+    Wire { path: PathBuf, wire: String, source: io::Error },
+    #[error(
+        "{path}: the two machines are reached in ways that do not go together; give both a Modbus wire, or both file exchange"
+    )]
+    WireKind { path: PathBuf },
+    #[error("{path}: no control socket can be made there: {source}; give --runs a local folder with a shorter name")]
+    ControlSocket { path: PathBuf, source: io::Error },
+    #[error("{path}: no run was made there; name the folder of a run")]
+    NoRun { path: PathBuf },
+    #[error("{path}: no cell runs there ({source}); `regrind audit show` tells how the run ended")]
+    NotRunning { path: PathBuf, source: io::Error },
+    #[error("the cell did not take the order: {words}")]
+    OrderRefused { words: String },
+    #[error("`confirm over` needs --machine and --evidence: which machine was looked at, and what was seen")]
+    Evidence,
+    #[error("the run did not come to its end: {reason}")]
+    Ended { reason: String },
     #[error("the result cannot be told: {what} is not a finite number; please report it with the files that led to it")]
     NotFinite { what: &'static str },
     /// The input was good and the place was writable before; now it is not.
@@ -51,7 +75,12 @@ impl Failure {
     /// Returns the exit code of the program.
     pub(super) fn exit_code(&self) -> u8 {
         match self {
-            Self::NotFinite { .. } | Self::NotSaved(_) | Self::Terminal(_) => FAULT,
+            Self::NotFinite { .. }
+            | Self::NotSaved(_)
+            | Self::Terminal(_)
+            | Self::OrderRefused { .. }
+            | Self::Wire { .. }
+            | Self::Ended { .. } => FAULT,
             _ => BAD_INPUT,
         }
     }

@@ -2,11 +2,17 @@
 
 mod accuracy;
 mod check;
+mod control;
 mod failure;
 mod initial;
 mod nominal;
+mod plan;
 mod register;
+mod run;
 mod schema;
+mod show;
+mod simulate;
+mod simulated;
 mod words;
 
 use std::io::{self, Write};
@@ -14,6 +20,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
+use control::Order;
 use failure::Failure;
 
 /// Closed-loop grinding: register measured probe centres to the offset of a nominal surface.
@@ -26,6 +33,21 @@ struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Run(run::Arguments),
+    Plan(plan::Arguments),
+    Simulate(simulate::Arguments),
+    /// Hold a running cell at the next safe place
+    Hold(control::Arguments),
+    /// Let a held cell go on
+    Resume(control::Arguments),
+    /// End a running cell in order
+    Stop(control::Arguments),
+    /// End a running cell at once: the safe sequence only
+    Abort(control::Arguments),
+    /// Tell a running cell what a person has seen
+    Confirm(control::Confirmation),
+    /// Tell how a running cell is
+    Status(control::Arguments),
     Register(register::Arguments),
     Accuracy(accuracy::Arguments),
     Check(check::Arguments),
@@ -59,6 +81,15 @@ fn run() -> ExitCode {
         }
     };
     let ended = match arguments.command {
+        Command::Run(arguments) => run::run(&arguments),
+        Command::Plan(arguments) => plan::run(&arguments),
+        Command::Simulate(arguments) => simulate::run(&arguments),
+        Command::Hold(arguments) => control::order(&arguments, Order::Hold),
+        Command::Resume(arguments) => control::order(&arguments, Order::Resume),
+        Command::Stop(arguments) => control::order(&arguments, Order::Stop),
+        Command::Abort(arguments) => control::order(&arguments, Order::Abort),
+        Command::Confirm(arguments) => control::confirm(&arguments),
+        Command::Status(arguments) => control::order(&arguments, Order::Status),
         Command::Register(arguments) => register::run(&arguments),
         Command::Accuracy(arguments) => accuracy::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
@@ -72,6 +103,11 @@ fn run() -> ExitCode {
             ExitCode::from(failure.exit_code())
         }
     }
+}
+
+/// Returns what asynchronous commands run on.
+fn runtime() -> Result<tokio::runtime::Runtime, Failure> {
+    tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().map_err(Failure::Terminal)
 }
 
 /// Writes text to the terminal; a reader that has gone away is no fault.

@@ -359,6 +359,8 @@ impl DeviceError {
                 | Self::Frozen { .. }
                 | Self::NotAcknowledged { .. }
                 | Self::StartUnknown { .. }
+                // Busy, a gateway that finds nobody, a memory error: asked again it may go well.
+                | Self::Exception { code: 4 | 5 | 6 | 8 | 10 | 11, .. }
         )
     }
 }

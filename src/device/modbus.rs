@@ -546,8 +546,13 @@ impl ModbusMachine {
         let mut tries = 0;
         loop {
             self.announce::<P>(slot).await?;
-            self.send_pages::<P>(&words, interrupt).await?;
-            match self.taken::<P>(slot).await {
+            let sent = self.send_pages::<P>(&words, interrupt).await;
+            let taken = match sent {
+                Ok(()) => self.taken::<P>(slot).await,
+                Err(error @ (DeviceError::Interrupted { .. } | DeviceError::Unreachable { .. })) => return Err(error),
+                Err(error) => Err(error),
+            };
+            match taken {
                 Ok(()) => break,
                 Err(error) if !error.is_link() || tries >= self.retries => return Err(error),
                 Err(_) => tries += 1,
@@ -586,7 +591,15 @@ impl ModbusMachine {
             let mut page = self.station.writer();
             page.u32(done).u16(data.len() as u16).zeros(5);
             let page = [page.words(), data].concat();
-            self.station.write("inbox page", address, &page).await?;
+            match self.station.write("inbox page", address, &page).await {
+                // Out of turn: an older write has come late and emptied the inbox.
+                Err(DeviceError::Exception { code: 3, .. }) => {
+                    let state = self.station.read("inbox state", self.station.map.inbox_state, 12).await?;
+                    let next = self.station.registers(&state).u32(2);
+                    return Err(self.station.distrust("number of the page it expects", done.into(), next.into()).await);
+                }
+                written => written?,
+            }
         }
         Ok(())
     }
@@ -764,9 +777,9 @@ impl ModbusMachine {
         let map = self.station.map;
         let mut select = self.station.writer();
         select.u32(page);
-        self.station.write("outbox select", map.outbox_select, select.words()).await?;
         let began = Instant::now();
         loop {
+            self.station.write("outbox select", map.outbox_select, select.words()).await?;
             let read = self.station.read("outbox page", map.outbox_page, 4 + due as u16).await?;
             let found = self.station.registers(&read).u32(0);
             if found == page && usize::from(read[2]) == due {

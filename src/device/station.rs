@@ -6,7 +6,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::time::Instant;
+use tokio::time::{Instant, sleep};
 
 use super::codec::{Registers, WordOrder, Writer};
 use super::link::{Ask, Link, LinkFault};
@@ -19,6 +19,8 @@ const MAGIC: [u16; 2] = [0x5247, 0x4431];
 const VERSION: u16 = 1;
 /// Registers of the identity block.
 const IDENTITY_REGISTERS: u16 = 32;
+/// A machine that says it is busy is asked again after this.
+const BUSY_PAUSE: Duration = Duration::from_millis(50);
 /// The sentinels that prove the order of words.
 const SENTINEL_WHOLE: u32 = 0x1234_5678;
 const SENTINEL_REAL: f64 = -2.5e-7;
@@ -116,7 +118,12 @@ impl Station {
             match self.attempt(what, address, &ask).await {
                 Ok(words) => return Ok(words),
                 Err(error) if self.gives_up(&error, tries, began) => return Err(error),
-                Err(_) => self.link.count_retry(),
+                Err(error) => {
+                    self.link.count_retry();
+                    if matches!(error, DeviceError::Exception { .. }) {
+                        sleep(BUSY_PAUSE).await;
+                    }
+                }
             }
             tries += 1;
         }

@@ -70,6 +70,31 @@ pub fn remove_socket(path: &Path) -> std::io::Result<()> {
     fs::remove_file(path)
 }
 
+/// Places a link to a device, replacing one that an earlier simulation left; anything else of that name is left alone.
+///
+/// # Errors
+/// A folder that cannot be written, and something of that name that is no link.
+pub fn place_link(device: &Path, link: &Path) -> std::io::Result<()> {
+    if fs::symlink_metadata(link).is_ok() {
+        remove_link(link)?;
+    }
+    #[cfg(unix)]
+    return std::os::unix::fs::symlink(device, link);
+    #[cfg(not(unix))]
+    Err(std::io::Error::from(std::io::ErrorKind::Unsupported))
+}
+
+/// Removes a link; anything else of that name is left alone.
+///
+/// # Errors
+/// A folder that cannot be written, and something of that name that is no link.
+pub fn remove_link(link: &Path) -> std::io::Result<()> {
+    if !fs::symlink_metadata(link)?.file_type().is_symlink() {
+        return Err(std::io::Error::from(std::io::ErrorKind::AlreadyExists));
+    }
+    fs::remove_file(link)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

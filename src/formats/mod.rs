@@ -21,7 +21,7 @@ pub use document::{
     Alternative, MeasuredInput, NominalInput, Program, RegistrationDocument, StandardUncertainty, save_registration,
 };
 pub use error::FormatError;
-pub use folder::{ResultFolder, remove_socket};
+pub use folder::{ResultFolder, place_link, remove_link, remove_socket};
 pub use map::{write_correction, write_error_map};
 pub use number::LIMIT_MM;
 pub use ply::{PlyFile, parse_ply, read_ply};
@@ -56,6 +56,26 @@ enum Kind {
     Ply,
     Stl,
     Toml,
+}
+
+/// Reads a nominal surface as [`read_nominal`] does, and returns the SHA-256 of the file with it.
+///
+/// # Errors
+/// Those of [`read_nominal`].
+pub fn read_nominal_with_identity(path: impl AsRef<Path>) -> Result<(NominalFile, [u8; 32]), FormatError> {
+    use sha2::Digest;
+    let path = path.as_ref();
+    let nominal = read_nominal(path)?;
+    let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
+    let mut hash = sha2::Sha256::new();
+    let mut file = std::fs::File::open(path).map_err(unreadable)?;
+    let mut chunk = vec![0; 1 << 16];
+    loop {
+        match std::io::Read::read(&mut file, &mut chunk).map_err(unreadable)? {
+            0 => return Ok((nominal, hash.finalize().into())),
+            n => hash.update(&chunk[..n]),
+        }
+    }
 }
 
 /// Reads a nominal surface: points as text or PLY, a mesh as PLY or STL, or a TOML definition.

@@ -1,0 +1,144 @@
+//! `regrind hold | resume | stop | abort | confirm | status`: a running cell from another terminal.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use regrind::cell::Device;
+use regrind::drive::{Reply, Request, ask};
+
+use super::Outcome;
+use super::failure::Failure;
+
+/// An order to a running cell.
+#[derive(Args, Debug)]
+#[command(after_help = "\
+RUN is the folder of a run; without it, the newest under runs/. Who gave the order is recorded as the operating
+system knows them.
+
+Example:
+  regrind hold runs/freeform-mirror-20260704T120000 --reason \"coolant looks low\"
+
+Exit codes: 0 the order was taken; 2 no such run; 3 the cell refused the order.")]
+pub(super) struct Arguments {
+    /// Folder of the run
+    #[arg(value_name = "RUN")]
+    run: Option<PathBuf>,
+    /// Why, for the record
+    #[arg(long, value_name = "TEXT", default_value = "")]
+    reason: String,
+    /// Print the answer as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Which order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Order {
+    Hold,
+    Resume,
+    Stop,
+    Abort,
+    Status,
+}
+
+/// What a person confirms to a running cell.
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Examples:
+  regrind confirm loaded
+  regrind confirm over --machine grinder --evidence \"stands, wheel up, one pass was ground\"
+
+Exit codes: 0 it was taken; 2 no such run; 3 the cell refused it.")]
+pub(super) struct Confirmation {
+    /// What is so
+    #[arg(value_enum)]
+    what: What,
+    /// Folder of the run
+    #[arg(value_name = "RUN")]
+    run: Option<PathBuf>,
+    /// The machine that was looked at, for `over`
+    #[arg(long, value_enum)]
+    machine: Option<MachineName>,
+    /// What was seen at the machine, for `over`
+    #[arg(long, value_name = "TEXT", default_value = "")]
+    evidence: String,
+    /// Print the answer as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum What {
+    /// The right part is loaded and clamped
+    Loaded,
+    /// A job that no machine can tell about is over: the machine stands, clear of the part
+    Over,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum MachineName {
+    Cmm,
+    Grinder,
+}
+
+pub(super) fn order(arguments: &Arguments, order: Order) -> Result<Outcome, Failure> {
+    let reason = arguments.reason.clone();
+    let request = match order {
+        Order::Hold => Request::Hold { reason },
+        Order::Resume => Request::Resume { reason },
+        Order::Stop => Request::Stop { reason },
+        Order::Abort => Request::Abort { reason },
+        Order::Status => Request::Status,
+    };
+    give(arguments.run.as_deref(), &request, arguments.json)
+}
+
+pub(super) fn confirm(arguments: &Confirmation) -> Result<Outcome, Failure> {
+    let request = match (arguments.what, arguments.machine) {
+        (What::Loaded, _) => Request::Loaded,
+        (What::Over, Some(machine)) if !arguments.evidence.trim().is_empty() => Request::Over {
+            device: match machine {
+                MachineName::Cmm => Device::Cmm,
+                MachineName::Grinder => Device::Grinder,
+            },
+            evidence: arguments.evidence.clone(),
+        },
+        (What::Over, _) => return Err(Failure::Evidence),
+    };
+    give(arguments.run.as_deref(), &request, arguments.json)
+}
+
+fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<Outcome, Failure> {
+    let folder = match run {
+        Some(run) => run.to_owned(),
+        None => newest(Path::new("runs")).ok_or_else(|| Failure::NoRun { path: "runs".into() })?,
+    };
+    let reply = ask(&folder, request).map_err(|source| Failure::NotRunning { path: folder.clone(), source })?;
+    show(&reply, request, json)?;
+    if reply.accepted { Ok(Outcome::Accepted) } else { Err(Failure::OrderRefused { words: reply.words }) }
+}
+
+fn show(reply: &Reply, request: &Request, json: bool) -> Result<(), Failure> {
+    if json {
+        return super::print_json(reply);
+    }
+    if *request != Request::Status {
+        return if reply.accepted { super::print(&format!("{}\n", reply.words)) } else { Ok(()) };
+    }
+    let text = |key: &str| reply.status.get(key).map(|v| v.as_str().map_or(v.to_string(), str::to_owned));
+    let marked = if reply.status["simulation"] == true { "SIMULATION  " } else { "" };
+    let mut words =
+        format!("{marked}{}, cycle {}\n", text("words").unwrap_or_default(), text("cycle").unwrap_or_default());
+    for row in reply.status["cycles"].as_array().into_iter().flatten() {
+        let figure = |key: &str| row[key].as_f64().unwrap_or(f64::NAN);
+        words += &format!("cycle {}: PV {:.2} um, rms {:.3} um\n", row["cycle"], figure("pv_um"), figure("rms_um"));
+    }
+    super::print(&words)
+}
+
+/// Returns the run folder that was made last.
+pub(super) fn newest(runs: &Path) -> Option<PathBuf> {
+    let folders = std::fs::read_dir(runs).ok()?.filter_map(io::Result::ok).filter(|entry| entry.path().is_dir());
+    folders.max_by_key(|entry| entry.metadata().and_then(|m| m.modified()).ok()).map(|entry| entry.path())
+}

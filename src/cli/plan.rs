@@ -1,0 +1,107 @@
+//! `regrind plan`: what a run would command, checked against every limit, without a device.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use regrind::config::CellConfig;
+use regrind::recipe::Recipe;
+use regrind::setup;
+use serde::Serialize;
+
+use super::Outcome;
+use super::failure::Failure;
+use super::run::or_show;
+use super::words::{counted, three_digits};
+
+/// Print what a run would command, checked against every limit, without a device
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Example:
+  regrind plan recipes/freeform-mirror.toml
+
+Exit codes: 0 everything is within its limits; 2 bad recipe or cell; 3 fault.")]
+pub(super) struct Arguments {
+    /// Recipe of the part
+    #[arg(value_name = "RECIPE")]
+    recipe: PathBuf,
+    /// Cell that would make it
+    #[arg(long, value_name = "FILE", default_value = "config/sim.toml")]
+    cell: PathBuf,
+    /// Print JSON instead of words
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Serialize)]
+struct Document {
+    simulation: bool,
+    part: String,
+    part_identity: String,
+    nominal_points: usize,
+    targets: usize,
+    sphere_points: usize,
+    most_cycles: u32,
+    first_level_um: f64,
+    depth_of_cut_um: f64,
+    last_level_um: f64,
+    removal_budget_um: f64,
+    tracks: u64,
+    path_mm: f64,
+    grinding_minutes: f64,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let recipe = or_show(Recipe::read(&arguments.recipe))?;
+    let cell = or_show(CellConfig::read(&arguments.cell))?;
+    let (task, plan) = setup::prepare(&recipe, &cell).map_err(Failure::Setup)?;
+    let [width, depth] = [task.pass.x_mm, task.pass.y_mm].map(|[low, high]| high - low);
+    let tracks = (depth / task.pass.track_spacing_mm).floor() + 1.0;
+    let path_mm = tracks * width * f64::from(1 + task.pass.spark_out_passes);
+    let depth_um = 1e3 * task.limits.depth_of_cut_mm;
+    let passes = f64::from(plan.max_cycles.max(1) - 1);
+    let first_um = 1e3 * task.limits.allowance_mm;
+    let document = Document {
+        simulation: cell.simulated,
+        part: recipe.part.name.clone(),
+        part_identity: task.part_identity.iter().map(|b| format!("{b:02x}")).collect(),
+        nominal_points: task.nominal.len(),
+        targets: task.targets.len(),
+        sphere_points: task.sphere.map_or(0, |s| s.points),
+        most_cycles: plan.max_cycles,
+        first_level_um: first_um,
+        depth_of_cut_um: depth_um,
+        last_level_um: first_um - (passes * depth_um).min(1e3 * task.limits.removal_budget_mm),
+        removal_budget_um: 1e3 * task.limits.removal_budget_mm,
+        tracks: tracks as u64,
+        path_mm,
+        grinding_minutes: path_mm / task.pass.feed_mm_min,
+    };
+    if arguments.json {
+        super::print_json(&document)?;
+    } else {
+        super::print(&words(&document))?;
+    }
+    Ok(Outcome::Accepted)
+}
+
+fn words(d: &Document) -> String {
+    let n = three_digits;
+    let marked = if d.simulation { "SIMULATION  " } else { "" };
+    format!(
+        "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\n\
+         level       {} um over the nominal surface first, {} um deeper each pass, {} um at the least\nbudget      {} um in all\ncycles      at most {}\n",
+        d.part,
+        counted(d.nominal_points, "point"),
+        d.part_identity,
+        counted(d.targets, "point"),
+        d.sphere_points,
+        d.tracks,
+        n(d.path_mm),
+        n(d.grinding_minutes),
+        n(d.first_level_um),
+        n(d.depth_of_cut_um),
+        n(d.last_level_um),
+        n(d.removal_budget_um),
+        d.most_cycles
+    )
+}

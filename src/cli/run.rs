@@ -1,0 +1,224 @@
+//! `regrind run`: grind, measure, register, judge, compensate, until the part is accepted or the loop must stop.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::Args;
+use regrind::cell::{Actor, Ending};
+use regrind::config::{CellConfig, Link};
+use regrind::device::{ModbusCmm, ModbusGrinder};
+use regrind::document::Problems;
+use regrind::drive::{Drive, Orders, Request, Run};
+use regrind::journal::{Header, Journal};
+use regrind::recipe::Recipe;
+use regrind::setup;
+use serde_json::json;
+use tokio::sync::mpsc;
+
+use super::failure::Failure;
+use super::show::Show;
+use super::{Outcome, check, simulated};
+
+/// Run correction cycles from a recipe until the part is accepted
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Without --cell everything is simulated, on real Modbus TCP connections within this program, and marked SIMULATION.
+Ctrl-C once holds the cell at the next safe place; twice aborts it.
+
+Example:
+  regrind run recipes/freeform-mirror.toml
+  regrind run recipes/freeform-mirror.toml --cell config/modbus-tcp.toml --part SN-0042 --operator \"A. Smith\"
+
+Exit codes: 0 accepted; 1 finished, not in tolerance; 2 bad arguments, recipe or data; 3 fault or abort.")]
+pub(super) struct Arguments {
+    /// Recipe of the part
+    #[arg(value_name = "RECIPE")]
+    recipe: PathBuf,
+    /// Cell that makes it
+    #[arg(long, value_name = "FILE", default_value = "config/sim.toml")]
+    cell: PathBuf,
+    /// Serial number of the part
+    #[arg(long, value_name = "SERIAL")]
+    part: Option<String>,
+    /// Who runs it
+    #[arg(long, value_name = "NAME")]
+    operator: Option<String>,
+    /// Folder that the run's own folder is made in
+    #[arg(long, value_name = "DIR", default_value = "runs")]
+    runs: PathBuf,
+    /// The right part is loaded already: do not ask for it
+    #[arg(long)]
+    loaded: bool,
+    /// Draw another simulated part and run from this number
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Print a line of JSON for everything that happens
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let recipe = or_show(Recipe::read(&arguments.recipe))?;
+    let cell = or_show(CellConfig::read(&arguments.cell))?;
+    let (task, plan) = setup::prepare(&recipe, &cell).map_err(Failure::Setup)?;
+    let spec = match within(&cell) {
+        true => Some(simulated::world_spec(&recipe, arguments.seed)?),
+        false => None,
+    };
+    super::runtime()?.block_on(async {
+        let mut cell = cell;
+        let _world = match spec {
+            Some(spec) => Some(simulated::serve(spec, &mut cell).await?),
+            None => None,
+        };
+        let actor = operator(arguments.operator.as_deref());
+        let began = jiff::Timestamp::now();
+        let journal = journal(arguments, &recipe, &cell, &actor, began)?;
+        let (notices, shown) = mpsc::unbounded_channel();
+        let poll = [cell.cmm.link.timing.poll, cell.grinder.link.timing.poll];
+        let folder = journal.folder().to_owned();
+        let job = u32::try_from(began.as_second() & 0x7fff_ffff).unwrap_or(1).max(1);
+        let loaded = arguments.loaded || cell.simulated;
+        let run = Run { plan, task, journal, job, actor: actor.clone(), loaded, poll, notices, interrupted: None };
+        let show = Show::new(arguments.json, cell.simulated, &recipe, &folder);
+        let showing = tokio::spawn(show.follow(shown));
+        let ending = go(run, &cell, actor, job).await?;
+        showing.await.map_err(|e| Failure::Terminal(e.into()))??;
+        outcome(&ending)
+    })
+}
+
+/// Gives the run its machines and lets it go.
+async fn go(run: Run, cell: &CellConfig, actor: Actor, epoch: u32) -> Result<Ending, Failure> {
+    let failed = |link: &Link| {
+        let path = cell.path().to_owned();
+        let wire = format!("{:?}", link.wire);
+        move |source| Failure::Wire { path, wire, source }
+    };
+    // One owner for both machines: this program on this computer.
+    let owner = owner(&actor);
+    let (cmm, grinder) = (&cell.cmm.link, &cell.grinder.link);
+    match (setup::modbus(cmm, owner, epoch), setup::modbus(grinder, owner, epoch)) {
+        (Some(of_cmm), Some(of_grinder)) => {
+            let (c, g) = if of_cmm.wire == of_grinder.wire {
+                let c = ModbusCmm::new(of_cmm).map_err(failed(cmm))?;
+                let g = ModbusGrinder::on(c.link().clone(), of_grinder);
+                (c, g)
+            } else {
+                (ModbusCmm::new(of_cmm).map_err(failed(cmm))?, ModbusGrinder::new(of_grinder).map_err(failed(grinder))?)
+            };
+            start(run, actor, c, g).await
+        }
+        _ => Err(Failure::WireKind { path: cell.path().to_owned() }),
+    }
+}
+
+async fn start<C, G>(run: Run, actor: Actor, cmm: C, grinder: G) -> Result<Ending, Failure>
+where
+    C: regrind::device::Cmm + 'static,
+    G: regrind::device::Grinder + 'static,
+{
+    let folder = run.journal.folder().to_owned();
+    let (drive, orders) =
+        Drive::new(run, cmm, grinder).map_err(|source| Failure::ControlSocket { path: folder, source })?;
+    let keys = tokio::spawn(heed_ctrl_c(orders, actor));
+    let ending = drive.run().await;
+    keys.abort();
+    Ok(ending)
+}
+
+/// Ctrl-C once holds at the next safe place, twice aborts.
+async fn heed_ctrl_c(orders: Orders, actor: Actor) {
+    let mut presses = 0;
+    while tokio::signal::ctrl_c().await.is_ok() {
+        presses += 1;
+        let reason = format!("Ctrl-C, {presses}");
+        let request = if presses == 1 { Request::Hold { reason } } else { Request::Abort { reason } };
+        orders.give(request, actor.clone()).await;
+    }
+}
+
+/// Whether the machines of a cell are simulated in this process: only there a port may be left open.
+fn within(cell: &CellConfig) -> bool {
+    let open = |link: &Link| matches!(link.wire, regrind::config::Wire::ModbusTcp { port: 0, .. });
+    cell.simulated && (open(&cell.cmm.link) || open(&cell.grinder.link))
+}
+
+fn journal(
+    arguments: &Arguments,
+    recipe: &Recipe,
+    cell: &CellConfig,
+    actor: &Actor,
+    began: jiff::Timestamp,
+) -> Result<Journal, Failure> {
+    let part = arguments.part.clone().unwrap_or_else(|| "unnamed".into());
+    let folder = free_folder(&arguments.runs, &recipe_name(recipe), began);
+    let hex = |bytes: &[u8; 32]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
+    let header = Header {
+        run: folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
+        part,
+        actor: actor.name.clone(),
+        station: actor.station.clone(),
+        simulation: cell.simulated,
+        first_command_id: 1,
+        content: json!({
+            "recipe": recipe.path(), "recipe_sha256": hex(recipe.source_sha256()),
+            "cell": cell.path(), "cell_sha256": hex(cell.source_sha256()),
+            "part_name": recipe.part.name, "seed": arguments.seed,
+        }),
+    };
+    let mut journal = Journal::create(&folder, header).map_err(Failure::Journal)?;
+    journal.store("recipe.toml", recipe.text().as_bytes(), 0, 0).map_err(Failure::Journal)?;
+    journal.store("cell.toml", cell.text().as_bytes(), 0, 0).map_err(Failure::Journal)?;
+    Ok(journal)
+}
+
+fn recipe_name(recipe: &Recipe) -> String {
+    recipe.path().file_stem().map_or("run".into(), |stem| stem.to_string_lossy().into_owned())
+}
+
+/// Returns a folder for a run that began now: the recipe's name and the time, and a number if two begin in one second.
+fn free_folder(runs: &Path, name: &str, began: jiff::Timestamp) -> PathBuf {
+    let stamp = began.strftime("%Y%m%dT%H%M%SZ");
+    let named = |more: u32| match more {
+        0 => runs.join(format!("{name}-{stamp}")),
+        more => runs.join(format!("{name}-{stamp}-{more}")),
+    };
+    (0..).map(named).find(|folder| !folder.exists()).expect("some number is free")
+}
+
+fn operator(named: Option<&str>) -> Actor {
+    let user = || std::env::var("USER").or_else(|_| std::env::var("USERNAME")).unwrap_or_else(|_| "unknown".into());
+    let host = std::fs::read_to_string("/etc/hostname").unwrap_or_default();
+    let host = if host.trim().is_empty() { "this computer".to_owned() } else { host.trim().to_owned() };
+    Actor { name: named.map_or_else(user, str::to_owned), station: host }
+}
+
+/// A number for this client: the same for every run on this computer.
+fn owner(actor: &Actor) -> u32 {
+    let mut hash = crc32fast::Hasher::new();
+    hash.update(b"regrind ");
+    hash.update(actor.station.as_bytes());
+    hash.finalize().max(1)
+}
+
+fn outcome(ending: &Ending) -> Result<Outcome, Failure> {
+    match ending {
+        Ending::Accepted { .. } => Ok(Outcome::Accepted),
+        Ending::NotAccepted { .. } => Ok(Outcome::NotInTolerance),
+        Ending::Stopped { reason, .. } | Ending::Aborted { reason, .. } => {
+            Err(Failure::Ended { reason: reason.clone() })
+        }
+    }
+}
+
+/// Shows every problem of a file at its place.
+pub(super) fn or_show<T>(read: Result<T, Problems>) -> Result<T, Failure> {
+    read.map_err(|problems| match check::show(&problems) {
+        Ok(()) => Failure::Checked { bad: 1, files: 1 },
+        Err(failure) => failure,
+    })
+}
+
+/// How long a line that says nothing new may be left out.
+pub(super) const QUIET: Duration = Duration::from_secs(2);

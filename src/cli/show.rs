@@ -1,0 +1,178 @@
+//! What a run shows while it runs: a bar on a terminal, plain lines elsewhere, JSON for programs.
+
+use std::fmt::Write as _;
+use std::io::{self, IsTerminal};
+use std::path::Path;
+use std::time::Instant;
+
+use indicatif::{ProgressBar, ProgressStyle};
+use regrind::cell::{Alarm, Device, Ending, Figures, Judgement};
+use regrind::drive::{CycleRow, Notice};
+use regrind::recipe::Recipe;
+use tokio::sync::mpsc;
+
+use super::failure::Failure;
+use super::run::QUIET;
+use super::words::three_digits;
+
+/// Shows a run.
+pub(super) struct Show {
+    json: bool,
+    simulated: bool,
+    head: String,
+    tolerance: String,
+    folder: String,
+    bar: Option<ProgressBar>,
+    /// When a plain line about progress was printed last.
+    said: Option<Instant>,
+    job: Option<(Device, u32)>,
+}
+
+impl Show {
+    pub(super) fn new(json: bool, simulated: bool, recipe: &Recipe, folder: &Path) -> Self {
+        let limit = |name: &str, mm: Option<f64>| mm.map(|mm| format!("{name} {} um", three_digits(1e3 * mm)));
+        let limits = [limit("PV", recipe.acceptance.pv_mm), limit("rms", recipe.acceptance.rms_mm)];
+        Self {
+            json,
+            simulated,
+            head: format!("{}, {}", recipe.part.name, recipe.path().display()),
+            tolerance: limits.into_iter().flatten().collect::<Vec<_>>().join(", "),
+            folder: folder.display().to_string(),
+            bar: (!json && io::stderr().is_terminal()).then(bar),
+            said: None,
+            job: None,
+        }
+    }
+
+    /// Shows notices until the run is over.
+    pub(super) async fn follow(mut self, mut notices: mpsc::UnboundedReceiver<Notice>) -> Result<(), Failure> {
+        if !self.json {
+            let marked = if self.simulated { "SIMULATION  " } else { "" };
+            self.line(&format!("{marked}{}; tolerance {}", self.head, self.tolerance))?;
+            self.line(&format!("record in {}", self.folder))?;
+        }
+        while let Some(notice) = notices.recv().await {
+            if self.json {
+                self.print_json(&notice)?;
+            } else {
+                self.show(&notice)?;
+            }
+        }
+        if let Some(bar) = self.bar.take() {
+            bar.finish_and_clear();
+        }
+        Ok(())
+    }
+
+    fn print_json(&self, notice: &Notice) -> Result<(), Failure> {
+        let mut value = serde_json::to_value(notice).map_err(|e| Failure::Terminal(e.into()))?;
+        if let Some(map) = value.as_object_mut() {
+            map.insert("simulation".into(), self.simulated.into());
+        }
+        super::print(&format!("{value}\n"))
+    }
+
+    fn show(&mut self, notice: &Notice) -> Result<(), Failure> {
+        match notice {
+            Notice::Progress { device, cycle, done, total } => self.progress(*device, *cycle, *done, *total),
+            Notice::State { state, cycle, .. } => {
+                if let Some(bar) = &self.bar {
+                    bar.set_message(format!("cycle {cycle}  {state}"));
+                }
+                Ok(())
+            }
+            Notice::LoadPart => self.line("load the part, clamp it, then: regrind confirm loaded"),
+            Notice::Figures { cycle, figures } => self.figures(*cycle, figures),
+            Notice::Judged(Judgement { cycle, reason, .. }) => self.line(&format!("cycle {cycle}: {reason}")),
+            Notice::Compensated { cycle, summary } => self.line(&format!(
+                "cycle {cycle}: next pass corrects up to {} um, {} um deep; PV {} um expected",
+                three_digits(1e3 * summary.largest_mm),
+                three_digits(1e3 * summary.depth_mm),
+                three_digits(1e3 * summary.predicted_pv_mm)
+            )),
+            Notice::Alarm(alarm) => self.alarm(alarm),
+            Notice::AlarmGone { .. } => Ok(()),
+            Notice::Refused { why } => self.line(&format!("not done: {why}")),
+            Notice::RecordFailed { words } => self.line(&format!("RECORD: {words}")),
+            Notice::Finished { ending, cycles } => self.finished(ending, cycles),
+        }
+    }
+
+    fn progress(&mut self, device: Device, cycle: u32, done: u32, total: u32) -> Result<(), Failure> {
+        let job = Some((device, cycle));
+        let (what, unit) = match device {
+            Device::Cmm => ("measuring", " points"),
+            Device::Grinder => ("grinding", "/1000 of the path"),
+        };
+        if let Some(bar) = &self.bar {
+            if self.job != job {
+                bar.reset();
+            }
+            bar.set_length(u64::from(total));
+            bar.set_position(u64::from(done));
+            bar.set_message(format!("cycle {cycle}  {what}"));
+        } else if self.job != job || self.said.is_none_or(|at| at.elapsed() >= QUIET) {
+            self.said = Some(Instant::now());
+            let of = if device == Device::Cmm { format!("{done} of {total}{unit}") } else { format!("{done}{unit}") };
+            self.line(&format!("cycle {cycle}: {what}, {of}"))?;
+        }
+        self.job = job;
+        Ok(())
+    }
+
+    fn figures(&mut self, cycle: u32, figures: &Figures) -> Result<(), Failure> {
+        let um = |mm: f64| three_digits(1e3 * mm);
+        let mut text = format!(
+            "cycle {cycle}: PV {} um, rms {} um; {} points, {} outliers",
+            um(figures.pv_mm),
+            um(figures.rms_mm),
+            figures.points,
+            figures.outliers
+        );
+        for words in figures.weak_directions.iter().chain(&figures.warnings) {
+            let _ = write!(text, "\n         {words}");
+        }
+        self.line(&text)
+    }
+
+    fn alarm(&mut self, alarm: &Alarm) -> Result<(), Failure> {
+        let mut text = format!("ALARM    {}\n         {}", alarm.what, alarm.consequence);
+        for (k, remedy) in alarm.remedy.iter().enumerate() {
+            let _ = write!(text, "\n         {}. {remedy}", k + 1);
+        }
+        self.line(&text)
+    }
+
+    fn finished(&mut self, ending: &Ending, cycles: &[CycleRow]) -> Result<(), Failure> {
+        let (word, reason) = match ending {
+            Ending::Accepted { reason, .. } => ("ACCEPTED", reason),
+            Ending::NotAccepted { reason, .. } => ("NOT ACCEPTED", reason),
+            Ending::Stopped { reason, .. } => ("STOPPED", reason),
+            Ending::Aborted { reason, .. } => ("ABORTED", reason),
+        };
+        let mut text = String::new();
+        if !cycles.is_empty() {
+            text += "\ncycle    PV um   rms um   points  outliers  level um\n";
+        }
+        for row in cycles {
+            let CycleRow { cycle, pv_um, rms_um, points, outliers, level_um } = row;
+            let _ = writeln!(text, "{cycle:>5} {pv_um:>8.2} {rms_um:>8.3} {points:>8} {outliers:>9} {level_um:>9.1}");
+        }
+        let marked = if self.simulated { "SIMULATION  " } else { "" };
+        let _ = write!(text, "\n{marked}{word}: {reason}");
+        self.line(&text)
+    }
+
+    fn line(&self, text: &str) -> Result<(), Failure> {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| super::print(&format!("{text}\n"))),
+            None => super::print(&format!("{text}\n")),
+        }
+    }
+}
+
+fn bar() -> ProgressBar {
+    let style = ProgressStyle::with_template("{msg:32} [{bar:40}] {pos}/{len}  {eta} left")
+        .unwrap_or_else(|_| ProgressStyle::default_bar());
+    ProgressBar::new(1).with_style(style)
+}

@@ -1,0 +1,48 @@
+//! `regrind simulate`: the simulated machines of a cell on their wires, for another process.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use regrind::config::CellConfig;
+use regrind::recipe::Recipe;
+
+use super::failure::Failure;
+use super::run::or_show;
+use super::{Outcome, simulated};
+
+/// Serve the simulated CMM and grinder of a cell on their wires until stopped
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Both machines share one simulated part: its truth is the table [simulation] of the recipe.
+
+Example:
+  regrind simulate --cell config/modbus-tcp.toml
+  regrind run recipes/freeform-mirror.toml --cell config/modbus-tcp.toml      # in another terminal
+
+Exit codes: 0 stopped by Ctrl-C; 2 bad files; 3 fault.")]
+pub(super) struct Arguments {
+    /// Recipe whose part is simulated
+    #[arg(value_name = "RECIPE", default_value = "recipes/freeform-mirror.toml")]
+    recipe: PathBuf,
+    /// Cell whose machines are simulated
+    #[arg(long, value_name = "FILE", default_value = "config/modbus-tcp.toml")]
+    cell: PathBuf,
+    /// Draw another part and another run from this number
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let recipe = or_show(Recipe::read(&arguments.recipe))?;
+    let mut cell = or_show(CellConfig::read(&arguments.cell))?;
+    let spec = simulated::world_spec(&recipe, arguments.seed)?;
+    super::runtime()?.block_on(async {
+        let serving = simulated::serve(spec, &mut cell).await?;
+        for place in &serving.places {
+            super::print(&format!("SIMULATION: {place}\n"))?;
+        }
+        super::print("Ctrl-C ends it.\n")?;
+        tokio::signal::ctrl_c().await.map_err(Failure::Terminal)?;
+        Ok(Outcome::Accepted)
+    })
+}

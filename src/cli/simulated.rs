@@ -1,0 +1,184 @@
+//! A simulated world for the cell: built here only, and handed to its wires alone.
+
+use std::path::{Path, PathBuf};
+
+use regrind::config::{CellConfig, Link, RegisterMap, Wire, WordOrder};
+use regrind::formats::{place_link, remove_link};
+use regrind::recipe::Recipe;
+use regrind_sim::registers::{Layout, Machine, MachineOptions};
+use regrind_sim::wire::rtu::Line;
+use regrind_sim::wire::faults::Faults;
+use regrind_sim::wire::{Serving, SharedMachine};
+use regrind_sim::words;
+use regrind_sim::world::{World, WorldSpec};
+use serde::Deserialize;
+
+use super::failure::Failure;
+
+/// The simulated machines of a cell, served until this is dropped.
+pub(super) struct SimulatedCell {
+    /// What answers, on each wire.
+    pub(super) servings: Vec<Serving>,
+    /// In words, where each machine answers.
+    pub(super) places: Vec<String>,
+    /// Links that were placed at the devices of serial lines.
+    links: Vec<PathBuf>,
+    /// Kept for the life of the machines.
+    _world: World,
+}
+
+impl Drop for SimulatedCell {
+    fn drop(&mut self) {
+        for link in &self.links {
+            // A link that is left behind is replaced by the next simulation.
+            let _ = remove_link(link);
+        }
+    }
+}
+
+/// Reads the truth of a recipe.
+///
+/// # Errors
+/// A recipe without one, and one that cannot be.
+pub(super) fn world_spec(recipe: &Recipe, seed: Option<u64>) -> Result<WorldSpec, Failure> {
+    let none = || {
+        Failure::Simulation {
+        path: recipe.path().to_owned(),
+        reason: "it has no table [simulation], which tells the simulator the true shape of the part; add one, or use a cell of real machines".into(),
+    }
+    };
+    let table = recipe.simulation.clone().ok_or_else(none)?;
+    let failed = |reason: String| Failure::Simulation { path: recipe.path().to_owned(), reason };
+    let mut spec =
+        WorldSpec::deserialize(toml::Value::Table(table)).map_err(|e| failed(format!("[simulation]: {e}")))?;
+    spec.seed = seed.unwrap_or(spec.seed);
+    spec.check().map_err(|e| failed(format!("[simulation]: {e}")))?;
+    Ok(spec)
+}
+
+/// Serves both machines of a cell on their wires. A port of 0 is replaced in the cell by the one that was free.
+///
+/// # Errors
+/// A wire that cannot be had.
+pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig) -> Result<SimulatedCell, Failure> {
+    let path = cell.path().to_owned();
+    let failed = |reason: String| Failure::Simulation { path: path.clone(), reason };
+    let speed = spec.speed;
+    let seed = spec.seed;
+    let world = World::new(spec).map_err(|e| failed(e.to_string()))?;
+    let cmm = machine(Machine::new(Box::new(world.cmm()), boot_id(), options(&cell.cmm.link, speed, seed)));
+    let grinder =
+        machine(Machine::new(Box::new(world.grinder()), boot_id(), options(&cell.grinder.link, speed, seed + 1)));
+    let mut simulated = SimulatedCell { servings: Vec::new(), places: Vec::new(), links: Vec::new(), _world: world };
+    let wires = [cell.cmm.link.wire.clone(), cell.grinder.link.wire.clone()];
+    let units = [(unit(&wires[0]), cmm), (unit(&wires[1]), grinder)];
+    if same_line(&wires[0], &wires[1]) {
+        let port = simulated.serve(&wires[0], units.to_vec()).await.map_err(failed)?;
+        set_port(&mut cell.cmm.link.wire, port);
+        set_port(&mut cell.grinder.link.wire, port);
+    } else {
+        let [of_cmm, of_grinder] = units;
+        let port = simulated.serve(&wires[0], vec![of_cmm]).await.map_err(&failed)?;
+        set_port(&mut cell.cmm.link.wire, port);
+        let port = simulated.serve(&wires[1], vec![of_grinder]).await.map_err(&failed)?;
+        set_port(&mut cell.grinder.link.wire, port);
+    }
+    Ok(simulated)
+}
+
+impl SimulatedCell {
+    async fn serve(&mut self, wire: &Wire, units: Vec<(u8, SharedMachine)>) -> Result<u16, String> {
+        let names: Vec<String> = units.iter().map(|(unit, _)| format!("unit {unit}")).collect();
+        match wire {
+            Wire::ModbusTcp { host, port, .. } => {
+                let serving = Serving::tcp((host.as_str(), *port), units).await.map_err(|e| {
+                    format!("{host}:{port} cannot be served: {e}; choose another port, or end what holds it")
+                })?;
+                let bound = serving.local_addr().map_or(*port, |address| address.port());
+                self.places.push(format!("Modbus TCP {host}:{bound}, {}", names.join(" and ")));
+                self.servings.push(serving);
+                Ok(bound)
+            }
+            Wire::ModbusRtu { device, baud, .. } => {
+                let serving = Serving::rtu(units, Line::paced(*baud), Faults::none())
+                    .map_err(|e| format!("no pseudo-terminal can be had for {device}: {e}"))?;
+                let terminal = serving.path().map(Path::to_owned).unwrap_or_default();
+                place_link(&terminal, Path::new(device)).map_err(|e| {
+                    format!(
+                        "{device} cannot be made a link to {}: {e}; remove what is there, or name another device",
+                        terminal.display()
+                    )
+                })?;
+                self.links.push(device.into());
+                self.places.push(format!("Modbus RTU {device} at {baud} baud, {}", names.join(" and ")));
+                self.servings.push(serving);
+                Ok(0)
+            }
+            Wire::FileExchange(_) => {
+                Err("a machine that is reached by files cannot be simulated; its files are yours to write".into())
+            }
+        }
+    }
+}
+
+fn machine(machine: Machine) -> SharedMachine {
+    machine.into()
+}
+
+/// A number that differs from start to start, as that of a real machine does.
+fn boot_id() -> u32 {
+    rand::random::<u32>().max(1)
+}
+
+fn options(link: &Link, speed: f64, seed: u64) -> MachineOptions {
+    let RegisterMap { word_order, .. } = link.registers;
+    MachineOptions {
+        word_order: match word_order {
+            WordOrder::Big => words::WordOrder::Big,
+            WordOrder::Little => words::WordOrder::Little,
+        },
+        layout: layout(&link.registers),
+        speed,
+        seed,
+        ..MachineOptions::default()
+    }
+}
+
+fn layout(r: &RegisterMap) -> Layout {
+    Layout {
+        identity: r.identity,
+        sync: r.sync,
+        beat: r.beat,
+        command: r.command,
+        status: r.status,
+        in_force: r.in_force,
+        inbox_header: r.inbox_header,
+        inbox_page: r.inbox_page,
+        inbox_state: r.inbox_state,
+        outbox_header: r.outbox_header,
+        outbox_select: r.outbox_select,
+        outbox_page: r.outbox_page,
+    }
+}
+
+fn unit(wire: &Wire) -> u8 {
+    match wire {
+        Wire::ModbusTcp { unit, .. } | Wire::ModbusRtu { unit, .. } => *unit,
+        Wire::FileExchange(_) => 0,
+    }
+}
+
+/// Whether two machines answer on one line.
+fn same_line(a: &Wire, b: &Wire) -> bool {
+    match (a, b) {
+        (Wire::ModbusTcp { host: h, port: p, .. }, Wire::ModbusTcp { host, port, .. }) => h == host && p == port,
+        (Wire::ModbusRtu { device: d, .. }, Wire::ModbusRtu { device, .. }) => d == device,
+        _ => false,
+    }
+}
+
+fn set_port(wire: &mut Wire, bound: u16) {
+    if let Wire::ModbusTcp { port, .. } = wire {
+        *port = bound;
+    }
+}

@@ -1,0 +1,357 @@
+//! From a recipe and a cell file to what a run needs: the nominal surface, the targets, the limits, the settings of the wires.
+//!
+//! Recipe and cell file are checked each by itself; what only shows when both are seen together is found here.
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use sha2::{Digest, Sha256};
+use thiserror::Error;
+
+use crate::cell::{Beginning, CellPlan, Deadlines, Disposal, Gates, Tolerance};
+use crate::compensation::{CorrectionLimits, MapOptions};
+use crate::config::{self, CellConfig, PointKind, SignalKind, WordOrder};
+use crate::device::{self, ModbusSettings, Pass, RegisterMap, Signal, SignalType};
+use crate::drive::{Probing, Sphere, Task};
+use crate::formats::{self, FormatError, NominalFile};
+use crate::geometry::Point;
+use crate::measuring::{Layout, PatternError, Target, targets};
+use crate::recipe::{Density, NominalSource, OnTrouble, Pattern, Recipe, StartAt};
+use crate::registration::ProbeSide;
+use crate::surface::{DefinedSurface, DefinitionError, Nominal, Side, SurfaceError};
+
+/// Why a recipe and a cell do not make a run.
+#[derive(Debug, Error)]
+#[allow(missing_docs)]
+pub enum SetupError {
+    #[error(transparent)]
+    File(#[from] FormatError),
+    #[error("{path}: {source}")]
+    Nominal { path: PathBuf, source: SurfaceError },
+    #[error("{path}: {source}")]
+    Definition { path: PathBuf, source: DefinitionError },
+    #[error("{path}: {source}")]
+    Pattern { path: PathBuf, source: PatternError },
+    #[error("{recipe}: {key} is {found}, and {cell} allows {allowed} ({limit}); change the recipe or use another cell")]
+    Limit { recipe: PathBuf, cell: PathBuf, key: &'static str, found: String, allowed: String, limit: &'static str },
+    #[error(
+        "{recipe}: measure.qualify asks for the reference sphere, and {cell} has none; add [cmm.reference_sphere] to the cell file, or write \
+         qualify = false"
+    )]
+    NoSphere { recipe: PathBuf, cell: PathBuf },
+    #[error(
+        "{recipe}: target {number} of the measuring pattern lies at {at} mm in the CMM frame, outside the travel of {cell} ({allowed}); move \
+         [cmm.fixture], or measure less of the part"
+    )]
+    Travel { recipe: PathBuf, cell: PathBuf, number: usize, at: String, allowed: String },
+    #[error(
+        "{recipe}: the measuring pattern is `free`, and {cell} reaches its CMM over a wire that needs a plan; choose grid, spiral or file"
+    )]
+    NeedsPlan { recipe: PathBuf, cell: PathBuf },
+}
+
+/// Makes what a run computes from, and what its cell decides by.
+///
+/// # Errors
+/// A nominal surface or a pattern that cannot be had, and limits of the cell that the recipe goes beyond.
+pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), SetupError> {
+    let (nominal, nominal_file, part_identity) = nominal(recipe)?;
+    let side = match recipe.measure.side {
+        ProbeSide::Known(side) => side,
+        ProbeSide::Auto => Side::Normal,
+    };
+    let targets = lay(recipe, &nominal, side)?;
+    check_limits(recipe, cell, &targets)?;
+    let task = Task {
+        pass: pass(recipe, &nominal, part_identity),
+        nominal: Arc::new(nominal),
+        nominal_file,
+        part_identity,
+        targets,
+        side,
+        probing: Probing {
+            probe_radius_mm: recipe.measure.probe_radius_mm,
+            approach_mm: recipe.measure.approach_mm,
+            search_mm: recipe.measure.search_mm,
+            speed_mm_s: recipe.measure.speed_mm_s,
+            safe_height_mm: recipe.measure.safe_height_mm,
+        },
+        sphere: sphere(recipe, cell)?,
+        fixture_cmm_from_model: cell.cmm.fixture_cmm_from_model,
+        registration: recipe.registration_options(cell.cmm.fixture_cmm_from_model),
+        start_at_fixture: recipe.registration.start == StartAt::Fixture,
+        contacts_expected: contacts_expected(cell),
+        map: MapOptions { cutoff_mm: recipe.compensation.cutoff_mm, spacing_mm: recipe.compensation.spacing_mm },
+        limits: CorrectionLimits {
+            gain: recipe.compensation.gain,
+            depth_of_cut_mm: recipe.compensation.depth_of_cut_mm,
+            largest_correction_mm: recipe.compensation.largest_correction_mm,
+            allowance_mm: recipe.grinding.allowance_mm,
+            removal_budget_mm: recipe.compensation.removal_budget_mm,
+        },
+        least_found: recipe.measure.minimum_coverage,
+        simulation: cell.simulated,
+    };
+    Ok((task, plan(recipe, cell)))
+}
+
+/// Reads or samples the nominal surface, and names the part by the SHA-256 of what it came from.
+fn nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> {
+    let of_definition = |path: &Path| {
+        let path = path.to_owned();
+        move |source| SetupError::Definition { path, source }
+    };
+    let sampled = |surface: &DefinedSurface, path: &Path| {
+        let spacing = surface.spacing_mm().map_err(of_definition(path))?;
+        let grid = surface.sample(spacing).map_err(of_definition(path))?;
+        Nominal::from_grid_with_normals(grid.columns, grid.rows, grid.points, grid.normals)
+            .map(|nominal| nominal.with_outline(surface.aperture().clone()))
+            .map_err(|source| SetupError::Nominal { path: path.to_owned(), source })
+    };
+    match recipe.nominal_source() {
+        NominalSource::Surface(surface) => {
+            let nominal = sampled(surface, recipe.path())?;
+            let identity = identity_of(&nominal);
+            Ok((nominal, recipe.path().to_owned(), identity))
+        }
+        NominalSource::File { path, projection, aperture } => {
+            let of_surface = |source| SetupError::Nominal { path: path.clone(), source };
+            let (file, identity) = formats::read_nominal_with_identity(path)?;
+            let nominal = match file {
+                NominalFile::Points(points) => Nominal::from_points(points, *projection).map_err(of_surface)?,
+                NominalFile::Mesh { points, triangles } => Nominal::from_mesh(points, triangles).map_err(of_surface)?,
+                NominalFile::Definition(text) => {
+                    let surface = DefinedSurface::from_toml(&text).map_err(of_definition(path))?;
+                    sampled(&surface, path)?
+                }
+            };
+            let nominal = match aperture {
+                Some(outline) => nominal.with_outline(outline.clone()),
+                None => nominal,
+            };
+            Ok((nominal, path.clone(), identity))
+        }
+    }
+}
+
+/// Names a formula by the nodes that it gives: the same surface has the same name however it is written.
+fn identity_of(nominal: &Nominal) -> [u8; 32] {
+    let mut hash = Sha256::new();
+    for point in nominal.points() {
+        for c in point.iter() {
+            hash.update(c.to_le_bytes());
+        }
+    }
+    hash.finalize().into()
+}
+
+fn lay(recipe: &Recipe, nominal: &Nominal, side: Side) -> Result<Vec<Target>, SetupError> {
+    let layout = match &recipe.measure.pattern {
+        Pattern::Grid(Density::SpacingMm(spacing)) => Layout::GridSpacing(*spacing),
+        Pattern::Grid(Density::Points(counts)) => Layout::GridPoints(*counts),
+        Pattern::Spiral(Density::SpacingMm(spacing)) => Layout::SpiralSpacing(*spacing),
+        Pattern::Spiral(Density::Points(count)) => Layout::SpiralPoints(*count),
+        Pattern::File { path } => Layout::Points(formats::read_measured(path)?),
+        Pattern::Free { .. } => return Ok(Vec::new()),
+    };
+    targets(nominal, side, &layout, recipe.measure.edge_margin_mm)
+        .map_err(|source| SetupError::Pattern { path: recipe.path().to_owned(), source })
+}
+
+fn sphere(recipe: &Recipe, cell: &CellConfig) -> Result<Option<Sphere>, SetupError> {
+    match (recipe.measure.qualify, &cell.cmm.reference_sphere) {
+        (false, _) => Ok(None),
+        (true, Some(sphere)) => {
+            Ok(Some(Sphere { centre: sphere.centre, radius_mm: sphere.radius_mm, points: usize::from(sphere.points) }))
+        }
+        (true, None) => Err(SetupError::NoSphere { recipe: recipe.path().to_owned(), cell: cell.path().to_owned() }),
+    }
+}
+
+fn contacts_expected(cell: &CellConfig) -> bool {
+    match &cell.cmm.link.wire {
+        config::Wire::FileExchange(exchange) => exchange.content.what == PointKind::Contacts,
+        _ => false,
+    }
+}
+
+fn check_limits(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Result<(), SetupError> {
+    let limits = &cell.grinder.limits;
+    let beyond = |key: &'static str, found: f64, least: f64, most: f64, limit: &'static str| {
+        if (least..=most).contains(&found) {
+            return Ok(());
+        }
+        let mut allowed = String::new();
+        let _ = if least > 0.0 { write!(allowed, "{least} to {most}") } else { write!(allowed, "at most {most}") };
+        let (recipe, cell) = (recipe.path().to_owned(), cell.path().to_owned());
+        Err(SetupError::Limit { recipe, cell, key, found: found.to_string(), allowed, limit })
+    };
+    let [least, most] = limits.wheel_radius_mm;
+    beyond("grinding.wheel.radius_mm", recipe.grinding.wheel.radius_mm(), least, most, "grinder.limits")?;
+    let feed = recipe.grinding.feed_mm_min;
+    beyond("grinding.feed_mm_min", feed, 0.0, limits.largest_feed_mm_min, "grinder.limits.largest_feed_mm_min")?;
+    let depth = recipe.compensation.depth_of_cut_mm;
+    beyond(
+        "compensation.depth_of_cut_um (in mm)",
+        depth,
+        0.0,
+        limits.largest_depth_mm,
+        "grinder.limits.largest_depth_mm",
+    )?;
+    if targets.is_empty() && !matches!(cell.cmm.link.wire, config::Wire::FileExchange(_)) {
+        return Err(SetupError::NeedsPlan { recipe: recipe.path().to_owned(), cell: cell.path().to_owned() });
+    }
+    check_travel(recipe, cell, targets)
+}
+
+fn check_travel(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Result<(), SetupError> {
+    let Some(travel) = &cell.cmm.travel else { return Ok(()) };
+    let reach = recipe.measure.probe_radius_mm + recipe.measure.approach_mm;
+    let pose = &cell.cmm.fixture_cmm_from_model;
+    let outside = |p: &Point| (0..3).any(|k| !(travel.least_mm[k]..=travel.most_mm[k]).contains(&p[k]));
+    let found = targets.iter().map(|t| pose.point(&(t.point + reach * t.normal))).enumerate().find(|(_, p)| outside(p));
+    match found {
+        None => Ok(()),
+        Some((k, at)) => Err(SetupError::Travel {
+            recipe: recipe.path().to_owned(),
+            cell: cell.path().to_owned(),
+            number: k + 1,
+            at: format!("{:.2}, {:.2}, {:.2}", at.x, at.y, at.z),
+            allowed: format!("{:?} to {:?}", travel.least_mm, travel.most_mm),
+        }),
+    }
+}
+
+fn pass(recipe: &Recipe, nominal: &Nominal, part_identity: [u8; 32]) -> Pass {
+    let [low, high] = match nominal.outline() {
+        Some(outline) => outline.bounds(),
+        None => nominal.points().fold([[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]], |[low, high], p| {
+            [[low[0].min(p.x), low[1].min(p.y)], [high[0].max(p.x), high[1].max(p.y)]]
+        }),
+    };
+    Pass {
+        spark_out_passes: recipe.grinding.spark_out_passes,
+        wheel_radius_mm: recipe.grinding.wheel.radius_mm(),
+        feed_mm_min: recipe.grinding.feed_mm_min,
+        track_spacing_mm: recipe.grinding.track_mm,
+        level_mm: recipe.grinding.allowance_mm,
+        depth_of_cut_mm: recipe.compensation.depth_of_cut_mm,
+        x_mm: [low[0], high[0]],
+        y_mm: [low[1], high[1]],
+        part_identity,
+    }
+}
+
+fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
+    let disposal = |trouble| match trouble {
+        OnTrouble::Hold => Disposal::Hold,
+        OnTrouble::Stop => Disposal::Stop,
+    };
+    // A file that a person brings may take days; a wire answers.
+    let by_hand =
+        [&cell.cmm.link.wire, &cell.grinder.link.wire].iter().any(|wire| matches!(wire, config::Wire::FileExchange(_)));
+    let week = Duration::from_secs(7 * 86_400);
+    let mut deadlines = Deadlines::default();
+    if by_hand {
+        (deadlines.progress, deadlines.transfer, deadlines.hold, deadlines.stop) = (week, week, week, week);
+    }
+    CellPlan {
+        begin_with: Beginning::Grind,
+        max_cycles: u32::from(recipe.cycle.most_cycles),
+        tolerance: Tolerance {
+            pv_mm: recipe.acceptance.pv_mm.unwrap_or(f64::INFINITY),
+            rms_mm: recipe.acceptance.rms_mm.unwrap_or(f64::INFINITY),
+            with_uncertainty: recipe.acceptance.expanded_uncertainty,
+        },
+        stall_share: 0.02,
+        on_stall: disposal(recipe.cycle.on_stall),
+        on_divergence: disposal(recipe.cycle.on_divergence),
+        on_refusal: Disposal::Stop,
+        gates: Gates {
+            least_found: recipe.measure.minimum_coverage,
+            least_coverage: 0.0,
+            most_shift_mm: recipe.registration.largest_shift_mm,
+            most_turn_rad: recipe.registration.largest_turn_rad,
+            most_radius_error_mm: recipe.measure.qualify.then_some(recipe.measure.radius_tolerance_mm),
+        },
+        removal_budget_mm: recipe.compensation.removal_budget_mm,
+        least_depth_mm: 0.0,
+        clear_at_start: cell.simulated,
+        deadlines,
+    }
+}
+
+/// Returns the settings of a Modbus driver; `None` for a machine that is reached by files.
+///
+/// `owner` and `epoch` name this client to the machine; the epoch rises with each start.
+pub fn modbus(link: &config::Link, owner: u32, epoch: u32) -> Option<ModbusSettings> {
+    let (wire, unit) = match &link.wire {
+        config::Wire::ModbusTcp { host, port, unit } => (device::Wire::Tcp { host: host.clone(), port: *port }, *unit),
+        config::Wire::ModbusRtu { device, baud, parity, stop_bits, unit } => {
+            let parity = match parity {
+                config::Parity::None => device::Parity::None,
+                config::Parity::Even => device::Parity::Even,
+                config::Parity::Odd => device::Parity::Odd,
+            };
+            (device::Wire::Rtu { device: device.clone(), baud: *baud, parity, stop_bits: *stop_bits }, *unit)
+        }
+        config::Wire::FileExchange(_) => return None,
+    };
+    let r = &link.registers;
+    Some(ModbusSettings {
+        unit,
+        word_order: order(r.word_order),
+        registers: RegisterMap {
+            identity: r.identity,
+            sync: r.sync,
+            beat: r.beat,
+            command: r.command,
+            status: r.status,
+            in_force: r.in_force,
+            inbox_header: r.inbox_header,
+            inbox_page: r.inbox_page,
+            inbox_state: r.inbox_state,
+            outbox_header: r.outbox_header,
+            outbox_select: r.outbox_select,
+            outbox_page: r.outbox_page,
+        },
+        request_timeout: link.timing.request_timeout,
+        retries: u32::from(link.timing.retries),
+        lost_after: link.timing.lost_after,
+        quarantine: link.timing.quarantine,
+        owner,
+        epoch,
+        signals: link.signals.iter().map(signal).collect(),
+        ..ModbusSettings::new(wire)
+    })
+}
+
+fn order(order: WordOrder) -> device::WordOrder {
+    match order {
+        WordOrder::Big => device::WordOrder::Big,
+        WordOrder::Little => device::WordOrder::Little,
+    }
+}
+
+fn signal(signal: &config::Signal) -> Signal {
+    let kind = match signal.kind {
+        SignalKind::U16 => SignalType::U16,
+        SignalKind::I16 => SignalType::I16,
+        SignalKind::U32 => SignalType::U32,
+        SignalKind::I32 => SignalType::I32,
+        SignalKind::F32 => SignalType::F32,
+        SignalKind::F64 => SignalType::F64,
+    };
+    let [least, most] = signal.range;
+    Signal {
+        name: signal.name.clone(),
+        address: signal.address,
+        kind,
+        scale: signal.scale,
+        unit: signal.unit.clone(),
+        least,
+        most,
+    }
+}
