@@ -4,6 +4,7 @@
 //! found, what was expected and what to do; nothing here panics, and time and memory are bounded by the size of the file.
 
 mod error;
+pub mod exchange;
 mod folder;
 mod layout;
 mod number;
