@@ -13,6 +13,7 @@
 //! Conventions: millimetres, radians, seconds. Frames are the model's {M} and the CMM's {W}; a pose is named for what it does,
 //! `cmm_from_model`. A deviation is positive where material stands proud, along the outward normal, the probe's side.
 
+pub mod device;
 pub mod formats;
 pub mod geometry;
 pub mod registration;

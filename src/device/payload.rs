@@ -1,0 +1,175 @@
+//! What is carried to a machine and what comes back.
+
+/// Something that is carried as one string of bytes and known by the SHA-256 of it.
+pub trait Identified {
+    /// The SHA-256 of the payload's bytes, high words first, whatever the order on the wire.
+    fn identity(&self) -> [u8; 32];
+}
+
+/// What a target belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[repr(u16)]
+pub enum TargetKind {
+    /// The part.
+    Part = 1,
+    /// The reference sphere.
+    ReferenceSphere = 2,
+}
+
+/// One point to be probed, in the CMM's frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Target {
+    /// Its number, which comes back with the measured point.
+    pub index: u32,
+    /// What it belongs to.
+    pub what: TargetKind,
+    /// The nominal contact point.
+    pub point_mm: [f64; 3],
+    /// The outward unit normal there.
+    pub normal: [f64; 3],
+}
+
+/// A measuring plan: what a CMM is to probe, and how.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Plan {
+    /// The targets, in the order in which they are probed.
+    pub targets: Vec<Target>,
+    /// The radius of the probe the plan is made for.
+    pub probe_radius_mm: f64,
+    /// How far from the point, ball surface, the probe turns into the normal.
+    pub approach_mm: f64,
+    /// How far beyond the point it searches.
+    pub search_mm: f64,
+    /// The probing speed.
+    pub speed_mm_s: f64,
+    /// How far above the highest target, along z of the CMM, the probe travels.
+    pub safe_height_mm: f64,
+}
+
+/// A correction map: by how much the ground surface is wanted displaced along the outward normal of the nominal surface. Positive leaves
+/// material. It is absolute: it replaces the one before.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CorrectionMap {
+    /// Nodes along x.
+    pub columns: usize,
+    /// Nodes along y.
+    pub rows: usize,
+    /// The first node, in the model frame.
+    pub first_mm: [f64; 2],
+    /// The spacing along x and y.
+    pub spacing_mm: [f64; 2],
+    /// Row by row, x fastest; `columns * rows` of them.
+    pub values_mm: Vec<f64>,
+    /// The identity of the part's nominal surface.
+    pub part_identity: [u8; 32],
+}
+
+/// How a pass is ground.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pass {
+    /// Passes without in-feed at the end.
+    pub spark_out_passes: u16,
+    /// The radius of the wheel.
+    pub wheel_radius_mm: f64,
+    /// The feed.
+    pub feed_mm_min: f64,
+    /// From track to track.
+    pub track_spacing_mm: f64,
+    /// The height of the surface wanted, over the nominal, along the normal.
+    pub level_mm: f64,
+    /// The most that may be taken off anywhere.
+    pub depth_of_cut_mm: f64,
+    /// Least and most x of the part, in the model frame.
+    pub x_mm: [f64; 2],
+    /// Least and most y of the part, in the model frame.
+    pub y_mm: [f64; 2],
+    /// The identity of the part's nominal surface.
+    pub part_identity: [u8; 32],
+}
+
+/// What became of a target.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum PointStatus {
+    /// The probe touched; the coordinates hold.
+    Touched,
+    /// The probe searched and touched nothing.
+    NotFound,
+    /// The probe could not get there.
+    NotReached,
+}
+
+/// One measured point.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MeasuredPoint {
+    /// The number of its target.
+    pub index: u32,
+    /// What became of it.
+    pub status: PointStatus,
+    /// 0 good to 100 bad.
+    pub quality: u16,
+    /// In the CMM's frame; of the probe's centre or of the contact, as the measurement says. Means nothing unless touched.
+    pub at_mm: [f64; 3],
+}
+
+/// What the coordinates of a measurement are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Coordinates {
+    /// Centres of the probe's ball.
+    Centres,
+    /// Points of contact, which the machine worked out itself.
+    Contacts,
+}
+
+/// What a CMM measured: a point for every target, in the order of the plan.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Measurement {
+    /// The points.
+    pub points: Vec<MeasuredPoint>,
+    /// What their coordinates are.
+    pub coordinates: Coordinates,
+    /// The radius of the probe that was used.
+    pub probe_radius_mm: f64,
+    /// Mean temperature of the part during the job.
+    pub temperature_c: f64,
+    /// How long the job took.
+    pub duration_s: f64,
+    /// The identity of the plan that was used.
+    pub plan_identity: [u8; 32],
+    /// The job it belongs to.
+    pub job: u32,
+    /// The cycle it belongs to.
+    pub cycle: u16,
+    /// The number to acknowledge it by.
+    pub done: u32,
+}
+
+/// What a grinder says of a pass.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PassRecord {
+    /// How the job ended.
+    pub outcome: super::Outcome,
+    /// Path travelled.
+    pub path_mm: f64,
+    /// Volume removed.
+    pub removed_mm3: f64,
+    /// Largest depth taken off.
+    pub deepest_mm: f64,
+    /// Share of the path that cut nothing, 0 to 1.
+    pub idle_share: f64,
+    /// Mean spindle load, 1 is full.
+    pub spindle_load: f64,
+    /// Radius of the wheel in use.
+    pub wheel_radius_mm: f64,
+    /// Mean temperature of the part during the job.
+    pub temperature_c: f64,
+    /// How long the job took.
+    pub duration_s: f64,
+    /// The identity of the map that was used.
+    pub map_identity: [u8; 32],
+    /// The job it belongs to.
+    pub job: u32,
+    /// The cycle it belongs to.
+    pub cycle: u16,
+    /// The number to acknowledge it by.
+    pub done: u32,
+}

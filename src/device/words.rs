@@ -1,0 +1,390 @@
+//! The words of a machine's handshake: who it is, what it is doing, what it answers.
+
+use std::fmt;
+
+/// What a machine is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum MachineKind {
+    /// A coordinate measuring machine.
+    Cmm,
+    /// A grinder.
+    Grinder,
+}
+
+impl fmt::Display for MachineKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Cmm => "measuring machine",
+            Self::Grinder => "grinder",
+        })
+    }
+}
+
+/// Who answers at the far end of the wire.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Identity {
+    /// What it is for.
+    pub kind: MachineKind,
+    /// Its name and serial number, as it gives them.
+    pub name: String,
+    /// A number that changes whenever the machine's application starts; 0 where the wire has no such number.
+    pub boot_id: u32,
+    /// Whether it is a simulation. Has to be said wherever its results are shown or stored.
+    pub simulation: bool,
+    /// After how many seconds of silence the machine takes its client for lost and holds.
+    pub silence_limit_s: f64,
+}
+
+/// One run of one machine: the part's run, the cycle in it, and a check number of the payloads it is about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Job {
+    /// The number of the part's run; not 0.
+    pub job: u32,
+    /// The cycle.
+    pub cycle: u16,
+    /// [`digest`] of the identities of the payloads, in the order plan, or map and pass.
+    pub digest: u32,
+}
+
+impl fmt::Display for Job {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "job {} cycle {} (digest {:08x})", self.job, self.cycle, self.digest)
+    }
+}
+
+/// The check number of payloads: the CRC-32 over their identities, in rising order of their kinds (plan; or map, pass).
+pub fn digest(identities: &[[u8; 32]]) -> u32 {
+    let mut crc = crc32fast::Hasher::new();
+    for identity in identities {
+        crc.update(identity);
+    }
+    crc.finalize()
+}
+
+/// A job that the machine has checked and would begin: the intent, to be journaled before [`start`](super::Machine::start).
+///
+/// After a restart it is put together again from the journal and given to [`reconcile`](super::Machine::reconcile).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Armed {
+    /// What was prepared.
+    pub job: Job,
+    /// The number that the START will carry, and no other command.
+    pub start_sequence: u32,
+    /// The machine's one-time word for this start; 0 where the wire has none.
+    pub token: u32,
+    /// The machine's boot id when it was prepared.
+    pub boot_id: u32,
+}
+
+/// A job that the machine has begun.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Started {
+    /// What was begun.
+    pub job: Job,
+    /// The START that began it.
+    pub start_sequence: u32,
+    /// The status that said so.
+    pub status: Status,
+}
+
+/// What became of a start.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Reconciled {
+    /// It was taken and the job is not at its end; the state in the status says whether it runs, holds or is ending.
+    Running(Status),
+    /// It was taken and has ended; `done` and `outcome` in the status say how.
+    Finished(Status),
+    /// It provably was not taken, seen twice with a second between: prepare anew.
+    NotStarted(Status),
+    /// It cannot be told from here. A person has to look at the machine; nothing may be repeated.
+    Unknown {
+        /// What does not fit, in words.
+        why: String,
+    },
+}
+
+/// A command of the handshake.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[repr(u16)]
+#[expect(missing_docs, reason = "the same words as the methods of `Machine`")]
+pub enum Command {
+    Claim = 1,
+    Prepare = 2,
+    Start = 3,
+    Hold = 4,
+    Resume = 5,
+    Stop = 6,
+    Abort = 7,
+    Clear = 8,
+    Acknowledge = 9,
+    Release = 10,
+}
+
+impl fmt::Display for Command {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Claim => "CLAIM",
+            Self::Prepare => "PREPARE",
+            Self::Start => "START",
+            Self::Hold => "HOLD",
+            Self::Resume => "RESUME",
+            Self::Stop => "STOP",
+            Self::Abort => "ABORT",
+            Self::Clear => "CLEAR",
+            Self::Acknowledge => "ACKNOWLEDGE",
+            Self::Release => "RELEASE",
+        })
+    }
+}
+
+/// Where a machine stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum State {
+    /// Nothing prepared, nothing running.
+    Idle,
+    /// A job is checked; START would begin it.
+    Prepared,
+    /// A job runs.
+    Execute,
+    /// On the way to a safe place.
+    Holding,
+    /// At a safe place in the middle of a job.
+    Held,
+    /// Ending the job in order.
+    Stopping,
+    /// A job has ended; its result waits to be acknowledged.
+    Complete,
+    /// Running the safe sequence.
+    Aborting,
+    /// Ended at once; needs CLEAR.
+    Aborted,
+    /// Stands because of a fault; needs CLEAR.
+    Faulted,
+}
+
+impl State {
+    /// Whether something may be moving.
+    pub fn moves(self) -> bool {
+        matches!(self, Self::Execute | Self::Holding | Self::Stopping | Self::Aborting)
+    }
+}
+
+impl fmt::Display for State {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Idle => "IDLE",
+            Self::Prepared => "PREPARED",
+            Self::Execute => "EXECUTE",
+            Self::Holding => "HOLDING",
+            Self::Held => "HELD",
+            Self::Stopping => "STOPPING",
+            Self::Complete => "COMPLETE",
+            Self::Aborting => "ABORTING",
+            Self::Aborted => "ABORTED",
+            Self::Faulted => "FAULTED",
+        })
+    }
+}
+
+/// Who may move the machine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Mode {
+    /// The client.
+    Automatic,
+    /// A person at the machine.
+    Manual,
+}
+
+/// What has to be good before anything may move. The machine's own circuits guard people; this is only what they say.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Interlocks {
+    /// Guards and doors are closed.
+    pub guards_closed: bool,
+    /// Wheel or probe is parked clear of the part.
+    pub clear_of_part: bool,
+    /// The part is clamped.
+    pub part_clamped: bool,
+    /// Air, coolant and the like are there.
+    pub supplies: bool,
+}
+
+impl Interlocks {
+    /// Everything is good.
+    pub fn all_good(&self) -> bool {
+        self.guards_closed && self.clear_of_part && self.part_clamped && self.supplies
+    }
+}
+
+/// What a machine answers to a command.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Answer {
+    /// None yet.
+    None,
+    /// Accepted.
+    Accepted,
+    /// The client is not the owner, or has an old epoch.
+    NotOwner,
+    /// Not allowed in the present state.
+    WrongState,
+    /// The machine does not know the command.
+    UnknownCommand,
+    /// The token is wrong or dead.
+    DeadToken,
+    /// Job, cycle or digest are not what was prepared or is in force.
+    OtherJob,
+    /// This job and cycle were begun already.
+    AlreadyBegun,
+    /// A payload is missing, broken or of another part.
+    PayloadMissing,
+    /// An interlock is open or the machine is not in automatic mode.
+    InterlockOpen,
+    /// A value of a payload is outside the machine's limits.
+    OutsideLimits,
+    /// The acknowledged number is not that of the finished job.
+    OtherResult,
+    /// A number that is not in the contract.
+    Unlisted(u16),
+}
+
+impl fmt::Display for Answer {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::None => "no answer yet",
+            Self::Accepted => "accepted",
+            Self::NotOwner => {
+                "another client owns the machine, or has since this one started: end the other client, then claim again"
+            }
+            Self::WrongState => "the machine does not allow it in its present state",
+            Self::UnknownCommand => "the machine does not know the command: compare its program with docs/modbus.md",
+            Self::DeadToken => "the token of the prepared job is dead (30 s passed, or an interlock opened): prepare again",
+            Self::OtherJob => "job, cycle or payloads are not those that were prepared: load and prepare again",
+            Self::AlreadyBegun => "this job and cycle were begun before and are never begun twice",
+            Self::PayloadMissing => "a payload is missing, broken, or made for another part: load it again, check the part",
+            Self::InterlockOpen => {
+                "an interlock is open or the machine is not in automatic mode: close the guards, check clamping and supplies"
+            }
+            Self::OutsideLimits => "a value of the payload is outside the machine's limits",
+            Self::OtherResult => "the result is not the one that was acknowledged: collect it again",
+            Self::Unlisted(number) => return write!(f, "answer {number}, which docs/modbus.md does not list"),
+        })
+    }
+}
+
+/// Why a machine stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Fault {
+    /// No fault.
+    None,
+    /// The stop circuit is open.
+    StopCircuit,
+    /// A collision or an unexpected touch.
+    Collision,
+    /// Air, coolant or power is missing.
+    Supplies,
+    /// A limit of travel was met.
+    TravelLimit,
+    /// A drive has failed.
+    Drive,
+    /// The probe or the spindle has failed.
+    Tool,
+    /// The client was silent for too long.
+    ClientSilent,
+    /// Another fault, by its number.
+    Other(u16),
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::None => "no fault",
+            Self::StopCircuit => "the stop circuit is open: close it at the machine, then clear",
+            Self::Collision => "collision or unexpected touch: look at the part and the probe or wheel before clearing",
+            Self::Supplies => "air, coolant or power is missing",
+            Self::TravelLimit => "a limit of travel was met: check where the part is clamped",
+            Self::Drive => "a drive has failed: see the machine's own panel",
+            Self::Tool => "the probe or the spindle has failed: see the machine's own panel",
+            Self::ClientSilent => "the machine heard nothing from its client for too long and holds",
+            Self::Other(number) => return write!(f, "fault {number}: see the machine's own panel"),
+        })
+    }
+}
+
+/// How a job ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Outcome {
+    /// It has not.
+    None,
+    /// To its end.
+    Complete,
+    /// By STOP.
+    Stopped,
+    /// By ABORT.
+    Aborted,
+    /// By a fault.
+    Failed,
+}
+
+/// The two counters by which client and machine see each other alive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Beats {
+    /// The machine's own.
+    pub machine: u16,
+    /// The client's, as the machine has seen it.
+    pub echo: u16,
+}
+
+/// A signal that a cell file asks for besides the contract's own, in its unit.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Reading {
+    /// Its name in the cell file.
+    pub name: String,
+    /// Its value.
+    pub value: f64,
+    /// Its unit, as written in the cell file.
+    pub unit: String,
+}
+
+/// What a machine says of itself, all of one moment.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Status {
+    /// Where it stands.
+    pub state: State,
+    /// Who may move it.
+    pub mode: Mode,
+    /// What has to be good.
+    pub interlocks: Interlocks,
+    /// The sequence number of the last command it acted upon.
+    pub acknowledged: u32,
+    /// Its answer to that command.
+    pub answer: Answer,
+    /// Why it stands.
+    pub fault: Fault,
+    /// The job prepared, running or finished.
+    pub job: Option<Job>,
+    /// The token of the prepared job; 0 when there is none.
+    pub token: u32,
+    /// The number of the START whose job ended last; 0 when there is none.
+    pub done: u32,
+    /// How that job ended.
+    pub outcome: Outcome,
+    /// Points measured, or thousandths of the path.
+    pub progress: u32,
+    /// Of how many.
+    pub total: u32,
+    /// The owner; 0 when there is none.
+    pub owner: u32,
+    /// The owner's epoch.
+    pub epoch: u32,
+    /// The two counters.
+    pub beats: Beats,
+    /// The job and cycle begun last, kept over a restart of the machine; job 0 when there is none.
+    pub last_begun: (u32, u16),
+    /// The START that began the running or last job; 0 when there is none.
+    pub begun_by: u32,
+    /// Temperature of the part or the machine.
+    pub temperature_c: f64,
+    /// The machine's boot id.
+    pub boot_id: u32,
+    /// The signals that the cell file asks for besides.
+    pub signals: Vec<Reading>,
+}
