@@ -134,6 +134,15 @@ pub enum DeviceError {
         what: &'static str,
     },
 
+    /// The folders that stand for the machine cannot be read or written, or hold something that must not be touched.
+    #[error("{machine}: {why}")]
+    Folder {
+        /// The machine.
+        machine: Arc<str>,
+        /// The file, the reason and the remedy, in words of the room that reads and writes files.
+        why: String,
+    },
+
     // ---- was told no, or the wrong thing -----------------------------------------------------------------------------------------
     /// The machine refused a command.
     #[error("{machine} refused {command} in {state}: {answer}")]
@@ -359,6 +368,7 @@ impl DeviceError {
                 | Self::Frozen { .. }
                 | Self::NotAcknowledged { .. }
                 | Self::StartUnknown { .. }
+                | Self::Folder { .. }
         )
     }
 }

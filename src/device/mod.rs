@@ -19,8 +19,10 @@
 //! its answer forgotten, the connection stays in order. To break off a long transfer politely raise its [`Interrupt`].
 
 mod error;
+pub mod exchange;
 mod machine;
 mod payload;
+mod tmp_identity;
 mod words;
 
 pub use error::DeviceError;

@@ -5,14 +5,19 @@
 //! stopped growing, has an end, and says, by its name or in itself, that it belongs to this part and this cycle; what does not belong
 //! is left where it is, and said.
 
+mod cmm;
 mod error;
+mod grinder;
+mod outbox;
 mod pattern;
 mod references;
 mod result;
 mod stations;
 mod watch;
 
+pub use cmm::{CmmExchange, CmmFolders, StationFiles, Stations};
 pub use error::ExchangeError;
+pub use grinder::{GrinderExchange, GrinderFolders};
 pub use pattern::{Pattern, file_word};
 pub use references::{Reference, References, parse_references, read_references};
 pub use result::{

@@ -220,7 +220,8 @@ pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<Resul
         DecimalMark::Comma => Some(Decimal::Comma),
     };
     let text = without_unit(text, unit_mm);
-    let mut points = if is_ply { ply::parse_ply(path, &text)?.points } else { parse_points_with(path, &text, decimal)? };
+    let mut points =
+        if is_ply { ply::parse_ply(path, &text)?.points } else { parse_points_with(path, &text, decimal)? };
     let columns = if is_ply { Columns::default() } else { Columns::read(path, &text, points.len())? };
     if unit_mm != 1.0 {
         points.iter_mut().for_each(|p| *p *= unit_mm);
