@@ -8,6 +8,14 @@
 //!  shape   what the part should be: height, gradient, curvature in closed form
 //!  form    what grinding left on it: a smooth random error along the normal
 //!  probe   a ball that touches the part, in a frame of its own, with noise and outliers
+//!
+//!  body       what the physics of one machine must be able to do
+//!  words      how values lie in registers
+//!  transfer   payloads in and results out, a page at a time
+//!  handshake  commands, states, interlocks, silence
+//!  registers  a whole machine: what a Modbus client reads and writes
+//!  seen       what the machine saw and did
+//!  wire       Modbus TCP and RTU servers, a serial line without hardware, and everything that goes wrong on them
 //! ```
 //!
 //! Units: millimetres and radians throughout. Frames: `shape` and `form` live in the model frame, the points a probe reports
@@ -15,8 +23,14 @@
 
 pub mod body;
 pub mod form;
+pub mod handshake;
 pub mod probe;
+pub mod registers;
+pub mod seen;
 pub mod shape;
+pub mod transfer;
+pub mod wire;
+pub mod words;
 
 /// A position or a direction in space.
 pub type Vec3 = [f64; 3];

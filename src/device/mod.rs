@@ -18,15 +18,21 @@
 //! One value of a driver is used by one task. Its futures may be dropped at any `.await`: a request that is on its way is finished and
 //! its answer forgotten, the connection stays in order. To break off a long transfer politely raise its [`Interrupt`].
 
+mod codec;
 mod error;
 pub mod exchange;
+mod link;
 mod machine;
+mod modbus;
 mod payload;
-mod tmp_identity;
+mod station;
 mod words;
 
+pub use codec::WordOrder;
 pub use error::DeviceError;
+pub use link::{Link, LinkFigures, Parity, Wire};
 pub use machine::{Cmm, Grinder, Interrupt, Machine};
+pub use modbus::{ModbusCmm, ModbusGrinder, ModbusMachine, ModbusSettings, RegisterMap, Signal, SignalType};
 pub use payload::{
     Coordinates, CorrectionMap, Identified, MeasuredPoint, Measurement, Pass, PassRecord, Plan, PointStatus, Target,
     TargetKind,

@@ -43,6 +43,8 @@ pub struct CmmExchange {
     pub free_count: bool,
     /// Whether files may be taken that lay in the inbox before the plan was handed over.
     pub take_earlier: bool,
+    /// With a free count: fewer points than this are waited on.
+    pub least_points: usize,
     /// By how much the probe radius in a file may differ from the plan's.
     pub probe_tolerance_mm: f64,
 }
@@ -59,6 +61,7 @@ impl CmmExchange {
             result: Pattern::new("{part}_c{cycle}.*"),
             stations: None,
             free_count: false,
+            least_points: 1,
             take_earlier: false,
             probe_tolerance_mm: 1e-3,
         }
@@ -68,7 +71,9 @@ impl CmmExchange {
 /// A measurement from several stations, each with its own frame.
 #[derive(Clone, Debug)]
 pub struct Stations {
-    /// For each station the names of its points and of its reference points.
+    /// For each station the names of its points and of its reference points. With one `*` in both names they stand for as many
+    /// stations as there are pairs of files in which the star is the same; such a measurement is complete when nothing in the inbox
+    /// changes any more and there are `least_points`.
     pub files: Vec<StationFiles>,
     /// The file of the reference points in the CMM's frame.
     pub nominal: PathBuf,
@@ -342,11 +347,14 @@ impl CmmFolders {
             }
         };
         let (mut pairs, mut waiting) = (Vec::new(), Vec::new());
-        for station in &stations.files {
+        for station in self.named_stations(ticket, stations, &new) {
             match (pick(&station.points)?, pick(&station.references)?) {
                 (Ok(points), Ok(references)) => pairs.push((points, references)),
                 (points, references) => waiting.extend([points.err(), references.err()].into_iter().flatten()),
             }
+        }
+        if waiting.is_empty() && pairs.is_empty() {
+            waiting.push("the first station".to_owned());
         }
         let used = |name: &str| pairs.iter().any(|(p, r)| p.name == name || r.name == name);
         let left: Vec<&str> = new.iter().map(|f| f.name.as_str()).filter(|name| !used(name)).collect();
@@ -362,7 +370,37 @@ impl CmmFolders {
         if !left.is_empty() {
             said.push(format!("left alone, no station's: {}", left.join(", ")));
         }
-        self.merge(expected, stations, &pairs).map(Some)
+        let accepted = self.merge(expected, stations, &pairs)?;
+        let (there, least) = (accepted.measurement.points.len(), self.settings.least_points);
+        if self.settings.free_count && there < least {
+            said.extend(accepted.said);
+            said.push(format!(
+                "{there} points of {} stations; at least {least} are needed, waiting for further stations",
+                pairs.len()
+            ));
+            return Ok(None);
+        }
+        Ok(Some(accepted))
+    }
+
+    /// Returns the stations with their stars replaced by what they stand for, in the order of their names.
+    fn named_stations(&self, ticket: &Ticket, stations: &Stations, files: &[&Found]) -> Vec<StationFiles> {
+        let mut named = Vec::new();
+        for station in &stations.files {
+            let [points, references] =
+                [&station.points, &station.references].map(|p| p.filled(&ticket.part, ticket.job, ticket.cycle));
+            if !points.as_str().contains('*') || !references.as_str().contains('*') {
+                named.push(StationFiles { points, references });
+                continue;
+            }
+            for star in files.iter().filter_map(|file| points.star(&file.name)) {
+                let wanted = references.with_star(star);
+                if files.iter().any(|file| file.name == wanted.as_str()) {
+                    named.push(StationFiles { points: points.with_star(star), references: wanted });
+                }
+            }
+        }
+        named
     }
 
     fn merge(

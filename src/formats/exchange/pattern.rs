@@ -32,6 +32,17 @@ impl Pattern {
         rest.ends_with(last)
     }
 
+    /// Returns what the one star of a pattern stands for in a name; nothing if the name does not fit or there is not one star.
+    pub fn star<'n>(&self, name: &'n str) -> Option<&'n str> {
+        let (before, after) = self.0.split_once('*').filter(|(_, after)| !after.contains('*'))?;
+        name.strip_prefix(before)?.strip_suffix(after)
+    }
+
+    /// Puts a text in the place of the star.
+    pub fn with_star(&self, text: &str) -> Self {
+        Self(self.0.replacen('*', text, 1))
+    }
+
     /// The pattern as text.
     pub fn as_str(&self) -> &str {
         &self.0
@@ -58,6 +69,17 @@ mod tests {
         assert!(fits("*a*b*", "xaxbx") && !fits("*a*b*", "xbxax") && fits("*", ""));
         // One character cannot serve two pieces.
         assert!(!fits("ab*ba", "aba") && fits("ab*ba", "abba"));
+    }
+
+    #[test]
+    fn one_star_pairs_two_names() {
+        let points = Pattern::new("M1_*.txt");
+        assert_eq!(points.star("M1_12.txt"), Some("12"));
+        assert_eq!(
+            (points.star("M2_1.txt"), Pattern::new("a*b*").star("axbx"), Pattern::new("a").star("a")),
+            (None, None, None)
+        );
+        assert_eq!(Pattern::new("ref_*.yaml").with_star("12").as_str(), "ref_12.yaml");
     }
 
     #[test]

@@ -1,0 +1,688 @@
+//! The handshake of docs/modbus.md as a machine keeps it: one state, commands that are values, and time that is told to it.
+//!
+//! Whatever a frame asks, the number and the answer are latched before anything moves, and a (job, cycle) moves once in a
+//! machine's life. Nothing here knows a register's address or a clock.
+
+use std::collections::BTreeSet;
+use std::time::Duration;
+
+use rand::RngExt;
+
+use crate::Rng;
+use crate::body::{Body, Kind, Payloads, Progress};
+use crate::registers::MachineOptions;
+use crate::seen::{Log, What};
+use crate::transfer::{Arrived, Origin, Outbox, Slot, slot_of};
+use crate::words::{Image, WordOrder, bytes_of, crc16};
+
+/// The states of docs/modbus.md.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[allow(missing_docs)]
+pub enum State {
+    Idle = 1,
+    Prepared = 2,
+    Execute = 3,
+    Holding = 4,
+    Held = 5,
+    Stopping = 6,
+    Complete = 7,
+    Aborting = 8,
+    Aborted = 9,
+    Faulted = 10,
+}
+
+impl State {
+    /// Every state, in the order of their numbers.
+    pub const ALL: [Self; 10] = [
+        Self::Idle,
+        Self::Prepared,
+        Self::Execute,
+        Self::Holding,
+        Self::Held,
+        Self::Stopping,
+        Self::Complete,
+        Self::Aborting,
+        Self::Aborted,
+        Self::Faulted,
+    ];
+}
+
+/// The commands of docs/modbus.md.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[allow(missing_docs)]
+pub enum Command {
+    Claim = 1,
+    Prepare = 2,
+    Start = 3,
+    Hold = 4,
+    Resume = 5,
+    Stop = 6,
+    Abort = 7,
+    Clear = 8,
+    Acknowledge = 9,
+    Release = 10,
+}
+
+impl Command {
+    /// Every command, in the order of their numbers.
+    pub const ALL: [Self; 10] = [
+        Self::Claim,
+        Self::Prepare,
+        Self::Start,
+        Self::Hold,
+        Self::Resume,
+        Self::Stop,
+        Self::Abort,
+        Self::Clear,
+        Self::Acknowledge,
+        Self::Release,
+    ];
+
+    /// Returns the command of a number.
+    pub fn of(number: u16) -> Option<Self> {
+        Self::ALL.get(usize::from(number).checked_sub(1)?).copied()
+    }
+
+    /// Says whether a machine in this state may do it.
+    pub fn is_allowed_in(self, state: State) -> bool {
+        match self {
+            Self::Claim | Self::Abort => true,
+            Self::Prepare => state == State::Idle,
+            Self::Start => state == State::Prepared,
+            Self::Hold => state == State::Execute,
+            Self::Resume => state == State::Held,
+            Self::Stop => matches!(state, State::Prepared | State::Execute | State::Holding | State::Held),
+            Self::Clear => matches!(state, State::Aborted | State::Faulted),
+            Self::Acknowledge => state == State::Complete,
+            Self::Release => state != State::Execute,
+        }
+    }
+}
+
+/// The answers of docs/modbus.md.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub enum Answer {
+    #[default]
+    None = 0,
+    Accepted = 1,
+    NotOwner = 2,
+    NotAllowed = 3,
+    Unknown = 4,
+    Token = 5,
+    Different = 6,
+    Begun = 7,
+    Payload = 8,
+    Interlock = 9,
+    Limits = 10,
+    Argument = 11,
+}
+
+/// A command as it stands in its 20 registers.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Frame {
+    /// Sequence number; 0 is never used.
+    pub sequence: u32,
+    /// Number of the command.
+    pub command: u16,
+    /// Cycle of the job.
+    pub cycle: u16,
+    /// Who commands.
+    pub owner: u32,
+    /// How often that one has started.
+    pub epoch: u32,
+    /// The part's run.
+    pub job: u32,
+    /// CRC-32 of the identities of the payloads it is about.
+    pub digest: u32,
+    /// The token that PREPARE gave.
+    pub token: u32,
+    /// The `done` number, for ACKNOWLEDGE.
+    pub argument: u32,
+}
+
+impl Frame {
+    /// Returns the 20 registers.
+    pub fn registers(&self, order: WordOrder) -> Vec<u16> {
+        let mut words = Image::new(order, 20)
+            .u32(0, self.sequence)
+            .u16(2, self.command)
+            .u16(3, self.cycle)
+            .u32(4, self.owner)
+            .u32(6, self.epoch)
+            .u32(8, self.job)
+            .u32(10, self.digest)
+            .u32(12, self.token)
+            .u32(14, self.argument)
+            .u32(18, self.sequence)
+            .done();
+        words[16] = crc16(&bytes_of(&words[..16]));
+        words
+    }
+
+    /// Reads the 20 registers; `None` if the CRC or the copies disagree, or the number is 0.
+    pub fn read(order: WordOrder, words: &[u16; 20]) -> Option<Self> {
+        let u32_at = |at: usize| order.to_u32([words[at], words[at + 1]]);
+        let sound = words[16] == crc16(&bytes_of(&words[..16])) && u32_at(0) == u32_at(18) && u32_at(0) != 0;
+        sound.then(|| Self {
+            sequence: u32_at(0),
+            command: words[2],
+            cycle: words[3],
+            owner: u32_at(4),
+            epoch: u32_at(6),
+            job: u32_at(8),
+            digest: u32_at(10),
+            token: u32_at(12),
+            argument: u32_at(14),
+        })
+    }
+}
+
+/// Whether the machine's own panel has the command.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Mode {
+    /// The client may command.
+    #[default]
+    Automatic = 1,
+    /// A person at the panel has the machine.
+    Manual = 2,
+}
+
+/// Bits of the status block's interlocks.
+pub mod interlock {
+    /// The guards are closed.
+    pub const GUARDS: u16 = 1;
+    /// Wheel or probe is clear of the part.
+    pub const CLEAR: u16 = 2;
+    /// The part is clamped.
+    pub const CLAMPED: u16 = 4;
+    /// Air and coolant are there.
+    pub const SUPPLIES: u16 = 8;
+    /// All of them.
+    pub const ALL: u16 = 15;
+    /// What must stay good while the machine moves.
+    pub const MOVING: u16 = GUARDS | CLAMPED | SUPPLIES;
+}
+
+/// Faults of docs/modbus.md that the handshake itself raises.
+const FAULT_STOP_CIRCUIT: u16 = 1;
+const FAULT_SUPPLIES: u16 = 3;
+const FAULT_SILENT: u16 = 20;
+const FAULT_OTHER: u16 = 30;
+
+/// How long a token lives.
+const TOKEN_LIFE: Duration = Duration::from_secs(30);
+
+/// The longest step in which the physics is moved on, unless there would be more than 200 in a tick.
+const STEP_S: f64 = 0.1;
+
+/// The job that was prepared.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Work {
+    job: u32,
+    cycle: u16,
+    digest: u32,
+}
+
+/// One machine's side of the handshake.
+pub(crate) struct Handshake {
+    pub(crate) body: Box<dyn Body>,
+    pub(crate) log: Log,
+    pub(crate) now: Duration,
+    pub(crate) speed: f64,
+    pub(crate) slots: [Option<Slot>; 3],
+    pub(crate) outbox: Option<Outbox>,
+    pub(crate) state: State,
+    pub(crate) boot_id: u32,
+    order: WordOrder,
+    silence_limit: Duration,
+    acting: Duration,
+    rng: Rng,
+    mode: Mode,
+    opened: u16,
+    acknowledged: u32,
+    answer: Answer,
+    fault: u16,
+    work: Work,
+    token: u32,
+    token_left: Duration,
+    /// A START began a job that has not ended.
+    running: bool,
+    begun_by: u32,
+    begun: BTreeSet<(u32, u16)>,
+    last_begun: (u32, u16),
+    done: u32,
+    result: u16,
+    progress: Progress,
+    owner: u32,
+    epoch: u32,
+    silent: Duration,
+    acting_left: Duration,
+}
+
+impl Handshake {
+    pub(crate) fn new(body: Box<dyn Body>, boot_id: u32, options: &MachineOptions) -> Self {
+        let silence_ms = if options.lost_after_ms == 0 { 3000 } else { options.lost_after_ms };
+        Self {
+            body,
+            log: Log::default(),
+            now: Duration::ZERO,
+            speed: options.speed,
+            slots: [None, None, None],
+            outbox: None,
+            state: State::Idle,
+            boot_id: boot_id.max(1),
+            order: options.word_order,
+            silence_limit: Duration::from_millis(silence_ms.into()),
+            acting: options.acting,
+            rng: crate::rng(options.seed ^ u64::from(boot_id)),
+            mode: Mode::Automatic,
+            opened: 0,
+            acknowledged: 0,
+            answer: Answer::None,
+            fault: 0,
+            work: Work::default(),
+            token: 0,
+            token_left: Duration::ZERO,
+            running: false,
+            begun_by: 0,
+            begun: options.last_begun.into_iter().collect(),
+            last_begun: options.last_begun.unwrap_or_default(),
+            done: 0,
+            result: 0,
+            progress: Progress::default(),
+            owner: 0,
+            epoch: 0,
+            silent: Duration::ZERO,
+            acting_left: Duration::ZERO,
+        }
+    }
+
+    /// Looks at the command block, of which the last register has just been written.
+    pub(crate) fn look(&mut self, words: &[u16; 20]) {
+        let Some(frame) = Frame::read(self.order, words) else { return self.note(What::Broken) };
+        let (sequence, command) = (frame.sequence, Command::of(frame.command));
+        if sequence == self.acknowledged {
+            return self.note(What::Repeated { sequence });
+        }
+        if sequence < self.acknowledged && command != Some(Command::Claim) {
+            return self.note(What::Old { sequence });
+        }
+        let answer = command.map_or(Answer::Unknown, |command| self.judge(command, &frame));
+        self.acknowledged = sequence;
+        self.answer = answer;
+        self.note(What::Commanded { frame, answer, state: self.state });
+        if let (Some(command), Answer::Accepted) = (command, answer) {
+            self.act(command, &frame);
+        }
+    }
+
+    /// The client's beat has moved.
+    pub(crate) fn hear(&mut self) {
+        self.silent = Duration::ZERO;
+    }
+
+    fn judge(&mut self, command: Command, frame: &Frame) -> Answer {
+        match command {
+            Command::Claim => return self.judge_claim(frame),
+            Command::Abort => return Answer::Accepted,
+            _ => {}
+        }
+        if self.owner == 0 || (frame.owner, frame.epoch) != (self.owner, self.epoch) {
+            return Answer::NotOwner;
+        }
+        self.hear();
+        if !command.is_allowed_in(self.state) {
+            if command == Command::Hold {
+                self.token = 0;
+            }
+            return Answer::NotAllowed;
+        }
+        match command {
+            Command::Prepare => self.judge_prepare(frame),
+            Command::Start => self.judge_start(frame),
+            Command::Resume if !self.is_safe(interlock::MOVING) => Answer::Interlock,
+            Command::Acknowledge if frame.argument != self.done => Answer::Argument,
+            _ => Answer::Accepted,
+        }
+    }
+
+    fn judge_claim(&self, frame: &Frame) -> Answer {
+        let free = self.owner == 0 || self.is_deserted();
+        let mine = frame.owner == self.owner && frame.epoch >= self.epoch;
+        if frame.owner != 0 && (free || mine) { Answer::Accepted } else { Answer::NotOwner }
+    }
+
+    fn judge_prepare(&mut self, frame: &Frame) -> Answer {
+        if !self.is_safe(interlock::ALL) {
+            return Answer::Interlock;
+        }
+        match self.digest() {
+            None => return Answer::Payload,
+            Some(digest) if digest != frame.digest || frame.job == 0 => return Answer::Different,
+            Some(_) => {}
+        }
+        let payload = |index: usize| self.slots[index].as_ref().map(|slot| slot.payload.clone());
+        let payloads = Payloads { plan: payload(0), map: payload(1), pass: payload(2) };
+        match self.body.prepare(frame.job, frame.cycle, &payloads) {
+            Ok(progress) => {
+                self.progress = progress;
+                Answer::Accepted
+            }
+            Err(refusal) => match refusal.answer {
+                9 => Answer::Interlock,
+                10 => Answer::Limits,
+                _ => Answer::Payload,
+            },
+        }
+    }
+
+    fn judge_start(&self, frame: &Frame) -> Answer {
+        let asked = Work { job: frame.job, cycle: frame.cycle, digest: frame.digest };
+        if !self.is_safe(interlock::ALL) {
+            Answer::Interlock
+        } else if self.token == 0 || frame.token != self.token {
+            Answer::Token
+        } else if asked != self.work || self.digest() != Some(frame.digest) {
+            Answer::Different
+        } else if self.begun.contains(&(frame.job, frame.cycle)) {
+            Answer::Begun
+        } else {
+            Answer::Accepted
+        }
+    }
+
+    /// Returns the CRC-32 over the identities in force, `None` if a payload is missing.
+    fn digest(&self) -> Option<u32> {
+        let needed: &[usize] = match self.body.kind() {
+            Kind::Cmm => &[0],
+            Kind::Grinder => &[1, 2],
+        };
+        let mut hasher = crc32fast::Hasher::new();
+        for index in needed {
+            hasher.update(&self.slots[*index].as_ref()?.payload.identity);
+        }
+        Some(hasher.finalize())
+    }
+
+    /// Does what was accepted; number and answer stand already.
+    fn act(&mut self, command: Command, frame: &Frame) {
+        match command {
+            Command::Claim => {
+                (self.owner, self.epoch, self.token) = (frame.owner, frame.epoch, 0);
+                self.hear();
+            }
+            Command::Prepare => {
+                self.work = Work { job: frame.job, cycle: frame.cycle, digest: frame.digest };
+                self.token = self.rng.random_range(1..=u32::MAX);
+                self.token_left = TOKEN_LIFE;
+                self.enter(State::Prepared);
+            }
+            Command::Start => self.begin(frame),
+            Command::Hold => self.hold(0),
+            Command::Resume => {
+                self.fault = 0;
+                self.enter(State::Execute);
+            }
+            Command::Stop if self.state == State::Prepared => self.enter(State::Idle),
+            Command::Stop => self.retract(State::Stopping),
+            Command::Abort if matches!(self.state, State::Aborting | State::Aborted) => {}
+            Command::Abort => self.retract(State::Aborting),
+            Command::Clear => self.enter(State::Idle),
+            Command::Acknowledge => {
+                (self.done, self.result) = (0, 0);
+                self.enter(State::Idle);
+            }
+            Command::Release => (self.owner, self.epoch, self.token) = (0, 0, 0),
+        }
+    }
+
+    fn begin(&mut self, frame: &Frame) {
+        let (job, cycle) = (frame.job, frame.cycle);
+        self.token = 0;
+        self.begun_by = frame.sequence;
+        self.last_begun = (job, cycle);
+        self.begun.insert((job, cycle));
+        self.running = true;
+        self.note(What::Began { start: frame.sequence, job, cycle });
+        self.enter(State::Execute);
+        self.body.begin();
+    }
+
+    fn hold(&mut self, fault: u16) {
+        self.show(fault);
+        self.retract(State::Holding);
+    }
+
+    /// Moves clear of the part and stays in a state that takes a while.
+    fn retract(&mut self, acting: State) {
+        self.token = 0;
+        self.acting_left = self.acting;
+        self.enter(acting);
+        self.body.retract();
+    }
+
+    /// Shows a fault, ends a job that is running as failed, and waits for CLEAR.
+    pub(crate) fn fail(&mut self, fault: u16) {
+        self.token = 0;
+        self.show(fault);
+        self.body.retract();
+        self.enter(State::Faulted);
+        self.end(4);
+    }
+
+    fn show(&mut self, fault: u16) {
+        self.fault = fault;
+        if fault != 0 {
+            self.note(What::Fault { fault });
+        }
+    }
+
+    fn enter(&mut self, to: State) {
+        if to == State::Idle {
+            (self.work, self.token, self.fault) = (Work::default(), 0, 0);
+            self.outbox = None;
+        }
+        let from = std::mem::replace(&mut self.state, to);
+        if from != to {
+            self.note(What::Changed { from, to });
+        }
+    }
+
+    /// Ends a job that is running; false if its result cannot be put into words.
+    fn end(&mut self, result: u16) -> bool {
+        if !std::mem::take(&mut self.running) {
+            return true;
+        }
+        (self.done, self.result) = (self.begun_by, result);
+        self.note(What::Ended { start: self.begun_by, result });
+        let slot = self.slots[if self.body.kind() == Kind::Cmm { 0 } else { 1 }].as_ref();
+        let identity = slot.map_or([0; 32], |slot| slot.payload.identity);
+        let origin = Origin { job: self.work.job, cycle: self.work.cycle, done: self.done, identity };
+        self.outbox = Outbox::new(self.order, self.body.outcome(result), origin);
+        self.outbox.is_some()
+    }
+
+    fn complete(&mut self, result: u16) {
+        if self.end(result) {
+            self.enter(State::Complete);
+        } else {
+            self.result = 4;
+            self.fail(FAULT_OTHER);
+        }
+    }
+
+    /// Lets some real time pass, at most a few hundredths of a second.
+    pub(crate) fn pass(&mut self, elapsed: Duration) {
+        self.now += elapsed;
+        self.silent = self.silent.saturating_add(elapsed);
+        match self.state {
+            State::Prepared => self.wait_for_start(elapsed),
+            State::Execute => self.execute(elapsed),
+            State::Holding | State::Stopping | State::Aborting => {
+                self.acting_left = self.acting_left.saturating_sub(elapsed);
+                if self.acting_left.is_zero() {
+                    self.arrive();
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn arrive(&mut self) {
+        match self.state {
+            State::Holding => self.enter(State::Held),
+            State::Stopping => self.complete(2),
+            State::Aborting => {
+                self.enter(State::Aborted);
+                self.end(3);
+            }
+            _ => {}
+        }
+    }
+
+    fn wait_for_start(&mut self, elapsed: Duration) {
+        self.token_left = self.token_left.saturating_sub(elapsed);
+        if !self.is_safe(interlock::ALL) {
+            self.token = 0;
+        }
+        if self.token_left.is_zero() {
+            self.enter(State::Idle);
+        }
+    }
+
+    fn execute(&mut self, elapsed: Duration) {
+        let lost = interlock::MOVING & !self.interlocks();
+        if lost != 0 {
+            return self.fail(match lost {
+                interlock::SUPPLIES => FAULT_SUPPLIES,
+                interlock::CLAMPED => FAULT_OTHER,
+                _ => FAULT_STOP_CIRCUIT,
+            });
+        }
+        if self.is_deserted() {
+            return self.hold(FAULT_SILENT);
+        }
+        let seconds = elapsed.as_secs_f64() * self.speed;
+        let steps = (seconds / STEP_S).ceil().clamp(1.0, 200.0);
+        for _ in 0..steps as u32 {
+            self.progress = self.body.advance(seconds / steps);
+            if self.progress.fault != 0 {
+                return self.fail(self.progress.fault);
+            }
+            if self.progress.finished {
+                return self.complete(1);
+            }
+        }
+    }
+
+    fn is_deserted(&self) -> bool {
+        self.silent > self.silence_limit
+    }
+
+    fn is_safe(&self, needed: u16) -> bool {
+        self.mode == Mode::Automatic && self.interlocks() & needed == needed
+    }
+
+    fn interlocks(&self) -> u16 {
+        self.body.interlocks() & interlock::ALL & !self.opened
+    }
+
+    /// Opens interlocks whatever the physics says; 0 leaves it to the physics again.
+    pub(crate) fn open(&mut self, bits: u16) {
+        self.opened = bits;
+        if self.state == State::Prepared && !self.is_safe(interlock::ALL) {
+            self.token = 0;
+        }
+    }
+
+    /// Turns the key at the panel; a machine that moves holds.
+    pub(crate) fn turn_key(&mut self, mode: Mode) {
+        if self.mode != mode {
+            self.mode = mode;
+            self.token = 0;
+            if self.state == State::Execute {
+                self.hold(0);
+            }
+        }
+    }
+
+    /// Starts the application anew: it forgets all but which jobs it began, and a motion that was cut off is a fault.
+    pub(crate) fn reboot(&mut self) {
+        let cut_off = std::mem::take(&mut self.running);
+        if cut_off {
+            self.body.retract();
+            // The physics ends its job; what it leaves is lost with the application's memory.
+            let _ = self.body.outcome(4);
+        }
+        self.boot_id = loop {
+            let id = self.rng.random_range(1..=u32::MAX);
+            if id != self.boot_id {
+                break id;
+            }
+        };
+        self.note(What::Rebooted { boot_id: self.boot_id });
+        self.slots = [None, None, None];
+        (self.acknowledged, self.answer, self.owner, self.epoch) = (0, Answer::None, 0, 0);
+        (self.begun_by, self.done, self.result) = (0, 0, 0);
+        self.progress = Progress::default();
+        self.silent = Duration::ZERO;
+        self.enter(State::Idle);
+        if cut_off {
+            self.show(FAULT_OTHER);
+            self.enter(State::Faulted);
+        }
+    }
+
+    pub(crate) fn note(&mut self, what: What) {
+        self.log.push(self.now, what);
+    }
+
+    /// Puts a payload into force; else says why not.
+    pub(crate) fn take(&mut self, arrived: Arrived) -> Result<(), u16> {
+        let (kind, identity) = (arrived.kind, arrived.identity);
+        let slot = Slot::new(self.order, arrived);
+        if let Err(refusal) = self.body.check(kind, &slot.payload) {
+            self.note(What::Refused { kind, reason: refusal.to_string() });
+            return Err(refusal.answer);
+        }
+        if let Some(index) = slot_of(self.body.kind(), kind) {
+            self.slots[index] = Some(slot);
+        }
+        self.note(What::Taken { kind, identity });
+        Ok(())
+    }
+
+    /// Says whether the payloads may not be touched.
+    pub(crate) fn is_moving(&self) -> bool {
+        matches!(self.state, State::Execute | State::Holding | State::Held)
+    }
+
+    /// Returns the status block but for its snapshot number and the beats.
+    pub(crate) fn image(&self) -> Vec<u16> {
+        let temperature = (self.body.temperature_c() * 100.0).round().clamp(-32768.0, 32767.0) as i16;
+        Image::new(self.order, 48)
+            .u16(1, self.state as u16)
+            .u16(2, self.mode as u16)
+            .u16(3, self.interlocks())
+            .u32(4, self.acknowledged)
+            .u16(6, self.answer as u16)
+            .u16(7, self.fault)
+            .u32(8, self.work.job)
+            .u16(10, self.work.cycle)
+            .u32(12, self.work.digest)
+            .u32(14, self.token)
+            .u32(16, self.done)
+            .u16(18, self.result)
+            .u32(20, self.progress.done)
+            .u32(22, self.progress.total)
+            .u32(24, self.owner)
+            .u32(26, self.epoch)
+            .u32(30, self.last_begun.0)
+            .u16(32, self.last_begun.1)
+            .u16(33, temperature as u16)
+            .u32(34, self.boot_id)
+            .u32(36, self.begun_by)
+            .done()
+    }
+}

@@ -1,0 +1,474 @@
+//! A machine as a Modbus client meets it: blocks of registers to read and to write, and time that passes.
+//!
+//! [`Machine`] is the whole simulated machine without its wire. Every answer follows from what was read, written and ticked,
+//! so a test runs hours of it in a moment and twice alike. Real time comes in by [`Machine::tick`] alone.
+
+use std::time::Duration;
+
+use crate::body::{Body, Kind};
+use crate::handshake::{Handshake, Mode, State};
+use crate::seen::{Seen, What};
+use crate::transfer::{Inbox, page_image, slots_image};
+use crate::words::{Image, WordOrder};
+
+/// Why a request is not carried out, as Modbus numbers it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Exception {
+    /// The function is not one of 3, 6 and 16.
+    Function = 1,
+    /// The address is outside the blocks, read only, or across a border.
+    Address = 2,
+    /// The content cannot be taken.
+    Value = 3,
+    /// The machine's application does not look at its inbox.
+    Busy = 6,
+    /// Nobody answers to the unit.
+    Target = 0x0B,
+}
+
+/// The first address of every block.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub struct Layout {
+    pub identity: u16,
+    pub sync: u16,
+    pub beat: u16,
+    pub command: u16,
+    pub status: u16,
+    pub in_force: u16,
+    pub inbox_header: u16,
+    pub inbox_page: u16,
+    pub inbox_state: u16,
+    pub outbox_header: u16,
+    pub outbox_select: u16,
+    pub outbox_page: u16,
+}
+
+impl Default for Layout {
+    fn default() -> Self {
+        Self {
+            identity: 0,
+            sync: 32,
+            beat: 36,
+            command: 40,
+            status: 64,
+            in_force: 120,
+            inbox_header: 200,
+            inbox_page: 224,
+            inbox_state: 350,
+            outbox_header: 400,
+            outbox_select: 460,
+            outbox_page: 462,
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Block {
+    Identity,
+    Sync,
+    Beat,
+    Command,
+    Status,
+    InForce,
+    InboxHeader,
+    InboxPage,
+    InboxState,
+    OutboxHeader,
+    OutboxSelect,
+    OutboxPage,
+}
+
+impl Layout {
+    fn blocks(&self) -> [(Block, u16, usize); 12] {
+        [
+            (Block::Identity, self.identity, 32),
+            (Block::Sync, self.sync, 4),
+            (Block::Beat, self.beat, 1),
+            (Block::Command, self.command, 20),
+            (Block::Status, self.status, 48),
+            (Block::InForce, self.in_force, 72),
+            (Block::InboxHeader, self.inbox_header, 24),
+            (Block::InboxPage, self.inbox_page, 120),
+            (Block::InboxState, self.inbox_state, 12),
+            (Block::OutboxHeader, self.outbox_header, 56),
+            (Block::OutboxSelect, self.outbox_select, 2),
+            (Block::OutboxPage, self.outbox_page, 116),
+        ]
+    }
+
+    /// Returns the block that an address lies in, and where in it.
+    fn find(&self, address: usize) -> Option<(Block, usize, usize)> {
+        self.blocks().into_iter().find_map(|(block, first, length)| {
+            let offset = address.checked_sub(first.into())?;
+            (offset < length).then_some((block, offset, length))
+        })
+    }
+}
+
+/// How a simulated machine is set up.
+#[derive(Clone, Debug)]
+pub struct MachineOptions {
+    /// In which order the words of a value stand.
+    pub word_order: WordOrder,
+    /// Where the blocks are.
+    pub layout: Layout,
+    /// Seconds of the machine's own time in a real second.
+    pub speed: f64,
+    /// Draws the tokens and the next boot ids.
+    pub seed: u64,
+    /// Milliseconds after which a silent client is lost; 0 stands for 3000.
+    pub lost_after_ms: u16,
+    /// Real time that the machine is HOLDING, STOPPING or ABORTING.
+    pub acting: Duration,
+    /// The longest payload it holds.
+    pub payload_limit_bytes: u32,
+    /// The job and cycle it began before it was switched off.
+    pub last_begun: Option<(u32, u16)>,
+}
+
+impl Default for MachineOptions {
+    fn default() -> Self {
+        Self {
+            word_order: WordOrder::Big,
+            layout: Layout::default(),
+            speed: 1.0,
+            seed: 1,
+            lost_after_ms: 0,
+            acting: Duration::from_millis(150),
+            payload_limit_bytes: 64 << 20,
+            last_begun: None,
+        }
+    }
+}
+
+/// The longest slice in which a tick is taken.
+const SLICE: Duration = Duration::from_millis(20);
+/// How often the machine's own beat advances.
+const BEAT: Duration = Duration::from_millis(100);
+
+/// A simulated machine: registers, handshake and physics.
+pub struct Machine {
+    handshake: Handshake,
+    options: MachineOptions,
+    inbox: Inbox,
+    sync: [u16; 2],
+    beat: u16,
+    command: [u16; 20],
+    inbox_header: [u16; 24],
+    inbox_page: [u16; 120],
+    select: [u16; 2],
+    machine_beat: u16,
+    beat_echo: u16,
+    beat_due: Duration,
+    status: Vec<u16>,
+    torn: bool,
+    frozen: bool,
+    /// A command came while the application did not look.
+    unseen: bool,
+}
+
+impl Machine {
+    /// Switches a machine on. `boot_id` should differ at every start of the program; 0 is taken for 1.
+    pub fn new(body: Box<dyn Body>, boot_id: u32, options: MachineOptions) -> Self {
+        let mut machine = Self {
+            handshake: Handshake::new(body, boot_id, &options),
+            options,
+            inbox: Inbox::default(),
+            sync: [0; 2],
+            beat: 0,
+            command: [0; 20],
+            inbox_header: [0; 24],
+            inbox_page: [0; 120],
+            select: [0; 2],
+            machine_beat: 0,
+            beat_echo: 0,
+            beat_due: BEAT,
+            status: vec![0; 48],
+            torn: false,
+            frozen: false,
+            unseen: false,
+        };
+        machine.publish();
+        machine
+    }
+
+    /// Reads some registers.
+    ///
+    /// # Errors
+    /// An address outside the blocks; none or more than 125 registers.
+    pub fn read(&mut self, address: u16, count: u16) -> Result<Vec<u16>, Exception> {
+        if !(1..=125).contains(&count) {
+            return Err(Exception::Value);
+        }
+        let count = usize::from(count);
+        let mut registers = Vec::with_capacity(count);
+        while registers.len() < count {
+            let at = usize::from(address) + registers.len();
+            let (block, offset, length) = self.options.layout.find(at).ok_or(Exception::Address)?;
+            let end = length.min(offset + count - registers.len());
+            registers.extend(&self.image(block)[offset..end]);
+        }
+        Ok(registers)
+    }
+
+    /// Writes some registers; what they ask for is done before this returns.
+    ///
+    /// # Errors
+    /// An address outside the client's blocks or across a border; content that cannot be taken.
+    pub fn write(&mut self, address: u16, values: &[u16]) -> Result<(), Exception> {
+        if !(1..=123).contains(&values.len()) {
+            return Err(Exception::Value);
+        }
+        let (block, offset, length) = self.options.layout.find(address.into()).ok_or(Exception::Address)?;
+        let writable = if block == Block::Sync { 2 } else { length };
+        if offset + values.len() > writable {
+            return Err(Exception::Address);
+        }
+        match block {
+            Block::Sync => self.sync[offset..offset + values.len()].copy_from_slice(values),
+            Block::Beat => self.write_beat(values[0]),
+            Block::Command => self.write_command(offset, values),
+            Block::InboxHeader => self.write_header(offset, values)?,
+            Block::InboxPage => self.write_page(offset, values)?,
+            Block::OutboxSelect => self.select[offset..offset + values.len()].copy_from_slice(values),
+            Block::Identity
+            | Block::Status
+            | Block::InForce
+            | Block::InboxState
+            | Block::OutboxHeader
+            | Block::OutboxPage => return Err(Exception::Address),
+        }
+        self.publish();
+        Ok(())
+    }
+
+    /// Lets real time pass.
+    pub fn tick(&mut self, elapsed_real: Duration) {
+        let mut left = elapsed_real;
+        while !left.is_zero() {
+            let slice = left.min(SLICE);
+            left -= slice;
+            if self.frozen {
+                self.handshake.now += slice;
+                continue;
+            }
+            if std::mem::take(&mut self.unseen) {
+                self.handshake.look(&self.command);
+            }
+            self.beat_echo = self.beat;
+            self.beat_due = self.beat_due.saturating_sub(slice);
+            if self.beat_due.is_zero() {
+                self.machine_beat = self.machine_beat.wrapping_add(1);
+                self.beat_due = BEAT;
+            }
+            self.handshake.pass(slice);
+        }
+        self.publish();
+    }
+
+    fn write_beat(&mut self, value: u16) {
+        if self.beat != value {
+            self.beat = value;
+            self.handshake.hear();
+        }
+    }
+
+    fn write_command(&mut self, offset: usize, values: &[u16]) {
+        self.command[offset..offset + values.len()].copy_from_slice(values);
+        if offset + values.len() < self.command.len() {
+            return;
+        }
+        if self.frozen {
+            self.unseen = true;
+        } else {
+            self.handshake.look(&self.command);
+        }
+    }
+
+    fn write_header(&mut self, offset: usize, values: &[u16]) -> Result<(), Exception> {
+        if self.frozen {
+            return Err(Exception::Busy);
+        }
+        let whole: [u16; 24] = values.try_into().map_err(|_| Exception::Value)?;
+        let (order, limit) = (self.options.word_order, self.options.payload_limit_bytes);
+        if offset != 0 || self.handshake.is_moving() || !self.inbox.header(order, &whole, self.kind(), limit) {
+            return Err(Exception::Value);
+        }
+        self.inbox_header = whole;
+        Ok(())
+    }
+
+    fn write_page(&mut self, offset: usize, values: &[u16]) -> Result<(), Exception> {
+        if self.frozen {
+            return Err(Exception::Busy);
+        }
+        let order = self.options.word_order;
+        if offset != 0 || values.len() < 9 || (self.handshake.is_moving() && !self.inbox.has_page(order, values)) {
+            return Err(Exception::Value);
+        }
+        let arrived = self.inbox.page(order, values).ok_or(Exception::Value)?;
+        self.inbox_page = [0; 120];
+        self.inbox_page[..values.len()].copy_from_slice(values);
+        if let Some(arrived) = arrived
+            && let Err(answer) = self.handshake.take(arrived)
+        {
+            self.inbox.refuse(answer);
+        }
+        Ok(())
+    }
+
+    fn image(&mut self, block: Block) -> Vec<u16> {
+        let order = self.options.word_order;
+        let outbox = self.handshake.outbox.as_ref().filter(|_| self.handshake.state == State::Complete);
+        match block {
+            Block::Identity => self.identity_image(),
+            Block::Sync => vec![self.sync[0], self.sync[1], !self.sync[0], !self.sync[1]],
+            Block::Beat => vec![self.beat],
+            Block::Command => self.command.to_vec(),
+            Block::Status => self.status_image(),
+            Block::InForce => slots_image(order, &self.handshake.slots),
+            Block::InboxHeader => self.inbox_header.to_vec(),
+            Block::InboxPage => self.inbox_page.to_vec(),
+            Block::InboxState => self.inbox.image(order),
+            Block::OutboxHeader => outbox.map_or_else(|| vec![0; 56], |outbox| outbox.header_image()),
+            Block::OutboxSelect => self.select.to_vec(),
+            Block::OutboxPage => {
+                let page = order.to_u32(self.select);
+                outbox.map_or_else(|| page_image(order, page, &[]), |outbox| outbox.page_image(order, page))
+            }
+        }
+    }
+
+    fn identity_image(&self) -> Vec<u16> {
+        let name: Vec<u8> = self.handshake.body.name().bytes().filter(u8::is_ascii).take(32).collect();
+        Image::new(self.options.word_order, 32)
+            .u16(0, 0x5247)
+            .u16(1, 0x4431)
+            .u16(2, 1)
+            .u16(3, self.kind() as u16)
+            .u32(4, 0x1234_5678)
+            .f64(6, -2.5e-7)
+            .u32(10, self.handshake.boot_id)
+            .u16(12, 1)
+            .u16(13, 1)
+            .u16(15, self.options.lost_after_ms)
+            .bytes(16, &name)
+            .done()
+    }
+
+    fn status_image(&mut self) -> Vec<u16> {
+        let mut image = self.status.clone();
+        if std::mem::take(&mut self.torn) {
+            image[47] = image[47].wrapping_sub(1);
+        }
+        image
+    }
+
+    /// Brings the status block up to date; a frozen application does not.
+    fn publish(&mut self) {
+        if self.frozen {
+            return;
+        }
+        let mut image = self.handshake.image();
+        (image[28], image[29]) = (self.machine_beat, self.beat_echo);
+        if image[1..47] != self.status[1..47] {
+            let number = self.status[0].wrapping_add(1);
+            (image[0], image[47]) = (number, number);
+            self.status = image;
+        }
+    }
+
+    /// Returns which machine it is.
+    pub fn kind(&self) -> Kind {
+        self.handshake.body.kind()
+    }
+
+    /// Returns the state it is in, frozen or not.
+    pub fn state(&self) -> State {
+        self.handshake.state
+    }
+
+    /// Returns the boot id of the identity block.
+    pub fn boot_id(&self) -> u32 {
+        self.handshake.boot_id
+    }
+
+    /// Returns where its blocks are.
+    pub fn layout(&self) -> &Layout {
+        &self.options.layout
+    }
+
+    /// Returns the order of words that it speaks.
+    pub fn word_order(&self) -> WordOrder {
+        self.options.word_order
+    }
+
+    /// Returns the newest things that it saw and did, the oldest of them first.
+    pub fn log(&self) -> &[Seen] {
+        self.handshake.log.all()
+    }
+
+    /// Returns how many older things are no longer in the log.
+    pub fn forgotten(&self) -> u64 {
+        self.handshake.log.forgotten()
+    }
+
+    /// Returns every START that moved the machine, as sequence number, job and cycle.
+    pub fn began(&self) -> Vec<(u32, u32, u16)> {
+        let began = |seen: &Seen| match seen.what {
+            What::Began { start, job, cycle } => Some((start, job, cycle)),
+            _ => None,
+        };
+        self.log().iter().filter_map(began).collect()
+    }
+
+    /// Returns the physics, for a test that changes it from under the handshake.
+    pub fn body_mut(&mut self) -> &mut dyn Body {
+        &mut *self.handshake.body
+    }
+
+    /// Sets how many seconds of its own time pass in a real second.
+    pub fn set_speed(&mut self, speed: f64) {
+        self.handshake.speed = speed.max(0.0);
+    }
+
+    /// Stops or continues the application, while the wire goes on answering with the registers as they are.
+    pub fn freeze(&mut self, frozen: bool) {
+        self.frozen = frozen;
+        self.publish();
+    }
+
+    /// Starts the application anew, with another boot id and empty memory; a motion it cuts off is fault 30.
+    pub fn reboot(&mut self) {
+        self.handshake.reboot();
+        self.inbox = Inbox::default();
+        (self.sync, self.beat, self.command, self.select) = ([0; 2], 0, [0; 20], [0; 2]);
+        (self.inbox_header, self.inbox_page) = ([0; 24], [0; 120]);
+        (self.machine_beat, self.beat_echo, self.frozen, self.unseen) = (0, 0, false, false);
+        self.publish();
+    }
+
+    /// Turns the key at the machine's panel.
+    pub fn set_mode(&mut self, mode: Mode) {
+        self.handshake.turn_key(mode);
+        self.publish();
+    }
+
+    /// Opens the interlocks of [`crate::handshake::interlock`] in `bits`, whatever the physics says; 0 closes them again.
+    pub fn open_interlocks(&mut self, bits: u16) {
+        self.handshake.open(bits);
+        self.publish();
+    }
+
+    /// Stops the machine with a fault of docs/modbus.md.
+    pub fn fail(&mut self, fault: u16) {
+        self.handshake.fail(fault);
+        self.publish();
+    }
+
+    /// Makes the two snapshot numbers of the next status that is read disagree.
+    pub fn tear_status(&mut self) {
+        self.torn = true;
+    }
+}

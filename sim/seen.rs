@@ -1,0 +1,114 @@
+//! What a simulated machine saw and did, in order, for a test to hold against the controller's journal.
+
+use std::time::Duration;
+
+use crate::handshake::{Answer, Frame, State};
+
+/// One thing that happened.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Seen {
+    /// Real time since the machine was made, as its ticks told it.
+    pub at: Duration,
+    /// What happened.
+    pub what: What,
+}
+
+/// What can happen at a machine.
+#[derive(Clone, Debug, PartialEq)]
+pub enum What {
+    /// A command was acted upon, or refused with an answer.
+    Commanded {
+        /// The frame as it was read.
+        frame: Frame,
+        /// What the machine answered.
+        answer: Answer,
+        /// In which state.
+        state: State,
+    },
+    /// The frame that was acted upon last came once more and changed nothing.
+    Repeated {
+        /// Its sequence number.
+        sequence: u32,
+    },
+    /// A frame was not looked at: its copies or its CRC disagree, or its number is 0.
+    Broken,
+    /// A sound frame was not looked at: its number is not greater than the one acknowledged.
+    Old {
+        /// Its sequence number.
+        sequence: u32,
+    },
+    /// The state changed.
+    Changed {
+        /// From.
+        from: State,
+        /// To.
+        to: State,
+    },
+    /// The physics began to move for a job; this is what may happen once for a (job, cycle).
+    Began {
+        /// Sequence number of the START.
+        start: u32,
+        /// The job.
+        job: u32,
+        /// Its cycle.
+        cycle: u16,
+    },
+    /// A job ended.
+    Ended {
+        /// Sequence number of its START.
+        start: u32,
+        /// 1 complete, 2 stopped, 3 aborted, 4 failed.
+        result: u16,
+    },
+    /// A payload came into force.
+    Taken {
+        /// Which.
+        kind: u16,
+        /// Its identity.
+        identity: [u8; 32],
+    },
+    /// A payload arrived that the machine cannot use.
+    Refused {
+        /// Which.
+        kind: u16,
+        /// In words.
+        reason: String,
+    },
+    /// A fault was shown; 20 is a silent client.
+    Fault {
+        /// Its number in docs/modbus.md.
+        fault: u16,
+    },
+    /// The machine's application started anew.
+    Rebooted {
+        /// Its new boot id.
+        boot_id: u32,
+    },
+}
+
+/// The newest things that happened; the older half is forgotten when it is full.
+#[derive(Debug, Default)]
+pub(crate) struct Log {
+    seen: Vec<Seen>,
+    forgotten: u64,
+}
+
+impl Log {
+    const CAPACITY: usize = 1 << 16;
+
+    pub(crate) fn push(&mut self, at: Duration, what: What) {
+        if self.seen.len() == Self::CAPACITY {
+            self.seen.drain(..Self::CAPACITY / 2);
+            self.forgotten += Self::CAPACITY as u64 / 2;
+        }
+        self.seen.push(Seen { at, what });
+    }
+
+    pub(crate) fn all(&self) -> &[Seen] {
+        &self.seen
+    }
+
+    pub(crate) fn forgotten(&self) -> u64 {
+        self.forgotten
+    }
+}

@@ -1,0 +1,224 @@
+//! Payloads on their way in and results on their way out, a page at a time.
+
+use crate::body::{Kind, Outcome, Payload};
+use crate::words::{Image, WordOrder, bytes_of, registers_of, turn_payload};
+
+/// Data registers of a full page.
+pub const PAGE_REGISTERS: usize = 112;
+const PAGE_BYTES: u32 = 2 * PAGE_REGISTERS as u32;
+
+/// Whether an inbox has what it was promised.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum InboxState {
+    /// No header yet.
+    #[default]
+    Empty = 0,
+    /// Waiting for pages.
+    Receiving = 1,
+    /// The payload is in force.
+    Taken = 2,
+    /// All pages came and are not what the header promised.
+    CrcWrong = 3,
+    /// The machine cannot use it.
+    Refused = 4,
+}
+
+/// A payload that has wholly arrived, in the machine's word order as it was sent.
+#[derive(Clone, Debug)]
+pub(crate) struct Arrived {
+    pub kind: u16,
+    pub bytes: Vec<u8>,
+    pub identity: [u8; 32],
+}
+
+/// Where a payload is put together.
+#[derive(Debug, Default)]
+pub(crate) struct Inbox {
+    kind: u16,
+    pub(crate) state: InboxState,
+    promised: u32,
+    crc: u32,
+    identity: [u8; 32],
+    next_page: u32,
+    bytes: Vec<u8>,
+    computed: u32,
+    pub(crate) reason: u16,
+}
+
+impl Inbox {
+    /// Takes a header; false if its content cannot be taken.
+    pub(crate) fn header(&mut self, order: WordOrder, words: &[u16], of: Kind, limit_bytes: u32) -> bool {
+        let (kind, promised) = (words[0], order.to_u32([words[2], words[3]]));
+        if slot_of(of, kind).is_none() || promised == 0 || promised > limit_bytes {
+            return false;
+        }
+        let mut identity = [0; 32];
+        identity.copy_from_slice(&bytes_of(&words[8..24]));
+        *self = Self {
+            kind,
+            state: InboxState::Receiving,
+            promised,
+            crc: order.to_u32([words[4], words[5]]),
+            identity,
+            ..Self::default()
+        };
+        true
+    }
+
+    /// Takes a page; `None` if it is out of turn or its length is wrong, `Some(Some(_))` if it was the last.
+    pub(crate) fn page(&mut self, order: WordOrder, words: &[u16]) -> Option<Option<Arrived>> {
+        if self.has_page(order, words) {
+            return Some(None);
+        }
+        let left = (self.promised - self.bytes.len() as u32).min(PAGE_BYTES);
+        let wanted = left.div_ceil(2) as usize;
+        let fits = usize::from(words[2]) == wanted && words.len() == 8 + wanted;
+        if self.state != InboxState::Receiving || order.to_u32([words[0], words[1]]) != self.next_page || !fits {
+            return None;
+        }
+        self.bytes.extend(&bytes_of(&words[8..])[..left as usize]);
+        self.next_page += 1;
+        Some(if self.bytes.len() as u32 == self.promised { self.close() } else { None })
+    }
+
+    /// Says whether a page was taken already.
+    pub(crate) fn has_page(&self, order: WordOrder, words: &[u16]) -> bool {
+        order.to_u32([words[0], words[1]]) < self.next_page
+    }
+
+    fn close(&mut self) -> Option<Arrived> {
+        self.computed = crc32fast::hash(&self.bytes);
+        if self.computed != self.crc {
+            self.state = InboxState::CrcWrong;
+            return None;
+        }
+        self.state = InboxState::Taken;
+        Some(Arrived { kind: self.kind, bytes: self.bytes.clone(), identity: self.identity })
+    }
+
+    /// Says that the machine cannot use what has arrived.
+    pub(crate) fn refuse(&mut self, answer: u16) {
+        self.state = InboxState::Refused;
+        self.reason = answer;
+    }
+
+    pub(crate) fn image(&self, order: WordOrder) -> Vec<u16> {
+        Image::new(order, 12)
+            .u16(0, self.kind)
+            .u16(1, self.state as u16)
+            .u32(2, self.next_page)
+            .u32(4, self.bytes.len() as u32)
+            .u32(6, self.computed)
+            .u16(8, self.reason)
+            .done()
+    }
+}
+
+/// Returns which slot in force a kind of payload goes to, `None` if a machine has no use for it.
+pub(crate) fn slot_of(machine: Kind, kind: u16) -> Option<usize> {
+    match (machine, kind) {
+        (Kind::Cmm, 1) => Some(0),
+        (Kind::Grinder, 2) => Some(1),
+        (Kind::Grinder, 3) => Some(2),
+        _ => None,
+    }
+}
+
+/// A payload in force.
+#[derive(Clone, Debug)]
+pub(crate) struct Slot {
+    /// As the physics reads it.
+    pub payload: Payload,
+    /// Over the bytes as they were sent.
+    pub crc: u32,
+}
+
+impl Slot {
+    pub(crate) fn new(order: WordOrder, arrived: Arrived) -> Self {
+        let crc = crc32fast::hash(&arrived.bytes);
+        let mut bytes = arrived.bytes;
+        if order == WordOrder::Little {
+            turn_payload(arrived.kind, 1, &mut bytes);
+        }
+        Self { payload: Payload { bytes, identity: arrived.identity }, crc }
+    }
+}
+
+pub(crate) fn slots_image(order: WordOrder, slots: &[Option<Slot>; 3]) -> Vec<u16> {
+    let mut image = Image::new(order, 72);
+    for (index, slot) in slots.iter().enumerate() {
+        let at = 24 * index;
+        image = image.u16(at, index as u16 + 1);
+        if let Some(slot) = slot {
+            image = image
+                .u16(at + 1, 1)
+                .u32(at + 2, slot.payload.bytes.len() as u32)
+                .u32(at + 4, slot.crc)
+                .bytes(at + 8, &slot.payload.identity);
+        }
+    }
+    image.done()
+}
+
+/// What a job left, until it is acknowledged.
+#[derive(Debug)]
+pub(crate) struct Outbox {
+    header: Vec<u16>,
+    registers: Vec<u16>,
+}
+
+/// Whose result it is.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Origin {
+    pub job: u32,
+    pub cycle: u16,
+    pub done: u32,
+    pub identity: [u8; 32],
+}
+
+impl Outbox {
+    /// Packs an outcome; `None` if one of its figures is not a number that may be sent.
+    pub(crate) fn new(order: WordOrder, outcome: Outcome, origin: Origin) -> Option<Self> {
+        let figures = [outcome.probe_radius_mm, outcome.scale_mm, outcome.temperature_c, outcome.duration_s];
+        if !figures.iter().all(|figure| figure.is_finite()) {
+            return None;
+        }
+        let mut bytes = outcome.bytes;
+        if order == WordOrder::Little {
+            turn_payload(outcome.kind, outcome.format, &mut bytes);
+        }
+        let header = Image::new(order, 56)
+            .u16(0, outcome.kind)
+            .u16(1, outcome.format)
+            .u32(2, bytes.len() as u32)
+            .u32(4, crc32fast::hash(&bytes))
+            .u32(6, origin.job)
+            .u16(8, origin.cycle)
+            .u16(9, outcome.coordinates)
+            .u32(10, outcome.records)
+            .f64(12, figures[0])
+            .f64(16, figures[1])
+            .f64(20, figures[2])
+            .f64(24, figures[3])
+            .u16(28, 1)
+            .bytes(30, &origin.identity)
+            .u32(46, origin.done)
+            .done();
+        Some(Self { header, registers: registers_of(&bytes) })
+    }
+
+    pub(crate) fn header_image(&self) -> Vec<u16> {
+        self.header.clone()
+    }
+
+    /// Returns the 116 registers of a page; beyond the last page they say 0 data registers.
+    pub(crate) fn page_image(&self, order: WordOrder, page: u32) -> Vec<u16> {
+        let data = self.registers.chunks(PAGE_REGISTERS).nth(page as usize).unwrap_or(&[]);
+        page_image(order, page, data)
+    }
+}
+
+/// Returns a page of an outbox: which it is, how many registers count, and they.
+pub(crate) fn page_image(order: WordOrder, page: u32, data: &[u16]) -> Vec<u16> {
+    Image::new(order, 4 + PAGE_REGISTERS).u32(0, page).u16(2, data.len() as u16).words(4, data).done()
+}

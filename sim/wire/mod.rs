@@ -1,0 +1,386 @@
+//! The machines' end of a Modbus wire.
+//!
+//! ```text
+//!  tcp      any number of clients, several units behind one port
+//!  rtu      a serial line, real or not, that takes as long as its baud rate says
+//!  pty      a serial line without hardware, opened by its path
+//!  faults   what goes wrong, when
+//! ```
+//!
+//! [`Serving`] is all that most callers need: it binds, serves, lets the machines' time pass, and stops.
+
+pub mod faults;
+#[cfg(unix)]
+pub mod pty;
+pub mod rtu;
+pub mod tcp;
+
+use std::io;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use tokio::io::{AsyncWrite, AsyncWriteExt};
+use tokio::net::{TcpListener, ToSocketAddrs};
+use tokio::task::JoinSet;
+use tokio::time::Instant;
+
+use crate::registers::{Exception, Machine};
+use crate::words::{bytes_of, crc16, registers_of};
+use faults::{Fault, Faults, Request};
+
+/// How often the machines' time passes.
+const TICK: Duration = Duration::from_millis(10);
+/// The most time that one tick lets pass. A simulator that was not given the processor has not lived meanwhile.
+const LONGEST_TICK: Duration = Duration::from_millis(100);
+
+/// A machine that wires, tests and time share.
+#[derive(Clone)]
+pub struct SharedMachine(Arc<Mutex<Living>>);
+
+struct Living {
+    machine: Machine,
+    ticked: Option<Instant>,
+}
+
+impl From<Machine> for SharedMachine {
+    fn from(machine: Machine) -> Self {
+        Self(Arc::new(Mutex::new(Living { machine, ticked: None })))
+    }
+}
+
+impl SharedMachine {
+    /// Looks at the machine, or changes it, while nobody else does.
+    pub fn with<T>(&self, look: impl FnOnce(&mut Machine) -> T) -> T {
+        look(&mut self.lock().machine)
+    }
+
+    /// Lets pass what time has passed since the last call.
+    fn live(&self) {
+        let now = Instant::now();
+        let mut living = self.lock();
+        let elapsed = now.saturating_duration_since(living.ticked.unwrap_or(now));
+        living.ticked = Some(now);
+        living.machine.tick(elapsed.min(LONGEST_TICK));
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Living> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The machines of a wire with their unit ids.
+pub type Units = Vec<(u8, SharedMachine)>;
+
+/// Lets real time pass at some machines until it is dropped.
+pub async fn live(machines: Vec<SharedMachine>) {
+    let mut ticks = tokio::time::interval(TICK);
+    ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    loop {
+        ticks.tick().await;
+        machines.iter().for_each(SharedMachine::live);
+    }
+}
+
+/// How an answer is put on the wire.
+#[derive(Clone, Copy)]
+enum Framing {
+    Tcp { transaction: u16 },
+    Rtu,
+}
+
+impl Framing {
+    fn frame(self, unit: u8, pdu: &[u8], spoiled: bool) -> Vec<u8> {
+        let spoil = u16::from(spoiled);
+        let mut frame = Vec::with_capacity(pdu.len() + 7);
+        match self {
+            Self::Tcp { transaction } => {
+                for word in [transaction, spoil, pdu.len() as u16 + 1] {
+                    frame.extend(word.to_be_bytes());
+                }
+                frame.push(unit);
+                frame.extend(pdu);
+            }
+            Self::Rtu => {
+                frame.push(unit);
+                frame.extend(pdu);
+                frame.extend((crc16(&frame) ^ spoil).to_le_bytes());
+            }
+        }
+        frame
+    }
+}
+
+/// What is left of the connection after an answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum After {
+    Open,
+    Closed,
+    Silent,
+}
+
+/// An answer with all that goes wrong with it.
+struct Delivery {
+    delay: Duration,
+    bytes: Vec<u8>,
+    pause: Option<Duration>,
+    after: After,
+}
+
+impl Delivery {
+    async fn send(&self, wire: &mut (impl AsyncWrite + Unpin)) -> io::Result<()> {
+        if !self.delay.is_zero() {
+            tokio::time::sleep(self.delay).await;
+        }
+        let Some(pause) = self.pause else {
+            wire.write_all(&self.bytes).await?;
+            return wire.flush().await;
+        };
+        for byte in &self.bytes {
+            wire.write_all(&[*byte]).await?;
+            wire.flush().await?;
+            tokio::time::sleep(pause).await;
+        }
+        Ok(())
+    }
+}
+
+/// Carries out a request and returns what the wire makes of the answer.
+fn answer(units: &Units, faults: &Faults, framing: Framing, unit: u8, pdu: &[u8]) -> Delivery {
+    let machine = units.iter().find(|(id, _)| *id == unit).map(|(_, machine)| machine);
+    let mut request = describe(machine, unit, pdu);
+    let met = faults.meet(&mut request);
+    for (unit, pdu) in faults.due(request.number) {
+        if let Some((_, machine)) = units.iter().find(|(id, _)| *id == unit) {
+            carry_out(machine, &pdu);
+        }
+    }
+    let mut exception = None;
+    for fault in &met {
+        match (fault, machine) {
+            (Fault::Exception(code), _) => exception = Some(vec![pdu[0] | 0x80, *code]),
+            (Fault::DropRequest, _) => exception = Some(Vec::new()),
+            (Fault::CarryOutAgain(after), _) => faults.keep(request.number + after, unit, pdu),
+            (Fault::Freeze, Some(machine)) => machine.with(|machine| machine.freeze(true)),
+            (Fault::Thaw, Some(machine)) => machine.with(|machine| machine.freeze(false)),
+            (Fault::Reboot, Some(machine)) => machine.with(Machine::reboot),
+            (Fault::TornStatus, Some(machine)) => machine.with(Machine::tear_status),
+            _ => {}
+        }
+    }
+    let reply = exception.unwrap_or_else(|| match (machine, framing) {
+        (Some(machine), _) => carry_out(machine, pdu),
+        (None, Framing::Tcp { .. }) => refusal(pdu[0], Exception::Target),
+        (None, Framing::Rtu) => Vec::new(),
+    });
+    deliver(framing, unit, reply, &met)
+}
+
+fn describe(machine: Option<&SharedMachine>, unit: u8, pdu: &[u8]) -> Request {
+    let word = |at: usize| pdu.get(at..at + 2).map_or(0, |pair| u16::from_be_bytes([pair[0], pair[1]]));
+    let (address, count) = (word(1), if pdu[0] == 6 { 1 } else { word(3) });
+    let (state, block) = machine.map(|machine| machine.with(|m| (m.state(), m.layout().command))).unzip();
+    let is_command = pdu[0] == 16 && block == Some(address) && count == 20;
+    let command = is_command.then(|| word(10));
+    Request { number: 0, unit, function: pdu[0], address, count, command, state }
+}
+
+fn deliver(framing: Framing, unit: u8, mut reply: Vec<u8>, met: &[Fault]) -> Delivery {
+    let mut delivery = Delivery { delay: Duration::ZERO, bytes: Vec::new(), pause: None, after: After::Open };
+    if reply.is_empty() {
+        return delivery;
+    }
+    let (mut framing, mut unit) = (framing, unit);
+    for fault in met {
+        match fault {
+            Fault::WrongTransaction => {
+                if let Framing::Tcp { transaction } = &mut framing {
+                    *transaction ^= 0x5A5A;
+                }
+            }
+            Fault::WrongUnit => unit ^= 0x40,
+            Fault::WrongFunction => reply[0] ^= 0x01,
+            Fault::FlipData => reply.last_mut().into_iter().for_each(|byte| *byte ^= 0x10),
+            Fault::WordSwap if reply[0] == 3 => reply[2..].chunks_exact_mut(4).for_each(|pair| pair.rotate_left(2)),
+            _ => {}
+        }
+    }
+    delivery.bytes = framing.frame(unit, &reply, met.contains(&Fault::FlipCrc));
+    for fault in met {
+        match fault {
+            Fault::DropReply => delivery.bytes.clear(),
+            Fault::DelayReply(delay) => delivery.delay = *delay,
+            Fault::DuplicateReply => delivery.bytes = delivery.bytes.repeat(2),
+            Fault::Truncate(length) => delivery.bytes.truncate(*length),
+            Fault::Extra(bytes) => delivery.bytes.extend(bytes),
+            Fault::Noise(bytes) => delivery.bytes = [&bytes[..], &delivery.bytes].concat(),
+            Fault::Split(pause) => delivery.pause = Some(*pause),
+            Fault::Disconnect(length) => {
+                delivery.bytes.truncate(*length);
+                delivery.after = After::Closed;
+            }
+            Fault::Silence => {
+                delivery.bytes.clear();
+                delivery.after = After::Silent;
+            }
+            _ => {}
+        }
+    }
+    delivery
+}
+
+fn refusal(function: u8, exception: Exception) -> Vec<u8> {
+    vec![function | 0x80, exception as u8]
+}
+
+/// Carries out functions 3, 6 and 16 and returns the answer's protocol data unit.
+fn carry_out(machine: &SharedMachine, pdu: &[u8]) -> Vec<u8> {
+    let word = |at: usize| u16::from_be_bytes([pdu[at], pdu[at + 1]]);
+    let done = match (pdu[0], pdu.len()) {
+        (3, 5) => machine.with(|m| m.read(word(1), word(3))).map(|registers| {
+            let mut reply = vec![3, 2 * registers.len() as u8];
+            reply.extend(bytes_of(&registers));
+            reply
+        }),
+        (6, 5) => machine.with(|m| m.write(word(1), &[word(3)])).map(|()| pdu.to_vec()),
+        (16, 8..) if usize::from(pdu[5]) == pdu.len() - 6 && u16::from(pdu[5]) == word(3).wrapping_mul(2) => {
+            machine.with(|m| m.write(word(1), &registers_of(&pdu[6..]))).map(|()| pdu[..5].to_vec())
+        }
+        (3 | 6 | 16, _) => Err(Exception::Value),
+        _ => Err(Exception::Function),
+    };
+    done.unwrap_or_else(|exception| refusal(pdu[0], exception))
+}
+
+/// Machines that are being served, until this is stopped or dropped.
+pub struct Serving {
+    local_addr: Option<SocketAddr>,
+    path: Option<PathBuf>,
+    machines: Units,
+    faults: Faults,
+    tasks: JoinSet<io::Result<()>>,
+}
+
+impl Serving {
+    /// Serves machines over Modbus TCP; port 0 takes any that is free.
+    ///
+    /// # Errors
+    /// The address cannot be bound.
+    pub async fn tcp<M: Into<SharedMachine>>(addr: impl ToSocketAddrs, units: Vec<(u8, M)>) -> io::Result<Self> {
+        Self::tcp_with(addr, units, Faults::none()).await
+    }
+
+    /// Serves machines over a Modbus TCP on which things go wrong.
+    ///
+    /// # Errors
+    /// The address cannot be bound.
+    pub async fn tcp_with<M: Into<SharedMachine>>(
+        addr: impl ToSocketAddrs,
+        units: Vec<(u8, M)>,
+        faults: Faults,
+    ) -> io::Result<Self> {
+        let listener = TcpListener::bind(addr).await?;
+        let mut serving = Self::of(units, faults);
+        serving.local_addr = Some(listener.local_addr()?);
+        let (machines, faults) = (serving.machines.clone(), serving.faults.clone());
+        serving.tasks.spawn(async move { tcp::serve_tcp(listener, machines, faults).await });
+        Ok(serving)
+    }
+
+    /// Serves machines over Modbus RTU on a new pseudo-terminal, whose path a client opens like that of a serial port.
+    ///
+    /// # Errors
+    /// No pseudo-terminal can be had.
+    #[cfg(unix)]
+    pub fn rtu<M: Into<SharedMachine>>(units: Vec<(u8, M)>, line: rtu::Line, faults: Faults) -> io::Result<Self> {
+        let port = pty::Pty::open()?;
+        let mut serving = Self::of(units, faults);
+        serving.path = Some(port.path().to_path_buf());
+        serving.spawn_rtu(port, line);
+        Ok(serving)
+    }
+
+    /// Serves machines over Modbus RTU on a serial port of this computer: 8 data bits, no parity, 1 stop bit.
+    ///
+    /// # Errors
+    /// The port cannot be opened.
+    pub fn rtu_at<M: Into<SharedMachine>>(
+        path: impl AsRef<Path>,
+        units: Vec<(u8, M)>,
+        line: rtu::Line,
+        faults: Faults,
+    ) -> io::Result<Self> {
+        let path = path.as_ref();
+        let builder = tokio_serial::new(path.to_string_lossy(), line.baud);
+        let port = tokio_serial::SerialStream::open(&builder)?;
+        let mut serving = Self::of(units, faults);
+        serving.path = Some(path.to_path_buf());
+        serving.spawn_rtu(port, line);
+        Ok(serving)
+    }
+
+    fn of<M: Into<SharedMachine>>(units: Vec<(u8, M)>, faults: Faults) -> Self {
+        let machines: Units = units.into_iter().map(|(unit, machine)| (unit, machine.into())).collect();
+        let living = machines.iter().map(|(_, machine)| machine.clone()).collect();
+        let mut tasks = JoinSet::new();
+        tasks.spawn(async move {
+            live(living).await;
+            Ok(())
+        });
+        Self { local_addr: None, path: None, machines, faults, tasks }
+    }
+
+    fn spawn_rtu<P>(&mut self, port: P, line: rtu::Line)
+    where
+        P: tokio::io::AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    {
+        let (machines, faults) = (self.machines.clone(), self.faults.clone());
+        self.tasks.spawn(async move { rtu::serve_rtu(port, machines, line, faults).await });
+    }
+
+    /// Returns the address that is served, if it is TCP.
+    pub fn local_addr(&self) -> Option<SocketAddr> {
+        self.local_addr
+    }
+
+    /// Returns the path of the serial port, for a client to open if it is a pseudo-terminal.
+    pub fn path(&self) -> Option<&Path> {
+        self.path.as_deref()
+    }
+
+    /// Returns the machines with their units.
+    pub fn machines(&self) -> &Units {
+        &self.machines
+    }
+
+    /// Returns the machine of a unit.
+    pub fn machine(&self, unit: u8) -> Option<&SharedMachine> {
+        self.machines.iter().find(|(id, _)| *id == unit).map(|(_, machine)| machine)
+    }
+
+    /// Returns what goes wrong on this wire, to be changed at any time.
+    pub fn faults(&self) -> &Faults {
+        &self.faults
+    }
+
+    /// Waits until the wire fails, as a serial port does that is pulled out; a TCP port does not.
+    ///
+    /// # Errors
+    /// Why it failed.
+    pub async fn failed(&mut self) -> io::Result<()> {
+        loop {
+            match self.tasks.join_next().await {
+                Some(Ok(Err(error))) => return Err(error),
+                Some(Err(error)) => return Err(io::Error::other(error)),
+                Some(Ok(Ok(()))) => {}
+                None => return Ok(()),
+            }
+        }
+    }
+
+    /// Closes every connection and waits until all is quiet. The machines stay as they are and can be served again.
+    pub async fn stop(mut self) {
+        self.tasks.shutdown().await;
+    }
+}

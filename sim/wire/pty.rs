@@ -1,0 +1,83 @@
+//! A serial line without hardware: a pseudo-terminal whose far end a client opens by its path.
+
+use std::io;
+use std::os::fd::OwnedFd;
+use std::os::unix::ffi::OsStringExt;
+use std::path::{Path, PathBuf};
+use std::pin::Pin;
+use std::task::{Context, Poll, ready};
+
+use rustix::fs::{Mode, OFlags, open};
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use rustix::termios::{OptionalActions, ioctl_tiocnxcl, tcgetattr, tcsetattr};
+use tokio::io::unix::AsyncFd;
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+
+/// The near end of a pseudo-terminal.
+///
+/// It holds the far end open too: a client that closes the port, or dies, leaves a line that another can open.
+#[derive(Debug)]
+pub struct Pty {
+    near: AsyncFd<OwnedFd>,
+    far: OwnedFd,
+    path: PathBuf,
+}
+
+impl Pty {
+    /// Opens a pseudo-terminal that changes no byte on its way.
+    ///
+    /// # Errors
+    /// The system has none left. Panics outside a tokio runtime, as all its sockets do.
+    pub fn open() -> io::Result<Self> {
+        let near = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY)?;
+        grantpt(&near)?;
+        unlockpt(&near)?;
+        let path = PathBuf::from(std::ffi::OsString::from_vec(ptsname(&near, Vec::new())?.into_bytes()));
+        let far = open(&path, OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC, Mode::empty())?;
+        let mut settings = tcgetattr(&far)?;
+        settings.make_raw();
+        tcsetattr(&far, OptionalActions::Now, &settings)?;
+        rustix::io::ioctl_fionbio(&near, true)?;
+        // Its successor is unsafe to call, for descriptors that others may close; this one is owned here alone.
+        #[allow(deprecated)]
+        let near = AsyncFd::new(near)?;
+        Ok(Self { near, far, path })
+    }
+
+    /// Returns the path that a client opens.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+}
+
+impl AsyncRead for Pty {
+    fn poll_read(self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+        loop {
+            let mut ready = ready!(self.near.poll_read_ready(cx))?;
+            let read = ready.try_io(|near| Ok(rustix::io::read(near.get_ref(), buf.initialize_unfilled())?));
+            let Ok(read) = read else { continue };
+            // A client that is killed leaves the line locked for everybody but root, since it stays open here.
+            let _ = ioctl_tiocnxcl(&self.far);
+            return Poll::Ready(read.map(|count| buf.advance(count)));
+        }
+    }
+}
+
+impl AsyncWrite for Pty {
+    fn poll_write(self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        loop {
+            let mut ready = ready!(self.near.poll_write_ready(cx))?;
+            if let Ok(written) = ready.try_io(|near| Ok(rustix::io::write(near.get_ref(), bytes)?)) {
+                return Poll::Ready(written);
+            }
+        }
+    }
+
+    fn poll_flush(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Poll::Ready(Ok(()))
+    }
+
+    fn poll_shutdown(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Poll::Ready(Ok(()))
+    }
+}

@@ -1,0 +1,125 @@
+//! Modbus RTU: frames that silence parts, a CRC at the end, and a line that takes its time.
+//!
+//! A pseudo-terminal carries any number of bytes at once, whatever its baud rate. A paced line therefore lets as much time pass
+//! as the bytes of request and answer would take on a wire, so that what a client measures is what a real line would give.
+
+use std::io;
+use std::time::Duration;
+
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite};
+
+use super::faults::Faults;
+use super::{After, Framing, Units, answer};
+use crate::words::crc16;
+
+/// Silence after which a frame that is not whole is given up: far longer than 3.5 characters, since a computer that
+/// has other things to do pauses between bytes where a wire does not.
+const GIVE_UP: Duration = Duration::from_millis(50);
+
+/// How fast a serial line is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Line {
+    /// Bits a second; a character has 11.
+    pub baud: u32,
+    /// Lets the time pass that the bytes take; false for a port that takes it by itself.
+    pub paced: bool,
+}
+
+impl Line {
+    /// A line without hardware that takes the time of its baud rate.
+    pub fn paced(baud: u32) -> Self {
+        Self { baud, paced: true }
+    }
+
+    /// A line that takes the time it takes.
+    pub fn unpaced(baud: u32) -> Self {
+        Self { baud, paced: false }
+    }
+
+    /// Returns how long some characters take.
+    pub fn characters(&self, count: usize) -> Duration {
+        Duration::from_secs_f64(11.0 * count as f64 / f64::from(self.baud.max(1)))
+    }
+
+    /// Returns the silence between frames: 3.5 characters, 1.75 ms above 19200 baud.
+    pub fn gap(&self) -> Duration {
+        if self.baud > 19_200 { Duration::from_micros(1750) } else { self.characters(7) / 2 }
+    }
+}
+
+/// Serves machines on a serial line until it is dropped or the line fails.
+///
+/// # Errors
+/// The line cannot be read or written any more.
+pub async fn serve_rtu<P>(mut port: P, units: Units, line: Line, faults: Faults) -> io::Result<()>
+where
+    P: AsyncRead + AsyncWrite + Unpin,
+{
+    let mut heard = Vec::new();
+    let mut silent = false;
+    loop {
+        let frame = next_frame(&mut port, &mut heard).await?;
+        let (unit, pdu) = (frame[0], &frame[1..frame.len() - 2]);
+        if unit == 0 || silent || pdu.is_empty() {
+            continue;
+        }
+        tokio::time::sleep(if line.paced { line.characters(frame.len()) } else { Duration::ZERO } + line.gap()).await;
+        let mut delivery = answer(&units, &faults, Framing::Rtu, unit, pdu);
+        if line.paced {
+            delivery.delay += line.characters(delivery.bytes.len());
+        }
+        delivery.send(&mut port).await?;
+        silent = delivery.after == After::Silent;
+    }
+}
+
+/// Returns the next frame whose CRC is right; what is not a frame is dropped at the next silence.
+async fn next_frame<P: AsyncRead + Unpin>(port: &mut P, heard: &mut Vec<u8>) -> io::Result<Vec<u8>> {
+    let mut broken = false;
+    loop {
+        if let Some(length) = length(heard).filter(|length| !broken && heard.len() >= *length) {
+            if is_sound(&heard[..length]) {
+                return Ok(heard.drain(..length).collect());
+            }
+            broken = true;
+        }
+        let mut bytes = [0; 256];
+        let read = port.read(&mut bytes);
+        let count = if heard.is_empty() {
+            read.await?
+        } else {
+            tokio::time::timeout(GIVE_UP, read).await.unwrap_or(Ok(usize::MAX))?
+        };
+        match count {
+            0 => return Err(io::ErrorKind::UnexpectedEof.into()),
+            usize::MAX => {
+                // Silence: a function of unknown length ends here.
+                let frame = std::mem::take(heard);
+                if !broken && is_sound(&frame) {
+                    return Ok(frame);
+                }
+                broken = false;
+            }
+            count => {
+                heard.extend(&bytes[..count]);
+                if heard.len() > 4096 {
+                    heard.clear();
+                    broken = true;
+                }
+            }
+        }
+    }
+}
+
+/// Returns how long the frame that begins here is, if that can be told.
+fn length(heard: &[u8]) -> Option<usize> {
+    match heard.get(1)? {
+        1..=6 | 8 => Some(8),
+        15 | 16 => Some(9 + usize::from(*heard.get(6)?)),
+        _ => None,
+    }
+}
+
+fn is_sound(frame: &[u8]) -> bool {
+    frame.len() >= 4 && frame.split_last_chunk().is_some_and(|(body, crc)| crc16(body) == u16::from_le_bytes(*crc))
+}

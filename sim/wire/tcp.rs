@@ -1,0 +1,62 @@
+//! Modbus TCP: the header of seven bytes, and nothing between clients but the machines.
+
+use std::io;
+use std::time::Duration;
+
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::task::JoinSet;
+
+use super::faults::Faults;
+use super::{After, Framing, Units, answer};
+
+/// Serves machines to any number of clients until it is dropped, and closes every connection then.
+///
+/// # Errors
+/// None; the type is that of the other wires.
+pub async fn serve_tcp(listener: TcpListener, units: Units, faults: Faults) -> io::Result<()> {
+    let mut clients = JoinSet::new();
+    loop {
+        tokio::select! {
+            accepted = listener.accept() => match accepted {
+                Ok((stream, _)) => {
+                    let (units, faults) = (units.clone(), faults.clone());
+                    clients.spawn(async move { serve_client(stream, &units, &faults).await });
+                }
+                // Out of descriptors, or a client that was gone at once: neither concerns the others.
+                Err(_) => tokio::time::sleep(Duration::from_millis(20)).await,
+            },
+            Some(_) = clients.join_next() => {}
+        }
+    }
+}
+
+/// Answers one client, request after request, until it goes away or sends what is not Modbus.
+async fn serve_client(mut stream: TcpStream, units: &Units, faults: &Faults) -> io::Result<()> {
+    stream.set_nodelay(true)?;
+    loop {
+        let mut header = [0; 7];
+        stream.read_exact(&mut header).await?;
+        let [t0, t1, p0, p1, l0, l1, unit] = header;
+        let length = u16::from_be_bytes([l0, l1]);
+        if [p0, p1] != [0, 0] || !(2..=254).contains(&length) {
+            return Ok(());
+        }
+        let mut pdu = vec![0; usize::from(length) - 1];
+        stream.read_exact(&mut pdu).await?;
+        let framing = Framing::Tcp { transaction: u16::from_be_bytes([t0, t1]) };
+        let delivery = answer(units, faults, framing, unit, &pdu);
+        delivery.send(&mut stream).await?;
+        match delivery.after {
+            After::Open => {}
+            After::Closed => return stream.shutdown().await,
+            After::Silent => return swallow(stream).await,
+        }
+    }
+}
+
+async fn swallow(mut stream: TcpStream) -> io::Result<()> {
+    let mut bytes = [0; 256];
+    while stream.read(&mut bytes).await? > 0 {}
+    Ok(())
+}

@@ -1,0 +1,546 @@
+//! One Modbus line: a TCP connection or a serial port, and everything that can go wrong on it.
+//!
+//! A line lives on a thread of its own with a little runtime of its own, because a serial port can block where it should not, and because
+//! whatever else the program computes must not delay a beat. Requests come in by a channel, one is on the wire at a time, and several
+//! machines on one line share it by cloning the [`Link`].
+//!
+//! A line is trusted until the first thing that is wrong. A time-out, a short answer, a foreign echo, bytes that nobody asked for: the
+//! connection is dropped with everything that may still arrive on it, the line is left alone for as long as the slowest machine may
+//! need, a serial line is listened to until it is silent, and only then is it opened anew, under a new *generation* number. Whoever had
+//! proved a machine on the old generation has to prove it again: a request names the generation it trusts and is turned away as stale when
+//! that is gone. An answer to an older question can so never be taken for the answer to a newer one.
+//!
+//! The library below checks lengths and echoes only in debug builds, by panicking. The plain responses are asked for here and checked here.
+
+use std::io;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, ReadBuf};
+use tokio::net::TcpStream;
+use tokio::sync::{mpsc, oneshot};
+use tokio::time::{Instant, sleep, sleep_until, timeout};
+use tokio_modbus::client::Client as _;
+use tokio_modbus::slave::{Slave, SlaveContext as _};
+use tokio_modbus::{ProtocolError, Request, Response};
+use tokio_serial::{SerialPort as _, SerialPortBuilderExt as _, SerialStream};
+
+/// The first wait before a line is opened again; it doubles up to [`LONGEST_BACKOFF`].
+const FIRST_BACKOFF: Duration = Duration::from_millis(100);
+/// The longest wait before a line is opened again.
+const LONGEST_BACKOFF: Duration = Duration::from_secs(5);
+/// A line that is not silent for so long is not going to be.
+const LONGEST_DRAIN: Duration = Duration::from_secs(2);
+
+/// The parity of a serial line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum Parity {
+    /// No parity bit.
+    None,
+    /// Even, the default of Modbus.
+    #[default]
+    Even,
+    /// Odd.
+    Odd,
+}
+
+/// Where a line leads.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub enum Wire {
+    /// Modbus TCP.
+    Tcp {
+        /// Host name or address.
+        host: String,
+        /// The port, 502 by the standard.
+        port: u16,
+    },
+    /// Modbus RTU on a serial port.
+    Rtu {
+        /// The port, best by its lasting name under /dev/serial/by-id.
+        device: String,
+        /// Bits per second.
+        baud: u32,
+        /// The parity.
+        parity: Parity,
+        /// Stop bits, 1 or 2.
+        stop_bits: u8,
+    },
+}
+
+impl std::fmt::Display for Wire {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Tcp { host, port } => write!(f, "{host}:{port}"),
+            Self::Rtu { device, baud, .. } => write!(f, "{device} ({baud} baud)"),
+        }
+    }
+}
+
+/// What a line has seen since it was made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct LinkFigures {
+    /// Requests sent.
+    pub requests: u64,
+    /// Sound answers.
+    pub answers: u64,
+    /// Modbus exceptions among them.
+    pub exceptions: u64,
+    /// Requests that nothing came back for in time.
+    pub timeouts: u64,
+    /// Answers that did not hold: length, echo, unit, function, check sum, or nobody had asked.
+    pub corrupt: u64,
+    /// Connections that ended from the other side.
+    pub disconnects: u64,
+    /// Attempts to open the line that failed.
+    pub refused: u64,
+    /// Times the line was opened.
+    pub opened: u64,
+    /// Requests that were asked again.
+    pub retries: u64,
+    /// Time from request to answer, summed up over the answers, in nanoseconds.
+    pub answer_ns: u64,
+    /// The longest of them.
+    pub slowest_ns: u64,
+}
+
+#[derive(Debug, Default)]
+struct Counters {
+    requests: AtomicU64,
+    answers: AtomicU64,
+    exceptions: AtomicU64,
+    timeouts: AtomicU64,
+    corrupt: AtomicU64,
+    disconnects: AtomicU64,
+    refused: AtomicU64,
+    opened: AtomicU64,
+    retries: AtomicU64,
+    answer_ns: AtomicU64,
+    slowest_ns: AtomicU64,
+}
+
+fn count(counter: &AtomicU64) {
+    counter.fetch_add(1, Ordering::Relaxed);
+}
+
+/// What can be wrong with one request.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum LinkFault {
+    /// The line could not be opened.
+    Unreachable(io::ErrorKind),
+    /// No answer in time.
+    TimedOut,
+    /// The other side closed.
+    Disconnected,
+    /// An answer that does not hold.
+    Corrupt { what: &'static str, expected: u64, found: u64 },
+    /// A sound answer that says no.
+    Exception(u8),
+    /// The generation that the request trusts is gone; nothing was sent.
+    Stale,
+}
+
+/// What is asked.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Ask {
+    Read {
+        address: u16,
+        count: u16,
+    },
+    Write {
+        address: u16,
+        words: Arc<[u16]>,
+    },
+    /// What came over the line does not hold, by a check that the line cannot make: give it up.
+    Distrust,
+}
+
+type Answer = Result<(u64, Vec<u16>), LinkFault>;
+
+struct Question {
+    unit: u8,
+    generation: Option<u64>,
+    ask: Ask,
+    reply: oneshot::Sender<Answer>,
+}
+
+/// A handle to one line. Clones share it; the line ends with its last handle.
+#[derive(Debug, Clone)]
+pub struct Link {
+    wire: Wire,
+    request_timeout: Duration,
+    questions: mpsc::Sender<Question>,
+    counters: Arc<Counters>,
+}
+
+impl Link {
+    /// A line that is opened when it is first asked. `quarantine` is how long a machine on it may need for an answer at worst: after an
+    /// error the line is left alone for so long.
+    pub fn new(wire: Wire, request_timeout: Duration, quarantine: Duration) -> io::Result<Self> {
+        let (questions, inbox) = mpsc::channel(16);
+        let counters = Arc::new(Counters::default());
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let line = Line::new(wire.clone(), request_timeout, quarantine, counters.clone());
+        std::thread::Builder::new().name(format!("line {wire}")).spawn(move || runtime.block_on(line.run(inbox)))?;
+        Ok(Self { wire, request_timeout, questions, counters })
+    }
+
+    /// Where it leads.
+    pub fn wire(&self) -> &Wire {
+        &self.wire
+    }
+
+    /// What it has seen so far.
+    pub fn figures(&self) -> LinkFigures {
+        let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        let c = &*self.counters;
+        LinkFigures {
+            requests: read(&c.requests),
+            answers: read(&c.answers),
+            exceptions: read(&c.exceptions),
+            timeouts: read(&c.timeouts),
+            corrupt: read(&c.corrupt),
+            disconnects: read(&c.disconnects),
+            refused: read(&c.refused),
+            opened: read(&c.opened),
+            retries: read(&c.retries),
+            answer_ns: read(&c.answer_ns),
+            slowest_ns: read(&c.slowest_ns),
+        }
+    }
+
+    pub(super) fn request_timeout(&self) -> Duration {
+        self.request_timeout
+    }
+
+    pub(super) fn count_retry(&self) {
+        count(&self.counters.retries);
+    }
+
+    /// Asks one thing of one unit. With a generation, only on that connection; without, the line is opened if need be. Gives the
+    /// generation on which the answer came.
+    pub(super) async fn ask(&self, unit: u8, generation: Option<u64>, ask: Ask) -> Answer {
+        let (reply, answer) = oneshot::channel();
+        let question = Question { unit, generation, ask, reply };
+        // The line keeps its own time-outs; this one is for a port that blocks inside the operating system.
+        let limit = self.request_timeout * 4 + LONGEST_BACKOFF * 2 + LONGEST_DRAIN;
+        let both = async {
+            self.questions.send(question).await.map_err(|_| LinkFault::Disconnected)?;
+            answer.await.unwrap_or(Err(LinkFault::Disconnected))
+        };
+        timeout(limit, both).await.unwrap_or(Err(LinkFault::TimedOut))
+    }
+}
+
+/// The far side of the channel: the connection and its history.
+struct Line {
+    wire: Wire,
+    request_timeout: Duration,
+    quarantine: Duration,
+    counters: Arc<Counters>,
+    connection: Option<tokio_modbus::client::Context>,
+    generation: u64,
+    failures: u32,
+    not_before: Instant,
+    silent_from: Instant,
+}
+
+impl Line {
+    fn new(wire: Wire, request_timeout: Duration, quarantine: Duration, counters: Arc<Counters>) -> Self {
+        let now = Instant::now();
+        Self {
+            wire,
+            request_timeout,
+            quarantine,
+            counters,
+            connection: None,
+            generation: 0,
+            failures: 0,
+            not_before: now,
+            silent_from: now,
+        }
+    }
+
+    async fn run(mut self, mut inbox: mpsc::Receiver<Question>) {
+        while let Some(question) = inbox.recv().await {
+            if question.reply.is_closed() {
+                continue; // whoever asked has gone; what was never sent need not be
+            }
+            let answer = self.serve(&question).await;
+            let _ = question.reply.send(answer);
+        }
+    }
+
+    async fn serve(&mut self, question: &Question) -> Answer {
+        let stale = question.generation.is_some_and(|trusted| self.connection.is_none() || trusted != self.generation);
+        if stale {
+            return Err(LinkFault::Stale);
+        }
+        if question.ask == Ask::Distrust {
+            count(&self.counters.corrupt);
+            self.give_up();
+            return Ok((self.generation, Vec::new()));
+        }
+        if self.connection.is_none() {
+            self.open().await?;
+        }
+        let answer = self.exchange(question.unit, &question.ask).await;
+        match answer {
+            Ok(words) => {
+                if question.generation.is_some() {
+                    self.failures = 0;
+                }
+                Ok((self.generation, words))
+            }
+            Err(fault) => {
+                self.account(fault);
+                Err(fault)
+            }
+        }
+    }
+
+    fn account(&mut self, fault: LinkFault) {
+        let counters = &self.counters;
+        count(match fault {
+            LinkFault::Exception(_) => &counters.exceptions,
+            LinkFault::TimedOut => &counters.timeouts,
+            LinkFault::Corrupt { .. } => &counters.corrupt,
+            LinkFault::Unreachable(_) | LinkFault::Disconnected | LinkFault::Stale => &counters.disconnects,
+        });
+        if !matches!(fault, LinkFault::Exception(_)) {
+            self.give_up();
+        }
+    }
+
+    /// Drops the connection with all that may still come over it, and leaves the line alone for a while.
+    fn give_up(&mut self) {
+        self.connection = None;
+        self.failures = self.failures.saturating_add(1);
+        let full = FIRST_BACKOFF.saturating_mul(1 << (self.failures - 1).min(10)).min(LONGEST_BACKOFF);
+        let jittered = full.mul_f64(0.5 + 0.5 * rand::random::<f64>());
+        self.not_before = Instant::now() + jittered.max(self.quarantine);
+    }
+
+    async fn open(&mut self) -> Result<(), LinkFault> {
+        sleep_until(self.not_before).await;
+        let limit = self.request_timeout.max(Duration::from_secs(1)) + LONGEST_DRAIN;
+        let opened = timeout(limit, connect(&self.wire)).await;
+        let opened = opened.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()));
+        match opened {
+            Ok(connection) => {
+                count(&self.counters.opened);
+                self.generation += 1;
+                self.connection = Some(connection);
+                Ok(())
+            }
+            Err(error) => {
+                count(&self.counters.refused);
+                self.give_up();
+                Err(LinkFault::Unreachable(error.kind()))
+            }
+        }
+    }
+
+    async fn exchange(&mut self, unit: u8, ask: &Ask) -> Result<Vec<u16>, LinkFault> {
+        sleep_until(self.silent_from).await;
+        let request = match ask {
+            Ask::Read { address, count } => Request::ReadHoldingRegisters(*address, *count),
+            Ask::Write { address, words } => {
+                Request::WriteMultipleRegisters(*address, std::borrow::Cow::Borrowed(words))
+            }
+            Ask::Distrust => return Ok(Vec::new()),
+        };
+        let limit = self.request_timeout + self.wire.transmission_at_most();
+        let Some(connection) = &mut self.connection else { return Err(LinkFault::Stale) };
+        connection.set_slave(Slave(unit));
+        count(&self.counters.requests);
+        let asked = Instant::now();
+        let response = timeout(limit, connection.call(request)).await;
+        self.silent_from = Instant::now() + self.wire.silence();
+        let words = check(ask, response.map_err(|_| LinkFault::TimedOut)?)?;
+        let taken_ns = u64::try_from(asked.elapsed().as_nanos()).unwrap_or(u64::MAX);
+        count(&self.counters.answers);
+        self.counters.answer_ns.fetch_add(taken_ns, Ordering::Relaxed);
+        self.counters.slowest_ns.fetch_max(taken_ns, Ordering::Relaxed);
+        Ok(words)
+    }
+}
+
+/// Whether a response is the whole answer to what was asked, and nothing else.
+fn check(ask: &Ask, response: tokio_modbus::Result<Response>) -> Result<Vec<u16>, LinkFault> {
+    let response = response.map_err(fault_of)?;
+    let response = response.map_err(|exception| LinkFault::Exception(exception.into()))?;
+    let corrupt = |what, expected: usize, found: usize| LinkFault::Corrupt {
+        what,
+        expected: expected as u64,
+        found: found as u64,
+    };
+    match (ask, response) {
+        (Ask::Read { count, .. }, Response::ReadHoldingRegisters(words)) if words.len() == usize::from(*count) => {
+            Ok(words)
+        }
+        (Ask::Read { count, .. }, Response::ReadHoldingRegisters(words)) => {
+            Err(corrupt("number of registers", usize::from(*count), words.len()))
+        }
+        (Ask::Write { address, words }, Response::WriteMultipleRegisters(at, count)) => {
+            if at != *address {
+                Err(corrupt("echo of an address", usize::from(*address), usize::from(at)))
+            } else if usize::from(count) != words.len() {
+                Err(corrupt("echo of a number of registers", words.len(), usize::from(count)))
+            } else {
+                Ok(Vec::new())
+            }
+        }
+        (ask, response) => {
+            let expected = if matches!(ask, Ask::Read { .. }) { 3 } else { 16 };
+            Err(corrupt("function", expected, usize::from(response.function_code().value())))
+        }
+    }
+}
+
+fn fault_of(error: tokio_modbus::Error) -> LinkFault {
+    match error {
+        tokio_modbus::Error::Protocol(ProtocolError::HeaderMismatch { .. }) => {
+            LinkFault::Corrupt { what: "header (transaction or unit)", expected: 0, found: 1 }
+        }
+        tokio_modbus::Error::Protocol(ProtocolError::FunctionCodeMismatch { request, result }) => {
+            let found = match result {
+                Ok(response) => response.function_code().value(),
+                Err(exception) => exception.function.value(),
+            };
+            LinkFault::Corrupt { what: "function", expected: u64::from(request.value()), found: u64::from(found) }
+        }
+        tokio_modbus::Error::Transport(error) => match error.kind() {
+            io::ErrorKind::InvalidData | io::ErrorKind::InvalidInput => {
+                LinkFault::Corrupt { what: "frame", expected: 0, found: 1 }
+            }
+            _ => LinkFault::Disconnected,
+        },
+    }
+}
+
+impl Wire {
+    /// The silence of three and a half characters that parts two frames; nothing on TCP.
+    fn silence(&self) -> Duration {
+        match self {
+            Self::Tcp { .. } => Duration::ZERO,
+            Self::Rtu { baud, .. } if *baud > 19_200 => Duration::from_micros(1_750),
+            Self::Rtu { baud, .. } => Duration::from_secs_f64(3.5 * 11.0 / f64::from((*baud).max(1))),
+        }
+    }
+
+    /// How long the longest request and the longest answer are on the line.
+    fn transmission_at_most(&self) -> Duration {
+        match self {
+            Self::Tcp { .. } => Duration::ZERO,
+            Self::Rtu { baud, .. } => Duration::from_secs_f64(2.0 * 256.0 * 11.0 / f64::from((*baud).max(1))),
+        }
+    }
+}
+
+async fn connect(wire: &Wire) -> io::Result<tokio_modbus::client::Context> {
+    match wire {
+        Wire::Tcp { host, port } => {
+            let stream = TcpStream::connect((host.as_str(), *port)).await?;
+            stream.set_nodelay(true)?;
+            Ok(tokio_modbus::client::tcp::attach(Listening::new(stream)))
+        }
+        Wire::Rtu { device, baud, parity, stop_bits } => {
+            let parity = match parity {
+                Parity::None => tokio_serial::Parity::None,
+                Parity::Even => tokio_serial::Parity::Even,
+                Parity::Odd => tokio_serial::Parity::Odd,
+            };
+            let stop_bits = if *stop_bits == 2 { tokio_serial::StopBits::Two } else { tokio_serial::StopBits::One };
+            let mut port = tokio_serial::new(device, *baud).parity(parity).stop_bits(stop_bits).open_native_async()?;
+            drain(&mut port, wire.silence().max(Duration::from_millis(5))).await?;
+            Ok(tokio_modbus::client::rtu::attach(Listening::new(port)))
+        }
+    }
+}
+
+/// Reads a serial line empty until it has been silent for a while.
+async fn drain(port: &mut SerialStream, silence: Duration) -> io::Result<()> {
+    let until = Instant::now() + LONGEST_DRAIN;
+    let mut bytes = [0; 256];
+    while Instant::now() < until {
+        match timeout(silence, port.read(&mut bytes)).await {
+            Err(_) => return Ok(()),
+            Ok(Ok(0)) => return Err(io::ErrorKind::UnexpectedEof.into()),
+            Ok(Ok(_)) => sleep(Duration::from_millis(1)).await,
+            Ok(Err(error)) => return Err(error),
+        }
+    }
+    Err(io::ErrorKind::TimedOut.into())
+}
+
+/// A stream that can tell whether bytes wait to be read.
+trait Waiting {
+    /// How many bytes wait, as far as can be told; an error when the far side has closed.
+    fn waiting(&self, cx: &mut Context<'_>) -> io::Result<usize>;
+}
+
+impl Waiting for TcpStream {
+    fn waiting(&self, cx: &mut Context<'_>) -> io::Result<usize> {
+        let mut byte = [0; 1];
+        match self.poll_peek(cx, &mut ReadBuf::new(&mut byte)) {
+            Poll::Pending => Ok(0),
+            Poll::Ready(Ok(0)) => Err(io::ErrorKind::ConnectionReset.into()),
+            Poll::Ready(count) => count,
+        }
+    }
+}
+
+impl Waiting for SerialStream {
+    fn waiting(&self, _: &mut Context<'_>) -> io::Result<usize> {
+        Ok(self.bytes_to_read()? as usize)
+    }
+}
+
+/// A stream on which nothing may wait when a request is begun: what waits then was sent to nobody's question, and the answer that follows
+/// could not be told from it. Its flush does not wait for a serial port to have sent everything, for that would block the thread.
+struct Listening<T> {
+    inner: T,
+    asking: bool,
+}
+
+impl<T> Listening<T> {
+    fn new(inner: T) -> Self {
+        Self { inner, asking: false }
+    }
+}
+
+impl<T: AsyncRead + Unpin> AsyncRead for Listening<T> {
+    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+        self.asking = false;
+        Pin::new(&mut self.inner).poll_read(cx, buffer)
+    }
+}
+
+impl<T: AsyncWrite + Waiting + Unpin> AsyncWrite for Listening<T> {
+    fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        if !self.asking {
+            if self.inner.waiting(cx)? > 0 {
+                return Poll::Ready(Err(io::ErrorKind::InvalidData.into()));
+            }
+            self.asking = true;
+        }
+        Pin::new(&mut self.inner).poll_write(cx, bytes)
+    }
+
+    fn poll_flush(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Poll::Ready(Ok(()))
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.inner).poll_shutdown(cx)
+    }
+}
+
+impl<T: std::fmt::Debug> std::fmt::Debug for Listening<T> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Listening").field("inner", &self.inner).finish()
+    }
+}

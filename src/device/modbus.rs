@@ -1,0 +1,1076 @@
+//! The drivers of docs/modbus.md: a measuring machine and a grinder behind Modbus registers.
+//!
+//! Both are the same machine with other payloads, so nearly everything is in [`ModbusMachine`]. It follows the page literally: a command is
+//! a value with a number, written until it is acknowledged; payloads go up in pages, and the slots in force are read back and compared;
+//! results come down in pages between two readings of their header. The one thing that is never repeated is START: its frame may be written
+//! again, with its number, and if that too does not tell, the outcome is unknown and stays so until the machine is asked.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::time::Duration;
+
+use tokio::time::{Instant, sleep};
+
+use super::codec::{self, CommandFrame, Payload, RecordFlaw, WordOrder, crc32};
+use super::link::{Link, Wire};
+use super::station::{Station, StationSettings};
+use super::{
+    Answer, Armed, Beats, Cmm, Command, Coordinates, CorrectionMap, DeviceError, Fault, Grinder, Identity, Interlocks,
+    Interrupt, Job, Machine, MachineKind, Measurement, Mode, Outcome, Pass, PassRecord, Plan, Reading, Reconciled,
+    Started, State, Status, digest,
+};
+
+/// Registers of data in a full page.
+const PAGE: usize = 112;
+/// A beat is written when the last one is so old.
+const BEAT_EVERY: Duration = Duration::from_millis(250);
+/// A machine whose beat stands for so long is frozen.
+const FROZEN_AFTER: Duration = Duration::from_millis(1500);
+/// How long a machine is given to acknowledge a command before the same frame is written again.
+const ACKNOWLEDGED_WITHIN: Duration = Duration::from_millis(500);
+/// How long a machine is given to work a payload in, or to reach the state that it has announced.
+const SETTLED_WITHIN: Duration = Duration::from_secs(5);
+/// The span over which a start has to be seen not taken.
+const SEEN_TWICE_OVER: Duration = Duration::from_millis(1050);
+/// More than this is no result of a measuring machine.
+const RESULT_BYTES: u32 = 64 << 20;
+
+/// Base addresses of the blocks, 0-based. The default is that of docs/modbus.md.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[expect(missing_docs, reason = "the names of the blocks in docs/modbus.md")]
+pub struct RegisterMap {
+    pub identity: u16,
+    pub sync: u16,
+    pub beat: u16,
+    pub command: u16,
+    pub status: u16,
+    pub in_force: u16,
+    pub inbox_header: u16,
+    pub inbox_page: u16,
+    pub inbox_state: u16,
+    pub outbox_header: u16,
+    pub outbox_select: u16,
+    pub outbox_page: u16,
+}
+
+impl Default for RegisterMap {
+    fn default() -> Self {
+        Self {
+            identity: 0,
+            sync: 32,
+            beat: 36,
+            command: 40,
+            status: 64,
+            in_force: 120,
+            inbox_header: 200,
+            inbox_page: 224,
+            inbox_state: 350,
+            outbox_header: 400,
+            outbox_select: 460,
+            outbox_page: 462,
+        }
+    }
+}
+
+/// How the value of a signal is kept in its registers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[expect(missing_docs, reason = "they say it")]
+pub enum SignalType {
+    U16,
+    I16,
+    U32,
+    I32,
+    F32,
+    F64,
+}
+
+impl SignalType {
+    fn registers(self) -> u16 {
+        match self {
+            Self::U16 | Self::I16 => 1,
+            Self::U32 | Self::I32 | Self::F32 => 2,
+            Self::F64 => 4,
+        }
+    }
+}
+
+/// A register of the machine that the cell file asks for besides the contract's own: read with every status, checked against its range.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Signal {
+    /// Its name.
+    pub name: String,
+    /// The 0-based address of its first register.
+    pub address: u16,
+    /// How the value is kept.
+    pub kind: SignalType,
+    /// What the kept value is multiplied with.
+    pub scale: f64,
+    /// The unit of the product.
+    pub unit: String,
+    /// The least that can be.
+    pub least: f64,
+    /// The most that can be.
+    pub most: f64,
+}
+
+/// Everything that has to be known to drive a machine over Modbus.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModbusSettings {
+    /// Where it is.
+    pub wire: Wire,
+    /// Its unit number.
+    pub unit: u8,
+    /// The order of its words.
+    pub word_order: WordOrder,
+    /// Where its blocks begin.
+    pub registers: RegisterMap,
+    /// How long an answer may take.
+    pub request_timeout: Duration,
+    /// How often a request is asked again.
+    pub retries: u32,
+    /// After how long without an answer a request is given up, however often it was asked.
+    pub lost_after: Duration,
+    /// How long the machine may need for an answer at worst: after an error the line is left alone for so long.
+    pub quarantine: Duration,
+    /// The number of this client; not 0.
+    pub owner: u32,
+    /// Rises with each start of this client.
+    pub epoch: u32,
+    /// What to read besides.
+    pub signals: Vec<Signal>,
+}
+
+impl ModbusSettings {
+    /// Settings that suit a machine on a quiet network, to be changed field by field.
+    pub fn new(wire: Wire) -> Self {
+        Self {
+            wire,
+            unit: 1,
+            word_order: WordOrder::Big,
+            registers: RegisterMap::default(),
+            request_timeout: Duration::from_millis(500),
+            retries: 3,
+            lost_after: Duration::from_secs(5),
+            quarantine: Duration::from_millis(100),
+            owner: 1,
+            epoch: 1,
+            signals: Vec::new(),
+        }
+    }
+}
+
+/// A payload that is in force at the machine, as far as this driver has brought it there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Slot {
+    bytes: u32,
+    crc: u32,
+    identity: [u8; 32],
+}
+
+/// What the drivers of both machines have in common.
+#[derive(Debug)]
+pub struct ModbusMachine {
+    station: Station,
+    owner: u32,
+    epoch: u32,
+    retries: u32,
+    signals: Vec<Signal>,
+    sequence: u32,
+    beat: u16,
+    beaten: Option<Instant>,
+    seen_beat: Option<(u16, Instant)>,
+    loaded: BTreeMap<u16, Slot>,
+}
+
+impl ModbusMachine {
+    fn new(kind: MachineKind, link: Link, settings: ModbusSettings) -> Self {
+        let station = StationSettings {
+            unit: settings.unit,
+            order: settings.word_order,
+            map: settings.registers,
+            retries: settings.retries,
+            lost_after: settings.lost_after,
+        };
+        Self {
+            station: Station::new(kind, link, station),
+            owner: settings.owner,
+            epoch: settings.epoch,
+            retries: settings.retries,
+            signals: settings.signals,
+            sequence: 0,
+            beat: 0,
+            beaten: None,
+            seen_beat: None,
+            loaded: BTreeMap::new(),
+        }
+    }
+
+    fn machine(&self) -> std::sync::Arc<str> {
+        self.station.name.clone()
+    }
+
+    /// The line of this machine.
+    pub fn link(&self) -> &Link {
+        &self.station.link
+    }
+
+    // ---- status and beats --------------------------------------------------------------------------------------------------------
+
+    async fn connect(&mut self) -> Result<Identity, DeviceError> {
+        self.seen_beat = None;
+        self.loaded.clear();
+        let identity = self.station.meet().await?;
+        let status = self.look().await?;
+        self.sequence = self.sequence.max(status.acknowledged);
+        Ok(identity)
+    }
+
+    /// Tells the machine that its client is alive, if that has not been said just now.
+    async fn beat(&mut self) -> Result<(), DeviceError> {
+        if self.beaten.is_some_and(|last| last.elapsed() < BEAT_EVERY) {
+            return Ok(());
+        }
+        self.beat = self.beat.wrapping_add(1);
+        self.beaten = Some(Instant::now());
+        let address = self.station.map.beat;
+        self.station.write("beat", address, &[self.beat]).await
+    }
+
+    /// Reads the status block, of one moment, without the further signals.
+    async fn look(&mut self) -> Result<Status, DeviceError> {
+        self.beat().await?;
+        let address = self.station.map.status;
+        let mut words = self.station.read("status", address, 48).await?;
+        for _ in 0..5 {
+            if words[0] == words[47] {
+                return self.understand(&words);
+            }
+            words = self.station.read("status", address, 48).await?;
+        }
+        Err(self.station.distrust("status block (its two snapshot numbers)", words[0].into(), words[47].into()).await)
+    }
+
+    fn understand(&mut self, words: &[u16]) -> Result<Status, DeviceError> {
+        let machine = self.machine();
+        let unlisted =
+            |field, found: u16| DeviceError::Unlisted { machine: machine.clone(), field, found: found.into() };
+        let block = self.station.registers(words);
+        let state = state_of(words[1]).ok_or_else(|| unlisted("its state", words[1]))?;
+        let mode = match words[2] {
+            1 => Mode::Automatic,
+            2 => Mode::Manual,
+            other => return Err(unlisted("its mode", other)),
+        };
+        let outcome = codec::outcome(words[18]).map_err(|_| unlisted("the result of its job", words[18]))?;
+        let job = Job { job: block.u32(8), cycle: words[10], digest: block.u32(12) };
+        let status = Status {
+            state,
+            mode,
+            interlocks: interlocks_of(words[3]),
+            acknowledged: block.u32(4),
+            answer: answer_of(words[6]),
+            fault: fault_of(words[7]),
+            job: (job.job != 0).then_some(job),
+            token: block.u32(14),
+            done: block.u32(16),
+            outcome,
+            progress: block.u32(20),
+            total: block.u32(22),
+            owner: block.u32(24),
+            epoch: block.u32(26),
+            beats: Beats { machine: words[28], echo: words[29] },
+            last_begun: (block.u32(30), words[32]),
+            begun_by: block.u32(36),
+            temperature_c: f64::from(block.i16(33)) / 100.0,
+            boot_id: block.u32(34),
+            signals: Vec::new(),
+        };
+        self.check_alive(&status)?;
+        Ok(status)
+    }
+
+    fn check_alive(&mut self, status: &Status) -> Result<(), DeviceError> {
+        let machine = self.machine();
+        let known = self.station.identity().map_or(0, |identity| identity.boot_id);
+        if status.boot_id != known {
+            return Err(DeviceError::Restarted { machine, was: known, is: status.boot_id });
+        }
+        let beat = status.beats.machine;
+        match self.seen_beat {
+            Some((seen, since)) if seen == beat => {
+                let still = since.elapsed();
+                if still > FROZEN_AFTER {
+                    return Err(DeviceError::Frozen { machine, beat, still, limit: FROZEN_AFTER });
+                }
+            }
+            _ => self.seen_beat = Some((beat, Instant::now())),
+        }
+        Ok(())
+    }
+
+    async fn status(&mut self) -> Result<Status, DeviceError> {
+        let mut status = self.look().await?;
+        for k in 0..self.signals.len() {
+            let reading = self.signal(k).await?;
+            status.signals.push(reading);
+        }
+        Ok(status)
+    }
+
+    async fn signal(&mut self, k: usize) -> Result<Reading, DeviceError> {
+        let signal = self.signals[k].clone();
+        let words = self.station.read("signal", signal.address, signal.kind.registers()).await?;
+        let block = self.station.registers(&words);
+        let kept = match signal.kind {
+            SignalType::U16 => f64::from(words[0]),
+            SignalType::I16 => f64::from(block.i16(0)),
+            SignalType::U32 => f64::from(block.u32(0)),
+            SignalType::I32 => f64::from(block.i32(0)),
+            SignalType::F32 => f64::from(block.f32(0)),
+            SignalType::F64 => block.f64(0),
+        };
+        let value = kept * signal.scale;
+        let (machine, Signal { name, unit, least, most, .. }) = (self.machine(), signal);
+        if !value.is_finite() {
+            return Err(DeviceError::NotFinite { machine, field: name, value });
+        }
+        if value < least || value > most {
+            return Err(DeviceError::OutOfRange { machine, field: name, value, least, most, unit });
+        }
+        Ok(Reading { name, value, unit })
+    }
+
+    // ---- commands ----------------------------------------------------------------------------------------------------------------
+
+    fn next_sequence(&mut self) -> u32 {
+        self.sequence = self.sequence.checked_add(1).unwrap_or(1);
+        self.sequence
+    }
+
+    fn frame(&mut self, command: Command) -> CommandFrame {
+        let sequence = self.next_sequence();
+        CommandFrame { sequence, command, job: None, owner: self.owner, epoch: self.epoch, token: 0, argument: 0 }
+    }
+
+    async fn simply(&mut self, command: Command) -> Result<Status, DeviceError> {
+        let frame = self.frame(command);
+        self.order(frame).await
+    }
+
+    /// Writes a command until it is acknowledged, and tells a no from a yes. The same frame every time.
+    async fn order(&mut self, frame: CommandFrame) -> Result<Status, DeviceError> {
+        let CommandFrame { command, sequence, .. } = frame;
+        let status = self.acknowledged(frame).await?;
+        self.sequence = self.sequence.max(sequence);
+        match status.answer {
+            Answer::Accepted => Ok(status),
+            answer => Err(DeviceError::Refused { machine: self.machine(), command, answer, state: status.state }),
+        }
+    }
+
+    async fn acknowledged(&mut self, frame: CommandFrame) -> Result<Status, DeviceError> {
+        let CommandFrame { command, sequence, .. } = frame;
+        let words = frame.words(self.station.order);
+        let address = self.station.map.command;
+        let mut tries = 0;
+        loop {
+            self.station.write("command", address, &words).await?;
+            tries += 1;
+            let written = Instant::now();
+            let mut pause = Duration::from_millis(1);
+            let last = loop {
+                let status = self.look().await?;
+                if status.acknowledged == sequence {
+                    return Ok(status);
+                }
+                if written.elapsed() >= ACKNOWLEDGED_WITHIN {
+                    break status.acknowledged;
+                }
+                sleep(pause).await;
+                pause = (pause * 2).min(Duration::from_millis(20));
+            };
+            if tries > self.retries {
+                let machine = self.machine();
+                return Err(DeviceError::NotAcknowledged { machine, command, sequence, acknowledged: last, tries });
+            }
+        }
+    }
+
+    async fn prepare(&mut self, job: Job) -> Result<Armed, DeviceError> {
+        let identities: Vec<_> = self.loaded.values().map(|slot| slot.identity).collect();
+        let loaded = digest(&identities);
+        if identities.is_empty() || loaded != job.digest {
+            let machine = self.machine();
+            return Err(DeviceError::Mismatch {
+                machine,
+                field: "the digest of the payloads",
+                sent: job.digest.into(),
+                held: loaded.into(),
+            });
+        }
+        for kind in self.loaded.keys().copied().collect::<Vec<_>>() {
+            self.compare_slot(kind).await?;
+        }
+        let frame = CommandFrame { job: Some(job), ..self.frame(Command::Prepare) };
+        self.order(frame).await?;
+        let status = self.reaches(|status| status.state == State::Prepared && status.token != 0).await?;
+        self.agree(job, &status)?;
+        Ok(Armed { job, start_sequence: self.next_sequence(), token: status.token, boot_id: status.boot_id })
+    }
+
+    /// The first status of which something holds; a fault, or another state than the way there, ends the wait.
+    async fn reaches(&mut self, holds: impl Fn(&Status) -> bool) -> Result<Status, DeviceError> {
+        let began = Instant::now();
+        loop {
+            let status = self.look().await?;
+            if holds(&status) {
+                return Ok(status);
+            }
+            let machine = self.machine();
+            if status.fault != Fault::None {
+                return Err(DeviceError::Faulted { machine, state: status.state, fault: status.fault });
+            }
+            if began.elapsed() > SETTLED_WITHIN {
+                return Err(DeviceError::TimedOut { machine, what: "the state announced", limit: SETTLED_WITHIN });
+            }
+            sleep(Duration::from_millis(5)).await;
+        }
+    }
+
+    /// Whether the machine is at the job that is meant.
+    fn agree(&self, job: Job, status: &Status) -> Result<(), DeviceError> {
+        let held = status.job.unwrap_or(Job { job: 0, cycle: 0, digest: 0 });
+        let fields = [
+            ("the job", u64::from(job.job), u64::from(held.job)),
+            ("the cycle", u64::from(job.cycle), u64::from(held.cycle)),
+            ("the digest of the payloads", u64::from(job.digest), u64::from(held.digest)),
+        ];
+        match fields.into_iter().find(|(_, sent, held)| sent != held) {
+            Some((field, sent, held)) => Err(DeviceError::Mismatch { machine: self.machine(), field, sent, held }),
+            None => Ok(()),
+        }
+    }
+
+    async fn start(&mut self, armed: Armed) -> Result<Started, DeviceError> {
+        let Armed { job, start_sequence, token, boot_id } = armed;
+        let known = self.station.identity().map_or(0, |identity| identity.boot_id);
+        if boot_id != known {
+            // Nothing has been sent: whatever was prepared died with the machine's restart.
+            return Err(DeviceError::Restarted { machine: self.machine(), was: boot_id, is: known });
+        }
+        let (owner, epoch) = (self.owner, self.epoch);
+        let frame = CommandFrame {
+            sequence: start_sequence,
+            command: Command::Start,
+            job: Some(job),
+            owner,
+            epoch,
+            token,
+            argument: 0,
+        };
+        let unknown =
+            |machine, why| DeviceError::StartUnknown { machine, job, sequence: start_sequence, why: Box::new(why) };
+        match self.order(frame).await {
+            Ok(status) if status.begun_by == start_sequence && status.job == Some(job) => {
+                Ok(Started { job, start_sequence, status })
+            }
+            Ok(status) => {
+                let (sent, held) = (u64::from(start_sequence), u64::from(status.begun_by));
+                let why = DeviceError::Mismatch {
+                    machine: self.machine(),
+                    field: "the START that began the job",
+                    sent,
+                    held,
+                };
+                Err(unknown(self.machine(), why))
+            }
+            // The machine has answered this very START, and the answer was no.
+            Err(refused @ DeviceError::Refused { .. }) => Err(refused),
+            Err(DeviceError::NotConnected { machine, what }) => Err(DeviceError::NotConnected { machine, what }),
+            Err(why) => Err(unknown(self.machine(), why)),
+        }
+    }
+
+    async fn abort(&mut self) -> Result<Status, DeviceError> {
+        match self.simply(Command::Abort).await {
+            // Somebody else has counted further; an abort is worth going past them.
+            Err(DeviceError::NotAcknowledged { acknowledged, .. }) if acknowledged > self.sequence => {
+                self.sequence = acknowledged;
+                self.simply(Command::Abort).await
+            }
+            answer => answer,
+        }
+    }
+
+    async fn acknowledge(&mut self, done: u32) -> Result<Status, DeviceError> {
+        let frame = CommandFrame { argument: done, ..self.frame(Command::Acknowledge) };
+        self.order(frame).await
+    }
+
+    async fn reconcile(&mut self, intended: &Armed) -> Result<Reconciled, DeviceError> {
+        let first = self.look().await?;
+        match what_became(intended, &first) {
+            Some(verdict) => return Ok(verdict),
+            None => {
+                let began = Instant::now();
+                while began.elapsed() < SEEN_TWICE_OVER {
+                    sleep(BEAT_EVERY).await;
+                    self.beat().await?;
+                }
+            }
+        }
+        let second = self.look().await?;
+        Ok(what_became(intended, &second).unwrap_or(Reconciled::NotStarted(second)))
+    }
+
+    // ---- payloads ----------------------------------------------------------------------------------------------------------------
+
+    async fn load<P: Payload>(&mut self, payload: &P, interrupt: &Interrupt) -> Result<(), DeviceError> {
+        if let Some((field, value, limit)) = payload.flaw() {
+            return Err(DeviceError::BadPayload { machine: self.machine(), what: P::WHAT, field, value, limit });
+        }
+        self.loaded.remove(&P::KIND);
+        let words = payload.words(self.station.order);
+        let bytes = 2 * words.len() as u64;
+        let Ok(bytes) = u32::try_from(bytes) else {
+            let (field, limit) = ("its size in bytes".to_owned(), "less than 4 GiB");
+            return Err(DeviceError::BadPayload {
+                machine: self.machine(),
+                what: P::WHAT,
+                field,
+                value: bytes as f64,
+                limit,
+            });
+        };
+        let slot = Slot { bytes, crc: crc32(&words), identity: payload.identity() };
+        let mut tries = 0;
+        loop {
+            self.announce::<P>(slot).await?;
+            self.send_pages::<P>(&words, interrupt).await?;
+            match self.taken::<P>(slot).await {
+                Ok(()) => break,
+                Err(error) if !error.is_link() || tries >= self.retries => return Err(error),
+                Err(_) => tries += 1,
+            }
+        }
+        self.loaded.insert(P::KIND, slot);
+        if let Err(error) = self.compare_slot(P::KIND).await {
+            self.loaded.remove(&P::KIND);
+            return Err(error);
+        }
+        Ok(())
+    }
+
+    async fn announce<P: Payload>(&mut self, slot: Slot) -> Result<(), DeviceError> {
+        let mut header = self.station.writer();
+        header.u16(P::KIND).u16(0).u32(slot.bytes).u32(slot.crc).zeros(2).identity(&slot.identity);
+        let address = self.station.map.inbox_header;
+        match self.station.write("inbox header", address, header.words()).await {
+            Err(DeviceError::Exception { code: 3, .. }) => {
+                let state = self.look().await?.state;
+                let busy = matches!(state, State::Execute | State::Holding | State::Held);
+                let answer = if busy { Answer::WrongState } else { Answer::OutsideLimits };
+                Err(DeviceError::PayloadRefused { machine: self.machine(), what: P::WHAT, answer })
+            }
+            other => other,
+        }
+    }
+
+    async fn send_pages<P: Payload>(&mut self, words: &[u16], interrupt: &Interrupt) -> Result<(), DeviceError> {
+        let address = self.station.map.inbox_page;
+        let of = words.len().div_ceil(PAGE) as u32;
+        for (number, data) in words.chunks(PAGE).enumerate() {
+            let done = number as u32;
+            self.break_off(interrupt, P::WHAT, done, of)?;
+            self.beat().await?;
+            let mut page = self.station.writer();
+            page.u32(done).u16(data.len() as u16).zeros(5);
+            let page = [page.words(), data].concat();
+            self.station.write("inbox page", address, &page).await?;
+        }
+        Ok(())
+    }
+
+    fn break_off(&self, interrupt: &Interrupt, what: &'static str, done: u32, of: u32) -> Result<(), DeviceError> {
+        match interrupt.is_raised() {
+            true => Err(DeviceError::Interrupted { machine: self.machine(), what, done, of }),
+            false => Ok(()),
+        }
+    }
+
+    /// Waits until the machine says that it has taken the payload, and whether it has it whole.
+    async fn taken<P: Payload>(&mut self, slot: Slot) -> Result<(), DeviceError> {
+        let began = Instant::now();
+        loop {
+            self.beat().await?;
+            let words = self.station.read("inbox state", self.station.map.inbox_state, 12).await?;
+            let block = self.station.registers(&words);
+            let (bytes, crc) = (block.u32(4), block.u32(6));
+            match words[1] {
+                2 if words[0] == P::KIND && bytes == slot.bytes && crc == slot.crc => return Ok(()),
+                2 | 3 => {
+                    let (expected, found) = (u64::from(slot.crc), u64::from(crc));
+                    return Err(self.station.distrust("check number of a payload", expected, found).await);
+                }
+                4 => {
+                    let answer = answer_of(words[8]);
+                    return Err(DeviceError::PayloadRefused { machine: self.machine(), what: P::WHAT, answer });
+                }
+                _ if began.elapsed() > SETTLED_WITHIN => {
+                    let found = u64::from(bytes);
+                    let (what, expected) = ("bytes arrived of the payload", u64::from(slot.bytes));
+                    return Err(DeviceError::Count { machine: self.machine(), what, expected, found });
+                }
+                _ => sleep(Duration::from_millis(5)).await,
+            }
+        }
+    }
+
+    /// Whether the machine would use what was brought there.
+    async fn compare_slot(&mut self, kind: u16) -> Result<(), DeviceError> {
+        let Some(slot) = self.loaded.get(&kind).copied() else { return Ok(()) };
+        let address = self.station.map.in_force + 24 * (kind - 1);
+        let words = self.station.read("slots in force", address, 24).await?;
+        let block = self.station.registers(&words);
+        let identity = block.identity(8);
+        let head = |identity: &[u8; 32]| identity[..8].iter().fold(0, |bits, byte| (bits << 8) | u64::from(*byte));
+        let fields = [
+            ("the kind of the payload in force", u64::from(kind), u64::from(words[0])),
+            ("the state of the slot in force", 1, u64::from(words[1])),
+            ("the size of the payload in force", u64::from(slot.bytes), u64::from(block.u32(2))),
+            ("the CRC-32 of the payload in force", u64::from(slot.crc), u64::from(block.u32(4))),
+            ("the identity of the payload in force (first 8 bytes)", head(&slot.identity), head(&identity)),
+        ];
+        let differs = fields.into_iter().find(|(_, sent, held)| sent != held).or_else(|| {
+            let tail = |identity: &[u8; 32]| u64::from(crc32fast::hash(identity));
+            let field = "the identity of the payload in force (its CRC-32)";
+            (identity != slot.identity).then(|| (field, tail(&slot.identity), tail(&identity)))
+        });
+        match differs {
+            Some((field, sent, held)) => Err(DeviceError::Mismatch { machine: self.machine(), field, sent, held }),
+            None => Ok(()),
+        }
+    }
+
+    // ---- results -----------------------------------------------------------------------------------------------------------------
+
+    /// Fetches the result of a job: its header, and its registers, proved whole.
+    async fn fetch(
+        &mut self,
+        job: Job,
+        kind: u16,
+        interrupt: &Interrupt,
+    ) -> Result<(Status, Header, Vec<u16>), DeviceError> {
+        let mut tries = 0;
+        loop {
+            let status = self.look().await?;
+            if status.state != State::Complete || status.done == 0 {
+                return Err(DeviceError::NoResult { machine: self.machine(), job, state: status.state });
+            }
+            self.agree(job, &status)?;
+            match self.fetch_once(job, kind, status.done, interrupt).await {
+                Ok((header, words)) => return Ok((status, header, words)),
+                Err(error) if !error.is_link() || tries >= self.retries => return Err(error),
+                Err(_) => tries += 1,
+            }
+        }
+    }
+
+    async fn fetch_once(
+        &mut self,
+        job: Job,
+        kind: u16,
+        done: u32,
+        interrupt: &Interrupt,
+    ) -> Result<(Header, Vec<u16>), DeviceError> {
+        let before = self.header_words().await?;
+        let header = self.header(&before, job, kind, done)?;
+        let total = (header.bytes / 2) as usize;
+        let pages = total.div_ceil(PAGE) as u32;
+        let mut words = Vec::with_capacity(total);
+        for page in 0..pages {
+            self.break_off(interrupt, "result", page, pages)?;
+            self.beat().await?;
+            let due = (total - words.len()).min(PAGE);
+            self.fetch_page(page, due, &mut words).await?;
+        }
+        let after = self.header_words().await?;
+        if before != after {
+            let (expected, found) = (u64::from(crc32(&before)), u64::from(crc32(&after)));
+            return Err(self.station.distrust("header of a result (read twice)", expected, found).await);
+        }
+        let crc = crc32(&words);
+        if crc != header.crc {
+            return Err(self.station.distrust("check number of a result", header.crc.into(), crc.into()).await);
+        }
+        Ok((header, words))
+    }
+
+    async fn header_words(&mut self) -> Result<Vec<u16>, DeviceError> {
+        self.station.read("outbox header", self.station.map.outbox_header, 56).await
+    }
+
+    fn header(&self, words: &[u16], job: Job, kind: u16, done: u32) -> Result<Header, DeviceError> {
+        let machine = self.machine();
+        let block = self.station.registers(words);
+        let fields = [
+            ("the kind of the result", u64::from(kind), u64::from(words[0])),
+            ("the job of the result", u64::from(job.job), u64::from(block.u32(6))),
+            ("the cycle of the result", u64::from(job.cycle), u64::from(words[8])),
+            ("the number of the finished job", u64::from(done), u64::from(block.u32(46))),
+        ];
+        if let Some((field, sent, held)) = fields.into_iter().find(|(_, sent, held)| sent != held) {
+            return Err(DeviceError::Mismatch { machine, field, sent, held });
+        }
+        if words[28] != 1 {
+            return Err(DeviceError::Inches { machine, unit: words[28] });
+        }
+        let reals = [("the probe's radius", 12), ("the scale", 16), ("the mean temperature", 20), ("the duration", 24)];
+        for (field, at) in reals {
+            if !block.f64(at).is_finite() {
+                return Err(DeviceError::NotFinite { machine, field: field.into(), value: block.f64(at) });
+            }
+        }
+        let (format, bytes, records) = (words[1], block.u32(2), block.u32(10));
+        let size = match kind {
+            4 => codec::point_registers(format),
+            _ => (format == 1).then_some(32),
+        };
+        let Some(size) = size else {
+            return Err(DeviceError::Unlisted { machine, field: "the format of the result", found: format.into() });
+        };
+        let expected = 2 * size as u64 * u64::from(records);
+        if u64::from(bytes) != expected || bytes > RESULT_BYTES {
+            let expected = expected.min(RESULT_BYTES.into());
+            return Err(DeviceError::Count { machine, what: "bytes of the result", expected, found: bytes.into() });
+        }
+        Ok(Header {
+            format,
+            bytes,
+            crc: block.u32(4),
+            records,
+            registers: size,
+            coordinates: words[9],
+            probe_radius_mm: block.f64(12),
+            scale_mm: block.f64(16),
+            temperature_c: block.f64(20),
+            duration_s: block.f64(24),
+            identity: block.identity(30),
+        })
+    }
+
+    /// Fetches one page. A machine may need a turn of its program to put it there, so another page's number is asked again for a while.
+    async fn fetch_page(&mut self, page: u32, due: usize, words: &mut Vec<u16>) -> Result<(), DeviceError> {
+        let map = self.station.map;
+        let mut select = self.station.writer();
+        select.u32(page);
+        self.station.write("outbox select", map.outbox_select, select.words()).await?;
+        let began = Instant::now();
+        loop {
+            let read = self.station.read("outbox page", map.outbox_page, 4 + due as u16).await?;
+            let found = self.station.registers(&read).u32(0);
+            if found == page && usize::from(read[2]) == due {
+                words.extend_from_slice(&read[4..]);
+                return Ok(());
+            }
+            if found == page {
+                return Err(self.station.distrust("number of registers in a page", due as u64, read[2].into()).await);
+            }
+            if began.elapsed() > ACKNOWLEDGED_WITHIN {
+                return Err(self.station.distrust("number of a page", page.into(), found.into()).await);
+            }
+            sleep(Duration::from_millis(2)).await;
+        }
+    }
+
+    fn flawed(&self, flaw: RecordFlaw) -> DeviceError {
+        let machine = self.machine();
+        match flaw {
+            RecordFlaw::NotFinite { field, value } => DeviceError::NotFinite { machine, field, value },
+            RecordFlaw::Unlisted { field, found } => DeviceError::Unlisted { machine, field, found },
+        }
+    }
+
+    fn count(&self, what: &'static str, expected: u64, found: u64) -> Result<(), DeviceError> {
+        match expected == found {
+            true => Ok(()),
+            false => Err(DeviceError::Count { machine: self.machine(), what, expected, found }),
+        }
+    }
+}
+
+/// The header of a result.
+struct Header {
+    format: u16,
+    bytes: u32,
+    crc: u32,
+    records: u32,
+    registers: usize,
+    coordinates: u16,
+    probe_radius_mm: f64,
+    scale_mm: f64,
+    temperature_c: f64,
+    duration_s: f64,
+    identity: [u8; 32],
+}
+
+/// What a status tells of a start, or nothing when it looks as if the start was not taken, which has to be seen twice.
+fn what_became(intended: &Armed, status: &Status) -> Option<Reconciled> {
+    let Armed { job, start_sequence, boot_id, .. } = *intended;
+    let unknown = |why: String| Some(Reconciled::Unknown { why });
+    if status.boot_id != boot_id {
+        let is = status.boot_id;
+        return unknown(format!(
+            "the machine was restarted since (boot id {boot_id:08x}, now {is:08x}); look at the part"
+        ));
+    }
+    if status.begun_by == start_sequence {
+        return match status.job {
+            Some(held) if held != job => {
+                unknown(format!("START {start_sequence} has begun {held} there, {job} was meant"))
+            }
+            _ if status.done == start_sequence => Some(Reconciled::Finished(status.clone())),
+            _ => match status.state {
+                State::Execute | State::Holding | State::Held | State::Stopping | State::Aborting => {
+                    Some(Reconciled::Running(status.clone()))
+                }
+                State::Aborted | State::Faulted => Some(Reconciled::Finished(status.clone())),
+                state => unknown(format!(
+                    "START {start_sequence} was taken, but the machine is {state} and keeps no result of it"
+                )),
+            },
+        };
+    }
+    let begun = status.last_begun == (job.job, job.cycle);
+    match status.state {
+        State::Idle | State::Prepared if !begun => None,
+        _ if begun => unknown(format!("{job} was begun by START {}, not by {start_sequence}", status.begun_by)),
+        state => unknown(format!("the machine is {state} with another job, begun by START {}", status.begun_by)),
+    }
+}
+
+fn state_of(number: u16) -> Option<State> {
+    const STATES: [State; 10] = [
+        State::Idle,
+        State::Prepared,
+        State::Execute,
+        State::Holding,
+        State::Held,
+        State::Stopping,
+        State::Complete,
+        State::Aborting,
+        State::Aborted,
+        State::Faulted,
+    ];
+    STATES.get(usize::from(number).checked_sub(1)?).copied()
+}
+
+fn interlocks_of(bits: u16) -> Interlocks {
+    let good = |bit: u16| bits & (1 << bit) != 0;
+    Interlocks { guards_closed: good(0), clear_of_part: good(1), part_clamped: good(2), supplies: good(3) }
+}
+
+fn answer_of(number: u16) -> Answer {
+    match number {
+        0 => Answer::None,
+        1 => Answer::Accepted,
+        2 => Answer::NotOwner,
+        3 => Answer::WrongState,
+        4 => Answer::UnknownCommand,
+        5 => Answer::DeadToken,
+        6 => Answer::OtherJob,
+        7 => Answer::AlreadyBegun,
+        8 => Answer::PayloadMissing,
+        9 => Answer::InterlockOpen,
+        10 => Answer::OutsideLimits,
+        11 => Answer::OtherResult,
+        other => Answer::Unlisted(other),
+    }
+}
+
+fn fault_of(number: u16) -> Fault {
+    match number {
+        0 => Fault::None,
+        1 => Fault::StopCircuit,
+        2 => Fault::Collision,
+        3 => Fault::Supplies,
+        4 => Fault::TravelLimit,
+        5 => Fault::Drive,
+        6 => Fault::Tool,
+        20 => Fault::ClientSilent,
+        other => Fault::Other(other),
+    }
+}
+
+/// A driver that is a [`ModbusMachine`] and answers as a [`Machine`] by it.
+macro_rules! modbus_driver {
+    ($(#[$doc:meta])* $driver:ident, $kind:expr) => {
+        $(#[$doc])*
+        #[derive(Debug)]
+        pub struct $driver(ModbusMachine);
+
+        impl $driver {
+            /// A driver on a line of its own. Nothing is sent before it is connected.
+            pub fn new(settings: ModbusSettings) -> io::Result<Self> {
+                let link = Link::new(settings.wire.clone(), settings.request_timeout, settings.quarantine)?;
+                Ok(Self::on(link, settings))
+            }
+
+            /// A driver on a line that it shares with other machines. The wire and the time-outs of the line hold, not those of the settings.
+            pub fn on(link: Link, settings: ModbusSettings) -> Self {
+                Self(ModbusMachine::new($kind, link, settings))
+            }
+
+            /// The line, for its figures, or to put another machine on it.
+            pub fn link(&self) -> &Link {
+                self.0.link()
+            }
+        }
+
+        impl Machine for $driver {
+            fn name(&self) -> &str {
+                &self.0.station.name
+            }
+            async fn connect(&mut self) -> Result<Identity, DeviceError> {
+                self.0.connect().await
+            }
+            async fn status(&mut self) -> Result<Status, DeviceError> {
+                self.0.status().await
+            }
+            async fn claim(&mut self) -> Result<Status, DeviceError> {
+                self.0.simply(Command::Claim).await
+            }
+            async fn prepare(&mut self, job: Job) -> Result<Armed, DeviceError> {
+                self.0.prepare(job).await
+            }
+            async fn start(&mut self, armed: Armed) -> Result<Started, DeviceError> {
+                self.0.start(armed).await
+            }
+            async fn hold(&mut self) -> Result<Status, DeviceError> {
+                self.0.simply(Command::Hold).await
+            }
+            async fn resume(&mut self) -> Result<Status, DeviceError> {
+                self.0.simply(Command::Resume).await
+            }
+            async fn stop(&mut self) -> Result<Status, DeviceError> {
+                self.0.simply(Command::Stop).await
+            }
+            async fn abort(&mut self) -> Result<Status, DeviceError> {
+                self.0.abort().await
+            }
+            async fn clear(&mut self) -> Result<Status, DeviceError> {
+                self.0.simply(Command::Clear).await
+            }
+            async fn acknowledge(&mut self, done: u32) -> Result<Status, DeviceError> {
+                self.0.acknowledge(done).await
+            }
+            async fn release(&mut self) -> Result<Status, DeviceError> {
+                self.0.simply(Command::Release).await
+            }
+            async fn reconcile(&mut self, intended: &Armed) -> Result<Reconciled, DeviceError> {
+                self.0.reconcile(intended).await
+            }
+        }
+    };
+}
+
+modbus_driver!(
+    /// A measuring machine that speaks docs/modbus.md.
+    ModbusCmm,
+    MachineKind::Cmm
+);
+modbus_driver!(
+    /// A grinder that speaks docs/modbus.md.
+    ModbusGrinder,
+    MachineKind::Grinder
+);
+
+impl Cmm for ModbusCmm {
+    async fn load_plan(&mut self, plan: &Plan, interrupt: &Interrupt) -> Result<(), DeviceError> {
+        self.0.load(plan, interrupt).await
+    }
+
+    async fn collect(&mut self, job: Job, interrupt: &Interrupt) -> Result<Measurement, DeviceError> {
+        let machine = &mut self.0;
+        let (status, header, words) = machine.fetch(job, 4, interrupt).await?;
+        if status.outcome != Outcome::Complete {
+            return Err(DeviceError::NoResult { machine: machine.machine(), job, state: status.state });
+        }
+        if digest(&[header.identity]) != job.digest {
+            let (sent, held) = (job.digest.into(), digest(&[header.identity]).into());
+            let field = "the digest of the plan that was measured";
+            return Err(DeviceError::Mismatch { machine: machine.machine(), field, sent, held });
+        }
+        if let Some(slot) = machine.loaded.get(&Plan::KIND) {
+            let targets = (u64::from(slot.bytes) - 64) / 56;
+            machine.count("points of the measurement", targets, header.records.into())?;
+        }
+        let coordinates = match header.coordinates {
+            1 => Coordinates::Centres,
+            2 => Coordinates::Contacts,
+            other => {
+                let (field, found) = ("what its coordinates are", u32::from(other));
+                return Err(DeviceError::Unlisted { machine: machine.machine(), field, found });
+            }
+        };
+        let points = words.chunks_exact(header.registers).map(|record| {
+            let record = machine.station.registers(record);
+            codec::point(record, header.format, header.scale_mm).map_err(|flaw| machine.flawed(flaw))
+        });
+        Ok(Measurement {
+            points: points.collect::<Result<_, _>>()?,
+            coordinates,
+            probe_radius_mm: header.probe_radius_mm,
+            temperature_c: header.temperature_c,
+            duration_s: header.duration_s,
+            plan_identity: header.identity,
+            job: job.job,
+            cycle: job.cycle,
+            done: status.done,
+        })
+    }
+}
+
+impl Grinder for ModbusGrinder {
+    async fn load_pass(&mut self, map: &CorrectionMap, pass: &Pass, interrupt: &Interrupt) -> Result<(), DeviceError> {
+        self.0.load(map, interrupt).await?;
+        self.0.load(pass, interrupt).await
+    }
+
+    async fn collect(&mut self, job: Job, interrupt: &Interrupt) -> Result<PassRecord, DeviceError> {
+        let machine = &mut self.0;
+        let (status, header, words) = machine.fetch(job, 5, interrupt).await?;
+        machine.count("pass records", 1, header.records.into())?;
+        let figures = codec::pass_figures(machine.station.registers(&words)).map_err(|flaw| machine.flawed(flaw))?;
+        let (number, cycle, outcome, [path_mm, removed_mm3, deepest_mm, idle_share, spindle_load, wheel_radius_mm]) =
+            figures;
+        let fields = [
+            ("the job in the pass record", u64::from(job.job), u64::from(number)),
+            ("the cycle in the pass record", u64::from(job.cycle), u64::from(cycle)),
+            ("the result in the pass record", status.outcome as u64, outcome as u64),
+        ];
+        if let Some((field, sent, held)) = fields.into_iter().find(|(_, sent, held)| sent != held) {
+            return Err(DeviceError::Mismatch { machine: machine.machine(), field, sent, held });
+        }
+        if let Some(map) = machine.loaded.get(&CorrectionMap::KIND).filter(|map| map.identity != header.identity) {
+            let (sent, held) = (digest(&[map.identity]).into(), digest(&[header.identity]).into());
+            let field = "the identity of the map that was ground (its CRC-32)";
+            return Err(DeviceError::Mismatch { machine: machine.machine(), field, sent, held });
+        }
+        Ok(PassRecord {
+            outcome,
+            path_mm,
+            removed_mm3,
+            deepest_mm,
+            idle_share,
+            spindle_load,
+            wheel_radius_mm,
+            temperature_c: header.temperature_c,
+            duration_s: header.duration_s,
+            map_identity: header.identity,
+            job: job.job,
+            cycle: job.cycle,
+            done: status.done,
+        })
+    }
+}

@@ -1,0 +1,252 @@
+//! One machine on a line: proved before it is believed, proved again whenever the line was opened anew, and asked again when an answer
+//! failed to come.
+//!
+//! Everything that is asked through a station may be asked twice: reads, and writes of values. Nothing here is a pulse.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::time::Instant;
+
+use super::codec::{Registers, WordOrder, Writer};
+use super::link::{Ask, Link, LinkFault};
+use super::modbus::RegisterMap;
+use super::{DeviceError, Identity, MachineKind};
+
+/// The first words of an identity block.
+const MAGIC: [u16; 2] = [0x5247, 0x4431];
+/// The version of the map that is spoken here.
+const VERSION: u16 = 1;
+/// Registers of the identity block.
+const IDENTITY_REGISTERS: u16 = 32;
+/// The sentinels that prove the order of words.
+const SENTINEL_WHOLE: u32 = 0x1234_5678;
+const SENTINEL_REAL: f64 = -2.5e-7;
+
+/// One machine on a line.
+#[derive(Debug)]
+pub(super) struct Station {
+    pub(super) name: Arc<str>,
+    pub(super) link: Link,
+    pub(super) order: WordOrder,
+    pub(super) map: RegisterMap,
+    unit: u8,
+    kind: MachineKind,
+    retries: u32,
+    lost_after: Duration,
+    /// The generation of the line on which the machine was proved.
+    trusted: Option<u64>,
+    identity: Option<Identity>,
+}
+
+/// What a station is told about its machine.
+pub(super) struct StationSettings {
+    pub(super) unit: u8,
+    pub(super) order: WordOrder,
+    pub(super) map: RegisterMap,
+    pub(super) retries: u32,
+    pub(super) lost_after: Duration,
+}
+
+impl Station {
+    pub(super) fn new(kind: MachineKind, link: Link, settings: StationSettings) -> Self {
+        let StationSettings { unit, order, map, retries, lost_after } = settings;
+        let name = format!("{kind} at {}, unit {unit}", link.wire()).into();
+        Self { name, link, order, map, unit, kind, retries, lost_after, trusted: None, identity: None }
+    }
+
+    /// Who was proved to be there.
+    pub(super) fn identity(&self) -> Option<&Identity> {
+        self.identity.as_ref()
+    }
+
+    pub(super) fn registers<'a>(&self, words: &'a [u16]) -> Registers<'a> {
+        Registers::new(words, self.order)
+    }
+
+    pub(super) fn writer(&self) -> Writer {
+        Writer::new(self.order)
+    }
+
+    /// Forgets who was there and proves who is there now.
+    pub(super) async fn meet(&mut self) -> Result<Identity, DeviceError> {
+        self.identity = None;
+        self.trusted = None;
+        let began = Instant::now();
+        for tries in 0.. {
+            match self.prove().await {
+                Ok(_) => break,
+                Err(error) if self.gives_up(&error, tries, began) => return Err(error),
+                Err(_) => self.link.count_retry(),
+            }
+        }
+        self.identity.clone().ok_or(DeviceError::NotConnected { machine: self.name.clone(), what: "identity" })
+    }
+
+    /// Reads registers, on a proved connection only.
+    pub(super) async fn read(&mut self, what: &'static str, address: u16, count: u16) -> Result<Vec<u16>, DeviceError> {
+        self.exchange(what, address, Ask::Read { address, count }).await
+    }
+
+    /// Writes registers, on a proved connection only. May be carried out more than once.
+    pub(super) async fn write(&mut self, what: &'static str, address: u16, words: &[u16]) -> Result<(), DeviceError> {
+        self.exchange(what, address, Ask::Write { address, words: words.into() }).await.map(drop)
+    }
+
+    /// Gives the connection up because something that came over it does not hold, and says what.
+    pub(super) async fn distrust(&mut self, what: &'static str, expected: u64, found: u64) -> DeviceError {
+        if let Some(generation) = self.trusted.take() {
+            // Stale is as good: then somebody else has given it up already.
+            let _ = self.link.ask(self.unit, Some(generation), Ask::Distrust).await;
+        }
+        DeviceError::Corrupt { machine: self.name.clone(), what, expected, found }
+    }
+
+    fn gives_up(&self, error: &DeviceError, tries: u32, began: Instant) -> bool {
+        !error.is_link() || tries >= self.retries || began.elapsed() >= self.lost_after
+    }
+
+    async fn exchange(&mut self, what: &'static str, address: u16, ask: Ask) -> Result<Vec<u16>, DeviceError> {
+        if self.identity.is_none() {
+            return Err(DeviceError::NotConnected { machine: self.name.clone(), what });
+        }
+        let began = Instant::now();
+        let mut tries = 0;
+        loop {
+            match self.attempt(what, address, &ask).await {
+                Ok(words) => return Ok(words),
+                Err(error) if self.gives_up(&error, tries, began) => return Err(error),
+                Err(_) => self.link.count_retry(),
+            }
+            tries += 1;
+        }
+    }
+
+    async fn attempt(&mut self, what: &'static str, address: u16, ask: &Ask) -> Result<Vec<u16>, DeviceError> {
+        loop {
+            let generation = match self.trusted {
+                Some(generation) => generation,
+                None => self.prove().await?,
+            };
+            match self.link.ask(self.unit, Some(generation), ask.clone()).await {
+                Ok((_, words)) => return Ok(words),
+                // Another machine on the line has met an error; prove again and ask for the first time.
+                Err(LinkFault::Stale) => self.trusted = None,
+                Err(fault) => return Err(self.failed(what, address, fault)),
+            }
+        }
+    }
+
+    fn failed(&mut self, what: &'static str, address: u16, fault: LinkFault) -> DeviceError {
+        let machine = self.name.clone();
+        if let LinkFault::Exception(code) = fault {
+            return DeviceError::Exception { machine, what, address, code };
+        }
+        self.trusted = None;
+        match fault {
+            LinkFault::Unreachable(why) => DeviceError::Unreachable { machine, why, limit: self.lost_after },
+            LinkFault::TimedOut => DeviceError::TimedOut { machine, what, limit: self.link.request_timeout() },
+            LinkFault::Corrupt { what, expected, found } => DeviceError::Corrupt { machine, what, expected, found },
+            LinkFault::Disconnected | LinkFault::Stale | LinkFault::Exception(_) => {
+                DeviceError::Disconnected { machine, what }
+            }
+        }
+    }
+
+    /// Proves who is at the far end of the present connection: the identity block, which is only read; then two random words that the
+    /// machine has to turn round, so that nothing older than this moment can be answering; then the identity once more.
+    async fn prove(&mut self) -> Result<u64, DeviceError> {
+        let first = self.map.identity;
+        let read = Ask::Read { address: first, count: IDENTITY_REGISTERS };
+        let asked = self.link.ask(self.unit, None, read.clone()).await;
+        let (generation, words) = asked.map_err(|fault| self.failed("identity", first, fault))?;
+        let identity = self.recognise(&words)?;
+        self.synchronise(generation).await?;
+        let again = self.link.ask(self.unit, Some(generation), read).await;
+        let (_, again) = again.map_err(|fault| self.failed("identity", first, fault))?;
+        self.trusted = Some(generation);
+        if again != words {
+            return Err(self.distrust("second reading of the identity", crc(&words), crc(&again)).await);
+        }
+        let machine = self.name.clone();
+        match &self.identity {
+            Some(known) if known.boot_id != identity.boot_id => {
+                self.trusted = None;
+                Err(DeviceError::Restarted { machine, was: known.boot_id, is: identity.boot_id })
+            }
+            _ => {
+                self.identity = Some(identity);
+                Ok(generation)
+            }
+        }
+    }
+
+    async fn synchronise(&mut self, generation: u64) -> Result<(), DeviceError> {
+        let address = self.map.sync;
+        let nonce: [u16; 2] = rand::random();
+        let write = Ask::Write { address, words: Arc::from(&nonce[..]) };
+        let written = self.link.ask(self.unit, Some(generation), write).await;
+        written.map_err(|fault| self.failed("proof of sync", address, fault))?;
+        let read = self.link.ask(self.unit, Some(generation), Ask::Read { address, count: 4 }).await;
+        let (_, found) = read.map_err(|fault| self.failed("proof of sync", address, fault))?;
+        let expected = [nonce[0], nonce[1], !nonce[0], !nonce[1]];
+        if found != expected {
+            self.trusted = Some(generation);
+            let number = |words: &[u16]| words.iter().fold(0, |bits, word| (bits << 16) | u64::from(*word));
+            return Err(self.distrust("proof of sync", number(&expected), number(&found)).await);
+        }
+        Ok(())
+    }
+
+    /// Reads an identity block, or says what it is that answers instead.
+    fn recognise(&self, words: &[u16]) -> Result<Identity, DeviceError> {
+        let machine = self.name.clone();
+        for (at, required) in MAGIC.into_iter().enumerate() {
+            if words[at] != required {
+                let address = self.map.identity.saturating_add(at as u16);
+                return Err(DeviceError::WrongDevice {
+                    machine,
+                    expected: self.kind,
+                    address,
+                    required,
+                    found: words[at],
+                });
+            }
+        }
+        if words[2] != VERSION {
+            return Err(DeviceError::WrongVersion { machine, required: VERSION, found: words[2] });
+        }
+        let sentinels_fit = |order| {
+            let block = Registers::new(words, order);
+            block.u32(4) == SENTINEL_WHOLE && block.f64(6).to_bits() == SENTINEL_REAL.to_bits()
+        };
+        if !sentinels_fit(self.order) {
+            let fits = sentinels_fit(self.order.other()).then_some(self.order.other().name());
+            return Err(DeviceError::WrongWordOrder { machine, configured: self.order.name(), fits });
+        }
+        let block = self.registers(words);
+        let kind = match words[3] {
+            1 => MachineKind::Cmm,
+            2 => MachineKind::Grinder,
+            other => return Err(DeviceError::Unlisted { machine, field: "its kind", found: u32::from(other) }),
+        };
+        if kind != self.kind {
+            return Err(DeviceError::WrongKind { machine, expected: self.kind, found: kind });
+        }
+        if words[13] != 1 {
+            return Err(DeviceError::Inches { machine, unit: words[13] });
+        }
+        let silence_ms = if words[15] == 0 { 3000 } else { words[15] };
+        Ok(Identity {
+            kind,
+            name: block.text(16, 16),
+            boot_id: block.u32(10),
+            simulation: words[12] & 1 == 1,
+            silence_limit_s: f64::from(silence_ms) / 1e3,
+        })
+    }
+}
+
+fn crc(words: &[u16]) -> u64 {
+    u64::from(super::codec::crc32(words))
+}
