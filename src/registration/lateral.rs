@@ -9,7 +9,7 @@
 //!
 //! The slope is that between neighbouring patches of the measured deviations, the value that 95 of 100 pairs stay below; patches and
 //! not points, so that the noise of points that lie close together is not taken for slope. The map is refused when its error is more
-//! than a share of what there is to correct, its rms. Directions that the recipe locks have no variance and do not count; nor do those
+//! than a share of what there is to correct, its rms. Directions that the recipe holds have no variance and do not count; nor do those
 //! that the surface cannot see at all, which stay where the start pose has them.
 
 use std::collections::BTreeMap;
@@ -72,8 +72,8 @@ pub fn weak_for_compensation(found: &Registration, limits: &MapLimits) -> Option
     Some(format!(
         "no correction is made: the measured heights are good, but the shape of the part does not tell where on it they lie{weak}. The \
          correction might sit {:.2} mm beside its place, and where the error map climbs by {:.2} um per mm that makes it wrong by \
-         {:.1} um; allowed are {:.1} um, {:.0} % of the {:.1} um rms to be corrected. Lock the directions in the recipe if the fixture \
-         holds the part better than that (registration.lock = [\"x\", \"y\", \"rz\"]), or measure edges or marks that show them",
+         {:.1} um; allowed are {:.1} um, {:.0} % of the {:.1} um rms to be corrected. Hold the directions in the recipe if the fixture \
+         holds the part better than that (registration.hold = [\"x\", \"y\", \"rz\"]), or measure edges or marks that show them",
         limits.coverage_factor * lateral_mm,
         1e3 * slope,
         1e3 * error_mm,
@@ -127,4 +127,94 @@ fn slope(used: &[&Deviation]) -> f64 {
     slopes.sort_unstable_by(f64::total_cmp);
     let at = (0.95 * slopes.len() as f64) as usize;
     slopes.get(at.min(slopes.len().saturating_sub(1))).copied().unwrap_or(0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Point, Pose};
+    use crate::registration::{Verdict, WeakDirection};
+    use crate::surface::Side;
+    use nalgebra::{Matrix6, Vector6};
+
+    const HALF_MM: f64 = 300.0;
+    const HEIGHT_MM: f64 = 0.05;
+    const WAVE_MM: f64 = 100.0;
+
+    /// A flat part that carries a wave, d = h sin(x / w), and whose pose has these standard uncertainties.
+    fn waved(sigmas: [f64; 6], twins: bool) -> Registration {
+        let at = |k: usize| HALF_MM * (k as f64 / 20.0 - 1.0);
+        let mut deviations: Vec<Deviation> = (0..=40)
+            .flat_map(|j| (0..=40).map(move |i| (at(i), at(j))))
+            .map(|(x, y)| Deviation {
+                point: Point::new(x, y, 0.0),
+                normal: Vector::z(),
+                deviation_mm: HEIGHT_MM * (x / WAVE_MM).sin(),
+                uncertainty_mm: 0.0,
+                status: PointStatus::Used,
+            })
+            .collect();
+        if twins {
+            // The same places again a micrometre aside, with noise: no slope of the part.
+            let noisy = |(k, d): (usize, &Deviation)| Deviation {
+                point: d.point + Vector::new(1e-3, 0.0, 0.0),
+                deviation_mm: d.deviation_mm + if k % 2 == 0 { 1e-3 } else { -1e-3 },
+                ..*d
+            };
+            let more: Vec<Deviation> = deviations.iter().enumerate().map(noisy).collect();
+            deviations.extend(more);
+        }
+        let n = deviations.len() as f64;
+        let objective_mm2 = deviations.iter().map(|d| d.deviation_mm * d.deviation_mm).sum::<f64>();
+        let words = "x and y shift: known to 3.4 mm only".to_owned();
+        let verdict = Verdict {
+            used: deviations.len(),
+            objective_mm2,
+            rms_mm: (objective_mm2 / n).sqrt(),
+            pv_mm: 2.0 * HEIGHT_MM,
+            residual_sigma_mm: 0.0,
+            covariance: Matrix6::from_diagonal(&Vector6::from(sigmas.map(|s| s * s))),
+            condition: 1.0,
+            weak_directions: vec![WeakDirection { words, held: false, sigma_mm: Some(3.4) }],
+            coverage: 1.0,
+            alternatives: Vec::new(),
+            warnings: Vec::new(),
+            iterations: 1,
+            converged: true,
+        };
+        Registration { cmm_from_model: Pose::identity(), deviations, trace: Vec::new(), side: Side::Normal, verdict }
+    }
+
+    #[test]
+    fn the_error_of_a_map_is_lateral_uncertainty_times_slope() {
+        let e = lateral_error(&waved([3.4, 1.0, 9.0, 0.0, 0.0, 0.0], false), 2.0);
+        assert!((e.lateral_mm - 3.4).abs() < 1e-12, "{e:?}");
+        // The steepest slope of the wave is h / w; patches see a little less of it.
+        let steepest = HEIGHT_MM / WAVE_MM;
+        assert!(e.slope > 0.85 * steepest && e.slope <= steepest, "{e:?}");
+        assert!((e.error_mm - 2.0 * e.lateral_mm * e.slope).abs() < 1e-15);
+        // A turn about z moves the corners most; turns about x and y move nothing along a flat part through the origin.
+        let e = lateral_error(&waved([0.0, 0.0, 0.0, 1e-2, 1e-2, 2e-4], false), 2.0);
+        assert!((e.lateral_mm - 2e-4 * HALF_MM * 2f64.sqrt()).abs() < 1e-9, "{e:?}");
+    }
+
+    #[test]
+    fn noise_of_points_that_lie_close_together_is_no_slope() {
+        let plain = lateral_error(&waved([1.0; 6], false), 2.0).slope;
+        let twins = lateral_error(&waved([1.0; 6], true), 2.0).slope;
+        assert!((twins / plain - 1.0).abs() < 0.25, "{twins} against {plain}");
+    }
+
+    #[test]
+    fn a_map_is_refused_where_the_error_is_above_its_share_and_not_before() {
+        let at = |sigma: f64| waved([sigma, 0.0, 0.0, 0.0, 0.0, 0.0], false);
+        let limits = MapLimits::default();
+        let unit = lateral_error(&at(1.0), limits.coverage_factor).error_mm;
+        let border = limits.share * at(1.0).verdict.rms_mm / unit;
+        assert_eq!(weak_for_compensation(&at(0.999 * border), &limits), None);
+        let why = weak_for_compensation(&at(1.001 * border), &limits).unwrap();
+        assert!(why.contains("known to 3.4 mm only") && why.contains("Hold the directions in the recipe"), "{why}");
+        // Locked directions have no variance.
+        assert_eq!(weak_for_compensation(&at(0.0), &limits), None);
+    }
 }

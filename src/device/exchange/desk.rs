@@ -392,20 +392,16 @@ impl<M: Mailbox> Desk<M> {
     }
 
     fn abort(&mut self) -> Told<()> {
-        if matches!(self.state, State::Execute | State::Held) {
-            // ABORTED is entered even if the folder cannot be reached; the error says that the hand-over may still lie there.
-            let marked = self.mark(Command::Abort, Standing::Aborted);
-            self.said = self.taken_back();
-            (self.state, self.outcome) = (State::Aborted, Outcome::Aborted);
-            return marked;
+        let was = std::mem::replace(&mut self.state, State::Aborted);
+        let lies = |h: &&HandOver| matches!(h.standing, Standing::Open | Standing::Held);
+        let ours = self.job.filter(|(_, sequence)| self.handed.iter().filter(lies).any(|h| h.sequence == *sequence));
+        if was == State::Prepared || ours.is_none() {
+            return Ok(());
         }
-        if self.state == State::Prepared {
-            self.job = None;
-        }
-        if self.state != State::Complete {
-            self.state = State::Aborted;
-        }
-        Ok(())
+        self.said = self.taken_back();
+        (self.outcome, self.answer) = (Outcome::Aborted, None);
+        // ABORTED is entered even if the folder cannot be reached; the error says that the hand-over may still lie there.
+        self.mark(Command::Abort, Standing::Aborted)
     }
 
     fn taken_back(&self) -> Vec<String> {
