@@ -9,7 +9,9 @@
 //!
 //! The slope is that between neighbouring patches of the measured deviations, the value that 95 of 100 pairs stay below; patches and
 //! not points, so that the noise of points that lie close together is not taken for slope. The map is refused when its error is more
-//! than a share of what there is to correct, its rms. Directions that the recipe holds have no variance and do not count; nor do those
+//! than a share of what there is to correct, its rms. It is refused too when it might sit farther beside its place than a limit,
+//! however gentle its slopes: where the part ends, and where panels meet, a map is not gentle, and a tool path that is cut to the outline
+//! of the part runs off it there. Directions that the recipe holds have no variance and do not count; nor do those
 //! that the surface cannot see at all, which stay where the start pose has them.
 
 use std::collections::BTreeMap;
@@ -26,11 +28,13 @@ pub struct MapLimits {
     pub coverage_factor: f64,
     /// The largest error of the map, as a share of the rms of what it corrects.
     pub share: f64,
+    /// How far the map may sit beside its place, with the coverage factor.
+    pub place_mm: f64,
 }
 
 impl Default for MapLimits {
     fn default() -> Self {
-        Self { coverage_factor: 2.0, share: 0.1 }
+        Self { coverage_factor: 2.0, share: 0.1, place_mm: 1.0 }
     }
 }
 
@@ -63,7 +67,8 @@ pub fn weak_for_compensation(found: &Registration, limits: &MapLimits) -> Option
     let LateralError { lateral_mm, slope, error_mm } = lateral_error(found, limits.coverage_factor);
     let rms_mm = found.verdict.rms_mm;
     let limit_mm = limits.share * rms_mm;
-    if error_mm <= limit_mm {
+    let beside_mm = limits.coverage_factor * lateral_mm;
+    if error_mm <= limit_mm && beside_mm <= limits.place_mm {
         return None;
     }
     let seen = found.verdict.weak_directions.iter().filter(|w| !w.held);
@@ -71,10 +76,11 @@ pub fn weak_for_compensation(found: &Registration, limits: &MapLimits) -> Option
     let weak = if weak.is_empty() { String::new() } else { format!(" ({})", weak.join("; ")) };
     Some(format!(
         "no correction is made: the measured heights are good, but the shape of the part does not tell where on it they lie{weak}. The \
-         correction might sit {:.2} mm beside its place, and where the error map climbs by {:.2} um per mm that makes it wrong by \
-         {:.1} um; allowed are {:.1} um, {:.0} % of the {:.1} um rms to be corrected. Hold the directions in the recipe if the fixture \
-         holds the part better than that (registration.hold = [\"x\", \"y\", \"rz\"]), or measure edges or marks that show them",
-        limits.coverage_factor * lateral_mm,
+         correction might sit {beside_mm:.2} mm beside its place, allowed are {:.2} mm. Where the error map climbs, by up to {:.2} um per \
+         mm, that makes it wrong by {:.1} um, allowed are {:.1} um, {:.0} % of the {:.1} um rms to be corrected; at edges and seams by \
+         more. Hold the directions in the recipe if the fixture holds the part better than that (registration.hold = [\"x\", \"y\", \
+         \"rz\"]), or measure edges or marks that show them",
+        limits.place_mm,
         1e3 * slope,
         1e3 * error_mm,
         1e3 * limit_mm,
@@ -208,12 +214,16 @@ mod tests {
     #[test]
     fn a_map_is_refused_where_the_error_is_above_its_share_and_not_before() {
         let at = |sigma: f64| waved([sigma, 0.0, 0.0, 0.0, 0.0, 0.0], false);
-        let limits = MapLimits::default();
+        let limits = MapLimits { place_mm: 1e3, ..MapLimits::default() };
         let unit = lateral_error(&at(1.0), limits.coverage_factor).error_mm;
         let border = limits.share * at(1.0).verdict.rms_mm / unit;
         assert_eq!(weak_for_compensation(&at(0.999 * border), &limits), None);
         let why = weak_for_compensation(&at(1.001 * border), &limits).unwrap();
         assert!(why.contains("known to 3.4 mm only") && why.contains("Hold the directions in the recipe"), "{why}");
+        let near = MapLimits { share: 1e3, ..MapLimits::default() };
+        assert_eq!(weak_for_compensation(&at(0.499), &near), None);
+        let why = weak_for_compensation(&at(0.501), &near).unwrap();
+        assert!(why.contains("might sit 1.00 mm beside its place, allowed are 1.00 mm"), "{why}");
         // Locked directions have no variance.
         assert_eq!(weak_for_compensation(&at(0.0), &limits), None);
     }

@@ -138,9 +138,14 @@ impl CmmFolders {
         }
         let missing = || ExchangeError::Missing { folder: self.settings.outbox.clone() };
         let lying = self.outbox.find(job)?.ok_or_else(missing)?;
-        let path = lying.path.join("plan.csv");
-        let plan = parse_result(&path, &read_bytes(&path)?, &Content::default())?;
-        let expected = Expected { lying, targets: plan.indices.unwrap_or_default(), since: None };
+        // Where any number of points will do the plan may name none.
+        let targets = if self.settings.free_count {
+            Vec::new()
+        } else {
+            let path = lying.path.join("plan.csv");
+            parse_result(&path, &read_bytes(&path)?, &Content::default())?.indices.unwrap_or_default()
+        };
+        let expected = Expected { lying, targets, since: None };
         self.expected = Some(expected.clone());
         Ok(expected)
     }
