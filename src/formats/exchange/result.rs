@@ -451,11 +451,11 @@ mod tests {
 
     #[test]
     fn inches_are_converted_only_where_the_cell_says_so() {
-        let text = "# units: inch\n1,2,3\n";
+        let text = "# units: inch\n1,2,4\n";
         assert!(matches!(parse(text, &Content::default()), Err(ExchangeError::Contradiction { key: "the unit", .. })));
         let inch = Content { unit_mm: INCH_MM, ..Content::default() };
-        assert_eq!(parse(text, &inch).unwrap().points, [Point::new(25.4, 50.8, 76.2)]);
-        assert_eq!(parse("1,2,3\n", &inch).unwrap().points, [Point::new(25.4, 50.8, 76.2)]);
+        assert_eq!(parse(text, &inch).unwrap().points, [Point::new(25.4, 50.8, 101.6)]);
+        assert_eq!(parse("1,2,4\n", &inch).unwrap().points, [Point::new(25.4, 50.8, 101.6)]);
         assert!(matches!(parse("# units: mm\n1,2,3\n", &inch), Err(ExchangeError::Contradiction { .. })));
         assert!(parse("x_inch,y_inch,z_inch\n1,2,3\n", &Content::default()).is_err());
     }
