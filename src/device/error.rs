@@ -134,6 +134,15 @@ pub enum DeviceError {
         what: &'static str,
     },
 
+    /// The folders that stand for the machine cannot be read or written, or hold something that must not be touched.
+    #[error("{machine}: {why}")]
+    Folder {
+        /// The machine.
+        machine: Arc<str>,
+        /// The file, the reason and the remedy, in words of the room that reads and writes files.
+        why: String,
+    },
+
     // ---- was told no, or the wrong thing -----------------------------------------------------------------------------------------
     /// The machine refused a command.
     #[error("{machine} refused {command} in {state}: {answer}")]
@@ -361,6 +370,7 @@ impl DeviceError {
                 | Self::StartUnknown { .. }
                 // Busy, a gateway that finds nobody, a memory error: asked again it may go well.
                 | Self::Exception { code: 4 | 5 | 6 | 8 | 10 | 11, .. }
+                | Self::Folder { .. }
         )
     }
 }

@@ -20,6 +20,7 @@
 
 mod codec;
 mod error;
+pub mod exchange;
 mod link;
 mod machine;
 mod modbus;

@@ -1,9 +1,10 @@
 //! How a text cloud is laid out: separator, columns, decimal mark, units. Found in its first lines, then enforced.
 
+use std::borrow::Cow;
 use std::path::Path;
 
 use super::error::{FormatError, excerpt};
-use super::number::{Decimal, Evidence, evidence, looks_numeric};
+use super::number::{Decimal, Evidence, evidence, looks_numeric, without_blanks};
 
 /// What stands between two columns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,6 +42,12 @@ impl Separator {
             Self::Tab => "tab",
             Self::Blank => "blank",
         }
+    }
+
+    /// Returns a field without the blanks that group its thousands; only where neither blanks nor commas separate columns.
+    pub(super) fn ungrouped(self, field: &[u8]) -> Cow<'_, [u8]> {
+        let may = matches!(self, Self::Tab | Self::Semicolon);
+        may.then(|| without_blanks(field)).flatten().map_or(Cow::Borrowed(field), Cow::Owned)
     }
 
     fn separates(self, byte: u8) -> bool {
@@ -124,7 +131,7 @@ impl Layout {
             }
             let (fields, _) = self.pick(line);
             for (field, column) in fields.iter().zip(self.columns) {
-                match evidence(field) {
+                match evidence(&self.separator.ungrouped(field)) {
                     Evidence::Says(decimal) => {
                         self.decimal = decimal;
                         return Ok(());
@@ -163,6 +170,12 @@ impl<'p> Preamble<'p> {
     /// Returns whether there was a header.
     pub(super) fn has_header(&self) -> bool {
         self.header.is_some()
+    }
+
+    /// Returns the names of the columns in lower case, if a header gives each of them one.
+    pub(super) fn names(&self, separator: Separator) -> Vec<String> {
+        let header = self.header.as_ref().or(self.comment.as_ref());
+        header.map_or(Vec::new(), |(_, line)| names(line, separator))
     }
 
     /// Takes the next line and returns the layout if it is the first with data.
@@ -251,8 +264,10 @@ impl<'p> Preamble<'p> {
 
 /// Returns the separator under which a line is a point: three numbers first, or else three numbers anywhere.
 fn data_separator(line: &[u8]) -> Option<Separator> {
-    let numbers =
-        |separator, first: usize| Fields::of(line, separator).take(first).filter(|f| looks_numeric(f)).count();
+    let numbers = |separator: Separator, first: usize| {
+        let fields = Fields::of(line, separator).take(first);
+        fields.filter(|field| looks_numeric(&separator.ungrouped(field))).count()
+    };
     let first_three = Separator::ALL.into_iter().find(|&separator| numbers(separator, 3) == 3);
     first_three.or_else(|| Separator::ALL.into_iter().find(|&separator| numbers(separator, usize::MAX) >= 3))
 }

@@ -5,6 +5,7 @@
 
 mod document;
 mod error;
+pub mod exchange;
 mod folder;
 mod layout;
 mod map;

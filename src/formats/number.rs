@@ -88,6 +88,20 @@ pub(super) fn evidence(field: &[u8]) -> Evidence {
     }
 }
 
+/// Returns a number without the blanks that group its thousands, as in 1 234,56; `None` if no blanks do.
+///
+/// A blank may be a plain one, one that does not break the line (U+00A0), or a narrow one of these (U+202F).
+pub(super) fn without_blanks(field: &[u8]) -> Option<Vec<u8>> {
+    let text = std::str::from_utf8(field).ok().filter(|text| text.len() <= LONGEST_MARKED)?;
+    let is_blank = |c: char| matches!(c, ' ' | '\u{a0}' | '\u{202f}');
+    let (whole, fraction) = text.split_at(text.find(['.', ',']).unwrap_or(text.len()));
+    let marked: String = whole.chars().map(|c| if is_blank(c) { ' ' } else { c }).collect();
+    if !is_grouped(marked.as_bytes(), b' ') || fraction.contains(is_blank) {
+        return None;
+    }
+    Some(marked.bytes().filter(|&b| b != b' ').chain(fraction.bytes()).collect())
+}
+
 /// Reads a number with a decimal point and nothing else in it.
 fn plain(field: &[u8]) -> Result<f64, NumberFault> {
     let value: f64 = fast_float2::parse(field).map_err(|_| NumberFault::Text)?;
@@ -157,6 +171,17 @@ mod tests {
         assert_eq!(point("2,512"), Err(NumberFault::AmbiguousComma));
         assert_eq!(point("2,5"), Err(NumberFault::OtherMark));
         assert_eq!(comma("2.5"), Err(NumberFault::OtherMark));
+    }
+
+    #[test]
+    fn blanks_group_thousands_only_in_threes() {
+        let without = |text: &str| without_blanks(text.as_bytes()).map(|t| String::from_utf8(t).unwrap());
+        assert_eq!(without("1 234,56").as_deref(), Some("1234,56"));
+        assert_eq!(without("-1\u{a0}234\u{202f}567.5").as_deref(), Some("-1234567.5"));
+        assert_eq!(without("12 345").as_deref(), Some("12345"));
+        for text in ["1 2", "1 2345", "1234 567", "0 123", "1 234,5 6", "1 234 ", "a 123", "", "12"] {
+            assert_eq!(without(text), None, "{text:?}");
+        }
     }
 
     #[test]

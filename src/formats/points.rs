@@ -32,7 +32,8 @@ const SHARE: usize = 256 << 10;
 /// One point a line; columns separated by comma, semicolon, tab or blanks, which is found in the first point and required of
 /// all. Blank lines and lines that begin with `#` or `//` are skipped. If a header, or a comment that stands for one, names
 /// x, y and z, those columns are taken, else the first three; further columns may hold anything. Decimal commas are understood
-/// where the comma does not separate columns, thousands separators where the number also has its decimal mark.
+/// where the comma does not separate columns, thousands separators where the number also has its decimal mark, and blanks between
+/// thousands where a tab or a semicolon separates columns.
 ///
 /// # Errors
 /// A file that is not readable, not text, empty, too large or cut; a line with another number of columns; anything but a
@@ -54,9 +55,16 @@ pub fn parse_points(path: impl AsRef<Path>, reader: impl Read + Send) -> Result<
     Cloud::new(path.as_ref(), 0).read(reader)
 }
 
+/// Reads a point cloud whose decimal mark is known from elsewhere.
+pub(super) fn parse_points_with(path: &Path, text: &[u8], decimal: Option<Decimal>) -> Result<Vec<Point>, FormatError> {
+    Cloud { decimal, ..Cloud::new(path, 0) }.read(text)
+}
+
 /// A cloud while it is being read.
 struct Cloud<'p> {
     path: &'p Path,
+    /// The decimal mark, where it need not be told from the file.
+    decimal: Option<Decimal>,
     /// Expected length of the file, for reserving memory only.
     length: u64,
     preamble: Preamble<'p>,
@@ -96,7 +104,7 @@ struct Share {
 
 impl<'p> Cloud<'p> {
     fn new(path: &'p Path, length: u64) -> Self {
-        Self { path, length, preamble: Preamble::new(path), layout: None, lines: 0, points: Vec::new() }
+        Self { path, decimal: None, length, preamble: Preamble::new(path), layout: None, lines: 0, points: Vec::new() }
     }
 
     fn read(mut self, mut reader: impl Read + Send) -> Result<Vec<Point>, FormatError> {
@@ -173,7 +181,10 @@ impl<'p> Cloud<'p> {
             let number = self.lines + 1;
             check_line(self.path, number, line)?;
             if let Some(mut layout) = self.preamble.take(line, number)? {
-                layout.settle_decimal(self.path, rest)?;
+                match self.decimal {
+                    Some(decimal) => layout.decimal = decimal,
+                    None => layout.settle_decimal(self.path, rest)?,
+                }
                 self.layout = Some(layout);
                 break;
             }
@@ -373,7 +384,7 @@ fn careful_line(
     }
     let mut values = [0.0; 3];
     for ((value, field), column) in values.iter_mut().zip(fields).zip(layout.columns) {
-        *value = coordinate(field, layout.decimal).map_err(|fault| {
+        *value = coordinate(&layout.separator.ungrouped(field), layout.decimal).map_err(|fault| {
             // The beginning of a number at the very end of a file is a cut, not somebody's text.
             let begun = field.iter().all(|b| matches!(b, b'0'..=b'9' | b'+' | b'-' | b'.' | b',' | b'e' | b'E'));
             if !ended && fault == NumberFault::Text && begun {

@@ -152,13 +152,13 @@ impl<'p> Draft<'p> {
         move |source| FormatError::Unwritable { path: path.clone(), action, source }
     }
 
-    fn write(&mut self, bytes: &[u8]) -> Result<(), FormatError> {
+    pub(super) fn write(&mut self, bytes: &[u8]) -> Result<(), FormatError> {
         let failed = self.failed("writing it");
         self.file.write_all(bytes).map_err(failed)
     }
 
     /// Brings the bytes to the disk, then gives the file its name, then brings the name to the disk.
-    fn publish(mut self) -> Result<(), FormatError> {
+    pub(super) fn publish(mut self) -> Result<(), FormatError> {
         let failed = self.failed("bringing it to the disk");
         self.file.flush().map_err(&failed)?;
         self.file.get_ref().sync_all().map_err(&failed)?;
@@ -178,7 +178,7 @@ impl Drop for Draft<'_> {
 }
 
 /// Makes a rename last; only Unix lets a folder be opened for it.
-fn sync_folder(path: &Path) -> io::Result<()> {
+pub(super) fn sync_folder(path: &Path) -> io::Result<()> {
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     if cfg!(unix) { File::open(folder)?.sync_all() } else { Ok(()) }
 }

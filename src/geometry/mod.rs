@@ -5,10 +5,12 @@
 pub mod aperture;
 pub mod grid;
 pub mod pose;
+pub mod rigid;
 
 pub use aperture::{Aperture, ApertureError};
 pub use grid::{GridOrder, recognise_grid};
 pub use pose::{Pose, PoseError, Twist};
+pub use rigid::{RigidError, RigidFit, fit_rigid};
 
 /// A position in space, in millimetres.
 pub type Point = nalgebra::Point3<f64>;

@@ -15,6 +15,7 @@
 
 mod correspond;
 mod iterate;
+mod lateral;
 mod linearize;
 mod point_to_point;
 mod robust;
@@ -31,6 +32,7 @@ use crate::surface::{Distance, Lookup, Nominal, OffsetSurface, Side, SurfaceErro
 use correspond::{Reading, Track, at_feet, middle_and_size};
 pub use iterate::Iteration;
 use iterate::{Descent, Problem};
+pub use lateral::{LateralError, MapLimits, lateral_error, weak_for_compensation};
 pub use point_to_point::{PointToPoint, register_point_to_point};
 pub use robust::Loss;
 use robust::{ScaledLoss, robust_sigma};

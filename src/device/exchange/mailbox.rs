@@ -1,0 +1,118 @@
+//! What the driver asks of the folders, so that it writes no file itself.
+
+use std::time::Duration;
+
+use crate::device::Job;
+
+/// Two folders that stand for a machine: one that hand-overs are put into, one that answers come out of.
+///
+/// Everything may be asked again: publishing apart, asking twice is the same as asking once.
+pub trait Mailbox: std::fmt::Debug + Send + 'static {
+    /// What is handed over.
+    type Request: std::fmt::Debug + Send + 'static;
+    /// What comes back.
+    type Answer: std::fmt::Debug + Clone + Send + 'static;
+
+    /// Tries both folders, and returns every hand-over that was ever made there, the oldest first.
+    fn open(&mut self) -> Result<Vec<HandOver>, MailboxError>;
+
+    /// Makes a hand-over appear, whole, by one rename. Never a second time for a job and cycle.
+    fn publish(&mut self, job: Job, sequence: u32, request: &Self::Request) -> Result<(), MailboxError>;
+
+    /// Moves a hand-over on to where it stands now.
+    fn mark(&mut self, job: Job, standing: Standing) -> Result<(), MailboxError>;
+
+    /// Looks for what has come back for a hand-over that is open. `now` is the time since the driver was made.
+    fn look(&mut self, now: Duration, job: Job) -> Result<Look<Self::Answer>, MailboxError>;
+}
+
+/// Folders whose jobs a person begins and ends.
+pub trait Confirmable: Mailbox {
+    /// Writes down that a person has begun or ended the job whose map has this identity.
+    fn confirm(&mut self, job: Job, step: Step, map_identity: [u8; 32]) -> Result<(), MailboxError>;
+}
+
+/// What a person confirms.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Step {
+    /// The machine has begun.
+    Started,
+    /// The machine has ended, the part is clear.
+    Done,
+}
+
+/// A hand-over that was made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct HandOver {
+    /// What for.
+    pub job: Job,
+    /// The number of its start; rises from one to the next.
+    pub sequence: u32,
+    /// What became of it.
+    pub standing: Standing,
+}
+
+/// What became of a hand-over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Standing {
+    /// It waits for its answer.
+    Open,
+    /// It was taken back for a while.
+    Held,
+    /// It was taken back for good, in order.
+    Stopped,
+    /// It was taken back for good, at once.
+    Aborted,
+    /// Its answer was acknowledged.
+    Closed,
+}
+
+/// What a look at the folders found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Look<A> {
+    /// The answer, if it is there, complete and right.
+    pub answer: Option<A>,
+    /// Whether a person has confirmed that the machine has begun.
+    pub begun: bool,
+    /// What a person should know: files left alone, and why; what is waited for.
+    pub said: Vec<String>,
+}
+
+/// Why the folders did not do what they were asked.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum MailboxError {
+    /// A file or a folder is not as it has to be.
+    #[error("{why}")]
+    Files {
+        /// The reason and the remedy, in words.
+        why: String,
+    },
+    /// The job and cycle were handed over before.
+    #[error("job {job} cycle {cycle} was handed over before")]
+    HandedOver {
+        /// The job.
+        job: u32,
+        /// The cycle.
+        cycle: u16,
+    },
+    /// A confirmation names another map.
+    #[error("the confirmation names the map {}, handed over was {}", hex(.found), hex(.expected))]
+    OtherMap {
+        /// What was handed over.
+        expected: [u8; 32],
+        /// What the confirmation names.
+        found: [u8; 32],
+    },
+    /// No hand-over of this job is open.
+    #[error("no hand-over of job {job} cycle {cycle} is open")]
+    NotOpen {
+        /// The job.
+        job: u32,
+        /// The cycle.
+        cycle: u16,
+    },
+}
+
+fn hex(bytes: &[u8; 32]) -> String {
+    bytes[..8].iter().map(|b| format!("{b:02x}")).collect()
+}

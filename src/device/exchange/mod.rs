@@ -1,0 +1,59 @@
+//! Machines without a wire: a folder that takes hand-overs, a folder that gives answers, and a person between.
+//!
+//! The states are those of a wire, so that whoever drives a cell sees no difference:
+//!
+//! ```text
+//!  PREPARE  the payload is checked; nothing is in the folder yet
+//!  START    the hand-over appears, whole, by one rename; at most once for a job and cycle        -> EXECUTE
+//!  EXECUTE  waiting; every status looks at the folder
+//!  HOLD     the hand-over is taken back -> HELD;  RESUME  it is put there again -> EXECUTE
+//!  STOP     it is taken back for good -> COMPLETE, stopped;   ABORT  likewise -> ABORTED
+//!  COMPLETE a result was accepted; ACKNOWLEDGE closes the hand-over                               -> IDLE
+//! ```
+//!
+//! What was handed over stays in the folder under a name that tells what became of it. That is the memory by which a restarted client
+//! learns whether a start was taken, and by which a job and cycle is never handed over twice. **Taking a hand-over back stops no
+//! machine**: once a person has begun the job, only that person can stop it, and the notes say so.
+//!
+//! The files themselves are read and written behind [`Mailbox`].
+
+mod desk;
+mod mailbox;
+
+pub use desk::{ExchangeMachine, ExchangeTiming};
+pub use mailbox::{Confirmable, HandOver, Look, Mailbox, MailboxError, Standing, Step};
+
+use crate::device::{CorrectionMap, Measurement, Pass, PassRecord, Plan};
+
+/// What a grinder is handed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GrindOrder {
+    /// The map.
+    pub map: CorrectionMap,
+    /// How to grind.
+    pub pass: Pass,
+    /// The identity of the map.
+    pub map_identity: [u8; 32],
+}
+
+/// What a measuring machine is handed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MeasureOrder {
+    /// The plan.
+    pub plan: Plan,
+    /// Its identity.
+    pub plan_identity: [u8; 32],
+}
+
+/// Folders of a measuring machine.
+pub trait CmmMailbox: Mailbox<Request = MeasureOrder, Answer = Measurement> {}
+impl<M: Mailbox<Request = MeasureOrder, Answer = Measurement>> CmmMailbox for M {}
+
+/// Folders of a grinder.
+pub trait GrinderMailbox: Confirmable + Mailbox<Request = GrindOrder, Answer = PassRecord> {}
+impl<M: Confirmable + Mailbox<Request = GrindOrder, Answer = PassRecord>> GrinderMailbox for M {}
+
+/// A measuring machine behind two folders.
+pub type ExchangeCmm<M> = ExchangeMachine<M>;
+/// A grinder behind two folders.
+pub type ExchangeGrinder<M> = ExchangeMachine<M>;

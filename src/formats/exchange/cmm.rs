@@ -1,0 +1,621 @@
+//! The folders of a measuring machine: the plan out, the measurement in.
+//!
+//! `plan.csv` holds a row a target, `index,x,y,z,nx,ny,nz,what`; `plan.json` says the rest, and what is expected back. A result belongs to
+//! a hand-over if its name fits the pattern, or if it says part and cycle or the plan's identity itself; one that says otherwise is
+//! left alone, whatever its name.
+
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use sha2::{Digest, Sha256};
+
+use super::outbox::{Lying, Outbox, Taken, Ticket, hand_over, hex, nanoseconds, told, unhex};
+use super::references::{References, parse_references, read_references};
+use super::result::{Content, Coordinates, ResultFile, is_ended, parse_result, read_bytes, read_statements};
+use super::stations::{PlacedStation, place_station};
+use super::watch::{Found, Look as FileLook, Watch};
+use super::{ExchangeError, Pattern};
+use crate::device::exchange::{HandOver, Look, Mailbox, MailboxError, MeasureOrder, Standing};
+use crate::device::{self, Job, MeasuredPoint, Measurement, Plan, PointStatus};
+
+/// What is taken for the part's temperature where no file tells it.
+const REFERENCE_TEMPERATURE_C: f64 = 20.0;
+
+/// How a measuring machine exchanges files.
+#[derive(Clone, Debug)]
+pub struct CmmExchange {
+    /// The part, as it stands in names of files and in headers.
+    pub part: String,
+    /// Where plans are put.
+    pub outbox: PathBuf,
+    /// Where results appear.
+    pub inbox: PathBuf,
+    /// A file that has not changed for so long is complete.
+    pub stable_for: Duration,
+    /// What is known of the result files.
+    pub content: Content,
+    /// The names of result files; `{part}`, `{job}`, `{cycle}` and `*`.
+    pub result: Pattern,
+    /// Where a measurement is made from several stations.
+    pub stations: Option<Stations>,
+    /// Whether a result may have any number of points, which then stand for themselves; else a point for every target.
+    pub free_count: bool,
+    /// Whether files may be taken that lay in the inbox before the plan was handed over.
+    pub take_earlier: bool,
+    /// With a free count: fewer points than this are waited on.
+    pub least_points: usize,
+    /// By how much the probe radius in a file may differ from the plan's.
+    pub probe_tolerance_mm: f64,
+}
+
+impl CmmExchange {
+    /// Returns the usual settings for a part and two folders.
+    pub fn new(part: impl Into<String>, outbox: impl Into<PathBuf>, inbox: impl Into<PathBuf>) -> Self {
+        Self {
+            part: part.into(),
+            outbox: outbox.into(),
+            inbox: inbox.into(),
+            stable_for: Duration::from_secs(2),
+            content: Content::default(),
+            result: Pattern::new("{part}_c{cycle}.*"),
+            stations: None,
+            free_count: false,
+            least_points: 1,
+            take_earlier: false,
+            probe_tolerance_mm: 1e-3,
+        }
+    }
+}
+
+/// A measurement from several stations, each with its own frame.
+#[derive(Clone, Debug)]
+pub struct Stations {
+    /// For each station the names of its points and of its reference points. With one `*` in both names they stand for as many
+    /// stations as there are pairs of files in which the star is the same; such a measurement is complete when nothing in the inbox
+    /// changes any more and there are `least_points`.
+    pub files: Vec<StationFiles>,
+    /// The file of the reference points in the CMM's frame.
+    pub nominal: PathBuf,
+    /// The group of points in the YAML files, where these hold several.
+    pub group: Option<String>,
+    /// By how much a reference point may be off after the fit.
+    pub limit_mm: f64,
+}
+
+/// The files of one station.
+#[derive(Clone, Debug)]
+pub struct StationFiles {
+    /// The points: one file of the inbox.
+    pub points: Pattern,
+    /// The reference points as this station sees them: one file of the inbox.
+    pub references: Pattern,
+}
+
+/// The folders of a measuring machine.
+#[derive(Debug)]
+pub struct CmmFolders {
+    settings: CmmExchange,
+    outbox: Outbox,
+    watch: Watch,
+    /// What is waited for, once it was handed over or found again.
+    expected: Option<Expected>,
+    /// What the folder looked like when it was judged last, and how.
+    judged: Option<(Vec<Found>, Look<Measurement>)>,
+}
+
+/// What is waited for.
+#[derive(Clone, Debug)]
+struct Expected {
+    lying: Lying,
+    /// The numbers of the targets, in the order of the plan.
+    targets: Vec<u32>,
+    since: Option<Duration>,
+}
+
+/// An answer that was made of some files.
+struct Accepted {
+    measurement: Measurement,
+    files: Vec<(String, String)>,
+    said: Vec<String>,
+}
+
+/// What a judgement of the folder comes to: an answer, or only words.
+type Judgement = Result<Option<Accepted>, ExchangeError>;
+
+impl CmmFolders {
+    /// Takes the settings; nothing is looked at before the driver opens the folders.
+    pub fn new(settings: CmmExchange) -> Self {
+        let outbox = Outbox { folder: settings.outbox.clone() };
+        let watch = Watch::new(&settings.inbox, settings.stable_for);
+        Self { settings, outbox, watch, expected: None, judged: None }
+    }
+
+    /// Finds a hand-over again that was made before a restart.
+    fn expect(&mut self, job: Job) -> Result<Expected, ExchangeError> {
+        if let Some(expected) = self.expected.as_ref().filter(|e| e.lying.ticket.job() == job) {
+            return Ok(expected.clone());
+        }
+        let missing = || ExchangeError::Missing { folder: self.settings.outbox.clone() };
+        let lying = self.outbox.find(job)?.ok_or_else(missing)?;
+        // Where any number of points will do the plan may name none.
+        let targets = if self.settings.free_count {
+            Vec::new()
+        } else {
+            let path = lying.path.join("plan.csv");
+            parse_result(&path, &read_bytes(&path)?, &Content::default())?.indices.unwrap_or_default()
+        };
+        let expected = Expected { lying, targets, since: None };
+        self.expected = Some(expected.clone());
+        Ok(expected)
+    }
+
+    fn judge(&self, expected: &Expected, found: &[Found], said: &mut Vec<String>) -> Judgement {
+        match &self.settings.stations {
+            None => self.judge_single(expected, found, said),
+            Some(stations) => self.judge_stations(expected, stations, found, said),
+        }
+    }
+
+    /// Returns whether a file may be looked at, and says why not.
+    fn is_new(&self, expected: &Expected, file: &Found, said: &mut Vec<String>) -> bool {
+        let earlier = !self.settings.take_earlier && expected.lying.ticket.is_earlier(&file.name, &file.look);
+        if earlier {
+            said.push(format!("{} lay there before the plan was handed over; left alone", file.name));
+        }
+        !earlier
+    }
+
+    // ---- one file -------------------------------------------------------------------------------------------------------------
+
+    fn judge_single(&self, expected: &Expected, found: &[Found], said: &mut Vec<String>) -> Judgement {
+        let ticket = &expected.lying.ticket;
+        let pattern = self.settings.result.filled(&ticket.part, ticket.job, ticket.cycle);
+        let mut ours: Vec<&Found> = Vec::new();
+        for file in found {
+            if !self.is_new(expected, file, said) {
+                continue;
+            }
+            if !file.settled {
+                said.push(format!("{} is still changing, or has only just stopped; waiting", file.name));
+                // A file that will be ours must not be overtaken by another one.
+                if pattern.fits(&file.name) {
+                    return Ok(None);
+                }
+                continue;
+            }
+            match self.belongs(ticket, &pattern, file) {
+                Ok(None) => ours.push(file),
+                Ok(Some(why)) => said.push(format!("{} {why}; left alone", file.name)),
+                Err(error) => said.push(error.to_string()),
+            }
+        }
+        match ours[..] {
+            [] => {
+                said.push(format!("waiting for {} in {}", pattern.as_str(), self.settings.inbox.display()));
+                Ok(None)
+            }
+            [file] => self.accept_single(expected, file).map(Some),
+            _ => Err(ExchangeError::Several {
+                folder: self.settings.inbox.clone(),
+                pattern: pattern.as_str().to_owned(),
+                names: ours.iter().map(|f| f.name.clone()).collect(),
+            }),
+        }
+    }
+
+    /// Returns why a file does not belong to a hand-over, or nothing if it does.
+    fn belongs(&self, ticket: &Ticket, pattern: &Pattern, file: &Found) -> Result<Option<String>, ExchangeError> {
+        let says = read_statements(&file.path, &read_bytes(&file.path)?)?;
+        let same_part = says.part.as_ref().map(|part| *part == ticket.part);
+        let same_cycle = says.cycle.map(|cycle| cycle == ticket.cycle);
+        let same_plan = says.plan.as_ref().map(|plan| *plan == ticket.identity);
+        Ok(match (same_part, same_cycle, same_plan) {
+            (Some(false), ..) => Some(format!("is of part {}, not {}", says.part.unwrap_or_default(), ticket.part)),
+            (_, Some(false), _) => {
+                Some(format!("is of cycle {}, not {}", says.cycle.unwrap_or_default(), ticket.cycle))
+            }
+            (.., Some(false)) => Some("was measured by another plan".to_owned()),
+            (Some(true), Some(true), _) | (.., Some(true)) => None,
+            _ if pattern.fits(&file.name) => None,
+            _ => Some(format!("does not say that it belongs here and its name does not fit {}", pattern.as_str())),
+        })
+    }
+
+    fn accept_single(&self, expected: &Expected, file: &Found) -> Result<Accepted, ExchangeError> {
+        let (result, sha) = self.read(expected, &file.path)?;
+        let points = self.matched(expected, file, &result)?;
+        let said = switched_off(&file.name, &result).into_iter().collect();
+        let measurement = self.measurement(expected, points, &[result]);
+        Ok(Accepted { measurement, files: vec![(file.name.clone(), sha)], said })
+    }
+
+    /// Reads a file of points and holds it against plan and cell.
+    fn read(&self, expected: &Expected, path: &Path) -> Result<(ResultFile, String), ExchangeError> {
+        let bytes = read_bytes(path)?;
+        if !is_ended(&bytes) {
+            let line = bytes.split(|&b| b == b'\n').count() as u64;
+            let last = bytes.rsplit(|&b| b == b'\n').next().unwrap_or_default();
+            let found = super::super::error::excerpt(last);
+            return Err(super::super::FormatError::CutLine { path: path.to_owned(), line, found }.into());
+        }
+        let sha = hex(&Sha256::digest(&bytes));
+        self.check_not_taken(expected, path, &sha)?;
+        let result = parse_result(path, &bytes, &self.settings.content)?;
+        if result.coordinates.is_none() {
+            return Err(ExchangeError::CoordinatesUnstated { path: path.to_owned() });
+        }
+        let expected_mm = expected.lying.ticket.tool_radius_mm;
+        let limit_mm = self.settings.probe_tolerance_mm;
+        match result.probe_radius_mm.filter(|found| (found - expected_mm).abs() > limit_mm) {
+            Some(found_mm) => {
+                Err(ExchangeError::ProbeRadius { path: path.to_owned(), found_mm, expected_mm, limit_mm })
+            }
+            None => Ok((result, sha)),
+        }
+    }
+
+    /// Refuses bytes that were the answer to another hand-over.
+    fn check_not_taken(&self, expected: &Expected, path: &Path, sha: &str) -> Result<(), ExchangeError> {
+        let own = (expected.lying.ticket.job, expected.lying.ticket.cycle);
+        let taken = self.outbox.list()?.into_iter().filter_map(|lying| lying.taken);
+        let before = taken.filter(|t| (t.job, t.cycle) != own).find(|t| t.files.iter().any(|(_, s)| s == sha));
+        match before {
+            // Another run may be fed with the same measurement where the cell says so; another cycle never.
+            Some(Taken { job, cycle, .. }) if job == own.0 || !self.settings.take_earlier => {
+                Err(ExchangeError::TakenBefore { path: path.to_owned(), job, cycle })
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Gives every point its target.
+    fn matched(
+        &self,
+        expected: &Expected,
+        file: &Found,
+        result: &ResultFile,
+    ) -> Result<Vec<MeasuredPoint>, ExchangeError> {
+        if self.settings.free_count {
+            return Ok(numbered(&result.points));
+        }
+        let (targets, path) = (&expected.targets, || file.path.clone());
+        let Some(indices) = &result.indices else {
+            if result.points.len() != targets.len() {
+                return Err(ExchangeError::Count { path: path(), found: result.points.len(), expected: targets.len() });
+            }
+            return Ok(targets.iter().zip(&result.points).map(|(&index, p)| touched(index, (*p).into())).collect());
+        };
+        // In the order of the plan; a target without a row was not found.
+        let mut all: Vec<MeasuredPoint> = targets.iter().map(|&index| not_found(index)).collect();
+        let place: std::collections::HashMap<u32, usize> = targets.iter().enumerate().map(|(k, &t)| (t, k)).collect();
+        for (row, (index, point)) in indices.iter().zip(&result.points).enumerate() {
+            let wrong =
+                |why| ExchangeError::Index { path: path(), line: row as u64 + 1, found: index.to_string(), why };
+            let slot = *place.get(index).ok_or_else(|| wrong("is not a target of the plan"))?;
+            if all[slot].status == PointStatus::Touched {
+                return Err(wrong("came before"));
+            }
+            all[slot] = touched(*index, (*point).into());
+        }
+        Ok(all)
+    }
+
+    fn measurement(&self, expected: &Expected, points: Vec<MeasuredPoint>, results: &[ResultFile]) -> Measurement {
+        let ticket = &expected.lying.ticket;
+        let coordinates = match results.iter().find_map(|r| r.coordinates) {
+            Some(Coordinates::Contacts) => device::Coordinates::Contacts,
+            _ => device::Coordinates::Centres,
+        };
+        let plan_identity = unhex(&ticket.identity);
+        Measurement {
+            points,
+            coordinates,
+            probe_radius_mm: results.iter().find_map(|r| r.probe_radius_mm).unwrap_or(ticket.tool_radius_mm),
+            temperature_c: results.iter().find_map(|r| r.statements.temperature_c).unwrap_or(REFERENCE_TEMPERATURE_C),
+            duration_s: 0.0,
+            plan_identity,
+            job: ticket.job,
+            cycle: ticket.cycle,
+            done: ticket.start_number,
+        }
+    }
+
+    // ---- several stations -----------------------------------------------------------------------------------------------------
+
+    fn judge_stations(
+        &self,
+        expected: &Expected,
+        stations: &Stations,
+        found: &[Found],
+        said: &mut Vec<String>,
+    ) -> Judgement {
+        let mut new: Vec<&Found> = Vec::new();
+        for file in found {
+            if self.is_new(expected, file, said) {
+                new.push(file);
+            }
+        }
+        let ticket = &expected.lying.ticket;
+        let pick = |pattern: &Pattern| -> Result<Result<Found, String>, ExchangeError> {
+            let pattern = pattern.filled(&ticket.part, ticket.job, ticket.cycle);
+            let fits: Vec<&&Found> = new.iter().filter(|f| pattern.fits(&f.name)).collect();
+            match fits[..] {
+                [] => Ok(Err(pattern.as_str().to_owned())),
+                [file] if !file.settled => Ok(Err(format!("{} to stop changing", file.name))),
+                [file] => Ok(Ok((*file).clone())),
+                _ => Err(ExchangeError::Several {
+                    folder: self.settings.inbox.clone(),
+                    pattern: pattern.as_str().to_owned(),
+                    names: fits.iter().map(|f| f.name.clone()).collect(),
+                }),
+            }
+        };
+        let (mut pairs, mut waiting) = (Vec::new(), Vec::new());
+        for station in self.named_stations(ticket, stations, &new) {
+            match (pick(&station.points)?, pick(&station.references)?) {
+                (Ok(points), Ok(references)) => pairs.push((points, references)),
+                (points, references) => waiting.extend([points.err(), references.err()].into_iter().flatten()),
+            }
+        }
+        if waiting.is_empty() && pairs.is_empty() {
+            waiting.push("the first station".to_owned());
+        }
+        let used = |name: &str| pairs.iter().any(|(p, r)| p.name == name || r.name == name);
+        let left: Vec<&str> = new.iter().map(|f| f.name.as_str()).filter(|name| !used(name)).collect();
+        if !waiting.is_empty() {
+            said.push(format!(
+                "{} of {} stations are there; waiting for {}",
+                pairs.len(),
+                stations.files.len(),
+                waiting.join(", ")
+            ));
+            return Ok(None);
+        }
+        if !left.is_empty() {
+            said.push(format!("left alone, no station's: {}", left.join(", ")));
+        }
+        let accepted = self.merge(expected, stations, &pairs)?;
+        let (there, least) = (accepted.measurement.points.len(), self.settings.least_points);
+        if self.settings.free_count && there < least {
+            said.extend(accepted.said);
+            said.push(format!(
+                "{there} points of {} stations; at least {least} are needed, waiting for further stations",
+                pairs.len()
+            ));
+            return Ok(None);
+        }
+        Ok(Some(accepted))
+    }
+
+    /// Returns the stations with their stars replaced by what they stand for, in the order of their names.
+    fn named_stations(&self, ticket: &Ticket, stations: &Stations, files: &[&Found]) -> Vec<StationFiles> {
+        let mut named = Vec::new();
+        for station in &stations.files {
+            let [points, references] =
+                [&station.points, &station.references].map(|p| p.filled(&ticket.part, ticket.job, ticket.cycle));
+            if !points.as_str().contains('*') || !references.as_str().contains('*') {
+                named.push(StationFiles { points, references });
+                continue;
+            }
+            for star in files.iter().filter_map(|file| points.star(&file.name)) {
+                let wanted = references.with_star(star);
+                if files.iter().any(|file| file.name == wanted.as_str()) {
+                    named.push(StationFiles { points: points.with_star(star), references: wanted });
+                }
+            }
+        }
+        named
+    }
+
+    fn merge(
+        &self,
+        expected: &Expected,
+        stations: &Stations,
+        pairs: &[(Found, Found)],
+    ) -> Result<Accepted, ExchangeError> {
+        let nominal = read_references(&stations.nominal, stations.group.as_deref())?;
+        let (mut points, mut results) = (Vec::new(), Vec::<ResultFile>::new());
+        let (mut files, mut said) = (Vec::new(), Vec::new());
+        for (k, (file, reference_file)) in pairs.iter().enumerate() {
+            let (result, sha) = self.read(expected, &file.path)?;
+            if let Some(why) = self.says_otherwise(expected, file)? {
+                return Err(why);
+            }
+            let bytes = read_bytes(&reference_file.path)?;
+            let seen = parse_references(&reference_file.path, &bytes, stations.group.as_deref())?;
+            let placed = self.place(k, &seen, &nominal, stations)?;
+            said.extend(switched_off(&file.name, &result));
+            said.push(placed.words());
+            points.extend(result.points.iter().map(|p| placed.cmm_from_station.point(p)));
+            files.extend([(file.name.clone(), sha), (reference_file.name.clone(), hex(&Sha256::digest(&bytes)))]);
+            if let Some(first) = results.first().filter(|first| first.coordinates != result.coordinates) {
+                let words = |c: Option<Coordinates>| format!("{c:?}").to_lowercase();
+                return Err(ExchangeError::Contradiction {
+                    path: file.path.clone(),
+                    key: "coordinates",
+                    found: words(result.coordinates),
+                    by: "first station",
+                    expected: words(first.coordinates),
+                });
+            }
+            results.push(result);
+        }
+        let targets = expected.targets.len();
+        if !self.settings.free_count && points.len() != targets {
+            let path = self.settings.inbox.clone();
+            return Err(ExchangeError::Count { path, found: points.len(), expected: targets });
+        }
+        let points = if self.settings.free_count {
+            numbered(&points)
+        } else {
+            expected.targets.iter().zip(&points).map(|(&index, p)| touched(index, (*p).into())).collect()
+        };
+        Ok(Accepted { measurement: self.measurement(expected, points, &results), files, said })
+    }
+
+    fn place(
+        &self,
+        index: usize,
+        seen: &References,
+        nominal: &References,
+        stations: &Stations,
+    ) -> Result<PlacedStation, ExchangeError> {
+        let name = seen.path.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
+        place_station(&format!("{} ({name})", index + 1), seen, nominal, stations.limit_mm)
+    }
+
+    /// Refuses a station's file that says it is of another part, cycle or plan.
+    fn says_otherwise(&self, expected: &Expected, file: &Found) -> Result<Option<ExchangeError>, ExchangeError> {
+        let ticket = &expected.lying.ticket;
+        let why = self.belongs(ticket, &Pattern::new("*"), file)?;
+        Ok(why.map(|found| ExchangeError::Contradiction {
+            path: file.path.clone(),
+            key: "the file",
+            found,
+            by: "plan",
+            expected: format!("part {} cycle {}", ticket.part, ticket.cycle),
+        }))
+    }
+}
+
+impl Mailbox for CmmFolders {
+    type Request = MeasureOrder;
+    type Answer = Measurement;
+
+    fn open(&mut self) -> Result<Vec<HandOver>, MailboxError> {
+        Outbox::try_writing(&self.settings.outbox).map_err(told)?;
+        self.watch.look(Duration::ZERO).map_err(|error| told(error.into()))?;
+        Ok(self.outbox.list().map_err(told)?.iter().map(hand_over).collect())
+    }
+
+    fn publish(&mut self, job: Job, sequence: u32, order: &MeasureOrder) -> Result<(), MailboxError> {
+        let earlier = earlier_files(&self.settings.inbox).map_err(told)?;
+        let ticket = Ticket {
+            format: 1,
+            part: self.settings.part.clone(),
+            job: job.job,
+            cycle: job.cycle,
+            digest: job.digest,
+            start_number: sequence,
+            identity: hex(&order.plan_identity),
+            tool_radius_mm: order.plan.probe_radius_mm,
+            earlier,
+        };
+        let expects = self.settings.result.filled(&ticket.part, ticket.job, ticket.cycle);
+        let files = [
+            ("plan.csv", plan_csv(&ticket, &order.plan).into_bytes()),
+            ("plan.json", plan_json(&ticket, order, &self.settings, expects.as_str())),
+        ];
+        self.outbox.publish(&ticket, &files).map_err(told)?;
+        (self.expected, self.judged) = (None, None);
+        Ok(())
+    }
+
+    fn mark(&mut self, job: Job, standing: Standing) -> Result<(), MailboxError> {
+        (self.expected, self.judged) = (None, None);
+        self.outbox.mark(job, standing).map_err(told)
+    }
+
+    fn look(&mut self, now: Duration, job: Job) -> Result<Look<Measurement>, MailboxError> {
+        let mut expected = self.expect(job).map_err(told)?;
+        let since = *expected.since.get_or_insert(now);
+        self.expected = Some(expected.clone());
+        let found = self.watch.look(now).map_err(|error| told(error.into()))?;
+        if let Some((_, look)) = self.judged.as_ref().filter(|(before, _)| *before == found) {
+            return Ok(look.clone());
+        }
+        let mut said = Vec::new();
+        let answer = match self.judge(&expected, &found, &mut said) {
+            Ok(None) => None,
+            Err(error) => {
+                said.push(format!("not taken: {error}"));
+                None
+            }
+            Ok(Some(accepted)) => {
+                let taken = Taken { job: job.job, cycle: job.cycle, files: accepted.files };
+                self.outbox.note_taken(&expected.lying, &taken).map_err(told)?;
+                said.extend(accepted.said);
+                let duration_s = now.saturating_sub(since).as_secs_f64();
+                Some(Measurement { duration_s, ..accepted.measurement })
+            }
+        };
+        let look = Look { begun: answer.is_some(), answer, said };
+        self.judged = Some((found, look.clone()));
+        Ok(look)
+    }
+}
+
+/// What lies in a folder now: name, length, time of change.
+pub(super) fn earlier_files(inbox: &Path) -> Result<Vec<(String, u64, u128)>, ExchangeError> {
+    let found = Watch::new(inbox, Duration::ZERO).look(Duration::ZERO)?;
+    let plain = |f: Found| {
+        let FileLook { bytes, modified } = f.look;
+        (f.name, bytes, nanoseconds(modified))
+    };
+    Ok(found.into_iter().map(plain).collect())
+}
+
+fn switched_off(name: &str, result: &ResultFile) -> Option<String> {
+    let off = result.switched_off;
+    (off > 0).then(|| format!("{name}: {off} rows are switched off and were left out"))
+}
+
+fn touched(index: u32, at_mm: [f64; 3]) -> MeasuredPoint {
+    MeasuredPoint { index, status: PointStatus::Touched, quality: 0, at_mm }
+}
+
+fn not_found(index: u32) -> MeasuredPoint {
+    MeasuredPoint { index, status: PointStatus::NotFound, quality: 100, at_mm: [0.0; 3] }
+}
+
+fn numbered(points: &[crate::geometry::Point]) -> Vec<MeasuredPoint> {
+    points.iter().zip(0..).map(|(p, index)| touched(index, (*p).into())).collect()
+}
+
+fn plan_csv(ticket: &Ticket, plan: &Plan) -> String {
+    let mut text = format!(
+        "# Regrind measuring plan\n# part: {}\n# job: {}\n# cycle: {}\n# plan: {}\n# units: mm\n# probe_radius_mm: {}\n\
+         # frame: that of the measuring machine; x y z nominal contact point, nx ny nz outward unit normal\n\
+         # what: 1 the part, 2 the reference sphere\nindex,x,y,z,nx,ny,nz,what\n",
+        ticket.part, ticket.job, ticket.cycle, ticket.identity, plan.probe_radius_mm
+    );
+    for target in &plan.targets {
+        let ([x, y, z], [nx, ny, nz]) = (target.point_mm, target.normal);
+        // Writing to a string cannot fail.
+        let _ = writeln!(text, "{},{x},{y},{z},{nx},{ny},{nz},{}", target.index, target.what as u16);
+    }
+    text
+}
+
+fn plan_json(ticket: &Ticket, order: &MeasureOrder, settings: &CmmExchange, expects: &str) -> Vec<u8> {
+    let plan = &order.plan;
+    let expects = match &settings.stations {
+        None => serde_json::json!({
+            "file": expects,
+            "folder": settings.inbox,
+            "points": if settings.free_count { serde_json::json!("any number") } else { plan.targets.len().into() },
+            "columns": "index,x,y,z in mm, or x,y,z with a row for every target in the order of the plan",
+            "say above the points": [
+                format!("# part: {}", ticket.part), format!("# cycle: {}", ticket.cycle), format!("# plan: {}", ticket.identity),
+                "# coordinates: centres  (or: contacts)".to_owned(), "# units: mm".to_owned(),
+            ],
+        }),
+        Some(stations) => serde_json::json!({
+            "folder": settings.inbox,
+            "stations": stations.files.iter().map(|s| [s.points.as_str(), s.references.as_str()]).collect::<Vec<_>>(),
+        }),
+    };
+    let value = serde_json::json!({
+        "kind": "measuring plan", "part": ticket.part, "job": ticket.job, "cycle": ticket.cycle, "plan": ticket.identity,
+        "units": "mm", "frame": "measuring machine", "targets": plan.targets.len(), "probe_radius_mm": plan.probe_radius_mm,
+        "approach_mm": plan.approach_mm, "search_mm": plan.search_mm, "speed_mm_s": plan.speed_mm_s,
+        "safe_height_mm": plan.safe_height_mm, "expected_back": expects,
+    });
+    let mut text = value.to_string().into_bytes();
+    if let Ok(pretty) = serde_json::to_vec_pretty(&value) {
+        text = pretty;
+    }
+    text.push(b'\n');
+    text
+}

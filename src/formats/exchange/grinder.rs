@@ -1,0 +1,286 @@
+//! The folders of a grinder: map and pass out, a person's word for start and end in.
+//!
+//! `correction.csv` holds a row a node, `x_mm,y_mm,correction_mm`, row by row, x fastest; `correction.json` says grid, sign, frame, units,
+//! the pass, and the hash that a confirmation has to name. `started.json` and `done.json` lie beside them, ready to be copied into the
+//! inbox by the person who begins and ends the job; `regrind confirm` writes the same files.
+
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use super::ExchangeError;
+use super::cmm::earlier_files;
+use super::outbox::{Lying, Outbox, Taken, Ticket, hand_over, hex, told, unhex, write_atomic};
+use super::result::read_bytes;
+use super::watch::{Found, Watch};
+use crate::device::exchange::{Confirmable, GrindOrder, HandOver, Look, Mailbox, MailboxError, Standing, Step};
+use crate::device::{CorrectionMap, Job, Outcome, PassRecord};
+
+/// What is taken for the part's temperature where no file tells it.
+const REFERENCE_TEMPERATURE_C: f64 = 20.0;
+/// The two files of a person's word, in the inbox.
+const STARTED: &str = "started.json";
+const DONE: &str = "done.json";
+
+/// How a grinder exchanges files.
+#[derive(Clone, Debug)]
+pub struct GrinderExchange {
+    /// The part, as it stands in names of files.
+    pub part: String,
+    /// Where maps are put.
+    pub outbox: PathBuf,
+    /// Where confirmations appear.
+    pub inbox: PathBuf,
+    /// A file that has not changed for so long is complete.
+    pub stable_for: Duration,
+}
+
+/// The folders of a grinder.
+#[derive(Debug)]
+pub struct GrinderFolders {
+    settings: GrinderExchange,
+    outbox: Outbox,
+    watch: Watch,
+    expected: Option<Lying>,
+    /// When the start was seen, by the driver's clock.
+    started: Option<Duration>,
+    /// When a confirmation was looked for first.
+    since: Option<Duration>,
+}
+
+/// A person's word that a job has begun or ended.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+struct Confirmation {
+    /// The identity of the map, 64 hexadecimal digits; need not be given whole, but at least 8 of them.
+    map: String,
+    job: Option<u32>,
+    cycle: Option<u16>,
+    /// Who says so.
+    operator: Option<String>,
+    wheel_radius_mm: Option<f64>,
+    temperature_c: Option<f64>,
+    removed_mm3: Option<f64>,
+}
+
+impl Confirmation {
+    fn of(ticket: &Ticket) -> Self {
+        Self { map: ticket.identity.clone(), job: Some(ticket.job), cycle: Some(ticket.cycle), ..Self::default() }
+    }
+
+    /// Returns what is wrong with it for a hand-over.
+    fn check(&self, path: &Path, ticket: &Ticket) -> Result<(), ExchangeError> {
+        let wrong = |found: String, expected: String, remedy| {
+            Err(ExchangeError::Confirmation { path: path.to_owned(), found, expected, remedy })
+        };
+        let (map, identity) = (self.map.trim().to_lowercase(), &ticket.identity);
+        if map.len() < 8 || !identity.starts_with(&map) {
+            let found = if map.is_empty() { "no map".to_owned() } else { format!("map `{}`", self.map) };
+            let remedy = "is the grinder set up with another map? copy the file from the folder of the hand-over";
+            return wrong(found, format!("map {identity}"), remedy);
+        }
+        let job = (self.job.unwrap_or(ticket.job), self.cycle.unwrap_or(ticket.cycle));
+        if job != (ticket.job, ticket.cycle) {
+            let (found, expected) =
+                (format!("job {} cycle {}", job.0, job.1), format!("job {} cycle {}", ticket.job, ticket.cycle));
+            return wrong(found, expected, "copy the file from the folder of the hand-over");
+        }
+        let positive = |value: Option<f64>| value.is_none_or(|v| v.is_finite() && v >= 0.0);
+        if !positive(self.wheel_radius_mm)
+            || !positive(self.removed_mm3)
+            || !self.temperature_c.is_none_or(f64::is_finite)
+        {
+            return wrong("a negative size".to_owned(), "sizes of 0 or more".to_owned(), "correct the numbers");
+        }
+        Ok(())
+    }
+}
+
+impl GrinderFolders {
+    /// Takes the settings; nothing is looked at before the driver opens the folders.
+    pub fn new(settings: GrinderExchange) -> Self {
+        let outbox = Outbox { folder: settings.outbox.clone() };
+        let watch = Watch::new(&settings.inbox, settings.stable_for);
+        Self { settings, outbox, watch, expected: None, started: None, since: None }
+    }
+
+    fn expect(&mut self, job: Job) -> Result<Lying, ExchangeError> {
+        if let Some(lying) = self.expected.as_ref().filter(|l| l.ticket.job() == job) {
+            return Ok(lying.clone());
+        }
+        let missing = || ExchangeError::Missing { folder: self.settings.outbox.clone() };
+        let lying = self.outbox.find(job)?.ok_or_else(missing)?;
+        self.expected = Some(lying.clone());
+        Ok(lying)
+    }
+
+    /// Returns the confirmation in a file of this name, if it is there, settled and for this hand-over; says why not.
+    fn confirmation(
+        &self,
+        name: &str,
+        lying: &Lying,
+        found: &[Found],
+        said: &mut Vec<String>,
+    ) -> Option<(Confirmation, String)> {
+        let file = found.iter().find(|f| f.name == name)?;
+        if lying.ticket.is_earlier(name, &file.look) {
+            said.push(format!("{name} lay there before the map was handed over; left alone"));
+            return None;
+        }
+        if !file.settled {
+            said.push(format!("{name} is still changing, or has only just stopped; waiting"));
+            return None;
+        }
+        let read = || -> Result<(Confirmation, String), ExchangeError> {
+            let bytes = read_bytes(&file.path)?;
+            let confirmation: Confirmation = super::outbox::read_json(&file.path)?;
+            confirmation.check(&file.path, &lying.ticket)?;
+            Ok((confirmation, hex(&Sha256::digest(&bytes))))
+        };
+        read().map_err(|error| said.push(format!("not taken: {error}"))).ok()
+    }
+
+    fn record(&self, lying: &Lying, done: &Confirmation, now: Duration) -> PassRecord {
+        let ticket = &lying.ticket;
+        let begun = self.started.or(self.since).unwrap_or(now);
+        let map_identity = unhex(&ticket.identity);
+        PassRecord {
+            outcome: Outcome::Complete,
+            // Nobody measures these; 0 where they are not told.
+            path_mm: 0.0,
+            removed_mm3: done.removed_mm3.unwrap_or(0.0),
+            deepest_mm: 0.0,
+            idle_share: 0.0,
+            spindle_load: 0.0,
+            wheel_radius_mm: done.wheel_radius_mm.unwrap_or(ticket.tool_radius_mm),
+            temperature_c: done.temperature_c.unwrap_or(REFERENCE_TEMPERATURE_C),
+            duration_s: now.saturating_sub(begun).as_secs_f64(),
+            map_identity,
+            job: ticket.job,
+            cycle: ticket.cycle,
+            done: ticket.start_number,
+        }
+    }
+}
+
+impl Mailbox for GrinderFolders {
+    type Request = GrindOrder;
+    type Answer = PassRecord;
+
+    fn open(&mut self) -> Result<Vec<HandOver>, MailboxError> {
+        Outbox::try_writing(&self.settings.outbox).map_err(told)?;
+        self.watch.look(Duration::ZERO).map_err(|error| told(error.into()))?;
+        Ok(self.outbox.list().map_err(told)?.iter().map(hand_over).collect())
+    }
+
+    fn publish(&mut self, job: Job, sequence: u32, order: &GrindOrder) -> Result<(), MailboxError> {
+        let ticket = Ticket {
+            format: 1,
+            part: self.settings.part.clone(),
+            job: job.job,
+            cycle: job.cycle,
+            digest: job.digest,
+            start_number: sequence,
+            identity: hex(&order.map_identity),
+            tool_radius_mm: order.pass.wheel_radius_mm,
+            earlier: earlier_files(&self.settings.inbox).map_err(told)?,
+        };
+        let word = json_lines(&serde_json::json!(Confirmation::of(&ticket)));
+        let files = [
+            ("correction.csv", correction_csv(&ticket, &order.map).into_bytes()),
+            ("correction.json", json_lines(&correction_json(&ticket, order, &self.settings.inbox))),
+            (STARTED, word.clone()),
+            (DONE, word),
+        ];
+        self.outbox.publish(&ticket, &files).map_err(told)?;
+        (self.expected, self.started, self.since) = (None, None, None);
+        Ok(())
+    }
+
+    fn mark(&mut self, job: Job, standing: Standing) -> Result<(), MailboxError> {
+        self.expected = None;
+        self.outbox.mark(job, standing).map_err(told)
+    }
+
+    fn look(&mut self, now: Duration, job: Job) -> Result<Look<PassRecord>, MailboxError> {
+        let lying = self.expect(job).map_err(told)?;
+        self.since.get_or_insert(now);
+        let found = self.watch.look(now).map_err(|error| told(error.into()))?;
+        let mut said = Vec::new();
+        if self.confirmation(STARTED, &lying, &found, &mut said).is_some() {
+            self.started.get_or_insert(now);
+        }
+        let done = self.confirmation(DONE, &lying, &found, &mut said);
+        let begun = self.started.is_some() || done.is_some();
+        let Some((done, sha)) = done else {
+            let (what, file) = if begun { ("end", DONE) } else { ("start", STARTED) };
+            said.push(format!(
+                "waiting for the {what} to be confirmed: `regrind confirm`, or copy {file} from {} to {}",
+                lying.path.display(),
+                self.settings.inbox.display()
+            ));
+            return Ok(Look { answer: None, begun, said });
+        };
+        if self.started.is_none() {
+            said.push("the end was confirmed without a start".to_owned());
+        }
+        let taken = Taken { job: job.job, cycle: job.cycle, files: vec![(DONE.to_owned(), sha)] };
+        self.outbox.note_taken(&lying, &taken).map_err(told)?;
+        Ok(Look { answer: Some(self.record(&lying, &done, now)), begun, said })
+    }
+}
+
+impl Confirmable for GrinderFolders {
+    fn confirm(&mut self, job: Job, step: Step, map_identity: [u8; 32]) -> Result<(), MailboxError> {
+        let lying = self.expect(job).map_err(told)?;
+        if hex(&map_identity) != lying.ticket.identity {
+            return Err(MailboxError::OtherMap { expected: unhex(&lying.ticket.identity), found: map_identity });
+        }
+        if lying.standing != Standing::Open {
+            return Err(MailboxError::NotOpen { job: job.job, cycle: job.cycle });
+        }
+        let name = if step == Step::Started { STARTED } else { DONE };
+        let word = json_lines(&serde_json::json!(Confirmation::of(&lying.ticket)));
+        write_atomic(&self.settings.inbox.join(name), &word).map_err(|error| told(error.into()))
+    }
+}
+
+fn json_lines(value: &serde_json::Value) -> Vec<u8> {
+    format!("{value:#}\n").into_bytes()
+}
+
+fn correction_csv(ticket: &Ticket, map: &CorrectionMap) -> String {
+    let mut text = format!(
+        "# Regrind correction\n# part: {}\n# job: {}\n# cycle: {}\n# map: {}\n# units: mm\n# frame: model\n\
+         # correction: by how much the ground surface is wanted displaced along the outward normal; positive leaves material\n\
+         x_mm,y_mm,correction_mm\n",
+        ticket.part, ticket.job, ticket.cycle, ticket.identity
+    );
+    for (k, value) in map.values_mm.iter().enumerate() {
+        let (column, row) = (k % map.columns.max(1), k / map.columns.max(1));
+        let x = map.first_mm[0] + map.spacing_mm[0] * column as f64;
+        let y = map.first_mm[1] + map.spacing_mm[1] * row as f64;
+        // Writing to a string cannot fail.
+        let _ = writeln!(text, "{x},{y},{value}");
+    }
+    text
+}
+
+fn correction_json(ticket: &Ticket, order: &GrindOrder, inbox: &Path) -> serde_json::Value {
+    let (map, pass) = (&order.map, &order.pass);
+    serde_json::json!({
+        "kind": "correction map", "part": ticket.part, "job": ticket.job, "cycle": ticket.cycle, "map": ticket.identity,
+        "units": "mm", "frame": "model", "sign": "positive leaves material, along the outward normal", "absolute": true,
+        "columns": map.columns, "rows": map.rows, "first_mm": map.first_mm, "spacing_mm": map.spacing_mm,
+        "nominal_surface": hex(&map.part_identity),
+        "pass": {
+            "wheel_radius_mm": pass.wheel_radius_mm, "feed_mm_min": pass.feed_mm_min, "track_spacing_mm": pass.track_spacing_mm,
+            "level_mm": pass.level_mm, "depth_of_cut_mm": pass.depth_of_cut_mm, "spark_out_passes": pass.spark_out_passes,
+            "x_mm": pass.x_mm, "y_mm": pass.y_mm,
+        },
+        "confirm": format!("copy {STARTED} when the grinder has begun, {DONE} when it has ended and the part is clear, to {}", inbox.display()),
+    })
+}

@@ -1,0 +1,250 @@
+//! The folder that hand-overs are put into, and the memory of all that ever were.
+//!
+//! A hand-over is a folder of its own: written under a hidden name, brought to the disk, and renamed, so that who sees it sees all of it.
+//! Its name tells the part, the job and the cycle, and by an ending what became of it:
+//!
+//! ```text
+//! SN-7_j3_c2           open        SN-7_j3_c2.held      taken back for a while      SN-7_j3_c2.done     its answer was acknowledged
+//! SN-7_j3_c2.stopped   taken back  SN-7_j3_c2.aborted   taken back at once
+//! ```
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::SystemTime;
+
+use serde::{Deserialize, Serialize};
+
+use super::super::FormatError;
+use super::super::registration::{Draft, sync_folder};
+use super::super::{whole, write_json_atomic};
+use super::watch::Look;
+use super::{ExchangeError, file_word};
+use crate::device::Job;
+use crate::device::exchange::{HandOver, MailboxError, Standing};
+
+/// What every folder of a hand-over holds.
+const TICKET: &str = "handover.json";
+/// What is written there when an answer was accepted.
+const TAKEN: &str = "taken.json";
+/// Largest of these files.
+const MOST_BYTES: u64 = 16 << 20;
+
+const ENDINGS: [(Standing, &str); 5] = [
+    (Standing::Open, ""),
+    (Standing::Held, ".held"),
+    (Standing::Stopped, ".stopped"),
+    (Standing::Aborted, ".aborted"),
+    (Standing::Closed, ".done"),
+];
+
+/// What a hand-over says of itself.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Ticket {
+    /// Of this file's layout: 1.
+    pub format: u16,
+    pub part: String,
+    pub job: u32,
+    pub cycle: u16,
+    pub digest: u32,
+    pub start_number: u32,
+    /// Of the plan, or of the map, 64 hexadecimal digits.
+    pub identity: String,
+    /// Radius of the probe, or of the wheel.
+    pub tool_radius_mm: f64,
+    /// Files that lay in the inbox before: name, length, time of change in nanoseconds.
+    pub earlier: Vec<(String, u64, u128)>,
+}
+
+impl Ticket {
+    pub(super) fn job(&self) -> Job {
+        Job { job: self.job, cycle: self.cycle, digest: self.digest }
+    }
+
+    /// Returns whether a file lay in the inbox before the hand-over, and has not been changed since.
+    pub(super) fn is_earlier(&self, name: &str, look: &Look) -> bool {
+        self.earlier.iter().any(|(n, bytes, at)| n == name && *bytes == look.bytes && *at == nanoseconds(look.modified))
+    }
+}
+
+/// Time of change since 1970, in nanoseconds.
+pub(super) fn nanoseconds(at: SystemTime) -> u128 {
+    at.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |d| d.as_nanos())
+}
+
+/// What was accepted as the answer to a hand-over.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct Taken {
+    pub job: u32,
+    pub cycle: u16,
+    /// The files and the SHA-256 of their bytes.
+    pub files: Vec<(String, String)>,
+}
+
+/// A hand-over as it lies in the folder.
+#[derive(Clone, Debug)]
+pub(super) struct Lying {
+    pub path: PathBuf,
+    pub ticket: Ticket,
+    pub standing: Standing,
+    pub taken: Option<Taken>,
+}
+
+/// The folder that hand-overs are put into.
+#[derive(Clone, Debug)]
+pub(super) struct Outbox {
+    pub folder: PathBuf,
+}
+
+impl Outbox {
+    /// Returns every hand-over in the folder, in the order of their start numbers.
+    pub(super) fn list(&self) -> Result<Vec<Lying>, ExchangeError> {
+        let unreadable = |source| FormatError::Unreadable { path: self.folder.clone(), source };
+        let mut found = Vec::new();
+        for entry in fs::read_dir(&self.folder).map_err(unreadable)? {
+            let path = entry.map_err(unreadable)?.path();
+            let Some(name) = path.file_name().and_then(|n| n.to_str()) else { continue };
+            if name.starts_with('.') || !path.join(TICKET).is_file() {
+                continue;
+            }
+            let ticket: Ticket = read_json(&path.join(TICKET))?;
+            let taken = if path.join(TAKEN).is_file() { Some(read_json(&path.join(TAKEN))?) } else { None };
+            let ending = name.strip_prefix(base_name(&ticket.part, ticket.job()).as_str());
+            let Some(standing) = ENDINGS.iter().find(|(_, e)| Some(*e) == ending).map(|(s, _)| *s) else {
+                let expected = "a folder with the name that was given to it, or with the ending .held, .stopped, .aborted or .done";
+                let found = name.to_owned();
+                return Err(FormatError::Unexpected {
+                    path,
+                    place: "name".to_owned(),
+                    expected: expected.to_owned(),
+                    found,
+                }
+                .into());
+            };
+            found.push(Lying { path, ticket, standing, taken });
+        }
+        found.sort_by_key(|lying| lying.ticket.start_number);
+        Ok(found)
+    }
+
+    /// Returns the hand-over of a job and cycle.
+    pub(super) fn find(&self, job: Job) -> Result<Option<Lying>, ExchangeError> {
+        Ok(self.list()?.into_iter().find(|l| (l.ticket.job, l.ticket.cycle) == (job.job, job.cycle)))
+    }
+
+    /// Puts a hand-over into the folder: its ticket, and files by name.
+    pub(super) fn publish(&self, ticket: &Ticket, files: &[(&str, Vec<u8>)]) -> Result<(), ExchangeError> {
+        static COUNT: AtomicU64 = AtomicU64::new(0);
+        if let Some(before) = self.find(ticket.job())? {
+            return Err(ExchangeError::HandedOver { job: ticket.job, cycle: ticket.cycle, folder: before.path });
+        }
+        let target = self.folder.join(base_name(&ticket.part, ticket.job()));
+        let hidden = format!(".draft-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let draft = DraftFolder::create(self.folder.join(hidden))?;
+        for (name, bytes) in files {
+            write_atomic(&draft.0.join(name), bytes)?;
+        }
+        write_json_atomic(draft.0.join(TICKET), ticket)?;
+        rename(&draft.0, &target)?;
+        Ok(())
+    }
+
+    /// Gives a hand-over the name that tells where it stands.
+    pub(super) fn mark(&self, job: Job, standing: Standing) -> Result<(), ExchangeError> {
+        let Some(lying) = self.find(job)? else { return Err(ExchangeError::Missing { folder: self.folder.clone() }) };
+        let ending = ENDINGS.iter().find(|(s, _)| *s == standing).map_or("", |(_, e)| *e);
+        let target = self.folder.join(base_name(&lying.ticket.part, lying.ticket.job()) + ending);
+        if target != lying.path { Ok(rename(&lying.path, &target)?) } else { Ok(()) }
+    }
+
+    /// Writes down what was accepted as an answer.
+    pub(super) fn note_taken(&self, lying: &Lying, taken: &Taken) -> Result<(), ExchangeError> {
+        if lying.taken.as_ref() == Some(taken) {
+            return Ok(());
+        }
+        Ok(write_json_atomic(lying.path.join(TAKEN), taken)?)
+    }
+
+    /// Tries whether the folder can be written to.
+    pub(super) fn try_writing(folder: &Path) -> Result<(), ExchangeError> {
+        drop(Draft::create(&folder.join("probe"))?);
+        Ok(())
+    }
+}
+
+/// What the driver wants to know of a hand-over.
+pub(super) fn hand_over(lying: &Lying) -> HandOver {
+    HandOver { job: lying.ticket.job(), sequence: lying.ticket.start_number, standing: lying.standing }
+}
+
+/// Says an error of this room in the driver's words.
+pub(super) fn told(error: ExchangeError) -> MailboxError {
+    match error {
+        ExchangeError::HandedOver { job, cycle, .. } => MailboxError::HandedOver { job, cycle },
+        other => MailboxError::Files { why: other.to_string() },
+    }
+}
+
+fn base_name(part: &str, job: Job) -> String {
+    format!("{}_j{}_c{}", file_word(part), job.job, job.cycle)
+}
+
+/// A folder that goes away unless it is renamed.
+struct DraftFolder(PathBuf);
+
+impl DraftFolder {
+    fn create(path: PathBuf) -> Result<Self, FormatError> {
+        let failed = |source| FormatError::Unwritable { path: path.clone(), action: "creating the folder", source };
+        fs::create_dir(&path).map_err(failed)?;
+        Ok(Self(path))
+    }
+}
+
+impl Drop for DraftFolder {
+    fn drop(&mut self) {
+        // Gone already if it was renamed; else the error that brought us here is the one to report.
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+fn rename(from: &Path, to: &Path) -> Result<(), FormatError> {
+    let failed = |action| move |source| FormatError::Unwritable { path: to.to_owned(), action, source };
+    if to.exists() {
+        return Err(failed("giving it its name")(io::Error::from(io::ErrorKind::AlreadyExists)));
+    }
+    fs::rename(from, to).map_err(failed("giving it its name"))?;
+    sync_folder(to).map_err(failed("bringing it to the disk"))
+}
+
+/// Writes a file whole or not at all.
+pub(super) fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), FormatError> {
+    let mut draft = Draft::create(path)?;
+    draft.write(bytes)?;
+    draft.publish()
+}
+
+/// Reads a small JSON file.
+pub(super) fn read_json<T: for<'de> Deserialize<'de>>(path: &Path) -> Result<T, FormatError> {
+    let bytes = whole::open(path)?.read_all(path, MOST_BYTES)?;
+    serde_json::from_slice(&bytes).map_err(|error| FormatError::Unexpected {
+        path: path.to_owned(),
+        place: format!("line {}", error.line()),
+        expected: "JSON as it was handed over".to_owned(),
+        found: error.to_string(),
+    })
+}
+
+/// Returns bytes as hexadecimal digits.
+pub(super) fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|b| format!("{b:02x}")).collect()
+}
+
+/// Returns the identity that 64 hexadecimal digits spell; what is no digit counts 0, and then it is nobody's identity.
+pub(super) fn unhex(digits: &str) -> [u8; 32] {
+    let mut identity = [0; 32];
+    for (byte, pair) in identity.iter_mut().zip(digits.as_bytes().chunks_exact(2)) {
+        *byte = std::str::from_utf8(pair).ok().and_then(|d| u8::from_str_radix(d, 16).ok()).unwrap_or_default();
+    }
+    identity
+}

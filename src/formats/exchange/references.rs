@@ -1,0 +1,242 @@
+//! Files of reference points: YAML as tracker software keeps them, or any point file, with or without names.
+//!
+//! YAML is read by its events, so that no alias unfolds and no depth of nesting is followed: wanted is one group, a list of points or
+//! a mapping from names to points, where a point is three numbers or a list that begins with them.
+
+use std::path::{Path, PathBuf};
+
+use saphyr_parser::{Event, Parser};
+
+use super::super::number::{Decimal, coordinate};
+use super::super::whole;
+use super::ExchangeError;
+use super::result::{Content, parse_result};
+use crate::geometry::Point;
+
+/// Largest file of reference points.
+const MOST_BYTES: u64 = 1 << 20;
+/// Deepest nesting that is followed.
+const DEEPEST: usize = 32;
+
+/// A reference point.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Reference {
+    /// Its name, if the file gives it one.
+    pub name: Option<String>,
+    /// Where it is, in millimetres.
+    pub at: Point,
+}
+
+/// The reference points of one file.
+#[derive(Clone, Debug, PartialEq)]
+pub struct References {
+    /// The file.
+    pub path: PathBuf,
+    /// The points, in the order of the file.
+    pub points: Vec<Reference>,
+}
+
+impl References {
+    /// The name of a point, or its number where it has none.
+    pub fn name(&self, index: usize) -> String {
+        self.points.get(index).and_then(|p| p.name.clone()).unwrap_or_else(|| format!("number {}", index + 1))
+    }
+}
+
+/// Reads reference points from YAML (`.yaml`, `.yml`) or from any point file.
+///
+/// `group` names the list in a YAML file that holds several; without it the file must hold one.
+///
+/// # Errors
+/// A file that cannot be read, a group that is not there, anything but finite numbers of millimetres where a point should be.
+pub fn read_references(path: &Path, group: Option<&str>) -> Result<References, ExchangeError> {
+    let bytes = whole::open(path)?.read_all(path, MOST_BYTES)?;
+    parse_references(path, &bytes, group)
+}
+
+/// Reads reference points from the bytes of a file; `path` tells the kind, and is what messages call it.
+///
+/// # Errors
+/// Those of [`read_references`].
+pub fn parse_references(path: &Path, bytes: &[u8], group: Option<&str>) -> Result<References, ExchangeError> {
+    let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
+    let points = if ["yaml", "yml"].contains(&extension.as_str()) {
+        from_yaml(path, bytes, group)?
+    } else {
+        let file = parse_result(path, bytes, &Content::default())?;
+        let names = file.names.unwrap_or_default();
+        let named = |(k, at)| Reference { name: names.get(k).cloned(), at };
+        file.points.into_iter().enumerate().map(named).collect()
+    };
+    if let Some(twice) =
+        (1..points.len()).find(|&k| points[k].name.is_some() && points[..k].iter().any(|p| p.name == points[k].name))
+    {
+        let found = format!("`{}` a second time", points[twice].name.as_deref().unwrap_or_default());
+        return Err(reference(path, twice + 1, "every name once", found));
+    }
+    Ok(References { path: path.to_owned(), points })
+}
+
+fn reference(path: &Path, line: usize, expected: &'static str, found: impl Into<String>) -> ExchangeError {
+    ExchangeError::Reference { path: path.to_owned(), line, expected, found: found.into() }
+}
+
+/// A piece of a YAML file.
+#[derive(Debug)]
+struct Node {
+    line: usize,
+    content: Tree,
+}
+
+#[derive(Debug)]
+enum Tree {
+    Scalar(String),
+    List(Vec<Node>),
+    /// Key and value in turn.
+    Mapping(Vec<Node>),
+}
+
+fn from_yaml(path: &Path, bytes: &[u8], group: Option<&str>) -> Result<Vec<Reference>, ExchangeError> {
+    let text = std::str::from_utf8(bytes)
+        .map_err(|error| reference(path, 1, "UTF-8 text", format!("another code at byte {}", error.valid_up_to())))?;
+    let root = tree(path, text)?;
+    let list = group_of(path, &root, group)?;
+    let point = |node: &Node, name: Option<&Node>| -> Result<Reference, ExchangeError> {
+        let name = name.and_then(|n| if let Tree::Scalar(text) = &n.content { Some(text.clone()) } else { None });
+        Ok(Reference { name, at: position(path, node)? })
+    };
+    match &list.content {
+        Tree::List(nodes) => nodes.iter().map(|node| point(node, None)).collect(),
+        Tree::Mapping(pairs) => pairs.chunks_exact(2).map(|pair| point(&pair[1], Some(&pair[0]))).collect(),
+        Tree::Scalar(text) => Err(reference(path, list.line, "a list of points", format!("`{text}`"))),
+    }
+}
+
+/// Finds the group of points: the one of that name, the only one, or the whole file.
+fn group_of<'n>(path: &Path, root: &'n Node, group: Option<&str>) -> Result<&'n Node, ExchangeError> {
+    let Tree::Mapping(pairs) = &root.content else { return Ok(root) };
+    let named: Vec<(&str, &Node)> = pairs
+        .chunks_exact(2)
+        .filter_map(|pair| match (&pair[0].content, &pair[1].content) {
+            (Tree::Scalar(_), Tree::Scalar(_)) => None,
+            (Tree::Scalar(key), _) => Some((key.as_str(), &pair[1])),
+            _ => None,
+        })
+        .collect();
+    let fits: Vec<&(&str, &Node)> = named.iter().filter(|(key, _)| group.is_none_or(|wanted| wanted == *key)).collect();
+    match fits[..] {
+        [(_, node)] => Ok(node),
+        _ => Err(ExchangeError::Group {
+            path: path.to_owned(),
+            wanted: group.unwrap_or("any").to_owned(),
+            there: named.iter().map(|(key, _)| *key).collect::<Vec<_>>().join(", "),
+        }),
+    }
+}
+
+/// Returns the position that a node holds: three numbers, or a list that begins with them.
+fn position(path: &Path, node: &Node) -> Result<Point, ExchangeError> {
+    let mut inner = node;
+    while let Tree::List(nodes) = &inner.content
+        && let [first, ..] = &nodes[..]
+        && matches!(first.content, Tree::List(_))
+    {
+        inner = first;
+    }
+    let wrong = |found: String| reference(path, inner.line, "three finite numbers in mm", found);
+    let Tree::List(nodes) = &inner.content else { return Err(wrong("something else".to_owned())) };
+    let [x, y, z] = &nodes[..] else { return Err(wrong(format!("{} entries", nodes.len()))) };
+    let number = |node: &Node| match &node.content {
+        Tree::Scalar(text) => coordinate(text.as_bytes(), Decimal::Point).map_err(|_| wrong(format!("`{text}`"))),
+        _ => Err(wrong("a list".to_owned())),
+    };
+    Ok(Point::new(number(x)?, number(y)?, number(z)?))
+}
+
+/// Builds the tree of a YAML file; the first document counts.
+fn tree(path: &Path, text: &str) -> Result<Node, ExchangeError> {
+    let mut open: Vec<Node> = Vec::new();
+    for event in Parser::new_from_str(text) {
+        let (event, span) = event.map_err(|e| reference(path, e.marker().line(), "YAML", e.info().to_owned()))?;
+        let line = span.start.line();
+        let closed = match event {
+            Event::SequenceStart(..) | Event::MappingStart(..) if open.len() == DEEPEST => {
+                return Err(reference(path, line, "a list of points", "lists nested too deep"));
+            }
+            Event::SequenceStart(..) => {
+                open.push(Node { line, content: Tree::List(Vec::new()) });
+                continue;
+            }
+            Event::MappingStart(..) => {
+                open.push(Node { line, content: Tree::Mapping(Vec::new()) });
+                continue;
+            }
+            Event::Scalar(text, ..) => Node { line, content: Tree::Scalar(text.into_owned()) },
+            Event::SequenceEnd | Event::MappingEnd => match open.pop() {
+                Some(node) => node,
+                None => continue,
+            },
+            Event::Alias(_) => return Err(reference(path, line, "numbers", "an alias")),
+            _ => continue,
+        };
+        match open.last_mut().map(|node| &mut node.content) {
+            Some(Tree::List(nodes) | Tree::Mapping(nodes)) => nodes.push(closed),
+            _ => return Ok(closed),
+        }
+    }
+    Err(reference(path, 1, "a list of points", "nothing"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn yaml(text: &str, group: Option<&str>) -> Result<Vec<Reference>, ExchangeError> {
+        parse_references(Path::new("ref.yaml"), text.as_bytes(), group).map(|r| r.points)
+    }
+
+    #[test]
+    fn nested_lists_and_names_are_understood() {
+        let bare =
+            yaml("primary:\n- - 2401.1\n  - -2698.6\n  - 4819.4\n- - -2397.5\n  - 1\n  - 2e3\n", Some("primary"))
+                .unwrap();
+        assert_eq!(bare.len(), 2);
+        assert_eq!((bare[1].name.as_ref(), bare[1].at), (None, Point::new(-2397.5, 1.0, 2000.0)));
+        let text = "coords: opt_global\nprimary:\n  a: [[2400.94, -2698.56, 4819.33], [['CODE14', [ 1, 2, 3]]]] # lower\n  b: [1, 2, 3]\n\
+                    bearing:\n  # - [[1, 2, 3]]\n  c: [[4, 5, 6]]\n";
+        let named = yaml(text, Some("primary")).unwrap();
+        assert_eq!(named[0], Reference { name: Some("a".into()), at: Point::new(2400.94, -2698.56, 4819.33) });
+        assert_eq!(named[1].name.as_deref(), Some("b"));
+        let message = yaml(text, None).unwrap_err().to_string();
+        assert!(message.contains("there are primary, bearing"), "{message}");
+        assert_eq!(yaml("[[1,2,3],[4,5,6]]", None).unwrap().len(), 2);
+    }
+
+    #[test]
+    fn what_is_no_point_is_refused_with_its_line() {
+        for (text, expected) in [
+            ("p:\n- [1, 2]\n", "line 2: expected three finite numbers in mm, found 2 entries"),
+            ("p:\n- [1, 2, 3]\n- [1, .nan, 3]\n", "line 3: expected three finite numbers in mm, found `.nan`"),
+            ("p:\n- [1, 2, x]\n", "found `x`"),
+            ("p: &a [1, 2, 3]\nq: [*a, *a]\n", "found an alias"),
+            ("p: [1, 2\n", "expected YAML"),
+            ("", "found nothing"),
+            ("p: {a: [1, 2, 3], a: [1, 2, 3]}", "a second time"),
+        ] {
+            let message = yaml(text, None).unwrap_err().to_string();
+            assert!(message.contains(expected), "{text:?}: {message}");
+        }
+        let deep = "[".repeat(5000);
+        assert!(yaml(&deep, None).is_err());
+        let deep: String = (0..5000).map(|k| format!("{}-\n", " ".repeat(k % 200))).collect();
+        assert!(yaml(&deep, None).is_err());
+    }
+
+    #[test]
+    fn point_files_give_names_by_a_column() {
+        let file = parse_references(Path::new("r.csv"), b"name,x,y,z\nleft,1,2,3\nright,4,5,6\n", None).unwrap();
+        assert_eq!(file.name(1), "right");
+        let file = parse_references(Path::new("r.txt"), b"1 2 3\n4 5 6\n", None).unwrap();
+        assert_eq!((file.name(1), file.points.len()), ("number 2".to_owned(), 2));
+    }
+}

@@ -1,0 +1,487 @@
+//! The result file of a measurement: points, and what the file says of itself.
+//!
+//! Any point file that the library reads will do. What it may say besides, in comments above the points:
+//!
+//! ```text
+//! # part: SN-0042          # cycle: 2              # plan: 5f3c... (the identity from plan.json)
+//! # coordinates: centres   # units: mm             # probe radius mm: 1.5     # temperature c: 20.1
+//! ```
+//!
+//! and in columns with a header: `index` (the number of the plan's target), `enabled` (rows that say unchecked are left out, as laser
+//! trackers export them), `probe` (the *diameter* of a tracker's reflector in mm) or `probe_radius_mm`, and `name` or `feature`.
+
+use std::borrow::Cow;
+use std::path::Path;
+
+use super::super::error::excerpt;
+use super::super::layout::{Fields, Preamble, is_comment};
+use super::super::number::{Decimal, coordinate};
+use super::super::points::parse_points_with;
+use super::super::{FormatError, ply, whole};
+use super::ExchangeError;
+use crate::geometry::Point;
+
+/// Largest result file that is read.
+const MOST_BYTES: u64 = 512 << 20;
+/// Bytes at the beginning of a file in which it may say something of itself.
+const PREAMBLE_BYTES: usize = 64 << 10;
+/// Millimetres per inch.
+const INCH_MM: f64 = 25.4;
+
+/// What measured coordinates are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Coordinates {
+    /// Centres of the probe.
+    Centres,
+    /// Points of contact.
+    Contacts,
+}
+
+impl Coordinates {
+    fn words(self) -> &'static str {
+        match self {
+            Self::Centres => "centres",
+            Self::Contacts => "contacts",
+        }
+    }
+}
+
+/// The decimal mark of a file.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum DecimalMark {
+    /// Told from the file; a file that does not tell it is refused.
+    #[default]
+    Auto,
+    /// A point.
+    Point,
+    /// A comma.
+    Comma,
+}
+
+/// What the cell knows of its result files.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Content {
+    /// What the coordinates are, where the cell says so.
+    pub coordinates: Option<Coordinates>,
+    /// The decimal mark.
+    pub decimal: DecimalMark,
+    /// Millimetres per unit of length of the files: 1, or 25.4 for a machine that is known to write inches.
+    pub unit_mm: f64,
+}
+
+impl Default for Content {
+    fn default() -> Self {
+        Self { coordinates: None, decimal: DecimalMark::Auto, unit_mm: 1.0 }
+    }
+}
+
+/// What a file says of itself.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Statements {
+    /// The part it belongs to.
+    pub part: Option<String>,
+    /// The cycle it belongs to.
+    pub cycle: Option<u16>,
+    /// The identity of the plan, 64 hexadecimal digits in lower case.
+    pub plan: Option<String>,
+    /// What the coordinates are.
+    pub coordinates: Option<Coordinates>,
+    /// Millimetres per unit of length.
+    pub unit_mm: Option<f64>,
+    /// Radius of the probe.
+    pub probe_radius_mm: Option<f64>,
+    /// Temperature of the part.
+    pub temperature_c: Option<f64>,
+}
+
+/// A result file as it was read.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ResultFile {
+    /// The points in millimetres, in the order of the file, rows that are switched off left out.
+    pub points: Vec<Point>,
+    /// For each point the number of its target, if the file has a column `index`.
+    pub indices: Option<Vec<u32>>,
+    /// For each point its name, if the file has a column `name`, `point` or `feature`.
+    pub names: Option<Vec<String>>,
+    /// What the coordinates are, by the file or else by the cell.
+    pub coordinates: Option<Coordinates>,
+    /// Radius of the probe, by a statement or a column.
+    pub probe_radius_mm: Option<f64>,
+    /// Rows that were left out because they are switched off.
+    pub switched_off: usize,
+    /// What the file says of itself.
+    pub statements: Statements,
+}
+
+/// Returns whether the last line of a text has its end; a file that was cut short in its last number has not.
+pub fn is_ended(text: &[u8]) -> bool {
+    ply::is_ply(text) || text.ends_with(b"\n")
+}
+
+/// Reads the bytes of a result file.
+///
+/// # Errors
+/// A file that cannot be read or is too large.
+pub fn read_bytes(path: &Path) -> Result<Vec<u8>, FormatError> {
+    whole::open(path)?.read_all(path, MOST_BYTES)
+}
+
+/// Reads what a file says of itself, without its points.
+///
+/// # Errors
+/// A statement that says something impossible.
+pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, ExchangeError> {
+    let head = &text[..text.len().min(PREAMBLE_BYTES)];
+    let head = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(head);
+    let is_ply = ply::is_ply(head);
+    let mut found = Statements::default();
+    for (line, number) in head.split(|&b| b == b'\n').zip(1..) {
+        let line = String::from_utf8_lossy(line.trim_ascii()).into_owned();
+        let comment = match (is_ply, line.strip_prefix("comment ")) {
+            (true, Some(comment)) => comment,
+            (true, None) if line == "end_header" => break,
+            (false, _) if is_comment(line.as_bytes()) => line.trim_start_matches(['#', '/']),
+            // Statements stand above the points; a header may stand between.
+            (false, _) if line.starts_with(|c: char| c.is_ascii_digit() || "+-.".contains(c)) => break,
+            _ => continue,
+        };
+        if let Some((key, value)) = comment.split_once([':', '=']) {
+            found.take(path, number, key, value.trim())?;
+        }
+    }
+    Ok(found)
+}
+
+impl Statements {
+    /// Takes one statement; what is none of ours is only a comment.
+    fn take(&mut self, path: &Path, line: u64, key: &str, value: &str) -> Result<(), ExchangeError> {
+        let wrong = |key, expected| ExchangeError::Statement {
+            path: path.to_owned(),
+            line,
+            key,
+            found: excerpt(value.as_bytes()),
+            expected,
+        };
+        let number = |key, range: std::ops::RangeInclusive<f64>, expected| {
+            let number = value.parse::<f64>().ok().filter(|v| range.contains(v));
+            number.map(Some).ok_or_else(|| wrong(key, expected))
+        };
+        let key = key.trim().to_lowercase().replace(['_', '-'], " ");
+        match key.as_str() {
+            "part" | "serial" | "part serial" => self.part = Some(value.to_owned()).filter(|v| !v.is_empty()),
+            "cycle" => {
+                self.cycle = Some(value.parse().map_err(|_| wrong("cycle", "a whole number from 0 to 65535"))?);
+            }
+            "plan" | "plan identity" => {
+                let is_hash = value.len() == 64 && value.bytes().all(|b| b.is_ascii_hexdigit());
+                let hash = is_hash.then(|| value.to_lowercase());
+                self.plan = Some(hash.ok_or_else(|| wrong("plan", "the 64 hexadecimal digits from plan.json"))?);
+            }
+            "coordinates" | "points are" => {
+                let kind = value.to_lowercase();
+                let (centres, contacts) = (kind.contains("cent"), kind.contains("contact"));
+                self.coordinates = match (centres, contacts) {
+                    (true, false) => Some(Coordinates::Centres),
+                    (false, true) => Some(Coordinates::Contacts),
+                    _ => return Err(wrong("coordinates", "`centres` or `contacts`")),
+                };
+            }
+            "unit" | "units" => {
+                self.unit_mm = match value.to_lowercase().trim_end_matches('.') {
+                    "mm" | "millimetre" | "millimetres" | "millimeter" | "millimeters" => Some(1.0),
+                    "in" | "inch" | "inches" => Some(INCH_MM),
+                    _ => return Err(wrong("units", "`mm`, or `inch` where the cell file says so too")),
+                };
+            }
+            "probe radius mm" => {
+                self.probe_radius_mm = number("probe radius mm", 1e-3..=1e3, "a radius from 0.001 to 1000 mm")?;
+            }
+            "temperature c" => {
+                self.temperature_c = number("temperature c", -40.0..=120.0, "degrees Celsius from -40 to 120")?;
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+}
+
+/// Reads the text of a result file; `path` is what messages call it.
+///
+/// # Errors
+/// Those of [`super::super::read_points`]; statements and columns that contradict the cell or each other.
+pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<ResultFile, ExchangeError> {
+    let statements = read_statements(path, text)?;
+    let coordinates = agreed_coordinates(path, &statements, content)?;
+    let unit_mm = agreed_unit(path, &statements, content)?;
+    let is_ply = ply::is_ply(text);
+    let decimal = match content.decimal {
+        DecimalMark::Auto => None,
+        DecimalMark::Point => Some(Decimal::Point),
+        DecimalMark::Comma => Some(Decimal::Comma),
+    };
+    let text = without_unit(text, unit_mm);
+    let mut points =
+        if is_ply { ply::parse_ply(path, &text)?.points } else { parse_points_with(path, &text, decimal)? };
+    let columns = if is_ply { Columns::default() } else { Columns::read(path, &text, points.len())? };
+    if unit_mm != 1.0 {
+        points.iter_mut().for_each(|p| *p *= unit_mm);
+    }
+    let on = |k: usize| columns.enabled.get(k).copied().unwrap_or(true);
+    let kept: Vec<usize> = (0..points.len()).filter(|&k| on(k)).collect();
+    let switched_off = points.len() - kept.len();
+    if kept.is_empty() {
+        return Err(FormatError::NoData { path: path.to_owned(), expected: "points that are switched on" }.into());
+    }
+    Ok(ResultFile {
+        indices: columns.indices.map(|all| kept.iter().map(|&k| all[k]).collect()),
+        names: columns.names.map(|all| kept.iter().map(|&k| all[k].clone()).collect()),
+        points: kept.iter().map(|&k| points[k]).collect(),
+        coordinates,
+        probe_radius_mm: agreed_radius(path, statements.probe_radius_mm, columns.probe_radius_mm)?,
+        switched_off,
+        statements,
+    })
+}
+
+/// Returns a text without its statement of the unit where that is not mm and the cell has agreed to it: the reader of points refuses
+/// any other. Lines keep their numbers.
+fn without_unit(text: &[u8], unit_mm: f64) -> Cow<'_, [u8]> {
+    if unit_mm == 1.0 {
+        return Cow::Borrowed(text);
+    }
+    let states_unit = |line: &[u8]| is_comment(line) && line.to_ascii_lowercase().windows(4).any(|w| w == b"unit");
+    let kept = text.split(|&b| b == b'\n').map(|line| if states_unit(line) { &line[..0] } else { line });
+    Cow::Owned(kept.collect::<Vec<_>>().join(&b'\n'))
+}
+
+fn agreed_coordinates(path: &Path, says: &Statements, cell: &Content) -> Result<Option<Coordinates>, ExchangeError> {
+    match (says.coordinates, cell.coordinates) {
+        (Some(found), Some(expected)) if found != expected => Err(ExchangeError::Contradiction {
+            path: path.to_owned(),
+            key: "coordinates",
+            found: found.words().to_owned(),
+            by: "cell file",
+            expected: expected.words().to_owned(),
+        }),
+        (found, expected) => Ok(found.or(expected)),
+    }
+}
+
+fn agreed_unit(path: &Path, says: &Statements, cell: &Content) -> Result<f64, ExchangeError> {
+    match says.unit_mm {
+        Some(found) if found != cell.unit_mm => Err(ExchangeError::Contradiction {
+            path: path.to_owned(),
+            key: "the unit",
+            found: format!("{found} mm"),
+            by: "cell file",
+            expected: format!("{} mm", cell.unit_mm),
+        }),
+        _ => Ok(cell.unit_mm),
+    }
+}
+
+fn agreed_radius(path: &Path, stated: Option<f64>, column: Option<f64>) -> Result<Option<f64>, ExchangeError> {
+    match (stated, column) {
+        (Some(stated), Some(column)) if (stated - column).abs() > 1e-6 => Err(ExchangeError::Contradiction {
+            path: path.to_owned(),
+            key: "the probe radius",
+            found: format!("{stated} mm"),
+            by: "column of the same file",
+            expected: format!("{column} mm"),
+        }),
+        (stated, column) => Ok(stated.or(column)),
+    }
+}
+
+/// What stands beside the coordinates.
+#[derive(Default)]
+struct Columns {
+    indices: Option<Vec<u32>>,
+    names: Option<Vec<String>>,
+    /// Empty if nothing is switched off.
+    enabled: Vec<bool>,
+    probe_radius_mm: Option<f64>,
+}
+
+impl Columns {
+    /// Goes through the lines again for the columns that the header names; the points have been read from the same lines.
+    fn read(path: &Path, text: &[u8], points: usize) -> Result<Self, ExchangeError> {
+        let text = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(text);
+        let mut preamble = Preamble::new(path);
+        let mut lines = text.split(|&b| b == b'\n').map(|l| l.strip_suffix(b"\r").unwrap_or(l)).zip(1..);
+        let layout = loop {
+            let Some((line, number)) = lines.next() else { return Ok(Self::default()) };
+            if let Some(layout) = preamble.take(line, number)? {
+                break layout;
+            }
+        };
+        let names = preamble.names(layout.separator);
+        let column = |wanted: &[&str]| names.iter().position(|n| wanted.contains(&n.trim()));
+        let index = column(&["index", "target"]);
+        let name = column(&["name", "point", "feature"]);
+        let enabled = column(&["enabled"]);
+        let radius = column(&["probe_radius_mm", "probe radius [mm]"]);
+        let diameter = column(&["probe"]);
+        if [index, name, enabled, radius, diameter].iter().all(Option::is_none) {
+            return Ok(Self::default());
+        }
+        let mut found = Self {
+            indices: index.map(|_| Vec::with_capacity(points)),
+            names: name.map(|_| Vec::with_capacity(points)),
+            ..Self::default()
+        };
+        let mut probe: Option<Vec<u8>> = None;
+        for (line, number) in text.split(|&b| b == b'\n').zip(1..).skip(layout.first_line as usize - 1) {
+            let line = line.strip_suffix(b"\r").unwrap_or(line);
+            if line.trim_ascii().is_empty() || is_comment(line) {
+                continue;
+            }
+            let field = |column: usize| Fields::of(line, layout.separator).nth(column).unwrap_or_default();
+            found.enabled.push(enabled.is_none_or(|c| is_on(field(c))));
+            if let (Some(column), Some(indices)) = (index, &mut found.indices) {
+                indices.push(whole_number(path, number, field(column))?);
+            }
+            if let (Some(column), Some(names)) = (name, &mut found.names) {
+                names.push(String::from_utf8_lossy(field(column)).into_owned());
+            }
+            if let Some(column) = radius.or(diameter) {
+                same_probe(path, number, field(column), &mut probe)?;
+            }
+        }
+        if let Some(text) = probe {
+            let size = coordinate(&layout.separator.ungrouped(&text), layout.decimal)
+                .ok()
+                .or_else(|| coordinate(&text, Decimal::Point).ok())
+                .filter(|v| *v > 0.0)
+                .ok_or_else(|| ExchangeError::Statement {
+                    path: path.to_owned(),
+                    line: layout.first_line,
+                    key: "probe",
+                    found: excerpt(&text),
+                    expected: "a size in millimetres",
+                })?;
+            found.probe_radius_mm = Some(if radius.is_some() { size } else { 0.5 * size });
+        }
+        Ok(found)
+    }
+}
+
+fn is_on(field: &[u8]) -> bool {
+    !["unchecked", "false", "no", "0", "off", "disabled"].iter().any(|off| field.eq_ignore_ascii_case(off.as_bytes()))
+}
+
+fn whole_number(path: &Path, line: u64, field: &[u8]) -> Result<u32, ExchangeError> {
+    std::str::from_utf8(field).ok().and_then(|text| text.parse().ok()).ok_or_else(|| ExchangeError::Index {
+        path: path.to_owned(),
+        line,
+        found: excerpt(field),
+        why: "is not a whole number",
+    })
+}
+
+/// Remembers the first probe of a file and refuses another one.
+fn same_probe(path: &Path, line: u64, field: &[u8], first: &mut Option<Vec<u8>>) -> Result<(), ExchangeError> {
+    match first {
+        Some(first) if first != field => Err(ExchangeError::ProbeVaries {
+            path: path.to_owned(),
+            line,
+            found: excerpt(field),
+            first: excerpt(first),
+        }),
+        Some(_) => Ok(()),
+        None => {
+            *first = Some(field.to_owned());
+            Ok(())
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(text: &str, content: &Content) -> Result<ResultFile, ExchangeError> {
+        parse_result(Path::new("r.csv"), text.as_bytes(), content)
+    }
+
+    #[test]
+    fn a_tracker_export_is_read_as_it_is() {
+        let text = "Enabled\tFeature\tID\tx         \ty          \tz         \ti\tj\tk\tDev From Fit\tDevice Position  \tProbe\tDevice Name\r\n\
+             Checked\tM1_1   \t1  \t2,512.1218\t2,217.6752 \t2,370.7970\t \t \t \t21.4291     \tDevice Position 1\t38.1 \tV2\r\n\
+             Unchecked\tM1_1   \t2  \t2,512.3458\t2,217.6435 \t2,370.7684\t \t \t \t21.4669     \tDevice Position 1\t38.1 \tV2\r\n\
+             Checked\tM1_1   \t3  \t-182.1032 \t-2,527.9733\t4,785.0571\t \t \t \t-4.9837     \tDevice Position 1\t38.1 \tV2\r\n";
+        let found = parse(text, &Content::default()).unwrap();
+        assert_eq!(
+            found.points,
+            [Point::new(2512.1218, 2217.6752, 2370.797), Point::new(-182.1032, -2527.9733, 4785.0571)]
+        );
+        assert_eq!((found.switched_off, found.probe_radius_mm, found.coordinates), (1, Some(19.05), None));
+        assert_eq!(found.names.unwrap(), ["M1_1", "M1_1"]);
+        let two = text.replacen("38.1 ", "12.7 ", 1);
+        assert!(matches!(parse(&two, &Content::default()), Err(ExchangeError::ProbeVaries { line: 3, .. })));
+    }
+
+    #[test]
+    fn what_a_file_says_of_itself_is_read_and_held_against_the_cell() {
+        let text = "# Part: SN 7\n# cycle = 2\n# coordinates: probe centres\n# Probe_radius_mm: 1.5\n# temperature c: 20.5\n\
+                    index,x,y,z\n4,1,2,3\n9,4,5,6\n";
+        let found = parse(text, &Content::default()).unwrap();
+        let says = &found.statements;
+        assert_eq!((says.part.as_deref(), says.cycle, says.temperature_c), (Some("SN 7"), Some(2), Some(20.5)));
+        assert_eq!((found.coordinates, found.probe_radius_mm), (Some(Coordinates::Centres), Some(1.5)));
+        assert_eq!(found.indices.unwrap(), [4, 9]);
+        let contacts = Content { coordinates: Some(Coordinates::Contacts), ..Content::default() };
+        let message = parse(text, &contacts).unwrap_err().to_string();
+        assert!(message.contains("coordinates is centres, the cell file says contacts"), "{message}");
+        for (line, expected) in [
+            ("# cycle: two", "line 1: `cycle` says `two`"),
+            ("# coordinates: centres of contact", "`coordinates` says"),
+            ("# probe radius mm: NaN", "`probe radius mm` says `NaN`"),
+            ("# plan: abc", "64 hexadecimal digits"),
+            ("# units: furlong", "`units` says `furlong`"),
+        ] {
+            let message = parse(&format!("{line}\n1,2,3\n"), &Content::default()).unwrap_err().to_string();
+            assert!(message.contains(expected), "{message}");
+        }
+        assert!(matches!(
+            parse("index,x,y,z\n1.5,1,2,3\n", &Content::default()),
+            Err(ExchangeError::Index { line: 2, .. })
+        ));
+    }
+
+    #[test]
+    fn inches_are_converted_only_where_the_cell_says_so() {
+        let text = "# units: inch\n1,2,4\n";
+        assert!(matches!(parse(text, &Content::default()), Err(ExchangeError::Contradiction { key: "the unit", .. })));
+        let inch = Content { unit_mm: INCH_MM, ..Content::default() };
+        assert_eq!(parse(text, &inch).unwrap().points, [Point::new(25.4, 50.8, 101.6)]);
+        assert_eq!(parse("1,2,4\n", &inch).unwrap().points, [Point::new(25.4, 50.8, 101.6)]);
+        assert!(matches!(parse("# units: mm\n1,2,3\n", &inch), Err(ExchangeError::Contradiction { .. })));
+        assert!(parse("x_inch,y_inch,z_inch\n1,2,3\n", &Content::default()).is_err());
+    }
+
+    #[test]
+    fn numbers_of_every_country_are_read_once_for_the_whole_file() {
+        let read = |text: &str| parse(text, &Content::default()).map(|f| f.points);
+        let expected = [Point::new(1234.56, -2.5, 3.0), Point::new(7.25, 8.5, 1e6)];
+        for text in [
+            "1.234,56;-2,5;3\n7,25;8,5;1.000.000,0\n",
+            "1,234.56\t-2.5\t3\n7.25\t8.5\t1,000,000.0\n",
+            "1 234,56;-2,5;3\n7,25;8,5;1 000 000\n",
+            "1\u{a0}234,56\t-2,5\t3\n7,25\t8,5\t1\u{202f}000\u{202f}000,0\n",
+            "\"1,234.56\",\"-2.5\",3\n7.25,8.5,\"1,000,000.0\"\n",
+        ] {
+            assert_eq!(read(text).unwrap(), expected, "{text}");
+        }
+        let ambiguous = read("1,234;5,678;9,012\n").unwrap_err().to_string();
+        assert!(ambiguous.contains("line 1, column 1: `1,234` may have"), "{ambiguous}");
+        let stated = Content { decimal: DecimalMark::Comma, ..Content::default() };
+        assert_eq!(parse("1,234;5,678;9,012\n", &stated).unwrap().points, [Point::new(1.234, 5.678, 9.012)]);
+        assert!(parse("1.5;2.5;3.5\n", &stated).unwrap_err().to_string().contains("decimal comma"));
+    }
+
+    #[test]
+    fn a_last_line_without_an_end_is_not_the_end() {
+        assert!(is_ended(b"1,2,3\n") && !is_ended(b"1,2,3") && !is_ended(b""));
+    }
+}

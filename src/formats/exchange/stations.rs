@@ -1,0 +1,271 @@
+//! Several stations in one frame, each by the reference points that it sees.
+//!
+//! A station is laid on the nominal reference points by a rigid best fit. Every reference point's residual is reported; one that is
+//! off by more than a limit is named, and where two seem exchanged or one seems moved that is said, because that is what a person
+//! then has to look for.
+
+use super::ExchangeError;
+use super::references::{Reference, References};
+use crate::geometry::{Point, Pose, RigidFit, Vector, fit_rigid};
+
+/// With more nominal points than this no subsets are tried for a station that names none.
+const MOST_NOMINAL: usize = 12;
+
+/// Where a station stands.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PlacedStation {
+    /// What messages call it.
+    pub station: String,
+    /// Takes what the station sees to the frame of the nominal reference points.
+    pub cmm_from_station: Pose,
+    /// The reference points that took part, and what is left of each: nominal less seen.
+    pub residuals: Vec<(String, Vector)>,
+    /// Root mean square of the lengths of these.
+    pub rms_mm: f64,
+    /// Nominal points that the station does not see.
+    pub missing: Vec<String>,
+    /// Points of the station that are not nominal ones; they took no part.
+    pub extra: Vec<String>,
+}
+
+impl PlacedStation {
+    /// Returns what a person should know of this station: the fit, and what is missing.
+    pub fn words(&self) -> String {
+        let each: Vec<String> = self.residuals.iter().map(|(name, r)| format!("{name} {:.3}", r.norm())).collect();
+        let mut words = format!(
+            "station {}: reference points fit to {:.3} mm rms ({} mm)",
+            self.station,
+            self.rms_mm,
+            each.join(", ")
+        );
+        for (what, names) in [("does not see", &self.missing), ("left out, not nominal:", &self.extra)] {
+            if !names.is_empty() {
+                words += &format!("; {what} {}", names.join(", "));
+            }
+        }
+        words
+    }
+}
+
+/// Lays a station on the nominal reference points.
+///
+/// Points are matched by name if the station names at least one nominal point, else by their order; a station that sees fewer than
+/// there are and names none is matched in order by its distances, if these leave one way only.
+///
+/// # Errors
+/// Points that cannot be matched, that fix no pose, or of which one is off by more than `limit_mm`.
+pub fn place_station(
+    station: &str,
+    seen: &References,
+    nominal: &References,
+    limit_mm: f64,
+) -> Result<PlacedStation, ExchangeError> {
+    let matching = match_points(station, seen, nominal, limit_mm)?;
+    let (from, to) = matching.points(seen, nominal);
+    let fit = fit_rigid(&from, &to).map_err(|source| ExchangeError::Fit { station: station.to_owned(), source })?;
+    let names: Vec<String> = matching.pairs.iter().map(|&(_, n)| nominal.name(n)).collect();
+    let (worst, off_mm) = fit.worst();
+    if off_mm > limit_mm {
+        let (suspect, diagnosis) = diagnose(&from, &to, &names, limit_mm);
+        let point = suspect.unwrap_or(worst);
+        let off_mm = if suspect.is_some() { off_without(&from, &to, point).unwrap_or(off_mm) } else { off_mm };
+        let (station, point) = (station.to_owned(), names[point].clone());
+        return Err(ExchangeError::ReferenceOff { station, point, off_mm, limit_mm, diagnosis });
+    }
+    let unpaired =
+        |count: usize, paired: &dyn Fn(usize) -> bool| (0..count).filter(|&k| !paired(k)).collect::<Vec<_>>();
+    let missing = unpaired(nominal.points.len(), &|n| matching.pairs.iter().any(|p| p.1 == n));
+    let extra = unpaired(seen.points.len(), &|s| matching.pairs.iter().any(|p| p.0 == s));
+    Ok(PlacedStation {
+        station: station.to_owned(),
+        cmm_from_station: fit.pose,
+        residuals: names.into_iter().zip(fit.residuals_mm).collect(),
+        rms_mm: fit.rms_mm,
+        missing: missing.into_iter().map(|n| nominal.name(n)).collect(),
+        extra: extra.into_iter().map(|s| seen.name(s)).collect(),
+    })
+}
+
+/// Which seen point is which nominal one.
+struct Matching {
+    /// Indices into the seen and the nominal points.
+    pairs: Vec<(usize, usize)>,
+}
+
+impl Matching {
+    fn points(&self, seen: &References, nominal: &References) -> (Vec<Point>, Vec<Point>) {
+        self.pairs.iter().map(|&(s, n)| (seen.points[s].at, nominal.points[n].at)).unzip()
+    }
+}
+
+fn match_points(
+    station: &str,
+    seen: &References,
+    nominal: &References,
+    limit_mm: f64,
+) -> Result<Matching, ExchangeError> {
+    let place = |point: &Reference| nominal.points.iter().position(|n| n.name.is_some() && n.name == point.name);
+    let named: Vec<(usize, usize)> =
+        seen.points.iter().enumerate().filter_map(|(s, point)| Some((s, place(point)?))).collect();
+    if named.len() >= 3 {
+        return Ok(Matching { pairs: named });
+    }
+    if !named.is_empty() {
+        let missing = (0..nominal.points.len()).filter(|n| named.iter().all(|p| p.1 != *n)).map(|n| nominal.name(n));
+        let extra = (0..seen.points.len()).filter(|s| named.iter().all(|p| p.0 != *s)).map(|s| seen.name(s));
+        return Err(ExchangeError::ReferenceNames {
+            station: station.to_owned(),
+            missing: missing.collect::<Vec<_>>().join(", "),
+            extra: extra.collect::<Vec<_>>().join(", "),
+        });
+    }
+    let (have, want) = (seen.points.len(), nominal.points.len());
+    let refuse = |why| ExchangeError::ReferenceCount {
+        station: station.to_owned(),
+        seen: have,
+        nominal: want,
+        names: (0..want).map(|n| nominal.name(n)).collect::<Vec<_>>().join(", "),
+        why,
+    };
+    match have {
+        _ if have == want => Ok(Matching { pairs: (0..have).map(|k| (k, k)).collect() }),
+        _ if have > want => Err(refuse("it cannot be told which are extra")),
+        _ if have < 3 => Err(refuse("3 are needed")),
+        _ if want > MOST_NOMINAL => Err(refuse("it cannot be told which are missing")),
+        _ => match_subset(seen, nominal, limit_mm).map_err(refuse),
+    }
+}
+
+/// Finds the one subset of the nominal points, in order, that the seen ones fit.
+fn match_subset(seen: &References, nominal: &References, limit_mm: f64) -> Result<Matching, &'static str> {
+    let (have, want) = (seen.points.len(), nominal.points.len());
+    let chosen = |mask: u32| (0..want).filter(|n| mask >> n & 1 == 1).enumerate().collect::<Vec<_>>();
+    let fits = (0..1u32 << want).filter(|mask| mask.count_ones() as usize == have).filter_map(|mask| {
+        let matching = Matching { pairs: chosen(mask) };
+        let (from, to) = matching.points(seen, nominal);
+        fit_rigid(&from, &to).ok().filter(|fit| fit.worst().1 <= limit_mm).map(|_| matching)
+    });
+    let mut fits: Vec<Matching> = fits.take(2).collect();
+    match fits.len() {
+        1 => Ok(fits.remove(0)),
+        0 => Err("their distances fit none of them"),
+        _ => Err("their distances fit in more than one way"),
+    }
+}
+
+/// Tells what may be wrong with reference points that do not fit, and which one to name.
+fn diagnose(from: &[Point], to: &[Point], names: &[String], limit_mm: f64) -> (Option<usize>, String) {
+    let fits = |fit: Option<RigidFit>| fit.is_some_and(|fit| fit.worst().1 <= limit_mm);
+    for a in 0..from.len() {
+        for b in a + 1..from.len() {
+            let mut exchanged = from.to_vec();
+            exchanged.swap(a, b);
+            if fits(fit_rigid(&exchanged, to).ok()) {
+                let words = format!("{} and {} seem exchanged: with the two swapped all fit", names[a], names[b]);
+                return (Some(a), words);
+            }
+        }
+    }
+    // Without one of four points the other three always leave something; of more than one candidate none is named.
+    let alone: Vec<usize> = (0..from.len())
+        .filter(|&k| from.len() > 3 && fits(fit_rigid(&without(from, k), &without(to, k)).ok()))
+        .collect();
+    match alone[..] {
+        [k] => (Some(k), "without it the others fit: measure it again, or correct the nominal point".to_owned()),
+        _ => (None, "no single point explains it: check the order of the points and the nominal file".to_owned()),
+    }
+}
+
+fn without(points: &[Point], index: usize) -> Vec<Point> {
+    points.iter().enumerate().filter(|(k, _)| *k != index).map(|(_, p)| *p).collect()
+}
+
+/// Returns how far a point is off when the others alone are fitted.
+fn off_without(from: &[Point], to: &[Point], index: usize) -> Option<f64> {
+    let fit = fit_rigid(&without(from, index), &without(to, index)).ok()?;
+    Some((to[index] - fit.pose.point(&from[index])).norm())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Twist;
+    use std::path::PathBuf;
+
+    const AT: [(&str, [f64; 3]); 5] = [
+        ("a", [0.0, 0.0, 0.0]),
+        ("b", [1000.0, 0.0, 10.0]),
+        ("c", [30.0, 700.0, 0.0]),
+        ("d", [900.0, 800.0, 300.0]),
+        ("e", [500.0, 300.0, 900.0]),
+    ];
+
+    fn nominal(count: usize) -> References {
+        let point = |(name, at): &(&str, [f64; 3])| Reference { name: Some((*name).into()), at: Point::from(*at) };
+        References { path: PathBuf::from("nominal.yaml"), points: AT[..count].iter().map(point).collect() }
+    }
+
+    fn truth() -> Pose {
+        Pose::exp(&Twist::new(20.0, -3000.0, 5.0, 0.1, -0.4, 2.0))
+    }
+
+    /// What a station at the planted pose sees, in the order given, with or without names.
+    fn seen(order: &[usize], named: bool) -> References {
+        let point = |&k: &usize| Reference {
+            name: named.then(|| AT[k].0.into()),
+            at: truth().inverse().point(&Point::from(AT[k].1)),
+        };
+        References { path: PathBuf::from("ref_3.yaml"), points: order.iter().map(point).collect() }
+    }
+
+    fn is_planted(station: &PlacedStation) -> bool {
+        (station.cmm_from_station.rotation - truth().rotation).amax() < 1e-12 && station.rms_mm < 1e-9
+    }
+
+    #[test]
+    fn a_station_is_placed_by_order_by_name_and_by_distances() {
+        let placed = place_station("3", &seen(&[0, 1, 2, 3], false), &nominal(4), 0.1).unwrap();
+        assert!(is_planted(&placed) && placed.missing.is_empty() && placed.residuals.len() == 4);
+        let placed = place_station("3", &seen(&[3, 0, 4, 1], true), &nominal(4), 0.1).unwrap();
+        assert!(is_planted(&placed));
+        assert!(placed.missing == ["c"] && placed.extra == ["e"]);
+        assert!(placed.words().contains("does not see c; left out, not nominal: e"), "{}", placed.words());
+        let placed = place_station("3", &seen(&[0, 2, 3, 4], false), &nominal(5), 0.1).unwrap();
+        assert!(is_planted(&placed) && placed.missing == ["b"]);
+    }
+
+    #[test]
+    fn exchanged_and_moved_points_are_named() {
+        let message = place_station("3", &seen(&[0, 2, 1, 3, 4], false), &nominal(5), 0.1).unwrap_err().to_string();
+        assert!(
+            message.contains("station 3: reference point b is off by") && message.contains("b and c seem exchanged"),
+            "{message}"
+        );
+        let mut moved = seen(&[0, 1, 2, 3, 4], false);
+        moved.points[3].at.x += 2.0;
+        let message = place_station("3", &moved, &nominal(5), 0.1).unwrap_err().to_string();
+        assert!(
+            message.contains("reference point d is off by 2.000 mm, limit 0.1 mm; without it the others fit"),
+            "{message}"
+        );
+        assert!(place_station("3", &moved, &nominal(5), 2.0).is_ok());
+    }
+
+    #[test]
+    fn what_cannot_be_matched_is_refused_in_words() {
+        let cases = [
+            (seen(&[0, 1, 2, 3, 4], false), 4, "extra"),
+            (seen(&[0, 1], false), 4, "3 are needed"),
+            (seen(&[0, 4], true), 4, "missing are b, c, d, not known are e"),
+            (seen(&[4, 0, 1], false), 4, "their distances fit none of them"),
+        ];
+        for (seen, count, expected) in cases {
+            let message = place_station("3", &seen, &nominal(count), 0.1).unwrap_err().to_string();
+            assert!(message.contains(expected), "{message}");
+        }
+        let mut line = nominal(4);
+        line.points.iter_mut().for_each(|p| (p.at.y, p.at.z) = (0.0, 0.0));
+        let message = place_station("3", &seen(&[0, 1, 2, 3], true), &line, 0.1).unwrap_err().to_string();
+        assert!(message.contains("on one line"), "{message}");
+    }
+}

@@ -1,0 +1,230 @@
+//! The rigid motion that lays one set of points on another, pair by pair.
+//!
+//! A tracker that was moved between two stations sees the same few reference points from each; the motion that carries what it sees
+//! to where these points should be brings the stations into one frame. The fit is Kabsch's: centroids, the 3 x 3 cross-covariance,
+//! its singular value decomposition, and a determinant that tells a rotation from a mirror image.
+//!
+//! Units: millimetres.
+
+use nalgebra::{Matrix3, Vector3};
+use thiserror::Error;
+
+use super::{Point, Pose, Vector};
+
+/// Points whose spread across their line is less than this share of that along it do not fix the rotation about it.
+const LEAST_WIDTH_SHARE: f64 = 1e-3;
+/// Only points whose spread out of their plane is more than this share of the largest one can tell a mirror image.
+const LEAST_DEPTH_SHARE: f64 = 1e-2;
+
+/// What a rigid fit found.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RigidFit {
+    /// Takes the first set to the second.
+    pub pose: Pose,
+    /// What is left of each pair, in the order given: the target less the moved point.
+    pub residuals_mm: Vec<Vector>,
+    /// Root mean square of the lengths of the residuals.
+    pub rms_mm: f64,
+}
+
+impl RigidFit {
+    /// Returns the index of the pair that fits worst and by how much it is off.
+    pub fn worst(&self) -> (usize, f64) {
+        let lengths = self.residuals_mm.iter().map(Vector3::norm).enumerate();
+        lengths.fold((0, 0.0), |worst, next| if next.1 > worst.1 { next } else { worst })
+    }
+}
+
+/// Why two sets of points have no rigid fit.
+#[derive(Clone, Copy, Debug, Error, PartialEq)]
+pub enum RigidError {
+    /// The sets are not pairs.
+    #[error("{from} points cannot be laid on {to}; give every point its partner")]
+    Counts {
+        /// Points of the first set.
+        from: usize,
+        /// Points of the second set.
+        to: usize,
+    },
+    /// Fewer points than fix a pose.
+    #[error("{points} pairs of points do not fix a pose, at least 3 are needed; measure more reference points")]
+    TooFew {
+        /// Pairs given.
+        points: usize,
+    },
+    /// A coordinate is NaN or infinite.
+    #[error("pair {} of the points holds a coordinate that is not finite; remove it", index + 1)]
+    NotFinite {
+        /// Its index.
+        index: usize,
+    },
+    /// All points on a line.
+    #[error(
+        "the points lie on one line: their width is {share:.1e} of their length, at least {LEAST_WIDTH_SHARE:.0e} is needed to fix \
+         the rotation about it; add a reference point off the line"
+    )]
+    Collinear {
+        /// Spread across the line over the spread along it.
+        share: f64,
+    },
+    /// One set is a mirror image of the other.
+    #[error(
+        "one set of points is a mirror image of the other: as given they fit to {rms_mm:.4} mm, mirrored to {mirrored_rms_mm:.4} mm \
+         rms; an axis is reversed or two points are exchanged"
+    )]
+    Mirrored {
+        /// Rms of the best rotation.
+        rms_mm: f64,
+        /// Rms of the best mirror image.
+        mirrored_rms_mm: f64,
+    },
+}
+
+/// Returns the rigid motion that lays `from` on `to` with the least sum of squared distances.
+///
+/// Shapes: two lists of equal length, pair by pair, three pairs or more. Units: millimetres. Kabsch (1976), Umeyama (1991).
+///
+/// # Errors
+/// Lists of different lengths, fewer than three pairs, coordinates that are not finite, points on one line, and sets of which one
+/// is the mirror image of the other.
+pub fn fit_rigid(from: &[Point], to: &[Point]) -> Result<RigidFit, RigidError> {
+    check(from, to)?;
+    let (a, b) = (centroid(from), centroid(to));
+    let cross: Matrix3<f64> = from.iter().zip(to).map(|(p, q)| (q.coords - b) * (p.coords - a).transpose()).sum();
+    let svd = cross.svd(true, true);
+    let (u, v_t) = (svd.u.expect("asked for"), svd.v_t.expect("asked for"));
+    let sign = (u * v_t).determinant().signum();
+    let rotation = u * Matrix3::from_diagonal(&Vector::new(1.0, 1.0, sign)) * v_t;
+    let pose = Pose { rotation, translation_mm: b - rotation * a }.orthonormalised();
+    let residuals_mm: Vec<Vector> = from.iter().zip(to).map(|(p, q)| q - pose.point(p)).collect();
+    let rms_mm = rms(&residuals_mm);
+    if sign < 0.0 {
+        let mirror = u * v_t;
+        let mirrored: Vec<Vector> =
+            from.iter().zip(to).map(|(p, q)| (q.coords - b) - mirror * (p.coords - a)).collect();
+        let mirrored_rms_mm = rms(&mirrored);
+        let deep = spreads(from)[2].min(spreads(to)[2]) > LEAST_DEPTH_SHARE * spreads(from)[0];
+        if deep && mirrored_rms_mm < 0.1 * rms_mm {
+            return Err(RigidError::Mirrored { rms_mm, mirrored_rms_mm });
+        }
+    }
+    Ok(RigidFit { pose, residuals_mm, rms_mm })
+}
+
+fn check(from: &[Point], to: &[Point]) -> Result<(), RigidError> {
+    if from.len() != to.len() {
+        return Err(RigidError::Counts { from: from.len(), to: to.len() });
+    }
+    if from.len() < 3 {
+        return Err(RigidError::TooFew { points: from.len() });
+    }
+    let finite = |p: &Point| p.coords.iter().all(|c| c.is_finite());
+    if let Some(index) = from.iter().zip(to).position(|(p, q)| !finite(p) || !finite(q)) {
+        return Err(RigidError::NotFinite { index });
+    }
+    for points in [from, to] {
+        let [length, width, _] = spreads(points);
+        let share = if length > 0.0 { width / length } else { 0.0 };
+        if share < LEAST_WIDTH_SHARE {
+            return Err(RigidError::Collinear { share });
+        }
+    }
+    Ok(())
+}
+
+fn centroid(points: &[Point]) -> Vector {
+    points.iter().map(|p| p.coords).sum::<Vector>() / points.len() as f64
+}
+
+fn rms(residuals: &[Vector]) -> f64 {
+    (residuals.iter().map(Vector3::norm_squared).sum::<f64>() / residuals.len() as f64).sqrt()
+}
+
+/// Returns the rms spread of points along their three principal axes, the largest first.
+fn spreads(points: &[Point]) -> [f64; 3] {
+    let middle = centroid(points);
+    let scatter: Matrix3<f64> = points.iter().map(|p| (p.coords - middle) * (p.coords - middle).transpose()).sum();
+    let mut squares: [f64; 3] = scatter.symmetric_eigenvalues().into();
+    squares.sort_unstable_by(|a, b| b.total_cmp(a));
+    squares.map(|square| (square.max(0.0) / points.len() as f64).sqrt())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Twist;
+
+    const SEEN: [[f64; 3]; 5] = [
+        [2400.0, -2698.0, 4817.0],
+        [-2397.0, -2699.0, 4820.0],
+        [2396.0, 2656.0, 2141.0],
+        [-2399.0, 2658.0, 2140.0],
+        [10.0, 20.0, 900.0],
+    ];
+
+    fn points(of: &[[f64; 3]]) -> Vec<Point> {
+        of.iter().map(|p| Point::from(*p)).collect()
+    }
+
+    #[test]
+    fn a_planted_motion_is_found_to_rounding_at_every_angle() {
+        let from = points(&SEEN);
+        for count in [3, 4, 5] {
+            for angle in [0.0, 1e-9, 0.01, 1.0, 2.0, std::f64::consts::PI] {
+                let omega = Vector::new(0.36, -0.48, 0.8) * angle;
+                let truth = Pose::exp(&Twist::new(300.0, -20.0, 1e4, omega.x, omega.y, omega.z));
+                let to: Vec<Point> = from.iter().map(|p| truth.point(p)).collect();
+                let fit = fit_rigid(&from[..count], &to[..count]).unwrap();
+                assert!((fit.pose.rotation - truth.rotation).amax() < 1e-14, "{count} points, {angle} rad");
+                assert!(fit.rms_mm < 1e-10 && (fit.pose.point(&from[0]) - to[0]).norm() < 1e-10);
+            }
+        }
+    }
+
+    #[test]
+    fn a_point_that_is_off_is_the_worst_one() {
+        let from = points(&SEEN);
+        let mut to = from.clone();
+        to[3].z += 4.0;
+        let fit = fit_rigid(&from, &to).unwrap();
+        let (worst, off_mm) = fit.worst();
+        assert!(worst == 3 && off_mm > 0.5 && off_mm < 4.0, "{worst}: {off_mm}");
+        // The best fit is a minimum: a small turn or shift about it makes it worse.
+        for k in 0..6 {
+            let mut twist = Twist::zeros();
+            twist[k] = if k < 3 { 1e-3 } else { 1e-6 };
+            let near = Pose::exp(&twist) * fit.pose;
+            let moved: Vec<Vector> = from.iter().zip(&to).map(|(p, q)| q - near.point(p)).collect();
+            assert!(rms(&moved) > fit.rms_mm, "direction {k}");
+        }
+    }
+
+    #[test]
+    fn a_mirror_image_is_refused_where_the_points_can_tell() {
+        let from = points(&SEEN);
+        let to: Vec<Point> = from.iter().map(|p| Point::new(-p.x, p.y, p.z)).collect();
+        assert!(
+            matches!(fit_rigid(&from, &to), Err(RigidError::Mirrored { mirrored_rms_mm, .. }) if mirrored_rms_mm < 1e-9)
+        );
+        // Three points lie in a plane, and there a mirror image is a rotation too.
+        assert!(fit_rigid(&from[..3], &to[..3]).unwrap().rms_mm < 1e-9);
+        // Noise out of the plane is no mirror image.
+        let noise = |s: f64| points(&[[0.0, 0.0, s], [1e3, 0.0, -s], [0.0, 1e3, -s], [1e3, 1e3, s]]);
+        assert!(fit_rigid(&noise(0.1), &noise(-0.1)).is_ok());
+    }
+
+    #[test]
+    fn what_fixes_no_pose_is_refused() {
+        let from = points(&SEEN);
+        let line = points(&[[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [2.0, 2.0, 2.0001], [5.0, 5.0, 5.0]]);
+        assert!(matches!(fit_rigid(&line, &from[..4]), Err(RigidError::Collinear { share }) if share < 1e-3));
+        assert!(matches!(fit_rigid(&from[..4], &line), Err(RigidError::Collinear { .. })));
+        let one = vec![from[0]; 4];
+        assert_eq!(fit_rigid(&one, &one), Err(RigidError::Collinear { share: 0.0 }));
+        assert_eq!(fit_rigid(&from[..2], &from[..2]), Err(RigidError::TooFew { points: 2 }));
+        assert_eq!(fit_rigid(&from, &from[..4]), Err(RigidError::Counts { from: 5, to: 4 }));
+        let mut bad = from.clone();
+        bad[1].y = f64::NAN;
+        assert_eq!(fit_rigid(&bad, &from), Err(RigidError::NotFinite { index: 1 }));
+    }
+}

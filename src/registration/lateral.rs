@@ -1,0 +1,230 @@
+//! Whether a map of the deviations would sit where it belongs on the part.
+//!
+//! On a shallow part the heights are known to micrometres while the part may be shifted or turned in its own surface by millimetres
+//! without any distance telling. A map made in such a pose has the right shape at the wrong place. By how much that makes it wrong:
+//!
+//! ```text
+//!  error of the map  =  k * (largest lateral uncertainty of a point, from the covariance of the pose)  *  (slope of the map)
+//! ```
+//!
+//! The slope is that between neighbouring patches of the measured deviations, the value that 95 of 100 pairs stay below; patches and
+//! not points, so that the noise of points that lie close together is not taken for slope. The map is refused when its error is more
+//! than a share of what there is to correct, its rms. It is refused too when it might sit farther beside its place than a limit,
+//! however gentle its slopes: where the part ends, and where panels meet, a map is not gentle, and a tool path that is cut to the outline
+//! of the part runs off it there. Directions that the recipe holds have no variance and do not count; nor do those
+//! that the surface cannot see at all, which stay where the start pose has them.
+
+use std::collections::BTreeMap;
+
+use nalgebra::Matrix3;
+
+use super::{Deviation, PointStatus, Registration};
+use crate::geometry::Vector;
+
+/// What error of a map is put up with.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MapLimits {
+    /// How many standard uncertainties are reckoned with.
+    pub coverage_factor: f64,
+    /// The largest error of the map, as a share of the rms of what it corrects.
+    pub share: f64,
+    /// How far the map may sit beside its place, with the coverage factor.
+    pub place_mm: f64,
+}
+
+impl Default for MapLimits {
+    fn default() -> Self {
+        Self { coverage_factor: 2.0, share: 0.1, place_mm: 1.0 }
+    }
+}
+
+/// What the lateral uncertainty of a pose does to a map.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LateralError {
+    /// Largest standard uncertainty of a measured point along the surface.
+    pub lateral_mm: f64,
+    /// Slope of the deviations, millimetres per millimetre, that 95 of 100 pairs of neighbouring patches stay below.
+    pub slope: f64,
+    /// Lateral uncertainty, with the coverage factor, times slope.
+    pub error_mm: f64,
+}
+
+/// Returns what the lateral uncertainty of a pose does to a map of its deviations.
+///
+/// Equation: for the twist [v; omega] of covariance C a point moves by v + omega x p; J C J^T with J = [1, -p^], seen in the tangent
+/// plane, is the covariance of that; its largest eigenvalue counts.
+pub fn lateral_error(found: &Registration, coverage_factor: f64) -> LateralError {
+    let used: Vec<&Deviation> = found.deviations.iter().filter(|d| d.status == PointStatus::Used).collect();
+    let lateral_mm = used.iter().map(|d| lateral_sigma(found, d)).fold(0.0, f64::max);
+    let slope = slope(&used);
+    LateralError { lateral_mm, slope, error_mm: coverage_factor * lateral_mm * slope }
+}
+
+/// Tells in words why no map may be made from a registration; nothing if one may.
+///
+/// See the head of this module for the criterion.
+pub fn weak_for_compensation(found: &Registration, limits: &MapLimits) -> Option<String> {
+    let LateralError { lateral_mm, slope, error_mm } = lateral_error(found, limits.coverage_factor);
+    let rms_mm = found.verdict.rms_mm;
+    let limit_mm = limits.share * rms_mm;
+    let beside_mm = limits.coverage_factor * lateral_mm;
+    if error_mm <= limit_mm && beside_mm <= limits.place_mm {
+        return None;
+    }
+    let seen = found.verdict.weak_directions.iter().filter(|w| !w.held);
+    let weak: Vec<&str> = seen.map(|w| w.words.as_str()).collect();
+    let weak = if weak.is_empty() { String::new() } else { format!(" ({})", weak.join("; ")) };
+    Some(format!(
+        "no correction is made: the measured heights are good, but the shape of the part does not tell where on it they lie{weak}. The \
+         correction might sit {beside_mm:.2} mm beside its place, allowed are {:.2} mm. Where the error map climbs, by up to {:.2} um per \
+         mm, that makes it wrong by {:.1} um, allowed are {:.1} um, {:.0} % of the {:.1} um rms to be corrected; at edges and seams by \
+         more. Hold the directions in the recipe if the fixture holds the part better than that (registration.hold = [\"x\", \"y\", \
+         \"rz\"]), or measure edges or marks that show them",
+        limits.place_mm,
+        1e3 * slope,
+        1e3 * error_mm,
+        1e3 * limit_mm,
+        1e2 * limits.share,
+        1e3 * rms_mm,
+    ))
+}
+
+/// Standard uncertainty of a point along the surface, in the direction in which it is largest.
+fn lateral_sigma(found: &Registration, deviation: &Deviation) -> f64 {
+    let c = &found.verdict.covariance;
+    let hat = deviation.point.coords.cross_matrix();
+    let block = |i: usize, j: usize| -> Matrix3<f64> { c.fixed_view::<3, 3>(i, j).into_owned() };
+    // (v - p^ omega) has the covariance Cvv - Cvw p^T... with p^T = -p^.
+    let moved = block(0, 0) + block(0, 3) * hat - hat * block(3, 0) - hat * block(3, 3) * hat;
+    let n: Vector = deviation.normal;
+    let tangent = Matrix3::identity() - n * n.transpose();
+    let seen = tangent * moved * tangent;
+    (0.5 * (seen + seen.transpose())).symmetric_eigenvalues().max().max(0.0).sqrt()
+}
+
+/// The slope between neighbouring patches that 95 of 100 pairs stay below; 0 if there are no neighbours.
+fn slope(used: &[&Deviation]) -> f64 {
+    let n = used.len() as f64;
+    let middle = used.iter().map(|d| d.point.coords).sum::<Vector>() / n;
+    let size = (used.iter().map(|d| (d.point.coords - middle).norm_squared()).sum::<f64>() / n).sqrt();
+    // Points spread over a square of rms size s stand s sqrt(6 / n) apart; a patch holds about nine of them.
+    let edge = 3.0 * size * (6.0 / n).sqrt();
+    if !(edge > 0.0 && edge.is_finite()) {
+        return 0.0;
+    }
+    let cell = |d: &Deviation| -> [i32; 3] { d.point.coords.map(|c| (c / edge).floor() as i32).into() };
+    let mut patches: BTreeMap<[i32; 3], (f64, Vector, f64)> = BTreeMap::new();
+    for d in used {
+        let patch = patches.entry(cell(d)).or_default();
+        *patch = (patch.0 + 1.0, patch.1 + d.point.coords, patch.2 + d.deviation_mm);
+    }
+    let means: BTreeMap<[i32; 3], (Vector, f64)> =
+        patches.into_iter().map(|(key, (n, p, d))| (key, (p / n, d / n))).collect();
+    let mut slopes = Vec::new();
+    for (key, (p, d)) in &means {
+        // Half of the 26 neighbours, so that every pair counts once.
+        for k in 14..27 {
+            let near = [key[0] + k / 9 - 1, key[1] + k / 3 % 3 - 1, key[2] + k % 3 - 1];
+            if let Some((q, e)) = means.get(&near).filter(|(q, _)| (q - p).norm() > 0.5 * edge) {
+                slopes.push((e - d).abs() / (q - p).norm());
+            }
+        }
+    }
+    slopes.sort_unstable_by(f64::total_cmp);
+    let at = (0.95 * slopes.len() as f64) as usize;
+    slopes.get(at.min(slopes.len().saturating_sub(1))).copied().unwrap_or(0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Point, Pose};
+    use crate::registration::{Verdict, WeakDirection};
+    use crate::surface::Side;
+    use nalgebra::{Matrix6, Vector6};
+
+    const HALF_MM: f64 = 300.0;
+    const HEIGHT_MM: f64 = 0.05;
+    const WAVE_MM: f64 = 100.0;
+
+    /// A flat part that carries a wave, d = h sin(x / w), and whose pose has these standard uncertainties.
+    fn waved(sigmas: [f64; 6], twins: bool) -> Registration {
+        let at = |k: usize| HALF_MM * (k as f64 / 20.0 - 1.0);
+        let mut deviations: Vec<Deviation> = (0..=40)
+            .flat_map(|j| (0..=40).map(move |i| (at(i), at(j))))
+            .map(|(x, y)| Deviation {
+                point: Point::new(x, y, 0.0),
+                normal: Vector::z(),
+                deviation_mm: HEIGHT_MM * (x / WAVE_MM).sin(),
+                uncertainty_mm: 0.0,
+                status: PointStatus::Used,
+            })
+            .collect();
+        if twins {
+            // The same places again a micrometre aside, with noise: no slope of the part.
+            let noisy = |(k, d): (usize, &Deviation)| Deviation {
+                point: d.point + Vector::new(1e-3, 0.0, 0.0),
+                deviation_mm: d.deviation_mm + if k % 2 == 0 { 1e-3 } else { -1e-3 },
+                ..*d
+            };
+            let more: Vec<Deviation> = deviations.iter().enumerate().map(noisy).collect();
+            deviations.extend(more);
+        }
+        let n = deviations.len() as f64;
+        let objective_mm2 = deviations.iter().map(|d| d.deviation_mm * d.deviation_mm).sum::<f64>();
+        let words = "x and y shift: known to 3.4 mm only".to_owned();
+        let verdict = Verdict {
+            used: deviations.len(),
+            objective_mm2,
+            rms_mm: (objective_mm2 / n).sqrt(),
+            pv_mm: 2.0 * HEIGHT_MM,
+            residual_sigma_mm: 0.0,
+            covariance: Matrix6::from_diagonal(&Vector6::from(sigmas.map(|s| s * s))),
+            condition: 1.0,
+            weak_directions: vec![WeakDirection { words, held: false, sigma_mm: Some(3.4) }],
+            coverage: 1.0,
+            alternatives: Vec::new(),
+            warnings: Vec::new(),
+            iterations: 1,
+            converged: true,
+        };
+        Registration { cmm_from_model: Pose::identity(), deviations, trace: Vec::new(), side: Side::Normal, verdict }
+    }
+
+    #[test]
+    fn the_error_of_a_map_is_lateral_uncertainty_times_slope() {
+        let e = lateral_error(&waved([3.4, 1.0, 9.0, 0.0, 0.0, 0.0], false), 2.0);
+        assert!((e.lateral_mm - 3.4).abs() < 1e-12, "{e:?}");
+        // The steepest slope of the wave is h / w; patches see a little less of it.
+        let steepest = HEIGHT_MM / WAVE_MM;
+        assert!(e.slope > 0.85 * steepest && e.slope <= steepest, "{e:?}");
+        assert!((e.error_mm - 2.0 * e.lateral_mm * e.slope).abs() < 1e-15);
+        // A turn about z moves the corners most; turns about x and y move nothing along a flat part through the origin.
+        let e = lateral_error(&waved([0.0, 0.0, 0.0, 1e-2, 1e-2, 2e-4], false), 2.0);
+        assert!((e.lateral_mm - 2e-4 * HALF_MM * 2f64.sqrt()).abs() < 1e-9, "{e:?}");
+    }
+
+    #[test]
+    fn noise_of_points_that_lie_close_together_is_no_slope() {
+        let plain = lateral_error(&waved([1.0; 6], false), 2.0).slope;
+        let twins = lateral_error(&waved([1.0; 6], true), 2.0).slope;
+        assert!((twins / plain - 1.0).abs() < 0.25, "{twins} against {plain}");
+    }
+
+    #[test]
+    fn a_map_is_refused_where_the_error_is_above_its_share_and_not_before() {
+        let at = |sigma: f64| waved([sigma, 0.0, 0.0, 0.0, 0.0, 0.0], false);
+        let limits = MapLimits { place_mm: 1e3, ..MapLimits::default() };
+        let unit = lateral_error(&at(1.0), limits.coverage_factor).error_mm;
+        let border = limits.share * at(1.0).verdict.rms_mm / unit;
+        assert_eq!(weak_for_compensation(&at(0.999 * border), &limits), None);
+        let why = weak_for_compensation(&at(1.001 * border), &limits).unwrap();
+        assert!(why.contains("known to 3.4 mm only") && why.contains("Hold the directions in the recipe"), "{why}");
+        let near = MapLimits { share: 1e3, ..MapLimits::default() };
+        assert_eq!(weak_for_compensation(&at(0.499), &near), None);
+        let why = weak_for_compensation(&at(0.501), &near).unwrap();
+        assert!(why.contains("might sit 1.00 mm beside its place, allowed are 1.00 mm"), "{why}");
+        // Locked directions have no variance.
+        assert_eq!(weak_for_compensation(&at(0.0), &limits), None);
+    }
+}

@@ -1,0 +1,561 @@
+//! Machines that are two folders and a person: what is taken, what is left alone, and that nothing is handed over twice.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use regrind::device::exchange::{
+    Confirmable, ExchangeMachine, ExchangeTiming, GrindOrder, Look, Mailbox, MailboxError, MeasureOrder, Standing, Step,
+};
+use regrind::device::{
+    Answer, Cmm, Coordinates, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Machine, MachineKind,
+    Measurement, Outcome, Pass, Plan, PointStatus, Reconciled, State, Target, TargetKind, digest,
+};
+use regrind::formats::exchange::{
+    CmmExchange, CmmFolders, GrinderExchange, GrinderFolders, Pattern, StationFiles, Stations,
+};
+
+/// Two folders of a machine.
+struct Shop {
+    _home: tempfile::TempDir,
+    outbox: PathBuf,
+    inbox: PathBuf,
+}
+
+impl Shop {
+    fn new() -> Self {
+        let home = tempfile::tempdir().unwrap();
+        let (outbox, inbox) = (home.path().join("out"), home.path().join("in"));
+        fs::create_dir_all(&outbox).unwrap();
+        fs::create_dir_all(&inbox).unwrap();
+        Self { _home: home, outbox, inbox }
+    }
+
+    fn cmm(&self) -> CmmExchange {
+        CmmExchange::new("SN 7", &self.outbox, &self.inbox)
+    }
+
+    fn grinder(&self) -> GrinderFolders {
+        let stable_for = Duration::from_secs(2);
+        let (outbox, inbox) = (self.outbox.clone(), self.inbox.clone());
+        GrinderFolders::new(GrinderExchange { part: "SN 7".into(), outbox, inbox, stable_for })
+    }
+
+    fn put(&self, name: &str, text: &str) {
+        fs::write(self.inbox.join(name), text).unwrap();
+    }
+
+    /// Names in the outbox.
+    fn handed(&self) -> Vec<String> {
+        let mut names: Vec<String> = fs::read_dir(&self.outbox)
+            .unwrap()
+            .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+            .collect();
+        names.sort();
+        names
+    }
+}
+
+fn plan(count: u32) -> Plan {
+    let target = |index| Target {
+        index: 10 + index,
+        what: TargetKind::Part,
+        point_mm: [f64::from(index), 0.25, -1e-7],
+        normal: [0.0, 0.6, 0.8],
+    };
+    Plan {
+        targets: (0..count).map(target).collect(),
+        probe_radius_mm: 1.5,
+        approach_mm: 2.0,
+        search_mm: 1.0,
+        speed_mm_s: 5.0,
+        safe_height_mm: 50.0,
+    }
+}
+
+fn order(count: u32) -> (MeasureOrder, u32) {
+    let plan = plan(count);
+    let plan_identity = plan.identity();
+    (MeasureOrder { plan, plan_identity }, digest(&[plan_identity]))
+}
+
+/// A measuring machine to whose folders a plan of three targets was handed, job 3 cycle 2, and its clock.
+struct Bench {
+    folders: CmmFolders,
+    job: Job,
+    now_s: u64,
+}
+
+impl Bench {
+    fn new(settings: CmmExchange) -> Self {
+        let mut folders = CmmFolders::new(settings);
+        let (order, digest) = order(3);
+        let job = Job { job: 3, cycle: 2, digest };
+        folders.publish(job, 1, &order).unwrap();
+        Self { folders, job, now_s: 0 }
+    }
+
+    fn look(&mut self) -> Look<Measurement> {
+        self.now_s += 1;
+        self.folders.look(Duration::from_secs(self.now_s), self.job).unwrap()
+    }
+
+    /// Looks until everything has settled.
+    fn settled(&mut self) -> Look<Measurement> {
+        for _ in 0..2 {
+            self.look();
+        }
+        self.look()
+    }
+
+    fn refused(&mut self, expected: &str) {
+        let look = self.settled();
+        let said = look.said.join("\n");
+        assert!(look.answer.is_none() && said.contains(expected), "said\n{said}\nnot {expected}");
+    }
+}
+
+const CENTRES: &str = "# coordinates: centres\n";
+const THREE: &str = "x,y,z\n1,2,3\n4,5,6\n7,8,9.125\n";
+
+fn three() -> String {
+    format!("{CENTRES}{THREE}")
+}
+
+#[test]
+fn the_plan_says_everything_and_reads_back_to_the_same_bits() {
+    let shop = Shop::new();
+    let bench = Bench::new(shop.cmm());
+    assert_eq!(shop.handed(), ["SN_7_j3_c2"]);
+    let folder = shop.outbox.join("SN_7_j3_c2");
+    let text = fs::read_to_string(folder.join("plan.csv")).unwrap();
+    let identity: String = plan(3).identity().iter().map(|b| format!("{b:02x}")).collect();
+    assert!(
+        text.contains(&format!("# plan: {identity}\n")) && text.contains("\nindex,x,y,z,nx,ny,nz,what\n"),
+        "{text}"
+    );
+    let rows: Vec<Vec<f64>> = text
+        .lines()
+        .filter(|l| l.starts_with(|c: char| c.is_ascii_digit()))
+        .map(|l| l.split(',').map(|n| n.parse().unwrap()).collect())
+        .collect();
+    assert_eq!(rows[2], [12.0, 2.0, 0.25, -1e-7, 0.0, 0.6, 0.8, 1.0]);
+    let json: serde_json::Value = serde_json::from_slice(&fs::read(folder.join("plan.json")).unwrap()).unwrap();
+    assert_eq!((&json["plan"], &json["cycle"], &json["units"]), (&identity.into(), &2.into(), &"mm".into()));
+    assert_eq!(json["expected_back"]["file"], "SN_7_c2.*");
+    drop(bench);
+}
+
+#[test]
+fn a_result_is_taken_when_it_has_settled_and_ended_and_not_before() {
+    let shop = Shop::new();
+    let mut bench = Bench::new(shop.cmm());
+    assert!(bench.look().said[0].contains("waiting for SN_7_c2.* in"));
+    shop.put("SN_7_c2.csv", "# coordinates: centres\nx,y,z\n1,2,3\n");
+    assert!(bench.look().answer.is_none());
+    // It grows while it is looked at: the time begins anew.
+    shop.put("SN_7_c2.csv", "# coordinates: centres\nx,y,z\n1,2,3\n4,5,6\n7,8,9.1");
+    let look = bench.look();
+    assert!(look.answer.is_none() && look.said[0].contains("still changing"), "{:?}", look.said);
+    // The last line has three numbers, and is not the end all the same.
+    bench.refused("cut in the middle of a line, found `7,8,9.1`");
+    shop.put("SN_7_c2.csv", &three());
+    assert!(bench.look().answer.is_none());
+    assert!(bench.look().answer.is_none());
+    let found = bench.look().answer.unwrap();
+    assert_eq!(found.points.iter().map(|p| p.index).collect::<Vec<_>>(), [10, 11, 12]);
+    assert_eq!((found.points[2].at_mm, found.coordinates), ([7.0, 8.0, 9.125], Coordinates::Centres));
+    assert_eq!((found.job, found.cycle, found.plan_identity), (3, 2, plan(3).identity()));
+    // Asked again it says the same.
+    assert_eq!(bench.look().answer.unwrap(), found);
+}
+
+#[test]
+fn what_is_not_for_this_part_and_cycle_is_left_alone_and_said() {
+    let shop = Shop::new();
+    shop.put("SN_7_c2.csv", &three());
+    let mut bench = Bench::new(shop.cmm());
+    bench.refused("SN_7_c2.csv lay there before the plan was handed over; left alone");
+    for (text, expected) in [
+        (format!("# part: SN 8\n{}", three()), "is of part SN 8, not SN 7; left alone"),
+        (format!("# cycle: 1\n{}", three()), "is of cycle 1, not 2; left alone"),
+        (format!("# plan: {}\n{}", "0".repeat(64), three()), "was measured by another plan; left alone"),
+        (format!("# cycle: second\n{}", three()), "`cycle` says `second`"),
+    ] {
+        shop.put("SN_7_c2.csv", &text);
+        bench.refused(expected);
+    }
+    fs::remove_file(shop.inbox.join("SN_7_c2.csv")).unwrap();
+    shop.put("notes.txt", &three());
+    bench.refused("notes.txt does not say that it belongs here and its name does not fit SN_7_c2.*");
+    // By what it says of itself any name will do.
+    shop.put("export 0815.txt", &format!("# part: SN 7\n# cycle: 2\n{}", three()));
+    assert!(bench.settled().answer.is_some());
+}
+
+#[test]
+fn what_is_wrong_with_a_result_is_said_with_the_remedy() {
+    let shop = Shop::new();
+    let mut bench = Bench::new(shop.cmm());
+    let with = |rows: &str| format!("{CENTRES}{rows}");
+    for (text, expected) in [
+        (with("1,2,3\n4,5,6\n"), "2 points for a plan of 3 targets"),
+        (with("1,2,3\n4,NaN,6\n7,8,9\n"), "line 3, column 2: expected a finite number"),
+        (with("1,2,3\n4,5,6\n7,8\n"), "line 4: expected 3 columns"),
+        (
+            with("1,234;5,678;9,012\n1,234;5,678;9,012\n1,234;5,678;9,012\n"),
+            "line 2, column 1: `1,234` may have a decimal comma",
+        ),
+        (with("1,5;2;3\n4.5;5;6\n7;8;9\n"), "line 3, column 1: expected a number with a decimal comma"),
+        (
+            THREE.to_owned(),
+            "neither the file nor the cell says whether the coordinates are probe centres or contact points",
+        ),
+        (format!("# units: inch\n{}", three()), "the file says that the unit is 25.4 mm, the cell file says 1 mm"),
+        (format!("# probe radius mm: 1.49\n{}", three()), "probe radius of 1.49 mm, the recipe says 1.5 mm"),
+        (with("index,x,y,z\n10,1,2,3\n99,4,5,6\n"), "index `99` is not a target of the plan"),
+        (with("index,x,y,z\n10,1,2,3\n10,4,5,6\n"), "index `10` came before"),
+        (String::new(), "cut in the middle of a line"),
+    ] {
+        shop.put("SN_7_c2.csv", &text);
+        bench.refused(expected);
+    }
+    // What came of targets without a row is known: they were not found.
+    shop.put("SN_7_c2.csv", &with("index,x,y,z\n12,1,2,3\n10,4,5,6\n"));
+    let found = bench.settled().answer.unwrap();
+    let status: Vec<PointStatus> = found.points.iter().map(|p| p.status).collect();
+    assert_eq!(status, [PointStatus::Touched, PointStatus::NotFound, PointStatus::Touched]);
+    assert_eq!(found.points[2].at_mm, [1.0, 2.0, 3.0]);
+}
+
+#[test]
+fn two_files_at_once_are_neither_taken() {
+    let shop = Shop::new();
+    let mut bench = Bench::new(shop.cmm());
+    shop.put("SN_7_c2.csv", &three());
+    shop.put("SN_7_c2.txt", &three());
+    bench.refused("2 files fit `SN_7_c2.*`: SN_7_c2.csv, SN_7_c2.txt; leave only the right one there");
+    fs::remove_file(shop.inbox.join("SN_7_c2.txt")).unwrap();
+    assert!(bench.settled().answer.is_some());
+}
+
+#[test]
+fn the_cell_may_say_what_the_file_does_not() {
+    use regrind::formats::exchange::{Content, Coordinates as Said, DecimalMark};
+    let shop = Shop::new();
+    let content = Content { coordinates: Some(Said::Contacts), decimal: DecimalMark::Comma, unit_mm: 25.4 };
+    let mut bench = Bench::new(CmmExchange { content, ..shop.cmm() });
+    shop.put("SN_7_c2.csv", &three());
+    bench.refused("the file says that coordinates is centres, the cell file says contacts");
+    shop.put("SN_7_c2.csv", "1,000;2;3\n1.000,5;5;6\n7;8;9\n");
+    let found = bench.settled().answer.unwrap();
+    assert_eq!(found.coordinates, Coordinates::Contacts);
+    assert_eq!((found.points[0].at_mm[0], found.points[1].at_mm[0]), (25.4, 25.4 * 1000.5));
+}
+
+#[test]
+fn a_job_and_cycle_is_handed_over_once_and_its_bytes_answer_no_other_cycle() {
+    let shop = Shop::new();
+    let mut bench = Bench::new(shop.cmm());
+    let (order, digest) = order(3);
+    let job = bench.job;
+    let again = |folders: &mut CmmFolders| folders.publish(job, 2, &order);
+    assert_eq!(again(&mut bench.folders), Err(MailboxError::HandedOver { job: 3, cycle: 2 }));
+    shop.put("SN_7_c2.csv", &three());
+    assert!(bench.settled().answer.is_some());
+    bench.folders.mark(bench.job, Standing::Closed).unwrap();
+    assert_eq!(shop.handed(), ["SN_7_j3_c2.done"]);
+    // Nor by another process, nor once it was acknowledged.
+    let mut other = CmmFolders::new(shop.cmm());
+    assert_eq!(again(&mut other), Err(MailboxError::HandedOver { job: 3, cycle: 2 }));
+    let handed = other.open().unwrap();
+    assert_eq!((handed.len(), handed[0].sequence, handed[0].standing), (1, 1, Standing::Closed));
+    let next = Job { job: 3, cycle: 3, digest };
+    other.publish(next, 2, &order).unwrap();
+    let mut bench = Bench { folders: other, job: next, now_s: 0 };
+    shop.put("SN_7_c3.csv", &three());
+    bench.refused("the same bytes were the result of job 3 cycle 2");
+}
+
+#[test]
+fn a_restart_finds_what_is_open() {
+    let shop = Shop::new();
+    let bench = Bench::new(shop.cmm());
+    let job = bench.job;
+    drop(bench);
+    let mut bench = Bench { folders: CmmFolders::new(shop.cmm()), job, now_s: 0 };
+    shop.put("SN_7_c2.csv", &three());
+    assert_eq!(bench.settled().answer.unwrap().points.len(), 3);
+    bench.folders.mark(job, Standing::Held).unwrap();
+    assert_eq!(shop.handed(), ["SN_7_j3_c2.held"]);
+    bench.folders.mark(job, Standing::Open).unwrap();
+    fs::rename(shop.outbox.join("SN_7_j3_c2"), shop.outbox.join("mine")).unwrap();
+    let MailboxError::Files { why } = bench.folders.open().unwrap_err() else { panic!() };
+    assert!(why.contains("expected a folder with the name that was given to it"), "{why}");
+}
+
+// ---- stations ------------------------------------------------------------------------------------------------------------------
+
+/// Where four reference points and three points of the part are.
+const REFERENCE: [[f64; 3]; 4] = [[0.0, 0.0, 0.0], [1000.0, 0.0, 10.0], [30.0, 700.0, 0.0], [900.0, 800.0, 300.0]];
+const NOMINAL: &str = "coords: opt_global\nprimary:\n  left: [[0, 0, 0], [['CODE14', [1, 2, 3]]]] # lower\n  \
+    right: [1000, 0, 10]\n  upper: [30, 700, 0]\n  lower: [900, 800, 300]\nother:\n  a: [1, 2, 3]\n";
+
+/// What a station sees that is turned by a quarter about z and shifted.
+fn seen(p: [f64; 3], station: usize) -> [f64; 3] {
+    let s = station as f64;
+    [p[1] + 100.0 * s, -p[0] + 5.0, p[2] - 3.0 * s]
+}
+
+fn references(order: [usize; 4], station: usize) -> String {
+    let rows = order.map(|k| seen(REFERENCE[k], station).map(|c| c.to_string()));
+    format!("primary:\n{}", rows.map(|r| format!("- - {}\n  - {}\n  - {}\n", r[0], r[1], r[2])).concat())
+}
+
+fn station_shop(shop: &Shop) -> CmmExchange {
+    let nominal = shop.outbox.with_file_name("reference.yaml");
+    fs::write(&nominal, NOMINAL).unwrap();
+    let files = vec![StationFiles { points: Pattern::new("P_*.txt"), references: Pattern::new("ref_*.yaml") }];
+    let stations = Stations { files, nominal, group: Some("primary".into()), limit_mm: 0.1 };
+    CmmExchange { stations: Some(stations), free_count: true, least_points: 4, ..shop.cmm() }
+}
+
+fn points(station: usize) -> String {
+    let rows = [[10.0, 20.0, 30.0], [40.0, 50.0, 61.0]].map(|p| seen(p, station).map(|c| c.to_string()).join("\t"));
+    format!("{CENTRES}{}\n{}\n", rows[0], rows[1])
+}
+
+#[test]
+fn stations_are_merged_by_their_reference_points() {
+    let shop = Shop::new();
+    let mut bench = Bench::new(station_shop(&shop));
+    bench.refused("waiting for the first station");
+    shop.put("P_1.txt", &points(1));
+    bench.refused("waiting for the first station");
+    shop.put("ref_1.yaml", &references([0, 1, 2, 3], 1));
+    shop.put("ref_9.yaml", &references([0, 1, 2, 3], 9));
+    bench.refused("2 points of 1 stations; at least 4 are needed, waiting for further stations");
+    shop.put("P_2.txt", &points(2));
+    shop.put("ref_2.yaml", &references([0, 2, 1, 3], 2));
+    bench.refused("station 2 (ref_2.yaml): reference point right is off by");
+    assert!(bench.look().said.join(" ").contains("right and upper seem exchanged"));
+    shop.put("ref_2.yaml", &references([0, 1, 2, 3], 2));
+    let look = bench.settled();
+    let found = look.answer.unwrap();
+    for (k, expected) in [[10.0, 20.0, 30.0], [40.0, 50.0, 61.0]].iter().cycle().take(4).enumerate() {
+        let at = found.points[k].at_mm;
+        assert!(at.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-9), "{at:?} not {expected:?}");
+    }
+    let said = look.said.join("\n");
+    assert!(said.contains("left alone, no station's: ref_9.yaml"), "{said}");
+    assert!(
+        said.contains("station 1 (ref_1.yaml): reference points fit to 0.000 mm rms (left 0.000, right 0.000"),
+        "{said}"
+    );
+}
+
+// ---- the grinder -----------------------------------------------------------------------------------------------------------------
+
+fn map() -> CorrectionMap {
+    CorrectionMap {
+        columns: 3,
+        rows: 2,
+        first_mm: [-1.0, 5.0],
+        spacing_mm: [0.5, 2.0],
+        values_mm: vec![0.0, 1e-4, -2e-4, 0.0, 3e-3, 0.25],
+        part_identity: [7; 32],
+    }
+}
+
+fn pass() -> Pass {
+    Pass {
+        spark_out_passes: 1,
+        wheel_radius_mm: 100.0,
+        feed_mm_min: 900.0,
+        track_spacing_mm: 0.2,
+        level_mm: 0.01,
+        depth_of_cut_mm: 0.02,
+        x_mm: [-1.0, 0.0],
+        y_mm: [5.0, 7.0],
+        part_identity: [7; 32],
+    }
+}
+
+#[test]
+fn a_pass_is_confirmed_by_files_that_name_its_map() {
+    let shop = Shop::new();
+    let mut grinder = shop.grinder();
+    let map_identity = map().identity();
+    let job = Job { job: 3, cycle: 2, digest: digest(&[map_identity, pass().identity()]) };
+    shop.put("done.json", "{}");
+    grinder.publish(job, 4, &GrindOrder { map: map(), pass: pass(), map_identity }).unwrap();
+    let folder = shop.outbox.join("SN_7_j3_c2");
+    let csv = fs::read_to_string(folder.join("correction.csv")).unwrap();
+    assert!(csv.contains("positive leaves material") && csv.ends_with("-1,7,0\n-0.5,7,0.003\n0,7,0.25\n"), "{csv}");
+    let mut now = 0;
+    let mut settled = |grinder: &mut GrinderFolders| {
+        now += 10;
+        grinder.look(Duration::from_secs(now), job).unwrap();
+        grinder.look(Duration::from_secs(now + 2), job).unwrap()
+    };
+    let said = settled(&mut grinder).said.join("\n");
+    assert!(
+        said.contains("done.json lay there before") && said.contains("waiting for the start to be confirmed"),
+        "{said}"
+    );
+    shop.put("started.json", r#"{"map": "0123456789abcdef"}"#);
+    let look = settled(&mut grinder);
+    assert!(
+        !look.begun && look.said.join("\n").contains("confirms map `0123456789abcdef`, handed over was map"),
+        "{:?}",
+        look.said
+    );
+    fs::copy(folder.join("started.json"), shop.inbox.join("started.json")).unwrap();
+    let look = settled(&mut grinder);
+    assert!(
+        look.begun && look.answer.is_none() && look.said.join("\n").contains("waiting for the end"),
+        "{:?}",
+        look.said
+    );
+    shop.put(
+        "done.json",
+        &fs::read_to_string(folder.join("done.json")).unwrap().replace("\"cycle\": 2", "\"cycle\": 1"),
+    );
+    assert!(settled(&mut grinder).said.join("\n").contains("confirms job 3 cycle 1, handed over was job 3 cycle 2"));
+    shop.put("done.json", "{\"map\"");
+    assert!(settled(&mut grinder).said.join("\n").contains("expected JSON"));
+    fs::copy(folder.join("done.json"), shop.inbox.join("done.json")).unwrap();
+    let record = settled(&mut grinder).answer.unwrap();
+    assert_eq!((record.map_identity, record.outcome, record.wheel_radius_mm), (map_identity, Outcome::Complete, 100.0));
+    assert!(record.duration_s > 0.0 && record.cycle == 2);
+    assert!(matches!(
+        grinder.publish(job, 5, &GrindOrder { map: map(), pass: pass(), map_identity }),
+        Err(MailboxError::HandedOver { .. })
+    ));
+    let wrong = grinder.confirm(job, Step::Done, [1; 32]);
+    assert_eq!(wrong, Err(MailboxError::OtherMap { expected: map_identity, found: [1; 32] }));
+}
+
+// ---- the drivers -----------------------------------------------------------------------------------------------------------------
+
+fn at_once(settings: CmmExchange) -> CmmExchange {
+    CmmExchange { stable_for: Duration::ZERO, ..settings }
+}
+
+async fn connected(shop: &Shop) -> ExchangeMachine<CmmFolders> {
+    let folders = CmmFolders::new(at_once(shop.cmm()));
+    let mut cmm = ExchangeMachine::new("cmm", MachineKind::Cmm, folders, ExchangeTiming::default());
+    assert_eq!(cmm.connect().await.unwrap().kind, MachineKind::Cmm);
+    cmm.claim().await.unwrap();
+    cmm
+}
+
+fn answer_of<T: std::fmt::Debug>(told: Result<T, DeviceError>) -> Answer {
+    match told.unwrap_err() {
+        DeviceError::Refused { answer, .. } => answer,
+        other => panic!("{other}"),
+    }
+}
+
+#[tokio::test]
+async fn a_measuring_machine_goes_through_the_states_of_a_wire() {
+    let shop = Shop::new();
+    let mut cmm = connected(&shop).await;
+    let plan = plan(3);
+    let job = Job { job: 3, cycle: 2, digest: digest(&[plan.identity()]) };
+    assert_eq!(answer_of(cmm.prepare(job).await), Answer::PayloadMissing);
+    cmm.load_plan(&plan, &Interrupt::new()).await.unwrap();
+    assert_eq!(answer_of(cmm.prepare(Job { digest: 1, ..job }).await), Answer::OtherJob);
+    let armed = cmm.prepare(job).await.unwrap();
+    assert_eq!(cmm.status().await.unwrap().state, State::Prepared);
+    assert!(shop.handed().is_empty());
+    assert!(matches!(cmm.reconcile(&armed).await.unwrap(), Reconciled::NotStarted(_)));
+    let started = cmm.start(armed.clone()).await.unwrap();
+    assert_eq!((started.status.state, shop.handed().len()), (State::Execute, 1));
+    assert_eq!(answer_of(cmm.start(armed.clone()).await), Answer::WrongState);
+    assert!(matches!(Cmm::collect(&mut cmm, job, &Interrupt::new()).await, Err(DeviceError::NoResult { .. })));
+    // Held, the plan is not there to be taken; resumed, it is.
+    assert_eq!(cmm.hold().await.unwrap().state, State::Held);
+    assert_eq!(shop.handed(), ["SN_7_j3_c2.held"]);
+    assert_eq!(cmm.resume().await.unwrap().state, State::Execute);
+    assert!(cmm.status().await.unwrap().state == State::Execute && cmm.notes()[0].contains("waiting for"));
+    shop.put("SN_7_c2.csv", &three());
+    let status = cmm.status().await.unwrap();
+    assert_eq!((status.state, status.outcome, status.done), (State::Complete, Outcome::Complete, armed.start_sequence));
+    let found = Cmm::collect(&mut cmm, job, &Interrupt::new()).await.unwrap();
+    assert_eq!((found.points.len(), found.done), (3, status.done));
+    assert_eq!(answer_of(cmm.acknowledge(status.done + 1).await), Answer::OtherResult);
+    assert_eq!(cmm.acknowledge(status.done).await.unwrap().state, State::Idle);
+    assert_eq!(shop.handed(), ["SN_7_j3_c2.done"]);
+    assert_eq!(answer_of(cmm.prepare(job).await), Answer::AlreadyBegun);
+}
+
+#[tokio::test]
+async fn a_restarted_client_learns_what_became_of_its_start() {
+    let shop = Shop::new();
+    let mut cmm = connected(&shop).await;
+    let plan = plan(3);
+    let job = Job { job: 3, cycle: 2, digest: digest(&[plan.identity()]) };
+    cmm.load_plan(&plan, &Interrupt::new()).await.unwrap();
+    let armed = cmm.prepare(job).await.unwrap();
+    // The future is dropped at once: the work behind it is done or not, but never half, and the folder tells which.
+    drop(cmm.start(armed.clone()));
+    cmm.start(armed.clone()).await.unwrap();
+    drop(cmm);
+    let mut cmm = connected(&shop).await;
+    assert_eq!(cmm.status().await.unwrap().state, State::Execute);
+    assert!(matches!(cmm.reconcile(&armed).await.unwrap(), Reconciled::Running(s) if s.state == State::Execute));
+    let other = regrind::device::Armed { start_sequence: 9, ..armed.clone() };
+    assert!(matches!(cmm.reconcile(&other).await.unwrap(), Reconciled::Unknown { .. }));
+    assert_eq!(cmm.stop().await.unwrap().outcome, Outcome::Stopped);
+    assert_eq!(shop.handed(), ["SN_7_j3_c2.stopped"]);
+    assert!(matches!(cmm.reconcile(&armed).await.unwrap(), Reconciled::Finished(s) if s.outcome == Outcome::Stopped));
+    cmm.acknowledge(armed.start_sequence).await.unwrap();
+    // An abort takes the next one back for good.
+    let next = Job { cycle: 3, ..job };
+    cmm.load_plan(&plan, &Interrupt::new()).await.unwrap();
+    let armed = cmm.prepare(next).await.unwrap();
+    assert_eq!(armed.start_sequence, 2);
+    cmm.start(armed).await.unwrap();
+    assert_eq!(cmm.abort().await.unwrap().state, State::Aborted);
+    assert_eq!(shop.handed(), ["SN_7_j3_c2.stopped", "SN_7_j3_c3.aborted"]);
+    assert_eq!(cmm.clear().await.unwrap().state, State::Idle);
+}
+
+#[tokio::test]
+async fn a_grinder_is_begun_and_ended_by_a_persons_word() {
+    let shop = Shop::new();
+    let stable_for = Duration::ZERO;
+    let (outbox, inbox) = (shop.outbox.clone(), shop.inbox.clone());
+    let folders = GrinderFolders::new(GrinderExchange { part: "SN 7".into(), outbox, inbox, stable_for });
+    let mut grinder = ExchangeMachine::new("grinder", MachineKind::Grinder, folders, ExchangeTiming::default());
+    assert!(matches!(grinder.status().await, Err(DeviceError::NotConnected { .. })));
+    grinder.connect().await.unwrap();
+    let (map, pass) = (map(), pass());
+    grinder.load_pass(&map, &pass, &Interrupt::new()).await.unwrap();
+    let job = Job { job: 3, cycle: 0, digest: digest(&[map.identity(), pass.identity()]) };
+    assert_eq!(answer_of(grinder.prepare(job).await), Answer::NotOwner);
+    grinder.claim().await.unwrap();
+    let armed = grinder.prepare(job).await.unwrap();
+    assert_eq!(answer_of(grinder.confirm_done(map.identity()).await), Answer::WrongState);
+    grinder.start(armed).await.unwrap();
+    assert!(matches!(grinder.confirm_started([9; 32]).await, Err(DeviceError::Mismatch { .. })));
+    grinder.confirm_started(map.identity()).await.unwrap();
+    assert_eq!(grinder.status().await.unwrap().state, State::Execute);
+    grinder.confirm_done(map.identity()).await.unwrap();
+    let status = grinder.status().await.unwrap();
+    assert_eq!(status.state, State::Complete);
+    let record = Grinder::collect(&mut grinder, job, &Interrupt::new()).await.unwrap();
+    assert_eq!(record.map_identity, map.identity());
+    grinder.acknowledge(status.done).await.unwrap();
+    grinder.load_pass(&map, &pass, &Interrupt::new()).await.unwrap();
+    assert_eq!(answer_of(grinder.prepare(job).await), Answer::AlreadyBegun);
+}
+
+#[tokio::test]
+async fn a_folder_that_is_not_there_is_named() {
+    let settings = CmmExchange::new("p", "/nowhere/out", Path::new("/nowhere/in"));
+    let mut cmm = ExchangeMachine::new("cmm", MachineKind::Cmm, CmmFolders::new(settings), ExchangeTiming::default());
+    let error = cmm.connect().await.unwrap_err();
+    assert!(error.is_link() && error.to_string().contains("/nowhere/out"), "{error}");
+}
