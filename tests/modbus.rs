@@ -10,9 +10,9 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use regrind::device::{
-    Answer, Armed, Cmm, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Link, Machine, MachineKind,
-    Measurement, ModbusCmm, ModbusGrinder, ModbusSettings, Outcome, Parity, Pass, Plan, PointStatus, Reconciled,
-    RegisterMap, Signal, SignalType, State, Target, TargetKind, Wire, WordOrder, digest,
+    Answer, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Link, Machine,
+    MachineKind, Measurement, ModbusCmm, ModbusGrinder, ModbusSettings, Outcome, Parity, Pass, Plan, PointStatus,
+    Reconciled, RegisterMap, Signal, SignalType, State, Target, TargetKind, Wire, WordOrder, digest,
 };
 use regrind_sim::body::Kind;
 use regrind_sim::registers::{Layout, MachineOptions};
@@ -494,14 +494,23 @@ async fn a_start_whose_answer_is_lost_is_the_same_start_when_it_is_written_again
     assert_eq!(began(&serving), [(sequence, 42, 1)]);
 }
 
+/// Nothing gets through after the first START, nor does that if it is lost too.
+fn silent_from_start(lost: bool) -> FaultPlan {
+    let mut seen = false;
+    let rule = When::Matching(Box::new(move |request| {
+        let first = !seen && request.command == Some(3);
+        seen |= first;
+        if first { lost } else { seen }
+    }));
+    FaultPlan::new(0).always(rule, Fault::DropRequest)
+}
+
 #[tokio::test]
 async fn a_start_that_is_lost_with_the_line_is_unknown_and_then_found_to_run() {
     let (serving, plan) = (serve(Kind::Cmm, 1.0, Faults::none()).await, plan(100));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     // It is carried out, and from then on nothing answers.
-    let silence =
-        FaultPlan::new(0).once(When::Commanding(3), Fault::DropReply).times(2, u64::MAX, When::Any, Fault::DropRequest);
-    serving.faults().set(silence);
+    serving.faults().set(silent_from_start(false).once(When::Commanding(3), Fault::DropReply));
     let unknown = cmm.start(armed.clone()).await;
     assert!(matches!(&unknown, Err(DeviceError::StartUnknown { sequence, .. }) if *sequence == armed.start_sequence));
     serving.faults().set(FaultPlan::new(0));
@@ -515,7 +524,7 @@ async fn a_start_that_is_lost_with_the_line_is_unknown_and_then_found_to_run() {
 async fn a_start_that_never_arrived_is_seen_twice_not_to_have() {
     let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, Faults::none()).await, plan(10));
     let (mut cmm, armed) = armed(&serving, &plan).await;
-    serving.faults().set(FaultPlan::new(0).always(When::Any, Fault::DropRequest));
+    serving.faults().set(silent_from_start(true));
     let unknown = cmm.start(armed.clone()).await;
     assert!(matches!(unknown, Err(DeviceError::StartUnknown { .. })), "{unknown:?}");
     serving.faults().set(FaultPlan::new(0));
@@ -624,13 +633,74 @@ async fn faults_on_a_serial_line_end_in_the_right_points() {
     }
 }
 
+#[tokio::test]
+async fn an_answer_that_comes_after_the_quarantine_is_not_taken_for_the_next_one() {
+    let plan = plan(20);
+    let rules = FaultPlan::new(5).times(2, 2, When::Reading(64), Fault::DelayReply(Duration::from_millis(900))).times(
+        3,
+        2,
+        When::Reading(462),
+        Fault::DelayReply(Duration::from_millis(900)),
+    );
+    let machine = toy(Kind::Cmm, AT_ONCE, MachineOptions::default());
+    let (serving, settings) = rtu(vec![(1, machine)], Line::unpaced(115_200), rules.into());
+    let mut cmm = ModbusCmm::new(settings).unwrap();
+    cmm.connect().await.unwrap();
+    assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), "late");
+    assert_eq!((serving.faults().fired().len(), began(&serving).len()), (4, 1));
+    assert!(cmm.link().figures().timeouts >= 4, "{:?}", cmm.link().figures());
+}
+
+#[tokio::test]
+async fn a_prepared_job_that_has_died_is_not_started() {
+    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, Faults::none()).await, plan(10));
+    let (mut cmm, armed) = armed(&serving, &plan).await;
+    serving.machine(1).unwrap().with(|machine| machine.open_interlocks(1));
+    let refused = cmm.start(armed).await;
+    assert!(matches!(refused, Err(DeviceError::Refused { command: Command::Start, .. })), "{refused:?}");
+    assert!(began(&serving).is_empty());
+}
+
+#[tokio::test]
+async fn a_hold_is_on_the_wire_within_a_tenth_of_a_second_whatever_is_being_transferred() {
+    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    let mut cmm = ModbusCmm::new(settings(&serving)).unwrap();
+    cmm.connect().await.unwrap();
+    cmm.claim().await.unwrap();
+    let plan = plan(4000);
+    let mut waits = Vec::new();
+    for _ in 0..40 {
+        let interrupt = Interrupt::new();
+        let raiser = interrupt.clone();
+        let pages = Arc::new(AtomicU32::new(0));
+        serving.faults().set(FaultPlan::new(0).always(
+            When::Matching(Box::new(move |request| {
+                if request.function == 16 && request.address == 224 && pages.fetch_add(1, Ordering::SeqCst) == 30 {
+                    raiser.raise();
+                }
+                false
+            })),
+            Fault::DropReply,
+        ));
+        let broken = cmm.load_plan(&plan, &interrupt).await;
+        assert!(matches!(broken, Err(DeviceError::Interrupted { .. })), "{broken:?}");
+        let raised = Instant::now();
+        let refused = cmm.hold().await; // it is idle, so it says no, but it says so
+        waits.push(raised.elapsed());
+        assert!(matches!(refused, Err(DeviceError::Refused { command: Command::Hold, .. })), "{refused:?}");
+    }
+    waits.sort();
+    println!("hold acknowledged: median {:.1?}, worst {:.1?} of 40", waits[20], waits[39]);
+    assert!(waits[20] < Duration::from_millis(100), "median {:?}", waits[20]);
+}
+
 /// The figure of the README: run with `--ignored --nocapture`.
 #[tokio::test]
 #[ignore = "takes as long as a line of 115,200 baud takes, half a minute"]
 async fn eighteen_hundred_points_over_a_serial_line() {
     let machine = toy(Kind::Cmm, AT_ONCE, MachineOptions::default());
     let (_serving, settings) = rtu(vec![(1, machine)], Line::paced(115_200), Faults::none());
-    let mut cmm = ModbusCmm::new(settings).unwrap();
+    let mut cmm = ModbusCmm::new(ModbusSettings { request_timeout: Duration::from_secs(2), ..settings }).unwrap();
     cmm.connect().await.unwrap();
     cmm.claim().await.unwrap();
     let (plan, calm) = (plan(1800), Interrupt::new());
