@@ -2,16 +2,19 @@
 
 #![cfg(unix)]
 
+#[path = "common/toy.rs"]
+mod toy;
+
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use regrind::device::{
-    Answer, Armed, Cmm, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Link, Machine, MachineKind,
-    Measurement, ModbusCmm, ModbusGrinder, ModbusSettings, Outcome, Parity, Pass, Plan, PointStatus, Reconciled,
-    RegisterMap, Signal, SignalType, State, Target, TargetKind, Wire, WordOrder, digest,
+    Answer, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Link, Machine,
+    MachineKind, Measurement, ModbusCmm, ModbusGrinder, ModbusSettings, Outcome, Parity, Pass, Plan, PointStatus,
+    Reconciled, RegisterMap, Signal, SignalType, State, Target, TargetKind, Wire, WordOrder, digest,
 };
-use regrind_sim::body::{self, Body, Kind, Payload, Payloads, Progress, Refusal};
+use regrind_sim::body::Kind;
 use regrind_sim::registers::{Layout, MachineOptions};
 use regrind_sim::wire::Serving;
 use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, When};
@@ -20,103 +23,9 @@ use regrind_sim::{registers, words};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpListener;
 
+use toy::Toy;
+
 // ---- machines to talk to ------------------------------------------------------------------------------------------------------------
-
-/// A measuring machine whose probe touches exactly where it was told to, or a grinder that only says what it did.
-struct Toy {
-    kind: Kind,
-    payloads: Payloads,
-    work: (u32, u16),
-    done: u32,
-    points_a_second: f64,
-    moved_s: f64,
-}
-
-impl Toy {
-    fn new(kind: Kind, points_a_second: f64) -> Self {
-        Self { kind, payloads: Payloads::default(), work: (0, 0), done: 0, points_a_second, moved_s: 0.0 }
-    }
-
-    fn total(&self) -> u32 {
-        let plan = self.payloads.plan.as_ref();
-        plan.map_or(1000, |plan| ((plan.bytes.len() - 64) / 56) as u32)
-    }
-
-    fn points(&self) -> Vec<u8> {
-        let plan = self.payloads.plan.as_ref().map(|plan| &plan.bytes[..]).unwrap_or_default();
-        let real = |at: usize| f64::from_be_bytes(plan[at..at + 8].try_into().unwrap());
-        let radius_mm = real(8);
-        let mut records = Vec::new();
-        for at in (64..plan.len()).step_by(56) {
-            records.extend(&plan[at..at + 4]);
-            records.extend([0, 1, 0, 0]);
-            for axis in 0..3 {
-                let centre_mm = real(at + 8 + 8 * axis) + radius_mm * real(at + 32 + 8 * axis);
-                records.extend(centre_mm.to_be_bytes());
-            }
-        }
-        records
-    }
-
-    fn record(&self, result: u16) -> Vec<u8> {
-        let mut record = Vec::new();
-        record.extend(self.work.0.to_be_bytes());
-        record.extend(self.work.1.to_be_bytes());
-        record.extend(result.to_be_bytes());
-        for figure in [1234.5, 67.8, 0.02, 0.25, 0.5, 25.0, 0.0] {
-            record.extend(f64::to_be_bytes(figure));
-        }
-        record
-    }
-}
-
-impl Body for Toy {
-    fn kind(&self) -> Kind {
-        self.kind
-    }
-    fn name(&self) -> String {
-        "Toy 1".into()
-    }
-    fn check(&self, _: u16, payload: &Payload) -> Result<(), Refusal> {
-        match payload.bytes.first_chunk() {
-            Some([0, 1]) => Ok(()),
-            _ => Err(Refusal { answer: 8, reason: "not format 1".into() }),
-        }
-    }
-    fn prepare(&mut self, job: u32, cycle: u16, payloads: &Payloads) -> Result<Progress, Refusal> {
-        (self.work, self.payloads, self.done, self.moved_s) = ((job, cycle), payloads.clone(), 0, 0.0);
-        Ok(Progress { total: self.total(), ..Progress::default() })
-    }
-    fn begin(&mut self) {}
-    fn advance(&mut self, seconds: f64) -> Progress {
-        self.moved_s += seconds;
-        let total = self.total();
-        self.done = ((self.moved_s * self.points_a_second) as u32).min(total);
-        Progress { done: self.done, total, finished: self.done == total, fault: 0 }
-    }
-    fn retract(&mut self) {}
-    fn outcome(&mut self, result: u16) -> body::Outcome {
-        let cmm = self.kind == Kind::Cmm;
-        let bytes = if cmm { self.points() } else { self.record(result) };
-        body::Outcome {
-            kind: if cmm { 4 } else { 5 },
-            format: 1,
-            records: if cmm { self.total() } else { 1 },
-            bytes,
-            coordinates: u16::from(cmm),
-            probe_radius_mm: if cmm { 2.0 } else { 0.0 },
-            scale_mm: 1.0,
-            temperature_c: 20.5,
-            duration_s: self.moved_s,
-        }
-    }
-    fn interlocks(&self) -> u16 {
-        15
-    }
-    fn temperature_c(&self) -> f64 {
-        20.25
-    }
-}
 
 fn toy(kind: Kind, points_a_second: f64, options: MachineOptions) -> registers::Machine {
     registers::Machine::new(Box::new(Toy::new(kind, points_a_second)), 0xb007, options)
@@ -585,14 +494,23 @@ async fn a_start_whose_answer_is_lost_is_the_same_start_when_it_is_written_again
     assert_eq!(began(&serving), [(sequence, 42, 1)]);
 }
 
+/// Nothing gets through after the first START, nor does that if it is lost too.
+fn silent_from_start(lost: bool) -> FaultPlan {
+    let mut seen = false;
+    let rule = When::Matching(Box::new(move |request| {
+        let first = !seen && request.command == Some(3);
+        seen |= first;
+        if first { lost } else { seen }
+    }));
+    FaultPlan::new(0).always(rule, Fault::DropRequest)
+}
+
 #[tokio::test]
 async fn a_start_that_is_lost_with_the_line_is_unknown_and_then_found_to_run() {
     let (serving, plan) = (serve(Kind::Cmm, 1.0, Faults::none()).await, plan(100));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     // It is carried out, and from then on nothing answers.
-    let silence =
-        FaultPlan::new(0).once(When::Commanding(3), Fault::DropReply).times(2, u64::MAX, When::Any, Fault::DropRequest);
-    serving.faults().set(silence);
+    serving.faults().set(silent_from_start(false).once(When::Commanding(3), Fault::DropReply));
     let unknown = cmm.start(armed.clone()).await;
     assert!(matches!(&unknown, Err(DeviceError::StartUnknown { sequence, .. }) if *sequence == armed.start_sequence));
     serving.faults().set(FaultPlan::new(0));
@@ -606,7 +524,7 @@ async fn a_start_that_is_lost_with_the_line_is_unknown_and_then_found_to_run() {
 async fn a_start_that_never_arrived_is_seen_twice_not_to_have() {
     let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, Faults::none()).await, plan(10));
     let (mut cmm, armed) = armed(&serving, &plan).await;
-    serving.faults().set(FaultPlan::new(0).always(When::Any, Fault::DropRequest));
+    serving.faults().set(silent_from_start(true));
     let unknown = cmm.start(armed.clone()).await;
     assert!(matches!(unknown, Err(DeviceError::StartUnknown { .. })), "{unknown:?}");
     serving.faults().set(FaultPlan::new(0));
@@ -715,13 +633,74 @@ async fn faults_on_a_serial_line_end_in_the_right_points() {
     }
 }
 
+#[tokio::test]
+async fn an_answer_that_comes_after_the_quarantine_is_not_taken_for_the_next_one() {
+    let plan = plan(20);
+    let rules = FaultPlan::new(5).times(2, 2, When::Reading(64), Fault::DelayReply(Duration::from_millis(900))).times(
+        3,
+        2,
+        When::Reading(462),
+        Fault::DelayReply(Duration::from_millis(900)),
+    );
+    let machine = toy(Kind::Cmm, AT_ONCE, MachineOptions::default());
+    let (serving, settings) = rtu(vec![(1, machine)], Line::unpaced(115_200), rules.into());
+    let mut cmm = ModbusCmm::new(settings).unwrap();
+    cmm.connect().await.unwrap();
+    assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), "late");
+    assert_eq!((serving.faults().fired().len(), began(&serving).len()), (4, 1));
+    assert!(cmm.link().figures().timeouts >= 4, "{:?}", cmm.link().figures());
+}
+
+#[tokio::test]
+async fn a_prepared_job_that_has_died_is_not_started() {
+    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, Faults::none()).await, plan(10));
+    let (mut cmm, armed) = armed(&serving, &plan).await;
+    serving.machine(1).unwrap().with(|machine| machine.open_interlocks(1));
+    let refused = cmm.start(armed).await;
+    assert!(matches!(refused, Err(DeviceError::Refused { command: Command::Start, .. })), "{refused:?}");
+    assert!(began(&serving).is_empty());
+}
+
+#[tokio::test]
+async fn a_hold_is_on_the_wire_within_a_tenth_of_a_second_whatever_is_being_transferred() {
+    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    let mut cmm = ModbusCmm::new(settings(&serving)).unwrap();
+    cmm.connect().await.unwrap();
+    cmm.claim().await.unwrap();
+    let plan = plan(4000);
+    let mut waits = Vec::new();
+    for _ in 0..40 {
+        let interrupt = Interrupt::new();
+        let raiser = interrupt.clone();
+        let pages = Arc::new(AtomicU32::new(0));
+        serving.faults().set(FaultPlan::new(0).always(
+            When::Matching(Box::new(move |request| {
+                if request.function == 16 && request.address == 224 && pages.fetch_add(1, Ordering::SeqCst) == 30 {
+                    raiser.raise();
+                }
+                false
+            })),
+            Fault::DropReply,
+        ));
+        let broken = cmm.load_plan(&plan, &interrupt).await;
+        assert!(matches!(broken, Err(DeviceError::Interrupted { .. })), "{broken:?}");
+        let raised = Instant::now();
+        let refused = cmm.hold().await; // it is idle, so it says no, but it says so
+        waits.push(raised.elapsed());
+        assert!(matches!(refused, Err(DeviceError::Refused { command: Command::Hold, .. })), "{refused:?}");
+    }
+    waits.sort();
+    println!("hold acknowledged: median {:.1?}, worst {:.1?} of 40", waits[20], waits[39]);
+    assert!(waits[20] < Duration::from_millis(100), "median {:?}", waits[20]);
+}
+
 /// The figure of the README: run with `--ignored --nocapture`.
 #[tokio::test]
 #[ignore = "takes as long as a line of 115,200 baud takes, half a minute"]
 async fn eighteen_hundred_points_over_a_serial_line() {
     let machine = toy(Kind::Cmm, AT_ONCE, MachineOptions::default());
     let (_serving, settings) = rtu(vec![(1, machine)], Line::paced(115_200), Faults::none());
-    let mut cmm = ModbusCmm::new(settings).unwrap();
+    let mut cmm = ModbusCmm::new(ModbusSettings { request_timeout: Duration::from_secs(2), ..settings }).unwrap();
     cmm.connect().await.unwrap();
     cmm.claim().await.unwrap();
     let (plan, calm) = (plan(1800), Interrupt::new());

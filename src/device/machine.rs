@@ -29,8 +29,12 @@ pub trait Machine: Send {
     /// [`Machine::start`].
     fn prepare(&mut self, job: Job) -> impl Future<Output = Result<Armed, DeviceError>> + Send;
 
-    /// Begins the job, at most once. An `Armed` is used up by this, however it ends: after [`DeviceError::StartUnknown`] only
-    /// [`Machine::reconcile`] can tell what became of it, and after a refusal the job is to be prepared anew.
+    /// Begins the job, at most once. An `Armed` is used up by this, however it ends.
+    ///
+    /// * `Ok`: the machine says that this very START has begun the job.
+    /// * [`DeviceError::Refused`]: the machine, or its state before anything was sent, said no; the job was not begun by it. Prepare anew.
+    /// * [`DeviceError::StartUnknown`], or the future dropped: nobody knows. Only [`Machine::reconcile`] can tell what became of it.
+    /// * Anything else comes from before the START: for an `Armed` that is used for the first time nothing was begun.
     fn start(&mut self, armed: Armed) -> impl Future<Output = Result<Started, DeviceError>> + Send;
 
     /// Stops at the next safe place, wheel or probe clear.

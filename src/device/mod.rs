@@ -16,8 +16,10 @@
 //! recipes, cells, surfaces or journals.
 //!
 //! One value of a driver is used by one task. Its futures may be dropped at any `.await`: a request that is on its way is finished and
-//! its answer forgotten, the connection stays in order. To break off a long transfer politely raise its [`Interrupt`].
+//! its answer forgotten, the connection stays in order (but a `start` that is dropped has to be reconciled). To break off a long transfer
+//! politely raise its [`Interrupt`].
 
+mod any;
 mod codec;
 mod error;
 pub mod exchange;
@@ -28,6 +30,7 @@ mod payload;
 mod station;
 mod words;
 
+pub use any::{AnyCmm, AnyGrinder};
 pub use codec::WordOrder;
 pub use error::DeviceError;
 pub use link::{Link, LinkFigures, Parity, Wire};

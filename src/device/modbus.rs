@@ -458,6 +458,13 @@ impl ModbusMachine {
             // Nothing has been sent: whatever was prepared died with the machine's restart.
             return Err(DeviceError::Restarted { machine: self.machine(), was: boot_id, is: known });
         }
+        // Nothing has been sent yet, so a failure here is only that; and a prepared job that has died since is a clear no.
+        let before = self.look().await?;
+        let taken = before.begun_by == start_sequence || before.acknowledged == start_sequence;
+        if !taken && (before.state != State::Prepared || before.token != token) {
+            let (command, answer, state) = (Command::Start, Answer::DeadToken, before.state);
+            return Err(DeviceError::Refused { machine: self.machine(), command, answer, state });
+        }
         let (owner, epoch) = (self.owner, self.epoch);
         let frame = CommandFrame {
             sequence: start_sequence,

@@ -1,7 +1,7 @@
 """A machine of docs/modbus.md on pymodbus, written from that page alone: registers, handshake, payloads, results.
 
-It is small and kind: it moves at once, never fails, and has no interlock that opens. What it does with a job is left to the two machines
-that import it.
+It is small and kind: it never fails, has no interlock that opens, and comes to a halt at once. What it does with a job is left to the
+two machines that import it. Words stand high first.
 """
 
 import argparse
@@ -15,16 +15,29 @@ from pymodbus.constants import ExcCodes
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-IDLE, PREPARED, EXECUTE, HELD, COMPLETE, ABORTED = 1, 2, 3, 5, 7, 9
+IDLE, PREPARED, EXECUTE, HELD, COMPLETE, ABORTED, FAULTED = 1, 2, 3, 5, 7, 9, 10
 CLAIM, PREPARE, START, HOLD, RESUME, STOP, ABORT, CLEAR, ACKNOWLEDGE, RELEASE = range(1, 11)
-ACCEPTED, NOT_OWNER, WRONG_STATE, UNKNOWN, TOKEN, OTHER, BEGUN, PAYLOAD, _, _, ARGUMENT = range(1, 12)
-READABLE = [(0, 32), (32, 4), (36, 1), (40, 20), (64, 48), (120, 72), (200, 24), (224, 120), (350, 12), (400, 56), (460, 2), (462, 116)]
+ACCEPTED, NOT_OWNER, WRONG_STATE, UNKNOWN, TOKEN, OTHER, BEGUN, PAYLOAD = range(1, 9)
+ARGUMENT = 11
+BLOCKS = [
+    (0, 32), (32, 4), (36, 1), (40, 20), (64, 48), (120, 72), (200, 24), (224, 120), (350, 12), (400, 56), (460, 2), (462, 116),
+]
 WRITABLE = [(32, 2), (36, 1), (40, 20), (200, 24), (224, 120), (460, 2)]
+ALLOWED = {
+    PREPARE: [IDLE],
+    START: [PREPARED],
+    HOLD: [EXECUTE],
+    RESUME: [HELD],
+    STOP: [PREPARED, EXECUTE, HELD],
+    CLEAR: [ABORTED, FAULTED],
+    ACKNOWLEDGE: [COMPLETE],
+    RELEASE: [IDLE, PREPARED, HELD, COMPLETE, ABORTED, FAULTED],
+}
 PAGE_BYTES = 224
 
 
 def registers_of(data):
-    data = data + b"\0" * (len(data) % 2)
+    data += b"\0" * (len(data) % 2)
     return list(struct.unpack(f">{len(data) // 2}H", data))
 
 
@@ -42,22 +55,27 @@ def crc16(data):
 
 
 class Machine:
-    """Everything that both machines have in common. Words stand high first."""
+    """Everything that both machines have in common."""
 
-    def __init__(self, kind, name, needs):
-        self.kind, self.name, self.needs = kind, name, needs
+    kind = 0
+    name = ""
+    payloads = ()
+    seconds = 0.2
+
+    def __init__(self):
         self.boot_id = random.randint(1, 0xFFFFFFFF)
         self.state, self.answer, self.acknowledged = IDLE, 0, 0
-        self.job = self.cycle = self.digest = self.token = 0
-        self.done = self.result = self.begun_by = 0
-        self.owner = self.epoch = 0
-        self.last_begun = (0, 0)
-        self.snapshot, self.last_image = 0, None
+        self.job = (0, 0, 0)
+        self.token = self.done = self.result = self.begun_by = 0
+        self.owner = self.epoch = self.heard = 0
+        self.begun = []
+        self.snapshot, self.shown = 0, b""
         self.slots = {}
-        self.header = None
-        self.pages, self.received, self.inbox_state, self.reason = 0, b"", 0, 0
+        self.inbox = (0, 0, 0, bytes(32))
+        self.received, self.inbox_state, self.reason = b"", 0, 0
         self.outbox = None
-        self.started_at = 0.0
+        self.moved = 0.0
+        self.since = time.monotonic()
 
     # What the two machines fill in.
 
@@ -69,29 +87,33 @@ class Machine:
         return 1000
 
     def work(self):
-        """The result of the job: kind, format, bytes, records, coordinates, probe radius, identity."""
+        """The result: kind, format, bytes, records, what the coordinates are, probe radius, identity of what was used."""
         raise NotImplementedError
 
     # Registers.
 
-    async def access(self, function, start, address, count, registers, values):
+    async def access(self, function, _start, address, count, registers, values):
         """Called by pymodbus before each read and each write."""
         if function not in (3, 16):
             return ExcCodes.ILLEGAL_FUNCTION
+        blocks = BLOCKS if values is None else WRITABLE
         if values is None:
-            if not all(any(a <= r < a + n for a, n in READABLE) for r in range(address, address + count)):
-                return ExcCodes.ILLEGAL_ADDRESS
-            self.advance()
-            self.show(registers)
-            return None
-        if not any(a <= address and address + count <= a + n for a, n in WRITABLE):
+            inside = all(any(a <= r < a + n for a, n in blocks) for r in range(address, address + count))
+        else:
+            inside = any(a <= address and address + count <= a + n for a, n in blocks)
+        if not inside:
             return ExcCodes.ILLEGAL_ADDRESS
-        if address == 200:
-            return None if self.announce(values) else ExcCodes.ILLEGAL_VALUE
-        if address == 224:
-            return None if self.page(values) else ExcCodes.ILLEGAL_VALUE
-        if address <= 59 and address + count == 60:
-            self.command((registers[40:address] + list(values))[:20])
+        self.advance()
+        if values is None:
+            self.show(registers)
+        elif address == 200:
+            return None if count == 24 and self.header(bytes_of(values)) else ExcCodes.ILLEGAL_VALUE
+        elif 224 <= address < 344:
+            return None if address == 224 and count > 8 and self.page(bytes_of(values)) else ExcCodes.ILLEGAL_VALUE
+        elif address == 36:
+            self.heard = time.monotonic()
+        elif address >= 40 and address + count == 60:
+            self.command(bytes_of(registers[40:address] + list(values)))
         return None
 
     def show(self, registers):
@@ -99,15 +121,176 @@ class Machine:
             words = registers_of(data)
             registers[at : at + len(words)] = words
 
-        put(0, struct.pack(">HHHHIdIHHHH", 0x5247, 0x4431, 1, self.kind, 0x12345678, -2.5e-7, self.boot_id, 1, 1, 0, 0))
-        put(32, self.name.encode("ascii")[:32].ljust(32, b"\0"))  # offset 16 registers is byte 32 of the block
-        registers[16:32], registers[32:48] = registers[32:48], registers[16:32]
-        registers[32:40] = self.kept(registers)
+        identity = struct.pack(">4HId", 0x5247, 0x4431, 1, self.kind, 0x12345678, -2.5e-7)
+        put(0, identity + struct.pack(">I4H", self.boot_id, 1, 1, 0, 0) + self.name.encode("ascii").ljust(32, b"\0"))
+        registers[34], registers[35] = registers[32] ^ 0xFFFF, registers[33] ^ 0xFFFF
         put(64, self.status(registers[36]))
         put(120, b"".join(self.slot(kind) for kind in (1, 2, 3)))
-        put(350, self.inbox())
+        kind, _, _, _ = self.inbox
+        pages = -(-len(self.received) // PAGE_BYTES)
+        crc = binascii.crc32(self.received)
+        put(350, struct.pack(">HHIIIHHHH", kind, self.inbox_state, pages, len(self.received), crc, self.reason, 0, 0, 0))
         put(400, self.outbox_header())
         put(462, self.outbox_page(registers[460] << 16 | registers[461]))
 
-    def kept(self, registers):
-        raise NotImplementedError
+    def status(self, echo):
+        progress = int(self.total() * min(1.0, self.moved / self.seconds)) if self.job[0] else 0
+        beat = int(time.monotonic() * 10) & 0xFFFF
+        last_job, last_cycle = self.begun[-1] if self.begun else (0, 0)
+        job, cycle, digest = self.job
+        body = struct.pack(">HHHIHH", self.state, 1, 15, self.acknowledged, self.answer, 0)
+        body += struct.pack(">IHHIIIHH", job, cycle, 0, digest, self.token, self.done, self.result, 0)
+        body += struct.pack(">IIIIHH", progress, self.total(), self.owner, self.epoch, beat, echo)
+        body += struct.pack(">IHhII", last_job, last_cycle, 2000, self.boot_id, self.begun_by) + bytes(18)
+        if body != self.shown:
+            self.snapshot, self.shown = (self.snapshot + 1) & 0xFFFF, body
+        number = struct.pack(">H", self.snapshot)
+        return number + body + number
+
+    def slot(self, kind):
+        if kind not in self.slots:
+            return struct.pack(">H46x", kind)
+        data, identity = self.slots[kind]
+        return struct.pack(">HHIIHH", kind, 1, len(data), binascii.crc32(data), 0, 0) + identity
+
+    # Payloads in, results out.
+
+    def header(self, data):
+        kind, _, size, crc = struct.unpack(">HHII", data[:12])
+        if kind not in self.payloads or self.state in (EXECUTE, HELD) or not 0 < size <= 1 << 26:
+            return False
+        self.inbox = (kind, size, crc, data[16:48])
+        self.received, self.inbox_state, self.reason = b"", 1, 0
+        return True
+
+    def page(self, data):
+        number, count = struct.unpack(">IH", data[:6])
+        kind, size, crc, identity = self.inbox
+        pages = -(-len(self.received) // PAGE_BYTES)
+        if self.inbox_state and number < pages:
+            return True
+        due = min(PAGE_BYTES, size - len(self.received))
+        if self.inbox_state != 1 or number != pages or count != -(-due // 2) or len(data) != 16 + 2 * count:
+            return False
+        self.received += data[16 : 16 + due]
+        if len(self.received) == size:
+            self.reason = self.refuse(kind, self.received)
+            self.inbox_state = 3 if binascii.crc32(self.received) != crc else 4 if self.reason else 2
+            if self.inbox_state == 2:
+                self.slots[kind] = (self.received, identity)
+        return True
+
+    def outbox_header(self):
+        if self.state != COMPLETE or self.outbox is None:
+            return bytes(112)
+        kind, form, data, records, coordinates, radius, identity = self.outbox
+        job, cycle, _ = self.job
+        head = struct.pack(">HHIIIHHI", kind, form, len(data), binascii.crc32(data), job, cycle, coordinates, records)
+        head += struct.pack(">ddddHH", radius, 1.0, 20.0, self.moved, 1, 0) + identity
+        return head + struct.pack(">I16x", self.done)
+
+    def outbox_page(self, number):
+        data = self.outbox[2][number * PAGE_BYTES : (number + 1) * PAGE_BYTES] if self.state == COMPLETE and self.outbox else b""
+        return (struct.pack(">IHH", number, len(data) // 2, 0) + data).ljust(232, b"\0")
+
+    # Commands.
+
+    def command(self, frame):
+        sequence, command, cycle, owner, epoch, job, digest, token, argument = struct.unpack(">IHHIIIIII", frame[:32])
+        crc, _, again = struct.unpack(">HHI", frame[32:40])
+        if crc != crc16(frame[:32]) or again != sequence or sequence in (0, self.acknowledged):
+            return
+        if sequence < self.acknowledged and command != CLAIM:
+            return
+        self.acknowledged = sequence
+        self.answer = self.judge(command, (job, cycle, digest), owner, epoch, token, argument)
+        if self.answer == ACCEPTED:
+            self.act(command, sequence, (job, cycle, digest), owner, epoch)
+
+    def judge(self, command, job, owner, epoch, token, argument):
+        if command == CLAIM:
+            silent = time.monotonic() - self.heard > 3.0
+            return ACCEPTED if self.owner == 0 or silent or (owner == self.owner and epoch >= self.epoch) else NOT_OWNER
+        if command == ABORT:
+            return ACCEPTED
+        if (owner, epoch) != (self.owner, self.epoch):
+            return NOT_OWNER
+        if command not in ALLOWED:
+            return UNKNOWN
+        if self.state not in ALLOWED[command]:
+            return WRONG_STATE
+        if command == PREPARE:
+            if any(kind not in self.slots for kind in self.payloads):
+                return PAYLOAD
+            identities = b"".join(self.slots[kind][1] for kind in self.payloads)
+            return ACCEPTED if job[0] and job[2] == binascii.crc32(identities) else OTHER
+        if command == START:
+            if token != self.token or not token:
+                return TOKEN
+            if job != self.job:
+                return OTHER
+            return BEGUN if job[:2] in self.begun else ACCEPTED
+        if command == ACKNOWLEDGE and argument != self.done:
+            return ARGUMENT
+        return ACCEPTED
+
+    def act(self, command, sequence, job, owner, epoch):
+        self.token = 0
+        if command == CLAIM:
+            self.owner, self.epoch, self.heard = owner, epoch, time.monotonic()
+        elif command == PREPARE:
+            self.state, self.job, self.token = PREPARED, job, random.randint(1, 0xFFFFFFFF)
+            self.begun_by, self.moved = 0, 0.0
+        elif command == START:
+            self.begun.append(job[:2])
+            self.state, self.begun_by, self.since = EXECUTE, sequence, time.monotonic()
+        elif command == HOLD:
+            self.state = HELD
+        elif command == RESUME:
+            self.state, self.since = EXECUTE, time.monotonic()
+        elif command == STOP:
+            if self.state == PREPARED:
+                self.state = IDLE
+            else:
+                self.end(COMPLETE, 2)
+        elif command == ABORT:
+            if self.state in (EXECUTE, HELD):
+                self.end(ABORTED, 3)
+            self.state = ABORTED
+        elif command == CLEAR:
+            self.state = IDLE
+        elif command == ACKNOWLEDGE:
+            self.state, self.done, self.result, self.outbox = IDLE, 0, 0, None
+        elif command == RELEASE:
+            self.owner = self.epoch = 0
+
+    def end(self, state, result):
+        self.state, self.done, self.result = state, self.begun_by, result
+        self.outbox = self.work()
+
+    def advance(self):
+        now = time.monotonic()
+        if self.state == EXECUTE:
+            self.moved += now - self.since
+            if self.moved >= self.seconds:
+                self.end(COMPLETE, 1)
+        self.since = now
+
+
+def serve(machine):
+    """Serves a machine until the process is ended; prints the port, which may have been chosen freely (port 0)."""
+    arguments = argparse.ArgumentParser()
+    arguments.add_argument("--host", default="127.0.0.1")
+    arguments.add_argument("--port", type=int, default=0)
+    arguments.add_argument("--unit", type=int, default=1)
+    given = arguments.parse_args()
+
+    async def main():
+        registers = SimData(0, values=[0] * 578, datatype=DataType.REGISTERS)
+        device = SimDevice(given.unit, simdata=[registers], action=machine.access)
+        server = ModbusTcpServer(device, address=(given.host, given.port))
+        await server.listen()
+        print("port", server.transport.sockets[0].getsockname()[1], flush=True)
+        await asyncio.Event().wait()
+
+    asyncio.run(main())

@@ -1,0 +1,100 @@
+//! A machine that does exactly what it is told, for tests of the wire.
+
+use regrind_sim::body::{self, Body, Kind, Payload, Payloads, Progress, Refusal};
+
+/// A measuring machine whose probe touches exactly where it was told to, or a grinder that only says what it did.
+pub struct Toy {
+    kind: Kind,
+    payloads: Payloads,
+    work: (u32, u16),
+    done: u32,
+    points_a_second: f64,
+    moved_s: f64,
+}
+
+impl Toy {
+    /// A machine that measures, or works off thousandths of its path, at a speed.
+    pub fn new(kind: Kind, points_a_second: f64) -> Self {
+        Self { kind, payloads: Payloads::default(), work: (0, 0), done: 0, points_a_second, moved_s: 0.0 }
+    }
+
+    fn total(&self) -> u32 {
+        let plan = self.payloads.plan.as_ref();
+        plan.map_or(1000, |plan| ((plan.bytes.len() - 64) / 56) as u32)
+    }
+
+    fn points(&self) -> Vec<u8> {
+        let plan = self.payloads.plan.as_ref().map(|plan| &plan.bytes[..]).unwrap_or_default();
+        let real = |at: usize| f64::from_be_bytes(plan[at..at + 8].try_into().unwrap());
+        let radius_mm = real(8);
+        let mut records = Vec::new();
+        for at in (64..plan.len()).step_by(56) {
+            records.extend(&plan[at..at + 4]);
+            records.extend([0, 1, 0, 0]);
+            for axis in 0..3 {
+                let centre_mm = real(at + 8 + 8 * axis) + radius_mm * real(at + 32 + 8 * axis);
+                records.extend(centre_mm.to_be_bytes());
+            }
+        }
+        records
+    }
+
+    fn record(&self, result: u16) -> Vec<u8> {
+        let mut record = Vec::new();
+        record.extend(self.work.0.to_be_bytes());
+        record.extend(self.work.1.to_be_bytes());
+        record.extend(result.to_be_bytes());
+        for figure in [1234.5, 67.8, 0.02, 0.25, 0.5, 25.0, 0.0] {
+            record.extend(f64::to_be_bytes(figure));
+        }
+        record
+    }
+}
+
+impl Body for Toy {
+    fn kind(&self) -> Kind {
+        self.kind
+    }
+    fn name(&self) -> String {
+        "Toy 1".into()
+    }
+    fn check(&self, _: u16, payload: &Payload) -> Result<(), Refusal> {
+        match payload.bytes.first_chunk() {
+            Some([0, 1]) => Ok(()),
+            _ => Err(Refusal { answer: 8, reason: "not format 1".into() }),
+        }
+    }
+    fn prepare(&mut self, job: u32, cycle: u16, payloads: &Payloads) -> Result<Progress, Refusal> {
+        (self.work, self.payloads, self.done, self.moved_s) = ((job, cycle), payloads.clone(), 0, 0.0);
+        Ok(Progress { total: self.total(), ..Progress::default() })
+    }
+    fn begin(&mut self) {}
+    fn advance(&mut self, seconds: f64) -> Progress {
+        self.moved_s += seconds;
+        let total = self.total();
+        self.done = ((self.moved_s * self.points_a_second) as u32).min(total);
+        Progress { done: self.done, total, finished: self.done == total, fault: 0 }
+    }
+    fn retract(&mut self) {}
+    fn outcome(&mut self, result: u16) -> body::Outcome {
+        let cmm = self.kind == Kind::Cmm;
+        let bytes = if cmm { self.points() } else { self.record(result) };
+        body::Outcome {
+            kind: if cmm { 4 } else { 5 },
+            format: 1,
+            records: if cmm { self.total() } else { 1 },
+            bytes,
+            coordinates: u16::from(cmm),
+            probe_radius_mm: if cmm { 2.0 } else { 0.0 },
+            scale_mm: 1.0,
+            temperature_c: 20.5,
+            duration_s: self.moved_s,
+        }
+    }
+    fn interlocks(&self) -> u16 {
+        15
+    }
+    fn temperature_c(&self) -> f64 {
+        20.25
+    }
+}

@@ -1,0 +1,221 @@
+//! Against other people's Modbus: machines and a client on pymodbus, written from docs/modbus.md alone (tests/interop/).
+//!
+//! They run with the Python that REGRIND_PYTHON names, which has to have pymodbus, or in an environment that is made below the target
+//! folder. Where neither can be had the tests say so and pass, unless REGRIND_INTEROP=1 says that they have to run.
+
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+use regrind::device::{
+    Cmm, Coordinates, CorrectionMap, Grinder, Identified, Interrupt, Job, Machine, MachineKind, ModbusCmm,
+    ModbusGrinder, ModbusSettings, Outcome, Pass, Plan, PointStatus, State, Status, Target, TargetKind, Wire, digest,
+};
+use regrind_sim::body::Kind;
+use regrind_sim::registers::{self, MachineOptions};
+use regrind_sim::wire::Serving;
+
+#[path = "common/toy.rs"]
+mod toy;
+
+// ---- Python -------------------------------------------------------------------------------------------------------------------------
+
+fn scripts() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop")
+}
+
+/// A Python that has pymodbus, made once.
+fn python() -> Option<&'static Path> {
+    static PYTHON: OnceLock<Result<PathBuf, String>> = OnceLock::new();
+    match PYTHON.get_or_init(find_python) {
+        Ok(python) => Some(python),
+        Err(why) => {
+            let must = std::env::var_os("REGRIND_INTEROP").is_some_and(|value| value == "1");
+            assert!(!must, "REGRIND_INTEROP=1, and there is no pymodbus: {why}");
+            println!("left out: no pymodbus to talk to ({why}); name a Python that has it in REGRIND_PYTHON");
+            None
+        }
+    }
+}
+
+fn find_python() -> Result<PathBuf, String> {
+    if let Some(named) = std::env::var_os("REGRIND_PYTHON") {
+        let named = PathBuf::from(named);
+        return run(Command::new(&named).args(["-c", "import pymodbus"])).map(|()| named);
+    }
+    let wanted = std::fs::read_to_string(scripts().join("requirements.txt")).map_err(|error| error.to_string())?;
+    let home = Path::new(env!("CARGO_TARGET_TMPDIR")).join("interop-python");
+    let python = home.join(if cfg!(windows) { "Scripts/python.exe" } else { "bin/python" });
+    let mark = home.join("has");
+    if std::fs::read_to_string(&mark).is_ok_and(|has| has == wanted) {
+        return Ok(python);
+    }
+    let base = if cfg!(windows) { "python" } else { "python3" };
+    run(Command::new(base).args(["-m", "venv"]).arg(&home))?;
+    let list = scripts().join("requirements.txt");
+    run(Command::new(&python).args(["-m", "pip", "install", "--quiet", "-r"]).arg(list))?;
+    std::fs::write(&mark, wanted).map_err(|error| error.to_string())?;
+    Ok(python)
+}
+
+fn run(command: &mut Command) -> Result<(), String> {
+    let done = command.output().map_err(|error| format!("{command:?}: {error}"))?;
+    match done.status.success() {
+        true => Ok(()),
+        false => Err(format!("{command:?}: {}", String::from_utf8_lossy(&done.stderr).trim())),
+    }
+}
+
+/// A machine in a process of its own, which ends with it.
+struct Process {
+    child: Child,
+    settings: ModbusSettings,
+}
+
+impl Process {
+    fn of(python: &Path, script: &str) -> Self {
+        let mut command = Command::new(python);
+        let mut child = command.arg(scripts().join(script)).stdout(Stdio::piped()).spawn().unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let port = line.trim().strip_prefix("port ").and_then(|port| port.parse().ok());
+        let port = port.unwrap_or_else(|| panic!("{script} said {line:?}"));
+        let settings = ModbusSettings {
+            request_timeout: Duration::from_secs(5),
+            ..ModbusSettings::new(Wire::Tcp { host: "127.0.0.1".into(), port })
+        };
+        Self { child, settings }
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+async fn until_complete<M: Machine>(machine: &mut M) -> Status {
+    let began = Instant::now();
+    loop {
+        let status = machine.status().await.unwrap();
+        if status.state == State::Complete {
+            return status;
+        }
+        assert!(began.elapsed() < Duration::from_secs(60), "not complete after a minute: {status:?}");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+// ---- our drivers, their machines ----------------------------------------------------------------------------------------------------
+
+fn plan() -> Plan {
+    let target = |index: u32| Target {
+        index,
+        what: TargetKind::Part,
+        point_mm: [f64::from(index), -0.25 * f64::from(index), 3.0],
+        normal: [0.6, 0.0, 0.8],
+    };
+    Plan {
+        targets: (0..200).map(target).collect(),
+        probe_radius_mm: 2.5,
+        approach_mm: 1.0,
+        search_mm: 1.0,
+        speed_mm_s: 2.0,
+        safe_height_mm: 20.0,
+    }
+}
+
+#[tokio::test]
+async fn our_driver_has_a_pymodbus_cmm_measure() {
+    let Some(python) = python() else { return };
+    let process = Process::of(python, "cmm.py");
+    let mut cmm = ModbusCmm::new(process.settings.clone()).unwrap();
+    let identity = cmm.connect().await.unwrap();
+    assert_eq!((identity.kind, identity.name.as_str()), (MachineKind::Cmm, "pymodbus CMM 1"));
+    cmm.claim().await.unwrap();
+    let (plan, calm) = (plan(), Interrupt::new());
+    for cycle in 1..=2 {
+        cmm.load_plan(&plan, &calm).await.unwrap();
+        let job = Job { job: 5, cycle, digest: digest(&[plan.identity()]) };
+        let armed = cmm.prepare(job).await.unwrap();
+        cmm.start(armed.clone()).await.unwrap();
+        let status = until_complete(&mut cmm).await;
+        assert_eq!((status.done, status.outcome), (armed.start_sequence, Outcome::Complete));
+        let measured = cmm.collect(job, &calm).await.unwrap();
+        assert_eq!((measured.coordinates, measured.probe_radius_mm), (Coordinates::Centres, 2.5));
+        for (target, point) in plan.targets.iter().zip(&measured.points) {
+            // The machine's own known error: 0.1 um along x at every odd index.
+            let x_mm = target.point_mm[0] + 1e-4 * f64::from(target.index % 2) + 2.5 * target.normal[0];
+            assert_eq!((point.index, point.status, point.at_mm[0]), (target.index, PointStatus::Touched, x_mm));
+        }
+        assert_eq!(measured.points.len(), 200);
+        cmm.acknowledge(measured.done).await.unwrap();
+    }
+    let figures = cmm.link().figures();
+    println!("{} answers, {:.0} us each", figures.answers, figures.answer_ns as f64 / 1e3 / figures.answers as f64);
+}
+
+#[tokio::test]
+async fn our_driver_has_a_pymodbus_grinder_grind() {
+    let Some(python) = python() else { return };
+    let process = Process::of(python, "grinder.py");
+    let mut grinder = ModbusGrinder::new(process.settings.clone()).unwrap();
+    grinder.connect().await.unwrap();
+    grinder.claim().await.unwrap();
+    let map = CorrectionMap {
+        columns: 30,
+        rows: 20,
+        first_mm: [0.0, 0.0],
+        spacing_mm: [1.0, 1.5],
+        values_mm: (0..600).map(|k| 1e-5 * f64::from(k)).collect(),
+        part_identity: [3; 32],
+    };
+    let pass = Pass {
+        spark_out_passes: 1,
+        wheel_radius_mm: 25.0,
+        feed_mm_min: 600.0,
+        track_spacing_mm: 0.2,
+        level_mm: 0.0,
+        depth_of_cut_mm: 0.01,
+        x_mm: [0.0, 29.0],
+        y_mm: [0.0, 28.5],
+        part_identity: [3; 32],
+    };
+    let calm = Interrupt::new();
+    grinder.load_pass(&map, &pass, &calm).await.unwrap();
+    let job = Job { job: 6, cycle: 1, digest: digest(&[map.identity(), pass.identity()]) };
+    let armed = grinder.prepare(job).await.unwrap();
+    grinder.start(armed).await.unwrap();
+    grinder.hold().await.unwrap();
+    assert_eq!(grinder.status().await.unwrap().state, State::Held);
+    grinder.resume().await.unwrap();
+    until_complete(&mut grinder).await;
+    let record = grinder.collect(job, &calm).await.unwrap();
+    assert_eq!((record.outcome, record.wheel_radius_mm, record.idle_share), (Outcome::Complete, 25.0, 1.0));
+    assert_eq!(record.map_identity, map.identity());
+    grinder.acknowledge(record.done).await.unwrap();
+    grinder.release().await.unwrap();
+    assert_eq!(grinder.status().await.unwrap().state, State::Idle);
+}
+
+// ---- their client, our machine ------------------------------------------------------------------------------------------------------
+
+#[tokio::test]
+async fn a_pymodbus_client_has_our_simulated_cmm_measure() {
+    let Some(python) = python() else { return };
+    let machine = registers::Machine::new(Box::new(toy::Toy::new(Kind::Cmm, 100.0)), 77, MachineOptions::default());
+    let serving = Serving::tcp("127.0.0.1:0", vec![(1, machine)]).await.unwrap();
+    let port = serving.local_addr().unwrap().port().to_string();
+    let mut client = Command::new(python);
+    client.arg(scripts().join("client.py")).args(["127.0.0.1", &port]);
+    let done = tokio::task::spawn_blocking(move || client.output()).await.unwrap().unwrap();
+    let said = String::from_utf8_lossy(&done.stdout);
+    assert!(done.status.success(), "{said}{}", String::from_utf8_lossy(&done.stderr));
+    let points: Vec<&str> = said.lines().collect();
+    assert_eq!(points.len(), 10, "{said}");
+    assert_eq!(points[3], "3 1 0 3.0 1.5 1.5");
+    assert_eq!(serving.machine(1).unwrap().with(|machine| machine.began().len()), 1);
+}
