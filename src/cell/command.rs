@@ -192,3 +192,35 @@ pub enum Ending {
         reason: String,
     },
 }
+
+impl Command {
+    /// Returns the name of the command, with the machine that it is for.
+    pub fn name(&self) -> String {
+        let (name, device) = match self {
+            Self::Connect { device } => ("Connect", Some(device)),
+            Self::AskToLoad => ("AskToLoad", None),
+            Self::LoadPass { .. } => ("LoadPass", None),
+            Self::LoadPlan { .. } => ("LoadPlan", None),
+            Self::VerifyClear { device } => ("VerifyClear", Some(device)),
+            Self::Prepare { device, .. } => ("Prepare", Some(device)),
+            Self::StartMachine { device, .. } => ("StartMachine", Some(device)),
+            Self::HoldMachine { device } => ("HoldMachine", Some(device)),
+            Self::ResumeMachine { device } => ("ResumeMachine", Some(device)),
+            Self::StopMachine { device } => ("StopMachine", Some(device)),
+            Self::AbortMachine { device } => ("AbortMachine", Some(device)),
+            Self::ClearMachine { device } => ("ClearMachine", Some(device)),
+            Self::Reconcile { device, .. } => ("Reconcile", Some(device)),
+            Self::Collect { .. } => ("Collect", None),
+            Self::Qualify { .. } => ("Qualify", None),
+            Self::Acknowledge { device } => ("Acknowledge", Some(device)),
+            Self::Register { .. } => ("Register", None),
+            Self::Compensate { .. } => ("Compensate", None),
+            Self::Announce(_) => ("Announce", None),
+            Self::Raise(_) => ("Raise", None),
+            Self::Withdraw { .. } => ("Withdraw", None),
+            Self::Refuse { .. } => ("Refuse", None),
+            Self::Finish(_) => ("Finish", None),
+        };
+        device.map_or(name.to_owned(), |device| format!("{name} {device}"))
+    }
+}

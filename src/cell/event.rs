@@ -500,3 +500,89 @@ impl fmt::Display for Actor {
         write!(f, "{} at {}", self.name, self.station)
     }
 }
+
+impl Event {
+    /// Returns the cycle that the event belongs to, if it belongs to one.
+    pub fn cycle(&self) -> Option<u32> {
+        match self {
+            Self::PassLoaded { cycle }
+            | Self::PlanLoaded { cycle }
+            | Self::Prepared { cycle, .. }
+            | Self::Started { cycle, .. }
+            | Self::StartUnknown { cycle, .. }
+            | Self::Ended { cycle, .. }
+            | Self::Reconciled { cycle, .. }
+            | Self::Collected { cycle, .. }
+            | Self::Qualified { cycle, .. }
+            | Self::Registered { cycle, .. }
+            | Self::RegistrationFailed { cycle, .. }
+            | Self::Compensated { cycle, .. }
+            | Self::CompensationRefused { cycle, .. } => Some(*cycle),
+            _ => None,
+        }
+    }
+
+    /// Returns whether a person gave it as an order.
+    pub fn is_order(&self) -> bool {
+        self.actor().is_some() && !matches!(self, Self::Restarted { .. })
+    }
+
+    /// Returns the person who gave the order.
+    pub fn actor(&self) -> Option<&Actor> {
+        match self {
+            Self::Start { actor }
+            | Self::LoadConfirmed { actor }
+            | Self::Hold { actor, .. }
+            | Self::Resume { actor, .. }
+            | Self::Stop { actor, .. }
+            | Self::Abort { actor, .. }
+            | Self::DeclaredOver { actor, .. }
+            | Self::Restarted { actor } => Some(actor),
+            _ => None,
+        }
+    }
+
+    /// Returns the name of the event.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Start { .. } => "Start",
+            Self::LoadConfirmed { .. } => "LoadConfirmed",
+            Self::Hold { .. } => "Hold",
+            Self::Resume { .. } => "Resume",
+            Self::Stop { .. } => "Stop",
+            Self::Abort { .. } => "Abort",
+            Self::DeclaredOver { .. } => "DeclaredOver",
+            Self::Restarted { .. } => "Restarted",
+            Self::Connected { .. } => "Connected",
+            Self::NotConnected { .. } => "NotConnected",
+            Self::LinkLost { .. } => "LinkLost",
+            Self::LinkBack { .. } => "LinkBack",
+            Self::ConditionLost { .. } => "ConditionLost",
+            Self::ConditionBack { .. } => "ConditionBack",
+            Self::PassLoaded { .. } => "PassLoaded",
+            Self::PlanLoaded { .. } => "PlanLoaded",
+            Self::Prepared { .. } => "Prepared",
+            Self::Started { .. } => "Started",
+            Self::StartUnknown { .. } => "StartUnknown",
+            Self::Progressed { .. } => "Progressed",
+            Self::MachineHeld { .. } => "MachineHeld",
+            Self::MachineResumed { .. } => "MachineResumed",
+            Self::Ended { .. } => "Ended",
+            Self::Cleared { .. } => "Cleared",
+            Self::Obstructed { .. } => "Obstructed",
+            Self::Refused { .. } => "Refused",
+            Self::Fault { .. } => "Fault",
+            Self::Acknowledged { .. } => "Acknowledged",
+            Self::AbortConfirmed { .. } => "AbortConfirmed",
+            Self::Reconciled { .. } => "Reconciled",
+            Self::Collected { .. } => "Collected",
+            Self::Qualified { .. } => "Qualified",
+            Self::Registered { .. } => "Registered",
+            Self::RegistrationFailed { .. } => "RegistrationFailed",
+            Self::Compensated { .. } => "Compensated",
+            Self::CompensationRefused { .. } => "CompensationRefused",
+            Self::RecordFailed { .. } => "RecordFailed",
+            Self::Deadline => "Deadline",
+        }
+    }
+}

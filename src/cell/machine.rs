@@ -1,25 +1,90 @@
-//! The table.
+//! The table, and what the cell keeps between two events.
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
+use super::act::{awaits, awaits_acknowledge, awaits_clear, because, reconciling, restart_of, running};
+use super::alarm::AlarmId;
 use super::command::Command;
-use super::event::Event;
+use super::event::{Asked, Condition, Event, Figures, JobResult};
 use super::plan::CellPlan;
-use super::state::State;
+use super::state::{Device, Phase, State, Step};
+
+use Phase::{Compensate, Grind, Load, Measure, Register, Transfer};
+use State::{
+    Aborting, Completing, Execute, Held, Holding, Idle, Starting, Stopping, Suspended, Suspending, Unholding,
+    Unsuspending,
+};
+
+/// Why the cell is suspended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Cause {
+    Link(Device),
+    Condition(Condition),
+}
+
+/// What the cell knows of one machine.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Known {
+    /// The boot id of the connection; none before the first and after a restart of this program.
+    pub(super) boot_id: Option<u32>,
+    /// Whether it was ever connected in this run, so that an abort must reach it.
+    pub(super) met: bool,
+    /// Whether it is connected and idle, or busy with this run's job.
+    pub(super) ready: bool,
+    /// Whether a fresh status has shown it clear of the part, and it has not been started since.
+    pub(super) clear: bool,
+    /// Whether it has ended its safe sequence.
+    pub(super) stands: bool,
+}
 
 /// A cell in the middle of a run.
 #[derive(Clone, Debug)]
 pub struct Cell {
-    plan: CellPlan,
-    state: State,
-    cycle: u32,
-    deadline: Option<Duration>,
+    pub(super) plan: CellPlan,
+    pub(super) state: State,
+    pub(super) cycle: u32,
+    /// Passes of the grinder begun.
+    pub(super) passes: u32,
+    pub(super) known: [Known; 2],
+    pub(super) causes: BTreeSet<Cause>,
+    pub(super) raised: BTreeSet<AlarmId>,
+    /// The figures of this cycle, and of the last one that was judged.
+    pub(super) figures: Option<Figures>,
+    pub(super) previous: Option<Figures>,
+    /// Cycles in a row that were worse than the one before.
+    pub(super) worse: u32,
+    /// How the run ends when the state that leads to the end is over.
+    pub(super) reason: String,
+    pub(super) judged_out: bool,
+    pub(super) repeated: bool,
+    /// The time of the event that is being handled, and when the next deadline is due.
+    pub(super) now: Duration,
+    pub(super) deadline: Option<Duration>,
+    pub(super) commands: Vec<Command>,
 }
 
 impl Cell {
     /// Returns a cell that waits for `Event::Start`.
     pub fn new(plan: CellPlan) -> Self {
-        Self { plan, state: State::Idle, cycle: 0, deadline: None }
+        Self {
+            plan,
+            state: Idle,
+            cycle: 0,
+            passes: 0,
+            known: [Known::default(); 2],
+            causes: BTreeSet::new(),
+            raised: BTreeSet::new(),
+            figures: None,
+            previous: None,
+            worse: 0,
+            reason: String::new(),
+            judged_out: false,
+            repeated: false,
+            now: Duration::ZERO,
+            deadline: None,
+            commands: Vec::new(),
+        }
     }
 
     /// Returns the state.
@@ -37,14 +102,238 @@ impl Cell {
         &self.plan
     }
 
+    /// Returns the figures of the last measurement that was registered.
+    pub fn figures(&self) -> Option<&Figures> {
+        self.figures.as_ref().or(self.previous.as_ref())
+    }
+
+    /// Returns the alarms that stand.
+    pub fn alarms(&self) -> impl Iterator<Item = AlarmId> + '_ {
+        self.raised.iter().copied()
+    }
+
     /// Returns when `Event::Deadline` is due, as time since the run began.
     pub fn next_deadline(&self) -> Option<Duration> {
         self.deadline
     }
 
     /// Takes an event in and returns what is to be done, in this order. After an end state that is nothing.
-    pub fn handle(&mut self, _now: Duration, event: Event) -> Vec<Command> {
-        let why = "the table is not written yet".to_owned();
-        vec![Command::Refuse { event: Box::new(event), state: self.state, why }]
+    ///
+    /// An event that does not fit is answered by [`Command::Refuse`] and changes nothing.
+    pub fn handle(&mut self, now: Duration, event: Event) -> Vec<Command> {
+        if self.state.is_end() {
+            return Vec::new();
+        }
+        self.now = now;
+        let refused = match self.foreign(&event) {
+            Some(why) => Err(why),
+            None => self.take(&event),
+        };
+        if let Err(why) = refused {
+            let state = self.state;
+            self.commands.push(Command::Refuse { event: Box::new(event), state, why });
+        }
+        if self.state.is_end() {
+            self.deadline = None;
+        }
+        std::mem::take(&mut self.commands)
+    }
+
+    /// Tells why an event cannot belong to what the cell is doing, whatever its state.
+    fn foreign(&self, event: &Event) -> Option<String> {
+        let cycle = event.cycle().filter(|cycle| *cycle != self.cycle);
+        cycle.map(|cycle| format!("it belongs to cycle {cycle}, and this is cycle {}", self.cycle))
+    }
+
+    /// The table. Abort and fault come first, then orders, then what interrupts, then the way of a run, then time.
+    fn take(&mut self, event: &Event) -> Result<(), String> {
+        match (self.state, event) {
+            // The safe sequence.
+            (Aborting, Event::Abort { .. } | Event::Fault { .. }) => {}
+            (_, Event::Abort { actor, reason }) => self.abort(&format!("{actor} ordered it{}", because(reason))),
+            (_, Event::Fault { device, code, words }) => {
+                let case = format!("{device}, fault {code}, {words}");
+                self.raise(AlarmId::MachineFault, &case);
+                self.abort(&case);
+            }
+            (Aborting, Event::AbortConfirmed { device }) => self.stands(*device),
+            (Aborting, Event::Cleared { device }) if self.knows(*device).stands => self.seen(*device, true, ""),
+            (Aborting, Event::Obstructed { device, words }) if self.knows(*device).stands => {
+                self.seen(*device, false, words);
+            }
+            (Aborting, Event::LinkLost { device, .. } | Event::LinkBack { device, .. }) => {
+                let lost = matches!(event, Event::LinkLost { .. });
+                self.note_link(*device, lost);
+                if !lost && !self.knows(*device).stands {
+                    self.push(Command::AbortMachine { device: *device });
+                }
+            }
+            (Aborting, Event::Restarted { .. }) => self.abort_again(),
+            (Aborting, Event::Deadline) => self.due(),
+            // What was under way when the abort came may still be told; nothing follows from it.
+            (Aborting, event) if !event.is_order() => {}
+
+            // Orders.
+            (Idle, Event::Start { .. }) => self.start(),
+            (_, Event::Stop { actor, reason }) if !matches!(self.state, Stopping | Completing) => {
+                self.stop(&format!("{actor} stopped the run{}", because(reason)), false);
+            }
+            (Starting, Event::Hold { .. }) => self.go(Held(Load)),
+            (Execute(phase) | Unholding(phase) | Unsuspending(phase), Event::Hold { .. }) => self.hold(phase),
+            (Suspending(phase), Event::Hold { .. }) => self.go(Holding(phase)),
+            (Suspended(phase), Event::Hold { .. }) => self.go(Held(phase)),
+            (Holding(_) | Held(_), Event::Hold { .. }) => {}
+            (Held(phase), Event::Resume { .. }) => self.resume(phase)?,
+            (Held(Grind(Step::Reconcile)), Event::DeclaredOver { device: Device::Grinder, .. }) => {
+                self.go(Held(Transfer))
+            }
+            (Held(Measure(Step::Reconcile)), Event::DeclaredOver { device: Device::Cmm, .. }) => self.measure_anew(),
+            (Execute(Load), Event::LoadConfirmed { .. }) => self.first_cycle(),
+            (Idle, Event::Restarted { .. }) => {}
+            (Stopping, Event::Restarted { .. }) => {
+                self.abort("the program was started again while the run was being stopped")
+            }
+            (_, Event::Restarted { actor }) => self.restarted(&actor.to_string()),
+
+            // What the record and the surroundings do to us.
+            (_, Event::RecordFailed { why }) => self.record_failed(why),
+            (Execute(phase), Event::LinkLost { device, why }) => self.link_lost(phase, *device, why, Suspended),
+            (
+                Unholding(phase) | Unsuspending(phase) | Suspending(phase) | Suspended(phase),
+                Event::LinkLost { device, why },
+            ) => {
+                self.link_lost(phase, *device, why, Suspended);
+            }
+            (Holding(phase) | Held(phase), Event::LinkLost { device, why }) => {
+                self.link_lost(phase, *device, why, Held)
+            }
+            (_, Event::LinkLost { device, why }) => {
+                self.note_link(*device, true);
+                self.raise(AlarmId::LinkLost, &format!("{device}, {why}"));
+            }
+            (_, Event::LinkBack { device, boot_id }) => self.link_back(*device, *boot_id),
+            (Execute(phase), Event::ConditionLost { condition, words }) => {
+                self.condition_lost(*condition, words);
+                if phase.moving().is_some() {
+                    self.suspend(phase);
+                }
+            }
+            (_, Event::ConditionLost { condition, words }) => self.condition_lost(*condition, words),
+            (_, Event::ConditionBack { condition }) => {
+                self.cause_gone(Cause::Condition(*condition), AlarmId::ConditionLost)
+            }
+
+            // Connecting.
+            (Starting, Event::Connected { device, boot_id, found, .. }) => self.connected(*device, *boot_id, found),
+            (Held(phase), Event::Connected { device, boot_id, found, .. }) => {
+                self.reconnected(phase, *device, *boot_id, found);
+            }
+            (Starting | Held(_), Event::NotConnected { device, why }) => self.not_connected(*device, why),
+            (Starting, Event::Refused { device, what: Asked::Clear, why }) => {
+                self.raise(AlarmId::NotIdle, &format!("{device}, {why}"));
+                self.stop(&format!("the {device} could not be cleared: {why}"), false);
+            }
+
+            // A job of a machine, in its steps. `advance` goes on, or stays at the border where the cell is being held.
+            (Execute(p) | Holding(p), Event::PassLoaded { .. }) if p == Grind(Step::Send) => {
+                self.advance(Grind(Step::Clear))
+            }
+            (Execute(p) | Holding(p), Event::PlanLoaded { .. }) if p == Measure(Step::Send) => {
+                self.advance(Measure(Step::Clear));
+            }
+            (Execute(p) | Holding(p), Event::Cleared { device }) if awaits_clear(p) == Some(*device) => {
+                self.know(*device).clear = true;
+                self.advance(p.job().map_or(Measure(Step::Send), |(job, _)| Phase::of(job, Step::Prepare)));
+            }
+            (Execute(p) | Holding(p), Event::Obstructed { device, words }) if awaits_clear(p) == Some(*device) => {
+                self.raise(AlarmId::NotClear, &format!("{device}, {words}"));
+                self.go(Held(restart_of(p)));
+            }
+            (Execute(p) | Holding(p), Event::Prepared { device, .. }) if p.job() == Some((*device, Step::Prepare)) => {
+                self.advance(Phase::of(*device, Step::Start));
+            }
+            (Execute(p), Event::Started { device, .. }) if p.job() == Some((*device, Step::Start)) => {
+                self.runs(Phase::of(*device, Step::Run));
+            }
+            (Holding(p) | Suspending(p), Event::Started { device, .. }) if p.job() == Some((*device, Step::Start)) => {
+                self.go(self.same(Phase::of(*device, Step::Run)));
+                self.push(Command::HoldMachine { device: *device });
+            }
+            (Execute(p) | Holding(p) | Suspending(p), Event::StartUnknown { device, .. })
+                if p.job() == Some((*device, Step::Start)) =>
+            {
+                self.reconcile(*device);
+            }
+            (Execute(p), Event::Progressed { device, .. }) if p.job() == Some((*device, Step::Run)) => {
+                self.go(self.state)
+            }
+            (
+                Execute(p) | Holding(p) | Suspending(p) | Unholding(p) | Unsuspending(p),
+                Event::Progressed { device, .. },
+            ) if p.moving() == Some(*device) => {}
+            (_, Event::MachineHeld { device }) => self.machine_held(*device)?,
+            (_, Event::MachineResumed { device }) => self.machine_resumed(*device)?,
+            (Stopping, Event::Ended { device, result, .. }) if *result != JobResult::Aborted => {
+                self.push(Command::Acknowledge { device: *device });
+            }
+            (state, Event::Ended { device, result, .. }) if running(state) == Some(*device) => {
+                self.ended(*device, *result)
+            }
+            (state, Event::Reconciled { device, outcome, .. }) if reconciling(state) == Some(*device) => {
+                self.reconciled(*device, outcome);
+            }
+            (Execute(p) | Holding(p), Event::Collected { targets, found, gate, .. }) if p == Measure(Step::Collect) => {
+                self.collected(*targets, *found, gate);
+            }
+            (Execute(p) | Holding(p), Event::Qualified { radius_error_mm, .. }) if p == Measure(Step::Qualify) => {
+                self.qualified(*radius_error_mm);
+            }
+            (Execute(p) | Holding(p), Event::Acknowledged { device }) if awaits_acknowledge(p) == Some(*device) => {
+                self.acknowledged(p);
+            }
+            (Stopping, Event::Acknowledged { .. }) => self.stopped(),
+            (Execute(p) | Holding(p), Event::Refused { device, what, why }) if awaits(p, *device, *what) => {
+                self.said_no(p, *device, *what, why);
+            }
+            (Holding(p) | Suspending(p), Event::Refused { device, what: Asked::Hold, why })
+                if p.moving() == Some(*device) =>
+            {
+                self.raise(AlarmId::HoldNotConfirmed, &format!("{device}, {why}"));
+                self.abort(&format!("the {device} refused to hold: {why}"));
+            }
+            (Unholding(p) | Unsuspending(p), Event::Refused { device, what: Asked::Resume, why })
+                if p.moving() == Some(*device) =>
+            {
+                self.raise(AlarmId::MachineRefused, &format!("{device}, resume: {why}"));
+                self.go(Held(p));
+            }
+            (Stopping, Event::Refused { device, what: Asked::Stop | Asked::Acknowledge, why }) => {
+                self.abort(&format!("the {device} refused to stop: {why}"));
+            }
+            (Execute(p), Event::Obstructed { device, words }) if p.moving() == Some(device.other()) => {
+                self.know(*device).clear = false;
+                self.raise(AlarmId::NotClear, &format!("{device}, {words}, while the {} moves", device.other()));
+                self.hold(p);
+            }
+            (Completing, Event::Obstructed { device, words }) => self.seen(*device, false, words),
+            (_, Event::Obstructed { device, .. }) => self.know(*device).clear = false,
+
+            // Computations.
+            (Execute(Register) | Holding(Register), Event::Registered { figures, .. }) => self.registered(figures),
+            (Execute(Register) | Holding(Register), Event::RegistrationFailed { why, .. }) => {
+                self.useless(AlarmId::RegistrationFailed, why);
+            }
+            (Execute(Compensate) | Holding(Compensate), Event::Compensated { .. }) => {
+                self.cycle += 1;
+                self.advance(Grind(Step::Send));
+            }
+            (Execute(Compensate) | Holding(Compensate), Event::CompensationRefused { why, .. }) => self.no_map(why),
+
+            // The end, and time.
+            (Completing, Event::Cleared { device }) => self.seen(*device, true, ""),
+            (_, Event::Deadline) => self.due(),
+            (state, event) => return Err(format!("{} does not fit the state {state}", event.name())),
+        }
+        Ok(())
     }
 }

@@ -16,12 +16,15 @@
 //! A machine is started at most once for a cycle. Only the machine's own proof that START was not taken allows another; a
 //! measurement that failed its gate is repeated under the next number, and a pass is never repeated.
 
+mod act;
 mod alarm;
 mod command;
 mod event;
+mod judge;
 mod machine;
 mod plan;
 mod state;
+mod table;
 
 pub use alarm::{Alarm, AlarmId, Role};
 pub use command::{Command, Ending, Judgement, Verdict};
@@ -32,3 +35,4 @@ pub use event::{
 pub use machine::Cell;
 pub use plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, Tolerance};
 pub use state::{Device, Phase, State, Step};
+pub use table::{Answer, Row, samples, table};

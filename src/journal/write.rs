@@ -326,13 +326,6 @@ impl Journal {
             _ => Ok(()),
         }
     }
-
-    /// Lets the database grow no further, as a full disk would.
-    #[cfg(test)]
-    pub(super) fn limit_pages(&self, pages: u32) {
-        let asked = format!("PRAGMA max_page_count = {pages}");
-        self.connection.query_row(&asked, [], |_| Ok(())).unwrap();
-    }
 }
 
 fn lock(folder: &Path) -> Result<File, JournalError> {

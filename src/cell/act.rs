@@ -1,0 +1,878 @@
+//! What the arms of the table do.
+
+use std::time::Duration;
+
+use super::alarm::{Alarm, AlarmId};
+use super::command::{Command, Ending, Judgement, Verdict};
+use super::event::{
+    Asked, CompensationRefusal, Condition, Figures, Found, Gate, GateFailure, JobResult, Mismatch, Reconciliation,
+    RecordFailure, Response,
+};
+use super::judge::{self, Judged, um};
+use super::machine::{Cause, Cell, Known};
+use super::plan::{Beginning, Disposal};
+use super::state::{Device, Phase, State, Step};
+
+use Phase::{Compensate, Grind, Judge, Load, Measure, Register, Transfer};
+use State::{
+    Aborted, Aborting, Complete, Completing, Execute, Held, Holding, Idle, Starting, Stopped, Stopping, Suspended,
+    Suspending, Unholding, Unsuspending,
+};
+
+// The small words.
+impl Cell {
+    pub(super) fn push(&mut self, command: Command) {
+        self.commands.push(command);
+    }
+
+    pub(super) fn knows(&self, device: Device) -> &Known {
+        &self.known[device as usize]
+    }
+
+    pub(super) fn know(&mut self, device: Device) -> &mut Known {
+        &mut self.known[device as usize]
+    }
+
+    pub(super) fn raise(&mut self, id: AlarmId, case: &str) {
+        self.raised.insert(id);
+        self.push(Command::Raise(Alarm::of(id, case)));
+    }
+
+    fn withdraw(&mut self, alarm: AlarmId) {
+        if self.raised.remove(&alarm) {
+            self.push(Command::Withdraw { alarm });
+        }
+    }
+
+    /// Takes a state, and the deadline that goes with it.
+    pub(super) fn go(&mut self, state: State) {
+        self.state = state;
+        self.deadline = self.limit().map(|limit| self.now.saturating_add(limit));
+    }
+
+    /// Returns the present state around another phase.
+    pub(super) fn same(&self, phase: Phase) -> State {
+        match self.state {
+            Holding(_) => Holding(phase),
+            Held(_) => Held(phase),
+            Unholding(_) => Unholding(phase),
+            Suspending(_) => Suspending(phase),
+            Suspended(_) => Suspended(phase),
+            Unsuspending(_) => Unsuspending(phase),
+            _ => Execute(phase),
+        }
+    }
+
+    /// Returns how long the present state may last without a sign of life.
+    fn limit(&self) -> Option<Duration> {
+        let limits = &self.plan.deadlines;
+        let job = self.state.phase().and_then(Phase::job).map(|(_, step)| step);
+        match (self.state, job) {
+            (Idle | Stopped | Aborted | Complete | Execute(Judge), _) => None,
+            (Starting, _) => Some(limits.connect),
+            (Execute(Load), _) => limits.load,
+            (Held(_), _) => limits.held,
+            (Suspended(_), _) => Some(limits.suspended),
+            (Stopping, _) => Some(limits.stop),
+            (Aborting, _) => Some(limits.abort),
+            (Execute(_), Some(Step::Run)) => Some(limits.progress),
+            (Holding(_) | Suspending(_), Some(Step::Run)) => Some(limits.hold),
+            (_, Some(Step::Send | Step::Collect)) => Some(limits.transfer),
+            (_, Some(Step::Qualify)) => Some(limits.compute),
+            (Execute(Register | Compensate) | Holding(Register | Compensate), _) => Some(limits.compute),
+            _ => Some(limits.answer),
+        }
+    }
+
+    pub(super) fn is_due(&self) -> bool {
+        self.deadline.is_some_and(|deadline| self.now >= deadline)
+    }
+}
+
+// The way of a run.
+impl Cell {
+    pub(super) fn start(&mut self) {
+        self.go(Starting);
+        for device in Device::BOTH {
+            self.push(Command::Connect { device });
+        }
+    }
+
+    pub(super) fn connected(&mut self, device: Device, boot_id: u32, found: &Found) {
+        let known = self.know(device);
+        (known.met, known.boot_id) = (true, Some(boot_id));
+        match found {
+            Found::Idle => known.ready = true,
+            Found::ToClear if self.plan.clear_at_start => self.push(Command::ClearMachine { device }),
+            Found::ToClear => self.not_idle(device, "it was aborted or is in fault"),
+            Found::Busy(words) => self.not_idle(device, words),
+        }
+        if self.state == Starting && self.known.iter().all(|known| known.ready) {
+            self.enter(Load);
+        }
+    }
+
+    fn not_idle(&mut self, device: Device, words: &str) {
+        self.raise(AlarmId::NotIdle, &format!("{device}, {words}"));
+        self.stop(&format!("the {device} is not idle: {words}"), false);
+    }
+
+    /// A machine comes back while the cell is held: it may still be at this run's job.
+    pub(super) fn reconnected(&mut self, phase: Phase, device: Device, boot_id: u32, found: &Found) {
+        let ours = phase.job().is_some_and(|(job, _)| job == device);
+        let known = self.know(device);
+        (known.met, known.boot_id) = (true, Some(boot_id));
+        known.ready = ours || *found == Found::Idle;
+        if !known.ready {
+            self.raise(AlarmId::NotIdle, &format!("{device}, {found:?}"));
+        }
+    }
+
+    pub(super) fn not_connected(&mut self, device: Device, why: &Mismatch) {
+        let (id, words) = match why {
+            Mismatch::Unreachable(words) => (AlarmId::Unreachable, words.as_str()),
+            Mismatch::WrongDevice(words) => (AlarmId::WrongDevice, words.as_str()),
+            Mismatch::WordOrder(words) => (AlarmId::WordOrder, words.as_str()),
+            Mismatch::Inches => (AlarmId::Inches, "the machine says so of itself"),
+            Mismatch::Owned(words) => (AlarmId::Owned, words.as_str()),
+        };
+        let case = format!("{device}, {words}");
+        self.raise(id, &case);
+        if self.state == Starting {
+            self.stop(&case, false);
+        }
+    }
+
+    pub(super) fn first_cycle(&mut self) {
+        self.cycle = 1;
+        self.enter(match self.plan.begin_with {
+            Beginning::Grind => Grind(Step::Send),
+            Beginning::Measure => Measure(Step::Send),
+        });
+    }
+
+    /// Goes on to a phase, or stops at the border before it if the cell is being held or suspended.
+    pub(super) fn advance(&mut self, next: Phase) {
+        match self.state {
+            Holding(_) | Held(_) => self.go(Held(restart_of(next))),
+            Suspending(_) | Suspended(_) => self.suspended(restart_of(next)),
+            _ => self.enter(next),
+        }
+    }
+
+    /// Enters a phase. Whether the surroundings allow it is looked at here, at every entry, and not only when they change.
+    fn enter(&mut self, phase: Phase) {
+        let alone = matches!(phase, Load | Register | Judge | Compensate);
+        if !alone && !self.causes.is_empty() {
+            return self.go(Suspended(restart_of(phase)));
+        }
+        self.go(Execute(phase));
+        let cycle = self.cycle;
+        match phase {
+            Load => self.push(Command::AskToLoad),
+            Grind(Step::Start) => self.start_machine(Device::Grinder),
+            Measure(Step::Start) => self.start_machine(Device::Cmm),
+            Grind(Step::Send) => self.push(Command::LoadPass { cycle }),
+            Measure(Step::Send) => self.push(Command::LoadPlan { cycle }),
+            Transfer => self.verify_clear(Device::Grinder),
+            Register => self.push(Command::Register { cycle }),
+            Judge => self.judge(),
+            Compensate => self.push(Command::Compensate { cycle }),
+            Grind(step) => self.enter_step(Device::Grinder, step),
+            Measure(step) => self.enter_step(Device::Cmm, step),
+        }
+    }
+
+    fn enter_step(&mut self, device: Device, step: Step) {
+        let cycle = self.cycle;
+        match step {
+            Step::Clear => self.verify_clear(device.other()),
+            Step::Prepare => self.push(Command::Prepare { device, cycle }),
+            Step::Reconcile => self.push(Command::Reconcile { device, cycle }),
+            Step::Collect => self.push(Command::Collect { cycle }),
+            Step::Qualify => self.push(Command::Qualify { cycle }),
+            Step::Acknowledge | Step::Discard => self.push(Command::Acknowledge { device }),
+            // The machine runs already, or is started with its interlock.
+            Step::Run | Step::Send | Step::Start => {}
+        }
+    }
+
+    fn verify_clear(&mut self, device: Device) {
+        self.know(device).clear = false;
+        self.push(Command::VerifyClear { device });
+    }
+
+    /// The interlock: the other machine was seen clear since this job began, and nothing has been heard to the contrary.
+    fn start_machine(&mut self, device: Device) {
+        let other = device.other();
+        if !self.knows(other).clear {
+            self.raise(AlarmId::NotClear, &format!("{other}, no longer, before the {device} was started"));
+            return self.go(Held(Phase::of(device, Step::Send)));
+        }
+        self.know(device).clear = false;
+        self.passes += u32::from(device == Device::Grinder);
+        self.push(Command::StartMachine { device, cycle: self.cycle });
+    }
+
+    /// The machine said for certain that it did not start.
+    fn not_started(&mut self, device: Device) {
+        self.passes = self.passes.saturating_sub(u32::from(device == Device::Grinder));
+    }
+
+    pub(super) fn said_no(&mut self, phase: Phase, device: Device, what: Asked, why: &str) {
+        if what == Asked::Start {
+            self.not_started(device);
+        }
+        self.raise(AlarmId::MachineRefused, &format!("{device}, {what:?}: {why}"));
+        self.go(Held(restart_of(phase)));
+    }
+
+    pub(super) fn ended(&mut self, device: Device, result: JobResult) {
+        match (result, device) {
+            (JobResult::Complete, Device::Grinder) => self.advance(Grind(Step::Acknowledge)),
+            (JobResult::Complete, Device::Cmm) => self.advance(Measure(Step::Collect)),
+            (JobResult::Stopped | JobResult::Failed, _) => {
+                self.raise(AlarmId::JobFailed, &format!("{device}, {result:?}"));
+                self.advance(Phase::of(device, Step::Discard));
+            }
+            (JobResult::Aborted, _) => {
+                self.raise(AlarmId::JobFailed, &format!("{device}, aborted at the machine"));
+                self.abort(&format!("the {device} was aborted at the machine"));
+            }
+        }
+    }
+
+    pub(super) fn acknowledged(&mut self, phase: Phase) {
+        match phase {
+            Grind(Step::Acknowledge) => self.advance(Transfer),
+            Grind(_) => self.go(Held(Transfer)),
+            Measure(Step::Acknowledge) => self.advance(Register),
+            _ => self.measure_anew(),
+        }
+    }
+
+    /// A measurement is repeated under the next number, after a person has resumed: no START is ever given twice.
+    pub(super) fn measure_anew(&mut self) {
+        self.cycle += 1;
+        self.go(Held(Measure(Step::Send)));
+    }
+
+    pub(super) fn collected(&mut self, targets: u32, found: u32, gate: &Gate) {
+        let share = f64::from(found) / f64::from(targets.max(1));
+        let gate = match gate {
+            Gate::Failed(why) => Some(gate_alarm(why)),
+            Gate::Passed if found > targets || share < self.plan.gates.least_found => {
+                let least = 100.0 * self.plan.gates.least_found;
+                Some((
+                    AlarmId::Coverage,
+                    format!("{found} of {targets} points were found, and {least:.0} % are needed"),
+                ))
+            }
+            Gate::Passed => None,
+        };
+        match gate {
+            Some((id, case)) => {
+                self.raise(id, &case);
+                self.advance(Measure(Step::Discard));
+            }
+            None if self.plan.gates.most_radius_error_mm.is_some() => self.advance(Measure(Step::Qualify)),
+            None => self.advance(Measure(Step::Acknowledge)),
+        }
+    }
+
+    pub(super) fn qualified(&mut self, radius_error_mm: f64) {
+        let most = self.plan.gates.most_radius_error_mm.unwrap_or(f64::INFINITY);
+        if radius_error_mm.abs() <= most {
+            return self.advance(Measure(Step::Acknowledge));
+        }
+        let case = format!("it is off by {}, and {} are allowed", um(radius_error_mm), um(most));
+        self.raise(AlarmId::ProbeRadius, &case);
+        self.advance(Measure(Step::Discard));
+    }
+
+    /// A measurement of which nothing can be made.
+    pub(super) fn useless(&mut self, id: AlarmId, case: &str) {
+        self.raise(id, case);
+        self.measure_anew();
+    }
+
+    pub(super) fn registered(&mut self, figures: &Figures) {
+        let gates = self.plan.gates;
+        let (shift, turn) = (figures.shift_mm, figures.turn_rad.to_degrees());
+        if !figures.are_sound() {
+            self.useless(AlarmId::RegistrationFailed, "a figure is not a number, or negative");
+        } else if figures.coverage < gates.least_coverage {
+            let (found, least) = (100.0 * figures.coverage, 100.0 * gates.least_coverage);
+            self.useless(
+                AlarmId::Coverage,
+                &format!("{found:.0} % of the aperture are covered, and {least:.0} % are needed"),
+            );
+        } else if shift > gates.most_shift_mm || figures.turn_rad > gates.most_turn_rad {
+            let (most, most_turn) = (gates.most_shift_mm, gates.most_turn_rad.to_degrees());
+            let case = format!("{shift:.3} mm of at most {most:.3} mm, {turn:.2} of at most {most_turn:.2} degrees");
+            self.useless(AlarmId::PartMisplaced, &case);
+        } else {
+            self.figures = Some(figures.clone());
+            self.advance(Judge);
+        }
+    }
+
+    fn judge(&mut self) {
+        let Some(figures) = self.figures.take() else { return self.go(Held(Register)) };
+        let Judged { verdict, reason } = judge::judge(&self.plan, self.previous.as_ref(), &figures, self.passes);
+        let response = figures.response;
+        self.previous = Some(figures);
+        self.worse = if verdict == Verdict::Diverging { self.worse + 1 } else { 0 };
+        self.push(Command::Announce(Judgement { cycle: self.cycle, verdict, reason: reason.clone() }));
+        match verdict {
+            Verdict::Accept => self.accept(reason),
+            Verdict::Continue => self.advance(Compensate),
+            Verdict::MaxCycles => self.give_up(AlarmId::MaxCycles, &reason),
+            Verdict::BudgetSpent => self.give_up(AlarmId::BudgetSpent, &reason),
+            Verdict::Diverging => {
+                self.raise(AlarmId::Diverging, &reason);
+                if self.worse < 2 { self.advance(Compensate) } else { self.dispose(self.plan.on_divergence, &reason) }
+            }
+            Verdict::Stalled => {
+                self.raise(AlarmId::Stalled, &reason);
+                self.dispose(self.plan.on_stall, &reason);
+            }
+            Verdict::WrongResponse => {
+                self.raise(response.map_or(AlarmId::NoEffect, response_alarm), &reason);
+                self.go(Held(Compensate));
+            }
+        }
+    }
+
+    fn accept(&mut self, reason: String) {
+        self.reason = reason;
+        self.go(Completing);
+        for device in Device::BOTH {
+            self.verify_clear(device);
+        }
+    }
+
+    fn give_up(&mut self, id: AlarmId, reason: &str) {
+        self.raise(id, reason);
+        self.stop(reason, true);
+    }
+
+    fn dispose(&mut self, disposal: Disposal, reason: &str) {
+        match disposal {
+            Disposal::Hold => self.go(Held(Compensate)),
+            Disposal::Stop => self.stop(reason, true),
+        }
+    }
+
+    pub(super) fn no_map(&mut self, why: &CompensationRefusal) {
+        match why {
+            CompensationRefusal::BudgetSpent(words) => {
+                let (cycle, verdict, reason) = (self.cycle, Verdict::BudgetSpent, words.clone());
+                self.push(Command::Announce(Judgement { cycle, verdict, reason }));
+                self.give_up(AlarmId::BudgetSpent, words);
+            }
+            CompensationRefusal::WeakDirections(directions) => {
+                let case = directions.join(", ");
+                self.raise(AlarmId::WeakDirections, &case);
+                self.dispose(self.plan.on_refusal, &format!("the surface does not hold the part: {case}"));
+            }
+            CompensationRefusal::Failed(words) => {
+                self.raise(AlarmId::CompensationFailed, words);
+                self.dispose(self.plan.on_refusal, words);
+            }
+        }
+    }
+}
+
+// Interruptions.
+impl Cell {
+    /// A hold by a person or from inside: what moves is told to hold, anything else comes to its border.
+    pub(super) fn hold(&mut self, phase: Phase) {
+        match phase.job() {
+            Some((device, Step::Run)) => {
+                self.go(Holding(phase));
+                self.push(Command::HoldMachine { device });
+            }
+            _ if phase == Load => self.go(Held(Load)),
+            _ => self.go(Holding(phase)),
+        }
+    }
+
+    pub(super) fn resume(&mut self, phase: Phase) -> Result<(), String> {
+        let absent: Vec<_> = Device::BOTH.into_iter().filter(|device| !self.knows(*device).ready).collect();
+        if !absent.is_empty() && self.cycle == 0 {
+            self.go(Starting);
+        }
+        for device in &absent {
+            self.push(Command::Connect { device: *device });
+        }
+        match absent.first() {
+            None => self.resume_connected(phase),
+            Some(_) if self.state == Starting => {}
+            Some(device) => {
+                return Err(format!("the {device} is not connected; it is being connected again, resume then"));
+            }
+        }
+        Ok(())
+    }
+
+    fn resume_connected(&mut self, phase: Phase) {
+        let standing: Vec<_> = self.raised.iter().copied().collect();
+        for alarm in standing {
+            if !matches!(alarm, AlarmId::LinkLost | AlarmId::ConditionLost) || self.causes.is_empty() {
+                self.withdraw(alarm);
+            }
+        }
+        match phase.job() {
+            Some((_, Step::Run)) if !self.causes.is_empty() => self.go(Suspended(phase)),
+            Some((device, Step::Run)) => {
+                self.go(Unholding(phase));
+                self.push(Command::ResumeMachine { device });
+            }
+            _ => self.enter(restart_of(phase)),
+        }
+    }
+
+    /// A condition is missing while a machine moves.
+    pub(super) fn suspend(&mut self, phase: Phase) {
+        self.go(Suspending(phase));
+        if let Some((device, Step::Run)) = phase.job() {
+            self.push(Command::HoldMachine { device });
+        }
+    }
+
+    fn suspended(&mut self, phase: Phase) {
+        self.go(Suspended(phase));
+        self.unsuspend_if_free();
+    }
+
+    fn unsuspend_if_free(&mut self) {
+        let Suspended(phase) = self.state else { return };
+        if !self.causes.is_empty() {
+            return;
+        }
+        match phase.job() {
+            Some((device, Step::Run)) => {
+                self.go(Unsuspending(phase));
+                self.push(Command::ResumeMachine { device });
+            }
+            Some((device, Step::Reconcile)) => {
+                self.go(Unsuspending(phase));
+                self.push(Command::Reconcile { device, cycle: self.cycle });
+            }
+            _ => self.enter(restart_of(phase)),
+        }
+    }
+
+    pub(super) fn condition_lost(&mut self, condition: Condition, words: &str) {
+        if self.causes.insert(Cause::Condition(condition)) {
+            self.raise(AlarmId::ConditionLost, &format!("{condition:?}, {words}"));
+        }
+    }
+
+    pub(super) fn note_link(&mut self, device: Device, lost: bool) {
+        if lost {
+            self.causes.insert(Cause::Link(device));
+            self.know(device).clear = false;
+        } else {
+            self.causes.remove(&Cause::Link(device));
+        }
+    }
+
+    /// A link is lost: a phase that needs it waits at a place from which it can be taken up again; a job of the other machine goes on.
+    pub(super) fn link_lost(&mut self, phase: Phase, device: Device, why: &str, wait: fn(Phase) -> State) {
+        self.note_link(device, true);
+        self.raise(AlarmId::LinkLost, &format!("{device}, {why}"));
+        let needed = phase.job().map(|(job, _)| job) == Some(device) || awaits_clear(phase) == Some(device);
+        if needed {
+            self.go(wait(out_of_sight(phase)));
+        }
+    }
+
+    pub(super) fn link_back(&mut self, device: Device, boot_id: u32) {
+        let known = self.know(device);
+        let same = known.boot_id.replace(boot_id).is_none_or(|before| before == boot_id);
+        if self.state == Starting {
+            self.note_link(device, false);
+            return self.push(Command::Connect { device });
+        }
+        if !same {
+            self.machine_restarted(device);
+        }
+        self.cause_gone(Cause::Link(device), AlarmId::LinkLost);
+    }
+
+    fn machine_restarted(&mut self, device: Device) {
+        self.raise(AlarmId::MachineRestarted, &device.to_string());
+        let Some(phase) = self.state.phase() else { return };
+        let before_start = matches!(restart_of(phase).job(), Some((_, Step::Send)));
+        if phase.job().map(|(job, _)| job) == Some(device) && !before_start {
+            self.go(Held(Phase::of(device, Step::Reconcile)));
+        }
+    }
+
+    pub(super) fn cause_gone(&mut self, cause: Cause, alarm: AlarmId) {
+        self.causes.remove(&cause);
+        let is_link = |cause: &Cause| matches!(cause, Cause::Link(_));
+        if !self.causes.iter().any(|other| is_link(other) == is_link(&cause)) {
+            self.withdraw(alarm);
+        }
+        self.unsuspend_if_free();
+    }
+
+    pub(super) fn record_failed(&mut self, why: &RecordFailure) {
+        let (id, words) = match why {
+            RecordFailure::DiskFull(words) => (AlarmId::DiskFull, words),
+            RecordFailure::Unwritable(words) => (AlarmId::JournalUnwritable, words),
+        };
+        self.raise(id, words);
+        match self.state {
+            Execute(phase) | Unholding(phase) | Unsuspending(phase) => self.hold(phase),
+            Suspending(phase) => self.go(Holding(phase)),
+            Suspended(phase) => self.go(Held(phase)),
+            Starting => self.go(Held(Load)),
+            _ => {}
+        }
+    }
+
+    pub(super) fn machine_held(&mut self, device: Device) -> Result<(), String> {
+        let at_job = running(self.state) == Some(device);
+        let run = Phase::of(device, Step::Run);
+        match self.state {
+            Stopping => {}
+            Holding(_) if at_job => self.go(Held(run)),
+            Suspending(_) if at_job => self.suspended(run),
+            Execute(_) | Unholding(_) | Unsuspending(_) if at_job => {
+                self.raise(AlarmId::MachineHeldItself, &device.to_string());
+                self.go(Held(run));
+            }
+            Held(_) | Suspended(_) if at_job => {}
+            state => return Err(format!("the {device} has no job that could be held in the state {state}")),
+        }
+        Ok(())
+    }
+
+    pub(super) fn machine_resumed(&mut self, device: Device) -> Result<(), String> {
+        let run = Phase::of(device, Step::Run);
+        let at_run = self.state.phase() == Some(run);
+        match self.state {
+            Stopping => {}
+            Unholding(_) | Unsuspending(_) if at_run => self.runs(run),
+            Held(_) if at_run => {
+                self.raise(AlarmId::MachineResumedItself, &device.to_string());
+                self.runs(run);
+            }
+            Suspended(_) if at_run => self.suspend(run),
+            Execute(_) | Holding(_) | Suspending(_) if at_run => {}
+            state => return Err(format!("the {device} has no job that could be resumed in the state {state}")),
+        }
+        Ok(())
+    }
+
+    /// The machine moves. If a condition went missing meanwhile it is held again.
+    pub(super) fn runs(&mut self, run: Phase) {
+        self.go(Execute(run));
+        if self.causes.iter().any(|cause| matches!(cause, Cause::Condition(_))) {
+            self.suspend(run);
+        }
+    }
+
+    pub(super) fn reconciled(&mut self, device: Device, outcome: &Reconciliation) {
+        let run = Phase::of(device, Step::Run);
+        match (outcome, self.state) {
+            (Reconciliation::Running, Holding(_) | Suspending(_)) => {
+                self.go(self.same(run));
+                self.push(Command::HoldMachine { device });
+            }
+            (Reconciliation::Running, _) => self.runs(run),
+            (Reconciliation::Held, Holding(_)) => self.go(Held(run)),
+            (Reconciliation::Held, Suspending(_)) => self.suspended(run),
+            (Reconciliation::Held, state) => {
+                self.go(if matches!(state, Unsuspending(_)) { Unsuspending(run) } else { Unholding(run) });
+                self.push(Command::ResumeMachine { device });
+            }
+            (Reconciliation::Ended(result), _) => self.ended(device, *result),
+            (Reconciliation::NotStarted, _) => {
+                self.not_started(device);
+                self.advance(Phase::of(device, Step::Send));
+            }
+            (Reconciliation::Unknown(words), _) => self.unknown(device, words),
+        }
+    }
+
+    fn unknown(&mut self, device: Device, words: &str) {
+        self.raise(AlarmId::StartUnknown, &format!("{device}, {words}"));
+        self.go(Held(Phase::of(device, Step::Reconcile)));
+    }
+
+    pub(super) fn reconcile(&mut self, device: Device) {
+        self.go(self.same(Phase::of(device, Step::Reconcile)));
+        self.push(Command::Reconcile { device, cycle: self.cycle });
+    }
+
+    /// This program was started again: nothing is known of the machines but that they may be at this run's job.
+    pub(super) fn restarted(&mut self, actor: &str) {
+        if self.state == Completing {
+            return self.complete();
+        }
+        for known in &mut self.known {
+            *known = Known { met: known.met, ..Known::default() };
+        }
+        self.causes.clear();
+        self.withdraw(AlarmId::LinkLost);
+        self.withdraw(AlarmId::ConditionLost);
+        self.raise(AlarmId::ProgramRestarted, &format!("by {actor}"));
+        let phase = self.state.phase().unwrap_or(Load);
+        self.go(Held(out_of_sight(phase)));
+        for device in Device::BOTH {
+            self.push(Command::Connect { device });
+        }
+    }
+}
+
+// The ends, and time.
+impl Cell {
+    /// Ends in order: a machine at a job is stopped, a result is given back, and then the run is over.
+    pub(super) fn stop(&mut self, reason: &str, judged_out: bool) {
+        reason.clone_into(&mut self.reason);
+        self.judged_out = judged_out;
+        match self.state.phase().and_then(Phase::job) {
+            Some((device, Step::Prepare | Step::Start | Step::Run | Step::Reconcile)) => {
+                self.go(Stopping);
+                self.push(Command::StopMachine { device });
+            }
+            Some((device, Step::Collect | Step::Qualify | Step::Acknowledge | Step::Discard)) => {
+                self.go(Stopping);
+                self.push(Command::Acknowledge { device });
+            }
+            _ => self.stopped(),
+        }
+    }
+
+    pub(super) fn stopped(&mut self) {
+        self.go(Stopped);
+        let (cycle, reason) = (self.cycle, std::mem::take(&mut self.reason));
+        let judged_out = self.judged_out;
+        let ending = if judged_out { Ending::NotAccepted { cycle, reason } } else { Ending::Stopped { cycle, reason } };
+        self.push(Command::Finish(ending));
+    }
+
+    /// The safe sequence: every machine that was met in this run is told to end at once; then each is seen to be clear.
+    pub(super) fn abort(&mut self, reason: &str) {
+        reason.clone_into(&mut self.reason);
+        self.repeated = false;
+        for known in &mut self.known {
+            (known.stands, known.clear) = (false, false);
+        }
+        self.go(Aborting);
+        self.abort_those_that_move();
+        if self.known.iter().all(|known| !known.met) {
+            self.aborted(true);
+        }
+    }
+
+    fn abort_those_that_move(&mut self) {
+        for device in Device::BOTH {
+            if self.knows(device).met && !self.knows(device).stands {
+                self.push(Command::AbortMachine { device });
+            }
+        }
+    }
+
+    /// The program was started again in the middle of the safe sequence.
+    pub(super) fn abort_again(&mut self) {
+        for device in Device::BOTH {
+            if self.knows(device).met {
+                self.push(Command::Connect { device });
+            }
+        }
+        let reason = std::mem::take(&mut self.reason);
+        self.abort(&reason);
+    }
+
+    pub(super) fn stands(&mut self, device: Device) {
+        self.know(device).stands = true;
+        self.verify_clear(device);
+    }
+
+    /// A machine was seen, at the end of a run.
+    pub(super) fn seen(&mut self, device: Device, clear: bool, words: &str) {
+        if !clear {
+            self.raise(AlarmId::NotClear, &format!("{device}, {words}"));
+        }
+        self.know(device).clear = true;
+        if self.known.iter().any(|known| known.met && !known.clear) {
+            return;
+        }
+        match self.state {
+            Aborting => self.aborted(true),
+            _ => self.complete(),
+        }
+    }
+
+    fn aborted(&mut self, confirmed: bool) {
+        self.go(Aborted);
+        let (cycle, reason) = (self.cycle, std::mem::take(&mut self.reason));
+        self.push(Command::Finish(Ending::Aborted { cycle, confirmed, reason }));
+    }
+
+    fn complete(&mut self) {
+        self.go(Complete);
+        let (cycle, reason) = (self.cycle, std::mem::take(&mut self.reason));
+        self.push(Command::Finish(Ending::Accepted { cycle, reason }));
+    }
+
+    /// Time has passed. A tick before its time is no fault and does nothing.
+    pub(super) fn due(&mut self) {
+        if !self.is_due() {
+            return;
+        }
+        match self.state {
+            Starting => {
+                self.raise(AlarmId::Unreachable, "not both were connected in time");
+                self.stop("the machines were not connected in time", false);
+            }
+            Held(_) | Execute(Load) => {
+                self.raise(AlarmId::WaitedTooLong, "");
+                self.stop("nobody answered in time", false);
+            }
+            Execute(phase) | Holding(phase) | Suspending(phase) | Unholding(phase) | Unsuspending(phase) => {
+                self.phase_is_due(phase);
+            }
+            Suspended(phase) => {
+                self.raise(AlarmId::StaysSuspended, "");
+                self.go(Held(phase));
+            }
+            Stopping => self.abort("the orderly stop was not confirmed in time"),
+            Aborting => self.abort_is_due(),
+            Completing => {
+                self.raise(AlarmId::NotClear, "not both were seen clear in time");
+                self.complete();
+            }
+            Idle | Stopped | Aborted | Complete => {}
+        }
+    }
+
+    fn phase_is_due(&mut self, phase: Phase) {
+        match (phase.job(), self.state) {
+            (Some((device, Step::Run)), Holding(_) | Suspending(_)) => {
+                self.raise(AlarmId::HoldNotConfirmed, &device.to_string());
+                self.abort(&format!("the {device} did not confirm in time that it holds"));
+            }
+            (Some((device, Step::Run)), _) => {
+                self.raise(AlarmId::NoAnswer, &format!("{device}, no sign of its job"));
+                self.hold(phase);
+            }
+            (Some((device, Step::Start)), _) => self.reconcile(device),
+            (Some((device, Step::Reconcile)), _) => self.unknown(device, "it was not found out in time"),
+            _ if matches!(phase, Register | Compensate) => {
+                self.raise(AlarmId::ComputationLate, phase.name());
+                self.go(Held(phase));
+            }
+            _ => {
+                self.raise(AlarmId::NoAnswer, &phase.to_string());
+                self.go(Held(restart_of(phase)));
+            }
+        }
+    }
+
+    fn abort_is_due(&mut self) {
+        let unconfirmed: Vec<_> =
+            Device::BOTH.into_iter().filter(|device| self.knows(*device).met && !self.knows(*device).stands).collect();
+        if unconfirmed.is_empty() {
+            self.raise(AlarmId::NotClear, "not both were seen clear in time");
+            return self.aborted(true);
+        }
+        if self.repeated {
+            return self.aborted(false);
+        }
+        self.repeated = true;
+        let names: Vec<_> = unconfirmed.iter().map(Device::to_string).collect();
+        self.raise(AlarmId::StopNotConfirmed, &names.join(" and "));
+        self.go(Aborting);
+        self.abort_those_that_move();
+    }
+}
+
+/// Returns the place from which a phase is taken up again while its machine has not been started.
+pub(super) fn restart_of(phase: Phase) -> Phase {
+    match phase.job() {
+        Some((device, Step::Clear | Step::Prepare | Step::Start)) => Phase::of(device, Step::Send),
+        _ => phase,
+    }
+}
+
+/// Returns the place from which a phase is taken up again after its machine was out of sight.
+fn out_of_sight(phase: Phase) -> Phase {
+    match phase.moving() {
+        Some(device) => Phase::of(device, Step::Reconcile),
+        None => restart_of(phase),
+    }
+}
+
+/// Returns the machine that is to be seen clear of the part.
+pub(super) fn awaits_clear(phase: Phase) -> Option<Device> {
+    match phase.job() {
+        Some((device, Step::Clear)) => Some(device.other()),
+        None if phase == Transfer => Some(Device::Grinder),
+        _ => None,
+    }
+}
+
+/// Returns the machine whose result is being given back.
+pub(super) fn awaits_acknowledge(phase: Phase) -> Option<Device> {
+    phase.job().filter(|(_, step)| matches!(step, Step::Acknowledge | Step::Discard)).map(|(device, _)| device)
+}
+
+/// Returns whether a phase waits for the answer to a question.
+pub(super) fn awaits(phase: Phase, device: Device, what: Asked) -> bool {
+    let steps: &[Step] = match what {
+        Asked::Load => &[Step::Send],
+        Asked::Prepare => &[Step::Prepare],
+        Asked::Start => &[Step::Start],
+        Asked::Collect => &[Step::Collect],
+        Asked::Acknowledge => &[Step::Acknowledge, Step::Discard],
+        Asked::Hold | Asked::Resume | Asked::Stop | Asked::Abort | Asked::Clear => &[],
+    };
+    phase.job().is_some_and(|(job, step)| job == device && steps.contains(&step))
+}
+
+/// Returns the machine that is at a job, if one is.
+pub(super) fn running(state: State) -> Option<Device> {
+    state.phase().and_then(Phase::moving)
+}
+
+/// Returns the machine whose job is being found out about.
+pub(super) fn reconciling(state: State) -> Option<Device> {
+    match state {
+        Execute(phase) | Holding(phase) | Suspending(phase) | Unsuspending(phase) | Unholding(phase) => {
+            phase.job().filter(|(_, step)| *step == Step::Reconcile).map(|(device, _)| device)
+        }
+        _ => None,
+    }
+}
+
+/// Writes the reason that a person gave, if any.
+pub(super) fn because(reason: &str) -> String {
+    if reason.is_empty() { String::new() } else { format!(", because {reason}") }
+}
+
+fn gate_alarm(why: &GateFailure) -> (AlarmId, String) {
+    match why {
+        GateFailure::Coverage(words) => (AlarmId::Coverage, words.clone()),
+        GateFailure::NoPart => (AlarmId::NoPart, String::new()),
+        GateFailure::Contacts => (AlarmId::Contacts, String::new()),
+        GateFailure::Inches => (AlarmId::Inches, "the points of the CMM".to_owned()),
+        GateFailure::Foreign(words) => (AlarmId::ForeignResult, words.clone()),
+        GateFailure::Broken(words) => (AlarmId::BrokenResult, words.clone()),
+        GateFailure::Temperature(words) => (AlarmId::Temperature, words.clone()),
+    }
+}
+
+fn response_alarm(response: Response) -> AlarmId {
+    match response {
+        Response::SignFlipped => AlarmId::SignFlipped,
+        Response::Mirrored => AlarmId::Mirrored,
+        Response::NoEffect | Response::Expected | Response::Unclear => AlarmId::NoEffect,
+    }
+}

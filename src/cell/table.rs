@@ -1,0 +1,256 @@
+//! The transition table, found by trying: every event in every state that can be reached. So it is what the machine does, and
+//! not what somebody wrote down once.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::time::Duration;
+
+use super::command::Command;
+use super::event::{
+    Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Found, Gate, GateFailure,
+    JobResult, Mismatch, Reconciliation, RecordFailure, Response,
+};
+use super::machine::Cell;
+use super::plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, Tolerance};
+use super::state::{Device, State};
+
+/// What an event does in a state.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Row {
+    /// The state.
+    pub state: State,
+    /// The name of the event, with the machine that it comes from.
+    pub event: String,
+    /// What can follow; more than one where it depends on the values of the event or on what happened before.
+    pub answers: BTreeSet<Answer>,
+}
+
+/// One thing that can follow.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Answer {
+    /// The next state.
+    pub next: State,
+    /// The commands, by name.
+    pub commands: Vec<String>,
+}
+
+impl Answer {
+    /// Returns whether the event did not fit.
+    pub fn is_refusal(&self) -> bool {
+        self.commands.iter().any(|command| command == "Refuse")
+    }
+}
+
+/// Returns the table, sorted by state and event.
+pub fn table() -> Vec<Row> {
+    let mut rows: BTreeMap<(State, String), BTreeSet<Answer>> = BTreeMap::new();
+    let mut open: VecDeque<Cell> = [Disposal::Hold, Disposal::Stop].into_iter().map(|d| Cell::new(plan(d))).collect();
+    let mut seen = BTreeSet::new();
+    while let Some(cell) = open.pop_front() {
+        for event in samples(cell.cycle()) {
+            let mut next = cell.clone();
+            let name = name_of(&event);
+            // Late enough for whatever is due.
+            let now = cell.next_deadline().unwrap_or(Duration::ZERO);
+            let commands = next.handle(now, event).iter().map(Command::name).collect();
+            let answer = Answer { next: next.state(), commands };
+            rows.entry((cell.state(), name)).or_default().insert(answer);
+            if seen.insert(key(&next)) {
+                open.push_back(next);
+            }
+        }
+    }
+    rows.into_iter().map(|((state, event), answers)| Row { state, event, answers }).collect()
+}
+
+/// What decides how a cell answers, without times and counts, and no finer than the table needs.
+fn key(cell: &Cell) -> impl Ord + use<> {
+    let known = cell.known.map(|known| (known.ready, known.met && known.stands));
+    let clear = cell.known.iter().all(|known| known.clear);
+    let memory = (cell.worse.min(1), cell.repeated, cell.previous.is_some(), cell.passes >= cell.plan.max_cycles);
+    (cell.state, known, clear, cell.causes.is_empty(), memory, cell.plan.on_stall == Disposal::Hold)
+}
+
+fn name_of(event: &Event) -> String {
+    match device_of(event) {
+        Some(device) => format!("{} ({device})", event.name()),
+        None => event.name().to_owned(),
+    }
+}
+
+fn device_of(event: &Event) -> Option<Device> {
+    match event {
+        Event::DeclaredOver { device, .. }
+        | Event::Connected { device, .. }
+        | Event::NotConnected { device, .. }
+        | Event::LinkLost { device, .. }
+        | Event::LinkBack { device, .. }
+        | Event::Prepared { device, .. }
+        | Event::Started { device, .. }
+        | Event::StartUnknown { device, .. }
+        | Event::Progressed { device, .. }
+        | Event::MachineHeld { device }
+        | Event::MachineResumed { device }
+        | Event::Ended { device, .. }
+        | Event::Cleared { device }
+        | Event::Obstructed { device, .. }
+        | Event::Refused { device, .. }
+        | Event::Fault { device, .. }
+        | Event::Acknowledged { device }
+        | Event::AbortConfirmed { device }
+        | Event::Reconciled { device, .. } => Some(*device),
+        _ => None,
+    }
+}
+
+fn plan(disposal: Disposal) -> CellPlan {
+    CellPlan {
+        begin_with: Beginning::Grind,
+        max_cycles: 3,
+        tolerance: Tolerance { pv_mm: 0.010, rms_mm: 0.002, with_uncertainty: false },
+        stall_share: 0.05,
+        on_stall: disposal,
+        on_divergence: disposal,
+        on_refusal: disposal,
+        gates: Gates {
+            least_found: 0.9,
+            least_coverage: 0.9,
+            most_shift_mm: 1.0,
+            most_turn_rad: 0.1,
+            most_radius_error_mm: Some(0.002),
+        },
+        removal_budget_mm: 1.0,
+        least_depth_mm: 0.001,
+        clear_at_start: disposal == Disposal::Stop,
+        deadlines: Deadlines::default(),
+    }
+}
+
+/// Returns events of every kind, with the values upon which the cell decides, for a cycle.
+pub fn samples(cycle: u32) -> Vec<Event> {
+    let mut events = orders();
+    for device in Device::BOTH {
+        events.extend(of_machine(device, cycle));
+    }
+    events.extend(of_computations(cycle));
+    for condition in [Condition::Supplies, Condition::Temperature] {
+        events.push(Event::ConditionLost { condition, words: String::new() });
+        events.push(Event::ConditionBack { condition });
+    }
+    events.push(Event::RecordFailed { why: RecordFailure::DiskFull(String::new()) });
+    events.push(Event::RecordFailed { why: RecordFailure::Unwritable(String::new()) });
+    events.push(Event::Deadline);
+    events
+}
+
+fn orders() -> Vec<Event> {
+    let (actor, reason) = (Actor { name: "somebody".to_owned(), station: "console".to_owned() }, String::new());
+    let evidence = String::new();
+    vec![
+        Event::Start { actor: actor.clone() },
+        Event::LoadConfirmed { actor: actor.clone() },
+        Event::Hold { actor: actor.clone(), reason: reason.clone() },
+        Event::Resume { actor: actor.clone(), reason: reason.clone() },
+        Event::Stop { actor: actor.clone(), reason: reason.clone() },
+        Event::Abort { actor: actor.clone(), reason },
+        Event::DeclaredOver { actor: actor.clone(), device: Device::Cmm, evidence: evidence.clone() },
+        Event::DeclaredOver { actor: actor.clone(), device: Device::Grinder, evidence },
+        Event::Restarted { actor },
+    ]
+}
+
+fn of_machine(device: Device, cycle: u32) -> Vec<Event> {
+    let words = String::new;
+    let mut events = vec![
+        Event::LinkLost { device, why: words() },
+        Event::LinkBack { device, boot_id: 1 },
+        Event::LinkBack { device, boot_id: 2 },
+        Event::Prepared { device, cycle },
+        Event::Started { device, cycle },
+        Event::StartUnknown { device, cycle, why: words() },
+        Event::Progressed { device, done: 1, total: 2 },
+        Event::MachineHeld { device },
+        Event::MachineResumed { device },
+        Event::Cleared { device },
+        Event::Obstructed { device, words: words() },
+        Event::Fault { device, code: 5, words: words() },
+        Event::Acknowledged { device },
+        Event::AbortConfirmed { device },
+    ];
+    for found in [Found::Idle, Found::ToClear, Found::Busy(words())] {
+        events.push(Event::Connected { device, boot_id: 1, simulated: true, found });
+    }
+    let unlike = [Mismatch::Unreachable(words()), Mismatch::WrongDevice(words()), Mismatch::WordOrder(words())];
+    for why in unlike.into_iter().chain([Mismatch::Inches, Mismatch::Owned(words())]) {
+        events.push(Event::NotConnected { device, why });
+    }
+    for result in [JobResult::Complete, JobResult::Stopped, JobResult::Aborted, JobResult::Failed] {
+        events.push(Event::Ended { device, cycle, result });
+        events.push(Event::Reconciled { device, cycle, outcome: Reconciliation::Ended(result) });
+    }
+    let outcomes = [Reconciliation::Running, Reconciliation::Held, Reconciliation::NotStarted];
+    for outcome in outcomes.into_iter().chain([Reconciliation::Unknown(words())]) {
+        events.push(Event::Reconciled { device, cycle, outcome });
+    }
+    use Asked::{Abort, Acknowledge, Clear, Collect, Hold, Load, Prepare, Resume, Start, Stop};
+    for what in [Load, Prepare, Start, Hold, Resume, Stop, Abort, Clear, Collect, Acknowledge] {
+        events.push(Event::Refused { device, what, why: words() });
+    }
+    events
+}
+
+fn of_computations(cycle: u32) -> Vec<Event> {
+    let words = String::new;
+    let failures = [GateFailure::NoPart, GateFailure::Contacts, GateFailure::Inches, GateFailure::Coverage(words())];
+    let more = [GateFailure::Foreign(words()), GateFailure::Broken(words()), GateFailure::Temperature(words())];
+    let gates = failures.into_iter().chain(more).map(Gate::Failed).chain([Gate::Passed]);
+    let mut events: Vec<_> = gates.map(|gate| Event::Collected { cycle, targets: 100, found: 99, gate }).collect();
+    events.push(Event::Collected { cycle, targets: 100, found: 10, gate: Gate::Passed });
+    events.push(Event::PassLoaded { cycle });
+    events.push(Event::PlanLoaded { cycle });
+    for radius_error_mm in [0.0, 0.010, f64::NAN] {
+        events.push(Event::Qualified { cycle, radius_error_mm });
+    }
+    events.extend(sample_figures().into_iter().map(|figures| Event::Registered { cycle, figures }));
+    events.push(Event::RegistrationFailed { cycle, why: words() });
+    let (largest_mm, depth_mm, predicted_pv_mm) = (0.02, 0.03, 0.005);
+    let summary = CompensationSummary { largest_mm, depth_mm, predicted_pv_mm, warnings: Vec::new() };
+    events.push(Event::Compensated { cycle, summary });
+    let refusals = [CompensationRefusal::BudgetSpent(words()), CompensationRefusal::WeakDirections(Vec::new())];
+    for why in refusals.into_iter().chain([CompensationRefusal::Failed(words())]) {
+        events.push(Event::CompensationRefused { cycle, why });
+    }
+    events
+}
+
+fn sample_figures() -> Vec<Figures> {
+    let plain = Figures {
+        pv_mm: 0.030,
+        rms_mm: 0.006,
+        pv_expanded_mm: 0.0005,
+        rms_expanded_mm: 0.0001,
+        coverage: 0.99,
+        points: 99,
+        outliers: 0,
+        shift_mm: 0.1,
+        turn_rad: 0.01,
+        weak_directions: Vec::new(),
+        warnings: Vec::new(),
+        response: None,
+        removed_mm: Some(0.1),
+    };
+    let mut all = vec![
+        plain.clone(),
+        Figures { pv_mm: 0.020, rms_mm: 0.004, ..plain.clone() },
+        Figures { pv_mm: 0.060, ..plain.clone() },
+        Figures { pv_mm: 0.005, rms_mm: 0.001, ..plain.clone() },
+        Figures { coverage: 0.5, ..plain.clone() },
+        Figures { shift_mm: 5.0, ..plain.clone() },
+        Figures { turn_rad: 3.0, ..plain.clone() },
+        Figures { removed_mm: Some(2.0), ..plain.clone() },
+        Figures { pv_mm: f64::NAN, ..plain.clone() },
+    ];
+    for response in [Response::Expected, Response::SignFlipped, Response::Mirrored, Response::NoEffect] {
+        all.push(Figures { response: Some(response), ..plain.clone() });
+    }
+    all
+}

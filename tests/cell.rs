@@ -1,0 +1,637 @@
+//! The machine: whole runs, every judgement, every interruption, every pair of state and event, and whatever chance brings.
+
+use std::time::Duration;
+
+use proptest::prelude::*;
+use regrind::cell::*;
+
+const S: Duration = Duration::from_secs(1);
+
+fn plan() -> CellPlan {
+    CellPlan {
+        begin_with: Beginning::Grind,
+        max_cycles: 4,
+        tolerance: Tolerance { pv_mm: 0.007, rms_mm: 0.001, with_uncertainty: true },
+        stall_share: 0.02,
+        on_stall: Disposal::Stop,
+        on_divergence: Disposal::Hold,
+        on_refusal: Disposal::Hold,
+        gates: Gates {
+            least_found: 0.95,
+            least_coverage: 0.9,
+            most_shift_mm: 1.0,
+            most_turn_rad: 0.1,
+            most_radius_error_mm: Some(0.002),
+        },
+        removal_budget_mm: 0.5,
+        least_depth_mm: 0.002,
+        clear_at_start: false,
+        deadlines: Deadlines::default(),
+    }
+}
+
+fn actor() -> Actor {
+    Actor { name: "Ada".into(), station: "console".into() }
+}
+
+fn figures(pv_um: f64, rms_um: f64) -> Figures {
+    Figures {
+        pv_mm: pv_um / 1e3,
+        rms_mm: rms_um / 1e3,
+        pv_expanded_mm: 0.0003,
+        rms_expanded_mm: 0.00005,
+        coverage: 0.99,
+        points: 1000,
+        outliers: 1,
+        shift_mm: 0.05,
+        turn_rad: 0.001,
+        weak_directions: vec![],
+        warnings: vec![],
+        response: None,
+        removed_mm: Some(0.1),
+    }
+}
+
+fn hold() -> Event {
+    Event::Hold { actor: actor(), reason: "coffee".into() }
+}
+
+fn resume() -> Event {
+    Event::Resume { actor: actor(), reason: String::new() }
+}
+
+fn stop() -> Event {
+    Event::Stop { actor: actor(), reason: String::new() }
+}
+
+fn abort() -> Event {
+    Event::Abort { actor: actor(), reason: String::new() }
+}
+
+/// Returns the answer that a good world gives to a command.
+fn answer(command: &Command, figures: &mut dyn FnMut(u32) -> Figures) -> Option<Event> {
+    Some(match command.clone() {
+        Command::Connect { device } | Command::ClearMachine { device } => {
+            Event::Connected { device, boot_id: 7, simulated: true, found: Found::Idle }
+        }
+        Command::AskToLoad => Event::LoadConfirmed { actor: actor() },
+        Command::LoadPass { cycle } => Event::PassLoaded { cycle },
+        Command::LoadPlan { cycle } => Event::PlanLoaded { cycle },
+        Command::VerifyClear { device } => Event::Cleared { device },
+        Command::Prepare { device, cycle } => Event::Prepared { device, cycle },
+        Command::StartMachine { device, cycle } => Event::Started { device, cycle },
+        Command::HoldMachine { device } => Event::MachineHeld { device },
+        Command::ResumeMachine { device } => Event::MachineResumed { device },
+        Command::StopMachine { device } => Event::Ended { device, cycle: u32::MAX, result: JobResult::Stopped },
+        Command::AbortMachine { device } => Event::AbortConfirmed { device },
+        Command::Reconcile { device, cycle } => Event::Reconciled { device, cycle, outcome: Reconciliation::Running },
+        Command::Collect { cycle } => Event::Collected { cycle, targets: 1000, found: 999, gate: Gate::Passed },
+        Command::Qualify { cycle } => Event::Qualified { cycle, radius_error_mm: 0.0003 },
+        Command::Acknowledge { device } => Event::Acknowledged { device },
+        Command::Register { cycle } => Event::Registered { cycle, figures: figures(cycle) },
+        Command::Compensate { cycle } => {
+            let (largest_mm, depth_mm, predicted_pv_mm) = (0.01, 0.02, 0.005);
+            let summary = CompensationSummary { largest_mm, depth_mm, predicted_pv_mm, warnings: vec![] };
+            Event::Compensated { cycle, summary }
+        }
+        Command::Announce(_)
+        | Command::Raise(_)
+        | Command::Withdraw { .. }
+        | Command::Refuse { .. }
+        | Command::Finish(_) => return None,
+    })
+}
+
+/// A cell and a good world around it.
+struct Run<'f> {
+    cell: Cell,
+    now: Duration,
+    all: Vec<Command>,
+    waiting: Vec<Command>,
+    figures: Box<dyn FnMut(u32) -> Figures + 'f>,
+}
+
+impl<'f> Run<'f> {
+    fn new(plan: CellPlan, figures: impl FnMut(u32) -> Figures + 'f) -> Self {
+        let cell = Cell::new(plan);
+        Self { cell, now: Duration::ZERO, all: vec![], waiting: vec![], figures: Box::new(figures) }
+    }
+
+    fn send(&mut self, event: Event) -> Vec<Command> {
+        self.now += S / 100;
+        let commands = self.cell.handle(self.now, event);
+        self.all.extend(commands.clone());
+        self.waiting.extend(commands.clone());
+        commands
+    }
+
+    /// Answers the oldest open command, or lets a running job end; false if nothing is left to do.
+    fn step(&mut self) -> bool {
+        while !self.waiting.is_empty() {
+            let command = self.waiting.remove(0);
+            if let Some(mut event) = answer(&command, &mut self.figures) {
+                if let Event::Ended { cycle, .. } = &mut event {
+                    *cycle = self.cell.cycle();
+                }
+                self.send(event);
+                return true;
+            }
+        }
+        let running = match self.cell.state() {
+            State::Execute(Phase::Grind(Step::Run)) => Some(Device::Grinder),
+            State::Execute(Phase::Measure(Step::Run)) => Some(Device::Cmm),
+            _ => None,
+        };
+        let cycle = self.cell.cycle();
+        running.map(|device| self.send(Event::Ended { device, cycle, result: JobResult::Complete })).is_some()
+    }
+
+    fn go_on(&mut self) -> &mut Self {
+        for _ in 0..2000 {
+            if !self.step() {
+                return self;
+            }
+        }
+        panic!("the run does not come to rest: {}", self.cell.state());
+    }
+
+    fn until(&mut self, state: State) -> &mut Self {
+        for _ in 0..2000 {
+            if self.cell.state() == state {
+                return self;
+            }
+            assert!(self.step(), "came to rest in {} and not {state}", self.cell.state());
+        }
+        panic!("never in {state}");
+    }
+
+    fn start(&mut self) -> &mut Self {
+        self.send(Event::Start { actor: actor() });
+        self
+    }
+
+    fn ending(&self) -> Option<&Ending> {
+        self.all.iter().find_map(|c| if let Command::Finish(ending) = c { Some(ending) } else { None })
+    }
+
+    fn alarms(&self) -> Vec<AlarmId> {
+        self.all.iter().filter_map(|c| if let Command::Raise(alarm) = c { Some(alarm.id) } else { None }).collect()
+    }
+
+    fn verdicts(&self) -> Vec<Verdict> {
+        self.all.iter().filter_map(|c| if let Command::Announce(j) = c { Some(j.verdict) } else { None }).collect()
+    }
+
+    fn starts(&self) -> Vec<(Device, u32)> {
+        let start =
+            |c: &Command| if let Command::StartMachine { device, cycle } = c { Some((*device, *cycle)) } else { None };
+        self.all.iter().filter_map(start).collect()
+    }
+}
+
+#[test]
+fn a_whole_run_grinds_twice_and_is_accepted() {
+    let mut run = Run::new(plan(), |cycle| if cycle == 1 { figures(27.0, 6.0) } else { figures(6.0, 0.9) });
+    run.start().go_on();
+    assert_eq!(run.cell.state(), State::Complete);
+    assert!(matches!(run.ending(), Some(Ending::Accepted { cycle: 2, .. })), "{:?}", run.ending());
+    use Device::{Cmm, Grinder};
+    assert_eq!(run.starts(), [(Grinder, 1), (Cmm, 1), (Grinder, 2), (Cmm, 2)]);
+    assert_eq!(run.verdicts(), [Verdict::Continue, Verdict::Accept]);
+    assert_eq!(run.alarms(), []);
+    assert!(!run.all.iter().any(|c| matches!(c, Command::Refuse { .. })));
+    assert_eq!(run.cell.next_deadline(), None);
+}
+
+#[test]
+fn a_run_may_begin_with_a_measurement() {
+    let begin_with = Beginning::Measure;
+    let mut run = Run::new(CellPlan { begin_with, ..plan() }, |_| figures(5.0, 0.5));
+    run.start().go_on();
+    assert_eq!(run.starts(), [(Device::Cmm, 1)]);
+    assert_eq!(run.cell.state(), State::Complete);
+}
+
+#[test]
+fn the_uncertainty_counts_only_where_the_plan_says_so() {
+    for (with_uncertainty, accepted) in [(true, false), (false, true)] {
+        let tolerance = Tolerance { with_uncertainty, ..plan().tolerance };
+        let mut run = Run::new(CellPlan { tolerance, max_cycles: 1, ..plan() }, |_| figures(7.0, 1.0));
+        run.start().go_on();
+        assert_eq!(run.cell.state() == State::Complete, accepted);
+    }
+}
+
+#[test]
+fn every_judgement_has_its_end() {
+    type Sequence = fn(u32) -> Figures;
+    let sequences: [(Sequence, &[Verdict], State); 7] = [
+        (
+            |k| figures(30.0 - 2.0 * f64::from(k), 6.0),
+            &[Verdict::Continue, Verdict::Continue, Verdict::Continue, Verdict::MaxCycles],
+            State::Stopped,
+        ),
+        (|_| figures(30.0, 6.0), &[Verdict::Continue, Verdict::Stalled], State::Stopped),
+        (
+            |k| figures(30.0 * 1.1_f64.powi(k as i32), 6.0),
+            &[Verdict::Continue, Verdict::Diverging, Verdict::Diverging],
+            State::Held(Phase::Compensate),
+        ),
+        (
+            |k| Figures { response: (k > 1).then_some(Response::SignFlipped), ..figures(20.0 * f64::from(k), 6.0) },
+            &[Verdict::Continue, Verdict::WrongResponse],
+            State::Held(Phase::Compensate),
+        ),
+        (
+            |k| Figures { response: (k > 1).then_some(Response::Mirrored), ..figures(20.0, 6.0) },
+            &[Verdict::Continue, Verdict::WrongResponse],
+            State::Held(Phase::Compensate),
+        ),
+        (
+            |k| Figures { response: (k > 1).then_some(Response::NoEffect), ..figures(20.0, 6.0) },
+            &[Verdict::Continue, Verdict::WrongResponse],
+            State::Held(Phase::Compensate),
+        ),
+        (|_| Figures { removed_mm: Some(0.499), ..figures(30.0, 6.0) }, &[Verdict::BudgetSpent], State::Stopped),
+    ];
+    for (i, (figures, verdicts, state)) in sequences.into_iter().enumerate() {
+        let mut run = Run::new(plan(), figures);
+        run.start().go_on();
+        assert_eq!((run.verdicts().as_slice(), run.cell.state()), (verdicts, state), "sequence {i}");
+        assert!(!run.alarms().is_empty(), "sequence {i} raises an alarm");
+        assert!(state != State::Stopped || matches!(run.ending(), Some(Ending::NotAccepted { .. })));
+    }
+}
+
+#[test]
+fn one_worse_cycle_is_forgiven() {
+    let mut run =
+        Run::new(plan(), |k| [figures(20.0, 4.0), figures(22.0, 4.0), figures(6.0, 0.9)][k as usize - 1].clone());
+    run.start().go_on();
+    assert_eq!(run.verdicts(), [Verdict::Continue, Verdict::Diverging, Verdict::Accept]);
+}
+
+/// The states through which an undisturbed run goes.
+fn way() -> Vec<State> {
+    let mut run = Run::new(plan(), |cycle| if cycle == 1 { figures(27.0, 6.0) } else { figures(6.0, 0.9) });
+    run.start();
+    let mut way = vec![run.cell.state()];
+    while run.step() {
+        if !way.contains(&run.cell.state()) {
+            way.push(run.cell.state());
+        }
+    }
+    way.retain(|state| !state.is_end());
+    way
+}
+
+#[test]
+fn hold_and_resume_at_every_step_lead_to_the_same_end() {
+    for state in way() {
+        if state == State::Completing {
+            continue;
+        }
+        let mut run = Run::new(plan(), |cycle| if cycle == 1 { figures(27.0, 6.0) } else { figures(6.0, 0.9) });
+        run.start().until(state).send(hold());
+        run.go_on();
+        assert!(matches!(run.cell.state(), State::Held(_)), "held at {state}: {}", run.cell.state());
+        let before = run.all.len();
+        run.send(hold());
+        assert_eq!(run.all.len(), before, "a second hold changes nothing");
+        run.send(resume());
+        run.go_on();
+        assert_eq!(run.cell.state(), State::Complete, "held at {state}");
+        let mut starts = run.starts();
+        starts.dedup();
+        assert_eq!(starts.len(), 4, "held at {state}: {starts:?}");
+    }
+}
+
+#[test]
+fn a_running_machine_is_told_to_hold_and_to_resume() {
+    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    run.start().until(State::Execute(Phase::Grind(Step::Run)));
+    assert_eq!(run.send(hold()), [Command::HoldMachine { device: Device::Grinder }]);
+    run.until(State::Held(Phase::Grind(Step::Run)));
+    assert_eq!(run.send(resume()), [Command::ResumeMachine { device: Device::Grinder }]);
+}
+
+#[test]
+fn stop_at_every_step_ends_in_order() {
+    for state in way() {
+        let mut run = Run::new(plan(), |cycle| if cycle == 1 { figures(27.0, 6.0) } else { figures(6.0, 0.9) });
+        run.start().until(state);
+        run.waiting.clear();
+        run.send(stop());
+        run.go_on();
+        let expected = if state == State::Completing { State::Completing } else { State::Stopped };
+        assert_eq!(run.cell.state(), expected, "stopped at {state}");
+        assert!(!run.all.iter().any(|c| matches!(c, Command::AbortMachine { .. })));
+    }
+}
+
+#[test]
+fn abort_and_fault_at_every_step_send_the_safe_sequence_only() {
+    let fault = Event::Fault { device: Device::Grinder, code: 5, words: "drive".into() };
+    for state in way() {
+        for event in [abort(), fault.clone()] {
+            let mut run = Run::new(plan(), |cycle| if cycle == 1 { figures(27.0, 6.0) } else { figures(6.0, 0.9) });
+            run.start().until(state);
+            run.waiting.clear();
+            let before = run.all.len();
+            run.send(event);
+            run.go_on();
+            assert_eq!(run.cell.state(), State::Aborted, "aborted at {state}");
+            for command in &run.all[before..] {
+                let safe = matches!(
+                    command,
+                    Command::AbortMachine { .. } | Command::VerifyClear { .. } | Command::Raise(_) | Command::Finish(_)
+                );
+                assert!(safe, "{command:?} after an abort at {state}");
+            }
+            assert!(matches!(run.ending(), Some(Ending::Aborted { confirmed: true, .. })));
+        }
+    }
+}
+
+#[test]
+fn an_abort_that_nobody_confirms_names_the_emergency_circuit_and_ends() {
+    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    run.start().until(State::Execute(Phase::Grind(Step::Run))).send(abort());
+    for _ in 0..2 {
+        let due = run.cell.next_deadline().unwrap();
+        assert!(due <= run.now + 2 * S);
+        run.now = due;
+        run.send(Event::Deadline);
+    }
+    assert_eq!(run.cell.state(), State::Aborted);
+    assert!(matches!(run.ending(), Some(Ending::Aborted { confirmed: false, .. })));
+    let alarm = run.all.iter().find_map(|c| if let Command::Raise(a) = c { Some(a.clone()) } else { None }).unwrap();
+    assert!(alarm.remedy[0].contains("the machine's own emergency circuit"), "{alarm:?}");
+}
+
+#[test]
+fn a_lost_link_suspends_and_the_machine_is_asked_what_became_of_its_job() {
+    let cases = [
+        (Reconciliation::Running, State::Execute(Phase::Grind(Step::Run))),
+        (Reconciliation::Held, State::Unsuspending(Phase::Grind(Step::Run))),
+        (Reconciliation::Ended(JobResult::Complete), State::Execute(Phase::Grind(Step::Acknowledge))),
+        (Reconciliation::NotStarted, State::Execute(Phase::Grind(Step::Send))),
+        (Reconciliation::Unknown("no memory".into()), State::Held(Phase::Grind(Step::Reconcile))),
+    ];
+    for (outcome, state) in cases {
+        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+        run.start().until(State::Execute(Phase::Grind(Step::Run)));
+        let device = Device::Grinder;
+        run.send(Event::LinkLost { device, why: "silent".into() });
+        assert_eq!(run.cell.state(), State::Suspended(Phase::Grind(Step::Reconcile)));
+        let commands = run.send(Event::LinkBack { device, boot_id: 7 });
+        assert!(commands.contains(&Command::Reconcile { device, cycle: 1 }), "{commands:?}");
+        run.send(Event::Reconciled { device, cycle: 1, outcome });
+        assert_eq!(run.cell.state(), state);
+    }
+}
+
+#[test]
+fn a_machine_that_was_restarted_is_looked_at_by_a_person() {
+    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    run.start().until(State::Execute(Phase::Grind(Step::Run)));
+    let device = Device::Grinder;
+    run.send(Event::LinkLost { device, why: "silent".into() });
+    run.send(Event::LinkBack { device, boot_id: 8 });
+    assert_eq!(run.cell.state(), State::Held(Phase::Grind(Step::Reconcile)));
+    run.send(Event::DeclaredOver { actor: actor(), device, evidence: "stands at the park position".into() });
+    assert_eq!(run.cell.state(), State::Held(Phase::Transfer));
+    run.waiting.clear();
+    run.send(resume());
+    run.go_on();
+    assert_eq!(run.cell.state(), State::Complete);
+    assert_eq!(run.starts(), [(device, 1), (Device::Cmm, 1)], "the pass is not repeated");
+}
+
+#[test]
+fn a_missing_condition_holds_the_machine_and_goes_on_by_itself() {
+    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    run.start().until(State::Execute(Phase::Measure(Step::Run)));
+    let condition = Condition::Temperature;
+    run.send(Event::ConditionLost { condition, words: "22.3 of at most 21 degrees".into() });
+    run.until(State::Suspended(Phase::Measure(Step::Run)));
+    run.send(Event::ConditionBack { condition });
+    run.go_on();
+    assert_eq!(run.cell.state(), State::Complete);
+}
+
+#[test]
+fn a_measurement_that_fails_its_gate_makes_no_map_and_is_repeated_under_the_next_number() {
+    let failures = [
+        (GateFailure::NoPart, AlarmId::NoPart),
+        (GateFailure::Contacts, AlarmId::Contacts),
+        (GateFailure::Inches, AlarmId::Inches),
+        (GateFailure::Coverage("3 of 9".into()), AlarmId::Coverage),
+    ];
+    for (why, alarm) in failures {
+        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+        run.start().until(State::Execute(Phase::Measure(Step::Collect)));
+        run.waiting.clear();
+        run.send(Event::Collected { cycle: 1, targets: 9, found: 9, gate: Gate::Failed(why) });
+        run.go_on();
+        assert_eq!((run.alarms(), run.cell.state()), (vec![alarm], State::Held(Phase::Measure(Step::Send))));
+        assert!(!run.all.iter().any(|c| matches!(c, Command::Register { .. })));
+        run.send(resume());
+        run.go_on();
+        assert_eq!(run.starts(), [(Device::Grinder, 1), (Device::Cmm, 1), (Device::Cmm, 2)]);
+    }
+}
+
+#[test]
+fn figures_outside_their_gates_are_never_judged() {
+    let bad = [
+        (Figures { shift_mm: 9.0, ..figures(1.0, 0.1) }, AlarmId::PartMisplaced),
+        (Figures { turn_rad: 3.1, ..figures(1.0, 0.1) }, AlarmId::PartMisplaced),
+        (Figures { coverage: 0.2, ..figures(1.0, 0.1) }, AlarmId::Coverage),
+        (Figures { pv_mm: f64::NAN, ..figures(1.0, 0.1) }, AlarmId::RegistrationFailed),
+        (Figures { rms_mm: -1.0, ..figures(1.0, 0.1) }, AlarmId::RegistrationFailed),
+    ];
+    for (figures, alarm) in bad {
+        let mut run = Run::new(plan(), |_| figures.clone());
+        run.start().go_on();
+        assert_eq!((run.alarms(), run.verdicts()), (vec![alarm], vec![]));
+        assert!(matches!(run.cell.state(), State::Held(_)));
+    }
+    for radius_error_mm in [0.010, -0.010, f64::NAN] {
+        let mut run = Run::new(plan(), |_| figures(1.0, 0.1));
+        run.start().until(State::Execute(Phase::Measure(Step::Qualify)));
+        run.waiting.clear();
+        run.send(Event::Qualified { cycle: 1, radius_error_mm });
+        run.go_on();
+        assert_eq!(run.alarms(), [AlarmId::ProbeRadius]);
+    }
+}
+
+#[test]
+fn a_machine_starts_only_while_the_other_is_clear() {
+    let mut run = Run::new(plan(), |_| figures(1.0, 0.1));
+    run.start().until(State::Execute(Phase::Grind(Step::Prepare)));
+    run.waiting.clear();
+    run.send(Event::Obstructed { device: Device::Cmm, words: "moved by hand".into() });
+    run.send(Event::Prepared { device: Device::Grinder, cycle: 1 });
+    assert_eq!(run.cell.state(), State::Held(Phase::Grind(Step::Send)));
+    assert_eq!(run.starts(), []);
+}
+
+#[test]
+fn a_restarted_program_asks_before_it_goes_on() {
+    for state in way() {
+        let mut run = Run::new(plan(), |cycle| if cycle == 1 { figures(27.0, 6.0) } else { figures(6.0, 0.9) });
+        run.start().until(state);
+        run.waiting.clear();
+        run.send(Event::Restarted { actor: actor() });
+        run.go_on();
+        if state == State::Completing {
+            continue;
+        }
+        assert!(matches!(run.cell.state(), State::Held(_)), "restarted at {state}: {}", run.cell.state());
+        run.send(resume());
+        run.go_on();
+        assert_eq!(run.cell.state(), State::Complete, "restarted at {state}");
+        let mut starts = run.starts();
+        starts.dedup();
+        assert_eq!(starts.len(), 4, "restarted at {state}: {starts:?}");
+    }
+}
+
+#[test]
+fn what_cannot_be_recorded_is_not_begun() {
+    let mut run = Run::new(plan(), |_| figures(1.0, 0.1));
+    run.start().until(State::Execute(Phase::Grind(Step::Prepare)));
+    run.send(Event::RecordFailed { why: RecordFailure::DiskFull("runs".into()) });
+    run.go_on();
+    assert_eq!((run.cell.state(), run.starts()), (State::Held(Phase::Grind(Step::Send)), vec![]));
+    assert_eq!(run.alarms(), [AlarmId::DiskFull]);
+}
+
+#[test]
+fn every_event_has_an_answer_in_every_state() {
+    let rows = table();
+    let states: std::collections::BTreeSet<_> = rows.iter().map(|row| row.state).collect();
+    let events: std::collections::BTreeSet<_> = rows.iter().map(|row| row.event.clone()).collect();
+    assert_eq!(rows.len(), states.len() * events.len());
+    for name in [
+        "Idle",
+        "Starting",
+        "Execute",
+        "Holding",
+        "Held",
+        "Unholding",
+        "Suspending",
+        "Suspended",
+        "Unsuspending",
+        "Stopping",
+        "Stopped",
+        "Aborting",
+        "Aborted",
+        "Completing",
+        "Complete",
+    ] {
+        assert!(states.iter().any(|state| state.name() == name), "{name} is never reached");
+    }
+    for row in &rows {
+        for answer in &row.answers {
+            assert!(!row.state.is_end() || (answer.commands.is_empty() && answer.next == row.state), "{row:?}");
+            assert!(!answer.is_refusal() || answer.next == row.state || row.event == "Resume", "{row:?}");
+            let begins = answer.commands.iter().any(|c| c.starts_with("StartMachine"));
+            assert!(!begins || row.event.starts_with("Prepared"), "{row:?}");
+        }
+        if row.event == "Abort" || row.event.starts_with("Fault") {
+            let ends = |next| matches!(next, State::Aborting | State::Aborted);
+            assert!(row.state.is_end() || row.answers.iter().all(|a| ends(a.next)), "{row:?}");
+        }
+    }
+    eprintln!("{} states, {} events, {} pairs", states.len(), events.len(), rows.len());
+}
+
+#[test]
+fn every_alarm_says_what_to_do() {
+    let mut run = Run::new(plan(), |_| figures(1.0, 0.1));
+    run.start().until(State::Execute(Phase::Grind(Step::Run)));
+    run.send(Event::Fault { device: Device::Grinder, code: 5, words: "drive".into() });
+    let Some(Command::Raise(alarm)) = run.all.iter().find(|c| matches!(c, Command::Raise(_))) else { panic!() };
+    assert_eq!(alarm.what, "A machine is in fault: grinder, fault 5, drive.");
+    assert!(AlarmId::ALL.len() > 30);
+}
+
+/// Plays events chosen by chance, half of them the right answers, and returns the commands with what came before.
+fn play(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> {
+    let mut run = Run::new(plan(), |cycle| figures(30.0 / f64::from(cycle), 6.0 / f64::from(cycle)));
+    run.start();
+    let mut excused = std::collections::BTreeMap::<Device, u32>::new();
+    let mut seen = 0;
+    let mut clear = [false; 2];
+    let mut aborted = false;
+    for (choice, good, wait) in choices {
+        let before = run.cell.state();
+        run.now += Duration::from_secs(u64::from(*wait));
+        let event = if *good && !run.waiting.is_empty() {
+            let command = run.waiting.remove(0);
+            answer(&command, &mut run.figures)
+        } else {
+            let all = samples(run.cell.cycle());
+            Some(all[usize::from(*choice) % all.len()].clone())
+        };
+        let Some(event) = event else { continue };
+        match &event {
+            Event::Cleared { device } => clear[*device as usize] = true,
+            Event::Obstructed { device, .. } | Event::LinkLost { device, .. } => clear[*device as usize] = false,
+            Event::Reconciled { device, outcome: Reconciliation::NotStarted, .. }
+            | Event::Refused { device, what: Asked::Start, .. } => *excused.entry(*device).or_default() += 1,
+            _ => {}
+        }
+        let restarted = matches!(event, Event::Restarted { .. });
+        let commands = run.send(event);
+        prop_assert!(!before.is_end() || commands.is_empty());
+        for command in &commands {
+            if let Command::StartMachine { device, .. } = command {
+                prop_assert!(clear[device.other() as usize], "{device} started while the other is not clear");
+                clear[*device as usize] = false;
+            }
+            let safe = !matches!(
+                command.name().split(' ').next(),
+                Some("AbortMachine" | "VerifyClear" | "Raise" | "Withdraw" | "Refuse" | "Finish" | "Connect")
+            );
+            prop_assert!(!(aborted && safe), "{command:?} after an abort, restarted {restarted}");
+        }
+        aborted |= run.cell.state() == State::Aborting;
+        seen += commands.len();
+    }
+    let mut count = std::collections::BTreeMap::<(Device, u32), u32>::new();
+    for start in run.starts() {
+        *count.entry(start).or_default() += 1;
+    }
+    for ((device, cycle), n) in count {
+        let excuses = excused.get(&device).copied().unwrap_or(0);
+        prop_assert!(n <= 1 + excuses, "{device} started {n} times for cycle {cycle} after {seen} commands");
+    }
+    // The faults stop, nobody answers: by its deadlines alone the cell comes to an end, or holds with an alarm, or waits to be loaded.
+    for _ in 0..12 {
+        match run.cell.next_deadline() {
+            Some(due) => {
+                run.now = run.now.max(due);
+                run.send(Event::Deadline);
+            }
+            None => break,
+        }
+    }
+    let state = run.cell.state();
+    let at_rest = state.is_end() || matches!(state, State::Held(_) | State::Execute(Phase::Load));
+    prop_assert!(at_rest && run.cell.next_deadline().is_none(), "hangs in {state}");
+    Ok(())
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 2000, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn whatever_comes_the_promises_hold(choices in prop::collection::vec((any::<u16>(), prop::bool::weighted(0.8), 0_u8..3), 0..120)) {
+        play(&choices)?;
+    }
+}
