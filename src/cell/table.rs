@@ -71,34 +71,9 @@ fn key(cell: &Cell) -> impl Ord + use<> {
 }
 
 fn name_of(event: &Event) -> String {
-    match device_of(event) {
+    match event.device() {
         Some(device) => format!("{} ({device})", event.name()),
         None => event.name().to_owned(),
-    }
-}
-
-fn device_of(event: &Event) -> Option<Device> {
-    match event {
-        Event::DeclaredOver { device, .. }
-        | Event::Connected { device, .. }
-        | Event::NotConnected { device, .. }
-        | Event::LinkLost { device, .. }
-        | Event::LinkBack { device, .. }
-        | Event::Prepared { device, .. }
-        | Event::Started { device, .. }
-        | Event::StartUnknown { device, .. }
-        | Event::Progressed { device, .. }
-        | Event::MachineHeld { device }
-        | Event::MachineResumed { device }
-        | Event::Ended { device, .. }
-        | Event::Cleared { device }
-        | Event::Obstructed { device, .. }
-        | Event::Refused { device, .. }
-        | Event::Fault { device, .. }
-        | Event::Acknowledged { device }
-        | Event::AbortConfirmed { device }
-        | Event::Reconciled { device, .. } => Some(*device),
-        _ => None,
     }
 }
 
