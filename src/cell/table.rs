@@ -65,7 +65,10 @@ pub fn table() -> Vec<Row> {
 /// What decides how a cell answers, without times and counts, and no finer than the table needs.
 fn key(cell: &Cell) -> impl Ord + use<> {
     let known = cell.known.map(|known| (known.ready, known.met && known.stands));
-    let clear = cell.known.iter().all(|known| known.clear);
+    // At the end of a run it matters which machine is clear already, elsewhere only whether both are.
+    let both = cell.known.iter().all(|known| known.clear);
+    let ends = matches!(cell.state, State::Aborting | State::Completing);
+    let clear = cell.known.map(|known| if ends { known.clear } else { both });
     let memory = (cell.worse.min(1), cell.repeated, cell.previous.is_some(), cell.passes >= cell.plan.max_cycles);
     (cell.state, known, clear, cell.causes.is_empty(), memory, cell.plan.on_stall == Disposal::Hold)
 }

@@ -10,11 +10,11 @@ use super::svg::{Anchor, INK, LARGE, Svg};
 use crate::cell::{Row, State};
 
 const WIDTH_PX: f64 = 1300.0;
-const HEIGHT_PX: f64 = 1180.0;
+const HEIGHT_PX: f64 = 1260.0;
 /// Of labels.
 const FINE_PX: f64 = 10.0;
 /// Where the second drawing begins.
-const CYCLE_TOP_PX: f64 = 770.0;
+const CYCLE_TOP_PX: f64 = 850.0;
 
 /// Arrows that follow an order of a person, go the way of a run, or tell that something went wrong.
 const ORDER: &str = "#2166ac";
@@ -38,21 +38,21 @@ const TROUBLES: [&str; 12] = [
 
 /// The states of PackML and the middles of their boxes.
 const STATES: [(&str, [f64; 2]); 15] = [
-    ("Idle", [80.0, 280.0]),
-    ("Starting", [240.0, 280.0]),
-    ("Execute", [520.0, 280.0]),
-    ("Holding", [320.0, 130.0]),
-    ("Held", [520.0, 130.0]),
-    ("Unholding", [720.0, 130.0]),
-    ("Suspending", [320.0, 430.0]),
-    ("Suspended", [520.0, 430.0]),
-    ("Unsuspending", [720.0, 430.0]),
-    ("Completing", [940.0, 280.0]),
-    ("Complete", [1180.0, 280.0]),
-    ("Stopping", [520.0, 570.0]),
-    ("Stopped", [1180.0, 570.0]),
-    ("Aborting", [520.0, 690.0]),
-    ("Aborted", [1180.0, 690.0]),
+    ("Idle", [80.0, 320.0]),
+    ("Starting", [240.0, 320.0]),
+    ("Execute", [560.0, 320.0]),
+    ("Holding", [310.0, 130.0]),
+    ("Held", [560.0, 130.0]),
+    ("Unholding", [810.0, 130.0]),
+    ("Suspending", [310.0, 510.0]),
+    ("Suspended", [560.0, 510.0]),
+    ("Unsuspending", [810.0, 510.0]),
+    ("Completing", [1000.0, 320.0]),
+    ("Complete", [1210.0, 320.0]),
+    ("Stopping", [560.0, 650.0]),
+    ("Stopped", [1210.0, 650.0]),
+    ("Aborting", [560.0, 770.0]),
+    ("Aborted", [1210.0, 770.0]),
 ];
 
 /// A frame around states that all have the same way out.
@@ -69,7 +69,7 @@ struct Frame {
 const FRAMES: [Frame; 2] = [
     Frame {
         corner: [20.0, 78.0],
-        size: [800.0, 432.0],
+        size: [880.0, 512.0],
         around: &[
             "Idle",
             "Starting",
@@ -82,11 +82,11 @@ const FRAMES: [Frame; 2] = [
             "Unsuspending",
         ],
         to: ["Stopping", "Stopped"],
-        label: ["Stop", "Stop, where no machine has a job"],
+        label: ["Stop", "Stop; no job is under way"],
     },
     Frame {
         corner: [8.0, 66.0],
-        size: [1020.0, 564.0],
+        size: [1072.0, 644.0],
         around: &[
             "Idle",
             "Starting",
@@ -101,7 +101,7 @@ const FRAMES: [Frame; 2] = [
             "Stopping",
         ],
         to: ["Aborting", "Aborted"],
-        label: ["Abort, Fault", "Abort, where no machine was met"],
+        label: ["Abort, Fault", "Abort; no machine was met"],
     },
 ];
 
@@ -212,7 +212,6 @@ fn draw_states(svg: &mut Svg, ways: &Ways) {
         // A frame stands only for a way that all within it have.
         if frame.around.iter().all(|from| leads(&from)) {
             ways.retain(|(from, to), _| !(frame.around.contains(&from.as_str()) && frame.to.contains(&to.as_str())));
-            // `Stopping` itself ends in `Stopped`, which is no way of the frame.
             draw_frame(svg, frame, &mut taken);
         }
     }
@@ -236,9 +235,9 @@ fn draw_frame(svg: &mut Svg, frame: &Frame, taken: &mut Vec<Taken>) {
     let to = [near[0], near[1] - HALF_STATE[1]];
     svg.arrow([near[0], bottom], [near[0], bottom], to, ORDER);
     svg.text([near[0] + 8.0, (bottom + to[1]) / 2.0 + 4.0], Anchor::Start, FINE_PX, frame.label[0]);
-    let (start, end) = ([right - 40.0, bottom], [far[0] - HALF_STATE[0], far[1] - 10.0]);
-    svg.arrow(start, [right - 30.0, end[1]], end, ORDER);
-    svg.text([end[0] - 8.0, end[1] - 6.0], Anchor::End, FINE_PX, frame.label[1]);
+    let (start, end) = ([right - 200.0, bottom], [far[0] - HALF_STATE[0], far[1] - 10.0]);
+    svg.arrow(start, [right - 180.0, end[1]], end, ORDER);
+    svg.text([end[0] - 8.0, end[1] - 5.0], Anchor::End, FINE_PX, frame.label[1]);
     taken.push(([end[0] - 80.0, end[1] - 8.0], [80.0, 8.0]));
 }
 
