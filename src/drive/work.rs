@@ -16,7 +16,9 @@ use crate::formats::{
 };
 use crate::geometry::{Point, Pose};
 use crate::measuring::{self, fit_sphere, sphere_targets};
-use crate::registration::{Options, PointStatus as Fate, Registration, Start, register};
+use crate::registration::{
+    MapLimits, Options, PointStatus as Fate, Registration, Start, register, weak_for_compensation,
+};
 use crate::report::HeatMap;
 use crate::surface::{Nominal, Side};
 
@@ -319,9 +321,9 @@ pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &
     let Some(found) = &cycle.registration else {
         return refused(CompensationRefusal::Failed("the measurement of this cycle is not registered".into()));
     };
-    let seen: Vec<String> = found.verdict.weak_directions.iter().map(|weak| weak.words.clone()).collect();
-    if !seen.is_empty() {
-        return refused(CompensationRefusal::WeakDirections(seen));
+    // Where the part may slide in its own surface, nobody knows where on the part a map would be ground in.
+    if let Some(words) = weak_for_compensation(found, &MapLimits::default()) {
+        return refused(CompensationRefusal::WeakDirections(vec![words]));
     }
     let map = match error_map(&readings(found), &task.map) {
         Ok(map) => map,
