@@ -439,12 +439,31 @@ impl Drive {
             Command::Acknowledge { device } => self.ask(device, Ask::Acknowledge).await,
             Command::Register { cycle } => self.register(cycle),
             Command::Compensate { cycle } => self.compensate(cycle),
-            Command::Announce(judgement) => self.notify(Notice::Judged(judgement)),
+            Command::Announce(judgement) => self.announce(judgement).await,
             Command::Raise(alarm) => self.notify(Notice::Alarm(alarm)),
             Command::Withdraw { alarm } => self.notify(Notice::AlarmGone { alarm }),
             Command::Refuse { why, .. } => self.notify(Notice::Refused { why }),
             Command::Finish(ending) => self.ending = Some(ending),
         }
+    }
+
+    /// Shows how a cycle was judged and leaves it beside its measurement.
+    async fn announce(&mut self, judgement: crate::cell::Judgement) {
+        let number = judgement.cycle;
+        let cycle = self.cycles.get(&number);
+        let result = json!({
+            "simulation": self.task.simulation,
+            "cycle": number,
+            "verdict": judgement.verdict,
+            "reason": judgement.reason,
+            "figures": cycle.and_then(|c| c.figures.as_ref()),
+            "level_mm": cycle.map(|c| c.correction.level_mm),
+        });
+        match write_json_atomic(self.cycle_folder(number).join("result.json"), &result) {
+            Ok(()) => self.adopt(vec![format!("cycle-{number}/result.json")], number).await,
+            Err(error) => self.notify(Notice::RecordFailed { words: error.to_string() }),
+        }
+        self.notify(Notice::Judged(judgement));
     }
 
     async fn ask(&mut self, device: Device, ask: Ask) {
@@ -503,7 +522,7 @@ impl Drive {
             let (planned, found, points) = work::gate(&task, &plan.unwrap_or_else(empty), &measurement);
             let saved = points.and_then(|points| {
                 let made = ResultFolder::prepare(&folder).map(ResultFolder::keep);
-                let saved = made.and_then(|()| work::save_points(&folder, &points));
+                let saved = made.and_then(|()| work::save_points(&folder, &points, task.simulation));
                 saved.map(|()| points).map_err(|error| GateFailure::Broken(error.to_string()))
             });
             let (gate, points) = match saved {
