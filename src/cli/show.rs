@@ -85,6 +85,9 @@ impl Show {
                 Ok(())
             }
             Notice::LoadPart => self.line("load the part, clamp it, then: regrind confirm loaded"),
+            Notice::Note { device, words } => {
+                words.iter().try_for_each(|words| self.line(&format!("{device}: {words}")))
+            }
             Notice::Figures { cycle, figures } => self.figures(*cycle, figures),
             Notice::Judged(Judgement { cycle, reason, .. }) => self.line(&format!("cycle {cycle}: {reason}")),
             Notice::Compensated { cycle, summary } => self.line(&format!(

@@ -24,12 +24,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
 
-use crate::cell::{Actor, Cell, CellPlan, Command, Device, Ending, Event, GateFailure, RecordFailure, State};
+use crate::cell::{Actor, Cell, CellPlan, Command, Device, Ending, Event, GateFailure, Phase, RecordFailure, State};
 use crate::compensation::{Correction, ErrorMap};
-use crate::device::{Armed, Cmm, Grinder, Interrupt};
+use crate::device::exchange::Step;
+use crate::device::{Armed, Cmm, Grinder, Identified, Interrupt};
 use crate::formats::{ResultFolder, write_json_atomic};
 use crate::journal::{Entry, Journal, Kind};
 use crate::registration::Registration;
@@ -244,6 +245,8 @@ impl Drive {
     /// Handles an order and answers who gave it.
     async fn order(&mut self, Ordered { request, actor, answer }: Ordered) {
         let event = match request {
+            Request::Started { map } => return self.confirm(Step::Started, &map, &actor, answer).await,
+            Request::Done { map } => return self.confirm(Step::Done, &map, &actor, answer).await,
             Request::Hold { reason } => Event::Hold { actor, reason },
             Request::Resume { reason } => Event::Resume { actor, reason },
             Request::Stop { reason } => Event::Stop { actor, reason },
@@ -260,7 +263,63 @@ impl Drive {
         }
     }
 
-    async fn told(&mut self, Told { event, detail, harvest }: Told) {
+    /// Takes a person's word for the pass that is under way, if it names the map of that pass.
+    async fn confirm(&mut self, step: Step, map: &str, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
+        let mut asked = self.confirmable(map);
+        if asked.is_ok() {
+            let done = if step == Step::Started { "started" } else { "done" };
+            let payload = json!({ "confirmed": done, "device": Device::Grinder, "map": map });
+            self.note(Kind::Note, (actor.name.clone(), actor.station.clone()), payload).await;
+            if self.record_failed {
+                asked = Err("the journal cannot be written, and what is not recorded is not done".into());
+            }
+        }
+        let asked = match asked {
+            Err(why) => Err(why),
+            Ok(map_identity) => {
+                let (told, word) = oneshot::channel();
+                self.ask(Device::Grinder, Ask::Confirm { step, map_identity, answer: told }).await;
+                Ok(word)
+            }
+        };
+        let (status, words) = (self.snapshot(), self.cell.state().to_string());
+        // The station answers in its turn; the loop does not wait for it.
+        tokio::spawn(async move {
+            let told = match asked {
+                Ok(word) => word.await.unwrap_or_else(|_| Err("the run is over".into())),
+                Err(why) => Err(why),
+            };
+            let reply = Reply { accepted: told.is_ok(), words: told.err().unwrap_or(words), status };
+            let _ = answer.map(|answer| answer.send(reply));
+        });
+    }
+
+    /// Returns the whole identity of the map of this cycle, if that is what the digits begin.
+    fn confirmable(&self, digits: &str) -> Result<[u8; 32], String> {
+        let digits = digits.trim().to_lowercase();
+        let grinds = self.cell.state().phase().and_then(Phase::moving) == Some(Device::Grinder);
+        let cycle = self.cycles.get(&self.cell.cycle()).filter(|_| grinds);
+        let Some(cycle) = cycle else { return Err("no pass is under way".into()) };
+        let identity = self.task.payloads(&cycle.correction).0.identity();
+        let whole: String = identity.iter().map(|b| format!("{b:02x}")).collect();
+        if digits.len() < 8 {
+            return Err("give the first 8 digits of the map, or more; they stand in correction.json".into());
+        }
+        if !whole.starts_with(&digits) {
+            let (given, handed) = (digits.get(..8).unwrap_or(&digits), &whole[..8]);
+            return Err(format!(
+                "map {handed} was handed over, and {given} is another one: is the grinder set up with it?"
+            ));
+        }
+        Ok(identity)
+    }
+
+    async fn told(&mut self, Told { event, detail, harvest, notes }: Told) {
+        if let Some((device, words)) = notes {
+            let payload = json!({ "device": device, "notes": words });
+            self.note(Kind::Note, (device.to_string(), "wire".into()), payload).await;
+            self.notify(Notice::Note { device, words });
+        }
         if let Some(Harvest::Record(record)) = &harvest {
             let payload = json!({ "pass_record": pass_record(record) });
             self.note(Kind::Note, ("grinder".into(), "wire".into()), payload).await;
@@ -299,16 +358,23 @@ impl Drive {
                     cycle.error = error.map(Arc::new);
                     cycle.figures = Some(figures);
                 }
-                let files: &[&str] = &["deviations.csv", "deviation_uncertainty.csv", "registration.json"];
-                (number, event, if any { files } else { &[] })
+                let map = self.cycles.get(&number).is_some_and(|cycle| cycle.error.is_some());
+                let files: &[&str] = &[
+                    "deviations.csv",
+                    "deviation_uncertainty.csv",
+                    "registration.json",
+                    "error_map.csv",
+                    "error_map.png",
+                ];
+                let count = if any { if map { 5 } else { 3 } } else { 0 };
+                (number, event, &files[..count])
             }
             Computed::Compensated(number, event, correction) => {
                 let any = correction.is_some();
                 if let Some(correction) = correction {
                     self.cycles.insert(number + 1, new_cycle(correction));
                 }
-                let files: &[&str] = &["error_map.csv", "correction.csv", "error_map.png"];
-                (number, event, if any { files } else { &[] })
+                (number, event, if any { &["correction.csv"] } else { &[] })
             }
         };
         let names = files.iter().map(|name| format!("cycle-{number}/{name}")).collect();

@@ -8,10 +8,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use serde::Serialize;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
 use crate::cell::{Asked, Condition, Device, Event, Found, JobResult, Mismatch, Reconciliation};
+use crate::device::exchange::Step;
 use crate::device::{
     Armed, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, Measurement, Outcome,
     Pass, PassRecord, Plan, Reconciled, State, Status, digest,
@@ -32,6 +33,7 @@ pub(super) enum Ask {
     Reconcile { cycle: u32 },
     Collect { cycle: u32 },
     Acknowledge,
+    Confirm { step: Step, map_identity: [u8; 32], answer: oneshot::Sender<Result<(), String>> },
 }
 
 /// A payload for one machine or the other.
@@ -48,11 +50,14 @@ pub(super) enum Harvest {
 }
 
 /// A fact, with what the journal should keep beside it.
+#[derive(Default)]
 pub(super) struct Told {
     /// `None` where the drive makes the event itself, from the harvest.
     pub(super) event: Option<Event>,
     pub(super) detail: Option<serde_json::Value>,
     pub(super) harvest: Option<Harvest>,
+    /// What a person should know of a machine, where that is new.
+    pub(super) notes: Option<(Device, Vec<String>)>,
 }
 
 /// The drivers of both kinds, seen alike.
@@ -64,6 +69,8 @@ pub(super) trait Bench: Send + 'static {
     fn load(&mut self, load: &Load, interrupt: &Interrupt) -> impl Future<Output = Result<u32, DeviceError>> + Send;
     fn harvest(&mut self, job: Job, interrupt: &Interrupt)
     -> impl Future<Output = Result<Harvest, DeviceError>> + Send;
+    /// Takes a person's word for the job with this map.
+    fn confirm(&mut self, step: Step, map_identity: [u8; 32]) -> impl Future<Output = Result<(), DeviceError>> + Send;
 }
 
 pub(super) struct CmmBench<C>(pub(super) C);
@@ -86,6 +93,10 @@ impl<C: Cmm + 'static> Bench for CmmBench<C> {
     async fn harvest(&mut self, job: Job, interrupt: &Interrupt) -> Result<Harvest, DeviceError> {
         Ok(Harvest::Points(Box::new(self.0.collect(job, interrupt).await?)))
     }
+
+    async fn confirm(&mut self, _: Step, _: [u8; 32]) -> Result<(), DeviceError> {
+        Err(DeviceError::TellsItself { machine: self.0.name().into() })
+    }
 }
 
 impl<G: Grinder + 'static> Bench for GrinderBench<G> {
@@ -105,6 +116,10 @@ impl<G: Grinder + 'static> Bench for GrinderBench<G> {
     async fn harvest(&mut self, job: Job, interrupt: &Interrupt) -> Result<Harvest, DeviceError> {
         Ok(Harvest::Record(Box::new(self.0.collect(job, interrupt).await?)))
     }
+
+    async fn confirm(&mut self, step: Step, map_identity: [u8; 32]) -> Result<(), DeviceError> {
+        self.0.confirm(step, map_identity).await
+    }
 }
 
 /// A task that attends to one machine.
@@ -119,6 +134,8 @@ pub(super) struct Station<B> {
     /// The cycle of the job that runs.
     cycle: u32,
     seen: Seen,
+    /// What a person was told last.
+    said: Vec<String>,
 }
 
 /// What the last look showed, so that only changes are told.
@@ -150,7 +167,17 @@ const PROGRESS_EVERY: Duration = Duration::from_millis(250);
 
 impl<B: Bench> Station<B> {
     pub(super) fn new(bench: B, job: u32, interrupt: Interrupt, told: mpsc::Sender<Told>) -> Self {
-        Self { bench, job, interrupt, told, loaded: None, armed: None, cycle: 0, seen: Seen::default() }
+        Self {
+            bench,
+            job,
+            interrupt,
+            told,
+            loaded: None,
+            armed: None,
+            cycle: 0,
+            seen: Seen::default(),
+            said: Vec::new(),
+        }
     }
 
     /// Restores the intent of an interrupted run, so that it can be reconciled.
@@ -187,7 +214,7 @@ impl<B: Bench> Station<B> {
 
     async fn tell_with(&mut self, event: Event, detail: Option<serde_json::Value>) {
         // The drive hears until it drops the last ask; after that nobody needs to know.
-        let _ = self.told.send(Told { event: Some(event), detail, harvest: None }).await;
+        let _ = self.told.send(Told { event: Some(event), detail, ..Told::default() }).await;
     }
 
     async fn act(&mut self, ask: Ask) {
@@ -209,6 +236,11 @@ impl<B: Bench> Station<B> {
             Ask::Reconcile { cycle } => self.reconcile(cycle).await,
             Ask::Collect { cycle } => self.collect(cycle).await,
             Ask::Acknowledge => self.acknowledge().await,
+            Ask::Confirm { step, map_identity, answer } => {
+                let told = self.bench.confirm(step, map_identity).await;
+                // Who asked may have gone.
+                let _ = answer.send(told.map_err(|error| error.to_string()));
+            }
         }
     }
 
@@ -418,7 +450,7 @@ impl<B: Bench> Station<B> {
 
     async fn hand_over(&mut self, harvest: Harvest) {
         // The drive hears as long as anybody asks.
-        let _ = self.told.send(Told { event: None, detail: None, harvest: Some(harvest) }).await;
+        let _ = self.told.send(Told { harvest: Some(harvest), ..Told::default() }).await;
     }
 
     async fn acknowledge(&mut self) {
@@ -466,6 +498,7 @@ impl<B: Bench> Station<B> {
         }
         match self.bench.machine().status().await {
             Ok(status) => {
+                self.pass_on_notes().await;
                 if std::mem::replace(&mut self.seen.signal_out, false) {
                     self.tell(Event::ConditionBack { condition: Condition::Temperature }).await;
                 }
@@ -478,6 +511,16 @@ impl<B: Bench> Station<B> {
                 }
             }
             Err(error) => self.lost(&error).await,
+        }
+    }
+
+    /// Tells what is new of what a person should know.
+    async fn pass_on_notes(&mut self) {
+        let notes = self.bench.machine().notes();
+        let new: Vec<String> = notes.iter().filter(|words| !self.said.contains(words)).cloned().collect();
+        self.said = notes;
+        if !new.is_empty() {
+            let _ = self.told.send(Told { notes: Some((B::DEVICE, new)), ..Told::default() }).await;
         }
     }
 
