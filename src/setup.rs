@@ -13,13 +13,20 @@ use thiserror::Error;
 use crate::cell::{Beginning, CellPlan, Deadlines, Disposal, Gates, Tolerance};
 use crate::compensation::{CorrectionLimits, MapOptions};
 use crate::config::{self, CellConfig, PointKind, SignalKind, WordOrder};
-use crate::device::{self, ModbusSettings, Pass, RegisterMap, Signal, SignalType};
+use crate::device::exchange::{ExchangeCmm, ExchangeGrinder, ExchangeTiming};
+use crate::device::{
+    self, AnyCmm, AnyGrinder, Coordinates, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, Pass, RegisterMap,
+    Signal, SignalType,
+};
 use crate::drive::{Probing, Sphere, Task};
+use crate::formats::exchange::{
+    self as files, CmmExchange, CmmFolders, ExchangeError, GrinderExchange, GrinderFolders, StationFiles, Stations,
+};
 use crate::formats::{self, FormatError, NominalFile};
 use crate::geometry::Point;
 use crate::measuring::{Layout, PatternError, Target, targets};
-use crate::recipe::{Density, NominalSource, OnTrouble, Pattern, Recipe, StartAt};
-use crate::registration::ProbeSide;
+use crate::recipe::{BeginWith, Density, NominalSource, OnTrouble, Pattern, Recipe, StartAt};
+use crate::registration::{MapLimits, ProbeSide};
 use crate::surface::{DefinedSurface, DefinitionError, Nominal, Side, SurfaceError};
 
 /// Why a recipe and a cell do not make a run.
@@ -34,23 +41,42 @@ pub enum SetupError {
     Definition { path: PathBuf, source: DefinitionError },
     #[error("{path}: {source}")]
     Pattern { path: PathBuf, source: PatternError },
-    #[error("{recipe}: {key} is {found}, and {cell} allows {allowed} ({limit}); change the recipe or use another cell")]
-    Limit { recipe: PathBuf, cell: PathBuf, key: &'static str, found: String, allowed: String, limit: &'static str },
+    #[error(
+        "{}: {key} is {found}, and {} allows {allowed} ({limit}); change the recipe or use another cell",
+        .recipe.display(), .cell.display()
+    )]
+    Limit { recipe: Box<Path>, cell: Box<Path>, key: &'static str, found: f64, allowed: Box<str>, limit: &'static str },
     #[error(
         "{recipe}: measure.qualify asks for the reference sphere, and {cell} has none; add [cmm.reference_sphere] to the cell file, or write \
          qualify = false"
     )]
     NoSphere { recipe: PathBuf, cell: PathBuf },
     #[error(
-        "{recipe}: target {number} of the measuring pattern lies at {at} mm in the CMM frame, outside the travel of {cell} ({allowed}); move \
-         [cmm.fixture], or measure less of the part"
+        "{}: target {number} of the measuring pattern lies at {at} mm in the CMM frame, outside the travel of {} ({allowed}); move \
+         [cmm.fixture], or measure less of the part",
+        .recipe.display(), .cell.display()
     )]
-    Travel { recipe: PathBuf, cell: PathBuf, number: usize, at: String, allowed: String },
+    Travel { recipe: Box<Path>, cell: Box<Path>, number: usize, at: Box<str>, allowed: Box<str> },
     #[error(
         "{recipe}: the measuring pattern is `free`, and {cell} reaches its CMM over a wire that needs a plan; choose grid, spiral or file"
     )]
     NeedsPlan { recipe: PathBuf, cell: PathBuf },
+    #[error(
+        "{cell}: {key}: the folder {path} is not there; make it where the {machine} finds it (mkdir -p {path}), or correct the cell file"
+    )]
+    Folder { cell: PathBuf, key: String, path: PathBuf, machine: &'static str },
+    #[error("{cell}: {key}: {source}")]
+    References { cell: PathBuf, key: &'static str, source: ExchangeError },
+    #[error("{path}: {wire} cannot be opened: {source}; check the cell file and the machine")]
+    Wire { path: PathBuf, wire: String, source: std::io::Error },
 }
+
+/// How long a machine without a wire may take, with the person who serves it.
+const WAIT_FOR_PEOPLE: Duration = Duration::from_secs(7 * 86_400);
+/// A folder, perhaps on another computer, answers within this, a large file read included.
+const FOLDER_ANSWERS_WITHIN: Duration = Duration::from_secs(30);
+/// A folder is looked at no more often than this.
+const FOLDER_POLL: Duration = Duration::from_millis(250);
 
 /// Makes what a run computes from, and what its cell decides by.
 ///
@@ -82,7 +108,8 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         fixture_cmm_from_model: cell.cmm.fixture_cmm_from_model,
         registration: recipe.registration_options(cell.cmm.fixture_cmm_from_model),
         start_at_fixture: recipe.registration.start == StartAt::Fixture,
-        contacts_expected: contacts_expected(cell),
+        coordinates: coordinates(cell),
+        place: MapLimits { place_mm: recipe.compensation.largest_displacement_mm, ..MapLimits::default() },
         map: MapOptions { cutoff_mm: recipe.compensation.cutoff_mm, spacing_mm: recipe.compensation.spacing_mm },
         limits: CorrectionLimits {
             gain: recipe.compensation.gain,
@@ -170,10 +197,14 @@ fn sphere(recipe: &Recipe, cell: &CellConfig) -> Result<Option<Sphere>, SetupErr
     }
 }
 
-fn contacts_expected(cell: &CellConfig) -> bool {
+/// What the measuring machine is expected to give; a machine with a wire of its own gives centres.
+fn coordinates(cell: &CellConfig) -> Option<Coordinates> {
     match &cell.cmm.link.wire {
-        config::Wire::FileExchange(exchange) => exchange.content.what == PointKind::Contacts,
-        _ => false,
+        config::Wire::FileExchange(exchange) => exchange.content.what.map(|what| match what {
+            PointKind::Centres => Coordinates::Centres,
+            PointKind::Contacts => Coordinates::Contacts,
+        }),
+        _ => Some(Coordinates::Centres),
     }
 }
 
@@ -185,8 +216,8 @@ fn check_limits(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
         }
         let mut allowed = String::new();
         let _ = if least > 0.0 { write!(allowed, "{least} to {most}") } else { write!(allowed, "at most {most}") };
-        let (recipe, cell) = (recipe.path().to_owned(), cell.path().to_owned());
-        Err(SetupError::Limit { recipe, cell, key, found: found.to_string(), allowed, limit })
+        let (recipe, cell) = (recipe.path().into(), cell.path().into());
+        Err(SetupError::Limit { recipe, cell, key, found, allowed: allowed.into(), limit })
     };
     let [least, most] = limits.wheel_radius_mm;
     beyond("grinding.wheel.radius_mm", recipe.grinding.wheel.radius_mm(), least, most, "grinder.limits")?;
@@ -215,11 +246,11 @@ fn check_travel(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
     match found {
         None => Ok(()),
         Some((k, at)) => Err(SetupError::Travel {
-            recipe: recipe.path().to_owned(),
-            cell: cell.path().to_owned(),
+            recipe: recipe.path().into(),
+            cell: cell.path().into(),
             number: k + 1,
-            at: format!("{:.2}, {:.2}, {:.2}", at.x, at.y, at.z),
-            allowed: format!("{:?} to {:?}", travel.least_mm, travel.most_mm),
+            at: format!("{:.2}, {:.2}, {:.2}", at.x, at.y, at.z).into(),
+            allowed: format!("{:?} to {:?}", travel.least_mm, travel.most_mm).into(),
         }),
     }
 }
@@ -249,16 +280,19 @@ fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
         OnTrouble::Hold => Disposal::Hold,
         OnTrouble::Stop => Disposal::Stop,
     };
-    // A file that a person brings may take days; a wire answers.
-    let by_hand =
-        [&cell.cmm.link.wire, &cell.grinder.link.wire].iter().any(|wire| matches!(wire, config::Wire::FileExchange(_)));
-    let week = Duration::from_secs(7 * 86_400);
+    // A file that a person brings may take days, and then the cell is held and still waits; everything else a folder answers at once.
     let mut deadlines = Deadlines::default();
-    if by_hand {
-        (deadlines.progress, deadlines.transfer, deadlines.hold, deadlines.stop) = (week, week, week, week);
+    for (progress, link) in deadlines.progress.iter_mut().zip([&cell.cmm.link, &cell.grinder.link]) {
+        if matches!(link.wire, config::Wire::FileExchange(_)) {
+            (*progress, deadlines.answer) = (WAIT_FOR_PEOPLE, 3 * FOLDER_ANSWERS_WITHIN);
+            deadlines.connect = deadlines.answer;
+        }
     }
     CellPlan {
-        begin_with: Beginning::Grind,
+        begin_with: match recipe.cycle.begin_with {
+            BeginWith::Grind => Beginning::Grind,
+            BeginWith::Measure => Beginning::Measure,
+        },
         max_cycles: u32::from(recipe.cycle.most_cycles),
         tolerance: Tolerance {
             pv_mm: recipe.acceptance.pv_mm.unwrap_or(f64::INFINITY),
@@ -281,6 +315,150 @@ fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
         clear_at_start: cell.simulated,
         deadlines,
     }
+}
+
+/// A measuring machine of a cell, by whatever wire.
+pub type CellCmm = AnyCmm<CmmFolders>;
+/// A grinder of a cell, by whatever wire.
+pub type CellGrinder = AnyGrinder<GrinderFolders>;
+
+/// Makes the drivers of both machines; nothing is asked of a machine yet. `part` is what the part is called in files, `owner` and `epoch`
+/// are those of [`modbus`].
+///
+/// # Errors
+/// A wire that cannot be opened, a folder that is not there, reference points that cannot be read.
+pub fn machines(
+    recipe: &Recipe,
+    cell: &CellConfig,
+    part: &str,
+    owner: u32,
+    epoch: u32,
+) -> Result<(CellCmm, CellGrinder), SetupError> {
+    let (cmm, grinder) = (&cell.cmm.link, &cell.grinder.link);
+    let failed = |link: &config::Link| {
+        let (path, wire) = (cell.path().to_owned(), format!("{:?}", link.wire));
+        move |source| SetupError::Wire { path, wire, source }
+    };
+    let [of_cmm, of_grinder] = [cmm, grinder].map(|link| modbus(link, owner, epoch));
+    // Two machines on one line share its driver.
+    if let (Some(of_cmm), Some(of_grinder)) = (&of_cmm, &of_grinder)
+        && of_cmm.wire == of_grinder.wire
+    {
+        let cmm = ModbusCmm::new(of_cmm.clone()).map_err(failed(cmm))?;
+        let grinder = ModbusGrinder::on(cmm.link().clone(), of_grinder.clone());
+        return Ok((cmm.into(), grinder.into()));
+    }
+    let made_cmm = match (of_cmm, &cmm.wire) {
+        (Some(settings), _) => ModbusCmm::new(settings).map_err(failed(cmm))?.into(),
+        (None, config::Wire::FileExchange(exchange)) => cmm_by_files(recipe, cell, exchange, part)?.into(),
+        (None, _) => unreachable!("every other wire is Modbus"),
+    };
+    let made_grinder = match (of_grinder, &grinder.wire) {
+        (Some(settings), _) => ModbusGrinder::new(settings).map_err(failed(grinder))?.into(),
+        (None, config::Wire::FileExchange(exchange)) => grinder_by_files(cell, exchange, part)?.into(),
+        (None, _) => unreachable!("every other wire is Modbus"),
+    };
+    Ok((made_cmm, made_grinder))
+}
+
+/// Returns the time between two looks at a machine.
+pub fn poll(link: &config::Link) -> Duration {
+    match link.wire {
+        config::Wire::FileExchange(_) => link.timing.poll.max(FOLDER_POLL),
+        _ => link.timing.poll,
+    }
+}
+
+/// A folder that Regrind made itself would be one that nobody looks into: both must be there.
+fn check_folders(
+    cell: &CellConfig,
+    exchange: &config::FileExchange,
+    table: &'static str,
+    machine: &'static str,
+) -> Result<(), SetupError> {
+    for (name, path) in [("outbox", &exchange.outbox), ("inbox", &exchange.inbox)] {
+        if !path.is_dir() {
+            let (cell, key, path) = (cell.path().to_owned(), format!("{table}.wire.{name}"), path.clone());
+            return Err(SetupError::Folder { cell, key, path, machine });
+        }
+    }
+    Ok(())
+}
+
+fn cmm_by_files(
+    recipe: &Recipe,
+    cell: &CellConfig,
+    exchange: &config::FileExchange,
+    part: &str,
+) -> Result<ExchangeCmm<CmmFolders>, SetupError> {
+    check_folders(cell, exchange, "cmm", "measuring machine")?;
+    let stations = match &exchange.reference_points {
+        Some(nominal) => Some(stations(cell, exchange, nominal)?),
+        None => None,
+    };
+    let free = matches!(recipe.measure.pattern, Pattern::Free { .. });
+    let settings = CmmExchange {
+        stable_for: exchange.stable_for,
+        content: files::Content {
+            coordinates: exchange.content.what.map(|what| match what {
+                PointKind::Centres => files::Coordinates::Centres,
+                PointKind::Contacts => files::Coordinates::Contacts,
+            }),
+            decimal: match exchange.content.decimal {
+                config::Decimal::Auto => files::DecimalMark::Auto,
+                config::Decimal::Point => files::DecimalMark::Point,
+                config::Decimal::Comma => files::DecimalMark::Comma,
+            },
+            unit_mm: exchange.content.unit_mm,
+        },
+        result: files::Pattern::new(&*exchange.result),
+        stations,
+        free_count: free,
+        least_points: match &recipe.measure.pattern {
+            Pattern::Free { least_points } => usize::try_from(*least_points).unwrap_or(usize::MAX),
+            _ => 1,
+        },
+        take_earlier: exchange.take_earlier,
+        probe_tolerance_mm: exchange.probe_tolerance_mm,
+        ..CmmExchange::new(part, &exchange.outbox, &exchange.inbox)
+    };
+    let name = format!("cmm by files, {}", exchange.inbox.display());
+    Ok(ExchangeCmm::new(name, MachineKind::Cmm, CmmFolders::new(settings), folder_timing()))
+}
+
+/// The reference points are read at once: an error in them must not come to light when a day's measuring is done.
+fn stations(cell: &CellConfig, exchange: &config::FileExchange, nominal: &Path) -> Result<Stations, SetupError> {
+    let group = exchange.reference_group.clone();
+    files::read_references(nominal, group.as_deref()).map_err(|source| SetupError::References {
+        cell: cell.path().to_owned(),
+        key: "cmm.wire.reference_points",
+        source,
+    })?;
+    let files = exchange.stations.iter().map(|station| StationFiles {
+        points: files::Pattern::new(&*station.points),
+        references: files::Pattern::new(&*station.reference),
+    });
+    Ok(Stations { files: files.collect(), nominal: nominal.to_owned(), group, limit_mm: exchange.reference_limit_mm })
+}
+
+fn grinder_by_files(
+    cell: &CellConfig,
+    exchange: &config::FileExchange,
+    part: &str,
+) -> Result<ExchangeGrinder<GrinderFolders>, SetupError> {
+    check_folders(cell, exchange, "grinder", "grinder")?;
+    let settings = GrinderExchange {
+        part: part.to_owned(),
+        outbox: exchange.outbox.clone(),
+        inbox: exchange.inbox.clone(),
+        stable_for: exchange.stable_for,
+    };
+    let name = format!("grinder by files, {}", exchange.inbox.display());
+    Ok(ExchangeGrinder::new(name, MachineKind::Grinder, GrinderFolders::new(settings), folder_timing()))
+}
+
+fn folder_timing() -> ExchangeTiming {
+    ExchangeTiming { request_timeout: FOLDER_ANSWERS_WITHIN }
 }
 
 /// Returns the settings of a Modbus driver; `None` for a machine that is reached by files.

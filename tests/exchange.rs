@@ -559,3 +559,49 @@ async fn a_folder_that_is_not_there_is_named() {
     let error = cmm.connect().await.unwrap_err();
     assert!(error.is_link() && error.to_string().contains("/nowhere/out"), "{error}");
 }
+
+// ---- whole cells ----------------------------------------------------------------------------------------------------------------
+
+/// A cell file with these two wires; folders are those of two shops.
+fn cell_of(wires: [bool; 2], shops: &[Shop; 2]) -> regrind::config::CellConfig {
+    let text = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("config/modbus-tcp.toml")).unwrap();
+    let mut text = text.replace("simulated = true", "simulated = false");
+    for (k, table) in ["cmm", "grinder"].into_iter().enumerate().filter(|(k, _)| wires[*k]) {
+        let modbus = format!("kind = \"modbus-tcp\"\nhost = \"127.0.0.1\"\nport = 1502{}\nunit = {}\n", k + 1, k + 1);
+        assert!(text.contains(&modbus), "{modbus}");
+        let (outbox, inbox) = (shops[k].outbox.display(), shops[k].inbox.display());
+        text =
+            text.replace(&modbus, &format!("kind = \"file-exchange\"\noutbox = \"{outbox}\"\ninbox = \"{inbox}\"\n"));
+        text = text.replace(&format!("[{table}.registers]"), "[nothing]");
+    }
+    let text: String = text.split("[nothing]").enumerate().fold(String::new(), |all, (k, piece)| match k {
+        0 => piece.to_owned(),
+        // What stands in a table that was taken out, up to the next one.
+        _ => all + piece.find("\n[").map_or("", |at| &piece[at..]),
+    });
+    regrind::config::CellConfig::parse(Path::new("cell.toml"), &text).unwrap_or_else(|problems| panic!("{problems}"))
+}
+
+#[tokio::test]
+async fn every_combination_of_wires_makes_two_machines() {
+    use regrind::setup;
+    let recipe = Path::new(env!("CARGO_MANIFEST_DIR")).join("recipes/shallow-wave.toml");
+    let recipe = regrind::recipe::Recipe::read(&recipe).unwrap();
+    let shops = [Shop::new(), Shop::new()];
+    for wires in [[false, false], [false, true], [true, false], [true, true]] {
+        let cell = cell_of(wires, &shops);
+        let (cmm, grinder) = setup::machines(&recipe, &cell, "SN 7", 1, 1).unwrap();
+        let by_files = [cmm.name(), grinder.name()].map(|name| name.contains("by files"));
+        assert_eq!(by_files, wires, "{} and {}", cmm.name(), grinder.name());
+        // A person may take a week; a wire may not. A person's word is for files only.
+        let (_, plan) = setup::prepare(&recipe, &cell).unwrap();
+        assert_eq!(plan.deadlines.progress.map(|limit| limit > Duration::from_secs(86_400)), wires);
+        let told = { grinder }.confirm(Step::Started, [0; 32]).await.unwrap_err();
+        assert_eq!(matches!(told, DeviceError::TellsItself { .. }), !wires[1], "{told}");
+    }
+    let cell = cell_of([true, true], &shops);
+    fs::remove_dir(&shops[0].outbox).unwrap();
+    let told = setup::machines(&recipe, &cell, "SN 7", 1, 1).unwrap_err().to_string();
+    assert!(told.contains("cmm.wire.outbox") && told.contains("is not there"), "{told}");
+    assert!(!shops[0].outbox.exists(), "no folder is made");
+}

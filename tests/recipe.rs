@@ -5,11 +5,11 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use proptest::prelude::*;
-use regrind::config::{CellConfig, Wire, WordOrder};
+use regrind::config::{CellConfig, PointKind, Wire, WordOrder};
 use regrind::document::Problems;
 use regrind::formats::read_points;
 use regrind::geometry::{Point, Pose};
-use regrind::recipe::{Density, NominalSource, OnTrouble, Pattern, Recipe, StartAt, Wheel};
+use regrind::recipe::{BeginWith, Density, NominalSource, OnTrouble, Pattern, Recipe, StartAt, Wheel};
 use regrind::registration::{ProbeSide, Start};
 use regrind::surface::{DefinedSurface, Side};
 use serde_json::Value;
@@ -154,6 +154,25 @@ fn the_telescope_holds_what_it_cannot_see() {
     let Wire::FileExchange(files) = &cell.cmm.link.wire else { panic!("files") };
     assert_eq!((files.stations.len(), files.content.unit_mm), (1, 1.0));
     assert_eq!(files.inbox, root().join("config/../exchange/cmm/in"));
+    assert_eq!((files.content.what, files.reference_limit_mm), (Some(PointKind::Centres), 1.0));
+    assert_eq!((files.take_earlier, files.probe_tolerance_mm), (false, 1e-3));
+    assert_eq!(recipe.cycle.begin_with, BeginWith::Measure);
+    assert_eq!(recipe.compensation.largest_displacement_mm, 1.0);
+}
+
+#[test]
+fn what_a_file_wire_leaves_out_is_not_guessed() {
+    let text = changed(FILES, "what = \"centres\"", "# what");
+    let text = changed(&text, "take_earlier = false", "take_earlier = true\nresult = \"{part}-{job}-{cycle}_*.ply\"");
+    let cell = cell(&text).unwrap();
+    let Wire::FileExchange(files) = &cell.cmm.link.wire else { panic!("files") };
+    assert_eq!((files.content.what, files.take_earlier), (None, true));
+    assert_eq!(files.result, "{part}-{job}-{cycle}_*.ply");
+    let Wire::FileExchange(files) = &cell.grinder.link.wire else { panic!("files") };
+    assert_eq!((files.result.as_str(), files.reference_limit_mm), ("{part}_c{cycle}.*", 0.1));
+    let recipe = recipe(RECIPE).unwrap();
+    assert_eq!(recipe.cycle.begin_with, BeginWith::Grind);
+    assert_eq!(recipe.compensation.largest_displacement_mm, 1.0);
 }
 
 #[test]
@@ -420,6 +439,15 @@ const BAD_CELLS: &[Bad] = &[
         "[[cmm.wire.stations]]",
         "name their file",
     ),
+    (
+        FILES,
+        "take_earlier = false",
+        "result = \"{part}/{cycle}.csv\"",
+        "cmm.wire.result",
+        "\"{part}/{cycle}.csv\"",
+        "is usual",
+    ),
+    (FILES, "reference_limit_mm = 1.0", "reference_limit_mm = 0", "cmm.wire.reference_limit_mm", "0", "100"),
     (FILES, "unit = \"mm\"", "unit = \"cm\"", "cmm.wire.unit", "\"cm\"", "inch"),
     (
         FILES,

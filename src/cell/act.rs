@@ -75,7 +75,7 @@ impl Cell {
             (Suspended(_), _) => Some(limits.suspended),
             (Stopping, _) => Some(limits.stop),
             (Aborting, _) => Some(limits.abort),
-            (Execute(_), Some(Step::Run)) => Some(limits.progress),
+            (Execute(phase), Some(Step::Run)) => phase.moving().map(|device| limits.progress[device as usize]),
             (Holding(_) | Suspending(_), Some(Step::Run)) => Some(limits.hold),
             (_, Some(Step::Send | Step::Collect)) => Some(limits.transfer),
             (_, Some(Step::Qualify)) => Some(limits.compute),
@@ -374,7 +374,7 @@ impl Cell {
             CompensationRefusal::WeakDirections(directions) => {
                 let case = directions.join(", ");
                 self.raise(AlarmId::WeakDirections, &case);
-                self.dispose(self.plan.on_refusal, &format!("the surface does not hold the part: {case}"));
+                self.dispose(self.plan.on_refusal, &format!("no correction is made: {case}"));
             }
             CompensationRefusal::Failed(words) => {
                 self.raise(AlarmId::CompensationFailed, words);

@@ -217,8 +217,9 @@ catalogue! {
     }
     /// Weak directions.
     WeakDirections {
-        "The surface does not hold the part in every direction", "No map is made: nobody knows where on the part it would be ground in.", ProcessEngineer,
-        ["Hold the named directions in the recipe (registration, lock), if the fixture holds them well enough.",
+        "The surface does not tell where on the part a correction would be ground in",
+        "No correction is made. The error map of this cycle is in the run folder.", ProcessEngineer,
+        ["Hold the named directions in the recipe (registration.hold), if the fixture or the reference points hold them well enough.",
          "Or measure features that hold them: edges, reference marks, a wider aperture.", "Start a new run that begins with a measurement."]
     }
     /// No map.

@@ -90,8 +90,8 @@ pub struct Deadlines {
     pub transfer: Duration,
     /// For any other answer of a machine: prepare, start, clear, acknowledge, resume, reconcile.
     pub answer: Duration,
-    /// Between two signs of progress of a running job.
-    pub progress: Duration,
+    /// Between two signs of progress of a running job of each machine: CMM, grinder. A job done by hand gives none before its end.
+    pub progress: [Duration; 2],
     /// From HOLD to the safe place.
     pub hold: Duration,
     /// From STOP to the end of the job.
@@ -114,7 +114,7 @@ impl Default for Deadlines {
             load: None,
             transfer: s(120),
             answer: s(10),
-            progress: s(60),
+            progress: [s(60); 2],
             hold: s(30),
             stop: s(60),
             abort: s(2),

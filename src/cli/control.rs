@@ -47,6 +47,8 @@ pub(super) enum Order {
 #[command(after_help = "\
 Examples:
   regrind confirm loaded
+  regrind confirm started --map 3fa9c210        the grinder works by the map that begins so; only for a grinder
+  regrind confirm done --map 3fa9c210           that takes files, see docs/file-exchange.md
   regrind confirm over --machine grinder --evidence \"stands, wheel up, one pass was ground\"
 
 Exit codes: 0 it was taken; 2 no such run; 3 the cell refused it.")]
@@ -60,6 +62,9 @@ pub(super) struct Confirmation {
     /// The machine that was looked at, for `over`
     #[arg(long, value_enum)]
     machine: Option<MachineName>,
+    /// First 8 digits, or more, of the map that the grinder works by, for `started` and `done`
+    #[arg(long, value_name = "DIGITS")]
+    map: Option<String>,
     /// What was seen at the machine, for `over`
     #[arg(long, value_name = "TEXT", default_value = "")]
     evidence: String,
@@ -72,6 +77,10 @@ pub(super) struct Confirmation {
 enum What {
     /// The right part is loaded and clamped
     Loaded,
+    /// The grinder has begun the pass that was handed over to it as files
+    Started,
+    /// The grinder has ended that pass, and the part is clear
+    Done,
     /// A job that no machine can tell about is over: the machine stands, clear of the part
     Over,
 }
@@ -97,6 +106,8 @@ pub(super) fn order(arguments: &Arguments, order: Order) -> Result<Outcome, Fail
 pub(super) fn confirm(arguments: &Confirmation) -> Result<Outcome, Failure> {
     let request = match (arguments.what, arguments.machine) {
         (What::Loaded, _) => Request::Loaded,
+        (What::Started, _) => Request::Started { map: named_map(arguments)? },
+        (What::Done, _) => Request::Done { map: named_map(arguments)? },
         (What::Over, Some(machine)) if !arguments.evidence.trim().is_empty() => Request::Over {
             device: match machine {
                 MachineName::Cmm => Device::Cmm,
@@ -107,6 +118,10 @@ pub(super) fn confirm(arguments: &Confirmation) -> Result<Outcome, Failure> {
         (What::Over, _) => return Err(Failure::Evidence),
     };
     give(arguments.run.as_deref(), &request, arguments.json)
+}
+
+fn named_map(arguments: &Confirmation) -> Result<String, Failure> {
+    arguments.map.clone().filter(|map| map.trim().len() >= 8).ok_or(Failure::NoMap)
 }
 
 fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<Outcome, Failure> {

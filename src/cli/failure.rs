@@ -57,12 +57,6 @@ pub(super) enum Failure {
     NoState { name: String, known: String },
     #[error(transparent)]
     Journal(JournalError),
-    #[error("{path}: {wire} cannot be opened: {source}; check the cell file and the machine")]
-    Wire { path: PathBuf, wire: String, source: io::Error },
-    #[error(
-        "{path}: the two machines are reached in ways that do not go together; give both a Modbus wire, or both file exchange"
-    )]
-    WireKind { path: PathBuf },
     #[error("{path}: no control socket can be made there: {source}; give --runs a local folder with a shorter name")]
     ControlSocket { path: PathBuf, source: io::Error },
     #[error("{path}: no run was made there; name the folder of a run")]
@@ -73,6 +67,10 @@ pub(super) enum Failure {
     OrderRefused { words: String },
     #[error("`confirm over` needs --machine and --evidence: which machine was looked at, and what was seen")]
     Evidence,
+    #[error(
+        "`confirm started` and `confirm done` need --map: the first 8 digits, or more, of the map at the grinder, as in correction.json"
+    )]
+    NoMap,
     #[error("the run did not come to its end: {reason}")]
     Ended { reason: String },
     #[error("the result cannot be told: {what} is not a finite number; please report it with the files that led to it")]
@@ -92,7 +90,7 @@ impl Failure {
             | Self::NotSaved(_)
             | Self::Terminal(_)
             | Self::OrderRefused { .. }
-            | Self::Wire { .. }
+            | Self::Setup(regrind::setup::SetupError::Wire { .. })
             | Self::Ended { .. } => FAULT,
             Self::Broken(_) | Self::Report(ReportError::Record(JournalError::Broken { .. })) => NOT_AS_IT_SHOULD_BE,
             _ => BAD_INPUT,

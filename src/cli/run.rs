@@ -6,12 +6,11 @@ use std::time::Duration;
 use clap::Args;
 use regrind::cell::{Actor, Ending};
 use regrind::config::{CellConfig, Link};
-use regrind::device::{ModbusCmm, ModbusGrinder};
 use regrind::document::Problems;
 use regrind::drive::{Drive, Orders, Request, Run};
 use regrind::journal::{Header, Journal};
 use regrind::recipe::Recipe;
-use regrind::setup;
+use regrind::setup::{self, CellCmm, CellGrinder};
 use serde_json::json;
 use tokio::sync::mpsc;
 
@@ -73,51 +72,26 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         };
         let actor = operator(arguments.operator.as_deref());
         let began = jiff::Timestamp::now();
+        let job = u32::try_from(began.as_second() & 0x7fff_ffff).unwrap_or(1).max(1);
+        // Before the record begins: a folder that is not there, or a line that is in use, is no run.
+        let part = arguments.part.clone().unwrap_or_else(|| recipe_name(&recipe));
+        let (cmm, grinder) = setup::machines(&recipe, &cell, &part, owner(&actor), job).map_err(Failure::Setup)?;
         let journal = journal(arguments, &recipe, &cell, &actor, began)?;
         let (notices, shown) = mpsc::unbounded_channel();
-        let poll = [cell.cmm.link.timing.poll, cell.grinder.link.timing.poll];
+        let poll = [setup::poll(&cell.cmm.link), setup::poll(&cell.grinder.link)];
         let folder = journal.folder().to_owned();
-        let job = u32::try_from(began.as_second() & 0x7fff_ffff).unwrap_or(1).max(1);
         let loaded = arguments.loaded || cell.simulated;
         let run = Run { plan, task, journal, job, actor: actor.clone(), loaded, poll, notices, interrupted: None };
         let show = Show::new(arguments.json, cell.simulated, &recipe, &folder);
         let showing = tokio::spawn(show.follow(shown));
-        let ending = go(run, &cell, actor, job).await?;
+        let ending = go(run, cmm, grinder, actor).await?;
         showing.await.map_err(|e| Failure::Terminal(e.into()))??;
         outcome(&ending)
     })
 }
 
 /// Gives the run its machines and lets it go.
-async fn go(run: Run, cell: &CellConfig, actor: Actor, epoch: u32) -> Result<Ending, Failure> {
-    let failed = |link: &Link| {
-        let path = cell.path().to_owned();
-        let wire = format!("{:?}", link.wire);
-        move |source| Failure::Wire { path, wire, source }
-    };
-    // One owner for both machines: this program on this computer.
-    let owner = owner(&actor);
-    let (cmm, grinder) = (&cell.cmm.link, &cell.grinder.link);
-    match (setup::modbus(cmm, owner, epoch), setup::modbus(grinder, owner, epoch)) {
-        (Some(of_cmm), Some(of_grinder)) => {
-            let (c, g) = if of_cmm.wire == of_grinder.wire {
-                let c = ModbusCmm::new(of_cmm).map_err(failed(cmm))?;
-                let g = ModbusGrinder::on(c.link().clone(), of_grinder);
-                (c, g)
-            } else {
-                (ModbusCmm::new(of_cmm).map_err(failed(cmm))?, ModbusGrinder::new(of_grinder).map_err(failed(grinder))?)
-            };
-            start(run, actor, c, g).await
-        }
-        _ => Err(Failure::WireKind { path: cell.path().to_owned() }),
-    }
-}
-
-async fn start<C, G>(run: Run, actor: Actor, cmm: C, grinder: G) -> Result<Ending, Failure>
-where
-    C: regrind::device::Cmm + 'static,
-    G: regrind::device::Grinder + 'static,
-{
+async fn go(run: Run, cmm: CellCmm, grinder: CellGrinder, actor: Actor) -> Result<Ending, Failure> {
     let folder = run.journal.folder().to_owned();
     let (drive, orders) =
         Drive::new(run, cmm, grinder).map_err(|source| Failure::ControlSocket { path: folder, source })?;
@@ -152,7 +126,7 @@ fn journal(
     began: jiff::Timestamp,
 ) -> Result<Journal, Failure> {
     let part = arguments.part.clone().unwrap_or_else(|| "unnamed".into());
-    let folder = free_folder(&arguments.runs, &recipe_name(recipe), began);
+    let folder = free_folder(&arguments.runs, &recipe_name(recipe), began, cell.simulated);
     let hex = |bytes: &[u8; 32]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
     let header = Header {
         run: folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
@@ -178,11 +152,13 @@ fn recipe_name(recipe: &Recipe) -> String {
 }
 
 /// Returns a folder for a run that began now: the recipe's name and the time, and a number if two begin in one second.
-fn free_folder(runs: &Path, name: &str, began: jiff::Timestamp) -> PathBuf {
+fn free_folder(runs: &Path, name: &str, began: jiff::Timestamp, simulated: bool) -> PathBuf {
+    // Every file in it carries the mark in its path.
+    let mark = if simulated { "-SIMULATION" } else { "" };
     let stamp = began.strftime("%Y%m%dT%H%M%SZ");
     let named = |more: u32| match more {
-        0 => runs.join(format!("{name}-{stamp}")),
-        more => runs.join(format!("{name}-{stamp}-{more}")),
+        0 => runs.join(format!("{name}-{stamp}{mark}")),
+        more => runs.join(format!("{name}-{stamp}-{more}{mark}")),
     };
     (0..).map(named).find(|folder| !folder.exists()).expect("some number is free")
 }

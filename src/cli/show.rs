@@ -26,6 +26,8 @@ pub(super) struct Show {
     /// When a plain line about progress was printed last.
     said: Option<Instant>,
     job: Option<(Device, u32)>,
+    /// When the job was first seen, and how far it was then.
+    first: Option<(Instant, u32)>,
 }
 
 impl Show {
@@ -41,6 +43,7 @@ impl Show {
             bar: (!json && io::stderr().is_terminal()).then(bar),
             said: None,
             job: None,
+            first: None,
         }
     }
 
@@ -75,13 +78,20 @@ impl Show {
     fn show(&mut self, notice: &Notice) -> Result<(), Failure> {
         match notice {
             Notice::Progress { device, cycle, done, total } => self.progress(*device, *cycle, *done, *total),
-            Notice::State { state, cycle, .. } => {
+            Notice::State { state, cycle, event } => {
                 if let Some(bar) = &self.bar {
                     bar.set_message(format!("cycle {cycle}  {state}"));
                 }
-                Ok(())
+                self.order(event)
             }
+            Notice::Transferred { cycle, points, seconds, ms_per_point } => self.line(&format!(
+                "cycle {cycle}: {points} points fetched in {seconds:.2} s, {} ms a point",
+                three_digits(*ms_per_point)
+            )),
             Notice::LoadPart => self.line("load the part, clamp it, then: regrind confirm loaded"),
+            Notice::Note { device, words } => {
+                words.iter().try_for_each(|words| self.line(&format!("{device}: {words}")))
+            }
             Notice::Figures { cycle, figures } => self.figures(*cycle, figures),
             Notice::Judged(Judgement { cycle, reason, .. }) => self.line(&format!("cycle {cycle}: {reason}")),
             Notice::Compensated { cycle, summary } => self.line(&format!(
@@ -98,8 +108,25 @@ impl Show {
         }
     }
 
+    /// Says that an order was taken, whoever gave it.
+    fn order(&mut self, event: &str) -> Result<(), Failure> {
+        match event {
+            "hold" => self.line(&format!(
+                "HOLD     the cell holds at the next safe place; to go on: regrind resume {0}; Ctrl-C, or regrind abort {0}, ends the run",
+                self.folder
+            )),
+            "resume" => self.line("RESUME   the cell goes on"),
+            "stop" => self.line("STOP     the cell ends in order"),
+            "abort" => self.line("ABORT    both machines run their safe sequence, and nothing else"),
+            _ => Ok(()),
+        }
+    }
+
     fn progress(&mut self, device: Device, cycle: u32, done: u32, total: u32) -> Result<(), Failure> {
         let job = Some((device, cycle));
+        if self.job != job {
+            self.first = Some((Instant::now(), done));
+        }
         let (what, unit) = match device {
             Device::Cmm => ("measuring", " points"),
             Device::Grinder => ("grinding", "/1000 of the path"),
@@ -114,18 +141,30 @@ impl Show {
         } else if self.job != job || self.said.is_none_or(|at| at.elapsed() >= QUIET) {
             self.said = Some(Instant::now());
             let of = if device == Device::Cmm { format!("{done} of {total}{unit}") } else { format!("{done}{unit}") };
-            self.line(&format!("cycle {cycle}: {what}, {of}"))?;
+            self.line(&format!("cycle {cycle}: {what}, {of}{}", self.left(done, total)))?;
         }
         self.job = job;
         Ok(())
     }
 
+    /// Tells how long the job will still take at the pace so far; nothing before there is a pace.
+    fn left(&self, done: u32, total: u32) -> String {
+        let Some((began, from)) = self.first else { return String::new() };
+        let seconds = began.elapsed().as_secs_f64();
+        if done <= from || seconds < 0.5 {
+            return String::new();
+        }
+        let left_s = seconds / f64::from(done - from) * f64::from(total.saturating_sub(done));
+        if left_s < 90.0 { format!(", {left_s:.0} s left") } else { format!(", {:.0} min left", left_s / 60.0) }
+    }
+
     fn figures(&mut self, cycle: u32, figures: &Figures) -> Result<(), Failure> {
         let um = |mm: f64| three_digits(1e3 * mm);
         let mut text = format!(
-            "cycle {cycle}: PV {} um, rms {} um; {} points, {} outliers",
+            "cycle {cycle}: PV {} um, rms {} um (tolerance {}); {} points, {} outliers",
             um(figures.pv_mm),
             um(figures.rms_mm),
+            self.tolerance,
             figures.points,
             figures.outliers
         );

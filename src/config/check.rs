@@ -265,6 +265,7 @@ impl Machine<'_> {
             let allowed = "what is written and what is awaited must be told apart";
             document.report(&self.key("wire.inbox"), "is the same folder as `outbox`", allowed, "give each a folder");
         }
+        self.check_result(&written.result, document);
         self.check_stations(written, document);
         let stations = written
             .stations
@@ -285,7 +286,28 @@ impl Machine<'_> {
             stations: stations.collect::<Option<Vec<Station>>>()?,
             reference_points: written.reference_points.as_ref().map(|file| folder.join(file)),
             reference_group: written.reference_group.clone(),
+            reference_limit_mm: written.reference_limit_mm,
+            result: written.result.clone(),
+            take_earlier: written.take_earlier,
+            probe_tolerance_mm: written.probe_tolerance_mm,
         })
+    }
+
+    fn check_result(&self, name: &str, document: &mut Document) {
+        let mut plain = name.to_owned();
+        for word in ["{part}", "{job}", "{cycle}"] {
+            plain = plain.replace(word, "");
+        }
+        if plain.contains(['/', '\\', '{', '}']) || plain.matches('*').count() > 1 {
+            let allowed =
+                "it must be the name of a file in the inbox, with `{part}`, `{job}`, `{cycle}` and one `*` at most";
+            document.report(
+                &self.key("wire.result"),
+                format!("is {name:?}"),
+                allowed,
+                "\"{part}_c{cycle}.*\" is usual",
+            );
+        }
     }
 
     fn check_stations(&self, written: &ExchangeTable, document: &mut Document) {

@@ -127,13 +127,21 @@ pub struct FileExchange {
     pub reference_points: Option<PathBuf>,
     /// Name of the group of reference points within the file.
     pub reference_group: Option<String>,
+    /// By how much a reference point may be off after the best fit of its station.
+    pub reference_limit_mm: f64,
+    /// Names of result files, with `{part}`, `{job}`, `{cycle}` and one `*`.
+    pub result: String,
+    /// Whether files may be taken that lay in the inbox before the plan was handed over.
+    pub take_earlier: bool,
+    /// By how much the probe radius that a file states may differ from the recipe's.
+    pub probe_tolerance_mm: f64,
 }
 
 /// How result files are written.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Content {
-    /// What the coordinates are.
-    pub what: PointKind,
+    /// What the coordinates are; `None` where each file has to say it.
+    pub what: Option<PointKind>,
     /// The decimal mark.
     pub decimal: Decimal,
     /// Millimetres per unit of length of the files.
@@ -141,11 +149,10 @@ pub struct Content {
 }
 
 /// What measured coordinates are.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum PointKind {
     /// Centres of the probe.
-    #[default]
     Centres,
     /// Points of the surface.
     Contacts,

@@ -145,8 +145,8 @@ pub(super) struct ExchangeTable {
     /// A file that has not changed for so long is complete.
     #[schemars(range(min = 0.05, max = 3600.0))]
     pub stable_for_s: f64,
-    /// What the coordinates of results are.
-    pub what: PointKind,
+    /// What the coordinates of results are, where the files do not say so themselves; said nowhere, they are refused.
+    pub what: Option<PointKind>,
     /// Decimal mark of results.
     pub decimal: Decimal,
     /// Unit of length of results.
@@ -160,6 +160,17 @@ pub(super) struct ExchangeTable {
     /// Name of the group of reference points within the file.
     #[schemars(length(min = 1, max = 80))]
     pub reference_group: Option<String>,
+    /// By how much a reference point may be off after the best fit of its station.
+    #[schemars(range(min = 0.0001, max = 100.0))]
+    pub reference_limit_mm: f64,
+    /// Names of result files: `{part}`, `{job}` and `{cycle}` are filled in, one `*` stands for any characters.
+    #[schemars(length(min = 1, max = 200))]
+    pub result: String,
+    /// Whether files may be taken that lay in the inbox before the plan was handed over.
+    pub take_earlier: bool,
+    /// By how much the probe radius that a file states may differ from the recipe's.
+    #[schemars(range(min = 0.0, max = 10.0))]
+    pub probe_tolerance_mm: f64,
 }
 
 /// A station of a measurement.
@@ -343,12 +354,16 @@ impl Default for ExchangeTable {
             outbox: None,
             inbox: None,
             stable_for_s: 2.0,
-            what: PointKind::Centres,
+            what: None,
             decimal: Decimal::Auto,
             unit: LengthWord::Mm,
             stations: Vec::new(),
             reference_points: None,
             reference_group: None,
+            reference_limit_mm: 0.1,
+            result: "{part}_c{cycle}.*".to_owned(),
+            take_earlier: false,
+            probe_tolerance_mm: 0.001,
         }
     }
 }

@@ -134,6 +134,13 @@ pub enum DeviceError {
         what: &'static str,
     },
 
+    /// A person's word was given for a machine that needs none.
+    #[error("{machine} tells itself when a job begins and ends; nothing is confirmed by hand")]
+    TellsItself {
+        /// The machine.
+        machine: Arc<str>,
+    },
+
     /// The folders that stand for the machine cannot be read or written, or hold something that must not be touched.
     #[error("{machine}: {why}")]
     Folder {

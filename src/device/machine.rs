@@ -4,6 +4,7 @@ use std::future::Future;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use super::exchange::Step;
 use super::{
     Armed, CorrectionMap, DeviceError, Identity, Job, Measurement, Pass, PassRecord, Plan, Reconciled, Started, Status,
 };
@@ -15,6 +16,12 @@ use super::{
 pub trait Machine: Send {
     /// The name by which messages call this machine, for example `cmm at 10.0.0.5:502, unit 1`.
     fn name(&self) -> &str;
+
+    /// What a person should know of this machine now, beyond its status: what is waited for, which files were left alone and why.
+    /// Nothing for a machine that tells everything by its status.
+    fn notes(&self) -> Vec<String> {
+        Vec::new()
+    }
 
     /// Opens the wire and proves that the machine at its far end is the one that is meant, before anything is written to it.
     fn connect(&mut self) -> impl Future<Output = Result<Identity, DeviceError>> + Send;
@@ -95,6 +102,17 @@ pub trait Grinder: Machine {
         job: Job,
         interrupt: &Interrupt,
     ) -> impl Future<Output = Result<PassRecord, DeviceError>> + Send;
+
+    /// Takes a person's word that the job with this map has begun, or that it has ended and the part is clear. Only a grinder that
+    /// cannot tell it itself needs it; any other refuses.
+    fn confirm(
+        &mut self,
+        _step: Step,
+        _map_identity: [u8; 32],
+    ) -> impl Future<Output = Result<(), DeviceError>> + Send {
+        let machine: Arc<str> = Arc::from(self.name());
+        async move { Err(DeviceError::TellsItself { machine }) }
+    }
 }
 
 /// A flag that breaks off a long transfer between two requests, so that a hold or an abort can reach the wire at once.

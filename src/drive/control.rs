@@ -58,6 +58,16 @@ pub enum Request {
         /// What was seen.
         evidence: String,
     },
+    /// The grinder has begun the job whose map is this one; for a grinder that takes files.
+    Started {
+        /// Identity of the map: its first 8 hexadecimal digits, or more.
+        map: String,
+    },
+    /// The grinder has ended that job, and the part is clear.
+    Done {
+        /// Identity of the map: its first 8 hexadecimal digits, or more.
+        map: String,
+    },
     /// How is it?
     Status,
 }

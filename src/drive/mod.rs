@@ -13,6 +13,7 @@
 
 mod control;
 mod notice;
+mod outcome;
 mod record;
 mod station;
 mod work;
@@ -23,12 +24,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
 
-use crate::cell::{Actor, Cell, CellPlan, Command, Device, Ending, Event, GateFailure, RecordFailure, State};
+use crate::cell::{Actor, Cell, CellPlan, Command, Device, Ending, Event, GateFailure, Phase, RecordFailure, State};
 use crate::compensation::{Correction, ErrorMap};
-use crate::device::{Armed, Cmm, Grinder, Interrupt};
+use crate::device::exchange::Step;
+use crate::device::{Armed, Cmm, Grinder, Identified, Interrupt};
 use crate::formats::{ResultFolder, write_json_atomic};
 use crate::journal::{Entry, Journal, Kind};
 use crate::registration::Registration;
@@ -37,7 +39,7 @@ use control::{Control, Ordered};
 pub use control::{Reply, Request, SOCKET, ask};
 pub use notice::{CycleRow, Notice};
 use record::{Recorder, entry};
-use station::{Ask, Bench, CmmBench, GrinderBench, Harvest, Intent, Load, Station, Told};
+use station::{Aborts, Ask, Bench, CmmBench, GrinderBench, Harvest, Intent, Load, Station, Told};
 use work::{Cycle, Points};
 pub use work::{Probing, Sphere, Task};
 
@@ -97,6 +99,8 @@ pub struct Drive {
     before: Duration,
     asks: [mpsc::Sender<Ask>; 2],
     interrupts: [Interrupt; 2],
+    /// Counts the aborts of each station, which so gives up what it is at.
+    aborts: [watch::Sender<u64>; 2],
     told: mpsc::Receiver<Told>,
     computed: (mpsc::UnboundedSender<Computed>, mpsc::UnboundedReceiver<Computed>),
     orders: mpsc::Receiver<Ordered>,
@@ -104,6 +108,8 @@ pub struct Drive {
     notices: mpsc::UnboundedSender<Notice>,
     cycles: BTreeMap<u32, Cycle>,
     armed: [Option<Value>; 2],
+    /// Commands on record that no event has answered yet.
+    open: Vec<(u32, Command)>,
     record_failed: bool,
     ending: Option<Ending>,
     stations: Vec<tokio::task::JoinHandle<()>>,
@@ -142,12 +148,13 @@ impl Drive {
         let control = Control::listen(&folder, orders.clone(), seen)?;
         let interrupted = run.interrupted.unwrap_or_default();
         let interrupts = [Interrupt::new(), Interrupt::new()];
+        let aborts = [watch::Sender::new(0), watch::Sender::new(0)];
         let armed = interrupted.intents.clone().map(|intent| intent.as_ref().and_then(restored));
         let [of_cmm, of_grinder] = armed;
         let [poll_cmm, poll_grinder] = run.poll;
-        let (cmm, cmm_task) = spawn(CmmBench(cmm), run.job, &interrupts[0], &told, of_cmm, poll_cmm);
+        let (cmm, cmm_task) = spawn(CmmBench(cmm), run.job, (&interrupts[0], &aborts[0]), &told, of_cmm, poll_cmm);
         let (grinder, grinder_task) =
-            spawn(GrinderBench(grinder), run.job, &interrupts[1], &told, of_grinder, poll_grinder);
+            spawn(GrinderBench(grinder), run.job, (&interrupts[1], &aborts[1]), &told, of_grinder, poll_grinder);
         let mut drive = Self {
             cell: Cell::new(run.plan),
             task: Arc::new(run.task),
@@ -159,6 +166,7 @@ impl Drive {
             before: Duration::ZERO,
             asks: [cmm, grinder],
             interrupts,
+            aborts,
             told: facts,
             computed: mpsc::unbounded_channel(),
             orders: ordered,
@@ -166,6 +174,7 @@ impl Drive {
             notices: run.notices,
             cycles: BTreeMap::new(),
             armed: interrupted.intents,
+            open: Vec::new(),
             record_failed: false,
             ending: None,
             stations: vec![cmm_task, grinder_task],
@@ -240,6 +249,8 @@ impl Drive {
     /// Handles an order and answers who gave it.
     async fn order(&mut self, Ordered { request, actor, answer }: Ordered) {
         let event = match request {
+            Request::Started { map } => return self.confirm(Step::Started, &map, &actor, answer).await,
+            Request::Done { map } => return self.confirm(Step::Done, &map, &actor, answer).await,
             Request::Hold { reason } => Event::Hold { actor, reason },
             Request::Resume { reason } => Event::Resume { actor, reason },
             Request::Stop { reason } => Event::Stop { actor, reason },
@@ -256,12 +267,69 @@ impl Drive {
         }
     }
 
-    async fn told(&mut self, Told { event, detail, harvest }: Told) {
+    /// Takes a person's word for the pass that is under way, if it names the map of that pass.
+    async fn confirm(&mut self, step: Step, map: &str, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
+        let mut asked = self.confirmable(map);
+        if asked.is_ok() {
+            let done = if step == Step::Started { "started" } else { "done" };
+            let payload = json!({ "confirmed": done, "device": Device::Grinder, "map": map });
+            self.note(Kind::Note, (actor.name.clone(), actor.station.clone()), payload).await;
+            if self.record_failed {
+                asked = Err("the journal cannot be written, and what is not recorded is not done".into());
+            }
+        }
+        let asked = match asked {
+            Err(why) => Err(why),
+            Ok(map_identity) => {
+                let (told, word) = oneshot::channel();
+                self.ask(Device::Grinder, Ask::Confirm { step, map_identity, answer: told }).await;
+                Ok(word)
+            }
+        };
+        let (status, words) = (self.snapshot(), self.cell.state().to_string());
+        // The station answers in its turn; the loop does not wait for it.
+        tokio::spawn(async move {
+            let told = match asked {
+                Ok(word) => word.await.unwrap_or_else(|_| Err("the run is over".into())),
+                Err(why) => Err(why),
+            };
+            let reply = Reply { accepted: told.is_ok(), words: told.err().unwrap_or(words), status };
+            let _ = answer.map(|answer| answer.send(reply));
+        });
+    }
+
+    /// Returns the whole identity of the map of this cycle, if that is what the digits begin.
+    fn confirmable(&self, digits: &str) -> Result<[u8; 32], String> {
+        let digits = digits.trim().to_lowercase();
+        let grinds = self.cell.state().phase().and_then(Phase::moving) == Some(Device::Grinder);
+        let cycle = self.cycles.get(&self.cell.cycle()).filter(|_| grinds);
+        let Some(cycle) = cycle else { return Err("no pass is under way".into()) };
+        let identity = self.task.payloads(&cycle.correction).0.identity();
+        let whole: String = identity.iter().map(|b| format!("{b:02x}")).collect();
+        if digits.len() < 8 {
+            return Err("give the first 8 digits of the map, or more; they stand in correction.json".into());
+        }
+        if !whole.starts_with(&digits) {
+            let (given, handed) = (digits.get(..8).unwrap_or(&digits), &whole[..8]);
+            return Err(format!(
+                "map {handed} was handed over, and {given} is another one: is the grinder set up with it?"
+            ));
+        }
+        Ok(identity)
+    }
+
+    async fn told(&mut self, Told { event, detail, harvest, notes }: Told) {
+        if let Some((device, words)) = notes {
+            let payload = json!({ "device": device, "notes": words });
+            self.note(Kind::Note, (device.to_string(), "wire".into()), payload).await;
+            self.notify(Notice::Note { device, words });
+        }
         if let Some(Harvest::Record(record)) = &harvest {
             let payload = json!({ "pass_record": pass_record(record) });
             self.note(Kind::Note, ("grinder".into(), "wire".into()), payload).await;
         }
-        if let Some(Harvest::Points(measurement)) = harvest {
+        if let Some(Harvest::Points(measurement, taken)) = harvest {
+            self.transferred(&measurement, taken).await;
             return self.gate(measurement);
         }
         if let Some(event) = event {
@@ -270,6 +338,15 @@ impl Drive {
             }
             self.take(event, detail).await;
         }
+    }
+
+    /// Records and shows how fast points came over the wire.
+    async fn transferred(&mut self, measurement: &crate::device::Measurement, taken: Duration) {
+        let (cycle, points, seconds) = (u32::from(measurement.cycle), measurement.points.len(), taken.as_secs_f64());
+        let ms_per_point = 1e3 * seconds / points.max(1) as f64;
+        let payload = json!({ "transfer": { "points": points, "seconds": seconds, "ms_per_point": ms_per_point } });
+        self.note(Kind::Note, ("cmm".into(), "wire".into()), payload).await;
+        self.notify(Notice::Transferred { cycle, points, seconds, ms_per_point });
     }
 
     async fn computed(&mut self, computed: Computed) {
@@ -295,16 +372,23 @@ impl Drive {
                     cycle.error = error.map(Arc::new);
                     cycle.figures = Some(figures);
                 }
-                let files: &[&str] = &["deviations.csv", "deviation_uncertainty.csv", "registration.json"];
-                (number, event, if any { files } else { &[] })
+                let map = self.cycles.get(&number).is_some_and(|cycle| cycle.error.is_some());
+                let files: &[&str] = &[
+                    "deviations.csv",
+                    "deviation_uncertainty.csv",
+                    "registration.json",
+                    "error_map.csv",
+                    "error_map.png",
+                ];
+                let count = if any { if map { 5 } else { 3 } } else { 0 };
+                (number, event, &files[..count])
             }
             Computed::Compensated(number, event, correction) => {
                 let any = correction.is_some();
                 if let Some(correction) = correction {
                     self.cycles.insert(number + 1, new_cycle(correction));
                 }
-                let files: &[&str] = &["error_map.csv", "correction.csv", "error_map.png"];
-                (number, event, if any { files } else { &[] })
+                (number, event, if any { &["correction.csv"] } else { &[] })
             }
         };
         let names = files.iter().map(|name| format!("cycle-{number}/{name}")).collect();
@@ -322,7 +406,12 @@ impl Drive {
                 events.push_back((Event::RecordFailed { why: failure }, None));
             }
             self.show_event(&event);
-            for command in self.cell.handle(now, event) {
+            let commands = self.cell.handle(now, event);
+            // What makes safe waits neither for the disk nor for the record of what comes before it.
+            for command in commands.iter().filter(|command| makes_safe(command)) {
+                self.execute(command.clone()).await;
+            }
+            for command in commands {
                 if let Command::Refuse { why, .. } = &command {
                     refusal = Some(why.clone());
                 }
@@ -341,7 +430,22 @@ impl Drive {
             map.insert("detail".into(), detail);
         }
         let written = self.recorder.append(entry(Kind::Event, now, self.cell.cycle(), actor_of(event), payload)).await;
-        self.settle(written.map(|()| 0))
+        let failure = self.settle(written.map(|()| 0));
+        self.close_answered(now, event).await;
+        failure
+    }
+
+    /// Records what became of the commands that an event answers.
+    async fn close_answered(&mut self, now: Duration, event: &Event) {
+        let (answered, open) =
+            std::mem::take(&mut self.open).into_iter().partition(|(_, c)| outcome::answers(event, c));
+        self.open = open;
+        for (id, _) in answered as Vec<(u32, Command)> {
+            let payload = json!({ "event": event_name(event) });
+            let record = entry(Kind::Outcome, now, self.cell.cycle(), actor_of(event), payload);
+            let written = self.recorder.append(Entry { command_id: Some(id), ..record }).await;
+            self.settle(written.map(|()| 0));
+        }
     }
 
     /// Returns a failure to record the first time only; the cell is told once.
@@ -374,23 +478,27 @@ impl Drive {
             map.insert("intent".into(), self.armed[index(*device)].clone().unwrap_or(Value::Null));
         }
         let record = Entry::new(Kind::Intent, record::nanoseconds(self.now()), self.cell.cycle(), payload);
-        let safe = makes_safe(&command);
-        if safe {
-            // What makes safe does not wait for the disk.
+        if !outcome::is_answered(&command) {
+            let written = self.recorder.append(Entry { kind: Kind::Note, ..record }).await;
             self.execute(command).await;
-            return self.settle_intent(record).await;
+            return self.settle(written.map(|()| 0));
         }
-        let failure = self.settle_intent(record).await;
+        if makes_safe(&command) {
+            // It has been carried out already.
+            return self.settle_intent(record, command).await;
+        }
+        let failure = self.settle_intent(record, command.clone()).await;
         if failure.is_none() && !self.record_failed || !moves(&command) {
             self.execute(command).await;
         }
         failure
     }
 
-    async fn settle_intent(&mut self, record: Entry) -> Option<RecordFailure> {
+    async fn settle_intent(&mut self, record: Entry, command: Command) -> Option<RecordFailure> {
         let written = self.recorder.intend(record).await;
-        if written.is_ok() {
+        if let Ok(id) = written {
             self.record_failed = false;
+            self.open.push((id, command));
         }
         self.settle(written)
     }
@@ -407,7 +515,10 @@ impl Drive {
             Command::HoldMachine { device } => self.ask_at_once(device, Ask::Hold).await,
             Command::ResumeMachine { device } => self.ask(device, Ask::Resume).await,
             Command::StopMachine { device } => self.ask_at_once(device, Ask::Stop).await,
-            Command::AbortMachine { device } => self.ask_at_once(device, Ask::Abort).await,
+            Command::AbortMachine { device } => {
+                self.aborts[index(device)].send_modify(|ordered| *ordered += 1);
+                self.ask_at_once(device, Ask::Abort).await;
+            }
             Command::ClearMachine { device } => self.ask(device, Ask::Clear).await,
             Command::Reconcile { device, cycle } => self.ask(device, Ask::Reconcile { cycle }).await,
             Command::Collect { cycle } => self.ask(Device::Cmm, Ask::Collect { cycle }).await,
@@ -415,12 +526,31 @@ impl Drive {
             Command::Acknowledge { device } => self.ask(device, Ask::Acknowledge).await,
             Command::Register { cycle } => self.register(cycle),
             Command::Compensate { cycle } => self.compensate(cycle),
-            Command::Announce(judgement) => self.notify(Notice::Judged(judgement)),
+            Command::Announce(judgement) => self.announce(judgement).await,
             Command::Raise(alarm) => self.notify(Notice::Alarm(alarm)),
             Command::Withdraw { alarm } => self.notify(Notice::AlarmGone { alarm }),
             Command::Refuse { why, .. } => self.notify(Notice::Refused { why }),
             Command::Finish(ending) => self.ending = Some(ending),
         }
+    }
+
+    /// Shows how a cycle was judged and leaves it beside its measurement.
+    async fn announce(&mut self, judgement: crate::cell::Judgement) {
+        let number = judgement.cycle;
+        let cycle = self.cycles.get(&number);
+        let result = json!({
+            "simulation": self.task.simulation,
+            "cycle": number,
+            "verdict": judgement.verdict,
+            "reason": judgement.reason,
+            "figures": cycle.and_then(|c| c.figures.as_ref()),
+            "level_mm": cycle.map(|c| c.correction.level_mm),
+        });
+        match write_json_atomic(self.cycle_folder(number).join("result.json"), &result) {
+            Ok(()) => self.adopt(vec![format!("cycle-{number}/result.json")], number).await,
+            Err(error) => self.notify(Notice::RecordFailed { words: error.to_string() }),
+        }
+        self.notify(Notice::Judged(judgement));
     }
 
     async fn ask(&mut self, device: Device, ask: Ask) {
@@ -479,7 +609,7 @@ impl Drive {
             let (planned, found, points) = work::gate(&task, &plan.unwrap_or_else(empty), &measurement);
             let saved = points.and_then(|points| {
                 let made = ResultFolder::prepare(&folder).map(ResultFolder::keep);
-                let saved = made.and_then(|()| work::save_points(&folder, &points));
+                let saved = made.and_then(|()| work::save_points(&folder, &points, task.simulation));
                 saved.map(|()| points).map_err(|error| GateFailure::Broken(error.to_string()))
             });
             let (gate, points) = match saved {
@@ -577,14 +707,14 @@ fn new_cycle(correction: Correction) -> Cycle {
 fn spawn<B: Bench>(
     bench: B,
     job: u32,
-    interrupt: &Interrupt,
+    (interrupt, aborts): (&Interrupt, &watch::Sender<u64>),
     told: &mpsc::Sender<Told>,
     armed: Option<(u32, Armed)>,
     poll: Duration,
 ) -> (mpsc::Sender<Ask>, tokio::task::JoinHandle<()>) {
     let (asks, asked) = mpsc::channel(16);
     let station = Station::new(bench, job, interrupt.clone(), told.clone()).with_intent(armed);
-    (asks, tokio::spawn(station.attend(asked, poll)))
+    (asks, tokio::spawn(station.attend(asked, poll, Aborts::new(aborts.subscribe()))))
 }
 
 fn restored(intent: &Value) -> Option<(u32, Armed)> {

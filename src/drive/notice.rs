@@ -13,8 +13,12 @@ pub enum Notice {
     State { state: String, cycle: u32, event: String },
     /// The right part is to be loaded, and that to be confirmed.
     LoadPart,
+    /// What a person should know of a machine: what it waits for, which files were left alone and why.
+    Note { device: Device, words: Vec<String> },
     /// A job goes on.
     Progress { device: Device, cycle: u32, done: u32, total: u32 },
+    /// The points of a measurement came over the wire, in this time.
+    Transferred { cycle: u32, points: usize, seconds: f64, ms_per_point: f64 },
     /// A measurement is registered.
     Figures { cycle: u32, figures: Figures },
     /// A cycle is judged.

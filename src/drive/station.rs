@@ -1,17 +1,19 @@
 //! A task for each machine: it alone talks to it. Orders come in, facts go out; while nothing is asked it looks at the status.
 //!
 //! What is asked is answered in order. A hold, a stop or an abort does not wait for a long transfer: the drive raises the
-//! [`Interrupt`], the transfer ends between two requests, and the order is next.
+//! [`Interrupt`], the transfer ends between two requests, and the order is next. An abort waits for nothing else either: what the
+//! machine was being asked is given up where it is, for nothing that it could still bring would be used.
 
 use std::future::Future;
 use std::sync::Arc;
 use std::time::Duration;
 
 use serde::Serialize;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
 use crate::cell::{Asked, Condition, Device, Event, Found, JobResult, Mismatch, Reconciliation};
+use crate::device::exchange::Step;
 use crate::device::{
     Armed, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, Measurement, Outcome,
     Pass, PassRecord, Plan, Reconciled, State, Status, digest,
@@ -32,6 +34,7 @@ pub(super) enum Ask {
     Reconcile { cycle: u32 },
     Collect { cycle: u32 },
     Acknowledge,
+    Confirm { step: Step, map_identity: [u8; 32], answer: oneshot::Sender<Result<(), String>> },
 }
 
 /// A payload for one machine or the other.
@@ -43,16 +46,20 @@ pub(super) enum Load {
 
 /// What a job left.
 pub(super) enum Harvest {
-    Points(Box<Measurement>),
+    /// With the time that their transfer took.
+    Points(Box<Measurement>, Duration),
     Record(Box<PassRecord>),
 }
 
 /// A fact, with what the journal should keep beside it.
+#[derive(Default)]
 pub(super) struct Told {
     /// `None` where the drive makes the event itself, from the harvest.
     pub(super) event: Option<Event>,
     pub(super) detail: Option<serde_json::Value>,
     pub(super) harvest: Option<Harvest>,
+    /// What a person should know of a machine, where that is new.
+    pub(super) notes: Option<(Device, Vec<String>)>,
 }
 
 /// The drivers of both kinds, seen alike.
@@ -64,6 +71,8 @@ pub(super) trait Bench: Send + 'static {
     fn load(&mut self, load: &Load, interrupt: &Interrupt) -> impl Future<Output = Result<u32, DeviceError>> + Send;
     fn harvest(&mut self, job: Job, interrupt: &Interrupt)
     -> impl Future<Output = Result<Harvest, DeviceError>> + Send;
+    /// Takes a person's word for the job with this map.
+    fn confirm(&mut self, step: Step, map_identity: [u8; 32]) -> impl Future<Output = Result<(), DeviceError>> + Send;
 }
 
 pub(super) struct CmmBench<C>(pub(super) C);
@@ -84,7 +93,13 @@ impl<C: Cmm + 'static> Bench for CmmBench<C> {
     }
 
     async fn harvest(&mut self, job: Job, interrupt: &Interrupt) -> Result<Harvest, DeviceError> {
-        Ok(Harvest::Points(Box::new(self.0.collect(job, interrupt).await?)))
+        let began = Instant::now();
+        let measurement = self.0.collect(job, interrupt).await?;
+        Ok(Harvest::Points(Box::new(measurement), began.elapsed()))
+    }
+
+    async fn confirm(&mut self, _: Step, _: [u8; 32]) -> Result<(), DeviceError> {
+        Err(DeviceError::TellsItself { machine: self.0.name().into() })
     }
 }
 
@@ -105,6 +120,31 @@ impl<G: Grinder + 'static> Bench for GrinderBench<G> {
     async fn harvest(&mut self, job: Job, interrupt: &Interrupt) -> Result<Harvest, DeviceError> {
         Ok(Harvest::Record(Box::new(self.0.collect(job, interrupt).await?)))
     }
+
+    async fn confirm(&mut self, step: Step, map_identity: [u8; 32]) -> Result<(), DeviceError> {
+        self.0.confirm(step, map_identity).await
+    }
+}
+
+/// Aborts on their way to a station: the drive counts them up before it asks, the station as it takes them.
+pub(super) struct Aborts {
+    ordered: watch::Receiver<u64>,
+    taken: u64,
+}
+
+impl Aborts {
+    pub(super) fn new(ordered: watch::Receiver<u64>) -> Self {
+        Self { ordered, taken: 0 }
+    }
+
+    /// Waits until an abort is on its way that has not been taken.
+    async fn ordered(&mut self) {
+        let taken = self.taken;
+        if self.ordered.wait_for(|ordered| *ordered > taken).await.is_err() {
+            // Nobody is left to order one.
+            std::future::pending::<()>().await;
+        }
+    }
 }
 
 /// A task that attends to one machine.
@@ -119,6 +159,8 @@ pub(super) struct Station<B> {
     /// The cycle of the job that runs.
     cycle: u32,
     seen: Seen,
+    /// What a person was told last.
+    said: Vec<String>,
 }
 
 /// What the last look showed, so that only changes are told.
@@ -150,7 +192,17 @@ const PROGRESS_EVERY: Duration = Duration::from_millis(250);
 
 impl<B: Bench> Station<B> {
     pub(super) fn new(bench: B, job: u32, interrupt: Interrupt, told: mpsc::Sender<Told>) -> Self {
-        Self { bench, job, interrupt, told, loaded: None, armed: None, cycle: 0, seen: Seen::default() }
+        Self {
+            bench,
+            job,
+            interrupt,
+            told,
+            loaded: None,
+            armed: None,
+            cycle: 0,
+            seen: Seen::default(),
+            said: Vec::new(),
+        }
     }
 
     /// Restores the intent of an interrupted run, so that it can be reconciled.
@@ -162,17 +214,29 @@ impl<B: Bench> Station<B> {
     }
 
     /// Attends until nobody can ask any more, then gives the machine back.
-    pub(super) async fn attend(mut self, mut asks: mpsc::Receiver<Ask>, poll: Duration) {
+    pub(super) async fn attend(mut self, mut asks: mpsc::Receiver<Ask>, poll: Duration, mut aborts: Aborts) {
         let mut ticks = interval(poll);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             tokio::select! {
                 biased;
                 ask = asks.recv() => match ask {
-                    Some(ask) => self.act(ask).await,
+                    Some(Ask::Abort) => {
+                        aborts.taken += 1;
+                        self.act(Ask::Abort).await;
+                    }
+                    Some(ask) => tokio::select! {
+                        biased;
+                        () = aborts.ordered() => {}
+                        () = self.act(ask) => {}
+                    },
                     None => break,
                 },
-                _ = ticks.tick(), if self.seen.connected => self.look().await,
+                _ = ticks.tick(), if self.seen.connected => tokio::select! {
+                    biased;
+                    () = aborts.ordered() => {}
+                    () = self.look() => {}
+                },
             }
         }
         if self.seen.connected && !self.seen.lost {
@@ -187,7 +251,7 @@ impl<B: Bench> Station<B> {
 
     async fn tell_with(&mut self, event: Event, detail: Option<serde_json::Value>) {
         // The drive hears until it drops the last ask; after that nobody needs to know.
-        let _ = self.told.send(Told { event: Some(event), detail, harvest: None }).await;
+        let _ = self.told.send(Told { event: Some(event), detail, ..Told::default() }).await;
     }
 
     async fn act(&mut self, ask: Ask) {
@@ -209,6 +273,11 @@ impl<B: Bench> Station<B> {
             Ask::Reconcile { cycle } => self.reconcile(cycle).await,
             Ask::Collect { cycle } => self.collect(cycle).await,
             Ask::Acknowledge => self.acknowledge().await,
+            Ask::Confirm { step, map_identity, answer } => {
+                let told = self.bench.confirm(step, map_identity).await;
+                // Who asked may have gone.
+                let _ = answer.send(told.map_err(|error| error.to_string()));
+            }
         }
     }
 
@@ -418,7 +487,7 @@ impl<B: Bench> Station<B> {
 
     async fn hand_over(&mut self, harvest: Harvest) {
         // The drive hears as long as anybody asks.
-        let _ = self.told.send(Told { event: None, detail: None, harvest: Some(harvest) }).await;
+        let _ = self.told.send(Told { harvest: Some(harvest), ..Told::default() }).await;
     }
 
     async fn acknowledge(&mut self) {
@@ -466,6 +535,7 @@ impl<B: Bench> Station<B> {
         }
         match self.bench.machine().status().await {
             Ok(status) => {
+                self.pass_on_notes().await;
                 if std::mem::replace(&mut self.seen.signal_out, false) {
                     self.tell(Event::ConditionBack { condition: Condition::Temperature }).await;
                 }
@@ -478,6 +548,16 @@ impl<B: Bench> Station<B> {
                 }
             }
             Err(error) => self.lost(&error).await,
+        }
+    }
+
+    /// Tells what is new of what a person should know.
+    async fn pass_on_notes(&mut self) {
+        let notes = self.bench.machine().notes();
+        let new: Vec<String> = notes.iter().filter(|words| !self.said.contains(words)).cloned().collect();
+        self.said = notes;
+        if !new.is_empty() {
+            let _ = self.told.send(Told { notes: Some((B::DEVICE, new)), ..Told::default() }).await;
         }
     }
 

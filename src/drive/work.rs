@@ -16,7 +16,9 @@ use crate::formats::{
 };
 use crate::geometry::{Point, Pose};
 use crate::measuring::{self, fit_sphere, sphere_targets};
-use crate::registration::{Options, PointStatus as Fate, Registration, Start, register};
+use crate::registration::{
+    MapLimits, Options, PointStatus as Fate, Registration, Start, register, weak_for_compensation,
+};
 use crate::report::HeatMap;
 use crate::surface::{Nominal, Side};
 
@@ -43,17 +45,19 @@ pub struct Task {
     pub registration: Options,
     /// Whether a registration begins where the fixture holds the part.
     pub start_at_fixture: bool,
-    /// Whether the machine is expected to give contact points.
-    pub contacts_expected: bool,
+    /// What the machine is expected to give; `None` where each result says it itself.
+    pub coordinates: Option<Coordinates>,
     /// How a map is made.
     pub map: MapOptions,
     /// What a correction must keep to.
     pub limits: CorrectionLimits,
+    /// What uncertainty of the place of a correction on the part is put up with.
+    pub place: MapLimits,
     /// How a pass is ground; level and identity are set for each cycle.
     pub pass: Pass,
     /// Least share of the targets that must be touched.
     pub least_found: f64,
-    /// Largest uncertainty of the place of the map, as an error of the map, that is allowed; weak directions are judged by it.
+    /// Whether the cell is simulated; everything stored is marked so.
     pub simulation: bool,
 }
 
@@ -95,6 +99,8 @@ pub(super) struct Points {
     pub(super) sphere: Vec<Point>,
     /// Radius that the probe really has, where a sphere was touched.
     pub(super) radius_mm: Option<f64>,
+    /// Centres of the probe, or points of contact.
+    pub(super) coordinates: Coordinates,
 }
 
 impl Task {
@@ -176,7 +182,7 @@ pub(super) fn gate(task: &Task, plan: &Plan, measurement: &Measurement) -> (u32,
                     100.0 * share
                 )))
             } else {
-                Ok(Points { part, sphere, radius_mm })
+                Ok(Points { part, sphere, radius_mm, coordinates: measurement.coordinates })
             }
         }
         Err(failure) => Err(failure),
@@ -189,13 +195,13 @@ fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFa
     if measurement.plan_identity != plan.identity() {
         return Some(GateFailure::Foreign("the machine names another plan than the one it was given".into()));
     }
-    let contacts = measurement.coordinates == Coordinates::Contacts;
-    if contacts != task.contacts_expected {
-        return Some(if contacts {
-            GateFailure::Contacts
-        } else {
-            GateFailure::Broken("the machine gives probe centres where the cell file expects contact points".into())
-        });
+    match (measurement.coordinates, task.coordinates) {
+        (Coordinates::Contacts, Some(Coordinates::Centres)) => return Some(GateFailure::Contacts),
+        (Coordinates::Centres, Some(Coordinates::Contacts)) => {
+            let words = "the machine gives probe centres where the cell file expects contact points";
+            return Some(GateFailure::Broken(words.into()));
+        }
+        _ => {}
     }
     if !plan.targets.is_empty() && measurement.points.len() != plan.targets.len() {
         let (found, planned) = (measurement.points.len(), plan.targets.len());
@@ -238,7 +244,8 @@ pub(super) fn register_cycle(
     let Some(points) = &cycle.points else { return failed("there are no points of this cycle".into()) };
     // The surface wanted by this pass stands above the nominal one by its level, and the ball rolls on that.
     let radius_mm = points.radius_mm.unwrap_or(task.probing.probe_radius_mm);
-    let probe_radius_mm = if task.contacts_expected { 0.0 } else { radius_mm } + cycle.correction.level_mm;
+    let ball_mm = if points.coordinates == Coordinates::Contacts { 0.0 } else { radius_mm };
+    let probe_radius_mm = ball_mm + cycle.correction.level_mm;
     let start = if task.start_at_fixture { Start::Pose(task.fixture_cmm_from_model) } else { Start::Search };
     let options = Options { probe_radius_mm, start, ..task.registration };
     let found = match register(&task.nominal, &points.part, &options) {
@@ -249,6 +256,10 @@ pub(super) fn register_cycle(
         return failed(error.to_string());
     }
     let error = error_map(&readings(&found), &task.map).ok();
+    // Every measurement leaves its map, whatever becomes of the correction.
+    if let Some(Err(why)) = error.as_ref().map(|map| save_map(task, folder, map)) {
+        return failed(why);
+    }
     let figures = figures(task, cycle, before, &found, error.as_ref());
     (Event::Registered { cycle: number, figures: figures.clone() }, Some((found, error, figures)))
 }
@@ -259,7 +270,8 @@ fn save(task: &Task, folder: &Path, found: &Registration, options: &Options) -> 
         points: task.nominal.len(),
         kind: format!("{:?}", task.nominal.kind()),
     };
-    let document = RegistrationDocument::new(found, options, nominal, Path::new("measured.csv"));
+    let mut document = RegistrationDocument::new(found, options, nominal, Path::new("measured.csv"));
+    document.simulation = Some(task.simulation);
     save_registration(folder, &document, &found.deviations)
 }
 
@@ -313,17 +325,21 @@ fn answer(before: &Cycle, cycle: &Cycle, error: &ErrorMap) -> Option<Response> {
     })
 }
 
-/// Makes the correction of the next pass and writes map, picture and correction.
+/// Makes the correction of the next pass and writes it.
 pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &Cycle) -> (Event, Option<Correction>) {
     let refused = |why| (Event::CompensationRefused { cycle: number, why }, None);
     let Some(found) = &cycle.registration else {
         return refused(CompensationRefusal::Failed("the measurement of this cycle is not registered".into()));
     };
-    let seen: Vec<String> = found.verdict.weak_directions.iter().map(|weak| weak.words.clone()).collect();
-    if !seen.is_empty() {
-        return refused(CompensationRefusal::WeakDirections(seen));
+    // Where the part may slide in its own surface, nobody knows where on the part a map would be ground in.
+    if let Some(why) = weak_for_compensation(found, &task.place) {
+        return refused(CompensationRefusal::WeakDirections(vec![why]));
     }
-    let map = match error_map(&readings(found), &task.map) {
+    let map = match &cycle.error {
+        Some(map) => Ok(Arc::clone(map)),
+        None => error_map(&readings(found), &task.map).map(Arc::new),
+    };
+    let map = match map {
         Ok(map) => map,
         Err(error) => return refused(CompensationRefusal::Failed(error.to_string())),
     };
@@ -334,8 +350,8 @@ pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &
         }
         Err(error) => return refused(CompensationRefusal::Failed(error.to_string())),
     };
-    if let Err(error) = save_map(task, folder, &map, &step.correction) {
-        return refused(CompensationRefusal::Failed(error));
+    if let Err(error) = save_correction(task, folder, &step.correction) {
+        return refused(CompensationRefusal::Failed(error.to_string()));
     }
     let largest_mm = step.correction.values_mm.iter().fold(0.0f64, |most, v| most.max(v.abs()));
     let ratio = found.verdict.pv_mm / found.verdict.rms_mm.max(f64::MIN_POSITIVE);
@@ -348,12 +364,13 @@ pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &
     (Event::Compensated { cycle: number, summary }, Some(step.correction))
 }
 
-fn save_map(task: &Task, folder: &Path, map: &ErrorMap, correction: &Correction) -> Result<(), String> {
-    let words = |error: FormatError| error.to_string();
-    write_error_map(&folder.join("error_map.csv"), map, task.simulation).map_err(words)?;
+fn save_correction(task: &Task, folder: &Path, correction: &Correction) -> Result<(), FormatError> {
     let identity = task.payloads(correction).0.identity();
     write_correction(&folder.join("correction.csv"), correction, &task.part_identity, &identity, task.simulation)
-        .map_err(words)?;
+}
+
+fn save_map(task: &Task, folder: &Path, map: &ErrorMap) -> Result<(), String> {
+    write_error_map(&folder.join("error_map.csv"), map, task.simulation).map_err(|error| error.to_string())?;
     let title =
         if task.simulation { "Error of the part, filtered (SIMULATION)" } else { "Error of the part, filtered" };
     HeatMap::of_lengths(title, "deviation", &map.samples_mm())
@@ -362,11 +379,12 @@ fn save_map(task: &Task, folder: &Path, map: &ErrorMap, correction: &Correction)
 }
 
 /// Writes the points of a measurement, in the CMM frame.
-pub(super) fn save_points(folder: &Path, points: &Points) -> Result<(), FormatError> {
+pub(super) fn save_points(folder: &Path, points: &Points, simulation: bool) -> Result<(), FormatError> {
+    let header = if simulation { "# SIMULATION\nx_mm,y_mm,z_mm" } else { "x_mm,y_mm,z_mm" };
     if !points.sphere.is_empty() {
-        write_points(folder.join("reference_sphere.csv"), "x_mm,y_mm,z_mm", &points.sphere)?;
+        write_points(folder.join("reference_sphere.csv"), header, &points.sphere)?;
     }
-    write_points(folder.join("measured.csv"), "x_mm,y_mm,z_mm", &points.part)
+    write_points(folder.join("measured.csv"), header, &points.part)
 }
 
 /// Turns what the gates said into the event that the cell gets.

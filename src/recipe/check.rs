@@ -334,6 +334,7 @@ fn compensation(written: &CompensationTable, document: &mut Document) -> Option<
         removal_budget_mm: MM_PER_UM * written.removal_budget_um?,
         depth_of_cut_mm: MM_PER_UM * written.depth_of_cut_um?,
         spacing_mm: written.spacing_mm,
+        largest_displacement_mm: written.largest_displacement_mm,
     })
 }
 
@@ -373,6 +374,7 @@ fn grinding(written: &GrindingTable, document: &mut Document) -> Option<Grinding
 
 fn cycle(written: &CycleTable) -> Cycle {
     Cycle {
+        begin_with: written.begin_with,
         most_cycles: written.most_cycles,
         on_stall: written.on_stall,
         on_divergence: written.on_divergence,

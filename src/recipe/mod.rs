@@ -186,6 +186,8 @@ pub struct Compensation {
     pub depth_of_cut_mm: f64,
     /// Distance of the nodes of the map.
     pub spacing_mm: f64,
+    /// How far the correction may sit beside its place on the part (k = 2).
+    pub largest_displacement_mm: f64,
 }
 
 /// How the part is ground.
@@ -239,6 +241,8 @@ impl Wheel {
 /// How often, and what to do when it does not get better.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cycle {
+    /// What the first cycle begins with.
+    pub begin_with: BeginWith,
     /// Most cycles of grinding and measuring.
     pub most_cycles: u16,
     /// What to do when a cycle brings next to nothing.
@@ -247,6 +251,16 @@ pub struct Cycle {
     pub on_divergence: OnTrouble,
     /// An rms that falls by less than this brings next to nothing.
     pub stall_mm: f64,
+}
+
+/// What the first cycle begins with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum BeginWith {
+    /// A pass of the grinder.
+    Grind,
+    /// A measurement of the part as it is; its surface stands over the nominal one by `grinding.allowance_um`.
+    Measure,
 }
 
 /// What to do when the part does not get better.

@@ -3,7 +3,7 @@
 use schemars::{JsonSchema, Schema, json_schema};
 use serde::Deserialize;
 
-use super::{OnTrouble, StartAt};
+use super::{BeginWith, OnTrouble, StartAt};
 use crate::registration::Loss;
 use crate::surface::Projection;
 
@@ -242,6 +242,10 @@ pub(super) struct CompensationTable {
     /// Distance of the nodes of the map.
     #[schemars(range(min = 0.01, max = 10000.0))]
     pub spacing_mm: f64,
+    /// The correction is refused where it might sit farther than this beside its place on the part (k = 2), because the surface does not
+    /// tell the part's place any better.
+    #[schemars(range(min = 0.001, max = 1000.0))]
+    pub largest_displacement_mm: f64,
 }
 
 /// How the part is ground.
@@ -300,6 +304,8 @@ pub(super) struct RimTable {
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub(super) struct CycleTable {
+    /// What the first cycle begins with: a pass, or a measurement of the part as it is.
+    pub begin_with: BeginWith,
     /// Most cycles of grinding and measuring.
     #[schemars(range(min = 1, max = 100))]
     pub most_cycles: u16,
@@ -365,6 +371,7 @@ impl Default for CompensationTable {
             removal_budget_um: None,
             depth_of_cut_um: None,
             spacing_mm: 1.0,
+            largest_displacement_mm: 1.0,
         }
     }
 }
@@ -377,7 +384,13 @@ impl Default for GrindingTable {
 
 impl Default for CycleTable {
     fn default() -> Self {
-        Self { most_cycles: 5, on_stall: OnTrouble::Stop, on_divergence: OnTrouble::Hold, stall_um: 0.1 }
+        Self {
+            begin_with: BeginWith::Grind,
+            most_cycles: 5,
+            on_stall: OnTrouble::Stop,
+            on_divergence: OnTrouble::Hold,
+            stall_um: 0.1,
+        }
     }
 }
 

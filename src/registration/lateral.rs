@@ -75,7 +75,7 @@ pub fn weak_for_compensation(found: &Registration, limits: &MapLimits) -> Option
     let weak: Vec<&str> = seen.map(|w| w.words.as_str()).collect();
     let weak = if weak.is_empty() { String::new() } else { format!(" ({})", weak.join("; ")) };
     Some(format!(
-        "no correction is made: the measured heights are good, but the shape of the part does not tell where on it they lie{weak}. The \
+        "the measured heights are good, but the shape of the part does not tell where on it they lie{weak}. The \
          correction might sit {beside_mm:.2} mm beside its place, allowed are {:.2} mm. Where the error map climbs, by up to {:.2} um per \
          mm, that makes it wrong by {:.1} um, allowed are {:.1} um, {:.0} % of the {:.1} um rms to be corrected; at edges and seams by \
          more. Hold the directions in the recipe if the fixture holds the part better than that (registration.hold = [\"x\", \"y\", \

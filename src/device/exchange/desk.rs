@@ -1,6 +1,6 @@
 //! The states of a machine that is two folders and a person.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError, TryLockError};
 use std::time::Duration;
 
 use tokio::time::{Instant, timeout};
@@ -95,9 +95,14 @@ impl<M: Mailbox> ExchangeMachine<M> {
         Self { name, timing, made: Instant::now(), desk: Arc::new(Mutex::new(desk)) }
     }
 
-    /// What a person should know now: what is waited for, which files were left alone and why.
+    /// What a person should know now: what is waited for, which files were left alone and why. Nothing while the folders are being
+    /// looked at.
     pub fn notes(&self) -> Vec<String> {
-        self.desk.lock().unwrap_or_else(PoisonError::into_inner).said.clone()
+        match self.desk.try_lock() {
+            Ok(desk) => desk.said.clone(),
+            Err(TryLockError::Poisoned(desk)) => desk.into_inner().said.clone(),
+            Err(TryLockError::WouldBlock) => Vec::new(),
+        }
     }
 
     /// Runs a piece of work on the folders, off the threads that must not wait.
@@ -170,7 +175,7 @@ impl<M: Confirmable> ExchangeMachine<M> {
     /// # Errors
     /// A map other than the one handed over, no open hand-over, a folder that cannot be written.
     pub async fn confirm_started(&self, map_identity: [u8; 32]) -> Told<()> {
-        self.confirm(Step::Started, map_identity).await
+        self.confirmed(Step::Started, map_identity).await
     }
 
     /// Takes a person's word that the job whose map has this identity has ended and the part is clear.
@@ -178,10 +183,10 @@ impl<M: Confirmable> ExchangeMachine<M> {
     /// # Errors
     /// Those of [`ExchangeMachine::confirm_started`].
     pub async fn confirm_done(&self, map_identity: [u8; 32]) -> Told<()> {
-        self.confirm(Step::Done, map_identity).await
+        self.confirmed(Step::Done, map_identity).await
     }
 
-    async fn confirm(&self, step: Step, map_identity: [u8; 32]) -> Told<()> {
+    async fn confirmed(&self, step: Step, map_identity: [u8; 32]) -> Told<()> {
         self.at_desk("a confirmation", move |desk, _| {
             desk.check_connected("a confirmation")?;
             let Some((job, _)) = desk.job.filter(|_| desk.state == State::Execute) else {
@@ -481,6 +486,10 @@ impl<M: Mailbox> Machine for ExchangeMachine<M> {
         &self.name
     }
 
+    fn notes(&self) -> Vec<String> {
+        Self::notes(self)
+    }
+
     async fn connect(&mut self) -> Told<Identity> {
         self.at_desk("who it is", |desk, _| {
             desk.open()?;
@@ -612,5 +621,9 @@ impl<M: GrinderMailbox> Grinder for ExchangeMachine<M> {
     async fn collect(&mut self, job: Job, _: &Interrupt) -> Told<PassRecord> {
         let (record, done) = self.answer(job).await?;
         Ok(PassRecord { done, ..record })
+    }
+
+    async fn confirm(&mut self, step: Step, map_identity: [u8; 32]) -> Told<()> {
+        self.confirmed(step, map_identity).await
     }
 }
