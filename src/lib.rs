@@ -1,14 +1,21 @@
 //! Regrind closes the loop of a precision grinding cell: a free-form part is ground, measured, registered to the offset of
 //! its nominal surface, corrected and ground again until it is accepted.
 //!
-//! What stands today is the numerical heart: given measured probe centres and a nominal surface, [`registration::register`]
-//! finds the pose, the deviation of every point and what to think of them.
+//! A pure machine decides, thin drivers act, a pure numerical core computes, and everything that happened is in one journal.
 //!
 //! ```text
-//!  cli ----> formats, report          files in and out, pictures
-//!   |
-//!   +------> registration -> surface -> geometry        pure: no file, no clock, no randomness, no logging
+//!  recipe.toml -> recipe --+                                             +-> formats, report
+//!                          +-> setup -> drive -> device ~~wire~~ [ real machine | sim ]
+//!  cell.toml   -> config --+            |  ^ \--> measuring, registration -> compensation   (blocking threads, pure)
+//!                                 Event v  | Command
+//!                                      cell            journal   (written before a command is carried out)
+//!
+//!  pure: geometry, surface, measuring, registration, compensation, cell: no file, no clock, no randomness, no logging
 //! ```
+//!
+//! Each room knows as little as it can: `cell` knows no point, `registration` no machine, `device` no recipe; `sim`, a crate
+//! of its own at the far end of the wires, knows no type of this one. Only `cli` prints or exits; only `journal`, `formats` and
+//! `report` write files.
 //!
 //! Conventions: millimetres, radians, seconds. Frames are the model's {M} and the CMM's {W}; a pose is named for what it does,
 //! `cmm_from_model`. A deviation is positive where material stands proud, along the outward normal, the probe's side.

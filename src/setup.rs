@@ -41,18 +41,22 @@ pub enum SetupError {
     Definition { path: PathBuf, source: DefinitionError },
     #[error("{path}: {source}")]
     Pattern { path: PathBuf, source: PatternError },
-    #[error("{recipe}: {key} is {found}, and {cell} allows {allowed} ({limit}); change the recipe or use another cell")]
-    Limit { recipe: PathBuf, cell: PathBuf, key: &'static str, found: String, allowed: String, limit: &'static str },
+    #[error(
+        "{}: {key} is {found}, and {} allows {allowed} ({limit}); change the recipe or use another cell",
+        .recipe.display(), .cell.display()
+    )]
+    Limit { recipe: Box<Path>, cell: Box<Path>, key: &'static str, found: f64, allowed: Box<str>, limit: &'static str },
     #[error(
         "{recipe}: measure.qualify asks for the reference sphere, and {cell} has none; add [cmm.reference_sphere] to the cell file, or write \
          qualify = false"
     )]
     NoSphere { recipe: PathBuf, cell: PathBuf },
     #[error(
-        "{recipe}: target {number} of the measuring pattern lies at {at} mm in the CMM frame, outside the travel of {cell} ({allowed}); move \
-         [cmm.fixture], or measure less of the part"
+        "{}: target {number} of the measuring pattern lies at {at} mm in the CMM frame, outside the travel of {} ({allowed}); move \
+         [cmm.fixture], or measure less of the part",
+        .recipe.display(), .cell.display()
     )]
-    Travel { recipe: PathBuf, cell: PathBuf, number: usize, at: String, allowed: String },
+    Travel { recipe: Box<Path>, cell: Box<Path>, number: usize, at: Box<str>, allowed: Box<str> },
     #[error(
         "{recipe}: the measuring pattern is `free`, and {cell} reaches its CMM over a wire that needs a plan; choose grid, spiral or file"
     )]
@@ -212,8 +216,8 @@ fn check_limits(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
         }
         let mut allowed = String::new();
         let _ = if least > 0.0 { write!(allowed, "{least} to {most}") } else { write!(allowed, "at most {most}") };
-        let (recipe, cell) = (recipe.path().to_owned(), cell.path().to_owned());
-        Err(SetupError::Limit { recipe, cell, key, found: found.to_string(), allowed, limit })
+        let (recipe, cell) = (recipe.path().into(), cell.path().into());
+        Err(SetupError::Limit { recipe, cell, key, found, allowed: allowed.into(), limit })
     };
     let [least, most] = limits.wheel_radius_mm;
     beyond("grinding.wheel.radius_mm", recipe.grinding.wheel.radius_mm(), least, most, "grinder.limits")?;
@@ -242,11 +246,11 @@ fn check_travel(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
     match found {
         None => Ok(()),
         Some((k, at)) => Err(SetupError::Travel {
-            recipe: recipe.path().to_owned(),
-            cell: cell.path().to_owned(),
+            recipe: recipe.path().into(),
+            cell: cell.path().into(),
             number: k + 1,
-            at: format!("{:.2}, {:.2}, {:.2}", at.x, at.y, at.z),
-            allowed: format!("{:?} to {:?}", travel.least_mm, travel.most_mm),
+            at: format!("{:.2}, {:.2}, {:.2}", at.x, at.y, at.z).into(),
+            allowed: format!("{:?} to {:?}", travel.least_mm, travel.most_mm).into(),
         }),
     }
 }

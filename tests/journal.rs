@@ -1,6 +1,13 @@
 //! The journal: what was acknowledged is there, and every change is found.
 
-use regrind::journal::{Anchor, Entry, Header, Journal, JournalError, Kind, open_read_only, verify, verify_against};
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use regrind::journal::{
+    Anchor, Entry, Header, Journal, JournalError, Kind, canonical_json, open_read_only, sha256_hex, verify,
+    verify_against,
+};
 use rusqlite::Connection;
 use serde_json::json;
 use tempfile::TempDir;
@@ -18,7 +25,7 @@ fn header() -> Header {
 }
 
 /// A run of a few records, closed.
-fn written() -> (TempDir, std::path::PathBuf, Anchor) {
+fn written() -> (TempDir, PathBuf, Anchor) {
     let home = tempfile::tempdir().unwrap();
     let folder = home.path().join("runs/run-1");
     let mut journal = Journal::create(&folder, header()).unwrap();
@@ -37,7 +44,7 @@ fn written() -> (TempDir, std::path::PathBuf, Anchor) {
 }
 
 /// Changes the database as somebody would who knows SQL.
-fn tamper(folder: &std::path::Path, sql: &str) {
+fn tamper(folder: &Path, sql: &str) {
     let database = Connection::open(folder.join("journal.sqlite")).unwrap();
     let triggers = ["record_is_not_changed", "record_is_not_deleted", "record_follows_the_last"];
     for trigger in triggers {
@@ -159,4 +166,251 @@ fn names_do_not_lead_out_of_the_folder_and_nothing_on_record_is_written_over() {
     let stored = journal.store("a.txt", b"x", 0, 0).unwrap();
     assert_eq!(journal.store("a.txt", b"x", 0, 0).unwrap(), stored);
     assert!(matches!(journal.store("a.txt", b"y", 0, 0), Err(JournalError::Recorded { .. })));
+}
+
+/// Says which part of this file a child process is to play, and where.
+const PLAY: &str = "REGRIND_JOURNAL_PLAY";
+
+/// This test program again, playing one of its parts in a folder.
+fn child(part: &str, folder: &Path) -> Command {
+    let mut child = Command::new(std::env::current_exe().unwrap());
+    child.args([part, "--exact", "--nocapture", "--test-threads=1"]).env(PLAY, folder);
+    child
+}
+
+/// The folder in which this process plays a part; none in an ordinary test run.
+fn stage() -> Option<PathBuf> {
+    std::env::var_os(PLAY).map(PathBuf::from)
+}
+
+/// Not a test of its own: what a writer does until it is killed. It tells the number of every record that was acknowledged.
+#[test]
+fn part_of_a_writer() {
+    let Some(folder) = stage() else { return };
+    let mut journal = Journal::create(folder, header()).unwrap();
+    for cycle in 0.. {
+        let payload = json!({ "words": "x".repeat(cycle as usize % 3000) });
+        let seq = journal.append(Entry::new(Kind::Event, 0, cycle, payload)).unwrap();
+        println!("\nacknowledged {seq}");
+    }
+}
+
+#[test]
+fn a_killed_writer_leaves_every_acknowledged_record_and_a_whole_chain() {
+    for least in [1, 40, 300] {
+        let home = tempfile::tempdir().unwrap();
+        let folder = home.path().join("run");
+        let mut writer = child("part_of_a_writer", &folder).stdout(Stdio::piped()).spawn().unwrap();
+        let mut lines = BufReader::new(writer.stdout.take().unwrap()).lines();
+        let acknowledged = |line: String| line.strip_prefix("acknowledged ").map(|seq| seq.parse::<u64>().unwrap());
+        let mut last = 0;
+        while last < least {
+            let line = lines.next().expect("the writer goes on until it is killed").unwrap();
+            last = acknowledged(line).unwrap_or(last);
+        }
+        writer.kill().unwrap();
+        writer.wait().unwrap();
+        // What it still told before it died, the cut line left out.
+        let rest: Vec<_> = lines.map_while(Result::ok).collect();
+        let whole = rest.iter().take(rest.len().saturating_sub(1)).cloned().filter_map(acknowledged);
+        let last = whole.max().unwrap_or(last).max(last);
+        let verified = verify(&folder).unwrap();
+        assert!(verified.records >= last, "{last} were acknowledged and {} are there", verified.records);
+        assert!(!verified.closed);
+        let mut journal = Journal::open(&folder).unwrap();
+        assert_eq!(journal.last_seq(), verified.records + 1, "the lock was free and nothing was lost");
+        journal.append(Entry::new(Kind::Note, 0, 0, json!("gone on"))).unwrap();
+        journal.close(0, 0, json!("accepted")).unwrap();
+        assert!(verify(&folder).unwrap().closed);
+    }
+}
+
+/// Not a test of its own: what a writer does on a disk of half a mebibyte, until that is full and a file is taken away from it.
+#[test]
+fn part_of_a_writer_on_a_small_disk() {
+    let Some(disk) = stage() else { return };
+    let ballast = disk.join("ballast");
+    std::fs::write(&ballast, vec![0; 128 << 10]).unwrap();
+    let folder = disk.join("run");
+    let mut journal = Journal::create(&folder, header()).unwrap();
+    let event = |k: u64| Entry::new(Kind::Event, k, 1, json!({ "words": "x".repeat(2000) }));
+    let full =
+        (0..10_000).find_map(|k| journal.append(event(k)).err()).expect("the disk was large enough for everything");
+    assert!(full.is_disk_full(), "{full:?}");
+    assert!(full.to_string().contains("free space"), "{full}");
+    let acknowledged = journal.last_seq();
+    assert_eq!(verify(&folder).unwrap().records, acknowledged, "read on a full disk");
+    let refused = journal.intend(Entry::new(Kind::Intent, 0, 1, json!({}))).unwrap_err();
+    assert!(refused.is_disk_full(), "a command is not on record, so it is not carried out: {refused:?}");
+    let refused = journal.store("large.csv", &[b'1'; 256 << 10], 0, 1).unwrap_err();
+    assert!(refused.is_disk_full(), "{refused:?}");
+    assert_eq!(std::fs::read_dir(&folder).unwrap().filter(|f| is_named(f, "large")).count(), 0, "half a file");
+    std::fs::remove_file(ballast).unwrap();
+    assert_eq!(journal.append(event(0)).unwrap(), acknowledged + 1, "room again: the run goes on");
+    assert_eq!(journal.intend(Entry::new(Kind::Intent, 0, 1, json!({}))).unwrap(), 1, "no number was used up");
+    journal.close(0, 1, json!("stopped")).unwrap();
+    assert_eq!(verify(&folder).unwrap().records, acknowledged + 3);
+    println!("\nplayed to the end, {acknowledged} records");
+}
+
+fn is_named(file: &std::io::Result<std::fs::DirEntry>, part: &str) -> bool {
+    file.as_ref().is_ok_and(|file| file.file_name().to_string_lossy().contains(part))
+}
+
+/// A disk of half a mebibyte, in a namespace of its own; where the system gives none, the test says so and leaves itself out.
+#[test]
+fn a_full_disk_stops_the_run_loses_nothing_and_is_recovered_from() {
+    let home = tempfile::tempdir().unwrap();
+    let mount = "mount -t tmpfs -o size=512k none \"$0\" || exit 77; exec \"$@\"";
+    let player = child("part_of_a_writer_on_a_small_disk", home.path());
+    let mut command = Command::new("unshare");
+    command.args(["--user", "--map-root-user", "--mount", "sh", "-c", mount]).arg(home.path());
+    command.arg(player.get_program()).args(player.get_args()).env(PLAY, home.path());
+    match command.output() {
+        Ok(output) if String::from_utf8_lossy(&output.stdout).contains("played to the end") => {}
+        Ok(output) if output.status.code() == Some(101) => {
+            panic!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
+        }
+        other => eprintln!("left out: this system gives no small disk to a test ({other:?})"),
+    }
+}
+
+#[test]
+fn a_full_disk_is_named_by_files_too() {
+    // A device on which every write fails for want of room, under the name that a file has before it is whole.
+    if !Path::new("/dev/full").exists() {
+        return eprintln!("left out: this system has no /dev/full");
+    }
+    #[cfg(unix)]
+    {
+        let home = tempfile::tempdir().unwrap();
+        let folder = home.path().join("run");
+        let mut journal = Journal::create(&folder, header()).unwrap();
+        let before = verify(&folder).unwrap();
+        std::os::unix::fs::symlink("/dev/full", folder.join(".points.csv.tmp")).unwrap();
+        let refused = journal.store("points.csv", b"1,2,3\n", 0, 1).unwrap_err();
+        assert!(refused.is_disk_full(), "{refused:?}");
+        assert!(!folder.join("points.csv").exists());
+        assert_eq!(verify(&folder).unwrap(), before, "what is not on the disk is not on record");
+        std::os::unix::fs::symlink("/dev/full", folder.join(".journal.anchor.tmp")).unwrap();
+        assert!(journal.anchor().unwrap_err().is_disk_full());
+        assert_eq!(verify(&folder).unwrap(), before, "the anchor before stands");
+        journal.store("points.csv", b"1,2,3\n", 0, 1).unwrap();
+    }
+}
+
+/// Sets who may write a folder and everything in it. Returns false where that stops nobody, as with root.
+#[cfg(unix)]
+fn make_read_only(folder: &Path, read_only: bool) -> bool {
+    use std::os::unix::fs::PermissionsExt;
+    let mode = |file, folder| std::fs::Permissions::from_mode(if read_only { file } else { folder });
+    for entry in std::fs::read_dir(folder).unwrap() {
+        std::fs::set_permissions(entry.unwrap().path(), mode(0o444, 0o644)).unwrap();
+    }
+    std::fs::set_permissions(folder, mode(0o555, 0o755)).unwrap();
+    std::fs::write(folder.join("probe"), "x").is_err() || std::fs::remove_file(folder.join("probe")).is_err()
+}
+
+#[cfg(unix)]
+#[test]
+fn a_folder_that_cannot_be_written_is_read_and_refuses_a_writer() {
+    let home = tempfile::tempdir().unwrap();
+    let folder = home.path().join("run");
+    let mut journal = Journal::create(&folder, header()).unwrap();
+    journal.append(Entry::new(Kind::Note, 0, 0, json!("x"))).unwrap();
+    let anchor = journal.close(0, 0, json!("stopped")).unwrap();
+    if !make_read_only(&folder, true) {
+        make_read_only(&folder, false);
+        return eprintln!("left out: this user may write everywhere");
+    }
+    let verified = verify(&folder);
+    let refused = [Journal::open(&folder).map(|_| ()), Journal::create(folder.join("below"), header()).map(|_| ())];
+    make_read_only(&folder, false);
+    assert_eq!(verified.unwrap().head, anchor.head);
+    for refused in refused {
+        assert!(matches!(&refused, Err(JournalError::File { .. })), "{refused:?}");
+        assert!(refused.unwrap_err().to_string().contains("yours to write"));
+    }
+}
+
+/// A journal of so many records, written at once by the rules of its documentation and not by the code under test.
+fn long_journal(records: u64) -> (TempDir, PathBuf) {
+    let home = tempfile::tempdir().unwrap();
+    let folder = home.path().join("run");
+    Journal::create(&folder, header()).unwrap();
+    let first = open_read_only(&folder).unwrap().records(0).next().unwrap().unwrap();
+    let mut database = Connection::open(folder.join("journal.sqlite")).unwrap();
+    let transaction = database.transaction().unwrap();
+    let mut previous = first.hash;
+    for seq in 2..=records {
+        let payload = json!({ "done": seq, "event": "progressed", "total": records, "words": "of the path" });
+        let (utc, boot_id) = ("2026-07-04T12:00:00Z", "0");
+        let text = canonical_json(&json!({
+            "seq": seq, "utc": utc, "boot_id": boot_id, "mono_ns": seq, "actor": "grinder", "station": "wire",
+            "kind": "event", "part": "SN 7", "cycle": 1, "command_id": null, "reason": "", "payload": payload,
+        }));
+        let hash = sha256_hex(format!("regrind journal record 1\n{previous}\n{text}").as_bytes());
+        let sql =
+            "INSERT INTO record VALUES (?1, ?2, ?3, ?1, 'grinder', 'wire', 'event', 'SN 7', 1, NULL, '', ?4, ?5, ?6)";
+        let values = rusqlite::params![seq as i64, utc, boot_id, canonical_json(&payload), previous, hash];
+        transaction.prepare_cached(sql).unwrap().execute(values).unwrap();
+        previous = hash;
+    }
+    transaction.commit().unwrap();
+    (home, folder)
+}
+
+#[test]
+fn a_journal_of_many_pages_is_read_whole_and_a_change_in_any_of_them_is_found() {
+    const RECORDS: u64 = 2_100;
+    let (_home, folder) = long_journal(RECORDS);
+    assert_eq!(verify(&folder).unwrap().records, RECORDS);
+    let reader = open_read_only(&folder).unwrap();
+    for from in [0, 1, 2, 1_023, 1_024, RECORDS, RECORDS + 1, u64::MAX] {
+        let numbers: Vec<u64> = reader.records(from).map(|r| r.unwrap().seq).collect();
+        assert_eq!(numbers, (from.max(1)..=RECORDS).collect::<Vec<_>>(), "from {from}");
+    }
+    // Pages end at 1, 3, 7 ... 511, 1023, 1535.
+    for seq in [1, 2, 3, 4, 511, 512, 1_535, 1_536, RECORDS] {
+        let (_home, folder) = long_journal(RECORDS);
+        tamper(&folder, &format!("UPDATE record SET kind = 'nothing' WHERE seq = {seq}"));
+        let found = verify(&folder);
+        assert!(matches!(found, Err(JournalError::Broken { seq: at, .. }) if at == seq), "{seq}: {found:?}");
+        let mut given = open_read_only(&folder).unwrap().records(0).map(|r| r.is_ok()).collect::<Vec<_>>();
+        assert_eq!(
+            (given.len() as u64, given.pop()),
+            (seq, Some(false)),
+            "what stands before it is given, and nothing behind"
+        );
+    }
+}
+
+#[test]
+fn what_a_writer_adds_is_found_by_a_reader_that_has_begun() {
+    let home = tempfile::tempdir().unwrap();
+    let folder = home.path().join("run");
+    let mut journal = Journal::create(&folder, header()).unwrap();
+    let reader = open_read_only(&folder).unwrap();
+    let mut records = reader.records(0);
+    for seq in 1..40 {
+        assert_eq!(records.next().unwrap().unwrap().seq, seq);
+        assert_eq!(journal.append(Entry::new(Kind::Note, 0, 0, json!(seq))).unwrap(), seq + 1);
+    }
+}
+
+/// Tells how long it takes to verify a long journal: `cargo test --release --test journal -- --ignored --nocapture`.
+#[test]
+#[ignore = "a measurement"]
+fn time_of_verifying() {
+    for records in [10_000, 100_000] {
+        let (_home, folder) = long_journal(records);
+        let began = std::time::Instant::now();
+        verify(&folder).unwrap();
+        let took = began.elapsed();
+        println!(
+            "{records} records in {:.3} s, {:.2} us each",
+            took.as_secs_f64(),
+            1e6 * took.as_secs_f64() / records as f64
+        );
+    }
 }

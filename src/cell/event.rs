@@ -522,6 +522,32 @@ impl Event {
         }
     }
 
+    /// Returns the machine that it comes from or is about.
+    pub fn device(&self) -> Option<Device> {
+        match self {
+            Self::DeclaredOver { device, .. }
+            | Self::Connected { device, .. }
+            | Self::NotConnected { device, .. }
+            | Self::LinkLost { device, .. }
+            | Self::LinkBack { device, .. }
+            | Self::Prepared { device, .. }
+            | Self::Started { device, .. }
+            | Self::StartUnknown { device, .. }
+            | Self::Progressed { device, .. }
+            | Self::MachineHeld { device }
+            | Self::MachineResumed { device }
+            | Self::Ended { device, .. }
+            | Self::Cleared { device }
+            | Self::Obstructed { device, .. }
+            | Self::Refused { device, .. }
+            | Self::Fault { device, .. }
+            | Self::Acknowledged { device }
+            | Self::AbortConfirmed { device }
+            | Self::Reconciled { device, .. } => Some(*device),
+            _ => None,
+        }
+    }
+
     /// Returns whether a person gave it as an order.
     pub fn is_order(&self) -> bool {
         self.actor().is_some() && !matches!(self, Self::Restarted { .. })

@@ -175,7 +175,7 @@ impl Cell {
 
             // Orders.
             (Idle, Event::Start { .. }) => self.start(),
-            (_, Event::Stop { actor, reason }) if !matches!(self.state, Stopping | Completing) => {
+            (_, Event::Stop { actor, reason }) if !matches!(self.state, Stopping | Completing | Aborting) => {
                 self.stop(&format!("{actor} stopped the run{}", because(reason)), false);
             }
             (Starting, Event::Hold { .. }) => self.go(Held(Load)),

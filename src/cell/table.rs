@@ -65,40 +65,18 @@ pub fn table() -> Vec<Row> {
 /// What decides how a cell answers, without times and counts, and no finer than the table needs.
 fn key(cell: &Cell) -> impl Ord + use<> {
     let known = cell.known.map(|known| (known.ready, known.met && known.stands));
-    let clear = cell.known.iter().all(|known| known.clear);
+    // At the end of a run it matters which machine is clear already, elsewhere only whether both are.
+    let both = cell.known.iter().all(|known| known.clear);
+    let ends = matches!(cell.state, State::Aborting | State::Completing);
+    let clear = cell.known.map(|known| if ends { known.clear } else { both });
     let memory = (cell.worse.min(1), cell.repeated, cell.previous.is_some(), cell.passes >= cell.plan.max_cycles);
     (cell.state, known, clear, cell.causes.is_empty(), memory, cell.plan.on_stall == Disposal::Hold)
 }
 
 fn name_of(event: &Event) -> String {
-    match device_of(event) {
+    match event.device() {
         Some(device) => format!("{} ({device})", event.name()),
         None => event.name().to_owned(),
-    }
-}
-
-fn device_of(event: &Event) -> Option<Device> {
-    match event {
-        Event::DeclaredOver { device, .. }
-        | Event::Connected { device, .. }
-        | Event::NotConnected { device, .. }
-        | Event::LinkLost { device, .. }
-        | Event::LinkBack { device, .. }
-        | Event::Prepared { device, .. }
-        | Event::Started { device, .. }
-        | Event::StartUnknown { device, .. }
-        | Event::Progressed { device, .. }
-        | Event::MachineHeld { device }
-        | Event::MachineResumed { device }
-        | Event::Ended { device, .. }
-        | Event::Cleared { device }
-        | Event::Obstructed { device, .. }
-        | Event::Refused { device, .. }
-        | Event::Fault { device, .. }
-        | Event::Acknowledged { device }
-        | Event::AbortConfirmed { device }
-        | Event::Reconciled { device, .. } => Some(*device),
-        _ => None,
     }
 }
 

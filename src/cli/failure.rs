@@ -8,6 +8,8 @@ use regrind::registration::RegistrationError;
 use regrind::surface::{DefinitionError, SurfaceError};
 use thiserror::Error;
 
+/// What was looked at is not as it should be.
+const NOT_AS_IT_SHOULD_BE: u8 = 1;
 /// Bad arguments, recipe or data.
 const BAD_INPUT: u8 = 2;
 /// A fault of the machine or of the program.
@@ -42,6 +44,15 @@ pub(super) enum Failure {
     Setup(regrind::setup::SetupError),
     #[error("{path}: {reason}")]
     Simulation { path: PathBuf, reason: String },
+    /// The record was read and cannot be believed.
+    #[error(transparent)]
+    Broken(regrind::journal::JournalError),
+    #[error("{path}: {reason}; give a copy of the journal.anchor of this run")]
+    Anchor { path: PathBuf, reason: String },
+    #[error(transparent)]
+    Picture(regrind::report::ReportError),
+    #[error("--state {name}: no state begins so; give one of {known}")]
+    NoState { name: String, known: String },
     #[error(transparent)]
     Journal(regrind::journal::JournalError),
     #[error("{path}: no control socket can be made there: {source}; give --runs a local folder with a shorter name")]
@@ -79,6 +90,7 @@ impl Failure {
             | Self::OrderRefused { .. }
             | Self::Setup(regrind::setup::SetupError::Wire { .. })
             | Self::Ended { .. } => FAULT,
+            Self::Broken(_) => NOT_AS_IT_SHOULD_BE,
             _ => BAD_INPUT,
         }
     }

@@ -1,6 +1,7 @@
 //! The command line: one file per command, and the only room that prints or exits.
 
 mod accuracy;
+mod audit;
 mod check;
 mod control;
 mod failure;
@@ -13,6 +14,7 @@ mod schema;
 mod show;
 mod simulate;
 mod simulated;
+mod states;
 mod words;
 
 use std::io::{self, Write};
@@ -48,10 +50,12 @@ enum Command {
     Confirm(control::Confirmation),
     /// Tell how a running cell is
     Status(control::Arguments),
+    Audit(audit::Arguments),
     Register(register::Arguments),
     Accuracy(accuracy::Arguments),
     Check(check::Arguments),
     Schema(schema::Arguments),
+    States(states::Arguments),
 }
 
 const EXIT_CODES: &str = "Exit codes: 0 accepted; 1 finished, not in tolerance; 2 bad arguments or data; 3 fault.";
@@ -90,10 +94,12 @@ fn run() -> ExitCode {
         Command::Abort(arguments) => control::order(&arguments, Order::Abort),
         Command::Confirm(arguments) => control::confirm(&arguments),
         Command::Status(arguments) => control::order(&arguments, Order::Status),
+        Command::Audit(arguments) => audit::run(&arguments),
         Command::Register(arguments) => register::run(&arguments),
         Command::Accuracy(arguments) => accuracy::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Schema(arguments) => schema::run(&arguments),
+        Command::States(arguments) => states::run(&arguments),
     };
     match ended {
         Ok(Outcome::Accepted) => ExitCode::SUCCESS,

@@ -126,7 +126,7 @@ fn journal(
     began: jiff::Timestamp,
 ) -> Result<Journal, Failure> {
     let part = arguments.part.clone().unwrap_or_else(|| "unnamed".into());
-    let folder = free_folder(&arguments.runs, &recipe_name(recipe), began);
+    let folder = free_folder(&arguments.runs, &recipe_name(recipe), began, cell.simulated);
     let hex = |bytes: &[u8; 32]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
     let header = Header {
         run: folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
@@ -152,11 +152,13 @@ fn recipe_name(recipe: &Recipe) -> String {
 }
 
 /// Returns a folder for a run that began now: the recipe's name and the time, and a number if two begin in one second.
-fn free_folder(runs: &Path, name: &str, began: jiff::Timestamp) -> PathBuf {
+fn free_folder(runs: &Path, name: &str, began: jiff::Timestamp, simulated: bool) -> PathBuf {
+    // Every file in it carries the mark in its path.
+    let mark = if simulated { "-SIMULATION" } else { "" };
     let stamp = began.strftime("%Y%m%dT%H%M%SZ");
     let named = |more: u32| match more {
-        0 => runs.join(format!("{name}-{stamp}")),
-        more => runs.join(format!("{name}-{stamp}-{more}")),
+        0 => runs.join(format!("{name}-{stamp}{mark}")),
+        more => runs.join(format!("{name}-{stamp}-{more}{mark}")),
     };
     (0..).map(named).find(|folder| !folder.exists()).expect("some number is free")
 }

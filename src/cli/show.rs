@@ -26,6 +26,8 @@ pub(super) struct Show {
     /// When a plain line about progress was printed last.
     said: Option<Instant>,
     job: Option<(Device, u32)>,
+    /// When the job was first seen, and how far it was then.
+    first: Option<(Instant, u32)>,
 }
 
 impl Show {
@@ -41,6 +43,7 @@ impl Show {
             bar: (!json && io::stderr().is_terminal()).then(bar),
             said: None,
             job: None,
+            first: None,
         }
     }
 
@@ -103,6 +106,9 @@ impl Show {
 
     fn progress(&mut self, device: Device, cycle: u32, done: u32, total: u32) -> Result<(), Failure> {
         let job = Some((device, cycle));
+        if self.job != job {
+            self.first = Some((Instant::now(), done));
+        }
         let (what, unit) = match device {
             Device::Cmm => ("measuring", " points"),
             Device::Grinder => ("grinding", "/1000 of the path"),
@@ -117,18 +123,30 @@ impl Show {
         } else if self.job != job || self.said.is_none_or(|at| at.elapsed() >= QUIET) {
             self.said = Some(Instant::now());
             let of = if device == Device::Cmm { format!("{done} of {total}{unit}") } else { format!("{done}{unit}") };
-            self.line(&format!("cycle {cycle}: {what}, {of}"))?;
+            self.line(&format!("cycle {cycle}: {what}, {of}{}", self.left(done, total)))?;
         }
         self.job = job;
         Ok(())
     }
 
+    /// Tells how long the job will still take at the pace so far; nothing before there is a pace.
+    fn left(&self, done: u32, total: u32) -> String {
+        let Some((began, from)) = self.first else { return String::new() };
+        let seconds = began.elapsed().as_secs_f64();
+        if done <= from || seconds < 0.5 {
+            return String::new();
+        }
+        let left_s = seconds / f64::from(done - from) * f64::from(total.saturating_sub(done));
+        if left_s < 90.0 { format!(", {left_s:.0} s left") } else { format!(", {:.0} min left", left_s / 60.0) }
+    }
+
     fn figures(&mut self, cycle: u32, figures: &Figures) -> Result<(), Failure> {
         let um = |mm: f64| three_digits(1e3 * mm);
         let mut text = format!(
-            "cycle {cycle}: PV {} um, rms {} um; {} points, {} outliers",
+            "cycle {cycle}: PV {} um, rms {} um (tolerance {}); {} points, {} outliers",
             um(figures.pv_mm),
             um(figures.rms_mm),
+            self.tolerance,
             figures.points,
             figures.outliers
         );

@@ -190,7 +190,8 @@ fn plane([s, x, y, xx, xy, yy, d, xd, yd]: [f64; 9]) -> Option<f64> {
     let (cxd, cyd) = (xd / s - mx * md, yd / s - my * md);
     let determinant = cxx * cyy - cxy * cxy;
     // The mean place must not be farther away than the points are wide: that would be extrapolation.
-    if !(determinant > 1e-4 * (cxx + cyy).powi(2)) || mx * mx + my * my > 4.0 * (cxx + cyy) {
+    let flat = determinant <= 1e-4 * (cxx + cyy).powi(2) || determinant.is_nan();
+    if flat || mx * mx + my * my > 4.0 * (cxx + cyy) {
         return None;
     }
     let (p, q) = ((cyy * cxd - cxy * cyd) / determinant, (cxx * cyd - cxy * cxd) / determinant);

@@ -52,7 +52,7 @@ impl Net {
         let sizes = [high[0] - low[0], high[1] - low[1]];
         let steps = sizes.map(|size| (size / spacing_mm).ceil().max(1.0));
         let nodes = (steps[0] + 1.0) * (steps[1] + 1.0);
-        if !(nodes <= MOST_NODES) {
+        if nodes > MOST_NODES || nodes.is_nan() {
             let [width_mm, depth_mm] = sizes;
             return Err(NetError::TooFine { spacing_mm, width_mm, depth_mm, nodes });
         }

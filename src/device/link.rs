@@ -544,3 +544,50 @@ impl<T: std::fmt::Debug> std::fmt::Debug for Listening<T> {
         f.debug_struct("Listening").field("inner", &self.inner).finish()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_answer_is_whole_or_it_is_none() {
+        let read = Ask::Read { address: 64, count: 2 };
+        let write = Ask::Write { address: 40, words: Arc::from([1, 2, 3]) };
+        assert_eq!(check(&read, Ok(Ok(Response::ReadHoldingRegisters(vec![7, 8])))), Ok(vec![7, 8]));
+        assert_eq!(check(&write, Ok(Ok(Response::WriteMultipleRegisters(40, 3)))), Ok(vec![]));
+        for (ask, response) in [
+            (&read, Response::ReadHoldingRegisters(vec![7])),
+            (&read, Response::ReadHoldingRegisters(vec![7, 8, 9])),
+            (&read, Response::ReadInputRegisters(vec![7, 8])),
+            (&read, Response::WriteMultipleRegisters(64, 2)),
+            (&write, Response::WriteMultipleRegisters(41, 3)),
+            (&write, Response::WriteMultipleRegisters(40, 2)),
+            (&write, Response::ReadHoldingRegisters(vec![1, 2, 3])),
+        ] {
+            let hint = format!("{ask:?} {response:?}");
+            assert!(matches!(check(ask, Ok(Ok(response))), Err(LinkFault::Corrupt { .. })), "{hint}");
+        }
+    }
+
+    #[test]
+    fn frames_on_a_serial_line_are_three_and_a_half_characters_apart() {
+        let line = |baud| Wire::Rtu { device: "x".into(), baud, parity: Parity::Even, stop_bits: 1 };
+        assert_eq!(line(115_200).silence(), Duration::from_micros(1750));
+        assert!((line(9_600).silence().as_secs_f64() - 4.0104e-3).abs() < 1e-6);
+        assert_eq!(Wire::Tcp { host: "x".into(), port: 502 }.silence(), Duration::ZERO);
+    }
+
+    #[tokio::test]
+    async fn a_line_waits_longer_after_every_failure_and_says_what_the_system_said() {
+        let wire = Wire::Rtu { device: "/dev/no-such-port".into(), baud: 9600, parity: Parity::Even, stop_bits: 1 };
+        let link = Link::new(wire, Duration::from_millis(50), Duration::ZERO).unwrap();
+        let began = Instant::now();
+        for _ in 0..3 {
+            let answer = link.ask(1, None, Ask::Read { address: 0, count: 1 }).await;
+            assert!(matches!(answer, Err(LinkFault::Unreachable(_))), "{answer:?}");
+        }
+        // At least half of 0.1 s and of 0.2 s, whatever the dice say.
+        assert!(began.elapsed() >= Duration::from_millis(150), "{:?}", began.elapsed());
+        assert_eq!((link.figures().refused, link.figures().opened), (3, 0));
+    }
+}

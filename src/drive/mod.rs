@@ -13,6 +13,7 @@
 
 mod control;
 mod notice;
+mod outcome;
 mod record;
 mod station;
 mod work;
@@ -105,6 +106,8 @@ pub struct Drive {
     notices: mpsc::UnboundedSender<Notice>,
     cycles: BTreeMap<u32, Cycle>,
     armed: [Option<Value>; 2],
+    /// Commands on record that no event has answered yet.
+    open: Vec<(u32, Command)>,
     record_failed: bool,
     ending: Option<Ending>,
     stations: Vec<tokio::task::JoinHandle<()>>,
@@ -167,6 +170,7 @@ impl Drive {
             notices: run.notices,
             cycles: BTreeMap::new(),
             armed: interrupted.intents,
+            open: Vec::new(),
             record_failed: false,
             ending: None,
             stations: vec![cmm_task, grinder_task],
@@ -407,7 +411,22 @@ impl Drive {
             map.insert("detail".into(), detail);
         }
         let written = self.recorder.append(entry(Kind::Event, now, self.cell.cycle(), actor_of(event), payload)).await;
-        self.settle(written.map(|()| 0))
+        let failure = self.settle(written.map(|()| 0));
+        self.close_answered(now, event).await;
+        failure
+    }
+
+    /// Records what became of the commands that an event answers.
+    async fn close_answered(&mut self, now: Duration, event: &Event) {
+        let (answered, open) =
+            std::mem::take(&mut self.open).into_iter().partition(|(_, c)| outcome::answers(event, c));
+        self.open = open;
+        for (id, _) in answered as Vec<(u32, Command)> {
+            let payload = json!({ "event": event_name(event) });
+            let record = entry(Kind::Outcome, now, self.cell.cycle(), actor_of(event), payload);
+            let written = self.recorder.append(Entry { command_id: Some(id), ..record }).await;
+            self.settle(written.map(|()| 0));
+        }
     }
 
     /// Returns a failure to record the first time only; the cell is told once.
@@ -440,23 +459,28 @@ impl Drive {
             map.insert("intent".into(), self.armed[index(*device)].clone().unwrap_or(Value::Null));
         }
         let record = Entry::new(Kind::Intent, record::nanoseconds(self.now()), self.cell.cycle(), payload);
-        let safe = makes_safe(&command);
-        if safe {
-            // What makes safe does not wait for the disk.
+        if !outcome::is_answered(&command) {
+            let written = self.recorder.append(Entry { kind: Kind::Note, ..record }).await;
             self.execute(command).await;
-            return self.settle_intent(record).await;
+            return self.settle(written.map(|()| 0));
         }
-        let failure = self.settle_intent(record).await;
+        if makes_safe(&command) {
+            // What makes safe does not wait for the disk.
+            self.execute(command.clone()).await;
+            return self.settle_intent(record, command).await;
+        }
+        let failure = self.settle_intent(record, command.clone()).await;
         if failure.is_none() && !self.record_failed || !moves(&command) {
             self.execute(command).await;
         }
         failure
     }
 
-    async fn settle_intent(&mut self, record: Entry) -> Option<RecordFailure> {
+    async fn settle_intent(&mut self, record: Entry, command: Command) -> Option<RecordFailure> {
         let written = self.recorder.intend(record).await;
-        if written.is_ok() {
+        if let Ok(id) = written {
             self.record_failed = false;
+            self.open.push((id, command));
         }
         self.settle(written)
     }
@@ -481,12 +505,31 @@ impl Drive {
             Command::Acknowledge { device } => self.ask(device, Ask::Acknowledge).await,
             Command::Register { cycle } => self.register(cycle),
             Command::Compensate { cycle } => self.compensate(cycle),
-            Command::Announce(judgement) => self.notify(Notice::Judged(judgement)),
+            Command::Announce(judgement) => self.announce(judgement).await,
             Command::Raise(alarm) => self.notify(Notice::Alarm(alarm)),
             Command::Withdraw { alarm } => self.notify(Notice::AlarmGone { alarm }),
             Command::Refuse { why, .. } => self.notify(Notice::Refused { why }),
             Command::Finish(ending) => self.ending = Some(ending),
         }
+    }
+
+    /// Shows how a cycle was judged and leaves it beside its measurement.
+    async fn announce(&mut self, judgement: crate::cell::Judgement) {
+        let number = judgement.cycle;
+        let cycle = self.cycles.get(&number);
+        let result = json!({
+            "simulation": self.task.simulation,
+            "cycle": number,
+            "verdict": judgement.verdict,
+            "reason": judgement.reason,
+            "figures": cycle.and_then(|c| c.figures.as_ref()),
+            "level_mm": cycle.map(|c| c.correction.level_mm),
+        });
+        match write_json_atomic(self.cycle_folder(number).join("result.json"), &result) {
+            Ok(()) => self.adopt(vec![format!("cycle-{number}/result.json")], number).await,
+            Err(error) => self.notify(Notice::RecordFailed { words: error.to_string() }),
+        }
+        self.notify(Notice::Judged(judgement));
     }
 
     async fn ask(&mut self, device: Device, ask: Ask) {
@@ -545,7 +588,7 @@ impl Drive {
             let (planned, found, points) = work::gate(&task, &plan.unwrap_or_else(empty), &measurement);
             let saved = points.and_then(|points| {
                 let made = ResultFolder::prepare(&folder).map(ResultFolder::keep);
-                let saved = made.and_then(|()| work::save_points(&folder, &points));
+                let saved = made.and_then(|()| work::save_points(&folder, &points, task.simulation));
                 saved.map(|()| points).map_err(|error| GateFailure::Broken(error.to_string()))
             });
             let (gate, points) = match saved {

@@ -57,7 +57,7 @@ pub struct Task {
     pub pass: Pass,
     /// Least share of the targets that must be touched.
     pub least_found: f64,
-    /// Whether the machines are simulated.
+    /// Whether the cell is simulated; everything stored is marked so.
     pub simulation: bool,
 }
 
@@ -270,7 +270,8 @@ fn save(task: &Task, folder: &Path, found: &Registration, options: &Options) -> 
         points: task.nominal.len(),
         kind: format!("{:?}", task.nominal.kind()),
     };
-    let document = RegistrationDocument::new(found, options, nominal, Path::new("measured.csv"));
+    let mut document = RegistrationDocument::new(found, options, nominal, Path::new("measured.csv"));
+    document.simulation = Some(task.simulation);
     save_registration(folder, &document, &found.deviations)
 }
 
@@ -330,6 +331,7 @@ pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &
     let Some(found) = &cycle.registration else {
         return refused(CompensationRefusal::Failed("the measurement of this cycle is not registered".into()));
     };
+    // Where the part may slide in its own surface, nobody knows where on the part a map would be ground in.
     if let Some(why) = weak_for_compensation(found, &task.place) {
         return refused(CompensationRefusal::WeakDirections(vec![why]));
     }
@@ -377,11 +379,12 @@ fn save_map(task: &Task, folder: &Path, map: &ErrorMap) -> Result<(), String> {
 }
 
 /// Writes the points of a measurement, in the CMM frame.
-pub(super) fn save_points(folder: &Path, points: &Points) -> Result<(), FormatError> {
+pub(super) fn save_points(folder: &Path, points: &Points, simulation: bool) -> Result<(), FormatError> {
+    let header = if simulation { "# SIMULATION\nx_mm,y_mm,z_mm" } else { "x_mm,y_mm,z_mm" };
     if !points.sphere.is_empty() {
-        write_points(folder.join("reference_sphere.csv"), "x_mm,y_mm,z_mm", &points.sphere)?;
+        write_points(folder.join("reference_sphere.csv"), header, &points.sphere)?;
     }
-    write_points(folder.join("measured.csv"), "x_mm,y_mm,z_mm", &points.part)
+    write_points(folder.join("measured.csv"), header, &points.part)
 }
 
 /// Turns what the gates said into the event that the cell gets.

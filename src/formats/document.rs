@@ -16,6 +16,9 @@ use crate::surface::{Distance, Side};
 #[allow(missing_docs)]
 pub struct RegistrationDocument<'a> {
     pub program: Program,
+    /// Whether the points come from a simulated machine; absent where that is not known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub simulation: Option<bool>,
     pub nominal: NominalInput<'a>,
     pub measured: MeasuredInput<'a>,
     pub method: Method,
@@ -112,6 +115,7 @@ impl<'a> RegistrationDocument<'a> {
         let names = ["x", "y", "z", "rx", "ry", "rz"];
         Self {
             program: Program { name: env!("CARGO_PKG_NAME"), version: env!("CARGO_PKG_VERSION") },
+            simulation: None,
             nominal,
             measured: MeasuredInput { file: measured_file },
             method: options.method,

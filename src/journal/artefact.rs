@@ -26,7 +26,7 @@ pub struct Artefact {
 /// Returns the path of a file within a run folder, if the name cannot lead out of it and is not one of the journal's own.
 pub(super) fn path_within(folder: &Path, name: &str) -> Result<PathBuf, JournalError> {
     let plain = Path::new(name).components().all(|part| matches!(part, Component::Normal(_)));
-    let own = [DATABASE, ANCHOR, LOCK].iter().any(|file| name == *file) || name.starts_with(&format!("{DATABASE}-"));
+    let own = [DATABASE, ANCHOR, LOCK].contains(&name) || name.starts_with(&format!("{DATABASE}-"));
     if name.is_empty() || name.contains('\\') || name.ends_with('/') || !plain || own {
         return Err(JournalError::Name { name: name.to_owned() });
     }

@@ -52,7 +52,8 @@ fn write_value(text: &mut String, value: &Value) {
 
 /// Writes a string as JSON does.
 pub(super) fn write_string(text: &mut String, string: &str) {
-    let _ = write!(text, "{}", Value::from(string));
+    // A string always has a JSON form.
+    text.push_str(&serde_json::to_string(string).unwrap_or_default());
 }
 
 /// Returns the SHA-256 of bytes in small hexadecimal digits.
@@ -70,8 +71,7 @@ pub(super) fn chain(prev_hash: &str, text: &str) -> String {
 }
 
 pub(super) fn hex(bytes: &[u8]) -> String {
-    bytes.iter().fold(String::with_capacity(2 * bytes.len()), |mut text, byte| {
-        let _ = write!(text, "{byte:02x}");
-        text
-    })
+    const DIGITS: &[u8; 16] = b"0123456789abcdef";
+    let digit = |nibble: u8| char::from(DIGITS[usize::from(nibble)]);
+    bytes.iter().flat_map(|byte| [digit(byte >> 4), digit(byte & 15)]).collect()
 }

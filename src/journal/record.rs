@@ -1,9 +1,10 @@
 //! One record, and the way through all of them.
 
+use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-use rusqlite::{Connection, OptionalExtension, Row, params};
+use rusqlite::{Connection, Row, params};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -197,34 +198,56 @@ fn record_of(row: &Row<'_>) -> rusqlite::Result<Record> {
     })
 }
 
-/// The records of a journal, in order; each is read when it is asked for, so that a writer is never kept waiting.
+/// Most records that are read at once.
+const LARGEST_PAGE: u32 = 512;
+
+/// The records of a journal, in order. They are read a page at a time, and nothing is held open between two pages, so that a
+/// writer is never kept waiting and what it adds meanwhile is found.
 #[derive(Debug)]
 pub struct Records<'j> {
     connection: &'j Connection,
     folder: PathBuf,
+    /// What is read and not yet given.
+    page: VecDeque<Result<Record, JournalError>>,
+    /// The number to read on from.
     next: u64,
+    /// The size of the next page: who wants one record pays for one.
+    size: u32,
     over: bool,
 }
 
 impl<'j> Records<'j> {
     pub(super) fn new(connection: &'j Connection, folder: &Path, from: u64) -> Self {
-        Self { connection, folder: folder.to_owned(), next: from, over: false }
+        Self { connection, folder: folder.to_owned(), page: VecDeque::new(), next: from, size: 1, over: false }
     }
 
-    fn read(&self) -> Result<Option<Record>, JournalError> {
-        let sql = format!("SELECT {COLUMNS} FROM record WHERE seq >= ?1 ORDER BY seq LIMIT 1");
+    /// Reads the next page. An error ends it and stands behind the records before it.
+    fn turn(&mut self) {
+        if let Err(error) = self.read() {
+            self.page.push_back(Err(error));
+            self.over = true;
+        }
+        self.over |= self.page.is_empty();
+        self.size = (2 * self.size).min(LARGEST_PAGE);
+    }
+
+    fn read(&mut self) -> Result<(), JournalError> {
+        let sql = format!("SELECT {COLUMNS} FROM record WHERE seq >= ?1 ORDER BY seq LIMIT ?2");
         let failed = JournalError::database(&self.folder);
         let mut statement = self.connection.prepare_cached(&sql).map_err(&failed)?;
         // A number too large for the database is past its end.
-        let from = i64::try_from(self.next).unwrap_or(i64::MAX);
-        statement.query_row(params![from], record_of).optional().map_err(|source| match source {
-            rusqlite::Error::SqliteFailure(..) => failed(source),
-            unreadable => JournalError::Broken {
+        let Ok(from) = i64::try_from(self.next) else { return Ok(()) };
+        let mut rows = statement.query(params![from, self.size]).map_err(&failed)?;
+        while let Some(row) = rows.next().map_err(&failed)? {
+            let record = record_of(row).map_err(|unreadable| JournalError::Broken {
                 path: self.folder.clone(),
-                seq: self.next,
+                seq: self.next.max(1),
                 what: format!("a field cannot be read ({unreadable})"),
-            },
-        })
+            })?;
+            self.next = record.seq.saturating_add(1);
+            self.page.push_back(Ok(record));
+        }
+        Ok(())
     }
 }
 
@@ -232,14 +255,9 @@ impl Iterator for Records<'_> {
     type Item = Result<Record, JournalError>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        if self.over {
-            return None;
+        if self.page.is_empty() && !self.over {
+            self.turn();
         }
-        let found = self.read().transpose();
-        match &found {
-            Some(Ok(record)) => self.next = record.seq.saturating_add(1),
-            _ => self.over = true,
-        }
-        found
+        self.page.pop_front()
     }
 }

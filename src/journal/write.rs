@@ -150,9 +150,9 @@ impl Journal {
     pub fn append(&mut self, entry: Entry) -> Result<u64, JournalError> {
         let wrong = |what| Err(JournalError::Entry { kind: entry.kind.as_str(), what });
         match (entry.kind, entry.command_id) {
-            (Kind::Intent, _) => return wrong("gets its command number from `intend`"),
-            (Kind::Outcome, None) => return wrong("needs the command number of its intent"),
-            (Kind::Begin, _) if self.tail.seq > 0 => return wrong("stands first only"),
+            (Kind::Intent, _) => wrong("gets its command number from `intend`"),
+            (Kind::Outcome, None) => wrong("needs the command number of its intent"),
+            (Kind::Begin, _) if self.tail.seq > 0 => wrong("stands first only"),
             _ => self.insert(entry).map(|record| record.seq),
         }
     }

@@ -80,7 +80,7 @@ fn algebraic(points: &[Point], middle: &nalgebra::Vector3<f64>) -> Option<(nalge
     }
     let solved = normal.cholesky()?.solve(&right);
     let least = normal.symmetric_eigenvalues().min();
-    if !(least > 1e-12) {
+    if least <= 1e-12 || least.is_nan() {
         return None;
     }
     let centre = solved.xyz();

@@ -14,7 +14,9 @@ mod colour;
 mod heat_map;
 mod plot;
 mod raster;
+mod states;
 mod svg;
+mod words;
 
 use std::fs;
 use std::io;
@@ -26,6 +28,8 @@ pub use axis::Scale;
 pub use colour::ColourMap;
 pub use heat_map::HeatMap;
 pub use plot::{Axis, Plot, Series};
+pub use states::state_picture;
+pub use words::{ending_words, words};
 
 /// Why a figure could not be drawn or saved.
 #[derive(Debug, Error)]
@@ -96,6 +100,14 @@ pub enum ReportError {
         /// The system's reason.
         source: io::Error,
     },
+}
+
+/// Writes a text as a whole file.
+///
+/// # Errors
+/// A file that cannot be written.
+pub fn save_text(path: &Path, text: &str) -> Result<(), ReportError> {
+    save(path, text.as_bytes())
 }
 
 /// Writes a whole file under a temporary name and then gives it its own, so that no half figure is ever found.

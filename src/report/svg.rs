@@ -98,6 +98,34 @@ impl Svg {
         ));
     }
 
+    /// A quadratic curve from a place to another with a head at its end.
+    pub(super) fn arrow(&mut self, [x1, y1]: [f64; 2], [cx, cy]: [f64; 2], [x2, y2]: [f64; 2], colour: &str) {
+        let (dx, dy) = if (cx - x2).hypot(cy - y2) > 1.0 { (x2 - cx, y2 - cy) } else { (x2 - x1, y2 - y1) };
+        let length = dx.hypot(dy).max(f64::MIN_POSITIVE);
+        let [ux, uy] = [7.0 * dx / length, 7.0 * dy / length];
+        let [lx, ly, rx, ry] = [x2 - ux - 0.4 * uy, y2 - uy + 0.4 * ux, x2 - ux + 0.4 * uy, y2 - uy - 0.4 * ux];
+        self.put(format_args!(
+            "<path d=\"M{x1:.2},{y1:.2}Q{cx:.2},{cy:.2} {x2:.2},{y2:.2}\" fill=\"none\" stroke=\"{colour}\"/>\n\
+             <path d=\"M{x2:.2},{y2:.2}L{lx:.2},{ly:.2}L{rx:.2},{ry:.2}z\" fill=\"{colour}\"/>\n"
+        ));
+    }
+
+    /// A piece of paper over what was drawn before.
+    pub(super) fn plate(&mut self, [x, y]: [f64; 2], [width, height]: [f64; 2]) {
+        self.put(format_args!(
+            "<rect x=\"{x:.2}\" y=\"{y:.2}\" width=\"{width:.2}\" height=\"{height:.2}\" fill=\"#ffffff\" \
+             fill-opacity=\"0.85\"/>\n"
+        ));
+    }
+
+    /// A text in a colour, centred on a place.
+    pub(super) fn coloured_text(&mut self, [x, y]: [f64; 2], size: f64, content: &str, colour: &str) {
+        let content = escaped(content);
+        self.put(format_args!(
+            "<text x=\"{x:.2}\" y=\"{y:.2}\" text-anchor=\"middle\" font-size=\"{size}\" fill=\"{colour}\">{content}</text>\n"
+        ));
+    }
+
     /// A marker: shape 0 is a disc, 1 a square, 2 a triangle, 3 a diamond.
     pub(super) fn marker(&mut self, [x, y]: [f64; 2], shape: usize, colour: &str) {
         if shape == 0 {

@@ -1,0 +1,244 @@
+//! `regrind audit`: is the record of a run what was written, and what does it say?
+
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use clap::{Args, Subcommand};
+use regrind::journal::{Anchor, JournalError, Kind, Reader, Record, Verified, verify, verify_against};
+use regrind::report::words;
+use serde_json::{Value, json};
+
+use super::Outcome;
+use super::control::newest;
+use super::failure::Failure;
+
+/// Verify, show or export the record of a run
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Examples:
+  regrind audit verify
+  regrind audit show runs/freeform-mirror-20260704T120000Z --kind event --cycle 2
+  regrind audit export runs/freeform-mirror-20260704T120000Z > record.jsonl")]
+pub(super) struct Arguments {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, Subcommand)]
+enum What {
+    Verify(ToVerify),
+    Show(ToShow),
+    Export(ToExport),
+}
+
+/// Prove that the record is what was written: every record, their order, the end, and every file by its hash
+#[derive(Args, Debug)]
+#[command(after_help = "\
+RUN is the folder of a run; without it, the newest under runs/. A record whose end was cut off together with its anchor is
+found only with --anchor and a copy of journal.anchor that was kept elsewhere.
+
+Example:
+  regrind audit verify runs/freeform-mirror-20260704T120000Z --anchor /mnt/quality/SN-0042.anchor
+
+Exit codes: 0 sound; 1 broken: the first record that cannot be believed is named; 2 no such run, or no record in it.")]
+struct ToVerify {
+    /// Folder of the run
+    #[arg(value_name = "RUN")]
+    run: Option<PathBuf>,
+    /// Copy of journal.anchor that was kept elsewhere
+    #[arg(long, value_name = "FILE")]
+    anchor: Option<PathBuf>,
+    /// Print JSON instead of words
+    #[arg(long)]
+    json: bool,
+}
+
+/// Print the record as a table
+#[derive(Args, Debug)]
+#[command(after_help = "\
+RUN is the folder of a run, also of one that is under way; without it, the newest under runs/. Nothing is proven here; see
+`regrind audit verify`.
+
+Example:
+  regrind audit show --kind intent,event --cycle 2
+
+Exit codes: 0 shown; 1 a record cannot be read; 2 no such run, or no record in it.")]
+struct ToShow {
+    /// Folder of the run
+    #[arg(value_name = "RUN")]
+    run: Option<PathBuf>,
+    /// Only records of these kinds: begin, reopen, intent, outcome, event, artefact, note, end
+    #[arg(long, value_name = "KIND,...", value_delimiter = ',', value_parser = kind)]
+    kind: Vec<Kind>,
+    /// Only records of this cycle
+    #[arg(long, value_name = "N")]
+    cycle: Option<u32>,
+    /// Print a line of JSON for each record instead of the table
+    #[arg(long)]
+    json: bool,
+}
+
+/// Print the whole record, one line of JSON for each, as it was hashed
+#[derive(Args, Debug)]
+#[command(after_help = "\
+RUN is the folder of a run; without it, the newest under runs/. The members `prev_hash` and `hash` at the end of a line are
+the chain; `hash` is SHA-256 of \"regrind journal record 1\", a line feed, prev_hash, a line feed, and the line without these two.
+
+Example:
+  regrind audit export runs/freeform-mirror-20260704T120000Z > record.jsonl
+
+Exit codes: 0 printed; 1 a record cannot be read; 2 no such run, or no record in it.")]
+struct ToExport {
+    /// Folder of the run
+    #[arg(value_name = "RUN")]
+    run: Option<PathBuf>,
+}
+
+fn kind(word: &str) -> Result<Kind, String> {
+    let known = || Kind::ALL.map(Kind::as_str).join(", ");
+    word.parse().map_err(|()| format!("give one of {}", known()))
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    match &arguments.what {
+        What::Verify(of) => prove(of),
+        What::Show(of) => show(of),
+        What::Export(of) => print_lines(folder(of.run.as_deref())?, None, |_| true, Record::json_line),
+    }
+}
+
+/// Returns the folder that was named, or that of the newest run.
+fn folder(run: Option<&Path>) -> Result<PathBuf, Failure> {
+    run.map(Path::to_owned).or_else(|| newest(Path::new("runs"))).ok_or_else(|| Failure::NoRun { path: "runs".into() })
+}
+
+fn failure(error: JournalError) -> Failure {
+    match error {
+        JournalError::Broken { .. } => Failure::Broken(error),
+        other => Failure::Journal(other),
+    }
+}
+
+fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
+    let folder = folder(arguments.run.as_deref())?;
+    let found = match &arguments.anchor {
+        Some(path) => verify_against(&folder, &read_anchor(path)?),
+        None => verify(&folder),
+    };
+    if let (Err(JournalError::Broken { seq, what, .. }), true) = (&found, arguments.json) {
+        super::print_json(&json!({ "run": folder, "sound": false, "record": seq, "what": what }))?;
+    }
+    let verified = found.map_err(failure)?;
+    let begin = first(&folder)?;
+    if arguments.json {
+        super::print_json(&json!({
+            "run": folder, "simulation": begin["simulation"], "sound": true, "records": verified.records,
+            "head": verified.head, "anchored": verified.anchored, "closed": verified.closed,
+            "artefacts": verified.artefacts,
+        }))?;
+    } else {
+        super::print(&sound(&folder, &begin, &verified))?;
+    }
+    Ok(Outcome::Accepted)
+}
+
+fn read_anchor(path: &Path) -> Result<Anchor, Failure> {
+    let wrong = |reason: String| Failure::Anchor { path: path.to_owned(), reason };
+    let bytes = std::fs::read(path).map_err(|error| wrong(error.to_string()))?;
+    serde_json::from_slice(&bytes).map_err(|error| wrong(format!("no anchor: {error}")))
+}
+
+fn first(folder: &Path) -> Result<Value, Failure> {
+    let reader = Reader::open(folder).map_err(failure)?;
+    let first = reader.records(0).next().transpose().map_err(failure)?;
+    Ok(first.map_or(Value::Null, |record| record.value()))
+}
+
+fn mark(begin: &Value) -> &'static str {
+    if begin["simulation"] == true { "SIMULATION  " } else { "" }
+}
+
+fn sound(folder: &Path, begin: &Value, verified: &Verified) -> String {
+    let Verified { records, head, anchored, closed, artefacts, .. } = verified;
+    let records = super::words::counted(*records as usize, "record");
+    let files = super::words::counted(*artefacts as usize, "file");
+    let end = match (closed, anchored) {
+        (true, _) => "the run is closed: nothing follows, nothing was cut off".to_owned(),
+        (false, 0) => "the run is not closed and has no anchor: a cut of its end would not be seen".to_owned(),
+        (false, anchored) => {
+            format!(
+                "the run is not closed: nothing was cut off up to record {anchored}; a cut behind it would not be seen"
+            )
+        }
+    };
+    format!(
+        "{}{}\nsound       {records} in an unbroken chain, {files} unchanged\nend         {end}\nhead        {head}\n",
+        mark(begin),
+        folder.display()
+    )
+}
+
+fn show(arguments: &ToShow) -> Result<Outcome, Failure> {
+    let folder = folder(arguments.run.as_deref())?;
+    let wanted = |record: &Record| {
+        (arguments.kind.is_empty() || arguments.kind.contains(&record.kind))
+            && arguments.cycle.is_none_or(|cycle| record.cycle == cycle)
+    };
+    if arguments.json {
+        return print_lines(folder, None, wanted, Record::json_line);
+    }
+    let begin = first(&folder)?;
+    let part = begin["content"]["part_name"].as_str().map_or(String::new(), |name| format!("; {name}"));
+    let head = format!(
+        "{}{}{part}\n{:>6}  {:<23}  {:<16}  {:<8}  {:>5}  what",
+        mark(&begin),
+        folder.display(),
+        "record",
+        "time (UTC)",
+        "who",
+        "kind",
+        "cycle"
+    );
+    print_lines(folder, Some(head), wanted, row)
+}
+
+/// A record as a row of the table.
+fn row(record: &Record) -> String {
+    // To the millisecond, without the letters of the standard.
+    let utc: String = record.utc.trim_end_matches('Z').replacen('T', " ", 1).chars().take(23).collect();
+    let who: String = record.actor.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+    let cycle = if record.cycle == 0 { "-".to_owned() } else { record.cycle.to_string() };
+    let kind = record.kind.as_str();
+    format!("{:>6}  {utc:<23}  {who:<16}  {kind:<8}  {cycle:>5}  {}", record.seq, words(record))
+}
+
+/// Prints a line for each record that is wanted, as they are read; a reader that has gone away ends it.
+fn print_lines(
+    folder: PathBuf,
+    head: Option<String>,
+    wanted: impl Fn(&Record) -> bool,
+    line: impl Fn(&Record) -> String,
+) -> Result<Outcome, Failure> {
+    let reader = Reader::open(&folder).map_err(failure)?;
+    let mut out = io::BufWriter::with_capacity(1 << 16, io::stdout().lock());
+    let written = head.map_or(Ok(()), |head| writeln!(out, "{head}"));
+    let written = reader.records(0).try_fold(written, |written, record| match (written, record) {
+        (Ok(()), Ok(record)) if wanted(&record) => Ok(writeln!(out, "{}", line(&record))),
+        (Ok(()), Ok(_)) => Ok(Ok(())),
+        (Ok(()), Err(error)) => Err(Ok(error)),
+        (Err(error), _) => Err(Err(error)),
+    });
+    let flushed = out.flush();
+    match written {
+        Err(Ok(error)) => Err(failure(error)),
+        Err(Err(error)) => gone_or(error),
+        Ok(written) => written.and(flushed).map_or_else(gone_or, |()| Ok(Outcome::Accepted)),
+    }
+}
+
+fn gone_or(error: io::Error) -> Result<Outcome, Failure> {
+    match error.kind() {
+        io::ErrorKind::BrokenPipe => Ok(Outcome::Accepted),
+        _ => Err(Failure::Terminal(error)),
+    }
+}

@@ -1,0 +1,101 @@
+//! `regrind states`: what the cell does upon every event in every state, as a table and as a picture.
+
+use std::fmt::Write as _;
+use std::path::PathBuf;
+
+use clap::Args;
+use regrind::cell::{Answer, Row, table};
+use regrind::report::{save_text, state_picture};
+use serde_json::{Value, json};
+
+use super::Outcome;
+use super::failure::Failure;
+
+/// Print what the cell does upon every event in every state
+#[derive(Args, Debug)]
+#[command(after_help = "\
+The table is found by trying: every event in every state that can be reached. A line is an event, the state that follows,
+and the commands that are given. More than one answer means that it depends on the values of the event or on what happened
+before.
+
+Examples:
+  regrind states --state Held
+  regrind states --svg states.svg
+
+Exit codes: 0 printed; 2 bad arguments, or the picture cannot be written; 3 fault.")]
+pub(super) struct Arguments {
+    /// Only states whose name begins so
+    #[arg(long, value_name = "NAME")]
+    state: Option<String>,
+    /// Also events that are refused or that nothing follows from
+    #[arg(long)]
+    all: bool,
+    /// Draw the states into this file instead
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["state", "all", "json"])]
+    svg: Option<PathBuf>,
+    /// Print JSON instead of words
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let rows = table();
+    if let Some(path) = &arguments.svg {
+        save_text(path, &state_picture(&rows)).map_err(Failure::Picture)?;
+        return Ok(Outcome::Accepted);
+    }
+    let wanted = arguments.state.as_deref().unwrap_or_default().to_lowercase();
+    let chosen: Vec<&Row> =
+        rows.iter().filter(|row| row.state.to_string().to_lowercase().starts_with(&wanted)).collect();
+    if chosen.is_empty() {
+        let mut known: Vec<&str> = rows.iter().map(|row| row.state.name()).collect();
+        known.dedup();
+        return Err(Failure::NoState { name: wanted, known: known.join(", ") });
+    }
+    if arguments.json {
+        super::print_json(&document(&chosen, arguments.all))?;
+    } else {
+        super::print(&text(&chosen, arguments.all))?;
+    }
+    Ok(Outcome::Accepted)
+}
+
+/// Whether anything follows from an event.
+fn acts(row: &Row, answer: &Answer) -> bool {
+    !answer.is_refusal() && (answer.next != row.state || !answer.commands.is_empty())
+}
+
+fn shown<'r>(row: &'r Row, all: bool) -> impl Iterator<Item = &'r Answer> {
+    row.answers.iter().filter(move |answer| all || acts(row, answer))
+}
+
+fn document(rows: &[&Row], all: bool) -> Value {
+    let rows = rows.iter().filter(|row| shown(row, all).next().is_some()).map(|row| {
+        let answers: Vec<Value> = shown(row, all)
+            .map(|answer| json!({ "next": answer.next.to_string(), "commands": answer.commands }))
+            .collect();
+        json!({ "state": row.state.to_string(), "event": row.event, "answers": answers })
+    });
+    rows.collect()
+}
+
+fn text(rows: &[&Row], all: bool) -> String {
+    let mut text = String::new();
+    let mut state = None;
+    for row in rows {
+        if state != Some(row.state) {
+            let gap = if state.is_some() { "\n" } else { "" };
+            let end = if row.state.is_end() { ": an end, nothing follows" } else { "" };
+            let _ = writeln!(text, "{gap}{}{end}", row.state);
+            state = Some(row.state);
+        }
+        let mut event = row.event.as_str();
+        for answer in shown(row, all) {
+            let next = if answer.next == row.state { "stays".to_owned() } else { format!("-> {}", answer.next) };
+            let commands = answer.commands.join(", ");
+            let _ = writeln!(text, "{}", format!("  {event:<30} {next:<34} {commands}").trim_end());
+            event = "";
+        }
+    }
+    text
+}

@@ -1,0 +1,82 @@
+//! Which event answers which command, so that the journal shows what became of each.
+
+use crate::cell::{Asked, Command, Device, Event};
+
+/// Whether a command is answered by an event at all; the others are done when they are given.
+pub(super) fn is_answered(command: &Command) -> bool {
+    !matches!(
+        command,
+        Command::Announce(_)
+            | Command::Raise(_)
+            | Command::Withdraw { .. }
+            | Command::Refuse { .. }
+            | Command::Finish(_)
+    )
+}
+
+/// Whether an event tells what became of a command. A start whose outcome is not known stays open until it is reconciled.
+pub(super) fn answers(event: &Event, command: &Command) -> bool {
+    use Command as C;
+    use Event as E;
+    match (command, event) {
+        (C::AskToLoad, E::LoadConfirmed { .. }) => true,
+        (C::Connect { device } | C::ClearMachine { device }, E::Connected { device: d, .. }) => device == d,
+        (C::Connect { device }, E::NotConnected { device: d, .. }) => device == d,
+        (C::LoadPass { cycle }, E::PassLoaded { cycle: c }) => cycle == c,
+        (C::LoadPlan { cycle }, E::PlanLoaded { cycle: c }) => cycle == c,
+        (C::VerifyClear { device }, E::Cleared { device: d } | E::Obstructed { device: d, .. }) => device == d,
+        (C::Prepare { device, .. }, E::Prepared { device: d, .. }) => device == d,
+        (C::StartMachine { device, cycle }, E::Started { device: d, cycle: c }) => device == d && cycle == c,
+        (C::StartMachine { device, cycle }, E::Reconciled { device: d, cycle: c, .. }) => device == d && cycle == c,
+        (C::StartMachine { device, .. }, E::DeclaredOver { device: d, .. }) => device == d,
+        (C::HoldMachine { device }, E::MachineHeld { device: d } | E::Ended { device: d, .. }) => device == d,
+        (C::ResumeMachine { device }, E::MachineResumed { device: d } | E::Ended { device: d, .. }) => device == d,
+        (C::StopMachine { device }, E::Ended { device: d, .. }) => device == d,
+        (C::AbortMachine { device }, E::AbortConfirmed { device: d }) => device == d,
+        (C::Reconcile { device, cycle }, E::Reconciled { device: d, cycle: c, .. }) => device == d && cycle == c,
+        (C::Collect { cycle }, E::Collected { cycle: c, .. }) => cycle == c,
+        (C::Qualify { cycle }, E::Qualified { cycle: c, .. }) => cycle == c,
+        (C::Acknowledge { device }, E::Acknowledged { device: d }) => device == d,
+        (C::Register { cycle }, E::Registered { cycle: c, .. } | E::RegistrationFailed { cycle: c, .. }) => cycle == c,
+        (C::Compensate { cycle }, E::Compensated { cycle: c, .. } | E::CompensationRefused { cycle: c, .. }) => {
+            cycle == c
+        }
+        (command, E::Refused { device, what, .. }) => asked(command) == Some((*device, *what)),
+        _ => false,
+    }
+}
+
+/// What a command asks of which machine, as a refusal names it.
+fn asked(command: &Command) -> Option<(Device, Asked)> {
+    Some(match command {
+        Command::LoadPass { .. } => (Device::Grinder, Asked::Load),
+        Command::LoadPlan { .. } => (Device::Cmm, Asked::Load),
+        Command::Prepare { device, .. } => (*device, Asked::Prepare),
+        Command::StartMachine { device, .. } => (*device, Asked::Start),
+        Command::HoldMachine { device } => (*device, Asked::Hold),
+        Command::ResumeMachine { device } => (*device, Asked::Resume),
+        Command::StopMachine { device } => (*device, Asked::Stop),
+        Command::AbortMachine { device } => (*device, Asked::Abort),
+        Command::ClearMachine { device } => (*device, Asked::Clear),
+        Command::Collect { .. } => (Device::Cmm, Asked::Collect),
+        Command::Acknowledge { device } => (*device, Asked::Acknowledge),
+        _ => return None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_start_is_answered_by_what_is_known_of_it() {
+        let start = Command::StartMachine { device: Device::Grinder, cycle: 2 };
+        let by = |event: Event| answers(&event, &start);
+        assert!(by(Event::Started { device: Device::Grinder, cycle: 2 }));
+        assert!(!by(Event::Started { device: Device::Grinder, cycle: 1 }));
+        assert!(!by(Event::Started { device: Device::Cmm, cycle: 2 }));
+        assert!(!by(Event::StartUnknown { device: Device::Grinder, cycle: 2, why: String::new() }));
+        let refused = |what| Event::Refused { device: Device::Grinder, what, why: String::new() };
+        assert!(by(refused(Asked::Start)) && !by(refused(Asked::Prepare)));
+    }
+}

@@ -1,0 +1,211 @@
+//! What a record of the journal says, in one line for a person.
+
+use std::fmt::Write;
+
+use serde_json::Value;
+
+use crate::cell::{
+    Command, CompensationRefusal, Condition, Device, Ending, Event, Figures, Found, Gate, GateFailure, Mismatch,
+    Reconciliation, RecordFailure,
+};
+use crate::journal::{Kind, Record};
+
+/// Returns what a record says, in one line. What this version of the program cannot read stands as it was written.
+pub fn words(record: &Record) -> String {
+    let value = record.value();
+    let told = match record.kind {
+        Kind::Begin => begin_words(&value),
+        Kind::Reopen => Some("opened again".to_owned()),
+        Kind::Intent => serde_json::from_value(value.clone()).ok().map(|command: Command| command_words(&command)),
+        Kind::Event => serde_json::from_value(value.clone()).ok().map(|event: Event| event_words(&event)),
+        Kind::Artefact => artefact_words(&value),
+        Kind::End => end_words(&value),
+        Kind::Outcome | Kind::Note => None,
+    };
+    let mut line = told.unwrap_or_else(|| value.as_str().map_or_else(|| record.payload.clone(), str::to_owned));
+    if !record.reason.is_empty() {
+        let _ = write!(line, " ({})", record.reason);
+    }
+    // Words may come from a machine; what controls a terminal stays out.
+    line.replace(|c: char| c.is_control(), " ")
+}
+
+fn begin_words(value: &Value) -> Option<String> {
+    let marked = if value["simulation"] == true { "SIMULATION  " } else { "" };
+    let mut line = format!("{marked}run {}", value["run"].as_str()?);
+    for key in ["part_name", "recipe", "cell"] {
+        if let Some(text) = value["content"][key].as_str() {
+            let _ = write!(line, ", {text}");
+        }
+    }
+    Some(line)
+}
+
+fn artefact_words(value: &Value) -> Option<String> {
+    let sha256 = value["sha256"].as_str()?;
+    let head = sha256.get(..12).unwrap_or(sha256);
+    Some(format!("{}, {} bytes, sha256 {head}...", value["name"].as_str()?, value["bytes"]))
+}
+
+fn end_words(value: &Value) -> Option<String> {
+    let ending = &value["ending"];
+    // The drive puts the ending beside the figures of all cycles.
+    let ending = ending.get("ending").filter(|inner| inner.is_object()).unwrap_or(ending);
+    serde_json::from_value(ending.clone()).ok().map(|ending: Ending| ending_words(&ending))
+}
+
+/// Returns how a run ended, and why.
+pub fn ending_words(ending: &Ending) -> String {
+    match ending {
+        Ending::Accepted { reason, .. } => format!("ACCEPTED: {reason}"),
+        Ending::NotAccepted { reason, .. } => format!("NOT ACCEPTED: {reason}"),
+        Ending::Stopped { reason, .. } => format!("STOPPED: {reason}"),
+        Ending::Aborted { reason, confirmed: true, .. } => format!("ABORTED: {reason}"),
+        Ending::Aborted { reason, confirmed: false, .. } => {
+            format!("ABORTED, and not every machine has confirmed that it stands: {reason}")
+        }
+    }
+}
+
+/// `LoadConfirmed` becomes `load confirmed`.
+fn spaced(name: &str) -> String {
+    let mut words = String::new();
+    for c in name.chars() {
+        if c.is_uppercase() && !words.is_empty() {
+            words.push(' ');
+        }
+        words.extend(c.to_lowercase());
+    }
+    words
+}
+
+/// The name of a command or event in words, with the machine named as it is.
+fn named(name: &str, device: Option<Device>) -> String {
+    device.map_or_else(|| spaced(name), |device| format!("{device}: {}", spaced(name)))
+}
+
+fn command_words(command: &Command) -> String {
+    match command {
+        Command::Announce(judgement) => {
+            format!("judged, {}: {}", spaced(&format!("{:?}", judgement.verdict)), judgement.reason)
+        }
+        Command::Raise(alarm) => format!("ALARM {}; {}", alarm.what, alarm.consequence),
+        Command::Withdraw { alarm } => format!("alarm over: {}", spaced(&format!("{alarm:?}"))),
+        Command::Refuse { event, state, why } => format!("{} refused in {state}: {why}", spaced(event.name())),
+        Command::Finish(ending) => format!("finish, {}", ending_words(ending)),
+        command => {
+            let name = command.name();
+            let (name, device) =
+                name.split_once(' ').map_or((name.as_str(), None), |(name, device)| (name, Some(device)));
+            let words = spaced(name.strip_suffix("Machine").unwrap_or(name));
+            device.map_or(words.clone(), |device| format!("{device}: {words}"))
+        }
+    }
+}
+
+fn event_words(event: &Event) -> String {
+    let name = named(event.name(), event.device());
+    let more = match event {
+        Event::Hold { reason, .. }
+        | Event::Resume { reason, .. }
+        | Event::Stop { reason, .. }
+        | Event::Abort { reason, .. } => reason.clone(),
+        Event::DeclaredOver { evidence, .. } => evidence.clone(),
+        Event::Connected { simulated, found, .. } => found_words(*simulated, found),
+        Event::NotConnected { why, .. } => mismatch_words(why),
+        Event::LinkLost { why, .. } | Event::StartUnknown { why, .. } | Event::RegistrationFailed { why, .. } => {
+            why.clone()
+        }
+        Event::ConditionLost { condition, words } => format!("{}: {words}", condition_words(*condition)),
+        Event::ConditionBack { condition } => condition_words(*condition).to_owned(),
+        Event::Progressed { done, total, .. } => format!("{done} of {total}"),
+        Event::Ended { result, .. } => spaced(&format!("{result:?}")),
+        Event::Obstructed { words, .. } => words.clone(),
+        Event::Refused { what, why, .. } => format!("{}: {why}", spaced(&format!("{what:?}"))),
+        Event::Fault { code, words, .. } => format!("{code}, {words}"),
+        Event::Reconciled { outcome, .. } => reconciliation_words(outcome),
+        Event::Collected { targets, found, gate, .. } => format!("{found} of {targets} points, {}", gate_words(gate)),
+        Event::Qualified { radius_error_mm, .. } => {
+            format!("radius of the probe off by {:.2} um", 1e3 * radius_error_mm)
+        }
+        Event::Registered { figures, .. } => figures_words(figures),
+        Event::Compensated { summary, .. } => format!(
+            "up to {:.2} um, {:.2} um deep, PV {:.2} um expected",
+            1e3 * summary.largest_mm,
+            1e3 * summary.depth_mm,
+            1e3 * summary.predicted_pv_mm
+        ),
+        Event::CompensationRefused { why, .. } => match why {
+            CompensationRefusal::BudgetSpent(words) | CompensationRefusal::Failed(words) => words.clone(),
+            CompensationRefusal::WeakDirections(directions) => format!("weak directions: {}", directions.join(", ")),
+        },
+        Event::RecordFailed { why: RecordFailure::DiskFull(words) | RecordFailure::Unwritable(words) } => words.clone(),
+        _ => String::new(),
+    };
+    if more.is_empty() { name } else { format!("{name}, {more}") }
+}
+
+fn found_words(simulated: bool, found: &Found) -> String {
+    let kind = if simulated { "a simulation" } else { "a real machine" };
+    match found {
+        Found::Idle => format!("{kind}, idle"),
+        Found::ToClear => format!("{kind}, to be cleared"),
+        Found::Busy(words) => format!("{kind}, busy: {words}"),
+    }
+}
+
+fn mismatch_words(why: &Mismatch) -> String {
+    match why {
+        Mismatch::Unreachable(words) => format!("unreachable: {words}"),
+        Mismatch::WrongDevice(words) => format!("another device: {words}"),
+        Mismatch::WordOrder(words) => format!("another word order: {words}"),
+        Mismatch::Inches => "in inches".to_owned(),
+        Mismatch::Owned(words) => format!("owned by another client: {words}"),
+    }
+}
+
+fn condition_words(condition: Condition) -> &'static str {
+    match condition {
+        Condition::Supplies => "supplies",
+        Condition::Temperature => "temperature",
+    }
+}
+
+fn reconciliation_words(outcome: &Reconciliation) -> String {
+    match outcome {
+        Reconciliation::Running => "it runs".to_owned(),
+        Reconciliation::Held => "it is held".to_owned(),
+        Reconciliation::Ended(result) => format!("it is over, {}", spaced(&format!("{result:?}"))),
+        Reconciliation::NotStarted => "it was not started".to_owned(),
+        Reconciliation::Unknown(words) => format!("nobody knows: {words}"),
+    }
+}
+
+fn gate_words(gate: &Gate) -> String {
+    match gate {
+        Gate::Passed => "usable".to_owned(),
+        Gate::Failed(GateFailure::NoPart) => "not usable: nothing was touched".to_owned(),
+        Gate::Failed(GateFailure::Contacts) => "not usable: contact points".to_owned(),
+        Gate::Failed(GateFailure::Inches) => "not usable: inches".to_owned(),
+        Gate::Failed(
+            GateFailure::Coverage(words)
+            | GateFailure::Foreign(words)
+            | GateFailure::Broken(words)
+            | GateFailure::Temperature(words),
+        ) => format!("not usable: {words}"),
+    }
+}
+
+fn figures_words(figures: &Figures) -> String {
+    let mut line = format!(
+        "PV {:.2} um, rms {:.3} um, {} points, {} outliers",
+        1e3 * figures.pv_mm,
+        1e3 * figures.rms_mm,
+        figures.points,
+        figures.outliers
+    );
+    for words in figures.weak_directions.iter().chain(&figures.warnings) {
+        let _ = write!(line, "; {words}");
+    }
+    line
+}

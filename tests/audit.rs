@@ -1,0 +1,272 @@
+//! The record of a run as quality reads it: proven, shown, exported; and the table of states beside its picture.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use regrind::cell::{
+    Actor, Alarm, AlarmId, Command as Order, Device, Ending, Event, Figures, Found, Judgement, Role, Verdict, table,
+};
+use regrind::journal::{Entry, Header, Journal, Kind, sha256_hex};
+use regrind::report::state_picture;
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+fn regrind(folder: &Path, arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_regrind")).args(arguments).current_dir(folder).output().unwrap()
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8(bytes.to_vec()).unwrap()
+}
+
+/// What a command prints when it ends with a code.
+fn printed(folder: &Path, arguments: &[&str], code: i32) -> String {
+    let output = regrind(folder, arguments);
+    assert_eq!(output.status.code(), Some(code), "{arguments:?}: {}{}", text(&output.stdout), text(&output.stderr));
+    text(&output.stdout)
+}
+
+fn figures() -> Figures {
+    Figures {
+        pv_mm: 0.004_2,
+        rms_mm: 0.000_812,
+        pv_expanded_mm: 0.0005,
+        rms_expanded_mm: 0.0001,
+        coverage: 0.99,
+        points: 812,
+        outliers: 3,
+        shift_mm: 0.1,
+        turn_rad: 0.01,
+        weak_directions: Vec::new(),
+        warnings: vec!["the part is warm".into()],
+        response: None,
+        removed_mm: Some(0.1),
+    }
+}
+
+fn events() -> Vec<Event> {
+    let device = Device::Grinder;
+    vec![
+        Event::Start { actor: Actor { name: "Ada".into(), station: "console".into() } },
+        Event::Connected { device, boot_id: 1, simulated: true, found: Found::Idle },
+        Event::Fault { device, code: 5, words: "drive\u{1b}[2J too warm".into() },
+        Event::Registered { cycle: 1, figures: figures() },
+    ]
+}
+
+fn orders() -> Vec<Order> {
+    let alarm = Alarm {
+        id: AlarmId::MachineFault,
+        what: "A machine is in fault: grinder.".into(),
+        consequence: "The run is aborted.".into(),
+        remedy: vec!["Look at it.".into()],
+        clears: Role::Operator,
+    };
+    vec![
+        Order::StartMachine { device: Device::Grinder, cycle: 1 },
+        Order::Raise(alarm),
+        Order::Announce(Judgement { cycle: 1, verdict: Verdict::Accept, reason: "in tolerance".into() }),
+    ]
+}
+
+/// A folder with one run in `runs/`, as a drive would have recorded it.
+fn recorded(simulation: bool) -> (TempDir, PathBuf) {
+    let home = tempfile::tempdir().unwrap();
+    let folder = home.path().join("runs/mirror-1");
+    let header = Header {
+        run: "mirror-1".into(),
+        part: "SN 7".into(),
+        actor: "Ada".into(),
+        station: "console".into(),
+        simulation,
+        first_command_id: 1,
+        content: json!({ "part_name": "Mirror", "recipe": "recipes/mirror.toml" }),
+    };
+    let mut journal = Journal::create(&folder, header).unwrap();
+    journal.store("recipe.toml", b"x = 1\n", 0, 0).unwrap();
+    for (k, event) in events().into_iter().enumerate() {
+        let payload = serde_json::to_value(event).unwrap();
+        journal.append(Entry::new(Kind::Event, 10 + k as u64, 1, payload)).unwrap();
+    }
+    for order in orders() {
+        journal.intend(Entry::new(Kind::Intent, 20, 2, serde_json::to_value(order).unwrap())).unwrap();
+    }
+    journal.append(Entry::new(Kind::Note, 30, 2, json!({ "pass_record": { "path_mm": 12.5 } }))).unwrap();
+    journal.store("cycle-2/measured.csv", b"1,2,3\n", 40, 2).unwrap();
+    let ending = Ending::Accepted { cycle: 2, reason: "in tolerance".into() };
+    journal.close(50, 2, json!({ "simulation": simulation, "ending": ending, "cycles": [] })).unwrap();
+    (home, folder)
+}
+
+#[test]
+fn a_sound_record_is_proven_in_words_and_json() {
+    let (home, folder) = recorded(true);
+    let words = printed(home.path(), &["audit", "verify"], 0);
+    assert!(words.starts_with("SIMULATION  runs/mirror-1\n"), "{words}");
+    assert!(words.contains("12 records in an unbroken chain, 2 files unchanged"), "{words}");
+    let value: Value =
+        serde_json::from_str(&printed(home.path(), &["audit", "verify", folder.to_str().unwrap(), "--json"], 0))
+            .unwrap();
+    assert_eq!((&value["sound"], &value["records"], &value["closed"]), (&json!(true), &json!(12), &json!(true)));
+    assert!(words.contains(value["head"].as_str().unwrap()));
+    fs::copy(folder.join("journal.anchor"), home.path().join("kept")).unwrap();
+    printed(home.path(), &["audit", "verify", "--anchor", "kept"], 0);
+    let (other, _) = recorded(false);
+    let words = printed(other.path(), &["audit", "verify"], 0);
+    assert!(!words.contains("SIMULATION"), "{words}");
+    let kept = home.path().join("kept");
+    printed(other.path(), &["audit", "verify", "--anchor", kept.to_str().unwrap()], 1);
+}
+
+#[test]
+fn a_broken_record_is_named_and_ends_with_1() {
+    let (home, folder) = recorded(true);
+    fs::write(folder.join("cycle-2/measured.csv"), "1,2,4\n").unwrap();
+    let output = regrind(home.path(), &["audit", "verify"]);
+    assert_eq!(output.status.code(), Some(1));
+    let error = text(&output.stderr);
+    assert!(error.contains("broken at record 11: the file cycle-2/measured.csv is not what was written"), "{error}");
+    let value: Value = serde_json::from_str(&printed(home.path(), &["audit", "verify", "--json"], 1)).unwrap();
+    assert_eq!((&value["sound"], &value["record"]), (&json!(false), &json!(11)));
+
+    let (home, folder) = recorded(true);
+    let database = rusqlite::Connection::open(folder.join("journal.sqlite")).unwrap();
+    database.execute_batch("DROP TRIGGER record_is_not_changed; UPDATE record SET kind = 'x' WHERE seq = 4").unwrap();
+    drop(database);
+    for what in ["verify", "show", "export"] {
+        let output = regrind(home.path(), &["audit", what]);
+        assert_eq!(output.status.code(), Some(1), "{what}");
+        assert!(text(&output.stderr).contains("broken at record 4"), "{what}: {}", text(&output.stderr));
+    }
+    assert_eq!(printed(home.path(), &["audit", "export"], 1).lines().count(), 3, "what stands before it is given");
+}
+
+#[test]
+fn folders_without_a_record_end_with_2() {
+    let home = tempfile::tempdir().unwrap();
+    for what in ["verify", "show", "export"] {
+        for arguments in [vec!["audit", what], vec!["audit", what, "nowhere"], vec!["audit", what, "."]] {
+            let output = regrind(home.path(), &arguments);
+            assert_eq!((output.status.code(), output.stdout.is_empty()), (Some(2), true), "{arguments:?}");
+            assert!(text(&output.stderr).contains("folder of a run"), "{arguments:?}: {}", text(&output.stderr));
+        }
+    }
+    let (home, _) = recorded(true);
+    fs::write(home.path().join("text"), "x").unwrap();
+    for anchor in ["text", "absent"] {
+        let output = regrind(home.path(), &["audit", "verify", "--anchor", anchor]);
+        assert_eq!(output.status.code(), Some(2));
+        assert!(text(&output.stderr).contains("journal.anchor"), "{}", text(&output.stderr));
+    }
+}
+
+#[test]
+fn the_table_says_what_happened_and_is_marked() {
+    let (home, _) = recorded(true);
+    let shown = printed(home.path(), &["audit", "show"], 0);
+    assert!(shown.starts_with("SIMULATION  runs/mirror-1; Mirror\n"), "{shown}");
+    let said = [
+        "begin         -  SIMULATION  run mirror-1, Mirror, recipes/mirror.toml",
+        "artefact      -  recipe.toml, 6 bytes, sha256 ",
+        "event         1  start",
+        "grinder: connected, a simulation, idle",
+        "grinder: fault, 5, drive [2J too warm",
+        "registered, PV 4.20 um, rms 0.812 um, 812 points, 3 outliers; the part is warm",
+        "intent        2  grinder: start",
+        "ALARM A machine is in fault: grinder.; The run is aborted.",
+        "judged, accept: in tolerance",
+        "{\"pass_record\":{\"path_mm\":12.5}}",
+        "end           2  ACCEPTED: in tolerance",
+    ];
+    for words in said {
+        assert!(shown.contains(words), "{words}\n{shown}");
+    }
+    assert!(!shown.contains('\u{1b}'), "a machine's words control no terminal");
+    let rows =
+        |arguments: &[&str]| printed(home.path(), &[&["audit", "show"], arguments].concat(), 0).lines().count() - 2;
+    assert_eq!(rows(&[]), 12);
+    assert_eq!(rows(&["--kind", "intent"]), 3);
+    assert_eq!(rows(&["--kind", "intent,note", "--cycle", "2"]), 4);
+    assert_eq!(rows(&["--cycle", "9"]), 0);
+    assert_eq!(printed(home.path(), &["audit", "show", "--kind", "event", "--json"], 0).lines().count(), 4);
+    let output = regrind(home.path(), &["audit", "show", "--kind", "evnt"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(text(&output.stderr).contains("begin, reopen, intent"), "{}", text(&output.stderr));
+}
+
+#[test]
+fn what_is_exported_proves_itself() {
+    let (home, _) = recorded(false);
+    let mut previous = "0".repeat(64);
+    let lines = printed(home.path(), &["audit", "export"], 0);
+    assert_eq!(lines.lines().count(), 12);
+    for line in lines.lines() {
+        let (hashed, chain) = line.split_once(",\"prev_hash\":\"").unwrap();
+        let (prev_hash, rest) = chain.split_once('"').unwrap();
+        assert_eq!(prev_hash, previous);
+        let due = sha256_hex(format!("regrind journal record 1\n{previous}\n{hashed}}}").as_bytes());
+        assert_eq!(rest, format!(",\"hash\":\"{due}\"}}"));
+        assert!(serde_json::from_str::<Value>(line).unwrap()["payload"].is_object());
+        previous = due;
+    }
+}
+
+#[test]
+fn a_run_under_way_is_shown_and_its_open_end_is_said() {
+    let home = tempfile::tempdir().unwrap();
+    let header = Header {
+        run: "r".into(),
+        part: "SN 7".into(),
+        actor: "Ada".into(),
+        station: "console".into(),
+        simulation: false,
+        first_command_id: 1,
+        content: Value::Null,
+    };
+    let mut journal = Journal::create(home.path().join("runs/r"), header).unwrap();
+    journal.append(Entry::new(Kind::Note, 0, 0, json!("a word"))).unwrap();
+    let proven = printed(home.path(), &["audit", "verify"], 0);
+    assert!(proven.contains("not closed: nothing was cut off up to record 1"), "{proven}");
+    assert!(printed(home.path(), &["audit", "show"], 0).ends_with("-  a word\n"));
+}
+
+#[test]
+fn states_are_printed_and_the_picture_in_the_documentation_is_current() {
+    let home = tempfile::tempdir().unwrap();
+    let idle = printed(home.path(), &["states", "--state", "idle"], 0);
+    assert!(idle.starts_with("Idle\n"), "{idle}");
+    assert!(idle.contains("  Start                          -> Starting"), "{idle}");
+    assert!(!idle.contains("Refuse"), "{idle}");
+    let value: Value =
+        serde_json::from_str(&printed(home.path(), &["states", "--state", "Held", "--json"], 0)).unwrap();
+    assert!(value.as_array().unwrap().iter().all(|row| row["state"].as_str().unwrap().starts_with("Held (")));
+    let unknown = regrind(home.path(), &["states", "--state", "x"]);
+    assert_eq!(unknown.status.code(), Some(2));
+    assert!(text(&unknown.stderr).contains("give one of Idle, Starting, Execute"), "{}", text(&unknown.stderr));
+
+    printed(home.path(), &["states", "--svg", "states.svg"], 0);
+    let drawn = fs::read_to_string(home.path().join("states.svg")).unwrap();
+    let kept = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/states.svg");
+    let current = fs::read_to_string(kept).unwrap_or_default();
+    assert!(drawn == current, "docs/states.svg is not what the cell does: regrind states --svg docs/states.svg");
+}
+
+#[test]
+fn the_picture_names_every_state_once_and_is_well_formed() {
+    let rows = table();
+    let picture = state_picture(&rows);
+    let document = roxmltree::Document::parse(&picture).unwrap();
+    let texts: Vec<&str> = document.descendants().filter(|n| n.has_tag_name("text")).filter_map(|n| n.text()).collect();
+    for row in &rows {
+        assert_eq!(texts.iter().filter(|text| **text == row.state.name()).count(), 1, "{}", row.state);
+    }
+    let steps = rows.iter().filter_map(|row| row.state.phase()).map(|phase| phase.to_string());
+    for step in steps.filter(|step| step != "Judge") {
+        let words = step.split(", ").last().unwrap();
+        assert!(texts.contains(&words), "{step}");
+    }
+    // With a table of nothing there are boxes and no arrows but those that explain the colours.
+    let empty = state_picture(&[]);
+    assert_eq!(empty.matches("<path").count(), 6);
+}
