@@ -78,12 +78,16 @@ impl Show {
     fn show(&mut self, notice: &Notice) -> Result<(), Failure> {
         match notice {
             Notice::Progress { device, cycle, done, total } => self.progress(*device, *cycle, *done, *total),
-            Notice::State { state, cycle, .. } => {
+            Notice::State { state, cycle, event } => {
                 if let Some(bar) = &self.bar {
                     bar.set_message(format!("cycle {cycle}  {state}"));
                 }
-                Ok(())
+                self.order(event)
             }
+            Notice::Transferred { cycle, points, seconds, ms_per_point } => self.line(&format!(
+                "cycle {cycle}: {points} points fetched in {seconds:.2} s, {} ms a point",
+                three_digits(*ms_per_point)
+            )),
             Notice::LoadPart => self.line("load the part, clamp it, then: regrind confirm loaded"),
             Notice::Note { device, words } => {
                 words.iter().try_for_each(|words| self.line(&format!("{device}: {words}")))
@@ -101,6 +105,20 @@ impl Show {
             Notice::Refused { why } => self.line(&format!("not done: {why}")),
             Notice::RecordFailed { words } => self.line(&format!("RECORD: {words}")),
             Notice::Finished { ending, cycles } => self.finished(ending, cycles),
+        }
+    }
+
+    /// Says that an order was taken, whoever gave it.
+    fn order(&mut self, event: &str) -> Result<(), Failure> {
+        match event {
+            "hold" => self.line(&format!(
+                "HOLD     the cell holds at the next safe place; to go on: regrind resume {0}; Ctrl-C, or regrind abort {0}, ends the run",
+                self.folder
+            )),
+            "resume" => self.line("RESUME   the cell goes on"),
+            "stop" => self.line("STOP     the cell ends in order"),
+            "abort" => self.line("ABORT    both machines run their safe sequence, and nothing else"),
+            _ => Ok(()),
         }
     }
 

@@ -3,8 +3,9 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use regrind::config::CellConfig;
+use regrind::config::{CellConfig, Link, Wire};
 use regrind::recipe::Recipe;
+use serde_json::{Value, json};
 
 use super::failure::Failure;
 use super::run::or_show;
@@ -30,6 +31,9 @@ pub(super) struct Arguments {
     /// Draw another part and another run from this number
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
+    /// Print where the machines answer as one line of JSON; a port of 0 in the cell file takes any that is free
+    #[arg(long)]
+    json: bool,
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
@@ -38,11 +42,29 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let spec = simulated::world_spec(&recipe, arguments.seed)?;
     super::runtime()?.block_on(async {
         let serving = simulated::serve(spec, &mut cell).await?;
+        if arguments.json {
+            let wires = json!({ "simulation": true, "cmm": wire(&cell.cmm.link), "grinder": wire(&cell.grinder.link) });
+            super::print(&format!("{wires}\n"))?;
+            return until_stopped().await;
+        }
         for place in &serving.places {
             super::print(&format!("SIMULATION: {place}\n"))?;
         }
         super::print("Ctrl-C ends it.\n")?;
-        tokio::signal::ctrl_c().await.map_err(Failure::Terminal)?;
-        Ok(Outcome::Accepted)
+        until_stopped().await
     })
+}
+
+async fn until_stopped() -> Result<Outcome, Failure> {
+    tokio::signal::ctrl_c().await.map_err(Failure::Terminal)?;
+    Ok(Outcome::Accepted)
+}
+
+/// Where a machine answers, after a port that was left open has become one.
+fn wire(link: &Link) -> Value {
+    match &link.wire {
+        Wire::ModbusTcp { host, port, unit } => json!({ "host": host, "port": port, "unit": unit }),
+        Wire::ModbusRtu { device, baud, unit, .. } => json!({ "device": device, "baud": baud, "unit": unit }),
+        Wire::FileExchange(_) => Value::Null,
+    }
 }

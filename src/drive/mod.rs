@@ -39,7 +39,7 @@ use control::{Control, Ordered};
 pub use control::{Reply, Request, SOCKET, ask};
 pub use notice::{CycleRow, Notice};
 use record::{Recorder, entry};
-use station::{Ask, Bench, CmmBench, GrinderBench, Harvest, Intent, Load, Station, Told};
+use station::{Aborts, Ask, Bench, CmmBench, GrinderBench, Harvest, Intent, Load, Station, Told};
 use work::{Cycle, Points};
 pub use work::{Probing, Sphere, Task};
 
@@ -99,6 +99,8 @@ pub struct Drive {
     before: Duration,
     asks: [mpsc::Sender<Ask>; 2],
     interrupts: [Interrupt; 2],
+    /// Counts the aborts of each station, which so gives up what it is at.
+    aborts: [watch::Sender<u64>; 2],
     told: mpsc::Receiver<Told>,
     computed: (mpsc::UnboundedSender<Computed>, mpsc::UnboundedReceiver<Computed>),
     orders: mpsc::Receiver<Ordered>,
@@ -146,12 +148,13 @@ impl Drive {
         let control = Control::listen(&folder, orders.clone(), seen)?;
         let interrupted = run.interrupted.unwrap_or_default();
         let interrupts = [Interrupt::new(), Interrupt::new()];
+        let aborts = [watch::Sender::new(0), watch::Sender::new(0)];
         let armed = interrupted.intents.clone().map(|intent| intent.as_ref().and_then(restored));
         let [of_cmm, of_grinder] = armed;
         let [poll_cmm, poll_grinder] = run.poll;
-        let (cmm, cmm_task) = spawn(CmmBench(cmm), run.job, &interrupts[0], &told, of_cmm, poll_cmm);
+        let (cmm, cmm_task) = spawn(CmmBench(cmm), run.job, (&interrupts[0], &aborts[0]), &told, of_cmm, poll_cmm);
         let (grinder, grinder_task) =
-            spawn(GrinderBench(grinder), run.job, &interrupts[1], &told, of_grinder, poll_grinder);
+            spawn(GrinderBench(grinder), run.job, (&interrupts[1], &aborts[1]), &told, of_grinder, poll_grinder);
         let mut drive = Self {
             cell: Cell::new(run.plan),
             task: Arc::new(run.task),
@@ -163,6 +166,7 @@ impl Drive {
             before: Duration::ZERO,
             asks: [cmm, grinder],
             interrupts,
+            aborts,
             told: facts,
             computed: mpsc::unbounded_channel(),
             orders: ordered,
@@ -324,7 +328,8 @@ impl Drive {
             let payload = json!({ "pass_record": pass_record(record) });
             self.note(Kind::Note, ("grinder".into(), "wire".into()), payload).await;
         }
-        if let Some(Harvest::Points(measurement)) = harvest {
+        if let Some(Harvest::Points(measurement, taken)) = harvest {
+            self.transferred(&measurement, taken).await;
             return self.gate(measurement);
         }
         if let Some(event) = event {
@@ -333,6 +338,15 @@ impl Drive {
             }
             self.take(event, detail).await;
         }
+    }
+
+    /// Records and shows how fast points came over the wire.
+    async fn transferred(&mut self, measurement: &crate::device::Measurement, taken: Duration) {
+        let (cycle, points, seconds) = (u32::from(measurement.cycle), measurement.points.len(), taken.as_secs_f64());
+        let ms_per_point = 1e3 * seconds / points.max(1) as f64;
+        let payload = json!({ "transfer": { "points": points, "seconds": seconds, "ms_per_point": ms_per_point } });
+        self.note(Kind::Note, ("cmm".into(), "wire".into()), payload).await;
+        self.notify(Notice::Transferred { cycle, points, seconds, ms_per_point });
     }
 
     async fn computed(&mut self, computed: Computed) {
@@ -392,7 +406,12 @@ impl Drive {
                 events.push_back((Event::RecordFailed { why: failure }, None));
             }
             self.show_event(&event);
-            for command in self.cell.handle(now, event) {
+            let commands = self.cell.handle(now, event);
+            // What makes safe waits neither for the disk nor for the record of what comes before it.
+            for command in commands.iter().filter(|command| makes_safe(command)) {
+                self.execute(command.clone()).await;
+            }
+            for command in commands {
                 if let Command::Refuse { why, .. } = &command {
                     refusal = Some(why.clone());
                 }
@@ -465,8 +484,7 @@ impl Drive {
             return self.settle(written.map(|()| 0));
         }
         if makes_safe(&command) {
-            // What makes safe does not wait for the disk.
-            self.execute(command.clone()).await;
+            // It has been carried out already.
             return self.settle_intent(record, command).await;
         }
         let failure = self.settle_intent(record, command.clone()).await;
@@ -497,7 +515,10 @@ impl Drive {
             Command::HoldMachine { device } => self.ask_at_once(device, Ask::Hold).await,
             Command::ResumeMachine { device } => self.ask(device, Ask::Resume).await,
             Command::StopMachine { device } => self.ask_at_once(device, Ask::Stop).await,
-            Command::AbortMachine { device } => self.ask_at_once(device, Ask::Abort).await,
+            Command::AbortMachine { device } => {
+                self.aborts[index(device)].send_modify(|ordered| *ordered += 1);
+                self.ask_at_once(device, Ask::Abort).await;
+            }
             Command::ClearMachine { device } => self.ask(device, Ask::Clear).await,
             Command::Reconcile { device, cycle } => self.ask(device, Ask::Reconcile { cycle }).await,
             Command::Collect { cycle } => self.ask(Device::Cmm, Ask::Collect { cycle }).await,
@@ -686,14 +707,14 @@ fn new_cycle(correction: Correction) -> Cycle {
 fn spawn<B: Bench>(
     bench: B,
     job: u32,
-    interrupt: &Interrupt,
+    (interrupt, aborts): (&Interrupt, &watch::Sender<u64>),
     told: &mpsc::Sender<Told>,
     armed: Option<(u32, Armed)>,
     poll: Duration,
 ) -> (mpsc::Sender<Ask>, tokio::task::JoinHandle<()>) {
     let (asks, asked) = mpsc::channel(16);
     let station = Station::new(bench, job, interrupt.clone(), told.clone()).with_intent(armed);
-    (asks, tokio::spawn(station.attend(asked, poll)))
+    (asks, tokio::spawn(station.attend(asked, poll, Aborts::new(aborts.subscribe()))))
 }
 
 fn restored(intent: &Value) -> Option<(u32, Armed)> {

@@ -17,6 +17,8 @@ pub enum Notice {
     Note { device: Device, words: Vec<String> },
     /// A job goes on.
     Progress { device: Device, cycle: u32, done: u32, total: u32 },
+    /// The points of a measurement came over the wire, in this time.
+    Transferred { cycle: u32, points: usize, seconds: f64, ms_per_point: f64 },
     /// A measurement is registered.
     Figures { cycle: u32, figures: Figures },
     /// A cycle is judged.

@@ -1,14 +1,15 @@
 //! A task for each machine: it alone talks to it. Orders come in, facts go out; while nothing is asked it looks at the status.
 //!
 //! What is asked is answered in order. A hold, a stop or an abort does not wait for a long transfer: the drive raises the
-//! [`Interrupt`], the transfer ends between two requests, and the order is next.
+//! [`Interrupt`], the transfer ends between two requests, and the order is next. An abort waits for nothing else either: what the
+//! machine was being asked is given up where it is, for nothing that it could still bring would be used.
 
 use std::future::Future;
 use std::sync::Arc;
 use std::time::Duration;
 
 use serde::Serialize;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
 use crate::cell::{Asked, Condition, Device, Event, Found, JobResult, Mismatch, Reconciliation};
@@ -45,7 +46,8 @@ pub(super) enum Load {
 
 /// What a job left.
 pub(super) enum Harvest {
-    Points(Box<Measurement>),
+    /// With the time that their transfer took.
+    Points(Box<Measurement>, Duration),
     Record(Box<PassRecord>),
 }
 
@@ -91,7 +93,9 @@ impl<C: Cmm + 'static> Bench for CmmBench<C> {
     }
 
     async fn harvest(&mut self, job: Job, interrupt: &Interrupt) -> Result<Harvest, DeviceError> {
-        Ok(Harvest::Points(Box::new(self.0.collect(job, interrupt).await?)))
+        let began = Instant::now();
+        let measurement = self.0.collect(job, interrupt).await?;
+        Ok(Harvest::Points(Box::new(measurement), began.elapsed()))
     }
 
     async fn confirm(&mut self, _: Step, _: [u8; 32]) -> Result<(), DeviceError> {
@@ -119,6 +123,27 @@ impl<G: Grinder + 'static> Bench for GrinderBench<G> {
 
     async fn confirm(&mut self, step: Step, map_identity: [u8; 32]) -> Result<(), DeviceError> {
         self.0.confirm(step, map_identity).await
+    }
+}
+
+/// Aborts on their way to a station: the drive counts them up before it asks, the station as it takes them.
+pub(super) struct Aborts {
+    ordered: watch::Receiver<u64>,
+    taken: u64,
+}
+
+impl Aborts {
+    pub(super) fn new(ordered: watch::Receiver<u64>) -> Self {
+        Self { ordered, taken: 0 }
+    }
+
+    /// Waits until an abort is on its way that has not been taken.
+    async fn ordered(&mut self) {
+        let taken = self.taken;
+        if self.ordered.wait_for(|ordered| *ordered > taken).await.is_err() {
+            // Nobody is left to order one.
+            std::future::pending::<()>().await;
+        }
     }
 }
 
@@ -189,17 +214,29 @@ impl<B: Bench> Station<B> {
     }
 
     /// Attends until nobody can ask any more, then gives the machine back.
-    pub(super) async fn attend(mut self, mut asks: mpsc::Receiver<Ask>, poll: Duration) {
+    pub(super) async fn attend(mut self, mut asks: mpsc::Receiver<Ask>, poll: Duration, mut aborts: Aborts) {
         let mut ticks = interval(poll);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             tokio::select! {
                 biased;
                 ask = asks.recv() => match ask {
-                    Some(ask) => self.act(ask).await,
+                    Some(Ask::Abort) => {
+                        aborts.taken += 1;
+                        self.act(Ask::Abort).await;
+                    }
+                    Some(ask) => tokio::select! {
+                        biased;
+                        () = aborts.ordered() => {}
+                        () = self.act(ask) => {}
+                    },
                     None => break,
                 },
-                _ = ticks.tick(), if self.seen.connected => self.look().await,
+                _ = ticks.tick(), if self.seen.connected => tokio::select! {
+                    biased;
+                    () = aborts.ordered() => {}
+                    () = self.look() => {}
+                },
             }
         }
         if self.seen.connected && !self.seen.lost {
