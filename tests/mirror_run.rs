@@ -61,7 +61,7 @@ impl Shop {
         let recipe = fs::read_to_string(root.join("recipes/telescope-panel.toml")).unwrap();
         let recipe = changed(&recipe, "hold = [\"x\", \"y\", \"rz\"]", hold);
         // As many as the files hold, so that a measurement is never taken before the last file is there.
-        let recipe = changed(&recipe, "points = 500", &format!("points = {POINTS}"));
+        let recipe = changed(&recipe, "points = 1100", &format!("points = {POINTS}"));
         let (recipe_path, cell_path) = (home.path().join("mirror.toml"), home.path().join("config/cell.toml"));
         fs::write(&recipe_path, recipe).unwrap();
         fs::write(&cell_path, cell).unwrap();
@@ -151,7 +151,6 @@ impl Running {
                 panic!("the program ended with {status} before {what}: {:#?}", self.said());
             }
             assert!(began.elapsed() < PATIENCE, "no {what}: {:#?}", self.said());
-            std::thread::yield_now();
             std::thread::park_timeout(Duration::from_millis(20));
         }
     }
@@ -259,11 +258,19 @@ fn with_its_place_held_the_mirror_gets_a_map_that_is_handed_over_once_and_confir
     run.until("the pass to be over", || shop.handed_over("grinder/out", "_c2.done"));
     // The next plan; the old files are no answer to it.
     run.until("the next plan", || shop.handed_over("cmm/out", "_c2"));
+    let lines = Arc::clone(&run.lines);
+    let left_alone = || lines.lock().unwrap().iter().any(|line| line.contains("lay there before the plan"));
+    run.until("the old files to be left alone", || left_alone().then_some(()));
     let mut stop = Command::new(env!("CARGO_BIN_EXE_regrind"));
     assert!(stop.arg("stop").arg(&folder).output().unwrap().status.success());
     let (code, said) = run.end();
     assert_eq!(code, 3, "{said:#?}");
     assert_eq!(notices(&said, "figures").len(), 1, "one measurement");
+    let notes: Vec<String> = notices(&said, "note").iter().map(|note| note["words"].to_string()).collect();
+    let how = format!("regrind confirm started --map {}", &map[..8]);
+    for words in [how.as_str(), "lay there before the plan", "stop it at its own panel"] {
+        assert!(notes.iter().any(|note| note.contains(words)), "{words}: {notes:#?}");
+    }
     assert!(shop.handed_over("cmm/out", "_c2.stopped").is_some());
     assert_eq!(fs::read_dir(shop.folder("grinder/out")).unwrap().count(), 1, "one pass was handed over");
     journal::verify(&folder).unwrap();

@@ -93,7 +93,7 @@ fn words(d: &Document) -> String {
         d.part,
         counted(d.nominal_points, "point"),
         d.part_identity,
-        counted(d.targets, "point"),
+        if d.targets == 0 { "where the operator takes the points".to_owned() } else { counted(d.targets, "point") },
         d.sphere_points,
         d.tracks,
         n(d.path_mm),

@@ -279,6 +279,10 @@ impl<B: Bench> Station<B> {
                 let _ = answer.send(told.map_err(|error| error.to_string()));
             }
         }
+        if urgent {
+            // Files that are taken back stop no machine: that must be told before the run is over.
+            self.pass_on_notes().await;
+        }
     }
 
     async fn connect(&mut self) {

@@ -216,9 +216,10 @@ impl Mailbox for GrinderFolders {
         let done = self.confirmation(DONE, &lying, &found, &mut said);
         let begun = self.started.is_some() || done.is_some();
         let Some((done, sha)) = done else {
-            let (what, file) = if begun { ("end", DONE) } else { ("start", STARTED) };
+            let (what, word, file) = if begun { ("end", "done", DONE) } else { ("start", "started", STARTED) };
+            let map = lying.ticket.identity.get(..8).unwrap_or_default();
             said.push(format!(
-                "waiting for the {what} to be confirmed: `regrind confirm`, or copy {file} from {} to {}",
+                "waiting for the {what} to be confirmed: regrind confirm {word} --map {map}, or copy {file} from {} to {}",
                 lying.path.display(),
                 self.settings.inbox.display()
             ));
