@@ -86,6 +86,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         let showing = tokio::spawn(show.follow(shown));
         let ending = go(run, cmm, grinder, actor).await?;
         showing.await.map_err(|e| Failure::Terminal(e.into()))??;
+        // The record is closed; a report that cannot be written must not change how the run ended.
+        if let Err(error) = regrind::report::write_run_report(&folder) {
+            super::print(&format!("no report: {error}\n"))?;
+        }
         outcome(&ending)
     })
 }
