@@ -66,6 +66,7 @@ fn orders() -> Vec<Order> {
     vec![
         Order::StartMachine { device: Device::Grinder, cycle: 1 },
         Order::Raise(alarm),
+        Order::Finish(Ending::Accepted { cycle: 1, reason: "in tolerance".into() }),
         Order::Announce(Judgement { cycle: 1, verdict: Verdict::Accept, reason: "in tolerance".into() }),
     ]
 }
@@ -81,7 +82,7 @@ fn recorded(simulation: bool) -> (TempDir, PathBuf) {
         station: "console".into(),
         simulation,
         first_command_id: 1,
-        content: json!({ "part_name": "Mirror", "recipe": "recipes/mirror.toml" }),
+        content: json!({ "part_name": "Mirror <A> & B", "recipe": "recipes/mirror.toml" }),
     };
     let mut journal = Journal::create(&folder, header).unwrap();
     journal.store("recipe.toml", b"x = 1\n", 0, 0).unwrap();
@@ -94,8 +95,15 @@ fn recorded(simulation: bool) -> (TempDir, PathBuf) {
     }
     journal.append(Entry::new(Kind::Note, 30, 2, json!({ "pass_record": { "path_mm": 12.5 } }))).unwrap();
     journal.store("cycle-2/measured.csv", b"1,2,3\n", 40, 2).unwrap();
+    journal.store("cycle-1/error_map.png", b"\x89PNG", 40, 1).unwrap();
     let ending = Ending::Accepted { cycle: 2, reason: "in tolerance".into() };
-    journal.close(50, 2, json!({ "simulation": simulation, "ending": ending, "cycles": [] })).unwrap();
+    journal
+        .close(
+            50,
+            2,
+            json!({ "simulation": simulation, "ending": ending, "cycles": [{ "cycle": 1, "level_um": 12.5 }] }),
+        )
+        .unwrap();
     (home, folder)
 }
 
@@ -104,11 +112,11 @@ fn a_sound_record_is_proven_in_words_and_json() {
     let (home, folder) = recorded(true);
     let words = printed(home.path(), &["audit", "verify"], 0);
     assert!(words.starts_with("SIMULATION  runs/mirror-1\n"), "{words}");
-    assert!(words.contains("12 records in an unbroken chain, 2 files unchanged"), "{words}");
+    assert!(words.contains("14 records in an unbroken chain, 3 files unchanged"), "{words}");
     let value: Value =
         serde_json::from_str(&printed(home.path(), &["audit", "verify", folder.to_str().unwrap(), "--json"], 0))
             .unwrap();
-    assert_eq!((&value["sound"], &value["records"], &value["closed"]), (&json!(true), &json!(12), &json!(true)));
+    assert_eq!((&value["sound"], &value["records"], &value["closed"]), (&json!(true), &json!(14), &json!(true)));
     assert!(words.contains(value["head"].as_str().unwrap()));
     fs::copy(folder.join("journal.anchor"), home.path().join("kept")).unwrap();
     printed(home.path(), &["audit", "verify", "--anchor", "kept"], 0);
@@ -126,9 +134,9 @@ fn a_broken_record_is_named_and_ends_with_1() {
     let output = regrind(home.path(), &["audit", "verify"]);
     assert_eq!(output.status.code(), Some(1));
     let error = text(&output.stderr);
-    assert!(error.contains("broken at record 11: the file cycle-2/measured.csv is not what was written"), "{error}");
+    assert!(error.contains("broken at record 12: the file cycle-2/measured.csv is not what was written"), "{error}");
     let value: Value = serde_json::from_str(&printed(home.path(), &["audit", "verify", "--json"], 1)).unwrap();
-    assert_eq!((&value["sound"], &value["record"]), (&json!(false), &json!(11)));
+    assert_eq!((&value["sound"], &value["record"]), (&json!(false), &json!(12)));
 
     let (home, folder) = recorded(true);
     let database = rusqlite::Connection::open(folder.join("journal.sqlite")).unwrap();
@@ -165,9 +173,9 @@ fn folders_without_a_record_end_with_2() {
 fn the_table_says_what_happened_and_is_marked() {
     let (home, _) = recorded(true);
     let shown = printed(home.path(), &["audit", "show"], 0);
-    assert!(shown.starts_with("SIMULATION  runs/mirror-1; Mirror\n"), "{shown}");
+    assert!(shown.starts_with("SIMULATION  runs/mirror-1; Mirror <A> & B\n"), "{shown}");
     let said = [
-        "begin         -  SIMULATION  run mirror-1, Mirror, recipes/mirror.toml",
+        "begin         -  SIMULATION  run mirror-1, Mirror <A> & B, recipes/mirror.toml",
         "artefact      -  recipe.toml, 6 bytes, sha256 ",
         "event         1  start",
         "grinder: connected, a simulation, idle",
@@ -185,9 +193,9 @@ fn the_table_says_what_happened_and_is_marked() {
     assert!(!shown.contains('\u{1b}'), "a machine's words control no terminal");
     let rows =
         |arguments: &[&str]| printed(home.path(), &[&["audit", "show"], arguments].concat(), 0).lines().count() - 2;
-    assert_eq!(rows(&[]), 12);
-    assert_eq!(rows(&["--kind", "intent"]), 3);
-    assert_eq!(rows(&["--kind", "intent,note", "--cycle", "2"]), 4);
+    assert_eq!(rows(&[]), 14);
+    assert_eq!(rows(&["--kind", "intent"]), 4);
+    assert_eq!(rows(&["--kind", "intent,note", "--cycle", "2"]), 5);
     assert_eq!(rows(&["--cycle", "9"]), 0);
     assert_eq!(printed(home.path(), &["audit", "show", "--kind", "event", "--json"], 0).lines().count(), 4);
     let output = regrind(home.path(), &["audit", "show", "--kind", "evnt"]);
@@ -200,7 +208,7 @@ fn what_is_exported_proves_itself() {
     let (home, _) = recorded(false);
     let mut previous = "0".repeat(64);
     let lines = printed(home.path(), &["audit", "export"], 0);
-    assert_eq!(lines.lines().count(), 12);
+    assert_eq!(lines.lines().count(), 14);
     for line in lines.lines() {
         let (hashed, chain) = line.split_once(",\"prev_hash\":\"").unwrap();
         let (prev_hash, rest) = chain.split_once('"').unwrap();
@@ -210,6 +218,44 @@ fn what_is_exported_proves_itself() {
         assert!(serde_json::from_str::<Value>(line).unwrap()["payload"].is_object());
         previous = due;
     }
+}
+
+#[test]
+fn the_report_of_a_run_is_one_file_that_needs_nothing_else() {
+    let (home, folder) = recorded(true);
+    assert_eq!(printed(home.path(), &["report"], 0), "runs/mirror-1/report.html\n");
+    let html = fs::read_to_string(folder.join("report.html")).unwrap();
+    let document = roxmltree::Document::parse(html.strip_prefix("<!DOCTYPE html>\n").unwrap()).unwrap();
+    let all: String = document.descendants().filter_map(|node| node.text()).collect();
+    let head = fs::read_to_string(folder.join("journal.anchor")).unwrap();
+    let head: Value = serde_json::from_str(&head).unwrap();
+    let said = [
+        "SIMULATION",
+        "Mirror <A> & B",
+        "SN 7",
+        "recipes/mirror.toml",
+        "Ada at console",
+        "ACCEPTED: in tolerance",
+        "4.20 \u{b1} 0.50",
+        "0.812 \u{b1} 0.100",
+        "12.5",
+        "A machine is in fault: grinder. The run is aborted. Look at it.",
+        head["head"].as_str().unwrap(),
+    ];
+    for words in said {
+        assert!(all.contains(words), "{words}\n{all}");
+    }
+    let image = document.descendants().find(|node| node.has_tag_name("img")).unwrap();
+    assert_eq!(image.attribute("src"), Some("data:image/png;base64,iVBORw=="));
+    assert!(!html.contains("http"), "nothing is fetched");
+    printed(home.path(), &["audit", "verify"], 0);
+    let (other, _) = recorded(false);
+    printed(other.path(), &["report"], 0);
+    assert!(!fs::read_to_string(other.path().join("runs/mirror-1/report.html")).unwrap().contains("SIMULATION"));
+    fs::remove_file(folder.join("cycle-1/error_map.png")).unwrap();
+    assert!(text(&regrind(home.path(), &["report"]).stderr).contains("cycle-1/error_map.png is missing"));
+    printed(home.path(), &["report"], 1);
+    printed(home.path(), &["report", "."], 2);
 }
 
 #[test]
@@ -238,9 +284,6 @@ fn states_are_printed_and_the_picture_in_the_documentation_is_current() {
     assert!(idle.starts_with("Idle\n"), "{idle}");
     assert!(idle.contains("  Start                          -> Starting"), "{idle}");
     assert!(!idle.contains("Refuse"), "{idle}");
-    let value: Value =
-        serde_json::from_str(&printed(home.path(), &["states", "--state", "Held", "--json"], 0)).unwrap();
-    assert!(value.as_array().unwrap().iter().all(|row| row["state"].as_str().unwrap().starts_with("Held (")));
     let unknown = regrind(home.path(), &["states", "--state", "x"]);
     assert_eq!(unknown.status.code(), Some(2));
     assert!(text(&unknown.stderr).contains("give one of Idle, Starting, Execute"), "{}", text(&unknown.stderr));

@@ -44,16 +44,18 @@ impl Answer {
 pub fn table() -> Vec<Row> {
     let mut rows: BTreeMap<(State, String), BTreeSet<Answer>> = BTreeMap::new();
     let mut open: VecDeque<Cell> = [Disposal::Hold, Disposal::Stop].into_iter().map(|d| Cell::new(plan(d))).collect();
-    let mut seen = BTreeSet::new();
+    let (mut seen, mut named) = (BTreeSet::new(), BTreeMap::new());
     while let Some(cell) = open.pop_front() {
-        for event in samples(cell.cycle()) {
+        let events: &Vec<(String, Event)> = named
+            .entry(cell.cycle())
+            .or_insert_with(|| samples(cell.cycle()).into_iter().map(|event| (name_of(&event), event)).collect());
+        for (name, event) in events {
             let mut next = cell.clone();
-            let name = name_of(&event);
             // Late enough for whatever is due.
             let now = cell.next_deadline().unwrap_or(Duration::ZERO);
-            let commands = next.handle(now, event).iter().map(Command::name).collect();
+            let commands = next.handle(now, event.clone()).iter().map(Command::name).collect();
             let answer = Answer { next: next.state(), commands };
-            rows.entry((cell.state(), name)).or_default().insert(answer);
+            rows.entry((cell.state(), name.clone())).or_default().insert(answer);
             if seen.insert(key(&next)) {
                 open.push_back(next);
             }
@@ -65,10 +67,7 @@ pub fn table() -> Vec<Row> {
 /// What decides how a cell answers, without times and counts, and no finer than the table needs.
 fn key(cell: &Cell) -> impl Ord + use<> {
     let known = cell.known.map(|known| (known.ready, known.met && known.stands));
-    // At the end of a run it matters which machine is clear already, elsewhere only whether both are.
-    let both = cell.known.iter().all(|known| known.clear);
-    let ends = matches!(cell.state, State::Aborting | State::Completing);
-    let clear = cell.known.map(|known| if ends { known.clear } else { both });
+    let clear = cell.known.map(|known| known.clear);
     let memory = (cell.worse.min(1), cell.repeated, cell.previous.is_some(), cell.passes >= cell.plan.max_cycles);
     (cell.state, known, clear, cell.causes.is_empty(), memory, cell.plan.on_stall == Disposal::Hold)
 }

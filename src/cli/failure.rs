@@ -4,7 +4,9 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use regrind::formats::FormatError;
+use regrind::journal::JournalError;
 use regrind::registration::RegistrationError;
+use regrind::report::ReportError;
 use regrind::surface::{DefinitionError, SurfaceError};
 use thiserror::Error;
 
@@ -46,15 +48,15 @@ pub(super) enum Failure {
     Simulation { path: PathBuf, reason: String },
     /// The record was read and cannot be believed.
     #[error(transparent)]
-    Broken(regrind::journal::JournalError),
+    Broken(JournalError),
     #[error("{path}: {reason}; give a copy of the journal.anchor of this run")]
     Anchor { path: PathBuf, reason: String },
     #[error(transparent)]
-    Picture(regrind::report::ReportError),
+    Report(ReportError),
     #[error("--state {name}: no state begins so; give one of {known}")]
     NoState { name: String, known: String },
     #[error(transparent)]
-    Journal(regrind::journal::JournalError),
+    Journal(JournalError),
     #[error("{path}: no control socket can be made there: {source}; give --runs a local folder with a shorter name")]
     ControlSocket { path: PathBuf, source: io::Error },
     #[error("{path}: no run was made there; name the folder of a run")]
@@ -90,7 +92,7 @@ impl Failure {
             | Self::OrderRefused { .. }
             | Self::Setup(regrind::setup::SetupError::Wire { .. })
             | Self::Ended { .. } => FAULT,
-            Self::Broken(_) => NOT_AS_IT_SHOULD_BE,
+            Self::Broken(_) | Self::Report(ReportError::Record(JournalError::Broken { .. })) => NOT_AS_IT_SHOULD_BE,
             _ => BAD_INPUT,
         }
     }

@@ -9,6 +9,7 @@ mod initial;
 mod nominal;
 mod plan;
 mod register;
+mod report;
 mod run;
 mod schema;
 mod show;
@@ -51,6 +52,7 @@ enum Command {
     /// Tell how a running cell is
     Status(control::Arguments),
     Audit(audit::Arguments),
+    Report(report::Arguments),
     Register(register::Arguments),
     Accuracy(accuracy::Arguments),
     Check(check::Arguments),
@@ -95,6 +97,7 @@ fn run() -> ExitCode {
         Command::Confirm(arguments) => control::confirm(&arguments),
         Command::Status(arguments) => control::order(&arguments, Order::Status),
         Command::Audit(arguments) => audit::run(&arguments),
+        Command::Report(arguments) => report::run(&arguments),
         Command::Register(arguments) => register::run(&arguments),
         Command::Accuracy(arguments) => accuracy::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),

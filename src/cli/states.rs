@@ -41,7 +41,7 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let rows = table();
     if let Some(path) = &arguments.svg {
-        save_text(path, &state_picture(&rows)).map_err(Failure::Picture)?;
+        save_text(path, &state_picture(&rows)).map_err(Failure::Report)?;
         return Ok(Outcome::Accepted);
     }
     let wanted = arguments.state.as_deref().unwrap_or_default().to_lowercase();

@@ -12,7 +12,7 @@ use serde::Serialize;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
-use crate::cell::{Asked, Condition, Device, Event, Found, JobResult, Mismatch, Reconciliation};
+use crate::cell::{Asked, Condition, Device, Event, Found, Gate, GateFailure, JobResult, Mismatch, Reconciliation};
 use crate::device::exchange::Step;
 use crate::device::{
     Armed, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, Measurement, Outcome,
@@ -485,7 +485,13 @@ impl<B: Bench> Station<B> {
         match self.bench.harvest(job, &self.interrupt).await {
             // The drive gates the points and tells the cell; this only hands them over.
             Ok(harvest) => self.hand_over(harvest).await,
-            Err(error) => self.failed(Asked::Collect, error).await,
+            Err(error) => match unusable(&error) {
+                Some(failure) => {
+                    let (targets, found) = (0, 0);
+                    self.tell(Event::Collected { cycle, targets, found, gate: Gate::Failed(failure) }).await;
+                }
+                None => self.failed(Asked::Collect, error).await,
+            },
         }
     }
 
@@ -519,7 +525,7 @@ impl<B: Bench> Station<B> {
         }
         match error {
             DeviceError::Faulted { fault, .. } if fault != Fault::None => {
-                let (device, words) = (B::DEVICE, fault.to_string());
+                let (device, words) = (B::DEVICE, fault_words(B::DEVICE, fault));
                 self.tell(Event::Fault { device, code: fault_code(fault), words }).await;
             }
             _ => self.tell(Event::Refused { device: B::DEVICE, what, why: error.to_string() }).await,
@@ -614,7 +620,8 @@ impl<B: Bench> Station<B> {
             }
             State::Aborted => self.note_abort(before).await,
             State::Faulted if before != Some(State::Faulted) => {
-                let (device, code, words) = (B::DEVICE, fault_code(status.fault), status.fault.to_string());
+                let (device, code) = (B::DEVICE, fault_code(status.fault));
+                let words = fault_words(device, status.fault);
                 self.tell(Event::Fault { device, code, words }).await;
             }
             _ => {}
@@ -709,6 +716,31 @@ fn fault_code(fault: Fault) -> u16 {
         Fault::Tool => 6,
         Fault::ClientSilent => 20,
         Fault::Other(number) => number,
+    }
+}
+
+/// Says what a fault means at this machine.
+fn fault_words(device: Device, fault: Fault) -> String {
+    match (device, fault) {
+        // A probe that meets material in the air is well; it is the part that is elsewhere.
+        (Device::Cmm, Fault::Collision) => {
+            "the probe met material where only air should be: see how the part lies (turned round, in another seat, another \
+             part) and whether the probe is whole, before clearing"
+                .to_owned()
+        }
+        (_, fault) => fault.to_string(),
+    }
+}
+
+/// A result that came and cannot be used; `None` where it did not come.
+fn unusable(error: &DeviceError) -> Option<GateFailure> {
+    match error {
+        DeviceError::NotFinite { .. }
+        | DeviceError::OutOfRange { .. }
+        | DeviceError::Unlisted { .. }
+        | DeviceError::Count { .. } => Some(GateFailure::Broken(error.to_string())),
+        DeviceError::Mismatch { .. } => Some(GateFailure::Foreign(error.to_string())),
+        _ => None,
     }
 }
 

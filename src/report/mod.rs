@@ -14,6 +14,7 @@ mod colour;
 mod heat_map;
 mod plot;
 mod raster;
+mod run;
 mod states;
 mod svg;
 mod words;
@@ -28,6 +29,7 @@ pub use axis::Scale;
 pub use colour::ColourMap;
 pub use heat_map::HeatMap;
 pub use plot::{Axis, Plot, Series};
+pub use run::{RUN_REPORT, write_run_report};
 pub use states::state_picture;
 pub use words::{ending_words, words};
 
@@ -91,6 +93,17 @@ pub enum ReportError {
         figure: String,
         /// The encoder's reason.
         source: png::EncodingError,
+    },
+    /// The record of the run cannot be read or believed.
+    #[error(transparent)]
+    Record(#[from] crate::journal::JournalError),
+    /// A file on record could not be read.
+    #[error("{path}: cannot be read: {source}; check the folder and its permissions")]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
     },
     /// The file could not be written.
     #[error("{path}: cannot be written: {source}; check the folder, the permissions and the space left")]

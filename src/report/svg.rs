@@ -205,7 +205,7 @@ impl Svg {
 }
 
 /// Replaces what XML reserves or forbids.
-fn escaped(text: &str) -> String {
+pub(super) fn escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
         match c {

@@ -17,10 +17,11 @@ pub fn words(record: &Record) -> String {
         Kind::Begin => begin_words(&value),
         Kind::Reopen => Some("opened again".to_owned()),
         Kind::Intent => serde_json::from_value(value.clone()).ok().map(|command: Command| command_words(&command)),
+        Kind::Outcome => value["event"].as_str().map(|event| format!("answered: {}", event.replace('_', " "))),
         Kind::Event => serde_json::from_value(value.clone()).ok().map(|event: Event| event_words(&event)),
         Kind::Artefact => artefact_words(&value),
         Kind::End => end_words(&value),
-        Kind::Outcome | Kind::Note => None,
+        Kind::Note => None,
     };
     let mut line = told.unwrap_or_else(|| value.as_str().map_or_else(|| record.payload.clone(), str::to_owned));
     if !record.reason.is_empty() {

@@ -1,0 +1,142 @@
+//! The program itself as a process, and one that is ended with the test.
+#![allow(dead_code, reason = "not every test that includes this uses all of it")]
+
+use std::fs;
+use std::io::{BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::mpsc::{Receiver, channel};
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+/// Longest wait for anything that must happen.
+pub const PATIENCE: Duration = Duration::from_secs(120);
+
+pub fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// Returns the text of a shipped file with some of it replaced, wherever it stands.
+pub fn changed(file: &str, changes: &[(&str, &str)]) -> String {
+    let mut text = fs::read_to_string(root().join(file)).unwrap();
+    for (from, to) in changes {
+        assert!(text.contains(from), "{file} has no {from:?}");
+        text = text.replace(from, to);
+    }
+    text
+}
+
+/// The shipped free-form mirror with 300 points; its machines take no second for a job.
+pub fn small_recipe(folder: &Path, speed: f64) -> PathBuf {
+    let speed = format!("[simulation]\nseed = 1\nspeed = {speed:.1}");
+    let changes = [
+        ("columns = 60", "columns = 20"),
+        ("rows = 30", "rows = 15"),
+        ("accuracy_nm = 0.5", "spacing_mm = 0.5"),
+        ("cutoff_mm = 5.0", "cutoff_mm = 11.0"),
+        ("[simulation]\nseed = 1", &speed),
+    ];
+    let path = folder.join("small.toml");
+    fs::write(&path, changed("recipes/freeform-mirror.toml", &changes)).unwrap();
+    path
+}
+
+pub fn regrind(arguments: &[&str], folder: &Path) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_regrind"));
+    command.args(arguments).current_dir(folder).stdin(Stdio::null());
+    command
+}
+
+/// A process whose lines are read as they come.
+pub struct Running {
+    child: Child,
+    lines: Receiver<String>,
+    errors: Option<std::thread::JoinHandle<String>>,
+    pub said: Vec<String>,
+}
+
+impl Running {
+    pub fn new(mut command: Command) -> Self {
+        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let (to, lines) = channel();
+        let out = BufReader::new(child.stdout.take().unwrap());
+        std::thread::spawn(move || out.lines().map_while(Result::ok).try_for_each(|line| to.send(line)));
+        let mut errors = child.stderr.take().unwrap();
+        let errors = std::thread::spawn(move || {
+            let mut text = String::new();
+            // What is no text is not looked at.
+            let _ = errors.read_to_string(&mut text);
+            text
+        });
+        Self { child, lines, errors: Some(errors), said: Vec::new() }
+    }
+
+    /// Waits for a line that will do.
+    pub fn line(&mut self, what: &str, will_do: impl Fn(&str) -> bool) -> String {
+        let began = Instant::now();
+        while let Ok(line) = self.lines.recv_timeout(PATIENCE.saturating_sub(began.elapsed())) {
+            self.said.push(line.clone());
+            if will_do(&line) {
+                return line;
+            }
+        }
+        let _ = self.child.kill();
+        panic!("no {what}:\n{}\n{}", self.said.join("\n"), self.errors.take().unwrap().join().unwrap());
+    }
+
+    /// Presses Ctrl-C.
+    pub fn interrupt(&self) {
+        let done = Command::new("kill").args(["-INT", &self.child.id().to_string()]).status().unwrap();
+        assert!(done.success());
+    }
+
+    /// Waits for the end; returns the exit code and what was said on the error stream.
+    pub fn end(&mut self) -> (i32, String) {
+        let began = Instant::now();
+        let code = loop {
+            while let Ok(line) = self.lines.recv_timeout(Duration::from_millis(20)) {
+                self.said.push(line);
+            }
+            if let Some(status) = self.child.try_wait().unwrap() {
+                break status.code().unwrap_or(-1);
+            }
+            if began.elapsed() > PATIENCE {
+                let _ = self.child.kill();
+                panic!("it does not end:\n{}", self.said.join("\n"));
+            }
+        };
+        while let Ok(line) = self.lines.recv() {
+            self.said.push(line);
+        }
+        (code, self.errors.take().map(|e| e.join().unwrap()).unwrap_or_default())
+    }
+
+    /// The folder of the run, once it is named.
+    pub fn folder(&mut self, home: &Path) -> PathBuf {
+        let line = self.line("run folder", |line| line.starts_with("record in "));
+        home.join(line.trim_start_matches("record in "))
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        // It may have ended long ago.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Runs the program to its end.
+pub fn run(arguments: &[&str], folder: &Path) -> (i32, String, String) {
+    let Output { status, stdout, stderr } = regrind(arguments, folder).output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    (status.code().unwrap_or(-1), text(stdout), text(stderr))
+}
+
+/// The content of the journal's records of a kind that have a key.
+pub fn records_with(folder: &Path, key: &str) -> Vec<Value> {
+    let reader = regrind::journal::Reader::open(folder).unwrap();
+    let values = reader.records(1).map(|record| record.unwrap().value());
+    values.filter(|value| value.get(key).is_some()).collect()
+}

@@ -1,0 +1,225 @@
+//! A simulated cell in the process of a test: the world, its wires, and as many runs as are wanted, one after the other.
+#![allow(dead_code, reason = "not every test that includes this uses all of it")]
+
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use regrind::cell::Actor;
+use regrind::config::{CellConfig, Link};
+use regrind::device::{ModbusCmm, ModbusGrinder};
+use regrind::drive::{Notice, Reply, Request, Run, ask};
+use regrind::journal::{Header, Journal};
+use regrind::recipe::Recipe;
+use regrind::setup;
+use regrind_sim::registers::{Machine, MachineOptions};
+use regrind_sim::wire::Serving;
+use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, When};
+use regrind_sim::world::{World, WorldSpec};
+use serde::Deserialize;
+use serde_json::json;
+use tempfile::TempDir;
+use tokio::sync::mpsc;
+
+/// Longest wait for anything that must happen.
+pub const PATIENCE: Duration = Duration::from_secs(60);
+pub const CMM: usize = 0;
+pub const GRINDER: usize = 1;
+
+/// Returns the text of a shipped file with some of it replaced.
+pub fn changed(file: &str, changes: &[(&str, &str)]) -> String {
+    let mut text = std::fs::read_to_string(root().join(file)).unwrap();
+    for (from, to) in changes {
+        assert!(text.contains(from), "{file} has no {from:?}");
+        text = text.replacen(from, to, 1);
+    }
+    text
+}
+
+pub fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// The shipped free-form mirror on a coarser net, so that a cycle takes a second.
+pub fn small(columns: u32, rows: u32, speed: f64) -> Recipe {
+    let of = [
+        ("columns = 60", format!("columns = {columns}")),
+        ("rows = 30", format!("rows = {rows}")),
+        ("accuracy_nm = 0.5", "spacing_mm = 0.5".to_owned()),
+        ("cutoff_mm = 5.0", "cutoff_mm = 20.0".to_owned()),
+        ("[simulation]\nseed = 1", format!("[simulation]\nseed = 1\nspeed = {speed:.1}")),
+    ];
+    let changes: Vec<(&str, &str)> = of.iter().map(|(from, to)| (*from, to.as_str())).collect();
+    recipe(&changes)
+}
+
+pub fn recipe(changes: &[(&str, &str)]) -> Recipe {
+    let text = changed("recipes/freeform-mirror.toml", changes);
+    Recipe::parse(&root().join("recipes/freeform-mirror.toml"), &text).unwrap_or_else(|p| panic!("{p:?}"))
+}
+
+/// A request that came to a simulated machine, when it came.
+#[derive(Clone, Copy, Debug)]
+pub struct Came {
+    pub at: Instant,
+    /// Whether it changed the beat.
+    pub beat: bool,
+    /// The number of the command, if it was one.
+    pub command: Option<u16>,
+}
+
+/// What a test does when a command comes, before the machine sees it.
+pub type Watch = Box<dyn FnMut(u16) + Send>;
+
+/// The world and its wires.
+pub struct Rig {
+    pub world: World,
+    pub servings: [Serving; 2],
+    pub came: [Arc<Mutex<Vec<Came>>>; 2],
+    pub recipe: Recipe,
+    pub cell: CellConfig,
+    pub home: TempDir,
+    runs: u32,
+}
+
+/// A run that has everything but its drive.
+pub struct Ready {
+    pub run: Run,
+    pub cmm: ModbusCmm,
+    pub grinder: ModbusGrinder,
+    pub notices: mpsc::UnboundedReceiver<Notice>,
+    pub folder: PathBuf,
+}
+
+impl Rig {
+    pub async fn new(recipe: Recipe) -> Self {
+        let spec = WorldSpec::deserialize(toml::Value::Table(recipe.simulation.clone().unwrap())).unwrap();
+        let speed = spec.speed;
+        let world = World::new(spec).unwrap();
+        let options = |seed| MachineOptions { speed, seed, ..MachineOptions::default() };
+        let cmm = Machine::new(Box::new(world.cmm()), 71, options(1));
+        let grinder = Machine::new(Box::new(world.grinder()), 72, options(2));
+        let serve = |unit, machine| Serving::tcp_with(("127.0.0.1", 0), vec![(unit, machine)], Faults::none());
+        let servings = [serve(1, cmm).await.unwrap(), serve(2, grinder).await.unwrap()];
+        let port = |k: usize| format!("port = {}", servings[k].local_addr().unwrap().port());
+        let text = changed("config/modbus-tcp.toml", &[("port = 15021", &port(0)), ("port = 15022", &port(1))]);
+        let cell = CellConfig::parse(Path::new("cell.toml"), &text).unwrap_or_else(|p| panic!("{p:?}"));
+        let rig = Self {
+            world,
+            servings,
+            came: [Arc::default(), Arc::default()],
+            recipe,
+            cell,
+            home: tempfile::tempdir().unwrap(),
+            runs: 0,
+        };
+        rig.watch(CMM, Box::new(|_| ()));
+        rig.watch(GRINDER, Box::new(|_| ()));
+        rig
+    }
+
+    /// Lets a test look at the moment at which a command comes.
+    pub fn watch(&self, machine: usize, mut watch: Watch) {
+        let came = Arc::clone(&self.came[machine]);
+        let look = move |request: &regrind_sim::wire::faults::Request| {
+            let beat = request.function == 16 && request.address == 36;
+            came.lock().unwrap().push(Came { at: Instant::now(), beat, command: request.command });
+            if let Some(command) = request.command {
+                watch(command);
+            }
+            false
+        };
+        let plan = FaultPlan::new(1).always(When::Matching(Box::new(look)), Fault::DropRequest);
+        self.servings[machine].faults().set(plan);
+    }
+
+    /// Prepares the next run: another job, so another part.
+    pub fn next(&mut self, loaded: bool) -> Ready {
+        self.runs += 1;
+        self.came.iter().for_each(|came| came.lock().unwrap().clear());
+        let (task, plan) = setup::prepare(&self.recipe, &self.cell).unwrap();
+        let folder = self.home.path().join(self.runs.to_string());
+        let header = Header {
+            run: self.runs.to_string(),
+            part: "SN-1".into(),
+            actor: "a test".into(),
+            station: "here".into(),
+            simulation: true,
+            first_command_id: 1,
+            content: json!({}),
+        };
+        let journal = Journal::create(&folder, header).unwrap();
+        let (notices, shown) = mpsc::unbounded_channel();
+        let link = |link: &Link| setup::modbus(link, 7, self.runs).unwrap();
+        let cmm = ModbusCmm::new(link(&self.cell.cmm.link)).unwrap();
+        let grinder = ModbusGrinder::new(link(&self.cell.grinder.link)).unwrap();
+        let run = Run {
+            plan,
+            task,
+            journal,
+            job: self.runs,
+            actor: Actor { name: "a test".into(), station: "here".into() },
+            loaded,
+            poll: [self.cell.cmm.link.timing.poll, self.cell.grinder.link.timing.poll],
+            notices,
+            interrupted: None,
+        };
+        Ready { run, cmm, grinder, notices: shown, folder }
+    }
+
+    /// When a command came to a machine, if it has.
+    pub fn command_at(&self, machine: usize, command: u16, since: Instant) -> Option<Instant> {
+        let came = self.came[machine].lock().unwrap();
+        came.iter().find(|c| c.command == Some(command) && c.at >= since).map(|c| c.at)
+    }
+}
+
+/// Gives an order over the control socket, as another terminal does; returns the answer and how long it took.
+pub async fn order(folder: &Path, request: Request) -> (Reply, Instant, Duration) {
+    let folder = folder.to_owned();
+    tokio::task::spawn_blocking(move || {
+        let began = Instant::now();
+        let reply = ask(&folder, &request).unwrap();
+        (reply, began, began.elapsed())
+    })
+    .await
+    .unwrap()
+}
+
+/// The state of a running cell, in words.
+pub async fn words(folder: &Path) -> String {
+    order(folder, Request::Status).await.0.status["words"].as_str().unwrap_or_default().to_owned()
+}
+
+/// Asks until the cell is in a state that will do, and returns its words.
+pub async fn until(folder: &Path, will_do: impl Fn(&str) -> bool) -> String {
+    let began = Instant::now();
+    loop {
+        let words = words(folder).await;
+        if will_do(&words) {
+            return words;
+        }
+        assert!(began.elapsed() < PATIENCE, "the cell stays {words}");
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+}
+
+/// Waits for an event of the run, from where the notices are.
+pub async fn event(notices: &mut mpsc::UnboundedReceiver<Notice>, wanted: &str, times: usize) {
+    let mut left = times;
+    let waiting = async {
+        while left > 0 {
+            let notice = notices.recv().await.expect("the run goes on");
+            let name = match &notice {
+                Notice::State { event, .. } => event.as_str(),
+                Notice::Progress { .. } => "progressed",
+                Notice::Figures { .. } => "registered",
+                Notice::Compensated { .. } => "compensated",
+                Notice::Finished { ending, .. } => panic!("over before {wanted}: {ending:?}"),
+                _ => "",
+            };
+            left -= usize::from(name == wanted);
+        }
+    };
+    tokio::time::timeout(PATIENCE, waiting).await.unwrap_or_else(|_| panic!("no {wanted}"));
+}

@@ -1,0 +1,116 @@
+//! One run that is held, resumed and aborted at a wanted moment from another terminal, with what came of it.
+#![allow(dead_code, reason = "not every test that includes this uses all of it")]
+
+use std::time::{Duration, Instant};
+
+use regrind::cell::Ending;
+use regrind::drive::{Drive, Request};
+
+use crate::rig::{CMM, GRINDER, Rig, event, order, until, words};
+
+/// A moment of a run: a name, the events to wait for, and whether loading the part is confirmed by itself.
+pub struct Moment {
+    pub name: &'static str,
+    pub after: &'static [(&'static str, usize)],
+    pub loaded: bool,
+}
+
+const fn moment(name: &'static str, after: &'static [(&'static str, usize)]) -> Moment {
+    Moment { name, after, loaded: true }
+}
+
+/// Every phase, by the event that leads there.
+pub const MOMENTS: [Moment; 15] = [
+    Moment { name: "load", after: &[("connected", 2)], loaded: false },
+    moment("grind, send", &[("load_confirmed", 1)]),
+    moment("grind, prepare", &[("pass_loaded", 1)]),
+    moment("grind, start", &[("prepared", 1)]),
+    moment("grind, run", &[("started", 1), ("progressed", 1)]),
+    moment("grind, end", &[("ended", 1)]),
+    moment("transfer", &[("acknowledged", 1)]),
+    moment("measure, send", &[("acknowledged", 1), ("cleared", 1)]),
+    moment("measure, prepare", &[("plan_loaded", 1)]),
+    moment("measure, start", &[("prepared", 2)]),
+    moment("measure, run", &[("started", 2)]),
+    moment("measure, collect", &[("ended", 2)]),
+    moment("register", &[("acknowledged", 2)]),
+    moment("judge and compensate", &[("registered", 1)]),
+    moment("grind again", &[("compensated", 1)]),
+];
+
+/// What came of one try. Times are from before the order was written.
+#[derive(Debug, Default)]
+pub struct Tried {
+    /// The state in which the cell was after the first order.
+    pub state: String,
+    /// To the HOLD on the wire; none where no machine moved.
+    pub hold: Option<Duration>,
+    pub hold_answered: Option<Duration>,
+    /// To the RESUME on the wire; none where no machine was held.
+    pub resume: Option<Duration>,
+    pub resume_answered: Option<Duration>,
+    /// To the ABORT on each wire.
+    pub abort: Vec<Duration>,
+    pub abort_answered: Duration,
+    /// Commands that came to a machine after its ABORT, other than ABORT and the RELEASE that gives it back.
+    pub after_abort: Vec<u16>,
+}
+
+/// Begins a run, holds and resumes it at a moment if wanted, aborts it, and sees it to its end.
+pub async fn attempt(rig: &mut Rig, moment: &Moment, hold: bool) -> (Tried, std::path::PathBuf) {
+    let ready = rig.next(moment.loaded);
+    attempt_with(rig, ready, moment, hold).await
+}
+
+pub async fn attempt_with(
+    rig: &Rig,
+    ready: crate::rig::Ready,
+    moment: &Moment,
+    hold: bool,
+) -> (Tried, std::path::PathBuf) {
+    let crate::rig::Ready { run, cmm, grinder, mut notices, folder } = ready;
+    let (drive, _orders) = Drive::new(run, cmm, grinder).unwrap();
+    let running = tokio::spawn(drive.run());
+    for (name, times) in moment.after {
+        event(&mut notices, name, *times).await;
+    }
+    let mut tried = Tried::default();
+    if hold {
+        hold_and_resume(rig, &folder, &mut tried).await;
+    }
+    let (reply, began, took) = order(&folder, Request::Abort { reason: "a try".into() }).await;
+    assert!(reply.accepted, "{}: {reply:?}", moment.name);
+    tried.abort_answered = took;
+    if !hold {
+        tried.state = reply.words;
+    }
+    let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
+    assert!(matches!(ending, Ending::Aborted { confirmed: true, .. }), "{}: {ending:?}", moment.name);
+    for machine in [CMM, GRINDER] {
+        let at = rig.command_at(machine, 7, began).expect("ABORT came to both machines");
+        tried.abort.push(at - began);
+        let came = rig.came[machine].lock().unwrap();
+        let later = came.iter().filter(|c| c.at > at).filter_map(|c| c.command);
+        tried.after_abort.extend(later.filter(|command| ![7, 10].contains(command)));
+    }
+    (tried, folder)
+}
+
+async fn hold_and_resume(rig: &Rig, folder: &std::path::Path, tried: &mut Tried) {
+    let (reply, began, took) = order(folder, Request::Hold { reason: "a try".into() }).await;
+    assert!(reply.accepted, "{reply:?}");
+    tried.hold_answered = Some(took);
+    until(folder, |words| words.starts_with("Held")).await;
+    tried.hold = [CMM, GRINDER].iter().find_map(|m| rig.command_at(*m, 4, began)).map(|at| at - began);
+    tried.state = words(folder).await;
+    let began = Instant::now();
+    let (reply, began_order, took) = order(folder, Request::Resume { reason: "a try".into() }).await;
+    assert!(reply.accepted, "{reply:?}, {began:?}");
+    tried.resume_answered = Some(took);
+    if reply.words.starts_with("Unholding") {
+        until(folder, |words| !words.starts_with("Unholding")).await;
+        tried.resume =
+            [CMM, GRINDER].iter().find_map(|m| rig.command_at(*m, 5, began_order)).map(|at| at - began_order);
+        assert!(tried.resume.is_some(), "a held machine was told to go on");
+    }
+}
