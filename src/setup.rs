@@ -66,7 +66,7 @@ pub enum SetupError {
     )]
     Folder { cell: PathBuf, key: String, path: PathBuf, machine: &'static str },
     #[error("{cell}: {key}: {source}")]
-    References { cell: PathBuf, key: &'static str, source: ExchangeError },
+    References { cell: PathBuf, key: &'static str, source: Box<ExchangeError> },
     #[error("{path}: {wire} cannot be opened: {source}; check the cell file and the machine")]
     Wire { path: PathBuf, wire: String, source: std::io::Error },
 }
@@ -432,7 +432,7 @@ fn stations(cell: &CellConfig, exchange: &config::FileExchange, nominal: &Path) 
     files::read_references(nominal, group.as_deref()).map_err(|source| SetupError::References {
         cell: cell.path().to_owned(),
         key: "cmm.wire.reference_points",
-        source,
+        source: Box::new(source),
     })?;
     let files = exchange.stations.iter().map(|station| StationFiles {
         points: files::Pattern::new(&*station.points),

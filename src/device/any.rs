@@ -11,6 +11,8 @@ macro_rules! any_machine {
     ($(#[$doc:meta])* $any:ident<$folders:ident: $mailbox:ident> { $($(#[$says:meta])* $wire:ident($driver:ty)),+ $(,)? }) => {
         $(#[$doc])*
         #[derive(Debug)]
+        // There are two of these in a program; nothing is gained by a box.
+        #[allow(clippy::large_enum_variant)]
         pub enum $any<$folders: $mailbox> {
             $($(#[$says])* $wire($driver)),+
         }
