@@ -537,8 +537,7 @@ fn conclude(
     let mut verdict = verdict::judge(problem, &descent, &tracks, seed, trace.len());
     let reporter = verdict::Reporter::new(part, &descent.lever, &verdict, options);
     let pose = &descent.cmm_from_model;
-    let report = |track: &Track, at_foot| reporter.deviation(track, at_foot);
-    let deviations = at_feet(&problem.surface, problem.measured, &tracks, pose, &descent.lever, report);
+    let deviations = at_feet(&problem.surface, problem.measured, &tracks, pose, &descent.lever, &reporter);
     verdict.coverage = verdict::coverage(part.nominal, &deviations);
     Ok(Registration { cmm_from_model: descent.cmm_from_model, deviations, trace, side: seed.side, verdict })
 }

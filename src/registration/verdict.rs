@@ -6,8 +6,9 @@ use nalgebra::{DMatrix, Matrix6, Vector6};
 
 use crate::geometry::{Point, Pose, Vector};
 use crate::surface::Nominal;
+use crate::surface::lanes::{LANES, Lane};
 
-use super::correspond::{Final, Track};
+use super::correspond::{FourFinal, Report, Track};
 use super::iterate::{Descent, Problem, free_directions};
 use super::linearize::Lever;
 use super::solve::Spectrum;
@@ -308,17 +309,49 @@ impl<'a> Reporter<'a> {
             back_mm: if options.method == Method::Contact { 0.0 } else { options.probe_radius_mm },
         }
     }
+}
 
-    /// Returns the deviation of one point.
-    pub(crate) fn deviation(&self, track: &Track, f: Final) -> Deviation {
-        let point = f.centre - f.foot.normal * self.back_mm;
-        let beyond_outline = self.nominal.outline().is_some_and(|o| !o.contains(point.x, point.y));
-        Deviation {
-            point,
-            normal: f.foot.normal,
-            deviation_mm: f.foot.distance_mm - self.subtract_mm,
-            uncertainty_mm: (self.variance_mm2 + f.row.dot(&(self.scaled * f.row)).max(0.0)).sqrt(),
-            status: if beyond_outline { PointStatus::OffPart } else { track.status() },
+impl Report for Reporter<'_> {
+    type Item = Deviation;
+
+    const BLANK: Deviation = Deviation {
+        point: Point::new(0.0, 0.0, 0.0),
+        normal: Vector::new(0.0, 0.0, 0.0),
+        deviation_mm: 0.0,
+        uncertainty_mm: 0.0,
+        status: PointStatus::Used,
+    };
+
+    #[inline(always)]
+    fn four(&self, tracks: [&Track; LANES], at: &FourFinal) -> [Deviation; LANES] {
+        let normal = &at.feet.normal;
+        let back = Lane::splat(self.back_mm);
+        let contact =
+            [at.centre[0] - normal[0] * back, at.centre[1] - normal[1] * back, at.centre[2] - normal[2] * back];
+        let deviation = at.feet.distance_mm - Lane::splat(self.subtract_mm);
+        let mut variance = Lane::splat(0.0);
+        for i in 0..6 {
+            let mut along = Lane::splat(0.0);
+            for j in 0..6 {
+                along = along + Lane::splat(self.scaled[(i, j)]) * at.row[j];
+            }
+            variance = variance + at.row[i] * along;
         }
+        let mut deviations = [Self::BLANK; LANES];
+        for (l, found) in deviations.iter_mut().enumerate() {
+            let point = Point::new(contact[0].0[l], contact[1].0[l], contact[2].0[l]);
+            let beyond_outline = match self.nominal.outline() {
+                Some(outline) => !outline.contains(point.x, point.y),
+                None => false,
+            };
+            *found = Deviation {
+                point,
+                normal: Vector::new(normal[0].0[l], normal[1].0[l], normal[2].0[l]),
+                deviation_mm: deviation.0[l],
+                uncertainty_mm: (self.variance_mm2 + variance.0[l].max(0.0)).sqrt(),
+                status: if beyond_outline { PointStatus::OffPart } else { tracks[l].status() },
+            };
+        }
+        deviations
     }
 }

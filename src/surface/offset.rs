@@ -88,6 +88,11 @@ impl Place {
     /// Nothing known yet.
     pub const UNKNOWN: Self = Self { patch: 0, facet: u32::MAX };
 
+    /// A facet of a surface of one patch.
+    pub(crate) fn on_first_patch(facet: u32) -> Self {
+        Self { patch: 0, facet }
+    }
+
     pub(crate) fn patch(self) -> u32 {
         self.patch
     }
