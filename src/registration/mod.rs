@@ -297,7 +297,7 @@ impl<'a> Part<'a> {
 
     /// Refuses a probe that does not fit into the surface.
     fn check_fold(&self, options: &Options, side: Side) -> Result<(), RegistrationError> {
-        match self.surface(options, side).fold(std::iter::empty()) {
+        match self.surface(options, side).fold() {
             Some(fold) => Err(fold.into()),
             None => Ok(()),
         }
@@ -531,7 +531,7 @@ fn conclude(
     seed: &start::Seed,
     options: &Options,
 ) -> Result<Registration, RegistrationError> {
-    if let Some(fold) = problem.surface.fold(tracks.iter().map(|t| t.place)) {
+    if let Some(fold) = problem.surface.fold_where_touched(tracks.iter().map(|t| t.place)) {
         return Err(fold.into());
     }
     let mut verdict = verdict::judge(problem, &descent, &tracks, seed, trace.len());

@@ -9,7 +9,7 @@
 use crate::geometry::Point;
 
 use super::offset::{Distance, INSIDE, Lookup, OffsetSurface, Place};
-use super::patch::{Facets, Lattice, Patch};
+use super::patch::{Facets, Lattice, Patch, Vertex};
 
 /// Points handled at a time.
 pub(crate) const LANES: usize = 4;
@@ -51,7 +51,7 @@ impl Lane {
     }
 
     #[inline(always)]
-    fn sqrt(self) -> Self {
+    pub(crate) fn sqrt(self) -> Self {
         Lane([self.0[0].sqrt(), self.0[1].sqrt(), self.0[2].sqrt(), self.0[3].sqrt()])
     }
 
@@ -83,7 +83,7 @@ pub(crate) fn minus(a: &Lane3, b: &Lane3) -> Lane3 {
 }
 
 #[inline(always)]
-fn times(a: &Lane3, b: Lane) -> Lane3 {
+pub(crate) fn times(a: &Lane3, b: Lane) -> Lane3 {
     [a[0] * b, a[1] * b, a[2] * b]
 }
 
@@ -192,19 +192,9 @@ impl OffsetSurface<'_> {
     #[inline(always)]
     fn corner(&self, patch: &Patch, [a, b, c, d]: [u32; LANES]) -> (Lane3, Lane3) {
         let (sign, radius) = (Lane::splat(self.side().sign()), Lane::splat(self.radius_mm()));
-        let point = |vertex: u32| &patch.points[vertex as usize];
-        let (pa, pb, pc, pd) = (point(a), point(b), point(c), point(d));
-        let (na, nb, nc, nd) = (patch.normal(a), patch.normal(b), patch.normal(c), patch.normal(d));
-        let normal = [
-            Lane([na.x, nb.x, nc.x, nd.x]) * sign,
-            Lane([na.y, nb.y, nc.y, nd.y]) * sign,
-            Lane([na.z, nb.z, nc.z, nd.z]) * sign,
-        ];
-        let on_offset = [
-            Lane([pa.x, pb.x, pc.x, pd.x]) + normal[0] * radius,
-            Lane([pa.y, pb.y, pc.y, pd.y]) + normal[1] * radius,
-            Lane([pa.z, pb.z, pc.z, pd.z]) + normal[2] * radius,
-        ];
+        let (point, normal) = four_vertices(&[patch.vertex(a), patch.vertex(b), patch.vertex(c), patch.vertex(d)]);
+        let normal = times(&normal, sign);
+        let on_offset = [point[0] + normal[0] * radius, point[1] + normal[1] * radius, point[2] + normal[2] * radius];
         (on_offset, normal)
     }
 }
@@ -256,6 +246,17 @@ fn height(x: &[Lane3; 3], n: &[Lane3; 3], b: &[Lane; 3]) -> Lane {
         total = total + (leaving + arriving);
     }
     along + Lane::splat(0.5) * total * b[0] * b[1] * b[2]
+}
+
+/// Four vertices side by side: their points and their normals.
+#[inline(always)]
+pub(crate) fn four_vertices([a, b, c, d]: &[Vertex; LANES]) -> (Lane3, Lane3) {
+    let normal = [
+        Lane([a.normal.x, b.normal.x, c.normal.x, d.normal.x]),
+        Lane([a.normal.y, b.normal.y, c.normal.y, d.normal.y]),
+        Lane([a.normal.z, b.normal.z, c.normal.z, d.normal.z]),
+    ];
+    (side_by_side(&[a.point, b.point, c.point, d.point]), normal)
 }
 
 /// Four points side by side.
