@@ -1,8 +1,7 @@
 //! How well the pose is known, which way it is not, and what each deviation is worth.
 
-use std::collections::HashSet;
-
 use nalgebra::{DMatrix, Matrix6, Vector6};
+use rayon::prelude::*;
 
 use crate::geometry::{Point, Pose, Vector};
 use crate::surface::Nominal;
@@ -62,10 +61,7 @@ pub struct WeakDirection {
 
 /// Judges the end of an iteration.
 pub(crate) fn judge(problem: &Problem, descent: &Descent, tracks: &[Track], seed: &Seed, iterations: usize) -> Verdict {
-    let used: Vec<f64> = tracks.iter().filter(|t| t.used).map(|t| t.distance_mm).collect();
-    let n = used.len();
-    let objective_mm2 = used.iter().map(|d| d * d).sum::<f64>();
-    let (low, high) = used.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), d| (l.min(*d), h.max(*d)));
+    let Spread { used: n, squares_mm2: objective_mm2, low_mm, high_mm } = Spread::of(tracks);
     let free = free_directions(&problem.locked, &descent.lever);
     let spectrum = Spectrum::new(&(free * descent.sums.gram() * free));
     let rank = descent.rank;
@@ -85,7 +81,7 @@ pub(crate) fn judge(problem: &Problem, descent: &Descent, tracks: &[Track], seed
         used: n,
         objective_mm2,
         rms_mm: (objective_mm2 / n as f64).sqrt(),
-        pv_mm: high - low,
+        pv_mm: high_mm - low_mm,
         residual_sigma_mm: residual2.sqrt(),
         covariance: to_twist * scaled * to_twist.transpose(),
         condition: (spectrum.squares[0] / spectrum.squares[rank - 1]).sqrt(),
@@ -95,6 +91,37 @@ pub(crate) fn judge(problem: &Problem, descent: &Descent, tracks: &[Track], seed
         alternatives,
         iterations,
         converged: descent.converged,
+    }
+}
+
+/// What the distances of the points used come to.
+#[derive(Clone, Copy)]
+struct Spread {
+    used: usize,
+    squares_mm2: f64,
+    low_mm: f64,
+    high_mm: f64,
+}
+
+impl Spread {
+    const NONE: Self = Self { used: 0, squares_mm2: 0.0, low_mm: f64::INFINITY, high_mm: f64::NEG_INFINITY };
+
+    fn of(tracks: &[Track]) -> Self {
+        let add = |sum: Self, d: f64| Self {
+            used: sum.used + 1,
+            squares_mm2: sum.squares_mm2 + d * d,
+            low_mm: sum.low_mm.min(d),
+            high_mm: sum.high_mm.max(d),
+        };
+        let part = |c: &[Track]| c.iter().filter(|t| t.used).map(|t| t.distance_mm).fold(Self::NONE, add);
+        // In chunks that are added in order: the same bits on any number of threads.
+        let parts: Vec<Self> = tracks.par_chunks(1 << 14).map(part).collect();
+        parts.iter().fold(Self::NONE, |a, b| Self {
+            used: a.used + b.used,
+            squares_mm2: a.squares_mm2 + b.squares_mm2,
+            low_mm: a.low_mm.min(b.low_mm),
+            high_mm: a.high_mm.max(b.high_mm),
+        })
     }
 }
 
@@ -282,10 +309,69 @@ pub(crate) fn coverage(nominal: &Nominal, deviations: &[Deviation]) -> f64 {
     let stride = deviations.len().div_ceil(MOST);
     let used: Vec<&Deviation> = deviations.iter().step_by(stride).filter(|d| d.status == PointStatus::Used).collect();
     let edge = (size / 15.0).max(3.0 * 3.5 * size / (used.len() as f64).sqrt());
-    let cell = |p: &Point| [p.x, p.y, p.z].map(|c| (c / edge).floor() as i32);
-    let touched: HashSet<[i32; 3]> = used.iter().map(|d| cell(&d.point)).collect();
     let sample = nominal.sample(20_000);
-    sample.iter().filter(|p| touched.contains(&cell(p))).count() as f64 / sample.len() as f64
+    let mut cells = Cells::around(&sample, edge);
+    for deviation in used {
+        cells.touch(&deviation.point);
+    }
+    sample.iter().filter(|p| cells.is_touched(p)).count() as f64 / sample.len() as f64
+}
+
+/// Cubes around some points, and which of them were touched.
+struct Cells {
+    low: [i32; 3],
+    counts: [usize; 3],
+    per_mm: f64,
+    touched: Vec<bool>,
+}
+
+impl Cells {
+    /// Cells along an axis at most; beyond, where a point far from all others has drawn them out, the rest share the last one.
+    const MOST: i64 = 256;
+
+    fn around(points: &[Point], edge_mm: f64) -> Self {
+        let per_mm = 1.0 / edge_mm;
+        let (mut low, mut high) = ([i32::MAX; 3], [i32::MIN; 3]);
+        for p in points {
+            let at = Self::cell(p, per_mm);
+            for c in 0..3 {
+                (low[c], high[c]) = (low[c].min(at[c]), high[c].max(at[c]));
+            }
+        }
+        let count = |c: usize| (i64::from(high[c]) - i64::from(low[c]) + 1).clamp(1, Self::MOST) as usize;
+        let counts = [count(0), count(1), count(2)];
+        Self { low, counts, per_mm, touched: vec![false; counts.iter().product()] }
+    }
+
+    fn cell(p: &Point, per_mm: f64) -> [i32; 3] {
+        [p.x, p.y, p.z].map(|c| (c * per_mm).floor() as i32)
+    }
+
+    /// The number of the cell of a point; `None` where there is none.
+    fn index(&self, p: &Point) -> Option<usize> {
+        let at = Self::cell(p, self.per_mm);
+        let mut index = 0;
+        for (c, at) in at.into_iter().enumerate() {
+            let k = i64::from(at) - i64::from(self.low[c]);
+            // The last cell is that of all beyond only where the cells are as many as there may be.
+            let k = if self.counts[c] == Self::MOST as usize { k.min(Self::MOST - 1) } else { k };
+            if k < 0 || k >= self.counts[c] as i64 {
+                return None;
+            }
+            index = index * self.counts[c] + k as usize;
+        }
+        Some(index)
+    }
+
+    fn touch(&mut self, p: &Point) {
+        if let Some(index) = self.index(p) {
+            self.touched[index] = true;
+        }
+    }
+
+    fn is_touched(&self, p: &Point) -> bool {
+        self.index(p).is_some_and(|index| self.touched[index])
+    }
 }
 
 /// What turns a foot into a deviation that is reported.

@@ -39,7 +39,7 @@ use mesh::MeshLattice;
 pub use offset::{Distance, Foot, Lookup, OffsetSurface, Place, Side};
 use patch::{Lattice, Patch, Vertex};
 pub use projection::Projection;
-pub(crate) use projection::{centroid, principal_axes};
+pub(crate) use projection::principal_axes;
 
 /// A nominal surface: one or several patches of points with normals, ready for distances.
 #[derive(Debug)]
@@ -49,6 +49,8 @@ pub struct Nominal {
     outline: Option<Aperture>,
     /// Where it bends how, worked out when a pose is searched for.
     features: OnceLock<Vec<Feature>>,
+    /// Rms distances of its points from their middle and from their best plane.
+    extent_mm: OnceLock<[f64; 2]>,
 }
 
 /// What a nominal surface was made from.
@@ -222,7 +224,7 @@ impl Nominal {
             return Err(SurfaceError::NoPatches);
         }
         let kind = NominalKind::Patches { count: patches.len() };
-        Ok(Self { patches, kind, outline: None, features: OnceLock::new() })
+        Ok(Self { patches, kind, outline: None, features: OnceLock::new(), extent_mm: OnceLock::new() })
     }
 
     /// States the outline of the part in xy: a point whose foot lies outside it is off the part.
@@ -236,7 +238,7 @@ impl Nominal {
     }
 
     fn of(patch: Patch, kind: NominalKind) -> Self {
-        Self { patches: vec![patch], kind, outline: None, features: OnceLock::new() }
+        Self { patches: vec![patch], kind, outline: None, features: OnceLock::new(), extent_mm: OnceLock::new() }
     }
 
     /// Returns what the surface was made from.
@@ -298,16 +300,21 @@ impl Nominal {
 
     /// Returns the rms distance of the points from their middle, in millimetres.
     pub fn size_mm(&self) -> f64 {
-        let sample = self.sample(SAMPLE);
-        let middle = centroid(&sample);
-        (sample.iter().map(|p| (p - middle).norm_squared()).sum::<f64>() / sample.len() as f64).sqrt()
+        self.extent_mm()[0]
     }
 
     /// Returns the rms distance of the points from their best plane, in millimetres: how much shape there is to register by.
     pub fn relief_mm(&self) -> f64 {
-        let sample = self.sample(SAMPLE);
-        let (_, eigen) = principal_axes(&sample);
-        (eigen.eigenvalues.min().max(0.0) / sample.len() as f64).sqrt()
+        self.extent_mm()[1]
+    }
+
+    fn extent_mm(&self) -> [f64; 2] {
+        *self.extent_mm.get_or_init(|| {
+            let sample = self.sample(SAMPLE);
+            let (middle, eigen) = principal_axes(&sample);
+            let squares = sample.iter().map(|p| (p - middle).norm_squared()).sum::<f64>();
+            [squares, eigen.eigenvalues.min().max(0.0)].map(|sum| (sum / sample.len() as f64).sqrt())
+        })
     }
 
     /// Returns the mean of the normals, of unit length; z for a closed surface, which has none.
@@ -354,6 +361,12 @@ fn check_grid(columns: usize, rows: usize, points: usize) -> Result<(), SurfaceE
 
 /// Whether points lie on one line to rounding.
 pub(crate) fn is_line(points: &[Point]) -> bool {
+    // Points of which some are on no line are on none.
+    let some: Vec<Point> = points.iter().step_by(points.len().div_ceil(SAMPLE).max(1)).copied().collect();
+    are_on_line(&some) && (some.len() == points.len() || are_on_line(points))
+}
+
+fn are_on_line(points: &[Point]) -> bool {
     let (_, eigen) = principal_axes(points);
     let mut spread: [f64; 3] = eigen.eigenvalues.into();
     spread.sort_by(f64::total_cmp);
