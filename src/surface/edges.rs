@@ -62,8 +62,6 @@ pub(crate) struct Triangulation {
     edges: Vec<Edge>,
     /// An edge of the hull that has everything on its left.
     hull: u32,
-    /// One edge out of each vertex.
-    out_of: Vec<u32>,
 }
 
 impl Triangulation {
@@ -75,61 +73,40 @@ impl Triangulation {
         let (part, unused) = divide(strewn, 0..count, &mut edges, 0);
         let Part::Hull(hull) = part else { unreachable!("three points have an edge") };
         unused.mark(&mut edges);
-        let mut out_of = vec![NOWHERE; count];
-        for (e, edge) in edges.iter().enumerate() {
-            if edge[ORIGIN] != NOWHERE {
-                out_of[edge[ORIGIN] as usize] = e as u32;
-            }
-        }
-        Self { edges, hull, out_of }
+        Self { edges, hull }
     }
 
-    /// Returns the corners of the inner faces, counter-clockwise from the lowest and in its order, and the faces across the
-    /// edge opposite to each corner.
+    /// Returns the corners of the inner faces, counter-clockwise, and the faces across the edge opposite to each corner.
+    ///
+    /// They are numbered as their edges are, and so stand in memory about where their corners do.
     pub(crate) fn faces(&self) -> (Vec<[u32; 3]>, Vec<[u32; 3]>) {
-        const CHUNK: usize = 4096;
         let number: Vec<AtomicU32> = (0..self.edges.len()).into_par_iter().map(|_| AtomicU32::new(0)).collect();
         self.along_the_hull(|e| number[(e ^ 1) as usize].store(BORDER, Ordering::Relaxed));
-        let outside = |e: u32| number[e as usize].load(Ordering::Relaxed) == BORDER;
-        let chunks: Vec<Vec<u32>> = (0..self.out_of.len().div_ceil(CHUNK))
-            .into_par_iter()
-            .map(|k| {
-                let end = self.out_of.len().min((k + 1) * CHUNK);
-                (k * CHUNK..end).flat_map(|v| self.faces_from(v as u32)).filter(|&e| !outside(e)).collect()
-            })
-            .collect();
-        let heads = chunks.concat();
+        let of = |e: u32| number[e as usize].load(Ordering::Relaxed);
         let round = |e: u32| {
             let second = self.left_next(e);
             [e, second, self.left_next(second)]
         };
-        heads.par_iter().enumerate().for_each(|(face, &e)| {
+        let is_first = |&e: &u32| {
+            self.edges[e as usize][ORIGIN] != NOWHERE && of(e) != BORDER && {
+                let [e, second, third] = round(e);
+                e < second && e < third
+            }
+        };
+        let firsts: Vec<u32> = (0..self.edges.len() as u32).into_par_iter().filter(is_first).collect();
+        firsts.par_iter().enumerate().for_each(|(face, &e)| {
             for e in round(e) {
                 number[e as usize].store(face as u32, Ordering::Relaxed);
             }
         });
-        let across = |e: u32| number[(e ^ 1) as usize].load(Ordering::Relaxed);
-        heads
+        let across = |e: u32| of(e ^ 1);
+        firsts
             .par_iter()
             .map(|&e| {
                 let [a, b, c] = round(e);
                 ([a, b, c].map(|e| self.edges[e as usize][ORIGIN]), [across(b), across(c), across(a)])
             })
             .unzip()
-    }
-
-    /// The edges out of a vertex whose left faces have it as their lowest; a face outside may be among them.
-    fn faces_from(&self, vertex: u32) -> impl Iterator<Item = u32> {
-        let first = self.out_of[vertex as usize];
-        let mut next = Some(first);
-        std::iter::from_fn(move || {
-            let e = next?;
-            let after = self.edges[e as usize][AFTER];
-            next = (after != first).then_some(after);
-            Some((e, after))
-        })
-        .filter(move |&(e, after)| [e, after].iter().all(|e| vertex < self.edges[(e ^ 1) as usize][ORIGIN]))
-        .map(|(e, _)| e)
     }
 
     fn left_next(&self, e: u32) -> u32 {
@@ -516,7 +493,7 @@ mod tests {
         let (corners, neighbours) = Triangulation::new(Strewn { places: &places, keys: &keys }).faces();
         let at = |v: u32| places[v as usize];
         for (f, c) in corners.iter().enumerate() {
-            assert!(turn(c.map(at)) > 0.0 && c[0] < c[1].min(c[2]));
+            assert!(turn(c.map(at)) > 0.0);
             for k in 0..3 {
                 let n = neighbours[f][k];
                 if n == BORDER {
@@ -529,17 +506,16 @@ mod tests {
                 assert!(!in_circle([at(c[0]), at(c[1]), at(c[2]), at(across[j])]));
             }
         }
-        assert!(corners.is_sorted_by_key(|c| c[0]));
         assert_eq!(corners.len(), by_spade(&places).num_inner_faces(), "the whole hull is covered");
-        (places, corners.into_iter().collect())
+        (places, corners.into_iter().map(from_lowest).collect())
     }
 
-    /// The same triangles, each from its lowest corner.
+    fn from_lowest(c: [u32; 3]) -> [u32; 3] {
+        let k = (0..3).min_by_key(|&k| c[k]).unwrap();
+        [c[k], c[(k + 1) % 3], c[(k + 2) % 3]]
+    }
+
     fn triangles_of_spade(places: &[[f64; 2]]) -> BTreeSet<[u32; 3]> {
-        let from_lowest = |c: [u32; 3]| {
-            let k = (0..3).min_by_key(|&k| c[k]).unwrap();
-            [c[k], c[(k + 1) % 3], c[(k + 2) % 3]]
-        };
         by_spade(places).inner_faces().map(|f| from_lowest(f.vertices().map(|v| v.index() as u32))).collect()
     }
 
