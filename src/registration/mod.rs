@@ -397,11 +397,15 @@ fn settle(
     let mut pose = seed.cmm_from_model;
     if seed.near {
         problem.ball_radius = problem.ball_radius.min(0.05);
+        look_ahead(&problem, tracks, &pose);
         evaluate(&problem, tracks, &pose);
         screen(&problem, options, tracks, true);
-    }
-    if !seed.near && problem.measured.len() >= 2 * PILOT {
-        pose = pilot(&problem, pose, trace)?;
+    } else {
+        let pilots = if problem.surface.fits_normals() { PILOT_WHERE_NORMALS_COST } else { PILOT };
+        if problem.measured.len() >= 2 * pilots {
+            pose = pilot(&problem, pose, pilots, trace)?;
+        }
+        look_ahead(&problem, tracks, &pose);
     }
     let mut round = 0;
     loop {
@@ -424,11 +428,27 @@ fn settle(
 /// Points that a dense cloud sends ahead.
 const PILOT: usize = 16_384;
 
-/// Descends with a few of many points, from where the rest have a step or two to go; its turns stand in the trace.
-fn pilot(problem: &Problem, pose: Pose, trace: &mut Vec<Iteration>) -> Result<Pose, RegistrationError> {
-    let few: Vec<Point> = start::spread(problem.measured, PILOT).copied().collect();
+/// The same where every place touched costs a fit: fewer touch less, and the rest then touch only where they end.
+const PILOT_WHERE_NORMALS_COST: usize = 2048;
+
+/// Starts the search for the feet near where they are, with the normals there fitted all at once.
+fn look_ahead(problem: &Problem, tracks: &mut [Track], pose: &Pose) {
+    if !problem.surface.fits_normals() {
+        return;
+    }
+    let model_from_cmm = pose.inverse();
+    let points: Vec<Point> = problem.measured.par_iter().map(|p| model_from_cmm.point(p)).collect();
+    for (track, place) in tracks.iter_mut().zip(problem.surface.look_ahead(&points)) {
+        track.place = place;
+    }
+}
+
+/// Descends with some of many points, from where the rest have a step or two to go; its turns stand in the trace.
+fn pilot(problem: &Problem, pose: Pose, count: usize, trace: &mut Vec<Iteration>) -> Result<Pose, RegistrationError> {
+    let few: Vec<Point> = start::spread(problem.measured, count).copied().collect();
     let mut tracks = vec![Track::NEW; few.len()];
     let ahead = Problem { measured: &few, ..*problem };
+    look_ahead(&ahead, &mut tracks, &pose);
     Ok(ahead.descend(pose, &mut tracks, trace)?.cmm_from_model)
 }
 

@@ -157,7 +157,7 @@ impl Strewn<'_> {
         }
         let bit = differing.ilog2();
         let cut = range.start + keys.partition_point(|key| key >> bit & 1 == 0);
-        (cut, if bit % 2 == 0 { Axis::U } else { Axis::V })
+        (cut, if bit.is_multiple_of(2) { Axis::U } else { Axis::V })
     }
 }
 

@@ -42,17 +42,16 @@ impl OffsetSurface<'_> {
                 }
                 Lattice::Mesh(mesh) => {
                     let stride = (mesh.facet_count() as usize).div_ceil(LOOKED_AT);
-                    (0..mesh.facet_count())
-                        .into_par_iter()
-                        .step_by(stride)
-                        .filter(|&f| self.folds(patch, mesh.corners(f)))
-                        .collect()
+                    let looked_at: Vec<u32> = (0..mesh.facet_count()).step_by(stride).collect();
+                    patch.fit_normals(&looked_at.iter().flat_map(|&f| mesh.corners(f)).collect::<Vec<_>>());
+                    looked_at.into_par_iter().filter(|&f| self.folds(patch, mesh.corners(f))).collect()
                 }
             };
             folded.into_iter().map(move |f| (patch, f))
         });
         let there = touched.map(|place| (&patches[place.patch() as usize], place.facet()));
-        let there = there.filter(|(p, f)| matches!(p.lattice, Lattice::Mesh(_)) && self.folds(p, p.corners(*f)));
+        let there: Vec<(&Patch, u32)> = there.filter(|(p, _)| matches!(p.lattice, Lattice::Mesh(_))).collect();
+        let there: Vec<_> = there.into_par_iter().filter(|(p, f)| self.folds(p, p.corners(*f))).collect();
         let worst = everywhere.chain(there).map(|(p, f)| (self.least_curvature(p, f), p, f));
         let (curvature, patch, facet) = worst.min_by(|a, b| a.0.total_cmp(&b.0))?;
         let at = patch.points[patch.corners(facet)[0] as usize].into();

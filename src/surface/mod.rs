@@ -12,6 +12,7 @@
 //! Pure: no file, no clock, no randomness. Frame: everything here is in the model frame {M}. Units: millimetres.
 
 pub mod accuracy;
+mod ahead;
 pub mod analytic;
 mod delaunay;
 mod edges;
