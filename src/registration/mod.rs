@@ -405,9 +405,12 @@ fn settle(
     if seed.near {
         problem.ball_radius = problem.ball_radius.min(0.05);
     }
-    for few in PILOTS.into_iter().filter(|few| problem.measured.len() >= 2 * PILOTS[1].max(*few)) {
-        pose = pilot(&problem, pose, few, if seed.near { Some(options) } else { None }, trace)?;
+    let pilots: &[usize] = if problem.surface.fits_normals() { &PILOT_WHERE_NORMALS_COST } else { &PILOTS };
+    let enough = 2 * pilots.iter().max().expect("there are pilots");
+    for few in pilots.iter().filter(|_| problem.measured.len() >= enough) {
+        pose = pilot(&problem, pose, *few, if seed.near { Some(options) } else { None }, trace)?;
     }
+    look_ahead(&problem, tracks, &pose);
     let mut known = None;
     if seed.near {
         let sums = problem.feet(tracks, &pose, &problem.lever_at(&pose));
@@ -435,6 +438,21 @@ fn settle(
 /// Points that a dense cloud sends ahead, first a few for the long way and then more for the rest of it.
 const PILOTS: [usize; 2] = [1024, 16_384];
 
+/// The same where every place touched costs a fit: fewer touch less, and the rest then touch only where they end.
+const PILOT_WHERE_NORMALS_COST: [usize; 1] = [2048];
+
+/// Starts the search for the feet near where they are, with the normals there fitted all at once.
+fn look_ahead(problem: &Problem, tracks: &mut [Track], pose: &Pose) {
+    if !problem.surface.fits_normals() {
+        return;
+    }
+    let model_from_cmm = pose.inverse();
+    let points: Vec<Point> = problem.measured.par_iter().map(|p| model_from_cmm.point(p)).collect();
+    for (track, place) in tracks.iter_mut().zip(problem.surface.look_ahead(&points)) {
+        track.place = place;
+    }
+}
+
 /// Descends with a few of many points, from where the rest have a step or two to go; its turns stand in the trace.
 ///
 /// Near the end outliers are told among the few themselves; far from it they cannot be.
@@ -449,6 +467,7 @@ fn pilot(
     let mut tracks = vec![Track::NEW; few.len()];
     let (middle, size_mm) = middle_and_size(&few);
     let ahead = Problem { measured: &few, middle, size_mm, ..*problem };
+    look_ahead(&ahead, &mut tracks, &pose);
     if let Some(options) = screened {
         ahead.feet(&mut tracks, &pose, &ahead.lever_at(&pose));
         screen(&ahead, options, &mut tracks, true);

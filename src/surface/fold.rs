@@ -38,7 +38,9 @@ impl OffsetSurface<'_> {
             return None;
         }
         let there = touched.map(|place| (&patches[place.patch() as usize], place.facet()));
-        self.worst_fold(there.filter(|(patch, f)| is_mesh(patch) && self.folds(patch, patch.corners(*f))))
+        let there: Vec<(&Patch, u32)> = there.filter(|(patch, _)| is_mesh(patch)).collect();
+        let there: Vec<_> = there.into_par_iter().filter(|(p, f)| self.folds(p, p.corners(*f))).collect();
+        self.worst_fold(there.into_iter())
     }
 
     /// The worst of some facets that fold.
@@ -68,11 +70,9 @@ impl OffsetSurface<'_> {
             }
             Lattice::Mesh(mesh) => {
                 let stride = (mesh.facet_count() as usize).div_ceil(LOOKED_AT);
-                (0..mesh.facet_count())
-                    .into_par_iter()
-                    .step_by(stride)
-                    .filter(|&f| self.folds(patch, mesh.corners(f)))
-                    .collect()
+                let looked_at: Vec<u32> = (0..mesh.facet_count()).step_by(stride).collect();
+                patch.fit_normals(&looked_at.iter().flat_map(|&f| mesh.corners(f)).collect::<Vec<_>>());
+                looked_at.into_par_iter().filter(|&f| self.folds(patch, mesh.corners(f))).collect()
             }
         }
     }

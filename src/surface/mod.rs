@@ -12,8 +12,10 @@
 //! Pure: no file, no clock, no randomness. Frame: everything here is in the model frame {M}. Units: millimetres.
 
 pub mod accuracy;
+mod ahead;
 pub mod analytic;
 mod delaunay;
+mod edges;
 mod feature;
 mod fold;
 mod grid;
@@ -160,16 +162,7 @@ impl Nominal {
             return Err(SurfaceError::Collinear { points: points.len() });
         }
         let (projection, map) = projection.prepare(&points)?;
-        let order = delaunay::neighbourly_order(&points, &map);
-        let points: Vec<Point> = order.iter().map(|&i| points[i as usize]).collect();
-        let as_given = |index: usize| order[index] as usize;
-        let triangles = delaunay::triangulate(&points, &map).map_err(|error| match error {
-            SurfaceError::DuplicatePoints { first, second, at } => {
-                let (a, b) = (as_given(first), as_given(second));
-                SurfaceError::DuplicatePoints { first: a.min(b), second: a.max(b), at }
-            }
-            other => other,
-        })?;
+        let (points, triangles) = delaunay::triangulate(&points, &map)?;
         let lattice = MeshLattice::from_parts(&points, triangles.corners, triangles.neighbours)?;
         Ok(Self::of(Patch::mesh(points, lattice), NominalKind::Scattered { projection }))
     }

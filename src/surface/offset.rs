@@ -251,6 +251,11 @@ impl<'a> OffsetSurface<'a> {
         facet
     }
 
+    /// Finds a facet of the first patch near the foot of a point, without its normals.
+    pub(super) fn place_near<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: Place) -> Place {
+        Place { patch: 0, facet: self.approach(patch, facets, p, start.facet) }
+    }
+
     /// Walks from facet to facet until one holds the foot, then measures there.
     #[inline]
     fn search<F: Facets>(&self, patch: &Patch, facets: &F, number: u32, p: &Point, start: u32) -> Foot {

@@ -6,9 +6,12 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use rayon::prelude::*;
+
 use crate::geometry::{Point, Vector};
 
 use super::grid::GridLattice;
+use super::lanes::LANES;
 use super::mesh::MeshLattice;
 use super::normals;
 
@@ -62,7 +65,7 @@ impl Patch {
 
     /// Joins a mesh with normals that are fitted when a triangle is first touched.
     pub(crate) fn mesh(points: Vec<Point>, lattice: MeshLattice) -> Self {
-        let cells = points.iter().map(|_| NormalCell::unknown()).collect();
+        let cells = points.par_iter().map(|_| NormalCell::unknown()).collect();
         Self { lattice: Lattice::Mesh(lattice), vertices: Vertices::WhenTouched(points, cells) }
     }
 
@@ -142,9 +145,28 @@ impl Patch {
     #[cold]
     fn fitted_normal(&self, vertex: u32) -> Vector {
         match &self.lattice {
-            Lattice::Mesh(mesh) => normals::fit_to_ring(self.mesh_points(), mesh, vertex, normals::NEIGHBOURS).normal,
+            Lattice::Mesh(mesh) => pulp::Arch::new().dispatch(Four { patch: self, mesh, vertices: [vertex; LANES] })[0],
             Lattice::Grid(_) => unreachable!("a grid has its normals ready"),
         }
+    }
+
+    /// Fits the normals of many vertices that are not known yet: on all cores and four at a time, several times faster than
+    /// one by one when they are touched, and to the same bits.
+    pub(crate) fn fit_normals(&self, vertices: &[u32]) {
+        /// Vertices that a task takes at a time.
+        const CHUNK: usize = 256;
+        let (Vertices::WhenTouched(_, cells), Lattice::Mesh(mesh)) = (&self.vertices, &self.lattice) else { return };
+        let arch = pulp::Arch::new();
+        vertices.par_chunks(CHUNK).for_each(|chunk| {
+            let unknown: Vec<u32> = chunk.iter().copied().filter(|&v| cells[v as usize].get().is_none()).collect();
+            for few in unknown.chunks(LANES) {
+                let vertices = std::array::from_fn(|l| few[l.min(few.len() - 1)]);
+                let normals = arch.dispatch(Four { patch: self, mesh, vertices });
+                for (&vertex, normal) in few.iter().zip(normals) {
+                    cells[vertex as usize].set(normal);
+                }
+            }
+        });
     }
 
     /// Returns the corners of a facet that exists.
@@ -153,6 +175,23 @@ impl Patch {
             Lattice::Grid(grid) => grid.corners(facet),
             Lattice::Mesh(mesh) => mesh.corners(facet),
         }
+    }
+}
+
+/// The normals of four vertices, in a form that is compiled once for each set of vector instructions.
+struct Four<'a> {
+    patch: &'a Patch,
+    mesh: &'a MeshLattice,
+    vertices: [u32; LANES],
+}
+
+impl pulp::NullaryFnOnce for Four<'_> {
+    type Output = [Vector; LANES];
+
+    // Inlined into the caller that has the instructions; a call from it would be to code without them.
+    #[inline(always)]
+    fn call(self) -> Self::Output {
+        normals::four_normals(self.patch.mesh_points(), self.mesh, &self.vertices)
     }
 }
 
