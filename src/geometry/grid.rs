@@ -30,6 +30,57 @@ impl GridOrder {
     }
 }
 
+/// A cloud that comes row by row, x fastest, without a hole.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct GridInOrder {
+    pub(crate) columns: usize,
+    pub(crate) rows: usize,
+    /// The first node and the last, in x and y.
+    pub(crate) corners: [[f64; 2]; 2],
+}
+
+/// How far two points of one column may stand apart in x, as a share of the extent: below, it is rounding.
+const COLUMN_TOLERANCE: f64 = 5e-7;
+
+/// Recognises a whole regular grid whose points come row by row, x fastest, in one pass and without taking memory.
+///
+/// What it takes for a grid, [`recognise_grid`] does too; the other way round there are the grids in another order and those
+/// with holes.
+pub(crate) fn grid_in_order(points: &[Point]) -> Option<GridInOrder> {
+    let columns = 1 + points.windows(2).take_while(|pair| pair[1].x > pair[0].x).count();
+    let rows = points.len() / columns;
+    if columns < 3 || rows < 3 || columns * rows != points.len() || points.len() >= NO_POINT as usize {
+        return None;
+    }
+    let first = &points[..columns];
+    let column: Vec<f64> = first.iter().map(|p| p.x).collect();
+    let row: Vec<f64> = points.iter().step_by(columns).map(|p| p.y).collect();
+    if !(is_even(&column) && is_even(&row)) {
+        return None;
+    }
+    let near = |from: f64, to: f64| COLUMN_TOLERANCE * (to - from);
+    let (near_x, near_y) = (near(column[0], column[columns - 1]), near(row[0], row[rows - 1]));
+    let holds = |(line, y): (&[Point], &f64)| {
+        // Without a way out in the middle: a line is short, and the compiler takes several points at a time.
+        line.iter()
+            .zip(&column)
+            .fold(true, |all, (p, x)| all & ((p.x - x).abs() <= near_x) & ((p.y - y).abs() <= near_y) & p.z.is_finite())
+    };
+    points.par_chunks(columns).zip(&row).with_min_len(16).all(holds).then(|| GridInOrder {
+        columns,
+        rows,
+        corners: [[column[0], row[0]], [column[columns - 1], row[rows - 1]]],
+    })
+}
+
+/// Whether coordinates rise in equal steps.
+fn is_even(at: &[f64]) -> bool {
+    let step = (at[at.len() - 1] - at[0]) / (at.len() - 1) as f64;
+    step > 0.0
+        && step.is_finite()
+        && at.iter().enumerate().all(|(k, c)| (c - at[0] - k as f64 * step).abs() <= NODE_TOLERANCE * step)
+}
+
 /// Recognises a regular grid in x and y, whatever the order of the points and with nodes missing.
 ///
 /// Shapes: at least 3 nodes on each axis, at most one node in four filled by chance is no grid. Returns `None` for
@@ -135,8 +186,12 @@ mod tests {
         let order = recognise_grid(&points).unwrap();
         assert_eq!((order.columns, order.rows, order.holes), (101, 57, 0));
         assert!(order.is_in_order());
+        let found = grid_in_order(&points).unwrap();
+        assert_eq!((found.columns, found.rows), (101, 57));
+        assert_eq!(found.corners, [[points[0].x, points[0].y], [points[101 * 57 - 1].x, points[101 * 57 - 1].y]]);
 
         let mixed = shuffled(&points);
+        assert_eq!(grid_in_order(&mixed), None);
         let order = recognise_grid(&mixed).unwrap();
         assert!(!order.is_in_order());
         for (node, &index) in order.point_at.iter().enumerate() {
@@ -168,7 +223,18 @@ mod tests {
             p.x = (p.x * 1e4).round() / 1e4;
             p.y = (p.y * 1e4).round() / 1e4;
         }
-        assert!(recognise_grid(&points).is_some());
+        assert!(recognise_grid(&points).is_some() && grid_in_order(&points).is_some());
+        // A point out of its column, one out of its row, one missing, one that is no number.
+        for spoil in [
+            |p: &mut Vec<Point>| p[5000].x += 0.003,
+            |p: &mut Vec<Point>| p[5000].y -= 0.003,
+            |p: &mut Vec<Point>| p.truncate(333 * 222 - 1),
+            |p: &mut Vec<Point>| p[5000].z = f64::NAN,
+        ] {
+            let mut spoilt = points.clone();
+            spoil(&mut spoilt);
+            assert_eq!(grid_in_order(&spoilt), None);
+        }
     }
 
     #[test]

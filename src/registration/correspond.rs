@@ -1,11 +1,10 @@
 //! The first of the two alternating problems: each point's foot on the offset surface under a given pose.
 
-use nalgebra::Vector6;
 use rayon::prelude::*;
 
 use crate::geometry::{Point, Pose, Vector};
-use crate::surface::lanes::{LANES, Lane, Lane3, side_by_side};
-use crate::surface::{Foot, OffsetSurface, Place};
+use crate::surface::lanes::{FourFeet, LANES, Lane, Lane3, side_by_side};
+use crate::surface::{OffsetSurface, Place};
 
 use super::PointStatus;
 use super::linearize::{FourSums, Lever, Sums};
@@ -95,22 +94,30 @@ struct Pass<'a> {
 }
 
 impl Pass<'_> {
-    /// Sums one chunk of points: in fours while they stay on their facets, alone where they do not.
+    /// Sums one chunk of points: in fours where they stay on their facets or find new ones together, alone elsewhere.
     #[inline(always)]
     fn chunk(&self, points: &[Point], tracks: &mut [Track]) -> Sums {
         let mut sums = Sums::zero();
         let mut fours = FourSums::zero();
         let mut last = Place::UNKNOWN;
-        let warm = self.surface.has_warm_feet();
+        let mut recent = [[Place::UNKNOWN; LANES]; 2];
+        let in_fours = self.surface.has_four_feet() && self.surface.nominal().outline().is_none();
         let (four_points, rest_points) = points.as_chunks::<LANES>();
         let (four_tracks, rest_tracks) = tracks.as_chunks_mut::<LANES>();
         for (points, tracks) in four_points.iter().zip(four_tracks) {
-            let known = tracks[0].place != Place::UNKNOWN;
-            if !(warm && known && self.four(points, tracks, &mut fours)) {
-                for (point, track) in points.iter().zip(tracks) {
+            // No closure around what is to be compiled with the vector instructions: it would be compiled without them.
+            let start = if in_fours { self.start(tracks, &recent) } else { None };
+            let taken = match start {
+                Some(places) => self.four(points, tracks, places, &mut fours),
+                None => false,
+            };
+            if !taken {
+                for (point, track) in points.iter().zip(&mut *tracks) {
                     self.one(point, track, &mut last, &mut sums);
                 }
             }
+            recent = [recent[1], [tracks[0].place, tracks[1].place, tracks[2].place, tracks[3].place]];
+            last = tracks[LANES - 1].place;
         }
         for (point, track) in rest_points.iter().zip(rest_tracks) {
             self.one(point, track, &mut last, &mut sums);
@@ -119,17 +126,31 @@ impl Pass<'_> {
         sums
     }
 
-    /// Takes four points that stay on their facets and all take part; returns false, with nothing done, for any others.
+    /// Where four points were, or may be expected after those before them; `None` where nothing tells.
     #[inline(always)]
-    fn four(&self, points: &[Point; LANES], tracks: &mut [Track; LANES], sums: &mut FourSums) -> bool {
-        let p = self.in_model(&side_by_side(points));
-        let feet = self.surface.warm_feet(&p, &[tracks[0].place, tracks[1].place, tracks[2].place, tracks[3].place]);
-        if feet.stays != [true; LANES] || self.surface.nominal().outline().is_some() {
-            return false;
+    fn start(&self, tracks: &[Track; LANES], recent: &[[Place; LANES]; 2]) -> Option<[Place; LANES]> {
+        let places = [tracks[0].place, tracks[1].place, tracks[2].place, tracks[3].place];
+        if !places.contains(&Place::UNKNOWN) {
+            return Some(places);
         }
+        self.surface.four_places_ahead(&recent[0], &recent[1])
+    }
+
+    /// Takes four points that are on the part, near the places given; returns false, with nothing done, for any others.
+    #[inline(always)]
+    fn four(
+        &self,
+        points: &[Point; LANES],
+        tracks: &mut [Track; LANES],
+        mut places: [Place; LANES],
+        sums: &mut FourSums,
+    ) -> bool {
+        let p = four_moved(&self.model_from_cmm, &side_by_side(points));
+        let Some(feet) = self.surface.four_feet(&p, &mut places) else { return false };
         let distance = feet.distance_mm - Lane::splat(self.reading.subtract_mm);
         let (mut weight, mut loss, mut used) = ([0.0; LANES], [0.0; LANES], 0);
         for l in 0..LANES {
+            tracks[l].place = places[l];
             tracks[l].distance_mm = distance.0[l];
             tracks[l].beyond_steps = 0.0;
             if tracks[l].used {
@@ -139,16 +160,6 @@ impl Pass<'_> {
         }
         sums.add(&self.lever.four_rows(&p, &feet.normal), distance, Lane(weight), Lane(loss), used);
         true
-    }
-
-    #[inline(always)]
-    fn in_model(&self, w: &Lane3) -> Lane3 {
-        let (r, t) = (&self.model_from_cmm.rotation, &self.model_from_cmm.translation_mm);
-        let row = |k: usize| {
-            let part = |c: usize| Lane::splat(r[(k, c)]) * w[c];
-            part(0) + part(1) + part(2) + Lane::splat(t[k])
-        };
-        [row(0), row(1), row(2)]
     }
 
     #[inline]
@@ -174,35 +185,121 @@ impl Pass<'_> {
     }
 }
 
-/// A measured point at the end: its foot, and the row of A there.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Final {
-    pub(crate) centre: Point,
-    pub(crate) foot: Foot,
-    pub(crate) row: Vector6<f64>,
+/// Four points moved by a pose.
+#[inline(always)]
+fn four_moved(pose: &Pose, w: &Lane3) -> Lane3 {
+    let (r, t) = (&pose.rotation, &pose.translation_mm);
+    let row = |k: usize| {
+        let part = |c: usize| Lane::splat(r[(k, c)]) * w[c];
+        part(0) + part(1) + part(2) + Lane::splat(t[k])
+    };
+    [row(0), row(1), row(2)]
 }
 
+/// Four measured points at the end: their feet, and the rows of A there.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct FourFinal {
+    pub(crate) centre: Lane3,
+    pub(crate) feet: FourFeet,
+    pub(crate) row: [Lane; 6],
+}
+
+/// Makes of four points at their feet what is to be reported of each.
+pub(crate) trait Report: Sync {
+    /// What is reported of one point.
+    type Item: Copy + Send;
+
+    /// Nothing reported yet.
+    const BLANK: Self::Item;
+
+    /// Returns what is reported of each of four points. Inlined, so that it is compiled with the caller's instructions.
+    fn four(&self, tracks: [&Track; LANES], at: &FourFinal) -> [Self::Item; LANES];
+}
+
+/// Fours that a task of [`at_feet`] takes at a time.
+const FOURS: usize = 8;
+
 /// Finds the feet once more and makes of each what is to be reported; nothing else of them is kept.
-pub(crate) fn at_feet<T: Send>(
+pub(crate) fn at_feet<R: Report>(
     surface: &OffsetSurface,
     measured: &[Point],
     tracks: &[Track],
     cmm_from_model: &Pose,
     lever: &Lever,
-    report: impl Fn(&Track, Final) -> T + Sync,
-) -> Vec<T> {
-    let model_from_cmm = cmm_from_model.inverse();
-    measured
-        .par_iter()
-        .zip(tracks)
-        .with_min_len(CHUNK)
-        .map(|(point, track)| {
-            let centre = model_from_cmm.point(point);
-            let foot = surface.foot(&centre, track.place);
-            let row = Vector6::from(lever.row(&centre, &foot.normal));
-            report(track, Final { centre, foot, row })
-        })
-        .collect()
+    report: &R,
+) -> Vec<R::Item> {
+    let at_end = AtEnd { surface, measured, tracks, model_from_cmm: cmm_from_model.inverse(), lever, report };
+    let arch = pulp::Arch::new();
+    // Whole blocks, written where they stay; the last is filled up with the last point.
+    let blocks: Vec<[[R::Item; LANES]; FOURS]> = (0..measured.len().div_ceil(LANES * FOURS))
+        .into_par_iter()
+        .with_min_len(CHUNK / (LANES * FOURS))
+        .map(|block| arch.dispatch(EndBlock { at_end: &at_end, block }))
+        .collect();
+    let mut items = blocks.into_flattened().into_flattened();
+    items.truncate(measured.len());
+    items
+}
+
+/// What is the same for all points at the end.
+struct AtEnd<'a, R> {
+    surface: &'a OffsetSurface<'a>,
+    measured: &'a [Point],
+    tracks: &'a [Track],
+    model_from_cmm: Pose,
+    lever: &'a Lever,
+    report: &'a R,
+}
+
+struct EndBlock<'a, R> {
+    at_end: &'a AtEnd<'a, R>,
+    block: usize,
+}
+
+impl<R: Report> pulp::NullaryFnOnce for EndBlock<'_, R> {
+    type Output = [[R::Item; LANES]; FOURS];
+
+    #[inline(always)]
+    fn call(self) -> Self::Output {
+        let mut items = [[R::BLANK; LANES]; FOURS];
+        for (four, items) in items.iter_mut().enumerate() {
+            *items = self.at_end.four((self.block * FOURS + four) * LANES);
+        }
+        items
+    }
+}
+
+impl<R: Report> AtEnd<'_, R> {
+    /// The four points from one on; past the end the last one again.
+    #[inline(always)]
+    fn four(&self, first: usize) -> [R::Item; LANES] {
+        let end = self.measured.len() - 1;
+        let (a, b, c, d) = (first.min(end), (first + 1).min(end), (first + 2).min(end), (first + 3).min(end));
+        let tracks = [&self.tracks[a], &self.tracks[b], &self.tracks[c], &self.tracks[d]];
+        let points = [self.measured[a], self.measured[b], self.measured[c], self.measured[d]];
+        let centre = four_moved(&self.model_from_cmm, &side_by_side(&points));
+        let mut places = [tracks[0].place, tracks[1].place, tracks[2].place, tracks[3].place];
+        let together = self.surface.has_four_feet() && !places.contains(&Place::UNKNOWN);
+        let feet = match if together { self.surface.four_feet(&centre, &mut places) } else { None } {
+            Some(feet) => feet,
+            None => self.four_single(&centre, tracks),
+        };
+        self.report.four(tracks, &FourFinal { centre, feet, row: self.lever.four_rows(&centre, &feet.normal) })
+    }
+
+    /// The feet of four points that were searched for one by one.
+    #[cold]
+    fn four_single(&self, centre: &Lane3, tracks: [&Track; LANES]) -> FourFeet {
+        let foot = |l: usize| {
+            let p = Point::new(centre[0].0[l], centre[1].0[l], centre[2].0[l]);
+            self.surface.foot(&p, tracks[l].place)
+        };
+        let feet: [_; LANES] = std::array::from_fn(foot);
+        FourFeet {
+            distance_mm: Lane(feet.map(|f| f.distance_mm)),
+            normal: [0, 1, 2].map(|c| Lane(feet.map(|f| f.normal[c]))),
+        }
+    }
 }
 
 /// Returns the middle of a cloud and its rms distance from it.

@@ -6,7 +6,7 @@ use crate::geometry::{Point, Pose};
 use crate::surface::OffsetSurface;
 
 use super::RegistrationError;
-use super::correspond::{Reading, Track, correspond, middle_and_size};
+use super::correspond::{Reading, Track, correspond};
 use super::linearize::{Lever, Sums};
 use super::solve::Spectrum;
 
@@ -31,6 +31,9 @@ pub(crate) struct Problem<'a> {
     pub(crate) surface: OffsetSurface<'a>,
     pub(crate) reading: Reading,
     pub(crate) measured: &'a [Point],
+    /// The middle of the measured points and their rms distance from it.
+    pub(crate) middle: Point,
+    pub(crate) size_mm: f64,
     /// Locked coordinates of the twist: x, y, z, rx, ry, rz of the model frame.
     pub(crate) locked: [bool; 6],
     /// Singular values below this share of the largest are directions that the surface cannot see.
@@ -56,24 +59,26 @@ pub(crate) struct Descent {
 /// A step this short moves no point by more than rounding.
 const STILL: f64 = 1e-14;
 
+/// A step that promises this share of the tolerance is not tried: a pass over all points would only confirm that it is none.
+const NO_GAIN: f64 = 1e-2;
+
 /// A step this short that raises the objective is the noise of rounding or of one triangle's edge, not a wrong way.
 const SETTLED: f64 = 1e-7;
 
 impl Problem<'_> {
     /// Descends from a pose to the nearest minimum of the objective; the objective of steps taken never rises, eq. (14).
     ///
-    /// At the end the tracks and the sums are those of the pose that is returned.
+    /// At the end the tracks and the sums are those of the pose that is returned. The sums at the start may be known already.
     pub(crate) fn descend(
         &self,
         start: Pose,
+        known: Option<Sums>,
         tracks: &mut [Track],
         trace: &mut Vec<Iteration>,
     ) -> Result<Descent, RegistrationError> {
-        let (middle, size_mm) = middle_and_size(self.measured);
-        let lever_at = |pose: &Pose| Lever { centre: pose.inverse().point(&middle), size_mm };
         let mut pose = start;
-        let mut lever = lever_at(&pose);
-        let mut sums = self.feet(tracks, &pose, &lever);
+        let mut lever = self.lever_at(&pose);
+        let mut sums = known.unwrap_or_else(|| self.feet(tracks, &pose, &lever));
         let mut ball_radius = self.ball_radius;
         let mut rank = 0;
         let mut converged = false;
@@ -86,14 +91,18 @@ impl Problem<'_> {
             let free = free_directions(&self.locked, &lever);
             let spectrum = Spectrum::new(&(free * sums.gram() * free));
             rank = spectrum.rank(self.least_share, sums.gram().trace());
-            let m = spectrum.step(&(free * sums.right()), rank, ball_radius); // eq. (15)
+            let right = free * sums.right();
+            let m = spectrum.step(&right, rank, ball_radius); // eq. (15)
             let step = m.norm();
-            if step < STILL || sums.objective_mm2 == 0.0 {
+            // What the linear problem says that the objective falls by, at most: m.(2 A^T b - A^T A m) <= 2 m.(A^T b).
+            let promised = 2.0 * m.dot(&right);
+            let none_left = !trace.is_empty() && promised <= NO_GAIN * self.tolerance * sums.objective_mm2;
+            if step < STILL || sums.objective_mm2 == 0.0 || none_left {
                 converged = true;
                 break;
             }
             let candidate = (pose * Pose::exp(&lever.twist(&m))).orthonormalised(); // eq. (10), left side
-            let candidate_lever = lever_at(&candidate);
+            let candidate_lever = self.lever_at(&candidate);
             let candidate_sums = self.feet(tracks, &candidate, &candidate_lever);
             let taken = candidate_sums.objective_mm2 <= sums.objective_mm2;
             current = taken;
@@ -126,6 +135,11 @@ impl Problem<'_> {
             sums = self.feet(tracks, &pose, &lever);
         }
         Ok(Descent { cmm_from_model: pose, objective_mm2: sums.objective_mm2, lever, sums, rank, converged })
+    }
+
+    /// Where the twist of a step from a pose is taken.
+    pub(crate) fn lever_at(&self, pose: &Pose) -> Lever {
+        Lever { centre: pose.inverse().point(&self.middle), size_mm: self.size_mm }
     }
 
     /// Finds the feet under a pose and sums the linear problem.

@@ -235,7 +235,7 @@ pub fn register(nominal: &Nominal, measured: &[Point], options: &Options) -> Res
     }
     let problem = part.problem(measured, options, seed.side);
     let mut trace = Vec::new();
-    let mut tracks = vec![Track::NEW; measured.len()];
+    let mut tracks: Vec<Track> = measured.par_iter().map(|_| Track::NEW).collect();
     let descent = settle(&problem, &seed, options, &mut tracks, &mut trace)?;
     let registration = conclude(&part, &problem, descent, tracks, trace, &seed, options)?;
     part.confirm(&registration, measured, options)?;
@@ -249,6 +249,8 @@ pub(crate) struct Part<'a> {
     offset_mm: f64,
     /// Subtracted from each distance.
     subtract_mm: f64,
+    /// Middle of the measured cloud.
+    middle: Point,
     /// Rms size of the measured cloud.
     size_mm: f64,
     /// Singular values below this share of the largest count as unseen.
@@ -262,7 +264,7 @@ impl<'a> Part<'a> {
         if measured.len() < LEAST {
             return Err(RegistrationError::TooFewPoints { points: measured.len(), least: LEAST });
         }
-        if let Some(index) = measured.iter().position(|p| !(p.x + p.y + p.z).is_finite()) {
+        if let Some(index) = measured.par_iter().position_first(|p| !(p.x + p.y + p.z).is_finite()) {
             return Err(RegistrationError::NotFinite { index });
         }
         if crate::surface::is_line(measured) {
@@ -272,7 +274,7 @@ impl<'a> Part<'a> {
         if options.locked == [true; 6] {
             return Err(RegistrationError::Undetermined);
         }
-        let (_, size_mm) = middle_and_size(measured);
+        let (middle, size_mm) = middle_and_size(measured);
         let nominal_mm = nominal.size_mm();
         check_sizes(size_mm, nominal_mm)?;
         let radius_mm = options.probe_radius_mm;
@@ -286,7 +288,7 @@ impl<'a> Part<'a> {
             Method::SubtractRadius => (0.0, radius_mm),
         };
         let least_share = 1e-6_f64.max(3.0 * nominal.normal_error());
-        Ok(Self { nominal, offset_mm, subtract_mm, size_mm, least_share })
+        Ok(Self { nominal, offset_mm, subtract_mm, middle, size_mm, least_share })
     }
 
     fn surface(&self, options: &Options, side: Side) -> OffsetSurface<'a> {
@@ -299,7 +301,7 @@ impl<'a> Part<'a> {
 
     /// Refuses a probe that does not fit into the surface.
     fn check_fold(&self, options: &Options, side: Side) -> Result<(), RegistrationError> {
-        match self.surface(options, side).fold(std::iter::empty()) {
+        match self.surface(options, side).fold() {
             Some(fold) => Err(fold.into()),
             None => Ok(()),
         }
@@ -313,6 +315,8 @@ impl<'a> Part<'a> {
             surface: self.surface(options, side),
             reading: Reading { subtract_mm: self.subtract_mm, loss: ScaledLoss::new(Loss::None, 1.0) },
             measured,
+            middle: self.middle,
+            size_mm: self.size_mm,
             locked: options.locked,
             least_share: self.least_share,
             tolerance: options.tolerance,
@@ -356,8 +360,9 @@ fn check_repeats(measured: &[Point]) -> Result<(), RegistrationError> {
         mixed ^ (mixed >> 29)
     };
     let one_in = measured.len().div_ceil(LOOKED_AT) as u64;
+    let mixed = |(k, p): (usize, &Point)| (mixed(p), k);
     let mut chosen: Vec<(u64, usize)> =
-        measured.iter().map(mixed).enumerate().filter(|(_, h)| h % one_in == 0).map(|(k, h)| (h, k)).collect();
+        measured.par_iter().enumerate().with_min_len(4096).map(mixed).filter(|(h, _)| h % one_in == 0).collect();
     chosen.sort_unstable();
     let doubled = chosen.windows(2).filter(|w| w[0].0 == w[1].0 && measured[w[0].1] == measured[w[1].1]).count();
     if doubled * 100 > chosen.len() {
@@ -399,16 +404,23 @@ fn settle(
     let mut pose = seed.cmm_from_model;
     if seed.near {
         problem.ball_radius = problem.ball_radius.min(0.05);
-        evaluate(&problem, tracks, &pose);
-        screen(&problem, options, tracks, true);
     }
-    if !seed.near && problem.measured.len() >= 2 * PILOT {
-        pose = pilot(&problem, pose, trace)?;
+    let pilots: &[usize] = if problem.surface.fits_normals() { &PILOT_WHERE_NORMALS_COST } else { &PILOTS };
+    let enough = 2 * pilots.iter().max().expect("there are pilots");
+    for few in pilots.iter().filter(|_| problem.measured.len() >= enough) {
+        pose = pilot(&problem, pose, *few, if seed.near { Some(options) } else { None }, trace)?;
+    }
+    look_ahead(&problem, tracks, &pose);
+    let mut known = None;
+    if seed.near {
+        let sums = problem.feet(tracks, &pose, &problem.lever_at(&pose));
+        let changed = screen(&problem, options, tracks, true);
+        known = (changed == 0 && options.loss == Loss::None).then_some(sums);
     }
     let mut round = 0;
     loop {
         rescale(&mut problem, options, tracks, round > 0 || seed.near);
-        let descent = problem.descend(pose, tracks, trace)?;
+        let descent = problem.descend(pose, known.take(), tracks, trace)?;
         if !descent.converged {
             let (iterations, objective_mm2) = (options.most_iterations, descent.objective_mm2);
             return Err(RegistrationError::NotConverged { iterations, objective_mm2 });
@@ -423,15 +435,44 @@ fn settle(
     }
 }
 
-/// Points that a dense cloud sends ahead.
-const PILOT: usize = 16_384;
+/// Points that a dense cloud sends ahead, first a few for the long way and then more for the rest of it.
+const PILOTS: [usize; 2] = [1024, 16_384];
+
+/// The same where every place touched costs a fit: fewer touch less, and the rest then touch only where they end.
+const PILOT_WHERE_NORMALS_COST: [usize; 1] = [2048];
+
+/// Starts the search for the feet near where they are, with the normals there fitted all at once.
+fn look_ahead(problem: &Problem, tracks: &mut [Track], pose: &Pose) {
+    if !problem.surface.fits_normals() {
+        return;
+    }
+    let model_from_cmm = pose.inverse();
+    let points: Vec<Point> = problem.measured.par_iter().map(|p| model_from_cmm.point(p)).collect();
+    for (track, place) in tracks.iter_mut().zip(problem.surface.look_ahead(&points)) {
+        track.place = place;
+    }
+}
 
 /// Descends with a few of many points, from where the rest have a step or two to go; its turns stand in the trace.
-fn pilot(problem: &Problem, pose: Pose, trace: &mut Vec<Iteration>) -> Result<Pose, RegistrationError> {
-    let few: Vec<Point> = start::spread(problem.measured, PILOT).copied().collect();
+///
+/// Near the end outliers are told among the few themselves; far from it they cannot be.
+fn pilot(
+    problem: &Problem,
+    pose: Pose,
+    count: usize,
+    screened: Option<&Options>,
+    trace: &mut Vec<Iteration>,
+) -> Result<Pose, RegistrationError> {
+    let few: Vec<Point> = start::spread(problem.measured, count).copied().collect();
     let mut tracks = vec![Track::NEW; few.len()];
-    let ahead = Problem { measured: &few, ..*problem };
-    Ok(ahead.descend(pose, &mut tracks, trace)?.cmm_from_model)
+    let (middle, size_mm) = middle_and_size(&few);
+    let ahead = Problem { measured: &few, middle, size_mm, ..*problem };
+    look_ahead(&ahead, &mut tracks, &pose);
+    if let Some(options) = screened {
+        ahead.feet(&mut tracks, &pose, &ahead.lever_at(&pose));
+        screen(&ahead, options, &mut tracks, true);
+    }
+    Ok(ahead.descend(pose, None, &mut tracks, trace)?.cmm_from_model)
 }
 
 /// Refuses an end that hangs on too few points, or on none of the six directions.
@@ -443,12 +484,6 @@ fn finish(descent: Descent, points: usize) -> Result<Descent, RegistrationError>
         return Err(RegistrationError::Undetermined);
     }
     Ok(descent)
-}
-
-fn evaluate(problem: &Problem, tracks: &mut [Track], pose: &Pose) {
-    let (middle, size_mm) = middle_and_size(problem.measured);
-    let lever = linearize::Lever { centre: pose.inverse().point(&middle), size_mm };
-    problem.feet(tracks, pose, &lever);
 }
 
 /// Gives a robust loss the scale of the distances as they are now.
@@ -533,14 +568,13 @@ fn conclude(
     seed: &start::Seed,
     options: &Options,
 ) -> Result<Registration, RegistrationError> {
-    if let Some(fold) = problem.surface.fold(tracks.iter().map(|t| t.place)) {
+    if let Some(fold) = problem.surface.fold_where_touched(tracks.iter().map(|t| t.place)) {
         return Err(fold.into());
     }
     let mut verdict = verdict::judge(problem, &descent, &tracks, seed, trace.len());
     let reporter = verdict::Reporter::new(part, &descent.lever, &verdict, options);
     let pose = &descent.cmm_from_model;
-    let report = |track: &Track, at_foot| reporter.deviation(track, at_foot);
-    let deviations = at_feet(&problem.surface, problem.measured, &tracks, pose, &descent.lever, report);
+    let deviations = at_feet(&problem.surface, problem.measured, &tracks, pose, &descent.lever, &reporter);
     verdict.coverage = verdict::coverage(part.nominal, &deviations);
     Ok(Registration { cmm_from_model: descent.cmm_from_model, deviations, trace, side: seed.side, verdict })
 }

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use crate::geometry::{Point, Pose, Vector};
 use crate::surface::{Feature, OffsetSurface, Place, Side, features, principal_axes};
 
-use super::correspond::{Reading, Track};
+use super::correspond::{Reading, Track, middle_and_size};
 use super::iterate::Problem;
 use super::robust::{Loss, ScaledLoss, robust_sigma};
 use super::{Options, Part, ProbeSide, Registration, RegistrationError, Start};
@@ -283,8 +283,11 @@ impl<'a> Search<'a> {
     /// Descends under a loss that forgets gross outliers, its scale following the distances down.
     fn refine(&self, start: Pose, side: Side, points: &[Point], rounds: usize, iterations: usize) -> Candidate {
         let surface = self.part.surface(self.options, side);
+        let (middle, size_mm) = middle_and_size(points);
         let mut problem = Problem {
             surface,
+            middle,
+            size_mm,
             reading: Reading { subtract_mm: self.part.subtract_mm, loss: ScaledLoss::new(Loss::None, 1.0) },
             measured: points,
             locked: self.options.locked,
@@ -301,7 +304,7 @@ impl<'a> Search<'a> {
                 let (_, sigma) = robust_sigma(tracks.iter().map(|t| t.distance_mm));
                 problem.reading.loss = ScaledLoss::new(Loss::Tukey, sigma.max(1e-4));
             }
-            match problem.descend(pose, &mut tracks, &mut trace) {
+            match problem.descend(pose, None, &mut tracks, &mut trace) {
                 Ok(descent) => pose = descent.cmm_from_model,
                 Err(_) => break,
             }

@@ -1,13 +1,13 @@
 //! How well the pose is known, which way it is not, and what each deviation is worth.
 
-use std::collections::HashSet;
-
 use nalgebra::{DMatrix, Matrix6, Vector6};
+use rayon::prelude::*;
 
 use crate::geometry::{Point, Pose, Vector};
 use crate::surface::Nominal;
+use crate::surface::lanes::{LANES, Lane};
 
-use super::correspond::{Final, Track};
+use super::correspond::{FourFinal, Report, Track};
 use super::iterate::{Descent, Problem, free_directions};
 use super::linearize::Lever;
 use super::solve::Spectrum;
@@ -61,10 +61,7 @@ pub struct WeakDirection {
 
 /// Judges the end of an iteration.
 pub(crate) fn judge(problem: &Problem, descent: &Descent, tracks: &[Track], seed: &Seed, iterations: usize) -> Verdict {
-    let used: Vec<f64> = tracks.iter().filter(|t| t.used).map(|t| t.distance_mm).collect();
-    let n = used.len();
-    let objective_mm2 = used.iter().map(|d| d * d).sum::<f64>();
-    let (low, high) = used.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), d| (l.min(*d), h.max(*d)));
+    let Spread { used: n, squares_mm2: objective_mm2, low_mm, high_mm } = Spread::of(tracks);
     let free = free_directions(&problem.locked, &descent.lever);
     let spectrum = Spectrum::new(&(free * descent.sums.gram() * free));
     let rank = descent.rank;
@@ -84,7 +81,7 @@ pub(crate) fn judge(problem: &Problem, descent: &Descent, tracks: &[Track], seed
         used: n,
         objective_mm2,
         rms_mm: (objective_mm2 / n as f64).sqrt(),
-        pv_mm: high - low,
+        pv_mm: high_mm - low_mm,
         residual_sigma_mm: residual2.sqrt(),
         covariance: to_twist * scaled * to_twist.transpose(),
         condition: (spectrum.squares[0] / spectrum.squares[rank - 1]).sqrt(),
@@ -94,6 +91,37 @@ pub(crate) fn judge(problem: &Problem, descent: &Descent, tracks: &[Track], seed
         alternatives,
         iterations,
         converged: descent.converged,
+    }
+}
+
+/// What the distances of the points used come to.
+#[derive(Clone, Copy)]
+struct Spread {
+    used: usize,
+    squares_mm2: f64,
+    low_mm: f64,
+    high_mm: f64,
+}
+
+impl Spread {
+    const NONE: Self = Self { used: 0, squares_mm2: 0.0, low_mm: f64::INFINITY, high_mm: f64::NEG_INFINITY };
+
+    fn of(tracks: &[Track]) -> Self {
+        let add = |sum: Self, d: f64| Self {
+            used: sum.used + 1,
+            squares_mm2: sum.squares_mm2 + d * d,
+            low_mm: sum.low_mm.min(d),
+            high_mm: sum.high_mm.max(d),
+        };
+        let part = |c: &[Track]| c.iter().filter(|t| t.used).map(|t| t.distance_mm).fold(Self::NONE, add);
+        // In chunks that are added in order: the same bits on any number of threads.
+        let parts: Vec<Self> = tracks.par_chunks(1 << 14).map(part).collect();
+        parts.iter().fold(Self::NONE, |a, b| Self {
+            used: a.used + b.used,
+            squares_mm2: a.squares_mm2 + b.squares_mm2,
+            low_mm: a.low_mm.min(b.low_mm),
+            high_mm: a.high_mm.max(b.high_mm),
+        })
     }
 }
 
@@ -281,10 +309,69 @@ pub(crate) fn coverage(nominal: &Nominal, deviations: &[Deviation]) -> f64 {
     let stride = deviations.len().div_ceil(MOST);
     let used: Vec<&Deviation> = deviations.iter().step_by(stride).filter(|d| d.status == PointStatus::Used).collect();
     let edge = (size / 15.0).max(3.0 * 3.5 * size / (used.len() as f64).sqrt());
-    let cell = |p: &Point| [p.x, p.y, p.z].map(|c| (c / edge).floor() as i32);
-    let touched: HashSet<[i32; 3]> = used.iter().map(|d| cell(&d.point)).collect();
     let sample = nominal.sample(20_000);
-    sample.iter().filter(|p| touched.contains(&cell(p))).count() as f64 / sample.len() as f64
+    let mut cells = Cells::around(&sample, edge);
+    for deviation in used {
+        cells.touch(&deviation.point);
+    }
+    sample.iter().filter(|p| cells.is_touched(p)).count() as f64 / sample.len() as f64
+}
+
+/// Cubes around some points, and which of them were touched.
+struct Cells {
+    low: [i32; 3],
+    counts: [usize; 3],
+    per_mm: f64,
+    touched: Vec<bool>,
+}
+
+impl Cells {
+    /// Cells along an axis at most; beyond, where a point far from all others has drawn them out, the rest share the last one.
+    const MOST: i64 = 256;
+
+    fn around(points: &[Point], edge_mm: f64) -> Self {
+        let per_mm = 1.0 / edge_mm;
+        let (mut low, mut high) = ([i32::MAX; 3], [i32::MIN; 3]);
+        for p in points {
+            let at = Self::cell(p, per_mm);
+            for c in 0..3 {
+                (low[c], high[c]) = (low[c].min(at[c]), high[c].max(at[c]));
+            }
+        }
+        let count = |c: usize| (i64::from(high[c]) - i64::from(low[c]) + 1).clamp(1, Self::MOST) as usize;
+        let counts = [count(0), count(1), count(2)];
+        Self { low, counts, per_mm, touched: vec![false; counts.iter().product()] }
+    }
+
+    fn cell(p: &Point, per_mm: f64) -> [i32; 3] {
+        [p.x, p.y, p.z].map(|c| (c * per_mm).floor() as i32)
+    }
+
+    /// The number of the cell of a point; `None` where there is none.
+    fn index(&self, p: &Point) -> Option<usize> {
+        let at = Self::cell(p, self.per_mm);
+        let mut index = 0;
+        for (c, at) in at.into_iter().enumerate() {
+            let k = i64::from(at) - i64::from(self.low[c]);
+            // The last cell is that of all beyond only where the cells are as many as there may be.
+            let k = if self.counts[c] == Self::MOST as usize { k.min(Self::MOST - 1) } else { k };
+            if k < 0 || k >= self.counts[c] as i64 {
+                return None;
+            }
+            index = index * self.counts[c] + k as usize;
+        }
+        Some(index)
+    }
+
+    fn touch(&mut self, p: &Point) {
+        if let Some(index) = self.index(p) {
+            self.touched[index] = true;
+        }
+    }
+
+    fn is_touched(&self, p: &Point) -> bool {
+        self.index(p).is_some_and(|index| self.touched[index])
+    }
 }
 
 /// What turns a foot into a deviation that is reported.
@@ -308,17 +395,49 @@ impl<'a> Reporter<'a> {
             back_mm: if options.method == Method::Contact { 0.0 } else { options.probe_radius_mm },
         }
     }
+}
 
-    /// Returns the deviation of one point.
-    pub(crate) fn deviation(&self, track: &Track, f: Final) -> Deviation {
-        let point = f.centre - f.foot.normal * self.back_mm;
-        let beyond_outline = self.nominal.outline().is_some_and(|o| !o.contains(point.x, point.y));
-        Deviation {
-            point,
-            normal: f.foot.normal,
-            deviation_mm: f.foot.distance_mm - self.subtract_mm,
-            uncertainty_mm: (self.variance_mm2 + f.row.dot(&(self.scaled * f.row)).max(0.0)).sqrt(),
-            status: if beyond_outline { PointStatus::OffPart } else { track.status() },
+impl Report for Reporter<'_> {
+    type Item = Deviation;
+
+    const BLANK: Deviation = Deviation {
+        point: Point::new(0.0, 0.0, 0.0),
+        normal: Vector::new(0.0, 0.0, 0.0),
+        deviation_mm: 0.0,
+        uncertainty_mm: 0.0,
+        status: PointStatus::Used,
+    };
+
+    #[inline(always)]
+    fn four(&self, tracks: [&Track; LANES], at: &FourFinal) -> [Deviation; LANES] {
+        let normal = &at.feet.normal;
+        let back = Lane::splat(self.back_mm);
+        let contact =
+            [at.centre[0] - normal[0] * back, at.centre[1] - normal[1] * back, at.centre[2] - normal[2] * back];
+        let deviation = at.feet.distance_mm - Lane::splat(self.subtract_mm);
+        let mut variance = Lane::splat(0.0);
+        for i in 0..6 {
+            let mut along = Lane::splat(0.0);
+            for j in 0..6 {
+                along = along + Lane::splat(self.scaled[(i, j)]) * at.row[j];
+            }
+            variance = variance + at.row[i] * along;
         }
+        let mut deviations = [Self::BLANK; LANES];
+        for (l, found) in deviations.iter_mut().enumerate() {
+            let point = Point::new(contact[0].0[l], contact[1].0[l], contact[2].0[l]);
+            let beyond_outline = match self.nominal.outline() {
+                Some(outline) => !outline.contains(point.x, point.y),
+                None => false,
+            };
+            *found = Deviation {
+                point,
+                normal: Vector::new(normal[0].0[l], normal[1].0[l], normal[2].0[l]),
+                deviation_mm: deviation.0[l],
+                uncertainty_mm: (self.variance_mm2 + variance.0[l].max(0.0)).sqrt(),
+                status: if beyond_outline { PointStatus::OffPart } else { tracks[l].status() },
+            };
+        }
+        deviations
     }
 }

@@ -1,11 +1,11 @@
 //! Triangulation of scattered points in the plane of their projection.
 
 use rayon::prelude::*;
-use spade::{DelaunayTriangulation, HasPosition, Point2, Triangulation};
 
 use crate::geometry::Point;
 
 use super::SurfaceError;
+use super::edges::{Strewn, Triangulation};
 use super::mesh::BORDER;
 use super::projection::Map;
 
@@ -21,113 +21,79 @@ const NEEDLE: f64 = 0.05;
 /// A triangle whose longest edge is this many times what is usual around its corners bridges a hole.
 const BRIDGE: f64 = 6.0;
 
-/// A projected point that remembers where it came from.
-struct Site {
-    place: Point2<f64>,
-    index: u32,
-}
-
-impl HasPosition for Site {
-    type Scalar = f64;
-
-    fn position(&self) -> Point2<f64> {
-        self.place
-    }
-}
+/// Coordinates beyond this (2^201) are refused: their fourth powers would leave what a number can hold.
+const LARGEST: f64 = 3.2e60;
 
 /// Triangulates scattered points in the plane of a map, without the needles at the hull and the bridges over holes.
 ///
-/// Shapes: corners index the points; counter-clockwise in the plane.
+/// Shapes: returns the points in an order in which neighbours in the plane are mostly neighbours in memory, and triangles whose
+/// corners index them, counter-clockwise in the plane.
 ///
 /// # Errors
 /// Two points at one place of the plane, or no three points off one line.
-pub(crate) fn triangulate(points: &[Point], map: &Map) -> Result<Triangles, SurfaceError> {
-    let places: Vec<[f64; 2]> = points.par_iter().map(|p| map.project(p).0).collect();
-    let sites = places
-        .iter()
-        .enumerate()
-        .map(|(index, &[u, v])| Site { place: Point2::new(lifted(u), lifted(v)), index: index as u32 })
-        .collect();
-    let triangulation = DelaunayTriangulation::<Site>::bulk_load(sites)
-        .map_err(|_| SurfaceError::NotFinite { index: places.iter().position(|p| !p[0].is_finite()).unwrap_or(0) })?;
-    if triangulation.num_vertices() < points.len() {
+pub(crate) fn triangulate(points: &[Point], map: &Map) -> Result<(Vec<Point>, Triangles), SurfaceError> {
+    let places: Vec<[f64; 2]> = points.par_iter().map(|p| map.project(p).0.map(lifted)).collect();
+    if let Some(index) = places.iter().position(|p| !(p[0].abs() <= LARGEST && p[1].abs() <= LARGEST)) {
+        return Err(SurfaceError::NotFinite { index });
+    }
+    let along = along_a_z_curve(&places);
+    let keys: Vec<u64> = along.par_iter().map(|(key, _)| *key).collect();
+    let ordered: Vec<[f64; 2]> = along.par_iter().map(|(_, index)| places[*index as usize]).collect();
+    if ordered.windows(2).any(|w| w[0] == w[1]) {
         return Err(first_duplicate(points, &places));
     }
-    if triangulation.num_inner_faces() == 0 {
+    let (corners, neighbours) = Triangulation::new(Strewn { places: &ordered, keys: &keys }).faces();
+    if corners.is_empty() {
         return Err(SurfaceError::Collinear { points: points.len() });
     }
-    let triangles = flat_arrays(&triangulation);
-    Ok(in_order_of_corners(without_bridges_and_needles(triangles, &places)))
+    let triangles = without_bridges_and_needles(Triangles { corners, neighbours }, &ordered);
+    Ok((along.par_iter().map(|(_, index)| points[*index as usize]).collect(), triangles))
 }
 
-/// Returns an order of the points in which neighbours in the plane are mostly neighbours in memory: along a Z-curve.
-pub(crate) fn neighbourly_order(points: &[Point], map: &Map) -> Vec<u32> {
-    let places: Vec<[f64; 2]> = points.par_iter().map(|p| map.project(p).0).collect();
+/// Returns the keys and the numbers of places in the order of a Z-curve; places of one key by u, then v.
+pub(crate) fn along_a_z_curve(places: &[[f64; 2]]) -> Vec<(u64, u32)> {
     let (low, high) = places.iter().fold(([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]), |(l, h), p| {
         ([l[0].min(p[0]), l[1].min(p[1])], [h[0].max(p[0]), h[1].max(p[1])])
     });
-    let cells = |k: usize| 65_535.0 / (high[k] - low[k]);
-    let per_mm = [cells(0), cells(1)];
+    let per_mm = [0, 1].map(|k: usize| f64::from(u32::MAX) / (high[k] - low[k]));
     let key = |p: &[f64; 2]| {
+        // Rounding keeps the order, so that of two cells the lower has the lower places.
         let [u, v] = [0, 1].map(|k| ((p[k] - low[k]) * per_mm[k]) as u32);
         spread_bits(u) | spread_bits(v) << 1
     };
-    let mut keyed: Vec<(u32, u32)> = places.par_iter().enumerate().map(|(i, p)| (key(p), i as u32)).collect();
-    keyed.par_sort_unstable();
-    keyed.into_iter().map(|(_, index)| index).collect()
-}
-
-/// Puts a zero between each two of the lower sixteen bits.
-fn spread_bits(mut bits: u32) -> u32 {
-    bits = (bits | bits << 8) & 0x00FF_00FF;
-    bits = (bits | bits << 4) & 0x0F0F_0F0F;
-    bits = (bits | bits << 2) & 0x3333_3333;
-    (bits | bits << 1) & 0x5555_5555
-}
-
-/// Numbers the triangles in the order of their lowest corners, so that they stand in memory where their points do.
-fn in_order_of_corners(t: Triangles) -> Triangles {
-    let mut order: Vec<(u32, u32)> =
-        t.corners.par_iter().enumerate().map(|(f, c)| (c[0].min(c[1]).min(c[2]), f as u32)).collect();
-    order.par_sort_unstable();
-    let mut number = vec![0; order.len()];
-    for (new, (_, old)) in order.iter().enumerate() {
-        number[*old as usize] = new as u32;
+    let mut along: Vec<(u64, u32)> = places.par_iter().enumerate().map(|(i, p)| (key(p), i as u32)).collect();
+    along.par_sort_unstable();
+    let place = |(_, index): &(u64, u32)| places[*index as usize];
+    for run in along.chunk_by_mut(|a, b| a.0 == b.0).filter(|run| run.len() > 1) {
+        run.sort_unstable_by(|a, b| {
+            let (p, q) = (place(a), place(b));
+            p[0].total_cmp(&q[0]).then(p[1].total_cmp(&q[1]))
+        });
     }
-    let renumbered = |n: u32| if n == BORDER { BORDER } else { number[n as usize] };
-    Triangles {
-        corners: order.par_iter().map(|(_, old)| t.corners[*old as usize]).collect(),
-        neighbours: order.par_iter().map(|(_, old)| t.neighbours[*old as usize].map(renumbered)).collect(),
-    }
+    along
 }
 
-/// Spade refuses coordinates closer to zero than 2^-142; those are zero to us.
+/// Puts a zero before each bit.
+fn spread_bits(bits: u32) -> u64 {
+    let mut bits = u64::from(bits);
+    bits = (bits | bits << 16) & 0x0000_FFFF_0000_FFFF;
+    bits = (bits | bits << 8) & 0x00FF_00FF_00FF_00FF;
+    bits = (bits | bits << 4) & 0x0F0F_0F0F_0F0F_0F0F;
+    bits = (bits | bits << 2) & 0x3333_3333_3333_3333;
+    (bits | bits << 1) & 0x5555_5555_5555_5555
+}
+
+/// Products of coordinates closer to zero than this vanish; those are zero to us, and so is -0.
 fn lifted(coordinate: f64) -> f64 {
     if coordinate.abs() < 1e-40 { 0.0 } else { coordinate }
 }
 
 fn first_duplicate(points: &[Point], places: &[[f64; 2]]) -> SurfaceError {
     let mut order: Vec<usize> = (0..places.len()).collect();
-    let key = |i: usize| (lifted(places[i][0]), lifted(places[i][1]));
+    let key = |i: usize| (places[i][0], places[i][1]);
     order.sort_by(|&a, &b| key(a).0.total_cmp(&key(b).0).then(key(a).1.total_cmp(&key(b).1)).then(a.cmp(&b)));
     let pair = order.windows(2).find(|w| key(w[0]) == key(w[1])).map_or((0, 0), |w| (w[0], w[1]));
     SurfaceError::DuplicatePoints { first: pair.0, second: pair.1, at: points[pair.0].into() }
-}
-
-fn flat_arrays(triangulation: &DelaunayTriangulation<Site>) -> Triangles {
-    let count = triangulation.num_inner_faces();
-    let (mut corners, mut neighbours) = (Vec::with_capacity(count), Vec::with_capacity(count));
-    // Face 0 is the outer one; the inner ones follow in order.
-    for face in triangulation.inner_faces() {
-        let edges = face.adjacent_edges();
-        corners.push(edges.map(|e| e.from().data().index));
-        // Opposite to corner k lies the edge that begins at corner k + 1.
-        neighbours.push([1, 2, 0].map(|k: usize| match edges[k].rev().face().as_inner() {
-            Some(face) => face.fix().index() as u32 - 1,
-            None => BORDER,
-        }));
-    }
-    Triangles { corners, neighbours }
 }
 
 fn without_bridges_and_needles(mut t: Triangles, places: &[[f64; 2]]) -> Triangles {
@@ -136,7 +102,8 @@ fn without_bridges_and_needles(mut t: Triangles, places: &[[f64; 2]]) -> Triangl
     for facet in bridges(&t, places) {
         drop_facet(&mut t, &mut dropped, facet, &mut open);
     }
-    open.extend((0..t.corners.len() as u32).filter(|&f| t.neighbours[f as usize].contains(&BORDER)));
+    let at_border = |f: &u32| t.neighbours[*f as usize].contains(&BORDER);
+    open.extend((0..t.corners.len() as u32).into_par_iter().filter(at_border).collect::<Vec<_>>());
     while let Some(facet) = open.pop() {
         if !dropped[facet as usize] && is_needle(&t, places, facet) {
             drop_facet(&mut t, &mut dropped, facet, &mut open);
@@ -157,34 +124,28 @@ fn drop_facet(t: &mut Triangles, dropped: &mut [bool], facet: u32, open: &mut Ve
     t.neighbours[facet as usize] = [BORDER; 3];
 }
 
-/// Lengths of the edges opposite to each corner.
-fn edge_lengths(corners: &[u32; 3], places: &[[f64; 2]]) -> [f64; 3] {
+/// Squared lengths of the edges opposite to each corner.
+fn squared_lengths(corners: &[u32; 3], places: &[[f64; 2]]) -> [f64; 3] {
     let at = corners.map(|c| places[c as usize]);
     [(1, 2), (2, 0), (0, 1)].map(|(a, b): (usize, usize)| {
         let (u, v) = (at[a][0] - at[b][0], at[a][1] - at[b][1]);
-        (u * u + v * v).sqrt()
+        u * u + v * v
     })
 }
 
 /// Finds triangles far longer than is usual around their corners.
 fn bridges(t: &Triangles, places: &[[f64; 2]]) -> Vec<u32> {
     let longest: Vec<f64> =
-        t.corners.par_iter().map(|c| edge_lengths(c, places).into_iter().fold(0.0, f64::max)).collect();
-    let usual_everywhere = median(longest.clone());
-    let suspects: Vec<u32> =
-        (0..t.corners.len() as u32).filter(|&f| longest[f as usize] > BRIDGE * usual_everywhere).collect();
+        t.corners.par_iter().map(|c| squared_lengths(c, places).into_iter().fold(0.0, f64::max).sqrt()).collect();
+    let usual_everywhere = median(&longest);
+    let suspects: Vec<u32> = (0..t.corners.len() as u32)
+        .into_par_iter()
+        .filter(|&f| longest[f as usize] > BRIDGE * usual_everywhere)
+        .collect();
     if suspects.is_empty() {
         return suspects;
     }
-    // What is usual at a vertex: the lower quartile of the longest edges around it, since at the rim of a hole half of its
-    // triangles may be bridges.
-    let mut around: Vec<(u32, f64)> =
-        t.corners.iter().zip(&longest).flat_map(|(c, &l)| c.map(|vertex| (vertex, l))).collect();
-    around.sort_unstable_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)));
-    let mut usual = vec![0.0; places.len()];
-    for at_vertex in around.chunk_by(|a, b| a.0 == b.0) {
-        usual[at_vertex[0].0 as usize] = at_vertex[(at_vertex.len() - 1) / 4].1;
-    }
+    let usual = usual_around(t, &longest, places.len(), &suspects);
     suspects
         .into_iter()
         .filter(|&f| {
@@ -194,11 +155,32 @@ fn bridges(t: &Triangles, places: &[[f64; 2]]) -> Vec<u32> {
         .collect()
 }
 
+/// Returns what is usual at the vertices of some triangles: the lower quartile of the longest edges around each, since at the
+/// rim of a hole half of its triangles may be bridges. Zero at all other vertices.
+fn usual_around(t: &Triangles, longest: &[f64], vertices: usize, suspects: &[u32]) -> Vec<f64> {
+    let mut asked = vec![false; vertices];
+    for c in suspects.iter().flat_map(|&f| t.corners[f as usize]) {
+        asked[c as usize] = true;
+    }
+    let mut around: Vec<(u32, f64)> = t
+        .corners
+        .par_iter()
+        .zip(longest)
+        .flat_map_iter(|(c, &l)| c.iter().filter(|&&c| asked[c as usize]).map(move |&c| (c, l)))
+        .collect();
+    around.par_sort_unstable_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)));
+    let mut usual = vec![0.0; vertices];
+    for at_vertex in around.chunk_by(|a, b| a.0 == b.0) {
+        usual[at_vertex[0].0 as usize] = at_vertex[(at_vertex.len() - 1) / 4].1;
+    }
+    usual
+}
+
 fn is_needle(t: &Triangles, places: &[[f64; 2]], facet: u32) -> bool {
     let [a, b, c] = t.corners[facet as usize].map(|c| places[c as usize]);
     let double_area = ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])).abs();
-    let lengths = edge_lengths(&t.corners[facet as usize], places);
-    (0..3).any(|k| t.neighbours[facet as usize][k] == BORDER && double_area < NEEDLE * lengths[k] * lengths[k])
+    let squared = squared_lengths(&t.corners[facet as usize], places);
+    (0..3).any(|k| t.neighbours[facet as usize][k] == BORDER && double_area < NEEDLE * squared[k])
 }
 
 fn compacted(t: Triangles, dropped: &[bool]) -> Triangles {
@@ -214,19 +196,29 @@ fn compacted(t: Triangles, dropped: &[bool]) -> Triangles {
             if gone { BORDER } else { number }
         })
         .collect();
-    let keep = |f: &usize| !dropped[*f];
+    let kept: Vec<u32> = (0..dropped.len() as u32).filter(|&f| !dropped[f as usize]).collect();
+    let across = |n: u32| if n == BORDER { BORDER } else { renumbered[n as usize] };
     Triangles {
-        corners: (0..dropped.len()).filter(keep).map(|f| t.corners[f]).collect(),
-        neighbours: (0..dropped.len())
-            .filter(keep)
-            .map(|f| t.neighbours[f].map(|n| if n == BORDER { BORDER } else { renumbered[n as usize] }))
-            .collect(),
+        corners: kept.par_iter().map(|&f| t.corners[f as usize]).collect(),
+        neighbours: kept.par_iter().map(|&f| t.neighbours[f as usize].map(across)).collect(),
     }
 }
 
-fn median(mut values: Vec<f64>) -> f64 {
+/// The middle one of many values.
+fn median(values: &[f64]) -> f64 {
+    const SAMPLE: usize = 1024;
     let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+    let mut sample: Vec<f64> = values.iter().step_by(values.len().div_ceil(SAMPLE)).copied().collect();
+    sample.sort_unstable_by(f64::total_cmp);
+    // It lies where it does in a sample, near enough; what is outside is counted only.
+    let [low, high] = [4, 6].map(|tenths| sample[sample.len() * tenths / 10]);
+    let below = values.par_iter().filter(|v| **v < low).count();
+    let mut within: Vec<f64> = values.par_iter().copied().filter(|v| (low..=high).contains(v)).collect();
+    if (below..below + within.len()).contains(&middle) {
+        *within.select_nth_unstable_by(middle - below, f64::total_cmp).1
+    } else {
+        *values.to_vec().select_nth_unstable_by(middle, f64::total_cmp).1
+    }
 }
 
 #[cfg(test)]
@@ -249,14 +241,13 @@ mod tests {
         t.corners.iter().map(|&[a, b, c]| 0.5 * (p(b) - p(a)).cross(&(p(c) - p(a))).z).sum()
     }
 
-    fn triangulated(points: &[Point]) -> Triangles {
+    fn triangulated(points: &[Point]) -> (Vec<Point>, Triangles) {
         triangulate(points, &Projection::Xy.prepare(points).unwrap().1).unwrap()
     }
 
     #[test]
     fn a_disc_is_covered_and_turns_counter_clockwise() {
-        let points = sunflower(3000, 0.0);
-        let t = triangulated(&points);
+        let (points, t) = triangulated(&sunflower(3000, 0.0));
         let disc = std::f64::consts::PI * 900.0;
         assert!((area(&t, &points) / disc - 1.0).abs() < 0.02);
         assert!(t.corners.iter().all(|&[a, b, c]| {
@@ -267,8 +258,7 @@ mod tests {
 
     #[test]
     fn neighbours_know_each_other_after_trimming() {
-        let points = sunflower(2000, 0.5);
-        let t = triangulated(&points);
+        let (_, t) = triangulated(&sunflower(2000, 0.5));
         for (f, across) in t.neighbours.iter().enumerate() {
             for (k, &n) in across.iter().enumerate() {
                 if n != BORDER {
@@ -281,10 +271,23 @@ mod tests {
 
     #[test]
     fn the_hole_of_an_annulus_is_not_bridged() {
-        let points = sunflower(3000, 0.5);
-        let t = triangulated(&points);
+        let (points, t) = triangulated(&sunflower(3000, 0.5));
         let annulus = std::f64::consts::PI * 900.0 * 0.75;
         assert!((area(&t, &points) / annulus - 1.0).abs() < 0.03, "{}", area(&t, &points) / annulus);
+    }
+
+    #[test]
+    fn the_median_is_the_middle_one_however_the_values_lie() {
+        let exact = |mut values: Vec<f64>| {
+            values.sort_by(f64::total_cmp);
+            values[values.len() / 2]
+        };
+        let fractions = |count: usize| (0..count).map(|k| (k as f64 * 0.618_033_988_749_895).fract());
+        // The last misleads a sample of every third value.
+        let periodic = (0..3000).map(|k| if k % 3 == 0 { 0.0 } else { 1.0 + f64::from(k) });
+        for values in [vec![3.0], vec![2.0, 1.0], vec![5.0; 4000], fractions(10_001).collect(), periodic.collect()] {
+            assert_eq!(median(&values), exact(values.clone()));
+        }
     }
 
     #[test]

@@ -6,8 +6,9 @@ use crate::geometry::Vector;
 
 use super::SurfaceError;
 use super::grid::GridLattice;
+use super::lanes::{LANES, Lane, Lane3, dot, four_vertices, minus, times};
 use super::offset::{OffsetSurface, Place};
-use super::patch::{Facets, Lattice, Patch};
+use super::patch::{Facets, Lattice, Patch, Vertex};
 
 /// Facets of a mesh that are looked at besides those touched: its normals are fitted only where they are needed.
 const LOOKED_AT: usize = 2048;
@@ -18,66 +19,82 @@ const STEP: usize = 2;
 const DOUBT: f64 = 1.4;
 
 impl OffsetSurface<'_> {
-    /// Returns the worst place where the offset surface folds, if it does: over a whole grid, and over a mesh where it was
-    /// touched and at some thousand places besides.
-    pub(crate) fn fold(&self, touched: impl Iterator<Item = Place>) -> Option<SurfaceError> {
+    /// Returns the worst place where the offset surface folds, if it does: over a whole grid, and over a mesh at some thousand
+    /// places.
+    pub(crate) fn fold(&self) -> Option<SurfaceError> {
         if self.radius_mm() == 0.0 {
             return None;
         }
         let patches = self.nominal().patches();
-        let everywhere = patches.iter().flat_map(|patch| {
-            let folded: Vec<u32> = match &patch.lattice {
-                Lattice::Grid(grid) => {
-                    let doubtful = (0..grid.rows() - 1)
-                        .into_par_iter()
-                        .step_by(STEP)
-                        .any(|j| self.row_is_doubtful(patch, grid, j));
-                    let rows = if doubtful { grid.rows() - 1 } else { 0 };
-                    (0..rows)
-                        .into_par_iter()
-                        .flat_map_iter(|j| grid.row_of_facets(j))
-                        .filter(|&(facet, corners)| grid.has_facet(facet) && self.folds(patch, corners))
-                        .map(|(facet, _)| facet)
-                        .collect()
-                }
-                Lattice::Mesh(mesh) => {
-                    let stride = (mesh.facet_count() as usize).div_ceil(LOOKED_AT);
-                    (0..mesh.facet_count())
-                        .into_par_iter()
-                        .step_by(stride)
-                        .filter(|&f| self.folds(patch, mesh.corners(f)))
-                        .collect()
-                }
-            };
-            folded.into_iter().map(move |f| (patch, f))
-        });
+        self.worst_fold(patches.iter().flat_map(|patch| self.folded(patch).into_iter().map(move |f| (patch, f))))
+    }
+
+    /// Returns the worst place where the offset surface folds among those of a mesh that were touched; a grid is looked at
+    /// whole by [`OffsetSurface::fold`].
+    pub(crate) fn fold_where_touched(&self, touched: impl Iterator<Item = Place>) -> Option<SurfaceError> {
+        let patches = self.nominal().patches();
+        let is_mesh = |patch: &Patch| matches!(patch.lattice, Lattice::Mesh(_));
+        if self.radius_mm() == 0.0 || !patches.iter().any(is_mesh) {
+            return None;
+        }
         let there = touched.map(|place| (&patches[place.patch() as usize], place.facet()));
-        let there = there.filter(|(p, f)| matches!(p.lattice, Lattice::Mesh(_)) && self.folds(p, p.corners(*f)));
-        let worst = everywhere.chain(there).map(|(p, f)| (self.least_curvature(p, f), p, f));
+        let there: Vec<(&Patch, u32)> = there.filter(|(patch, _)| is_mesh(patch)).collect();
+        let there: Vec<_> = there.into_par_iter().filter(|(p, f)| self.folds(p, p.corners(*f))).collect();
+        self.worst_fold(there.into_iter())
+    }
+
+    /// The worst of some facets that fold.
+    fn worst_fold<'a>(&self, folded: impl Iterator<Item = (&'a Patch, u32)>) -> Option<SurfaceError> {
+        let worst = folded.map(|(p, f)| (self.least_curvature(p, f), p, f));
         let (curvature, patch, facet) = worst.min_by(|a, b| a.0.total_cmp(&b.0))?;
-        let at = patch.points[patch.corners(facet)[0] as usize].into();
+        let at = (*patch.point(patch.corners(facet)[0])).into();
         Some(SurfaceError::OffsetFolds { at, concave_radius_mm: -1.0 / curvature, probe_radius_mm: self.radius_mm() })
     }
 
-    /// Whether any of the wide facets along a row of nodes comes near to folding; holes do not.
-    fn row_is_doubtful(&self, patch: &Patch, grid: &GridLattice, row: usize) -> bool {
-        let (columns, normals) = (grid.columns(), patch.known_normals());
-        let up = STEP.min(grid.rows() - 1 - row) * columns;
-        let reach = self.radius_mm() * self.side().sign() * DOUBT;
-        (row * columns..(row + 1) * columns - STEP).step_by(STEP).any(|node| {
-            let edges = [node + STEP, node + up].map(|k| patch.points[k] - patch.points[node]);
-            let changes = [node + STEP, node + up].map(|k| (normals[k] - normals[node]) * reach);
-            not_positive(edges[0], edges[1], changes[0], changes[1])
-        })
+    /// The facets of a patch that fold, among those looked at.
+    fn folded(&self, patch: &Patch) -> Vec<u32> {
+        match &patch.lattice {
+            Lattice::Grid(grid) => {
+                let (arch, nodes) = (pulp::Arch::new(), patch.nodes());
+                let doubtful = (0..(grid.rows() - 1).div_ceil(STEP))
+                    .into_par_iter()
+                    .with_min_len(16)
+                    .any(|k| arch.dispatch(self.wide_row(grid, nodes, STEP * k)));
+                let rows = if doubtful { grid.rows() - 1 } else { 0 };
+                (0..rows)
+                    .into_par_iter()
+                    .flat_map_iter(|j| grid.row_of_facets(j))
+                    .filter(|&(facet, corners)| grid.has_facet(facet) && self.folds(patch, corners))
+                    .map(|(facet, _)| facet)
+                    .collect()
+            }
+            Lattice::Mesh(mesh) => {
+                let stride = (mesh.facet_count() as usize).div_ceil(LOOKED_AT);
+                let looked_at: Vec<u32> = (0..mesh.facet_count()).step_by(stride).collect();
+                patch.fit_normals(&looked_at.iter().flat_map(|&f| mesh.corners(f)).collect::<Vec<_>>());
+                looked_at.into_par_iter().filter(|&f| self.folds(patch, mesh.corners(f))).collect()
+            }
+        }
+    }
+
+    /// The wide facets along a row of nodes.
+    fn wide_row<'a>(&self, grid: &GridLattice, nodes: &'a [Vertex], row: usize) -> WideRow<'a> {
+        let columns = grid.columns();
+        let up = STEP.min(grid.rows() - 1 - row);
+        WideRow {
+            nodes: &nodes[row * columns..][..columns],
+            above: &nodes[(row + up) * columns..][..columns],
+            reach: self.radius_mm() * self.side().sign() * DOUBT,
+        }
     }
 
     /// Whether the offset turns a facet over or flattens it: whether E + r B is no longer positive definite.
     #[inline]
     fn folds(&self, patch: &Patch, corners: [u32; 3]) -> bool {
-        let [p, q, t] = corners.map(|v| patch.points[v as usize]);
-        let [a, b, c] = corners.map(|v| patch.normal(v));
+        let (p, q, t) = (patch.vertex(corners[0]), patch.vertex(corners[1]), patch.vertex(corners[2]));
         let reach = self.radius_mm() * self.side().sign();
-        not_positive(q - p, t - p, (b - a) * reach, (c - a) * reach)
+        let edges = (q.point - p.point, t.point - p.point);
+        not_positive(edges.0, edges.1, (q.normal - p.normal) * reach, (t.normal - p.normal) * reach)
     }
 
     /// Returns the least normal curvature of a facet in 1/mm, negative where it is concave seen from the probe's side: the
@@ -96,12 +113,66 @@ impl OffsetSurface<'_> {
     /// E^-1 B and the offset has the first form E + 2 r B + O(r^2), which is singular where E + r B is.
     #[inline]
     fn forms(&self, patch: &Patch, [a, b, c]: [u32; 3]) -> ([f64; 3], [f64; 3]) {
-        let (p, q) = (patch.points[a as usize], patch.normal(a));
-        let (e1, e2) = (patch.points[b as usize] - p, patch.points[c as usize] - p);
+        let (a, b, c) = (patch.vertex(a), patch.vertex(b), patch.vertex(c));
+        let (e1, e2) = (b.point - a.point, c.point - a.point);
         let sign = self.side().sign();
-        let (d1, d2) = ((patch.normal(b) - q) * sign, (patch.normal(c) - q) * sign);
+        let (d1, d2) = ((b.normal - a.normal) * sign, (c.normal - a.normal) * sign);
         let first = [e1.dot(&e1), e1.dot(&e2), e2.dot(&e2)];
         (first, [e1.dot(&d1), 0.5 * (e1.dot(&d2) + e2.dot(&d1)), e2.dot(&d2)])
+    }
+}
+
+/// Facets two nodes wide along a row of a grid.
+struct WideRow<'a> {
+    nodes: &'a [Vertex],
+    above: &'a [Vertex],
+    reach: f64,
+}
+
+impl pulp::NullaryFnOnce for WideRow<'_> {
+    type Output = bool;
+
+    /// Whether any of them comes near to folding; holes do not.
+    #[inline(always)]
+    fn call(self) -> bool {
+        let (nodes, above) = (self.nodes, &self.above[..self.nodes.len()]);
+        let mut k = 0;
+        let mut doubtful = false;
+        while k + LANES * STEP < nodes.len() {
+            let (a, b, c) = (k + STEP, k + 2 * STEP, k + 3 * STEP);
+            let here = four_vertices(&[nodes[k], nodes[a], nodes[b], nodes[c]]);
+            let next = four_vertices(&[nodes[a], nodes[b], nodes[c], nodes[c + STEP]]);
+            let up = four_vertices(&[above[k], above[a], above[b], above[c]]);
+            doubtful |= self.any_of_four(&here, &next, &up);
+            k += LANES * STEP;
+        }
+        while k + STEP < nodes.len() {
+            let (p, q, t) = (nodes[k], nodes[k + STEP], above[k]);
+            let edges = (q.point - p.point, t.point - p.point);
+            let changes = ((q.normal - p.normal) * self.reach, (t.normal - p.normal) * self.reach);
+            doubtful |= not_positive(edges.0, edges.1, changes.0, changes.1);
+            k += STEP;
+        }
+        doubtful
+    }
+}
+
+impl WideRow<'_> {
+    /// Whether E + r B is not positive definite for any of four; see [`not_positive`].
+    #[inline(always)]
+    fn any_of_four(&self, here: &(Lane3, Lane3), next: &(Lane3, Lane3), up: &(Lane3, Lane3)) -> bool {
+        let reach = Lane::splat(self.reach);
+        let (e1, e2) = (minus(&next.0, &here.0), minus(&up.0, &here.0));
+        let (d1, d2) = (times(&minus(&next.1, &here.1), reach), times(&minus(&up.1, &here.1), reach));
+        let e = dot(&e1, &e1) + dot(&e1, &d1);
+        let g = dot(&e2, &e2) + dot(&e2, &d2);
+        let f = dot(&e1, &e2) + Lane::splat(0.5) * (dot(&e1, &d2) + dot(&e2, &d1));
+        let det = e * g - f * f;
+        let mut any = false;
+        for l in 0..LANES {
+            any |= (e.0[l] <= 0.0) | (det.0[l] <= 0.0);
+        }
+        any
     }
 }
 

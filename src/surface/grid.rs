@@ -2,10 +2,11 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::grid::{GridOrder, NO_POINT};
+use crate::geometry::grid::{GridInOrder, GridOrder, NO_POINT};
 use crate::geometry::{Point, Vector};
 
-use super::patch::Facets;
+use super::lanes::{LANES, Lane, Lane3, cross, dot, minus, side_by_side, times};
+use super::patch::{Facets, Vertex};
 
 /// The triangles of a structured grid, row by row with the column fastest.
 ///
@@ -41,6 +42,18 @@ impl GridLattice {
             (low, [per_mm(0, columns), per_mm(1, rows)])
         });
         Self { columns: columns as u32, rows: rows as u32, present, regular }
+    }
+
+    /// Lays triangles over a grid that is known to be regular in x and y and to have no hole.
+    pub(crate) fn whole(found: &GridInOrder) -> Self {
+        let [low, high] = found.corners;
+        let per_mm = |k: usize, n: usize| (n - 1) as f64 / (high[k] - low[k]);
+        Self {
+            columns: found.columns as u32,
+            rows: found.rows as u32,
+            present: Vec::new(),
+            regular: Some((low, [per_mm(0, found.columns), per_mm(1, found.rows)])),
+        }
     }
 
     pub(crate) fn columns(&self) -> usize {
@@ -182,40 +195,97 @@ const DERIVATIVES: [&[&[f64]]; 6] = [
     ],
 ];
 
-/// Fits the unit normals of a structured grid, on the side where column x row is right-handed.
+/// Fits the unit normals of a structured grid, on the side where column x row is right-handed, and sets them beside the points.
 ///
-/// Shapes: one normal a node, in grid order; NaN at holes and at nodes that have no neighbour along one of the two lines.
-/// Equation: the tangents are the derivatives of the bi-quartic through five nodes along each grid line, central inside and
-/// one-sided at the border; the normal is their cross product.
-pub(crate) fn grid_normals(points: &[Point], lattice: &GridLattice) -> Vec<Vector> {
-    let columns = lattice.columns();
-    let mut normals = vec![Vector::zeros(); points.len()];
-    normals.par_chunks_mut(columns).enumerate().for_each(|(j, row)| {
-        let inner = (2..lattice.rows() - 2.min(lattice.rows())).contains(&j) && lattice.present.is_empty();
-        for (i, normal) in row.iter_mut().enumerate() {
-            let node = j * columns + i;
-            let inner = inner && i >= 2 && i + 2 < columns;
-            let [u, v] = if inner {
-                [central_derivative(points, node, 1), central_derivative(points, node, columns)]
-            } else {
-                [
-                    line_derivative(points, lattice, node, 1, i, columns),
-                    line_derivative(points, lattice, node, columns, j, lattice.rows()),
-                ]
-            };
-            let n = u.cross(&v);
-            *normal = n / n.norm();
-        }
-    });
-    normals
+/// Shapes: one vertex a node, in grid order; the normal NaN at holes and at nodes that have no neighbour along one of the two
+/// lines. Equation: the tangents are the derivatives of the bi-quartic through five nodes along each grid line, central inside
+/// and one-sided at the border; the normal is their cross product.
+pub(crate) fn grid_nodes(points: &[Point], lattice: &GridLattice) -> Vec<Vertex> {
+    let arch = pulp::Arch::new();
+    // Whole blocks, written where they stay; the last is filled up with the last node.
+    let blocks: Vec<[Vertex; BLOCK]> = (0..points.len().div_ceil(BLOCK))
+        .into_par_iter()
+        .with_min_len(64)
+        .map(|block| arch.dispatch(Block { points, lattice, first: block * BLOCK }))
+        .collect();
+    let mut nodes = blocks.into_flattened();
+    nodes.truncate(points.len());
+    nodes
 }
 
-/// The derivative of the quartic through five nodes at the middle one.
-#[inline(always)]
-fn central_derivative(points: &[Point], node: usize, stride: usize) -> Vector {
-    let near = points[node + stride] - points[node - stride];
-    let far = points[node + 2 * stride] - points[node - 2 * stride];
-    near * (2.0 / 3.0) - far * (1.0 / 12.0)
+/// Nodes that are fitted in one call to code for the vector instructions of the machine.
+const BLOCK: usize = 32;
+
+struct Block<'a> {
+    points: &'a [Point],
+    lattice: &'a GridLattice,
+    first: usize,
+}
+
+impl pulp::NullaryFnOnce for Block<'_> {
+    type Output = [Vertex; BLOCK];
+
+    #[inline(always)]
+    fn call(self) -> [Vertex; BLOCK] {
+        const NONE: Vertex = Vertex { point: Point::new(0.0, 0.0, 0.0), normal: Vector::new(0.0, 0.0, 0.0) };
+        let mut nodes = [NONE; BLOCK];
+        let (columns, rows) = (self.lattice.columns(), self.lattice.rows());
+        let (mut i, mut j) = (self.first % columns, self.first / columns);
+        for (k, four) in nodes.as_chunks_mut::<LANES>().0.iter_mut().enumerate() {
+            let node = self.first + k * LANES;
+            let inner = i >= 2 && i + LANES + 2 <= columns && j >= 2 && j + 2 < rows;
+            if inner && self.lattice.present.is_empty() {
+                self.four_inside(node, four);
+            } else {
+                self.four_anywhere(node, four);
+            }
+            i += LANES;
+            if i >= columns {
+                (i, j) = (i % columns, j + i / columns);
+            }
+        }
+        nodes
+    }
+}
+
+impl Block<'_> {
+    /// Four nodes of one row of a whole grid, none of them within two of its border.
+    #[inline(always)]
+    fn four_inside(&self, first: usize, nodes: &mut [Vertex; LANES]) {
+        let (u, v) = (self.central_derivative(first, 1), self.central_derivative(first, self.lattice.columns()));
+        let n = cross(&u, &v);
+        let normal = times(&n, Lane::splat(1.0) / dot(&n, &n).sqrt());
+        for (l, node) in nodes.iter_mut().enumerate() {
+            let normal = Vector::new(normal[0].0[l], normal[1].0[l], normal[2].0[l]);
+            *node = Vertex { point: self.points[first + l], normal };
+        }
+    }
+
+    /// The derivative of the quartic through five nodes at the middle one, for four neighbours along a row.
+    #[inline(always)]
+    fn central_derivative(&self, node: usize, stride: usize) -> Lane3 {
+        let near = minus(&self.four_points(node + stride), &self.four_points(node - stride));
+        let far = minus(&self.four_points(node + 2 * stride), &self.four_points(node - 2 * stride));
+        minus(&times(&near, Lane::splat(2.0 / 3.0)), &times(&far, Lane::splat(1.0 / 12.0)))
+    }
+
+    #[inline(always)]
+    fn four_points(&self, first: usize) -> Lane3 {
+        let (four, _) = self.points[first..].split_first_chunk::<LANES>().expect("inside the grid");
+        side_by_side(four)
+    }
+
+    #[inline(never)]
+    fn four_anywhere(&self, first: usize, nodes: &mut [Vertex; LANES]) {
+        let (points, lattice) = (self.points, self.lattice);
+        let (columns, rows) = (lattice.columns(), lattice.rows());
+        for (l, vertex) in nodes.iter_mut().enumerate() {
+            let node = (first + l).min(points.len() - 1);
+            let u = line_derivative(points, lattice, node, 1, node % columns, columns);
+            let v = line_derivative(points, lattice, node, columns, node / columns, rows);
+            *vertex = Vertex { point: points[node], normal: u.cross(&v).normalize() };
+        }
+    }
 }
 
 /// The derivative along one grid line at its `at`-th node of `count`, from the window of present nodes around it.
@@ -261,9 +331,12 @@ mod tests {
         let z = |x: f64, y: f64| 0.01 * x * x * x * y * y * y - 0.2 * x * y * y + 0.3 * x;
         let gradient =
             |x: f64, y: f64| [0.03 * x * x * y.powi(3) - 0.2 * y * y + 0.3, 0.03 * x.powi(3) * y * y - 0.4 * x * y];
-        for (columns, rows) in [(9, 8), (5, 5), (6, 12)] {
+        for (columns, rows) in [(9, 8), (5, 5), (6, 12), (41, 9)] {
             let (points, lattice) = lattice(columns, rows, z);
-            for (p, n) in points.iter().zip(grid_normals(&points, &lattice)) {
+            let nodes = grid_nodes(&points, &lattice);
+            assert_eq!(nodes.len(), points.len());
+            for (p, Vertex { point, normal: n }) in points.iter().zip(nodes) {
+                assert_eq!(*p, point);
                 let [a, b] = gradient(p.x, p.y);
                 assert!((n - Vector::new(-a, -b, 1.0).normalize()).norm() < 1e-13, "{p} {n}");
             }
@@ -276,7 +349,7 @@ mod tests {
         points[9] = Point::new(f64::NAN, f64::NAN, f64::NAN);
         let lattice = GridLattice::new(7, 4, &points, true);
         let expected = Vector::new(-0.3, 0.1, 1.0).normalize();
-        for (node, n) in grid_normals(&points, &lattice).iter().enumerate() {
+        for (node, n) in grid_nodes(&points, &lattice).iter().map(|vertex| vertex.normal).enumerate() {
             // Node 2 lies in no whole cell: the node above it is the hole.
             if node == 9 || node == 2 {
                 assert!(n.x.is_nan());

@@ -1,14 +1,15 @@
-//! The warm case of the point location, four points at a time.
+//! The point location and the distance, four points at a time.
 //!
-//! Once a registration has settled, nearly every point stays on its facet from one iteration to the next. For those the
-//! arithmetic of [`super::offset`] is the same straight line of products and sums, which the compiler turns into vector
-//! instructions when four points stand side by side. A point that left its facet is told from its weights and walks alone.
-//! The operations are those of the single point, so the two agree to rounding.
+//! Once a registration has settled, nearly every point stays on its facet from one iteration to the next, and over a grid a
+//! point that left it is a jump or two away. The arithmetic of [`super::offset`] is then the same straight line of products
+//! and sums for all, which the compiler turns into vector instructions when four points stand side by side. Points that leave
+//! the surface, or have a longer way, are left to the single search. The operations are those of the single point, so the two
+//! agree to rounding.
 
 use crate::geometry::Point;
 
 use super::offset::{Distance, INSIDE, Lookup, OffsetSurface, Place};
-use super::patch::{Facets, Lattice, Patch};
+use super::patch::{Facets, Lattice, Patch, Vertex};
 
 /// Points handled at a time.
 pub(crate) const LANES: usize = 4;
@@ -50,7 +51,7 @@ impl Lane {
     }
 
     #[inline(always)]
-    fn sqrt(self) -> Self {
+    pub(crate) fn sqrt(self) -> Self {
         Lane([self.0[0].sqrt(), self.0[1].sqrt(), self.0[2].sqrt(), self.0[3].sqrt()])
     }
 
@@ -82,7 +83,7 @@ pub(crate) fn minus(a: &Lane3, b: &Lane3) -> Lane3 {
 }
 
 #[inline(always)]
-fn times(a: &Lane3, b: Lane) -> Lane3 {
+pub(crate) fn times(a: &Lane3, b: Lane) -> Lane3 {
     [a[0] * b, a[1] * b, a[2] * b]
 }
 
@@ -92,57 +93,93 @@ fn weighted(v: &[Lane3; 3], b: &[Lane; 3]) -> Lane3 {
     [at(0), at(1), at(2)]
 }
 
-/// The feet of four points on the facets where they last were.
+/// Jumps that four points take together over a grid before they are left to the single search.
+const JUMPS: usize = 4;
+
+/// The feet of four points.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct WarmFeet {
+pub(crate) struct FourFeet {
     pub(crate) distance_mm: Lane,
     pub(crate) normal: Lane3,
-    /// Which points are still on their facet; the others' numbers mean nothing.
-    pub(crate) stays: [bool; LANES],
+}
+
+/// Four facets with their corners on the offset surface.
+struct FourFacets {
+    x: [Lane3; 3],
+    n: [Lane3; 3],
+    turned: Lane3,
+    squared: Lane,
 }
 
 impl OffsetSurface<'_> {
-    /// Whether [`OffsetSurface::warm_feet`] answers for this surface: one patch, the curved distance at the foot.
-    pub(crate) fn has_warm_feet(&self) -> bool {
+    /// Whether [`OffsetSurface::four_feet`] answers for this surface: one patch, the curved distance at the foot.
+    pub(crate) fn has_four_feet(&self) -> bool {
         self.nominal().patches().len() == 1 && self.distance() == Distance::Curved && self.lookup() == Lookup::Foot
     }
 
-    /// Finds the feet of four points that have not left their facets.
+    /// Finds the feet of four points near the places given, which become those of the feet.
+    ///
+    /// Returns `None`, and the places mean nothing, where one of them lies beyond the edge or too far away: on a mesh already
+    /// where it is not on its facet, since a walk over one would fit normals on the way.
     #[inline(always)]
-    pub(crate) fn warm_feet(&self, p: &Lane3, places: &[Place; LANES]) -> WarmFeet {
+    pub(crate) fn four_feet(&self, p: &Lane3, places: &mut [Place; LANES]) -> Option<FourFeet> {
         let patch = &self.nominal().patches()[0];
         match &patch.lattice {
-            Lattice::Grid(grid) => self.warm_feet_on(patch, grid, p, places),
-            Lattice::Mesh(mesh) => self.warm_feet_on(patch, mesh, p, places),
+            Lattice::Grid(grid) => self.four_feet_on(patch, grid, JUMPS, p, places),
+            Lattice::Mesh(mesh) => self.four_feet_on(patch, mesh, 0, p, places),
+        }
+    }
+
+    /// Returns where four points may be that follow others as those followed the ones before; `None` where nothing tells.
+    pub(crate) fn four_places_ahead(&self, before: &[Place; LANES], last: &[Place; LANES]) -> Option<[Place; LANES]> {
+        let Lattice::Grid(grid) = &self.nominal().patches()[0].lattice else { return None };
+        if last.contains(&Place::UNKNOWN) {
+            return None;
+        }
+        Some(std::array::from_fn(|l| {
+            let step = if before[l] == Place::UNKNOWN { 0 } else { last[l].facet().wrapping_sub(before[l].facet()) };
+            let ahead = last[l].facet().wrapping_add(step);
+            if grid.has_facet(ahead) { Place::on_first_patch(ahead) } else { last[l] }
+        }))
+    }
+
+    #[inline(always)]
+    fn four_feet_on<F: Facets>(
+        &self,
+        patch: &Patch,
+        facets: &F,
+        jumps: usize,
+        p: &Lane3,
+        places: &mut [Place; LANES],
+    ) -> Option<FourFeet> {
+        let mut jump = 0;
+        loop {
+            let four = self.four_facets(patch, facets, places);
+            let b = four.weights(p);
+            let least = b[0].min(b[1]).min(b[2]);
+            let stays = [least.0[0] >= INSIDE, least.0[1] >= INSIDE, least.0[2] >= INSIDE, least.0[3] >= INSIDE];
+            if stays == [true; LANES] {
+                return Some(four.feet(self.side().sign(), p, &b));
+            }
+            if jump == jumps || !jumped(facets, places, &stays, &b) {
+                return None;
+            }
+            jump += 1;
         }
     }
 
     #[inline(always)]
-    fn warm_feet_on<F: Facets>(&self, patch: &Patch, facets: &F, p: &Lane3, places: &[Place; LANES]) -> WarmFeet {
-        let known = places.map(|place| place != Place::UNKNOWN);
+    fn four_facets<F: Facets>(&self, patch: &Patch, facets: &F, places: &[Place; LANES]) -> FourFacets {
         let (x, n) = self.gathered(patch, facets, places);
-        let (e1, e2) = (minus(&x[1], &x[0]), minus(&x[2], &x[0]));
-        let turned = cross(&e1, &e2);
-        let squared = dot(&turned, &turned);
-        let flat = times(&turned, Lane::splat(self.side().sign()) / squared.sqrt());
-        let per_squared = Lane::splat(1.0) / squared;
-        let w = minus(p, &x[0]);
-        let b1 = dot(&cross(&w, &e2), &turned) * per_squared;
-        let b2 = dot(&cross(&e1, &w), &turned) * per_squared;
-        let b = [Lane::splat(1.0) - b1 - b2, b1, b2];
-        let least = b[0].min(b[1]).min(b[2]);
-        let mean = weighted(&n, &b);
-        let normal = times(&mean, Lane::splat(1.0) / dot(&mean, &mean).sqrt());
-        let distance_mm = dot(&w, &flat) * dot(&normal, &flat) - height(&x, &n, &b);
-        let stays = std::array::from_fn(|l| known[l] && least.0[l] >= INSIDE);
-        WarmFeet { distance_mm, normal, stays }
+        let turned = cross(&minus(&x[1], &x[0]), &minus(&x[2], &x[0]));
+        FourFacets { x, n, turned, squared: dot(&turned, &turned) }
     }
 
     /// Corners on the offset surface, eq. (3), and their normals.
     #[inline(always)]
     fn gathered<F: Facets>(&self, patch: &Patch, facets: &F, places: &[Place; LANES]) -> ([Lane3; 3], [Lane3; 3]) {
-        let corners = |place: &Place| facets.corners(if *place == Place::UNKNOWN { 0 } else { place.facet() });
-        let [a, b, c, d] = [corners(&places[0]), corners(&places[1]), corners(&places[2]), corners(&places[3])];
+        let (a, b) = (facets.corners(places[0].facet()), facets.corners(places[1].facet()));
+        let (c, d) = (facets.corners(places[2].facet()), facets.corners(places[3].facet()));
         let first = self.corner(patch, [a[0], b[0], c[0], d[0]]);
         let second = self.corner(patch, [a[1], b[1], c[1], d[1]]);
         let third = self.corner(patch, [a[2], b[2], c[2], d[2]]);
@@ -155,21 +192,45 @@ impl OffsetSurface<'_> {
     #[inline(always)]
     fn corner(&self, patch: &Patch, [a, b, c, d]: [u32; LANES]) -> (Lane3, Lane3) {
         let (sign, radius) = (Lane::splat(self.side().sign()), Lane::splat(self.radius_mm()));
-        let point = |vertex: u32| &patch.points[vertex as usize];
-        let (pa, pb, pc, pd) = (point(a), point(b), point(c), point(d));
-        let (na, nb, nc, nd) = (patch.normal(a), patch.normal(b), patch.normal(c), patch.normal(d));
-        let normal = [
-            Lane([na.x, nb.x, nc.x, nd.x]) * sign,
-            Lane([na.y, nb.y, nc.y, nd.y]) * sign,
-            Lane([na.z, nb.z, nc.z, nd.z]) * sign,
-        ];
-        let on_offset = [
-            Lane([pa.x, pb.x, pc.x, pd.x]) + normal[0] * radius,
-            Lane([pa.y, pb.y, pc.y, pd.y]) + normal[1] * radius,
-            Lane([pa.z, pb.z, pc.z, pd.z]) + normal[2] * radius,
-        ];
+        let (point, normal) = four_vertices(&[patch.vertex(a), patch.vertex(b), patch.vertex(c), patch.vertex(d)]);
+        let normal = times(&normal, sign);
+        let on_offset = [point[0] + normal[0] * radius, point[1] + normal[1] * radius, point[2] + normal[2] * radius];
         (on_offset, normal)
     }
+}
+
+impl FourFacets {
+    /// Barycentric weights of the feet on the planes of the flat facets.
+    #[inline(always)]
+    fn weights(&self, p: &Lane3) -> [Lane; 3] {
+        let (e1, e2) = (minus(&self.x[1], &self.x[0]), minus(&self.x[2], &self.x[0]));
+        let per_squared = Lane::splat(1.0) / self.squared;
+        let w = minus(p, &self.x[0]);
+        let b1 = dot(&cross(&w, &e2), &self.turned) * per_squared;
+        let b2 = dot(&cross(&e1, &w), &self.turned) * per_squared;
+        [Lane::splat(1.0) - b1 - b2, b1, b2]
+    }
+
+    #[inline(always)]
+    fn feet(&self, sign: f64, p: &Lane3, b: &[Lane; 3]) -> FourFeet {
+        let flat = times(&self.turned, Lane::splat(sign) / self.squared.sqrt());
+        let mean = weighted(&self.n, b);
+        let normal = times(&mean, Lane::splat(1.0) / dot(&mean, &mean).sqrt());
+        let flat_mm = dot(&minus(p, &self.x[0]), &flat);
+        FourFeet { distance_mm: flat_mm * dot(&normal, &flat) - height(&self.x, &self.n, b), normal }
+    }
+}
+
+/// Takes the points that do not stay to the facets their weights point at; false where one of them has none.
+#[inline(never)]
+fn jumped<F: Facets>(facets: &F, places: &mut [Place; LANES], stays: &[bool; LANES], b: &[Lane; 3]) -> bool {
+    for l in (0..LANES).filter(|&l| !stays[l]) {
+        match facets.advance(places[l].facet(), &[b[0].0[l], b[1].0[l], b[2].0[l]]) {
+            Some(next) => places[l] = Place::on_first_patch(next),
+            None => return false,
+        }
+    }
+    true
 }
 
 /// Height of the curved surface over the flat facet.
@@ -187,10 +248,22 @@ fn height(x: &[Lane3; 3], n: &[Lane3; 3], b: &[Lane; 3]) -> Lane {
     along + Lane::splat(0.5) * total * b[0] * b[1] * b[2]
 }
 
+/// Four vertices side by side: their points and their normals.
+#[inline(always)]
+pub(crate) fn four_vertices([a, b, c, d]: &[Vertex; LANES]) -> (Lane3, Lane3) {
+    let normal = [
+        Lane([a.normal.x, b.normal.x, c.normal.x, d.normal.x]),
+        Lane([a.normal.y, b.normal.y, c.normal.y, d.normal.y]),
+        Lane([a.normal.z, b.normal.z, c.normal.z, d.normal.z]),
+    ];
+    (side_by_side(&[a.point, b.point, c.point, d.point]), normal)
+}
+
 /// Four points side by side.
 #[inline(always)]
 pub(crate) fn side_by_side(points: &[Point; LANES]) -> Lane3 {
-    [0, 1, 2].map(|c| Lane([points[0][c], points[1][c], points[2][c], points[3][c]]))
+    let [a, b, c, d] = points;
+    [Lane([a.x, b.x, c.x, d.x]), Lane([a.y, b.y, c.y, d.y]), Lane([a.z, b.z, c.z, d.z])]
 }
 
 #[cfg(test)]
@@ -211,6 +284,7 @@ mod tests {
         ] {
             for side in [Side::Normal, Side::Opposite] {
                 let surface = OffsetSurface::new(&nominal, 1.5, side).unwrap();
+                let mut left = 0;
                 for k in 0..400 {
                     let points: [Point; LANES] = std::array::from_fn(|l| {
                         let t = f64::from(4 * k + l as i32);
@@ -218,26 +292,40 @@ mod tests {
                         Point::new(x, y, z(x, y) + side.sign() * (1.5 + 0.01 * t.sin()))
                     });
                     let feet = points.map(|p| surface.foot(&p, Place::UNKNOWN));
-                    let warm = surface.warm_feet(&side_by_side(&points), &feet.map(|f| f.place));
-                    for (l, foot) in feet.iter().enumerate().filter(|(l, _)| warm.stays[*l]) {
-                        assert!((warm.distance_mm.0[l] - foot.distance_mm).abs() < 1e-14);
-                        assert!((0..3).all(|c| (warm.normal[c].0[l] - foot.normal[c]).abs() < 1e-14));
+                    let mut places = feet.map(|f| f.place);
+                    let Some(four) = surface.four_feet(&side_by_side(&points), &mut places) else {
+                        left += 1;
+                        continue;
+                    };
+                    for (l, foot) in feet.iter().enumerate() {
+                        assert_eq!(places[l], foot.place);
+                        assert!((four.distance_mm.0[l] - foot.distance_mm).abs() < 1e-14);
+                        assert!((0..3).all(|c| (four.normal[c].0[l] - foot.normal[c]).abs() < 1e-14));
                     }
-                    assert!(warm.stays.iter().filter(|s| **s).count() >= 3, "{:?}", warm.stays);
                 }
+                assert!(left < 8, "{left} of 400");
             }
         }
     }
 
     #[test]
-    fn who_left_or_was_never_there_does_not_stay() {
-        let cloud = (0..100).map(|k| Point::new(f64::from(k % 10), f64::from(k / 10), 0.0)).collect();
-        let nominal = Nominal::from_points(cloud, Projection::Auto).unwrap();
+    fn over_a_grid_they_jump_to_their_facets_and_over_the_edge_they_do_not() {
+        let cloud = (0..100).map(|k| Point::new(f64::from(k % 10), f64::from(k / 10), 0.0)).collect::<Vec<_>>();
+        let nominal = Nominal::from_points(cloud.clone(), Projection::Auto).unwrap();
         let surface = OffsetSurface::new(&nominal, 0.5, Side::Normal).unwrap();
         let at = |x: f64| Point::new(x, 4.3, 0.5);
         let place = surface.foot(&at(2.6), Place::UNKNOWN).place;
-        let points = [at(2.6), at(3.6), at(2.6), at(2.7)];
-        let warm = surface.warm_feet(&side_by_side(&points), &[place, place, Place::UNKNOWN, place]);
-        assert_eq!(warm.stays, [true, false, false, true]);
+        let points = [at(2.6), at(3.6), at(8.1), at(0.2)];
+        let mut places = [place; LANES];
+        assert!(surface.four_feet(&side_by_side(&points), &mut places).is_some());
+        assert_eq!(places, points.map(|p| surface.foot(&p, Place::UNKNOWN).place));
+        let beyond = [at(2.6), at(9.6), at(2.6), at(2.7)];
+        assert!(surface.four_feet(&side_by_side(&beyond), &mut [place; LANES]).is_none());
+
+        let mesh = Nominal::scattered(cloud, Projection::Auto).unwrap();
+        let surface = OffsetSurface::new(&mesh, 0.5, Side::Normal).unwrap();
+        let place = surface.foot(&at(2.6), Place::UNKNOWN).place;
+        assert!(surface.four_feet(&side_by_side(&[at(2.6); LANES]), &mut [place; LANES]).is_some());
+        assert!(surface.four_feet(&side_by_side(&points), &mut [place; LANES]).is_none());
     }
 }

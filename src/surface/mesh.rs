@@ -50,17 +50,20 @@ impl MeshLattice {
         if corners.is_empty() {
             return Err(SurfaceError::NoTriangles);
         }
-        let facet_of = first_facets(points.len(), &corners, &neighbours);
-        let stride = corners.len().div_ceil(STARTS);
-        let start_facets: Vec<u32> = (0..corners.len() as u32).step_by(stride).collect();
-        let centres: Vec<[f64; 3]> = start_facets
-            .iter()
-            .map(|&f| {
-                let sum: Vector = corners[f as usize].iter().map(|&c| points[c as usize].coords).sum();
-                (sum / 3.0).into()
-            })
-            .collect();
-        let starts = ImmutableKdTree::new_from_slice(&centres).map_err(|_| SurfaceError::NoTriangles)?;
+        let (facet_of, starts) = rayon::join(
+            || first_facets(points.len(), &corners, &neighbours),
+            || {
+                let stride = corners.len().div_ceil(STARTS);
+                let start_facets: Vec<u32> = (0..corners.len() as u32).step_by(stride).collect();
+                let centre = |f: &u32| {
+                    let sum: Vector = corners[*f as usize].iter().map(|&c| points[c as usize].coords).sum();
+                    (sum / 3.0).into()
+                };
+                let centres: Vec<[f64; 3]> = start_facets.iter().map(centre).collect();
+                ImmutableKdTree::new_from_slice(&centres).map(|tree| (tree, start_facets))
+            },
+        );
+        let (starts, start_facets) = starts.map_err(|_| SurfaceError::NoTriangles)?;
         Ok(Self { corners, neighbours, facet_of, starts, start_facets })
     }
 
@@ -69,6 +72,7 @@ impl MeshLattice {
     }
 
     /// Calls `visit` with each facet around a vertex and the place of the vertex in it, counter-clockwise.
+    #[inline]
     pub(crate) fn around(&self, vertex: u32, mut visit: impl FnMut(u32, usize)) {
         let first = self.facet_of[vertex as usize];
         let mut facet = first;
@@ -84,6 +88,24 @@ impl MeshLattice {
             if facet == first {
                 return;
             }
+        }
+    }
+}
+
+impl MeshLattice {
+    /// Calls `visit` with each neighbour of a vertex once, counter-clockwise.
+    #[inline]
+    pub(crate) fn neighbours_of(&self, vertex: u32, mut visit: impl FnMut(u32)) {
+        let mut last = None;
+        self.around(vertex, |facet, k| {
+            visit(self.corners[facet as usize][(k + 1) % 3]);
+            last = Some((facet as usize, k));
+        });
+        // Where the facets do not close on themselves the last one has a neighbour of its own.
+        if let Some((facet, k)) = last
+            && self.neighbours[facet][(k + 1) % 3] == BORDER
+        {
+            visit(self.corners[facet][(k + 2) % 3]);
         }
     }
 }

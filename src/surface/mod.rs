@@ -12,8 +12,10 @@
 //! Pure: no file, no clock, no randomness. Frame: everything here is in the model frame {M}. Units: millimetres.
 
 pub mod accuracy;
+mod ahead;
 pub mod analytic;
 mod delaunay;
+mod edges;
 mod feature;
 mod fold;
 mod grid;
@@ -26,18 +28,20 @@ mod projection;
 
 use std::sync::OnceLock;
 
+use rayon::prelude::*;
 use thiserror::Error;
 
+use crate::geometry::grid::grid_in_order;
 use crate::geometry::{Aperture, Point, Vector, recognise_grid};
 
 pub use analytic::{AnalyticSurface, DefinedSurface, DefinitionError, SampledSurface, Sampling, SurfaceDefinition};
 pub(crate) use feature::{Feature, features};
-use grid::{GridLattice, grid_normals, in_grid_order};
+use grid::{GridLattice, grid_nodes, in_grid_order};
 use mesh::MeshLattice;
 pub use offset::{Distance, Foot, Lookup, OffsetSurface, Place, Side};
-use patch::{Lattice, Patch};
+use patch::{Lattice, Patch, Vertex};
 pub use projection::Projection;
-pub(crate) use projection::{centroid, principal_axes};
+pub(crate) use projection::principal_axes;
 
 /// A nominal surface: one or several patches of points with normals, ready for distances.
 #[derive(Debug)]
@@ -47,6 +51,8 @@ pub struct Nominal {
     outline: Option<Aperture>,
     /// Where it bends how, worked out when a pose is searched for.
     features: OnceLock<Vec<Feature>>,
+    /// Rms distances of its points from their middle and from their best plane.
+    extent_mm: OnceLock<[f64; 2]>,
 }
 
 /// What a nominal surface was made from.
@@ -133,14 +139,16 @@ impl Nominal {
         if points.len() < LEAST {
             return Err(SurfaceError::TooFewPoints { points: points.len(), least: LEAST });
         }
+        let may_be_grid = matches!(projection, Projection::Auto | Projection::Xy);
+        if may_be_grid && let Some(found) = grid_in_order(&points) {
+            return Ok(Self::grid(GridLattice::whole(&found), &points));
+        }
         if let Some(index) = points.iter().position(|p| !(p.x + p.y + p.z).is_finite()) {
             return Err(SurfaceError::NotFinite { index });
         }
-        if matches!(projection, Projection::Auto | Projection::Xy)
-            && let Some(order) = recognise_grid(&points)
-        {
-            let (columns, rows) = (order.columns, order.rows);
-            return Ok(Self::grid(columns, rows, in_grid_order(points, &order), true));
+        if may_be_grid && let Some(order) = recognise_grid(&points) {
+            let points = in_grid_order(points, &order);
+            return Ok(Self::grid(GridLattice::new(order.columns, order.rows, &points, true), &points));
         }
         Self::scattered(points, projection)
     }
@@ -154,16 +162,7 @@ impl Nominal {
             return Err(SurfaceError::Collinear { points: points.len() });
         }
         let (projection, map) = projection.prepare(&points)?;
-        let order = delaunay::neighbourly_order(&points, &map);
-        let points: Vec<Point> = order.iter().map(|&i| points[i as usize]).collect();
-        let as_given = |index: usize| order[index] as usize;
-        let triangles = delaunay::triangulate(&points, &map).map_err(|error| match error {
-            SurfaceError::DuplicatePoints { first, second, at } => {
-                let (a, b) = (as_given(first), as_given(second));
-                SurfaceError::DuplicatePoints { first: a.min(b), second: a.max(b), at }
-            }
-            other => other,
-        })?;
+        let (points, triangles) = delaunay::triangulate(&points, &map)?;
         let lattice = MeshLattice::from_parts(&points, triangles.corners, triangles.neighbours)?;
         Ok(Self::of(Patch::mesh(points, lattice), NominalKind::Scattered { projection }))
     }
@@ -177,7 +176,7 @@ impl Nominal {
     /// A number of points other than announced, or fewer than 3 nodes on an axis.
     pub fn from_parameter_grid(columns: usize, rows: usize, points: Vec<Point>) -> Result<Self, SurfaceError> {
         check_grid(columns, rows, points.len())?;
-        Ok(Self::grid(columns, rows, points, false))
+        Ok(Self::grid(GridLattice::new(columns, rows, &points, false), &points))
     }
 
     /// Makes a surface from a regular xy grid of points whose unit normals are known.
@@ -192,7 +191,8 @@ impl Nominal {
     ) -> Result<Self, SurfaceError> {
         check_grid(columns, rows, points.len().min(normals.len()))?;
         let lattice = GridLattice::new(columns, rows, &points, true);
-        Ok(Self::of(Patch::grid(points, normals, lattice), NominalKind::Grid { columns, rows }))
+        let nodes = points.into_par_iter().zip(normals).map(|(point, normal)| Vertex { point, normal }).collect();
+        Ok(Self::of(Patch::grid(nodes, lattice), NominalKind::Grid { columns, rows }))
     }
 
     /// Makes a surface from a mesh; the normals are on the side from which its triangles turn counter-clockwise.
@@ -217,7 +217,7 @@ impl Nominal {
             return Err(SurfaceError::NoPatches);
         }
         let kind = NominalKind::Patches { count: patches.len() };
-        Ok(Self { patches, kind, outline: None, features: OnceLock::new() })
+        Ok(Self { patches, kind, outline: None, features: OnceLock::new(), extent_mm: OnceLock::new() })
     }
 
     /// States the outline of the part in xy: a point whose foot lies outside it is off the part.
@@ -225,14 +225,13 @@ impl Nominal {
         Self { outline: Some(outline), ..self }
     }
 
-    fn grid(columns: usize, rows: usize, points: Vec<Point>, regular_in_xy: bool) -> Self {
-        let lattice = GridLattice::new(columns, rows, &points, regular_in_xy);
-        let normals = grid_normals(&points, &lattice);
-        Self::of(Patch::grid(points, normals, lattice), NominalKind::Grid { columns, rows })
+    fn grid(lattice: GridLattice, points: &[Point]) -> Self {
+        let kind = NominalKind::Grid { columns: lattice.columns(), rows: lattice.rows() };
+        Self::of(Patch::grid(grid_nodes(points, &lattice), lattice), kind)
     }
 
     fn of(patch: Patch, kind: NominalKind) -> Self {
-        Self { patches: vec![patch], kind, outline: None, features: OnceLock::new() }
+        Self { patches: vec![patch], kind, outline: None, features: OnceLock::new(), extent_mm: OnceLock::new() }
     }
 
     /// Returns what the surface was made from.
@@ -251,15 +250,18 @@ impl Nominal {
 
     /// Returns every point of the surface, holes left out.
     pub fn points(&self) -> impl Iterator<Item = &Point> {
-        self.patches.iter().flat_map(|p| &p.points).filter(|p| p.x.is_finite())
+        self.patches
+            .iter()
+            .flat_map(|patch| (0..patch.len()).map(move |v| patch.point(v as u32)))
+            .filter(|p| p.x.is_finite())
     }
 
     /// Returns every point moved along its normal by a length in millimetres, eq. (3); holes left out.
     pub fn offset_points(&self, by_mm: f64) -> impl Iterator<Item = Point> {
-        let moved = move |patch: &Patch, v: usize| patch.points[v] + patch.normal(v as u32) * by_mm;
+        let moved = move |vertex: Vertex| vertex.point + vertex.normal * by_mm;
         self.patches
             .iter()
-            .flat_map(move |patch| (0..patch.points.len()).map(move |v| moved(patch, v)))
+            .flat_map(move |patch| (0..patch.len()).map(move |v| moved(patch.vertex(v as u32))))
             .filter(|p| p.x.is_finite())
     }
 
@@ -278,28 +280,34 @@ impl Nominal {
         let share = count / self.patches.len();
         self.patches
             .iter()
-            .flat_map(|patch| patch.sample(share.max(1)).map(|v| (patch.points[v as usize], patch.normal(v))))
+            .flat_map(|patch| patch.sample(share.max(1)).map(|v| patch.vertex(v)))
+            .map(|vertex| (vertex.point, vertex.normal))
             .collect()
     }
 
     /// Returns some points spread over the surface.
     pub(crate) fn sample(&self, count: usize) -> Vec<Point> {
         let share = (count / self.patches.len()).max(1);
-        self.patches.iter().flat_map(|patch| patch.sample(share).map(|v| patch.points[v as usize])).collect()
+        self.patches.iter().flat_map(|patch| patch.sample(share).map(|v| *patch.point(v))).collect()
     }
 
     /// Returns the rms distance of the points from their middle, in millimetres.
     pub fn size_mm(&self) -> f64 {
-        let sample = self.sample(SAMPLE);
-        let middle = centroid(&sample);
-        (sample.iter().map(|p| (p - middle).norm_squared()).sum::<f64>() / sample.len() as f64).sqrt()
+        self.extent_mm()[0]
     }
 
     /// Returns the rms distance of the points from their best plane, in millimetres: how much shape there is to register by.
     pub fn relief_mm(&self) -> f64 {
-        let sample = self.sample(SAMPLE);
-        let (_, eigen) = principal_axes(&sample);
-        (eigen.eigenvalues.min().max(0.0) / sample.len() as f64).sqrt()
+        self.extent_mm()[1]
+    }
+
+    fn extent_mm(&self) -> [f64; 2] {
+        *self.extent_mm.get_or_init(|| {
+            let sample = self.sample(SAMPLE);
+            let (middle, eigen) = principal_axes(&sample);
+            let squares = sample.iter().map(|p| (p - middle).norm_squared()).sum::<f64>();
+            [squares, eigen.eigenvalues.min().max(0.0)].map(|sum| (sum / sample.len() as f64).sqrt())
+        })
     }
 
     /// Returns the mean of the normals, of unit length; z for a closed surface, which has none.
@@ -316,7 +324,7 @@ impl Nominal {
         for patch in self.patches.iter().filter(|p| p.has_scattered_normals()) {
             let Lattice::Mesh(mesh) = &patch.lattice else { continue };
             for vertex in patch.sample(256) {
-                let wider = normals::fit_to_ring(&patch.points, mesh, vertex, 2 * normals::NEIGHBOURS);
+                let wider = normals::fit_to_ring(patch.mesh_points(), mesh, vertex, 2 * normals::NEIGHBOURS);
                 sum += (wider.normal - patch.normal(vertex)).norm_squared();
                 count += 1;
             }
@@ -346,6 +354,12 @@ fn check_grid(columns: usize, rows: usize, points: usize) -> Result<(), SurfaceE
 
 /// Whether points lie on one line to rounding.
 pub(crate) fn is_line(points: &[Point]) -> bool {
+    // Points of which some are on no line are on none.
+    let some: Vec<Point> = points.iter().step_by(points.len().div_ceil(SAMPLE).max(1)).copied().collect();
+    are_on_line(&some) && (some.len() == points.len() || are_on_line(points))
+}
+
+fn are_on_line(points: &[Point]) -> bool {
     let (_, eigen) = principal_axes(points);
     let mut spread: [f64; 3] = eigen.eigenvalues.into();
     spread.sort_by(f64::total_cmp);

@@ -2,6 +2,7 @@
 
 use crate::geometry::{Point, Vector};
 
+use super::lanes::{LANES, Lane, Lane3};
 use super::mesh::MeshLattice;
 use super::patch::Facets;
 
@@ -58,6 +59,156 @@ pub(crate) fn fit(at: Point, mean: Vector, neighbours: impl Iterator<Item = Poin
     let solved = solve::<9>(local).or_else(|| solve::<5>(local)).or_else(|| solve::<2>(local));
     let c = solved.unwrap_or([0.0; 9]);
     LocalFit::new(&mean, &tu, &tv, &[c[0], c[1], c[2] / h, c[3] / h, c[4] / h])
+}
+
+/// Fits the normals of four vertices side by side, as [`fit_to_ring`] does to rounding; what comes out for one does not depend
+/// on which the others are.
+#[inline(always)]
+pub(crate) fn four_normals(points: &[Point], mesh: &MeshLattice, vertices: &[u32; LANES]) -> [Vector; LANES] {
+    let mut rings = Rings { local: [[Lane::splat(0.0); 3]; MOST], most: 0 };
+    let mut last = (None, [Vector::zeros(); 3]);
+    let frames: [[Vector; 3]; LANES] = std::array::from_fn(|l| {
+        if last.0 == Some(vertices[l]) {
+            rings.repeat(l);
+        } else {
+            last = (Some(vertices[l]), rings.add(points, mesh, vertices[l], l));
+        }
+        last.1
+    });
+    let (slopes, determined) = rings.slopes();
+    std::array::from_fn(|l| {
+        if !determined[l] {
+            return fit_to_ring(points, mesh, vertices[l], NEIGHBOURS).normal;
+        }
+        let [mean, tu, tv] = frames[l];
+        let (p, q) = (slopes[0].0[l], slopes[1].0[l]);
+        (mean - tu * p - tv * q) / (1.0 + p * p + q * q).sqrt()
+    })
+}
+
+/// The neighbours of four vertices in the frame of each, in units of their mean distance; zeros fill up the shorter rings.
+struct Rings {
+    local: [Lane3; MOST],
+    most: usize,
+}
+
+impl Rings {
+    /// Enters the neighbours of a vertex in a lane; returns its mean normal and tangents.
+    #[inline(always)]
+    fn add(&mut self, points: &[Point], mesh: &MeshLattice, vertex: u32, lane: usize) -> [Vector; 3] {
+        let mut ring = [0u32; MOST];
+        let count = neighbours(mesh, vertex, NEIGHBOURS, &mut ring);
+        let mean = mean_facet_normal(points, mesh, vertex);
+        let [tu, tv] = tangents(&mean);
+        let at = points[vertex as usize];
+        let mut spread = 0.0;
+        for (local, &i) in self.local.iter_mut().zip(&ring[..count]) {
+            let d = points[i as usize] - at;
+            let (u, v) = (d.dot(&tu), d.dot(&tv));
+            spread += (u * u + v * v).sqrt();
+            (local[0].0[lane], local[1].0[lane], local[2].0[lane]) = (u, v, d.dot(&mean));
+        }
+        let per_mean = count as f64 / spread;
+        for c in self.local[..count].iter_mut().flatten() {
+            c.0[lane] *= per_mean;
+        }
+        self.most = self.most.max(count);
+        [mean, tu, tv]
+    }
+
+    /// Enters in a lane what the one before it holds.
+    fn repeat(&mut self, lane: usize) {
+        for c in self.local[..self.most].iter_mut().flatten() {
+            c.0[lane] = c.0[lane - 1];
+        }
+    }
+
+    /// Returns the slopes along u and v of the cubics, and in which lanes the neighbours determine one.
+    ///
+    /// The normal equations hold only 25 different numbers: the weighted sums of the monomials of the degrees 2 to 6.
+    #[inline(always)]
+    fn slopes(&self) -> ([Lane; 2], [bool; LANES]) {
+        let one = Lane::splat(1.0);
+        let mut moments = [Lane::splat(0.0); MOMENTS];
+        let mut right = [Lane::splat(0.0); TERMS.len()];
+        for [u, v, w] in &self.local[..self.most] {
+            let weight = one / (one + *u * *u + *v * *v);
+            let powers = monomials::<MOMENTS>([weight * *u * *u, weight * *u * *v, weight * *v * *v], *u, *v);
+            for (sum, power) in moments.iter_mut().zip(powers) {
+                *sum = *sum + power;
+            }
+            let (wu, wv) = (weight * *w * *u, weight * *w * *v);
+            let rest = monomials::<7>([wu * *u, wu * *v, wv * *v], *u, *v);
+            for (sum, power) in right.iter_mut().zip([wu, wv].into_iter().chain(rest)) {
+                *sum = *sum + power;
+            }
+        }
+        let moment = |i: usize, j: usize| {
+            let (of_u, of_v) = (TERMS[i][0] + TERMS[j][0], TERMS[i][1] + TERMS[j][1]);
+            moments[(of_u + of_v) * (of_u + of_v + 1) / 2 - 3 + of_v]
+        };
+        let gram = std::array::from_fn(|i| std::array::from_fn(|j| moment(i, j)));
+        solve_side_by_side(gram, right)
+    }
+}
+
+/// Powers of u and v in the cubic, in the order of [`solve`].
+const TERMS: [[usize; 2]; 9] = [[1, 0], [0, 1], [2, 0], [1, 1], [0, 2], [3, 0], [2, 1], [1, 2], [0, 3]];
+
+/// Monomials of u and v of the degrees 2 to 6.
+const MOMENTS: usize = 25;
+
+/// Continues the three monomials of the second degree by those of higher ones, u^n first and v^n last in each.
+#[inline(always)]
+fn monomials<const N: usize>(squares: [Lane; 3], u: Lane, v: Lane) -> [Lane; N] {
+    let mut all = [Lane::splat(0.0); N];
+    all[..3].copy_from_slice(&squares);
+    let (mut begin, mut end) = (0, 3);
+    while end < N {
+        for k in begin..end {
+            all[k + end - begin] = all[k] * u;
+        }
+        all[2 * end - begin] = all[end - 1] * v;
+        (begin, end) = (end, 2 * end - begin + 1);
+    }
+    all
+}
+
+/// Solves four systems for their first two unknowns, and tells which of them have a solution.
+#[inline(always)]
+fn solve_side_by_side<const N: usize>(mut m: [[Lane; N]; N], mut x: [Lane; N]) -> ([Lane; 2], [bool; LANES]) {
+    let least_pivot: [f64; LANES] =
+        std::array::from_fn(|l| WEAK_PIVOT * (0..N).map(|i| m[i][i].0[l]).fold(0.0, f64::max));
+    let mut determined = [true; LANES];
+    for j in 0..N {
+        let mut pivot = m[j][j];
+        for factor in &m[j][..j] {
+            pivot = pivot - *factor * *factor;
+        }
+        for l in 0..LANES {
+            // Not for NaN either.
+            determined[l] &= pivot.0[l] > least_pivot[l];
+        }
+        let inverse = Lane::splat(1.0) / Lane(pivot.0.map(f64::sqrt));
+        for i in j + 1..N {
+            for k in 0..j {
+                m[i][j] = m[i][j] - m[i][k] * m[j][k];
+            }
+            m[i][j] = m[i][j] * inverse;
+        }
+        for k in 0..j {
+            x[j] = x[j] - m[j][k] * x[k];
+        }
+        x[j] = x[j] * inverse;
+        m[j][j] = inverse;
+    }
+    for i in (0..N).rev() {
+        for k in i + 1..N {
+            x[i] = x[i] - m[k][i] * x[k];
+        }
+        x[i] = x[i] * m[i][i];
+    }
+    ([x[0], x[1]], determined)
 }
 
 impl LocalFit {
@@ -171,13 +322,10 @@ fn neighbours(mesh: &MeshLattice, vertex: u32, wanted: usize, ring: &mut [u32; M
 /// Adds the neighbours of one vertex that are not in the ring yet; returns how many there are then.
 #[inline(always)]
 fn add_around(mesh: &MeshLattice, of: u32, vertex: u32, ring: &mut [u32; MOST], mut count: usize) -> usize {
-    mesh.around(of, |facet, k| {
-        let corners = mesh.corners(facet);
-        for candidate in [corners[(k + 1) % 3], corners[(k + 2) % 3]] {
-            if candidate != vertex && count < MOST && !ring[..count].contains(&candidate) {
-                ring[count] = candidate;
-                count += 1;
-            }
+    mesh.neighbours_of(of, |candidate| {
+        if candidate != vertex && count < MOST && !ring[..count].contains(&candidate) {
+            ring[count] = candidate;
+            count += 1;
         }
     });
     count
@@ -248,5 +396,22 @@ mod tests {
         let few = fit(Point::origin(), Vector::z(), around(Point::origin(), z, 6).into_iter());
         assert!((few.normal - Vector::new(-0.1, 0.0, 1.0).normalize()).norm() < 1e-12);
         assert_eq!(fit(Point::origin(), Vector::z(), std::iter::empty()).normal, Vector::z());
+    }
+
+    #[test]
+    fn four_normals_are_those_of_one_at_a_time() {
+        let z = |x: f64, y: f64| 0.3 * x - 0.02 * x * y + 0.01 * y * y * y;
+        let points: Vec<Point> = around(Point::origin(), z, 400);
+        let map = crate::surface::projection::Projection::Xy.prepare(&points).unwrap().1;
+        let (points, t) = crate::surface::delaunay::triangulate(&points, &map).unwrap();
+        let mesh = MeshLattice::from_parts(&points, t.corners, t.neighbours).unwrap();
+        for v in 0..points.len() as u32 {
+            let four = four_normals(&points, &mesh, &[v, v / 2, v, 0]);
+            let one = fit_to_ring(&points, &mesh, v, NEIGHBOURS).normal;
+            assert!((four[0] - one).norm() < 1e-9, "{v}: {}", four[0] - one);
+            // Whatever stands beside it.
+            assert_eq!(four[0], four[2]);
+            assert_eq!(four[0], four_normals(&points, &mesh, &[v; LANES])[3]);
+        }
     }
 }

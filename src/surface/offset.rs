@@ -90,6 +90,11 @@ impl Place {
     /// Nothing known yet.
     pub const UNKNOWN: Self = Self { patch: 0, facet: u32::MAX };
 
+    /// A facet of a surface of one patch.
+    pub(crate) fn on_first_patch(facet: u32) -> Self {
+        Self { patch: 0, facet }
+    }
+
     pub(crate) fn patch(self) -> u32 {
         self.patch
     }
@@ -178,7 +183,7 @@ impl<'a> OffsetSurface<'a> {
     /// Returns the step of the nominal sampling at a place, in millimetres: the side of a square of two of its facets.
     pub(crate) fn spacing_mm(&self, place: Place) -> f64 {
         let patch = &self.nominal.patches()[place.patch as usize];
-        let [a, b, c] = patch.corners(place.facet).map(|v| patch.points[v as usize]);
+        let [a, b, c] = patch.corners(place.facet).map(|v| *patch.point(v));
         (b - a).cross(&(c - a)).norm().sqrt()
     }
 
@@ -230,7 +235,7 @@ impl<'a> OffsetSurface<'a> {
         }
         let mut before = u32::MAX;
         for _ in 0..MOST_STEPS {
-            let [a, b, c] = facets.corners(facet).map(|v| patch.points[v as usize]);
+            let [a, b, c] = facets.corners(facet).map(|v| *patch.point(v));
             let (e1, e2) = (b - a, c - a);
             let turned = e1.cross(&e2);
             let squared = turned.norm_squared();
@@ -244,6 +249,11 @@ impl<'a> OffsetSurface<'a> {
             }
         }
         facet
+    }
+
+    /// Finds a facet of the first patch near the foot of a point, without its normals.
+    pub(super) fn place_near<F: Facets>(&self, patch: &Patch, facets: &F, p: &Point, start: Place) -> Place {
+        Place { patch: 0, facet: self.approach(patch, facets, p, start.facet) }
     }
 
     /// Walks from facet to facet until one holds the foot, then measures there.
@@ -287,9 +297,10 @@ impl OffsetFacet {
     #[inline(always)]
     fn new(surface: &OffsetSurface, patch: &Patch, [a, b, c]: [u32; 3]) -> Self {
         let sign = surface.side.sign();
-        let n = [patch.normal(a) * sign, patch.normal(b) * sign, patch.normal(c) * sign];
-        let offset = |vertex: u32, n: &Vector| patch.points[vertex as usize].coords + n * surface.radius_mm; // eq. (3)
-        let x = [offset(a, &n[0]), offset(b, &n[1]), offset(c, &n[2])];
+        let (a, b, c) = (patch.vertex(a), patch.vertex(b), patch.vertex(c));
+        let n = [a.normal * sign, b.normal * sign, c.normal * sign];
+        let offset = |point: &Point, n: &Vector| point.coords + n * surface.radius_mm; // eq. (3)
+        let x = [offset(&a.point, &n[0]), offset(&b.point, &n[1]), offset(&c.point, &n[2])];
         let turned = (x[1] - x[0]).cross(&(x[2] - x[0]));
         let squared = turned.norm_squared();
         let flat = turned * (sign / squared.sqrt());

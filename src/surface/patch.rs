@@ -1,22 +1,33 @@
 //! One patch of a nominal surface: points, unit normals, and the triangles between them.
 //!
-//! A grid has its triangles by arithmetic and its normals ready; a mesh keeps its triangles in flat arrays and fits a normal
-//! when a triangle is first touched, so that the work done is that of the measured region, not of the whole cloud.
+//! A grid has its triangles by arithmetic and its normals ready, each beside its point; a mesh keeps its triangles in flat
+//! arrays and fits a normal when a triangle is first touched, so that the work done is that of the measured region, not of the
+//! whole cloud.
 
 use std::sync::atomic::{AtomicU64, Ordering};
+
+use rayon::prelude::*;
 
 use crate::geometry::{Point, Vector};
 
 use super::grid::GridLattice;
+use super::lanes::LANES;
 use super::mesh::MeshLattice;
 use super::normals;
 
 /// A smooth piece of surface that one lattice of triangles covers.
 #[derive(Debug)]
 pub(crate) struct Patch {
-    pub(crate) points: Vec<Point>,
     pub(crate) lattice: Lattice,
-    normals: Normals,
+    vertices: Vertices,
+}
+
+/// A point of a surface with its unit normal: side by side, since a point location needs both, and apart they would cost it
+/// twice the cache lines.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Vertex {
+    pub(crate) point: Point,
+    pub(crate) normal: Vector,
 }
 
 /// How the triangles of a patch are known.
@@ -41,38 +52,62 @@ pub(crate) trait Facets: Sync {
 }
 
 #[derive(Debug)]
-enum Normals {
-    Ready(Vec<Vector>),
-    WhenTouched(Vec<NormalCell>),
+enum Vertices {
+    Ready(Vec<Vertex>),
+    WhenTouched(Vec<Point>, Vec<NormalCell>),
 }
 
 impl Patch {
-    /// Joins a grid with normals that are known at every node.
-    pub(crate) fn grid(points: Vec<Point>, normals: Vec<Vector>, lattice: GridLattice) -> Self {
-        Self { points, lattice: Lattice::Grid(lattice), normals: Normals::Ready(normals) }
+    /// Joins a grid with its nodes, whose normals are all known.
+    pub(crate) fn grid(nodes: Vec<Vertex>, lattice: GridLattice) -> Self {
+        Self { lattice: Lattice::Grid(lattice), vertices: Vertices::Ready(nodes) }
     }
 
     /// Joins a mesh with normals that are fitted when a triangle is first touched.
     pub(crate) fn mesh(points: Vec<Point>, lattice: MeshLattice) -> Self {
-        let cells = points.iter().map(|_| NormalCell::unknown()).collect();
-        Self { points, lattice: Lattice::Mesh(lattice), normals: Normals::WhenTouched(cells) }
+        let cells = points.par_iter().map(|_| NormalCell::unknown()).collect();
+        Self { lattice: Lattice::Mesh(lattice), vertices: Vertices::WhenTouched(points, cells) }
+    }
+
+    /// Returns the number of vertices, holes of a grid included.
+    pub(crate) fn len(&self) -> usize {
+        match &self.vertices {
+            Vertices::Ready(nodes) => nodes.len(),
+            Vertices::WhenTouched(points, _) => points.len(),
+        }
+    }
+
+    /// Returns the point of a vertex; NaN at a hole of a grid.
+    #[inline(always)]
+    pub(crate) fn point(&self, vertex: u32) -> &Point {
+        match &self.vertices {
+            Vertices::Ready(nodes) => &nodes[vertex as usize].point,
+            Vertices::WhenTouched(points, _) => &points[vertex as usize],
+        }
     }
 
     /// Returns the unit normal at a vertex; NaN at a hole of a grid.
     #[inline(always)]
     pub(crate) fn normal(&self, vertex: u32) -> Vector {
-        match &self.normals {
-            Normals::Ready(normals) => normals[vertex as usize],
-            Normals::WhenTouched(cells) => {
+        self.vertex(vertex).normal
+    }
+
+    /// Returns a vertex: its point and its unit normal.
+    #[inline(always)]
+    pub(crate) fn vertex(&self, vertex: u32) -> Vertex {
+        match &self.vertices {
+            Vertices::Ready(nodes) => nodes[vertex as usize],
+            Vertices::WhenTouched(points, cells) => {
                 let cell = &cells[vertex as usize];
-                cell.get().unwrap_or_else(|| cell.set(self.fitted_normal(vertex)))
+                let normal = cell.get().unwrap_or_else(|| cell.set(self.fitted_normal(vertex)));
+                Vertex { point: points[vertex as usize], normal }
             }
         }
     }
 
     /// Returns about so many vertices, spread over the patch, holes left out.
     pub(crate) fn sample(&self, count: usize) -> impl Iterator<Item = u32> {
-        let n = self.points.len();
+        let n = self.len();
         let (columns, step_i, step_j) = match &self.lattice {
             Lattice::Grid(grid) => {
                 let step = ((n as f64 / count as f64).sqrt() as usize).clamp(1, grid.columns().min(grid.rows()) / 3);
@@ -83,30 +118,55 @@ impl Patch {
         (0..n / columns)
             .step_by(step_j)
             .flat_map(move |j| (0..columns).step_by(step_i).map(move |i| (j * columns + i) as u32))
-            .filter(|&v| {
-                self.points[v as usize].x.is_finite() && (self.has_scattered_normals() || self.normal(v).x.is_finite())
-            })
+            .filter(|&v| self.point(v).x.is_finite() && (self.has_scattered_normals() || self.normal(v).x.is_finite()))
     }
 
     /// Whether normals were given or exact rather than fitted to scattered neighbours.
     pub(crate) fn has_scattered_normals(&self) -> bool {
-        matches!(self.normals, Normals::WhenTouched(_))
+        matches!(self.vertices, Vertices::WhenTouched(..))
     }
 
-    /// Returns the normals of a grid, which are all known; of a mesh none.
-    pub(crate) fn known_normals(&self) -> &[Vector] {
-        match &self.normals {
-            Normals::Ready(normals) => normals,
-            Normals::WhenTouched(_) => &[],
+    /// Returns the nodes of a grid, whose normals are all known; of a mesh none.
+    pub(crate) fn nodes(&self) -> &[Vertex] {
+        match &self.vertices {
+            Vertices::Ready(nodes) => nodes,
+            Vertices::WhenTouched(..) => &[],
+        }
+    }
+
+    /// Returns the points of a mesh; of a grid, where they stand among the nodes, none.
+    pub(crate) fn mesh_points(&self) -> &[Point] {
+        match &self.vertices {
+            Vertices::Ready(_) => &[],
+            Vertices::WhenTouched(points, _) => points,
         }
     }
 
     #[cold]
     fn fitted_normal(&self, vertex: u32) -> Vector {
         match &self.lattice {
-            Lattice::Mesh(mesh) => normals::fit_to_ring(&self.points, mesh, vertex, normals::NEIGHBOURS).normal,
+            Lattice::Mesh(mesh) => pulp::Arch::new().dispatch(Four { patch: self, mesh, vertices: [vertex; LANES] })[0],
             Lattice::Grid(_) => unreachable!("a grid has its normals ready"),
         }
+    }
+
+    /// Fits the normals of many vertices that are not known yet: on all cores and four at a time, several times faster than
+    /// one by one when they are touched, and to the same bits.
+    pub(crate) fn fit_normals(&self, vertices: &[u32]) {
+        /// Vertices that a task takes at a time.
+        const CHUNK: usize = 256;
+        let (Vertices::WhenTouched(_, cells), Lattice::Mesh(mesh)) = (&self.vertices, &self.lattice) else { return };
+        let arch = pulp::Arch::new();
+        vertices.par_chunks(CHUNK).for_each(|chunk| {
+            let unknown: Vec<u32> = chunk.iter().copied().filter(|&v| cells[v as usize].get().is_none()).collect();
+            for few in unknown.chunks(LANES) {
+                let vertices = std::array::from_fn(|l| few[l.min(few.len() - 1)]);
+                let normals = arch.dispatch(Four { patch: self, mesh, vertices });
+                for (&vertex, normal) in few.iter().zip(normals) {
+                    cells[vertex as usize].set(normal);
+                }
+            }
+        });
     }
 
     /// Returns the corners of a facet that exists.
@@ -115,6 +175,23 @@ impl Patch {
             Lattice::Grid(grid) => grid.corners(facet),
             Lattice::Mesh(mesh) => mesh.corners(facet),
         }
+    }
+}
+
+/// The normals of four vertices, in a form that is compiled once for each set of vector instructions.
+struct Four<'a> {
+    patch: &'a Patch,
+    mesh: &'a MeshLattice,
+    vertices: [u32; LANES],
+}
+
+impl pulp::NullaryFnOnce for Four<'_> {
+    type Output = [Vector; LANES];
+
+    // Inlined into the caller that has the instructions; a call from it would be to code without them.
+    #[inline(always)]
+    fn call(self) -> Self::Output {
+        normals::four_normals(self.patch.mesh_points(), self.mesh, &self.vertices)
     }
 }
 

@@ -1,0 +1,584 @@
+//! The Delaunay triangulation of points that stand along a Z-curve: by divide and conquer, on all cores.
+//!
+//! The construction is that of Guibas and Stolfi (Primitives for the manipulation of general subdivisions, 1985) with the cuts
+//! across u and v in turn that Dwyer (1987) found to leave little to stitch. A Z-curve has these cuts in it: where the highest
+//! bit changes in which its keys differ, everything before lies below a line of the plane and everything after above it. Halves
+//! know nothing of each other until they are stitched, so each can be built by a thread of its own, and what is built does not
+//! depend on how many there are.
+//!
+//! Every decision is exact: a determinant that rounding could have turned over is worked out by the adaptive predicates of
+//! Shewchuk. Four points on one circle are divided as it comes.
+
+use std::ops::Range;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use rayon::prelude::*;
+use robust::Coord;
+
+use super::mesh::BORDER;
+
+/// Points and their keys in the order of a Z-curve; points of one key by u, then v. No two points at one place.
+#[derive(Clone, Copy)]
+pub(crate) struct Strewn<'a> {
+    pub(crate) places: &'a [[f64; 2]],
+    /// Bits of v and u in turn, those of v the higher.
+    pub(crate) keys: &'a [u64],
+}
+
+/// A directed edge of a subdivision of the plane; its other direction is the one whose number differs in the last bit.
+type Edge = [u32; 3];
+
+const ORIGIN: usize = 0;
+/// The next edge counter-clockwise round the origin.
+const AFTER: usize = 1;
+/// The next edge clockwise round the origin.
+const BEFORE: usize = 2;
+
+/// The origin of an edge that was deleted, or never made.
+const NOWHERE: u32 = u32::MAX;
+
+/// A planar graph of n vertices has fewer than 3 n edges, each in two directions.
+const PER_VERTEX: usize = 6;
+
+/// So many points are triangulated by one thread.
+const ALONE: usize = 8192;
+
+/// Across which axis of the plane a cut separates: what lies before it has the smaller coordinate.
+#[derive(Clone, Copy, PartialEq)]
+enum Axis {
+    U,
+    V,
+}
+
+/// A finished part: one vertex, or the edge of a hull that has everything on its left.
+#[derive(Clone, Copy)]
+enum Part {
+    Lone(u32),
+    Hull(u32),
+}
+
+/// The edges of a triangulation with a number for each inner face.
+pub(crate) struct Triangulation {
+    edges: Vec<Edge>,
+    /// An edge of the hull that has everything on its left.
+    hull: u32,
+}
+
+impl Triangulation {
+    /// Triangulates at least three points.
+    pub(crate) fn new(strewn: Strewn) -> Self {
+        let count = strewn.places.len();
+        // Zeros come from the system untouched; the threads that build here are the first to touch them.
+        let mut edges: Vec<Edge> = vec![[0; 3]; PER_VERTEX * count];
+        let (part, unused) = divide(strewn, 0..count, &mut edges, 0);
+        let Part::Hull(hull) = part else { unreachable!("three points have an edge") };
+        unused.mark(&mut edges);
+        Self { edges, hull }
+    }
+
+    /// Returns the corners of the inner faces, counter-clockwise, and the faces across the edge opposite to each corner.
+    ///
+    /// They are numbered as their edges are, and so stand in memory about where their corners do.
+    pub(crate) fn faces(&self) -> (Vec<[u32; 3]>, Vec<[u32; 3]>) {
+        let number: Vec<AtomicU32> = (0..self.edges.len()).into_par_iter().map(|_| AtomicU32::new(0)).collect();
+        self.along_the_hull(|e| number[(e ^ 1) as usize].store(BORDER, Ordering::Relaxed));
+        let of = |e: u32| number[e as usize].load(Ordering::Relaxed);
+        let round = |e: u32| {
+            let second = self.left_next(e);
+            [e, second, self.left_next(second)]
+        };
+        let is_first = |&e: &u32| {
+            self.edges[e as usize][ORIGIN] != NOWHERE && of(e) != BORDER && {
+                let [e, second, third] = round(e);
+                e < second && e < third
+            }
+        };
+        let firsts: Vec<u32> = (0..self.edges.len() as u32).into_par_iter().filter(is_first).collect();
+        firsts.par_iter().enumerate().for_each(|(face, &e)| {
+            for e in round(e) {
+                number[e as usize].store(face as u32, Ordering::Relaxed);
+            }
+        });
+        let across = |e: u32| of(e ^ 1);
+        firsts
+            .par_iter()
+            .map(|&e| {
+                let [a, b, c] = round(e);
+                ([a, b, c].map(|e| self.edges[e as usize][ORIGIN]), [across(b), across(c), across(a)])
+            })
+            .unzip()
+    }
+
+    fn left_next(&self, e: u32) -> u32 {
+        self.edges[(e ^ 1) as usize][BEFORE]
+    }
+
+    fn along_the_hull(&self, visit: impl Fn(u32)) {
+        let mut e = self.hull;
+        loop {
+            visit(e);
+            e = self.edges[(e ^ 1) as usize][AFTER];
+            if e == self.hull {
+                return;
+            }
+        }
+    }
+}
+
+/// Triangulates a range of the points in the edges that are set aside for it, of which the first has the number `base`.
+fn divide(strewn: Strewn, range: Range<usize>, edges: &mut [Edge], base: u32) -> (Part, Slots) {
+    if range.len() <= ALONE {
+        let fresh = base..base + edges.len() as u32;
+        let mut net = Net { strewn, edges, base, slots: Slots { freed: Vec::new(), fresh: vec![fresh] } };
+        let part = net.build(range);
+        return (part, net.slots);
+    }
+    let (cut, axis) = strewn.cut(&range);
+    let set_aside = PER_VERTEX * (cut - range.start);
+    let (below, above) = edges.split_at_mut(set_aside);
+    let ((lower, mut slots), (upper, more)) = rayon::join(
+        || divide(strewn, range.start..cut, below, base),
+        || divide(strewn, cut..range.end, above, base + set_aside as u32),
+    );
+    slots.freed.extend(more.freed);
+    slots.fresh.extend(more.fresh);
+    let mut net = Net { strewn, edges, base, slots };
+    let part = net.stitch(lower, upper, axis);
+    (part, net.slots)
+}
+
+impl Strewn<'_> {
+    /// Divides a range of at least two points by a line: where the second part begins, and what it is above in.
+    fn cut(&self, range: &Range<usize>) -> (usize, Axis) {
+        let keys = &self.keys[range.clone()];
+        let differing = keys[0] ^ keys[keys.len() - 1];
+        if differing == 0 {
+            return (range.start + keys.len() / 2, Axis::U);
+        }
+        let bit = differing.ilog2();
+        let cut = range.start + keys.partition_point(|key| key >> bit & 1 == 0);
+        (cut, if bit.is_multiple_of(2) { Axis::U } else { Axis::V })
+    }
+}
+
+/// Numbers for edges: those of deleted ones, and those not given out yet.
+struct Slots {
+    freed: Vec<u32>,
+    fresh: Vec<Range<u32>>,
+}
+
+impl Slots {
+    /// Takes the lower of two numbers that differ in the last bit.
+    fn take(&mut self) -> u32 {
+        if let Some(e) = self.freed.pop() {
+            return e;
+        }
+        loop {
+            let range = self.fresh.last_mut().expect("a planar graph has fewer than three edges a vertex");
+            if range.start < range.end {
+                range.start += 2;
+                return range.start - 2;
+            }
+            self.fresh.pop();
+        }
+    }
+
+    /// Marks the edges whose numbers were not given out.
+    fn mark(&self, edges: &mut [Edge]) {
+        for range in &self.fresh {
+            edges[range.start as usize..range.end as usize].fill([NOWHERE; 3]);
+        }
+    }
+}
+
+/// A part of the plane being triangulated.
+struct Net<'a> {
+    strewn: Strewn<'a>,
+    edges: &'a mut [Edge],
+    /// The number of the first of these edges.
+    base: u32,
+    slots: Slots,
+}
+
+impl Net<'_> {
+    fn build(&mut self, range: Range<usize>) -> Part {
+        match range.len() {
+            1 => Part::Lone(range.start as u32),
+            2 => Part::Hull(self.make(range.start as u32, range.start as u32 + 1)),
+            3 => self.three(range.start as u32),
+            _ => {
+                let (cut, axis) = self.strewn.cut(&range);
+                let lower = self.build(range.start..cut);
+                let upper = self.build(cut..range.end);
+                self.stitch(lower, upper, axis)
+            }
+        }
+    }
+
+    /// Joins three points: to a triangle, or to two edges where they lie on one line.
+    fn three(&mut self, first: u32) -> Part {
+        let mut v = [first, first + 1, first + 2];
+        let turn = self.turn(v[0], v[1], v[2]);
+        if turn == 0.0 {
+            v.sort_by(|&a, &b| self.before(Axis::U, a, b));
+        } else if turn < 0.0 {
+            v.swap(1, 2);
+        }
+        let (a, b) = (self.make(v[0], v[1]), self.make(v[1], v[2]));
+        self.put_after(b, a ^ 1);
+        if turn != 0.0 {
+            self.connect(b, a);
+        }
+        Part::Hull(a)
+    }
+
+    /// Joins two parts that a line separates, the lower one before the line; returns their common hull.
+    fn stitch(&mut self, lower: Part, upper: Part, axis: Axis) -> Part {
+        let mut base = self.tangent(lower, upper, axis);
+        loop {
+            let (right, left) = (self.origin(base), self.dest(base));
+            let mut at_left = self.edge(base ^ 1)[AFTER];
+            let goes_left = self.turn(right, left, self.dest(at_left)) < 0.0;
+            if goes_left {
+                at_left = self.clear(at_left, AFTER, left, right);
+            }
+            let mut at_right = self.edge(base)[BEFORE];
+            let goes_right = self.turn(right, left, self.dest(at_right)) < 0.0;
+            if goes_right {
+                at_right = self.clear(at_right, BEFORE, left, right);
+            }
+            base = match (goes_left, goes_right) {
+                (false, false) => return Part::Hull(base),
+                (false, true) => self.connect(at_right, base ^ 1),
+                (true, false) => self.connect(base ^ 1, at_left ^ 1),
+                (true, true) if self.in_circle(self.dest(at_left), left, right, self.dest(at_right)) => {
+                    self.connect(at_right, base ^ 1)
+                }
+                (true, true) => self.connect(base ^ 1, at_left ^ 1),
+            };
+        }
+    }
+
+    /// Deletes the edges on one side that a circle through the base and the end of the edge shows not to be Delaunay's;
+    /// returns the first that stays.
+    fn clear(&mut self, mut e: u32, way: usize, left: u32, right: u32) -> u32 {
+        loop {
+            let next = self.edge(e)[way];
+            if !self.in_circle(left, right, self.dest(e), self.dest(next)) {
+                return e;
+            }
+            self.delete(e);
+            e = next;
+        }
+    }
+
+    /// Makes the lowest edge between two parts, seen with the line that separates them upright: from the upper to the lower.
+    fn tangent(&mut self, lower: Part, upper: Part, axis: Axis) -> u32 {
+        // Clockwise along the lower hull and counter-clockwise along the upper one.
+        let mut l = match lower {
+            Part::Lone(_) => None,
+            Part::Hull(e) => Some(self.edge(self.farthest(e, |a, b| self.before(axis, a, b).is_lt()))[BEFORE]),
+        };
+        let mut u = match upper {
+            Part::Lone(_) => None,
+            Part::Hull(e) => Some(self.farthest(e, |a, b| self.before(axis, a, b).is_gt())),
+        };
+        let vertex = |net: &Self, part: Part, e: Option<u32>| match (part, e) {
+            (Part::Lone(v), _) => v,
+            (_, e) => net.origin(e.expect("a hull has edges")),
+        };
+        loop {
+            let (at_l, at_u) = (vertex(self, lower, l), vertex(self, upper, u));
+            if let Some(e) = l
+                && self.turn(at_l, self.dest(e), at_u) > 0.0
+            {
+                l = Some(self.left_next(e));
+            } else if let Some(e) = u
+                && self.turn(at_u, self.dest(e), at_l) < 0.0
+            {
+                u = Some(self.edge(e ^ 1)[AFTER]);
+            } else {
+                let base = self.make(at_u, at_l);
+                if let Some(e) = u {
+                    self.put_after(base, self.edge(e)[BEFORE]);
+                }
+                if let Some(e) = l {
+                    self.put_after(base ^ 1, e);
+                }
+                return base;
+            }
+        }
+    }
+
+    /// Climbs along a hull to the edge out of the vertex that no other is beyond.
+    fn farthest(&self, mut e: u32, beyond: impl Fn(u32, u32) -> bool) -> u32 {
+        let next = |e: u32| self.edge(e ^ 1)[AFTER];
+        let previous = |e: u32| self.edge(e)[BEFORE] ^ 1;
+        while beyond(self.origin(e), self.origin(next(e))) {
+            e = next(e);
+        }
+        while beyond(self.origin(e), self.origin(previous(e))) {
+            e = previous(e);
+        }
+        e
+    }
+
+    /// Orders two vertices across a line that separates parts; along it where that does not tell.
+    fn before(&self, axis: Axis, a: u32, b: u32) -> std::cmp::Ordering {
+        let (a, b) = (self.strewn.places[a as usize], self.strewn.places[b as usize]);
+        match axis {
+            Axis::U => a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])),
+            // The same turned by a right angle.
+            Axis::V => a[1].total_cmp(&b[1]).then(b[0].total_cmp(&a[0])),
+        }
+    }
+
+    #[inline(always)]
+    fn edge(&self, e: u32) -> &Edge {
+        &self.edges[(e - self.base) as usize]
+    }
+
+    #[inline(always)]
+    fn edge_mut(&mut self, e: u32) -> &mut Edge {
+        &mut self.edges[(e - self.base) as usize]
+    }
+
+    #[inline(always)]
+    fn origin(&self, e: u32) -> u32 {
+        self.edge(e)[ORIGIN]
+    }
+
+    #[inline(always)]
+    fn dest(&self, e: u32) -> u32 {
+        self.edge(e ^ 1)[ORIGIN]
+    }
+
+    /// The next edge along the face on the left.
+    #[inline(always)]
+    fn left_next(&self, e: u32) -> u32 {
+        self.edge(e ^ 1)[BEFORE]
+    }
+
+    /// Makes an edge that hangs on nothing.
+    fn make(&mut self, from: u32, to: u32) -> u32 {
+        let e = self.slots.take();
+        *self.edge_mut(e) = [from, e, e];
+        *self.edge_mut(e ^ 1) = [to, e ^ 1, e ^ 1];
+        e
+    }
+
+    /// Hangs an edge that is alone at its origin next to another one, counter-clockwise.
+    #[inline(always)]
+    fn put_after(&mut self, e: u32, other: u32) {
+        let next = self.edge(other)[AFTER];
+        self.edge_mut(other)[AFTER] = e;
+        self.edge_mut(next)[BEFORE] = e;
+        let edge = self.edge_mut(e);
+        (edge[BEFORE], edge[AFTER]) = (other, next);
+    }
+
+    /// Makes an edge from the end of one edge to the origin of another, across the face on the left of both.
+    fn connect(&mut self, a: u32, b: u32) -> u32 {
+        let e = self.make(self.dest(a), self.origin(b));
+        self.put_after(e, self.left_next(a));
+        self.put_after(e ^ 1, b);
+        e
+    }
+
+    fn delete(&mut self, e: u32) {
+        for e in [e, e ^ 1] {
+            let [_, after, before] = *self.edge(e);
+            self.edge_mut(before)[AFTER] = after;
+            self.edge_mut(after)[BEFORE] = before;
+            self.edge_mut(e)[ORIGIN] = NOWHERE;
+        }
+        self.slots.freed.push(e & !1);
+    }
+
+    #[inline(always)]
+    fn turn(&self, a: u32, b: u32, c: u32) -> f64 {
+        turn([a, b, c].map(|v| self.strewn.places[v as usize]))
+    }
+
+    #[inline(always)]
+    fn in_circle(&self, a: u32, b: u32, c: u32, d: u32) -> bool {
+        in_circle([a, b, c, d].map(|v| self.strewn.places[v as usize]))
+    }
+}
+
+/// Positive where three points turn counter-clockwise, 0 on a line; the sign is exact.
+#[inline(always)]
+fn turn([a, b, c]: [[f64; 2]; 3]) -> f64 {
+    // The first filter of Shewchuk's predicate, here so that it is inlined; eps is half the distance from 1 to the next number.
+    const BOUND: f64 = (3.0 + 16.0 * HALF_EPSILON) * HALF_EPSILON;
+    let left = (a[0] - c[0]) * (b[1] - c[1]);
+    let right = (a[1] - c[1]) * (b[0] - c[0]);
+    let det = left - right;
+    let permanent = left.abs() + right.abs();
+    // Nothing but zeros is exact: two of the points are one.
+    if det.abs() > BOUND * permanent || permanent == 0.0 { det } else { robust::orient2d(coord(a), coord(b), coord(c)) }
+}
+
+const HALF_EPSILON: f64 = 0.5 * f64::EPSILON;
+
+/// Whether the fourth point lies within the circle through the others, which turn counter-clockwise; exact.
+#[inline(always)]
+fn in_circle([a, b, c, d]: [[f64; 2]; 4]) -> bool {
+    const BOUND: f64 = (10.0 + 96.0 * HALF_EPSILON) * HALF_EPSILON;
+    let [a_d, b_d, c_d] = [a, b, c].map(|p| [p[0] - d[0], p[1] - d[1]]);
+    let lift = |p: [f64; 2]| p[0] * p[0] + p[1] * p[1];
+    let minor = |p: [f64; 2], q: [f64; 2]| (p[0] * q[1], q[0] * p[1]);
+    let terms = [(minor(b_d, c_d), lift(a_d)), (minor(c_d, a_d), lift(b_d)), (minor(a_d, b_d), lift(c_d))];
+    let (mut det, mut permanent) = (0.0, 0.0);
+    for ((plus, minus), lift) in terms {
+        det += lift * (plus - minus);
+        permanent += lift * (plus.abs() + minus.abs());
+    }
+    if det.abs() > BOUND * permanent || permanent == 0.0 {
+        det > 0.0
+    } else {
+        robust::incircle(coord(a), coord(b), coord(c), coord(d)) > 0.0
+    }
+}
+
+fn coord([x, y]: [f64; 2]) -> Coord<f64> {
+    Coord { x, y }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use spade::{DelaunayTriangulation, Point2, Triangulation as _};
+
+    use super::super::delaunay::along_a_z_curve;
+    use super::*;
+
+    /// Numbers between 0 and 1 without any order (splitmix64).
+    fn noise(mut seed: u64) -> impl FnMut() -> f64 {
+        move || {
+            seed = seed.wrapping_add(0x9E37_79B9_7F4A_7C15);
+            let mixed = (seed ^ seed >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+            let mixed = (mixed ^ mixed >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
+            (mixed ^ mixed >> 31) as f64 / u64::MAX as f64
+        }
+    }
+
+    fn strewn(count: usize, seed: u64) -> Vec<[f64; 2]> {
+        let mut next = noise(seed);
+        (0..count).map(|_| [next(), next()]).collect()
+    }
+
+    fn grid(columns: usize, rows: usize) -> Vec<[f64; 2]> {
+        (0..columns * rows).map(|k| [(k % columns) as f64 * 0.1, (k / columns) as f64 * 0.1]).collect()
+    }
+
+    /// A few points far apart, most of the others within a hair's breadth of one of them.
+    fn clustered(count: usize, breadth: f64) -> Vec<[f64; 2]> {
+        let (centres, mut next) = (strewn(5, 3), noise(4));
+        (0..count).map(|k| centres[k % 5].map(|c| c + breadth * next() * next())).collect()
+    }
+
+    fn in_order(places: &[[f64; 2]]) -> (Vec<[f64; 2]>, Vec<u64>) {
+        along_a_z_curve(places).into_iter().map(|(key, index)| (places[index as usize], key)).unzip()
+    }
+
+    fn by_spade(places: &[[f64; 2]]) -> DelaunayTriangulation<Point2<f64>> {
+        DelaunayTriangulation::bulk_load_stable(places.iter().map(|&[u, v]| Point2::new(u, v)).collect()).unwrap()
+    }
+
+    /// Triangulates and checks everything that makes a triangulation Delaunay's; returns its triangles.
+    fn checked(places: &[[f64; 2]]) -> (Vec<[f64; 2]>, BTreeSet<[u32; 3]>) {
+        let (places, keys) = in_order(places);
+        let (corners, neighbours) = Triangulation::new(Strewn { places: &places, keys: &keys }).faces();
+        let at = |v: u32| places[v as usize];
+        for (f, c) in corners.iter().enumerate() {
+            assert!(turn(c.map(at)) > 0.0);
+            for k in 0..3 {
+                let n = neighbours[f][k];
+                if n == BORDER {
+                    continue;
+                }
+                let j = neighbours[n as usize].iter().position(|&n| n == f as u32).expect("neighbours know each other");
+                let across = corners[n as usize];
+                assert_eq!([across[(j + 1) % 3], across[(j + 2) % 3]], [c[(k + 2) % 3], c[(k + 1) % 3]]);
+                // Locally Delaunay everywhere is Delaunay.
+                assert!(!in_circle([at(c[0]), at(c[1]), at(c[2]), at(across[j])]));
+            }
+        }
+        assert_eq!(corners.len(), by_spade(&places).num_inner_faces(), "the whole hull is covered");
+        (places, corners.into_iter().map(from_lowest).collect())
+    }
+
+    fn from_lowest(c: [u32; 3]) -> [u32; 3] {
+        let k = (0..3).min_by_key(|&k| c[k]).unwrap();
+        [c[k], c[(k + 1) % 3], c[(k + 2) % 3]]
+    }
+
+    fn triangles_of_spade(places: &[[f64; 2]]) -> BTreeSet<[u32; 3]> {
+        by_spade(places).inner_faces().map(|f| from_lowest(f.vertices().map(|v| v.index() as u32))).collect()
+    }
+
+    #[test]
+    fn without_four_points_on_a_circle_there_is_only_one() {
+        for count in (3..60).chain([1000, 30_000]) {
+            let (places, triangles) = checked(&strewn(count, count as u64));
+            assert_eq!(triangles, triangles_of_spade(&places), "{count} points");
+        }
+        let mut next = noise(9);
+        let rough: Vec<_> = grid(120, 90).into_iter().map(|p| p.map(|c| c + 1e-3 * next())).collect();
+        let (places, triangles) = checked(&rough);
+        assert_eq!(triangles, triangles_of_spade(&places));
+        for breadth in [1e-3, 1e-7, 1e-11] {
+            let (places, triangles) = checked(&clustered(12_000, breadth));
+            assert_eq!(triangles, triangles_of_spade(&places), "clusters of {breadth}");
+        }
+    }
+
+    #[test]
+    fn points_on_circles_and_lines_are_divided_somehow() {
+        checked(&grid(150, 110));
+        checked(&grid(2, 500));
+        checked(&grid(500, 2));
+        // A grid that leans, whose lines are lines to rounding only.
+        let (s, c) = 0.3f64.sin_cos();
+        checked(&grid(130, 70).iter().map(|[u, v]| [c * u - s * v, s * u + c * v]).collect::<Vec<_>>());
+        let circle = |k: usize| [(k as f64).cos(), (k as f64).sin()];
+        checked(&(0..5000).map(circle).collect::<Vec<_>>());
+        // All but one on a line: upright, level, leaning.
+        for [du, dv] in [[0.0, 1.0], [1.0, 0.0], [1.0, 3.0]] {
+            let line = (0..2000).map(|k| [f64::from(k) * du, f64::from(k) * dv]);
+            checked(&line.chain([[500.5, 200.25]]).collect::<Vec<_>>());
+        }
+    }
+
+    #[test]
+    fn a_few_points_in_whole_numbers_meet_every_special_case() {
+        let mut next = noise(1);
+        for _ in 0..4000 {
+            let (count, size) = (3 + (9.0 * next()) as usize, 2.0 + 4.0 * next());
+            let mut places: Vec<[f64; 2]> = (0..count).map(|_| [0; 2].map(|_| (size * next()).floor())).collect();
+            places.sort_by(|a, b| a.partial_cmp(b).unwrap());
+            places.dedup();
+            if places.len() >= 3 {
+                checked(&places);
+            }
+        }
+    }
+
+    #[test]
+    fn points_on_one_line_have_no_triangle() {
+        for [du, dv] in [[0.0, 1.0], [1.0, 0.0], [1.0, 2.0]] {
+            let (_, triangles) = checked(&(0..300).map(|k| [f64::from(k) * du, f64::from(k) * dv]).collect::<Vec<_>>());
+            assert!(triangles.is_empty());
+        }
+    }
+
+    #[test]
+    fn points_far_from_the_origin_keep_their_order() {
+        let far: Vec<_> = strewn(3000, 5).into_iter().map(|[u, v]| [1e9 + u, -1e9 + v]).collect();
+        let (mut places, _) = in_order(&far);
+        places.dedup();
+        checked(&places);
+    }
+}
