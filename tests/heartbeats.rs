@@ -11,8 +11,8 @@ use std::time::{Duration, Instant};
 use regrind::cell::Ending;
 use regrind::device::Identified;
 use regrind::device::{
-    Armed, Cmm, DeviceError, Identity, Interrupt, Job, Machine, MeasuredPoint, Measurement, ModbusCmm, Plan,
-    PointStatus, Reconciled, Started, Status, digest,
+    Armed, Cmm, DeviceError, Identified, Identity, Interrupt, Job, Machine, MeasuredPoint, Measurement, ModbusCmm,
+    Plan, PointStatus, Reconciled, Started, Status, digest,
 };
 use regrind::drive::{Drive, Request};
 use rig::{CMM, GRINDER, PATIENCE, Rig, event, order, until, words};
@@ -104,6 +104,8 @@ fn recipe() -> regrind::recipe::Recipe {
         ("columns = 60", "columns = 901"),
         ("rows = 30", "rows = 501"),
         ("accuracy_nm = 0.5", "spacing_mm = 0.118"),
+        // A filter over thousands of points for each point would only take long.
+        ("cutoff_mm = 5.0", "cutoff_mm = 1.0"),
         ("[simulation]\nseed = 1", "[simulation]\nseed = 1\nspeed = 5000.0"),
     ])
 }

@@ -111,6 +111,8 @@ pub struct Drive {
     /// Commands on record that no event has answered yet.
     open: Vec<(u32, Command)>,
     record_failed: bool,
+    /// A failure to record that the cell has not heard of yet.
+    untold: Option<RecordFailure>,
     ending: Option<Ending>,
     stations: Vec<tokio::task::JoinHandle<()>>,
     _control: Control,
@@ -176,6 +178,7 @@ impl Drive {
             armed: interrupted.intents,
             open: Vec::new(),
             record_failed: false,
+            untold: None,
             ending: None,
             stations: vec![cmm_task, grinder_task],
             _control: control,
@@ -217,6 +220,10 @@ impl Drive {
                 Some(computed) = self.computed.1.recv() => self.computed(computed).await,
                 Some(told) = self.told.recv() => self.told(told).await,
                 () = deadline => drop(self.take(Event::Deadline, None).await),
+            }
+            // What failed beside an event: a file that was to be adopted, a note.
+            if let Some(why) = self.untold.take() {
+                self.take(Event::RecordFailed { why }, None).await;
             }
         }
         self.conclude().await
@@ -402,9 +409,7 @@ impl Drive {
         let mut events = std::collections::VecDeque::from([(event, detail)]);
         while let Some((event, detail)) = events.pop_front() {
             let now = self.now();
-            if let Some(failure) = self.journal_event(now, &event, detail).await {
-                events.push_back((Event::RecordFailed { why: failure }, None));
-            }
+            self.journal_event(now, &event, detail).await;
             self.show_event(&event);
             let commands = self.cell.handle(now, event);
             // What makes safe waits neither for the disk nor for the record of what comes before it.
@@ -415,24 +420,22 @@ impl Drive {
                 if let Command::Refuse { why, .. } = &command {
                     refusal = Some(why.clone());
                 }
-                if let Some(failure) = self.carry_out(command).await {
-                    events.push_back((Event::RecordFailed { why: failure }, None));
-                }
+                self.carry_out(command).await;
             }
+            events.extend(self.untold.take().map(|why| (Event::RecordFailed { why }, None)));
             self.status.send_replace(self.snapshot());
         }
         refusal
     }
 
-    async fn journal_event(&mut self, now: Duration, event: &Event, detail: Option<Value>) -> Option<RecordFailure> {
+    async fn journal_event(&mut self, now: Duration, event: &Event, detail: Option<Value>) {
         let mut payload = serde_json::to_value(event).unwrap_or(Value::Null);
         if let (Some(map), Some(detail)) = (payload.as_object_mut(), detail) {
             map.insert("detail".into(), detail);
         }
         let written = self.recorder.append(entry(Kind::Event, now, self.cell.cycle(), actor_of(event), payload)).await;
-        let failure = self.settle(written.map(|()| 0));
+        self.settle(written);
         self.close_answered(now, event).await;
-        failure
     }
 
     /// Records what became of the commands that an event answers.
@@ -444,35 +447,34 @@ impl Drive {
             let payload = json!({ "event": event_name(event) });
             let record = entry(Kind::Outcome, now, self.cell.cycle(), actor_of(event), payload);
             let written = self.recorder.append(Entry { command_id: Some(id), ..record }).await;
-            self.settle(written.map(|()| 0));
+            self.settle(written);
         }
     }
 
-    /// Returns a failure to record the first time only; the cell is told once.
-    fn settle(&mut self, written: Result<u32, RecordFailure>) -> Option<RecordFailure> {
-        match written {
-            Ok(_) => None,
-            Err(failure) => {
-                self.notify(Notice::RecordFailed { words: record_words(&failure) });
-                (!std::mem::replace(&mut self.record_failed, true)).then_some(failure)
-            }
+    /// Keeps the first failure to record for the cell, whatever was to be recorded; those that follow from it say nothing new.
+    fn settle(&mut self, written: Result<(), RecordFailure>) {
+        if let Err(failure) = written
+            && !std::mem::replace(&mut self.record_failed, true)
+        {
+            self.notify(Notice::RecordFailed { words: record_words(&failure) });
+            self.untold = Some(failure);
         }
     }
 
     async fn note(&mut self, kind: Kind, actor: (String, String), payload: Value) {
         let written = self.recorder.append(entry(kind, self.now(), self.cell.cycle(), actor, payload)).await;
-        self.settle(written.map(|()| 0));
+        self.settle(written);
     }
 
     async fn adopt(&mut self, names: Vec<String>, cycle: u32) {
         if !names.is_empty() {
             let adopted = self.recorder.adopt(names, self.now(), cycle).await;
-            self.settle(adopted.map(|()| 0));
+            self.settle(adopted);
         }
     }
 
-    /// Carries a command out, after it is on record. Returns a failure to record that the cell should hear of.
-    async fn carry_out(&mut self, command: Command) -> Option<RecordFailure> {
+    /// Carries a command out, after it is on record.
+    async fn carry_out(&mut self, command: Command) {
         let mut payload = serde_json::to_value(&command).unwrap_or(Value::Null);
         if let (Command::StartMachine { device, .. }, Some(map)) = (&command, payload.as_object_mut()) {
             map.insert("intent".into(), self.armed[index(*device)].clone().unwrap_or(Value::Null));
@@ -480,27 +482,26 @@ impl Drive {
         let record = Entry::new(Kind::Intent, record::nanoseconds(self.now()), self.cell.cycle(), payload);
         if !outcome::is_answered(&command) {
             let written = self.recorder.append(Entry { kind: Kind::Note, ..record }).await;
-            self.execute(command).await;
-            return self.settle(written.map(|()| 0));
+            self.settle(written);
+            return self.execute(command).await;
         }
         if makes_safe(&command) {
             // It has been carried out already.
             return self.settle_intent(record, command).await;
         }
-        let failure = self.settle_intent(record, command.clone()).await;
-        if failure.is_none() && !self.record_failed || !moves(&command) {
+        self.settle_intent(record, command.clone()).await;
+        if !self.record_failed || !moves(&command) {
             self.execute(command).await;
         }
-        failure
     }
 
-    async fn settle_intent(&mut self, record: Entry, command: Command) -> Option<RecordFailure> {
+    async fn settle_intent(&mut self, record: Entry, command: Command) {
         let written = self.recorder.intend(record).await;
-        if let Ok(id) = written {
+        if let Ok(id) = &written {
             self.record_failed = false;
-            self.open.push((id, command));
+            self.open.push((*id, command));
         }
-        self.settle(written)
+        self.settle(written.map(|_| ()));
     }
 
     async fn execute(&mut self, command: Command) {
