@@ -11,9 +11,7 @@ use serde::Serialize;
 use tokio::sync::mpsc;
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
-use crate::cell::{
-    Asked, Condition, Device, Event, Found, Gate, GateFailure, JobResult, Mismatch, Reconciliation,
-};
+use crate::cell::{Asked, Condition, Device, Event, Found, Gate, GateFailure, JobResult, Mismatch, Reconciliation};
 use crate::device::{
     Armed, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, Measurement, Outcome,
     Pass, PassRecord, Plan, Reconciled, State, Status, digest,
