@@ -115,7 +115,16 @@ fn a_probe_that_is_10_um_off_is_told_from_the_reference_sphere() {
 #[test]
 fn a_part_that_lies_turned_round_is_told() {
     let faults = Faults { part_turned_180: true, ..Faults::default() };
-    caught(broken(faults), AlarmId::PartMisplaced, &["turned"], 1);
+    // The probe meets the steep part in the air, and the machine stops by itself; the alarm must still send a person to the part.
+    let ran = caught(broken(faults), AlarmId::MachineFault, &["see how the part lies", "turned round"], 1);
+    assert!(matches!(ran.ending, Ending::Aborted { cycle: 1, confirmed: true, .. }), "{}", ran.told());
+}
+
+#[test]
+fn a_shallow_part_that_lies_turned_round_is_told() {
+    let faults = Faults { part_turned_180: true, ..Faults::default() };
+    let setup = Setup::new("shallow-wave", 1).with(move |world| world.faults = faults.clone());
+    caught(setup, AlarmId::PartMisplaced, &["turned round", "degrees"], 1);
 }
 
 #[test]

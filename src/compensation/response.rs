@@ -2,10 +2,17 @@
 //!
 //! The change of the error from one pass to the next is compared with the change of the correction. The slope of the one over the
 //! other is 1 where everything is right, -1 where a sign is wrong, near 0 where the correction was not applied or was
-//! applied somewhere else; in the latter case it fits once it is mirrored or turned.
+//! applied somewhere else; in the latter case it fits better once it is mirrored or turned. A map that is nearly symmetric
+//! makes the part better even when it is mirrored, so the way that leaves least unexplained is asked for, not the sign of the slope alone.
+//!
+//! Whatever of a change looks like a motion of the part is taken away by the next registration, and is never seen. It is taken out
+//! of what was asked and of what was answered before they are compared.
+
+use nalgebra::{Matrix6, Vector6};
 
 use super::correction::Correction;
 use super::map::ErrorMap;
+use crate::geometry::{Point, Vector};
 
 /// How the part answered.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
@@ -38,23 +45,35 @@ pub struct Response {
     pub sense: Sense,
 }
 
+/// A mirrored or turned map must leave less than this share of what the straight one leaves unexplained.
+const CLEARLY_BETTER: f64 = 0.5;
+/// Share of the answer that may stay unexplained before another way than the straight one is thought of.
+const WELL_EXPLAINED: f64 = 0.05;
+
 /// Compares the change of the error with the change of the correction.
 ///
+/// Shapes: `places` are points of the nominal surface with their unit normals, in any order, where both maps have been measured.
 /// `scatter_mm` is by how much the error may change by itself, as a standard deviation: the repeatability of grinding and measuring
-/// together. All maps are compared on the net of the later error.
-pub fn response(errors: [&ErrorMap; 2], corrections: [&Correction; 2], scatter_mm: f64) -> Response {
+/// together. Frames: the model frame.
+pub fn response(
+    errors: [&ErrorMap; 2],
+    corrections: [&Correction; 2],
+    places: &[(Point, Vector)],
+    scatter_mm: f64,
+) -> Response {
     let [before, after] = errors;
     let net = after.net;
-    let nodes: Vec<usize> = (0..net.len()).filter(|&k| after.valid[k]).collect();
+    let unseen = Motions::new(places);
+    let over =
+        |value: &dyn Fn([f64; 2]) -> f64| unseen.without(places.iter().map(|(p, _)| value([p.x, p.y])).collect());
     let changed = |place: [f64; 2]| corrections[1].at(place) - corrections[0].at(place);
-    let answer: Vec<f64> =
-        nodes.iter().map(|&k| after.values_mm[k] - before.at(net.place_mm(k))).collect::<Vec<_>>().centred();
+    let answer = over(&|place| after.at(place) - before.at(place));
     let [cx, cy] = [0, 1].map(|k| {
         let nodes = [net.columns, net.rows][k];
         2.0 * net.first_mm[k] + (nodes - 1) as f64 * net.spacing_mm[k]
     });
     let fit = |place: fn([f64; 2], [f64; 2]) -> [f64; 2]| {
-        let asked = nodes.iter().map(|&k| changed(place(net.place_mm(k), [cx, cy]))).collect::<Vec<_>>().centred();
+        let asked = over(&|at| changed(place(at, [cx, cy])));
         regress(&asked, &answer)
     };
     let straight = fit(|place, _| place);
@@ -74,16 +93,18 @@ fn sense(straight: &Fit, mirrored: &[(Sense, Fit)], scatter_mm: f64) -> Sense {
     if straight.asked_rms < 2.0 * scatter_mm || straight.asked_rms == 0.0 {
         return Sense::Unclear;
     }
+    let best =
+        mirrored.iter().max_by(|a, b| a.1.correlation.total_cmp(&b.1.correlation)).expect("three ways are tried");
+    let left = [straight, &best.1].map(|fit| 1.0 - fit.correlation * fit.correlation.abs());
+    let better = left[0] > WELL_EXPLAINED && left[1] < CLEARLY_BETTER * left[0];
+    if better && best.1.correlation > 0.8 && best.1.slope > 0.5 {
+        return best.0;
+    }
     if straight.slope > 0.4 && straight.correlation > 0.5 {
         return Sense::AsCommanded;
     }
     if straight.slope < -0.4 && straight.correlation < -0.5 {
         return Sense::Flipped;
-    }
-    let best =
-        mirrored.iter().max_by(|a, b| a.1.correlation.total_cmp(&b.1.correlation)).expect("three ways are tried");
-    if best.1.correlation > 0.8 && best.1.correlation > straight.correlation + 0.2 && best.1.slope > 0.5 {
-        return best.0;
     }
     if straight.slope.abs() < 0.4 { Sense::NoEffect } else { Sense::Unclear }
 }
@@ -103,15 +124,38 @@ fn regress(asked: &[f64], answer: &[f64]) -> Fit {
     Fit { slope: or_zero(ab / aa), correlation: or_zero(ab / (aa * bb).sqrt()), asked_rms }
 }
 
-trait Centred {
-    fn centred(self) -> Self;
+/// The changes that a motion of the part makes: they span what no registered map can show.
+struct Motions {
+    /// For each place what the six motions change there, with lengths in units of the part's size.
+    rows: Vec<Vector6<f64>>,
+    /// The pseudo-inverse of their sum of squares; on a flat part some motions change nothing.
+    inverse: Matrix6<f64>,
 }
 
-impl Centred for Vec<f64> {
-    fn centred(mut self) -> Self {
-        let mean = self.iter().sum::<f64>() / self.len().max(1) as f64;
-        self.iter_mut().for_each(|v| *v -= mean);
-        self
+impl Motions {
+    fn new(places: &[(Point, Vector)]) -> Self {
+        let size = places.iter().map(|(p, _)| p.coords.norm()).fold(f64::MIN_POSITIVE, f64::max);
+        let row = |(p, n): &(Point, Vector)| {
+            let turn = p.coords.cross(n) / size;
+            Vector6::new(n.x, n.y, n.z, turn.x, turn.y, turn.z)
+        };
+        let rows: Vec<Vector6<f64>> = places.iter().map(row).collect();
+        let gram: Matrix6<f64> = rows.iter().map(|row| row * row.transpose()).sum();
+        let parts = gram.symmetric_eigen();
+        let least = 1e-9 * parts.eigenvalues.max();
+        let inverse = (0..6).filter(|&k| parts.eigenvalues[k] > least).map(|k| {
+            let v = parts.eigenvectors.column(k);
+            v * v.transpose() / parts.eigenvalues[k]
+        });
+        Self { inverse: inverse.sum(), rows }
+    }
+
+    /// Returns values at the places without what a motion could make.
+    fn without(&self, mut values: Vec<f64>) -> Vec<f64> {
+        let seen: Vector6<f64> = self.rows.iter().zip(&values).map(|(row, v)| row * *v).sum();
+        let motion = self.inverse * seen;
+        values.iter_mut().zip(&self.rows).for_each(|(v, row)| *v -= row.dot(&motion));
+        values
     }
 }
 
@@ -136,7 +180,12 @@ mod tests {
         let before = map(error);
         let none = Correction::none(NET, 0.0);
         let asked = Correction { values_mm: before.values_mm.iter().map(|e| -e).collect(), ..none.clone() };
-        response([&before, &map(|x, y| error(x, y) + seen(x, y))], [&none, &asked], 2e-4)
+        response([&before, &map(|x, y| error(x, y) + seen(x, y))], [&none, &asked], &places(), 2e-4)
+    }
+
+    /// The nodes, on a part that is flat.
+    fn places() -> Vec<(Point, Vector)> {
+        (0..NET.len()).map(|k| NET.place_mm(k)).map(|[x, y]| (Point::new(x, y, 0.0), Vector::z())).collect()
     }
 
     #[test]
@@ -154,7 +203,7 @@ mod tests {
     fn a_change_within_the_scatter_tells_nothing() {
         let flat = map(|_, _| 1e-5);
         let none = Correction::none(NET, 0.0);
-        assert_eq!(response([&flat, &flat], [&none, &none], 1e-4).sense, Sense::Unclear);
-        assert_eq!(response([&flat, &flat], [&none, &none], 0.0).sense, Sense::Unclear);
+        assert_eq!(response([&flat, &flat], [&none, &none], &places(), 1e-4).sense, Sense::Unclear);
+        assert_eq!(response([&flat, &flat], [&none, &none], &places(), 0.0).sense, Sense::Unclear);
     }
 }

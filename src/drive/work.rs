@@ -14,7 +14,7 @@ use crate::device::{Coordinates, CorrectionMap, Identified, Measurement, Pass, P
 use crate::formats::{
     FormatError, NominalInput, RegistrationDocument, save_registration, write_correction, write_error_map, write_points,
 };
-use crate::geometry::{Point, Pose};
+use crate::geometry::{Point, Pose, Vector};
 use crate::measuring::{self, fit_sphere, sphere_targets};
 use crate::registration::{
     MapLimits, Options, PointStatus as Fate, Registration, Start, register, weak_for_compensation,
@@ -101,6 +101,8 @@ pub(super) struct Points {
     pub(super) radius_mm: Option<f64>,
     /// Centres of the probe, or points of contact.
     pub(super) coordinates: Coordinates,
+    /// Standard uncertainty of that; 0 where the radius is the recipe's, which states none.
+    pub(super) radius_sigma_mm: f64,
 }
 
 impl Task {
@@ -173,7 +175,8 @@ pub(super) fn gate(task: &Task, plan: &Plan, measurement: &Measurement) -> (u32,
         return (planned, 0, Err(GateFailure::NoPart));
     }
     let checked = match radius(task, &sphere) {
-        Ok(radius_mm) => {
+        Ok(ball) => {
+            let (radius_mm, radius_sigma_mm) = (ball.map(|b| b[0]), ball.map_or(0.0, |b| b[1]));
             let share = f64::from(found) / f64::from(planned.max(1));
             if planned > 0 && share < task.least_found {
                 let limit = 100.0 * task.least_found;
@@ -182,7 +185,7 @@ pub(super) fn gate(task: &Task, plan: &Plan, measurement: &Measurement) -> (u32,
                     100.0 * share
                 )))
             } else {
-                Ok(Points { part, sphere, radius_mm, coordinates: measurement.coordinates })
+                Ok(Points { part, sphere, radius_mm, radius_sigma_mm, coordinates: measurement.coordinates })
             }
         }
         Err(failure) => Err(failure),
@@ -217,8 +220,8 @@ fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFa
     Some(GateFailure::Broken(format!("the coordinates of target {} are not finite numbers", wrong.index)))
 }
 
-/// Finds the radius of the probe from the reference sphere: it tells contact points and inches from centres in millimetres.
-fn radius(task: &Task, points: &[Point]) -> Result<Option<f64>, GateFailure> {
+/// Finds the radius of the probe and its standard uncertainty from the reference sphere: it tells contact points and inches from centres in millimetres.
+fn radius(task: &Task, points: &[Point]) -> Result<Option<[f64; 2]>, GateFailure> {
     let Some(sphere) = task.sphere else { return Ok(None) };
     let fit = fit_sphere(points).map_err(|error| GateFailure::Broken(error.to_string()))?;
     let (stated, found) = (task.probing.probe_radius_mm, fit.radius_mm - sphere.radius_mm);
@@ -229,7 +232,7 @@ fn radius(task: &Task, points: &[Point]) -> Result<Option<f64>, GateFailure> {
     if (fit.radius_mm * 25.4 / (sphere.radius_mm + stated) - 1.0).abs() < 0.05 {
         return Err(GateFailure::Inches);
     }
-    Ok(Some(found))
+    Ok(Some([found, fit.radius_sigma_mm]))
 }
 
 /// Registers the points of a cycle and writes what was found.
@@ -248,10 +251,11 @@ pub(super) fn register_cycle(
     let probe_radius_mm = ball_mm + cycle.correction.level_mm;
     let start = if task.start_at_fixture { Start::Pose(task.fixture_cmm_from_model) } else { Start::Search };
     let options = Options { probe_radius_mm, start, ..task.registration };
-    let found = match register(&task.nominal, &points.part, &options) {
+    let mut found = match register(&task.nominal, &points.part, &options) {
         Ok(found) => found,
         Err(error) => return failed(error.to_string()),
     };
+    found.allow_for_radius(points.radius_sigma_mm);
     if let Err(error) = save(task, folder, &found, &options) {
         return failed(error.to_string());
     }
@@ -307,16 +311,18 @@ fn figures(
         turn_rad: moved.angle_rad(),
         weak_directions: verdict.weak_directions.iter().map(|w| w.words.clone()).collect(),
         warnings: verdict.warnings.clone(),
-        response: before.and_then(|before| answer(before, cycle, error?)),
+        response: before.and_then(|before| answer(before, cycle, found, error?)),
         removed_mm: Some(task.limits.allowance_mm - cycle.correction.level_mm),
     }
 }
 
-fn answer(before: &Cycle, cycle: &Cycle, error: &ErrorMap) -> Option<Response> {
+fn answer(before: &Cycle, cycle: &Cycle, found: &Registration, error: &ErrorMap) -> Option<Response> {
     let earlier = before.error.as_ref()?;
+    let used = found.deviations.iter().filter(|d| d.status == Fate::Used);
+    let places: Vec<(Point, Vector)> = used.map(|d| (d.point, d.normal)).collect();
     let scatter_mm = earlier.rest_sigma_mm.hypot(error.rest_sigma_mm);
-    let found = response([earlier, error], [&before.correction, &cycle.correction], scatter_mm);
-    Some(match found.sense {
+    let answered = response([earlier, error], [&before.correction, &cycle.correction], &places, scatter_mm);
+    Some(match answered.sense {
         Sense::AsCommanded => Response::Expected,
         Sense::Flipped => Response::SignFlipped,
         Sense::MirroredX | Sense::MirroredY | Sense::Turned => Response::Mirrored,

@@ -18,6 +18,7 @@ mod iterate;
 mod lateral;
 mod linearize;
 mod point_to_point;
+mod radius;
 mod robust;
 mod solve;
 mod start;
