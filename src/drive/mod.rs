@@ -32,7 +32,7 @@ use crate::compensation::{Correction, ErrorMap};
 use crate::device::exchange::Step;
 use crate::device::{Armed, Cmm, Grinder, Identified, Interrupt};
 use crate::formats::{ResultFolder, write_json_atomic};
-use crate::journal::{Entry, Journal, Kind};
+use crate::journal::{Artefact, Entry, Journal, Kind};
 use crate::registration::Registration;
 
 use control::{Control, Ordered};
@@ -123,6 +123,8 @@ enum Computed {
     Registered(u32, Event, Option<Box<(Registration, Option<ErrorMap>, crate::cell::Figures)>>),
     Compensated(u32, Event, Option<Correction>),
     Gated(u32, Event, Option<Points>),
+    /// The files of one of these are on the disk and read.
+    Filed(u32, Event, Result<Vec<Artefact>, RecordFailure>),
 }
 
 fn index(device: Device) -> usize {
@@ -390,6 +392,7 @@ impl Drive {
                 let count = if any { if map { 5 } else { 3 } } else { 0 };
                 (number, event, &files[..count])
             }
+            Computed::Filed(number, event, files) => return self.filed(number, event, files).await,
             Computed::Compensated(number, event, correction) => {
                 let any = correction.is_some();
                 if let Some(correction) = correction {
@@ -398,8 +401,29 @@ impl Drive {
                 (number, event, if any { &["correction.csv"] } else { &[] })
             }
         };
-        let names = files.iter().map(|name| format!("cycle-{number}/{name}")).collect();
-        self.adopt(names, number).await;
+        let names: Vec<String> = files.iter().map(|name| format!("cycle-{number}/{name}")).collect();
+        if names.is_empty() {
+            return self.filed(number, event, Ok(Vec::new())).await;
+        }
+        // The files of a fine measurement are large: neither the loop nor the journal waits while they are read.
+        let (folder, done) = (self.folder.clone(), self.computed.0.clone());
+        tokio::task::spawn_blocking(move || {
+            let files = record::describe(&folder, &names);
+            // The run may be over meanwhile.
+            let _ = done.send(Computed::Filed(number, event, files));
+        });
+    }
+
+    /// Takes an event in whose files are on the disk.
+    async fn filed(&mut self, number: u32, event: Event, files: Result<Vec<Artefact>, RecordFailure>) {
+        match files {
+            Ok(files) if files.is_empty() => {}
+            Ok(files) => {
+                let adopted = self.recorder.adopt(files, self.now(), number).await;
+                self.settle(adopted);
+            }
+            Err(failure) => self.settle(Err(failure)),
+        }
         self.take(event, None).await;
     }
 
@@ -468,8 +492,14 @@ impl Drive {
 
     async fn adopt(&mut self, names: Vec<String>, cycle: u32) {
         if !names.is_empty() {
-            let adopted = self.recorder.adopt(names, self.now(), cycle).await;
-            self.settle(adopted);
+            // Small files of the loop's own.
+            match record::describe(&self.folder, &names) {
+                Ok(files) => {
+                    let adopted = self.recorder.adopt(files, self.now(), cycle).await;
+                    self.settle(adopted);
+                }
+                Err(failure) => self.settle(Err(failure)),
+            }
         }
     }
 

@@ -8,13 +8,13 @@ use serde_json::Value;
 use tokio::sync::{mpsc, oneshot};
 
 use crate::cell::RecordFailure;
-use crate::journal::{Entry, Journal, JournalError, Kind};
+use crate::journal::{Artefact, Entry, Journal, JournalError, Kind};
 
 /// One thing for the journal to do.
 enum Errand {
     Append(Box<Entry>, oneshot::Sender<Result<(), RecordFailure>>),
     Intend(Box<Entry>, oneshot::Sender<Result<u32, RecordFailure>>),
-    Adopt(Vec<String>, Duration, u32, oneshot::Sender<Result<(), RecordFailure>>),
+    Adopt(Vec<Artefact>, Duration, u32, oneshot::Sender<Result<(), RecordFailure>>),
     Close(Duration, u32, Value, oneshot::Sender<Result<(), RecordFailure>>),
 }
 
@@ -48,8 +48,8 @@ impl Recorder {
     }
 
     /// Brings files of the run folder on record.
-    pub(super) async fn adopt(&self, names: Vec<String>, now: Duration, cycle: u32) -> Result<(), RecordFailure> {
-        self.ask(|answer| Errand::Adopt(names, now, cycle, answer)).await
+    pub(super) async fn adopt(&self, files: Vec<Artefact>, now: Duration, cycle: u32) -> Result<(), RecordFailure> {
+        self.ask(|answer| Errand::Adopt(files, now, cycle, answer)).await
     }
 
     /// Writes the last record.
@@ -87,8 +87,9 @@ fn keep(journal: Journal, mut asked: mpsc::UnboundedReceiver<Errand>) {
         match errand {
             Errand::Append(entry, answer) => drop(answer.send(open.append(*entry).map(|_| ()).map_err(failure))),
             Errand::Intend(entry, answer) => drop(answer.send(open.intend(*entry).map_err(failure))),
-            Errand::Adopt(names, now, cycle, answer) => {
-                let adopted = names.iter().try_for_each(|name| open.adopt(name, nanoseconds(now), cycle).map(|_| ()));
+            Errand::Adopt(files, now, cycle, answer) => {
+                let mut files = files.into_iter();
+                let adopted = files.try_for_each(|file| open.adopt_known(file, nanoseconds(now), cycle).map(|_| ()));
                 drop(answer.send(adopted.map_err(failure)));
             }
             Errand::Close(now, cycle, ending, answer) => {
@@ -102,6 +103,11 @@ fn keep(journal: Journal, mut asked: mpsc::UnboundedReceiver<Errand>) {
 /// Time since the run began as the journal counts it.
 pub(super) fn nanoseconds(now: Duration) -> u64 {
     u64::try_from(now.as_nanos()).unwrap_or(u64::MAX)
+}
+
+/// Brings files of a run folder to the disk and reads them, for [`Recorder::adopt`]. Blocks, and takes its time for large ones.
+pub(super) fn describe(folder: &std::path::Path, names: &[String]) -> Result<Vec<Artefact>, RecordFailure> {
+    names.iter().map(|name| Artefact::of(folder, name).map_err(failure)).collect()
 }
 
 fn failure(error: JournalError) -> RecordFailure {

@@ -23,6 +23,18 @@ pub struct Artefact {
     pub sha256: String,
 }
 
+impl Artefact {
+    /// Brings a file that was written into a run folder to the disk and reads what it holds. A large one takes its time.
+    ///
+    /// # Errors
+    /// A name that is no plain relative path, a file that cannot be read, a disk that fails.
+    pub fn of(folder: &Path, name: &str) -> Result<Self, JournalError> {
+        let path = path_within(folder, name)?;
+        sync_file(&path)?;
+        describe(&path, name)
+    }
+}
+
 /// Returns the path of a file within a run folder, if the name cannot lead out of it and is not one of the journal's own.
 pub(super) fn path_within(folder: &Path, name: &str) -> Result<PathBuf, JournalError> {
     let plain = Path::new(name).components().all(|part| matches!(part, Component::Normal(_)));

@@ -199,10 +199,16 @@ impl Journal {
     /// # Errors
     /// As [`Journal::store`].
     pub fn adopt(&mut self, name: &str, mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError> {
-        let path = artefact::path_within(&self.folder, name)?;
-        artefact::sync_file(&path)?;
-        let found = artefact::describe(&path, name)?;
-        if self.artefacts.get(name).is_some_and(|known| *known != found.sha256) {
+        self.adopt_known(Artefact::of(&self.folder, name)?, mono_ns, cycle)
+    }
+
+    /// Brings a file on record that was brought to the disk and read already, by [`Artefact::of`].
+    ///
+    /// # Errors
+    /// As [`Journal::store`].
+    pub fn adopt_known(&mut self, found: Artefact, mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError> {
+        let path = artefact::path_within(&self.folder, &found.name)?;
+        if self.artefacts.get(&found.name).is_some_and(|known| *known != found.sha256) {
             return Err(JournalError::Recorded { path });
         }
         self.register(found, mono_ns, cycle)

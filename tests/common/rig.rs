@@ -45,7 +45,7 @@ pub fn small(columns: u32, rows: u32, speed: f64) -> Recipe {
     let of = [
         ("columns = 60", format!("columns = {columns}")),
         ("rows = 30", format!("rows = {rows}")),
-        ("accuracy_nm = 0.5", "spacing_mm = 0.5".to_owned()),
+        ("accuracy_nm = 0.5", "spacing_mm = 1.0".to_owned()),
         ("cutoff_mm = 5.0", "cutoff_mm = 20.0".to_owned()),
         ("[simulation]\nseed = 1", format!("[simulation]\nseed = 1\nspeed = {speed:.1}")),
     ];
