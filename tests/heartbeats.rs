@@ -9,7 +9,6 @@ mod rig;
 use std::time::{Duration, Instant};
 
 use regrind::cell::Ending;
-use regrind::device::Identified;
 use regrind::device::{
     Armed, Cmm, DeviceError, Identified, Identity, Interrupt, Job, Machine, MeasuredPoint, Measurement, ModbusCmm,
     Plan, PointStatus, Reconciled, Started, Status, digest,
