@@ -35,8 +35,8 @@ impl Truth {
     }
 }
 
-/// Fits the true surface of a cycle.
-pub fn truth(world: &World, seen: &Snapshot, radius_mm: f64, level_mm: f64) -> Truth {
+/// Fits the true surface of a cycle at the places that took part in the registration; the map is that of all places.
+pub fn truth(world: &World, seen: &Snapshot, used: &[bool], radius_mm: f64, level_mm: f64) -> Truth {
     let places = seen.places_mm.iter().zip(&seen.heights_mm);
     let centres: Vec<Vec3> =
         places.map(|(place, height)| seen.placement.apply(centre(world, *place, *height, radius_mm))).collect();
@@ -44,7 +44,7 @@ pub fn truth(world: &World, seen: &Snapshot, radius_mm: f64, level_mm: f64) -> T
     loop {
         let (mut gram, mut right) = (Matrix6::zeros(), Vector6::zeros());
         let mut deviations_mm = Vec::with_capacity(centres.len());
-        for c in &centres {
+        for (c, used) in centres.iter().zip(used) {
             let q: Vec3 = pose.inverse().point(&(*c).into()).into();
             let (_, n, distance) = foot(world, q);
             let deviation = distance - radius_mm - level_mm;
@@ -56,8 +56,10 @@ pub fn truth(world: &World, seen: &Snapshot, radius_mm: f64, level_mm: f64) -> T
                 q[2] * n[0] - q[0] * n[2],
                 q[0] * n[1] - q[1] * n[0],
             );
-            gram += row * row.transpose();
-            right -= row * deviation;
+            if *used {
+                gram += row * row.transpose();
+                right -= row * deviation;
+            }
             deviations_mm.push(deviation);
         }
         let step: Twist = gram.lu().solve(&right).expect("the part holds its pose");
