@@ -96,16 +96,18 @@ fn watch_the_disk(rig: &Rig, folder: &Arc<Mutex<PathBuf>>, broken: &Arc<Mutex<Ve
     for machine in [CMM, GRINDER] {
         let (folder, broken) = (Arc::clone(folder), Arc::clone(broken));
         let mut of_run = PathBuf::new();
-        let mut counts = [0usize; 16];
+        let (mut counts, mut last) = ([0usize; 16], 0);
         rig.watch(
             machine,
             Box::new(move |command| {
                 let folder = folder.lock().unwrap().clone();
                 if of_run != folder {
-                    (of_run, counts) = (folder.clone(), [0; 16]);
+                    (of_run, counts, last) = (folder.clone(), [0; 16], 0);
                 }
                 let number = usize::from(command).min(15);
-                counts[number] += 1;
+                // A frame that was not acknowledged in time comes again; no command is ever given twice in a row.
+                counts[number] += usize::from(command != last);
+                last = command;
                 let on_disk = match command {
                     // Orders that make safe wait for no intent; what led to them is on the disk.
                     4 | 6 | 7 => {
