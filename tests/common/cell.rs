@@ -231,7 +231,8 @@ pub fn foot(world: &World, p: Vec3) -> ([f64; 2], Vec3, f64) {
 pub fn table(path: &std::path::Path) -> Vec<Vec<f64>> {
     let text = std::fs::read_to_string(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
     let row = |line: &str| line.split(',').map(|cell| cell.trim().parse().unwrap()).collect();
-    text.lines().skip(1).map(row).collect()
+    // Comments, such as the mark of a simulation, then the header.
+    text.lines().filter(|line| !line.starts_with('#')).skip(1).map(row).collect()
 }
 
 /// The project's own folder.
