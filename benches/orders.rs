@@ -28,7 +28,7 @@ async fn measure(tries: usize) {
     let mut times: BTreeMap<&str, Vec<Duration>> = BTreeMap::new();
     let mut states: BTreeMap<String, usize> = BTreeMap::new();
     for k in 0..tries {
-        let (tried, _) = attempt(&mut rig, &MOMENTS[k % MOMENTS.len()], k / MOMENTS.len() % 2 == 0).await;
+        let (tried, _) = attempt(&mut rig, &MOMENTS[k % MOMENTS.len()], (k / MOMENTS.len()).is_multiple_of(2)).await;
         assert!(tried.after_abort.is_empty(), "{tried:?}");
         *states.entry(tried.state).or_default() += 1;
         times.entry("abort, on the wire").or_default().extend(&tried.abort);

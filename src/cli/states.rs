@@ -65,7 +65,7 @@ fn acts(row: &Row, answer: &Answer) -> bool {
     !answer.is_refusal() && (answer.next != row.state || !answer.commands.is_empty())
 }
 
-fn shown<'r>(row: &'r Row, all: bool) -> impl Iterator<Item = &'r Answer> {
+fn shown(row: &Row, all: bool) -> impl Iterator<Item = &Answer> {
     row.answers.iter().filter(move |answer| all || acts(row, answer))
 }
 

@@ -210,7 +210,7 @@ fn draw_states(svg: &mut Svg, ways: &Ways) {
     for frame in &FRAMES {
         let leads = |from: &&str| frame.to.iter().any(|to| ways.contains_key(&((**from).to_owned(), (*to).to_owned())));
         // A frame stands only for a way that all within it have.
-        if frame.around.iter().all(|from| leads(&from)) {
+        if frame.around.iter().all(leads) {
             ways.retain(|(from, to), _| !(frame.around.contains(&from.as_str()) && frame.to.contains(&to.as_str())));
             draw_frame(svg, frame, &mut taken);
         }
