@@ -223,14 +223,9 @@ fn check_limits(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
     beyond("grinding.wheel.radius_mm", recipe.grinding.wheel.radius_mm(), least, most, "grinder.limits")?;
     let feed = recipe.grinding.feed_mm_min;
     beyond("grinding.feed_mm_min", feed, 0.0, limits.largest_feed_mm_min, "grinder.limits.largest_feed_mm_min")?;
-    let depth = recipe.compensation.depth_of_cut_mm;
-    beyond(
-        "compensation.depth_of_cut_um (in mm)",
-        depth,
-        0.0,
-        limits.largest_depth_mm,
-        "grinder.limits.largest_depth_mm",
-    )?;
+    // Both as they are written: the recipe in micrometres, the cell file in millimetres.
+    let (depth_um, most_um) = (1e3 * recipe.compensation.depth_of_cut_mm, 1e3 * limits.largest_depth_mm);
+    beyond("compensation.depth_of_cut_um", depth_um, 0.0, most_um, "1000 times grinder.limits.largest_depth_mm")?;
     if targets.is_empty() && !matches!(cell.cmm.link.wire, config::Wire::FileExchange(_)) {
         return Err(SetupError::NeedsPlan { recipe: recipe.path().to_owned(), cell: cell.path().to_owned() });
     }
@@ -339,7 +334,7 @@ pub fn machines(
         let (path, wire) = (cell.path().to_owned(), format!("{:?}", link.wire));
         move |source| SetupError::Wire { path, wire, source }
     };
-    let [of_cmm, of_grinder] = [cmm, grinder].map(|link| modbus(link, owner, epoch));
+    let [of_cmm, of_grinder] = [cmm, grinder].map(|link| modbus(link, cell.simulated, owner, epoch));
     // Two machines on one line share its driver.
     if let (Some(of_cmm), Some(of_grinder)) = (&of_cmm, &of_grinder)
         && of_cmm.wire == of_grinder.wire
@@ -463,8 +458,9 @@ fn folder_timing() -> ExchangeTiming {
 
 /// Returns the settings of a Modbus driver; `None` for a machine that is reached by files.
 ///
-/// `owner` and `epoch` name this client to the machine; the epoch rises with each start.
-pub fn modbus(link: &config::Link, owner: u32, epoch: u32) -> Option<ModbusSettings> {
+/// `simulated` says whether the cell's machines are simulations: one that says otherwise is refused. `owner` and `epoch` name this client
+/// to the machine; the epoch rises with each start.
+pub fn modbus(link: &config::Link, simulated: bool, owner: u32, epoch: u32) -> Option<ModbusSettings> {
     let (wire, unit) = match &link.wire {
         config::Wire::ModbusTcp { host, port, unit } => (device::Wire::Tcp { host: host.clone(), port: *port }, *unit),
         config::Wire::ModbusRtu { device, baud, parity, stop_bits, unit } => {
@@ -502,6 +498,9 @@ pub fn modbus(link: &config::Link, owner: u32, epoch: u32) -> Option<ModbusSetti
         owner,
         epoch,
         signals: link.signals.iter().map(signal).collect(),
+        beat_every: link.timing.heartbeat,
+        expected_name: link.expected_name.clone(),
+        simulation: Some(simulated),
         ..ModbusSettings::new(wire)
     })
 }

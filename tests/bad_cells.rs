@@ -300,5 +300,5 @@ fn ctrl_c_holds_once_and_aborts_twice() {
     assert!(verified.closed, "{verified:?}");
     let causes = records_with(&folder, "event");
     let reasons: Vec<_> = causes.iter().filter_map(|e| e["reason"].as_str()).collect();
-    assert_eq!(reasons, ["Ctrl-C, 1", "Ctrl-C, 2"]);
+    assert_eq!(reasons, ["Ctrl-C", "Ctrl-C, twice"]);
 }

@@ -1,4 +1,5 @@
-//! Against other people's Modbus: machines and a client on pymodbus, written from docs/modbus.md alone (tests/interop/).
+//! Against other people's Modbus: machines and a client on pymodbus, written from docs/modbus.md alone (tests/interop/); jobs, and a
+//! whole run of the program.
 //!
 //! They run with the Python that REGRIND_PYTHON names, which has to have pymodbus, or in an environment that is made below the target
 //! folder. Where neither can be had the tests say so and pass, unless REGRIND_INTEROP=1 says that they have to run.
@@ -13,10 +14,14 @@ use regrind::device::{
     Cmm, Coordinates, CorrectionMap, Grinder, Identified, Interrupt, Job, Machine, MachineKind, ModbusCmm,
     ModbusGrinder, ModbusSettings, Outcome, Pass, Plan, PointStatus, State, Status, Target, TargetKind, Wire, digest,
 };
+use regrind::journal::verify;
 use regrind_sim::body::Kind;
 use regrind_sim::registers::{self, MachineOptions};
 use regrind_sim::wire::Serving;
+use serde_json::Value;
 
+#[path = "common/program.rs"]
+mod program;
 #[path = "common/toy.rs"]
 mod toy;
 
@@ -75,9 +80,9 @@ struct Process {
 }
 
 impl Process {
-    fn of(python: &Path, script: &str) -> Self {
+    fn of(python: &Path, script: &str, arguments: &[&str]) -> Self {
         let mut command = Command::new(python);
-        let mut child = command.arg(scripts().join(script)).stdout(Stdio::piped()).spawn().unwrap();
+        let mut child = command.arg(scripts().join(script)).args(arguments).stdout(Stdio::piped()).spawn().unwrap();
         let mut line = String::new();
         BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
         let port = line.trim().strip_prefix("port ").and_then(|port| port.parse().ok());
@@ -131,7 +136,7 @@ fn plan() -> Plan {
 #[tokio::test]
 async fn our_driver_has_a_pymodbus_cmm_measure() {
     let Some(python) = python() else { return };
-    let process = Process::of(python, "cmm.py");
+    let process = Process::of(python, "cmm.py", &[]);
     let mut cmm = ModbusCmm::new(process.settings.clone()).unwrap();
     let identity = cmm.connect().await.unwrap();
     assert_eq!((identity.kind, identity.name.as_str()), (MachineKind::Cmm, "pymodbus CMM 1"));
@@ -161,7 +166,7 @@ async fn our_driver_has_a_pymodbus_cmm_measure() {
 #[tokio::test]
 async fn our_driver_has_a_pymodbus_grinder_grind() {
     let Some(python) = python() else { return };
-    let process = Process::of(python, "grinder.py");
+    let process = Process::of(python, "grinder.py", &[]);
     let mut grinder = ModbusGrinder::new(process.settings.clone()).unwrap();
     grinder.connect().await.unwrap();
     grinder.claim().await.unwrap();
@@ -199,6 +204,59 @@ async fn our_driver_has_a_pymodbus_grinder_grind() {
     grinder.acknowledge(record.done).await.unwrap();
     grinder.release().await.unwrap();
     assert_eq!(grinder.status().await.unwrap().state, State::Idle);
+}
+
+/// The whole program against both: grind, measure, register, judge, compensate, until the part is accepted.
+#[test]
+fn a_whole_run_on_a_pymodbus_cmm_and_grinder() {
+    let Some(python) = python() else { return };
+    let home = tempfile::tempdir().unwrap();
+    let part = home.path().join("part.bin");
+    let part = part.to_str().unwrap();
+    let cmm = Process::of(python, "cmm.py", &["--part", part]);
+    let grinder = Process::of(python, "grinder.py", &["--part", part, "--unit", "2"]);
+    let port = |process: &Process| match &process.settings.wire {
+        Wire::Tcp { port, .. } => format!("port = {port}"),
+        Wire::Rtu { .. } => unreachable!("both serve TCP"),
+    };
+    let recipe = program::small_recipe(home.path(), 1.0);
+    let named = "# expected_name = \"CMM 7, serial 12345\"";
+    let changes = [
+        ("port = 15021", &*port(&cmm)),
+        ("port = 15022", &*port(&grinder)),
+        (named, "expected_name = \"pymodbus CMM 1\""),
+        ("request_timeout_ms = 500", "request_timeout_ms = 2000"),
+        ("lost_after_ms = 3000", "lost_after_ms = 30000"),
+    ];
+    let write = |name: &str, text: String| std::fs::write(home.path().join(name), text).unwrap();
+    write("cell.toml", program::changed("config/modbus-tcp.toml", &changes));
+    let recipe = recipe.to_str().unwrap();
+    let arguments = ["run", recipe, "--cell", "cell.toml", "--runs", "runs", "--part", "SN-3"];
+    let (code, said, errors) = program::run(&arguments, home.path());
+    assert_eq!(code, 0, "{said}\n{errors}");
+    assert!(said.contains("SIMULATION  ACCEPTED") && errors.is_empty(), "{said}\n{errors}");
+    let folder = std::fs::read_dir(home.path().join("runs")).unwrap().next().unwrap().unwrap().path();
+    let verified = verify(&folder).unwrap();
+    assert!(verified.closed && verified.open_intents.is_empty(), "{verified:?}");
+    let result: Value = serde_json::from_slice(&std::fs::read(folder.join("result.json")).unwrap()).unwrap();
+    let cycles = result["cycles"].as_array().unwrap();
+    let rms_um = |cycle: &Value| cycle["rms_um"].as_f64().unwrap();
+    println!("pymodbus machines: rms {:.2} um, then {:.3} um", rms_um(&cycles[0]), rms_um(&cycles[1]));
+    assert_eq!(cycles.len(), 2, "{result}");
+    assert!(rms_um(&cycles[0]) > 3.0 && rms_um(&cycles[1]) < 0.3 * rms_um(&cycles[0]), "{result}");
+
+    // The same cell file with another name in it: not the machine that is meant, and nothing is begun.
+    write("other.toml", program::changed("config/modbus-tcp.toml", &[&changes[..2], &[(named, "expected_name = \"CMM 8\"")]].concat()));
+    let (code, said, errors) = program::run(&["run", recipe, "--cell", "other.toml", "--runs", "other"], home.path());
+    assert_eq!(code, 3, "{said}\n{errors}");
+    let all = format!("{said}{errors}");
+    assert!(all.contains("calls itself \"pymodbus CMM 1\"") && all.contains("expects \"CMM 8\""), "{all}");
+    // And one that takes these machines for real.
+    write("real.toml", program::changed("config/modbus-tcp.toml", &[&changes[..2], &[("simulated = true", "simulated = false")]].concat()));
+    let (code, said, errors) =
+        program::run(&["run", recipe, "--cell", "real.toml", "--runs", "real", "--loaded"], home.path());
+    assert_eq!(code, 3, "{said}\n{errors}");
+    assert!(format!("{said}{errors}").contains("says that it is a simulation"), "{said}\n{errors}");
 }
 
 // ---- their client, our machine ------------------------------------------------------------------------------------------------------

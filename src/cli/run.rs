@@ -1,7 +1,7 @@
 //! `regrind run`: grind, measure, register, judge, compensate, until the part is accepted or the loop must stop.
 
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use clap::Args;
 use regrind::cell::{Actor, Ending};
@@ -105,13 +105,17 @@ async fn go(run: Run, cmm: CellCmm, grinder: CellGrinder, actor: Actor) -> Resul
     Ok(ending)
 }
 
-/// Ctrl-C once holds at the next safe place, twice aborts.
+/// Ctrl-C once holds at the next safe place, twice aborts. After a resume it counts from one again.
 async fn heed_ctrl_c(orders: Orders, actor: Actor) {
-    let mut presses = 0;
+    let mut held_at: Option<Instant> = None;
     while tokio::signal::ctrl_c().await.is_ok() {
-        presses += 1;
-        let reason = format!("Ctrl-C, {presses}");
-        let request = if presses == 1 { Request::Hold { reason } } else { Request::Abort { reason } };
+        let again = held_at.is_some_and(|at| at.elapsed() < IN_ONE_GO || !orders.is_working());
+        held_at = if again { held_at } else { Some(Instant::now()) };
+        let request = if again {
+            Request::Abort { reason: "Ctrl-C, twice".into() }
+        } else {
+            Request::Hold { reason: "Ctrl-C".into() }
+        };
         orders.give(request, actor.clone()).await;
     }
 }
@@ -200,5 +204,7 @@ pub(super) fn or_show<T>(read: Result<T, Problems>) -> Result<T, Failure> {
     })
 }
 
+/// Two presses within this are one wish, whatever the cell has made of the first by then.
+const IN_ONE_GO: Duration = Duration::from_secs(3);
 /// How long a line that says nothing new may be left out.
 pub(super) const QUIET: Duration = Duration::from_secs(2);

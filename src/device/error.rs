@@ -134,6 +134,30 @@ pub enum DeviceError {
         what: &'static str,
     },
 
+    /// The right kind of machine, but not the one that the cell file names.
+    #[error(
+        "{machine} calls itself {found:?}, and the cell file expects {expected:?}: check address and port, or correct expected_name"
+    )]
+    WrongName {
+        /// The machine.
+        machine: Arc<str>,
+        /// What the cell file says.
+        expected: String,
+        /// What the machine says.
+        found: String,
+    },
+    /// A simulation where the cell file has a real machine, or the other way round.
+    #[error(
+        "{machine} says that it is {}, and the cell file says simulated = {}: nothing was sent to it. Check address and port, or correct \
+         cell.simulated",
+        if *.simulation { "a simulation" } else { "a real machine" }, !.simulation
+    )]
+    WrongReality {
+        /// The machine.
+        machine: Arc<str>,
+        /// Whether it says that it is simulated.
+        simulation: bool,
+    },
     /// A person's word was given for a machine that needs none.
     #[error("{machine} tells itself when a job begins and ends; nothing is confirmed by hand")]
     TellsItself {

@@ -22,8 +22,6 @@ use super::{
 
 /// Registers of data in a full page.
 const PAGE: usize = 112;
-/// A beat is written when the last one is so old.
-const BEAT_EVERY: Duration = Duration::from_millis(250);
 /// A machine whose beat stands for so long is frozen.
 const FROZEN_AFTER: Duration = Duration::from_millis(1500);
 /// How long a machine is given to acknowledge a command before the same frame is written again.
@@ -138,6 +136,12 @@ pub struct ModbusSettings {
     pub epoch: u32,
     /// What to read besides.
     pub signals: Vec<Signal>,
+    /// A beat is written when the last one is so old; a machine takes its client for lost after a second and a half without one.
+    pub beat_every: Duration,
+    /// The name that the machine must give of itself; `None` takes any.
+    pub expected_name: Option<String>,
+    /// Whether the machine must be a simulation or must not be one; `None` takes either.
+    pub simulation: Option<bool>,
 }
 
 impl ModbusSettings {
@@ -155,6 +159,9 @@ impl ModbusSettings {
             owner: 1,
             epoch: 1,
             signals: Vec::new(),
+            beat_every: Duration::from_millis(250),
+            expected_name: None,
+            simulation: None,
         }
     }
 }
@@ -175,6 +182,9 @@ pub struct ModbusMachine {
     epoch: u32,
     retries: u32,
     signals: Vec<Signal>,
+    beat_every: Duration,
+    expected_name: Option<String>,
+    simulation: Option<bool>,
     sequence: u32,
     beat: u16,
     beaten: Option<Instant>,
@@ -197,6 +207,9 @@ impl ModbusMachine {
             epoch: settings.epoch,
             retries: settings.retries,
             signals: settings.signals,
+            beat_every: settings.beat_every,
+            expected_name: settings.expected_name,
+            simulation: settings.simulation,
             sequence: 0,
             beat: 0,
             beaten: None,
@@ -220,14 +233,30 @@ impl ModbusMachine {
         self.seen_beat = None;
         self.loaded.clear();
         let identity = self.station.meet().await?;
+        // Before the first write that means anything to a machine that may be another one.
+        self.check_identity(&identity)?;
         let status = self.look().await?;
         self.sequence = self.sequence.max(status.acknowledged);
         Ok(identity)
     }
 
+    /// Compares who is there with what the cell file says of the machine.
+    fn check_identity(&self, identity: &Identity) -> Result<(), DeviceError> {
+        if let Some(expected) = self.expected_name.as_ref().filter(|expected| **expected != identity.name) {
+            let (expected, found) = (expected.clone(), identity.name.clone());
+            return Err(DeviceError::WrongName { machine: self.machine(), expected, found });
+        }
+        match self.simulation {
+            Some(expected) if expected != identity.simulation => {
+                Err(DeviceError::WrongReality { machine: self.machine(), simulation: identity.simulation })
+            }
+            _ => Ok(()),
+        }
+    }
+
     /// Tells the machine that its client is alive, if that has not been said just now.
     async fn beat(&mut self) -> Result<(), DeviceError> {
-        if self.beaten.is_some_and(|last| last.elapsed() < BEAT_EVERY) {
+        if self.beaten.is_some_and(|last| last.elapsed() < self.beat_every) {
             return Ok(());
         }
         self.beat = self.beat.wrapping_add(1);
@@ -521,7 +550,7 @@ impl ModbusMachine {
             None => {
                 let began = Instant::now();
                 while began.elapsed() < SEEN_TWICE_OVER {
-                    sleep(BEAT_EVERY).await;
+                    sleep(self.beat_every).await;
                     self.beat().await?;
                 }
             }

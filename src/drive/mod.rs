@@ -76,13 +76,21 @@ pub struct Interrupted {
 
 /// Orders from this process itself: Ctrl-C, a prompt.
 #[derive(Clone)]
-pub struct Orders(mpsc::Sender<Ordered>);
+pub struct Orders {
+    orders: mpsc::Sender<Ordered>,
+    status: watch::Receiver<Value>,
+}
 
 impl Orders {
     /// Gives an order; it is handled in its turn.
     pub async fn give(&self, request: Request, actor: Actor) {
         // A run that is over needs no orders.
-        let _ = self.0.send(Ordered { request, actor, answer: None }).await;
+        let _ = self.orders.send(Ordered { request, actor, answer: None }).await;
+    }
+
+    /// Whether the cell goes about its work: neither held, nor on its way to a stand or from one.
+    pub fn is_working(&self) -> bool {
+        self.status.borrow()["state"] == "Execute"
     }
 }
 
@@ -149,7 +157,7 @@ impl Drive {
         let (status, seen) = watch::channel(Value::Null);
         let recorder = Recorder::new(run.journal);
         let folder = recorder.folder().to_owned();
-        let control = Control::listen(&folder, orders.clone(), seen)?;
+        let control = Control::listen(&folder, orders.clone(), seen.clone())?;
         let interrupted = run.interrupted.unwrap_or_default();
         let interrupts = [Interrupt::new(), Interrupt::new()];
         let aborts = [watch::Sender::new(0), watch::Sender::new(0)];
@@ -186,7 +194,7 @@ impl Drive {
             _control: control,
         };
         drive.replay(interrupted.events);
-        Ok((drive, Orders(orders)))
+        Ok((drive, Orders { orders, status: seen }))
     }
 
     /// Takes the cell to where the interrupted run was, carrying nothing out.

@@ -110,6 +110,56 @@ impl MeshLattice {
     }
 }
 
+impl MeshLattice {
+    /// Collects the neighbours of a vertex, counter-clockwise, and behind them their further neighbours, each once; returns how many
+    /// there are with the first ring and with both. `None` where the surface ends within them or they do not find room.
+    ///
+    /// A neighbour is gone round on the side away from the vertex only, from beyond one edge of the first ring to beyond the next.
+    #[inline(always)]
+    pub(crate) fn two_rings<const N: usize>(&self, vertex: u32, ring: &mut [u32; N]) -> Option<[usize; 2]> {
+        let place = |facet: u32, of: u32| self.corners[facet as usize].iter().position(|&c| c == of);
+        let mut beyond = [BORDER; N];
+        let (begin, mut first) = (self.facet_of[vertex as usize], 0);
+        let mut facet = begin;
+        while facet != BORDER && first < N {
+            let k = place(facet, vertex)?;
+            ring[first] = self.corners[facet as usize][(k + 1) % 3];
+            beyond[first] = self.neighbours[facet as usize][k];
+            first += 1;
+            facet = self.neighbours[facet as usize][(k + 1) % 3];
+            if facet == begin {
+                break;
+            }
+        }
+        if facet != begin || facet == BORDER {
+            return None;
+        }
+        let (mut count, mut before) = (first, beyond[first - 1]);
+        for k in 0..first {
+            let (of, after) = (ring[k], beyond[k]);
+            let mut facet = before;
+            // A mesh from a file may close on itself in strange ways.
+            for _ in 0..N {
+                if facet == BORDER {
+                    return None;
+                }
+                if facet == after {
+                    break;
+                }
+                let j = place(facet, of)?;
+                let candidate = self.corners[facet as usize][(j + 2) % 3];
+                if candidate != vertex && !ring[..count].contains(&candidate) {
+                    *ring.get_mut(count)? = candidate;
+                    count += 1;
+                }
+                facet = self.neighbours[facet as usize][(j + 1) % 3];
+            }
+            before = after;
+        }
+        Some([first, count])
+    }
+}
+
 impl Facets for MeshLattice {
     #[inline]
     fn corners(&self, facet: u32) -> [u32; 3] {

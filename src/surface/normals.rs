@@ -307,8 +307,11 @@ fn substitute<const N: usize>(l: &[[f64; N]; N], inverse_pivots: &[f64; N], x: &
 
 /// Collects whole rings of neighbours round a vertex until there are as many as wanted; returns how many.
 fn neighbours(mesh: &MeshLattice, vertex: u32, wanted: usize, ring: &mut [u32; MOST]) -> usize {
-    let mut count = add_around(mesh, vertex, vertex, ring, 0);
-    let mut begin = 0;
+    let (mut begin, mut count) = match mesh.two_rings(vertex, ring) {
+        Some([first, _]) if first >= wanted => return first,
+        Some([first, both]) => (first, both),
+        None => (0, add_around(mesh, vertex, vertex, ring, 0)),
+    };
     while count < wanted && begin < count {
         let end = count;
         for k in begin..end {
@@ -396,6 +399,33 @@ mod tests {
         let few = fit(Point::origin(), Vector::z(), around(Point::origin(), z, 6).into_iter());
         assert!((few.normal - Vector::new(-0.1, 0.0, 1.0).normalize()).norm() < 1e-12);
         assert_eq!(fit(Point::origin(), Vector::z(), std::iter::empty()).normal, Vector::z());
+    }
+
+    #[test]
+    fn the_rings_are_those_of_going_round_every_neighbour() {
+        let points: Vec<Point> = around(Point::origin(), |x, y| 0.1 * x * y, 600);
+        let map = crate::surface::projection::Projection::Xy.prepare(&points).unwrap().1;
+        let (points, t) = crate::surface::delaunay::triangulate(&points, &map).unwrap();
+        let mesh = MeshLattice::from_parts(&points, t.corners, t.neighbours).unwrap();
+        let mut inside = 0;
+        for v in 0..points.len() as u32 {
+            let mut plain = [0; MOST];
+            let first = add_around(&mesh, v, v, &mut plain, 0);
+            let both = (0..first).fold(first, |count, k| add_around(&mesh, plain[k], v, &mut plain, count));
+            let mut ring = [0; MOST];
+            let Some(counts) = mesh.two_rings(v, &mut ring) else { continue };
+            inside += 1;
+            assert_eq!(counts, [first, both], "{v}");
+            for part in [0..first, first..both] {
+                let sorted = |ring: &[u32]| {
+                    let mut ring = ring[part.clone()].to_vec();
+                    ring.sort_unstable();
+                    ring
+                };
+                assert_eq!(sorted(&ring), sorted(&plain), "{v}");
+            }
+        }
+        assert!(inside > 400, "only {inside} vertices have their rings on the part");
     }
 
     #[test]

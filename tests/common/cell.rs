@@ -366,6 +366,6 @@ async fn serve(
         link.timing.request_timeout = Duration::from_secs(5);
         link.timing.lost_after = Duration::from_secs(60);
     }
-    let settings = links.map(|link| setup::modbus(&link, 0x7e57, 1).unwrap());
+    let settings = links.map(|link| setup::modbus(&link, true, 0x7e57, 1).unwrap());
     ([cmm, grinder], settings)
 }

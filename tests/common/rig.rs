@@ -150,7 +150,7 @@ impl Rig {
         };
         let journal = Journal::create(&folder, header).unwrap();
         let (notices, shown) = mpsc::unbounded_channel();
-        let link = |link: &Link| setup::modbus(link, 7, self.runs).unwrap();
+        let link = |link: &Link| setup::modbus(link, true, 7, self.runs).unwrap();
         let cmm = ModbusCmm::new(link(&self.cell.cmm.link)).unwrap();
         let grinder = ModbusGrinder::new(link(&self.cell.grinder.link)).unwrap();
         let run = Run {

@@ -1,7 +1,11 @@
-"""A measuring machine of docs/modbus.md on pymodbus: it touches every point where it should be, and a known bit beside it."""
+"""A measuring machine of docs/modbus.md on pymodbus: it touches every point where it should be, and a known bit beside it.
+
+With a part it touches that where it stands, in the frame of the model.
+"""
 
 import struct
 
+import part
 from machine import PAYLOAD, Machine, serve
 
 # How far beside the exact centre each point is given, in mm: 0.1 um along x for every odd index.
@@ -25,9 +29,13 @@ class Cmm(Machine):
         (radius,) = struct.unpack(">d", plan[8:16])
         records = b""
         for at in range(64, len(plan), 56):
-            index, _, _, x, y, z, nx, ny, nz = struct.unpack(">IHHdddddd", plan[at : at + 56])
-            x += ERROR_MM * (index % 2)
-            records += struct.pack(">IHHddd", index, 1, 0, x + radius * nx, y + radius * ny, z + radius * nz)
+            index, what, _, x, y, z, nx, ny, nz = struct.unpack(">IHHdddddd", plan[at : at + 56])
+            out = radius
+            if self.part is None:
+                x += ERROR_MM * (index % 2)
+            elif what == 1:
+                out += part.error_mm(self.part, x, y)
+            records += struct.pack(">IHHddd", index, 1, 0, x + out * nx, y + out * ny, z + out * nz)
         return 4, 1, records, self.total(), 1, radius, identity
 
 

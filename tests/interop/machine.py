@@ -7,6 +7,7 @@ two machines that import it. Words stand high first.
 import argparse
 import asyncio
 import binascii
+import pathlib
 import random
 import struct
 import time
@@ -61,6 +62,8 @@ class Machine:
     name = ""
     payloads = ()
     seconds = 0.2
+    # The file that stands for the part, where the machines work on one.
+    part = None
 
     def __init__(self):
         self.boot_id = random.randint(1, 0xFFFFFFFF)
@@ -283,7 +286,9 @@ def serve(machine):
     arguments.add_argument("--host", default="127.0.0.1")
     arguments.add_argument("--port", type=int, default=0)
     arguments.add_argument("--unit", type=int, default=1)
+    arguments.add_argument("--part", type=pathlib.Path, help="file that stands for the part (part.py)")
     given = arguments.parse_args()
+    machine.part = given.part
 
     async def main():
         registers = SimData(0, values=[0] * 578, datatype=DataType.REGISTERS)
