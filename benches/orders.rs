@@ -27,8 +27,13 @@ async fn measure(tries: usize) {
     let mut rig = Rig::new(rig::small(12, 8, 5000.0)).await;
     let mut times: BTreeMap<&str, Vec<Duration>> = BTreeMap::new();
     let mut states: BTreeMap<String, usize> = BTreeMap::new();
+    let mut slowest: Vec<(Duration, &str, &str)> = Vec::new();
     for k in 0..tries {
-        let (tried, _) = attempt(&mut rig, &MOMENTS[k % MOMENTS.len()], (k / MOMENTS.len()).is_multiple_of(2)).await;
+        let moment = &MOMENTS[k % MOMENTS.len()];
+        let (tried, _) = attempt(&mut rig, moment, (k / MOMENTS.len()).is_multiple_of(2)).await;
+        let aborts = tried.abort.iter().zip(["abort, CMM", "abort, grinder"]);
+        slowest.extend(aborts.map(|(time, what)| (*time, what, moment.name)));
+        slowest.extend(tried.hold.map(|time| (time, "hold", moment.name)));
         assert!(tried.after_abort.is_empty(), "{tried:?}");
         *states.entry(tried.state).or_default() += 1;
         times.entry("abort, on the wire").or_default().extend(&tried.abort);
@@ -44,6 +49,11 @@ async fn measure(tries: usize) {
         let at = |share: f64| times.get(((times.len() as f64 * share).ceil() as usize).saturating_sub(1));
         let ms = |share: f64| at(share).map_or(f64::NAN, |time| 1e3 * time.as_secs_f64());
         println!("{what:22}{:>6}{:>10.2}{:>10.2}{:>10.2}", times.len(), ms(0.5), ms(0.99), ms(1.0));
+    }
+    slowest.sort_unstable_by(|a, b| b.cmp(a));
+    println!("\nslowest on the wire");
+    for (time, what, moment) in slowest.iter().take(8) {
+        println!("{:>8.2} ms  {what}, at: {moment}", 1e3 * time.as_secs_f64());
     }
     println!("\nstates after the first order");
     for (state, count) in states {

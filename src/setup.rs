@@ -25,7 +25,7 @@ use crate::formats::exchange::{
 use crate::formats::{self, FormatError, NominalFile};
 use crate::geometry::Point;
 use crate::measuring::{Layout, PatternError, Target, targets};
-use crate::recipe::{BeginWith, Density, NominalSource, OnTrouble, Pattern, Recipe, StartAt};
+use crate::recipe::{BeginWith, Density, NominalSource, OnTrouble, Pattern, PvOf, Recipe, StartAt};
 use crate::registration::{MapLimits, ProbeSide};
 use crate::surface::{DefinedSurface, DefinitionError, Nominal, Side, SurfaceError};
 
@@ -111,8 +111,12 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         coordinates: coordinates(cell),
         place: MapLimits { place_mm: recipe.compensation.largest_displacement_mm, ..MapLimits::default() },
         map: MapOptions { cutoff_mm: recipe.compensation.cutoff_mm, spacing_mm: recipe.compensation.spacing_mm },
+        gain: recipe.compensation.gain,
+        repeatability_mm: recipe.compensation.repeatability_mm,
+        learned: None,
+        setting: setting(recipe, cell, &part_identity),
         limits: CorrectionLimits {
-            gain: recipe.compensation.gain,
+            least_depth_mm: recipe.compensation.least_depth_mm,
             depth_of_cut_mm: recipe.compensation.depth_of_cut_mm,
             largest_correction_mm: recipe.compensation.largest_correction_mm,
             allowance_mm: recipe.grinding.allowance_mm,
@@ -122,6 +126,16 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         simulation: cell.simulated,
     };
     Ok((task, plan(recipe, cell)))
+}
+
+/// Says what a run has to have in common with another to learn from it: the cell, the part, and how it is ground and looked at.
+fn setting(recipe: &Recipe, cell: &CellConfig, part: &[u8; 32]) -> String {
+    let part: String = part.iter().map(|byte| format!("{byte:02x}")).collect();
+    let (grinding, cutoff_mm) = (&recipe.grinding, recipe.compensation.cutoff_mm);
+    format!(
+        "cell {:?}, part {part}, {:?}, feed {} mm/min, tracks {} mm, spark-out {}, cut-off {cutoff_mm} mm",
+        cell.name, grinding.wheel, grinding.feed_mm_min, grinding.track_mm, grinding.spark_out_passes
+    )
 }
 
 /// Reads or samples the nominal surface, and names the part by the SHA-256 of what it came from.
@@ -293,6 +307,7 @@ fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
             pv_mm: recipe.acceptance.pv_mm.unwrap_or(f64::INFINITY),
             rms_mm: recipe.acceptance.rms_mm.unwrap_or(f64::INFINITY),
             with_uncertainty: recipe.acceptance.expanded_uncertainty,
+            robust_pv: recipe.acceptance.pv_of == PvOf::MostPoints,
         },
         stall_share: 0.02,
         on_stall: disposal(recipe.cycle.on_stall),

@@ -40,6 +40,8 @@ fn figures() -> Figures {
         turn_rad: 0.01,
         weak_directions: Vec::new(),
         warnings: vec!["the part is warm".into()],
+        forecast: None,
+        pv_robust_mm: None,
         response: None,
         removed_mm: Some(0.1),
     }

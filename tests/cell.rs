@@ -11,7 +11,7 @@ fn plan() -> CellPlan {
     CellPlan {
         begin_with: Beginning::Grind,
         max_cycles: 4,
-        tolerance: Tolerance { pv_mm: 0.007, rms_mm: 0.001, with_uncertainty: true },
+        tolerance: Tolerance { pv_mm: 0.007, rms_mm: 0.001, with_uncertainty: true, robust_pv: false },
         stall_share: 0.02,
         on_stall: Disposal::Stop,
         on_divergence: Disposal::Hold,
@@ -47,6 +47,8 @@ fn figures(pv_um: f64, rms_um: f64) -> Figures {
         turn_rad: 0.001,
         weak_directions: vec![],
         warnings: vec![],
+        forecast: None,
+        pv_robust_mm: None,
         response: None,
         removed_mm: Some(0.1),
     }
@@ -91,7 +93,8 @@ fn answer(command: &Command, figures: &mut dyn FnMut(u32) -> Figures) -> Option<
         Command::Register { cycle } => Event::Registered { cycle, figures: figures(cycle) },
         Command::Compensate { cycle } => {
             let (largest_mm, depth_mm, predicted_pv_mm) = (0.01, 0.02, 0.005);
-            let summary = CompensationSummary { largest_mm, depth_mm, predicted_pv_mm, warnings: vec![] };
+            let summary =
+                CompensationSummary { largest_mm, depth_mm, predicted_pv_mm, ..CompensationSummary::default() };
             Event::Compensated { cycle, summary }
         }
         Command::Announce(_)

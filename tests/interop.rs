@@ -246,13 +246,22 @@ fn a_whole_run_on_a_pymodbus_cmm_and_grinder() {
     assert!(rms_um(&cycles[0]) > 3.0 && rms_um(&cycles[1]) < 0.3 * rms_um(&cycles[0]), "{result}");
 
     // The same cell file with another name in it: not the machine that is meant, and nothing is begun.
-    write("other.toml", program::changed("config/modbus-tcp.toml", &[&changes[..2], &[(named, "expected_name = \"CMM 8\"")]].concat()));
+    write(
+        "other.toml",
+        program::changed("config/modbus-tcp.toml", &[&changes[..2], &[(named, "expected_name = \"CMM 8\"")]].concat()),
+    );
     let (code, said, errors) = program::run(&["run", recipe, "--cell", "other.toml", "--runs", "other"], home.path());
     assert_eq!(code, 3, "{said}\n{errors}");
     let all = format!("{said}{errors}");
     assert!(all.contains("calls itself \"pymodbus CMM 1\"") && all.contains("expects \"CMM 8\""), "{all}");
     // And one that takes these machines for real.
-    write("real.toml", program::changed("config/modbus-tcp.toml", &[&changes[..2], &[("simulated = true", "simulated = false")]].concat()));
+    write(
+        "real.toml",
+        program::changed(
+            "config/modbus-tcp.toml",
+            &[&changes[..2], &[("simulated = true", "simulated = false")]].concat(),
+        ),
+    );
     let (code, said, errors) =
         program::run(&["run", recipe, "--cell", "real.toml", "--runs", "real", "--loaded"], home.path());
     assert_eq!(code, 3, "{said}\n{errors}");

@@ -337,6 +337,10 @@ impl Cell {
                 self.raise(AlarmId::Stalled, &reason);
                 self.dispose(self.plan.on_stall, &reason);
             }
+            Verdict::Undecided => {
+                self.raise(AlarmId::Undecided, &reason);
+                self.dispose(self.plan.on_stall, &reason);
+            }
             Verdict::WrongResponse => {
                 self.raise(response.map_or(AlarmId::NoEffect, response_alarm), &reason);
                 self.go(Held(Compensate));

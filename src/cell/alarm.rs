@@ -257,6 +257,12 @@ catalogue! {
         ["Compare what is left with the measuring uncertainty and the repeatability of the grinder.",
          "Resume for another pass, or stop the run."]
     }
+    /// Neither proven good nor proven bad.
+    Undecided {
+        "The measurement proves the part neither good nor bad", "The run does what the recipe says: hold or stop.", ProcessEngineer,
+        ["Measure with more points or less noise: a smaller uncertainty decides.",
+         "Another pass would take material and is not expected to help."]
+    }
     /// Passes spent.
     MaxCycles {
         "The recipe allows no further pass", "The run ends, not in tolerance.", ProcessEngineer,

@@ -149,8 +149,10 @@ pub enum Verdict {
     Diverging,
     /// The part does not answer to the map as it should.
     WrongResponse,
-    /// No better than before.
+    /// No better than before, or not going to be.
     Stalled,
+    /// The uncertainty reaches over a limit, and another pass would not help.
+    Undecided,
     /// No pass is left.
     MaxCycles,
     /// No material is left to take off.

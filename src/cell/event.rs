@@ -418,6 +418,9 @@ pub enum GateFailure {
 pub struct Figures {
     /// Peak to valley of the deviations.
     pub pv_mm: f64,
+    /// Peak to valley of all deviations but the outermost 0.2 %; none where it was not worked out.
+    #[serde(default)]
+    pub pv_robust_mm: Option<f64>,
     /// Root mean square of the deviations.
     pub rms_mm: f64,
     /// Expanded measuring uncertainty (k = 2) of the peak to valley.
@@ -440,8 +443,22 @@ pub struct Figures {
     pub warnings: Vec<String>,
     /// How the part answered to the map before; none before the second pass.
     pub response: Option<Response>,
+    /// What another pass is expected to leave; none where nobody can tell.
+    #[serde(default)]
+    pub forecast: Option<Forecast>,
     /// The most that was taken off anywhere since the run began; none where nobody knows.
     pub removed_mm: Option<f64>,
+}
+
+/// What another pass is expected to leave.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Forecast {
+    /// Root mean square of the deviations.
+    pub rms_mm: f64,
+    /// Its standard deviation.
+    pub sigma_mm: f64,
+    /// What no correction can go below, as far as the passes have told.
+    pub floor_mm: Option<f64>,
 }
 
 /// How the part answered to the last map.
@@ -461,7 +478,7 @@ pub enum Response {
 }
 
 /// What the next map will do.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct CompensationSummary {
     /// Largest absolute value of the map.
     pub largest_mm: f64,
@@ -469,6 +486,18 @@ pub struct CompensationSummary {
     pub depth_mm: f64,
     /// The PV that is expected after it.
     pub predicted_pv_mm: f64,
+    /// The RMS that is expected after it.
+    #[serde(default)]
+    pub predicted_rms_mm: f64,
+    /// Share of the part where the wheel will cut air, as far as it can be foreseen.
+    #[serde(default)]
+    pub air_share: f64,
+    /// Share of the error that is taken back, with the wavelength in millimetres from which each counts.
+    #[serde(default)]
+    pub gains: Vec<[f64; 2]>,
+    /// Share of a correction that the part answers with.
+    #[serde(default)]
+    pub response: f64,
     /// What else a person should know.
     pub warnings: Vec<String>,
 }

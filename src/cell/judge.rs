@@ -24,9 +24,34 @@ impl Figures {
             self.coverage,
             self.shift_mm,
             self.turn_rad,
+            self.pv_robust_mm.unwrap_or(0.0),
+            self.forecast.map_or(0.0, |forecast| forecast.rms_mm),
             self.removed_mm.unwrap_or(0.0),
         ];
         all.iter().all(|figure| figure.is_finite() && *figure >= 0.0)
+    }
+}
+
+/// Where a figure lies beside its limit once its uncertainty is counted (ISO 14253-1).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Conformity {
+    /// Within, for certain.
+    Within,
+    /// The uncertainty reaches over the limit: nothing is proven.
+    Undecided,
+    /// Beyond, for certain.
+    Beyond,
+}
+
+impl Conformity {
+    fn of(found: f64, expanded: f64, limit: f64) -> Self {
+        if found + expanded <= limit {
+            Self::Within
+        } else if found - expanded <= limit {
+            Self::Undecided
+        } else {
+            Self::Beyond
+        }
     }
 }
 
@@ -34,7 +59,8 @@ impl Figures {
 pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, passes: u32) -> Judged {
     let tell = |verdict, reason| Judged { verdict, reason };
     let figures = told(plan, now);
-    if in_tolerance(plan, now) {
+    let conformity = conformity(plan, now);
+    if conformity == Conformity::Within {
         return tell(Verdict::Accept, format!("in tolerance: {figures}"));
     }
     let spent = now.removed_mm.filter(|removed| removed + plan.least_depth_mm > plan.removal_budget_mm);
@@ -55,27 +81,54 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
     if let Some(words) = now.response.and_then(wrong) {
         return tell(Verdict::WrongResponse, format!("{words}; {figures}"));
     }
-    let Some(before) = before else { return tell(Verdict::Continue, format!("not yet in tolerance: {figures}")) };
-    let was = format!("before: PV {}, RMS {}", um(before.pv_mm), um(before.rms_mm));
-    if now.pv_mm > WORSE * before.pv_mm || now.rms_mm > WORSE * before.rms_mm {
-        return tell(Verdict::Diverging, format!("worse than the cycle before: {figures}; {was}"));
+    if let Some(before) = before {
+        let was = format!("before: PV {}, RMS {}", um(judged_pv(plan, before)), um(before.rms_mm));
+        if judged_pv(plan, now) > WORSE * judged_pv(plan, before) || now.rms_mm > WORSE * before.rms_mm {
+            return tell(Verdict::Diverging, format!("worse than the cycle before: {figures}; {was}"));
+        }
+        if has_stalled(plan, before, now) {
+            let least = format!("less than the measuring uncertainty or {:.0} %", 100.0 * plan.stall_share);
+            return tell(Verdict::Stalled, format!("improved by {least}: {figures}; {was}"));
+        }
     }
-    if has_stalled(plan, before, now) {
-        let least = format!("less than the measuring uncertainty or {:.0} %", 100.0 * plan.stall_share);
-        return tell(Verdict::Stalled, format!("improved by {least}: {figures}; {was}"));
-    }
-    tell(Verdict::Continue, format!("better, not yet in tolerance: {figures}; {was}"))
+    go_on(plan, before, now, conformity)
 }
 
-fn in_tolerance(plan: &CellPlan, now: &Figures) -> bool {
+/// Whether another pass is worth its material.
+fn go_on(plan: &CellPlan, before: Option<&Figures>, now: &Figures, conformity: Conformity) -> Judged {
+    let (tell, figures) = (|verdict, reason| Judged { verdict, reason }, told(plan, now));
+    let undecided = conformity == Conformity::Undecided;
+    let so_far = if undecided { "neither in tolerance nor out of it for certain" } else { "not yet in tolerance" };
+    // Before the first correction nobody knows what one can do.
+    let forecast = now.forecast.filter(|_| before.is_some());
+    let Some(forecast) = forecast else { return tell(Verdict::Continue, format!("{so_far}: {figures}")) };
+    let (expected, sigma) = (um(forecast.rms_mm), um(forecast.sigma_mm));
+    let floor = forecast.floor_mm.map_or(String::new(), |floor| format!(", no pass can go below {}", um(floor)));
+    let expected = format!("RMS {expected} ± {sigma} is expected of another pass{floor}");
+    if forecast.rms_mm < (1.0 - plan.stall_share) * now.rms_mm {
+        return tell(Verdict::Continue, format!("{so_far}: {figures}; {expected}"));
+    }
+    let verdict = if undecided { Verdict::Undecided } else { Verdict::Stalled };
+    tell(verdict, format!("no gain is to be expected, and {so_far}: {figures}; {expected}"))
+}
+
+/// The worse of the two figures that are limited.
+fn conformity(plan: &CellPlan, now: &Figures) -> Conformity {
     let tolerance = &plan.tolerance;
     let (pv, rms) = if tolerance.with_uncertainty { (now.pv_expanded_mm, now.rms_expanded_mm) } else { (0.0, 0.0) };
-    now.pv_mm + pv <= tolerance.pv_mm && now.rms_mm + rms <= tolerance.rms_mm
+    let of_pv = Conformity::of(judged_pv(plan, now), pv, tolerance.pv_mm);
+    of_pv.max(Conformity::of(now.rms_mm, rms, tolerance.rms_mm))
+}
+
+/// The peak to valley that is judged: of all points, or of all but the outermost.
+fn judged_pv(plan: &CellPlan, figures: &Figures) -> f64 {
+    figures.pv_robust_mm.filter(|_| plan.tolerance.robust_pv).unwrap_or(figures.pv_mm)
 }
 
 fn has_stalled(plan: &CellPlan, before: &Figures, now: &Figures) -> bool {
     let still = |was: f64, is: f64, uncertainty: f64| was - is < uncertainty.max(plan.stall_share * was);
-    still(before.pv_mm, now.pv_mm, now.pv_expanded_mm) && still(before.rms_mm, now.rms_mm, now.rms_expanded_mm)
+    still(judged_pv(plan, before), judged_pv(plan, now), now.pv_expanded_mm)
+        && still(before.rms_mm, now.rms_mm, now.rms_expanded_mm)
 }
 
 /// Says what a wrong response means.
@@ -90,11 +143,12 @@ fn wrong(response: Response) -> Option<&'static str> {
 
 fn told(plan: &CellPlan, now: &Figures) -> String {
     let tolerance = &plan.tolerance;
-    let (pv, rms) = (um(now.pv_mm), um(now.rms_mm));
+    let (pv, rms) = (um(judged_pv(plan, now)), um(now.rms_mm));
+    let which = if tolerance.robust_pv && now.pv_robust_mm.is_some() { "PV 99.8 %" } else { "PV" };
     let (pv_u, rms_u) = (um(now.pv_expanded_mm), um(now.rms_expanded_mm));
     let counts = if tolerance.with_uncertainty { "with" } else { "without" };
     format!(
-        "PV {pv} ± {pv_u} of {}, RMS {rms} ± {rms_u} of {}, {counts} the uncertainty",
+        "{which} {pv} ± {pv_u} of {}, RMS {rms} ± {rms_u} of {}, {counts} the uncertainty",
         um(tolerance.pv_mm),
         um(tolerance.rms_mm)
     )

@@ -29,8 +29,8 @@ mod table;
 pub use alarm::{Alarm, AlarmId, Role};
 pub use command::{Command, Ending, Judgement, Verdict};
 pub use event::{
-    Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Found, Gate, GateFailure,
-    JobResult, Mismatch, Reconciliation, RecordFailure, Response,
+    Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Forecast, Found, Gate,
+    GateFailure, JobResult, Mismatch, Reconciliation, RecordFailure, Response,
 };
 pub use machine::Cell;
 pub use plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, Tolerance};

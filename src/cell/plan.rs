@@ -52,6 +52,9 @@ pub struct Tolerance {
     pub rms_mm: f64,
     /// Whether the expanded uncertainty is added to the figures first.
     pub with_uncertainty: bool,
+    /// Whether the peak to valley is taken without the outermost 0.2 % of the points.
+    #[serde(default)]
+    pub robust_pv: bool,
 }
 
 /// What to do when a run does not get on.

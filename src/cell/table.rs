@@ -83,7 +83,7 @@ fn plan(disposal: Disposal) -> CellPlan {
     CellPlan {
         begin_with: Beginning::Grind,
         max_cycles: 3,
-        tolerance: Tolerance { pv_mm: 0.010, rms_mm: 0.002, with_uncertainty: false },
+        tolerance: Tolerance { pv_mm: 0.010, rms_mm: 0.002, with_uncertainty: false, robust_pv: false },
         stall_share: 0.05,
         on_stall: disposal,
         on_divergence: disposal,
@@ -190,7 +190,7 @@ fn of_computations(cycle: u32) -> Vec<Event> {
     events.extend(sample_figures().into_iter().map(|figures| Event::Registered { cycle, figures }));
     events.push(Event::RegistrationFailed { cycle, why: words() });
     let (largest_mm, depth_mm, predicted_pv_mm) = (0.02, 0.03, 0.005);
-    let summary = CompensationSummary { largest_mm, depth_mm, predicted_pv_mm, warnings: Vec::new() };
+    let summary = CompensationSummary { largest_mm, depth_mm, predicted_pv_mm, ..CompensationSummary::default() };
     events.push(Event::Compensated { cycle, summary });
     let refusals = [CompensationRefusal::BudgetSpent(words()), CompensationRefusal::WeakDirections(Vec::new())];
     for why in refusals.into_iter().chain([CompensationRefusal::Failed(words())]) {
@@ -202,6 +202,7 @@ fn of_computations(cycle: u32) -> Vec<Event> {
 fn sample_figures() -> Vec<Figures> {
     let plain = Figures {
         pv_mm: 0.030,
+        pv_robust_mm: None,
         rms_mm: 0.006,
         pv_expanded_mm: 0.0005,
         rms_expanded_mm: 0.0001,
@@ -213,6 +214,7 @@ fn sample_figures() -> Vec<Figures> {
         weak_directions: Vec::new(),
         warnings: Vec::new(),
         response: None,
+        forecast: None,
         removed_mm: Some(0.1),
     };
     let mut all = vec![

@@ -44,6 +44,8 @@ pub(super) enum Failure {
     Checked { bad: usize, files: usize },
     #[error(transparent)]
     Setup(regrind::setup::SetupError),
+    #[error("{0}; or write learn = false")]
+    Learned(regrind::formats::LearnedError),
     #[error("{path}: {reason}")]
     Simulation { path: PathBuf, reason: String },
     /// The record was read and cannot be believed.

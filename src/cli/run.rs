@@ -8,6 +8,7 @@ use regrind::cell::{Actor, Ending};
 use regrind::config::{CellConfig, Link};
 use regrind::document::Problems;
 use regrind::drive::{Drive, Orders, Request, Run};
+use regrind::formats::{LEARNED, Learned};
 use regrind::journal::{Header, Journal};
 use regrind::recipe::Recipe;
 use regrind::setup::{self, CellCmm, CellGrinder};
@@ -59,7 +60,10 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let recipe = or_show(Recipe::read(&arguments.recipe))?;
     let cell = or_show(CellConfig::read(&arguments.cell))?;
-    let (task, plan) = setup::prepare(&recipe, &cell).map_err(Failure::Setup)?;
+    let (mut task, plan) = setup::prepare(&recipe, &cell).map_err(Failure::Setup)?;
+    if recipe.compensation.learn {
+        task.learned = newest_learned(&arguments.runs, &task.setting, cell.simulated)?;
+    }
     let spec = match within(&cell) {
         true => Some(simulated::world_spec(&recipe, arguments.seed)?),
         false => None,
@@ -76,7 +80,11 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         // Before the record begins: a folder that is not there, or a line that is in use, is no run.
         let part = arguments.part.clone().unwrap_or_else(|| recipe_name(&recipe));
         let (cmm, grinder) = setup::machines(&recipe, &cell, &part, owner(&actor), job).map_err(Failure::Setup)?;
-        let journal = journal(arguments, &recipe, &cell, &actor, began)?;
+        let learned_from = task.learned.as_ref().map(|learned| learned.run.clone());
+        if let Some(run) = learned_from.as_ref().filter(|_| !arguments.json) {
+            super::print(&format!("begins with what {run} found to come back in every pass\n"))?;
+        }
+        let journal = journal(arguments, &recipe, &cell, &actor, began, learned_from)?;
         let (notices, shown) = mpsc::unbounded_channel();
         let poll = [setup::poll(&cell.cmm.link), setup::poll(&cell.grinder.link)];
         let folder = journal.folder().to_owned();
@@ -92,6 +100,24 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         }
         outcome(&ending)
     })
+}
+
+/// Returns what the newest finished run of the same part, wheel and cell left to learn from.
+fn newest_learned(runs: &Path, setting: &str, simulated: bool) -> Result<Option<Learned>, Failure> {
+    // No folder is no run yet.
+    let Ok(entries) = std::fs::read_dir(runs) else { return Ok(None) };
+    let mut found: Option<(std::time::SystemTime, Learned)> = None;
+    for entry in entries.filter_map(Result::ok) {
+        let Ok(written) = std::fs::metadata(entry.path().join(LEARNED)).and_then(|m| m.modified()) else { continue };
+        if found.as_ref().is_some_and(|(newest, _)| *newest >= written) {
+            continue;
+        }
+        let learned = Learned::read(&entry.path()).map_err(Failure::Learned)?;
+        if let Some(learned) = learned.filter(|l| l.setting == setting && l.simulation == simulated) {
+            found = Some((written, learned));
+        }
+    }
+    Ok(found.map(|(_, learned)| learned))
 }
 
 /// Gives the run its machines and lets it go.
@@ -132,6 +158,7 @@ fn journal(
     cell: &CellConfig,
     actor: &Actor,
     began: jiff::Timestamp,
+    learned_from: Option<String>,
 ) -> Result<Journal, Failure> {
     let part = arguments.part.clone().unwrap_or_else(|| "unnamed".into());
     let folder = free_folder(&arguments.runs, &recipe_name(recipe), began, cell.simulated);
@@ -146,7 +173,7 @@ fn journal(
         content: json!({
             "recipe": recipe.path(), "recipe_sha256": hex(recipe.source_sha256()),
             "cell": cell.path(), "cell_sha256": hex(cell.source_sha256()),
-            "part_name": recipe.part.name, "seed": arguments.seed,
+            "part_name": recipe.part.name, "seed": arguments.seed, "learned_from": learned_from,
         }),
     };
     let mut journal = Journal::create(&folder, header).map_err(Failure::Journal)?;

@@ -95,10 +95,12 @@ impl Show {
             Notice::Figures { cycle, figures } => self.figures(*cycle, figures),
             Notice::Judged(Judgement { cycle, reason, .. }) => self.line(&format!("cycle {cycle}: {reason}")),
             Notice::Compensated { cycle, summary } => self.line(&format!(
-                "cycle {cycle}: next pass corrects up to {} um, {} um deep; PV {} um expected",
+                "cycle {cycle}: next pass corrects up to {} um, {} um deep, gain {}; PV {}, RMS {} um expected",
                 three_digits(1e3 * summary.largest_mm),
                 three_digits(1e3 * summary.depth_mm),
-                three_digits(1e3 * summary.predicted_pv_mm)
+                gains(&summary.gains),
+                three_digits(1e3 * summary.predicted_pv_mm),
+                three_digits(1e3 * summary.predicted_rms_mm)
             )),
             Notice::Alarm(alarm) => self.alarm(alarm),
             Notice::AlarmGone { .. } => Ok(()),
@@ -214,4 +216,11 @@ fn bar() -> ProgressBar {
     let style = ProgressStyle::with_template("{msg:32} [{bar:40}] {pos}/{len}  {eta} left")
         .unwrap_or_else(|_| ProgressStyle::default_bar());
     ProgressBar::new(1).with_style(style)
+}
+
+/// The shares of the error that are taken back: one, or from the shortest waves to the longest.
+fn gains(gains: &[[f64; 2]]) -> String {
+    let least = gains.iter().map(|gain| gain[1]).fold(f64::INFINITY, f64::min);
+    let most = gains.iter().map(|gain| gain[1]).fold(0.0, f64::max);
+    if most - least < 0.005 { format!("{most:.2}") } else { format!("{least:.2} to {most:.2}") }
 }

@@ -1,12 +1,14 @@
 //! What the next pass is asked for: the correction so far, less what was found, within limits.
 
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use super::learning::Knowledge;
 use super::map::ErrorMap;
 use super::net::Net;
 
 /// What the grinder is to displace its surface by: absolute, it replaces the one before.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Correction {
     /// Where the nodes are.
     pub net: Net,
@@ -21,10 +23,10 @@ pub struct Correction {
 /// What a correction must keep to.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CorrectionLimits {
-    /// Share of the error that is taken back, from 0 to 1.2.
-    pub gain: f64,
-    /// Least depth of cut of the pass, in millimetres.
+    /// Depth of the pass under the one before, in millimetres, unless it takes more to cut everywhere.
     pub depth_of_cut_mm: f64,
+    /// What is taken off at least where least is taken off, in millimetres.
+    pub least_depth_mm: f64,
     /// Largest correction anywhere, in millimetres.
     pub largest_correction_mm: f64,
     /// Level of the first pass, in millimetres: what removal is counted from.
@@ -42,8 +44,8 @@ pub struct Step {
     pub depth_mm: f64,
     /// Removed in all below the surface of the first pass, where it is most, in millimetres.
     pub removed_mm: f64,
-    /// Root mean square of the error that should be left, in millimetres.
-    pub predicted_rms_mm: f64,
+    /// Share of the part where the wheel will cut air, as far as it can be foreseen.
+    pub air_share: f64,
 }
 
 /// Why there is no next pass.
@@ -75,24 +77,38 @@ impl Correction {
         self.net.interpolate(&self.values_mm, place_mm)
     }
 
-    /// Takes back a share of the error that the last pass left and goes deep enough to cut everywhere.
+    /// Returns the correction with what is worth taking back of an error, whatever any limit says of it; for the same pass and level.
+    pub fn changed(&self, error: &ErrorMap, known: &Knowledge) -> Self {
+        Self { values_mm: self.with(error, &known.step_mm(error)), ..self.clone() }
+    }
+
+    /// The values with changes added that are given on the net of an error.
+    fn with(&self, error: &ErrorMap, changes_mm: &[f64]) -> Vec<f64> {
+        let change_at = |k: usize| error.net.interpolate(changes_mm, self.net.place_mm(k));
+        (0..self.net.len()).map(|k| self.values_mm[k] + change_at(k)).collect()
+    }
+
+    /// Takes back of the error that the last pass left what is worth taking back, and goes deep enough to cut everywhere.
     ///
-    /// Only removal is possible: the new surface must lie below the present one everywhere. What is there is the old level
-    /// plus the error e; what comes is the new level plus e - gain e. So the depth is at least -gain e where the part is low.
+    /// Only removal is possible: the new surface must lie below the present one everywhere. A rise of the correction by d raises the
+    /// surface by s d, s being the part's response, and every pass adds its own scatter; so the depth is at least the largest rise, two
+    /// standard deviations of the scatter and the least depth of cut together.
+    ///
+    /// Frames: x and y of the model frame. Units: millimetres.
     ///
     /// # Errors
     /// A correction above its limit, and a removal above the budget.
-    pub fn next(&self, error: &ErrorMap, limits: &CorrectionLimits) -> Result<Step, StepError> {
-        let net = error.net;
-        let values_mm: Vec<f64> =
-            (0..net.len()).map(|k| self.at(net.place_mm(k)) - limits.gain * error.values_mm[k]).collect();
+    pub fn next(&self, error: &ErrorMap, known: &Knowledge, limits: &CorrectionLimits) -> Result<Step, StepError> {
+        let (net, changes_mm) = (self.net, known.step_mm(error));
+        let values_mm = self.with(error, &changes_mm);
         if let Some(k) = (0..net.len()).find(|&k| values_mm[k].abs() > limits.largest_correction_mm) {
             let [x_mm, y_mm] = net.place_mm(k);
             let limit_mm = limits.largest_correction_mm;
             return Err(StepError::TooLarge { found_mm: values_mm[k], x_mm, y_mm, limit_mm });
         }
-        let lowest_mm = error.values_mm.iter().copied().fold(0.0, f64::min);
-        let depth_mm = limits.depth_of_cut_mm.max(-limits.gain * lowest_mm);
+        let (response, scatter_mm) = (known.response()[0], known.scatter_mm().unwrap_or(0.0));
+        let rise_mm = changes_mm.iter().map(|change| response * change).fold(0.0, f64::max);
+        let depth_mm = limits.depth_of_cut_mm.max(rise_mm + 2.0 * scatter_mm + limits.least_depth_mm);
         let level_mm = self.level_mm - depth_mm;
         // Below the first pass's surface; the correction itself adds where it is negative.
         let deepest_mm = values_mm.iter().copied().fold(0.0, f64::min);
@@ -101,21 +117,36 @@ impl Correction {
         if removed_mm > limits.removal_budget_mm + 1e-9 {
             return Err(StepError::BudgetSpent { removed_mm, budget_mm: limits.removal_budget_mm });
         }
-        let left2 = error.samples_mm().iter().map(|[_, _, e]| ((1.0 - limits.gain) * e).powi(2)).sum::<f64>();
-        let count = error.valid.iter().filter(|v| **v).count().max(1) as f64;
-        let predicted_rms_mm = (left2 / count + error.rest_sigma_mm.powi(2)).sqrt();
+        let depths_mm =
+            || changes_mm.iter().zip(&error.valid).filter(|(_, valid)| **valid).map(|(c, _)| depth_mm - response * c);
+        let air: f64 = depths_mm().map(|depth| normal_tail(depth / (2f64.sqrt() * scatter_mm))).sum();
+        let air_share = air / depths_mm().count().max(1) as f64;
         let correction = Self { net, values_mm, cycle: self.cycle + 1, level_mm };
-        Ok(Step { correction, depth_mm, removed_mm, predicted_rms_mm })
+        Ok(Step { correction, depth_mm, removed_mm, air_share })
     }
+}
+
+/// The share of a normal distribution that lies more than z standard deviations below its mean; within 1e-7.
+fn normal_tail(z: f64) -> f64 {
+    if z.is_nan() || z > 8.0 {
+        return 0.0;
+    }
+    // Abramowitz and Stegun, 26.2.17, for z >= 0; the other side by symmetry.
+    let t = 1.0 / (1.0 + 0.231_641_9 * z.abs());
+    let terms = [0.319_381_530, -0.356_563_782, 1.781_477_937, -1.821_255_978, 1.330_274_429];
+    let sum = terms.iter().rev().fold(0.0, |sum, term| (sum + term) * t);
+    let tail = (-0.5 * z * z).exp() / std::f64::consts::TAU.sqrt() * sum;
+    if z >= 0.0 { tail } else { 1.0 - tail }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::compensation::{GainRule, MapOptions, Seen};
 
     const LIMITS: CorrectionLimits = CorrectionLimits {
-        gain: 1.0,
         depth_of_cut_mm: 0.01,
+        least_depth_mm: 0.0005,
         largest_correction_mm: 0.05,
         allowance_mm: 0.06,
         removal_budget_mm: 0.06,
@@ -130,20 +161,25 @@ mod tests {
         Correction::none(map([0.0; 4]).net, 0.06)
     }
 
+    fn next(correction: &Correction, error: &ErrorMap, gain: f64) -> Result<Step, StepError> {
+        let options = MapOptions { cutoff_mm: 1.0, spacing_mm: 1.0 };
+        let known = Knowledge::new(GainRule::Fixed(gain), &options, [1.0; 2], None);
+        correction.next(error, &known.after(&Seen { correction, error, answer: None }), &LIMITS)
+    }
+
     #[test]
     fn the_error_is_taken_back_and_the_pass_cuts_everywhere() {
-        let step = first().next(&map([0.004, -0.012, 0.0, 0.002]), &LIMITS).unwrap();
+        let step = next(&first(), &map([0.004, -0.012, 0.0, 0.002]), 1.0).unwrap();
         assert_eq!(step.correction.values_mm, [-0.004, 0.012, 0.0, -0.002]);
-        assert_eq!((step.correction.cycle, step.depth_mm, step.predicted_rms_mm), (2, 0.012, 0.0));
-        assert!((step.correction.level_mm - 0.048).abs() < 1e-15);
-        assert!((step.removed_mm - 0.016).abs() < 1e-15, "{}", step.removed_mm);
+        assert_eq!((step.correction.cycle, step.depth_mm, step.air_share), (2, 0.0125, 0.0));
+        assert!((step.correction.level_mm - 0.0475).abs() < 1e-15);
+        assert!((step.removed_mm - 0.0165).abs() < 1e-15, "{}", step.removed_mm);
     }
 
     #[test]
     fn corrections_add_up_and_the_gain_counts() {
-        let half = CorrectionLimits { gain: 0.5, ..LIMITS };
-        let once = first().next(&map([0.004; 4]), &half).unwrap();
-        let twice = once.correction.next(&map([0.002; 4]), &half).unwrap();
+        let once = next(&first(), &map([0.004; 4]), 0.5).unwrap();
+        let twice = next(&once.correction, &map([0.002; 4]), 0.5).unwrap();
         assert!(twice.correction.values_mm.iter().all(|v| (v + 0.003).abs() < 1e-15));
         assert!((twice.correction.level_mm - 0.04).abs() < 1e-15);
         assert_eq!(twice.correction.cycle, 3);
@@ -151,13 +187,21 @@ mod tests {
 
     #[test]
     fn limits_are_kept() {
-        let far = first().next(&map([0.0, 0.051, 0.0, 0.0]), &LIMITS);
+        let far = next(&first(), &map([0.0, 0.051, 0.0, 0.0]), 1.0);
         assert!(matches!(far, Err(StepError::TooLarge { x_mm: 1.0, y_mm: 0.0, .. })), "{far:?}");
         let mut correction = first();
         for _ in 0..6 {
-            correction = correction.next(&map([0.0; 4]), &LIMITS).unwrap().correction;
+            correction = next(&correction, &map([0.0; 4]), 1.0).unwrap().correction;
         }
-        let spent = correction.next(&map([0.0; 4]), &LIMITS);
+        let spent = next(&correction, &map([0.0; 4]), 1.0);
         assert!(matches!(spent, Err(StepError::BudgetSpent { .. })), "{spent:?}");
+    }
+
+    #[test]
+    fn the_normal_tail_is_that_of_the_tables() {
+        for (z, tail) in [(0.0, 0.5), (1.0, 0.158_655_254), (-1.0, 0.841_344_746), (3.0, 0.001_349_898), (9.0, 0.0)] {
+            assert!((normal_tail(z) - tail).abs() < 1e-7, "{z}");
+        }
+        assert_eq!(normal_tail(f64::INFINITY), 0.0);
     }
 }

@@ -10,11 +10,13 @@
 //! outward normal, so that a correction takes back a deviation of the opposite sign.
 
 mod correction;
+mod learning;
 mod map;
 mod net;
 mod response;
 
 pub use correction::{Correction, CorrectionLimits, Step, StepError};
+pub use learning::{Forecast, GainRule, Knowledge, Seen};
 pub use map::{ErrorMap, MapError, MapOptions, Reading, error_map};
 pub use net::{Net, NetError};
 pub use response::{Response, Sense, response};

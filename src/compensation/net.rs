@@ -1,12 +1,13 @@
 //! A regular net over x and y that maps and corrections are written on.
 
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 /// Most nodes a net may have: a correction is read back over a wire.
 const MOST_NODES: f64 = 4e6;
 
 /// A regular net over x and y of the model frame; nodes run row by row, x fastest.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Net {
     /// Nodes along x.
     pub columns: usize,

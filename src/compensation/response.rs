@@ -41,6 +41,10 @@ pub struct Response {
     pub slope: f64,
     /// Correlation of the two, from -1 to 1.
     pub correlation: f64,
+    /// Root mean square of the change that was asked for, as far as it can be seen, in millimetres.
+    pub asked_mm: f64,
+    /// Root mean square of what the change asked for does not explain of the answer, in millimetres.
+    pub unexplained_mm: f64,
     /// What to think of it.
     pub sense: Sense,
 }
@@ -85,6 +89,8 @@ pub fn response(
     Response {
         slope: straight.slope,
         correlation: straight.correlation,
+        asked_mm: straight.asked_rms,
+        unexplained_mm: straight.unexplained_rms,
         sense: sense(&straight, &mirrored, scatter_mm),
     }
 }
@@ -114,14 +120,20 @@ struct Fit {
     slope: f64,
     correlation: f64,
     asked_rms: f64,
+    unexplained_rms: f64,
 }
 
 fn regress(asked: &[f64], answer: &[f64]) -> Fit {
     let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
     let (aa, ab, bb) = (dot(asked, asked), dot(asked, answer), dot(answer, answer));
     let or_zero = |v: f64| if v.is_finite() { v } else { 0.0 };
-    let asked_rms = (aa / asked.len().max(1) as f64).sqrt();
-    Fit { slope: or_zero(ab / aa), correlation: or_zero(ab / (aa * bb).sqrt()), asked_rms }
+    let (count, slope) = (asked.len().max(1) as f64, or_zero(ab / aa));
+    Fit {
+        slope,
+        correlation: or_zero(ab / (aa * bb).sqrt()),
+        asked_rms: (aa / count).sqrt(),
+        unexplained_rms: ((bb - slope * ab).max(0.0) / count).sqrt(),
+    }
 }
 
 /// The changes that a motion of the part makes: they span what no registered map can show.

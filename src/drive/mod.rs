@@ -28,12 +28,11 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
 
 use crate::cell::{Actor, Cell, CellPlan, Command, Device, Ending, Event, GateFailure, Phase, RecordFailure, State};
-use crate::compensation::{Correction, ErrorMap};
+use crate::compensation::Correction;
 use crate::device::exchange::Step;
 use crate::device::{Armed, Cmm, Grinder, Identified, Interrupt};
-use crate::formats::{ResultFolder, write_json_atomic};
+use crate::formats::{LEARNED, ResultFolder, write_json_atomic};
 use crate::journal::{Artefact, Entry, Journal, Kind};
-use crate::registration::Registration;
 
 use control::{Control, Ordered};
 pub use control::{Reply, Request, SOCKET, ask};
@@ -128,7 +127,7 @@ pub struct Drive {
 
 /// What a computation brought.
 enum Computed {
-    Registered(u32, Event, Option<Box<(Registration, Option<ErrorMap>, crate::cell::Figures)>>),
+    Registered(u32, Event, Option<Box<work::Found>>),
     Compensated(u32, Event, Option<Correction>),
     Gated(u32, Event, Option<Points>),
     /// The files of one of these are on the disk and read.
@@ -251,6 +250,7 @@ impl Drive {
         } else {
             self.adopt(vec!["result.json".into()], self.cell.cycle()).await;
         }
+        self.keep_what_was_learned(&ending).await;
         if let Err(failure) = self.recorder.close(now, self.cell.cycle(), result).await {
             self.notify(Notice::RecordFailed { words: record_words(&failure) });
         }
@@ -384,9 +384,10 @@ impl Drive {
             Computed::Registered(number, event, found) => {
                 let any = found.is_some();
                 if let (Some(found), Some(cycle)) = (found, self.cycles.get_mut(&number)) {
-                    let (registration, error, figures) = *found;
+                    let work::Found { registration, error, known, figures } = *found;
                     cycle.registration = Some(Arc::new(registration));
                     cycle.error = error.map(Arc::new);
+                    cycle.known = known.map(Arc::new);
                     cycle.figures = Some(figures);
                 }
                 let map = self.cycles.get(&number).is_some_and(|cycle| cycle.error.is_some());
@@ -592,6 +593,20 @@ impl Drive {
         self.notify(Notice::Judged(judgement));
     }
 
+    /// Leaves what the next part of this kind can begin with, where the run got to its end.
+    async fn keep_what_was_learned(&mut self, ending: &Ending) {
+        if !matches!(ending, Ending::Accepted { .. } | Ending::NotAccepted { .. }) {
+            return;
+        }
+        let run = self.folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        let last = self.cycles.values().rev().find(|cycle| cycle.known.is_some()).cloned();
+        let Some(learned) = last.and_then(|cycle| work::learned(&self.task, run, &cycle)) else { return };
+        match write_json_atomic(self.folder.join(LEARNED), &learned) {
+            Ok(()) => self.adopt(vec![LEARNED.into()], self.cell.cycle()).await,
+            Err(error) => self.notify(Notice::RecordFailed { words: error.to_string() }),
+        }
+    }
+
     async fn ask(&mut self, device: Device, ask: Ask) {
         // A station lives as long as the drive; its channel is wide enough for what one cell has under way.
         let _ = self.asks[index(device)].send(ask).await;
@@ -740,7 +755,15 @@ impl Drive {
 }
 
 fn new_cycle(correction: Correction) -> Cycle {
-    Cycle { correction: Arc::new(correction), plan: None, points: None, registration: None, error: None, figures: None }
+    Cycle {
+        correction: Arc::new(correction),
+        plan: None,
+        points: None,
+        registration: None,
+        error: None,
+        known: None,
+        figures: None,
+    }
 }
 
 fn spawn<B: Bench>(

@@ -6,18 +6,20 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::cell::{CompensationRefusal, CompensationSummary, Event, Figures, Gate, GateFailure, Response};
+use crate::cell::{CompensationRefusal, CompensationSummary, Event, Figures, Forecast, Gate, GateFailure, Response};
 use crate::compensation::{
-    Correction, CorrectionLimits, ErrorMap, MapOptions, Net, Reading, Sense, StepError, error_map, response,
+    self, Correction, CorrectionLimits, ErrorMap, GainRule, Knowledge, MapOptions, Net, Reading, Seen, Sense,
+    StepError, error_map, response,
 };
 use crate::device::{Coordinates, CorrectionMap, Identified, Measurement, Pass, Plan, PointStatus, Target, TargetKind};
 use crate::formats::{
-    FormatError, NominalInput, RegistrationDocument, save_registration, write_correction, write_error_map, write_points,
+    CorrectionIdentities, FormatError, Learned, NominalInput, RegistrationDocument, save_registration,
+    write_correction, write_error_map, write_points,
 };
 use crate::geometry::{Point, Pose, Vector};
 use crate::measuring::{self, fit_sphere, sphere_targets};
 use crate::registration::{
-    MapLimits, Options, PointStatus as Fate, Registration, Start, register, weak_for_compensation,
+    MapLimits, Options, PointStatus as Fate, Registration, RegistrationError, Start, register, weak_for_compensation,
 };
 use crate::report::HeatMap;
 use crate::surface::{Nominal, Side};
@@ -49,6 +51,14 @@ pub struct Task {
     pub coordinates: Option<Coordinates>,
     /// How a map is made.
     pub map: MapOptions,
+    /// By what the share of an error that is taken back is chosen.
+    pub gain: GainRule,
+    /// What a pass adds by itself (rms), where the recipe knows it.
+    pub repeatability_mm: Option<f64>,
+    /// What an earlier run of this part found to come back in every pass.
+    pub learned: Option<Learned>,
+    /// What a run has to have in common with another to learn from it.
+    pub setting: String,
     /// What a correction must keep to.
     pub limits: CorrectionLimits,
     /// What uncertainty of the place of a correction on the part is put up with.
@@ -89,7 +99,17 @@ pub(super) struct Cycle {
     pub(super) points: Option<Arc<Points>>,
     pub(super) registration: Option<Arc<Registration>>,
     pub(super) error: Option<Arc<ErrorMap>>,
+    /// What is known of the grinder with this cycle taken in.
+    pub(super) known: Option<Arc<Knowledge>>,
     pub(super) figures: Option<Figures>,
+}
+
+/// What a registration gives besides its event.
+pub(super) struct Found {
+    pub(super) registration: Registration,
+    pub(super) error: Option<ErrorMap>,
+    pub(super) known: Option<Knowledge>,
+    pub(super) figures: Figures,
 }
 
 /// The points of a measurement that may be used.
@@ -115,7 +135,42 @@ impl Task {
             first_mm: corners[0],
             spacing_mm: [corners[1][0] - corners[0][0], corners[1][1] - corners[0][1]],
         });
-        Correction::none(net, self.limits.allowance_mm)
+        let none = Correction::none(net, self.limits.allowance_mm);
+        match &self.learned {
+            Some(learned) => learned.first_correction(none),
+            None => none,
+        }
+    }
+
+    /// What is known of the grinder before the first pass.
+    fn beginning(&self) -> Knowledge {
+        let Pass { x_mm, y_mm, .. } = self.pass;
+        let size_mm = [x_mm[1] - x_mm[0], y_mm[1] - y_mm[0]];
+        let fresh = || Knowledge::new(self.gain, &self.map, size_mm, self.repeatability_mm);
+        self.learned.as_ref().map_or_else(fresh, |learned| learned.known.for_next_part())
+    }
+
+    /// Registers points to the surface offset by a radius, and returns the options that it was done with.
+    ///
+    /// A search leaves the part anywhere along a direction that the surface cannot see, and a correction would be ground in there. Only
+    /// the fixture knows better, so that is begun at then.
+    ///
+    /// # Errors
+    /// Those of [`register`].
+    pub fn register(
+        &self,
+        points: &[Point],
+        probe_radius_mm: f64,
+    ) -> Result<(Registration, Options), RegistrationError> {
+        let at_fixture = Start::Pose(self.fixture_cmm_from_model);
+        let start = if self.start_at_fixture { at_fixture } else { Start::Search };
+        let options = Options { probe_radius_mm, start, ..self.registration };
+        let found = register(&self.nominal, points, &options)?;
+        if self.start_at_fixture || !found.verdict.weak_directions.iter().any(|weak| weak.held) {
+            return Ok((found, options));
+        }
+        let options = Options { start: at_fixture, ..options };
+        Ok((register(&self.nominal, points, &options)?, options))
     }
 
     /// Returns the payloads of a pass.
@@ -242,16 +297,14 @@ pub(super) fn register_cycle(
     number: u32,
     cycle: &Cycle,
     before: Option<&Cycle>,
-) -> (Event, Option<(Registration, Option<ErrorMap>, Figures)>) {
+) -> (Event, Option<Found>) {
     let failed = |why: String| (Event::RegistrationFailed { cycle: number, why }, None);
     let Some(points) = &cycle.points else { return failed("there are no points of this cycle".into()) };
     // The surface wanted by this pass stands above the nominal one by its level, and the ball rolls on that.
     let radius_mm = points.radius_mm.unwrap_or(task.probing.probe_radius_mm);
     let ball_mm = if points.coordinates == Coordinates::Contacts { 0.0 } else { radius_mm };
     let probe_radius_mm = ball_mm + cycle.correction.level_mm;
-    let start = if task.start_at_fixture { Start::Pose(task.fixture_cmm_from_model) } else { Start::Search };
-    let options = Options { probe_radius_mm, start, ..task.registration };
-    let mut found = match register(&task.nominal, &points.part, &options) {
+    let (mut found, options) = match task.register(&points.part, probe_radius_mm) {
         Ok(found) => found,
         Err(error) => return failed(error.to_string()),
     };
@@ -264,8 +317,32 @@ pub(super) fn register_cycle(
     if let Some(Err(why)) = error.as_ref().map(|map| save_map(task, folder, map)) {
         return failed(why);
     }
-    let figures = figures(task, cycle, before, &found, error.as_ref());
-    (Event::Registered { cycle: number, figures: figures.clone() }, Some((found, error, figures)))
+    let answer = error.as_ref().and_then(|error| answer(before?, cycle, &found, error));
+    let known = error.as_ref().map(|error| learned_from(task, cycle, before, error, answer));
+    let forecast = known.as_ref().zip(error.as_ref()).map(|(known, error)| known.forecast(error));
+    let figures = figures(task, cycle, &found, error.as_ref(), answer, forecast);
+    let event = Event::Registered { cycle: number, figures: figures.clone() };
+    (event, Some(Found { registration: found, error, known, figures }))
+}
+
+/// Takes a measured pass into what is known of the grinder.
+fn learned_from(
+    task: &Task,
+    cycle: &Cycle,
+    before: Option<&Cycle>,
+    error: &ErrorMap,
+    answer: Option<compensation::Response>,
+) -> Knowledge {
+    let earlier = before.and_then(|before| before.known.as_deref().cloned());
+    // Measured once more after the same pass: nothing new of the grinder.
+    let same_pass = before.is_some_and(|before| before.correction == cycle.correction);
+    match earlier {
+        Some(earlier) if same_pass => earlier,
+        earlier => {
+            let earlier = earlier.unwrap_or_else(|| task.beginning());
+            earlier.after(&Seen { correction: &cycle.correction, error, answer })
+        }
+    }
 }
 
 fn save(task: &Task, folder: &Path, found: &Registration, options: &Options) -> Result<(), FormatError> {
@@ -287,9 +364,10 @@ fn readings(found: &Registration) -> Vec<Reading> {
 fn figures(
     task: &Task,
     cycle: &Cycle,
-    before: Option<&Cycle>,
     found: &Registration,
     error: Option<&ErrorMap>,
+    answer: Option<compensation::Response>,
+    forecast: Option<compensation::Forecast>,
 ) -> Figures {
     let verdict = &found.verdict;
     let moved = task.fixture_cmm_from_model.inverse() * found.cmm_from_model;
@@ -299,6 +377,7 @@ fn figures(
     let points = verdict.used.max(1) as f64;
     Figures {
         pv_mm: verdict.pv_mm,
+        pv_robust_mm: pv_of_most(found),
         rms_mm: verdict.rms_mm,
         // Of two extreme points, each uncertain by the scatter; k = 2.
         pv_expanded_mm: 2.0 * 2f64.sqrt() * scatter_mm,
@@ -311,24 +390,37 @@ fn figures(
         turn_rad: moved.angle_rad(),
         weak_directions: verdict.weak_directions.iter().map(|w| w.words.clone()).collect(),
         warnings: verdict.warnings.clone(),
-        response: before.and_then(|before| answer(before, cycle, found, error?)),
+        response: answer.map(|answer| in_words_of_the_cell(answer.sense)),
+        forecast: forecast.map(|f| Forecast { rms_mm: f.rms_mm, sigma_mm: f.sigma_mm, floor_mm: f.floor_mm }),
         removed_mm: Some(task.limits.allowance_mm - cycle.correction.level_mm),
     }
 }
 
-fn answer(before: &Cycle, cycle: &Cycle, found: &Registration, error: &ErrorMap) -> Option<Response> {
+/// Peak to valley without the outermost 0.2 % of the points, half at each end.
+fn pv_of_most(found: &Registration) -> Option<f64> {
+    let used = found.deviations.iter().filter(|d| d.status == Fate::Used);
+    let mut values: Vec<f64> = used.map(|d| d.deviation_mm).collect();
+    values.sort_unstable_by(f64::total_cmp);
+    let beyond = values.len() / 1000;
+    Some(values.get(values.len().checked_sub(1 + beyond)?)? - values.get(beyond)?)
+}
+
+fn answer(before: &Cycle, cycle: &Cycle, found: &Registration, error: &ErrorMap) -> Option<compensation::Response> {
     let earlier = before.error.as_ref()?;
     let used = found.deviations.iter().filter(|d| d.status == Fate::Used);
     let places: Vec<(Point, Vector)> = used.map(|d| (d.point, d.normal)).collect();
     let scatter_mm = earlier.rest_sigma_mm.hypot(error.rest_sigma_mm);
-    let answered = response([earlier, error], [&before.correction, &cycle.correction], &places, scatter_mm);
-    Some(match answered.sense {
+    Some(response([earlier, error], [&before.correction, &cycle.correction], &places, scatter_mm))
+}
+
+fn in_words_of_the_cell(sense: Sense) -> Response {
+    match sense {
         Sense::AsCommanded => Response::Expected,
         Sense::Flipped => Response::SignFlipped,
         Sense::MirroredX | Sense::MirroredY | Sense::Turned => Response::Mirrored,
         Sense::NoEffect => Response::NoEffect,
         Sense::Unclear => Response::Unclear,
-    })
+    }
 }
 
 /// Makes the correction of the next pass and writes it.
@@ -349,30 +441,40 @@ pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &
         Ok(map) => map,
         Err(error) => return refused(CompensationRefusal::Failed(error.to_string())),
     };
-    let step = match cycle.correction.next(&map, &task.limits) {
+    let known = match &cycle.known {
+        Some(known) => Arc::clone(known),
+        None => Arc::new(learned_from(task, cycle, None, &map, None)),
+    };
+    let step = match cycle.correction.next(&map, &known, &task.limits) {
         Ok(step) => step,
         Err(error @ StepError::BudgetSpent { .. }) => {
             return refused(CompensationRefusal::BudgetSpent(error.to_string()));
         }
         Err(error) => return refused(CompensationRefusal::Failed(error.to_string())),
     };
-    if let Err(error) = save_correction(task, folder, &step.correction) {
+    if let Err(error) = save_correction(task, folder, &step.correction, &cycle.correction) {
         return refused(CompensationRefusal::Failed(error.to_string()));
     }
     let largest_mm = step.correction.values_mm.iter().fold(0.0f64, |most, v| most.max(v.abs()));
     let ratio = found.verdict.pv_mm / found.verdict.rms_mm.max(f64::MIN_POSITIVE);
+    let forecast = known.forecast(&map);
     let summary = CompensationSummary {
         largest_mm,
         depth_mm: step.depth_mm,
-        predicted_pv_mm: step.predicted_rms_mm * ratio,
+        predicted_pv_mm: forecast.rms_mm * ratio,
+        predicted_rms_mm: forecast.rms_mm,
+        air_share: step.air_share,
+        gains: known.gains(),
+        response: known.response()[0],
         warnings: Vec::new(),
     };
     (Event::Compensated { cycle: number, summary }, Some(step.correction))
 }
 
-fn save_correction(task: &Task, folder: &Path, correction: &Correction) -> Result<(), FormatError> {
-    let identity = task.payloads(correction).0.identity();
-    write_correction(&folder.join("correction.csv"), correction, &task.part_identity, &identity, task.simulation)
+fn save_correction(task: &Task, folder: &Path, correction: &Correction, base: &Correction) -> Result<(), FormatError> {
+    let [identity, replaces] = [correction, base].map(|correction| task.payloads(correction).0.identity());
+    let identities = CorrectionIdentities { part: task.part_identity, map: identity, replaces };
+    write_correction(&folder.join("correction.csv"), correction, &identities, task.simulation)
 }
 
 fn save_map(task: &Task, folder: &Path, map: &ErrorMap) -> Result<(), String> {
@@ -382,6 +484,18 @@ fn save_map(task: &Task, folder: &Path, map: &ErrorMap) -> Result<(), String> {
     HeatMap::of_lengths(title, "deviation", &map.samples_mm())
         .and_then(|picture| picture.save_png(&folder.join("error_map.png")))
         .map_err(|error| error.to_string())
+}
+
+/// What the next part of this kind can begin with; none where this run did not get so far.
+pub(super) fn learned(task: &Task, run: String, cycle: &Cycle) -> Option<Learned> {
+    let (known, error) = (cycle.known.as_deref()?, cycle.error.as_deref()?);
+    let wrong = [Response::SignFlipped, Response::Mirrored, Response::NoEffect];
+    if cycle.figures.as_ref()?.response.is_some_and(|response| wrong.contains(&response)) {
+        return None;
+    }
+    let (setting, simulation) = (task.setting.clone(), task.simulation);
+    let correction = cycle.correction.changed(error, known);
+    Some(Learned { simulation, setting, run, correction, known: known.clone() })
 }
 
 /// Writes the points of a measurement, in the CMM frame.

@@ -23,6 +23,17 @@ pub fn write_error_map(path: &Path, map: &ErrorMap, simulation: bool) -> Result<
     write_rows(path, &header, &rows, |(values, valid)| (*values, Some(*valid)))
 }
 
+/// What a correction is for, what it is, and what it takes the place of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct CorrectionIdentities {
+    /// SHA-256 of the part's nominal surface.
+    pub part: [u8; 32],
+    /// SHA-256 of the map as the grinder gets it.
+    pub map: [u8; 32],
+    /// That of the map of the pass before.
+    pub replaces: [u8; 32],
+}
+
 /// Writes `correction.csv`: `x_mm,y_mm,correction_mm`, with part, cycle, level and identities in comments.
 ///
 /// # Errors
@@ -30,8 +41,7 @@ pub fn write_error_map(path: &Path, map: &ErrorMap, simulation: bool) -> Result<
 pub fn write_correction(
     path: &Path,
     correction: &Correction,
-    part: &[u8; 32],
-    identity: &[u8; 32],
+    identities: &CorrectionIdentities,
     simulation: bool,
 ) -> Result<(), FormatError> {
     let rows: Vec<[f64; 3]> = (0..correction.net.len())
@@ -42,11 +52,12 @@ pub fn write_correction(
     let marked = if simulation { "# SIMULATION\n" } else { "" };
     let header = format!(
         "{marked}# for pass {}; absolute: it replaces the one before\n# frame: model; positive leaves material, along the outward normal\n# level over the \
-         nominal surface: {} mm\n# part: sha256 {}\n# map: sha256 {}\nx_mm,y_mm,correction_mm",
+         nominal surface: {} mm\n# part: sha256 {}\n# map: sha256 {}\n# replaces: sha256 {}\nx_mm,y_mm,correction_mm",
         correction.cycle,
         correction.level_mm,
-        hex(part),
-        hex(identity)
+        hex(&identities.part),
+        hex(&identities.map),
+        hex(&identities.replaces)
     );
     write_rows(path, &header, &rows, |values| (*values, None))
 }

@@ -8,6 +8,7 @@ mod error;
 pub mod exchange;
 mod folder;
 mod layout;
+mod learned;
 mod map;
 mod number;
 pub mod ply;
@@ -23,7 +24,8 @@ pub use document::{
 };
 pub use error::FormatError;
 pub use folder::{ResultFolder, place_link, remove_link, remove_socket};
-pub use map::{write_correction, write_error_map};
+pub use learned::{LEARNED, Learned, LearnedError};
+pub use map::{CorrectionIdentities, write_correction, write_error_map};
 pub use number::LIMIT_MM;
 pub use ply::{PlyFile, parse_ply, read_ply};
 pub use points::{parse_points, read_points};

@@ -10,9 +10,10 @@ use super::written::{
     NominalTable, PartTable, PatternWord, RecipeFile, RegistrationTable, SideWord, WheelTable,
 };
 use super::{
-    Acceptance, Compensation, Cycle, Density, Grinding, Measure, NominalSource, Part, Pattern, Recipe,
+    Acceptance, Compensation, Cycle, Density, GainBy, Grinding, Measure, NominalSource, Part, Pattern, Recipe,
     RegistrationSettings, StartAt, Wheel,
 };
+use crate::compensation::GainRule;
 use crate::document::Document;
 use crate::geometry::Aperture;
 use crate::registration::ProbeSide;
@@ -299,6 +300,7 @@ fn acceptance(written: &AcceptanceTable, document: &mut Document) -> Acceptance 
     }
     Acceptance {
         pv_mm: written.pv_um.map(|um| MM_PER_UM * um),
+        pv_of: written.pv_of,
         rms_mm: written.rms_um.map(|um| MM_PER_UM * um),
         expanded_uncertainty: written.expanded_uncertainty,
     }
@@ -327,8 +329,23 @@ fn compensation(written: &CompensationTable, document: &mut Document) -> Option<
             "raise it, or lower `compensation.spacing_mm`",
         );
     }
+    if let (Some(gain), Some(by)) = (written.gain, written.gain_by) {
+        document.report(
+            "compensation.gain",
+            format!("is {gain}, and `gain_by` is {by:?}"),
+            "the share is fixed or chosen, not both",
+            "leave one of the two out",
+        );
+    }
     Some(Compensation {
-        gain: written.gain,
+        gain: match (written.gain, written.gain_by.unwrap_or_default()) {
+            (Some(share), _) => GainRule::Fixed(share),
+            (None, GainBy::Adaptive) => GainRule::Adaptive,
+            (None, GainBy::Wavelength) => GainRule::Wavelength,
+        },
+        repeatability_mm: written.repeatability_um.map(|um| MM_PER_UM * um),
+        learn: written.learn,
+        least_depth_mm: MM_PER_UM * written.least_depth_um,
         cutoff_mm: written.cutoff_mm?,
         largest_correction_mm: MM_PER_UM * written.largest_correction_um?,
         removal_budget_mm: MM_PER_UM * written.removal_budget_um?,

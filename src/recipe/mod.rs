@@ -16,6 +16,7 @@ mod written;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
+use crate::compensation::GainRule;
 use crate::document::{Document, Problems, problem_at, read_text, schema_of, sha256};
 use crate::geometry::{Aperture, Pose};
 use crate::registration::{self, Loss, ProbeSide, Start};
@@ -165,6 +166,8 @@ pub enum StartAt {
 pub struct Acceptance {
     /// Largest peak to valley of the deviations.
     pub pv_mm: Option<f64>,
+    /// Which points the peak to valley is taken of.
+    pub pv_of: PvOf,
     /// Largest rms of the deviations.
     pub rms_mm: Option<f64>,
     /// Whether the expanded uncertainty (k = 2) is added before the comparison.
@@ -174,8 +177,14 @@ pub struct Acceptance {
 /// How what is left is turned into a correction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Compensation {
-    /// Share of the deviation that one cycle takes back, 0 to 1.2; 0 measures and judges only.
-    pub gain: f64,
+    /// By what the share of the deviation that one cycle takes back is chosen; fixed at 0 measures and judges only.
+    pub gain: GainRule,
+    /// What a pass adds by itself, as far as the recipe knows (rms).
+    pub repeatability_mm: Option<f64>,
+    /// Whether a run begins with what the last one of this part found to come back.
+    pub learn: bool,
+    /// The least that a pass takes off where it takes off least.
+    pub least_depth_mm: f64,
     /// Wavelengths shorter than this are left alone.
     pub cutoff_mm: f64,
     /// The correction is nowhere larger than this.
@@ -261,6 +270,29 @@ pub enum BeginWith {
     Grind,
     /// A measurement of the part as it is; its surface stands over the nominal one by `grinding.allowance_um`.
     Measure,
+}
+
+/// Which points a peak to valley is taken of.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
+pub enum PvOf {
+    /// All that were used.
+    #[serde(rename = "all")]
+    All,
+    /// All but the outermost 0.2 %, so that no two points decide.
+    #[default]
+    #[serde(rename = "99.8 %")]
+    MostPoints,
+}
+
+/// What the share of a deviation that a cycle takes back is chosen by.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum GainBy {
+    /// What the passes have told of what comes back and what does not, one share for all wavelengths.
+    Adaptive,
+    /// The same for each octave of wavelengths by itself.
+    #[default]
+    Wavelength,
 }
 
 /// What to do when the part does not get better.

@@ -3,7 +3,7 @@
 use schemars::{JsonSchema, Schema, json_schema};
 use serde::Deserialize;
 
-use super::{BeginWith, OnTrouble, StartAt};
+use super::{BeginWith, GainBy, OnTrouble, PvOf, StartAt};
 use crate::registration::Loss;
 use crate::surface::Projection;
 
@@ -213,6 +213,8 @@ pub(super) struct AcceptanceTable {
     /// Largest peak to valley of the deviations.
     #[schemars(range(min = 0.001, max = 100000.0))]
     pub pv_um: Option<f64>,
+    /// Which points the peak to valley is taken of.
+    pub pv_of: PvOf,
     /// Largest rms of the deviations.
     #[schemars(range(min = 0.001, max = 100000.0))]
     pub rms_um: Option<f64>,
@@ -224,9 +226,19 @@ pub(super) struct AcceptanceTable {
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub(super) struct CompensationTable {
-    /// Share of the deviation that one cycle takes back; 0 measures and judges only.
+    /// A fixed share of the deviation that every cycle takes back; 0 measures and judges only. Left out, `gain_by` chooses it.
     #[schemars(range(min = 0.0, max = 1.2))]
-    pub gain: f64,
+    pub gain: Option<f64>,
+    /// What the share that a cycle takes back is chosen by, where `gain` does not fix it.
+    pub gain_by: Option<GainBy>,
+    /// Root mean square of what a pass adds by itself, where that is known; without it the cycles tell it.
+    #[schemars(range(min = 0.001, max = 1000.0))]
+    pub repeatability_um: Option<f64>,
+    /// Begin with what the last finished run of this part, wheel and cell found to come back in every pass.
+    pub learn: bool,
+    /// The least that a pass takes off where it takes off least.
+    #[schemars(range(min = 0.0, max = 1000.0))]
+    pub least_depth_um: f64,
     /// Wavelengths shorter than this are left alone.
     #[schemars(range(min = 0.05, max = 10000.0), extend("x-required" = true), example = 8.0)]
     pub cutoff_mm: Option<f64>,
@@ -358,14 +370,18 @@ impl Default for RegistrationTable {
 
 impl Default for AcceptanceTable {
     fn default() -> Self {
-        Self { pv_um: None, rms_um: None, expanded_uncertainty: true }
+        Self { pv_um: None, pv_of: PvOf::default(), rms_um: None, expanded_uncertainty: true }
     }
 }
 
 impl Default for CompensationTable {
     fn default() -> Self {
         Self {
-            gain: 1.0,
+            gain: None,
+            gain_by: None,
+            repeatability_um: None,
+            learn: false,
+            least_depth_um: 0.5,
             cutoff_mm: None,
             largest_correction_um: None,
             removal_budget_um: None,

@@ -1,0 +1,306 @@
+//! Cycles of one simulated part without wires: ground, touched, registered, compensated as in a run, and held against the truth.
+#![allow(dead_code, reason = "not every program that includes this uses all of it")]
+
+use std::path::Path;
+
+use regrind::compensation::{
+    Correction, ErrorMap, GainRule, Knowledge, MapOptions, Net, Reading, Seen, StepError, error_map, response,
+};
+use regrind::config::CellConfig;
+use regrind::drive::Task;
+use regrind::geometry::{Point, Vector};
+use regrind::recipe::Recipe;
+use regrind::registration::{PointStatus, Registration};
+use regrind::setup;
+use regrind_sim::body::{Body, Payload, Payloads};
+use regrind_sim::payload::{Feature, Map, Pass, Plan, Status, Target, decode_points};
+use regrind_sim::process::{Grinder, GrinderSpec};
+use regrind_sim::world::{World, WorldSpec};
+
+/// Every recipe that ships with a truth to simulate.
+pub const RECIPES: [&str; 4] = ["freeform-mirror", "off-axis-asphere", "biconic", "shallow-wave"];
+
+/// How the next correction is made.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Way {
+    /// As Regrind does it, by a rule for the gain.
+    Regrind(GainRule),
+    /// What a spreadsheet does: subtract from the map what was measured, nearest point by nearest point, nothing filtered.
+    Plain,
+}
+
+/// The truth after one pass, in micrometres, of the surface with the best position taken out.
+#[derive(Clone, Copy, Debug)]
+pub struct After {
+    /// RMS of the whole error.
+    pub rms_um: f64,
+    /// RMS of what comes back in every pass.
+    pub repeatable_um: f64,
+    /// RMS of what this pass added by itself, which no correction could have known.
+    pub floor_um: f64,
+    /// RMS that was forecast for this pass after the one before, with its standard deviation, and what the CMM then saw.
+    pub forecast_um: Option<[f64; 3]>,
+}
+
+/// A recipe with everything that a run makes of it.
+pub struct Bench {
+    pub name: String,
+    task: Task,
+    spec: WorldSpec,
+    plan_of: Vec<(Point, Vector)>,
+}
+
+impl Bench {
+    pub fn new(name: &str) -> Self {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let recipe = Recipe::read(&root.join(format!("recipes/{name}.toml"))).unwrap();
+        let cell = CellConfig::read(&root.join("config/sim.toml")).unwrap();
+        let (task, _) = setup::prepare(&recipe, &cell).unwrap();
+        let spec: WorldSpec = recipe.simulation.clone().unwrap().try_into().unwrap();
+        let plan_of = task.targets.iter().map(|t| (t.point, t.normal)).collect();
+        Self { name: name.to_owned(), task, spec, plan_of }
+    }
+
+    /// Makes one part after another in a world of its own: for each the truth after every pass.
+    ///
+    /// A second part begins with what was learned from the first.
+    pub fn parts(&self, seed: u64, way: Way, parts: usize, passes: u16) -> Vec<Vec<After>> {
+        let spec = WorldSpec { seed, ..self.spec.clone() };
+        // The same random part of every pass, and nothing else: what the best correction would leave.
+        let alone = GrinderSpec {
+            repeatability_um: spec.grinder.repeatability_um,
+            repeatability_correlation_mm: spec.grinder.repeatability_correlation_mm,
+            error_copying: spec.grinder.error_copying,
+            ..GrinderSpec::perfect()
+        };
+        let twin = WorldSpec { grinder: alone, ..spec.clone() };
+        let (world, twin) = (World::new(spec).unwrap(), World::new(twin).unwrap());
+        let mut learned: Option<(Correction, Knowledge)> = None;
+        (0..parts)
+            .map(|part| {
+                let mut line = Line::new(self, way, &world, &twin, learned.take(), part as u32 + 1);
+                let after = (1..=passes).map(|cycle| line.pass(cycle)).collect();
+                learned = line.learned();
+                after
+            })
+            .collect()
+    }
+}
+
+/// One part on its way.
+struct Line<'a> {
+    bench: &'a Bench,
+    way: Way,
+    worlds: [&'a World; 2],
+    grinders: [Grinder; 2],
+    job: u32,
+    places: Vec<[f64; 2]>,
+    correction: Correction,
+    known: Knowledge,
+    before: Option<(Correction, ErrorMap)>,
+    forecast: Option<[f64; 2]>,
+}
+
+impl<'a> Line<'a> {
+    fn new(
+        bench: &'a Bench,
+        way: Way,
+        world: &'a World,
+        twin: &'a World,
+        learned: Option<(Correction, Knowledge)>,
+        job: u32,
+    ) -> Self {
+        let task = &bench.task;
+        let corners = [[task.pass.x_mm[0], task.pass.y_mm[0]], [task.pass.x_mm[1], task.pass.y_mm[1]]];
+        let net = Net::over(corners.into_iter(), task.map.spacing_mm).unwrap();
+        let size_mm = [corners[1][0] - corners[0][0], corners[1][1] - corners[0][1]];
+        let rule = if let Way::Regrind(rule) = way { rule } else { GainRule::Fixed(1.0) };
+        let none = Correction::none(net, task.limits.allowance_mm);
+        let (correction, known) = match learned {
+            Some((correction, known)) => {
+                (Correction { values_mm: correction.values_mm, ..none }, known.for_next_part())
+            }
+            None => (none, Knowledge::new(rule, &task.map, size_mm, None)),
+        };
+        if job > 1 {
+            world.load_blank();
+            twin.load_blank();
+        }
+        let places = bench.plan_of.iter().map(|(p, _)| [p.x, p.y]).collect();
+        let (worlds, grinders) = ([world, twin], [world.grinder(), twin.grinder()]);
+        Self { bench, way, worlds, grinders, job, places, correction, known, before: None, forecast: None }
+    }
+
+    /// Grinds and measures once, and makes the correction of the next pass.
+    fn pass(&mut self, cycle: u16) -> After {
+        let level_mm = self.correction.level_mm;
+        let map = self.payload();
+        let flat = Map { values_mm: vec![0.0; map.values_mm.len()], ..map.clone() };
+        let [real, twin] = &mut self.grinders;
+        grind(real, self.job, cycle, &map, &pass_of(&self.bench.task, level_mm));
+        grind(twin, self.job, cycle, &flat, &pass_of(&self.bench.task, level_mm));
+        let [whole, alone] = self.worlds.map(|world| {
+            let deviations: Vec<f64> = world.deviations_mm(&self.places).iter().map(|d| d - level_mm).collect();
+            self.without_motion(&deviations)
+        });
+        let difference: Vec<f64> = whole.iter().zip(&alone).map(|(a, b)| a - b).collect();
+        let found = self.register(level_mm);
+        let seen_um = 1e3 * found.verdict.rms_mm;
+        let after = After {
+            rms_um: rms_um(&whole),
+            repeatable_um: rms_um(&self.without_motion(&difference)),
+            floor_um: rms_um(&alone),
+            forecast_um: self.forecast.map(|[rms, sigma]| [rms, sigma, seen_um]),
+        };
+        self.correct(&found);
+        after
+    }
+
+    fn payload(&self) -> Map {
+        let Net { columns, rows, first_mm, spacing_mm } = self.correction.net;
+        Map {
+            columns: columns as u32,
+            rows: rows as u32,
+            first_mm,
+            spacing_mm,
+            nominal: [7; 32],
+            values_mm: self.correction.values_mm.clone(),
+        }
+    }
+
+    /// Touches the part where the recipe says, and registers what the probe gave.
+    fn register(&self, level_mm: f64) -> Registration {
+        let task = &self.bench.task;
+        let target = |(index, (p, n)): (usize, &(Point, Vector))| {
+            let at = task.fixture_cmm_from_model.point(&(p + level_mm * n));
+            let normal = task.fixture_cmm_from_model.direction(n);
+            Target { index: index as u32, feature: Feature::Part, point_mm: at.into(), normal: normal.into() }
+        };
+        let radius_mm = task.probing.probe_radius_mm;
+        let plan = Plan {
+            probe_radius_mm: radius_mm,
+            approach_mm: task.probing.approach_mm,
+            search_mm: task.probing.search_mm,
+            speed_mm_s: task.probing.speed_mm_s,
+            safe_height_mm: task.probing.safe_height_mm,
+            targets: self.bench.plan_of.iter().enumerate().map(target).collect(),
+        };
+        let mut cmm = self.worlds[0].cmm();
+        let payload = Payload { bytes: plan.encode(), identity: [1; 32] };
+        cmm.prepare(self.job, 0, &Payloads { plan: Some(payload), ..Payloads::default() }).unwrap();
+        cmm.begin();
+        while !cmm.advance(1000.0).finished {}
+        let outcome = cmm.outcome(1);
+        let records = decode_points(&outcome.bytes, (outcome.format == 2).then_some(outcome.scale_mm)).unwrap();
+        let points: Vec<Point> =
+            records.iter().filter(|r| r.status == Status::Touched).map(|r| Point::from(r.position_mm)).collect();
+        // The true radius, as the reference sphere tells it in a run.
+        let true_radius_mm = radius_mm + 1e-3 * self.bench.spec.cmm.probe_radius_error_um;
+        task.register(&points, true_radius_mm + level_mm).unwrap().0
+    }
+
+    /// Makes the next correction of what was found.
+    fn correct(&mut self, found: &Registration) {
+        let task = &self.bench.task;
+        let used = || found.deviations.iter().filter(|d| d.status == PointStatus::Used);
+        let readings: Vec<Reading> =
+            used().map(|d| Reading { at_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect();
+        let error = match self.way {
+            Way::Regrind(_) => error_map(&readings, &task.map).unwrap(),
+            Way::Plain => unfiltered(&readings, &task.map),
+        };
+        let places: Vec<(Point, Vector)> = used().map(|d| (d.point, d.normal)).collect();
+        let answer = self.before.as_ref().map(|(correction, earlier)| {
+            let scatter_mm = earlier.rest_sigma_mm.hypot(error.rest_sigma_mm);
+            response([earlier, &error], [correction, &self.correction], &places, scatter_mm)
+        });
+        let answer = answer.filter(|_| self.way != Way::Plain);
+        self.known = self.known.after(&Seen { correction: &self.correction, error: &error, answer });
+        let forecast = self.known.forecast(&error);
+        self.forecast = Some([1e3 * forecast.rms_mm, 1e3 * forecast.sigma_mm]);
+        let next = match self.correction.next(&error, &self.known, &task.limits) {
+            Ok(step) => step.correction,
+            // The study goes on where a recipe would have no material left: what counts here is the form.
+            Err(StepError::BudgetSpent { .. }) => {
+                let changed = self.correction.changed(&error, &self.known);
+                Correction {
+                    level_mm: changed.level_mm - task.limits.depth_of_cut_mm,
+                    cycle: changed.cycle + 1,
+                    ..changed
+                }
+            }
+            Err(error) => panic!("{}: {error}", self.bench.name),
+        };
+        self.before = Some((std::mem::replace(&mut self.correction, next), error));
+    }
+
+    /// What a next part would begin with.
+    fn learned(&self) -> Option<(Correction, Knowledge)> {
+        Some((self.correction.clone(), self.known.clone()))
+    }
+
+    /// Deviations at the places without what a motion of the part could be.
+    fn without_motion(&self, deviations_mm: &[f64]) -> Vec<f64> {
+        let size = 50.0;
+        let row = |(p, n): &(Point, Vector)| {
+            let turn = p.coords.cross(n) / size;
+            nalgebra::Vector6::new(n.x, n.y, n.z, turn.x, turn.y, turn.z)
+        };
+        let rows: Vec<_> = self.bench.plan_of.iter().map(row).collect();
+        let gram: nalgebra::Matrix6<f64> = rows.iter().map(|row| row * row.transpose()).sum();
+        let right: nalgebra::Vector6<f64> = rows.iter().zip(deviations_mm).map(|(row, d)| row * *d).sum();
+        let parts = gram.symmetric_eigen();
+        let least = 1e-9 * parts.eigenvalues.max();
+        let motion: nalgebra::Vector6<f64> = (0..6)
+            .filter(|&k| parts.eigenvalues[k] > least)
+            .map(|k| {
+                let v = parts.eigenvectors.column(k);
+                v * (v.dot(&right) / parts.eigenvalues[k])
+            })
+            .sum();
+        rows.iter().zip(deviations_mm).map(|(row, d)| d - row.dot(&motion)).collect()
+    }
+}
+
+fn pass_of(task: &Task, level_mm: f64) -> Pass {
+    Pass {
+        spark_out: task.pass.spark_out_passes,
+        wheel_radius_mm: task.pass.wheel_radius_mm,
+        feed_mm_min: task.pass.feed_mm_min,
+        track_spacing_mm: task.pass.track_spacing_mm,
+        level_mm,
+        depth_of_cut_mm: task.pass.depth_of_cut_mm,
+        extent_mm: [task.pass.x_mm[0], task.pass.x_mm[1], task.pass.y_mm[0], task.pass.y_mm[1]],
+        nominal: [7; 32],
+    }
+}
+
+fn grind(grinder: &mut Grinder, job: u32, cycle: u16, map: &Map, pass: &Pass) {
+    let payload = |bytes: Vec<u8>, kind: u8| Some(Payload { bytes, identity: [kind; 32] });
+    let payloads = Payloads { plan: None, map: payload(map.encode(), 2), pass: payload(pass.encode(), 3) };
+    grinder.prepare(job, cycle, &payloads).unwrap();
+    grinder.begin();
+    loop {
+        let progress = grinder.advance(1000.0);
+        assert_eq!(progress.fault, 0);
+        if progress.finished {
+            break;
+        }
+    }
+    grinder.outcome(1);
+}
+
+/// What was measured, nearest point by nearest point.
+fn unfiltered(readings: &[Reading], options: &MapOptions) -> ErrorMap {
+    let net = Net::over(readings.iter().map(|r| r.at_mm), options.spacing_mm).unwrap();
+    let nearest = |[x, y]: [f64; 2]| {
+        let distance = |r: &&Reading| (r.at_mm[0] - x).powi(2) + (r.at_mm[1] - y).powi(2);
+        readings.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap().deviation_mm
+    };
+    let values_mm = (0..net.len()).map(|k| nearest(net.place_mm(k))).collect();
+    ErrorMap { values_mm, valid: vec![true; net.len()], ..error_map(readings, options).unwrap() }
+}
+
+fn rms_um(values_mm: &[f64]) -> f64 {
+    1e3 * (values_mm.iter().map(|v| v * v).sum::<f64>() / values_mm.len() as f64).sqrt()
+}
