@@ -12,15 +12,16 @@ use crate::compensation::{
 };
 use crate::device::{Coordinates, CorrectionMap, Identified, Measurement, Pass, Plan, PointStatus, Target, TargetKind};
 use crate::formats::{
-    FormatError, NominalInput, RegistrationDocument, save_registration, write_correction, write_error_map, write_points,
+    FormatError, NominalInput, RegistrationDocument, save_registration, write_correction, write_points,
 };
 use crate::geometry::{Point, Pose, Vector};
 use crate::measuring::{self, fit_sphere, sphere_targets};
 use crate::registration::{
-    MapLimits, Options, PointStatus as Fate, Registration, Start, register, weak_for_compensation,
+    MapLimits, Method, Options, PointStatus as Fate, Registration, Start, register, weak_for_compensation,
 };
-use crate::report::HeatMap;
 use crate::surface::{Nominal, Side};
+
+use super::maps;
 
 /// Everything that does not change during a run.
 #[derive(Debug)]
@@ -55,6 +56,8 @@ pub struct Task {
     pub place: MapLimits,
     /// How a pass is ground; level and identity are set for each cycle.
     pub pass: Pass,
+    /// Half the largest PV that is accepted: what lies within it about zero is drawn as within tolerance.
+    pub tolerance_mm: Option<f64>,
     /// Least share of the targets that must be touched.
     pub least_found: f64,
     /// Whether the cell is simulated; everything stored is marked so.
@@ -247,10 +250,13 @@ pub(super) fn register_cycle(
     let Some(points) = &cycle.points else { return failed("there are no points of this cycle".into()) };
     // The surface wanted by this pass stands above the nominal one by its level, and the ball rolls on that.
     let radius_mm = points.radius_mm.unwrap_or(task.probing.probe_radius_mm);
-    let ball_mm = if points.coordinates == Coordinates::Contacts { 0.0 } else { radius_mm };
-    let probe_radius_mm = ball_mm + cycle.correction.level_mm;
+    let contacts = points.coordinates == Coordinates::Contacts;
+    let ball_mm = if contacts { 0.0 } else { radius_mm };
+    let probe_radius_mm = (ball_mm + cycle.correction.level_mm).max(0.0);
+    // Without a ball and at the nominal surface, or below it by the last in-feed, there is no offset: it is laid on the surface itself.
+    let method = if contacts && probe_radius_mm == 0.0 { Method::Contact } else { task.registration.method };
     let start = if task.start_at_fixture { Start::Pose(task.fixture_cmm_from_model) } else { Start::Search };
-    let options = Options { probe_radius_mm, start, ..task.registration };
+    let options = Options { probe_radius_mm, method, start, ..task.registration };
     let mut found = match register(&task.nominal, &points.part, &options) {
         Ok(found) => found,
         Err(error) => return failed(error.to_string()),
@@ -261,7 +267,7 @@ pub(super) fn register_cycle(
     }
     let error = error_map(&readings(&found), &task.map).ok();
     // Every measurement leaves its map, whatever becomes of the correction.
-    if let Some(Err(why)) = error.as_ref().map(|map| save_map(task, folder, map)) {
+    if let Some(Err(why)) = error.as_ref().map(|map| maps::save(task, folder, map, &found)) {
         return failed(why);
     }
     let figures = figures(task, cycle, before, &found, error.as_ref());
@@ -373,15 +379,6 @@ pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &
 fn save_correction(task: &Task, folder: &Path, correction: &Correction) -> Result<(), FormatError> {
     let identity = task.payloads(correction).0.identity();
     write_correction(&folder.join("correction.csv"), correction, &task.part_identity, &identity, task.simulation)
-}
-
-fn save_map(task: &Task, folder: &Path, map: &ErrorMap) -> Result<(), String> {
-    write_error_map(&folder.join("error_map.csv"), map, task.simulation).map_err(|error| error.to_string())?;
-    let title =
-        if task.simulation { "Error of the part, filtered (SIMULATION)" } else { "Error of the part, filtered" };
-    HeatMap::of_lengths(title, "deviation", &map.samples_mm())
-        .and_then(|picture| picture.save_png(&folder.join("error_map.png")))
-        .map_err(|error| error.to_string())
 }
 
 /// Writes the points of a measurement, in the CMM frame.
