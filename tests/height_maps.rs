@@ -310,7 +310,22 @@ async fn an_interferometers_maps_close_the_loop() {
     let X3pFile::Map(map) = read_x3p(cycle.join("error_map.x3p")).unwrap() else { panic!("a map") };
     assert!(map.columns > 90 && map.measured_count() > 5000 && map.rms_mm() < 1e-3);
     assert!(fs::read_to_string(cycle.join("registration.json")).unwrap().contains("\"weak_directions\": []"));
-    regrind::journal::verify(&ran.folder).unwrap();
+    let figures: Value = serde_json::from_slice(&fs::read(cycle.join("figures.json")).unwrap()).unwrap();
+    let rows = figures["figures"].as_array().unwrap();
+    let named = |name: &str| rows.iter().find(|row| row["name"] == name).unwrap()["value"].as_f64().unwrap();
+    assert!((named("RMS") / last.rms_um - 1.0).abs() < 1e-9 && (named("PV") / last.pv_um - 1.0).abs() < 1e-9);
+    assert!(named("PVr") > 0.0 && named("coverage") > 95.0 && named("slope RMS") > 0.0, "{figures}");
+    assert!(figures["missing"].as_array().unwrap().is_empty(), "{figures}");
+    for name in ["error_map.csv", "error_map.svg", "error_map.png", "deviations.ply"] {
+        assert!(cycle.join(name).is_file(), "{name}");
+    }
+    // The report proves the record, and shows them.
+    let report = fs::read_to_string(regrind::report::write_run_report(&ran.folder).unwrap()).unwrap();
+    let notation = figures["iso_10110_5"]["notation"].as_str().unwrap();
+    println!("{notation}");
+    for words in ["<td>PVr</td>", "highest (stock left)", "36 Legendre terms", &notation.replace('<', "&lt;")] {
+        assert!(report.contains(words), "{words}");
+    }
 }
 
 // ---- the folders --------------------------------------------------------------------------------------------------------------------

@@ -1,12 +1,37 @@
-//! What a cycle leaves behind of the part's error: the map as text, X3P and picture, and the points in colours.
+//! What a cycle leaves behind of the part's error: figures, the map as text, X3P and picture, and the points in colours.
 
 use std::path::Path;
 
 use super::work::Task;
 use crate::compensation::ErrorMap;
-use crate::formats::{write_error_map, write_error_map_x3p};
+use crate::form::{FormOptions, Sample, figures, slope};
+use crate::formats::{FormatError, write_error_map, write_error_map_x3p, write_figures};
 use crate::registration::{PointStatus, Registration};
 use crate::report::{HeatMap, ReportError, save_coloured_ply};
+
+/// Length over which slopes are taken, in cut-offs of the map's filter: shorter waves are not in the map.
+const INTEGRATION: f64 = 0.5;
+
+/// Writes the figures of a cycle; where there are none the file says why.
+pub(super) fn save_figures(
+    task: &Task,
+    folder: &Path,
+    map: Option<&ErrorMap>,
+    found: &Registration,
+) -> Result<(), FormatError> {
+    let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
+    let samples: Vec<Sample> =
+        used.map(|d| Sample { at_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect();
+    let options = FormOptions { aperture: task.nominal.outline().cloned(), ..FormOptions::default() };
+    let made = figures(&samples, &options);
+    let cutoff_mm = task.map.cutoff_mm;
+    let slopes = map.map(|map| {
+        let size = [map.net.columns, map.net.rows];
+        slope(size, map.net.spacing_mm, &map.values_mm, &map.valid, INTEGRATION * cutoff_mm)
+    });
+    let slopes = slopes.as_ref().map(|slope| (slope.as_ref(), cutoff_mm));
+    write_figures(&folder.join("figures.json"), made.as_ref(), slopes, task.simulation)
+}
 
 /// Writes the map of a cycle's error and the points that it was made from.
 pub(super) fn save(task: &Task, folder: &Path, map: &ErrorMap, found: &Registration) -> Result<(), String> {

@@ -387,13 +387,14 @@ impl Drive {
                     "deviations.csv",
                     "deviation_uncertainty.csv",
                     "registration.json",
+                    "figures.json",
                     "error_map.csv",
                     "error_map.x3p",
                     "error_map.svg",
                     "error_map.png",
                     "deviations.ply",
                 ];
-                let count = if any { if map { files.len() } else { 3 } } else { 0 };
+                let count = if any { if map { files.len() } else { 4 } } else { 0 };
                 (number, event, &files[..count])
             }
             Computed::Filed(number, event, files) => return self.filed(number, event, files).await,

@@ -266,6 +266,9 @@ pub(super) fn register_cycle(
         return failed(error.to_string());
     }
     let error = error_map(&readings(&found), &task.map).ok();
+    if let Err(error) = maps::save_figures(task, folder, error.as_ref(), &found) {
+        return failed(error.to_string());
+    }
     // Every measurement leaves its map, whatever becomes of the correction.
     if let Some(Err(why)) = error.as_ref().map(|map| maps::save(task, folder, map, &found)) {
         return failed(why);

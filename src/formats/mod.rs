@@ -6,6 +6,7 @@
 mod document;
 mod error;
 pub mod exchange;
+mod figures;
 mod folder;
 mod height_map;
 mod layout;
@@ -26,6 +27,7 @@ pub use document::{
     Alternative, MeasuredInput, NominalInput, Program, RegistrationDocument, StandardUncertainty, save_registration,
 };
 pub use error::FormatError;
+pub use figures::write_figures;
 pub use folder::{ResultFolder, place_link, remove_link, remove_socket};
 pub use height_map::HeightMap;
 pub use map::{write_correction, write_error_map};
@@ -171,13 +173,19 @@ pub fn is_map(path: impl AsRef<Path>) -> Result<bool, FormatError> {
     Ok(MapKind::of(&whole::open(path.as_ref())?.head).is_some())
 }
 
-/// Parses the bytes of a map and returns its measured points and what the reader had to decide; none where the bytes are no map.
-fn parse_map(path: &Path, bytes: &[u8]) -> Option<Result<(Vec<Point>, Vec<String>), FormatError>> {
-    let of_map = |map: HeightMap| (map.points(), map.notes);
+/// The measured points of a map, and what the reader had to decide about it.
+struct MapPoints {
+    points: Vec<Point>,
+    notes: Vec<String>,
+}
+
+/// Parses the bytes of a map; none where the bytes are no map.
+fn parse_map(path: &Path, bytes: &[u8]) -> Option<Result<MapPoints, FormatError>> {
+    let of_map = |map: HeightMap| MapPoints { points: map.points(), notes: map.notes };
     Some(match MapKind::of(bytes)? {
         MapKind::X3p => parse_x3p(path, bytes).map(|file| match file {
             X3pFile::Map(map) => of_map(map),
-            X3pFile::Points(points) => (points, Vec::new()),
+            X3pFile::Points(points) => MapPoints { points, notes: Vec::new() },
         }),
         MapKind::Sdf => parse_sdf(path, bytes).map(of_map),
         MapKind::MetroPro => parse_metropro(path, bytes).map(of_map),

@@ -20,7 +20,7 @@ use super::super::error::excerpt;
 use super::super::layout::{Fields, Preamble, is_comment};
 use super::super::number::{Decimal, coordinate};
 use super::super::points::parse_points_with;
-use super::super::{FormatError, MapKind, parse_map, ply, whole};
+use super::super::{FormatError, MapKind, MapPoints, parse_map, ply, whole};
 use super::ExchangeError;
 use crate::geometry::Point;
 
@@ -221,7 +221,7 @@ pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<Resul
     let statements = read_statements(path, text)?;
     let coordinates = agreed_coordinates(path, &statements, content)?;
     if let Some(map) = parse_map(path, text) {
-        let (points, notes) = map?;
+        let MapPoints { points, notes } = map?;
         let (indices, names, probe_radius_mm) = (None, None, None);
         return Ok(ResultFile {
             points,
