@@ -90,8 +90,9 @@ impl Interferometer {
         let piston_mm = 0.137 * f64::from(self.pictures) - 0.4;
         let [columns, rows] = SIZE;
         let place = |i: usize, j: usize| [CORNER_MM[0] + i as f64 * PITCH_MM, CORNER_MM[1] + j as f64 * PITCH_MM];
-        let lost =
-            |i: usize, j: usize| (i * 7919 + j * 104_729) % 41 == 0 || (i as f64 - 70.0).hypot(j as f64 - 30.0) < 2.5;
+        let lost = |i: usize, j: usize| {
+            (i * 7919 + j * 104_729).is_multiple_of(41) || (i as f64 - 70.0).hypot(j as f64 - 30.0) < 2.5
+        };
         let places = (0..rows).rev().flat_map(|j| (0..columns).map(move |i| (i, j)));
         let sample = |(i, j)| if lost(i, j) { None } else { self.height(place(i, j)).map(|z| z + piston_mm) };
         places.map(sample).collect()
@@ -332,7 +333,7 @@ async fn an_interferometers_maps_close_the_loop() {
 
 /// The maps of a small surface in each format, with one sample that was not measured.
 fn small_maps(folder: &Path) -> Vec<(PathBuf, HeightMap)> {
-    let sample = |k: usize| (k != 7).then(|| 1e-3 * (k as f64 - 5.0));
+    let sample = |k: usize| (k != 7).then_some(1e-3 * (k as f64 - 5.0));
     let map = HeightMap::new(Path::new("map"), [5, 4], [0.0; 2], [0.25, 0.25], (0..20).map(sample)).unwrap();
     let record = MapRecord {
         date: "2026-03-01T12:00:00Z".into(),

@@ -1,7 +1,7 @@
 //! The polynomials that form is taken apart into.
 
 use crate::geometry::Aperture;
-use crate::surface::analytic::{Zernike, ZernikeDefinition, ZernikeNormalisation, ZernikeNumbering};
+use crate::surface::analytic::{ZernikeNumbering, jacobi_values};
 
 use super::{FormError, Sample};
 
@@ -110,20 +110,11 @@ impl Basis {
             return Err(FormError::Terms { terms, basis: self.name(), most: self.most() });
         }
         match self {
+            Self::Zernike { radius_mm, .. } if !(*radius_mm > 0.0 && radius_mm.is_finite()) => Err(FormError::NoArea),
             Self::Zernike { numbering, centre_mm, radius_mm } => {
-                let unit = |k: u32| {
-                    Zernike::try_from(&ZernikeDefinition {
-                        numbering: *numbering,
-                        normalisation_radius_mm: *radius_mm,
-                        coefficients_mm: [((first(*numbering) + k).to_string(), 1.0)].into(),
-                        normalisation: Some(ZernikeNormalisation::Orthonormal),
-                        base: None,
-                    })
-                };
-                let polynomials: Result<Vec<Zernike>, _> = (0..terms as u32).map(unit).collect();
-                // The indices exist; only a radius that is none is left.
-                let polynomials = polynomials.map_err(|_| FormError::NoArea)?;
-                Ok(Terms::Zernike { polynomials, centre_mm: *centre_mm, radius_mm: *radius_mm })
+                let index = |k: u32| numbering.degree_and_order(first(*numbering) + k).unwrap_or_default();
+                let orders = Order::grouped((0..terms as u32).map(index));
+                Ok(Terms::Zernike { orders, terms, centre_mm: *centre_mm, radius_mm: *radius_mm })
             }
             Self::Legendre { half_mm, .. } if !(half_mm[0] > 0.0 && half_mm[1] > 0.0) => Err(FormError::NoArea),
             Self::Legendre { centre_mm, half_mm } => {
@@ -136,14 +127,14 @@ impl Basis {
 
 /// The first terms of a basis.
 pub(super) enum Terms {
-    Zernike { polynomials: Vec<Zernike>, centre_mm: [f64; 2], radius_mm: f64 },
+    Zernike { orders: Vec<Order>, terms: usize, centre_mm: [f64; 2], radius_mm: f64 },
     Legendre { degrees: Vec<[usize; 2]>, centre_mm: [f64; 2], half_mm: [f64; 2] },
 }
 
 impl Terms {
     pub(super) fn len(&self) -> usize {
         match self {
-            Self::Zernike { polynomials, .. } => polynomials.len(),
+            Self::Zernike { terms, .. } => *terms,
             Self::Legendre { degrees, .. } => degrees.len(),
         }
     }
@@ -152,12 +143,14 @@ impl Terms {
     pub(super) fn values(&self, index: usize, sample: &Sample, row: &mut [f64]) -> Result<(), FormError> {
         let [x, y] = sample.at_mm;
         match self {
-            Self::Zernike { polynomials, centre_mm, radius_mm } => {
+            Self::Zernike { orders, centre_mm, radius_mm, .. } => {
                 let (x, y) = (x - centre_mm[0], y - centre_mm[1]);
-                for (value, polynomial) in row.iter_mut().zip(polynomials) {
-                    let far = FormError::FarOut { index, distance_mm: x.hypot(y), radius_mm: *radius_mm };
-                    *value = polynomial.sag_and_gradient(x, y).ok_or(far)?.0;
+                let (u, v) = (x / radius_mm, y / radius_mm);
+                let q = u * u + v * v;
+                if q > FAR * FAR {
+                    return Err(FormError::FarOut { index, distance_mm: x.hypot(y), radius_mm: *radius_mm });
                 }
+                zernike(orders, [u, v], q, row);
             }
             Self::Legendre { degrees, centre_mm, half_mm } => {
                 let [u, v] = [(x - centre_mm[0]) / half_mm[0], (y - centre_mm[1]) / half_mm[1]];
@@ -168,6 +161,51 @@ impl Terms {
             }
         }
         Ok(())
+    }
+}
+
+/// How far beyond their disc Zernike polynomials are still evaluated, in radii.
+const FAR: f64 = 1.5;
+/// Most radial polynomials of one azimuthal order: up to degree 13, and the one of degree 12 of Fringe.
+const RADIAL: usize = 7;
+
+/// The Zernike terms of one azimuthal order.
+pub(super) struct Order {
+    m: u32,
+    /// Radial polynomials needed.
+    radial: usize,
+    /// For each term its place in the row, (n - m) / 2, whether it is a sine, and the factor that makes its mean square 1.
+    terms: Vec<(usize, usize, bool, f64)>,
+}
+
+impl Order {
+    /// Sorts terms, given by degree and azimuthal order, by the latter.
+    fn grouped(terms: impl Iterator<Item = (u32, i32)>) -> Vec<Self> {
+        let mut orders: Vec<Self> = Vec::new();
+        for (place, (n, m)) in terms.enumerate() {
+            let k = ((n - m.unsigned_abs()) / 2) as usize;
+            let factor = (f64::from(n + 1) * if m == 0 { 1.0 } else { 2.0 }).sqrt();
+            while orders.len() <= m.unsigned_abs() as usize {
+                orders.push(Self { m: orders.len() as u32, radial: 0, terms: Vec::new() });
+            }
+            let order = &mut orders[m.unsigned_abs() as usize];
+            order.radial = order.radial.max(k + 1);
+            order.terms.push((place, k, m < 0, factor));
+        }
+        orders
+    }
+}
+
+/// Writes the values of all terms: rho^m cos and sin are the parts of (u + i v)^m, the rest is P_k^(0, m)(2 rho^2 - 1).
+fn zernike(orders: &[Order], [u, v]: [f64; 2], q: f64, row: &mut [f64]) {
+    let mut power = [1.0, 0.0];
+    let mut radial = [0.0; RADIAL];
+    for order in orders {
+        jacobi_values(order.m, 2.0 * q - 1.0, &mut radial[..order.radial]);
+        for &(place, k, sine, factor) in &order.terms {
+            row[place] = factor * radial[k] * power[usize::from(sine)];
+        }
+        power = [power[0] * u - power[1] * v, power[0] * v + power[1] * u];
     }
 }
 
@@ -217,6 +255,31 @@ mod tests {
         let square = Aperture::Rectangle { centre_mm: [0.0; 2], width_mm: 6.0, height_mm: 8.0 };
         assert!(matches!(Basis::zernike(&square), Basis::Zernike { radius_mm: 5.0, .. }));
         assert!(matches!(rectangle.terms(0), Err(FormError::Terms { most: 105, .. })));
+    }
+
+    #[test]
+    fn zernike_terms_are_those_of_the_surfaces_of_that_name() {
+        use crate::surface::analytic::{Zernike, ZernikeDefinition, ZernikeNormalisation};
+        for numbering in [ZernikeNumbering::Fringe, ZernikeNumbering::Noll, ZernikeNumbering::Ansi] {
+            let basis = Basis::Zernike { numbering, centre_mm: [1.0, -2.0], radius_mm: 20.0 };
+            let terms = basis.terms(basis.most()).unwrap();
+            let mut row = vec![f64::NAN; terms.len()];
+            for at_mm in [[1.0, -2.0], [8.0, 3.0], [-12.0, 11.5], [21.0, -2.0], [1.0, -27.0]] {
+                terms.values(0, &Sample { at_mm, deviation_mm: 0.0 }, &mut row).unwrap();
+                for (k, value) in row.iter().enumerate() {
+                    let written = ZernikeDefinition {
+                        numbering,
+                        normalisation_radius_mm: 20.0,
+                        coefficients_mm: [((first(numbering) + k as u32).to_string(), 1.0)].into(),
+                        normalisation: Some(ZernikeNormalisation::Orthonormal),
+                        base: None,
+                    };
+                    let surface = Zernike::try_from(&written).unwrap();
+                    let (expected, _) = surface.sag_and_gradient(at_mm[0] - 1.0, at_mm[1] + 2.0).unwrap();
+                    assert!((value - expected).abs() <= 1e-11 * expected.abs().max(1.0), "{}: {value}", basis.term(k));
+                }
+            }
+        }
     }
 
     #[test]

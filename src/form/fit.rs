@@ -1,11 +1,12 @@
 //! Least squares of polynomials over the points as they lie.
 //!
-//! The rows [terms | deviation] go through a QR decomposition, a share at a time, so that only a small triangle R is kept: its last
-//! column holds Q^T d. The columns of Q are the terms made orthogonal on the true aperture, in their order (Gram and Schmidt);
-//! Q^T d / sqrt(n) is the root mean square that each of them takes, whatever terms follow. R^-1 Q^T d are the
-//! coefficients of the terms themselves.
+//! The rows [terms | deviation] go through a QR decomposition, share by share, of which only the small triangles R are kept and
+//! decomposed again in their order, so that the number of cores does not change the result. The last column of the last R holds
+//! Q^T d. The columns of Q are the terms made orthogonal on the true aperture, in their order (Gram and Schmidt); Q^T d / sqrt(n) is
+//! the root mean square that each of them takes, whatever terms follow. R^-1 Q^T d are the coefficients of the terms themselves.
 
 use nalgebra::DMatrix;
+use rayon::prelude::*;
 
 use super::basis::{Basis, Terms};
 use super::{FormError, Sample, check};
@@ -78,12 +79,11 @@ impl Fit {
     /// A sample far outside of the polynomials' domain.
     pub fn values_mm(&self, samples: &[Sample]) -> Result<Vec<f64>, FormError> {
         let terms: Terms = self.basis.terms(self.coefficients_mm.len())?;
-        let mut row = vec![0.0; terms.len()];
-        let value = |(index, sample): (usize, &Sample)| {
-            terms.values(index, sample, &mut row)?;
+        let value = |row: &mut Vec<f64>, (index, sample): (usize, &Sample)| {
+            terms.values(index, sample, row)?;
             Ok(row.iter().zip(&self.coefficients_mm).map(|(value, c)| value * c).sum())
         };
-        samples.iter().enumerate().map(value).collect()
+        samples.par_iter().enumerate().map_init(|| vec![0.0; terms.len()], value).collect()
     }
 }
 
@@ -101,20 +101,31 @@ pub(super) struct Solved {
 pub(super) fn solve(
     terms: usize,
     samples: &[Sample],
-    mut row: impl FnMut(usize, &Sample, &mut [f64]) -> Result<(), FormError>,
+    row: impl Fn(usize, &Sample, &mut [f64]) -> Result<(), FormError> + Sync,
 ) -> Result<Solved, FormError> {
     let width = terms + 1;
-    let mut r = DMatrix::<f64>::zeros(width, width);
-    let mut values = vec![0.0; terms];
-    for (share, chunk) in samples.chunks(SHARE).enumerate() {
-        let mut stacked = DMatrix::zeros(width + chunk.len(), width);
-        stacked.rows_mut(0, width).copy_from(&r);
+    let triangles = samples.par_chunks(SHARE).enumerate().map(|(share, chunk)| {
+        let mut rows = DMatrix::zeros(chunk.len(), width);
+        let mut values = vec![0.0; terms];
         for (k, sample) in chunk.iter().enumerate() {
             row(share * SHARE + k, sample, &mut values)?;
             for (column, value) in values.iter().enumerate() {
-                stacked[(width + k, column)] = *value;
+                rows[(k, column)] = *value;
             }
-            stacked[(width + k, terms)] = sample.deviation_mm;
+            rows[(k, terms)] = sample.deviation_mm;
+        }
+        Ok(rows.qr().r())
+    });
+    let triangles: Vec<DMatrix<f64>> = triangles.collect::<Result<_, FormError>>()?;
+    let mut r = DMatrix::<f64>::zeros(width, width);
+    for some in triangles.chunks(SHARE.div_ceil(width)) {
+        let height = width + some.iter().map(DMatrix::nrows).sum::<usize>();
+        let mut stacked = DMatrix::zeros(height, width);
+        stacked.rows_mut(0, width).copy_from(&r);
+        let mut begin = width;
+        for triangle in some {
+            stacked.rows_mut(begin, triangle.nrows()).copy_from(triangle);
+            begin += triangle.nrows();
         }
         r = stacked.qr().r();
     }

@@ -91,7 +91,7 @@ pub fn iso_10110(samples: &[Sample], aperture: &Aperture, wavelength_nm: f64) ->
 
 /// Fits P_0 to P_6 of 2 (r/R)^2 - 1, Legendre's polynomials, which are the Zernike terms without azimuth but for a factor; fewer where the
 /// points do not carry them. Returns the values at the samples.
-fn symmetric(samples: &[Sample], square: impl Fn(&Sample) -> f64) -> Result<Vec<f64>, FormError> {
+fn symmetric(samples: &[Sample], square: impl Fn(&Sample) -> f64 + Sync) -> Result<Vec<f64>, FormError> {
     let values = |s: &Sample| {
         let t = 2.0 * square(s) - 1.0;
         let mut row = [1.0; SYMMETRIC + 1];
