@@ -6,11 +6,11 @@
 //! ```text
 //!  recipe.toml -> recipe --+                                             +-> formats, report
 //!                          +-> setup -> drive -> device ~~wire~~ [ real machine | sim ]
-//!  cell.toml   -> config --+            |  ^ \--> measuring, registration -> compensation   (blocking threads, pure)
+//!  cell.toml   -> config --+            |  ^ \--> measuring, registration -> compensation, form   (pure)
 //!                                 Event v  | Command
 //!                                      cell            journal   (written before a command is carried out)
 //!
-//!  pure: geometry, surface, measuring, registration, compensation, cell: no file, no clock, no randomness, no logging
+//!  pure: geometry, surface, measuring, registration, compensation, form, cell: no file, no clock, no randomness, no logging
 //! ```
 //!
 //! Each room knows as little as it can: `cell` knows no point, `registration` no machine, `device` no recipe; `sim`, a crate
@@ -26,6 +26,7 @@ pub mod config;
 pub mod device;
 pub mod document;
 pub mod drive;
+pub mod form;
 pub mod formats;
 pub mod geometry;
 pub mod journal;

@@ -122,6 +122,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
             allowance_mm: recipe.grinding.allowance_mm,
             removal_budget_mm: recipe.compensation.removal_budget_mm,
         },
+        tolerance_mm: recipe.acceptance.pv_mm.map(|pv_mm| 0.5 * pv_mm),
         least_found: recipe.measure.minimum_coverage,
         simulation: cell.simulated,
     };

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Rooms that compute and decide, and do nothing else.
-const PURE: [&str; 6] = ["geometry", "surface", "measuring", "registration", "compensation", "cell"];
+const PURE: [&str; 7] = ["geometry", "surface", "measuring", "registration", "compensation", "form", "cell"];
 
 /// What a pure room has no word for.
 const IMPURE: [&str; 13] = [

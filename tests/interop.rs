@@ -1,7 +1,7 @@
-//! Against other people's Modbus: machines and a client on pymodbus, written from docs/modbus.md alone (tests/interop/); jobs, and a
-//! whole run of the program.
+//! Against other people's programs: Modbus machines and a client on pymodbus, written from docs/modbus.md alone, in jobs and in a whole
+//! run; and our maps in x3pio (tests/interop/).
 //!
-//! They run with the Python that REGRIND_PYTHON names, which has to have pymodbus, or in an environment that is made below the target
+//! They run with the Python that REGRIND_PYTHON names, which has to have both, or in an environment that is made below the target
 //! folder. Where neither can be had the tests say so and pass, unless REGRIND_INTEROP=1 says that they have to run.
 
 use std::io::{BufRead, BufReader};
@@ -10,10 +10,12 @@ use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
+use regrind::compensation::{ErrorMap, Net};
 use regrind::device::{
     Cmm, Coordinates, CorrectionMap, Grinder, Identified, Interrupt, Job, Machine, MachineKind, ModbusCmm,
     ModbusGrinder, ModbusSettings, Outcome, Pass, Plan, PointStatus, State, Status, Target, TargetKind, Wire, digest,
 };
+use regrind::formats::write_error_map_x3p;
 use regrind::journal::verify;
 use regrind_sim::body::Kind;
 use regrind_sim::registers::{self, MachineOptions};
@@ -31,15 +33,15 @@ fn scripts() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop")
 }
 
-/// A Python that has pymodbus, made once.
+/// A Python that has what the tests need, made once.
 fn python() -> Option<&'static Path> {
     static PYTHON: OnceLock<Result<PathBuf, String>> = OnceLock::new();
     match PYTHON.get_or_init(find_python) {
         Ok(python) => Some(python),
         Err(why) => {
             let must = std::env::var_os("REGRIND_INTEROP").is_some_and(|value| value == "1");
-            assert!(!must, "REGRIND_INTEROP=1, and there is no pymodbus: {why}");
-            println!("left out: no pymodbus to talk to ({why}); name a Python that has it in REGRIND_PYTHON");
+            assert!(!must, "REGRIND_INTEROP=1, and there is no Python for it: {why}");
+            println!("left out: no pymodbus and x3pio ({why}); name a Python that has them in REGRIND_PYTHON");
             None
         }
     }
@@ -48,7 +50,7 @@ fn python() -> Option<&'static Path> {
 fn find_python() -> Result<PathBuf, String> {
     if let Some(named) = std::env::var_os("REGRIND_PYTHON") {
         let named = PathBuf::from(named);
-        return run(Command::new(&named).args(["-c", "import pymodbus"])).map(|()| named);
+        return run(Command::new(&named).args(["-c", "import pymodbus, x3pio"])).map(|()| named);
     }
     let wanted = std::fs::read_to_string(scripts().join("requirements.txt")).map_err(|error| error.to_string())?;
     let home = Path::new(env!("CARGO_TARGET_TMPDIR")).join("interop-python");
@@ -285,4 +287,41 @@ async fn a_pymodbus_client_has_our_simulated_cmm_measure() {
     assert_eq!(points.len(), 10, "{said}");
     assert_eq!(points[3], "3 1 0 3.0 1.5 1.5");
     assert_eq!(serving.machine(1).unwrap().with(|machine| machine.began().len()), 1);
+}
+
+// ---- our maps, their reader ---------------------------------------------------------------------------------------------------------
+
+#[test]
+fn our_x3p_opens_in_another_reader_with_equal_values() {
+    let Some(python) = python() else { return };
+    let net = Net { columns: 31, rows: 17, first_mm: [-51.0, -31.0], spacing_mm: [3.4, 3.875] };
+    let values_mm: Vec<f64> = (0..net.len()).map(|k| 1e-3 * (0.37 * k as f64).sin() + 1e-9 * k as f64).collect();
+    let valid: Vec<bool> = (0..net.len()).map(|k| k % 7 != 3).collect();
+    let map = ErrorMap { net, values_mm, valid, rest_sigma_mm: 0.0 };
+    let home = tempfile::tempdir().unwrap();
+    let path = home.path().join("error_map.x3p");
+    write_error_map_x3p(&path, &map, "2026-03-01T12:00:00Z", true).unwrap();
+    let done = Command::new(python).arg(scripts().join("x3p.py")).arg(&path).output().unwrap();
+    let said = String::from_utf8_lossy(&done.stdout);
+    assert!(done.status.success(), "{said}{}", String::from_utf8_lossy(&done.stderr));
+    let read: serde_json::Value = serde_json::from_str(&said).unwrap();
+    assert_eq!((&read["columns"], &read["rows"]), (&31.into(), &17.into()));
+    let list = |name: &str| -> Vec<Option<f64>> { serde_json::from_value(read[name].clone()).unwrap() };
+    let (x, y, z) = (list("x_m"), list("y_m"), list("z_m"));
+    assert_eq!([x.len(), y.len(), z.len()], [net.len(); 3]);
+    for k in 0..net.len() {
+        let [px, py] = net.place_mm(k);
+        let is = |found: Option<f64>, mm: f64| found.is_some_and(|m| (1e3 * m - mm).abs() <= 1e-12 * mm.abs().max(1.0));
+        assert!(is(x[k], px) && is(y[k], py), "{k}: {:?} {:?}", x[k], y[k]);
+        assert_eq!(
+            z[k].map(|m| 1e3 * m - map.values_mm[k]).map(|d| d.abs() < 1e-18),
+            map.valid[k].then_some(true),
+            "{k}"
+        );
+    }
+    // The mask says the same as the values.
+    let mask: Vec<bool> = serde_json::from_value(read["mask"].clone()).unwrap();
+    assert_eq!(mask, map.valid);
+    assert!(read["comment"].as_str().unwrap().starts_with("SIMULATION"), "{read}");
+    assert_eq!(read["date"], "2026-03-01T12:00:00+00:00");
 }

@@ -34,6 +34,8 @@ pub(super) enum Failure {
     ProbeRadius { source: RegistrationError },
     #[error("--probe-radius is missing; give the radius of the probe in millimetres, or --method contact")]
     NoProbeRadius,
+    #[error("{path}: a map holds points of the surface and no centres of a probe; give --method contact")]
+    MapOfContacts { path: PathBuf },
     #[error("{path}: --projection is for points, and this is {what}; leave it out")]
     Projection { path: PathBuf, what: &'static str },
     #[error(

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use regrind::formats::{
-    Alternative, NominalInput, RegistrationDocument, ResultFolder, read_measured, save_registration,
+    Alternative, NominalInput, RegistrationDocument, ResultFolder, is_map, read_measured, save_registration,
 };
 use regrind::geometry::{Point, Pose};
 use regrind::registration::{Loss, Method, Options, ProbeSide, Start, register};
@@ -25,7 +25,7 @@ pub(super) struct Arguments {
     /// Nominal surface: points as text or PLY, a mesh as STL or PLY, or a TOML definition, in mm
     #[arg(long, value_name = "FILE")]
     nominal: PathBuf,
-    /// Measured points as text or PLY, in mm
+    /// Measured points as text or PLY, in mm, or an interferometer's or profilometer's map as X3P, SDF or MetroPro
     #[arg(long, value_name = "FILE")]
     measured: PathBuf,
     /// Radius of the probe in mm; not needed with --method contact
@@ -198,6 +198,9 @@ fn options(arguments: &Arguments) -> Result<Options, Failure> {
 /// Reads both files at once; the nominal surface is made while the measured points are still read.
 fn read_inputs(arguments: &Arguments) -> Result<(Nominal, Vec<Point>), Failure> {
     let (path, projection) = (&arguments.nominal, arguments.projection);
+    if is_map(&arguments.measured)? && !matches!(arguments.method, MethodName::Contact) {
+        return Err(Failure::MapOfContacts { path: arguments.measured.clone() });
+    }
     std::thread::scope(|scope| {
         let nominal = scope
             .spawn(move || nominal::read(path, projection).and_then(|file| nominal::surface(path, file, projection)));

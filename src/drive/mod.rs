@@ -12,6 +12,7 @@
 //! whether it can be written or not.
 
 mod control;
+mod maps;
 mod notice;
 mod outcome;
 mod record;
@@ -395,10 +396,14 @@ impl Drive {
                     "deviations.csv",
                     "deviation_uncertainty.csv",
                     "registration.json",
+                    "figures.json",
                     "error_map.csv",
+                    "error_map.x3p",
+                    "error_map.svg",
                     "error_map.png",
+                    "deviations.ply",
                 ];
-                let count = if any { if map { 5 } else { 3 } } else { 0 };
+                let count = if any { if map { files.len() } else { 4 } } else { 0 };
                 (number, event, &files[..count])
             }
             Computed::Filed(number, event, files) => return self.filed(number, event, files).await,

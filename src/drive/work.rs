@@ -14,15 +14,17 @@ use crate::compensation::{
 use crate::device::{Coordinates, CorrectionMap, Identified, Measurement, Pass, Plan, PointStatus, Target, TargetKind};
 use crate::formats::{
     CorrectionIdentities, FormatError, Learned, NominalInput, RegistrationDocument, save_registration,
-    write_correction, write_error_map, write_points,
+    write_correction, write_points,
 };
 use crate::geometry::{Point, Pose, Vector};
 use crate::measuring::{self, fit_sphere, sphere_targets};
 use crate::registration::{
-    MapLimits, Options, PointStatus as Fate, Registration, RegistrationError, Start, register, weak_for_compensation,
+    MapLimits, Method, Options, PointStatus as Fate, Registration, RegistrationError, Start, register,
+    weak_for_compensation,
 };
-use crate::report::HeatMap;
 use crate::surface::{Nominal, Side};
+
+use super::maps;
 
 /// Everything that does not change during a run.
 #[derive(Debug)]
@@ -65,6 +67,8 @@ pub struct Task {
     pub place: MapLimits,
     /// How a pass is ground; level and identity are set for each cycle.
     pub pass: Pass,
+    /// Half the largest PV that is accepted: what lies within it about zero is drawn as within tolerance.
+    pub tolerance_mm: Option<f64>,
     /// Least share of the targets that must be touched.
     pub least_found: f64,
     /// Whether the cell is simulated; everything stored is marked so.
@@ -164,7 +168,9 @@ impl Task {
     ) -> Result<(Registration, Options), RegistrationError> {
         let at_fixture = Start::Pose(self.fixture_cmm_from_model);
         let start = if self.start_at_fixture { at_fixture } else { Start::Search };
-        let options = Options { probe_radius_mm, start, ..self.registration };
+        // Without a ball and at the nominal surface, or below it by the last in-feed, there is no offset: the points lie on the surface.
+        let method = if probe_radius_mm == 0.0 { Method::Contact } else { self.registration.method };
+        let options = Options { probe_radius_mm, method, start, ..self.registration };
         let found = register(&self.nominal, points, &options)?;
         if self.start_at_fixture || !found.verdict.weak_directions.iter().any(|weak| weak.held) {
             return Ok((found, options));
@@ -303,7 +309,7 @@ pub(super) fn register_cycle(
     // The surface wanted by this pass stands above the nominal one by its level, and the ball rolls on that.
     let radius_mm = points.radius_mm.unwrap_or(task.probing.probe_radius_mm);
     let ball_mm = if points.coordinates == Coordinates::Contacts { 0.0 } else { radius_mm };
-    let probe_radius_mm = ball_mm + cycle.correction.level_mm;
+    let probe_radius_mm = (ball_mm + cycle.correction.level_mm).max(0.0);
     let (mut found, options) = match task.register(&points.part, probe_radius_mm) {
         Ok(found) => found,
         Err(error) => return failed(error.to_string()),
@@ -313,8 +319,11 @@ pub(super) fn register_cycle(
         return failed(error.to_string());
     }
     let error = error_map(&readings(&found), &task.map).ok();
+    if let Err(error) = maps::save_figures(task, folder, error.as_ref(), &found) {
+        return failed(error.to_string());
+    }
     // Every measurement leaves its map, whatever becomes of the correction.
-    if let Some(Err(why)) = error.as_ref().map(|map| save_map(task, folder, map)) {
+    if let Some(Err(why)) = error.as_ref().map(|map| maps::save(task, folder, map, &found)) {
         return failed(why);
     }
     let answer = error.as_ref().and_then(|error| answer(before?, cycle, &found, error));
@@ -475,15 +484,6 @@ fn save_correction(task: &Task, folder: &Path, correction: &Correction, base: &C
     let [identity, replaces] = [correction, base].map(|correction| task.payloads(correction).0.identity());
     let identities = CorrectionIdentities { part: task.part_identity, map: identity, replaces };
     write_correction(&folder.join("correction.csv"), correction, &identities, task.simulation)
-}
-
-fn save_map(task: &Task, folder: &Path, map: &ErrorMap) -> Result<(), String> {
-    write_error_map(&folder.join("error_map.csv"), map, task.simulation).map_err(|error| error.to_string())?;
-    let title =
-        if task.simulation { "Error of the part, filtered (SIMULATION)" } else { "Error of the part, filtered" };
-    HeatMap::of_lengths(title, "deviation", &map.samples_mm())
-        .and_then(|picture| picture.save_png(&folder.join("error_map.png")))
-        .map_err(|error| error.to_string())
 }
 
 /// What the next part of this kind can begin with; none where this run did not get so far.

@@ -303,6 +303,58 @@ pub enum FormatError {
         /// What to do.
         remedy: &'static str,
     },
+    /// A container that is damaged, encrypted or packed in a way that is not read.
+    #[error("{path}: the zip container cannot be read: {source}; copy or export the file again")]
+    Container {
+        /// The file.
+        path: PathBuf,
+        /// The reason.
+        source: zip::result::ZipError,
+    },
+    /// A container without something that belongs into it.
+    #[error("{path}: the container has no {expected}; export the file again")]
+    Missing {
+        /// The file.
+        path: PathBuf,
+        /// What is not there.
+        expected: String,
+    },
+    /// XML that is none.
+    #[error("{path}, {entry}: no readable XML: {source}; export the file again")]
+    Xml {
+        /// The file.
+        path: PathBuf,
+        /// The entry of the container.
+        entry: String,
+        /// The reason.
+        source: roxmltree::Error,
+    },
+    /// Bytes that are not those that were sealed.
+    #[error(
+        "{path}: {entry} was changed or damaged after it was written: its MD5 is {found}, sealed was {expected}; copy or export \
+         the file again"
+    )]
+    Checksum {
+        /// The file.
+        path: PathBuf,
+        /// The entry of the container.
+        entry: String,
+        /// The sum on record, in lower case.
+        expected: String,
+        /// The sum of what is there.
+        found: String,
+    },
+    /// A map of which nobody knows how large it is.
+    #[error(
+        "{path}: the map has no lateral scale (the resolution in the file is {found} m a pixel), so that its size in x and y is \
+         not known; calibrate the lateral resolution in the instrument's program and save the map again"
+    )]
+    NoLateralScale {
+        /// The file.
+        path: PathBuf,
+        /// What stands for it in the file.
+        found: f64,
+    },
     /// A file could not be written; nothing of that name was changed.
     #[error("{path}: cannot be written, {action}: {source}; check the name, the permissions and the space left")]
     Unwritable {

@@ -6,16 +6,21 @@
 mod document;
 mod error;
 pub mod exchange;
+mod figures;
 mod folder;
+mod height_map;
 mod layout;
 mod learned;
 mod map;
+pub mod metropro;
 mod number;
 pub mod ply;
 pub mod points;
 pub mod registration;
+pub mod sdf;
 pub mod stl;
 mod whole;
+pub mod x3p;
 
 use std::path::Path;
 
@@ -23,14 +28,19 @@ pub use document::{
     Alternative, MeasuredInput, NominalInput, Program, RegistrationDocument, StandardUncertainty, save_registration,
 };
 pub use error::FormatError;
+pub use figures::write_figures;
 pub use folder::{ResultFolder, place_link, remove_link, remove_socket};
+pub use height_map::HeightMap;
 pub use learned::{LEARNED, Learned, LearnedError};
 pub use map::{CorrectionIdentities, write_correction, write_error_map};
+pub use metropro::{parse_metropro, read_metropro};
 pub use number::LIMIT_MM;
 pub use ply::{PlyFile, parse_ply, read_ply};
 pub use points::{parse_points, read_points};
 pub use registration::{DeviationRow, write_column, write_deviations, write_json_atomic, write_points};
+pub use sdf::{parse_sdf, read_sdf};
 pub use stl::{StlFile, parse_stl, read_stl};
+pub use x3p::{MapRecord, X3pFile, parse_x3p, read_x3p, write_error_map_x3p, write_x3p};
 
 use crate::geometry::Point;
 
@@ -59,6 +69,28 @@ enum Kind {
     Ply,
     Stl,
     Toml,
+    Map(MapKind),
+}
+
+/// A format of maps.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum MapKind {
+    X3p,
+    Sdf,
+    MetroPro,
+}
+
+impl MapKind {
+    /// Tells the format by the first bytes; none where it is no map.
+    fn of(head: &[u8]) -> Option<Self> {
+        if x3p::is_zip(head) {
+            return Some(Self::X3p);
+        }
+        if sdf::is_sdf(head) {
+            return Some(Self::Sdf);
+        }
+        metropro::is_metropro(head).then_some(Self::MetroPro)
+    }
 }
 
 /// Reads a nominal surface as [`read_nominal`] does, and returns the SHA-256 of the file with it.
@@ -100,17 +132,28 @@ pub fn read_nominal(path: impl AsRef<Path>) -> Result<NominalFile, FormatError> 
             let PlyFile { points, triangles, .. } = read_ply(path)?;
             if triangles.is_empty() { NominalFile::Points(points) } else { NominalFile::Mesh { points, triangles } }
         }
+        Kind::Map(_) => {
+            return Err(FormatError::WrongKind {
+                path: path.to_owned(),
+                expected: "a nominal surface as points, mesh or definition",
+                found: "a measured map of heights",
+                remedy: "give the map as the measurement",
+            });
+        }
     })
 }
 
-/// Reads measured points, in millimetres and in the order of the file, from text or the vertices of a PLY file.
+/// Reads measured points, in millimetres and in the order of the file, from text, the vertices of a PLY file, or the measured
+/// samples of a map: X3P, SDF or MetroPro.
+///
+/// The points of a map lie on the surface, where a probe's centres lie above it.
 ///
 /// # Errors
 /// Those of the format found, and a file that is STL or TOML.
 pub fn read_measured(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> {
     let path = path.as_ref();
     let wrong = |found, remedy| {
-        let expected = "measured points as text or PLY";
+        let expected = "measured points as text or PLY, or a map as X3P, SDF or MetroPro";
         Err(FormatError::WrongKind { path: path.to_owned(), expected, found, remedy })
     };
     match kind(path)? {
@@ -118,7 +161,37 @@ pub fn read_measured(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> 
         Kind::Ply => read_ply(path).map(|file| file.points),
         Kind::Stl => wrong("an STL mesh", "export the points, or give the mesh as the nominal"),
         Kind::Toml => wrong("a TOML file", "give the definition as the nominal"),
+        Kind::Map(MapKind::X3p) => read_x3p(path).map(X3pFile::into_points),
+        Kind::Map(MapKind::Sdf) => read_sdf(path).map(|map| map.points()),
+        Kind::Map(MapKind::MetroPro) => read_metropro(path).map(|map| map.points()),
     }
+}
+
+/// Returns whether a file is a map of heights, whose points lie on the surface: X3P, SDF or MetroPro.
+///
+/// # Errors
+/// A file that cannot be read.
+pub fn is_map(path: impl AsRef<Path>) -> Result<bool, FormatError> {
+    Ok(MapKind::of(&whole::open(path.as_ref())?.head).is_some())
+}
+
+/// The measured points of a map, and what the reader had to decide about it.
+struct MapPoints {
+    points: Vec<Point>,
+    notes: Vec<String>,
+}
+
+/// Parses the bytes of a map; none where the bytes are no map.
+fn parse_map(path: &Path, bytes: &[u8]) -> Option<Result<MapPoints, FormatError>> {
+    let of_map = |map: HeightMap| MapPoints { points: map.points(), notes: map.notes };
+    Some(match MapKind::of(bytes)? {
+        MapKind::X3p => parse_x3p(path, bytes).map(|file| match file {
+            X3pFile::Map(map) => of_map(map),
+            X3pFile::Points(points) => MapPoints { points, notes: Vec::new() },
+        }),
+        MapKind::Sdf => parse_sdf(path, bytes).map(of_map),
+        MapKind::MetroPro => parse_metropro(path, bytes).map(of_map),
+    })
 }
 
 /// Tells the kind of a file by its beginning, and by its extension where that leaves it open.
@@ -127,6 +200,9 @@ fn kind(path: &Path) -> Result<Kind, FormatError> {
     let (head, length) = (&opened.head[..], opened.length);
     if ply::is_ply(head) {
         return Ok(Kind::Ply);
+    }
+    if let Some(kind) = MapKind::of(head) {
+        return Ok(Kind::Map(kind));
     }
     if stl::is_stl(head, length) {
         return Ok(Kind::Stl);

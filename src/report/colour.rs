@@ -53,6 +53,70 @@ impl ColourMap {
     }
 }
 
+/// How values become colours: a range, and perhaps a band of values that are within tolerance.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Tones {
+    pub(super) colours: ColourMap,
+    /// Values at the two ends.
+    pub(super) range: [f64; 2],
+    /// Half the width of the band about zero.
+    pub(super) tolerance: Option<f64>,
+}
+
+/// Share of an arm of the diverging map that a value within tolerance takes: no more than a tint.
+const TINT: f64 = 0.12;
+/// Share of an arm at which a value just beyond the tolerance stands: a step that is seen in print and with every eye.
+const STEP: f64 = 0.4;
+/// A colour bar reaches beyond its band by this factor at least.
+const BEYOND: f64 = 1.25;
+
+impl Tones {
+    /// Symmetric tones for values up to a limit, which grows where it would hide the band.
+    pub(super) fn symmetric(limit: f64, tolerance: Option<f64>) -> Self {
+        let limit = limit.max(tolerance.map_or(0.0, |t| BEYOND * t));
+        // Values that are all zero have no range of their own.
+        let limit = if limit > 0.0 { limit } else { 1.0 };
+        Self { colours: ColourMap::Diverging, range: [-limit, limit], tolerance }
+    }
+
+    /// Returns the colour of a value.
+    pub(super) fn at(&self, value: f64) -> [u8; 3] {
+        let [low, high] = self.range;
+        let Some(band) = self.tolerance else { return self.colours.at((value - low) / (high - low)) };
+        let size = value.abs();
+        let arm = if size <= band {
+            TINT * size / band
+        } else {
+            STEP + (1.0 - STEP) * ((size - band) / (high - band).max(f64::MIN_POSITIVE)).min(1.0)
+        };
+        self.colours.at(0.5 + 0.5 * arm.copysign(value))
+    }
+
+    /// Returns where along the bar, from 0 below to 1 above, which colour stands; it runs straight between two neighbours.
+    pub(super) fn stops(&self) -> Vec<(f64, [u8; 3])> {
+        let [low, high] = self.range;
+        let place = |value: f64| (value - low) / (high - low);
+        let Some(band) = self.tolerance.filter(|band| *band < high) else {
+            let steps = self.colours.anchors().len() - 1;
+            let value = |k: usize| low + (high - low) * k as f64 / steps as f64;
+            return (0..=steps).map(|k| (k as f64 / steps as f64, self.at(value(k)))).collect();
+        };
+        // On either side of an end of the band stand two colours.
+        let outside = |k: i32| band.next_up() + (high - band) * f64::from(k) / 4.0;
+        let below = (0..=4).rev().map(|k| -outside(k));
+        let values = below.chain([-band, 0.0, band]).chain((0..=4).map(outside));
+        values.map(|value| (place(value).clamp(0.0, 1.0), self.at(value))).collect()
+    }
+
+    /// A name that is the same for the same colours, wherever figures are put together in one document.
+    pub(super) fn id(&self) -> String {
+        match self.tolerance {
+            Some(band) => format!("{}-{:.0}", self.colours.id(), 1e4 * band / self.range[1]),
+            None => self.colours.id().to_owned(),
+        }
+    }
+}
+
 fn channels(colour: u32) -> [u8; 3] {
     let [_, r, g, b] = colour.to_be_bytes();
     [r, g, b]
@@ -86,6 +150,23 @@ mod tests {
     fn the_sequential_map_lightens_steadily() {
         let at = |k: i32| lightness(ColourMap::Sequential.at(f64::from(k) / 100.0));
         assert!((0..100).all(|k| at(k + 1) > at(k)));
+    }
+
+    #[test]
+    fn the_band_is_a_tint_with_a_step_at_its_ends() {
+        let tones = Tones::symmetric(10.0, Some(4.0));
+        assert_eq!((tones.range, tones.at(0.0)), ([-10.0, 10.0], [0xf7; 3]));
+        assert_eq!((tones.at(10.0), tones.at(-99.0)), ([0x67, 0x00, 0x1f], [0x05, 0x30, 0x61]));
+        for sign in [-1.0, 1.0] {
+            let [inside, outside] = [4.0, 4.01].map(|v| lightness(tones.at(sign * v)));
+            assert!(inside > 92.0 && inside - outside > 12.0, "{inside} {outside}");
+        }
+        // A colour bar always shows its band.
+        assert_eq!(Tones::symmetric(1.0, Some(4.0)).range, [-5.0, 5.0]);
+        assert_eq!(Tones::symmetric(0.0, None).range, [-1.0, 1.0]);
+        let stops = tones.stops();
+        assert!(stops.is_sorted_by(|a, b| a.0 <= b.0) && stops[0].0 == 0.0 && stops.last().unwrap().0 == 1.0);
+        assert!(stops.iter().filter(|(place, _)| (place - 0.7).abs() < 1e-9).count() == 2, "{stops:?}");
     }
 
     #[test]

@@ -5,10 +5,11 @@ use std::path::Path;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
+use crate::geometry::Aperture;
 use crate::registration::{Deviation, PointStatus};
 
 use super::axis::{Ruler, Scale, grouped, three_digits};
-use super::colour::ColourMap;
+use super::colour::{ColourMap, Tones};
 use super::raster::Raster;
 use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
 use super::{ReportError, save};
@@ -20,9 +21,9 @@ pub struct HeatMap {
     quantity: String,
     unit: String,
     raster: Raster,
-    colours: ColourMap,
-    /// Values at the two ends of the colour bar.
-    range: [f64; 2],
+    tones: Tones,
+    /// What a millimetre is in the unit of the map.
+    per_mm: f64,
     pv: f64,
     rms: f64,
     points: usize,
@@ -45,8 +46,8 @@ impl HeatMap {
             quantity: quantity.into(),
             unit: unit.into(),
             raster,
-            colours: ColourMap::Diverging,
-            range: [low, high],
+            tones: Tones { colours: ColourMap::Diverging, range: [low, high], tolerance: None },
+            per_mm: 1.0,
             pv: high - low,
             rms: (squares / samples.len() as f64).sqrt(),
             points: samples.len(),
@@ -65,7 +66,7 @@ impl HeatMap {
             samples_mm.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), s| (l.min(s[2]), h.max(s[2])));
         let (per_mm, unit) = if high - low < 1e-4 { (1e6, "nm") } else { (1e3, "µm") };
         let samples: Vec<[f64; 3]> = samples_mm.iter().map(|&[x, y, value]| [x, y, value * per_mm]).collect();
-        Self::new(title, quantity, unit, &samples)
+        Ok(Self { per_mm, ..Self::new(title, quantity, unit, &samples)? })
     }
 
     /// Draws the deviations of a registration at their contact points; points that took no part in the fit are left out.
@@ -90,7 +91,7 @@ impl HeatMap {
         };
         // A map of one value has no range of its own.
         let range = if range[1] > range[0] { range } else { [range[0] - 1.0, range[1] + 1.0] };
-        Self { colours, range, ..self }
+        Self { tones: Tones { colours, range, tolerance: None }, ..self }
     }
 
     /// Ends the colour bar at plus and minus a limit, so that several maps can be compared; what lies beyond takes the colour
@@ -104,12 +105,44 @@ impl HeatMap {
         if !(limit > 0.0 && limit.is_finite()) {
             return Err(ReportError::ColourLimit { figure: self.title, limit });
         }
-        Ok(Self { colours: ColourMap::Diverging, range: [-limit, limit], ..self })
+        Ok(Self { tones: Tones::symmetric(limit, self.tones.tolerance), ..self })
+    }
+
+    /// Draws what lies within plus and minus a tolerance as no more than a tint, and marks the band on the colour bar; where the
+    /// colour bar would end within the band it is made longer.
+    ///
+    /// Units: millimetres for a map of lengths, those of the map for any other.
+    ///
+    /// # Errors
+    /// A tolerance that is not a finite number above 0.
+    pub fn with_tolerance(self, tolerance: f64) -> Result<Self, ReportError> {
+        if !(tolerance > 0.0 && tolerance.is_finite()) {
+            return Err(ReportError::ColourLimit { figure: self.title, limit: tolerance });
+        }
+        let [low, high] = self.tones.range;
+        let tones = Tones::symmetric(low.abs().max(high.abs()), Some(tolerance * self.per_mm));
+        Ok(Self { tones, ..self })
+    }
+
+    /// Leaves open what lies outside of an aperture, even where a gap between samples would be filled.
+    ///
+    /// Units: millimetres. Frame: that of the samples.
+    pub fn within(mut self, aperture: &Aperture) -> Self {
+        let Raster { columns, first_mm, pixel_mm, .. } = self.raster;
+        for (k, value) in self.raster.values.iter_mut().enumerate() {
+            let place = |axis: usize, index: usize| first_mm[axis] + index as f64 * pixel_mm[axis];
+            // A sample on the rim fills a pixel that reaches half its width beyond.
+            let outside = aperture.distance_mm(place(0, k % columns), place(1, k / columns));
+            if outside > 0.5 * pixel_mm[0].hypot(pixel_mm[1]) {
+                *value = f64::NAN;
+            }
+        }
+        self
     }
 
     /// Returns the value at the upper end of the colour bar, in the unit of the map.
     pub fn limit(&self) -> f64 {
-        self.range[1]
+        self.tones.range[1]
     }
 
     /// Returns the largest less the least sample, in the unit of the map.
@@ -128,7 +161,9 @@ impl HeatMap {
     /// What the encoder says.
     pub fn to_png(&self) -> Result<Vec<u8>, ReportError> {
         let mut palette = vec![0; 3];
-        palette.extend((0..LEVELS).flat_map(|k| self.colours.at(f64::from(k) / f64::from(LEVELS - 1))));
+        let [low, high] = self.tones.range;
+        let value = |level: u8| low + (high - low) * f64::from(level) / f64::from(LEVELS - 1);
+        palette.extend((0..LEVELS).flat_map(|level| self.tones.at(value(level))));
         let rows = self.raster.values.chunks(self.raster.columns).rev();
         let pixels: Vec<u8> = rows.flatten().map(|&v| self.level(v)).collect();
         let encoded = || {
@@ -152,7 +187,8 @@ impl HeatMap {
         if value.is_nan() {
             return 0;
         }
-        let share = (value - self.range[0]) / (self.range[1] - self.range[0]);
+        let [low, high] = self.tones.range;
+        let share = (value - low) / (high - low);
         1 + (share.clamp(0.0, 1.0) * f64::from(LEVELS - 1)).round() as u8
     }
 
@@ -191,9 +227,13 @@ impl HeatMap {
 
     fn colour_bar(&self, svg: &mut Svg, [left, top]: [f64; 2], height: f64) {
         const BAR: f64 = 16.0;
-        svg.gradient(self.colours.id(), self.colours.anchors());
-        svg.rectangle([left, top], [BAR, height], &format!("url(#{})", self.colours.id()));
-        let ruler = Ruler::new(Scale::Linear, self.range, [top + height, top]);
+        svg.gradient(&self.tones.id(), &self.tones.stops());
+        svg.rectangle([left, top], [BAR, height], &format!("url(#{})", self.tones.id()));
+        let ruler = Ruler::new(Scale::Linear, self.tones.range, [top + height, top]);
+        for end in self.tones.tolerance.into_iter().flat_map(|band| [-band, band]) {
+            let pixel = ruler.pixel(end);
+            svg.line([left - 5.0, pixel], [left + BAR, pixel], super::svg::INK);
+        }
         for tick in ruler.ticks((height / 36.0) as usize) {
             svg.line([left + BAR, tick.pixel], [left + BAR + 4.0, tick.pixel], super::svg::INK);
             svg.tick_label([left + BAR + 8.0, tick.pixel + 4.0], Anchor::Start, &tick);
@@ -204,16 +244,25 @@ impl HeatMap {
 
     fn summary(&self) -> String {
         let (unit, points) = (&self.unit, grouped(self.points));
-        match self.colours {
+        match self.tones.colours {
             ColourMap::Diverging => {
                 let (pv, rms) = (three_digits(self.pv), three_digits(self.rms));
-                format!("PV {pv} {unit}, RMS {rms} {unit}, {points} points")
+                let summary = format!("PV {pv} {unit}, RMS {rms} {unit}, {points} points");
+                let Some(band) = self.tones.tolerance else { return summary };
+                let share = 100.0 * self.share_within(band);
+                format!("{summary}, {share:.1} % of the area within \u{b1} {} {unit}", three_digits(band))
             }
             ColourMap::Sequential => {
-                let [low, high] = self.range.map(three_digits);
+                let [low, high] = self.tones.range.map(three_digits);
                 format!("{low} to {high} {unit}, {points} points")
             }
         }
+    }
+
+    /// The share of the pixels whose values lie within a band about zero.
+    fn share_within(&self, band: f64) -> f64 {
+        let known = || self.raster.values.iter().filter(|v| !v.is_nan());
+        known().filter(|v| v.abs() <= band).count() as f64 / known().count().max(1) as f64
     }
 
     /// Saves the figure.
@@ -260,7 +309,7 @@ mod tests {
     #[test]
     fn a_known_map_has_known_pixels() {
         let map = HeatMap::of_lengths("known", "height", &SMALL_MAP).unwrap();
-        assert_eq!((map.unit.as_str(), map.range), ("µm", [-2.0, 2.0]));
+        assert_eq!((map.unit.as_str(), map.tones.range), ("µm", [-2.0, 2.0]));
         assert!((map.pv() - 4.0).abs() < 1e-12 && (map.rms() - (10f64 / 6.0).sqrt()).abs() < 1e-12);
         let (info, pixels) = decoded(&map.to_png().unwrap());
         assert_eq!((info.width, info.height), (3, 2));
@@ -270,6 +319,36 @@ mod tests {
         assert_eq!(pixel(1, 1), [0xf7, 0xf7, 0xf7, 255]);
         assert_eq!(pixel(2, 1), [0x67, 0x00, 0x1f, 255]);
         assert!(pixel(0, 0)[0] > pixel(0, 0)[2] && pixel(2, 0)[2] > pixel(2, 0)[0]);
+    }
+
+    #[test]
+    fn what_is_within_tolerance_is_a_tint_and_the_bar_says_so() {
+        let map = HeatMap::of_lengths("band", "height", &SMALL_MAP).unwrap().with_tolerance(1.5e-3).unwrap();
+        assert_eq!((map.limit(), map.tones.tolerance), (2.0, Some(1.5)));
+        let (_, pixels) = decoded(&map.to_png().unwrap());
+        let pixel = |i: usize, j: usize| <[u8; 4]>::try_from(&pixels[(j * 3 + i) * 4..][..4]).unwrap();
+        assert_eq!((pixel(0, 1), pixel(1, 1)), ([0x05, 0x30, 0x61, 255], [0xf7, 0xf7, 0xf7, 255]));
+        assert!(pixel(0, 0)[..3].iter().all(|c| *c > 0xe0), "1 um is a tint: {:?}", pixel(0, 0));
+        let svg = map.to_svg().unwrap();
+        assert!(svg.contains("66.7 % of the area within \u{b1} 1.50 µm"), "{svg}");
+        roxmltree::Document::parse(&svg).unwrap();
+        assert!(map.clone().with_tolerance(0.0).is_err() && map.with_tolerance(f64::NAN).is_err());
+        // A tolerance beyond every value is still to be seen.
+        let wide = HeatMap::of_lengths("band", "height", &SMALL_MAP).unwrap().with_tolerance(4e-3).unwrap();
+        assert_eq!(wide.limit(), 5.0);
+        assert!(wide.to_svg().unwrap().contains("100.0 % of the area"));
+    }
+
+    #[test]
+    fn outside_of_the_aperture_nothing_is_drawn() {
+        // A narrow slot between two halves would be filled as a gap.
+        let half = |sign: f64| (0..400).map(move |k| [sign * (1.2 + f64::from(k % 20)), f64::from(k / 20), 1e-3]);
+        let samples: Vec<[f64; 3]> = half(1.0).chain(half(-1.0)).collect();
+        let slot = Aperture::Annulus { centre_mm: [0.0, 10.0], inner_radius_mm: 4.0, outer_radius_mm: 60.0 };
+        let map = HeatMap::of_lengths("slot", "height", &samples).unwrap();
+        let open = |map: &HeatMap| map.raster.values.iter().filter(|v| v.is_nan()).count();
+        let (before, after) = (open(&map), open(&map.clone().within(&slot)));
+        assert!(before == 0 && after > 20, "{before} {after}");
     }
 
     #[test]

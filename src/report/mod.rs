@@ -1,9 +1,10 @@
-//! Figures for people: heat maps of deviations and line plots, as SVG and PNG.
+//! Figures for people: heat maps of deviations as SVG, PNG and coloured PLY, and line plots.
 //!
 //! ```text
 //!  samples (x, y, value) -> raster -> colours --+-> PNG   one pixel a pixel, nothing else
 //!                                               +-> SVG   the PNG inside axes, with a colour bar
 //!  series of (x, y) --------------> ticks ------+-> SVG
+//!  points with deviations --------> colours --------> PLY
 //! ```
 //!
 //! A figure is a plain value until it is saved, and the same figure gives the same bytes. Frame: maps are drawn over x and y
@@ -13,6 +14,7 @@ mod axis;
 mod colour;
 mod heat_map;
 mod plot;
+mod ply;
 mod raster;
 mod run;
 mod states;
@@ -29,6 +31,7 @@ pub use axis::Scale;
 pub use colour::ColourMap;
 pub use heat_map::HeatMap;
 pub use plot::{Axis, Plot, Series};
+pub use ply::{coloured_ply, save_coloured_ply};
 pub use run::{RUN_REPORT, write_run_report};
 pub use states::state_picture;
 pub use words::{ending_words, words};
@@ -85,6 +88,16 @@ pub enum ReportError {
         figure: String,
         /// What was given.
         limit: f64,
+    },
+    /// A triangle has a corner that is no point.
+    #[error("{figure}: a triangle has the corner {corner}, and there are {points} points, counted from 0")]
+    Corner {
+        /// Title of the figure.
+        figure: String,
+        /// The corner.
+        corner: u32,
+        /// How many points there are.
+        points: usize,
     },
     /// The pixels could not be encoded.
     #[error("{figure}: the picture could not be encoded: {source}")]

@@ -6,12 +6,14 @@
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::Value;
 
+use super::axis::three_digits;
 use super::svg::escaped;
 use super::words::{ending_words, words};
 use super::{ReportError, save};
@@ -23,6 +25,9 @@ pub const RUN_REPORT: &str = "report.html";
 
 /// The picture of a cycle.
 const PICTURE: &str = "error_map.png";
+
+/// The figures of a cycle.
+const FIGURES: &str = "figures.json";
 
 const STYLE: &str = "body{font:15px/1.45 Helvetica,Arial,sans-serif;color:#222;max-width:62em;margin:2em auto;padding:0 1em}\
 h1{font-size:1.6em;margin:0}h2{font-size:1.15em;margin:2em 0 .5em}table{border-collapse:collapse}\
@@ -51,6 +56,8 @@ struct CycleStory {
     level_um: Option<f64>,
     /// Name of the picture within the run folder.
     picture: Option<String>,
+    /// Name of the file of figures within the run folder.
+    form: Option<String>,
 }
 
 /// Proves the record of a run, writes its report beside it and returns the name of the report.
@@ -83,6 +90,9 @@ impl Story {
                 let name = value["name"].as_str().unwrap_or_default();
                 if name == format!("cycle-{}/{PICTURE}", record.cycle) {
                     self.cycle(record.cycle).picture = Some(name.to_owned());
+                }
+                if name == format!("cycle-{}/{FIGURES}", record.cycle) {
+                    self.cycle(record.cycle).form = Some(name.to_owned());
                 }
             }
             Kind::End => {
@@ -126,6 +136,7 @@ impl Story {
         html += &self.verdict();
         html += &self.facts(&begin);
         html += &self.figures();
+        html += &self.form(folder)?;
         html += &self.pictures(folder)?;
         html += &self.happenings();
         let Verified { records, head, closed, .. } = verified;
@@ -193,6 +204,53 @@ impl Story {
         html + "</table>\n<p>PV and rms are those of the deviations along the normal, positive where material stands proud; \
                 \u{b1} is the expanded uncertainty (k = 2) by the scatter of the points. The level is the height of the surface \
                 that was wanted over the nominal one.</p>\n"
+    }
+
+    /// A row a figure, a column a cycle, and what must be known of each figure.
+    fn form(&self, folder: &Path) -> Result<String, ReportError> {
+        let mut cycles = Vec::new();
+        for (number, cycle) in &self.cycles {
+            let Some(name) = &cycle.form else { continue };
+            let path = folder.join(name);
+            let bytes = fs::read(&path).map_err(|source| ReportError::Unreadable { path: path.clone(), source })?;
+            let figures: Value = serde_json::from_slice(&bytes)
+                .map_err(|source| ReportError::Unreadable { path, source: io::Error::from(source) })?;
+            cycles.push((number, figures));
+        }
+        let listed = |figures: &Value| figures["figures"].as_array().cloned().unwrap_or_default();
+        let named = |figures: &Value, name: &Value| listed(figures).into_iter().find(|row| row["name"] == *name);
+        let Some((_, last)) = cycles.last() else { return Ok(String::new()) };
+        let heads: String = cycles.iter().map(|(number, _)| format!("<th class=\"n\">cycle {number}</th>")).collect();
+        let mut html = format!(
+            "<h2>Form of the surface</h2>\n<table>\n<tr><th>figure</th>{heads}<th>unit</th><th>removed</th><th>waves left \
+             out</th><th>how</th></tr>\n"
+        );
+        for row in listed(last) {
+            let text = |key: &str| escaped(row[key].as_str().unwrap_or_default());
+            let cell = |(_, figures): &(&u32, Value)| {
+                let value = named(figures, &row["name"]).and_then(|row| row["value"].as_f64());
+                format!("<td class=\"n\">{}</td>", value.map_or("-".to_owned(), three_digits))
+            };
+            let cells: String = cycles.iter().map(cell).collect();
+            let _ = writeln!(
+                html,
+                "<tr><td>{}</td>{cells}<td>{}</td><td>{}</td><td>{}</td><td>{}</td></tr>",
+                text("name"),
+                text("unit"),
+                text("removed"),
+                text("cut_off"),
+                text("made")
+            );
+        }
+        html += "</table>\n<p>All along the outward normal, positive where material stands proud; figures of the surface, not \
+                 of a wavefront. ISO 10110-5, in nanometres, that the surface just meets:</p>\n<ul>\n";
+        for (number, figures) in &cycles {
+            let notation = figures["iso_10110_5"]["notation"].as_str().unwrap_or("-");
+            let missing = figures["missing"].as_array().into_iter().flatten().filter_map(Value::as_str);
+            let missing: String = missing.map(|why| format!("; no {}", escaped(why))).collect();
+            let _ = writeln!(html, "<li>cycle {number}: <code>{}</code>{missing}</li>", escaped(notation));
+        }
+        Ok(html + "</ul>\n")
     }
 
     fn pictures(&self, folder: &Path) -> Result<String, ReportError> {

@@ -193,12 +193,11 @@ impl Svg {
         ));
     }
 
-    /// A gradient from bottom to top through colours at equal distances, to be used as the fill `url(#id)`.
-    pub(super) fn gradient(&mut self, id: &str, colours: &[u32]) {
+    /// A gradient from bottom to top through colours at their places from 0 to 1, to be used as the fill `url(#id)`.
+    pub(super) fn gradient(&mut self, id: &str, stops: &[(f64, [u8; 3])]) {
         self.put(format_args!("<defs><linearGradient id=\"{id}\" x1=\"0\" y1=\"1\" x2=\"0\" y2=\"0\">"));
-        for (k, colour) in colours.iter().enumerate() {
-            let offset = k as f64 / (colours.len() - 1) as f64;
-            self.put(format_args!("<stop offset=\"{offset:.4}\" stop-color=\"#{colour:06x}\"/>"));
+        for (offset, [r, g, b]) in stops {
+            self.put(format_args!("<stop offset=\"{offset:.4}\" stop-color=\"#{r:02x}{g:02x}{b:02x}\"/>"));
         }
         self.put(format_args!("</linearGradient></defs>\n"));
     }
@@ -229,7 +228,7 @@ mod tests {
         let odd = "a < b & \"c\" > \u{1} \u{ffff} µm";
         svg.text([1.0, 2.0], Anchor::End, SMALL, odd);
         svg.upright([3.0, 4.0], odd);
-        svg.gradient("g", &[0, 0xff_ffff]);
+        svg.gradient("g", &[(0.0, [0; 3]), (1.0, [255; 3])]);
         (0..4).for_each(|shape| svg.marker([5.0, 5.0], shape, INK));
         svg.tick_label([0.0, 0.0], Anchor::Start, &Tick { pixel: 0.0, label: "10".into(), exponent: Some(-3) });
         let text = svg.finish();

@@ -225,7 +225,8 @@ impl CmmFolders {
     fn accept_single(&self, expected: &Expected, file: &Found) -> Result<Accepted, ExchangeError> {
         let (result, sha) = self.read(expected, &file.path)?;
         let points = self.matched(expected, file, &result)?;
-        let said = switched_off(&file.name, &result).into_iter().collect();
+        let mut said: Vec<String> = result.notes.iter().map(|note| format!("{}: {note}", file.name)).collect();
+        said.extend(switched_off(&file.name, &result));
         let measurement = self.measurement(expected, points, &[result]);
         Ok(Accepted { measurement, files: vec![(file.name.clone(), sha)], said })
     }

@@ -9,6 +9,9 @@
 //!
 //! and in columns with a header: `index` (the number of the plan's target), `enabled` (rows that say unchecked are left out, as laser
 //! trackers export them), `probe` (the *diameter* of a tracker's reflector in mm) or `probe_radius_mm`, and `name` or `feature`.
+//!
+//! A map of an interferometer or profilometer (X3P, SDF, MetroPro) says nothing of itself; its measured samples are points of contact,
+//! in millimetres whatever the unit of other files.
 
 use std::borrow::Cow;
 use std::path::Path;
@@ -17,7 +20,7 @@ use super::super::error::excerpt;
 use super::super::layout::{Fields, Preamble, is_comment};
 use super::super::number::{Decimal, coordinate};
 use super::super::points::parse_points_with;
-use super::super::{FormatError, ply, whole};
+use super::super::{FormatError, MapKind, MapPoints, parse_map, ply, whole};
 use super::ExchangeError;
 use crate::geometry::Point;
 
@@ -109,13 +112,15 @@ pub struct ResultFile {
     pub probe_radius_mm: Option<f64>,
     /// Rows that were left out because they are switched off.
     pub switched_off: usize,
+    /// What the reader had to decide about the file, in words.
+    pub notes: Vec<String>,
     /// What the file says of itself.
     pub statements: Statements,
 }
 
 /// Returns whether the last line of a text has its end; a file that was cut short in its last number has not.
 pub fn is_ended(text: &[u8]) -> bool {
-    ply::is_ply(text) || text.ends_with(b"\n")
+    ply::is_ply(text) || MapKind::of(text).is_some() || text.ends_with(b"\n")
 }
 
 /// Reads the bytes of a result file.
@@ -131,6 +136,9 @@ pub fn read_bytes(path: &Path) -> Result<Vec<u8>, FormatError> {
 /// # Errors
 /// A statement that says something impossible.
 pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, ExchangeError> {
+    if MapKind::of(text).is_some() {
+        return Ok(Statements { coordinates: Some(Coordinates::Contacts), ..Statements::default() });
+    }
     let head = &text[..text.len().min(PREAMBLE_BYTES)];
     let head = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(head);
     let is_ply = ply::is_ply(head);
@@ -212,6 +220,20 @@ impl Statements {
 pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<ResultFile, ExchangeError> {
     let statements = read_statements(path, text)?;
     let coordinates = agreed_coordinates(path, &statements, content)?;
+    if let Some(map) = parse_map(path, text) {
+        let MapPoints { points, notes } = map?;
+        let (indices, names, probe_radius_mm) = (None, None, None);
+        return Ok(ResultFile {
+            points,
+            indices,
+            names,
+            coordinates,
+            probe_radius_mm,
+            switched_off: 0,
+            notes,
+            statements,
+        });
+    }
     let unit_mm = agreed_unit(path, &statements, content)?;
     let is_ply = ply::is_ply(text);
     let decimal = match content.decimal {
@@ -239,6 +261,7 @@ pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<Resul
         coordinates,
         probe_radius_mm: agreed_radius(path, statements.probe_radius_mm, columns.probe_radius_mm)?,
         switched_off,
+        notes: Vec::new(),
         statements,
     })
 }

@@ -19,6 +19,15 @@ pub(super) fn series<const N: usize>(coefficients: &[[f64; N]], b: u32, t: f64) 
     sums
 }
 
+/// Writes P_0^(0, b)(t), P_1^(0, b)(t) and so on, as many as there is room for.
+pub(crate) fn values(b: u32, t: f64, out: &mut [f64]) {
+    let [mut below, mut here] = [(0.0, 0.0), (1.0, 0.0)];
+    for (k, value) in out.iter_mut().enumerate() {
+        *value = here.0;
+        (below, here) = (here, step(k as f64 + 1.0, f64::from(b), t, here, below));
+    }
+}
+
 /// One step of the recurrence, from the polynomials of degree n - 1 and n - 2 to that of degree n.
 fn step(n: f64, b: f64, t: f64, here: (f64, f64), below: (f64, f64)) -> (f64, f64) {
     if n == 1.0 {

@@ -26,6 +26,7 @@ pub use definition::{
 };
 pub use error::DefinitionError;
 pub use forbes::{Qbfs, QbfsDefinition, Qcon, QconDefinition};
+pub(crate) use jacobi::values as jacobi_values;
 pub use off_axis::{OffAxis, OffAxisDefinition, SectionFrame};
 pub use polynomial::{XyPolynomial, XyPolynomialDefinition};
 pub use sampling::{SampledSurface, curved_triangle_sag};

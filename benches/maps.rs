@@ -1,0 +1,78 @@
+//! What a cycle takes to say what is left on the part: figures, and its map as X3P and picture.
+//!
+//! ```text
+//! cargo bench --bench maps
+//! ```
+
+use std::path::{Path, PathBuf};
+
+use divan::{Bencher, black_box};
+use regrind::compensation::{ErrorMap, Net};
+use regrind::form::{FormOptions, Sample, figures};
+use regrind::formats::{parse_x3p, write_error_map_x3p};
+use regrind::geometry::Aperture;
+use regrind::report::HeatMap;
+
+fn main() {
+    divan::main();
+}
+
+/// A rough surface over the free form's aperture.
+fn samples(points: usize) -> Vec<Sample> {
+    let columns = (points as f64 * 102.0 / 62.0).sqrt().round() as usize;
+    let rows = points.div_ceil(columns);
+    let place = |k: usize| {
+        [
+            (k % columns) as f64 * 102.0 / (columns - 1) as f64 - 51.0,
+            (k / columns) as f64 * 62.0 / (rows - 1) as f64 - 31.0,
+        ]
+    };
+    let rough = |[x, y]: [f64; 2]| 1e-3 * (0.2 * x).sin() * (0.3 * y).cos() + 1e-4 * (5.0 * x + 7.0 * y).sin();
+    (0..columns * rows).map(place).map(|at_mm| Sample { at_mm, deviation_mm: rough(at_mm) }).collect()
+}
+
+fn error_map(nodes: usize) -> ErrorMap {
+    let columns = (nodes as f64).sqrt() as usize;
+    let net = Net {
+        columns,
+        rows: columns,
+        first_mm: [-51.0, -31.0],
+        spacing_mm: [102.0 / columns as f64, 62.0 / columns as f64],
+    };
+    let values_mm = (0..net.len()).map(|k| 1e-3 * (k as f64 * 0.01).sin()).collect();
+    ErrorMap { net, values_mm, valid: (0..net.len()).map(|k| k % 11 != 3).collect(), rest_sigma_mm: 0.0 }
+}
+
+fn written(map: &ErrorMap) -> PathBuf {
+    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join("maps.x3p");
+    write_error_map_x3p(&path, map, "2026-03-01T12:00:00Z", true).unwrap();
+    path
+}
+
+#[divan::bench(args = [1_800, 28_476, 451_401], sample_count = 10)]
+fn all_figures(bencher: Bencher, points: usize) {
+    let samples = samples(points);
+    let aperture = Some(Aperture::Rectangle { centre_mm: [0.0; 2], width_mm: 102.0, height_mm: 62.0 });
+    let options = FormOptions { aperture, ..FormOptions::default() };
+    bencher.bench_local(|| figures(black_box(&samples), &options).unwrap());
+}
+
+#[divan::bench(args = [6_400, 1_000_000], sample_count = 10)]
+fn x3p_written(bencher: Bencher, nodes: usize) {
+    let map = error_map(nodes);
+    bencher.bench_local(|| written(black_box(&map)));
+}
+
+#[divan::bench(args = [6_400, 1_000_000], sample_count = 10)]
+fn x3p_read(bencher: Bencher, nodes: usize) {
+    let path = written(&error_map(nodes));
+    let bytes = std::fs::read(&path).unwrap();
+    bencher.bench_local(|| parse_x3p(&path, black_box(&bytes)).unwrap());
+}
+
+#[divan::bench(args = [6_400, 1_000_000], sample_count = 10)]
+fn picture(bencher: Bencher, nodes: usize) {
+    let map = error_map(nodes).samples_mm();
+    let drawn = || HeatMap::of_lengths("map", "deviation", black_box(&map)).unwrap().with_tolerance(2e-4).unwrap();
+    bencher.bench_local(|| drawn().to_svg().unwrap());
+}

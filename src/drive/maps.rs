@@ -1,0 +1,64 @@
+//! What a cycle leaves behind of the part's error: figures, the map as text, X3P and picture, and the points in colours.
+
+use std::path::Path;
+
+use super::work::Task;
+use crate::compensation::ErrorMap;
+use crate::form::{FormOptions, Sample, figures, slope};
+use crate::formats::{FormatError, write_error_map, write_error_map_x3p, write_figures};
+use crate::registration::{PointStatus, Registration};
+use crate::report::{HeatMap, ReportError, save_coloured_ply};
+
+/// Length over which slopes are taken, in cut-offs of the map's filter: shorter waves are not in the map.
+const INTEGRATION: f64 = 0.5;
+
+/// Writes the figures of a cycle; where there are none the file says why.
+pub(super) fn save_figures(
+    task: &Task,
+    folder: &Path,
+    map: Option<&ErrorMap>,
+    found: &Registration,
+) -> Result<(), FormatError> {
+    let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
+    let samples: Vec<Sample> =
+        used.map(|d| Sample { at_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect();
+    let options = FormOptions { aperture: task.nominal.outline().cloned(), ..FormOptions::default() };
+    let made = figures(&samples, &options);
+    let cutoff_mm = task.map.cutoff_mm;
+    let slopes = map.map(|map| {
+        let size = [map.net.columns, map.net.rows];
+        slope(size, map.net.spacing_mm, &map.values_mm, &map.valid, INTEGRATION * cutoff_mm)
+    });
+    let slopes = slopes.as_ref().map(|slope| (slope.as_ref(), cutoff_mm));
+    write_figures(&folder.join("figures.json"), made.as_ref(), slopes, task.simulation)
+}
+
+/// Writes the map of a cycle's error and the points that it was made from.
+pub(super) fn save(task: &Task, folder: &Path, map: &ErrorMap, found: &Registration) -> Result<(), String> {
+    let date = jiff::Timestamp::now().strftime("%Y-%m-%dT%H:%M:%SZ").to_string();
+    write_error_map(&folder.join("error_map.csv"), map, task.simulation)
+        .and_then(|()| write_error_map_x3p(&folder.join("error_map.x3p"), map, &date, task.simulation))
+        .map_err(|error| error.to_string())?;
+    save_pictures(task, folder, map).and_then(|()| save_points(task, folder, found)).map_err(|error| error.to_string())
+}
+
+fn save_pictures(task: &Task, folder: &Path, map: &ErrorMap) -> Result<(), ReportError> {
+    let title =
+        if task.simulation { "Error of the part, filtered (SIMULATION)" } else { "Error of the part, filtered" };
+    let mut picture = HeatMap::of_lengths(title, "deviation", &map.samples_mm())?;
+    if let Some(outline) = task.nominal.outline() {
+        picture = picture.within(outline);
+    }
+    if let Some(tolerance_mm) = task.tolerance_mm {
+        picture = picture.with_tolerance(tolerance_mm)?;
+    }
+    picture.save_svg(&folder.join("error_map.svg"))?;
+    picture.save_png(&folder.join("error_map.png"))
+}
+
+fn save_points(task: &Task, folder: &Path, found: &Registration) -> Result<(), ReportError> {
+    let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
+    let rows: Vec<[f64; 4]> = used.map(|d| [d.point.x, d.point.y, d.point.z, d.deviation_mm]).collect();
+    let remarks: &[&str] = if task.simulation { &["SIMULATION", "frame: model"] } else { &["frame: model"] };
+    save_coloured_ply(&folder.join("deviations.ply"), "Deviations", &rows, &[], task.tolerance_mm, remarks)
+}

@@ -1,0 +1,151 @@
+//! Least squares of polynomials over the points as they lie.
+//!
+//! The rows [terms | deviation] go through a QR decomposition, share by share, of which only the small triangles R are kept and
+//! decomposed again in their order, so that the number of cores does not change the result. The last column of the last R holds
+//! Q^T d. The columns of Q are the terms made orthogonal on the true aperture, in their order (Gram and Schmidt); Q^T d / sqrt(n) is
+//! the root mean square that each of them takes, whatever terms follow. R^-1 Q^T d are the coefficients of the terms themselves.
+
+use nalgebra::DMatrix;
+use rayon::prelude::*;
+
+use super::basis::{Basis, Terms};
+use super::{FormError, Sample, check};
+
+/// Rows that are decomposed at a time.
+const SHARE: usize = 512;
+/// A term of which less than this share is new is not determined.
+const NEW: f64 = 1e-7;
+/// A fit that chooses its number of terms has so many points a term at least.
+const POINTS_A_TERM: usize = 4;
+
+/// Polynomials fitted to deviations.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Fit {
+    /// The polynomials.
+    pub basis: Basis,
+    /// The coefficient of each term in millimetres; a term's mean square is 1 over the full disc or rectangle.
+    pub coefficients_mm: Vec<f64>,
+    /// With its sign, the root mean square that each term takes of the deviations once it is orthogonal to those before it on
+    /// the points, in millimetres.
+    pub orthogonal_mm: Vec<f64>,
+    /// Root mean square of what the terms leave, in millimetres.
+    pub residual_rms_mm: f64,
+    /// How many points were fitted.
+    pub points: usize,
+}
+
+/// Fits the first terms of a basis to samples.
+///
+/// Frame: model. Units: millimetres.
+///
+/// # Errors
+/// Fewer points than terms; a term that the points do not determine; a point that is not finite or far outside.
+pub fn fit(basis: &Basis, terms: usize, samples: &[Sample]) -> Result<Fit, FormError> {
+    check(samples, terms)?;
+    let rows = basis.terms(terms)?;
+    let solved = solve(terms, samples, |index, sample, row| rows.values(index, sample, row))?;
+    let Solved { coefficients, orthogonal, residual, undetermined } = solved;
+    if let Some(k) = undetermined {
+        return Err(FormError::Undetermined { term: basis.term(k), points: samples.len() });
+    }
+    Ok(Fit {
+        basis: basis.clone(),
+        coefficients_mm: coefficients,
+        orthogonal_mm: orthogonal,
+        residual_rms_mm: residual,
+        points: samples.len(),
+    })
+}
+
+/// Fits as many complete sets of terms as the points carry, four points a term, but no more than some.
+///
+/// # Errors
+/// Points that carry not one term, or that are not finite or far outside.
+pub fn fit_most(basis: &Basis, most: usize, samples: &[Sample]) -> Result<Fit, FormError> {
+    check(samples, POINTS_A_TERM)?;
+    let mut terms = basis.complete(most.min(samples.len() / POINTS_A_TERM));
+    loop {
+        match fit(basis, terms, samples) {
+            Err(FormError::Undetermined { .. }) if terms > 1 => terms = basis.complete(terms - 1),
+            fitted => return fitted,
+        }
+    }
+}
+
+impl Fit {
+    /// Returns the value of the fit at every sample, in millimetres.
+    ///
+    /// # Errors
+    /// A sample far outside of the polynomials' domain.
+    pub fn values_mm(&self, samples: &[Sample]) -> Result<Vec<f64>, FormError> {
+        let terms: Terms = self.basis.terms(self.coefficients_mm.len())?;
+        let value = |row: &mut Vec<f64>, (index, sample): (usize, &Sample)| {
+            terms.values(index, sample, row)?;
+            Ok(row.iter().zip(&self.coefficients_mm).map(|(value, c)| value * c).sum())
+        };
+        samples.par_iter().enumerate().map_init(|| vec![0.0; terms.len()], value).collect()
+    }
+}
+
+/// What least squares gives.
+pub(super) struct Solved {
+    pub(super) coefficients: Vec<f64>,
+    pub(super) orthogonal: Vec<f64>,
+    /// Root mean square of what is left.
+    pub(super) residual: f64,
+    /// The first term that the points do not determine.
+    pub(super) undetermined: Option<usize>,
+}
+
+/// Solves for the coefficients of functions whose values `row` writes.
+pub(super) fn solve(
+    terms: usize,
+    samples: &[Sample],
+    row: impl Fn(usize, &Sample, &mut [f64]) -> Result<(), FormError> + Sync,
+) -> Result<Solved, FormError> {
+    let width = terms + 1;
+    let triangles = samples.par_chunks(SHARE).enumerate().map(|(share, chunk)| {
+        let mut rows = DMatrix::zeros(chunk.len(), width);
+        let mut values = vec![0.0; terms];
+        for (k, sample) in chunk.iter().enumerate() {
+            row(share * SHARE + k, sample, &mut values)?;
+            for (column, value) in values.iter().enumerate() {
+                rows[(k, column)] = *value;
+            }
+            rows[(k, terms)] = sample.deviation_mm;
+        }
+        Ok(rows.qr().r())
+    });
+    let triangles: Vec<DMatrix<f64>> = triangles.collect::<Result<_, FormError>>()?;
+    let mut r = DMatrix::<f64>::zeros(width, width);
+    for some in triangles.chunks(SHARE.div_ceil(width)) {
+        let height = width + some.iter().map(DMatrix::nrows).sum::<usize>();
+        let mut stacked = DMatrix::zeros(height, width);
+        stacked.rows_mut(0, width).copy_from(&r);
+        let mut begin = width;
+        for triangle in some {
+            stacked.rows_mut(begin, triangle.nrows()).copy_from(triangle);
+            begin += triangle.nrows();
+        }
+        r = stacked.qr().r();
+    }
+    Ok(back_substituted(&r, terms, samples.len()))
+}
+
+fn back_substituted(r: &DMatrix<f64>, terms: usize, points: usize) -> Solved {
+    let scale = (points as f64).sqrt();
+    let undetermined = (0..terms).find(|&k| {
+        let norm = r.column(k).rows(0, k + 1).norm();
+        // Not greater: a NaN determines nothing.
+        !matches!(r[(k, k)].abs().partial_cmp(&(NEW * norm)), Some(std::cmp::Ordering::Greater))
+    });
+    let orthogonal: Vec<f64> = (0..terms).map(|k| r[(k, terms)] * r[(k, k)].signum() / scale).collect();
+    let mut coefficients = vec![0.0; terms];
+    if undetermined.is_none() {
+        for k in (0..terms).rev() {
+            let known: f64 = (k + 1..terms).map(|j| r[(k, j)] * coefficients[j]).sum();
+            coefficients[k] = (r[(k, terms)] - known) / r[(k, k)];
+        }
+    }
+    Solved { coefficients, orthogonal, residual: r[(terms, terms)].abs() / scale, undetermined }
+}

@@ -1,0 +1,142 @@
+//! Surface form in the notation of ISO 10110-5: `3/A(B/C) RMSt<D; RMSi<E; RMSa<F; lambda=G`.
+//!
+//! With the deviation d over the aperture, all fits by least squares (ISO 14999-4):
+//!
+//! ```text
+//!  total          T = d - (piston, tilt)                RMSt = rms T
+//!  power          c r^2 of the fit (piston, tilt, r^2)  A    = PV of c r^2
+//!  irregularity   I = d - (piston, tilt, r^2)           B    = PV I     RMSi = rms I
+//!  symmetric part S = even polynomial in r fitted to I  C    = PV S
+//!  varying part   I - S                                 RMSa = rms (I - S)
+//! ```
+
+use serde::Serialize;
+
+use super::figures::{Removed, pv, without};
+use super::fit::solve;
+use super::{FormError, Sample, check};
+use crate::geometry::Aperture;
+
+/// Highest power of r of the symmetric part, halved.
+const SYMMETRIC: usize = 6;
+
+/// Power, irregularity and their like, of the surface, in nanometres.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Iso10110 {
+    /// A: PV of the power.
+    pub power_nm: f64,
+    /// Height of the power at the rim over the middle: above 0 where the rim stands proud.
+    pub power_rim_nm: f64,
+    /// B: PV of the irregularity.
+    pub irregularity_nm: f64,
+    /// C: PV of the part of the irregularity that is symmetric about the middle.
+    pub symmetric_nm: f64,
+    /// Root mean square of the total.
+    pub rms_total_nm: f64,
+    /// Root mean square of the irregularity.
+    pub rms_irregularity_nm: f64,
+    /// Root mean square of what is not symmetric.
+    pub rms_varying_nm: f64,
+    /// The wavelength named.
+    pub wavelength_nm: f64,
+    /// The indication that the surface just meets: every value rounded up, in nanometres.
+    pub notation: String,
+}
+
+/// Takes deviations apart as ISO 10110-5 does.
+///
+/// Frame: model; symmetry is meant about the middle of the aperture. Units: samples in millimetres.
+///
+/// # Errors
+/// Fewer than four points, points on a line, numbers that are not finite, a wavelength that is none.
+pub fn iso_10110(samples: &[Sample], aperture: &Aperture, wavelength_nm: f64) -> Result<Iso10110, FormError> {
+    check(samples, 4)?;
+    if !(wavelength_nm > 0.0 && wavelength_nm.is_finite()) {
+        return Err(FormError::Wavelength { wavelength_nm });
+    }
+    let [low, high] = aperture.bounds();
+    let middle: [f64; 2] = std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
+    let radius = samples.iter().map(|s| (s.at_mm[0] - middle[0]).hypot(s.at_mm[1] - middle[1])).fold(0.0, f64::max);
+    let square = |s: &Sample| {
+        let [x, y]: [f64; 2] = std::array::from_fn(|k| (s.at_mm[k] - middle[k]) / radius);
+        x * x + y * y
+    };
+    let total = without(&[Removed::Piston, Removed::Tilt], samples)?;
+    let irregularity = without(&[Removed::Piston, Removed::Tilt, Removed::Power], samples)?;
+    // The coefficient of r^2, the origin of which does not matter beside piston and tilt.
+    let power = solve(4, samples, |_, s, row| {
+        let [x, y]: [f64; 2] = std::array::from_fn(|k| (s.at_mm[k] - middle[k]) / radius);
+        row.copy_from_slice(&[1.0, x, y, x * x + y * y]);
+        Ok(())
+    })?
+    .coefficients[3];
+    let symmetric = symmetric(&irregularity, square)?;
+    let varying = irregularity.iter().zip(&symmetric).map(|(s, even)| s.deviation_mm - even);
+    let nm = |mm: f64| 1e6 * mm;
+    let rms_varying_nm = nm(rms(varying));
+    let mut found = Iso10110 {
+        power_nm: nm(power.abs() * pv(samples.iter().map(square))),
+        power_rim_nm: nm(power),
+        irregularity_nm: nm(pv(irregularity.iter().map(|s| s.deviation_mm))),
+        symmetric_nm: nm(pv(symmetric.into_iter())),
+        rms_total_nm: nm(rms(total.iter().map(|s| s.deviation_mm))),
+        rms_irregularity_nm: nm(rms(irregularity.iter().map(|s| s.deviation_mm))),
+        rms_varying_nm,
+        wavelength_nm,
+        notation: String::new(),
+    };
+    found.notation = notation(&found);
+    Ok(found)
+}
+
+/// Fits P_0 to P_6 of 2 (r/R)^2 - 1, Legendre's polynomials, which are the Zernike terms without azimuth but for a factor; fewer where the
+/// points do not carry them. Returns the values at the samples.
+fn symmetric(samples: &[Sample], square: impl Fn(&Sample) -> f64 + Sync) -> Result<Vec<f64>, FormError> {
+    let values = |s: &Sample| {
+        let t = 2.0 * square(s) - 1.0;
+        let mut row = [1.0; SYMMETRIC + 1];
+        row[1] = t;
+        for n in 1..SYMMETRIC {
+            let k = n as f64;
+            row[n + 1] = ((2.0 * k + 1.0) * t * row[n] - k * row[n - 1]) / (k + 1.0);
+        }
+        row
+    };
+    let mut terms = (SYMMETRIC + 1).min(samples.len() / 4).max(1);
+    loop {
+        let solved = solve(terms, samples, |_, s, row| {
+            row.copy_from_slice(&values(s)[..row.len()]);
+            Ok(())
+        })?;
+        if solved.undetermined.is_none() || terms == 1 {
+            let even = |s: &Sample| values(s).iter().zip(&solved.coefficients).map(|(value, c)| value * c).sum();
+            return Ok(samples.iter().map(even).collect());
+        }
+        terms -= 1;
+    }
+}
+
+fn rms(values: impl ExactSizeIterator<Item = f64>) -> f64 {
+    let count = values.len() as f64;
+    (values.map(|v| v * v).sum::<f64>() / count).sqrt()
+}
+
+fn notation(found: &Iso10110) -> String {
+    format!(
+        "3/{}({}/{}) RMSt<{}; RMSi<{}; RMSa<{}; lambda={}",
+        up(found.power_nm),
+        up(found.irregularity_nm),
+        up(found.symmetric_nm),
+        up(found.rms_total_nm),
+        up(found.rms_irregularity_nm),
+        up(found.rms_varying_nm),
+        found.wavelength_nm
+    )
+}
+
+/// Writes a value in nanometres rounded up: to whole ones from 10 on, to hundredths below.
+fn up(value_nm: f64) -> String {
+    // What rounding leaves of a zero is no hundredth, and a zero has no sign.
+    let steps = if value_nm >= 10.0 { 1.0 } else { 100.0 };
+    format!("{}", ((value_nm * steps - 1e-6).ceil().max(0.0) + 0.0) / steps)
+}

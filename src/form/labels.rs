@@ -1,0 +1,87 @@
+//! Figures with their labels: no number leaves without what was removed, its direction and its cut-off.
+
+use serde::Serialize;
+
+use super::figures::{Figures, Removed};
+use super::slope::Slope;
+
+/// The direction of all figures.
+const DIRECTION: &str = "along the outward normal of the nominal surface, positive where material stands proud";
+
+/// A figure with everything that one must know of it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Labelled {
+    /// What it is called.
+    pub name: &'static str,
+    /// The number.
+    pub value: f64,
+    /// Its unit.
+    pub unit: &'static str,
+    /// What was removed before.
+    pub removed: String,
+    /// Its direction.
+    pub direction: &'static str,
+    /// What the filter took out, or that there was none.
+    pub cut_off: String,
+    /// How it was made, where its name does not tell.
+    pub made: String,
+    /// Where on the part, in the model frame, if it is of one place.
+    pub at_mm: Option<[f64; 2]>,
+}
+
+/// Returns the figures of points with their labels, in the order of a report.
+///
+/// Units: micrometres; coverage in per cent.
+pub fn labelled(figures: &Figures) -> Vec<Labelled> {
+    let Figures { pvr, highest, lowest, coverage, .. } = figures;
+    let um = |name, mm: f64, made: &str| {
+        row(name, 1e3 * mm, "um", &removed(&figures.removed), "none: every point used", made)
+    };
+    let of_fit = format!(
+        "PV of {} {} terms, {:.4} um, and 3 times the rms of the rest, {:.4} um",
+        pvr.terms,
+        pvr.basis,
+        1e3 * pvr.fit_pv_mm,
+        1e3 * pvr.residual_rms_mm
+    );
+    let cells = format!("cells of {:.3} mm within the aperture that hold a point", coverage.cell_mm);
+    vec![
+        um("PV", figures.pv_mm, "largest less least"),
+        um("PVr", pvr.value_mm, &of_fit),
+        um("PV 99.8 %", figures.pv998_mm, "from the quantile 0.1 % to 99.9 %"),
+        um("RMS", figures.rms_mm, "about zero"),
+        um("mean", figures.mean_mm, ""),
+        Labelled { at_mm: Some(highest.at_mm), ..um("highest (stock left)", highest.value_mm, "") },
+        Labelled { at_mm: Some(lowest.at_mm), ..um("lowest (undercut)", lowest.value_mm, "") },
+        row("coverage", 100.0 * coverage.share, "%", "nothing", "none: every point used", &cells),
+    ]
+}
+
+/// Returns the slopes of a map with their labels.
+///
+/// Units: microradians. `cutoff_mm` is the wavelength at which the map's filter passes one half.
+pub fn labelled_slope(slope: &Slope, cutoff_mm: f64) -> Vec<Labelled> {
+    let [x, y] = slope.integration_mm;
+    let made = format!("from the map, over {x:.3} mm along x and {y:.3} mm along y, at {} nodes", slope.nodes);
+    let cut_off = format!("waves below {cutoff_mm} mm (Gaussian, ISO 16610-61)");
+    let urad = |name, rad: f64| row(name, 1e6 * rad, "urad", &removed(&[]), &cut_off, &made);
+    vec![urad("slope RMS", slope.rms_rad), urad("slope, largest", slope.largest_rad)]
+}
+
+fn row(name: &'static str, value: f64, unit: &'static str, removed: &str, cut_off: &str, made: &str) -> Labelled {
+    Labelled {
+        name,
+        value,
+        unit,
+        removed: removed.to_owned(),
+        direction: DIRECTION,
+        cut_off: cut_off.to_owned(),
+        made: made.to_owned(),
+        at_mm: None,
+    }
+}
+
+fn removed(forms: &[Removed]) -> String {
+    let words = std::iter::once("rigid motion (registration)").chain(forms.iter().map(|form| form.word()));
+    words.collect::<Vec<_>>().join(", ")
+}

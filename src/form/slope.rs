@@ -1,0 +1,115 @@
+//! Slopes of a map.
+
+use serde::Serialize;
+
+use super::FormError;
+
+/// The slopes of a map over an integration length.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Slope {
+    /// Root mean square of the gradient's length.
+    pub rms_rad: f64,
+    /// Root mean square of the slopes along x and along y.
+    pub rms_along_rad: [f64; 2],
+    /// Largest length of the gradient.
+    pub largest_rad: f64,
+    /// Length over which a slope was taken along x and along y, in millimetres: an even number of steps of the net.
+    pub integration_mm: [f64; 2],
+    /// At how many nodes it was taken.
+    pub nodes: usize,
+}
+
+/// Returns the slopes of values on a regular net, each the difference of two values an integration length apart, divided by it.
+///
+/// Shapes: columns and rows; a value and whether it is valid for every node, row by row, x fastest. Units: millimetres. The length is rounded to an even number of steps, two at
+/// least; a node counts where all four of its neighbours at half the length are valid.
+///
+/// # Errors
+/// A length that is none, and a map without such a node.
+pub fn slope(
+    [columns, rows]: [usize; 2],
+    spacing_mm: [f64; 2],
+    values_mm: &[f64],
+    valid: &[bool],
+    integration_mm: f64,
+) -> Result<Slope, FormError> {
+    if !(integration_mm > 0.0 && integration_mm.is_finite()) {
+        return Err(FormError::Integration { integration_mm });
+    }
+    let half = spacing_mm.map(|spacing| (0.5 * integration_mm / spacing).round().clamp(1.0, 1e9) as usize);
+    let length_mm: [f64; 2] = std::array::from_fn(|k| 2.0 * half[k] as f64 * spacing_mm[k]);
+    let known = |i: usize, j: usize| {
+        let k = j * columns + i;
+        (i < columns && j < rows && valid[k]).then(|| values_mm[k])
+    };
+    let (mut sums, mut largest, mut nodes) = ([0.0; 2], 0.0f64, 0usize);
+    for j in half[1]..rows.saturating_sub(half[1]) {
+        for i in half[0]..columns.saturating_sub(half[0]) {
+            let ends = [(i - half[0], j), (i + half[0], j), (i, j - half[1]), (i, j + half[1])];
+            let [Some(left), Some(right), Some(low), Some(high)] = ends.map(|(i, j)| known(i, j)) else { continue };
+            let [x, y] = [(right - left) / length_mm[0], (high - low) / length_mm[1]];
+            (sums[0], sums[1], nodes) = (sums[0] + x * x, sums[1] + y * y, nodes + 1);
+            largest = largest.max(x.hypot(y));
+        }
+    }
+    if nodes == 0 {
+        return Err(FormError::NoSlope { integration_mm });
+    }
+    let mean = sums.map(|sum| sum / nodes as f64);
+    Ok(Slope {
+        rms_rad: (mean[0] + mean[1]).sqrt(),
+        rms_along_rad: mean.map(f64::sqrt),
+        largest_rad: largest,
+        integration_mm: length_mm,
+        nodes,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NODES: usize = 41 * 31;
+
+    fn of(f: impl Fn(f64, f64) -> f64, valid: &[bool], integration_mm: f64) -> Result<Slope, FormError> {
+        let values: Vec<f64> = (0..NODES).map(|k| f((k % 41) as f64 - 20.0, (k / 41) as f64 - 15.0)).collect();
+        slope([41, 31], [1.0; 2], &values, valid, integration_mm)
+    }
+
+    #[test]
+    fn a_plane_has_its_slope_at_every_length() {
+        let all = vec![true; NODES];
+        for length in [0.1, 2.0, 3.0, 12.0] {
+            let found = of(|x, y| 3e-6 * x - 4e-6 * y + 1.0, &all, length).unwrap();
+            assert!((found.rms_rad - 5e-6).abs() < 1e-15 && (found.largest_rad - 5e-6).abs() < 1e-15);
+            assert!((found.rms_along_rad[0] - 3e-6).abs() < 1e-15);
+        }
+        assert_eq!(of(|_, _| 0.0, &all, 4.0).unwrap().rms_rad, 0.0);
+        let found = of(|_, _| 0.0, &all, 4.9).unwrap();
+        assert_eq!((found.integration_mm, found.nodes), ([4.0, 4.0], 37 * 27));
+    }
+
+    #[test]
+    fn a_wave_is_flattened_by_the_integration_as_it_should() {
+        // sin(kx) over a length L has the slope k cos(kx) sinc(kL/2); its rms over whole waves is k sinc / sqrt 2.
+        let (k, all) = (std::f64::consts::TAU / 12.0, vec![true; NODES]);
+        for length in [2.0, 4.0, 6.0] {
+            let expected = (0.5 * k * length).sin() / (0.5 * k * length) * k * 1e-6 / 2f64.sqrt();
+            let found = of(|x, _| 1e-6 * (k * x).sin(), &all, length).unwrap().rms_along_rad[0];
+            // Not whole waves: a few per cent.
+            assert!((found / expected - 1.0).abs() < 0.05, "{length}: {found} {expected}");
+        }
+    }
+
+    #[test]
+    fn what_was_not_measured_has_no_slope() {
+        let mut valid = vec![true; NODES];
+        valid[15 * 41 + 20] = false;
+        let spike = |x: f64, y: f64| if (x, y) == (0.0, 0.0) { 1.0 } else { 0.0 };
+        let found = of(spike, &valid, 2.0).unwrap();
+        assert_eq!((found.rms_rad, found.nodes), (0.0, 39 * 29 - 4));
+        assert_eq!(of(spike, &vec![false; NODES], 2.0), Err(FormError::NoSlope { integration_mm: 2.0 }));
+        assert_eq!(of(spike, &valid, 50.0), Err(FormError::NoSlope { integration_mm: 50.0 }));
+        assert!(matches!(of(spike, &valid, f64::NAN), Err(FormError::Integration { .. })));
+    }
+}

@@ -1,0 +1,104 @@
+//! `figures.json`: what is left on the part, each figure with its labels.
+
+use std::path::Path;
+
+use serde::Serialize;
+
+use super::error::FormatError;
+use super::registration::write_json_atomic;
+use crate::form::{Basis, Figures, Fit, FormError, Iso10110, Labelled, Slope, labelled, labelled_slope};
+
+/// What is written of a cycle's figures.
+#[derive(Serialize)]
+struct FiguresDocument<'a> {
+    simulation: bool,
+    frame: &'static str,
+    /// Points that took part.
+    points: Option<usize>,
+    figures: Vec<Labelled>,
+    iso_10110_5: Option<&'a Iso10110>,
+    zernike: Option<SeriesDocument>,
+    legendre: Option<SeriesDocument>,
+    /// Which figures there are not, and why.
+    missing: Vec<String>,
+}
+
+/// Polynomials fitted to the deviations.
+#[derive(Serialize)]
+struct SeriesDocument {
+    polynomials: &'static str,
+    normalisation: &'static str,
+    centre_mm: [f64; 2],
+    /// Radius of the disc, or half the sides of the rectangle.
+    half_size_mm: [f64; 2],
+    points: usize,
+    residual_rms_nm: f64,
+    terms: Vec<TermDocument>,
+}
+
+#[derive(Serialize)]
+struct TermDocument {
+    term: String,
+    /// Least squares of all terms together.
+    coefficient_nm: f64,
+    /// What the term takes once it is orthogonal, on the points, to those before it: a root mean square with a sign.
+    orthogonal_nm: f64,
+}
+
+/// Writes `figures.json`: the figures of the points and, where there is a map, its slopes with the filter's cut-off.
+///
+/// Where there are no figures the file says why.
+///
+/// # Errors
+/// A file that cannot be written.
+pub fn write_figures(
+    path: &Path,
+    figures: Result<&Figures, &FormError>,
+    slope: Option<(Result<&Slope, &FormError>, f64)>,
+    simulation: bool,
+) -> Result<(), FormatError> {
+    let (mut rows, mut missing) = (Vec::new(), Vec::new());
+    match figures {
+        Ok(figures) => rows.extend(labelled(figures)),
+        Err(why) => missing.push(format!("figures of the points: {why}")),
+    }
+    match slope {
+        Some((Ok(slope), cutoff_mm)) => rows.extend(labelled_slope(slope, cutoff_mm)),
+        Some((Err(why), _)) => missing.push(format!("slopes: {why}")),
+        None => missing.push("slopes: there is no map".to_owned()),
+    }
+    let found = figures.ok();
+    let document = FiguresDocument {
+        simulation,
+        frame: "model",
+        points: found.map(|f| f.points),
+        figures: rows,
+        iso_10110_5: found.map(|f| &f.iso_10110),
+        zernike: found.and_then(|f| f.zernike.as_ref()).map(series),
+        legendre: found.and_then(|f| f.legendre.as_ref()).map(series),
+        missing,
+    };
+    write_json_atomic(path, &document)
+}
+
+fn series(fit: &Fit) -> SeriesDocument {
+    let (normalisation, centre_mm, half_size_mm) = match fit.basis {
+        Basis::Zernike { centre_mm, radius_mm, .. } => ("mean square 1 over the full disc", centre_mm, [radius_mm; 2]),
+        Basis::Legendre { centre_mm, half_mm } => ("mean square 1 over the full rectangle", centre_mm, half_mm),
+    };
+    let pairs = fit.coefficients_mm.iter().zip(&fit.orthogonal_mm).enumerate();
+    let term = |(k, (coefficient, orthogonal)): (usize, (&f64, &f64))| TermDocument {
+        term: fit.basis.term(k),
+        coefficient_nm: 1e6 * coefficient,
+        orthogonal_nm: 1e6 * orthogonal,
+    };
+    SeriesDocument {
+        polynomials: fit.basis.name(),
+        normalisation,
+        centre_mm,
+        half_size_mm,
+        points: fit.points,
+        residual_rms_nm: 1e6 * fit.residual_rms_mm,
+        terms: pairs.map(term).collect(),
+    }
+}

@@ -1,0 +1,180 @@
+//! A map of heights over a regular grid, as interferometers and profilometers give it.
+
+use std::path::Path;
+
+use super::error::FormatError;
+use super::number::{LIMIT_MM, is_believable};
+use crate::geometry::Point;
+
+/// Most samples of a map that is read: 450 MB of them.
+pub(super) const MOST_SAMPLES: u64 = 50_000_000;
+
+/// Heights over a regular grid in x and y, some of which may not have been measured.
+///
+/// Frame: that of the instrument, right-handed: x to the right, y upwards, z towards the instrument. Units: millimetres. Order:
+/// row by row, x fastest, y rising.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HeightMap {
+    /// Samples along x.
+    pub columns: usize,
+    /// Samples along y.
+    pub rows: usize,
+    /// x and y of the first sample.
+    pub first_mm: [f64; 2],
+    /// Distance of the samples along x and y, above 0.
+    pub spacing_mm: [f64; 2],
+    /// The heights; finite everywhere, 0 where `valid` is not.
+    pub heights_mm: Vec<f64>,
+    /// Whether a sample was measured.
+    pub valid: Vec<bool>,
+    /// What the reader had to decide about the file, in words.
+    pub notes: Vec<String>,
+}
+
+impl HeightMap {
+    /// Lays samples on a grid; `None` is a sample that was not measured.
+    ///
+    /// # Errors
+    /// No sample along an axis, more than 50 million of them or another number than the grid has; a spacing that is not above
+    /// 0; a place or a height that is NaN, infinite or beyond 1e7 mm; not one sample that was measured. `path` is only what
+    /// messages call the file.
+    pub fn new(
+        path: &Path,
+        [columns, rows]: [usize; 2],
+        first_mm: [f64; 2],
+        spacing_mm: [f64; 2],
+        samples: impl IntoIterator<Item = Option<f64>>,
+    ) -> Result<Self, FormatError> {
+        let unexpected = |place: String, expected: &str, found: String| FormatError::Unexpected {
+            path: path.to_owned(),
+            place,
+            expected: expected.to_owned(),
+            found,
+        };
+        check_size(path, columns as u64, rows as u64)?;
+        for (k, axis) in ["x", "y"].into_iter().enumerate() {
+            if !(spacing_mm[k] > 0.0 && is_believable(spacing_mm[k] * (columns.max(rows) as f64))) {
+                let found = format!("{} mm", spacing_mm[k]);
+                return Err(unexpected(
+                    format!("spacing along {axis}"),
+                    "a length above 0 that a part may have",
+                    found,
+                ));
+            }
+            if !is_believable(first_mm[k]) {
+                let found = format!("{} mm", first_mm[k]);
+                return Err(unexpected(format!("offset along {axis}"), "a place on a part", found));
+            }
+        }
+        let count = columns * rows;
+        let (mut heights_mm, mut valid) = (Vec::with_capacity(count), Vec::with_capacity(count));
+        for sample in samples.into_iter().take(count + 1) {
+            if let Some(height) = sample.filter(|h| !is_believable(*h)) {
+                let k = heights_mm.len();
+                return Err(unexpected(
+                    format!("sample {} of row {}", k % columns + 1, k / columns + 1),
+                    &format!("a height of at most {LIMIT_MM:e} mm"),
+                    format!("{height} mm"),
+                ));
+            }
+            heights_mm.push(sample.unwrap_or(0.0));
+            valid.push(sample.is_some());
+        }
+        if heights_mm.len() != count {
+            let found = if heights_mm.len() > count { "more".to_owned() } else { heights_mm.len().to_string() };
+            return Err(unexpected("samples".to_owned(), &format!("{columns} times {rows} of them"), found));
+        }
+        if !valid.contains(&true) {
+            return Err(FormatError::NoData { path: path.to_owned(), expected: "sample that was measured" });
+        }
+        Ok(Self { columns, rows, first_mm, spacing_mm, heights_mm, valid, notes: Vec::new() })
+    }
+
+    /// Returns x and y of a sample by its index.
+    pub fn place_mm(&self, index: usize) -> [f64; 2] {
+        let (i, j) = (index % self.columns, index / self.columns);
+        [self.first_mm[0] + i as f64 * self.spacing_mm[0], self.first_mm[1] + j as f64 * self.spacing_mm[1]]
+    }
+
+    /// Returns the measured samples as points (x, y, height), in the order of the map.
+    pub fn points(&self) -> Vec<Point> {
+        self.measured().map(|(k, height)| (self.place_mm(k), height)).map(|([x, y], z)| Point::new(x, y, z)).collect()
+    }
+
+    /// Returns how many samples were measured.
+    pub fn measured_count(&self) -> usize {
+        self.valid.iter().filter(|v| **v).count()
+    }
+
+    /// Returns the largest less the least measured height, in millimetres.
+    pub fn pv_mm(&self) -> f64 {
+        let (low, high) = self.measured().fold((f64::MAX, f64::MIN), |(l, h), (_, z)| (l.min(z), h.max(z)));
+        high - low
+    }
+
+    /// Returns the root mean square of the measured heights about their mean, in millimetres.
+    pub fn rms_mm(&self) -> f64 {
+        let count = self.measured_count() as f64;
+        let mean = self.measured().map(|(_, z)| z).sum::<f64>() / count;
+        (self.measured().map(|(_, z)| (z - mean).powi(2)).sum::<f64>() / count).sqrt()
+    }
+
+    fn measured(&self) -> impl Iterator<Item = (usize, f64)> {
+        self.heights_mm.iter().copied().enumerate().filter(|(k, _)| self.valid[*k])
+    }
+}
+
+/// Refuses a grid that has no sample or more than are read, before anything is reserved for it.
+pub(super) fn check_size(path: &Path, columns: u64, rows: u64) -> Result<(), FormatError> {
+    let samples = columns.saturating_mul(rows);
+    match samples {
+        0 => Err(FormatError::NoData { path: path.to_owned(), expected: "samples (a side of the map is 0)" }),
+        1..=MOST_SAMPLES => Ok(()),
+        found => {
+            Err(FormatError::TooLarge { path: path.to_owned(), found, limit: MOST_SAMPLES, unit: "samples of a map" })
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn map(samples: &[Option<f64>]) -> Result<HeightMap, FormatError> {
+        HeightMap::new(Path::new("m"), [3, 2], [-1.0, 4.0], [0.5, 2.0], samples.iter().copied())
+    }
+
+    #[test]
+    fn what_was_not_measured_is_no_point() {
+        let some = |k: i32| (k != 4).then(|| f64::from(k));
+        let map = map(&(0..6).map(some).collect::<Vec<_>>()).unwrap();
+        let points = map.points();
+        assert_eq!((points.len(), map.measured_count()), (5, 5));
+        assert_eq!((points[1], points[4]), (Point::new(-0.5, 4.0, 1.0), Point::new(0.0, 6.0, 5.0)));
+        assert_eq!((map.pv_mm(), map.heights_mm[4]), (5.0, 0.0));
+        // 0 1 2 3 5: mean 2.2, squares about it 4.84 1.44 0.04 0.64 7.84.
+        assert!((map.rms_mm() - (14.8f64 / 5.0).sqrt()).abs() < 1e-15);
+    }
+
+    #[test]
+    fn what_is_no_map_is_refused() {
+        let full = [Some(0.0); 6];
+        assert!(map(&full).is_ok());
+        let told = |made: Result<HeightMap, FormatError>| made.unwrap_err().to_string();
+        assert!(told(map(&full[..5])).contains("expected 3 times 2 of them, found `5`"));
+        assert!(told(map(&[Some(0.0); 9])).contains("found `more`"));
+        assert!(told(map(&[None; 6])).contains("no sample that was measured"));
+        for bad in [f64::NAN, f64::INFINITY, -1e8] {
+            let mut samples = full;
+            samples[4] = Some(bad);
+            assert!(told(map(&samples)).contains("sample 2 of row 2"), "{bad}");
+        }
+        let of = |size, first, spacing| HeightMap::new(Path::new("m"), size, first, spacing, full.iter().copied());
+        for spacing in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e9] {
+            assert!(told(of([3, 2], [0.0; 2], [1.0, spacing])).contains("spacing along y"), "{spacing}");
+        }
+        assert!(told(of([3, 2], [f64::NAN, 0.0], [1.0; 2])).contains("offset along x"));
+        assert!(matches!(of([0, 2], [0.0; 2], [1.0; 2]), Err(FormatError::NoData { .. })));
+        assert!(matches!(of([usize::MAX, 2], [0.0; 2], [1.0; 2]), Err(FormatError::TooLarge { .. })));
+    }
+}

@@ -1,0 +1,206 @@
+//! Maps in the surface data file format (`.sdf`; ISO 25178-71, EUNA 15178), as text and binary.
+//!
+//! A header of thirteen fields, the heights profile by profile, and a trailer that is not read. Scales are metres. As text: `key =
+//! value` lines between the version and a line `*`; `BAD` was not measured. Binary: 81 bytes, little-endian; not measured are NaN, the infinities,
+//! the least value of signed and the largest of unsigned integers of 16 and 32 bits.
+
+use std::path::Path;
+
+use super::error::{FormatError, excerpt};
+use super::height_map::{HeightMap, check_size};
+use super::whole::{MOST_BYTES, open};
+
+/// Length of the binary header.
+const HEADER: usize = 81;
+/// Some instruments write two more words before the heights.
+const EXTRA: usize = 8;
+/// The fields of the header that are read, as they are called in text.
+const FIELDS: [&str; 8] =
+    ["NumPoints", "NumProfiles", "Xscale", "Yscale", "Zscale", "Compression", "DataType", "CheckType"];
+
+/// Reads an SDF map of at most 1 GiB.
+///
+/// # Errors
+/// A file that is not readable, no SDF, malformed, compressed or cut; a number that is none.
+pub fn read_sdf(path: impl AsRef<Path>) -> Result<HeightMap, FormatError> {
+    let path = path.as_ref();
+    let opened = open(path)?;
+    check_version(path, &opened.head)?;
+    parse_sdf(path, &opened.read_all(path, MOST_BYTES)?)
+}
+
+/// Parses the bytes of an SDF file; `path` is only what messages call it.
+///
+/// # Errors
+/// Those of [`read_sdf`].
+pub fn parse_sdf(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
+    check_version(path, bytes)?;
+    if bytes[0] == b'a' { parse_text(path, bytes) } else { parse_binary(path, bytes) }
+}
+
+fn check_version(path: &Path, head: &[u8]) -> Result<(), FormatError> {
+    if is_sdf(head) {
+        return Ok(());
+    }
+    Err(unexpected(path, "byte 0", "aISO-1.0 or bISO-1.0", excerpt(&head[..head.len().min(8)])))
+}
+
+/// Returns whether a file begins like SDF.
+pub(super) fn is_sdf(head: &[u8]) -> bool {
+    let version = head.get(..8).unwrap_or_default();
+    matches!(version.first(), Some(b'a' | b'b'))
+        && [&b"ISO-1.0"[..], b"BCR-0.0", b"BCR-1.0"].contains(&version.get(1..).unwrap_or_default())
+}
+
+fn unexpected(path: &Path, place: &str, expected: &str, found: impl Into<String>) -> FormatError {
+    let (place, expected, found) = (place.to_owned(), expected.to_owned(), found.into());
+    FormatError::Unexpected { path: path.to_owned(), place, expected, found }
+}
+
+/// What is read of a header.
+struct Header {
+    size: [usize; 2],
+    /// Metres per step.
+    scale_m: [f64; 3],
+    kind: u8,
+}
+
+impl Header {
+    /// Checks the fields in the order of [`FIELDS`].
+    fn new(path: &Path, fields: [f64; 8]) -> Result<Self, FormatError> {
+        let [columns, rows, x, y, z, compression, kind, check] = fields;
+        let field = |k: usize, expected: &str| unexpected(path, FIELDS[k], expected, fields[k].to_string());
+        for (k, count) in [columns, rows].into_iter().enumerate() {
+            if !(count >= 0.0 && count.fract() == 0.0 && count <= f64::from(u32::MAX)) {
+                return Err(field(k, "a whole number"));
+            }
+        }
+        check_size(path, columns as u64, rows as u64)?;
+        for (k, scale) in [(2, x), (3, y), (4, z)] {
+            if !(scale > 0.0 && scale.is_finite()) {
+                return Err(field(k, "metres per step, above 0"));
+            }
+        }
+        if compression != 0.0 {
+            return Err(field(5, "0, as compressed heights are not read"));
+        }
+        if check != 0.0 {
+            return Err(field(7, "0, as no other check is defined"));
+        }
+        if !(0.0..=7.0).contains(&kind) || kind.fract() != 0.0 {
+            return Err(field(6, "a data type from 0 to 7"));
+        }
+        Ok(Self { size: [columns as usize, rows as usize], scale_m: [x, y, z], kind: kind as u8 })
+    }
+
+    fn map(
+        &self,
+        path: &Path,
+        samples: impl Iterator<Item = Result<Option<f64>, FormatError>>,
+    ) -> Result<HeightMap, FormatError> {
+        let [x, y, z] = self.scale_m.map(|scale| 1e3 * scale);
+        let mut first_bad = None;
+        // An error ends the samples, and is what is wrong with the file.
+        let heights = samples.map_while(|sample| sample.map_err(|error| first_bad = Some(error)).ok());
+        let made = HeightMap::new(path, self.size, [0.0; 2], [x, y], heights.map(|raw| raw.map(|v| v * z)));
+        match first_bad {
+            Some(error) => Err(error),
+            None => made,
+        }
+    }
+}
+
+fn parse_binary(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
+    let cut =
+        |expected: String| FormatError::Cut { path: path.to_owned(), place: format!("byte {}", bytes.len()), expected };
+    let head = bytes.get(..HEADER).ok_or_else(|| cut(format!("a header of {HEADER} bytes")))?;
+    let count = |at: usize| f64::from(u16::from_le_bytes([head[at], head[at + 1]]));
+    let real = |at: usize| head[at..].first_chunk().map_or(f64::NAN, |b| f64::from_le_bytes(*b));
+    let byte = |at: usize| f64::from(head[at]);
+    // Zresolution, at 70, changes no value.
+    let fields = [count(42), count(44), real(46), real(54), real(62), byte(78), byte(79), byte(80)];
+    let header = Header::new(path, fields)?;
+    let size = [1, 2, 4, 4, 1, 2, 4, 8][usize::from(header.kind)];
+    let length = header.size[0] * header.size[1] * size;
+    let begin = if bytes.len() == HEADER + length + EXTRA { HEADER + EXTRA } else { HEADER };
+    let expected = || format!("{} times {} heights of {size} bytes", header.size[0], header.size[1]);
+    let raw = bytes.get(begin..begin + length).ok_or_else(|| cut(expected()))?;
+    let kind = header.kind;
+    header.map(path, raw.chunks_exact(size).map(|at| Ok(binary_value(kind, at))))
+}
+
+/// Reads a height; `None` where it was not measured.
+fn binary_value(kind: u8, at: &[u8]) -> Option<f64> {
+    let two = || at.first_chunk().copied().unwrap_or_default();
+    let four = || at.first_chunk().copied().unwrap_or_default();
+    let value = match kind {
+        0 => f64::from(at[0]),
+        1 => Some(u16::from_le_bytes(two())).filter(|v| *v != u16::MAX)?.into(),
+        2 => Some(u32::from_le_bytes(four())).filter(|v| *v != u32::MAX)?.into(),
+        3 => f32::from_le_bytes(four()).into(),
+        4 => f64::from(i8::from_le_bytes([at[0]])),
+        5 => Some(i16::from_le_bytes(two())).filter(|v| *v != i16::MIN)?.into(),
+        6 => Some(i32::from_le_bytes(four())).filter(|v| *v != i32::MIN)?.into(),
+        _ => f64::from_le_bytes(at.first_chunk().copied().unwrap_or_default()),
+    };
+    value.is_finite().then_some(value)
+}
+
+fn parse_text(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatError> {
+    let mut fields = [f64::NAN; 8];
+    let mut lines = bytes.split(|&b| b == b'\n').map(<[u8]>::trim_ascii).zip(1u64..).skip(1);
+    let mut offset = bytes.iter().position(|&b| b == b'\n').map_or(bytes.len(), |at| at + 1);
+    let first_line = loop {
+        let Some((line, number)) = lines.next() else {
+            let place = "the end of the header".to_owned();
+            return Err(FormatError::Cut { path: path.to_owned(), place, expected: "a line `*`".to_owned() });
+        };
+        offset += bytes[offset..].iter().position(|&b| b == b'\n').map_or(bytes.len() - offset, |at| at + 1);
+        if line.starts_with(b"*") {
+            break number + 1;
+        }
+        read_field(path, line, number, &mut fields)?;
+    };
+    if let Some(k) = fields.iter().position(|field| field.is_nan()) {
+        return Err(unexpected(path, "the header", &format!("a line `{} = ...`", FIELDS[k]), ""));
+    }
+    let header = Header::new(path, fields)?;
+    let count = header.size[0] * header.size[1];
+    let words = || {
+        let lines = bytes[offset..].split(|&b| b == b'\n').zip(first_line..);
+        let words = lines.flat_map(|(line, number)| {
+            let words = line.split(|b| b.is_ascii_whitespace()).filter(|word| !word.is_empty());
+            words.map(move |word| (word, number))
+        });
+        // What follows the last height is the trailer.
+        words.take_while(|(word, _)| !word.starts_with(b"*")).take(count + 1)
+    };
+    let found = words().count();
+    if found < count {
+        let (place, expected) = (format!("height {}", found + 1), format!("{count} heights"));
+        return Err(FormatError::Cut { path: path.to_owned(), place, expected });
+    }
+    header.map(path, words().map(|(word, number)| text_value(path, word, number)))
+}
+
+fn read_field(path: &Path, line: &[u8], number: u64, fields: &mut [f64; 8]) -> Result<(), FormatError> {
+    let at = line.iter().position(|&b| b == b'=').unwrap_or(line.len());
+    let key = line[..at].trim_ascii();
+    let Some(k) = FIELDS.iter().position(|name| key.eq_ignore_ascii_case(name.as_bytes())) else { return Ok(()) };
+    let value = line.get(at + 1..).unwrap_or_default().trim_ascii();
+    match fast_float2::parse::<f64, _>(value) {
+        Ok(value) if value.is_finite() => fields[k] = value,
+        _ => return Err(unexpected(path, &format!("line {number}"), "a number", excerpt(value))),
+    }
+    Ok(())
+}
+
+fn text_value(path: &Path, word: &[u8], number: u64) -> Result<Option<f64>, FormatError> {
+    if word.eq_ignore_ascii_case(b"bad") {
+        return Ok(None);
+    }
+    match fast_float2::parse::<f64, _>(word) {
+        Ok(value) => Ok(Some(value).filter(|v| v.is_finite())),
+        Err(_) => Err(unexpected(path, &format!("line {number}"), "a height or `BAD`", excerpt(word))),
+    }
+}

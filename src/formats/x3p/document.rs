@@ -1,0 +1,319 @@
+//! What `main.xml` says.
+
+use std::path::Path;
+
+use roxmltree::{Document, Node, ParsingOptions};
+
+use super::Record;
+use crate::formats::error::{FormatError, excerpt};
+use crate::formats::height_map::{MOST_SAMPLES, check_size};
+
+/// Most nodes of the document: three for a sample that stands in it.
+const MOST_NODES: u32 = 10_000_000;
+
+/// What is read of `main.xml`.
+pub(super) struct Main {
+    /// x, y and z.
+    pub(super) axes: [Axis; 3],
+    pub(super) extent: Extent,
+    /// Whether the first row is the uppermost one.
+    pub(super) rows_from_north: bool,
+    /// The entry with the sum of `main.xml`.
+    pub(super) checksum_file: Option<String>,
+    pub(super) notes: Vec<String>,
+}
+
+/// How an axis is coded: value in metres = offset + increment * (raw value, or index where the axis is not absolute).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Axis {
+    pub(super) absolute: bool,
+    pub(super) kind: Kind,
+    pub(super) increment: f64,
+    pub(super) offset_m: f64,
+}
+
+/// The type of a value: the standard's I, L, F and D.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Kind {
+    Int16,
+    Int32,
+    Float32,
+    Float64,
+}
+
+impl Kind {
+    pub(super) fn bytes(self) -> usize {
+        match self {
+            Self::Int16 => 2,
+            Self::Int32 | Self::Float32 => 4,
+            Self::Float64 => 8,
+        }
+    }
+
+    /// Reads a value of as many bytes.
+    pub(super) fn value(self, at: &[u8]) -> f64 {
+        match self {
+            Self::Int16 => at.first_chunk().map_or(f64::NAN, |b| i16::from_le_bytes(*b).into()),
+            Self::Int32 => at.first_chunk().map_or(f64::NAN, |b| i32::from_le_bytes(*b).into()),
+            Self::Float32 => at.first_chunk().map_or(f64::NAN, |b| f32::from_le_bytes(*b).into()),
+            Self::Float64 => at.first_chunk().map_or(f64::NAN, |b| f64::from_le_bytes(*b)),
+        }
+    }
+}
+
+/// How many samples there are.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Extent {
+    Matrix([usize; 2]),
+    List(usize),
+}
+
+impl Extent {
+    /// Returns the number of samples, if it is one that is read.
+    pub(super) fn count(self, path: &Path) -> Result<usize, FormatError> {
+        let [columns, rows] = match self {
+            Self::Matrix(size) => size,
+            Self::List(count) => [count, 1],
+        };
+        check_size(path, columns as u64, rows as u64)?;
+        Ok(columns * rows)
+    }
+}
+
+/// An entry of the container and its MD5 sum, if one is on record.
+pub(super) struct Sealed {
+    pub(super) entry: String,
+    pub(super) md5: Option<String>,
+}
+
+/// Where the samples are.
+pub(super) enum Samples {
+    Inline(Vec<Record>),
+    Linked { data: Sealed, valid: Option<Sealed> },
+}
+
+/// A document and where it comes from, for messages.
+struct Place<'a> {
+    path: &'a Path,
+    entry: &'a str,
+}
+
+impl Place<'_> {
+    fn unexpected(&self, node: Node<'_, '_>, expected: &str, found: &str) -> FormatError {
+        let line = node.document().text_pos_at(node.range().start).row;
+        FormatError::Unexpected {
+            path: self.path.to_owned(),
+            place: format!("{}, line {line} ({})", self.entry, node.tag_name().name()),
+            expected: expected.to_owned(),
+            found: excerpt(found.as_bytes()),
+        }
+    }
+
+    fn missing(&self, what: &str) -> FormatError {
+        FormatError::Missing { path: self.path.to_owned(), expected: format!("{what} in {}", self.entry) }
+    }
+
+    fn child<'d>(&self, node: Node<'d, 'd>, name: &str) -> Result<Node<'d, 'd>, FormatError> {
+        child(node, name).ok_or_else(|| self.missing(&format!("{}/{name}", node.tag_name().name())))
+    }
+
+    fn number(&self, node: Node<'_, '_>) -> Result<f64, FormatError> {
+        let text = text(node);
+        let number = fast_float2::parse::<f64, _>(text.as_bytes()).ok().filter(|v| v.is_finite());
+        number.ok_or_else(|| self.unexpected(node, "a finite number", &text))
+    }
+
+    /// Returns the number in an element; a default where it is not there or empty.
+    fn number_or(&self, parent: Node<'_, '_>, name: &str, default: f64) -> Result<f64, FormatError> {
+        match child(parent, name).filter(|node| !text(*node).is_empty()) {
+            Some(node) => self.number(node),
+            None => Ok(default),
+        }
+    }
+
+    fn count(&self, node: Node<'_, '_>) -> Result<usize, FormatError> {
+        let text = text(node);
+        text.parse().map_err(|_| self.unexpected(node, "a whole number", &text))
+    }
+}
+
+/// Returns the first child of a name, whatever its namespace: writers disagree on it.
+fn child<'a, 'd>(node: Node<'a, 'd>, name: &str) -> Option<Node<'a, 'd>> {
+    node.children().find(|c| c.is_element() && c.tag_name().name() == name)
+}
+
+fn text(node: Node<'_, '_>) -> String {
+    node.text().unwrap_or_default().trim().to_owned()
+}
+
+impl Main {
+    /// Parses the document; returns with it the samples, or where they are.
+    pub(super) fn parse(path: &Path, entry: &str, bytes: &[u8]) -> Result<(Self, Samples), FormatError> {
+        let place = Place { path, entry };
+        let source = std::str::from_utf8(bytes).map_err(|error| {
+            let at = error.valid_up_to();
+            let line = 1 + bytes[..at].iter().filter(|&&b| b == b'\n').count() as u64;
+            FormatError::NotText { path: path.to_owned(), line, value: bytes[at] }
+        })?;
+        let options = ParsingOptions { nodes_limit: MOST_NODES, ..ParsingOptions::default() };
+        let document = Document::parse_with_options(source.trim_start_matches('\u{feff}'), options)
+            .map_err(|source| FormatError::Xml { path: path.to_owned(), entry: entry.to_owned(), source })?;
+        Self::of(&place, document.root_element())
+    }
+
+    fn of<'d>(place: &Place<'_>, root: Node<'d, 'd>) -> Result<(Self, Samples), FormatError> {
+        if !root.tag_name().name().starts_with("ISO5436") {
+            return Err(place.unexpected(root, "the root ISO5436_2", root.tag_name().name()));
+        }
+        let first = place.child(root, "Record1")?;
+        let revision = child(first, "Revision").map(text).unwrap_or_default();
+        let axes = place.child(first, "Axes")?;
+        check_frame(place, axes)?;
+        let mut notes = Vec::new();
+        let rows_from_north = from_north(place, axes, &mut notes)?;
+        let axes = [
+            axis(place, place.child(axes, "CX")?, &revision)?,
+            axis(place, place.child(axes, "CY")?, &revision)?,
+            axis(place, place.child(axes, "CZ")?, &revision)?,
+        ];
+        let third = place.child(root, "Record3")?;
+        let extent = extent(place, first, third, &axes)?;
+        let samples = samples(place, third, &axes)?;
+        let checksum_file = child(root, "Record4").and_then(|r| child(r, "ChecksumFile")).map(text);
+        Ok((Self { axes, extent, rows_from_north, checksum_file, notes }, samples))
+    }
+}
+
+/// Refuses a frame that is turned against the axes of the data.
+fn check_frame<'d>(place: &Place<'_>, axes: Node<'d, 'd>) -> Result<(), FormatError> {
+    let Some(rotation) = child(axes, "Rotation") else { return Ok(()) };
+    for element in rotation.children().filter(Node::is_element) {
+        let name = element.tag_name().name();
+        let unit = if matches!(name, "r11" | "r22" | "r33") { 1.0 } else { 0.0 };
+        let found = place.number(element)?;
+        if (found - unit).abs() > 1e-9 {
+            let expected = "a frame that is not turned; export the map without rotation";
+            return Err(place.unexpected(element, expected, &found.to_string()));
+        }
+    }
+    Ok(())
+}
+
+/// Tells whether the rows begin above; the standard knows no such element, and some writers use it.
+fn from_north<'d>(place: &Place<'_>, axes: Node<'d, 'd>, notes: &mut Vec<String>) -> Result<bool, FormatError> {
+    let Some(origin) = child(axes, "Origin") else { return Ok(false) };
+    match text(origin).as_str() {
+        "" | "SW" => Ok(false),
+        "NW" => {
+            notes.push("the file says that its first sample is the north-western one: rows were turned over".into());
+            Ok(true)
+        }
+        other => Err(place.unexpected(origin, "SW or NW", other)),
+    }
+}
+
+fn axis<'d>(place: &Place<'_>, node: Node<'d, 'd>, revision: &str) -> Result<Axis, FormatError> {
+    let name = node.tag_name().name();
+    let absolute = match place.child(node, "AxisType").map(|n| (n, text(n)))? {
+        (_, kind) if kind == "A" => true,
+        (_, kind) if kind == "I" && name != "CZ" => false,
+        (n, other) => {
+            return Err(place.unexpected(n, if name == "CZ" { "A (absolute)" } else { "A or I" }, &other));
+        }
+    };
+    let kind = match child(node, "DataType").map(|n| (n, text(n))) {
+        Some((_, kind)) if kind == "I" => Kind::Int16,
+        Some((_, kind)) if kind == "L" => Kind::Int32,
+        Some((_, kind)) if kind == "F" => Kind::Float32,
+        Some((_, kind)) if kind == "D" => Kind::Float64,
+        Some((n, other)) => return Err(place.unexpected(n, "I, L, F or D", &other)),
+        None if !absolute => Kind::Float64,
+        None => return Err(place.missing(&format!("{name}/DataType"))),
+    };
+    let increment = place.number_or(node, "Increment", 1.0)?;
+    let offset_m = place.number_or(node, "Offset", 0.0)?;
+    if !absolute && increment <= 0.0 || increment == 0.0 {
+        return Err(place.unexpected(node, "an increment above 0", &increment.to_string()));
+    }
+    // Before the amendment of 2020 the increment of floating point values had no meaning, and some readers leave it out.
+    let floating = matches!(kind, Kind::Float32 | Kind::Float64);
+    if absolute && floating && increment != 1.0 && !revision.contains("25178") {
+        let expected = "an increment of 1, as it is not said whether floating point values are multiplied by it; export the \
+                        values in metres";
+        return Err(place.unexpected(node, expected, &increment.to_string()));
+    }
+    Ok(Axis { absolute, kind, increment, offset_m })
+}
+
+fn extent<'d>(
+    place: &Place<'_>,
+    first: Node<'d, 'd>,
+    third: Node<'d, 'd>,
+    axes: &[Axis; 3],
+) -> Result<Extent, FormatError> {
+    let feature = place.child(first, "FeatureType")?;
+    match text(feature).as_str() {
+        "SUR" | "PCL" => {}
+        "PRF" => return Err(place.unexpected(feature, "a surface (SUR) or points (PCL)", "PRF, a profile")),
+        other => return Err(place.unexpected(feature, "SUR or PCL", other)),
+    }
+    if let Some(list) = child(third, "ListDimension") {
+        if axes.iter().any(|axis| !axis.absolute) {
+            return Err(place.unexpected(list, "a list only where all axes are absolute", &text(list)));
+        }
+        return Ok(Extent::List(place.count(list)?));
+    }
+    let matrix = place.child(third, "MatrixDimension")?;
+    let layers = place.child(matrix, "SizeZ")?;
+    if place.count(layers)? != 1 {
+        return Err(place.unexpected(layers, "one layer", &text(layers)));
+    }
+    Ok(Extent::Matrix([place.count(place.child(matrix, "SizeX")?)?, place.count(place.child(matrix, "SizeY")?)?]))
+}
+
+fn samples<'d>(place: &Place<'_>, third: Node<'d, 'd>, axes: &[Axis; 3]) -> Result<Samples, FormatError> {
+    if let Some(link) = child(third, "DataLink") {
+        let sealed = |name, sum| -> Result<Option<Sealed>, FormatError> {
+            let Some(node) = child(link, name) else { return Ok(None) };
+            let entry = text(node);
+            if entry.starts_with('/') || entry.contains(':') || entry.split(['/', '\\']).any(|part| part == "..") {
+                return Err(place.unexpected(node, "an entry of this container", &entry));
+            }
+            let md5 = child(link, sum).map(text).filter(|sum| super::is_sum(sum));
+            Ok(Some(Sealed { entry, md5 }))
+        };
+        let data = sealed("PointDataLink", "MD5ChecksumPointData")?;
+        let data = data.ok_or_else(|| place.missing("DataLink/PointDataLink"))?;
+        return Ok(Samples::Linked { data, valid: sealed("ValidPointsLink", "MD5ChecksumValidPoints")? });
+    }
+    let list = child(third, "DataList").ok_or_else(|| place.missing("DataLink or DataList"))?;
+    let mut records = Vec::new();
+    for datum in list.children().filter(|n| n.is_element() && n.tag_name().name() == "Datum") {
+        if records.len() as u64 >= MOST_SAMPLES {
+            let (found, limit) = (records.len() as u64 + 1, MOST_SAMPLES);
+            return Err(FormatError::TooLarge { path: place.path.to_owned(), found, limit, unit: "samples of a map" });
+        }
+        records.push(record(place, datum, axes)?);
+    }
+    Ok(Samples::Inline(records))
+}
+
+/// Reads a sample in XML: the values of the absolute axes with semicolons between them, or nothing where none was measured.
+fn record<'d>(place: &Place<'_>, datum: Node<'d, 'd>, axes: &[Axis; 3]) -> Result<Record, FormatError> {
+    let text = text(datum);
+    if text.is_empty() {
+        return Ok(None);
+    }
+    let absolute = axes.iter().filter(|axis| axis.absolute).count();
+    let wrong = || place.unexpected(datum, &format!("{absolute} numbers separated by semicolons"), &text);
+    let mut words = text.split(';');
+    let mut values = [0.0; 3];
+    for value in values.iter_mut().zip(axes).filter(|(_, axis)| axis.absolute).map(|(value, _)| value) {
+        let word = words.next().ok_or_else(wrong)?.trim();
+        *value = fast_float2::parse::<f64, _>(word.as_bytes()).map_err(|_| wrong())?;
+    }
+    if words.next().is_some() {
+        return Err(wrong());
+    }
+    Ok(values.iter().all(|v| v.is_finite()).then_some(values))
+}

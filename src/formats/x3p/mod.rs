@@ -1,0 +1,290 @@
+//! Maps and point lists in X3P (ISO 25178-72, formerly ISO 5436-2): a zip container of XML and binary heights.
+//!
+//! ```text
+//!  main.xml          axes, instrument, size; the heights themselves, or where they are
+//!  bindata/data.bin  heights, or (x, y, z) with as many axes as are absolute; little-endian; metres after the axes' increments
+//!  bindata/valid.bin one bit a sample, the least significant first, 1 where it was measured
+//!  md5checksum.hex   MD5 of main.xml; those of the binary parts stand in main.xml
+//! ```
+//!
+//! Read are files as they are found: entries in a folder of their own beside what an operating system leaves there, NaN and infinity for
+//! samples that were not measured, sums in either case, any dash in the revision. Refused is what may be another surface than it
+//! seems: another sum than was sealed, layers, profiles, a turned frame, heights of which nobody can tell the unit.
+
+mod document;
+mod write;
+
+use std::io::{Cursor, Read};
+use std::path::Path;
+
+use md5::{Digest, Md5};
+use zip::ZipArchive;
+
+use super::error::{FormatError, excerpt};
+use super::height_map::HeightMap;
+use super::number::is_believable;
+use super::whole::{MOST_BYTES, open};
+use crate::geometry::Point;
+use document::{Axis, Extent, Main, Samples, Sealed};
+pub use write::{MapRecord, write_error_map_x3p, write_x3p};
+
+/// Largest `main.xml`, heights included.
+const MOST_XML_BYTES: u64 = 64 << 20;
+/// Where the sum of `main.xml` stands, if the document does not name another entry.
+const SEAL: &str = "md5checksum.hex";
+/// Largest entry with a sum.
+const MOST_SEAL_BYTES: u64 = 4096;
+/// Most entries of a container.
+const MOST_ENTRIES: usize = 10_000;
+
+/// What an X3P file holds.
+#[derive(Clone, Debug, PartialEq)]
+pub enum X3pFile {
+    /// Heights over a regular grid.
+    Map(HeightMap),
+    /// Points in millimetres, those not measured left out.
+    Points(Vec<Point>),
+}
+
+impl X3pFile {
+    /// Returns the measured points in millimetres, whatever the file holds.
+    pub fn into_points(self) -> Vec<Point> {
+        match self {
+            Self::Map(map) => map.points(),
+            Self::Points(points) => points,
+        }
+    }
+}
+
+/// Reads an X3P file of at most 1 GiB.
+///
+/// # Errors
+/// A file that is not readable, no zip container, damaged or encrypted; without `main.xml` or its data; with another sum than was
+/// sealed; whose data are more or fewer than its size says; a profile, layers, a turned frame.
+pub fn read_x3p(path: impl AsRef<Path>) -> Result<X3pFile, FormatError> {
+    let path = path.as_ref();
+    let opened = open(path)?;
+    if !is_zip(&opened.head) {
+        let found = excerpt(&opened.head[..opened.head.len().min(8)]);
+        let (place, expected) = ("byte 0".to_owned(), "a zip container".to_owned());
+        return Err(FormatError::Unexpected { path: path.to_owned(), place, expected, found });
+    }
+    parse_x3p(path, &opened.read_all(path, MOST_BYTES)?)
+}
+
+/// Parses the bytes of an X3P file; `path` is only what messages call it.
+///
+/// # Errors
+/// Those of [`read_x3p`].
+pub fn parse_x3p(path: &Path, bytes: &[u8]) -> Result<X3pFile, FormatError> {
+    let mut container = Container::open(path, bytes)?;
+    let xml = container.entry("main.xml", MOST_XML_BYTES)?;
+    // A changed document is told as such, not by what it says now.
+    container.check_sealed(SEAL, &xml)?;
+    let (main, samples) = Main::parse(path, &container.name("main.xml"), &xml)?;
+    if let Some(seal) = main.checksum_file.as_deref().filter(|seal| *seal != SEAL) {
+        container.check_sealed(seal, &xml)?;
+    }
+    drop(xml);
+    let count = main.extent.count(path)?;
+    let records = match samples {
+        Samples::Inline(records) => records,
+        Samples::Linked { data, valid } => linked(&mut container, &main.axes, &data, valid.as_ref(), count)?,
+    };
+    if records.len() != count {
+        let (place, expected) = ("Record3".to_owned(), format!("{count} samples, as its dimension says"));
+        return Err(FormatError::Unexpected {
+            path: path.to_owned(),
+            place,
+            expected,
+            found: records.len().to_string(),
+        });
+    }
+    assembled(path, &main, &records)
+}
+
+/// Returns whether a file begins like a zip container, be it an empty one.
+pub(super) fn is_zip(head: &[u8]) -> bool {
+    head.starts_with(b"PK\x03\x04") || head.starts_with(b"PK\x05\x06")
+}
+
+/// Raw values of the absolute axes of a sample, 0 for the others; `None` where it was not measured.
+type Record = Option<[f64; 3]>;
+
+/// Reads the binary parts.
+fn linked(
+    container: &mut Container<'_>,
+    axes: &[Axis; 3],
+    data: &Sealed,
+    valid: Option<&Sealed>,
+    count: usize,
+) -> Result<Vec<Record>, FormatError> {
+    let width: usize = axes.iter().filter(|axis| axis.absolute).map(|axis| axis.kind.bytes()).sum();
+    let bytes = container.sealed(data, (count * width) as u64)?;
+    let mask = valid.map(|valid| container.sealed(valid, count.div_ceil(8) as u64)).transpose()?;
+    let is_valid = |k: usize| mask.as_ref().is_none_or(|mask| mask[k / 8] >> (k % 8) & 1 == 1);
+    let record = |mut at: &[u8]| {
+        let mut values = [0.0; 3];
+        for (value, axis) in values.iter_mut().zip(axes).filter(|(_, axis)| axis.absolute) {
+            let (own, rest) = at.split_at(axis.kind.bytes());
+            (*value, at) = (axis.kind.value(own), rest);
+        }
+        // Instruments write NaN or an infinity where they saw nothing.
+        values.iter().all(|v| v.is_finite()).then_some(values)
+    };
+    Ok(bytes.chunks_exact(width).enumerate().map(|(k, at)| if is_valid(k) { record(at) } else { None }).collect())
+}
+
+/// Makes a map or points of the samples.
+fn assembled(path: &Path, main: &Main, records: &[Record]) -> Result<X3pFile, FormatError> {
+    let [x, y, z] = &main.axes;
+    let mm = |axis: &Axis, raw: f64| 1e3 * (axis.offset_m + raw * axis.increment);
+    let Extent::Matrix([columns, rows]) = main.extent else {
+        return points(path, records.iter().flatten().map(|[a, b, c]| [mm(x, *a), mm(y, *b), mm(z, *c)]));
+    };
+    if x.absolute || y.absolute {
+        let place = |axis: &Axis, raw: f64, index: usize| mm(axis, if axis.absolute { raw } else { index as f64 });
+        let samples = records.iter().enumerate().filter_map(|(k, r)| r.map(|r| (k, r)));
+        return points(
+            path,
+            samples.map(|(k, [a, b, c])| [place(x, a, k % columns), place(y, b, k / columns), mm(z, c)]),
+        );
+    }
+    let heights = |k: usize| records[k].map(|[.., raw]| mm(z, raw));
+    let (first, spacing) = ([mm(x, 0.0), mm(y, 0.0)], [1e3 * x.increment, 1e3 * y.increment]);
+    let mut map = if main.rows_from_north {
+        let order = (0..rows).rev().flat_map(|row| (0..columns).map(move |column| row * columns + column));
+        HeightMap::new(path, [columns, rows], first, spacing, order.map(heights))?
+    } else {
+        HeightMap::new(path, [columns, rows], first, spacing, (0..records.len()).map(heights))?
+    };
+    map.notes.clone_from(&main.notes);
+    Ok(X3pFile::Map(map))
+}
+
+fn points(path: &Path, places: impl Iterator<Item = [f64; 3]>) -> Result<X3pFile, FormatError> {
+    let mut points = Vec::new();
+    for (k, [x, y, z]) in places.enumerate() {
+        for (what, value) in [("x", x), ("y", y), ("z", z)] {
+            if !is_believable(value) {
+                let place = format!("measured point {}", k + 1);
+                return Err(FormatError::BadCoordinate { path: path.to_owned(), place, what, value });
+            }
+        }
+        points.push(Point::new(x, y, z));
+    }
+    if points.is_empty() {
+        return Err(FormatError::NoData { path: path.to_owned(), expected: "point that was measured" });
+    }
+    Ok(X3pFile::Points(points))
+}
+
+fn check_sum(path: &Path, entry: &str, bytes: &[u8], expected: &str) -> Result<(), FormatError> {
+    let found: String = Md5::digest(bytes).iter().map(|b| format!("{b:02x}")).collect();
+    if found.eq_ignore_ascii_case(expected) {
+        return Ok(());
+    }
+    let (entry, expected) = (entry.to_owned(), expected.to_lowercase());
+    Err(FormatError::Checksum { path: path.to_owned(), entry, expected, found })
+}
+
+/// The zip container of a file.
+struct Container<'a> {
+    path: &'a Path,
+    zip: ZipArchive<Cursor<&'a [u8]>>,
+    /// The folder in which everything stands, with its slash; mostly none.
+    folder: String,
+}
+
+impl<'a> Container<'a> {
+    /// Opens a container and finds the one `main.xml` in it.
+    fn open(path: &'a Path, bytes: &'a [u8]) -> Result<Self, FormatError> {
+        let zip = ZipArchive::new(Cursor::new(bytes))
+            .map_err(|source| FormatError::Container { path: path.to_owned(), source })?;
+        if zip.len() > MOST_ENTRIES {
+            let (found, limit) = (zip.len() as u64, MOST_ENTRIES as u64);
+            return Err(FormatError::TooLarge { path: path.to_owned(), found, limit, unit: "entries of a container" });
+        }
+        let mut folders: Vec<String> = Vec::new();
+        for name in (0..zip.len()).filter_map(|k| zip.name_for_index(k)) {
+            let name = name.map_err(|source| FormatError::Container { path: path.to_owned(), source })?;
+            let name = name.replace('\\', "/");
+            // What macOS leaves beside the entries bears their names.
+            if name.starts_with("__MACOSX/") || name.contains("/__MACOSX/") {
+                continue;
+            }
+            if let Some(folder) = name.strip_suffix("main.xml").filter(|f| f.is_empty() || f.ends_with('/')) {
+                folders.push(folder.to_owned());
+            }
+        }
+        match folders.len() {
+            1 => Ok(Self { path, zip, folder: folders.remove(0) }),
+            0 => Err(FormatError::Missing { path: path.to_owned(), expected: "main.xml".to_owned() }),
+            _ => Err(FormatError::Unexpected {
+                path: path.to_owned(),
+                place: "the container".to_owned(),
+                expected: "one main.xml".to_owned(),
+                found: format!("{} of them", folders.len()),
+            }),
+        }
+    }
+
+    /// Returns the full name of an entry.
+    fn name(&self, entry: &str) -> String {
+        format!("{}{entry}", self.folder)
+    }
+
+    fn find(&self, entry: &str) -> Option<usize> {
+        let wanted = self.name(entry.trim_start_matches("./"));
+        let is_it =
+            |k: &usize| self.zip.name_for_index(*k).is_some_and(|n| n.is_ok_and(|n| n.replace('\\', "/") == wanted));
+        (0..self.zip.len()).find(is_it)
+    }
+
+    /// Unpacks an entry, whose length in the container is not believed, up to a limit.
+    fn entry(&mut self, entry: &str, limit: u64) -> Result<Vec<u8>, FormatError> {
+        let missing = || FormatError::Missing { path: self.path.to_owned(), expected: entry.to_owned() };
+        let index = self.find(entry).ok_or_else(missing)?;
+        let path = self.path;
+        let damaged = |source| FormatError::Container { path: path.to_owned(), source };
+        let packed = self.zip.by_index(index).map_err(damaged)?;
+        let mut bytes = Vec::new();
+        packed.take(limit + 1).read_to_end(&mut bytes).map_err(|error| damaged(error.into()))?;
+        let found = bytes.len() as u64;
+        if found > limit {
+            return Err(FormatError::TooLarge { path: path.to_owned(), found, limit, unit: "bytes unpacked" });
+        }
+        Ok(bytes)
+    }
+
+    /// Unpacks an entry of a known length and checks its sum.
+    fn sealed(&mut self, sealed: &Sealed, length: u64) -> Result<Vec<u8>, FormatError> {
+        let bytes = self.entry(&sealed.entry, length)?;
+        if bytes.len() as u64 != length {
+            let (place, expected) = (sealed.entry.clone(), format!("{length} bytes for the dimension in main.xml"));
+            let found = bytes.len().to_string();
+            return Err(FormatError::Unexpected { path: self.path.to_owned(), place, expected, found });
+        }
+        match &sealed.md5 {
+            Some(expected) => check_sum(self.path, &sealed.entry, &bytes, expected).map(|()| bytes),
+            None => Ok(bytes),
+        }
+    }
+
+    /// Checks the sum of `main.xml` that an entry holds; one that is not there or holds none says nothing.
+    fn check_sealed(&mut self, seal: &str, xml: &[u8]) -> Result<(), FormatError> {
+        if self.find(seal).is_none() {
+            return Ok(());
+        }
+        let text = String::from_utf8_lossy(&self.entry(seal, MOST_SEAL_BYTES)?).into_owned();
+        match text.split_whitespace().find(|word| is_sum(word)) {
+            Some(expected) => check_sum(self.path, "main.xml", xml, expected),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Returns whether a word is an MD5 sum in hexadecimal digits.
+fn is_sum(word: &str) -> bool {
+    word.len() == 32 && word.bytes().all(|b| b.is_ascii_hexdigit())
+}
