@@ -110,7 +110,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         start_at_fixture: recipe.registration.start == StartAt::Fixture,
         coordinates: coordinates(cell),
         place: MapLimits { place_mm: recipe.compensation.largest_displacement_mm, ..MapLimits::default() },
-        map: MapOptions { cutoff_mm: recipe.compensation.cutoff_mm, spacing_mm: recipe.compensation.spacing_mm },
+        map: MapOptions::new(recipe.compensation.cutoff_mm, recipe.compensation.spacing_mm),
         limits: CorrectionLimits {
             gain: recipe.compensation.gain,
             depth_of_cut_mm: recipe.compensation.depth_of_cut_mm,

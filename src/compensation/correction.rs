@@ -123,7 +123,7 @@ mod tests {
 
     fn map(values_mm: [f64; 4]) -> ErrorMap {
         let net = Net { columns: 2, rows: 2, first_mm: [0.0, 0.0], spacing_mm: [1.0, 1.0] };
-        ErrorMap { net, values_mm: values_mm.to_vec(), valid: vec![true; 4], rest_sigma_mm: 0.0 }
+        ErrorMap::known(net, values_mm.to_vec(), vec![true; 4])
     }
 
     fn first() -> Correction {

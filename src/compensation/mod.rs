@@ -10,11 +10,20 @@
 //! outward normal, so that a correction takes back a deviation of the opposite sign.
 
 mod correction;
+mod filter;
+mod level;
 mod map;
 mod net;
 mod response;
+mod robust;
+mod sampling;
+mod selected;
+mod spline;
 
 pub use correction::{Correction, CorrectionLimits, Step, StepError};
-pub use map::{ErrorMap, MapError, MapOptions, Reading, error_map};
+pub use filter::Order;
+pub use map::{ErrorMap, FilteredNet, MapError, MapOptions, Reading, Smoothing, error_map, filter_net};
 pub use net::{Net, NetError};
 pub use response::{Response, Sense, response};
+pub use sampling::{check_cutoff, contact_width_mm, least_cutoff_mm, point_spacing_mm};
+pub use spline::{Roughness, SplineError};
