@@ -270,8 +270,8 @@ fn scatter_over_stated(readings: &[Reading], options: &MapOptions, noise_mm: f64
 fn the_uncertainty_of_the_filter_is_the_scatter() {
     for (readings, options) in [
         (trial(form), plain(6.0, 2.0)),
-        (strewn(3000, [60.0, 40.0], 4, form), plain(6.0, 2.0)),
-        (strewn(3000, [60.0, 40.0], 4, form), MapOptions { order: Order::Quadric, ..plain(9.0, 2.0) }),
+        (strewn(1500, [40.0, 30.0], 4, form), plain(6.0, 2.0)),
+        (strewn(1500, [40.0, 30.0], 4, form), MapOptions { order: Order::Quadric, ..plain(9.0, 2.0) }),
     ] {
         let (ratio, outside, point) = scatter_over_stated(&readings, &options, 3e-4, 200);
         println!("filter: scatter over stated {ratio}, outside {outside}, point {point}");
@@ -283,8 +283,8 @@ fn the_uncertainty_of_the_filter_is_the_scatter() {
 
 #[test]
 fn the_uncertainty_of_the_spline_is_the_scatter() {
-    for readings in [trial(form), strewn(2500, [60.0, 40.0], 4, form)] {
-        let options = MapOptions { smoothing: Smoothing::Spline, ..plain(8.0, 2.0) };
+    for (readings, cutoff_mm) in [(trial(form), 20.0), (strewn(700, [40.0, 30.0], 4, form), 8.0)] {
+        let options = MapOptions { smoothing: Smoothing::Spline, ..plain(cutoff_mm, 2.0) };
         let (ratio, outside, point) = scatter_over_stated(&readings, &options, 3e-4, 200);
         println!("spline: scatter over stated {ratio}, outside {outside}, point {point}");
         assert!((ratio - 1.0).abs() < 0.1, "scatter over stated {ratio}");

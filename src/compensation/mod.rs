@@ -14,6 +14,7 @@ mod filter;
 mod level;
 mod map;
 mod net;
+mod parameters;
 mod response;
 mod robust;
 mod sampling;
@@ -24,6 +25,9 @@ pub use correction::{Correction, CorrectionLimits, Step, StepError};
 pub use filter::Order;
 pub use map::{ErrorMap, FilteredNet, MapError, MapOptions, Reading, Smoothing, error_map, filter_net};
 pub use net::{Net, NetError};
+pub use parameters::{
+    Contact, Parameter, ParameterError, ParameterKind, ParameterOptions, Parameters, WheelTerm, parameters,
+};
 pub use response::{Response, Sense, response};
 pub use sampling::{check_cutoff, contact_width_mm, least_cutoff_mm, point_spacing_mm};
 pub use spline::{Roughness, SplineError};
