@@ -40,7 +40,7 @@ fn error_map(nodes: usize) -> ErrorMap {
         spacing_mm: [102.0 / columns as f64, 62.0 / columns as f64],
     };
     let values_mm = (0..net.len()).map(|k| 1e-3 * (k as f64 * 0.01).sin()).collect();
-    ErrorMap { net, values_mm, valid: (0..net.len()).map(|k| k % 11 != 3).collect(), rest_sigma_mm: 0.0 }
+    ErrorMap::known(net, values_mm, (0..net.len()).map(|k| k % 11 != 3).collect())
 }
 
 fn written(map: &ErrorMap) -> PathBuf {

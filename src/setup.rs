@@ -11,7 +11,7 @@ use sha2::{Digest, Sha256};
 use thiserror::Error;
 
 use crate::cell::{Beginning, CellPlan, Deadlines, Disposal, Gates, Tolerance};
-use crate::compensation::{CorrectionLimits, MapOptions};
+use crate::compensation::{CorrectionLimits, MapOptions, contact_width_mm};
 use crate::config::{self, CellConfig, PointKind, SignalKind, WordOrder};
 use crate::device::exchange::{ExchangeCmm, ExchangeGrinder, ExchangeTiming};
 use crate::device::{
@@ -110,7 +110,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         start_at_fixture: recipe.registration.start == StartAt::Fixture,
         coordinates: coordinates(cell),
         place: MapLimits { place_mm: recipe.compensation.largest_displacement_mm, ..MapLimits::default() },
-        map: MapOptions { cutoff_mm: recipe.compensation.cutoff_mm, spacing_mm: recipe.compensation.spacing_mm },
+        map: map_options(recipe),
         gain: recipe.compensation.gain,
         repeatability_mm: recipe.compensation.repeatability_mm,
         learned: None,
@@ -127,6 +127,16 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         simulation: cell.simulated,
     };
     Ok((task, plan(recipe, cell)))
+}
+
+fn map_options(recipe: &Recipe) -> MapOptions {
+    let (wheel_radius_mm, compensation) = (recipe.grinding.wheel.radius_mm(), &recipe.compensation);
+    MapOptions {
+        level_off_mm: wheel_radius_mm,
+        contact_width_mm: contact_width_mm(wheel_radius_mm, compensation.depth_of_cut_mm),
+        smoothing: compensation.smoothing,
+        ..MapOptions::new(compensation.cutoff_mm, compensation.spacing_mm)
+    }
 }
 
 /// Says what a run has to have in common with another to learn from it: the cell, the part, and how it is ground and looked at.

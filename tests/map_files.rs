@@ -352,7 +352,7 @@ fn a_container_that_swells_is_refused_before_it_does() {
 fn error_map() -> ErrorMap {
     let net = Net { columns: 7, rows: 5, first_mm: [-51.0, -31.0], spacing_mm: [17.0, 15.5] };
     let values_mm = (0..35).map(|k| 1e-3 * f64::from(k).sin()).collect();
-    ErrorMap { net, values_mm, valid: (0..35).map(|k| k % 6 != 2).collect(), rest_sigma_mm: 0.0 }
+    ErrorMap::known(net, values_mm, (0..35).map(|k| k % 6 != 2).collect())
 }
 
 #[test]

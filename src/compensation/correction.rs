@@ -154,7 +154,7 @@ mod tests {
 
     fn map(values_mm: [f64; 4]) -> ErrorMap {
         let net = Net { columns: 2, rows: 2, first_mm: [0.0, 0.0], spacing_mm: [1.0, 1.0] };
-        ErrorMap { net, values_mm: values_mm.to_vec(), valid: vec![true; 4], rest_sigma_mm: 0.0 }
+        ErrorMap::known(net, values_mm.to_vec(), vec![true; 4])
     }
 
     fn first() -> Correction {
@@ -162,7 +162,7 @@ mod tests {
     }
 
     fn next(correction: &Correction, error: &ErrorMap, gain: f64) -> Result<Step, StepError> {
-        let options = MapOptions { cutoff_mm: 1.0, spacing_mm: 1.0 };
+        let options = MapOptions::new(1.0, 1.0);
         let known = Knowledge::new(GainRule::Fixed(gain), &options, [1.0; 2], None);
         correction.next(error, &known.after(&Seen { correction, error, answer: None }), &LIMITS)
     }

@@ -16,7 +16,8 @@
 use serde::{Deserialize, Serialize};
 
 use super::correction::Correction;
-use super::map::{ErrorMap, MapOptions, Reading, error_map};
+use super::filter::Order;
+use super::map::{ErrorMap, MapOptions, filter_net};
 use super::response::{Response, Sense};
 
 /// Variance by which a pass makes what is believed of R older, over that of N.
@@ -264,13 +265,8 @@ fn mean_square(error: &ErrorMap, values: &[f64]) -> f64 {
 
 /// The map without waves shorter than a wavelength, on the same net.
 fn low_passed(error: &ErrorMap, cutoff_mm: f64) -> Vec<f64> {
-    let readings: Vec<Reading> =
-        error.samples_mm().into_iter().map(|[x, y, e]| Reading { at_mm: [x, y], deviation_mm: e }).collect();
-    match error_map(
-        &readings,
-        &MapOptions { cutoff_mm, spacing_mm: error.net.spacing_mm[0].min(error.net.spacing_mm[1]) },
-    ) {
-        Ok(smooth) => (0..error.net.len()).map(|k| smooth.at(error.net.place_mm(k))).collect(),
+    match filter_net(&error.net, &error.values_mm, &error.valid, cutoff_mm, Order::default(), false) {
+        Ok(smooth) => smooth.values,
         // A map too small for this wavelength has no waves that are longer.
         Err(_) => vec![0.0; error.net.len()],
     }

@@ -1,20 +1,25 @@
-//! From scattered deviations to a smooth map on a net.
+//! From scattered deviations to a smooth map on a net, with what is known of its uncertainty.
 //!
-//! At every node a plane is fitted to the deviations around it with the weights of the areal Gaussian filter (ISO 16610-61; as
-//! a regression filter of first order, ISO 16610-31, robustness left out). Inside the part this is the Gaussian filter, 50 % at the cut-off; at an edge
-//! the plane carries on the slope that is there, so that nothing is pulled towards zero as padding would.
+//! ```text
+//!  readings -> outliers out -> filter (Gaussian, robust, spline) -> levelled off outside -> ErrorMap
+//! ```
 
-use rayon::prelude::*;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use super::filter::{Filtered, Gaussian, LEAST_READINGS, Order};
+use super::level::{Levelled, level_off};
 use super::net::{Net, NetError};
+use super::robust::{Residuals, residuals, robust};
+use super::sampling::{check_cutoff, point_spacings_mm};
+use super::spline::{Roughness, SplineError, spline};
 
-/// Weights beyond this share of the cut-off are below 1e-6 of the largest.
-const REACH: f64 = 1.0;
-/// alpha = sqrt(ln 2 / pi), by which the filter passes one half at the cut-off.
-const ALPHA: f64 = 0.469_718_639_349_825_66;
-/// Fewer points than this around a node are no evidence for a plane.
-const LEAST_POINTS: usize = 6;
+/// Most nodes that a filter may work on; a short cut-off on a wide net asks for more nodes than the net has.
+const MOST_WORKED: f64 = 2e7;
+
+/// Least cut-off of the surface that outliers are looked for on, in distances between readings.
+const DETECTION: f64 = 4.0;
 
 /// One deviation and where it was measured.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -25,6 +30,19 @@ pub struct Reading {
     pub deviation_mm: f64,
 }
 
+/// What makes the deviations smooth.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Smoothing {
+    /// The areal Gaussian filter, ISO 16610-61.
+    #[default]
+    Gaussian,
+    /// Its robust form, ISO 16610-71: what stands out counts less.
+    RobustGaussian,
+    /// A smoothing surface of tensor-product cubic B-splines.
+    Spline,
+}
+
 /// How a map is made.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MapOptions {
@@ -32,6 +50,34 @@ pub struct MapOptions {
     pub cutoff_mm: f64,
     /// Wanted distance of the nodes, in millimetres.
     pub spacing_mm: f64,
+    /// Distance from what was measured over which the map levels off, in millimetres: the radius of the wheel; 0 levels off at once.
+    pub level_off_mm: f64,
+    /// Width over which the wheel touches, in millimetres, see [`super::contact_width_mm`]; 0 where it is not known.
+    pub contact_width_mm: f64,
+    /// What makes the deviations smooth.
+    pub smoothing: Smoothing,
+    /// What the Gaussian filters let pass unchanged.
+    pub order: Order,
+    /// How the spline's smoothness is chosen.
+    pub roughness: Roughness,
+    /// Readings off by more than so many standard deviations are left out; `None` keeps them all.
+    pub outlier_limit: Option<f64>,
+}
+
+impl MapOptions {
+    /// The Gaussian filter of first order, outliers beyond five standard deviations out, levelled off at once.
+    pub fn new(cutoff_mm: f64, spacing_mm: f64) -> Self {
+        Self {
+            cutoff_mm,
+            spacing_mm,
+            level_off_mm: 0.0,
+            contact_width_mm: 0.0,
+            smoothing: Smoothing::default(),
+            order: Order::default(),
+            roughness: Roughness::default(),
+            outlier_limit: Some(5.0),
+        }
+    }
 }
 
 /// A smooth map of the error of the part.
@@ -39,12 +85,23 @@ pub struct MapOptions {
 pub struct ErrorMap {
     /// Where the nodes are.
     pub net: Net,
-    /// The error at every node in millimetres, finite everywhere; where `valid` is not, that of the nearest valid node.
+    /// The error at every node in millimetres, finite everywhere; where `valid` is not, levelled off from the nearest valid node.
     pub values_mm: Vec<f64>,
     /// Whether enough was measured around a node.
     pub valid: Vec<bool>,
     /// Standard deviation of the deviations from the map, in millimetres: what the filter took out.
     pub rest_sigma_mm: f64,
+    /// Standard uncertainty of the error at every node from the scatter of single readings, in millimetres; where `valid` is not, that of
+    /// the nearest valid node, which says nothing of how far the part goes on as it does there.
+    pub sigma_mm: Vec<f64>,
+    /// Standard deviation of a single reading in millimetres, as far as readings near each other disagree: noise, and waves that the filter takes out.
+    pub point_sigma_mm: f64,
+    /// Indices of the readings that were left out as outliers, ascending.
+    pub outliers: Vec<usize>,
+    /// Distance of neighbouring readings, in millimetres, in the direction in which it is larger.
+    pub point_spacing_mm: f64,
+    /// What should be done better, in words; empty where all is well.
+    pub advice: Vec<String>,
 }
 
 /// Why there is no map.
@@ -53,48 +110,230 @@ pub struct ErrorMap {
 pub enum MapError {
     #[error(transparent)]
     Net(#[from] NetError),
+    #[error(transparent)]
+    Spline(#[from] SplineError),
     #[error("a cut-off of {cutoff_mm} mm is asked for; it must be above 0")]
     Cutoff { cutoff_mm: f64 },
+    #[error("{name} of {value} is asked for; it must be {wanted}")]
+    Option { name: &'static str, value: f64, wanted: &'static str },
     #[error("deviation {} is not finite; the measurement must not be used", index + 1)]
     NotFinite { index: usize },
     #[error(
-        "only {valid} of {nodes} nodes have {LEAST_POINTS} measured points within the cut-off of {cutoff_mm} mm; measure more \
+        "only {valid} of {nodes} nodes have {LEAST_READINGS} measured points around them within the cut-off of {cutoff_mm} mm; measure more \
          densely or choose a longer cut-off"
     )]
     TooSparse { valid: usize, nodes: usize, cutoff_mm: f64 },
+    #[error(
+        "a cut-off of {cutoff_mm} mm on a net of {width_mm:.1} x {depth_mm:.1} mm needs {nodes:.0} nodes to filter on, more than \
+         {MOST_WORKED:.0}; choose a longer cut-off"
+    )]
+    CutoffTooShort { cutoff_mm: f64, width_mm: f64, depth_mm: f64, nodes: f64 },
+    #[error(
+        "a cut-off of {cutoff_mm:.3} mm is below {least_mm:.3} mm, twice the width of {contact_width_mm:.3} mm over which the wheel touches: \
+         shorter waves cannot be ground; choose a longer cut-off or a smaller wheel"
+    )]
+    CutoffBelowContact { cutoff_mm: f64, least_mm: f64, contact_width_mm: f64 },
+    #[error(
+        "a cut-off of {cutoff_mm:.3} mm is below {least_mm:.3} mm, twice the distance of {point_spacing_mm:.3} mm between measured points: \
+         shorter waves are not seen; choose a longer cut-off or measure more densely"
+    )]
+    CutoffBelowSpacing { cutoff_mm: f64, least_mm: f64, point_spacing_mm: f64 },
+    #[error("{found} values are given for a net of {nodes} nodes; there must be one for each")]
+    Shape { found: usize, nodes: usize },
 }
 
-/// Filters deviations and lays them on a net.
+/// Takes outliers out of deviations, filters the rest and lays it on a net.
 ///
 /// Shapes: readings in any order. Frames: x and y of the model frame. Units: millimetres. Equation: weighted least squares of a
-/// plane at every node with weights exp(-pi (r / (alpha cutoff))^2), alpha = sqrt(ln 2 / pi).
+/// polynomial at every node with weights exp(-pi (r / (alpha cutoff))^2), see [`Order::alpha`]; or the smoothing spline. A cut-off that is
+/// short for the wheel or the distance of the points is no error but is said in [`ErrorMap::advice`]: [`check_cutoff`] refuses it
+/// before anything is measured.
 ///
 /// # Errors
-/// Deviations that are not finite, too few of them for the cut-off, and a net that cannot be.
+/// Deviations that are not finite, too few of them for the cut-off, options out of range, and a net that cannot be.
 pub fn error_map(readings: &[Reading], options: &MapOptions) -> Result<ErrorMap, MapError> {
-    let MapOptions { cutoff_mm, spacing_mm } = *options;
+    check(readings, options)?;
+    let net = Net::over(readings.iter().map(|r| r.at_mm), options.spacing_mm)?;
+    let gaussian = Gaussian { cutoff_mm: options.cutoff_mm, order: options.order };
+    let worked = worked_net(&net, &gaussian)?;
+    let apart_mm = point_spacings_mm(readings);
+    let mut kept = Kept::all(readings);
+    let mut outliers = Vec::new();
+    if let Some(limit) = options.outlier_limit {
+        outliers = outliers_of(&kept, &net, &gaussian, limit, apart_mm)?;
+        kept = Kept::without(readings, &outliers);
+    }
+    let (filtered, weights) = if options.smoothing == Smoothing::RobustGaussian {
+        let found = robust(&gaussian, &kept.places, &kept.values, &worked);
+        (found.filtered, Some(found.weights))
+    } else {
+        (gaussian.scattered(&kept.places, &kept.values, None, &worked), None)
+    };
+    let found = residuals(&filtered, &kept.places, &kept.values, weights.as_deref());
+    let smooth = Smooth::from_filtered(&filtered, &net, found.sigma(weights.as_deref()));
+    let count = smooth.valid.iter().filter(|v| **v).count();
+    if count * 4 < net.len() {
+        return Err(MapError::TooSparse { valid: count, nodes: net.len(), cutoff_mm: options.cutoff_mm });
+    }
+    let smooth = match options.smoothing {
+        Smoothing::Spline => smooth.with_spline(&net, &kept, density(&filtered, &gaussian), options)?,
+        _ => smooth,
+    };
+    let map = smooth.into_map(net, &kept, outliers, options.level_off_mm);
+    Ok(map.advised(options, readings.len(), apart_mm))
+}
+
+/// Finds the readings that do not belong to the surface.
+///
+/// The surface is the robust filter's, with a cut-off of four distances between readings at least: with a shorter one a reading is
+/// compared with little but itself.
+fn outliers_of(
+    kept: &Kept,
+    net: &Net,
+    gaussian: &Gaussian,
+    limit: f64,
+    apart_mm: [f64; 2],
+) -> Result<Vec<usize>, MapError> {
+    let cutoff_mm = gaussian.cutoff_mm.max(DETECTION * apart_mm[0].max(apart_mm[1]));
+    let wide = Gaussian { cutoff_mm, ..*gaussian };
+    let found = robust(&wide, &kept.places, &kept.values, &worked_net(net, &wide)?);
+    Ok(found.outliers(&kept.places, limit, apart_mm))
+}
+
+/// Returns how many readings there are to the square millimetre, typically, from their shares in the values.
+fn density(filtered: &Filtered, gaussian: &Gaussian) -> f64 {
+    let supported = (0..filtered.net.len()).filter(|&k| filtered.supported[k]);
+    let mut shares: Vec<f64> = supported.map(|k| filtered.leverage[k]).collect();
+    let middle = shares.len() / 2;
+    let median = if shares.is_empty() { 1.0 } else { *shares.select_nth_unstable_by(middle, f64::total_cmp).1 };
+    gaussian.open_leverage() / median
+}
+
+fn check(readings: &[Reading], options: &MapOptions) -> Result<(), MapError> {
+    let MapOptions { cutoff_mm, level_off_mm, contact_width_mm, outlier_limit, .. } = *options;
     if !(cutoff_mm > 0.0 && cutoff_mm.is_finite()) {
         return Err(MapError::Cutoff { cutoff_mm });
     }
-    if let Some(index) = readings.iter().position(|r| !(r.at_mm[0] + r.at_mm[1] + r.deviation_mm).is_finite()) {
-        return Err(MapError::NotFinite { index });
+    for (name, value) in [("level_off_mm", level_off_mm), ("contact_width_mm", contact_width_mm)] {
+        if !(value >= 0.0 && value.is_finite()) {
+            return Err(MapError::Option { name, value, wanted: "0 or more" });
+        }
     }
-    let net = Net::over(readings.iter().map(|r| r.at_mm), spacing_mm)?;
-    let buckets = Buckets::new(readings, REACH * cutoff_mm);
-    let fitted: Vec<Option<f64>> =
-        (0..net.len()).into_par_iter().map(|node| buckets.plane_at(net.place_mm(node), cutoff_mm)).collect();
-    let valid: Vec<bool> = fitted.iter().map(Option::is_some).collect();
-    let count = valid.iter().filter(|v| **v).count();
-    if count * 4 < net.len() {
-        return Err(MapError::TooSparse { valid: count, nodes: net.len(), cutoff_mm });
+    if let Some(value) = outlier_limit.filter(|limit| limit.is_nan() || *limit < 3.0) {
+        return Err(MapError::Option { name: "outlier_limit", value, wanted: "3 or more, or good points are lost" });
     }
-    let values_mm = level_off(&net, &fitted);
-    let rest2: f64 = readings.iter().map(|r| (r.deviation_mm - net.interpolate(&values_mm, r.at_mm)).powi(2)).sum();
-    let rest_sigma_mm = (rest2 / readings.len() as f64).sqrt();
-    Ok(ErrorMap { net, values_mm, valid, rest_sigma_mm })
+    match readings.iter().position(|r| !(r.at_mm[0] + r.at_mm[1] + r.deviation_mm).is_finite()) {
+        Some(index) => Err(MapError::NotFinite { index }),
+        None => Ok(()),
+    }
+}
+
+/// Returns the net that the filter works on: nodes of the map and as many between them as the weights ask for.
+fn worked_net(net: &Net, gaussian: &Gaussian) -> Result<Net, MapError> {
+    let division = gaussian.division(net);
+    let finer = |k: usize| ([net.columns, net.rows][k] - 1) as f64 * division[k] as f64 + 1.0;
+    let nodes = finer(0) * finer(1);
+    if nodes > MOST_WORKED {
+        let [width_mm, depth_mm] = [0, 1].map(|k| ([net.columns, net.rows][k] - 1) as f64 * net.spacing_mm[k]);
+        return Err(MapError::CutoffTooShort { cutoff_mm: gaussian.cutoff_mm, width_mm, depth_mm, nodes });
+    }
+    let spacing_mm = [0, 1].map(|k| net.spacing_mm[k] / division[k] as f64);
+    Ok(Net { columns: finer(0) as usize, rows: finer(1) as usize, first_mm: net.first_mm, spacing_mm })
+}
+
+/// The readings that are used, places and values apart.
+pub(super) struct Kept {
+    pub places: Vec<[f64; 2]>,
+    pub values: Vec<f64>,
+}
+
+impl Kept {
+    fn all(readings: &[Reading]) -> Self {
+        Self {
+            places: readings.iter().map(|r| r.at_mm).collect(),
+            values: readings.iter().map(|r| r.deviation_mm).collect(),
+        }
+    }
+
+    fn without(readings: &[Reading], outliers: &[usize]) -> Self {
+        let mut left_out = vec![false; readings.len()];
+        outliers.iter().for_each(|&k| left_out[k] = true);
+        let used: Vec<Reading> = (0..readings.len()).filter(|&k| !left_out[k]).map(|k| readings[k]).collect();
+        Self::all(&used)
+    }
+}
+
+/// What was found at the nodes of a map, before it is levelled off.
+struct Smooth {
+    values: Vec<f64>,
+    slopes: Vec<[f64; 2]>,
+    sigma: Vec<f64>,
+    valid: Vec<bool>,
+    point_sigma: f64,
+}
+
+impl Smooth {
+    /// Picks the nodes of the map out of those that were worked on.
+    fn from_filtered(filtered: &Filtered, net: &Net, point_sigma: f64) -> Self {
+        let step = |worked: usize, wanted: usize| if wanted > 1 { (worked - 1) / (wanted - 1) } else { 1 };
+        let (across, along) = (step(filtered.net.columns, net.columns), step(filtered.net.rows, net.rows));
+        let node = |k: usize| (k / net.columns) * along * filtered.net.columns + (k % net.columns) * across;
+        let nodes: Vec<usize> = (0..net.len()).map(node).collect();
+        Self {
+            values: nodes.iter().map(|&n| filtered.values[n]).collect(),
+            slopes: nodes.iter().map(|&n| filtered.slopes[n]).collect(),
+            sigma: nodes.iter().map(|&n| point_sigma * filtered.variance[n].max(0.0).sqrt()).collect(),
+            valid: nodes.iter().map(|&n| filtered.supported[n]).collect(),
+            point_sigma,
+        }
+    }
+
+    /// Puts the spline's surface in the place of the filter's; what was measured enough stays as it is.
+    fn with_spline(self, net: &Net, kept: &Kept, density: f64, options: &MapOptions) -> Result<Self, MapError> {
+        let fitted = spline(kept, net, density, options.cutoff_mm, options.roughness)?;
+        Ok(Self {
+            values: fitted.values,
+            slopes: fitted.slopes,
+            sigma: fitted.sigma,
+            valid: self.valid,
+            point_sigma: fitted.point_sigma,
+        })
+    }
+
+    fn into_map(self, net: Net, kept: &Kept, outliers: Vec<usize>, level_off_mm: f64) -> ErrorMap {
+        let Levelled { values, sources } = level_off(&net, self.values, &self.slopes, &self.valid, level_off_mm);
+        let rest2: f64 =
+            kept.places.iter().zip(&kept.values).map(|(p, v)| (v - net.interpolate(&values, *p)).powi(2)).sum();
+        ErrorMap {
+            net,
+            values_mm: values,
+            valid: self.valid,
+            rest_sigma_mm: (rest2 / kept.values.len().max(1) as f64).sqrt(),
+            sigma_mm: sources.into_iter().map(|source| self.sigma[source]).collect(),
+            point_sigma_mm: self.point_sigma,
+            outliers,
+            point_spacing_mm: 0.0,
+            advice: Vec::new(),
+        }
+    }
 }
 
 impl ErrorMap {
+    /// Returns a map whose values are known as they are: no scatter, no outliers.
+    pub fn known(net: Net, values_mm: Vec<f64>, valid: Vec<bool>) -> Self {
+        Self {
+            net,
+            sigma_mm: vec![0.0; values_mm.len()],
+            values_mm,
+            valid,
+            rest_sigma_mm: 0.0,
+            point_sigma_mm: 0.0,
+            outliers: Vec::new(),
+            point_spacing_mm: 0.0,
+            advice: Vec::new(),
+        }
+    }
+
     /// Returns the filtered error at a place, in millimetres.
     pub fn at(&self, place_mm: [f64; 2]) -> f64 {
         self.net.interpolate(&self.values_mm, place_mm)
@@ -105,193 +344,77 @@ impl ErrorMap {
         let nodes = (0..self.net.len()).filter(|&k| self.valid[k]);
         nodes.map(|k| (self.net.place_mm(k), self.values_mm[k])).map(|([x, y], e)| [x, y, e]).collect()
     }
-}
 
-/// The readings, sorted into square cells as wide as the filter reaches.
-struct Buckets<'a> {
-    readings: &'a [Reading],
-    /// Indices of the readings, cell by cell.
-    order: Vec<u32>,
-    /// Where each cell begins in `order`; one more than there are cells.
-    begins: Vec<u32>,
-    first_mm: [f64; 2],
-    size_mm: f64,
-    cells: [usize; 2],
-}
-
-impl<'a> Buckets<'a> {
-    fn new(readings: &'a [Reading], reach_mm: f64) -> Self {
-        let fold = |pick: fn(f64, f64) -> f64, start: f64| {
-            readings.iter().fold([start; 2], |b, r| [pick(b[0], r.at_mm[0]), pick(b[1], r.at_mm[1])])
-        };
-        let (low, high) = (fold(f64::min, f64::INFINITY), fold(f64::max, f64::NEG_INFINITY));
-        // A short reach over a large part must not ask for more cells than there are readings to put in them.
-        let area = (high[0] - low[0]).max(reach_mm) * (high[1] - low[1]).max(reach_mm);
-        let size_mm = reach_mm.max((area / (4 * readings.len()) as f64).sqrt());
-        let cells = [0, 1].map(|k| ((high[k] - low[k]) / size_mm) as usize + 1);
-        let mut begins = vec![0u32; cells[0] * cells[1] + 1];
-        let cell = |r: &Reading| {
-            let [i, j] = [0, 1].map(|k| (((r.at_mm[k] - low[k]) / size_mm) as usize).min(cells[k] - 1));
-            j * cells[0] + i
-        };
-        readings.iter().for_each(|r| begins[cell(r) + 1] += 1);
-        for k in 1..begins.len() {
-            begins[k] += begins[k - 1];
+    fn advised(mut self, options: &MapOptions, readings: usize, apart_mm: [f64; 2]) -> Self {
+        self.point_spacing_mm = apart_mm[0].max(apart_mm[1]);
+        if let Err(short) = check_cutoff(options.cutoff_mm, options.contact_width_mm, self.point_spacing_mm) {
+            self.advice.push(short.to_string());
         }
-        let mut next = begins.clone();
-        let mut order = vec![0u32; readings.len()];
-        for (index, r) in readings.iter().enumerate() {
-            let slot = &mut next[cell(r)];
-            order[*slot as usize] = index as u32;
-            *slot += 1;
+        let left_out = self.outliers.len();
+        if left_out * 50 > readings {
+            let advice =
+                format!("{left_out} of {readings} points were left out as outliers; clean the part and the probe");
+            self.advice.push(advice);
         }
-        Self { readings, order, begins, first_mm: low, size_mm, cells }
-    }
-
-    /// Returns the readings of the cells within reach of a place.
-    fn near(&self, place_mm: [f64; 2]) -> impl Iterator<Item = &Reading> {
-        let [(i0, i1), (j0, j1)] = [0, 1].map(|k| {
-            let c = ((place_mm[k] - self.first_mm[k]) / self.size_mm).floor();
-            (c.max(1.0) as usize - 1, ((c + 1.0).max(0.0) as usize).min(self.cells[k] - 1))
-        });
-        (j0..=j1).flat_map(move |j| {
-            let row = j * self.cells[0];
-            let (begin, end) = (self.begins[row + i0.min(i1)] as usize, self.begins[row + i1 + 1] as usize);
-            self.order[begin..end].iter().map(|&index| &self.readings[index as usize])
-        })
-    }
-
-    /// Fits the weighted plane at a place and returns its height there; `None` where too little was measured.
-    fn plane_at(&self, place_mm: [f64; 2], cutoff_mm: f64) -> Option<f64> {
-        let reach2 = (REACH * cutoff_mm).powi(2);
-        let falloff = std::f64::consts::PI / (ALPHA * cutoff_mm).powi(2);
-        // Moments of the weights: 1, x, y, xx, xy, yy, and of the weighted deviations: d, xd, yd; lengths in cut-offs.
-        let (mut m, mut count) = ([0.0f64; 9], 0usize);
-        for r in self.near(place_mm) {
-            let (x, y) = (r.at_mm[0] - place_mm[0], r.at_mm[1] - place_mm[1]);
-            let r2 = x * x + y * y;
-            if r2 <= reach2 {
-                let (w, x, y, d) = ((-falloff * r2).exp(), x / cutoff_mm, y / cutoff_mm, r.deviation_mm);
-                for (sum, term) in m.iter_mut().zip([1.0, x, y, x * x, x * y, y * y, d, x * d, y * d]) {
-                    *sum += w * term;
-                }
-                count += 1;
-            }
-        }
-        if count < LEAST_POINTS { None } else { plane(m) }
+        self
     }
 }
 
-/// Solves the normal equations for the plane's height at the origin; `None` where the points lie all to one side or on a line.
-fn plane([s, x, y, xx, xy, yy, d, xd, yd]: [f64; 9]) -> Option<f64> {
-    // Centred at the mean place, the slope part is 2 by 2.
-    let (mx, my, md) = (x / s, y / s, d / s);
-    let (cxx, cxy, cyy) = (xx / s - mx * mx, xy / s - mx * my, yy / s - my * my);
-    let (cxd, cyd) = (xd / s - mx * md, yd / s - my * md);
-    let determinant = cxx * cyy - cxy * cxy;
-    // The mean place must not be farther away than the points are wide: that would be extrapolation.
-    let flat = determinant <= 1e-4 * (cxx + cyy).powi(2) || determinant.is_nan();
-    if flat || mx * mx + my * my > 4.0 * (cxx + cyy) {
-        return None;
-    }
-    let (p, q) = ((cyy * cxd - cxy * cyd) / determinant, (cxx * cyd - cxy * cxd) / determinant);
-    Some(md - p * mx - q * my)
+/// A surface on a net that was filtered.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FilteredNet {
+    /// Filtered values at every node, in the units of those that were given; those that are not valid are the nearest valid one's.
+    pub values: Vec<f64>,
+    /// Whether enough is known around a node.
+    pub valid: Vec<bool>,
+    /// How often the filter was applied: 1 for the plain form.
+    pub rounds: usize,
 }
 
-/// Gives every node without a value that of the nearest node with one, so that the map levels off outside.
-fn level_off(net: &Net, fitted: &[Option<f64>]) -> Vec<f64> {
-    let mut values: Vec<f64> = fitted.iter().map(|v| v.unwrap_or(f64::NAN)).collect();
-    // Rings grow outwards from the valid nodes; the first to arrive is the nearest in steps.
-    let mut edge: Vec<usize> = (0..net.len()).filter(|&k| fitted[k].is_some()).collect();
-    while !edge.is_empty() {
-        let mut next = Vec::new();
-        for k in edge {
-            let (i, j) = (k % net.columns, k / net.columns);
-            let left = (i > 0).then(|| k - 1);
-            let right = (i + 1 < net.columns).then_some(k + 1);
-            let below = (j > 0).then(|| k - net.columns);
-            let above = (j + 1 < net.rows).then_some(k + net.columns);
-            for neighbour in [left, right, below, above].into_iter().flatten() {
-                if values[neighbour].is_nan() {
-                    values[neighbour] = values[k];
-                    next.push(neighbour);
-                }
-            }
-        }
-        edge = next;
+/// Filters a map that already lies on a net, as an interferometer gives it: ISO 16610-61, or its robust form ISO 16610-71.
+///
+/// Shapes: a value and whether it is valid for every node, row by row, x fastest. Values that are not valid may be anything and are not
+/// read. Units: any for the values; the cut-off in millimetres.
+///
+/// # Errors
+/// Numbers of values other than that of the nodes, valid values that are not finite, a cut-off that is not above 0.
+pub fn filter_net(
+    net: &Net,
+    values: &[f64],
+    valid: &[bool],
+    cutoff_mm: f64,
+    order: Order,
+    robust_form: bool,
+) -> Result<FilteredNet, MapError> {
+    if values.len() != net.len() || valid.len() != net.len() {
+        return Err(MapError::Shape { found: values.len().min(valid.len()), nodes: net.len() });
     }
-    values
+    if !(cutoff_mm > 0.0 && cutoff_mm.is_finite()) {
+        return Err(MapError::Cutoff { cutoff_mm });
+    }
+    if let Some(index) = (0..net.len()).find(|&k| valid[k] && !values[k].is_finite()) {
+        return Err(MapError::NotFinite { index });
+    }
+    let gaussian = Gaussian { cutoff_mm, order };
+    let mask: Vec<f64> = valid.iter().map(|v| f64::from(u8::from(*v))).collect();
+    let plain = gaussian.on_net(values, &mask, net);
+    let (filtered, rounds) = if robust_form { robust_net(&gaussian, plain, values, &mask, net) } else { (plain, 1) };
+    let count = filtered.supported.iter().filter(|s| **s).count();
+    if count == 0 {
+        return Err(MapError::TooSparse { valid: 0, nodes: net.len(), cutoff_mm });
+    }
+    let levelled = level_off(net, filtered.values, &filtered.slopes, &filtered.supported, 0.0);
+    Ok(FilteredNet { values: levelled.values, valid: filtered.supported, rounds })
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Readings every `step` over a rectangle, of a function of the place.
-    fn sampled(width: f64, depth: f64, step: f64, f: impl Fn(f64, f64) -> f64) -> Vec<Reading> {
-        let (columns, rows) = ((width / step) as usize + 1, (depth / step) as usize + 1);
-        (0..columns * rows)
-            .map(|k| [(k % columns) as f64 * step - width / 2.0, (k / columns) as f64 * step - depth / 2.0])
-            .map(|at_mm| Reading { at_mm, deviation_mm: f(at_mm[0], at_mm[1]) })
-            .collect()
-    }
-
-    fn made(readings: &[Reading], cutoff_mm: f64) -> ErrorMap {
-        error_map(readings, &MapOptions { cutoff_mm, spacing_mm: 1.0 }).unwrap()
-    }
-
-    #[test]
-    fn nothing_gives_nothing_and_a_plane_stays_a_plane_to_its_edges() {
-        assert!(made(&sampled(40.0, 30.0, 1.0, |_, _| 0.0), 8.0).values_mm.iter().all(|v| *v == 0.0));
-        let plane = |x: f64, y: f64| 3e-3 + 1e-4 * x - 2e-4 * y;
-        let map = made(&sampled(40.0, 30.0, 1.0, plane), 8.0);
-        for k in 0..map.net.len() {
-            let [x, y] = map.net.place_mm(k);
-            assert!(map.valid[k] && (map.values_mm[k] - plane(x, y)).abs() < 1e-15);
-        }
-    }
-
-    #[test]
-    fn a_wave_at_the_cutoff_passes_by_half() {
-        let cutoff = 10.0;
-        for (ratio, passed) in [(1.0, 0.5), (2.0, 0.5f64.powf(0.25)), (0.5, 0.5f64.powi(4))] {
-            let k = std::f64::consts::TAU / (ratio * cutoff);
-            let map = made(&sampled(80.0, 60.0, 0.5, |x, _| 1e-3 * (k * x).cos()), cutoff);
-            assert!((map.at([0.0, 0.0]) - 1e-3 * passed).abs() < 5e-6, "{ratio}: {}", map.at([0.0, 0.0]));
-        }
-    }
-
-    #[test]
-    fn a_hole_is_not_valid_and_levels_off() {
-        let mut readings = sampled(60.0, 60.0, 1.0, |x, _| 1e-5 * x);
-        readings.retain(|r| r.at_mm[0].hypot(r.at_mm[1]) > 15.0);
-        let map = made(&readings, 6.0);
-        let middle = (0..map.net.len()).find(|&k| map.net.place_mm(k) == [0.0, 0.0]).unwrap();
-        assert!(!map.valid[middle]);
-        assert!(map.values_mm.iter().all(|v| v.is_finite() && v.abs() < 3.1e-4));
-    }
-
-    #[test]
-    fn the_order_of_the_points_does_not_matter() {
-        let mut readings = sampled(30.0, 30.0, 1.3, |x, y| 1e-3 * (0.3 * x + 0.2 * y).sin());
-        let map = made(&readings, 7.0);
-        readings.reverse();
-        let back = made(&readings, 7.0);
-        assert!(map.values_mm.iter().zip(&back.values_mm).all(|(a, b)| (a - b).abs() < 1e-15));
-    }
-
-    #[test]
-    fn what_makes_no_map_is_said() {
-        let options = MapOptions { cutoff_mm: 5.0, spacing_mm: 1.0 };
-        let mut readings = sampled(30.0, 30.0, 1.0, |_, _| 0.0);
-        assert!(matches!(error_map(&[], &options), Err(MapError::Net(NetError::NoPoints))));
-        let zero = MapOptions { cutoff_mm: 0.0, ..options };
-        assert!(matches!(error_map(&readings, &zero), Err(MapError::Cutoff { .. })));
-        readings[7].deviation_mm = f64::NAN;
-        assert_eq!(error_map(&readings, &options), Err(MapError::NotFinite { index: 7 }));
-        let sparse = sampled(100.0, 100.0, 20.0, |_, _| 0.0);
-        assert!(matches!(error_map(&sparse, &options), Err(MapError::TooSparse { .. })));
-        let line: Vec<Reading> = (0..100).map(|k| Reading { at_mm: [f64::from(k), 0.0], deviation_mm: 0.0 }).collect();
-        assert!(matches!(error_map(&line, &options), Err(MapError::TooSparse { .. })));
-    }
+fn robust_net(gaussian: &Gaussian, plain: Filtered, values: &[f64], mask: &[f64], net: &Net) -> (Filtered, usize) {
+    let masked = |weights: &[f64]| weights.iter().zip(mask).map(|(w, m)| w * m).collect::<Vec<f64>>();
+    let again = |weights: &[f64]| gaussian.on_net(values, &masked(weights), net);
+    let compare = |filtered: &Filtered, _: Option<&[f64]>| {
+        let known = |k: usize| mask[k] > 0.0 && filtered.supported[k];
+        let plain = (0..net.len()).map(|k| if known(k) { values[k] - filtered.values[k] } else { f64::NAN }).collect();
+        Residuals { plain, freedom: vec![1.0; net.len()] }
+    };
+    let found = super::robust::iterate(plain, net.len(), again, compare);
+    (found.filtered, found.rounds)
 }

@@ -3,6 +3,8 @@
 //! ```text
 //!  deviations --error_map--> ErrorMap --Correction::next--> Correction --(ground, measured)--> Response
 //!  (scattered)               (filtered, on a net)           (absolute, versioned)              (did it answer as commanded?)
+//!      |
+//!      +--parameters--> Parameters (wheel radius, setting, wear: corrected as such, not baked into the map)
 //! ```
 //!
 //! Pure: no file, no clock, no randomness. Frames: everything is over x and y of the model frame {M}. Units: millimetres. Signs:
@@ -10,13 +12,26 @@
 //! outward normal, so that a correction takes back a deviation of the opposite sign.
 
 mod correction;
+mod filter;
 mod learning;
+mod level;
 mod map;
 mod net;
+mod parameters;
 mod response;
+mod robust;
+mod sampling;
+mod selected;
+mod spline;
 
 pub use correction::{Correction, CorrectionLimits, Step, StepError};
+pub use filter::Order;
 pub use learning::{Forecast, GainRule, Knowledge, Seen};
-pub use map::{ErrorMap, MapError, MapOptions, Reading, error_map};
+pub use map::{ErrorMap, FilteredNet, MapError, MapOptions, Reading, Smoothing, error_map, filter_net};
 pub use net::{Net, NetError};
+pub use parameters::{
+    Contact, Parameter, ParameterError, ParameterKind, ParameterOptions, Parameters, WheelTerm, parameters,
+};
 pub use response::{Response, Sense, response};
+pub use sampling::{check_cutoff, contact_width_mm, least_cutoff_mm, point_spacing_mm};
+pub use spline::{Roughness, SplineError};

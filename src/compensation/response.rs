@@ -180,7 +180,7 @@ mod tests {
 
     fn map(f: impl Fn(f64, f64) -> f64) -> ErrorMap {
         let values_mm = (0..NET.len()).map(|k| NET.place_mm(k)).map(|[x, y]| f(x, y)).collect();
-        ErrorMap { net: NET, values_mm, valid: vec![true; NET.len()], rest_sigma_mm: 0.0 }
+        ErrorMap::known(NET, values_mm, vec![true; NET.len()])
     }
 
     /// An error without any symmetry.

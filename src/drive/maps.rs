@@ -2,10 +2,12 @@
 
 use std::path::Path;
 
+use serde_json::json;
+
 use super::work::Task;
-use crate::compensation::ErrorMap;
+use crate::compensation::{self, Contact, ErrorMap, ParameterOptions};
 use crate::form::{FormOptions, Sample, figures, slope};
-use crate::formats::{FormatError, write_error_map, write_error_map_x3p, write_figures};
+use crate::formats::{FormatError, write_error_map, write_error_map_x3p, write_figures, write_json_atomic};
 use crate::registration::{PointStatus, Registration};
 use crate::report::{HeatMap, ReportError, save_coloured_ply};
 
@@ -31,6 +33,32 @@ pub(super) fn save_figures(
     });
     let slopes = slopes.as_ref().map(|slope| (slope.as_ref(), cutoff_mm));
     write_figures(&folder.join("figures.json"), made.as_ref(), slopes, task.simulation)
+}
+
+/// Says what of the deviations the machine's parameters explain: the wheel's radius and setting, its wear. What is offered is better
+/// corrected there than ground in with every map.
+pub(super) fn parameters(task: &Task, folder: &Path, found: &Registration) -> Result<Vec<String>, FormatError> {
+    let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
+    let contact =
+        |d: &crate::registration::Deviation| Contact { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
+    let contacts: Vec<Contact> = used.map(contact).collect();
+    let options = ParameterOptions {
+        free_motions: task.registration.locked.map(|locked| !locked),
+        ..ParameterOptions::new(task.pass.wheel_radius_mm)
+    };
+    let document = match compensation::parameters(&contacts, None, &options) {
+        Ok(told) => {
+            let um = |mm: f64| 1e3 * mm;
+            let document = json!({
+                "simulation": task.simulation, "rms_um": um(told.rms_mm), "rest_rms_um": um(told.rest_rms_mm),
+                "parameters": told.found,
+            });
+            write_json_atomic(folder.join("parameters.json"), &document)?;
+            return Ok(told.found.into_iter().filter(|p| p.offered).map(|p| p.words).collect());
+        }
+        Err(error) => json!({ "simulation": task.simulation, "why_not": error.to_string() }),
+    };
+    write_json_atomic(folder.join("parameters.json"), &document).map(|()| Vec::new())
 }
 
 /// Writes the map of a cycle's error and the points that it was made from.

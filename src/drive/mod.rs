@@ -397,6 +397,7 @@ impl Drive {
                     "deviation_uncertainty.csv",
                     "registration.json",
                     "figures.json",
+                    "parameters.json",
                     "error_map.csv",
                     "error_map.x3p",
                     "error_map.svg",

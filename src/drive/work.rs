@@ -322,6 +322,10 @@ pub(super) fn register_cycle(
     if let Err(error) = maps::save_figures(task, folder, error.as_ref(), &found) {
         return failed(error.to_string());
     }
+    let offered = match maps::parameters(task, folder, &found) {
+        Ok(offered) => offered,
+        Err(error) => return failed(error.to_string()),
+    };
     // Every measurement leaves its map, whatever becomes of the correction.
     if let Some(Err(why)) = error.as_ref().map(|map| maps::save(task, folder, map, &found)) {
         return failed(why);
@@ -329,7 +333,8 @@ pub(super) fn register_cycle(
     let answer = error.as_ref().and_then(|error| answer(before?, cycle, &found, error));
     let known = error.as_ref().map(|error| learned_from(task, cycle, before, error, answer));
     let forecast = known.as_ref().zip(error.as_ref()).map(|(known, error)| known.forecast(error));
-    let figures = figures(task, cycle, &found, error.as_ref(), answer, forecast);
+    let mut figures = figures(task, cycle, &found, error.as_ref(), answer, forecast);
+    figures.warnings.extend(error.iter().flat_map(|map| map.advice.iter().cloned()).chain(offered));
     let event = Event::Registered { cycle: number, figures: figures.clone() };
     (event, Some(Found { registration: found, error, known, figures }))
 }

@@ -347,6 +347,7 @@ fn compensation(written: &CompensationTable, document: &mut Document) -> Option<
         learn: written.learn,
         least_depth_mm: MM_PER_UM * written.least_depth_um,
         cutoff_mm: written.cutoff_mm?,
+        smoothing: written.smoothing,
         largest_correction_mm: MM_PER_UM * written.largest_correction_um?,
         removal_budget_mm: MM_PER_UM * written.removal_budget_um?,
         depth_of_cut_mm: MM_PER_UM * written.depth_of_cut_um?,

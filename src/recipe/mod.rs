@@ -16,7 +16,7 @@ mod written;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
-use crate::compensation::GainRule;
+use crate::compensation::{GainRule, Smoothing};
 use crate::document::{Document, Problems, problem_at, read_text, schema_of, sha256};
 use crate::geometry::{Aperture, Pose};
 use crate::registration::{self, Loss, ProbeSide, Start};
@@ -187,6 +187,8 @@ pub struct Compensation {
     pub least_depth_mm: f64,
     /// Wavelengths shorter than this are left alone.
     pub cutoff_mm: f64,
+    /// What makes the map smooth.
+    pub smoothing: Smoothing,
     /// The correction is nowhere larger than this.
     pub largest_correction_mm: f64,
     /// The most that may be taken off anywhere, over all passes.

@@ -4,6 +4,7 @@ use schemars::{JsonSchema, Schema, json_schema};
 use serde::Deserialize;
 
 use super::{BeginWith, GainBy, OnTrouble, PvOf, StartAt};
+use crate::compensation::Smoothing;
 use crate::registration::Loss;
 use crate::surface::Projection;
 
@@ -242,6 +243,8 @@ pub(super) struct CompensationTable {
     /// Wavelengths shorter than this are left alone.
     #[schemars(range(min = 0.05, max = 10000.0), extend("x-required" = true), example = 8.0)]
     pub cutoff_mm: Option<f64>,
+    /// What makes the map of the deviations smooth.
+    pub smoothing: Smoothing,
     /// The correction is nowhere larger than this.
     #[schemars(range(min = 0.01, max = 10000.0), extend("x-required" = true), example = 60.0)]
     pub largest_correction_um: Option<f64>,
@@ -381,6 +384,7 @@ impl Default for CompensationTable {
             gain_by: None,
             repeatability_um: None,
             learn: false,
+            smoothing: Smoothing::default(),
             least_depth_um: 0.5,
             cutoff_mm: None,
             largest_correction_um: None,

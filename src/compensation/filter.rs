@@ -1,0 +1,590 @@
+//! The areal Gaussian filter (ISO 16610-61) for readings that lie anywhere, with honest edges and holes.
+//!
+//! At a place a polynomial of order 0, 1 or 2 is fitted to the readings around it with the weights
+//! exp(-pi (r / (alpha cutoff))^2), and its height there is the filtered value: the Gaussian regression filter (ISO 16610-31, areal).
+//! In the open this is the Gaussian filter; at an edge or a hole the readings that are there are weighed alone and no padding
+//! is needed. The normal equations of a fit are moments of the weights, and since the weights separate, the moments at all nodes of a
+//! net are sums along x and then along y: the cost is that of the reach on one axis, not of its square.
+//!
+//! **Readings between nodes.** A reading is spread over the 7 x 7 nodes about it by a narrow Gaussian of width s, and what is
+//! summed along the axes is a Gaussian narrower by as much, of width sqrt(sigma^2 - s^2); the moments' polynomials are changed to match
+//! (Hermite). Both together are the wanted weight at the reading's true place, up to the sampling of the product of two
+//! Gaussians, whose error falls as exp(-2 pi^2 s^2 (1 - s^2 / sigma^2) / step^2). With a step of at most 0.55 sigma and
+//! s of 0.75 steps weights are right to 2e-4 of the largest; halving the step makes it 4e-6. A polynomial of the filter's own
+//! order is taken out before and put back after, so that planes (quadrics) pass to rounding all the same.
+
+use std::f64::consts::PI;
+
+use nalgebra::{DMatrix, DVector, SMatrix, SVector};
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::net::Net;
+
+/// Width of the spreading Gaussian in steps.
+const SPREAD: f64 = 0.75;
+/// A reading is spread over so many nodes to either side: beyond it is 2e-5 of the largest.
+const SPREAD_REACH: usize = 3;
+/// Widest step in standard deviations of the weights.
+const WIDEST_STEP: f64 = 0.55;
+/// Weights beyond so many standard deviations are below 1e-6 of the largest.
+const REACH: f64 = 5.3;
+/// Fewer readings than this within the cut-off of a node, along x and along y, are no evidence for a surface.
+pub(super) const LEAST_READINGS: u32 = 6;
+/// A value whose variance is more than so many times that of one reading is a guess.
+const MOST_VARIANCE: f64 = 2.0;
+
+/// Largest mean square distance of the readings that count, in variances of the weights: 2 in the open, 3.6 between four readings half a
+/// cut-off apart, more in a hole.
+const MOST_SPREAD: f64 = 4.5;
+
+/// Order of the polynomial that the filter lets pass unchanged.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Order {
+    /// Constants pass: the plain weighted mean, which is pulled askew by slopes at edges.
+    Constant,
+    /// Planes pass.
+    #[default]
+    Plane,
+    /// Quadrics pass.
+    Quadric,
+}
+
+impl Order {
+    /// Returns alpha, the width of the weights over the cut-off, by which one half passes at the cut-off.
+    ///
+    /// With u = (2 pi sigma / cutoff)^2 / 2 a constant or plane passes exp(-u) of a wave, a quadric (1 + u) exp(-u). They are one half
+    /// at u = ln 2 and 1.678347, and alpha = sqrt(u / pi).
+    pub fn alpha(self) -> f64 {
+        match self {
+            Self::Constant | Self::Plane => 0.469_718_639_349_825_66,
+            Self::Quadric => 0.730_913_428_094_675,
+        }
+    }
+
+    /// Returns the share of a wave's amplitude that passes in the open, its length in cut-offs.
+    pub fn passes(self, wavelength_in_cutoffs: f64) -> f64 {
+        let u = PI * (self.alpha() / wavelength_in_cutoffs).powi(2);
+        if self == Self::Quadric { (1.0 + u) * (-u).exp() } else { (-u).exp() }
+    }
+
+    fn degree(self) -> usize {
+        match self {
+            Self::Constant => 0,
+            Self::Plane => 1,
+            Self::Quadric => 2,
+        }
+    }
+}
+
+/// Exponents of x and y of the terms of a polynomial, by degree.
+const TERMS: [[usize; 2]; 6] = [[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2]];
+/// Moments up to the fourth degree.
+const MOMENTS: usize = 15;
+
+/// Returns where the moment of x^a y^b stands: by degree, then by b.
+const fn moment(a: usize, b: usize) -> usize {
+    (a + b) * (a + b + 1) / 2 + b
+}
+
+const fn terms(degree: usize) -> usize {
+    (degree + 1) * (degree + 2) / 2
+}
+
+/// A Gaussian filter.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Gaussian {
+    pub cutoff_mm: f64,
+    pub order: Order,
+}
+
+/// What a filter found at every node of its net.
+#[derive(Clone, Debug)]
+pub(super) struct Filtered {
+    pub net: Net,
+    /// Filtered values; 0 where not supported.
+    pub values: Vec<f64>,
+    /// Slopes of the fitted polynomial along x and y, per millimetre.
+    pub slopes: Vec<[f64; 2]>,
+    /// Share that a reading of weight 1 at the node would have in the value there.
+    pub leverage: Vec<f64>,
+    /// Variance of the value over that of one reading.
+    pub variance: Vec<f64>,
+    /// Whether there are enough readings around a node, and not all to one side.
+    pub supported: Vec<bool>,
+}
+
+impl Gaussian {
+    /// Share of a reading in the value at its place times the readings to the square millimetre, in the open.
+    pub fn open_leverage(&self) -> f64 {
+        let weight = (self.order.alpha() * self.cutoff_mm).powi(2);
+        if self.order == Order::Quadric { 2.0 / weight } else { 1.0 / weight }
+    }
+
+    /// Standard deviation of the weights, in millimetres.
+    fn sigma_mm(&self) -> f64 {
+        self.order.alpha() * self.cutoff_mm / (2.0 * PI).sqrt()
+    }
+
+    /// Returns how many steps a net's spacing must be divided into along x and y for this filter.
+    pub fn division(&self, net: &Net) -> [usize; 2] {
+        let widest_mm = WIDEST_STEP * self.sigma_mm();
+        net.spacing_mm.map(|spacing| (spacing / widest_mm).ceil().clamp(1.0, 1e6) as usize)
+    }
+
+    /// Filters values that lie anywhere over a net; `weights` are factors from 0 to 1, one for each.
+    pub fn scattered(&self, places: &[[f64; 2]], values: &[f64], weights: Option<&[f64]>, net: &Net) -> Filtered {
+        let degree = self.order.degree();
+        let trend = Trend::fit(places, values, degree);
+        let sigma_mm = self.sigma_mm();
+        let spread = net.spacing_mm.map(|step| SPREAD * step / sigma_mm);
+        let taps = self.taps(net);
+        let rest: Vec<f64> = places.iter().zip(values).map(|(p, v)| v - trend.at(*p)).collect();
+        let channels = spread_out(places, &rest, weights, net, taps);
+        let counts = Counts::new(places, net);
+        let mut filtered = self.solve(&channels, spread, taps, net, &counts);
+        filtered.add(&trend);
+        filtered
+    }
+
+    /// Filters values at the nodes of a net, of those that are valid.
+    pub fn on_net(&self, values: &[f64], weights: &[f64], net: &Net) -> Filtered {
+        let degree = self.order.degree();
+        let (places, known): (Vec<[f64; 2]>, Vec<f64>) =
+            (0..net.len()).filter(|&k| weights[k] > 0.0).map(|k| (net.place_mm(k), values[k])).unzip();
+        let trend = Trend::fit(&places, &known, degree);
+        let taps = self.taps(net);
+        let mut channels = Channels::new(net, taps, true);
+        for k in (0..net.len()).filter(|&k| weights[k] > 0.0) {
+            let slot = channels.slot(k % net.columns, k / net.columns);
+            let weight = weights[k];
+            channels.weight[slot] = weight;
+            channels.value[slot] = weight * (values[k] - trend.at(net.place_mm(k)));
+            channels.weight2[slot] = weight * weight;
+        }
+        let counts = Counts::new(&places, net);
+        let mut filtered = self.solve(&channels, [0.0; 2], taps, net, &counts);
+        filtered.add(&trend);
+        filtered
+    }
+
+    /// Reach of the weights along x and y, in nodes.
+    fn taps(&self, net: &Net) -> [usize; 2] {
+        [0, 1].map(|k| {
+            let nodes = [net.columns, net.rows][k];
+            ((REACH * self.sigma_mm() / net.spacing_mm[k]).ceil() as usize).clamp(1, nodes.max(4)).max(SPREAD_REACH)
+        })
+    }
+
+    fn solve(&self, channels: &Channels, spread: [f64; 2], taps: [usize; 2], net: &Net, counts: &Counts) -> Filtered {
+        let degree = self.order.degree();
+        let sigma_mm = self.sigma_mm();
+        let kernels = |scale: f64, most: usize| {
+            [0, 1].map(|k| kernels(most, scale, net.spacing_mm[k] / sigma_mm, spread[k], taps[k]))
+        };
+        // Where the readings lie about a node is asked for whatever the order.
+        let most = (2 * degree).max(2);
+        let ([wx, wy], [qx, qy]) = (kernels(1.0, most), kernels(2f64.sqrt(), 2 * degree));
+        let weight = Summed::along_x(channels, &channels.weight, &wx);
+        let value = Summed::along_x(channels, &channels.value, &wx[..=degree]);
+        let weight2 = Summed::along_x(channels, channels.squares(), &qx);
+        let rows: Vec<Vec<Node>> = (0..net.rows)
+            .into_par_iter()
+            .map(|j| {
+                let weight = weight.along_y(&wy, most, j);
+                let sums = [weight, value.along_y(&wy, degree, j), weight2.along_y(&qy, 2 * degree, j)];
+                let enough = |i: usize| counts.within(i, j, self.cutoff_mm) >= LEAST_READINGS;
+                (0..net.columns).map(|i| if enough(i) { node(self.order, &sums, i) } else { None }).collect()
+            })
+            .collect();
+        gathered(net, sigma_mm, rows.into_iter().flatten())
+    }
+}
+
+/// Value, slopes per standard deviation, leverage and variance at a node that is supported.
+type Node = Option<[f64; 5]>;
+
+fn gathered(net: &Net, sigma_mm: f64, nodes: impl Iterator<Item = Node>) -> Filtered {
+    let count = net.len();
+    let mut all = Filtered {
+        net: *net,
+        values: Vec::with_capacity(count),
+        slopes: Vec::with_capacity(count),
+        leverage: Vec::with_capacity(count),
+        variance: Vec::with_capacity(count),
+        supported: Vec::with_capacity(count),
+    };
+    for node in nodes {
+        let [value, p, q, leverage, variance] = node.unwrap_or_default();
+        all.values.push(value);
+        all.slopes.push([p / sigma_mm, q / sigma_mm]);
+        all.leverage.push(leverage);
+        all.variance.push(variance);
+        all.supported.push(node.is_some());
+    }
+    all
+}
+
+fn node(order: Order, sums: &[Vec<Vec<f64>>; 3], i: usize) -> Node {
+    let at = |sums: &[Vec<f64>]| {
+        let mut m = [0.0; MOMENTS];
+        sums.iter().zip(&mut m).for_each(|(sum, m)| *m = sum[i]);
+        m
+    };
+    let (weight, value, weight2) = (at(&sums[0]), at(&sums[1]), at(&sums[2]));
+    match order {
+        Order::Constant => fit::<1>(&weight, &value, &weight2),
+        Order::Plane => fit::<3>(&weight, &value, &weight2),
+        Order::Quadric => fit::<6>(&weight, &value, &weight2),
+    }
+}
+
+/// Solves the normal equations of a polynomial of P terms about a node.
+fn fit<const P: usize>(weight: &[f64; MOMENTS], value: &[f64; MOMENTS], weight2: &[f64; MOMENTS]) -> Node {
+    if one_sided(weight) {
+        return None;
+    }
+    let gram = |m: &[f64; MOMENTS]| {
+        SMatrix::<f64, P, P>::from_fn(|r, c| m[moment(TERMS[r][0] + TERMS[c][0], TERMS[r][1] + TERMS[c][1])])
+    };
+    let solved = gram(weight).cholesky()?;
+    let terms = solved.solve(&SVector::<f64, P>::from_fn(|r, _| value[r]));
+    // The row of the inverse that gives the height: its readings' shares are weight times this polynomial.
+    let share = solved.solve(&SVector::<f64, P>::from_fn(|r, _| if r == 0 { 1.0 } else { 0.0 }));
+    let variance = share.dot(&(gram(weight2) * share));
+    let slope = |k: usize| if P > 1 { terms[k.min(P - 1)] } else { 0.0 };
+    let node = [terms[0], slope(1), slope(2), share[0], variance];
+    (variance <= MOST_VARIANCE && node.iter().all(|v| v.is_finite())).then_some(node)
+}
+
+/// Whether the readings lie on a line, farther to one side than they are wide, or all far away as around a hole: a polynomial would
+/// be extrapolated, or span what nobody has seen.
+fn one_sided(m: &[f64; MOMENTS]) -> bool {
+    let (mx, my) = (m[1] / m[0], m[2] / m[0]);
+    let (cxx, cxy, cyy) = (m[3] / m[0] - mx * mx, m[4] / m[0] - mx * my, m[5] / m[0] - my * my);
+    let spread = cxx + cyy;
+    // At the corner of a dense square the mean is off by 1.8 of the spread; one standard deviation off a straight edge by 1.9.
+    let inside = cxx * cyy - cxy * cxy > 1e-4 * spread * spread && mx * mx + my * my <= 2.0 * spread;
+    !inside || spread > MOST_SPREAD
+}
+
+/// Sampled sums on a net with a border as wide as the reach.
+struct Channels {
+    columns: usize,
+    rows: usize,
+    border: [usize; 2],
+    weight: Vec<f64>,
+    value: Vec<f64>,
+    /// Squares of the weights; empty where all are 0 or 1.
+    weight2: Vec<f64>,
+}
+
+impl Channels {
+    fn new(net: &Net, border: [usize; 2], squares: bool) -> Self {
+        let (columns, rows) = (net.columns + 2 * border[0], net.rows + 2 * border[1]);
+        let empty = || vec![0.0; columns * rows];
+        let weight2 = if squares { empty() } else { Vec::new() };
+        Self { columns, rows, border, weight: empty(), value: empty(), weight2 }
+    }
+
+    fn slot(&self, i: usize, j: usize) -> usize {
+        (j + self.border[1]) * self.columns + i + self.border[0]
+    }
+
+    fn squares(&self) -> &[f64] {
+        if self.weight2.is_empty() { &self.weight } else { &self.weight2 }
+    }
+
+    fn add(&mut self, other: &Self) {
+        for (mine, theirs) in
+            [(&mut self.weight, &other.weight), (&mut self.value, &other.value), (&mut self.weight2, &other.weight2)]
+        {
+            mine.iter_mut().zip(theirs).for_each(|(a, b)| *a += b);
+        }
+    }
+}
+
+/// Spreads readings over the nodes about them.
+fn spread_out(places: &[[f64; 2]], values: &[f64], weights: Option<&[f64]>, net: &Net, border: [usize; 2]) -> Channels {
+    // The number of parts depends on the sizes alone, so that sums are the same on every machine.
+    let nodes = (net.columns + 2 * border[0]) * (net.rows + 2 * border[1]);
+    let parts = if nodes < 4 * places.len() { 4 } else { 1 };
+    let size = places.len().div_ceil(parts).max(1);
+    let peaks = std::array::from_fn(|n| (-0.5 * (n as f64 / SPREAD).powi(2)).exp() / (SPREAD * (2.0 * PI).sqrt()));
+    let chunks: Vec<Channels> = places
+        .par_chunks(size)
+        .enumerate()
+        .map(|(part, chunk)| {
+            let mut channels = Channels::new(net, border, weights.is_some());
+            for (k, place) in chunk.iter().enumerate() {
+                let index = part * size + k;
+                spread_one(&mut channels, net, &peaks, *place, values[index], weights.map_or(1.0, |w| w[index]));
+            }
+            channels
+        })
+        .collect();
+    let mut chunks = chunks.into_iter();
+    let mut all = chunks.next().unwrap_or_else(|| Channels::new(net, border, weights.is_some()));
+    chunks.for_each(|chunk| all.add(&chunk));
+    all
+}
+
+fn spread_one(
+    channels: &mut Channels,
+    net: &Net,
+    peaks: &[f64; SPREAD_REACH + 1],
+    place: [f64; 2],
+    value: f64,
+    weight: f64,
+) {
+    let mut first = [0usize; 2];
+    let shares = [0, 1].map(|k| {
+        let last = [net.columns, net.rows][k] - 1;
+        let at = (place[k] - net.first_mm[k]) / net.spacing_mm[k];
+        let nearest = at.round().clamp(0.0, last as f64);
+        first[k] = nearest as usize;
+        // exp(-((n - d) / s)^2 / 2), from two exponentials: that of n^2 is a constant, that of n d a power.
+        let off = at - nearest;
+        let (middle, ratio) = ((-0.5 * (off / SPREAD).powi(2)).exp(), (off / (SPREAD * SPREAD)).exp());
+        let mut shares = [middle * peaks[0]; 2 * SPREAD_REACH + 1];
+        let mut power = 1.0;
+        for n in 1..=SPREAD_REACH {
+            power *= ratio;
+            shares[SPREAD_REACH + n] = middle * peaks[n] * power;
+            shares[SPREAD_REACH - n] = middle * peaks[n] / power;
+        }
+        shares
+    });
+    let squares = !channels.weight2.is_empty();
+    for (n, across) in shares[1].iter().enumerate() {
+        let begin = channels.slot(first[0], first[1] + n) - SPREAD_REACH - SPREAD_REACH * channels.columns;
+        let ends = begin..begin + shares[0].len();
+        let factor = weight * across;
+        channels.weight[ends.clone()].iter_mut().zip(&shares[0]).for_each(|(sum, s)| *sum += factor * s);
+        let factor = value * factor;
+        channels.value[ends.clone()].iter_mut().zip(&shares[0]).for_each(|(sum, s)| *sum += factor * s);
+        if squares {
+            let factor = weight * weight * across;
+            channels.weight2[ends].iter_mut().zip(&shares[0]).for_each(|(sum, s)| *sum += factor * s);
+        }
+    }
+}
+
+/// Returns the sampled kernels that give the moments t^0 .. t^most of the weights exp(-(scale t)^2 / 2) after spreading.
+///
+/// t is the distance of a reading from the node in standard deviations, `step` that of the nodes, `spread` the width by which
+/// readings were spread. With G the wanted Gaussian, G = S * T for the spreading S and a narrower T, t^k G is a sum of derivatives of
+/// G, and each is S convolved with the same derivative of T: a Hermite polynomial times T.
+fn kernels(most: usize, scale: f64, step: f64, spread: f64, taps: usize) -> Vec<Vec<f64>> {
+    let tau = (1.0 - (scale * spread).powi(2)).sqrt();
+    let (t1, t2) = (1.0 / tau, 1.0 / (tau * tau));
+    (0..=most)
+        .map(|k| {
+            let sample = |n: usize| {
+                let a = scale * step * (n as f64 - taps as f64) * t1;
+                let a2 = a * a;
+                let polynomial = match k {
+                    0 => 1.0,
+                    1 => a * t1,
+                    2 => (a2 - 1.0) * t2 + 1.0,
+                    3 => a * t1 * ((a2 - 3.0) * t2 + 3.0),
+                    _ => ((a2 * a2 - 6.0 * a2 + 3.0) * t2 + 6.0 * (a2 - 1.0)) * t2 + 3.0,
+                };
+                polynomial * (-0.5 * a2).exp() * t1 / scale.powi(k as i32)
+            };
+            (0..=2 * taps).map(sample).collect()
+        })
+        .collect()
+}
+
+/// Sums along x of one channel, for each power of x.
+struct Summed {
+    columns: usize,
+    powers: Vec<Vec<f64>>,
+}
+
+impl Summed {
+    fn along_x(channels: &Channels, channel: &[f64], kernels: &[Vec<f64>]) -> Self {
+        let columns = channels.columns - 2 * channels.border[0];
+        let powers = kernels
+            .iter()
+            .map(|kernel| {
+                let mut sums = vec![0.0; columns * channels.rows];
+                let rows = sums.par_chunks_mut(columns).zip(channel.par_chunks(channels.columns));
+                rows.with_min_len(8).for_each(|(out, row)| {
+                    // Most rows of the border, and holes, are empty.
+                    if row.iter().any(|v| *v != 0.0) {
+                        for (tap, factor) in kernel.iter().enumerate() {
+                            out.iter_mut().zip(&row[tap..]).for_each(|(sum, v)| *sum += factor * v);
+                        }
+                    }
+                });
+                sums
+            })
+            .collect();
+        Self { columns, powers }
+    }
+
+    /// Returns the moments up to a degree along one row of nodes, by [`moment`].
+    fn along_y(&self, kernels: &[Vec<f64>], degree: usize, row: usize) -> Vec<Vec<f64>> {
+        let mut moments = vec![vec![0.0; self.columns]; terms(degree)];
+        for (a, sums) in self.powers.iter().enumerate().take(degree + 1) {
+            for (b, kernel) in kernels.iter().enumerate().take(degree + 1 - a) {
+                let out = &mut moments[moment(a, b)];
+                for (tap, factor) in kernel.iter().enumerate() {
+                    let line = &sums[(row + tap) * self.columns..][..self.columns];
+                    out.iter_mut().zip(line).for_each(|(sum, v)| *sum += factor * v);
+                }
+            }
+        }
+        moments
+    }
+}
+
+/// How many readings lie in any rectangle of nodes: sums of all to the left and below.
+struct Counts {
+    net: Net,
+    sums: Vec<u32>,
+}
+
+impl Counts {
+    fn new(places: &[[f64; 2]], net: &Net) -> Self {
+        let columns = net.columns + 1;
+        let mut sums = vec![0u32; columns * (net.rows + 1)];
+        for place in places {
+            let [i, j] = [0, 1].map(|k| {
+                let last = [net.columns, net.rows][k] - 1;
+                ((place[k] - net.first_mm[k]) / net.spacing_mm[k]).round().clamp(0.0, last as f64) as usize
+            });
+            sums[(j + 1) * columns + i + 1] += 1;
+        }
+        for j in 1..=net.rows {
+            let mut along = 0;
+            for i in 1..columns {
+                along += sums[j * columns + i];
+                sums[j * columns + i] = along + sums[(j - 1) * columns + i];
+            }
+        }
+        Self { net: *net, sums }
+    }
+
+    /// Returns how many readings lie in the square about a node.
+    fn within(&self, i: usize, j: usize, half_side_mm: f64) -> u32 {
+        let range = |at: usize, k: usize, nodes: usize| {
+            let reach = (half_side_mm / self.net.spacing_mm[k]).round().min(1e9) as usize;
+            (at.saturating_sub(reach), (at + reach + 1).min(nodes))
+        };
+        let ((i0, i1), (j0, j1)) = (range(i, 0, self.net.columns), range(j, 1, self.net.rows));
+        let sum = |i: usize, j: usize| self.sums[j * (self.net.columns + 1) + i];
+        sum(i1, j1) + sum(i0, j0) - sum(i0, j1) - sum(i1, j0)
+    }
+}
+
+/// A polynomial over all readings, taken out before filtering.
+pub(super) struct Trend {
+    middle: [f64; 2],
+    size: f64,
+    terms: Vec<f64>,
+}
+
+impl Trend {
+    /// Fits a polynomial of a degree up to 2, or of a lower one where the readings have no such.
+    pub fn fit(places: &[[f64; 2]], values: &[f64], degree: usize) -> Self {
+        let fold = |pick: fn(f64, f64) -> f64, start: f64| {
+            places.iter().fold([start; 2], |b, p| [pick(b[0], p[0]), pick(b[1], p[1])])
+        };
+        let (low, high) = (fold(f64::min, f64::INFINITY), fold(f64::max, f64::NEG_INFINITY));
+        let middle = [0, 1].map(|k| 0.5 * (low[k] + high[k]));
+        let size = 0.5 * (high[0] - low[0]).max(high[1] - low[1]).max(f64::MIN_POSITIVE);
+        let mut trend = Self { middle, size, terms: Vec::new() };
+        // Readings on a line have no plane; their mean is always there.
+        trend.terms =
+            (0..=degree).rev().find_map(|degree| trend.solve(places, values, terms(degree))).unwrap_or_default();
+        // Once more on what is left: normal equations lose half the digits, and this brings them back.
+        let rest: Vec<f64> = places.iter().zip(values).map(|(p, v)| v - trend.at(*p)).collect();
+        let more = trend.solve(places, &rest, trend.terms.len()).unwrap_or_default();
+        trend.terms.iter_mut().zip(more).for_each(|(term, more)| *term += more);
+        trend
+    }
+
+    fn solve(&self, places: &[[f64; 2]], values: &[f64], count: usize) -> Option<Vec<f64>> {
+        let mut gram = DMatrix::<f64>::zeros(count, count);
+        let mut right = DVector::<f64>::zeros(count);
+        for (place, value) in places.iter().zip(values) {
+            let basis = self.basis(*place);
+            for r in 0..count {
+                for c in 0..=r {
+                    gram[(r, c)] += basis[r] * basis[c];
+                }
+                right[r] += basis[r] * value;
+            }
+        }
+        let least = 1e-10 * places.len() as f64;
+        let solved = gram.cholesky()?;
+        let definite = (0..count).all(|k| solved.l_dirty()[(k, k)].powi(2) > least);
+        definite.then(|| solved.solve(&right).as_slice().to_vec())
+    }
+
+    fn basis(&self, place: [f64; 2]) -> [f64; 6] {
+        let [x, y] = [0, 1].map(|k| (place[k] - self.middle[k]) / self.size);
+        [1.0, x, y, x * x, x * y, y * y]
+    }
+
+    pub fn at(&self, place: [f64; 2]) -> f64 {
+        self.terms.iter().zip(self.basis(place)).map(|(term, basis)| term * basis).sum()
+    }
+
+    /// Adds the polynomial to values and slopes at the nodes of a net, of those that are wanted.
+    pub fn put_back(&self, net: &Net, wanted: impl Fn(usize) -> bool, values: &mut [f64], slopes: &mut [[f64; 2]]) {
+        let term = |k: usize| self.terms.get(k).copied().unwrap_or(0.0);
+        for k in (0..net.len()).filter(|&k| wanted(k)) {
+            let place = net.place_mm(k);
+            let [x, y] = [0, 1].map(|a| (place[a] - self.middle[a]) / self.size);
+            values[k] += self.at(place);
+            slopes[k][0] += (term(1) + 2.0 * term(3) * x + term(4) * y) / self.size;
+            slopes[k][1] += (term(2) + term(4) * x + 2.0 * term(5) * y) / self.size;
+        }
+    }
+}
+
+impl Filtered {
+    fn add(&mut self, trend: &Trend) {
+        let supported = &self.supported;
+        trend.put_back(&self.net, |k| supported[k], &mut self.values, &mut self.slopes);
+    }
+
+    /// Returns value, leverage and variance at a place of the net; `None` where no node about it is supported.
+    ///
+    /// The values and half the slopes of the four nodes about a place, weighed as for a bilinear value, are right up to the third
+    /// derivative: the error of the one makes up for that of the other.
+    pub fn at(&self, place: [f64; 2]) -> Option<[f64; 3]> {
+        let net = &self.net;
+        let [(i, u), (j, v)] = [0, 1].map(|k| {
+            let nodes = [net.columns, net.rows][k];
+            let at = ((place[k] - net.first_mm[k]) / net.spacing_mm[k]).clamp(0.0, (nodes - 1) as f64);
+            let cell = (at as usize).min(nodes.saturating_sub(2));
+            (cell, at - cell as f64)
+        });
+        let corners = [[0, 0], [1, 0], [0, 1], [1, 1]].map(|[a, b]: [usize; 2]| {
+            let node = (j + b).min(net.rows - 1) * net.columns + (i + a).min(net.columns - 1);
+            let share = (if a == 0 { 1.0 - u } else { u }) * (if b == 0 { 1.0 - v } else { v });
+            (node, if self.supported[node] { share } else { 0.0 })
+        });
+        let total: f64 = corners.iter().map(|(_, share)| share).sum();
+        if total < 1e-6 {
+            return None;
+        }
+        // With a corner missing the others' values are brought to the place along their slopes.
+        let along = if total > 1.0 - 1e-9 { 0.5 } else { 1.0 };
+        let mut sums = [0.0; 3];
+        for (node, share) in corners.into_iter().filter(|(_, share)| *share > 0.0) {
+            let [x, y] = net.place_mm(node);
+            let [p, q] = self.slopes[node];
+            sums[0] += share * (self.values[node] + along * (p * (place[0] - x) + q * (place[1] - y)));
+            sums[1] += share * self.leverage[node];
+            sums[2] += share * self.variance[node];
+        }
+        Some(sums.map(|sum| sum / total))
+    }
+}

@@ -1,0 +1,168 @@
+//! The robust Gaussian filter (ISO 16610-71) and the readings that do not belong to the surface.
+//!
+//! Readings far from the filtered surface are weighed less, by Tukey's biweight (1 - (r / c)^2)^2 with c = 4.4 median |r|, and the filter is
+//! applied again, until c changes by less than 1 % or fifteen rounds are over.
+//!
+//! **Outliers.** Near a reading the surface leans towards it, the more the fewer others are about. With the share l of the
+//! reading in the value at its place, and the variance v of that value, a residual r has the variance sigma^2 (1 - 2 l + v);
+//! z = r / sqrt(1 - 2 l + v) scatters alike everywhere. Sigma is 1.4826 median |z|. What has |z| above the limit is an outlier
+//! unless three or more of its eight neighbours are as far off to the same side: that is a feature of the part, or dirt as large as one, and
+//! no point rule can tell which.
+
+use super::filter::{Filtered, Gaussian};
+use super::net::Net;
+
+/// Most rounds of the robust filter.
+const ROUNDS: usize = 15;
+/// Change of the scale at which it has settled.
+const SETTLED: f64 = 0.01;
+/// c over the median of the residuals.
+const BIWEIGHT: f64 = 4.4;
+/// Standard deviation over the median of the absolute values, of a normal distribution.
+const SIGMA_OVER_MEDIAN: f64 = 1.482_602_218_505_602;
+/// Below this share of its variance a residual tells nothing about its reading.
+const LEAST_FREEDOM: f64 = 0.02;
+/// Fewer readings than this have no scatter to compare with.
+const LEAST_READINGS: usize = 20;
+/// Residuals below this are rounding of the files, not outliers, in millimetres.
+const LEAST_SCALE_MM: f64 = 1e-6;
+/// So many neighbours on the same side make a feature.
+const FEATURE: usize = 3;
+/// What is within so many distances of neighbours along both axes is a neighbour: eight are, on a grid.
+const NEIGHBOUR: f64 = 1.5;
+
+/// The robust filter's result.
+#[derive(Clone, Debug)]
+pub(super) struct Robust {
+    pub filtered: Filtered,
+    /// Weight of every reading.
+    pub weights: Vec<f64>,
+    /// Residual of every reading over the square root of its freedom; `NaN` where it tells nothing.
+    pub scaled: Vec<f64>,
+    /// Standard deviation of one reading.
+    pub sigma: f64,
+    /// How often the filter was applied.
+    pub rounds: usize,
+}
+
+/// Residuals of readings from a filtered surface.
+pub(super) struct Residuals {
+    /// Reading less surface; `NaN` where the surface is not known.
+    pub plain: Vec<f64>,
+    /// Variance of a residual over that of a reading.
+    pub freedom: Vec<f64>,
+}
+
+/// Compares readings with the surface that was filtered from them.
+pub(super) fn residuals(
+    filtered: &Filtered,
+    places: &[[f64; 2]],
+    values: &[f64],
+    weights: Option<&[f64]>,
+) -> Residuals {
+    use rayon::prelude::*;
+    let each = |k: usize| match filtered.at(places[k]) {
+        Some([value, leverage, variance]) => {
+            let share = weights.map_or(1.0, |w| w[k]) * leverage;
+            (values[k] - value, (1.0 - 2.0 * share + variance).max(0.0))
+        }
+        None => (f64::NAN, 0.0),
+    };
+    let (plain, freedom) = (0..places.len()).into_par_iter().with_min_len(512).map(each).unzip();
+    Residuals { plain, freedom }
+}
+
+impl Residuals {
+    fn scaled(&self) -> Vec<f64> {
+        let each = |(r, f): (&f64, &f64)| if *f < LEAST_FREEDOM { f64::NAN } else { r / f.sqrt() };
+        self.plain.iter().zip(&self.freedom).map(each).collect()
+    }
+
+    /// Returns the standard deviation of one reading, weights given: the residuals' sum of squares over their freedom.
+    pub fn sigma(&self, weights: Option<&[f64]>) -> f64 {
+        let (mut squares, mut freedom) = (0.0, 0.0);
+        for k in (0..self.plain.len()).filter(|&k| self.plain[k].is_finite()) {
+            let weight = weights.map_or(1.0, |w| w[k]);
+            squares += weight * self.plain[k].powi(2);
+            freedom += weight * self.freedom[k];
+        }
+        if freedom > 0.0 { (squares / freedom).sqrt() } else { 0.0 }
+    }
+}
+
+/// Applies the robust filter.
+pub(super) fn robust(gaussian: &Gaussian, places: &[[f64; 2]], values: &[f64], net: &Net) -> Robust {
+    let again = |weights: &[f64]| gaussian.scattered(places, values, Some(weights), net);
+    let compare = |filtered: &Filtered, weights: Option<&[f64]>| residuals(filtered, places, values, weights);
+    iterate(gaussian.scattered(places, values, None, net), values.len(), again, compare)
+}
+
+/// Filters and weighs by turns, from the plain filter's result.
+pub(super) fn iterate(
+    first: Filtered,
+    count: usize,
+    again: impl Fn(&[f64]) -> Filtered,
+    compare: impl Fn(&Filtered, Option<&[f64]>) -> Residuals,
+) -> Robust {
+    let mut filtered = first;
+    let mut weights = vec![1.0; count];
+    let mut found = compare(&filtered, None);
+    let mut scale = f64::NAN;
+    let mut rounds = 1;
+    while rounds < ROUNDS {
+        let c = BIWEIGHT * median_size(&found.plain);
+        // NaN, at first, is not settled; a surface without residuals is.
+        if c == 0.0 || (c - scale).abs() <= SETTLED * c {
+            break;
+        }
+        scale = c;
+        let weigh = |r: &f64| if r.abs() < c { (1.0 - (r / c).powi(2)).powi(2) } else { 0.0 };
+        // A reading without a surface about it keeps its weight: it may be the first of one.
+        weights = found.plain.iter().map(|r| if r.is_nan() { 1.0 } else { weigh(r) }).collect();
+        filtered = again(&weights);
+        found = compare(&filtered, Some(&weights));
+        rounds += 1;
+    }
+    let scaled = found.scaled();
+    let sigma = SIGMA_OVER_MEDIAN * median_size(&scaled);
+    Robust { filtered, weights, scaled, sigma, rounds }
+}
+
+impl Robust {
+    /// Returns the indices of the readings that do not belong to the surface, ascending.
+    ///
+    /// `apart` is the distance of neighbouring readings along x and y.
+    pub fn outliers(&self, places: &[[f64; 2]], limit: f64, apart: [f64; 2]) -> Vec<usize> {
+        if places.len() < LEAST_READINGS {
+            return Vec::new();
+        }
+        let limit = limit * self.sigma.max(LEAST_SCALE_MM);
+        let mut far: Vec<usize> = (0..places.len()).filter(|&k| self.scaled[k].abs() > limit).collect();
+        far.sort_by(|&a, &b| places[a][0].total_cmp(&places[b][0]));
+        let mut outliers: Vec<usize> =
+            (0..far.len()).filter(|&n| !self.is_feature(n, &far, places, apart)).map(|n| far[n]).collect();
+        outliers.sort_unstable();
+        outliers
+    }
+
+    /// Whether enough of the eight neighbours are as far off, to the same side; `far` is sorted along x.
+    fn is_feature(&self, n: usize, far: &[usize], places: &[[f64; 2]], apart: [f64; 2]) -> bool {
+        let k = far[n];
+        let reach = apart.map(|a| NEIGHBOUR * a);
+        let off = |j: usize, axis: usize| (places[j][axis] - places[k][axis]).abs();
+        let alike = |j: &&usize| off(**j, 1) <= reach[1] && self.scaled[**j].signum() == self.scaled[k].signum();
+        let before = far[..n].iter().rev().take_while(|j| off(**j, 0) <= reach[0]).filter(alike);
+        let after = far[n + 1..].iter().take_while(|j| off(**j, 0) <= reach[0]).filter(alike);
+        before.chain(after).take(FEATURE).count() == FEATURE
+    }
+}
+
+/// Returns the median of the absolute values, of those that are numbers; 0 of none.
+fn median_size(values: &[f64]) -> f64 {
+    let mut sizes: Vec<f64> = values.iter().filter(|v| !v.is_nan()).map(|v| v.abs()).collect();
+    if sizes.is_empty() {
+        return 0.0;
+    }
+    let middle = sizes.len() / 2;
+    *sizes.select_nth_unstable_by(middle, f64::total_cmp).1
+}

@@ -1,0 +1,115 @@
+//! Which waves can be corrected at all: how far apart points lie, how wide the wheel touches, and what cut-off both ask for.
+
+use rayon::prelude::*;
+
+use super::map::{MapError, Reading};
+
+/// Readings whose neighbours are looked up for the spacing; more would not change a median.
+const PROBED: usize = 50;
+
+/// Returns the width over which a wheel touches a flat surface, in millimetres: 2 sqrt(2 R a - a^2).
+///
+/// `wheel_radius_mm` is that of the section across which the width is meant, `depth_mm` the depth of cut. The wheel
+/// evens out within that width, so no shorter wave can be ground in.
+pub fn contact_width_mm(wheel_radius_mm: f64, depth_mm: f64) -> f64 {
+    let depth_mm = depth_mm.clamp(0.0, wheel_radius_mm.max(0.0));
+    2.0 * (2.0 * wheel_radius_mm * depth_mm - depth_mm * depth_mm).max(0.0).sqrt()
+}
+
+/// Returns the least cut-off of a map in millimetres: twice the larger of contact width and distance of the points.
+///
+/// A shorter wave is either not seen by the points or cannot be ground by the wheel.
+pub fn least_cutoff_mm(contact_width_mm: f64, point_spacing_mm: f64) -> f64 {
+    2.0 * contact_width_mm.max(point_spacing_mm)
+}
+
+/// Compares a cut-off with [`least_cutoff_mm`].
+///
+/// # Errors
+/// A cut-off below it, with what limits it and the remedy.
+pub fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_mm: f64) -> Result<(), MapError> {
+    let least_mm = least_cutoff_mm(contact_width_mm, point_spacing_mm);
+    // A tenth is the uncertainty of a spacing that is estimated.
+    if cutoff_mm >= 0.9 * least_mm {
+        return Ok(());
+    }
+    Err(if contact_width_mm > point_spacing_mm {
+        MapError::CutoffBelowContact { cutoff_mm, least_mm, contact_width_mm }
+    } else {
+        MapError::CutoffBelowSpacing { cutoff_mm, least_mm, point_spacing_mm }
+    })
+}
+
+/// Estimates the distance between neighbouring readings in millimetres, in the direction in which it is larger.
+///
+/// Around a reading the nearest other one is looked for in each of four sectors, about +x, -x, +y and -y. The median over
+/// readings is taken for x and y apart: rows that are dense along and sparse across give the distance across. 0 where
+/// there are too few readings to tell.
+pub fn point_spacing_mm(readings: &[Reading]) -> f64 {
+    let [x, y] = point_spacings_mm(readings);
+    x.max(y)
+}
+
+/// Returns the distance between neighbouring readings along x and along y, in millimetres.
+pub(super) fn point_spacings_mm(readings: &[Reading]) -> [f64; 2] {
+    let step = readings.len().div_ceil(PROBED).max(1);
+    let chosen: Vec<&Reading> = readings.iter().step_by(step).collect();
+    let nearest: Vec<[f64; 4]> = chosen.par_iter().map(|from| nearest_by_sector(from.at_mm, readings)).collect();
+    let median = |sectors: [usize; 2]| {
+        let mut found: Vec<f64> =
+            nearest.iter().flat_map(|n| sectors.map(|s| n[s])).filter(|d| d.is_finite()).collect();
+        found.sort_by(f64::total_cmp);
+        found.get(found.len() / 2).copied().unwrap_or(0.0)
+    };
+    [median([0, 1]), median([2, 3])]
+}
+
+/// Returns the distances of the nearest readings about +x, -x, +y and -y; infinite where there is none.
+fn nearest_by_sector([x, y]: [f64; 2], readings: &[Reading]) -> [f64; 4] {
+    let mut nearest2 = [f64::INFINITY; 4];
+    for r in readings {
+        let (dx, dy) = (r.at_mm[0] - x, r.at_mm[1] - y);
+        let sector = if dx.abs() >= dy.abs() { usize::from(dx < 0.0) } else { 2 + usize::from(dy < 0.0) };
+        let distance2 = dx * dx + dy * dy;
+        // The same place measured twice is not a neighbour.
+        if distance2 > 0.0 && distance2 < nearest2[sector] {
+            nearest2[sector] = distance2;
+        }
+    }
+    nearest2.map(f64::sqrt)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn grid(columns: usize, rows: usize, step_mm: [f64; 2]) -> Vec<Reading> {
+        let place = |k: usize| [(k % columns) as f64 * step_mm[0], (k / columns) as f64 * step_mm[1]];
+        (0..columns * rows).map(|k| Reading { at_mm: place(k), deviation_mm: 0.0 }).collect()
+    }
+
+    #[test]
+    fn the_contact_of_a_wheel_is_its_chord() {
+        // 20 um deep with 12.5 mm: half the chord is sqrt(12.5^2 - 12.48^2).
+        assert!((contact_width_mm(12.5, 0.02) - 2.0 * (12.5f64.powi(2) - 12.48f64.powi(2)).sqrt()).abs() < 1e-12);
+        assert_eq!((contact_width_mm(12.5, 0.0), contact_width_mm(0.0, 1.0)), (0.0, 0.0));
+    }
+
+    #[test]
+    fn the_spacing_is_that_of_the_sparser_direction() {
+        let found = point_spacing_mm(&grid(60, 30, [102.0 / 59.0, 62.0 / 29.0]));
+        assert!((found - 62.0 / 29.0).abs() < 1e-12, "{found}");
+        assert!((point_spacing_mm(&grid(500, 12, [0.1, 4.0])) - 4.0).abs() < 1e-12);
+        assert_eq!(point_spacing_mm(&grid(1, 1, [1.0, 1.0])), 0.0);
+        assert_eq!(point_spacing_mm(&[]), 0.0);
+    }
+
+    #[test]
+    fn the_cutoff_must_suit_wheel_and_points() {
+        let contact = contact_width_mm(12.5, 0.02);
+        assert!(check_cutoff(5.0, contact, 2.14).is_ok());
+        assert_eq!(least_cutoff_mm(contact, 2.14), 4.28);
+        assert!(matches!(check_cutoff(3.0, contact, 2.14), Err(MapError::CutoffBelowSpacing { .. })));
+        assert!(matches!(check_cutoff(2.0, contact, 0.5), Err(MapError::CutoffBelowContact { .. })));
+    }
+}

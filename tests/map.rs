@@ -1,0 +1,428 @@
+//! The error map against what a filter must do: sines, planes, edges, holes, outliers, and scatter that is drawn again and again.
+
+use std::f64::consts::{PI, TAU};
+
+use rand::rngs::StdRng;
+use rand::{RngExt, SeedableRng};
+use regrind::compensation::{
+    ErrorMap, MapError, MapOptions, Net, NetError, Order, Reading, Roughness, Smoothing, error_map, filter_net,
+};
+
+/// Readings at the nodes of a grid about the origin, of a function of the place.
+fn sampled(columns: usize, rows: usize, step_mm: [f64; 2], f: impl Fn(f64, f64) -> f64) -> Vec<Reading> {
+    let at = |k: usize, n: usize, step: f64| (k as f64 - 0.5 * (n - 1) as f64) * step;
+    let place = |k: usize| [at(k % columns, columns, step_mm[0]), at(k / columns, rows, step_mm[1])];
+    let reading = |at_mm: [f64; 2]| Reading { at_mm, deviation_mm: f(at_mm[0], at_mm[1]) };
+    (0..columns * rows).map(place).map(reading).collect()
+}
+
+/// The measurement of the trials: 60 x 30 points over 102 x 62 mm.
+fn trial(f: impl Fn(f64, f64) -> f64) -> Vec<Reading> {
+    sampled(60, 30, [102.0 / 59.0, 62.0 / 29.0], f)
+}
+
+/// Readings strewn evenly over a rectangle about the origin.
+fn strewn(count: usize, size_mm: [f64; 2], seed: u64, f: impl Fn(f64, f64) -> f64) -> Vec<Reading> {
+    let mut rng = StdRng::seed_from_u64(seed);
+    let mut place = || size_mm.map(|size| size * (rng.random::<f64>() - 0.5));
+    let reading = |at_mm: [f64; 2]| Reading { at_mm, deviation_mm: f(at_mm[0], at_mm[1]) };
+    (0..count).map(|_| place()).map(reading).collect()
+}
+
+fn normal(rng: &mut StdRng) -> f64 {
+    let (u, v): (f64, f64) = (rng.random(), rng.random());
+    (-2.0 * (1.0 - u).ln()).sqrt() * (TAU * v).cos()
+}
+
+fn with_noise(readings: &[Reading], sigma_mm: f64, seed: u64) -> Vec<Reading> {
+    let mut rng = StdRng::seed_from_u64(seed);
+    readings.iter().map(|r| Reading { deviation_mm: r.deviation_mm + sigma_mm * normal(&mut rng), ..*r }).collect()
+}
+
+fn made(readings: &[Reading], options: &MapOptions) -> ErrorMap {
+    error_map(readings, options).unwrap()
+}
+
+fn plain(cutoff_mm: f64, spacing_mm: f64) -> MapOptions {
+    MapOptions { outlier_limit: None, ..MapOptions::new(cutoff_mm, spacing_mm) }
+}
+
+fn rms(values: impl Iterator<Item = f64>) -> f64 {
+    let (count, sum) = values.fold((0.0, 0.0), |(n, s), v| (n + 1.0, s + v * v));
+    (sum / f64::max(count, 1.0)).sqrt()
+}
+
+/// Share of a wave that a map let pass, by least squares over valid nodes far enough from edges and holes.
+fn passed(map: &ErrorMap, wave: impl Fn([f64; 2]) -> f64, counts: impl Fn([f64; 2]) -> bool) -> f64 {
+    let nodes = (0..map.net.len()).filter(|&k| map.valid[k] && counts(map.net.place_mm(k)));
+    let (top, bottom) = nodes.fold((0.0, 0.0), |(top, bottom), k| {
+        let w = wave(map.net.place_mm(k));
+        (top + w * map.values_mm[k], bottom + w * w)
+    });
+    assert!(bottom > 0.0);
+    top / bottom
+}
+
+/// The direct sum over all readings at every node, as the filter is defined: first order.
+fn direct(readings: &[Reading], net: &Net, cutoff_mm: f64) -> Vec<f64> {
+    let width2 = (2f64.ln() / PI) * cutoff_mm * cutoff_mm;
+    (0..net.len())
+        .map(|k| {
+            let [x0, y0] = net.place_mm(k);
+            let (mut normal, mut right) = (nalgebra::Matrix3::zeros(), nalgebra::Vector3::zeros());
+            for r in readings {
+                let t = nalgebra::Vector3::new(1.0, r.at_mm[0] - x0, r.at_mm[1] - y0);
+                let w = (-PI * (t[1] * t[1] + t[2] * t[2]) / width2).exp();
+                normal += w * t * t.transpose();
+                right += w * r.deviation_mm * t;
+            }
+            normal.lu().solve(&right).map_or(f64::NAN, |s| s[0])
+        })
+        .collect()
+}
+
+const HOLE_MM: f64 = 11.0;
+
+fn waves(order: Order) {
+    let cutoff = 5.0;
+    for (name, direction) in [("x", [1.0, 0.0]), ("y", [0.0, 1.0]), ("diagonal", [0.5f64.sqrt(), 0.5f64.sqrt()])] {
+        for (ratio, phase) in [(1.0, 0.3), (2.0, 1.1), (0.6, 0.0)] {
+            let wave =
+                move |[x, y]: [f64; 2]| (TAU / (ratio * cutoff) * (direction[0] * x + direction[1] * y) + phase).cos();
+            let inside = |[x, y]: [f64; 2]| {
+                x.hypot(y) > HOLE_MM + 1.2 * cutoff && x.abs() < 45.0 - cutoff && y.abs() < 35.0 - cutoff
+            };
+            let mut readings = sampled(161, 121, [90.0 / 160.0, 70.0 / 120.0], |x, y| 1e-3 * wave([x, y]));
+            readings.retain(|r| r.at_mm[0].hypot(r.at_mm[1]) > HOLE_MM);
+            let map = made(&readings, &MapOptions { order, ..plain(cutoff, 1.0) });
+            let share = 1e3 * passed(&map, wave, inside);
+            let wanted = order.passes(ratio);
+            assert!((share - wanted).abs() < 0.005, "{name}, {ratio} cut-offs, {order:?}: {share} instead of {wanted}");
+        }
+    }
+}
+
+#[test]
+fn half_of_a_wave_passes_at_the_cutoff() {
+    assert!((Order::Plane.passes(1.0) - 0.5).abs() < 1e-12);
+    assert!((Order::Quadric.passes(1.0) - 0.5).abs() < 1e-9);
+    waves(Order::Constant);
+    waves(Order::Plane);
+    waves(Order::Quadric);
+}
+
+#[test]
+fn strewn_readings_pass_half_of_a_wave_too() {
+    for (spacing, cutoff) in [(1.0, 5.0), (0.5, 5.0), (1.0, 20.0)] {
+        let wave = move |[x, y]: [f64; 2]| (TAU / cutoff * (0.8 * x + 0.6 * y)).sin();
+        let readings = strewn(30_000, [90.0, 70.0], 3, |x, y| wave([x, y]));
+        let map = made(&readings, &plain(cutoff, spacing));
+        let share = passed(&map, wave, |[x, y]| x.abs() < 45.0 - cutoff && y.abs() < 35.0 - cutoff);
+        // Chance thins the readings out here and there, which is worth half a per cent by itself.
+        assert!((share - 0.5).abs() < 0.01, "{spacing} {cutoff}: {share}");
+    }
+}
+
+/// Spreading readings over nodes changes what the definition gives by less than a thousandth of what is filtered.
+#[test]
+fn the_sums_along_the_axes_are_those_of_the_definition() {
+    for (spacing, cutoff, seed) in [(1.0, 5.0, 1), (0.7, 4.0, 2), (1.5, 11.0, 3)] {
+        let readings = with_noise(&strewn(1500, [40.0, 30.0], seed, |x, y| (0.2 * x).sin() + 0.03 * y), 0.3, seed);
+        let map = made(&readings, &plain(cutoff, spacing));
+        let exact = direct(&readings, &map.net, cutoff);
+        let most = (0..map.net.len())
+            .filter(|&k| map.valid[k])
+            .map(|k| (map.values_mm[k] - exact[k]).abs())
+            .fold(0.0, f64::max);
+        assert!(most < 1e-3, "spacing {spacing}, cut-off {cutoff}, seed {seed}: {most}");
+        assert!(map.valid.iter().filter(|v| **v).count() * 100 > 97 * map.net.len());
+    }
+}
+
+#[test]
+fn what_the_order_lets_pass_passes_to_the_edges() {
+    let hole = |r: &Reading| (r.at_mm[0] - 5.0).hypot(r.at_mm[1]) > 8.0;
+    let plane = |x: f64, y: f64| 3e-3 + 1e-4 * x - 2e-4 * y;
+    let quadric = |x: f64, y: f64| plane(x, y) + 1e-5 * x * x - 3e-6 * x * y + 2e-5 * y * y;
+    let check = |order: Order, smoothing: Smoothing, f: &dyn Fn(f64, f64) -> f64, most: f64| {
+        for mut readings in [sampled(71, 51, [0.8, 0.9], f), strewn(4000, [56.0, 45.0], 5, f)] {
+            readings.retain(hole);
+            let map = made(&readings, &MapOptions { order, smoothing, ..MapOptions::new(6.0, 1.0) });
+            assert!(map.outliers.is_empty());
+            for [x, y, e] in map.samples_mm() {
+                assert!((e - f(x, y)).abs() < most, "{order:?} {smoothing:?} {x} {y}: {e} {}", f(x, y));
+            }
+        }
+    };
+    let constant = |_: f64, _: f64| 7e-3;
+    for smoothing in [Smoothing::Gaussian, Smoothing::RobustGaussian, Smoothing::Spline] {
+        check(Order::Constant, smoothing, &constant, 1e-15);
+        check(Order::Plane, smoothing, &plane, 1e-13);
+    }
+    check(Order::Quadric, Smoothing::Gaussian, &quadric, 1e-13);
+    check(Order::Quadric, Smoothing::RobustGaussian, &quadric, 1e-13);
+}
+
+#[test]
+fn the_filter_does_not_care_where_the_part_lies() {
+    for smoothing in [Smoothing::Gaussian, Smoothing::RobustGaussian, Smoothing::Spline] {
+        let options = MapOptions { smoothing, ..MapOptions::new(6.0, 1.0) };
+        let here = with_noise(&strewn(2000, [50.0, 40.0], 8, |x, y| 1e-3 * (0.3 * x).sin() * (0.2 * y).cos()), 2e-4, 4);
+        let there: Vec<Reading> =
+            here.iter().map(|r| Reading { at_mm: [r.at_mm[0] + 1234.5, r.at_mm[1] - 777.25], ..*r }).collect();
+        let mut turned = here.clone();
+        turned.reverse();
+        let (map, moved, back) = (made(&here, &options), made(&there, &options), made(&turned, &options));
+        let apart = |a: &ErrorMap, b: &ErrorMap| {
+            a.values_mm.iter().zip(&b.values_mm).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+        };
+        assert!(apart(&map, &moved) < 1e-12 && apart(&map, &back) < 1e-13, "{smoothing:?}");
+        assert_eq!(map.valid, back.valid);
+    }
+}
+
+#[test]
+fn good_points_are_not_taken_for_outliers() {
+    let mut lost = 0;
+    for seed in 0..50 {
+        lost += made(&with_noise(&trial(|_, _| 0.0), 3e-4, seed), &MapOptions::new(5.0, 1.0)).outliers.len();
+    }
+    assert!(lost <= 9, "{lost} of 90,000 points");
+}
+
+/// A form of the size and wavelengths of what grinding leaves.
+fn form(x: f64, y: f64) -> f64 {
+    2e-3 * ((0.11 * x + 0.05 * y).sin() + (0.14 * y - 0.06 * x + 1.0).cos() + 2e-4 * x * y)
+}
+
+/// Puts a spike of 20 standard deviations on one point in a hundred; returns which.
+fn spiked(readings: &mut [Reading], height_mm: f64, seed: u64) -> Vec<usize> {
+    let mut rng = StdRng::seed_from_u64(seed);
+    let spikes: Vec<usize> = (0..readings.len()).filter(|_| rng.random::<f64>() < 0.01).collect();
+    for &k in &spikes {
+        readings[k].deviation_mm += if rng.random::<bool>() { height_mm } else { -height_mm };
+    }
+    spikes
+}
+
+#[test]
+fn spikes_are_found_and_change_nothing() {
+    const NOISE_MM: f64 = 3e-4;
+    for seed in 0..5 {
+        for clean in [trial(form), strewn(6000, [102.0, 62.0], seed, form)] {
+            let clean = with_noise(&clean, NOISE_MM, seed + 100);
+            let mut readings = clean.clone();
+            let spikes = spiked(&mut readings, 20.0 * NOISE_MM, seed);
+            let map = made(&readings, &MapOptions::new(5.0, 1.0));
+            let missed = spikes.iter().filter(|k| !map.outliers.contains(k)).count();
+            assert!(missed * 20 <= spikes.len(), "seed {seed}: {missed} of {} missed", spikes.len());
+            let wrong = map.outliers.iter().filter(|k| !spikes.contains(k)).count();
+            assert!(wrong <= 2, "seed {seed}: {wrong} good points lost");
+        }
+    }
+}
+
+#[test]
+fn the_robust_form_takes_no_notice_of_spikes() {
+    const NOISE_MM: f64 = 3e-4;
+    let clean = with_noise(&sampled(129, 79, [0.8, 0.8], form), NOISE_MM, 1);
+    let mut readings = clean.clone();
+    spiked(&mut readings, 50.0 * NOISE_MM, 2);
+    let apart = |smoothing: Smoothing| {
+        let options = MapOptions { smoothing, ..plain(8.0, 1.0) };
+        let (with, without) = (made(&readings, &options), made(&clean, &options));
+        rms(with.values_mm.iter().zip(&without.values_mm).map(|(a, b)| a - b))
+    };
+    let (plain_form, robust_form) = (apart(Smoothing::Gaussian), apart(Smoothing::RobustGaussian));
+    println!("spikes move the plain map by {plain_form}, the robust one by {robust_form}");
+    assert!(robust_form < 0.1 * NOISE_MM, "{robust_form}");
+    assert!(plain_form > 10.0 * robust_form, "{plain_form} {robust_form}");
+}
+
+#[test]
+fn a_feature_of_the_part_is_kept() {
+    // A mound 8 mm wide and thirty times the noise, on a quiet surface.
+    let mound = |x: f64, y: f64| 9e-3 * (-((x - 10.0).powi(2) + (y + 5.0).powi(2)) / 8.0).exp();
+    let map = made(&with_noise(&trial(mound), 3e-4, 5), &MapOptions::new(5.0, 1.0));
+    assert!(map.outliers.len() <= 1, "{:?}", map.outliers);
+    assert!(map.at([10.0, -5.0]) > 5e-3);
+}
+
+/// Scatter of the map over draws, over the uncertainty it states, at valid nodes.
+fn scatter_over_stated(readings: &[Reading], options: &MapOptions, noise_mm: f64, draws: u64) -> (f64, f64, f64) {
+    let clean = made(readings, options);
+    let mut squares = vec![0.0; clean.net.len()];
+    let mut point = 0.0;
+    let mut stated = vec![0.0; clean.net.len()];
+    for seed in 0..draws {
+        let map = made(&with_noise(readings, noise_mm, 1000 + seed), options);
+        squares.iter_mut().enumerate().for_each(|(k, s)| *s += (map.values_mm[k] - clean.values_mm[k]).powi(2));
+        stated.iter_mut().zip(&map.sigma_mm).for_each(|(s, sigma)| *s += sigma / draws as f64);
+        point += map.point_sigma_mm / draws as f64;
+    }
+    let ratio = |k: usize| (squares[k] / draws as f64).sqrt() / stated[k];
+    let valid: Vec<f64> = (0..clean.net.len()).filter(|&k| clean.valid[k]).map(ratio).collect();
+    let outside = valid.iter().filter(|r| !(0.8..1.2).contains(*r)).count();
+    (rms(valid.iter().copied()), outside as f64 / valid.len() as f64, point / noise_mm)
+}
+
+#[test]
+fn the_uncertainty_of_the_filter_is_the_scatter() {
+    for (readings, options) in [
+        (trial(form), plain(6.0, 2.0)),
+        (strewn(1500, [40.0, 30.0], 4, form), MapOptions { order: Order::Quadric, ..plain(9.0, 2.0) }),
+    ] {
+        let (ratio, outside, point) = scatter_over_stated(&readings, &options, 3e-4, 200);
+        println!("filter: scatter over stated {ratio}, outside {outside}, point {point}");
+        assert!((ratio - 1.0).abs() < 0.1, "scatter over stated {ratio}");
+        assert!(outside < 0.02, "{outside} of the nodes are off by more than 20 %");
+        assert!((point - 1.0).abs() < 0.15, "scatter of a point {point}");
+    }
+}
+
+#[test]
+fn the_uncertainty_of_the_spline_is_the_scatter() {
+    for (readings, cutoff_mm) in [(trial(form), 20.0), (strewn(700, [40.0, 30.0], 4, form), 8.0)] {
+        let options = MapOptions { smoothing: Smoothing::Spline, ..plain(cutoff_mm, 2.0) };
+        let (ratio, outside, point) = scatter_over_stated(&readings, &options, 3e-4, 200);
+        println!("spline: scatter over stated {ratio}, outside {outside}, point {point}");
+        assert!((ratio - 1.0).abs() < 0.1, "scatter over stated {ratio}");
+        assert!(outside < 0.02, "{outside} of the nodes are off by more than 20 %");
+        assert!((point - 1.0).abs() < 0.1, "scatter of a point {point}");
+    }
+}
+
+#[test]
+fn the_spline_passes_half_at_the_cutoff_and_finds_what_is_there() {
+    let cutoff = 6.0;
+    for direction in [[1.0, 0.0], [0.0, 1.0], [0.5f64.sqrt(), 0.5f64.sqrt()]] {
+        let wave = move |[x, y]: [f64; 2]| (TAU / cutoff * (direction[0] * x + direction[1] * y) + 0.4).cos();
+        let options = MapOptions { smoothing: Smoothing::Spline, ..plain(cutoff, 1.0) };
+        let map = made(&sampled(121, 91, [0.5, 0.5], |x, y| wave([x, y])), &options);
+        let share = passed(&map, wave, |[x, y]| x.abs() < 30.0 - cutoff && y.abs() < 22.5 - cutoff);
+        assert!((share - 0.5).abs() < 0.005, "{direction:?}: {share}");
+    }
+    // A planted truth under noise: cross-validation comes closer to it than the noise by far.
+    let readings = with_noise(&strewn(2500, [60.0, 40.0], 4, form), 1e-3, 3);
+    let options = |roughness| MapOptions { smoothing: Smoothing::Spline, roughness, ..plain(5.0, 1.0) };
+    let off = |roughness| {
+        let map = made(&readings, &options(roughness));
+        rms(map.samples_mm().into_iter().map(|[x, y, e]| e - form(x, y)))
+    };
+    let (by_cutoff, validated) = (off(Roughness::Cutoff), off(Roughness::CrossValidation));
+    println!("spline off by {by_cutoff}, cross-validated {validated}");
+    assert!(by_cutoff < 5e-4 && validated < 2e-4, "{by_cutoff} {validated}");
+}
+
+#[test]
+fn outside_what_was_measured_the_map_levels_off() {
+    // A round part whose error rises to its border.
+    let mut readings = sampled(81, 81, [1.0, 1.0], |x, _| 1e-4 * x);
+    readings.retain(|r| r.at_mm[0].hypot(r.at_mm[1]) < 40.0);
+    let level_off_mm = 12.5;
+    let map = made(&readings, &MapOptions { level_off_mm, ..MapOptions::new(6.0, 1.0) });
+    let corner = map.net.len() - 1;
+    assert!(!map.valid[corner] && map.valid[map.net.len() / 2]);
+    // From the nearest valid node, off by 4/27 of slope times distance at most, and without slope at the corner, 16 mm away.
+    let most = map.samples_mm().into_iter().map(|[_, _, e]| e).fold(0.0, f64::max);
+    assert!(map.values_mm.iter().all(|v| v.abs() <= most + 4.0 / 27.0 * 1e-4 * level_off_mm + 1e-12));
+    let [x, y] = map.net.place_mm(corner);
+    let near = map.samples_mm().into_iter().min_by(|a, b| {
+        let d = |s: &[f64; 3]| (s[0] - x).hypot(s[1] - y);
+        d(a).total_cmp(&d(b))
+    });
+    assert!((map.values_mm[corner] - near.unwrap()[2]).abs() < 1e-12);
+    // Everything valid lies where something was measured, or within a node of it.
+    assert!(map.samples_mm().iter().all(|[x, y, _]| x.hypot(*y) < 41.5));
+}
+
+#[test]
+fn a_map_on_a_net_is_filtered_as_readings_are() {
+    let net = Net { columns: 81, rows: 61, first_mm: [-20.0, -15.0], spacing_mm: [0.5, 0.5] };
+    let valid: Vec<bool> = (0..net.len()).map(|k| net.place_mm(k)).map(|[x, y]| x.hypot(y) > 6.0).collect();
+    let mut rng = StdRng::seed_from_u64(9);
+    let values: Vec<f64> = (0..net.len())
+        .map(|k| net.place_mm(k))
+        .zip(&valid)
+        .map(|([x, y], v)| if *v { form(x, y) + 3e-4 * normal(&mut rng) } else { f64::INFINITY })
+        .collect();
+    let plain_form = filter_net(&net, &values, &valid, 5.0, Order::Plane, false).unwrap();
+    let readings: Vec<Reading> = (0..net.len())
+        .filter(|&k| valid[k])
+        .map(|k| Reading { at_mm: net.place_mm(k), deviation_mm: values[k] })
+        .collect();
+    let exact = direct(&readings, &net, 5.0);
+    let nodes = || (0..net.len()).filter(|&k| plain_form.valid[k]);
+    assert!(nodes().count() > net.len() * 8 / 10);
+    let most = nodes().map(|k| (plain_form.values[k] - exact[k]).abs()).fold(0.0, f64::max);
+    assert!(most < 1e-8, "{most}");
+    let robust_form = filter_net(&net, &values, &valid, 5.0, Order::Plane, true).unwrap();
+    assert!(robust_form.rounds > 1);
+    assert!(rms(nodes().map(|k| robust_form.values[k] - exact[k])) < 1e-4);
+    assert!(matches!(filter_net(&net, &values[1..], &valid, 5.0, Order::Plane, true), Err(MapError::Shape { .. })));
+    assert!(matches!(
+        filter_net(&net, &values, &vec![true; net.len()], 5.0, Order::Plane, true),
+        Err(MapError::NotFinite { .. })
+    ));
+}
+
+#[test]
+fn what_makes_no_map_is_said() {
+    let options = MapOptions::new(5.0, 1.0);
+    let some = sampled(31, 31, [1.0, 1.0], |_, _| 0.0);
+    assert!(matches!(error_map(&[], &options), Err(MapError::Net(NetError::NoPoints))));
+    assert!(matches!(error_map(&some[..1], &options), Err(MapError::TooSparse { .. })));
+    for smoothing in [Smoothing::Gaussian, Smoothing::RobustGaussian, Smoothing::Spline] {
+        let options = MapOptions { smoothing, ..options };
+        let line: Vec<Reading> = (0..100).map(|k| Reading { at_mm: [f64::from(k), 0.0], deviation_mm: 1e-3 }).collect();
+        assert!(matches!(error_map(&line, &options), Err(MapError::TooSparse { .. })), "{smoothing:?}");
+        let slanted: Vec<Reading> =
+            (0..100).map(|k| Reading { at_mm: [f64::from(k), 0.3 * f64::from(k)], deviation_mm: 1e-3 }).collect();
+        assert!(matches!(error_map(&slanted, &options), Err(MapError::TooSparse { .. })), "{smoothing:?}");
+        let one_place = vec![Reading { at_mm: [3.0, 4.0], deviation_mm: 1e-3 }; 50];
+        assert!(error_map(&one_place, &options).is_err(), "{smoothing:?}");
+    }
+    let mut broken = some.clone();
+    broken[7].deviation_mm = f64::NAN;
+    assert_eq!(error_map(&broken, &options), Err(MapError::NotFinite { index: 7 }));
+    for cutoff_mm in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+        assert!(matches!(error_map(&some, &MapOptions { cutoff_mm, ..options }), Err(MapError::Cutoff { .. })));
+    }
+    let tiny = MapOptions { cutoff_mm: 1e-6, ..options };
+    assert!(matches!(error_map(&some, &tiny), Err(MapError::CutoffTooShort { .. })));
+    let wrong = MapOptions { level_off_mm: f64::NAN, ..options };
+    assert!(matches!(error_map(&some, &wrong), Err(MapError::Option { name: "level_off_mm", .. })));
+    let eager = MapOptions { outlier_limit: Some(1.0), ..options };
+    assert!(matches!(error_map(&some, &eager), Err(MapError::Option { name: "outlier_limit", .. })));
+    let sparse = sampled(6, 6, [20.0, 20.0], |_, _| 0.0);
+    assert!(matches!(error_map(&sparse, &options), Err(MapError::TooSparse { .. })));
+    let long = sampled(3, 3, [4000.0, 4000.0], |_, _| 0.0);
+    let spline = MapOptions { smoothing: Smoothing::Spline, ..MapOptions::new(5.0, 20.0) };
+    assert!(error_map(&long, &spline).is_err());
+}
+
+#[test]
+fn the_size_of_the_values_does_not_matter() {
+    for smoothing in [Smoothing::Gaussian, Smoothing::RobustGaussian, Smoothing::Spline] {
+        let options = MapOptions { smoothing, ..plain(6.0, 1.0) };
+        let unit = with_noise(&trial(form), 3e-4, 6);
+        let map = made(&unit, &options);
+        for factor in [1e-6, 1e6, 0.0] {
+            let scaled: Vec<Reading> =
+                unit.iter().map(|r| Reading { deviation_mm: factor * r.deviation_mm, ..*r }).collect();
+            let other = made(&scaled, &options);
+            let apart = other.values_mm.iter().zip(&map.values_mm).map(|(o, m)| (o - factor * m).abs());
+            assert!(apart.fold(0.0, f64::max) <= 1e-14 * factor, "{smoothing:?} {factor}");
+        }
+    }
+}
+
+#[test]
+fn a_short_cutoff_is_advised_against() {
+    let readings = with_noise(&trial(form), 3e-4, 6);
+    assert!(made(&readings, &MapOptions::new(5.0, 1.0)).advice.is_empty());
+    let short = made(&readings, &MapOptions::new(3.5, 1.0));
+    assert!(short.advice[0].contains("choose a longer cut-off or measure more densely"), "{:?}", short.advice);
+    let wide = MapOptions { contact_width_mm: 4.0, ..MapOptions::new(5.0, 1.0) };
+    assert!(made(&readings, &wide).advice[0].contains("smaller wheel"));
+}
