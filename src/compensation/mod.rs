@@ -12,6 +12,7 @@
 mod correction;
 mod map;
 mod net;
+pub mod path;
 mod response;
 
 pub use correction::{Correction, CorrectionLimits, Step, StepError};

@@ -14,6 +14,7 @@
 mod control;
 mod notice;
 mod outcome;
+mod program;
 mod record;
 mod station;
 mod work;
@@ -38,6 +39,7 @@ use crate::registration::Registration;
 use control::{Control, Ordered};
 pub use control::{Reply, Request, SOCKET, ask};
 pub use notice::{CycleRow, Notice};
+pub use program::{ProgramError, Programs};
 use record::{Recorder, entry};
 use station::{Aborts, Ask, Bench, CmmBench, GrinderBench, Harvest, Intent, Load, Station, Told};
 use work::{Cycle, Points};

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::cell::{CompensationRefusal, CompensationSummary, Event, Figures, Gate, GateFailure, Response};
+use crate::compensation::path::PathError;
 use crate::compensation::{
     Correction, CorrectionLimits, ErrorMap, MapOptions, Net, Reading, Sense, StepError, error_map, response,
 };
@@ -21,6 +22,8 @@ use crate::registration::{
 };
 use crate::report::HeatMap;
 use crate::surface::{Nominal, Side};
+
+use super::program::Programs;
 
 /// Everything that does not change during a run.
 #[derive(Debug)]
@@ -55,6 +58,8 @@ pub struct Task {
     pub place: MapLimits,
     /// How a pass is ground; level and identity are set for each cycle.
     pub pass: Pass,
+    /// How programs are made, or why there are none.
+    pub programs: Result<Programs, PathError>,
     /// Least share of the targets that must be touched.
     pub least_found: f64,
     /// Whether the cell is simulated; everything stored is marked so.
@@ -359,13 +364,14 @@ pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &
     if let Err(error) = save_correction(task, folder, &step.correction) {
         return refused(CompensationRefusal::Failed(error.to_string()));
     }
+    let warnings: Vec<String> = save_program(task, folder, &step.correction).into_iter().collect();
     let largest_mm = step.correction.values_mm.iter().fold(0.0f64, |most, v| most.max(v.abs()));
     let ratio = found.verdict.pv_mm / found.verdict.rms_mm.max(f64::MIN_POSITIVE);
     let summary = CompensationSummary {
         largest_mm,
         depth_mm: step.depth_mm,
         predicted_pv_mm: step.predicted_rms_mm * ratio,
-        warnings: Vec::new(),
+        warnings,
     };
     (Event::Compensated { cycle: number, summary }, Some(step.correction))
 }
@@ -373,6 +379,16 @@ pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &
 fn save_correction(task: &Task, folder: &Path, correction: &Correction) -> Result<(), FormatError> {
     let identity = task.payloads(correction).0.identity();
     write_correction(&folder.join("correction.csv"), correction, &task.part_identity, &identity, task.simulation)
+}
+
+/// Writes the program of the next pass; returns why there is none, which is no reason not to grind: the grinder gets the map.
+fn save_program(task: &Task, folder: &Path, correction: &Correction) -> Option<String> {
+    let identity = task.payloads(correction).0.identity();
+    let kept = match &task.programs {
+        Ok(programs) => programs.keep(&folder.join("toolpath.ngc"), correction, identity).map_err(|e| e.to_string()),
+        Err(error) => Err(error.to_string()),
+    };
+    kept.err().map(|why| format!("there is no toolpath.ngc: {why}"))
 }
 
 fn save_map(task: &Task, folder: &Path, map: &ErrorMap) -> Result<(), String> {

@@ -7,6 +7,7 @@ mod document;
 mod error;
 pub mod exchange;
 mod folder;
+pub mod gcode;
 mod layout;
 mod map;
 mod number;
