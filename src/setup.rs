@@ -288,6 +288,9 @@ fn programs(
     part_identity: [u8; 32],
 ) -> Result<Programs, PathError> {
     let (grinding, limits) = (&recipe.grinding, &cell.grinder.limits);
+    if recipe.measure.side == ProbeSide::Known(Side::Opposite) {
+        return Err(PathError::OtherSide);
+    }
     let ground = Programs::ground(nominal)?;
     let plain = PathOptions::new(path_wheel(&grinding.wheel, nominal), grinding.track_mm, grinding.feed_mm_min);
     // The wheel comes up to its feed before it meets the part.

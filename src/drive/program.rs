@@ -6,9 +6,9 @@ use thiserror::Error;
 
 use crate::compensation::Correction;
 use crate::compensation::path::{
-    Field, Limits, PathError, PathOptions, Pattern, Summary, ToolPath, TrackSpacing, Wanted, height_of,
+    Field, Limits, PathError, PathOptions, Pattern, Summary, ToolPath, TrackSpacing, Wanted, axis_offsets, height_of,
 };
-use crate::formats::gcode::{GcodeError, PathMode, ProgramHeader, write_program};
+use crate::formats::gcode::{GcodeError, PathMode, ProgramHeader, write_axis_table, write_program};
 use crate::geometry::Aperture;
 use crate::surface::Nominal;
 
@@ -95,7 +95,23 @@ impl Programs {
         if summary.points > MOST_POINTS {
             return Err(ProgramError::TooLong { points: summary.points });
         }
-        self.write_path(file, correction, map_identity, &path, &summary)
+        self.write_path(file, correction, map_identity, &path, &summary)?;
+        self.keep_table(&file.with_file_name("toolpath_z.csv"), correction, map_identity, &path)
+    }
+
+    /// Writes the correction as an offset of Z over the axes, for controllers that compensate by a table.
+    fn keep_table(
+        &self,
+        file: &Path,
+        correction: &Correction,
+        map_identity: [u8; 32],
+        path: &ToolPath,
+    ) -> Result<(), ProgramError> {
+        let none = Correction { values_mm: vec![0.0; correction.net.len()], ..correction.clone() };
+        let before = Wanted::new(self.ground.0.clone(), &none, 1.0)?;
+        let offsets = axis_offsets(&before, path.wanted(), &self.options.wheel, &correction.net)?;
+        write_axis_table(file, &correction.net, &offsets, &map_identity, self.simulation).map_err(GcodeError::from)?;
+        Ok(())
     }
 
     fn write_path(

@@ -112,7 +112,7 @@ pub(super) struct Points {
 
 impl Task {
     /// Returns the correction of the first pass: none.
-    pub(super) fn first_correction(&self) -> Correction {
+    pub fn first_correction(&self) -> Correction {
         let corners = [[self.pass.x_mm[0], self.pass.y_mm[0]], [self.pass.x_mm[1], self.pass.y_mm[1]]];
         let net = Net::over(corners.into_iter(), self.map.spacing_mm).unwrap_or(Net {
             columns: 2,
@@ -121,6 +121,11 @@ impl Task {
             spacing_mm: [corners[1][0] - corners[0][0], corners[1][1] - corners[0][1]],
         });
         Correction::none(net, self.limits.allowance_mm)
+    }
+
+    /// Returns the identity of the map that a pass is given.
+    pub fn map_identity(&self, correction: &Correction) -> [u8; 32] {
+        self.payloads(correction).0.identity()
     }
 
     /// Returns the payloads of a pass.
@@ -383,7 +388,7 @@ fn save_correction(task: &Task, folder: &Path, correction: &Correction) -> Resul
 
 /// Writes the program of the next pass; returns why there is none, which is no reason not to grind: the grinder gets the map.
 fn save_program(task: &Task, folder: &Path, correction: &Correction) -> Option<String> {
-    let identity = task.payloads(correction).0.identity();
+    let identity = task.map_identity(correction);
     let kept = match &task.programs {
         Ok(programs) => programs.keep(&folder.join("toolpath.ngc"), correction, identity).map_err(|e| e.to_string()),
         Err(error) => Err(error.to_string()),

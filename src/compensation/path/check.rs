@@ -337,27 +337,163 @@ fn hollow(bend: &Bend, wheel: &[f64; 3], [x_mm, y_mm]: [f64; 2]) -> PathError {
 /// disc, the opposite wall of a valley.
 pub(super) fn body(path: &ToolPath) -> Result<(), PathError> {
     let (wanted, wheel) = (path.wanted(), &path.options().wheel);
-    let reach = wheel.reach_mm();
-    let [low, high] = path.outline().bounds();
+    let ground: Vec<([f64; 2], Point)> =
+        places(path.outline(), GROUND).into_par_iter().map(|at| (at, wanted.at(at).point)).collect();
+    let reach = wheel.reach_mm() + DEEPEST_MM;
     let one = |place: &[f64; 2]| {
-        let contact = wanted.at(*place);
         let [x_mm, y_mm] = *place;
-        let centre = wheel.centre(&contact).ok_or(PathError::CannotTouch { x_mm, y_mm })?;
-        let from: [f64; 2] = std::array::from_fn(|k| low[k].max(centre[k] - reach));
-        let to: [f64; 2] = std::array::from_fn(|k| high[k].min(centre[k] + reach));
-        for n in 0..GROUND * GROUND {
-            let share = [n % GROUND, n / GROUND].map(|i| i as f64 / (GROUND - 1) as f64);
-            let at: [f64; 2] = std::array::from_fn(|k| from[k] + (to[k] - from[k]) * share[k]);
-            if from[0] > to[0] || from[1] > to[1] || !path.outline().contains(at[0], at[1]) {
+        let centre = wheel.centre(&wanted.at(*place)).ok_or(PathError::CannotTouch { x_mm, y_mm })?;
+        for (at, point) in &ground {
+            let from = point - centre;
+            if from.norm_squared() > reach * reach {
                 continue;
             }
-            let depth_mm = -wheel.distance_mm(&(wanted.at(at).point - centre));
+            let depth_mm = -wheel.distance_mm(&from);
             if depth_mm > DEEPEST_MM {
-                let ([at_x_mm, at_y_mm], limit_mm) = (at, DEEPEST_MM);
+                let ([at_x_mm, at_y_mm], limit_mm) = (*at, DEEPEST_MM);
                 return Err(PathError::Body { x_mm, y_mm, at_x_mm, at_y_mm, depth_mm, limit_mm });
             }
         }
         Ok(())
     };
     places(path.outline(), BODIES).par_iter().try_for_each(one)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::compensation::path::{Field, Lattice};
+    use crate::compensation::{Correction, Net};
+    use crate::geometry::Aperture;
+
+    const PART: Aperture = Aperture::Rectangle { centre_mm: [0.0, 0.0], width_mm: 16.0, height_mm: 12.0 };
+
+    /// A surface z = a x^2 + b y^2 without a correction.
+    fn quadric(a: f64, b: f64) -> Wanted {
+        let on = Lattice { columns: 81, rows: 81, first_mm: [-10.0, -10.0], spacing_mm: [0.25, 0.25] };
+        let places = (0..81 * 81).map(|k| [-10.0 + (k % 81) as f64 * 0.25, -10.0 + (k / 81) as f64 * 0.25]);
+        let (z, slopes): (Vec<f64>, Vec<[f64; 2]>) =
+            places.map(|[x, y]| (a * x * x + b * y * y, [2.0 * a * x, 2.0 * b * y])).unzip();
+        let net = Net { columns: 2, rows: 2, first_mm: [-8.0, -6.0], spacing_mm: [16.0, 12.0] };
+        let none = Correction { net, values_mm: vec![0.0; 4], cycle: 1, level_mm: 0.0 };
+        Wanted::new(Field::hermite(on, &z, &slopes), &none, 5.0).unwrap()
+    }
+
+    fn ball(radius_mm: f64) -> PathOptions {
+        PathOptions::new(Wheel::Sphere { radius_mm }, 0.5, 600.0)
+    }
+
+    fn path(wanted: Wanted, options: PathOptions) -> Result<ToolPath, PathError> {
+        ToolPath::new(wanted, PART, options)
+    }
+
+    #[test]
+    fn a_wheel_must_be_smaller_than_every_hollow_in_every_direction() {
+        // Hollow across the tracks with a radius of 20 mm, and on a dome along them.
+        let hollow = || quadric(-0.01, 0.025);
+        assert!(path(hollow(), ball(18.0)).is_ok());
+        let refused = path(hollow(), ball(20.5)).unwrap_err();
+        let PathError::Hollow { direction_deg, hollow_mm, wheel_mm, .. } = refused else { panic!("{refused}") };
+        assert!((direction_deg - 90.0).abs() < 5.0 && (hollow_mm - 20.0).abs() < 1.6 && wheel_mm == 20.5, "{refused}");
+        // A disc that rolls along the track is narrow across it, and would not fit the other way.
+        let disc = |spindle| PathOptions { wheel: Wheel::Torus { ring_mm: 40.0, tube_mm: 5.0, spindle }, ..ball(1.0) };
+        assert!(path(hollow(), disc(Vector::y())).is_ok());
+        assert!(matches!(path(hollow(), disc(Vector::x())), Err(PathError::Hollow { .. })));
+        assert!(path(quadric(0.0, 0.0), ball(1000.0)).is_ok());
+    }
+
+    #[test]
+    fn slopes_rims_and_bodies_are_held_against_the_part() {
+        assert!(matches!(path(quadric(0.2, 0.0), ball(1.0)), Err(PathError::Steep { .. })));
+        // Along x the part faces the spindle more and more.
+        let along = Wheel::Torus { ring_mm: 3.0, tube_mm: 0.5, spindle: Vector::new(0.6, 0.0, 0.8) };
+        assert!(matches!(
+            path(quadric(-0.05, 0.0), PathOptions { wheel: along, ..ball(1.0) }),
+            Err(PathError::CannotTouch { .. })
+        ));
+        // A cup that is tilted less than the dome slopes would have to touch with the other side of its ring.
+        let cup = PathOptions { wheel: Wheel::tilted_cup(6.0, 1.0, 0.15), ..ball(1.0) };
+        assert!(matches!(path(quadric(-0.0125, -0.001), cup), Err(PathError::CannotTouch { .. })));
+        assert!(path(quadric(-0.002, -0.001), cup).is_ok());
+    }
+
+    #[test]
+    fn options_that_make_no_path_are_named() {
+        for (options, key) in [
+            (PathOptions { chord_error_mm: 0.0, ..ball(5.0) }, "chord error (mm)"),
+            (PathOptions { feed_mm_min: f64::NAN, ..ball(5.0) }, "feed (mm/min)"),
+            (PathOptions { overrun_mm: -1.0, ..ball(5.0) }, "overrun (mm)"),
+            (ball(-5.0), "wheel radius (mm)"),
+        ] {
+            assert!(matches!(path(quadric(0.0, 0.0), options), Err(PathError::Option { key: k, .. }) if k == key));
+        }
+    }
+
+    #[test]
+    fn the_scallop_height_sets_the_distance_of_tracks() {
+        let spacing = TrackSpacing::Scallop { height_mm: 1e-4, widest_mm: 5.0 };
+        let flat = path(quadric(0.0, 0.0), PathOptions { spacing, ..ball(10.0) }).unwrap();
+        // h = s^2 / (8 R); the tracks are laid evenly, so a little closer.
+        let most = (8.0f64 * 10.0 * 1e-4).sqrt();
+        assert!(flat.track_mm() <= most && flat.track_mm() > 0.98 * most, "{}", flat.track_mm());
+        // In a hollow of 20 mm the ridges are half as high.
+        let hollow = path(quadric(0.0, 0.025), PathOptions { spacing, ..ball(10.0) }).unwrap();
+        assert!(hollow.track_mm() > 1.2 * most);
+    }
+
+    #[test]
+    fn a_machine_must_be_able_to_follow() {
+        let path = path(quadric(0.01, 0.01), ball(10.0)).unwrap();
+        let summary = path.summary().unwrap();
+        // 10 mm/s.
+        let Peak { value, .. } = summary.acceleration_mm_s2;
+        // It comes down on a radius of 5 mm over x and y, which is a little more along the slope.
+        assert!((value - 100.0 / 5.0).abs() < 1.5, "{value}");
+        assert!(summary.check(&Limits::default()).is_ok());
+        let travel_mm = Some([[-9.0, -50.0, 0.0], [50.0, 50.0, 50.0]]);
+        assert!(matches!(
+            summary.check(&Limits { travel_mm, ..Limits::default() }),
+            Err(PathError::Travel { axis: 'X', .. })
+        ));
+        let speed_mm_s = Some(9.0);
+        assert!(matches!(
+            summary.check(&Limits { speed_mm_s, ..Limits::default() }),
+            Err(PathError::Speed { axis: 'X', .. })
+        ));
+        let limited = |a: f64| summary.check(&Limits { acceleration_mm_s2: Some(a), ..Limits::default() });
+        assert!(limited(25.0).is_ok());
+        let Err(PathError::Acceleration { feed_mm_min, .. }) = limited(10.0) else { panic!() };
+        assert!((feed_mm_min - 600.0 * (10.0 / value).sqrt()).abs() < 1.0);
+        let straight = Summary { acceleration_mm_s2: Peak::default(), ..summary };
+        let slow = Limits { acceleration_mm_s2: Some(1.0), ..Limits::default() };
+        assert!(matches!(straight.check(&slow), Err(PathError::RunUp { .. })));
+    }
+
+    #[test]
+    fn every_point_is_told_and_the_chords_keep_to_the_path() {
+        let path = path(quadric(0.01, -0.005), ball(10.0)).unwrap();
+        let summary = path.summary().unwrap();
+        assert_eq!(path.moves().count() as u64, summary.moves);
+        let mut last: Option<Point> = None;
+        for one in path.moves() {
+            if let (Move::Feed { at, .. }, Some(from)) = (one, last) {
+                let middle = nalgebra::center(&from, &at);
+                // The centre of a ball that touches is 10 mm from the surface; in a lead it is more.
+                let nearest = |p: &Point| {
+                    let mut place = [p.x, p.y];
+                    for _ in 0..50 {
+                        let contact = path.wanted().at(place);
+                        let off = p - contact.point;
+                        let aside = off - contact.normal * off.dot(&contact.normal);
+                        place = [place[0] + 0.7 * aside.x, place[1] + 0.7 * aside.y];
+                    }
+                    (p - path.wanted().at(place).point).norm()
+                };
+                let off = nearest(&middle) - 10.0;
+                let on_part = PART.contains(middle.x, middle.y);
+                assert!(off > -1.1e-4 && (!on_part || off < 1.1e-4), "{off} at {middle}");
+            }
+            last = if let Move::Feed { at, .. } = one { Some(at) } else { None };
+        }
+    }
 }

@@ -13,6 +13,11 @@ pub enum PathError {
          the model frame so that z looks away from the part"
     )]
     NotAHeight { x_mm: f64, y_mm: f64 },
+    #[error(
+        "the part is worked on from the side of -z (measure.side), and paths are laid on the side of +z; turn the model frame so that z looks away \
+         from the part"
+    )]
+    OtherSide,
     #[error("the correction is not a finite number at x {x_mm:.3}, y {y_mm:.3} mm; make it anew")]
     Correction { x_mm: f64, y_mm: f64 },
     #[error("{key} is {found}; it must be {allowed}")]

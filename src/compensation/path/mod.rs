@@ -10,6 +10,7 @@
 //! Pure. Frame: everything is in the model frame {M}, z away from the part. Units: mm, s, rad; feeds are mm/min. A path is never
 //! held in memory: it is a list of tracks and an iterator over their points.
 
+mod axis_table;
 mod check;
 mod error;
 mod field;
@@ -19,13 +20,14 @@ mod walk;
 mod wanted;
 mod wheel;
 
+pub use axis_table::axis_offsets;
 pub use check::{Limits, Peak, Summary};
 pub use error::PathError;
 pub use field::{Field, Jet, Lattice};
 pub use nominal::height_of;
 pub use tracks::{Pattern, TrackSpacing};
 pub use walk::{Move, Moves};
-pub use wanted::{Bend, Contact, Wanted, displaced};
+pub use wanted::{Bend, Contact, Wanted, displaced, spline_of};
 pub use wheel::Wheel;
 
 use crate::geometry::{Aperture, Point};
@@ -76,6 +78,9 @@ impl PathOptions {
         }
     }
 }
+
+/// Tracks on which the highest place is looked for.
+const SOME_TRACKS: usize = 200;
 
 /// The way of a wheel over a part, point by point when it is asked for.
 #[derive(Clone, Debug)]
@@ -159,12 +164,12 @@ impl ToolPath {
         }
     }
 
-    /// The highest place of the centre, looked for at most a millimetre apart.
+    /// The highest place of the centre, looked for a millimetre apart on some of the tracks: the height of travel has room above it.
     fn highest_mm(&self) -> Result<f64, PathError> {
         use rayon::prelude::*;
         let highest = |span: &Span| {
             let (from, to) = span.with_leads(&self.options);
-            let count = (span.length_mm(from, to).ceil() as usize).clamp(8, 100_000);
+            let count = (span.length_mm(from, to).ceil() as usize).clamp(8, 20_000);
             (0..=count)
                 .map(|k| from + (to - from) * k as f64 / count as f64)
                 .map(|t| (self.centre(span, t).z, t))
@@ -173,9 +178,10 @@ impl ToolPath {
                     |most, (z, t)| if z.is_finite() { Ok(most.max(z)) } else { Err(span.place(t)) },
                 )
         };
-        self.tracks
-            .spans
-            .par_iter()
+        let spans = &self.tracks.spans;
+        let some = spans.len().div_ceil(SOME_TRACKS).max(1);
+        let chosen = spans.par_iter().step_by(some).chain(spans.par_iter().rev().take(1));
+        chosen
             .map(highest)
             .try_reduce(|| f64::NEG_INFINITY, |a, b| Ok(a.max(b)))
             .map_err(|[x_mm, y_mm]| PathError::CannotTouch { x_mm, y_mm })

@@ -130,7 +130,7 @@ impl Tracks {
         let [low, high] = outline.bounds();
         let size = [high[0] - low[0], high[1] - low[1]];
         let turns = size[1].max(size[0]) / track_mm;
-        if !(turns < MOST_TRACKS) {
+        if turns.is_nan() || turns >= MOST_TRACKS {
             return Err(PathError::TooManyTracks { tracks: turns, track_mm, limit: MOST_TRACKS });
         }
         let tracks = match options.pattern {

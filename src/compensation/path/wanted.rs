@@ -51,7 +51,7 @@ impl Wanted {
             let [x_mm, y_mm] = correction.net.place_mm(node);
             return Err(PathError::Correction { x_mm, y_mm });
         }
-        Ok(Self { nominal, correction: levelled_off(correction, level_off_mm), level_mm: correction.level_mm })
+        Ok(Self { nominal, correction: spline_of(correction, level_off_mm), level_mm: correction.level_mm })
     }
 
     /// Returns the point and the normal at a place of the nominal surface.
@@ -162,12 +162,12 @@ const STEPS: usize = 100;
 ///
 /// With the slope g across the border and the length L the correction rises by g L (t - t^3 + t^4 / 2) at t = s / L <= 1: as
 /// steep as it was at the border, level at L, and never further.
-fn levelled_off(correction: &Correction, length_mm: f64) -> Field {
+pub fn spline_of(correction: &Correction, length_mm: f64) -> Field {
     let net = correction.net;
     let spacing_mm = [0, 1].map(|k| {
         let nodes = [net.columns, net.rows][k];
         // A single row or column is level across.
-        if nodes < 2 || !(net.spacing_mm[k] > 0.0) { length_mm } else { net.spacing_mm[k] }
+        if nodes < 2 || net.spacing_mm[k] <= 0.0 { length_mm } else { net.spacing_mm[k] }
     });
     let rings = spacing_mm.map(|h| (length_mm / h).ceil().clamp(1.0, MOST_RINGS) as usize);
     let reach = [0, 1].map(|k| length_mm.min(rings[k] as f64 * spacing_mm[k]));
@@ -253,7 +253,7 @@ mod tests {
 
     #[test]
     fn a_correction_levels_off_beyond_its_net_and_nowhere_jumps() {
-        let field = levelled_off(&correction(|x, _| 0.002 * x), 3.0);
+        let field = spline_of(&correction(|x, _| 0.002 * x), 3.0);
         assert!((field.at([2.2, 0.0]).value - 0.0044).abs() < 1e-7);
         let far = field.at([11.0, 0.0]);
         assert!((far.value - (0.016 + 0.002 * 3.0 * 0.5)).abs() < 1e-5, "{far:?}");
@@ -267,7 +267,7 @@ mod tests {
             cycle: 1,
             level_mm: 0.0,
         };
-        assert!((levelled_off(&one, 2.0).at([5.0, -9.0]).value - 0.007).abs() < 1e-15);
+        assert!((spline_of(&one, 2.0).at([5.0, -9.0]).value - 0.007).abs() < 1e-15);
     }
 
     #[test]

@@ -29,7 +29,7 @@ const INCH_MM: f64 = 25.4;
 pub struct Amendment<'a> {
     /// What the surface is moved by along its normal, in millimetres, positive away from the part; over x and y of the program's frame.
     pub shift: &'a Field,
-    /// The nominal surface, and the radius of the ball that grinds it; `None` to move the program's points along z.
+    /// The nominal surface that a ball grinds; `None` to move the program's points along z.
     pub along_normals: Option<AlongNormals<'a>>,
     /// How far the new program may be from the corrected path, in millimetres.
     pub tolerance_mm: f64,
@@ -48,8 +48,8 @@ pub struct Amendment<'a> {
 pub struct AlongNormals<'a> {
     /// The nominal surface, without a correction.
     pub nominal: &'a Wanted,
-    /// How far below the program's point the ball's centre is: 0 where the program moves the centre, minus the radius where its tip.
-    pub centre_below_mm: f64,
+    /// How far above the program's point the ball's centre is: 0 where the program moves the centre, the radius where it moves the tip.
+    pub centre_above_mm: f64,
 }
 
 /// What became of a program.
@@ -275,7 +275,7 @@ impl<'a> Rewriter<'a> {
     }
 
     fn choose_system(&mut self, code: i64, word: &Word) -> Result<(), Refusal> {
-        let same = self.system.is_none_or(|system| system == code);
+        let same = self.system == Some(code);
         if !same && self.moved {
             let remedy = "a map belongs to one zero: divide the program";
             return Err((format!("{} changes the zero after the tool has moved at feed", word.text), remedy));
@@ -458,7 +458,7 @@ impl<'a> Rewriter<'a> {
     fn displacement(&self, at: &Point) -> Result<Vector, Refusal> {
         let shift = self.amendment.shift;
         let Some(along) = &self.amendment.along_normals else { return Ok(Vector::z() * shift.at([at.x, at.y]).value) };
-        let centre = at - Vector::z() * along.centre_below_mm;
+        let centre = at + Vector::z() * along.centre_above_mm;
         displaced(along.nominal, shift, &centre).ok_or_else(|| {
             let found =
                 format!("no place of the nominal surface is under x {:.3}, y {:.3}, z {:.3} mm", at.x, at.y, at.z);

@@ -57,7 +57,7 @@ impl Arc {
         let ([u, v], [s, t]) = (arm(p), arm(q));
         let (radius, end) = (u.hypot(v), s.hypot(t));
         let off = (radius - end).abs();
-        if !(radius > 0.0) || off > RADIUS_TOLERANCE[0].min(RADIUS_TOLERANCE[1] * radius.max(0.01)) {
+        if radius == 0.0 || off > RADIUS_TOLERANCE[0].min(RADIUS_TOLERANCE[1] * radius.max(0.01)) {
             let found = format!("the radius of the arc is {radius:.4} mm at its beginning and {end:.4} mm at its end");
             return Err((found, "correct its centre or its end"));
         }
@@ -109,7 +109,7 @@ fn by_radius(p: [f64; 2], q: [f64; 2], radius: f64, clockwise: bool) -> Result<[
     let chord = dx.hypot(dy);
     let above2 = radius * radius - 0.25 * chord * chord;
     // A little short, by rounding, is half a turn.
-    if !(chord > 0.0) || above2 < -1e-3 * radius * radius {
+    if chord == 0.0 || above2 < -1e-3 * radius * radius {
         let found = format!("an arc of radius {radius} mm does not join two points {chord:.4} mm apart");
         return Err((found, "give its centre by I, J, K"));
     }

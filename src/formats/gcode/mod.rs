@@ -11,6 +11,7 @@ mod error;
 mod map;
 mod number;
 mod read;
+mod table;
 mod write;
 
 use std::fmt;
@@ -22,6 +23,7 @@ use crate::formats::FormatError;
 pub use amend::{AlongNormals, Amended, Amendment, correct_program};
 pub use error::GcodeError;
 pub use map::{MapKind, ProgramMap, read_program_map};
+pub use table::write_axis_table;
 pub use write::{ProgramHeader, write_program};
 
 /// How exactly a controller keeps to the path that a program describes.

@@ -121,19 +121,9 @@ mod tests {
 
     #[test]
     fn what_nobody_can_know_is_refused() {
-        for line in [
-            "/G1 X1",
-            "G1 X#5",
-            "G1 X[1+2]",
-            "O100 call",
-            "G1 X",
-            "G1 X1e5.",
-            "G1 X--1",
-            "(open",
-            "G1 X1 $",
-            "G1 X1e99",
-            "\u{e9}",
-        ] {
+        for line in
+            ["/G1 X1", "G1 X#5", "G1 X[1+2]", "O100 call", "G1 X", "G1 X--1", "(open", "G1 X1 $", "G1 X1e", "\u{e9}"]
+        {
             assert!(block(line).is_err(), "{line}");
         }
         assert!(block(&"X1".repeat(200)).is_err());

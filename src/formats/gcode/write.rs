@@ -120,8 +120,7 @@ impl Lines {
 
     #[inline]
     fn word(&mut self, axis: usize, value_mm: f64) -> Result<(), GcodeError> {
-        // NaN is not within.
-        if !(value_mm.abs() <= LARGEST_MM) {
+        if value_mm.is_nan() || value_mm.abs() > LARGEST_MM {
             return Err(GcodeError::NotFinite { axis: ['X', 'Y', 'Z'][axis], value_mm, number: self.count });
         }
         let value = rounded(value_mm);
