@@ -11,6 +11,9 @@ use sha2::{Digest, Sha256};
 use thiserror::Error;
 
 use crate::cell::{Beginning, CellPlan, Deadlines, Disposal, Gates, Tolerance};
+use crate::compensation::path::{
+    Limits, PathError, PathOptions, Pattern as TrackPattern, TrackSpacing, Wheel as PathWheel,
+};
 use crate::compensation::{CorrectionLimits, MapOptions, contact_width_mm};
 use crate::config::{self, CellConfig, PointKind, SignalKind, WordOrder};
 use crate::device::exchange::{ExchangeCmm, ExchangeGrinder, ExchangeTiming};
@@ -18,14 +21,17 @@ use crate::device::{
     self, AnyCmm, AnyGrinder, Coordinates, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, Pass, RegisterMap,
     Signal, SignalType,
 };
-use crate::drive::{Probing, Sphere, Task};
+use crate::drive::{Probing, Programs, Sphere, Task};
 use crate::formats::exchange::{
     self as files, CmmExchange, CmmFolders, ExchangeError, GrinderExchange, GrinderFolders, StationFiles, Stations,
 };
+use crate::formats::gcode;
 use crate::formats::{self, FormatError, NominalFile};
-use crate::geometry::Point;
+use crate::geometry::{Point, Vector};
 use crate::measuring::{Layout, PatternError, Target, targets};
-use crate::recipe::{BeginWith, Density, NominalSource, OnTrouble, Pattern, PvOf, Recipe, StartAt};
+use crate::recipe::{
+    BeginWith, Density, NominalSource, OnTrouble, PathMode, Pattern, PvOf, Recipe, StartAt, Tracks, Wheel,
+};
 use crate::registration::{MapLimits, ProbeSide};
 use crate::surface::{DefinedSurface, DefinitionError, Nominal, Side, SurfaceError};
 
@@ -92,6 +98,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
     check_limits(recipe, cell, &targets)?;
     let task = Task {
         pass: pass(recipe, &nominal, part_identity),
+        programs: programs(recipe, cell, &nominal, part_identity),
         nominal: Arc::new(nominal),
         nominal_file,
         part_identity,
@@ -292,6 +299,75 @@ fn pass(recipe: &Recipe, nominal: &Nominal, part_identity: [u8; 32]) -> Pass {
         x_mm: [low[0], high[0]],
         y_mm: [low[1], high[1]],
         part_identity,
+    }
+}
+
+/// How the programs of a part are made.
+fn programs(
+    recipe: &Recipe,
+    cell: &CellConfig,
+    nominal: &Nominal,
+    part_identity: [u8; 32],
+) -> Result<Programs, PathError> {
+    let (grinding, limits) = (&recipe.grinding, &cell.grinder.limits);
+    if recipe.measure.side == ProbeSide::Known(Side::Opposite) {
+        return Err(PathError::OtherSide);
+    }
+    let ground = Programs::ground(nominal)?;
+    let plain = PathOptions::new(path_wheel(&grinding.wheel, nominal), grinding.track_mm, grinding.feed_mm_min);
+    // The wheel comes up to its feed before it meets the part.
+    let run_up_mm =
+        limits.largest_acceleration_mm_s2.map_or(0.0, |a| 1.1 * (grinding.feed_mm_min / 60.0).powi(2) / (2.0 * a));
+    let options = PathOptions {
+        pattern: match grinding.tracks {
+            Tracks::Raster { one_way } => TrackPattern::Raster { one_way },
+            Tracks::Spiral => TrackPattern::Spiral,
+        },
+        spacing: match grinding.scallop_mm {
+            Some(height_mm) => TrackSpacing::Scallop { height_mm, widest_mm: grinding.track_mm },
+            None => TrackSpacing::Distance(grinding.track_mm),
+        },
+        chord_error_mm: grinding.chord_error_mm,
+        overrun_mm: grinding.overrun_mm,
+        lead_mm: plain.lead_mm.max(run_up_mm - grinding.overrun_mm),
+        safe_height_mm: grinding.safe_height_mm,
+        spiral_acceleration_mm_s2: limits.largest_acceleration_mm_s2,
+        ..plain
+    };
+    Ok(Programs {
+        part: recipe.part.name.clone(),
+        part_identity,
+        ground,
+        options,
+        limits: Limits {
+            travel_mm: limits.travel.map(|travel| [travel.least_mm, travel.most_mm]),
+            speed_mm_s: limits.largest_speed_mm_s,
+            acceleration_mm_s2: limits.largest_acceleration_mm_s2,
+        },
+        mode: match grinding.path_mode {
+            PathMode::Blend { tolerance_mm } => gcode::PathMode::Blend { tolerance_mm, naive_mm: 0.0 },
+            PathMode::ExactPath => gcode::PathMode::ExactPath,
+            PathMode::ExactStop => gcode::PathMode::ExactStop,
+        },
+        spark_out_passes: grinding.spark_out_passes,
+        simulation: cell.simulated,
+    })
+}
+
+/// The wheel of a recipe as paths have it; a cup is tilted further than the part slopes unless the recipe says by how much.
+fn path_wheel(wheel: &Wheel, nominal: &Nominal) -> PathWheel {
+    const BEYOND_THE_SLOPE_RAD: f64 = 0.0873;
+    match *wheel {
+        Wheel::Sphere { radius_mm } => PathWheel::Sphere { radius_mm },
+        Wheel::Torus { radius_mm, minor_radius_mm, spindle_along_x } => PathWheel::Torus {
+            ring_mm: radius_mm - minor_radius_mm,
+            tube_mm: minor_radius_mm,
+            spindle: if spindle_along_x { Vector::x() } else { Vector::y() },
+        },
+        Wheel::Cup { radius_mm, minor_radius_mm, tilt_rad } => {
+            let tilt = tilt_rad.unwrap_or_else(|| nominal.steepest_rad() + BEYOND_THE_SLOPE_RAD);
+            PathWheel::tilted_cup(radius_mm, minor_radius_mm, tilt)
+        }
     }
 }
 

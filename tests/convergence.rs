@@ -44,7 +44,12 @@ fn cycles_come_down_to_what_the_grinder_cannot_repeat() {
     };
     let taken_back = rms(runs.iter().map(|(_, parts)| parts[0][0].repeatable_um))
         / rms(runs.iter().map(|(_, parts)| parts[0][1].repeatable_um));
-    println!("taken back {taken_back:.1}; over the floor {:.2}, {:.2}; next part {:.2}", over(0, 1), over(0, 2), over(1, 0));
+    println!(
+        "taken back {taken_back:.1}; over the floor {:.2}, {:.2}; next part {:.2}",
+        over(0, 1),
+        over(0, 2),
+        over(1, 0)
+    );
     assert!(taken_back > 8.0, "{taken_back}");
     assert!(over(0, 2) < 1.4 && over(0, 2) < over(0, 1), "{} then {}", over(0, 1), over(0, 2));
     assert!(over(1, 0) < 1.5, "the second part began at {} of the floor", over(1, 0));

@@ -24,6 +24,12 @@ pub(super) enum Failure {
     File(#[from] FormatError),
     #[error("{path}: {source}")]
     Definition { path: PathBuf, source: DefinitionError },
+    #[error(transparent)]
+    Program(regrind::formats::gcode::GcodeError),
+    #[error(transparent)]
+    Programs(regrind::drive::ProgramError),
+    #[error("{path}: {source}")]
+    Path { path: PathBuf, source: regrind::compensation::path::PathError },
     #[error("{path}: {source}")]
     Nominal { path: PathBuf, source: SurfaceError },
     #[error("{path}: {source}")]

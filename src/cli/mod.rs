@@ -3,6 +3,7 @@
 mod accuracy;
 mod audit;
 mod check;
+mod compensate;
 mod control;
 mod failure;
 mod initial;
@@ -55,6 +56,7 @@ enum Command {
     Report(report::Arguments),
     Register(register::Arguments),
     Accuracy(accuracy::Arguments),
+    Compensate(compensate::Arguments),
     Check(check::Arguments),
     Schema(schema::Arguments),
     States(states::Arguments),
@@ -100,6 +102,7 @@ fn run() -> ExitCode {
         Command::Report(arguments) => report::run(&arguments),
         Command::Register(arguments) => register::run(&arguments),
         Command::Accuracy(arguments) => accuracy::run(&arguments),
+        Command::Compensate(arguments) => compensate::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Schema(arguments) => schema::run(&arguments),
         Command::States(arguments) => states::run(&arguments),

@@ -3,7 +3,9 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use regrind::compensation::path::{PathError, Summary, ToolPath};
 use regrind::config::CellConfig;
+use regrind::drive::Task;
 use regrind::recipe::Recipe;
 use regrind::setup;
 use serde::Serialize;
@@ -27,6 +29,9 @@ pub(super) struct Arguments {
     /// Cell that would make it
     #[arg(long, value_name = "FILE", default_value = "config/sim.toml")]
     cell: PathBuf,
+    /// Write the program of the first pass, which has no correction
+    #[arg(long, value_name = "FILE")]
+    program: Option<PathBuf>,
     /// Print JSON instead of words
     #[arg(long)]
     json: bool,
@@ -48,15 +53,29 @@ struct Document {
     tracks: u64,
     path_mm: f64,
     grinding_minutes: f64,
+    /// Of the program of one pass; absent where none can be made.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    program_points: Option<u64>,
+    /// Why none can be made.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    no_program: Option<String>,
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let recipe = or_show(Recipe::read(&arguments.recipe))?;
     let cell = or_show(CellConfig::read(&arguments.cell))?;
     let (task, plan) = setup::prepare(&recipe, &cell).map_err(Failure::Setup)?;
+    let program = program(arguments, &task)?;
     let [width, depth] = [task.pass.x_mm, task.pass.y_mm].map(|[low, high]| high - low);
-    let tracks = (depth / task.pass.track_spacing_mm).floor() + 1.0;
-    let path_mm = tracks * width * f64::from(1 + task.pass.spark_out_passes);
+    // Without a program the tracks over the box around the part are the best there is.
+    let (tracks, pass_mm) = match &program {
+        Ok((path, summary)) => (path.tracks() as f64, summary.length_mm),
+        Err(_) => {
+            let tracks = (depth / task.pass.track_spacing_mm).floor() + 1.0;
+            (tracks, tracks * width)
+        }
+    };
+    let path_mm = pass_mm * f64::from(1 + task.pass.spark_out_passes);
     let depth_um = 1e3 * task.limits.depth_of_cut_mm;
     let passes = f64::from(plan.max_cycles.max(1) - 1);
     let first_um = 1e3 * task.limits.allowance_mm;
@@ -75,6 +94,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         tracks: tracks as u64,
         path_mm,
         grinding_minutes: path_mm / task.pass.feed_mm_min,
+        program_points: program.as_ref().ok().map(|(_, summary)| summary.points),
+        no_program: program.as_ref().err().map(ToString::to_string),
     };
     if arguments.json {
         super::print_json(&document)?;
@@ -84,11 +105,26 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
+/// Lays the path of the first pass, and writes its program where one is asked for.
+fn program(arguments: &Arguments, task: &Task) -> Result<Result<(ToolPath, Summary), PathError>, Failure> {
+    let first = task.first_correction();
+    let laid = task.programs.as_ref().map_err(Clone::clone).and_then(|programs| programs.path(&first));
+    if let Some(file) = &arguments.program {
+        let programs = task.programs.as_ref().map_err(|error| Failure::Programs(error.clone().into()))?;
+        programs.write(file, &first, task.map_identity(&first)).map_err(Failure::Programs)?;
+    }
+    Ok(laid)
+}
+
 fn words(d: &Document) -> String {
     let n = three_digits;
     let marked = if d.simulation { "SIMULATION  " } else { "" };
+    let program = match (d.program_points, &d.no_program) {
+        (Some(points), _) => format!("{} a pass", counted(points as usize, "point")),
+        (None, why) => format!("none: {}", why.as_deref().unwrap_or_default()),
+    };
     format!(
-        "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\n\
+        "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nprogram     {program}\n\
          level       {} um over the nominal surface first, {} um deeper each pass, {} um at the least\nbudget      {} um in all\ncycles      at most {}\n",
         d.part,
         counted(d.nominal_points, "point"),

@@ -18,6 +18,7 @@ mod level;
 mod map;
 mod net;
 mod parameters;
+pub mod path;
 mod response;
 mod robust;
 mod sampling;

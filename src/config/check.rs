@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use super::written::{
-    CellFile, ExchangeTable, FixtureTable, LengthWord, LimitsTable, RegistersTable, SignalTable, SphereTable,
+    CellFile, ExchangeTable, FixtureTable, GrinderTable, LengthWord, RegistersTable, SignalTable, SphereTable,
     TimingTable, TravelTable, WireTable,
 };
 use super::{
@@ -77,8 +77,8 @@ pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) ->
     let [cmm_link, grinder_link] = machines.map(|machine| machine.link(simulated, folder, document));
     compare_wires(cmm_link.as_ref(), grinder_link.as_ref(), document);
     let sphere = cmm.reference_sphere.as_ref().map(|sphere| reference_sphere(sphere, cmm.travel.as_ref(), document));
-    let travel = cmm.travel.as_ref().map(|travel| self::travel(travel, document));
-    let limits = limits(&grinder.limits, document);
+    let travel = cmm.travel.as_ref().map(|travel| self::travel(travel, "cmm", document));
+    let limits = limits(grinder, document);
     // A table that is there and incomplete has been told of.
     let complete = !matches!(sphere, Some(None)) && !matches!(travel, Some(None));
     Checked {
@@ -432,18 +432,24 @@ fn reference_sphere(
     Some(ReferenceSphere { centre: Point::from(centre_mm), radius_mm, points: written.points })
 }
 
-fn travel(written: &TravelTable, document: &mut Document) -> Option<Travel> {
+fn travel(written: &TravelTable, machine: &str, document: &mut Document) -> Option<Travel> {
     let (least_mm, most_mm) = (written.least_mm?, written.most_mm?);
     for (k, axis) in ["x", "y", "z"].into_iter().enumerate() {
         if least_mm[k] >= most_mm[k] {
             let found = format!("is {} in {axis}, `most_mm` is {}", least_mm[k], most_mm[k]);
-            document.report("cmm.travel.least_mm", found, "it must be less", "are the two interchanged?");
+            document.report(
+                &format!("{machine}.travel.least_mm"),
+                found,
+                "it must be less",
+                "are the two interchanged?",
+            );
         }
     }
     Some(Travel { least_mm, most_mm })
 }
 
-fn limits(written: &LimitsTable, document: &mut Document) -> Option<GrinderLimits> {
+fn limits(grinder: &GrinderTable, document: &mut Document) -> Option<GrinderLimits> {
+    let written = &grinder.limits;
     let wheel_radius_mm = [written.least_wheel_radius_mm?, written.largest_wheel_radius_mm?];
     if wheel_radius_mm[0] > wheel_radius_mm[1] {
         document.report(
@@ -457,5 +463,8 @@ fn limits(written: &LimitsTable, document: &mut Document) -> Option<GrinderLimit
         largest_feed_mm_min: written.largest_feed_mm_min?,
         wheel_radius_mm,
         largest_depth_mm: written.largest_depth_mm?,
+        largest_speed_mm_s: written.largest_speed_mm_s,
+        largest_acceleration_mm_s2: written.largest_acceleration_mm_s2,
+        travel: grinder.travel.as_ref().and_then(|travel| self::travel(travel, "grinder", document)),
     })
 }

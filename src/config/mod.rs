@@ -321,7 +321,7 @@ pub struct ReferenceSphere {
     pub points: u16,
 }
 
-/// A box in the CMM frame.
+/// A box: in the CMM frame for the probe, in the model frame for the wheel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Travel {
     /// Least x, y, z.
@@ -339,6 +339,12 @@ pub struct GrinderLimits {
     pub wheel_radius_mm: [f64; 2],
     /// Most that one pass may take off.
     pub largest_depth_mm: f64,
+    /// Largest speed of an axis, where it is known.
+    pub largest_speed_mm_s: Option<f64>,
+    /// Largest acceleration of an axis, where it is known.
+    pub largest_acceleration_mm_s2: Option<f64>,
+    /// Where the wheel's centre may be, in the model frame, where it is known.
+    pub travel: Option<Travel>,
 }
 
 static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<written::CellFile>);

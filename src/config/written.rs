@@ -77,6 +77,8 @@ pub(super) struct GrinderTable {
     /// What it can do.
     #[schemars(extend("x-required" = true))]
     pub limits: LimitsTable,
+    /// The box that the wheel's centre must not leave, in the frame of its programs, which is the model's.
+    pub travel: Option<TravelTable>,
 }
 
 /// A wire.
@@ -306,7 +308,7 @@ pub(super) struct SphereTable {
     pub points: u16,
 }
 
-/// A box in the CMM frame.
+/// A box: in the CMM frame for the probe, in the model frame for the wheel.
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub(super) struct TravelTable {
@@ -334,6 +336,12 @@ pub(super) struct LimitsTable {
     /// Most that one pass may take off.
     #[schemars(range(min = 0.00001, max = 100.0), extend("x-required" = true), example = 0.2)]
     pub largest_depth_mm: Option<f64>,
+    /// Largest speed of an axis.
+    #[schemars(range(min = 0.01, max = 100000.0))]
+    pub largest_speed_mm_s: Option<f64>,
+    /// Largest acceleration of an axis.
+    #[schemars(range(min = 0.1, max = 10000000.0))]
+    pub largest_acceleration_mm_s2: Option<f64>,
 }
 
 impl Default for TcpTable {

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::cell::{CompensationRefusal, CompensationSummary, Event, Figures, Forecast, Gate, GateFailure, Response};
+use crate::compensation::path::PathError;
 use crate::compensation::{
     self, Correction, CorrectionLimits, ErrorMap, GainRule, Knowledge, MapOptions, Net, Reading, Seen, Sense,
     StepError, error_map, response,
@@ -25,6 +26,7 @@ use crate::registration::{
 use crate::surface::{Nominal, Side};
 
 use super::maps;
+use super::program::Programs;
 
 /// Everything that does not change during a run.
 #[derive(Debug)]
@@ -69,6 +71,8 @@ pub struct Task {
     pub pass: Pass,
     /// Half the largest PV that is accepted: what lies within it about zero is drawn as within tolerance.
     pub tolerance_mm: Option<f64>,
+    /// How programs are made, or why there are none.
+    pub programs: Result<Programs, PathError>,
     /// Least share of the targets that must be touched.
     pub least_found: f64,
     /// Whether the cell is simulated; everything stored is marked so.
@@ -131,7 +135,7 @@ pub(super) struct Points {
 
 impl Task {
     /// Returns the correction of the first pass: none.
-    pub(super) fn first_correction(&self) -> Correction {
+    pub fn first_correction(&self) -> Correction {
         let corners = [[self.pass.x_mm[0], self.pass.y_mm[0]], [self.pass.x_mm[1], self.pass.y_mm[1]]];
         let net = Net::over(corners.into_iter(), self.map.spacing_mm).unwrap_or(Net {
             columns: 2,
@@ -177,6 +181,11 @@ impl Task {
         }
         let options = Options { start: at_fixture, ..options };
         Ok((register(&self.nominal, points, &options)?, options))
+    }
+
+    /// Returns the identity of the map that a pass is given.
+    pub fn map_identity(&self, correction: &Correction) -> [u8; 32] {
+        self.payloads(correction).0.identity()
     }
 
     /// Returns the payloads of a pass.
@@ -469,6 +478,7 @@ pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &
     if let Err(error) = save_correction(task, folder, &step.correction, &cycle.correction) {
         return refused(CompensationRefusal::Failed(error.to_string()));
     }
+    let warnings: Vec<String> = save_program(task, folder, &step.correction).into_iter().collect();
     let largest_mm = step.correction.values_mm.iter().fold(0.0f64, |most, v| most.max(v.abs()));
     let ratio = found.verdict.pv_mm / found.verdict.rms_mm.max(f64::MIN_POSITIVE);
     let forecast = known.forecast(&map);
@@ -480,7 +490,7 @@ pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &
         air_share: step.air_share,
         gains: known.gains(),
         response: known.response()[0],
-        warnings: Vec::new(),
+        warnings,
     };
     (Event::Compensated { cycle: number, summary }, Some(step.correction))
 }
@@ -489,6 +499,16 @@ fn save_correction(task: &Task, folder: &Path, correction: &Correction, base: &C
     let [identity, replaces] = [correction, base].map(|correction| task.payloads(correction).0.identity());
     let identities = CorrectionIdentities { part: task.part_identity, map: identity, replaces };
     write_correction(&folder.join("correction.csv"), correction, &identities, task.simulation)
+}
+
+/// Writes the program of the next pass; returns why there is none, which is no reason not to grind: the grinder gets the map.
+fn save_program(task: &Task, folder: &Path, correction: &Correction) -> Option<String> {
+    let identity = task.map_identity(correction);
+    let kept = match &task.programs {
+        Ok(programs) => programs.keep(&folder.join("toolpath.ngc"), correction, identity).map_err(|e| e.to_string()),
+        Err(error) => Err(error.to_string()),
+    };
+    kept.err().map(|why| format!("there is no toolpath.ngc: {why}"))
 }
 
 /// What the next part of this kind can begin with; none where this run did not get so far.

@@ -8,6 +8,7 @@ mod error;
 pub mod exchange;
 mod figures;
 mod folder;
+pub mod gcode;
 mod height_map;
 mod layout;
 mod learned;

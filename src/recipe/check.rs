@@ -6,12 +6,13 @@ use serde::Deserialize;
 
 use super::curvature;
 use super::written::{
-    AcceptanceTable, CompensationTable, CoordinateWord, CycleTable, DistanceWord, GrindingTable, MeasureTable,
-    NominalTable, PartTable, PatternWord, RecipeFile, RegistrationTable, SideWord, WheelTable,
+    AcceptanceTable, AxisWord, CompensationTable, CoordinateWord, CycleTable, DistanceWord, GrindingTable,
+    MeasureTable, NominalTable, PartTable, PathModeWord, PatternWord, RecipeFile, RegistrationTable, SideWord,
+    TracksWord, WheelTable,
 };
 use super::{
-    Acceptance, Compensation, Cycle, Density, GainBy, Grinding, Measure, NominalSource, Part, Pattern, Recipe,
-    RegistrationSettings, StartAt, Wheel,
+    Acceptance, Compensation, Cycle, Density, GainBy, Grinding, Measure, NominalSource, Part, PathMode, Pattern,
+    Recipe, RegistrationSettings, StartAt, Tracks, Wheel,
 };
 use crate::compensation::GainRule;
 use crate::document::Document;
@@ -359,10 +360,18 @@ fn compensation(written: &CompensationTable, document: &mut Document) -> Option<
 fn grinding(written: &GrindingTable, document: &mut Document) -> Option<Grinding> {
     let wheel = match written.wheel.as_ref()? {
         WheelTable::Sphere(ball) => Wheel::Sphere { radius_mm: ball.radius_mm? },
-        WheelTable::Torus(rim) => Wheel::Torus { radius_mm: rim.radius_mm?, minor_radius_mm: rim.minor_radius_mm? },
-        WheelTable::Cup(rim) => Wheel::Cup { radius_mm: rim.radius_mm?, minor_radius_mm: rim.minor_radius_mm? },
+        WheelTable::Torus(rim) => Wheel::Torus {
+            radius_mm: rim.radius_mm?,
+            minor_radius_mm: rim.minor_radius_mm?,
+            spindle_along_x: rim.spindle == AxisWord::X,
+        },
+        WheelTable::Cup(cup) => Wheel::Cup {
+            radius_mm: cup.radius_mm?,
+            minor_radius_mm: cup.minor_radius_mm?,
+            tilt_rad: cup.tilt_deg.map(f64::to_radians),
+        },
     };
-    if let Wheel::Torus { radius_mm, minor_radius_mm } | Wheel::Cup { radius_mm, minor_radius_mm } = wheel
+    if let Wheel::Torus { radius_mm, minor_radius_mm, .. } | Wheel::Cup { radius_mm, minor_radius_mm, .. } = wheel
         && minor_radius_mm > radius_mm
     {
         document.report(
@@ -370,6 +379,14 @@ fn grinding(written: &GrindingTable, document: &mut Document) -> Option<Grinding
             format!("is {minor_radius_mm} mm, more than `radius_mm`, {radius_mm} mm"),
             "the rim's own curve is inside the wheel",
             "are the two interchanged?",
+        );
+    }
+    if written.one_way && written.pattern == TracksWord::Spiral {
+        document.report(
+            "grinding.one_way",
+            "is set for a spiral",
+            "only a raster has tracks that could alternate",
+            "leave it out",
         );
     }
     let track_mm = written.track_mm?;
@@ -385,6 +402,19 @@ fn grinding(written: &GrindingTable, document: &mut Document) -> Option<Grinding
         wheel,
         feed_mm_min: written.feed_mm_min?,
         track_mm,
+        tracks: match written.pattern {
+            TracksWord::Raster => Tracks::Raster { one_way: written.one_way },
+            TracksWord::Spiral => Tracks::Spiral,
+        },
+        scallop_mm: written.scallop_nm.map(|nm| 1e-6 * nm),
+        chord_error_mm: MM_PER_UM * written.chord_error_um,
+        overrun_mm: written.overrun_mm,
+        safe_height_mm: written.safe_height_mm,
+        path_mode: match written.path_mode {
+            PathModeWord::Blend => PathMode::Blend { tolerance_mm: MM_PER_UM * written.path_tolerance_um },
+            PathModeWord::ExactPath => PathMode::ExactPath,
+            PathModeWord::ExactStop => PathMode::ExactStop,
+        },
         spark_out_passes: written.spark_out_passes,
         allowance_mm: MM_PER_UM * written.allowance_um,
     })

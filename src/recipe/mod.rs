@@ -208,12 +208,50 @@ pub struct Grinding {
     pub wheel: Wheel,
     /// Feed along the track.
     pub feed_mm_min: f64,
-    /// Distance of the tracks.
+    /// Distance of the tracks; the largest one where a scallop height is given.
     pub track_mm: f64,
+    /// How the tracks run.
+    pub tracks: Tracks,
+    /// Height of the ridges between tracks at most.
+    pub scallop_mm: Option<f64>,
+    /// How far the lines of a program may be from the path of the wheel's centre.
+    pub chord_error_mm: f64,
+    /// How far tracks go on beyond the edge of the part.
+    pub overrun_mm: f64,
+    /// How far above its path the wheel travels between tracks.
+    pub safe_height_mm: f64,
+    /// How exactly the controller keeps to the program.
+    pub path_mode: PathMode,
     /// Passes without in-feed at the end.
     pub spark_out_passes: u16,
     /// Level of the first pass over the nominal surface; each further pass goes deeper by the depth of cut.
     pub allowance_mm: f64,
+}
+
+/// How tracks run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Tracks {
+    /// Along x, one beside the other.
+    Raster {
+        /// Whether all run towards +x.
+        one_way: bool,
+    },
+    /// From the rim to the middle.
+    Spiral,
+}
+
+/// How exactly a controller keeps to a program.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum PathMode {
+    /// Corners are rounded off.
+    Blend {
+        /// By so much at most.
+        tolerance_mm: f64,
+    },
+    /// Every point is passed through.
+    ExactPath,
+    /// Every point is stopped at.
+    ExactStop,
 }
 
 /// The shape of a wheel.
@@ -230,6 +268,8 @@ pub enum Wheel {
         radius_mm: f64,
         /// Radius of the rim's own curve.
         minor_radius_mm: f64,
+        /// Whether the spindle lies along x; else along y.
+        spindle_along_x: bool,
     },
     /// A ring that cuts with its face.
     Cup {
@@ -237,6 +277,8 @@ pub enum Wheel {
         radius_mm: f64,
         /// Radius of the face's own curve.
         minor_radius_mm: f64,
+        /// Tilt of the spindle from z towards -x; `None` for five degrees more than the part slopes.
+        tilt_rad: Option<f64>,
     },
 }
 

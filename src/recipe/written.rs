@@ -273,15 +273,69 @@ pub(super) struct GrindingTable {
     /// Feed along the track.
     #[schemars(range(min = 0.1, max = 100000.0), extend("x-required" = true), example = 600.0)]
     pub feed_mm_min: Option<f64>,
-    /// Distance of the tracks.
+    /// Distance of the tracks; the largest one where scallop_nm is given.
     #[schemars(range(min = 0.001, max = 1000.0), extend("x-required" = true), example = 0.5)]
     pub track_mm: Option<f64>,
+    /// How the tracks run.
+    pub pattern: TracksWord,
+    /// Whether every track of a raster runs towards +x; else they alternate.
+    pub one_way: bool,
+    /// Height of the ridges between tracks, at most: the tracks are laid as close as that takes.
+    #[schemars(range(min = 0.01, max = 1000000.0))]
+    pub scallop_nm: Option<f64>,
+    /// How far the straight lines of the program may be from the path of the wheel's centre.
+    #[schemars(range(min = 0.001, max = 100.0))]
+    pub chord_error_um: f64,
+    /// How far tracks go on beyond the edge of the part.
+    #[schemars(range(min = 0.0, max = 1000.0))]
+    pub overrun_mm: f64,
+    /// How far above the highest point of its path the wheel travels between tracks.
+    #[schemars(range(min = 0.5, max = 1000.0))]
+    pub safe_height_mm: f64,
+    /// How exactly the controller keeps to the program.
+    pub path_mode: PathModeWord,
+    /// How far the controller may round a corner off with path_mode = "blend".
+    #[schemars(range(min = 0.001, max = 1000.0))]
+    pub path_tolerance_um: f64,
     /// Passes without in-feed at the end.
     #[schemars(range(max = 20))]
     pub spark_out_passes: u16,
     /// Level of the first pass over the nominal surface; each further pass goes deeper by the depth of cut.
     #[schemars(range(min = 0.0, max = 10000.0))]
     pub allowance_um: f64,
+}
+
+/// How tracks run.
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum TracksWord {
+    /// Along x, one beside the other.
+    #[default]
+    Raster,
+    /// From the rim to the middle.
+    Spiral,
+}
+
+/// How exactly a controller keeps to a program.
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum PathModeWord {
+    /// G64: corners are rounded off within path_tolerance_um.
+    #[default]
+    Blend,
+    /// G61: every point is passed through.
+    ExactPath,
+    /// G61.1: every point is stopped at.
+    ExactStop,
+}
+
+/// An axis of the model frame.
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum AxisWord {
+    X,
+    #[default]
+    Y,
 }
 
 /// The wheel.
@@ -293,7 +347,7 @@ pub(super) enum WheelTable {
     /// A disc with a round rim.
     Torus(RimTable),
     /// A ring that cuts with its face.
-    Cup(RimTable),
+    Cup(CupTable),
 }
 
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
@@ -307,12 +361,28 @@ pub(super) struct BallTable {
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub(super) struct RimTable {
-    /// Radius to the outermost point of the rim, or to the middle of the face.
+    /// Radius to the outermost point of the rim.
     #[schemars(range(min = 0.1, max = 1000.0), extend("x-required" = true), example = 75.0)]
     pub radius_mm: Option<f64>,
-    /// Radius of the rim's or the face's own curve.
+    /// Radius of the rim's own curve.
     #[schemars(range(min = 0.05, max = 1000.0), extend("x-required" = true), example = 2.0)]
     pub minor_radius_mm: Option<f64>,
+    /// Axis of the model frame that the spindle lies along: across the tracks of a raster is y.
+    pub spindle: AxisWord,
+}
+
+#[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct CupTable {
+    /// Radius to the middle of the face.
+    #[schemars(range(min = 0.1, max = 1000.0), extend("x-required" = true), example = 40.0)]
+    pub radius_mm: Option<f64>,
+    /// Radius of the face's own curve.
+    #[schemars(range(min = 0.05, max = 1000.0), extend("x-required" = true), example = 2.0)]
+    pub minor_radius_mm: Option<f64>,
+    /// Tilt of the spindle from z towards -x; left out, five degrees more than the part slopes.
+    #[schemars(range(min = 1.0, max = 80.0))]
+    pub tilt_deg: Option<f64>,
 }
 
 /// How often, and what to do when it does not get better.
@@ -398,7 +468,21 @@ impl Default for CompensationTable {
 
 impl Default for GrindingTable {
     fn default() -> Self {
-        Self { wheel: None, feed_mm_min: None, track_mm: None, spark_out_passes: 2, allowance_um: 0.0 }
+        Self {
+            wheel: None,
+            feed_mm_min: None,
+            track_mm: None,
+            pattern: TracksWord::Raster,
+            one_way: false,
+            scallop_nm: None,
+            chord_error_um: 0.1,
+            overrun_mm: 2.0,
+            safe_height_mm: 10.0,
+            path_mode: PathModeWord::Blend,
+            path_tolerance_um: 0.1,
+            spark_out_passes: 2,
+            allowance_um: 0.0,
+        }
     }
 }
 

@@ -285,6 +285,12 @@ impl Nominal {
             .collect()
     }
 
+    /// Returns the steepest slope against the plane of x and y that some places spread over the surface have, in radians.
+    pub(crate) fn steepest_rad(&self) -> f64 {
+        let normals = self.sampled_vertices(SAMPLE).into_iter().map(|(_, n)| n.z.clamp(-1.0, 1.0).acos());
+        normals.fold(0.0, f64::max)
+    }
+
     /// Returns some points spread over the surface.
     pub(crate) fn sample(&self, count: usize) -> Vec<Point> {
         let share = (count / self.patches.len()).max(1);

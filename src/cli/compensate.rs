@@ -1,0 +1,121 @@
+//! `regrind compensate`: corrects a program that exists already by a map of the part's error.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use regrind::compensation::path::{Wanted, height_of, spline_of};
+use regrind::compensation::{Correction, Net};
+use regrind::formats::gcode::{AlongNormals, Amendment, MapKind, correct_program, read_program_map};
+use serde::Serialize;
+
+use super::failure::Failure;
+use super::nominal::{self, ProjectionName};
+use super::words::three_digits;
+use super::{Outcome, finite_above_zero};
+
+/// Correct a program that exists already by a map of the part's error
+#[derive(Args, Debug)]
+#[command(after_long_help = LONG_HELP, after_help = "Example:\n  regrind compensate --program part.ngc --map error_map.csv --out part-2.ngc\n\n--help \
+tells more than -h.")]
+pub(super) struct Arguments {
+    /// Program to be corrected, in the dialect of LinuxCNC
+    #[arg(long, value_name = "FILE")]
+    program: PathBuf,
+    /// error_map.csv, whose error is taken off, or correction.csv, which is added
+    #[arg(long, value_name = "FILE")]
+    map: PathBuf,
+    /// Share of the map that is applied
+    #[arg(long, value_name = "SHARE", default_value_t = 1.0, value_parser = finite_above_zero)]
+    gain: f64,
+    /// The program's new text
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Apply the map along the normals of this nominal surface instead of along z
+    #[arg(long, value_name = "FILE")]
+    nominal: Option<PathBuf>,
+    /// With --nominal: the program moves the lowest point of a ball of this radius, not its centre; in mm
+    #[arg(long, value_name = "MM", requires = "nominal", value_parser = finite_above_zero)]
+    tip_of_radius: Option<f64>,
+    /// How far the new program may be from the corrected path, in um
+    #[arg(long, value_name = "UM", default_value_t = 0.1, value_parser = finite_above_zero)]
+    tolerance_um: f64,
+    /// Print JSON instead of a summary
+    #[arg(long)]
+    json: bool,
+}
+
+const LONG_HELP: &str = "\
+Example:
+  regrind compensate --program part.ngc --map error_map.csv --out part-2.ngc
+
+x and y of the map are those of the program's work coordinates (G54): the model frame. A map is applied along z unless
+--nominal is given; on a slope a correction e then lacks e (1 - nz). With --nominal the wheel is a ball of any radius,
+and the program moves its centre, or its lowest point with --tip-of-radius.
+
+Straight moves at feed are divided where the correction changes along them. An arc stays an arc where the correction
+is the same all along it, else it becomes chords. Rapid moves (G0) and moves in machine coordinates (G53) stay as they
+are. Refused, with their line: variables, O-words, canned cycles, cutter compensation, G92 and other moved zeros, inverse
+time, rotary axes, a change of the work coordinates on the way. Comments are kept, line numbers are not.
+
+The new program names the hash of the old one and of the map. A program that names the map already is refused, and so is a map
+that names another part.
+
+Exit codes: 0 written; 2 bad arguments or data; 3 fault.";
+
+/// What is told.
+#[derive(Serialize)]
+struct Document<'a> {
+    simulation: bool,
+    out: &'a std::path::Path,
+    #[serde(flatten)]
+    amended: regrind::formats::gcode::Amended,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let map = read_program_map(&arguments.map).map_err(Failure::Program)?;
+    // An error is taken off; a correction is what the surface is to be moved by.
+    let sign = if map.kind == MapKind::Error { -arguments.gain } else { arguments.gain };
+    let values_mm = map.values_mm.iter().map(|v| sign * v).collect();
+    let tip_mm = arguments.tip_of_radius.unwrap_or(0.0);
+    let level_off_mm = LEVEL_OFF_NODES * map.net.spacing_mm[0].max(map.net.spacing_mm[1]);
+    let shift = spline_of(&Correction { net: map.net, values_mm, cycle: 1, level_mm: 0.0 }, level_off_mm);
+    let ground = arguments.nominal.as_ref().map(|file| ground(file)).transpose()?;
+    let amendment = Amendment {
+        shift: &shift,
+        along_normals: ground.as_ref().map(|nominal| AlongNormals { nominal, centre_above_mm: tip_mm }),
+        tolerance_mm: 1e-3 * arguments.tolerance_um,
+        map_identity: map.identity,
+        part: map.part,
+        gain: arguments.gain,
+        simulation: map.simulation,
+    };
+    let amended = correct_program(&arguments.program, &arguments.out, &amendment).map_err(Failure::Program)?;
+    if arguments.json {
+        super::print_json(&Document { simulation: map.simulation, out: &arguments.out, amended })?;
+    } else {
+        let marked = if map.simulation { "SIMULATION  " } else { "" };
+        super::print(&format!(
+            "{marked}{}: {} straight moves and {} arcs became {} moves, {} arcs among them; no point moved by more than {} um\n",
+            arguments.out.display(),
+            amended.straight,
+            amended.arcs,
+            amended.written,
+            amended.arcs_kept,
+            three_digits(1e3 * amended.largest_mm)
+        ))?;
+    }
+    Ok(Outcome::Accepted)
+}
+
+/// Beyond its net a map is levelled off within so many nodes.
+const LEVEL_OFF_NODES: f64 = 5.0;
+
+/// Reads the nominal surface.
+fn ground(file: &std::path::Path) -> Result<Wanted, Failure> {
+    let read = nominal::read(file, ProjectionName::Auto)?;
+    let surface = nominal::surface(file, read, ProjectionName::Auto)?;
+    let failed = |source| Failure::Path { path: file.to_owned(), source };
+    let (field, _) = height_of(&surface).map_err(failed)?;
+    let net = Net { columns: 1, rows: 1, first_mm: [0.0; 2], spacing_mm: [1.0; 2] };
+    Wanted::new(field, &Correction::none(net, 0.0), 1.0).map_err(failed)
+}

@@ -1,0 +1,499 @@
+//! What must hold before a path is sent: the wheel fits the surface, and the machine can follow.
+
+use rayon::prelude::*;
+
+use crate::geometry::{Aperture, Point, Vector};
+
+use super::tracks::{Pattern, TrackSpacing};
+use super::wanted::Bend;
+use super::{Move, Moves, PathError, PathOptions, ToolPath, Wanted, Wheel};
+
+/// Places along each axis at which the wheel is held against the surface.
+const PLACES: usize = 101;
+/// Places of the wheel, and places of the surface along each axis, at which its body is held against the part.
+const BODIES: usize = 24;
+const GROUND: usize = 48;
+/// How much a wheel must be more curved than a hollow: in a nearer fit a little error of either touches along a line.
+const MARGIN: f64 = 1.05;
+/// Depth at which the body of a wheel cuts where it should not: what the surface's own smoothness leaves.
+const DEEPEST_MM: f64 = 1e-4;
+/// Steepest slope that a wheel grinds: beyond, the machine's spindle is in the way.
+const STEEPEST_RAD: f64 = 1.2;
+/// Most points of a path.
+const MOST_POINTS: u64 = 200_000_000;
+
+/// What a machine can do; `None` where it was not told.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Limits {
+    /// Least and largest x, y, z of the point that a program moves, in the frame of the program.
+    pub travel_mm: Option<[[f64; 3]; 2]>,
+    /// Largest speed of an axis.
+    pub speed_mm_s: Option<f64>,
+    /// Largest acceleration.
+    pub acceleration_mm_s2: Option<f64>,
+}
+
+/// A largest value and where it is.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Peak {
+    /// The value.
+    pub value: f64,
+    /// Where, over x and y.
+    pub at_mm: [f64; 2],
+    /// The feed there.
+    pub feed_mm_min: f64,
+}
+
+/// A path as a whole.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Summary {
+    /// Moves, rapid ones included.
+    pub moves: u64,
+    /// Points at feed.
+    pub points: u64,
+    /// Least x, y, z.
+    pub least_mm: [f64; 3],
+    /// Largest x, y, z.
+    pub most_mm: [f64; 3],
+    /// Length of the moves at feed.
+    pub length_mm: f64,
+    /// Length of the rapid moves.
+    pub rapid_mm: f64,
+    /// Time of the moves at feed, without acceleration.
+    pub seconds: f64,
+    /// Largest speed of each axis, in mm/s.
+    pub speed_mm_s: [Peak; 3],
+    /// Largest acceleration across the path, v^2 times its curvature, in mm/s2.
+    pub acceleration_mm_s2: Peak,
+    /// Feed with which tracks begin.
+    pub feed_mm_min: f64,
+    /// Length from standstill to the part.
+    pub run_up_mm: f64,
+}
+
+impl ToolPath {
+    /// Walks the whole path once, all tracks at the same time, and returns what is largest and least on it.
+    ///
+    /// # Errors
+    /// More than 2e8 points.
+    pub fn summary(&self) -> Result<Summary, PathError> {
+        let options = self.options();
+        let empty = Summary {
+            moves: 0,
+            points: 0,
+            least_mm: [f64::INFINITY; 3],
+            most_mm: [f64::NEG_INFINITY; 3],
+            length_mm: 0.0,
+            rapid_mm: 0.0,
+            seconds: 0.0,
+            speed_mm_s: [Peak::default(); 3],
+            acceleration_mm_s2: Peak::default(),
+            feed_mm_min: options.feed_mm_min,
+            run_up_mm: options.overrun_mm + options.lead_mm,
+        };
+        let whole = (0..self.tracks())
+            .into_par_iter()
+            .map(|k| {
+                let mut one = empty;
+                one.take(Moves::of(self, k, k + 1), self.safe_z_mm());
+                one
+            })
+            .reduce(|| empty, Summary::and);
+        if whole.points > MOST_POINTS {
+            return Err(PathError::TooManyPoints { points: whole.points, limit: MOST_POINTS });
+        }
+        Ok(whole)
+    }
+}
+
+impl Summary {
+    /// Takes in the moves of one track.
+    fn take(&mut self, mut moves: Moves, safe_z_mm: f64) {
+        let mut last: Option<Point> = None;
+        let mut height = safe_z_mm;
+        while let Some(one) = moves.next() {
+            self.moves += 1;
+            match one {
+                Move::RapidZ(z) => {
+                    let from = last.take().map_or(height, |p| p.z);
+                    self.rapid_mm += (z - from).abs();
+                    (self.least_mm[2], self.most_mm[2]) = (self.least_mm[2].min(z), self.most_mm[2].max(z));
+                    height = z;
+                }
+                Move::RapidXy(_) => {}
+                Move::Feed { at, feed_mm_min } => {
+                    self.points += 1;
+                    for k in 0..3 {
+                        (self.least_mm[k], self.most_mm[k]) = (self.least_mm[k].min(at[k]), self.most_mm[k].max(at[k]));
+                    }
+                    if let Some(from) = last {
+                        self.step(&(at - from), &at, feed_mm_min, moves.bend);
+                    }
+                    last = Some(at);
+                }
+            }
+        }
+    }
+
+    #[inline]
+    fn step(&mut self, by: &Vector, at: &Point, feed_mm_min: f64, bend: f64) {
+        let (length, speed) = (by.norm(), feed_mm_min / 60.0);
+        self.length_mm += length;
+        self.seconds += length / speed;
+        let share = if length > 0.0 { speed / length } else { 0.0 };
+        let peak = |value: f64| Peak { value, at_mm: [at.x, at.y], feed_mm_min };
+        for k in 0..3 {
+            if by[k].abs() * share > self.speed_mm_s[k].value {
+                self.speed_mm_s[k] = peak(by[k].abs() * share);
+            }
+        }
+        if speed * speed * bend > self.acceleration_mm_s2.value {
+            self.acceleration_mm_s2 = peak(speed * speed * bend);
+        }
+    }
+
+    fn and(self, other: Self) -> Self {
+        let larger = |a: Peak, b: Peak| if b.value > a.value { b } else { a };
+        Self {
+            moves: self.moves + other.moves,
+            points: self.points + other.points,
+            least_mm: std::array::from_fn(|k| self.least_mm[k].min(other.least_mm[k])),
+            most_mm: std::array::from_fn(|k| self.most_mm[k].max(other.most_mm[k])),
+            length_mm: self.length_mm + other.length_mm,
+            rapid_mm: self.rapid_mm + other.rapid_mm,
+            seconds: self.seconds + other.seconds,
+            speed_mm_s: std::array::from_fn(|k| larger(self.speed_mm_s[k], other.speed_mm_s[k])),
+            acceleration_mm_s2: larger(self.acceleration_mm_s2, other.acceleration_mm_s2),
+            ..self
+        }
+    }
+
+    /// Compares a path with what a machine can do. Jerk is left to the controller's planner.
+    ///
+    /// # Errors
+    /// Travel, speed of an axis, acceleration across the path, and a run-up v^2 / (2 a) longer than the way to the part.
+    pub fn check(&self, limits: &Limits) -> Result<(), PathError> {
+        if let Some([least, most]) = limits.travel_mm {
+            for (k, axis) in ['X', 'Y', 'Z'].into_iter().enumerate() {
+                for found_mm in [self.least_mm[k], self.most_mm[k]] {
+                    if !(least[k]..=most[k]).contains(&found_mm) {
+                        return Err(PathError::Travel { axis, found_mm, least_mm: least[k], most_mm: most[k] });
+                    }
+                }
+            }
+        }
+        if let Some(limit_mm_s) = limits.speed_mm_s {
+            for (axis, peak) in ['X', 'Y', 'Z'].into_iter().zip(self.speed_mm_s) {
+                // Rounding is no excess.
+                if peak.value > limit_mm_s * (1.0 + 1e-9) {
+                    let ([x_mm, y_mm], found_mm_s) = (peak.at_mm, peak.value);
+                    let feed_mm_min = (peak.feed_mm_min * limit_mm_s / found_mm_s).floor();
+                    return Err(PathError::Speed { axis, found_mm_s, x_mm, y_mm, limit_mm_s, feed_mm_min });
+                }
+            }
+        }
+        limits.acceleration_mm_s2.map_or(Ok(()), |limit| self.check_acceleration(limit))
+    }
+
+    fn check_acceleration(&self, limit_mm_s2: f64) -> Result<(), PathError> {
+        let Peak { value: found_mm_s2, at_mm: [x_mm, y_mm], feed_mm_min } = self.acceleration_mm_s2;
+        if found_mm_s2 > limit_mm_s2 {
+            let feed_mm_min = (feed_mm_min * (limit_mm_s2 / found_mm_s2).sqrt()).floor();
+            return Err(PathError::Acceleration { x_mm, y_mm, found_mm_s2, limit_mm_s2, feed_mm_min });
+        }
+        let found_mm = (self.feed_mm_min / 60.0).powi(2) / (2.0 * limit_mm_s2);
+        if found_mm > self.run_up_mm {
+            let feed_mm_min = (60.0 * (2.0 * limit_mm_s2 * self.run_up_mm).sqrt()).floor();
+            return Err(PathError::RunUp { found_mm, limit_mm: self.run_up_mm, feed_mm_min });
+        }
+        Ok(())
+    }
+}
+
+/// Checks options that make no sense whatever the surface.
+pub(super) fn options(options: &PathOptions) -> Result<(), PathError> {
+    let (spacing, height) = match options.spacing {
+        TrackSpacing::Distance(mm) => (mm, 1.0),
+        TrackSpacing::Scallop { height_mm, widest_mm } => (widest_mm, height_mm),
+    };
+    let (radius, tube) = match options.wheel {
+        Wheel::Sphere { radius_mm } => (radius_mm, radius_mm),
+        Wheel::Torus { ring_mm, tube_mm, .. } | Wheel::Cup { ring_mm, tube_mm, .. } => (ring_mm, tube_mm),
+    };
+    let above_zero = [
+        ("track spacing (mm)", spacing),
+        ("scallop height (mm)", height),
+        ("wheel radius (mm)", radius),
+        ("radius of the rim's curve (mm)", tube),
+        ("chord error (mm)", options.chord_error_mm),
+        ("longest step (mm)", options.longest_step_mm),
+        ("lead radius (mm)", options.lead_radius_mm),
+        ("feed (mm/min)", options.feed_mm_min),
+        ("acceleration on a spiral (mm/s2)", options.spiral_acceleration_mm_s2.unwrap_or(1.0)),
+    ];
+    for (key, found) in above_zero {
+        if !(found > 0.0 && found.is_finite()) {
+            return Err(PathError::Option { key, found, allowed: "a finite number above 0" });
+        }
+    }
+    for (key, found) in [
+        ("overrun (mm)", options.overrun_mm),
+        ("lead (mm)", options.lead_mm),
+        ("safe height (mm)", options.safe_height_mm),
+    ] {
+        if !(found >= 0.0 && found.is_finite()) {
+            return Err(PathError::Option { key, found, allowed: "a finite number, 0 or above" });
+        }
+    }
+    Ok(())
+}
+
+/// Holds the wheel against the surface at places all over the part, and returns the distance of the tracks over x and y.
+pub(super) fn fit(wanted: &Wanted, outline: &Aperture, options: &PathOptions) -> Result<f64, PathError> {
+    let places = places(outline, PLACES);
+    let one = |place: &[f64; 2]| fit_at(&wanted.bend(*place), *place, options);
+    let narrowest = places.par_iter().map(one).try_reduce(|| f64::INFINITY, |a, b| Ok(a.min(b)))?;
+    match options.spacing {
+        TrackSpacing::Distance(mm) => Ok(mm),
+        TrackSpacing::Scallop { widest_mm, .. } => Ok(narrowest.min(widest_mm)),
+    }
+}
+
+/// Places of a net over the part, its border included.
+fn places(outline: &Aperture, count: usize) -> Vec<[f64; 2]> {
+    let [low, high] = outline.bounds();
+    let at = |k: usize, i: usize| low[k] + (high[k] - low[k]) * i as f64 / (count - 1) as f64;
+    let net = (0..count * count).map(|n| [at(0, n % count), at(1, n / count)]);
+    net.filter(|[x, y]| outline.contains(*x, *y)).chain(outline.outline_mm(4 * count)).collect()
+}
+
+/// Checks slope and hollows at a place; returns the distance over x and y of tracks that leave the scallop wanted.
+fn fit_at(bend: &Bend, place: [f64; 2], options: &PathOptions) -> Result<f64, PathError> {
+    let [x_mm, y_mm] = place;
+    let normal = &bend.contact.normal;
+    let finite = (bend.curvature.iter().sum::<f64>() + bend.contact.point.z).is_finite();
+    if !finite {
+        return Err(PathError::NotAHeight { x_mm, y_mm });
+    }
+    let slope = normal.z.clamp(-1.0, 1.0).acos();
+    if slope > STEEPEST_RAD {
+        let (slope_deg, limit_deg) = (slope.to_degrees(), STEEPEST_RAD.to_degrees());
+        return Err(PathError::Steep { x_mm, y_mm, slope_deg, limit_deg });
+    }
+    if options.wheel.centre(&bend.contact).is_none() {
+        return Err(PathError::CannotTouch { x_mm, y_mm });
+    }
+    let wheel = wheel_in(bend, &options.wheel);
+    let [a, b, c] = std::array::from_fn(|k| wheel[k] - MARGIN * bend.curvature[k]);
+    // The gap opens in every direction where both the trace and the determinant of this are positive.
+    if !(a + c > 0.0 && a * c - b * b > 0.0) {
+        return Err(hollow(bend, &wheel, place));
+    }
+    let TrackSpacing::Scallop { height_mm: height, .. } = options.spacing else { return Ok(f64::INFINITY) };
+    // Across a raster is y, whatever the surface's slant; a spiral crosses everything.
+    let gap = std::array::from_fn::<f64, 3, _>(|k| wheel[k] - bend.curvature[k]);
+    let across = match options.pattern {
+        Pattern::Raster { .. } => gap[2],
+        Pattern::Spiral => 0.5 * (gap[0] + gap[2]) + (0.25 * (gap[0] - gap[2]).powi(2) + gap[1] * gap[1]).sqrt(),
+    };
+    // A millimetre along the surface is less over x and y.
+    let shortened = match options.pattern {
+        Pattern::Raster { .. } => (1.0 - bend.along[1].z.powi(2)).sqrt(),
+        Pattern::Spiral => normal.z,
+    };
+    Ok((8.0 * height / across).sqrt() * shortened)
+}
+
+/// The wheel's curvature in the directions of a bend: along, mixed, across.
+fn wheel_in(bend: &Bend, wheel: &Wheel) -> [f64; 3] {
+    let ([around, across], direction) = wheel.curvatures(&bend.contact.normal);
+    let [c, s] = [0, 1].map(|k| direction.dot(&bend.along[k]));
+    [around * c * c + across * s * s, (around - across) * s * c, around * s * s + across * c * c]
+}
+
+/// The direction in which the wheel fits least.
+fn hollow(bend: &Bend, wheel: &[f64; 3], [x_mm, y_mm]: [f64; 2]) -> PathError {
+    let in_direction = |q: &[f64; 3], angle: f64| {
+        let (s, c) = angle.sin_cos();
+        q[0] * c * c + 2.0 * q[1] * s * c + q[2] * s * s
+    };
+    let gap = |angle: f64| in_direction(wheel, angle) - MARGIN * in_direction(&bend.curvature, angle);
+    let angles = (0..180).map(|d| f64::from(d).to_radians());
+    let worst = angles.min_by(|a, b| gap(*a).total_cmp(&gap(*b))).unwrap_or(0.0);
+    let hollow_mm = 1.0 / in_direction(&bend.curvature, worst);
+    PathError::Hollow {
+        x_mm,
+        y_mm,
+        direction_deg: worst.to_degrees(),
+        hollow_mm,
+        wheel_mm: 1.0 / in_direction(wheel, worst),
+        limit_mm: hollow_mm / MARGIN,
+    }
+}
+
+/// Holds the whole body of the wheel, at places all over the part, against the whole part within its reach.
+///
+/// Curvature tells that a wheel fits where it touches; this tells that it does not touch elsewhere: the far side of a cup, the flank of a
+/// disc, the opposite wall of a valley.
+pub(super) fn body(path: &ToolPath) -> Result<(), PathError> {
+    let (wanted, wheel) = (path.wanted(), &path.options().wheel);
+    let ground: Vec<([f64; 2], Point)> =
+        places(path.outline(), GROUND).into_par_iter().map(|at| (at, wanted.at(at).point)).collect();
+    let reach = wheel.reach_mm() + DEEPEST_MM;
+    let one = |place: &[f64; 2]| {
+        let [x_mm, y_mm] = *place;
+        let centre = wheel.centre(&wanted.at(*place)).ok_or(PathError::CannotTouch { x_mm, y_mm })?;
+        for (at, point) in &ground {
+            let from = point - centre;
+            if from.norm_squared() > reach * reach {
+                continue;
+            }
+            let depth_mm = -wheel.distance_mm(&from);
+            if depth_mm > DEEPEST_MM {
+                let ([at_x_mm, at_y_mm], limit_mm) = (*at, DEEPEST_MM);
+                return Err(PathError::Body { x_mm, y_mm, at_x_mm, at_y_mm, depth_mm, limit_mm });
+            }
+        }
+        Ok(())
+    };
+    places(path.outline(), BODIES).par_iter().try_for_each(one)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::compensation::path::{Field, Lattice};
+    use crate::compensation::{Correction, Net};
+    use crate::geometry::Aperture;
+
+    const PART: Aperture = Aperture::Rectangle { centre_mm: [0.0, 0.0], width_mm: 16.0, height_mm: 12.0 };
+
+    /// A surface z = a x^2 + b y^2 without a correction.
+    fn quadric(a: f64, b: f64) -> Wanted {
+        let on = Lattice { columns: 81, rows: 81, first_mm: [-10.0, -10.0], spacing_mm: [0.25, 0.25] };
+        let places = (0..81 * 81).map(|k| [-10.0 + (k % 81) as f64 * 0.25, -10.0 + (k / 81) as f64 * 0.25]);
+        let (z, slopes): (Vec<f64>, Vec<[f64; 2]>) =
+            places.map(|[x, y]| (a * x * x + b * y * y, [2.0 * a * x, 2.0 * b * y])).unzip();
+        let net = Net { columns: 2, rows: 2, first_mm: [-8.0, -6.0], spacing_mm: [16.0, 12.0] };
+        let none = Correction { net, values_mm: vec![0.0; 4], cycle: 1, level_mm: 0.0 };
+        Wanted::new(Field::hermite(on, &z, &slopes), &none, 5.0).unwrap()
+    }
+
+    fn ball(radius_mm: f64) -> PathOptions {
+        PathOptions::new(Wheel::Sphere { radius_mm }, 0.5, 600.0)
+    }
+
+    fn path(wanted: Wanted, options: PathOptions) -> Result<ToolPath, PathError> {
+        ToolPath::new(wanted, PART, options)
+    }
+
+    #[test]
+    fn a_wheel_must_be_smaller_than_every_hollow_in_every_direction() {
+        // Hollow across the tracks with a radius of 20 mm, and on a dome along them.
+        let hollow = || quadric(-0.01, 0.025);
+        assert!(path(hollow(), ball(18.0)).is_ok());
+        let refused = path(hollow(), ball(20.5)).unwrap_err();
+        let PathError::Hollow { direction_deg, hollow_mm, wheel_mm, .. } = refused else { panic!("{refused}") };
+        assert!((direction_deg - 90.0).abs() < 5.0 && (hollow_mm - 20.0).abs() < 1.6 && wheel_mm == 20.5, "{refused}");
+        // A disc that rolls along the track is narrow across it, and would not fit the other way.
+        let disc = |spindle| PathOptions { wheel: Wheel::Torus { ring_mm: 40.0, tube_mm: 5.0, spindle }, ..ball(1.0) };
+        assert!(path(hollow(), disc(Vector::y())).is_ok());
+        assert!(matches!(path(hollow(), disc(Vector::x())), Err(PathError::Hollow { .. })));
+        assert!(path(quadric(0.0, 0.0), ball(1000.0)).is_ok());
+    }
+
+    #[test]
+    fn slopes_rims_and_bodies_are_held_against_the_part() {
+        assert!(matches!(path(quadric(0.2, 0.0), ball(1.0)), Err(PathError::Steep { .. })));
+        // Along x the part faces the spindle more and more.
+        let along = Wheel::Torus { ring_mm: 3.0, tube_mm: 0.5, spindle: Vector::new(0.6, 0.0, 0.8) };
+        assert!(matches!(
+            path(quadric(-0.05, 0.0), PathOptions { wheel: along, ..ball(1.0) }),
+            Err(PathError::CannotTouch { .. })
+        ));
+        // A cup that is tilted less than the dome slopes would have to touch with the other side of its ring.
+        let cup = PathOptions { wheel: Wheel::tilted_cup(6.0, 1.0, 0.15), ..ball(1.0) };
+        assert!(matches!(path(quadric(-0.0125, -0.001), cup), Err(PathError::CannotTouch { .. })));
+        assert!(path(quadric(-0.002, -0.001), cup).is_ok());
+    }
+
+    #[test]
+    fn options_that_make_no_path_are_named() {
+        for (options, key) in [
+            (PathOptions { chord_error_mm: 0.0, ..ball(5.0) }, "chord error (mm)"),
+            (PathOptions { feed_mm_min: f64::NAN, ..ball(5.0) }, "feed (mm/min)"),
+            (PathOptions { overrun_mm: -1.0, ..ball(5.0) }, "overrun (mm)"),
+            (ball(-5.0), "wheel radius (mm)"),
+        ] {
+            assert!(matches!(path(quadric(0.0, 0.0), options), Err(PathError::Option { key: k, .. }) if k == key));
+        }
+    }
+
+    #[test]
+    fn the_scallop_height_sets_the_distance_of_tracks() {
+        let spacing = TrackSpacing::Scallop { height_mm: 1e-4, widest_mm: 5.0 };
+        let flat = path(quadric(0.0, 0.0), PathOptions { spacing, ..ball(10.0) }).unwrap();
+        // h = s^2 / (8 R); the tracks are laid evenly, so a little closer.
+        let most = (8.0f64 * 10.0 * 1e-4).sqrt();
+        assert!(flat.track_mm() <= most && flat.track_mm() > 0.98 * most, "{}", flat.track_mm());
+        // In a hollow of 20 mm the ridges are half as high.
+        let hollow = path(quadric(0.0, 0.025), PathOptions { spacing, ..ball(10.0) }).unwrap();
+        assert!(hollow.track_mm() > 1.2 * most);
+    }
+
+    #[test]
+    fn a_machine_must_be_able_to_follow() {
+        let path = path(quadric(0.01, 0.01), ball(10.0)).unwrap();
+        let summary = path.summary().unwrap();
+        // 10 mm/s.
+        let Peak { value, .. } = summary.acceleration_mm_s2;
+        // It comes down on a radius of 5 mm over x and y, which is a little more along the slope.
+        assert!((value - 100.0 / 5.0).abs() < 1.5, "{value}");
+        assert!(summary.check(&Limits::default()).is_ok());
+        let travel_mm = Some([[-9.0, -50.0, 0.0], [50.0, 50.0, 50.0]]);
+        assert!(matches!(
+            summary.check(&Limits { travel_mm, ..Limits::default() }),
+            Err(PathError::Travel { axis: 'X', .. })
+        ));
+        let speed_mm_s = Some(9.0);
+        assert!(matches!(
+            summary.check(&Limits { speed_mm_s, ..Limits::default() }),
+            Err(PathError::Speed { axis: 'X', .. })
+        ));
+        let limited = |a: f64| summary.check(&Limits { acceleration_mm_s2: Some(a), ..Limits::default() });
+        assert!(limited(25.0).is_ok());
+        let Err(PathError::Acceleration { feed_mm_min, .. }) = limited(10.0) else { panic!() };
+        assert!((feed_mm_min - 600.0 * (10.0 / value).sqrt()).abs() < 1.0);
+        let straight = Summary { acceleration_mm_s2: Peak::default(), ..summary };
+        let slow = Limits { acceleration_mm_s2: Some(1.0), ..Limits::default() };
+        assert!(matches!(straight.check(&slow), Err(PathError::RunUp { .. })));
+    }
+
+    #[test]
+    fn every_point_is_told_and_the_chords_keep_to_the_path() {
+        let path = path(quadric(0.01, -0.005), ball(10.0)).unwrap();
+        let summary = path.summary().unwrap();
+        assert_eq!(path.moves().count() as u64, summary.moves);
+        let mut last: Option<Point> = None;
+        for one in path.moves() {
+            if let (Move::Feed { at, .. }, Some(from)) = (one, last) {
+                let middle = nalgebra::center(&from, &at);
+                // The centre of a ball that touches is 10 mm from the surface; in a lead it is more.
+                let nearest = |p: &Point| {
+                    let mut place = [p.x, p.y];
+                    for _ in 0..50 {
+                        let contact = path.wanted().at(place);
+                        let off = p - contact.point;
+                        let aside = off - contact.normal * off.dot(&contact.normal);
+                        place = [place[0] + 0.7 * aside.x, place[1] + 0.7 * aside.y];
+                    }
+                    (p - path.wanted().at(place).point).norm()
+                };
+                let off = nearest(&middle) - 10.0;
+                let on_part = PART.contains(middle.x, middle.y);
+                assert!(off > -1.1e-4 && (!on_part || off < 1.1e-4), "{off} at {middle}");
+            }
+            last = if let Move::Feed { at, .. } = one { Some(at) } else { None };
+        }
+    }
+}

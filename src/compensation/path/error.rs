@@ -1,0 +1,70 @@
+//! Why there is no path, or why it must not be sent.
+
+use thiserror::Error;
+
+/// Why there is no path, or why it must not be sent: what, where, the limit, and what to do.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[allow(missing_docs)]
+pub enum PathError {
+    #[error("there is no surface to lay a path over; check the nominal surface and its outline")]
+    Empty,
+    #[error(
+        "the nominal surface is no height over x and y at x {x_mm:.3}, y {y_mm:.3} mm: it is steeper than 84 degrees or turned away from +z; turn \
+         the model frame so that z looks away from the part"
+    )]
+    NotAHeight { x_mm: f64, y_mm: f64 },
+    #[error(
+        "the part is worked on from the side of -z (measure.side), and paths are laid on the side of +z; turn the model frame so that z looks away \
+         from the part"
+    )]
+    OtherSide,
+    #[error("the correction is not a finite number at x {x_mm:.3}, y {y_mm:.3} mm; make it anew")]
+    Correction { x_mm: f64, y_mm: f64 },
+    #[error("{key} is {found}; it must be {allowed}")]
+    Option { key: &'static str, found: f64, allowed: &'static str },
+    #[error("tracks every {track_mm} mm make {tracks:.0} tracks, more than {limit:.0}; choose a wider distance")]
+    TooManyTracks { tracks: f64, track_mm: f64, limit: f64 },
+    #[error(
+        "the surface is hollow with a radius of {hollow_mm:.3} mm at x {x_mm:.3}, y {y_mm:.3} mm, at {direction_deg:.0} degrees from the track, and \
+         the wheel has {wheel_mm:.3} mm in that direction; it must be less than {limit_mm:.3} mm: take a smaller wheel"
+    )]
+    Hollow { x_mm: f64, y_mm: f64, direction_deg: f64, hollow_mm: f64, wheel_mm: f64, limit_mm: f64 },
+    #[error(
+        "the surface slopes by {slope_deg:.1} degrees at x {x_mm:.3}, y {y_mm:.3} mm, more than the {limit_deg:.1} degrees that this wheel can \
+         grind; turn the part, or take another wheel"
+    )]
+    Steep { x_mm: f64, y_mm: f64, slope_deg: f64, limit_deg: f64 },
+    #[error(
+        "the rim of the wheel cannot touch the surface at x {x_mm:.3}, y {y_mm:.3} mm: the normal there lies along the spindle within \
+         2 degrees; tilt the spindle further than the part slopes"
+    )]
+    CannotTouch { x_mm: f64, y_mm: f64 },
+    #[error(
+        "while it touches x {x_mm:.3}, y {y_mm:.3} mm the wheel would cut {depth_um:.2} um deep at x {at_x_mm:.3}, y {at_y_mm:.3} mm, and {limit_um} um \
+         is the limit; take a smaller wheel, or tilt its spindle",
+        depth_um = 1e3 * depth_mm, limit_um = 1e3 * limit_mm
+    )]
+    Body { x_mm: f64, y_mm: f64, at_x_mm: f64, at_y_mm: f64, depth_mm: f64, limit_mm: f64 },
+    #[error(
+        "the path reaches {axis} {found_mm:.3} mm, beyond the travel of {least_mm} to {most_mm} mm; move the part or its work offset, or \
+         shorten the overrun"
+    )]
+    Travel { axis: char, found_mm: f64, least_mm: f64, most_mm: f64 },
+    #[error(
+        "the path moves {axis} at {found_mm_s:.2} mm/s at x {x_mm:.3}, y {y_mm:.3} mm, faster than the machine's {limit_mm_s} mm/s; lower the feed to \
+         {feed_mm_min:.0} mm/min"
+    )]
+    Speed { axis: char, found_mm_s: f64, x_mm: f64, y_mm: f64, limit_mm_s: f64, feed_mm_min: f64 },
+    #[error(
+        "the path bends at x {x_mm:.3}, y {y_mm:.3} mm so that {found_mm_s2:.1} mm/s2 would be needed across it, more than the machine's \
+         {limit_mm_s2} mm/s2; lower the feed to {feed_mm_min:.0} mm/min"
+    )]
+    Acceleration { x_mm: f64, y_mm: f64, found_mm_s2: f64, limit_mm_s2: f64, feed_mm_min: f64 },
+    #[error(
+        "the wheel needs {found_mm:.2} mm to come up to the feed, and has {limit_mm:.2} mm before the part; lengthen the overrun, or lower the \
+         feed to {feed_mm_min:.0} mm/min"
+    )]
+    RunUp { found_mm: f64, limit_mm: f64, feed_mm_min: f64 },
+    #[error("the path has {points} points, more than {limit}; allow a larger chord error or wider tracks")]
+    TooManyPoints { points: u64, limit: u64 },
+}

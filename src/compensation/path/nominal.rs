@@ -1,0 +1,205 @@
+//! From a nominal surface to a smooth height over x and y.
+
+use rayon::prelude::*;
+
+use crate::geometry::{Aperture, Point};
+use crate::surface::{Nominal, NominalKind, OffsetSurface, Place, Side};
+
+use super::PathError;
+use super::field::{Field, Lattice};
+
+/// Most nodes of a field that is laid over points that are no grid.
+const MOST_NODES: f64 = 2e6;
+/// Steps of Newton's method down to a surface; each squares the error.
+const STEPS: usize = 8;
+/// Normals flatter than this are no height over the plane: 84 degrees of slope.
+const LEAST_UPRIGHT: f64 = 0.1;
+
+/// Returns the nominal surface as a height, and the outline of the part: the one stated, or the box around its points.
+///
+/// A grid that is regular in x and y is taken as it is, with its normals; any other surface is sampled as finely as its points lie.
+///
+/// # Errors
+/// A surface that is steeper than 84 degrees somewhere, or turned away from +z.
+pub fn height_of(nominal: &Nominal) -> Result<(Field, Aperture), PathError> {
+    let [low, high] = bounds(nominal);
+    let outline = nominal.outline().cloned().unwrap_or(Aperture::Rectangle {
+        centre_mm: [0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1])],
+        width_mm: high[0] - low[0],
+        height_mm: high[1] - low[1],
+    });
+    let field = match regular(nominal)? {
+        Some(field) => field,
+        None => sampled(nominal, [low, high])?,
+    };
+    Ok((field, outline))
+}
+
+fn bounds(nominal: &Nominal) -> [[f64; 2]; 2] {
+    nominal.points().fold([[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]], |[low, high], p| {
+        [[low[0].min(p.x), low[1].min(p.y)], [high[0].max(p.x), high[1].max(p.y)]]
+    })
+}
+
+/// The field of a surface whose nodes are a regular grid already.
+fn regular(nominal: &Nominal) -> Result<Option<Field>, PathError> {
+    let (NominalKind::Grid { columns, rows }, [patch]) = (nominal.kind(), nominal.patches()) else { return Ok(None) };
+    let nodes = patch.nodes();
+    // Two nodes that are there tell where all are.
+    let of = |k: usize| (k % columns, k / columns);
+    let mut there = (0..nodes.len()).filter(|&k| nodes[k].point.x.is_finite());
+    let Some(first) = there.next() else { return Ok(None) };
+    let other = |axis: usize| {
+        let at = |k: usize| [of(k).0, of(k).1][axis];
+        let far =
+            (0..nodes.len()).filter(|&k| nodes[k].point.x.is_finite()).max_by_key(|&k| at(k).abs_diff(at(first)))?;
+        let steps = at(far) as f64 - at(first) as f64;
+        let spacing = (nodes[far].point[axis] - nodes[first].point[axis]) / steps;
+        Some((spacing, nodes[first].point[axis] - spacing * at(first) as f64))
+    };
+    let (Some((dx, x0)), Some((dy, y0))) = (other(0), other(1)) else { return Ok(None) };
+    let on = Lattice { columns, rows, first_mm: [x0, y0], spacing_mm: [dx, dy] };
+    let is_regular = |k: usize| {
+        let (p, (i, j)) = (&nodes[k].point, of(k));
+        !p.x.is_finite()
+            || ((p.x - x0 - i as f64 * dx).abs() < 1e-4 * dx && (p.y - y0 - j as f64 * dy).abs() < 1e-4 * dy)
+    };
+    if !(dx > 0.0 && dy > 0.0 && (0..nodes.len()).into_par_iter().all(is_regular)) {
+        return Ok(None);
+    }
+    let mut slopes = Vec::with_capacity(nodes.len());
+    let mut heights = Vec::with_capacity(nodes.len());
+    for (k, node) in nodes.iter().enumerate() {
+        let (p, n) = (&node.point, &node.normal);
+        if !(p.z.is_finite() && n.z.is_finite()) {
+            (slopes.push([0.0; 2]), heights.push(f64::NAN));
+            continue;
+        }
+        if n.z < LEAST_UPRIGHT {
+            return Err(PathError::NotAHeight { x_mm: p.x, y_mm: p.y });
+        }
+        let slope = [-n.x / n.z, -n.y / n.z];
+        // A node that is off its place by rounding is brought there along its tangent.
+        let (i, j) = of(k);
+        let off = [x0 + i as f64 * dx - p.x, y0 + j as f64 * dy - p.y];
+        (slopes.push(slope), heights.push(p.z + slope[0] * off[0] + slope[1] * off[1]));
+    }
+    Ok(Some(Field::hermite(on, &heights, &slopes)))
+}
+
+/// The field of any other surface: its height is searched for at every node.
+fn sampled(nominal: &Nominal, [low, high]: [[f64; 2]; 2]) -> Result<Field, PathError> {
+    let surface = OffsetSurface::new(nominal, 0.0, Side::Normal).map_err(|_| PathError::Empty)?;
+    let size = [high[0] - low[0], high[1] - low[1]];
+    let count = (nominal.len() as f64).clamp(9.0, MOST_NODES);
+    let spacing = (size[0] * size[1] / count).sqrt();
+    if !(spacing > 0.0 && spacing.is_finite()) {
+        return Err(PathError::Empty);
+    }
+    let cells = size.map(|s| (s / spacing).ceil().clamp(2.0, MOST_NODES.sqrt()));
+    let [columns, rows] = cells.map(|c| c as usize + 1);
+    let on = Lattice { columns, rows, first_mm: low, spacing_mm: [size[0] / cells[0], size[1] / cells[1]] };
+    let middle = nominal.points().map(|p| p.z).sum::<f64>() / nominal.len() as f64;
+    let lines: Result<Vec<Vec<(f64, [f64; 2])>>, PathError> = (0..rows)
+        .into_par_iter()
+        .map(|j| {
+            let (mut place, mut z) = (Place::UNKNOWN, middle);
+            (0..columns)
+                .map(|i| {
+                    let [x, y] = [low[0] + i as f64 * on.spacing_mm[0], low[1] + j as f64 * on.spacing_mm[1]];
+                    let node = height_at(&surface, [x, y], z, &mut place)?;
+                    if node.0.is_finite() {
+                        z = node.0;
+                    }
+                    Ok(node)
+                })
+                .collect()
+        })
+        .collect();
+    let (heights, slopes): (Vec<f64>, Vec<[f64; 2]>) = lines?.into_iter().flatten().unzip();
+    Ok(Field::hermite(on, &heights, &slopes))
+}
+
+/// Searches the height and the slopes at a place; NaN off the part.
+fn height_at(
+    surface: &OffsetSurface,
+    [x, y]: [f64; 2],
+    start_mm: f64,
+    place: &mut Place,
+) -> Result<(f64, [f64; 2]), PathError> {
+    let mut z = start_mm;
+    for _ in 0..STEPS {
+        let foot = surface.foot(&Point::new(x, y, z), *place);
+        *place = foot.place;
+        let n = foot.normal;
+        if n.z < LEAST_UPRIGHT {
+            return Err(PathError::NotAHeight { x_mm: x, y_mm: y });
+        }
+        let step = foot.distance_mm / n.z;
+        z -= step;
+        if step.abs() < 1e-10 {
+            if foot.beyond_mm > 0.0 && foot.beyond_steps > 1.0 {
+                return Ok((f64::NAN, [0.0; 2]));
+            }
+            return Ok((z, [-n.x / n.z, -n.y / n.z]));
+        }
+    }
+    Ok((f64::NAN, [0.0; 2]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Vector;
+    use crate::surface::Projection;
+
+    fn z(x: f64, y: f64) -> (f64, [f64; 2]) {
+        (0.01 * x * x - 0.004 * y * y + 0.1 * x, [0.02 * x + 0.1, -0.008 * y])
+    }
+
+    #[test]
+    fn a_grid_with_normals_is_taken_as_it_is_and_holes_are_continued() {
+        let (columns, rows) = (41, 31);
+        let place = |k: usize| [(k % columns) as f64 * 0.5 - 10.0, (k / columns) as f64 * 0.5 - 7.5];
+        let hole = |[x, y]: [f64; 2]| x.hypot(y) > 7.6;
+        let nan = Point::new(f64::NAN, f64::NAN, f64::NAN);
+        let points: Vec<Point> = (0..columns * rows)
+            .map(place)
+            .map(|[x, y]| if hole([x, y]) { nan } else { Point::new(x, y, z(x, y).0) })
+            .collect();
+        let normals = (0..columns * rows)
+            .map(place)
+            .map(|[x, y]| Vector::new(-z(x, y).1[0], -z(x, y).1[1], 1.0).normalize())
+            .collect();
+        let nominal = Nominal::from_grid_with_normals(columns, rows, points, normals)
+            .unwrap()
+            .with_outline(Aperture::Circle { centre_mm: [0.0; 2], radius_mm: 6.0 });
+        let (field, outline) = height_of(&nominal).unwrap();
+        assert_eq!(outline.reach_mm(), 6.0);
+        for [x, y] in [[0.3, 0.1], [-5.1, 2.7], [1.1, -5.8]] {
+            let jet = field.at([x, y]);
+            assert!((jet.value - z(x, y).0).abs() < 1e-9 && (jet.slope[0] - z(x, y).1[0]).abs() < 1e-9);
+        }
+        assert!((field.at([9.0, 6.0]).value - z(9.0, 6.0).0).abs() < 0.2);
+    }
+
+    #[test]
+    fn scattered_points_are_sampled() {
+        let points: Vec<Point> = (0..3000)
+            .map(|k| [(f64::from(k) * 0.618_034).fract() * 20.0 - 10.0, (f64::from(k) + 0.5) / 200.0 - 7.5])
+            .map(|[x, y]| Point::new(x, y, z(x, y).0))
+            .collect();
+        let nominal = Nominal::scattered(points, Projection::Xy).unwrap();
+        let (field, _) = height_of(&nominal).unwrap();
+        for [x, y] in [[0.3, 0.1], [-5.1, 2.7], [7.1, -5.8]] {
+            assert!((field.at([x, y]).value - z(x, y).0).abs() < 2e-6, "{}", field.at([x, y]).value - z(x, y).0);
+        }
+    }
+
+    #[test]
+    fn a_wall_is_refused() {
+        let points = (0..25).map(|k| Point::new(f64::from(k % 5), f64::from(k / 5), 20.0 * f64::from(k % 5))).collect();
+        let nominal = Nominal::from_points(points, Projection::Xy).unwrap();
+        assert!(matches!(height_of(&nominal), Err(PathError::NotAHeight { .. })));
+    }
+}

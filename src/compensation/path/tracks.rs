@@ -1,0 +1,282 @@
+//! Tracks over x and y: a raster along x or a spiral from the rim inwards, cut where they are off the part.
+
+use std::f64::consts::TAU;
+
+use crate::geometry::Aperture;
+
+use super::{PathError, PathOptions};
+
+/// Most tracks of a path.
+const MOST_TRACKS: f64 = 1e6;
+/// Places at which a track is looked at for whether it is on the part; parts of it that are shorter may be missed.
+const LOOKS: usize = 720;
+
+/// How tracks run.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Pattern {
+    /// Along x, one beside the other in y from the least to the largest.
+    Raster {
+        /// Whether every track runs towards +x; else they alternate.
+        one_way: bool,
+    },
+    /// On a spiral about the middle of the outline, from outside inwards, turning clockwise seen from +z.
+    Spiral,
+}
+
+/// How far apart tracks are.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum TrackSpacing {
+    /// So far over x and y, in millimetres, at most.
+    Distance(f64),
+    /// As far as leaves ridges of a height at most, in millimetres: h = s^2 / (8 r_eff), with 1 / r_eff the curvature of the wheel less
+    /// that of the hollow surface across the track.
+    Scallop {
+        /// The height.
+        height_mm: f64,
+        /// Never farther apart than this, in millimetres.
+        widest_mm: f64,
+    },
+}
+
+/// A track, or a piece of one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Span {
+    curve: Curve,
+    /// Where it meets and leaves the part and its overrun, in the curve's own parameter.
+    pub(super) from: f64,
+    pub(super) to: f64,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Curve {
+    /// The parameter is x.
+    Line { y_mm: f64 },
+    /// r = b |angle|; the parameter is the angle, which falls to 0 in the middle.
+    Spiral { centre_mm: [f64; 2], rise_mm: f64 },
+}
+
+/// The tracks of a path.
+#[derive(Clone, Debug)]
+pub(super) struct Tracks {
+    pub(super) spans: Vec<Span>,
+    pub(super) track_mm: f64,
+}
+
+impl Span {
+    /// Returns x and y at a parameter.
+    #[inline]
+    pub(super) fn place(&self, t: f64) -> [f64; 2] {
+        match self.curve {
+            Curve::Line { y_mm } => [t, y_mm],
+            Curve::Spiral { centre_mm: [x, y], rise_mm } => {
+                let (sine, cosine) = t.sin_cos();
+                [x + rise_mm * t * cosine, y + rise_mm * t * sine]
+            }
+        }
+    }
+
+    /// Returns the length over x and y from the origin of the parameter.
+    #[inline]
+    fn arc_mm(&self, t: f64) -> f64 {
+        match self.curve {
+            Curve::Line { .. } => t,
+            Curve::Spiral { rise_mm, .. } => 0.5 * rise_mm * (t * (1.0 + t * t).sqrt() + t.asinh()),
+        }
+    }
+
+    /// Returns the length over x and y per unit of the parameter.
+    #[inline]
+    pub(super) fn speed_mm(&self, t: f64) -> f64 {
+        match self.curve {
+            Curve::Line { .. } => 1.0,
+            Curve::Spiral { rise_mm, .. } => rise_mm * (1.0 + t * t).sqrt(),
+        }
+    }
+
+    /// Returns the length between two parameters over x and y.
+    pub(super) fn length_mm(&self, from: f64, to: f64) -> f64 {
+        (self.arc_mm(to) - self.arc_mm(from)).abs()
+    }
+
+    /// Returns the parameter this far beyond another one.
+    fn beyond(&self, t: f64, by_mm: f64) -> f64 {
+        match self.curve {
+            Curve::Line { .. } => t + by_mm,
+            Curve::Spiral { .. } => {
+                let wanted = self.arc_mm(t) + by_mm;
+                let mut at = t + by_mm / self.speed_mm(t);
+                for _ in 0..60 {
+                    let step = (self.arc_mm(at) - wanted) / self.speed_mm(at);
+                    at -= step;
+                    if step.abs() < 1e-12 * (1.0 + at.abs()) {
+                        break;
+                    }
+                }
+                at
+            }
+        }
+    }
+
+    /// Returns the parameters where the wheel begins to come down and has lifted off.
+    pub(super) fn with_leads(&self, options: &PathOptions) -> (f64, f64) {
+        let ahead = (self.to - self.from).signum() * options.lead_mm;
+        (self.beyond(self.from, -ahead), self.beyond(self.to, ahead))
+    }
+}
+
+impl Tracks {
+    /// Lays tracks that cover the outline.
+    pub(super) fn lay(outline: &Aperture, options: &PathOptions, track_mm: f64) -> Result<Self, PathError> {
+        let [low, high] = outline.bounds();
+        let size = [high[0] - low[0], high[1] - low[1]];
+        let turns = size[1].max(size[0]) / track_mm;
+        if turns.is_nan() || turns >= MOST_TRACKS {
+            return Err(PathError::TooManyTracks { tracks: turns, track_mm, limit: MOST_TRACKS });
+        }
+        let tracks = match options.pattern {
+            Pattern::Raster { one_way } => raster(outline, options.overrun_mm, track_mm, one_way),
+            Pattern::Spiral => spiral(outline, options.overrun_mm, track_mm),
+        };
+        if tracks.spans.is_empty() { Err(PathError::Empty) } else { Ok(tracks) }
+    }
+
+    /// Returns how far the wheel is lifted off the surface at a parameter, in millimetres: s^2 / (2 rho) at s beyond a span's end.
+    #[inline]
+    pub(super) fn lift_mm(&self, span: &Span, t: f64, options: &PathOptions) -> f64 {
+        let ahead = (span.to - span.from).signum();
+        let beyond = if (t - span.from) * ahead < 0.0 {
+            span.length_mm(t, span.from)
+        } else if (t - span.to) * ahead > 0.0 {
+            span.length_mm(t, span.to)
+        } else {
+            return 0.0;
+        };
+        beyond * beyond / (2.0 * options.lead_radius_mm)
+    }
+}
+
+fn raster(outline: &Aperture, overrun_mm: f64, track_mm: f64, one_way: bool) -> Tracks {
+    let [[x0, y0], [x1, y1]] = outline.bounds();
+    // From border to border in equal steps, so that the edges have their tracks; rounding makes no step more.
+    let steps = ((y1 - y0) / track_mm * (1.0 - 1e-9)).ceil().max(1.0);
+    let step_mm = (y1 - y0) / steps;
+    let mut spans = Vec::new();
+    let mut backwards = false;
+    for k in 0..=steps as usize {
+        let line = Span { curve: Curve::Line { y_mm: y0 + k as f64 * step_mm }, from: 0.0, to: 0.0 };
+        let mut pieces = on_part(&line, outline, overrun_mm, x0 - overrun_mm, x1 + overrun_mm);
+        if backwards {
+            pieces.reverse();
+            pieces.iter_mut().for_each(|p| std::mem::swap(&mut p.from, &mut p.to));
+        }
+        backwards = !backwards && !one_way;
+        spans.extend(pieces);
+    }
+    Tracks { spans, track_mm: step_mm }
+}
+
+fn spiral(outline: &Aperture, overrun_mm: f64, track_mm: f64) -> Tracks {
+    let [[x0, y0], [x1, y1]] = outline.bounds();
+    let centre_mm = [0.5 * (x0 + x1), 0.5 * (y0 + y1)];
+    let rim = outline.outline_mm(LOOKS).into_iter().map(|[x, y]| (x - centre_mm[0]).hypot(y - centre_mm[1]));
+    let rim_mm = rim.fold(0.0, f64::max);
+    let rise_mm = track_mm / TAU;
+    let curve = Curve::Spiral { centre_mm, rise_mm };
+    // A full turn at or beyond the rim, and what of it is within the overrun.
+    let outermost = rim_mm / rise_mm + TAU;
+    let turns = (outermost / TAU).ceil() as usize;
+    let mut spans: Vec<Span> = Vec::new();
+    for turn in (0..turns).rev() {
+        let (least, most) = (TAU * turn as f64, (TAU * (turn + 1) as f64).min(outermost));
+        let whole = Span { curve, from: 0.0, to: 0.0 };
+        for piece in on_part(&whole, outline, overrun_mm, least, most).into_iter().rev() {
+            match spans.last_mut() {
+                Some(last) if (last.to - piece.to).abs() < 1e-9 => last.to = piece.from,
+                _ => spans.push(Span { curve, from: piece.to, to: piece.from }),
+            }
+        }
+    }
+    Tracks { spans, track_mm }
+}
+
+/// Returns the pieces of a curve between two parameters that are within the overrun of the outline, in rising order.
+fn on_part(curve: &Span, outline: &Aperture, overrun_mm: f64, least: f64, most: f64) -> Vec<Span> {
+    let inside = |t: f64| {
+        let [x, y] = curve.place(t);
+        outline.distance_mm(x, y) <= overrun_mm
+    };
+    let border = |mut a: f64, mut b: f64| {
+        let at_a = inside(a);
+        for _ in 0..60 {
+            let middle = 0.5 * (a + b);
+            *(if inside(middle) == at_a { &mut a } else { &mut b }) = middle;
+        }
+        if at_a { a } else { b }
+    };
+    let at = |k: usize| least + (most - least) * k as f64 / LOOKS as f64;
+    let mut pieces = Vec::new();
+    let mut began = None;
+    for k in 0..=LOOKS {
+        match (began, inside(at(k))) {
+            (None, true) => began = Some(if k == 0 { at(0) } else { border(at(k - 1), at(k)) }),
+            (Some(from), false) => {
+                pieces.push(Span { from, to: border(at(k - 1), at(k)), ..*curve });
+                began = None;
+            }
+            _ => {}
+        }
+    }
+    if let Some(from) = began {
+        pieces.push(Span { from, to: most, ..*curve });
+    }
+    pieces.retain(|p| p.to > p.from);
+    pieces
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::compensation::path::Wheel;
+
+    fn options() -> PathOptions {
+        PathOptions::new(Wheel::Sphere { radius_mm: 10.0 }, 0.5, 600.0)
+    }
+
+    #[test]
+    fn a_raster_covers_a_rectangle_from_edge_to_edge_and_alternates() {
+        let part = Aperture::Rectangle { centre_mm: [1.0, 2.0], width_mm: 10.0, height_mm: 6.0 };
+        let tracks = Tracks::lay(&part, &options(), 0.5).unwrap();
+        assert_eq!((tracks.spans.len(), tracks.track_mm), (13, 0.5));
+        let ends = |k: usize| [tracks.spans[k].place(tracks.spans[k].from), tracks.spans[k].place(tracks.spans[k].to)];
+        assert!((ends(0)[0][0] + 6.0).abs() < 1e-9 && (ends(0)[1][0] - 8.0).abs() < 1e-9 && ends(0)[0][1] == -1.0);
+        assert!((ends(1)[0][0] - 8.0).abs() < 1e-9 && (ends(12)[0][1] - 5.0).abs() < 1e-12);
+        let one_way = raster(&part, 2.0, 0.5, true);
+        assert!(one_way.spans.iter().all(|s| s.to > s.from));
+        assert!(matches!(Tracks::lay(&part, &options(), 1e-9), Err(PathError::TooManyTracks { .. })));
+    }
+
+    #[test]
+    fn a_ring_is_left_and_met_again() {
+        let part = Aperture::Annulus { centre_mm: [0.0; 2], inner_radius_mm: 5.0, outer_radius_mm: 12.0 };
+        let tracks = raster(&part, 1.0, 0.5, false);
+        let middle: Vec<_> = tracks.spans.iter().filter(|s| s.place(0.0)[1].abs() < 1e-9).collect();
+        assert_eq!(middle.len(), 2);
+        assert!((middle[0].place(middle[0].to)[0].abs() - 4.0).abs() < 1e-9, "{middle:?}");
+    }
+
+    #[test]
+    fn a_spiral_on_a_disc_is_one_piece_from_the_rim_to_the_middle() {
+        let part = Aperture::Circle { centre_mm: [3.0, 0.0], radius_mm: 8.0 };
+        let tracks = spiral(&part, 2.0, 0.5);
+        assert_eq!(tracks.spans.len(), 1);
+        let span = tracks.spans[0];
+        let r = |t: f64| (span.place(t)[0] - 3.0).hypot(span.place(t)[1]);
+        assert!((r(span.from) - 8.5).abs() < 0.01 && r(span.to) == 0.0);
+        assert!((r(span.from) - r(span.from - TAU) - 0.5).abs() < 1e-9);
+        let (first, last) = span.with_leads(&options());
+        assert!(
+            (span.length_mm(first, span.from) - 2.0).abs() < 1e-9 && (span.length_mm(last, span.to) - 2.0).abs() < 1e-9
+        );
+        assert!((tracks.lift_mm(&span, last, &options()) - 0.4).abs() < 1e-9);
+    }
+}

@@ -1,0 +1,177 @@
+//! Along the tracks, point by point: as far from each to the next as the chord error allows.
+
+use crate::geometry::{Point, Vector};
+
+use super::ToolPath;
+use super::tracks::{Pattern, Span};
+
+/// Share of the chord error that a step aims at: the deviation is looked at in the middle of a step, and the largest is near it.
+const AIM: f64 = 0.8;
+/// A step is never shorter than this share of the longest one.
+const SHORTEST: f64 = 1e-5;
+/// Height above the beginning of a track down to which the wheel comes down rapidly, in millimetres.
+const APPROACH_MM: f64 = 1.0;
+/// Share of the acceleration that a spiral takes up.
+const ACCELERATION_SHARE: f64 = 0.8;
+
+/// A move of the point that a program moves; in the model frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Move {
+    /// Rapidly along z alone, in the air.
+    RapidZ(f64),
+    /// Rapidly in x and y, at the safe height.
+    RapidXy([f64; 2]),
+    /// Straight at a feed.
+    Feed {
+        /// Where to, in millimetres.
+        at: Point,
+        /// How fast.
+        feed_mm_min: f64,
+    },
+}
+
+/// The moves of a path. Each point costs two places of the surface; nothing is stored.
+#[derive(Clone, Debug)]
+pub struct Moves<'a> {
+    path: &'a ToolPath,
+    /// The next span, and where to stop.
+    next: usize,
+    end: usize,
+    state: State,
+    /// How the path bends and where its x and y are, at the last point given.
+    pub(super) bend: f64,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum State {
+    Above,
+    Over(Walk),
+    Down(Walk),
+    Begin(Walk),
+    Along(Walk),
+    Ended,
+}
+
+/// The way along one span.
+#[derive(Clone, Copy, Debug)]
+struct Walk {
+    span: Span,
+    to: f64,
+    t: f64,
+    step: f64,
+    at: Point,
+}
+
+impl<'a> Moves<'a> {
+    pub(super) fn new(path: &'a ToolPath) -> Self {
+        Self::of(path, 0, path.tracks())
+    }
+
+    /// The moves of some of the spans, which begin and end at the safe height.
+    pub(super) fn of(path: &'a ToolPath, from: usize, to: usize) -> Self {
+        Self { path, next: from, end: to, state: State::Above, bend: 0.0 }
+    }
+
+    fn walk(&self, span: Span) -> Walk {
+        let (from, to) = span.with_leads(self.path.options());
+        let longest = self.path.options().longest_step_mm;
+        let step = 0.25 * longest / span.speed_mm(from);
+        Walk { span, to, t: from, step, at: self.path.centre(&span, from) }
+    }
+
+    /// Goes on by as much as the chord error allows.
+    #[inline]
+    fn along(&mut self, mut walk: Walk) -> Walk {
+        let path = self.path;
+        let options = path.options();
+        let (span, left) = (walk.span, walk.to - walk.t);
+        let longest = options.longest_step_mm.min(path.grain_mm()) / span.speed_mm(walk.t);
+        let mut step = walk.step.min(longest);
+        loop {
+            // A rest shorter than half a step joins the last one; two even ones are better than a long and a tiny one.
+            let whole = step >= left.abs();
+            let t = if whole {
+                walk.to
+            } else if 2.0 * step > left.abs() {
+                walk.t + 0.5 * left
+            } else {
+                walk.t + step * left.signum()
+            };
+            let taken = (t - walk.t).abs();
+            let at = path.centre(&span, t);
+            let middle = path.centre(&span, 0.5 * (walk.t + t));
+            let (sag, chord) = sag_mm(&walk.at, &middle, &at);
+            let share = sag / (AIM * options.chord_error_mm);
+            if share > 1.0 && taken > SHORTEST * longest {
+                step = taken * (0.95 / share.sqrt()).max(0.2);
+                continue;
+            }
+            self.bend = 8.0 * sag / (chord * chord).max(f64::MIN_POSITIVE);
+            let next = taken * (0.95 / share.max(1e-6).sqrt()).clamp(0.5, 2.0);
+            walk = Walk { t, at, step: next, ..walk };
+            return walk;
+        }
+    }
+
+    /// The feed at the last point: on a spiral as low as the acceleration asks for, to two digits so that it seldom changes.
+    fn feed_mm_min(&self) -> f64 {
+        let options = self.path.options();
+        let (Pattern::Spiral, Some(limit)) = (options.pattern, options.spiral_acceleration_mm_s2) else {
+            return options.feed_mm_min;
+        };
+        let most = 60.0 * (ACCELERATION_SHARE * limit / self.bend.max(1e-12)).sqrt();
+        if most >= options.feed_mm_min {
+            return options.feed_mm_min;
+        }
+        let unit = 10f64.powf(most.log10().floor() - 1.0);
+        (most / unit).floor() * unit
+    }
+}
+
+impl Iterator for Moves<'_> {
+    type Item = Move;
+
+    #[inline]
+    fn next(&mut self) -> Option<Move> {
+        let safe = self.path.safe_z_mm();
+        let (state, given) = match self.state {
+            State::Along(walk) if walk.t != walk.to => {
+                let walk = self.along(walk);
+                (State::Along(walk), Move::Feed { at: walk.at, feed_mm_min: self.feed_mm_min() })
+            }
+            State::Along(_) => (State::Above, Move::RapidZ(safe)),
+            State::Above if self.next < self.end => {
+                let walk = self.walk(self.path.tracks.spans[self.next]);
+                let first = self.next == 0;
+                self.next += 1;
+                // The wheel may be anywhere before the first move of all.
+                if first { (State::Over(walk), Move::RapidZ(safe)) } else { (State::Down(walk), xy(&walk)) }
+            }
+            State::Above => (State::Ended, Move::RapidZ(safe)),
+            State::Over(walk) => (State::Down(walk), xy(&walk)),
+            State::Down(walk) => (State::Begin(walk), Move::RapidZ((walk.at.z + APPROACH_MM).min(safe))),
+            State::Begin(walk) => {
+                self.bend = 0.0;
+                (State::Along(walk), Move::Feed { at: walk.at, feed_mm_min: self.feed_mm_min() })
+            }
+            State::Ended => return None,
+        };
+        let ended = matches!(state, State::Ended);
+        self.state = state;
+        // The last retreat has been given with the last track.
+        if ended { None } else { Some(given) }
+    }
+}
+
+fn xy(walk: &Walk) -> Move {
+    Move::RapidXy([walk.at.x, walk.at.y])
+}
+
+/// How far the middle of a step is from its chord, and how long the chord is.
+#[inline]
+fn sag_mm(from: &Point, middle: &Point, to: &Point) -> (f64, f64) {
+    let (chord, half): (Vector, Vector) = (to - from, middle - from);
+    let length2 = chord.norm_squared();
+    let along = if length2 > 0.0 { half.dot(&chord) / length2 } else { 0.0 };
+    ((half - chord * along).norm(), length2.sqrt())
+}

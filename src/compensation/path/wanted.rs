@@ -1,0 +1,278 @@
+//! The surface that a pass is to leave: the nominal one, moved along its own normals by the level and the correction.
+//!
+//! P(x, y) = S(x, y) + d(x, y) N(x, y) with d = level + correction. The normals are those of P itself, from the derivatives of
+//! the same interpolation that defines where P is: n ~ P_x x P_y, P_x = S_x + d_x N + d N_x. The slope of the correction is in
+//! them; with the nominal normals a wheel of radius R would be off by R |grad d|^2 / 2 along the normal and R |grad d| along the surface.
+
+use crate::compensation::Correction;
+use crate::geometry::{Point, Vector};
+
+use super::PathError;
+use super::field::{Field, Jet, Lattice};
+
+/// Rings of nodes that are added around a correction at most.
+const MOST_RINGS: f64 = 200.0;
+
+/// The surface that a pass is to leave.
+#[derive(Clone, Debug)]
+pub struct Wanted {
+    nominal: Field,
+    correction: Field,
+    level_mm: f64,
+}
+
+/// A place of the wanted surface.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Contact {
+    /// The point, in the model frame.
+    pub point: Point,
+    /// Unit normal of the wanted surface, on the side of +z.
+    pub normal: Vector,
+}
+
+/// How the wanted surface bends at a place.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Bend {
+    /// The place and its normal.
+    pub contact: Contact,
+    /// Two unit vectors along the surface, at right angles: along x, and across.
+    pub along: [Vector; 2],
+    /// Normal curvature in these directions, 1/mm, positive where the surface is hollow: along the first, mixed, along the second.
+    pub curvature: [f64; 3],
+}
+
+impl Wanted {
+    /// Joins a nominal surface and a correction, which is levelled off within `level_off_mm` beyond its net.
+    ///
+    /// # Errors
+    /// Values that are not finite.
+    pub fn new(nominal: Field, correction: &Correction, level_off_mm: f64) -> Result<Self, PathError> {
+        if let Some(node) = correction.values_mm.iter().position(|v| !v.is_finite()) {
+            let [x_mm, y_mm] = correction.net.place_mm(node);
+            return Err(PathError::Correction { x_mm, y_mm });
+        }
+        Ok(Self { nominal, correction: spline_of(correction, level_off_mm), level_mm: correction.level_mm })
+    }
+
+    /// Returns the point and the normal at a place of the nominal surface.
+    #[inline]
+    pub fn at(&self, place_mm: [f64; 2]) -> Contact {
+        let (point, tangents) = self.tangents(place_mm);
+        Contact { point, normal: tangents[0].cross(&tangents[1]).normalize() }
+    }
+
+    /// The point, and its derivatives by x and y.
+    #[inline]
+    fn tangents(&self, place_mm: [f64; 2]) -> (Point, [Vector; 2]) {
+        let e = self.correction.at(place_mm);
+        self.moved(place_mm, &Jet { value: self.level_mm + e.value, ..e })
+    }
+
+    /// The nominal point moved along its normal, and the derivatives by x and y.
+    #[inline]
+    fn moved(&self, place_mm: [f64; 2], e: &Jet) -> (Point, [Vector; 2]) {
+        let s = self.nominal.at(place_mm);
+        let d = e.value;
+        let [p, q] = s.slope;
+        let w = 1.0 / (1.0 + p * p + q * q).sqrt();
+        let normal = Vector::new(-p * w, -q * w, w);
+        // N_x = (-r, -s, 0) w - N (p r + q s) w^2, and the like for y.
+        let turned = |a: f64, b: f64| Vector::new(-a * w, -b * w, 0.0) - normal * ((p * a + q * b) * w * w);
+        let [r, mixed, t] = s.bend;
+        let by_x = Vector::new(1.0, 0.0, p) + normal * e.slope[0] + turned(r, mixed) * d;
+        let by_y = Vector::new(0.0, 1.0, q) + normal * e.slope[1] + turned(mixed, t) * d;
+        (Point::new(place_mm[0], place_mm[1], s.value) + normal * d, [by_x, by_y])
+    }
+
+    /// Returns how the surface bends at a place, from differences of its normals over a thousandth of a cell.
+    pub fn bend(&self, place_mm: [f64; 2]) -> Bend {
+        let (point, [by_x, by_y]) = self.tangents(place_mm);
+        let normal = by_x.cross(&by_y).normalize();
+        let first = by_x.normalize();
+        let along = [first, normal.cross(&first)];
+        let steps = self.nominal.spacing_mm().map(|h| 1e-3 * h);
+        // The shape operator: how the normal turns for a step along x and along y.
+        let turn = |k: usize| {
+            let mut sides = [place_mm; 2];
+            sides[0][k] += steps[k];
+            sides[1][k] -= steps[k];
+            let [ahead, behind] = sides.map(|place| self.at(place).normal);
+            (ahead - behind) / (2.0 * steps[k])
+        };
+        let (n_x, n_y) = (turn(0), turn(1));
+        // Directions of the frame in terms of the derivatives: along[0] = by_x / |by_x|, along[1] = a by_x + b by_y.
+        let (length, slant) = (by_x.norm(), by_y.dot(&along[1]));
+        let b = 1.0 / slant;
+        let a = -by_y.dot(&along[0]) / (slant * length);
+        let turned = [n_x / length, n_x * a + n_y * b];
+        let of = |i: usize, j: usize| -turned[i].dot(&along[j]);
+        // A hollow bends its normal against the step.
+        Bend { contact: Contact { point, normal }, along, curvature: [of(0, 0), 0.5 * (of(0, 1) + of(1, 0)), of(1, 1)] }
+    }
+
+    /// The share of a tangential step that leads to the foot of a point at a height over a surface that bends: 1 / (1 - h k), with the
+    /// mean curvature k, positive in a hollow.
+    fn bend_factor(&self, place_mm: [f64; 2], height_mm: f64) -> f64 {
+        let [a, _, c] = self.bend(place_mm).curvature;
+        (1.0 / (1.0 - 0.5 * height_mm * (a + c)).max(0.05)).min(1.9)
+    }
+
+    /// Returns the shorter distance of the nodes of both fields, in millimetres: nothing of the surface is finer.
+    pub fn grain_mm(&self) -> f64 {
+        let [a, b] = [self.nominal.spacing_mm(), self.correction.spacing_mm()].map(|[x, y]| x.min(y));
+        a.min(b)
+    }
+}
+
+/// Returns by how much the centre of a ball that touches a nominal surface moves when the surface is moved along its normals.
+///
+/// The ball's radius is the distance of its centre from the surface. With the foot P and the normal n of the nominal surface, the shift e
+/// and the normal n' of the moved surface: P + e n + R n' less the centre. `None` where no place of the surface is under the centre.
+pub fn displaced(nominal: &Wanted, shift: &Field, centre: &Point) -> Option<Vector> {
+    let mut place = [centre.x, centre.y];
+    for _ in 0..STEPS {
+        let (point, [by_x, by_y]) = nominal.tangents(place);
+        let arm = centre - point;
+        let normal = by_x.cross(&by_y).normalize();
+        // Where the tangent plane at this place has the centre above it; then on from there.
+        let (a, b, c) = (by_x.norm_squared(), by_x.dot(&by_y), by_y.norm_squared());
+        let (u, v) = (arm.dot(&by_x), arm.dot(&by_y));
+        let determinant = a * c - b * b;
+        let step = [(c * u - b * v) / determinant, (a * v - b * u) / determinant];
+        // A plane takes the ball's height into no account; half-way steps over a dome, shorter ones in a hollow, settle all the same.
+        let bend = nominal.bend_factor(place, arm.dot(&normal));
+        place = [place[0] + step[0] * bend, place[1] + step[1] * bend];
+        if !(place[0] + place[1]).is_finite() {
+            return None;
+        }
+        if step[0].hypot(step[1]) < 1e-9 {
+            let e = shift.at(place);
+            let (moved, [by_x, by_y]) = nominal.moved(place, &Jet { value: nominal.level_mm + e.value, ..e });
+            let radius = arm.dot(&normal);
+            return Some(moved + by_x.cross(&by_y).normalize() * radius - centre);
+        }
+    }
+    None
+}
+
+/// Steps down to a foot; each leaves a small share of the error, since how the surface bends is taken into account.
+const STEPS: usize = 100;
+
+/// Lays a spline through a correction that goes on beyond its net with a slope that fades away.
+///
+/// With the slope g across the border and the length L the correction rises by g L (t - t^3 + t^4 / 2) at t = s / L <= 1: as
+/// steep as it was at the border, level at L, and never further.
+pub fn spline_of(correction: &Correction, length_mm: f64) -> Field {
+    let net = correction.net;
+    let spacing_mm = [0, 1].map(|k| {
+        let nodes = [net.columns, net.rows][k];
+        // A single row or column is level across.
+        if nodes < 2 || net.spacing_mm[k] <= 0.0 { length_mm } else { net.spacing_mm[k] }
+    });
+    let rings = spacing_mm.map(|h| (length_mm / h).ceil().clamp(1.0, MOST_RINGS) as usize);
+    let reach = [0, 1].map(|k| length_mm.min(rings[k] as f64 * spacing_mm[k]));
+    let fade = |k: usize, steps: usize| {
+        let t = (steps as f64 * spacing_mm[k] / reach[k]).min(1.0);
+        reach[k] / spacing_mm[k] * (t - t.powi(3) + 0.5 * t.powi(4))
+    };
+    let along = |line: &[f64], k: usize| -> Vec<f64> {
+        let n = line.len();
+        let rise = |end: usize, next: usize, third: usize| match n {
+            1 => 0.0,
+            2 => line[end] - line[next],
+            _ => 1.5 * line[end] - 2.0 * line[next] + 0.5 * line[third],
+        };
+        let (before, after) =
+            (rise(0, 1.min(n - 1), 2.min(n - 1)), rise(n - 1, n.saturating_sub(2), n.saturating_sub(3)));
+        let left = (1..=rings[k]).rev().map(|s| line[0] + before * fade(k, s));
+        let right = (1..=rings[k]).map(|s| line[n - 1] + after * fade(k, s));
+        left.chain(line.iter().copied()).chain(right).collect()
+    };
+    let wide: Vec<Vec<f64>> = correction.values_mm.chunks(net.columns).map(|row| along(row, 0)).collect();
+    let columns = net.columns + 2 * rings[0];
+    let tall: Vec<Vec<f64>> =
+        (0..columns).map(|i| along(&wide.iter().map(|row| row[i]).collect::<Vec<f64>>(), 1)).collect();
+    let rows = net.rows + 2 * rings[1];
+    let values: Vec<f64> = (0..rows).flat_map(|j| tall.iter().map(move |line| line[j])).collect();
+    let first_mm = [0, 1].map(|k| net.first_mm[k] - rings[k] as f64 * spacing_mm[k]);
+    Field::spline(Lattice { columns, rows, first_mm, spacing_mm }, &values)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::compensation::Net;
+
+    /// A hollow sphere as a field.
+    fn bowl(radius_mm: f64) -> Field {
+        let on = Lattice { columns: 81, rows: 81, first_mm: [-10.0, -10.0], spacing_mm: [0.25, 0.25] };
+        let places = (0..81 * 81).map(|k| [-10.0 + (k % 81) as f64 * 0.25, -10.0 + (k / 81) as f64 * 0.25]);
+        let (z, slopes): (Vec<f64>, Vec<[f64; 2]>) = places
+            .map(|[x, y]| {
+                let root = (radius_mm * radius_mm - x * x - y * y).sqrt();
+                (radius_mm - root, [x / root, y / root])
+            })
+            .unzip();
+        Field::hermite(on, &z, &slopes)
+    }
+
+    fn correction(value: impl Fn(f64, f64) -> f64) -> Correction {
+        let net = Net { columns: 17, rows: 17, first_mm: [-8.0, -8.0], spacing_mm: [1.0, 1.0] };
+        let values_mm = (0..net.len()).map(|k| net.place_mm(k)).map(|[x, y]| value(x, y)).collect();
+        Correction { net, values_mm, cycle: 2, level_mm: 0.02 }
+    }
+
+    #[test]
+    fn a_sphere_with_a_level_alone_is_a_smaller_sphere() {
+        let wanted = Wanted::new(bowl(40.0), &correction(|_, _| 0.0), 5.0).unwrap();
+        for place in [[0.1, 0.2], [7.3, -5.5], [-9.9, 3.0]] {
+            let Contact { point, normal } = wanted.at(place);
+            let centre = Point::new(0.0, 0.0, 40.0);
+            assert!(((point - centre).norm() - 39.98).abs() < 1e-8, "{}", (point - centre).norm());
+            assert!((normal - (centre - point).normalize()).norm() < 1e-6);
+            let [a, mixed, c] = wanted.bend(place).curvature;
+            assert!(
+                (a - 1.0 / 39.98).abs() < 1e-5 && (c - 1.0 / 39.98).abs() < 1e-5 && mixed.abs() < 1e-5,
+                "{a} {mixed} {c}"
+            );
+        }
+    }
+
+    #[test]
+    fn normals_are_those_of_the_surface_itself() {
+        let e = |x: f64, y: f64| 0.01 * (0.5 * x).sin() + 0.003 * y;
+        let wanted = Wanted::new(bowl(40.0), &correction(e), 5.0).unwrap();
+        for [x, y] in [[1.3, 2.2], [-6.7, 0.4], [7.9, 9.1], [9.4, -2.0]] {
+            let h = 1e-5;
+            let by_x = wanted.at([x + h, y]).point - wanted.at([x - h, y]).point;
+            let by_y = wanted.at([x, y + h]).point - wanted.at([x, y - h]).point;
+            let normal = by_x.cross(&by_y).normalize();
+            assert!((normal - wanted.at([x, y]).normal).norm() < 1e-8, "{x} {y}");
+        }
+    }
+
+    #[test]
+    fn a_correction_levels_off_beyond_its_net_and_nowhere_jumps() {
+        let field = spline_of(&correction(|x, _| 0.002 * x), 3.0);
+        assert!((field.at([2.2, 0.0]).value - 0.0044).abs() < 1e-7);
+        let far = field.at([11.0, 0.0]);
+        assert!((far.value - (0.016 + 0.002 * 3.0 * 0.5)).abs() < 1e-5, "{far:?}");
+        assert_eq!(field.at([30.0, 0.0]).value, field.at([11.0, 0.0]).value);
+        let steepest =
+            (0..400).map(|k| field.at([7.0 + 0.01 * f64::from(k), 3.0]).slope[0]).fold(0.0f64, |m, s| m.max(s.abs()));
+        assert!(steepest < 0.0021, "{steepest}");
+        let one = Correction {
+            net: Net { columns: 1, rows: 1, first_mm: [0.0; 2], spacing_mm: [0.0; 2] },
+            values_mm: vec![0.007],
+            cycle: 1,
+            level_mm: 0.0,
+        };
+        assert!((spline_of(&one, 2.0).at([5.0, -9.0]).value - 0.007).abs() < 1e-15);
+    }
+
+    #[test]
+    fn what_is_not_finite_is_refused() {
+        let broken = correction(|x, _| if x == 3.0 { f64::NAN } else { 0.0 });
+        assert!(matches!(Wanted::new(bowl(40.0), &broken, 5.0), Err(PathError::Correction { x_mm: 3.0, .. })));
+    }
+}

@@ -1,0 +1,159 @@
+//! The program of a pass: from the correction to the file that a controller runs.
+
+use std::path::Path;
+
+use thiserror::Error;
+
+use crate::compensation::Correction;
+use crate::compensation::path::{
+    Field, Limits, PathError, PathOptions, Pattern, Summary, ToolPath, TrackSpacing, Wanted, axis_offsets, height_of,
+};
+use crate::formats::gcode::{GcodeError, PathMode, ProgramHeader, write_axis_table, write_program};
+use crate::geometry::Aperture;
+use crate::surface::Nominal;
+
+/// More points than that are not written beside every correction of a run.
+const MOST_POINTS: u64 = 3_000_000;
+
+/// What the programs of a part have in common.
+#[derive(Debug)]
+pub struct Programs {
+    /// The part by name.
+    pub part: String,
+    /// SHA-256 of what the nominal surface came from.
+    pub part_identity: [u8; 32],
+    /// The nominal surface as a height over x and y, and the outline of the part.
+    pub ground: (Field, Aperture),
+    /// How paths are laid.
+    pub options: PathOptions,
+    /// What the grinder can do.
+    pub limits: Limits,
+    /// How exactly its controller keeps to a program.
+    pub mode: PathMode,
+    /// Passes without in-feed.
+    pub spark_out_passes: u16,
+    /// Whether the cell is simulated.
+    pub simulation: bool,
+}
+
+/// Why there is no program.
+#[derive(Debug, Error)]
+#[allow(missing_docs)]
+pub enum ProgramError {
+    #[error(transparent)]
+    Path(#[from] PathError),
+    #[error(transparent)]
+    File(#[from] GcodeError),
+    #[error(
+        "the program of the next pass would have {points} points, more than the {MOST_POINTS} that a run keeps; allow a larger chord error, or \
+         write it by `regrind plan --program`"
+    )]
+    TooLong { points: u64 },
+}
+
+impl Programs {
+    /// Returns the nominal surface of a part as programs need it.
+    ///
+    /// # Errors
+    /// A surface that is no height over x and y.
+    pub fn ground(nominal: &Nominal) -> Result<(Field, Aperture), PathError> {
+        height_of(nominal)
+    }
+
+    /// Lays the path of a pass and checks it against what the grinder can do.
+    ///
+    /// # Errors
+    /// A wheel that does not fit the corrected surface, and limits of the grinder that the path goes beyond.
+    pub fn path(&self, correction: &Correction) -> Result<(ToolPath, Summary), PathError> {
+        let (nominal, outline) = &self.ground;
+        let level_off_mm = self.options.wheel.reach_mm();
+        let wanted = Wanted::new(nominal.clone(), correction, level_off_mm)?;
+        let path = ToolPath::new(wanted, outline.clone(), self.options)?;
+        let summary = path.summary()?;
+        summary.check(&self.limits)?;
+        Ok((path, summary))
+    }
+
+    /// Writes the program of a pass.
+    ///
+    /// # Errors
+    /// Those of [`Programs::path`], and a file that cannot be written.
+    pub fn write(&self, file: &Path, correction: &Correction, map_identity: [u8; 32]) -> Result<Summary, ProgramError> {
+        let (path, summary) = self.path(correction)?;
+        self.write_path(file, correction, map_identity, &path, &summary)?;
+        Ok(summary)
+    }
+
+    /// Writes the program of a pass beside its correction, unless it is too long for that.
+    pub(super) fn keep(
+        &self,
+        file: &Path,
+        correction: &Correction,
+        map_identity: [u8; 32],
+    ) -> Result<(), ProgramError> {
+        let (path, summary) = self.path(correction)?;
+        if summary.points > MOST_POINTS {
+            return Err(ProgramError::TooLong { points: summary.points });
+        }
+        self.write_path(file, correction, map_identity, &path, &summary)?;
+        self.keep_table(&file.with_file_name("toolpath_z.csv"), correction, map_identity, &path)
+    }
+
+    /// Writes the correction as an offset of Z over the axes, for controllers that compensate by a table.
+    fn keep_table(
+        &self,
+        file: &Path,
+        correction: &Correction,
+        map_identity: [u8; 32],
+        path: &ToolPath,
+    ) -> Result<(), ProgramError> {
+        let none = Correction { values_mm: vec![0.0; correction.net.len()], ..correction.clone() };
+        let before = Wanted::new(self.ground.0.clone(), &none, 1.0)?;
+        let offsets = axis_offsets(&before, path.wanted(), &self.options.wheel, &correction.net)?;
+        write_axis_table(file, &correction.net, &offsets, &map_identity, self.simulation).map_err(GcodeError::from)?;
+        Ok(())
+    }
+
+    fn write_path(
+        &self,
+        file: &Path,
+        correction: &Correction,
+        map_identity: [u8; 32],
+        path: &ToolPath,
+        summary: &Summary,
+    ) -> Result<(), ProgramError> {
+        let header = ProgramHeader {
+            part: self.part.clone(),
+            cycle: correction.cycle,
+            base_identity: self.part_identity,
+            map_identity,
+            level_mm: correction.level_mm,
+            wheel: self.options.wheel.words(),
+            tracks: tracks_in_words(path),
+            spark_out_passes: self.spark_out_passes,
+            simulation: self.simulation,
+            mode: self.mode,
+        };
+        Ok(write_program(file, &header, summary, path.moves())?)
+    }
+}
+
+fn tracks_in_words(path: &ToolPath) -> String {
+    let options = path.options();
+    let pattern = match options.pattern {
+        Pattern::Raster { one_way: true } => "raster along +x",
+        Pattern::Raster { one_way: false } => "raster along x, to and fro",
+        Pattern::Spiral => "spiral inwards",
+    };
+    let scallop = match options.spacing {
+        TrackSpacing::Scallop { height_mm, .. } => format!(", ridges of {:.3} um at most", 1e3 * height_mm),
+        TrackSpacing::Distance(_) => String::new(),
+    };
+    format!(
+        "{} pieces, {:.6} mm apart, {pattern}{scallop}, chords within {:.4} um, overrun {} mm",
+        path.tracks(),
+        path.track_mm(),
+        1e3 * options.chord_error_mm,
+        options.overrun_mm
+    )
+}

@@ -1,0 +1,157 @@
+//! Arcs and helices of a program: where they run, and how many chords stand for them.
+
+use std::f64::consts::TAU;
+
+use super::read::Refusal;
+use crate::geometry::Point;
+
+/// The plane of arcs: its first and second axis, and the one across; turning from the first to the second is counter-clockwise.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Plane(pub(super) [usize; 3]);
+
+impl Plane {
+    pub(super) const XY: Self = Self([0, 1, 2]);
+    pub(super) const ZX: Self = Self([2, 0, 1]);
+    pub(super) const YZ: Self = Self([1, 2, 0]);
+}
+
+/// An arc or a helix, in millimetres.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Arc {
+    plane: Plane,
+    from: Point,
+    /// In the plane.
+    centre: [f64; 2],
+    radius: f64,
+    begins: f64,
+    /// Counter-clockwise is positive.
+    pub(super) sweep: f64,
+    rise: f64,
+}
+
+/// How the centre of an arc is given.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Centre {
+    /// By its place along the two axes.
+    At([f64; 2]),
+    /// By the radius; negative for the longer way.
+    Radius(f64),
+}
+
+/// How far the radius at the end may be from that at the beginning, as LinuxCNC has it: in millimetres, and as a share.
+const RADIUS_TOLERANCE: [f64; 2] = [0.0127, 0.001];
+
+impl Arc {
+    /// Lays an arc between two points.
+    ///
+    /// # Errors
+    /// A radius that does not fit the ends.
+    pub(super) fn new(plane: Plane, from: Point, to: Point, clockwise: bool, centre: Centre) -> Result<Self, Refusal> {
+        let [a, b, c] = plane.0;
+        let (p, q) = ([from[a], from[b]], [to[a], to[b]]);
+        let centre = match centre {
+            Centre::At(at) => at,
+            Centre::Radius(radius) => by_radius(p, q, radius, clockwise)?,
+        };
+        let arm = |at: [f64; 2]| [at[0] - centre[0], at[1] - centre[1]];
+        let ([u, v], [s, t]) = (arm(p), arm(q));
+        let (radius, end) = (u.hypot(v), s.hypot(t));
+        let off = (radius - end).abs();
+        if radius == 0.0 || off > RADIUS_TOLERANCE[0].min(RADIUS_TOLERANCE[1] * radius.max(0.01)) {
+            let found = format!("the radius of the arc is {radius:.4} mm at its beginning and {end:.4} mm at its end");
+            return Err((found, "correct its centre or its end"));
+        }
+        let begins = v.atan2(u);
+        let turn = t.atan2(s) - begins;
+        // The end at the beginning is a whole turn.
+        let sweep = if clockwise {
+            let down = turn.rem_euclid(TAU) - TAU;
+            if down > -1e-9 { down - TAU } else { down }
+        } else {
+            let up = turn.rem_euclid(TAU);
+            if up < 1e-9 { up + TAU } else { up }
+        };
+        Ok(Self { plane, from, centre, radius, begins, sweep, rise: to[c] - from[c] })
+    }
+
+    /// Returns the point at a share of the way.
+    pub(super) fn at(&self, share: f64) -> Point {
+        let [a, b, c] = self.plane.0;
+        let (sine, cosine) = (self.begins + self.sweep * share).sin_cos();
+        let mut at = self.from;
+        at[a] = self.centre[0] + self.radius * cosine;
+        at[b] = self.centre[1] + self.radius * sine;
+        at[c] = self.from[c] + self.rise * share;
+        at
+    }
+
+    /// Returns the centre from the beginning, along the two axes of the plane.
+    pub(super) fn centre_from_start(&self) -> [(usize, f64); 2] {
+        let [a, b, _] = self.plane.0;
+        [(a, self.centre[0] - self.from[a]), (b, self.centre[1] - self.from[b])]
+    }
+
+    /// Returns how long it is.
+    pub(super) fn length(&self) -> f64 {
+        (self.radius * self.sweep).hypot(self.rise)
+    }
+
+    /// Returns how many chords are within a tolerance of it.
+    pub(super) fn chords(&self, tolerance: f64) -> f64 {
+        let angle = 2.0 * (1.0 - (tolerance / self.radius).min(1.0)).acos();
+        (self.sweep.abs() / angle.max(1e-9)).ceil().max(1.0)
+    }
+}
+
+/// Where the centre of an arc of a radius is: on the side that makes it the shorter way, or with a negative radius the longer.
+fn by_radius(p: [f64; 2], q: [f64; 2], radius: f64, clockwise: bool) -> Result<[f64; 2], Refusal> {
+    let (dx, dy) = (q[0] - p[0], q[1] - p[1]);
+    let chord = dx.hypot(dy);
+    let above2 = radius * radius - 0.25 * chord * chord;
+    // A little short, by rounding, is half a turn.
+    if chord == 0.0 || above2 < -1e-3 * radius * radius {
+        let found = format!("an arc of radius {radius} mm does not join two points {chord:.4} mm apart");
+        return Err((found, "give its centre by I, J, K"));
+    }
+    let side = if clockwise == (radius < 0.0) { 1.0 } else { -1.0 };
+    let above = above2.max(0.0).sqrt() * side / chord;
+    Ok([p[0] + 0.5 * dx - above * dy, p[1] + 0.5 * dy + above * dx])
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::PI;
+
+    use super::*;
+
+    #[test]
+    fn arcs_run_where_the_centre_and_the_radius_say() {
+        let (from, to) = (Point::new(10.0, 0.0, 1.0), Point::new(0.0, 10.0, 3.0));
+        let arc = Arc::new(Plane::XY, from, to, false, Centre::At([0.0, 0.0])).unwrap();
+        assert!((arc.sweep - PI / 2.0).abs() < 1e-12);
+        let middle = arc.at(0.5);
+        assert!((middle - Point::new(50f64.sqrt(), 50f64.sqrt(), 2.0)).norm() < 1e-12);
+        let same = Arc::new(Plane::XY, from, to, false, Centre::Radius(10.0)).unwrap();
+        assert!((same.at(0.3) - arc.at(0.3)).norm() < 1e-9);
+        let long = Arc::new(Plane::XY, from, to, true, Centre::At([0.0, 0.0])).unwrap();
+        assert!((long.sweep + 1.5 * PI).abs() < 1e-12);
+        let far = Arc::new(Plane::XY, from, to, true, Centre::Radius(-10.0)).unwrap();
+        assert!((far.at(0.3) - long.at(0.3)).norm() < 1e-9);
+        let circle = Arc::new(Plane::XY, from, from, true, Centre::At([0.0, 0.0])).unwrap();
+        assert!((circle.sweep + TAU).abs() < 1e-12 && (circle.length() - 20.0 * PI).abs() < 1e-9);
+        assert!(Arc::new(Plane::XY, from, to, true, Centre::At([1.0, 0.0])).is_err());
+        assert!(Arc::new(Plane::XY, from, to, true, Centre::Radius(3.0)).is_err());
+        assert!(Arc::new(Plane::XY, from, from, true, Centre::Radius(3.0)).is_err());
+    }
+
+    #[test]
+    fn chords_keep_to_their_tolerance() {
+        let (from, to) = (Point::new(0.0, 5.0, 10.0), Point::new(10.0, 5.0, 0.0));
+        let arc = Arc::new(Plane::ZX, from, to, true, Centre::At([0.0, 0.0]));
+        let arc = arc.or_else(|_| Arc::new(Plane::ZX, from, to, false, Centre::At([0.0, 0.0]))).unwrap();
+        let n = arc.chords(1e-4);
+        let sag = (arc.at(0.5 / n) - nalgebra::center(&arc.at(0.0), &arc.at(1.0 / n))).norm();
+        assert!(sag <= 1e-4 && sag > 0.5e-4, "{sag}");
+        assert_eq!(arc.at(0.37).y, 5.0);
+    }
+}

@@ -1,0 +1,135 @@
+//! A map over x and y to correct a program by: `error_map.csv` or `correction.csv`.
+
+use std::io::{BufRead, BufReader, Read as _};
+use std::path::Path;
+
+use sha2::{Digest, Sha256};
+
+use super::GcodeError;
+use crate::compensation::Net;
+use crate::formats::FormatError;
+use crate::geometry::grid::NO_POINT;
+use crate::geometry::{Point, recognise_grid};
+
+/// Largest map that is read.
+const MOST_BYTES: u64 = 512 << 20;
+
+/// What the values of a map are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MapKind {
+    /// The error of the part: positive stands proud, and is taken off.
+    Error,
+    /// The correction of the surface: positive leaves material.
+    Correction,
+}
+
+/// A map as read.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ProgramMap {
+    /// Where the nodes are.
+    pub net: Net,
+    /// The values in millimetres, row by row with x fastest.
+    pub values_mm: Vec<f64>,
+    /// What they are.
+    pub kind: MapKind,
+    /// The map's own identity, or the SHA-256 of the file where it states none.
+    pub identity: [u8; 32],
+    /// The part that it belongs to, where it says so.
+    pub part: Option<[u8; 32]>,
+    /// Whether it comes from a simulated cell.
+    pub simulation: bool,
+}
+
+/// Reads a map: a header `x_mm,y_mm,error_mm` or `x_mm,y_mm,correction_mm`, perhaps with further columns, and a row for every node of a
+/// regular grid. Comments tell `part: sha256 ...`, `map: sha256 ...` and `SIMULATION`.
+///
+/// # Errors
+/// A file that cannot be read, other columns, rows that are no numbers, nodes that are no whole grid.
+pub fn read_program_map(path: &Path) -> Result<ProgramMap, GcodeError> {
+    let unreadable = |source| GcodeError::File(FormatError::Unreadable { path: path.to_owned(), source });
+    let line_error = |line: u64, what: String| {
+        let remedy = "give the error_map.csv or correction.csv of a run, or a file like it";
+        GcodeError::Line { path: path.to_owned(), line, what, remedy }
+    };
+    let file = std::fs::File::open(path).map_err(unreadable)?;
+    let mut reader = BufReader::new(file.take(MOST_BYTES + 1));
+    let (mut hash, mut line, mut number, mut bytes) = (Sha256::new(), Vec::new(), 0u64, 0u64);
+    let (mut kind, mut points, mut part, mut stated, mut simulation) = (None, Vec::new(), None, None, false);
+    loop {
+        line.clear();
+        // A file without lines is not read into one.
+        let taken = (&mut reader).take(4096).read_until(b'\n', &mut line).map_err(unreadable)?;
+        if taken == 0 {
+            break;
+        }
+        (number, bytes) = (number + 1, bytes + taken as u64);
+        hash.update(&line);
+        if bytes > MOST_BYTES {
+            return Err(GcodeError::File(FormatError::TooLarge {
+                path: path.to_owned(),
+                found: bytes,
+                limit: MOST_BYTES,
+                unit: "bytes",
+            }));
+        }
+        let text = std::str::from_utf8(&line).map_err(|_| line_error(number, "the line is no text".into()))?.trim();
+        if let Some(comment) = text.strip_prefix('#') {
+            simulation |= comment.trim() == "SIMULATION";
+            part = part.or(identity_in(comment, "part:"));
+            stated = stated.or(identity_in(comment, "map:"));
+        } else if !text.is_empty() && kind.is_none() {
+            kind = Some(columns(text).ok_or_else(|| line_error(number, format!("the columns are {text:?}")))?);
+        } else if !text.is_empty() {
+            points.push(node(text).ok_or_else(|| line_error(number, format!("{text:?} is no node of a map")))?);
+        }
+    }
+    let remedy = "every node of a regular grid needs its row";
+    let no_grid = |what: String| GcodeError::Program { path: path.to_owned(), what, remedy };
+    let kind = kind.ok_or_else(|| no_grid("the map is empty".into()))?;
+    let (net, values_mm) =
+        grid(&points).ok_or_else(|| no_grid(format!("its {} nodes are no whole grid", points.len())))?;
+    Ok(ProgramMap {
+        net,
+        values_mm,
+        kind,
+        identity: stated.unwrap_or_else(|| hash.finalize().into()),
+        part,
+        simulation,
+    })
+}
+
+fn columns(header: &str) -> Option<MapKind> {
+    let mut names = header.split(',').map(str::trim);
+    match (names.next()?, names.next()?, names.next()?) {
+        ("x_mm", "y_mm", "error_mm") => Some(MapKind::Error),
+        ("x_mm", "y_mm", "correction_mm") => Some(MapKind::Correction),
+        _ => None,
+    }
+}
+
+fn node(row: &str) -> Option<Point> {
+    let mut cells = row.split(',').map(|cell| cell.trim().parse::<f64>().ok().filter(|v| v.abs() < 1e7));
+    Some(Point::new(cells.next()??, cells.next()??, cells.next()??))
+}
+
+fn grid(points: &[Point]) -> Option<(Net, Vec<f64>)> {
+    let order = recognise_grid(points)?;
+    if order.point_at.contains(&NO_POINT) {
+        return None;
+    }
+    let at = |node: usize| points[order.point_at[node] as usize];
+    let (first, last) = (at(0), at(order.columns * order.rows - 1));
+    let spacing_mm = [(last.x - first.x) / (order.columns - 1) as f64, (last.y - first.y) / (order.rows - 1) as f64];
+    let net = Net { columns: order.columns, rows: order.rows, first_mm: [first.x, first.y], spacing_mm };
+    Some((net, (0..net.len()).map(|k| at(k).z).collect()))
+}
+
+/// Finds an identity after a name in a comment.
+pub(super) fn identity_in(comment: &str, name: &str) -> Option<[u8; 32]> {
+    let digits = comment.split_once(name)?.1.trim_start().strip_prefix("sha256")?.trim_start().get(..64)?;
+    let mut bytes = [0; 32];
+    for (k, byte) in bytes.iter_mut().enumerate() {
+        *byte = u8::from_str_radix(digits.get(2 * k..2 * k + 2)?, 16).ok()?;
+    }
+    Some(bytes)
+}

@@ -1,0 +1,97 @@
+//! Numbers of a program: a sign, digits, a point, six decimals. No exponent, which LinuxCNC takes for an E word.
+
+/// Decimals that are written: a nanometre.
+pub(super) const PER_MM: f64 = 1e6;
+/// Largest coordinate that is written, in millimetres.
+pub(super) const LARGEST_MM: f64 = 1e9;
+
+/// Rounds a length to what is written of it, in millionths of a millimetre.
+#[inline]
+pub(super) fn rounded(value_mm: f64) -> i64 {
+    (value_mm * PER_MM).round() as i64
+}
+
+/// Appends a number of millionths with six decimals.
+#[inline]
+pub(super) fn push_fixed(text: &mut Vec<u8>, millionths: i64) {
+    // Nineteen digits, a point and a sign at most; filled from the end.
+    let mut digits = [0u8; 24];
+    let mut at = digits.len();
+    let mut rest = millionths.unsigned_abs();
+    for _ in 0..3 {
+        let pair = (rest % 100) as usize;
+        rest /= 100;
+        at -= 2;
+        digits[at..at + 2].copy_from_slice(&PAIRS[pair]);
+    }
+    at -= 1;
+    digits[at] = b'.';
+    loop {
+        at -= 1;
+        digits[at] = b'0' + (rest % 10) as u8;
+        rest /= 10;
+        if rest == 0 {
+            break;
+        }
+    }
+    if millionths < 0 {
+        at -= 1;
+        digits[at] = b'-';
+    }
+    text.extend_from_slice(&digits[at..]);
+}
+
+const PAIRS: [[u8; 2]; 100] = {
+    let mut pairs = [[0; 2]; 100];
+    let mut k = 0;
+    while k < 100 {
+        pairs[k] = [b'0' + (k / 10) as u8, b'0' + (k % 10) as u8];
+        k += 1;
+    }
+    pairs
+};
+
+/// Returns a number without trailing zeros, as headers and feeds have it.
+pub(super) fn short(value: f64) -> String {
+    let mut text = Vec::new();
+    push_fixed(&mut text, rounded(value));
+    let kept = text.iter().rposition(|b| *b != b'0').map_or(0, |k| if text[k] == b'.' { k } else { k + 1 });
+    text.truncate(kept);
+    String::from_utf8_lossy(&text).into_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_have_six_decimals_and_no_exponent() {
+        let text = |v: f64| {
+            let mut text = Vec::new();
+            push_fixed(&mut text, rounded(v));
+            String::from_utf8(text).unwrap()
+        };
+        for (value, expected) in [
+            (0.0, "0.000000"),
+            (-0.0, "0.000000"),
+            (-1e-9, "0.000000"),
+            (1.0 / 3.0, "0.333333"),
+            (-12.345_678_5, "-12.345679"),
+            (1e-6, "0.000001"),
+            (-1e-6, "-0.000001"),
+            (999.999_999_9, "1000.000000"),
+            (1e9, "1000000000.000000"),
+        ] {
+            assert_eq!(text(value), expected);
+        }
+        for k in 0..20_000 {
+            let value = f64::from(k) * 0.013_577_1 - 131.0;
+            assert!((text(value).parse::<f64>().unwrap() - value).abs() <= 0.5e-6 + 1e-12);
+        }
+    }
+
+    #[test]
+    fn short_numbers_lose_their_zeros_only() {
+        assert_eq!([short(1000.0), short(0.0001), short(-2.5), short(0.0)], ["1000", "0.0001", "-2.5", "0"]);
+    }
+}

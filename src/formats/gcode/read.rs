@@ -1,0 +1,131 @@
+//! Lines of a program taken apart: words, comments, and what is refused because nobody can know where it moves the tool.
+
+/// A word of a line: a letter and its number, and how it is written.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Word<'a> {
+    pub(super) letter: u8,
+    pub(super) value: f64,
+    pub(super) text: &'a str,
+}
+
+/// A line taken apart.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Block<'a> {
+    pub(super) words: Vec<Word<'a>>,
+    /// As written, with their marks.
+    pub(super) comments: Vec<&'a str>,
+    /// A line of a percent sign alone.
+    pub(super) percent: bool,
+}
+
+/// What is wrong with a line, and what to do.
+pub(super) type Refusal = (String, &'static str);
+
+/// Longest line that LinuxCNC takes.
+const LONGEST_LINE: usize = 255;
+
+/// Takes a line apart.
+///
+/// # Errors
+/// Block delete, variables and expressions, O-words, a letter without a number, a comment without an end.
+pub(super) fn block(line: &str) -> Result<Block<'_>, Refusal> {
+    if line.len() > LONGEST_LINE {
+        let found = format!("the line is {} characters long, and controllers take {LONGEST_LINE}", line.len());
+        return Err((found, "is it a program? divide the line"));
+    }
+    let mut block = Block::default();
+    let bytes = line.as_bytes();
+    let mut at = 0;
+    while at < bytes.len() {
+        match bytes[at] {
+            b if b.is_ascii_whitespace() => at += 1,
+            b'%' => (block.percent, at) = (true, at + 1),
+            b';' => {
+                block.comments.push(line.get(at..).unwrap_or_default());
+                break;
+            }
+            b'(' => {
+                let end = bytes[at..].iter().position(|b| *b == b')').map(|n| at + n + 1);
+                let end = end.ok_or_else(|| ("a comment has no end".to_owned(), "close its bracket"))?;
+                block.comments.push(line.get(at..end).unwrap_or_default());
+                at = end;
+            }
+            letter if letter.is_ascii_alphabetic() => {
+                let (word, end) = word(line, at)?;
+                block.words.push(word);
+                at = end;
+            }
+            b'/' => {
+                let remedy = "delete the line or the stroke: what it does must be known beforehand";
+                return Err(("the line begins with a stroke and may be left out by a switch".into(), remedy));
+            }
+            b'#' | b'[' | b'<' | b'=' => return Err(expression()),
+            other => {
+                let found = format!("{:?} cannot be read", char::from(other));
+                return Err((found, "remove it, or write the program out in plain words and numbers"));
+            }
+        }
+    }
+    Ok(block)
+}
+
+fn expression() -> Refusal {
+    let remedy = "let the CAM system write the program out in plain numbers";
+    ("a variable or an expression is used, whose value only the controller knows".into(), remedy)
+}
+
+/// Reads the word that begins at a byte, and returns where it ends.
+fn word(line: &str, at: usize) -> Result<(Word<'_>, usize), Refusal> {
+    let bytes = line.as_bytes();
+    let letter = bytes[at].to_ascii_uppercase();
+    if letter == b'O' {
+        let remedy = "let the CAM system write loops and subprograms out";
+        return Err(("an O-word calls or repeats what stands elsewhere".into(), remedy));
+    }
+    let mut begin = at + 1;
+    while bytes.get(begin).is_some_and(u8::is_ascii_whitespace) {
+        begin += 1;
+    }
+    let is_number = |b: &u8| b.is_ascii_digit() || matches!(b, b'+' | b'-' | b'.');
+    let end = begin + bytes[begin..].iter().take_while(|b| is_number(b)).count();
+    if matches!(bytes.get(begin), Some(b'#' | b'[' | b'<')) {
+        return Err(expression());
+    }
+    let number = line.get(begin..end).unwrap_or_default();
+    match number.parse::<f64>() {
+        Ok(value) if value.abs() <= super::number::LARGEST_MM => {
+            Ok((Word { letter, value, text: line.get(at..end).unwrap_or_default() }, end))
+        }
+        _ => Err((
+            format!("{} is followed by {number:?}, which is no number", char::from(letter)),
+            "write a number with a point and without an exponent",
+        )),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn words_and_comments_are_told_apart() {
+        let block = block("n10 G1x-1.5 Y + 2. (to (here) z.25;rest").map(|b| b.words.len());
+        // Blanks within a number are not taken.
+        assert!(block.is_err());
+        let block = super::block("n10 G1x-1.5 Y+2. (to here) z.25;rest (of it").unwrap();
+        let words: Vec<(char, f64)> = block.words.iter().map(|w| (char::from(w.letter), w.value)).collect();
+        assert_eq!(words, [('N', 10.0), ('G', 1.0), ('X', -1.5), ('Y', 2.0), ('Z', 0.25)]);
+        assert_eq!(block.comments, ["(to here)", ";rest (of it"]);
+        assert!(super::block("%").unwrap().percent);
+    }
+
+    #[test]
+    fn what_nobody_can_know_is_refused() {
+        for line in
+            ["/G1 X1", "G1 X#5", "G1 X[1+2]", "O100 call", "G1 X", "G1 X--1", "(open", "G1 X1 $", "G1 X1e", "\u{e9}"]
+        {
+            assert!(block(line).is_err(), "{line}");
+        }
+        assert!(block(&"X1".repeat(200)).is_err());
+    }
+}
