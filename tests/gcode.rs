@@ -133,6 +133,10 @@ fn a_header_says_what_a_person_needs_and_counts_right() {
     for words in [
         "(part: free-form mirror)",
         "(cycle: 2)",
+        &format!(
+            "(part: sha256 {})",
+            part.programs.part_identity.iter().map(|b| format!("{b:02x}")).collect::<String>()
+        ),
         &format!("(map: sha256 {hash})"),
         "(level over the nominal surface: 0.02 mm)",
         "(feed: 1000 mm/min)",

@@ -72,7 +72,8 @@ fn regular(nominal: &Nominal) -> Result<Option<Field>, PathError> {
     for (k, node) in nodes.iter().enumerate() {
         let (p, n) = (&node.point, &node.normal);
         if !(p.z.is_finite() && n.z.is_finite()) {
-            (slopes.push([0.0; 2]), heights.push(f64::NAN));
+            slopes.push([0.0; 2]);
+            heights.push(f64::NAN);
             continue;
         }
         if n.z < LEAST_UPRIGHT {
@@ -82,10 +83,14 @@ fn regular(nominal: &Nominal) -> Result<Option<Field>, PathError> {
         // A node that is off its place by rounding is brought there along its tangent.
         let (i, j) = of(k);
         let off = [x0 + i as f64 * dx - p.x, y0 + j as f64 * dy - p.y];
-        (slopes.push(slope), heights.push(p.z + slope[0] * off[0] + slope[1] * off[1]));
+        slopes.push(slope);
+        heights.push(p.z + slope[0] * off[0] + slope[1] * off[1]);
     }
     Ok(Some(Field::hermite(on, &heights, &slopes)))
 }
+
+/// A height and its slopes.
+type Node = (f64, [f64; 2]);
 
 /// The field of any other surface: its height is searched for at every node.
 fn sampled(nominal: &Nominal, [low, high]: [[f64; 2]; 2]) -> Result<Field, PathError> {
@@ -100,7 +105,7 @@ fn sampled(nominal: &Nominal, [low, high]: [[f64; 2]; 2]) -> Result<Field, PathE
     let [columns, rows] = cells.map(|c| c as usize + 1);
     let on = Lattice { columns, rows, first_mm: low, spacing_mm: [size[0] / cells[0], size[1] / cells[1]] };
     let middle = nominal.points().map(|p| p.z).sum::<f64>() / nominal.len() as f64;
-    let lines: Result<Vec<Vec<(f64, [f64; 2])>>, PathError> = (0..rows)
+    let lines: Result<Vec<Vec<Node>>, PathError> = (0..rows)
         .into_par_iter()
         .map(|j| {
             let (mut place, mut z) = (Place::UNKNOWN, middle);
@@ -121,12 +126,7 @@ fn sampled(nominal: &Nominal, [low, high]: [[f64; 2]; 2]) -> Result<Field, PathE
 }
 
 /// Searches the height and the slopes at a place; NaN off the part.
-fn height_at(
-    surface: &OffsetSurface,
-    [x, y]: [f64; 2],
-    start_mm: f64,
-    place: &mut Place,
-) -> Result<(f64, [f64; 2]), PathError> {
+fn height_at(surface: &OffsetSurface, [x, y]: [f64; 2], start_mm: f64, place: &mut Place) -> Result<Node, PathError> {
     let mut z = start_mm;
     for _ in 0..STEPS {
         let foot = surface.foot(&Point::new(x, y, z), *place);

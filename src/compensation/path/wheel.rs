@@ -11,10 +11,10 @@
 //! ```
 //!
 //! A disc's spindle lies along y, across tracks that run along x, unless said otherwise: it rolls along the track. A cup's spindle is
-//! tilted from z towards -x by a: it stands on the edge of its ring at +x... the lowest point of its ring, and touches with the
-//! outside of its face there. With the ring flat on a hollow sphere of radius rho all of the ring touches,
-//! sin a = D / (2 (rho - r)) measured at its lowest place; on a dome, from inside the ring, sin a = D / (2 (rho + r)). A free form has no one
-//! rho: the spindle is tilted further than any slope of the part, and one place of the ring touches at a time.
+//! tilted from z towards -x: the lowest place of its ring is on the side of -x, touches with the outer side of the face, and the rest of
+//! the ring stands clear. On a hollow sphere of radius rho the whole ring touches where the normal leans from the spindle by a with
+//! sin a = D / (2 (rho - r)); on a dome it would be the inner side of the face, with sin a = D / (2 (rho + r)). A free form has no one
+//! rho, so the spindle is tilted further than any slope of the part, and one place of the ring touches at a time: the outer one.
 
 use crate::geometry::{Point, Vector};
 
@@ -188,8 +188,8 @@ mod tests {
     #[test]
     fn a_cup_on_a_hollow_sphere_touches_with_all_of_its_ring_at_the_angle_of_the_formula() {
         // sin a = D / (2 (rho - r)): the normal leans from the spindle by a, and every place of the ring is as far from the middle.
-        let (ring, tube, rho) = (20.0, 2.0, 100.0);
-        let lean = (ring / (rho - tube) as f64).asin();
+        let (ring, tube, rho): (f64, f64, f64) = (20.0, 2.0, 100.0);
+        let lean = (ring / (rho - tube)).asin();
         let wheel = Wheel::tilted_cup(ring, tube, lean);
         let bottom = Contact { point: Point::origin(), normal: Vector::z() };
         let centre = wheel.centre(&bottom).unwrap();

@@ -247,7 +247,7 @@ impl<'a> Rewriter<'a> {
             901 => self.arcs_absolute = true,
             911 => self.arcs_absolute = false,
             530 => asked.machine = true,
-            code @ (540..=590 | 591..=593) => self.choose_system(code, word)?,
+            code @ (540 | 550 | 560 | 570 | 580 | 590 | 591 | 592 | 593) => self.choose_system(code, word)?,
             800 => self.motion = None,
             40 | 400 | 430 | 490 | 610 | 611 | 640 | 940 | 950 | 960 | 970 | 980 | 990 => {}
             930 => {

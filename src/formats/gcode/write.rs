@@ -151,6 +151,7 @@ fn header_lines(h: &ProgramHeader, s: &Summary, lines: u64) -> String {
     }
     say(format_args!("Regrind {} tool path", env!("CARGO_PKG_VERSION")));
     say(format_args!("part: {}", h.part));
+    say(format_args!("part: sha256 {}", hex(&h.base_identity)));
     say(format_args!("cycle: {}", h.cycle));
     say(format_args!("base: sha256 {}", hex(&h.base_identity)));
     say(format_args!("map: sha256 {}", hex(&h.map_identity)));
