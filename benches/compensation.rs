@@ -6,6 +6,7 @@
 use std::sync::LazyLock;
 
 use divan::{Bencher, black_box};
+use rand::RngExt;
 use regrind::compensation::{
     Contact, MapOptions, ParameterOptions, Reading, Smoothing, error_map, parameters, point_spacing_mm,
 };
@@ -32,14 +33,15 @@ fn main() {
 fn measured() -> Vec<Contact> {
     let shape = FreeForm::default();
     let form = FormError::new(5, 30.0, 6.657e-3, FreeForm::WIDTH_MM, FreeForm::DEPTH_MM);
-    let random = |k: usize| ((k as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40) as f64 / (1u64 << 24) as f64 - 0.5;
+    let mut rng = regrind_sim::rng(1);
+    let mut random = move || rng.random::<f64>() - 0.5;
     (0..SCAN.0 * SCAN.1)
         .map(|k| {
             let at = |i: usize, n: usize, size: f64| (size - 2.0) * (i as f64 / (n - 1) as f64 - 0.5);
             let (x, y) = (at(k % SCAN.0, SCAN.0, FreeForm::WIDTH_MM), at(k / SCAN.0, SCAN.1, FreeForm::DEPTH_MM));
             // Four even numbers between -1/2 and 1/2 have a standard deviation of 0.577.
-            let noise = 3e-4 / 0.577 * (0..4).map(|n| random(4 * k + n + 1)).sum::<f64>();
-            let spike = if random(7 * k + 3) > 0.49 { 8e-3 } else { 0.0 };
+            let noise = 3e-4 / 0.577 * (0..4).map(|_| random()).sum::<f64>();
+            let spike = if random() > 0.49 { 8e-3 } else { 0.0 };
             let normal = Vector::from(shape.normal(x, y));
             let wheel = -0.02 * (1.0 / normal.z - 1.0);
             let deviation_mm = form.height(x, y) + noise + spike + wheel;

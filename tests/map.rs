@@ -269,7 +269,7 @@ fn scatter_over_stated(readings: &[Reading], options: &MapOptions, noise_mm: f64
 #[test]
 fn the_uncertainty_of_the_filter_is_the_scatter() {
     for (readings, options) in [
-        (trial(form), plain(6.0, 2.0)),
+        (trial(form), plain(5.0, 2.0)),
         (strewn(1500, [40.0, 30.0], 4, form), MapOptions { order: Order::Quadric, ..plain(9.0, 2.0) }),
     ] {
         let (ratio, outside, point) = scatter_over_stated(&readings, &options, 3e-4, 200);

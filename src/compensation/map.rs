@@ -11,15 +11,15 @@ use thiserror::Error;
 use super::filter::{Filtered, Gaussian, LEAST_READINGS, Order};
 use super::level::{Levelled, level_off};
 use super::net::{Net, NetError};
-use super::robust::{Residuals, residuals, robust};
+use super::robust::{Residuals, Robust, residuals, robust};
 use super::sampling::{check_cutoff, point_spacings_mm};
 use super::spline::{Roughness, SplineError, spline};
 
 /// Most nodes that a filter may work on; a short cut-off on a wide net asks for more nodes than the net has.
 const MOST_WORKED: f64 = 2e7;
 
-/// Least cut-off of the surface that outliers are looked for on, in distances between readings.
-const DETECTION: f64 = 4.0;
+/// Least cut-off of the surface that readings are judged by, in distances between them.
+const WIDE: f64 = 4.0;
 
 /// One deviation and where it was measured.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -37,7 +37,8 @@ pub enum Smoothing {
     /// The areal Gaussian filter, ISO 16610-61.
     #[default]
     Gaussian,
-    /// Its robust form, ISO 16610-71: what stands out counts less.
+    /// Its robust form, ISO 16610-71: what stands out counts less. What stands out is told on a surface with a cut-off of four distances
+    /// between readings at least.
     RobustGaussian,
     /// A smoothing surface of tensor-product cubic B-splines.
     Spline,
@@ -157,20 +158,32 @@ pub fn error_map(readings: &[Reading], options: &MapOptions) -> Result<ErrorMap,
     let gaussian = Gaussian { cutoff_mm: options.cutoff_mm, order: options.order };
     let worked = worked_net(&net, &gaussian)?;
     let apart_mm = point_spacings_mm(readings);
+    let wide = Gaussian { cutoff_mm: options.cutoff_mm.max(WIDE * apart_mm[0].max(apart_mm[1])), ..gaussian };
+    let wide = Wide { gaussian: wide, net: worked_net(&net, &wide)?, same: wide == gaussian };
     let mut kept = Kept::all(readings);
-    let mut outliers = Vec::new();
+    let (mut outliers, mut found, mut advice) = (Vec::new(), None, Vec::new());
     if let Some(limit) = options.outlier_limit {
-        outliers = outliers_of(&kept, &net, &gaussian, limit, apart_mm)?;
+        let all = wide.robust(&kept);
+        outliers = all.outliers(&kept.places, limit, apart_mm).unwrap_or_else(|| {
+            advice.push(
+                "more than a tenth of the points stand out, so none was left out; clean the part and the probe"
+                    .to_owned(),
+            );
+            Vec::new()
+        });
         kept = Kept::without(readings, &outliers);
+        found = Some(all).filter(|_| outliers.is_empty());
     }
-    let (filtered, weights) = if options.smoothing == Smoothing::RobustGaussian {
-        let found = robust(&gaussian, &kept.places, &kept.values, &worked);
-        (found.filtered, Some(found.weights))
+    let (filtered, point_sigma) = if options.smoothing == Smoothing::RobustGaussian {
+        let found = found.unwrap_or_else(|| wide.robust(&kept));
+        let with_weights = || gaussian.scattered(&kept.places, &kept.values, Some(&found.weights), &worked);
+        (if wide.same { found.filtered.clone() } else { with_weights() }, found.sigma)
     } else {
-        (gaussian.scattered(&kept.places, &kept.values, None, &worked), None)
+        let filtered = gaussian.scattered(&kept.places, &kept.values, None, &worked);
+        let point_sigma = wide.point_sigma(&kept, &filtered);
+        (filtered, point_sigma)
     };
-    let found = residuals(&filtered, &kept.places, &kept.values, weights.as_deref());
-    let smooth = Smooth::from_filtered(&filtered, &net, found.sigma(weights.as_deref()));
+    let smooth = Smooth::from_filtered(&filtered, &net, point_sigma);
     let count = smooth.valid.iter().filter(|v| **v).count();
     if count * 4 < net.len() {
         return Err(MapError::TooSparse { valid: count, nodes: net.len(), cutoff_mm: options.cutoff_mm });
@@ -180,24 +193,31 @@ pub fn error_map(readings: &[Reading], options: &MapOptions) -> Result<ErrorMap,
         _ => smooth,
     };
     let map = smooth.into_map(net, &kept, outliers, options.level_off_mm);
-    Ok(map.advised(options, readings.len(), apart_mm))
+    Ok(ErrorMap { advice, ..map }.advised(options, readings.len(), apart_mm))
 }
 
-/// Finds the readings that do not belong to the surface.
-///
-/// The surface is the robust filter's, with a cut-off of four distances between readings at least: with a shorter one a reading is
+/// The filter that readings are judged by: with a cut-off of four distances between them at least. With a shorter one a reading is
 /// compared with little but itself.
-fn outliers_of(
-    kept: &Kept,
-    net: &Net,
-    gaussian: &Gaussian,
-    limit: f64,
-    apart_mm: [f64; 2],
-) -> Result<Vec<usize>, MapError> {
-    let cutoff_mm = gaussian.cutoff_mm.max(DETECTION * apart_mm[0].max(apart_mm[1]));
-    let wide = Gaussian { cutoff_mm, ..*gaussian };
-    let found = robust(&wide, &kept.places, &kept.values, &worked_net(net, &wide)?);
-    Ok(found.outliers(&kept.places, limit, apart_mm))
+struct Wide {
+    gaussian: Gaussian,
+    net: Net,
+    /// Whether it is the filter of the map.
+    same: bool,
+}
+
+impl Wide {
+    fn robust(&self, kept: &Kept) -> Robust {
+        robust(&self.gaussian, &kept.places, &kept.values, &self.net)
+    }
+
+    /// Returns the standard deviation of one reading; `filtered` is what the map's own filter found.
+    fn point_sigma(&self, kept: &Kept, filtered: &Filtered) -> f64 {
+        if self.same {
+            return residuals(filtered, &kept.places, &kept.values, None).sigma();
+        }
+        let wide = self.gaussian.scattered(&kept.places, &kept.values, None, &self.net);
+        residuals(&wide, &kept.places, &kept.values, None).sigma()
+    }
 }
 
 /// Returns how many readings there are to the square millimetre, typically, from their shares in the values.

@@ -78,14 +78,10 @@ impl Residuals {
         self.plain.iter().zip(&self.freedom).map(each).collect()
     }
 
-    /// Returns the standard deviation of one reading, weights given: the residuals' sum of squares over their freedom.
-    pub fn sigma(&self, weights: Option<&[f64]>) -> f64 {
-        let (mut squares, mut freedom) = (0.0, 0.0);
-        for k in (0..self.plain.len()).filter(|&k| self.plain[k].is_finite()) {
-            let weight = weights.map_or(1.0, |w| w[k]);
-            squares += weight * self.plain[k].powi(2);
-            freedom += weight * self.freedom[k];
-        }
+    /// Returns the standard deviation of one reading: the residuals' sum of squares over their freedom.
+    pub fn sigma(&self) -> f64 {
+        let known = (0..self.plain.len()).filter(|&k| self.freedom[k] > LEAST_FREEDOM && self.plain[k].is_finite());
+        let (squares, freedom) = known.fold((0.0, 0.0), |(s, f), k| (s + self.plain[k].powi(2), f + self.freedom[k]));
         if freedom > 0.0 { (squares / freedom).sqrt() } else { 0.0 }
     }
 }
@@ -131,10 +127,11 @@ pub(super) fn iterate(
 impl Robust {
     /// Returns the indices of the readings that do not belong to the surface, ascending.
     ///
-    /// `apart` is the distance of neighbouring readings along x and y.
-    pub fn outliers(&self, places: &[[f64; 2]], limit: f64, apart: [f64; 2]) -> Vec<usize> {
+    /// `apart` is the distance of neighbouring readings along x and y. `None` where more than a tenth would be outliers: such readings are
+    /// no exception, and the surface has no other rule.
+    pub fn outliers(&self, places: &[[f64; 2]], limit: f64, apart: [f64; 2]) -> Option<Vec<usize>> {
         if places.len() < LEAST_READINGS {
-            return Vec::new();
+            return Some(Vec::new());
         }
         let limit = limit * self.sigma.max(LEAST_SCALE_MM);
         let mut far: Vec<usize> = (0..places.len()).filter(|&k| self.scaled[k].abs() > limit).collect();
@@ -142,7 +139,7 @@ impl Robust {
         let mut outliers: Vec<usize> =
             (0..far.len()).filter(|&n| !self.is_feature(n, &far, places, apart)).map(|n| far[n]).collect();
         outliers.sort_unstable();
-        outliers
+        (outliers.len() * 10 <= places.len()).then_some(outliers)
     }
 
     /// Whether enough of the eight neighbours are as far off, to the same side; `far` is sorted along x.
