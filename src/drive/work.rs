@@ -396,7 +396,7 @@ fn figures(
     let moved = task.fixture_cmm_from_model.inverse() * found.cmm_from_model;
     let outliers = found.deviations.iter().filter(|d| d.status == Fate::Outlier).count() as u32;
     // What the filter takes out is what a point scatters by: noise of the probe and the finest texture.
-    let scatter_mm = error.map_or(verdict.residual_sigma_mm, |map| map.rest_sigma_mm);
+    let scatter_mm = error.map_or(verdict.residual_sigma_mm, |map| map.point_sigma_mm);
     let points = verdict.used.max(1) as f64;
     Figures {
         pv_mm: verdict.pv_mm,
@@ -432,7 +432,7 @@ fn answer(before: &Cycle, cycle: &Cycle, found: &Registration, error: &ErrorMap)
     let earlier = before.error.as_ref()?;
     let used = found.deviations.iter().filter(|d| d.status == Fate::Used);
     let places: Vec<(Point, Vector)> = used.map(|d| (d.point, d.normal)).collect();
-    let scatter_mm = earlier.rest_sigma_mm.hypot(error.rest_sigma_mm);
+    let scatter_mm = earlier.point_sigma_mm.hypot(error.point_sigma_mm);
     Some(response([earlier, error], [&before.correction, &cycle.correction], &places, scatter_mm))
 }
 

@@ -211,7 +211,7 @@ impl<'a> Line<'a> {
         };
         let places: Vec<(Point, Vector)> = used().map(|d| (d.point, d.normal)).collect();
         let answer = self.before.as_ref().map(|(correction, earlier)| {
-            let scatter_mm = earlier.rest_sigma_mm.hypot(error.rest_sigma_mm);
+            let scatter_mm = earlier.point_sigma_mm.hypot(error.point_sigma_mm);
             response([earlier, &error], [correction, &self.correction], &places, scatter_mm)
         });
         let answer = answer.filter(|_| self.way != Way::Plain);
