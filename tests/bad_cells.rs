@@ -240,7 +240,7 @@ fn every_kind_of_broken_file_through_every_command() {
         ("syntax", replaced("[measure]", "[measure")),
         ("unknown", replaced("probe_radius_mm", "probe_radius_um")),
         ("type", replaced("columns = 20", "columns = \"twenty\"")),
-        ("range", replaced("cutoff_mm = 5.0", "cutoff_mm = 50000.0")),
+        ("range", replaced("removal_budget_um = 400.0", "removal_budget_um = 4e9")),
         ("nan", replaced("pv_um = 7.0", "pv_um = nan")),
         ("binary", "\u{0}\u{1}\u{2}".to_owned()),
         ("contradiction", replaced("columns = 20", "columns = 0")),

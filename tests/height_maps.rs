@@ -185,7 +185,6 @@ fn cell(shop: &Path, port: u16) -> CellConfig {
     let text = changed(
         "config/modbus-tcp.toml",
         &[
-            ("simulated = true", "simulated = false"),
             ("kind = \"modbus-tcp\"\nhost = \"127.0.0.1\"\nport = 15021\nunit = 1\n", &wire),
             ("port = 15022", &format!("port = {port}")),
         ],
@@ -230,7 +229,7 @@ async fn run(seed: u64) -> Ran {
         part: "FFM".into(),
         actor: "test".into(),
         station: "here".into(),
-        simulation: false,
+        simulation: true,
         first_command_id: 1,
         content: json!({}),
     };
