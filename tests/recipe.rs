@@ -244,7 +244,7 @@ const BAD_RECIPES: &[Bad] = &[
     (RECIPE, "[acceptance]", "[acceptence]", "acceptence", "acceptence", "did you mean `acceptance`"),
     (RECIPE, "pv_um = 7.0", "pv_um = 0.5", "acceptance.pv_um", "0.5\nrms", "interchanged"),
     (RECIPE, "pv_um = 7.0\nrms_um = 1.0\n", "", "acceptance", "acceptance]", "add `rms_um = 1.0`"),
-    (RECIPE, "gain = 1.0", "gain = 1.5", "compensation.gain", "1.5\ncutoff", "1.2"),
+    (RECIPE, "cutoff_mm = 5.0 ", "gain = 1.5\ncutoff_mm = 5.0 ", "compensation.gain", "1.5\ncutoff", "1.2"),
     (RECIPE, "depth_of_cut_um = 20.0", "depth_of_cut_um = 500.0", "compensation.depth_of_cut_um", "500.0", "budget"),
     (
         RECIPE,
@@ -529,12 +529,12 @@ fn all_problems_are_told_at_once_and_in_order() {
 
 #[test]
 fn several_places_of_broken_syntax_are_told() {
-    let text = changed(RECIPE, "gain = 1.0", "gain 1.0");
+    let text = changed(RECIPE, "depth_of_cut_um = 20.0", "depth_of_cut_um 20.0");
     let text = changed(&text, "track_mm = 0.5", "track_mm = = 0.5");
     let problems = recipe(&text).unwrap_err();
     assert!(problems.problems.len() >= 2, "{problems}");
     let lines: Vec<usize> = problems.problems.iter().map(|problem| problems.place(problem).0).collect();
-    for needle in ["gain 1.0", "track_mm = = 0.5"] {
+    for needle in ["depth_of_cut_um 20.0", "track_mm = = 0.5"] {
         assert!(lines.contains(&place_of(&text, needle).0), "{problems}");
     }
 }

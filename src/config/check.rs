@@ -74,6 +74,11 @@ pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) ->
         },
     ];
     let simulated = written.cell.simulated;
+    // One machine by files beside a simulated one is a rehearsal; both by files leave nothing to be simulated.
+    if simulated == Some(true) && machines.iter().all(|m| matches!(m.wire, Some(WireTable::FileExchange(_)))) {
+        let found = "is true, and both machines are reached by files";
+        document.report("cell.simulated", found, "nobody simulates a person with files", "write `simulated = false`");
+    }
     let [cmm_link, grinder_link] = machines.map(|machine| machine.link(simulated, folder, document));
     compare_wires(cmm_link.as_ref(), grinder_link.as_ref(), document);
     let sphere = cmm.reference_sphere.as_ref().map(|sphere| reference_sphere(sphere, cmm.travel.as_ref(), document));
@@ -225,14 +230,7 @@ impl Machine<'_> {
                 stop_bits: rtu.stop_bits,
                 unit: rtu.unit,
             }),
-            WireTable::FileExchange(files) => {
-                if simulated == Some(true) {
-                    let found = "is \"file-exchange\" in a simulated cell";
-                    let remedy = "write `simulated = false`, or choose a Modbus wire";
-                    document.report(&self.key("wire.kind"), found, "nobody simulates a person with files", remedy);
-                }
-                self.files(files, folder, document).map(Wire::FileExchange)
-            }
+            WireTable::FileExchange(files) => self.files(files, folder, document).map(Wire::FileExchange),
         }
     }
 
