@@ -414,7 +414,7 @@ const BAD_CELLS: &[Bad] = &[
         "did you mean \"even\"",
     ),
     (RTU, "stop_bits = 1\nunit = 1", "stop_bits = 3\nunit = 1", "cmm.wire.stop_bits", "3\nunit", "1 to 2"),
-    (FILES, "simulated = false", "simulated = true", "cmm.wire.kind", "\"file-exchange\"", "simulated = false"),
+    (FILES, "simulated = false", "simulated = true", "cell.simulated", "true", "simulated = false"),
     (
         FILES,
         "inbox = \"../exchange/cmm/in\"",
