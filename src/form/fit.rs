@@ -83,7 +83,10 @@ impl Fit {
             terms.values(index, sample, row)?;
             Ok(row.iter().zip(&self.coefficients_mm).map(|(value, c)| value * c).sum())
         };
-        samples.par_iter().enumerate().map_init(|| vec![0.0; terms.len()], value).collect()
+        let values: Vec<Result<f64, FormError>> =
+            samples.par_iter().enumerate().map_init(|| vec![0.0; terms.len()], value).collect();
+        // The first sample that fails in their order, not in time.
+        values.into_iter().collect()
     }
 }
 
@@ -104,19 +107,23 @@ pub(super) fn solve(
     row: impl Fn(usize, &Sample, &mut [f64]) -> Result<(), FormError> + Sync,
 ) -> Result<Solved, FormError> {
     let width = terms + 1;
-    let triangles = samples.par_chunks(SHARE).enumerate().map(|(share, chunk)| {
-        let mut rows = DMatrix::zeros(chunk.len(), width);
-        let mut values = vec![0.0; terms];
-        for (k, sample) in chunk.iter().enumerate() {
-            row(share * SHARE + k, sample, &mut values)?;
-            for (column, value) in values.iter().enumerate() {
-                rows[(k, column)] = *value;
+    let triangles: Vec<Result<DMatrix<f64>, FormError>> = samples
+        .par_chunks(SHARE)
+        .enumerate()
+        .map(|(share, chunk)| {
+            let mut rows = DMatrix::zeros(chunk.len(), width);
+            let mut values = vec![0.0; terms];
+            for (k, sample) in chunk.iter().enumerate() {
+                row(share * SHARE + k, sample, &mut values)?;
+                for (column, value) in values.iter().enumerate() {
+                    rows[(k, column)] = *value;
+                }
+                rows[(k, terms)] = sample.deviation_mm;
             }
-            rows[(k, terms)] = sample.deviation_mm;
-        }
-        Ok(rows.qr().r())
-    });
-    let triangles: Vec<DMatrix<f64>> = triangles.collect::<Result<_, FormError>>()?;
+            Ok(rows.qr().r())
+        })
+        .collect();
+    let triangles: Vec<DMatrix<f64>> = triangles.into_iter().collect::<Result<_, FormError>>()?;
     let mut r = DMatrix::<f64>::zeros(width, width);
     for some in triangles.chunks(SHARE.div_ceil(width)) {
         let height = width + some.iter().map(DMatrix::nrows).sum::<usize>();

@@ -91,14 +91,16 @@ impl ToolPath {
             feed_mm_min: options.feed_mm_min,
             run_up_mm: options.overrun_mm + options.lead_mm,
         };
-        let whole = (0..self.tracks())
+        let tracks: Vec<Summary> = (0..self.tracks())
             .into_par_iter()
             .map(|k| {
                 let mut one = empty;
                 one.take(Moves::of(self, k, k + 1), self.safe_z_mm());
                 one
             })
-            .reduce(|| empty, Summary::and);
+            .collect();
+        // Added up in their order, so that a path has one length whichever thread was first.
+        let whole = tracks.into_iter().fold(empty, Summary::and);
         if whole.points > MOST_POINTS {
             return Err(PathError::TooManyPoints { points: whole.points, limit: MOST_POINTS });
         }
@@ -252,10 +254,25 @@ pub(super) fn options(options: &PathOptions) -> Result<(), PathError> {
 pub(super) fn fit(wanted: &Wanted, outline: &Aperture, options: &PathOptions) -> Result<f64, PathError> {
     let places = places(outline, PLACES);
     let one = |place: &[f64; 2]| fit_at(&wanted.bend(*place), *place, options);
-    let narrowest = places.par_iter().map(one).try_reduce(|| f64::INFINITY, |a, b| Ok(a.min(b)))?;
+    let distances: Vec<Result<f64, PathError>> = places.par_iter().map(one).collect();
+    let narrowest = distances.into_iter().reduce(narrower).unwrap_or(Err(PathError::Empty))?;
     match options.spacing {
         TrackSpacing::Distance(mm) => Ok(mm),
         TrackSpacing::Scallop { widest_mm, .. } => Ok(narrowest.min(widest_mm)),
+    }
+}
+
+/// The lesser distance or, where the wheel is refused, the refusal that says most: the narrowest hollow, which tells the wheel that fits
+/// everywhere, and else the first, so that the same path is refused with the same words each time.
+fn narrower(a: Result<f64, PathError>, b: Result<f64, PathError>) -> Result<f64, PathError> {
+    let room = |e: &PathError| match e {
+        PathError::Hollow { limit_mm, wheel_mm, .. } => Some(limit_mm / wheel_mm),
+        _ => None,
+    };
+    match (a, b) {
+        (Ok(a), Ok(b)) => Ok(a.min(b)),
+        (Err(a), Err(b)) => Err(if room(&a).zip(room(&b)).is_some_and(|(a, b)| b < a) { b } else { a }),
+        (Err(e), Ok(_)) | (Ok(_), Err(e)) => Err(e),
     }
 }
 
@@ -343,20 +360,25 @@ pub(super) fn body(path: &ToolPath) -> Result<(), PathError> {
     let one = |place: &[f64; 2]| {
         let [x_mm, y_mm] = *place;
         let centre = wheel.centre(&wanted.at(*place)).ok_or(PathError::CannotTouch { x_mm, y_mm })?;
+        let (mut depth_mm, mut deepest_at) = (DEEPEST_MM, None);
         for (at, point) in &ground {
             let from = point - centre;
             if from.norm_squared() > reach * reach {
                 continue;
             }
-            let depth_mm = -wheel.distance_mm(&from);
-            if depth_mm > DEEPEST_MM {
-                let ([at_x_mm, at_y_mm], limit_mm) = (*at, DEEPEST_MM);
-                return Err(PathError::Body { x_mm, y_mm, at_x_mm, at_y_mm, depth_mm, limit_mm });
+            let depth = -wheel.distance_mm(&from);
+            if depth > depth_mm {
+                (depth_mm, deepest_at) = (depth, Some(*at));
             }
         }
-        Ok(())
+        deepest_at.map_or(Ok(()), |[at_x_mm, at_y_mm]| {
+            Err(PathError::Body { x_mm, y_mm, at_x_mm, at_y_mm, depth_mm, limit_mm: DEEPEST_MM })
+        })
     };
-    places(path.outline(), BODIES).par_iter().try_for_each(one)
+    let cuts: Vec<Result<(), PathError>> = places(path.outline(), BODIES).par_iter().map(one).collect();
+    let depth = |e: &PathError| if let PathError::Body { depth_mm, .. } = e { *depth_mm } else { f64::INFINITY };
+    let deeper = |a: PathError, b: PathError| if depth(&b) > depth(&a) { b } else { a };
+    cuts.into_iter().filter_map(Result::err).reduce(deeper).map_or(Ok(()), Err)
 }
 
 #[cfg(test)]
@@ -370,10 +392,14 @@ mod tests {
 
     /// A surface z = a x^2 + b y^2 without a correction.
     fn quadric(a: f64, b: f64) -> Wanted {
+        surface(|[x, y]| (a * x * x + b * y * y, [2.0 * a * x, 2.0 * b * y]))
+    }
+
+    /// A surface by its height and slopes over x and y, without a correction.
+    fn surface(height: impl Fn([f64; 2]) -> (f64, [f64; 2])) -> Wanted {
         let on = Lattice { columns: 81, rows: 81, first_mm: [-10.0, -10.0], spacing_mm: [0.25, 0.25] };
         let places = (0..81 * 81).map(|k| [-10.0 + (k % 81) as f64 * 0.25, -10.0 + (k / 81) as f64 * 0.25]);
-        let (z, slopes): (Vec<f64>, Vec<[f64; 2]>) =
-            places.map(|[x, y]| (a * x * x + b * y * y, [2.0 * a * x, 2.0 * b * y])).unzip();
+        let (z, slopes): (Vec<f64>, Vec<[f64; 2]>) = places.map(height).unzip();
         let net = Net { columns: 2, rows: 2, first_mm: [-8.0, -6.0], spacing_mm: [16.0, 12.0] };
         let none = Correction { net, values_mm: vec![0.0; 4], cycle: 1, level_mm: 0.0 };
         Wanted::new(Field::hermite(on, &z, &slopes), &none, 5.0).unwrap()
@@ -394,7 +420,11 @@ mod tests {
         assert!(path(hollow(), ball(18.0)).is_ok());
         let refused = path(hollow(), ball(20.5)).unwrap_err();
         let PathError::Hollow { direction_deg, hollow_mm, wheel_mm, .. } = refused else { panic!("{refused}") };
-        assert!((direction_deg - 90.0).abs() < 5.0 && (hollow_mm - 20.0).abs() < 1.6 && wheel_mm == 20.5, "{refused}");
+        assert!((direction_deg - 90.0).abs() < 5.0 && (hollow_mm - 20.0).abs() < 0.01 && wheel_mm == 20.5, "{refused}");
+        // The narrowest place of all is told, whichever thread came first.
+        for _ in 0..20 {
+            assert_eq!(path(hollow(), ball(20.5)).unwrap_err().to_string(), refused.to_string());
+        }
         // A disc that rolls along the track is narrow across it, and would not fit the other way.
         let disc = |spindle| PathOptions { wheel: Wheel::Torus { ring_mm: 40.0, tube_mm: 5.0, spindle }, ..ball(1.0) };
         assert!(path(hollow(), disc(Vector::y())).is_ok());
@@ -415,6 +445,26 @@ mod tests {
         let cup = PathOptions { wheel: Wheel::tilted_cup(6.0, 1.0, 0.15), ..ball(1.0) };
         assert!(matches!(path(quadric(-0.0125, -0.001), cup), Err(PathError::CannotTouch { .. })));
         assert!(path(quadric(-0.002, -0.001), cup).is_ok());
+    }
+
+    #[test]
+    fn the_far_side_of_a_wheel_must_not_reach_the_part() {
+        // A disc that leans by 37 degrees reaches up over the part towards -x, below a wall of 50 degrees at whose foot its rim still fits.
+        let wall = |steepest: f64| {
+            surface(move |[x, _]| {
+                let (into, width) = ((-2.0 - x).max(0.0), 0.8 * steepest / 1.2);
+                let slope = steepest * (into / width).min(1.0);
+                (if into < width { 0.5 * slope * into } else { steepest * (into - 0.5 * width) }, [-slope, 0.0])
+            })
+        };
+        let leaning = Wheel::Torus { ring_mm: 3.0, tube_mm: 0.4, spindle: Vector::new(0.6, 0.0, 0.8) };
+        let options = PathOptions { wheel: leaning, overrun_mm: 0.0, lead_mm: 0.0, ..ball(1.0) };
+        assert!(path(wall(0.4), options).is_ok());
+        let refused = path(wall(1.2), options).unwrap_err();
+        let PathError::Body { x_mm, at_x_mm, depth_mm, limit_mm, .. } = refused else { panic!("{refused}") };
+        // On the wall it touches with the side that is high on the flat; the deepest of all is told, and a rim is no deeper than its tube.
+        assert!(x_mm < -2.0 && (at_x_mm - x_mm).abs() > 1.0 && limit_mm == DEEPEST_MM, "{refused}");
+        assert!(depth_mm > 0.1 && depth_mm <= 0.4, "{refused}");
     }
 
     #[test]

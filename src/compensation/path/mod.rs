@@ -181,9 +181,10 @@ impl ToolPath {
         let spans = &self.tracks.spans;
         let some = spans.len().div_ceil(SOME_TRACKS).max(1);
         let chosen = spans.par_iter().step_by(some).chain(spans.par_iter().rev().take(1));
-        chosen
-            .map(highest)
-            .try_reduce(|| f64::NEG_INFINITY, |a, b| Ok(a.max(b)))
+        let heights: Vec<Result<f64, [f64; 2]>> = chosen.map(highest).collect();
+        heights
+            .into_iter()
+            .try_fold(f64::NEG_INFINITY, |most, one| one.map(|z| most.max(z)))
             .map_err(|[x_mm, y_mm]| PathError::CannotTouch { x_mm, y_mm })
     }
 }

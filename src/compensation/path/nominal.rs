@@ -105,7 +105,7 @@ fn sampled(nominal: &Nominal, [low, high]: [[f64; 2]; 2]) -> Result<Field, PathE
     let [columns, rows] = cells.map(|c| c as usize + 1);
     let on = Lattice { columns, rows, first_mm: low, spacing_mm: [size[0] / cells[0], size[1] / cells[1]] };
     let middle = nominal.points().map(|p| p.z).sum::<f64>() / nominal.len() as f64;
-    let lines: Result<Vec<Vec<Node>>, PathError> = (0..rows)
+    let lines: Vec<Result<Vec<Node>, PathError>> = (0..rows)
         .into_par_iter()
         .map(|j| {
             let (mut place, mut z) = (Place::UNKNOWN, middle);
@@ -121,7 +121,9 @@ fn sampled(nominal: &Nominal, [low, high]: [[f64; 2]; 2]) -> Result<Field, PathE
                 .collect()
         })
         .collect();
-    let (heights, slopes): (Vec<f64>, Vec<[f64; 2]>) = lines?.into_iter().flatten().unzip();
+    // The first that fails in their order, not in time, so that the same surface is refused with the same words.
+    let lines: Vec<Vec<Node>> = lines.into_iter().collect::<Result<_, PathError>>()?;
+    let (heights, slopes): (Vec<f64>, Vec<[f64; 2]>) = lines.into_iter().flatten().unzip();
     Ok(Field::hermite(on, &heights, &slopes))
 }
 
