@@ -8,7 +8,8 @@ use std::sync::LazyLock;
 use divan::{Bencher, black_box};
 use rand::RngExt;
 use regrind::compensation::{
-    Contact, MapOptions, ParameterOptions, Reading, Smoothing, error_map, parameters, point_spacing_mm,
+    Contact, Correction, CorrectionLimits, GainRule, Knowledge, MapOptions, ParameterOptions, Reading, Seen, Smoothing,
+    error_map, parameters, point_spacing_mm,
 };
 use regrind::geometry::{Point, Vector};
 use regrind_sim::form::FormError;
@@ -97,6 +98,25 @@ fn spline(bencher: Bencher, spacing_mm: f64) {
     let readings = &*READINGS;
     let options = MapOptions { smoothing: Smoothing::Spline, ..plain(spacing_mm) };
     bencher.bench(|| error_map(black_box(readings), &options));
+}
+
+/// What a second pass tells, by octaves, and the correction of the third.
+#[divan::bench(args = SPACINGS_MM)]
+fn correction(bencher: Bencher, spacing_mm: f64) {
+    let options = MapOptions::new(CUTOFF_MM, spacing_mm);
+    let error = error_map(&READINGS, &options).expect("a map");
+    let now = Correction::none(error.net, 0.06);
+    let begin = Knowledge::new(GainRule::Wavelength, &options, [FreeForm::WIDTH_MM, FreeForm::DEPTH_MM], None);
+    let seen = Seen { correction: &now, error: &error, answer: None };
+    let known = begin.after(&seen);
+    let limits = CorrectionLimits {
+        depth_of_cut_mm: 0.01,
+        least_depth_mm: 0.0005,
+        largest_correction_mm: 0.1,
+        allowance_mm: 0.06,
+        removal_budget_mm: 1.0,
+    };
+    bencher.bench(|| now.next(&error, &black_box(&known).after(&seen), &limits).expect("a correction"));
 }
 
 /// Wheel, setting and wear told from form.

@@ -3,10 +3,14 @@
 //! The part is a free form of 100 x 60 mm with a correction on a net of 1 mm. How many points there are is set by the distance of the
 //! tracks; the chord error is 0.1 um. Growth in time is linear, and nothing but one chunk of text is held in memory.
 
+use std::path::Path;
+
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
-use regrind::compensation::path::{Field, Lattice, Move, PathOptions, ToolPath, Wanted, Wheel};
-use regrind::compensation::{Correction, Net};
+use regrind::compensation::path::{Field, Lattice, Move, PathOptions, Summary, ToolPath, Wanted, Wheel};
+use regrind::compensation::{
+    Correction, CorrectionLimits, GainRule, Knowledge, MapOptions, Net, Reading, Seen, error_map,
+};
 use regrind::formats::gcode::{PathMode, ProgramHeader, write_program};
 use regrind::geometry::Aperture;
 
@@ -25,6 +29,17 @@ fn sizes() -> Vec<u64> {
 
 /// A path of about so many points.
 fn path(points: u64) -> ToolPath {
+    let net = Net { columns: 101, rows: 61, first_mm: [-50.0, -30.0], spacing_mm: [1.0, 1.0] };
+    let values_mm = (0..net.len()).map(|k| error_mm(net.place_mm(k))).collect();
+    path_of(nominal(), &Correction { net, values_mm, cycle: 2, level_mm: 0.02 }, points)
+}
+
+/// What the grinder left, in millimetres.
+fn error_mm([x, y]: [f64; 2]) -> f64 {
+    5e-3 * (0.3 * x).sin() * (0.25 * y).cos()
+}
+
+fn nominal() -> Field {
     let on = Lattice { columns: 263, rows: 163, first_mm: [-52.4, -32.4], spacing_mm: [0.4, 0.4] };
     let form = |x: f64, y: f64| {
         let (s, c) = (0.042 * x + 0.016 * y + 0.4).sin_cos();
@@ -33,11 +48,11 @@ fn path(points: u64) -> ToolPath {
     };
     let place = |k: usize| ((k % 263) as f64 * 0.4 - 52.4, (k / 263) as f64 * 0.4 - 32.4);
     let (heights, slopes): (Vec<f64>, Vec<[f64; 2]>) = (0..263 * 163).map(place).map(|(x, y)| form(x, y)).unzip();
-    let net = Net { columns: 101, rows: 61, first_mm: [-50.0, -30.0], spacing_mm: [1.0, 1.0] };
-    let error = |[x, y]: [f64; 2]| 5e-3 * (0.3 * x).sin() * (0.25 * y).cos();
-    let values_mm = (0..net.len()).map(|k| error(net.place_mm(k))).collect();
-    let correction = Correction { net, values_mm, cycle: 2, level_mm: 0.02 };
-    let wanted = Wanted::new(Field::hermite(on, &heights, &slopes), &correction, 12.5).expect("finite");
+    Field::hermite(on, &heights, &slopes)
+}
+
+fn path_of(nominal: Field, correction: &Correction, points: u64) -> ToolPath {
+    let wanted = Wanted::new(nominal, correction, 12.5).expect("finite");
     // A track of 104 mm has some 450 points at 0.1 um.
     let track_mm = 60.0 * 450.0 / points as f64;
     let options = PathOptions::new(Wheel::Sphere { radius_mm: 12.5 }, track_mm, 1000.0);
@@ -74,7 +89,11 @@ fn points(bencher: Bencher, points: u64) {
 #[divan::bench(args = sizes(), sample_count = 3)]
 fn program(bencher: Bencher, points: u64) {
     let (path, folder) = (path(points), tempfile::tempdir().expect("a folder"));
-    let summary = path.summary().expect("a path");
+    let (summary, file) = (path.summary().expect("a path"), folder.path().join("part.ngc"));
+    bencher.counter(ItemsCount::new(points)).bench(|| write(&path, &summary, &file));
+}
+
+fn write(path: &ToolPath, summary: &Summary, file: &Path) {
     let header = ProgramHeader {
         part: "bench".into(),
         cycle: 2,
@@ -87,8 +106,36 @@ fn program(bencher: Bencher, points: u64) {
         simulation: true,
         mode: PathMode::default(),
     };
+    write_program(file, &header, summary, path.moves()).expect("a program");
+}
+
+/// All together: 28,476 deviations, their map, what they tell, the correction, the path and its program of a million points.
+#[divan::bench(sample_count = 5)]
+fn from_deviations_to_a_program(bencher: Bencher) {
+    let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("part.ngc");
-    bencher
-        .counter(ItemsCount::new(points))
-        .bench(|| write_program(&file, &header, &summary, path.moves()).expect("a program"));
+    let readings: Vec<Reading> = (0..226 * 126)
+        .map(|k| [(k % 226) as f64 * 100.0 / 225.0 - 50.0, (k / 226) as f64 * 60.0 / 125.0 - 30.0])
+        .map(|at_mm| Reading {
+            at_mm,
+            deviation_mm: error_mm(at_mm) + 3e-4 * (1e4 * (at_mm[0] + 3.0 * at_mm[1])).sin(),
+        })
+        .collect();
+    let options = MapOptions::new(5.0, 1.0);
+    let limits = CorrectionLimits {
+        depth_of_cut_mm: 0.01,
+        least_depth_mm: 0.0005,
+        largest_correction_mm: 0.1,
+        allowance_mm: 0.06,
+        removal_budget_mm: 1.0,
+    };
+    let begin = Knowledge::new(GainRule::Wavelength, &options, [100.0, 60.0], None);
+    bencher.bench(|| {
+        let error = error_map(black_box(&readings), &options).expect("a map");
+        let now = Correction::none(error.net, 0.06);
+        let known = begin.after(&Seen { correction: &now, error: &error, answer: None });
+        let step = now.next(&error, &known, &limits).expect("a correction");
+        let path = path_of(nominal(), &step.correction, 1_000_000);
+        write(&path, &path.summary().expect("a path"), &file);
+    });
 }

@@ -1,10 +1,10 @@
 //! How fast cycles come down to what the grinder cannot repeat, and how far: by gain, for every recipe.
 //!
 //! ```text
-//! cargo run --release --example convergence [SEEDS [PASSES]]
+//! cargo run --release --example convergence [SEEDS [PASSES [WAY]]]
 //! ```
 //! SEEDS (50) worlds are drawn for each recipe that ships with a truth, and PASSES (4) ground in each. Everything between the surfaces is as in a run: a ball that
-//! touches the true surface, registration, map, correction; only the wires are left out. The figure is written to
+//! touches the true surface, registration, map, correction; only the wires are left out. WAY is the beginning of a line's name, where not all are wanted. The figure is written to
 //! `target/convergence/convergence.svg`.
 
 #[path = "../tests/common/study.rs"]
@@ -38,7 +38,8 @@ fn main() {
     (1..=passes).for_each(|pass| print!("{pass:>8}"));
     println!("{:>14}{:>14}", "worst of all", "taken back");
     let mut series = Vec::new();
-    for (name, way) in ways {
+    let wanted = std::env::args().nth(3).unwrap_or_default();
+    for (name, way) in ways.into_iter().filter(|(name, _)| name.starts_with(&wanted)) {
         let parts = if name == "by wavelength" { 2 } else { 1 };
         let runs: Vec<Vec<Vec<After>>> = (0..benches.len() as u64 * seeds)
             .into_par_iter()

@@ -102,7 +102,6 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         nominal: Arc::new(nominal),
         nominal_file,
         part_identity,
-        targets,
         side,
         probing: Probing {
             probe_radius_mm: recipe.measure.probe_radius_mm,
@@ -121,7 +120,8 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         gain: recipe.compensation.gain,
         repeatability_mm: recipe.compensation.repeatability_mm,
         learned: None,
-        setting: setting(recipe, cell, &part_identity),
+        setting: setting(recipe, cell, &part_identity, targets.len()),
+        targets,
         limits: CorrectionLimits {
             least_depth_mm: recipe.compensation.least_depth_mm,
             depth_of_cut_mm: recipe.compensation.depth_of_cut_mm,
@@ -146,14 +146,31 @@ fn map_options(recipe: &Recipe) -> MapOptions {
     }
 }
 
-/// Says what a run has to have in common with another to learn from it: the cell, the part, and how it is ground and looked at.
-fn setting(recipe: &Recipe, cell: &CellConfig, part: &[u8; 32]) -> String {
+/// Says what a run has to have in common with another to learn from it: the cell, the part, and how it is ground, looked at and corrected.
+fn setting(recipe: &Recipe, cell: &CellConfig, part: &[u8; 32], targets: usize) -> String {
     let part: String = part.iter().map(|byte| format!("{byte:02x}")).collect();
-    let (grinding, cutoff_mm) = (&recipe.grinding, recipe.compensation.cutoff_mm);
-    format!(
-        "cell {:?}, part {part}, {:?}, feed {} mm/min, tracks {} mm, spark-out {}, cut-off {cutoff_mm} mm",
-        cell.name, grinding.wheel, grinding.feed_mm_min, grinding.track_mm, grinding.spark_out_passes
-    )
+    let (grinding, measure, map) = (&recipe.grinding, &recipe.measure, &recipe.compensation);
+    let mut said = format!(
+        "cell {:?}, part {part}, begin with {:?}; {:?}, feed {} mm/min, tracks {} mm, spark-out {}, depth {} mm; {targets} targets, probe {} mm, \
+         held {:?}; cut-off {} mm, {:?}, gain {:?}",
+        cell.name,
+        recipe.cycle.begin_with,
+        grinding.wheel,
+        grinding.feed_mm_min,
+        grinding.track_mm,
+        grinding.spark_out_passes,
+        map.depth_of_cut_mm,
+        measure.probe_radius_mm,
+        recipe.registration.held,
+        map.cutoff_mm,
+        map.smoothing,
+        map.gain
+    );
+    // Another simulated world is another grinder.
+    if let Some(world) = recipe.simulation.as_ref().filter(|_| cell.simulated) {
+        let _ = write!(said, "; simulation {}", serde_json::json!(world));
+    }
+    said
 }
 
 /// Reads or samples the nominal surface, and names the part by the SHA-256 of what it came from.

@@ -185,6 +185,13 @@ impl<'f> Run<'f> {
         self.all.iter().filter_map(|c| if let Command::Announce(j) = c { Some(j.verdict) } else { None }).collect()
     }
 
+    fn reasons(&self) -> Vec<String> {
+        self.all
+            .iter()
+            .filter_map(|c| if let Command::Announce(j) = c { Some(j.reason.clone()) } else { None })
+            .collect()
+    }
+
     fn starts(&self) -> Vec<(Device, u32)> {
         let start =
             |c: &Command| if let Command::StartMachine { device, cycle } = c { Some((*device, *cycle)) } else { None };
@@ -264,6 +271,50 @@ fn every_judgement_has_its_end() {
         assert!(!run.alarms().is_empty(), "sequence {i} raises an alarm");
         assert!(state != State::Stopped || matches!(run.ending(), Some(Ending::NotAccepted { .. })));
     }
+}
+
+#[test]
+fn a_figure_is_in_tolerance_out_of_it_or_neither() {
+    // Limits of 7 and 1 um, uncertainties of 0.3 and 0.05 um: within means the figure and its uncertainty, beyond the figure without it.
+    let expecting = |rms_um: f64| Forecast { rms_mm: rms_um / 1e3, sigma_mm: 2e-5, floor_mm: Some(rms_um / 1.2e3) };
+    let judged = |pv_um: f64, rms_um: f64, next_rms_um: f64| {
+        let mut run = Run::new(plan(), |k| match k {
+            1 => figures(30.0, 6.0),
+            _ => Figures { forecast: Some(expecting(next_rms_um)), ..figures(pv_um, rms_um) },
+        });
+        run.start().go_on();
+        run.verdicts()[1]
+    };
+    assert_eq!(judged(6.7, 0.95, 0.9), Verdict::Accept);
+    assert_eq!(judged(6.71, 0.9, 0.95), Verdict::Undecided, "PV reaches over its limit, and no pass makes it better");
+    assert_eq!(judged(6.0, 0.96, 0.95), Verdict::Undecided);
+    assert_eq!(judged(7.3, 0.96, 0.95), Verdict::Undecided);
+    assert_eq!(
+        judged(7.31, 0.96, 0.95),
+        Verdict::Stalled,
+        "beyond its limit for certain, and no gain is to be expected"
+    );
+    assert_eq!(judged(6.71, 0.96, 0.5), Verdict::Continue, "what is undecided is ground again where that is worth it");
+    // By the figure alone, where the recipe says so.
+    let alone = CellPlan { tolerance: Tolerance { with_uncertainty: false, ..plan().tolerance }, ..plan() };
+    let mut run = Run::new(alone, |_| figures(6.99, 0.99));
+    run.start().go_on();
+    assert_eq!(run.verdicts(), [Verdict::Accept]);
+}
+
+#[test]
+fn no_pass_is_ground_that_is_not_expected_to_make_it_better() {
+    let expecting = |rms_um: f64| Some(Forecast { rms_mm: rms_um / 1e3, sigma_mm: 2e-5, floor_mm: None });
+    // The first pass goes on whatever is forecast: nobody knows yet what a correction can do.
+    let mut run = Run::new(plan(), |k| Figures {
+        forecast: expecting(6.0),
+        ..figures(30.0 - 10.0 * f64::from(k), 6.0 - 2.0 * f64::from(k - 1))
+    });
+    run.start().go_on();
+    assert_eq!(run.verdicts(), [Verdict::Continue, Verdict::Stalled]);
+    assert!(matches!(run.ending(), Some(Ending::NotAccepted { .. })) && run.cell.state() == State::Stopped);
+    let told = run.reasons().pop().unwrap();
+    assert!(told.contains("no gain is to be expected") && told.contains("RMS 6.00 um ± 0.02 um is expected"), "{told}");
 }
 
 #[test]

@@ -25,7 +25,7 @@ impl Figures {
             self.shift_mm,
             self.turn_rad,
             self.pv_robust_mm.unwrap_or(0.0),
-            self.forecast.map_or(0.0, |forecast| forecast.rms_mm),
+            self.forecast.map_or(0.0, |f| f.rms_mm + f.sigma_mm + f.floor_mm.unwrap_or(0.0)),
             self.removed_mm.unwrap_or(0.0),
         ];
         all.iter().all(|figure| figure.is_finite() && *figure >= 0.0)

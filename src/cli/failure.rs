@@ -3,6 +3,7 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
+use regrind::compensation::StepError;
 use regrind::formats::FormatError;
 use regrind::journal::JournalError;
 use regrind::registration::RegistrationError;
@@ -52,8 +53,8 @@ pub(super) enum Failure {
     Checked { bad: usize, files: usize },
     #[error(transparent)]
     Setup(regrind::setup::SetupError),
-    #[error("{0}; or write learn = false")]
-    Learned(regrind::formats::LearnedError),
+    #[error("what {run} learned cannot be begun with: {source}; or write learn = false")]
+    TooMuchLearned { run: String, source: StepError },
     #[error("{path}: {reason}")]
     Simulation { path: PathBuf, reason: String },
     /// The record was read and cannot be believed.

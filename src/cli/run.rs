@@ -8,7 +8,7 @@ use regrind::cell::{Actor, Ending};
 use regrind::config::{CellConfig, Link};
 use regrind::document::Problems;
 use regrind::drive::{Drive, Orders, Request, Run};
-use regrind::formats::{LEARNED, Learned};
+use regrind::formats::{LEARNED, Learned, LearnedError};
 use regrind::journal::{Header, Journal};
 use regrind::recipe::Recipe;
 use regrind::setup::{self, CellCmm, CellGrinder};
@@ -61,8 +61,16 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let recipe = or_show(Recipe::read(&arguments.recipe))?;
     let cell = or_show(CellConfig::read(&arguments.cell))?;
     let (mut task, plan) = setup::prepare(&recipe, &cell).map_err(Failure::Setup)?;
-    if recipe.compensation.learn {
-        task.learned = newest_learned(&arguments.runs, &task.setting, cell.simulated)?;
+    if let Some(seed) = arguments.seed {
+        task.setting.push_str(&format!(", seed {seed}"));
+    }
+    let (learned_from, left_alone) = match recipe.compensation.learn {
+        true => newest_learned(&arguments.runs, &task.setting, cell.simulated),
+        false => (None, Vec::new()),
+    };
+    if let Some((learned, _)) = &learned_from {
+        let run = learned.run.clone();
+        task.begin_with(learned.clone()).map_err(|source| Failure::TooMuchLearned { run, source })?;
     }
     let spec = match within(&cell) {
         true => Some(simulated::world_spec(&recipe, arguments.seed)?),
@@ -80,9 +88,17 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         // Before the record begins: a folder that is not there, or a line that is in use, is no run.
         let part = arguments.part.clone().unwrap_or_else(|| recipe_name(&recipe));
         let (cmm, grinder) = setup::machines(&recipe, &cell, &part, owner(&actor), job).map_err(Failure::Setup)?;
-        let learned_from = task.learned.as_ref().map(|learned| learned.run.clone());
-        if let Some(run) = learned_from.as_ref().filter(|_| !arguments.json) {
-            super::print(&format!("begins with what {run} found to come back in every pass\n"))?;
+        if recipe.compensation.learn && !arguments.json {
+            for error in &left_alone {
+                super::print(&format!("left alone: {error}\n"))?;
+            }
+            super::print(&match &learned_from {
+                Some((learned, _)) => format!("begins with what {} found to come back in every pass\n", learned.run),
+                None => format!(
+                    "begins from nothing: no finished run in {} has this part, cell, wheel, gain and way of measuring\n",
+                    arguments.runs.display()
+                ),
+            })?;
         }
         let journal = journal(arguments, &recipe, &cell, &actor, began, learned_from)?;
         let (notices, shown) = mpsc::unbounded_channel();
@@ -102,22 +118,25 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
-/// Returns what the newest finished run of the same part, wheel and cell left to learn from.
-fn newest_learned(runs: &Path, setting: &str, simulated: bool) -> Result<Option<Learned>, Failure> {
+/// What an earlier run left, and the file as it is.
+type LearnedFrom = Option<(Learned, Vec<u8>)>;
+
+/// Returns what the newest finished run of the same setting left to learn from, and which files could not be read on the way to it.
+fn newest_learned(runs: &Path, setting: &str, simulated: bool) -> (LearnedFrom, Vec<LearnedError>) {
     // No folder is no run yet.
-    let Ok(entries) = std::fs::read_dir(runs) else { return Ok(None) };
-    let mut found: Option<(std::time::SystemTime, Learned)> = None;
-    for entry in entries.filter_map(Result::ok) {
-        let Ok(written) = std::fs::metadata(entry.path().join(LEARNED)).and_then(|m| m.modified()) else { continue };
-        if found.as_ref().is_some_and(|(newest, _)| *newest >= written) {
-            continue;
-        }
-        let learned = Learned::read(&entry.path()).map_err(Failure::Learned)?;
-        if let Some(learned) = learned.filter(|l| l.setting == setting && l.simulation == simulated) {
-            found = Some((written, learned));
+    let Ok(entries) = std::fs::read_dir(runs) else { return (None, Vec::new()) };
+    let written = |run: PathBuf| Some((std::fs::metadata(run.join(LEARNED)).and_then(|m| m.modified()).ok()?, run));
+    let mut all: Vec<_> = entries.filter_map(|entry| written(entry.ok()?.path())).collect();
+    all.sort();
+    let mut left_alone = Vec::new();
+    for (_, run) in all.into_iter().rev() {
+        match Learned::read(&run, setting, simulated) {
+            Ok(None) => {}
+            Ok(found) => return (found, left_alone),
+            Err(error) => left_alone.push(error),
         }
     }
-    Ok(found.map(|(_, learned)| learned))
+    (None, left_alone)
 }
 
 /// Gives the run its machines and lets it go.
@@ -158,7 +177,7 @@ fn journal(
     cell: &CellConfig,
     actor: &Actor,
     began: jiff::Timestamp,
-    learned_from: Option<String>,
+    learned_from: LearnedFrom,
 ) -> Result<Journal, Failure> {
     let part = arguments.part.clone().unwrap_or_else(|| "unnamed".into());
     let folder = free_folder(&arguments.runs, &recipe_name(recipe), began, cell.simulated);
@@ -173,12 +192,15 @@ fn journal(
         content: json!({
             "recipe": recipe.path(), "recipe_sha256": hex(recipe.source_sha256()),
             "cell": cell.path(), "cell_sha256": hex(cell.source_sha256()),
-            "part_name": recipe.part.name, "seed": arguments.seed, "learned_from": learned_from,
+            "part_name": recipe.part.name, "seed": arguments.seed, "learned_from": learned_from.as_ref().map(|(learned, _)| &learned.run),
         }),
     };
     let mut journal = Journal::create(&folder, header).map_err(Failure::Journal)?;
     journal.store("recipe.toml", recipe.text().as_bytes(), 0, 0).map_err(Failure::Journal)?;
     journal.store("cell.toml", cell.text().as_bytes(), 0, 0).map_err(Failure::Journal)?;
+    if let Some((_, text)) = learned_from {
+        journal.store("learned_from.json", &text, 0, 0).map_err(Failure::Journal)?;
+    }
     Ok(journal)
 }
 

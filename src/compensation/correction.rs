@@ -64,6 +64,12 @@ pub enum StepError {
         removed_um = 1e3 * removed_mm, budget_um = 1e3 * budget_mm
     )]
     BudgetSpent { removed_mm: f64, budget_mm: f64 },
+    #[error(
+        "the first pass would take {removed_um:.2} um off where it takes off most, more than the budget of {budget_um:.2} um; raise \
+         removal_budget_um",
+        removed_um = 1e3 * removed_mm, budget_um = 1e3 * budget_mm
+    )]
+    BudgetAtOnce { removed_mm: f64, budget_mm: f64 },
 }
 
 impl Correction {
@@ -77,15 +83,30 @@ impl Correction {
         self.net.interpolate(&self.values_mm, place_mm)
     }
 
-    /// Returns the correction with what is worth taking back of an error, whatever any limit says of it; for the same pass and level.
-    pub fn changed(&self, error: &ErrorMap, known: &Knowledge) -> Self {
-        Self { values_mm: self.with(error, &known.step_mm(error)), ..self.clone() }
+    /// Returns the correction that takes back what is worth it, whatever any limit says of it; for the same pass and level.
+    pub fn changed(&self, known: &Knowledge) -> Self {
+        let values_mm = known.wanted_mm().unwrap_or(&self.values_mm).to_vec();
+        Self { values_mm, ..self.clone() }
     }
 
-    /// The values with changes added that are given on the net of an error.
-    fn with(&self, error: &ErrorMap, changes_mm: &[f64]) -> Vec<f64> {
-        let change_at = |k: usize| error.net.interpolate(changes_mm, self.net.place_mm(k));
-        (0..self.net.len()).map(|k| self.values_mm[k] + change_at(k)).collect()
+    /// Returns what the part has lost in all where it loses most, below the surface of a first pass without a correction, in millimetres.
+    ///
+    /// # Errors
+    /// A correction above its limit, and a removal above the budget.
+    pub fn removed_mm(&self, limits: &CorrectionLimits) -> Result<f64, StepError> {
+        let within = |v: f64| v.abs() <= limits.largest_correction_mm;
+        if let Some(k) = self.values_mm.iter().position(|v| !within(*v)) {
+            let ([x_mm, y_mm], limit_mm) = (self.net.place_mm(k), limits.largest_correction_mm);
+            return Err(StepError::TooLarge { found_mm: self.values_mm[k], x_mm, y_mm, limit_mm });
+        }
+        // The correction itself adds where it is negative.
+        let deepest_mm = self.values_mm.iter().copied().fold(0.0, f64::min);
+        let removed_mm = limits.allowance_mm - self.level_mm - deepest_mm;
+        // A picometre is rounding, not removal.
+        if removed_mm > limits.removal_budget_mm + 1e-9 {
+            return Err(StepError::BudgetSpent { removed_mm, budget_mm: limits.removal_budget_mm });
+        }
+        Ok(removed_mm)
     }
 
     /// Takes back of the error that the last pass left what is worth taking back, and goes deep enough to cut everywhere.
@@ -99,29 +120,19 @@ impl Correction {
     /// # Errors
     /// A correction above its limit, and a removal above the budget.
     pub fn next(&self, error: &ErrorMap, known: &Knowledge, limits: &CorrectionLimits) -> Result<Step, StepError> {
-        let (net, changes_mm) = (self.net, known.step_mm(error));
-        let values_mm = self.with(error, &changes_mm);
-        if let Some(k) = (0..net.len()).find(|&k| values_mm[k].abs() > limits.largest_correction_mm) {
-            let [x_mm, y_mm] = net.place_mm(k);
-            let limit_mm = limits.largest_correction_mm;
-            return Err(StepError::TooLarge { found_mm: values_mm[k], x_mm, y_mm, limit_mm });
-        }
+        let values_mm = self.changed(known).values_mm;
+        let on_net: Vec<f64> = values_mm.iter().zip(&self.values_mm).map(|(next, now)| next - now).collect();
+        // Where it was measured: there it is known how much the wheel will cut.
+        let changes_mm = self.net.resample(&on_net, &error.net);
         let (response, scatter_mm) = (known.response()[0], known.scatter_mm().unwrap_or(0.0));
-        let rise_mm = changes_mm.iter().map(|change| response * change).fold(0.0, f64::max);
+        let rise_mm = on_net.iter().map(|change| response * change).fold(0.0, f64::max);
         let depth_mm = limits.depth_of_cut_mm.max(rise_mm + 2.0 * scatter_mm + limits.least_depth_mm);
-        let level_mm = self.level_mm - depth_mm;
-        // Below the first pass's surface; the correction itself adds where it is negative.
-        let deepest_mm = values_mm.iter().copied().fold(0.0, f64::min);
-        let removed_mm = limits.allowance_mm - level_mm - deepest_mm;
-        // A picometre is rounding, not removal.
-        if removed_mm > limits.removal_budget_mm + 1e-9 {
-            return Err(StepError::BudgetSpent { removed_mm, budget_mm: limits.removal_budget_mm });
-        }
+        let correction = Self { net: self.net, values_mm, cycle: self.cycle + 1, level_mm: self.level_mm - depth_mm };
+        let removed_mm = correction.removed_mm(limits)?;
         let depths_mm =
             || changes_mm.iter().zip(&error.valid).filter(|(_, valid)| **valid).map(|(c, _)| depth_mm - response * c);
         let air: f64 = depths_mm().map(|depth| normal_tail(depth / (2f64.sqrt() * scatter_mm))).sum();
         let air_share = air / depths_mm().count().max(1) as f64;
-        let correction = Self { net, values_mm, cycle: self.cycle + 1, level_mm };
         Ok(Step { correction, depth_mm, removed_mm, air_share })
     }
 }

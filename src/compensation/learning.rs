@@ -1,23 +1,29 @@
-//! What the grinder leaves in every pass, learned pass by pass, and how much of the last measurement to believe.
+//! What the grinder leaves in every pass, learned pass by pass, and how much of it to take back.
 //!
 //! A measured error is e = R + s u + N: R comes back in every pass, u is the correction, s the share of it that the part answers
-//! with, and N is drawn afresh each time, so that nothing can take it away. A correction that takes all of e back grinds the N of
-//! the last pass into the next one. So R is estimated as a Kalman filter does it: with p for the variance of what is believed of R
-//! over that of N, the share of the newest error to take back and what is known afterwards are
+//! with, and N is drawn afresh each time, by the grinder and by the measurement, so that nothing can take it away. A correction that takes
+//! all of e back grinds the N of the last pass into the next one. So every pass tells e - s u = R + N, and R is estimated from all of
+//! them in two steps, for each band of wavelengths by itself: an octave each, from the cut-off up.
+//!
+//! A Kalman filter makes the mean. With p for the variance of the mean over that of N, the share of the newest pass in it and
+//! what is known afterwards are
 //!
 //! ```text
 //!  g = p / (1 + p)        p' = p / (1 + p) + q
 //! ```
 //!
-//! From nothing (p without bound) these are the gains 1, 1/2, 1/3 of a plain mean, which leave N sqrt(1 + 1/k) after k corrections; q keeps
-//! the filter awake to a machine that drifts. Where N is known beforehand the first gain is Wiener's, 1 - |N|^2 / |e|^2. All of this holds
-//! for each band of wavelengths by itself: an octave each, from the cut-off up.
+//! From nothing (p without bound) these are the shares 1, 1/2, 1/3 of a plain mean, which leaves N sqrt(1 + 1/k) after k passes; q keeps
+//! the filter awake to a machine that drifts. The means of e and u are kept apart, so that all of it is told anew when s is known better.
+//! Then Wiener's share of the mean m is believed, 1 - p' |N|^2 / |m|^2: where nothing stands out of the scatter, nothing is taken back. What
+//! passes differ by tells |N|^2; before that, unless it is stated, only the noise of the points is known, and its share of each band
+//! follows from the filter.
 
 use serde::{Deserialize, Serialize};
 
 use super::correction::Correction;
 use super::filter::Order;
 use super::map::{ErrorMap, MapOptions, filter_net};
+use super::net::Net;
 use super::response::{Response, Sense};
 
 /// Variance by which a pass makes what is believed of R older, over that of N.
@@ -28,16 +34,17 @@ const DRIFT_TO_NEXT_PART: f64 = 0.3;
 const CHANGED_SIGMAS: f64 = 6.0;
 /// Scatter is correlated over longer ways than the shortest waves, so that so many of its values make one that is independent.
 const CORRELATED: f64 = 4.0;
-/// What is believed of s before anything answered.
+/// Standard uncertainty of s before anything answered, and what another part adds to it.
 const RESPONSE_SIGMA: f64 = 0.1;
-/// A response is never taken to be outside this.
+const RESPONSE_SIGMA_OF_NEXT_PART: f64 = 0.02;
+/// A response outside this is none of the correction alone, and not believed.
 const RESPONSE_LIMITS: [f64; 2] = [0.5, 1.5];
 
-/// By what the share of an error that is taken back is chosen.
+/// By what is chosen how much of an error is taken back.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum GainRule {
-    /// Always the same share.
+    /// Always the same share of the newest error.
     Fixed(f64),
     /// By what passes have told so far, one share for all wavelengths.
     Adaptive,
@@ -50,12 +57,33 @@ pub enum GainRule {
 struct Band {
     /// Waves longer than this belong to it, in millimetres.
     from_mm: f64,
-    /// Variance of what is believed of R over that of N; `None` while nothing is known.
+    /// Variance of the mean over that of N; `None` while nothing is known.
     belief: Option<f64>,
     /// Sum of what passes told of the variance of N, in square millimetres, and of how many.
     scatter: [f64; 2],
-    /// The share that was taken back last.
+    /// The share that the newest pass has in the mean.
     gain: f64,
+    /// The share of the mean that is believed.
+    share: f64,
+    /// Whether the last pass was taken for that of a machine that has changed.
+    changed: bool,
+}
+
+/// The means over all passes, each by its share.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct Means {
+    net: Net,
+    error_mm: Vec<f64>,
+    correction_mm: Vec<f64>,
+}
+
+/// An error on the net of a correction.
+struct Told {
+    net: Net,
+    error_mm: Vec<f64>,
+    valid: Vec<bool>,
+    /// Mean square of the standard uncertainty of a node from the noise of the points.
+    noise_mm2: f64,
 }
 
 /// What is known of the error that comes back in every pass.
@@ -66,8 +94,15 @@ pub struct Knowledge {
     response: [f64; 2],
     /// From the shortest waves to the longest.
     bands: Vec<Band>,
+    /// All wavelengths together: bands overlap, so that their scatters do not add up to that of the whole.
+    whole: Band,
     /// Passes that it was learned from.
     passes: u32,
+    /// On the net of the correction.
+    means: Option<Means>,
+    /// What the pass after the last one taken in is to be corrected by, on the net of the correction.
+    #[serde(skip)]
+    wanted_mm: Option<Vec<f64>>,
 }
 
 /// What the next pass is expected to leave.
@@ -102,70 +137,126 @@ impl Knowledge {
             let octave = |from: &f64| Some(2.0 * from).filter(|next| *next < longest_mm);
             edges = std::iter::successors(Some(map.cutoff_mm), octave).collect();
         }
-        let each = repeatability_mm.map_or([0.0; 2], |rms| [rms * rms / edges.len() as f64, 1.0]);
-        let bands = edges.into_iter().map(|from_mm| Band { from_mm, belief: None, scatter: each, gain: 1.0 });
-        Self { rule, response: [1.0, RESPONSE_SIGMA], bands: bands.collect(), passes: 0 }
+        let count = edges.len() as f64;
+        let band = |from_mm: f64, share: f64| {
+            let scatter = repeatability_mm.map_or([0.0; 2], |rms| [rms * rms * share, 1.0]);
+            Band { from_mm, belief: None, scatter, gain: 1.0, share: 1.0, changed: false }
+        };
+        let whole = band(map.cutoff_mm, 1.0);
+        let bands = edges.into_iter().map(|from_mm| band(from_mm, 1.0 / count));
+        Self {
+            rule,
+            response: [1.0, RESPONSE_SIGMA],
+            bands: bands.collect(),
+            whole,
+            passes: 0,
+            means: None,
+            wanted_mm: None,
+        }
     }
 
-    /// Takes in what a pass left; afterwards [`Self::step_mm`] tells the next change of the correction.
+    /// Takes in what a pass left; afterwards [`Self::wanted_mm`] tells the next correction.
+    ///
+    /// Of a pass that was not ground as it was commanded nothing is learned, and the next one is asked for the same again.
     pub fn after(&self, seen: &Seen) -> Self {
         let mut known = self.clone();
+        if seen.answer.is_some_and(|answer| !matches!(answer.sense, Sense::AsCommanded | Sense::Unclear)) {
+            known.wanted_mm = Some(seen.correction.values_mm.clone());
+            return known;
+        }
+        let told = Told::of(seen.error, seen.correction.net);
         if let Some(answer) = seen.answer.filter(|answer| answer.sense == Sense::AsCommanded) {
-            known.response = combined(self.response, &answer, self.bands[0].independent(seen.error));
+            known.response = combined(self.response, &answer, self.bands[0].independent(&told));
         }
-        for (band, values) in known.bands.iter_mut().zip(self.split(seen.error)) {
-            let independent = band.independent(seen.error);
-            band.take_in(mean_square(seen.error, &values), independent, self.rule, self.passes > 0);
+        let response = known.response[0];
+        let mut means = Means::on(self.means.as_ref(), told.net);
+        let less = |values: &[f64], mean: &[f64]| values.iter().zip(mean).map(|(v, m)| v - m).collect::<Vec<f64>>();
+        let of_error = self.split(&told, less(&told.error_mm, &means.error_mm));
+        let of_correction = self.split(&told, less(&seen.correction.values_mm, &means.correction_mm));
+        let mut whole = vec![0.0; told.net.len()];
+        for ((band, e), u) in known.bands.iter_mut().zip(&of_error).zip(&of_correction) {
+            let news: Vec<f64> = e.iter().zip(u).map(|(e, u)| e - response * u).collect();
+            band.take_in(told.mean_square(&news), band.independent(&told));
+            add(&mut whole, 1.0, &news);
+            add(&mut means.error_mm, band.gain, e);
+            add(&mut means.correction_mm, band.gain, u);
         }
+        known.whole.take_in(told.mean_square(&whole), known.whole.independent(&told));
+        let mean = means.error_mm.iter().zip(&means.correction_mm).map(|(e, u)| e - response * u).collect();
+        let mut believed = vec![0.0; told.net.len()];
+        let noise = known.noise_mm2(told.noise_mm2);
+        for ((band, mean), noise_mm2) in known.bands.iter_mut().zip(self.split(&told, mean)).zip(noise) {
+            band.believe(told.mean_square(&mean), noise_mm2);
+            add(&mut believed, band.share, &mean);
+        }
+        known.wanted_mm = Some(match self.rule {
+            GainRule::Fixed(share) => {
+                let last = seen.correction.values_mm.iter().zip(&told.error_mm);
+                last.map(|(u, e)| u - share / response * e).collect()
+            }
+            GainRule::Adaptive | GainRule::Wavelength => believed.iter().map(|r| -r / response).collect(),
+        });
+        known.means = Some(means);
         known.passes += 1;
         known
+    }
+
+    /// Returns what the correction of the next pass is, in millimetres, at each node of the net of the last one; `None` before a pass of
+    /// this part was taken in.
+    pub fn wanted_mm(&self) -> Option<&[f64]> {
+        self.wanted_mm.as_deref()
     }
 
     /// Returns what the next part of the same kind begins with.
     pub fn for_next_part(&self) -> Self {
         let mut known = self.clone();
-        for band in &mut known.bands {
+        for band in known.bands.iter_mut().chain([&mut known.whole]) {
             band.belief = band.belief.map(|belief| belief + DRIFT_TO_NEXT_PART);
+            band.changed = false;
         }
+        known.response[1] = known.response[1].hypot(RESPONSE_SIGMA_OF_NEXT_PART);
+        known.wanted_mm = None;
         known
-    }
-
-    /// Returns by how much the correction changes after an error, at each node of its net, in millimetres.
-    pub fn step_mm(&self, error: &ErrorMap) -> Vec<f64> {
-        let mut step = vec![0.0; error.net.len()];
-        for (band, values) in self.bands.iter().zip(self.split(error)) {
-            step.iter_mut().zip(values).for_each(|(sum, value)| *sum -= band.gain / self.response[0] * value);
-        }
-        step
     }
 
     /// Returns what the pass after this error is expected to leave.
     pub fn forecast(&self, error: &ErrorMap) -> Forecast {
         let rest2 = error.rest_sigma_mm.powi(2);
-        let (mut left2, mut floor2, mut independent) = (rest2, rest2, 0.0);
-        for (band, values) in self.bands.iter().zip(self.split(error)) {
-            let seen2 = mean_square(error, &values);
-            let scatter2 = band.scatter_mm2();
-            // What is not taken back, and what is taken back by a response known that well only.
-            let missed2 = seen2 * ((1.0 - band.gain).powi(2) + (band.gain * self.response[1]).powi(2));
-            left2 += match scatter2 {
-                // The error is R - R' + N, with the variances p and 1 in units of that of N.
-                Some(n2) => n2 * (1.0 + band.belief.unwrap_or(1.0)),
-                None => missed2,
+        let (mut left2, mut scatter2, mut independent) = (0.0, 0.0, 0.0);
+        let told = Told::of(error, error.net);
+        let noise = self.noise_mm2(told.noise_mm2);
+        for ((band, values), noise_mm2) in self.bands.iter().zip(self.split(&told, told.error_mm.clone())).zip(noise) {
+            let seen2 = told.mean_square(&values);
+            let [n2, taken] = [band.scatter_mm2().unwrap_or(noise_mm2), self.taken(band)];
+            // What comes back and is not taken back, the scatter that is ground in and that of the next pass; and what is taken back by a
+            // response that is known that well only.
+            let left = match (self.rule, band.scatter_mm2(), band.belief) {
+                (GainRule::Adaptive | GainRule::Wavelength, Some(_), Some(belief)) => n2 * (1.0 + band.share * belief),
+                _ => (1.0 - taken).powi(2) * (seen2 - n2).max(0.0) + n2 * (1.0 + taken * taken),
             };
-            floor2 += scatter2.unwrap_or(0.0);
-            independent += band.independent(error);
+            left2 += left + seen2 * (taken * self.response[1]).powi(2);
+            scatter2 += n2;
+            independent += band.independent(&told);
         }
-        let rms_mm = left2.sqrt();
+        // What bands have in common is in none of them.
+        let whole2 = self.whole.scatter_mm2().unwrap_or(scatter2);
+        let in_common = if scatter2 > 0.0 { whole2 / scatter2 } else { 1.0 };
+        let rms_mm = (rest2 + in_common * left2).sqrt();
         // The rms of m independent values scatters by 1 / sqrt(2 m); while N is a guess, so is the forecast.
         let known = self.bands.iter().all(|band| band.scatter[1] > 0.0);
         let relative = if known { 1.0 / (2.0 * independent).sqrt() } else { 0.5 };
-        Forecast { rms_mm, sigma_mm: relative * rms_mm, floor_mm: known.then(|| floor2.sqrt()) }
+        Forecast { rms_mm, sigma_mm: relative * rms_mm, floor_mm: known.then(|| (rest2 + whole2).sqrt()) }
     }
 
-    /// Returns the share of the error that is taken back, from the shortest waves to the longest, with the wavelength from which each counts.
+    /// Returns the share of the newest error that is taken back, from the shortest waves to the longest, with the wavelength from which each
+    /// counts.
     pub fn gains(&self) -> Vec<[f64; 2]> {
-        self.bands.iter().map(|band| [band.from_mm, band.gain]).collect()
+        self.bands.iter().map(|band| [band.from_mm, self.taken(band)]).collect()
+    }
+
+    /// The share of the newest error that is taken back.
+    fn taken(&self, band: &Band) -> f64 {
+        if let GainRule::Fixed(share) = self.rule { share } else { band.gain * band.share }
     }
 
     /// Returns the share of a correction that the part answers with, and its standard uncertainty.
@@ -175,7 +266,7 @@ impl Knowledge {
 
     /// Returns the rms of what a pass adds by itself, in millimetres, as far as passes have told.
     pub fn scatter_mm(&self) -> Option<f64> {
-        self.bands.iter().map(Band::scatter_mm2).sum::<Option<f64>>().map(f64::sqrt)
+        self.whole.scatter_mm2().map(f64::sqrt)
     }
 
     /// Returns the number of passes that this was learned from.
@@ -187,26 +278,85 @@ impl Knowledge {
     pub fn is_sound(&self) -> bool {
         let number = |v: f64| v.is_finite() && v >= 0.0;
         let [least, most] = RESPONSE_LIMITS;
-        let of_band =
-            |b: &Band| number(b.from_mm) && b.from_mm > 0.0 && b.scatter.iter().all(|v| number(*v)) && number(b.gain);
+        let of_band = |b: &Band| {
+            number(b.from_mm)
+                && b.from_mm > 0.0
+                && b.scatter.iter().all(|v| number(*v))
+                && number(b.gain)
+                && number(b.share)
+        };
+        let of_mean = |net: Net, values: &[f64]| {
+            net.is_sound() && values.len() == net.len() && values.iter().all(|v| v.is_finite())
+        };
+        let of_means = |m: &Means| of_mean(m.net, &m.error_mm) && of_mean(m.net, &m.correction_mm);
         (least..=most).contains(&self.response[0])
             && number(self.response[1])
+            && self.means.as_ref().is_none_or(of_means)
             && (1..=32).contains(&self.bands.len())
-            && self.bands.iter().all(|b| of_band(b) && b.belief.is_none_or(number))
+            && self.bands.iter().chain([&self.whole]).all(|b| of_band(b) && b.belief.is_none_or(number))
             && self.bands.windows(2).all(|w| w[0].from_mm < w[1].from_mm)
     }
 
-    /// Splits a map into what each band holds of it; the parts add up to the map.
-    fn split(&self, error: &ErrorMap) -> Vec<Vec<f64>> {
-        let mut rest = error.values_mm.clone();
+    /// Splits values on the net of an error into what each band holds of them; the parts add up to the values.
+    fn split(&self, told: &Told, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
         let mut parts = Vec::with_capacity(self.bands.len());
+        if rest.iter().all(|value| *value == 0.0) {
+            return vec![rest; self.bands.len()];
+        }
+        let whole = rest.clone();
         for longer in &self.bands[1..] {
-            let smooth = low_passed(error, longer.from_mm);
+            let smooth = told.low_passed(&whole, longer.from_mm);
             parts.push(rest.iter().zip(&smooth).map(|(value, smooth)| value - smooth).collect());
             rest = smooth;
         }
         parts.push(rest);
         parts
+    }
+
+    /// What the noise of the measured points leaves in each band of a map, as a mean square, given that of the whole.
+    ///
+    /// Equation: white noise below a Gaussian of width s has a power of 1 / s^2, and between two of widths s and t one of
+    /// 1 / s^2 + 1 / t^2 - 4 / (s^2 + t^2). The map has been through the Gaussian of the cut-off already, so that the widths add up in
+    /// squares. That is so in the open; near the border the longest waves take up to twice as much.
+    fn noise_mm2(&self, whole_mm2: f64) -> Vec<f64> {
+        let first2 = self.bands[0].from_mm.powi(2);
+        let width2 = |k: usize| if k == 0 { 1.0 } else { 1.0 + self.bands[k].from_mm.powi(2) / first2 };
+        let last = self.bands.len() - 1;
+        let between = |k: usize| 1.0 / width2(k) + 1.0 / width2(k + 1) - 4.0 / (width2(k) + width2(k + 1));
+        (0..=last).map(|k| whole_mm2 * if k == last { 1.0 / width2(k) } else { between(k) }).collect()
+    }
+}
+
+impl Means {
+    /// The means on a net: as they are where they stand on it, what lies between their nodes otherwise, and nothing without any.
+    fn on(means: Option<&Self>, net: Net) -> Self {
+        let nothing = || vec![0.0; net.len()];
+        let Some(means) = means else { return Self { net, error_mm: nothing(), correction_mm: nothing() } };
+        let on_net = |values: &[f64]| means.net.resample(values, &net);
+        Self { net, error_mm: on_net(&means.error_mm), correction_mm: on_net(&means.correction_mm) }
+    }
+}
+
+impl Told {
+    /// An error on another net: everything that is learned stands on the net of the correction, so that only the error, which becomes
+    /// small, is ever taken from between nodes.
+    fn of(error: &ErrorMap, net: Net) -> Self {
+        let noise_mm2 = mean_square(&error.valid, &error.sigma_mm);
+        let valid = (0..net.len()).map(|k| error.net.nearest(net.place_mm(k)).is_some_and(|node| error.valid[node]));
+        Self { net, error_mm: error.net.resample(&error.values_mm, &net), valid: valid.collect(), noise_mm2 }
+    }
+
+    fn mean_square(&self, values: &[f64]) -> f64 {
+        mean_square(&self.valid, values)
+    }
+
+    /// Values without waves shorter than a wavelength.
+    fn low_passed(&self, values: &[f64], cutoff_mm: f64) -> Vec<f64> {
+        match filter_net(&self.net, values, &self.valid, cutoff_mm, Order::default(), false) {
+            Ok(smooth) => smooth.values,
+            // A map too small for this wavelength has no waves that are longer.
+            Err(_) => vec![0.0; self.net.len()],
+        }
     }
 }
 
@@ -216,58 +366,373 @@ impl Band {
         (count > 0.0).then(|| sum / count)
     }
 
-    /// Takes in the mean square of an error in this band.
-    fn take_in(&mut self, seen_mm2: f64, independent: f64, rule: GainRule, seen_before: bool) {
+    /// Takes in the mean square of what a pass told beside what was believed.
+    fn take_in(&mut self, news_mm2: f64, independent: f64) {
         let expected = self.belief.zip(self.scatter_mm2()).map(|(belief, n2)| (1.0 + belief) * n2);
         let changed = 1.0 + CHANGED_SIGMAS * (2.0 / independent * (1.0 + 1.0 / self.scatter[1].max(1.0))).sqrt();
-        match (self.belief, expected) {
+        let stands_out = expected.is_some_and(|expected| news_mm2 > changed * expected);
+        match self.belief {
             // Not the scatter of before: the machine has changed, and what is believed of it counts for little.
-            (Some(_), Some(expected)) if seen_mm2 > changed * expected => {
-                self.belief = self.scatter_mm2().map(|n2| seen_mm2 / n2 - 1.0);
+            Some(_) if stands_out && !self.changed => {
+                self.belief = self.scatter_mm2().map(|n2| news_mm2 / n2 - 1.0).filter(|belief| belief.is_finite());
             }
-            (Some(belief), _) => {
-                self.scatter[0] += seen_mm2 / (1.0 + belief);
+            // Nor was it a change, if the next pass stands out as well: what was known of the scatter was too little.
+            Some(belief) if stands_out => self.scatter = [news_mm2 / (1.0 + belief), 1.0],
+            Some(belief) => {
+                self.scatter[0] += news_mm2 / (1.0 + belief);
                 self.scatter[1] += 1.0;
             }
-            (None, _) => {}
+            None => {}
         }
-        let prior = self.belief.or_else(|| self.scatter_mm2().map(|n2| (seen_mm2 / n2 - 1.0).max(0.0)));
-        let best = prior.map_or(1.0, |p| if p.is_finite() { p / (1.0 + p) } else { 1.0 });
-        self.gain = if let GainRule::Fixed(share) = rule { share } else { best };
-        // Of an unknown error a share of less than one leaves an unknown rest; after two such steps it is small.
-        let rest = match prior {
-            Some(p) => Some((1.0 - self.gain).powi(2) * p),
-            None => (self.gain == 1.0 || seen_before).then_some(0.0),
-        };
-        self.belief = rest.map(|rest| rest + self.gain * self.gain + DRIFT).filter(|belief| belief.is_finite());
+        self.changed = stands_out && !self.changed;
+        self.gain = self.belief.map_or(1.0, |p| p / (1.0 + p));
+        self.belief = Some(self.gain + DRIFT);
     }
 
-    /// Number of independent values that a map has in this band: half a wave each way makes one.
-    fn independent(&self, error: &ErrorMap) -> f64 {
-        let [dx, dy] = error.net.spacing_mm;
-        let area_mm2 = dx * dy * error.valid.iter().filter(|valid| **valid).count() as f64;
+    /// Chooses the share of the mean, given by its mean square, that is believed; `noise_mm2` is what the points alone scatter by.
+    fn believe(&mut self, mean_mm2: f64, noise_mm2: f64) {
+        let of_mean_mm2 = self.scatter_mm2().unwrap_or(noise_mm2) * self.belief.unwrap_or(1.0);
+        let share = 1.0 - of_mean_mm2 / mean_mm2;
+        // Of nothing all may be believed.
+        self.share = if share.is_nan() { 1.0 } else { share.max(0.0) };
+    }
+
+    /// Number of independent values that a map has in this band: [`CORRELATED`] squares of twice its shortest waves make one.
+    fn independent(&self, told: &Told) -> f64 {
+        let [dx, dy] = told.net.spacing_mm;
+        let area_mm2 = dx * dy * told.valid.iter().filter(|valid| **valid).count() as f64;
         (area_mm2 / (2.0 * self.from_mm).powi(2) / CORRELATED).max(1.0)
     }
 }
 
 /// What is believed of the response with an answer taken in, each by its certainty.
 fn combined([before, sigma]: [f64; 2], answer: &Response, independent: f64) -> [f64; 2] {
+    let [least, most] = RESPONSE_LIMITS;
+    if !(least..=most).contains(&answer.slope) {
+        return [before, sigma];
+    }
     let of_answer = (answer.unexplained_mm / answer.asked_mm / independent.sqrt()).max(1e-3);
     let [w, v] = [sigma, of_answer].map(|s| 1.0 / (s * s));
-    let [least, most] = RESPONSE_LIMITS;
     [((w * before + v * answer.slope) / (w + v)).clamp(least, most), (w + v).sqrt().recip()]
 }
 
-fn mean_square(error: &ErrorMap, values: &[f64]) -> f64 {
-    let valid = || error.valid.iter().zip(values).filter(|(valid, _)| **valid);
-    valid().map(|(_, value)| value * value).sum::<f64>() / valid().count().max(1) as f64
+/// Over what is valid.
+fn mean_square(valid: &[bool], values: &[f64]) -> f64 {
+    let used = || valid.iter().zip(values).filter(|(valid, _)| **valid);
+    used().map(|(_, value)| value * value).sum::<f64>() / used().count().max(1) as f64
 }
 
-/// The map without waves shorter than a wavelength, on the same net.
-fn low_passed(error: &ErrorMap, cutoff_mm: f64) -> Vec<f64> {
-    match filter_net(&error.net, &error.values_mm, &error.valid, cutoff_mm, Order::default(), false) {
-        Ok(smooth) => smooth.values,
-        // A map too small for this wavelength has no waves that are longer.
-        Err(_) => vec![0.0; error.net.len()],
+fn add(sum: &mut [f64], factor: f64, values: &[f64]) {
+    sum.iter_mut().zip(values).for_each(|(sum, value)| *sum += factor * value);
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::rngs::StdRng;
+    use rand::{RngExt, SeedableRng};
+
+    use super::*;
+
+    const NET: Net = Net { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0, 1.0] };
+    /// Bands from 2.5, 5 and 10 mm; an octave more would be half the part.
+    const CUTOFF_MM: f64 = 2.5;
+
+    fn begin(rule: GainRule, repeatability_mm: Option<f64>) -> Knowledge {
+        Knowledge::new(rule, &MapOptions::new(CUTOFF_MM, 1.0), [40.0, 30.0], repeatability_mm)
+    }
+
+    fn map(value: impl Fn([f64; 2]) -> f64) -> ErrorMap {
+        let values = (0..NET.len()).map(|k| value(NET.place_mm(k))).collect();
+        ErrorMap::known(NET, values, vec![true; NET.len()])
+    }
+
+    fn none() -> Correction {
+        Correction::none(NET, 0.0)
+    }
+
+    fn after(known: &Knowledge, correction: &Correction, error: &ErrorMap) -> Knowledge {
+        known.after(&Seen { correction, error, answer: None })
+    }
+
+    fn rms(values: &[f64]) -> f64 {
+        (values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64).sqrt()
+    }
+
+    /// Smooth scatter: waves of 6 to 40 mm in all directions with phases drawn.
+    fn drawn(random: &mut StdRng, rms_mm: f64) -> Vec<f64> {
+        let waves: Vec<[f64; 3]> = (0..40)
+            .map(|_| {
+                let turn = random.random_range(0.0..std::f64::consts::TAU);
+                let number = std::f64::consts::TAU / random.random_range(6.0..40.0);
+                [number * f64::cos(turn), number * f64::sin(turn), random.random_range(0.0..std::f64::consts::TAU)]
+            })
+            .collect();
+        let at = |[x, y]: [f64; 2]| waves.iter().map(|[a, b, phase]| (a * x + b * y + phase).sin()).sum::<f64>();
+        (0..NET.len()).map(|k| at(NET.place_mm(k)) * rms_mm * (2.0f64 / 40.0).sqrt()).collect()
+    }
+
+    #[test]
+    fn from_nothing_the_mean_of_all_passes_is_taken_back() {
+        // An error far above the scatter is believed; its shares are those of a plain mean, a little more for a machine that may drift.
+        let mut random = StdRng::seed_from_u64(7);
+        let mut known = begin(GainRule::Adaptive, None);
+        for pass in 1..=4 {
+            let scatter = drawn(&mut random, 0.01);
+            let error = ErrorMap { values_mm: scatter.iter().map(|n| n + 1.0).collect(), ..map(|_| 0.0) };
+            known = after(&known, &none(), &error);
+            let [[from_mm, gain]] = known.gains()[..] else { panic!("one band") };
+            assert_eq!(from_mm, CUTOFF_MM);
+            assert!((gain - 1.0 / f64::from(pass)).abs() < 0.03, "pass {pass}: {gain}");
+        }
+    }
+
+    #[test]
+    fn what_comes_back_is_found_to_the_scatter_of_the_mean() {
+        // k passes leave N sqrt(1 + 1/k) of an error that stands far above N; and N itself is told.
+        const SCATTER_MM: f64 = 1e-3;
+        let (seed, worlds) = (20_260, 40);
+        let mut left = [0.0; 4];
+        let mut told = 0.0;
+        for world in 0..worlds {
+            let mut random = StdRng::seed_from_u64(seed + world);
+            let form = drawn(&mut random, 0.02);
+            let mut known = begin(GainRule::Wavelength, None);
+            let mut correction = none();
+            for left in &mut left {
+                let scatter = drawn(&mut random, SCATTER_MM);
+                let sum = |k: usize| form[k] + correction.values_mm[k] + scatter[k];
+                let error = ErrorMap { values_mm: (0..NET.len()).map(sum).collect(), ..map(|_| 0.0) };
+                known = after(&known, &correction, &error);
+                correction = correction.changed(&known);
+                let rest: Vec<f64> = form.iter().zip(&correction.values_mm).map(|(r, u)| r + u).collect();
+                *left += rms(&rest).powi(2) / worlds as f64;
+            }
+            told += known.scatter_mm().unwrap() / worlds as f64;
+        }
+        for (k, left) in (1..).zip(left) {
+            let expected = SCATTER_MM / f64::from(k).sqrt();
+            assert!((left.sqrt() / expected - 1.0).abs() < 0.1, "{k} passes leave {:e}, seed {seed}", left.sqrt());
+        }
+        assert!((told / SCATTER_MM - 1.0).abs() < 0.1, "{told}");
+    }
+
+    #[test]
+    fn where_nothing_stands_out_of_the_scatter_nothing_is_taken_back() {
+        // Known scatter of 1 um in one band: of 2 um rms Wiener takes 1 - 1.02 / 4, of 0.5 um nothing.
+        let gain = |rms_mm: f64| after(&begin(GainRule::Adaptive, Some(1e-3)), &none(), &map(|_| rms_mm)).gains()[0][1];
+        assert!((gain(2e-3) - (1.0 - (1.0 + DRIFT) / 4.0)).abs() < 1e-12, "{}", gain(2e-3));
+        assert_eq!(gain(0.5e-3), 0.0);
+        // Without a second pass the noise of the points is what is known: nearly all of it is in the shortest waves, and they are left.
+        let noisy = |error: ErrorMap| ErrorMap { sigma_mm: vec![1e-3; NET.len()], ..error };
+        let short = noisy(map(|[x, _]| 0.9e-3 * (x * std::f64::consts::TAU / 4.0).sin()));
+        let known = after(&begin(GainRule::Wavelength, None), &none(), &short);
+        let shares: Vec<f64> = known.gains().iter().map(|[_, gain]| *gain).collect();
+        assert!(shares[0] < 0.05, "{shares:?}");
+        assert!(rms(known.wanted_mm().unwrap()) < 0.1 * rms(&short.values_mm));
+        let long = noisy(map(|[x, _]| 5e-3 * (x * std::f64::consts::TAU / 30.0).cos()));
+        let known = after(&begin(GainRule::Wavelength, None), &none(), &long);
+        assert!(known.gains().last().unwrap()[1] > 0.98, "{:?}", known.gains());
+    }
+
+    #[test]
+    fn a_machine_that_has_changed_is_believed_at_once() {
+        let mut random = StdRng::seed_from_u64(3);
+        let mut known = begin(GainRule::Adaptive, None);
+        for _ in 0..4 {
+            let scatter = drawn(&mut random, 1e-3);
+            known = after(&known, &none(), &ErrorMap { values_mm: scatter, ..map(|_| 0.0) });
+        }
+        let before = known.bands[0].gain;
+        let changed = after(&known, &none(), &map(|_| 0.02));
+        assert!(before < 0.35 && changed.bands[0].gain > 0.95, "{before} then {}", changed.bands[0].gain);
+        assert_eq!(changed.scatter_mm(), known.scatter_mm(), "a change is no scatter");
+        let next_part = known.for_next_part();
+        let first = after(&next_part, &none(), &ErrorMap { values_mm: drawn(&mut random, 1e-3), ..map(|_| 0.0) });
+        assert!(first.bands[0].gain > before, "another part is believed more than another pass");
+    }
+
+    #[test]
+    fn a_fixed_gain_stays_what_it_is() {
+        for share in [0.0, 0.8, 1.2] {
+            let mut known = begin(GainRule::Fixed(share), None);
+            let mut correction = none();
+            for pass in 0..3 {
+                let error = map(|[x, _]| 1e-3 + correction.at([x, 0.0]));
+                known = after(&known, &correction, &error);
+                let next = correction.changed(&known);
+                for ((now, next), e) in correction.values_mm.iter().zip(&next.values_mm).zip(&error.values_mm) {
+                    assert_eq!(*next, now - share * e, "pass {pass}");
+                }
+                correction = next;
+                let forecast = known.forecast(&error);
+                assert!(forecast.rms_mm.is_finite() && forecast.sigma_mm.is_finite(), "{forecast:?}");
+            }
+            assert_eq!(known.gains(), [[CUTOFF_MM, share]]);
+        }
+    }
+
+    #[test]
+    fn a_response_below_one_is_made_up_for() {
+        let (known, form) = (begin(GainRule::Adaptive, None), map(|[x, y]| 1e-3 * (0.1 * x).sin() + 2e-5 * y));
+        let answer =
+            Response { slope: 0.9, correlation: 1.0, asked_mm: 1e-3, unexplained_mm: 0.0, sense: Sense::AsCommanded };
+        let known = known.after(&Seen { correction: &none(), error: &form, answer: Some(answer) });
+        assert!((known.response()[0] - 0.9).abs() < 1e-3, "{:?}", known.response());
+        for (u, e) in known.wanted_mm().unwrap().iter().zip(&form.values_mm) {
+            assert!((u + e / known.response()[0]).abs() < 1e-15);
+        }
+        // Four times what was asked for is no answer to it.
+        let wild = Response { slope: 4.0, ..answer };
+        let known =
+            begin(GainRule::Adaptive, None).after(&Seen { correction: &none(), error: &form, answer: Some(wild) });
+        assert_eq!(known.response(), [1.0, RESPONSE_SIGMA]);
+    }
+
+    #[test]
+    fn what_was_not_ground_as_it_was_commanded_teaches_nothing() {
+        let form = map(|[x, y]| 1e-3 * (0.2 * x + 0.1 * y).sin());
+        let first = after(&begin(GainRule::Wavelength, None), &none(), &form);
+        let asked = none().changed(&first);
+        for sense in [Sense::NoEffect, Sense::Flipped, Sense::MirroredX, Sense::MirroredY, Sense::Turned] {
+            let answer = Response { slope: 0.0, correlation: 0.0, asked_mm: 1e-3, unexplained_mm: 1e-3, sense };
+            let twice = first.after(&Seen { correction: &asked, error: &form, answer: Some(answer) });
+            assert_eq!((twice.wanted_mm(), twice.passes()), (Some(&asked.values_mm[..]), 1), "{sense:?}");
+            assert_eq!(twice.scatter_mm(), None);
+        }
+    }
+
+    #[test]
+    fn passes_are_told_anew_when_the_response_is_known_better() {
+        // A part that answers with 0.8 of what is asked: the second pass leaves a fifth and tells so, and the third nothing; on a net beside that
+        // of the correction, with a hole, so that what lies between nodes is lost.
+        let form = |[x, y]: [f64; 2]| 0.02 * (0.15 * x + 0.1).sin() * (0.12 * y).cos();
+        let net = Net { columns: 38, rows: 29, first_mm: [-18.6, -14.3], spacing_mm: [1.0, 1.0] };
+        let mut known = begin(GainRule::Adaptive, None);
+        let mut correction = none();
+        let mut left = Vec::new();
+        for slope in [None, Some(0.8), Some(0.8), Some(0.8)] {
+            let at = |place| form(place) + 0.8 * correction.at(place);
+            let hole = |[x, y]: [f64; 2]| x.hypot(y) > 4.0;
+            let places: Vec<[f64; 2]> = (0..net.len()).map(|k| net.place_mm(k)).collect();
+            let error = ErrorMap::known(
+                net,
+                places.iter().map(|p| at(*p)).collect(),
+                places.iter().map(|p| hole(*p)).collect(),
+            );
+            left.push(mean_square(&error.valid, &error.values_mm).sqrt());
+            let answer = slope.map(|slope| Response {
+                slope,
+                correlation: 1.0,
+                asked_mm: 1.0,
+                unexplained_mm: 0.0,
+                sense: Sense::AsCommanded,
+            });
+            known = known.after(&Seen { correction: &correction, error: &error, answer });
+            correction = correction.changed(&known);
+        }
+        assert!((left[1] / left[0] - 0.2).abs() < 0.01 && left[2] < 0.015 * left[0] && left[3] < left[2], "{left:?}");
+    }
+
+    #[test]
+    fn a_scatter_that_was_stated_too_small_is_found_out() {
+        let mut random = StdRng::seed_from_u64(11);
+        let mut known = begin(GainRule::Adaptive, Some(1e-4));
+        for _ in 0..5 {
+            known = after(&known, &none(), &ErrorMap { values_mm: drawn(&mut random, 1e-3), ..map(|_| 0.0) });
+        }
+        let told = known.scatter_mm().unwrap();
+        assert!((0.6e-3..1.5e-3).contains(&told), "{told}");
+        assert!(known.bands[0].gain < 0.4, "{}", known.bands[0].gain);
+    }
+
+    #[test]
+    fn bands_are_octaves_and_add_up() {
+        let known = begin(GainRule::Wavelength, None);
+        assert_eq!(known.bands.iter().map(|b| b.from_mm).collect::<Vec<_>>(), [2.5, 5.0, 10.0]);
+        let error = map(|[x, y]| (1.3 * x).sin() + 0.1 * y + (0.2 * x * y).cos());
+        let parts = known.split(&Told::of(&error, NET), error.values_mm.clone());
+        for (k, value) in error.values_mm.iter().enumerate() {
+            assert!((parts.iter().map(|part| part[k]).sum::<f64>() - value).abs() < 1e-12);
+        }
+        // A long wave is in the last band, a short one in the first.
+        let share = |wavelength_mm: f64, band: usize| {
+            let wave = map(|[x, _]| (x * std::f64::consts::TAU / wavelength_mm).cos());
+            rms(&known.split(&Told::of(&wave, NET), wave.values_mm.clone())[band]) / rms(&wave.values_mm)
+        };
+        assert!(share(30.0, 2) > 0.85 && share(3.0, 0) > 0.8, "{} {}", share(30.0, 2), share(3.0, 0));
+    }
+
+    #[test]
+    fn noise_is_shared_out_over_the_bands_as_the_filter_does_it() {
+        // White noise through the filter of the cut-off, as a map holds it, split into bands.
+        let known = begin(GainRule::Wavelength, None);
+        let (mut inside, mut everywhere) = ([0.0; 3], [0.0; 3]);
+        let mut random = StdRng::seed_from_u64(5);
+        for _ in 0..60 {
+            let white: Vec<f64> = (0..NET.len()).map(|_| random.random_range(-1.0..1.0)).collect();
+            let smooth =
+                filter_net(&NET, &white, &vec![true; NET.len()], CUTOFF_MM, Order::default(), false).unwrap().values;
+            let told = Told::of(&ErrorMap::known(NET, smooth.clone(), vec![true; NET.len()]), NET);
+            let middle: Vec<bool> =
+                (0..NET.len()).map(|k| NET.place_mm(k)).map(|[x, y]| x.abs() < 8.0 && y.abs() < 5.0).collect();
+            for (k, part) in known.split(&told, smooth.clone()).iter().enumerate() {
+                inside[k] += mean_square(&middle, part) / mean_square(&middle, &smooth) / 60.0;
+                everywhere[k] += told.mean_square(part) / told.mean_square(&smooth) / 60.0;
+            }
+        }
+        // By hand: 1 + 1/5 - 4/6, 1/5 + 1/17 - 4/22, 1/17.
+        let shares = known.noise_mm2(1.0);
+        for (share, by_hand) in shares.iter().zip([0.533_333, 0.077_005, 0.058_824]) {
+            assert!((share - by_hand).abs() < 1e-6, "{shares:?}");
+        }
+        println!("inside {inside:.3?}, everywhere {everywhere:.3?}");
+        for k in 0..3 {
+            assert!((inside[k] / shares[k] - 1.0).abs() < 0.35, "{inside:?} against {shares:?}");
+            assert!((0.5..2.5).contains(&(everywhere[k] / shares[k])), "{everywhere:?} against {shares:?}");
+        }
+    }
+
+    #[test]
+    fn nothing_and_no_scatter_are_no_trouble() {
+        for repeatability_mm in [None, Some(0.0), Some(1e-3)] {
+            for rule in [GainRule::Wavelength, GainRule::Adaptive, GainRule::Fixed(1.0)] {
+                let mut known = begin(rule, repeatability_mm);
+                for value in [0.0, 0.0, 1e-3, 0.0, 1e6, 1e-300] {
+                    let error = map(|_| value);
+                    known = after(&known, &none(), &error);
+                    assert!(known.is_sound(), "{known:?}");
+                    let forecast = known.forecast(&error);
+                    assert!(forecast.rms_mm.is_finite() && known.wanted_mm().unwrap().iter().all(|v| v.is_finite()));
+                }
+            }
+        }
+        let all = after(&begin(GainRule::Adaptive, None), &none(), &map(|_| 0.0));
+        assert!(all.wanted_mm().unwrap().iter().all(|v| *v == 0.0) && all.forecast(&map(|_| 0.0)).rms_mm == 0.0);
+    }
+
+    #[test]
+    fn numbers_that_cannot_be_are_seen() {
+        let known = after(&begin(GainRule::Wavelength, None), &none(), &map(|[x, _]| 1e-3 * x));
+        assert!(known.is_sound());
+        let broken = |change: fn(&mut Knowledge)| {
+            let mut known = known.clone();
+            change(&mut known);
+            !known.is_sound()
+        };
+        assert!(broken(|k| k.response[0] = 9.0));
+        assert!(broken(|k| k.response[1] = f64::NAN));
+        assert!(broken(|k| k.bands.clear()));
+        assert!(broken(|k| k.bands.swap(0, 1)));
+        assert!(broken(|k| k.bands[1].belief = Some(-1.0)));
+        assert!(broken(|k| k.bands[1].scatter[0] = f64::INFINITY));
+        assert!(broken(|k| k.bands[0].from_mm = 0.0));
+        assert!(broken(|k| k.bands[0].share = f64::NAN));
+        assert!(broken(|k| k.means.as_mut().unwrap().error_mm.truncate(3)));
+        assert!(broken(|k| k.means.as_mut().unwrap().correction_mm[0] = f64::NAN));
+        assert!(broken(|k| k.means.as_mut().unwrap().net.spacing_mm[0] = 0.0));
+        assert!(broken(|k| {
+            let means = k.means.as_mut().unwrap();
+            (means.net.columns, means.error_mm, means.correction_mm) = (0, Vec::new(), Vec::new());
+        }));
     }
 }

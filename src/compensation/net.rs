@@ -83,6 +83,33 @@ impl Net {
         [self.first_mm[0] + i as f64 * self.spacing_mm[0], self.first_mm[1] + j as f64 * self.spacing_mm[1]]
     }
 
+    /// Whether it has nodes, not too many of them, at places that are numbers; for what was read from a file.
+    pub fn is_sound(&self) -> bool {
+        let nodes = self.columns as f64 * self.rows as f64;
+        self.columns > 0
+            && self.rows > 0
+            && nodes <= MOST_NODES
+            && self.first_mm.iter().all(|v| v.is_finite())
+            && self.spacing_mm.iter().all(|v| *v > 0.0 && v.is_finite())
+    }
+
+    /// Returns the node nearest to a place; `None` more than half a cell beyond the border.
+    pub fn nearest(&self, place_mm: [f64; 2]) -> Option<usize> {
+        let along = |k: usize, nodes: usize| {
+            let node = ((place_mm[k] - self.first_mm[k]) / self.spacing_mm[k]).round();
+            (0.0..nodes as f64).contains(&node).then_some(node as usize)
+        };
+        Some(along(1, self.rows)? * self.columns + along(0, self.columns)?)
+    }
+
+    /// Returns values on another net; where it is the same one, as they are.
+    pub fn resample(&self, values: &[f64], onto: &Self) -> Vec<f64> {
+        if self == onto {
+            return values.to_vec();
+        }
+        (0..onto.len()).map(|k| self.interpolate(values, onto.place_mm(k))).collect()
+    }
+
     /// Returns the value at a place between the nodes, bilinear; beyond the border that of the nearest place on it.
     pub fn interpolate(&self, values: &[f64], [x, y]: [f64; 2]) -> f64 {
         let along = |at: f64, first: f64, spacing: f64, nodes: usize| {
@@ -112,6 +139,23 @@ mod tests {
         assert!(matches!(Net::over([[0.0; 2], [1e9, 1.0]].into_iter(), 1e-3), Err(NetError::TooFine { .. })));
         let line = Net::over([[0.0, 1.0], [4.0, 1.0]].into_iter(), 2.0).unwrap();
         assert_eq!(line.interpolate(&[1.0, 2.0, 4.0, 1.0, 2.0, 4.0], [3.0, 1.0]), 3.0);
+    }
+
+    #[test]
+    fn the_nearest_node_is_within_half_a_cell() {
+        let net = Net { columns: 3, rows: 2, first_mm: [-1.0, 5.0], spacing_mm: [1.0, 2.0] };
+        for (place, node) in [([-1.4, 5.9], Some(0)), ([0.6, 6.1], Some(5)), ([1.6, 5.0], None), ([0.0, 3.9], None)] {
+            assert_eq!(net.nearest(place), node, "{place:?}");
+        }
+        assert_eq!(net.nearest([f64::NAN, 5.0]), None);
+        assert!(net.is_sound() && !Net { columns: 0, ..net }.is_sound() && !Net { columns: 1 << 60, ..net }.is_sound());
+        assert!(
+            !Net { spacing_mm: [0.0, 1.0], ..net }.is_sound() && !Net { first_mm: [f64::NAN, 1.0], ..net }.is_sound()
+        );
+        let values = [0.0, 1.0, 2.0, 4.0, 5.0, 6.0];
+        let finer = Net { columns: 5, rows: 1, first_mm: [-1.0, 6.0], spacing_mm: [0.5, 1.0] };
+        assert_eq!(net.resample(&values, &net), values);
+        assert_eq!(net.resample(&values, &finer), [2.0, 2.5, 3.0, 3.5, 4.0]);
     }
 
     #[test]

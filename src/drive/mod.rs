@@ -585,6 +585,9 @@ impl Drive {
     /// Shows how a cycle was judged and leaves it beside its measurement.
     async fn announce(&mut self, judgement: crate::cell::Judgement) {
         let number = judgement.cycle;
+        if let Some(cycle) = self.cycles.get_mut(&number) {
+            cycle.judged = true;
+        }
         let cycle = self.cycles.get(&number);
         let result = json!({
             "simulation": self.task.simulation,
@@ -607,7 +610,7 @@ impl Drive {
             return;
         }
         let run = self.folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-        let last = self.cycles.values().rev().find(|cycle| cycle.known.is_some()).cloned();
+        let last = self.cycles.values().rev().find(|cycle| cycle.judged && cycle.known.is_some()).cloned();
         let Some(learned) = last.and_then(|cycle| work::learned(&self.task, run, &cycle)) else { return };
         match write_json_atomic(self.folder.join(LEARNED), &learned) {
             Ok(()) => self.adopt(vec![LEARNED.into()], self.cell.cycle()).await,
@@ -692,7 +695,10 @@ impl Drive {
 
     fn register(&mut self, number: u32) {
         let Some(cycle) = self.cycles.get(&number).cloned() else { return };
-        let before = self.cycles.range(..number).next_back().map(|(_, c)| c.clone());
+        // What a gate refused, and what was measured once more after the same pass, is no pass before this one.
+        let pass = cycle.correction.cycle;
+        let earlier = |c: &&Cycle| c.judged && c.known.is_some() && c.correction.cycle < pass;
+        let before = self.cycles.range(..number).rev().map(|(_, c)| c).find(earlier).cloned();
         let (task, folder, done) = (Arc::clone(&self.task), self.cycle_folder(number), self.computed.0.clone());
         tokio::task::spawn_blocking(move || {
             let (event, found) = work::register_cycle(&task, &folder, number, &cycle, before.as_ref());
@@ -771,6 +777,7 @@ fn new_cycle(correction: Correction) -> Cycle {
         error: None,
         known: None,
         figures: None,
+        judged: false,
     }
 }
 

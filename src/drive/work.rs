@@ -110,6 +110,8 @@ pub(super) struct Cycle {
     /// What is known of the grinder with this cycle taken in.
     pub(super) known: Option<Arc<Knowledge>>,
     pub(super) figures: Option<Figures>,
+    /// Whether it was judged: a measurement that a gate refused tells nothing of the grinder.
+    pub(super) judged: bool,
 }
 
 /// What a registration gives besides its event.
@@ -134,7 +136,23 @@ pub(super) struct Points {
 }
 
 impl Task {
-    /// Returns the correction of the first pass: none.
+    /// Begins with what an earlier part told of the grinder: the first pass is ground with its correction.
+    ///
+    /// # Errors
+    /// A first correction beyond the limits of this run; the task is left as it was.
+    pub fn begin_with(&mut self, learned: Learned) -> Result<(), StepError> {
+        let before = self.learned.replace(learned);
+        let within = self.first_correction().removed_mm(&self.limits).map_err(|error| match error {
+            StepError::BudgetSpent { removed_mm, budget_mm } => StepError::BudgetAtOnce { removed_mm, budget_mm },
+            error => error,
+        });
+        if within.is_err() {
+            self.learned = before;
+        }
+        within.map(|_| ())
+    }
+
+    /// Returns the correction of the first pass: none, or what an earlier part left.
     pub fn first_correction(&self) -> Correction {
         let corners = [[self.pass.x_mm[0], self.pass.y_mm[0]], [self.pass.x_mm[1], self.pass.y_mm[1]]];
         let net = Net::over(corners.into_iter(), self.map.spacing_mm).unwrap_or(Net {
@@ -305,7 +323,7 @@ fn radius(task: &Task, points: &[Point]) -> Result<Option<[f64; 2]>, GateFailure
     Ok(Some([found, fit.radius_sigma_mm]))
 }
 
-/// Registers the points of a cycle and writes what was found.
+/// Registers the points of a cycle and writes what was found; `before` is the last measurement of an earlier pass that was judged.
 pub(super) fn register_cycle(
     task: &Task,
     folder: &Path,
@@ -356,16 +374,8 @@ fn learned_from(
     error: &ErrorMap,
     answer: Option<compensation::Response>,
 ) -> Knowledge {
-    let earlier = before.and_then(|before| before.known.as_deref().cloned());
-    // Measured once more after the same pass: nothing new of the grinder.
-    let same_pass = before.is_some_and(|before| before.correction == cycle.correction);
-    match earlier {
-        Some(earlier) if same_pass => earlier,
-        earlier => {
-            let earlier = earlier.unwrap_or_else(|| task.beginning());
-            earlier.after(&Seen { correction: &cycle.correction, error, answer })
-        }
-    }
+    let earlier = before.and_then(|before| before.known.as_deref().cloned()).unwrap_or_else(|| task.beginning());
+    earlier.after(&Seen { correction: &cycle.correction, error, answer })
 }
 
 fn save(task: &Task, folder: &Path, found: &Registration, options: &Options) -> Result<(), FormatError> {
@@ -513,14 +523,14 @@ fn save_program(task: &Task, folder: &Path, correction: &Correction) -> Option<S
 
 /// What the next part of this kind can begin with; none where this run did not get so far.
 pub(super) fn learned(task: &Task, run: String, cycle: &Cycle) -> Option<Learned> {
-    let (known, error) = (cycle.known.as_deref()?, cycle.error.as_deref()?);
+    let known = cycle.known.as_deref()?;
     let wrong = [Response::SignFlipped, Response::Mirrored, Response::NoEffect];
     if cycle.figures.as_ref()?.response.is_some_and(|response| wrong.contains(&response)) {
         return None;
     }
     let (setting, simulation) = (task.setting.clone(), task.simulation);
-    let correction = cycle.correction.changed(error, known);
-    Some(Learned { simulation, setting, run, correction, known: known.clone() })
+    let correction = cycle.correction.changed(known);
+    Some(Learned::new(simulation, setting, run, correction, known.clone()))
 }
 
 /// Writes the points of a measurement, in the CMM frame.

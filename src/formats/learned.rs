@@ -12,9 +12,13 @@ pub const LEARNED: &str = "learned.json";
 /// A file larger than this is none of ours.
 const MOST_BYTES: u64 = 256 << 20;
 
+/// How the file is laid out; another number is not read.
+const LAYOUT: u32 = 2;
+
 /// The correction that took back what comes in every pass, and how well it is known.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Learned {
+    layout: u32,
     /// Whether the passes were simulated.
     pub simulation: bool,
     /// What the passes had in common; a run with another of these learns nothing from it.
@@ -27,6 +31,15 @@ pub struct Learned {
     pub known: Knowledge,
 }
 
+/// What tells whether a file is looked for at all.
+#[derive(Deserialize)]
+struct Head {
+    #[serde(default)]
+    layout: u32,
+    simulation: bool,
+    setting: String,
+}
+
 /// Why nothing is learned from a file.
 #[derive(Debug, Error)]
 #[allow(missing_docs)]
@@ -35,16 +48,21 @@ pub enum LearnedError {
     Unreadable { path: PathBuf, source: std::io::Error },
     #[error("{path}: {bytes} bytes, more than the {MOST_BYTES} of any run; it is not one that Regrind wrote")]
     TooLarge { path: PathBuf, bytes: u64 },
-    #[error("{path}: {why}; remove it, or copy the run again from its archive")]
+    #[error("{path}: {why}; copy the run again from its archive")]
     Broken { path: PathBuf, why: String },
 }
 
 impl Learned {
-    /// Reads what a run left; `None` where it left nothing.
+    /// What a run leaves to the next part.
+    pub fn new(simulation: bool, setting: String, run: String, correction: Correction, known: Knowledge) -> Self {
+        Self { layout: LAYOUT, simulation, setting, run, correction, known }
+    }
+
+    /// Reads what a run left, and the file as it is; `None` where it left nothing, or nothing for this setting.
     ///
     /// # Errors
-    /// A file that cannot be read, or whose numbers cannot be.
-    pub fn read(run: &Path) -> Result<Option<Self>, LearnedError> {
+    /// A file that cannot be read, that is none of ours, or whose numbers cannot be.
+    pub fn read(run: &Path, setting: &str, simulation: bool) -> Result<Option<(Self, Vec<u8>)>, LearnedError> {
         let path = run.join(LEARNED);
         let bytes = match std::fs::metadata(&path) {
             Ok(metadata) => metadata.len(),
@@ -58,35 +76,128 @@ impl Learned {
             Ok(text) => text,
             Err(source) => return Err(LearnedError::Unreadable { path, source }),
         };
+        let broken = |path, why| Err(LearnedError::Broken { path, why });
+        // First whether it is meant at all: what another part left, or an earlier version, is in nobody's way.
+        match serde_json::from_slice::<Head>(&text) {
+            Ok(head) if head.layout != LAYOUT || head.simulation != simulation || head.setting != setting => {
+                return Ok(None);
+            }
+            Ok(_) => {}
+            Err(error) => return broken(path, error.to_string()),
+        }
         let learned: Self = match serde_json::from_slice(&text) {
             Ok(learned) => learned,
-            Err(error) => return Err(LearnedError::Broken { path, why: error.to_string() }),
+            Err(error) => return broken(path, error.to_string()),
         };
         match learned.flaw() {
-            None => Ok(Some(learned)),
-            Some(why) => Err(LearnedError::Broken { path, why }),
+            None => Ok(Some((learned, text))),
+            Some(why) => broken(path, why),
         }
     }
 
     /// What in it cannot be.
     fn flaw(&self) -> Option<String> {
         let Correction { net, values_mm, level_mm, .. } = &self.correction;
-        let numbers = [net.first_mm, net.spacing_mm].concat();
-        if values_mm.len() != net.len() || net.is_empty() {
-            return Some(format!("{} values on a net of {} x {} nodes", values_mm.len(), net.columns, net.rows));
+        if !net.is_sound() || values_mm.len() != net.len() {
+            let [dx, dy] = net.spacing_mm;
+            let found = format!(
+                "{} values on a net of {} x {} nodes, {dx} x {dy} mm apart",
+                values_mm.len(),
+                net.columns,
+                net.rows
+            );
+            return Some(found);
         }
-        if !values_mm.iter().chain(&numbers).all(|v| v.is_finite())
-            || !level_mm.is_finite()
-            || net.spacing_mm.iter().any(|s| *s <= 0.0)
-        {
-            return Some("a number of its correction is not finite, or its spacing not above 0".into());
+        if !values_mm.iter().all(|v| v.is_finite()) || !level_mm.is_finite() {
+            return Some("a number of its correction is not finite".into());
         }
         (!self.known.is_sound()).then(|| "a number of what it knows of the grinder cannot be".into())
     }
 
     /// Returns the correction of the first pass of another part: what came back in every pass of this one, on the net of `none`.
     pub fn first_correction(&self, none: Correction) -> Correction {
-        let values_mm = (0..none.net.len()).map(|k| self.correction.at(none.net.place_mm(k))).collect();
+        let values_mm = self.correction.net.resample(&self.correction.values_mm, &none.net);
         Correction { values_mm, ..none }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::compensation::{ErrorMap, GainRule, MapOptions, Net, Seen};
+
+    const NET: Net = Net { columns: 5, rows: 4, first_mm: [-2.0, -1.5], spacing_mm: [1.0, 1.0] };
+
+    fn learned() -> Learned {
+        let correction = Correction::none(NET, 0.05);
+        let values = (0..NET.len()).map(|k| 1e-3 * k as f64).collect();
+        let error = ErrorMap::known(NET, values, vec![true; NET.len()]);
+        let begin = Knowledge::new(GainRule::Wavelength, &MapOptions::new(1.0, 1.0), [4.0, 3.0], None);
+        let known = begin.after(&Seen { correction: &correction, error: &error, answer: None });
+        Learned::new(true, "a part".into(), "run-1".into(), correction.changed(&known), known)
+    }
+
+    fn read(text: &str) -> Result<Option<(Learned, Vec<u8>)>, LearnedError> {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join(LEARNED), text).unwrap();
+        Learned::read(folder.path(), "a part", true)
+    }
+
+    #[test]
+    fn what_was_written_is_read_back_with_its_text() {
+        let text = serde_json::to_string(&learned()).unwrap();
+        let (back, bytes) = read(&text).unwrap().unwrap();
+        assert_eq!(back.correction, learned().correction);
+        assert_eq!(bytes, text.as_bytes());
+        assert_eq!(serde_json::to_string(&back).unwrap(), text);
+        assert!(
+            Learned::read(tempfile::tempdir().unwrap().path(), "", true).unwrap().is_none(),
+            "no file is nothing learned"
+        );
+        // Another net of the same part: what lies between the nodes, and the height of the new part.
+        let finer = Net { columns: 9, rows: 7, spacing_mm: [0.5, 0.5], ..NET };
+        let first = back.first_correction(Correction::none(finer, 0.06));
+        assert_eq!((first.level_mm, first.cycle, first.values_mm.len()), (0.06, 1, 63));
+        assert_eq!(first.values_mm[2], back.correction.values_mm[1]);
+    }
+
+    #[test]
+    fn what_another_part_or_version_left_is_in_nobodys_way() {
+        let text = serde_json::to_string(&learned()).unwrap();
+        for (from, to) in
+            [("a part", "another"), ("\"simulation\":true", "\"simulation\":false"), ("\"layout\":2,", "")]
+        {
+            assert!(text.contains(from));
+            assert!(read(&text.replacen(from, to, 1)).unwrap().is_none(), "{to}");
+        }
+        // Whatever else has become of it.
+        assert!(read("{\"setting\": \"another\", \"simulation\": true, \"known\": 7}").unwrap().is_none());
+    }
+
+    #[test]
+    fn what_cannot_be_is_refused_with_its_place() {
+        let text = serde_json::to_string(&learned()).unwrap();
+        let broken = |from: &str, to: &str| {
+            assert!(text.contains(from), "no {from} in {text}");
+            // Where it stands once and where it stands again: the correction and the means.
+            let all = [text.replacen(from, to, 1), text.replace(from, to)];
+            all.map(|text| {
+                let error = read(&text).unwrap_err().to_string();
+                assert!(error.contains(LEARNED) && error.contains("archive"), "{error}");
+                error
+            })
+        };
+        assert!(broken("\"columns\":5", "\"columns\":6")[0].contains("20 values on a net of 6 x 4 nodes"));
+        assert!(broken("\"columns\":5,\"rows\":4", "\"columns\":0,\"rows\":0")[0].contains("0 x 0"));
+        assert!(broken("\"spacing_mm\":[1.0,1.0]", "\"spacing_mm\":[0.0,1.0]")[0].contains("0 x 1 mm apart"));
+        assert!(broken("\"response\":[1.0", "\"response\":[7.0")[0].contains("cannot be"));
+        assert!(broken("\"run\"", "\"ran\"")[0].contains("run"));
+        // The means have a net of their own.
+        let at = text.rfind("\"columns\":5").unwrap();
+        let of_means = format!("{}{}", &text[..at], text[at..].replacen("\"columns\":5", "\"columns\":0", 1));
+        assert!(read(&of_means).unwrap_err().to_string().contains("cannot be"));
+        for text in ["", "{", &text[..text.len() / 2], "[]", "7"] {
+            assert!(matches!(read(text), Err(LearnedError::Broken { .. })), "{text}");
+        }
     }
 }

@@ -11,8 +11,8 @@ use super::written::{
     TracksWord, WheelTable,
 };
 use super::{
-    Acceptance, Compensation, Cycle, Density, GainBy, Grinding, Measure, NominalSource, Part, PathMode, Pattern,
-    Recipe, RegistrationSettings, StartAt, Tracks, Wheel,
+    Acceptance, BeginWith, Compensation, Cycle, Density, GainBy, Grinding, Measure, NominalSource, Part, PathMode,
+    Pattern, Recipe, RegistrationSettings, StartAt, Tracks, Wheel,
 };
 use crate::compensation::GainRule;
 use crate::document::Document;
@@ -440,6 +440,14 @@ fn compare_tables(written: &RecipeFile, document: &mut Document) {
             format!("is {most} um, less than `acceptance.rms_um`, {rms} um"),
             "a good part would be refused",
             "raise it well above the first cycle's rms, or leave it out",
+        );
+    }
+    if written.compensation.learn && written.cycle.begin_with == BeginWith::Measure {
+        document.report(
+            "compensation.learn",
+            "is true, and `cycle.begin_with` is \"measure\"".to_owned(),
+            "what was learned is ground in with the first pass, and a part that is measured first has had its pass already",
+            "leave one of the two out",
         );
     }
     let (allowance, cycles) = (written.grinding.allowance_um, written.cycle.most_cycles);

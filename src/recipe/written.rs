@@ -235,7 +235,8 @@ pub(super) struct CompensationTable {
     /// Root mean square of what a pass adds by itself, where that is known; without it the cycles tell it.
     #[schemars(range(min = 0.001, max = 1000.0))]
     pub repeatability_um: Option<f64>,
-    /// Begin with what the last finished run of this part, wheel and cell found to come back in every pass.
+    /// Begin with what the last finished run found to come back in every pass, if it had this part and cell, this wheel and way of grinding,
+    /// as many targets, and this cut-off, smoothing and gain.
     pub learn: bool,
     /// The least that a pass takes off where it takes off least.
     #[schemars(range(min = 0.0, max = 1000.0))]

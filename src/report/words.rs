@@ -131,9 +131,10 @@ fn event_words(event: &Event) -> String {
         }
         Event::Registered { figures, .. } => figures_words(figures),
         Event::Compensated { summary, .. } => format!(
-            "up to {:.2} um, {:.2} um deep, PV {:.2} um expected",
+            "up to {:.2} um, {:.2} um deep, {:.1} % in air, PV {:.2} um expected",
             1e3 * summary.largest_mm,
             1e3 * summary.depth_mm,
+            100.0 * summary.air_share,
             1e3 * summary.predicted_pv_mm
         ),
         Event::CompensationRefused { why, .. } => match why {

@@ -222,7 +222,7 @@ impl<'a> Line<'a> {
             Ok(step) => step.correction,
             // The study goes on where a recipe would have no material left: what counts here is the form.
             Err(StepError::BudgetSpent { .. }) => {
-                let changed = self.correction.changed(&error, &self.known);
+                let changed = self.correction.changed(&self.known);
                 Correction {
                     level_mm: changed.level_mm - task.limits.depth_of_cut_mm,
                     cycle: changed.cycle + 1,

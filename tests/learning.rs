@@ -1,0 +1,111 @@
+//! From part to part: what one run found to come back in every pass is what the next one begins with, or it says why not.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+/// A folder of runs, and a recipe that learns.
+struct Shop {
+    home: tempfile::TempDir,
+    recipe: String,
+}
+
+impl Shop {
+    fn new() -> Self {
+        let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("recipes/shallow-wave.toml");
+        let recipe = fs::read_to_string(shipped).unwrap();
+        let recipe = changed(&recipe, "columns = 50\nrows = 40", "columns = 34\nrows = 26");
+        let recipe = changed(&recipe, "cutoff_mm = 5.0", "cutoff_mm = 8.0\nlearn = true");
+        Self { home: tempfile::tempdir().unwrap(), recipe }
+    }
+
+    fn run(&self, recipe: &str) -> Output {
+        let path = self.home.path().join("wave.toml");
+        fs::write(&path, recipe).unwrap();
+        let cell = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/sim.toml");
+        let mut program = Command::new(env!("CARGO_BIN_EXE_regrind"));
+        program.arg("run").arg(path).arg("--cell").arg(cell).arg("--runs").arg(self.home.path().join("runs"));
+        program.output().unwrap()
+    }
+
+    /// Runs a recipe to its end and returns its folder.
+    fn ran(&self, recipe: &str) -> (PathBuf, String) {
+        let before = self.folders();
+        let output = self.run(recipe);
+        let said = told(&output);
+        assert!(matches!(output.status.code(), Some(0 | 1)), "{said}");
+        let mut new = self.folders();
+        new.retain(|folder| !before.contains(folder));
+        (new.pop().expect("a run has a folder"), said)
+    }
+
+    fn folders(&self) -> Vec<PathBuf> {
+        let Ok(entries) = fs::read_dir(self.home.path().join("runs")) else { return Vec::new() };
+        entries.map(|entry| entry.unwrap().path()).collect()
+    }
+}
+
+fn changed(text: &str, from: &str, to: &str) -> String {
+    assert!(text.contains(from), "no {from:?}");
+    text.replace(from, to)
+}
+
+fn told(output: &Output) -> String {
+    format!("{}\n{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
+}
+
+/// RMS of the part after the first pass, as it was measured.
+fn first_rms_mm(run: &Path) -> f64 {
+    let document: Value = serde_json::from_slice(&fs::read(run.join("cycle-1/registration.json")).unwrap()).unwrap();
+    document["rms_mm"].as_f64().expect("registration.json tells rms_mm")
+}
+
+#[test]
+fn a_part_begins_with_what_the_one_before_it_told() {
+    let shop = Shop::new();
+    let (first, said) = shop.ran(&shop.recipe);
+    assert!(said.contains("begins from nothing"), "{said}");
+    let name = first.file_name().unwrap().to_str().unwrap().to_owned();
+
+    let (second, said) = shop.ran(&shop.recipe);
+    assert!(said.contains(&format!("begins with what {name} found")), "{said}");
+    let [before, after] = [&first, &second].map(|run| first_rms_mm(run));
+    assert!(after < 0.5 * before, "the first pass left {before} mm, and that of the next part {after} mm");
+    // The record holds what it began with.
+    assert_eq!(fs::read(first.join("learned.json")).unwrap(), fs::read(second.join("learned_from.json")).unwrap());
+    let audited = Command::new(env!("CARGO_BIN_EXE_regrind")).args(["audit", "verify"]).arg(&second).output().unwrap();
+    assert!(audited.status.success(), "{}", told(&audited));
+
+    // Another way of choosing the gain is another thing to learn; so is another cut-off.
+    for (from, to) in [("learn = true", "learn = true\ngain = 0.8"), ("cutoff_mm = 8.0", "cutoff_mm = 9.0")] {
+        let (_, said) = shop.ran(&changed(&shop.recipe, from, to));
+        assert!(said.contains("begins from nothing"), "{said}");
+    }
+}
+
+#[test]
+fn what_cannot_be_begun_with_is_refused() {
+    let shop = Shop::new();
+    let (first, _) = shop.ran(&shop.recipe);
+    let refused = |recipe: &str, words: &[&str]| {
+        let runs = shop.folders().len();
+        let output = shop.run(recipe);
+        let said = told(&output);
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(words.iter().all(|word| said.contains(word)), "{said}");
+        assert_eq!(shop.folders().len(), runs, "a refused run leaves no folder");
+    };
+    let small = changed(&shop.recipe, "largest_correction_um = 60.0", "largest_correction_um = 0.5");
+    refused(&small, &["more than the 0.50 um", "raise largest_correction_um", "learn = false"]);
+    let measured_first = changed(&shop.recipe, "most_cycles = 5", "most_cycles = 5\nbegin_with = \"measure\"");
+    refused(&measured_first, &["compensation.learn", "leave one of the two out"]);
+    // A file that has come to harm is told, and in nobody's way.
+    fs::write(first.join("learned.json"), "{").unwrap();
+    let (_, said) = shop.ran(&shop.recipe);
+    assert!(
+        said.contains("left alone:") && said.contains("learned.json") && said.contains("begins from nothing"),
+        "{said}"
+    );
+}
