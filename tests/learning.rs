@@ -78,6 +78,16 @@ fn a_part_begins_with_what_the_one_before_it_told() {
     let audited = Command::new(env!("CARGO_BIN_EXE_regrind")).args(["audit", "verify"]).arg(&second).output().unwrap();
     assert!(audited.status.success(), "{}", told(&audited));
 
+    // A plan does not know which run that will be.
+    let plan = |recipe: &str| {
+        fs::write(shop.home.path().join("wave.toml"), recipe).unwrap();
+        let cell = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/sim.toml");
+        let mut program = Command::new(env!("CARGO_BIN_EXE_regrind"));
+        told(&program.arg("plan").arg(shop.home.path().join("wave.toml")).arg("--cell").arg(cell).output().unwrap())
+    };
+    assert!(plan(&shop.recipe).contains("begins with the correction that the last one like it left"));
+    assert!(!plan(&changed(&shop.recipe, "learn = true", "learn = false")).contains("begins with"));
+
     // Another way of choosing the gain is another thing to learn; so is another cut-off.
     for (from, to) in [("learn = true", "learn = true\ngain = 0.8"), ("cutoff_mm = 8.0", "cutoff_mm = 9.0")] {
         let (_, said) = shop.ran(&changed(&shop.recipe, from, to));

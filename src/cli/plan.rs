@@ -59,6 +59,8 @@ struct Document {
     /// Why none can be made.
     #[serde(skip_serializing_if = "Option::is_none")]
     no_program: Option<String>,
+    /// Whether a run would begin with what an earlier one learned.
+    learns: bool,
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
@@ -96,6 +98,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         grinding_minutes: path_mm / task.pass.feed_mm_min,
         program_points: program.as_ref().ok().map(|(_, summary)| summary.points),
         no_program: program.as_ref().err().map(ToString::to_string),
+        learns: recipe.compensation.learn,
     };
     if arguments.json {
         super::print_json(&document)?;
@@ -123,8 +126,13 @@ fn words(d: &Document) -> String {
         (Some(points), _) => format!("{} a pass", counted(points as usize, "point")),
         (None, why) => format!("none: {}", why.as_deref().unwrap_or_default()),
     };
+    let learns = if d.learns {
+        "learn       a run begins with the correction that the last one like it left; what is told and written here is without it\n"
+    } else {
+        ""
+    };
     format!(
-        "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nprogram     {program}\n\
+        "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nprogram     {program}\n{learns}\
          level       {} um over the nominal surface first, {} um deeper each pass, {} um at the least\nbudget      {} um in all\ncycles      at most {}\n",
         d.part,
         counted(d.nominal_points, "point"),
