@@ -106,7 +106,7 @@ fn write(path: &ToolPath, summary: &Summary, file: &Path) {
         simulation: true,
         mode: PathMode::default(),
     };
-    write_program(file, &header, summary, path.moves()).expect("a program");
+    write_program(file, &header, summary, &path.moves_by_track()).expect("a program");
 }
 
 /// All together: 28,476 deviations, their map, what they tell, the correction, the path and its program of a million points.

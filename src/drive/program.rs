@@ -134,7 +134,7 @@ impl Programs {
             simulation: self.simulation,
             mode: self.mode,
         };
-        Ok(write_program(file, &header, summary, path.moves())?)
+        Ok(write_program(file, &header, summary, &path.moves_by_track())?)
     }
 }
 

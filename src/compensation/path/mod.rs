@@ -117,6 +117,11 @@ impl ToolPath {
         Moves::new(self)
     }
 
+    /// Returns the same moves track by track; each ends at the safe height.
+    pub fn moves_by_track(&self) -> Vec<Moves<'_>> {
+        (0..self.tracks()).map(|k| Moves::of(self, k, k + 1)).collect()
+    }
+
     /// Returns the distance of the tracks over x and y, in millimetres.
     pub fn track_mm(&self) -> f64 {
         self.tracks.track_mm

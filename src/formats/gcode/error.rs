@@ -23,3 +23,13 @@ pub enum GcodeError {
     #[error("{path}: {what}; {remedy}")]
     Program { path: PathBuf, what: String, remedy: &'static str },
 }
+
+impl GcodeError {
+    /// Counts the moves that came before those whose error this is.
+    pub(super) fn after(self, moves: u64) -> Self {
+        match self {
+            Self::NotFinite { axis, value_mm, number } => Self::NotFinite { axis, value_mm, number: number + moves },
+            error => error,
+        }
+    }
+}

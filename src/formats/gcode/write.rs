@@ -3,6 +3,8 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
+use rayon::prelude::*;
+
 use super::number::{LARGEST_MM, push_fixed, rounded, short};
 use super::{GcodeError, PathMode, hex};
 use crate::compensation::path::{Move, Summary};
@@ -10,6 +12,8 @@ use crate::formats::registration::Draft;
 
 /// Bytes that are gathered before they go to the file.
 const CHUNK: usize = 1 << 16;
+/// Points whose lines are made at the same time and wait for their turn, some 30 bytes each.
+const AT_ONCE: u64 = 200_000;
 
 /// What the header of a program tells.
 #[derive(Clone, Debug)]
@@ -36,35 +40,50 @@ pub struct ProgramHeader {
     pub mode: PathMode,
 }
 
-/// Writes a program: the header, the moves, the end.
+/// Writes a program: the header, the moves track by track, the end.
 ///
-/// Frame: the model frame, which G54 must have its zero in. Units: mm, mm/min. A coordinate that does not change is left out. The file
-/// appears whole or not at all.
+/// Frame: the model frame, which G54 must have its zero in. Units: mm, mm/min. A coordinate that does not change within a track is left
+/// out; every track says all of its beginning anew, so that a program can be gone on with at any of them, and many are written at the same
+/// time. The file appears whole or not at all.
 ///
 /// # Errors
 /// A coordinate that is not finite or beyond a kilometre; a number of moves other than the summary has; a file that cannot be written.
-pub fn write_program(
-    path: &Path,
-    header: &ProgramHeader,
-    summary: &Summary,
-    moves: impl Iterator<Item = Move>,
-) -> Result<(), GcodeError> {
+pub fn write_program<T>(path: &Path, header: &ProgramHeader, summary: &Summary, tracks: &[T]) -> Result<(), GcodeError>
+where
+    T: Iterator<Item = Move> + Clone + Sync,
+{
     let mut draft = Draft::create(path)?;
-    let head = header_text(header, summary);
-    draft.write(head.as_bytes())?;
-    let mut lines = Lines { text: Vec::with_capacity(CHUNK + 256), last: [i64::MAX; 3], mode: None, feed: 0, count: 0 };
-    for one in moves {
-        lines.push(&one)?;
-        if lines.text.len() >= CHUNK {
+    draft.write(header_text(header, summary).as_bytes())?;
+    let mut count = 0;
+    let at_once = (AT_ONCE * tracks.len() as u64 / summary.points.max(1)) as usize;
+    if at_once < 2 {
+        // Long tracks go to the file as they come.
+        for track in tracks {
+            let mut lines = Lines::new(count);
+            for one in track.clone() {
+                lines.push(&one)?;
+                if lines.text.len() >= CHUNK {
+                    draft.write(&lines.text)?;
+                    lines.text.clear();
+                }
+            }
             draft.write(&lines.text)?;
-            lines.text.clear();
+            count = lines.count;
+        }
+    } else {
+        for some in tracks.chunks(at_once) {
+            let texts: Vec<Result<Lines, GcodeError>> = some.par_iter().map(Lines::of).collect();
+            for lines in texts {
+                let lines = lines.map_err(|error| error.after(count))?;
+                draft.write(&lines.text)?;
+                count += lines.count;
+            }
         }
     }
-    if lines.count != summary.moves {
-        return Err(GcodeError::Count { found: lines.count, expected: summary.moves });
+    if count != summary.moves {
+        return Err(GcodeError::Count { found: count, expected: summary.moves });
     }
-    lines.text.extend_from_slice(b"M2\n");
-    draft.write(&lines.text)?;
+    draft.write(b"M2\n")?;
     draft.publish()?;
     Ok(())
 }
@@ -80,6 +99,18 @@ struct Lines {
 }
 
 impl Lines {
+    /// Nothing is in force, after so many moves.
+    fn new(count: u64) -> Self {
+        Self { text: Vec::new(), last: [i64::MAX; 3], mode: None, feed: 0, count }
+    }
+
+    /// The lines of a whole track.
+    fn of<T: Iterator<Item = Move> + Clone>(track: &T) -> Result<Self, GcodeError> {
+        let mut lines = Self::new(0);
+        track.clone().try_for_each(|one| lines.push(&one))?;
+        Ok(lines)
+    }
+
     #[inline]
     fn push(&mut self, one: &Move) -> Result<(), GcodeError> {
         self.count += 1;
@@ -182,4 +213,90 @@ pub(super) fn comment(words: &str) -> String {
         _ => '?',
     };
     words.chars().map(plain).take(200).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::compensation::path::Peak;
+    use crate::geometry::Point;
+
+    /// Along x there and back, one track after the other.
+    fn tracks(count: usize) -> Vec<std::vec::IntoIter<Move>> {
+        let feed = |x: f64, y: f64| Move::Feed { at: Point::new(x, y, 0.1 * y), feed_mm_min: 600.0 };
+        let track = |k: usize| {
+            let (y, turn) = (k as f64, if k % 2 == 0 { 1.0 } else { -1.0 });
+            let moves =
+                [Move::RapidXy([-turn, y]), Move::RapidZ(1.0), feed(-turn, y), feed(turn, y), Move::RapidZ(5.0)];
+            moves.to_vec().into_iter()
+        };
+        (0..count).map(track).collect()
+    }
+
+    fn write(tracks: &[std::vec::IntoIter<Move>], points: u64) -> Result<String, GcodeError> {
+        let header = ProgramHeader {
+            part: "part".into(),
+            cycle: 1,
+            base_identity: [1; 32],
+            map_identity: [2; 32],
+            level_mm: 0.0,
+            wheel: "ball".into(),
+            tracks: "raster".into(),
+            spark_out_passes: 0,
+            simulation: true,
+            mode: PathMode::default(),
+        };
+        let summary = Summary {
+            moves: 5 * tracks.len() as u64,
+            points,
+            least_mm: [0.0; 3],
+            most_mm: [0.0; 3],
+            length_mm: 0.0,
+            rapid_mm: 0.0,
+            seconds: 0.0,
+            speed_mm_s: [Peak::default(); 3],
+            acceleration_mm_s2: Peak::default(),
+            feed_mm_min: 600.0,
+            run_up_mm: 0.0,
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("part.ngc");
+        write_program(&file, &header, &summary, tracks)?;
+        let text = std::fs::read_to_string(file).unwrap();
+        Ok(text[text.find("G54").unwrap()..].to_owned())
+    }
+
+    #[test]
+    fn every_track_says_all_of_its_beginning() {
+        let text = write(&tracks(2), 4).unwrap();
+        let lines: Vec<&str> = text.lines().skip_while(|line| !line.starts_with("G0")).collect();
+        let first = ["G0 X-1.000000Y0.000000", "Z1.000000", "G1 Z0.000000F600", "X1.000000", "G0 Z5.000000"];
+        let second = ["G0 X1.000000Y1.000000", "Z1.000000", "G1 Z0.100000F600", "X-1.000000", "G0 Z5.000000"];
+        assert_eq!(lines, [&first[..], &second, &["M2"]].concat());
+    }
+
+    #[test]
+    fn tracks_that_are_written_at_the_same_time_are_the_same_text() {
+        let many = tracks(1000);
+        let after_header = |text: String| text[text.find("G0").unwrap()..].to_owned();
+        let [at_once, one_by_one] = [2000, u64::MAX].map(|points| after_header(write(&many, points).unwrap()));
+        assert!(at_once == one_by_one && at_once.lines().count() == 5001);
+        // A few at a time, with some left over.
+        let some = after_header(write(&many, AT_ONCE * 1000 / 7).unwrap());
+        assert!(some == at_once);
+    }
+
+    #[test]
+    fn what_is_no_number_is_told_by_its_place_in_the_whole() {
+        let mut many = tracks(1000);
+        let broken = Move::Feed { at: Point::new(0.0, f64::NAN, 0.0), feed_mm_min: 600.0 };
+        many[700] = vec![Move::RapidZ(5.0), broken].into_iter();
+        for points in [2000, u64::MAX, AT_ONCE * 1000 / 7] {
+            let error = write(&many, points).unwrap_err();
+            assert!(matches!(error, GcodeError::NotFinite { axis: 'Y', number: 3502, .. }), "{error}");
+        }
+        assert!(matches!(write(&tracks(2)[..1], 1), Ok(_)));
+        let short = vec![vec![Move::RapidZ(5.0)].into_iter()];
+        assert!(matches!(write(&short, 1), Err(GcodeError::Count { found: 1, expected: 5 })));
+    }
 }
