@@ -179,7 +179,7 @@ mod tests {
         let text = serde_json::to_string(&learned()).unwrap();
         let broken = |from: &str, to: &str| {
             assert!(text.contains(from), "no {from} in {text}");
-            // Where it stands once and where it stands again: the correction and the means.
+            // Where it stands once and where it stands again: the correction and the mean.
             let all = [text.replacen(from, to, 1), text.replace(from, to)];
             all.map(|text| {
                 let error = read(&text).unwrap_err().to_string();
@@ -192,10 +192,10 @@ mod tests {
         assert!(broken("\"spacing_mm\":[1.0,1.0]", "\"spacing_mm\":[0.0,1.0]")[0].contains("0 x 1 mm apart"));
         assert!(broken("\"response\":[1.0", "\"response\":[7.0")[0].contains("cannot be"));
         assert!(broken("\"run\"", "\"ran\"")[0].contains("run"));
-        // The means have a net of their own.
+        // The mean has a net of its own.
         let at = text.rfind("\"columns\":5").unwrap();
-        let of_means = format!("{}{}", &text[..at], text[at..].replacen("\"columns\":5", "\"columns\":0", 1));
-        assert!(read(&of_means).unwrap_err().to_string().contains("cannot be"));
+        let of_mean = format!("{}{}", &text[..at], text[at..].replacen("\"columns\":5", "\"columns\":0", 1));
+        assert!(read(&of_mean).unwrap_err().to_string().contains("cannot be"));
         for text in ["", "{", &text[..text.len() / 2], "[]", "7"] {
             assert!(matches!(read(text), Err(LearnedError::Broken { .. })), "{text}");
         }
