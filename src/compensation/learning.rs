@@ -598,9 +598,9 @@ mod tests {
 
     #[test]
     fn a_better_response_counts_for_what_is_still_seen() {
-        // A part that answers with 0.8 of what is asked: the second pass leaves a fifth and tells so, of which half and then a third, with the
-        // drift a little more, is taken back by the right response: (1 - 1.02 / 2.02) / 5, and less by 0.525 / 1.525. On a net beside that
-        // of the correction, with a hole, so that what lies between nodes is lost.
+        // A part that answers with 0.8 of what is asked. By hand, in units of the error: the second pass leaves 0.2 and tells so; with a gain of
+        // 0.505 the mean is 0.901, of which 0.987 is believed beside a scatter of 0.2^2 / 2.02: 0.1105 is left. Then 0.344, 0.935, 0.9945
+        // and 0.0701. On a net beside that of the correction, with a hole, so that what lies between nodes is lost.
         let form = |[x, y]: [f64; 2]| 0.02 * (0.15 * x + 0.1).sin() * (0.12 * y).cos();
         let net = Net { columns: 38, rows: 29, first_mm: [-18.6, -14.3], spacing_mm: [1.0, 1.0] };
         let mut known = begin(GainRule::Adaptive, None);
@@ -626,8 +626,8 @@ mod tests {
             known = known.after(&Seen { correction: &correction, error: &error, answer });
             correction = correction.changed(&known);
         }
-        for (left_mm, expected) in left.windows(2).map(|w| w[1] / w[0]).zip([0.2, 0.495, 0.656]) {
-            assert!((left_mm - expected).abs() < 0.02, "{left:?}");
+        for (left_mm, expected) in left.windows(2).map(|w| w[1] / w[0]).zip([0.2, 0.5525, 0.634]) {
+            assert!((left_mm - expected).abs() < 0.01, "{left:?}");
         }
     }
 
