@@ -226,9 +226,8 @@ mod tests {
         let feed = |x: f64, y: f64| Move::Feed { at: Point::new(x, y, 0.1 * y), feed_mm_min: 600.0 };
         let track = |k: usize| {
             let (y, turn) = (k as f64, if k.is_multiple_of(2) { 1.0 } else { -1.0 });
-            let moves =
-                [Move::RapidXy([-turn, y]), Move::RapidZ(1.0), feed(-turn, y), feed(turn, y), Move::RapidZ(5.0)];
-            moves.to_vec().into_iter()
+            let (over, up) = (Move::RapidXy([-turn, y]), Move::RapidZ(5.0));
+            vec![over, Move::RapidZ(1.0), feed(-turn, y), feed(turn, y), up].into_iter()
         };
         (0..count).map(track).collect()
     }
