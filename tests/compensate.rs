@@ -3,13 +3,15 @@
 mod common {
     pub mod path;
     pub mod program;
+    pub mod rs274;
 }
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use common::path::{Step, error_mm, read};
 use common::program::run;
+use common::rs274::interpret;
 
 /// A folder with a map of the error over 60 x 40 mm and a program.
 struct Bench {
@@ -280,22 +282,8 @@ fn corrected_programs_are_read_by_the_interpreter_of_linuxcnc() {
         let bench = Bench::new(error, program);
         bench.compensate(&[]).unwrap();
         for name in ["base.ngc", "out.ngc"] {
-            let Ok(output) = interpreter(&bench.path(name)) else { return };
-            assert!(output.status.success(), "{name}: {}", String::from_utf8_lossy(&output.stderr));
+            let Some(calls) = interpret(&bench.path(name)) else { return };
+            calls.unwrap_or_else(|said| panic!("{name}: {said}"));
         }
     }
-}
-
-fn interpreter(file: &Path) -> std::io::Result<std::process::Output> {
-    let mut command = std::process::Command::new("rs274");
-    command.arg("-g").arg(file).current_dir(file.parent().unwrap()).stdin(std::process::Stdio::null());
-    let output = command.output();
-    if output.is_err() {
-        assert!(
-            std::env::var_os("REGRIND_LINUXCNC").is_none(),
-            "rs274 is not installed: apt-get install linuxcnc-uspace"
-        );
-        eprintln!("left out: rs274 is not installed (Debian package linuxcnc-uspace)");
-    }
-    output
 }

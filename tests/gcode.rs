@@ -4,59 +4,38 @@
 
 mod common {
     pub mod path;
+    pub mod rs274;
 }
 
 use std::fs;
 use std::path::Path;
-use std::process::{Command, Stdio};
 
 use common::path::{correction, part, read, wheels, with};
+use common::rs274::interpret;
 use regrind::compensation::path::{PathError, Pattern};
 use regrind::config::CellConfig;
 use regrind::formats::gcode::PathMode;
 use regrind::recipe::Recipe;
 use regrind::setup;
 
-/// Whether the interpreter is there.
-fn is_installed() -> bool {
-    let found = Command::new("rs274").arg("-h").stdin(Stdio::null()).output().is_ok();
-    if !found {
-        assert!(
-            std::env::var_os("REGRIND_LINUXCNC").is_none(),
-            "rs274 is not installed: apt-get install linuxcnc-uspace"
-        );
-        eprintln!("left out: rs274 is not installed (Debian package linuxcnc-uspace)");
-    }
-    found
-}
+/// Where a straight feed (true) or a rapid (false) ends.
+type End = ([f64; 3], bool);
 
-/// Lets the interpreter read a program; returns where its straight feeds and rapids end. It writes files into its folder.
-fn interpreted(file: &Path) -> Result<Vec<([f64; 3], bool)>, String> {
-    let folder = file.parent().unwrap();
-    let output = Command::new("rs274")
-        .args(["-g", file.to_str().unwrap()])
-        .current_dir(folder)
-        .stdin(Stdio::null())
-        .output()
-        .unwrap();
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    if !output.status.success() {
-        return Err(said);
-    }
-    let text = String::from_utf8_lossy(&output.stdout).into_owned();
-    let ends = text.lines().filter_map(|line| {
-        let (call, rest) = line.split_once("STRAIGHT_")?.1.split_once('(')?;
-        let mut numbers = rest.trim_end_matches(')').split(',').map(|n| n.trim().parse::<f64>().unwrap());
-        Some(([numbers.next()?, numbers.next()?, numbers.next()?], call == "FEED"))
-    });
-    Ok(ends.collect())
+/// Where the interpreter's moves end, or what it says against the program.
+fn interpreted(file: &Path) -> Option<Result<Vec<End>, String>> {
+    let ends = |text: String| {
+        let ends = text.lines().filter_map(|line| {
+            let (call, rest) = line.split_once("STRAIGHT_")?.1.split_once('(')?;
+            let mut numbers = rest.trim_end_matches(')').split(',').map(|n| n.trim().parse::<f64>().unwrap());
+            Some(([numbers.next()?, numbers.next()?, numbers.next()?], call == "FEED"))
+        });
+        ends.collect()
+    };
+    Some(interpret(file)?.map(ends))
 }
 
 #[test]
 fn every_program_of_every_recipe_is_read_point_by_point() {
-    if !is_installed() {
-        return;
-    }
     let folder = tempfile::tempdir().unwrap();
     for name in ["freeform-mirror", "off-axis-asphere", "shallow-wave", "biconic"] {
         let mut part = part(name);
@@ -69,8 +48,8 @@ fn every_program_of_every_recipe_is_read_point_by_point() {
                 let file = folder.path().join("part.ngc");
                 part.programs.write(&file, &correction(part.half_mm), [9; 32]).unwrap();
                 let text = fs::read_to_string(&file).unwrap();
-                let ends =
-                    interpreted(&file).unwrap_or_else(|said| panic!("{name}, {wheel_name}, {pattern:?}: {said}"));
+                let Some(ends) = interpreted(&file) else { return };
+                let ends = ends.unwrap_or_else(|said| panic!("{name}, {wheel_name}, {pattern:?}: {said}"));
                 let ours: Vec<_> = read(&text);
                 assert_eq!(ends.len(), ours.len(), "{name}, {wheel_name}, {pattern:?}");
                 for (theirs, step) in ends.iter().zip(&ours).filter(|(_, step)| !step.at[0].is_nan()) {
@@ -85,9 +64,6 @@ fn every_program_of_every_recipe_is_read_point_by_point() {
 
 #[test]
 fn every_path_mode_is_read() {
-    if !is_installed() {
-        return;
-    }
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("part.ngc");
     let mut part = part("shallow-wave");
@@ -96,7 +72,8 @@ fn every_path_mode_is_read() {
     for mode in [PathMode::default(), rounded, PathMode::ExactPath, PathMode::ExactStop] {
         part.programs.mode = mode;
         part.programs.write(&file, &correction(part.half_mm), [9; 32]).unwrap();
-        assert!(!interpreted(&file).unwrap().is_empty());
+        let Some(ends) = interpreted(&file) else { return };
+        assert!(!ends.unwrap_or_else(|said| panic!("{mode:?}: {said}")).is_empty());
     }
 }
 
@@ -111,13 +88,12 @@ fn a_part_that_is_worked_on_from_below_has_no_program() {
 
 #[test]
 fn the_interpreter_is_one_that_refuses() {
-    if !is_installed() {
-        return;
-    }
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("bad.ngc");
     fs::write(&file, "G21 G90\nG1 X1 F100\nG1 X1.5e3\nM2\n").unwrap();
-    assert!(interpreted(&file).is_err());
+    let Some(ends) = interpreted(&file) else { return };
+    let said = ends.unwrap_err();
+    assert!(said.contains("G1 X1.5e3"), "it names the line: {said}");
 }
 
 #[test]
