@@ -100,7 +100,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
                 ),
             })?;
         }
-        let journal = journal(arguments, &recipe, &cell, &actor, began, learned_from)?;
+        let left_alone = left_alone.iter().map(ToString::to_string).collect();
+        let journal = journal(arguments, &recipe, &cell, &actor, began, learned_from, left_alone)?;
         let (notices, shown) = mpsc::unbounded_channel();
         let poll = [setup::poll(&cell.cmm.link), setup::poll(&cell.grinder.link)];
         let folder = journal.folder().to_owned();
@@ -178,6 +179,7 @@ fn journal(
     actor: &Actor,
     began: jiff::Timestamp,
     learned_from: LearnedFrom,
+    left_alone: Vec<String>,
 ) -> Result<Journal, Failure> {
     let part = arguments.part.clone().unwrap_or_else(|| "unnamed".into());
     let folder = free_folder(&arguments.runs, &recipe_name(recipe), began, cell.simulated);
@@ -193,6 +195,7 @@ fn journal(
             "recipe": recipe.path(), "recipe_sha256": hex(recipe.source_sha256()),
             "cell": cell.path(), "cell_sha256": hex(cell.source_sha256()),
             "part_name": recipe.part.name, "seed": arguments.seed, "learned_from": learned_from.as_ref().map(|(learned, _)| &learned.run),
+            "left_alone": left_alone,
         }),
     };
     let mut journal = Journal::create(&folder, header).map_err(Failure::Journal)?;

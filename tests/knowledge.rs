@@ -1,0 +1,54 @@
+//! What is learned of a grinder over many drawn worlds: what comes back is found down to the scatter of the mean, and the scatter is told.
+
+use rand::rngs::StdRng;
+use rand::{RngExt, SeedableRng};
+use regrind::compensation::{Correction, ErrorMap, GainRule, Knowledge, MapOptions, Net, Seen};
+
+const NET: Net = Net { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0, 1.0] };
+const SCATTER_MM: f64 = 1e-3;
+const SEED: u64 = 20_260;
+const WORLDS: u64 = 40;
+
+/// Waves of 6 to 40 mm in all directions with phases drawn.
+fn drawn(random: &mut StdRng, rms_mm: f64) -> Vec<f64> {
+    let waves: Vec<[f64; 3]> = (0..40)
+        .map(|_| {
+            let turn = random.random_range(0.0..std::f64::consts::TAU);
+            let number = std::f64::consts::TAU / random.random_range(6.0..40.0);
+            [number * f64::cos(turn), number * f64::sin(turn), random.random_range(0.0..std::f64::consts::TAU)]
+        })
+        .collect();
+    let at = |[x, y]: [f64; 2]| waves.iter().map(|[a, b, phase]| (a * x + b * y + phase).sin()).sum::<f64>();
+    (0..NET.len()).map(|k| at(NET.place_mm(k)) * rms_mm * (2.0f64 / 40.0).sqrt()).collect()
+}
+
+fn rms(values: &[f64]) -> f64 {
+    (values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64).sqrt()
+}
+
+#[test]
+fn what_comes_back_is_found_to_the_scatter_of_the_mean() {
+    // k passes leave N / sqrt(k) of an error that stands far above N; and N itself is told.
+    let (mut left, mut told) = ([0.0; 4], 0.0);
+    for world in 0..WORLDS {
+        let mut random = StdRng::seed_from_u64(SEED + world);
+        let form = drawn(&mut random, 0.02);
+        let mut known = Knowledge::new(GainRule::Wavelength, &MapOptions::new(2.5, 1.0), [40.0, 30.0], None);
+        let mut correction = Correction::none(NET, 0.0);
+        for left in &mut left {
+            let scatter = drawn(&mut random, SCATTER_MM);
+            let sum = |k: usize| form[k] + correction.values_mm[k] + scatter[k];
+            let error = ErrorMap::known(NET, (0..NET.len()).map(sum).collect(), vec![true; NET.len()]);
+            known = known.after(&Seen { correction: &correction, error: &error, answer: None });
+            correction = correction.changed(&known);
+            let rest: Vec<f64> = form.iter().zip(&correction.values_mm).map(|(r, u)| r + u).collect();
+            *left += rms(&rest).powi(2) / WORLDS as f64;
+        }
+        told += known.scatter_mm().expect("four passes tell it") / WORLDS as f64;
+    }
+    for (k, left) in (1..).zip(left) {
+        let expected = SCATTER_MM / f64::from(k).sqrt();
+        assert!((left.sqrt() / expected - 1.0).abs() < 0.1, "{k} passes leave {:e}, seed {SEED}", left.sqrt());
+    }
+    assert!((told / SCATTER_MM - 1.0).abs() < 0.1, "{told}, seed {SEED}");
+}
