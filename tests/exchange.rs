@@ -1,8 +1,9 @@
 //! Machines that are two folders and a person: what is taken, what is left alone, and that nothing is handed over twice.
 
-use std::fs;
+use std::fs::{self, File};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, SystemTime};
 
 use regrind::device::exchange::{
     Confirmable, ExchangeMachine, ExchangeTiming, GrindOrder, Look, Mailbox, MailboxError, MeasureOrder, Standing, Step,
@@ -14,6 +15,9 @@ use regrind::device::{
 use regrind::formats::exchange::{
     CmmExchange, CmmFolders, GrinderExchange, GrinderFolders, Pattern, StationFiles, Stations,
 };
+
+/// When the next file is said to have been written.
+static WRITTEN_S: AtomicU64 = AtomicU64::new(1_700_000_000);
 
 /// Two folders of a machine.
 struct Shop {
@@ -41,8 +45,12 @@ impl Shop {
         GrinderFolders::new(GrinderExchange { part: "SN 7".into(), outbox, inbox, stable_for })
     }
 
+    /// Writes a file; every one is a second younger than the one before, however coarse the clock of the disk.
     fn put(&self, name: &str, text: &str) {
-        fs::write(self.inbox.join(name), text).unwrap();
+        let path = self.inbox.join(name);
+        fs::write(&path, text).unwrap();
+        let written = SystemTime::UNIX_EPOCH + Duration::from_secs(WRITTEN_S.fetch_add(1, Ordering::Relaxed));
+        File::options().write(true).open(&path).unwrap().set_modified(written).unwrap();
     }
 
     /// Names in the outbox.

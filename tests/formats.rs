@@ -195,18 +195,18 @@ fn sparse_files_of_a_gigabyte_are_refused_at_once() {
 
 #[test]
 fn real_tracker_exports_are_read() {
-    let Some(data) = std::env::var_os("REGRIND_DATA").map(PathBuf::from).filter(|d| d.is_dir()) else {
-        eprintln!("left out: REGRIND_DATA names no folder");
+    let data = std::env::var_os("REGRIND_DATA").map(|data| PathBuf::from(data).join("lat-freeform-mirror"));
+    let Some(data) = data.filter(|folder| folder.is_dir()) else {
+        eprintln!("left out: REGRIND_DATA names no folder with lat-freeform-mirror");
         return;
     };
-    let session = data.join("lat-freeform-mirror/20250824_M1_1");
-    let stations = (1..=7).map(|i| read_measured(session.join(format!("M1_{i}.txt"))).unwrap());
+    let stations = (1..=7).map(|i| read_measured(data.join("20250824_M1_1").join(format!("M1_{i}.txt"))).unwrap());
     let points: Vec<Point> = stations.flatten().collect();
     assert!(points.len() > 1000);
     assert_eq!(points[0], Point::new(2512.1218, 2217.6752, 2370.7970));
-    let result = read_measured(session.join("M1_Tracker_20250824_1_surface.txt")).unwrap();
+    let result = read_measured(data.join("20250824_M1_1").join("M1_Tracker_20250824_1_surface.txt")).unwrap();
     assert_eq!(result[0].x, 2_496.209_650_820_596_4);
-    assert!(read_measured(data.join("lat-freeform-mirror/20250825_M1/M1_Tracker_20250825_part2_to_hit.csv")).is_err());
+    assert!(read_measured(data.join("20250825_M1/M1_Tracker_20250825_part2_to_hit.csv")).is_err());
 }
 
 fn ply_ascii() -> Vec<u8> {

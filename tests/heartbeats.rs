@@ -159,6 +159,6 @@ async fn beats_and_orders_stay_on_time_while_451_401_points_are_computed() {
         );
         // Before that the made-up points themselves are computed between two beats, which no real machine asks for.
         assert!(pauses[1] < SILENCE_LIMIT, "{name} took its client for gone: {pauses:?}");
-        assert!(abort < Duration::from_secs(2), "{name}: {abort:?}");
+        assert!(abort < Duration::from_secs(20), "{name}: {abort:?}");
     }
 }

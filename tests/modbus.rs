@@ -21,7 +21,7 @@ use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, When};
 use regrind_sim::wire::rtu::Line;
 use regrind_sim::{registers, words};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpSocket};
 
 use toy::Toy;
 
@@ -48,6 +48,11 @@ fn settings(serving: &Serving) -> ModbusSettings {
         lost_after: Duration::from_secs(20),
         ..ModbusSettings::new(Wire::Tcp { host: "127.0.0.1".into(), port })
     }
+}
+
+/// For what must go well at the first try: no stall of the computer is taken for a silent machine.
+fn patient(settings: ModbusSettings) -> ModbusSettings {
+    ModbusSettings { request_timeout: Duration::from_secs(30), ..settings }
 }
 
 fn began(serving: &Serving) -> Vec<(u32, u32, u16)> {
@@ -147,7 +152,7 @@ async fn measure(cmm: &mut ModbusCmm, plan: &Plan, cycle: u16) -> Result<Measure
 #[tokio::test]
 async fn a_plan_is_measured_and_comes_back_to_the_last_bit() {
     let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
-    let mut cmm = ModbusCmm::new(settings(&serving)).unwrap();
+    let mut cmm = ModbusCmm::new(patient(settings(&serving))).unwrap();
     let identity = cmm.connect().await.unwrap();
     assert_eq!((identity.kind, identity.name.as_str(), identity.simulation), (MachineKind::Cmm, "Toy 1", true));
     let plan = plan(300);
@@ -256,7 +261,7 @@ async fn another_client_is_refused_and_an_abort_is_not() {
 #[tokio::test]
 async fn a_transfer_breaks_off_between_two_pages_and_leaves_nothing_in_force() {
     let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
-    let mut cmm = ModbusCmm::new(settings(&serving)).unwrap();
+    let mut cmm = ModbusCmm::new(patient(settings(&serving))).unwrap();
     cmm.connect().await.unwrap();
     cmm.claim().await.unwrap();
     let (interrupt, plan) = (Interrupt::new(), plan(20_000));
@@ -383,7 +388,10 @@ async fn a_machine_with_the_right_identity_that_does_not_answer_freshly_is_not_b
 
 #[tokio::test]
 async fn nobody_there_is_said_so() {
-    let port = TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap().port();
+    // A port that is taken and not listened on.
+    let taken = TcpSocket::new_v4().unwrap();
+    taken.bind("127.0.0.1:0".parse().unwrap()).unwrap();
+    let port = taken.local_addr().unwrap().port();
     let wire = Wire::Tcp { host: "127.0.0.1".into(), port };
     let absent = ModbusCmm::new(ModbusSettings { retries: 1, ..ModbusSettings::new(wire) }).unwrap().connect().await;
     assert!(matches!(absent, Err(DeviceError::Unreachable { .. })), "{absent:?}");
@@ -601,6 +609,7 @@ async fn two_machines_share_a_serial_line() {
     let options = MachineOptions::default;
     let units = vec![(1, toy(Kind::Cmm, AT_ONCE, options())), (2, toy(Kind::Grinder, AT_ONCE, options()))];
     let (_serving, settings) = rtu(units, Line::unpaced(115_200), Faults::none());
+    let settings = patient(settings);
     let link = Link::new(settings.wire.clone(), settings.request_timeout, settings.quarantine).unwrap();
     let mut cmm = ModbusCmm::on(link.clone(), settings.clone());
     let mut grinder = ModbusGrinder::on(link.clone(), ModbusSettings { unit: 2, ..settings });

@@ -19,7 +19,7 @@ use serde_json::Value;
 use tries::{MOMENTS, attempt_with};
 
 /// Longer than this no order may take on the busiest computer.
-const NEVER_LONGER: Duration = Duration::from_secs(2);
+const NEVER_LONGER: Duration = Duration::from_secs(20);
 const DEVICES: [&str; 2] = ["cmm", "grinder"];
 
 /// The command of docs/modbus.md that an intent leads to, if it leads to one.

@@ -542,9 +542,8 @@ async fn a_pseudo_terminal_changes_no_byte_and_outlives_its_client() {
 
 #[tokio::test]
 async fn a_serial_line_can_have_the_name_that_a_cell_file_gives_it() {
-    let folder = std::env::temp_dir().join(format!("regrind-sim-{}", std::process::id()));
-    std::fs::create_dir_all(&folder).unwrap();
-    let name = folder.join("cmm");
+    let folder = tempfile::tempdir().unwrap();
+    let name = folder.path().join("cmm");
     // A link that an older simulator left behind is replaced; a file of somebody else is not.
     std::os::unix::fs::symlink("/dev/pts/none", &name).unwrap();
     let mut serving = Serving::rtu(vec![(1, machine(Kind::Cmm))], Line::unpaced(9600), Faults::none()).unwrap();
@@ -560,7 +559,6 @@ async fn a_serial_line_can_have_the_name_that_a_cell_file_gives_it() {
     assert!(serving.link(&name).is_err());
     drop(serving);
     assert_eq!(std::fs::read_to_string(&name).unwrap(), "mine");
-    std::fs::remove_dir_all(&folder).unwrap();
 }
 
 #[tokio::test]

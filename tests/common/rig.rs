@@ -103,7 +103,12 @@ impl Rig {
         let servings = [serve(1, cmm).await.unwrap(), serve(2, grinder).await.unwrap()];
         let port = |k: usize| format!("port = {}", servings[k].local_addr().unwrap().port());
         let text = changed("config/modbus-tcp.toml", &[("port = 15021", &port(0)), ("port = 15022", &port(1))]);
-        let cell = CellConfig::parse(Path::new("cell.toml"), &text).unwrap_or_else(|p| panic!("{p:?}"));
+        let mut cell = CellConfig::parse(Path::new("cell.toml"), &text).unwrap_or_else(|p| panic!("{p:?}"));
+        for link in [&mut cell.cmm.link, &mut cell.grinder.link] {
+            // No stall of the computer is taken for a machine that is gone.
+            link.timing.request_timeout = Duration::from_secs(5);
+            link.timing.lost_after = Duration::from_secs(60);
+        }
         let rig = Self {
             world,
             servings,

@@ -287,8 +287,9 @@ def serve(machine):
     arguments.add_argument("--port", type=int, default=0)
     arguments.add_argument("--unit", type=int, default=1)
     arguments.add_argument("--part", type=pathlib.Path, help="file that stands for the part (part.py)")
+    arguments.add_argument("--seconds", type=float, default=machine.seconds, help="how long a job takes")
     given = arguments.parse_args()
-    machine.part = given.part
+    machine.part, machine.seconds = given.part, given.seconds
 
     async def main():
         registers = SimData(0, values=[0] * 578, datatype=DataType.REGISTERS)
