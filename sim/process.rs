@@ -359,8 +359,11 @@ fn displaced(state: &State, map: &Map, x: f64, y: f64) -> f64 {
         Mirrored::None => (x, y),
         Mirrored::X => (-x, y),
         Mirrored::Y => (x, -y),
+        Mirrored::HalfTurn => (-x, -y),
+        Mirrored::QuarterTurn => (-y, x),
     };
-    let u = if faults.map_ignored { 0.0 } else { map.at(x, y) };
+    let times = if faults.map_doubled { 2.0 } else { 1.0 };
+    let u = if faults.map_ignored { 0.0 } else { times * map.at(x, y) };
     if faults.map_sign_flipped { -u } else { u }
 }
 

@@ -52,7 +52,7 @@ impl Default for WorldSpec {
     }
 }
 
-/// About which axis the grinder turns a map over.
+/// How the grinder turns a map over or round.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Mirrored {
@@ -63,6 +63,10 @@ pub enum Mirrored {
     X,
     /// y for -y.
     Y,
+    /// By half a turn.
+    HalfTurn,
+    /// By a quarter of a turn: -y for x, and x for y.
+    QuarterTurn,
 }
 
 /// What is broken, for tests.
@@ -73,6 +77,8 @@ pub struct Faults {
     pub map_sign_flipped: bool,
     /// The grinder turns the map over.
     pub map_mirrored: Mirrored,
+    /// The grinder displaces by the map twice over.
+    pub map_doubled: bool,
     /// The grinder grinds as if the map were zero.
     pub map_ignored: bool,
     /// The CMM reports contact points (centre less stated radius along the target's normal).

@@ -123,6 +123,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         setting: setting(recipe, cell, &part_identity, targets.len()),
         targets,
         limits: CorrectionLimits {
+            largest_depth_mm: cell.grinder.limits.largest_depth_mm,
             least_depth_mm: recipe.compensation.least_depth_mm,
             depth_of_cut_mm: recipe.compensation.depth_of_cut_mm,
             largest_correction_mm: recipe.compensation.largest_correction_mm,
@@ -414,6 +415,7 @@ fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
             robust_pv: recipe.acceptance.pv_of == PvOf::MostPoints,
         },
         stall_share: 0.02,
+        stall_mm: recipe.cycle.stall_mm,
         on_stall: disposal(recipe.cycle.on_stall),
         on_divergence: disposal(recipe.cycle.on_divergence),
         on_refusal: Disposal::Stop,

@@ -13,6 +13,7 @@ fn plan() -> CellPlan {
         max_cycles: 4,
         tolerance: Tolerance { pv_mm: 0.007, rms_mm: 0.001, with_uncertainty: true, robust_pv: false },
         stall_share: 0.02,
+        stall_mm: 0.0,
         on_stall: Disposal::Stop,
         on_divergence: Disposal::Hold,
         on_refusal: Disposal::Hold,
@@ -271,6 +272,25 @@ fn every_judgement_has_its_end() {
         assert!(!run.alarms().is_empty(), "sequence {i} raises an alarm");
         assert!(state != State::Stopped || matches!(run.ending(), Some(Ending::NotAccepted { .. })));
     }
+}
+
+#[test]
+fn a_gain_below_what_the_recipe_calls_one_is_none() {
+    // From 6.0 to 5.5 um is 8 %, and half a micrometre.
+    let judged = |stall_um: f64, forecast_um: Option<f64>| {
+        let forecast = forecast_um.map(|um| Forecast { rms_mm: 1e-3 * um, sigma_mm: 1e-5, floor_mm: None });
+        let mut run = Run::new(CellPlan { stall_mm: 1e-3 * stall_um, ..plan() }, move |k| match k {
+            1 => figures(30.0, 6.0),
+            _ => Figures { forecast, ..figures(30.0, 5.5) },
+        });
+        run.start().go_on();
+        run.verdicts()[1]
+    };
+    assert_eq!(judged(0.0, None), Verdict::Continue);
+    assert_eq!(judged(0.45, None), Verdict::Continue);
+    assert_eq!(judged(0.55, None), Verdict::Stalled);
+    assert_eq!(judged(0.45, Some(5.0)), Verdict::Continue, "half a micrometre is expected of the next pass too");
+    assert_eq!(judged(0.45, Some(5.1)), Verdict::Stalled);
 }
 
 #[test]

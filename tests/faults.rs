@@ -81,6 +81,20 @@ fn a_mirrored_y_is_told_at_the_first_pass_with_a_map() {
 }
 
 #[test]
+fn a_turned_map_is_told_at_the_first_pass_with_a_map() {
+    for map_mirrored in [Mirrored::HalfTurn, Mirrored::QuarterTurn] {
+        let faults = Faults { map_mirrored, ..Faults::default() };
+        caught(broken(faults), AlarmId::Mirrored, &["turned map", "how the part is turned"], 2);
+    }
+}
+
+#[test]
+fn a_map_that_is_applied_twice_is_told_at_the_first_pass_with_one() {
+    let faults = Faults { map_doubled: true, ..Faults::default() };
+    caught(broken(faults), AlarmId::Doubled, &["two times", "in one place only"], 2);
+}
+
+#[test]
 fn a_map_that_is_ignored_is_told_at_the_first_pass_with_one() {
     let faults = Faults { map_ignored: true, ..Faults::default() };
     caught(broken(faults), AlarmId::NoEffect, &["did not answer to the map"], 2);

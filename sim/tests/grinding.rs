@@ -87,19 +87,25 @@ fn a_share_of_what_stood_proud_stays_and_spark_out_takes_it_again() {
 #[test]
 fn a_map_displaces_the_surface_by_what_it_says() {
     let slope = |x: f64, y: f64| 1e-4 * x + 2e-4 * y;
-    let cases = [
-        (Faults::default(), 1.0, 1.0, 1.0),
-        (Faults { map_sign_flipped: true, ..Faults::default() }, -1.0, 1.0, 1.0),
-        (Faults { map_mirrored: Mirrored::X, ..Faults::default() }, 1.0, -1.0, 1.0),
-        (Faults { map_mirrored: Mirrored::Y, ..Faults::default() }, 1.0, 1.0, -1.0),
-        (Faults { map_ignored: true, ..Faults::default() }, 0.0, 1.0, 1.0),
+    let mirrored = |map_mirrored| Faults { map_mirrored, ..Faults::default() };
+    type Case = (Faults, f64, fn([f64; 2]) -> [f64; 2]);
+    let cases: [Case; 8] = [
+        (Faults::default(), 1.0, |at| at),
+        (Faults { map_sign_flipped: true, ..Faults::default() }, -1.0, |at| at),
+        (mirrored(Mirrored::X), 1.0, |[x, y]| [-x, y]),
+        (mirrored(Mirrored::Y), 1.0, |[x, y]| [x, -y]),
+        (mirrored(Mirrored::HalfTurn), 1.0, |[x, y]| [-x, -y]),
+        (mirrored(Mirrored::QuarterTurn), 1.0, |[x, y]| [-y, x]),
+        (Faults { map_doubled: true, ..Faults::default() }, 2.0, |at| at),
+        (Faults { map_ignored: true, ..Faults::default() }, 0.0, |at| at),
     ];
-    for (faults, sign, mx, my) in cases {
+    for (faults, times, turned) in cases {
         let world = world(WorldSpec { faults: faults.clone(), ..small_perfect() });
         // The net reaches beyond the overtravel, so that nothing is held at its edge.
-        grind(&mut world.grinder(), 1, 0, &map_of([18.0, 13.0], 1.0, slope), &deep(0.1));
-        for ([x, y], h) in places().iter().zip(world.deviations_mm(&places())) {
-            let wanted = 0.1 + sign * slope(mx * x, my * y);
+        grind(&mut world.grinder(), 1, 0, &map_of([18.0, 18.0], 1.0, slope), &deep(0.1));
+        for (&[x, y], h) in places().iter().zip(world.deviations_mm(&places())) {
+            let [at_x, at_y] = turned([x, y]);
+            let wanted = 0.1 + times * slope(at_x, at_y);
             assert!((h - wanted).abs() < 1e-14, "{faults:?} at ({x}, {y}): {h}, wanted {wanted}");
         }
     }

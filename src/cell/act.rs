@@ -877,6 +877,7 @@ fn response_alarm(response: Response) -> AlarmId {
     match response {
         Response::SignFlipped => AlarmId::SignFlipped,
         Response::Mirrored => AlarmId::Mirrored,
+        Response::Doubled => AlarmId::Doubled,
         Response::NoEffect | Response::Expected | Response::Unclear => AlarmId::NoEffect,
     }
 }

@@ -235,9 +235,15 @@ catalogue! {
     }
     /// Axis.
     Mirrored {
-        "The part answered as to a mirrored map", "Another pass would make it worse; the cell is held.", ProcessEngineer,
+        "The part answered as to a mirrored or turned map", "Another pass would make it worse; the cell is held.", ProcessEngineer,
         ["Check the direction of x and y at the grinder, and how the part is turned in its fixture.",
          "Do not resume before a test pass on a scrap part has shown the right direction.", "Stop the run."]
+    }
+    /// Applied twice.
+    Doubled {
+        "The part answered to the map as if it had been applied twice", "Another pass would swing to the other side; the cell is held.", ProcessEngineer,
+        ["See whether the map is in the program and in the controller's table as well, or was added to the one before: it is absolute.",
+         "Do not resume before it is applied in one place only.", "Stop the run."]
     }
     /// No effect.
     NoEffect {

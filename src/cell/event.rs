@@ -471,10 +471,12 @@ pub enum Response {
     Unclear,
     /// The other way round: the sign of the map is wrong.
     SignFlipped,
-    /// As to a mirrored map: an axis points the other way.
+    /// As to a mirrored or turned map: an axis points another way.
     Mirrored,
     /// Not at all.
     NoEffect,
+    /// Twice: the map was applied two times.
+    Doubled,
 }
 
 /// What the next map will do.

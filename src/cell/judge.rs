@@ -87,7 +87,12 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
             return tell(Verdict::Diverging, format!("worse than the cycle before: {figures}; {was}"));
         }
         if has_stalled(plan, before, now) {
-            let least = format!("less than the measuring uncertainty or {:.0} %", 100.0 * plan.stall_share);
+            let least = match plan.stall_mm {
+                0.0 => format!("less than the measuring uncertainty or {:.0} %", 100.0 * plan.stall_share),
+                least => {
+                    format!("less than the measuring uncertainty, {:.0} % or {}", 100.0 * plan.stall_share, um(least))
+                }
+            };
             return tell(Verdict::Stalled, format!("improved by {least}: {figures}; {was}"));
         }
     }
@@ -105,7 +110,7 @@ fn go_on(plan: &CellPlan, before: Option<&Figures>, now: &Figures, conformity: C
     let (expected, sigma) = (um(forecast.rms_mm), um(forecast.sigma_mm));
     let floor = forecast.floor_mm.map_or(String::new(), |floor| format!(", no pass can go below {}", um(floor)));
     let expected = format!("RMS {expected} ± {sigma} is expected of another pass{floor}");
-    if forecast.rms_mm < (1.0 - plan.stall_share) * now.rms_mm {
+    if now.rms_mm - forecast.rms_mm > plan.stall_mm.max(plan.stall_share * now.rms_mm) {
         return tell(Verdict::Continue, format!("{so_far}: {figures}; {expected}"));
     }
     let verdict = if undecided { Verdict::Undecided } else { Verdict::Stalled };
@@ -126,9 +131,9 @@ fn judged_pv(plan: &CellPlan, figures: &Figures) -> f64 {
 }
 
 fn has_stalled(plan: &CellPlan, before: &Figures, now: &Figures) -> bool {
-    let still = |was: f64, is: f64, uncertainty: f64| was - is < uncertainty.max(plan.stall_share * was);
+    let still = |was: f64, is: f64, least: f64| was - is < least.max(plan.stall_share * was);
     still(judged_pv(plan, before), judged_pv(plan, now), now.pv_expanded_mm)
-        && still(before.rms_mm, now.rms_mm, now.rms_expanded_mm)
+        && still(before.rms_mm, now.rms_mm, now.rms_expanded_mm.max(plan.stall_mm))
 }
 
 /// Says what a wrong response means.
@@ -136,8 +141,9 @@ fn wrong(response: Response) -> Option<&'static str> {
     match response {
         Response::Expected | Response::Unclear => None,
         Response::SignFlipped => Some("the part answered to the map the other way round: its sign is wrong"),
-        Response::Mirrored => Some("the part answered as to a mirrored map: an axis points the other way"),
+        Response::Mirrored => Some("the part answered as to a mirrored or turned map: an axis points another way"),
         Response::NoEffect => Some("the part did not answer to the map"),
+        Response::Doubled => Some("the part answered to the map twice: it was applied two times"),
     }
 }
 

@@ -15,6 +15,9 @@ pub struct CellPlan {
     pub tolerance: Tolerance,
     /// Improvement, as a share of the cycle before, below which the run is taken as stalled.
     pub stall_share: f64,
+    /// Improvement of the rms below which the run is taken as stalled, whatever share that is.
+    #[serde(default)]
+    pub stall_mm: f64,
     /// What to do when it stalls.
     pub on_stall: Disposal,
     /// What to do when it has diverged twice.

@@ -85,6 +85,7 @@ fn plan(disposal: Disposal) -> CellPlan {
         max_cycles: 3,
         tolerance: Tolerance { pv_mm: 0.010, rms_mm: 0.002, with_uncertainty: false, robust_pv: false },
         stall_share: 0.05,
+        stall_mm: 0.0,
         on_stall: disposal,
         on_divergence: disposal,
         on_refusal: disposal,
@@ -228,7 +229,9 @@ fn sample_figures() -> Vec<Figures> {
         Figures { removed_mm: Some(2.0), ..plain.clone() },
         Figures { pv_mm: f64::NAN, ..plain.clone() },
     ];
-    for response in [Response::Expected, Response::SignFlipped, Response::Mirrored, Response::NoEffect] {
+    for response in
+        [Response::Expected, Response::SignFlipped, Response::Mirrored, Response::NoEffect, Response::Doubled]
+    {
         all.push(Figures { response: Some(response), ..plain.clone() });
     }
     all

@@ -569,7 +569,9 @@ mod tests {
         let form = map(|[x, y]| 1e-3 * (0.2 * x + 0.1 * y).sin());
         let first = after(&begin(GainRule::Wavelength, None), &none(), &form);
         let asked = none().changed(&first);
-        for sense in [Sense::NoEffect, Sense::Flipped, Sense::MirroredX, Sense::MirroredY, Sense::Turned] {
+        for sense in
+            [Sense::NoEffect, Sense::Flipped, Sense::MirroredX, Sense::MirroredY, Sense::Turned, Sense::Doubled]
+        {
             let answer = Response { slope: 0.0, correlation: 0.0, asked_mm: 1e-3, unexplained_mm: 1e-3, sense };
             let twice = first.after(&Seen { correction: &asked, error: &form, answer: Some(answer) });
             assert_eq!((twice.wanted_mm(), twice.passes()), (Some(&asked.values_mm[..]), 1), "{sense:?}");

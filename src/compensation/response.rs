@@ -1,8 +1,8 @@
 //! Did the part answer as it was asked to?
 //!
 //! The change of the error from one pass to the next is compared with the change of the correction. The slope of the one over the
-//! other is 1 where everything is right, -1 where a sign is wrong, near 0 where the correction was not applied or was
-//! applied somewhere else; in the latter case it fits better once it is mirrored or turned. A map that is nearly symmetric
+//! other is 1 where everything is right, -1 where a sign is wrong, 2 where the correction was applied twice, near 0 where it was not applied or
+//! was applied somewhere else; in the latter case it fits better once it is mirrored or turned. A map that is nearly symmetric
 //! makes the part better even when it is mirrored, so the way that leaves least unexplained is asked for, not the sign of the slope alone.
 //!
 //! Whatever of a change looks like a motion of the part is taken away by the next registration, and is never seen. It is taken out
@@ -26,8 +26,10 @@ pub enum Sense {
     MirroredX,
     /// As if y ran the other way.
     MirroredY,
-    /// As if the map had been turned by half a turn.
+    /// As if the map had been turned by half a turn, or by a quarter.
     Turned,
+    /// As commanded, but far more: as if the map had been applied twice.
+    Doubled,
     /// Not at all.
     NoEffect,
     /// The change that was asked for is too small beside the scatter to tell.
@@ -53,6 +55,8 @@ pub struct Response {
 const CLEARLY_BETTER: f64 = 0.5;
 /// Share of the answer that may stay unexplained before another way than the straight one is thought of.
 const WELL_EXPLAINED: f64 = 0.05;
+/// Slope above which an answer is nearer to twice what was asked for than to the once of a stiff machine.
+const TWICE: f64 = 1.6;
 
 /// Compares the change of the error with the change of the correction.
 ///
@@ -85,6 +89,8 @@ pub fn response(
         (Sense::MirroredX, fit(|[x, y], [cx, _]| [cx - x, y])),
         (Sense::MirroredY, fit(|[x, y], [_, cy]| [x, cy - y])),
         (Sense::Turned, fit(|[x, y], [cx, cy]| [cx - x, cy - y])),
+        (Sense::Turned, fit(|[x, y], [cx, cy]| [(cx - cy) / 2.0 + y, (cx + cy) / 2.0 - x])),
+        (Sense::Turned, fit(|[x, y], [cx, cy]| [(cx + cy) / 2.0 - y, (cy - cx) / 2.0 + x])),
     ];
     Response {
         slope: straight.slope,
@@ -99,12 +105,14 @@ fn sense(straight: &Fit, mirrored: &[(Sense, Fit)], scatter_mm: f64) -> Sense {
     if straight.asked_rms < 2.0 * scatter_mm || straight.asked_rms == 0.0 {
         return Sense::Unclear;
     }
-    let best =
-        mirrored.iter().max_by(|a, b| a.1.correlation.total_cmp(&b.1.correlation)).expect("three ways are tried");
+    let best = mirrored.iter().max_by(|a, b| a.1.correlation.total_cmp(&b.1.correlation)).expect("five ways are tried");
     let left = [straight, &best.1].map(|fit| 1.0 - fit.correlation * fit.correlation.abs());
     let better = left[0] > WELL_EXPLAINED && left[1] < CLEARLY_BETTER * left[0];
     if better && best.1.correlation > 0.8 && best.1.slope > 0.5 {
         return best.0;
+    }
+    if straight.slope > TWICE && straight.correlation > 0.5 {
+        return Sense::Doubled;
     }
     if straight.slope > 0.4 && straight.correlation > 0.5 {
         return Sense::AsCommanded;
@@ -208,6 +216,10 @@ mod tests {
         assert_eq!(answered(|x, y| -error(-x, y)).sense, Sense::MirroredX);
         assert_eq!(answered(|x, y| -error(x, -y)).sense, Sense::MirroredY);
         assert_eq!(answered(|x, y| -error(-x, -y)).sense, Sense::Turned);
+        assert_eq!(answered(|x, y| -error(y, -x)).sense, Sense::Turned);
+        assert_eq!(answered(|x, y| -error(-y, x)).sense, Sense::Turned);
+        assert_eq!(answered(|x, y| -2.0 * error(x, y)).sense, Sense::Doubled);
+        assert_eq!(answered(|x, y| -1.2 * error(x, y)).sense, Sense::AsCommanded);
         assert_eq!(answered(|_, _| 0.0).sense, Sense::NoEffect);
     }
 

@@ -249,10 +249,13 @@ pub(super) struct CompensationTable {
     /// The correction is nowhere larger than this.
     #[schemars(range(min = 0.01, max = 10000.0), extend("x-required" = true), example = 60.0)]
     pub largest_correction_um: Option<f64>,
-    /// The most that may be taken off anywhere, over all passes.
+    /// The most that may be taken off anywhere below the surface of the first pass, over all passes; it is allowance and what may go below the
+    /// nominal surface together.
     #[schemars(range(min = 0.01, max = 100000.0), extend("x-required" = true), example = 300.0)]
     pub removal_budget_um: Option<f64>,
-    /// The most that one pass may take off anywhere.
+    /// How much deeper each pass goes than the one before; it goes deeper than that where the part is so low that the wheel would else cut
+    /// air there, and locally by as much as the part stands proud. The most that the machine may take off is grinder.limits.largest_depth_mm
+    /// of the cell.
     #[schemars(range(min = 0.01, max = 10000.0), extend("x-required" = true), example = 60.0)]
     pub depth_of_cut_um: Option<f64>,
     /// Distance of the nodes of the map.
@@ -399,7 +402,7 @@ pub(super) struct CycleTable {
     pub on_stall: OnTrouble,
     /// What to do when a cycle makes it worse.
     pub on_divergence: OnTrouble,
-    /// An rms that falls by less than this brings next to nothing.
+    /// A cycle whose rms falls by less than this, or is expected to, brings next to nothing; so does one whose rms falls by less than 2 %.
     #[schemars(range(min = 0.0, max = 10000.0))]
     pub stall_um: f64,
 }
@@ -494,7 +497,7 @@ impl Default for CycleTable {
             most_cycles: 5,
             on_stall: OnTrouble::Stop,
             on_divergence: OnTrouble::Hold,
-            stall_um: 0.1,
+            stall_um: 0.0,
         }
     }
 }
