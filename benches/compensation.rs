@@ -115,6 +115,7 @@ fn correction(bencher: Bencher, spacing_mm: f64) {
         largest_correction_mm: 0.1,
         allowance_mm: 0.06,
         removal_budget_mm: 1.0,
+        largest_depth_mm: 1.0,
     };
     bencher.bench(|| now.next(&error, &black_box(&known).after(&seen), &limits).expect("a correction"));
 }

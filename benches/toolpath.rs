@@ -99,6 +99,7 @@ fn write(path: &ToolPath, summary: &Summary, file: &Path) {
         cycle: 2,
         base_identity: [1; 32],
         map_identity: [2; 32],
+        uncorrected: false,
         level_mm: 0.02,
         wheel: path.options().wheel.words(),
         tracks: String::new(),
@@ -128,6 +129,7 @@ fn from_deviations_to_a_program(bencher: Bencher) {
         largest_correction_mm: 0.1,
         allowance_mm: 0.06,
         removal_budget_mm: 1.0,
+        largest_depth_mm: 1.0,
     };
     let begin = Knowledge::new(GainRule::Wavelength, &options, [100.0, 60.0], None);
     bencher.bench(|| {

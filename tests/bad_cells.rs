@@ -172,10 +172,10 @@ fn a_file_stands_where_a_serial_device_should_be_linked() {
 fn machines_that_are_not_there() {
     let home = tempfile::tempdir().unwrap();
     let recipe = recipe(home.path(), 1e4);
-    let free = {
-        let listener = std::net::TcpListener::bind(("127.0.0.1", 0)).unwrap();
-        listener.local_addr().unwrap().port().to_string()
-    };
+    // A port that is taken and not listened on.
+    let taken = tokio::net::TcpSocket::new_v4().unwrap();
+    taken.bind("127.0.0.1:0".parse().unwrap()).unwrap();
+    let free = taken.local_addr().unwrap().port().to_string();
     let nobody = changed("config/modbus-tcp.toml", &[("15021", &free), ("15022", &free)]);
     let nowhere = nobody
         .replace("host = \"127.0.0.1\"", "host = \"no-such-host.invalid\"")
@@ -212,6 +212,13 @@ fn a_recipe_for_another_cell() {
             "most_mm = [500.0, 500.0, 400.0]",
             "most_mm = [20.0, 500.0, 400.0]",
             "travel",
+        ),
+        (
+            "travel-of-the-grinder",
+            "config/modbus-tcp.toml",
+            "[grinder.limits]",
+            "[grinder.travel]\nleast_mm = [-10.0, -500.0, -400.0]\nmost_mm = [10.0, 500.0, 400.0]\n\n[grinder.limits]",
+            "beyond the travel of -10 to 10 mm",
         ),
     ];
     for (name, file, from, to, named) in cells {

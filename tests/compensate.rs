@@ -12,6 +12,11 @@ use std::path::PathBuf;
 use common::path::{Step, error_mm, read};
 use common::program::run;
 use common::rs274::interpret;
+use regrind::compensation::{Correction, ErrorMap, Net};
+use regrind::formats::{CorrectionIdentities, ErrorMapOrigin, write_correction, write_error_map};
+
+const NET: Net = Net { columns: 121, rows: 81, first_mm: [-30.0, -20.0], spacing_mm: [0.5, 0.5] };
+const PART: [u8; 32] = [0xab; 32];
 
 /// A folder with a map of the error over 60 x 40 mm and a program.
 struct Bench {
@@ -21,16 +26,23 @@ struct Bench {
 impl Bench {
     fn new(error: impl Fn(f64, f64) -> f64, program: &str) -> Self {
         let bench = Self { folder: tempfile::tempdir().unwrap() };
-        let mut map = format!("# SIMULATION\n# part: sha256 {}\nx_mm,y_mm,error_mm,valid\n", "ab".repeat(32));
-        for j in 0..=80 {
-            for i in 0..=120 {
-                let (x, y) = (f64::from(i) * 0.5 - 30.0, f64::from(j) * 0.5 - 20.0);
-                map += &format!("{x},{y},{},1\n", error(x, y));
-            }
-        }
-        fs::write(bench.path("map.csv"), map).unwrap();
+        bench.save_error(error, None);
         fs::write(bench.path("base.ngc"), program).unwrap();
         bench
+    }
+
+    /// Writes the map as a run does it.
+    fn save_error(&self, error: impl Fn(f64, f64) -> f64, ground_with: Option<[u8; 32]>) {
+        let values_mm = (0..NET.len()).map(|k| NET.place_mm(k)).map(|[x, y]| error(x, y)).collect();
+        let map = ErrorMap::known(NET, values_mm, vec![true; NET.len()]);
+        let origin = ErrorMapOrigin { part: PART, cycle: 1, ground_with };
+        write_error_map(&self.path("map.csv"), &map, &origin, true).unwrap();
+    }
+
+    /// Writes a correction as a run does it, which has this map's identity.
+    fn save_correction(&self, map: [u8; 32]) {
+        let identities = CorrectionIdentities { part: PART, map, replaces: [1; 32] };
+        write_correction(&self.path("map.csv"), &Correction::none(NET, 0.02), &identities, true).unwrap();
     }
 
     fn path(&self, name: &str) -> PathBuf {
@@ -200,6 +212,33 @@ fn a_map_is_applied_once_and_only_to_its_part() {
 }
 
 #[test]
+fn a_map_goes_only_onto_the_program_that_it_was_made_for() {
+    let program = |comments: &str| format!("{comments}G21 G90\nG0 X-20 Y0 Z5\nG1 Z0 F100\nG1 X20\nM2\n");
+    let (one, other) = ("01".repeat(32), "02".repeat(32));
+    let has = |map: &str| format!("(part: sha256 {})\n(map: sha256 {map})\n", "ab".repeat(32));
+    let bench = Bench::new(|_, _| 0.001, &program(""));
+    let after = |comments: &str| {
+        fs::write(bench.path("base.ngc"), program(comments)).unwrap();
+        bench.compensate(&[]).map(|_| ())
+    };
+    // An error that was measured after a pass with a correction belongs on the program with that correction.
+    bench.save_error(|_, _| 0.001, Some([1; 32]));
+    after(&has(&one)).unwrap();
+    for comments in [has(&other), String::new(), has(&one) + "(map: 0 everywhere)\n"] {
+        let said = after(&comments).unwrap_err();
+        assert!(said.contains("another correction than the program has"), "{said}");
+    }
+    // A correction is absolute: it does not come on top of another.
+    bench.save_correction([3; 32]);
+    after("").unwrap();
+    after(&(has(&other) + "(map: 0 everywhere)\n")).unwrap();
+    let said = after(&has(&other)).unwrap_err();
+    assert!(said.contains("absolute") && said.contains("regrind plan --program"), "{said}");
+    let said = after(&has(&"03".repeat(32))).unwrap_err();
+    assert!(said.contains("already applied"), "{said}");
+}
+
+#[test]
 fn maps_that_are_none_are_refused() {
     let bench = Bench::new(error_mm, "G21 G90\nG0 X0 Y0 Z1\nG1 X5 F100\nM2\n");
     let whole = fs::read_to_string(bench.path("map.csv")).unwrap();
@@ -208,7 +247,7 @@ fn maps_that_are_none_are_refused() {
     };
     for (text, words) in [
         (String::new(), "empty"),
-        (without(2), "columns"),
+        (without(whole.lines().position(|line| line.starts_with("x_mm")).unwrap()), "columns"),
         (without(50), "no whole grid"),
         (whole.replace("0.5,0.5,", "0.5,0.5,x"), "no node"),
         (whole.replace("0.5,0.5,", "0.5,0.5,NaN;"), "no node"),

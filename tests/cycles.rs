@@ -212,6 +212,9 @@ fn every_recipe_ends_accepted() {
         let rows = ran.rows();
         println!("{recipe}\n{}", ran.told());
         assert!(ran.accepted(), "{recipe}\n{}", ran.told());
+        for file in ["correction.csv", "toolpath.ngc", "toolpath_z.csv"] {
+            assert!(ran.folder.join("cycle-1").join(file).is_file(), "{recipe}: no {file}");
+        }
         for row in &rows {
             assert_eq!(ran.world.grinds_begun(JOB, row.cycle as u16), 1, "{recipe}, cycle {}", row.cycle);
         }

@@ -3,7 +3,7 @@
 use std::f64::consts::TAU;
 
 use regrind::form::{
-    Basis, Figures, Fit, FormError, FormOptions, Removed, Sample, figures, fit, fit_most, iso_10110, labelled,
+    Basis, Figures, Fit, FormError, FormOptions, Removed, Sample, TakenOut, figures, fit, fit_most, iso_10110, labelled,
 };
 use regrind::geometry::Aperture;
 use regrind::surface::analytic::ZernikeNumbering;
@@ -183,10 +183,11 @@ fn what_is_removed_is_gone_and_recorded() {
         found.pv_mm
     );
     assert!(of(vec![Piston, Tilt, Power, Astigmatism]).pv_mm < 1e-11);
-    let rows = labelled(&found);
+    let taken_out = TakenOut { motion: "rigid motion but x (registration)".into(), filter: "waves below 3 mm".into() };
+    let rows = labelled(&found, &taken_out);
     assert!(rows.iter().all(|row| !row.removed.is_empty() && !row.direction.is_empty() && !row.cut_off.is_empty()));
     let pv = rows.iter().find(|row| row.name == "PV").unwrap();
-    assert_eq!((pv.unit, pv.removed.as_str()), ("um", "rigid motion (registration), piston, tilt, power"));
+    assert_eq!((pv.unit, pv.removed.as_str()), ("um", "rigid motion but x (registration), piston, tilt, power"));
     assert!(is_about(pv.value, 1e3 * found.pv_mm, 1e-9));
 }
 

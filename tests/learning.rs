@@ -74,7 +74,18 @@ fn a_part_begins_with_what_the_one_before_it_told() {
     assert!(said.contains(&format!("begins with what {name} found")), "{said}");
     let [before, after] = [&first, &second].map(|run| first_rms_mm(run));
     assert!(after < 0.5 * before, "the first pass left {before} mm, and that of the next part {after} mm");
-    // The record holds what it began with.
+    // The record holds what it began with, and what the first pass was ground by.
+    let recorded = |run: &Path| {
+        let export = Command::new(env!("CARGO_BIN_EXE_regrind")).args(["audit", "export"]).arg(run).output().unwrap();
+        String::from_utf8(export.stdout).unwrap()
+    };
+    for name in ["correction.csv", "toolpath.ngc", "toolpath_z.csv"] {
+        for (run, cycle, there) in [(&first, 0, false), (&first, 1, true), (&second, 0, true)] {
+            let name = format!("cycle-{cycle}/{name}");
+            assert_eq!(run.join(&name).is_file(), there, "{name} of {run:?}");
+            assert_eq!(recorded(run).contains(&name), there, "{name} in the record of {run:?}");
+        }
+    }
     assert_eq!(fs::read(first.join("learned.json")).unwrap(), fs::read(second.join("learned_from.json")).unwrap());
     let audited = Command::new(env!("CARGO_BIN_EXE_regrind")).args(["audit", "verify"]).arg(&second).output().unwrap();
     assert!(audited.status.success(), "{}", told(&audited));

@@ -7,8 +7,9 @@ mod common {
 }
 
 use common::path::{Part, Step, correction, part, read, truth, wheels, with};
-use regrind::compensation::path::{Pattern, TrackSpacing, Wheel};
+use regrind::compensation::path::{PathOptions, Pattern, TrackSpacing, Wheel};
 
+const PARTS: [&str; 4] = ["freeform-mirror", "off-axis-asphere", "shallow-wave", "biconic"];
 /// What a touching place may be off, in millimetres.
 const WITHIN_MM: f64 = 2e-4;
 
@@ -85,7 +86,7 @@ fn places(part: &Part, track_mm: f64, beside: f64) -> Vec<[f64; 2]> {
 
 #[test]
 fn every_wheel_leaves_the_corrected_surface_on_its_tracks() {
-    for name in ["freeform-mirror", "off-axis-asphere", "shallow-wave", "biconic"] {
+    for name in PARTS {
         let mut part = part(name);
         let plain = part.programs.options;
         for (wheel_name, wheel) in wheels(0.8) {
@@ -101,27 +102,29 @@ fn every_wheel_leaves_the_corrected_surface_on_its_tracks() {
 
 #[test]
 fn between_tracks_the_ridges_are_as_high_as_stated_and_nothing_is_cut_deeper() {
-    let mut part = part("freeform-mirror");
     let height_mm = 1e-2;
-    for (wheel_name, wheel) in wheels(0.8) {
-        part.programs.options.wheel = wheel;
+    for (name, (wheel_name, wheel)) in
+        PARTS.into_iter().flat_map(|name| wheels(0.8).into_iter().map(move |w| (name, w)))
+    {
+        let mut part = part(name);
+        part.programs.options = with(&part.programs.options, wheel, 4.0);
         part.programs.options.spacing = TrackSpacing::Scallop { height_mm, widest_mm: 20.0 };
         let (steps, track_mm) = program(&part);
         let mut highest = f64::NEG_INFINITY;
         for beside in [0.1, 0.3, 0.5] {
             for place in places(&part, track_mm, beside) {
                 let off = clearance(&wheel, &steps, truth(&part, 0.02, place));
-                assert!(off > -WITHIN_MM, "{wheel_name}: {:.3} um too deep at {place:?}", -1e3 * off);
+                assert!(off > -WITHIN_MM, "{name}, {wheel_name}: {:.3} um too deep at {place:?}", -1e3 * off);
                 // The formula takes the ridge for a parabola; the next order is a few percent of it here.
                 assert!(
                     off < 1.05 * height_mm + WITHIN_MM,
-                    "{wheel_name}: a ridge of {:.3} um at {place:?}",
+                    "{name}, {wheel_name}: a ridge of {:.3} um at {place:?}",
                     1e3 * off
                 );
                 highest = highest.max(off);
             }
         }
-        assert!(highest > 0.3 * height_mm, "{wheel_name}: {highest}");
+        assert!(highest > 0.3 * height_mm, "{name}, {wheel_name}: {highest}");
     }
 }
 
@@ -138,6 +141,25 @@ fn a_spiral_leaves_ridges_within_its_distance_everywhere() {
         let (r, angle) = (29.9 * (k as f64 / 200.0).sqrt(), 2.4 * k as f64);
         let off = clearance(&wheel, &steps, truth(&part, 0.02, [r * angle.cos(), r * angle.sin()]));
         assert!(off > -WITHIN_MM && off < most + WITHIN_MM, "{:.3} um at {r} {angle}", 1e3 * off);
+    }
+}
+
+#[test]
+fn no_spiral_cuts_deeper_anywhere() {
+    for name in PARTS {
+        let mut part = part(name);
+        let plain = part.programs.options;
+        for (wheel_name, wheel) in wheels(0.8) {
+            part.programs.options = PathOptions { pattern: Pattern::Spiral, ..with(&plain, wheel, 3.0) };
+            let (steps, _) = program(&part);
+            let [a, b] = part.half_mm;
+            for k in 0..150 {
+                let (r, angle) = ((k as f64 / 150.0).sqrt(), 2.4 * k as f64);
+                let place = [a * r * angle.cos(), b * r * angle.sin()];
+                let off = clearance(&wheel, &steps, truth(&part, 0.02, place));
+                assert!(off > -WITHIN_MM, "{name}, {wheel_name}: {:.3} um too deep at {place:?}", -1e3 * off);
+            }
+        }
     }
 }
 

@@ -21,7 +21,7 @@ pub(super) struct Arguments {
     /// Program to be corrected, in the dialect of LinuxCNC
     #[arg(long, value_name = "FILE")]
     program: PathBuf,
-    /// error_map.csv, whose error is taken off, or correction.csv, which is added
+    /// error_map.csv, whose error is taken off, or correction.csv, which is put on a program without a correction
     #[arg(long, value_name = "FILE")]
     map: PathBuf,
     /// Share of the map that is applied
@@ -57,8 +57,10 @@ is the same all along it, else it becomes chords. Rapid moves (G0) and moves in 
 are. Refused, with their line: variables, O-words, canned cycles, cutter compensation, G92 and other moved zeros, inverse
 time, rotary axes, a change of the work coordinates on the way. Comments are kept, line numbers are not.
 
-The new program names the hash of the old one and of the map. A program that names the map already is refused, and so is a map
-that names another part.
+The new program names the hash of the old one and of the map. Refused are a program that names the map already, a map of another
+part, an error that was measured after a pass with another correction than the program has in it, and a correction.csv, which is
+absolute, for a program that has a correction already. The program goes no deeper by it: where the map raises the tool it
+cuts air, unless its zero is set lower.
 
 Exit codes: 0 written; 2 bad arguments or data; 3 fault.";
 
@@ -86,6 +88,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         tolerance_mm: 1e-3 * arguments.tolerance_um,
         map_identity: map.identity,
         part: map.part,
+        base: map.base,
         gain: arguments.gain,
         simulation: map.simulation,
     };

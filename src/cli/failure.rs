@@ -29,6 +29,8 @@ pub(super) enum Failure {
     Program(regrind::formats::gcode::GcodeError),
     #[error(transparent)]
     Programs(regrind::drive::ProgramError),
+    #[error("{recipe} in the cell of {cell}: {source}")]
+    FirstPath { recipe: PathBuf, cell: PathBuf, source: regrind::compensation::path::PathError },
     #[error("{path}: {source}")]
     Path { path: PathBuf, source: regrind::compensation::path::PathError },
     #[error("{path}: {source}")]

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use regrind::compensation::path::{PathError, Summary, ToolPath};
+use regrind::compensation::path::{Summary, ToolPath};
 use regrind::config::CellConfig;
 use regrind::drive::Task;
 use regrind::recipe::Recipe;
@@ -21,7 +21,7 @@ use super::words::{counted, three_digits};
 Example:
   regrind plan recipes/freeform-mirror.toml
 
-Exit codes: 0 everything is within its limits; 2 bad recipe or cell; 3 fault.")]
+Exit codes: 0 everything is within its limits; 2 bad recipe or cell, or something is beyond its limits; 3 fault.")]
 pub(super) struct Arguments {
     /// Recipe of the part
     #[arg(value_name = "RECIPE")]
@@ -67,12 +67,17 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let recipe = or_show(Recipe::read(&arguments.recipe))?;
     let cell = or_show(CellConfig::read(&arguments.cell))?;
     let (task, plan) = setup::prepare(&recipe, &cell).map_err(Failure::Setup)?;
-    let program = program(arguments, &task)?;
+    let program = first_path(&task, &recipe, &cell)?;
+    if let Some(file) = &arguments.program {
+        let first = task.first_correction();
+        let programs = task.programs.as_ref().map_err(|error| Failure::Programs(error.clone().into()))?;
+        programs.write(file, &first, task.map_identity(&first)).map_err(Failure::Programs)?;
+    }
     let [width, depth] = [task.pass.x_mm, task.pass.y_mm].map(|[low, high]| high - low);
     // Without a program the tracks over the box around the part are the best there is.
     let (tracks, pass_mm) = match &program {
-        Ok((path, summary)) => (path.tracks() as f64, summary.length_mm),
-        Err(_) => {
+        Some((path, summary)) => (path.tracks() as f64, summary.length_mm),
+        None => {
             let tracks = (depth / task.pass.track_spacing_mm).floor() + 1.0;
             (tracks, tracks * width)
         }
@@ -96,8 +101,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         tracks: tracks as u64,
         path_mm,
         grinding_minutes: path_mm / task.pass.feed_mm_min,
-        program_points: program.as_ref().ok().map(|(_, summary)| summary.points),
-        no_program: program.as_ref().err().map(ToString::to_string),
+        program_points: program.as_ref().map(|(_, summary)| summary.points),
+        no_program: task.programs.as_ref().err().map(ToString::to_string),
         learns: recipe.compensation.learn,
     };
     if arguments.json {
@@ -108,15 +113,14 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Lays the path of the first pass, and writes its program where one is asked for.
-fn program(arguments: &Arguments, task: &Task) -> Result<Result<(ToolPath, Summary), PathError>, Failure> {
-    let first = task.first_correction();
-    let laid = task.programs.as_ref().map_err(Clone::clone).and_then(|programs| programs.path(&first));
-    if let Some(file) = &arguments.program {
-        let programs = task.programs.as_ref().map_err(|error| Failure::Programs(error.clone().into()))?;
-        programs.write(file, &first, task.map_identity(&first)).map_err(Failure::Programs)?;
-    }
-    Ok(laid)
+/// Lays the path of the first pass and checks it; none where only the grinder's controller can lay one.
+pub(super) fn first_path(
+    task: &Task,
+    recipe: &Recipe,
+    cell: &CellConfig,
+) -> Result<Option<(ToolPath, Summary)>, Failure> {
+    let (recipe, cell) = (recipe.path().to_owned(), cell.path().to_owned());
+    task.first_path().map_err(|source| Failure::FirstPath { recipe, cell, source })
 }
 
 fn words(d: &Document) -> String {
@@ -133,7 +137,7 @@ fn words(d: &Document) -> String {
     };
     format!(
         "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nprogram     {program}\n{learns}\
-         level       {} um over the nominal surface first, {} um deeper each pass, {} um at the least\nbudget      {} um in all\ncycles      at most {}\n",
+         level       {} um over the nominal surface first, at least {} um deeper each pass, so {} um at the last\nbudget      {} um in all\ncycles      at most {}\n",
         d.part,
         counted(d.nominal_points, "point"),
         d.part_identity,

@@ -7,7 +7,7 @@ use clap::Args;
 use regrind::cell::{Actor, Ending};
 use regrind::config::{CellConfig, Link};
 use regrind::document::Problems;
-use regrind::drive::{Drive, Orders, Request, Run};
+use regrind::drive::{Drive, Orders, Request, Run, Task};
 use regrind::formats::{LEARNED, Learned, LearnedError};
 use regrind::journal::{Header, Journal};
 use regrind::recipe::Recipe;
@@ -17,7 +17,7 @@ use tokio::sync::mpsc;
 
 use super::failure::Failure;
 use super::show::Show;
-use super::{Outcome, check, simulated};
+use super::{Outcome, check, plan, simulated};
 
 /// Run correction cycles from a recipe until the part is accepted
 #[derive(Args, Debug)]
@@ -72,6 +72,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         let run = learned.run.clone();
         task.begin_with(learned.clone()).map_err(|source| Failure::TooMuchLearned { run, source })?;
     }
+    // What the first pass would be ground along is checked before anything opens; the paths of the others when their maps are made.
+    plan::first_path(&task, &recipe, &cell)?;
     let spec = match within(&cell) {
         true => Some(simulated::world_spec(&recipe, arguments.seed)?),
         false => None,
@@ -101,7 +103,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             })?;
         }
         let left_alone = left_alone.iter().map(ToString::to_string).collect();
-        let journal = journal(arguments, &recipe, &cell, &actor, began, learned_from, left_alone)?;
+        let mut journal = journal(arguments, &recipe, &cell, &actor, began, learned_from, left_alone)?;
+        if task.learned.is_some() {
+            record_first_correction(&task, &mut journal)?;
+        }
         let (notices, shown) = mpsc::unbounded_channel();
         let poll = [setup::poll(&cell.cmm.link), setup::poll(&cell.grinder.link)];
         let folder = journal.folder().to_owned();
@@ -205,6 +210,15 @@ fn journal(
         journal.store("learned_from.json", &text, 0, 0).map_err(Failure::Journal)?;
     }
     Ok(journal)
+}
+
+/// Records the correction of a first pass that begins with what was learned, and its program: as if a cycle before the first had made it.
+fn record_first_correction(task: &Task, journal: &mut Journal) -> Result<(), Failure> {
+    let folder = journal.folder().join("cycle-0");
+    for name in task.save_first(&folder).map_err(Failure::Programs)? {
+        journal.adopt(&format!("cycle-0/{name}"), 0, 0).map_err(Failure::Journal)?;
+    }
+    Ok(())
 }
 
 fn recipe_name(recipe: &Recipe) -> String {

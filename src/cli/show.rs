@@ -94,15 +94,18 @@ impl Show {
             }
             Notice::Figures { cycle, figures } => self.figures(*cycle, figures),
             Notice::Judged(Judgement { cycle, reason, .. }) => self.line(&format!("cycle {cycle}: {reason}")),
-            Notice::Compensated { cycle, summary } => self.line(&format!(
-                "cycle {cycle}: next pass corrects up to {} um, {} um deep, {} % in air, gain {}; PV {}, RMS {} um expected",
-                three_digits(1e3 * summary.largest_mm),
-                three_digits(1e3 * summary.depth_mm),
-                three_digits(100.0 * summary.air_share),
-                gains(&summary.gains),
-                three_digits(1e3 * summary.predicted_pv_mm),
-                three_digits(1e3 * summary.predicted_rms_mm)
-            )),
+            Notice::Compensated { cycle, summary } => {
+                self.line(&format!(
+                    "cycle {cycle}: next pass corrects up to {} um, {} um deep, {} % in air, gain {}; PV {}, RMS {} um expected",
+                    three_digits(1e3 * summary.largest_mm),
+                    three_digits(1e3 * summary.depth_mm),
+                    three_digits(100.0 * summary.air_share),
+                    gains(&summary.gains),
+                    three_digits(1e3 * summary.predicted_pv_mm),
+                    three_digits(1e3 * summary.predicted_rms_mm)
+                ))?;
+                summary.warnings.iter().try_for_each(|warning| self.line(&format!("cycle {cycle}: {warning}")))
+            }
             Notice::Alarm(alarm) => self.alarm(alarm),
             Notice::AlarmGone { .. } => Ok(()),
             Notice::Refused { why } => self.line(&format!("not done: {why}")),

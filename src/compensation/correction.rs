@@ -33,6 +33,8 @@ pub struct CorrectionLimits {
     pub allowance_mm: f64,
     /// All that may be removed below the surface of the first pass, in millimetres.
     pub removal_budget_mm: f64,
+    /// The most that the machine may take off in one pass anywhere, in millimetres.
+    pub largest_depth_mm: f64,
 }
 
 /// A correction and what it will do.
@@ -70,12 +72,23 @@ pub enum StepError {
         removed_um = 1e3 * removed_mm, budget_um = 1e3 * budget_mm
     )]
     BudgetAtOnce { removed_mm: f64, budget_mm: f64 },
+    #[error(
+        "the next pass would take {found_um:.2} um off where it takes off most, more than the {limit_um:.2} um of grinder.limits.largest_depth_mm; \
+         lower the error by another way, or raise the limit if the machine allows it",
+        found_um = 1e3 * found_mm, limit_um = 1e3 * limit_mm
+    )]
+    TooDeep { found_mm: f64, limit_mm: f64 },
 }
 
 impl Correction {
     /// The first pass of a part: nothing is known yet.
     pub fn none(net: Net, level_mm: f64) -> Self {
         Self { net, values_mm: vec![0.0; net.len()], cycle: 1, level_mm }
+    }
+
+    /// Returns whether it is 0 everywhere.
+    pub fn is_none(&self) -> bool {
+        self.values_mm.iter().all(|value| *value == 0.0)
     }
 
     /// Returns the correction at a place, in millimetres.
@@ -118,7 +131,7 @@ impl Correction {
     /// Frames: x and y of the model frame. Units: millimetres.
     ///
     /// # Errors
-    /// A correction above its limit, and a removal above the budget.
+    /// A correction above its limit, a pass deeper than the machine may cut, and a removal above the budget.
     pub fn next(&self, error: &ErrorMap, known: &Knowledge, limits: &CorrectionLimits) -> Result<Step, StepError> {
         let values_mm = self.changed(known).values_mm;
         let on_net: Vec<f64> = values_mm.iter().zip(&self.values_mm).map(|(next, now)| next - now).collect();
@@ -127,6 +140,11 @@ impl Correction {
         let (response, scatter_mm) = (known.response()[0], known.scatter_mm().unwrap_or(0.0));
         let rise_mm = on_net.iter().map(|change| response * change).fold(0.0, f64::max);
         let depth_mm = limits.depth_of_cut_mm.max(rise_mm + 2.0 * scatter_mm + limits.least_depth_mm);
+        let fall_mm = on_net.iter().map(|change| response * change).fold(0.0, f64::min);
+        let (found_mm, limit_mm) = (depth_mm - fall_mm, limits.largest_depth_mm);
+        if found_mm > limit_mm {
+            return Err(StepError::TooDeep { found_mm, limit_mm });
+        }
         let correction = Self { net: self.net, values_mm, cycle: self.cycle + 1, level_mm: self.level_mm - depth_mm };
         let removed_mm = correction.removed_mm(limits)?;
         let depths_mm =
@@ -161,6 +179,7 @@ mod tests {
         largest_correction_mm: 0.05,
         allowance_mm: 0.06,
         removal_budget_mm: 0.06,
+        largest_depth_mm: 0.062,
     };
 
     fn map(values_mm: [f64; 4]) -> ErrorMap {
@@ -200,6 +219,10 @@ mod tests {
     fn limits_are_kept() {
         let far = next(&first(), &map([0.0, 0.051, 0.0, 0.0]), 1.0);
         assert!(matches!(far, Err(StepError::TooLarge { x_mm: 1.0, y_mm: 0.0, .. })), "{far:?}");
+        // 49 um where it stands proud, and 13.5 um everywhere.
+        let deep = next(&first(), &map([0.049, -0.013, 0.0, 0.0]), 1.0);
+        let Err(StepError::TooDeep { found_mm, limit_mm: 0.062 }) = deep else { panic!("{deep:?}") };
+        assert!((found_mm - 0.0625).abs() < 1e-12, "{found_mm}");
         let mut correction = first();
         for _ in 0..6 {
             correction = next(&correction, &map([0.0; 4]), 1.0).unwrap().correction;

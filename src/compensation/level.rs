@@ -36,7 +36,7 @@ pub(super) fn level_off(
 /// Returns for every node the nearest one that is known, itself where it is; at least one must be.
 ///
 /// Two sweeps over the net, down and up, hand on from neighbour to neighbour where the nearest known node is (Danielsson 1980).
-fn nearest_known(net: &Net, known: &[bool]) -> Vec<usize> {
+pub(super) fn nearest_known(net: &Net, known: &[bool]) -> Vec<usize> {
     const NONE: usize = usize::MAX;
     let (columns, rows) = (net.columns, net.rows);
     let mut nearest: Vec<usize> = (0..net.len()).map(|k| if known[k] { k } else { NONE }).collect();

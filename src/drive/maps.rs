@@ -4,10 +4,12 @@ use std::path::Path;
 
 use serde_json::json;
 
-use super::work::Task;
-use crate::compensation::{self, Contact, ErrorMap, ParameterOptions};
-use crate::form::{FormOptions, Sample, figures, slope};
-use crate::formats::{FormatError, write_error_map, write_error_map_x3p, write_figures, write_json_atomic};
+use super::work::{Cycle, Task};
+use crate::compensation::{self, Contact, ErrorMap, ParameterOptions, Smoothing};
+use crate::form::{FormOptions, Sample, TakenOut, figures, slope};
+use crate::formats::{
+    ErrorMapOrigin, FormatError, write_error_map, write_error_map_x3p, write_figures, write_json_atomic,
+};
 use crate::registration::{PointStatus, Registration};
 use crate::report::{HeatMap, ReportError, save_coloured_ply};
 
@@ -31,8 +33,25 @@ pub(super) fn save_figures(
         let size = [map.net.columns, map.net.rows];
         slope(size, map.net.spacing_mm, &map.values_mm, &map.valid, INTEGRATION * cutoff_mm)
     });
-    let slopes = slopes.as_ref().map(|slope| (slope.as_ref(), cutoff_mm));
-    write_figures(&folder.join("figures.json"), made.as_ref(), slopes, task.simulation)
+    let slopes = slopes.as_ref().map(Result::as_ref);
+    write_figures(&folder.join("figures.json"), made.as_ref(), slopes, &taken_out(task), task.simulation)
+}
+
+/// What registration and filter take out, in words.
+fn taken_out(task: &Task) -> TakenOut {
+    let names = ["x", "y", "z", "rx", "ry", "rz"].into_iter().zip(task.registration.locked);
+    let held: Vec<&str> = names.filter(|(_, held)| *held).map(|(name, _)| name).collect();
+    let motion = match held.len() {
+        0 => "rigid motion (registration)".to_owned(),
+        6 => "nothing (every direction is held)".to_owned(),
+        _ => format!("rigid motion but {} (registration)", held.join(", ")),
+    };
+    let smoothing = match task.map.smoothing {
+        Smoothing::Gaussian => "Gaussian, ISO 16610-61",
+        Smoothing::RobustGaussian => "robust Gaussian, ISO 16610-71",
+        Smoothing::Spline => "smoothing B-splines",
+    };
+    TakenOut { motion, filter: format!("waves below {} mm ({smoothing})", task.map.cutoff_mm) }
 }
 
 /// Says what of the deviations the machine's parameters explain: the wheel's radius and setting, its wear. What is offered is better
@@ -62,9 +81,17 @@ pub(super) fn parameters(task: &Task, folder: &Path, found: &Registration) -> Re
 }
 
 /// Writes the map of a cycle's error and the points that it was made from.
-pub(super) fn save(task: &Task, folder: &Path, map: &ErrorMap, found: &Registration) -> Result<(), String> {
+pub(super) fn save(
+    task: &Task,
+    folder: &Path,
+    (number, cycle): (u32, &Cycle),
+    map: &ErrorMap,
+    found: &Registration,
+) -> Result<(), String> {
+    let ground_with = (!cycle.correction.is_none()).then(|| task.map_identity(&cycle.correction));
+    let origin = ErrorMapOrigin { part: task.part_identity, cycle: number, ground_with };
     let date = jiff::Timestamp::now().strftime("%Y-%m-%dT%H:%M:%SZ").to_string();
-    write_error_map(&folder.join("error_map.csv"), map, task.simulation)
+    write_error_map(&folder.join("error_map.csv"), map, &origin, task.simulation)
         .and_then(|()| write_error_map_x3p(&folder.join("error_map.x3p"), map, &date, task.simulation))
         .map_err(|error| error.to_string())?;
     save_pictures(task, folder, map).and_then(|()| save_points(task, folder, found)).map_err(|error| error.to_string())

@@ -131,7 +131,7 @@ pub struct Drive {
 /// What a computation brought.
 enum Computed {
     Registered(u32, Event, Option<Box<work::Found>>),
-    Compensated(u32, Event, Option<Correction>),
+    Compensated(u32, Event, Option<work::Next>),
     Gated(u32, Event, Option<Points>),
     /// The files of one of these are on the disk and read.
     Filed(u32, Event, Result<Vec<Artefact>, RecordFailure>),
@@ -410,12 +410,12 @@ impl Drive {
                 (number, event, &files[..count])
             }
             Computed::Filed(number, event, files) => return self.filed(number, event, files).await,
-            Computed::Compensated(number, event, correction) => {
-                let any = correction.is_some();
-                if let Some(correction) = correction {
-                    self.cycles.insert(number + 1, new_cycle(correction));
+            Computed::Compensated(number, event, next) => {
+                let files = next.as_ref().map_or(&[][..], |next| next.files);
+                if let Some(next) = next {
+                    self.cycles.insert(number + 1, new_cycle(next.correction));
                 }
-                (number, event, if any { &["correction.csv"] } else { &[] })
+                (number, event, files)
             }
         };
         let names: Vec<String> = files.iter().map(|name| format!("cycle-{number}/{name}")).collect();

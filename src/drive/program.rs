@@ -12,6 +12,8 @@ use crate::formats::gcode::{GcodeError, PathMode, ProgramHeader, write_axis_tabl
 use crate::geometry::Aperture;
 use crate::surface::Nominal;
 
+/// What a pass leaves beside its correction.
+pub(super) const PROGRAM_FILES: [&str; 2] = ["toolpath.ngc", "toolpath_z.csv"];
 /// More points than that are not written beside every correction of a run.
 const MOST_POINTS: u64 = 3_000_000;
 
@@ -84,19 +86,25 @@ impl Programs {
         Ok(summary)
     }
 
-    /// Writes the program of a pass beside its correction, unless it is too long for that.
+    /// Writes `toolpath.ngc` and `toolpath_z.csv` of a pass into a folder; returns how many of the two, and why not both: a program that is
+    /// too long to be kept, a table that reaches where the wheel cannot.
     pub(super) fn keep(
         &self,
-        file: &Path,
+        folder: &Path,
         correction: &Correction,
         map_identity: [u8; 32],
-    ) -> Result<(), ProgramError> {
+    ) -> Result<(usize, Option<String>), ProgramError> {
         let (path, summary) = self.path(correction)?;
         if summary.points > MOST_POINTS {
-            return Err(ProgramError::TooLong { points: summary.points });
+            let error = ProgramError::TooLong { points: summary.points };
+            return Ok((0, Some(format!("there is no {}: {error}", PROGRAM_FILES[0]))));
         }
-        self.write_path(file, correction, map_identity, &path, &summary)?;
-        self.keep_table(&file.with_file_name("toolpath_z.csv"), correction, map_identity, &path)
+        self.write_path(&folder.join(PROGRAM_FILES[0]), correction, map_identity, &path, &summary)?;
+        match self.keep_table(&folder.join(PROGRAM_FILES[1]), correction, map_identity, &path) {
+            Ok(()) => Ok((2, None)),
+            Err(ProgramError::Path(error)) => Ok((1, Some(format!("there is no {}: {error}", PROGRAM_FILES[1])))),
+            Err(error) => Err(error),
+        }
     }
 
     /// Writes the correction as an offset of Z over the axes, for controllers that compensate by a table.
@@ -127,6 +135,7 @@ impl Programs {
             cycle: correction.cycle,
             base_identity: self.part_identity,
             map_identity,
+            uncorrected: correction.is_none(),
             level_mm: correction.level_mm,
             wheel: self.options.wheel.words(),
             tracks: tracks_in_words(path),

@@ -7,14 +7,15 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::cell::{CompensationRefusal, CompensationSummary, Event, Figures, Forecast, Gate, GateFailure, Response};
-use crate::compensation::path::PathError;
+use crate::compensation::path::{PathError, Summary, ToolPath};
 use crate::compensation::{
     self, Correction, CorrectionLimits, ErrorMap, GainRule, Knowledge, MapOptions, Net, Reading, Seen, Sense,
     StepError, error_map, response,
 };
 use crate::device::{Coordinates, CorrectionMap, Identified, Measurement, Pass, Plan, PointStatus, Target, TargetKind};
+use crate::formats::gcode::GcodeError;
 use crate::formats::{
-    CorrectionIdentities, FormatError, Learned, NominalInput, RegistrationDocument, save_registration,
+    CorrectionIdentities, FormatError, Learned, NominalInput, RegistrationDocument, ResultFolder, save_registration,
     write_correction, write_points,
 };
 use crate::geometry::{Point, Pose, Vector};
@@ -26,7 +27,7 @@ use crate::registration::{
 use crate::surface::{Nominal, Side};
 
 use super::maps;
-use super::program::Programs;
+use super::program::{PROGRAM_FILES, ProgramError, Programs};
 
 /// Everything that does not change during a run.
 #[derive(Debug)]
@@ -152,8 +153,27 @@ impl Task {
         within.map(|_| ())
     }
 
+    /// Writes correction and program of a first pass that begins with what was learned; returns the names of the files.
+    ///
+    /// # Errors
+    /// Those of [`Task::first_path`], and files that cannot be written.
+    pub fn save_first(&self, folder: &Path) -> Result<&'static [&'static str], ProgramError> {
+        ResultFolder::prepare(folder).map_err(GcodeError::from)?.keep();
+        let (first, none) = (self.first_correction(), self.uncorrected());
+        save_correction(self, folder, &first, &none).map_err(GcodeError::from)?;
+        Ok(save_program(self, folder, &first)?.files)
+    }
+
     /// Returns the correction of the first pass: none, or what an earlier part left.
     pub fn first_correction(&self) -> Correction {
+        let none = self.uncorrected();
+        match &self.learned {
+            Some(learned) => learned.first_correction(none),
+            None => none,
+        }
+    }
+
+    fn uncorrected(&self) -> Correction {
         let corners = [[self.pass.x_mm[0], self.pass.y_mm[0]], [self.pass.x_mm[1], self.pass.y_mm[1]]];
         let net = Net::over(corners.into_iter(), self.map.spacing_mm).unwrap_or(Net {
             columns: 2,
@@ -161,10 +181,18 @@ impl Task {
             first_mm: corners[0],
             spacing_mm: [corners[1][0] - corners[0][0], corners[1][1] - corners[0][1]],
         });
-        let none = Correction::none(net, self.limits.allowance_mm);
-        match &self.learned {
-            Some(learned) => learned.first_correction(none),
-            None => none,
+        Correction::none(net, self.limits.allowance_mm)
+    }
+
+    /// Lays the path of the first pass; `None` where only the grinder's controller can, and `programs` says why.
+    ///
+    /// # Errors
+    /// A surface that the wheel cannot grind, and limits of the grinder that the path goes beyond.
+    pub fn first_path(&self) -> Result<Option<(ToolPath, Summary)>, PathError> {
+        match &self.programs {
+            Ok(programs) => programs.path(&self.first_correction()).map(Some),
+            Err(error) if error.is_ours() => Ok(None),
+            Err(error) => Err(error.clone()),
         }
     }
 
@@ -354,7 +382,7 @@ pub(super) fn register_cycle(
         Err(error) => return failed(error.to_string()),
     };
     // Every measurement leaves its map, whatever becomes of the correction.
-    if let Some(Err(why)) = error.as_ref().map(|map| maps::save(task, folder, map, &found)) {
+    if let Some(Err(why)) = error.as_ref().map(|map| maps::save(task, folder, (number, cycle), map, &found)) {
         return failed(why);
     }
     let answer = error.as_ref().and_then(|error| answer(before?, cycle, &found, error));
@@ -452,12 +480,13 @@ fn in_words_of_the_cell(sense: Sense) -> Response {
         Sense::Flipped => Response::SignFlipped,
         Sense::MirroredX | Sense::MirroredY | Sense::Turned => Response::Mirrored,
         Sense::NoEffect => Response::NoEffect,
+        Sense::Doubled => Response::Doubled,
         Sense::Unclear => Response::Unclear,
     }
 }
 
 /// Makes the correction of the next pass and writes it.
-pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &Cycle) -> (Event, Option<Correction>) {
+pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &Cycle) -> (Event, Option<Next>) {
     let refused = |why| (Event::CompensationRefused { cycle: number, why }, None);
     let Some(found) = &cycle.registration else {
         return refused(CompensationRefusal::Failed("the measurement of this cycle is not registered".into()));
@@ -488,7 +517,10 @@ pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &
     if let Err(error) = save_correction(task, folder, &step.correction, &cycle.correction) {
         return refused(CompensationRefusal::Failed(error.to_string()));
     }
-    let warnings: Vec<String> = save_program(task, folder, &step.correction).into_iter().collect();
+    let Kept { files, warning } = match save_program(task, folder, &step.correction) {
+        Ok(kept) => kept,
+        Err(error) => return refused(CompensationRefusal::Failed(format!("the next pass cannot be ground: {error}"))),
+    };
     let largest_mm = step.correction.values_mm.iter().fold(0.0f64, |most, v| most.max(v.abs()));
     let ratio = found.verdict.pv_mm / found.verdict.rms_mm.max(f64::MIN_POSITIVE);
     let forecast = known.forecast(&map);
@@ -500,9 +532,24 @@ pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &
         air_share: step.air_share,
         gains: known.gains(),
         response: known.response()[0],
-        warnings,
+        warnings: warning.into_iter().collect(),
     };
-    (Event::Compensated { cycle: number, summary }, Some(step.correction))
+    (Event::Compensated { cycle: number, summary }, Some(Next { correction: step.correction, files }))
+}
+
+/// The correction of the next pass, and which files it left.
+pub(super) struct Next {
+    pub(super) correction: Correction,
+    pub(super) files: &'static [&'static str],
+}
+
+/// What a correction leaves in the folder of its cycle, the table for controllers last.
+const FILES: [&str; 3] = ["correction.csv", PROGRAM_FILES[0], PROGRAM_FILES[1]];
+
+/// What was written of a correction and its program, and why that is not all.
+struct Kept {
+    files: &'static [&'static str],
+    warning: Option<String>,
 }
 
 fn save_correction(task: &Task, folder: &Path, correction: &Correction, base: &Correction) -> Result<(), FormatError> {
@@ -511,20 +558,23 @@ fn save_correction(task: &Task, folder: &Path, correction: &Correction, base: &C
     write_correction(&folder.join("correction.csv"), correction, &identities, task.simulation)
 }
 
-/// Writes the program of the next pass; returns why there is none, which is no reason not to grind: the grinder gets the map.
-fn save_program(task: &Task, folder: &Path, correction: &Correction) -> Option<String> {
-    let identity = task.map_identity(correction);
-    let kept = match &task.programs {
-        Ok(programs) => programs.keep(&folder.join("toolpath.ngc"), correction, identity).map_err(|e| e.to_string()),
-        Err(error) => Err(error.to_string()),
+/// Writes the program of the next pass, if there is one: a pass without it can be ground all the same, as the grinder gets the map.
+///
+/// # Errors
+/// A surface that the wheel cannot grind, limits of the grinder that the path goes beyond, files that cannot be written.
+fn save_program(task: &Task, folder: &Path, correction: &Correction) -> Result<Kept, ProgramError> {
+    let (programs, warning) = match &task.programs {
+        Ok(programs) => programs.keep(folder, correction, task.map_identity(correction))?,
+        Err(error) if error.is_ours() => (0, Some(format!("there is no {}: {error}", PROGRAM_FILES[0]))),
+        Err(error) => return Err(error.clone().into()),
     };
-    kept.err().map(|why| format!("there is no toolpath.ngc: {why}"))
+    Ok(Kept { files: &FILES[..1 + programs], warning })
 }
 
 /// What the next part of this kind can begin with; none where this run did not get so far.
 pub(super) fn learned(task: &Task, run: String, cycle: &Cycle) -> Option<Learned> {
     let known = cycle.known.as_deref()?;
-    let wrong = [Response::SignFlipped, Response::Mirrored, Response::NoEffect];
+    let wrong = [Response::SignFlipped, Response::Mirrored, Response::NoEffect, Response::Doubled];
     if cycle.figures.as_ref()?.response.is_some_and(|response| wrong.contains(&response)) {
         return None;
     }

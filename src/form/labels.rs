@@ -6,7 +6,7 @@ use super::figures::{Figures, Removed};
 use super::slope::Slope;
 
 /// The direction of all figures.
-const DIRECTION: &str = "along the outward normal of the nominal surface, positive where material stands proud";
+pub const DIRECTION: &str = "along the outward normal of the nominal surface, positive where material stands proud";
 
 /// A figure with everything that one must know of it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -29,14 +29,33 @@ pub struct Labelled {
     pub at_mm: Option<[f64; 2]>,
 }
 
+/// What was taken out of the deviations before any figure was made of them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TakenOut {
+    /// The motions that the registration took out, in words.
+    pub motion: String,
+    /// What the filter of the map took out, in words.
+    pub filter: String,
+}
+
+impl TakenOut {
+    /// Returns what was removed, with forms beside the motion.
+    pub fn removed(&self, forms: &[Removed]) -> String {
+        let words = std::iter::once(self.motion.as_str()).chain(forms.iter().map(|form| form.word()));
+        words.collect::<Vec<_>>().join(", ")
+    }
+}
+
+/// The cut-off of figures that are made of the points.
+pub const EVERY_POINT: &str = "none: every point used";
+
 /// Returns the figures of points with their labels, in the order of a report.
 ///
 /// Units: micrometres; coverage in per cent.
-pub fn labelled(figures: &Figures) -> Vec<Labelled> {
+pub fn labelled(figures: &Figures, taken_out: &TakenOut) -> Vec<Labelled> {
     let Figures { pvr, highest, lowest, coverage, .. } = figures;
-    let um = |name, mm: f64, made: &str| {
-        row(name, 1e3 * mm, "um", &removed(&figures.removed), "none: every point used", made)
-    };
+    let removed = taken_out.removed(&figures.removed);
+    let um = |name, mm: f64, made: &str| row(name, 1e3 * mm, "um", &removed, EVERY_POINT, made);
     let of_fit = format!(
         "PV of {} {} terms, {:.4} um, and 3 times the rms of the rest, {:.4} um",
         pvr.terms,
@@ -53,18 +72,17 @@ pub fn labelled(figures: &Figures) -> Vec<Labelled> {
         um("mean", figures.mean_mm, ""),
         Labelled { at_mm: Some(highest.at_mm), ..um("highest (stock left)", highest.value_mm, "") },
         Labelled { at_mm: Some(lowest.at_mm), ..um("lowest (undercut)", lowest.value_mm, "") },
-        row("coverage", 100.0 * coverage.share, "%", "nothing", "none: every point used", &cells),
+        row("coverage", 100.0 * coverage.share, "%", "nothing", EVERY_POINT, &cells),
     ]
 }
 
 /// Returns the slopes of a map with their labels.
 ///
-/// Units: microradians. `cutoff_mm` is the wavelength at which the map's filter passes one half.
-pub fn labelled_slope(slope: &Slope, cutoff_mm: f64) -> Vec<Labelled> {
+/// Units: microradians.
+pub fn labelled_slope(slope: &Slope, taken_out: &TakenOut) -> Vec<Labelled> {
     let [x, y] = slope.integration_mm;
     let made = format!("from the map, over {x:.3} mm along x and {y:.3} mm along y, at {} nodes", slope.nodes);
-    let cut_off = format!("waves below {cutoff_mm} mm (Gaussian, ISO 16610-61)");
-    let urad = |name, rad: f64| row(name, 1e6 * rad, "urad", &removed(&[]), &cut_off, &made);
+    let urad = |name, rad: f64| row(name, 1e6 * rad, "urad", &taken_out.motion, &taken_out.filter, &made);
     vec![urad("slope RMS", slope.rms_rad), urad("slope, largest", slope.largest_rad)]
 }
 
@@ -79,9 +97,4 @@ fn row(name: &'static str, value: f64, unit: &'static str, removed: &str, cut_of
         made: made.to_owned(),
         at_mm: None,
     }
-}
-
-fn removed(forms: &[Removed]) -> String {
-    let words = std::iter::once("rigid motion (registration)").chain(forms.iter().map(|form| form.word()));
-    words.collect::<Vec<_>>().join(", ")
 }

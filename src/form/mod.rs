@@ -23,7 +23,7 @@ pub use error::FormError;
 pub use figures::{Coverage, Extreme, Figures, FormOptions, Removed, RobustPv, figures};
 pub use fit::{Fit, fit, fit_most};
 pub use iso::{Iso10110, iso_10110};
-pub use labels::{Labelled, labelled, labelled_slope};
+pub use labels::{DIRECTION, EVERY_POINT, Labelled, TakenOut, labelled, labelled_slope};
 pub use slope::{Slope, slope};
 
 /// A deviation and where on the part it is.

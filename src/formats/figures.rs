@@ -6,7 +6,10 @@ use serde::Serialize;
 
 use super::error::FormatError;
 use super::registration::write_json_atomic;
-use crate::form::{Basis, Figures, Fit, FormError, Iso10110, Labelled, Slope, labelled, labelled_slope};
+use crate::form::{
+    Basis, DIRECTION, EVERY_POINT, Figures, Fit, FormError, Iso10110, Labelled, Slope, TakenOut, labelled,
+    labelled_slope,
+};
 
 /// What is written of a cycle's figures.
 #[derive(Serialize)]
@@ -16,11 +19,21 @@ struct FiguresDocument<'a> {
     /// Points that took part.
     points: Option<usize>,
     figures: Vec<Labelled>,
-    iso_10110_5: Option<&'a Iso10110>,
-    zernike: Option<SeriesDocument>,
-    legendre: Option<SeriesDocument>,
+    iso_10110_5: Option<OfPoints<&'a Iso10110>>,
+    zernike: Option<OfPoints<SeriesDocument>>,
+    legendre: Option<OfPoints<SeriesDocument>>,
     /// Which figures there are not, and why.
     missing: Vec<String>,
+}
+
+/// Something that is made of the points, with what one must know of it.
+#[derive(Serialize)]
+struct OfPoints<T> {
+    removed: String,
+    direction: &'static str,
+    cut_off: &'static str,
+    #[serde(flatten)]
+    what: T,
 }
 
 /// Polynomials fitted to the deviations.
@@ -45,7 +58,7 @@ struct TermDocument {
     orthogonal_nm: f64,
 }
 
-/// Writes `figures.json`: the figures of the points and, where there is a map, its slopes with the filter's cut-off.
+/// Writes `figures.json`: the figures of the points and, where there is a map, its slopes, all with what was taken out before.
 ///
 /// Where there are no figures the file says why.
 ///
@@ -54,31 +67,37 @@ struct TermDocument {
 pub fn write_figures(
     path: &Path,
     figures: Result<&Figures, &FormError>,
-    slope: Option<(Result<&Slope, &FormError>, f64)>,
+    slope: Option<Result<&Slope, &FormError>>,
+    taken_out: &TakenOut,
     simulation: bool,
 ) -> Result<(), FormatError> {
     let (mut rows, mut missing) = (Vec::new(), Vec::new());
     match figures {
-        Ok(figures) => rows.extend(labelled(figures)),
+        Ok(figures) => rows.extend(labelled(figures, taken_out)),
         Err(why) => missing.push(format!("figures of the points: {why}")),
     }
     match slope {
-        Some((Ok(slope), cutoff_mm)) => rows.extend(labelled_slope(slope, cutoff_mm)),
-        Some((Err(why), _)) => missing.push(format!("slopes: {why}")),
+        Some(Ok(slope)) => rows.extend(labelled_slope(slope, taken_out)),
+        Some(Err(why)) => missing.push(format!("slopes: {why}")),
         None => missing.push("slopes: there is no map".to_owned()),
     }
     let found = figures.ok();
+    let removed = taken_out.removed(found.map_or(&[], |f| &f.removed));
     let document = FiguresDocument {
         simulation,
         frame: "model",
         points: found.map(|f| f.points),
         figures: rows,
-        iso_10110_5: found.map(|f| &f.iso_10110),
-        zernike: found.and_then(|f| f.zernike.as_ref()).map(series),
-        legendre: found.and_then(|f| f.legendre.as_ref()).map(series),
+        iso_10110_5: found.map(|f| of_points(&removed, &f.iso_10110)),
+        zernike: found.and_then(|f| f.zernike.as_ref()).map(|fit| of_points(&removed, series(fit))),
+        legendre: found.and_then(|f| f.legendre.as_ref()).map(|fit| of_points(&removed, series(fit))),
         missing,
     };
     write_json_atomic(path, &document)
+}
+
+fn of_points<T>(removed: &str, what: T) -> OfPoints<T> {
+    OfPoints { removed: removed.to_owned(), direction: DIRECTION, cut_off: EVERY_POINT, what }
 }
 
 fn series(fit: &Fit) -> SeriesDocument {

@@ -33,7 +33,7 @@ pub use figures::write_figures;
 pub use folder::{ResultFolder, place_link, remove_link, remove_socket};
 pub use height_map::HeightMap;
 pub use learned::{LEARNED, Learned, LearnedError};
-pub use map::{CorrectionIdentities, write_correction, write_error_map};
+pub use map::{CorrectionIdentities, ErrorMapOrigin, write_correction, write_error_map};
 pub use metropro::{parse_metropro, read_metropro};
 pub use number::LIMIT_MM;
 pub use ply::{PlyFile, parse_ply, read_ply};

@@ -131,11 +131,12 @@ fn event_words(event: &Event) -> String {
         }
         Event::Registered { figures, .. } => figures_words(figures),
         Event::Compensated { summary, .. } => format!(
-            "up to {:.2} um, {:.2} um deep, {:.1} % in air, PV {:.2} um expected",
+            "up to {:.2} um, {:.2} um deep, {:.1} % in air, PV {:.2} um expected{}",
             1e3 * summary.largest_mm,
             1e3 * summary.depth_mm,
             100.0 * summary.air_share,
-            1e3 * summary.predicted_pv_mm
+            1e3 * summary.predicted_pv_mm,
+            summary.warnings.iter().map(|warning| format!("; {warning}")).collect::<String>()
         ),
         Event::CompensationRefused { why, .. } => match why {
             CompensationRefusal::BudgetSpent(words) | CompensationRefusal::Failed(words) => words.clone(),

@@ -8,46 +8,62 @@ use rayon::prelude::*;
 
 use super::{PathError, Wanted, Wheel};
 use crate::compensation::Net;
+use crate::compensation::level::nearest_known;
+use crate::geometry::Point;
 
-const STEPS: usize = 30;
+const STEPS: usize = 40;
 
 /// Returns the offset of Z at every node of a net over the axes X and Y, in millimetres; positive leaves material.
 ///
+/// A node where the wheel would touch far from the part, whose continued surface it need not fit, has the offset of the nearest other one.
+///
 /// # Errors
-/// A place that the wheel cannot touch.
+/// A place that the wheel cannot touch, where that is so at every node.
 pub fn axis_offsets(before: &Wanted, after: &Wanted, wheel: &Wheel, net: &Net) -> Result<Vec<f64>, PathError> {
     let one = |node: usize| {
         let axes = net.place_mm(node);
         Ok(height_mm(after, wheel, axes)? - height_mm(before, wheel, axes)?)
     };
-    (0..net.len()).into_par_iter().map(one).collect()
+    let offsets: Vec<Result<f64, PathError>> = (0..net.len()).into_par_iter().map(one).collect();
+    let known: Vec<bool> = offsets.iter().map(Result::is_ok).collect();
+    if !known.contains(&true) {
+        return offsets.into_iter().collect();
+    }
+    let values: Vec<f64> = offsets.into_iter().map(Result::unwrap_or_default).collect();
+    Ok(nearest_known(net, &known).into_iter().map(|node| values[node]).collect())
 }
 
 /// The height of the wheel's centre over X and Y: the place that it touches then is searched by Newton's method.
 fn height_mm(wanted: &Wanted, wheel: &Wheel, axes: [f64; 2]) -> Result<f64, PathError> {
     let refused = |[x_mm, y_mm]: [f64; 2]| PathError::CannotTouch { x_mm, y_mm };
     let centre = |place: [f64; 2]| wheel.centre(&wanted.at(place)).ok_or_else(|| refused(place));
-    let mut place = axes;
+    let off = |at: &Point| [at.x - axes[0], at.y - axes[1]];
+    let size = |[x, y]: [f64; 2]| f64::hypot(x, y);
     // A rim touches far from below its centre.
-    let first = centre(place)?;
-    place = [2.0 * place[0] - first.x, 2.0 * place[1] - first.y];
+    let first = centre(axes)?;
+    let mut place = [2.0 * axes[0] - first.x, 2.0 * axes[1] - first.y];
+    let mut at = centre(place)?;
     for _ in 0..STEPS {
-        let at = centre(place)?;
-        let off = [at.x - axes[0], at.y - axes[1]];
-        if off[0].hypot(off[1]) < 1e-9 {
+        if size(off(&at)) < 1e-9 {
             return Ok(at.z);
         }
         const H: f64 = 1e-4;
         let (east, north) = (centre([place[0] + H, place[1]])?, centre([place[0], place[1] + H])?);
         let [a, b, c, d] = [east.x - at.x, north.x - at.x, east.y - at.y, north.y - at.y].map(|v| v / H);
-        let determinant = a * d - b * c;
-        let step = [(d * off[0] - b * off[1]) / determinant, (a * off[1] - c * off[0]) / determinant];
-        // A step no longer than the wheel, whatever the surface does.
-        let share = (wheel.reach_mm() / step[0].hypot(step[1])).min(1.0);
-        place = [place[0] - share * step[0], place[1] - share * step[1]];
-        if !(place[0] + place[1]).is_finite() {
-            return Err(refused(axes));
-        }
+        let ([x, y], determinant) = (off(&at), a * d - b * c);
+        let step = [(d * x - b * y) / determinant, (a * y - c * x) / determinant];
+        // A step no longer than the wheel, and shorter until it leads nearer: beyond the edge the surface bends otherwise than before it.
+        let mut share = (wheel.reach_mm() / size(step)).min(1.0);
+        (place, at) = loop {
+            let next = [place[0] - share * step[0], place[1] - share * step[1]];
+            if !(next[0] + next[1]).is_finite() || share < 1e-6 {
+                return Err(refused(axes));
+            }
+            match centre(next) {
+                Ok(there) if size(off(&there)) < size(off(&at)) => break (next, there),
+                _ => share /= 2.0,
+            }
+        };
     }
     Err(refused(axes))
 }
@@ -75,5 +91,29 @@ mod tests {
             let expected = 0.004 * 1.25f64.sqrt();
             assert!(offsets.iter().all(|dz| (dz - expected).abs() < 1e-9), "{offsets:?}");
         }
+    }
+
+    #[test]
+    fn where_the_wheel_cannot_touch_the_nearest_offset_holds() {
+        // Flat ground that becomes a slope whose normal is the spindle of a cup: its rim touches the one and not the other.
+        let spindle = Vector::new(-0.5, 0.0, 0.75f64.sqrt());
+        let wheel = Wheel::Cup { ring_mm: 6.0, tube_mm: 1.0, spindle };
+        let facing = 0.5 / 0.75f64.sqrt();
+        let on = Lattice { columns: 61, rows: 41, first_mm: [-30.0, -20.0], spacing_mm: [1.0, 1.0] };
+        let ground = |k: usize| (k % on.columns) as f64 - 30.0;
+        let offsets = |first_mm: f64| {
+            let heights: Vec<f64> = (0..on.columns * on.rows).map(|k| facing * ground(k).max(0.0)).collect();
+            let slopes: Vec<[f64; 2]> =
+                (0..on.columns * on.rows).map(|k| [if ground(k) > 0.0 { facing } else { 0.0 }, 0.0]).collect();
+            let net = Net { columns: 2, rows: 1, first_mm: [first_mm, 0.0], spacing_mm: [40.0, 1.0] };
+            let corrected = |e: f64| Correction { net, values_mm: vec![e; 2], cycle: 1, level_mm: 0.0 };
+            let [before, after] =
+                [0.0, 0.004].map(|e| Wanted::new(Field::hermite(on, &heights, &slopes), &corrected(e), 1.0).unwrap());
+            axis_offsets(&before, &after, &wheel, &net)
+        };
+        let found = offsets(-20.0).unwrap();
+        assert!(found.iter().all(|dz| (dz - 0.004).abs() < 1e-9), "{found:?}");
+        let nowhere = offsets(20.0);
+        assert!(matches!(nowhere, Err(PathError::CannotTouch { .. })), "{nowhere:?}");
     }
 }

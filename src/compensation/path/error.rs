@@ -68,3 +68,10 @@ pub enum PathError {
     #[error("the path has {points} points, more than {limit}; allow a larger chord error or wider tracks")]
     TooManyPoints { points: u64, limit: u64 },
 }
+
+impl PathError {
+    /// Returns whether only we cannot lay the path: a controller that makes its own from the map may well grind the part.
+    pub fn is_ours(&self) -> bool {
+        matches!(self, Self::OtherSide | Self::NotAHeight { .. })
+    }
+}

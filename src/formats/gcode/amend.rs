@@ -10,9 +10,10 @@ use std::path::Path;
 use sha2::{Digest, Sha256};
 
 use super::arc::{Arc, Centre, Plane};
-use super::map::identity_in;
+use super::map::{MapBase, identity_in};
 use super::number::{push_fixed, rounded};
 use super::read::{Block, Refusal, Word, block};
+use super::write::UNCORRECTED;
 use super::{GcodeError, hex};
 use crate::compensation::path::{Field, Wanted, displaced};
 use crate::formats::registration::Draft;
@@ -37,6 +38,8 @@ pub struct Amendment<'a> {
     pub map_identity: [u8; 32],
     /// The part that the map belongs to, where it says so.
     pub part: Option<[u8; 32]>,
+    /// What the program must have in it already.
+    pub base: MapBase,
     /// What the map was multiplied by.
     pub gain: f64,
     /// Whether the map comes from a simulated cell.
@@ -72,7 +75,8 @@ pub struct Amended {
 /// Reads a program, corrects it, and writes it under another name.
 ///
 /// # Errors
-/// A program that has the map in it already, that belongs to another part, or that holds what cannot be corrected; files.
+/// A program that has the map in it already, that belongs to another part or has another correction in it than the map takes up, or that
+/// holds what cannot be corrected; files.
 pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result<Amended, GcodeError> {
     let bytes = crate::formats::gcode::read_bytes(base, MOST_BYTES)?;
     let text = std::str::from_utf8(&bytes).map_err(|_| GcodeError::Program {
@@ -101,11 +105,17 @@ pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result
     Ok(writer.done)
 }
 
-/// Refuses a program that has the map in it, or that belongs to another part than the map.
+/// Refuses a program that has the map in it, that belongs to another part than the map, or to another correction.
 fn refuse_foreign(path: &Path, text: &str, amendment: &Amendment) -> Result<(), GcodeError> {
     let refused = |what: &str, remedy| Err(GcodeError::Program { path: path.to_owned(), what: what.into(), remedy });
-    let comments = text.lines().filter(|line| line.contains("sha256"));
+    let mut maps = Vec::new();
+    let comments = text.lines().filter(|line| line.contains("sha256") || line.contains(UNCORRECTED));
     for line in comments {
+        if line.contains(UNCORRECTED) {
+            // It is the map named last that the program does without.
+            maps.pop();
+        }
+        maps.extend(identity_in(line, "map:"));
         if identity_in(line, "map:") == Some(amendment.map_identity) {
             return refused(
                 "this map is already applied in the program",
@@ -118,7 +128,17 @@ fn refuse_foreign(path: &Path, text: &str, amendment: &Amendment) -> Result<(), 
             return refused("the map belongs to another part than the program", "give the map of this part");
         }
     }
-    Ok(())
+    match amendment.base {
+        MapBase::Nothing if !maps.is_empty() => refused(
+            "the program has a correction in it, and this one is absolute: it replaces that, it does not come on top of it",
+            "correct the program without a correction, as regrind plan --program writes it",
+        ),
+        MapBase::Map(identity) if !maps.contains(&identity) => refused(
+            "the map was measured after a pass with another correction than the program has in it",
+            "correct the program that the part was ground with before it was measured",
+        ),
+        _ => Ok(()),
+    }
 }
 
 fn header(base: &[u8; 32], amendment: &Amendment) -> String {

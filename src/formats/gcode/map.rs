@@ -23,6 +23,17 @@ pub enum MapKind {
     Correction,
 }
 
+/// What the program that a map is put on must have in it already.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MapBase {
+    /// No correction: the map is absolute, it replaces what was before it.
+    Nothing,
+    /// This map: the error was measured after a pass that was ground with it.
+    Map([u8; 32]),
+    /// Whatever: the map does not say what it was measured after.
+    Anything,
+}
+
 /// A map as read.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ProgramMap {
@@ -36,12 +47,14 @@ pub struct ProgramMap {
     pub identity: [u8; 32],
     /// The part that it belongs to, where it says so.
     pub part: Option<[u8; 32]>,
+    /// What the program must have in it already.
+    pub base: MapBase,
     /// Whether it comes from a simulated cell.
     pub simulation: bool,
 }
 
 /// Reads a map: a header `x_mm,y_mm,error_mm` or `x_mm,y_mm,correction_mm`, perhaps with further columns, and a row for every node of a
-/// regular grid. Comments tell `part: sha256 ...`, `map: sha256 ...` and `SIMULATION`.
+/// regular grid. Comments tell `part: sha256 ...`, `map: sha256 ...`, `ground with: sha256 ...` and `SIMULATION`.
 ///
 /// # Errors
 /// A file that cannot be read, other columns, rows that are no numbers, nodes that are no whole grid.
@@ -55,6 +68,7 @@ pub fn read_program_map(path: &Path) -> Result<ProgramMap, GcodeError> {
     let mut reader = BufReader::new(file.take(MOST_BYTES + 1));
     let (mut hash, mut line, mut number, mut bytes) = (Sha256::new(), Vec::new(), 0u64, 0u64);
     let (mut kind, mut points, mut part, mut stated, mut simulation) = (None, Vec::new(), None, None, false);
+    let mut ground_with = None;
     loop {
         line.clear();
         // A file without lines is not read into one.
@@ -77,6 +91,7 @@ pub fn read_program_map(path: &Path) -> Result<ProgramMap, GcodeError> {
             simulation |= comment.trim() == "SIMULATION";
             part = part.or(identity_in(comment, "part:"));
             stated = stated.or(identity_in(comment, "map:"));
+            ground_with = ground_with.or(identity_in(comment, "ground with:"));
         } else if !text.is_empty() && kind.is_none() {
             kind = Some(columns(text).ok_or_else(|| line_error(number, format!("the columns are {text:?}")))?);
         } else if !text.is_empty() {
@@ -94,6 +109,11 @@ pub fn read_program_map(path: &Path) -> Result<ProgramMap, GcodeError> {
         kind,
         identity: stated.unwrap_or_else(|| hash.finalize().into()),
         part,
+        base: match (kind, ground_with) {
+            (MapKind::Correction, _) => MapBase::Nothing,
+            (MapKind::Error, Some(identity)) => MapBase::Map(identity),
+            (MapKind::Error, None) => MapBase::Anything,
+        },
         simulation,
     })
 }

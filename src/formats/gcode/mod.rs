@@ -22,7 +22,7 @@ use crate::formats::FormatError;
 
 pub use amend::{AlongNormals, Amended, Amendment, correct_program};
 pub use error::GcodeError;
-pub use map::{MapKind, ProgramMap, read_program_map};
+pub use map::{MapBase, MapKind, ProgramMap, read_program_map};
 pub use table::write_axis_table;
 pub use write::{ProgramHeader, write_program};
 
@@ -62,7 +62,7 @@ impl fmt::Display for PathMode {
     }
 }
 
-fn hex(bytes: &[u8; 32]) -> String {
+pub(super) fn hex(bytes: &[u8; 32]) -> String {
     bytes.iter().map(|b| format!("{b:02x}")).collect()
 }
 

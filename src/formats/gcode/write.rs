@@ -15,6 +15,9 @@ const CHUNK: usize = 1 << 16;
 /// Points whose lines are made at the same time and wait for their turn, some 30 bytes each.
 const AT_ONCE: u64 = 200_000;
 
+/// What the header of a program without a correction says of its map.
+pub(super) const UNCORRECTED: &str = "map: 0 everywhere";
+
 /// What the header of a program tells.
 #[derive(Clone, Debug)]
 pub struct ProgramHeader {
@@ -26,6 +29,8 @@ pub struct ProgramHeader {
     pub base_identity: [u8; 32],
     /// Identity of the correction that is in the path.
     pub map_identity: [u8; 32],
+    /// Whether that is 0 everywhere.
+    pub uncorrected: bool,
     /// Height of the surface wanted over the nominal one, in millimetres.
     pub level_mm: f64,
     /// The wheel in words.
@@ -186,6 +191,9 @@ fn header_lines(h: &ProgramHeader, s: &Summary, lines: u64) -> String {
     say(format_args!("cycle: {}", h.cycle));
     say(format_args!("base: sha256 {}", hex(&h.base_identity)));
     say(format_args!("map: sha256 {}", hex(&h.map_identity)));
+    if h.uncorrected {
+        say(format_args!("{UNCORRECTED}"));
+    }
     say(format_args!("frame: model, z away from the part; G54 has its zero in the origin of the model"));
     say(format_args!("units: mm, mm/min; a correction is positive where it leaves material, along the outward normal"));
     say(format_args!("level over the nominal surface: {} mm", short(h.level_mm)));
@@ -238,6 +246,7 @@ mod tests {
             cycle: 1,
             base_identity: [1; 32],
             map_identity: [2; 32],
+            uncorrected: false,
             level_mm: 0.0,
             wheel: "ball".into(),
             tracks: "raster".into(),
