@@ -234,6 +234,26 @@ fn a_recipe_for_another_cell() {
 }
 
 #[test]
+fn a_part_that_is_measured_first_is_judged_and_a_pass_that_cannot_be_ground_is_not_begun() {
+    let home = tempfile::tempdir().unwrap();
+    let text = fs::read_to_string(recipe(home.path(), 1e4)).unwrap();
+    assert!(text.contains("[cycle]\n"));
+    fs::write(home.path().join("first.toml"), text.replace("[cycle]\n", "[cycle]\nbegin_with = \"measure\"\n"))
+        .unwrap();
+    let narrow =
+        "[grinder.travel]\nleast_mm = [-10.0, -500.0, -400.0]\nmost_mm = [10.0, 500.0, 400.0]\n\n[grinder.limits]";
+    fs::write(home.path().join("narrow.toml"), changed("config/sim.toml", &[("[grinder.limits]", narrow)])).unwrap();
+    let (code, said, errors) = in_time(&["run", "first.toml", "--cell", "narrow.toml"], home.path());
+    assert_eq!(code, 1, "{said}\n{errors}");
+    assert!(said.contains("ALARM") && said.contains("beyond the travel of -10 to 10 mm"), "{said}");
+    let cycle = only_run(&home.path().join("runs")).join("cycle-1");
+    assert!(cycle.join("error_map.csv").is_file());
+    for file in ["correction.csv", "toolpath.ngc", "toolpath_z.csv"] {
+        assert!(!cycle.join(file).exists(), "{file} of a pass that is not begun");
+    }
+}
+
+#[test]
 fn every_kind_of_broken_file_through_every_command() {
     let home = tempfile::tempdir().unwrap();
     let good = recipe(home.path(), 1e4);

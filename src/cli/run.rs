@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use clap::Args;
-use regrind::cell::{Actor, Ending};
+use regrind::cell::{Actor, Beginning, Ending};
 use regrind::config::{CellConfig, Link};
 use regrind::document::Problems;
 use regrind::drive::{Drive, Orders, Request, Run, Task};
@@ -72,8 +72,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         let run = learned.run.clone();
         task.begin_with(learned.clone()).map_err(|source| Failure::TooMuchLearned { run, source })?;
     }
-    // What the first pass would be ground along is checked before anything opens; the paths of the others when their maps are made.
-    plan::first_path(&task, &recipe, &cell)?;
+    // What a run begins with is checked before anything opens; the path of any other pass when its map is made, and it may come to none.
+    if plan.begin_with == Beginning::Grind {
+        plan::first_path(&task, &recipe, &cell)?;
+    }
     let spec = match within(&cell) {
         true => Some(simulated::world_spec(&recipe, arguments.seed)?),
         false => None,

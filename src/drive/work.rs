@@ -514,13 +514,14 @@ pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &
         }
         Err(error) => return refused(CompensationRefusal::Failed(error.to_string())),
     };
-    if let Err(error) = save_correction(task, folder, &step.correction, &cycle.correction) {
-        return refused(CompensationRefusal::Failed(error.to_string()));
-    }
+    // A pass that cannot be ground leaves no correction that somebody might take for one.
     let Kept { files, warning } = match save_program(task, folder, &step.correction) {
         Ok(kept) => kept,
         Err(error) => return refused(CompensationRefusal::Failed(format!("the next pass cannot be ground: {error}"))),
     };
+    if let Err(error) = save_correction(task, folder, &step.correction, &cycle.correction) {
+        return refused(CompensationRefusal::Failed(error.to_string()));
+    }
     let largest_mm = step.correction.values_mm.iter().fold(0.0f64, |most, v| most.max(v.abs()));
     let ratio = found.verdict.pv_mm / found.verdict.rms_mm.max(f64::MIN_POSITIVE);
     let forecast = known.forecast(&map);
