@@ -20,22 +20,18 @@
 //! Conventions: millimetres, radians, seconds. Frames are the model's {M} and the CMM's {W}; a pose is named for what it does,
 //! `cmm_from_model`. A deviation is positive where material stands proud, along the outward normal, the probe's side.
 
-pub mod cell;
-pub mod compensation;
+pub use regrind_cell as cell;
+pub use regrind_core::{compensation, form, geometry, measuring, registration, surface};
+
 pub mod config;
 pub mod device;
 pub mod document;
 pub mod drive;
-pub mod form;
 pub mod formats;
-pub mod geometry;
 pub mod journal;
-pub mod measuring;
 pub mod recipe;
-pub mod registration;
 pub mod report;
 pub mod setup;
-pub mod surface;
 
 /// The example of the README is run as a test.
 #[cfg(doctest)]

@@ -1,11 +1,11 @@
 //! Parts of every shape, each with an expectation of its own.
 
-mod common;
-
-use common::{RADIUS_MM, centres, placed, points, pose};
-use regrind::geometry::{Point, Pose, Vector};
-use regrind::registration::{Method, Options, ProbeSide, Registration, RegistrationError, Start, register};
-use regrind::surface::{DefinedSurface, Nominal, NominalKind, OffsetSurface, Place, Projection, Side, SurfaceError};
+use crate::common::{RADIUS_MM, centres, placed, points, pose};
+use regrind_core::geometry::{Point, Pose, Vector};
+use regrind_core::registration::{Method, Options, ProbeSide, Registration, RegistrationError, Start, register};
+use regrind_core::surface::{
+    DefinedSurface, Nominal, NominalKind, OffsetSurface, Place, Projection, Side, SurfaceError,
+};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise};
 use regrind_sim::shape::{Biconic, OffAxisAsphere, Shape, Sphere, Wave};
@@ -64,7 +64,7 @@ fn a_biconic_fits_in_two_poses_and_says_so() {
         register(&nominal, &measured(&shape, [29.0, 29.0], [45, 45], &placement, 3e-4), &Options::new(RADIUS_MM))
             .unwrap();
     // Half a turn about z carries the surface into itself: either pose is right, and the other one is named.
-    let half_turn = Pose::exp(&regrind::geometry::Twist::new(0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI));
+    let half_turn = Pose::exp(&regrind_core::geometry::Twist::new(0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI));
     let truths = [pose(&placement), pose(&placement) * half_turn];
     let error = |p: &Pose| {
         truths.map(|t| normal_error_mm(p, &t, &shape, [29.0, 29.0])).into_iter().fold(f64::INFINITY, f64::min)
@@ -302,10 +302,10 @@ fn the_same_surface_as_a_formula_and_as_points() {
 #[test]
 fn robust_losses_from_a_given_pose() {
     let shape = regrind_sim::shape::FreeForm::default();
-    let nominal = common::free_form(301, 181);
+    let nominal = crate::common::free_form(301, 181);
     let placement = Placement::new([0.3, -0.2, 0.25], [0.2, 0.1, -0.3]);
     let cloud = measured(&shape, [50.0, 30.0], [50, 30], &placement, 3e-4);
-    for loss in [regrind::registration::Loss::Huber, regrind::registration::Loss::Tukey] {
+    for loss in [regrind_core::registration::Loss::Huber, regrind_core::registration::Loss::Tukey] {
         let options = Options { loss, start: Start::Pose(Pose::identity()), ..Options::new(RADIUS_MM) };
         let found = register(&nominal, &cloud, &options).unwrap();
         let error = normal_error_mm(&found.cmm_from_model, &pose(&placement), &shape, [50.0, 30.0]);
@@ -317,7 +317,7 @@ fn robust_losses_from_a_given_pose() {
 #[test]
 fn contact_points_and_the_subtracted_radius() {
     let shape = regrind_sim::shape::FreeForm::default();
-    let nominal = common::free_form(451, 251);
+    let nominal = crate::common::free_form(451, 251);
     let placement = Placement::new([0.1, -0.2, 0.15], [0.1, 0.05, -0.1]);
     let form = FormError::new(8, 30.0, 6.657e-3, 102.0, 62.0);
     let cloud = points(&placed(&placement, &centres(&shape, &form, [[-50.0, -30.0], [50.0, 30.0]], [90, 60])));

@@ -2,7 +2,7 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use regrind::compensation::{Correction, ErrorMap, GainRule, Knowledge, MapOptions, Net, Seen};
+use regrind_core::compensation::{Correction, ErrorMap, GainRule, Knowledge, MapOptions, Net, Seen};
 
 const NET: Net = Net { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0, 1.0] };
 const SCATTER_MM: f64 = 1e-3;

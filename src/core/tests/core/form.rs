@@ -2,11 +2,11 @@
 
 use std::f64::consts::TAU;
 
-use regrind::form::{
+use regrind_core::form::{
     Basis, Figures, Fit, FormError, FormOptions, Removed, Sample, TakenOut, figures, fit, fit_most, iso_10110, labelled,
 };
-use regrind::geometry::Aperture;
-use regrind::surface::analytic::ZernikeNumbering;
+use regrind_core::geometry::Aperture;
+use regrind_core::surface::analytic::ZernikeNumbering;
 
 const CENTRE: [f64; 2] = [3.0, -2.0];
 const RADIUS: f64 = 20.0;

@@ -286,7 +286,7 @@ impl Nominal {
     }
 
     /// Returns the steepest slope against the plane of x and y that some places spread over the surface have, in radians.
-    pub(crate) fn steepest_rad(&self) -> f64 {
+    pub fn steepest_rad(&self) -> f64 {
         let normals = self.sampled_vertices(SAMPLE).into_iter().map(|(_, n)| n.z.clamp(-1.0, 1.0).acos());
         normals.fold(0.0, f64::max)
     }

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use proptest::prelude::*;
-use regrind::cell::*;
+use regrind_cell::*;
 
 const S: Duration = Duration::from_secs(1);
 

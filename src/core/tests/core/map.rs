@@ -4,7 +4,7 @@ use std::f64::consts::{PI, TAU};
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use regrind::compensation::{
+use regrind_core::compensation::{
     ErrorMap, MapError, MapOptions, Net, NetError, Order, Reading, Roughness, Smoothing, error_map, filter_net,
 };
 

@@ -1,8 +1,7 @@
 //! What the tests share: clouds from the simulated truth, and how far a pose is from it.
-#![allow(dead_code)]
 
-use regrind::geometry::{Point, Pose};
-use regrind::surface::{Nominal, Projection};
+use regrind_core::geometry::{Point, Pose};
+use regrind_core::surface::{Nominal, Projection};
 use regrind_sim::Vec3;
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, centre};

@@ -1,7 +1,7 @@
 //! The distance of a probe centre from the offset surface, against the exact one.
 
-use regrind::geometry::Point;
-use regrind::surface::{Distance, Nominal, OffsetSurface, Place, Projection, Side};
+use regrind_core::geometry::Point;
+use regrind_core::surface::{Distance, Nominal, OffsetSurface, Place, Projection, Side};
 use regrind_sim::form::FormError;
 use regrind_sim::shape::{FreeForm, Shape};
 

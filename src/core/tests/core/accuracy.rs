@@ -1,8 +1,8 @@
 //! What is predicted of the distance from the nominal points alone, against what it is.
 
-use regrind::geometry::Point;
-use regrind::surface::accuracy::{Accuracy, Net, Trust, accuracy};
-use regrind::surface::{Distance, Nominal, OffsetSurface, Place, Projection, Side, SurfaceError};
+use regrind_core::geometry::Point;
+use regrind_core::surface::accuracy::{Accuracy, Net, Trust, accuracy};
+use regrind_core::surface::{Distance, Nominal, OffsetSurface, Place, Projection, Side, SurfaceError};
 use regrind_sim::shape::{FreeForm, Shape};
 
 fn free_form(columns: usize, rows: usize) -> Vec<Point> {

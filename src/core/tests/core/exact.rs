@@ -1,12 +1,10 @@
 //! Pose and map against least squares with the exact (Newton) foot on the exact surface.
 
-mod common;
-
-use common::{RADIUS_MM, centres, free_form, placed, points, pose, pose_error_mm};
+use crate::common::{RADIUS_MM, centres, free_form, placed, points, pose, pose_error_mm};
 use nalgebra::{Matrix6, Vector6};
-use regrind::geometry::{Point, Pose, Vector};
-use regrind::registration::{Options, PointStatus, register};
-use regrind::surface::{Nominal, Projection};
+use regrind_core::geometry::{Point, Pose, Vector};
+use regrind_core::registration::{Options, PointStatus, register};
+use regrind_core::surface::{Nominal, Projection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise, add_outliers};
 use regrind_sim::shape::{FreeForm, Shape};
@@ -184,7 +182,7 @@ fn the_stated_covariance_is_the_observed_scatter() {
             let mut measured = clean.clone();
             add_noise(&mut regrind_sim::rng(seed), &mut measured, 3e-4);
             let mut options = Options::new(RADIUS_MM);
-            options.start = regrind::registration::Start::Pose(truth);
+            options.start = regrind_core::registration::Start::Pose(truth);
             let found = register(&nominal, &points(&measured), &options).unwrap();
             let error = (truth.inverse() * found.cmm_from_model).log();
             observed += error * error.transpose() / DRAWS as f64;

@@ -2,10 +2,10 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use regrind::compensation::{
+use regrind_core::compensation::{
     Contact, Parameter, ParameterError, ParameterKind, ParameterOptions, Parameters, WheelTerm, parameters,
 };
-use regrind::geometry::{Point, Vector};
+use regrind_core::geometry::{Point, Vector};
 use regrind_sim::form::FormError;
 use regrind_sim::shape::{FreeForm, Shape, Sphere};
 

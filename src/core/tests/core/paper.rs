@@ -1,8 +1,8 @@
 //! The main numbers of sections 3.2 and 4 of the paper, on the simulated free form; `examples/paper.rs` shows them all.
 
-use regrind::geometry::{Point, Pose};
-use regrind::registration::{Method, Options, ProbeSide, Registration, Start, register};
-use regrind::surface::{Distance, Nominal, Projection, Side};
+use regrind_core::geometry::{Point, Pose};
+use regrind_core::registration::{Method, Options, ProbeSide, Registration, Start, register};
+use regrind_core::surface::{Distance, Nominal, Projection, Side};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, centre};
 use regrind_sim::shape::{FreeForm, Shape};

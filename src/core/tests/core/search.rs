@@ -1,9 +1,7 @@
 //! Registration without an initial guess.
 
-mod common;
-
-use common::{RADIUS_MM, centres, free_form, placed, points, pose, pose_error_mm};
-use regrind::registration::{Options, register};
+use crate::common::{RADIUS_MM, centres, free_form, placed, points, pose, pose_error_mm};
+use regrind_core::registration::{Options, register};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
 use regrind_sim::shape::FreeForm;

@@ -1,0 +1,13 @@
+//! The numerical core against truths that were planted, worked out by hand, or found by other means.
+
+mod accuracy;
+mod common;
+mod distance;
+mod exact;
+mod form;
+mod knowledge;
+mod map;
+mod paper;
+mod parameters;
+mod parts;
+mod search;
