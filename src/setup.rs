@@ -16,16 +16,18 @@ use crate::compensation::path::{
 };
 use crate::compensation::{CorrectionLimits, MapOptions, contact_width_mm};
 use crate::config::{self, CellConfig, PointKind, SignalKind, WordOrder};
-use crate::device::exchange::{ExchangeCmm, ExchangeGrinder, ExchangeTiming};
+use crate::device::exchange::{
+    CmmExchange, CmmFolders, ExchangeCmm, ExchangeGrinder, ExchangeTiming, GrinderExchange, GrinderFolders,
+    Pattern as NamePattern, StationFiles, Stations,
+};
 use crate::device::{
     self, AnyCmm, AnyGrinder, Coordinates, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, Pass, RegisterMap,
     Signal, SignalType,
 };
 use crate::drive::{Probing, Programs, Sphere, Task};
-use crate::formats::exchange::{
-    self as files, CmmExchange, CmmFolders, ExchangeError, GrinderExchange, GrinderFolders, StationFiles, Stations,
-};
 use crate::formats::gcode;
+use crate::formats::references::read_references;
+use crate::formats::result as files;
 use crate::formats::{self, FormatError, NominalFile};
 use crate::geometry::{Point, Vector};
 use crate::measuring::{Layout, PatternError, Target, targets};
@@ -72,7 +74,7 @@ pub enum SetupError {
     )]
     Folder { cell: PathBuf, key: String, path: PathBuf, machine: &'static str },
     #[error("{cell}: {key}: {source}")]
-    References { cell: PathBuf, key: &'static str, source: Box<ExchangeError> },
+    References { cell: PathBuf, key: &'static str, source: Box<FormatError> },
     #[error("{path}: {wire} cannot be opened: {source}; check the cell file and the machine")]
     Wire { path: PathBuf, wire: String, source: std::io::Error },
 }
@@ -527,7 +529,7 @@ fn cmm_by_files(
             },
             unit_mm: exchange.content.unit_mm,
         },
-        result: files::Pattern::new(&*exchange.result),
+        result: NamePattern::new(&*exchange.result),
         stations,
         free_count: free,
         least_points: match &recipe.measure.pattern {
@@ -545,14 +547,14 @@ fn cmm_by_files(
 /// The reference points are read at once: an error in them must not come to light when a day's measuring is done.
 fn stations(cell: &CellConfig, exchange: &config::FileExchange, nominal: &Path) -> Result<Stations, SetupError> {
     let group = exchange.reference_group.clone();
-    files::read_references(nominal, group.as_deref()).map_err(|source| SetupError::References {
+    read_references(nominal, group.as_deref()).map_err(|source| SetupError::References {
         cell: cell.path().to_owned(),
         key: "cmm.wire.reference_points",
         source: Box::new(source),
     })?;
     let files = exchange.stations.iter().map(|station| StationFiles {
-        points: files::Pattern::new(&*station.points),
-        references: files::Pattern::new(&*station.reference),
+        points: NamePattern::new(&*station.points),
+        references: NamePattern::new(&*station.reference),
     });
     Ok(Stations { files: files.collect(), nominal: nominal.to_owned(), group, limit_mm: exchange.reference_limit_mm })
 }

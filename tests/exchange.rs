@@ -6,14 +6,12 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
 use regrind::device::exchange::{
-    Confirmable, ExchangeMachine, ExchangeTiming, GrindOrder, Look, Mailbox, MailboxError, MeasureOrder, Standing, Step,
+    CmmExchange, CmmFolders, Confirmable, ExchangeMachine, ExchangeTiming, GrindOrder, GrinderExchange, GrinderFolders,
+    Look, Mailbox, MailboxError, MeasureOrder, Pattern, Standing, StationFiles, Stations, Step,
 };
 use regrind::device::{
     Answer, Cmm, Coordinates, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Machine, MachineKind,
     Measurement, Outcome, Pass, Plan, PointStatus, Reconciled, State, Target, TargetKind, digest,
-};
-use regrind::formats::exchange::{
-    CmmExchange, CmmFolders, GrinderExchange, GrinderFolders, Pattern, StationFiles, Stations,
 };
 
 /// When the next file is said to have been written.
@@ -249,7 +247,7 @@ fn two_files_at_once_are_neither_taken() {
 
 #[test]
 fn the_cell_may_say_what_the_file_does_not() {
-    use regrind::formats::exchange::{Content, Coordinates as Said, DecimalMark};
+    use regrind::formats::result::{Content, Coordinates as Said, DecimalMark};
     let shop = Shop::new();
     let content = Content { coordinates: Some(Said::Contacts), decimal: DecimalMark::Comma, unit_mm: 25.4 };
     let mut bench = Bench::new(CmmExchange { content, ..shop.cmm() });

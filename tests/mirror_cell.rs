@@ -5,11 +5,9 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use regrind::device::exchange::{Mailbox, MeasureOrder};
+use regrind::device::exchange::{CmmExchange, CmmFolders, Mailbox, MeasureOrder, Pattern, StationFiles, Stations};
 use regrind::device::{Coordinates, Identified, Job, Measurement, Plan, digest};
-use regrind::formats::exchange::{
-    CmmExchange, CmmFolders, Content, Coordinates as Said, Pattern, StationFiles, Stations,
-};
+use regrind::formats::result::{Content, Coordinates as Said};
 use regrind::geometry::{Point, Pose, Twist, Vector};
 use regrind::registration::{MapLimits, Options, Registration, Start, lateral_error, register, weak_for_compensation};
 use regrind::surface::{DefinedSurface, Nominal, Side};

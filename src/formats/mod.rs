@@ -5,7 +5,6 @@
 
 mod document;
 mod error;
-pub mod exchange;
 mod figures;
 mod folder;
 pub mod gcode;
@@ -17,7 +16,9 @@ pub mod metropro;
 mod number;
 pub mod ply;
 pub mod points;
+pub mod references;
 pub mod registration;
+pub mod result;
 pub mod sdf;
 pub mod stl;
 mod whole;
@@ -38,9 +39,13 @@ pub use metropro::{parse_metropro, read_metropro};
 pub use number::LIMIT_MM;
 pub use ply::{PlyFile, parse_ply, read_ply};
 pub use points::{parse_points, read_points};
-pub use registration::{DeviationRow, write_column, write_deviations, write_json_atomic, write_points};
+pub use registration::{
+    DeviationRow, sync_folder, try_writing, write_atomic, write_column, write_deviations, write_json_atomic,
+    write_points,
+};
 pub use sdf::{parse_sdf, read_sdf};
 pub use stl::{StlFile, parse_stl, read_stl};
+pub use whole::read_whole;
 pub use x3p::{MapRecord, X3pFile, parse_x3p, read_x3p, write_error_map_x3p, write_x3p};
 
 use crate::geometry::Point;

@@ -74,9 +74,26 @@ pub fn write_json_atomic(path: impl AsRef<Path>, value: &impl Serialize) -> Resu
     let json = |source| FormatError::Json { path: path.to_owned(), source };
     let mut text = serde_json::to_vec_pretty(value).map_err(json)?;
     text.push(b'\n');
+    write_atomic(path, &text)
+}
+
+/// Writes a file whole or not at all.
+///
+/// # Errors
+/// A file that cannot be written.
+pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), FormatError> {
     let mut draft = Draft::create(path)?;
-    draft.write(&text)?;
+    draft.write(bytes)?;
     draft.publish()
+}
+
+/// Tries whether files can be written to a folder.
+///
+/// # Errors
+/// A folder that is not there or that takes none.
+pub fn try_writing(folder: &Path) -> Result<(), FormatError> {
+    drop(Draft::create(&folder.join("probe"))?);
+    Ok(())
 }
 
 /// Writes rows of N numbers and perhaps a flag.
@@ -177,8 +194,11 @@ impl Drop for Draft<'_> {
     }
 }
 
-/// Makes a rename last; only Unix lets a folder be opened for it.
-pub(super) fn sync_folder(path: &Path) -> io::Result<()> {
+/// Makes the rename of a path last; only Unix lets a folder be opened for it.
+///
+/// # Errors
+/// A folder that cannot be brought to the disk.
+pub fn sync_folder(path: &Path) -> io::Result<()> {
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     if cfg!(unix) { File::open(folder)?.sync_all() } else { Ok(()) }
 }

@@ -33,6 +33,14 @@ pub(super) fn open(path: &Path) -> Result<Opened, FormatError> {
     Ok(Opened { file, length, head })
 }
 
+/// Reads a whole file, if it has no more bytes than `limit`.
+///
+/// # Errors
+/// A file that cannot be read or is too large.
+pub fn read_whole(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
+    open(path)?.read_all(path, limit)
+}
+
 impl Opened {
     /// Returns all bytes of the file, if there are no more than `limit`.
     pub(super) fn read_all(mut self, path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {

@@ -15,13 +15,28 @@
 //! learns whether a start was taken, and by which a job and cycle is never handed over twice. **Taking a hand-over back stops no
 //! machine**: once a person has begun the job, only that person can stop it, and the notes say so.
 //!
-//! The files themselves are read and written behind [`Mailbox`].
+//! A hand-over is a folder that appears whole; a result is taken when it has stopped growing, has an end, and says, by its name or in
+//! itself, that it belongs to this part and this cycle; what does not belong is left where it is, and said. The files themselves are read
+//! and written behind [`Mailbox`].
 
+mod cmm;
 mod desk;
+mod error;
+mod grinder;
 mod mailbox;
+mod outbox;
+mod pattern;
+mod stations;
+mod watch;
 
+pub use cmm::{CmmExchange, CmmFolders, StationFiles, Stations};
 pub use desk::{ExchangeMachine, ExchangeTiming};
+pub use error::ExchangeError;
+pub use grinder::{GrinderExchange, GrinderFolders};
 pub use mailbox::{Confirmable, HandOver, Look, Mailbox, MailboxError, Standing, Step};
+pub use pattern::{Pattern, file_word};
+pub use stations::{PlacedStation, place_station};
+pub use watch::Watch;
 
 use crate::device::{CorrectionMap, Measurement, Pass, PassRecord, Plan};
 

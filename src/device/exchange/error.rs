@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-use super::super::error::FormatError;
+use crate::formats::FormatError;
 use crate::geometry::RigidError;
 
 /// Why a file that was exchanged with a machine is not taken. Lines count from 1.
@@ -13,20 +13,6 @@ pub enum ExchangeError {
     /// The file itself is not good.
     #[error(transparent)]
     Format(#[from] FormatError),
-    /// A statement such as `# cycle: 3` that says something impossible.
-    #[error("{path}, line {line}: `{key}` says `{found}`, expected {expected}; correct the line")]
-    Statement {
-        /// The file.
-        path: PathBuf,
-        /// The line.
-        line: u64,
-        /// What it is about.
-        key: &'static str,
-        /// What it says.
-        found: String,
-        /// What it may say.
-        expected: &'static str,
-    },
     /// Nothing tells centres from contact points.
     #[error(
         "{path}: neither the file nor the cell says whether the coordinates are probe centres or contact points, and a wrong guess is \
@@ -36,20 +22,6 @@ pub enum ExchangeError {
     CoordinatesUnstated {
         /// The file.
         path: PathBuf,
-    },
-    /// File and cell contradict each other.
-    #[error("{path}: the file says that {key} is {found}, the {by} says {expected}; correct one of them")]
-    Contradiction {
-        /// The file.
-        path: PathBuf,
-        /// What it is about.
-        key: &'static str,
-        /// What the file says.
-        found: String,
-        /// Who says otherwise: cell file, plan.
-        by: &'static str,
-        /// What that says.
-        expected: String,
     },
     /// Another number of points than the plan has targets.
     #[error(
@@ -63,18 +35,6 @@ pub enum ExchangeError {
         found: usize,
         /// Targets of the plan.
         expected: usize,
-    },
-    /// A number of a target that the plan does not have, or that came before.
-    #[error("{path}, line {line}: index `{found}` {why}; export the measurement of this plan")]
-    Index {
-        /// The file.
-        path: PathBuf,
-        /// The line.
-        line: u64,
-        /// What stands there.
-        found: String,
-        /// What is wrong with it.
-        why: &'static str,
     },
     /// The radius of the probe is not the plan's.
     #[error(
@@ -90,42 +50,6 @@ pub enum ExchangeError {
         expected_mm: f64,
         /// How much they may differ.
         limit_mm: f64,
-    },
-    /// More than one probe in one file.
-    #[error("{path}, line {line}: probe `{found}`, the lines above have `{first}`; export one file a probe")]
-    ProbeVaries {
-        /// The file.
-        path: PathBuf,
-        /// The line.
-        line: u64,
-        /// What stands there.
-        found: String,
-        /// What stood before.
-        first: String,
-    },
-    /// A file of reference points that cannot be understood.
-    #[error("{path}, line {line}: expected {expected}, found {found}; correct the file of reference points")]
-    Reference {
-        /// The file.
-        path: PathBuf,
-        /// The line.
-        line: usize,
-        /// What belongs there.
-        expected: &'static str,
-        /// What stands there.
-        found: String,
-    },
-    /// A group of reference points that is not there or not unique.
-    #[error(
-        "{path}: no single group `{wanted}` of reference points; there are {there}; name one of them in the cell file"
-    )]
-    Group {
-        /// The file.
-        path: PathBuf,
-        /// The group asked for.
-        wanted: String,
-        /// The groups in the file.
-        there: String,
     },
     /// A station that sees too few, or too many, reference points.
     #[error(

@@ -16,13 +16,10 @@ use std::time::SystemTime;
 
 use serde::{Deserialize, Serialize};
 
-use super::super::FormatError;
-use super::super::registration::{Draft, sync_folder};
-use super::super::{whole, write_json_atomic};
 use super::watch::Look;
-use super::{ExchangeError, file_word};
+use super::{ExchangeError, HandOver, MailboxError, Standing, file_word};
 use crate::device::Job;
-use crate::device::exchange::{HandOver, MailboxError, Standing};
+use crate::formats::{FormatError, read_whole, sync_folder, write_atomic, write_json_atomic};
 
 /// What every folder of a hand-over holds.
 const TICKET: &str = "handover.json";
@@ -165,12 +162,6 @@ impl Outbox {
         }
         Ok(write_json_atomic(lying.path.join(TAKEN), taken)?)
     }
-
-    /// Tries whether the folder can be written to.
-    pub(super) fn try_writing(folder: &Path) -> Result<(), ExchangeError> {
-        drop(Draft::create(&folder.join("probe"))?);
-        Ok(())
-    }
 }
 
 /// What the driver wants to know of a hand-over.
@@ -179,8 +170,8 @@ pub(super) fn hand_over(lying: &Lying) -> HandOver {
 }
 
 /// Says an error of this room in the driver's words.
-pub(super) fn told(error: ExchangeError) -> MailboxError {
-    match error {
+pub(super) fn told(error: impl Into<ExchangeError>) -> MailboxError {
+    match error.into() {
         ExchangeError::HandedOver { job, cycle, .. } => MailboxError::HandedOver { job, cycle },
         other => MailboxError::Files { why: other.to_string() },
     }
@@ -217,16 +208,9 @@ fn rename(from: &Path, to: &Path) -> Result<(), FormatError> {
     sync_folder(to).map_err(failed("bringing it to the disk"))
 }
 
-/// Writes a file whole or not at all.
-pub(super) fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), FormatError> {
-    let mut draft = Draft::create(path)?;
-    draft.write(bytes)?;
-    draft.publish()
-}
-
 /// Reads a small JSON file.
 pub(super) fn read_json<T: for<'de> Deserialize<'de>>(path: &Path) -> Result<T, FormatError> {
-    let bytes = whole::open(path)?.read_all(path, MOST_BYTES)?;
+    let bytes = read_whole(path, MOST_BYTES)?;
     serde_json::from_slice(&bytes).map_err(|error| FormatError::Unexpected {
         path: path.to_owned(),
         place: format!("line {}", error.line()),

@@ -5,7 +5,7 @@
 //! then has to look for.
 
 use super::ExchangeError;
-use super::references::{Reference, References};
+use crate::formats::references::{Reference, References};
 use crate::geometry::{Point, Pose, RigidFit, Vector, fit_rigid};
 
 /// With more nominal points than this no subsets are tried for a station that names none.

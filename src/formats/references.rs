@@ -7,10 +7,10 @@ use std::path::{Path, PathBuf};
 
 use saphyr_parser::{Event, Parser};
 
-use super::super::number::{Decimal, coordinate};
-use super::super::whole;
-use super::ExchangeError;
+use super::FormatError;
+use super::number::{Decimal, coordinate};
 use super::result::{Content, parse_result};
+use super::whole;
 use crate::geometry::Point;
 
 /// Largest file of reference points.
@@ -49,7 +49,7 @@ impl References {
 ///
 /// # Errors
 /// A file that cannot be read, a group that is not there, anything but finite numbers of millimetres where a point should be.
-pub fn read_references(path: &Path, group: Option<&str>) -> Result<References, ExchangeError> {
+pub fn read_references(path: &Path, group: Option<&str>) -> Result<References, FormatError> {
     let bytes = whole::open(path)?.read_all(path, MOST_BYTES)?;
     parse_references(path, &bytes, group)
 }
@@ -58,7 +58,7 @@ pub fn read_references(path: &Path, group: Option<&str>) -> Result<References, E
 ///
 /// # Errors
 /// Those of [`read_references`].
-pub fn parse_references(path: &Path, bytes: &[u8], group: Option<&str>) -> Result<References, ExchangeError> {
+pub fn parse_references(path: &Path, bytes: &[u8], group: Option<&str>) -> Result<References, FormatError> {
     let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
     let points = if ["yaml", "yml"].contains(&extension.as_str()) {
         from_yaml(path, bytes, group)?
@@ -77,8 +77,8 @@ pub fn parse_references(path: &Path, bytes: &[u8], group: Option<&str>) -> Resul
     Ok(References { path: path.to_owned(), points })
 }
 
-fn reference(path: &Path, line: usize, expected: &'static str, found: impl Into<String>) -> ExchangeError {
-    ExchangeError::Reference { path: path.to_owned(), line, expected, found: found.into() }
+fn reference(path: &Path, line: usize, expected: &'static str, found: impl Into<String>) -> FormatError {
+    FormatError::Reference { path: path.to_owned(), line, expected, found: found.into() }
 }
 
 /// A piece of a YAML file.
@@ -96,12 +96,12 @@ enum Tree {
     Mapping(Vec<Node>),
 }
 
-fn from_yaml(path: &Path, bytes: &[u8], group: Option<&str>) -> Result<Vec<Reference>, ExchangeError> {
+fn from_yaml(path: &Path, bytes: &[u8], group: Option<&str>) -> Result<Vec<Reference>, FormatError> {
     let text = std::str::from_utf8(bytes)
         .map_err(|error| reference(path, 1, "UTF-8 text", format!("another code at byte {}", error.valid_up_to())))?;
     let root = tree(path, text)?;
     let list = group_of(path, &root, group)?;
-    let point = |node: &Node, name: Option<&Node>| -> Result<Reference, ExchangeError> {
+    let point = |node: &Node, name: Option<&Node>| -> Result<Reference, FormatError> {
         let name = name.and_then(|n| if let Tree::Scalar(text) = &n.content { Some(text.clone()) } else { None });
         Ok(Reference { name, at: position(path, node)? })
     };
@@ -113,7 +113,7 @@ fn from_yaml(path: &Path, bytes: &[u8], group: Option<&str>) -> Result<Vec<Refer
 }
 
 /// Finds the group of points: the one of that name, the only one, or the whole file.
-fn group_of<'n>(path: &Path, root: &'n Node, group: Option<&str>) -> Result<&'n Node, ExchangeError> {
+fn group_of<'n>(path: &Path, root: &'n Node, group: Option<&str>) -> Result<&'n Node, FormatError> {
     let Tree::Mapping(pairs) = &root.content else { return Ok(root) };
     let named: Vec<(&str, &Node)> = pairs
         .chunks_exact(2)
@@ -126,7 +126,7 @@ fn group_of<'n>(path: &Path, root: &'n Node, group: Option<&str>) -> Result<&'n 
     let fits: Vec<&(&str, &Node)> = named.iter().filter(|(key, _)| group.is_none_or(|wanted| wanted == *key)).collect();
     match fits[..] {
         [(_, node)] => Ok(node),
-        _ => Err(ExchangeError::Group {
+        _ => Err(FormatError::Group {
             path: path.to_owned(),
             wanted: group.unwrap_or("any").to_owned(),
             there: named.iter().map(|(key, _)| *key).collect::<Vec<_>>().join(", "),
@@ -135,7 +135,7 @@ fn group_of<'n>(path: &Path, root: &'n Node, group: Option<&str>) -> Result<&'n 
 }
 
 /// Returns the position that a node holds: three numbers, or a list that begins with them.
-fn position(path: &Path, node: &Node) -> Result<Point, ExchangeError> {
+fn position(path: &Path, node: &Node) -> Result<Point, FormatError> {
     let mut inner = node;
     while let Tree::List(nodes) = &inner.content
         && let [first, ..] = &nodes[..]
@@ -154,7 +154,7 @@ fn position(path: &Path, node: &Node) -> Result<Point, ExchangeError> {
 }
 
 /// Builds the tree of a YAML file; the first document counts.
-fn tree(path: &Path, text: &str) -> Result<Node, ExchangeError> {
+fn tree(path: &Path, text: &str) -> Result<Node, FormatError> {
     let mut open: Vec<Node> = Vec::new();
     for event in Parser::new_from_str(text) {
         let (event, span) = event.map_err(|e| reference(path, e.marker().line(), "YAML", e.info().to_owned()))?;
@@ -191,7 +191,7 @@ fn tree(path: &Path, text: &str) -> Result<Node, ExchangeError> {
 mod tests {
     use super::*;
 
-    fn yaml(text: &str, group: Option<&str>) -> Result<Vec<Reference>, ExchangeError> {
+    fn yaml(text: &str, group: Option<&str>) -> Result<Vec<Reference>, FormatError> {
         parse_references(Path::new("ref.yaml"), text.as_bytes(), group).map(|r| r.points)
     }
 

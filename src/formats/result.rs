@@ -16,12 +16,11 @@
 use std::borrow::Cow;
 use std::path::Path;
 
-use super::super::error::excerpt;
-use super::super::layout::{Fields, Preamble, is_comment};
-use super::super::number::{Decimal, coordinate};
-use super::super::points::parse_points_with;
-use super::super::{FormatError, MapKind, MapPoints, parse_map, ply, whole};
-use super::ExchangeError;
+use super::error::excerpt;
+use super::layout::{Fields, Preamble, is_comment};
+use super::number::{Decimal, coordinate};
+use super::points::parse_points_with;
+use super::{FormatError, MapKind, MapPoints, parse_map, ply, whole};
 use crate::geometry::Point;
 
 /// Largest result file that is read.
@@ -118,9 +117,17 @@ pub struct ResultFile {
     pub statements: Statements,
 }
 
-/// Returns whether the last line of a text has its end; a file that was cut short in its last number has not.
-pub fn is_ended(text: &[u8]) -> bool {
-    ply::is_ply(text) || MapKind::of(text).is_some() || text.ends_with(b"\n")
+/// Checks that the last line of a text has its end; a file that was cut short in its last number has not.
+///
+/// # Errors
+/// The line that was cut.
+pub fn check_ended(path: &Path, text: &[u8]) -> Result<(), FormatError> {
+    if ply::is_ply(text) || MapKind::of(text).is_some() || text.ends_with(b"\n") {
+        return Ok(());
+    }
+    let line = text.split(|&b| b == b'\n').count() as u64;
+    let found = excerpt(text.rsplit(|&b| b == b'\n').next().unwrap_or_default());
+    Err(FormatError::CutLine { path: path.to_owned(), line, found })
 }
 
 /// Reads the bytes of a result file.
@@ -135,7 +142,7 @@ pub fn read_bytes(path: &Path) -> Result<Vec<u8>, FormatError> {
 ///
 /// # Errors
 /// A statement that says something impossible.
-pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, ExchangeError> {
+pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatError> {
     if MapKind::of(text).is_some() {
         return Ok(Statements { coordinates: Some(Coordinates::Contacts), ..Statements::default() });
     }
@@ -162,8 +169,8 @@ pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, ExchangeE
 
 impl Statements {
     /// Takes one statement; what is none of ours is only a comment.
-    fn take(&mut self, path: &Path, line: u64, key: &str, value: &str) -> Result<(), ExchangeError> {
-        let wrong = |key, expected| ExchangeError::Statement {
+    fn take(&mut self, path: &Path, line: u64, key: &str, value: &str) -> Result<(), FormatError> {
+        let wrong = |key, expected| FormatError::Statement {
             path: path.to_owned(),
             line,
             key,
@@ -216,8 +223,8 @@ impl Statements {
 /// Reads the text of a result file; `path` is what messages call it.
 ///
 /// # Errors
-/// Those of [`super::super::read_points`]; statements and columns that contradict the cell or each other.
-pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<ResultFile, ExchangeError> {
+/// Those of [`super::read_points`]; statements and columns that contradict the cell or each other.
+pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<ResultFile, FormatError> {
     let statements = read_statements(path, text)?;
     let coordinates = agreed_coordinates(path, &statements, content)?;
     if let Some(map) = parse_map(path, text) {
@@ -252,7 +259,7 @@ pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<Resul
     let kept: Vec<usize> = (0..points.len()).filter(|&k| on(k)).collect();
     let switched_off = points.len() - kept.len();
     if kept.is_empty() {
-        return Err(FormatError::NoData { path: path.to_owned(), expected: "points that are switched on" }.into());
+        return Err(FormatError::NoData { path: path.to_owned(), expected: "points that are switched on" });
     }
     Ok(ResultFile {
         indices: columns.indices.map(|all| kept.iter().map(|&k| all[k]).collect()),
@@ -277,9 +284,9 @@ fn without_unit(text: &[u8], unit_mm: f64) -> Cow<'_, [u8]> {
     Cow::Owned(kept.collect::<Vec<_>>().join(&b'\n'))
 }
 
-fn agreed_coordinates(path: &Path, says: &Statements, cell: &Content) -> Result<Option<Coordinates>, ExchangeError> {
+fn agreed_coordinates(path: &Path, says: &Statements, cell: &Content) -> Result<Option<Coordinates>, FormatError> {
     match (says.coordinates, cell.coordinates) {
-        (Some(found), Some(expected)) if found != expected => Err(ExchangeError::Contradiction {
+        (Some(found), Some(expected)) if found != expected => Err(FormatError::Contradiction {
             path: path.to_owned(),
             key: "coordinates",
             found: found.words().to_owned(),
@@ -290,9 +297,9 @@ fn agreed_coordinates(path: &Path, says: &Statements, cell: &Content) -> Result<
     }
 }
 
-fn agreed_unit(path: &Path, says: &Statements, cell: &Content) -> Result<f64, ExchangeError> {
+fn agreed_unit(path: &Path, says: &Statements, cell: &Content) -> Result<f64, FormatError> {
     match says.unit_mm {
-        Some(found) if found != cell.unit_mm => Err(ExchangeError::Contradiction {
+        Some(found) if found != cell.unit_mm => Err(FormatError::Contradiction {
             path: path.to_owned(),
             key: "the unit",
             found: format!("{found} mm"),
@@ -303,9 +310,9 @@ fn agreed_unit(path: &Path, says: &Statements, cell: &Content) -> Result<f64, Ex
     }
 }
 
-fn agreed_radius(path: &Path, stated: Option<f64>, column: Option<f64>) -> Result<Option<f64>, ExchangeError> {
+fn agreed_radius(path: &Path, stated: Option<f64>, column: Option<f64>) -> Result<Option<f64>, FormatError> {
     match (stated, column) {
-        (Some(stated), Some(column)) if (stated - column).abs() > 1e-6 => Err(ExchangeError::Contradiction {
+        (Some(stated), Some(column)) if (stated - column).abs() > 1e-6 => Err(FormatError::Contradiction {
             path: path.to_owned(),
             key: "the probe radius",
             found: format!("{stated} mm"),
@@ -328,7 +335,7 @@ struct Columns {
 
 impl Columns {
     /// Goes through the lines again for the columns that the header names; the points have been read from the same lines.
-    fn read(path: &Path, text: &[u8], points: usize) -> Result<Self, ExchangeError> {
+    fn read(path: &Path, text: &[u8], points: usize) -> Result<Self, FormatError> {
         let text = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(text);
         let mut preamble = Preamble::new(path);
         let mut lines = text.split(|&b| b == b'\n').map(|l| l.strip_suffix(b"\r").unwrap_or(l)).zip(1..);
@@ -376,7 +383,7 @@ impl Columns {
                 .ok()
                 .or_else(|| coordinate(&text, Decimal::Point).ok())
                 .filter(|v| *v > 0.0)
-                .ok_or_else(|| ExchangeError::Statement {
+                .ok_or_else(|| FormatError::Statement {
                     path: path.to_owned(),
                     line: layout.first_line,
                     key: "probe",
@@ -393,8 +400,8 @@ fn is_on(field: &[u8]) -> bool {
     !["unchecked", "false", "no", "0", "off", "disabled"].iter().any(|off| field.eq_ignore_ascii_case(off.as_bytes()))
 }
 
-fn whole_number(path: &Path, line: u64, field: &[u8]) -> Result<u32, ExchangeError> {
-    std::str::from_utf8(field).ok().and_then(|text| text.parse().ok()).ok_or_else(|| ExchangeError::Index {
+fn whole_number(path: &Path, line: u64, field: &[u8]) -> Result<u32, FormatError> {
+    std::str::from_utf8(field).ok().and_then(|text| text.parse().ok()).ok_or_else(|| FormatError::Index {
         path: path.to_owned(),
         line,
         found: excerpt(field),
@@ -403,14 +410,11 @@ fn whole_number(path: &Path, line: u64, field: &[u8]) -> Result<u32, ExchangeErr
 }
 
 /// Remembers the first probe of a file and refuses another one.
-fn same_probe(path: &Path, line: u64, field: &[u8], first: &mut Option<Vec<u8>>) -> Result<(), ExchangeError> {
+fn same_probe(path: &Path, line: u64, field: &[u8], first: &mut Option<Vec<u8>>) -> Result<(), FormatError> {
     match first {
-        Some(first) if first != field => Err(ExchangeError::ProbeVaries {
-            path: path.to_owned(),
-            line,
-            found: excerpt(field),
-            first: excerpt(first),
-        }),
+        Some(first) if first != field => {
+            Err(FormatError::ProbeVaries { path: path.to_owned(), line, found: excerpt(field), first: excerpt(first) })
+        }
         Some(_) => Ok(()),
         None => {
             *first = Some(field.to_owned());
@@ -423,7 +427,7 @@ fn same_probe(path: &Path, line: u64, field: &[u8], first: &mut Option<Vec<u8>>)
 mod tests {
     use super::*;
 
-    fn parse(text: &str, content: &Content) -> Result<ResultFile, ExchangeError> {
+    fn parse(text: &str, content: &Content) -> Result<ResultFile, FormatError> {
         parse_result(Path::new("r.csv"), text.as_bytes(), content)
     }
 
@@ -441,7 +445,7 @@ mod tests {
         assert_eq!((found.switched_off, found.probe_radius_mm, found.coordinates), (1, Some(19.05), None));
         assert_eq!(found.names.unwrap(), ["M1_1", "M1_1"]);
         let two = text.replacen("38.1 ", "12.7 ", 1);
-        assert!(matches!(parse(&two, &Content::default()), Err(ExchangeError::ProbeVaries { line: 3, .. })));
+        assert!(matches!(parse(&two, &Content::default()), Err(FormatError::ProbeVaries { line: 3, .. })));
     }
 
     #[test]
@@ -468,18 +472,18 @@ mod tests {
         }
         assert!(matches!(
             parse("index,x,y,z\n1.5,1,2,3\n", &Content::default()),
-            Err(ExchangeError::Index { line: 2, .. })
+            Err(FormatError::Index { line: 2, .. })
         ));
     }
 
     #[test]
     fn inches_are_converted_only_where_the_cell_says_so() {
         let text = "# units: inch\n1,2,4\n";
-        assert!(matches!(parse(text, &Content::default()), Err(ExchangeError::Contradiction { key: "the unit", .. })));
+        assert!(matches!(parse(text, &Content::default()), Err(FormatError::Contradiction { key: "the unit", .. })));
         let inch = Content { unit_mm: INCH_MM, ..Content::default() };
         assert_eq!(parse(text, &inch).unwrap().points, [Point::new(25.4, 50.8, 101.6)]);
         assert_eq!(parse("1,2,4\n", &inch).unwrap().points, [Point::new(25.4, 50.8, 101.6)]);
-        assert!(matches!(parse("# units: mm\n1,2,3\n", &inch), Err(ExchangeError::Contradiction { .. })));
+        assert!(matches!(parse("# units: mm\n1,2,3\n", &inch), Err(FormatError::Contradiction { .. })));
         assert!(parse("x_inch,y_inch,z_inch\n1,2,3\n", &Content::default()).is_err());
     }
 
@@ -505,6 +509,7 @@ mod tests {
 
     #[test]
     fn a_last_line_without_an_end_is_not_the_end() {
-        assert!(is_ended(b"1,2,3\n") && !is_ended(b"1,2,3") && !is_ended(b""));
+        let is_ended = |text: &str| check_ended(Path::new("r.csv"), text.as_bytes()).is_ok();
+        assert!(is_ended("1,2,3\n") && !is_ended("1,2,3") && !is_ended(""));
     }
 }

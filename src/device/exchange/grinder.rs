@@ -11,13 +11,13 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use super::ExchangeError;
 use super::cmm::earlier_files;
-use super::outbox::{Lying, Outbox, Taken, Ticket, hand_over, hex, told, unhex, write_atomic};
-use super::result::read_bytes;
+use super::outbox::{Lying, Outbox, Taken, Ticket, hand_over, hex, told, unhex};
 use super::watch::{Found, Watch};
-use crate::device::exchange::{Confirmable, GrindOrder, HandOver, Look, Mailbox, MailboxError, Standing, Step};
+use super::{Confirmable, ExchangeError, GrindOrder, HandOver, Look, Mailbox, MailboxError, Standing, Step};
 use crate::device::{CorrectionMap, Job, Outcome, PassRecord};
+use crate::formats::result::read_bytes;
+use crate::formats::{try_writing, write_atomic};
 
 /// What is taken for the part's temperature where no file tells it.
 const REFERENCE_TEMPERATURE_C: f64 = 20.0;
@@ -171,8 +171,8 @@ impl Mailbox for GrinderFolders {
     type Answer = PassRecord;
 
     fn open(&mut self) -> Result<Vec<HandOver>, MailboxError> {
-        Outbox::try_writing(&self.settings.outbox).map_err(told)?;
-        self.watch.look(Duration::ZERO).map_err(|error| told(error.into()))?;
+        try_writing(&self.settings.outbox).map_err(told)?;
+        self.watch.look(Duration::ZERO).map_err(told)?;
         Ok(self.outbox.list().map_err(told)?.iter().map(hand_over).collect())
     }
 
@@ -208,7 +208,7 @@ impl Mailbox for GrinderFolders {
     fn look(&mut self, now: Duration, job: Job) -> Result<Look<PassRecord>, MailboxError> {
         let lying = self.expect(job).map_err(told)?;
         self.since.get_or_insert(now);
-        let found = self.watch.look(now).map_err(|error| told(error.into()))?;
+        let found = self.watch.look(now).map_err(told)?;
         let mut said = Vec::new();
         if self.confirmation(STARTED, &lying, &found, &mut said).is_some() {
             self.started.get_or_insert(now);
@@ -245,7 +245,7 @@ impl Confirmable for GrinderFolders {
         }
         let name = if step == Step::Started { STARTED } else { DONE };
         let word = json_lines(&serde_json::json!(Confirmation::of(&lying.ticket)));
-        write_atomic(&self.settings.inbox.join(name), &word).map_err(|error| told(error.into()))
+        write_atomic(&self.settings.inbox.join(name), &word).map_err(told)
     }
 }
 

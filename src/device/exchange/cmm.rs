@@ -11,13 +11,15 @@ use std::time::Duration;
 use sha2::{Digest, Sha256};
 
 use super::outbox::{Lying, Outbox, Taken, Ticket, hand_over, hex, nanoseconds, told, unhex};
-use super::references::{References, parse_references, read_references};
-use super::result::{Content, Coordinates, ResultFile, is_ended, parse_result, read_bytes, read_statements};
 use super::stations::{PlacedStation, place_station};
 use super::watch::{Found, Look as FileLook, Watch};
-use super::{ExchangeError, Pattern};
-use crate::device::exchange::{HandOver, Look, Mailbox, MailboxError, MeasureOrder, Standing};
+use super::{ExchangeError, HandOver, Look, Mailbox, MailboxError, MeasureOrder, Pattern, Standing};
 use crate::device::{self, Job, MeasuredPoint, Measurement, Plan, PointStatus};
+use crate::formats::references::{References, parse_references, read_references};
+use crate::formats::result::{
+    Content, Coordinates, ResultFile, check_ended, parse_result, read_bytes, read_statements,
+};
+use crate::formats::{FormatError, try_writing};
 
 /// What is taken for the part's temperature where no file tells it.
 const REFERENCE_TEMPERATURE_C: f64 = 20.0;
@@ -234,12 +236,7 @@ impl CmmFolders {
     /// Reads a file of points and holds it against plan and cell.
     fn read(&self, expected: &Expected, path: &Path) -> Result<(ResultFile, String), ExchangeError> {
         let bytes = read_bytes(path)?;
-        if !is_ended(&bytes) {
-            let line = bytes.split(|&b| b == b'\n').count() as u64;
-            let last = bytes.rsplit(|&b| b == b'\n').next().unwrap_or_default();
-            let found = super::super::error::excerpt(last);
-            return Err(super::super::FormatError::CutLine { path: path.to_owned(), line, found }.into());
-        }
+        check_ended(path, &bytes)?;
         let sha = hex(&Sha256::digest(&bytes));
         self.check_not_taken(expected, path, &sha)?;
         let result = parse_result(path, &bytes, &self.settings.content)?;
@@ -291,11 +288,10 @@ impl CmmFolders {
         let mut all: Vec<MeasuredPoint> = targets.iter().map(|&index| not_found(index)).collect();
         let place: std::collections::HashMap<u32, usize> = targets.iter().enumerate().map(|(k, &t)| (t, k)).collect();
         for (row, (index, point)) in indices.iter().zip(&result.points).enumerate() {
-            let wrong =
-                |why| ExchangeError::Index { path: path(), line: row as u64 + 1, found: index.to_string(), why };
+            let wrong = |why| FormatError::Index { path: path(), line: row as u64 + 1, found: index.to_string(), why };
             let slot = *place.get(index).ok_or_else(|| wrong("is not a target of the plan"))?;
             if all[slot].status == PointStatus::Touched {
-                return Err(wrong("came before"));
+                return Err(wrong("came before").into());
             }
             all[slot] = touched(*index, (*point).into());
         }
@@ -432,13 +428,14 @@ impl CmmFolders {
             files.extend([(file.name.clone(), sha), (reference_file.name.clone(), hex(&Sha256::digest(&bytes)))]);
             if let Some(first) = results.first().filter(|first| first.coordinates != result.coordinates) {
                 let words = |c: Option<Coordinates>| format!("{c:?}").to_lowercase();
-                return Err(ExchangeError::Contradiction {
+                return Err(FormatError::Contradiction {
                     path: file.path.clone(),
                     key: "coordinates",
                     found: words(result.coordinates),
                     by: "first station",
                     expected: words(first.coordinates),
-                });
+                }
+                .into());
             }
             results.push(result);
         }
@@ -470,12 +467,15 @@ impl CmmFolders {
     fn says_otherwise(&self, expected: &Expected, file: &Found) -> Result<Option<ExchangeError>, ExchangeError> {
         let ticket = &expected.lying.ticket;
         let why = self.belongs(ticket, &Pattern::new("*"), file)?;
-        Ok(why.map(|found| ExchangeError::Contradiction {
-            path: file.path.clone(),
-            key: "the file",
-            found,
-            by: "plan",
-            expected: format!("part {} cycle {}", ticket.part, ticket.cycle),
+        Ok(why.map(|found| {
+            FormatError::Contradiction {
+                path: file.path.clone(),
+                key: "the file",
+                found,
+                by: "plan",
+                expected: format!("part {} cycle {}", ticket.part, ticket.cycle),
+            }
+            .into()
         }))
     }
 }
@@ -485,8 +485,8 @@ impl Mailbox for CmmFolders {
     type Answer = Measurement;
 
     fn open(&mut self) -> Result<Vec<HandOver>, MailboxError> {
-        Outbox::try_writing(&self.settings.outbox).map_err(told)?;
-        self.watch.look(Duration::ZERO).map_err(|error| told(error.into()))?;
+        try_writing(&self.settings.outbox).map_err(told)?;
+        self.watch.look(Duration::ZERO).map_err(told)?;
         Ok(self.outbox.list().map_err(told)?.iter().map(hand_over).collect())
     }
 
@@ -522,7 +522,7 @@ impl Mailbox for CmmFolders {
         let mut expected = self.expect(job).map_err(told)?;
         let since = *expected.since.get_or_insert(now);
         self.expected = Some(expected.clone());
-        let found = self.watch.look(now).map_err(|error| told(error.into()))?;
+        let found = self.watch.look(now).map_err(told)?;
         if let Some((_, look)) = self.judged.as_ref().filter(|(before, _)| *before == found) {
             return Ok(look.clone());
         }
