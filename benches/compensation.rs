@@ -105,7 +105,7 @@ fn spline(bencher: Bencher, spacing_mm: f64) {
 fn correction(bencher: Bencher, spacing_mm: f64) {
     let options = MapOptions::new(CUTOFF_MM, spacing_mm);
     let error = error_map(&READINGS, &options).expect("a map");
-    let now = Correction::none(error.net, 0.06);
+    let now = Correction::none(error.grid, 0.06);
     let begin = Knowledge::new(GainRule::Wavelength, &options, [FreeForm::WIDTH_MM, FreeForm::DEPTH_MM], None);
     let seen = Seen { correction: &now, error: &error, answer: None };
     let known = begin.after(&seen);

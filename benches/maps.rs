@@ -7,10 +7,10 @@
 use std::path::{Path, PathBuf};
 
 use divan::{Bencher, black_box};
-use regrind::compensation::{ErrorMap, Net};
+use regrind::compensation::ErrorMap;
 use regrind::form::{FormOptions, Sample, figures};
 use regrind::formats::{parse_x3p, write_error_map_x3p};
-use regrind::geometry::Aperture;
+use regrind::geometry::{Aperture, Grid};
 use regrind::report::HeatMap;
 
 fn main() {
@@ -33,14 +33,14 @@ fn samples(points: usize) -> Vec<Sample> {
 
 fn error_map(nodes: usize) -> ErrorMap {
     let columns = (nodes as f64).sqrt() as usize;
-    let net = Net {
+    let grid = Grid {
         columns,
         rows: columns,
         first_mm: [-51.0, -31.0],
         spacing_mm: [102.0 / columns as f64, 62.0 / columns as f64],
     };
-    let values_mm = (0..net.len()).map(|k| 1e-3 * (k as f64 * 0.01).sin()).collect();
-    ErrorMap::known(net, values_mm, (0..net.len()).map(|k| k % 11 != 3).collect())
+    let values_mm = (0..grid.len()).map(|k| 1e-3 * (k as f64 * 0.01).sin()).collect();
+    ErrorMap::known(grid, values_mm, (0..grid.len()).map(|k| k % 11 != 3).collect())
 }
 
 fn written(map: &ErrorMap) -> PathBuf {

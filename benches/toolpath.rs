@@ -1,18 +1,16 @@
 //! Speed of the path and of its program, by the number of points; `REGRIND_BENCH_LARGE=1` adds ten million.
 //!
-//! The part is a free form of 100 x 60 mm with a correction on a net of 1 mm. How many points there are is set by the distance of the
+//! The part is a free form of 100 x 60 mm with a correction on a grid of 1 mm. How many points there are is set by the distance of the
 //! tracks; the chord error is 0.1 um. Growth in time is linear, and nothing but one chunk of text is held in memory.
 
 use std::path::Path;
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
-use regrind::compensation::path::{Field, Lattice, Move, PathOptions, Summary, ToolPath, Wanted, Wheel};
-use regrind::compensation::{
-    Correction, CorrectionLimits, GainRule, Knowledge, MapOptions, Net, Reading, Seen, error_map,
-};
+use regrind::compensation::path::{Field, Move, PathOptions, Summary, ToolPath, Wanted, Wheel};
+use regrind::compensation::{Correction, CorrectionLimits, GainRule, Knowledge, MapOptions, Reading, Seen, error_map};
 use regrind::formats::gcode::{PathMode, ProgramHeader, write_program};
-use regrind::geometry::Aperture;
+use regrind::geometry::{Aperture, Grid};
 
 fn main() {
     divan::main();
@@ -29,9 +27,9 @@ fn sizes() -> Vec<u64> {
 
 /// A path of about so many points.
 fn path(points: u64) -> ToolPath {
-    let net = Net { columns: 101, rows: 61, first_mm: [-50.0, -30.0], spacing_mm: [1.0, 1.0] };
-    let values_mm = (0..net.len()).map(|k| error_mm(net.place_mm(k))).collect();
-    path_of(nominal(), &Correction { net, values_mm, cycle: 2, level_mm: 0.02 }, points)
+    let grid = Grid { columns: 101, rows: 61, first_mm: [-50.0, -30.0], spacing_mm: [1.0, 1.0] };
+    let values_mm = (0..grid.len()).map(|k| error_mm(grid.place_mm(k))).collect();
+    path_of(nominal(), &Correction { grid, values_mm, cycle: 2, level_mm: 0.02 }, points)
 }
 
 /// What the grinder left, in millimetres.
@@ -40,7 +38,7 @@ fn error_mm([x, y]: [f64; 2]) -> f64 {
 }
 
 fn nominal() -> Field {
-    let on = Lattice { columns: 263, rows: 163, first_mm: [-52.4, -32.4], spacing_mm: [0.4, 0.4] };
+    let on = Grid { columns: 263, rows: 163, first_mm: [-52.4, -32.4], spacing_mm: [0.4, 0.4] };
     let form = |x: f64, y: f64| {
         let (s, c) = (0.042 * x + 0.016 * y + 0.4).sin_cos();
         let slope = [x / 210.0 + 0.294 * c, -y / 155.0 + 0.112 * c];
@@ -134,7 +132,7 @@ fn from_deviations_to_a_program(bencher: Bencher) {
     let begin = Knowledge::new(GainRule::Wavelength, &options, [100.0, 60.0], None);
     bencher.bench(|| {
         let error = error_map(black_box(&readings), &options).expect("a map");
-        let now = Correction::none(error.net, 0.06);
+        let now = Correction::none(error.grid, 0.06);
         let known = begin.after(&Seen { correction: &now, error: &error, answer: None });
         let step = now.next(&error, &known, &limits).expect("a correction");
         let path = path_of(nominal(), &step.correction, 1_000_000);

@@ -12,10 +12,11 @@ use std::path::PathBuf;
 use common::path::{Step, error_mm, read};
 use common::program::run;
 use common::rs274::interpret;
-use regrind::compensation::{Correction, ErrorMap, Net};
+use regrind::compensation::{Correction, ErrorMap};
 use regrind::formats::{CorrectionIdentities, ErrorMapOrigin, write_correction, write_error_map};
+use regrind::geometry::Grid;
 
-const NET: Net = Net { columns: 121, rows: 81, first_mm: [-30.0, -20.0], spacing_mm: [0.5, 0.5] };
+const GRID: Grid = Grid { columns: 121, rows: 81, first_mm: [-30.0, -20.0], spacing_mm: [0.5, 0.5] };
 const PART: [u8; 32] = [0xab; 32];
 
 /// A folder with a map of the error over 60 x 40 mm and a program.
@@ -33,8 +34,8 @@ impl Bench {
 
     /// Writes the map as a run does it.
     fn save_error(&self, error: impl Fn(f64, f64) -> f64, ground_with: Option<[u8; 32]>) {
-        let values_mm = (0..NET.len()).map(|k| NET.place_mm(k)).map(|[x, y]| error(x, y)).collect();
-        let map = ErrorMap::known(NET, values_mm, vec![true; NET.len()]);
+        let values_mm = (0..GRID.len()).map(|k| GRID.place_mm(k)).map(|[x, y]| error(x, y)).collect();
+        let map = ErrorMap::known(GRID, values_mm, vec![true; GRID.len()]);
         let origin = ErrorMapOrigin { part: PART, cycle: 1, ground_with };
         write_error_map(&self.path("map.csv"), &map, &origin, true).unwrap();
     }
@@ -42,7 +43,7 @@ impl Bench {
     /// Writes a correction as a run does it, which has this map's identity.
     fn save_correction(&self, map: [u8; 32]) {
         let identities = CorrectionIdentities { part: PART, map, replaces: [1; 32] };
-        write_correction(&self.path("map.csv"), &Correction::none(NET, 0.02), &identities, true).unwrap();
+        write_correction(&self.path("map.csv"), &Correction::none(GRID, 0.02), &identities, true).unwrap();
     }
 
     fn path(&self, name: &str) -> PathBuf {

@@ -13,6 +13,7 @@ use regrind::device::{
     Answer, Cmm, Coordinates, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Machine, MachineKind,
     Measurement, Outcome, Pass, Plan, PointStatus, Reconciled, State, Target, TargetKind, digest,
 };
+use regrind::geometry::Grid;
 
 /// When the next file is said to have been written.
 static WRITTEN_S: AtomicU64 = AtomicU64::new(1_700_000_000);
@@ -364,10 +365,7 @@ fn stations_are_merged_by_their_reference_points() {
 
 fn map() -> CorrectionMap {
     CorrectionMap {
-        columns: 3,
-        rows: 2,
-        first_mm: [-1.0, 5.0],
-        spacing_mm: [0.5, 2.0],
+        grid: Grid { columns: 3, rows: 2, first_mm: [-1.0, 5.0], spacing_mm: [0.5, 2.0] },
         values_mm: vec![0.0, 1e-4, -2e-4, 0.0, 3e-3, 0.25],
         part_identity: [7; 32],
     }

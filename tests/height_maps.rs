@@ -15,7 +15,7 @@ use regrind::device::{Coordinates, Identified, Job, Measurement, Plan, digest};
 use regrind::drive::{CycleRow, Drive, Notice, Run};
 use regrind::formats::result::{Content, Coordinates as Said};
 use regrind::formats::{self, HeightMap, MapRecord, X3pFile, read_measured, read_x3p, write_x3p};
-use regrind::geometry::Pose;
+use regrind::geometry::{Grid, Pose};
 use regrind::journal::{Header, Journal};
 use regrind::recipe::Recipe;
 use regrind::setup;
@@ -308,7 +308,7 @@ async fn an_interferometers_maps_close_the_loop() {
     // The record holds what was measured and what was made of it.
     let cycle = ran.folder.join(format!("cycle-{}", last.cycle));
     let X3pFile::Map(map) = read_x3p(cycle.join("error_map.x3p")).unwrap() else { panic!("a map") };
-    assert!(map.columns > 90 && map.measured_count() > 5000 && map.rms_mm() < 1e-3);
+    assert!(map.grid.columns > 90 && map.measured_count() > 5000 && map.rms_mm() < 1e-3);
     assert!(fs::read_to_string(cycle.join("registration.json")).unwrap().contains("\"weak_directions\": []"));
     let figures: Value = serde_json::from_slice(&fs::read(cycle.join("figures.json")).unwrap()).unwrap();
     let rows = figures["figures"].as_array().unwrap();
@@ -333,7 +333,12 @@ async fn an_interferometers_maps_close_the_loop() {
 /// The maps of a small surface in each format, with one sample that was not measured.
 fn small_maps(folder: &Path) -> Vec<(PathBuf, HeightMap)> {
     let sample = |k: usize| (k != 7).then_some(1e-3 * (k as f64 - 5.0));
-    let map = HeightMap::new(Path::new("map"), [5, 4], [0.0; 2], [0.25, 0.25], (0..20).map(sample)).unwrap();
+    let map = HeightMap::new(
+        Path::new("map"),
+        Grid { columns: 5, rows: 4, first_mm: [0.0; 2], spacing_mm: [0.25; 2] },
+        (0..20).map(sample),
+    )
+    .unwrap();
     let record = MapRecord {
         date: "2026-03-01T12:00:00Z".into(),
         creator: "a test".into(),
@@ -428,7 +433,12 @@ fn a_map_is_registered_from_the_command_line_as_contact_points() {
         let [x, y] = [f64::from((k % 100) as u16) * 0.5 - 25.0, f64::from((k / 100) as u16) * 0.5 - 15.0];
         (k % 13 != 5).then(|| shape.height(x - dx, y - dy) + dz)
     };
-    let map = HeightMap::new(Path::new("map"), [100, 60], [-25.0, -15.0], [0.5; 2], (0..6000).map(height)).unwrap();
+    let map = HeightMap::new(
+        Path::new("map"),
+        Grid { columns: 100, rows: 60, first_mm: [-25.0, -15.0], spacing_mm: [0.5; 2] },
+        (0..6000).map(height),
+    )
+    .unwrap();
     let record = MapRecord {
         date: "2026-03-01T12:00:00Z".into(),
         creator: "a test".into(),

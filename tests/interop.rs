@@ -10,12 +10,13 @@ use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use regrind::compensation::{ErrorMap, Net};
+use regrind::compensation::ErrorMap;
 use regrind::device::{
     Cmm, Coordinates, CorrectionMap, Grinder, Identified, Interrupt, Job, Machine, MachineKind, ModbusCmm,
     ModbusGrinder, ModbusSettings, Outcome, Pass, Plan, PointStatus, State, Status, Target, TargetKind, Wire, digest,
 };
 use regrind::formats::write_error_map_x3p;
+use regrind::geometry::Grid;
 use regrind::journal::verify;
 use regrind_sim::body::Kind;
 use regrind_sim::registers::{self, MachineOptions};
@@ -178,10 +179,7 @@ async fn our_driver_has_a_pymodbus_grinder_grind() {
     grinder.connect().await.unwrap();
     grinder.claim().await.unwrap();
     let map = CorrectionMap {
-        columns: 30,
-        rows: 20,
-        first_mm: [0.0, 0.0],
-        spacing_mm: [1.0, 1.5],
+        grid: Grid { columns: 30, rows: 20, first_mm: [0.0, 0.0], spacing_mm: [1.0, 1.5] },
         values_mm: (0..600).map(|k| 1e-5 * f64::from(k)).collect(),
         part_identity: [3; 32],
     };
@@ -299,10 +297,10 @@ async fn a_pymodbus_client_has_our_simulated_cmm_measure() {
 #[test]
 fn our_x3p_opens_in_another_reader_with_equal_values() {
     let Some(python) = python() else { return };
-    let net = Net { columns: 31, rows: 17, first_mm: [-51.0, -31.0], spacing_mm: [3.4, 3.875] };
-    let values_mm: Vec<f64> = (0..net.len()).map(|k| 1e-3 * (0.37 * k as f64).sin() + 1e-9 * k as f64).collect();
-    let valid: Vec<bool> = (0..net.len()).map(|k| k % 7 != 3).collect();
-    let map = ErrorMap::known(net, values_mm, valid);
+    let grid = Grid { columns: 31, rows: 17, first_mm: [-51.0, -31.0], spacing_mm: [3.4, 3.875] };
+    let values_mm: Vec<f64> = (0..grid.len()).map(|k| 1e-3 * (0.37 * k as f64).sin() + 1e-9 * k as f64).collect();
+    let valid: Vec<bool> = (0..grid.len()).map(|k| k % 7 != 3).collect();
+    let map = ErrorMap::known(grid, values_mm, valid);
     let home = tempfile::tempdir().unwrap();
     let path = home.path().join("error_map.x3p");
     write_error_map_x3p(&path, &map, "2026-03-01T12:00:00Z", true).unwrap();
@@ -313,9 +311,9 @@ fn our_x3p_opens_in_another_reader_with_equal_values() {
     assert_eq!((&read["columns"], &read["rows"]), (&31.into(), &17.into()));
     let list = |name: &str| -> Vec<Option<f64>> { serde_json::from_value(read[name].clone()).unwrap() };
     let (x, y, z) = (list("x_m"), list("y_m"), list("z_m"));
-    assert_eq!([x.len(), y.len(), z.len()], [net.len(); 3]);
-    for k in 0..net.len() {
-        let [px, py] = net.place_mm(k);
+    assert_eq!([x.len(), y.len(), z.len()], [grid.len(); 3]);
+    for k in 0..grid.len() {
+        let [px, py] = grid.place_mm(k);
         let is = |found: Option<f64>, mm: f64| found.is_some_and(|m| (1e3 * m - mm).abs() <= 1e-12 * mm.abs().max(1.0));
         assert!(is(x[k], px) && is(y[k], py), "{k}: {:?} {:?}", x[k], y[k]);
         assert_eq!(

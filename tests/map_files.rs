@@ -9,11 +9,12 @@ use std::path::{Path, PathBuf};
 
 use md5::{Digest, Md5};
 use proptest::prelude::*;
-use regrind::compensation::{ErrorMap, Net};
+use regrind::compensation::ErrorMap;
 use regrind::formats::{
     FormatError, HeightMap, MapRecord, X3pFile, parse_metropro, parse_sdf, parse_x3p, read_measured, read_metropro,
     read_sdf, read_x3p, write_error_map_x3p, write_x3p,
 };
+use regrind::geometry::Grid;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
@@ -118,13 +119,17 @@ fn every_valid_x3p_map_is_read() {
     for known in KNOWN {
         let file = known.file;
         let X3pFile::Map(map) = read_x3p(folder.join(file)).unwrap() else { panic!("{file} is a map") };
-        assert_eq!(([map.columns, map.rows], map.measured_count()), (known.size, known.measured), "{file}");
-        assert!((0..2).all(|k| is_about(map.spacing_mm[k], known.spacing_mm[k])), "{file}: {:?}", map.spacing_mm);
+        assert_eq!(([map.grid.columns, map.grid.rows], map.measured_count()), (known.size, known.measured), "{file}");
+        assert!(
+            (0..2).all(|k| is_about(map.grid.spacing_mm[k], known.spacing_mm[k])),
+            "{file}: {:?}",
+            map.grid.spacing_mm
+        );
         let measured = map.points();
         let (low, high) = measured.iter().fold((f64::MAX, f64::MIN), |(l, h), p| (l.min(p.z), h.max(p.z)));
         assert!(is_about(low, known.range_mm[0]) && is_about(high, known.range_mm[1]), "{file}: {low} {high}");
         let (column, row, height) = known.sample;
-        let found = map.heights_mm[row * map.columns + column];
+        let found = map.heights_mm[row * map.grid.columns + column];
         assert!(height.is_nan() || (found / height - 1.0).abs() < 1e-8, "{file}: {found}");
         assert_eq!(read_measured(folder.join(file)).unwrap(), measured);
         assert_eq!(map.notes.is_empty(), !file.contains("sample-land"), "{file}: {:?}", map.notes);
@@ -166,9 +171,13 @@ fn both_zygo_maps_have_the_figures_that_others_found() {
         let map = read_metropro(folder.join(file)).unwrap();
         let [pv, rms] = [1e6 * map.pv_mm(), 1e6 * map.rms_mm()];
         println!("{file}: PV {pv:.3} nm, RMS {rms:.4} nm, {} of {} measured", map.measured_count(), map.valid.len());
-        assert_eq!(([map.columns, map.rows], map.measured_count()), (size, measured), "{file}");
+        assert_eq!(([map.grid.columns, map.grid.rows], map.measured_count()), (size, measured), "{file}");
         assert!((pv - pv_nm).abs() < 5e-3 && (rms - rms_nm).abs() < 5e-4, "{file}: {pv} {rms}");
-        assert!(map.spacing_mm.iter().all(|spacing| is_about(*spacing, pitch_mm)), "{file}: {:?}", map.spacing_mm);
+        assert!(
+            map.grid.spacing_mm.iter().all(|spacing| is_about(*spacing, pitch_mm)),
+            "{file}: {:?}",
+            map.grid.spacing_mm
+        );
         assert_eq!(read_measured(folder.join(file)).unwrap().len(), measured);
     }
 }
@@ -178,8 +187,8 @@ fn the_softgauge_is_read_from_text() {
     let Some(folder) = data("x3p-sdf-samples") else { return };
     for file in ["surfacetopography/sdf-1.sdf", "surfalize/test_ascii.sdf"] {
         let map = read_sdf(folder.join(file)).unwrap();
-        assert_eq!(([map.columns, map.rows], map.measured_count()), ([7, 4], 28), "{file}");
-        assert!(map.spacing_mm.iter().all(|spacing| is_about(*spacing, 1e-3)));
+        assert_eq!(([map.grid.columns, map.grid.rows], map.measured_count()), ([7, 4], 28), "{file}");
+        assert!(map.grid.spacing_mm.iter().all(|spacing| is_about(*spacing, 1e-3)));
         for (k, height) in [(0, 1e-3), (12, 0.96736e-3), (27, 0.97986e-3)] {
             assert!(is_about(map.heights_mm[k], height), "{file}: {}", map.heights_mm[k]);
         }
@@ -248,7 +257,7 @@ fn heights_of_every_type_are_read_and_what_is_no_number_was_not_measured() {
     for (kind, increment, data) in [("I", 1e-3, &shorts), ("L", 1e-3, &longs)] {
         let map = map(parsed(&main_xml(kind, increment, ""), data));
         assert!(map.heights_mm.iter().zip(&heights).all(|(a, b)| is_about(*a, *b)), "{kind}: {:?}", map.heights_mm);
-        assert_eq!((map.spacing_mm, map.first_mm, map.measured_count()), ([1.0, 1.0], [0.0, 0.0], 6));
+        assert_eq!((map.grid.spacing_mm, map.grid.first_mm, map.measured_count()), ([1.0, 1.0], [0.0, 0.0], 6));
     }
     assert_eq!(map(parsed(&main_xml("F", 1.0, ""), &singles)).heights_mm[5], 1750.0);
     let bad = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 0.25, 0.0, 1.0];
@@ -350,9 +359,9 @@ fn a_container_that_swells_is_refused_before_it_does() {
 // ---- X3P written --------------------------------------------------------------------------------------------------------------------
 
 fn error_map() -> ErrorMap {
-    let net = Net { columns: 7, rows: 5, first_mm: [-51.0, -31.0], spacing_mm: [17.0, 15.5] };
+    let grid = Grid { columns: 7, rows: 5, first_mm: [-51.0, -31.0], spacing_mm: [17.0, 15.5] };
     let values_mm = (0..35).map(|k| 1e-3 * f64::from(k).sin()).collect();
-    ErrorMap::known(net, values_mm, (0..35).map(|k| k % 6 != 2).collect())
+    ErrorMap::known(grid, values_mm, (0..35).map(|k| k % 6 != 2).collect())
 }
 
 #[test]
@@ -365,9 +374,9 @@ fn a_written_map_reads_back_and_is_the_same_each_time() {
     }
     assert_eq!(fs::read(&path).unwrap(), fs::read(&again).unwrap());
     let X3pFile::Map(read) = read_x3p(&path).unwrap() else { panic!("a map") };
-    assert_eq!((read.columns, read.rows, &read.valid), (7, 5, &written.valid));
-    assert!((0..2).all(|k| is_about(read.first_mm[k], written.net.first_mm[k])));
-    assert!((0..2).all(|k| is_about(read.spacing_mm[k], written.net.spacing_mm[k])));
+    assert_eq!((read.grid.columns, read.grid.rows, &read.valid), (7, 5, &written.valid));
+    assert!((0..2).all(|k| is_about(read.grid.first_mm[k], written.grid.first_mm[k])));
+    assert!((0..2).all(|k| is_about(read.grid.spacing_mm[k], written.grid.spacing_mm[k])));
     for (k, valid) in read.valid.iter().enumerate() {
         let expected = if *valid { written.values_mm[k] } else { 0.0 };
         assert!(is_about(read.heights_mm[k], expected), "{k}");
@@ -386,7 +395,12 @@ fn a_written_map_reads_back_and_is_the_same_each_time() {
 fn whatever_the_words_the_document_is_well_formed() {
     let home = tempfile::tempdir().unwrap();
     let path = home.path().join("m.x3p");
-    let map = HeightMap::new(&path, [2, 2], [0.0; 2], [1.0; 2], [Some(1.0), None, Some(0.5), Some(-1e-9)]).unwrap();
+    let map = HeightMap::new(
+        &path,
+        Grid { columns: 2, rows: 2, first_mm: [0.0; 2], spacing_mm: [1.0; 2] },
+        [Some(1.0), None, Some(0.5), Some(-1e-9)],
+    )
+    .unwrap();
     let odd = "a < b & \"c\" ]]> \u{1}\u{ffff} µm".to_owned();
     let record = MapRecord { date: odd.clone(), creator: odd.clone(), instrument: odd.clone(), comment: odd };
     write_x3p(&path, &map, &record).unwrap();
@@ -402,7 +416,7 @@ const SDF: &str = "aISO-1.0\r\nManufacID = x\r\nCreateDate = 010120260000\r\nNum
 #[test]
 fn sdf_text_is_read_and_its_faults_are_named() {
     let read = parse_sdf(Path::new("s"), SDF.as_bytes()).unwrap();
-    assert_eq!((read.columns, read.rows, read.spacing_mm), (3, 2, [1.0, 2.0]));
+    assert_eq!((read.grid.columns, read.grid.rows, read.grid.spacing_mm), (3, 2, [1.0, 2.0]));
     assert_eq!((read.valid[2], read.measured_count()), (false, 5));
     assert!(is_about(read.heights_mm[1], 2.5e-3) && is_about(read.heights_mm[5], 0.06));
     for (from, to, expected) in [
@@ -454,7 +468,7 @@ fn sdf_binary_is_read_in_every_type() {
     for (kind, heights, measured) in cases {
         for extra in [&[][..], &[5, 0, 0, 0, 1, 0, 0, 0]] {
             let read = parse_sdf(Path::new("s"), &binary_sdf(kind, &heights, extra)).unwrap();
-            assert_eq!((read.measured_count(), read.spacing_mm), (measured, [1.0, 2.0]), "type {kind}");
+            assert_eq!((read.measured_count(), read.grid.spacing_mm), (measured, [1.0, 2.0]), "type {kind}");
             assert!(
                 (0..5).all(|k| is_about(read.heights_mm[k], 1e-3 * k as f64)),
                 "type {kind}: {:?}",
@@ -485,7 +499,7 @@ fn metropro() -> Vec<u8> {
 fn metropro_is_read_from_the_top_and_its_faults_are_named() {
     let good = metropro();
     let read = parse_metropro(Path::new("z"), &good).unwrap();
-    assert_eq!((read.valid.clone(), read.first_mm), (vec![true, true, true, false], [0.0; 2]));
+    assert_eq!((read.valid.clone(), read.grid.first_mm), (vec![true, true, true, false], [0.0; 2]));
     // Half a wave of 625 nm is 32768 steps; the lower row comes last in the file.
     let wave_mm = f64::from(6.25e-7f32) * 1e3;
     for (found, waves) in read.heights_mm.iter().zip([-0.5, 1.0, 0.5 / 32768.0, 0.0]) {

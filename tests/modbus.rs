@@ -14,6 +14,7 @@ use regrind::device::{
     MachineKind, Measurement, ModbusCmm, ModbusGrinder, ModbusSettings, Outcome, Parity, Pass, Plan, PointStatus,
     Reconciled, RegisterMap, Signal, SignalType, State, Target, TargetKind, Wire, WordOrder, digest,
 };
+use regrind::geometry::Grid;
 use regrind_sim::body::Kind;
 use regrind_sim::registers::{Layout, MachineOptions};
 use regrind_sim::wire::Serving;
@@ -84,10 +85,7 @@ fn plan(points: u32) -> Plan {
 
 fn map_and_pass() -> (CorrectionMap, Pass) {
     let map = CorrectionMap {
-        columns: 20,
-        rows: 30,
-        first_mm: [-10.0, -15.0],
-        spacing_mm: [1.0, 1.0],
+        grid: Grid { columns: 20, rows: 30, first_mm: [-10.0, -15.0], spacing_mm: [1.0, 1.0] },
         values_mm: (0..600).map(|k| 1e-3 * f64::from(k % 17)).collect(),
         part_identity: [7; 32],
     };

@@ -168,7 +168,7 @@ fn with_the_normals_of_the_nominal_surface_it_would_not_hold() {
     // The check must be able to fail: a ball whose correction was added along z alone is seen at once.
     let part = part("freeform-mirror");
     let correction = correction(part.half_mm);
-    let flat = regrind::compensation::Correction { values_mm: vec![0.0; correction.net.len()], ..correction };
+    let flat = regrind::compensation::Correction { values_mm: vec![0.0; correction.grid.len()], ..correction };
     let (path, _) = part.programs.path(&flat).unwrap();
     let steps: Vec<Step> = path
         .moves()

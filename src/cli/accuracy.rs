@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::formats::NominalFile;
-use regrind::surface::accuracy::{Accuracy, Estimate, Figures, Net, Trust, accuracy};
+use regrind::surface::accuracy::{Accuracy, Estimate, Figures, Samples, Trust, accuracy};
 use serde::Serialize;
 
 use super::failure::Failure;
@@ -91,12 +91,12 @@ fn judge(arguments: &Arguments) -> Result<Accuracy, Failure> {
     let projection = arguments.projection.into();
     match nominal::read(path, arguments.projection)? {
         NominalFile::Points(points) | NominalFile::Mesh { points, .. } => {
-            accuracy(Net::Points { points: &points, projection })
+            accuracy(Samples::Points { points: &points, projection })
         }
         NominalFile::Definition(text) => {
             let (grid, _) = nominal::sampled(path, &text)?;
             let (columns, rows) = (grid.columns, grid.rows);
-            accuracy(Net::Grid { columns, rows, points: &grid.points, normals: &grid.normals })
+            accuracy(Samples::Grid { columns, rows, points: &grid.points, normals: &grid.normals })
         }
     }
     .map_err(|source| Failure::Nominal { path: path.clone(), source })

@@ -3,9 +3,10 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use regrind::compensation::Correction;
 use regrind::compensation::path::{Wanted, height_of, spline_of};
-use regrind::compensation::{Correction, Net};
 use regrind::formats::gcode::{AlongNormals, Amendment, MapKind, correct_program, read_program_map};
+use regrind::geometry::Grid;
 use serde::Serialize;
 
 use super::failure::Failure;
@@ -79,8 +80,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let sign = if map.kind == MapKind::Error { -arguments.gain } else { arguments.gain };
     let values_mm = map.values_mm.iter().map(|v| sign * v).collect();
     let tip_mm = arguments.tip_of_radius.unwrap_or(0.0);
-    let level_off_mm = LEVEL_OFF_NODES * map.net.spacing_mm[0].max(map.net.spacing_mm[1]);
-    let shift = spline_of(&Correction { net: map.net, values_mm, cycle: 1, level_mm: 0.0 }, level_off_mm);
+    let level_off_mm = LEVEL_OFF_NODES * map.grid.spacing_mm[0].max(map.grid.spacing_mm[1]);
+    let shift = spline_of(&Correction { grid: map.grid, values_mm, cycle: 1, level_mm: 0.0 }, level_off_mm);
     let ground = arguments.nominal.as_ref().map(|file| ground(file)).transpose()?;
     let amendment = Amendment {
         shift: &shift,
@@ -110,7 +111,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
-/// Beyond its net a map is levelled off within so many nodes.
+/// Beyond its grid a map is levelled off within so many nodes.
 const LEVEL_OFF_NODES: f64 = 5.0;
 
 /// Reads the nominal surface.
@@ -119,6 +120,6 @@ fn ground(file: &std::path::Path) -> Result<Wanted, Failure> {
     let surface = nominal::surface(file, read, ProjectionName::Auto)?;
     let failed = |source| Failure::Path { path: file.to_owned(), source };
     let (field, _) = height_of(&surface).map_err(failed)?;
-    let net = Net { columns: 1, rows: 1, first_mm: [0.0; 2], spacing_mm: [1.0; 2] };
-    Wanted::new(field, &Correction::none(net, 0.0), 1.0).map_err(failed)
+    let grid = Grid { columns: 1, rows: 1, first_mm: [0.0; 2], spacing_mm: [1.0; 2] };
+    Wanted::new(field, &Correction::none(grid, 0.0), 1.0).map_err(failed)
 }

@@ -6,6 +6,7 @@
 use sha2::{Digest, Sha256};
 
 use super::{Command, CorrectionMap, Identified, Job, MeasuredPoint, Outcome, Pass, Plan, PointStatus};
+use crate::geometry::Grid;
 
 /// In which order the registers of a longer value are sent. The bytes within a register are high byte first always.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
@@ -278,23 +279,25 @@ impl Payload for CorrectionMap {
 
     fn words(&self, order: WordOrder) -> Vec<u16> {
         let largest_mm = self.values_mm.iter().fold(0.0, |most: f64, value| most.max(value.abs()));
+        let Grid { columns, rows, first_mm, spacing_mm } = self.grid;
         let mut map = Writer::new(order);
-        map.u16(1).u16(1).u32(self.columns as u32).u32(self.rows as u32).u32(0);
-        map.f64s(&self.first_mm).f64s(&self.spacing_mm).f64(largest_mm).zeros(4).identity(&self.part_identity);
+        map.u16(1).u16(1).u32(columns as u32).u32(rows as u32).u32(0);
+        map.f64s(&first_mm).f64s(&spacing_mm).f64(largest_mm).zeros(4).identity(&self.part_identity);
         map.f64s(&self.values_mm);
         map.finish()
     }
 
     fn flaw(&self) -> Option<(String, f64, &'static str)> {
-        let nodes = self.columns.checked_mul(self.rows);
+        let Grid { columns, rows, first_mm, spacing_mm } = self.grid;
+        let nodes = columns.checked_mul(rows);
         if nodes != Some(self.values_mm.len()) {
             return Some(("the number of values".into(), self.values_mm.len() as f64, "columns times rows"));
         }
-        if !(2..=65_535).contains(&self.columns) || !(2..=65_535).contains(&self.rows) {
-            return Some(("the number of columns or rows".into(), self.columns.min(self.rows) as f64, "2 to 65,535"));
+        if !(2..=65_535).contains(&columns) || !(2..=65_535).contains(&rows) {
+            return Some(("the number of columns or rows".into(), columns.min(rows) as f64, "2 to 65,535"));
         }
-        not_positive([("spacing_mm along x", self.spacing_mm[0]), ("spacing_mm along y", self.spacing_mm[1])])
-            .or_else(|| not_finite([("first_mm x", self.first_mm[0]), ("first_mm y", self.first_mm[1])]))
+        not_positive([("spacing_mm along x", spacing_mm[0]), ("spacing_mm along y", spacing_mm[1])])
+            .or_else(|| not_finite([("first_mm x", first_mm[0]), ("first_mm y", first_mm[1])]))
             .or_else(|| not_finite(self.values_mm.iter().map(|value| ("a value of the map", *value))))
     }
 }
@@ -495,10 +498,7 @@ mod tests {
     #[test]
     fn map_and_pass_are_laid_out_as_the_contract_says() {
         let map = CorrectionMap {
-            columns: 2,
-            rows: 3,
-            first_mm: [-1.0, -2.0],
-            spacing_mm: [2.0, 4.0],
+            grid: Grid { columns: 2, rows: 3, first_mm: [-1.0, -2.0], spacing_mm: [2.0, 4.0] },
             values_mm: vec![0.0, 0.5, -0.25, 0.0, 0.0, 1.0],
             part_identity: [0xab; 32],
         };

@@ -1,5 +1,7 @@
 //! What is carried to a machine and what comes back.
 
+use crate::geometry::Grid;
+
 /// Something that is carried as one string of bytes and known by the SHA-256 of it.
 pub trait Identified {
     /// The SHA-256 of the payload's bytes, high words first, whatever the order on the wire.
@@ -50,15 +52,9 @@ pub struct Plan {
 /// material. It is absolute: it replaces the one before.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CorrectionMap {
-    /// Nodes along x.
-    pub columns: usize,
-    /// Nodes along y.
-    pub rows: usize,
-    /// The first node, in the model frame.
-    pub first_mm: [f64; 2],
-    /// The spacing along x and y.
-    pub spacing_mm: [f64; 2],
-    /// Row by row, x fastest; `columns * rows` of them.
+    /// Where its nodes are, in the model frame.
+    pub grid: Grid,
+    /// One for each node.
     pub values_mm: Vec<f64>,
     /// The identity of the part's nominal surface.
     pub part_identity: [u8; 32],

@@ -29,10 +29,7 @@ pub(super) fn save_figures(
     let options = FormOptions { aperture: task.nominal.outline().cloned(), ..FormOptions::default() };
     let made = figures(&samples, &options);
     let cutoff_mm = task.map.cutoff_mm;
-    let slopes = map.map(|map| {
-        let size = [map.net.columns, map.net.rows];
-        slope(size, map.net.spacing_mm, &map.values_mm, &map.valid, INTEGRATION * cutoff_mm)
-    });
+    let slopes = map.map(|map| slope(&map.grid, &map.values_mm, &map.valid, INTEGRATION * cutoff_mm));
     let slopes = slopes.as_ref().map(Result::as_ref);
     write_figures(&folder.join("figures.json"), made.as_ref(), slopes, &taken_out(task), task.simulation)
 }

@@ -115,10 +115,10 @@ impl Programs {
         map_identity: [u8; 32],
         path: &ToolPath,
     ) -> Result<(), ProgramError> {
-        let none = Correction { values_mm: vec![0.0; correction.net.len()], ..correction.clone() };
+        let none = Correction { values_mm: vec![0.0; correction.grid.len()], ..correction.clone() };
         let before = Wanted::new(self.ground.0.clone(), &none, 1.0)?;
-        let offsets = axis_offsets(&before, path.wanted(), &self.options.wheel, &correction.net)?;
-        write_axis_table(file, &correction.net, &offsets, &map_identity, self.simulation).map_err(GcodeError::from)?;
+        let offsets = axis_offsets(&before, path.wanted(), &self.options.wheel, &correction.grid)?;
+        write_axis_table(file, &correction.grid, &offsets, &map_identity, self.simulation).map_err(GcodeError::from)?;
         Ok(())
     }
 

@@ -9,8 +9,8 @@ use std::sync::Arc;
 use crate::cell::{CompensationRefusal, CompensationSummary, Event, Figures, Forecast, Gate, GateFailure, Response};
 use crate::compensation::path::{PathError, Summary, ToolPath};
 use crate::compensation::{
-    self, Correction, CorrectionLimits, ErrorMap, GainRule, Knowledge, MapOptions, Net, Reading, Seen, Sense,
-    StepError, error_map, response,
+    self, Correction, CorrectionLimits, ErrorMap, GainRule, Knowledge, MapOptions, Reading, Seen, Sense, StepError,
+    error_map, response,
 };
 use crate::device::{Coordinates, CorrectionMap, Identified, Measurement, Pass, Plan, PointStatus, Target, TargetKind};
 use crate::formats::gcode::GcodeError;
@@ -18,7 +18,7 @@ use crate::formats::{
     CorrectionIdentities, FormatError, Learned, NominalInput, RegistrationDocument, ResultFolder, save_registration,
     write_correction, write_points,
 };
-use crate::geometry::{Point, Pose, Vector};
+use crate::geometry::{Grid, Point, Pose, Vector};
 use crate::measuring::{self, fit_sphere, sphere_targets};
 use crate::registration::{
     MapLimits, Method, Options, PointStatus as Fate, Registration, RegistrationError, Start, register,
@@ -175,13 +175,13 @@ impl Task {
 
     fn uncorrected(&self) -> Correction {
         let corners = [[self.pass.x_mm[0], self.pass.y_mm[0]], [self.pass.x_mm[1], self.pass.y_mm[1]]];
-        let net = Net::over(corners.into_iter(), self.map.spacing_mm).unwrap_or(Net {
+        let grid = Grid::over(corners.into_iter(), self.map.spacing_mm).unwrap_or(Grid {
             columns: 2,
             rows: 2,
             first_mm: corners[0],
             spacing_mm: [corners[1][0] - corners[0][0], corners[1][1] - corners[0][1]],
         });
-        Correction::none(net, self.limits.allowance_mm)
+        Correction::none(grid, self.limits.allowance_mm)
     }
 
     /// Lays the path of the first pass; `None` where only the grinder's controller can, and `programs` says why.
@@ -236,12 +236,8 @@ impl Task {
 
     /// Returns the payloads of a pass.
     pub(super) fn payloads(&self, correction: &Correction) -> (CorrectionMap, Pass) {
-        let Net { columns, rows, first_mm, spacing_mm } = correction.net;
         let map = CorrectionMap {
-            columns,
-            rows,
-            first_mm,
-            spacing_mm,
+            grid: correction.grid,
             values_mm: correction.values_mm.clone(),
             part_identity: self.part_identity,
         };

@@ -4,25 +4,18 @@ use std::path::Path;
 
 use super::error::FormatError;
 use super::number::{LIMIT_MM, is_believable};
-use crate::geometry::Point;
+use crate::geometry::{Grid, Point};
 
 /// Most samples of a map that is read: 450 MB of them.
 pub(super) const MOST_SAMPLES: u64 = 50_000_000;
 
 /// Heights over a regular grid in x and y, some of which may not have been measured.
 ///
-/// Frame: that of the instrument, right-handed: x to the right, y upwards, z towards the instrument. Units: millimetres. Order:
-/// row by row, x fastest, y rising.
+/// Frame: that of the instrument, right-handed: x to the right, y upwards, z towards the instrument. Units: millimetres.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeightMap {
-    /// Samples along x.
-    pub columns: usize,
-    /// Samples along y.
-    pub rows: usize,
-    /// x and y of the first sample.
-    pub first_mm: [f64; 2],
-    /// Distance of the samples along x and y, above 0.
-    pub spacing_mm: [f64; 2],
+    /// Where the samples are.
+    pub grid: Grid,
     /// The heights; finite everywhere, 0 where `valid` is not.
     pub heights_mm: Vec<f64>,
     /// Whether a sample was measured.
@@ -38,13 +31,8 @@ impl HeightMap {
     /// No sample along an axis, more than 50 million of them or another number than the grid has; a spacing that is not above
     /// 0; a place or a height that is NaN, infinite or beyond 1e7 mm; not one sample that was measured. `path` is only what
     /// messages call the file.
-    pub fn new(
-        path: &Path,
-        [columns, rows]: [usize; 2],
-        first_mm: [f64; 2],
-        spacing_mm: [f64; 2],
-        samples: impl IntoIterator<Item = Option<f64>>,
-    ) -> Result<Self, FormatError> {
+    pub fn new(path: &Path, grid: Grid, samples: impl IntoIterator<Item = Option<f64>>) -> Result<Self, FormatError> {
+        let Grid { columns, rows, first_mm, spacing_mm } = grid;
         let unexpected = |place: String, expected: &str, found: String| FormatError::Unexpected {
             path: path.to_owned(),
             place,
@@ -87,18 +75,15 @@ impl HeightMap {
         if !valid.contains(&true) {
             return Err(FormatError::NoData { path: path.to_owned(), expected: "sample that was measured" });
         }
-        Ok(Self { columns, rows, first_mm, spacing_mm, heights_mm, valid, notes: Vec::new() })
-    }
-
-    /// Returns x and y of a sample by its index.
-    pub fn place_mm(&self, index: usize) -> [f64; 2] {
-        let (i, j) = (index % self.columns, index / self.columns);
-        [self.first_mm[0] + i as f64 * self.spacing_mm[0], self.first_mm[1] + j as f64 * self.spacing_mm[1]]
+        Ok(Self { grid, heights_mm, valid, notes: Vec::new() })
     }
 
     /// Returns the measured samples as points (x, y, height), in the order of the map.
     pub fn points(&self) -> Vec<Point> {
-        self.measured().map(|(k, height)| (self.place_mm(k), height)).map(|([x, y], z)| Point::new(x, y, z)).collect()
+        self.measured()
+            .map(|(k, height)| (self.grid.place_mm(k), height))
+            .map(|([x, y], z)| Point::new(x, y, z))
+            .collect()
     }
 
     /// Returns how many samples were measured.
@@ -141,7 +126,11 @@ mod tests {
     use super::*;
 
     fn map(samples: &[Option<f64>]) -> Result<HeightMap, FormatError> {
-        HeightMap::new(Path::new("m"), [3, 2], [-1.0, 4.0], [0.5, 2.0], samples.iter().copied())
+        HeightMap::new(
+            Path::new("m"),
+            Grid { columns: 3, rows: 2, first_mm: [-1.0, 4.0], spacing_mm: [0.5, 2.0] },
+            samples.iter().copied(),
+        )
     }
 
     #[test]
@@ -169,7 +158,10 @@ mod tests {
             samples[4] = Some(bad);
             assert!(told(map(&samples)).contains("sample 2 of row 2"), "{bad}");
         }
-        let of = |size, first, spacing| HeightMap::new(Path::new("m"), size, first, spacing, full.iter().copied());
+        let of = |[columns, rows]: [usize; 2], first_mm, spacing_mm| {
+            let grid = Grid { columns, rows, first_mm, spacing_mm };
+            HeightMap::new(Path::new("m"), grid, full.iter().copied())
+        };
         for spacing in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e9] {
             assert!(told(of([3, 2], [0.0; 2], [1.0, spacing])).contains("spacing along y"), "{spacing}");
         }

@@ -97,14 +97,14 @@ impl Learned {
 
     /// What in it cannot be.
     fn flaw(&self) -> Option<String> {
-        let Correction { net, values_mm, level_mm, .. } = &self.correction;
-        if !net.is_sound() || values_mm.len() != net.len() {
-            let [dx, dy] = net.spacing_mm;
+        let Correction { grid, values_mm, level_mm, .. } = &self.correction;
+        if !grid.is_sound() || values_mm.len() != grid.len() {
+            let [dx, dy] = grid.spacing_mm;
             let found = format!(
-                "{} values on a net of {} x {} nodes, {dx} x {dy} mm apart",
+                "{} values on a grid of {} x {} nodes, {dx} x {dy} mm apart",
                 values_mm.len(),
-                net.columns,
-                net.rows
+                grid.columns,
+                grid.rows
             );
             return Some(found);
         }
@@ -114,9 +114,9 @@ impl Learned {
         (!self.known.is_sound()).then(|| "a number of what it knows of the grinder cannot be".into())
     }
 
-    /// Returns the correction of the first pass of another part: what came back in every pass of this one, on the net of `none`.
+    /// Returns the correction of the first pass of another part: what came back in every pass of this one, on the grid of `none`.
     pub fn first_correction(&self, none: Correction) -> Correction {
-        let values_mm = self.correction.net.resample(&self.correction.values_mm, &none.net);
+        let values_mm = self.correction.grid.resample(&self.correction.values_mm, &none.grid);
         Correction { values_mm, ..none }
     }
 }
@@ -124,14 +124,15 @@ impl Learned {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::compensation::{ErrorMap, GainRule, MapOptions, Net, Seen};
+    use crate::compensation::{ErrorMap, GainRule, MapOptions, Seen};
+    use crate::geometry::Grid;
 
-    const NET: Net = Net { columns: 5, rows: 4, first_mm: [-2.0, -1.5], spacing_mm: [1.0, 1.0] };
+    const GRID: Grid = Grid { columns: 5, rows: 4, first_mm: [-2.0, -1.5], spacing_mm: [1.0, 1.0] };
 
     fn learned() -> Learned {
-        let correction = Correction::none(NET, 0.05);
-        let values = (0..NET.len()).map(|k| 1e-3 * k as f64).collect();
-        let error = ErrorMap::known(NET, values, vec![true; NET.len()]);
+        let correction = Correction::none(GRID, 0.05);
+        let values = (0..GRID.len()).map(|k| 1e-3 * k as f64).collect();
+        let error = ErrorMap::known(GRID, values, vec![true; GRID.len()]);
         let begin = Knowledge::new(GainRule::Wavelength, &MapOptions::new(1.0, 1.0), [4.0, 3.0], None);
         let known = begin.after(&Seen { correction: &correction, error: &error, answer: None });
         Learned::new(true, "a part".into(), "run-1".into(), correction.changed(&known), known)
@@ -154,8 +155,8 @@ mod tests {
             Learned::read(tempfile::tempdir().unwrap().path(), "", true).unwrap().is_none(),
             "no file is nothing learned"
         );
-        // Another net of the same part: what lies between the nodes, and the height of the new part.
-        let finer = Net { columns: 9, rows: 7, spacing_mm: [0.5, 0.5], ..NET };
+        // Another grid of the same part: what lies between the nodes, and the height of the new part.
+        let finer = Grid { columns: 9, rows: 7, spacing_mm: [0.5, 0.5], ..GRID };
         let first = back.first_correction(Correction::none(finer, 0.06));
         assert_eq!((first.level_mm, first.cycle, first.values_mm.len()), (0.06, 1, 63));
         assert_eq!(first.values_mm[2], back.correction.values_mm[1]);
@@ -187,12 +188,12 @@ mod tests {
                 error
             })
         };
-        assert!(broken("\"columns\":5", "\"columns\":6")[0].contains("20 values on a net of 6 x 4 nodes"));
+        assert!(broken("\"columns\":5", "\"columns\":6")[0].contains("20 values on a grid of 6 x 4 nodes"));
         assert!(broken("\"columns\":5,\"rows\":4", "\"columns\":0,\"rows\":0")[0].contains("0 x 0"));
         assert!(broken("\"spacing_mm\":[1.0,1.0]", "\"spacing_mm\":[0.0,1.0]")[0].contains("0 x 1 mm apart"));
         assert!(broken("\"response\":[1.0", "\"response\":[7.0")[0].contains("cannot be"));
         assert!(broken("\"run\"", "\"ran\"")[0].contains("run"));
-        // The mean has a net of its own.
+        // The mean has a grid of its own.
         let at = text.rfind("\"columns\":5").unwrap();
         let of_mean = format!("{}{}", &text[..at], text[at..].replacen("\"columns\":5", "\"columns\":0", 1));
         assert!(read(&of_mean).unwrap_err().to_string().contains("cannot be"));

@@ -32,8 +32,8 @@ pub fn write_error_map(
     origin: &ErrorMapOrigin,
     simulation: bool,
 ) -> Result<(), FormatError> {
-    let rows: Vec<([f64; 4], bool)> = (0..map.net.len())
-        .map(|k| (map.net.place_mm(k), k))
+    let rows: Vec<([f64; 4], bool)> = (0..map.grid.len())
+        .map(|k| (map.grid.place_mm(k), k))
         .map(|([x, y], k)| ([x, y, map.values_mm[k], map.sigma_mm[k]], map.valid[k]))
         .collect();
     let marked = if simulation { "# SIMULATION\n" } else { "" };
@@ -71,8 +71,8 @@ pub fn write_correction(
     identities: &CorrectionIdentities,
     simulation: bool,
 ) -> Result<(), FormatError> {
-    let rows: Vec<[f64; 3]> = (0..correction.net.len())
-        .map(|k| (correction.net.place_mm(k), correction.values_mm[k]))
+    let rows: Vec<[f64; 3]> = (0..correction.grid.len())
+        .map(|k| (correction.grid.place_mm(k), correction.values_mm[k]))
         .map(|([x, y], value)| [x, y, value])
         .collect();
     let marked = if simulation { "# SIMULATION\n" } else { "" };

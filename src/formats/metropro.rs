@@ -11,6 +11,7 @@ use std::path::Path;
 use super::error::FormatError;
 use super::height_map::{HeightMap, check_size};
 use super::whole::open;
+use crate::geometry::Grid;
 
 /// From here on a phase was not measured.
 const NOT_MEASURED: i32 = 2_147_483_640;
@@ -50,7 +51,7 @@ pub fn parse_metropro(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatErro
         (raw < NOT_MEASURED).then(|| f64::from(raw) * unit_mm)
     };
     let samples = raw.chunks_exact(4 * columns).rev().flat_map(|row| row.chunks_exact(4).map(height));
-    HeightMap::new(path, [columns, rows], [0.0; 2], [1e3 * pitch_m; 2], samples)
+    HeightMap::new(path, Grid { columns, rows, first_mm: [0.0; 2], spacing_mm: [1e3 * pitch_m; 2] }, samples)
 }
 
 /// Returns whether a file begins like one of MetroPro.

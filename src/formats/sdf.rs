@@ -9,6 +9,7 @@ use std::path::Path;
 use super::error::{FormatError, excerpt};
 use super::height_map::{HeightMap, check_size};
 use super::whole::{MOST_BYTES, open};
+use crate::geometry::Grid;
 
 /// Length of the binary header.
 const HEADER: usize = 81;
@@ -102,7 +103,9 @@ impl Header {
         let mut first_bad = None;
         // An error ends the samples, and is what is wrong with the file.
         let heights = samples.map_while(|sample| sample.map_err(|error| first_bad = Some(error)).ok());
-        let made = HeightMap::new(path, self.size, [0.0; 2], [x, y], heights.map(|raw| raw.map(|v| v * z)));
+        let [columns, rows] = self.size;
+        let grid = Grid { columns, rows, first_mm: [0.0; 2], spacing_mm: [x, y] };
+        let made = HeightMap::new(path, grid, heights.map(|raw| raw.map(|v| v * z)));
         match first_bad {
             Some(error) => Err(error),
             None => made,

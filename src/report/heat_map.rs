@@ -5,7 +5,7 @@ use std::path::Path;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
-use crate::geometry::Aperture;
+use crate::geometry::{Aperture, Grid};
 use crate::registration::{Deviation, PointStatus};
 
 use super::axis::{Ruler, Scale, grouped, three_digits};
@@ -128,12 +128,11 @@ impl HeatMap {
     ///
     /// Units: millimetres. Frame: that of the samples.
     pub fn within(mut self, aperture: &Aperture) -> Self {
-        let Raster { columns, first_mm, pixel_mm, .. } = self.raster;
+        let grid = self.raster.grid;
         for (k, value) in self.raster.values.iter_mut().enumerate() {
-            let place = |axis: usize, index: usize| first_mm[axis] + index as f64 * pixel_mm[axis];
+            let [x, y] = grid.place_mm(k);
             // A sample on the rim fills a pixel that reaches half its width beyond.
-            let outside = aperture.distance_mm(place(0, k % columns), place(1, k / columns));
-            if outside > 0.5 * pixel_mm[0].hypot(pixel_mm[1]) {
+            if aperture.distance_mm(x, y) > 0.5 * grid.spacing_mm[0].hypot(grid.spacing_mm[1]) {
                 *value = f64::NAN;
             }
         }
@@ -164,11 +163,12 @@ impl HeatMap {
         let [low, high] = self.tones.range;
         let value = |level: u8| low + (high - low) * f64::from(level) / f64::from(LEVELS - 1);
         palette.extend((0..LEVELS).flat_map(|level| self.tones.at(value(level))));
-        let rows = self.raster.values.chunks(self.raster.columns).rev();
+        let rows = self.raster.values.chunks(self.raster.grid.columns).rev();
         let pixels: Vec<u8> = rows.flatten().map(|&v| self.level(v)).collect();
         let encoded = || {
             let mut bytes = Vec::new();
-            let mut encoder = png::Encoder::new(&mut bytes, self.raster.columns as u32, self.raster.rows as u32);
+            let mut encoder =
+                png::Encoder::new(&mut bytes, self.raster.grid.columns as u32, self.raster.grid.rows as u32);
             encoder.set_color(png::ColorType::Indexed);
             encoder.set_depth(png::BitDepth::Eight);
             encoder.set_palette(palette);
@@ -202,7 +202,7 @@ impl HeatMap {
         let mut svg = Svg::new(left + width + 106.0, top + height + 54.0);
         svg.text([left, 24.0], Anchor::Start, LARGE, &self.title);
         svg.text([left, 44.0], Anchor::Start, SMALL, &self.summary());
-        let pixel = width / self.raster.columns as f64;
+        let pixel = width / self.raster.grid.columns as f64;
         // Few samples are shown as the blocks they are; many are smoothed when the figure is scaled.
         let rendering = if pixel > 4.0 { "pixelated" } else { "auto" };
         svg.image(frame.corner, frame.size, &STANDARD.encode(self.to_png()?), rendering);
@@ -212,7 +212,7 @@ impl HeatMap {
     }
 
     fn frame(&self) -> Frame<'static> {
-        let Raster { columns, rows, first_mm, pixel_mm, .. } = self.raster;
+        let Grid { columns, rows, first_mm, spacing_mm: pixel_mm } = self.raster.grid;
         let extent = [columns as f64 * pixel_mm[0], rows as f64 * pixel_mm[1]];
         let scale = (WIDTH / extent[0]).min(HEIGHT / extent[1]);
         // A part like a strip is drawn out of scale rather than as a line.

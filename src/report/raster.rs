@@ -1,17 +1,14 @@
 //! From scattered samples to pixels.
 
 use super::ReportError;
+use crate::geometry::Grid;
 
 /// A picture of values: NaN where nothing is known.
 #[derive(Clone, Debug)]
 pub(super) struct Raster {
-    pub(super) columns: usize,
-    pub(super) rows: usize,
-    /// Centre of the first pixel, at the least x and y, in millimetres.
-    pub(super) first_mm: [f64; 2],
-    /// Width and height of a pixel in millimetres.
-    pub(super) pixel_mm: [f64; 2],
-    /// Row by row, x fastest, y rising.
+    /// Where the centres of the pixels are.
+    pub(super) grid: Grid,
+    /// One for each pixel.
     pub(super) values: Vec<f64>,
 }
 
@@ -40,25 +37,25 @@ impl Raster {
             return Err(ReportError::NoExtent { figure: title.into(), points });
         }
         let counts = size.map(|s| (s / spacing).round() as usize + 1);
-        let pixel_mm = std::array::from_fn(|k| if counts[k] > 1 { size[k] / (counts[k] - 1) as f64 } else { spacing });
+        let spacing_mm =
+            std::array::from_fn(|k| if counts[k] > 1 { size[k] / (counts[k] - 1) as f64 } else { spacing });
         let [columns, rows] = counts;
-        let mut raster = Self { columns, rows, first_mm: low, pixel_mm, values: Vec::new() };
+        let mut raster = Self { grid: Grid { columns, rows, first_mm: low, spacing_mm }, values: Vec::new() };
         raster.values = raster.means(samples);
         raster.fill();
         Ok(raster)
     }
 
     fn means(&self, samples: &[[f64; 3]]) -> Vec<f64> {
-        let mut sums = vec![[0.0; 2]; self.columns * self.rows];
-        for [x, y, value] in samples {
-            let (i, u) = split((x - self.first_mm[0]) / self.pixel_mm[0], self.columns);
-            let (j, v) = split((y - self.first_mm[1]) / self.pixel_mm[1], self.rows);
+        let mut sums = vec![[0.0; 2]; self.grid.len()];
+        for &[x, y, value] in samples {
+            let [(i, u), (j, v)] = self.grid.cell([x, y]);
             for (di, dj, weight) in
                 [(0, 0, (1.0 - u) * (1.0 - v)), (1, 0, u * (1.0 - v)), (0, 1, (1.0 - u) * v), (1, 1, u * v)]
             {
                 // A sample on the last column or row has no weight beyond it.
                 if weight > 0.0 {
-                    let [sum, total] = &mut sums[(j + dj) * self.columns + i + di];
+                    let [sum, total] = &mut sums[(j + dj) * self.grid.columns + i + di];
                     *sum += weight * value;
                     *total += weight;
                 }
@@ -88,11 +85,13 @@ impl Raster {
     }
 
     fn mean_around(&self, values: &[f64], pixel: usize) -> f64 {
-        let (i, j) = (pixel % self.columns, pixel / self.columns);
+        let (i, j) = (pixel % self.grid.columns, pixel / self.grid.columns);
         let around = |at: usize, count: usize| at.saturating_sub(1)..(at + 2).min(count);
         let (mut sum, mut total) = (0.0, 0.0);
-        for row in around(j, self.rows) {
-            for value in around(i, self.columns).map(|i| values[row * self.columns + i]).filter(|v| !v.is_nan()) {
+        for row in around(j, self.grid.rows) {
+            for value in
+                around(i, self.grid.columns).map(|i| values[row * self.grid.columns + i]).filter(|v| !v.is_nan())
+            {
                 sum += value;
                 total += 1.0;
             }
@@ -102,16 +101,16 @@ impl Raster {
 
     /// The morphological closing of a mask by a square: grown by a reach, then shrunk by it.
     fn closed(&self, mask: &[bool], reach: usize) -> Vec<bool> {
-        let (columns, rows) = (self.columns + 2 * reach, self.rows + 2 * reach);
+        let (columns, rows) = (self.grid.columns + 2 * reach, self.grid.rows + 2 * reach);
         let mut wide = vec![false; columns * rows];
-        for j in 0..self.rows {
+        for j in 0..self.grid.rows {
             let to = (j + reach) * columns + reach;
-            wide[to..to + self.columns].copy_from_slice(&mask[j * self.columns..(j + 1) * self.columns]);
+            wide[to..to + self.grid.columns].copy_from_slice(&mask[j * self.grid.columns..(j + 1) * self.grid.columns]);
         }
         let grown = spread(&wide, columns, rows, reach, true);
         let shrunk = spread(&grown, columns, rows, reach, false);
         let row = |j: usize| (j + reach) * columns + reach;
-        (0..self.rows).flat_map(|j| shrunk[row(j)..row(j) + self.columns].iter().copied()).collect()
+        (0..self.grid.rows).flat_map(|j| shrunk[row(j)..row(j) + self.grid.columns].iter().copied()).collect()
     }
 }
 
@@ -130,13 +129,6 @@ fn spread(mask: &[bool], columns: usize, rows: usize, reach: usize, value: bool)
         }
     }
     out
-}
-
-/// The pixel below a place and the share of the way to the next one.
-fn split(place: f64, count: usize) -> (usize, f64) {
-    let below = (place.max(0.0) as usize).min(count - 1);
-    let share = (place - below as f64).clamp(0.0, 1.0);
-    if below + 1 == count { (below, 0.0) } else { (below, share) }
 }
 
 /// The spacing of a square grid of so many points over a rectangle: (n - 1) s^2 = (w + h) s + w h.
@@ -181,8 +173,8 @@ mod tests {
     #[test]
     fn a_grid_of_samples_becomes_its_own_pixels() {
         let raster = Raster::new("grid", &grid(12, 7, |_, _| true)).unwrap();
-        assert_eq!((raster.columns, raster.rows), (12, 7));
-        assert_eq!(raster.pixel_mm, [0.5, 0.5]);
+        assert_eq!((raster.grid.columns, raster.grid.rows), (12, 7));
+        assert_eq!(raster.grid.spacing_mm, [0.5, 0.5]);
         for (pixel, value) in raster.values.iter().enumerate() {
             let exact = (pixel % 12) as f64 - 2.0 * (pixel / 12) as f64;
             assert!((value - exact).abs() < 1e-9, "{pixel}: {value} against {exact}");
@@ -195,8 +187,8 @@ mod tests {
         let hole = |i: i32, j: i32| (20..30).contains(&i) && (10..20).contains(&j);
         let raster = Raster::new("holes", &grid(40, 30, |i, j| !lost(i, j) && !hole(i, j))).unwrap();
         let at = |x: f64, y: f64| {
-            let i = ((x - raster.first_mm[0]) / raster.pixel_mm[0]).round() as usize;
-            raster.values[(y / raster.pixel_mm[1]).round() as usize * raster.columns + i]
+            let i = ((x - raster.grid.first_mm[0]) / raster.grid.spacing_mm[0]).round() as usize;
+            raster.values[(y / raster.grid.spacing_mm[1]).round() as usize * raster.grid.columns + i]
         };
         // The value changes by 3 from one pixel to the next across the diagonal.
         assert!((at(-1.5, 1.5) + 3.0).abs() < 3.0, "{}", at(-1.5, 1.5));
@@ -215,7 +207,7 @@ mod tests {
     fn a_disc_stays_round() {
         let raster = Raster::new("disc", &grid(41, 41, |i, j| (i - 20).pow(2) + (j - 20).pow(2) <= 400)).unwrap();
         assert!(raster.values[0].is_nan() && raster.values.last().unwrap().is_nan());
-        let middle = raster.values[raster.rows / 2 * raster.columns + raster.columns / 2];
+        let middle = raster.values[raster.grid.rows / 2 * raster.grid.columns + raster.grid.columns / 2];
         assert!(middle.is_finite());
         let known = raster.values.iter().filter(|v| v.is_finite()).count() as f64;
         assert!((known / raster.values.len() as f64 - 0.785).abs() < 0.06, "{known}");

@@ -3,11 +3,11 @@
 
 use std::path::Path;
 
+use regrind::compensation::Correction;
 use regrind::compensation::path::{PathOptions, Wheel};
-use regrind::compensation::{Correction, Net};
 use regrind::config::CellConfig;
 use regrind::drive::Programs;
-use regrind::geometry::Vector;
+use regrind::geometry::{Grid, Vector};
 use regrind::recipe::Recipe;
 use regrind::setup;
 use regrind_sim::shape::Shape;
@@ -48,9 +48,9 @@ pub fn error_mm(x: f64, y: f64) -> f64 {
 pub fn correction(half_mm: [f64; 2]) -> Correction {
     let reach = half_mm.map(|h| h + 4.0);
     let corners = [[-reach[0], -reach[1]], reach];
-    let net = Net::over(corners.into_iter(), 0.5).unwrap();
-    let values_mm = (0..net.len()).map(|k| net.place_mm(k)).map(|[x, y]| error_mm(x, y)).collect();
-    Correction { net, values_mm, cycle: 2, level_mm: 0.02 }
+    let grid = Grid::over(corners.into_iter(), 0.5).unwrap();
+    let values_mm = (0..grid.len()).map(|k| grid.place_mm(k)).map(|[x, y]| error_mm(x, y)).collect();
+    Correction { grid, values_mm, cycle: 2, level_mm: 0.02 }
 }
 
 /// The surface that is wanted, by closed forms: the shape moved along its normals by level and correction.

@@ -40,7 +40,7 @@ pub fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// The shipped free-form mirror on a coarser net, so that a cycle takes a second.
+/// The shipped free-form mirror on a coarser grid, so that a cycle takes a second.
 pub fn small(columns: u32, rows: u32, speed: f64) -> Recipe {
     let of = [
         ("columns = 60", format!("columns = {columns}")),

@@ -4,11 +4,11 @@
 use std::path::Path;
 
 use regrind::compensation::{
-    Correction, ErrorMap, GainRule, Knowledge, MapOptions, Net, Reading, Seen, StepError, error_map, response,
+    Correction, ErrorMap, GainRule, Knowledge, MapOptions, Reading, Seen, StepError, error_map, response,
 };
 use regrind::config::CellConfig;
 use regrind::drive::Task;
-use regrind::geometry::{Point, Vector};
+use regrind::geometry::{Grid, Point, Vector};
 use regrind::recipe::Recipe;
 use regrind::registration::{PointStatus, Registration};
 use regrind::setup;
@@ -112,10 +112,10 @@ impl<'a> Line<'a> {
     ) -> Self {
         let task = &bench.task;
         let corners = [[task.pass.x_mm[0], task.pass.y_mm[0]], [task.pass.x_mm[1], task.pass.y_mm[1]]];
-        let net = Net::over(corners.into_iter(), task.map.spacing_mm).unwrap();
+        let grid = Grid::over(corners.into_iter(), task.map.spacing_mm).unwrap();
         let size_mm = [corners[1][0] - corners[0][0], corners[1][1] - corners[0][1]];
         let rule = if let Way::Regrind(rule) = way { rule } else { GainRule::Fixed(1.0) };
-        let none = Correction::none(net, task.limits.allowance_mm);
+        let none = Correction::none(grid, task.limits.allowance_mm);
         let (correction, known) = match learned {
             Some((correction, known)) => {
                 (Correction { values_mm: correction.values_mm, ..none }, known.for_next_part())
@@ -157,7 +157,7 @@ impl<'a> Line<'a> {
     }
 
     fn payload(&self) -> Map {
-        let Net { columns, rows, first_mm, spacing_mm } = self.correction.net;
+        let Grid { columns, rows, first_mm, spacing_mm } = self.correction.grid;
         Map {
             columns: columns as u32,
             rows: rows as u32,
@@ -292,13 +292,13 @@ fn grind(grinder: &mut Grinder, job: u32, cycle: u16, map: &Map, pass: &Pass) {
 
 /// What was measured, nearest point by nearest point.
 fn unfiltered(readings: &[Reading], options: &MapOptions) -> ErrorMap {
-    let net = Net::over(readings.iter().map(|r| r.at_mm), options.spacing_mm).unwrap();
+    let grid = Grid::over(readings.iter().map(|r| r.at_mm), options.spacing_mm).unwrap();
     let nearest = |[x, y]: [f64; 2]| {
         let distance = |r: &&Reading| (r.at_mm[0] - x).powi(2) + (r.at_mm[1] - y).powi(2);
         readings.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap().deviation_mm
     };
-    let values_mm = (0..net.len()).map(|k| nearest(net.place_mm(k))).collect();
-    ErrorMap { values_mm, valid: vec![true; net.len()], ..error_map(readings, options).unwrap() }
+    let values_mm = (0..grid.len()).map(|k| nearest(grid.place_mm(k))).collect();
+    ErrorMap { values_mm, valid: vec![true; grid.len()], ..error_map(readings, options).unwrap() }
 }
 
 fn rms_um(values_mm: &[f64]) -> f64 {

@@ -5,13 +5,14 @@ use thiserror::Error;
 
 use super::learning::Knowledge;
 use super::map::ErrorMap;
-use super::net::Net;
+use crate::geometry::Grid;
 
 /// What the grinder is to displace its surface by: absolute, it replaces the one before.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Correction {
     /// Where the nodes are.
-    pub net: Net,
+    #[serde(rename = "net")]
+    pub grid: Grid,
     /// Wanted displacement along the outward normal at every node, in millimetres; positive leaves material.
     pub values_mm: Vec<f64>,
     /// The pass it is for, from 1.
@@ -82,8 +83,8 @@ pub enum StepError {
 
 impl Correction {
     /// The first pass of a part: nothing is known yet.
-    pub fn none(net: Net, level_mm: f64) -> Self {
-        Self { net, values_mm: vec![0.0; net.len()], cycle: 1, level_mm }
+    pub fn none(grid: Grid, level_mm: f64) -> Self {
+        Self { grid, values_mm: vec![0.0; grid.len()], cycle: 1, level_mm }
     }
 
     /// Returns whether it is 0 everywhere.
@@ -93,7 +94,7 @@ impl Correction {
 
     /// Returns the correction at a place, in millimetres.
     pub fn at(&self, place_mm: [f64; 2]) -> f64 {
-        self.net.interpolate(&self.values_mm, place_mm)
+        self.grid.interpolate(&self.values_mm, place_mm)
     }
 
     /// Returns the correction that takes back what is worth it, whatever any limit says of it; for the same pass and level.
@@ -109,7 +110,7 @@ impl Correction {
     pub fn removed_mm(&self, limits: &CorrectionLimits) -> Result<f64, StepError> {
         let within = |v: f64| v.abs() <= limits.largest_correction_mm;
         if let Some(k) = self.values_mm.iter().position(|v| !within(*v)) {
-            let ([x_mm, y_mm], limit_mm) = (self.net.place_mm(k), limits.largest_correction_mm);
+            let ([x_mm, y_mm], limit_mm) = (self.grid.place_mm(k), limits.largest_correction_mm);
             return Err(StepError::TooLarge { found_mm: self.values_mm[k], x_mm, y_mm, limit_mm });
         }
         // The correction itself adds where it is negative.
@@ -134,18 +135,18 @@ impl Correction {
     /// A correction above its limit, a pass deeper than the machine may cut, and a removal above the budget.
     pub fn next(&self, error: &ErrorMap, known: &Knowledge, limits: &CorrectionLimits) -> Result<Step, StepError> {
         let values_mm = self.changed(known).values_mm;
-        let on_net: Vec<f64> = values_mm.iter().zip(&self.values_mm).map(|(next, now)| next - now).collect();
+        let on_grid: Vec<f64> = values_mm.iter().zip(&self.values_mm).map(|(next, now)| next - now).collect();
         // Where it was measured: there it is known how much the wheel will cut.
-        let changes_mm = self.net.resample(&on_net, &error.net);
+        let changes_mm = self.grid.resample(&on_grid, &error.grid);
         let (response, scatter_mm) = (known.response()[0], known.scatter_mm().unwrap_or(0.0));
-        let rise_mm = on_net.iter().map(|change| response * change).fold(0.0, f64::max);
+        let rise_mm = on_grid.iter().map(|change| response * change).fold(0.0, f64::max);
         let depth_mm = limits.depth_of_cut_mm.max(rise_mm + 2.0 * scatter_mm + limits.least_depth_mm);
-        let fall_mm = on_net.iter().map(|change| response * change).fold(0.0, f64::min);
+        let fall_mm = on_grid.iter().map(|change| response * change).fold(0.0, f64::min);
         let (found_mm, limit_mm) = (depth_mm - fall_mm, limits.largest_depth_mm);
         if found_mm > limit_mm {
             return Err(StepError::TooDeep { found_mm, limit_mm });
         }
-        let correction = Self { net: self.net, values_mm, cycle: self.cycle + 1, level_mm: self.level_mm - depth_mm };
+        let correction = Self { grid: self.grid, values_mm, cycle: self.cycle + 1, level_mm: self.level_mm - depth_mm };
         let removed_mm = correction.removed_mm(limits)?;
         let depths_mm =
             || changes_mm.iter().zip(&error.valid).filter(|(_, valid)| **valid).map(|(c, _)| depth_mm - response * c);
@@ -183,12 +184,12 @@ mod tests {
     };
 
     fn map(values_mm: [f64; 4]) -> ErrorMap {
-        let net = Net { columns: 2, rows: 2, first_mm: [0.0, 0.0], spacing_mm: [1.0, 1.0] };
-        ErrorMap::known(net, values_mm.to_vec(), vec![true; 4])
+        let grid = Grid { columns: 2, rows: 2, first_mm: [0.0, 0.0], spacing_mm: [1.0, 1.0] };
+        ErrorMap::known(grid, values_mm.to_vec(), vec![true; 4])
     }
 
     fn first() -> Correction {
-        Correction::none(map([0.0; 4]).net, 0.06)
+        Correction::none(map([0.0; 4]).grid, 0.06)
     }
 
     fn next(correction: &Correction, error: &ErrorMap, gain: f64) -> Result<Step, StepError> {

@@ -4,7 +4,7 @@
 //! exp(-pi (r / (alpha cutoff))^2), and its height there is the filtered value: the Gaussian regression filter (ISO 16610-31, areal).
 //! In the open this is the Gaussian filter; at an edge or a hole the readings that are there are weighed alone and no padding
 //! is needed. The normal equations of a fit are moments of the weights, and since the weights separate, the moments at all nodes of a
-//! net are sums along x and then along y: the cost is that of the reach on one axis, not of its square.
+//! grid are sums along x and then along y: the cost is that of the reach on one axis, not of its square.
 //!
 //! **Readings between nodes.** A reading is spread over the 7 x 7 nodes about it by a narrow Gaussian of width s, and what is
 //! summed along the axes is a Gaussian narrower by as much, of width sqrt(sigma^2 - s^2); the moments' polynomials are changed to match
@@ -19,7 +19,7 @@ use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::net::Net;
+use crate::geometry::Grid;
 
 /// Width of the spreading Gaussian in steps.
 const SPREAD: f64 = 0.75;
@@ -99,10 +99,10 @@ pub(super) struct Gaussian {
     pub order: Order,
 }
 
-/// What a filter found at every node of its net.
+/// What a filter found at every node of its grid.
 #[derive(Clone, Debug)]
 pub(super) struct Filtered {
-    pub net: Net,
+    pub grid: Grid,
     /// Filtered values; 0 where not supported.
     pub values: Vec<f64>,
     /// Slopes of the fitted polynomial along x and y, per millimetre.
@@ -127,61 +127,61 @@ impl Gaussian {
         self.order.alpha() * self.cutoff_mm / (2.0 * PI).sqrt()
     }
 
-    /// Returns how many steps a net's spacing must be divided into along x and y for this filter.
-    pub fn division(&self, net: &Net) -> [usize; 2] {
+    /// Returns how many steps a grid's spacing must be divided into along x and y for this filter.
+    pub fn division(&self, grid: &Grid) -> [usize; 2] {
         let widest_mm = WIDEST_STEP * self.sigma_mm();
-        net.spacing_mm.map(|spacing| (spacing / widest_mm).ceil().clamp(1.0, 1e6) as usize)
+        grid.spacing_mm.map(|spacing| (spacing / widest_mm).ceil().clamp(1.0, 1e6) as usize)
     }
 
-    /// Filters values that lie anywhere over a net; `weights` are factors from 0 to 1, one for each.
-    pub fn scattered(&self, places: &[[f64; 2]], values: &[f64], weights: Option<&[f64]>, net: &Net) -> Filtered {
+    /// Filters values that lie anywhere over a grid; `weights` are factors from 0 to 1, one for each.
+    pub fn scattered(&self, places: &[[f64; 2]], values: &[f64], weights: Option<&[f64]>, grid: &Grid) -> Filtered {
         let degree = self.order.degree();
         let trend = Trend::fit(places, values, degree);
         let sigma_mm = self.sigma_mm();
-        let spread = net.spacing_mm.map(|step| SPREAD * step / sigma_mm);
-        let taps = self.taps(net);
+        let spread = grid.spacing_mm.map(|step| SPREAD * step / sigma_mm);
+        let taps = self.taps(grid);
         let rest: Vec<f64> = places.iter().zip(values).map(|(p, v)| v - trend.at(*p)).collect();
-        let channels = spread_out(places, &rest, weights, net, taps);
-        let counts = Counts::new(places, net);
-        let mut filtered = self.solve(&channels, spread, taps, net, &counts);
+        let channels = spread_out(places, &rest, weights, grid, taps);
+        let counts = Counts::new(places, grid);
+        let mut filtered = self.solve(&channels, spread, taps, grid, &counts);
         filtered.add(&trend);
         filtered
     }
 
-    /// Filters values at the nodes of a net, of those that are valid.
-    pub fn on_net(&self, values: &[f64], weights: &[f64], net: &Net) -> Filtered {
+    /// Filters values at the nodes of a grid, of those that are valid.
+    pub fn on_grid(&self, values: &[f64], weights: &[f64], grid: &Grid) -> Filtered {
         let degree = self.order.degree();
         let (places, known): (Vec<[f64; 2]>, Vec<f64>) =
-            (0..net.len()).filter(|&k| weights[k] > 0.0).map(|k| (net.place_mm(k), values[k])).unzip();
+            (0..grid.len()).filter(|&k| weights[k] > 0.0).map(|k| (grid.place_mm(k), values[k])).unzip();
         let trend = Trend::fit(&places, &known, degree);
-        let taps = self.taps(net);
-        let mut channels = Channels::new(net, taps, true);
-        for k in (0..net.len()).filter(|&k| weights[k] > 0.0) {
-            let slot = channels.slot(k % net.columns, k / net.columns);
+        let taps = self.taps(grid);
+        let mut channels = Channels::new(grid, taps, true);
+        for k in (0..grid.len()).filter(|&k| weights[k] > 0.0) {
+            let slot = channels.slot(k % grid.columns, k / grid.columns);
             let weight = weights[k];
             channels.weight[slot] = weight;
-            channels.value[slot] = weight * (values[k] - trend.at(net.place_mm(k)));
+            channels.value[slot] = weight * (values[k] - trend.at(grid.place_mm(k)));
             channels.weight2[slot] = weight * weight;
         }
-        let counts = Counts::new(&places, net);
-        let mut filtered = self.solve(&channels, [0.0; 2], taps, net, &counts);
+        let counts = Counts::new(&places, grid);
+        let mut filtered = self.solve(&channels, [0.0; 2], taps, grid, &counts);
         filtered.add(&trend);
         filtered
     }
 
     /// Reach of the weights along x and y, in nodes.
-    fn taps(&self, net: &Net) -> [usize; 2] {
+    fn taps(&self, grid: &Grid) -> [usize; 2] {
         [0, 1].map(|k| {
-            let nodes = [net.columns, net.rows][k];
-            ((REACH * self.sigma_mm() / net.spacing_mm[k]).ceil() as usize).clamp(1, nodes.max(4)).max(SPREAD_REACH)
+            let nodes = grid.counts()[k];
+            ((REACH * self.sigma_mm() / grid.spacing_mm[k]).ceil() as usize).clamp(1, nodes.max(4)).max(SPREAD_REACH)
         })
     }
 
-    fn solve(&self, channels: &Channels, spread: [f64; 2], taps: [usize; 2], net: &Net, counts: &Counts) -> Filtered {
+    fn solve(&self, channels: &Channels, spread: [f64; 2], taps: [usize; 2], grid: &Grid, counts: &Counts) -> Filtered {
         let degree = self.order.degree();
         let sigma_mm = self.sigma_mm();
         let kernels = |scale: f64, most: usize| {
-            [0, 1].map(|k| kernels(most, scale, net.spacing_mm[k] / sigma_mm, spread[k], taps[k]))
+            [0, 1].map(|k| kernels(most, scale, grid.spacing_mm[k] / sigma_mm, spread[k], taps[k]))
         };
         // Where the readings lie about a node is asked for whatever the order.
         let most = (2 * degree).max(2);
@@ -189,26 +189,26 @@ impl Gaussian {
         let weight = Summed::along_x(channels, &channels.weight, &wx);
         let value = Summed::along_x(channels, &channels.value, &wx[..=degree]);
         let weight2 = Summed::along_x(channels, channels.squares(), &qx);
-        let rows: Vec<Vec<Node>> = (0..net.rows)
+        let rows: Vec<Vec<Node>> = (0..grid.rows)
             .into_par_iter()
             .map(|j| {
                 let weight = weight.along_y(&wy, most, j);
                 let sums = [weight, value.along_y(&wy, degree, j), weight2.along_y(&qy, 2 * degree, j)];
                 let enough = |i: usize| counts.within(i, j, self.cutoff_mm) >= LEAST_READINGS;
-                (0..net.columns).map(|i| if enough(i) { node(self.order, &sums, i) } else { None }).collect()
+                (0..grid.columns).map(|i| if enough(i) { node(self.order, &sums, i) } else { None }).collect()
             })
             .collect();
-        gathered(net, sigma_mm, rows.into_iter().flatten())
+        gathered(grid, sigma_mm, rows.into_iter().flatten())
     }
 }
 
 /// Value, slopes per standard deviation, leverage and variance at a node that is supported.
 type Node = Option<[f64; 5]>;
 
-fn gathered(net: &Net, sigma_mm: f64, nodes: impl Iterator<Item = Node>) -> Filtered {
-    let count = net.len();
+fn gathered(grid: &Grid, sigma_mm: f64, nodes: impl Iterator<Item = Node>) -> Filtered {
+    let count = grid.len();
     let mut all = Filtered {
-        net: *net,
+        grid: *grid,
         values: Vec::with_capacity(count),
         slopes: Vec::with_capacity(count),
         leverage: Vec::with_capacity(count),
@@ -269,7 +269,7 @@ fn one_sided(m: &[f64; MOMENTS]) -> bool {
     !inside || spread > MOST_SPREAD
 }
 
-/// Sampled sums on a net with a border as wide as the reach.
+/// Sampled sums on a grid with a border as wide as the reach.
 struct Channels {
     columns: usize,
     rows: usize,
@@ -281,8 +281,8 @@ struct Channels {
 }
 
 impl Channels {
-    fn new(net: &Net, border: [usize; 2], squares: bool) -> Self {
-        let (columns, rows) = (net.columns + 2 * border[0], net.rows + 2 * border[1]);
+    fn new(grid: &Grid, border: [usize; 2], squares: bool) -> Self {
+        let (columns, rows) = (grid.columns + 2 * border[0], grid.rows + 2 * border[1]);
         let empty = || vec![0.0; columns * rows];
         let weight2 = if squares { empty() } else { Vec::new() };
         Self { columns, rows, border, weight: empty(), value: empty(), weight2 }
@@ -306,9 +306,15 @@ impl Channels {
 }
 
 /// Spreads readings over the nodes about them.
-fn spread_out(places: &[[f64; 2]], values: &[f64], weights: Option<&[f64]>, net: &Net, border: [usize; 2]) -> Channels {
+fn spread_out(
+    places: &[[f64; 2]],
+    values: &[f64],
+    weights: Option<&[f64]>,
+    grid: &Grid,
+    border: [usize; 2],
+) -> Channels {
     // The number of parts depends on the sizes alone, so that sums are the same on every machine.
-    let nodes = (net.columns + 2 * border[0]) * (net.rows + 2 * border[1]);
+    let nodes = (grid.columns + 2 * border[0]) * (grid.rows + 2 * border[1]);
     let parts = if nodes < 4 * places.len() { 4 } else { 1 };
     let size = places.len().div_ceil(parts).max(1);
     let peaks = std::array::from_fn(|n| (-0.5 * (n as f64 / SPREAD).powi(2)).exp() / (SPREAD * (2.0 * PI).sqrt()));
@@ -316,23 +322,23 @@ fn spread_out(places: &[[f64; 2]], values: &[f64], weights: Option<&[f64]>, net:
         .par_chunks(size)
         .enumerate()
         .map(|(part, chunk)| {
-            let mut channels = Channels::new(net, border, weights.is_some());
+            let mut channels = Channels::new(grid, border, weights.is_some());
             for (k, place) in chunk.iter().enumerate() {
                 let index = part * size + k;
-                spread_one(&mut channels, net, &peaks, *place, values[index], weights.map_or(1.0, |w| w[index]));
+                spread_one(&mut channels, grid, &peaks, *place, values[index], weights.map_or(1.0, |w| w[index]));
             }
             channels
         })
         .collect();
     let mut chunks = chunks.into_iter();
-    let mut all = chunks.next().unwrap_or_else(|| Channels::new(net, border, weights.is_some()));
+    let mut all = chunks.next().unwrap_or_else(|| Channels::new(grid, border, weights.is_some()));
     chunks.for_each(|chunk| all.add(&chunk));
     all
 }
 
 fn spread_one(
     channels: &mut Channels,
-    net: &Net,
+    grid: &Grid,
     peaks: &[f64; SPREAD_REACH + 1],
     place: [f64; 2],
     value: f64,
@@ -340,8 +346,8 @@ fn spread_one(
 ) {
     let mut first = [0usize; 2];
     let shares = [0, 1].map(|k| {
-        let last = [net.columns, net.rows][k] - 1;
-        let at = (place[k] - net.first_mm[k]) / net.spacing_mm[k];
+        let last = grid.counts()[k] - 1;
+        let at = (place[k] - grid.first_mm[k]) / grid.spacing_mm[k];
         let nearest = at.round().clamp(0.0, last as f64);
         first[k] = nearest as usize;
         // exp(-((n - d) / s)^2 / 2), from two exponentials: that of n^2 is a constant, that of n d a power.
@@ -444,39 +450,39 @@ impl Summed {
 
 /// How many readings lie in any rectangle of nodes: sums of all to the left and below.
 struct Counts {
-    net: Net,
+    grid: Grid,
     sums: Vec<u32>,
 }
 
 impl Counts {
-    fn new(places: &[[f64; 2]], net: &Net) -> Self {
-        let columns = net.columns + 1;
-        let mut sums = vec![0u32; columns * (net.rows + 1)];
+    fn new(places: &[[f64; 2]], grid: &Grid) -> Self {
+        let columns = grid.columns + 1;
+        let mut sums = vec![0u32; columns * (grid.rows + 1)];
         for place in places {
             let [i, j] = [0, 1].map(|k| {
-                let last = [net.columns, net.rows][k] - 1;
-                ((place[k] - net.first_mm[k]) / net.spacing_mm[k]).round().clamp(0.0, last as f64) as usize
+                let last = grid.counts()[k] - 1;
+                ((place[k] - grid.first_mm[k]) / grid.spacing_mm[k]).round().clamp(0.0, last as f64) as usize
             });
             sums[(j + 1) * columns + i + 1] += 1;
         }
-        for j in 1..=net.rows {
+        for j in 1..=grid.rows {
             let mut along = 0;
             for i in 1..columns {
                 along += sums[j * columns + i];
                 sums[j * columns + i] = along + sums[(j - 1) * columns + i];
             }
         }
-        Self { net: *net, sums }
+        Self { grid: *grid, sums }
     }
 
     /// Returns how many readings lie in the square about a node.
     fn within(&self, i: usize, j: usize, half_side_mm: f64) -> u32 {
         let range = |at: usize, k: usize, nodes: usize| {
-            let reach = (half_side_mm / self.net.spacing_mm[k]).round().min(1e9) as usize;
+            let reach = (half_side_mm / self.grid.spacing_mm[k]).round().min(1e9) as usize;
             (at.saturating_sub(reach), (at + reach + 1).min(nodes))
         };
-        let ((i0, i1), (j0, j1)) = (range(i, 0, self.net.columns), range(j, 1, self.net.rows));
-        let sum = |i: usize, j: usize| self.sums[j * (self.net.columns + 1) + i];
+        let ((i0, i1), (j0, j1)) = (range(i, 0, self.grid.columns), range(j, 1, self.grid.rows));
+        let sum = |i: usize, j: usize| self.sums[j * (self.grid.columns + 1) + i];
         sum(i1, j1) + sum(i0, j0) - sum(i0, j1) - sum(i1, j0)
     }
 }
@@ -535,11 +541,11 @@ impl Trend {
         self.terms.iter().zip(self.basis(place)).map(|(term, basis)| term * basis).sum()
     }
 
-    /// Adds the polynomial to values and slopes at the nodes of a net, of those that are wanted.
-    pub fn put_back(&self, net: &Net, wanted: impl Fn(usize) -> bool, values: &mut [f64], slopes: &mut [[f64; 2]]) {
+    /// Adds the polynomial to values and slopes at the nodes of a grid, of those that are wanted.
+    pub fn put_back(&self, grid: &Grid, wanted: impl Fn(usize) -> bool, values: &mut [f64], slopes: &mut [[f64; 2]]) {
         let term = |k: usize| self.terms.get(k).copied().unwrap_or(0.0);
-        for k in (0..net.len()).filter(|&k| wanted(k)) {
-            let place = net.place_mm(k);
+        for k in (0..grid.len()).filter(|&k| wanted(k)) {
+            let place = grid.place_mm(k);
             let [x, y] = [0, 1].map(|a| (place[a] - self.middle[a]) / self.size);
             values[k] += self.at(place);
             slopes[k][0] += (term(1) + 2.0 * term(3) * x + term(4) * y) / self.size;
@@ -551,23 +557,18 @@ impl Trend {
 impl Filtered {
     fn add(&mut self, trend: &Trend) {
         let supported = &self.supported;
-        trend.put_back(&self.net, |k| supported[k], &mut self.values, &mut self.slopes);
+        trend.put_back(&self.grid, |k| supported[k], &mut self.values, &mut self.slopes);
     }
 
-    /// Returns value, leverage and variance at a place of the net; `None` where no node about it is supported.
+    /// Returns value, leverage and variance at a place of the grid; `None` where no node about it is supported.
     ///
     /// The values and half the slopes of the four nodes about a place, weighed as for a bilinear value, are right up to the third
     /// derivative: the error of the one makes up for that of the other.
     pub fn at(&self, place: [f64; 2]) -> Option<[f64; 3]> {
-        let net = &self.net;
-        let [(i, u), (j, v)] = [0, 1].map(|k| {
-            let nodes = [net.columns, net.rows][k];
-            let at = ((place[k] - net.first_mm[k]) / net.spacing_mm[k]).clamp(0.0, (nodes - 1) as f64);
-            let cell = (at as usize).min(nodes.saturating_sub(2));
-            (cell, at - cell as f64)
-        });
+        let grid = &self.grid;
+        let [(i, u), (j, v)] = grid.cell(place);
         let corners = [[0, 0], [1, 0], [0, 1], [1, 1]].map(|[a, b]: [usize; 2]| {
-            let node = (j + b).min(net.rows - 1) * net.columns + (i + a).min(net.columns - 1);
+            let node = (j + b).min(grid.rows - 1) * grid.columns + (i + a).min(grid.columns - 1);
             let share = (if a == 0 { 1.0 - u } else { u }) * (if b == 0 { 1.0 - v } else { v });
             (node, if self.supported[node] { share } else { 0.0 })
         });
@@ -579,7 +580,7 @@ impl Filtered {
         let along = if total > 1.0 - 1e-9 { 0.5 } else { 1.0 };
         let mut sums = [0.0; 3];
         for (node, share) in corners.into_iter().filter(|(_, share)| *share > 0.0) {
-            let [x, y] = net.place_mm(node);
+            let [x, y] = grid.place_mm(node);
             let [p, q] = self.slopes[node];
             sums[0] += share * (self.values[node] + along * (p * (place[0] - x) + q * (place[1] - y)));
             sums[1] += share * self.leverage[node];

@@ -23,9 +23,9 @@ use serde::{Deserialize, Serialize};
 
 use super::correction::Correction;
 use super::filter::Order;
-use super::map::{ErrorMap, MapOptions, filter_net};
-use super::net::Net;
+use super::map::{ErrorMap, MapOptions, filter_grid};
 use super::response::{Response, Sense};
+use crate::geometry::Grid;
 
 /// Variance by which a pass makes what is believed of R older, over that of N.
 const DRIFT: f64 = 0.02;
@@ -73,13 +73,14 @@ struct Band {
 /// The mean of what passes told of R, each by its share.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct Mean {
-    net: Net,
+    #[serde(rename = "net")]
+    grid: Grid,
     values_mm: Vec<f64>,
 }
 
-/// An error on the net of a correction.
+/// An error on the grid of a correction.
 struct Told {
-    net: Net,
+    grid: Grid,
     error_mm: Vec<f64>,
     valid: Vec<bool>,
     /// Mean square of the standard uncertainty of a node from the noise of the points.
@@ -98,9 +99,9 @@ pub struct Knowledge {
     whole: Band,
     /// Passes that it was learned from.
     passes: u32,
-    /// On the net of the correction.
+    /// On the grid of the correction.
     mean: Option<Mean>,
-    /// What the pass after the last one taken in is to be corrected by, on the net of the correction.
+    /// What the pass after the last one taken in is to be corrected by, on the grid of the correction.
     #[serde(skip)]
     wanted_mm: Option<Vec<f64>>,
 }
@@ -164,12 +165,12 @@ impl Knowledge {
             known.wanted_mm = Some(seen.correction.values_mm.clone());
             return known;
         }
-        let told = Told::of(seen.error, seen.correction.net);
+        let told = Told::of(seen.error, seen.correction.grid);
         if let Some(answer) = seen.answer.filter(|answer| answer.sense == Sense::AsCommanded) {
             known.response = combined(self.response, &answer, self.bands[0].independent(&told));
         }
         let response = known.response[0];
-        let mut mean = Mean::on(self.mean.as_ref(), told.net, response / self.response[0]);
+        let mut mean = Mean::on(self.mean.as_ref(), told.grid, response / self.response[0]);
         let u = &seen.correction.values_mm;
         let news: Vec<f64> =
             told.error_mm.iter().zip(u).zip(&mean.values_mm).map(|((e, u), m)| e - response * u - m).collect();
@@ -178,7 +179,7 @@ impl Knowledge {
             band.take_in(told.mean_square(&news), band.independent(&told));
             add(&mut mean.values_mm, band.gain, &news);
         }
-        let mut believed = vec![0.0; told.net.len()];
+        let mut believed = vec![0.0; told.grid.len()];
         let noise = known.noise_mm2(told.noise_mm2);
         for ((band, mean), noise_mm2) in
             known.bands.iter_mut().zip(self.split(&told, mean.values_mm.clone())).zip(noise)
@@ -198,7 +199,7 @@ impl Knowledge {
         known
     }
 
-    /// Returns what the correction of the next pass is, in millimetres, at each node of the net of the last one; `None` before a pass of
+    /// Returns what the correction of the next pass is, in millimetres, at each node of the grid of the last one; `None` before a pass of
     /// this part was taken in.
     pub fn wanted_mm(&self) -> Option<&[f64]> {
         self.wanted_mm.as_deref()
@@ -220,7 +221,7 @@ impl Knowledge {
     pub fn forecast(&self, error: &ErrorMap) -> Forecast {
         let rest2 = error.rest_sigma_mm.powi(2);
         let (mut left2, mut scatter2, mut independent) = (0.0, 0.0, 0.0);
-        let told = Told::of(error, error.net);
+        let told = Told::of(error, error.grid);
         let noise = self.noise_mm2(told.noise_mm2);
         for ((band, values), noise_mm2) in self.bands.iter().zip(self.split(&told, told.error_mm.clone())).zip(noise) {
             let seen2 = told.mean_square(&values);
@@ -283,7 +284,7 @@ impl Knowledge {
                 && number(b.share)
         };
         let of_mean = |m: &Mean| {
-            m.net.is_sound() && m.values_mm.len() == m.net.len() && m.values_mm.iter().all(|v| v.is_finite())
+            m.grid.is_sound() && m.values_mm.len() == m.grid.len() && m.values_mm.iter().all(|v| v.is_finite())
         };
         (least..=most).contains(&self.response[0])
             && number(self.response[1])
@@ -293,7 +294,7 @@ impl Knowledge {
             && self.bands.windows(2).all(|w| w[0].from_mm < w[1].from_mm)
     }
 
-    /// Splits values on the net of an error into what each band holds of them; the parts add up to the values.
+    /// Splits values on the grid of an error into what each band holds of them; the parts add up to the values.
     fn split(&self, told: &Told, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
         let mut parts = Vec::with_capacity(self.bands.len());
         let whole = rest.clone();
@@ -321,21 +322,21 @@ impl Knowledge {
 }
 
 impl Mean {
-    /// The mean times a factor, on a net: as it is where it stands on it, what lies between its nodes otherwise, and nothing without any.
-    fn on(mean: Option<&Self>, net: Net, factor: f64) -> Self {
-        let mut values_mm = mean.map_or_else(|| vec![0.0; net.len()], |m| m.net.resample(&m.values_mm, &net));
+    /// The mean times a factor, on a grid: as it is where it stands on it, what lies between its nodes otherwise, and nothing without any.
+    fn on(mean: Option<&Self>, grid: Grid, factor: f64) -> Self {
+        let mut values_mm = mean.map_or_else(|| vec![0.0; grid.len()], |m| m.grid.resample(&m.values_mm, &grid));
         values_mm.iter_mut().for_each(|value| *value *= factor);
-        Self { net, values_mm }
+        Self { grid, values_mm }
     }
 }
 
 impl Told {
-    /// An error on another net: everything that is learned stands on the net of the correction, so that only the error, which becomes
+    /// An error on another grid: everything that is learned stands on the grid of the correction, so that only the error, which becomes
     /// small, is ever taken from between nodes.
-    fn of(error: &ErrorMap, net: Net) -> Self {
+    fn of(error: &ErrorMap, grid: Grid) -> Self {
         let noise_mm2 = mean_square(&error.valid, &error.sigma_mm);
-        let valid = (0..net.len()).map(|k| error.net.nearest(net.place_mm(k)).is_some_and(|node| error.valid[node]));
-        Self { net, error_mm: error.net.resample(&error.values_mm, &net), valid: valid.collect(), noise_mm2 }
+        let valid = (0..grid.len()).map(|k| error.grid.nearest(grid.place_mm(k)).is_some_and(|node| error.valid[node]));
+        Self { grid, error_mm: error.grid.resample(&error.values_mm, &grid), valid: valid.collect(), noise_mm2 }
     }
 
     fn mean_square(&self, values: &[f64]) -> f64 {
@@ -344,10 +345,10 @@ impl Told {
 
     /// Values without waves shorter than a wavelength.
     fn low_passed(&self, values: &[f64], cutoff_mm: f64) -> Vec<f64> {
-        match filter_net(&self.net, values, &self.valid, cutoff_mm, Order::default(), false) {
+        match filter_grid(&self.grid, values, &self.valid, cutoff_mm, Order::default(), false) {
             Ok(smooth) => smooth.values,
             // A map too small for this wavelength has no waves that are longer.
-            Err(_) => vec![0.0; self.net.len()],
+            Err(_) => vec![0.0; self.grid.len()],
         }
     }
 }
@@ -391,7 +392,7 @@ impl Band {
 
     /// Number of independent values that a map has in this band: [`CORRELATED`] squares of twice its shortest waves make one.
     fn independent(&self, told: &Told) -> f64 {
-        let [dx, dy] = told.net.spacing_mm;
+        let [dx, dy] = told.grid.spacing_mm;
         let area_mm2 = dx * dy * told.valid.iter().filter(|valid| **valid).count() as f64;
         (area_mm2 / (2.0 * self.from_mm).powi(2) / CORRELATED).max(1.0)
     }
@@ -422,7 +423,7 @@ fn add(sum: &mut [f64], factor: f64, values: &[f64]) {
 mod tests {
     use super::*;
 
-    const NET: Net = Net { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0, 1.0] };
+    const GRID: Grid = Grid { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0, 1.0] };
     /// Bands from 2.5, 5 and 10 mm; an octave more would be half the part.
     const CUTOFF_MM: f64 = 2.5;
 
@@ -431,12 +432,12 @@ mod tests {
     }
 
     fn map(value: impl Fn([f64; 2]) -> f64) -> ErrorMap {
-        let values = (0..NET.len()).map(|k| value(NET.place_mm(k))).collect();
-        ErrorMap::known(NET, values, vec![true; NET.len()])
+        let values = (0..GRID.len()).map(|k| value(GRID.place_mm(k))).collect();
+        ErrorMap::known(GRID, values, vec![true; GRID.len()])
     }
 
     fn none() -> Correction {
-        Correction::none(NET, 0.0)
+        Correction::none(GRID, 0.0)
     }
 
     fn after(known: &Knowledge, correction: &Correction, error: &ErrorMap) -> Knowledge {
@@ -451,7 +452,7 @@ mod tests {
     fn scatter(pass: u32, rms_mm: f64) -> Vec<f64> {
         let number = f64::from(pass + 2) * std::f64::consts::TAU / 41.0;
         let at = |[x, _]: [f64; 2]| (number * x + f64::from(pass)).sin();
-        (0..NET.len()).map(|k| at(NET.place_mm(k)) * rms_mm * 2f64.sqrt()).collect()
+        (0..GRID.len()).map(|k| at(GRID.place_mm(k)) * rms_mm * 2f64.sqrt()).collect()
     }
 
     fn of(values_mm: Vec<f64>) -> ErrorMap {
@@ -480,7 +481,7 @@ mod tests {
         for pass in 1..=6 {
             let scatter = scatter(pass, 1e-3);
             let left = |k: usize| form[k] + correction.values_mm[k];
-            known = after(&known, &correction, &of((0..NET.len()).map(|k| left(k) + scatter[k]).collect()));
+            known = after(&known, &correction, &of((0..GRID.len()).map(|k| left(k) + scatter[k]).collect()));
             correction = correction.changed(&known);
             let left: Vec<f64> = form.iter().zip(&correction.values_mm).map(|(r, u)| r + u).collect();
             let expected = 1e-3 / f64::from(pass).sqrt();
@@ -501,7 +502,7 @@ mod tests {
         assert!((gain(2e-3) - (1.0 - (1.0 + DRIFT) / 4.0)).abs() < 1e-12, "{}", gain(2e-3));
         assert_eq!(gain(0.5e-3), 0.0);
         // Without a second pass the noise of the points is what is known: nearly all of it is in the shortest waves, and they are left.
-        let noisy = |error: ErrorMap| ErrorMap { sigma_mm: vec![1e-3; NET.len()], ..error };
+        let noisy = |error: ErrorMap| ErrorMap { sigma_mm: vec![1e-3; GRID.len()], ..error };
         let short = noisy(map(|[x, _]| 0.9e-3 * (x * std::f64::consts::TAU / 4.0).sin()));
         let known = after(&begin(GainRule::Wavelength, None), &none(), &short);
         let shares: Vec<f64> = known.gains().iter().map(|[_, gain]| *gain).collect();
@@ -583,18 +584,18 @@ mod tests {
     fn a_better_response_counts_for_what_is_still_seen() {
         // A part that answers with 0.8 of what is asked. By hand, in units of the error: the second pass leaves 0.2 and tells so; with a gain of
         // 0.505 the mean is 0.901, of which 0.987 is believed beside a scatter of 0.2^2 / 2.02: 0.1105 is left. Then 0.344, 0.935, 0.9945
-        // and 0.0701. On a net beside that of the correction, with a hole, so that what lies between nodes is lost.
+        // and 0.0701. On a grid beside that of the correction, with a hole, so that what lies between nodes is lost.
         let form = |[x, y]: [f64; 2]| 0.02 * (0.15 * x + 0.1).sin() * (0.12 * y).cos();
-        let net = Net { columns: 38, rows: 29, first_mm: [-18.6, -14.3], spacing_mm: [1.0, 1.0] };
+        let grid = Grid { columns: 38, rows: 29, first_mm: [-18.6, -14.3], spacing_mm: [1.0, 1.0] };
         let mut known = begin(GainRule::Adaptive, None);
         let mut correction = none();
         let mut left = Vec::new();
         for slope in [None, Some(0.8), Some(0.8), Some(0.8)] {
             let at = |place| form(place) + 0.8 * correction.at(place);
             let hole = |[x, y]: [f64; 2]| x.hypot(y) > 4.0;
-            let places: Vec<[f64; 2]> = (0..net.len()).map(|k| net.place_mm(k)).collect();
+            let places: Vec<[f64; 2]> = (0..grid.len()).map(|k| grid.place_mm(k)).collect();
             let error = ErrorMap::known(
-                net,
+                grid,
                 places.iter().map(|p| at(*p)).collect(),
                 places.iter().map(|p| hole(*p)).collect(),
             );
@@ -630,14 +631,14 @@ mod tests {
         let known = begin(GainRule::Wavelength, None);
         assert_eq!(known.bands.iter().map(|b| b.from_mm).collect::<Vec<_>>(), [2.5, 5.0, 10.0]);
         let error = map(|[x, y]| (1.3 * x).sin() + 0.1 * y + (0.2 * x * y).cos());
-        let parts = known.split(&Told::of(&error, NET), error.values_mm.clone());
+        let parts = known.split(&Told::of(&error, GRID), error.values_mm.clone());
         for (k, value) in error.values_mm.iter().enumerate() {
             assert!((parts.iter().map(|part| part[k]).sum::<f64>() - value).abs() < 1e-12);
         }
         // A long wave is in the last band, a short one in the first.
         let share = |wavelength_mm: f64, band: usize| {
             let wave = map(|[x, _]| (x * std::f64::consts::TAU / wavelength_mm).cos());
-            rms(&known.split(&Told::of(&wave, NET), wave.values_mm.clone())[band]) / rms(&wave.values_mm)
+            rms(&known.split(&Told::of(&wave, GRID), wave.values_mm.clone())[band]) / rms(&wave.values_mm)
         };
         assert!(share(30.0, 2) > 0.85 && share(3.0, 0) > 0.8, "{} {}", share(30.0, 2), share(3.0, 0));
     }
@@ -648,10 +649,11 @@ mod tests {
         // points all over for the mean with the border.
         let known = begin(GainRule::Wavelength, None);
         let powers = |node: usize| {
-            let mut point = vec![0.0; NET.len()];
+            let mut point = vec![0.0; GRID.len()];
             point[node] = 1.0;
-            let smooth = filter_net(&NET, &point, &vec![true; NET.len()], CUTOFF_MM, Order::default(), false).unwrap();
-            let told = Told::of(&of(smooth.values.clone()), NET);
+            let smooth =
+                filter_grid(&GRID, &point, &vec![true; GRID.len()], CUTOFF_MM, Order::default(), false).unwrap();
+            let told = Told::of(&of(smooth.values.clone()), GRID);
             let power = |values: &[f64]| values.iter().map(|v| v * v).sum::<f64>();
             let parts = known.split(&told, smooth.values.clone());
             [power(&parts[0]), power(&parts[1]), power(&parts[2]), power(&smooth.values)]
@@ -660,7 +662,7 @@ mod tests {
             let sum = nodes.map(powers).fold([0.0; 4], |a, b| std::array::from_fn(|k| a[k] + b[k]));
             [0, 1, 2].map(|k| sum[k] / sum[3])
         };
-        let (inside, everywhere) = (share(&mut [15 * 41 + 20].into_iter()), share(&mut (0..NET.len()).step_by(7)));
+        let (inside, everywhere) = (share(&mut [15 * 41 + 20].into_iter()), share(&mut (0..GRID.len()).step_by(7)));
         // By hand: 1 + 1/5 - 4/6, 1/5 + 1/17 - 4/22, 1/17.
         let shares = known.noise_mm2(1.0);
         for (share, by_hand) in shares.iter().zip([0.533_333, 0.077_005, 0.058_824]) {
@@ -709,10 +711,10 @@ mod tests {
         assert!(broken(|k| k.bands[0].share = f64::NAN));
         assert!(broken(|k| k.mean.as_mut().unwrap().values_mm.truncate(3)));
         assert!(broken(|k| k.mean.as_mut().unwrap().values_mm[0] = f64::NAN));
-        assert!(broken(|k| k.mean.as_mut().unwrap().net.spacing_mm[0] = 0.0));
+        assert!(broken(|k| k.mean.as_mut().unwrap().grid.spacing_mm[0] = 0.0));
         assert!(broken(|k| {
             let mean = k.mean.as_mut().unwrap();
-            (mean.net.columns, mean.values_mm) = (0, Vec::new());
+            (mean.grid.columns, mean.values_mm) = (0, Vec::new());
         }));
     }
 }

@@ -1,8 +1,8 @@
 //! What a map says where nothing was measured: it levels off, and never extrapolates.
 
-use super::net::Net;
+use crate::geometry::Grid;
 
-/// Values at every node of a net, and for each the node that they come from.
+/// Values at every node of a grid, and for each the node that they come from.
 pub(super) struct Levelled {
     pub values: Vec<f64>,
     /// The nearest node with a value of its own; the node itself where it has one.
@@ -15,16 +15,16 @@ pub(super) struct Levelled {
 /// g t (1 - t / L)^2, with the slope g at the source towards the node. So it leaves with the slope that it has there, never gets
 /// farther from the constant than 4/27 g L, and is the constant, with no slope, from L on. With L = 0 it is the constant at once.
 pub(super) fn level_off(
-    net: &Net,
+    grid: &Grid,
     mut values: Vec<f64>,
     slopes: &[[f64; 2]],
     known: &[bool],
     distance_mm: f64,
 ) -> Levelled {
-    let sources = nearest_known(net, known);
-    for k in (0..net.len()).filter(|&k| !known[k]) {
+    let sources = nearest_known(grid, known);
+    for k in (0..grid.len()).filter(|&k| !known[k]) {
         let source = sources[k];
-        let (here, there) = (net.place_mm(k), net.place_mm(source));
+        let (here, there) = (grid.place_mm(k), grid.place_mm(source));
         let off = [here[0] - there[0], here[1] - there[1]];
         let left = 1.0 - off[0].hypot(off[1]) / distance_mm;
         let rise = slopes[source][0] * off[0] + slopes[source][1] * off[1];
@@ -35,14 +35,14 @@ pub(super) fn level_off(
 
 /// Returns for every node the nearest one that is known, itself where it is; at least one must be.
 ///
-/// Two sweeps over the net, down and up, hand on from neighbour to neighbour where the nearest known node is (Danielsson 1980).
-pub(super) fn nearest_known(net: &Net, known: &[bool]) -> Vec<usize> {
+/// Two sweeps over the grid, down and up, hand on from neighbour to neighbour where the nearest known node is (Danielsson 1980).
+pub(super) fn nearest_known(grid: &Grid, known: &[bool]) -> Vec<usize> {
     const NONE: usize = usize::MAX;
-    let (columns, rows) = (net.columns, net.rows);
-    let mut nearest: Vec<usize> = (0..net.len()).map(|k| if known[k] { k } else { NONE }).collect();
+    let (columns, rows) = (grid.columns, grid.rows);
+    let mut nearest: Vec<usize> = (0..grid.len()).map(|k| if known[k] { k } else { NONE }).collect();
     let distance2 = |a: usize, b: usize| {
         let steps = [(a % columns).abs_diff(b % columns), (a / columns).abs_diff(b / columns)];
-        (steps[0] as f64 * net.spacing_mm[0]).powi(2) + (steps[1] as f64 * net.spacing_mm[1]).powi(2)
+        (steps[0] as f64 * grid.spacing_mm[0]).powi(2) + (steps[1] as f64 * grid.spacing_mm[1]).powi(2)
     };
     let mut offer = |to: usize, from: usize| {
         let candidate = nearest[from];
@@ -75,17 +75,17 @@ pub(super) fn nearest_known(net: &Net, known: &[bool]) -> Vec<usize> {
 mod tests {
     use super::*;
 
-    const NET: Net = Net { columns: 31, rows: 9, first_mm: [0.0, 0.0], spacing_mm: [1.0, 2.0] };
+    const GRID: Grid = Grid { columns: 31, rows: 9, first_mm: [0.0, 0.0], spacing_mm: [1.0, 2.0] };
 
     #[test]
     fn the_nearest_is_the_nearest() {
         let seeds = [0, 40, 95, 200, 260];
-        let known: Vec<bool> = (0..NET.len()).map(|k| seeds.contains(&k)).collect();
+        let known: Vec<bool> = (0..GRID.len()).map(|k| seeds.contains(&k)).collect();
         let far = |a: usize, b: usize| {
-            let (p, q) = (NET.place_mm(a), NET.place_mm(b));
+            let (p, q) = (GRID.place_mm(a), GRID.place_mm(b));
             (p[0] - q[0]).hypot(p[1] - q[1])
         };
-        for (k, found) in nearest_known(&NET, &known).into_iter().enumerate() {
+        for (k, found) in nearest_known(&GRID, &known).into_iter().enumerate() {
             let least = seeds.iter().map(|s| far(k, *s)).fold(f64::INFINITY, f64::min);
             assert!((far(k, found) - least).abs() < 1e-12, "{k}: {found}");
         }
@@ -93,15 +93,15 @@ mod tests {
 
     #[test]
     fn the_slope_goes_to_nothing_within_the_distance() {
-        let known: Vec<bool> = (0..NET.len()).map(|k| k % NET.columns <= 10).collect();
-        let values = (0..NET.len()).map(|k| if known[k] { 0.1 * NET.place_mm(k)[0] } else { 0.0 }).collect();
-        let slopes = vec![[0.1, 0.0]; NET.len()];
-        let levelled = level_off(&NET, values, &slopes, &known, 12.0).values;
+        let known: Vec<bool> = (0..GRID.len()).map(|k| k % GRID.columns <= 10).collect();
+        let values = (0..GRID.len()).map(|k| if known[k] { 0.1 * GRID.place_mm(k)[0] } else { 0.0 }).collect();
+        let slopes = vec![[0.1, 0.0]; GRID.len()];
+        let levelled = level_off(&GRID, values, &slopes, &known, 12.0).values;
         // One millimetre on: 1 + 0.1 (1 - 1/12)^2.
         assert!((levelled[11] - (1.0 + 0.1 * (11.0f64 / 12.0).powi(2))).abs() < 1e-15);
         assert!(levelled.iter().all(|v| *v <= 1.0 + 4.0 / 27.0 * 1.2 + 1e-12));
         assert!((22..31).all(|i| levelled[i] == 1.0));
-        let at_once = level_off(&NET, levelled.clone(), &slopes, &known, 0.0).values;
+        let at_once = level_off(&GRID, levelled.clone(), &slopes, &known, 0.0).values;
         assert!((11..31).all(|i| at_once[i] == 1.0));
     }
 }

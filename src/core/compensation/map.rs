@@ -1,4 +1,4 @@
-//! From scattered deviations to a smooth map on a net, with what is known of its uncertainty.
+//! From scattered deviations to a smooth map on a grid, with what is known of its uncertainty.
 //!
 //! ```text
 //!  readings -> outliers out -> filter (Gaussian, robust, spline) -> levelled off outside -> ErrorMap
@@ -10,12 +10,12 @@ use thiserror::Error;
 
 use super::filter::{Filtered, Gaussian, LEAST_READINGS, Order};
 use super::level::{Levelled, level_off};
-use super::net::{Net, NetError};
 use super::robust::{Residuals, Robust, residuals, robust};
 use super::sampling::{check_cutoff, point_spacings_mm};
 use super::spline::{Roughness, SplineError, spline};
+use crate::geometry::{Grid, GridError};
 
-/// Most nodes that a filter may work on; a short cut-off on a wide net asks for more nodes than the net has.
+/// Most nodes that a filter may work on; a short cut-off on a wide grid asks for more nodes than the grid has.
 const MOST_WORKED: f64 = 2e7;
 
 /// Least cut-off of the surface that readings are judged by, in distances between them.
@@ -85,7 +85,7 @@ impl MapOptions {
 #[derive(Clone, Debug, PartialEq)]
 pub struct ErrorMap {
     /// Where the nodes are.
-    pub net: Net,
+    pub grid: Grid,
     /// The error at every node in millimetres, finite everywhere; where `valid` is not, levelled off from the nearest valid node.
     pub values_mm: Vec<f64>,
     /// Whether enough was measured around a node.
@@ -110,7 +110,7 @@ pub struct ErrorMap {
 #[allow(missing_docs)]
 pub enum MapError {
     #[error(transparent)]
-    Net(#[from] NetError),
+    Grid(#[from] GridError),
     #[error(transparent)]
     Spline(#[from] SplineError),
     #[error("a cut-off of {cutoff_mm} mm is asked for; it must be above 0")]
@@ -125,7 +125,7 @@ pub enum MapError {
     )]
     TooSparse { valid: usize, nodes: usize, cutoff_mm: f64 },
     #[error(
-        "a cut-off of {cutoff_mm} mm on a net of {width_mm:.1} x {depth_mm:.1} mm needs {nodes:.0} nodes to filter on, more than \
+        "a cut-off of {cutoff_mm} mm on a grid of {width_mm:.1} x {depth_mm:.1} mm needs {nodes:.0} nodes to filter on, more than \
          {MOST_WORKED:.0}; choose a longer cut-off"
     )]
     CutoffTooShort { cutoff_mm: f64, width_mm: f64, depth_mm: f64, nodes: f64 },
@@ -139,11 +139,11 @@ pub enum MapError {
          shorter waves are not seen; choose a longer cut-off or measure more densely"
     )]
     CutoffBelowSpacing { cutoff_mm: f64, least_mm: f64, point_spacing_mm: f64 },
-    #[error("{found} values are given for a net of {nodes} nodes; there must be one for each")]
+    #[error("{found} values are given for a grid of {nodes} nodes; there must be one for each")]
     Shape { found: usize, nodes: usize },
 }
 
-/// Takes outliers out of deviations, filters the rest and lays it on a net.
+/// Takes outliers out of deviations, filters the rest and lays it on a grid.
 ///
 /// Shapes: readings in any order. Frames: x and y of the model frame. Units: millimetres. Equation: weighted least squares of a
 /// polynomial at every node with weights exp(-pi (r / (alpha cutoff))^2), see [`Order::alpha`]; or the smoothing spline. A cut-off that is
@@ -151,15 +151,15 @@ pub enum MapError {
 /// before anything is measured.
 ///
 /// # Errors
-/// Deviations that are not finite, too few of them for the cut-off, options out of range, and a net that cannot be.
+/// Deviations that are not finite, too few of them for the cut-off, options out of range, and a grid that cannot be.
 pub fn error_map(readings: &[Reading], options: &MapOptions) -> Result<ErrorMap, MapError> {
     check(readings, options)?;
-    let net = Net::over(readings.iter().map(|r| r.at_mm), options.spacing_mm)?;
+    let grid = Grid::over(readings.iter().map(|r| r.at_mm), options.spacing_mm)?;
     let gaussian = Gaussian { cutoff_mm: options.cutoff_mm, order: options.order };
-    let worked = worked_net(&net, &gaussian)?;
+    let worked = worked_grid(&grid, &gaussian)?;
     let apart_mm = point_spacings_mm(readings);
     let wide = Gaussian { cutoff_mm: options.cutoff_mm.max(WIDE * apart_mm[0].max(apart_mm[1])), ..gaussian };
-    let wide = Wide { gaussian: wide, net: worked_net(&net, &wide)?, same: wide == gaussian };
+    let wide = Wide { gaussian: wide, grid: worked_grid(&grid, &wide)?, same: wide == gaussian };
     let mut kept = Kept::all(readings);
     let (mut outliers, mut found, mut advice) = (Vec::new(), None, Vec::new());
     if let Some(limit) = options.outlier_limit {
@@ -183,16 +183,16 @@ pub fn error_map(readings: &[Reading], options: &MapOptions) -> Result<ErrorMap,
         let point_sigma = wide.point_sigma(&kept, &filtered);
         (filtered, point_sigma)
     };
-    let smooth = Smooth::from_filtered(&filtered, &net, point_sigma);
+    let smooth = Smooth::from_filtered(&filtered, &grid, point_sigma);
     let count = smooth.valid.iter().filter(|v| **v).count();
-    if count * 4 < net.len() {
-        return Err(MapError::TooSparse { valid: count, nodes: net.len(), cutoff_mm: options.cutoff_mm });
+    if count * 4 < grid.len() {
+        return Err(MapError::TooSparse { valid: count, nodes: grid.len(), cutoff_mm: options.cutoff_mm });
     }
     let smooth = match options.smoothing {
-        Smoothing::Spline => smooth.with_spline(&net, &kept, density(&filtered, &gaussian), options)?,
+        Smoothing::Spline => smooth.with_spline(&grid, &kept, density(&filtered, &gaussian), options)?,
         _ => smooth,
     };
-    let map = smooth.into_map(net, &kept, outliers, options.level_off_mm);
+    let map = smooth.into_map(grid, &kept, outliers, options.level_off_mm);
     Ok(ErrorMap { advice, ..map }.advised(options, readings.len(), apart_mm))
 }
 
@@ -200,14 +200,14 @@ pub fn error_map(readings: &[Reading], options: &MapOptions) -> Result<ErrorMap,
 /// compared with little but itself.
 struct Wide {
     gaussian: Gaussian,
-    net: Net,
+    grid: Grid,
     /// Whether it is the filter of the map.
     same: bool,
 }
 
 impl Wide {
     fn robust(&self, kept: &Kept) -> Robust {
-        robust(&self.gaussian, &kept.places, &kept.values, &self.net)
+        robust(&self.gaussian, &kept.places, &kept.values, &self.grid)
     }
 
     /// Returns the standard deviation of one reading; `filtered` is what the map's own filter found.
@@ -215,14 +215,14 @@ impl Wide {
         if self.same {
             return residuals(filtered, &kept.places, &kept.values, None).sigma();
         }
-        let wide = self.gaussian.scattered(&kept.places, &kept.values, None, &self.net);
+        let wide = self.gaussian.scattered(&kept.places, &kept.values, None, &self.grid);
         residuals(&wide, &kept.places, &kept.values, None).sigma()
     }
 }
 
 /// Returns how many readings there are to the square millimetre, typically, from their shares in the values.
 fn density(filtered: &Filtered, gaussian: &Gaussian) -> f64 {
-    let supported = (0..filtered.net.len()).filter(|&k| filtered.supported[k]);
+    let supported = (0..filtered.grid.len()).filter(|&k| filtered.supported[k]);
     let mut shares: Vec<f64> = supported.map(|k| filtered.leverage[k]).collect();
     let middle = shares.len() / 2;
     let median = if shares.is_empty() { 1.0 } else { *shares.select_nth_unstable_by(middle, f64::total_cmp).1 };
@@ -248,17 +248,17 @@ fn check(readings: &[Reading], options: &MapOptions) -> Result<(), MapError> {
     }
 }
 
-/// Returns the net that the filter works on: nodes of the map and as many between them as the weights ask for.
-fn worked_net(net: &Net, gaussian: &Gaussian) -> Result<Net, MapError> {
-    let division = gaussian.division(net);
-    let finer = |k: usize| ([net.columns, net.rows][k] - 1) as f64 * division[k] as f64 + 1.0;
+/// Returns the grid that the filter works on: nodes of the map and as many between them as the weights ask for.
+fn worked_grid(grid: &Grid, gaussian: &Gaussian) -> Result<Grid, MapError> {
+    let division = gaussian.division(grid);
+    let finer = |k: usize| (grid.counts()[k] - 1) as f64 * division[k] as f64 + 1.0;
     let nodes = finer(0) * finer(1);
     if nodes > MOST_WORKED {
-        let [width_mm, depth_mm] = [0, 1].map(|k| ([net.columns, net.rows][k] - 1) as f64 * net.spacing_mm[k]);
+        let [width_mm, depth_mm] = [0, 1].map(|k| (grid.counts()[k] - 1) as f64 * grid.spacing_mm[k]);
         return Err(MapError::CutoffTooShort { cutoff_mm: gaussian.cutoff_mm, width_mm, depth_mm, nodes });
     }
-    let spacing_mm = [0, 1].map(|k| net.spacing_mm[k] / division[k] as f64);
-    Ok(Net { columns: finer(0) as usize, rows: finer(1) as usize, first_mm: net.first_mm, spacing_mm })
+    let spacing_mm = [0, 1].map(|k| grid.spacing_mm[k] / division[k] as f64);
+    Ok(Grid { columns: finer(0) as usize, rows: finer(1) as usize, first_mm: grid.first_mm, spacing_mm })
 }
 
 /// The readings that are used, places and values apart.
@@ -294,11 +294,11 @@ struct Smooth {
 
 impl Smooth {
     /// Picks the nodes of the map out of those that were worked on.
-    fn from_filtered(filtered: &Filtered, net: &Net, point_sigma: f64) -> Self {
+    fn from_filtered(filtered: &Filtered, grid: &Grid, point_sigma: f64) -> Self {
         let step = |worked: usize, wanted: usize| if wanted > 1 { (worked - 1) / (wanted - 1) } else { 1 };
-        let (across, along) = (step(filtered.net.columns, net.columns), step(filtered.net.rows, net.rows));
-        let node = |k: usize| (k / net.columns) * along * filtered.net.columns + (k % net.columns) * across;
-        let nodes: Vec<usize> = (0..net.len()).map(node).collect();
+        let (across, along) = (step(filtered.grid.columns, grid.columns), step(filtered.grid.rows, grid.rows));
+        let node = |k: usize| (k / grid.columns) * along * filtered.grid.columns + (k % grid.columns) * across;
+        let nodes: Vec<usize> = (0..grid.len()).map(node).collect();
         Self {
             values: nodes.iter().map(|&n| filtered.values[n]).collect(),
             slopes: nodes.iter().map(|&n| filtered.slopes[n]).collect(),
@@ -309,8 +309,8 @@ impl Smooth {
     }
 
     /// Puts the spline's surface in the place of the filter's; what was measured enough stays as it is.
-    fn with_spline(self, net: &Net, kept: &Kept, density: f64, options: &MapOptions) -> Result<Self, MapError> {
-        let fitted = spline(kept, net, density, options.cutoff_mm, options.roughness)?;
+    fn with_spline(self, grid: &Grid, kept: &Kept, density: f64, options: &MapOptions) -> Result<Self, MapError> {
+        let fitted = spline(kept, grid, density, options.cutoff_mm, options.roughness)?;
         Ok(Self {
             values: fitted.values,
             slopes: fitted.slopes,
@@ -320,12 +320,12 @@ impl Smooth {
         })
     }
 
-    fn into_map(self, net: Net, kept: &Kept, outliers: Vec<usize>, level_off_mm: f64) -> ErrorMap {
-        let Levelled { values, sources } = level_off(&net, self.values, &self.slopes, &self.valid, level_off_mm);
+    fn into_map(self, grid: Grid, kept: &Kept, outliers: Vec<usize>, level_off_mm: f64) -> ErrorMap {
+        let Levelled { values, sources } = level_off(&grid, self.values, &self.slopes, &self.valid, level_off_mm);
         let rest2: f64 =
-            kept.places.iter().zip(&kept.values).map(|(p, v)| (v - net.interpolate(&values, *p)).powi(2)).sum();
+            kept.places.iter().zip(&kept.values).map(|(p, v)| (v - grid.interpolate(&values, *p)).powi(2)).sum();
         ErrorMap {
-            net,
+            grid,
             values_mm: values,
             valid: self.valid,
             rest_sigma_mm: (rest2 / kept.values.len().max(1) as f64).sqrt(),
@@ -340,9 +340,9 @@ impl Smooth {
 
 impl ErrorMap {
     /// Returns a map whose values are known as they are: no scatter, no outliers.
-    pub fn known(net: Net, values_mm: Vec<f64>, valid: Vec<bool>) -> Self {
+    pub fn known(grid: Grid, values_mm: Vec<f64>, valid: Vec<bool>) -> Self {
         Self {
-            net,
+            grid,
             sigma_mm: vec![0.0; values_mm.len()],
             values_mm,
             valid,
@@ -356,13 +356,13 @@ impl ErrorMap {
 
     /// Returns the filtered error at a place, in millimetres.
     pub fn at(&self, place_mm: [f64; 2]) -> f64 {
-        self.net.interpolate(&self.values_mm, place_mm)
+        self.grid.interpolate(&self.values_mm, place_mm)
     }
 
     /// Returns x, y and the error of every valid node, in millimetres.
     pub fn samples_mm(&self) -> Vec<[f64; 3]> {
-        let nodes = (0..self.net.len()).filter(|&k| self.valid[k]);
-        nodes.map(|k| (self.net.place_mm(k), self.values_mm[k])).map(|([x, y], e)| [x, y, e]).collect()
+        let nodes = (0..self.grid.len()).filter(|&k| self.valid[k]);
+        nodes.map(|k| (self.grid.place_mm(k), self.values_mm[k])).map(|([x, y], e)| [x, y, e]).collect()
     }
 
     fn advised(mut self, options: &MapOptions, readings: usize, apart_mm: [f64; 2]) -> Self {
@@ -380,9 +380,9 @@ impl ErrorMap {
     }
 }
 
-/// A surface on a net that was filtered.
+/// A surface on a grid that was filtered.
 #[derive(Clone, Debug, PartialEq)]
-pub struct FilteredNet {
+pub struct FilteredGrid {
     /// Filtered values at every node, in the units of those that were given; those that are not valid are the nearest valid one's.
     pub values: Vec<f64>,
     /// Whether enough is known around a node.
@@ -391,50 +391,50 @@ pub struct FilteredNet {
     pub rounds: usize,
 }
 
-/// Filters a map that already lies on a net, as an interferometer gives it: ISO 16610-61, or its robust form ISO 16610-71.
+/// Filters a map that already lies on a grid, as an interferometer gives it: ISO 16610-61, or its robust form ISO 16610-71.
 ///
 /// Shapes: a value and whether it is valid for every node, row by row, x fastest. Values that are not valid may be anything and are not
 /// read. Units: any for the values; the cut-off in millimetres.
 ///
 /// # Errors
 /// Numbers of values other than that of the nodes, valid values that are not finite, a cut-off that is not above 0.
-pub fn filter_net(
-    net: &Net,
+pub fn filter_grid(
+    grid: &Grid,
     values: &[f64],
     valid: &[bool],
     cutoff_mm: f64,
     order: Order,
     robust_form: bool,
-) -> Result<FilteredNet, MapError> {
-    if values.len() != net.len() || valid.len() != net.len() {
-        return Err(MapError::Shape { found: values.len().min(valid.len()), nodes: net.len() });
+) -> Result<FilteredGrid, MapError> {
+    if values.len() != grid.len() || valid.len() != grid.len() {
+        return Err(MapError::Shape { found: values.len().min(valid.len()), nodes: grid.len() });
     }
     if !(cutoff_mm > 0.0 && cutoff_mm.is_finite()) {
         return Err(MapError::Cutoff { cutoff_mm });
     }
-    if let Some(index) = (0..net.len()).find(|&k| valid[k] && !values[k].is_finite()) {
+    if let Some(index) = (0..grid.len()).find(|&k| valid[k] && !values[k].is_finite()) {
         return Err(MapError::NotFinite { index });
     }
     let gaussian = Gaussian { cutoff_mm, order };
     let mask: Vec<f64> = valid.iter().map(|v| f64::from(u8::from(*v))).collect();
-    let plain = gaussian.on_net(values, &mask, net);
-    let (filtered, rounds) = if robust_form { robust_net(&gaussian, plain, values, &mask, net) } else { (plain, 1) };
+    let plain = gaussian.on_grid(values, &mask, grid);
+    let (filtered, rounds) = if robust_form { robust_grid(&gaussian, plain, values, &mask, grid) } else { (plain, 1) };
     let count = filtered.supported.iter().filter(|s| **s).count();
     if count == 0 {
-        return Err(MapError::TooSparse { valid: 0, nodes: net.len(), cutoff_mm });
+        return Err(MapError::TooSparse { valid: 0, nodes: grid.len(), cutoff_mm });
     }
-    let levelled = level_off(net, filtered.values, &filtered.slopes, &filtered.supported, 0.0);
-    Ok(FilteredNet { values: levelled.values, valid: filtered.supported, rounds })
+    let levelled = level_off(grid, filtered.values, &filtered.slopes, &filtered.supported, 0.0);
+    Ok(FilteredGrid { values: levelled.values, valid: filtered.supported, rounds })
 }
 
-fn robust_net(gaussian: &Gaussian, plain: Filtered, values: &[f64], mask: &[f64], net: &Net) -> (Filtered, usize) {
+fn robust_grid(gaussian: &Gaussian, plain: Filtered, values: &[f64], mask: &[f64], grid: &Grid) -> (Filtered, usize) {
     let masked = |weights: &[f64]| weights.iter().zip(mask).map(|(w, m)| w * m).collect::<Vec<f64>>();
-    let again = |weights: &[f64]| gaussian.on_net(values, &masked(weights), net);
+    let again = |weights: &[f64]| gaussian.on_grid(values, &masked(weights), grid);
     let compare = |filtered: &Filtered, _: Option<&[f64]>| {
         let known = |k: usize| mask[k] > 0.0 && filtered.supported[k];
-        let plain = (0..net.len()).map(|k| if known(k) { values[k] - filtered.values[k] } else { f64::NAN }).collect();
-        Residuals { plain, freedom: vec![1.0; net.len()] }
+        let plain = (0..grid.len()).map(|k| if known(k) { values[k] - filtered.values[k] } else { f64::NAN }).collect();
+        Residuals { plain, freedom: vec![1.0; grid.len()] }
     };
-    let found = super::robust::iterate(plain, net.len(), again, compare);
+    let found = super::robust::iterate(plain, grid.len(), again, compare);
     (found.filtered, found.rounds)
 }

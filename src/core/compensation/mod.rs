@@ -2,7 +2,7 @@
 //!
 //! ```text
 //!  deviations --error_map--> ErrorMap --Correction::next--> Correction --(ground, measured)--> Response
-//!  (scattered)               (filtered, on a net)           (absolute, versioned)              (did it answer as commanded?)
+//!  (scattered)               (filtered, on a grid)           (absolute, versioned)              (did it answer as commanded?)
 //!      |
 //!      +--parameters--> Parameters (wheel radius, setting, wear: corrected as such, not baked into the map)
 //! ```
@@ -16,7 +16,6 @@ mod filter;
 mod learning;
 mod level;
 mod map;
-mod net;
 mod parameters;
 pub mod path;
 mod response;
@@ -28,8 +27,7 @@ mod spline;
 pub use correction::{Correction, CorrectionLimits, Step, StepError};
 pub use filter::Order;
 pub use learning::{Forecast, GainRule, Knowledge, Seen};
-pub use map::{ErrorMap, FilteredNet, MapError, MapOptions, Reading, Smoothing, error_map, filter_net};
-pub use net::{Net, NetError};
+pub use map::{ErrorMap, FilteredGrid, MapError, MapOptions, Reading, Smoothing, error_map, filter_grid};
 pub use parameters::{
     Contact, Parameter, ParameterError, ParameterKind, ParameterOptions, Parameters, WheelTerm, parameters,
 };

@@ -70,15 +70,15 @@ pub fn response(
     scatter_mm: f64,
 ) -> Response {
     let [before, after] = errors;
-    let net = after.net;
+    let grid = after.grid;
     let unseen = Motions::new(places);
     let over =
         |value: &dyn Fn([f64; 2]) -> f64| unseen.without(places.iter().map(|(p, _)| value([p.x, p.y])).collect());
     let changed = |place: [f64; 2]| corrections[1].at(place) - corrections[0].at(place);
     let answer = over(&|place| after.at(place) - before.at(place));
     let [cx, cy] = [0, 1].map(|k| {
-        let nodes = [net.columns, net.rows][k];
-        2.0 * net.first_mm[k] + (nodes - 1) as f64 * net.spacing_mm[k]
+        let nodes = grid.counts()[k];
+        2.0 * grid.first_mm[k] + (nodes - 1) as f64 * grid.spacing_mm[k]
     });
     let fit = |place: fn([f64; 2], [f64; 2]) -> [f64; 2]| {
         let asked = over(&|at| changed(place(at, [cx, cy])));
@@ -182,13 +182,13 @@ impl Motions {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::compensation::Net;
+    use crate::geometry::Grid;
 
-    const NET: Net = Net { columns: 21, rows: 13, first_mm: [-10.0, -6.0], spacing_mm: [1.0, 1.0] };
+    const GRID: Grid = Grid { columns: 21, rows: 13, first_mm: [-10.0, -6.0], spacing_mm: [1.0, 1.0] };
 
     fn map(f: impl Fn(f64, f64) -> f64) -> ErrorMap {
-        let values_mm = (0..NET.len()).map(|k| NET.place_mm(k)).map(|[x, y]| f(x, y)).collect();
-        ErrorMap::known(NET, values_mm, vec![true; NET.len()])
+        let values_mm = (0..GRID.len()).map(|k| GRID.place_mm(k)).map(|[x, y]| f(x, y)).collect();
+        ErrorMap::known(GRID, values_mm, vec![true; GRID.len()])
     }
 
     /// An error without any symmetry.
@@ -198,14 +198,14 @@ mod tests {
 
     fn answered(seen: impl Fn(f64, f64) -> f64) -> Response {
         let before = map(error);
-        let none = Correction::none(NET, 0.0);
+        let none = Correction::none(GRID, 0.0);
         let asked = Correction { values_mm: before.values_mm.iter().map(|e| -e).collect(), ..none.clone() };
         response([&before, &map(|x, y| error(x, y) + seen(x, y))], [&none, &asked], &places(), 2e-4)
     }
 
     /// The nodes, on a part that is flat.
     fn places() -> Vec<(Point, Vector)> {
-        (0..NET.len()).map(|k| NET.place_mm(k)).map(|[x, y]| (Point::new(x, y, 0.0), Vector::z())).collect()
+        (0..GRID.len()).map(|k| GRID.place_mm(k)).map(|[x, y]| (Point::new(x, y, 0.0), Vector::z())).collect()
     }
 
     #[test]
@@ -226,7 +226,7 @@ mod tests {
     #[test]
     fn a_change_within_the_scatter_tells_nothing() {
         let flat = map(|_, _| 1e-5);
-        let none = Correction::none(NET, 0.0);
+        let none = Correction::none(GRID, 0.0);
         assert_eq!(response([&flat, &flat], [&none, &none], &places(), 1e-4).sense, Sense::Unclear);
         assert_eq!(response([&flat, &flat], [&none, &none], &places(), 0.0).sense, Sense::Unclear);
     }

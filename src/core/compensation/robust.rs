@@ -10,7 +10,7 @@
 //! no point rule can tell which.
 
 use super::filter::{Filtered, Gaussian};
-use super::net::Net;
+use crate::geometry::Grid;
 
 /// Most rounds of the robust filter.
 const ROUNDS: usize = 15;
@@ -87,10 +87,10 @@ impl Residuals {
 }
 
 /// Applies the robust filter.
-pub(super) fn robust(gaussian: &Gaussian, places: &[[f64; 2]], values: &[f64], net: &Net) -> Robust {
-    let again = |weights: &[f64]| gaussian.scattered(places, values, Some(weights), net);
+pub(super) fn robust(gaussian: &Gaussian, places: &[[f64; 2]], values: &[f64], grid: &Grid) -> Robust {
+    let again = |weights: &[f64]| gaussian.scattered(places, values, Some(weights), grid);
     let compare = |filtered: &Filtered, weights: Option<&[f64]>| residuals(filtered, places, values, weights);
-    iterate(gaussian.scattered(places, values, None, net), values.len(), again, compare)
+    iterate(gaussian.scattered(places, values, None, grid), values.len(), again, compare)
 }
 
 /// Filters and weighs by turns, from the plain filter's result.

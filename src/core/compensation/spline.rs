@@ -1,6 +1,6 @@
 //! A smoothing surface fitted to scattered readings: tensor-product cubic B-splines, held smooth by what it would take to bend it.
 //!
-//! The coefficients c minimise |d - B c|^2 + mu c^T P c, where c^T P c is the integral of f_xx^2 + 2 f_xy^2 + f_yy^2 over the net: the
+//! The coefficients c minimise |d - B c|^2 + mu c^T P c, where c^T P c is the integral of f_xx^2 + 2 f_xy^2 + f_yy^2 over the grid: the
 //! bending of a thin plate, worked out exactly for the splines. So A c = B^T d with A = B^T B + mu P, which is sparse (7 x 7
 //! neighbours) and is solved by sparse Cholesky. Planes cost nothing and pass.
 //!
@@ -25,8 +25,8 @@ use thiserror::Error;
 
 use super::filter::Trend;
 use super::map::Kept;
-use super::net::Net;
 use super::selected::{Pattern, SelectedInverse};
+use crate::geometry::Grid;
 
 /// Knots to a cut-off: with five the splines themselves let waves at the cut-off pass to 0.2 %.
 const KNOTS: f64 = 5.0;
@@ -61,7 +61,7 @@ pub enum SplineError {
     NotDetermined { points: usize },
 }
 
-/// A smoothing surface at the nodes of a net.
+/// A smoothing surface at the nodes of a grid.
 #[derive(Clone, Debug)]
 pub(super) struct Fitted {
     pub values: Vec<f64>,
@@ -75,19 +75,19 @@ pub(super) struct Fitted {
     pub cutoff_mm: f64,
 }
 
-/// Fits a smoothing surface to readings over a net.
+/// Fits a smoothing surface to readings over a grid.
 ///
 /// `density` is how many readings there are to the square millimetre.
 pub(super) fn spline(
     kept: &Kept,
-    net: &Net,
+    grid: &Grid,
     density: f64,
     cutoff_mm: f64,
     roughness: Roughness,
 ) -> Result<Fitted, SplineError> {
     let points = kept.values.len();
     let undetermined = || SplineError::NotDetermined { points };
-    let axes = axes(net, cutoff_mm)?;
+    let axes = axes(grid, cutoff_mm)?;
     let trend = Trend::fit(&kept.places, &kept.values, 1);
     let rest: Vec<f64> = kept.places.iter().zip(&kept.values).map(|(p, v)| v - trend.at(*p)).collect();
     let system = System::new(axes, &kept.places, &rest).ok_or_else(undetermined)?;
@@ -99,21 +99,21 @@ pub(super) fn spline(
             system.cross_validated(mu_of(cutoff_mm), mu_of(size_mm)).ok_or_else(undetermined)?
         }
     };
-    let mut fitted = system.fitted(net, mu).ok_or_else(undetermined)?;
+    let mut fitted = system.fitted(grid, mu).ok_or_else(undetermined)?;
     fitted.cutoff_mm = TAU * (mu / density).sqrt().sqrt();
-    trend.put_back(net, |_| true, &mut fitted.values, &mut fitted.slopes);
+    trend.put_back(grid, |_| true, &mut fitted.values, &mut fitted.slopes);
     Ok(fitted)
 }
 
-fn axes(net: &Net, cutoff_mm: f64) -> Result<[Axis; 2], SplineError> {
-    let length = |k: usize| [net.columns, net.rows][k].saturating_sub(1).max(1) as f64 * net.spacing_mm[k];
+fn axes(grid: &Grid, cutoff_mm: f64) -> Result<[Axis; 2], SplineError> {
+    let length = |k: usize| grid.counts()[k].saturating_sub(1).max(1) as f64 * grid.spacing_mm[k];
     let cells = |k: usize| (KNOTS * length(k) / cutoff_mm).ceil().max(4.0);
     let coefficients = (cells(0) + 3.0) * (cells(1) + 3.0);
     if coefficients > MOST_COEFFICIENTS {
         let [width_mm, depth_mm] = [length(0), length(1)];
         return Err(SplineError::TooFine { cutoff_mm, width_mm, depth_mm, coefficients });
     }
-    Ok([0, 1].map(|k| Axis { first: net.first_mm[k], step: length(k) / cells(k), cells: cells(k) as usize }))
+    Ok([0, 1].map(|k| Axis { first: grid.first_mm[k], step: length(k) / cells(k), cells: cells(k) as usize }))
 }
 
 /// Uniform cubic B-splines along one axis.
@@ -276,7 +276,7 @@ impl<'a> System<'a> {
         self.places.iter().zip(self.values).map(left).sum()
     }
 
-    fn fitted(&self, net: &Net, mu: f64) -> Option<Fitted> {
+    fn fitted(&self, grid: &Grid, mu: f64) -> Option<Fitted> {
         let coefficients = self.solve(mu)?;
         let (below, above) = rayon::join(|| self.inverse(mu * (-STEP).exp()), || self.inverse(mu * STEP.exp()));
         let (below, above) = (below?, above?);
@@ -286,11 +286,11 @@ impl<'a> System<'a> {
         let freedom =
             self.values.len() as f64 - 2.0 * self.trace(&inverse, &self.normal) + self.trace(&sandwich, &self.normal);
         let point_sigma = (self.squares(&coefficients) / freedom.max(1.0)).sqrt();
-        let nodes: Vec<[f64; 4]> = (0..net.len())
+        let nodes: Vec<[f64; 4]> = (0..grid.len())
             .into_par_iter()
             .with_min_len(256)
             .map(|k| {
-                let local = Local::at(&self.axes, net.place_mm(k));
+                let local = Local::at(&self.axes, grid.place_mm(k));
                 let [p, q] = local.slopes(&self.axes, &coefficients);
                 [local.sum(&coefficients), p, q, point_sigma * local.form(&sandwich).max(0.0).sqrt()]
             })

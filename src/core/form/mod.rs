@@ -3,7 +3,7 @@
 //! ```text
 //!  deviations (x, y, d) --+--> removed terms --> Figures    each with what was removed, its direction and its cut-off
 //!                         +--> Fit              Zernike or Legendre coefficients, orthogonal on the true aperture
-//!  error map (on a net) ----> Slope             over a stated integration length
+//!  error map (on a grid) ----> Slope             over a stated integration length
 //! ```
 //!
 //! Pure: no file, no clock, no randomness. Frames: x and y of the model frame {M}. Units: millimetres and radians inside, nanometres

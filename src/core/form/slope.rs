@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use super::FormError;
+use crate::geometry::Grid;
 
 /// The slopes of a map over an integration length.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -13,29 +14,24 @@ pub struct Slope {
     pub rms_along_rad: [f64; 2],
     /// Largest length of the gradient.
     pub largest_rad: f64,
-    /// Length over which a slope was taken along x and along y, in millimetres: an even number of steps of the net.
+    /// Length over which a slope was taken along x and along y, in millimetres: an even number of steps of the grid.
     pub integration_mm: [f64; 2],
     /// At how many nodes it was taken.
     pub nodes: usize,
 }
 
-/// Returns the slopes of values on a regular net, each the difference of two values an integration length apart, divided by it.
+/// Returns the slopes of values on a grid, each the difference of two values an integration length apart, divided by it.
 ///
-/// Shapes: columns and rows; a value and whether it is valid for every node, row by row, x fastest. Units: millimetres. The length is rounded to an even number of steps, two at
+/// Shapes: a value and whether it is valid for every node. Units: millimetres. The length is rounded to an even number of steps, two at
 /// least; a node counts where all four of its neighbours at half the length are valid.
 ///
 /// # Errors
 /// A length that is none, and a map without such a node.
-pub fn slope(
-    [columns, rows]: [usize; 2],
-    spacing_mm: [f64; 2],
-    values_mm: &[f64],
-    valid: &[bool],
-    integration_mm: f64,
-) -> Result<Slope, FormError> {
+pub fn slope(grid: &Grid, values_mm: &[f64], valid: &[bool], integration_mm: f64) -> Result<Slope, FormError> {
     if !(integration_mm > 0.0 && integration_mm.is_finite()) {
         return Err(FormError::Integration { integration_mm });
     }
+    let Grid { columns, rows, spacing_mm, .. } = *grid;
     let half = spacing_mm.map(|spacing| (0.5 * integration_mm / spacing).round().clamp(1.0, 1e9) as usize);
     let length_mm: [f64; 2] = std::array::from_fn(|k| 2.0 * half[k] as f64 * spacing_mm[k]);
     let known = |i: usize, j: usize| {
@@ -73,7 +69,12 @@ mod tests {
 
     fn of(f: impl Fn(f64, f64) -> f64, valid: &[bool], integration_mm: f64) -> Result<Slope, FormError> {
         let values: Vec<f64> = (0..NODES).map(|k| f((k % 41) as f64 - 20.0, (k / 41) as f64 - 15.0)).collect();
-        slope([41, 31], [1.0; 2], &values, valid, integration_mm)
+        slope(
+            &Grid { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0; 2] },
+            &values,
+            valid,
+            integration_mm,
+        )
     }
 
     #[test]

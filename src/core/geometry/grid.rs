@@ -1,259 +1,183 @@
-//! Regular grids among points that come in any order.
+//! A regular grid over x and y that heights, maps and corrections are written on.
 
-use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
 
-use super::Point;
+/// Most nodes a grid may have: a correction is read back over a wire.
+const MOST_NODES: f64 = 4e6;
 
-/// How far a point may stand from its node, in spacings: rounding in a file is far below, scatter far above.
-const NODE_TOLERANCE: f64 = 0.02;
-
-/// A node that no point fills.
-pub const NO_POINT: u32 = u32::MAX;
-
-/// A cloud seen as a grid over the xy plane: which point stands at each node.
-#[derive(Clone, Debug, PartialEq)]
-pub struct GridOrder {
-    /// Number of nodes along x.
+/// A regular grid over x and y of the model frame; nodes run row by row, x fastest.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Grid {
+    /// Nodes along x.
     pub columns: usize,
-    /// Number of nodes along y.
+    /// Nodes along y.
     pub rows: usize,
-    /// Index of the point at each node, row by row with x fastest; [`NO_POINT`] where there is none.
-    pub point_at: Vec<u32>,
-    /// Number of nodes without a point.
-    pub holes: usize,
+    /// The first node, in millimetres.
+    pub first_mm: [f64; 2],
+    /// Distance of the nodes, in millimetres.
+    pub spacing_mm: [f64; 2],
 }
 
-impl GridOrder {
-    /// Whether the points already come row by row, x fastest, without a hole.
-    pub fn is_in_order(&self) -> bool {
-        self.holes == 0 && self.point_at.iter().enumerate().all(|(node, &point)| node as u32 == point)
-    }
+/// Why there is no such grid.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[allow(missing_docs)]
+pub enum GridError {
+    #[error("a map with nodes every {spacing_mm} mm is asked for; the spacing must be above 0")]
+    Spacing { spacing_mm: f64 },
+    #[error(
+        "a map with nodes every {spacing_mm} mm over {width_mm:.1} x {depth_mm:.1} mm has {nodes:.0} nodes, more than \
+         {MOST_NODES:.0}; choose a wider spacing"
+    )]
+    TooFine { spacing_mm: f64, width_mm: f64, depth_mm: f64, nodes: f64 },
+    #[error("there is no point to lay a map over")]
+    NoPoints,
 }
 
-/// A cloud that comes row by row, x fastest, without a hole.
-#[derive(Clone, Debug, PartialEq)]
-pub(crate) struct GridInOrder {
-    pub(crate) columns: usize,
-    pub(crate) rows: usize,
-    /// The first node and the last, in x and y.
-    pub(crate) corners: [[f64; 2]; 2],
-}
-
-/// How far two points of one column may stand apart in x, as a share of the extent: below, it is rounding.
-const COLUMN_TOLERANCE: f64 = 5e-7;
-
-/// Recognises a whole regular grid whose points come row by row, x fastest, in one pass and without taking memory.
-///
-/// What it takes for a grid, [`recognise_grid`] does too; the other way round there are the grids in another order and those
-/// with holes.
-pub(crate) fn grid_in_order(points: &[Point]) -> Option<GridInOrder> {
-    let columns = 1 + points.windows(2).take_while(|pair| pair[1].x > pair[0].x).count();
-    let rows = points.len() / columns;
-    if columns < 3 || rows < 3 || columns * rows != points.len() || points.len() >= NO_POINT as usize {
-        return None;
-    }
-    let first = &points[..columns];
-    let column: Vec<f64> = first.iter().map(|p| p.x).collect();
-    let row: Vec<f64> = points.iter().step_by(columns).map(|p| p.y).collect();
-    if !(is_even(&column) && is_even(&row)) {
-        return None;
-    }
-    let near = |from: f64, to: f64| COLUMN_TOLERANCE * (to - from);
-    let (near_x, near_y) = (near(column[0], column[columns - 1]), near(row[0], row[rows - 1]));
-    let holds = |(line, y): (&[Point], &f64)| {
-        // Without a way out in the middle: a line is short, and the compiler takes several points at a time.
-        line.iter()
-            .zip(&column)
-            .fold(true, |all, (p, x)| all & ((p.x - x).abs() <= near_x) & ((p.y - y).abs() <= near_y) & p.z.is_finite())
-    };
-    points.par_chunks(columns).zip(&row).with_min_len(16).all(holds).then(|| GridInOrder {
-        columns,
-        rows,
-        corners: [[column[0], row[0]], [column[columns - 1], row[rows - 1]]],
-    })
-}
-
-/// Whether coordinates rise in equal steps.
-fn is_even(at: &[f64]) -> bool {
-    let step = (at[at.len() - 1] - at[0]) / (at.len() - 1) as f64;
-    step > 0.0
-        && step.is_finite()
-        && at.iter().enumerate().all(|(k, c)| (c - at[0] - k as f64 * step).abs() <= NODE_TOLERANCE * step)
-}
-
-/// Recognises a regular grid in x and y, whatever the order of the points and with nodes missing.
-///
-/// Shapes: at least 3 nodes on each axis, at most one node in four filled by chance is no grid. Returns `None` for
-/// scattered points, for two points at one node, and for anything that is not finite.
-pub fn recognise_grid(points: &[Point]) -> Option<GridOrder> {
-    if points.len() < 9 || points.len() >= NO_POINT as usize {
-        return None;
-    }
-    let x = Axis::find(points, |p| p.x)?;
-    let y = Axis::find(points, |p| p.y)?;
-    let nodes = x.count.checked_mul(y.count)?;
-    if x.count < 3 || y.count < 3 || nodes > 4 * points.len() {
-        return None;
-    }
-    let node_of = |p: &Point| Some(y.node(p.y)? as u32 * x.count as u32 + x.node(p.x)? as u32);
-    let node_of: Vec<u32> = points.par_iter().with_min_len(8192).map(node_of).collect::<Option<_>>()?;
-    let mut point_at = vec![NO_POINT; nodes];
-    for (index, node) in node_of.into_iter().enumerate() {
-        if std::mem::replace(&mut point_at[node as usize], index as u32) != NO_POINT {
-            return None;
+impl Grid {
+    /// Lays a grid over the bounds of some places, its spacing at most the one wanted, its border on the bounds.
+    ///
+    /// # Errors
+    /// A spacing that is not above 0 or makes too many nodes; no place.
+    pub fn over(places_mm: impl Iterator<Item = [f64; 2]>, spacing_mm: f64) -> Result<Self, GridError> {
+        let mut bounds: Option<[[f64; 2]; 2]> = None;
+        for [x, y] in places_mm {
+            let [low, high] = bounds.get_or_insert([[x, y]; 2]);
+            (low[0], low[1]) = (low[0].min(x), low[1].min(y));
+            (high[0], high[1]) = (high[0].max(x), high[1].max(y));
         }
-    }
-    Some(GridOrder { columns: x.count, rows: y.count, point_at, holes: nodes - points.len() })
-}
-
-/// Equally spaced coordinates along one axis.
-struct Axis {
-    first: f64,
-    per_mm: f64,
-    count: usize,
-}
-
-impl Axis {
-    /// Finds the spacing as the least gap between sorted coordinates of a sample that no order of the points can fool.
-    fn find(points: &[Point], coordinate: impl Fn(&Point) -> f64 + Sync) -> Option<Self> {
-        let (low, high) = points
-            .par_chunks(8192)
-            .map(|chunk| {
-                chunk.iter().map(&coordinate).fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), c| {
-                    if (c + low).is_nan() { (f64::NAN, f64::NAN) } else { (low.min(c), high.max(c)) }
-                })
-            })
-            .reduce(
-                || (f64::INFINITY, f64::NEG_INFINITY),
-                |a, b| if (a.0 + b.0).is_nan() { (f64::NAN, f64::NAN) } else { (a.0.min(b.0), a.1.max(b.1)) },
-            );
-        let extent = high - low;
-        if !extent.is_finite() || extent <= 0.0 {
-            return None;
+        let [low, high] = bounds.ok_or(GridError::NoPoints)?;
+        if !(spacing_mm > 0.0 && spacing_mm.is_finite()) {
+            return Err(GridError::Spacing { spacing_mm });
         }
-        let mut sample = sampled(points).map(&coordinate).collect::<Vec<_>>();
-        sample.sort_unstable_by(f64::total_cmp);
-        let gap = sample.windows(2).map(|w| w[1] - w[0]).filter(|gap| *gap > 1e-6 * extent).fold(extent, f64::min);
-        let steps = (extent / gap).round();
-        (steps < 6e4).then_some(Self { first: low, per_mm: steps / extent, count: steps as usize + 1 })
+        let sizes = [high[0] - low[0], high[1] - low[1]];
+        let steps = sizes.map(|size| (size / spacing_mm).ceil().max(1.0));
+        let nodes = (steps[0] + 1.0) * (steps[1] + 1.0);
+        if nodes > MOST_NODES || nodes.is_nan() {
+            let [width_mm, depth_mm] = sizes;
+            return Err(GridError::TooFine { spacing_mm, width_mm, depth_mm, nodes });
+        }
+        // A single column or row keeps a spacing of its own, so that positions stay apart.
+        let spacing = |size: f64, steps: f64| if size > 0.0 { size / steps } else { spacing_mm };
+        Ok(Self {
+            columns: steps[0] as usize + 1,
+            rows: steps[1] as usize + 1,
+            first_mm: low,
+            spacing_mm: [spacing(sizes[0], steps[0]), spacing(sizes[1], steps[1])],
+        })
     }
 
-    /// Returns the number of the node at a coordinate, if there is one.
-    #[inline]
-    fn node(&self, coordinate: f64) -> Option<usize> {
-        let at = (coordinate - self.first) * self.per_mm;
-        // Never below zero, so truncation is the floor.
-        let node = (at + 0.5) as u32;
-        ((at - f64::from(node)).abs() <= NODE_TOLERANCE).then_some(node as usize)
+    /// Returns the number of nodes.
+    pub fn len(&self) -> usize {
+        self.columns * self.rows
     }
-}
 
-/// The first points and a scatter over all of them: a grid in order shows its spacing in the first, a shuffled one in the
-/// second.
-fn sampled(points: &[Point]) -> impl Iterator<Item = &Point> {
-    const SAMPLE: usize = 4096;
-    let n = points.len();
-    let scattered = (0..SAMPLE.min(n) as u64).map(move |k| (k.wrapping_mul(0x9E37_79B9_7F4A_7C15) % n as u64) as usize);
-    points.iter().take(SAMPLE).chain(scattered.map(|i| &points[i]))
+    /// Returns the number of nodes along x and along y.
+    pub fn counts(&self) -> [usize; 2] {
+        [self.columns, self.rows]
+    }
+
+    /// Whether there is no node.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Returns x and y of a node, in millimetres.
+    pub fn place_mm(&self, node: usize) -> [f64; 2] {
+        let (i, j) = (node % self.columns.max(1), node / self.columns.max(1));
+        [self.first_mm[0] + i as f64 * self.spacing_mm[0], self.first_mm[1] + j as f64 * self.spacing_mm[1]]
+    }
+
+    /// Whether it has nodes, not too many of them, at places that are numbers; for what was read from a file.
+    pub fn is_sound(&self) -> bool {
+        let nodes = self.columns as f64 * self.rows as f64;
+        self.columns > 0
+            && self.rows > 0
+            && nodes <= MOST_NODES
+            && self.first_mm.iter().all(|v| v.is_finite())
+            && self.spacing_mm.iter().all(|v| *v > 0.0 && v.is_finite())
+    }
+
+    /// Returns the node nearest to a place; `None` more than half a cell beyond the border.
+    pub fn nearest(&self, place_mm: [f64; 2]) -> Option<usize> {
+        let along = |k: usize, nodes: usize| {
+            let node = ((place_mm[k] - self.first_mm[k]) / self.spacing_mm[k]).round();
+            (0.0..nodes as f64).contains(&node).then_some(node as usize)
+        };
+        Some(along(1, self.rows)? * self.columns + along(0, self.columns)?)
+    }
+
+    /// Returns values on another grid; where it is the same one, as they are.
+    pub fn resample(&self, values: &[f64], onto: &Self) -> Vec<f64> {
+        if self == onto {
+            return values.to_vec();
+        }
+        (0..onto.len()).map(|k| self.interpolate(values, onto.place_mm(k))).collect()
+    }
+
+    /// Returns the cell that a place lies in, or the nearest one: along x and y its lower node and the share of the way to the next.
+    pub fn cell(&self, place_mm: [f64; 2]) -> [(usize, f64); 2] {
+        [0, 1].map(|k| {
+            let nodes = self.counts()[k];
+            let at = ((place_mm[k] - self.first_mm[k]) / self.spacing_mm[k]).clamp(0.0, (nodes - 1) as f64);
+            let lower = (at as usize).min(nodes.saturating_sub(2));
+            (lower, at - lower as f64)
+        })
+    }
+
+    /// Returns the value at a place between the nodes, bilinear; beyond the border that of the nearest place on it.
+    pub fn interpolate(&self, values: &[f64], place_mm: [f64; 2]) -> f64 {
+        let [(i, u), (j, v)] = self.cell(place_mm);
+        let at = |i: usize, j: usize| values[j.min(self.rows - 1) * self.columns + i.min(self.columns - 1)];
+        (1.0 - v) * ((1.0 - u) * at(i, j) + u * at(i + 1, j)) + v * ((1.0 - u) * at(i, j + 1) + u * at(i + 1, j + 1))
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn grid(columns: usize, rows: usize, dx: f64, dy: f64) -> Vec<Point> {
-        (0..rows)
-            .flat_map(|j| {
-                (0..columns).map(move |i| Point::new(i as f64 * dx - 7.3, j as f64 * dy + 1.1, (i * j) as f64))
-            })
-            .collect()
-    }
-
-    /// A fixed shuffle: multiplication by a number coprime to the length.
-    fn shuffled(points: &[Point]) -> Vec<Point> {
-        let n = points.len();
-        let step = (n / 3..).find(|s| num_gcd(*s, n) == 1).unwrap();
-        (0..n).map(|i| points[(i * step + 5) % n]).collect()
-    }
-
-    fn num_gcd(a: usize, b: usize) -> usize {
-        if b == 0 { a } else { num_gcd(b, a % b) }
+    #[test]
+    fn a_grid_reaches_from_border_to_border() {
+        let grid = Grid::over([[-1.0, 2.0], [3.0, 5.5]].into_iter(), 1.0).unwrap();
+        assert_eq!((grid.columns, grid.rows), (5, 5));
+        assert_eq!(grid.place_mm(0), [-1.0, 2.0]);
+        assert_eq!(grid.place_mm(24), [3.0, 5.5]);
+        assert_eq!(Grid::over(std::iter::empty(), 1.0), Err(GridError::NoPoints));
+        assert!(matches!(Grid::over([[0.0; 2]].into_iter(), f64::NAN), Err(GridError::Spacing { .. })));
+        assert!(matches!(Grid::over([[0.0; 2], [1e9, 1.0]].into_iter(), 1e-3), Err(GridError::TooFine { .. })));
+        let line = Grid::over([[0.0, 1.0], [4.0, 1.0]].into_iter(), 2.0).unwrap();
+        assert_eq!(line.interpolate(&[1.0, 2.0, 4.0, 1.0, 2.0, 4.0], [3.0, 1.0]), 3.0);
     }
 
     #[test]
-    fn a_grid_in_order_and_the_same_grid_shuffled() {
-        let points = grid(101, 57, 0.1133, 0.124);
-        let order = recognise_grid(&points).unwrap();
-        assert_eq!((order.columns, order.rows, order.holes), (101, 57, 0));
-        assert!(order.is_in_order());
-        let found = grid_in_order(&points).unwrap();
-        assert_eq!((found.columns, found.rows), (101, 57));
-        assert_eq!(found.corners, [[points[0].x, points[0].y], [points[101 * 57 - 1].x, points[101 * 57 - 1].y]]);
-
-        let mixed = shuffled(&points);
-        assert_eq!(grid_in_order(&mixed), None);
-        let order = recognise_grid(&mixed).unwrap();
-        assert!(!order.is_in_order());
-        for (node, &index) in order.point_at.iter().enumerate() {
-            assert_eq!(mixed[index as usize], points[node]);
+    fn the_nearest_node_is_within_half_a_cell() {
+        let grid = Grid { columns: 3, rows: 2, first_mm: [-1.0, 5.0], spacing_mm: [1.0, 2.0] };
+        for (place, node) in [([-1.4, 5.9], Some(0)), ([0.6, 6.1], Some(5)), ([1.6, 5.0], None), ([0.0, 3.9], None)] {
+            assert_eq!(grid.nearest(place), node, "{place:?}");
         }
+        assert_eq!(grid.nearest([f64::NAN, 5.0]), None);
+        assert!(
+            grid.is_sound() && !Grid { columns: 0, ..grid }.is_sound() && !Grid { columns: 1 << 60, ..grid }.is_sound()
+        );
+        assert!(
+            !Grid { spacing_mm: [0.0, 1.0], ..grid }.is_sound()
+                && !Grid { first_mm: [f64::NAN, 1.0], ..grid }.is_sound()
+        );
+        let values = [0.0, 1.0, 2.0, 4.0, 5.0, 6.0];
+        let finer = Grid { columns: 5, rows: 1, first_mm: [-1.0, 6.0], spacing_mm: [0.5, 1.0] };
+        assert_eq!(grid.resample(&values, &grid), values);
+        assert_eq!(grid.resample(&values, &finer), [2.0, 2.5, 3.0, 3.5, 4.0]);
     }
 
     #[test]
-    fn columns_first_is_a_grid_too() {
-        let mut points = grid(40, 30, 1.0, 2.0);
-        points.sort_by(|a, b| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
-        let order = recognise_grid(&points).unwrap();
-        assert_eq!((order.columns, order.rows), (40, 30));
-    }
-
-    #[test]
-    fn a_round_aperture_leaves_holes() {
-        let points: Vec<_> =
-            grid(81, 81, 0.5, 0.5).into_iter().filter(|p| (p.x - 12.7).hypot(p.y - 21.1) <= 20.001).collect();
-        let order = recognise_grid(&points).unwrap();
-        assert_eq!((order.columns, order.rows), (81, 81));
-        assert_eq!(order.holes, 81 * 81 - points.len());
-    }
-
-    #[test]
-    fn rounding_to_a_file_does_not_hide_the_grid() {
-        let mut points = grid(333, 222, 102.0 / 332.0, 62.0 / 221.0);
-        for p in &mut points {
-            p.x = (p.x * 1e4).round() / 1e4;
-            p.y = (p.y * 1e4).round() / 1e4;
+    fn values_between_nodes_are_bilinear_and_level_off_outside() {
+        let grid = Grid { columns: 3, rows: 2, first_mm: [0.0, 0.0], spacing_mm: [1.0, 2.0] };
+        let plane = |[x, y]: [f64; 2]| 1.0 + 2.0 * x - 0.5 * y;
+        let values: Vec<f64> = (0..6).map(|k| plane(grid.place_mm(k))).collect();
+        for place in [[0.3, 0.1], [1.9, 2.0], [2.0, 1.3]] {
+            assert!((grid.interpolate(&values, place) - plane(place)).abs() < 1e-15);
         }
-        assert!(recognise_grid(&points).is_some() && grid_in_order(&points).is_some());
-        // A point out of its column, one out of its row, one missing, one that is no number.
-        for spoil in [
-            |p: &mut Vec<Point>| p[5000].x += 0.003,
-            |p: &mut Vec<Point>| p[5000].y -= 0.003,
-            |p: &mut Vec<Point>| p.truncate(333 * 222 - 1),
-            |p: &mut Vec<Point>| p[5000].z = f64::NAN,
-        ] {
-            let mut spoilt = points.clone();
-            spoil(&mut spoilt);
-            assert_eq!(grid_in_order(&spoilt), None);
-        }
-    }
-
-    #[test]
-    fn what_is_no_grid_is_not_taken_for_one() {
-        let mut scattered = grid(50, 50, 1.0, 1.0);
-        for (k, p) in scattered.iter_mut().enumerate() {
-            p.x += 0.3 * (k as f64 * 1.7).sin();
-        }
-        assert_eq!(recognise_grid(&scattered), None);
-        let line: Vec<_> = (0..100).map(|i| Point::new(f64::from(i), 0.0, 0.0)).collect();
-        assert_eq!(recognise_grid(&line), None);
-        let mut doubled = grid(10, 10, 1.0, 1.0);
-        doubled.push(doubled[17]);
-        assert_eq!(recognise_grid(&doubled), None);
-        let mut broken = grid(10, 10, 1.0, 1.0);
-        broken[3].x = f64::NAN;
-        assert_eq!(recognise_grid(&broken), None);
-        broken[3].x = 1e300;
-        assert_eq!(recognise_grid(&broken), None);
-        assert_eq!(recognise_grid(&[]), None);
+        assert_eq!(grid.interpolate(&values, [9.0, -4.0]), plane([2.0, 0.0]));
     }
 }

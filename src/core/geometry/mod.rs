@@ -4,11 +4,13 @@
 
 pub mod aperture;
 pub mod grid;
+pub mod grid_order;
 pub mod pose;
 pub mod rigid;
 
 pub use aperture::{Aperture, ApertureError};
-pub use grid::{GridOrder, recognise_grid};
+pub use grid::{Grid, GridError};
+pub use grid_order::{GridOrder, recognise_grid};
 pub use pose::{Pose, PoseError, Twist};
 pub use rigid::{RigidError, RigidFit, fit_rigid};
 

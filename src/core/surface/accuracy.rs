@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 use super::projection::Map;
 use super::{Distance, Nominal, OffsetSurface, Place, Projection, Side, SurfaceError};
-use crate::geometry::grid::NO_POINT;
+use crate::geometry::grid_order::NO_POINT;
 use crate::geometry::{Point, Vector, recognise_grid};
 
 /// The spacings of the two coarser nets in spacings of the whole one: of a grid, and of scattered points.
@@ -35,7 +35,7 @@ const LEAST_INSIDE: usize = 30;
 
 /// What a nominal surface is made of.
 #[derive(Clone, Copy, Debug)]
-pub enum Net<'a> {
+pub enum Samples<'a> {
     /// Points in any order, a grid or scattered; also the vertices of a mesh.
     Points {
         /// The points in the model frame, in millimetres.
@@ -140,14 +140,14 @@ impl Estimate {
 ///
 /// # Errors
 /// Points that make no surface, and fewer than it takes to leave most of them out.
-pub fn accuracy(net: Net) -> Result<Accuracy, SurfaceError> {
-    let (points, factor, [fine, coarse]) = match net {
-        Net::Grid { columns, rows, points, normals } => {
+pub fn accuracy(samples: Samples) -> Result<Accuracy, SurfaceError> {
+    let (points, factor, [fine, coarse]) = match samples {
+        Samples::Grid { columns, rows, points, normals } => {
             super::check_grid(columns, rows, points.len().min(normals.len()))?;
             let level = |stride| defined_grid_level(columns, rows, points, normals, stride);
             (points, OF_GRID[0], [level(OF_GRID[0])?, level(OF_GRID[1])?])
         }
-        Net::Points { points, projection } => {
+        Samples::Points { points, projection } => {
             // Whatever is wrong with the points is said of all of them, not of those that happen to be kept.
             if let Some(index) = points.iter().position(|p| !(p.x + p.y + p.z).is_finite()) {
                 return Err(SurfaceError::NotFinite { index });

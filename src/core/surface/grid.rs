@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::grid::{GridInOrder, GridOrder, NO_POINT};
+use crate::geometry::grid_order::{GridInOrder, GridOrder, NO_POINT};
 use crate::geometry::{Point, Vector};
 
 use super::lanes::{LANES, Lane, Lane3, cross, dot, minus, side_by_side, times};

@@ -31,7 +31,7 @@ use std::sync::OnceLock;
 use rayon::prelude::*;
 use thiserror::Error;
 
-use crate::geometry::grid::grid_in_order;
+use crate::geometry::grid_order::grid_in_order;
 use crate::geometry::{Aperture, Point, Vector, recognise_grid};
 
 pub use analytic::{AnalyticSurface, DefinedSurface, DefinitionError, SampledSurface, Sampling, SurfaceDefinition};

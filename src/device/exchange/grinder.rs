@@ -261,9 +261,7 @@ fn correction_csv(ticket: &Ticket, map: &CorrectionMap) -> String {
         ticket.part, ticket.job, ticket.cycle, ticket.identity
     );
     for (k, value) in map.values_mm.iter().enumerate() {
-        let (column, row) = (k % map.columns.max(1), k / map.columns.max(1));
-        let x = map.first_mm[0] + map.spacing_mm[0] * column as f64;
-        let y = map.first_mm[1] + map.spacing_mm[1] * row as f64;
+        let [x, y] = map.grid.place_mm(k);
         // Writing to a string cannot fail.
         let _ = writeln!(text, "{x},{y},{value}");
     }
@@ -271,11 +269,11 @@ fn correction_csv(ticket: &Ticket, map: &CorrectionMap) -> String {
 }
 
 fn correction_json(ticket: &Ticket, order: &GrindOrder, inbox: &Path) -> serde_json::Value {
-    let (map, pass) = (&order.map, &order.pass);
+    let (map, grid, pass) = (&order.map, &order.map.grid, &order.pass);
     serde_json::json!({
         "kind": "correction map", "part": ticket.part, "job": ticket.job, "cycle": ticket.cycle, "map": ticket.identity,
         "units": "mm", "frame": "model", "sign": "positive leaves material, along the outward normal", "absolute": true,
-        "columns": map.columns, "rows": map.rows, "first_mm": map.first_mm, "spacing_mm": map.spacing_mm,
+        "columns": grid.columns, "rows": grid.rows, "first_mm": grid.first_mm, "spacing_mm": grid.spacing_mm,
         "nominal_surface": hex(&map.part_identity),
         "pass": {
             "wheel_radius_mm": pass.wheel_radius_mm, "feed_mm_min": pass.feed_mm_min, "track_spacing_mm": pass.track_spacing_mm,

@@ -6,10 +6,9 @@ use std::path::Path;
 use sha2::{Digest, Sha256};
 
 use super::GcodeError;
-use crate::compensation::Net;
 use crate::formats::FormatError;
-use crate::geometry::grid::NO_POINT;
-use crate::geometry::{Point, recognise_grid};
+use crate::geometry::grid_order::NO_POINT;
+use crate::geometry::{Grid, Point, recognise_grid};
 
 /// Largest map that is read.
 const MOST_BYTES: u64 = 512 << 20;
@@ -38,7 +37,7 @@ pub enum MapBase {
 #[derive(Clone, Debug, PartialEq)]
 pub struct ProgramMap {
     /// Where the nodes are.
-    pub net: Net,
+    pub grid: Grid,
     /// The values in millimetres, row by row with x fastest.
     pub values_mm: Vec<f64>,
     /// What they are.
@@ -101,10 +100,10 @@ pub fn read_program_map(path: &Path) -> Result<ProgramMap, GcodeError> {
     let remedy = "every node of a regular grid needs its row";
     let no_grid = |what: String| GcodeError::Program { path: path.to_owned(), what, remedy };
     let kind = kind.ok_or_else(|| no_grid("the map is empty".into()))?;
-    let (net, values_mm) =
+    let (grid, values_mm) =
         grid(&points).ok_or_else(|| no_grid(format!("its {} nodes are no whole grid", points.len())))?;
     Ok(ProgramMap {
-        net,
+        grid,
         values_mm,
         kind,
         identity: stated.unwrap_or_else(|| hash.finalize().into()),
@@ -132,7 +131,7 @@ fn node(row: &str) -> Option<Point> {
     Some(Point::new(cells.next()??, cells.next()??, cells.next()??))
 }
 
-fn grid(points: &[Point]) -> Option<(Net, Vec<f64>)> {
+fn grid(points: &[Point]) -> Option<(Grid, Vec<f64>)> {
     let order = recognise_grid(points)?;
     if order.point_at.contains(&NO_POINT) {
         return None;
@@ -140,8 +139,8 @@ fn grid(points: &[Point]) -> Option<(Net, Vec<f64>)> {
     let at = |node: usize| points[order.point_at[node] as usize];
     let (first, last) = (at(0), at(order.columns * order.rows - 1));
     let spacing_mm = [(last.x - first.x) / (order.columns - 1) as f64, (last.y - first.y) / (order.rows - 1) as f64];
-    let net = Net { columns: order.columns, rows: order.rows, first_mm: [first.x, first.y], spacing_mm };
-    Some((net, (0..net.len()).map(|k| at(k).z).collect()))
+    let grid = Grid { columns: order.columns, rows: order.rows, first_mm: [first.x, first.y], spacing_mm };
+    Some((grid, (0..grid.len()).map(|k| at(k).z).collect()))
 }
 
 /// Finds an identity after a name in a comment.

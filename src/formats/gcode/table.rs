@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use super::hex;
-use crate::compensation::Net;
 use crate::formats::FormatError;
 use crate::formats::registration::write_rows;
+use crate::geometry::Grid;
 
 /// Writes `toolpath_z.csv`: `x_mm,y_mm,dz_mm`, a row per node, row by row with x fastest.
 ///
@@ -16,13 +16,13 @@ use crate::formats::registration::write_rows;
 /// Those of [`crate::formats::write_deviations`].
 pub fn write_axis_table(
     path: &Path,
-    net: &Net,
+    grid: &Grid,
     offsets_mm: &[f64],
     map_identity: &[u8; 32],
     simulation: bool,
 ) -> Result<(), FormatError> {
     let rows: Vec<[f64; 3]> =
-        offsets_mm.iter().enumerate().map(|(k, dz)| (net.place_mm(k), *dz)).map(|([x, y], dz)| [x, y, dz]).collect();
+        offsets_mm.iter().enumerate().map(|(k, dz)| (grid.place_mm(k), *dz)).map(|([x, y], dz)| [x, y, dz]).collect();
     let marked = if simulation { "# SIMULATION\n" } else { "" };
     let header = format!(
         "{marked}# offset of Z over the places of the axes X and Y, for the program of the nominal surface alone; toolpath.ngc holds it already\n# map: \

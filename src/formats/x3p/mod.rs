@@ -24,7 +24,7 @@ use super::error::{FormatError, excerpt};
 use super::height_map::HeightMap;
 use super::number::is_believable;
 use super::whole::{MOST_BYTES, open};
-use crate::geometry::Point;
+use crate::geometry::{Grid, Point};
 use document::{Axis, Extent, Main, Samples, Sealed};
 pub use write::{MapRecord, write_error_map_x3p, write_x3p};
 
@@ -151,12 +151,13 @@ fn assembled(path: &Path, main: &Main, records: &[Record]) -> Result<X3pFile, Fo
         );
     }
     let heights = |k: usize| records[k].map(|[.., raw]| mm(z, raw));
-    let (first, spacing) = ([mm(x, 0.0), mm(y, 0.0)], [1e3 * x.increment, 1e3 * y.increment]);
+    let grid =
+        Grid { columns, rows, first_mm: [mm(x, 0.0), mm(y, 0.0)], spacing_mm: [1e3 * x.increment, 1e3 * y.increment] };
     let mut map = if main.rows_from_north {
         let order = (0..rows).rev().flat_map(|row| (0..columns).map(move |column| row * columns + column));
-        HeightMap::new(path, [columns, rows], first, spacing, order.map(heights))?
+        HeightMap::new(path, grid, order.map(heights))?
     } else {
-        HeightMap::new(path, [columns, rows], first, spacing, (0..records.len()).map(heights))?
+        HeightMap::new(path, grid, (0..records.len()).map(heights))?
     };
     map.notes.clone_from(&main.notes);
     Ok(X3pFile::Map(map))

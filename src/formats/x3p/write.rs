@@ -11,6 +11,7 @@ use crate::compensation::ErrorMap;
 use crate::formats::error::FormatError;
 use crate::formats::height_map::HeightMap;
 use crate::formats::registration::Draft;
+use crate::geometry::Grid;
 
 /// What a file says of how its map came to be.
 #[derive(Clone, Debug, PartialEq)]
@@ -33,9 +34,8 @@ pub struct MapRecord {
 /// # Errors
 /// Those of [`write_x3p`].
 pub fn write_error_map_x3p(path: &Path, map: &ErrorMap, date: &str, simulation: bool) -> Result<(), FormatError> {
-    let net = map.net;
     let samples = map.values_mm.iter().zip(&map.valid).map(|(value, valid)| valid.then_some(*value));
-    let heights = HeightMap::new(path, [net.columns, net.rows], net.first_mm, net.spacing_mm, samples)?;
+    let heights = HeightMap::new(path, map.grid, samples)?;
     let marked = if simulation { "SIMULATION. " } else { "" };
     let record = MapRecord {
         date: date.to_owned(),
@@ -99,11 +99,11 @@ fn main_xml(map: &HeightMap, record: &MapRecord, data: &str, mask: &str) -> Stri
              <Increment>{increment_m:e}</Increment>\n        <Offset>{offset_m:e}</Offset>\n      </{name}>\n"
         )
     };
-    let [x, y] = [0, 1].map(|k| axis(["CX", "CY"][k], "I", 1e-3 * map.spacing_mm[k], 1e-3 * map.first_mm[k]));
+    let [x, y] = [0, 1].map(|k| axis(["CX", "CY"][k], "I", 1e-3 * map.grid.spacing_mm[k], 1e-3 * map.grid.first_mm[k]));
     let z = axis("CZ", "A", 1.0, 0.0);
     let MapRecord { date, creator, instrument, comment } = record;
     let [date, creator, instrument, comment] = [date, creator, instrument, comment].map(|text| escaped(text));
-    let (version, HeightMap { columns, rows, .. }) = (env!("CARGO_PKG_VERSION"), map);
+    let (version, Grid { columns, rows, .. }) = (env!("CARGO_PKG_VERSION"), map.grid);
     format!(
         "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n\
          <p:ISO5436_2 xmlns:p=\"http://www.opengps.eu/2008/ISO5436_2\" xmlns:xsi=\"http://www.w3.org/2001/XMLSchema-instance\" \

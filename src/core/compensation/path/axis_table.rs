@@ -7,30 +7,29 @@
 use rayon::prelude::*;
 
 use super::{PathError, Wanted, Wheel};
-use crate::compensation::Net;
 use crate::compensation::level::nearest_known;
-use crate::geometry::Point;
+use crate::geometry::{Grid, Point};
 
 const STEPS: usize = 40;
 
-/// Returns the offset of Z at every node of a net over the axes X and Y, in millimetres; positive leaves material.
+/// Returns the offset of Z at every node of a grid over the axes X and Y, in millimetres; positive leaves material.
 ///
 /// A node where the wheel would touch far from the part, whose continued surface it need not fit, has the offset of the nearest other one.
 ///
 /// # Errors
 /// A place that the wheel cannot touch, where that is so at every node.
-pub fn axis_offsets(before: &Wanted, after: &Wanted, wheel: &Wheel, net: &Net) -> Result<Vec<f64>, PathError> {
+pub fn axis_offsets(before: &Wanted, after: &Wanted, wheel: &Wheel, grid: &Grid) -> Result<Vec<f64>, PathError> {
     let one = |node: usize| {
-        let axes = net.place_mm(node);
+        let axes = grid.place_mm(node);
         Ok(height_mm(after, wheel, axes)? - height_mm(before, wheel, axes)?)
     };
-    let offsets: Vec<Result<f64, PathError>> = (0..net.len()).into_par_iter().map(one).collect();
+    let offsets: Vec<Result<f64, PathError>> = (0..grid.len()).into_par_iter().map(one).collect();
     let known: Vec<bool> = offsets.iter().map(Result::is_ok).collect();
     if !known.contains(&true) {
         return offsets.into_iter().collect();
     }
     let values: Vec<f64> = offsets.into_iter().map(Result::unwrap_or_default).collect();
-    Ok(nearest_known(net, &known).into_iter().map(|node| values[node]).collect())
+    Ok(nearest_known(grid, &known).into_iter().map(|node| values[node]).collect())
 }
 
 /// The height of the wheel's centre over X and Y: the place that it touches then is searched by Newton's method.
@@ -72,21 +71,21 @@ fn height_mm(wanted: &Wanted, wheel: &Wheel, axes: [f64; 2]) -> Result<f64, Path
 mod tests {
     use super::*;
     use crate::compensation::Correction;
-    use crate::compensation::path::{Field, Lattice};
-    use crate::geometry::Vector;
+    use crate::compensation::path::Field;
+    use crate::geometry::{Grid, Vector};
 
     #[test]
     fn a_slope_raises_the_offset_by_one_over_the_cosine() {
-        let on = Lattice { columns: 41, rows: 41, first_mm: [-20.0, -20.0], spacing_mm: [1.0, 1.0] };
+        let on = Grid { columns: 41, rows: 41, first_mm: [-20.0, -20.0], spacing_mm: [1.0, 1.0] };
         let heights: Vec<f64> = (0..41 * 41).map(|k| 0.5 * (f64::from(k % 41) - 20.0)).collect();
         let slope = Field::hermite(on, &heights, &vec![[0.5, 0.0]; 41 * 41]);
-        let net = Net { columns: 3, rows: 3, first_mm: [-2.0, -2.0], spacing_mm: [2.0, 2.0] };
-        let corrected = |e: f64| Correction { net, values_mm: vec![e; 9], cycle: 1, level_mm: 0.01 };
+        let grid = Grid { columns: 3, rows: 3, first_mm: [-2.0, -2.0], spacing_mm: [2.0, 2.0] };
+        let corrected = |e: f64| Correction { grid, values_mm: vec![e; 9], cycle: 1, level_mm: 0.01 };
         let [before, after] = [0.0, 0.004].map(|e| Wanted::new(slope.clone(), &corrected(e), 5.0).unwrap());
         for wheel in
             [Wheel::Sphere { radius_mm: 5.0 }, Wheel::Torus { ring_mm: 8.0, tube_mm: 2.0, spindle: Vector::y() }]
         {
-            let offsets = axis_offsets(&before, &after, &wheel, &net).unwrap();
+            let offsets = axis_offsets(&before, &after, &wheel, &grid).unwrap();
             // Moved by e along the normal, a plane is higher by e / nz.
             let expected = 0.004 * 1.25f64.sqrt();
             assert!(offsets.iter().all(|dz| (dz - expected).abs() < 1e-9), "{offsets:?}");
@@ -99,17 +98,17 @@ mod tests {
         let spindle = Vector::new(-0.5, 0.0, 0.75f64.sqrt());
         let wheel = Wheel::Cup { ring_mm: 6.0, tube_mm: 1.0, spindle };
         let facing = 0.5 / 0.75f64.sqrt();
-        let on = Lattice { columns: 61, rows: 41, first_mm: [-30.0, -20.0], spacing_mm: [1.0, 1.0] };
+        let on = Grid { columns: 61, rows: 41, first_mm: [-30.0, -20.0], spacing_mm: [1.0, 1.0] };
         let ground = |k: usize| (k % on.columns) as f64 - 30.0;
         let offsets = |first_mm: f64| {
             let heights: Vec<f64> = (0..on.columns * on.rows).map(|k| facing * ground(k).max(0.0)).collect();
             let slopes: Vec<[f64; 2]> =
                 (0..on.columns * on.rows).map(|k| [if ground(k) > 0.0 { facing } else { 0.0 }, 0.0]).collect();
-            let net = Net { columns: 2, rows: 1, first_mm: [first_mm, 0.0], spacing_mm: [40.0, 1.0] };
-            let corrected = |e: f64| Correction { net, values_mm: vec![e; 2], cycle: 1, level_mm: 0.0 };
+            let grid = Grid { columns: 2, rows: 1, first_mm: [first_mm, 0.0], spacing_mm: [40.0, 1.0] };
+            let corrected = |e: f64| Correction { grid, values_mm: vec![e; 2], cycle: 1, level_mm: 0.0 };
             let [before, after] =
                 [0.0, 0.004].map(|e| Wanted::new(Field::hermite(on, &heights, &slopes), &corrected(e), 1.0).unwrap());
-            axis_offsets(&before, &after, &wheel, &net)
+            axis_offsets(&before, &after, &wheel, &grid)
         };
         let found = offsets(-20.0).unwrap();
         assert!(found.iter().all(|dz| (dz - 0.004).abs() < 1e-9), "{found:?}");

@@ -276,12 +276,12 @@ fn narrower(a: Result<f64, PathError>, b: Result<f64, PathError>) -> Result<f64,
     }
 }
 
-/// Places of a net over the part, its border included.
+/// Places of a grid over the part, its border included.
 fn places(outline: &Aperture, count: usize) -> Vec<[f64; 2]> {
     let [low, high] = outline.bounds();
     let at = |k: usize, i: usize| low[k] + (high[k] - low[k]) * i as f64 / (count - 1) as f64;
-    let net = (0..count * count).map(|n| [at(0, n % count), at(1, n / count)]);
-    net.filter(|[x, y]| outline.contains(*x, *y)).chain(outline.outline_mm(4 * count)).collect()
+    let grid = (0..count * count).map(|n| [at(0, n % count), at(1, n / count)]);
+    grid.filter(|[x, y]| outline.contains(*x, *y)).chain(outline.outline_mm(4 * count)).collect()
 }
 
 /// Checks slope and hollows at a place; returns the distance over x and y of tracks that leave the scallop wanted.
@@ -384,9 +384,9 @@ pub(super) fn body(path: &ToolPath) -> Result<(), PathError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::compensation::path::{Field, Lattice};
-    use crate::compensation::{Correction, Net};
-    use crate::geometry::Aperture;
+    use crate::compensation::Correction;
+    use crate::compensation::path::Field;
+    use crate::geometry::{Aperture, Grid};
 
     const PART: Aperture = Aperture::Rectangle { centre_mm: [0.0, 0.0], width_mm: 16.0, height_mm: 12.0 };
 
@@ -397,11 +397,11 @@ mod tests {
 
     /// A surface by its height and slopes over x and y, without a correction.
     fn surface(height: impl Fn([f64; 2]) -> (f64, [f64; 2])) -> Wanted {
-        let on = Lattice { columns: 81, rows: 81, first_mm: [-10.0, -10.0], spacing_mm: [0.25, 0.25] };
+        let on = Grid { columns: 81, rows: 81, first_mm: [-10.0, -10.0], spacing_mm: [0.25, 0.25] };
         let places = (0..81 * 81).map(|k| [-10.0 + (k % 81) as f64 * 0.25, -10.0 + (k / 81) as f64 * 0.25]);
         let (z, slopes): (Vec<f64>, Vec<[f64; 2]>) = places.map(height).unzip();
-        let net = Net { columns: 2, rows: 2, first_mm: [-8.0, -6.0], spacing_mm: [16.0, 12.0] };
-        let none = Correction { net, values_mm: vec![0.0; 4], cycle: 1, level_mm: 0.0 };
+        let grid = Grid { columns: 2, rows: 2, first_mm: [-8.0, -6.0], spacing_mm: [16.0, 12.0] };
+        let none = Correction { grid, values_mm: vec![0.0; 4], cycle: 1, level_mm: 0.0 };
         Wanted::new(Field::hermite(on, &z, &slopes), &none, 5.0).unwrap()
     }
 

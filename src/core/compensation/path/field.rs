@@ -1,10 +1,12 @@
-//! A smooth height over a regular net: bicubic between the nodes, with the slopes and curvatures of the very same function.
+//! A smooth height over a regular grid: bicubic between the nodes, with the slopes and curvatures of the very same function.
 //!
 //! Made from values alone it is the tensor product of cubic splines, twice continuously differentiable; made from values and
 //! slopes it is Hermite's bicubic, once continuously differentiable and exact in both at every node. Beyond the border it goes
 //! on along its tangents.
 
 use rayon::prelude::*;
+
+use crate::geometry::Grid;
 
 /// A value and its derivatives at a place; lengths in millimetres.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -17,34 +19,19 @@ pub struct Jet {
     pub bend: [f64; 3],
 }
 
-/// A smooth height over a regular net.
+/// A smooth height over a regular grid.
 #[derive(Clone, Debug)]
 pub struct Field {
-    columns: usize,
-    rows: usize,
-    first_mm: [f64; 2],
+    on: Grid,
     per_mm: [f64; 2],
     /// Value, slopes along the columns and the rows, and twist at every node, lengths along x and y counted in cells.
     nodes: Vec<[f64; 4]>,
 }
 
-/// Where the nodes of a field are: row by row, x fastest.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Lattice {
-    /// Nodes along x, two at least.
-    pub columns: usize,
-    /// Nodes along y, two at least.
-    pub rows: usize,
-    /// The first node, in millimetres.
-    pub first_mm: [f64; 2],
-    /// Distance of the nodes, in millimetres.
-    pub spacing_mm: [f64; 2],
-}
-
 impl Field {
     /// Lays a spline through values, level across the border.
-    pub fn spline(on: Lattice, values: &[f64]) -> Self {
-        let Lattice { columns, rows, .. } = on;
+    pub fn spline(on: Grid, values: &[f64]) -> Self {
+        let Grid { columns, rows, .. } = on;
         let mut nodes: Vec<[f64; 4]> = values.iter().map(|v| [*v, 0.0, 0.0, 0.0]).collect();
         nodes.par_chunks_mut(columns).for_each(|row| {
             let slopes = level_spline(columns, |i| row[i][0]);
@@ -61,7 +48,7 @@ impl Field {
     }
 
     /// Lays Hermite's bicubic through values and slopes; nodes without a value, which are NaN, continue their neighbours.
-    pub fn hermite(on: Lattice, values: &[f64], slopes: &[[f64; 2]]) -> Self {
+    pub fn hermite(on: Grid, values: &[f64], slopes: &[[f64; 2]]) -> Self {
         let h = on.spacing_mm;
         let mut nodes: Vec<[f64; 4]> =
             values.iter().zip(slopes).map(|(v, s)| [*v, s[0] * h[0], s[1] * h[1], 0.0]).collect();
@@ -70,9 +57,8 @@ impl Field {
         Self::of(on, nodes)
     }
 
-    fn of(on: Lattice, nodes: Vec<[f64; 4]>) -> Self {
-        let Lattice { columns, rows, first_mm, spacing_mm } = on;
-        Self { columns, rows, first_mm, per_mm: spacing_mm.map(|h| 1.0 / h), nodes }
+    fn of(on: Grid, nodes: Vec<[f64; 4]>) -> Self {
+        Self { on, per_mm: on.spacing_mm.map(|h| 1.0 / h), nodes }
     }
 
     /// Returns the distance of the nodes along x and y, in millimetres.
@@ -83,8 +69,8 @@ impl Field {
     /// Returns the value and its derivatives at a place.
     #[inline]
     pub fn at(&self, [x, y]: [f64; 2]) -> Jet {
-        let (i, u, over_u) = cell((x - self.first_mm[0]) * self.per_mm[0], self.columns);
-        let (j, v, over_v) = cell((y - self.first_mm[1]) * self.per_mm[1], self.rows);
+        let (i, u, over_u) = cell((x - self.on.first_mm[0]) * self.per_mm[0], self.on.columns);
+        let (j, v, over_v) = cell((y - self.on.first_mm[1]) * self.per_mm[1], self.on.rows);
         let mut jet = self.within(i, j, u, v);
         if over_u != 0.0 || over_v != 0.0 {
             continued(&mut jet, [over_u, over_v]);
@@ -98,8 +84,8 @@ impl Field {
     /// The bicubic of a cell, with lengths counted in cells.
     #[inline]
     fn within(&self, i: usize, j: usize, u: f64, v: f64) -> Jet {
-        let below = j * self.columns + i;
-        let above = below + self.columns;
+        let below = j * self.on.columns + i;
+        let above = below + self.on.columns;
         let (low, high) = (&self.nodes[below..below + 2], &self.nodes[above..above + 2]);
         let across = Basis::at(u);
         // Along u on both rows: the height, and its slope across the rows.
@@ -255,15 +241,10 @@ fn difference(at: usize, count: usize, value: impl Fn(usize) -> f64) -> f64 {
 mod tests {
     use super::*;
 
-    const ON: Lattice = Lattice { columns: 41, rows: 31, first_mm: [-5.0, 2.0], spacing_mm: [0.25, 0.3] };
+    const ON: Grid = Grid { columns: 41, rows: 31, first_mm: [-5.0, 2.0], spacing_mm: [0.25, 0.3] };
 
-    fn places(on: Lattice) -> Vec<[f64; 2]> {
-        let Lattice { columns, first_mm, spacing_mm, rows } = on;
-        (0..columns * rows)
-            .map(|k| {
-                [first_mm[0] + (k % columns) as f64 * spacing_mm[0], first_mm[1] + (k / columns) as f64 * spacing_mm[1]]
-            })
-            .collect()
+    fn places(on: Grid) -> Vec<[f64; 2]> {
+        (0..on.len()).map(|k| on.place_mm(k)).collect()
     }
 
     fn derivatives_agree(field: &Field, place: [f64; 2]) {
@@ -341,7 +322,7 @@ mod tests {
 
     #[test]
     fn two_nodes_each_way_are_enough() {
-        let on = Lattice { columns: 2, rows: 2, first_mm: [0.0, 0.0], spacing_mm: [10.0, 20.0] };
+        let on = Grid { columns: 2, rows: 2, first_mm: [0.0, 0.0], spacing_mm: [10.0, 20.0] };
         let field = Field::spline(on, &[1.0, 1.0, 1.0, 1.0]);
         assert_eq!(field.at([3.0, 40.0]), Jet { value: 1.0, ..Jet::default() });
     }

@@ -23,7 +23,7 @@ mod wheel;
 pub use axis_table::axis_offsets;
 pub use check::{Limits, Peak, Summary};
 pub use error::PathError;
-pub use field::{Field, Jet, Lattice};
+pub use field::{Field, Jet};
 pub use nominal::height_of;
 pub use tracks::{Pattern, TrackSpacing};
 pub use walk::{Move, Moves};

@@ -2,11 +2,11 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::{Aperture, Point};
+use crate::geometry::{Aperture, Grid, Point};
 use crate::surface::{Nominal, NominalKind, OffsetSurface, Place, Side};
 
 use super::PathError;
-use super::field::{Field, Lattice};
+use super::field::Field;
 
 /// Most nodes of a field that is laid over points that are no grid.
 const MOST_NODES: f64 = 2e6;
@@ -58,7 +58,7 @@ fn regular(nominal: &Nominal) -> Result<Option<Field>, PathError> {
         Some((spacing, nodes[first].point[axis] - spacing * at(first) as f64))
     };
     let (Some((dx, x0)), Some((dy, y0))) = (other(0), other(1)) else { return Ok(None) };
-    let on = Lattice { columns, rows, first_mm: [x0, y0], spacing_mm: [dx, dy] };
+    let on = Grid { columns, rows, first_mm: [x0, y0], spacing_mm: [dx, dy] };
     let is_regular = |k: usize| {
         let (p, (i, j)) = (&nodes[k].point, of(k));
         !p.x.is_finite()
@@ -103,7 +103,7 @@ fn sampled(nominal: &Nominal, [low, high]: [[f64; 2]; 2]) -> Result<Field, PathE
     }
     let cells = size.map(|s| (s / spacing).ceil().clamp(2.0, MOST_NODES.sqrt()));
     let [columns, rows] = cells.map(|c| c as usize + 1);
-    let on = Lattice { columns, rows, first_mm: low, spacing_mm: [size[0] / cells[0], size[1] / cells[1]] };
+    let on = Grid { columns, rows, first_mm: low, spacing_mm: [size[0] / cells[0], size[1] / cells[1]] };
     let middle = nominal.points().map(|p| p.z).sum::<f64>() / nominal.len() as f64;
     let lines: Vec<Result<Vec<Node>, PathError>> = (0..rows)
         .into_par_iter()

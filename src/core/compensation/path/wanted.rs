@@ -5,10 +5,10 @@
 //! them; with the nominal normals a wheel of radius R would be off by R |grad d|^2 / 2 along the normal and R |grad d| along the surface.
 
 use crate::compensation::Correction;
-use crate::geometry::{Point, Vector};
+use crate::geometry::{Grid, Point, Vector};
 
 use super::PathError;
-use super::field::{Field, Jet, Lattice};
+use super::field::{Field, Jet};
 
 /// Rings of nodes that are added around a correction at most.
 const MOST_RINGS: f64 = 200.0;
@@ -42,13 +42,13 @@ pub struct Bend {
 }
 
 impl Wanted {
-    /// Joins a nominal surface and a correction, which is levelled off within `level_off_mm` beyond its net.
+    /// Joins a nominal surface and a correction, which is levelled off within `level_off_mm` beyond its grid.
     ///
     /// # Errors
     /// Values that are not finite.
     pub fn new(nominal: Field, correction: &Correction, level_off_mm: f64) -> Result<Self, PathError> {
         if let Some(node) = correction.values_mm.iter().position(|v| !v.is_finite()) {
-            let [x_mm, y_mm] = correction.net.place_mm(node);
+            let [x_mm, y_mm] = correction.grid.place_mm(node);
             return Err(PathError::Correction { x_mm, y_mm });
         }
         Ok(Self { nominal, correction: spline_of(correction, level_off_mm), level_mm: correction.level_mm })
@@ -158,16 +158,16 @@ pub fn displaced(nominal: &Wanted, shift: &Field, centre: &Point) -> Option<Vect
 /// Steps down to a foot; each leaves a small share of the error, since how the surface bends is taken into account.
 const STEPS: usize = 100;
 
-/// Lays a spline through a correction that goes on beyond its net with a slope that fades away.
+/// Lays a spline through a correction that goes on beyond its grid with a slope that fades away.
 ///
 /// With the slope g across the border and the length L the correction rises by g L (t - t^3 + t^4 / 2) at t = s / L <= 1: as
 /// steep as it was at the border, level at L, and never further.
 pub fn spline_of(correction: &Correction, length_mm: f64) -> Field {
-    let net = correction.net;
+    let grid = correction.grid;
     let spacing_mm = [0, 1].map(|k| {
-        let nodes = [net.columns, net.rows][k];
+        let nodes = grid.counts()[k];
         // A single row or column is level across.
-        if nodes < 2 || net.spacing_mm[k] <= 0.0 { length_mm } else { net.spacing_mm[k] }
+        if nodes < 2 || grid.spacing_mm[k] <= 0.0 { length_mm } else { grid.spacing_mm[k] }
     });
     let rings = spacing_mm.map(|h| (length_mm / h).ceil().clamp(1.0, MOST_RINGS) as usize);
     let reach = [0, 1].map(|k| length_mm.min(rings[k] as f64 * spacing_mm[k]));
@@ -188,24 +188,24 @@ pub fn spline_of(correction: &Correction, length_mm: f64) -> Field {
         let right = (1..=rings[k]).map(|s| line[n - 1] + after * fade(k, s));
         left.chain(line.iter().copied()).chain(right).collect()
     };
-    let wide: Vec<Vec<f64>> = correction.values_mm.chunks(net.columns).map(|row| along(row, 0)).collect();
-    let columns = net.columns + 2 * rings[0];
+    let wide: Vec<Vec<f64>> = correction.values_mm.chunks(grid.columns).map(|row| along(row, 0)).collect();
+    let columns = grid.columns + 2 * rings[0];
     let tall: Vec<Vec<f64>> =
         (0..columns).map(|i| along(&wide.iter().map(|row| row[i]).collect::<Vec<f64>>(), 1)).collect();
-    let rows = net.rows + 2 * rings[1];
+    let rows = grid.rows + 2 * rings[1];
     let values: Vec<f64> = (0..rows).flat_map(|j| tall.iter().map(move |line| line[j])).collect();
-    let first_mm = [0, 1].map(|k| net.first_mm[k] - rings[k] as f64 * spacing_mm[k]);
-    Field::spline(Lattice { columns, rows, first_mm, spacing_mm }, &values)
+    let first_mm = [0, 1].map(|k| grid.first_mm[k] - rings[k] as f64 * spacing_mm[k]);
+    Field::spline(Grid { columns, rows, first_mm, spacing_mm }, &values)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::compensation::Net;
+    use crate::geometry::Grid;
 
     /// A hollow sphere as a field.
     fn bowl(radius_mm: f64) -> Field {
-        let on = Lattice { columns: 81, rows: 81, first_mm: [-10.0, -10.0], spacing_mm: [0.25, 0.25] };
+        let on = Grid { columns: 81, rows: 81, first_mm: [-10.0, -10.0], spacing_mm: [0.25, 0.25] };
         let places = (0..81 * 81).map(|k| [-10.0 + (k % 81) as f64 * 0.25, -10.0 + (k / 81) as f64 * 0.25]);
         let (z, slopes): (Vec<f64>, Vec<[f64; 2]>) = places
             .map(|[x, y]| {
@@ -217,9 +217,9 @@ mod tests {
     }
 
     fn correction(value: impl Fn(f64, f64) -> f64) -> Correction {
-        let net = Net { columns: 17, rows: 17, first_mm: [-8.0, -8.0], spacing_mm: [1.0, 1.0] };
-        let values_mm = (0..net.len()).map(|k| net.place_mm(k)).map(|[x, y]| value(x, y)).collect();
-        Correction { net, values_mm, cycle: 2, level_mm: 0.02 }
+        let grid = Grid { columns: 17, rows: 17, first_mm: [-8.0, -8.0], spacing_mm: [1.0, 1.0] };
+        let values_mm = (0..grid.len()).map(|k| grid.place_mm(k)).map(|[x, y]| value(x, y)).collect();
+        Correction { grid, values_mm, cycle: 2, level_mm: 0.02 }
     }
 
     #[test]
@@ -262,7 +262,7 @@ mod tests {
             (0..400).map(|k| field.at([7.0 + 0.01 * f64::from(k), 3.0]).slope[0]).fold(0.0f64, |m, s| m.max(s.abs()));
         assert!(steepest < 0.0021, "{steepest}");
         let one = Correction {
-            net: Net { columns: 1, rows: 1, first_mm: [0.0; 2], spacing_mm: [0.0; 2] },
+            grid: Grid { columns: 1, rows: 1, first_mm: [0.0; 2], spacing_mm: [0.0; 2] },
             values_mm: vec![0.007],
             cycle: 1,
             level_mm: 0.0,

@@ -1,7 +1,7 @@
 //! What is predicted of the distance from the nominal points alone, against what it is.
 
 use regrind_core::geometry::Point;
-use regrind_core::surface::accuracy::{Accuracy, Net, Trust, accuracy};
+use regrind_core::surface::accuracy::{Accuracy, Samples, Trust, accuracy};
 use regrind_core::surface::{Distance, Nominal, OffsetSurface, Place, Projection, Side, SurfaceError};
 use regrind_sim::shape::{FreeForm, Shape};
 
@@ -47,7 +47,7 @@ fn truth(points: Vec<Point>, distance: Distance, step_mm: f64) -> [f64; 2] {
 }
 
 fn predicted(points: &[Point]) -> Accuracy {
-    accuracy(Net::Points { points, projection: Projection::Auto }).unwrap()
+    accuracy(Samples::Points { points, projection: Projection::Auto }).unwrap()
 }
 
 /// Asserts that the predicted PV and rms agree with the true ones within a factor of two.
@@ -118,7 +118,7 @@ fn a_plane_is_exact_at_any_spacing_that_was_looked_at() {
 
 #[test]
 fn what_makes_no_surface_is_refused() {
-    let of = |points: &[Point]| accuracy(Net::Points { points, projection: Projection::Auto }).unwrap_err();
+    let of = |points: &[Point]| accuracy(Samples::Points { points, projection: Projection::Auto }).unwrap_err();
     assert!(matches!(of(&[]), SurfaceError::TooFewPoints { .. }));
     assert!(matches!(of(&free_form(9, 9)), SurfaceError::TooFewPoints { .. }));
     let line: Vec<Point> = (0..100).map(|k| Point::new(f64::from(k), 0.0, 0.0)).collect();

@@ -2,9 +2,10 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use regrind_core::compensation::{Correction, ErrorMap, GainRule, Knowledge, MapOptions, Net, Seen};
+use regrind_core::compensation::{Correction, ErrorMap, GainRule, Knowledge, MapOptions, Seen};
+use regrind_core::geometry::Grid;
 
-const NET: Net = Net { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0, 1.0] };
+const GRID: Grid = Grid { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0, 1.0] };
 const SCATTER_MM: f64 = 1e-3;
 const SEED: u64 = 20_260;
 const WORLDS: u64 = 40;
@@ -19,7 +20,7 @@ fn drawn(random: &mut StdRng, rms_mm: f64) -> Vec<f64> {
         })
         .collect();
     let at = |[x, y]: [f64; 2]| waves.iter().map(|[a, b, phase]| (a * x + b * y + phase).sin()).sum::<f64>();
-    (0..NET.len()).map(|k| at(NET.place_mm(k)) * rms_mm * (2.0f64 / 40.0).sqrt()).collect()
+    (0..GRID.len()).map(|k| at(GRID.place_mm(k)) * rms_mm * (2.0f64 / 40.0).sqrt()).collect()
 }
 
 fn rms(values: &[f64]) -> f64 {
@@ -34,11 +35,11 @@ fn what_comes_back_is_found_to_the_scatter_of_the_mean() {
         let mut random = StdRng::seed_from_u64(SEED + world);
         let form = drawn(&mut random, 0.02);
         let mut known = Knowledge::new(GainRule::Wavelength, &MapOptions::new(2.5, 1.0), [40.0, 30.0], None);
-        let mut correction = Correction::none(NET, 0.0);
+        let mut correction = Correction::none(GRID, 0.0);
         for left in &mut left {
             let scatter = drawn(&mut random, SCATTER_MM);
             let sum = |k: usize| form[k] + correction.values_mm[k] + scatter[k];
-            let error = ErrorMap::known(NET, (0..NET.len()).map(sum).collect(), vec![true; NET.len()]);
+            let error = ErrorMap::known(GRID, (0..GRID.len()).map(sum).collect(), vec![true; GRID.len()]);
             known = known.after(&Seen { correction: &correction, error: &error, answer: None });
             correction = correction.changed(&known);
             let rest: Vec<f64> = form.iter().zip(&correction.values_mm).map(|(r, u)| r + u).collect();

@@ -5,8 +5,9 @@ use std::f64::consts::{PI, TAU};
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use regrind_core::compensation::{
-    ErrorMap, MapError, MapOptions, Net, NetError, Order, Reading, Roughness, Smoothing, error_map, filter_net,
+    ErrorMap, MapError, MapOptions, Order, Reading, Roughness, Smoothing, error_map, filter_grid,
 };
+use regrind_core::geometry::{Grid, GridError};
 
 /// Readings at the nodes of a grid about the origin, of a function of the place.
 fn sampled(columns: usize, rows: usize, step_mm: [f64; 2], f: impl Fn(f64, f64) -> f64) -> Vec<Reading> {
@@ -54,9 +55,9 @@ fn rms(values: impl Iterator<Item = f64>) -> f64 {
 
 /// Share of a wave that a map let pass, by least squares over valid nodes far enough from edges and holes.
 fn passed(map: &ErrorMap, wave: impl Fn([f64; 2]) -> f64, counts: impl Fn([f64; 2]) -> bool) -> f64 {
-    let nodes = (0..map.net.len()).filter(|&k| map.valid[k] && counts(map.net.place_mm(k)));
+    let nodes = (0..map.grid.len()).filter(|&k| map.valid[k] && counts(map.grid.place_mm(k)));
     let (top, bottom) = nodes.fold((0.0, 0.0), |(top, bottom), k| {
-        let w = wave(map.net.place_mm(k));
+        let w = wave(map.grid.place_mm(k));
         (top + w * map.values_mm[k], bottom + w * w)
     });
     assert!(bottom > 0.0);
@@ -64,11 +65,11 @@ fn passed(map: &ErrorMap, wave: impl Fn([f64; 2]) -> f64, counts: impl Fn([f64; 
 }
 
 /// The direct sum over all readings at every node, as the filter is defined: first order.
-fn direct(readings: &[Reading], net: &Net, cutoff_mm: f64) -> Vec<f64> {
+fn direct(readings: &[Reading], grid: &Grid, cutoff_mm: f64) -> Vec<f64> {
     let width2 = (2f64.ln() / PI) * cutoff_mm * cutoff_mm;
-    (0..net.len())
+    (0..grid.len())
         .map(|k| {
-            let [x0, y0] = net.place_mm(k);
+            let [x0, y0] = grid.place_mm(k);
             let (mut normal, mut right) = (nalgebra::Matrix3::zeros(), nalgebra::Vector3::zeros());
             for r in readings {
                 let t = nalgebra::Vector3::new(1.0, r.at_mm[0] - x0, r.at_mm[1] - y0);
@@ -129,13 +130,13 @@ fn the_sums_along_the_axes_are_those_of_the_definition() {
     for (spacing, cutoff, seed) in [(1.0, 5.0, 1), (0.7, 4.0, 2), (1.5, 11.0, 3)] {
         let readings = with_noise(&strewn(1500, [40.0, 30.0], seed, |x, y| (0.2 * x).sin() + 0.03 * y), 0.3, seed);
         let map = made(&readings, &plain(cutoff, spacing));
-        let exact = direct(&readings, &map.net, cutoff);
-        let most = (0..map.net.len())
+        let exact = direct(&readings, &map.grid, cutoff);
+        let most = (0..map.grid.len())
             .filter(|&k| map.valid[k])
             .map(|k| (map.values_mm[k] - exact[k]).abs())
             .fold(0.0, f64::max);
         assert!(most < 1e-3, "spacing {spacing}, cut-off {cutoff}, seed {seed}: {most}");
-        assert!(map.valid.iter().filter(|v| **v).count() * 100 > 97 * map.net.len());
+        assert!(map.valid.iter().filter(|v| **v).count() * 100 > 97 * map.grid.len());
     }
 }
 
@@ -251,9 +252,9 @@ fn a_feature_of_the_part_is_kept() {
 /// Scatter of the map over draws, over the uncertainty it states, at valid nodes.
 fn scatter_over_stated(readings: &[Reading], options: &MapOptions, noise_mm: f64, draws: u64) -> (f64, f64, f64) {
     let clean = made(readings, options);
-    let mut squares = vec![0.0; clean.net.len()];
+    let mut squares = vec![0.0; clean.grid.len()];
     let mut point = 0.0;
-    let mut stated = vec![0.0; clean.net.len()];
+    let mut stated = vec![0.0; clean.grid.len()];
     for seed in 0..draws {
         let map = made(&with_noise(readings, noise_mm, 1000 + seed), options);
         squares.iter_mut().enumerate().for_each(|(k, s)| *s += (map.values_mm[k] - clean.values_mm[k]).powi(2));
@@ -261,7 +262,7 @@ fn scatter_over_stated(readings: &[Reading], options: &MapOptions, noise_mm: f64
         point += map.point_sigma_mm / draws as f64;
     }
     let ratio = |k: usize| (squares[k] / draws as f64).sqrt() / stated[k];
-    let valid: Vec<f64> = (0..clean.net.len()).filter(|&k| clean.valid[k]).map(ratio).collect();
+    let valid: Vec<f64> = (0..clean.grid.len()).filter(|&k| clean.valid[k]).map(ratio).collect();
     let outside = valid.iter().filter(|r| !(0.8..1.2).contains(*r)).count();
     (rms(valid.iter().copied()), outside as f64 / valid.len() as f64, point / noise_mm)
 }
@@ -321,12 +322,12 @@ fn outside_what_was_measured_the_map_levels_off() {
     readings.retain(|r| r.at_mm[0].hypot(r.at_mm[1]) < 40.0);
     let level_off_mm = 12.5;
     let map = made(&readings, &MapOptions { level_off_mm, ..MapOptions::new(6.0, 1.0) });
-    let corner = map.net.len() - 1;
-    assert!(!map.valid[corner] && map.valid[map.net.len() / 2]);
+    let corner = map.grid.len() - 1;
+    assert!(!map.valid[corner] && map.valid[map.grid.len() / 2]);
     // From the nearest valid node, off by 4/27 of slope times distance at most, and without slope at the corner, 16 mm away.
     let most = map.samples_mm().into_iter().map(|[_, _, e]| e).fold(0.0, f64::max);
     assert!(map.values_mm.iter().all(|v| v.abs() <= most + 4.0 / 27.0 * 1e-4 * level_off_mm + 1e-12));
-    let [x, y] = map.net.place_mm(corner);
+    let [x, y] = map.grid.place_mm(corner);
     let near = map.samples_mm().into_iter().min_by(|a, b| {
         let d = |s: &[f64; 3]| (s[0] - x).hypot(s[1] - y);
         d(a).total_cmp(&d(b))
@@ -338,30 +339,30 @@ fn outside_what_was_measured_the_map_levels_off() {
 
 #[test]
 fn a_map_on_a_net_is_filtered_as_readings_are() {
-    let net = Net { columns: 81, rows: 61, first_mm: [-20.0, -15.0], spacing_mm: [0.5, 0.5] };
-    let valid: Vec<bool> = (0..net.len()).map(|k| net.place_mm(k)).map(|[x, y]| x.hypot(y) > 6.0).collect();
+    let grid = Grid { columns: 81, rows: 61, first_mm: [-20.0, -15.0], spacing_mm: [0.5, 0.5] };
+    let valid: Vec<bool> = (0..grid.len()).map(|k| grid.place_mm(k)).map(|[x, y]| x.hypot(y) > 6.0).collect();
     let mut rng = StdRng::seed_from_u64(9);
-    let values: Vec<f64> = (0..net.len())
-        .map(|k| net.place_mm(k))
+    let values: Vec<f64> = (0..grid.len())
+        .map(|k| grid.place_mm(k))
         .zip(&valid)
         .map(|([x, y], v)| if *v { form(x, y) + 3e-4 * normal(&mut rng) } else { f64::INFINITY })
         .collect();
-    let plain_form = filter_net(&net, &values, &valid, 5.0, Order::Plane, false).unwrap();
-    let readings: Vec<Reading> = (0..net.len())
+    let plain_form = filter_grid(&grid, &values, &valid, 5.0, Order::Plane, false).unwrap();
+    let readings: Vec<Reading> = (0..grid.len())
         .filter(|&k| valid[k])
-        .map(|k| Reading { at_mm: net.place_mm(k), deviation_mm: values[k] })
+        .map(|k| Reading { at_mm: grid.place_mm(k), deviation_mm: values[k] })
         .collect();
-    let exact = direct(&readings, &net, 5.0);
-    let nodes = || (0..net.len()).filter(|&k| plain_form.valid[k]);
-    assert!(nodes().count() > net.len() * 8 / 10);
+    let exact = direct(&readings, &grid, 5.0);
+    let nodes = || (0..grid.len()).filter(|&k| plain_form.valid[k]);
+    assert!(nodes().count() > grid.len() * 8 / 10);
     let most = nodes().map(|k| (plain_form.values[k] - exact[k]).abs()).fold(0.0, f64::max);
     assert!(most < 1e-8, "{most}");
-    let robust_form = filter_net(&net, &values, &valid, 5.0, Order::Plane, true).unwrap();
+    let robust_form = filter_grid(&grid, &values, &valid, 5.0, Order::Plane, true).unwrap();
     assert!(robust_form.rounds > 1);
     assert!(rms(nodes().map(|k| robust_form.values[k] - exact[k])) < 1e-4);
-    assert!(matches!(filter_net(&net, &values[1..], &valid, 5.0, Order::Plane, true), Err(MapError::Shape { .. })));
+    assert!(matches!(filter_grid(&grid, &values[1..], &valid, 5.0, Order::Plane, true), Err(MapError::Shape { .. })));
     assert!(matches!(
-        filter_net(&net, &values, &vec![true; net.len()], 5.0, Order::Plane, true),
+        filter_grid(&grid, &values, &vec![true; grid.len()], 5.0, Order::Plane, true),
         Err(MapError::NotFinite { .. })
     ));
 }
@@ -370,7 +371,7 @@ fn a_map_on_a_net_is_filtered_as_readings_are() {
 fn what_makes_no_map_is_said() {
     let options = MapOptions::new(5.0, 1.0);
     let some = sampled(31, 31, [1.0, 1.0], |_, _| 0.0);
-    assert!(matches!(error_map(&[], &options), Err(MapError::Net(NetError::NoPoints))));
+    assert!(matches!(error_map(&[], &options), Err(MapError::Grid(GridError::NoPoints))));
     assert!(matches!(error_map(&some[..1], &options), Err(MapError::TooSparse { .. })));
     for smoothing in [Smoothing::Gaussian, Smoothing::RobustGaussian, Smoothing::Spline] {
         let options = MapOptions { smoothing, ..options };

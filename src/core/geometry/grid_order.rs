@@ -1,0 +1,259 @@
+//! Regular grids among points that come in any order.
+
+use rayon::prelude::*;
+
+use super::Point;
+
+/// How far a point may stand from its node, in spacings: rounding in a file is far below, scatter far above.
+const NODE_TOLERANCE: f64 = 0.02;
+
+/// A node that no point fills.
+pub const NO_POINT: u32 = u32::MAX;
+
+/// A cloud seen as a grid over the xy plane: which point stands at each node.
+#[derive(Clone, Debug, PartialEq)]
+pub struct GridOrder {
+    /// Number of nodes along x.
+    pub columns: usize,
+    /// Number of nodes along y.
+    pub rows: usize,
+    /// Index of the point at each node, row by row with x fastest; [`NO_POINT`] where there is none.
+    pub point_at: Vec<u32>,
+    /// Number of nodes without a point.
+    pub holes: usize,
+}
+
+impl GridOrder {
+    /// Whether the points already come row by row, x fastest, without a hole.
+    pub fn is_in_order(&self) -> bool {
+        self.holes == 0 && self.point_at.iter().enumerate().all(|(node, &point)| node as u32 == point)
+    }
+}
+
+/// A cloud that comes row by row, x fastest, without a hole.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct GridInOrder {
+    pub(crate) columns: usize,
+    pub(crate) rows: usize,
+    /// The first node and the last, in x and y.
+    pub(crate) corners: [[f64; 2]; 2],
+}
+
+/// How far two points of one column may stand apart in x, as a share of the extent: below, it is rounding.
+const COLUMN_TOLERANCE: f64 = 5e-7;
+
+/// Recognises a whole regular grid whose points come row by row, x fastest, in one pass and without taking memory.
+///
+/// What it takes for a grid, [`recognise_grid`] does too; the other way round there are the grids in another order and those
+/// with holes.
+pub(crate) fn grid_in_order(points: &[Point]) -> Option<GridInOrder> {
+    let columns = 1 + points.windows(2).take_while(|pair| pair[1].x > pair[0].x).count();
+    let rows = points.len() / columns;
+    if columns < 3 || rows < 3 || columns * rows != points.len() || points.len() >= NO_POINT as usize {
+        return None;
+    }
+    let first = &points[..columns];
+    let column: Vec<f64> = first.iter().map(|p| p.x).collect();
+    let row: Vec<f64> = points.iter().step_by(columns).map(|p| p.y).collect();
+    if !(is_even(&column) && is_even(&row)) {
+        return None;
+    }
+    let near = |from: f64, to: f64| COLUMN_TOLERANCE * (to - from);
+    let (near_x, near_y) = (near(column[0], column[columns - 1]), near(row[0], row[rows - 1]));
+    let holds = |(line, y): (&[Point], &f64)| {
+        // Without a way out in the middle: a line is short, and the compiler takes several points at a time.
+        line.iter()
+            .zip(&column)
+            .fold(true, |all, (p, x)| all & ((p.x - x).abs() <= near_x) & ((p.y - y).abs() <= near_y) & p.z.is_finite())
+    };
+    points.par_chunks(columns).zip(&row).with_min_len(16).all(holds).then(|| GridInOrder {
+        columns,
+        rows,
+        corners: [[column[0], row[0]], [column[columns - 1], row[rows - 1]]],
+    })
+}
+
+/// Whether coordinates rise in equal steps.
+fn is_even(at: &[f64]) -> bool {
+    let step = (at[at.len() - 1] - at[0]) / (at.len() - 1) as f64;
+    step > 0.0
+        && step.is_finite()
+        && at.iter().enumerate().all(|(k, c)| (c - at[0] - k as f64 * step).abs() <= NODE_TOLERANCE * step)
+}
+
+/// Recognises a regular grid in x and y, whatever the order of the points and with nodes missing.
+///
+/// Shapes: at least 3 nodes on each axis, at most one node in four filled by chance is no grid. Returns `None` for
+/// scattered points, for two points at one node, and for anything that is not finite.
+pub fn recognise_grid(points: &[Point]) -> Option<GridOrder> {
+    if points.len() < 9 || points.len() >= NO_POINT as usize {
+        return None;
+    }
+    let x = Axis::find(points, |p| p.x)?;
+    let y = Axis::find(points, |p| p.y)?;
+    let nodes = x.count.checked_mul(y.count)?;
+    if x.count < 3 || y.count < 3 || nodes > 4 * points.len() {
+        return None;
+    }
+    let node_of = |p: &Point| Some(y.node(p.y)? as u32 * x.count as u32 + x.node(p.x)? as u32);
+    let node_of: Vec<u32> = points.par_iter().with_min_len(8192).map(node_of).collect::<Option<_>>()?;
+    let mut point_at = vec![NO_POINT; nodes];
+    for (index, node) in node_of.into_iter().enumerate() {
+        if std::mem::replace(&mut point_at[node as usize], index as u32) != NO_POINT {
+            return None;
+        }
+    }
+    Some(GridOrder { columns: x.count, rows: y.count, point_at, holes: nodes - points.len() })
+}
+
+/// Equally spaced coordinates along one axis.
+struct Axis {
+    first: f64,
+    per_mm: f64,
+    count: usize,
+}
+
+impl Axis {
+    /// Finds the spacing as the least gap between sorted coordinates of a sample that no order of the points can fool.
+    fn find(points: &[Point], coordinate: impl Fn(&Point) -> f64 + Sync) -> Option<Self> {
+        let (low, high) = points
+            .par_chunks(8192)
+            .map(|chunk| {
+                chunk.iter().map(&coordinate).fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), c| {
+                    if (c + low).is_nan() { (f64::NAN, f64::NAN) } else { (low.min(c), high.max(c)) }
+                })
+            })
+            .reduce(
+                || (f64::INFINITY, f64::NEG_INFINITY),
+                |a, b| if (a.0 + b.0).is_nan() { (f64::NAN, f64::NAN) } else { (a.0.min(b.0), a.1.max(b.1)) },
+            );
+        let extent = high - low;
+        if !extent.is_finite() || extent <= 0.0 {
+            return None;
+        }
+        let mut sample = sampled(points).map(&coordinate).collect::<Vec<_>>();
+        sample.sort_unstable_by(f64::total_cmp);
+        let gap = sample.windows(2).map(|w| w[1] - w[0]).filter(|gap| *gap > 1e-6 * extent).fold(extent, f64::min);
+        let steps = (extent / gap).round();
+        (steps < 6e4).then_some(Self { first: low, per_mm: steps / extent, count: steps as usize + 1 })
+    }
+
+    /// Returns the number of the node at a coordinate, if there is one.
+    #[inline]
+    fn node(&self, coordinate: f64) -> Option<usize> {
+        let at = (coordinate - self.first) * self.per_mm;
+        // Never below zero, so truncation is the floor.
+        let node = (at + 0.5) as u32;
+        ((at - f64::from(node)).abs() <= NODE_TOLERANCE).then_some(node as usize)
+    }
+}
+
+/// The first points and a scatter over all of them: a grid in order shows its spacing in the first, a shuffled one in the
+/// second.
+fn sampled(points: &[Point]) -> impl Iterator<Item = &Point> {
+    const SAMPLE: usize = 4096;
+    let n = points.len();
+    let scattered = (0..SAMPLE.min(n) as u64).map(move |k| (k.wrapping_mul(0x9E37_79B9_7F4A_7C15) % n as u64) as usize);
+    points.iter().take(SAMPLE).chain(scattered.map(|i| &points[i]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn grid(columns: usize, rows: usize, dx: f64, dy: f64) -> Vec<Point> {
+        (0..rows)
+            .flat_map(|j| {
+                (0..columns).map(move |i| Point::new(i as f64 * dx - 7.3, j as f64 * dy + 1.1, (i * j) as f64))
+            })
+            .collect()
+    }
+
+    /// A fixed shuffle: multiplication by a number coprime to the length.
+    fn shuffled(points: &[Point]) -> Vec<Point> {
+        let n = points.len();
+        let step = (n / 3..).find(|s| num_gcd(*s, n) == 1).unwrap();
+        (0..n).map(|i| points[(i * step + 5) % n]).collect()
+    }
+
+    fn num_gcd(a: usize, b: usize) -> usize {
+        if b == 0 { a } else { num_gcd(b, a % b) }
+    }
+
+    #[test]
+    fn a_grid_in_order_and_the_same_grid_shuffled() {
+        let points = grid(101, 57, 0.1133, 0.124);
+        let order = recognise_grid(&points).unwrap();
+        assert_eq!((order.columns, order.rows, order.holes), (101, 57, 0));
+        assert!(order.is_in_order());
+        let found = grid_in_order(&points).unwrap();
+        assert_eq!((found.columns, found.rows), (101, 57));
+        assert_eq!(found.corners, [[points[0].x, points[0].y], [points[101 * 57 - 1].x, points[101 * 57 - 1].y]]);
+
+        let mixed = shuffled(&points);
+        assert_eq!(grid_in_order(&mixed), None);
+        let order = recognise_grid(&mixed).unwrap();
+        assert!(!order.is_in_order());
+        for (node, &index) in order.point_at.iter().enumerate() {
+            assert_eq!(mixed[index as usize], points[node]);
+        }
+    }
+
+    #[test]
+    fn columns_first_is_a_grid_too() {
+        let mut points = grid(40, 30, 1.0, 2.0);
+        points.sort_by(|a, b| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
+        let order = recognise_grid(&points).unwrap();
+        assert_eq!((order.columns, order.rows), (40, 30));
+    }
+
+    #[test]
+    fn a_round_aperture_leaves_holes() {
+        let points: Vec<_> =
+            grid(81, 81, 0.5, 0.5).into_iter().filter(|p| (p.x - 12.7).hypot(p.y - 21.1) <= 20.001).collect();
+        let order = recognise_grid(&points).unwrap();
+        assert_eq!((order.columns, order.rows), (81, 81));
+        assert_eq!(order.holes, 81 * 81 - points.len());
+    }
+
+    #[test]
+    fn rounding_to_a_file_does_not_hide_the_grid() {
+        let mut points = grid(333, 222, 102.0 / 332.0, 62.0 / 221.0);
+        for p in &mut points {
+            p.x = (p.x * 1e4).round() / 1e4;
+            p.y = (p.y * 1e4).round() / 1e4;
+        }
+        assert!(recognise_grid(&points).is_some() && grid_in_order(&points).is_some());
+        // A point out of its column, one out of its row, one missing, one that is no number.
+        for spoil in [
+            |p: &mut Vec<Point>| p[5000].x += 0.003,
+            |p: &mut Vec<Point>| p[5000].y -= 0.003,
+            |p: &mut Vec<Point>| p.truncate(333 * 222 - 1),
+            |p: &mut Vec<Point>| p[5000].z = f64::NAN,
+        ] {
+            let mut spoilt = points.clone();
+            spoil(&mut spoilt);
+            assert_eq!(grid_in_order(&spoilt), None);
+        }
+    }
+
+    #[test]
+    fn what_is_no_grid_is_not_taken_for_one() {
+        let mut scattered = grid(50, 50, 1.0, 1.0);
+        for (k, p) in scattered.iter_mut().enumerate() {
+            p.x += 0.3 * (k as f64 * 1.7).sin();
+        }
+        assert_eq!(recognise_grid(&scattered), None);
+        let line: Vec<_> = (0..100).map(|i| Point::new(f64::from(i), 0.0, 0.0)).collect();
+        assert_eq!(recognise_grid(&line), None);
+        let mut doubled = grid(10, 10, 1.0, 1.0);
+        doubled.push(doubled[17]);
+        assert_eq!(recognise_grid(&doubled), None);
+        let mut broken = grid(10, 10, 1.0, 1.0);
+        broken[3].x = f64::NAN;
+        assert_eq!(recognise_grid(&broken), None);
+        broken[3].x = 1e300;
+        assert_eq!(recognise_grid(&broken), None);
+        assert_eq!(recognise_grid(&[]), None);
+    }
+}
