@@ -3,11 +3,11 @@
 use rayon::prelude::*;
 
 use crate::geometry::{Point, Pose, Vector};
-use crate::surface::lanes::{FourFeet, LANES, Lane, Lane3, side_by_side};
+use crate::surface::simd::{F64x4, FourFeet, LANES, Vector3x4, side_by_side};
 use crate::surface::{OffsetSurface, Place};
 
 use super::PointStatus;
-use super::linearize::{FourSums, Lever, Sums};
+use super::linearize::{FourSums, Scaling, Sums};
 use super::robust::ScaledLoss;
 
 /// Points a task takes at a time: long enough to hide the cost of a task, short enough to share out.
@@ -15,7 +15,7 @@ const CHUNK: usize = 512;
 
 /// How a centre becomes a distance.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Reading {
+pub(crate) struct ResidualModel {
     /// Subtracted from every distance: the probe radius where it was not put into the surface.
     pub(crate) subtract_mm: f64,
     /// What a distance counts for.
@@ -24,7 +24,7 @@ pub(crate) struct Reading {
 
 /// What is remembered of a measured point from one iteration to the next.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Track {
+pub(crate) struct Correspondence {
     pub(crate) place: Place,
     pub(crate) distance_mm: f64,
     /// How far beyond the edge, in steps of the sampling.
@@ -33,7 +33,7 @@ pub(crate) struct Track {
     pub(crate) used: bool,
 }
 
-impl Track {
+impl Correspondence {
     /// Returns what became of the point.
     pub(crate) fn status(&self) -> PointStatus {
         match self.used {
@@ -52,19 +52,19 @@ impl Track {
 /// threads there are; nor does it depend on the vector instructions of the machine, which are chosen as it runs.
 pub(crate) fn correspond(
     surface: &OffsetSurface,
-    reading: &Reading,
+    residual: &ResidualModel,
     measured: &[Point],
-    tracks: &mut [Track],
+    correspondences: &mut [Correspondence],
     cmm_from_model: &Pose,
-    lever: &Lever,
+    scaling: &Scaling,
 ) -> Sums {
-    let pass = Pass { surface, reading, model_from_cmm: cmm_from_model.inverse(), lever };
+    let pass = Pass { surface, residual, model_from_cmm: cmm_from_model.inverse(), scaling };
     let arch = pulp::Arch::new();
-    let task = |(points, tracks)| arch.dispatch(Chunk { pass: &pass, points, tracks });
+    let task = |(points, correspondences)| arch.dispatch(Chunk { pass: &pass, points, correspondences });
     if measured.len() <= 2 * CHUNK {
-        return task((measured, tracks));
+        return task((measured, correspondences));
     }
-    let parts: Vec<Sums> = measured.par_chunks(CHUNK).zip(tracks.par_chunks_mut(CHUNK)).map(task).collect();
+    let parts: Vec<Sums> = measured.par_chunks(CHUNK).zip(correspondences.par_chunks_mut(CHUNK)).map(task).collect();
     parts.iter().fold(Sums::zero(), Sums::merge)
 }
 
@@ -72,7 +72,7 @@ pub(crate) fn correspond(
 struct Chunk<'a> {
     pass: &'a Pass<'a>,
     points: &'a [Point],
-    tracks: &'a mut [Track],
+    correspondences: &'a mut [Correspondence],
 }
 
 impl pulp::NullaryFnOnce for Chunk<'_> {
@@ -81,46 +81,54 @@ impl pulp::NullaryFnOnce for Chunk<'_> {
     // Inlined into the caller that has the instructions; a call from it would be to code without them.
     #[inline(always)]
     fn call(self) -> Sums {
-        self.pass.chunk(self.points, self.tracks)
+        self.pass.chunk(self.points, self.correspondences)
     }
 }
 
 /// One pass over the points: everything that is the same for all of them.
 struct Pass<'a> {
     surface: &'a OffsetSurface<'a>,
-    reading: &'a Reading,
+    residual: &'a ResidualModel,
     model_from_cmm: Pose,
-    lever: &'a Lever,
+    scaling: &'a Scaling,
 }
 
 impl Pass<'_> {
     /// Sums one chunk of points: in fours where they stay on their facets or find new ones together, alone elsewhere.
     #[inline(always)]
-    fn chunk(&self, points: &[Point], tracks: &mut [Track]) -> Sums {
+    fn chunk(&self, points: &[Point], correspondences: &mut [Correspondence]) -> Sums {
         let mut sums = Sums::zero();
         let mut fours = FourSums::zero();
         let mut last = Place::UNKNOWN;
         let mut recent = [[Place::UNKNOWN; LANES]; 2];
         let in_fours = self.surface.has_four_feet() && self.surface.nominal().outline().is_none();
         let (four_points, rest_points) = points.as_chunks::<LANES>();
-        let (four_tracks, rest_tracks) = tracks.as_chunks_mut::<LANES>();
-        for (points, tracks) in four_points.iter().zip(four_tracks) {
+        let (four_correspondences, rest_correspondences) = correspondences.as_chunks_mut::<LANES>();
+        for (points, correspondences) in four_points.iter().zip(four_correspondences) {
             // No closure around what is to be compiled with the vector instructions: it would be compiled without them.
-            let start = if in_fours { self.start(tracks, &recent) } else { None };
+            let start = if in_fours { self.start(correspondences, &recent) } else { None };
             let taken = match start {
-                Some(places) => self.four(points, tracks, places, &mut fours),
+                Some(places) => self.four(points, correspondences, places, &mut fours),
                 None => false,
             };
             if !taken {
-                for (point, track) in points.iter().zip(&mut *tracks) {
-                    self.one(point, track, &mut last, &mut sums);
+                for (point, correspondence) in points.iter().zip(&mut *correspondences) {
+                    self.one(point, correspondence, &mut last, &mut sums);
                 }
             }
-            recent = [recent[1], [tracks[0].place, tracks[1].place, tracks[2].place, tracks[3].place]];
-            last = tracks[LANES - 1].place;
+            recent = [
+                recent[1],
+                [
+                    correspondences[0].place,
+                    correspondences[1].place,
+                    correspondences[2].place,
+                    correspondences[3].place,
+                ],
+            ];
+            last = correspondences[LANES - 1].place;
         }
-        for (point, track) in rest_points.iter().zip(rest_tracks) {
-            self.one(point, track, &mut last, &mut sums);
+        for (point, correspondence) in rest_points.iter().zip(rest_correspondences) {
+            self.one(point, correspondence, &mut last, &mut sums);
         }
         fours.add_to(&mut sums);
         sums
@@ -128,12 +136,13 @@ impl Pass<'_> {
 
     /// Where four points were, or may be expected after those before them; `None` where nothing tells.
     #[inline(always)]
-    fn start(&self, tracks: &[Track; LANES], recent: &[[Place; LANES]; 2]) -> Option<[Place; LANES]> {
-        let places = [tracks[0].place, tracks[1].place, tracks[2].place, tracks[3].place];
+    fn start(&self, correspondences: &[Correspondence; LANES], recent: &[[Place; LANES]; 2]) -> Option<[Place; LANES]> {
+        let places =
+            [correspondences[0].place, correspondences[1].place, correspondences[2].place, correspondences[3].place];
         if !places.contains(&Place::UNKNOWN) {
             return Some(places);
         }
-        self.surface.four_places_ahead(&recent[0], &recent[1])
+        self.surface.four_extrapolated_places(&recent[0], &recent[1])
     }
 
     /// Takes four points that are on the part, near the places given; returns false, with nothing done, for any others.
@@ -141,57 +150,57 @@ impl Pass<'_> {
     fn four(
         &self,
         points: &[Point; LANES],
-        tracks: &mut [Track; LANES],
+        correspondences: &mut [Correspondence; LANES],
         mut places: [Place; LANES],
         sums: &mut FourSums,
     ) -> bool {
         let p = four_moved(&self.model_from_cmm, &side_by_side(points));
         let Some(feet) = self.surface.four_feet(&p, &mut places) else { return false };
-        let distance = feet.distance_mm - Lane::splat(self.reading.subtract_mm);
+        let distance = feet.distance_mm - F64x4::splat(self.residual.subtract_mm);
         let (mut weight, mut loss, mut used) = ([0.0; LANES], [0.0; LANES], 0);
         for l in 0..LANES {
-            tracks[l].place = places[l];
-            tracks[l].distance_mm = distance.0[l];
-            tracks[l].beyond_steps = 0.0;
-            if tracks[l].used {
-                (weight[l], loss[l]) = self.reading.loss.weigh(distance.0[l]);
+            correspondences[l].place = places[l];
+            correspondences[l].distance_mm = distance.0[l];
+            correspondences[l].beyond_steps = 0.0;
+            if correspondences[l].used {
+                (weight[l], loss[l]) = self.residual.loss.weigh(distance.0[l]);
                 used += 1;
             }
         }
-        sums.add(&self.lever.four_rows(&p, &feet.normal), distance, Lane(weight), Lane(loss), used);
+        sums.add(&self.scaling.four_rows(&p, &feet.normal), distance, F64x4(weight), F64x4(loss), used);
         true
     }
 
     #[inline]
-    fn one(&self, point: &Point, track: &mut Track, last: &mut Place, sums: &mut Sums) {
+    fn one(&self, point: &Point, correspondence: &mut Correspondence, last: &mut Place, sums: &mut Sums) {
         let p = self.model_from_cmm.point(point); // g^-1 Y
         // A point without a past begins where its neighbour in the file ended, if it has one.
-        let start = if track.place == Place::UNKNOWN { *last } else { track.place };
+        let start = if correspondence.place == Place::UNKNOWN { *last } else { correspondence.place };
         let foot = self.surface.foot(&p, start);
         *last = foot.place;
-        track.place = foot.place;
-        track.distance_mm = foot.distance_mm - self.reading.subtract_mm;
-        track.beyond_steps = foot.beyond_steps as f32;
+        correspondence.place = foot.place;
+        correspondence.distance_mm = foot.distance_mm - self.residual.subtract_mm;
+        correspondence.beyond_steps = foot.beyond_steps as f32;
         if let Some(outline) = self.surface.nominal().outline() {
             let contact = p - foot.normal * (foot.distance_mm + self.surface.radius_mm());
             if !outline.contains(contact.x, contact.y) {
-                track.beyond_steps = track.beyond_steps.max(1.0);
+                correspondence.beyond_steps = correspondence.beyond_steps.max(1.0);
             }
         }
-        if track.used {
-            let (weight, loss) = self.reading.loss.weigh(track.distance_mm);
-            sums.add(&self.lever.row(&p, &foot.normal), track.distance_mm, weight, loss);
+        if correspondence.used {
+            let (weight, loss) = self.residual.loss.weigh(correspondence.distance_mm);
+            sums.add(&self.scaling.row(&p, &foot.normal), correspondence.distance_mm, weight, loss);
         }
     }
 }
 
 /// Four points moved by a pose.
 #[inline(always)]
-fn four_moved(pose: &Pose, w: &Lane3) -> Lane3 {
+fn four_moved(pose: &Pose, w: &Vector3x4) -> Vector3x4 {
     let (r, t) = (&pose.rotation, &pose.translation_mm);
     let row = |k: usize| {
-        let part = |c: usize| Lane::splat(r[(k, c)]) * w[c];
-        part(0) + part(1) + part(2) + Lane::splat(t[k])
+        let part = |c: usize| F64x4::splat(r[(k, c)]) * w[c];
+        part(0) + part(1) + part(2) + F64x4::splat(t[k])
     };
     [row(0), row(1), row(2)]
 }
@@ -199,9 +208,9 @@ fn four_moved(pose: &Pose, w: &Lane3) -> Lane3 {
 /// Four measured points at the end: their feet, and the rows of A there.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FourFinal {
-    pub(crate) centre: Lane3,
+    pub(crate) centre: Vector3x4,
     pub(crate) feet: FourFeet,
-    pub(crate) row: [Lane; 6],
+    pub(crate) row: [F64x4; 6],
 }
 
 /// Makes of four points at their feet what is to be reported of each.
@@ -213,7 +222,7 @@ pub(crate) trait Report: Sync {
     const BLANK: Self::Item;
 
     /// Returns what is reported of each of four points. Inlined, so that it is compiled with the caller's instructions.
-    fn four(&self, tracks: [&Track; LANES], at: &FourFinal) -> [Self::Item; LANES];
+    fn four(&self, correspondences: [&Correspondence; LANES], at: &FourFinal) -> [Self::Item; LANES];
 }
 
 /// Fours that a task of [`at_feet`] takes at a time.
@@ -223,12 +232,13 @@ const FOURS: usize = 8;
 pub(crate) fn at_feet<R: Report>(
     surface: &OffsetSurface,
     measured: &[Point],
-    tracks: &[Track],
+    correspondences: &[Correspondence],
     cmm_from_model: &Pose,
-    lever: &Lever,
+    scaling: &Scaling,
     report: &R,
 ) -> Vec<R::Item> {
-    let at_end = AtEnd { surface, measured, tracks, model_from_cmm: cmm_from_model.inverse(), lever, report };
+    let at_end =
+        AtEnd { surface, measured, correspondences, model_from_cmm: cmm_from_model.inverse(), scaling, report };
     let arch = pulp::Arch::new();
     // Whole blocks, written where they stay; the last is filled up with the last point.
     let blocks: Vec<[[R::Item; LANES]; FOURS]> = (0..measured.len().div_ceil(LANES * FOURS))
@@ -245,9 +255,9 @@ pub(crate) fn at_feet<R: Report>(
 struct AtEnd<'a, R> {
     surface: &'a OffsetSurface<'a>,
     measured: &'a [Point],
-    tracks: &'a [Track],
+    correspondences: &'a [Correspondence],
     model_from_cmm: Pose,
-    lever: &'a Lever,
+    scaling: &'a Scaling,
     report: &'a R,
 }
 
@@ -275,29 +285,32 @@ impl<R: Report> AtEnd<'_, R> {
     fn four(&self, first: usize) -> [R::Item; LANES] {
         let end = self.measured.len() - 1;
         let (a, b, c, d) = (first.min(end), (first + 1).min(end), (first + 2).min(end), (first + 3).min(end));
-        let tracks = [&self.tracks[a], &self.tracks[b], &self.tracks[c], &self.tracks[d]];
+        let correspondences =
+            [&self.correspondences[a], &self.correspondences[b], &self.correspondences[c], &self.correspondences[d]];
         let points = [self.measured[a], self.measured[b], self.measured[c], self.measured[d]];
         let centre = four_moved(&self.model_from_cmm, &side_by_side(&points));
-        let mut places = [tracks[0].place, tracks[1].place, tracks[2].place, tracks[3].place];
+        let mut places =
+            [correspondences[0].place, correspondences[1].place, correspondences[2].place, correspondences[3].place];
         let together = self.surface.has_four_feet() && !places.contains(&Place::UNKNOWN);
         let feet = match if together { self.surface.four_feet(&centre, &mut places) } else { None } {
             Some(feet) => feet,
-            None => self.four_single(&centre, tracks),
+            None => self.four_single(&centre, correspondences),
         };
-        self.report.four(tracks, &FourFinal { centre, feet, row: self.lever.four_rows(&centre, &feet.normal) })
+        self.report
+            .four(correspondences, &FourFinal { centre, feet, row: self.scaling.four_rows(&centre, &feet.normal) })
     }
 
     /// The feet of four points that were searched for one by one.
     #[cold]
-    fn four_single(&self, centre: &Lane3, tracks: [&Track; LANES]) -> FourFeet {
+    fn four_single(&self, centre: &Vector3x4, correspondences: [&Correspondence; LANES]) -> FourFeet {
         let foot = |l: usize| {
             let p = Point::new(centre[0].0[l], centre[1].0[l], centre[2].0[l]);
-            self.surface.foot(&p, tracks[l].place)
+            self.surface.foot(&p, correspondences[l].place)
         };
         let feet: [_; LANES] = std::array::from_fn(foot);
         FourFeet {
-            distance_mm: Lane(feet.map(|f| f.distance_mm)),
-            normal: [0, 1, 2].map(|c| Lane(feet.map(|f| f.normal[c]))),
+            distance_mm: F64x4(feet.map(|f| f.distance_mm)),
+            normal: [0, 1, 2].map(|c| F64x4(feet.map(|f| f.normal[c]))),
         }
     }
 }

@@ -6,8 +6,8 @@ use crate::geometry::{Point, Pose};
 use crate::surface::OffsetSurface;
 
 use super::RegistrationError;
-use super::correspond::{Reading, Track, correspond};
-use super::linearize::{Lever, Sums};
+use super::correspond::{Correspondence, ResidualModel, correspond};
+use super::linearize::{Scaling, Sums};
 use super::solve::Spectrum;
 
 /// One turn of the iteration.
@@ -29,7 +29,7 @@ pub struct Iteration {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Problem<'a> {
     pub(crate) surface: OffsetSurface<'a>,
-    pub(crate) reading: Reading,
+    pub(crate) residual: ResidualModel,
     pub(crate) measured: &'a [Point],
     /// The middle of the measured points and their rms distance from it.
     pub(crate) middle: Point,
@@ -50,7 +50,7 @@ pub(crate) struct Problem<'a> {
 pub(crate) struct Descent {
     pub(crate) cmm_from_model: Pose,
     pub(crate) objective_mm2: f64,
-    pub(crate) lever: Lever,
+    pub(crate) scaling: Scaling,
     pub(crate) sums: Sums,
     pub(crate) rank: usize,
     pub(crate) converged: bool,
@@ -68,27 +68,27 @@ const SETTLED: f64 = 1e-7;
 impl Problem<'_> {
     /// Descends from a pose to the nearest minimum of the objective; the objective of steps taken never rises, eq. (14).
     ///
-    /// At the end the tracks and the sums are those of the pose that is returned. The sums at the start may be known already.
+    /// At the end the correspondences and the sums are those of the pose that is returned. The sums at the start may be known already.
     pub(crate) fn descend(
         &self,
         start: Pose,
         known: Option<Sums>,
-        tracks: &mut [Track],
+        correspondences: &mut [Correspondence],
         trace: &mut Vec<Iteration>,
     ) -> Result<Descent, RegistrationError> {
         let mut pose = start;
-        let mut lever = self.lever_at(&pose);
-        let mut sums = known.unwrap_or_else(|| self.feet(tracks, &pose, &lever));
+        let mut scaling = self.scaling_at(&pose);
+        let mut sums = known.unwrap_or_else(|| self.feet(correspondences, &pose, &scaling));
         let mut ball_radius = self.ball_radius;
         let mut rank = 0;
         let mut converged = false;
-        // Whether the tracks tell of the pose that stands, or of one that was taken back.
+        // Whether the correspondences tell of the pose that stands, or of one that was taken back.
         let mut current = true;
         for _ in 0..self.most_iterations {
             if sums.points < 6 {
                 return Err(RegistrationError::TooFewUsed { used: sums.points, points: self.measured.len() });
             }
-            let free = free_directions(&self.locked, &lever);
+            let free = free_directions(&self.locked, &scaling);
             let spectrum = Spectrum::new(&(free * sums.gram() * free));
             rank = spectrum.rank(self.least_share, sums.gram().trace());
             let right = free * sums.right();
@@ -101,9 +101,9 @@ impl Problem<'_> {
                 converged = true;
                 break;
             }
-            let candidate = (pose * Pose::exp(&lever.twist(&m))).orthonormalised(); // eq. (10), left side
-            let candidate_lever = self.lever_at(&candidate);
-            let candidate_sums = self.feet(tracks, &candidate, &candidate_lever);
+            let candidate = (pose * Pose::exp(&scaling.twist(&m))).orthonormalised(); // eq. (10), left side
+            let candidate_scaling = self.scaling_at(&candidate);
+            let candidate_sums = self.feet(correspondences, &candidate, &candidate_scaling);
             let taken = candidate_sums.objective_mm2 <= sums.objective_mm2;
             current = taken;
             trace.push(Iteration {
@@ -125,32 +125,32 @@ impl Problem<'_> {
             if step > 0.99 * ball_radius {
                 ball_radius *= 2.0;
             }
-            (pose, lever, sums) = (candidate, candidate_lever, candidate_sums);
+            (pose, scaling, sums) = (candidate, candidate_scaling, candidate_sums);
             if gain <= self.tolerance {
                 converged = true;
                 break;
             }
         }
         if !current {
-            sums = self.feet(tracks, &pose, &lever);
+            sums = self.feet(correspondences, &pose, &scaling);
         }
-        Ok(Descent { cmm_from_model: pose, objective_mm2: sums.objective_mm2, lever, sums, rank, converged })
+        Ok(Descent { cmm_from_model: pose, objective_mm2: sums.objective_mm2, scaling, sums, rank, converged })
     }
 
     /// Where the twist of a step from a pose is taken.
-    pub(crate) fn lever_at(&self, pose: &Pose) -> Lever {
-        Lever { centre: pose.inverse().point(&self.middle), size_mm: self.size_mm }
+    pub(crate) fn scaling_at(&self, pose: &Pose) -> Scaling {
+        Scaling { centre: pose.inverse().point(&self.middle), size_mm: self.size_mm }
     }
 
     /// Finds the feet under a pose and sums the linear problem.
-    pub(crate) fn feet(&self, tracks: &mut [Track], pose: &Pose, lever: &Lever) -> Sums {
-        correspond(&self.surface, &self.reading, self.measured, tracks, pose, lever)
+    pub(crate) fn feet(&self, correspondences: &mut [Correspondence], pose: &Pose, scaling: &Scaling) -> Sums {
+        correspond(&self.surface, &self.residual, self.measured, correspondences, pose, scaling)
     }
 }
 
 /// Returns the projector onto the scaled steps that leave the locked coordinates of the twist at zero.
-pub(crate) fn free_directions(locked: &[bool; 6], lever: &Lever) -> Matrix6<f64> {
-    let to_twist = lever.to_twist();
+pub(crate) fn free_directions(locked: &[bool; 6], scaling: &Scaling) -> Matrix6<f64> {
+    let to_twist = scaling.to_twist();
     let mut projector = Matrix6::identity();
     // Gram-Schmidt over the locked rows.
     for k in (0..6).filter(|&k| locked[k]) {
@@ -169,12 +169,12 @@ mod tests {
 
     #[test]
     fn free_steps_leave_the_locked_coordinates_alone() {
-        let lever = Lever { centre: Point::new(10.0, 20.0, -5.0), size_mm: 30.0 };
+        let scaling = Scaling { centre: Point::new(10.0, 20.0, -5.0), size_mm: 30.0 };
         let locked = [true, false, false, false, true, true];
-        let free = free_directions(&locked, &lever);
+        let free = free_directions(&locked, &scaling);
         assert!((free * free - free).amax() < 1e-12);
         for k in 0..6 {
-            let twist = lever.twist(&free.column(k).into());
+            let twist = scaling.twist(&free.column(k).into());
             for (c, _) in locked.iter().enumerate().filter(|(_, l)| **l) {
                 assert!(twist[c].abs() < 1e-12 * 30.0, "{twist}");
             }

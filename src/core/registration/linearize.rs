@@ -3,7 +3,7 @@
 use nalgebra::{Matrix6, Vector6};
 
 use crate::geometry::{Point, Twist, Vector};
-use crate::surface::lanes::{LANES, Lane, Lane3, cross, minus};
+use crate::surface::simd::{F64x4, LANES, Vector3x4, cross, minus};
 
 /// Where the twist of a step is taken: about the middle of the cloud, translations in units of its size.
 ///
@@ -11,12 +11,12 @@ use crate::surface::lanes::{LANES, Lane, Lane3, cross, minus};
 /// columns are as independent as the surface allows. In units of its size a ball |m| <= alpha means the same motion of the
 /// rim for a translation as for a rotation, whatever the size of the part.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Lever {
+pub(crate) struct Scaling {
     pub(crate) centre: Point,
     pub(crate) size_mm: f64,
 }
 
-impl Lever {
+impl Scaling {
     /// Returns the twist in the model frame, millimetres and radians, of scaled coordinates about the centre.
     pub(crate) fn twist(&self, scaled: &Vector6<f64>) -> Twist {
         let omega: Vector = scaled.fixed_rows::<3>(3).into();
@@ -43,13 +43,13 @@ impl Lever {
     }
 }
 
-impl Lever {
+impl Scaling {
     /// The rows of four points side by side.
     #[inline(always)]
-    pub(crate) fn four_rows(&self, p: &Lane3, normal: &Lane3) -> [Lane; 6] {
-        let centre = [Lane::splat(self.centre.x), Lane::splat(self.centre.y), Lane::splat(self.centre.z)];
+    pub(crate) fn four_rows(&self, p: &Vector3x4, normal: &Vector3x4) -> [F64x4; 6] {
+        let centre = [F64x4::splat(self.centre.x), F64x4::splat(self.centre.y), F64x4::splat(self.centre.z)];
         let arm = cross(&minus(p, &centre), normal);
-        let s = Lane::splat(self.size_mm);
+        let s = F64x4::splat(self.size_mm);
         [s * normal[0], s * normal[1], s * normal[2], arm[0], arm[1], arm[2]]
     }
 }
@@ -57,21 +57,21 @@ impl Lever {
 /// The sums of points that come in fours, a sum for each of the four.
 #[derive(Clone, Debug)]
 pub(crate) struct FourSums {
-    gram: [Lane; 21],
-    right: [Lane; 6],
-    objective_mm2: Lane,
+    gram: [F64x4; 21],
+    right: [F64x4; 6],
+    objective_mm2: F64x4,
     points: usize,
 }
 
 impl FourSums {
     pub(crate) fn zero() -> Self {
-        let zero = Lane::splat(0.0);
+        let zero = F64x4::splat(0.0);
         Self { gram: [zero; 21], right: [zero; 6], objective_mm2: zero, points: 0 }
     }
 
     /// Adds four points, of which those with a weight and a loss of 0 change nothing.
     #[inline(always)]
-    pub(crate) fn add(&mut self, row: &[Lane; 6], distance: Lane, weight: Lane, loss_mm2: Lane, used: usize) {
+    pub(crate) fn add(&mut self, row: &[F64x4; 6], distance: F64x4, weight: F64x4, loss_mm2: F64x4, used: usize) {
         let mut k = 0;
         for i in 0..6 {
             let weighted = weight * row[i];
@@ -169,15 +169,15 @@ mod tests {
     /// The row is the derivative of the distance to a fixed plane, with the sign of eq. (11), as the equation states it.
     #[test]
     fn the_row_is_the_derivative_of_the_distance() {
-        let lever = Lever { centre: Point::new(30.0, -20.0, 7.0), size_mm: 40.0 };
+        let scaling = Scaling { centre: Point::new(30.0, -20.0, 7.0), size_mm: 40.0 };
         let (p, normal) = (Point::new(55.0, 12.0, -3.0), Vector::new(0.2, -0.5, 0.9).normalize());
         let anchor = Point::new(54.0, 12.0, -2.0);
-        let row = lever.row(&p, &normal);
+        let row = scaling.row(&p, &normal);
         for k in 0..6 {
             let distance = |step: f64| {
                 let mut m = Vector6::zeros();
                 m[k] = step;
-                let moved = Pose::exp(&lever.twist(&m)).inverse().point(&p);
+                let moved = Pose::exp(&scaling.twist(&m)).inverse().point(&p);
                 (moved - anchor).dot(&normal)
             };
             let slope = (distance(1e-6) - distance(-1e-6)) / 2e-6;
@@ -187,9 +187,9 @@ mod tests {
 
     #[test]
     fn sliding_in_the_plane_changes_nothing() {
-        let lever = Lever { centre: Point::origin(), size_mm: 1.0 };
+        let scaling = Scaling { centre: Point::origin(), size_mm: 1.0 };
         let normal = Vector::new(1.0, 1.0, 1.0).normalize();
-        let row = lever.row(&Point::new(3.0, 4.0, 5.0), &normal);
+        let row = scaling.row(&Point::new(3.0, 4.0, 5.0), &normal);
         let slide = Vector::new(1.0, -1.0, 0.0);
         assert!((row[0] * slide.x + row[1] * slide.y + row[2] * slide.z).abs() < 1e-15);
     }

@@ -30,7 +30,7 @@ use thiserror::Error;
 use crate::geometry::{Point, Pose, Vector};
 use crate::surface::{Distance, Lookup, Nominal, OffsetSurface, Side, SurfaceError};
 
-use correspond::{Reading, Track, at_feet, middle_and_size};
+use correspond::{Correspondence, ResidualModel, at_feet, middle_and_size};
 pub use iterate::Iteration;
 use iterate::{Descent, Problem};
 pub use lateral::{LateralError, MapLimits, lateral_error, weak_for_compensation};
@@ -230,15 +230,15 @@ pub fn register(nominal: &Nominal, measured: &[Point], options: &Options) -> Res
     if let ProbeSide::Known(side) = options.side {
         part.check_fold(options, side)?;
     }
-    let seed = start::begin(&part, measured, options)?;
+    let initial = start::initial_pose(&part, measured, options)?;
     if options.side == ProbeSide::Auto {
-        part.check_fold(options, seed.side)?;
+        part.check_fold(options, initial.side)?;
     }
-    let problem = part.problem(measured, options, seed.side);
+    let problem = part.problem(measured, options, initial.side);
     let mut trace = Vec::new();
-    let mut tracks: Vec<Track> = measured.par_iter().map(|_| Track::NEW).collect();
-    let descent = settle(&problem, &seed, options, &mut tracks, &mut trace)?;
-    let registration = conclude(&part, &problem, descent, tracks, trace, &seed, options)?;
+    let mut correspondences: Vec<Correspondence> = measured.par_iter().map(|_| Correspondence::NEW).collect();
+    let descent = trim_and_refit(&problem, &initial, options, &mut correspondences, &mut trace)?;
+    let registration = report(&part, &problem, descent, correspondences, trace, &initial, options)?;
     part.confirm(&registration, measured, options)?;
     Ok(registration)
 }
@@ -314,7 +314,7 @@ impl<'a> Part<'a> {
     {
         Problem {
             surface: self.surface(options, side),
-            reading: Reading { subtract_mm: self.subtract_mm, loss: ScaledLoss::new(Loss::None, 1.0) },
+            residual: ResidualModel { subtract_mm: self.subtract_mm, loss: ScaledLoss::new(Loss::None, 1.0) },
             measured,
             middle: self.middle,
             size_mm: self.size_mm,
@@ -391,73 +391,74 @@ fn check_sizes(measured_mm: f64, nominal_mm: f64) -> Result<(), RegistrationErro
 }
 
 /// Descends, drops what is off the part or an outlier, and descends again until nothing changes.
-fn settle(
+fn trim_and_refit(
     problem: &Problem,
-    seed: &start::Seed,
+    initial: &start::InitialPose,
     options: &Options,
-    tracks: &mut [Track],
+    correspondences: &mut [Correspondence],
     trace: &mut Vec<Iteration>,
 ) -> Result<Descent, RegistrationError> {
     /// Rounds after which points are only dropped and no longer taken back, so that the sets cannot alternate for ever.
     const BOTH_WAYS: usize = 8;
     const MOST_ROUNDS: usize = 16;
     let mut problem = *problem;
-    let mut pose = seed.cmm_from_model;
-    if seed.near {
+    let mut pose = initial.cmm_from_model;
+    if initial.near {
         problem.ball_radius = problem.ball_radius.min(0.05);
     }
-    let pilots: &[usize] = if problem.surface.fits_normals() { &PILOT_WHERE_NORMALS_COST } else { &PILOTS };
-    let enough = 2 * pilots.iter().max().expect("there are pilots");
-    for few in pilots.iter().filter(|_| problem.measured.len() >= enough) {
-        pose = pilot(&problem, pose, *few, if seed.near { Some(options) } else { None }, trace)?;
+    let counts: &[usize] =
+        if problem.surface.fits_normals() { &COARSE_COUNTS_WHERE_NORMALS_COST } else { &COARSE_COUNTS };
+    let enough = 2 * counts.iter().max().expect("there is a count");
+    for few in counts.iter().filter(|_| problem.measured.len() >= enough) {
+        pose = descend_coarsely(&problem, pose, *few, if initial.near { Some(options) } else { None }, trace)?;
     }
-    look_ahead(&problem, tracks, &pose);
+    prefetch(&problem, correspondences, &pose);
     let mut known = None;
-    if seed.near {
-        let sums = problem.feet(tracks, &pose, &problem.lever_at(&pose));
-        let changed = screen(&problem, options, tracks, true);
+    if initial.near {
+        let sums = problem.feet(correspondences, &pose, &problem.scaling_at(&pose));
+        let changed = screen(&problem, options, correspondences, true);
         known = (changed == 0 && options.loss == Loss::None).then_some(sums);
     }
     let mut round = 0;
     loop {
-        rescale(&mut problem, options, tracks, round > 0 || seed.near);
-        let descent = problem.descend(pose, known.take(), tracks, trace)?;
+        rescale(&mut problem, options, correspondences, round > 0 || initial.near);
+        let descent = problem.descend(pose, known.take(), correspondences, trace)?;
         if !descent.converged {
             let (iterations, objective_mm2) = (options.most_iterations, descent.objective_mm2);
             return Err(RegistrationError::NotConverged { iterations, objective_mm2 });
         }
         pose = descent.cmm_from_model;
         round += 1;
-        let changed = screen(&problem, options, tracks, round < BOTH_WAYS);
+        let changed = screen(&problem, options, correspondences, round < BOTH_WAYS);
         let robust_settling = options.loss != Loss::None && round < 4;
         if (changed == 0 && !robust_settling) || round == MOST_ROUNDS {
-            return finish(descent, tracks.len());
+            return finish(descent, correspondences.len());
         }
     }
 }
 
-/// Points that a dense cloud sends ahead, first a few for the long way and then more for the rest of it.
-const PILOTS: [usize; 2] = [1024, 16_384];
+/// How many points of a dense cloud descend before the rest: first a few for the long way, then more for the rest of it.
+const COARSE_COUNTS: [usize; 2] = [1024, 16_384];
 
 /// The same where every place touched costs a fit: fewer touch less, and the rest then touch only where they end.
-const PILOT_WHERE_NORMALS_COST: [usize; 1] = [2048];
+const COARSE_COUNTS_WHERE_NORMALS_COST: [usize; 1] = [2048];
 
 /// Starts the search for the feet near where they are, with the normals there fitted all at once.
-fn look_ahead(problem: &Problem, tracks: &mut [Track], pose: &Pose) {
+fn prefetch(problem: &Problem, correspondences: &mut [Correspondence], pose: &Pose) {
     if !problem.surface.fits_normals() {
         return;
     }
     let model_from_cmm = pose.inverse();
     let points: Vec<Point> = problem.measured.par_iter().map(|p| model_from_cmm.point(p)).collect();
-    for (track, place) in tracks.iter_mut().zip(problem.surface.look_ahead(&points)) {
-        track.place = place;
+    for (correspondence, place) in correspondences.iter_mut().zip(problem.surface.prefetch(&points)) {
+        correspondence.place = place;
     }
 }
 
 /// Descends with a few of many points, from where the rest have a step or two to go; its turns stand in the trace.
 ///
 /// Near the end outliers are told among the few themselves; far from it they cannot be.
-fn pilot(
+fn descend_coarsely(
     problem: &Problem,
     pose: Pose,
     count: usize,
@@ -465,15 +466,15 @@ fn pilot(
     trace: &mut Vec<Iteration>,
 ) -> Result<Pose, RegistrationError> {
     let few: Vec<Point> = start::spread(problem.measured, count).copied().collect();
-    let mut tracks = vec![Track::NEW; few.len()];
+    let mut correspondences = vec![Correspondence::NEW; few.len()];
     let (middle, size_mm) = middle_and_size(&few);
-    let ahead = Problem { measured: &few, middle, size_mm, ..*problem };
-    look_ahead(&ahead, &mut tracks, &pose);
+    let coarse = Problem { measured: &few, middle, size_mm, ..*problem };
+    prefetch(&coarse, &mut correspondences, &pose);
     if let Some(options) = screened {
-        ahead.feet(&mut tracks, &pose, &ahead.lever_at(&pose));
-        screen(&ahead, options, &mut tracks, true);
+        coarse.feet(&mut correspondences, &pose, &coarse.scaling_at(&pose));
+        screen(&coarse, options, &mut correspondences, true);
     }
-    Ok(ahead.descend(pose, None, &mut tracks, trace)?.cmm_from_model)
+    Ok(coarse.descend(pose, None, &mut correspondences, trace)?.cmm_from_model)
 }
 
 /// Refuses an end that hangs on too few points, or on none of the six directions.
@@ -488,20 +489,20 @@ fn finish(descent: Descent, points: usize) -> Result<Descent, RegistrationError>
 }
 
 /// Gives a robust loss the scale of the distances as they are now.
-fn rescale(problem: &mut Problem, options: &Options, tracks: &[Track], known: bool) {
+fn rescale(problem: &mut Problem, options: &Options, correspondences: &[Correspondence], known: bool) {
     // Before the first distances are known there is no scale, and every point counts by its square.
     if known && options.loss != Loss::None {
-        problem.reading.loss = ScaledLoss::new(options.loss, sigma_of(tracks).1);
+        problem.residual.loss = ScaledLoss::new(options.loss, sigma_of(correspondences).1);
     }
 }
 
 /// No CMM repeats better than this, and rounding in a file may be all the scatter there is.
 const LEAST_SIGMA_MM: f64 = 1e-5;
 
-fn sigma_of(tracks: &[Track]) -> (f64, f64) {
+fn sigma_of(correspondences: &[Correspondence]) -> (f64, f64) {
     // A sample tells the sigma of many points to a percent.
-    let stride = tracks.len().div_ceil(1 << 16);
-    let on_part = tracks.iter().step_by(stride).filter(|t| t.beyond_steps <= 0.5).map(|t| t.distance_mm);
+    let stride = correspondences.len().div_ceil(1 << 16);
+    let on_part = correspondences.iter().step_by(stride).filter(|t| t.beyond_steps <= 0.5).map(|t| t.distance_mm);
     let (median, sigma) = robust_sigma(on_part);
     (median, sigma.max(LEAST_SIGMA_MM))
 }
@@ -510,22 +511,25 @@ fn sigma_of(tracks: &[Track]) -> (f64, f64) {
 ///
 /// An outlier is far from the surface and from its neighbours: a smooth form error, however large, is neither noise nor a
 /// mistake of the probe. Beyond four times the limit its neighbours are no longer asked.
-fn screen(problem: &Problem, options: &Options, tracks: &mut [Track], both_ways: bool) -> usize {
-    let (median, sigma) = sigma_of(tracks);
+fn screen(problem: &Problem, options: &Options, correspondences: &mut [Correspondence], both_ways: bool) -> usize {
+    let (median, sigma) = sigma_of(correspondences);
     let limit = options.outlier_sigmas * sigma;
-    let far = |t: &Track| (t.distance_mm - median).abs() > limit;
-    let suspects: Vec<usize> = (0..tracks.len()).filter(|&k| far(&tracks[k])).collect();
-    let lonely =
-        if suspects.is_empty() { Vec::new() } else { lonely(problem.measured, tracks, &suspects, 0.5 * limit) };
-    let mut outlier = vec![false; if suspects.is_empty() { 0 } else { tracks.len() }];
-    for (&k, lonely) in suspects.iter().zip(lonely) {
-        outlier[k] = lonely || (tracks[k].distance_mm - median).abs() > 4.0 * limit;
+    let far = |t: &Correspondence| (t.distance_mm - median).abs() > limit;
+    let suspects: Vec<usize> = (0..correspondences.len()).filter(|&k| far(&correspondences[k])).collect();
+    let isolated = if suspects.is_empty() {
+        Vec::new()
+    } else {
+        isolated(problem.measured, correspondences, &suspects, 0.5 * limit)
+    };
+    let mut outlier = vec![false; if suspects.is_empty() { 0 } else { correspondences.len() }];
+    for (&k, isolated) in suspects.iter().zip(isolated) {
+        outlier[k] = isolated || (correspondences[k].distance_mm - median).abs() > 4.0 * limit;
     }
     let mut changed = 0;
-    for (k, track) in tracks.iter_mut().enumerate() {
-        let fits = track.beyond_steps <= 0.5 && !outlier.get(k).copied().unwrap_or(false);
-        if fits != track.used && (both_ways || !fits) {
-            track.used = fits;
+    for (k, correspondence) in correspondences.iter_mut().enumerate() {
+        let fits = correspondence.beyond_steps <= 0.5 && !outlier.get(k).copied().unwrap_or(false);
+        if fits != correspondence.used && (both_ways || !fits) {
+            correspondence.used = fits;
             changed += 1;
         }
     }
@@ -535,8 +539,8 @@ fn screen(problem: &Problem, options: &Options, tracks: &mut [Track], both_ways:
 /// For each suspect, whether its distance departs by more than a limit from the median of eight neighbours.
 ///
 /// Neighbours nearer than half the mean spacing are twins, repeats of the same place that repeat its mistake; they are not
-/// asked. A suspect with nothing but twins around it is alone.
-fn lonely(measured: &[Point], tracks: &[Track], suspects: &[usize], limit_mm: f64) -> Vec<bool> {
+/// asked. A suspect with nothing but twins around it is isolated.
+fn isolated(measured: &[Point], correspondences: &[Correspondence], suspects: &[usize], limit_mm: f64) -> Vec<bool> {
     const ASKED: usize = 8;
     const NEAREST: std::num::NonZero<usize> = std::num::NonZero::new(64).expect("not zero");
     let coordinates: Vec<[f64; 3]> = measured.iter().map(|p| (*p).into()).collect();
@@ -545,37 +549,37 @@ fn lonely(measured: &[Point], tracks: &[Track], suspects: &[usize], limit_mm: f6
     };
     // Points spread over a square of rms size s stand s sqrt(6 / n) apart.
     let twin_mm = 0.5 * middle_and_size(measured).1 * (6.0 / measured.len() as f64).sqrt();
-    let is_lonely = |&k: &usize| {
+    let is_isolated = |&k: &usize| {
         let nearest = tree.query(&coordinates[k]).nearest_n::<kiddo::SquaredEuclidean<f64>>(NEAREST).execute();
         let mut around: Vec<f64> = nearest
             .iter()
             .filter(|n| n.distance > twin_mm * twin_mm)
             .take(ASKED)
-            .map(|n| tracks[n.item as usize].distance_mm)
+            .map(|n| correspondences[n.item as usize].distance_mm)
             .collect();
         around.sort_unstable_by(f64::total_cmp);
-        around.get(around.len() / 2).is_none_or(|median| (tracks[k].distance_mm - median).abs() > limit_mm)
+        around.get(around.len() / 2).is_none_or(|median| (correspondences[k].distance_mm - median).abs() > limit_mm)
     };
-    suspects.par_iter().map(is_lonely).collect()
+    suspects.par_iter().map(is_isolated).collect()
 }
 
 /// Turns the end of the iteration into what is reported.
-fn conclude(
+fn report(
     part: &Part,
     problem: &Problem,
     descent: Descent,
-    tracks: Vec<Track>,
+    correspondences: Vec<Correspondence>,
     trace: Vec<Iteration>,
-    seed: &start::Seed,
+    initial: &start::InitialPose,
     options: &Options,
 ) -> Result<Registration, RegistrationError> {
-    if let Some(fold) = problem.surface.fold_where_touched(tracks.iter().map(|t| t.place)) {
+    if let Some(fold) = problem.surface.fold_where_touched(correspondences.iter().map(|t| t.place)) {
         return Err(fold.into());
     }
-    let mut verdict = verdict::judge(problem, &descent, &tracks, seed, trace.len());
-    let reporter = verdict::Reporter::new(part, &descent.lever, &verdict, options);
+    let mut verdict = verdict::judge(problem, &descent, &correspondences, initial, trace.len());
+    let reporter = verdict::Reporter::new(part, &descent.scaling, &verdict, options);
     let pose = &descent.cmm_from_model;
-    let deviations = at_feet(&problem.surface, problem.measured, &tracks, pose, &descent.lever, &reporter);
+    let deviations = at_feet(&problem.surface, problem.measured, &correspondences, pose, &descent.scaling, &reporter);
     verdict.coverage = verdict::coverage(part.nominal, &deviations);
-    Ok(Registration { cmm_from_model: descent.cmm_from_model, deviations, trace, side: seed.side, verdict })
+    Ok(Registration { cmm_from_model: descent.cmm_from_model, deviations, trace, side: initial.side, verdict })
 }

@@ -10,14 +10,14 @@ use rayon::prelude::*;
 use crate::geometry::{Point, Pose, Vector};
 use crate::surface::{Feature, OffsetSurface, Place, Side, features, principal_axes};
 
-use super::correspond::{Reading, Track, middle_and_size};
+use super::correspond::{Correspondence, ResidualModel, middle_and_size};
 use super::iterate::Problem;
 use super::robust::{Loss, ScaledLoss, robust_sigma};
 use super::{Options, Part, ProbeSide, Registration, RegistrationError, Start};
 
 /// Where the registration begins.
 #[derive(Clone, Debug)]
-pub(crate) struct Seed {
+pub(crate) struct InitialPose {
     pub(crate) cmm_from_model: Pose,
     pub(crate) side: Side,
     /// Whether the side was given, or told by the data; else it was assumed.
@@ -66,7 +66,11 @@ const COMPARED_AT_MOST: usize = 6;
 const SIDE_RATIO: f64 = 2.0;
 
 /// Chooses the pose to begin from and the side of the probe.
-pub(crate) fn begin(part: &Part, measured: &[Point], options: &Options) -> Result<Seed, RegistrationError> {
+pub(crate) fn initial_pose(
+    part: &Part,
+    measured: &[Point],
+    options: &Options,
+) -> Result<InitialPose, RegistrationError> {
     let search = Search::new(part, measured, options);
     match options.start {
         Start::Pose(pose) => search.side_at(pose),
@@ -107,7 +111,7 @@ impl<'a> Search<'a> {
     }
 
     /// Takes a pose as given and finds the side on which the points fit.
-    fn side_at(&self, pose: Pose) -> Result<Seed, RegistrationError> {
+    fn side_at(&self, pose: Pose) -> Result<InitialPose, RegistrationError> {
         // A given pose may be meant for either side.
         let at = |side: Side| {
             let as_given = self.refine(pose, side, &self.some, 2, 8);
@@ -120,7 +124,7 @@ impl<'a> Search<'a> {
         let (normal, opposite) = rayon::join(|| at(Side::Normal), || at(Side::Opposite));
         let (side, _, side_known) = self.choose_side(normal, opposite)?;
         let side = if side_known { side } else { self.nearer_side(&pose) };
-        Ok(Seed { cmm_from_model: pose, side, side_known, near: false, alternatives: Vec::new() })
+        Ok(InitialPose { cmm_from_model: pose, side, side_known, near: false, alternatives: Vec::new() })
     }
 
     /// Returns the side of the nominal surface on which most points lie under a pose.
@@ -135,7 +139,7 @@ impl<'a> Search<'a> {
     ///
     /// The candidates are refined on one side of the surface: on the other the probe centres lie two radii away, which is
     /// little against the differences between right and wrong poses. Only the best are compared on both.
-    fn search(&self) -> Result<Seed, RegistrationError> {
+    fn search(&self) -> Result<InitialPose, RegistrationError> {
         let side = match self.options.side {
             ProbeSide::Known(side) => side,
             ProbeSide::Auto => Side::Normal,
@@ -153,7 +157,7 @@ impl<'a> Search<'a> {
         };
         let (side, best, side_known) = self.choose_side(at_normal, at_opposite)?;
         let alternatives = self.alternatives(&best, if side == Side::Normal { normal } else { opposite });
-        Ok(Seed { cmm_from_model: best.cmm_from_model, side, side_known, near: true, alternatives })
+        Ok(InitialPose { cmm_from_model: best.cmm_from_model, side, side_known, near: true, alternatives })
     }
 
     /// Decides between the best fits on the two sides, and whether they could be told apart.
@@ -288,7 +292,7 @@ impl<'a> Search<'a> {
             surface,
             middle,
             size_mm,
-            reading: Reading { subtract_mm: self.part.subtract_mm, loss: ScaledLoss::new(Loss::None, 1.0) },
+            residual: ResidualModel { subtract_mm: self.part.subtract_mm, loss: ScaledLoss::new(Loss::None, 1.0) },
             measured: points,
             locked: self.options.locked,
             least_share: self.part.least_share,
@@ -297,14 +301,14 @@ impl<'a> Search<'a> {
             most_iterations: iterations,
         };
         let mut pose = start;
-        let mut tracks = vec![Track::NEW; points.len()];
+        let mut correspondences = vec![Correspondence::NEW; points.len()];
         let mut trace = Vec::new();
         for round in 0..rounds {
             if round > 0 {
-                let (_, sigma) = robust_sigma(tracks.iter().map(|t| t.distance_mm));
-                problem.reading.loss = ScaledLoss::new(Loss::Tukey, sigma.max(1e-4));
+                let (_, sigma) = robust_sigma(correspondences.iter().map(|t| t.distance_mm));
+                problem.residual.loss = ScaledLoss::new(Loss::Tukey, sigma.max(1e-4));
             }
-            match problem.descend(pose, None, &mut tracks, &mut trace) {
+            match problem.descend(pose, None, &mut correspondences, &mut trace) {
                 Ok(descent) => pose = descent.cmm_from_model,
                 Err(_) => break,
             }

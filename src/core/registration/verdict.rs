@@ -5,13 +5,13 @@ use rayon::prelude::*;
 
 use crate::geometry::{Point, Pose, Vector};
 use crate::surface::Nominal;
-use crate::surface::lanes::{LANES, Lane};
+use crate::surface::simd::{F64x4, LANES};
 
-use super::correspond::{FourFinal, Report, Track};
+use super::correspond::{Correspondence, FourFinal, Report};
 use super::iterate::{Descent, Problem, free_directions};
-use super::linearize::Lever;
+use super::linearize::Scaling;
 use super::solve::Spectrum;
-use super::start::Seed;
+use super::start::InitialPose;
 use super::{Deviation, Method, Options, Part, PointStatus};
 
 /// What to think of a registration.
@@ -60,23 +60,29 @@ pub struct WeakDirection {
 }
 
 /// Judges the end of an iteration.
-pub(crate) fn judge(problem: &Problem, descent: &Descent, tracks: &[Track], seed: &Seed, iterations: usize) -> Verdict {
-    let Spread { used: n, squares_mm2: objective_mm2, low_mm, high_mm } = Spread::of(tracks);
-    let free = free_directions(&problem.locked, &descent.lever);
+pub(crate) fn judge(
+    problem: &Problem,
+    descent: &Descent,
+    correspondences: &[Correspondence],
+    initial: &InitialPose,
+    iterations: usize,
+) -> Verdict {
+    let Spread { used: n, squares_mm2: objective_mm2, low_mm, high_mm } = Spread::of(correspondences);
+    let free = free_directions(&problem.locked, &descent.scaling);
     let spectrum = Spectrum::new(&(free * descent.sums.gram() * free));
     let rank = descent.rank;
     // The weights of a robust loss leave out what the outliers would add.
     let residual2 = descent.sums.objective_mm2 / n.saturating_sub(rank).max(1) as f64;
     let scaled = scaled_covariance(&spectrum, rank, residual2);
-    let to_twist = descent.lever.to_twist();
+    let to_twist = descent.scaling.to_twist();
     let locked = problem.locked.iter().filter(|l| **l).count();
     let held = spectrum.directions.columns(rank, 6 - rank).into_owned();
-    let mut weak_directions = held_directions(&(free * held), 6 - rank - locked.min(6 - rank), &descent.lever);
-    weak_directions.extend(weakly_seen(&scaled, residual2.sqrt(), &descent.lever, !weak_directions.is_empty()));
+    let mut weak_directions = held_directions(&(free * held), 6 - rank - locked.min(6 - rank), &descent.scaling);
+    weak_directions.extend(weakly_seen(&scaled, residual2.sqrt(), &descent.scaling, !weak_directions.is_empty()));
     // Where a direction is held the surface fits in any pose along it, and that is said already.
     let all_seen = rank + locked >= 6;
     let alternatives: Vec<(Pose, f64)> =
-        seed.alternatives.iter().filter(|_| all_seen).map(|c| (c.cmm_from_model, c.rms_mm)).collect();
+        initial.alternatives.iter().filter(|_| all_seen).map(|c| (c.cmm_from_model, c.rms_mm)).collect();
     Verdict {
         used: n,
         objective_mm2,
@@ -87,7 +93,7 @@ pub(crate) fn judge(problem: &Problem, descent: &Descent, tracks: &[Track], seed
         condition: (spectrum.squares[0] / spectrum.squares[rank - 1]).sqrt(),
         weak_directions,
         coverage: 0.0,
-        warnings: warnings(problem, seed, &alternatives, (objective_mm2 / n as f64).sqrt()),
+        warnings: warnings(problem, initial, &alternatives, (objective_mm2 / n as f64).sqrt()),
         alternatives,
         iterations,
         converged: descent.converged,
@@ -106,16 +112,16 @@ struct Spread {
 impl Spread {
     const NONE: Self = Self { used: 0, squares_mm2: 0.0, low_mm: f64::INFINITY, high_mm: f64::NEG_INFINITY };
 
-    fn of(tracks: &[Track]) -> Self {
+    fn of(correspondences: &[Correspondence]) -> Self {
         let add = |sum: Self, d: f64| Self {
             used: sum.used + 1,
             squares_mm2: sum.squares_mm2 + d * d,
             low_mm: sum.low_mm.min(d),
             high_mm: sum.high_mm.max(d),
         };
-        let part = |c: &[Track]| c.iter().filter(|t| t.used).map(|t| t.distance_mm).fold(Self::NONE, add);
+        let part = |c: &[Correspondence]| c.iter().filter(|t| t.used).map(|t| t.distance_mm).fold(Self::NONE, add);
         // In chunks that are added in order: the same bits on any number of threads.
-        let parts: Vec<Self> = tracks.par_chunks(1 << 14).map(part).collect();
+        let parts: Vec<Self> = correspondences.par_chunks(1 << 14).map(part).collect();
         parts.iter().fold(Self::NONE, |a, b| Self {
             used: a.used + b.used,
             squares_mm2: a.squares_mm2 + b.squares_mm2,
@@ -126,9 +132,9 @@ impl Spread {
 }
 
 /// Tells what the numbers alone do not.
-fn warnings(problem: &Problem, seed: &Seed, alternatives: &[(Pose, f64)], rms_mm: f64) -> Vec<String> {
+fn warnings(problem: &Problem, initial: &InitialPose, alternatives: &[(Pose, f64)], rms_mm: f64) -> Vec<String> {
     let mut warnings = Vec::new();
-    if !seed.side_known {
+    if !initial.side_known {
         warnings.push(
             "the shape does not tell on which side of the surface the probe was; the side is assumed, state it"
                 .to_string(),
@@ -163,7 +169,7 @@ fn scaled_covariance(spectrum: &Spectrum, rank: usize, variance: f64) -> Matrix6
 }
 
 /// Tells in words which motions leave every distance as it is.
-fn held_directions(basis: &nalgebra::Matrix6xX<f64>, count: usize, lever: &Lever) -> Vec<WeakDirection> {
+fn held_directions(basis: &nalgebra::Matrix6xX<f64>, count: usize, scaling: &Scaling) -> Vec<WeakDirection> {
     if count == 0 {
         return Vec::new();
     }
@@ -187,10 +193,10 @@ fn held_directions(basis: &nalgebra::Matrix6xX<f64>, count: usize, lever: &Lever
         words.push(format!("shift along {}", names.join(" and along ")));
     }
     if rotations.len() == 3 {
-        let c = common_centre(&rotations, lever);
+        let c = common_centre(&rotations, scaling);
         words.push(format!("every rotation about ({:.3}, {:.3}, {:.3}) mm", c.x, c.y, c.z));
     } else {
-        words.extend(rotations.iter().map(|r| axis_name(r, lever)));
+        words.extend(rotations.iter().map(|r| axis_name(r, scaling)));
     }
     words
         .into_iter()
@@ -223,26 +229,26 @@ fn shifts(span: &DMatrix<f64>, rotations: &[Vector6<f64>]) -> Vec<Vector6<f64>> 
 }
 
 /// The point that rotations about three independent axes leave where it is.
-fn common_centre(rotations: &[Vector6<f64>], lever: &Lever) -> Point {
+fn common_centre(rotations: &[Vector6<f64>], scaling: &Scaling) -> Point {
     let (mut gram, mut right) = (nalgebra::Matrix3::zeros(), Vector::zeros());
     for r in rotations {
-        let (v, omega) = parts(r, lever);
+        let (v, omega) = parts(r, scaling);
         // v + omega x q = 0.
         let hat = omega.cross_matrix();
         gram += hat.transpose() * hat;
         right -= hat.transpose() * v;
     }
-    lever.centre + gram.lu().solve(&right).unwrap_or_default()
+    scaling.centre + gram.lu().solve(&right).unwrap_or_default()
 }
 
-fn parts(scaled: &Vector6<f64>, lever: &Lever) -> (Vector, Vector) {
-    let v: Vector = scaled.fixed_rows::<3>(0) * lever.size_mm;
+fn parts(scaled: &Vector6<f64>, scaling: &Scaling) -> (Vector, Vector) {
+    let v: Vector = scaled.fixed_rows::<3>(0) * scaling.size_mm;
     (v, scaled.fixed_rows::<3>(3).into())
 }
 
-fn axis_name(rotation: &Vector6<f64>, lever: &Lever) -> String {
-    let (v, omega) = parts(rotation, lever);
-    let through = lever.centre + omega.cross(&v) / omega.norm_squared();
+fn axis_name(rotation: &Vector6<f64>, scaling: &Scaling) -> String {
+    let (v, omega) = parts(rotation, scaling);
+    let through = scaling.centre + omega.cross(&v) / omega.norm_squared();
     let name = direction_name(&omega.normalize());
     format!("rotation about {name} through ({:.3}, {:.3}, {:.3}) mm", through.x, through.y, through.z)
 }
@@ -258,8 +264,8 @@ fn direction_name(v: &Vector) -> String {
 }
 
 /// Tells which shifts and rotations are known less well than a single point: about the middle of the cloud, on the model's axes.
-fn weakly_seen(scaled: &Matrix6<f64>, sigma_mm: f64, lever: &Lever, some_held: bool) -> Vec<WeakDirection> {
-    let at_rim: [f64; 6] = std::array::from_fn(|k| scaled[(k, k)].sqrt() * lever.size_mm);
+fn weakly_seen(scaled: &Matrix6<f64>, sigma_mm: f64, scaling: &Scaling, some_held: bool) -> Vec<WeakDirection> {
+    let at_rim: [f64; 6] = std::array::from_fn(|k| scaled[(k, k)].sqrt() * scaling.size_mm);
     let weak = |k: &usize| at_rim[*k] > sigma_mm && !some_held;
     let mut found = Vec::new();
     for (first, kind) in [(0, "shift"), (3, "rotation")] {
@@ -273,7 +279,7 @@ fn weakly_seen(scaled: &Matrix6<f64>, sigma_mm: f64, lever: &Lever, some_held: b
             let words = if kind == "shift" {
                 format!("{names} shift: known to {} only", length(at_rim[worst]))
             } else {
-                let angle = at_rim[worst] / lever.size_mm;
+                let angle = at_rim[worst] / scaling.size_mm;
                 format!(
                     "rotation about {names}: known to {:.2} mrad only, {} at the rim",
                     1e3 * angle,
@@ -385,8 +391,8 @@ pub(crate) struct Reporter<'a> {
 }
 
 impl<'a> Reporter<'a> {
-    pub(crate) fn new(part: &Part<'a>, lever: &Lever, verdict: &Verdict, options: &Options) -> Self {
-        let to_scaled = lever.to_twist().try_inverse().unwrap_or_default();
+    pub(crate) fn new(part: &Part<'a>, scaling: &Scaling, verdict: &Verdict, options: &Options) -> Self {
+        let to_scaled = scaling.to_twist().try_inverse().unwrap_or_default();
         Self {
             nominal: part.nominal,
             scaled: to_scaled * verdict.covariance * to_scaled.transpose(),
@@ -409,17 +415,17 @@ impl Report for Reporter<'_> {
     };
 
     #[inline(always)]
-    fn four(&self, tracks: [&Track; LANES], at: &FourFinal) -> [Deviation; LANES] {
+    fn four(&self, correspondences: [&Correspondence; LANES], at: &FourFinal) -> [Deviation; LANES] {
         let normal = &at.feet.normal;
-        let back = Lane::splat(self.back_mm);
+        let back = F64x4::splat(self.back_mm);
         let contact =
             [at.centre[0] - normal[0] * back, at.centre[1] - normal[1] * back, at.centre[2] - normal[2] * back];
-        let deviation = at.feet.distance_mm - Lane::splat(self.subtract_mm);
-        let mut variance = Lane::splat(0.0);
+        let deviation = at.feet.distance_mm - F64x4::splat(self.subtract_mm);
+        let mut variance = F64x4::splat(0.0);
         for i in 0..6 {
-            let mut along = Lane::splat(0.0);
+            let mut along = F64x4::splat(0.0);
             for j in 0..6 {
-                along = along + Lane::splat(self.scaled[(i, j)]) * at.row[j];
+                along = along + F64x4::splat(self.scaled[(i, j)]) * at.row[j];
             }
             variance = variance + at.row[i] * along;
         }
@@ -435,7 +441,7 @@ impl Report for Reporter<'_> {
                 normal: Vector::new(normal[0].0[l], normal[1].0[l], normal[2].0[l]),
                 deviation_mm: deviation.0[l],
                 uncertainty_mm: (self.variance_mm2 + variance.0[l].max(0.0)).sqrt(),
-                status: if beyond_outline { PointStatus::OffPart } else { tracks[l].status() },
+                status: if beyond_outline { PointStatus::OffPart } else { correspondences[l].status() },
             };
         }
         deviations

@@ -1,8 +1,8 @@
 //! How exact distances to a nominal surface will be, found from its points alone (section 3.1 of the paper).
 //!
-//! Points are left out: two coarser nets are made of what is kept, and the distance of the points left out from them is
-//! measured. They lie on the surface, so that the distance is the error. The errors of the two nets give the order p at which
-//! the error falls with the spacing, and with it the error of the whole net and of any other.
+//! Points are left out: two coarser samplings are made of what is kept, and the distance of the points left out from them is
+//! measured. They lie on the surface, so that the distance is the error. The errors of the two samplings give the order p at which
+//! the error falls with the spacing, and with it the error of the whole sampling and of any other.
 //!
 //! Of a grid every third and every sixth node is kept along each axis, and not every second: the points left out between
 //! those lie on edges alone, where the curved distance is of a higher order than within the triangles.
@@ -14,7 +14,7 @@ use super::{Distance, Nominal, OffsetSurface, Place, Projection, Side, SurfaceEr
 use crate::geometry::grid_order::NO_POINT;
 use crate::geometry::{Point, Vector, recognise_grid};
 
-/// The spacings of the two coarser nets in spacings of the whole one: of a grid, and of scattered points.
+/// The spacings of the two coarser samplings in spacings of the whole one: of a grid, and of scattered points.
 const OF_GRID: [usize; 2] = [3, 6];
 const OF_SCATTERED: [usize; 2] = [2, 4];
 
@@ -27,10 +27,10 @@ const LEAST_ORDER: [f64; 2] = [1.2, 1.8];
 /// Left-out points that are measured at most.
 const MEASURED: usize = 150_000;
 
-/// A place counts as inside if the net goes on for that many of its spacings all around.
+/// A place counts as inside if the sampling goes on for that many of its spacings all around.
 const BORDER: f64 = 2.0;
 
-/// Places a net must have inside to be judged by.
+/// Places a sampling must have inside to be judged by.
 const LEAST_INSIDE: usize = 30;
 
 /// What a nominal surface is made of.
@@ -74,7 +74,7 @@ pub struct Accuracy {
 pub struct Estimate {
     /// Errors away from the border.
     pub inside: Figures,
-    /// Errors within two spacings of the border of the net.
+    /// Errors within two spacings of the border of the sampling.
     pub border: Figures,
     /// Where the error is largest.
     pub worst: Worst,
@@ -85,7 +85,7 @@ pub struct Estimate {
     /// How far the estimate may be trusted.
     pub trust: Trust,
     spacing_mm: f64,
-    /// Spacing of the coarsest net looked at.
+    /// Spacing of the coarsest sampling looked at.
     coarsest_mm: f64,
 }
 
@@ -107,7 +107,7 @@ pub struct Worst {
     pub at: Point,
     /// How large, in millimetres; signed.
     pub error_mm: f64,
-    /// Whether it lies within two spacings of the border of the net.
+    /// Whether it lies within two spacings of the border of the sampling.
     pub near_border: bool,
 }
 
@@ -118,13 +118,13 @@ pub enum Trust {
     Extrapolated,
     /// The error hardly falls: the points are rounded or scatter, and the estimate is what they scatter by.
     Rounding,
-    /// The coarser nets are too coarse for the features of the surface: the estimate is a guess.
+    /// The coarser samplings are too coarse for the features of the surface: the estimate is a guess.
     TooCoarse,
 }
 
 impl Estimate {
     /// Returns the spacing at which the PV error inside is a wanted one, in millimetres; `None` where no spacing brings it
-    /// because the points are not exact enough. It is never coarser than the coarsest net that was looked at.
+    /// because the points are not exact enough. It is never coarser than the coarsest sampling that was looked at.
     pub fn spacing_for(&self, wanted_pv_mm: f64) -> Option<f64> {
         if self.trust == Trust::Rounding {
             return (self.inside.pv_mm <= wanted_pv_mm).then_some(self.spacing_mm);
@@ -166,11 +166,11 @@ pub fn accuracy(samples: Samples) -> Result<Accuracy, SurfaceError> {
     Ok(Accuracy { points: count, spacing_mm, flat, curved })
 }
 
-/// Errors measured at the points that a coarser net leaves out.
+/// Errors measured at the points that a coarser sampling leaves out.
 struct Errors {
     inside: Vec<Measured>,
     border: Vec<Measured>,
-    /// Mean spacing of the coarser net, in millimetres.
+    /// Mean spacing of the coarser sampling, in millimetres.
     spacing_mm: f64,
 }
 
@@ -203,7 +203,7 @@ fn coarse_nodes(columns: usize, rows: usize, stride: usize) -> impl Iterator<Ite
     (0..rows).step_by(stride).flat_map(move |j| (0..columns).step_by(stride).map(move |i| j * columns + i))
 }
 
-/// Chooses what to keep for the two coarser nets; returns the spacing of the finer of them in spacings of the whole net.
+/// Chooses what to keep for the two coarser samplings; returns the spacing of the finer of them in spacings of the whole sampling.
 fn kept_of_points(points: &[Point], projection: Projection) -> Result<(usize, [Vec<u32>; 2]), SurfaceError> {
     let on_plane = matches!(projection, Projection::Auto | Projection::Xy);
     if let Some(order) = recognise_grid(points).filter(|_| on_plane) {
@@ -246,7 +246,7 @@ fn along_the_plane(points: &[Point], map: &Map) -> Vec<u32> {
     coded.into_iter().map(|(_, k)| k).collect()
 }
 
-/// The net of the points that are kept, its normals fitted as those of the whole net are.
+/// The sampling of the points that are kept, its normals fitted as those of the whole sampling are.
 fn kept_level(points: &[Point], kept: &[u32], projection: Projection) -> Result<Errors, SurfaceError> {
     let coarse = Nominal::from_points(kept.iter().map(|&k| points[k as usize]).collect(), projection)?;
     let mut left_out = vec![true; points.len()];
@@ -254,7 +254,7 @@ fn kept_level(points: &[Point], kept: &[u32], projection: Projection) -> Result<
     Ok(measure(&coarse, points, &left_out))
 }
 
-/// Measures the distances of points left out from a coarser net.
+/// Measures the distances of points left out from a coarser sampling.
 fn measure(coarse: &Nominal, points: &[Point], left_out: &[bool]) -> Errors {
     let surface = OffsetSurface::new(coarse, 0.0, Side::Normal).expect("a radius of 0 is one");
     let (flat, curved) = (surface.with_distance(Distance::Triangle), surface.with_distance(Distance::Curved));
@@ -282,7 +282,7 @@ fn measure(coarse: &Nominal, points: &[Point], left_out: &[bool]) -> Errors {
     Errors { inside: strip(inside), border: strip(border), spacing_mm }
 }
 
-/// Extrapolates from two coarser nets to the whole one.
+/// Extrapolates from two coarser samplings to the whole one.
 fn estimate(fine: &Errors, coarse: &Errors, kind: usize, factor: f64, spacing_mm: f64) -> Estimate {
     let [inside_fine, inside_coarse] = [fine, coarse].map(|errors| figures(&errors.inside, kind));
     let [border_fine, border_coarse] = [fine, coarse].map(|errors| figures(&errors.border, kind));
@@ -313,7 +313,7 @@ fn estimate(fine: &Errors, coarse: &Errors, kind: usize, factor: f64, spacing_mm
     }
 }
 
-/// The order at which the error fell from one net to the next, whose spacing is half as large.
+/// The order at which the error fell from one sampling to the next, whose spacing is half as large.
 fn observed(fine: &Figures, coarse: &Figures) -> f64 {
     let ratio = coarse.rms_mm / fine.rms_mm;
     if ratio > 0.0 && ratio.is_finite() { ratio.log2() } else { ORDERS[0] }

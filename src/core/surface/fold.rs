@@ -6,9 +6,9 @@ use crate::geometry::Vector;
 
 use super::SurfaceError;
 use super::grid::GridLattice;
-use super::lanes::{LANES, Lane, Lane3, dot, four_vertices, minus, times};
 use super::offset::{OffsetSurface, Place};
 use super::patch::{Facets, Lattice, Patch, Vertex};
+use super::simd::{F64x4, LANES, Vector3x4, dot, four_vertices, minus, times};
 
 /// Facets of a mesh that are looked at besides those touched: its normals are fitted only where they are needed.
 const LOOKED_AT: usize = 2048;
@@ -160,13 +160,18 @@ impl pulp::NullaryFnOnce for WideRow<'_> {
 impl WideRow<'_> {
     /// Whether E + r B is not positive definite for any of four; see [`not_positive`].
     #[inline(always)]
-    fn any_of_four(&self, here: &(Lane3, Lane3), next: &(Lane3, Lane3), up: &(Lane3, Lane3)) -> bool {
-        let reach = Lane::splat(self.reach);
+    fn any_of_four(
+        &self,
+        here: &(Vector3x4, Vector3x4),
+        next: &(Vector3x4, Vector3x4),
+        up: &(Vector3x4, Vector3x4),
+    ) -> bool {
+        let reach = F64x4::splat(self.reach);
         let (e1, e2) = (minus(&next.0, &here.0), minus(&up.0, &here.0));
         let (d1, d2) = (times(&minus(&next.1, &here.1), reach), times(&minus(&up.1, &here.1), reach));
         let e = dot(&e1, &e1) + dot(&e1, &d1);
         let g = dot(&e2, &e2) + dot(&e2, &d2);
-        let f = dot(&e1, &e2) + Lane::splat(0.5) * (dot(&e1, &d2) + dot(&e2, &d1));
+        let f = dot(&e1, &e2) + F64x4::splat(0.5) * (dot(&e1, &d2) + dot(&e2, &d1));
         let det = e * g - f * f;
         let mut any = false;
         for l in 0..LANES {

@@ -5,8 +5,8 @@ use rayon::prelude::*;
 use crate::geometry::grid_order::{GridInOrder, GridOrder, NO_POINT};
 use crate::geometry::{Point, Vector};
 
-use super::lanes::{LANES, Lane, Lane3, cross, dot, minus, side_by_side, times};
 use super::patch::{Facets, Vertex};
+use super::simd::{F64x4, LANES, Vector3x4, cross, dot, minus, side_by_side, times};
 
 /// The triangles of a structured grid, row by row with the column fastest.
 ///
@@ -254,7 +254,7 @@ impl Block<'_> {
     fn four_inside(&self, first: usize, nodes: &mut [Vertex; LANES]) {
         let (u, v) = (self.central_derivative(first, 1), self.central_derivative(first, self.lattice.columns()));
         let n = cross(&u, &v);
-        let normal = times(&n, Lane::splat(1.0) / dot(&n, &n).sqrt());
+        let normal = times(&n, F64x4::splat(1.0) / dot(&n, &n).sqrt());
         for (l, node) in nodes.iter_mut().enumerate() {
             let normal = Vector::new(normal[0].0[l], normal[1].0[l], normal[2].0[l]);
             *node = Vertex { point: self.points[first + l], normal };
@@ -263,14 +263,14 @@ impl Block<'_> {
 
     /// The derivative of the quartic through five nodes at the middle one, for four neighbours along a row.
     #[inline(always)]
-    fn central_derivative(&self, node: usize, stride: usize) -> Lane3 {
+    fn central_derivative(&self, node: usize, stride: usize) -> Vector3x4 {
         let near = minus(&self.four_points(node + stride), &self.four_points(node - stride));
         let far = minus(&self.four_points(node + 2 * stride), &self.four_points(node - 2 * stride));
-        minus(&times(&near, Lane::splat(2.0 / 3.0)), &times(&far, Lane::splat(1.0 / 12.0)))
+        minus(&times(&near, F64x4::splat(2.0 / 3.0)), &times(&far, F64x4::splat(1.0 / 12.0)))
     }
 
     #[inline(always)]
-    fn four_points(&self, first: usize) -> Lane3 {
+    fn four_points(&self, first: usize) -> Vector3x4 {
         let (four, _) = self.points[first..].split_first_chunk::<LANES>().expect("inside the grid");
         side_by_side(four)
     }

@@ -1,4 +1,4 @@
-//! Nominal surfaces: what the part should be, as a net of points with normals, and the surface at a probe's radius from it.
+//! Nominal surfaces: what the part should be, as points with normals, and the surface at a probe's radius from it.
 //!
 //! ```text
 //!  points --+-- regular grid? ----------------> grid lattice   (no triangulation; normals from the grid lines)
@@ -12,19 +12,19 @@
 //! Pure: no file, no clock, no randomness. Frame: everything here is in the model frame {M}. Units: millimetres.
 
 pub mod accuracy;
-mod ahead;
 pub mod analytic;
 mod delaunay;
 mod edges;
 mod feature;
 mod fold;
 mod grid;
-pub(crate) mod lanes;
 mod mesh;
 mod normals;
 mod offset;
 mod patch;
+mod prefetch;
 mod projection;
+pub(crate) mod simd;
 
 use std::sync::OnceLock;
 

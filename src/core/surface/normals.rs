@@ -2,9 +2,9 @@
 
 use crate::geometry::{Point, Vector};
 
-use super::lanes::{LANES, Lane, Lane3};
 use super::mesh::MeshLattice;
 use super::patch::Facets;
+use super::simd::{F64x4, LANES, Vector3x4};
 
 /// How many neighbours a fit asks for: nine unknowns and some to spare. Two rings of a triangulation have eighteen, at a border
 /// about ten, so that a third ring is taken in there.
@@ -65,7 +65,7 @@ pub(crate) fn fit(at: Point, mean: Vector, neighbours: impl Iterator<Item = Poin
 /// on which the others are.
 #[inline(always)]
 pub(crate) fn four_normals(points: &[Point], mesh: &MeshLattice, vertices: &[u32; LANES]) -> [Vector; LANES] {
-    let mut rings = Rings { local: [[Lane::splat(0.0); 3]; MOST], most: 0 };
+    let mut rings = Rings { local: [[F64x4::splat(0.0); 3]; MOST], most: 0 };
     let mut last = (None, [Vector::zeros(); 3]);
     let frames: [[Vector; 3]; LANES] = std::array::from_fn(|l| {
         if last.0 == Some(vertices[l]) {
@@ -88,7 +88,7 @@ pub(crate) fn four_normals(points: &[Point], mesh: &MeshLattice, vertices: &[u32
 
 /// The neighbours of four vertices in the frame of each, in units of their mean distance; zeros fill up the shorter rings.
 struct Rings {
-    local: [Lane3; MOST],
+    local: [Vector3x4; MOST],
     most: usize,
 }
 
@@ -127,10 +127,10 @@ impl Rings {
     ///
     /// The normal equations hold only 25 different numbers: the weighted sums of the monomials of the degrees 2 to 6.
     #[inline(always)]
-    fn slopes(&self) -> ([Lane; 2], [bool; LANES]) {
-        let one = Lane::splat(1.0);
-        let mut moments = [Lane::splat(0.0); MOMENTS];
-        let mut right = [Lane::splat(0.0); TERMS.len()];
+    fn slopes(&self) -> ([F64x4; 2], [bool; LANES]) {
+        let one = F64x4::splat(1.0);
+        let mut moments = [F64x4::splat(0.0); MOMENTS];
+        let mut right = [F64x4::splat(0.0); TERMS.len()];
         for [u, v, w] in &self.local[..self.most] {
             let weight = one / (one + *u * *u + *v * *v);
             let powers = monomials::<MOMENTS>([weight * *u * *u, weight * *u * *v, weight * *v * *v], *u, *v);
@@ -160,8 +160,8 @@ const MOMENTS: usize = 25;
 
 /// Continues the three monomials of the second degree by those of higher ones, u^n first and v^n last in each.
 #[inline(always)]
-fn monomials<const N: usize>(squares: [Lane; 3], u: Lane, v: Lane) -> [Lane; N] {
-    let mut all = [Lane::splat(0.0); N];
+fn monomials<const N: usize>(squares: [F64x4; 3], u: F64x4, v: F64x4) -> [F64x4; N] {
+    let mut all = [F64x4::splat(0.0); N];
     all[..3].copy_from_slice(&squares);
     let (mut begin, mut end) = (0, 3);
     while end < N {
@@ -176,7 +176,7 @@ fn monomials<const N: usize>(squares: [Lane; 3], u: Lane, v: Lane) -> [Lane; N] 
 
 /// Solves four systems for their first two unknowns, and tells which of them have a solution.
 #[inline(always)]
-fn solve_side_by_side<const N: usize>(mut m: [[Lane; N]; N], mut x: [Lane; N]) -> ([Lane; 2], [bool; LANES]) {
+fn solve_side_by_side<const N: usize>(mut m: [[F64x4; N]; N], mut x: [F64x4; N]) -> ([F64x4; 2], [bool; LANES]) {
     let least_pivot: [f64; LANES] =
         std::array::from_fn(|l| WEAK_PIVOT * (0..N).map(|i| m[i][i].0[l]).fold(0.0, f64::max));
     let mut determined = [true; LANES];
@@ -189,7 +189,7 @@ fn solve_side_by_side<const N: usize>(mut m: [[Lane; N]; N], mut x: [Lane; N]) -
             // Not for NaN either.
             determined[l] &= pivot.0[l] > least_pivot[l];
         }
-        let inverse = Lane::splat(1.0) / Lane(pivot.0.map(f64::sqrt));
+        let inverse = F64x4::splat(1.0) / F64x4(pivot.0.map(f64::sqrt));
         for i in j + 1..N {
             for k in 0..j {
                 m[i][j] = m[i][j] - m[i][k] * m[j][k];

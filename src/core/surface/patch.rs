@@ -11,9 +11,9 @@ use rayon::prelude::*;
 use crate::geometry::{Point, Vector};
 
 use super::grid::GridLattice;
-use super::lanes::LANES;
 use super::mesh::MeshLattice;
 use super::normals;
+use super::simd::LANES;
 
 /// A smooth piece of surface that one lattice of triangles covers.
 #[derive(Debug)]

@@ -1,4 +1,4 @@
-//! Looking ahead: about where the feet of many points will be, and the normals there, before any foot is asked for.
+//! Prefetching: about where the feet of many points will be, and the normals there, before any foot is asked for.
 //!
 //! A scattered surface fits a normal where it is first touched. One by one, as the search for each foot meets them, that is the
 //! most expensive part of a registration; all at once it runs four at a time on all cores.
@@ -24,7 +24,7 @@ impl OffsetSurface<'_> {
 
     /// Fits the normals that the feet of points will need, all at once, and returns places to start from for each point, given
     /// in the model frame; nothing where normals are ready, or where several patches contend for a point.
-    pub(crate) fn look_ahead(&self, points: &[Point]) -> Vec<Place> {
+    pub(crate) fn prefetch(&self, points: &[Point]) -> Vec<Place> {
         let [patch] = self.nominal().patches() else { return Vec::new() };
         let Lattice::Mesh(mesh) = &patch.lattice else { return Vec::new() };
         let walk = |chunk: &[Point]| -> Vec<Place> {

@@ -16,19 +16,19 @@ pub(crate) const LANES: usize = 4;
 
 /// One number of each of four points.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Lane(pub(crate) [f64; LANES]);
+pub(crate) struct F64x4(pub(crate) [f64; LANES]);
 
 /// A vector of each of four points: x, y, z.
-pub(crate) type Lane3 = [Lane; 3];
+pub(crate) type Vector3x4 = [F64x4; 3];
 
 macro_rules! lanewise {
     ($trait:ident, $method:ident, $op:tt) => {
-        impl std::ops::$trait for Lane {
-            type Output = Lane;
+        impl std::ops::$trait for F64x4 {
+            type Output = F64x4;
 
             #[inline(always)]
-            fn $method(self, other: Lane) -> Lane {
-                Lane([
+            fn $method(self, other: F64x4) -> F64x4 {
+                F64x4([
                     self.0[0] $op other.0[0],
                     self.0[1] $op other.0[1],
                     self.0[2] $op other.0[2],
@@ -44,21 +44,21 @@ lanewise!(Sub, sub, -);
 lanewise!(Mul, mul, *);
 lanewise!(Div, div, /);
 
-impl Lane {
+impl F64x4 {
     #[inline(always)]
     pub(crate) fn splat(value: f64) -> Self {
-        Lane([value; LANES])
+        F64x4([value; LANES])
     }
 
     #[inline(always)]
     pub(crate) fn sqrt(self) -> Self {
-        Lane([self.0[0].sqrt(), self.0[1].sqrt(), self.0[2].sqrt(), self.0[3].sqrt()])
+        F64x4([self.0[0].sqrt(), self.0[1].sqrt(), self.0[2].sqrt(), self.0[3].sqrt()])
     }
 
     #[inline(always)]
     fn min(self, other: Self) -> Self {
         let least = |a: f64, b: f64| if a < b { a } else { b };
-        Lane([
+        F64x4([
             least(self.0[0], other.0[0]),
             least(self.0[1], other.0[1]),
             least(self.0[2], other.0[2]),
@@ -68,27 +68,27 @@ impl Lane {
 }
 
 #[inline(always)]
-pub(crate) fn dot(a: &Lane3, b: &Lane3) -> Lane {
+pub(crate) fn dot(a: &Vector3x4, b: &Vector3x4) -> F64x4 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
 #[inline(always)]
-pub(crate) fn cross(a: &Lane3, b: &Lane3) -> Lane3 {
+pub(crate) fn cross(a: &Vector3x4, b: &Vector3x4) -> Vector3x4 {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
 #[inline(always)]
-pub(crate) fn minus(a: &Lane3, b: &Lane3) -> Lane3 {
+pub(crate) fn minus(a: &Vector3x4, b: &Vector3x4) -> Vector3x4 {
     [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
 }
 
 #[inline(always)]
-pub(crate) fn times(a: &Lane3, b: Lane) -> Lane3 {
+pub(crate) fn times(a: &Vector3x4, b: F64x4) -> Vector3x4 {
     [a[0] * b, a[1] * b, a[2] * b]
 }
 
 #[inline(always)]
-fn weighted(v: &[Lane3; 3], b: &[Lane; 3]) -> Lane3 {
+fn weighted(v: &[Vector3x4; 3], b: &[F64x4; 3]) -> Vector3x4 {
     let at = |k: usize| v[0][k] * b[0] + v[1][k] * b[1] + v[2][k] * b[2];
     [at(0), at(1), at(2)]
 }
@@ -99,16 +99,16 @@ const JUMPS: usize = 4;
 /// The feet of four points.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FourFeet {
-    pub(crate) distance_mm: Lane,
-    pub(crate) normal: Lane3,
+    pub(crate) distance_mm: F64x4,
+    pub(crate) normal: Vector3x4,
 }
 
 /// Four facets with their corners on the offset surface.
 struct FourFacets {
-    x: [Lane3; 3],
-    n: [Lane3; 3],
-    turned: Lane3,
-    squared: Lane,
+    x: [Vector3x4; 3],
+    n: [Vector3x4; 3],
+    turned: Vector3x4,
+    squared: F64x4,
 }
 
 impl OffsetSurface<'_> {
@@ -122,7 +122,7 @@ impl OffsetSurface<'_> {
     /// Returns `None`, and the places mean nothing, where one of them lies beyond the edge or too far away: on a mesh already
     /// where it is not on its facet, since a walk over one would fit normals on the way.
     #[inline(always)]
-    pub(crate) fn four_feet(&self, p: &Lane3, places: &mut [Place; LANES]) -> Option<FourFeet> {
+    pub(crate) fn four_feet(&self, p: &Vector3x4, places: &mut [Place; LANES]) -> Option<FourFeet> {
         let patch = &self.nominal().patches()[0];
         match &patch.lattice {
             Lattice::Grid(grid) => self.four_feet_on(patch, grid, JUMPS, p, places),
@@ -131,15 +131,19 @@ impl OffsetSurface<'_> {
     }
 
     /// Returns where four points may be that follow others as those followed the ones before; `None` where nothing tells.
-    pub(crate) fn four_places_ahead(&self, before: &[Place; LANES], last: &[Place; LANES]) -> Option<[Place; LANES]> {
+    pub(crate) fn four_extrapolated_places(
+        &self,
+        before: &[Place; LANES],
+        last: &[Place; LANES],
+    ) -> Option<[Place; LANES]> {
         let Lattice::Grid(grid) = &self.nominal().patches()[0].lattice else { return None };
         if last.contains(&Place::UNKNOWN) {
             return None;
         }
         Some(std::array::from_fn(|l| {
             let step = if before[l] == Place::UNKNOWN { 0 } else { last[l].facet().wrapping_sub(before[l].facet()) };
-            let ahead = last[l].facet().wrapping_add(step);
-            if grid.has_facet(ahead) { Place::on_first_patch(ahead) } else { last[l] }
+            let next = last[l].facet().wrapping_add(step);
+            if grid.has_facet(next) { Place::on_first_patch(next) } else { last[l] }
         }))
     }
 
@@ -149,7 +153,7 @@ impl OffsetSurface<'_> {
         patch: &Patch,
         facets: &F,
         jumps: usize,
-        p: &Lane3,
+        p: &Vector3x4,
         places: &mut [Place; LANES],
     ) -> Option<FourFeet> {
         let mut jump = 0;
@@ -177,7 +181,12 @@ impl OffsetSurface<'_> {
 
     /// Corners on the offset surface, eq. (3), and their normals.
     #[inline(always)]
-    fn gathered<F: Facets>(&self, patch: &Patch, facets: &F, places: &[Place; LANES]) -> ([Lane3; 3], [Lane3; 3]) {
+    fn gathered<F: Facets>(
+        &self,
+        patch: &Patch,
+        facets: &F,
+        places: &[Place; LANES],
+    ) -> ([Vector3x4; 3], [Vector3x4; 3]) {
         let (a, b) = (facets.corners(places[0].facet()), facets.corners(places[1].facet()));
         let (c, d) = (facets.corners(places[2].facet()), facets.corners(places[3].facet()));
         let first = self.corner(patch, [a[0], b[0], c[0], d[0]]);
@@ -190,8 +199,8 @@ impl OffsetSurface<'_> {
     ///
     /// Every lane is built from registers; built through an array in memory it would wait for four narrow stores.
     #[inline(always)]
-    fn corner(&self, patch: &Patch, [a, b, c, d]: [u32; LANES]) -> (Lane3, Lane3) {
-        let (sign, radius) = (Lane::splat(self.side().sign()), Lane::splat(self.radius_mm()));
+    fn corner(&self, patch: &Patch, [a, b, c, d]: [u32; LANES]) -> (Vector3x4, Vector3x4) {
+        let (sign, radius) = (F64x4::splat(self.side().sign()), F64x4::splat(self.radius_mm()));
         let (point, normal) = four_vertices(&[patch.vertex(a), patch.vertex(b), patch.vertex(c), patch.vertex(d)]);
         let normal = times(&normal, sign);
         let on_offset = [point[0] + normal[0] * radius, point[1] + normal[1] * radius, point[2] + normal[2] * radius];
@@ -202,20 +211,20 @@ impl OffsetSurface<'_> {
 impl FourFacets {
     /// Barycentric weights of the feet on the planes of the flat facets.
     #[inline(always)]
-    fn weights(&self, p: &Lane3) -> [Lane; 3] {
+    fn weights(&self, p: &Vector3x4) -> [F64x4; 3] {
         let (e1, e2) = (minus(&self.x[1], &self.x[0]), minus(&self.x[2], &self.x[0]));
-        let per_squared = Lane::splat(1.0) / self.squared;
+        let per_squared = F64x4::splat(1.0) / self.squared;
         let w = minus(p, &self.x[0]);
         let b1 = dot(&cross(&w, &e2), &self.turned) * per_squared;
         let b2 = dot(&cross(&e1, &w), &self.turned) * per_squared;
-        [Lane::splat(1.0) - b1 - b2, b1, b2]
+        [F64x4::splat(1.0) - b1 - b2, b1, b2]
     }
 
     #[inline(always)]
-    fn feet(&self, sign: f64, p: &Lane3, b: &[Lane; 3]) -> FourFeet {
-        let flat = times(&self.turned, Lane::splat(sign) / self.squared.sqrt());
+    fn feet(&self, sign: f64, p: &Vector3x4, b: &[F64x4; 3]) -> FourFeet {
+        let flat = times(&self.turned, F64x4::splat(sign) / self.squared.sqrt());
         let mean = weighted(&self.n, b);
-        let normal = times(&mean, Lane::splat(1.0) / dot(&mean, &mean).sqrt());
+        let normal = times(&mean, F64x4::splat(1.0) / dot(&mean, &mean).sqrt());
         let flat_mm = dot(&minus(p, &self.x[0]), &flat);
         FourFeet { distance_mm: flat_mm * dot(&normal, &flat) - height(&self.x, &self.n, b), normal }
     }
@@ -223,7 +232,7 @@ impl FourFacets {
 
 /// Takes the points that do not stay to the facets their weights point at; false where one of them has none.
 #[inline(never)]
-fn jumped<F: Facets>(facets: &F, places: &mut [Place; LANES], stays: &[bool; LANES], b: &[Lane; 3]) -> bool {
+fn jumped<F: Facets>(facets: &F, places: &mut [Place; LANES], stays: &[bool; LANES], b: &[F64x4; 3]) -> bool {
     for l in (0..LANES).filter(|&l| !stays[l]) {
         match facets.advance(places[l].facet(), &[b[0].0[l], b[1].0[l], b[2].0[l]]) {
             Some(next) => places[l] = Place::on_first_patch(next),
@@ -235,8 +244,8 @@ fn jumped<F: Facets>(facets: &F, places: &mut [Place; LANES], stays: &[bool; LAN
 
 /// Height of the curved surface over the flat facet.
 #[inline(always)]
-fn height(x: &[Lane3; 3], n: &[Lane3; 3], b: &[Lane; 3]) -> Lane {
-    let zero = Lane::splat(0.0);
+fn height(x: &[Vector3x4; 3], n: &[Vector3x4; 3], b: &[F64x4; 3]) -> F64x4 {
+    let zero = F64x4::splat(0.0);
     let mut along = zero;
     let mut total = zero;
     for (i, j) in [(0, 1), (1, 2), (2, 0)] {
@@ -245,25 +254,25 @@ fn height(x: &[Lane3; 3], n: &[Lane3; 3], b: &[Lane; 3]) -> Lane {
         along = along + b[i] * b[j] * (b[i] * leaving + b[j] * arriving);
         total = total + (leaving + arriving);
     }
-    along + Lane::splat(0.5) * total * b[0] * b[1] * b[2]
+    along + F64x4::splat(0.5) * total * b[0] * b[1] * b[2]
 }
 
 /// Four vertices side by side: their points and their normals.
 #[inline(always)]
-pub(crate) fn four_vertices([a, b, c, d]: &[Vertex; LANES]) -> (Lane3, Lane3) {
+pub(crate) fn four_vertices([a, b, c, d]: &[Vertex; LANES]) -> (Vector3x4, Vector3x4) {
     let normal = [
-        Lane([a.normal.x, b.normal.x, c.normal.x, d.normal.x]),
-        Lane([a.normal.y, b.normal.y, c.normal.y, d.normal.y]),
-        Lane([a.normal.z, b.normal.z, c.normal.z, d.normal.z]),
+        F64x4([a.normal.x, b.normal.x, c.normal.x, d.normal.x]),
+        F64x4([a.normal.y, b.normal.y, c.normal.y, d.normal.y]),
+        F64x4([a.normal.z, b.normal.z, c.normal.z, d.normal.z]),
     ];
     (side_by_side(&[a.point, b.point, c.point, d.point]), normal)
 }
 
 /// Four points side by side.
 #[inline(always)]
-pub(crate) fn side_by_side(points: &[Point; LANES]) -> Lane3 {
+pub(crate) fn side_by_side(points: &[Point; LANES]) -> Vector3x4 {
     let [a, b, c, d] = points;
-    [Lane([a.x, b.x, c.x, d.x]), Lane([a.y, b.y, c.y, d.y]), Lane([a.z, b.z, c.z, d.z])]
+    [F64x4([a.x, b.x, c.x, d.x]), F64x4([a.y, b.y, c.y, d.y]), F64x4([a.z, b.z, c.z, d.z])]
 }
 
 #[cfg(test)]
