@@ -7,7 +7,7 @@
 //! touches the true surface, registration, map, correction; only the wires are left out. WAY is the beginning of a line's name, where not all are wanted. The figure is written to
 //! `target/convergence/convergence.svg`.
 
-#[path = "../tests/common/study.rs"]
+#[path = "../tests/run/study.rs"]
 mod study;
 
 use std::fs;

@@ -1,12 +1,43 @@
-//! The rules of absence: what each room must not contain.
+//! The rules of the house: which room may know which, and what each must not contain.
+//!
+//! What the dependencies of the crates keep, the compiler keeps; here stands the rest.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Rooms that compute and decide, and do nothing else.
-const PURE: [&str; 7] = ["geometry", "surface", "measuring", "registration", "compensation", "form", "cell"];
+/// Every room, its folder or file, and the rooms that it may name. An arrow that stands here in no line is a turned arrow.
+const ARROWS: [(&str, &str, &[&str]); 17] = [
+    ("geometry", "src/core/geometry", &[]),
+    ("surface", "src/core/surface", &["geometry"]),
+    ("measuring", "src/core/measuring", &["geometry", "surface"]),
+    ("registration", "src/core/registration", &["geometry", "surface"]),
+    ("compensation", "src/core/compensation", &["geometry", "surface", "registration"]),
+    ("form", "src/core/form", &["geometry", "surface"]),
+    ("cell", "src/cell", &[]),
+    ("document", "src/document", &[]),
+    ("journal", "src/journal", &[]),
+    ("formats", "src/formats", &CORE),
+    ("recipe", "src/recipe", &["document", "geometry", "surface", "registration", "compensation"]),
+    ("config", "src/config", &["document", "geometry"]),
+    ("device", "src/device", &["formats", "geometry"]),
+    ("report", "src/report", &["cell", "journal", "formats", "geometry", "registration"]),
+    (
+        "drive",
+        "src/drive",
+        &[CORE[0], CORE[1], CORE[2], CORE[3], CORE[4], CORE[5], "cell", "device", "formats", "journal", "report"],
+    ),
+    (
+        "setup",
+        "src/setup.rs",
+        &[CORE[0], CORE[1], CORE[2], CORE[3], CORE[4], "cell", "config", "device", "drive", "formats", "recipe"],
+    ),
+    ("sim", "sim", &[]),
+];
 
-/// What a pure room has no word for.
+/// The rooms of the numerical core.
+const CORE: [&str; 6] = ["geometry", "surface", "measuring", "registration", "compensation", "form"];
+
+/// What the numerical core and the deciding machine have no word for.
 const IMPURE: [&str; 13] = [
     "tokio",
     "async ",
@@ -29,18 +60,25 @@ struct Source {
     code: String,
 }
 
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// The sources of a room, tests of its crate left out.
 fn sources(room: &str) -> Vec<Source> {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join(room);
     let mut found = Vec::new();
-    let mut open = vec![root];
+    let mut open = vec![root().join(room)];
     while let Some(path) = open.pop() {
-        if path.is_dir() {
+        if path.ends_with("tests") {
+            continue;
+        } else if path.is_dir() {
             open.extend(fs::read_dir(&path).unwrap().map(|entry| entry.unwrap().path()));
         } else if path.extension().is_some_and(|e| e == "rs") {
             let code = code_of(&fs::read_to_string(&path).unwrap());
             found.push(Source { path, code });
         }
     }
+    assert!(!found.is_empty(), "no room {room}");
     found
 }
 
@@ -54,6 +92,42 @@ fn code_of(text: &str) -> String {
     })
 }
 
+/// The names that a path begins with behind one of our crates: `a` and `b` of `use crate::{a::X, b}`.
+fn named(code: &str) -> Vec<&str> {
+    let mut names = Vec::new();
+    for (at, _) in
+        code.match_indices("crate::").chain(code.match_indices("regrind::")).chain(code.match_indices("regrind_core::"))
+    {
+        let path = &code[at..];
+        let rest = &path[path.find("::").unwrap() + 2..];
+        match rest.strip_prefix('{') {
+            Some(list) => names.extend(top_level(list)),
+            None => names.extend(rest.split(|c: char| !c.is_alphanumeric() && c != '_').next()),
+        }
+    }
+    names
+}
+
+/// The first names in a list in braces, whatever stands in braces within it left out.
+fn top_level(list: &str) -> Vec<&str> {
+    let (mut depth, mut begins, mut names) = (0, 0, Vec::new());
+    for (at, c) in list.char_indices() {
+        match c {
+            '{' => depth += 1,
+            '}' if depth > 0 => depth -= 1,
+            '}' | ',' if depth == 0 => {
+                names.extend(list[begins..at].split("::").next().map(str::trim));
+                begins = at + 1;
+                if c == '}' {
+                    break;
+                }
+            }
+            _ => {}
+        }
+    }
+    names
+}
+
 fn assert_absent<'a>(sources: impl IntoIterator<Item = &'a Source>, words: &[&str]) {
     for Source { path, code } in sources {
         for word in words {
@@ -63,47 +137,91 @@ fn assert_absent<'a>(sources: impl IntoIterator<Item = &'a Source>, words: &[&st
     }
 }
 
-fn in_room(source: &Source, room: &str) -> bool {
-    source.path.starts_with(Path::new(env!("CARGO_MANIFEST_DIR")).join(room))
+fn is_in(source: &Source, room: &str) -> bool {
+    source.path.starts_with(root().join(room))
 }
 
 #[test]
-fn pure_rooms_have_no_file_no_clock_no_chance_and_no_log() {
-    for room in PURE {
-        let found = sources(&format!("src/{room}"));
-        assert_absent(&found, &IMPURE);
+fn no_room_names_one_that_it_must_not_know() {
+    let rooms = || ARROWS.iter().map(|(room, ..)| *room).chain(["cli"]);
+    for (room, place, may) in ARROWS {
+        for source in sources(place) {
+            for name in named(&source.code) {
+                let fine = name == room || may.contains(&name) || !rooms().any(|other| other == name);
+                assert!(fine, "{}: `{room}` must not know `{name}`", source.path.display());
+            }
+        }
     }
-    assert!(!sources("src/geometry").is_empty() && !sources("src/registration").is_empty());
 }
 
 #[test]
-fn the_simulator_knows_nothing_of_the_controller() {
-    let found = sources("sim");
-    assert!(!found.is_empty());
-    assert_absent(&found, &["regrind::", "extern crate regrind"]);
-    let manifest = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("sim/Cargo.toml")).unwrap();
-    assert!(!manifest.lines().any(|line| line.starts_with("regrind ") || line.starts_with("regrind=")));
+fn every_folder_of_the_sources_is_a_room() {
+    for folder in ["src", "src/core"] {
+        for entry in fs::read_dir(root().join(folder)).unwrap().map(|entry| entry.unwrap().path()) {
+            let name = entry.file_stem().unwrap().to_string_lossy().into_owned();
+            let known = ARROWS.iter().any(|(room, ..)| *room == name);
+            let no_room = ["cli", "core", "lib", "main", "tests", "Cargo"].contains(&name.as_str());
+            assert!(known || no_room, "{} stands in no line of the arrows", entry.display());
+        }
+    }
+}
+
+#[test]
+fn names_are_found_in_lists_and_paths() {
+    let code = "use crate::{a::{self, X}, b, c::Y};\nlet d = crate::d::e(regrind_core::f::G);";
+    assert_eq!(named(code), ["a", "b", "c", "d", "f"]);
+}
+
+#[test]
+fn the_core_and_the_machine_that_decides_have_no_file_no_clock_no_chance_and_no_log() {
+    for room in ["src/core", "src/cell"] {
+        assert_absent(&sources(room), &IMPURE);
+    }
+}
+
+/// The crates that the manifest of one of ours names.
+fn dependencies(manifest: &str) -> Vec<String> {
+    let text = fs::read_to_string(root().join(manifest)).unwrap();
+    let table: toml::Table = text.parse().unwrap();
+    table["dependencies"].as_table().unwrap().keys().cloned().collect()
+}
+
+#[test]
+fn the_crates_depend_on_nothing_above_them() {
+    for (manifest, may) in [
+        ("src/core/Cargo.toml", &[][..]),
+        ("src/cell/Cargo.toml", &[]),
+        ("src/journal/Cargo.toml", &[]),
+        ("src/formats/Cargo.toml", &["regrind-core"]),
+        ("sim/Cargo.toml", &[]),
+    ] {
+        let ours: Vec<_> = dependencies(manifest).into_iter().filter(|name| name.starts_with("regrind")).collect();
+        assert!(ours.iter().all(|name| may.contains(&name.as_str())), "{manifest}: {ours:?}");
+    }
+    for manifest in ["src/core/Cargo.toml", "src/cell/Cargo.toml"] {
+        let heavy = ["tokio", "tokio-modbus", "tokio-serial", "rusqlite", "clap", "serialport", "miette", "rand"];
+        let found: Vec<_> = dependencies(manifest).into_iter().filter(|name| heavy.contains(&name.as_str())).collect();
+        assert!(found.is_empty(), "{manifest}: {found:?}");
+    }
 }
 
 #[test]
 fn only_the_command_line_prints_or_exits() {
-    let found = sources("src");
     let words =
         ["println!", "print!", "eprint", "io::stdout", "io::stderr", "process::exit", "ExitCode::", "anyhow", "miette"];
-    assert_absent(found.iter().filter(|s| !in_room(s, "src/cli")), &words);
+    assert_absent(sources("src").iter().filter(|s| !is_in(s, "src/cli") && !is_in(s, "src/main.rs")), &words);
 }
 
 #[test]
 fn only_formats_report_journal_and_the_file_exchange_write_files() {
-    let found = sources("src");
     let words = ["File::create", "OpenOptions", "fs::write", "fs::rename", "fs::remove", "fs::create_dir"];
     let may = ["src/formats", "src/report", "src/journal", "src/device/exchange"];
-    assert_absent(found.iter().filter(|s| !may.iter().any(|room| in_room(s, room))), &words);
+    assert_absent(sources("src").iter().filter(|s| !may.iter().any(|room| is_in(s, room))), &words);
 }
 
 #[test]
 fn the_library_does_not_know_its_command_line() {
     let found = sources("src");
-    let others = found.iter().filter(|s| !in_room(s, "src/cli") && !s.path.ends_with("src/main.rs"));
+    let others = found.iter().filter(|s| !is_in(s, "src/cli") && !is_in(s, "src/main.rs"));
     assert_absent(others, &["clap", "crate::cli", "mod cli"]);
 }

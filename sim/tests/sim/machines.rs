@@ -1,0 +1,163 @@
+//! The real physics behind the registers: a part is ground and measured in both word orders, and cannot be in two places.
+
+use std::time::Duration;
+
+use crate::common::{net, pass, plan, small_perfect, zero_map};
+use regrind_sim::body::Body;
+use regrind_sim::handshake::{Answer, Command, Frame, State};
+use regrind_sim::payload::{PassRecord, decode_points};
+use regrind_sim::registers::{Machine, MachineOptions};
+use regrind_sim::words::{WordOrder, bytes_of, registers_of, turn_payload};
+use regrind_sim::world::World;
+
+const HALF_MM: [f64; 2] = [15.0, 10.0];
+
+struct Desk {
+    machine: Machine,
+    order: WordOrder,
+    digest: u32,
+    sequence: u32,
+    beat: u16,
+}
+
+impl Desk {
+    fn new(body: impl Body + 'static, order: WordOrder, payloads: Vec<(u16, Vec<u8>)>) -> Self {
+        let options = MachineOptions { word_order: order, speed: 200.0, ..MachineOptions::default() };
+        let machine = Machine::new(Box::new(body), 5, options);
+        let identities: Vec<u8> = payloads.iter().flat_map(|(kind, _)| [*kind as u8; 32]).collect();
+        let mut desk = Self { machine, order, digest: crc32fast::hash(&identities), sequence: 0, beat: 0 };
+        for (kind, bytes) in payloads {
+            desk.send(kind, bytes);
+        }
+        desk.command(Command::Claim, Answer::Accepted);
+        desk
+    }
+
+    fn send(&mut self, kind: u16, mut bytes: Vec<u8>) {
+        if self.order == WordOrder::Little {
+            turn_payload(kind, 1, &mut bytes);
+        }
+        let mut header = vec![kind, 0];
+        header.extend(self.order.from_u32(bytes.len() as u32));
+        header.extend(self.order.from_u32(crc32fast::hash(&bytes)));
+        header.extend([0, 0]);
+        header.extend(registers_of(&[kind as u8; 32]));
+        self.machine.write(200, &header).unwrap();
+        for (page, data) in registers_of(&bytes).chunks(112).enumerate() {
+            let mut words = self.order.from_u32(page as u32).to_vec();
+            words.extend([data.len() as u16, 0, 0, 0, 0, 0]);
+            words.extend(data);
+            self.machine.write(224, &words).unwrap();
+        }
+        assert_eq!(self.machine.read(351, 1), Ok(vec![2]), "payload {kind} is in force");
+    }
+
+    fn u32(&mut self, address: u16) -> u32 {
+        let words = self.machine.read(address, 2).unwrap();
+        self.order.to_u32([words[0], words[1]])
+    }
+
+    fn command(&mut self, command: Command, expected: Answer) {
+        self.sequence += 1;
+        let frame = Frame {
+            sequence: self.sequence,
+            command: command as u16,
+            cycle: 1,
+            owner: 4,
+            epoch: 1,
+            job: 12,
+            digest: self.digest,
+            token: self.u32(78),
+            argument: self.u32(80),
+        };
+        self.machine.write(40, &frame.registers(self.order)).unwrap();
+        let answer = self.machine.read(70, 1).unwrap()[0];
+        assert_eq!((self.u32(68), answer), (self.sequence, expected as u16), "{command:?}");
+    }
+
+    fn wait_for(&mut self, state: State) {
+        for _ in 0..100_000 {
+            if self.machine.state() == state {
+                return;
+            }
+            self.beat = self.beat.wrapping_add(1);
+            self.machine.write(36, &[self.beat]).unwrap();
+            self.machine.tick(Duration::from_millis(100));
+        }
+        panic!("{state:?} did not come; it is {:?}", self.machine.state());
+    }
+
+    fn result(&mut self) -> (u16, f64, Vec<u8>) {
+        let header = self.machine.read(400, 56).unwrap();
+        let length = self.u32(402) as usize;
+        let mut registers = Vec::new();
+        while registers.len() < length.div_ceil(2) {
+            let page = self.order.from_u32((registers.len() / 112) as u32);
+            self.machine.write(460, &page).unwrap();
+            let answer = self.machine.read(462, 116).unwrap();
+            registers.extend(&answer[4..4 + usize::from(answer[2])]);
+        }
+        let mut bytes = bytes_of(&registers);
+        bytes.truncate(length);
+        if self.order == WordOrder::Little {
+            turn_payload(header[0], header[1], &mut bytes);
+        }
+        (header[1], self.order.to_f64(header[16..20].try_into().unwrap()), bytes)
+    }
+}
+
+#[test]
+fn a_part_is_ground_and_measured_through_registers() {
+    for order in [WordOrder::Big, WordOrder::Little] {
+        let world = World::new(small_perfect()).unwrap();
+        let level_mm = world.level_mm() - 0.01;
+        let map = (2, zero_map(HALF_MM).encode());
+        let mut grinder = Desk::new(world.grinder(), order, vec![map, (3, pass(HALF_MM, level_mm).encode())]);
+        let targets = plan(&world, &net([12.0, 8.0], 4.0));
+        let mut cmm = Desk::new(world.cmm(), order, vec![(1, targets.encode())]);
+
+        grinder.command(Command::Prepare, Answer::Accepted);
+        grinder.command(Command::Start, Answer::Accepted);
+        grinder.machine.tick(Duration::from_millis(100));
+        assert_eq!(grinder.machine.state(), State::Execute);
+        cmm.command(Command::Prepare, Answer::Interlock);
+        grinder.wait_for(State::Complete);
+        let (_, _, record) = grinder.result();
+        let record = PassRecord::decode(&record).unwrap();
+        assert_eq!((record.job, record.cycle, record.result), (12, 1, 1), "{order:?}");
+        assert!((record.depth_mm - 0.01).abs() < 1e-3, "{order:?}: {record:?}");
+        grinder.command(Command::Acknowledge, Answer::Accepted);
+
+        cmm.command(Command::Prepare, Answer::Accepted);
+        cmm.command(Command::Start, Answer::Accepted);
+        cmm.wait_for(State::Complete);
+        let (format, scale_mm, bytes) = cmm.result();
+        let records = decode_points(&bytes, (format == 2).then_some(scale_mm)).unwrap();
+        assert_eq!(records.len(), targets.targets.len(), "{order:?}");
+        assert!(records.iter().all(|record| record.status as u16 == 1), "{order:?}");
+        assert_eq!(world.grinds_begun(12, 1), 1);
+    }
+}
+
+#[test]
+fn a_part_that_is_held_and_stopped_is_given_free() {
+    let world = World::new(small_perfect()).unwrap();
+    let level_mm = world.level_mm() - 0.01;
+    let map = (2, zero_map(HALF_MM).encode());
+    let mut grinder = Desk::new(world.grinder(), WordOrder::Big, vec![map, (3, pass(HALF_MM, level_mm).encode())]);
+    let targets = plan(&world, &net([12.0, 8.0], 4.0));
+    let mut cmm = Desk::new(world.cmm(), WordOrder::Big, vec![(1, targets.encode())]);
+    grinder.command(Command::Prepare, Answer::Accepted);
+    grinder.command(Command::Start, Answer::Accepted);
+    grinder.machine.tick(Duration::from_millis(200));
+    grinder.command(Command::Hold, Answer::Accepted);
+    grinder.wait_for(State::Held);
+    cmm.command(Command::Prepare, Answer::Interlock);
+    grinder.command(Command::Stop, Answer::Accepted);
+    grinder.wait_for(State::Complete);
+    assert_eq!(grinder.machine.read(82, 1), Ok(vec![2]), "stopped");
+    cmm.command(Command::Prepare, Answer::Accepted);
+    grinder.command(Command::Acknowledge, Answer::Accepted);
+    grinder.command(Command::Prepare, Answer::Accepted);
+    grinder.command(Command::Start, Answer::Begun);
+}

@@ -1,0 +1,11 @@
+//! The simulated machines: what they do to a part, and what stands on their wires.
+
+mod closing_the_loop;
+mod common;
+mod counter;
+mod grinding;
+mod machines;
+mod measuring;
+mod payloads;
+mod registers;
+mod wires;

@@ -1,0 +1,752 @@
+//! Recipes and cell files: what ships is good, what is wrong is told at its place, and nothing makes the reader panic.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use proptest::prelude::*;
+use regrind::config::{CellConfig, PointKind, Wire, WordOrder};
+use regrind::document::Problems;
+use regrind::formats::read_points;
+use regrind::geometry::{Point, Pose};
+use regrind::recipe::{BeginWith, Density, NominalSource, OnTrouble, Pattern, Recipe, StartAt, Wheel};
+use regrind::registration::{ProbeSide, Start};
+use regrind::surface::{DefinedSurface, Side};
+use serde_json::Value;
+
+const RECIPE: &str = include_str!("../../recipes/freeform-mirror.toml");
+const BICONIC: &str = include_str!("../../recipes/biconic.toml");
+const SPIRAL: &str = include_str!("../../recipes/off-axis-asphere.toml");
+const TELESCOPE: &str = include_str!("../../recipes/telescope-panel.toml");
+const SIM: &str = include_str!("../../config/sim.toml");
+const TCP: &str = include_str!("../../config/modbus-tcp.toml");
+const RTU: &str = include_str!("../../config/serial-rtu.toml");
+const FILES: &str = include_str!("../../config/file-exchange.toml");
+
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+fn shipped(folder: &str) -> Vec<PathBuf> {
+    let entries = fs::read_dir(root().join(folder)).unwrap().map(|entry| entry.unwrap().path());
+    let mut files: Vec<PathBuf> = entries.filter(|path| path.extension().is_some_and(|e| e == "toml")).collect();
+    files.sort();
+    files
+}
+
+fn recipe(text: &str) -> Result<Recipe, Problems> {
+    Recipe::parse(&root().join("recipes/test.toml"), text)
+}
+
+fn cell(text: &str) -> Result<CellConfig, Problems> {
+    CellConfig::parse(&root().join("config/test.toml"), text)
+}
+
+fn changed(text: &str, from: &str, to: &str) -> String {
+    assert_eq!(text.matches(from).count(), 1, "`{from}` must stand once");
+    text.replacen(from, to, 1)
+}
+
+fn place_of(text: &str, needle: &str) -> (usize, usize) {
+    place_of_byte(text, text.find(needle).unwrap_or_else(|| panic!("`{needle}` must stand in the text")))
+}
+
+#[test]
+fn everything_shipped_is_good() {
+    let (recipes, cells) = (shipped("recipes"), shipped("config"));
+    assert!(recipes.len() >= 5 && cells.len() >= 4);
+    for path in &recipes {
+        let recipe = Recipe::read(path).unwrap_or_else(|problems| panic!("{problems}"));
+        let text = fs::read_to_string(path).unwrap();
+        assert_eq!((recipe.text(), recipe.path()), (text.as_str(), path.as_path()));
+    }
+    for path in &cells {
+        CellConfig::read(path).unwrap_or_else(|problems| panic!("{problems}"));
+    }
+    let output = Command::new(env!("CARGO_BIN_EXE_regrind")).arg("check").args(&recipes).args(&cells).output().unwrap();
+    let text = String::from_utf8(output.stdout).unwrap();
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    assert_eq!(text.matches("a good recipe").count(), recipes.len());
+    assert_eq!(text.matches("a good cell file").count(), cells.len());
+}
+
+#[test]
+fn the_default_recipe_is_what_it_says() {
+    let recipe = recipe(RECIPE).unwrap();
+    assert_eq!(recipe.part.name, "free-form mirror");
+    assert_eq!(recipe.measure.probe_radius_mm, 1.5);
+    assert_eq!(recipe.measure.pattern, Pattern::Grid(Density::Points([60, 30])));
+    assert_eq!(recipe.measure.side, ProbeSide::Known(Side::Normal));
+    assert_eq!((recipe.acceptance.pv_mm, recipe.acceptance.rms_mm), (Some(7e-3), Some(1e-3)));
+    assert!((recipe.registration.largest_turn_rad - 5f64.to_radians()).abs() < 1e-15);
+    assert!((recipe.compensation.removal_budget_mm - 0.4).abs() < 1e-15);
+    assert_eq!(recipe.grinding.wheel, Wheel::Sphere { radius_mm: 12.5 });
+    assert_eq!((recipe.cycle.on_stall, recipe.cycle.on_divergence), (OnTrouble::Stop, OnTrouble::Hold));
+    let options = recipe.registration_options(Pose::identity());
+    assert_eq!((options.probe_radius_mm, options.start, options.rms_limit_mm), (1.5, Start::Search, Some(0.1)));
+    let NominalSource::Surface(surface) = recipe.nominal_source() else { panic!("a formula") };
+    let steepest = (0..=40)
+        .flat_map(|j| (0..=40).map(move |i| (2.55 * f64::from(i) - 51.0, 1.55 * f64::from(j) - 31.0)))
+        .map(|(x, y)| surface.formula().sag_and_gradient(x, y).unwrap().1)
+        .map(|[p, q]| p.hypot(q).atan().to_degrees())
+        .fold(0.0, f64::max);
+    assert!((29.0..31.0).contains(&steepest), "{steepest} degrees");
+    let hash = recipe.source_sha256().iter().map(|b| format!("{b:02x}")).collect::<String>();
+    let again = self::recipe(&RECIPE.replace("12.5", "12.6")).unwrap();
+    assert_eq!(hash.len(), 64);
+    assert_ne!(recipe.source_sha256(), again.source_sha256());
+}
+
+/// The simulator is told the same surface in its own words.
+#[test]
+fn the_simulated_part_of_every_polynomial_is_the_nominal_one() {
+    for name in ["freeform-mirror", "shallow-wave"] {
+        let recipe = Recipe::read(&root().join(format!("recipes/{name}.toml"))).unwrap();
+        let NominalSource::Surface(surface) = recipe.nominal_source() else { panic!("a formula") };
+        let shape = &recipe.simulation.as_ref().unwrap()["part"]["shape"];
+        let radius_mm = shape["normalisation_radius_mm"].as_float().unwrap();
+        for (x, y) in [(0.0, 0.0), (40.0, 30.0), (-39.0, 12.0), (7.0, -29.0)] {
+            let terms = shape["coefficients"].as_array().unwrap().iter();
+            let power = |term: &toml::Value, key: &str| term[key].as_integer().unwrap() as i32;
+            let z: f64 = terms
+                .map(|t| {
+                    let (u, v): (f64, f64) = (x / radius_mm, y / radius_mm);
+                    t["value_mm"].as_float().unwrap() * u.powi(power(t, "i")) * v.powi(power(t, "j"))
+                })
+                .sum();
+            assert!((z - surface.formula().sag(x, y).unwrap()).abs() < 1e-12, "{name} at {x}, {y}");
+        }
+    }
+}
+
+#[test]
+fn the_points_of_the_biconic_are_its_formula() {
+    let path = root().join("recipes/biconic.csv");
+    assert!(fs::metadata(&path).unwrap().len() < 150_000);
+    let points = read_points(&path).unwrap();
+    assert_eq!(points.len(), 61 * 45);
+    let formula = "[surface]\nkind = 'biconic'\nradius_x_mm = 140\nradius_y_mm = 90\nconic_x = -0.5\nconic_y = 0.3\n\
+                   [aperture]\nkind = 'rectangle'\nwidth_mm = 60\nheight_mm = 44\n";
+    let surface = DefinedSurface::from_toml(formula).unwrap();
+    for p in &points {
+        assert!((surface.formula().sag(p.x, p.y).unwrap() - p.z).abs() < 1e-9);
+    }
+    let recipe = recipe(BICONIC).unwrap();
+    assert!(matches!(recipe.nominal_source(), NominalSource::File { path: file, .. } if *file == path));
+    let shape = &recipe.simulation.as_ref().unwrap()["part"]["shape"];
+    assert_eq!(shape["radius_mm"].as_array().unwrap(), &[140.0.into(), 90.0.into()]);
+    assert_eq!(shape["conic"].as_array().unwrap(), &[(-0.5).into(), 0.3.into()]);
+}
+
+#[test]
+fn the_telescope_holds_what_it_cannot_see() {
+    let recipe = recipe(TELESCOPE).unwrap();
+    assert_eq!(recipe.registration.held, [true, true, false, false, false, true]);
+    assert_eq!(recipe.registration.start, StartAt::Fixture);
+    assert_eq!(recipe.measure.side, ProbeSide::Known(Side::Opposite));
+    let cell = cell(FILES).unwrap();
+    // opt_global -> mirror frame is p' = Rx (p - s), Rx = [[1, 0, 0], [0, c, -s], [0, s, c]] with tan = 1/2.
+    let (sine, cosine) = (0.5f64.atan().sin(), 0.5f64.atan().cos());
+    let p = Point::new(2401.0905, -2698.6984, 4819.4921);
+    let back = cell.cmm.fixture_cmm_from_model.inverse().point(&p);
+    let (y, z) = (p.y, p.z - 3600.0);
+    assert!((back - Point::new(p.x, cosine * y - sine * z, sine * y + cosine * z)).norm() < 1e-9);
+    let Wire::FileExchange(files) = &cell.cmm.link.wire else { panic!("files") };
+    assert_eq!((files.stations.len(), files.content.unit_mm), (1, 1.0));
+    assert_eq!(files.inbox, root().join("config/../exchange/cmm/in"));
+    assert_eq!((files.content.what, files.reference_limit_mm), (Some(PointKind::Centres), 1.0));
+    assert_eq!((files.take_earlier, files.probe_tolerance_mm), (false, 1e-3));
+    assert_eq!(recipe.cycle.begin_with, BeginWith::Measure);
+    assert_eq!(recipe.compensation.largest_displacement_mm, 1.0);
+}
+
+#[test]
+fn what_a_file_wire_leaves_out_is_not_guessed() {
+    let text = changed(FILES, "what = \"centres\"", "# what");
+    let text = changed(&text, "take_earlier = false", "take_earlier = true\nresult = \"{part}-{job}-{cycle}_*.ply\"");
+    let cell = cell(&text).unwrap();
+    let Wire::FileExchange(files) = &cell.cmm.link.wire else { panic!("files") };
+    assert_eq!((files.content.what, files.take_earlier), (None, true));
+    assert_eq!(files.result, "{part}-{job}-{cycle}_*.ply");
+    let Wire::FileExchange(files) = &cell.grinder.link.wire else { panic!("files") };
+    assert_eq!((files.result.as_str(), files.reference_limit_mm), ("{part}_c{cycle}.*", 0.1));
+    let recipe = recipe(RECIPE).unwrap();
+    assert_eq!(recipe.cycle.begin_with, BeginWith::Grind);
+    assert_eq!(recipe.compensation.largest_displacement_mm, 1.0);
+}
+
+#[test]
+fn registers_and_signals_are_read() {
+    let text = changed(
+        TCP,
+        "# status = 64",
+        "status = 600\n[[cmm.signals]]\nname = 'air'\naddress = 1000\ntype = 'f32'\nrange = [4, 8]",
+    );
+    let cell = cell(&text).unwrap();
+    assert_eq!((cell.cmm.link.registers.status, cell.cmm.link.registers.command), (600, 40));
+    assert_eq!(cell.cmm.link.signals[0].range, [4.0, 8.0]);
+    assert_eq!(cell.cmm.link.signals[0].word_order, WordOrder::Big);
+    assert_eq!(cell.grinder.link.wire, Wire::ModbusTcp { host: "127.0.0.1".into(), port: 15022, unit: 2 });
+}
+
+/// File, what is changed into what, and the one problem: its key, what stands where it is, and a word of its remedy or limit.
+type Bad = (&'static str, &'static str, &'static str, &'static str, &'static str, &'static str);
+
+const BAD_RECIPES: &[Bad] = &[
+    (
+        RECIPE,
+        "probe_radius_mm = 1.5",
+        "probe_radius_um = 1.5",
+        "measure.probe_radius_um",
+        "probe_radius_um",
+        "did you mean `probe_radius_mm`",
+    ),
+    (
+        RECIPE,
+        "probe_radius_mm = 1.5",
+        "probe_radius_mm = 1500",
+        "measure.probe_radius_mm",
+        "1500",
+        "write 1.5 millimetres",
+    ),
+    (
+        RECIPE,
+        "probe_radius_mm = 1.5",
+        "probe_radius_mm = '1.5'",
+        "measure.probe_radius_mm",
+        "'1.5'",
+        "remove the quotes: 1.5",
+    ),
+    (RECIPE, "probe_radius_mm = 1.5", "probe_radius_mm = '1,5'", "measure.probe_radius_mm", "'1,5'", "decimal point"),
+    (RECIPE, "probe_radius_mm = 1.5", "probe_radius_mm = nan", "measure.probe_radius_mm", "nan", "0.05 to 50 mm"),
+    (RECIPE, "probe_radius_mm = 1.5", "probe_radius_mm = -inf", "measure.probe_radius_mm", "-inf", "1.5 is usual"),
+    (
+        RECIPE,
+        "probe_radius_mm = 1.5",
+        "probe_radius_mm = '1.5 mm'",
+        "measure.probe_radius_mm",
+        "'1.5 mm'",
+        "without its unit",
+    ),
+    (RECIPE, "probe_radius_mm = 1.5\n", "", "measure.probe_radius_mm", "measure]", "add `probe_radius_mm = 1.5`"),
+    (RECIPE, "columns = 60 ", "columns = 60.5", "measure.columns", "60.5", "without a decimal point"),
+    (RECIPE, "rows = 30", "spacing_mm = 2.0", "measure", "measure]", "`columns` and `rows`"),
+    (RECIPE, "rows = 30", "rows = 30\nspacing_mm = 2.0", "measure", "measure]", "just these"),
+    (RECIPE, "rows = 30", "rows = 30\npoints = 1800", "measure.points", "1800", "leave it out"),
+    (SPIRAL, "points = 1500", "spacing_mm = 0.008", "measure.spacing_mm", "0.008", "coarser"),
+    (SPIRAL, "points = 1500", "spacing_mm = 80", "measure.spacing_mm", "80", "finer"),
+    (RECIPE, "pattern = \"grid\"", "pattern = \"gird\"", "measure.pattern", "\"gird\"", "did you mean \"grid\""),
+    (RECIPE, "side = \"above\"", "side = \"left\"", "measure.side", "\"left\"", "\"below\""),
+    (RECIPE, "edge_margin_mm = 0.5", "edge_margin_mm = 31", "measure.edge_margin_mm", "31", "lower it"),
+    (RECIPE, "safe_height_mm = 10.0", "safe_height_mm = 1.0", "measure.safe_height_mm", "1.0\n", "raise it"),
+    (RECIPE, "minimum_coverage = 0.95", "minimum_coverage = 95", "measure.minimum_coverage", "95 ", "0.1 to 1"),
+    (RECIPE, "qualify = true", "qualify = \"yes\"", "measure.qualify", "\"yes\"", "true or false"),
+    (RECIPE, "[acceptance]", "[acceptence]", "acceptence", "acceptence", "did you mean `acceptance`"),
+    (RECIPE, "pv_um = 7.0", "pv_um = 0.5", "acceptance.pv_um", "0.5\nrms", "interchanged"),
+    (RECIPE, "pv_um = 7.0\nrms_um = 1.0\n", "", "acceptance", "acceptance]", "add `rms_um = 1.0`"),
+    (RECIPE, "cutoff_mm = 5.0 ", "gain = 1.5\ncutoff_mm = 5.0 ", "compensation.gain", "1.5\ncutoff", "1.2"),
+    (RECIPE, "depth_of_cut_um = 20.0", "depth_of_cut_um = 500.0", "compensation.depth_of_cut_um", "500.0", "budget"),
+    (
+        RECIPE,
+        "largest_correction_um = 60.0",
+        "largest_correction_um = 600",
+        "compensation.largest_correction_um",
+        "600",
+        "budget",
+    ),
+    (RECIPE, "cutoff_mm = 5.0 ", "cutoff_mm = 3.0 ", "compensation.cutoff_mm", "3.0 ", "measure more points"),
+    (BICONIC, "cutoff_mm = 5.0", "cutoff_mm = 1.5", "compensation.cutoff_mm", "1.5\nlargest", "two nodes"),
+    (RECIPE, "cutoff_mm = 5.0 ", "gian = 5.0 \ncutoff_mm = 5.0", "compensation.gian", "gian", "did you mean `gain`"),
+    (RECIPE, "feed_mm_min = 1000.0", "feed_mm_min = 0", "grinding.feed_mm_min", "0\ntrack", "mm/min"),
+    (RECIPE, "track_mm = 0.5", "track_mm = 13.0", "grinding.track_mm", "13.0", "lower it"),
+    (RECIPE, "allowance_um = 20.0", "allowance_um = 90.0", "grinding.allowance_um", "90.0", "most_cycles"),
+    (RECIPE, "shape = \"sphere\"", "shape = \"cone\"", "grinding.wheel.shape", "\"cone\"", "\"torus\""),
+    (RECIPE, "shape = \"sphere\"", "", "grinding.wheel.shape", "wheel]", "add `shape"),
+    (
+        RECIPE,
+        "shape = \"sphere\"",
+        "shape = \"torus\"\nminor_radius_mm = 20",
+        "grinding.wheel.minor_radius_mm",
+        "20\nradius",
+        "interchanged",
+    ),
+    (RECIPE, "radius_mm = 12.5", "radius_mm = 120.0", "grinding.wheel.radius_mm", "120.0", "smaller"),
+    (RECIPE, "most_cycles = 5", "most_cycles = 0", "cycle.most_cycles", "0\non_stall", "1 to 100"),
+    (RECIPE, "on_stall = \"stop\"", "on_stall = \"go\"", "cycle.on_stall", "\"go\"", "\"hold\""),
+    (RECIPE, "start = \"search\"", "start = \"search\"\nhold = [\"x\"]", "registration.hold", "[\"x\"]", "fixture"),
+    (
+        RECIPE,
+        "start = \"search\"",
+        "start = \"fixture\"\nhold = [\"x\", \"u\"]",
+        "registration.hold[1]",
+        "\"u\"",
+        "\"rz\"",
+    ),
+    (RECIPE, "max_rms_um = 100.0", "max_rms_um = 0.5", "registration.max_rms_um", "0.5\n\n[acc", "raise it"),
+    (
+        RECIPE,
+        "max_rms_um = 100.0",
+        "max_rms_um = 100.0\npv_um = 1",
+        "registration.pv_um",
+        "pv_um",
+        "belongs into [acceptance]",
+    ),
+    (RECIPE, "[part]", "[part]\nnominal = 1", "part.nominal", "nominal", "the top of the file"),
+    (RECIPE, "name = \"free-form mirror\"", "name = \"\"", "part.name", "\"\"", "1 to 80"),
+    (RECIPE, "name = \"free-form mirror\"", "name = \"two\\nlines\"", "part.name", "\"two", "line breaks"),
+    (
+        RECIPE,
+        "kind = \"xy-polynomial\"\nnormalisation_radius_mm = 50.0\nterms",
+        "kind = \"xy-polynom\"\nnormalisation_radius_mm = 50.0\nterms",
+        "nominal.surface.kind",
+        "\"xy-polynom\"",
+        "did you mean \"xy-polynomial\"",
+    ),
+    (RECIPE, "[1, 0, 2.1]", "[1, 0]", "nominal.surface.terms[0]", "[1, 0]", "there must be 3"),
+    (RECIPE, "[1, 0, 2.1]", "[1, -1, 2.1]", "nominal.surface.terms[0][1]", "-1", "0 to 60"),
+    (RECIPE, "[1, 0, 2.1]", "[0, 1, 2.1]", "nominal.surface.terms", "[   ", "twice"),
+    (RECIPE, "width_mm = 102.0", "width_mm = -102.0", "nominal.aperture.width_mm", "-102.0", "-102"),
+    (
+        RECIPE,
+        "width_mm = 102.0",
+        "wide_mm = 102.0\nwidth_mm = 102.0",
+        "nominal.aperture.wide_mm",
+        "wide_mm",
+        "did you mean `width_mm`",
+    ),
+    (RECIPE, "accuracy_nm = 0.5", "accuracy_nm = 0.5\nspacing_mm = 1", "nominal.sampling", "sampling]", "keep one"),
+    (BICONIC, "projection = \"xy\"", "projection = \"yx\"", "nominal.projection", "\"yx\"", "best-fit"),
+    (BICONIC, "projection = \"xy\"", "sampling = { spacing_mm = 1 }", "nominal.sampling", "sampling", "one source"),
+];
+
+const BAD_CELLS: &[Bad] = &[
+    (SIM, "simulated = true ", "simulated = false ", "cmm.wire.port", "0                    #", "1 to 65535"),
+    (SIM, "simulated = true ", "simulated = 1 ", "cell.simulated", "1 ", "without quotes"),
+    (SIM, "name = \"simulated cell\"\n", "", "cell.name", "cell]", "add `name"),
+    (TCP, "port = 15021", "port = 70000", "cmm.wire.port", "70000", "0 to 65535"),
+    (TCP, "port = 15021", "prot = 15021\nport = 1", "cmm.wire.prot", "prot", "did you mean `port`"),
+    (TCP, "port = 15022\nunit = 2", "port = 15021\nunit = 1", "grinder.wire.unit", "1\n\n[grinder.limits", "two units"),
+    (
+        TCP,
+        "kind = \"modbus-tcp\"\nhost = \"127.0.0.1\"\nport = 15021",
+        "kind = \"modbus\"\nhost = \"127.0.0.1\"\nport = 15021",
+        "cmm.wire.kind",
+        "\"modbus\"",
+        "modbus-rtu",
+    ),
+    (
+        TCP,
+        "host = \"127.0.0.1\"\nport = 15021",
+        "host = \"192.168.0.5\"\nport = 15021",
+        "cmm.wire.host",
+        "\"192.168.0.5\"",
+        "simulated = false",
+    ),
+    (
+        TCP,
+        "host = \"127.0.0.1\"\nport = 15021",
+        "host = \"http://a\"\nport = 15021",
+        "cmm.wire.host",
+        "\"http://a\"",
+        "the port has a key",
+    ),
+    (TCP, "# status = 64", "status = 50", "cmm.registers.status", "50\n", "overlaps"),
+    (TCP, "# status = 64", "in_force = 65500", "cmm.registers.in_force", "65500", "65535"),
+    (TCP, "word_order = \"big\"", "word_order = \"middle\"", "cmm.registers.word_order", "\"middle\"", "little"),
+    (TCP, "heartbeat_ms = 250", "heartbeat_ms = 900", "cmm.timing.heartbeat_ms", "900", "20 to 500"),
+    (TCP, "lost_after_ms = 3000", "lost_after_ms = 1500", "cmm.timing.lost_after_ms", "1500", "retries"),
+    (
+        TCP,
+        "# expected_name",
+        "[[cmm.signals]]\nname = 'a'\naddress = 65535\ntype = 'u32'\nrange = [0, 1]\n#",
+        "cmm.signals[0].address",
+        "65535",
+        "lower it",
+    ),
+    (
+        TCP,
+        "# expected_name",
+        "[[cmm.signals]]\nname = 'a'\naddress = 1\ntype = 'u8'\nrange = [0, 1]\n#",
+        "cmm.signals[0].type",
+        "'u8'",
+        "u16",
+    ),
+    (
+        TCP,
+        "# expected_name",
+        "[[cmm.signals]]\nname = 'a'\naddress = 1\ntype = 'u16'\nrange = [1, 0]\n#",
+        "cmm.signals[0].range",
+        "[1, 0]",
+        "interchange",
+    ),
+    (TCP, "least_mm = [-500.0", "least_mm = [600.0", "cmm.travel.least_mm", "[600.0", "interchanged"),
+    (
+        TCP,
+        "centre_mm = [0.0, 120.0",
+        "centre_mm = [0.0, 1200.0",
+        "cmm.reference_sphere.centre_mm",
+        "[0.0, 1200",
+        "outside",
+    ),
+    (TCP, "largest_depth_mm = 0.5\n", "", "grinder.limits.largest_depth_mm", "limits]", "add `largest_depth_mm"),
+    (
+        TCP,
+        "least_wheel_radius_mm = 1.0",
+        "least_wheel_radius_mm = 200",
+        "grinder.limits.least_wheel_radius_mm",
+        "200",
+        "no wheel",
+    ),
+    (
+        RTU,
+        "device = \"/tmp/regrind-grinder.tty\"\nbaud = 115200",
+        "device = \"/tmp/regrind-cmm.tty\"\nbaud = 9600",
+        "grinder.wire",
+        "wire]\nkind = \"modbus-rtu\"\ndevice = \"/tmp/regrind-cmm.tty\"\nbaud = 9600",
+        "one setting",
+    ),
+    (
+        RTU,
+        "parity = \"even\"\nstop_bits = 1\nunit = 1",
+        "parity = \"evn\"\nstop_bits = 1\nunit = 1",
+        "cmm.wire.parity",
+        "\"evn\"",
+        "did you mean \"even\"",
+    ),
+    (RTU, "stop_bits = 1\nunit = 1", "stop_bits = 3\nunit = 1", "cmm.wire.stop_bits", "3\nunit", "1 to 2"),
+    (FILES, "simulated = false", "simulated = true", "cell.simulated", "true", "simulated = false"),
+    (
+        FILES,
+        "inbox = \"../exchange/cmm/in\"",
+        "inbox = \"../exchange/cmm/out\"",
+        "cmm.wire.inbox",
+        "\"../exchange/cmm/out\"\nstable",
+        "told apart",
+    ),
+    (
+        FILES,
+        "reference = \"ref_*.yaml\"",
+        "reference = \"ref.yaml\"",
+        "cmm.wire.stations[0].reference",
+        "\"ref.yaml\"",
+        "add the `*`",
+    ),
+    (
+        FILES,
+        "reference_points = \"../exchange/cmm/reference.yaml\"\n",
+        "",
+        "cmm.wire.stations",
+        "[[cmm.wire.stations]]",
+        "name their file",
+    ),
+    (
+        FILES,
+        "take_earlier = false",
+        "result = \"{part}/{cycle}.csv\"",
+        "cmm.wire.result",
+        "\"{part}/{cycle}.csv\"",
+        "is usual",
+    ),
+    (FILES, "reference_limit_mm = 1.0", "reference_limit_mm = 0", "cmm.wire.reference_limit_mm", "0", "100"),
+    (FILES, "unit = \"mm\"", "unit = \"cm\"", "cmm.wire.unit", "\"cm\"", "inch"),
+    (
+        FILES,
+        "rotation_deg = [-26.56505117707799, 0.0, 0.0]",
+        "rotation_deg = [0.0, 0.0]",
+        "cmm.fixture.rotation_deg",
+        "[0.0, 0.0]",
+        "there must be 3",
+    ),
+];
+
+/// Returns what is not told as it should be.
+fn not_told<T>(bad: &Bad, read: fn(&str) -> Result<T, Problems>) -> Option<String> {
+    let (text, from, to, key, needle, word) = bad;
+    let text = changed(text, from, to);
+    let Err(problems) = read(&text) else { return Some(format!("{from} -> {to} was taken")) };
+    let Some(problem) = problems.problems.iter().find(|problem| problem.key == *key) else {
+        return Some(format!("{from} -> {to}: nothing about `{key}`:\n{problems}"));
+    };
+    // The needle is looked for from the change on; a table's name stands before it.
+    let changed_at = text.find(to).unwrap_or(0);
+    let at = text[changed_at..].find(needle).map(|k| changed_at + k).or_else(|| text.find(needle));
+    let expected = place_of_byte(&text, at.unwrap_or_else(|| panic!("`{needle}` must stand in the text")));
+    let wrong = problems.problems.len() > 1 && !ALSO.contains(key)
+        || problems.place(problem) != expected
+        || !problem.to_string().contains(word);
+    wrong.then(|| format!("{from} -> {to}: expected `{word}` at {expected:?} in:\n{problems}"))
+}
+
+fn assert_told<T>(table: &[Bad], read: fn(&str) -> Result<T, Problems>) {
+    let wrong: Vec<String> = table.iter().filter_map(|bad| not_told(bad, read)).collect();
+    assert!(wrong.is_empty(), "{}", wrong.join("\n\n"));
+}
+
+/// What is wrong with these is wrong with something else as well.
+const ALSO: &[&str] = &["cmm.wire.port", "cmm.wire.kind"];
+
+fn place_of_byte(text: &str, at: usize) -> (usize, usize) {
+    let line_start = text[..at].rfind('\n').map_or(0, |newline| newline + 1);
+    (text[..at].matches('\n').count() + 1, text[line_start..at].chars().count() + 1)
+}
+
+#[test]
+fn every_bad_recipe_is_told_at_its_place() {
+    assert_told(BAD_RECIPES, recipe);
+}
+
+#[test]
+fn every_bad_cell_is_told_at_its_place() {
+    assert_told(BAD_CELLS, cell);
+}
+
+#[test]
+fn all_problems_are_told_at_once_and_in_order() {
+    let text = RECIPE
+        .replace("probe_radius_mm = 1.5", "probe_radius_mm = 1500")
+        .replace("edge_margin_mm", "edge_margin")
+        .replace("pv_um = 7.0", "pv_um = 0.5")
+        .replace("depth_of_cut_um = 20.0", "depth_of_cut_um = 500.0")
+        .replace("shape = \"sphere\"", "shape = \"spere\"")
+        .replace("most_cycles = 5", "most_cycles = \"five\"");
+    let problems = recipe(&text).unwrap_err();
+    let keys: Vec<&str> = problems.problems.iter().map(|problem| problem.key.as_str()).collect();
+    assert_eq!(
+        keys,
+        [
+            "measure.probe_radius_mm",
+            "measure.edge_margin",
+            "acceptance.pv_um",
+            "compensation.depth_of_cut_um",
+            "grinding.wheel.shape",
+            "cycle.most_cycles"
+        ]
+    );
+    let lines: Vec<usize> = problems.problems.iter().map(|problem| problems.place(problem).0).collect();
+    assert!(lines.is_sorted());
+    assert_eq!(problems.to_string().lines().count(), 6);
+}
+
+#[test]
+fn several_places_of_broken_syntax_are_told() {
+    let text = changed(RECIPE, "depth_of_cut_um = 20.0", "depth_of_cut_um 20.0");
+    let text = changed(&text, "track_mm = 0.5", "track_mm = = 0.5");
+    let problems = recipe(&text).unwrap_err();
+    assert!(problems.problems.len() >= 2, "{problems}");
+    let lines: Vec<usize> = problems.problems.iter().map(|problem| problems.place(problem).0).collect();
+    for needle in ["depth_of_cut_um 20.0", "track_mm = = 0.5"] {
+        assert!(lines.contains(&place_of(&text, needle).0), "{problems}");
+    }
+}
+
+#[test]
+fn what_is_no_text_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("recipe.toml");
+    let read = |bytes: &[u8]| {
+        fs::write(&path, bytes).unwrap();
+        Recipe::read(&path).unwrap_err().to_string()
+    };
+    assert!(read(b"a = 1,5").contains("decimal point"));
+    assert!(read(b"[part]\nname = \"\xff\"").contains("line 2 is not UTF-8"));
+    assert!(read(b"[part]\n\0\0").contains("NUL"));
+    assert!(read(&vec![b'#'; 300 << 10]).contains("256 KiB"));
+    assert!(read(b"").contains("[measure]"));
+    assert!(Recipe::read(folder.path()).unwrap_err().to_string().contains("cannot be read"));
+    assert!(CellConfig::read(&folder.path().join("none")).unwrap_err().to_string().contains("cannot be read"));
+    let utf16: Vec<u8> = RECIPE.encode_utf16().flat_map(u16::to_le_bytes).collect();
+    assert!(read(&utf16).contains("no TOML"));
+    fs::write(&path, format!("\u{feff}{RECIPE}").replace('\n', "\r\n")).unwrap();
+    assert!(Recipe::read(&path).is_ok(), "a mark of the byte order and Windows line ends are no fault");
+}
+
+#[test]
+fn depth_and_number_have_an_end() {
+    for text in [
+        format!("a = {}{}", "[".repeat(20_000), "]".repeat(20_000)),
+        format!("a = {}1{}", "{ a = ".repeat(5_000), "}".repeat(5_000)),
+        format!("[{}a]", "a.".repeat(20_000)),
+        "x = 1e999999\n".to_owned(),
+        "x = 99999999999999999999999\n".to_owned(),
+    ] {
+        assert!(recipe(&text).is_err() && cell(&text).is_err());
+    }
+    let many: String = (0..5_000).map(|k| format!("unknown{k} = 1\n")).collect();
+    let problems = recipe(&many).unwrap_err();
+    assert!(problems.problems.len() <= 201);
+    assert!(problems.to_string().contains("more problems"));
+}
+
+#[test]
+fn somebody_else_can_point_into_a_file() {
+    let recipe = recipe(RECIPE).unwrap();
+    let problems = recipe.problem("simulation.part.stock_um", "is 200", "it must be 0 to 100", "lower it");
+    let (line, column) = problems.place(&problems.problems[0]);
+    assert_eq!((line, column), place_of(RECIPE, "200.0"));
+    assert!(problems.to_string().ends_with("`simulation.part.stock_um` is 200; it must be 0 to 100; lower it"));
+}
+
+#[test]
+fn the_command_tells_problems_in_words_and_as_json() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("bad.toml");
+    fs::write(&path, changed(BICONIC, "biconic.csv", "none.csv")).unwrap();
+    let good = root().join("config/sim.toml");
+    let run = |arguments: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_regrind"));
+        command.arg("check").args(arguments).arg(&path).arg(&good).output().unwrap()
+    };
+    let output = run(&[]);
+    let (told, error) = (String::from_utf8(output.stdout).unwrap(), String::from_utf8(output.stderr).unwrap());
+    assert_eq!(output.status.code(), Some(2));
+    assert!(told.contains("sim.toml: a good cell file"), "{told}");
+    assert!(error.contains("nominal.file") && error.contains("none.csv") && error.contains("1 of 2 files"), "{error}");
+    let output = run(&["--json"]);
+    assert_eq!(output.status.code(), Some(2));
+    let document: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(document[0]["problems"][0]["key"], "nominal.file");
+    assert_eq!(document[0]["problems"][0]["line"], place_of(BICONIC, "file = ").0);
+    assert_eq!((&document[0]["good"], &document[1]["good"]), (&false.into(), &true.into()));
+}
+
+#[test]
+fn the_truth_of_a_simulated_cell_is_checked_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("recipe.toml");
+    for (to, key, words) in [
+        ("stock_um = -1.0", "`simulation.part.stock_um` is -1", "0 to 10000"),
+        ("stok_um = 200.0", "`simulation`", "stok_um"),
+    ] {
+        fs::write(&path, changed(RECIPE, "stock_um = 200.0", to)).unwrap();
+        let output = Command::new(env!("CARGO_BIN_EXE_regrind")).arg("check").arg(&path).output().unwrap();
+        let error = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{error}");
+        assert!(error.contains(key) && error.contains(words), "{error}");
+    }
+}
+
+#[test]
+fn the_committed_schemas_are_the_ones_in_force() {
+    for (name, schema) in [("recipe", regrind::recipe::json_schema()), ("cell", regrind::config::json_schema())] {
+        let committed = fs::read_to_string(root().join(format!("docs/{name}.schema.json"))).unwrap();
+        let committed: Value = serde_json::from_str(&committed).unwrap();
+        assert_eq!(&committed, schema, "write it anew: regrind schema {name} > docs/{name}.schema.json");
+        let output = Command::new(env!("CARGO_BIN_EXE_regrind")).args(["schema", name]).output().unwrap();
+        assert_eq!(&serde_json::from_slice::<Value>(&output.stdout).unwrap(), schema);
+    }
+}
+
+/// The few words of JSON schema that ours use, by themselves.
+fn accepts(schema: &Value, value: &Value) -> bool {
+    if let Some(variants) = schema.get("oneOf").and_then(Value::as_array) {
+        return variants.iter().filter(|one| accepts(one, value)).count() == 1;
+    }
+    let words = schema.get("enum").and_then(Value::as_array);
+    if words.is_some_and(|words| !words.contains(value)) || schema.get("const").is_some_and(|one| one != value) {
+        return false;
+    }
+    let limit = |key: &str, otherwise: f64| schema.get(key).and_then(Value::as_f64).unwrap_or(otherwise);
+    let within = |number: f64, least: &str, most: &str| {
+        (limit(least, f64::NEG_INFINITY)..=limit(most, f64::INFINITY)).contains(&number)
+    };
+    match (schema["type"].as_str().expect("a type"), value) {
+        ("boolean", Value::Bool(_)) => true,
+        ("string", Value::String(text)) => within(text.chars().count() as f64, "minLength", "maxLength"),
+        ("integer", Value::Number(number)) if !number.is_f64() => {
+            within(number.as_f64().unwrap(), "minimum", "maximum")
+        }
+        ("number", Value::Number(number)) => within(number.as_f64().unwrap(), "minimum", "maximum"),
+        ("array", Value::Array(items)) => {
+            within(items.len() as f64, "minItems", "maxItems")
+                && items.iter().enumerate().all(|(k, item)| {
+                    let one = schema.get("prefixItems").and_then(|each| each.get(k)).or_else(|| schema.get("items"));
+                    one.is_none_or(|one| accepts(one, item))
+                })
+        }
+        ("object", Value::Object(table)) => {
+            let required = schema.get("required").and_then(Value::as_array).into_iter().flatten();
+            required.into_iter().all(|key| table.contains_key(key.as_str().unwrap()))
+                && table.iter().all(|(key, value)| {
+                    match (schema["properties"].get(key), &schema["additionalProperties"]) {
+                        (Some(schema), _) => accepts(schema, value),
+                        (None, Value::Bool(allowed)) => *allowed,
+                        (None, Value::Null) => true,
+                        (None, schema) => accepts(schema, value),
+                    }
+                })
+        }
+        _ => false,
+    }
+}
+
+#[test]
+fn the_schemas_accept_what_ships_and_refuse_what_is_wrong() {
+    for (folder, schema) in [("recipes", regrind::recipe::json_schema()), ("config", regrind::config::json_schema())] {
+        for path in shipped(folder) {
+            let text = fs::read_to_string(&path).unwrap();
+            let value = serde_json::to_value(toml::from_str::<toml::Table>(&text).unwrap()).unwrap();
+            assert!(accepts(schema, &value), "{}", path.display());
+            for table in ["measure", "cmm"] {
+                let mut broken = value.clone();
+                if broken.get(table).is_some() {
+                    broken[table]["unheard_of"] = 1.into();
+                    assert!(!accepts(schema, &broken));
+                }
+            }
+        }
+    }
+}
+
+fn shipped_texts() -> [&'static str; 8] {
+    [RECIPE, BICONIC, SPIRAL, TELESCOPE, SIM, TCP, RTU, FILES]
+}
+
+/// Reads as both kinds, and looks at every problem.
+fn survive(text: &str) {
+    for problems in [recipe(text).err(), cell(text).err()].into_iter().flatten() {
+        assert!(!problems.problems.is_empty());
+        for problem in &problems.problems {
+            assert!(text.get(problem.span.clone()).is_some(), "{problem}");
+            assert!(problems.place(problem) >= (1, 1));
+        }
+        assert!(!problems.to_string().is_empty());
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 256, ..ProptestConfig::default() })]
+
+    #[test]
+    fn any_text_is_read_or_refused(text in "\\PC{0,200}|[\\[\\]{}=\"'.,#a-z0-9_\n -]{0,300}") {
+        survive(&text);
+    }
+
+    #[test]
+    fn mutated_files_are_read_or_refused(
+        which in 0usize..8,
+        cuts in prop::collection::vec((0.0f64..1.0, 0usize..12, "[\\[\\]{}=\"'.,#a-z0-9_\n\u{0}é-]{0,6}"), 1..6),
+    ) {
+        let mut text = shipped_texts()[which].to_owned();
+        for (at, length, with) in cuts {
+            let boundary = |k: usize| (k..=text.len()).find(|&k| text.is_char_boundary(k)).unwrap_or(text.len());
+            let start = boundary((at * text.len() as f64) as usize);
+            let end = boundary((start + length).min(text.len()));
+            text.replace_range(start..end, &with);
+        }
+        survive(&text);
+    }
+
+    #[test]
+    fn swapped_values_are_read_or_refused(which in 0usize..8, line in 0usize..200, value in prop::sample::select(vec![
+        "0", "-1", "1e308", "nan", "inf", "-inf", "''", "[]", "{}", "[[]]", "true", "1979-05-27", "9223372036854775807",
+        "[1, 2, 3, 4]", "{ kind = 'plane' }", "'x'",
+    ])) {
+        let lines: Vec<&str> = shipped_texts()[which].lines().collect();
+        let line = line % lines.len();
+        let text: String = lines.iter().enumerate().map(|(k, text)| match text.split_once(" = ") {
+            Some((key, _)) if k == line && !key.starts_with('#') => format!("{key} = {value}\n"),
+            _ => format!("{text}\n"),
+        }).collect();
+        survive(&text);
+    }
+}

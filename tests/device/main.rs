@@ -1,0 +1,8 @@
+//! The drivers, each against machines at the far end of its real wire.
+
+mod exchange;
+mod interop;
+mod modbus;
+#[path = "../common/program.rs"]
+mod program;
+mod toy;

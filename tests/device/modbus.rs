@@ -1,0 +1,729 @@
+//! The Modbus drivers against simulated machines at the far end of real sockets and serial lines, in order and out of order.
+
+#![cfg(unix)]
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use regrind::device::{
+    Answer, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Link, Machine,
+    MachineKind, Measurement, ModbusCmm, ModbusGrinder, ModbusSettings, Outcome, Parity, Pass, Plan, PointStatus,
+    Reconciled, RegisterMap, Signal, SignalType, State, Target, TargetKind, Wire, WordOrder, digest,
+};
+use regrind::geometry::Grid;
+use regrind_sim::body::Kind;
+use regrind_sim::registers::{Layout, MachineOptions};
+use regrind_sim::wire::Serving;
+use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, When};
+use regrind_sim::wire::rtu::Line;
+use regrind_sim::{registers, words};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpSocket};
+
+use crate::toy::Toy;
+
+// ---- machines to talk to ------------------------------------------------------------------------------------------------------------
+
+fn toy(kind: Kind, points_a_second: f64, options: MachineOptions) -> registers::Machine {
+    registers::Machine::new(Box::new(Toy::new(kind, points_a_second)), 0xb007, options)
+}
+
+/// Fast enough to be done between two looks.
+const AT_ONCE: f64 = 1e9;
+
+async fn serve(kind: Kind, points_a_second: f64, faults: Faults) -> Serving {
+    let machine = toy(kind, points_a_second, MachineOptions::default());
+    Serving::tcp_with("127.0.0.1:0", vec![(1, machine)], faults).await.unwrap()
+}
+
+fn settings(serving: &Serving) -> ModbusSettings {
+    let port = serving.local_addr().unwrap().port();
+    ModbusSettings {
+        request_timeout: Duration::from_millis(300),
+        quarantine: Duration::from_millis(20),
+        retries: 6,
+        lost_after: Duration::from_secs(20),
+        ..ModbusSettings::new(Wire::Tcp { host: "127.0.0.1".into(), port })
+    }
+}
+
+/// For what must go well at the first try: no stall of the computer is taken for a silent machine.
+fn patient(settings: ModbusSettings) -> ModbusSettings {
+    ModbusSettings { request_timeout: Duration::from_secs(30), ..settings }
+}
+
+fn began(serving: &Serving) -> Vec<(u32, u32, u16)> {
+    serving.machine(1).unwrap().with(|machine| machine.began())
+}
+
+// ---- what is sent -------------------------------------------------------------------------------------------------------------------
+
+fn plan(points: u32) -> Plan {
+    let target = |index: u32| {
+        let (x, y) = (f64::from(index % 40) * 0.5, f64::from(index / 40) * 0.5);
+        let length = (1.0 + 0.01 * x * x).sqrt();
+        Target {
+            index,
+            what: if index < 5 { TargetKind::ReferenceSphere } else { TargetKind::Part },
+            point_mm: [x, y, -0.05 * x * x],
+            normal: [0.1 * x / length, 0.0, 1.0 / length],
+        }
+    };
+    Plan {
+        targets: (0..points).map(target).collect(),
+        probe_radius_mm: 2.0,
+        approach_mm: 1.0,
+        search_mm: 1.0,
+        speed_mm_s: 2.0,
+        safe_height_mm: 20.0,
+    }
+}
+
+fn map_and_pass() -> (CorrectionMap, Pass) {
+    let map = CorrectionMap {
+        grid: Grid { columns: 20, rows: 30, first_mm: [-10.0, -15.0], spacing_mm: [1.0, 1.0] },
+        values_mm: (0..600).map(|k| 1e-3 * f64::from(k % 17)).collect(),
+        part_identity: [7; 32],
+    };
+    let pass = Pass {
+        spark_out_passes: 1,
+        wheel_radius_mm: 25.0,
+        feed_mm_min: 300.0,
+        track_spacing_mm: 0.2,
+        level_mm: 0.1,
+        depth_of_cut_mm: 0.02,
+        x_mm: [-10.0, 9.0],
+        y_mm: [-15.0, 14.0],
+        part_identity: [7; 32],
+    };
+    (map, pass)
+}
+
+fn job_of(plan: &Plan, cycle: u16) -> Job {
+    Job { job: 42, cycle, digest: digest(&[plan.identity()]) }
+}
+
+/// Every coordinate to the last bit: what the toy machine does is known.
+fn assert_exact(plan: &Plan, measured: &Measurement, hint: &str) {
+    assert_eq!(measured.points.len(), plan.targets.len(), "{hint}");
+    assert_eq!(measured.plan_identity, plan.identity(), "{hint}");
+    for (target, point) in plan.targets.iter().zip(&measured.points) {
+        assert_eq!((point.index, point.status), (target.index, PointStatus::Touched), "{hint}");
+        let centre_mm: [f64; 3] =
+            std::array::from_fn(|axis| target.point_mm[axis] + plan.probe_radius_mm * target.normal[axis]);
+        assert_eq!(point.at_mm, centre_mm, "{hint}");
+    }
+}
+
+async fn until_complete<M: Machine>(machine: &mut M) -> Result<(), DeviceError> {
+    let began = Instant::now();
+    loop {
+        let status = machine.status().await?;
+        if status.state == State::Complete {
+            return Ok(());
+        }
+        assert!(began.elapsed() < Duration::from_secs(60), "not complete after a minute: {status:?}");
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+}
+
+async fn measure(cmm: &mut ModbusCmm, plan: &Plan, cycle: u16) -> Result<Measurement, DeviceError> {
+    let (job, calm) = (job_of(plan, cycle), Interrupt::new());
+    cmm.claim().await?;
+    cmm.load_plan(plan, &calm).await?;
+    let armed = cmm.prepare(job).await?;
+    let started = cmm.start(armed).await?;
+    assert_eq!(started.job, job);
+    until_complete(cmm).await?;
+    let measured = cmm.collect(job, &calm).await?;
+    assert_eq!(cmm.collect(job, &calm).await?, measured);
+    cmm.acknowledge(measured.done).await?;
+    Ok(measured)
+}
+
+// ---- in order -----------------------------------------------------------------------------------------------------------------------
+
+#[tokio::test]
+async fn a_plan_is_measured_and_comes_back_to_the_last_bit() {
+    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    let mut cmm = ModbusCmm::new(patient(settings(&serving))).unwrap();
+    let identity = cmm.connect().await.unwrap();
+    assert_eq!((identity.kind, identity.name.as_str(), identity.simulation), (MachineKind::Cmm, "Toy 1", true));
+    let plan = plan(300);
+    for cycle in 1..=2 {
+        let measured = measure(&mut cmm, &plan, cycle).await.unwrap();
+        assert_exact(&plan, &measured, "in order");
+        assert_eq!((measured.job, measured.cycle, measured.temperature_c), (42, cycle, 20.5));
+    }
+    assert_eq!(cmm.status().await.unwrap().state, State::Idle);
+    assert_eq!(began(&serving).len(), 2);
+    let figures = cmm.link().figures();
+    assert_eq!((figures.opened, figures.timeouts, figures.corrupt, figures.retries), (1, 0, 0, 0));
+    println!("{} requests, {:.0} us each", figures.answers, figures.answer_ns as f64 / 1e3 / figures.answers as f64);
+}
+
+#[tokio::test]
+async fn a_pass_is_ground_and_recorded() {
+    let serving = serve(Kind::Grinder, AT_ONCE, Faults::none()).await;
+    let mut grinder = ModbusGrinder::new(settings(&serving)).unwrap();
+    grinder.connect().await.unwrap();
+    grinder.claim().await.unwrap();
+    let ((map, pass), calm) = (map_and_pass(), Interrupt::new());
+    grinder.load_pass(&map, &pass, &calm).await.unwrap();
+    let job = Job { job: 9, cycle: 3, digest: digest(&[map.identity(), pass.identity()]) };
+    let armed = grinder.prepare(job).await.unwrap();
+    grinder.start(armed).await.unwrap();
+    until_complete(&mut grinder).await.unwrap();
+    let record = grinder.collect(job, &calm).await.unwrap();
+    assert_eq!((record.outcome, record.path_mm, record.removed_mm3), (Outcome::Complete, 1234.5, 67.8));
+    assert_eq!((record.map_identity, record.wheel_radius_mm), (map.identity(), 25.0));
+    grinder.acknowledge(record.done).await.unwrap();
+    // The same job and cycle are not begun twice, however well they are prepared.
+    let armed = grinder.prepare(job).await.unwrap();
+    let refused = grinder.start(armed).await;
+    assert!(matches!(refused, Err(DeviceError::Refused { answer: Answer::AlreadyBegun, .. })), "{refused:?}");
+    assert_eq!(began(&serving).len(), 1);
+}
+
+#[tokio::test]
+async fn low_words_first_and_other_addresses_are_as_good() {
+    let layout = Layout { status: 1064, command: 1040, outbox_page: 2462, ..Layout::default() };
+    let options = MachineOptions { word_order: words::WordOrder::Little, layout, ..MachineOptions::default() };
+    let serving = Serving::tcp("127.0.0.1:0", vec![(7, toy(Kind::Cmm, AT_ONCE, options))]).await.unwrap();
+    let registers = RegisterMap { status: 1064, command: 1040, outbox_page: 2462, ..RegisterMap::default() };
+    let settings = ModbusSettings { unit: 7, word_order: WordOrder::Little, registers, ..settings(&serving) };
+    let mut cmm = ModbusCmm::new(settings).unwrap();
+    cmm.connect().await.unwrap();
+    let plan = plan(50);
+    assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), "low words first");
+}
+
+#[tokio::test]
+async fn hold_resume_stop_abort_and_clear_are_obeyed() {
+    let serving = serve(Kind::Cmm, 20.0, Faults::none()).await;
+    let mut cmm = ModbusCmm::new(settings(&serving)).unwrap();
+    cmm.connect().await.unwrap();
+    cmm.claim().await.unwrap();
+    let (plan, calm) = (plan(200), Interrupt::new());
+    cmm.load_plan(&plan, &calm).await.unwrap();
+    let armed = cmm.prepare(job_of(&plan, 1)).await.unwrap();
+    cmm.start(armed.clone()).await.unwrap();
+    cmm.hold().await.unwrap();
+    reaches(&mut cmm, State::Held).await;
+    cmm.resume().await.unwrap();
+    reaches(&mut cmm, State::Execute).await;
+    cmm.stop().await.unwrap();
+    reaches(&mut cmm, State::Complete).await;
+    let status = cmm.status().await.unwrap();
+    assert_eq!((status.outcome, status.done), (Outcome::Stopped, armed.start_sequence));
+    cmm.acknowledge(status.done).await.unwrap();
+    let armed = cmm.prepare(job_of(&plan, 2)).await.unwrap();
+    cmm.start(armed).await.unwrap();
+    cmm.abort().await.unwrap();
+    reaches(&mut cmm, State::Aborted).await;
+    cmm.clear().await.unwrap();
+    reaches(&mut cmm, State::Idle).await;
+    let refused = cmm.hold().await;
+    assert!(matches!(refused, Err(DeviceError::Refused { answer: Answer::WrongState, .. })), "{refused:?}");
+    cmm.release().await.unwrap();
+    assert_eq!(cmm.status().await.unwrap().owner, 0);
+}
+
+async fn reaches(cmm: &mut ModbusCmm, state: State) {
+    let began = Instant::now();
+    while cmm.status().await.unwrap().state != state {
+        assert!(began.elapsed() < Duration::from_secs(30), "{state} was not reached");
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+}
+
+#[tokio::test]
+async fn another_client_is_refused_and_an_abort_is_not() {
+    let serving = serve(Kind::Cmm, 20.0, Faults::none()).await;
+    let mut first = ModbusCmm::new(settings(&serving)).unwrap();
+    let mut second = ModbusCmm::new(ModbusSettings { owner: 2, ..settings(&serving) }).unwrap();
+    first.connect().await.unwrap();
+    first.claim().await.unwrap();
+    second.connect().await.unwrap();
+    let refused = second.claim().await;
+    assert!(matches!(refused, Err(DeviceError::Refused { answer: Answer::NotOwner, .. })), "{refused:?}");
+    second.abort().await.unwrap();
+    let state = first.status().await.unwrap().state;
+    assert!(matches!(state, State::Aborting | State::Aborted), "{state}");
+}
+
+#[tokio::test]
+async fn a_transfer_breaks_off_between_two_pages_and_leaves_nothing_in_force() {
+    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    let mut cmm = ModbusCmm::new(patient(settings(&serving))).unwrap();
+    cmm.connect().await.unwrap();
+    cmm.claim().await.unwrap();
+    let (interrupt, plan) = (Interrupt::new(), plan(20_000));
+    let raiser = interrupt.clone();
+    let page_written = Arc::new(AtomicU32::new(0));
+    let seen = page_written.clone();
+    serving.faults().set(FaultPlan::new(0).always(
+        When::Matching(Box::new(move |request| {
+            // The hundredth page raises the flag, so that the break comes in the middle for certain.
+            if request.function == 16 && request.address == 224 && seen.fetch_add(1, Ordering::SeqCst) == 100 {
+                raiser.raise();
+            }
+            false
+        })),
+        Fault::DropReply,
+    ));
+    let broken = cmm.load_plan(&plan, &interrupt).await;
+    assert!(matches!(broken, Err(DeviceError::Interrupted { done: 101, of: 5001, .. })), "{broken:?}");
+    let asked = Instant::now();
+    cmm.abort().await.unwrap();
+    println!("abort acknowledged after {:.1} ms", asked.elapsed().as_secs_f64() * 1e3);
+    let unprepared = cmm.prepare(job_of(&plan, 1)).await;
+    assert!(matches!(unprepared, Err(DeviceError::Mismatch { .. })), "{unprepared:?}");
+}
+
+#[tokio::test]
+async fn further_signals_are_read_scaled_and_held_against_their_range() {
+    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    let temperature = Signal {
+        name: "part_temperature".into(),
+        address: 97,
+        kind: SignalType::I16,
+        scale: 0.01,
+        unit: "C".into(),
+        least: 15.0,
+        most: 25.0,
+    };
+    let narrow = Signal { most: 19.0, ..temperature.clone() };
+    let mut cmm = ModbusCmm::new(ModbusSettings { signals: vec![temperature], ..settings(&serving) }).unwrap();
+    cmm.connect().await.unwrap();
+    let status = cmm.status().await.unwrap();
+    assert_eq!((status.signals[0].value, status.temperature_c), (20.25, 20.25));
+    let mut cmm = ModbusCmm::new(ModbusSettings { signals: vec![narrow], ..settings(&serving) }).unwrap();
+    cmm.connect().await.unwrap();
+    let refused = cmm.status().await.unwrap_err();
+    assert!(matches!(refused, DeviceError::OutOfRange { most: 19.0, .. }), "{refused}");
+}
+
+// ---- not the machine that is meant --------------------------------------------------------------------------------------------------
+
+/// Something that answers every read with the same registers, and counts what is written to it.
+async fn impostor(image: Vec<u16>) -> (ModbusSettings, Arc<AtomicU32>) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let port = listener.local_addr().unwrap().port();
+    let writes = Arc::new(AtomicU32::new(0));
+    let counter = writes.clone();
+    tokio::spawn(async move {
+        while let Ok((mut stream, _)) = listener.accept().await {
+            let mut head = [0; 8];
+            while stream.read_exact(&mut head).await.is_ok() {
+                let mut rest = vec![0; usize::from(u16::from_be_bytes([head[4], head[5]])) - 2];
+                stream.read_exact(&mut rest).await.unwrap();
+                if head[7] != 3 {
+                    counter.fetch_add(1, Ordering::SeqCst);
+                }
+                let count = usize::from(u16::from_be_bytes([rest[2], rest[3]]));
+                let mut answer = head[..4].to_vec();
+                answer.extend((2 * count as u16 + 3).to_be_bytes());
+                answer.extend([head[6], 3, 2 * count as u8]);
+                (0..count).for_each(|k| answer.extend(image.get(k).copied().unwrap_or(0).to_be_bytes()));
+                stream.write_all(&answer).await.unwrap();
+            }
+        }
+    });
+    (ModbusSettings::new(Wire::Tcp { host: "127.0.0.1".into(), port }), writes)
+}
+
+fn true_identity() -> Vec<u16> {
+    let mut image = vec![0x5247, 0x4431, 1, 1, 0x1234, 0x5678, 0xbe90, 0xc6f7, 0xa0b5, 0xed8d, 0, 9, 0, 1];
+    image.resize(32, 0);
+    image
+}
+
+async fn refusal(change: impl FnOnce(&mut Vec<u16>)) -> DeviceError {
+    let mut image = true_identity();
+    change(&mut image);
+    let (settings, writes) = impostor(image).await;
+    let refused = ModbusCmm::new(settings).unwrap().connect().await.unwrap_err();
+    assert_eq!(writes.load(Ordering::SeqCst), 0, "written to: {refused}");
+    println!("{refused}");
+    refused
+}
+
+#[tokio::test]
+async fn what_is_not_the_machine_is_told_apart_and_never_written_to() {
+    let e = refusal(|image| image.fill(0)).await;
+    assert!(matches!(e, DeviceError::WrongDevice { address: 0, required: 0x5247, found: 0, .. }), "{e}");
+    let e = refusal(|image| image[1] = 0x4432).await;
+    assert!(matches!(e, DeviceError::WrongDevice { address: 1, .. }), "{e}");
+    let e = refusal(|image| image[2] = 2).await;
+    assert!(matches!(e, DeviceError::WrongVersion { required: 1, found: 2, .. }), "{e}");
+    let e = refusal(|image| image[3] = 2).await;
+    assert!(matches!(e, DeviceError::WrongKind { found: MachineKind::Grinder, .. }), "{e}");
+    let e = refusal(|image| image[13] = 2).await;
+    assert!(matches!(e, DeviceError::Inches { unit: 2, .. }), "{e}");
+    let e = refusal(|image| {
+        image[4..6].reverse();
+        image[6..10].reverse();
+    })
+    .await;
+    assert!(matches!(e, DeviceError::WrongWordOrder { fits: Some("little"), .. }), "{e}");
+    let e = refusal(|image| image[4..6].reverse()).await;
+    assert!(matches!(e, DeviceError::WrongWordOrder { fits: None, .. }), "{e}");
+}
+
+#[tokio::test]
+async fn a_machine_with_the_right_identity_that_does_not_answer_freshly_is_not_believed() {
+    let (settings, writes) = impostor(true_identity()).await;
+    let settings = ModbusSettings { retries: 1, quarantine: Duration::ZERO, ..settings };
+    let refused = ModbusCmm::new(settings).unwrap().connect().await.unwrap_err();
+    assert!(matches!(refused, DeviceError::Corrupt { .. }), "{refused}");
+    assert!(writes.load(Ordering::SeqCst) > 0);
+}
+
+#[tokio::test]
+async fn nobody_there_is_said_so() {
+    // A port that is taken and not listened on.
+    let taken = TcpSocket::new_v4().unwrap();
+    taken.bind("127.0.0.1:0".parse().unwrap()).unwrap();
+    let port = taken.local_addr().unwrap().port();
+    let wire = Wire::Tcp { host: "127.0.0.1".into(), port };
+    let absent = ModbusCmm::new(ModbusSettings { retries: 1, ..ModbusSettings::new(wire) }).unwrap().connect().await;
+    assert!(matches!(absent, Err(DeviceError::Unreachable { .. })), "{absent:?}");
+    let wire = Wire::Rtu { device: "/dev/no-such-port".into(), baud: 9600, parity: Parity::Even, stop_bits: 1 };
+    let absent = ModbusCmm::new(ModbusSettings { retries: 1, ..ModbusSettings::new(wire) }).unwrap().connect().await;
+    assert!(matches!(absent, Err(DeviceError::Unreachable { .. })), "{absent:?}");
+}
+
+// ---- out of order -------------------------------------------------------------------------------------------------------------------
+
+/// Everything that a wire can do to an answer without the machine being at fault.
+fn wire_faults() -> Vec<Fault> {
+    vec![
+        Fault::DropRequest,
+        Fault::DropReply,
+        Fault::DelayReply(Duration::from_millis(350)),
+        Fault::DuplicateReply,
+        Fault::Truncate(9),
+        Fault::Extra(vec![1, 3, 2, 0, 7]),
+        Fault::WrongTransaction,
+        Fault::WrongUnit,
+        Fault::WrongFunction,
+        Fault::Exception(6),
+        Fault::Exception(11),
+        Fault::Split(Duration::from_micros(100)),
+        Fault::FlipCrc,
+        Fault::Disconnect(5),
+        Fault::TornStatus,
+        Fault::CarryOutAgain(3),
+    ]
+}
+
+#[tokio::test]
+async fn every_fault_of_the_wire_ends_in_the_right_points_or_in_an_error() {
+    let plan = plan(60);
+    for fault in wire_faults() {
+        let rules = FaultPlan::new(5).always(When::Every(17), fault.clone());
+        let serving = serve(Kind::Cmm, AT_ONCE, rules.into()).await;
+        let mut cmm = ModbusCmm::new(settings(&serving)).unwrap();
+        let hint = format!("{fault:?}");
+        cmm.connect().await.unwrap_or_else(|error| panic!("{hint}: {error}"));
+        let measured = measure(&mut cmm, &plan, 1).await;
+        let measured = measured.unwrap_or_else(|error| panic!("{hint}: {error}"));
+        assert_exact(&plan, &measured, &hint);
+        assert_eq!(began(&serving).len(), 1, "{hint}");
+        assert!(!serving.faults().fired().is_empty(), "{hint}");
+    }
+}
+
+#[tokio::test]
+async fn seeded_mixtures_of_faults_give_no_wrong_value_and_no_second_start() {
+    let plan = plan(40);
+    let mut finished = 0;
+    for seed in 0..12 {
+        let faults = FaultPlan::seeded(seed, 0.06, wire_faults()).into();
+        let serving = serve(Kind::Cmm, AT_ONCE, faults).await;
+        let mut cmm = ModbusCmm::new(settings(&serving)).unwrap();
+        let hint = format!("seed {seed}");
+        let outcome = match cmm.connect().await {
+            Ok(_) => measure(&mut cmm, &plan, 1).await,
+            Err(error) => Err(error),
+        };
+        match outcome {
+            Ok(measured) => {
+                assert_exact(&plan, &measured, &hint);
+                finished += 1;
+            }
+            Err(error) => println!("{hint}: {error}"),
+        }
+        assert!(began(&serving).len() <= 1, "{hint}: begun twice");
+    }
+    assert!(finished >= 6, "only {finished} of 12 came through");
+}
+
+#[tokio::test]
+async fn a_bit_that_every_check_sum_of_the_wire_passes_is_still_found() {
+    // In the pages, where the CRC-32 over the whole stands; once, so that the second fetch comes through.
+    let rules = FaultPlan::new(1).once(When::Reading(462), Fault::FlipData);
+    let serving = serve(Kind::Cmm, AT_ONCE, rules.into()).await;
+    let mut cmm = ModbusCmm::new(settings(&serving)).unwrap();
+    cmm.connect().await.unwrap();
+    let plan = plan(40);
+    assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), "a flipped bit");
+    assert_eq!((serving.faults().fired().len(), cmm.link().figures().corrupt), (1, 1));
+    // And for ever: an error, no points.
+    serving.faults().set(FaultPlan::new(1).always(When::Reading(462), Fault::FlipData));
+    let refused = measure(&mut cmm, &plan, 2).await;
+    assert!(matches!(refused, Err(DeviceError::Corrupt { what: "check number of a result", .. })), "{refused:?}");
+}
+
+async fn armed(serving: &Serving, plan: &Plan) -> (ModbusCmm, Armed) {
+    let settings = ModbusSettings { retries: 2, lost_after: Duration::from_secs(2), ..settings(serving) };
+    let mut cmm = ModbusCmm::new(settings).unwrap();
+    cmm.connect().await.unwrap();
+    cmm.claim().await.unwrap();
+    cmm.load_plan(plan, &Interrupt::new()).await.unwrap();
+    let armed = cmm.prepare(job_of(plan, 1)).await.unwrap();
+    (cmm, armed)
+}
+
+#[tokio::test]
+async fn a_start_whose_answer_is_lost_is_the_same_start_when_it_is_written_again() {
+    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, Faults::none()).await, plan(10));
+    let (mut cmm, armed) = armed(&serving, &plan).await;
+    serving.faults().set(FaultPlan::new(0).times(1, 2, When::Commanding(3), Fault::DropReply));
+    let sequence = armed.start_sequence;
+    assert_eq!(cmm.start(armed).await.unwrap().start_sequence, sequence);
+    assert_eq!(began(&serving), [(sequence, 42, 1)]);
+}
+
+/// Nothing gets through after the first START, nor does that if it is lost too.
+fn silent_from_start(lost: bool) -> FaultPlan {
+    let mut seen = false;
+    let rule = When::Matching(Box::new(move |request| {
+        let first = !seen && request.command == Some(3);
+        seen |= first;
+        if first { lost } else { seen }
+    }));
+    FaultPlan::new(0).always(rule, Fault::DropRequest)
+}
+
+#[tokio::test]
+async fn a_start_that_is_lost_with_the_line_is_unknown_and_then_found_to_run() {
+    let (serving, plan) = (serve(Kind::Cmm, 1.0, Faults::none()).await, plan(100));
+    let (mut cmm, armed) = armed(&serving, &plan).await;
+    // It is carried out, and from then on nothing answers.
+    serving.faults().set(silent_from_start(false).once(When::Commanding(3), Fault::DropReply));
+    let unknown = cmm.start(armed.clone()).await;
+    assert!(matches!(&unknown, Err(DeviceError::StartUnknown { sequence, .. }) if *sequence == armed.start_sequence));
+    serving.faults().set(FaultPlan::new(0));
+    cmm.connect().await.unwrap();
+    let found = cmm.reconcile(&armed).await.unwrap();
+    assert!(matches!(found, Reconciled::Running(_)), "{found:?}");
+    assert_eq!(began(&serving).len(), 1);
+}
+
+#[tokio::test]
+async fn a_start_that_never_arrived_is_seen_twice_not_to_have() {
+    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, Faults::none()).await, plan(10));
+    let (mut cmm, armed) = armed(&serving, &plan).await;
+    serving.faults().set(silent_from_start(true));
+    let unknown = cmm.start(armed.clone()).await;
+    assert!(matches!(unknown, Err(DeviceError::StartUnknown { .. })), "{unknown:?}");
+    serving.faults().set(FaultPlan::new(0));
+    // A client that has been started anew knows of the start from its journal only.
+    let mut after = ModbusCmm::new(settings(&serving)).unwrap();
+    after.connect().await.unwrap();
+    let asked = Instant::now();
+    let found = after.reconcile(&armed).await.unwrap();
+    assert!(matches!(found, Reconciled::NotStarted(_)), "{found:?}");
+    assert!(asked.elapsed() >= Duration::from_secs(1));
+    assert!(began(&serving).is_empty());
+}
+
+#[tokio::test]
+async fn a_finished_start_is_found_and_a_restarted_machine_is_not_trusted() {
+    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, Faults::none()).await, plan(10));
+    let (mut cmm, armed) = armed(&serving, &plan).await;
+    cmm.start(armed.clone()).await.unwrap();
+    until_complete(&mut cmm).await.unwrap();
+    let found = cmm.reconcile(&armed).await.unwrap();
+    assert!(matches!(found, Reconciled::Finished(_)), "{found:?}");
+    serving.machine(1).unwrap().with(registers::Machine::reboot);
+    let restarted = cmm.status().await;
+    assert!(matches!(restarted, Err(DeviceError::Restarted { .. })), "{restarted:?}");
+    cmm.connect().await.unwrap();
+    let found = cmm.reconcile(&armed).await.unwrap();
+    assert!(matches!(found, Reconciled::Unknown { .. }), "{found:?}");
+    let dead = cmm.start(armed).await;
+    assert!(matches!(dead, Err(DeviceError::Restarted { .. })), "{dead:?}");
+    assert_eq!(began(&serving).len(), 1);
+}
+
+#[tokio::test]
+async fn a_frozen_application_behind_a_living_wire_is_found() {
+    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    let mut cmm = ModbusCmm::new(settings(&serving)).unwrap();
+    cmm.connect().await.unwrap();
+    serving.machine(1).unwrap().with(|machine| machine.freeze(true));
+    let began = Instant::now();
+    let frozen = loop {
+        match cmm.status().await {
+            Err(error) => break error,
+            Ok(_) => tokio::time::sleep(Duration::from_millis(50)).await,
+        }
+        assert!(began.elapsed() < Duration::from_secs(20));
+    };
+    assert!(matches!(frozen, DeviceError::Frozen { .. }), "{frozen}");
+    serving.machine(1).unwrap().with(|machine| machine.freeze(false));
+    let began = Instant::now();
+    while cmm.status().await.is_err() {
+        assert!(began.elapsed() < Duration::from_secs(20));
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+// ---- serial lines -------------------------------------------------------------------------------------------------------------------
+
+fn rtu(units: Vec<(u8, registers::Machine)>, line: Line, faults: Faults) -> (Serving, ModbusSettings) {
+    let serving = Serving::rtu(units, line, faults).unwrap();
+    let device = serving.path().unwrap().to_string_lossy().into_owned();
+    let wire = Wire::Rtu { device, baud: line.baud, parity: Parity::None, stop_bits: 1 };
+    let settings = ModbusSettings {
+        request_timeout: Duration::from_millis(300),
+        quarantine: Duration::from_millis(200),
+        retries: 6,
+        lost_after: Duration::from_secs(20),
+        ..ModbusSettings::new(wire)
+    };
+    (serving, settings)
+}
+
+#[tokio::test]
+async fn two_machines_share_a_serial_line() {
+    let options = MachineOptions::default;
+    let units = vec![(1, toy(Kind::Cmm, AT_ONCE, options())), (2, toy(Kind::Grinder, AT_ONCE, options()))];
+    let (_serving, settings) = rtu(units, Line::unpaced(115_200), Faults::none());
+    let settings = patient(settings);
+    let link = Link::new(settings.wire.clone(), settings.request_timeout, settings.quarantine).unwrap();
+    let mut cmm = ModbusCmm::on(link.clone(), settings.clone());
+    let mut grinder = ModbusGrinder::on(link.clone(), ModbusSettings { unit: 2, ..settings });
+    cmm.connect().await.unwrap();
+    grinder.connect().await.unwrap();
+    grinder.claim().await.unwrap();
+    let (plan, (map, pass), calm) = (plan(40), map_and_pass(), Interrupt::new());
+    let (measured, loaded) = tokio::join!(measure(&mut cmm, &plan, 1), grinder.load_pass(&map, &pass, &calm));
+    assert_exact(&plan, &measured.unwrap(), "two on a line");
+    loaded.unwrap();
+    assert_eq!(link.figures().opened, 1);
+}
+
+#[tokio::test]
+async fn faults_on_a_serial_line_end_in_the_right_points() {
+    let plan = plan(20);
+    let mut faults = wire_faults();
+    faults.retain(|fault| !matches!(fault, Fault::WrongTransaction));
+    faults.push(Fault::Noise(vec![0xff, 0x00, 0x13]));
+    for fault in faults {
+        let rules = FaultPlan::new(5).always(When::Every(23), fault.clone());
+        let machine = toy(Kind::Cmm, AT_ONCE, MachineOptions::default());
+        let (serving, settings) = rtu(vec![(1, machine)], Line::unpaced(115_200), rules.into());
+        let mut cmm = ModbusCmm::new(settings).unwrap();
+        let hint = format!("{fault:?}");
+        cmm.connect().await.unwrap_or_else(|error| panic!("{hint}: {error}"));
+        let measured = measure(&mut cmm, &plan, 1).await;
+        assert_exact(&plan, &measured.unwrap_or_else(|error| panic!("{hint}: {error}")), &hint);
+        assert_eq!(began(&serving).len(), 1, "{hint}");
+    }
+}
+
+#[tokio::test]
+async fn an_answer_that_comes_after_the_quarantine_is_not_taken_for_the_next_one() {
+    let plan = plan(20);
+    let rules = FaultPlan::new(5).times(2, 2, When::Reading(64), Fault::DelayReply(Duration::from_millis(900))).times(
+        3,
+        2,
+        When::Reading(462),
+        Fault::DelayReply(Duration::from_millis(900)),
+    );
+    let machine = toy(Kind::Cmm, AT_ONCE, MachineOptions::default());
+    let (serving, settings) = rtu(vec![(1, machine)], Line::unpaced(115_200), rules.into());
+    let mut cmm = ModbusCmm::new(settings).unwrap();
+    cmm.connect().await.unwrap();
+    assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), "late");
+    assert_eq!((serving.faults().fired().len(), began(&serving).len()), (4, 1));
+    assert!(cmm.link().figures().timeouts >= 4, "{:?}", cmm.link().figures());
+}
+
+#[tokio::test]
+async fn a_prepared_job_that_has_died_is_not_started() {
+    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, Faults::none()).await, plan(10));
+    let (mut cmm, armed) = armed(&serving, &plan).await;
+    serving.machine(1).unwrap().with(|machine| machine.open_interlocks(1));
+    let refused = cmm.start(armed).await;
+    assert!(matches!(refused, Err(DeviceError::Refused { command: Command::Start, .. })), "{refused:?}");
+    assert!(began(&serving).is_empty());
+}
+
+#[tokio::test]
+async fn a_hold_is_on_the_wire_within_a_tenth_of_a_second_whatever_is_being_transferred() {
+    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    let mut cmm = ModbusCmm::new(settings(&serving)).unwrap();
+    cmm.connect().await.unwrap();
+    cmm.claim().await.unwrap();
+    let plan = plan(4000);
+    let mut waits = Vec::new();
+    for _ in 0..40 {
+        let interrupt = Interrupt::new();
+        let raiser = interrupt.clone();
+        let pages = Arc::new(AtomicU32::new(0));
+        serving.faults().set(FaultPlan::new(0).always(
+            When::Matching(Box::new(move |request| {
+                if request.function == 16 && request.address == 224 && pages.fetch_add(1, Ordering::SeqCst) == 30 {
+                    raiser.raise();
+                }
+                false
+            })),
+            Fault::DropReply,
+        ));
+        let broken = cmm.load_plan(&plan, &interrupt).await;
+        assert!(matches!(broken, Err(DeviceError::Interrupted { .. })), "{broken:?}");
+        let raised = Instant::now();
+        let refused = cmm.hold().await; // it is idle, so it says no, but it says so
+        waits.push(raised.elapsed());
+        assert!(matches!(refused, Err(DeviceError::Refused { command: Command::Hold, .. })), "{refused:?}");
+    }
+    waits.sort();
+    println!("hold acknowledged: median {:.1?}, worst {:.1?} of 40", waits[20], waits[39]);
+    assert!(waits[20] < Duration::from_millis(100), "median {:?}", waits[20]);
+}
+
+/// The figure of the README: run with `--ignored --nocapture`.
+#[tokio::test]
+#[ignore = "takes as long as a line of 115,200 baud takes, half a minute"]
+async fn eighteen_hundred_points_over_a_serial_line() {
+    let machine = toy(Kind::Cmm, AT_ONCE, MachineOptions::default());
+    let (_serving, settings) = rtu(vec![(1, machine)], Line::paced(115_200), Faults::none());
+    let mut cmm = ModbusCmm::new(ModbusSettings { request_timeout: Duration::from_secs(2), ..settings }).unwrap();
+    cmm.connect().await.unwrap();
+    cmm.claim().await.unwrap();
+    let (plan, calm) = (plan(1800), Interrupt::new());
+    let began = Instant::now();
+    cmm.load_plan(&plan, &calm).await.unwrap();
+    let loaded = began.elapsed();
+    let job = job_of(&plan, 1);
+    let armed = cmm.prepare(job).await.unwrap();
+    cmm.start(armed).await.unwrap();
+    until_complete(&mut cmm).await.unwrap();
+    let began = Instant::now();
+    let measured = cmm.collect(job, &calm).await.unwrap();
+    let collected = began.elapsed();
+    assert_exact(&plan, &measured, "1,800 points");
+    let ms = |time: Duration| time.as_secs_f64() * 1e3 / 1800.0;
+    println!(
+        "plan {loaded:.1?} ({:.2} ms a point), points {collected:.1?} ({:.2} ms a point)",
+        ms(loaded),
+        ms(collected)
+    );
+    println!("{:?}", cmm.link().figures());
+}

@@ -1,0 +1,7 @@
+//! Files in and out: points, meshes and maps.
+
+#[path = "../common/data.rs"]
+mod data;
+mod map_files;
+mod points;
+mod real_files;

@@ -1,0 +1,540 @@
+//! Files in and out: every notation that is understood, every fault that is named, and nothing that panics.
+
+use std::fs::{self, File};
+use std::io::{self, Read, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use proptest::prelude::*;
+use regrind::formats::*;
+use regrind::geometry::Point;
+
+type Outcome = Result<Vec<Point>, FormatError>;
+
+fn text(content: impl AsRef<[u8]>) -> Outcome {
+    parse_points(Path::new("measured.csv"), content.as_ref())
+}
+
+fn message(content: impl AsRef<[u8]>) -> String {
+    text(content).expect_err("an error").to_string()
+}
+
+/// A small deterministic generator, so that a failure can be repeated.
+struct Lcg(u64);
+
+impl Lcg {
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        self.0 >> 33
+    }
+
+    fn bytes(&mut self, count: usize) -> Vec<u8> {
+        (0..count).map(|_| self.next() as u8).collect()
+    }
+}
+
+fn two_points() -> Vec<Point> {
+    vec![Point::new(1.5, -2.25, 3.0), Point::new(4.0, 5.5, -1200.125)]
+}
+
+#[test]
+fn every_separator_and_header_is_understood() {
+    let forms: &[&str] = &[
+        "1.5,-2.25,3\n4,5.5,-1200.125\n",
+        "1.5;-2.25;3\n4;5.5;-1200.125\n",
+        "1.5\t-2.25\t3\n4\t5.5\t-1200.125",
+        "  1.5  -2.25 \t 3 \n4 5.5 -1200.125\n",
+        "1.5, -2.25, 3 \r\n4, 5.5,\t-1200.125\r\n",
+        "\u{feff}x,y,z\r\n1.5,-2.25,3\r\n4,5.5,-1200.125",
+        "x_mm;y_mm;z_mm\n1,5;-2,25;3\n4;5,5;-1200,125\n",
+        "1,5 -2,25 3\n4 5,5 -1.200,125\n",
+        "left;right;up\n1.5;-2.25;3\n4;5.5;-1,200.125\n",
+        "# a comment\n\n// another, with, commas\nx y z\n1.5 -2.25 3\n# between\n\n4 5.5 -1200.125\n\n\n",
+        "id,Z [mm],Y [mm],X [mm],note\na,3,-2.25,1.5,\"p, 1\"\nb,-1200.125,5.5,4,\n",
+        "# id x y z\n1 1.5 -2.25 3\n2 4 5.5 -1200.125\n",
+        "Enabled\tID \tx     \ty \tz\ti\nChecked\t1\t1.5\t-2.25\t3.0\t \nChecked\t2\t4.0\t5.5\t\"-1,200.1250\"\t \n",
+        "x,y,z,x_res\n1.5,-2.25,3,nan\n4,5.5,-1200.125,\n",
+        "x (mm) y (mm) z (mm)\n1.5 -2.25 3\n4 5.5 -1200.125\n",
+        "x_mm,y_mm,z_mm,nx,ny,nz,deviation_mm,used\n1.5,-2.25,3,0,0,1,1e-3,1\n4,5.5,-1200.125,0,0,1,0,0\n",
+        "+1.5,-225e-2,3.\n4e0,5.5,-1.200125E+3\n",
+    ];
+    for form in forms {
+        assert_eq!(text(form).unwrap_or_else(|e| panic!("{e}\n{form}")), two_points(), "{form}");
+    }
+}
+
+#[test]
+fn a_fault_is_named_with_place_finding_and_remedy() {
+    let cases: &[(&str, &str)] = &[
+        ("", "measured.csv: the file is empty, expected points; export it again"),
+        ("\n# nothing\n\n", "measured.csv: the file is empty"),
+        ("x,y,z\n", "measured.csv: a header but no points after it"),
+        (
+            "x,y,z\n1,2,3\n1,abc,3\n",
+            "measured.csv, line 3, column 2: expected a number in millimetres, found `abc`; remove the text or give the column \
+             a header",
+        ),
+        ("1,2,3\n1,,3\n", "line 2, column 2: expected a number in millimetres, found nothing"),
+        ("1,2,3\n1,2,nan\n", "line 2, column 3: expected a finite number in millimetres, found `nan`"),
+        ("nan,nan,nan\n", "line 1, column 1: expected a finite number"),
+        ("1,-inf,3\n", "line 1, column 2: expected a finite number"),
+        ("1,2,1e300\n", "line 1, column 3: expected at most 1e7 mm in size, found `1e300`"),
+        ("1,2,1e999\n", "found `1e999`"),
+        ("1,2,3\n1,2\n1,2,3\n", "line 2: expected 3 columns separated by comma as in line 1, found 2"),
+        ("1,2,3\n1,2,3,4\n", "line 2: expected 3 columns separated by comma as in line 1, found 4"),
+        ("1 2 3 4\n1 2 3 \n", "line 2: expected 4 columns separated by blank as in line 1, found 3"),
+        ("1;2;3\n1,2,3\n", "line 2: expected 3 columns separated by semicolon as in line 1, found 1"),
+        (
+            "1|2|3\n4|5|6\n",
+            "line 2: expected three columns x, y, z separated by comma, semicolon, tab or blank, found 1",
+        ),
+        ("1,2\n", "line 1: expected three columns"),
+        ("words of prose\nmore words\n", "line 2: expected three columns x, y, z"),
+        ("a title line\nfoo bar baz\n", "line 2, column 1: expected a number in millimetres, found `foo`"),
+        ("1,2,3\n0x10,2,3\n", "found `0x10`"),
+        ("1,2,3\n1,2,3mm\n", "line 2, column 3: expected a number in millimetres, found `3mm`"),
+        ("1,2,3\n4,5", "line 2: the file is cut in the middle of a line, found `4,5`"),
+        ("1,2,3\n4,5,-", "the file is cut in the middle of a line"),
+        ("x,y,z\n1;2;3\n", "line 1: the header has 1 columns separated by semicolon, the data under it has 3"),
+        ("id,x,y\n1,2,3\n", "line 1: the header names column 2 x but not all of x, y and z"),
+        ("x,y,z,x\n1,2,3,4\n", "line 1: the header names 2 columns x"),
+        ("x_m,y_m,z_m\n1,2,3\n", "line 1: expected coordinates in mm, found the unit `m`; convert the file to mm"),
+        ("x [inch];y [inch];z [inch]\n1;2;3\n", "found the unit `inch`"),
+        ("x [mm];y [mm];z [\u{b5}m]\n1;2;3\n", "found the unit `\u{b5}m`"),
+        ("# units: inch\n1 2 3\n", "line 1: expected coordinates in mm, found the unit `inch`"),
+        ("12,345;23,456;34,567\n", "line 1, column 1: `12,345` may have a decimal comma or a thousands comma"),
+        ("1.5;2.5;3.5\n1,5;2,5;3,5\n", "line 2, column 1: expected a number with a decimal point like those before it"),
+        ("1,5;2,5;3,5\n1.5;2.5;3.5\n", "line 2, column 1: expected a number with a decimal comma like those before it"),
+        ("1.5;2.5;3.5\n1.5;2,512;3.5\n", "line 2, column 2: `2,512` may have a decimal comma or a thousands comma"),
+        ("1,2,3\n1,\"2,3\n", "line 2"),
+        ("1,2,3\n1,2,3\0\n", "line 2: expected text, found byte 0x00"),
+    ];
+    for (content, expected) in cases {
+        let message = message(content);
+        assert!(message.contains(expected), "{content:?}\n gave {message}\n not {expected}");
+        assert!(message.starts_with("measured.csv") && !message.ends_with('.'), "{message}");
+    }
+    assert!(matches!(text(b"\xff\xfe1\0,\0"), Err(FormatError::Utf16 { .. })));
+    assert!(matches!(text(b"PK\x03\x04binary"), Err(FormatError::NotText { line: 1, value: 3, .. })));
+}
+
+/// A line far down, past several batches and shares, is still named by its number.
+#[test]
+fn a_bad_line_far_down_has_its_number() {
+    let mut content = String::from("x,y,z\n");
+    for line in 0..400_000 {
+        content += if line % 7 == 0 { "1.5,2.5,3.5\n# note\n" } else { "1.23456789,2.3456789,3.456789\n" };
+    }
+    let good = text(&content).unwrap();
+    assert_eq!(good.len(), 400_000);
+    let line = content.lines().count() as u64 + 1;
+    content += "1,2,oops\n1,2,nan\n";
+    assert!(matches!(text(&content), Err(FormatError::NotANumber { line: l, column: 3, .. }) if l == line));
+    content.insert(content.len() / 2, '\0');
+    assert!(text(&content).is_err());
+}
+
+#[test]
+fn order_is_kept_across_batches() {
+    let content: String = (0..300_000).map(|i| format!("{i},{}.5,-0.000{i}\n", i / 3)).collect();
+    let points = text(content).unwrap();
+    assert_eq!(points.len(), 300_000);
+    assert!(points.iter().enumerate().all(|(i, p)| p.x == i as f64 && p.y == (i / 3) as f64 + 0.5));
+}
+
+/// An endless stream that repeats a piece; it counts what was taken from it.
+struct Endless<'a> {
+    piece: &'a [u8],
+    at: usize,
+    taken: &'a AtomicU64,
+}
+
+impl Read for Endless<'_> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        for byte in buffer.iter_mut() {
+            *byte = self.piece[self.at % self.piece.len()];
+            self.at += 1;
+        }
+        self.taken.fetch_add(buffer.len() as u64, Ordering::Relaxed);
+        Ok(buffer.len())
+    }
+}
+
+#[test]
+fn endless_rubbish_is_given_up_early() {
+    let rubbish: [&[u8]; 6] = [b"\0", b"9", b" ", b"no end of words ", b"\x7f\xf0\xd3", b"1,2,3\nfoo\n"];
+    for piece in rubbish {
+        let taken = AtomicU64::new(0);
+        let outcome = parse_points(Path::new("endless"), Endless { piece, at: 0, taken: &taken });
+        assert!(outcome.is_err());
+        assert!(taken.load(Ordering::Relaxed) < 10 << 20, "{piece:?} took {taken:?}");
+    }
+}
+
+#[test]
+fn sparse_files_of_a_gigabyte_are_refused_at_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let begin: [(&str, &[u8]); 4] = [
+        ("zeros.csv", b""),
+        ("good-then-zeros.csv", b"x,y,z\n1,2,3\n"),
+        ("cut.ply", b"ply\nformat ascii 1.0\nelement vertex 4000000000\nproperty float x\nproperty float y\nproperty float z\nend_header\n"),
+        ("zeros.stl", b""),
+    ];
+    for (name, head) in begin {
+        let path = folder.path().join(name);
+        let mut file = File::create(&path).unwrap();
+        file.write_all(head).unwrap();
+        file.set_len((1 << 30) - 1).unwrap();
+        let message = read_nominal(&path).expect_err(name).to_string();
+        assert!(message.contains(name), "{message}");
+    }
+    let path = folder.path().join("large.csv");
+    File::create(&path).unwrap().set_len(3 << 30).unwrap();
+    assert!(matches!(read_points(&path), Err(FormatError::TooLarge { .. })));
+}
+
+fn ply_ascii() -> Vec<u8> {
+    b"ply\nformat ascii 1.0\ncomment by hand\nelement camera 1\nproperty list uchar float values\nelement vertex 4\n\
+      property uchar red\nproperty double z\nproperty float x\nproperty list uchar int tags\nproperty float y\n\
+      element face 2\nproperty uchar flags\nproperty list uchar int vertex_indices\nend_header\n\
+      2 0.5 nan\n1 0 0 0 0\n2 0 1 2 7 8 0\n3 0.5 1 0 1\n4 0 0 1 9 1\n9 4 0 1 2 3\n9 3 0 1 1\n"
+        .to_vec()
+}
+
+fn ply_binary(big: bool) -> Vec<u8> {
+    let order = if big { "big" } else { "little" };
+    let mut bytes = format!(
+        "ply\nformat binary_{order}_endian 1.0\nelement vertex 3\nproperty short x\nproperty float ny\nproperty double y\n\
+         property list uint8 uint16 tags\nproperty float z\nproperty float nx\nproperty float nz\nelement face 1\n\
+         property list uchar uint vertex_index\nend_header\n"
+    )
+    .into_bytes();
+    let mut put = |little: &[u8]| {
+        let value: Vec<u8> = if big { little.iter().rev().copied().collect() } else { little.to_vec() };
+        bytes.extend(value);
+    };
+    for (x, y, z) in [(-1i16, 0.5f64, 2.0f32), (1, 0.25, -3.5), (300, 1e-3, 0.0)] {
+        put(&x.to_le_bytes());
+        put(&0f32.to_le_bytes());
+        put(&y.to_le_bytes());
+        put(&[2]);
+        put(&7u16.to_le_bytes());
+        put(&8u16.to_le_bytes());
+        put(&z.to_le_bytes());
+        put(&0f32.to_le_bytes());
+        put(&2f32.to_le_bytes());
+    }
+    put(&[3]);
+    [2u32, 0, 1].iter().for_each(|index| put(&index.to_le_bytes()));
+    bytes
+}
+
+#[test]
+fn ply_is_read_in_all_encodings() {
+    let path = Path::new("part.ply");
+    let file = parse_ply(path, &ply_ascii()).unwrap();
+    assert_eq!(file.points[2], Point::new(1.0, 1.0, 0.5));
+    assert_eq!(file.triangles, [[0, 1, 2], [0, 2, 3]]);
+    assert_eq!((file.degenerate, file.normals), (1, None));
+    for big in [false, true] {
+        let file = parse_ply(path, &ply_binary(big)).unwrap();
+        assert_eq!(
+            file.points,
+            [Point::new(-1.0, 0.5, 2.0), Point::new(1.0, 0.25, -3.5), Point::new(300.0, 1e-3, 0.0)]
+        );
+        assert_eq!(file.triangles, [[2, 0, 1]]);
+        assert_eq!(file.normals.unwrap()[1].z, 1.0);
+    }
+}
+
+#[test]
+fn faults_of_ply_are_named() {
+    let good = String::from_utf8(ply_ascii()).unwrap();
+    let cases = [
+        ("ply\n", "plywood\n", "line 1: expected `ply` in a line of its own, found `plywood`"),
+        ("format ascii 1.0\n", "", "line 3: expected `format ascii 1.0` or another format"),
+        ("format ascii 1.0", "format ascii 2.0", "line 2: expected `format ascii 1.0`"),
+        ("format ascii", "format utf", "line 2: expected format ascii, binary_little_endian or binary_big_endian"),
+        ("vertex 4", "vertex -4", "line 6: expected an element with a count"),
+        ("vertex 4", "vertex 99999999999999999999", "line 6: expected an element with a count"),
+        ("vertex 4", "vertex 99999999999", "is more than the limit of 4294967295 vertices"),
+        ("vertex 4", "vertex 0", "no vertices"),
+        ("vertex 4", "vertex 5", "line 22: the file is cut, expected face 2 of 2"),
+        ("vertex 4", "points 4", "expected one element vertex, found `0 of them`"),
+        ("double z", "real z", "line 8: expected a type such as float"),
+        ("double z", "double w", "expected scalar properties x, y and z"),
+        ("double z", "double x", "line 9: expected a property of another name"),
+        ("list uchar int vertex", "list float int vertex", "line 14: expected a list with an integer length"),
+        ("list uchar int vertex", "list uchar float vertex", "expected vertex indices of an integer type"),
+        ("element camera 1\n", "", "line 4: expected an element before its properties"),
+        ("comment by hand", "remark by hand", "line 3: expected comment, element, property or end_header"),
+        ("9 4 0 1 2 3", "9 4 0 1 2 4", "line 21: face names vertex 4, but there are 4"),
+        ("9 4 0 1 2 3", "9 4 0 1 2 -1", "line 21: face names vertex -1"),
+        ("9 4 0 1 2 3", "9 2 0 1", "line 21: expected at least 3 corners of face 1, found `2`"),
+        ("9 4 0 1 2 3", "9 4.5 0 1 2 3", "line 21: expected face 1 of 2, found `4.5`"),
+        (
+            "9 4 0 1 2 3",
+            "9 -4 0 1 2 3",
+            "line 21: expected the length of list vertex_indices of face 1 of 2, found `-4`",
+        ),
+        ("3 0.5 1", "3 nan 1", "line 19: expected z as a finite number"),
+        ("3 0.5 1", "3 1e9 1", "line 19: expected z as a finite number of at most 1e7 mm, found 1000000000"),
+        ("3 0.5 1", "3 half 1", "line 19: expected vertex 3 of 4, found `half`"),
+        ("3 0.5 1 0 1", "3 0.5 1 0 1 5", "line 19: expected vertex 3 of 4, found `5`"),
+        ("9 3 0 1 1\n", "", "the file is cut, expected face 2 of 2"),
+        ("9 3 0 1 1\n", "9 3 0 1 1\nmore\n", "line 23: expected the end of the file, found `more`"),
+    ];
+    for (from, to, expected) in cases {
+        let bad = good.replacen(from, to, 1);
+        assert_ne!(bad, good);
+        let message = parse_ply(Path::new("part.ply"), bad.as_bytes()).expect_err(to).to_string();
+        assert!(
+            message.starts_with("part.ply") && message.contains(expected),
+            "{to}\n gave {message}\n not {expected}"
+        );
+    }
+}
+
+fn stl_ascii() -> Vec<u8> {
+    let facet = |a: &str, b: &str, c: &str| {
+        format!(
+            " facet normal 0 0 1\n  outer loop\n   vertex {a}\n   vertex {b}\n   vertex {c}\n  endloop\n endfacet\n"
+        )
+    };
+    let facets =
+        facet("0 0 0", "1 0 0", "0 1 0.5") + &facet("1 0 -0", "1 1 0", "0 1 0.5") + &facet("0 0 0", "1 0 0", "2 0 0");
+    format!("solid a part\n{facets}endsolid a part\n").into_bytes()
+}
+
+fn stl_binary(points: &[[f32; 3]]) -> Vec<u8> {
+    let mut bytes = b"solid, but binary all the same".to_vec();
+    bytes.resize(80, b' ');
+    bytes.extend((points.len() as u32 / 3).to_le_bytes());
+    for facet in points.chunks_exact(3) {
+        bytes.extend([0; 12]);
+        facet.iter().flatten().for_each(|v| bytes.extend(v.to_le_bytes()));
+        bytes.extend([0; 2]);
+    }
+    bytes
+}
+
+const TWO_FACETS: [[f32; 3]; 6] =
+    [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.5], [1.0, -0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.5]];
+
+#[test]
+fn stl_is_welded_and_its_faults_are_named() {
+    let path = Path::new("part.stl");
+    for (bytes, degenerate) in [(stl_ascii(), 1), (stl_binary(&TWO_FACETS), 0)] {
+        let mesh = parse_stl(path, &bytes).unwrap();
+        assert_eq!(mesh.points.len(), 4);
+        assert_eq!(mesh.points[2], Point::new(0.0, 1.0, 0.5));
+        assert_eq!((mesh.triangles, mesh.degenerate), (vec![[0, 1, 2], [1, 3, 2]], degenerate));
+    }
+    let good = String::from_utf8(stl_ascii()).unwrap();
+    let cases = [
+        ("facet normal", "facette normal", "line 2: expected `facet` or `endsolid`, found `facette`"),
+        ("outer loop", "inner loop", "line 3: expected `outer`, found `inner`"),
+        ("vertex 1 0 0", "vertex 1 0", "line 6: expected coordinate z in millimetres, found `vertex`"),
+        ("vertex 1 0 0", "vertex 1 nan 0", "line 5: expected y as a finite number"),
+        ("vertex 1 0 0", "vertex 1 0 1e8", "line 5: expected z as a finite number"),
+        ("vertex 1 0 0", "vertex 1,5 0 0", "line 5: expected coordinate x in millimetres, found `1,5`"),
+        ("endsolid a part\n", "", "line 23: the file is cut, expected facet"),
+    ];
+    for (from, to, expected) in cases {
+        let message = parse_stl(path, good.replacen(from, to, 1).as_bytes()).expect_err(to).to_string();
+        assert!(
+            message.starts_with("part.stl") && message.contains(expected),
+            "{to}\n gave {message}\n not {expected}"
+        );
+    }
+    let mut bad = stl_binary(&TWO_FACETS);
+    bad[84 + 12 + 4..84 + 12 + 8].copy_from_slice(&f32::NAN.to_le_bytes());
+    let message = parse_stl(path, &bad).unwrap_err().to_string();
+    assert!(message.contains("part.stl, byte 100: expected y as a finite number"), "{message}");
+    assert!(matches!(parse_stl(path, &stl_binary(&[])), Err(FormatError::NoData { .. })));
+    let flat = stl_binary(&[[1.0, 2.0, 3.0]; 3]);
+    assert!(matches!(parse_stl(path, &flat), Err(FormatError::NoData { .. })));
+}
+
+#[test]
+fn a_cut_at_any_byte_is_an_error_or_a_whole_prefix() {
+    let cloud = b"x_mm,y_mm,z_mm\n1.5,-2.25,3.125\n4.5,5.5,-6.5\n7,8,9\n";
+    for end in 0..cloud.len() {
+        match text(&cloud[..end]) {
+            Ok(points) => {
+                let lines = cloud[..end].iter().filter(|&&b| b == b'\n').count();
+                assert!(points.len() + 1 == lines || points.len() == lines, "{end}");
+            }
+            Err(error) => assert!(error.to_string().starts_with("measured.csv"), "{error}"),
+        }
+    }
+    let path = Path::new("part");
+    for bytes in [ply_ascii(), ply_binary(false), ply_binary(true)] {
+        // Without its last newline a text file is whole; without its last digit it may be too.
+        for end in 0..bytes.len() - 2 {
+            let error = parse_ply(path, &bytes[..end]).expect_err("cut");
+            assert!(error.is_cut() || end > bytes.len() - 14, "{end}: {error}");
+        }
+    }
+    for bytes in [stl_ascii(), stl_binary(&TWO_FACETS)] {
+        let last_word = bytes.len() - if bytes[6] == b'a' { 8 } else { 0 };
+        for end in 0..last_word {
+            let error = parse_stl(path, &bytes[..end]).expect_err("cut");
+            assert!(error.is_cut(), "{end}: {error}");
+        }
+    }
+}
+
+#[test]
+fn random_bytes_never_panic() {
+    let mut random = Lcg(7);
+    let path = Path::new("noise");
+    let seeds = [ply_ascii(), ply_binary(false), ply_binary(true), stl_ascii(), stl_binary(&TWO_FACETS)];
+    let cloud = b"# c\nx;y;z\n1,5;\"2.000,5\";3\n4;5,5;6e1\n".to_vec();
+    for round in 0..2000 {
+        let length = random.next() as usize % 300;
+        let noise = random.bytes(length);
+        let digits: Vec<u8> = noise.iter().map(|b| b"0123456789.,;-+eE# \t\r\n\"xyznaif"[*b as usize % 30]).collect();
+        let mut damaged = if round % 6 == 5 { cloud.clone() } else { seeds[round % 6].clone() };
+        for _ in 0..1 + random.next() % 4 {
+            let at = random.next() as usize % damaged.len();
+            damaged[at] = random.next() as u8;
+        }
+        for bytes in [&noise, &digits, &damaged] {
+            if let Ok(points) = parse_points(path, &bytes[..]) {
+                assert!(points.iter().all(|p| p.iter().all(|v| v.abs() <= LIMIT_MM)));
+            }
+            if let Ok(file) = parse_ply(path, bytes) {
+                assert!(file.triangles.iter().flatten().all(|&i| (i as usize) < file.points.len()));
+            }
+            let _ = parse_stl(path, bytes);
+        }
+    }
+}
+
+/// A generous list of the same lines in quick and careful form gives the same numbers.
+#[test]
+fn the_quick_way_and_the_careful_way_agree() {
+    let mut random = Lcg(3);
+    let value = |random: &mut Lcg| (random.next() as f64 - 1e9) / 10f64.powi((random.next() % 12) as i32);
+    let rows: Vec<[f64; 3]> = (0..5000).map(|_| [(); 3].map(|()| value(&mut random) / 1e3)).collect();
+    let plain: String = rows.iter().map(|[x, y, z]| format!("{x},{y},{z}\n")).collect();
+    let quoted: String = rows.iter().map(|[x, y, z]| format!("\"{x}\",\"{y}\",\"{z}\"\n")).collect();
+    let comma = plain.replace(',', ";").replace('.', ",");
+    let expected: Vec<Point> = rows.iter().map(|&row| Point::from(row)).collect();
+    for form in [plain, quoted, comma] {
+        assert_eq!(text(form).unwrap(), expected);
+    }
+}
+
+#[test]
+fn content_comes_before_the_extension() {
+    let folder = tempfile::tempdir().unwrap();
+    let put = |name: &str, bytes: &[u8]| {
+        let path = folder.path().join(name);
+        fs::write(&path, bytes).unwrap();
+        path
+    };
+    let is = |name: &str, bytes: &[u8]| read_nominal(put(name, bytes));
+    assert!(matches!(is("a.txt", &ply_ascii()), Ok(NominalFile::Mesh { points, .. }) if points.len() == 4));
+    assert!(matches!(is("a.csv", &stl_binary(&TWO_FACETS)), Ok(NominalFile::Mesh { .. })));
+    assert!(matches!(is("a.dat", &stl_ascii()), Ok(NominalFile::Mesh { .. })));
+    assert!(matches!(is("a.stl", b"1,2,3\n"), Ok(NominalFile::Points(points)) if points.len() == 1));
+    assert!(matches!(is("a", b"# sphere\n[surface]\nkind = \"sphere\"\n"), Ok(NominalFile::Definition(_))));
+    assert!(matches!(is("b", b"kind = \"sphere\"\n"), Ok(NominalFile::Definition(_))));
+    assert!(matches!(is("empty.toml", b""), Err(FormatError::Empty { .. })));
+    assert!(matches!(is("rubbish.ply", b"\x01\x02"), Err(FormatError::Unexpected { .. })));
+    assert!(matches!(is("rubbish.stl", b"\x01\x02"), Err(FormatError::Cut { .. })));
+    assert!(matches!(is("rubbish.xyz", b"\x01\x02"), Err(FormatError::NotText { .. })));
+    assert!(matches!(is("latin.toml", b"a = 1\nb = \"\xb5\"\n"), Err(FormatError::NotText { line: 2, .. })));
+
+    assert_eq!(read_measured(put("m.ply", &ply_ascii())).unwrap().len(), 4);
+    assert_eq!(read_measured(put("m.csv", b"1 2 3\n")).unwrap().len(), 1);
+    assert!(matches!(read_measured(put("m.stl", &stl_ascii())), Err(FormatError::WrongKind { .. })));
+    assert!(matches!(read_measured(put("m.toml", b"[a]\n")), Err(FormatError::WrongKind { .. })));
+    assert!(matches!(read_measured(folder.path().join("none")), Err(FormatError::Unreadable { .. })));
+    assert!(matches!(read_measured(folder.path()), Err(FormatError::Unreadable { .. })));
+}
+
+#[test]
+fn results_are_written_whole_or_not_at_all() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("deviations.csv");
+    let row = |i: usize| DeviationRow {
+        point_mm: [i as f64 / 3.0, -1.0, 1e-9],
+        normal: [0.0, 0.0, 1.0],
+        deviation_mm: -1.25e-4,
+        used: i.is_multiple_of(2),
+    };
+    let rows: Vec<DeviationRow> = (0..70_000).map(row).collect();
+    write_deviations(&path, &rows).unwrap();
+    let written = fs::read_to_string(&path).unwrap();
+    let mut lines = written.lines();
+    assert_eq!(lines.next(), Some("x_mm,y_mm,z_mm,nx,ny,nz,deviation_mm,used"));
+    for (line, row) in lines.by_ref().zip(&rows) {
+        let cells: Vec<f64> = line.split(',').map(|cell| cell.parse().unwrap()).collect();
+        assert_eq!(cells[..3], row.point_mm);
+        assert_eq!(cells[6..], [row.deviation_mm, f64::from(u8::from(row.used))]);
+    }
+    assert_eq!(read_points(&path).unwrap().len(), rows.len());
+
+    let mut bad = rows.clone();
+    bad[41].deviation_mm = f64::NAN;
+    assert!(matches!(write_deviations(&path, &bad), Err(FormatError::RowNotFinite { row: 42, .. })));
+    assert_eq!(fs::read_to_string(&path).unwrap(), written);
+
+    write_json_atomic(folder.path().join("r.json"), &vec![1.5, 0.1]).unwrap();
+    assert_eq!(fs::read_to_string(folder.path().join("r.json")).unwrap(), "[\n  1.5,\n  0.1\n]\n");
+    for target in [folder.path().to_owned(), folder.path().join("none/r.json"), PathBuf::from("/")] {
+        let error = write_json_atomic(&target, &1).expect_err("unwritable");
+        assert!(matches!(error, FormatError::Unwritable { .. }), "{error}");
+    }
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 2, "no temporary file is left");
+}
+
+fn coordinates(most: f64) -> impl Strategy<Value = Vec<[f64; 3]>> {
+    proptest::collection::vec([-most..most, -most..most, -1e-3..1e-3], 1..60)
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 48, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn points_survive_text_and_ply(rows in coordinates(LIMIT_MM)) {
+        let points: Vec<Point> = rows.iter().map(|&row| Point::from(row)).collect();
+        let folder = tempfile::tempdir().unwrap();
+        for header in ["", "x_mm,y_mm,z_mm"] {
+            let path = folder.path().join("points.csv");
+            write_points(&path, header, &points).unwrap();
+            prop_assert_eq!(&read_measured(&path).unwrap(), &points);
+        }
+        let head = |format: &str| {
+            format!(
+                "ply\nformat {format} 1.0\nelement vertex {}\nproperty double x\nproperty double y\nproperty double z\n\
+                 end_header\n",
+                rows.len()
+            )
+            .into_bytes()
+        };
+        let mut ascii = head("ascii");
+        rows.iter().for_each(|[x, y, z]| ascii.extend(format!("{x} {y} {z}\n").into_bytes()));
+        let mut little = head("binary_little_endian");
+        rows.iter().flatten().for_each(|v| little.extend(v.to_le_bytes()));
+        let mut big = head("binary_big_endian");
+        rows.iter().flatten().for_each(|v| big.extend(v.to_be_bytes()));
+        for bytes in [ascii, little, big] {
+            prop_assert_eq!(&parse_ply(Path::new("p"), &bytes).unwrap().points, &points);
+        }
+    }
+
+    #[test]
+    fn corners_survive_stl(rows in coordinates(1e3)) {
+        let corners: Vec<[f32; 3]> = rows.iter().map(|row| row.map(|v| v as f32)).collect();
+        let corners = &corners[..corners.len() / 3 * 3];
+        prop_assume!(!corners.is_empty());
+        let mesh = parse_stl(Path::new("p"), &stl_binary(corners)).unwrap();
+        let back: Vec<Point> = mesh.triangles.iter().flatten().map(|&i| mesh.points[i as usize]).collect();
+        let expected: Vec<Point> = corners.iter().map(|c| Point::from(c.map(f64::from))).collect();
+        prop_assert_eq!(back, expected);
+    }
+}

@@ -1,0 +1,309 @@
+//! Programs that exist already, corrected by a map: `regrind compensate`.
+
+use std::fs;
+use std::path::PathBuf;
+
+use crate::path::{Step, error_mm, read};
+use crate::program::run;
+use regrind::compensation::{Correction, ErrorMap};
+use regrind::formats::{CorrectionIdentities, ErrorMapOrigin, write_correction, write_error_map};
+use regrind::geometry::Grid;
+
+const GRID: Grid = Grid { columns: 121, rows: 81, first_mm: [-30.0, -20.0], spacing_mm: [0.5, 0.5] };
+const PART: [u8; 32] = [0xab; 32];
+
+/// A folder with a map of the error over 60 x 40 mm and a program.
+pub struct Shop {
+    folder: tempfile::TempDir,
+}
+
+impl Shop {
+    pub fn new(error: impl Fn(f64, f64) -> f64, program: &str) -> Self {
+        let bench = Self { folder: tempfile::tempdir().unwrap() };
+        bench.save_error(error, None);
+        fs::write(bench.path("base.ngc"), program).unwrap();
+        bench
+    }
+
+    /// Writes the map as a run does it.
+    fn save_error(&self, error: impl Fn(f64, f64) -> f64, ground_with: Option<[u8; 32]>) {
+        let values_mm = (0..GRID.len()).map(|k| GRID.place_mm(k)).map(|[x, y]| error(x, y)).collect();
+        let map = ErrorMap::known(GRID, values_mm, vec![true; GRID.len()]);
+        let origin = ErrorMapOrigin { part: PART, cycle: 1, ground_with };
+        write_error_map(&self.path("map.csv"), &map, &origin, true).unwrap();
+    }
+
+    /// Writes a correction as a run does it, which has this map's identity.
+    fn save_correction(&self, map: [u8; 32]) {
+        let identities = CorrectionIdentities { part: PART, map, replaces: [1; 32] };
+        write_correction(&self.path("map.csv"), &Correction::none(GRID, 0.02), &identities, true).unwrap();
+    }
+
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    pub fn compensate(&self, more: &[&str]) -> Result<String, String> {
+        self.correct("base.ngc", "out.ngc", more)
+    }
+
+    fn correct(&self, base: &str, out: &str, more: &[&str]) -> Result<String, String> {
+        let mut arguments = vec!["compensate", "--program", base, "--map", "map.csv", "--out", out];
+        arguments.extend(more);
+        let (code, _, said) = run(&arguments, self.folder.path());
+        match code {
+            0 => Ok(fs::read_to_string(self.path(out)).unwrap()),
+            2 => Err(said),
+            _ => panic!("exit code {code}: {said}"),
+        }
+    }
+}
+
+/// Steps at feed.
+fn feeds(text: &str) -> Vec<[f64; 3]> {
+    read(text).into_iter().filter(|s| s.feed).map(|s| s.at).collect()
+}
+
+/// The largest distance of a polyline from the corrected path over it: z less the error, at every x and y on the way.
+fn worst_mm(points: &[[f64; 3]], z: f64, error: impl Fn(f64, f64) -> f64) -> f64 {
+    let mut worst = 0.0f64;
+    for pair in points.windows(2) {
+        for k in 0..=20 {
+            let t = f64::from(k) / 20.0;
+            let [x, y, at] = [0, 1, 2].map(|c| pair[0][c] + t * (pair[1][c] - pair[0][c]));
+            worst = worst.max((at - (z - error(x, y))).abs());
+        }
+    }
+    worst
+}
+
+#[test]
+fn a_long_line_is_divided_where_the_correction_changes_along_it() {
+    // Flat on the left, a wave on the right.
+    let error = |x: f64, _: f64| if x > 0.0 { 5e-3 * (1.0 - (0.4 * x).cos()) } else { 0.0 };
+    let bench = Shop::new(error, "G21 G90 G17\nG0 Z5\nG0 X-28 Y3\nG1 Z1 F500\nG1 X28 Y3\nG0 Z5\nM2\n");
+    let text = bench.compensate(&[]).unwrap();
+    let points = feeds(&text);
+    assert!(points.len() > 20 && points.len() < 200, "{}", points.len());
+    assert!(points.iter().filter(|p| p[0] < -2.0).count() <= 3, "the flat part is not divided");
+    assert_eq!(points[0], [-28.0, 3.0, 1.0]);
+    let worst = worst_mm(&points, 1.0, error);
+    assert!(worst < 1.1e-4, "{worst}");
+    assert!(
+        text.contains("(base: sha256 ")
+            && text.contains("(map: sha256 ")
+            && text.contains("(SIMULATION)")
+            && text.contains("F500")
+    );
+    // Half of the gain is half of the correction.
+    let half = feeds(&bench.correct("base.ngc", "half.ngc", &["--gain", "0.5"]).unwrap());
+    assert!((half.last().unwrap()[2] - (1.0 - 0.5 * error(28.0, 3.0))).abs() < 1e-6);
+}
+
+#[test]
+fn rapid_moves_and_machine_coordinates_stay_as_they_are() {
+    let program = "%\n(head)\nN10 G21 G90 G54\nN20 G53 G0 Z0\nN30 G0 X0 Y0\nN40 G0 Z2.5 M8\nN50 G1 X10 Y5 F200 S3000\nN60 G53 G0 Z0\nN70 X1 Y1\nN80 M30\n%\n";
+    let bench = Shop::new(error_mm, program);
+    let text = bench.compensate(&[]).unwrap();
+    assert!(text.starts_with("%\n(Regrind ") && text.trim_end().ends_with("%"));
+    assert_eq!(text.matches("G53 G0 Z0").count(), 2);
+    assert!(
+        text.contains("G0 X0.000000 Y0.000000\n")
+            && text.contains("M8\nG0 Z2.500000\n")
+            && text.contains("F200 S3000\n")
+    );
+    // After the rapid move the tool is brought to where the corrected path begins.
+    let points = feeds(&text);
+    assert!((points[0][2] - (2.5 - error_mm(0.0, 0.0))).abs() < 1e-6 && points[0][0] == 0.0);
+    assert!(worst_mm(&points, 2.5, error_mm) < 1.1e-4);
+}
+
+#[test]
+fn arcs_stay_arcs_only_where_the_correction_is_the_same_all_along() {
+    let program = "G21 G90 G17\nG0 X10 Y0 Z1\nG1 Z0 F300\nG3 X0 Y10 I-10 J0\nG2 X10 Y0 R10\nG3 X10 Y0 I-10\nM2\n";
+    let constant = Shop::new(|_, _| 0.004, program).compensate(&[]).unwrap();
+    assert!(constant.contains("G3 X0.000000 Y10.000000 Z-0.004000 I-10.000000 J0.000000\n"), "{constant}");
+    assert!(constant.contains("G2 X10.000000 Y0.000000 Z-0.004000 I0.000000 J-10.000000\n"), "{constant}");
+    assert_eq!(constant.matches("\nG3 ").count(), 2);
+    let bench = Shop::new(error_mm, program);
+    let text = bench.compensate(&[]).unwrap();
+    assert!(!text.contains("G3 X") && !text.contains("G2 X"));
+    let points = feeds(&text);
+    let off = points[1..].windows(2).map(|pair| {
+        let middle = [0, 1].map(|k| 0.5 * (pair[0][k] + pair[1][k]));
+        // The first and the last arc are about the origin, the other about the same place from outside.
+        (middle[0].hypot(middle[1]) - 10.0).abs()
+    });
+    assert!(off.fold(0.0, f64::max) < 1e-4);
+    assert!(points.iter().all(|p| (p[2] + error_mm(p[0], p[1])).abs() < 1e-6));
+    let turned = points.last().unwrap();
+    assert!((turned[0] - 10.0).abs() < 1e-6 && turned[1].abs() < 1e-6);
+}
+
+#[test]
+fn arcs_in_the_other_planes_helices_inches_and_distances() {
+    let side = "G21 G90 G18\nG0 X0 Y2 Z10\nG1 X0.001 F100\nG2 X10 Z0 I-0.001 K-10\nM2\n";
+    let text = Shop::new(|_, _| 0.003, side).compensate(&[]).unwrap();
+    assert!(text.contains("G2 X10.000000 Y2.000000 Z-0.003000"), "{text}");
+    let inches = "G20 G90\nG0 X0 Y0 Z0.1\nG1 Z0 F10\nG1 X1\nM2\n";
+    let text = Shop::new(|_, _| 0.00254, inches).compensate(&[]).unwrap();
+    assert!(text.contains("G1 X1.00000000 Y0.00000000 Z-0.00010000\n"), "{text}");
+    let relative = "G21 G91\nG90 G0 X1 Y1 Z1\nG91 G1 X2 F100\nX3 Z-0.5\nG0 Z4\nM2\n";
+    let text = Shop::new(|_, _| 0.002, relative).compensate(&[]).unwrap();
+    assert!(text.contains("G1 X6.000000 Y1.000000 Z0.498000\n") && text.contains("G0 Z4.500000\n"), "{text}");
+    assert!(!text.contains("G91"));
+}
+
+#[test]
+fn what_moves_the_tool_and_is_not_told_is_refused_with_its_line() {
+    for (line, words) in [
+        ("G81 X1 Y1 Z-1 R2", "canned cycle"),
+        ("O100 call", "O-word"),
+        ("G1 X#1", "variable"),
+        ("G1 X[1+1]", "variable"),
+        ("G41 D1", "radius"),
+        ("G92 X0", "zero"),
+        ("G93", "times"),
+        ("G5.2 X1", "zero"),
+        ("G1 X1 A5", "turns the part"),
+        ("M98 P1", "subprogram"),
+        ("/G1 X1", "stroke"),
+        ("G2 X1 Y1", "centre"),
+        ("G2 X1 Y1 I9 J9", "radius"),
+        ("G1 X1 X2", "twice"),
+        ("G80\nX5", "no G0"),
+        ("G53 G2 X1 Y1 I1", "G53"),
+        ("G1 X1\nG55 G1 X1", "zero"),
+        ("G53 G0 Z0\nG1 X2", "not known where Z"),
+        ("G91\nG53 G0 Z0", "G53"),
+        ("G1 X1e3", "not known"),
+        ("E5", "not known"),
+    ] {
+        let bench = Shop::new(error_mm, &format!("G21 G90\nG0 X0 Y0 Z1\nG1 Z0 F100\n{line}\nM2\n"));
+        let said = bench.compensate(&[]).expect_err(line);
+        let number = 3 + line.lines().count();
+        assert!(said.contains(words) && said.contains(&format!("line {number}")), "{line}: {said}");
+        assert!(!bench.path("out.ngc").exists(), "{line}");
+    }
+    let lost = Shop::new(error_mm, "G21 G90\nG1 X1 F100\nM2\n").compensate(&[]).unwrap_err();
+    assert!(lost.contains("XYZ") && lost.contains("G0"), "{lost}");
+}
+
+#[test]
+fn a_map_is_applied_once_and_only_to_its_part() {
+    let program = "G21 G90\nG0 X0 Y0 Z1\nG1 X5 F100\nM2\n";
+    let bench = Shop::new(error_mm, program);
+    bench.compensate(&[]).unwrap();
+    let again = bench.correct("out.ngc", "twice.ngc", &[]).unwrap_err();
+    assert!(again.contains("already applied") && !bench.path("twice.ngc").exists(), "{again}");
+    // Another map of the same part goes on top.
+    let first = fs::read_to_string(bench.path("map.csv")).unwrap();
+    fs::write(bench.path("map.csv"), first.replace(",1\n", ",0\n")).unwrap();
+    let both = bench.correct("out.ngc", "both.ngc", &[]).unwrap();
+    assert_eq!(both.matches("(map: sha256 ").count(), 2);
+    let other = Shop::new(error_mm, &format!("(part: sha256 {})\n{program}", "cd".repeat(32)));
+    assert!(other.compensate(&[]).unwrap_err().contains("another part"));
+}
+
+#[test]
+fn a_map_goes_only_onto_the_program_that_it_was_made_for() {
+    let program = |comments: &str| format!("{comments}G21 G90\nG0 X-20 Y0 Z5\nG1 Z0 F100\nG1 X20\nM2\n");
+    let (one, other) = ("01".repeat(32), "02".repeat(32));
+    let has = |map: &str| format!("(part: sha256 {})\n(map: sha256 {map})\n", "ab".repeat(32));
+    let bench = Shop::new(|_, _| 0.001, &program(""));
+    let after = |comments: &str| {
+        fs::write(bench.path("base.ngc"), program(comments)).unwrap();
+        bench.compensate(&[]).map(|_| ())
+    };
+    // An error that was measured after a pass with a correction belongs on the program with that correction.
+    bench.save_error(|_, _| 0.001, Some([1; 32]));
+    after(&has(&one)).unwrap();
+    for comments in [has(&other), String::new(), has(&one) + "(map: 0 everywhere)\n"] {
+        let said = after(&comments).unwrap_err();
+        assert!(said.contains("another correction than the program has"), "{said}");
+    }
+    // A correction is absolute: it does not come on top of another.
+    bench.save_correction([3; 32]);
+    after("").unwrap();
+    after(&(has(&other) + "(map: 0 everywhere)\n")).unwrap();
+    let said = after(&has(&other)).unwrap_err();
+    assert!(said.contains("absolute") && said.contains("regrind plan --program"), "{said}");
+    let said = after(&has(&"03".repeat(32))).unwrap_err();
+    assert!(said.contains("already applied"), "{said}");
+}
+
+#[test]
+fn maps_that_are_none_are_refused() {
+    let bench = Shop::new(error_mm, "G21 G90\nG0 X0 Y0 Z1\nG1 X5 F100\nM2\n");
+    let whole = fs::read_to_string(bench.path("map.csv")).unwrap();
+    let without = |n: usize| {
+        whole.lines().enumerate().filter(|(k, _)| *k != n).map(|(_, l)| format!("{l}\n")).collect::<String>()
+    };
+    for (text, words) in [
+        (String::new(), "empty"),
+        (without(whole.lines().position(|line| line.starts_with("x_mm")).unwrap()), "columns"),
+        (without(50), "no whole grid"),
+        (whole.replace("0.5,0.5,", "0.5,0.5,x"), "no node"),
+        (whole.replace("0.5,0.5,", "0.5,0.5,NaN;"), "no node"),
+    ] {
+        fs::write(bench.path("map.csv"), text).unwrap();
+        let said = bench.compensate(&[]).unwrap_err();
+        assert!(said.contains(words) && said.contains("map.csv"), "{words}: {said}");
+    }
+}
+
+#[test]
+fn along_the_normals_the_ball_leaves_the_corrected_surface() {
+    // A dome z = -x^2 / 80 - y^2 / 120 and a ball of 5 mm whose tip the program moves.
+    let height = |x: f64, y: f64| -x * x / 80.0 - y * y / 120.0;
+    let normal = |x: f64, y: f64| {
+        let n = [x / 40.0, y / 60.0, 1.0];
+        let length = n.iter().map(|c| c * c).sum::<f64>().sqrt();
+        n.map(|c| c / length)
+    };
+    let radius = 5.0;
+    let mut program = String::from("G21 G90\nG0 Z20\n");
+    for (k, y) in [-6.0, 0.0, 6.0].into_iter().enumerate() {
+        for i in 0..=200 {
+            let x = f64::from(i) * 0.1 - 10.0;
+            let n = normal(x, y);
+            let c = [x + radius * n[0], y + radius * n[1], height(x, y) + radius * n[2] - radius];
+            let g = if i == 0 { format!("G0 X{:.6} Y{:.6}\nG1 F100 ", c[0], c[1]) } else { String::new() };
+            program += &format!("{g}X{:.6} Y{:.6} Z{:.6}\n", c[0], c[1], c[2]);
+        }
+        program += if k < 2 { "G0 Z20\n" } else { "G0 Z20\nM2\n" };
+    }
+    let bench = Shop::new(error_mm, &program);
+    let mut nominal = String::from("x_mm,y_mm,z_mm\n");
+    for j in 0..=100 {
+        for i in 0..=140 {
+            let (x, y) = (f64::from(i) * 0.25 - 17.5, f64::from(j) * 0.25 - 12.5);
+            nominal += &format!("{x},{y},{}\n", height(x, y));
+        }
+    }
+    fs::write(bench.path("nominal.csv"), nominal).unwrap();
+    let text = bench.compensate(&["--nominal", "nominal.csv", "--tip-of-radius", "5"]).unwrap();
+    let steps: Vec<Step> = read(&text);
+    let gap = |q: [f64; 3]| {
+        let segments = steps.windows(2).filter(|pair| pair[1].feed && !pair[0].at[0].is_nan());
+        let off = segments.map(|pair| {
+            let (a, b) = (pair[0].at, pair[1].at);
+            // The centre stands over the tip by the radius.
+            let from = [q[0] - a[0], q[1] - a[1], q[2] - a[2] - radius];
+            let along = [0, 1, 2].map(|k| b[k] - a[k]);
+            let length2 = along.iter().map(|c| c * c).sum::<f64>().max(1e-18);
+            let t = ((0..3).map(|k| from[k] * along[k]).sum::<f64>() / length2).clamp(0.0, 1.0);
+            (0..3).map(|k| (from[k] - t * along[k]).powi(2)).sum::<f64>().sqrt() - radius
+        });
+        off.fold(f64::INFINITY, f64::min)
+    };
+    for y in [-6.0, 0.0, 6.0] {
+        for i in 0..60 {
+            let x = f64::from(i) * 0.3 - 8.9;
+            let (n, e) = (normal(x, y), -error_mm(x, y));
+            let off = gap([x + e * n[0], y + e * n[1], height(x, y) + e * n[2]]);
+            // The base program's own chords, 0.1 mm long, are off by 0.02 um.
+            assert!(off.abs() < 2e-4, "{:.3} um at {x}, {y}", 1e3 * off);
+        }
+    }
+}

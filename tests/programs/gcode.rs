@@ -1,0 +1,57 @@
+//! What stands in a program, and which parts have none.
+
+use std::fs;
+use std::path::Path;
+
+use crate::path::{correction, part, read};
+use regrind::compensation::path::PathError;
+use regrind::config::CellConfig;
+use regrind::recipe::Recipe;
+use regrind::setup;
+
+#[test]
+fn a_part_that_is_worked_on_from_below_has_no_program() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let recipe = Recipe::read(&root.join("recipes/telescope-panel.toml")).unwrap();
+    let cell = CellConfig::read(&root.join("config/file-exchange.toml")).unwrap();
+    let (task, _) = setup::prepare(&recipe, &cell).unwrap();
+    assert_eq!(task.programs.err(), Some(PathError::OtherSide));
+}
+
+#[test]
+fn a_header_says_what_a_person_needs_and_counts_right() {
+    let part = part("freeform-mirror");
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("part.ngc");
+    let summary = part.programs.write(&file, &correction(part.half_mm), [9; 32]).unwrap();
+    let text = fs::read_to_string(&file).unwrap();
+    assert!(text.starts_with("(SIMULATION)\n"));
+    let hash = "09".repeat(32);
+    let lines = text.lines().count();
+    for words in [
+        "(part: free-form mirror)",
+        "(cycle: 2)",
+        &format!(
+            "(part: sha256 {})",
+            part.programs.part_identity.iter().map(|b| format!("{b:02x}")).collect::<String>()
+        ),
+        &format!("(map: sha256 {hash})"),
+        "(level over the nominal surface: 0.02 mm)",
+        "(feed: 1000 mm/min)",
+        &format!("(points: {})", summary.points),
+        &format!("(lines: {lines})"),
+        "G21 G90 G94 G17 G40 G49 G80 G54",
+        "G64 P0.0001 Q0",
+    ] {
+        assert!(text.lines().any(|line| line == words), "{words} is missing");
+    }
+    assert!(text.ends_with("\nM2\n"));
+    assert!(text.lines().all(|line| line.len() < 256 && line.matches('(').count() <= 1 && line.is_ascii()));
+    let steps = read(&text);
+    for k in 0..3 {
+        let within = |v: f64| v >= summary.least_mm[k] - 1e-6 && v <= summary.most_mm[k] + 1e-6;
+        assert!(steps.iter().all(|s| s.at[k].is_nan() || within(s.at[k])));
+    }
+    // The wheel comes down and goes up beyond the edge of the part, and travels above it.
+    assert!(text.lines().filter(|line| line.starts_with("G0")).count() > 100);
+}

@@ -1,0 +1,111 @@
+//! Programs as LinuxCNC's own interpreter reads them: `rs274 -g` of the package linuxcnc-uspace.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use crate::compensate::Shop;
+use crate::path::{correction, error_mm, part, read, wheels, with};
+use regrind::compensation::path::Pattern;
+use regrind::formats::gcode::PathMode;
+
+/// Lets the interpreter read a program; returns what it would have the machine do, or what it said against it. It writes files into the
+/// program's folder.
+fn interpret(program: &Path) -> Result<String, String> {
+    let folder = program.parent().expect("a program stands in a folder");
+    let mut command = Command::new("rs274");
+    // It keeps its tools in a file that it maps into memory in the home folder: two at once with one home kill each other (SIGBUS).
+    command.arg("-g").arg(program).current_dir(folder).env("HOME", folder).stdin(Stdio::null());
+    let output = command.output().expect("rs274 starts: apt-get install linuxcnc-uspace");
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    match output.status.success() {
+        true => Ok(text(&output.stdout)),
+        false => Err(format!("{}: {}", output.status, text(&output.stderr))),
+    }
+}
+
+/// Where a straight feed (true) or a rapid (false) ends.
+type End = ([f64; 3], bool);
+
+/// Where the interpreter's moves end, or what it says against the program.
+fn interpreted(file: &Path) -> Result<Vec<End>, String> {
+    let ends = |text: String| {
+        let ends = text.lines().filter_map(|line| {
+            let (call, rest) = line.split_once("STRAIGHT_")?.1.split_once('(')?;
+            let mut numbers = rest.trim_end_matches(')').split(',').map(|n| n.trim().parse::<f64>().unwrap());
+            Some(([numbers.next()?, numbers.next()?, numbers.next()?], call == "FEED"))
+        });
+        ends.collect()
+    };
+    interpret(file).map(ends)
+}
+
+#[test]
+#[ignore = "needs the interpreter of LinuxCNC: Debian package linuxcnc-uspace"]
+fn every_program_of_every_recipe_is_read_point_by_point() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["freeform-mirror", "off-axis-asphere", "shallow-wave", "biconic"] {
+        let mut part = part(name);
+        let plain = part.programs.options;
+        for (wheel_name, wheel) in wheels(0.8) {
+            for pattern in [Pattern::Raster { one_way: false }, Pattern::Raster { one_way: true }, Pattern::Spiral] {
+                let spaced = if pattern == Pattern::Spiral { 3.0 } else { 6.0 };
+                part.programs.options =
+                    regrind::compensation::path::PathOptions { pattern, ..with(&plain, wheel, spaced) };
+                let file = folder.path().join("part.ngc");
+                part.programs.write(&file, &correction(part.half_mm), [9; 32]).unwrap();
+                let text = fs::read_to_string(&file).unwrap();
+                let ends = interpreted(&file);
+                let ends = ends.unwrap_or_else(|said| panic!("{name}, {wheel_name}, {pattern:?}: {said}"));
+                let ours: Vec<_> = read(&text);
+                assert_eq!(ends.len(), ours.len(), "{name}, {wheel_name}, {pattern:?}");
+                for (theirs, step) in ends.iter().zip(&ours).filter(|(_, step)| !step.at[0].is_nan()) {
+                    // It prints four decimals.
+                    let off = (0..3).map(|k| (theirs.0[k] - step.at[k]).abs()).fold(0.0, f64::max);
+                    assert!(off < 0.6e-4 && theirs.1 == step.feed, "{name}, {wheel_name}: {theirs:?} {step:?}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs the interpreter of LinuxCNC: Debian package linuxcnc-uspace"]
+fn every_path_mode_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("part.ngc");
+    let mut part = part("shallow-wave");
+    part.programs.options = with(&part.programs.options, part.programs.options.wheel, 6.0);
+    let rounded = PathMode::Blend { tolerance_mm: 0.01, naive_mm: 0.001 };
+    for mode in [PathMode::default(), rounded, PathMode::ExactPath, PathMode::ExactStop] {
+        part.programs.mode = mode;
+        part.programs.write(&file, &correction(part.half_mm), [9; 32]).unwrap();
+        let ends = interpreted(&file);
+        assert!(!ends.unwrap_or_else(|said| panic!("{mode:?}: {said}")).is_empty());
+    }
+}
+
+#[test]
+#[ignore = "needs the interpreter of LinuxCNC: Debian package linuxcnc-uspace"]
+fn the_interpreter_is_one_that_refuses() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("bad.ngc");
+    fs::write(&file, "G21 G90\nG1 X1 F100\nG1 X1.5e3\nM2\n").unwrap();
+    let ends = interpreted(&file);
+    let said = ends.unwrap_err();
+    assert!(said.contains("G1 X1.5e3"), "it names the line: {said}");
+}
+
+#[test]
+#[ignore = "needs the interpreter of LinuxCNC: Debian package linuxcnc-uspace"]
+fn corrected_programs_are_read_by_the_interpreter_of_linuxcnc() {
+    let program = "%\nG21 G90 G17 G64 P0.001\nG0 Z5\nG0 X-10 Y0\nG1 Z0 F300\nG1 X10\nG2 X-10 Y0 I-10 J0\nG18 G3 X10 Z0 R10.0\nG17 G91 G1 X1 Y1\nG90 G0 Z5\nM2\n%\n";
+    for error in [|_: f64, _: f64| 0.004, error_mm] {
+        let bench = Shop::new(error, program);
+        bench.compensate(&[]).unwrap();
+        for name in ["base.ngc", "out.ngc"] {
+            let calls = interpret(&bench.path(name));
+            calls.unwrap_or_else(|said| panic!("{name}: {said}"));
+        }
+    }
+}

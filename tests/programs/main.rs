@@ -1,0 +1,9 @@
+//! Programs for the grinder: read back by an interpreter that none of us wrote, swept by wheels, corrected by maps.
+
+mod compensate;
+mod gcode;
+mod linuxcnc;
+mod path;
+#[path = "../common/program.rs"]
+mod program;
+mod sweep;

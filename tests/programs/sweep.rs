@@ -1,0 +1,184 @@
+//! The wheel, swept along a program as it stands in the file, leaves the corrected surface: checked by closed forms alone.
+//!
+//! The surface is that of the simulator's shapes, the wheel a distance of its own, the program is read back from its text.
+
+use crate::path::{Part, Step, correction, part, read, truth, wheels, with};
+use regrind::compensation::path::{PathOptions, Pattern, TrackSpacing, Wheel};
+
+const PARTS: [&str; 4] = ["freeform-mirror", "off-axis-asphere", "shallow-wave", "biconic"];
+/// What a touching place may be off, in millimetres.
+const WITHIN_MM: f64 = 2e-4;
+
+/// How far a point is from a wheel, from its centre.
+fn distance(wheel: &Wheel, d: [f64; 3]) -> f64 {
+    let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    match *wheel {
+        Wheel::Sphere { radius_mm } => dot(d, d).sqrt() - radius_mm,
+        Wheel::Torus { ring_mm, tube_mm, spindle } | Wheel::Cup { ring_mm, tube_mm, spindle } => {
+            let axial = dot(d, spindle.into());
+            let radial = (dot(d, d) - axial * axial).max(0.0).sqrt();
+            let outside =
+                if matches!(wheel, Wheel::Torus { .. }) { (radial - ring_mm).max(0.0) } else { radial - ring_mm };
+            let below = if matches!(wheel, Wheel::Cup { .. }) { axial.min(0.0) } else { axial };
+            outside.hypot(below) - tube_mm
+        }
+    }
+}
+
+/// How far a point stays from a wheel that goes through a program, rapid moves included.
+fn clearance(wheel: &Wheel, steps: &[Step], q: [f64; 3]) -> f64 {
+    let reach = wheel.reach_mm() + 0.1;
+    let mut nearest = f64::INFINITY;
+    for pair in steps.windows(2) {
+        let (a, b) = (pair[0].at, pair[1].at);
+        // The first move knows no x and y.
+        if a.iter().any(|v| v.is_nan()) {
+            continue;
+        }
+        let (low, high) = ([0, 1, 2].map(|k| a[k].min(b[k])), [0, 1, 2].map(|k| a[k].max(b[k])));
+        if (0..3).any(|k| q[k] < low[k] - reach || q[k] > high[k] + reach) {
+            continue;
+        }
+        let at = |t: f64| distance(wheel, [0, 1, 2].map(|k| q[k] - a[k] - t * (b[k] - a[k])));
+        let (mut from, mut to) = (0.0, 1.0);
+        // Along so short a way the distance has one least value; a long rapid one is far away or passes once.
+        let length = (0..3).map(|k| (b[k] - a[k]).powi(2)).sum::<f64>().sqrt();
+        if at(0.5) > nearest + length {
+            continue;
+        }
+        for _ in 0..60 {
+            let (u, v) = (from + (to - from) / 3.0, to - (to - from) / 3.0);
+            if at(u) < at(v) { to = v } else { from = u }
+        }
+        nearest = nearest.min(at(from)).min(at(0.0)).min(at(1.0));
+    }
+    nearest
+}
+
+/// Writes a program and reads it back.
+fn program(part: &Part) -> (Vec<Step>, f64) {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("part.ngc");
+    let correction = correction(part.half_mm);
+    let (path, _) = part.programs.path(&correction).unwrap();
+    part.programs.write(&file, &correction, [3; 32]).unwrap();
+    (read(&std::fs::read_to_string(file).unwrap()), path.track_mm())
+}
+
+/// Places on some tracks of a raster, and beside them by a share of their distance.
+fn places(part: &Part, track_mm: f64, beside: f64) -> Vec<[f64; 2]> {
+    let [a, b] = part.half_mm;
+    let rows = (2.0 * b / track_mm).round() as usize;
+    (0..80)
+        .map(|k| {
+            let row = (k * 7919) % rows;
+            let y = -b + (row as f64 + beside) * track_mm;
+            let x = a * (2.0 * (k as f64 * 0.618_034).fract() - 1.0);
+            [x, y]
+        })
+        .filter(|[x, y]| part.programs.ground.1.contains(*x, *y))
+        .collect()
+}
+
+#[test]
+fn every_wheel_leaves_the_corrected_surface_on_its_tracks() {
+    for name in PARTS {
+        let mut part = part(name);
+        let plain = part.programs.options;
+        for (wheel_name, wheel) in wheels(0.8) {
+            part.programs.options = with(&plain, wheel, 4.0);
+            let (steps, track_mm) = program(&part);
+            for place in places(&part, track_mm, 0.0) {
+                let off = clearance(&wheel, &steps, truth(&part, 0.02, place));
+                assert!(off.abs() < WITHIN_MM, "{name}, {wheel_name}, {place:?}: {:.3} um", 1e3 * off);
+            }
+        }
+    }
+}
+
+#[test]
+fn between_tracks_the_ridges_are_as_high_as_stated_and_nothing_is_cut_deeper() {
+    let height_mm = 1e-2;
+    for (name, (wheel_name, wheel)) in
+        PARTS.into_iter().flat_map(|name| wheels(0.8).into_iter().map(move |w| (name, w)))
+    {
+        let mut part = part(name);
+        part.programs.options = with(&part.programs.options, wheel, 4.0);
+        part.programs.options.spacing = TrackSpacing::Scallop { height_mm, widest_mm: 20.0 };
+        let (steps, track_mm) = program(&part);
+        let mut highest = f64::NEG_INFINITY;
+        for beside in [0.1, 0.3, 0.5] {
+            for place in places(&part, track_mm, beside) {
+                let off = clearance(&wheel, &steps, truth(&part, 0.02, place));
+                assert!(off > -WITHIN_MM, "{name}, {wheel_name}: {:.3} um too deep at {place:?}", -1e3 * off);
+                // The formula takes the ridge for a parabola; the next order is a few percent of it here.
+                assert!(
+                    off < 1.05 * height_mm + WITHIN_MM,
+                    "{name}, {wheel_name}: a ridge of {:.3} um at {place:?}",
+                    1e3 * off
+                );
+                highest = highest.max(off);
+            }
+        }
+        assert!(highest > 0.3 * height_mm, "{name}, {wheel_name}: {highest}");
+    }
+}
+
+#[test]
+fn a_spiral_leaves_ridges_within_its_distance_everywhere() {
+    let mut part = part("off-axis-asphere");
+    let wheel = Wheel::Sphere { radius_mm: 12.5 };
+    part.programs.options = with(&part.programs.options, wheel, 0.4);
+    part.programs.options.pattern = Pattern::Spiral;
+    let (steps, _) = program(&part);
+    // h = s^2 / 8 (1 / R - k): hollow with 180 mm and more; on a slope s grows.
+    let most = 0.4f64.powi(2) / 8.0 / 12.5 * 1.1;
+    for k in 0..200 {
+        let (r, angle) = (29.9 * (k as f64 / 200.0).sqrt(), 2.4 * k as f64);
+        let off = clearance(&wheel, &steps, truth(&part, 0.02, [r * angle.cos(), r * angle.sin()]));
+        assert!(off > -WITHIN_MM && off < most + WITHIN_MM, "{:.3} um at {r} {angle}", 1e3 * off);
+    }
+}
+
+#[test]
+fn no_spiral_cuts_deeper_anywhere() {
+    for name in PARTS {
+        let mut part = part(name);
+        let plain = part.programs.options;
+        for (wheel_name, wheel) in wheels(0.8) {
+            part.programs.options = PathOptions { pattern: Pattern::Spiral, ..with(&plain, wheel, 3.0) };
+            let (steps, _) = program(&part);
+            let [a, b] = part.half_mm;
+            for k in 0..150 {
+                let (r, angle) = ((k as f64 / 150.0).sqrt(), 2.4 * k as f64);
+                let place = [a * r * angle.cos(), b * r * angle.sin()];
+                let off = clearance(&wheel, &steps, truth(&part, 0.02, place));
+                assert!(off > -WITHIN_MM, "{name}, {wheel_name}: {:.3} um too deep at {place:?}", -1e3 * off);
+            }
+        }
+    }
+}
+
+#[test]
+fn with_the_normals_of_the_nominal_surface_it_would_not_hold() {
+    // The check must be able to fail: a ball whose correction was added along z alone is seen at once.
+    let part = part("freeform-mirror");
+    let correction = correction(part.half_mm);
+    let flat = regrind::compensation::Correction { values_mm: vec![0.0; correction.grid.len()], ..correction };
+    let (path, _) = part.programs.path(&flat).unwrap();
+    let steps: Vec<Step> = path
+        .moves()
+        .filter_map(|one| match one {
+            regrind::compensation::path::Move::Feed { at, .. } => {
+                Some(Step { at: [at.x, at.y, at.z + crate::path::error_mm(at.x, at.y)], feed: true })
+            }
+            _ => None,
+        })
+        .collect();
+    let wheel = part.programs.options.wheel;
+    let worst = places(&part, path.track_mm(), 0.0)
+        .into_iter()
+        .map(|place| clearance(&wheel, &steps, truth(&part, 0.02, place)).abs())
+        .fold(0.0, f64::max);
+    assert!(worst > 5.0 * WITHIN_MM, "{worst}");
+}

@@ -1,0 +1,324 @@
+//! What can be wrong with a run folder, a wire, a cell file and a recipe before and while a cell runs: a clear error, the exit code,
+//! a bounded time, and a journal that verifies.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use crate::program::{Running, changed, records_with, regrind, root, run, small_recipe};
+use regrind::journal::verify;
+
+/// No wrong input may keep anybody longer, on the busiest computer.
+const BOUNDED: Duration = Duration::from_secs(60);
+
+fn in_time(arguments: &[&str], home: &Path) -> (i32, String, String) {
+    let began = Instant::now();
+    let ended = run(arguments, home);
+    println!("{arguments:?}: {} in {:.1} s\n{}", ended.0, began.elapsed().as_secs_f64(), ended.2);
+    assert!(began.elapsed() < BOUNDED, "{arguments:?} took {:?}", began.elapsed());
+    assert!(!ended.2.contains("panicked") && !ended.2.contains("fault of the program"), "{}", ended.2);
+    ended
+}
+
+/// The only run folder under a folder.
+fn only_run(runs: &Path) -> PathBuf {
+    let mut folders: Vec<_> = fs::read_dir(runs).unwrap().map(|entry| entry.unwrap().path()).collect();
+    assert_eq!(folders.len(), 1, "{folders:?}");
+    folders.pop().unwrap()
+}
+
+fn recipe(home: &Path, speed: f64) -> String {
+    small_recipe(home, speed).to_str().unwrap().to_owned()
+}
+
+fn sim_cell() -> String {
+    root().join("config/sim.toml").to_str().unwrap().to_owned()
+}
+
+#[test]
+fn a_file_stands_where_the_runs_should_be() {
+    let home = tempfile::tempdir().unwrap();
+    fs::write(home.path().join("runs"), "not a folder").unwrap();
+    let (code, _, errors) = in_time(&["run", &recipe(home.path(), 1e4), "--cell", &sim_cell()], home.path());
+    assert_eq!(code, 2, "{errors}");
+    assert!(errors.contains("runs"), "{errors}");
+    assert_eq!(fs::read_to_string(home.path().join("runs")).unwrap(), "not a folder");
+}
+
+#[test]
+fn runs_that_begin_in_one_second_have_folders_of_their_own() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = recipe(home.path(), 1e4);
+    let mut both: Vec<Running> = (0..2)
+        .map(|_| Running::new(regrind(&["run", &recipe, "--cell", &sim_cell(), "--runs", "runs"], home.path())))
+        .collect();
+    let codes: Vec<_> = both.iter_mut().map(Running::end).collect();
+    for (code, errors) in codes {
+        // The one that found its folder taken a moment ago says so and harms nothing.
+        assert!(code == 0 || code == 2 && errors.contains("runs/"), "{code} {errors}");
+    }
+    for folder in fs::read_dir(home.path().join("runs")).unwrap() {
+        assert!(verify(folder.unwrap().path()).unwrap().closed);
+    }
+}
+
+#[test]
+#[ignore = "needs a user who may not write everywhere: not root"]
+fn a_folder_that_may_not_be_written() {
+    use std::os::unix::fs::PermissionsExt;
+    let home = tempfile::tempdir().unwrap();
+    let recipe = recipe(home.path(), 1e4);
+    let locked = home.path().join("locked");
+    fs::create_dir(&locked).unwrap();
+    fs::set_permissions(&locked, fs::Permissions::from_mode(0o500)).unwrap();
+    let (code, _, errors) = in_time(&["run", &recipe, "--cell", &sim_cell(), "--runs", "locked"], home.path());
+    assert_eq!(code, 2, "{errors}");
+    assert!(errors.contains("locked"), "{errors}");
+}
+
+/// A cell whose record cannot be written any more says so, holds, and can be aborted; what was written verifies.
+fn fills_up(command: Command, home: &Path, named: &str) {
+    let mut running = Running::new(command);
+    let folder = running.folder(home);
+    let words = running.line("what failed", |line| line.starts_with("RECORD"));
+    assert!(words.contains(named), "{words}");
+    // The cell is told, whatever it was that could not be written.
+    running.line("alarm", |line| line.starts_with("ALARM"));
+    let (code, _, errors) = run(&["abort", folder.to_str().unwrap()], home);
+    assert_eq!(code, 0, "an abort needs no disk: {errors}");
+    let (code, words) = running.end();
+    println!("{}\n{words}", running.said.join("\n"));
+    assert_eq!(code, 3, "{words}");
+    let verified = verify(&folder).unwrap();
+    assert!(verified.records > 1, "{verified:?}");
+}
+
+/// The shell's limit on the size of a file: a write beyond it fails.
+#[test]
+fn a_journal_that_cannot_grow_holds_the_cell_and_loses_nothing() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = recipe(home.path(), 2000.0);
+    let mut command = Command::new("bash");
+    // Blocks of 1,024 bytes; the signal that comes with it is ignored, so that the write itself fails.
+    command.args(["-c", "trap '' XFSZ; ulimit -f 120; exec \"$@\"", "regrind", env!("CARGO_BIN_EXE_regrind"), "run"]);
+    command.args([&recipe, "--cell", &sim_cell(), "--runs", "runs"]).current_dir(home.path());
+    fills_up(command, home.path(), "runs/small-");
+}
+
+/// A disk of 400 kB.
+struct SmallDisk(PathBuf);
+
+impl SmallDisk {
+    fn at(folder: PathBuf) -> Self {
+        fs::create_dir(&folder).unwrap();
+        let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", "size=400k", "tmpfs"]).arg(&folder).output();
+        assert!(mounted.is_ok_and(|done| done.status.success()), "a disk of 400 kB is mounted");
+        Self(folder)
+    }
+}
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        // What stays mounted is gone with the machine.
+        let _ = Command::new("umount").arg("-l").arg(&self.0).status();
+    }
+}
+
+#[test]
+#[ignore = "needs a user who may mount a small disk: root"]
+fn a_disk_that_fills_up_holds_the_cell_and_loses_nothing() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = recipe(home.path(), 2000.0);
+    let _disk = SmallDisk::at(home.path().join("small"));
+    let command = regrind(&["run", &recipe, "--cell", &sim_cell(), "--runs", "small"], home.path());
+    fills_up(command, home.path(), "disk");
+}
+
+#[test]
+fn a_port_that_is_taken_cannot_be_simulated() {
+    let home = tempfile::tempdir().unwrap();
+    let taken = std::net::TcpListener::bind(("127.0.0.1", 0)).unwrap();
+    let port = taken.local_addr().unwrap().port().to_string();
+    let cell = changed("config/modbus-tcp.toml", &[("15021", &port), ("15022", "0")]);
+    fs::write(home.path().join("cell.toml"), cell).unwrap();
+    let (code, _, errors) = in_time(&["simulate", &recipe(home.path(), 1e4), "--cell", "cell.toml"], home.path());
+    assert!(code == 2 || code == 3, "{code} {errors}");
+    assert!(errors.contains(&format!("127.0.0.1:{port}")) && errors.contains("choose another port"), "{errors}");
+}
+
+#[test]
+fn a_file_stands_where_a_serial_device_should_be_linked() {
+    let home = tempfile::tempdir().unwrap();
+    let devices = format!("device = \"{}/", home.path().display());
+    let text = changed("config/serial-rtu.toml", &[("device = \"/tmp/regrind-", &devices)]);
+    fs::write(home.path().join("cell.toml"), text).unwrap();
+    fs::write(home.path().join("grinder.tty"), "mine").unwrap();
+    let (code, _, errors) = in_time(&["simulate", &recipe(home.path(), 1e4), "--cell", "cell.toml"], home.path());
+    assert!(code == 2 || code == 3, "{code} {errors}");
+    assert!(errors.contains("grinder.tty") && errors.contains("remove what is there"), "{errors}");
+    assert_eq!(fs::read_to_string(home.path().join("grinder.tty")).unwrap(), "mine");
+    assert!(fs::symlink_metadata(home.path().join("cmm.tty")).is_err(), "what was linked before is taken back");
+}
+
+#[test]
+fn machines_that_are_not_there() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = recipe(home.path(), 1e4);
+    // A port that is taken and not listened on.
+    let taken = tokio::net::TcpSocket::new_v4().unwrap();
+    taken.bind("127.0.0.1:0".parse().unwrap()).unwrap();
+    let free = taken.local_addr().unwrap().port().to_string();
+    let nobody = changed("config/modbus-tcp.toml", &[("15021", &free), ("15022", &free)]);
+    let nowhere = nobody
+        .replace("host = \"127.0.0.1\"", "host = \"no-such-host.invalid\"")
+        .replace("simulated = true", "simulated = false");
+    let devices = format!("device = \"{}/absent-", home.path().display());
+    let absent = changed("config/serial-rtu.toml", &[("device = \"/tmp/regrind-", &devices)]);
+    for (name, cell, named) in [
+        ("nobody", nobody, format!("127.0.0.1:{free}")),
+        ("nowhere", nowhere, "no-such-host.invalid".to_owned()),
+        ("absent", absent, "absent-".to_owned()),
+    ] {
+        let cell_file = format!("{name}.toml");
+        fs::write(home.path().join(&cell_file), cell).unwrap();
+        let (code, said, errors) = in_time(&["run", &recipe, "--cell", &cell_file, "--runs", name], home.path());
+        assert_eq!(code, 3, "{said}\n{errors}");
+        assert!(errors.contains(&named) && said.contains("ALARM"), "{name}: {said}\n{errors}");
+        let folder = only_run(&home.path().join(name));
+        assert!(verify(&folder).unwrap().closed, "{name}");
+        assert!(!records_with(&folder, "event").is_empty());
+    }
+}
+
+#[test]
+fn a_recipe_for_another_cell() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = recipe(home.path(), 1e4);
+    let cells = [
+        ("depth", "config/modbus-tcp.toml", "largest_depth_mm = 0.5", "largest_depth_mm = 0.001", "depth_of_cut"),
+        ("feed", "config/modbus-tcp.toml", "largest_feed_mm_min = 20000.0", "largest_feed_mm_min = 100.0", "feed"),
+        ("wheel", "config/modbus-tcp.toml", "least_wheel_radius_mm = 1.0", "least_wheel_radius_mm = 100.0", "wheel"),
+        (
+            "travel",
+            "config/modbus-tcp.toml",
+            "most_mm = [500.0, 500.0, 400.0]",
+            "most_mm = [20.0, 500.0, 400.0]",
+            "travel",
+        ),
+        (
+            "travel-of-the-grinder",
+            "config/modbus-tcp.toml",
+            "[grinder.limits]",
+            "[grinder.travel]\nleast_mm = [-10.0, -500.0, -400.0]\nmost_mm = [10.0, 500.0, 400.0]\n\n[grinder.limits]",
+            "beyond the travel of -10 to 10 mm",
+        ),
+    ];
+    for (name, file, from, to, named) in cells {
+        let cell = format!("{name}.toml");
+        fs::write(home.path().join(&cell), changed(file, &[(from, to)])).unwrap();
+        for command in ["plan", "run"] {
+            let (code, _, errors) = in_time(&[command, &recipe, "--cell", &cell], home.path());
+            assert_eq!(code, 2, "{errors}");
+            assert!(errors.contains(named) && errors.contains(&cell), "{command} {name}: {errors}");
+        }
+    }
+    assert!(!home.path().join("runs").exists(), "nothing was begun");
+}
+
+#[test]
+fn a_part_that_is_measured_first_is_judged_and_a_pass_that_cannot_be_ground_is_not_begun() {
+    let home = tempfile::tempdir().unwrap();
+    let text = fs::read_to_string(recipe(home.path(), 1e4)).unwrap();
+    assert!(text.contains("[cycle]\n"));
+    fs::write(home.path().join("first.toml"), text.replace("[cycle]\n", "[cycle]\nbegin_with = \"measure\"\n"))
+        .unwrap();
+    let narrow =
+        "[grinder.travel]\nleast_mm = [-10.0, -500.0, -400.0]\nmost_mm = [10.0, 500.0, 400.0]\n\n[grinder.limits]";
+    fs::write(home.path().join("narrow.toml"), changed("config/sim.toml", &[("[grinder.limits]", narrow)])).unwrap();
+    let (code, said, errors) = in_time(&["run", "first.toml", "--cell", "narrow.toml"], home.path());
+    assert_eq!(code, 1, "{said}\n{errors}");
+    assert!(said.contains("ALARM") && said.contains("beyond the travel of -10 to 10 mm"), "{said}");
+    let cycle = only_run(&home.path().join("runs")).join("cycle-1");
+    assert!(cycle.join("error_map.csv").is_file());
+    for file in ["correction.csv", "toolpath.ngc", "toolpath_z.csv"] {
+        assert!(!cycle.join(file).exists(), "{file} of a pass that is not begun");
+    }
+}
+
+#[test]
+fn every_kind_of_broken_file_through_every_command() {
+    let home = tempfile::tempdir().unwrap();
+    let good = recipe(home.path(), 1e4);
+    let text = fs::read_to_string(&good).unwrap();
+    let replaced = |from: &str, to: &str| {
+        assert!(text.contains(from), "{from}");
+        text.replacen(from, to, 1)
+    };
+    let files: Vec<(&str, String)> = vec![
+        ("empty", String::new()),
+        ("syntax", replaced("[measure]", "[measure")),
+        ("unknown", replaced("probe_radius_mm", "probe_radius_um")),
+        ("type", replaced("columns = 20", "columns = \"twenty\"")),
+        ("range", replaced("removal_budget_um = 400.0", "removal_budget_um = 4e9")),
+        ("nan", replaced("pv_um = 7.0", "pv_um = nan")),
+        ("binary", "\u{0}\u{1}\u{2}".to_owned()),
+        ("contradiction", replaced("columns = 20", "columns = 0")),
+    ];
+    for (name, content) in &files {
+        let file = format!("{name}.toml");
+        fs::write(home.path().join(&file), content).unwrap();
+        for command in ["run", "plan", "simulate", "check"] {
+            let (code, _, errors) = in_time(&[command, &file], home.path());
+            assert_eq!(code, 2, "{command} {name}: {errors}");
+            assert!(errors.contains(&file) || errors.contains("listed above"), "{command} {name}: {errors}");
+        }
+        let (code, _, errors) = in_time(&["run", &good, "--cell", &file], home.path());
+        assert_eq!(code, 2, "a recipe as a cell, {name}: {errors}");
+    }
+    let (code, _, errors) = in_time(&["run", "absent.toml"], home.path());
+    assert_eq!(code, 2, "{errors}");
+    assert!(errors.contains("absent.toml"), "{errors}");
+    assert!(!home.path().join("runs").exists(), "nothing was begun");
+}
+
+#[test]
+fn a_recipe_without_a_truth_cannot_be_simulated() {
+    let home = tempfile::tempdir().unwrap();
+    let text = fs::read_to_string(recipe(home.path(), 1e4)).unwrap();
+    let cut = text.split("# The truth of a simulated cell").next().unwrap();
+    fs::write(home.path().join("real.toml"), cut).unwrap();
+    for command in ["run", "simulate"] {
+        let (code, _, errors) = in_time(&[command, "real.toml", "--cell", &sim_cell()], home.path());
+        assert_eq!(code, 2, "{errors}");
+        assert!(errors.contains("[simulation]"), "{errors}");
+    }
+}
+
+#[test]
+fn ctrl_c_holds_once_and_aborts_twice() {
+    let home = tempfile::tempdir().unwrap();
+    // Slow enough that the machine still grinds.
+    let recipe = recipe(home.path(), 100.0);
+    let mut running = Running::new(regrind(&["run", &recipe, "--cell", &sim_cell(), "--runs", "runs"], home.path()));
+    let folder = running.folder(home.path());
+    running.line("grinding", |line| line.contains("grinding"));
+    running.interrupt();
+    let words = running.line("hold", |line| line.starts_with("HOLD"));
+    assert!(words.contains("next safe place") && words.contains("regrind resume"), "{words}");
+    let held = |home: &Path| run(&["status", folder.to_str().unwrap()], home).1.contains("Held");
+    let began = Instant::now();
+    while !held(home.path()) {
+        assert!(began.elapsed() < BOUNDED, "it does not come to hold");
+    }
+    running.interrupt();
+    running.line("abort", |line| line.starts_with("ABORT"));
+    let (code, errors) = running.end();
+    assert_eq!(code, 3, "{errors}");
+    assert!(running.said.iter().any(|line| line.contains("ABORTED")), "{}", running.said.join("\n"));
+    let verified = verify(&folder).unwrap();
+    assert!(verified.closed, "{verified:?}");
+    let causes = records_with(&folder, "event");
+    let reasons: Vec<_> = causes.iter().filter_map(|e| e["reason"].as_str()).collect();
+    assert_eq!(reasons, ["Ctrl-C", "Ctrl-C, twice"]);
+}

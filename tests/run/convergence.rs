@@ -1,0 +1,53 @@
+//! What one correction takes back of what comes back in every pass, and how near the floor cycles end, by the truth of the world.
+//!
+//! A few worlds only; `cargo run --release --example convergence` draws fifty for each recipe and prints the figures.
+
+use crate::study::{After, Bench, RECIPES, Way};
+use rayon::prelude::*;
+use regrind::compensation::GainRule;
+
+/// Worlds drawn for each recipe.
+const SEEDS: u64 = 2;
+const PASSES: u16 = 3;
+
+fn runs(way: Way, parts: usize) -> Vec<(String, Vec<Vec<After>>)> {
+    let benches: Vec<Bench> = RECIPES.iter().map(|name| Bench::new(name)).collect();
+    let each = (0..benches.len() as u64 * SEEDS).into_par_iter().map(|k| {
+        let (bench, seed) = (&benches[(k / SEEDS) as usize], 1 + k % SEEDS);
+        (format!("{}, seed {seed}", bench.name), bench.parts(seed, way, parts, PASSES))
+    });
+    each.collect()
+}
+
+/// Root of the mean square over many passes.
+fn rms(values: impl Iterator<Item = f64> + Clone) -> f64 {
+    let count = values.clone().count() as f64;
+    (values.map(|v| v * v).sum::<f64>() / count).sqrt()
+}
+
+#[test]
+fn cycles_come_down_to_what_the_grinder_cannot_repeat() {
+    let runs = runs(Way::Regrind(GainRule::Wavelength), 2);
+    for (name, parts) in &runs {
+        println!("{name}: {:.3?}", parts[0]);
+        let (first, last) = (parts[0][0], parts[0][usize::from(PASSES) - 1]);
+        assert!(last.rms_um < first.rms_um, "{name} ended worse than it began");
+        let taken_back = first.repeatable_um / parts[0][1].repeatable_um;
+        assert!(taken_back > 5.0, "{name}: one correction took back {taken_back} times");
+    }
+    let over = |part: usize, pass: usize| {
+        let all = || runs.iter().map(move |(_, parts)| parts[part][pass]);
+        rms(all().map(|a| a.rms_um)) / rms(all().map(|a| a.floor_um))
+    };
+    let taken_back = rms(runs.iter().map(|(_, parts)| parts[0][0].repeatable_um))
+        / rms(runs.iter().map(|(_, parts)| parts[0][1].repeatable_um));
+    println!(
+        "taken back {taken_back:.1}; over the floor {:.2}, {:.2}; next part {:.2}",
+        over(0, 1),
+        over(0, 2),
+        over(1, 0)
+    );
+    assert!(taken_back > 8.0, "{taken_back}");
+    assert!(over(0, 2) < 1.4 && over(0, 2) < over(0, 1), "{} then {}", over(0, 1), over(0, 2));
+    assert!(over(1, 0) < 1.5, "the second part began at {} of the floor", over(1, 0));
+}

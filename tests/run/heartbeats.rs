@@ -1,0 +1,161 @@
+//! Nothing that is computed delays what is said to the machines: beats and orders while 451,401 points are registered and compensated.
+//!
+//! The machines, their wires and the drive are those of every simulated run. Only the points do not all come over the wire: between
+//! driver and drive stands a measuring machine that measures the first few targets and makes up the rest.
+
+use std::time::{Duration, Instant};
+
+use crate::rig::{CMM, GRINDER, PATIENCE, Rig, event, order, until, words};
+use regrind::cell::Ending;
+use regrind::device::{
+    Armed, Cmm, DeviceError, Identified, Identity, Interrupt, Job, Machine, MeasuredPoint, Measurement, ModbusCmm,
+    Plan, PointStatus, Reconciled, Started, Status, digest,
+};
+use regrind::drive::{Drive, Request};
+
+const POINTS: usize = 451_401;
+/// What the simulated machines take for a client that is gone.
+const SILENCE_LIMIT: Duration = Duration::from_secs(3);
+/// Targets that are really measured: the reference sphere and a few.
+const FEW: usize = 40;
+
+/// A measuring machine that makes most of its points up.
+struct Generous {
+    cmm: ModbusCmm,
+    wanted: Option<Plan>,
+    few: u32,
+}
+
+impl Machine for Generous {
+    fn name(&self) -> &str {
+        self.cmm.name()
+    }
+    async fn connect(&mut self) -> Result<Identity, DeviceError> {
+        self.cmm.connect().await
+    }
+    async fn status(&mut self) -> Result<Status, DeviceError> {
+        self.cmm.status().await
+    }
+    async fn claim(&mut self) -> Result<Status, DeviceError> {
+        self.cmm.claim().await
+    }
+    async fn prepare(&mut self, job: Job) -> Result<Armed, DeviceError> {
+        self.cmm.prepare(Job { digest: self.few, ..job }).await
+    }
+    async fn start(&mut self, armed: Armed) -> Result<Started, DeviceError> {
+        self.cmm.start(armed).await
+    }
+    async fn hold(&mut self) -> Result<Status, DeviceError> {
+        self.cmm.hold().await
+    }
+    async fn resume(&mut self) -> Result<Status, DeviceError> {
+        self.cmm.resume().await
+    }
+    async fn stop(&mut self) -> Result<Status, DeviceError> {
+        self.cmm.stop().await
+    }
+    async fn abort(&mut self) -> Result<Status, DeviceError> {
+        self.cmm.abort().await
+    }
+    async fn clear(&mut self) -> Result<Status, DeviceError> {
+        self.cmm.clear().await
+    }
+    async fn acknowledge(&mut self, done: u32) -> Result<Status, DeviceError> {
+        self.cmm.acknowledge(done).await
+    }
+    async fn release(&mut self) -> Result<Status, DeviceError> {
+        self.cmm.release().await
+    }
+    async fn reconcile(&mut self, intended: &Armed) -> Result<Reconciled, DeviceError> {
+        self.cmm.reconcile(intended).await
+    }
+}
+
+impl Cmm for Generous {
+    async fn load_plan(&mut self, plan: &Plan, interrupt: &Interrupt) -> Result<(), DeviceError> {
+        let few = Plan { targets: plan.targets[..FEW].to_vec(), ..plan.clone() };
+        self.few = digest(&[few.identity()]);
+        self.wanted = Some(plan.clone());
+        self.cmm.load_plan(&few, interrupt).await
+    }
+
+    async fn collect(&mut self, job: Job, interrupt: &Interrupt) -> Result<Measurement, DeviceError> {
+        let measured = self.cmm.collect(job, interrupt).await?;
+        let plan = self.wanted.as_ref().expect("a plan was loaded");
+        let sample = measured.points[0];
+        let points = plan.targets.iter().map(|t| {
+            // Waves of 10 um, so that there is something to compensate.
+            let [x, y, _] = t.point_mm;
+            let proud_mm = if (t.index as usize) < FEW { 0.0 } else { 0.01 * (x / 9.0).sin() * (y / 7.0).cos() };
+            let out_mm = plan.probe_radius_mm + proud_mm;
+            let at_mm = std::array::from_fn(|k| t.point_mm[k] + out_mm * t.normal[k]);
+            MeasuredPoint { index: t.index, status: PointStatus::Touched, at_mm, ..sample }
+        });
+        Ok(Measurement { points: points.collect(), plan_identity: plan.identity(), ..measured })
+    }
+}
+
+fn recipe() -> regrind::recipe::Recipe {
+    crate::rig::recipe(&[
+        ("columns = 60", "columns = 901"),
+        ("rows = 30", "rows = 501"),
+        ("accuracy_nm = 0.5", "spacing_mm = 0.118"),
+        // A filter over thousands of points for each point would only take long.
+        ("cutoff_mm = 5.0", "cutoff_mm = 2.0"),
+        ("[simulation]\nseed = 1", "[simulation]\nseed = 1\nspeed = 5000.0"),
+    ])
+}
+
+/// The longest time between two beats that came to a machine, with the open end.
+fn longest_pause(rig: &Rig, machine: usize, since: Instant) -> Duration {
+    let came = rig.came[machine].lock().unwrap();
+    let beats: Vec<Instant> = came.iter().filter(|c| c.beat && c.at >= since).map(|c| c.at).collect();
+    assert!(!beats.is_empty(), "no beat came to machine {machine}");
+    beats.windows(2).map(|two| two[1] - two[0]).max().unwrap_or_default()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn beats_and_orders_stay_on_time_while_451_401_points_are_computed() {
+    let mut rig = Rig::new(recipe()).await;
+    let ready = rig.next(true);
+    let (folder, mut notices) = (ready.folder, ready.notices);
+    assert!(ready.run.task.nominal.len() >= POINTS && ready.run.task.targets.len() == POINTS);
+    let cmm = Generous { cmm: ready.cmm, wanted: None, few: 0 };
+    let (drive, _orders) = Drive::new(ready.run, cmm, ready.grinder).unwrap();
+    let running = tokio::spawn(drive.run());
+    let whole = Instant::now();
+    // From the acknowledgement of the measurement on the points are registered.
+    event(&mut notices, "acknowledged", 2).await;
+    let began = Instant::now();
+    let (reply, _, answered) = order(&folder, Request::Hold { reason: "while it computes".into() }).await;
+    println!("HOLD while registering: answered in {answered:?}: {}", reply.words);
+    assert!(reply.words.starts_with("Holding (Register"), "{}", reply.words);
+    let mut slowest = Duration::ZERO;
+    while words(&folder).await.starts_with("Holding (Register") {
+        slowest = slowest.max(order(&folder, Request::Status).await.2);
+        tokio::time::sleep(Duration::from_millis(20)).await;
+        assert!(began.elapsed() < 4 * PATIENCE, "the registration does not end");
+    }
+    println!("registered in {:.2} s; slowest answer meanwhile {slowest:?}", began.elapsed().as_secs_f64());
+    let held = until(&folder, |words| words.starts_with("Held")).await;
+    println!("{held}");
+    order(&folder, Request::Resume { reason: String::new() }).await;
+    // Judged at once; now the map is made of 451,401 deviations.
+    let computing = words(&folder).await;
+    let (reply, asked, _) = order(&folder, Request::Abort { reason: "while it computes".into() }).await;
+    assert!(reply.accepted, "{reply:?}");
+    let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
+    assert!(matches!(ending, Ending::Aborted { confirmed: true, .. }), "{ending:?}");
+    for machine in [CMM, GRINDER] {
+        let pauses = [longest_pause(&rig, machine, whole), longest_pause(&rig, machine, began)];
+        let abort = rig.command_at(machine, 7, asked).expect("ABORT came") - asked;
+        let name = ["CMM", "grinder"][machine];
+        println!(
+            "{name}: longest pause between beats {:?} in the run, {:?} while computing; ABORT from {computing} in {abort:?}",
+            pauses[0], pauses[1]
+        );
+        // Before that the made-up points themselves are computed between two beats, which no real machine asks for.
+        assert!(pauses[1] < SILENCE_LIMIT, "{name} took its client for gone: {pauses:?}");
+        assert!(abort < Duration::from_secs(20), "{name}: {abort:?}");
+    }
+}

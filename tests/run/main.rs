@@ -1,0 +1,25 @@
+//! Whole runs: the program and its drive against simulated machines on real wires, on sunny days and others.
+
+mod audit;
+mod bad_cells;
+mod convergence;
+mod cycles;
+#[path = "../common/data.rs"]
+mod data;
+mod faults;
+mod heartbeats;
+mod height_maps;
+mod learning;
+mod mirror_cell;
+mod mirror_run;
+mod orders;
+#[path = "../common/program.rs"]
+mod program;
+#[path = "../common/rig.rs"]
+mod rig;
+mod study;
+#[path = "../common/tries.rs"]
+mod tries;
+mod truth;
+mod two_processes;
+mod worlds;

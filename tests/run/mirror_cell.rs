@@ -1,0 +1,154 @@
+//! Real clouds of a 6 m telescope mirror, raw files of a laser tracker as they are, through the folders of a measuring machine.
+//!
+//! The data stand outside of the project, in the folder that REGRIND_DATA names.
+
+use std::path::Path;
+use std::time::Duration;
+
+use crate::data::data;
+use regrind::device::exchange::{CmmExchange, CmmFolders, Mailbox, MeasureOrder, Pattern, StationFiles, Stations};
+use regrind::device::{Coordinates, Identified, Job, Measurement, Plan, digest};
+use regrind::formats::result::{Content, Coordinates as Said};
+use regrind::geometry::{Point, Pose, Twist, Vector};
+use regrind::registration::{MapLimits, Options, Registration, Start, lateral_error, register, weak_for_compensation};
+use regrind::surface::{DefinedSurface, Nominal, Side};
+
+const REFLECTOR_MM: f64 = 19.05;
+
+/// What the cell file says: the reference points are nominal in the telescope's frame, which is the frame of the measuring machine.
+fn cell(data: &Path, session: &str, outbox: &Path) -> CmmExchange {
+    let files = vec![StationFiles { points: Pattern::new("M1_*.txt"), references: Pattern::new("ref_*.yaml") }];
+    let nominal = data.join("nominal/reference.yaml");
+    CmmExchange {
+        stable_for: Duration::ZERO,
+        content: Content { coordinates: Some(Said::Centres), ..Content::default() },
+        stations: Some(Stations { files, nominal, group: Some("primary".into()), limit_mm: 1.0 }),
+        free_count: true,
+        least_points: 500,
+        take_earlier: true,
+        ..CmmExchange::new("M1", outbox, data.join(session))
+    }
+}
+
+fn plan(radius_mm: f64) -> MeasureOrder {
+    let plan = Plan {
+        targets: Vec::new(),
+        probe_radius_mm: radius_mm,
+        approach_mm: 0.0,
+        search_mm: 0.0,
+        speed_mm_s: 0.0,
+        safe_height_mm: 0.0,
+    };
+    let plan_identity = plan.identity();
+    MeasureOrder { plan, plan_identity }
+}
+
+fn measured(settings: CmmExchange, radius_mm: f64) -> (Option<Measurement>, Vec<String>) {
+    let mut folders = CmmFolders::new(settings);
+    assert!(folders.open().unwrap().is_empty());
+    let order = plan(radius_mm);
+    let job = Job { job: 1, cycle: 0, digest: digest(&[order.plan_identity]) };
+    folders.publish(job, 1, &order).unwrap();
+    let look = folders.look(Duration::from_secs(1), job).unwrap();
+    (look.answer, look.said)
+}
+
+/// Where the fixture holds the mirror in the telescope's frame: turned about x by -atan(1/2), 3600 mm up.
+fn cmm_from_model() -> Pose {
+    let turn = Pose::exp(&Twist::new(0.0, 0.0, 0.0, -(0.5f64).atan(), 0.0, 0.0));
+    Pose { translation_mm: Vector::new(0.0, 0.0, 3600.0), ..turn }
+}
+
+/// z(x, y) = sum a_ij (x/3000)^i (y/3000)^j.
+fn nominal() -> Nominal {
+    let text = r#"
+        [surface]
+        kind = "xy-polynomial"
+        normalisation_radius_mm = 3000.0
+        terms = [
+            [0, 2, -57.74022], [0, 3, 1.5373825], [0, 4, 1.154294], [0, 5, -0.441762], [0, 6, 0.0906601],
+            [2, 0, -72.17349], [2, 1, 1.8691899], [2, 2, 2.8859421], [2, 3, -1.026471], [2, 4, 0.2610568],
+            [4, 0, 1.8083973], [4, 1, -0.603195], [4, 2, 0.2177414], [6, 0, 0.0394559],
+        ]
+        [aperture]
+        kind = "rectangle"
+        width_mm = 6600.0
+        height_mm = 6600.0
+        [sampling]
+        spacing_mm = 10.0
+    "#;
+    let s = DefinedSurface::from_toml(text).unwrap().sample(10.0).unwrap();
+    Nominal::from_grid_with_normals(s.columns, s.rows, s.points, s.normals).unwrap()
+}
+
+fn registered(nominal: &Nominal, cloud: &[Point], locked: [bool; 6]) -> Registration {
+    let start = Start::Pose(cmm_from_model());
+    let options = Options { start, locked, outlier_sigmas: 5.0, ..Options::new(REFLECTOR_MM) };
+    register(nominal, cloud, &options).unwrap()
+}
+
+#[test]
+#[ignore = "needs real measurements: REGRIND_DATA"]
+fn raw_tracker_files_become_a_measurement_and_no_map_while_the_plane_is_free() {
+    let data = data("lat-freeform-mirror");
+    let nominal = nominal();
+    for (session, points, rms_um, pv_um, in_plane_mm) in
+        [("20250824_M1_1", 1161, 57.5, 384.0, [3.4, 3.3]), ("20250825_M1", 1422, 57.5, 422.0, [3.0, 3.0])]
+    {
+        let home = tempfile::tempdir().unwrap();
+        let (found, said) = measured(cell(&data, session, home.path()), REFLECTOR_MM);
+        let found = found.unwrap_or_else(|| panic!("{said:#?}"));
+        println!("{session}\n{}", said.join("\n"));
+        assert_eq!((found.points.len(), found.coordinates), (points, Coordinates::Centres));
+        assert!((found.probe_radius_mm - REFLECTOR_MM).abs() < 1e-12, "{}", found.probe_radius_mm);
+        let cloud: Vec<Point> = found.points.iter().map(|p| Point::from(p.at_mm)).collect();
+        let free = registered(&nominal, &cloud, [false; 6]);
+        let v = &free.verdict;
+        let said: Vec<&str> = v.weak_directions.iter().map(|w| w.words.as_str()).collect();
+        println!(
+            "{} of {points} used, rms {:.2} um, PV {:.1} um; {}",
+            v.used,
+            v.rms_mm * 1e3,
+            v.pv_mm * 1e3,
+            said.join("; ")
+        );
+        assert_eq!(free.side, Side::Opposite, "the reflectors lie behind the mirror's normal");
+        assert!((v.rms_mm * 1e3 - rms_um).abs() < 0.5 && (v.pv_mm * 1e3 - pv_um).abs() < 8.0);
+        for k in [0, 1] {
+            assert!((v.covariance[(k, k)].sqrt() / in_plane_mm[k] - 1.0).abs() < 0.1, "{session}: axis {k}");
+        }
+        let lateral = lateral_error(&free, 2.0);
+        let why = weak_for_compensation(&free, &MapLimits::default());
+        println!("{lateral:?}\n{}", why.as_deref().unwrap_or("a map may be made"));
+        let why = why.expect("refused");
+        assert!(
+            why.contains("x and y shift: known to 3.")
+                && why.contains("rotation about z: known to")
+                && why.contains("Hold the directions in the recipe"),
+            "{why}"
+        );
+        let held = registered(&nominal, &cloud, [true, true, false, false, false, true]);
+        println!("held: rms {:.2} um, {:?}", held.verdict.rms_mm * 1e3, lateral_error(&held, 2.0));
+        assert_eq!(weak_for_compensation(&held, &MapLimits::default()), None);
+    }
+}
+
+#[test]
+#[ignore = "needs real measurements: REGRIND_DATA"]
+fn another_reflector_than_the_recipes_is_refused() {
+    let data = data("lat-freeform-mirror");
+    let home = tempfile::tempdir().unwrap();
+    let (found, said) = measured(cell(&data, "20250825_M1", home.path()), 6.35);
+    let said = said.join("\n");
+    assert!(found.is_none() && said.contains("a probe radius of 19.05 mm, the recipe says 6.35 mm"), "{said}");
+    // A reference point that is off by more than the limit is named.
+    let mut strict = cell(&data, "20250825_M1", home.path());
+    strict.part = "strict".into();
+    strict.stations.as_mut().unwrap().limit_mm = 0.01;
+    let outbox = home.path().join("strict");
+    std::fs::create_dir(&outbox).unwrap();
+    strict.outbox = outbox;
+    let (found, said) = measured(strict, REFLECTOR_MM);
+    let said = said.join("\n");
+    assert!(found.is_none() && said.contains("station 1 (ref_1.yaml): reference point primary_"), "{said}");
+}

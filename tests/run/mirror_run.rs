@@ -1,0 +1,284 @@
+//! A real measurement through a whole run: raw files of a laser tracker, put into an inbox as a person would, and the program itself.
+//!
+//! The data stand outside of the project, in the folder that REGRIND_DATA names.
+
+use std::fs;
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use crate::data::data;
+use regrind::journal;
+use serde_json::Value;
+
+/// Generous: the machine that tests may be busy with something else.
+const PATIENCE: Duration = Duration::from_secs(300);
+const SESSION: &str = "20250824_M1_1";
+const POINTS: usize = 1161;
+
+/// A shop: a cell file with its folders, and a recipe.
+struct Shop {
+    home: tempfile::TempDir,
+    recipe: PathBuf,
+    cell: PathBuf,
+}
+
+fn changed(text: &str, from: &str, to: &str) -> String {
+    assert!(text.contains(from), "no {from:?}");
+    text.replace(from, to)
+}
+
+impl Shop {
+    /// Takes what ships, with folders of its own; `hold` is the recipe's line of that name.
+    fn new(data: &Path, hold: &str) -> Self {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let home = tempfile::tempdir().unwrap();
+        for machine in ["cmm", "grinder"] {
+            for folder in ["in", "out"] {
+                fs::create_dir_all(home.path().join("exchange").join(machine).join(folder)).unwrap();
+            }
+        }
+        fs::create_dir(home.path().join("config")).unwrap();
+        let cell = fs::read_to_string(root.join("config/file-exchange.toml")).unwrap();
+        let nominal = data.join("nominal/reference.yaml");
+        let cell = changed(&cell, "../exchange/cmm/reference.yaml", nominal.to_str().unwrap());
+        let cell = changed(&cell, "stable_for_s = 2.0", "stable_for_s = 0.2");
+        let cell = changed(
+            &cell,
+            "inbox = \"../exchange/grinder/in\"",
+            "inbox = \"../exchange/grinder/in\"\nstable_for_s = 0.2",
+        );
+        let recipe = fs::read_to_string(root.join("recipes/telescope-panel.toml")).unwrap();
+        let recipe = changed(&recipe, "hold = [\"x\", \"y\", \"rz\"]", hold);
+        // As many as the files hold, so that a measurement is never taken before the last file is there.
+        let recipe = changed(&recipe, "points = 1100", &format!("points = {POINTS}"));
+        let (recipe_path, cell_path) = (home.path().join("mirror.toml"), home.path().join("config/cell.toml"));
+        fs::write(&recipe_path, recipe).unwrap();
+        fs::write(&cell_path, cell).unwrap();
+        Self { home, recipe: recipe_path, cell: cell_path }
+    }
+
+    fn folder(&self, name: &str) -> PathBuf {
+        self.home.path().join("exchange").join(name)
+    }
+
+    fn command(&self) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_regrind"));
+        command.arg("run").arg(&self.recipe).arg("--cell").arg(&self.cell).args(["--part", "M1", "--loaded", "--json"]);
+        command.arg("--runs").arg(self.home.path().join("runs")).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command
+    }
+
+    fn run(&self) -> Running {
+        let mut child = self.command().spawn().unwrap();
+        let lines = Arc::new(Mutex::new(Vec::new()));
+        let (seen, out) = (Arc::clone(&lines), child.stdout.take().unwrap());
+        let reading = std::thread::spawn(move || {
+            for line in BufReader::new(out).lines().map_while(Result::ok) {
+                seen.lock().unwrap().push(line);
+            }
+        });
+        Running { child, lines, reading: Some(reading) }
+    }
+
+    /// Puts the raw files of all stations into the inbox, as they are.
+    fn deliver(&self, data: &Path) {
+        for k in 1..=7 {
+            for name in [format!("M1_{k}.txt"), format!("ref_{k}.yaml")] {
+                fs::copy(data.join(SESSION).join(&name), self.folder("cmm/in").join(&name)).unwrap();
+            }
+        }
+    }
+
+    fn run_folder(&self) -> PathBuf {
+        let mut runs: Vec<_> =
+            fs::read_dir(self.home.path().join("runs")).unwrap().map(|e| e.unwrap().path()).collect();
+        assert_eq!(runs.len(), 1);
+        runs.remove(0)
+    }
+
+    /// Returns the one hand-over in an outbox whose name ends so.
+    fn handed_over(&self, outbox: &str, ending: &str) -> Option<PathBuf> {
+        let entries = fs::read_dir(self.folder(outbox)).unwrap().map(|e| e.unwrap().path());
+        let mut found: Vec<_> = entries
+            .filter(|path| {
+                let name = path.file_name().unwrap().to_str().unwrap();
+                !name.starts_with('.') && name.ends_with(ending)
+            })
+            .collect();
+        assert!(found.len() < 2, "handed over twice: {found:?}");
+        found.pop()
+    }
+
+    fn confirm(&self, what: &str, map: &str) -> (bool, String) {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_regrind"));
+        let output = command.args(["confirm", what, "--map", map]).arg(self.run_folder()).output().unwrap();
+        let text = [output.stdout, output.stderr].concat();
+        (output.status.success(), String::from_utf8_lossy(&text).into_owned())
+    }
+}
+
+/// A run of the program that goes on, and what it has said.
+struct Running {
+    child: Child,
+    lines: Arc<Mutex<Vec<String>>>,
+    reading: Option<std::thread::JoinHandle<()>>,
+}
+
+impl Running {
+    fn said(&self) -> Vec<Value> {
+        self.lines.lock().unwrap().iter().map(|line| serde_json::from_str(line).unwrap()).collect()
+    }
+
+    /// Waits until something is so, while the program runs.
+    fn until<T>(&mut self, what: &str, mut is_so: impl FnMut() -> Option<T>) -> T {
+        let began = Instant::now();
+        loop {
+            if let Some(found) = is_so() {
+                return found;
+            }
+            if let Some(status) = self.child.try_wait().unwrap() {
+                panic!("the program ended with {status} before {what}: {:#?}", self.said());
+            }
+            assert!(began.elapsed() < PATIENCE, "no {what}: {:#?}", self.said());
+            std::thread::park_timeout(Duration::from_millis(20));
+        }
+    }
+
+    /// Waits for the end, and returns the exit code and everything said.
+    fn end(mut self) -> (i32, Vec<Value>) {
+        let began = Instant::now();
+        let status = loop {
+            if let Some(status) = self.child.try_wait().unwrap() {
+                break status;
+            }
+            assert!(began.elapsed() < PATIENCE, "no end: {:#?}", self.said());
+            std::thread::park_timeout(Duration::from_millis(20));
+        };
+        self.reading.take().unwrap().join().unwrap();
+        (status.code().unwrap(), self.said())
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        // Ended already, unless the test failed.
+        let _ = self.child.kill();
+    }
+}
+
+fn notices<'s>(said: &'s [Value], kind: &str) -> Vec<&'s Value> {
+    said.iter().filter(|notice| notice["notice"] == kind).collect()
+}
+
+fn is_about(found: f64, expected: f64) -> bool {
+    (found / expected - 1.0).abs() < 0.01
+}
+
+#[test]
+#[ignore = "needs real measurements: REGRIND_DATA"]
+fn a_real_mirror_is_measured_and_judged_and_its_correction_refused_in_words() {
+    let data = data("lat-freeform-mirror");
+    let shop = Shop::new(&data, "");
+    let mut run = shop.run();
+    let plan = run.until("the plan", || shop.handed_over("cmm/out", ""));
+    assert_eq!(plan.file_name().unwrap().to_str().unwrap().split("_j").next(), Some("M1"));
+    shop.deliver(&data);
+    let (code, said) = run.end();
+    // Finished in order, not in tolerance.
+    assert_eq!(code, 1, "{said:#?}");
+    let figures = &notices(&said, "figures")[0]["figures"];
+    let (rms_um, pv_um) = (1e3 * figures["rms_mm"].as_f64().unwrap(), 1e3 * figures["pv_mm"].as_f64().unwrap());
+    println!("rms {rms_um:.2} um, PV {pv_um:.1} um, {} points", figures["points"]);
+    assert!(is_about(rms_um, 57.5) && is_about(pv_um, 384.0), "rms {rms_um} um, PV {pv_um} um");
+    let stations = notices(&said, "note").iter().flat_map(|n| n["words"].as_array().unwrap().clone()).count();
+    assert!(stations >= 7, "a line for every station");
+    let alarm = notices(&said, "alarm").into_iter().find(|a| a["id"] == "weak_directions").expect("an alarm");
+    let what = alarm["what"].as_str().unwrap();
+    println!("{what}");
+    for words in ["x and y shift: known to 3.", "rotation about z", "registration.hold", "beside its place"] {
+        assert!(what.contains(words), "{words}: {what}");
+    }
+    let folder = shop.run_folder();
+    let measured = fs::read_to_string(folder.join("cycle-1/measured.csv")).unwrap();
+    assert_eq!(measured.lines().filter(|l| l.starts_with(|c: char| c.is_ascii_digit() || c == '-')).count(), POINTS);
+    for (name, there) in [("error_map.csv", true), ("error_map.png", true), ("correction.csv", false)] {
+        assert_eq!(folder.join("cycle-1").join(name).is_file(), there, "{name}");
+    }
+    assert!(shop.handed_over("grinder/out", "").is_none(), "nothing is ground");
+    assert!(shop.handed_over("cmm/out", ".done").is_some());
+    let verified = journal::verify(&folder).unwrap();
+    println!("{verified:?}");
+}
+
+#[test]
+#[ignore = "needs real measurements: REGRIND_DATA"]
+fn with_its_place_held_the_mirror_gets_a_map_that_is_handed_over_once_and_confirmed() {
+    let data = data("lat-freeform-mirror");
+    let shop = Shop::new(&data, "hold = [\"x\", \"y\", \"rz\"]");
+    let mut run = shop.run();
+    run.until("the plan", || shop.handed_over("cmm/out", ""));
+    shop.deliver(&data);
+    let handed = run.until("the map", || shop.handed_over("grinder/out", "_c2"));
+    let folder = shop.run_folder();
+    let json: Value = serde_json::from_slice(&fs::read(handed.join("correction.json")).unwrap()).unwrap();
+    let map = json["map"].as_str().unwrap().to_owned();
+    assert_eq!(map.len(), 64);
+    // What the grinder gets is what the record has.
+    let kept = fs::read_to_string(folder.join("cycle-1/correction.csv")).unwrap();
+    assert!(kept.contains(&map), "the record names the same map");
+    let values = |text: &str| -> Vec<f64> {
+        let rows = text.lines().filter(|l| l.starts_with(|c: char| c.is_ascii_digit() || c == '-'));
+        rows.map(|row| row.rsplit(',').next().unwrap().parse().unwrap()).collect()
+    };
+    let correction = values(&fs::read_to_string(handed.join("correction.csv")).unwrap());
+    assert_eq!(correction.len(), (json["columns"].as_u64().unwrap() * json["rows"].as_u64().unwrap()) as usize);
+    let largest_um = correction.iter().fold(0.0f64, |most, v| most.max(1e3 * v.abs()));
+    println!("{} nodes, up to {largest_um:.1} um", correction.len());
+    assert!(largest_um > 20.0 && largest_um < 400.0);
+    assert!(folder.join("cycle-1/error_map.csv").is_file());
+    // The word of a person who works by another map is not taken.
+    run.until("a pass that is under way", || match shop.confirm("started", "00000000") {
+        (false, text) if text.contains("is another one") => Some(()),
+        (false, text) if text.contains("no pass is under way") => None,
+        told => panic!("{told:?}"),
+    });
+    run.until("the start to be confirmed", || shop.confirm("started", &map[..8]).0.then_some(()));
+    assert!(shop.folder("grinder/in").join("started.json").is_file());
+    // The end is told the other way: the file of the hand-over, copied by hand.
+    fs::copy(handed.join("done.json"), shop.folder("grinder/in").join("done.json")).unwrap();
+    run.until("the pass to be over", || shop.handed_over("grinder/out", "_c2.done"));
+    // The next plan; the old files are no answer to it.
+    run.until("the next plan", || shop.handed_over("cmm/out", "_c2"));
+    let lines = Arc::clone(&run.lines);
+    let left_alone = || lines.lock().unwrap().iter().any(|line| line.contains("lay there before the plan"));
+    run.until("the old files to be left alone", || left_alone().then_some(()));
+    let mut stop = Command::new(env!("CARGO_BIN_EXE_regrind"));
+    assert!(stop.arg("stop").arg(&folder).output().unwrap().status.success());
+    let (code, said) = run.end();
+    assert_eq!(code, 3, "{said:#?}");
+    assert_eq!(notices(&said, "figures").len(), 1, "one measurement");
+    let notes: Vec<String> = notices(&said, "note").iter().map(|note| note["words"].to_string()).collect();
+    let how = format!("regrind confirm started --map {}", &map[..8]);
+    for words in [how.as_str(), "lay there before the plan", "stop it at its own panel"] {
+        assert!(notes.iter().any(|note| note.contains(words)), "{words}: {notes:#?}");
+    }
+    assert!(shop.handed_over("cmm/out", "_c2.stopped").is_some());
+    assert_eq!(fs::read_dir(shop.folder("grinder/out")).unwrap().count(), 1, "one pass was handed over");
+    journal::verify(&folder).unwrap();
+}
+
+#[test]
+#[ignore = "needs real measurements: REGRIND_DATA"]
+fn a_folder_that_is_not_there_is_told_before_anything_begins() {
+    let data = data("lat-freeform-mirror");
+    let shop = Shop::new(&data, "");
+    fs::remove_dir(shop.folder("grinder/in")).unwrap();
+    let output = shop.command().output().unwrap();
+    let told = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{told}");
+    assert!(told.contains("grinder.wire.inbox") && told.contains("mkdir -p"), "{told}");
+    assert!(!shop.home.path().join("runs").exists(), "no run was begun");
+}

@@ -1,0 +1,157 @@
+//! Orders from another terminal at every phase: what comes on the wire, and whether the journal says what the machines saw.
+//!
+//! How long an order takes is measured by `cargo bench --bench orders`; here only that it is not long.
+
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use crate::rig::{CMM, GRINDER, Rig};
+use crate::tries::{MOMENTS, attempt_with};
+use regrind::journal::{Kind, Reader, verify};
+use regrind_sim::handshake::Frame;
+use regrind_sim::seen::What;
+use serde_json::Value;
+
+/// Longer than this no order may take on the busiest computer.
+const NEVER_LONGER: Duration = Duration::from_secs(20);
+const DEVICES: [&str; 2] = ["cmm", "grinder"];
+
+/// The command of docs/modbus.md that an intent leads to, if it leads to one.
+fn command_of(intent: &Value) -> Option<u16> {
+    let names = [
+        "connect",
+        "prepare",
+        "start_machine",
+        "hold_machine",
+        "resume_machine",
+        "stop_machine",
+        "abort_machine",
+        "clear_machine",
+        "acknowledge",
+    ];
+    names.iter().position(|name| intent["command"] == **name).map(|k| k as u16 + 1)
+}
+
+fn records(folder: &Path, kind: Kind) -> Vec<Value> {
+    let reader = Reader::open(folder).unwrap();
+    reader.records(1).map(Result::unwrap).filter(|r| r.kind == kind).map(|r| r.value()).collect()
+}
+
+fn intents(folder: &Path, machine: usize) -> Vec<(u16, Value)> {
+    let of_it = records(folder, Kind::Intent).into_iter().filter(|value| value["device"] == DEVICES[machine]);
+    of_it.filter_map(|value| Some((command_of(&value)?, value))).collect()
+}
+
+fn frames(rig: &Rig, machine: usize, from: usize) -> Vec<Frame> {
+    rig.servings[machine].machines()[0].1.with(|m| {
+        let seen = m.log()[from..].iter();
+        seen.filter_map(|seen| if let What::Commanded { frame, .. } = &seen.what { Some(*frame) } else { None })
+            .collect()
+    })
+}
+
+fn seen_so_far(rig: &Rig, machine: usize) -> usize {
+    rig.servings[machine].machines()[0].1.with(|m| m.log().len())
+}
+
+/// Every frame has its intent, in order, and every intent its frame unless an abort made it void.
+fn compare(name: &str, frames: &[Frame], intents: &[(u16, Value)]) {
+    let mut next = 0;
+    let commands: Vec<u16> = frames.iter().map(|f| f.command).collect();
+    let intended: Vec<u16> = intents.iter().map(|(command, _)| *command).collect();
+    let story = format!("{name}: intents {intended:?}, frames {commands:?}");
+    for (k, frame) in frames.iter().enumerate() {
+        // What gives the machine back at the end, and what takes a standing preparation back before another, are part of something else.
+        let part_of_prepare = frame.command == 6 && commands.get(k + 1) == Some(&2);
+        if frame.command == 10 || part_of_prepare {
+            continue;
+        }
+        let skipped = intents[next..].iter().position(|(command, _)| *command == frame.command);
+        let skipped = skipped.unwrap_or_else(|| panic!("{story}: frame {} has no intent", k + 1));
+        for (command, _) in &intents[next..next + skipped] {
+            // A result that is not there needs no acknowledging; an abort gives up what was being asked.
+            assert!(*command == 9 || frame.command == 7, "{story}: intent {command} was not carried out");
+        }
+        next += skipped;
+        let intent = &intents[next].1;
+        if frame.command == 3 {
+            let is = &intent["intent"];
+            let told = (is["start_sequence"].as_u64(), is["token"].as_u64(), is["cycle"].as_u64());
+            let meant = (Some(frame.sequence.into()), Some(frame.token.into()), Some(frame.cycle.into()));
+            assert_eq!(told, meant, "{story}");
+        }
+        next += 1;
+    }
+    assert_eq!(next, intents.len(), "{story}: intents without a frame at the end");
+}
+
+/// Watches that nothing is on a wire that is not on the disk.
+fn watch_the_disk(rig: &Rig, folder: &Arc<Mutex<PathBuf>>, broken: &Arc<Mutex<Vec<String>>>) {
+    for machine in [CMM, GRINDER] {
+        let (folder, broken) = (Arc::clone(folder), Arc::clone(broken));
+        let mut of_run = PathBuf::new();
+        let (mut counts, mut last) = ([0usize; 16], 0);
+        rig.watch(
+            machine,
+            Box::new(move |command| {
+                let folder = folder.lock().unwrap().clone();
+                if of_run != folder {
+                    (of_run, counts, last) = (folder.clone(), [0; 16], 0);
+                }
+                let number = usize::from(command).min(15);
+                // A frame that was not acknowledged in time comes again; no command is ever given twice in a row.
+                counts[number] += usize::from(command != last);
+                last = command;
+                let on_disk = match command {
+                    // Orders that make safe wait for no intent; what led to them is on the disk.
+                    4 | 6 | 7 => {
+                        let causes = records(&folder, Kind::Event).into_iter().map(|e| e["event"].clone());
+                        causes
+                            .filter(|e| ["hold", "abort", "stop", "prepared", "connected"].iter().any(|o| e == o))
+                            .count()
+                    }
+                    10 => usize::MAX,
+                    _ => intents(&folder, machine).iter().filter(|(intended, _)| *intended == command).count(),
+                };
+                if on_disk < if matches!(command, 4 | 6 | 7) { 1 } else { counts[number] } {
+                    let times = counts[number];
+                    broken.lock().unwrap().push(format!("command {command} came the {times}. time, on disk {on_disk}"));
+                }
+            }),
+        );
+    }
+}
+
+async fn at_every_phase(hold: bool) {
+    let mut rig = Rig::new(crate::rig::small(12, 8, 5000.0)).await;
+    let (folder, broken) = (Arc::default(), Arc::default());
+    watch_the_disk(&rig, &folder, &broken);
+    for moment in &MOMENTS {
+        let from = [CMM, GRINDER].map(|machine| seen_so_far(&rig, machine));
+        let ready = rig.next(moment.loaded);
+        folder.lock().unwrap().clone_from(&ready.folder);
+        let (tried, folder) = attempt_with(&rig, ready, moment, hold).await;
+        println!("{:22} {tried:?}", moment.name);
+        assert!(tried.after_abort.is_empty(), "{}: after an abort nothing but the safe sequence", moment.name);
+        let longest = tried.abort.iter().chain(&tried.hold).chain(&tried.resume).max().unwrap();
+        assert!(*longest < NEVER_LONGER, "{}: {longest:?}", moment.name);
+        for machine in [CMM, GRINDER] {
+            let (frames, intents) = (frames(&rig, machine, from[machine]), intents(&folder, machine));
+            compare(&format!("{}, {}", moment.name, DEVICES[machine]), &frames, &intents);
+        }
+        let verified = verify(&folder).unwrap();
+        assert!(verified.records > 0);
+        assert_eq!(*broken.lock().unwrap(), Vec::<String>::new(), "{}", moment.name);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn hold_and_resume_at_every_phase_and_then_abort() {
+    at_every_phase(true).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn abort_at_every_phase() {
+    at_every_phase(false).await;
+}

@@ -1,0 +1,90 @@
+//! What a registration ought to find, from the world's truth and by means of its own.
+//!
+//! The measurand is the pose, and the map of deviations, that best fit the *true* surface at the *measured* places: the form
+//! error itself moves a best fit, and no measurement can undo that. So the true centre of a ball on the real surface is
+//! computed at the foot of every measured centre, without noise, and the pose is the exact least-squares one, found by
+//! Newton's method on the closed form with feet of its own. Nothing here is shared with the library but the type of a pose.
+
+use nalgebra::{Matrix6, Vector6};
+use regrind::geometry::{Pose, Twist};
+use regrind_sim::Vec3;
+use regrind_sim::probe::Placement;
+use regrind_sim::world::World;
+
+use crate::worlds::{Snapshot, foot};
+
+/// The best fit to the true surface.
+pub struct Truth {
+    /// Takes the model frame to the CMM's.
+    pub pose: Pose,
+    /// Deviation at each measured place, less the level.
+    pub deviations_mm: Vec<f64>,
+}
+
+impl Truth {
+    /// Largest less least.
+    pub fn pv_mm(&self) -> f64 {
+        let (low, high) = self.deviations_mm.iter().fold((f64::MAX, f64::MIN), |(l, h), d| (l.min(*d), h.max(*d)));
+        high - low
+    }
+
+    /// Root mean square.
+    pub fn rms_mm(&self) -> f64 {
+        (self.deviations_mm.iter().map(|d| d * d).sum::<f64>() / self.deviations_mm.len() as f64).sqrt()
+    }
+}
+
+/// Fits the true surface of a cycle at the places that took part in the registration; the map is that of all places.
+pub fn truth(world: &World, seen: &Snapshot, used: &[bool], radius_mm: f64, level_mm: f64) -> Truth {
+    let places = seen.places_mm.iter().zip(&seen.heights_mm);
+    let centres: Vec<Vec3> =
+        places.map(|(place, height)| seen.placement.apply(centre(world, *place, *height, radius_mm))).collect();
+    let mut pose = pose_of(&seen.placement);
+    loop {
+        let (mut gram, mut right) = (Matrix6::zeros(), Vector6::zeros());
+        let mut deviations_mm = Vec::with_capacity(centres.len());
+        for (c, used) in centres.iter().zip(used) {
+            let q: Vec3 = pose.inverse().point(&(*c).into()).into();
+            let (_, n, distance) = foot(world, q);
+            let deviation = distance - radius_mm - level_mm;
+            let row = -Vector6::new(
+                n[0],
+                n[1],
+                n[2],
+                q[1] * n[2] - q[2] * n[1],
+                q[2] * n[0] - q[0] * n[2],
+                q[0] * n[1] - q[1] * n[0],
+            );
+            if *used {
+                gram += row * row.transpose();
+                right -= row * deviation;
+            }
+            deviations_mm.push(deviation);
+        }
+        let step: Twist = gram.lu().solve(&right).expect("the part holds its pose");
+        if step.norm() < 1e-9 {
+            return Truth { pose, deviations_mm };
+        }
+        pose = pose * Pose::exp(&step);
+    }
+}
+
+/// The centre of a ball that touches the real surface r = S + h n at a place; its normal is that of the real surface.
+fn centre(world: &World, [x, y]: [f64; 2], [h, hx, hy]: [f64; 3], radius_mm: f64) -> Vec3 {
+    const D: f64 = 1e-3;
+    let (s, n) = world.nominal(x, y);
+    let tangent = |dx: f64, dy: f64, slope: f64| -> Vec3 {
+        let ((sa, na), (sb, nb)) = (world.nominal(x + dx, y + dy), world.nominal(x - dx, y - dy));
+        std::array::from_fn(|i| (sa[i] - sb[i] + h * (na[i] - nb[i])) / (2.0 * D) + slope * n[i])
+    };
+    let (a, b) = (tangent(D, 0.0, hx), tangent(0.0, D, hy));
+    let m = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+    let norm = m.iter().map(|c| c * c).sum::<f64>().sqrt();
+    std::array::from_fn(|i| s[i] + h * n[i] + radius_mm * m[i] / norm)
+}
+
+fn pose_of(placement: &Placement) -> Pose {
+    let (r, t) = (&placement.rotation, &placement.translation_mm);
+    let row = |i: usize| [r[i][0], r[i][1], r[i][2], t[i]];
+    Pose::from_rows([row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]).unwrap()
+}

@@ -1,0 +1,354 @@
+//! A whole cell in one process: a simulated world behind real sockets, and the drive that runs it; for tests of whole cycles.
+//!
+//! [`run`] goes through a recipe as `regrind run` does. What the world was like when a measurement was made is kept just before
+//! the next pass changes it, so that a test can hold every cycle against the truth.
+
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use regrind::cell::{Actor, Alarm, AlarmId, Ending, Role};
+use regrind::config::{CellConfig, Wire};
+use regrind::device::{ModbusCmm, ModbusGrinder, ModbusSettings};
+use regrind::drive::{CycleRow, Drive, Notice, Request, Run, ask};
+use regrind::journal::{Header, Journal};
+use regrind::recipe::Recipe;
+use regrind::setup;
+use regrind_sim::Vec3;
+use regrind_sim::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
+use regrind_sim::probe::Placement;
+use regrind_sim::registers::{Machine, MachineOptions};
+use regrind_sim::wire::Serving;
+use regrind_sim::words;
+use regrind_sim::world::{World, WorldSpec};
+use serde::Deserialize;
+use serde_json::json;
+use tokio::sync::mpsc;
+
+/// The number of the part's run.
+pub const JOB: u32 = 7;
+/// No run takes so long, however loaded the computer is.
+const PATIENCE: Duration = Duration::from_secs(300);
+/// Machine seconds in a second.
+const SPEED: f64 = 50_000.0;
+
+/// What a test changes about a cell before it runs.
+pub struct Setup {
+    /// The recipe's name, without its ending.
+    pub recipe: &'static str,
+    /// Draws everything that is random in the world.
+    pub seed: u64,
+    /// Changes the truth.
+    pub world: Box<dyn Fn(&mut WorldSpec) + Send>,
+    /// Each machine answers where the other should.
+    pub exchanged: bool,
+    /// The words of the machines' values stand the other way round than the cell file says.
+    pub other_word_order: bool,
+}
+
+impl Setup {
+    /// A recipe as it is, with a seed.
+    pub fn new(recipe: &'static str, seed: u64) -> Self {
+        let world = Box::new(|_: &mut WorldSpec| {});
+        Self { recipe, seed, world, exchanged: false, other_word_order: false }
+    }
+
+    /// The same in another world.
+    pub fn with(mut self, world: impl Fn(&mut WorldSpec) + Send + 'static) -> Self {
+        self.world = Box::new(world);
+        self
+    }
+}
+
+/// What the world was like when a cycle was measured.
+pub struct Snapshot {
+    /// The cycle.
+    pub cycle: u32,
+    /// Where the part lay on the CMM.
+    pub placement: Placement,
+    /// Feet of the measured centres on the nominal surface, over the plane of the true model frame.
+    pub places_mm: Vec<[f64; 2]>,
+    /// How far the real surface stood over the nominal there, and its gradient.
+    pub heights_mm: Vec<[f64; 3]>,
+}
+
+/// What came of a run.
+pub struct Ran {
+    /// How it ended.
+    pub ending: Ending,
+    /// What was shown, in order.
+    pub notices: Vec<Notice>,
+    /// The run folder, with the journal.
+    pub folder: PathBuf,
+    /// The truth.
+    pub world: World,
+    /// The truth at each measured cycle.
+    pub snapshots: Vec<Snapshot>,
+    /// Largest PV and RMS that are accepted.
+    pub tolerance_mm: [f64; 2],
+    /// Radius that the recipe states of the probe.
+    pub probe_radius_mm: f64,
+    /// Passes begun when the first alarm that a person must clear was seen, if one was.
+    pub passes_at_alarm: Option<usize>,
+    _home: tempfile::TempDir,
+}
+
+impl Ran {
+    /// The table of cycles.
+    pub fn rows(&self) -> Vec<CycleRow> {
+        let rows = |n: &Notice| if let Notice::Finished { cycles, .. } = n { Some(cycles.clone()) } else { None };
+        self.notices.iter().rev().find_map(rows).unwrap_or_default()
+    }
+
+    /// All alarms, in order.
+    pub fn alarms(&self) -> Vec<&Alarm> {
+        self.notices.iter().filter_map(|n| if let Notice::Alarm(alarm) = n { Some(alarm) } else { None }).collect()
+    }
+
+    /// Whether the part was accepted.
+    pub fn accepted(&self) -> bool {
+        matches!(self.ending, Ending::Accepted { .. })
+    }
+
+    /// Everything that a failed test should show.
+    pub fn told(&self) -> String {
+        let alarms: Vec<_> = self.alarms().iter().map(|a| format!("{:?}: {}", a.id, a.what)).collect();
+        let rows: Vec<_> = self
+            .rows()
+            .iter()
+            .map(|r| format!("cycle {}: PV {:.2} RMS {:.3} um", r.cycle, r.pv_um, r.rms_um))
+            .collect();
+        format!("{:?}\n{}\n{}", self.ending, alarms.join("\n"), rows.join("\n"))
+    }
+}
+
+/// A grinder that lets a test look at the world just before every pass.
+struct Watched<B> {
+    body: B,
+    before: Box<dyn FnMut() + Send>,
+}
+
+impl<B: Body> Body for Watched<B> {
+    fn kind(&self) -> Kind {
+        self.body.kind()
+    }
+    fn name(&self) -> String {
+        self.body.name()
+    }
+    fn check(&self, kind: u16, payload: &Payload) -> Result<(), Refusal> {
+        self.body.check(kind, payload)
+    }
+    fn prepare(&mut self, job: u32, cycle: u16, payloads: &Payloads) -> Result<Progress, Refusal> {
+        self.body.prepare(job, cycle, payloads)
+    }
+    fn begin(&mut self) {
+        (self.before)();
+        self.body.begin();
+    }
+    fn advance(&mut self, seconds: f64) -> Progress {
+        self.body.advance(seconds)
+    }
+    fn retract(&mut self) {
+        self.body.retract();
+    }
+    fn outcome(&mut self, result: u16) -> Outcome {
+        self.body.outcome(result)
+    }
+    fn interlocks(&self) -> u16 {
+        self.body.interlocks()
+    }
+    fn temperature_c(&self) -> f64 {
+        self.body.temperature_c()
+    }
+}
+
+/// Looks at the world where the newest cycle was measured.
+fn snapshot(world: &World, folder: &std::path::Path, taken: &Mutex<Vec<Snapshot>>) {
+    let mut taken = taken.lock().unwrap();
+    let cycles = std::fs::read_dir(folder).unwrap().filter_map(|entry| {
+        let name = entry.unwrap().file_name();
+        name.to_str()?.strip_prefix("cycle-")?.parse::<u32>().ok()
+    });
+    let measured = |cycle: &u32| folder.join(format!("cycle-{cycle}/registration.json")).is_file();
+    let Some(cycle) = cycles.filter(measured).max() else { return };
+    if taken.iter().any(|t| t.cycle == cycle) {
+        return;
+    }
+    let (placement, measured) = (world.placement(), table(&folder.join(format!("cycle-{cycle}/measured.csv"))));
+    let centres = measured.iter().map(|row| back(&placement, [row[0], row[1], row[2]]));
+    let places_mm: Vec<[f64; 2]> = centres.map(|centre| foot(world, centre).0).collect();
+    let h = 1e-3;
+    let stencil: Vec<[f64; 2]> =
+        places_mm.iter().flat_map(|&[x, y]| [[x, y], [x + h, y], [x - h, y], [x, y + h], [x, y - h]]).collect();
+    let values = world.deviations_mm(&stencil);
+    let slopes = values.chunks(5).map(|v| [v[0], (v[1] - v[2]) / (2.0 * h), (v[3] - v[4]) / (2.0 * h)]);
+    taken.push(Snapshot { cycle, placement, places_mm, heights_mm: slopes.collect() });
+}
+
+/// Moves a point of the CMM's frame into the part's.
+pub fn back(placement: &Placement, p: Vec3) -> Vec3 {
+    let d: Vec3 = std::array::from_fn(|i| p[i] - placement.translation_mm[i]);
+    std::array::from_fn(|k| (0..3).map(|i| placement.rotation[i][k] * d[i]).sum())
+}
+
+/// Returns the foot of a point on the true nominal surface: its place, the normal there, the distance.
+///
+/// Each turn moves the foot by what is left along the surface; what is left shrinks by distance over radius of curvature.
+pub fn foot(world: &World, p: Vec3) -> ([f64; 2], Vec3, f64) {
+    let [mut x, mut y] = [p[0], p[1]];
+    for _ in 0..40 {
+        let (s, n) = world.nominal(x, y);
+        let d: Vec3 = std::array::from_fn(|i| p[i] - s[i]);
+        let along: f64 = (0..3).map(|i| d[i] * n[i]).sum();
+        let [tx, ty] = [d[0] - along * n[0], d[1] - along * n[1]];
+        (x, y) = (x + tx, y + ty);
+        if tx.abs().max(ty.abs()) < 1e-12 {
+            break;
+        }
+    }
+    let (s, n) = world.nominal(x, y);
+    ([x, y], n, (0..3).map(|i| (p[i] - s[i]) * n[i]).sum())
+}
+
+/// Reads a table of numbers under a header.
+pub fn table(path: &std::path::Path) -> Vec<Vec<f64>> {
+    let text = std::fs::read_to_string(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+    let row = |line: &str| line.split(',').map(|cell| cell.trim().parse().unwrap()).collect();
+    // Comments, such as the mark of a simulation, then the header.
+    text.lines().filter(|line| !line.starts_with('#')).skip(1).map(row).collect()
+}
+
+/// The project's own folder.
+pub fn root() -> PathBuf {
+    env!("CARGO_MANIFEST_DIR").into()
+}
+
+/// Runs a cell in a runtime of its own.
+pub fn run(setup: Setup) -> Ran {
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
+    runtime.block_on(async {
+        let seed = setup.seed;
+        let name = setup.recipe;
+        tokio::time::timeout(PATIENCE, go(setup)).await.unwrap_or_else(|_| panic!("{name}, seed {seed}: no end"))
+    })
+}
+
+async fn go(setup: Setup) -> Ran {
+    let home = tempfile::tempdir().unwrap();
+    let folder = home.path().join("run");
+    let recipe = Recipe::read(&root().join(format!("recipes/{}.toml", setup.recipe))).unwrap();
+    let cell = CellConfig::read(&root().join("config/sim.toml")).unwrap();
+    let (task, plan) = setup::prepare(&recipe, &cell).unwrap();
+    let probe_radius_mm = recipe.measure.probe_radius_mm;
+    let tolerance_mm = [plan.tolerance.pv_mm, plan.tolerance.rms_mm];
+    let world = world(&setup, &recipe);
+    let taken = Arc::new(Mutex::new(Vec::new()));
+    let (servings, [of_cmm, of_grinder]) = serve(&setup, &world, &cell, &folder, &taken).await;
+    let journal = Journal::create(&folder, header()).unwrap();
+    let (notices, mut shown) = mpsc::unbounded_channel();
+    let poll = [Duration::from_millis(10); 2];
+    let actor = Actor { name: "test".into(), station: "here".into() };
+    let run =
+        Run { plan, task, journal, job: JOB, actor: actor.clone(), loaded: true, poll, notices, interrupted: None };
+    let cmm = ModbusCmm::new(of_cmm).unwrap();
+    let grinder = ModbusGrinder::new(of_grinder).unwrap();
+    let (drive, orders) = Drive::new(run, cmm, grinder).unwrap();
+    let driving = tokio::spawn(drive.run());
+    let mut seen = Vec::new();
+    let mut passes_at_alarm = None;
+    while let Some(notice) = shown.recv().await {
+        let person =
+            matches!(&notice, Notice::Alarm(alarm) if alarm.clears != Role::Nobody && alarm.id != AlarmId::Diverging);
+        seen.push(notice);
+        if person && passes_at_alarm.is_none() {
+            passes_at_alarm = Some(world.history().len());
+            let (folder, orders, actor) = (folder.clone(), orders.clone(), actor.clone());
+            // A held cell waits for a person; this one ends it.
+            tokio::spawn(async move {
+                if rests(folder).await {
+                    orders.give(Request::Stop { reason: "the test has seen enough".into() }, actor).await;
+                }
+            });
+        }
+    }
+    let ending = driving.await.unwrap();
+    snapshot(&world, &folder, &taken);
+    drop(servings);
+    let snapshots = std::mem::take(&mut *taken.lock().unwrap());
+    Ran { ending, notices: seen, folder, world, snapshots, tolerance_mm, probe_radius_mm, passes_at_alarm, _home: home }
+}
+
+/// Waits until the cell is held; false if it ended by itself.
+async fn rests(folder: PathBuf) -> bool {
+    loop {
+        let folder = folder.clone();
+        let reply = tokio::task::spawn_blocking(move || ask(&folder, &Request::Status)).await.unwrap();
+        match reply {
+            Ok(reply) if reply.status["state"] == "Held" => return true,
+            Ok(_) => tokio::time::sleep(Duration::from_millis(5)).await,
+            Err(_) => return false,
+        }
+    }
+}
+
+fn header() -> Header {
+    Header {
+        run: "run".into(),
+        part: "test part".into(),
+        actor: "test".into(),
+        station: "here".into(),
+        simulation: true,
+        first_command_id: 1,
+        content: json!({}),
+    }
+}
+
+fn world(setup: &Setup, recipe: &Recipe) -> World {
+    let table = recipe.simulation.clone().expect("the recipe has a world");
+    let mut spec = WorldSpec::deserialize(toml::Value::Table(table)).unwrap();
+    spec.seed = setup.seed;
+    spec.speed = SPEED;
+    (setup.world)(&mut spec);
+    World::new(spec).unwrap()
+}
+
+/// Serves both machines on ports of their own, and tells the drivers of the cell where.
+async fn serve(
+    setup: &Setup,
+    world: &World,
+    cell: &CellConfig,
+    folder: &std::path::Path,
+    taken: &Arc<Mutex<Vec<Snapshot>>>,
+) -> ([Serving; 2], [ModbusSettings; 2]) {
+    let options = |seed| MachineOptions {
+        speed: SPEED,
+        seed,
+        // A loaded computer is no silent client.
+        lost_after_ms: 30_000,
+        acting: Duration::from_millis(10),
+        word_order: if setup.other_word_order { words::WordOrder::Little } else { words::WordOrder::Big },
+        ..MachineOptions::default()
+    };
+    let (seen, here, kept) = (world.clone(), folder.to_owned(), taken.clone());
+    let before: Box<dyn FnMut() + Send> = Box::new(move || snapshot(&seen, &here, &kept));
+    let grinder = Watched { body: world.grinder(), before };
+    let cmm = Machine::new(Box::new(world.cmm()), 0xc, options(setup.seed));
+    let grinder = Machine::new(Box::new(grinder), 0x9, options(setup.seed + 1));
+    let mut links = [cell.cmm.link.clone(), cell.grinder.link.clone()];
+    let [cmm_unit, grinder_unit] = if setup.exchanged { [2, 1] } else { [1, 2] };
+    let cmm = Serving::tcp("127.0.0.1:0", vec![(cmm_unit, cmm)]).await.unwrap();
+    let grinder = Serving::tcp("127.0.0.1:0", vec![(grinder_unit, grinder)]).await.unwrap();
+    let mut ports = [&cmm, &grinder].map(|serving| serving.local_addr().unwrap().port());
+    if setup.exchanged {
+        ports.reverse();
+    }
+    for (link, bound) in links.iter_mut().zip(ports) {
+        if let Wire::ModbusTcp { port, .. } = &mut link.wire {
+            *port = bound;
+        }
+        link.timing.request_timeout = Duration::from_secs(5);
+        link.timing.lost_after = Duration::from_secs(60);
+    }
+    let settings = links.map(|link| setup::modbus(&link, true, 0x7e57, 1).unwrap());
+    ([cmm, grinder], settings)
+}
