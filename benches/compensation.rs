@@ -8,10 +8,10 @@ use std::sync::LazyLock;
 use divan::{Bencher, black_box};
 use rand::RngExt;
 use regrind::compensation::{
-    Contact, Correction, CorrectionLimits, GainRule, Knowledge, MapOptions, ParameterOptions, Reading, Seen, Smoothing,
+    Contact, Correction, CorrectionLimits, GainRule, LearningState, MapOptions, ParameterOptions, Seen, Smoothing,
     error_map, parameters, point_spacing_mm,
 };
-use regrind::geometry::{Point, Vector};
+use regrind::geometry::{Point, Sample, Vector};
 use regrind_sim::form::FormError;
 use regrind_sim::shape::{FreeForm, Shape};
 
@@ -22,8 +22,8 @@ const SCAN: (usize, usize) = (226, 126);
 const SPACINGS_MM: [f64; 2] = [1.0, 0.5];
 
 static CONTACTS: LazyLock<Vec<Contact>> = LazyLock::new(measured);
-static READINGS: LazyLock<Vec<Reading>> = LazyLock::new(|| {
-    let reading = |c: &Contact| Reading { at_mm: [c.point.x, c.point.y], deviation_mm: c.deviation_mm };
+static READINGS: LazyLock<Vec<Sample>> = LazyLock::new(|| {
+    let reading = |c: &Contact| Sample { at_mm: [c.point.x, c.point.y], deviation_mm: c.deviation_mm };
     CONTACTS.iter().map(reading).collect()
 });
 
@@ -106,7 +106,7 @@ fn correction(bencher: Bencher, spacing_mm: f64) {
     let options = MapOptions::new(CUTOFF_MM, spacing_mm);
     let error = error_map(&READINGS, &options).expect("a map");
     let now = Correction::none(error.grid, 0.06);
-    let begin = Knowledge::new(GainRule::Wavelength, &options, [FreeForm::WIDTH_MM, FreeForm::DEPTH_MM], None);
+    let begin = LearningState::new(GainRule::Wavelength, &options, [FreeForm::WIDTH_MM, FreeForm::DEPTH_MM], None);
     let seen = Seen { correction: &now, error: &error, answer: None };
     let known = begin.after(&seen);
     let limits = CorrectionLimits {

@@ -8,9 +8,9 @@ use std::path::{Path, PathBuf};
 
 use divan::{Bencher, black_box};
 use regrind::compensation::ErrorMap;
-use regrind::form::{FormOptions, Sample, figures};
+use regrind::form::{FormOptions, figures};
 use regrind::formats::{parse_x3p, write_error_map_x3p};
-use regrind::geometry::{Aperture, Grid};
+use regrind::geometry::{Aperture, Grid, Sample};
 use regrind::report::HeatMap;
 
 fn main() {

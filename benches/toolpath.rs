@@ -8,9 +8,9 @@ use std::path::Path;
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
 use regrind::compensation::path::{Field, Move, PathOptions, Summary, ToolPath, Wanted, Wheel};
-use regrind::compensation::{Correction, CorrectionLimits, GainRule, Knowledge, MapOptions, Reading, Seen, error_map};
+use regrind::compensation::{Correction, CorrectionLimits, GainRule, LearningState, MapOptions, Seen, error_map};
 use regrind::formats::gcode::{PathMode, ProgramHeader, write_program};
-use regrind::geometry::{Aperture, Grid};
+use regrind::geometry::{Aperture, Grid, Sample};
 
 fn main() {
     divan::main();
@@ -99,7 +99,7 @@ fn write(path: &ToolPath, summary: &Summary, file: &Path) {
         map_identity: [2; 32],
         uncorrected: false,
         level_mm: 0.02,
-        wheel: path.options().wheel.words(),
+        wheel: path.options().wheel.description(),
         tracks: String::new(),
         spark_out_passes: 0,
         simulation: true,
@@ -113,12 +113,9 @@ fn write(path: &ToolPath, summary: &Summary, file: &Path) {
 fn from_deviations_to_a_program(bencher: Bencher) {
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("part.ngc");
-    let readings: Vec<Reading> = (0..226 * 126)
+    let readings: Vec<Sample> = (0..226 * 126)
         .map(|k| [(k % 226) as f64 * 100.0 / 225.0 - 50.0, (k / 226) as f64 * 60.0 / 125.0 - 30.0])
-        .map(|at_mm| Reading {
-            at_mm,
-            deviation_mm: error_mm(at_mm) + 3e-4 * (1e4 * (at_mm[0] + 3.0 * at_mm[1])).sin(),
-        })
+        .map(|at_mm| Sample { at_mm, deviation_mm: error_mm(at_mm) + 3e-4 * (1e4 * (at_mm[0] + 3.0 * at_mm[1])).sin() })
         .collect();
     let options = MapOptions::new(5.0, 1.0);
     let limits = CorrectionLimits {
@@ -129,7 +126,7 @@ fn from_deviations_to_a_program(bencher: Bencher) {
         removal_budget_mm: 1.0,
         largest_depth_mm: 1.0,
     };
-    let begin = Knowledge::new(GainRule::Wavelength, &options, [100.0, 60.0], None);
+    let begin = LearningState::new(GainRule::Wavelength, &options, [100.0, 60.0], None);
     bencher.bench(|| {
         let error = error_map(black_box(&readings), &options).expect("a map");
         let now = Correction::none(error.grid, 0.06);

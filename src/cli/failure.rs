@@ -3,7 +3,7 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
-use regrind::compensation::StepError;
+use regrind::compensation::NextPassError;
 use regrind::formats::FormatError;
 use regrind::journal::JournalError;
 use regrind::registration::RegistrationError;
@@ -56,7 +56,7 @@ pub(super) enum Failure {
     #[error(transparent)]
     Setup(regrind::setup::SetupError),
     #[error("what {run} learned cannot be begun with: {source}; or write learn = false")]
-    TooMuchLearned { run: String, source: StepError },
+    TooMuchLearned { run: String, source: NextPassError },
     #[error("{path}: {reason}")]
     Simulation { path: PathBuf, reason: String },
     /// The record was read and cannot be believed.

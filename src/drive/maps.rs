@@ -6,10 +6,11 @@ use serde_json::json;
 
 use super::work::{Cycle, Task};
 use crate::compensation::{self, Contact, ErrorMap, ParameterOptions, Smoothing};
-use crate::form::{FormOptions, Sample, TakenOut, figures, slope};
+use crate::form::{FormOptions, TakenOut, figures, slope};
 use crate::formats::{
     ErrorMapOrigin, FormatError, write_error_map, write_error_map_x3p, write_figures, write_json_atomic,
 };
+use crate::geometry::Sample;
 use crate::registration::{PointStatus, Registration};
 use crate::report::{HeatMap, ReportError, save_coloured_ply};
 
@@ -70,7 +71,7 @@ pub(super) fn parameters(task: &Task, folder: &Path, found: &Registration) -> Re
                 "parameters": told.found,
             });
             write_json_atomic(folder.join("parameters.json"), &document)?;
-            return Ok(told.found.into_iter().filter(|p| p.offered).map(|p| p.words).collect());
+            return Ok(told.found.into_iter().filter(|p| p.offered).map(|p| p.message).collect());
         }
         Err(error) => json!({ "simulation": task.simulation, "why_not": error.to_string() }),
     };

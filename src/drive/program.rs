@@ -137,7 +137,7 @@ impl Programs {
             map_identity,
             uncorrected: correction.is_none(),
             level_mm: correction.level_mm,
-            wheel: self.options.wheel.words(),
+            wheel: self.options.wheel.description(),
             tracks: tracks_in_words(path),
             spark_out_passes: self.spark_out_passes,
             simulation: self.simulation,

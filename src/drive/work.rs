@@ -9,7 +9,7 @@ use std::sync::Arc;
 use crate::cell::{CompensationRefusal, CompensationSummary, Event, Figures, Forecast, Gate, GateFailure, Response};
 use crate::compensation::path::{PathError, Summary, ToolPath};
 use crate::compensation::{
-    self, Correction, CorrectionLimits, ErrorMap, GainRule, Knowledge, MapOptions, Reading, Seen, Sense, StepError,
+    self, Correction, CorrectionLimits, ErrorMap, GainRule, LearningState, MapOptions, NextPassError, Seen, Sense,
     error_map, response,
 };
 use crate::device::{Coordinates, CorrectionMap, Identified, Measurement, Pass, Plan, PointStatus, Target, TargetKind};
@@ -18,7 +18,7 @@ use crate::formats::{
     CorrectionIdentities, FormatError, Learned, NominalInput, RegistrationDocument, ResultFolder, save_registration,
     write_correction, write_points,
 };
-use crate::geometry::{Grid, Point, Pose, Vector};
+use crate::geometry::{Grid, Point, Pose, Sample, Vector};
 use crate::measuring::{self, fit_sphere, sphere_targets};
 use crate::registration::{
     MapLimits, Method, Options, PointStatus as Fate, Registration, RegistrationError, Start, register,
@@ -109,7 +109,7 @@ pub(super) struct Cycle {
     pub(super) registration: Option<Arc<Registration>>,
     pub(super) error: Option<Arc<ErrorMap>>,
     /// What is known of the grinder with this cycle taken in.
-    pub(super) known: Option<Arc<Knowledge>>,
+    pub(super) known: Option<Arc<LearningState>>,
     pub(super) figures: Option<Figures>,
     /// Whether it was judged: a measurement that a gate refused tells nothing of the grinder.
     pub(super) judged: bool,
@@ -119,7 +119,7 @@ pub(super) struct Cycle {
 pub(super) struct Found {
     pub(super) registration: Registration,
     pub(super) error: Option<ErrorMap>,
-    pub(super) known: Option<Knowledge>,
+    pub(super) known: Option<LearningState>,
     pub(super) figures: Figures,
 }
 
@@ -141,10 +141,12 @@ impl Task {
     ///
     /// # Errors
     /// A first correction beyond the limits of this run; the task is left as it was.
-    pub fn begin_with(&mut self, learned: Learned) -> Result<(), StepError> {
+    pub fn begin_with(&mut self, learned: Learned) -> Result<(), NextPassError> {
         let before = self.learned.replace(learned);
         let within = self.first_correction().removed_mm(&self.limits).map_err(|error| match error {
-            StepError::BudgetSpent { removed_mm, budget_mm } => StepError::BudgetAtOnce { removed_mm, budget_mm },
+            NextPassError::BudgetSpent { removed_mm, budget_mm } => {
+                NextPassError::BudgetAtOnce { removed_mm, budget_mm }
+            }
             error => error,
         });
         if within.is_err() {
@@ -197,10 +199,10 @@ impl Task {
     }
 
     /// What is known of the grinder before the first pass.
-    fn beginning(&self) -> Knowledge {
+    fn beginning(&self) -> LearningState {
         let Pass { x_mm, y_mm, .. } = self.pass;
         let size_mm = [x_mm[1] - x_mm[0], y_mm[1] - y_mm[0]];
-        let fresh = || Knowledge::new(self.gain, &self.map, size_mm, self.repeatability_mm);
+        let fresh = || LearningState::new(self.gain, &self.map, size_mm, self.repeatability_mm);
         self.learned.as_ref().map_or_else(fresh, |learned| learned.known.for_next_part())
     }
 
@@ -397,7 +399,7 @@ fn learned_from(
     before: Option<&Cycle>,
     error: &ErrorMap,
     answer: Option<compensation::Response>,
-) -> Knowledge {
+) -> LearningState {
     let earlier = before.and_then(|before| before.known.as_deref().cloned()).unwrap_or_else(|| task.beginning());
     earlier.after(&Seen { correction: &cycle.correction, error, answer })
 }
@@ -413,9 +415,9 @@ fn save(task: &Task, folder: &Path, found: &Registration, options: &Options) -> 
     save_registration(folder, &document, &found.deviations)
 }
 
-fn readings(found: &Registration) -> Vec<Reading> {
+fn readings(found: &Registration) -> Vec<Sample> {
     let used = found.deviations.iter().filter(|d| d.status == Fate::Used);
-    used.map(|d| Reading { at_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect()
+    used.map(|d| Sample { at_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect()
 }
 
 fn figures(
@@ -505,7 +507,7 @@ pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &
     };
     let step = match cycle.correction.next(&map, &known, &task.limits) {
         Ok(step) => step,
-        Err(error @ StepError::BudgetSpent { .. }) => {
+        Err(error @ NextPassError::BudgetSpent { .. }) => {
             return refused(CompensationRefusal::BudgetSpent(error.to_string()));
         }
         Err(error) => return refused(CompensationRefusal::Failed(error.to_string())),

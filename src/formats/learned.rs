@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::compensation::{Correction, Knowledge};
+use crate::compensation::{Correction, LearningState};
 
 /// The file in a run folder.
 pub const LEARNED: &str = "learned.json";
@@ -28,7 +28,7 @@ pub struct Learned {
     /// The correction that the next pass of that part would have had.
     pub correction: Correction,
     /// How well it is known.
-    pub known: Knowledge,
+    pub known: LearningState,
 }
 
 /// What tells whether a file is looked for at all.
@@ -54,7 +54,7 @@ pub enum LearnedError {
 
 impl Learned {
     /// What a run leaves to the next part.
-    pub fn new(simulation: bool, setting: String, run: String, correction: Correction, known: Knowledge) -> Self {
+    pub fn new(simulation: bool, setting: String, run: String, correction: Correction, known: LearningState) -> Self {
         Self { layout: LAYOUT, simulation, setting, run, correction, known }
     }
 
@@ -133,7 +133,7 @@ mod tests {
         let correction = Correction::none(GRID, 0.05);
         let values = (0..GRID.len()).map(|k| 1e-3 * k as f64).collect();
         let error = ErrorMap::known(GRID, values, vec![true; GRID.len()]);
-        let begin = Knowledge::new(GainRule::Wavelength, &MapOptions::new(1.0, 1.0), [4.0, 3.0], None);
+        let begin = LearningState::new(GainRule::Wavelength, &MapOptions::new(1.0, 1.0), [4.0, 3.0], None);
         let known = begin.after(&Seen { correction: &correction, error: &error, answer: None });
         Learned::new(true, "a part".into(), "run-1".into(), correction.changed(&known), known)
     }

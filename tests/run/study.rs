@@ -4,11 +4,11 @@
 use std::path::Path;
 
 use regrind::compensation::{
-    Correction, ErrorMap, GainRule, Knowledge, MapOptions, Reading, Seen, StepError, error_map, response,
+    Correction, ErrorMap, GainRule, LearningState, MapOptions, NextPassError, Seen, error_map, response,
 };
 use regrind::config::CellConfig;
 use regrind::drive::Task;
-use regrind::geometry::{Grid, Point, Vector};
+use regrind::geometry::{Grid, Point, Sample, Vector};
 use regrind::recipe::Recipe;
 use regrind::registration::{PointStatus, Registration};
 use regrind::setup;
@@ -75,7 +75,7 @@ impl Bench {
         };
         let twin = WorldSpec { grinder: alone, ..spec.clone() };
         let (world, twin) = (World::new(spec).unwrap(), World::new(twin).unwrap());
-        let mut learned: Option<(Correction, Knowledge)> = None;
+        let mut learned: Option<(Correction, LearningState)> = None;
         (0..parts)
             .map(|part| {
                 let mut line = Line::new(self, way, &world, &twin, learned.take(), part as u32 + 1);
@@ -96,7 +96,7 @@ struct Line<'a> {
     job: u32,
     places: Vec<[f64; 2]>,
     correction: Correction,
-    known: Knowledge,
+    known: LearningState,
     before: Option<(Correction, ErrorMap)>,
     forecast: Option<[f64; 2]>,
 }
@@ -107,7 +107,7 @@ impl<'a> Line<'a> {
         way: Way,
         world: &'a World,
         twin: &'a World,
-        learned: Option<(Correction, Knowledge)>,
+        learned: Option<(Correction, LearningState)>,
         job: u32,
     ) -> Self {
         let task = &bench.task;
@@ -120,7 +120,7 @@ impl<'a> Line<'a> {
             Some((correction, known)) => {
                 (Correction { values_mm: correction.values_mm, ..none }, known.for_next_part())
             }
-            None => (none, Knowledge::new(rule, &task.map, size_mm, None)),
+            None => (none, LearningState::new(rule, &task.map, size_mm, None)),
         };
         if job > 1 {
             world.load_blank();
@@ -203,8 +203,8 @@ impl<'a> Line<'a> {
     fn correct(&mut self, found: &Registration) {
         let task = &self.bench.task;
         let used = || found.deviations.iter().filter(|d| d.status == PointStatus::Used);
-        let readings: Vec<Reading> =
-            used().map(|d| Reading { at_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect();
+        let readings: Vec<Sample> =
+            used().map(|d| Sample { at_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect();
         let error = match self.way {
             Way::Regrind(_) => error_map(&readings, &task.map).unwrap(),
             Way::Plain => unfiltered(&readings, &task.map),
@@ -221,7 +221,7 @@ impl<'a> Line<'a> {
         let next = match self.correction.next(&error, &self.known, &task.limits) {
             Ok(step) => step.correction,
             // The study goes on where a recipe would have no material left: what counts here is the form.
-            Err(StepError::BudgetSpent { .. }) => {
+            Err(NextPassError::BudgetSpent { .. }) => {
                 let changed = self.correction.changed(&self.known);
                 Correction {
                     level_mm: changed.level_mm - task.limits.depth_of_cut_mm,
@@ -235,7 +235,7 @@ impl<'a> Line<'a> {
     }
 
     /// What a next part would begin with.
-    fn learned(&self) -> Option<(Correction, Knowledge)> {
+    fn learned(&self) -> Option<(Correction, LearningState)> {
         Some((self.correction.clone(), self.known.clone()))
     }
 
@@ -291,10 +291,10 @@ fn grind(grinder: &mut Grinder, job: u32, cycle: u16, map: &Map, pass: &Pass) {
 }
 
 /// What was measured, nearest point by nearest point.
-fn unfiltered(readings: &[Reading], options: &MapOptions) -> ErrorMap {
+fn unfiltered(readings: &[Sample], options: &MapOptions) -> ErrorMap {
     let grid = Grid::over(readings.iter().map(|r| r.at_mm), options.spacing_mm).unwrap();
     let nearest = |[x, y]: [f64; 2]| {
-        let distance = |r: &&Reading| (r.at_mm[0] - x).powi(2) + (r.at_mm[1] - y).powi(2);
+        let distance = |r: &&Sample| (r.at_mm[0] - x).powi(2) + (r.at_mm[1] - y).powi(2);
         readings.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap().deviation_mm
     };
     let values_mm = (0..grid.len()).map(|k| nearest(grid.place_mm(k))).collect();

@@ -31,6 +31,8 @@ const WIDEST_STEP: f64 = 0.55;
 const REACH: f64 = 5.3;
 /// Fewer readings than this within the cut-off of a node, along x and along y, are no evidence for a surface.
 pub(super) const LEAST_READINGS: u32 = 6;
+/// Most nodes that a filter may work on; a short cut-off on a wide grid asks for more nodes than the grid has.
+pub(super) const MOST_WORKED: f64 = 2e7;
 /// A value whose variance is more than so many times that of one reading is a guess.
 const MOST_VARIANCE: f64 = 2.0;
 

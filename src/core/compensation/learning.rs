@@ -79,7 +79,7 @@ struct Mean {
 }
 
 /// An error on the grid of a correction.
-struct Told {
+struct ErrorOnGrid {
     grid: Grid,
     error_mm: Vec<f64>,
     valid: Vec<bool>,
@@ -89,7 +89,7 @@ struct Told {
 
 /// What is known of the error that comes back in every pass.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Knowledge {
+pub struct LearningState {
     rule: GainRule,
     /// Change of the surface over change of the correction, and its standard uncertainty.
     response: [f64; 2],
@@ -128,7 +128,7 @@ pub struct Seen<'a> {
     pub answer: Option<Response>,
 }
 
-impl Knowledge {
+impl LearningState {
     /// Knows nothing yet. `repeatability_mm` is the rms of what a pass adds by itself, where that is known from elsewhere; it is shared out
     /// over the bands alike.
     pub fn new(rule: GainRule, map: &MapOptions, size_mm: [f64; 2], repeatability_mm: Option<f64>) -> Self {
@@ -165,7 +165,7 @@ impl Knowledge {
             known.wanted_mm = Some(seen.correction.values_mm.clone());
             return known;
         }
-        let told = Told::of(seen.error, seen.correction.grid);
+        let told = ErrorOnGrid::of(seen.error, seen.correction.grid);
         if let Some(answer) = seen.answer.filter(|answer| answer.sense == Sense::AsCommanded) {
             known.response = combined(self.response, &answer, self.bands[0].independent(&told));
         }
@@ -184,7 +184,7 @@ impl Knowledge {
         for ((band, mean), noise_mm2) in
             known.bands.iter_mut().zip(self.split(&told, mean.values_mm.clone())).zip(noise)
         {
-            band.believe(told.mean_square(&mean), noise_mm2);
+            band.shrink(told.mean_square(&mean), noise_mm2);
             add(&mut believed, band.share, &mean);
         }
         known.wanted_mm = Some(match self.rule {
@@ -219,9 +219,9 @@ impl Knowledge {
 
     /// Returns what the pass after this error is expected to leave.
     pub fn forecast(&self, error: &ErrorMap) -> Forecast {
-        let rest2 = error.rest_sigma_mm.powi(2);
+        let rest2 = error.residual_sigma_mm.powi(2);
         let (mut left2, mut scatter2, mut independent) = (0.0, 0.0, 0.0);
-        let told = Told::of(error, error.grid);
+        let told = ErrorOnGrid::of(error, error.grid);
         let noise = self.noise_mm2(told.noise_mm2);
         for ((band, values), noise_mm2) in self.bands.iter().zip(self.split(&told, told.error_mm.clone())).zip(noise) {
             let seen2 = told.mean_square(&values);
@@ -295,7 +295,7 @@ impl Knowledge {
     }
 
     /// Splits values on the grid of an error into what each band holds of them; the parts add up to the values.
-    fn split(&self, told: &Told, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
+    fn split(&self, told: &ErrorOnGrid, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
         let mut parts = Vec::with_capacity(self.bands.len());
         let whole = rest.clone();
         for longer in &self.bands[1..] {
@@ -330,7 +330,7 @@ impl Mean {
     }
 }
 
-impl Told {
+impl ErrorOnGrid {
     /// An error on another grid: everything that is learned stands on the grid of the correction, so that only the error, which becomes
     /// small, is ever taken from between nodes.
     fn of(error: &ErrorMap, grid: Grid) -> Self {
@@ -383,7 +383,7 @@ impl Band {
     }
 
     /// Chooses the share of the mean, given by its mean square, that is believed; `noise_mm2` is what the points alone scatter by.
-    fn believe(&mut self, mean_mm2: f64, noise_mm2: f64) {
+    fn shrink(&mut self, mean_mm2: f64, noise_mm2: f64) {
         let of_mean_mm2 = self.scatter_mm2().unwrap_or(noise_mm2) * self.belief.unwrap_or(1.0);
         let share = 1.0 - of_mean_mm2 / mean_mm2;
         // Of nothing all may be believed.
@@ -391,7 +391,7 @@ impl Band {
     }
 
     /// Number of independent values that a map has in this band: [`CORRELATED`] squares of twice its shortest waves make one.
-    fn independent(&self, told: &Told) -> f64 {
+    fn independent(&self, told: &ErrorOnGrid) -> f64 {
         let [dx, dy] = told.grid.spacing_mm;
         let area_mm2 = dx * dy * told.valid.iter().filter(|valid| **valid).count() as f64;
         (area_mm2 / (2.0 * self.from_mm).powi(2) / CORRELATED).max(1.0)
@@ -427,8 +427,8 @@ mod tests {
     /// Bands from 2.5, 5 and 10 mm; an octave more would be half the part.
     const CUTOFF_MM: f64 = 2.5;
 
-    fn begin(rule: GainRule, repeatability_mm: Option<f64>) -> Knowledge {
-        Knowledge::new(rule, &MapOptions::new(CUTOFF_MM, 1.0), [40.0, 30.0], repeatability_mm)
+    fn begin(rule: GainRule, repeatability_mm: Option<f64>) -> LearningState {
+        LearningState::new(rule, &MapOptions::new(CUTOFF_MM, 1.0), [40.0, 30.0], repeatability_mm)
     }
 
     fn map(value: impl Fn([f64; 2]) -> f64) -> ErrorMap {
@@ -440,7 +440,7 @@ mod tests {
         Correction::none(GRID, 0.0)
     }
 
-    fn after(known: &Knowledge, correction: &Correction, error: &ErrorMap) -> Knowledge {
+    fn after(known: &LearningState, correction: &Correction, error: &ErrorMap) -> LearningState {
         known.after(&Seen { correction, error, answer: None })
     }
 
@@ -631,14 +631,14 @@ mod tests {
         let known = begin(GainRule::Wavelength, None);
         assert_eq!(known.bands.iter().map(|b| b.from_mm).collect::<Vec<_>>(), [2.5, 5.0, 10.0]);
         let error = map(|[x, y]| (1.3 * x).sin() + 0.1 * y + (0.2 * x * y).cos());
-        let parts = known.split(&Told::of(&error, GRID), error.values_mm.clone());
+        let parts = known.split(&ErrorOnGrid::of(&error, GRID), error.values_mm.clone());
         for (k, value) in error.values_mm.iter().enumerate() {
             assert!((parts.iter().map(|part| part[k]).sum::<f64>() - value).abs() < 1e-12);
         }
         // A long wave is in the last band, a short one in the first.
         let share = |wavelength_mm: f64, band: usize| {
             let wave = map(|[x, _]| (x * std::f64::consts::TAU / wavelength_mm).cos());
-            rms(&known.split(&Told::of(&wave, GRID), wave.values_mm.clone())[band]) / rms(&wave.values_mm)
+            rms(&known.split(&ErrorOnGrid::of(&wave, GRID), wave.values_mm.clone())[band]) / rms(&wave.values_mm)
         };
         assert!(share(30.0, 2) > 0.85 && share(3.0, 0) > 0.8, "{} {}", share(30.0, 2), share(3.0, 0));
     }
@@ -653,7 +653,7 @@ mod tests {
             point[node] = 1.0;
             let smooth =
                 filter_grid(&GRID, &point, &vec![true; GRID.len()], CUTOFF_MM, Order::default(), false).unwrap();
-            let told = Told::of(&of(smooth.values.clone()), GRID);
+            let told = ErrorOnGrid::of(&of(smooth.values.clone()), GRID);
             let power = |values: &[f64]| values.iter().map(|v| v * v).sum::<f64>();
             let parts = known.split(&told, smooth.values.clone());
             [power(&parts[0]), power(&parts[1]), power(&parts[2]), power(&smooth.values)]
@@ -696,7 +696,7 @@ mod tests {
     fn numbers_that_cannot_be_are_seen() {
         let known = after(&begin(GainRule::Wavelength, None), &none(), &map(|[x, _]| 1e-3 * x));
         assert!(known.is_sound());
-        let broken = |change: fn(&mut Knowledge)| {
+        let broken = |change: fn(&mut LearningState)| {
             let mut known = known.clone();
             change(&mut known);
             !known.is_sound()

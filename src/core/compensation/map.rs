@@ -6,29 +6,18 @@
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use thiserror::Error;
 
-use super::filter::{Filtered, Gaussian, LEAST_READINGS, Order};
+use super::MapError;
+use super::filter::{Filtered, Gaussian, MOST_WORKED, Order};
+use super::kept::Kept;
 use super::level::{Levelled, level_off};
 use super::robust::{Residuals, Robust, residuals, robust};
 use super::sampling::{check_cutoff, point_spacings_mm};
-use super::spline::{Roughness, SplineError, spline};
-use crate::geometry::{Grid, GridError};
-
-/// Most nodes that a filter may work on; a short cut-off on a wide grid asks for more nodes than the grid has.
-const MOST_WORKED: f64 = 2e7;
+use super::spline::{Roughness, spline};
+use crate::geometry::{Grid, Sample};
 
 /// Least cut-off of the surface that readings are judged by, in distances between them.
 const WIDE: f64 = 4.0;
-
-/// One deviation and where it was measured.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Reading {
-    /// x and y of the contact point in the model frame, in millimetres.
-    pub at_mm: [f64; 2],
-    /// Positive where material stands proud, in millimetres.
-    pub deviation_mm: f64,
-}
 
 /// What makes the deviations smooth.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -91,7 +80,7 @@ pub struct ErrorMap {
     /// Whether enough was measured around a node.
     pub valid: Vec<bool>,
     /// Standard deviation of the deviations from the map, in millimetres: what the filter took out.
-    pub rest_sigma_mm: f64,
+    pub residual_sigma_mm: f64,
     /// Standard uncertainty of the error at every node from the scatter of single readings, in millimetres; where `valid` is not, that of
     /// the nearest valid node, which says nothing of how far the part goes on as it does there.
     pub sigma_mm: Vec<f64>,
@@ -105,44 +94,6 @@ pub struct ErrorMap {
     pub advice: Vec<String>,
 }
 
-/// Why there is no map.
-#[derive(Clone, Debug, Error, PartialEq)]
-#[allow(missing_docs)]
-pub enum MapError {
-    #[error(transparent)]
-    Grid(#[from] GridError),
-    #[error(transparent)]
-    Spline(#[from] SplineError),
-    #[error("a cut-off of {cutoff_mm} mm is asked for; it must be above 0")]
-    Cutoff { cutoff_mm: f64 },
-    #[error("{name} of {value} is asked for; it must be {wanted}")]
-    Option { name: &'static str, value: f64, wanted: &'static str },
-    #[error("deviation {} is not finite; the measurement must not be used", index + 1)]
-    NotFinite { index: usize },
-    #[error(
-        "only {valid} of {nodes} nodes have {LEAST_READINGS} measured points around them within the cut-off of {cutoff_mm} mm; measure more \
-         densely or choose a longer cut-off"
-    )]
-    TooSparse { valid: usize, nodes: usize, cutoff_mm: f64 },
-    #[error(
-        "a cut-off of {cutoff_mm} mm on a grid of {width_mm:.1} x {depth_mm:.1} mm needs {nodes:.0} nodes to filter on, more than \
-         {MOST_WORKED:.0}; choose a longer cut-off"
-    )]
-    CutoffTooShort { cutoff_mm: f64, width_mm: f64, depth_mm: f64, nodes: f64 },
-    #[error(
-        "a cut-off of {cutoff_mm:.3} mm is below {least_mm:.3} mm, twice the width of {contact_width_mm:.3} mm over which the wheel touches: \
-         shorter waves cannot be ground; choose a longer cut-off or a smaller wheel"
-    )]
-    CutoffBelowContact { cutoff_mm: f64, least_mm: f64, contact_width_mm: f64 },
-    #[error(
-        "a cut-off of {cutoff_mm:.3} mm is below {least_mm:.3} mm, twice the distance of {point_spacing_mm:.3} mm between measured points: \
-         shorter waves are not seen; choose a longer cut-off or measure more densely"
-    )]
-    CutoffBelowSpacing { cutoff_mm: f64, least_mm: f64, point_spacing_mm: f64 },
-    #[error("{found} values are given for a grid of {nodes} nodes; there must be one for each")]
-    Shape { found: usize, nodes: usize },
-}
-
 /// Takes outliers out of deviations, filters the rest and lays it on a grid.
 ///
 /// Shapes: readings in any order. Frames: x and y of the model frame. Units: millimetres. Equation: weighted least squares of a
@@ -152,7 +103,7 @@ pub enum MapError {
 ///
 /// # Errors
 /// Deviations that are not finite, too few of them for the cut-off, options out of range, and a grid that cannot be.
-pub fn error_map(readings: &[Reading], options: &MapOptions) -> Result<ErrorMap, MapError> {
+pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, MapError> {
     check(readings, options)?;
     let grid = Grid::over(readings.iter().map(|r| r.at_mm), options.spacing_mm)?;
     let gaussian = Gaussian { cutoff_mm: options.cutoff_mm, order: options.order };
@@ -229,7 +180,7 @@ fn density(filtered: &Filtered, gaussian: &Gaussian) -> f64 {
     gaussian.open_leverage() / median
 }
 
-fn check(readings: &[Reading], options: &MapOptions) -> Result<(), MapError> {
+fn check(readings: &[Sample], options: &MapOptions) -> Result<(), MapError> {
     let MapOptions { cutoff_mm, level_off_mm, contact_width_mm, outlier_limit, .. } = *options;
     if !(cutoff_mm > 0.0 && cutoff_mm.is_finite()) {
         return Err(MapError::Cutoff { cutoff_mm });
@@ -242,7 +193,7 @@ fn check(readings: &[Reading], options: &MapOptions) -> Result<(), MapError> {
     if let Some(value) = outlier_limit.filter(|limit| limit.is_nan() || *limit < 3.0) {
         return Err(MapError::Option { name: "outlier_limit", value, wanted: "3 or more, or good points are lost" });
     }
-    match readings.iter().position(|r| !(r.at_mm[0] + r.at_mm[1] + r.deviation_mm).is_finite()) {
+    match readings.iter().position(|r| !r.is_finite()) {
         Some(index) => Err(MapError::NotFinite { index }),
         None => Ok(()),
     }
@@ -259,28 +210,6 @@ fn worked_grid(grid: &Grid, gaussian: &Gaussian) -> Result<Grid, MapError> {
     }
     let spacing_mm = [0, 1].map(|k| grid.spacing_mm[k] / division[k] as f64);
     Ok(Grid { columns: finer(0) as usize, rows: finer(1) as usize, first_mm: grid.first_mm, spacing_mm })
-}
-
-/// The readings that are used, places and values apart.
-pub(super) struct Kept {
-    pub places: Vec<[f64; 2]>,
-    pub values: Vec<f64>,
-}
-
-impl Kept {
-    fn all(readings: &[Reading]) -> Self {
-        Self {
-            places: readings.iter().map(|r| r.at_mm).collect(),
-            values: readings.iter().map(|r| r.deviation_mm).collect(),
-        }
-    }
-
-    fn without(readings: &[Reading], outliers: &[usize]) -> Self {
-        let mut left_out = vec![false; readings.len()];
-        outliers.iter().for_each(|&k| left_out[k] = true);
-        let used: Vec<Reading> = (0..readings.len()).filter(|&k| !left_out[k]).map(|k| readings[k]).collect();
-        Self::all(&used)
-    }
 }
 
 /// What was found at the nodes of a map, before it is levelled off.
@@ -328,7 +257,7 @@ impl Smooth {
             grid,
             values_mm: values,
             valid: self.valid,
-            rest_sigma_mm: (rest2 / kept.values.len().max(1) as f64).sqrt(),
+            residual_sigma_mm: (rest2 / kept.values.len().max(1) as f64).sqrt(),
             sigma_mm: sources.into_iter().map(|source| self.sigma[source]).collect(),
             point_sigma_mm: self.point_sigma,
             outliers,
@@ -346,7 +275,7 @@ impl ErrorMap {
             sigma_mm: vec![0.0; values_mm.len()],
             values_mm,
             valid,
-            rest_sigma_mm: 0.0,
+            residual_sigma_mm: 0.0,
             point_sigma_mm: 0.0,
             outliers: Vec::new(),
             point_spacing_mm: 0.0,

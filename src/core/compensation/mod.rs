@@ -12,10 +12,13 @@
 //! outward normal, so that a correction takes back a deviation of the opposite sign.
 
 mod correction;
+mod error;
 mod filter;
+mod kept;
 mod learning;
 mod level;
 mod map;
+mod next_pass;
 mod parameters;
 pub mod path;
 mod response;
@@ -24,10 +27,12 @@ mod sampling;
 mod selected;
 mod spline;
 
-pub use correction::{Correction, CorrectionLimits, Step, StepError};
+pub use correction::Correction;
+pub use error::MapError;
 pub use filter::Order;
-pub use learning::{Forecast, GainRule, Knowledge, Seen};
-pub use map::{ErrorMap, FilteredGrid, MapError, MapOptions, Reading, Smoothing, error_map, filter_grid};
+pub use learning::{Forecast, GainRule, LearningState, Seen};
+pub use map::{ErrorMap, FilteredGrid, MapOptions, Smoothing, error_map, filter_grid};
+pub use next_pass::{CorrectionLimits, NextPass, NextPassError};
 pub use parameters::{
     Contact, Parameter, ParameterError, ParameterKind, ParameterOptions, Parameters, WheelTerm, parameters,
 };

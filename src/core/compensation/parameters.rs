@@ -88,6 +88,7 @@ impl ParameterOptions {
 /// A parameter that is looked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
 pub enum ParameterKind {
     /// True radius of the wheel less the stated one.
     WheelRadius,
@@ -116,8 +117,9 @@ pub struct Parameter {
     pub offered: bool,
     /// By how much the root mean square falls when it is corrected beside the others that are offered, in millimetres; 0 where it is not offered.
     pub removes_rms_mm: f64,
-    /// What to do, in words.
-    pub words: String,
+    /// What to do, for people.
+    #[serde(rename = "words")]
+    pub message: String,
 }
 
 /// Parameters and what is left without those that are offered.
@@ -136,6 +138,7 @@ pub struct Parameters {
 /// Why parameters cannot be separated.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
+#[non_exhaustive]
 pub enum ParameterError {
     #[error("{points} points do not tell parameters from form; measure {LEAST_POINTS} at least")]
     TooFew { points: usize },
@@ -189,9 +192,9 @@ pub fn parameters(
             alike: if separable[k] { Vec::new() } else { alike(k, &motions, &candidates) },
             offered: offered[k],
             removes_rms_mm: if offered[k] { rms(&left(Some(k))) - rest_rms_mm } else { 0.0 },
-            words: String::new(),
+            message: String::new(),
         };
-        parameter.words = words(&parameter, rest_rms_mm, options.wheel_radius_mm);
+        parameter.message = message(&parameter, rest_rms_mm, options.wheel_radius_mm);
         found.push(parameter);
     }
     Ok(Parameters { found, rms_mm, rest_rms_mm, rest_mm })
@@ -498,7 +501,7 @@ fn name(kind: ParameterKind) -> &'static str {
     }
 }
 
-fn words(parameter: &Parameter, rest_rms_mm: f64, wheel_radius_mm: f64) -> String {
+fn message(parameter: &Parameter, rest_rms_mm: f64, wheel_radius_mm: f64) -> String {
     let (name, value_um, sigma_um) = (name(parameter.kind), 1e3 * parameter.value_mm, 1e3 * parameter.sigma_mm);
     if !parameter.alike.is_empty() {
         let alike = parameter.alike.join(" and ");

@@ -2,7 +2,8 @@
 
 use rayon::prelude::*;
 
-use super::map::{MapError, Reading};
+use super::MapError;
+use crate::geometry::Sample;
 
 /// Readings whose neighbours are looked up for the spacing; more would not change a median.
 const PROBED: usize = 50;
@@ -45,15 +46,15 @@ pub fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_mm: f64
 /// Around a reading the nearest other one is looked for in each of four sectors, about +x, -x, +y and -y. The median over
 /// readings is taken for x and y apart: rows that are dense along and sparse across give the distance across. 0 where
 /// there are too few readings to tell.
-pub fn point_spacing_mm(readings: &[Reading]) -> f64 {
+pub fn point_spacing_mm(readings: &[Sample]) -> f64 {
     let [x, y] = point_spacings_mm(readings);
     x.max(y)
 }
 
 /// Returns the distance between neighbouring readings along x and along y, in millimetres.
-pub(super) fn point_spacings_mm(readings: &[Reading]) -> [f64; 2] {
+pub(super) fn point_spacings_mm(readings: &[Sample]) -> [f64; 2] {
     let step = readings.len().div_ceil(PROBED).max(1);
-    let chosen: Vec<&Reading> = readings.iter().step_by(step).collect();
+    let chosen: Vec<&Sample> = readings.iter().step_by(step).collect();
     let nearest: Vec<[f64; 4]> = chosen.par_iter().map(|from| nearest_by_sector(from.at_mm, readings)).collect();
     let median = |sectors: [usize; 2]| {
         let mut found: Vec<f64> =
@@ -65,7 +66,7 @@ pub(super) fn point_spacings_mm(readings: &[Reading]) -> [f64; 2] {
 }
 
 /// Returns the distances of the nearest readings about +x, -x, +y and -y; infinite where there is none.
-fn nearest_by_sector([x, y]: [f64; 2], readings: &[Reading]) -> [f64; 4] {
+fn nearest_by_sector([x, y]: [f64; 2], readings: &[Sample]) -> [f64; 4] {
     let mut nearest2 = [f64::INFINITY; 4];
     for r in readings {
         let (dx, dy) = (r.at_mm[0] - x, r.at_mm[1] - y);
@@ -83,9 +84,9 @@ fn nearest_by_sector([x, y]: [f64; 2], readings: &[Reading]) -> [f64; 4] {
 mod tests {
     use super::*;
 
-    fn grid(columns: usize, rows: usize, step_mm: [f64; 2]) -> Vec<Reading> {
+    fn grid(columns: usize, rows: usize, step_mm: [f64; 2]) -> Vec<Sample> {
         let place = |k: usize| [(k % columns) as f64 * step_mm[0], (k / columns) as f64 * step_mm[1]];
-        (0..columns * rows).map(|k| Reading { at_mm: place(k), deviation_mm: 0.0 }).collect()
+        (0..columns * rows).map(|k| Sample { at_mm: place(k), deviation_mm: 0.0 }).collect()
     }
 
     #[test]

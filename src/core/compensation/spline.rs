@@ -24,7 +24,7 @@ use serde::Serialize;
 use thiserror::Error;
 
 use super::filter::Trend;
-use super::map::Kept;
+use super::kept::Kept;
 use super::selected::{Pattern, SelectedInverse};
 use crate::geometry::Grid;
 
@@ -51,6 +51,7 @@ pub enum Roughness {
 /// Why there is no smoothing surface.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
+#[non_exhaustive]
 pub enum SplineError {
     #[error(
         "a spline with a cut-off of {cutoff_mm} mm over {width_mm:.1} x {depth_mm:.1} mm takes {coefficients:.0} coefficients, more than \

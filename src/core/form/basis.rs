@@ -1,9 +1,9 @@
 //! The polynomials that form is taken apart into.
 
-use crate::geometry::Aperture;
+use crate::geometry::{Aperture, Sample};
 use crate::surface::analytic::{ZernikeNumbering, jacobi_values};
 
-use super::{FormError, Sample};
+use super::FormError;
 
 /// Most terms of a Legendre series: complete up to degree 13.
 const MOST_LEGENDRE: usize = 105;

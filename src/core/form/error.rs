@@ -2,9 +2,12 @@
 
 use thiserror::Error;
 
+use crate::geometry::Sample;
+
 /// Why there is no such figure.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
+#[non_exhaustive]
 pub enum FormError {
     #[error("{points} points, and at least {least} are needed; measure more of them or ask for fewer terms")]
     TooFewPoints { points: usize, least: usize },
@@ -33,4 +36,15 @@ pub enum FormError {
          measure more densely"
     )]
     NoSlope { integration_mm: f64 },
+}
+
+/// Refuses samples that no figure can be made of.
+pub(super) fn check(samples: &[Sample], least: usize) -> Result<(), FormError> {
+    if samples.len() < least {
+        return Err(FormError::TooFewPoints { points: samples.len(), least });
+    }
+    match samples.iter().position(|sample| !sample.is_finite()) {
+        Some(index) => Err(FormError::NotFinite { index }),
+        None => Ok(()),
+    }
 }

@@ -1,12 +1,14 @@
 //! The figures of the points themselves.
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
+use super::FormError;
 use super::basis::Basis;
-use super::fit::{Fit, fit_most, solve};
+use super::error::check;
+use super::fit::{Fit, fit_most};
 use super::iso::{Iso10110, iso_10110};
-use super::{FormError, Sample, bounds, check};
-use crate::geometry::Aperture;
+use super::removed::{Removed, bounds, pv, without};
+use crate::geometry::{Aperture, Sample};
 
 /// Terms of the fit in PVr (Evans 2009: the first 36 Fringe Zernike polynomials).
 const PVR_TERMS: usize = 36;
@@ -16,38 +18,6 @@ const LEFT_OUT: f64 = 0.002;
 const MOST_CELLS: f64 = 64.0;
 /// Points that a cell of the coverage holds on average.
 const POINTS_A_CELL: f64 = 4.0;
-
-/// A simple form that is taken off before anything else.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Removed {
-    /// A constant.
-    Piston,
-    /// A tilt about any axis: x and y.
-    Tilt,
-    /// x^2 + y^2, as an error of the radius of curvature makes it.
-    Power,
-    /// x^2 - y^2 and 2 x y.
-    Astigmatism,
-    /// (x^2 + y^2) x and (x^2 + y^2) y.
-    Coma,
-    /// (x^2 + y^2)^2.
-    Spherical,
-}
-
-impl Removed {
-    /// Returns what it is called.
-    pub fn word(self) -> &'static str {
-        match self {
-            Self::Piston => "piston",
-            Self::Tilt => "tilt",
-            Self::Power => "power",
-            Self::Astigmatism => "astigmatism",
-            Self::Coma => "coma",
-            Self::Spherical => "spherical",
-        }
-    }
-}
 
 /// How figures are made.
 #[derive(Clone, Debug, PartialEq)]
@@ -185,56 +155,6 @@ fn rectangle([low, high]: [[f64; 2]; 2]) -> Result<Aperture, FormError> {
     Ok(Aperture::Rectangle { centre_mm, width_mm, height_mm })
 }
 
-/// Takes simple forms off by least squares, all at once.
-pub(super) fn without(removed: &[Removed], samples: &[Sample]) -> Result<Vec<Sample>, FormError> {
-    let [low, high] = bounds(samples);
-    let middle: [f64; 2] = std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
-    let half = 0.5 * (high[0] - low[0]).max(high[1] - low[1]);
-    if removed.is_empty() {
-        return Ok(samples.to_vec());
-    }
-    if half == 0.0 {
-        return Err(FormError::NoArea);
-    }
-    // Lengths in half sizes of the part, so that every term is of order 1.
-    let values = |sample: &Sample| {
-        let [x, y]: [f64; 2] = std::array::from_fn(|k| (sample.at_mm[k] - middle[k]) / half);
-        let q = x * x + y * y;
-        removed.iter().flat_map(move |form| {
-            let (first, second) = match form {
-                Removed::Piston => (1.0, None),
-                Removed::Tilt => (x, Some(y)),
-                Removed::Power => (q, None),
-                Removed::Astigmatism => (x * x - y * y, Some(2.0 * x * y)),
-                Removed::Coma => (q * x, Some(q * y)),
-                Removed::Spherical => (q * q, None),
-            };
-            [Some(first), second].into_iter().flatten()
-        })
-    };
-    let terms = values(&samples[0]).count();
-    check(samples, terms)?;
-    let solved = solve(terms, samples, |_, sample, row| {
-        row.iter_mut().zip(values(sample)).for_each(|(slot, value)| *slot = value);
-        Ok(())
-    })?;
-    if let Some(k) = solved.undetermined {
-        let names = removed.iter().flat_map(|form| std::iter::repeat_n(form.word(), values_of(*form)));
-        let term = names.collect::<Vec<_>>()[k].to_owned();
-        return Err(FormError::Undetermined { term, points: samples.len() });
-    }
-    let left = |sample: &Sample| {
-        let form: f64 = values(sample).zip(&solved.coefficients).map(|(value, c)| value * c).sum();
-        Sample { deviation_mm: sample.deviation_mm - form, ..*sample }
-    };
-    Ok(samples.iter().map(left).collect())
-}
-
-/// How many terms a form has.
-fn values_of(form: Removed) -> usize {
-    if matches!(form, Removed::Tilt | Removed::Astigmatism | Removed::Coma) { 2 } else { 1 }
-}
-
 fn robust_pv(fit: &Fit, samples: &[Sample]) -> Result<RobustPv, FormError> {
     let values = fit.values_mm(samples)?;
     let fit_pv_mm = pv(values.into_iter());
@@ -246,11 +166,6 @@ fn robust_pv(fit: &Fit, samples: &[Sample]) -> Result<RobustPv, FormError> {
         basis: fit.basis.name(),
         terms: fit.coefficients_mm.len(),
     })
-}
-
-pub(super) fn pv(values: impl Iterator<Item = f64>) -> f64 {
-    let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
-    if high >= low { high - low } else { 0.0 }
 }
 
 /// The range between the quantiles 0.1 % and 99.9 %, straight between neighbouring points.

@@ -8,8 +8,10 @@
 use nalgebra::DMatrix;
 use rayon::prelude::*;
 
+use super::FormError;
 use super::basis::{Basis, Terms};
-use super::{FormError, Sample, check};
+use super::error::check;
+use crate::geometry::Sample;
 
 /// Rows that are decomposed at a time.
 const SHARE: usize = 512;

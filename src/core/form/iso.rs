@@ -12,10 +12,11 @@
 
 use serde::Serialize;
 
-use super::figures::{Removed, pv, without};
+use super::FormError;
+use super::error::check;
 use super::fit::solve;
-use super::{FormError, Sample, check};
-use crate::geometry::Aperture;
+use super::removed::{Removed, pv, without};
+use crate::geometry::{Aperture, Sample};
 
 /// Highest power of r of the symmetric part, halved.
 const SYMMETRIC: usize = 6;

@@ -2,7 +2,8 @@
 
 use serde::Serialize;
 
-use super::figures::{Figures, Removed};
+use super::figures::Figures;
+use super::removed::Removed;
 use super::slope::Slope;
 
 /// The direction of all figures.

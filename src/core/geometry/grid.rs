@@ -22,6 +22,7 @@ pub struct Grid {
 /// Why there is no such grid.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
+#[non_exhaustive]
 pub enum GridError {
     #[error("a map with nodes every {spacing_mm} mm is asked for; the spacing must be above 0")]
     Spacing { spacing_mm: f64 },

@@ -7,12 +7,14 @@ pub mod grid;
 pub mod grid_order;
 pub mod pose;
 pub mod rigid;
+pub mod sample;
 
 pub use aperture::{Aperture, ApertureError};
 pub use grid::{Grid, GridError};
 pub use grid_order::{GridOrder, recognise_grid};
 pub use pose::{Pose, PoseError, Twist};
 pub use rigid::{RigidError, RigidFit, fit_rigid};
+pub use sample::Sample;
 
 /// A position in space, in millimetres.
 pub type Point = nalgebra::Point3<f64>;

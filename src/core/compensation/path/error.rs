@@ -5,6 +5,7 @@ use thiserror::Error;
 /// Why there is no path, or why it must not be sent: what, where, the limit, and what to do.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
+#[non_exhaustive]
 pub enum PathError {
     #[error("there is no surface to lay a path over; check the nominal surface and its outline")]
     Empty,

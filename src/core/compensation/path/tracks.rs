@@ -4,39 +4,13 @@ use std::f64::consts::TAU;
 
 use crate::geometry::Aperture;
 
-use super::{PathError, PathOptions};
+use super::PathError;
+use super::options::{PathOptions, Pattern};
 
 /// Most tracks of a path.
 const MOST_TRACKS: f64 = 1e6;
 /// Places at which a track is looked at for whether it is on the part; parts of it that are shorter may be missed.
 const LOOKS: usize = 720;
-
-/// How tracks run.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Pattern {
-    /// Along x, one beside the other in y from the least to the largest.
-    Raster {
-        /// Whether every track runs towards +x; else they alternate.
-        one_way: bool,
-    },
-    /// On a spiral about the middle of the outline, from outside inwards, turning clockwise seen from +z.
-    Spiral,
-}
-
-/// How far apart tracks are.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum TrackSpacing {
-    /// So far over x and y, in millimetres, at most.
-    Distance(f64),
-    /// As far as leaves ridges of a height at most, in millimetres: h = s^2 / (8 r_eff), with 1 / r_eff the curvature of the wheel less
-    /// that of the hollow surface across the track.
-    Scallop {
-        /// The height.
-        height_mm: f64,
-        /// Never farther apart than this, in millimetres.
-        widest_mm: f64,
-    },
-}
 
 /// A track, or a piece of one.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -1,9 +1,8 @@
 //! Along the tracks, point by point: as far from each to the next as the chord error allows.
 
+use super::tracks::Span;
+use super::{Pattern, ToolPath};
 use crate::geometry::{Point, Vector};
-
-use super::ToolPath;
-use super::tracks::{Pattern, Span};
 
 /// Share of the chord error that a step aims at: the deviation is looked at in the middle of a step, and the largest is near it.
 const AIM: f64 = 0.8;
@@ -62,11 +61,19 @@ struct Walk {
     at: Point,
 }
 
-impl<'a> Moves<'a> {
-    pub(super) fn new(path: &'a ToolPath) -> Self {
-        Self::of(path, 0, path.tracks())
+impl ToolPath {
+    /// Returns the moves of the wheel's centre, from the first rapid one to the last.
+    pub fn moves(&self) -> Moves<'_> {
+        Moves::of(self, 0, self.tracks())
     }
 
+    /// Returns the same moves track by track; each ends at the safe height.
+    pub fn moves_by_track(&self) -> Vec<Moves<'_>> {
+        (0..self.tracks()).map(|k| Moves::of(self, k, k + 1)).collect()
+    }
+}
+
+impl<'a> Moves<'a> {
     /// The moves of some of the spans, which begin and end at the safe height.
     pub(super) fn of(path: &'a ToolPath, from: usize, to: usize) -> Self {
         Self { path, next: from, end: to, state: State::Above, bend: 0.0 }

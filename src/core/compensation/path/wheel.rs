@@ -110,8 +110,8 @@ impl Wheel {
         }
     }
 
-    /// Returns the wheel in words, for the header of a program.
-    pub fn words(&self) -> String {
+    /// Returns what the wheel is, for the header of a program.
+    pub fn description(&self) -> String {
         let of = |v: &Vector| format!("{:.4} {:.4} {:.4}", v.x, v.y, v.z);
         match self {
             Self::Sphere { radius_mm } => format!("sphere, radius {radius_mm} mm, XYZ is its centre"),

@@ -3,9 +3,9 @@
 use std::f64::consts::TAU;
 
 use regrind_core::form::{
-    Basis, Figures, Fit, FormError, FormOptions, Removed, Sample, TakenOut, figures, fit, fit_most, iso_10110, labelled,
+    Basis, Figures, Fit, FormError, FormOptions, Removed, TakenOut, figures, fit, fit_most, iso_10110, labelled,
 };
-use regrind_core::geometry::Aperture;
+use regrind_core::geometry::{Aperture, Sample};
 use regrind_core::surface::analytic::ZernikeNumbering;
 
 const CENTRE: [f64; 2] = [3.0, -2.0];

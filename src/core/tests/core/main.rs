@@ -5,7 +5,7 @@ mod common;
 mod distance;
 mod exact;
 mod form;
-mod knowledge;
+mod learning;
 mod map;
 mod paper;
 mod parameters;

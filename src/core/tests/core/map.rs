@@ -4,29 +4,27 @@ use std::f64::consts::{PI, TAU};
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use regrind_core::compensation::{
-    ErrorMap, MapError, MapOptions, Order, Reading, Roughness, Smoothing, error_map, filter_grid,
-};
-use regrind_core::geometry::{Grid, GridError};
+use regrind_core::compensation::{ErrorMap, MapError, MapOptions, Order, Roughness, Smoothing, error_map, filter_grid};
+use regrind_core::geometry::{Grid, GridError, Sample};
 
 /// Readings at the nodes of a grid about the origin, of a function of the place.
-fn sampled(columns: usize, rows: usize, step_mm: [f64; 2], f: impl Fn(f64, f64) -> f64) -> Vec<Reading> {
+fn sampled(columns: usize, rows: usize, step_mm: [f64; 2], f: impl Fn(f64, f64) -> f64) -> Vec<Sample> {
     let at = |k: usize, n: usize, step: f64| (k as f64 - 0.5 * (n - 1) as f64) * step;
     let place = |k: usize| [at(k % columns, columns, step_mm[0]), at(k / columns, rows, step_mm[1])];
-    let reading = |at_mm: [f64; 2]| Reading { at_mm, deviation_mm: f(at_mm[0], at_mm[1]) };
+    let reading = |at_mm: [f64; 2]| Sample { at_mm, deviation_mm: f(at_mm[0], at_mm[1]) };
     (0..columns * rows).map(place).map(reading).collect()
 }
 
 /// The measurement of the trials: 60 x 30 points over 102 x 62 mm.
-fn trial(f: impl Fn(f64, f64) -> f64) -> Vec<Reading> {
+fn trial(f: impl Fn(f64, f64) -> f64) -> Vec<Sample> {
     sampled(60, 30, [102.0 / 59.0, 62.0 / 29.0], f)
 }
 
 /// Readings strewn evenly over a rectangle about the origin.
-fn strewn(count: usize, size_mm: [f64; 2], seed: u64, f: impl Fn(f64, f64) -> f64) -> Vec<Reading> {
+fn strewn(count: usize, size_mm: [f64; 2], seed: u64, f: impl Fn(f64, f64) -> f64) -> Vec<Sample> {
     let mut rng = StdRng::seed_from_u64(seed);
     let mut place = || size_mm.map(|size| size * (rng.random::<f64>() - 0.5));
-    let reading = |at_mm: [f64; 2]| Reading { at_mm, deviation_mm: f(at_mm[0], at_mm[1]) };
+    let reading = |at_mm: [f64; 2]| Sample { at_mm, deviation_mm: f(at_mm[0], at_mm[1]) };
     (0..count).map(|_| place()).map(reading).collect()
 }
 
@@ -35,12 +33,12 @@ fn normal(rng: &mut StdRng) -> f64 {
     (-2.0 * (1.0 - u).ln()).sqrt() * (TAU * v).cos()
 }
 
-fn with_noise(readings: &[Reading], sigma_mm: f64, seed: u64) -> Vec<Reading> {
+fn with_noise(readings: &[Sample], sigma_mm: f64, seed: u64) -> Vec<Sample> {
     let mut rng = StdRng::seed_from_u64(seed);
-    readings.iter().map(|r| Reading { deviation_mm: r.deviation_mm + sigma_mm * normal(&mut rng), ..*r }).collect()
+    readings.iter().map(|r| Sample { deviation_mm: r.deviation_mm + sigma_mm * normal(&mut rng), ..*r }).collect()
 }
 
-fn made(readings: &[Reading], options: &MapOptions) -> ErrorMap {
+fn made(readings: &[Sample], options: &MapOptions) -> ErrorMap {
     error_map(readings, options).unwrap()
 }
 
@@ -65,7 +63,7 @@ fn passed(map: &ErrorMap, wave: impl Fn([f64; 2]) -> f64, counts: impl Fn([f64; 
 }
 
 /// The direct sum over all readings at every node, as the filter is defined: first order.
-fn direct(readings: &[Reading], grid: &Grid, cutoff_mm: f64) -> Vec<f64> {
+fn direct(readings: &[Sample], grid: &Grid, cutoff_mm: f64) -> Vec<f64> {
     let width2 = (2f64.ln() / PI) * cutoff_mm * cutoff_mm;
     (0..grid.len())
         .map(|k| {
@@ -142,7 +140,7 @@ fn the_sums_along_the_axes_are_those_of_the_definition() {
 
 #[test]
 fn what_the_order_lets_pass_passes_to_the_edges() {
-    let hole = |r: &Reading| (r.at_mm[0] - 5.0).hypot(r.at_mm[1]) > 8.0;
+    let hole = |r: &Sample| (r.at_mm[0] - 5.0).hypot(r.at_mm[1]) > 8.0;
     let plane = |x: f64, y: f64| 3e-3 + 1e-4 * x - 2e-4 * y;
     let quadric = |x: f64, y: f64| plane(x, y) + 1e-5 * x * x - 3e-6 * x * y + 2e-5 * y * y;
     let check = |order: Order, smoothing: Smoothing, f: &dyn Fn(f64, f64) -> f64, most: f64| {
@@ -169,8 +167,8 @@ fn the_filter_does_not_care_where_the_part_lies() {
     for smoothing in [Smoothing::Gaussian, Smoothing::RobustGaussian, Smoothing::Spline] {
         let options = MapOptions { smoothing, ..MapOptions::new(6.0, 1.0) };
         let here = with_noise(&strewn(2000, [50.0, 40.0], 8, |x, y| 1e-3 * (0.3 * x).sin() * (0.2 * y).cos()), 2e-4, 4);
-        let there: Vec<Reading> =
-            here.iter().map(|r| Reading { at_mm: [r.at_mm[0] + 1234.5, r.at_mm[1] - 777.25], ..*r }).collect();
+        let there: Vec<Sample> =
+            here.iter().map(|r| Sample { at_mm: [r.at_mm[0] + 1234.5, r.at_mm[1] - 777.25], ..*r }).collect();
         let mut turned = here.clone();
         turned.reverse();
         let (map, moved, back) = (made(&here, &options), made(&there, &options), made(&turned, &options));
@@ -197,7 +195,7 @@ fn form(x: f64, y: f64) -> f64 {
 }
 
 /// Puts a spike of 20 standard deviations on one point in a hundred; returns which.
-fn spiked(readings: &mut [Reading], height_mm: f64, seed: u64) -> Vec<usize> {
+fn spiked(readings: &mut [Sample], height_mm: f64, seed: u64) -> Vec<usize> {
     let mut rng = StdRng::seed_from_u64(seed);
     let spikes: Vec<usize> = (0..readings.len()).filter(|_| rng.random::<f64>() < 0.01).collect();
     for &k in &spikes {
@@ -250,7 +248,7 @@ fn a_feature_of_the_part_is_kept() {
 }
 
 /// Scatter of the map over draws, over the uncertainty it states, at valid nodes.
-fn scatter_over_stated(readings: &[Reading], options: &MapOptions, noise_mm: f64, draws: u64) -> (f64, f64, f64) {
+fn scatter_over_stated(readings: &[Sample], options: &MapOptions, noise_mm: f64, draws: u64) -> (f64, f64, f64) {
     let clean = made(readings, options);
     let mut squares = vec![0.0; clean.grid.len()];
     let mut point = 0.0;
@@ -348,9 +346,9 @@ fn a_map_on_a_net_is_filtered_as_readings_are() {
         .map(|([x, y], v)| if *v { form(x, y) + 3e-4 * normal(&mut rng) } else { f64::INFINITY })
         .collect();
     let plain_form = filter_grid(&grid, &values, &valid, 5.0, Order::Plane, false).unwrap();
-    let readings: Vec<Reading> = (0..grid.len())
+    let readings: Vec<Sample> = (0..grid.len())
         .filter(|&k| valid[k])
-        .map(|k| Reading { at_mm: grid.place_mm(k), deviation_mm: values[k] })
+        .map(|k| Sample { at_mm: grid.place_mm(k), deviation_mm: values[k] })
         .collect();
     let exact = direct(&readings, &grid, 5.0);
     let nodes = || (0..grid.len()).filter(|&k| plain_form.valid[k]);
@@ -375,12 +373,12 @@ fn what_makes_no_map_is_said() {
     assert!(matches!(error_map(&some[..1], &options), Err(MapError::TooSparse { .. })));
     for smoothing in [Smoothing::Gaussian, Smoothing::RobustGaussian, Smoothing::Spline] {
         let options = MapOptions { smoothing, ..options };
-        let line: Vec<Reading> = (0..100).map(|k| Reading { at_mm: [f64::from(k), 0.0], deviation_mm: 1e-3 }).collect();
+        let line: Vec<Sample> = (0..100).map(|k| Sample { at_mm: [f64::from(k), 0.0], deviation_mm: 1e-3 }).collect();
         assert!(matches!(error_map(&line, &options), Err(MapError::TooSparse { .. })), "{smoothing:?}");
-        let slanted: Vec<Reading> =
-            (0..100).map(|k| Reading { at_mm: [f64::from(k), 0.3 * f64::from(k)], deviation_mm: 1e-3 }).collect();
+        let slanted: Vec<Sample> =
+            (0..100).map(|k| Sample { at_mm: [f64::from(k), 0.3 * f64::from(k)], deviation_mm: 1e-3 }).collect();
         assert!(matches!(error_map(&slanted, &options), Err(MapError::TooSparse { .. })), "{smoothing:?}");
-        let one_place = vec![Reading { at_mm: [3.0, 4.0], deviation_mm: 1e-3 }; 50];
+        let one_place = vec![Sample { at_mm: [3.0, 4.0], deviation_mm: 1e-3 }; 50];
         assert!(error_map(&one_place, &options).is_err(), "{smoothing:?}");
     }
     let mut broken = some.clone();
@@ -409,8 +407,8 @@ fn the_size_of_the_values_does_not_matter() {
         let unit = with_noise(&trial(form), 3e-4, 6);
         let map = made(&unit, &options);
         for factor in [1e-6, 1e6, 0.0] {
-            let scaled: Vec<Reading> =
-                unit.iter().map(|r| Reading { deviation_mm: factor * r.deviation_mm, ..*r }).collect();
+            let scaled: Vec<Sample> =
+                unit.iter().map(|r| Sample { deviation_mm: factor * r.deviation_mm, ..*r }).collect();
             let other = made(&scaled, &options);
             let apart = other.values_mm.iter().zip(&map.values_mm).map(|(o, m)| (o - factor * m).abs());
             assert!(apart.fold(0.0, f64::max) <= 1e-14 * factor, "{smoothing:?} {factor}");

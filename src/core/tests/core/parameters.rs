@@ -59,11 +59,11 @@ fn what_is_planted_is_found_exactly_without_form() {
         [(ParameterKind::WheelRadius, 0.09), (ParameterKind::SettingX, 0.012), (ParameterKind::SettingY, -0.009)]
     {
         let parameter = of(&found, kind);
-        println!("{}: own share {}", parameter.words, parameter.own_share);
-        assert!((parameter.value_mm - value).abs() < 1e-10 && parameter.offered, "{}", parameter.words);
+        println!("{}: own share {}", parameter.message, parameter.own_share);
+        assert!((parameter.value_mm - value).abs() < 1e-10 && parameter.offered, "{}", parameter.message);
     }
     assert!(found.rest_rms_mm < 1e-10 && found.rms_mm > 1e-3);
-    let radius = &of(&found, ParameterKind::WheelRadius).words;
+    let radius = &of(&found, ParameterKind::WheelRadius).message;
     assert!(radius.starts_with("wheel radius: 12.5900 mm instead of 12.5000 mm would remove "), "{radius}");
 }
 
@@ -90,7 +90,7 @@ fn coverage(
                 ParameterKind::WheelRadius => 0.09,
                 ParameterKind::SettingX => 0.012,
                 ParameterKind::SettingY => -0.009,
-                ParameterKind::Wear => 0.0,
+                _ => 0.0,
             };
             let parameter = of(&found, *kind);
             let z = (parameter.value_mm - truth) / parameter.sigma_mm;
@@ -144,19 +144,19 @@ fn what_looks_alike_is_said() {
     // A setting error of a round wheel is a shift of the part.
     let free = find(&on(&FreeForm::default(), scatter), [true; 6]);
     let setting = of(&free, ParameterKind::SettingX);
-    assert_eq!(setting.alike, ["a shift of the part along x"], "{}", setting.words);
+    assert_eq!(setting.alike, ["a shift of the part along x"], "{}", setting.message);
     assert!(!setting.offered && setting.value_mm == 0.0);
     // On a sphere a shift is also a tilt.
     let sphere = find(&on(&Sphere { radius_mm: 120.0 }, scatter), DATUM);
     for kind in [ParameterKind::SettingX, ParameterKind::SettingY] {
         let setting = of(&sphere, kind);
-        assert!(!setting.offered && setting.alike[0].starts_with("a tilt of the part about"), "{}", setting.words);
+        assert!(!setting.offered && setting.alike[0].starts_with("a tilt of the part about"), "{}", setting.message);
     }
     let plane = find(&on(&FreeForm { scale: 0.0 }, scatter), [true; 6]);
     let radius = of(&plane, ParameterKind::WheelRadius);
-    assert!(radius.words.contains("no effect on a level surface"), "{}", radius.words);
+    assert!(radius.message.contains("no effect on a level surface"), "{}", radius.message);
     let wear = of(&plane, ParameterKind::Wear);
-    assert!(wear.alike.contains(&"a tilt of the part about x".to_owned()), "{}", wear.words);
+    assert!(wear.alike.contains(&"a tilt of the part about x".to_owned()), "{}", wear.message);
     assert!(plane.found.iter().all(|p| !p.offered && !p.alike.is_empty()));
     assert_eq!(plane.rest_rms_mm, plane.rms_mm);
     // A plane that leans: 1/nz - 1 is a constant there, which is a shift along z.
@@ -166,7 +166,7 @@ fn what_looks_alike_is_said() {
         .map(|c| Contact { normal: tilted, point: Point::new(c.point.x, c.point.y, -0.3 * c.point.x), ..c })
         .collect();
     let radius = of(&find(&leaning, [true; 6]), ParameterKind::WheelRadius).clone();
-    assert!(!radius.offered && radius.alike.iter().any(|a| a.starts_with("a shift")), "{}", radius.words);
+    assert!(!radius.offered && radius.alike.iter().any(|a| a.starts_with("a shift")), "{}", radius.message);
 }
 
 /// Progress along a spiral from the middle: as the area within.

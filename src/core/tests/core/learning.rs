@@ -2,7 +2,7 @@
 
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use regrind_core::compensation::{Correction, ErrorMap, GainRule, Knowledge, MapOptions, Seen};
+use regrind_core::compensation::{Correction, ErrorMap, GainRule, LearningState, MapOptions, Seen};
 use regrind_core::geometry::Grid;
 
 const GRID: Grid = Grid { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0, 1.0] };
@@ -34,7 +34,7 @@ fn what_comes_back_is_found_to_the_scatter_of_the_mean() {
     for world in 0..WORLDS {
         let mut random = StdRng::seed_from_u64(SEED + world);
         let form = drawn(&mut random, 0.02);
-        let mut known = Knowledge::new(GainRule::Wavelength, &MapOptions::new(2.5, 1.0), [40.0, 30.0], None);
+        let mut known = LearningState::new(GainRule::Wavelength, &MapOptions::new(2.5, 1.0), [40.0, 30.0], None);
         let mut correction = Correction::none(GRID, 0.0);
         for left in &mut left {
             let scatter = drawn(&mut random, SCATTER_MM);

@@ -1,0 +1,25 @@
+//! The readings that a map is made of.
+
+use crate::geometry::Sample;
+
+/// The readings that are used, places and values apart.
+pub(super) struct Kept {
+    pub places: Vec<[f64; 2]>,
+    pub values: Vec<f64>,
+}
+
+impl Kept {
+    pub fn all(readings: &[Sample]) -> Self {
+        Self {
+            places: readings.iter().map(|r| r.at_mm).collect(),
+            values: readings.iter().map(|r| r.deviation_mm).collect(),
+        }
+    }
+
+    pub fn without(readings: &[Sample], outliers: &[usize]) -> Self {
+        let mut left_out = vec![false; readings.len()];
+        outliers.iter().for_each(|&k| left_out[k] = true);
+        let used: Vec<Sample> = (0..readings.len()).filter(|&k| !left_out[k]).map(|k| readings[k]).collect();
+        Self::all(&used)
+    }
+}

@@ -1,0 +1,219 @@
+//! What the next pass is asked for: the correction so far, less what was found, within limits.
+
+use thiserror::Error;
+
+use super::correction::Correction;
+use super::learning::LearningState;
+use super::map::ErrorMap;
+
+/// What a correction must keep to.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CorrectionLimits {
+    /// Depth of the pass under the one before, in millimetres, unless it takes more to cut everywhere.
+    pub depth_of_cut_mm: f64,
+    /// What is taken off at least where least is taken off, in millimetres.
+    pub least_depth_mm: f64,
+    /// Largest correction anywhere, in millimetres.
+    pub largest_correction_mm: f64,
+    /// Level of the first pass, in millimetres: what removal is counted from.
+    pub allowance_mm: f64,
+    /// All that may be removed below the surface of the first pass, in millimetres.
+    pub removal_budget_mm: f64,
+    /// The most that the machine may take off in one pass anywhere, in millimetres.
+    pub largest_depth_mm: f64,
+}
+
+/// The correction of the next pass and what it will do.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NextPass {
+    /// For the next pass.
+    pub correction: Correction,
+    /// Depth of this pass under the one before, in millimetres: the depth of cut, or more where the part is low.
+    pub depth_mm: f64,
+    /// Removed in all below the surface of the first pass, where it is most, in millimetres.
+    pub removed_mm: f64,
+    /// Share of the part where the wheel will cut air, as far as it can be foreseen.
+    pub air_share: f64,
+}
+
+/// Why there is no next pass.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[allow(missing_docs)]
+#[non_exhaustive]
+pub enum NextPassError {
+    #[error(
+        "the correction would reach {found_um:.2} um at x {x_mm:.2}, y {y_mm:.2} mm, more than the {limit_um:.2} um that the recipe allows; find \
+         the cause of so large an error, or raise largest_correction_um",
+        found_um = 1e3 * found_mm, limit_um = 1e3 * limit_mm
+    )]
+    TooLarge { found_mm: f64, x_mm: f64, y_mm: f64, limit_mm: f64 },
+    #[error(
+        "the next pass would bring the removal to {removed_um:.2} um, more than the budget of {budget_um:.2} um; the part has no more material to \
+         give: accept it as it is, or scrap it",
+        removed_um = 1e3 * removed_mm, budget_um = 1e3 * budget_mm
+    )]
+    BudgetSpent { removed_mm: f64, budget_mm: f64 },
+    #[error(
+        "the first pass would take {removed_um:.2} um off where it takes off most, more than the budget of {budget_um:.2} um; raise \
+         removal_budget_um",
+        removed_um = 1e3 * removed_mm, budget_um = 1e3 * budget_mm
+    )]
+    BudgetAtOnce { removed_mm: f64, budget_mm: f64 },
+    #[error(
+        "the next pass would take {found_um:.2} um off where it takes off most, more than the {limit_um:.2} um of grinder.limits.largest_depth_mm; \
+         lower the error by another way, or raise the limit if the machine allows it",
+        found_um = 1e3 * found_mm, limit_um = 1e3 * limit_mm
+    )]
+    TooDeep { found_mm: f64, limit_mm: f64 },
+}
+
+impl Correction {
+    /// Returns the correction that takes back what is worth it, whatever any limit says of it; for the same pass and level.
+    pub fn changed(&self, known: &LearningState) -> Self {
+        let values_mm = known.wanted_mm().unwrap_or(&self.values_mm).to_vec();
+        Self { values_mm, ..self.clone() }
+    }
+
+    /// Returns what the part has lost in all where it loses most, below the surface of a first pass without a correction, in millimetres.
+    ///
+    /// # Errors
+    /// A correction above its limit, and a removal above the budget.
+    pub fn removed_mm(&self, limits: &CorrectionLimits) -> Result<f64, NextPassError> {
+        let within = |v: f64| v.abs() <= limits.largest_correction_mm;
+        if let Some(k) = self.values_mm.iter().position(|v| !within(*v)) {
+            let ([x_mm, y_mm], limit_mm) = (self.grid.place_mm(k), limits.largest_correction_mm);
+            return Err(NextPassError::TooLarge { found_mm: self.values_mm[k], x_mm, y_mm, limit_mm });
+        }
+        // The correction itself adds where it is negative.
+        let deepest_mm = self.values_mm.iter().copied().fold(0.0, f64::min);
+        let removed_mm = limits.allowance_mm - self.level_mm - deepest_mm;
+        // A picometre is rounding, not removal.
+        if removed_mm > limits.removal_budget_mm + 1e-9 {
+            return Err(NextPassError::BudgetSpent { removed_mm, budget_mm: limits.removal_budget_mm });
+        }
+        Ok(removed_mm)
+    }
+
+    /// Takes back of the error that the last pass left what is worth taking back, and goes deep enough to cut everywhere.
+    ///
+    /// Only removal is possible: the new surface must lie below the present one everywhere. A rise of the correction by d raises the
+    /// surface by s d, s being the part's response, and every pass adds its own scatter; so the depth is at least the largest rise, two
+    /// standard deviations of the scatter and the least depth of cut together.
+    ///
+    /// Frames: x and y of the model frame. Units: millimetres.
+    ///
+    /// # Errors
+    /// A correction above its limit, a pass deeper than the machine may cut, and a removal above the budget.
+    pub fn next(
+        &self,
+        error: &ErrorMap,
+        known: &LearningState,
+        limits: &CorrectionLimits,
+    ) -> Result<NextPass, NextPassError> {
+        let values_mm = self.changed(known).values_mm;
+        let on_grid: Vec<f64> = values_mm.iter().zip(&self.values_mm).map(|(next, now)| next - now).collect();
+        // Where it was measured: there it is known how much the wheel will cut.
+        let changes_mm = self.grid.resample(&on_grid, &error.grid);
+        let (response, scatter_mm) = (known.response()[0], known.scatter_mm().unwrap_or(0.0));
+        let rise_mm = on_grid.iter().map(|change| response * change).fold(0.0, f64::max);
+        let depth_mm = limits.depth_of_cut_mm.max(rise_mm + 2.0 * scatter_mm + limits.least_depth_mm);
+        let fall_mm = on_grid.iter().map(|change| response * change).fold(0.0, f64::min);
+        let (found_mm, limit_mm) = (depth_mm - fall_mm, limits.largest_depth_mm);
+        if found_mm > limit_mm {
+            return Err(NextPassError::TooDeep { found_mm, limit_mm });
+        }
+        let correction = Self { grid: self.grid, values_mm, cycle: self.cycle + 1, level_mm: self.level_mm - depth_mm };
+        let removed_mm = correction.removed_mm(limits)?;
+        let depths_mm =
+            || changes_mm.iter().zip(&error.valid).filter(|(_, valid)| **valid).map(|(c, _)| depth_mm - response * c);
+        let air: f64 = depths_mm().map(|depth| normal_tail(depth / (2f64.sqrt() * scatter_mm))).sum();
+        let air_share = air / depths_mm().count().max(1) as f64;
+        Ok(NextPass { correction, depth_mm, removed_mm, air_share })
+    }
+}
+
+/// The share of a normal distribution that lies more than z standard deviations below its mean; within 1e-7.
+fn normal_tail(z: f64) -> f64 {
+    if z.is_nan() || z > 8.0 {
+        return 0.0;
+    }
+    // Abramowitz and Stegun, 26.2.17, for z >= 0; the other side by symmetry.
+    let t = 1.0 / (1.0 + 0.231_641_9 * z.abs());
+    let terms = [0.319_381_530, -0.356_563_782, 1.781_477_937, -1.821_255_978, 1.330_274_429];
+    let sum = terms.iter().rev().fold(0.0, |sum, term| (sum + term) * t);
+    let tail = (-0.5 * z * z).exp() / std::f64::consts::TAU.sqrt() * sum;
+    if z >= 0.0 { tail } else { 1.0 - tail }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::compensation::{GainRule, MapOptions, Seen};
+    use crate::geometry::Grid;
+
+    const LIMITS: CorrectionLimits = CorrectionLimits {
+        depth_of_cut_mm: 0.01,
+        least_depth_mm: 0.0005,
+        largest_correction_mm: 0.05,
+        allowance_mm: 0.06,
+        removal_budget_mm: 0.06,
+        largest_depth_mm: 0.062,
+    };
+
+    fn map(values_mm: [f64; 4]) -> ErrorMap {
+        let grid = Grid { columns: 2, rows: 2, first_mm: [0.0, 0.0], spacing_mm: [1.0, 1.0] };
+        ErrorMap::known(grid, values_mm.to_vec(), vec![true; 4])
+    }
+
+    fn first() -> Correction {
+        Correction::none(map([0.0; 4]).grid, 0.06)
+    }
+
+    fn next(correction: &Correction, error: &ErrorMap, gain: f64) -> Result<NextPass, NextPassError> {
+        let options = MapOptions::new(1.0, 1.0);
+        let known = LearningState::new(GainRule::Fixed(gain), &options, [1.0; 2], None);
+        correction.next(error, &known.after(&Seen { correction, error, answer: None }), &LIMITS)
+    }
+
+    #[test]
+    fn the_error_is_taken_back_and_the_pass_cuts_everywhere() {
+        let step = next(&first(), &map([0.004, -0.012, 0.0, 0.002]), 1.0).unwrap();
+        assert_eq!(step.correction.values_mm, [-0.004, 0.012, 0.0, -0.002]);
+        assert_eq!((step.correction.cycle, step.depth_mm, step.air_share), (2, 0.0125, 0.0));
+        assert!((step.correction.level_mm - 0.0475).abs() < 1e-15);
+        assert!((step.removed_mm - 0.0165).abs() < 1e-15, "{}", step.removed_mm);
+    }
+
+    #[test]
+    fn corrections_add_up_and_the_gain_counts() {
+        let once = next(&first(), &map([0.004; 4]), 0.5).unwrap();
+        let twice = next(&once.correction, &map([0.002; 4]), 0.5).unwrap();
+        assert!(twice.correction.values_mm.iter().all(|v| (v + 0.003).abs() < 1e-15));
+        assert!((twice.correction.level_mm - 0.04).abs() < 1e-15);
+        assert_eq!(twice.correction.cycle, 3);
+    }
+
+    #[test]
+    fn limits_are_kept() {
+        let far = next(&first(), &map([0.0, 0.051, 0.0, 0.0]), 1.0);
+        assert!(matches!(far, Err(NextPassError::TooLarge { x_mm: 1.0, y_mm: 0.0, .. })), "{far:?}");
+        // 49 um where it stands proud, and 13.5 um everywhere.
+        let deep = next(&first(), &map([0.049, -0.013, 0.0, 0.0]), 1.0);
+        let Err(NextPassError::TooDeep { found_mm, limit_mm: 0.062 }) = deep else { panic!("{deep:?}") };
+        assert!((found_mm - 0.0625).abs() < 1e-12, "{found_mm}");
+        let mut correction = first();
+        for _ in 0..6 {
+            correction = next(&correction, &map([0.0; 4]), 1.0).unwrap().correction;
+        }
+        let spent = next(&correction, &map([0.0; 4]), 1.0);
+        assert!(matches!(spent, Err(NextPassError::BudgetSpent { .. })), "{spent:?}");
+    }
+
+    #[test]
+    fn the_normal_tail_is_that_of_the_tables() {
+        for (z, tail) in [(0.0, 0.5), (1.0, 0.158_655_254), (-1.0, 0.841_344_746), (3.0, 0.001_349_898), (9.0, 0.0)] {
+            assert!((normal_tail(z) - tail).abs() < 1e-7, "{z}");
+        }
+        assert_eq!(normal_tail(f64::INFINITY), 0.0);
+    }
+}

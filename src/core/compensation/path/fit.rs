@@ -1,0 +1,261 @@
+//! What must hold before a path is laid: the wheel fits the surface, and touches the part nowhere else.
+
+use rayon::prelude::*;
+
+use super::options::{PathOptions, Pattern, TrackSpacing};
+use super::wanted::Bend;
+use super::{PathError, Wanted, Wheel};
+use crate::geometry::{Aperture, Point};
+
+/// Places along each axis at which the wheel is held against the surface.
+const PLACES: usize = 101;
+/// Places of the wheel, and places of the surface along each axis, at which its body is held against the part.
+const BODIES: usize = 24;
+const GROUND: usize = 48;
+/// How much a wheel must be more curved than a hollow: in a nearer fit a little error of either touches along a line.
+const MARGIN: f64 = 1.05;
+/// Depth at which the body of a wheel cuts where it should not: what the surface's own smoothness leaves.
+const DEEPEST_MM: f64 = 1e-4;
+/// Steepest slope that a wheel grinds: beyond, the machine's spindle is in the way.
+const STEEPEST_RAD: f64 = 1.2;
+/// Holds the wheel against the surface at places all over the part, and returns the distance of the tracks over x and y.
+pub(super) fn track_mm(wanted: &Wanted, outline: &Aperture, options: &PathOptions) -> Result<f64, PathError> {
+    let places = places(outline, PLACES);
+    let one = |place: &[f64; 2]| fit_at(&wanted.bend(*place), *place, options);
+    let distances: Vec<Result<f64, PathError>> = places.par_iter().map(one).collect();
+    let narrowest = distances.into_iter().reduce(narrower).unwrap_or(Err(PathError::Empty))?;
+    match options.spacing {
+        TrackSpacing::Distance(mm) => Ok(mm),
+        TrackSpacing::Scallop { widest_mm, .. } => Ok(narrowest.min(widest_mm)),
+    }
+}
+
+/// The lesser distance or, where the wheel is refused, the refusal that says most: the narrowest hollow, which tells the wheel that fits
+/// everywhere, and else the first, so that the same path is refused with the same words each time.
+fn narrower(a: Result<f64, PathError>, b: Result<f64, PathError>) -> Result<f64, PathError> {
+    let room = |e: &PathError| match e {
+        PathError::Hollow { limit_mm, wheel_mm, .. } => Some(limit_mm / wheel_mm),
+        _ => None,
+    };
+    match (a, b) {
+        (Ok(a), Ok(b)) => Ok(a.min(b)),
+        (Err(a), Err(b)) => Err(if room(&a).zip(room(&b)).is_some_and(|(a, b)| b < a) { b } else { a }),
+        (Err(e), Ok(_)) | (Ok(_), Err(e)) => Err(e),
+    }
+}
+
+/// Places of a grid over the part, its border included.
+fn places(outline: &Aperture, count: usize) -> Vec<[f64; 2]> {
+    let [low, high] = outline.bounds();
+    let at = |k: usize, i: usize| low[k] + (high[k] - low[k]) * i as f64 / (count - 1) as f64;
+    let grid = (0..count * count).map(|n| [at(0, n % count), at(1, n / count)]);
+    grid.filter(|[x, y]| outline.contains(*x, *y)).chain(outline.outline_mm(4 * count)).collect()
+}
+
+/// Checks slope and hollows at a place; returns the distance over x and y of tracks that leave the scallop wanted.
+fn fit_at(bend: &Bend, place: [f64; 2], options: &PathOptions) -> Result<f64, PathError> {
+    let [x_mm, y_mm] = place;
+    let normal = &bend.contact.normal;
+    let finite = (bend.curvature.iter().sum::<f64>() + bend.contact.point.z).is_finite();
+    if !finite {
+        return Err(PathError::NotAHeight { x_mm, y_mm });
+    }
+    let slope = normal.z.clamp(-1.0, 1.0).acos();
+    if slope > STEEPEST_RAD {
+        let (slope_deg, limit_deg) = (slope.to_degrees(), STEEPEST_RAD.to_degrees());
+        return Err(PathError::Steep { x_mm, y_mm, slope_deg, limit_deg });
+    }
+    if options.wheel.centre(&bend.contact).is_none() {
+        return Err(PathError::CannotTouch { x_mm, y_mm });
+    }
+    let wheel = wheel_in(bend, &options.wheel);
+    let [a, b, c] = std::array::from_fn(|k| wheel[k] - MARGIN * bend.curvature[k]);
+    // The gap opens in every direction where both the trace and the determinant of this are positive.
+    if !(a + c > 0.0 && a * c - b * b > 0.0) {
+        return Err(hollow(bend, &wheel, place));
+    }
+    let TrackSpacing::Scallop { height_mm: height, .. } = options.spacing else { return Ok(f64::INFINITY) };
+    // Across a raster is y, whatever the surface's slant; a spiral crosses everything.
+    let gap = std::array::from_fn::<f64, 3, _>(|k| wheel[k] - bend.curvature[k]);
+    let across = match options.pattern {
+        Pattern::Raster { .. } => gap[2],
+        Pattern::Spiral => 0.5 * (gap[0] + gap[2]) + (0.25 * (gap[0] - gap[2]).powi(2) + gap[1] * gap[1]).sqrt(),
+    };
+    // A millimetre along the surface is less over x and y.
+    let shortened = match options.pattern {
+        Pattern::Raster { .. } => (1.0 - bend.along[1].z.powi(2)).sqrt(),
+        Pattern::Spiral => normal.z,
+    };
+    Ok((8.0 * height / across).sqrt() * shortened)
+}
+
+/// The wheel's curvature in the directions of a bend: along, mixed, across.
+fn wheel_in(bend: &Bend, wheel: &Wheel) -> [f64; 3] {
+    let ([around, across], direction) = wheel.curvatures(&bend.contact.normal);
+    let [c, s] = [0, 1].map(|k| direction.dot(&bend.along[k]));
+    [around * c * c + across * s * s, (around - across) * s * c, around * s * s + across * c * c]
+}
+
+/// The direction in which the wheel fits least.
+fn hollow(bend: &Bend, wheel: &[f64; 3], [x_mm, y_mm]: [f64; 2]) -> PathError {
+    let in_direction = |q: &[f64; 3], angle: f64| {
+        let (s, c) = angle.sin_cos();
+        q[0] * c * c + 2.0 * q[1] * s * c + q[2] * s * s
+    };
+    let gap = |angle: f64| in_direction(wheel, angle) - MARGIN * in_direction(&bend.curvature, angle);
+    let angles = (0..180).map(|d| f64::from(d).to_radians());
+    let worst = angles.min_by(|a, b| gap(*a).total_cmp(&gap(*b))).unwrap_or(0.0);
+    let hollow_mm = 1.0 / in_direction(&bend.curvature, worst);
+    PathError::Hollow {
+        x_mm,
+        y_mm,
+        direction_deg: worst.to_degrees(),
+        hollow_mm,
+        wheel_mm: 1.0 / in_direction(wheel, worst),
+        limit_mm: hollow_mm / MARGIN,
+    }
+}
+
+/// Holds the whole body of the wheel, at places all over the part, against the whole part within its reach.
+///
+/// Curvature tells that a wheel fits where it touches; this tells that it does not touch elsewhere: the far side of a cup, the flank of a
+/// disc, the opposite wall of a valley.
+pub(super) fn check_body(wanted: &Wanted, outline: &Aperture, wheel: &Wheel) -> Result<(), PathError> {
+    let ground: Vec<([f64; 2], Point)> =
+        places(outline, GROUND).into_par_iter().map(|at| (at, wanted.at(at).point)).collect();
+    let reach = wheel.reach_mm() + DEEPEST_MM;
+    let one = |place: &[f64; 2]| {
+        let [x_mm, y_mm] = *place;
+        let centre = wheel.centre(&wanted.at(*place)).ok_or(PathError::CannotTouch { x_mm, y_mm })?;
+        let (mut depth_mm, mut deepest_at) = (DEEPEST_MM, None);
+        for (at, point) in &ground {
+            let from = point - centre;
+            if from.norm_squared() > reach * reach {
+                continue;
+            }
+            let depth = -wheel.distance_mm(&from);
+            if depth > depth_mm {
+                (depth_mm, deepest_at) = (depth, Some(*at));
+            }
+        }
+        deepest_at.map_or(Ok(()), |[at_x_mm, at_y_mm]| {
+            Err(PathError::Body { x_mm, y_mm, at_x_mm, at_y_mm, depth_mm, limit_mm: DEEPEST_MM })
+        })
+    };
+    let cuts: Vec<Result<(), PathError>> = places(outline, BODIES).par_iter().map(one).collect();
+    let depth = |e: &PathError| if let PathError::Body { depth_mm, .. } = e { *depth_mm } else { f64::INFINITY };
+    let deeper = |a: PathError, b: PathError| if depth(&b) > depth(&a) { b } else { a };
+    cuts.into_iter().filter_map(Result::err).reduce(deeper).map_or(Ok(()), Err)
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use crate::compensation::Correction;
+    use crate::compensation::path::{Field, ToolPath};
+    use crate::geometry::{Grid, Vector};
+
+    pub(in super::super) const PART: Aperture =
+        Aperture::Rectangle { centre_mm: [0.0, 0.0], width_mm: 16.0, height_mm: 12.0 };
+
+    /// A surface z = a x^2 + b y^2 without a correction.
+    pub(in super::super) fn quadric(a: f64, b: f64) -> Wanted {
+        surface(|[x, y]| (a * x * x + b * y * y, [2.0 * a * x, 2.0 * b * y]))
+    }
+
+    /// A surface by its height and slopes over x and y, without a correction.
+    fn surface(height: impl Fn([f64; 2]) -> (f64, [f64; 2])) -> Wanted {
+        let on = Grid { columns: 81, rows: 81, first_mm: [-10.0, -10.0], spacing_mm: [0.25, 0.25] };
+        let places = (0..on.len()).map(|k| on.place_mm(k));
+        let (z, slopes): (Vec<f64>, Vec<[f64; 2]>) = places.map(height).unzip();
+        let grid = Grid { columns: 2, rows: 2, first_mm: [-8.0, -6.0], spacing_mm: [16.0, 12.0] };
+        let none = Correction { grid, values_mm: vec![0.0; 4], cycle: 1, level_mm: 0.0 };
+        Wanted::new(Field::hermite(on, &z, &slopes), &none, 5.0).unwrap()
+    }
+
+    pub(in super::super) fn ball(radius_mm: f64) -> PathOptions {
+        PathOptions::new(Wheel::Sphere { radius_mm }, 0.5, 600.0)
+    }
+
+    pub(in super::super) fn path(wanted: Wanted, options: PathOptions) -> Result<ToolPath, PathError> {
+        ToolPath::new(wanted, PART, options)
+    }
+
+    #[test]
+    fn a_wheel_must_be_smaller_than_every_hollow_in_every_direction() {
+        // Hollow across the tracks with a radius of 20 mm, and on a dome along them.
+        let hollow = || quadric(-0.01, 0.025);
+        assert!(path(hollow(), ball(18.0)).is_ok());
+        let refused = path(hollow(), ball(20.5)).unwrap_err();
+        let PathError::Hollow { direction_deg, hollow_mm, wheel_mm, .. } = refused else { panic!("{refused}") };
+        assert!((direction_deg - 90.0).abs() < 5.0 && (hollow_mm - 20.0).abs() < 0.01 && wheel_mm == 20.5, "{refused}");
+        // The narrowest place of all is told, whichever thread came first.
+        for _ in 0..20 {
+            assert_eq!(path(hollow(), ball(20.5)).unwrap_err().to_string(), refused.to_string());
+        }
+        // A disc that rolls along the track is narrow across it, and would not fit the other way.
+        let disc = |spindle| PathOptions { wheel: Wheel::Torus { ring_mm: 40.0, tube_mm: 5.0, spindle }, ..ball(1.0) };
+        assert!(path(hollow(), disc(Vector::y())).is_ok());
+        assert!(matches!(path(hollow(), disc(Vector::x())), Err(PathError::Hollow { .. })));
+        assert!(path(quadric(0.0, 0.0), ball(1000.0)).is_ok());
+    }
+
+    #[test]
+    fn slopes_rims_and_bodies_are_held_against_the_part() {
+        assert!(matches!(path(quadric(0.2, 0.0), ball(1.0)), Err(PathError::Steep { .. })));
+        // Along x the part faces the spindle more and more.
+        let along = Wheel::Torus { ring_mm: 3.0, tube_mm: 0.5, spindle: Vector::new(0.6, 0.0, 0.8) };
+        assert!(matches!(
+            path(quadric(-0.05, 0.0), PathOptions { wheel: along, ..ball(1.0) }),
+            Err(PathError::CannotTouch { .. })
+        ));
+        // A cup that is tilted less than the dome slopes would have to touch with the other side of its ring.
+        let cup = PathOptions { wheel: Wheel::tilted_cup(6.0, 1.0, 0.15), ..ball(1.0) };
+        assert!(matches!(path(quadric(-0.0125, -0.001), cup), Err(PathError::CannotTouch { .. })));
+        assert!(path(quadric(-0.002, -0.001), cup).is_ok());
+    }
+
+    #[test]
+    fn the_far_side_of_a_wheel_must_not_reach_the_part() {
+        // A disc that leans by 37 degrees reaches up over the part towards -x, below a wall of 50 degrees at whose foot its rim still fits.
+        let wall = |steepest: f64| {
+            surface(move |[x, _]| {
+                let (into, width) = ((-2.0 - x).max(0.0), 0.8 * steepest / 1.2);
+                let slope = steepest * (into / width).min(1.0);
+                (if into < width { 0.5 * slope * into } else { steepest * (into - 0.5 * width) }, [-slope, 0.0])
+            })
+        };
+        let leaning = Wheel::Torus { ring_mm: 3.0, tube_mm: 0.4, spindle: Vector::new(0.6, 0.0, 0.8) };
+        let options = PathOptions { wheel: leaning, overrun_mm: 0.0, lead_mm: 0.0, ..ball(1.0) };
+        assert!(path(wall(0.4), options).is_ok());
+        let refused = path(wall(1.2), options).unwrap_err();
+        let PathError::Body { x_mm, at_x_mm, depth_mm, limit_mm, .. } = refused else { panic!("{refused}") };
+        // On the wall it touches with the side that is high on the flat; the deepest of all is told, and a rim is no deeper than its tube.
+        assert!(x_mm < -2.0 && (at_x_mm - x_mm).abs() > 1.0 && limit_mm == DEEPEST_MM, "{refused}");
+        assert!(depth_mm > 0.1 && depth_mm <= 0.4, "{refused}");
+    }
+
+    #[test]
+    fn options_that_make_no_path_are_named() {
+        for (options, key) in [
+            (PathOptions { chord_error_mm: 0.0, ..ball(5.0) }, "chord error (mm)"),
+            (PathOptions { feed_mm_min: f64::NAN, ..ball(5.0) }, "feed (mm/min)"),
+            (PathOptions { overrun_mm: -1.0, ..ball(5.0) }, "overrun (mm)"),
+            (ball(-5.0), "wheel radius (mm)"),
+        ] {
+            assert!(matches!(path(quadric(0.0, 0.0), options), Err(PathError::Option { key: k, .. }) if k == key));
+        }
+    }
+
+    #[test]
+    fn the_scallop_height_sets_the_distance_of_tracks() {
+        let spacing = TrackSpacing::Scallop { height_mm: 1e-4, widest_mm: 5.0 };
+        let flat = path(quadric(0.0, 0.0), PathOptions { spacing, ..ball(10.0) }).unwrap();
+        // h = s^2 / (8 R); the tracks are laid evenly, so a little closer.
+        let most = (8.0f64 * 10.0 * 1e-4).sqrt();
+        assert!(flat.track_mm() <= most && flat.track_mm() > 0.98 * most, "{}", flat.track_mm());
+        // In a hollow of 20 mm the ridges are half as high.
+        let hollow = path(quadric(0.0, 0.025), PathOptions { spacing, ..ball(10.0) }).unwrap();
+        assert!(hollow.track_mm() > 1.2 * most);
+    }
+}

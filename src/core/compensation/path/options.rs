@@ -1,0 +1,112 @@
+//! How a path is laid.
+
+use super::{PathError, Wheel};
+
+/// How tracks run.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Pattern {
+    /// Along x, one beside the other in y from the least to the largest.
+    Raster {
+        /// Whether every track runs towards +x; else they alternate.
+        one_way: bool,
+    },
+    /// On a spiral about the middle of the outline, from outside inwards, turning clockwise seen from +z.
+    Spiral,
+}
+
+/// How far apart tracks are.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum TrackSpacing {
+    /// So far over x and y, in millimetres, at most.
+    Distance(f64),
+    /// As far as leaves ridges of a height at most, in millimetres: h = s^2 / (8 r_eff), with 1 / r_eff the curvature of the wheel less
+    /// that of the hollow surface across the track.
+    Scallop {
+        /// The height.
+        height_mm: f64,
+        /// Never farther apart than this, in millimetres.
+        widest_mm: f64,
+    },
+}
+
+/// How a path is laid.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PathOptions {
+    /// The wheel.
+    pub wheel: Wheel,
+    /// How the tracks run.
+    pub pattern: Pattern,
+    /// How far apart they are.
+    pub spacing: TrackSpacing,
+    /// How far the straight lines between points may be from the path of the wheel's centre, in millimetres.
+    pub chord_error_mm: f64,
+    /// Longest distance of two points, over x and y, in millimetres.
+    pub longest_step_mm: f64,
+    /// How far tracks go on beyond the edge of the part, on the tangent of the surface, in millimetres.
+    pub overrun_mm: f64,
+    /// How long the wheel takes, beyond that, to come down and to lift off, over x and y, in millimetres.
+    pub lead_mm: f64,
+    /// Radius of the curve on which it comes down and lifts off, in millimetres.
+    pub lead_radius_mm: f64,
+    /// How far above the highest point of the path the wheel travels, in millimetres.
+    pub safe_height_mm: f64,
+    /// Feed of the wheel's centre along the path.
+    pub feed_mm_min: f64,
+    /// On a spiral the feed is lowered towards the middle so that this acceleration is kept, in mm/s2.
+    pub spiral_acceleration_mm_s2: Option<f64>,
+}
+
+impl PathOptions {
+    /// Options with a chord error of 0.1 um and room for an ordinary machine.
+    pub fn new(wheel: Wheel, track_mm: f64, feed_mm_min: f64) -> Self {
+        Self {
+            wheel,
+            pattern: Pattern::Raster { one_way: false },
+            spacing: TrackSpacing::Distance(track_mm),
+            chord_error_mm: 1e-4,
+            longest_step_mm: 1.0,
+            overrun_mm: 2.0,
+            lead_mm: 2.0,
+            lead_radius_mm: 5.0,
+            safe_height_mm: 10.0,
+            feed_mm_min,
+            spiral_acceleration_mm_s2: None,
+        }
+    }
+
+    /// Refuses what makes no sense whatever the surface.
+    pub(super) fn check(&self) -> Result<(), PathError> {
+        let (spacing, height) = match self.spacing {
+            TrackSpacing::Distance(mm) => (mm, 1.0),
+            TrackSpacing::Scallop { height_mm, widest_mm } => (widest_mm, height_mm),
+        };
+        let (radius, tube) = match self.wheel {
+            Wheel::Sphere { radius_mm } => (radius_mm, radius_mm),
+            Wheel::Torus { ring_mm, tube_mm, .. } | Wheel::Cup { ring_mm, tube_mm, .. } => (ring_mm, tube_mm),
+        };
+        let above_zero = [
+            ("track spacing (mm)", spacing),
+            ("scallop height (mm)", height),
+            ("wheel radius (mm)", radius),
+            ("radius of the rim's curve (mm)", tube),
+            ("chord error (mm)", self.chord_error_mm),
+            ("longest step (mm)", self.longest_step_mm),
+            ("lead radius (mm)", self.lead_radius_mm),
+            ("feed (mm/min)", self.feed_mm_min),
+            ("acceleration on a spiral (mm/s2)", self.spiral_acceleration_mm_s2.unwrap_or(1.0)),
+        ];
+        for (key, found) in above_zero {
+            if !(found > 0.0 && found.is_finite()) {
+                return Err(PathError::Option { key, found, allowed: "a finite number above 0" });
+            }
+        }
+        for (key, found) in
+            [("overrun (mm)", self.overrun_mm), ("lead (mm)", self.lead_mm), ("safe height (mm)", self.safe_height_mm)]
+        {
+            if !(found >= 0.0 && found.is_finite()) {
+                return Err(PathError::Option { key, found, allowed: "a finite number, 0 or above" });
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,261 @@
+//! A path as a whole, and whether a machine can follow it.
+
+use rayon::prelude::*;
+
+use super::{Move, Moves, PathError, ToolPath};
+use crate::geometry::{Point, Vector};
+
+/// Most points of a path.
+const MOST_POINTS: u64 = 200_000_000;
+
+/// What a machine can do; `None` where it was not told.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Limits {
+    /// Least and largest x, y, z of the point that a program moves, in the frame of the program.
+    pub travel_mm: Option<[[f64; 3]; 2]>,
+    /// Largest speed of an axis.
+    pub speed_mm_s: Option<f64>,
+    /// Largest acceleration.
+    pub acceleration_mm_s2: Option<f64>,
+}
+
+/// A largest value and where it is.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Peak {
+    /// The value.
+    pub value: f64,
+    /// Where, over x and y.
+    pub at_mm: [f64; 2],
+    /// The feed there.
+    pub feed_mm_min: f64,
+}
+
+/// A path as a whole.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Summary {
+    /// Moves, rapid ones included.
+    pub moves: u64,
+    /// Points at feed.
+    pub points: u64,
+    /// Least x, y, z.
+    pub least_mm: [f64; 3],
+    /// Largest x, y, z.
+    pub most_mm: [f64; 3],
+    /// Length of the moves at feed.
+    pub length_mm: f64,
+    /// Length of the rapid moves.
+    pub rapid_mm: f64,
+    /// Time of the moves at feed, without acceleration.
+    pub seconds: f64,
+    /// Largest speed of each axis, in mm/s.
+    pub speed_mm_s: [Peak; 3],
+    /// Largest acceleration across the path, v^2 times its curvature, in mm/s2.
+    pub acceleration_mm_s2: Peak,
+    /// Feed with which tracks begin.
+    pub feed_mm_min: f64,
+    /// Length from standstill to the part.
+    pub run_up_mm: f64,
+}
+
+impl ToolPath {
+    /// Walks the whole path once, all tracks at the same time, and returns what is largest and least on it.
+    ///
+    /// # Errors
+    /// More than 2e8 points.
+    pub fn summary(&self) -> Result<Summary, PathError> {
+        let options = self.options();
+        let empty = Summary {
+            moves: 0,
+            points: 0,
+            least_mm: [f64::INFINITY; 3],
+            most_mm: [f64::NEG_INFINITY; 3],
+            length_mm: 0.0,
+            rapid_mm: 0.0,
+            seconds: 0.0,
+            speed_mm_s: [Peak::default(); 3],
+            acceleration_mm_s2: Peak::default(),
+            feed_mm_min: options.feed_mm_min,
+            run_up_mm: options.overrun_mm + options.lead_mm,
+        };
+        let tracks: Vec<Summary> = (0..self.tracks())
+            .into_par_iter()
+            .map(|k| {
+                let mut one = empty;
+                one.take(Moves::of(self, k, k + 1), self.safe_z_mm());
+                one
+            })
+            .collect();
+        // Added up in their order, so that a path has one length whichever thread was first.
+        let whole = tracks.into_iter().fold(empty, Summary::and);
+        if whole.points > MOST_POINTS {
+            return Err(PathError::TooManyPoints { points: whole.points, limit: MOST_POINTS });
+        }
+        Ok(whole)
+    }
+}
+
+impl Summary {
+    /// Takes in the moves of one track.
+    fn take(&mut self, mut moves: Moves, safe_z_mm: f64) {
+        let mut last: Option<Point> = None;
+        let mut height = safe_z_mm;
+        while let Some(one) = moves.next() {
+            self.moves += 1;
+            match one {
+                Move::RapidZ(z) => {
+                    let from = last.take().map_or(height, |p| p.z);
+                    self.rapid_mm += (z - from).abs();
+                    (self.least_mm[2], self.most_mm[2]) = (self.least_mm[2].min(z), self.most_mm[2].max(z));
+                    height = z;
+                }
+                Move::RapidXy(_) => {}
+                Move::Feed { at, feed_mm_min } => {
+                    self.points += 1;
+                    for k in 0..3 {
+                        (self.least_mm[k], self.most_mm[k]) = (self.least_mm[k].min(at[k]), self.most_mm[k].max(at[k]));
+                    }
+                    if let Some(from) = last {
+                        self.step(&(at - from), &at, feed_mm_min, moves.bend);
+                    }
+                    last = Some(at);
+                }
+            }
+        }
+    }
+
+    #[inline]
+    fn step(&mut self, by: &Vector, at: &Point, feed_mm_min: f64, bend: f64) {
+        let (length, speed) = (by.norm(), feed_mm_min / 60.0);
+        self.length_mm += length;
+        self.seconds += length / speed;
+        let share = if length > 0.0 { speed / length } else { 0.0 };
+        let peak = |value: f64| Peak { value, at_mm: [at.x, at.y], feed_mm_min };
+        for k in 0..3 {
+            if by[k].abs() * share > self.speed_mm_s[k].value {
+                self.speed_mm_s[k] = peak(by[k].abs() * share);
+            }
+        }
+        if speed * speed * bend > self.acceleration_mm_s2.value {
+            self.acceleration_mm_s2 = peak(speed * speed * bend);
+        }
+    }
+
+    fn and(self, other: Self) -> Self {
+        let larger = |a: Peak, b: Peak| if b.value > a.value { b } else { a };
+        Self {
+            moves: self.moves + other.moves,
+            points: self.points + other.points,
+            least_mm: std::array::from_fn(|k| self.least_mm[k].min(other.least_mm[k])),
+            most_mm: std::array::from_fn(|k| self.most_mm[k].max(other.most_mm[k])),
+            length_mm: self.length_mm + other.length_mm,
+            rapid_mm: self.rapid_mm + other.rapid_mm,
+            seconds: self.seconds + other.seconds,
+            speed_mm_s: std::array::from_fn(|k| larger(self.speed_mm_s[k], other.speed_mm_s[k])),
+            acceleration_mm_s2: larger(self.acceleration_mm_s2, other.acceleration_mm_s2),
+            ..self
+        }
+    }
+
+    /// Compares a path with what a machine can do. Jerk is left to the controller's planner.
+    ///
+    /// # Errors
+    /// Travel, speed of an axis, acceleration across the path, and a run-up v^2 / (2 a) longer than the way to the part.
+    pub fn check(&self, limits: &Limits) -> Result<(), PathError> {
+        if let Some([least, most]) = limits.travel_mm {
+            for (k, axis) in ['X', 'Y', 'Z'].into_iter().enumerate() {
+                for found_mm in [self.least_mm[k], self.most_mm[k]] {
+                    if !(least[k]..=most[k]).contains(&found_mm) {
+                        return Err(PathError::Travel { axis, found_mm, least_mm: least[k], most_mm: most[k] });
+                    }
+                }
+            }
+        }
+        if let Some(limit_mm_s) = limits.speed_mm_s {
+            for (axis, peak) in ['X', 'Y', 'Z'].into_iter().zip(self.speed_mm_s) {
+                // Rounding is no excess.
+                if peak.value > limit_mm_s * (1.0 + 1e-9) {
+                    let ([x_mm, y_mm], found_mm_s) = (peak.at_mm, peak.value);
+                    let feed_mm_min = (peak.feed_mm_min * limit_mm_s / found_mm_s).floor();
+                    return Err(PathError::Speed { axis, found_mm_s, x_mm, y_mm, limit_mm_s, feed_mm_min });
+                }
+            }
+        }
+        limits.acceleration_mm_s2.map_or(Ok(()), |limit| self.check_acceleration(limit))
+    }
+
+    fn check_acceleration(&self, limit_mm_s2: f64) -> Result<(), PathError> {
+        let Peak { value: found_mm_s2, at_mm: [x_mm, y_mm], feed_mm_min } = self.acceleration_mm_s2;
+        if found_mm_s2 > limit_mm_s2 {
+            let feed_mm_min = (feed_mm_min * (limit_mm_s2 / found_mm_s2).sqrt()).floor();
+            return Err(PathError::Acceleration { x_mm, y_mm, found_mm_s2, limit_mm_s2, feed_mm_min });
+        }
+        let found_mm = (self.feed_mm_min / 60.0).powi(2) / (2.0 * limit_mm_s2);
+        if found_mm > self.run_up_mm {
+            let feed_mm_min = (60.0 * (2.0 * limit_mm_s2 * self.run_up_mm).sqrt()).floor();
+            return Err(PathError::RunUp { found_mm, limit_mm: self.run_up_mm, feed_mm_min });
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::fit::tests::{PART, ball, path, quadric};
+    use super::*;
+
+    #[test]
+    fn a_machine_must_be_able_to_follow() {
+        let path = path(quadric(0.01, 0.01), ball(10.0)).unwrap();
+        let summary = path.summary().unwrap();
+        // 10 mm/s.
+        let Peak { value, .. } = summary.acceleration_mm_s2;
+        // It comes down on a radius of 5 mm over x and y, which is a little more along the slope.
+        assert!((value - 100.0 / 5.0).abs() < 1.5, "{value}");
+        assert!(summary.check(&Limits::default()).is_ok());
+        let travel_mm = Some([[-9.0, -50.0, 0.0], [50.0, 50.0, 50.0]]);
+        assert!(matches!(
+            summary.check(&Limits { travel_mm, ..Limits::default() }),
+            Err(PathError::Travel { axis: 'X', .. })
+        ));
+        let speed_mm_s = Some(9.0);
+        assert!(matches!(
+            summary.check(&Limits { speed_mm_s, ..Limits::default() }),
+            Err(PathError::Speed { axis: 'X', .. })
+        ));
+        let limited = |a: f64| summary.check(&Limits { acceleration_mm_s2: Some(a), ..Limits::default() });
+        assert!(limited(25.0).is_ok());
+        let Err(PathError::Acceleration { feed_mm_min, .. }) = limited(10.0) else { panic!() };
+        assert!((feed_mm_min - 600.0 * (10.0 / value).sqrt()).abs() < 1.0);
+        let straight = Summary { acceleration_mm_s2: Peak::default(), ..summary };
+        let slow = Limits { acceleration_mm_s2: Some(1.0), ..Limits::default() };
+        assert!(matches!(straight.check(&slow), Err(PathError::RunUp { .. })));
+    }
+
+    #[test]
+    fn every_point_is_told_and_the_chords_keep_to_the_path() {
+        let path = path(quadric(0.01, -0.005), ball(10.0)).unwrap();
+        let summary = path.summary().unwrap();
+        assert_eq!(path.moves().count() as u64, summary.moves);
+        let mut last: Option<Point> = None;
+        for one in path.moves() {
+            if let (Move::Feed { at, .. }, Some(from)) = (one, last) {
+                let middle = nalgebra::center(&from, &at);
+                // The centre of a ball that touches is 10 mm from the surface; in a lead it is more.
+                let nearest = |p: &Point| {
+                    let mut place = [p.x, p.y];
+                    for _ in 0..50 {
+                        let contact = path.wanted().at(place);
+                        let off = p - contact.point;
+                        let aside = off - contact.normal * off.dot(&contact.normal);
+                        place = [place[0] + 0.7 * aside.x, place[1] + 0.7 * aside.y];
+                    }
+                    (p - path.wanted().at(place).point).norm()
+                };
+                let off = nearest(&middle) - 10.0;
+                let on_part = PART.contains(middle.x, middle.y);
+                assert!(off > -1.1e-4 && (!on_part || off < 1.1e-4), "{off} at {middle}");
+            }
+            last = if let Move::Feed { at, .. } = one { Some(at) } else { None };
+        }
+    }
+}

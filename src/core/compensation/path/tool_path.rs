@@ -1,0 +1,112 @@
+//! The way of a wheel over a part.
+
+use rayon::prelude::*;
+
+use super::options::PathOptions;
+use super::tracks::{Span, Tracks};
+use super::{PathError, Wanted, fit};
+use crate::geometry::{Aperture, Point};
+
+/// Tracks on which the highest place is looked for.
+const SOME_TRACKS: usize = 200;
+
+/// The way of a wheel over a part, point by point when it is asked for.
+#[derive(Clone, Debug)]
+pub struct ToolPath {
+    wanted: Wanted,
+    outline: Aperture,
+    options: PathOptions,
+    pub(super) tracks: Tracks,
+    safe_z_mm: f64,
+    grain_mm: f64,
+}
+
+impl ToolPath {
+    /// Lays tracks over a part.
+    ///
+    /// Checked are the options, and whether the wheel fits the surface: its slope, its hollows in every direction, and whether the body
+    /// of the wheel touches the part elsewhere. Travel, speed and acceleration are checked by [`super::Summary::check`].
+    ///
+    /// # Errors
+    /// Options that make no path, and a wheel that does not fit, each with place, value, limit and remedy.
+    pub fn new(wanted: Wanted, outline: Aperture, options: PathOptions) -> Result<Self, PathError> {
+        options.check()?;
+        let track_mm = fit::track_mm(&wanted, &outline, &options)?;
+        let tracks = Tracks::lay(&outline, &options, track_mm)?;
+        let grain_mm = wanted.grain_mm();
+        let mut path = Self { wanted, outline, options, tracks, safe_z_mm: f64::INFINITY, grain_mm };
+        path.safe_z_mm = path.highest_mm()? + options.safe_height_mm;
+        fit::check_body(&path.wanted, &path.outline, &options.wheel)?;
+        Ok(path)
+    }
+
+    /// Returns the distance of the tracks over x and y, in millimetres.
+    pub fn track_mm(&self) -> f64 {
+        self.tracks.track_mm
+    }
+
+    /// Returns the number of tracks, or of pieces of them where they leave the part.
+    pub fn tracks(&self) -> usize {
+        self.tracks.spans.len()
+    }
+
+    /// Returns the height at which the wheel travels, in millimetres.
+    pub fn safe_z_mm(&self) -> f64 {
+        self.safe_z_mm
+    }
+
+    /// Nothing of the surface is finer than this, in millimetres.
+    pub(super) fn grain_mm(&self) -> f64 {
+        self.grain_mm
+    }
+
+    /// Returns how the path was laid.
+    pub fn options(&self) -> &PathOptions {
+        &self.options
+    }
+
+    /// Returns the surface that it leaves.
+    pub fn wanted(&self) -> &Wanted {
+        &self.wanted
+    }
+
+    /// Returns the outline of the part.
+    pub fn outline(&self) -> &Aperture {
+        &self.outline
+    }
+
+    /// Returns where the wheel's centre is at a place of a track; NaN where a rim cannot touch, which [`ToolPath::new`] has refused.
+    #[inline]
+    pub(super) fn centre(&self, span: &Span, t: f64) -> Point {
+        let contact = self.wanted.at(span.place(t));
+        let lifted = self.tracks.lift_mm(span, t, &self.options);
+        match self.options.wheel.centre(&contact) {
+            Some(centre) if lifted > 0.0 => centre + contact.normal * lifted,
+            Some(centre) => centre,
+            None => Point::new(f64::NAN, f64::NAN, f64::NAN),
+        }
+    }
+
+    /// The highest place of the centre, looked for a millimetre apart on some of the tracks: the height of travel has room above it.
+    fn highest_mm(&self) -> Result<f64, PathError> {
+        let highest = |span: &Span| {
+            let (from, to) = span.with_leads(&self.options);
+            let count = (span.length_mm(from, to).ceil() as usize).clamp(8, 20_000);
+            (0..=count)
+                .map(|k| from + (to - from) * k as f64 / count as f64)
+                .map(|t| (self.centre(span, t).z, t))
+                .try_fold(
+                    f64::NEG_INFINITY,
+                    |most, (z, t)| if z.is_finite() { Ok(most.max(z)) } else { Err(span.place(t)) },
+                )
+        };
+        let spans = &self.tracks.spans;
+        let some = spans.len().div_ceil(SOME_TRACKS).max(1);
+        let chosen = spans.par_iter().step_by(some).chain(spans.par_iter().rev().take(1));
+        let heights: Vec<Result<f64, [f64; 2]>> = chosen.map(highest).collect();
+        heights
+            .into_iter()
+            .try_fold(f64::NEG_INFINITY, |most, one| one.map(|z| most.max(z)))
+            .map_err(|[x_mm, y_mm]| PathError::CannotTouch { x_mm, y_mm })
+    }
+}
