@@ -22,12 +22,12 @@
 
 pub use regrind_cell as cell;
 pub use regrind_core::{compensation, form, geometry, measuring, registration, surface};
+pub use regrind_formats as formats;
 
 pub mod config;
 pub mod device;
 pub mod document;
 pub mod drive;
-pub mod formats;
 pub mod journal;
 pub mod recipe;
 pub mod report;

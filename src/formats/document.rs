@@ -7,9 +7,11 @@ use serde::Serialize;
 
 use super::error::FormatError;
 use super::registration::{DeviationRow, write_column, write_deviations, write_json_atomic};
-use crate::geometry::Pose;
-use crate::registration::{Deviation, Iteration, Loss, Method, Options, PointStatus, Registration, WeakDirection};
-use crate::surface::{Distance, Side};
+use regrind_core::geometry::Pose;
+use regrind_core::registration::{
+    Deviation, Iteration, Loss, Method, Options, PointStatus, Registration, WeakDirection,
+};
+use regrind_core::surface::{Distance, Side};
 
 /// What stands in `registration.json`. The names are a contract; lengths are millimetres, angles radians.
 #[derive(Serialize)]
@@ -114,7 +116,7 @@ impl<'a> RegistrationDocument<'a> {
             |(pose, rms_mm): &(Pose, f64)| Alternative { cmm_from_model: pose.to_rows(), rms_mm: *rms_mm };
         let names = ["x", "y", "z", "rx", "ry", "rz"];
         Self {
-            program: Program { name: env!("CARGO_PKG_NAME"), version: env!("CARGO_PKG_VERSION") },
+            program: Program { name: "regrind", version: env!("CARGO_PKG_VERSION") },
             simulation: None,
             nominal,
             measured: MeasuredInput { file: measured_file },

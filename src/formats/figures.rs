@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::error::FormatError;
 use super::registration::write_json_atomic;
-use crate::form::{
+use regrind_core::form::{
     Basis, DIRECTION, EVERY_POINT, Figures, Fit, FormError, Iso10110, Labelled, Slope, TakenOut, labelled,
     labelled_slope,
 };

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::error::FormatError;
 use super::number::{LIMIT_MM, is_believable};
-use crate::geometry::{Grid, Point};
+use regrind_core::geometry::{Grid, Point};
 
 /// Most samples of a map that is read: 450 MB of them.
 pub(super) const MOST_SAMPLES: u64 = 50_000_000;
@@ -106,6 +106,28 @@ impl HeightMap {
 
     fn measured(&self) -> impl Iterator<Item = (usize, f64)> {
         self.heights_mm.iter().copied().enumerate().filter(|(k, _)| self.valid[*k])
+    }
+}
+
+/// A format of maps.
+pub(super) struct MapFormat {
+    /// Whether the first bytes of a file are those of one.
+    pub(super) begins: fn(&[u8]) -> bool,
+    /// Reads a file.
+    pub(super) read: fn(&Path) -> Result<MapPoints, FormatError>,
+    /// Parses the bytes of a file; the path is what messages call it.
+    pub(super) parse: fn(&Path, &[u8]) -> Result<MapPoints, FormatError>,
+}
+
+/// The measured points of a map, and what the reader had to decide about it.
+pub(super) struct MapPoints {
+    pub(super) points: Vec<Point>,
+    pub(super) notes: Vec<String>,
+}
+
+impl From<HeightMap> for MapPoints {
+    fn from(map: HeightMap) -> Self {
+        Self { points: map.points(), notes: map.notes }
     }
 }
 

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::compensation::{Correction, LearningState};
+use regrind_core::compensation::{Correction, LearningState};
 
 /// The file in a run folder.
 pub const LEARNED: &str = "learned.json";
@@ -124,8 +124,8 @@ impl Learned {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::compensation::{ErrorMap, GainRule, MapOptions, Seen};
-    use crate::geometry::Grid;
+    use regrind_core::compensation::{ErrorMap, GainRule, MapOptions, Seen};
+    use regrind_core::geometry::Grid;
 
     const GRID: Grid = Grid { columns: 5, rows: 4, first_mm: [-2.0, -1.5], spacing_mm: [1.0, 1.0] };
 

@@ -5,7 +5,7 @@ use std::path::Path;
 use super::error::FormatError;
 use super::gcode::hex;
 use super::registration::write_rows;
-use crate::compensation::{Correction, ErrorMap};
+use regrind_core::compensation::{Correction, ErrorMap};
 
 /// What an error was measured on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -9,9 +9,9 @@
 use std::path::Path;
 
 use super::error::FormatError;
-use super::height_map::{HeightMap, check_size};
+use super::height_map::{HeightMap, MapFormat, check_size};
 use super::whole::open;
-use crate::geometry::Grid;
+use regrind_core::geometry::Grid;
 
 /// From here on a phase was not measured.
 const NOT_MEASURED: i32 = 2_147_483_640;
@@ -19,6 +19,13 @@ const NOT_MEASURED: i32 = 2_147_483_640;
 const HEADERS: [(u32, u16, u32); 3] = [(0x881b_036f, 1, 834), (0x881b_0370, 2, 834), (0x881b_0371, 3, 4096)];
 /// Bytes of a header in which everything stands that is read.
 const LEAST_HEADER: usize = 834;
+
+/// MetroPro, told by its first bytes.
+pub(super) const FORMAT: MapFormat = MapFormat {
+    begins: is_metropro,
+    read: |path| read_metropro(path).map(Into::into),
+    parse: |path, bytes| parse_metropro(path, bytes).map(Into::into),
+};
 
 /// Reads a MetroPro map of at most 1 GiB.
 ///
@@ -55,7 +62,7 @@ pub fn parse_metropro(path: &Path, bytes: &[u8]) -> Result<HeightMap, FormatErro
 }
 
 /// Returns whether a file begins like one of MetroPro.
-pub(super) fn is_metropro(head: &[u8]) -> bool {
+fn is_metropro(head: &[u8]) -> bool {
     HEADERS.iter().any(|(magic, ..)| head.starts_with(&magic.to_be_bytes()))
 }
 

@@ -10,7 +10,7 @@ use std::path::Path;
 use super::error::{FormatError, excerpt};
 use super::number::{any_number, is_believable};
 use super::whole::{is_degenerate, open};
-use crate::geometry::{Point, Vector};
+use regrind_core::geometry::{Point, Vector};
 
 /// What a PLY file holds.
 #[derive(Clone, Debug, Default, PartialEq)]

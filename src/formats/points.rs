@@ -13,7 +13,7 @@ use rayon::prelude::*;
 use super::error::{FormatError, excerpt};
 use super::layout::{Layout, Preamble, Separator, is_comment};
 use super::number::{Decimal, NumberFault, coordinate, is_believable};
-use crate::geometry::Point;
+use regrind_core::geometry::Point;
 
 /// Largest text file that is read.
 const MOST_BYTES: u64 = 2 << 30;

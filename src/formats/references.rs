@@ -11,7 +11,7 @@ use super::FormatError;
 use super::number::{Decimal, coordinate};
 use super::result::{Content, parse_result};
 use super::whole;
-use crate::geometry::Point;
+use regrind_core::geometry::Point;
 
 /// Largest file of reference points.
 const MOST_BYTES: u64 = 1 << 20;

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::error::FormatError;
-use crate::geometry::Point;
+use regrind_core::geometry::Point;
 
 /// The first line of `deviations.csv`. These names are a contract.
 pub const DEVIATIONS_HEADER: &str = "x_mm,y_mm,z_mm,nx,ny,nz,deviation_mm,used";

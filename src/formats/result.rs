@@ -17,11 +17,13 @@ use std::borrow::Cow;
 use std::path::Path;
 
 use super::error::excerpt;
+use super::height_map::MapPoints;
 use super::layout::{Fields, Preamble, is_comment};
+use super::measured_map::map_format;
 use super::number::{Decimal, coordinate};
 use super::points::parse_points_with;
-use super::{FormatError, MapKind, MapPoints, parse_map, ply, whole};
-use crate::geometry::Point;
+use super::{FormatError, ply, whole};
+use regrind_core::geometry::Point;
 
 /// Largest result file that is read.
 const MOST_BYTES: u64 = 512 << 20;
@@ -122,7 +124,7 @@ pub struct ResultFile {
 /// # Errors
 /// The line that was cut.
 pub fn check_ended(path: &Path, text: &[u8]) -> Result<(), FormatError> {
-    if ply::is_ply(text) || MapKind::of(text).is_some() || text.ends_with(b"\n") {
+    if ply::is_ply(text) || map_format(text).is_some() || text.ends_with(b"\n") {
         return Ok(());
     }
     let line = text.split(|&b| b == b'\n').count() as u64;
@@ -143,7 +145,7 @@ pub fn read_bytes(path: &Path) -> Result<Vec<u8>, FormatError> {
 /// # Errors
 /// A statement that says something impossible.
 pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatError> {
-    if MapKind::of(text).is_some() {
+    if map_format(text).is_some() {
         return Ok(Statements { coordinates: Some(Coordinates::Contacts), ..Statements::default() });
     }
     let head = &text[..text.len().min(PREAMBLE_BYTES)];
@@ -227,8 +229,8 @@ impl Statements {
 pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<ResultFile, FormatError> {
     let statements = read_statements(path, text)?;
     let coordinates = agreed_coordinates(path, &statements, content)?;
-    if let Some(map) = parse_map(path, text) {
-        let MapPoints { points, notes } = map?;
+    if let Some(format) = map_format(text) {
+        let MapPoints { points, notes } = (format.parse)(path, text)?;
         let (indices, names, probe_radius_mm) = (None, None, None);
         return Ok(ResultFile {
             points,

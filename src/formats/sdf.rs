@@ -7,9 +7,9 @@
 use std::path::Path;
 
 use super::error::{FormatError, excerpt};
-use super::height_map::{HeightMap, check_size};
+use super::height_map::{HeightMap, MapFormat, check_size};
 use super::whole::{MOST_BYTES, open};
-use crate::geometry::Grid;
+use regrind_core::geometry::Grid;
 
 /// Length of the binary header.
 const HEADER: usize = 81;
@@ -18,6 +18,13 @@ const EXTRA: usize = 8;
 /// The fields of the header that are read, as they are called in text.
 const FIELDS: [&str; 8] =
     ["NumPoints", "NumProfiles", "Xscale", "Yscale", "Zscale", "Compression", "DataType", "CheckType"];
+
+/// SDF, told by its first bytes.
+pub(super) const FORMAT: MapFormat = MapFormat {
+    begins: is_sdf,
+    read: |path| read_sdf(path).map(Into::into),
+    parse: |path, bytes| parse_sdf(path, bytes).map(Into::into),
+};
 
 /// Reads an SDF map of at most 1 GiB.
 ///
@@ -47,7 +54,7 @@ fn check_version(path: &Path, head: &[u8]) -> Result<(), FormatError> {
 }
 
 /// Returns whether a file begins like SDF.
-pub(super) fn is_sdf(head: &[u8]) -> bool {
+fn is_sdf(head: &[u8]) -> bool {
     let version = head.get(..8).unwrap_or_default();
     matches!(version.first(), Some(b'a' | b'b'))
         && [&b"ISO-1.0"[..], b"BCR-0.0", b"BCR-1.0"].contains(&version.get(1..).unwrap_or_default())

@@ -9,7 +9,7 @@ use std::path::Path;
 use super::error::{FormatError, excerpt};
 use super::number::{any_number, is_believable};
 use super::whole::{MOST_BYTES, is_degenerate, open};
-use crate::geometry::Point;
+use regrind_core::geometry::Point;
 
 /// Bytes before the first facet, and of one facet, in binary.
 const BINARY_HEADER: usize = 84;

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use super::error::FormatError;
 use super::points::fill;
-use crate::geometry::Point;
+use regrind_core::geometry::Point;
 
 /// Largest mesh file that is read.
 pub(super) const MOST_BYTES: u64 = 1 << 30;

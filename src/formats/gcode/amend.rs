@@ -15,9 +15,9 @@ use super::number::{push_fixed, rounded};
 use super::read::{Block, Refusal, Word, block};
 use super::write::UNCORRECTED;
 use super::{GcodeError, hex};
-use crate::compensation::path::{Field, Wanted, displaced};
-use crate::formats::registration::Draft;
-use crate::geometry::{Point, Vector};
+use crate::registration::Draft;
+use regrind_core::compensation::path::{Field, Wanted, displaced};
+use regrind_core::geometry::{Point, Vector};
 
 /// Largest program that is read, in bytes.
 const MOST_BYTES: u64 = 1 << 30;
@@ -78,7 +78,7 @@ pub struct Amended {
 /// A program that has the map in it already, that belongs to another part or has another correction in it than the map takes up, or that
 /// holds what cannot be corrected; files.
 pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result<Amended, GcodeError> {
-    let bytes = crate::formats::gcode::read_bytes(base, MOST_BYTES)?;
+    let bytes = crate::gcode::read_bytes(base, MOST_BYTES)?;
     let text = std::str::from_utf8(&bytes).map_err(|_| GcodeError::Program {
         path: base.to_owned(),
         what: "the program is no plain text".into(),

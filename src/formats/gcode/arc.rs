@@ -3,7 +3,7 @@
 use std::f64::consts::TAU;
 
 use super::read::Refusal;
-use crate::geometry::Point;
+use regrind_core::geometry::Point;
 
 /// The plane of arcs: its first and second axis, and the one across; turning from the first to the second is counter-clockwise.
 #[derive(Clone, Copy, Debug, PartialEq)]

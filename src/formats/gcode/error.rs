@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-use crate::formats::FormatError;
+use crate::FormatError;
 
 /// Why a program could not be written, read or corrected. Lines count from 1.
 #[derive(Debug, Error)]

@@ -6,9 +6,9 @@ use std::path::Path;
 use sha2::{Digest, Sha256};
 
 use super::GcodeError;
-use crate::formats::FormatError;
-use crate::geometry::grid_order::NO_POINT;
-use crate::geometry::{Grid, Point, recognise_grid};
+use crate::FormatError;
+use regrind_core::geometry::grid_order::NO_POINT;
+use regrind_core::geometry::{Grid, Point, recognise_grid};
 
 /// Largest map that is read.
 const MOST_BYTES: u64 = 512 << 20;

@@ -18,7 +18,7 @@ use std::fmt;
 use std::io::Read as _;
 use std::path::Path;
 
-use crate::formats::FormatError;
+use crate::FormatError;
 
 pub use amend::{AlongNormals, Amended, Amendment, correct_program};
 pub use error::GcodeError;

@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use super::hex;
-use crate::formats::FormatError;
-use crate::formats::registration::write_rows;
-use crate::geometry::Grid;
+use crate::FormatError;
+use crate::registration::write_rows;
+use regrind_core::geometry::Grid;
 
 /// Writes `toolpath_z.csv`: `x_mm,y_mm,dz_mm`, a row per node, row by row with x fastest.
 ///
@@ -13,7 +13,7 @@ use crate::geometry::Grid;
 /// compensation over two axes, levelling meshes. A program that holds the correction already must not be given the table too.
 ///
 /// # Errors
-/// Those of [`crate::formats::write_deviations`].
+/// Those of [`crate::write_deviations`].
 pub fn write_axis_table(
     path: &Path,
     grid: &Grid,

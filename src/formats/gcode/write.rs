@@ -7,8 +7,8 @@ use rayon::prelude::*;
 
 use super::number::{LARGEST_MM, push_fixed, rounded, short};
 use super::{GcodeError, PathMode, hex};
-use crate::compensation::path::{Move, Summary};
-use crate::formats::registration::Draft;
+use crate::registration::Draft;
+use regrind_core::compensation::path::{Move, Summary};
 
 /// Bytes that are gathered before they go to the file.
 const CHUNK: usize = 1 << 16;
@@ -226,8 +226,8 @@ pub(super) fn comment(words: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::compensation::path::Peak;
-    use crate::geometry::Point;
+    use regrind_core::compensation::path::Peak;
+    use regrind_core::geometry::Point;
 
     /// Along x there and back, one track after the other.
     fn tracks(count: usize) -> Vec<std::vec::IntoIter<Move>> {

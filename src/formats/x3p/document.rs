@@ -4,9 +4,8 @@ use std::path::Path;
 
 use roxmltree::{Document, Node, ParsingOptions};
 
-use super::Record;
-use crate::formats::error::{FormatError, excerpt};
-use crate::formats::height_map::{MOST_SAMPLES, check_size};
+use crate::error::{FormatError, excerpt};
+use crate::height_map::{MOST_SAMPLES, check_size};
 
 /// Most nodes of the document: three for a sample that stands in it.
 const MOST_NODES: u32 = 10_000_000;
@@ -85,6 +84,9 @@ pub(super) struct Sealed {
     pub(super) entry: String,
     pub(super) md5: Option<String>,
 }
+
+/// Raw values of the absolute axes of a sample, 0 for the others; `None` where it was not measured.
+pub(super) type Record = Option<[f64; 3]>;
 
 /// Where the samples are.
 pub(super) enum Samples {
@@ -279,7 +281,7 @@ fn samples<'d>(place: &Place<'_>, third: Node<'d, 'd>, axes: &[Axis; 3]) -> Resu
             if entry.starts_with('/') || entry.contains(':') || entry.split(['/', '\\']).any(|part| part == "..") {
                 return Err(place.unexpected(node, "an entry of this container", &entry));
             }
-            let md5 = child(link, sum).map(text).filter(|sum| super::is_sum(sum));
+            let md5 = child(link, sum).map(text).filter(|sum| is_sum(sum));
             Ok(Some(Sealed { entry, md5 }))
         };
         let data = sealed("PointDataLink", "MD5ChecksumPointData")?;
@@ -316,4 +318,9 @@ fn record<'d>(place: &Place<'_>, datum: Node<'d, 'd>, axes: &[Axis; 3]) -> Resul
         return Err(wrong());
     }
     Ok(values.iter().all(|v| v.is_finite()).then_some(values))
+}
+
+/// Returns whether a word is an MD5 sum in hexadecimal digits.
+pub(super) fn is_sum(word: &str) -> bool {
+    word.len() == 32 && word.bytes().all(|b| b.is_ascii_hexdigit())
 }

@@ -21,11 +21,11 @@ use md5::{Digest, Md5};
 use zip::ZipArchive;
 
 use super::error::{FormatError, excerpt};
-use super::height_map::HeightMap;
+use super::height_map::{HeightMap, MapFormat, MapPoints};
 use super::number::is_believable;
 use super::whole::{MOST_BYTES, open};
-use crate::geometry::{Grid, Point};
-use document::{Axis, Extent, Main, Samples, Sealed};
+use document::{Axis, Extent, Main, Record, Samples, Sealed, is_sum};
+use regrind_core::geometry::{Grid, Point};
 pub use write::{MapRecord, write_error_map_x3p, write_x3p};
 
 /// Largest `main.xml`, heights included.
@@ -52,6 +52,22 @@ impl X3pFile {
         match self {
             Self::Map(map) => map.points(),
             Self::Points(points) => points,
+        }
+    }
+}
+
+/// X3P, told by its first bytes.
+pub(super) const FORMAT: MapFormat = MapFormat {
+    begins: is_zip,
+    read: |path| read_x3p(path).map(Into::into),
+    parse: |path, bytes| parse_x3p(path, bytes).map(Into::into),
+};
+
+impl From<X3pFile> for MapPoints {
+    fn from(file: X3pFile) -> Self {
+        match file {
+            X3pFile::Map(map) => map.into(),
+            X3pFile::Points(points) => Self { points, notes: Vec::new() },
         }
     }
 }
@@ -104,12 +120,9 @@ pub fn parse_x3p(path: &Path, bytes: &[u8]) -> Result<X3pFile, FormatError> {
 }
 
 /// Returns whether a file begins like a zip container, be it an empty one.
-pub(super) fn is_zip(head: &[u8]) -> bool {
+fn is_zip(head: &[u8]) -> bool {
     head.starts_with(b"PK\x03\x04") || head.starts_with(b"PK\x05\x06")
 }
-
-/// Raw values of the absolute axes of a sample, 0 for the others; `None` where it was not measured.
-type Record = Option<[f64; 3]>;
 
 /// Reads the binary parts.
 fn linked(
@@ -283,9 +296,4 @@ impl<'a> Container<'a> {
             None => Ok(()),
         }
     }
-}
-
-/// Returns whether a word is an MD5 sum in hexadecimal digits.
-fn is_sum(word: &str) -> bool {
-    word.len() == 32 && word.bytes().all(|b| b.is_ascii_hexdigit())
 }

@@ -7,11 +7,11 @@ use md5::{Digest, Md5};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
-use crate::compensation::ErrorMap;
-use crate::formats::error::FormatError;
-use crate::formats::height_map::HeightMap;
-use crate::formats::registration::Draft;
-use crate::geometry::Grid;
+use crate::error::FormatError;
+use crate::height_map::HeightMap;
+use crate::registration::Draft;
+use regrind_core::compensation::ErrorMap;
+use regrind_core::geometry::Grid;
 
 /// What a file says of how its map came to be.
 #[derive(Clone, Debug, PartialEq)]

@@ -12,6 +12,7 @@ mod height_map;
 mod layout;
 mod learned;
 mod map;
+mod measured_map;
 pub mod metropro;
 mod number;
 pub mod ply;
@@ -35,6 +36,7 @@ pub use folder::{ResultFolder, place_link, remove_link, remove_socket};
 pub use height_map::HeightMap;
 pub use learned::{LEARNED, Learned, LearnedError};
 pub use map::{CorrectionIdentities, ErrorMapOrigin, write_correction, write_error_map};
+pub use measured_map::is_map;
 pub use metropro::{parse_metropro, read_metropro};
 pub use number::LIMIT_MM;
 pub use ply::{PlyFile, parse_ply, read_ply};
@@ -48,7 +50,9 @@ pub use stl::{StlFile, parse_stl, read_stl};
 pub use whole::read_whole;
 pub use x3p::{MapRecord, X3pFile, parse_x3p, read_x3p, write_error_map_x3p, write_x3p};
 
-use crate::geometry::Point;
+use height_map::MapFormat;
+use measured_map::map_format;
+use regrind_core::geometry::Point;
 
 /// Largest surface definition that is read.
 const MOST_DEFINITION_BYTES: u64 = 1 << 20;
@@ -69,34 +73,12 @@ pub enum NominalFile {
     Definition(String),
 }
 
-#[derive(Clone, Copy, Debug, PartialEq)]
 enum Kind {
     Text,
     Ply,
     Stl,
     Toml,
-    Map(MapKind),
-}
-
-/// A format of maps.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum MapKind {
-    X3p,
-    Sdf,
-    MetroPro,
-}
-
-impl MapKind {
-    /// Tells the format by the first bytes; none where it is no map.
-    fn of(head: &[u8]) -> Option<Self> {
-        if x3p::is_zip(head) {
-            return Some(Self::X3p);
-        }
-        if sdf::is_sdf(head) {
-            return Some(Self::Sdf);
-        }
-        metropro::is_metropro(head).then_some(Self::MetroPro)
-    }
+    Map(&'static MapFormat),
 }
 
 /// Reads a nominal surface as [`read_nominal`] does, and returns the SHA-256 of the file with it.
@@ -167,37 +149,8 @@ pub fn read_measured(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> 
         Kind::Ply => read_ply(path).map(|file| file.points),
         Kind::Stl => wrong("an STL mesh", "export the points, or give the mesh as the nominal"),
         Kind::Toml => wrong("a TOML file", "give the definition as the nominal"),
-        Kind::Map(MapKind::X3p) => read_x3p(path).map(X3pFile::into_points),
-        Kind::Map(MapKind::Sdf) => read_sdf(path).map(|map| map.points()),
-        Kind::Map(MapKind::MetroPro) => read_metropro(path).map(|map| map.points()),
+        Kind::Map(format) => (format.read)(path).map(|map| map.points),
     }
-}
-
-/// Returns whether a file is a map of heights, whose points lie on the surface: X3P, SDF or MetroPro.
-///
-/// # Errors
-/// A file that cannot be read.
-pub fn is_map(path: impl AsRef<Path>) -> Result<bool, FormatError> {
-    Ok(MapKind::of(&whole::open(path.as_ref())?.head).is_some())
-}
-
-/// The measured points of a map, and what the reader had to decide about it.
-struct MapPoints {
-    points: Vec<Point>,
-    notes: Vec<String>,
-}
-
-/// Parses the bytes of a map; none where the bytes are no map.
-fn parse_map(path: &Path, bytes: &[u8]) -> Option<Result<MapPoints, FormatError>> {
-    let of_map = |map: HeightMap| MapPoints { points: map.points(), notes: map.notes };
-    Some(match MapKind::of(bytes)? {
-        MapKind::X3p => parse_x3p(path, bytes).map(|file| match file {
-            X3pFile::Map(map) => of_map(map),
-            X3pFile::Points(points) => MapPoints { points, notes: Vec::new() },
-        }),
-        MapKind::Sdf => parse_sdf(path, bytes).map(of_map),
-        MapKind::MetroPro => parse_metropro(path, bytes).map(of_map),
-    })
 }
 
 /// Tells the kind of a file by its beginning, and by its extension where that leaves it open.
@@ -207,8 +160,8 @@ fn kind(path: &Path) -> Result<Kind, FormatError> {
     if ply::is_ply(head) {
         return Ok(Kind::Ply);
     }
-    if let Some(kind) = MapKind::of(head) {
-        return Ok(Kind::Map(kind));
+    if let Some(format) = map_format(head) {
+        return Ok(Kind::Map(format));
     }
     if stl::is_stl(head, length) {
         return Ok(Kind::Stl);

@@ -9,12 +9,12 @@ use std::path::Path;
 
 use md5::{Digest, Md5};
 use proptest::prelude::*;
-use regrind::compensation::ErrorMap;
-use regrind::formats::{
+use regrind_core::compensation::ErrorMap;
+use regrind_core::geometry::Grid;
+use regrind_formats::{
     FormatError, HeightMap, MapRecord, X3pFile, parse_metropro, parse_sdf, parse_x3p, read_measured, read_x3p,
     write_error_map_x3p, write_x3p,
 };
-use regrind::geometry::Grid;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 

@@ -1,6 +1,6 @@
 //! Files in and out: points, meshes and maps.
 
-#[path = "../common/data.rs"]
+#[path = "../../../../tests/common/data.rs"]
 mod data;
 mod map_files;
 mod points;

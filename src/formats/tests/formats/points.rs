@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use proptest::prelude::*;
-use regrind::formats::*;
-use regrind::geometry::Point;
+use regrind_core::geometry::Point;
+use regrind_formats::*;
 
 type Outcome = Result<Vec<Point>, FormatError>;
 
