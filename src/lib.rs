@@ -23,12 +23,12 @@
 pub use regrind_cell as cell;
 pub use regrind_core::{compensation, form, geometry, measuring, registration, surface};
 pub use regrind_formats as formats;
+pub use regrind_journal as journal;
 
 pub mod config;
 pub mod device;
 pub mod document;
 pub mod drive;
-pub mod journal;
 pub mod recipe;
 pub mod report;
 pub mod setup;

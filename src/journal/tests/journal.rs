@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use regrind::journal::{
+use regrind_journal::{
     Anchor, Entry, Header, Journal, JournalError, Kind, canonical_json, open_read_only, sha256_hex, verify,
     verify_against,
 };
@@ -391,7 +391,7 @@ fn what_a_writer_adds_is_found_by_a_reader_that_has_begun() {
     }
 }
 
-/// Tells how long it takes to verify a long journal: `cargo test --release --test journal -- --ignored --nocapture`.
+/// Tells how long it takes to verify a long journal: `cargo test --release -p regrind-journal --test journal -- --ignored --nocapture`.
 #[test]
 #[ignore = "a measurement"]
 fn time_of_verifying() {
