@@ -17,121 +17,19 @@ use std::sync::{Arc, Mutex};
 
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
-use serde::{Deserialize, Serialize};
 
 use crate::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
 use crate::part::{Approach, Contact, touch_sphere};
 use crate::payload::{BROKEN, Feature, INTERLOCK, Plan, PointRecord, Status, Target, encode_points, outside};
 use crate::probe::Placement;
-use crate::process::nothing_done;
-use crate::world::{Faults, Source, State, locked, stream};
+use crate::spec::{CmmSpec, Faults, REFERENCE_C};
+use crate::truth::{Source, State, locked, nothing_done, stream};
 use crate::{Rng, Vec3};
 
 /// Millimetres per count of scaled points: a nanometre.
 pub const COUNT_MM: f64 = 1e-6;
-/// Temperature at which lengths are what drawings say, in degrees Celsius.
-const REFERENCE_C: f64 = 20.0;
-
-/// Where the part lies on the measuring machine, and what is wrong with the machine.
-#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct CmmSpec {
-    /// Where the origin of the model frame lies in the machine's frame.
-    pub translation_mm: Vec3,
-    /// How the part is turned, about x, then y, then z.
-    pub rotation_deg: Vec3,
-    /// Standard deviation of the part's place from loading to loading, along each axis.
-    pub loading_shift_um: f64,
-    /// The same for its angles.
-    pub loading_turn_deg: f64,
-    /// Standard deviation of a reported coordinate, on each axis.
-    pub noise_um: f64,
-    /// Share of the touches that are outliers.
-    pub outlier_share: f64,
-    /// Largest shift of an outlier.
-    pub outlier_um: f64,
-    /// Share of the touches that are missed.
-    pub not_found_share: f64,
-    /// True radius of the ball less the one that the plan states.
-    pub probe_radius_error_um: f64,
-    /// Temperature of the part while it is measured.
-    pub part_temperature_c: f64,
-    /// Its expansion per kelvin.
-    pub cte_per_k: f64,
-    /// Radius of the reference sphere on the table.
-    pub sphere_radius_mm: f64,
-    /// Its centre in the machine's frame.
-    pub sphere_centre_mm: Vec3,
-    /// Least coordinates that the ball's centre comes to.
-    pub travel_least_mm: Vec3,
-    /// Most.
-    pub travel_most_mm: Vec3,
-    /// Time that a point takes.
-    pub seconds_per_point: f64,
-    /// Touches before the search begins that the machine puts up with in one measurement.
-    pub unexpected_touches_most: u32,
-    /// Points are sent as 32-bit counts of a nanometre (format 2) in place of floats (format 1).
-    pub scaled_points: bool,
-}
-
-impl Default for CmmSpec {
-    fn default() -> Self {
-        Self {
-            translation_mm: [0.25, -0.2, 0.15],
-            rotation_deg: [0.1, -0.08, 0.08],
-            loading_shift_um: 20.0,
-            loading_turn_deg: 0.005,
-            noise_um: 0.3,
-            outlier_share: 0.0,
-            outlier_um: 200.0,
-            not_found_share: 0.0,
-            probe_radius_error_um: 0.0,
-            part_temperature_c: REFERENCE_C,
-            cte_per_k: 0.55e-6,
-            sphere_radius_mm: 12.5,
-            sphere_centre_mm: [0.0, 120.0, 20.0],
-            travel_least_mm: [-500.0, -500.0, -300.0],
-            travel_most_mm: [500.0, 500.0, 400.0],
-            seconds_per_point: 1.0,
-            unexpected_touches_most: 20,
-            scaled_points: false,
-        }
-    }
-}
 
 impl CmmSpec {
-    /// A machine without noise, that has the part where it should be.
-    pub fn perfect() -> Self {
-        Self {
-            translation_mm: [0.0; 3],
-            rotation_deg: [0.0; 3],
-            loading_shift_um: 0.0,
-            loading_turn_deg: 0.0,
-            noise_um: 0.0,
-            ..Self::default()
-        }
-    }
-
-    /// Returns where the part lies after the n-th loading; 0 is where the table says.
-    pub(crate) fn placement(&self, faults: &Faults, seed: u64, loading: u32) -> Placement {
-        let mut rng = stream(seed, Source::Loading, loading);
-        let mut about = |middle: Vec3, sigma: f64| -> Vec3 {
-            middle.map(|c| {
-                let z: f64 = StandardNormal.sample(&mut rng);
-                if loading == 0 { c } else { c + sigma * z }
-            })
-        };
-        let shift = about(self.translation_mm, 1e-3 * self.loading_shift_um);
-        let turn = about(self.rotation_deg, self.loading_turn_deg);
-        let mut placement = Placement::new(shift, turn);
-        if faults.part_turned_180 {
-            for row in &mut placement.rotation {
-                (row[0], row[1]) = (-row[0], -row[1]);
-            }
-        }
-        placement
-    }
-
     /// Returns the size of the part over its size on the drawing.
     fn growth(&self) -> f64 {
         1.0 + self.cte_per_k * (self.part_temperature_c - REFERENCE_C)

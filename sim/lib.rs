@@ -9,7 +9,9 @@
 //!  form    what grinding left on it: a smooth random error along the normal
 //!  probe   a ball that touches the part, in a frame of its own, with noise and outliers
 //!
-//!  world      the truth in one table, the two machines that share it, and queries for tests
+//!  spec       the truth in one table: what is wrong with everything
+//!  truth      what the two machines share, and where every random number comes from
+//!  world      the two machines, and queries for tests
 //!  part       the part as it really is, and exact contact with it
 //!  process    the grinder: what a pass leaves, node by node along its path
 //!  cmm        the measuring machine: what it reports of a plan
@@ -18,7 +20,9 @@
 //!  body       what the physics of one machine must be able to do
 //!  words      how values lie in registers
 //!  transfer   payloads in and results out, a page at a time
-//!  handshake  commands, states, interlocks, silence
+//!  command    commands, answers and states as the wire has them
+//!  options    how a machine is set up: where its registers are
+//!  handshake  one machine's side of the handshake: states, interlocks, silence
 //!  registers  a whole machine: what a Modbus client reads and writes
 //!  seen       what the machine saw and did
 //!  wire       Modbus TCP and RTU servers, a serial line without hardware, and everything that goes wrong on them
@@ -29,8 +33,10 @@
 
 pub mod body;
 pub mod cmm;
+pub mod command;
 pub mod form;
-pub mod handshake;
+mod handshake;
+pub mod options;
 pub mod part;
 pub mod payload;
 pub mod probe;
@@ -38,7 +44,9 @@ pub mod process;
 pub mod registers;
 pub mod seen;
 pub mod shape;
+pub mod spec;
 pub mod transfer;
+pub mod truth;
 pub mod wire;
 pub mod words;
 pub mod world;

@@ -27,13 +27,12 @@
 
 use std::sync::{Arc, Mutex};
 
-use serde::{Deserialize, Serialize};
-
 use crate::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
 use crate::form::FormError;
 use crate::part::Part;
 use crate::payload::{BROKEN, INTERLOCK, Map, Pass, PassRecord, outside};
-use crate::world::{Mirrored, Source, State, locked, stream};
+use crate::spec::{GrinderSpec, Mirrored, WorldSpec};
+use crate::truth::{GrindEntry, Source, State, locked, nothing_done, stream};
 
 /// Most strokes of one pass, roughing and finishing.
 pub const MOST_STROKES: u32 = 400;
@@ -42,102 +41,7 @@ pub const OVERTRAVEL_MM: f64 = 1.5;
 /// Feed of a roughing stroke over that of a finishing stroke.
 const ROUGHING_FEED: f64 = 10.0;
 
-/// What is wrong with the grinder.
-#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct GrinderSpec {
-    /// True radius of the wheel less the radius stated in the first pass; the true one stays.
-    pub wheel_radius_error_um: f64,
-    /// Offset of the wheel in x and y.
-    pub setting_error_um: [f64; 2],
-    /// Straightness along x: amplitudes of the second and third Legendre polynomial over the part.
-    pub straightness_x_um: [f64; 2],
-    /// The same along y.
-    pub straightness_y_um: [f64; 2],
-    /// Amplitude of the screw's error along x.
-    pub periodic_um: f64,
-    /// Its pitch.
-    pub periodic_pitch_mm: f64,
-    /// RMS of a fixed random waviness.
-    pub waviness_um: f64,
-    /// Its correlation length.
-    pub waviness_correlation_mm: f64,
-    /// Lag along the path at 1000 mm/min, proportional to the feed.
-    pub following_um: f64,
-    /// Growth of the surface left by the wearing wheel, over one finishing stroke.
-    pub wear_um: f64,
-    /// Fast wear of the freshly dressed wheel.
-    pub break_in_um: f64,
-    /// Share of a finishing stroke after which all but 1/e of the fast wear is over.
-    pub break_in_share: f64,
-    /// The wheel is dressed before every pass; else its fast wear is over after the first.
-    pub dressed_each_pass: bool,
-    /// Growth of the spindle when it is warm through.
-    pub thermal_um: f64,
-    /// Its time constant.
-    pub thermal_tau_s: f64,
-    /// Share of what stands proud that stays, mu.
-    pub error_copying: f64,
-    /// RMS of the random part drawn for every pass.
-    pub repeatability_um: f64,
-    /// Its correlation length.
-    pub repeatability_correlation_mm: f64,
-    /// How far the wheel reaches from the middle of the machine in x and y.
-    pub travel_mm: [f64; 2],
-    /// Fastest feed.
-    pub feed_most_mm_min: f64,
-    /// Largest displacement that a map may ask for.
-    pub map_most_um: f64,
-}
-
-impl Default for GrinderSpec {
-    fn default() -> Self {
-        Self {
-            wheel_radius_error_um: 90.0,
-            setting_error_um: [12.0, -9.0],
-            straightness_x_um: [-6.0, -4.5],
-            straightness_y_um: [-4.5, -3.0],
-            periodic_um: 0.4,
-            periodic_pitch_mm: 20.0,
-            waviness_um: 0.8,
-            waviness_correlation_mm: 18.0,
-            following_um: 0.1,
-            wear_um: 4.0,
-            break_in_um: 2.0,
-            break_in_share: 0.08,
-            dressed_each_pass: true,
-            thermal_um: 4.0,
-            thermal_tau_s: 1200.0,
-            error_copying: 0.15,
-            repeatability_um: 0.4,
-            repeatability_correlation_mm: 14.0,
-            travel_mm: [250.0, 250.0],
-            feed_most_mm_min: 20_000.0,
-            map_most_um: 500.0,
-        }
-    }
-}
-
 impl GrinderSpec {
-    /// A grinder without any error, as stiff as can be.
-    pub fn perfect() -> Self {
-        Self {
-            wheel_radius_error_um: 0.0,
-            setting_error_um: [0.0; 2],
-            straightness_x_um: [0.0; 2],
-            straightness_y_um: [0.0; 2],
-            periodic_um: 0.0,
-            waviness_um: 0.0,
-            following_um: 0.0,
-            wear_um: 0.0,
-            break_in_um: 0.0,
-            thermal_um: 0.0,
-            error_copying: 0.0,
-            repeatability_um: 0.0,
-            ..Self::default()
-        }
-    }
-
     /// Returns what comes back in every pass but the wheel's radius, at (x, y) of a part, in micrometres.
     fn systematic_um(&self, part: &Part, [x, y]: [f64; 2]) -> f64 {
         let [half_x, half_y] = part.aperture.half_mm();
@@ -164,7 +68,8 @@ fn finite_or_zero(value: f64) -> f64 {
 }
 
 /// Returns the systematic error at every node, waviness included and the wheel's radius not, in millimetres.
-pub(crate) fn systematic_mm(spec: &GrinderSpec, part: &Part, seed: u64) -> Vec<f64> {
+pub(crate) fn systematic_mm(spec: &WorldSpec, part: &Part) -> Vec<f64> {
+    let (seed, spec) = (spec.seed, &spec.grinder);
     let waves = smooth(&mut stream(seed, Source::Waviness, 0), spec.waviness_correlation_mm, spec.waviness_um);
     let mut error_mm: Vec<f64> = part.height.nodes().map(|place| 1e-3 * spec.systematic_um(part, place)).collect();
     part.height.add(&waves, &mut error_mm);
@@ -173,27 +78,6 @@ pub(crate) fn systematic_mm(spec: &GrinderSpec, part: &Part, seed: u64) -> Vec<f
 
 fn smooth(rng: &mut crate::Rng, correlation_mm: f64, rms_um: f64) -> FormError {
     if rms_um > 0.0 { FormError::with_rms(rng, correlation_mm, rms_um * 1e-3) } else { FormError::none() }
-}
-
-/// A pass that the grinder began.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct GrindEntry {
-    /// The part's run.
-    pub job: u32,
-    /// Its cycle.
-    pub cycle: u16,
-    /// The height that was wanted, in millimetres.
-    pub level_mm: f64,
-    /// Largest value of the map that came with it, in millimetres.
-    pub map_largest_mm: f64,
-    /// Identity of the map.
-    pub map: [u8; 32],
-    /// Strokes to take off what stood above the depth of cut.
-    pub roughing_strokes: u32,
-    /// How it ended as in the pass record; 0 while it goes on.
-    pub result: u16,
-    /// Volume removed in cubic millimetres.
-    pub volume_mm3: f64,
 }
 
 /// One travel over the whole part.
@@ -619,20 +503,5 @@ impl Drop for Grinder {
     /// A machine that is taken away keeps nothing.
     fn drop(&mut self) {
         locked(&self.world).release(Kind::Grinder);
-    }
-}
-
-/// The outbox of a job that never began.
-pub(crate) fn nothing_done(temperature_c: f64) -> Outcome {
-    Outcome {
-        kind: 0,
-        format: 1,
-        bytes: Vec::new(),
-        records: 0,
-        coordinates: 0,
-        probe_radius_mm: 0.0,
-        scale_mm: 1.0,
-        temperature_c,
-        duration_s: 0.0,
     }
 }

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::handshake::{Answer, Frame, State};
+use crate::command::{Answer, Frame, State};
 
 /// One thing that happened.
 #[derive(Clone, Debug, PartialEq)]

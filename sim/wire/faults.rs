@@ -9,7 +9,7 @@ use std::time::Duration;
 use rand::RngExt;
 
 use crate::Rng;
-use crate::handshake::State;
+use crate::command::State;
 
 /// One thing that goes wrong with a request or with the answer to it.
 #[derive(Clone, Debug, PartialEq)]

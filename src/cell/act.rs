@@ -5,13 +5,13 @@ use std::time::Duration;
 use super::alarm::{Alarm, AlarmId};
 use super::command::{Command, Ending, Judgement, Verdict};
 use super::event::{
-    Asked, CompensationRefusal, Condition, Figures, Found, Gate, GateFailure, JobResult, Mismatch, Reconciliation,
+    Asked, CompensationRefusal, Condition, Figures, Gate, GateFailure, JobResult, Mismatch, Occupation, Reconciliation,
     RecordFailure, Response,
 };
 use super::judge::{self, Judged, um};
-use super::machine::{Cause, Cell, Known};
+use super::memory::{Cause, Cell, Known};
 use super::plan::{Beginning, Disposal};
-use super::state::{Device, Phase, State, Step};
+use super::state::{Device, JobStep, Phase, State};
 
 use Phase::{Compensate, Grind, Judge, Load, Measure, Register, Transfer};
 use State::{
@@ -19,7 +19,7 @@ use State::{
     Suspending, Unholding, Unsuspending,
 };
 
-// The small words.
+// Its vocabulary.
 impl Cell {
     pub(super) fn push(&mut self, command: Command) {
         self.commands.push(command);
@@ -75,10 +75,10 @@ impl Cell {
             (Suspended(_), _) => Some(limits.suspended),
             (Stopping, _) => Some(limits.stop),
             (Aborting, _) => Some(limits.abort),
-            (Execute(phase), Some(Step::Run)) => phase.moving().map(|device| limits.progress[device as usize]),
-            (Holding(_) | Suspending(_), Some(Step::Run)) => Some(limits.hold),
-            (_, Some(Step::Send | Step::Collect)) => Some(limits.transfer),
-            (_, Some(Step::Qualify)) => Some(limits.compute),
+            (Execute(phase), Some(JobStep::Run)) => phase.moving().map(|device| limits.progress[device as usize]),
+            (Holding(_) | Suspending(_), Some(JobStep::Run)) => Some(limits.hold),
+            (_, Some(JobStep::Send | JobStep::Collect)) => Some(limits.transfer),
+            (_, Some(JobStep::Qualify)) => Some(limits.compute),
             (Execute(Register | Compensate) | Holding(Register | Compensate), _) => Some(limits.compute),
             _ => Some(limits.answer),
         }
@@ -98,45 +98,44 @@ impl Cell {
         }
     }
 
-    pub(super) fn connected(&mut self, device: Device, boot_id: u32, found: &Found) {
+    pub(super) fn connected(&mut self, device: Device, boot_id: u32, found: &Occupation) {
         let known = self.know(device);
         (known.met, known.boot_id) = (true, Some(boot_id));
         match found {
-            Found::Idle => known.ready = true,
-            Found::ToClear if self.plan.clear_at_start => self.push(Command::ClearMachine { device }),
-            Found::ToClear => self.not_idle(device, "it was aborted or is in fault"),
-            Found::Busy(words) => self.not_idle(device, words),
+            Occupation::Idle => known.ready = true,
+            Occupation::ToClear if self.plan.clear_at_start => self.push(Command::ClearMachine { device }),
+            Occupation::ToClear | Occupation::Busy(_) => self.not_idle(device, &found.to_string()),
         }
         if self.state == Starting && self.known.iter().all(|known| known.ready) {
             self.enter(Load);
         }
     }
 
-    fn not_idle(&mut self, device: Device, words: &str) {
-        self.raise(AlarmId::NotIdle, &format!("{device}, {words}"));
-        self.stop(&format!("the {device} is not idle: {words}"), false);
+    fn not_idle(&mut self, device: Device, message: &str) {
+        self.raise(AlarmId::NotIdle, &format!("{device}, {message}"));
+        self.stop(&format!("the {device} is not idle: {message}"), false);
     }
 
     /// A machine comes back while the cell is held: it may still be at this run's job.
-    pub(super) fn reconnected(&mut self, phase: Phase, device: Device, boot_id: u32, found: &Found) {
+    pub(super) fn reconnected(&mut self, phase: Phase, device: Device, boot_id: u32, found: &Occupation) {
         let ours = phase.job().is_some_and(|(job, _)| job == device);
         let known = self.know(device);
         (known.met, known.boot_id) = (true, Some(boot_id));
-        known.ready = ours || *found == Found::Idle;
+        known.ready = ours || *found == Occupation::Idle;
         if !known.ready {
-            self.raise(AlarmId::NotIdle, &format!("{device}, {found:?}"));
+            self.raise(AlarmId::NotIdle, &format!("{device}, {found}"));
         }
     }
 
     pub(super) fn not_connected(&mut self, device: Device, why: &Mismatch) {
-        let (id, words) = match why {
-            Mismatch::Unreachable(words) => (AlarmId::Unreachable, words.as_str()),
-            Mismatch::WrongDevice(words) => (AlarmId::WrongDevice, words.as_str()),
-            Mismatch::WordOrder(words) => (AlarmId::WordOrder, words.as_str()),
+        let (id, message) = match why {
+            Mismatch::Unreachable(message) => (AlarmId::Unreachable, message.as_str()),
+            Mismatch::WrongDevice(message) => (AlarmId::WrongDevice, message.as_str()),
+            Mismatch::WordOrder(message) => (AlarmId::WordOrder, message.as_str()),
             Mismatch::Inches => (AlarmId::Inches, "the machine says so of itself"),
-            Mismatch::Owned(words) => (AlarmId::Owned, words.as_str()),
+            Mismatch::Owned(message) => (AlarmId::Owned, message.as_str()),
         };
-        let case = format!("{device}, {words}");
+        let case = format!("{device}, {message}");
         self.raise(id, &case);
         if self.state == Starting {
             self.stop(&case, false);
@@ -146,8 +145,8 @@ impl Cell {
     pub(super) fn first_cycle(&mut self) {
         self.cycle = 1;
         self.enter(match self.plan.begin_with {
-            Beginning::Grind => Grind(Step::Send),
-            Beginning::Measure => Measure(Step::Send),
+            Beginning::Grind => Grind(JobStep::Send),
+            Beginning::Measure => Measure(JobStep::Send),
         });
     }
 
@@ -170,10 +169,10 @@ impl Cell {
         let cycle = self.cycle;
         match phase {
             Load => self.push(Command::AskToLoad),
-            Grind(Step::Start) => self.start_machine(Device::Grinder),
-            Measure(Step::Start) => self.start_machine(Device::Cmm),
-            Grind(Step::Send) => self.push(Command::LoadPass { cycle }),
-            Measure(Step::Send) => self.push(Command::LoadPlan { cycle }),
+            Grind(JobStep::Start) => self.start_machine(Device::Grinder),
+            Measure(JobStep::Start) => self.start_machine(Device::Cmm),
+            Grind(JobStep::Send) => self.push(Command::LoadPass { cycle }),
+            Measure(JobStep::Send) => self.push(Command::LoadPlan { cycle }),
             Transfer => self.verify_clear(Device::Grinder),
             Register => self.push(Command::Register { cycle }),
             Judge => self.judge(),
@@ -183,17 +182,17 @@ impl Cell {
         }
     }
 
-    fn enter_step(&mut self, device: Device, step: Step) {
+    fn enter_step(&mut self, device: Device, step: JobStep) {
         let cycle = self.cycle;
         match step {
-            Step::Clear => self.verify_clear(device.other()),
-            Step::Prepare => self.push(Command::Prepare { device, cycle }),
-            Step::Reconcile => self.push(Command::Reconcile { device, cycle }),
-            Step::Collect => self.push(Command::Collect { cycle }),
-            Step::Qualify => self.push(Command::Qualify { cycle }),
-            Step::Acknowledge | Step::Discard => self.push(Command::Acknowledge { device }),
+            JobStep::Clear => self.verify_clear(device.other()),
+            JobStep::Prepare => self.push(Command::Prepare { device, cycle }),
+            JobStep::Reconcile => self.push(Command::Reconcile { device, cycle }),
+            JobStep::Collect => self.push(Command::Collect { cycle }),
+            JobStep::Qualify => self.push(Command::Qualify { cycle }),
+            JobStep::Acknowledge | JobStep::Discard => self.push(Command::Acknowledge { device }),
             // The machine runs already, or is started with its interlock.
-            Step::Run | Step::Send | Step::Start => {}
+            JobStep::Run | JobStep::Send | JobStep::Start => {}
         }
     }
 
@@ -207,7 +206,7 @@ impl Cell {
         let other = device.other();
         if !self.knows(other).clear {
             self.raise(AlarmId::NotClear, &format!("{other}, no longer, before the {device} was started"));
-            return self.go(Held(Phase::of(device, Step::Send)));
+            return self.go(Held(Phase::of(device, JobStep::Send)));
         }
         self.know(device).clear = false;
         self.passes += u32::from(device == Device::Grinder);
@@ -223,17 +222,17 @@ impl Cell {
         if what == Asked::Start {
             self.not_started(device);
         }
-        self.raise(AlarmId::MachineRefused, &format!("{device}, {what:?}: {why}"));
+        self.raise(AlarmId::MachineRefused, &format!("{device}, {what}: {why}"));
         self.go(Held(restart_of(phase)));
     }
 
     pub(super) fn ended(&mut self, device: Device, result: JobResult) {
         match (result, device) {
-            (JobResult::Complete, Device::Grinder) => self.advance(Grind(Step::Acknowledge)),
-            (JobResult::Complete, Device::Cmm) => self.advance(Measure(Step::Collect)),
+            (JobResult::Complete, Device::Grinder) => self.advance(Grind(JobStep::Acknowledge)),
+            (JobResult::Complete, Device::Cmm) => self.advance(Measure(JobStep::Collect)),
             (JobResult::Stopped | JobResult::Failed, _) => {
-                self.raise(AlarmId::JobFailed, &format!("{device}, {result:?}"));
-                self.advance(Phase::of(device, Step::Discard));
+                self.raise(AlarmId::JobFailed, &format!("{device}, {result}"));
+                self.advance(Phase::of(device, JobStep::Discard));
             }
             (JobResult::Aborted, _) => {
                 self.raise(AlarmId::JobFailed, &format!("{device}, aborted at the machine"));
@@ -244,9 +243,9 @@ impl Cell {
 
     pub(super) fn acknowledged(&mut self, phase: Phase) {
         match phase {
-            Grind(Step::Acknowledge) => self.advance(Transfer),
+            Grind(JobStep::Acknowledge) => self.advance(Transfer),
             Grind(_) => self.go(Held(Transfer)),
-            Measure(Step::Acknowledge) => self.advance(Register),
+            Measure(JobStep::Acknowledge) => self.advance(Register),
             _ => self.measure_anew(),
         }
     }
@@ -254,7 +253,7 @@ impl Cell {
     /// A measurement is repeated under the next number, after a person has resumed: no START is ever given twice.
     pub(super) fn measure_anew(&mut self) {
         self.cycle += 1;
-        self.go(Held(Measure(Step::Send)));
+        self.go(Held(Measure(JobStep::Send)));
     }
 
     pub(super) fn collected(&mut self, targets: u32, found: u32, gate: &Gate) {
@@ -273,21 +272,21 @@ impl Cell {
         match gate {
             Some((id, case)) => {
                 self.raise(id, &case);
-                self.advance(Measure(Step::Discard));
+                self.advance(Measure(JobStep::Discard));
             }
-            None if self.plan.gates.most_radius_error_mm.is_some() => self.advance(Measure(Step::Qualify)),
-            None => self.advance(Measure(Step::Acknowledge)),
+            None if self.plan.gates.most_radius_error_mm.is_some() => self.advance(Measure(JobStep::Qualify)),
+            None => self.advance(Measure(JobStep::Acknowledge)),
         }
     }
 
     pub(super) fn qualified(&mut self, radius_error_mm: f64) {
         let most = self.plan.gates.most_radius_error_mm.unwrap_or(f64::INFINITY);
         if radius_error_mm.abs() <= most {
-            return self.advance(Measure(Step::Acknowledge));
+            return self.advance(Measure(JobStep::Acknowledge));
         }
         let case = format!("it is off by {}, and {} are allowed", um(radius_error_mm), um(most));
         self.raise(AlarmId::ProbeRadius, &case);
-        self.advance(Measure(Step::Discard));
+        self.advance(Measure(JobStep::Discard));
     }
 
     /// A measurement of which nothing can be made.
@@ -370,19 +369,19 @@ impl Cell {
 
     pub(super) fn no_map(&mut self, why: &CompensationRefusal) {
         match why {
-            CompensationRefusal::BudgetSpent(words) => {
-                let (cycle, verdict, reason) = (self.cycle, Verdict::BudgetSpent, words.clone());
+            CompensationRefusal::BudgetSpent(message) => {
+                let (cycle, verdict, reason) = (self.cycle, Verdict::BudgetSpent, message.clone());
                 self.push(Command::Announce(Judgement { cycle, verdict, reason }));
-                self.give_up(AlarmId::BudgetSpent, words);
+                self.give_up(AlarmId::BudgetSpent, message);
             }
             CompensationRefusal::WeakDirections(directions) => {
                 let case = directions.join(", ");
                 self.raise(AlarmId::WeakDirections, &case);
                 self.dispose(self.plan.on_refusal, &format!("no correction is made: {case}"));
             }
-            CompensationRefusal::Failed(words) => {
-                self.raise(AlarmId::CompensationFailed, words);
-                self.dispose(self.plan.on_refusal, words);
+            CompensationRefusal::Failed(message) => {
+                self.raise(AlarmId::CompensationFailed, message);
+                self.dispose(self.plan.on_refusal, message);
             }
         }
     }
@@ -393,7 +392,7 @@ impl Cell {
     /// A hold by a person or from inside: what moves is told to hold, anything else comes to its border.
     pub(super) fn hold(&mut self, phase: Phase) {
         match phase.job() {
-            Some((device, Step::Run)) => {
+            Some((device, JobStep::Run)) => {
                 self.go(Holding(phase));
                 self.push(Command::HoldMachine { device });
             }
@@ -428,8 +427,8 @@ impl Cell {
             }
         }
         match phase.job() {
-            Some((_, Step::Run)) if !self.causes.is_empty() => self.go(Suspended(phase)),
-            Some((device, Step::Run)) => {
+            Some((_, JobStep::Run)) if !self.causes.is_empty() => self.go(Suspended(phase)),
+            Some((device, JobStep::Run)) => {
                 self.go(Unholding(phase));
                 self.push(Command::ResumeMachine { device });
             }
@@ -440,7 +439,7 @@ impl Cell {
     /// A condition is missing while a machine moves.
     pub(super) fn suspend(&mut self, phase: Phase) {
         self.go(Suspending(phase));
-        if let Some((device, Step::Run)) = phase.job() {
+        if let Some((device, JobStep::Run)) = phase.job() {
             self.push(Command::HoldMachine { device });
         }
     }
@@ -456,11 +455,11 @@ impl Cell {
             return;
         }
         match phase.job() {
-            Some((device, Step::Run)) => {
+            Some((device, JobStep::Run)) => {
                 self.go(Unsuspending(phase));
                 self.push(Command::ResumeMachine { device });
             }
-            Some((device, Step::Reconcile)) => {
+            Some((device, JobStep::Reconcile)) => {
                 self.go(Unsuspending(phase));
                 self.push(Command::Reconcile { device, cycle: self.cycle });
             }
@@ -468,9 +467,9 @@ impl Cell {
         }
     }
 
-    pub(super) fn condition_lost(&mut self, condition: Condition, words: &str) {
+    pub(super) fn condition_lost(&mut self, condition: Condition, message: &str) {
         if self.causes.insert(Cause::Condition(condition)) {
-            self.raise(AlarmId::ConditionLost, &format!("{condition:?}, {words}"));
+            self.raise(AlarmId::ConditionLost, &format!("{condition}, {message}"));
         }
     }
 
@@ -509,9 +508,9 @@ impl Cell {
     fn machine_restarted(&mut self, device: Device) {
         self.raise(AlarmId::MachineRestarted, &device.to_string());
         let Some(phase) = self.state.phase() else { return };
-        let before_start = matches!(restart_of(phase).job(), Some((_, Step::Send)));
+        let before_start = matches!(restart_of(phase).job(), Some((_, JobStep::Send)));
         if phase.job().map(|(job, _)| job) == Some(device) && !before_start {
-            self.go(Held(Phase::of(device, Step::Reconcile)));
+            self.go(Held(Phase::of(device, JobStep::Reconcile)));
         }
     }
 
@@ -525,11 +524,11 @@ impl Cell {
     }
 
     pub(super) fn record_failed(&mut self, why: &RecordFailure) {
-        let (id, words) = match why {
-            RecordFailure::DiskFull(words) => (AlarmId::DiskFull, words),
-            RecordFailure::Unwritable(words) => (AlarmId::JournalUnwritable, words),
+        let (id, message) = match why {
+            RecordFailure::DiskFull(message) => (AlarmId::DiskFull, message),
+            RecordFailure::Unwritable(message) => (AlarmId::JournalUnwritable, message),
         };
-        self.raise(id, words);
+        self.raise(id, message);
         match self.state {
             Execute(phase) | Unholding(phase) | Unsuspending(phase) => self.hold(phase),
             Suspending(phase) => self.go(Holding(phase)),
@@ -541,7 +540,7 @@ impl Cell {
 
     pub(super) fn machine_held(&mut self, device: Device) -> Result<(), String> {
         let at_job = running(self.state) == Some(device);
-        let run = Phase::of(device, Step::Run);
+        let run = Phase::of(device, JobStep::Run);
         match self.state {
             Stopping => {}
             Holding(_) if at_job => self.go(Held(run)),
@@ -557,7 +556,7 @@ impl Cell {
     }
 
     pub(super) fn machine_resumed(&mut self, device: Device) -> Result<(), String> {
-        let run = Phase::of(device, Step::Run);
+        let run = Phase::of(device, JobStep::Run);
         let at_run = self.state.phase() == Some(run);
         match self.state {
             Stopping => {}
@@ -582,7 +581,7 @@ impl Cell {
     }
 
     pub(super) fn reconciled(&mut self, device: Device, outcome: &Reconciliation) {
-        let run = Phase::of(device, Step::Run);
+        let run = Phase::of(device, JobStep::Run);
         match (outcome, self.state) {
             (Reconciliation::Running, Holding(_) | Suspending(_)) => {
                 self.go(self.same(run));
@@ -598,19 +597,19 @@ impl Cell {
             (Reconciliation::Ended(result), _) => self.ended(device, *result),
             (Reconciliation::NotStarted, _) => {
                 self.not_started(device);
-                self.advance(Phase::of(device, Step::Send));
+                self.advance(Phase::of(device, JobStep::Send));
             }
-            (Reconciliation::Unknown(words), _) => self.unknown(device, words),
+            (Reconciliation::Unknown(message), _) => self.unknown(device, message),
         }
     }
 
-    fn unknown(&mut self, device: Device, words: &str) {
-        self.raise(AlarmId::StartUnknown, &format!("{device}, {words}"));
-        self.go(Held(Phase::of(device, Step::Reconcile)));
+    fn unknown(&mut self, device: Device, message: &str) {
+        self.raise(AlarmId::StartUnknown, &format!("{device}, {message}"));
+        self.go(Held(Phase::of(device, JobStep::Reconcile)));
     }
 
     pub(super) fn reconcile(&mut self, device: Device) {
-        self.go(self.same(Phase::of(device, Step::Reconcile)));
+        self.go(self.same(Phase::of(device, JobStep::Reconcile)));
         self.push(Command::Reconcile { device, cycle: self.cycle });
     }
 
@@ -641,11 +640,11 @@ impl Cell {
         reason.clone_into(&mut self.reason);
         self.judged_out = judged_out;
         match self.state.phase().and_then(Phase::job) {
-            Some((device, Step::Prepare | Step::Start | Step::Run | Step::Reconcile)) => {
+            Some((device, JobStep::Prepare | JobStep::Start | JobStep::Run | JobStep::Reconcile)) => {
                 self.go(Stopping);
                 self.push(Command::StopMachine { device });
             }
-            Some((device, Step::Collect | Step::Qualify | Step::Acknowledge | Step::Discard)) => {
+            Some((device, JobStep::Collect | JobStep::Qualify | JobStep::Acknowledge | JobStep::Discard)) => {
                 self.go(Stopping);
                 self.push(Command::Acknowledge { device });
             }
@@ -700,9 +699,9 @@ impl Cell {
     }
 
     /// A machine was seen, at the end of a run.
-    pub(super) fn seen(&mut self, device: Device, clear: bool, words: &str) {
+    pub(super) fn seen(&mut self, device: Device, clear: bool, message: &str) {
         if !clear {
-            self.raise(AlarmId::NotClear, &format!("{device}, {words}"));
+            self.raise(AlarmId::NotClear, &format!("{device}, {message}"));
         }
         self.know(device).clear = true;
         if self.known.iter().any(|known| known.met && !known.clear) {
@@ -759,16 +758,16 @@ impl Cell {
 
     fn phase_is_due(&mut self, phase: Phase) {
         match (phase.job(), self.state) {
-            (Some((device, Step::Run)), Holding(_) | Suspending(_)) => {
+            (Some((device, JobStep::Run)), Holding(_) | Suspending(_)) => {
                 self.raise(AlarmId::HoldNotConfirmed, &device.to_string());
                 self.abort(&format!("the {device} did not confirm in time that it holds"));
             }
-            (Some((device, Step::Run)), _) => {
+            (Some((device, JobStep::Run)), _) => {
                 self.raise(AlarmId::NoAnswer, &format!("{device}, no sign of its job"));
                 self.hold(phase);
             }
-            (Some((device, Step::Start)), _) => self.reconcile(device),
-            (Some((device, Step::Reconcile)), _) => self.unknown(device, "it was not found out in time"),
+            (Some((device, JobStep::Start)), _) => self.reconcile(device),
+            (Some((device, JobStep::Reconcile)), _) => self.unknown(device, "it was not found out in time"),
             _ if matches!(phase, Register | Compensate) => {
                 self.raise(AlarmId::ComputationLate, phase.name());
                 self.go(Held(phase));
@@ -801,7 +800,7 @@ impl Cell {
 /// Returns the place from which a phase is taken up again while its machine has not been started.
 pub(super) fn restart_of(phase: Phase) -> Phase {
     match phase.job() {
-        Some((device, Step::Clear | Step::Prepare | Step::Start)) => Phase::of(device, Step::Send),
+        Some((device, JobStep::Clear | JobStep::Prepare | JobStep::Start)) => Phase::of(device, JobStep::Send),
         _ => phase,
     }
 }
@@ -809,7 +808,7 @@ pub(super) fn restart_of(phase: Phase) -> Phase {
 /// Returns the place from which a phase is taken up again after its machine was out of sight.
 fn out_of_sight(phase: Phase) -> Phase {
     match phase.moving() {
-        Some(device) => Phase::of(device, Step::Reconcile),
+        Some(device) => Phase::of(device, JobStep::Reconcile),
         None => restart_of(phase),
     }
 }
@@ -817,7 +816,7 @@ fn out_of_sight(phase: Phase) -> Phase {
 /// Returns the machine that is to be seen clear of the part.
 pub(super) fn awaits_clear(phase: Phase) -> Option<Device> {
     match phase.job() {
-        Some((device, Step::Clear)) => Some(device.other()),
+        Some((device, JobStep::Clear)) => Some(device.other()),
         None if phase == Transfer => Some(Device::Grinder),
         _ => None,
     }
@@ -825,17 +824,17 @@ pub(super) fn awaits_clear(phase: Phase) -> Option<Device> {
 
 /// Returns the machine whose result is being given back.
 pub(super) fn awaits_acknowledge(phase: Phase) -> Option<Device> {
-    phase.job().filter(|(_, step)| matches!(step, Step::Acknowledge | Step::Discard)).map(|(device, _)| device)
+    phase.job().filter(|(_, step)| matches!(step, JobStep::Acknowledge | JobStep::Discard)).map(|(device, _)| device)
 }
 
 /// Returns whether a phase waits for the answer to a question.
 pub(super) fn awaits(phase: Phase, device: Device, what: Asked) -> bool {
-    let steps: &[Step] = match what {
-        Asked::Load => &[Step::Send],
-        Asked::Prepare => &[Step::Prepare],
-        Asked::Start => &[Step::Start],
-        Asked::Collect => &[Step::Collect],
-        Asked::Acknowledge => &[Step::Acknowledge, Step::Discard],
+    let steps: &[JobStep] = match what {
+        Asked::Load => &[JobStep::Send],
+        Asked::Prepare => &[JobStep::Prepare],
+        Asked::Start => &[JobStep::Start],
+        Asked::Collect => &[JobStep::Collect],
+        Asked::Acknowledge => &[JobStep::Acknowledge, JobStep::Discard],
         Asked::Hold | Asked::Resume | Asked::Stop | Asked::Abort | Asked::Clear => &[],
     };
     phase.job().is_some_and(|(job, step)| job == device && steps.contains(&step))
@@ -850,7 +849,7 @@ pub(super) fn running(state: State) -> Option<Device> {
 pub(super) fn reconciling(state: State) -> Option<Device> {
     match state {
         Execute(phase) | Holding(phase) | Suspending(phase) | Unsuspending(phase) | Unholding(phase) => {
-            phase.job().filter(|(_, step)| *step == Step::Reconcile).map(|(device, _)| device)
+            phase.job().filter(|(_, step)| *step == JobStep::Reconcile).map(|(device, _)| device)
         }
         _ => None,
     }
@@ -863,13 +862,13 @@ pub(super) fn because(reason: &str) -> String {
 
 fn gate_alarm(why: &GateFailure) -> (AlarmId, String) {
     match why {
-        GateFailure::Coverage(words) => (AlarmId::Coverage, words.clone()),
+        GateFailure::Coverage(message) => (AlarmId::Coverage, message.clone()),
         GateFailure::NoPart => (AlarmId::NoPart, String::new()),
         GateFailure::Contacts => (AlarmId::Contacts, String::new()),
         GateFailure::Inches => (AlarmId::Inches, "the points of the CMM".to_owned()),
-        GateFailure::Foreign(words) => (AlarmId::ForeignResult, words.clone()),
-        GateFailure::Broken(words) => (AlarmId::BrokenResult, words.clone()),
-        GateFailure::Temperature(words) => (AlarmId::Temperature, words.clone()),
+        GateFailure::Foreign(message) => (AlarmId::ForeignResult, message.clone()),
+        GateFailure::Broken(message) => (AlarmId::BrokenResult, message.clone()),
+        GateFailure::Temperature(message) => (AlarmId::Temperature, message.clone()),
     }
 }
 

@@ -20,6 +20,7 @@ pub struct Alarm {
 /// Who may clear an alarm.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
+#[non_exhaustive]
 pub enum Role {
     /// It goes away by itself.
     Nobody,

@@ -140,6 +140,7 @@ pub struct Judgement {
 /// What follows from the figures of a cycle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
+#[non_exhaustive]
 pub enum Verdict {
     /// In tolerance: the part is done.
     Accept,
@@ -196,32 +197,32 @@ pub enum Ending {
 }
 
 impl Command {
-    /// Returns the name of the command, with the machine that it is for.
+    /// Returns the name of the command, as it is recorded, with the machine that it is for.
     pub fn name(&self) -> String {
         let (name, device) = match self {
-            Self::Connect { device } => ("Connect", Some(device)),
-            Self::AskToLoad => ("AskToLoad", None),
-            Self::LoadPass { .. } => ("LoadPass", None),
-            Self::LoadPlan { .. } => ("LoadPlan", None),
-            Self::VerifyClear { device } => ("VerifyClear", Some(device)),
-            Self::Prepare { device, .. } => ("Prepare", Some(device)),
-            Self::StartMachine { device, .. } => ("StartMachine", Some(device)),
-            Self::HoldMachine { device } => ("HoldMachine", Some(device)),
-            Self::ResumeMachine { device } => ("ResumeMachine", Some(device)),
-            Self::StopMachine { device } => ("StopMachine", Some(device)),
-            Self::AbortMachine { device } => ("AbortMachine", Some(device)),
-            Self::ClearMachine { device } => ("ClearMachine", Some(device)),
-            Self::Reconcile { device, .. } => ("Reconcile", Some(device)),
-            Self::Collect { .. } => ("Collect", None),
-            Self::Qualify { .. } => ("Qualify", None),
-            Self::Acknowledge { device } => ("Acknowledge", Some(device)),
-            Self::Register { .. } => ("Register", None),
-            Self::Compensate { .. } => ("Compensate", None),
-            Self::Announce(_) => ("Announce", None),
-            Self::Raise(_) => ("Raise", None),
-            Self::Withdraw { .. } => ("Withdraw", None),
-            Self::Refuse { .. } => ("Refuse", None),
-            Self::Finish(_) => ("Finish", None),
+            Self::Connect { device } => ("connect", Some(device)),
+            Self::AskToLoad => ("ask_to_load", None),
+            Self::LoadPass { .. } => ("load_pass", None),
+            Self::LoadPlan { .. } => ("load_plan", None),
+            Self::VerifyClear { device } => ("verify_clear", Some(device)),
+            Self::Prepare { device, .. } => ("prepare", Some(device)),
+            Self::StartMachine { device, .. } => ("start_machine", Some(device)),
+            Self::HoldMachine { device } => ("hold_machine", Some(device)),
+            Self::ResumeMachine { device } => ("resume_machine", Some(device)),
+            Self::StopMachine { device } => ("stop_machine", Some(device)),
+            Self::AbortMachine { device } => ("abort_machine", Some(device)),
+            Self::ClearMachine { device } => ("clear_machine", Some(device)),
+            Self::Reconcile { device, .. } => ("reconcile", Some(device)),
+            Self::Collect { .. } => ("collect", None),
+            Self::Qualify { .. } => ("qualify", None),
+            Self::Acknowledge { device } => ("acknowledge", Some(device)),
+            Self::Register { .. } => ("register", None),
+            Self::Compensate { .. } => ("compensate", None),
+            Self::Announce(_) => ("announce", None),
+            Self::Raise(_) => ("raise", None),
+            Self::Withdraw { .. } => ("withdraw", None),
+            Self::Refuse { .. } => ("refuse", None),
+            Self::Finish(_) => ("finish", None),
         };
         device.map_or(name.to_owned(), |device| format!("{name} {device}"))
     }

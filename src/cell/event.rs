@@ -86,7 +86,7 @@ pub enum Event {
         /// Whether it says that it is a simulation.
         simulated: bool,
         /// What it was found doing.
-        found: Found,
+        found: Occupation,
     },
     /// The machine cannot be used. Answers `Connect`.
     NotConnected {
@@ -114,7 +114,8 @@ pub enum Event {
         /// What.
         condition: Condition,
         /// In words, with the value and the limit.
-        words: String,
+        #[serde(rename = "words")]
+        message: String,
     },
     /// It is there again; hysteresis is the business of who reports.
     ConditionBack {
@@ -192,7 +193,8 @@ pub enum Event {
         /// The machine.
         device: Device,
         /// What was seen, in words.
-        words: String,
+        #[serde(rename = "words")]
+        message: String,
     },
     /// The machine was asked and said no.
     Refused {
@@ -210,7 +212,8 @@ pub enum Event {
         /// The number of the fault.
         code: u16,
         /// What it means.
-        words: String,
+        #[serde(rename = "words")]
+        message: String,
     },
     /// The machine has forgotten its result and is idle. Answers `Acknowledge`.
     Acknowledged {
@@ -292,7 +295,7 @@ pub enum Event {
 /// What a machine was found doing when it was connected.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Found {
+pub enum Occupation {
     /// Idle, as it should be.
     Idle,
     /// Aborted or faulted in an earlier run; it can be cleared.
@@ -464,6 +467,7 @@ pub struct Forecast {
 /// How the part answered to the last map.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
+#[non_exhaustive]
 pub enum Response {
     /// As it should.
     Expected,
@@ -532,6 +536,53 @@ impl fmt::Display for Actor {
     }
 }
 
+impl fmt::Display for Occupation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Idle => f.write_str("idle"),
+            Self::ToClear => f.write_str("it was aborted or is in fault"),
+            Self::Busy(message) => f.write_str(message),
+        }
+    }
+}
+
+impl fmt::Display for Condition {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Supplies => "supplies",
+            Self::Temperature => "temperature",
+        })
+    }
+}
+
+impl fmt::Display for Asked {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Load => "to take its payload",
+            Self::Prepare => "to prepare",
+            Self::Start => "to start",
+            Self::Hold => "to hold",
+            Self::Resume => "to resume",
+            Self::Stop => "to stop",
+            Self::Abort => "to abort",
+            Self::Clear => "to be cleared",
+            Self::Collect => "to give its result",
+            Self::Acknowledge => "to forget its result",
+        })
+    }
+}
+
+impl fmt::Display for JobResult {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Complete => "complete",
+            Self::Stopped => "stopped",
+            Self::Aborted => "aborted",
+            Self::Failed => "failed",
+        })
+    }
+}
+
 impl Event {
     /// Returns the cycle that the event belongs to, if it belongs to one.
     pub fn cycle(&self) -> Option<u32> {
@@ -584,6 +635,28 @@ impl Event {
         self.actor().is_some() && !matches!(self, Self::Restarted { .. })
     }
 
+    /// Returns who is behind it, as it is recorded: the person, the machine or the cell itself, and where.
+    pub fn origin(&self) -> (String, String) {
+        match (self.actor(), self.device()) {
+            (Some(Actor { name, station }), _) => (name.clone(), station.clone()),
+            (None, Some(device)) => (device.name().to_owned(), "wire".to_owned()),
+            (None, None) => ("cell".to_owned(), "regrind".to_owned()),
+        }
+    }
+
+    /// Says what it is to a person whom it did not fit.
+    pub(super) fn in_words(&self) -> String {
+        match self {
+            Self::LoadConfirmed { .. } => "the word that the part is loaded".to_owned(),
+            Self::DeclaredOver { device, .. } => format!("the word that the job of the {device} is over"),
+            event if event.is_order() => format!("the order to {}", event.name()),
+            event => match event.device() {
+                Some(device) => format!("what the {device} tells"),
+                None => "a result".to_owned(),
+            },
+        }
+    }
+
     /// Returns the person who gave the order.
     pub fn actor(&self) -> Option<&Actor> {
         match self {
@@ -599,47 +672,47 @@ impl Event {
         }
     }
 
-    /// Returns the name of the event.
+    /// Returns the name of the event, as it is recorded.
     pub fn name(&self) -> &'static str {
         match self {
-            Self::Start { .. } => "Start",
-            Self::LoadConfirmed { .. } => "LoadConfirmed",
-            Self::Hold { .. } => "Hold",
-            Self::Resume { .. } => "Resume",
-            Self::Stop { .. } => "Stop",
-            Self::Abort { .. } => "Abort",
-            Self::DeclaredOver { .. } => "DeclaredOver",
-            Self::Restarted { .. } => "Restarted",
-            Self::Connected { .. } => "Connected",
-            Self::NotConnected { .. } => "NotConnected",
-            Self::LinkLost { .. } => "LinkLost",
-            Self::LinkBack { .. } => "LinkBack",
-            Self::ConditionLost { .. } => "ConditionLost",
-            Self::ConditionBack { .. } => "ConditionBack",
-            Self::PassLoaded { .. } => "PassLoaded",
-            Self::PlanLoaded { .. } => "PlanLoaded",
-            Self::Prepared { .. } => "Prepared",
-            Self::Started { .. } => "Started",
-            Self::StartUnknown { .. } => "StartUnknown",
-            Self::Progressed { .. } => "Progressed",
-            Self::MachineHeld { .. } => "MachineHeld",
-            Self::MachineResumed { .. } => "MachineResumed",
-            Self::Ended { .. } => "Ended",
-            Self::Cleared { .. } => "Cleared",
-            Self::Obstructed { .. } => "Obstructed",
-            Self::Refused { .. } => "Refused",
-            Self::Fault { .. } => "Fault",
-            Self::Acknowledged { .. } => "Acknowledged",
-            Self::AbortConfirmed { .. } => "AbortConfirmed",
-            Self::Reconciled { .. } => "Reconciled",
-            Self::Collected { .. } => "Collected",
-            Self::Qualified { .. } => "Qualified",
-            Self::Registered { .. } => "Registered",
-            Self::RegistrationFailed { .. } => "RegistrationFailed",
-            Self::Compensated { .. } => "Compensated",
-            Self::CompensationRefused { .. } => "CompensationRefused",
-            Self::RecordFailed { .. } => "RecordFailed",
-            Self::Deadline => "Deadline",
+            Self::Start { .. } => "start",
+            Self::LoadConfirmed { .. } => "load_confirmed",
+            Self::Hold { .. } => "hold",
+            Self::Resume { .. } => "resume",
+            Self::Stop { .. } => "stop",
+            Self::Abort { .. } => "abort",
+            Self::DeclaredOver { .. } => "declared_over",
+            Self::Restarted { .. } => "restarted",
+            Self::Connected { .. } => "connected",
+            Self::NotConnected { .. } => "not_connected",
+            Self::LinkLost { .. } => "link_lost",
+            Self::LinkBack { .. } => "link_back",
+            Self::ConditionLost { .. } => "condition_lost",
+            Self::ConditionBack { .. } => "condition_back",
+            Self::PassLoaded { .. } => "pass_loaded",
+            Self::PlanLoaded { .. } => "plan_loaded",
+            Self::Prepared { .. } => "prepared",
+            Self::Started { .. } => "started",
+            Self::StartUnknown { .. } => "start_unknown",
+            Self::Progressed { .. } => "progressed",
+            Self::MachineHeld { .. } => "machine_held",
+            Self::MachineResumed { .. } => "machine_resumed",
+            Self::Ended { .. } => "ended",
+            Self::Cleared { .. } => "cleared",
+            Self::Obstructed { .. } => "obstructed",
+            Self::Refused { .. } => "refused",
+            Self::Fault { .. } => "fault",
+            Self::Acknowledged { .. } => "acknowledged",
+            Self::AbortConfirmed { .. } => "abort_confirmed",
+            Self::Reconciled { .. } => "reconciled",
+            Self::Collected { .. } => "collected",
+            Self::Qualified { .. } => "qualified",
+            Self::Registered { .. } => "registered",
+            Self::RegistrationFailed { .. } => "registration_failed",
+            Self::Compensated { .. } => "compensated",
+            Self::CompensationRefused { .. } => "compensation_refused",
+            Self::RecordFailed { .. } => "record_failed",
+            Self::Deadline => "deadline",
         }
     }
 }

@@ -72,14 +72,14 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
         );
     }
     if passes >= plan.max_cycles {
-        let response = now.response.and_then(wrong).map_or(String::new(), |words| format!("; {words}"));
+        let response = now.response.and_then(wrong).map_or(String::new(), |message| format!("; {message}"));
         return tell(
             Verdict::MaxCycles,
             format!("{passes} of {} passes are ground; {figures}{response}", plan.max_cycles),
         );
     }
-    if let Some(words) = now.response.and_then(wrong) {
-        return tell(Verdict::WrongResponse, format!("{words}; {figures}"));
+    if let Some(message) = now.response.and_then(wrong) {
+        return tell(Verdict::WrongResponse, format!("{message}; {figures}"));
     }
     if let Some(before) = before {
         let was = format!("before: PV {}, RMS {}", um(judged_pv(plan, before)), um(before.rms_mm));

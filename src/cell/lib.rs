@@ -22,6 +22,7 @@ mod command;
 mod event;
 mod judge;
 mod machine;
+mod memory;
 mod plan;
 mod state;
 mod table;
@@ -29,10 +30,10 @@ mod table;
 pub use alarm::{Alarm, AlarmId, Role};
 pub use command::{Command, Ending, Judgement, Verdict};
 pub use event::{
-    Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Forecast, Found, Gate,
-    GateFailure, JobResult, Mismatch, Reconciliation, RecordFailure, Response,
+    Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Forecast, Gate, GateFailure,
+    JobResult, Mismatch, Occupation, Reconciliation, RecordFailure, Response,
 };
-pub use machine::Cell;
+pub use memory::Cell;
 pub use plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, Tolerance};
-pub use state::{Device, Phase, State, Step};
+pub use state::{Device, JobStep, Phase, State, StateName};
 pub use table::{Answer, Row, samples, table};

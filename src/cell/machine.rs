@@ -1,14 +1,13 @@
-//! The table, and what the cell keeps between two events.
+//! The table: what follows from an event in a state.
 
-use std::collections::BTreeSet;
 use std::time::Duration;
 
 use super::act::{awaits, awaits_acknowledge, awaits_clear, because, reconciling, restart_of, running};
 use super::alarm::AlarmId;
 use super::command::Command;
-use super::event::{Asked, Condition, Event, Figures, JobResult};
-use super::plan::CellPlan;
-use super::state::{Device, Phase, State, Step};
+use super::event::{Asked, Event, JobResult};
+use super::memory::{Cause, Cell};
+use super::state::{Device, JobStep, Phase, State};
 
 use Phase::{Compensate, Grind, Load, Measure, Register, Transfer};
 use State::{
@@ -16,107 +15,7 @@ use State::{
     Unsuspending,
 };
 
-/// Why the cell is suspended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Cause {
-    Link(Device),
-    Condition(Condition),
-}
-
-/// What the cell knows of one machine.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct Known {
-    /// The boot id of the connection; none before the first and after a restart of this program.
-    pub(super) boot_id: Option<u32>,
-    /// Whether it was ever connected in this run, so that an abort must reach it.
-    pub(super) met: bool,
-    /// Whether it is connected and idle, or busy with this run's job.
-    pub(super) ready: bool,
-    /// Whether a fresh status has shown it clear of the part, and it has not been started since.
-    pub(super) clear: bool,
-    /// Whether it has ended its safe sequence.
-    pub(super) stands: bool,
-}
-
-/// A cell in the middle of a run.
-#[derive(Clone, Debug)]
-pub struct Cell {
-    pub(super) plan: CellPlan,
-    pub(super) state: State,
-    pub(super) cycle: u32,
-    /// Passes of the grinder begun.
-    pub(super) passes: u32,
-    pub(super) known: [Known; 2],
-    pub(super) causes: BTreeSet<Cause>,
-    pub(super) raised: BTreeSet<AlarmId>,
-    /// The figures of this cycle, and of the last one that was judged.
-    pub(super) figures: Option<Figures>,
-    pub(super) previous: Option<Figures>,
-    /// Cycles in a row that were worse than the one before.
-    pub(super) worse: u32,
-    /// How the run ends when the state that leads to the end is over.
-    pub(super) reason: String,
-    pub(super) judged_out: bool,
-    pub(super) repeated: bool,
-    /// The time of the event that is being handled, and when the next deadline is due.
-    pub(super) now: Duration,
-    pub(super) deadline: Option<Duration>,
-    pub(super) commands: Vec<Command>,
-}
-
 impl Cell {
-    /// Returns a cell that waits for `Event::Start`.
-    pub fn new(plan: CellPlan) -> Self {
-        Self {
-            plan,
-            state: Idle,
-            cycle: 0,
-            passes: 0,
-            known: [Known::default(); 2],
-            causes: BTreeSet::new(),
-            raised: BTreeSet::new(),
-            figures: None,
-            previous: None,
-            worse: 0,
-            reason: String::new(),
-            judged_out: false,
-            repeated: false,
-            now: Duration::ZERO,
-            deadline: None,
-            commands: Vec::new(),
-        }
-    }
-
-    /// Returns the state.
-    pub fn state(&self) -> State {
-        self.state
-    }
-
-    /// Returns the number of the cycle; 0 before the first.
-    pub fn cycle(&self) -> u32 {
-        self.cycle
-    }
-
-    /// Returns the plan.
-    pub fn plan(&self) -> &CellPlan {
-        &self.plan
-    }
-
-    /// Returns the figures of the last measurement that was registered.
-    pub fn figures(&self) -> Option<&Figures> {
-        self.figures.as_ref().or(self.previous.as_ref())
-    }
-
-    /// Returns the alarms that stand.
-    pub fn alarms(&self) -> impl Iterator<Item = AlarmId> + '_ {
-        self.raised.iter().copied()
-    }
-
-    /// Returns when `Event::Deadline` is due, as time since the run began.
-    pub fn next_deadline(&self) -> Option<Duration> {
-        self.deadline
-    }
-
     /// Takes an event in and returns what is to be done, in this order. After an end state that is nothing.
     ///
     /// An event that does not fit is answered by [`Command::Refuse`] and changes nothing.
@@ -151,15 +50,15 @@ impl Cell {
             // The safe sequence.
             (Aborting, Event::Abort { .. } | Event::Fault { .. }) => {}
             (_, Event::Abort { actor, reason }) => self.abort(&format!("{actor} ordered it{}", because(reason))),
-            (_, Event::Fault { device, code, words }) => {
-                let case = format!("{device}, fault {code}, {words}");
+            (_, Event::Fault { device, code, message }) => {
+                let case = format!("{device}, fault {code}, {message}");
                 self.raise(AlarmId::MachineFault, &case);
                 self.abort(&case);
             }
             (Aborting, Event::AbortConfirmed { device }) => self.stands(*device),
             (Aborting, Event::Cleared { device }) if self.knows(*device).stands => self.seen(*device, true, ""),
-            (Aborting, Event::Obstructed { device, words }) if self.knows(*device).stands => {
-                self.seen(*device, false, words);
+            (Aborting, Event::Obstructed { device, message }) if self.knows(*device).stands => {
+                self.seen(*device, false, message);
             }
             (Aborting, Event::LinkLost { device, .. } | Event::LinkBack { device, .. }) => {
                 let lost = matches!(event, Event::LinkLost { .. });
@@ -184,10 +83,10 @@ impl Cell {
             (Suspended(phase), Event::Hold { .. }) => self.go(Held(phase)),
             (Holding(_) | Held(_), Event::Hold { .. }) => {}
             (Held(phase), Event::Resume { .. }) => self.resume(phase)?,
-            (Held(Grind(Step::Reconcile)), Event::DeclaredOver { device: Device::Grinder, .. }) => {
+            (Held(Grind(JobStep::Reconcile)), Event::DeclaredOver { device: Device::Grinder, .. }) => {
                 self.go(Held(Transfer))
             }
-            (Held(Measure(Step::Reconcile)), Event::DeclaredOver { device: Device::Cmm, .. }) => self.measure_anew(),
+            (Held(Measure(JobStep::Reconcile)), Event::DeclaredOver { device: Device::Cmm, .. }) => self.measure_anew(),
             (Execute(Load), Event::LoadConfirmed { .. }) => self.first_cycle(),
             (Idle, Event::Restarted { .. }) => {}
             (Stopping, Event::Restarted { .. }) => {
@@ -212,13 +111,13 @@ impl Cell {
                 self.raise(AlarmId::LinkLost, &format!("{device}, {why}"));
             }
             (_, Event::LinkBack { device, boot_id }) => self.link_back(*device, *boot_id),
-            (Execute(phase), Event::ConditionLost { condition, words }) => {
-                self.condition_lost(*condition, words);
+            (Execute(phase), Event::ConditionLost { condition, message }) => {
+                self.condition_lost(*condition, message);
                 if phase.moving().is_some() {
                     self.suspend(phase);
                 }
             }
-            (_, Event::ConditionLost { condition, words }) => self.condition_lost(*condition, words),
+            (_, Event::ConditionLost { condition, message }) => self.condition_lost(*condition, message),
             (_, Event::ConditionBack { condition }) => {
                 self.cause_gone(Cause::Condition(*condition), AlarmId::ConditionLost)
             }
@@ -235,36 +134,40 @@ impl Cell {
             }
 
             // A job of a machine, in its steps. `advance` goes on, or stays at the border where the cell is being held.
-            (Execute(p) | Holding(p), Event::PassLoaded { .. }) if p == Grind(Step::Send) => {
-                self.advance(Grind(Step::Clear))
+            (Execute(p) | Holding(p), Event::PassLoaded { .. }) if p == Grind(JobStep::Send) => {
+                self.advance(Grind(JobStep::Clear))
             }
-            (Execute(p) | Holding(p), Event::PlanLoaded { .. }) if p == Measure(Step::Send) => {
-                self.advance(Measure(Step::Clear));
+            (Execute(p) | Holding(p), Event::PlanLoaded { .. }) if p == Measure(JobStep::Send) => {
+                self.advance(Measure(JobStep::Clear));
             }
             (Execute(p) | Holding(p), Event::Cleared { device }) if awaits_clear(p) == Some(*device) => {
                 self.know(*device).clear = true;
-                self.advance(p.job().map_or(Measure(Step::Send), |(job, _)| Phase::of(job, Step::Prepare)));
+                self.advance(p.job().map_or(Measure(JobStep::Send), |(job, _)| Phase::of(job, JobStep::Prepare)));
             }
-            (Execute(p) | Holding(p), Event::Obstructed { device, words }) if awaits_clear(p) == Some(*device) => {
-                self.raise(AlarmId::NotClear, &format!("{device}, {words}"));
+            (Execute(p) | Holding(p), Event::Obstructed { device, message }) if awaits_clear(p) == Some(*device) => {
+                self.raise(AlarmId::NotClear, &format!("{device}, {message}"));
                 self.go(Held(restart_of(p)));
             }
-            (Execute(p) | Holding(p), Event::Prepared { device, .. }) if p.job() == Some((*device, Step::Prepare)) => {
-                self.advance(Phase::of(*device, Step::Start));
+            (Execute(p) | Holding(p), Event::Prepared { device, .. })
+                if p.job() == Some((*device, JobStep::Prepare)) =>
+            {
+                self.advance(Phase::of(*device, JobStep::Start));
             }
-            (Execute(p), Event::Started { device, .. }) if p.job() == Some((*device, Step::Start)) => {
-                self.runs(Phase::of(*device, Step::Run));
+            (Execute(p), Event::Started { device, .. }) if p.job() == Some((*device, JobStep::Start)) => {
+                self.runs(Phase::of(*device, JobStep::Run));
             }
-            (Holding(p) | Suspending(p), Event::Started { device, .. }) if p.job() == Some((*device, Step::Start)) => {
-                self.go(self.same(Phase::of(*device, Step::Run)));
+            (Holding(p) | Suspending(p), Event::Started { device, .. })
+                if p.job() == Some((*device, JobStep::Start)) =>
+            {
+                self.go(self.same(Phase::of(*device, JobStep::Run)));
                 self.push(Command::HoldMachine { device: *device });
             }
             (Execute(p) | Holding(p) | Suspending(p), Event::StartUnknown { device, .. })
-                if p.job() == Some((*device, Step::Start)) =>
+                if p.job() == Some((*device, JobStep::Start)) =>
             {
                 self.reconcile(*device);
             }
-            (Execute(p), Event::Progressed { device, .. }) if p.job() == Some((*device, Step::Run)) => {
+            (Execute(p), Event::Progressed { device, .. }) if p.job() == Some((*device, JobStep::Run)) => {
                 self.go(self.state)
             }
             (
@@ -282,10 +185,12 @@ impl Cell {
             (state, Event::Reconciled { device, outcome, .. }) if reconciling(state) == Some(*device) => {
                 self.reconciled(*device, outcome);
             }
-            (Execute(p) | Holding(p), Event::Collected { targets, found, gate, .. }) if p == Measure(Step::Collect) => {
+            (Execute(p) | Holding(p), Event::Collected { targets, found, gate, .. })
+                if p == Measure(JobStep::Collect) =>
+            {
                 self.collected(*targets, *found, gate);
             }
-            (Execute(p) | Holding(p), Event::Qualified { radius_error_mm, .. }) if p == Measure(Step::Qualify) => {
+            (Execute(p) | Holding(p), Event::Qualified { radius_error_mm, .. }) if p == Measure(JobStep::Qualify) => {
                 self.qualified(*radius_error_mm);
             }
             (Execute(p) | Holding(p), Event::Acknowledged { device }) if awaits_acknowledge(p) == Some(*device) => {
@@ -310,12 +215,12 @@ impl Cell {
             (Stopping, Event::Refused { device, what: Asked::Stop | Asked::Acknowledge, why }) => {
                 self.abort(&format!("the {device} refused to stop: {why}"));
             }
-            (Execute(p), Event::Obstructed { device, words }) if p.moving() == Some(device.other()) => {
+            (Execute(p), Event::Obstructed { device, message }) if p.moving() == Some(device.other()) => {
                 self.know(*device).clear = false;
-                self.raise(AlarmId::NotClear, &format!("{device}, {words}, while the {} moves", device.other()));
+                self.raise(AlarmId::NotClear, &format!("{device}, {message}, while the {} moves", device.other()));
                 self.hold(p);
             }
-            (Completing, Event::Obstructed { device, words }) => self.seen(*device, false, words),
+            (Completing, Event::Obstructed { device, message }) => self.seen(*device, false, message),
             (_, Event::Obstructed { device, .. }) => self.know(*device).clear = false,
 
             // Computations.
@@ -325,14 +230,14 @@ impl Cell {
             }
             (Execute(Compensate) | Holding(Compensate), Event::Compensated { .. }) => {
                 self.cycle += 1;
-                self.advance(Grind(Step::Send));
+                self.advance(Grind(JobStep::Send));
             }
             (Execute(Compensate) | Holding(Compensate), Event::CompensationRefused { why, .. }) => self.no_map(why),
 
             // The end, and time.
             (Completing, Event::Cleared { device }) => self.seen(*device, true, ""),
             (_, Event::Deadline) => self.due(),
-            (state, event) => return Err(format!("{} does not fit the state {state}", event.name())),
+            (state, event) => return Err(format!("{} does not fit the state {state}", event.in_words())),
         }
         Ok(())
     }

@@ -18,6 +18,14 @@ impl Device {
     /// Both, in the order in which they are commanded.
     pub const BOTH: [Self; 2] = [Self::Cmm, Self::Grinder];
 
+    /// Returns the name of the machine, as it is recorded.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Cmm => "cmm",
+            Self::Grinder => "grinder",
+        }
+    }
+
     /// Returns the machine that must be clear of the part while this one moves.
     pub fn other(self) -> Self {
         match self {
@@ -39,7 +47,7 @@ impl fmt::Display for Device {
 /// A step of one job of one machine, named for what is waited for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Step {
+pub enum JobStep {
     /// The payload is being sent: the pass and its map to the grinder, the plan to the CMM.
     Send,
     /// A fresh status must show that the other machine is clear of the part.
@@ -69,11 +77,11 @@ pub enum Phase {
     /// A person, or the recipe, confirms that the right part is loaded.
     Load,
     /// A pass of the grinder.
-    Grind(Step),
+    Grind(JobStep),
     /// The grinder leaves the part to the CMM.
     Transfer,
     /// A measurement.
-    Measure(Step),
+    Measure(JobStep),
     /// The measurement is registered to the nominal surface.
     Register,
     /// The figures are judged; at once, unless the cell is held before it.
@@ -84,7 +92,7 @@ pub enum Phase {
 
 impl Phase {
     /// Returns the job of a machine at a step.
-    pub(super) fn of(device: Device, step: Step) -> Self {
+    pub(super) fn of(device: Device, step: JobStep) -> Self {
         match device {
             Device::Cmm => Self::Measure(step),
             Device::Grinder => Self::Grind(step),
@@ -92,7 +100,7 @@ impl Phase {
     }
 
     /// Returns the machine whose job this phase is, and the step of it.
-    pub fn job(self) -> Option<(Device, Step)> {
+    pub fn job(self) -> Option<(Device, JobStep)> {
         match self {
             Self::Grind(step) => Some((Device::Grinder, step)),
             Self::Measure(step) => Some((Device::Cmm, step)),
@@ -103,7 +111,7 @@ impl Phase {
     /// Returns the machine that may be moving in this phase.
     pub fn moving(self) -> Option<Device> {
         self.job()
-            .filter(|(_, step)| matches!(step, Step::Start | Step::Run | Step::Reconcile))
+            .filter(|(_, step)| matches!(step, JobStep::Start | JobStep::Run | JobStep::Reconcile))
             .map(|(device, _)| device)
     }
 
@@ -187,24 +195,52 @@ impl State {
     }
 
     /// Returns PackML's name.
-    pub fn name(self) -> &'static str {
+    pub fn name(self) -> StateName {
         match self {
-            Self::Idle => "Idle",
-            Self::Starting => "Starting",
-            Self::Execute(_) => "Execute",
-            Self::Holding(_) => "Holding",
-            Self::Held(_) => "Held",
-            Self::Unholding(_) => "Unholding",
-            Self::Suspending(_) => "Suspending",
-            Self::Suspended(_) => "Suspended",
-            Self::Unsuspending(_) => "Unsuspending",
-            Self::Stopping => "Stopping",
-            Self::Stopped => "Stopped",
-            Self::Aborting => "Aborting",
-            Self::Aborted => "Aborted",
-            Self::Completing => "Completing",
-            Self::Complete => "Complete",
+            Self::Idle => StateName::Idle,
+            Self::Starting => StateName::Starting,
+            Self::Execute(_) => StateName::Execute,
+            Self::Holding(_) => StateName::Holding,
+            Self::Held(_) => StateName::Held,
+            Self::Unholding(_) => StateName::Unholding,
+            Self::Suspending(_) => StateName::Suspending,
+            Self::Suspended(_) => StateName::Suspended,
+            Self::Unsuspending(_) => StateName::Unsuspending,
+            Self::Stopping => StateName::Stopping,
+            Self::Stopped => StateName::Stopped,
+            Self::Aborting => StateName::Aborting,
+            Self::Aborted => StateName::Aborted,
+            Self::Completing => StateName::Completing,
+            Self::Complete => StateName::Complete,
         }
+    }
+}
+
+/// The names of the states by PackML, without their phases.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[allow(missing_docs)]
+pub enum StateName {
+    #[default]
+    Idle,
+    Starting,
+    Execute,
+    Holding,
+    Held,
+    Unholding,
+    Suspending,
+    Suspended,
+    Unsuspending,
+    Stopping,
+    Stopped,
+    Aborting,
+    Aborted,
+    Completing,
+    Complete,
+}
+
+impl fmt::Display for StateName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Debug::fmt(self, f)
     }
 }
 
@@ -212,7 +248,7 @@ impl fmt::Display for State {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.phase() {
             Some(phase) => write!(f, "{} ({phase})", self.name()),
-            None => f.write_str(self.name()),
+            None => self.name().fmt(f),
         }
     }
 }

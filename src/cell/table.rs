@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use super::command::Command;
 use super::event::{
-    Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Found, Gate, GateFailure,
-    JobResult, Mismatch, Reconciliation, RecordFailure, Response,
+    Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Gate, GateFailure, JobResult,
+    Mismatch, Occupation, Reconciliation, RecordFailure, Response,
 };
-use super::machine::Cell;
+use super::memory::Cell;
 use super::plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, Tolerance};
 use super::state::{Device, State};
 
@@ -36,7 +36,7 @@ pub struct Answer {
 impl Answer {
     /// Returns whether the event did not fit.
     pub fn is_refusal(&self) -> bool {
-        self.commands.iter().any(|command| command == "Refuse")
+        self.commands.iter().any(|command| command == "refuse")
     }
 }
 
@@ -111,7 +111,7 @@ pub fn samples(cycle: u32) -> Vec<Event> {
     }
     events.extend(of_computations(cycle));
     for condition in [Condition::Supplies, Condition::Temperature] {
-        events.push(Event::ConditionLost { condition, words: String::new() });
+        events.push(Event::ConditionLost { condition, message: String::new() });
         events.push(Event::ConditionBack { condition });
     }
     events.push(Event::RecordFailed { why: RecordFailure::DiskFull(String::new()) });
@@ -137,28 +137,28 @@ fn orders() -> Vec<Event> {
 }
 
 fn of_machine(device: Device, cycle: u32) -> Vec<Event> {
-    let words = String::new;
+    let text = String::new;
     let mut events = vec![
-        Event::LinkLost { device, why: words() },
+        Event::LinkLost { device, why: text() },
         Event::LinkBack { device, boot_id: 1 },
         Event::LinkBack { device, boot_id: 2 },
         Event::Prepared { device, cycle },
         Event::Started { device, cycle },
-        Event::StartUnknown { device, cycle, why: words() },
+        Event::StartUnknown { device, cycle, why: text() },
         Event::Progressed { device, done: 1, total: 2 },
         Event::MachineHeld { device },
         Event::MachineResumed { device },
         Event::Cleared { device },
-        Event::Obstructed { device, words: words() },
-        Event::Fault { device, code: 5, words: words() },
+        Event::Obstructed { device, message: text() },
+        Event::Fault { device, code: 5, message: text() },
         Event::Acknowledged { device },
         Event::AbortConfirmed { device },
     ];
-    for found in [Found::Idle, Found::ToClear, Found::Busy(words())] {
+    for found in [Occupation::Idle, Occupation::ToClear, Occupation::Busy(text())] {
         events.push(Event::Connected { device, boot_id: 1, simulated: true, found });
     }
-    let unlike = [Mismatch::Unreachable(words()), Mismatch::WrongDevice(words()), Mismatch::WordOrder(words())];
-    for why in unlike.into_iter().chain([Mismatch::Inches, Mismatch::Owned(words())]) {
+    let unlike = [Mismatch::Unreachable(text()), Mismatch::WrongDevice(text()), Mismatch::WordOrder(text())];
+    for why in unlike.into_iter().chain([Mismatch::Inches, Mismatch::Owned(text())]) {
         events.push(Event::NotConnected { device, why });
     }
     for result in [JobResult::Complete, JobResult::Stopped, JobResult::Aborted, JobResult::Failed] {
@@ -166,20 +166,20 @@ fn of_machine(device: Device, cycle: u32) -> Vec<Event> {
         events.push(Event::Reconciled { device, cycle, outcome: Reconciliation::Ended(result) });
     }
     let outcomes = [Reconciliation::Running, Reconciliation::Held, Reconciliation::NotStarted];
-    for outcome in outcomes.into_iter().chain([Reconciliation::Unknown(words())]) {
+    for outcome in outcomes.into_iter().chain([Reconciliation::Unknown(text())]) {
         events.push(Event::Reconciled { device, cycle, outcome });
     }
     use Asked::{Abort, Acknowledge, Clear, Collect, Hold, Load, Prepare, Resume, Start, Stop};
     for what in [Load, Prepare, Start, Hold, Resume, Stop, Abort, Clear, Collect, Acknowledge] {
-        events.push(Event::Refused { device, what, why: words() });
+        events.push(Event::Refused { device, what, why: text() });
     }
     events
 }
 
 fn of_computations(cycle: u32) -> Vec<Event> {
-    let words = String::new;
-    let failures = [GateFailure::NoPart, GateFailure::Contacts, GateFailure::Inches, GateFailure::Coverage(words())];
-    let more = [GateFailure::Foreign(words()), GateFailure::Broken(words()), GateFailure::Temperature(words())];
+    let text = String::new;
+    let failures = [GateFailure::NoPart, GateFailure::Contacts, GateFailure::Inches, GateFailure::Coverage(text())];
+    let more = [GateFailure::Foreign(text()), GateFailure::Broken(text()), GateFailure::Temperature(text())];
     let gates = failures.into_iter().chain(more).map(Gate::Failed).chain([Gate::Passed]);
     let mut events: Vec<_> = gates.map(|gate| Event::Collected { cycle, targets: 100, found: 99, gate }).collect();
     events.push(Event::Collected { cycle, targets: 100, found: 10, gate: Gate::Passed });
@@ -189,12 +189,12 @@ fn of_computations(cycle: u32) -> Vec<Event> {
         events.push(Event::Qualified { cycle, radius_error_mm });
     }
     events.extend(sample_figures().into_iter().map(|figures| Event::Registered { cycle, figures }));
-    events.push(Event::RegistrationFailed { cycle, why: words() });
+    events.push(Event::RegistrationFailed { cycle, why: text() });
     let (largest_mm, depth_mm, predicted_pv_mm) = (0.02, 0.03, 0.005);
     let summary = CompensationSummary { largest_mm, depth_mm, predicted_pv_mm, ..CompensationSummary::default() };
     events.push(Event::Compensated { cycle, summary });
-    let refusals = [CompensationRefusal::BudgetSpent(words()), CompensationRefusal::WeakDirections(Vec::new())];
-    for why in refusals.into_iter().chain([CompensationRefusal::Failed(words())]) {
+    let refusals = [CompensationRefusal::BudgetSpent(text()), CompensationRefusal::WeakDirections(Vec::new())];
+    for why in refusals.into_iter().chain([CompensationRefusal::Failed(text())]) {
         events.push(Event::CompensationRefused { cycle, why });
     }
     events

@@ -9,7 +9,7 @@ use miette::{Diagnostic, GraphicalReportHandler, GraphicalTheme, LabeledSpan, Na
 use regrind::config::CellConfig;
 use regrind::document::{Problem, Problems};
 use regrind::recipe::{NominalSource, Pattern, Recipe};
-use regrind_sim::world::WorldSpec;
+use regrind_sim::spec::WorldSpec;
 use serde::Serialize;
 use thiserror::Error;
 

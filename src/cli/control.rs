@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use regrind::cell::Device;
-use regrind::drive::{Reply, Request, ask};
+use regrind::drive::{CycleRow, Reply, Request, Snapshot, ask};
 
 use super::Outcome;
 use super::failure::Failure;
@@ -131,7 +131,7 @@ fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<Outcome, Fa
     };
     let reply = ask(&folder, request).map_err(|source| Failure::NotRunning { path: folder.clone(), source })?;
     show(&reply, request, json)?;
-    if reply.accepted { Ok(Outcome::Accepted) } else { Err(Failure::OrderRefused { words: reply.words }) }
+    if reply.accepted { Ok(Outcome::Accepted) } else { Err(Failure::OrderRefused { message: reply.message }) }
 }
 
 fn show(reply: &Reply, request: &Request, json: bool) -> Result<(), Failure> {
@@ -139,17 +139,14 @@ fn show(reply: &Reply, request: &Request, json: bool) -> Result<(), Failure> {
         return super::print_json(reply);
     }
     if *request != Request::Status {
-        return if reply.accepted { super::print(&format!("{}\n", reply.words)) } else { Ok(()) };
+        return if reply.accepted { super::print(&format!("{}\n", reply.message)) } else { Ok(()) };
     }
-    let text = |key: &str| reply.status.get(key).map(|v| v.as_str().map_or(v.to_string(), str::to_owned));
-    let marked = if reply.status["simulation"] == true { "SIMULATION  " } else { "" };
-    let mut words =
-        format!("{marked}{}, cycle {}\n", text("words").unwrap_or_default(), text("cycle").unwrap_or_default());
-    for row in reply.status["cycles"].as_array().into_iter().flatten() {
-        let figure = |key: &str| row[key].as_f64().unwrap_or(f64::NAN);
-        words += &format!("cycle {}: PV {:.2} um, rms {:.3} um\n", row["cycle"], figure("pv_um"), figure("rms_um"));
+    let Snapshot { simulation, message, cycle, cycles, .. } = &reply.status;
+    let mut text = format!("{}{message}, cycle {cycle}\n", if *simulation { "SIMULATION  " } else { "" });
+    for CycleRow { cycle, pv_um, rms_um, .. } in cycles {
+        text += &format!("cycle {cycle}: PV {pv_um:.2} um, rms {rms_um:.3} um\n");
     }
-    super::print(&words)
+    super::print(&text)
 }
 
 /// Returns the run folder that was made last.

@@ -76,8 +76,8 @@ pub(super) enum Failure {
     NoRun { path: PathBuf },
     #[error("{path}: no cell runs there ({source}); `regrind audit show` tells how the run ended")]
     NotRunning { path: PathBuf, source: io::Error },
-    #[error("the cell did not take the order: {words}")]
-    OrderRefused { words: String },
+    #[error("the cell did not take the order: {message}")]
+    OrderRefused { message: String },
     #[error("`confirm over` needs --machine and --evidence: which machine was looked at, and what was seen")]
     Evidence,
     #[error(

@@ -89,8 +89,8 @@ impl Show {
                 three_digits(*ms_per_point)
             )),
             Notice::LoadPart => self.line("load the part, clamp it, then: regrind confirm loaded"),
-            Notice::Note { device, words } => {
-                words.iter().try_for_each(|words| self.line(&format!("{device}: {words}")))
+            Notice::Note { device, messages } => {
+                messages.iter().try_for_each(|message| self.line(&format!("{device}: {message}")))
             }
             Notice::Figures { cycle, figures } => self.figures(*cycle, figures),
             Notice::Judged(Judgement { cycle, reason, .. }) => self.line(&format!("cycle {cycle}: {reason}")),
@@ -109,7 +109,7 @@ impl Show {
             Notice::Alarm(alarm) => self.alarm(alarm),
             Notice::AlarmGone { .. } => Ok(()),
             Notice::Refused { why } => self.line(&format!("not done: {why}")),
-            Notice::RecordFailed { words } => self.line(&format!("RECORD: {words}")),
+            Notice::RecordFailed { message } => self.line(&format!("RECORD: {message}")),
             Notice::Finished { ending, cycles } => self.finished(ending, cycles),
         }
     }
@@ -133,9 +133,9 @@ impl Show {
         if self.job != job {
             self.first = Some((Instant::now(), done));
         }
-        let (what, unit) = match device {
-            Device::Cmm => ("measuring", " points"),
-            Device::Grinder => ("grinding", "/1000 of the path"),
+        let what = match device {
+            Device::Cmm => "measuring",
+            Device::Grinder => "grinding",
         };
         if let Some(bar) = &self.bar {
             if self.job != job {
@@ -146,7 +146,10 @@ impl Show {
             bar.set_message(format!("cycle {cycle}  {what}"));
         } else if self.job != job || self.said.is_none_or(|at| at.elapsed() >= QUIET) {
             self.said = Some(Instant::now());
-            let of = if device == Device::Cmm { format!("{done} of {total}{unit}") } else { format!("{done}{unit}") };
+            let of = match device {
+                Device::Cmm => format!("{done} of {total} points"),
+                Device::Grinder => format!("{:.1} % of the path", 100.0 * f64::from(done) / f64::from(total.max(1))),
+            };
             self.line(&format!("cycle {cycle}: {what}, {of}{}", self.left(done, total)))?;
         }
         self.job = job;

@@ -5,12 +5,14 @@ use std::path::{Path, PathBuf};
 use regrind::config::{CellConfig, Link, RegisterMap, Wire, WordOrder};
 use regrind::formats::{place_link, remove_link};
 use regrind::recipe::Recipe;
-use regrind_sim::registers::{Layout, Machine, MachineOptions};
+use regrind_sim::options::{Layout, MachineOptions};
+use regrind_sim::registers::Machine;
+use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::faults::Faults;
 use regrind_sim::wire::rtu::Line;
 use regrind_sim::wire::{Serving, SharedMachine};
 use regrind_sim::words;
-use regrind_sim::world::{World, WorldSpec};
+use regrind_sim::world::World;
 use serde::Deserialize;
 
 use super::failure::Failure;

@@ -48,7 +48,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let chosen: Vec<&Row> =
         rows.iter().filter(|row| row.state.to_string().to_lowercase().starts_with(&wanted)).collect();
     if chosen.is_empty() {
-        let mut known: Vec<&str> = rows.iter().map(|row| row.state.name()).collect();
+        let mut known: Vec<String> = rows.iter().map(|row| row.state.name().to_string()).collect();
         known.dedup();
         return Err(Failure::NoState { name: wanted, known: known.join(", ") });
     }

@@ -7,15 +7,15 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::{mpsc, oneshot, watch};
 
-use crate::cell::{Actor, Device};
+use super::notice::CycleRow;
+use crate::cell::{Actor, Device, Phase, StateName};
 
 /// The socket in a run folder.
-pub const SOCKET: &str = "control.sock";
+const SOCKET: &str = "control.sock";
 /// Longest line that is read.
 const LONGEST_LINE: u64 = 4096;
 /// A client that says nothing for so long is gone.
@@ -78,9 +78,31 @@ pub struct Reply {
     /// Whether the order was taken.
     pub accepted: bool,
     /// Why not, or what follows, for the person who asked.
-    pub words: String,
+    #[serde(rename = "words")]
+    pub message: String,
     /// How the cell is after it.
-    pub status: Value,
+    pub status: Snapshot,
+}
+
+/// How a running cell is.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Snapshot {
+    /// Whether any machine of it is simulated.
+    pub simulation: bool,
+    /// The state, by PackML's name.
+    pub state: StateName,
+    /// The phase in which it is or will go on, and the step of a machine's job in it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub phase: Option<Phase>,
+    /// State and phase, for people.
+    #[serde(rename = "words")]
+    pub message: String,
+    /// The number of the cycle; 0 before the first.
+    pub cycle: u32,
+    /// Time since the run began.
+    pub seconds: f64,
+    /// What is known of each cycle.
+    pub cycles: Vec<CycleRow>,
 }
 
 /// An order on its way to the loop.
@@ -105,7 +127,7 @@ impl Control {
     pub(super) fn listen(
         folder: &Path,
         orders: mpsc::Sender<Ordered>,
-        status: watch::Receiver<Value>,
+        status: watch::Receiver<Snapshot>,
     ) -> io::Result<Self> {
         let path = folder.join(SOCKET);
         // One that a killed process left behind; the lock of the journal says that nobody lives there.
@@ -132,24 +154,27 @@ impl Drop for Control {
     }
 }
 
-async fn answer(stream: UnixStream, orders: mpsc::Sender<Ordered>, status: watch::Receiver<Value>) -> io::Result<()> {
+async fn answer(
+    stream: UnixStream,
+    orders: mpsc::Sender<Ordered>,
+    status: watch::Receiver<Snapshot>,
+) -> io::Result<()> {
     let actor = actor_of(&stream)?;
     let (read, mut write) = stream.into_split();
     let mut line = String::new();
     BufReader::new(read).take(LONGEST_LINE).read_line(&mut line).await?;
+    let now = || status.borrow().clone();
     let reply = match serde_json::from_str(&line) {
-        Ok(Request::Status) => Reply { accepted: true, words: String::new(), status: status.borrow().clone() },
+        Ok(Request::Status) => Reply { accepted: true, message: String::new(), status: now() },
         Ok(request) => {
             let (answer, answered) = oneshot::channel();
-            let over = Reply { accepted: false, words: "the run is over".into(), status: status.borrow().clone() };
+            let over = Reply { accepted: false, message: "the run is over".into(), status: now() };
             match orders.send(Ordered { request, actor, answer: Some(answer) }).await {
                 Ok(()) => answered.await.unwrap_or(over),
                 Err(_) => over,
             }
         }
-        Err(error) => {
-            Reply { accepted: false, words: format!("not an order: {error}"), status: status.borrow().clone() }
-        }
+        Err(error) => Reply { accepted: false, message: format!("not an order: {error}"), status: now() },
     };
     let mut text = serde_json::to_vec(&reply)?;
     text.push(b'\n');

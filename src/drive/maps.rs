@@ -1,9 +1,8 @@
 //! What a cycle leaves behind of the part's error: figures, the map as text, X3P and picture, and the points in colours.
 
-use std::path::Path;
-
 use serde_json::json;
 
+use super::record::Files;
 use super::work::{Cycle, Task};
 use crate::compensation::{self, Contact, ErrorMap, ParameterOptions, Smoothing};
 use crate::form::{FormOptions, TakenOut, figures, slope};
@@ -20,7 +19,7 @@ const INTEGRATION: f64 = 0.5;
 /// Writes the figures of a cycle; where there are none the file says why.
 pub(super) fn save_figures(
     task: &Task,
-    folder: &Path,
+    files: &mut Files,
     map: Option<&ErrorMap>,
     found: &Registration,
 ) -> Result<(), FormatError> {
@@ -32,7 +31,7 @@ pub(super) fn save_figures(
     let cutoff_mm = task.map.cutoff_mm;
     let slopes = map.map(|map| slope(&map.grid, &map.values_mm, &map.valid, INTEGRATION * cutoff_mm));
     let slopes = slopes.as_ref().map(Result::as_ref);
-    write_figures(&folder.join("figures.json"), made.as_ref(), slopes, &taken_out(task), task.simulation)
+    write_figures(&files.place("figures.json"), made.as_ref(), slopes, &taken_out(task), task.simulation)
 }
 
 /// What registration and filter take out, in words.
@@ -54,7 +53,7 @@ fn taken_out(task: &Task) -> TakenOut {
 
 /// Says what of the deviations the machine's parameters explain: the wheel's radius and setting, its wear. What is offered is better
 /// corrected there than ground in with every map.
-pub(super) fn parameters(task: &Task, folder: &Path, found: &Registration) -> Result<Vec<String>, FormatError> {
+pub(super) fn parameters(task: &Task, files: &mut Files, found: &Registration) -> Result<Vec<String>, FormatError> {
     let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
     let contact =
         |d: &crate::registration::Deviation| Contact { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
@@ -63,25 +62,28 @@ pub(super) fn parameters(task: &Task, folder: &Path, found: &Registration) -> Re
         free_motions: task.registration.locked.map(|locked| !locked),
         ..ParameterOptions::new(task.pass.wheel_radius_mm)
     };
-    let document = match compensation::parameters(&contacts, None, &options) {
+    let path = files.place("parameters.json");
+    match compensation::parameters(&contacts, None, &options) {
         Ok(told) => {
             let um = |mm: f64| 1e3 * mm;
             let document = json!({
                 "simulation": task.simulation, "rms_um": um(told.rms_mm), "rest_rms_um": um(told.rest_rms_mm),
                 "parameters": told.found,
             });
-            write_json_atomic(folder.join("parameters.json"), &document)?;
-            return Ok(told.found.into_iter().filter(|p| p.offered).map(|p| p.message).collect());
+            write_json_atomic(path, &document)?;
+            Ok(told.found.into_iter().filter(|p| p.offered).map(|p| p.message).collect())
         }
-        Err(error) => json!({ "simulation": task.simulation, "why_not": error.to_string() }),
-    };
-    write_json_atomic(folder.join("parameters.json"), &document).map(|()| Vec::new())
+        Err(error) => {
+            let document = json!({ "simulation": task.simulation, "why_not": error.to_string() });
+            write_json_atomic(path, &document).map(|()| Vec::new())
+        }
+    }
 }
 
 /// Writes the map of a cycle's error and the points that it was made from.
 pub(super) fn save(
     task: &Task,
-    folder: &Path,
+    files: &mut Files,
     (number, cycle): (u32, &Cycle),
     map: &ErrorMap,
     found: &Registration,
@@ -89,13 +91,13 @@ pub(super) fn save(
     let ground_with = (!cycle.correction.is_none()).then(|| task.map_identity(&cycle.correction));
     let origin = ErrorMapOrigin { part: task.part_identity, cycle: number, ground_with };
     let date = jiff::Timestamp::now().strftime("%Y-%m-%dT%H:%M:%SZ").to_string();
-    write_error_map(&folder.join("error_map.csv"), map, &origin, task.simulation)
-        .and_then(|()| write_error_map_x3p(&folder.join("error_map.x3p"), map, &date, task.simulation))
+    write_error_map(&files.place("error_map.csv"), map, &origin, task.simulation)
+        .and_then(|()| write_error_map_x3p(&files.place("error_map.x3p"), map, &date, task.simulation))
         .map_err(|error| error.to_string())?;
-    save_pictures(task, folder, map).and_then(|()| save_points(task, folder, found)).map_err(|error| error.to_string())
+    save_pictures(task, files, map).and_then(|()| save_points(task, files, found)).map_err(|error| error.to_string())
 }
 
-fn save_pictures(task: &Task, folder: &Path, map: &ErrorMap) -> Result<(), ReportError> {
+fn save_pictures(task: &Task, files: &mut Files, map: &ErrorMap) -> Result<(), ReportError> {
     let title =
         if task.simulation { "Error of the part, filtered (SIMULATION)" } else { "Error of the part, filtered" };
     let mut picture = HeatMap::of_lengths(title, "deviation", &map.samples_mm())?;
@@ -105,13 +107,13 @@ fn save_pictures(task: &Task, folder: &Path, map: &ErrorMap) -> Result<(), Repor
     if let Some(tolerance_mm) = task.tolerance_mm {
         picture = picture.with_tolerance(tolerance_mm)?;
     }
-    picture.save_svg(&folder.join("error_map.svg"))?;
-    picture.save_png(&folder.join("error_map.png"))
+    picture.save_svg(&files.place("error_map.svg"))?;
+    picture.save_png(&files.place("error_map.png"))
 }
 
-fn save_points(task: &Task, folder: &Path, found: &Registration) -> Result<(), ReportError> {
+fn save_points(task: &Task, files: &mut Files, found: &Registration) -> Result<(), ReportError> {
     let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
     let rows: Vec<[f64; 4]> = used.map(|d| [d.point.x, d.point.y, d.point.z, d.deviation_mm]).collect();
     let remarks: &[&str] = if task.simulation { &["SIMULATION", "frame: model"] } else { &["frame: model"] };
-    save_coloured_ply(&folder.join("deviations.ply"), "Deviations", &rows, &[], task.tolerance_mm, remarks)
+    save_coloured_ply(&files.place("deviations.ply"), "Deviations", &rows, &[], task.tolerance_mm, remarks)
 }

@@ -25,24 +25,25 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use serde::Serialize;
 use serde_json::{Value, json};
 use tokio::sync::{mpsc, oneshot, watch};
+use tokio::task::JoinSet;
 use tokio::time::Instant;
 
-use crate::cell::{Actor, Cell, CellPlan, Command, Device, Ending, Event, GateFailure, Phase, RecordFailure, State};
-use crate::compensation::Correction;
+use crate::cell::{Actor, Cell, CellPlan, Command, Device, Ending, Event, Phase, RecordFailure, State, StateName};
 use crate::device::exchange::Step;
-use crate::device::{Armed, Cmm, Grinder, Identified, Interrupt};
-use crate::formats::{LEARNED, ResultFolder, write_json_atomic};
+use crate::device::{Armed, Cmm, Grinder, Identified, Interrupt, Measurement};
+use crate::formats::{LEARNED, write_json_atomic};
 use crate::journal::{Artefact, Entry, Journal, Kind};
 
 use control::{Control, Ordered};
-pub use control::{Reply, Request, SOCKET, ask};
+pub use control::{Reply, Request, Snapshot, ask};
 pub use notice::{CycleRow, Notice};
 pub use program::{ProgramError, Programs};
-use record::{Recorder, entry};
-use station::{Aborts, Ask, Bench, CmmBench, GrinderBench, Harvest, Intent, Load, Station, Told};
-use work::{Cycle, Points};
+use record::{Files, Recorder, entry};
+use station::{Aborts, Ask, CmmDriver, Fetched, GrinderDriver, Intent, Load, Station, StationDriver, StationReport};
+use work::{Cycle, Product};
 pub use work::{Probing, Sphere, Task};
 
 /// Everything a run needs besides its machines.
@@ -80,7 +81,7 @@ pub struct Interrupted {
 #[derive(Clone)]
 pub struct Orders {
     orders: mpsc::Sender<Ordered>,
-    status: watch::Receiver<Value>,
+    status: watch::Receiver<Snapshot>,
 }
 
 impl Orders {
@@ -92,7 +93,7 @@ impl Orders {
 
     /// Whether the cell goes about its work: neither held, nor on its way to a stand or from one.
     pub fn is_working(&self) -> bool {
-        self.status.borrow()["state"] == "Execute"
+        self.status.borrow().state == StateName::Execute
     }
 }
 
@@ -111,10 +112,10 @@ pub struct Drive {
     interrupts: [Interrupt; 2],
     /// Counts the aborts of each station, which so gives up what it is at.
     aborts: [watch::Sender<u64>; 2],
-    told: mpsc::Receiver<Told>,
-    computed: (mpsc::UnboundedSender<Computed>, mpsc::UnboundedReceiver<Computed>),
+    reports: mpsc::Receiver<StationReport>,
+    computations: JoinSet<Computed>,
     orders: mpsc::Receiver<Ordered>,
-    status: watch::Sender<Value>,
+    status: watch::Sender<Snapshot>,
     notices: mpsc::UnboundedSender<Notice>,
     cycles: BTreeMap<u32, Cycle>,
     armed: [Option<Value>; 2],
@@ -129,12 +130,12 @@ pub struct Drive {
 }
 
 /// What a computation brought.
-enum Computed {
-    Registered(u32, Event, Option<Box<work::Found>>),
-    Compensated(u32, Event, Option<work::Next>),
-    Gated(u32, Event, Option<Points>),
-    /// The files of one of these are on the disk and read.
-    Filed(u32, Event, Result<Vec<Artefact>, RecordFailure>),
+struct Computed {
+    cycle: u32,
+    event: Event,
+    product: Product,
+    /// The files that it made, on the disk and read.
+    files: Result<Vec<Artefact>, RecordFailure>,
 }
 
 fn index(device: Device) -> usize {
@@ -154,9 +155,9 @@ impl Drive {
         cmm: C,
         grinder: G,
     ) -> std::io::Result<(Self, Orders)> {
-        let (told, facts) = mpsc::channel(64);
+        let (reports, reported) = mpsc::channel(64);
         let (orders, ordered) = mpsc::channel(16);
-        let (status, seen) = watch::channel(Value::Null);
+        let (status, seen) = watch::channel(Snapshot::default());
         let recorder = Recorder::new(run.journal);
         let folder = recorder.folder().to_owned();
         let control = Control::listen(&folder, orders.clone(), seen.clone())?;
@@ -166,9 +167,9 @@ impl Drive {
         let armed = interrupted.intents.clone().map(|intent| intent.as_ref().and_then(restored));
         let [of_cmm, of_grinder] = armed;
         let [poll_cmm, poll_grinder] = run.poll;
-        let (cmm, cmm_task) = spawn(CmmBench(cmm), run.job, (&interrupts[0], &aborts[0]), &told, of_cmm, poll_cmm);
+        let (cmm, cmm_task) = spawn(CmmDriver(cmm), run.job, (&interrupts[0], &aborts[0]), &reports, of_cmm, poll_cmm);
         let (grinder, grinder_task) =
-            spawn(GrinderBench(grinder), run.job, (&interrupts[1], &aborts[1]), &told, of_grinder, poll_grinder);
+            spawn(GrinderDriver(grinder), run.job, (&interrupts[1], &aborts[1]), &reports, of_grinder, poll_grinder);
         let mut drive = Self {
             cell: Cell::new(run.plan),
             task: Arc::new(run.task),
@@ -181,8 +182,8 @@ impl Drive {
             asks: [cmm, grinder],
             interrupts,
             aborts,
-            told: facts,
-            computed: mpsc::unbounded_channel(),
+            reports: reported,
+            computations: JoinSet::new(),
             orders: ordered,
             status,
             notices: run.notices,
@@ -196,6 +197,7 @@ impl Drive {
             _control: control,
         };
         drive.replay(interrupted.events);
+        drive.status.send_replace(drive.snapshot());
         Ok((drive, Orders { orders, status: seen }))
     }
 
@@ -229,8 +231,11 @@ impl Drive {
             tokio::select! {
                 biased;
                 Some(ordered) = self.orders.recv() => self.order(ordered).await,
-                Some(computed) = self.computed.1.recv() => self.computed(computed).await,
-                Some(told) = self.told.recv() => self.told(told).await,
+                // One that panicked brings nothing, and the cell finds it late.
+                Some(computed) = self.computations.join_next() => if let Ok(computed) = computed {
+                    self.computed(computed).await;
+                },
+                Some(report) = self.reports.recv() => self.reported(report).await,
                 () = deadline => drop(self.take(Event::Deadline, None).await),
             }
             // What failed beside an event: a file that was to be adopted, a note.
@@ -244,18 +249,20 @@ impl Drive {
     /// Writes the end of the run and gives the machines back.
     async fn conclude(mut self) -> Ending {
         let ending = self.ending.take().expect("the loop ended with one");
+        self.orders.close();
+        // Whatever is still computed leaves files in the run folder, so it is waited for.
+        while let Some(computed) = self.computations.join_next().await {
+            if let Ok(Computed { cycle, files, .. }) = computed {
+                self.adopt(cycle, files).await;
+            }
+        }
         let rows: Vec<CycleRow> = self.rows();
         let result = json!({ "simulation": self.task.simulation, "ending": ending, "cycles": rows });
-        let path = self.folder.join("result.json");
         let now = self.now();
-        if let Err(error) = write_json_atomic(&path, &result) {
-            self.notify(Notice::RecordFailed { words: error.to_string() });
-        } else {
-            self.adopt(vec!["result.json".into()], self.cell.cycle()).await;
-        }
+        self.leave("result.json".into(), self.cell.cycle(), &result).await;
         self.keep_what_was_learned(&ending).await;
         if let Err(failure) = self.recorder.close(now, self.cell.cycle(), result).await {
-            self.notify(Notice::RecordFailed { words: record_words(&failure) });
+            self.notify(Notice::RecordFailed { message: message_of(&failure) });
         }
         self.notify(Notice::Finished { ending: ending.clone(), cycles: rows });
         // No more asks: each station gives its machine back and ends.
@@ -281,9 +288,9 @@ impl Drive {
         };
         let refusal = self.take(event, None).await;
         if let Some(answer) = answer {
-            let words = refusal.clone().unwrap_or_else(|| self.cell.state().to_string());
+            let message = refusal.clone().unwrap_or_else(|| self.cell.state().to_string());
             // Who asked may have gone.
-            let _ = answer.send(Reply { accepted: refusal.is_none(), words, status: self.snapshot() });
+            let _ = answer.send(Reply { accepted: refusal.is_none(), message, status: self.snapshot() });
         }
     }
 
@@ -306,14 +313,15 @@ impl Drive {
                 Ok(word)
             }
         };
-        let (status, words) = (self.snapshot(), self.cell.state().to_string());
+        let status = self.snapshot();
         // The station answers in its turn; the loop does not wait for it.
         tokio::spawn(async move {
             let told = match asked {
                 Ok(word) => word.await.unwrap_or_else(|_| Err("the run is over".into())),
                 Err(why) => Err(why),
             };
-            let reply = Reply { accepted: told.is_ok(), words: told.err().unwrap_or(words), status };
+            let message = told.as_ref().err().unwrap_or(&status.message).clone();
+            let reply = Reply { accepted: told.is_ok(), message, status };
             let _ = answer.map(|answer| answer.send(reply));
         });
     }
@@ -338,17 +346,17 @@ impl Drive {
         Ok(identity)
     }
 
-    async fn told(&mut self, Told { event, detail, harvest, notes }: Told) {
-        if let Some((device, words)) = notes {
-            let payload = json!({ "device": device, "notes": words });
+    async fn reported(&mut self, StationReport { event, detail, fetched, notes }: StationReport) {
+        if let Some((device, messages)) = notes {
+            let payload = json!({ "device": device, "notes": messages });
             self.note(Kind::Note, (device.to_string(), "wire".into()), payload).await;
-            self.notify(Notice::Note { device, words });
+            self.notify(Notice::Note { device, messages });
         }
-        if let Some(Harvest::Record(record)) = &harvest {
+        if let Some(Fetched::Record(record)) = &fetched {
             let payload = json!({ "pass_record": pass_record(record) });
             self.note(Kind::Note, ("grinder".into(), "wire".into()), payload).await;
         }
-        if let Some(Harvest::Points(measurement, taken)) = harvest {
+        if let Some(Fetched::Points(measurement, taken)) = fetched {
             self.transferred(&measurement, taken).await;
             return self.gate(measurement);
         }
@@ -361,7 +369,7 @@ impl Drive {
     }
 
     /// Records and shows how fast points came over the wire.
-    async fn transferred(&mut self, measurement: &crate::device::Measurement, taken: Duration) {
+    async fn transferred(&mut self, measurement: &Measurement, taken: Duration) {
         let (cycle, points, seconds) = (u32::from(measurement.cycle), measurement.points.len(), taken.as_secs_f64());
         let ms_per_point = 1e3 * seconds / points.max(1) as f64;
         let payload = json!({ "transfer": { "points": points, "seconds": seconds, "ms_per_point": ms_per_point } });
@@ -370,78 +378,24 @@ impl Drive {
     }
 
     async fn computed(&mut self, computed: Computed) {
-        let (number, event, files): (u32, Event, &[&str]) = match computed {
-            Computed::Gated(number, event, points) => {
-                let sphere = points.as_ref().is_some_and(|p| !p.sphere.is_empty());
-                let usable = points.is_some();
-                if let (Some(points), Some(cycle)) = (points, self.cycles.get_mut(&number)) {
-                    cycle.points = Some(Arc::new(points));
-                }
-                let files: &[&str] = match (usable, sphere) {
-                    (true, true) => &["reference_sphere.csv", "measured.csv"],
-                    (true, false) => &["measured.csv"],
-                    _ => &[],
-                };
-                (number, event, files)
-            }
-            Computed::Registered(number, event, found) => {
-                let any = found.is_some();
-                if let (Some(found), Some(cycle)) = (found, self.cycles.get_mut(&number)) {
-                    let work::Found { registration, error, known, figures } = *found;
-                    cycle.registration = Some(Arc::new(registration));
-                    cycle.error = error.map(Arc::new);
-                    cycle.known = known.map(Arc::new);
-                    cycle.figures = Some(figures);
-                }
-                let map = self.cycles.get(&number).is_some_and(|cycle| cycle.error.is_some());
-                let files: &[&str] = &[
-                    "deviations.csv",
-                    "deviation_uncertainty.csv",
-                    "registration.json",
-                    "figures.json",
-                    "parameters.json",
-                    "error_map.csv",
-                    "error_map.x3p",
-                    "error_map.svg",
-                    "error_map.png",
-                    "deviations.ply",
-                ];
-                let count = if any { if map { files.len() } else { 4 } } else { 0 };
-                (number, event, &files[..count])
-            }
-            Computed::Filed(number, event, files) => return self.filed(number, event, files).await,
-            Computed::Compensated(number, event, next) => {
-                let files = next.as_ref().map_or(&[][..], |next| next.files);
-                if let Some(next) = next {
-                    self.cycles.insert(number + 1, new_cycle(next.correction));
-                }
-                (number, event, files)
-            }
-        };
-        let names: Vec<String> = files.iter().map(|name| format!("cycle-{number}/{name}")).collect();
-        if names.is_empty() {
-            return self.filed(number, event, Ok(Vec::new())).await;
+        let Computed { cycle: number, event, product, files } = computed;
+        if let Product::Correction(next) = product {
+            self.cycles.insert(number + 1, Cycle::new(next));
+        } else if let Some(cycle) = self.cycles.get_mut(&number) {
+            cycle.take(product);
         }
-        // The files of a fine measurement are large: neither the loop nor the journal waits while they are read.
-        let (folder, done) = (self.folder.clone(), self.computed.0.clone());
-        tokio::task::spawn_blocking(move || {
-            let files = record::describe(&folder, &names);
-            // The run may be over meanwhile.
-            let _ = done.send(Computed::Filed(number, event, files));
-        });
+        self.adopt(number, files).await;
+        self.take(event, None).await;
     }
 
-    /// Takes an event in whose files are on the disk.
-    async fn filed(&mut self, number: u32, event: Event, files: Result<Vec<Artefact>, RecordFailure>) {
-        match files {
-            Ok(files) if files.is_empty() => {}
-            Ok(files) => {
-                let adopted = self.recorder.adopt(files, self.now(), number).await;
-                self.settle(adopted);
-            }
-            Err(failure) => self.settle(Err(failure)),
-        }
-        self.take(event, None).await;
+    /// Brings files on record.
+    async fn adopt(&mut self, cycle: u32, files: Result<Vec<Artefact>, RecordFailure>) {
+        let adopted = match files {
+            Ok(files) if files.is_empty() => return,
+            Ok(files) => self.recorder.adopt(files, self.now(), cycle).await,
+            Err(failure) => Err(failure),
+        };
+        self.settle(adopted);
     }
 
     /// Records an event, lets the cell handle it, and carries out what it decides. Returns why it was refused, if it was.
@@ -474,7 +428,7 @@ impl Drive {
         if let (Some(map), Some(detail)) = (payload.as_object_mut(), detail) {
             map.insert("detail".into(), detail);
         }
-        let written = self.recorder.append(entry(Kind::Event, now, self.cell.cycle(), actor_of(event), payload)).await;
+        let written = self.recorder.append(entry(Kind::Event, now, self.cell.cycle(), event.origin(), payload)).await;
         self.settle(written);
         self.close_answered(now, event).await;
     }
@@ -485,8 +439,8 @@ impl Drive {
             std::mem::take(&mut self.open).into_iter().partition(|(_, c)| outcome::answers(event, c));
         self.open = open;
         for (id, _) in answered as Vec<(u32, Command)> {
-            let payload = json!({ "event": event_name(event) });
-            let record = entry(Kind::Outcome, now, self.cell.cycle(), actor_of(event), payload);
+            let payload = json!({ "event": event.name() });
+            let record = entry(Kind::Outcome, now, self.cell.cycle(), event.origin(), payload);
             let written = self.recorder.append(Entry { command_id: Some(id), ..record }).await;
             self.settle(written);
         }
@@ -497,7 +451,7 @@ impl Drive {
         if let Err(failure) = written
             && !std::mem::replace(&mut self.record_failed, true)
         {
-            self.notify(Notice::RecordFailed { words: record_words(&failure) });
+            self.notify(Notice::RecordFailed { message: message_of(&failure) });
             self.untold = Some(failure);
         }
     }
@@ -507,16 +461,11 @@ impl Drive {
         self.settle(written);
     }
 
-    async fn adopt(&mut self, names: Vec<String>, cycle: u32) {
-        if !names.is_empty() {
-            // Small files of the loop's own.
-            match record::describe(&self.folder, &names) {
-                Ok(files) => {
-                    let adopted = self.recorder.adopt(files, self.now(), cycle).await;
-                    self.settle(adopted);
-                }
-                Err(failure) => self.settle(Err(failure)),
-            }
+    /// Writes a small document of the loop's own into the run folder and brings it on record.
+    async fn leave(&mut self, name: String, cycle: u32, document: &impl Serialize) {
+        match write_json_atomic(self.folder.join(&name), document) {
+            Ok(()) => self.adopt(cycle, record::describe(&self.folder, &[name])).await,
+            Err(error) => self.notify(Notice::RecordFailed { message: error.to_string() }),
         }
     }
 
@@ -577,7 +526,9 @@ impl Drive {
             Command::Announce(judgement) => self.announce(judgement).await,
             Command::Raise(alarm) => self.notify(Notice::Alarm(alarm)),
             Command::Withdraw { alarm } => self.notify(Notice::AlarmGone { alarm }),
-            Command::Refuse { why, .. } => self.notify(Notice::Refused { why }),
+            Command::Refuse { event, why, .. } if event.is_order() => self.notify(Notice::Refused { why }),
+            // What a machine tells too late is on record, and nothing for a person to act on.
+            Command::Refuse { .. } => {}
             Command::Finish(ending) => self.ending = Some(ending),
         }
     }
@@ -585,9 +536,8 @@ impl Drive {
     /// Shows how a cycle was judged and leaves it beside its measurement.
     async fn announce(&mut self, judgement: crate::cell::Judgement) {
         let number = judgement.cycle;
-        if let Some(cycle) = self.cycles.get_mut(&number) {
-            cycle.judged = true;
-        }
+        // A judgement that is amended stands in the journal; the file of the first one is on record and stays.
+        let amended = self.cycles.get_mut(&number).is_some_and(|cycle| std::mem::replace(&mut cycle.judged, true));
         let cycle = self.cycles.get(&number);
         let result = json!({
             "simulation": self.task.simulation,
@@ -597,9 +547,8 @@ impl Drive {
             "figures": cycle.and_then(|c| c.figures.as_ref()),
             "level_mm": cycle.map(|c| c.correction.level_mm),
         });
-        match write_json_atomic(self.cycle_folder(number).join("result.json"), &result) {
-            Ok(()) => self.adopt(vec![format!("cycle-{number}/result.json")], number).await,
-            Err(error) => self.notify(Notice::RecordFailed { words: error.to_string() }),
+        if !amended {
+            self.leave(format!("cycle-{number}/result.json"), number, &result).await;
         }
         self.notify(Notice::Judged(judgement));
     }
@@ -612,10 +561,7 @@ impl Drive {
         let run = self.folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         let last = self.cycles.values().rev().find(|cycle| cycle.judged && cycle.known.is_some()).cloned();
         let Some(learned) = last.and_then(|cycle| work::learned(&self.task, run, &cycle)) else { return };
-        match write_json_atomic(self.folder.join(LEARNED), &learned) {
-            Ok(()) => self.adopt(vec![LEARNED.into()], self.cell.cycle()).await,
-            Err(error) => self.notify(Notice::RecordFailed { words: error.to_string() }),
-        }
+        self.leave(LEARNED.into(), self.cell.cycle(), &learned).await;
     }
 
     async fn ask(&mut self, device: Device, ask: Ask) {
@@ -632,9 +578,7 @@ impl Drive {
         if self.loaded {
             let name = if self.task.simulation { "simulation" } else { "recipe" };
             let actor = Actor { name: name.into(), station: "regrind".into() };
-            let (_, event) = (0, Event::LoadConfirmed { actor });
-            // In its turn, like everything else that the cell hears.
-            let _ = self.computed.0.send(Computed::Gated(0, event, None));
+            self.answer(0, Event::LoadConfirmed { actor });
         } else {
             self.notify(Notice::LoadPart);
         }
@@ -642,7 +586,7 @@ impl Drive {
 
     async fn load_pass(&mut self, number: u32) {
         let task = Arc::clone(&self.task);
-        let cycle = self.cycles.entry(number).or_insert_with(|| new_cycle(task.first_correction()));
+        let cycle = self.cycles.entry(number).or_insert_with(|| Cycle::new(task.first_correction()));
         let correction = Arc::clone(&cycle.correction);
         let (map, pass) = task.payloads(&correction);
         let load = Load::Pass(Arc::new(map), Box::new(pass));
@@ -656,41 +600,23 @@ impl Drive {
         let found = self.cycles.values().rev().find_map(|c| c.registration.as_ref().map(|r| r.cmm_from_model));
         let pose = found.unwrap_or(self.task.fixture_cmm_from_model);
         let plan = Arc::new(self.task.plan(correction.level_mm, &pose));
-        let cycle = self.cycles.entry(number).or_insert_with(|| new_cycle((*correction).clone()));
+        let cycle = self.cycles.entry(number).or_insert_with(|| Cycle::new((*correction).clone()));
         cycle.plan = Some(Arc::clone(&plan));
         self.ask(Device::Cmm, Ask::Load { cycle: number, load: Load::Plan(plan) }).await;
     }
 
-    /// Looks through the points of a measurement and writes them, off the asynchronous threads.
-    fn gate(&mut self, measurement: Box<crate::device::Measurement>) {
+    /// Looks through the points of a measurement and writes them.
+    fn gate(&mut self, measurement: Box<Measurement>) {
         let number = u32::from(measurement.cycle);
-        let (task, folder) = (Arc::clone(&self.task), self.cycle_folder(number));
         let plan = self.cycles.get(&number).and_then(|cycle| cycle.plan.clone());
-        let done = self.computed.0.clone();
-        tokio::task::spawn_blocking(move || {
-            let empty = || {
-                Arc::new(crate::device::Plan { targets: Vec::new(), ..task.plan(0.0, &task.fixture_cmm_from_model) })
-            };
-            let (planned, found, points) = work::gate(&task, &plan.unwrap_or_else(empty), &measurement);
-            let saved = points.and_then(|points| {
-                let made = ResultFolder::prepare(&folder).map(ResultFolder::keep);
-                let saved = made.and_then(|()| work::save_points(&folder, &points, task.simulation));
-                saved.map(|()| points).map_err(|error| GateFailure::Broken(error.to_string()))
-            });
-            let (gate, points) = match saved {
-                Ok(points) => (Ok(()), Some(points)),
-                Err(failure) => (Err(failure), None),
-            };
-            let event = work::collected(number, planned, found, gate);
-            let _ = done.send(Computed::Gated(number, event, points));
-        });
+        self.compute(number, move |task, files| work::gate_cycle(task, files, number, plan.as_deref(), &measurement));
     }
 
     fn qualify(&mut self, number: u32) {
         let stated = self.task.probing.probe_radius_mm;
         let found = self.cycles.get(&number).and_then(|c| c.points.as_ref()?.radius_mm);
-        let event = Event::Qualified { cycle: number, radius_error_mm: found.map_or(0.0, |radius| radius - stated) };
-        let _ = self.computed.0.send(Computed::Gated(number, event, None));
+        let radius_error_mm = found.map_or(0.0, |radius| radius - stated);
+        self.answer(number, Event::Qualified { cycle: number, radius_error_mm });
     }
 
     fn register(&mut self, number: u32) {
@@ -699,24 +625,30 @@ impl Drive {
         let pass = cycle.correction.cycle;
         let earlier = |c: &&Cycle| c.judged && c.known.is_some() && c.correction.cycle < pass;
         let before = self.cycles.range(..number).rev().map(|(_, c)| c).find(earlier).cloned();
-        let (task, folder, done) = (Arc::clone(&self.task), self.cycle_folder(number), self.computed.0.clone());
-        tokio::task::spawn_blocking(move || {
-            let (event, found) = work::register_cycle(&task, &folder, number, &cycle, before.as_ref());
-            let _ = done.send(Computed::Registered(number, event, found.map(Box::new)));
-        });
+        self.compute(number, move |task, files| work::register_cycle(task, files, number, &cycle, before.as_ref()));
     }
 
     fn compensate(&mut self, number: u32) {
         let Some(cycle) = self.cycles.get(&number).cloned() else { return };
-        let (task, folder, done) = (Arc::clone(&self.task), self.cycle_folder(number), self.computed.0.clone());
-        tokio::task::spawn_blocking(move || {
-            let (event, correction) = work::compensate_cycle(&task, &folder, number, &cycle);
-            let _ = done.send(Computed::Compensated(number, event, correction));
+        self.compute(number, move |task, files| work::compensate_cycle(task, files, number, &cycle));
+    }
+
+    /// Computes off the asynchronous threads. The files are brought to the disk and read there too: those of a fine measurement are
+    /// large, and neither the loop nor the journal waits for them.
+    fn compute(&mut self, cycle: u32, work: impl FnOnce(&Task, &mut Files) -> (Event, Product) + Send + 'static) {
+        let (task, folder) = (Arc::clone(&self.task), self.folder.clone());
+        self.computations.spawn_blocking(move || {
+            let mut files = Files::new(folder.join(format!("cycle-{cycle}")));
+            let (event, product) = work(&task, &mut files);
+            let names: Vec<String> = files.made().iter().map(|name| format!("cycle-{cycle}/{name}")).collect();
+            Computed { cycle, event, product, files: record::describe(&folder, &names) }
         });
     }
 
-    fn cycle_folder(&self, number: u32) -> PathBuf {
-        self.folder.join(format!("cycle-{number}"))
+    /// Lets the cell hear of an event in its turn, like everything else that it hears.
+    fn answer(&mut self, cycle: u32, event: Event) {
+        let computed = Computed { cycle, event, product: Product::Nothing, files: Ok(Vec::new()) };
+        self.computations.spawn(std::future::ready(computed));
     }
 
     fn notify(&self, notice: Notice) {
@@ -734,7 +666,7 @@ impl Drive {
             event => Notice::State {
                 state: self.cell.state().to_string(),
                 cycle: self.cell.cycle(),
-                event: event_name(event),
+                event: event.name().to_owned(),
             },
         };
         self.notify(notice);
@@ -756,41 +688,30 @@ impl Drive {
     }
 
     /// How the cell is, as the control socket tells it.
-    fn snapshot(&self) -> Value {
-        json!({
-            "simulation": self.task.simulation,
-            "state": self.cell.state().name(),
-            "words": self.cell.state().to_string(),
-            "cycle": self.cell.cycle(),
-            "seconds": self.now().as_secs_f64(),
-            "cycles": self.rows(),
-        })
+    fn snapshot(&self) -> Snapshot {
+        let state = self.cell.state();
+        Snapshot {
+            simulation: self.task.simulation,
+            state: state.name(),
+            phase: state.phase(),
+            message: state.to_string(),
+            cycle: self.cell.cycle(),
+            seconds: self.now().as_secs_f64(),
+            cycles: self.rows(),
+        }
     }
 }
 
-fn new_cycle(correction: Correction) -> Cycle {
-    Cycle {
-        correction: Arc::new(correction),
-        plan: None,
-        points: None,
-        registration: None,
-        error: None,
-        known: None,
-        figures: None,
-        judged: false,
-    }
-}
-
-fn spawn<B: Bench>(
-    bench: B,
+fn spawn<D: StationDriver>(
+    driver: D,
     job: u32,
     (interrupt, aborts): (&Interrupt, &watch::Sender<u64>),
-    told: &mpsc::Sender<Told>,
+    reports: &mpsc::Sender<StationReport>,
     armed: Option<(u32, Armed)>,
     poll: Duration,
 ) -> (mpsc::Sender<Ask>, tokio::task::JoinHandle<()>) {
     let (asks, asked) = mpsc::channel(16);
-    let station = Station::new(bench, job, interrupt.clone(), told.clone()).with_intent(armed);
+    let station = Station::new(driver, job, interrupt.clone(), reports.clone()).with_intent(armed);
     (asks, tokio::spawn(station.attend(asked, poll, Aborts::new(aborts.subscribe()))))
 }
 
@@ -809,26 +730,10 @@ fn makes_safe(command: &Command) -> bool {
     matches!(command, Command::HoldMachine { .. } | Command::StopMachine { .. } | Command::AbortMachine { .. })
 }
 
-fn record_words(failure: &RecordFailure) -> String {
+fn message_of(failure: &RecordFailure) -> String {
     match failure {
-        RecordFailure::DiskFull(words) | RecordFailure::Unwritable(words) => words.clone(),
+        RecordFailure::DiskFull(message) | RecordFailure::Unwritable(message) => message.clone(),
     }
-}
-
-/// Who is behind an event.
-fn actor_of(event: &Event) -> (String, String) {
-    let cell = || ("cell".to_owned(), "regrind".to_owned());
-    let Ok(Value::Object(map)) = serde_json::to_value(event) else { return cell() };
-    let text = |value: Option<&Value>| value.and_then(Value::as_str).map(str::to_owned);
-    match map.get("actor") {
-        Some(actor) => (text(actor.get("name")).unwrap_or_default(), text(actor.get("station")).unwrap_or_default()),
-        None => text(map.get("device")).map_or_else(cell, |device| (device, "wire".into())),
-    }
-}
-
-fn event_name(event: &Event) -> String {
-    let value = serde_json::to_value(event).unwrap_or(Value::Null);
-    value.get("event").and_then(Value::as_str).unwrap_or_default().to_owned()
 }
 
 fn pass_record(record: &crate::device::PassRecord) -> Value {

@@ -1,6 +1,6 @@
 //! What is shown of a run while it runs.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::cell::{Alarm, AlarmId, CompensationSummary, Device, Ending, Figures, Judgement};
 
@@ -14,7 +14,11 @@ pub enum Notice {
     /// The right part is to be loaded, and that to be confirmed.
     LoadPart,
     /// What a person should know of a machine: what it waits for, which files were left alone and why.
-    Note { device: Device, words: Vec<String> },
+    Note {
+        device: Device,
+        #[serde(rename = "words")]
+        messages: Vec<String>,
+    },
     /// A job goes on.
     Progress { device: Device, cycle: u32, done: u32, total: u32 },
     /// The points of a measurement came over the wire, in this time.
@@ -32,13 +36,16 @@ pub enum Notice {
     /// An order or an event did not fit.
     Refused { why: String },
     /// The journal or a file could not be written.
-    RecordFailed { words: String },
+    RecordFailed {
+        #[serde(rename = "words")]
+        message: String,
+    },
     /// The run is over.
     Finished { ending: Ending, cycles: Vec<CycleRow> },
 }
 
 /// A cycle in the table at the end of a run.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[allow(missing_docs)]
 pub struct CycleRow {
     pub cycle: u32,

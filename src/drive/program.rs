@@ -12,8 +12,11 @@ use crate::formats::gcode::{GcodeError, PathMode, ProgramHeader, write_axis_tabl
 use crate::geometry::Aperture;
 use crate::surface::Nominal;
 
-/// What a pass leaves beside its correction.
-pub(super) const PROGRAM_FILES: [&str; 2] = ["toolpath.ngc", "toolpath_z.csv"];
+use super::record::Files;
+
+/// What a pass leaves beside its correction: the program, and the table for controllers that compensate by one.
+pub(super) const PROGRAM_FILE: &str = "toolpath.ngc";
+const TABLE_FILE: &str = "toolpath_z.csv";
 /// More points than that are not written beside every correction of a run.
 const MOST_POINTS: u64 = 3_000_000;
 
@@ -41,6 +44,7 @@ pub struct Programs {
 /// Why there is no program.
 #[derive(Debug, Error)]
 #[allow(missing_docs)]
+#[non_exhaustive]
 pub enum ProgramError {
     #[error(transparent)]
     Path(#[from] PathError),
@@ -86,23 +90,23 @@ impl Programs {
         Ok(summary)
     }
 
-    /// Writes `toolpath.ngc` and `toolpath_z.csv` of a pass into a folder; returns how many of the two, and why not both: a program that is
-    /// too long to be kept, a table that reaches where the wheel cannot.
+    /// Writes `toolpath.ngc` and `toolpath_z.csv` of a pass into a folder; returns why not both: a program that is too long to be kept,
+    /// a table that reaches where the wheel cannot.
     pub(super) fn keep(
         &self,
-        folder: &Path,
+        files: &mut Files,
         correction: &Correction,
         map_identity: [u8; 32],
-    ) -> Result<(usize, Option<String>), ProgramError> {
+    ) -> Result<Option<String>, ProgramError> {
         let (path, summary) = self.path(correction)?;
         if summary.points > MOST_POINTS {
             let error = ProgramError::TooLong { points: summary.points };
-            return Ok((0, Some(format!("there is no {}: {error}", PROGRAM_FILES[0]))));
+            return Ok(Some(format!("there is no {PROGRAM_FILE}: {error}")));
         }
-        self.write_path(&folder.join(PROGRAM_FILES[0]), correction, map_identity, &path, &summary)?;
-        match self.keep_table(&folder.join(PROGRAM_FILES[1]), correction, map_identity, &path) {
-            Ok(()) => Ok((2, None)),
-            Err(ProgramError::Path(error)) => Ok((1, Some(format!("there is no {}: {error}", PROGRAM_FILES[1])))),
+        self.write_path(&files.place(PROGRAM_FILE), correction, map_identity, &path, &summary)?;
+        match self.keep_table(&files.place(TABLE_FILE), correction, map_identity, &path) {
+            Ok(()) => Ok(None),
+            Err(ProgramError::Path(error)) => Ok(Some(format!("there is no {TABLE_FILE}: {error}"))),
             Err(error) => Err(error),
         }
     }

@@ -12,7 +12,9 @@ use serde::Serialize;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
-use crate::cell::{Asked, Condition, Device, Event, Found, Gate, GateFailure, JobResult, Mismatch, Reconciliation};
+use crate::cell::{
+    Asked, Condition, Device, Event, Gate, GateFailure, JobResult, Mismatch, Occupation, Reconciliation,
+};
 use crate::device::exchange::Step;
 use crate::device::{
     Armed, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, Measurement, Outcome,
@@ -45,7 +47,7 @@ pub(super) enum Load {
 }
 
 /// What a job left.
-pub(super) enum Harvest {
+pub(super) enum Fetched {
     /// With the time that their transfer took.
     Points(Box<Measurement>, Duration),
     Record(Box<PassRecord>),
@@ -53,32 +55,31 @@ pub(super) enum Harvest {
 
 /// A fact, with what the journal should keep beside it.
 #[derive(Default)]
-pub(super) struct Told {
-    /// `None` where the drive makes the event itself, from the harvest.
+pub(super) struct StationReport {
+    /// `None` where the drive makes the event itself, from what was fetched.
     pub(super) event: Option<Event>,
     pub(super) detail: Option<serde_json::Value>,
-    pub(super) harvest: Option<Harvest>,
+    pub(super) fetched: Option<Fetched>,
     /// What a person should know of a machine, where that is new.
     pub(super) notes: Option<(Device, Vec<String>)>,
 }
 
 /// The drivers of both kinds, seen alike.
-pub(super) trait Bench: Send + 'static {
+pub(super) trait StationDriver: Send + 'static {
     type Machine: Machine;
     const DEVICE: Device;
     fn machine(&mut self) -> &mut Self::Machine;
     /// Carries the payloads and returns the digest of their identities.
     fn load(&mut self, load: &Load, interrupt: &Interrupt) -> impl Future<Output = Result<u32, DeviceError>> + Send;
-    fn harvest(&mut self, job: Job, interrupt: &Interrupt)
-    -> impl Future<Output = Result<Harvest, DeviceError>> + Send;
+    fn fetch(&mut self, job: Job, interrupt: &Interrupt) -> impl Future<Output = Result<Fetched, DeviceError>> + Send;
     /// Takes a person's word for the job with this map.
     fn confirm(&mut self, step: Step, map_identity: [u8; 32]) -> impl Future<Output = Result<(), DeviceError>> + Send;
 }
 
-pub(super) struct CmmBench<C>(pub(super) C);
-pub(super) struct GrinderBench<G>(pub(super) G);
+pub(super) struct CmmDriver<C>(pub(super) C);
+pub(super) struct GrinderDriver<G>(pub(super) G);
 
-impl<C: Cmm + 'static> Bench for CmmBench<C> {
+impl<C: Cmm + 'static> StationDriver for CmmDriver<C> {
     type Machine = C;
     const DEVICE: Device = Device::Cmm;
 
@@ -92,10 +93,10 @@ impl<C: Cmm + 'static> Bench for CmmBench<C> {
         Ok(digest(&[plan.identity()]))
     }
 
-    async fn harvest(&mut self, job: Job, interrupt: &Interrupt) -> Result<Harvest, DeviceError> {
+    async fn fetch(&mut self, job: Job, interrupt: &Interrupt) -> Result<Fetched, DeviceError> {
         let began = Instant::now();
         let measurement = self.0.collect(job, interrupt).await?;
-        Ok(Harvest::Points(Box::new(measurement), began.elapsed()))
+        Ok(Fetched::Points(Box::new(measurement), began.elapsed()))
     }
 
     async fn confirm(&mut self, _: Step, _: [u8; 32]) -> Result<(), DeviceError> {
@@ -103,7 +104,7 @@ impl<C: Cmm + 'static> Bench for CmmBench<C> {
     }
 }
 
-impl<G: Grinder + 'static> Bench for GrinderBench<G> {
+impl<G: Grinder + 'static> StationDriver for GrinderDriver<G> {
     type Machine = G;
     const DEVICE: Device = Device::Grinder;
 
@@ -117,8 +118,8 @@ impl<G: Grinder + 'static> Bench for GrinderBench<G> {
         Ok(digest(&[map.identity(), pass.identity()]))
     }
 
-    async fn harvest(&mut self, job: Job, interrupt: &Interrupt) -> Result<Harvest, DeviceError> {
-        Ok(Harvest::Record(Box::new(self.0.collect(job, interrupt).await?)))
+    async fn fetch(&mut self, job: Job, interrupt: &Interrupt) -> Result<Fetched, DeviceError> {
+        Ok(Fetched::Record(Box::new(self.0.collect(job, interrupt).await?)))
     }
 
     async fn confirm(&mut self, step: Step, map_identity: [u8; 32]) -> Result<(), DeviceError> {
@@ -149,10 +150,10 @@ impl Aborts {
 
 /// A task that attends to one machine.
 pub(super) struct Station<B> {
-    bench: B,
+    driver: B,
     job: u32,
     interrupt: Interrupt,
-    told: mpsc::Sender<Told>,
+    reports: mpsc::Sender<StationReport>,
     /// Digest of the payloads that were loaded last.
     loaded: Option<u32>,
     armed: Option<Armed>,
@@ -190,13 +191,13 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(5);
 /// Progress is told at most this often, so that the journal stays readable.
 const PROGRESS_EVERY: Duration = Duration::from_millis(250);
 
-impl<B: Bench> Station<B> {
-    pub(super) fn new(bench: B, job: u32, interrupt: Interrupt, told: mpsc::Sender<Told>) -> Self {
+impl<B: StationDriver> Station<B> {
+    pub(super) fn new(driver: B, job: u32, interrupt: Interrupt, reports: mpsc::Sender<StationReport>) -> Self {
         Self {
-            bench,
+            driver,
             job,
             interrupt,
-            told,
+            reports,
             loaded: None,
             armed: None,
             cycle: 0,
@@ -241,7 +242,7 @@ impl<B: Bench> Station<B> {
         }
         if self.seen.connected && !self.seen.lost {
             // Nothing depends on it: a machine whose owner falls silent can be claimed by the next.
-            let _ = self.bench.machine().release().await;
+            let _ = self.driver.machine().release().await;
         }
     }
 
@@ -251,7 +252,7 @@ impl<B: Bench> Station<B> {
 
     async fn tell_with(&mut self, event: Event, detail: Option<serde_json::Value>) {
         // The drive hears until it drops the last ask; after that nobody needs to know.
-        let _ = self.told.send(Told { event: Some(event), detail, ..Told::default() }).await;
+        let _ = self.reports.send(StationReport { event: Some(event), detail, ..StationReport::default() }).await;
     }
 
     async fn act(&mut self, ask: Ask) {
@@ -274,7 +275,7 @@ impl<B: Bench> Station<B> {
             Ask::Collect { cycle } => self.collect(cycle).await,
             Ask::Acknowledge => self.acknowledge().await,
             Ask::Confirm { step, map_identity, answer } => {
-                let told = self.bench.confirm(step, map_identity).await;
+                let told = self.driver.confirm(step, map_identity).await;
                 // Who asked may have gone.
                 let _ = answer.send(told.map_err(|error| error.to_string()));
             }
@@ -287,8 +288,8 @@ impl<B: Bench> Station<B> {
 
     async fn connect(&mut self) {
         let connected = async {
-            let identity = self.bench.machine().connect().await?;
-            let status = self.bench.machine().claim().await?;
+            let identity = self.driver.machine().connect().await?;
+            let status = self.driver.machine().claim().await?;
             Ok::<_, DeviceError>((identity, status))
         };
         match connected.await {
@@ -297,7 +298,7 @@ impl<B: Bench> Station<B> {
                 self.seen.state = Some(status.state);
                 let found = self.found(&status).await;
                 let (device, boot_id, simulated) = (B::DEVICE, identity.boot_id, identity.simulation);
-                let detail = serde_json::json!({ "name": identity.name, "address": self.bench.machine().name() });
+                let detail = serde_json::json!({ "name": identity.name, "address": self.driver.machine().name() });
                 self.tell_with(Event::Connected { device, boot_id, simulated, found }, Some(detail)).await;
             }
             Err(error) => self.tell(Event::NotConnected { device: B::DEVICE, why: mismatch(&error) }).await,
@@ -305,15 +306,15 @@ impl<B: Bench> Station<B> {
     }
 
     /// Tells what a machine was found doing; a preparation of somebody who is gone is taken back.
-    async fn found(&mut self, status: &Status) -> Found {
+    async fn found(&mut self, status: &Status) -> Occupation {
         match status.state {
-            State::Idle => Found::Idle,
-            State::Aborted | State::Faulted => Found::ToClear,
-            State::Prepared => match self.bench.machine().stop().await {
-                Ok(_) => Found::Idle,
-                Err(error) => Found::Busy(error.to_string()),
+            State::Idle => Occupation::Idle,
+            State::Aborted | State::Faulted => Occupation::ToClear,
+            State::Prepared => match self.driver.machine().stop().await {
+                Ok(_) => Occupation::Idle,
+                Err(error) => Occupation::Busy(error.to_string()),
             },
-            state => Found::Busy(match status.job {
+            state => Occupation::Busy(match status.job {
                 Some(job) => format!("{state} with {job}"),
                 None => state.to_string(),
             }),
@@ -322,7 +323,7 @@ impl<B: Bench> Station<B> {
 
     async fn load(&mut self, cycle: u32, load: &Load) {
         self.loaded = None;
-        match self.bench.load(load, &self.interrupt).await {
+        match self.driver.load(load, &self.interrupt).await {
             Ok(digest) => {
                 self.loaded = Some(digest);
                 let event = match load {
@@ -337,14 +338,14 @@ impl<B: Bench> Station<B> {
     }
 
     async fn verify_clear(&mut self) {
-        match self.bench.machine().status().await {
+        match self.driver.machine().status().await {
             Ok(status) if status.interlocks.clear_of_part && !status.state.moves() => {
                 self.tell(Event::Cleared { device: B::DEVICE }).await;
             }
             Ok(status) => {
                 let clear = if status.interlocks.clear_of_part { "clear of the part" } else { "not clear of the part" };
-                let words = format!("{} is {} and {clear}", self.bench.machine().name(), status.state);
-                self.tell(Event::Obstructed { device: B::DEVICE, words }).await;
+                let message = format!("{} is {} and {clear}", self.driver.machine().name(), status.state);
+                self.tell(Event::Obstructed { device: B::DEVICE, message }).await;
             }
             Err(error) => self.lost(&error).await,
         }
@@ -358,11 +359,11 @@ impl<B: Bench> Station<B> {
         };
         let job = Job { job: self.job, cycle: cycle as u16, digest };
         if self.seen.state == Some(State::Prepared)
-            && let Err(error) = self.bench.machine().stop().await
+            && let Err(error) = self.driver.machine().stop().await
         {
             return self.failed(Asked::Prepare, error).await;
         }
-        match self.bench.machine().prepare(job).await {
+        match self.driver.machine().prepare(job).await {
             Ok(armed) => {
                 let detail = intent(&armed);
                 self.armed = Some(armed);
@@ -382,7 +383,7 @@ impl<B: Bench> Station<B> {
         };
         self.seen =
             Seen { connected: true, running: true, supplies_missing: self.seen.supplies_missing, ..Seen::default() };
-        match self.bench.machine().start(armed).await {
+        match self.driver.machine().start(armed).await {
             Ok(started) => {
                 self.seen.state = Some(State::Execute);
                 let detail = serde_json::json!({ "start_sequence": started.start_sequence });
@@ -400,11 +401,11 @@ impl<B: Bench> Station<B> {
     }
 
     async fn hold(&mut self) {
-        match self.bench.machine().hold().await {
+        match self.driver.machine().hold().await {
             Ok(status) => self.note(&status).await,
             Err(error) if error.is_link() => self.lost(&error).await,
             // Not in EXECUTE: the status tells whether it holds already, has ended, or never ran.
-            Err(error) => match self.bench.machine().status().await {
+            Err(error) => match self.driver.machine().status().await {
                 Ok(status) if status.state == State::Held => self.tell(Event::MachineHeld { device: B::DEVICE }).await,
                 Ok(status) if status.state == State::Complete => self.note(&status).await,
                 Ok(status) if !status.state.moves() => self.tell(Event::MachineHeld { device: B::DEVICE }).await,
@@ -415,7 +416,7 @@ impl<B: Bench> Station<B> {
     }
 
     async fn resume(&mut self) {
-        match self.bench.machine().resume().await {
+        match self.driver.machine().resume().await {
             Ok(status) => self.note(&status).await,
             Err(error) => self.failed(Asked::Resume, error).await,
         }
@@ -423,10 +424,10 @@ impl<B: Bench> Station<B> {
 
     async fn stop(&mut self) {
         self.seen.stopping = true;
-        match self.bench.machine().stop().await {
+        match self.driver.machine().stop().await {
             Ok(status) => self.note(&status).await,
             Err(error) if error.is_link() => self.lost(&error).await,
-            Err(error) => match self.bench.machine().status().await {
+            Err(error) => match self.driver.machine().status().await {
                 Ok(status) if !status.state.moves() => self.note(&status).await,
                 _ => self.failed(Asked::Stop, error).await,
             },
@@ -435,7 +436,7 @@ impl<B: Bench> Station<B> {
 
     async fn abort(&mut self) {
         self.seen.aborting = true;
-        match self.bench.machine().abort().await {
+        match self.driver.machine().abort().await {
             Ok(status) => self.note(&status).await,
             Err(error) => self.failed(Asked::Abort, error).await,
         }
@@ -443,7 +444,7 @@ impl<B: Bench> Station<B> {
 
     async fn clear(&mut self) {
         self.seen.clearing = true;
-        match self.bench.machine().clear().await {
+        match self.driver.machine().clear().await {
             Ok(status) => self.note(&status).await,
             Err(error) => self.failed(Asked::Clear, error).await,
         }
@@ -454,7 +455,7 @@ impl<B: Bench> Station<B> {
             let outcome = Reconciliation::NotStarted;
             return self.tell(Event::Reconciled { device: B::DEVICE, cycle, outcome }).await;
         };
-        let outcome = match self.bench.machine().reconcile(&armed).await {
+        let outcome = match self.driver.machine().reconcile(&armed).await {
             Ok(Reconciled::Running(status)) if status.state == State::Held => Reconciliation::Held,
             Ok(Reconciled::Running(_)) => Reconciliation::Running,
             Ok(Reconciled::Finished(status)) => {
@@ -482,9 +483,9 @@ impl<B: Bench> Station<B> {
             let why = "no job of this run is known to it".to_owned();
             return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Collect, why }).await;
         };
-        match self.bench.harvest(job, &self.interrupt).await {
+        match self.driver.fetch(job, &self.interrupt).await {
             // The drive gates the points and tells the cell; this only hands them over.
-            Ok(harvest) => self.hand_over(harvest).await,
+            Ok(fetched) => self.hand_over(fetched).await,
             Err(error) => match unusable(&error) {
                 Some(failure) => {
                     let (targets, found) = (0, 0);
@@ -495,16 +496,16 @@ impl<B: Bench> Station<B> {
         }
     }
 
-    async fn hand_over(&mut self, harvest: Harvest) {
+    async fn hand_over(&mut self, fetched: Fetched) {
         // The drive hears as long as anybody asks.
-        let _ = self.told.send(Told { harvest: Some(harvest), ..Told::default() }).await;
+        let _ = self.reports.send(StationReport { fetched: Some(fetched), ..StationReport::default() }).await;
     }
 
     async fn acknowledge(&mut self) {
         let acknowledged = async {
-            let status = self.bench.machine().status().await?;
+            let status = self.driver.machine().status().await?;
             match status.state {
-                State::Complete => self.bench.machine().acknowledge(status.done).await,
+                State::Complete => self.driver.machine().acknowledge(status.done).await,
                 _ => Ok(status),
             }
         };
@@ -525,8 +526,8 @@ impl<B: Bench> Station<B> {
         }
         match error {
             DeviceError::Faulted { fault, .. } if fault != Fault::None => {
-                let (device, words) = (B::DEVICE, fault_words(B::DEVICE, fault));
-                self.tell(Event::Fault { device, code: fault_code(fault), words }).await;
+                let (device, message) = (B::DEVICE, fault_words(B::DEVICE, fault));
+                self.tell(Event::Fault { device, code: fault_code(fault), message }).await;
             }
             _ => self.tell(Event::Refused { device: B::DEVICE, what, why: error.to_string() }).await,
         }
@@ -543,7 +544,7 @@ impl<B: Bench> Station<B> {
         if self.seen.lost {
             return self.reach().await;
         }
-        match self.bench.machine().status().await {
+        match self.driver.machine().status().await {
             Ok(status) => {
                 self.pass_on_notes().await;
                 if std::mem::replace(&mut self.seen.signal_out, false) {
@@ -553,8 +554,8 @@ impl<B: Bench> Station<B> {
             }
             Err(error @ DeviceError::OutOfRange { .. }) => {
                 if !std::mem::replace(&mut self.seen.signal_out, true) {
-                    let (condition, words) = (Condition::Temperature, error.to_string());
-                    self.tell(Event::ConditionLost { condition, words }).await;
+                    let (condition, message) = (Condition::Temperature, error.to_string());
+                    self.tell(Event::ConditionLost { condition, message }).await;
                 }
             }
             Err(error) => self.lost(&error).await,
@@ -563,11 +564,12 @@ impl<B: Bench> Station<B> {
 
     /// Tells what is new of what a person should know.
     async fn pass_on_notes(&mut self) {
-        let notes = self.bench.machine().notes();
-        let new: Vec<String> = notes.iter().filter(|words| !self.said.contains(words)).cloned().collect();
+        let notes = self.driver.machine().notes();
+        let new: Vec<String> = notes.iter().filter(|message| !self.said.contains(message)).cloned().collect();
         self.said = notes;
         if !new.is_empty() {
-            let _ = self.told.send(Told { notes: Some((B::DEVICE, new)), ..Told::default() }).await;
+            let _ =
+                self.reports.send(StationReport { notes: Some((B::DEVICE, new)), ..StationReport::default() }).await;
         }
     }
 
@@ -576,8 +578,8 @@ impl<B: Bench> Station<B> {
             return;
         }
         let reached = async {
-            let identity = self.bench.machine().connect().await?;
-            self.bench.machine().claim().await?;
+            let identity = self.driver.machine().connect().await?;
+            self.driver.machine().claim().await?;
             Ok::<_, DeviceError>(identity)
         };
         match reached.await {
@@ -616,13 +618,13 @@ impl<B: Bench> Station<B> {
             State::Idle if self.seen.clearing => {
                 self.seen.clearing = false;
                 let (device, boot_id) = (B::DEVICE, status.boot_id);
-                self.tell(Event::Connected { device, boot_id, simulated: false, found: Found::Idle }).await;
+                self.tell(Event::Connected { device, boot_id, simulated: false, found: Occupation::Idle }).await;
             }
             State::Aborted => self.note_abort(before).await,
             State::Faulted if before != Some(State::Faulted) => {
                 let (device, code) = (B::DEVICE, fault_code(status.fault));
-                let words = fault_words(device, status.fault);
-                self.tell(Event::Fault { device, code, words }).await;
+                let message = fault_words(device, status.fault);
+                self.tell(Event::Fault { device, code, message }).await;
             }
             _ => {}
         }
@@ -635,8 +637,8 @@ impl<B: Bench> Station<B> {
         }
         let condition = Condition::Supplies;
         let event = if missing {
-            let words = format!("{} says that air or coolant is missing", self.bench.machine().name());
-            Event::ConditionLost { condition, words }
+            let message = format!("{} says that air or coolant is missing", self.driver.machine().name());
+            Event::ConditionLost { condition, message }
         } else {
             Event::ConditionBack { condition }
         };
@@ -662,7 +664,7 @@ impl<B: Bench> Station<B> {
             return;
         }
         let record = match (B::DEVICE, self.armed.as_ref().map(|armed| armed.job)) {
-            (Device::Grinder, Some(job)) if !self.seen.ended => match self.bench.harvest(job, &self.interrupt).await {
+            (Device::Grinder, Some(job)) if !self.seen.ended => match self.driver.fetch(job, &self.interrupt).await {
                 Ok(record) => Some(record),
                 // The next look tries again; a link that is lost is told.
                 Err(error) if error.is_link() => return self.lost(&error).await,
@@ -675,7 +677,7 @@ impl<B: Bench> Station<B> {
         self.end(job_result(status.outcome), record).await;
     }
 
-    async fn end(&mut self, result: JobResult, record: Option<Harvest>) {
+    async fn end(&mut self, result: JobResult, record: Option<Fetched>) {
         self.seen.ended = true;
         if let Some(record) = record {
             self.hand_over(record).await;
@@ -745,13 +747,13 @@ fn unusable(error: &DeviceError) -> Option<GateFailure> {
 }
 
 fn mismatch(error: &DeviceError) -> Mismatch {
-    let words = error.to_string();
+    let message = error.to_string();
     match error {
-        DeviceError::WrongWordOrder { .. } => Mismatch::WordOrder(words),
+        DeviceError::WrongWordOrder { .. } => Mismatch::WordOrder(message),
         DeviceError::Inches { .. } => Mismatch::Inches,
-        DeviceError::Refused { answer: crate::device::Answer::NotOwner, .. } => Mismatch::Owned(words),
-        error if error.is_link() => Mismatch::Unreachable(words),
-        _ => Mismatch::WrongDevice(words),
+        DeviceError::Refused { answer: crate::device::Answer::NotOwner, .. } => Mismatch::Owned(message),
+        error if error.is_link() => Mismatch::Unreachable(message),
+        _ => Mismatch::WrongDevice(message),
     }
 }
 

@@ -3,6 +3,7 @@
 //! Everything here blocks and is called off the asynchronous threads; what it needs is shared, what it returns is the event that
 //! the cell gets and the files for the run folder.
 
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -27,7 +28,8 @@ use crate::registration::{
 use crate::surface::{Nominal, Side};
 
 use super::maps;
-use super::program::{PROGRAM_FILES, ProgramError, Programs};
+use super::program::{PROGRAM_FILE, ProgramError, Programs};
+use super::record::Files;
 
 /// Everything that does not change during a run.
 #[derive(Debug)]
@@ -115,8 +117,48 @@ pub(super) struct Cycle {
     pub(super) judged: bool,
 }
 
+impl Cycle {
+    /// A cycle of which nothing is known but how its pass is corrected.
+    pub(super) fn new(correction: Correction) -> Self {
+        Self {
+            correction: Arc::new(correction),
+            plan: None,
+            points: None,
+            registration: None,
+            error: None,
+            known: None,
+            figures: None,
+            judged: false,
+        }
+    }
+
+    /// Takes what a computation found.
+    pub(super) fn take(&mut self, product: Product) {
+        match product {
+            Product::Points(points) => self.points = Some(Arc::new(points)),
+            Product::Registered(found) => {
+                let Registered { registration, error, known, figures } = *found;
+                self.registration = Some(Arc::new(registration));
+                self.error = error.map(Arc::new);
+                self.known = known.map(Arc::new);
+                self.figures = Some(figures);
+            }
+            Product::Correction(_) | Product::Nothing => {}
+        }
+    }
+}
+
+/// What a computation leaves for those that follow, besides its event and its files.
+pub(super) enum Product {
+    Nothing,
+    Points(Points),
+    Registered(Box<Registered>),
+    /// The correction of the next cycle.
+    Correction(Correction),
+}
+
 /// What a registration gives besides its event.
-pub(super) struct Found {
+pub(super) struct Registered {
     pub(super) registration: Registration,
     pub(super) error: Option<ErrorMap>,
     pub(super) known: Option<LearningState>,
@@ -159,11 +201,13 @@ impl Task {
     ///
     /// # Errors
     /// Those of [`Task::first_path`], and files that cannot be written.
-    pub fn save_first(&self, folder: &Path) -> Result<&'static [&'static str], ProgramError> {
+    pub fn save_first(&self, folder: &Path) -> Result<Vec<&'static str>, ProgramError> {
         ResultFolder::prepare(folder).map_err(GcodeError::from)?.keep();
         let (first, none) = (self.first_correction(), self.uncorrected());
-        save_correction(self, folder, &first, &none).map_err(GcodeError::from)?;
-        Ok(save_program(self, folder, &first)?.files)
+        let mut files = Files::new(folder.to_owned());
+        save_correction(self, &mut files, &first, &none).map_err(GcodeError::from)?;
+        save_program(self, &mut files, &first)?;
+        Ok(files.made())
     }
 
     /// Returns the correction of the first pass: none, or what an earlier part left.
@@ -265,46 +309,69 @@ impl Task {
     }
 }
 
-/// Looks whether a measurement may be used, and takes its points apart.
-pub(super) fn gate(task: &Task, plan: &Plan, measurement: &Measurement) -> (u32, u32, Result<Points, GateFailure>) {
+/// Looks whether the measurement of a cycle may be used, and writes its points.
+pub(super) fn gate_cycle(
+    task: &Task,
+    files: &mut Files,
+    number: u32,
+    plan: Option<&Plan>,
+    measurement: &Measurement,
+) -> (Event, Product) {
+    let unplanned = || Plan { targets: Vec::new(), ..task.plan(0.0, &task.fixture_cmm_from_model) };
+    let plan = plan.map_or_else(|| Cow::Owned(unplanned()), Cow::Borrowed);
     let planned = plan.targets.iter().filter(|t| t.what == TargetKind::Part).count() as u32;
-    let touched = |kind: TargetKind| -> Vec<Point> {
-        let pairs = measurement.points.iter().zip(&plan.targets);
-        pairs
-            .filter(|(p, t)| p.status == PointStatus::Touched && t.what == kind)
-            .map(|(p, _)| Point::from(p.at_mm))
-            .collect()
-    };
-    if let Some(failure) = foreign(task, plan, measurement) {
-        return (planned, 0, Err(failure));
-    }
-    // A machine without a plan of ours gives what the operator took.
-    let part = if planned == 0 {
-        measurement.points.iter().filter(|p| p.status == PointStatus::Touched).map(|p| p.at_mm.into()).collect()
-    } else {
-        touched(TargetKind::Part)
-    };
-    let (sphere, found) = (touched(TargetKind::ReferenceSphere), part.len() as u32);
-    if found == 0 {
-        return (planned, 0, Err(GateFailure::NoPart));
-    }
-    let checked = match radius(task, &sphere) {
-        Ok(ball) => {
-            let (radius_mm, radius_sigma_mm) = (ball.map(|b| b[0]), ball.map_or(0.0, |b| b[1]));
-            let share = f64::from(found) / f64::from(planned.max(1));
-            if planned > 0 && share < task.least_found {
-                let limit = 100.0 * task.least_found;
-                Err(GateFailure::Coverage(format!(
-                    "{found} of {planned} points were found, {:.1} %, and the recipe asks for {limit:.1} % (minimum_coverage)",
-                    100.0 * share
-                )))
-            } else {
-                Ok(Points { part, sphere, radius_mm, radius_sigma_mm, coordinates: measurement.coordinates })
-            }
+    let (found, usable) = match foreign(task, &plan, measurement) {
+        Some(failure) => (0, Err(failure)),
+        None => {
+            let [part, sphere] = touched(&plan, planned, measurement);
+            (part.len() as u32, gate(task, planned, part, sphere, measurement.coordinates))
         }
-        Err(failure) => Err(failure),
     };
-    (planned, found, checked)
+    let saved = usable.and_then(|points| {
+        let made = ResultFolder::prepare(files.folder()).map(ResultFolder::keep);
+        let saved = made.and_then(|()| save_points(files, &points, task.simulation));
+        saved.map(|()| points).map_err(|error| GateFailure::Broken(error.to_string()))
+    });
+    let (gate, product) = match saved {
+        Ok(points) => (Gate::Passed, Product::Points(points)),
+        Err(failure) => (Gate::Failed(failure), Product::Nothing),
+    };
+    (Event::Collected { cycle: number, targets: planned.max(found), found, gate }, product)
+}
+
+/// Returns what was touched of the part and of the reference sphere. A machine without a plan of ours gives what the operator took.
+fn touched(plan: &Plan, planned: u32, measurement: &Measurement) -> [Vec<Point>; 2] {
+    let taken = measurement.points.iter().filter(|p| p.status == PointStatus::Touched).map(|p| p.at_mm.into());
+    let of = |kind: TargetKind| -> Vec<Point> {
+        let pairs = measurement.points.iter().zip(&plan.targets);
+        let touched = pairs.filter(|(p, t)| p.status == PointStatus::Touched && t.what == kind);
+        touched.map(|(p, _)| p.at_mm.into()).collect()
+    };
+    let part = if planned == 0 { taken.collect() } else { of(TargetKind::Part) };
+    [part, of(TargetKind::ReferenceSphere)]
+}
+
+fn gate(
+    task: &Task,
+    planned: u32,
+    part: Vec<Point>,
+    sphere: Vec<Point>,
+    coordinates: Coordinates,
+) -> Result<Points, GateFailure> {
+    if part.is_empty() {
+        return Err(GateFailure::NoPart);
+    }
+    let ball = radius(task, &sphere)?;
+    let (found, share) = (part.len(), part.len() as f64 / f64::from(planned.max(1)));
+    if planned > 0 && share < task.least_found {
+        let limit = 100.0 * task.least_found;
+        return Err(GateFailure::Coverage(format!(
+            "{found} of {planned} points were found, {:.1} %, and the recipe asks for {limit:.1} % (minimum_coverage)",
+            100.0 * share
+        )));
+    }
+    let (radius_mm, radius_sigma_mm) = (ball.map(|b| b[0]), ball.map_or(0.0, |b| b[1]));
+    Ok(Points { part, sphere, radius_mm, radius_sigma_mm, coordinates })
 }
 
 /// A result that belongs to another plan, or whose numbers cannot be.
@@ -352,44 +419,46 @@ fn radius(task: &Task, points: &[Point]) -> Result<Option<[f64; 2]>, GateFailure
 /// Registers the points of a cycle and writes what was found; `before` is the last measurement of an earlier pass that was judged.
 pub(super) fn register_cycle(
     task: &Task,
-    folder: &Path,
+    files: &mut Files,
     number: u32,
     cycle: &Cycle,
     before: Option<&Cycle>,
-) -> (Event, Option<Found>) {
-    let failed = |why: String| (Event::RegistrationFailed { cycle: number, why }, None);
-    let Some(points) = &cycle.points else { return failed("there are no points of this cycle".into()) };
+) -> (Event, Product) {
+    match registered(task, files, number, cycle, before) {
+        Ok(found) => {
+            let event = Event::Registered { cycle: number, figures: found.figures.clone() };
+            (event, Product::Registered(Box::new(found)))
+        }
+        Err(why) => (Event::RegistrationFailed { cycle: number, why }, Product::Nothing),
+    }
+}
+
+fn registered(
+    task: &Task,
+    files: &mut Files,
+    number: u32,
+    cycle: &Cycle,
+    before: Option<&Cycle>,
+) -> Result<Registered, String> {
+    let points = cycle.points.as_ref().ok_or("there are no points of this cycle")?;
     // The surface wanted by this pass stands above the nominal one by its level, and the ball rolls on that.
     let radius_mm = points.radius_mm.unwrap_or(task.probing.probe_radius_mm);
     let ball_mm = if points.coordinates == Coordinates::Contacts { 0.0 } else { radius_mm };
     let probe_radius_mm = (ball_mm + cycle.correction.level_mm).max(0.0);
-    let (mut found, options) = match task.register(&points.part, probe_radius_mm) {
-        Ok(found) => found,
-        Err(error) => return failed(error.to_string()),
-    };
+    let (mut found, options) = task.register(&points.part, probe_radius_mm).map_err(|error| error.to_string())?;
     found.allow_for_radius(points.radius_sigma_mm);
-    if let Err(error) = save(task, folder, &found, &options) {
-        return failed(error.to_string());
-    }
+    save(task, files, &found, &options).map_err(|error| error.to_string())?;
     let error = error_map(&readings(&found), &task.map).ok();
-    if let Err(error) = maps::save_figures(task, folder, error.as_ref(), &found) {
-        return failed(error.to_string());
-    }
-    let offered = match maps::parameters(task, folder, &found) {
-        Ok(offered) => offered,
-        Err(error) => return failed(error.to_string()),
-    };
+    maps::save_figures(task, files, error.as_ref(), &found).map_err(|error| error.to_string())?;
+    let offered = maps::parameters(task, files, &found).map_err(|error| error.to_string())?;
     // Every measurement leaves its map, whatever becomes of the correction.
-    if let Some(Err(why)) = error.as_ref().map(|map| maps::save(task, folder, (number, cycle), map, &found)) {
-        return failed(why);
-    }
+    error.as_ref().map_or(Ok(()), |map| maps::save(task, files, (number, cycle), map, &found))?;
     let answer = error.as_ref().and_then(|error| answer(before?, cycle, &found, error));
     let known = error.as_ref().map(|error| learned_from(task, cycle, before, error, answer));
     let forecast = known.as_ref().zip(error.as_ref()).map(|(known, error)| known.forecast(error));
     let mut figures = figures(task, cycle, &found, error.as_ref(), answer, forecast);
     figures.warnings.extend(error.iter().flat_map(|map| map.advice.iter().cloned()).chain(offered));
-    let event = Event::Registered { cycle: number, figures: figures.clone() };
-    (event, Some(Found { registration: found, error, known, figures }))
+    Ok(Registered { registration: found, error, known, figures })
 }
 
 /// Takes a measured pass into what is known of the grinder.
@@ -404,7 +473,7 @@ fn learned_from(
     earlier.after(&Seen { correction: &cycle.correction, error, answer })
 }
 
-fn save(task: &Task, folder: &Path, found: &Registration, options: &Options) -> Result<(), FormatError> {
+fn save(task: &Task, files: &mut Files, found: &Registration, options: &Options) -> Result<(), FormatError> {
     let nominal = NominalInput {
         file: &task.nominal_file,
         points: task.nominal.len(),
@@ -412,7 +481,10 @@ fn save(task: &Task, folder: &Path, found: &Registration, options: &Options) -> 
     };
     let mut document = RegistrationDocument::new(found, options, nominal, Path::new("measured.csv"));
     document.simulation = Some(task.simulation);
-    save_registration(folder, &document, &found.deviations)
+    for name in ["deviations.csv", "deviation_uncertainty.csv", "registration.json"] {
+        files.place(name);
+    }
+    save_registration(files.folder(), &document, &found.deviations)
 }
 
 fn readings(found: &Registration) -> Vec<Sample> {
@@ -484,42 +556,41 @@ fn in_words_of_the_cell(sense: Sense) -> Response {
 }
 
 /// Makes the correction of the next pass and writes it.
-pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &Cycle) -> (Event, Option<Next>) {
-    let refused = |why| (Event::CompensationRefused { cycle: number, why }, None);
-    let Some(found) = &cycle.registration else {
-        return refused(CompensationRefusal::Failed("the measurement of this cycle is not registered".into()));
-    };
+pub(super) fn compensate_cycle(task: &Task, files: &mut Files, number: u32, cycle: &Cycle) -> (Event, Product) {
+    match compensated(task, files, cycle) {
+        Ok((summary, next)) => (Event::Compensated { cycle: number, summary }, Product::Correction(next)),
+        Err(why) => (Event::CompensationRefused { cycle: number, why }, Product::Nothing),
+    }
+}
+
+fn compensated(
+    task: &Task,
+    files: &mut Files,
+    cycle: &Cycle,
+) -> Result<(CompensationSummary, Correction), CompensationRefusal> {
+    let failed = |why: &dyn std::fmt::Display| CompensationRefusal::Failed(why.to_string());
+    let found =
+        cycle.registration.as_ref().ok_or_else(|| failed(&"the measurement of this cycle is not registered"))?;
     // Where the part may slide in its own surface, nobody knows where on the part a map would be ground in.
     if let Some(why) = weak_for_compensation(found, &task.place) {
-        return refused(CompensationRefusal::WeakDirections(vec![why]));
+        return Err(CompensationRefusal::WeakDirections(vec![why]));
     }
     let map = match &cycle.error {
-        Some(map) => Ok(Arc::clone(map)),
-        None => error_map(&readings(found), &task.map).map(Arc::new),
-    };
-    let map = match map {
-        Ok(map) => map,
-        Err(error) => return refused(CompensationRefusal::Failed(error.to_string())),
+        Some(map) => Arc::clone(map),
+        None => Arc::new(error_map(&readings(found), &task.map).map_err(|error| failed(&error))?),
     };
     let known = match &cycle.known {
         Some(known) => Arc::clone(known),
         None => Arc::new(learned_from(task, cycle, None, &map, None)),
     };
-    let step = match cycle.correction.next(&map, &known, &task.limits) {
-        Ok(step) => step,
-        Err(error @ NextPassError::BudgetSpent { .. }) => {
-            return refused(CompensationRefusal::BudgetSpent(error.to_string()));
-        }
-        Err(error) => return refused(CompensationRefusal::Failed(error.to_string())),
-    };
+    let step = cycle.correction.next(&map, &known, &task.limits).map_err(|error| match error {
+        NextPassError::BudgetSpent { .. } => CompensationRefusal::BudgetSpent(error.to_string()),
+        error => failed(&error),
+    })?;
     // A pass that cannot be ground leaves no correction that somebody might take for one.
-    let Kept { files, warning } = match save_program(task, folder, &step.correction) {
-        Ok(kept) => kept,
-        Err(error) => return refused(CompensationRefusal::Failed(format!("the next pass cannot be ground: {error}"))),
-    };
-    if let Err(error) = save_correction(task, folder, &step.correction, &cycle.correction) {
-        return refused(CompensationRefusal::Failed(error.to_string()));
-    }
+    let warning = save_program(task, files, &step.correction)
+        .map_err(|error| failed(&format_args!("the next pass cannot be ground: {error}")))?;
+    save_correction(task, files, &step.correction, &cycle.correction).map_err(|error| failed(&error))?;
     let largest_mm = step.correction.values_mm.iter().fold(0.0f64, |most, v| most.max(v.abs()));
     let ratio = found.verdict.pv_mm / found.verdict.rms_mm.max(f64::MIN_POSITIVE);
     let forecast = known.forecast(&map);
@@ -533,41 +604,31 @@ pub(super) fn compensate_cycle(task: &Task, folder: &Path, number: u32, cycle: &
         response: known.response()[0],
         warnings: warning.into_iter().collect(),
     };
-    (Event::Compensated { cycle: number, summary }, Some(Next { correction: step.correction, files }))
+    Ok((summary, step.correction))
 }
 
-/// The correction of the next pass, and which files it left.
-pub(super) struct Next {
-    pub(super) correction: Correction,
-    pub(super) files: &'static [&'static str],
-}
-
-/// What a correction leaves in the folder of its cycle, the table for controllers last.
-const FILES: [&str; 3] = ["correction.csv", PROGRAM_FILES[0], PROGRAM_FILES[1]];
-
-/// What was written of a correction and its program, and why that is not all.
-struct Kept {
-    files: &'static [&'static str],
-    warning: Option<String>,
-}
-
-fn save_correction(task: &Task, folder: &Path, correction: &Correction, base: &Correction) -> Result<(), FormatError> {
-    let [identity, replaces] = [correction, base].map(|correction| task.payloads(correction).0.identity());
+fn save_correction(
+    task: &Task,
+    files: &mut Files,
+    correction: &Correction,
+    base: &Correction,
+) -> Result<(), FormatError> {
+    let [identity, replaces] = [correction, base].map(|correction| task.map_identity(correction));
     let identities = CorrectionIdentities { part: task.part_identity, map: identity, replaces };
-    write_correction(&folder.join("correction.csv"), correction, &identities, task.simulation)
+    write_correction(&files.place("correction.csv"), correction, &identities, task.simulation)
 }
 
-/// Writes the program of the next pass, if there is one: a pass without it can be ground all the same, as the grinder gets the map.
+/// Writes the program of the next pass, if there is one, and returns why not all of it is there: a pass without it can be ground all the
+/// same, as the grinder gets the map.
 ///
 /// # Errors
 /// A surface that the wheel cannot grind, limits of the grinder that the path goes beyond, files that cannot be written.
-fn save_program(task: &Task, folder: &Path, correction: &Correction) -> Result<Kept, ProgramError> {
-    let (programs, warning) = match &task.programs {
-        Ok(programs) => programs.keep(folder, correction, task.map_identity(correction))?,
-        Err(error) if error.is_ours() => (0, Some(format!("there is no {}: {error}", PROGRAM_FILES[0]))),
-        Err(error) => return Err(error.clone().into()),
-    };
-    Ok(Kept { files: &FILES[..1 + programs], warning })
+fn save_program(task: &Task, files: &mut Files, correction: &Correction) -> Result<Option<String>, ProgramError> {
+    match &task.programs {
+        Ok(programs) => programs.keep(files, correction, task.map_identity(correction)),
+        Err(error) if error.is_ours() => Ok(Some(format!("there is no {PROGRAM_FILE}: {error}"))),
+        Err(error) => Err(error.clone().into()),
+    }
 }
 
 /// What the next part of this kind can begin with; none where this run did not get so far.
@@ -583,16 +644,10 @@ pub(super) fn learned(task: &Task, run: String, cycle: &Cycle) -> Option<Learned
 }
 
 /// Writes the points of a measurement, in the CMM frame.
-pub(super) fn save_points(folder: &Path, points: &Points, simulation: bool) -> Result<(), FormatError> {
+fn save_points(files: &mut Files, points: &Points, simulation: bool) -> Result<(), FormatError> {
     let header = if simulation { "# SIMULATION\nx_mm,y_mm,z_mm" } else { "x_mm,y_mm,z_mm" };
     if !points.sphere.is_empty() {
-        write_points(folder.join("reference_sphere.csv"), header, &points.sphere)?;
+        write_points(files.place("reference_sphere.csv"), header, &points.sphere)?;
     }
-    write_points(folder.join("measured.csv"), header, &points.part)
-}
-
-/// Turns what the gates said into the event that the cell gets.
-pub(super) fn collected(cycle: u32, planned: u32, found: u32, gate: Result<(), GateFailure>) -> Event {
-    let gate = gate.map_or_else(Gate::Failed, |()| Gate::Passed);
-    Event::Collected { cycle, targets: planned.max(found), found, gate }
+    write_points(files.place("measured.csv"), header, &points.part)
 }

@@ -7,6 +7,7 @@ use thiserror::Error;
 
 /// Why a journal could not be opened, written or believed.
 #[derive(Debug, Error)]
+#[non_exhaustive]
 pub enum JournalError {
     /// The run folder is in use by an earlier run.
     #[error(

@@ -20,20 +20,20 @@ const CYCLE_TOP_PX: f64 = 850.0;
 const ORDER: &str = "#2166ac";
 const TROUBLE: &str = "#b2182b";
 
-const ORDERS: [&str; 6] = ["Start", "LoadConfirmed", "Hold", "Resume", "Stop", "Abort"];
+const ORDERS: [&str; 6] = ["start", "load_confirmed", "hold", "resume", "stop", "abort"];
 const TROUBLES: [&str; 12] = [
-    "CompensationRefused",
-    "ConditionLost",
-    "Deadline",
-    "Fault",
-    "LinkLost",
-    "NotConnected",
-    "Obstructed",
-    "RecordFailed",
-    "Refused",
-    "RegistrationFailed",
-    "Restarted",
-    "StartUnknown",
+    "compensation_refused",
+    "condition_lost",
+    "deadline",
+    "fault",
+    "link_lost",
+    "not_connected",
+    "obstructed",
+    "record_failed",
+    "refused",
+    "registration_failed",
+    "restarted",
+    "start_unknown",
 ];
 
 /// The states of PackML and the middles of their boxes.
@@ -159,7 +159,7 @@ pub fn state_picture(rows: &[Row]) -> String {
     let mut svg = Svg::new(WIDTH_PX, HEIGHT_PX);
     svg.text([20.0, 30.0], Anchor::Start, LARGE, "The cell: states");
     legend(&mut svg);
-    draw_states(&mut svg, &ways(rows, |state| Some(state.name().to_owned())));
+    draw_states(&mut svg, &ways(rows, |state| Some(state.name().to_string())));
     svg.text(
         [20.0, CYCLE_TOP_PX],
         Anchor::Start,

@@ -5,7 +5,7 @@ use std::fmt::Write;
 use serde_json::Value;
 
 use crate::cell::{
-    Command, CompensationRefusal, Condition, Device, Ending, Event, Figures, Found, Gate, GateFailure, Mismatch,
+    Command, CompensationRefusal, Device, Ending, Event, Figures, Gate, GateFailure, Mismatch, Occupation,
     Reconciliation, RecordFailure,
 };
 use crate::journal::{Kind, Record};
@@ -68,14 +68,14 @@ pub fn ending_words(ending: &Ending) -> String {
     }
 }
 
-/// `LoadConfirmed` becomes `load confirmed`.
+/// `load_confirmed` and `LoadConfirmed` become `load confirmed`.
 fn spaced(name: &str) -> String {
     let mut words = String::new();
     for c in name.chars() {
         if c.is_uppercase() && !words.is_empty() {
             words.push(' ');
         }
-        words.extend(c.to_lowercase());
+        words.extend(if c == '_' { ' ' } else { c }.to_lowercase());
     }
     words
 }
@@ -98,7 +98,7 @@ fn command_words(command: &Command) -> String {
             let name = command.name();
             let (name, device) =
                 name.split_once(' ').map_or((name.as_str(), None), |(name, device)| (name, Some(device)));
-            let words = spaced(name.strip_suffix("Machine").unwrap_or(name));
+            let words = spaced(name.strip_suffix("_machine").unwrap_or(name));
             device.map_or(words.clone(), |device| format!("{device}: {words}"))
         }
     }
@@ -117,13 +117,13 @@ fn event_words(event: &Event) -> String {
         Event::LinkLost { why, .. } | Event::StartUnknown { why, .. } | Event::RegistrationFailed { why, .. } => {
             why.clone()
         }
-        Event::ConditionLost { condition, words } => format!("{}: {words}", condition_words(*condition)),
-        Event::ConditionBack { condition } => condition_words(*condition).to_owned(),
+        Event::ConditionLost { condition, message } => format!("{condition}: {message}"),
+        Event::ConditionBack { condition } => condition.to_string(),
         Event::Progressed { done, total, .. } => format!("{done} of {total}"),
-        Event::Ended { result, .. } => spaced(&format!("{result:?}")),
-        Event::Obstructed { words, .. } => words.clone(),
+        Event::Ended { result, .. } => result.to_string(),
+        Event::Obstructed { message, .. } => message.clone(),
         Event::Refused { what, why, .. } => format!("{}: {why}", spaced(&format!("{what:?}"))),
-        Event::Fault { code, words, .. } => format!("{code}, {words}"),
+        Event::Fault { code, message, .. } => format!("{code}, {message}"),
         Event::Reconciled { outcome, .. } => reconciliation_words(outcome),
         Event::Collected { targets, found, gate, .. } => format!("{found} of {targets} points, {}", gate_words(gate)),
         Event::Qualified { radius_error_mm, .. } => {
@@ -148,12 +148,12 @@ fn event_words(event: &Event) -> String {
     if more.is_empty() { name } else { format!("{name}, {more}") }
 }
 
-fn found_words(simulated: bool, found: &Found) -> String {
+fn found_words(simulated: bool, found: &Occupation) -> String {
     let kind = if simulated { "a simulation" } else { "a real machine" };
     match found {
-        Found::Idle => format!("{kind}, idle"),
-        Found::ToClear => format!("{kind}, to be cleared"),
-        Found::Busy(words) => format!("{kind}, busy: {words}"),
+        Occupation::Idle => format!("{kind}, idle"),
+        Occupation::ToClear => format!("{kind}, to be cleared"),
+        Occupation::Busy(words) => format!("{kind}, busy: {words}"),
     }
 }
 
@@ -167,18 +167,11 @@ fn mismatch_words(why: &Mismatch) -> String {
     }
 }
 
-fn condition_words(condition: Condition) -> &'static str {
-    match condition {
-        Condition::Supplies => "supplies",
-        Condition::Temperature => "temperature",
-    }
-}
-
 fn reconciliation_words(outcome: &Reconciliation) -> String {
     match outcome {
         Reconciliation::Running => "it runs".to_owned(),
         Reconciliation::Held => "it is held".to_owned(),
-        Reconciliation::Ended(result) => format!("it is over, {}", spaced(&format!("{result:?}"))),
+        Reconciliation::Ended(result) => format!("it is over, {result}"),
         Reconciliation::NotStarted => "it was not started".to_owned(),
         Reconciliation::Unknown(words) => format!("nobody knows: {words}"),
     }

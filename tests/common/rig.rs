@@ -12,10 +12,12 @@ use regrind::drive::{Notice, Reply, Request, Run, ask};
 use regrind::journal::{Header, Journal};
 use regrind::recipe::Recipe;
 use regrind::setup;
-use regrind_sim::registers::{Machine, MachineOptions};
+use regrind_sim::options::MachineOptions;
+use regrind_sim::registers::Machine;
+use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::Serving;
 use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, When};
-use regrind_sim::world::{World, WorldSpec};
+use regrind_sim::world::World;
 use serde::Deserialize;
 use serde_json::json;
 use tempfile::TempDir;
@@ -193,7 +195,7 @@ pub async fn order(folder: &Path, request: Request) -> (Reply, Instant, Duration
 
 /// The state of a running cell, in words.
 pub async fn words(folder: &Path) -> String {
-    order(folder, Request::Status).await.0.status["words"].as_str().unwrap_or_default().to_owned()
+    order(folder, Request::Status).await.0.status.message
 }
 
 /// Asks until the cell is in a state that will do, and returns its words.

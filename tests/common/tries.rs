@@ -82,7 +82,7 @@ pub async fn attempt_with(
     assert!(reply.accepted, "{}: {reply:?}", moment.name);
     tried.abort_answered = took;
     if !hold {
-        tried.state = reply.words;
+        tried.state = reply.message;
     }
     let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
     assert!(matches!(ending, Ending::Aborted { confirmed: true, .. }), "{}: {ending:?}", moment.name);
@@ -107,7 +107,7 @@ async fn hold_and_resume(rig: &Rig, folder: &std::path::Path, tried: &mut Tried)
     let (reply, began_order, took) = order(folder, Request::Resume { reason: "a try".into() }).await;
     assert!(reply.accepted, "{reply:?}, {began:?}");
     tried.resume_answered = Some(took);
-    if reply.words.starts_with("Unholding") {
+    if reply.message.starts_with("Unholding") {
         until(folder, |words| !words.starts_with("Unholding")).await;
         tried.resume =
             [CMM, GRINDER].iter().find_map(|m| rig.command_at(*m, 5, began_order)).map(|at| at - began_order);

@@ -19,7 +19,8 @@ use regrind::formats::write_error_map_x3p;
 use regrind::geometry::Grid;
 use regrind::journal::verify;
 use regrind_sim::body::Kind;
-use regrind_sim::registers::{self, MachineOptions};
+use regrind_sim::options::MachineOptions;
+use regrind_sim::registers;
 use regrind_sim::wire::Serving;
 use serde_json::Value;
 

@@ -11,7 +11,7 @@ use regrind::geometry::{Grid, Vector};
 use regrind::recipe::Recipe;
 use regrind::setup;
 use regrind_sim::shape::Shape;
-use regrind_sim::world::WorldSpec;
+use regrind_sim::spec::WorldSpec;
 
 /// A part: how its programs are made, and what it truly should be.
 pub struct Part {

@@ -5,7 +5,7 @@
 
 use crate::worlds::{JOB, Ran, Setup, run};
 use regrind::cell::{AlarmId, Ending};
-use regrind_sim::world::{Faults, Mirrored};
+use regrind_sim::spec::{Faults, Mirrored};
 
 const RECIPE: &str = "freeform-mirror";
 

@@ -14,8 +14,10 @@ use regrind::registration::{PointStatus, Registration};
 use regrind::setup;
 use regrind_sim::body::{Body, Payload, Payloads};
 use regrind_sim::payload::{Feature, Map, Pass, Plan, Status, Target, decode_points};
-use regrind_sim::process::{Grinder, GrinderSpec};
-use regrind_sim::world::{World, WorldSpec};
+use regrind_sim::process::Grinder;
+use regrind_sim::spec::GrinderSpec;
+use regrind_sim::spec::WorldSpec;
+use regrind_sim::world::World;
 
 /// Every recipe that ships with a truth to simulate.
 pub const RECIPES: [&str; 4] = ["freeform-mirror", "off-axis-asphere", "biconic", "shallow-wave"];

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use regrind::cell::{Actor, Alarm, AlarmId, Ending, Role};
+use regrind::cell::{Actor, Alarm, AlarmId, Ending, Role, StateName};
 use regrind::config::{CellConfig, Wire};
 use regrind::device::{ModbusCmm, ModbusGrinder, ModbusSettings};
 use regrind::drive::{CycleRow, Drive, Notice, Request, Run, ask};
@@ -16,11 +16,13 @@ use regrind::recipe::Recipe;
 use regrind::setup;
 use regrind_sim::Vec3;
 use regrind_sim::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
+use regrind_sim::options::MachineOptions;
 use regrind_sim::probe::Placement;
-use regrind_sim::registers::{Machine, MachineOptions};
+use regrind_sim::registers::Machine;
+use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::Serving;
 use regrind_sim::words;
-use regrind_sim::world::{World, WorldSpec};
+use regrind_sim::world::World;
 use serde::Deserialize;
 use serde_json::json;
 use tokio::sync::mpsc;
@@ -284,7 +286,7 @@ async fn rests(folder: PathBuf) -> bool {
         let folder = folder.clone();
         let reply = tokio::task::spawn_blocking(move || ask(&folder, &Request::Status)).await.unwrap();
         match reply {
-            Ok(reply) if reply.status["state"] == "Held" => return true,
+            Ok(reply) if reply.status.state == StateName::Held => return true,
             Ok(_) => tokio::time::sleep(Duration::from_millis(5)).await,
             Err(_) => return false,
         }

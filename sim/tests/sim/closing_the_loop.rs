@@ -4,7 +4,8 @@ use crate::common::{best_fit, grind, map_of, net, pass, pv_rms_um};
 use rand_distr::{Distribution, StandardNormal};
 use regrind_sim::part::Aperture;
 use regrind_sim::payload::{Map, Pass};
-use regrind_sim::world::{World, WorldSpec};
+use regrind_sim::spec::WorldSpec;
+use regrind_sim::world::World;
 
 /// Gaussian low-pass of scattered values, normalised where the neighbours are missing; cut-off 8 mm (half amplitude).
 fn low_passed(places_mm: &[[f64; 2]], values_mm: &[f64], x: f64, y: f64) -> f64 {

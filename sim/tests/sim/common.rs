@@ -2,11 +2,13 @@
 #![allow(dead_code)]
 
 use regrind_sim::body::{Body, Outcome, Payload, Payloads};
-use regrind_sim::cmm::CmmSpec;
 use regrind_sim::part::{Aperture, PartSpec, ShapeSpec};
 use regrind_sim::payload::{Feature, Map, Pass, PassRecord, Plan, PointRecord, Target, decode_points};
-use regrind_sim::process::{Grinder, GrinderSpec};
-use regrind_sim::world::{World, WorldSpec};
+use regrind_sim::process::Grinder;
+use regrind_sim::spec::CmmSpec;
+use regrind_sim::spec::GrinderSpec;
+use regrind_sim::spec::WorldSpec;
+use regrind_sim::world::World;
 
 /// Identity of the part of these tests.
 pub const NOMINAL: [u8; 32] = [7; 32];

@@ -4,7 +4,7 @@
 use std::sync::{Arc, Mutex};
 
 use regrind_sim::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
-use regrind_sim::handshake::interlock;
+use regrind_sim::command::interlock;
 
 /// What the handshake asked of the physics, in order, but for the time that passed.
 pub type Asked = Arc<Mutex<Vec<String>>>;

@@ -1,13 +1,12 @@
 //! The grinder against what can be worked out by hand.
 
-use std::time::Instant;
-
 use crate::common::{NOMINAL, grind, grinder_payloads, map_of, pass, run, small_perfect, zero_map};
 use regrind_sim::body::Body;
 use regrind_sim::part::{PartSpec, ShapeSpec};
 use regrind_sim::payload::{Pass, PassRecord};
-use regrind_sim::process::GrinderSpec;
-use regrind_sim::world::{Faults, Mirrored, World, WorldSpec};
+use regrind_sim::spec::GrinderSpec;
+use regrind_sim::spec::{Faults, Mirrored, WorldSpec};
+use regrind_sim::world::World;
 
 const HALF_MM: [f64; 2] = [15.0, 10.0];
 
@@ -308,19 +307,4 @@ fn without_a_part_the_wheel_cuts_air() {
     let world = world(spec);
     let record = grind(&mut world.grinder(), 1, 0, &zero_map(HALF_MM), &deep(0.1));
     assert_eq!((record.air_share, record.volume_mm3), (1.0, 0.0));
-}
-
-#[test]
-fn a_pass_over_the_default_part_is_quick() {
-    let world = world(WorldSpec::default());
-    let half = [51.0, 31.0];
-    let mut grinder = world.grinder();
-    let (map, pass) = (map_of(half, 0.5, |x, y| 1e-6 * x * y), pass(half, 0.0));
-    let begun = Instant::now();
-    grinder.prepare(1, 0, &grinder_payloads(&map, &pass)).unwrap();
-    let prepared = begun.elapsed();
-    grinder.begin();
-    run(&mut grinder, 10.0);
-    grinder.outcome(1);
-    println!("prepared in {prepared:?}, ground in {:?}", begun.elapsed() - prepared);
 }

@@ -4,9 +4,10 @@ use std::time::Duration;
 
 use crate::common::{net, pass, plan, small_perfect, zero_map};
 use regrind_sim::body::Body;
-use regrind_sim::handshake::{Answer, Command, Frame, State};
+use regrind_sim::command::{Answer, Command, Frame, State};
+use regrind_sim::options::MachineOptions;
 use regrind_sim::payload::{PassRecord, decode_points};
-use regrind_sim::registers::{Machine, MachineOptions};
+use regrind_sim::registers::Machine;
 use regrind_sim::words::{WordOrder, bytes_of, registers_of, turn_payload};
 use regrind_sim::world::World;
 

@@ -4,8 +4,9 @@ use std::time::Duration;
 
 use crate::counter::{Counter, digest, payloads};
 use regrind_sim::body::Kind;
-use regrind_sim::handshake::{Answer, Command, Frame, Mode, State, interlock};
-use regrind_sim::registers::{Exception, Layout, Machine, MachineOptions};
+use regrind_sim::command::{Answer, Command, Frame, Mode, State, interlock};
+use regrind_sim::options::{Layout, MachineOptions};
+use regrind_sim::registers::{Exception, Machine};
 use regrind_sim::seen::What;
 use regrind_sim::words::{WordOrder, bytes_of, registers_of, turn_payload};
 

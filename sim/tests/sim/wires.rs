@@ -6,8 +6,9 @@ use std::time::{Duration, Instant};
 
 use crate::counter::{Counter, digest, payloads};
 use regrind_sim::body::Kind;
-use regrind_sim::handshake::{Command, Frame, State};
-use regrind_sim::registers::{Machine, MachineOptions};
+use regrind_sim::command::{Command, Frame, State};
+use regrind_sim::options::MachineOptions;
+use regrind_sim::registers::Machine;
 use regrind_sim::wire::Serving;
 use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, When};
 use regrind_sim::wire::pty::Pty;

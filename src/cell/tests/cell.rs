@@ -75,7 +75,7 @@ fn abort() -> Event {
 fn answer(command: &Command, figures: &mut dyn FnMut(u32) -> Figures) -> Option<Event> {
     Some(match command.clone() {
         Command::Connect { device } | Command::ClearMachine { device } => {
-            Event::Connected { device, boot_id: 7, simulated: true, found: Found::Idle }
+            Event::Connected { device, boot_id: 7, simulated: true, found: Occupation::Idle }
         }
         Command::AskToLoad => Event::LoadConfirmed { actor: actor() },
         Command::LoadPass { cycle } => Event::PassLoaded { cycle },
@@ -142,8 +142,8 @@ impl<'f> Run<'f> {
             }
         }
         let running = match self.cell.state() {
-            State::Execute(Phase::Grind(Step::Run)) => Some(Device::Grinder),
-            State::Execute(Phase::Measure(Step::Run)) => Some(Device::Cmm),
+            State::Execute(Phase::Grind(JobStep::Run)) => Some(Device::Grinder),
+            State::Execute(Phase::Measure(JobStep::Run)) => Some(Device::Cmm),
             _ => None,
         };
         let cycle = self.cell.cycle();
@@ -384,9 +384,9 @@ fn hold_and_resume_at_every_step_lead_to_the_same_end() {
 #[test]
 fn a_running_machine_is_told_to_hold_and_to_resume() {
     let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(Step::Run)));
+    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
     assert_eq!(run.send(hold()), [Command::HoldMachine { device: Device::Grinder }]);
-    run.until(State::Held(Phase::Grind(Step::Run)));
+    run.until(State::Held(Phase::Grind(JobStep::Run)));
     assert_eq!(run.send(resume()), [Command::ResumeMachine { device: Device::Grinder }]);
 }
 
@@ -406,7 +406,7 @@ fn stop_at_every_step_ends_in_order() {
 
 #[test]
 fn abort_and_fault_at_every_step_send_the_safe_sequence_only() {
-    let fault = Event::Fault { device: Device::Grinder, code: 5, words: "drive".into() };
+    let fault = Event::Fault { device: Device::Grinder, code: 5, message: "drive".into() };
     for state in way() {
         for event in [abort(), fault.clone()] {
             let mut run = Run::new(plan(), |cycle| if cycle == 1 { figures(27.0, 6.0) } else { figures(6.0, 0.9) });
@@ -431,7 +431,7 @@ fn abort_and_fault_at_every_step_send_the_safe_sequence_only() {
 #[test]
 fn an_abort_that_nobody_confirms_names_the_emergency_circuit_and_ends() {
     let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(Step::Run))).send(abort());
+    run.start().until(State::Execute(Phase::Grind(JobStep::Run))).send(abort());
     for _ in 0..2 {
         let due = run.cell.next_deadline().unwrap();
         assert!(due <= run.now + 2 * S);
@@ -447,18 +447,18 @@ fn an_abort_that_nobody_confirms_names_the_emergency_circuit_and_ends() {
 #[test]
 fn a_lost_link_suspends_and_the_machine_is_asked_what_became_of_its_job() {
     let cases = [
-        (Reconciliation::Running, State::Execute(Phase::Grind(Step::Run))),
-        (Reconciliation::Held, State::Unsuspending(Phase::Grind(Step::Run))),
-        (Reconciliation::Ended(JobResult::Complete), State::Execute(Phase::Grind(Step::Acknowledge))),
-        (Reconciliation::NotStarted, State::Execute(Phase::Grind(Step::Send))),
-        (Reconciliation::Unknown("no memory".into()), State::Held(Phase::Grind(Step::Reconcile))),
+        (Reconciliation::Running, State::Execute(Phase::Grind(JobStep::Run))),
+        (Reconciliation::Held, State::Unsuspending(Phase::Grind(JobStep::Run))),
+        (Reconciliation::Ended(JobResult::Complete), State::Execute(Phase::Grind(JobStep::Acknowledge))),
+        (Reconciliation::NotStarted, State::Execute(Phase::Grind(JobStep::Send))),
+        (Reconciliation::Unknown("no memory".into()), State::Held(Phase::Grind(JobStep::Reconcile))),
     ];
     for (outcome, state) in cases {
         let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-        run.start().until(State::Execute(Phase::Grind(Step::Run)));
+        run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
         let device = Device::Grinder;
         run.send(Event::LinkLost { device, why: "silent".into() });
-        assert_eq!(run.cell.state(), State::Suspended(Phase::Grind(Step::Reconcile)));
+        assert_eq!(run.cell.state(), State::Suspended(Phase::Grind(JobStep::Reconcile)));
         let commands = run.send(Event::LinkBack { device, boot_id: 7 });
         assert!(commands.contains(&Command::Reconcile { device, cycle: 1 }), "{commands:?}");
         run.send(Event::Reconciled { device, cycle: 1, outcome });
@@ -469,11 +469,11 @@ fn a_lost_link_suspends_and_the_machine_is_asked_what_became_of_its_job() {
 #[test]
 fn a_machine_that_was_restarted_is_looked_at_by_a_person() {
     let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Grind(Step::Run)));
+    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
     let device = Device::Grinder;
     run.send(Event::LinkLost { device, why: "silent".into() });
     run.send(Event::LinkBack { device, boot_id: 8 });
-    assert_eq!(run.cell.state(), State::Held(Phase::Grind(Step::Reconcile)));
+    assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Reconcile)));
     run.send(Event::DeclaredOver { actor: actor(), device, evidence: "stands at the park position".into() });
     assert_eq!(run.cell.state(), State::Held(Phase::Transfer));
     run.waiting.clear();
@@ -486,10 +486,10 @@ fn a_machine_that_was_restarted_is_looked_at_by_a_person() {
 #[test]
 fn a_missing_condition_holds_the_machine_and_goes_on_by_itself() {
     let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-    run.start().until(State::Execute(Phase::Measure(Step::Run)));
+    run.start().until(State::Execute(Phase::Measure(JobStep::Run)));
     let condition = Condition::Temperature;
-    run.send(Event::ConditionLost { condition, words: "22.3 of at most 21 degrees".into() });
-    run.until(State::Suspended(Phase::Measure(Step::Run)));
+    run.send(Event::ConditionLost { condition, message: "22.3 of at most 21 degrees".into() });
+    run.until(State::Suspended(Phase::Measure(JobStep::Run)));
     run.send(Event::ConditionBack { condition });
     run.go_on();
     assert_eq!(run.cell.state(), State::Complete);
@@ -505,11 +505,11 @@ fn a_measurement_that_fails_its_gate_makes_no_map_and_is_repeated_under_the_next
     ];
     for (why, alarm) in failures {
         let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
-        run.start().until(State::Execute(Phase::Measure(Step::Collect)));
+        run.start().until(State::Execute(Phase::Measure(JobStep::Collect)));
         run.waiting.clear();
         run.send(Event::Collected { cycle: 1, targets: 9, found: 9, gate: Gate::Failed(why) });
         run.go_on();
-        assert_eq!((run.alarms(), run.cell.state()), (vec![alarm], State::Held(Phase::Measure(Step::Send))));
+        assert_eq!((run.alarms(), run.cell.state()), (vec![alarm], State::Held(Phase::Measure(JobStep::Send))));
         assert!(!run.all.iter().any(|c| matches!(c, Command::Register { .. })));
         run.send(resume());
         run.go_on();
@@ -534,7 +534,7 @@ fn figures_outside_their_gates_are_never_judged() {
     }
     for radius_error_mm in [0.010, -0.010, f64::NAN] {
         let mut run = Run::new(plan(), |_| figures(1.0, 0.1));
-        run.start().until(State::Execute(Phase::Measure(Step::Qualify)));
+        run.start().until(State::Execute(Phase::Measure(JobStep::Qualify)));
         run.waiting.clear();
         run.send(Event::Qualified { cycle: 1, radius_error_mm });
         run.go_on();
@@ -545,11 +545,11 @@ fn figures_outside_their_gates_are_never_judged() {
 #[test]
 fn a_machine_starts_only_while_the_other_is_clear() {
     let mut run = Run::new(plan(), |_| figures(1.0, 0.1));
-    run.start().until(State::Execute(Phase::Grind(Step::Prepare)));
+    run.start().until(State::Execute(Phase::Grind(JobStep::Prepare)));
     run.waiting.clear();
-    run.send(Event::Obstructed { device: Device::Cmm, words: "moved by hand".into() });
+    run.send(Event::Obstructed { device: Device::Cmm, message: "moved by hand".into() });
     run.send(Event::Prepared { device: Device::Grinder, cycle: 1 });
-    assert_eq!(run.cell.state(), State::Held(Phase::Grind(Step::Send)));
+    assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Send)));
     assert_eq!(run.starts(), []);
 }
 
@@ -577,10 +577,10 @@ fn a_restarted_program_asks_before_it_goes_on() {
 #[test]
 fn what_cannot_be_recorded_is_not_begun() {
     let mut run = Run::new(plan(), |_| figures(1.0, 0.1));
-    run.start().until(State::Execute(Phase::Grind(Step::Prepare)));
+    run.start().until(State::Execute(Phase::Grind(JobStep::Prepare)));
     run.send(Event::RecordFailed { why: RecordFailure::DiskFull("runs".into()) });
     run.go_on();
-    assert_eq!((run.cell.state(), run.starts()), (State::Held(Phase::Grind(Step::Send)), vec![]));
+    assert_eq!((run.cell.state(), run.starts()), (State::Held(Phase::Grind(JobStep::Send)), vec![]));
     assert_eq!(run.alarms(), [AlarmId::DiskFull]);
 }
 
@@ -607,16 +607,16 @@ fn every_event_has_an_answer_in_every_state() {
         "Completing",
         "Complete",
     ] {
-        assert!(states.iter().any(|state| state.name() == name), "{name} is never reached");
+        assert!(states.iter().any(|state| state.name().to_string() == name), "{name} is never reached");
     }
     for row in &rows {
         for answer in &row.answers {
             assert!(!row.state.is_end() || (answer.commands.is_empty() && answer.next == row.state), "{row:?}");
-            assert!(!answer.is_refusal() || answer.next == row.state || row.event == "Resume", "{row:?}");
-            let begins = answer.commands.iter().any(|c| c.starts_with("StartMachine"));
-            assert!(!begins || row.event.starts_with("Prepared"), "{row:?}");
+            assert!(!answer.is_refusal() || answer.next == row.state || row.event == "resume", "{row:?}");
+            let begins = answer.commands.iter().any(|c| c.starts_with("start_machine"));
+            assert!(!begins || row.event.starts_with("prepared"), "{row:?}");
         }
-        if row.event == "Abort" || row.event.starts_with("Fault") {
+        if row.event == "abort" || row.event.starts_with("fault") {
             let ends = |next| matches!(next, State::Aborting | State::Aborted);
             assert!(row.state.is_end() || row.answers.iter().all(|a| ends(a.next)), "{row:?}");
         }
@@ -629,10 +629,25 @@ fn every_event_has_an_answer_in_every_state() {
 }
 
 #[test]
+fn events_and_commands_are_named_as_they_are_recorded() {
+    for event in samples(1) {
+        assert_eq!(serde_json::to_value(&event).unwrap()["event"], event.name());
+    }
+    for device in Device::BOTH {
+        assert_eq!(serde_json::to_value(device).unwrap(), device.name());
+        let command = Command::StartMachine { device, cycle: 1 };
+        assert_eq!(
+            command.name(),
+            format!("{} {device}", serde_json::to_value(&command).unwrap()["command"].as_str().unwrap())
+        );
+    }
+}
+
+#[test]
 fn every_alarm_says_what_to_do() {
     let mut run = Run::new(plan(), |_| figures(1.0, 0.1));
-    run.start().until(State::Execute(Phase::Grind(Step::Run)));
-    run.send(Event::Fault { device: Device::Grinder, code: 5, words: "drive".into() });
+    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    run.send(Event::Fault { device: Device::Grinder, code: 5, message: "drive".into() });
     let Some(Command::Raise(alarm)) = run.all.iter().find(|c| matches!(c, Command::Raise(_))) else { panic!() };
     assert_eq!(alarm.what, "A machine is in fault: grinder, fault 5, drive.");
     assert!(AlarmId::ALL.len() > 30);
@@ -674,7 +689,7 @@ fn play(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> {
             }
             let safe = !matches!(
                 command.name().split(' ').next(),
-                Some("AbortMachine" | "VerifyClear" | "Raise" | "Withdraw" | "Refuse" | "Finish" | "Connect")
+                Some("abort_machine" | "verify_clear" | "raise" | "withdraw" | "refuse" | "finish" | "connect")
             );
             prop_assert!(!(aborted && safe), "{command:?} after an abort, restarted {restarted}");
         }

@@ -1,0 +1,194 @@
+//! What a client and a machine say to each other by docs/modbus.md: states, commands, answers, and the registers of a command.
+//!
+//! The controller has the same numbers in types of its own: one wrong number must not stand at both ends of the wire.
+
+use crate::words::{Image, WordOrder, bytes_of, crc16};
+
+/// The states of docs/modbus.md.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[allow(missing_docs)]
+pub enum State {
+    Idle = 1,
+    Prepared = 2,
+    Execute = 3,
+    Holding = 4,
+    Held = 5,
+    Stopping = 6,
+    Complete = 7,
+    Aborting = 8,
+    Aborted = 9,
+    Faulted = 10,
+}
+
+impl State {
+    /// Every state, in the order of their numbers.
+    pub const ALL: [Self; 10] = [
+        Self::Idle,
+        Self::Prepared,
+        Self::Execute,
+        Self::Holding,
+        Self::Held,
+        Self::Stopping,
+        Self::Complete,
+        Self::Aborting,
+        Self::Aborted,
+        Self::Faulted,
+    ];
+}
+
+/// The commands of docs/modbus.md.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[allow(missing_docs)]
+pub enum Command {
+    Claim = 1,
+    Prepare = 2,
+    Start = 3,
+    Hold = 4,
+    Resume = 5,
+    Stop = 6,
+    Abort = 7,
+    Clear = 8,
+    Acknowledge = 9,
+    Release = 10,
+}
+
+impl Command {
+    /// Every command, in the order of their numbers.
+    pub const ALL: [Self; 10] = [
+        Self::Claim,
+        Self::Prepare,
+        Self::Start,
+        Self::Hold,
+        Self::Resume,
+        Self::Stop,
+        Self::Abort,
+        Self::Clear,
+        Self::Acknowledge,
+        Self::Release,
+    ];
+
+    /// Returns the command of a number.
+    pub fn of(number: u16) -> Option<Self> {
+        Self::ALL.get(usize::from(number).checked_sub(1)?).copied()
+    }
+
+    /// Says whether a machine in this state may do it.
+    pub fn is_allowed_in(self, state: State) -> bool {
+        match self {
+            Self::Claim | Self::Abort => true,
+            Self::Prepare => state == State::Idle,
+            Self::Start => state == State::Prepared,
+            Self::Hold => state == State::Execute,
+            Self::Resume => state == State::Held,
+            Self::Stop => matches!(state, State::Prepared | State::Execute | State::Holding | State::Held),
+            Self::Clear => matches!(state, State::Aborted | State::Faulted),
+            Self::Acknowledge => state == State::Complete,
+            Self::Release => state != State::Execute,
+        }
+    }
+}
+
+/// The answers of docs/modbus.md.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub enum Answer {
+    #[default]
+    None = 0,
+    Accepted = 1,
+    NotOwner = 2,
+    NotAllowed = 3,
+    Unknown = 4,
+    Token = 5,
+    Different = 6,
+    Begun = 7,
+    Payload = 8,
+    Interlock = 9,
+    Limits = 10,
+    Argument = 11,
+}
+
+/// A command as it stands in its 20 registers.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Frame {
+    /// Sequence number; 0 is never used.
+    pub sequence: u32,
+    /// Number of the command.
+    pub command: u16,
+    /// Cycle of the job.
+    pub cycle: u16,
+    /// Who commands.
+    pub owner: u32,
+    /// How often that one has started.
+    pub epoch: u32,
+    /// The part's run.
+    pub job: u32,
+    /// CRC-32 of the identities of the payloads it is about.
+    pub digest: u32,
+    /// The token that PREPARE gave.
+    pub token: u32,
+    /// The `done` number, for ACKNOWLEDGE.
+    pub argument: u32,
+}
+
+impl Frame {
+    /// Returns the 20 registers.
+    pub fn registers(&self, order: WordOrder) -> Vec<u16> {
+        let mut words = Image::new(order, 20)
+            .u32(0, self.sequence)
+            .u16(2, self.command)
+            .u16(3, self.cycle)
+            .u32(4, self.owner)
+            .u32(6, self.epoch)
+            .u32(8, self.job)
+            .u32(10, self.digest)
+            .u32(12, self.token)
+            .u32(14, self.argument)
+            .u32(18, self.sequence)
+            .done();
+        words[16] = crc16(&bytes_of(&words[..16]));
+        words
+    }
+
+    /// Reads the 20 registers; `None` if the CRC or the copies disagree, or the number is 0.
+    pub fn read(order: WordOrder, words: &[u16; 20]) -> Option<Self> {
+        let u32_at = |at: usize| order.to_u32([words[at], words[at + 1]]);
+        let sound = words[16] == crc16(&bytes_of(&words[..16])) && u32_at(0) == u32_at(18) && u32_at(0) != 0;
+        sound.then(|| Self {
+            sequence: u32_at(0),
+            command: words[2],
+            cycle: words[3],
+            owner: u32_at(4),
+            epoch: u32_at(6),
+            job: u32_at(8),
+            digest: u32_at(10),
+            token: u32_at(12),
+            argument: u32_at(14),
+        })
+    }
+}
+
+/// Whether the machine's own panel has the command.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Mode {
+    /// The client may command.
+    #[default]
+    Automatic = 1,
+    /// A person at the panel has the machine.
+    Manual = 2,
+}
+
+/// Bits of the status block's interlocks.
+pub mod interlock {
+    /// The guards are closed.
+    pub const GUARDS: u16 = 1;
+    /// Wheel or probe is clear of the part.
+    pub const CLEAR: u16 = 2;
+    /// The part is clamped.
+    pub const CLAMPED: u16 = 4;
+    /// Air and coolant are there.
+    pub const SUPPLIES: u16 = 8;
+    /// All of them.
+    pub const ALL: u16 = 15;
+    /// What must stay good while the machine moves.
+    pub const MOVING: u16 = GUARDS | CLAMPED | SUPPLIES;
+}

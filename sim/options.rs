@@ -1,0 +1,123 @@
+//! How a simulated machine is set up: where its blocks of registers are, and how it behaves.
+//!
+//! The controller has a register map of its own, read from its cell file: here stands what the machine really has.
+
+use std::time::Duration;
+
+use crate::words::WordOrder;
+
+/// The first address of every block.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub struct Layout {
+    pub identity: u16,
+    pub sync: u16,
+    pub beat: u16,
+    pub command: u16,
+    pub status: u16,
+    pub in_force: u16,
+    pub inbox_header: u16,
+    pub inbox_page: u16,
+    pub inbox_state: u16,
+    pub outbox_header: u16,
+    pub outbox_select: u16,
+    pub outbox_page: u16,
+}
+
+impl Default for Layout {
+    fn default() -> Self {
+        Self {
+            identity: 0,
+            sync: 32,
+            beat: 36,
+            command: 40,
+            status: 64,
+            in_force: 120,
+            inbox_header: 200,
+            inbox_page: 224,
+            inbox_state: 350,
+            outbox_header: 400,
+            outbox_select: 460,
+            outbox_page: 462,
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Block {
+    Identity,
+    Sync,
+    Beat,
+    Command,
+    Status,
+    InForce,
+    InboxHeader,
+    InboxPage,
+    InboxState,
+    OutboxHeader,
+    OutboxSelect,
+    OutboxPage,
+}
+
+impl Layout {
+    fn blocks(&self) -> [(Block, u16, usize); 12] {
+        [
+            (Block::Identity, self.identity, 32),
+            (Block::Sync, self.sync, 4),
+            (Block::Beat, self.beat, 1),
+            (Block::Command, self.command, 20),
+            (Block::Status, self.status, 48),
+            (Block::InForce, self.in_force, 72),
+            (Block::InboxHeader, self.inbox_header, 24),
+            (Block::InboxPage, self.inbox_page, 120),
+            (Block::InboxState, self.inbox_state, 12),
+            (Block::OutboxHeader, self.outbox_header, 56),
+            (Block::OutboxSelect, self.outbox_select, 2),
+            (Block::OutboxPage, self.outbox_page, 116),
+        ]
+    }
+
+    /// Returns the block that an address lies in, and where in it.
+    pub(crate) fn find(&self, address: usize) -> Option<(Block, usize, usize)> {
+        self.blocks().into_iter().find_map(|(block, first, length)| {
+            let offset = address.checked_sub(first.into())?;
+            (offset < length).then_some((block, offset, length))
+        })
+    }
+}
+
+/// How a simulated machine is set up.
+#[derive(Clone, Debug)]
+pub struct MachineOptions {
+    /// In which order the words of a value stand.
+    pub word_order: WordOrder,
+    /// Where the blocks are.
+    pub layout: Layout,
+    /// Seconds of the machine's own time in a real second.
+    pub speed: f64,
+    /// Draws the tokens and the next boot ids.
+    pub seed: u64,
+    /// Milliseconds after which a silent client is lost; 0 stands for 3000.
+    pub lost_after_ms: u16,
+    /// Real time that the machine is HOLDING, STOPPING or ABORTING.
+    pub acting: Duration,
+    /// The longest payload it holds.
+    pub payload_limit_bytes: u32,
+    /// The job and cycle it began before it was switched off.
+    pub last_begun: Option<(u32, u16)>,
+}
+
+impl Default for MachineOptions {
+    fn default() -> Self {
+        Self {
+            word_order: WordOrder::Big,
+            layout: Layout::default(),
+            speed: 1.0,
+            seed: 1,
+            lost_after_ms: 0,
+            acting: Duration::from_millis(150),
+            payload_limit_bytes: 64 << 20,
+            last_begun: None,
+        }
+    }
+}

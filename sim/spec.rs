@@ -1,0 +1,387 @@
+//! The table of a simulated world: what is wrong with everything in it, with what each number may be.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use crate::Vec3;
+use crate::part::{Aperture, PartSpec};
+
+/// Temperature at which lengths are what drawings say, in degrees Celsius.
+pub(crate) const REFERENCE_C: f64 = 20.0;
+
+/// What is wrong with the grinder.
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct GrinderSpec {
+    /// True radius of the wheel less the radius stated in the first pass; the true one stays.
+    pub wheel_radius_error_um: f64,
+    /// Offset of the wheel in x and y.
+    pub setting_error_um: [f64; 2],
+    /// Straightness along x: amplitudes of the second and third Legendre polynomial over the part.
+    pub straightness_x_um: [f64; 2],
+    /// The same along y.
+    pub straightness_y_um: [f64; 2],
+    /// Amplitude of the screw's error along x.
+    pub periodic_um: f64,
+    /// Its pitch.
+    pub periodic_pitch_mm: f64,
+    /// RMS of a fixed random waviness.
+    pub waviness_um: f64,
+    /// Its correlation length.
+    pub waviness_correlation_mm: f64,
+    /// Lag along the path at 1000 mm/min, proportional to the feed.
+    pub following_um: f64,
+    /// Growth of the surface left by the wearing wheel, over one finishing stroke.
+    pub wear_um: f64,
+    /// Fast wear of the freshly dressed wheel.
+    pub break_in_um: f64,
+    /// Share of a finishing stroke after which all but 1/e of the fast wear is over.
+    pub break_in_share: f64,
+    /// The wheel is dressed before every pass; else its fast wear is over after the first.
+    pub dressed_each_pass: bool,
+    /// Growth of the spindle when it is warm through.
+    pub thermal_um: f64,
+    /// Its time constant.
+    pub thermal_tau_s: f64,
+    /// Share of what stands proud that stays, mu.
+    pub error_copying: f64,
+    /// RMS of the random part drawn for every pass.
+    pub repeatability_um: f64,
+    /// Its correlation length.
+    pub repeatability_correlation_mm: f64,
+    /// How far the wheel reaches from the middle of the machine in x and y.
+    pub travel_mm: [f64; 2],
+    /// Fastest feed.
+    pub feed_most_mm_min: f64,
+    /// Largest displacement that a map may ask for.
+    pub map_most_um: f64,
+}
+
+impl Default for GrinderSpec {
+    fn default() -> Self {
+        Self {
+            wheel_radius_error_um: 90.0,
+            setting_error_um: [12.0, -9.0],
+            straightness_x_um: [-6.0, -4.5],
+            straightness_y_um: [-4.5, -3.0],
+            periodic_um: 0.4,
+            periodic_pitch_mm: 20.0,
+            waviness_um: 0.8,
+            waviness_correlation_mm: 18.0,
+            following_um: 0.1,
+            wear_um: 4.0,
+            break_in_um: 2.0,
+            break_in_share: 0.08,
+            dressed_each_pass: true,
+            thermal_um: 4.0,
+            thermal_tau_s: 1200.0,
+            error_copying: 0.15,
+            repeatability_um: 0.4,
+            repeatability_correlation_mm: 14.0,
+            travel_mm: [250.0, 250.0],
+            feed_most_mm_min: 20_000.0,
+            map_most_um: 500.0,
+        }
+    }
+}
+
+impl GrinderSpec {
+    /// A grinder without any error, as stiff as can be.
+    pub fn perfect() -> Self {
+        Self {
+            wheel_radius_error_um: 0.0,
+            setting_error_um: [0.0; 2],
+            straightness_x_um: [0.0; 2],
+            straightness_y_um: [0.0; 2],
+            periodic_um: 0.0,
+            waviness_um: 0.0,
+            following_um: 0.0,
+            wear_um: 0.0,
+            break_in_um: 0.0,
+            thermal_um: 0.0,
+            error_copying: 0.0,
+            repeatability_um: 0.0,
+            ..Self::default()
+        }
+    }
+}
+
+/// Where the part lies on the measuring machine, and what is wrong with the machine.
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct CmmSpec {
+    /// Where the origin of the model frame lies in the machine's frame.
+    pub translation_mm: Vec3,
+    /// How the part is turned, about x, then y, then z.
+    pub rotation_deg: Vec3,
+    /// Standard deviation of the part's place from loading to loading, along each axis.
+    pub loading_shift_um: f64,
+    /// The same for its angles.
+    pub loading_turn_deg: f64,
+    /// Standard deviation of a reported coordinate, on each axis.
+    pub noise_um: f64,
+    /// Share of the touches that are outliers.
+    pub outlier_share: f64,
+    /// Largest shift of an outlier.
+    pub outlier_um: f64,
+    /// Share of the touches that are missed.
+    pub not_found_share: f64,
+    /// True radius of the ball less the one that the plan states.
+    pub probe_radius_error_um: f64,
+    /// Temperature of the part while it is measured.
+    pub part_temperature_c: f64,
+    /// Its expansion per kelvin.
+    pub cte_per_k: f64,
+    /// Radius of the reference sphere on the table.
+    pub sphere_radius_mm: f64,
+    /// Its centre in the machine's frame.
+    pub sphere_centre_mm: Vec3,
+    /// Least coordinates that the ball's centre comes to.
+    pub travel_least_mm: Vec3,
+    /// Most.
+    pub travel_most_mm: Vec3,
+    /// Time that a point takes.
+    pub seconds_per_point: f64,
+    /// Touches before the search begins that the machine puts up with in one measurement.
+    pub unexpected_touches_most: u32,
+    /// Points are sent as 32-bit counts of a nanometre (format 2) in place of floats (format 1).
+    pub scaled_points: bool,
+}
+
+impl Default for CmmSpec {
+    fn default() -> Self {
+        Self {
+            translation_mm: [0.25, -0.2, 0.15],
+            rotation_deg: [0.1, -0.08, 0.08],
+            loading_shift_um: 20.0,
+            loading_turn_deg: 0.005,
+            noise_um: 0.3,
+            outlier_share: 0.0,
+            outlier_um: 200.0,
+            not_found_share: 0.0,
+            probe_radius_error_um: 0.0,
+            part_temperature_c: REFERENCE_C,
+            cte_per_k: 0.55e-6,
+            sphere_radius_mm: 12.5,
+            sphere_centre_mm: [0.0, 120.0, 20.0],
+            travel_least_mm: [-500.0, -500.0, -300.0],
+            travel_most_mm: [500.0, 500.0, 400.0],
+            seconds_per_point: 1.0,
+            unexpected_touches_most: 20,
+            scaled_points: false,
+        }
+    }
+}
+
+impl CmmSpec {
+    /// A machine without noise, that has the part where it should be.
+    pub fn perfect() -> Self {
+        Self {
+            translation_mm: [0.0; 3],
+            rotation_deg: [0.0; 3],
+            loading_shift_um: 0.0,
+            loading_turn_deg: 0.0,
+            noise_um: 0.0,
+            ..Self::default()
+        }
+    }
+}
+
+/// The whole truth in one table.
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct WorldSpec {
+    /// What everything random is drawn from.
+    pub seed: u64,
+    /// Seconds of the machines' time in a second of ours.
+    pub speed: f64,
+    /// The part.
+    pub part: PartSpec,
+    /// The grinder.
+    pub grinder: GrinderSpec,
+    /// The measuring machine.
+    pub cmm: CmmSpec,
+    /// What is broken, for tests.
+    pub faults: Faults,
+}
+
+impl Default for WorldSpec {
+    fn default() -> Self {
+        Self {
+            seed: 1,
+            speed: 1000.0,
+            part: PartSpec::default(),
+            grinder: GrinderSpec::default(),
+            cmm: CmmSpec::default(),
+            faults: Faults::default(),
+        }
+    }
+}
+
+/// How the grinder turns a map over or round.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Mirrored {
+    /// Not at all.
+    #[default]
+    None,
+    /// x for -x.
+    X,
+    /// y for -y.
+    Y,
+    /// By half a turn.
+    HalfTurn,
+    /// By a quarter of a turn: -y for x, and x for y.
+    QuarterTurn,
+}
+
+/// What is broken, for tests.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, Serialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Faults {
+    /// The grinder displaces to the wrong side.
+    pub map_sign_flipped: bool,
+    /// The grinder turns the map over.
+    pub map_mirrored: Mirrored,
+    /// The grinder displaces by the map twice over.
+    pub map_doubled: bool,
+    /// The grinder grinds as if the map were zero.
+    pub map_ignored: bool,
+    /// The CMM reports contact points (centre less stated radius along the target's normal).
+    pub returns_contact_points: bool,
+    /// And says so in the header of the outbox; else the header says centres.
+    pub contact_points_declared: bool,
+    /// The CMM reports inches, and the header says millimetres.
+    pub inches: bool,
+    /// The part lies on the CMM turned by half a turn about z.
+    pub part_turned_180: bool,
+    /// There is no part in either machine.
+    pub no_part: bool,
+    /// The grinder holds a part of another identity than any payload names.
+    pub wrong_part: bool,
+    /// One record of the points holds a NaN (format 1 only).
+    pub non_finite_point: bool,
+    /// So many records are missing at the end of the points.
+    pub missing_records: u32,
+}
+
+/// Why a table cannot be a world.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SpecError {
+    /// The key, as a path in the table.
+    pub key: &'static str,
+    /// Its value.
+    pub value: f64,
+    /// What is allowed.
+    pub limit: &'static str,
+}
+
+impl fmt::Display for SpecError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "`{}` of the simulated world is {}, allowed is {}", self.key, self.value, self.limit)
+    }
+}
+
+impl std::error::Error for SpecError {}
+
+const SIZE: &str = "0 to 10000";
+const SIGNED: &str = "-10000 to 10000";
+const LENGTH: &str = "0.5 to 10000 mm";
+const SHARE: &str = "0 to 1";
+
+impl WorldSpec {
+    /// Checks every number.
+    ///
+    /// # Errors
+    /// The first one that is outside what the simulation holds for.
+    pub fn check(&self) -> Result<(), SpecError> {
+        check_all("speed", &[self.speed], 1e-3, 1e6, "0.001 to 1e6")?;
+        let [half_x, half_y] = self.part.aperture.half_mm();
+        check_all("part.aperture", &[half_x, half_y], 2.0, 1000.0, "2 to 1000 mm")?;
+        check_all("part.stock_um", &[self.part.stock_um], 0.0, 10_000.0, SIZE)?;
+        check_all("part.form_error_um", &[self.part.form_error_um], 0.0, 10_000.0, SIZE)?;
+        let length = self.part.form_error_correlation_mm;
+        check_all("part.form_error_correlation_mm", &[length], 0.5, 10_000.0, LENGTH)?;
+        self.check_grinder()?;
+        self.check_cmm()?;
+        self.check_shape()
+    }
+
+    fn check_grinder(&self) -> Result<(), SpecError> {
+        let g = &self.grinder;
+        let signed = [
+            ("grinder.wheel_radius_error_um", &[g.wheel_radius_error_um][..]),
+            ("grinder.setting_error_um", &g.setting_error_um),
+            ("grinder.straightness_x_um", &g.straightness_x_um),
+            ("grinder.straightness_y_um", &g.straightness_y_um),
+            ("grinder.periodic_um", &[g.periodic_um]),
+            ("grinder.following_um", &[g.following_um]),
+            ("grinder.wear_um", &[g.wear_um]),
+            ("grinder.break_in_um", &[g.break_in_um]),
+            ("grinder.thermal_um", &[g.thermal_um]),
+        ];
+        signed.iter().try_for_each(|(key, values)| check_all(key, values, -1e4, 1e4, SIGNED))?;
+        check_all("grinder.waviness_um", &[g.waviness_um], 0.0, 1e4, SIZE)?;
+        check_all("grinder.repeatability_um", &[g.repeatability_um], 0.0, 1e4, SIZE)?;
+        check_all("grinder.periodic_pitch_mm", &[g.periodic_pitch_mm], 0.5, 1e4, LENGTH)?;
+        check_all("grinder.waviness_correlation_mm", &[g.waviness_correlation_mm], 0.5, 1e4, LENGTH)?;
+        check_all("grinder.repeatability_correlation_mm", &[g.repeatability_correlation_mm], 0.5, 1e4, LENGTH)?;
+        check_all("grinder.break_in_share", &[g.break_in_share], 0.0, 1.0, SHARE)?;
+        check_all("grinder.thermal_tau_s", &[g.thermal_tau_s], 1.0, 1e6, "1 to 1e6 s")?;
+        check_all("grinder.error_copying", &[g.error_copying], 0.0, 0.95, "0 to 0.95")?;
+        check_all("grinder.travel_mm", &g.travel_mm, 1.0, 1e4, "1 to 10000 mm")?;
+        check_all("grinder.feed_most_mm_min", &[g.feed_most_mm_min], 1.0, 5e4, "1 to 50000 mm/min")?;
+        check_all("grinder.map_most_um", &[g.map_most_um], 0.0, 1e4, SIZE)
+    }
+
+    fn check_cmm(&self) -> Result<(), SpecError> {
+        let c = &self.cmm;
+        check_all("cmm.translation_mm", &c.translation_mm, -1e3, 1e3, "-1000 to 1000 mm")?;
+        check_all("cmm.rotation_deg", &c.rotation_deg, -360.0, 360.0, "-360 to 360 degrees")?;
+        check_all("cmm.loading_shift_um", &[c.loading_shift_um], 0.0, 1e4, SIZE)?;
+        check_all("cmm.loading_turn_deg", &[c.loading_turn_deg], 0.0, 10.0, "0 to 10 degrees")?;
+        check_all("cmm.noise_um", &[c.noise_um], 0.0, 1e4, SIZE)?;
+        check_all("cmm.outlier_share", &[c.outlier_share], 0.0, 1.0, SHARE)?;
+        check_all("cmm.outlier_um", &[c.outlier_um], 0.0, 1e4, SIZE)?;
+        check_all("cmm.not_found_share", &[c.not_found_share], 0.0, 1.0, SHARE)?;
+        check_all("cmm.probe_radius_error_um", &[c.probe_radius_error_um], -1e4, 1e4, SIGNED)?;
+        check_all("cmm.part_temperature_c", &[c.part_temperature_c], -50.0, 100.0, "-50 to 100 degrees Celsius")?;
+        check_all("cmm.cte_per_k", &[c.cte_per_k], -1e-4, 1e-4, "-1e-4 to 1e-4 per kelvin")?;
+        check_all("cmm.sphere_radius_mm", &[c.sphere_radius_mm], 0.5, 200.0, "0.5 to 200 mm")?;
+        check_all("cmm.sphere_centre_mm", &c.sphere_centre_mm, -2e3, 2e3, "-2000 to 2000 mm")?;
+        check_all("cmm.travel_least_mm", &c.travel_least_mm, -2e3, 2e3, "-2000 to 2000 mm")?;
+        check_all("cmm.travel_most_mm", &c.travel_most_mm, -2e3, 2e3, "-2000 to 2000 mm")?;
+        check_all("cmm.seconds_per_point", &[c.seconds_per_point], 1e-3, 1e3, "0.001 to 1000 s")
+    }
+
+    /// The surface must have a height everywhere on the part; domains of these shapes are convex, so the rim tells.
+    fn check_shape(&self) -> Result<(), SpecError> {
+        let (shape, [half_x, half_y]) = (self.part.shape.build(), self.part.aperture.half_mm());
+        for k in 0..360 {
+            let (sine, cosine) = f64::from(k).to_radians().sin_cos();
+            let stretch = match self.part.aperture {
+                Aperture::Circle { .. } => 1.0,
+                Aperture::Rectangle { .. } => 1.0 / sine.abs().max(cosine.abs()),
+            };
+            let (x, y) = (half_x * cosine * stretch, half_y * sine * stretch);
+            let [p, q] = shape.gradient(x, y);
+            let slope = p.hypot(q);
+            if !shape.height(x, y).is_finite() || !(0.0..=10.0).contains(&slope) {
+                return Err(SpecError {
+                    key: "part.shape",
+                    value: slope,
+                    limit: "a slope up to 10 all over the aperture",
+                });
+            }
+        }
+        Ok(())
+    }
+}
+
+fn check_all(key: &'static str, values: &[f64], least: f64, most: f64, limit: &'static str) -> Result<(), SpecError> {
+    match values.iter().find(|value| !(least..=most).contains(*value)) {
+        Some(&value) => Err(SpecError { key, value, limit }),
+        None => Ok(()),
+    }
+}

@@ -1,0 +1,215 @@
+//! What both machines share: the part and what has been done to it.
+//!
+//! Every random number has a stream of its own, by what it is for and how often that has been drawn, so that one more
+//! source of error changes no other, and neither do the steps in which time goes on.
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use rand_distr::{Distribution, StandardNormal};
+
+use crate::Vec3;
+use crate::body::{Kind, Outcome};
+use crate::part::Part;
+use crate::probe::Placement;
+use crate::spec::WorldSpec;
+
+/// A pass that the grinder began.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GrindEntry {
+    /// The part's run.
+    pub job: u32,
+    /// Its cycle.
+    pub cycle: u16,
+    /// The height that was wanted, in millimetres.
+    pub level_mm: f64,
+    /// Largest value of the map that came with it, in millimetres.
+    pub map_largest_mm: f64,
+    /// Identity of the map.
+    pub map: [u8; 32],
+    /// Strokes to take off what stood above the depth of cut.
+    pub roughing_strokes: u32,
+    /// How it ended as in the pass record; 0 while it goes on.
+    pub result: u16,
+    /// Volume removed in cubic millimetres.
+    pub volume_mm3: f64,
+}
+
+/// What a stream of random numbers is for.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Source {
+    Blank = 1,
+    Waviness = 2,
+    Repeatability = 3,
+    Loading = 4,
+    Noise = 5,
+    Outliers = 6,
+    NotFound = 7,
+}
+
+/// Returns the stream of a source for its n-th use.
+pub(crate) fn stream(seed: u64, source: Source, number: u32) -> crate::Rng {
+    let mut rng = crate::rng(seed);
+    rng.set_stream((source as u64) << 32 | u64::from(number));
+    rng
+}
+
+/// What both machines share.
+pub(crate) struct State {
+    pub spec: WorldSpec,
+    pub part: Part,
+    /// Systematic error of the grinder at every node but the wheel's radius, in millimetres.
+    pub systematic_mm: Vec<f64>,
+    /// Number of the blank in the grinder, from 1.
+    pub blanks: u32,
+    /// The job that the blank belongs to.
+    pub job: Option<u32>,
+    /// Identity of the part in the grinder.
+    pub held: Option<[u8; 32]>,
+    pub true_wheel_radius_mm: Option<f64>,
+    pub passes_begun: u32,
+    pub measurements_begun: u32,
+    pub loadings: u32,
+    /// The part has not left the CMM since it was measured last.
+    pub on_table: bool,
+    /// Takes the model frame to the CMM's.
+    pub placement: Placement,
+    /// How warm the spindle is, 0 to 1.
+    pub heat: f64,
+    /// Finishing strokes since the wheel was dressed.
+    pub worn_strokes: f64,
+    /// The machine whose job has the part.
+    pub busy: Option<Kind>,
+    /// The machine whose wheel or probe is at the part.
+    pub engaged: Option<Kind>,
+    pub history: Vec<GrindEntry>,
+}
+
+impl State {
+    /// The state before anything has happened; `systematic_mm` says what is wrong with the grinder at the part's nodes.
+    pub fn new(spec: WorldSpec, systematic_mm: impl FnOnce(&WorldSpec, &Part) -> Vec<f64>) -> Self {
+        let part = Part::blank(&spec.part, blank_seed(spec.seed, 1));
+        let systematic_mm = systematic_mm(&spec, &part);
+        let placement = placement(&spec, 0);
+        Self {
+            spec,
+            part,
+            systematic_mm,
+            blanks: 1,
+            job: None,
+            held: None,
+            true_wheel_radius_mm: None,
+            passes_begun: 0,
+            measurements_begun: 0,
+            loadings: 0,
+            on_table: false,
+            placement,
+            heat: 0.0,
+            worn_strokes: 0.0,
+            busy: None,
+            engaged: None,
+            history: Vec::new(),
+        }
+    }
+
+    pub fn load_blank(&mut self) {
+        self.blanks += 1;
+        self.part = Part::blank(&self.spec.part, blank_seed(self.spec.seed, self.blanks));
+        (self.held, self.job, self.on_table) = (None, None, false);
+    }
+
+    /// Sees to it that the part in the grinder is that of the job.
+    pub fn blank_for(&mut self, job: u32) {
+        if self.spec.part.fresh_per_job && self.job.is_some_and(|other| other != job) {
+            self.load_blank();
+        }
+        self.job = Some(job);
+    }
+
+    /// Returns the placement for a measurement: the last one if the part has lain still, else one of a fresh loading.
+    pub fn load_on_table(&mut self) -> Placement {
+        if !self.on_table {
+            self.on_table = true;
+            self.loadings += 1;
+            self.placement = placement(&self.spec, self.loadings);
+        }
+        self.placement
+    }
+
+    pub fn taken_by_other(&self, kind: Kind) -> bool {
+        self.busy.is_some_and(|other| other != kind)
+    }
+
+    /// Gives the part to a machine, unless the other has it.
+    pub fn take(&mut self, kind: Kind) -> bool {
+        if self.taken_by_other(kind) {
+            return false;
+        }
+        (self.busy, self.engaged) = (Some(kind), Some(kind));
+        true
+    }
+
+    pub fn clear(&mut self, kind: Kind) {
+        if self.engaged == Some(kind) {
+            self.engaged = None;
+        }
+    }
+
+    pub fn release(&mut self, kind: Kind) {
+        self.clear(kind);
+        if self.busy == Some(kind) {
+            self.busy = None;
+        }
+    }
+
+    pub fn interlocks(&self, kind: Kind) -> u16 {
+        let (guards, supplies) = (1, 1 << 3);
+        let clear = if self.engaged == Some(kind) { 0 } else { 1 << 1 };
+        let clamped = if self.taken_by_other(kind) { 0 } else { 1 << 2 };
+        guards | clear | clamped | supplies
+    }
+}
+
+/// Returns where the part lies on the measuring machine after the n-th loading; 0 is where the table says.
+fn placement(spec: &WorldSpec, loading: u32) -> Placement {
+    let mut rng = stream(spec.seed, Source::Loading, loading);
+    let mut about = |middle: Vec3, sigma: f64| -> Vec3 {
+        middle.map(|c| {
+            let z: f64 = StandardNormal.sample(&mut rng);
+            if loading == 0 { c } else { c + sigma * z }
+        })
+    };
+    let shift = about(spec.cmm.translation_mm, 1e-3 * spec.cmm.loading_shift_um);
+    let turn = about(spec.cmm.rotation_deg, spec.cmm.loading_turn_deg);
+    let mut placement = Placement::new(shift, turn);
+    if spec.faults.part_turned_180 {
+        for row in &mut placement.rotation {
+            (row[0], row[1]) = (-row[0], -row[1]);
+        }
+    }
+    placement
+}
+
+fn blank_seed(seed: u64, number: u32) -> u64 {
+    use rand::RngExt;
+    stream(seed, Source::Blank, number).random()
+}
+
+/// A panic elsewhere leaves a state that still tells the truth about the part.
+pub(crate) fn locked(state: &Mutex<State>) -> MutexGuard<'_, State> {
+    state.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// The outbox of a job that never began.
+pub(crate) fn nothing_done(temperature_c: f64) -> Outcome {
+    Outcome {
+        kind: 0,
+        format: 1,
+        bytes: Vec::new(),
+        records: 0,
+        coordinates: 0,
+        probe_radius_mm: 0.0,
+        scale_mm: 1.0,
+        temperature_c,
+        duration_s: 0.0,
+    }
+}

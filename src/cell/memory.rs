@@ -1,0 +1,112 @@
+//! What the cell keeps between two events.
+
+use std::collections::BTreeSet;
+use std::time::Duration;
+
+use super::alarm::AlarmId;
+use super::command::Command;
+use super::event::{Condition, Figures};
+use super::plan::CellPlan;
+use super::state::{Device, State};
+
+/// Why the cell is suspended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Cause {
+    Link(Device),
+    Condition(Condition),
+}
+
+/// What the cell knows of one machine.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Known {
+    /// The boot id of the connection; none before the first and after a restart of this program.
+    pub(super) boot_id: Option<u32>,
+    /// Whether it was ever connected in this run, so that an abort must reach it.
+    pub(super) met: bool,
+    /// Whether it is connected and idle, or busy with this run's job.
+    pub(super) ready: bool,
+    /// Whether a fresh status has shown it clear of the part, and it has not been started since.
+    pub(super) clear: bool,
+    /// Whether it has ended its safe sequence.
+    pub(super) stands: bool,
+}
+
+/// A cell in the middle of a run.
+#[derive(Clone, Debug)]
+pub struct Cell {
+    pub(super) plan: CellPlan,
+    pub(super) state: State,
+    pub(super) cycle: u32,
+    /// Passes of the grinder begun.
+    pub(super) passes: u32,
+    pub(super) known: [Known; 2],
+    pub(super) causes: BTreeSet<Cause>,
+    pub(super) raised: BTreeSet<AlarmId>,
+    /// The figures of this cycle, and of the last one that was judged.
+    pub(super) figures: Option<Figures>,
+    pub(super) previous: Option<Figures>,
+    /// Cycles in a row that were worse than the one before.
+    pub(super) worse: u32,
+    /// How the run ends when the state that leads to the end is over.
+    pub(super) reason: String,
+    pub(super) judged_out: bool,
+    pub(super) repeated: bool,
+    /// The time of the event that is being handled, and when the next deadline is due.
+    pub(super) now: Duration,
+    pub(super) deadline: Option<Duration>,
+    pub(super) commands: Vec<Command>,
+}
+
+impl Cell {
+    /// Returns a cell that waits for `Event::Start`.
+    pub fn new(plan: CellPlan) -> Self {
+        Self {
+            plan,
+            state: State::Idle,
+            cycle: 0,
+            passes: 0,
+            known: [Known::default(); 2],
+            causes: BTreeSet::new(),
+            raised: BTreeSet::new(),
+            figures: None,
+            previous: None,
+            worse: 0,
+            reason: String::new(),
+            judged_out: false,
+            repeated: false,
+            now: Duration::ZERO,
+            deadline: None,
+            commands: Vec::new(),
+        }
+    }
+
+    /// Returns the state.
+    pub fn state(&self) -> State {
+        self.state
+    }
+
+    /// Returns the number of the cycle; 0 before the first.
+    pub fn cycle(&self) -> u32 {
+        self.cycle
+    }
+
+    /// Returns the plan.
+    pub fn plan(&self) -> &CellPlan {
+        &self.plan
+    }
+
+    /// Returns the figures of the last measurement that was registered.
+    pub fn figures(&self) -> Option<&Figures> {
+        self.figures.as_ref().or(self.previous.as_ref())
+    }
+
+    /// Returns the alarms that stand.
+    pub fn alarms(&self) -> impl Iterator<Item = AlarmId> + '_ {
+        self.raised.iter().copied()
+    }
+
+    /// Returns when `Event::Deadline` is due, as time since the run began.
+    pub fn next_deadline(&self) -> Option<Duration> {
+        self.deadline
+    }
+}
