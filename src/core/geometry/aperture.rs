@@ -255,6 +255,23 @@ impl Aperture {
             _ => self.outline_mm(720).iter().map(|[x, y]| x.hypot(*y)).fold(0.0, f64::max),
         }
     }
+
+    /// Returns fixed places all over the aperture and along its outline, some hundred of each.
+    ///
+    /// Units: millimetres. Within the bounds they follow the additive recurrence of the plastic number, which leaves no gaps and
+    /// no lattice.
+    pub(crate) fn places_mm(&self) -> Vec<[f64; 2]> {
+        let [least, most] = self.bounds();
+        let plastic = 1.324_717_957_244_746_f64;
+        let inside = (0..800).map(|i| {
+            [0, 1].map(|k| {
+                let t = (0.5 + f64::from(i) * plastic.powi(-1 - k as i32)).fract();
+                least[k] + t * (most[k] - least[k])
+            })
+        });
+        let inside = inside.filter(|[x, y]| self.contains(*x, *y));
+        inside.chain(self.outline_mm(240)).collect()
+    }
 }
 
 /// Checks the coordinates of a point.
@@ -324,24 +341,24 @@ fn crosses_ray(p: [f64; 2], q: [f64; 2], x: f64, y: f64) -> bool {
 }
 
 /// Twice the signed area of a triangle.
-fn turn(p: [f64; 2], q: [f64; 2], r: [f64; 2]) -> f64 {
+fn orient2d(p: [f64; 2], q: [f64; 2], r: [f64; 2]) -> f64 {
     (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
 }
 
 /// Tells whether an edge runs back over the one before it.
 fn folds_back([p, q]: [[f64; 2]; 2], [_, r]: [[f64; 2]; 2]) -> bool {
     let forward = (q[0] - p[0]) * (r[0] - q[0]) + (q[1] - p[1]) * (r[1] - q[1]);
-    turn(p, q, r) == 0.0 && forward < 0.0
+    orient2d(p, q, r) == 0.0 && forward < 0.0
 }
 
 /// Tells whether two segments cross or touch.
 fn segments_meet([a, b]: [[f64; 2]; 2], [c, d]: [[f64; 2]; 2]) -> bool {
-    let (c_side, d_side, a_side, b_side) = (turn(a, b, c), turn(a, b, d), turn(c, d, a), turn(c, d, b));
+    let (c_side, d_side, a_side, b_side) = (orient2d(a, b, c), orient2d(a, b, d), orient2d(c, d, a), orient2d(c, d, b));
     if c_side * d_side < 0.0 && a_side * b_side < 0.0 {
         return true;
     }
     let within = |p: [f64; 2], q: [f64; 2], r: [f64; 2]| {
-        (0..2).all(|k| p[k].min(q[k]) <= r[k] && r[k] <= p[k].max(q[k])) && turn(p, q, r) == 0.0
+        (0..2).all(|k| p[k].min(q[k]) <= r[k] && r[k] <= p[k].max(q[k])) && orient2d(p, q, r) == 0.0
     };
     within(a, b, c) || within(a, b, d) || within(c, d, a) || within(c, d, b)
 }

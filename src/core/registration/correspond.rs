@@ -3,10 +3,10 @@
 use rayon::prelude::*;
 
 use crate::geometry::{Point, Pose, Vector};
-use crate::surface::simd::{F64x4, FourFeet, LANES, Vector3x4, side_by_side};
-use crate::surface::{OffsetSurface, Place};
+use crate::surface::simd::{F64x4, LANES, Real, Vector3x4};
+use crate::surface::{FourFeet, OffsetSurface, Place, side_by_side};
 
-use super::PointStatus;
+use super::deviation::PointStatus;
 use super::linearize::{FourSums, Scaling, Sums};
 use super::robust::ScaledLoss;
 

@@ -1,12 +1,12 @@
 //! The alternating iteration of section 2.3 of the paper: feet, ball-constrained step, feet again.
 
-use nalgebra::Matrix6;
+use nalgebra::{Matrix6, Vector6};
 
 use crate::geometry::{Point, Pose};
 use crate::surface::OffsetSurface;
 
-use super::RegistrationError;
 use super::correspond::{Correspondence, ResidualModel, correspond};
+use super::error::RegistrationError;
 use super::linearize::{Scaling, Sums};
 use super::solve::Spectrum;
 
@@ -65,10 +65,28 @@ const NO_GAIN: f64 = 1e-2;
 /// A step this short that raises the objective is the noise of rounding or of one triangle's edge, not a wrong way.
 const SETTLED: f64 = 1e-7;
 
+/// A pose, and the linear problem at the feet under it.
+struct Standing {
+    pose: Pose,
+    scaling: Scaling,
+    sums: Sums,
+}
+
+/// A step within the ball, in scaled coordinates.
+struct BallStep {
+    scaled: Vector6<f64>,
+    length: f64,
+    /// What the linear problem says that the objective falls by, at most.
+    promised_mm2: f64,
+    /// Number of directions that the surface sees.
+    rank: usize,
+}
+
 impl Problem<'_> {
     /// Descends from a pose to the nearest minimum of the objective; the objective of steps taken never rises, eq. (14).
     ///
-    /// At the end the correspondences and the sums are those of the pose that is returned. The sums at the start may be known already.
+    /// At the end the correspondences and the sums are those of the pose that is returned. The sums at the start may be known
+    /// already.
     pub(crate) fn descend(
         &self,
         start: Pose,
@@ -76,65 +94,71 @@ impl Problem<'_> {
         correspondences: &mut [Correspondence],
         trace: &mut Vec<Iteration>,
     ) -> Result<Descent, RegistrationError> {
-        let mut pose = start;
-        let mut scaling = self.scaling_at(&pose);
-        let mut sums = known.unwrap_or_else(|| self.feet(correspondences, &pose, &scaling));
-        let mut ball_radius = self.ball_radius;
-        let mut rank = 0;
-        let mut converged = false;
+        let mut at = match known {
+            Some(sums) => Standing { pose: start, scaling: self.scaling_at(&start), sums },
+            None => self.stand(start, correspondences),
+        };
+        let (mut ball_radius, mut rank, mut converged) = (self.ball_radius, 0, false);
         // Whether the correspondences tell of the pose that stands, or of one that was taken back.
         let mut current = true;
         for _ in 0..self.most_iterations {
-            if sums.points < 6 {
-                return Err(RegistrationError::TooFewUsed { used: sums.points, points: self.measured.len() });
-            }
-            let free = free_directions(&self.locked, &scaling);
-            let spectrum = Spectrum::new(&(free * sums.gram() * free));
-            rank = spectrum.rank(self.least_share, sums.gram().trace());
-            let right = free * sums.right();
-            let m = spectrum.step(&right, rank, ball_radius); // eq. (15)
-            let step = m.norm();
-            // What the linear problem says that the objective falls by, at most: m.(2 A^T b - A^T A m) <= 2 m.(A^T b).
-            let promised = 2.0 * m.dot(&right);
-            let none_left = !trace.is_empty() && promised <= NO_GAIN * self.tolerance * sums.objective_mm2;
-            if step < STILL || sums.objective_mm2 == 0.0 || none_left {
-                converged = true;
+            let step = self.step_within(ball_radius, &at)?;
+            rank = step.rank;
+            converged = self.is_at_minimum(&step, &at.sums, trace.is_empty());
+            if converged {
                 break;
             }
-            let candidate = (pose * Pose::exp(&scaling.twist(&m))).orthonormalised(); // eq. (10), left side
-            let candidate_scaling = self.scaling_at(&candidate);
-            let candidate_sums = self.feet(correspondences, &candidate, &candidate_scaling);
-            let taken = candidate_sums.objective_mm2 <= sums.objective_mm2;
-            current = taken;
-            trace.push(Iteration {
-                objective_mm2: candidate_sums.objective_mm2,
-                step,
-                ball_radius,
-                taken,
-                points: candidate_sums.points,
-            });
-            if !taken {
-                ball_radius = step.min(ball_radius) * 0.25;
-                converged = step < SETTLED;
-                if converged {
-                    break;
+            let there = (at.pose * Pose::exp(&at.scaling.twist(&step.scaled))).orthonormalised(); // eq. (10), left side
+            let candidate = self.stand(there, correspondences);
+            let Sums { objective_mm2, points, .. } = candidate.sums;
+            current = objective_mm2 <= at.sums.objective_mm2;
+            trace.push(Iteration { objective_mm2, step: step.length, ball_radius, taken: current, points });
+            if current {
+                converged = 1.0 - objective_mm2 / at.sums.objective_mm2 <= self.tolerance;
+                if step.length > 0.99 * ball_radius {
+                    ball_radius *= 2.0;
                 }
-                continue;
+                at = candidate;
+            } else {
+                converged = step.length < SETTLED;
+                ball_radius = step.length.min(ball_radius) * 0.25;
             }
-            let gain = 1.0 - candidate_sums.objective_mm2 / sums.objective_mm2;
-            if step > 0.99 * ball_radius {
-                ball_radius *= 2.0;
-            }
-            (pose, scaling, sums) = (candidate, candidate_scaling, candidate_sums);
-            if gain <= self.tolerance {
-                converged = true;
+            if converged {
                 break;
             }
         }
         if !current {
-            sums = self.feet(correspondences, &pose, &scaling);
+            at = self.stand(at.pose, correspondences);
         }
+        let Standing { pose, scaling, sums } = at;
         Ok(Descent { cmm_from_model: pose, objective_mm2: sums.objective_mm2, scaling, sums, rank, converged })
+    }
+
+    /// Finds the feet under a pose and sums the linear problem there.
+    fn stand(&self, pose: Pose, correspondences: &mut [Correspondence]) -> Standing {
+        let scaling = self.scaling_at(&pose);
+        Standing { pose, scaling, sums: self.feet(correspondences, &pose, &scaling) }
+    }
+
+    /// Returns the best step of the linear problem within the ball, along the directions that are free and seen; eq. (15).
+    fn step_within(&self, ball_radius: f64, at: &Standing) -> Result<BallStep, RegistrationError> {
+        let sums = &at.sums;
+        if sums.points < 6 {
+            return Err(RegistrationError::TooFewUsed { used: sums.points, points: self.measured.len() });
+        }
+        let free = free_directions(&self.locked, &at.scaling);
+        let spectrum = Spectrum::new(&(free * sums.gram() * free));
+        let rank = spectrum.rank(self.least_share, sums.gram().trace());
+        let right = free * sums.right();
+        let m = spectrum.step(&right, rank, ball_radius);
+        // m.(2 A^T b - A^T A m) <= 2 m.(A^T b).
+        Ok(BallStep { scaled: m, length: m.norm(), promised_mm2: 2.0 * m.dot(&right), rank })
+    }
+
+    /// Whether a step is not worth trying; the first of a registration is, if it moves anything.
+    fn is_at_minimum(&self, step: &BallStep, sums: &Sums, is_first: bool) -> bool {
+        let little = !is_first && step.promised_mm2 <= NO_GAIN * self.tolerance * sums.objective_mm2;
+        step.length < STILL || sums.objective_mm2 == 0.0 || little
     }
 
     /// Where the twist of a step from a pose is taken.

@@ -18,7 +18,8 @@ use std::collections::BTreeMap;
 
 use nalgebra::Matrix3;
 
-use super::{Deviation, PointStatus, Registration};
+use super::deviation::{Deviation, PointStatus};
+use super::result::Registration;
 use crate::geometry::Vector;
 
 /// What error of a map is put up with.

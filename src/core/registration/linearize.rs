@@ -3,7 +3,7 @@
 use nalgebra::{Matrix6, Vector6};
 
 use crate::geometry::{Point, Twist, Vector};
-use crate::surface::simd::{F64x4, LANES, Vector3x4, cross, minus};
+use crate::surface::simd::{F64x4, LANES, Real, Vector3x4, cross, minus};
 
 /// Where the twist of a step is taken: about the middle of the cloud, translations in units of its size.
 ///

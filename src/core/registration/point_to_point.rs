@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use crate::geometry::{Point, Pose, Vector};
 use crate::surface::{Nominal, Side};
 
-use super::RegistrationError;
+use super::error::RegistrationError;
 
 /// What an iteration on closest points found.
 #[derive(Clone, Debug)]

@@ -11,7 +11,8 @@
 
 use nalgebra::Vector6;
 
-use super::{Deviation, PointStatus, Registration};
+use super::deviation::{Deviation, PointStatus};
+use super::result::Registration;
 
 impl Registration {
     /// Adds the standard uncertainty of the probe's radius, in millimetres, to what is stated of pose and deviations.

@@ -10,10 +10,12 @@ use rayon::prelude::*;
 use crate::geometry::{Point, Pose, Vector};
 use crate::surface::{Feature, OffsetSurface, Place, Side, features, principal_axes};
 
-use super::correspond::{Correspondence, ResidualModel, middle_and_size};
+use super::correspond::{Correspondence, middle_and_size};
+use super::error::RegistrationError;
 use super::iterate::Problem;
+use super::options::{Options, ProbeSide, Start};
+use super::part::Part;
 use super::robust::{Loss, ScaledLoss, robust_sigma};
-use super::{Options, Part, ProbeSide, Registration, RegistrationError, Start};
 
 /// Where the registration begins.
 #[derive(Clone, Debug)]
@@ -79,12 +81,12 @@ pub(crate) fn initial_pose(
 }
 
 /// Returns the rms to which the mirrored cloud fits; `None` if it cannot be registered at all.
-pub(crate) fn mirrored_rms(part: &Part, measured: &[Point], options: &Options, found: &Registration) -> Option<f64> {
+pub(crate) fn mirrored_rms(part: &Part, measured: &[Point], options: &Options, side: Side) -> Option<f64> {
     // Mirrored in the plane x = 0 of the CMM frame: which plane does not matter to a search over all poses.
     let mirrored: Vec<Point> = spread(measured, 4 * COMPARED).map(|p| Point::new(-p.x, p.y, p.z)).collect();
-    let options = Options { side: ProbeSide::Known(found.side), ..*options };
+    let options = Options { side: ProbeSide::Known(side), ..*options };
     let search = Search::new(part, &mirrored, &options);
-    search.compared(&search.candidates(found.side), found.side).first().map(|c| c.rms_mm)
+    search.compared(&search.candidates(side), side).first().map(|c| c.rms_mm)
 }
 
 /// Some of the points, evenly along their order; jittered, so that the choice does not run along one column of a grid.
@@ -286,19 +288,14 @@ impl<'a> Search<'a> {
 
     /// Descends under a loss that forgets gross outliers, its scale following the distances down.
     fn refine(&self, start: Pose, side: Side, points: &[Point], rounds: usize, iterations: usize) -> Candidate {
-        let surface = self.part.surface(self.options, side);
         let (middle, size_mm) = middle_and_size(points);
         let mut problem = Problem {
-            surface,
             middle,
             size_mm,
-            residual: ResidualModel { subtract_mm: self.part.subtract_mm, loss: ScaledLoss::new(Loss::None, 1.0) },
-            measured: points,
-            locked: self.options.locked,
-            least_share: self.part.least_share,
             tolerance: 1e-6,
             ball_radius: 0.4,
             most_iterations: iterations,
+            ..self.part.problem(points, self.options, side)
         };
         let mut pose = start;
         let mut correspondences = vec![Correspondence::NEW; points.len()];
@@ -313,7 +310,7 @@ impl<'a> Search<'a> {
                 Err(_) => break,
             }
         }
-        let (rms_mm, off_part) = self.trimmed_rms(&surface, &pose, points);
+        let (rms_mm, off_part) = self.trimmed_rms(&problem.surface, &pose, points);
         Candidate { cmm_from_model: pose, rms_mm, off_part, side }
     }
 

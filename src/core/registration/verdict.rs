@@ -5,14 +5,16 @@ use rayon::prelude::*;
 
 use crate::geometry::{Point, Pose, Vector};
 use crate::surface::Nominal;
-use crate::surface::simd::{F64x4, LANES};
+use crate::surface::simd::{F64x4, LANES, Real};
 
 use super::correspond::{Correspondence, FourFinal, Report};
+use super::deviation::{Deviation, PointStatus};
 use super::iterate::{Descent, Problem, free_directions};
 use super::linearize::Scaling;
+use super::options::{Method, Options};
+use super::part::Part;
 use super::solve::Spectrum;
 use super::start::InitialPose;
-use super::{Deviation, Method, Options, Part, PointStatus};
 
 /// What to think of a registration.
 #[derive(Clone, Debug)]

@@ -9,10 +9,15 @@
 
 use rayon::prelude::*;
 
-use super::projection::Map;
-use super::{Distance, Nominal, OffsetSurface, Place, Projection, Side, SurfaceError};
 use crate::geometry::grid_order::NO_POINT;
 use crate::geometry::{Point, Vector, recognise_grid};
+
+use super::error::SurfaceError;
+use super::facet::Side;
+use super::nominal::{Nominal, check_grid};
+use super::normals::tangents;
+use super::offset::{Distance, OffsetSurface, Place};
+use super::projection::{Map, Projection, is_line};
 
 /// The spacings of the two coarser samplings in spacings of the whole one: of a grid, and of scattered points.
 const OF_GRID: [usize; 2] = [3, 6];
@@ -143,7 +148,7 @@ impl Estimate {
 pub fn accuracy(samples: Samples) -> Result<Accuracy, SurfaceError> {
     let (points, factor, [fine, coarse]) = match samples {
         Samples::Grid { columns, rows, points, normals } => {
-            super::check_grid(columns, rows, points.len().min(normals.len()))?;
+            check_grid(columns, rows, points.len().min(normals.len()))?;
             let level = |stride| defined_grid_level(columns, rows, points, normals, stride);
             (points, OF_GRID[0], [level(OF_GRID[0])?, level(OF_GRID[1])?])
         }
@@ -216,7 +221,7 @@ fn kept_of_points(points: &[Point], projection: Projection) -> Result<(usize, [V
     if points.len() < 9 {
         return Err(SurfaceError::TooFewPoints { points: points.len(), least: 9 });
     }
-    if super::is_line(points) {
+    if is_line(points) {
         return Err(SurfaceError::Collinear { points: points.len() });
     }
     let (_, map) = projection.prepare(points)?;
@@ -269,7 +274,7 @@ fn measure(coarse: &Nominal, points: &[Point], left_out: &[bool]) -> Errors {
         let errors_mm = [flat.foot(&at, foot.place).distance_mm, foot.distance_mm];
         let spacing_mm = curved.spacing_mm(foot.place);
         let reach = BORDER * spacing_mm;
-        let [u, v] = super::normals::tangents(&foot.normal);
+        let [u, v] = tangents(&foot.normal);
         let around = (0..8).map(|k| std::f64::consts::FRAC_PI_4 * f64::from(k)).map(|a| u * a.cos() + v * a.sin());
         let inside = around.into_iter().all(|d| curved.foot(&(at + d * reach), foot.place).beyond_mm == 0.0);
         Some((inside, spacing_mm, Measured { at, errors_mm }))

@@ -4,8 +4,8 @@ use rayon::prelude::*;
 
 use crate::geometry::Point;
 
-use super::SurfaceError;
 use super::edges::{Strewn, Triangulation};
+use super::error::SurfaceError;
 use super::mesh::BORDER;
 use super::projection::Map;
 

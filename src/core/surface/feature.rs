@@ -5,8 +5,8 @@ use rayon::prelude::*;
 
 use crate::geometry::{Point, Vector};
 
+use super::facet::Side;
 use super::normals::fit;
-use super::offset::Side;
 use super::projection::principal_axes;
 
 /// A place of a surface with its normal and the way it bends there.

@@ -4,11 +4,12 @@ use rayon::prelude::*;
 
 use crate::geometry::Vector;
 
-use super::SurfaceError;
+use super::error::SurfaceError;
+use super::facet::{Facets, Vertex, four_vertices};
 use super::grid::GridLattice;
 use super::offset::{OffsetSurface, Place};
-use super::patch::{Facets, Lattice, Patch, Vertex};
-use super::simd::{F64x4, LANES, Vector3x4, dot, four_vertices, minus, times};
+use super::patch::{Lattice, Patch};
+use super::simd::{F64x4, LANES, Real, Vector3x4, dot, minus, times};
 
 /// Facets of a mesh that are looked at besides those touched: its normals are fitted only where they are needed.
 const LOOKED_AT: usize = 2048;

@@ -5,8 +5,8 @@ use rayon::prelude::*;
 use crate::geometry::grid_order::{GridInOrder, GridOrder, NO_POINT};
 use crate::geometry::{Point, Vector};
 
-use super::patch::{Facets, Vertex};
-use super::simd::{F64x4, LANES, Vector3x4, cross, dot, minus, side_by_side, times};
+use super::facet::{Facets, Vertex, side_by_side};
+use super::simd::{F64x4, LANES, Real, Vector3x4, cross, minus, times};
 
 /// The triangles of a structured grid, row by row with the column fastest.
 ///
@@ -254,7 +254,7 @@ impl Block<'_> {
     fn four_inside(&self, first: usize, nodes: &mut [Vertex; LANES]) {
         let (u, v) = (self.central_derivative(first, 1), self.central_derivative(first, self.lattice.columns()));
         let n = cross(&u, &v);
-        let normal = times(&n, F64x4::splat(1.0) / dot(&n, &n).sqrt());
+        let normal = F64x4::unit(&n);
         for (l, node) in nodes.iter_mut().enumerate() {
             let normal = Vector::new(normal[0].0[l], normal[1].0[l], normal[2].0[l]);
             *node = Vertex { point: self.points[first + l], normal };

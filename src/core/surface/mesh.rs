@@ -4,8 +4,8 @@ use kiddo::{ImmutableKdTree, SquaredEuclidean};
 
 use crate::geometry::{Point, Vector};
 
-use super::SurfaceError;
-use super::patch::Facets;
+use super::error::SurfaceError;
+use super::facet::Facets;
 
 /// No neighbour: the surface ends at this edge.
 pub(crate) const BORDER: u32 = u32::MAX;

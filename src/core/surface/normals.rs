@@ -2,9 +2,9 @@
 
 use crate::geometry::{Point, Vector};
 
+use super::facet::Facets;
 use super::mesh::MeshLattice;
-use super::patch::Facets;
-use super::simd::{F64x4, LANES, Vector3x4};
+use super::simd::{F64x4, LANES, Real, Vector3x4};
 
 /// How many neighbours a fit asks for: nine unknowns and some to spare. Two rings of a triangulation have eighteen, at a border
 /// about ten, so that a third ring is taken in there.

@@ -1,22 +1,12 @@
-//! The surface on which the centre of a probe travels, and the signed distance of a point from it.
-//!
-//! A corner of a facet is offset along its normal, S_e = S + r n, eq. (3). The flat distance is that of the paper,
-//! eq. (1) and (2). The curved distance knows that the surface bulges between its corners: with barycentric weights b and the
-//! slope of the surface along each edge at each of its ends, the height over the flat facet is the cubic
-//!
-//! ```text
-//! h(b) = sum over i != j of g_ij b_i^2 b_j + 1/2 b_0 b_1 b_2 sum over i != j of g_ij,   g_ij = -n_i.(p_j - p_i)
-//! ```
-//!
-//! which is the cubic triangle with quadratic precision (Vlachos et al., Curved PN triangles, 2001), its heights taken along
-//! the normals of the surface instead of the normal of the facet. The foot of the perpendicular on the flat facet is off by
-//! the distance times the lean of the surface against the facet, so the distance along the normal n(b) of the surface is
-//! d (N.n(b)) - h(b), with d and N the flat distance and normal: exact to third order in the size of a facet.
+//! The surface on which the centre of a probe travels, and where the foot of a point on it is; the formula is in [`super::facet`].
 
 use crate::geometry::{Point, Vector};
 
-use super::patch::{Facets, Lattice, Patch};
-use super::{Nominal, SurfaceError};
+use super::error::SurfaceError;
+use super::facet::{Facet, Facets, Side, corner};
+use super::nominal::Nominal;
+use super::patch::{Lattice, Patch};
+use super::simd::{dot, minus};
 
 /// How the surface runs between the corners of a facet.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
@@ -37,35 +27,6 @@ pub enum Lookup {
     Foot,
     /// The one above or below which it lies along z, as in section 2.1 of the paper.
     Projection,
-}
-
-/// On which side of the nominal surface the probe travels.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Side {
-    /// Where the normals of the nominal surface point: +z for a height over the plane, outwards for a mesh.
-    #[default]
-    Normal,
-    /// The other one.
-    Opposite,
-}
-
-impl Side {
-    /// Returns +1 on the side of the normals and -1 on the other.
-    pub fn sign(self) -> f64 {
-        match self {
-            Self::Normal => 1.0,
-            Self::Opposite => -1.0,
-        }
-    }
-
-    /// Returns the other side.
-    pub fn other(self) -> Self {
-        match self {
-            Self::Normal => Self::Opposite,
-            Self::Opposite => Self::Normal,
-        }
-    }
 }
 
 /// The offset of a nominal surface: a view that holds no points of its own.
@@ -150,11 +111,6 @@ impl<'a> OffsetSurface<'a> {
     /// Chooses which facet a point belongs to.
     pub fn with_lookup(self, lookup: Lookup) -> Self {
         Self { lookup, ..self }
-    }
-
-    /// Chooses the side of the nominal surface.
-    pub fn with_side(self, side: Side) -> Self {
-        Self { side, ..self }
     }
 
     /// Returns the nominal surface that is offset.
@@ -262,8 +218,8 @@ impl<'a> OffsetSurface<'a> {
         let mut facet = self.approach(patch, facets, p, start);
         let mut before = u32::MAX;
         for _ in 0..MOST_STEPS {
-            let corner = OffsetFacet::new(self, patch, facets.corners(facet));
-            let weights = corner.weights(p, self.lookup);
+            let here = self.facet(patch, facets.corners(facet));
+            let weights = self.weights(&here, p);
             let inside = weights[0].min(weights[1]).min(weights[2]) >= INSIDE;
             let next = if inside { None } else { facets.advance(facet, &weights) };
             match next {
@@ -273,120 +229,71 @@ impl<'a> OffsetSurface<'a> {
                     before = facet;
                     facet = next;
                 }
-                _ => return corner.foot(p, weights, inside || next.is_some(), self.distance, number, facet),
+                _ => return self.foot_in(&here, p, weights, inside || next.is_some(), Place { patch: number, facet }),
             }
         }
-        let corner = OffsetFacet::new(self, patch, facets.corners(facet));
-        let weights = corner.weights(p, self.lookup);
-        corner.foot(p, weights, true, self.distance, number, facet)
+        let here = self.facet(patch, facets.corners(facet));
+        self.foot_in(&here, p, self.weights(&here, p), true, Place { patch: number, facet })
     }
-}
 
-/// A facet with its corners on the offset surface.
-struct OffsetFacet {
-    x: [Vector; 3],
-    n: [Vector; 3],
-    /// Normal of the flat facet, not of unit length, in the sense in which the corners turn.
-    turned: Vector,
-    /// The same of unit length, towards the probe's side; eq. (1).
-    flat: Vector,
-    per_turned_squared: f64,
-}
-
-impl OffsetFacet {
+    /// A facet with its corners on the offset surface.
     #[inline(always)]
-    fn new(surface: &OffsetSurface, patch: &Patch, [a, b, c]: [u32; 3]) -> Self {
-        let sign = surface.side.sign();
-        let (a, b, c) = (patch.vertex(a), patch.vertex(b), patch.vertex(c));
-        let n = [a.normal * sign, b.normal * sign, c.normal * sign];
-        let offset = |point: &Point, n: &Vector| point.coords + n * surface.radius_mm; // eq. (3)
-        let x = [offset(&a.point, &n[0]), offset(&b.point, &n[1]), offset(&c.point, &n[2])];
-        let turned = (x[1] - x[0]).cross(&(x[2] - x[0]));
-        let squared = turned.norm_squared();
-        let flat = turned * (sign / squared.sqrt());
-        Self { x, n, turned, flat, per_turned_squared: 1.0 / squared }
+    fn facet(&self, patch: &Patch, corners: [u32; 3]) -> Facet<f64> {
+        let sign = self.side.sign();
+        let [a, b, c] = corners.map(|k| patch.vertex(k)).map(|v| (v.point.coords.into(), v.normal.into()));
+        Facet::new([a, b, c].map(|vertex| corner(vertex, sign, self.radius_mm)), sign)
     }
 
     /// Barycentric weights of the foot on the plane of the flat facet.
     #[inline(always)]
-    fn weights(&self, p: &Point, lookup: Lookup) -> [f64; 3] {
-        let mut w = p.coords - self.x[0];
-        if lookup == Lookup::Projection {
-            w.z -= w.dot(&self.turned) / self.turned.z;
+    fn weights(&self, facet: &Facet<f64>, p: &Point) -> [f64; 3] {
+        let mut w = facet.seen_from(0, &p.coords.into());
+        if self.lookup == Lookup::Projection {
+            w[2] -= dot(&w, &facet.turned) / facet.turned[2];
         }
-        let b1 = w.cross(&(self.x[2] - self.x[0])).dot(&self.turned) * self.per_turned_squared;
-        let b2 = (self.x[1] - self.x[0]).cross(&w).dot(&self.turned) * self.per_turned_squared;
-        [1.0 - b1 - b2, b1, b2]
+        facet.weights(&w)
     }
 
     #[inline(always)]
-    fn foot(&self, p: &Point, weights: [f64; 3], inside: bool, distance: Distance, patch: u32, facet: u32) -> Foot {
-        let place = Place { patch, facet };
+    fn foot_in(&self, facet: &Facet<f64>, p: &Point, weights: [f64; 3], inside: bool, place: Place) -> Foot {
+        let w = facet.seen_from(0, &p.coords.into());
         let (mut beyond_mm, mut beyond_steps) = (0.0, 0.0);
         if !inside {
-            let clamped = self.clamped(p, &weights);
-            beyond_mm = (self.at(&clamped) - self.at(&weights)).norm();
-            beyond_steps = beyond_mm / self.turned.norm().sqrt();
+            let clamped = clamped(facet, &p.coords.into(), &weights);
+            let beyond = minus(&facet.at(&clamped), &facet.at(&weights));
+            beyond_mm = dot(&beyond, &beyond).sqrt();
+            beyond_steps = beyond_mm / facet.squared.sqrt().sqrt();
             if beyond_steps > EDGE_REACH {
-                let (distance_mm, normal) = self.over_tangent_plane(p, &clamped, distance);
+                let (distance_mm, normal) = self.over_tangent_plane(facet, p, &clamped);
                 return Foot { place, distance_mm, normal, beyond_mm, beyond_steps };
             }
         }
-        let flat_mm = (p.coords - self.x[0]).dot(&self.flat); // eq. (2)
-        let (distance_mm, normal) = match distance {
-            Distance::Triangle => (flat_mm, self.flat),
-            Distance::Curved => {
-                let normal = self.normal(&weights);
-                (flat_mm * normal.dot(&self.flat) - self.height(&weights), normal)
-            }
+        let (distance_mm, normal) = match self.distance {
+            Distance::Triangle => facet.flat_distance(&w),
+            Distance::Curved => facet.curved_distance(&w, &weights),
         };
-        Foot { place, distance_mm, normal, beyond_mm, beyond_steps }
+        Foot { place, distance_mm, normal: normal.into(), beyond_mm, beyond_steps }
     }
 
     /// The distance from the tangent plane at a place of the edge, and its normal.
     #[cold]
-    fn over_tangent_plane(&self, p: &Point, at: &[f64; 3], distance: Distance) -> (f64, Vector) {
-        let (anchor, normal) = match distance {
-            Distance::Triangle => (self.at(at), self.flat),
-            Distance::Curved => (self.at(at) + self.flat * self.height(at), self.normal(at)),
+    fn over_tangent_plane(&self, facet: &Facet<f64>, p: &Point, at: &[f64; 3]) -> (f64, Vector) {
+        let (on_flat, flat) = (Vector::from(facet.at(at)), Vector::from(facet.flat_normal()));
+        let (anchor, normal) = match self.distance {
+            Distance::Triangle => (on_flat, flat),
+            Distance::Curved => (on_flat + flat * facet.height(at), facet.normal(at).into()),
         };
         ((p.coords - anchor).dot(&normal), normal)
     }
+}
 
-    #[inline(always)]
-    fn at(&self, b: &[f64; 3]) -> Vector {
-        self.x[0] * b[0] + self.x[1] * b[1] + self.x[2] * b[2]
-    }
-
-    #[inline(always)]
-    fn normal(&self, b: &[f64; 3]) -> Vector {
-        let n = self.n[0] * b[0] + self.n[1] * b[1] + self.n[2] * b[2];
-        n / n.norm_squared().sqrt()
-    }
-
-    /// Height of the curved surface over the flat facet, positive on the probe's side.
-    #[inline(always)]
-    fn height(&self, b: &[f64; 3]) -> f64 {
-        let edges = [self.x[1] - self.x[0], self.x[2] - self.x[1], self.x[0] - self.x[2]];
-        // Slope of the surface along edge k, at its beginning and against its direction at its end.
-        let leaving = |k: usize| -self.n[k].dot(&edges[k]);
-        let arriving = |k: usize, end: usize| self.n[end].dot(&edges[k]);
-        let g = [(leaving(0), arriving(0, 1)), (leaving(1), arriving(1, 2)), (leaving(2), arriving(2, 0))];
-        let along = b[0] * b[1] * (b[0] * g[0].0 + b[1] * g[0].1)
-            + b[1] * b[2] * (b[1] * g[1].0 + b[2] * g[1].1)
-            + b[2] * b[0] * (b[2] * g[2].0 + b[0] * g[2].1);
-        let total = g[0].0 + g[0].1 + g[1].0 + g[1].1 + g[2].0 + g[2].1;
-        along + 0.5 * total * b[0] * b[1] * b[2]
-    }
-
-    /// Weights of the nearest place of the facet for a point that lies beyond its most negative edge.
-    fn clamped(&self, p: &Point, b: &[f64; 3]) -> [f64; 3] {
-        let k = (0..3).min_by(|&i, &j| b[i].total_cmp(&b[j])).expect("three weights");
-        let (i, j) = ((k + 1) % 3, (k + 2) % 3);
-        let edge = self.x[j] - self.x[i];
-        let t = ((p.coords - self.x[i]).dot(&edge) / edge.norm_squared()).clamp(0.0, 1.0);
-        let mut clamped = [0.0; 3];
-        (clamped[i], clamped[j]) = (1.0 - t, t);
-        clamped
-    }
+/// Weights of the nearest place of a facet for a point that lies beyond its most negative edge.
+fn clamped(facet: &Facet<f64>, p: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
+    let k = (0..3).min_by(|&i, &j| b[i].total_cmp(&b[j])).expect("three weights");
+    let (i, j) = ((k + 1) % 3, (k + 2) % 3);
+    let edge = facet.edge(i, j);
+    let t = (dot(&facet.seen_from(i, p), &edge) / dot(&edge, &edge)).clamp(0.0, 1.0);
+    let mut clamped = [0.0; 3];
+    (clamped[i], clamped[j]) = (1.0 - t, t);
+    clamped
 }

@@ -10,6 +10,7 @@ use rayon::prelude::*;
 
 use crate::geometry::{Point, Vector};
 
+use super::facet::{Facets, Vertex};
 use super::grid::GridLattice;
 use super::mesh::MeshLattice;
 use super::normals;
@@ -22,14 +23,6 @@ pub(crate) struct Patch {
     vertices: Vertices,
 }
 
-/// A point of a surface with its unit normal: side by side, since a point location needs both, and apart they would cost it
-/// twice the cache lines.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Vertex {
-    pub(crate) point: Point,
-    pub(crate) normal: Vector,
-}
-
 /// How the triangles of a patch are known.
 #[derive(Debug)]
 pub(crate) enum Lattice {
@@ -37,18 +30,6 @@ pub(crate) enum Lattice {
     Grid(GridLattice),
     /// Triangles and their neighbours in flat arrays.
     Mesh(MeshLattice),
-}
-
-/// What a point location needs of the triangles; counter-clockwise seen from the side of the normals.
-pub(crate) trait Facets: Sync {
-    /// Returns the three corners of a facet.
-    fn corners(&self, facet: u32) -> [u32; 3];
-
-    /// Returns the facet to look at next for a point with these barycentric weights; `None` where the surface ends.
-    fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32>;
-
-    /// Returns a facet to start from.
-    fn start(&self, p: &Point) -> u32;
 }
 
 #[derive(Debug)]

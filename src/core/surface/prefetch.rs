@@ -7,8 +7,9 @@ use rayon::prelude::*;
 
 use crate::geometry::Point;
 
+use super::facet::Facets;
 use super::offset::{OffsetSurface, Place};
-use super::patch::{Facets, Lattice};
+use super::patch::Lattice;
 
 /// Points that a task takes at a time.
 const CHUNK: usize = 512;

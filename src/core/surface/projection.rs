@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::geometry::{Point, Vector};
 
-use super::SurfaceError;
+use super::error::SurfaceError;
 use super::normals::tangents;
 
 /// What to project scattered points onto before they are triangulated.
@@ -191,6 +191,21 @@ fn best_fit_sphere(points: &[Point]) -> Option<Map> {
     let pole = if offset.norm() > 1e-6 * radius_mm { -offset.normalize() } else { Vector::z() };
     let [tu, tv] = tangents(&pole);
     radius_mm.is_finite().then(|| Map::Sphere { centre: middle + offset, radius_mm, axes: [tu, tv, pole] })
+}
+
+/// Whether points lie on one line to rounding.
+pub(crate) fn is_line(points: &[Point]) -> bool {
+    const FEW: usize = 4096;
+    // Points of which some are on no line are on none.
+    let some: Vec<Point> = points.iter().step_by(points.len().div_ceil(FEW).max(1)).copied().collect();
+    are_on_line(&some) && (some.len() == points.len() || are_on_line(points))
+}
+
+fn are_on_line(points: &[Point]) -> bool {
+    let (_, eigen) = principal_axes(points);
+    let mut spread: [f64; 3] = eigen.eigenvalues.into();
+    spread.sort_by(f64::total_cmp);
+    spread[1] <= 1e-18 * spread[2]
 }
 
 #[cfg(test)]

@@ -1,18 +1,27 @@
-//! The point location and the distance, four points at a time.
-//!
-//! Once a registration has settled, nearly every point stays on its facet from one iteration to the next, and over a grid a
-//! point that left it is a jump or two away. The arithmetic of [`super::offset`] is then the same straight line of products
-//! and sums for all, which the compiler turns into vector instructions when four points stand side by side. Points that leave
-//! the surface, or have a longer way, are left to the single search. The operations are those of the single point, so the two
-//! agree to rounding.
+//! The arithmetic of four numbers side by side, which the compiler turns into vector instructions, and what it has in common with
+//! that of one: a formula written for any [`Real`] serves both.
 
-use crate::geometry::Point;
+use std::ops::{Add, Div, Mul, Sub};
 
-use super::offset::{Distance, INSIDE, Lookup, OffsetSurface, Place};
-use super::patch::{Facets, Lattice, Patch, Vertex};
-
-/// Points handled at a time.
+/// Numbers handled at a time.
 pub(crate) const LANES: usize = 4;
+
+/// A number to compute with: one, or four side by side.
+pub(crate) trait Real:
+    Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self>
+{
+    /// The same number everywhere.
+    fn splat(value: f64) -> Self;
+
+    /// The square root.
+    fn sqrt(self) -> Self;
+
+    /// The vector of unit length along one; four at once by one division instead of three.
+    fn unit(v: &[Self; 3]) -> [Self; 3];
+
+    /// The sum of three, grouped as suits its kind: one after the other, or the last two first so that they need not wait.
+    fn plus(self, second: Self, third: Self) -> Self;
+}
 
 /// One number of each of four points.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -23,7 +32,7 @@ pub(crate) type Vector3x4 = [F64x4; 3];
 
 macro_rules! lanewise {
     ($trait:ident, $method:ident, $op:tt) => {
-        impl std::ops::$trait for F64x4 {
+        impl $trait for F64x4 {
             type Output = F64x4;
 
             #[inline(always)]
@@ -44,19 +53,54 @@ lanewise!(Sub, sub, -);
 lanewise!(Mul, mul, *);
 lanewise!(Div, div, /);
 
-impl F64x4 {
+impl Real for F64x4 {
     #[inline(always)]
-    pub(crate) fn splat(value: f64) -> Self {
+    fn splat(value: f64) -> Self {
         F64x4([value; LANES])
     }
 
     #[inline(always)]
-    pub(crate) fn sqrt(self) -> Self {
+    fn sqrt(self) -> Self {
         F64x4([self.0[0].sqrt(), self.0[1].sqrt(), self.0[2].sqrt(), self.0[3].sqrt()])
     }
 
     #[inline(always)]
-    fn min(self, other: Self) -> Self {
+    fn unit(v: &[Self; 3]) -> [Self; 3] {
+        times(v, Self::splat(1.0) / dot(v, v).sqrt())
+    }
+
+    #[inline(always)]
+    fn plus(self, second: Self, third: Self) -> Self {
+        self + (second + third)
+    }
+}
+
+impl Real for f64 {
+    #[inline(always)]
+    fn splat(value: f64) -> Self {
+        value
+    }
+
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        self.sqrt()
+    }
+
+    #[inline(always)]
+    fn unit(v: &[Self; 3]) -> [Self; 3] {
+        let norm = dot(v, v).sqrt();
+        [v[0] / norm, v[1] / norm, v[2] / norm]
+    }
+
+    #[inline(always)]
+    fn plus(self, second: Self, third: Self) -> Self {
+        self + second + third
+    }
+}
+
+impl F64x4 {
+    #[inline(always)]
+    pub(crate) fn min(self, other: Self) -> Self {
         let least = |a: f64, b: f64| if a < b { a } else { b };
         F64x4([
             least(self.0[0], other.0[0]),
@@ -68,273 +112,21 @@ impl F64x4 {
 }
 
 #[inline(always)]
-pub(crate) fn dot(a: &Vector3x4, b: &Vector3x4) -> F64x4 {
+pub(crate) fn dot<T: Real>(a: &[T; 3], b: &[T; 3]) -> T {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
 #[inline(always)]
-pub(crate) fn cross(a: &Vector3x4, b: &Vector3x4) -> Vector3x4 {
+pub(crate) fn cross<T: Real>(a: &[T; 3], b: &[T; 3]) -> [T; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
 #[inline(always)]
-pub(crate) fn minus(a: &Vector3x4, b: &Vector3x4) -> Vector3x4 {
+pub(crate) fn minus<T: Real>(a: &[T; 3], b: &[T; 3]) -> [T; 3] {
     [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
 }
 
 #[inline(always)]
-pub(crate) fn times(a: &Vector3x4, b: F64x4) -> Vector3x4 {
+pub(crate) fn times<T: Real>(a: &[T; 3], b: T) -> [T; 3] {
     [a[0] * b, a[1] * b, a[2] * b]
-}
-
-#[inline(always)]
-fn weighted(v: &[Vector3x4; 3], b: &[F64x4; 3]) -> Vector3x4 {
-    let at = |k: usize| v[0][k] * b[0] + v[1][k] * b[1] + v[2][k] * b[2];
-    [at(0), at(1), at(2)]
-}
-
-/// Jumps that four points take together over a grid before they are left to the single search.
-const JUMPS: usize = 4;
-
-/// The feet of four points.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct FourFeet {
-    pub(crate) distance_mm: F64x4,
-    pub(crate) normal: Vector3x4,
-}
-
-/// Four facets with their corners on the offset surface.
-struct FourFacets {
-    x: [Vector3x4; 3],
-    n: [Vector3x4; 3],
-    turned: Vector3x4,
-    squared: F64x4,
-}
-
-impl OffsetSurface<'_> {
-    /// Whether [`OffsetSurface::four_feet`] answers for this surface: one patch, the curved distance at the foot.
-    pub(crate) fn has_four_feet(&self) -> bool {
-        self.nominal().patches().len() == 1 && self.distance() == Distance::Curved && self.lookup() == Lookup::Foot
-    }
-
-    /// Finds the feet of four points near the places given, which become those of the feet.
-    ///
-    /// Returns `None`, and the places mean nothing, where one of them lies beyond the edge or too far away: on a mesh already
-    /// where it is not on its facet, since a walk over one would fit normals on the way.
-    #[inline(always)]
-    pub(crate) fn four_feet(&self, p: &Vector3x4, places: &mut [Place; LANES]) -> Option<FourFeet> {
-        let patch = &self.nominal().patches()[0];
-        match &patch.lattice {
-            Lattice::Grid(grid) => self.four_feet_on(patch, grid, JUMPS, p, places),
-            Lattice::Mesh(mesh) => self.four_feet_on(patch, mesh, 0, p, places),
-        }
-    }
-
-    /// Returns where four points may be that follow others as those followed the ones before; `None` where nothing tells.
-    pub(crate) fn four_extrapolated_places(
-        &self,
-        before: &[Place; LANES],
-        last: &[Place; LANES],
-    ) -> Option<[Place; LANES]> {
-        let Lattice::Grid(grid) = &self.nominal().patches()[0].lattice else { return None };
-        if last.contains(&Place::UNKNOWN) {
-            return None;
-        }
-        Some(std::array::from_fn(|l| {
-            let step = if before[l] == Place::UNKNOWN { 0 } else { last[l].facet().wrapping_sub(before[l].facet()) };
-            let next = last[l].facet().wrapping_add(step);
-            if grid.has_facet(next) { Place::on_first_patch(next) } else { last[l] }
-        }))
-    }
-
-    #[inline(always)]
-    fn four_feet_on<F: Facets>(
-        &self,
-        patch: &Patch,
-        facets: &F,
-        jumps: usize,
-        p: &Vector3x4,
-        places: &mut [Place; LANES],
-    ) -> Option<FourFeet> {
-        let mut jump = 0;
-        loop {
-            let four = self.four_facets(patch, facets, places);
-            let b = four.weights(p);
-            let least = b[0].min(b[1]).min(b[2]);
-            let stays = [least.0[0] >= INSIDE, least.0[1] >= INSIDE, least.0[2] >= INSIDE, least.0[3] >= INSIDE];
-            if stays == [true; LANES] {
-                return Some(four.feet(self.side().sign(), p, &b));
-            }
-            if jump == jumps || !jumped(facets, places, &stays, &b) {
-                return None;
-            }
-            jump += 1;
-        }
-    }
-
-    #[inline(always)]
-    fn four_facets<F: Facets>(&self, patch: &Patch, facets: &F, places: &[Place; LANES]) -> FourFacets {
-        let (x, n) = self.gathered(patch, facets, places);
-        let turned = cross(&minus(&x[1], &x[0]), &minus(&x[2], &x[0]));
-        FourFacets { x, n, turned, squared: dot(&turned, &turned) }
-    }
-
-    /// Corners on the offset surface, eq. (3), and their normals.
-    #[inline(always)]
-    fn gathered<F: Facets>(
-        &self,
-        patch: &Patch,
-        facets: &F,
-        places: &[Place; LANES],
-    ) -> ([Vector3x4; 3], [Vector3x4; 3]) {
-        let (a, b) = (facets.corners(places[0].facet()), facets.corners(places[1].facet()));
-        let (c, d) = (facets.corners(places[2].facet()), facets.corners(places[3].facet()));
-        let first = self.corner(patch, [a[0], b[0], c[0], d[0]]);
-        let second = self.corner(patch, [a[1], b[1], c[1], d[1]]);
-        let third = self.corner(patch, [a[2], b[2], c[2], d[2]]);
-        ([first.0, second.0, third.0], [first.1, second.1, third.1])
-    }
-
-    /// One corner of each of four facets: its place on the offset surface and its normal.
-    ///
-    /// Every lane is built from registers; built through an array in memory it would wait for four narrow stores.
-    #[inline(always)]
-    fn corner(&self, patch: &Patch, [a, b, c, d]: [u32; LANES]) -> (Vector3x4, Vector3x4) {
-        let (sign, radius) = (F64x4::splat(self.side().sign()), F64x4::splat(self.radius_mm()));
-        let (point, normal) = four_vertices(&[patch.vertex(a), patch.vertex(b), patch.vertex(c), patch.vertex(d)]);
-        let normal = times(&normal, sign);
-        let on_offset = [point[0] + normal[0] * radius, point[1] + normal[1] * radius, point[2] + normal[2] * radius];
-        (on_offset, normal)
-    }
-}
-
-impl FourFacets {
-    /// Barycentric weights of the feet on the planes of the flat facets.
-    #[inline(always)]
-    fn weights(&self, p: &Vector3x4) -> [F64x4; 3] {
-        let (e1, e2) = (minus(&self.x[1], &self.x[0]), minus(&self.x[2], &self.x[0]));
-        let per_squared = F64x4::splat(1.0) / self.squared;
-        let w = minus(p, &self.x[0]);
-        let b1 = dot(&cross(&w, &e2), &self.turned) * per_squared;
-        let b2 = dot(&cross(&e1, &w), &self.turned) * per_squared;
-        [F64x4::splat(1.0) - b1 - b2, b1, b2]
-    }
-
-    #[inline(always)]
-    fn feet(&self, sign: f64, p: &Vector3x4, b: &[F64x4; 3]) -> FourFeet {
-        let flat = times(&self.turned, F64x4::splat(sign) / self.squared.sqrt());
-        let mean = weighted(&self.n, b);
-        let normal = times(&mean, F64x4::splat(1.0) / dot(&mean, &mean).sqrt());
-        let flat_mm = dot(&minus(p, &self.x[0]), &flat);
-        FourFeet { distance_mm: flat_mm * dot(&normal, &flat) - height(&self.x, &self.n, b), normal }
-    }
-}
-
-/// Takes the points that do not stay to the facets their weights point at; false where one of them has none.
-#[inline(never)]
-fn jumped<F: Facets>(facets: &F, places: &mut [Place; LANES], stays: &[bool; LANES], b: &[F64x4; 3]) -> bool {
-    for l in (0..LANES).filter(|&l| !stays[l]) {
-        match facets.advance(places[l].facet(), &[b[0].0[l], b[1].0[l], b[2].0[l]]) {
-            Some(next) => places[l] = Place::on_first_patch(next),
-            None => return false,
-        }
-    }
-    true
-}
-
-/// Height of the curved surface over the flat facet.
-#[inline(always)]
-fn height(x: &[Vector3x4; 3], n: &[Vector3x4; 3], b: &[F64x4; 3]) -> F64x4 {
-    let zero = F64x4::splat(0.0);
-    let mut along = zero;
-    let mut total = zero;
-    for (i, j) in [(0, 1), (1, 2), (2, 0)] {
-        let edge = minus(&x[j], &x[i]);
-        let (leaving, arriving) = (zero - dot(&n[i], &edge), dot(&n[j], &edge));
-        along = along + b[i] * b[j] * (b[i] * leaving + b[j] * arriving);
-        total = total + (leaving + arriving);
-    }
-    along + F64x4::splat(0.5) * total * b[0] * b[1] * b[2]
-}
-
-/// Four vertices side by side: their points and their normals.
-#[inline(always)]
-pub(crate) fn four_vertices([a, b, c, d]: &[Vertex; LANES]) -> (Vector3x4, Vector3x4) {
-    let normal = [
-        F64x4([a.normal.x, b.normal.x, c.normal.x, d.normal.x]),
-        F64x4([a.normal.y, b.normal.y, c.normal.y, d.normal.y]),
-        F64x4([a.normal.z, b.normal.z, c.normal.z, d.normal.z]),
-    ];
-    (side_by_side(&[a.point, b.point, c.point, d.point]), normal)
-}
-
-/// Four points side by side.
-#[inline(always)]
-pub(crate) fn side_by_side(points: &[Point; LANES]) -> Vector3x4 {
-    let [a, b, c, d] = points;
-    [F64x4([a.x, b.x, c.x, d.x]), F64x4([a.y, b.y, c.y, d.y]), F64x4([a.z, b.z, c.z, d.z])]
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::surface::{Nominal, Projection, Side};
-
-    #[test]
-    fn four_at_a_time_agree_with_one_at_a_time() {
-        let z = |x: f64, y: f64| 3.0 * (0.11 * x + 0.2).sin() * (0.07 * y - 0.4).cos();
-        let cloud: Vec<Point> = (0..41 * 31)
-            .map(|k| (f64::from(k % 41) * 0.8 - 16.0, f64::from(k / 41) * 0.9 - 13.0))
-            .map(|(x, y)| Point::new(x, y, z(x, y)))
-            .collect();
-        for nominal in [
-            Nominal::from_points(cloud.clone(), Projection::Auto).unwrap(),
-            Nominal::scattered(cloud, Projection::Auto).unwrap(),
-        ] {
-            for side in [Side::Normal, Side::Opposite] {
-                let surface = OffsetSurface::new(&nominal, 1.5, side).unwrap();
-                let mut left = 0;
-                for k in 0..400 {
-                    let points: [Point; LANES] = std::array::from_fn(|l| {
-                        let t = f64::from(4 * k + l as i32);
-                        let (x, y) = (13.0 * (t * 0.613).sin(), 11.0 * (t * 0.377).cos());
-                        Point::new(x, y, z(x, y) + side.sign() * (1.5 + 0.01 * t.sin()))
-                    });
-                    let feet = points.map(|p| surface.foot(&p, Place::UNKNOWN));
-                    let mut places = feet.map(|f| f.place);
-                    let Some(four) = surface.four_feet(&side_by_side(&points), &mut places) else {
-                        left += 1;
-                        continue;
-                    };
-                    for (l, foot) in feet.iter().enumerate() {
-                        assert_eq!(places[l], foot.place);
-                        assert!((four.distance_mm.0[l] - foot.distance_mm).abs() < 1e-14);
-                        assert!((0..3).all(|c| (four.normal[c].0[l] - foot.normal[c]).abs() < 1e-14));
-                    }
-                }
-                assert!(left < 8, "{left} of 400");
-            }
-        }
-    }
-
-    #[test]
-    fn over_a_grid_they_jump_to_their_facets_and_over_the_edge_they_do_not() {
-        let cloud = (0..100).map(|k| Point::new(f64::from(k % 10), f64::from(k / 10), 0.0)).collect::<Vec<_>>();
-        let nominal = Nominal::from_points(cloud.clone(), Projection::Auto).unwrap();
-        let surface = OffsetSurface::new(&nominal, 0.5, Side::Normal).unwrap();
-        let at = |x: f64| Point::new(x, 4.3, 0.5);
-        let place = surface.foot(&at(2.6), Place::UNKNOWN).place;
-        let points = [at(2.6), at(3.6), at(8.1), at(0.2)];
-        let mut places = [place; LANES];
-        assert!(surface.four_feet(&side_by_side(&points), &mut places).is_some());
-        assert_eq!(places, points.map(|p| surface.foot(&p, Place::UNKNOWN).place));
-        let beyond = [at(2.6), at(9.6), at(2.6), at(2.7)];
-        assert!(surface.four_feet(&side_by_side(&beyond), &mut [place; LANES]).is_none());
-
-        let mesh = Nominal::scattered(cloud, Projection::Auto).unwrap();
-        let surface = OffsetSurface::new(&mesh, 0.5, Side::Normal).unwrap();
-        let place = surface.foot(&at(2.6), Place::UNKNOWN).place;
-        assert!(surface.four_feet(&side_by_side(&[at(2.6); LANES]), &mut [place; LANES]).is_some());
-        assert!(surface.four_feet(&side_by_side(&points), &mut [place; LANES]).is_none());
-    }
 }

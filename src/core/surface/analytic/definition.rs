@@ -22,6 +22,7 @@ use serde::{Deserialize, Serialize};
 use toml::Spanned;
 use toml::de::{DeTable, DeValue, ValueDeserializer};
 
+use super::AnalyticSurface;
 use super::conic::{Asphere, AsphereDefinition, Conic, ConicDefinition};
 use super::error::{self, DefinitionError};
 use super::forbes::{Qbfs, QbfsDefinition, Qcon, QconDefinition};
@@ -29,7 +30,6 @@ use super::off_axis::{OffAxis, OffAxisDefinition, SectionFrame};
 use super::polynomial::{XyPolynomial, XyPolynomialDefinition};
 use super::toroid::{Biconic, BiconicDefinition, Toroid, ToroidDefinition};
 use super::zernike::{Zernike, ZernikeDefinition};
-use super::{AnalyticSurface, sampling};
 use crate::geometry::Aperture;
 
 /// How exact a sampling is when nothing is said about it, in nanometres.
@@ -266,7 +266,7 @@ impl DefinedSurface {
             }
         }
         let undefined = |[x, y]: &[f64; 2]| formula.sag_and_gradient(*x, *y).is_none();
-        if let Some([x_mm, y_mm]) = sampling::places(&aperture).into_iter().find(undefined) {
+        if let Some([x_mm, y_mm]) = aperture.places_mm().into_iter().find(undefined) {
             return Err(DefinitionError::NotDefined { x_mm, y_mm });
         }
         if let Some(limit_mm) = formula.normalisation_radius_mm() {

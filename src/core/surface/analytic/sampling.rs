@@ -92,7 +92,7 @@ impl DefinedSurface {
     pub fn spacing_for_accuracy(&self, accuracy_mm: f64) -> Result<f64, DefinitionError> {
         error::positive("sampling.accuracy_mm", accuracy_mm)?;
         let [least, most] = self.aperture().bounds();
-        let places = places(self.aperture());
+        let places = self.aperture().places_mm();
         let error = |h: f64| 2.0 * places.par_iter().map(|&place| self.cell_error(place, h)).reduce(|| 0.0, f64::max);
         let coarsest = COARSEST * (most[0] - least[0]).min(most[1] - least[1]);
         let mut fine = coarsest;
@@ -201,22 +201,6 @@ pub fn curved_triangle_sag(places: [[f64; 2]; 3], sags: [f64; 3], gradients: [[f
     sag + 6.0 * weights[0] * weights[1] * weights[2] * middle
 }
 
-/// Returns fixed places all over an aperture and along its outline.
-///
-/// Within the bounds they follow the additive recurrence of the plastic number, which leaves no gaps and no lattice.
-pub(super) fn places(aperture: &Aperture) -> Vec<[f64; 2]> {
-    let [least, most] = aperture.bounds();
-    let plastic = 1.324_717_957_244_746_f64;
-    let inside = (0..800).map(|i| {
-        [0, 1].map(|k| {
-            let t = (0.5 + f64::from(i) * plastic.powi(-1 - k as i32)).fract();
-            least[k] + t * (most[k] - least[k])
-        })
-    });
-    let inside = inside.filter(|[x, y]| aperture.contains(*x, *y));
-    inside.chain(aperture.outline_mm(240)).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -255,7 +239,7 @@ mod tests {
             let surface = defined(ASPHERE, aperture);
             let sampled = surface.sample(0.9).unwrap();
             let mut missing = 0;
-            for [x, y] in places(surface.aperture()).into_iter().chain(surface.aperture().outline_mm(5000)) {
+            for [x, y] in surface.aperture().places_mm().into_iter().chain(surface.aperture().outline_mm(5000)) {
                 let cell = |k: usize, v: f64| ((v - sampled.origin_mm[k]) / sampled.spacing_mm[k]).floor() as usize;
                 let (i, j) = (cell(0, x), cell(1, y));
                 for (di, dj) in [(0, 0), (1, 0), (0, 1), (1, 1)] {

@@ -1,0 +1,58 @@
+//! Why a registration cannot be had.
+
+use thiserror::Error;
+
+use crate::surface::SurfaceError;
+
+/// Why a registration cannot be had.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[allow(missing_docs)]
+pub enum RegistrationError {
+    #[error(transparent)]
+    Surface(#[from] SurfaceError),
+    #[error(
+        "the probe radius is {radius_mm} mm; it must be above 0 and below {limit_mm:.3} mm, half the size of the part"
+    )]
+    ProbeRadius { radius_mm: f64, limit_mm: f64 },
+    #[error("there are {points} measured points and at least {least} are needed; measure more")]
+    TooFewPoints { points: usize, least: usize },
+    #[error("measured point {} is not finite; remove it or correct it", index + 1)]
+    NotFinite { index: usize },
+    #[error("all {points} measured points lie on one line; a pose needs points off it")]
+    Collinear { points: usize },
+    #[error(
+        "{doubled} of {points} measured points that were looked at repeat another one exactly; was a file joined to itself? \
+         remove the repeats"
+    )]
+    Repeated { doubled: usize, points: usize },
+    #[error(
+        "the measured cloud is {ratio:.4} times the size of the nominal surface ({measured_mm:.4} mm against {nominal_mm:.4} \
+         mm); {remedy}"
+    )]
+    Size { ratio: f64, measured_mm: f64, nominal_mm: f64, remedy: &'static str },
+    #[error(
+        "only {used} of {points} measured points lie on the part; check that the cloud belongs to it, and the start pose"
+    )]
+    TooFewUsed { used: usize, points: usize },
+    #[error(
+        "no minimum within {iterations} iterations; the objective is at {objective_mm2:.3e} mm^2; allow more, or give a start pose"
+    )]
+    NotConverged { iterations: usize, objective_mm2: f64 },
+    #[error(
+        "the measured points do not fit the nominal surface: rms {rms_mm:.4} mm, limit {limit_mm:.4} mm; check part, units and \
+         probe radius, or raise the limit"
+    )]
+    DoesNotFit { rms_mm: f64, limit_mm: f64 },
+    #[error(
+        "the measured cloud is a mirror image of the part: as measured it fits to {rms_mm:.4} mm, mirrored to \
+         {mirrored_rms_mm:.4} mm rms; one axis of the CMM file is reversed"
+    )]
+    Mirrored { rms_mm: f64, mirrored_rms_mm: f64 },
+    #[error(
+        "the probe lies on the other side of the nominal surface: rms {other_rms_mm:.4} mm there, {rms_mm:.4} mm on the side \
+         given; turn the normals or the side"
+    )]
+    WrongSide { rms_mm: f64, other_rms_mm: f64 },
+    #[error("no direction of the pose is free or visible; unlock one, or give a surface with more shape")]
+    Undetermined,
+}

@@ -1,0 +1,145 @@
+//! The part to register to, with what can be checked before anything is computed.
+
+use rayon::prelude::*;
+
+use crate::geometry::Point;
+use crate::surface::{Lookup, Nominal, OffsetSurface, Side};
+
+use super::correspond::{ResidualModel, middle_and_size};
+use super::error::RegistrationError;
+use super::iterate::Problem;
+use super::options::{Method, Options};
+use super::robust::{Loss, ScaledLoss};
+
+/// The nominal surface and the sizes that limits are stated in.
+pub(super) struct Part<'a> {
+    pub(super) nominal: &'a Nominal,
+    /// Radius of the offset surface: the probe's, or 0 where the points are registered to the nominal surface itself.
+    pub(super) offset_mm: f64,
+    /// Subtracted from each distance.
+    pub(super) subtract_mm: f64,
+    /// Middle of the measured cloud.
+    pub(super) middle: Point,
+    /// Rms size of the measured cloud.
+    pub(super) size_mm: f64,
+    /// Singular values below this share of the largest count as unseen.
+    pub(super) least_share: f64,
+}
+
+impl<'a> Part<'a> {
+    /// Checks what can be checked before anything is computed.
+    pub(super) fn check(
+        nominal: &'a Nominal,
+        measured: &[Point],
+        options: &Options,
+    ) -> Result<Self, RegistrationError> {
+        const LEAST: usize = 7;
+        if measured.len() < LEAST {
+            return Err(RegistrationError::TooFewPoints { points: measured.len(), least: LEAST });
+        }
+        if let Some(index) = measured.par_iter().position_first(|p| !(p.x + p.y + p.z).is_finite()) {
+            return Err(RegistrationError::NotFinite { index });
+        }
+        if crate::surface::is_line(measured) {
+            return Err(RegistrationError::Collinear { points: measured.len() });
+        }
+        check_repeats(measured)?;
+        if options.locked == [true; 6] {
+            return Err(RegistrationError::Undetermined);
+        }
+        let (middle, size_mm) = middle_and_size(measured);
+        let nominal_mm = nominal.size_mm();
+        check_sizes(size_mm, nominal_mm)?;
+        let radius_mm = options.probe_radius_mm;
+        let limit_mm = 0.5 * nominal_mm;
+        if options.method != Method::Contact && !(radius_mm > 0.0 && radius_mm < limit_mm) {
+            return Err(RegistrationError::ProbeRadius { radius_mm, limit_mm });
+        }
+        let (offset_mm, subtract_mm) = match options.method {
+            Method::Offset => (radius_mm, 0.0),
+            Method::Contact => (0.0, 0.0),
+            Method::SubtractRadius => (0.0, radius_mm),
+        };
+        let least_share = 1e-6_f64.max(3.0 * nominal.normal_error());
+        Ok(Self { nominal, offset_mm, subtract_mm, middle, size_mm, least_share })
+    }
+
+    pub(super) fn surface(&self, options: &Options, side: Side) -> OffsetSurface<'a> {
+        let lookup = if options.method == Method::SubtractRadius { Lookup::Projection } else { Lookup::Foot };
+        OffsetSurface::new(self.nominal, self.offset_mm, side)
+            .expect("the radius was checked")
+            .with_distance(options.distance)
+            .with_lookup(lookup)
+    }
+
+    /// Refuses a probe that does not fit into the surface.
+    pub(super) fn check_fold(&self, options: &Options, side: Side) -> Result<(), RegistrationError> {
+        match self.surface(options, side).fold() {
+            Some(fold) => Err(fold.into()),
+            None => Ok(()),
+        }
+    }
+
+    pub(super) fn problem<'b>(&self, measured: &'b [Point], options: &Options, side: Side) -> Problem<'b>
+    where
+        'a: 'b,
+    {
+        Problem {
+            surface: self.surface(options, side),
+            residual: ResidualModel { subtract_mm: self.subtract_mm, loss: ScaledLoss::new(Loss::None, 1.0) },
+            measured,
+            middle: self.middle,
+            size_mm: self.size_mm,
+            locked: options.locked,
+            least_share: self.least_share,
+            tolerance: options.tolerance,
+            ball_radius: options.ball_radius,
+            most_iterations: options.most_iterations,
+        }
+    }
+
+    pub(super) fn rms_limit_mm(&self, options: &Options) -> f64 {
+        options.rms_limit_mm.unwrap_or(0.2 + 1e-4 * self.size_mm)
+    }
+}
+
+/// Refuses a cloud of which more than one point in a hundred is there twice.
+///
+/// Looked at are the points whose own bits choose them, some thousand of any number: of two equal points both or neither.
+fn check_repeats(measured: &[Point]) -> Result<(), RegistrationError> {
+    const LOOKED_AT: usize = 8192;
+    let mixed = |p: &Point| {
+        let [x, y, z] = [p.x, p.y, p.z].map(|c| (c + 0.0).to_bits());
+        let mixed = x.wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ y.rotate_left(21).wrapping_mul(0xD6E8_FEB8_6659_FD93) ^ z;
+        let mixed = (mixed ^ (mixed >> 32)).wrapping_mul(0xD6E8_FEB8_6659_FD93);
+        mixed ^ (mixed >> 29)
+    };
+    let one_in = measured.len().div_ceil(LOOKED_AT) as u64;
+    let mixed = |(k, p): (usize, &Point)| (mixed(p), k);
+    let mut chosen: Vec<(u64, usize)> =
+        measured.par_iter().enumerate().with_min_len(4096).map(mixed).filter(|(h, _)| h % one_in == 0).collect();
+    chosen.sort_unstable();
+    let doubled = chosen.windows(2).filter(|w| w[0].0 == w[1].0 && measured[w[0].1] == measured[w[1].1]).count();
+    if doubled * 100 > chosen.len() {
+        return Err(RegistrationError::Repeated { doubled, points: chosen.len() });
+    }
+    Ok(())
+}
+
+fn check_sizes(measured_mm: f64, nominal_mm: f64) -> Result<(), RegistrationError> {
+    let ratio = measured_mm / nominal_mm;
+    let remedy = match ratio {
+        r if !(r > 0.0 && r.is_finite()) => "a size must be above 0",
+        r if r > 500.0 => {
+            "are the nominal points in metres, or the measured ones in micrometres? give both in millimetres"
+        }
+        r if r > 15.0 => "are the nominal points in inches or centimetres? give both in millimetres",
+        r if r > 3.0 => "is this the nominal surface of this part, and are both in millimetres?",
+        r if r < 0.002 => "are the measured points in metres? give both in millimetres",
+        r if r < 0.06 => {
+            "are the measured points in inches or centimetres, or on a small part of the surface only? give both in millimetres"
+        }
+        _ => return Ok(()),
+    };
+    Err(RegistrationError::Size { ratio, measured_mm, nominal_mm, remedy })
+}

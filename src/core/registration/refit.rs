@@ -1,0 +1,185 @@
+//! From the initial pose to the one that is reported: descend, trim what does not belong to the fit, and refit.
+
+use rayon::prelude::*;
+
+use crate::geometry::{Point, Pose};
+
+use super::correspond::{Correspondence, middle_and_size};
+use super::error::RegistrationError;
+use super::iterate::{Descent, Iteration, Problem};
+use super::options::Options;
+use super::robust::{Loss, ScaledLoss, robust_sigma};
+use super::start::{InitialPose, spread};
+
+/// Descends, drops what is off the part or an outlier, and descends again until nothing changes.
+pub(super) fn trim_and_refit(
+    problem: &Problem,
+    initial: &InitialPose,
+    options: &Options,
+    correspondences: &mut [Correspondence],
+    trace: &mut Vec<Iteration>,
+) -> Result<Descent, RegistrationError> {
+    /// Rounds after which points are only dropped and no longer taken back, so that the sets cannot alternate for ever.
+    const BOTH_WAYS: usize = 8;
+    const MOST_ROUNDS: usize = 16;
+    let mut problem = *problem;
+    let mut pose = initial.cmm_from_model;
+    if initial.near {
+        problem.ball_radius = problem.ball_radius.min(0.05);
+    }
+    let counts: &[usize] =
+        if problem.surface.fits_normals() { &COARSE_COUNTS_WHERE_NORMALS_COST } else { &COARSE_COUNTS };
+    let enough = 2 * counts.iter().max().expect("there is a count");
+    for few in counts.iter().filter(|_| problem.measured.len() >= enough) {
+        pose = descend_coarsely(&problem, pose, *few, if initial.near { Some(options) } else { None }, trace)?;
+    }
+    prefetch(&problem, correspondences, &pose);
+    let mut known = None;
+    if initial.near {
+        let sums = problem.feet(correspondences, &pose, &problem.scaling_at(&pose));
+        let changed = screen(&problem, options, correspondences, true);
+        known = (changed == 0 && options.loss == Loss::None).then_some(sums);
+    }
+    let mut round = 0;
+    loop {
+        rescale(&mut problem, options, correspondences, round > 0 || initial.near);
+        let descent = problem.descend(pose, known.take(), correspondences, trace)?;
+        if !descent.converged {
+            let (iterations, objective_mm2) = (options.most_iterations, descent.objective_mm2);
+            return Err(RegistrationError::NotConverged { iterations, objective_mm2 });
+        }
+        pose = descent.cmm_from_model;
+        round += 1;
+        let changed = screen(&problem, options, correspondences, round < BOTH_WAYS);
+        let robust_settling = options.loss != Loss::None && round < 4;
+        if (changed == 0 && !robust_settling) || round == MOST_ROUNDS {
+            return finish(descent, correspondences.len());
+        }
+    }
+}
+
+/// How many points of a dense cloud descend before the rest: first a few for the long way, then more for the rest of it.
+const COARSE_COUNTS: [usize; 2] = [1024, 16_384];
+
+/// The same where every place touched costs a fit: fewer touch less, and the rest then touch only where they end.
+const COARSE_COUNTS_WHERE_NORMALS_COST: [usize; 1] = [2048];
+
+/// Starts the search for the feet near where they are, with the normals there fitted all at once.
+fn prefetch(problem: &Problem, correspondences: &mut [Correspondence], pose: &Pose) {
+    if !problem.surface.fits_normals() {
+        return;
+    }
+    let model_from_cmm = pose.inverse();
+    let points: Vec<Point> = problem.measured.par_iter().map(|p| model_from_cmm.point(p)).collect();
+    for (correspondence, place) in correspondences.iter_mut().zip(problem.surface.prefetch(&points)) {
+        correspondence.place = place;
+    }
+}
+
+/// Descends with a few of many points, from where the rest have a step or two to go; its turns stand in the trace.
+///
+/// Near the end outliers are told among the few themselves; far from it they cannot be.
+fn descend_coarsely(
+    problem: &Problem,
+    pose: Pose,
+    count: usize,
+    screened: Option<&Options>,
+    trace: &mut Vec<Iteration>,
+) -> Result<Pose, RegistrationError> {
+    let few: Vec<Point> = spread(problem.measured, count).copied().collect();
+    let mut correspondences = vec![Correspondence::NEW; few.len()];
+    let (middle, size_mm) = middle_and_size(&few);
+    let coarse = Problem { measured: &few, middle, size_mm, ..*problem };
+    prefetch(&coarse, &mut correspondences, &pose);
+    if let Some(options) = screened {
+        coarse.feet(&mut correspondences, &pose, &coarse.scaling_at(&pose));
+        screen(&coarse, options, &mut correspondences, true);
+    }
+    Ok(coarse.descend(pose, None, &mut correspondences, trace)?.cmm_from_model)
+}
+
+/// Refuses an end that hangs on too few points, or on none of the six directions.
+fn finish(descent: Descent, points: usize) -> Result<Descent, RegistrationError> {
+    if descent.sums.points * 2 < points {
+        return Err(RegistrationError::TooFewUsed { used: descent.sums.points, points });
+    }
+    if descent.rank == 0 {
+        return Err(RegistrationError::Undetermined);
+    }
+    Ok(descent)
+}
+
+/// Gives a robust loss the scale of the distances as they are now.
+fn rescale(problem: &mut Problem, options: &Options, correspondences: &[Correspondence], known: bool) {
+    // Before the first distances are known there is no scale, and every point counts by its square.
+    if known && options.loss != Loss::None {
+        problem.residual.loss = ScaledLoss::new(options.loss, sigma_of(correspondences).1);
+    }
+}
+
+/// No CMM repeats better than this, and rounding in a file may be all the scatter there is.
+pub(super) const LEAST_SIGMA_MM: f64 = 1e-5;
+
+fn sigma_of(correspondences: &[Correspondence]) -> (f64, f64) {
+    // A sample tells the sigma of many points to a percent.
+    let stride = correspondences.len().div_ceil(1 << 16);
+    let on_part = correspondences.iter().step_by(stride).filter(|t| t.beyond_steps <= 0.5).map(|t| t.distance_mm);
+    let (median, sigma) = robust_sigma(on_part);
+    (median, sigma.max(LEAST_SIGMA_MM))
+}
+
+/// Decides which points take part; returns how many changed.
+///
+/// An outlier is far from the surface and from its neighbours: a smooth form error, however large, is neither noise nor a
+/// mistake of the probe. Beyond four times the limit its neighbours are no longer asked.
+fn screen(problem: &Problem, options: &Options, correspondences: &mut [Correspondence], both_ways: bool) -> usize {
+    let (median, sigma) = sigma_of(correspondences);
+    let limit = options.outlier_sigmas * sigma;
+    let far = |t: &Correspondence| (t.distance_mm - median).abs() > limit;
+    let suspects: Vec<usize> = (0..correspondences.len()).filter(|&k| far(&correspondences[k])).collect();
+    let isolated = if suspects.is_empty() {
+        Vec::new()
+    } else {
+        isolated(problem.measured, correspondences, &suspects, 0.5 * limit)
+    };
+    let mut outlier = vec![false; if suspects.is_empty() { 0 } else { correspondences.len() }];
+    for (&k, isolated) in suspects.iter().zip(isolated) {
+        outlier[k] = isolated || (correspondences[k].distance_mm - median).abs() > 4.0 * limit;
+    }
+    let mut changed = 0;
+    for (k, correspondence) in correspondences.iter_mut().enumerate() {
+        let fits = correspondence.beyond_steps <= 0.5 && !outlier.get(k).copied().unwrap_or(false);
+        if fits != correspondence.used && (both_ways || !fits) {
+            correspondence.used = fits;
+            changed += 1;
+        }
+    }
+    changed
+}
+
+/// For each suspect, whether its distance departs by more than a limit from the median of eight neighbours.
+///
+/// Neighbours nearer than half the mean spacing are twins, repeats of the same place that repeat its mistake; they are not
+/// asked. A suspect with nothing but twins around it is isolated.
+fn isolated(measured: &[Point], correspondences: &[Correspondence], suspects: &[usize], limit_mm: f64) -> Vec<bool> {
+    const ASKED: usize = 8;
+    const NEAREST: std::num::NonZero<usize> = std::num::NonZero::new(64).expect("not zero");
+    let coordinates: Vec<[f64; 3]> = measured.iter().map(|p| (*p).into()).collect();
+    let Ok(tree) = kiddo::ImmutableKdTree::<f64, 3>::new_from_slice(&coordinates) else {
+        return vec![true; suspects.len()];
+    };
+    // Points spread over a square of rms size s stand s sqrt(6 / n) apart.
+    let twin_mm = 0.5 * middle_and_size(measured).1 * (6.0 / measured.len() as f64).sqrt();
+    let is_isolated = |&k: &usize| {
+        let nearest = tree.query(&coordinates[k]).nearest_n::<kiddo::SquaredEuclidean<f64>>(NEAREST).execute();
+        let mut around: Vec<f64> = nearest
+            .iter()
+            .filter(|n| n.distance > twin_mm * twin_mm)
+            .take(ASKED)
+            .map(|n| correspondences[n.item as usize].distance_mm)
+            .collect();
+        around.sort_unstable_by(f64::total_cmp);
+        around.get(around.len() / 2).is_none_or(|median| (correspondences[k].distance_mm - median).abs() > limit_mm)
+    };
+    suspects.par_iter().map(is_isolated).collect()
+}

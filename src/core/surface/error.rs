@@ -1,0 +1,50 @@
+//! Why a nominal surface or its offset cannot be had.
+
+use thiserror::Error;
+
+/// Why a nominal surface or its offset cannot be had.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[allow(missing_docs)]
+pub enum SurfaceError {
+    #[error("the nominal surface has {points} points and needs at least {least}; give a denser nominal")]
+    TooFewPoints { points: usize, least: usize },
+    #[error("nominal point {} is not finite; remove it or correct it", index + 1)]
+    NotFinite { index: usize },
+    #[error("all {points} nominal points lie on one line; a surface needs points off it")]
+    Collinear { points: usize },
+    #[error(
+        "nominal points {} and {} share one place at ({:.6}, {:.6}, {:.6}) mm; remove the duplicate",
+        first + 1, second + 1, at[0], at[1], at[2]
+    )]
+    DuplicatePoints { first: usize, second: usize, at: [f64; 3] },
+    #[error(
+        "no projection of the nominal points is one-to-one: {tried}; divide the surface into patches, or give a mesh"
+    )]
+    NoProjection { tried: String },
+    #[error("the nominal mesh has no triangle; give a file with faces")]
+    NoTriangles,
+    #[error("a triangle of the nominal mesh names vertex {vertex}, but there are {points} (counted from 0)")]
+    VertexOutOfRange { vertex: u32, points: usize },
+    #[error(
+        "{triangles} triangles of the nominal mesh share one edge at ({:.6}, {:.6}, {:.6}) mm; a surface has two at most",
+        at[0], at[1], at[2]
+    )]
+    NonManifold { at: [f64; 3], triangles: usize },
+    #[error(
+        "neighbouring triangles of the nominal mesh turn opposite ways at ({:.6}, {:.6}, {:.6}) mm; orient them alike",
+        at[0], at[1], at[2]
+    )]
+    Orientation { at: [f64; 3] },
+    #[error("a grid of {columns} x {rows} nodes was announced and {points} points were given")]
+    GridSize { columns: usize, rows: usize, points: usize },
+    #[error("a patch list is empty; give at least one patch")]
+    NoPatches,
+    #[error("the probe radius is {radius_mm} mm; it must be a finite number, 0 or above")]
+    ProbeRadius { radius_mm: f64 },
+    #[error(
+        "the offset surface folds at ({:.3}, {:.3}, {:.3}) mm: the nominal surface is concave there with a radius of \
+         {concave_radius_mm:.4} mm, and a probe of radius {probe_radius_mm} mm does not fit; use a smaller probe",
+        at[0], at[1], at[2]
+    )]
+    OffsetFolds { at: [f64; 3], concave_radius_mm: f64, probe_radius_mm: f64 },
+}

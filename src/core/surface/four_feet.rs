@@ -1,0 +1,180 @@
+//! The point location and the distance, four points at a time.
+//!
+//! Once a registration has settled, nearly every point stays on its facet from one iteration to the next, and over a grid a
+//! point that left it is a jump or two away. The arithmetic of the [facet](super::facet) is then the same straight line of products
+//! and sums for all, which the compiler turns into vector instructions when four points stand side by side. Points that leave
+//! the surface, or have a longer way, are left to the single search; the two agree to rounding.
+
+use super::facet::{Corner, Facet, Facets, corner, four_vertices};
+use super::offset::{Distance, INSIDE, Lookup, OffsetSurface, Place};
+use super::patch::{Lattice, Patch};
+use super::simd::{F64x4, LANES, Real, Vector3x4};
+
+/// Jumps that four points take together over a grid before they are left to the single search.
+const JUMPS: usize = 4;
+
+/// The feet of four points.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct FourFeet {
+    pub(crate) distance_mm: F64x4,
+    pub(crate) normal: Vector3x4,
+}
+
+impl OffsetSurface<'_> {
+    /// Whether [`OffsetSurface::four_feet`] answers for this surface: one patch, the curved distance at the foot.
+    pub(crate) fn has_four_feet(&self) -> bool {
+        self.nominal().patches().len() == 1 && self.distance() == Distance::Curved && self.lookup() == Lookup::Foot
+    }
+
+    /// Finds the feet of four points near the places given, which become those of the feet.
+    ///
+    /// Returns `None`, and the places mean nothing, where one of them lies beyond the edge or too far away: on a mesh already
+    /// where it is not on its facet, since a walk over one would fit normals on the way.
+    #[inline(always)]
+    pub(crate) fn four_feet(&self, p: &Vector3x4, places: &mut [Place; LANES]) -> Option<FourFeet> {
+        let patch = &self.nominal().patches()[0];
+        match &patch.lattice {
+            Lattice::Grid(grid) => self.four_feet_on(patch, grid, JUMPS, p, places),
+            Lattice::Mesh(mesh) => self.four_feet_on(patch, mesh, 0, p, places),
+        }
+    }
+
+    /// Returns where four points may be that follow others as those followed the ones before; `None` where nothing tells.
+    pub(crate) fn four_extrapolated_places(
+        &self,
+        before: &[Place; LANES],
+        last: &[Place; LANES],
+    ) -> Option<[Place; LANES]> {
+        let Lattice::Grid(grid) = &self.nominal().patches()[0].lattice else { return None };
+        if last.contains(&Place::UNKNOWN) {
+            return None;
+        }
+        Some(std::array::from_fn(|l| {
+            let step = if before[l] == Place::UNKNOWN { 0 } else { last[l].facet().wrapping_sub(before[l].facet()) };
+            let next = last[l].facet().wrapping_add(step);
+            if grid.has_facet(next) { Place::on_first_patch(next) } else { last[l] }
+        }))
+    }
+
+    #[inline(always)]
+    fn four_feet_on<F: Facets>(
+        &self,
+        patch: &Patch,
+        facets: &F,
+        jumps: usize,
+        p: &Vector3x4,
+        places: &mut [Place; LANES],
+    ) -> Option<FourFeet> {
+        let mut jump = 0;
+        loop {
+            let four = self.four_facets(patch, facets, places);
+            let w = four.seen_from(0, p);
+            let b = four.weights(&w);
+            let least = b[0].min(b[1]).min(b[2]);
+            let stays = [least.0[0] >= INSIDE, least.0[1] >= INSIDE, least.0[2] >= INSIDE, least.0[3] >= INSIDE];
+            if stays == [true; LANES] {
+                let (distance_mm, normal) = four.curved_distance(&w, &b);
+                return Some(FourFeet { distance_mm, normal });
+            }
+            if jump == jumps || !jumped(facets, places, &stays, &b) {
+                return None;
+            }
+            jump += 1;
+        }
+    }
+
+    #[inline(always)]
+    fn four_facets<F: Facets>(&self, patch: &Patch, facets: &F, places: &[Place; LANES]) -> Facet<F64x4> {
+        let (a, b) = (facets.corners(places[0].facet()), facets.corners(places[1].facet()));
+        let (c, d) = (facets.corners(places[2].facet()), facets.corners(places[3].facet()));
+        let first = self.four_corners(patch, [a[0], b[0], c[0], d[0]]);
+        let second = self.four_corners(patch, [a[1], b[1], c[1], d[1]]);
+        let third = self.four_corners(patch, [a[2], b[2], c[2], d[2]]);
+        Facet::new([first, second, third], F64x4::splat(self.side().sign()))
+    }
+
+    /// One corner of each of four facets: its place on the offset surface and its normal.
+    #[inline(always)]
+    fn four_corners(&self, patch: &Patch, [a, b, c, d]: [u32; LANES]) -> Corner<F64x4> {
+        let four = four_vertices(&[patch.vertex(a), patch.vertex(b), patch.vertex(c), patch.vertex(d)]);
+        corner(four, F64x4::splat(self.side().sign()), F64x4::splat(self.radius_mm()))
+    }
+}
+
+/// Takes the points that do not stay to the facets their weights point at; false where one of them has none.
+#[inline(never)]
+fn jumped<F: Facets>(facets: &F, places: &mut [Place; LANES], stays: &[bool; LANES], b: &[F64x4; 3]) -> bool {
+    for l in (0..LANES).filter(|&l| !stays[l]) {
+        match facets.advance(places[l].facet(), &[b[0].0[l], b[1].0[l], b[2].0[l]]) {
+            Some(next) => places[l] = Place::on_first_patch(next),
+            None => return false,
+        }
+    }
+    true
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::facet::side_by_side;
+    use super::*;
+    use crate::geometry::Point;
+    use crate::surface::{Nominal, Projection, Side};
+
+    #[test]
+    fn four_at_a_time_agree_with_one_at_a_time() {
+        let z = |x: f64, y: f64| 3.0 * (0.11 * x + 0.2).sin() * (0.07 * y - 0.4).cos();
+        let cloud: Vec<Point> = (0..41 * 31)
+            .map(|k| (f64::from(k % 41) * 0.8 - 16.0, f64::from(k / 41) * 0.9 - 13.0))
+            .map(|(x, y)| Point::new(x, y, z(x, y)))
+            .collect();
+        for nominal in [
+            Nominal::from_points(cloud.clone(), Projection::Auto).unwrap(),
+            Nominal::scattered(cloud, Projection::Auto).unwrap(),
+        ] {
+            for side in [Side::Normal, Side::Opposite] {
+                let surface = OffsetSurface::new(&nominal, 1.5, side).unwrap();
+                let mut left = 0;
+                for k in 0..400 {
+                    let points: [Point; LANES] = std::array::from_fn(|l| {
+                        let t = f64::from(4 * k + l as i32);
+                        let (x, y) = (13.0 * (t * 0.613).sin(), 11.0 * (t * 0.377).cos());
+                        Point::new(x, y, z(x, y) + side.sign() * (1.5 + 0.01 * t.sin()))
+                    });
+                    let feet = points.map(|p| surface.foot(&p, Place::UNKNOWN));
+                    let mut places = feet.map(|f| f.place);
+                    let Some(four) = surface.four_feet(&side_by_side(&points), &mut places) else {
+                        left += 1;
+                        continue;
+                    };
+                    for (l, foot) in feet.iter().enumerate() {
+                        assert_eq!(places[l], foot.place);
+                        assert!((four.distance_mm.0[l] - foot.distance_mm).abs() < 1e-14);
+                        assert!((0..3).all(|c| (four.normal[c].0[l] - foot.normal[c]).abs() < 1e-14));
+                    }
+                }
+                assert!(left < 8, "{left} of 400");
+            }
+        }
+    }
+
+    #[test]
+    fn over_a_grid_they_jump_to_their_facets_and_over_the_edge_they_do_not() {
+        let cloud = (0..100).map(|k| Point::new(f64::from(k % 10), f64::from(k / 10), 0.0)).collect::<Vec<_>>();
+        let nominal = Nominal::from_points(cloud.clone(), Projection::Auto).unwrap();
+        let surface = OffsetSurface::new(&nominal, 0.5, Side::Normal).unwrap();
+        let at = |x: f64| Point::new(x, 4.3, 0.5);
+        let place = surface.foot(&at(2.6), Place::UNKNOWN).place;
+        let points = [at(2.6), at(3.6), at(8.1), at(0.2)];
+        let mut places = [place; LANES];
+        assert!(surface.four_feet(&side_by_side(&points), &mut places).is_some());
+        assert_eq!(places, points.map(|p| surface.foot(&p, Place::UNKNOWN).place));
+        let beyond = [at(2.6), at(9.6), at(2.6), at(2.7)];
+        assert!(surface.four_feet(&side_by_side(&beyond), &mut [place; LANES]).is_none());
+
+        let mesh = Nominal::scattered(cloud, Projection::Auto).unwrap();
+        let surface = OffsetSurface::new(&mesh, 0.5, Side::Normal).unwrap();
+        let place = surface.foot(&at(2.6), Place::UNKNOWN).place;
+        assert!(surface.four_feet(&side_by_side(&[at(2.6); LANES]), &mut [place; LANES]).is_some());
+        assert!(surface.four_feet(&side_by_side(&points), &mut [place; LANES]).is_none());
+    }
+}

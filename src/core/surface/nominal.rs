@@ -1,0 +1,286 @@
+//! A nominal surface: made from points, a grid, a mesh or several patches, and what it tells of itself.
+
+use std::sync::OnceLock;
+
+use rayon::prelude::*;
+
+use crate::geometry::grid_order::grid_in_order;
+use crate::geometry::{Aperture, Point, Vector, recognise_grid};
+
+use super::delaunay;
+use super::error::SurfaceError;
+use super::facet::Vertex;
+use super::feature::{Feature, features};
+use super::grid::{GridLattice, grid_nodes, in_grid_order};
+use super::mesh::MeshLattice;
+use super::normals;
+use super::patch::{Lattice, Patch};
+use super::projection::{Projection, is_line, principal_axes};
+
+/// A nominal surface: one or several patches of points with normals, ready for distances.
+#[derive(Debug)]
+pub struct Nominal {
+    patches: Vec<Patch>,
+    kind: NominalKind,
+    outline: Option<Aperture>,
+    /// Where it bends how, worked out when a pose is searched for.
+    features: OnceLock<Vec<Feature>>,
+    /// Rms distances of its points from their middle and from their best plane.
+    extent_mm: OnceLock<[f64; 2]>,
+}
+
+/// What a nominal surface was made from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum NominalKind {
+    /// Points on a regular grid, or a grid of (u, v) parameters.
+    Grid {
+        /// Nodes along the first direction.
+        columns: usize,
+        /// Nodes along the second direction.
+        rows: usize,
+    },
+    /// Scattered points, triangulated in a projection.
+    Scattered {
+        /// The projection, never `Auto`.
+        projection: Projection,
+    },
+    /// A mesh that came with its triangles.
+    Mesh,
+    /// Several patches.
+    Patches {
+        /// How many.
+        count: usize,
+    },
+}
+
+impl Nominal {
+    /// Makes a surface from points in any order: a regular grid in xy is used as it is, anything else is triangulated.
+    ///
+    /// Shapes: at least 9 points. The order of the points does not matter.
+    ///
+    /// # Errors
+    /// Too few points, a coordinate that is not finite, two points at one place, points on one line, or no projection that
+    /// is one-to-one.
+    pub fn from_points(points: Vec<Point>, projection: Projection) -> Result<Self, SurfaceError> {
+        const LEAST: usize = 9;
+        if points.len() < LEAST {
+            return Err(SurfaceError::TooFewPoints { points: points.len(), least: LEAST });
+        }
+        let may_be_grid = matches!(projection, Projection::Auto | Projection::Xy);
+        if may_be_grid && let Some(found) = grid_in_order(&points) {
+            return Ok(Self::grid(GridLattice::whole(&found), &points));
+        }
+        if let Some(index) = points.iter().position(|p| !(p.x + p.y + p.z).is_finite()) {
+            return Err(SurfaceError::NotFinite { index });
+        }
+        if may_be_grid && let Some(order) = recognise_grid(&points) {
+            let points = in_grid_order(points, &order);
+            return Ok(Self::grid(GridLattice::new(order.columns, order.rows, &points, true), &points));
+        }
+        Self::scattered(points, projection)
+    }
+
+    /// Makes a surface from points by triangulation, even where they would make a grid.
+    ///
+    /// # Errors
+    /// As [`Nominal::from_points`].
+    pub fn scattered(points: Vec<Point>, projection: Projection) -> Result<Self, SurfaceError> {
+        if points.len() > 3 && is_line(&points) {
+            return Err(SurfaceError::Collinear { points: points.len() });
+        }
+        let (projection, map) = projection.prepare(&points)?;
+        let (points, triangles) = delaunay::triangulate(&points, &map)?;
+        let lattice = MeshLattice::from_parts(&points, triangles.corners, triangles.neighbours)?;
+        Ok(Self::of(Patch::mesh(points, lattice), NominalKind::Scattered { projection }))
+    }
+
+    /// Makes a surface from a structured grid of points, one for each pair of parameters (u, v).
+    ///
+    /// Shapes: `columns * rows` points, row by row with u fastest; a NaN point is a hole. The normal is on the side where
+    /// u, v and normal are right-handed.
+    ///
+    /// # Errors
+    /// A number of points other than announced, or fewer than 3 nodes on an axis.
+    pub fn from_parameter_grid(columns: usize, rows: usize, points: Vec<Point>) -> Result<Self, SurfaceError> {
+        check_grid(columns, rows, points.len())?;
+        Ok(Self::grid(GridLattice::new(columns, rows, &points, false), &points))
+    }
+
+    /// Makes a surface from a regular xy grid of points whose unit normals are known.
+    ///
+    /// # Errors
+    /// As [`Nominal::from_parameter_grid`].
+    pub fn from_grid_with_normals(
+        columns: usize,
+        rows: usize,
+        points: Vec<Point>,
+        normals: Vec<Vector>,
+    ) -> Result<Self, SurfaceError> {
+        check_grid(columns, rows, points.len().min(normals.len()))?;
+        let lattice = GridLattice::new(columns, rows, &points, true);
+        let nodes = points.into_par_iter().zip(normals).map(|(point, normal)| Vertex { point, normal }).collect();
+        Ok(Self::of(Patch::grid(nodes, lattice), NominalKind::Grid { columns, rows }))
+    }
+
+    /// Makes a surface from a mesh; the normals are on the side from which its triangles turn counter-clockwise.
+    ///
+    /// # Errors
+    /// No triangle, an index out of range, more than two triangles at an edge, neighbours that turn opposite ways.
+    pub fn from_mesh(points: Vec<Point>, triangles: Vec<[u32; 3]>) -> Result<Self, SurfaceError> {
+        if let Some(index) = points.iter().position(|p| !(p.x + p.y + p.z).is_finite()) {
+            return Err(SurfaceError::NotFinite { index });
+        }
+        let lattice = MeshLattice::new(&points, triangles)?;
+        Ok(Self::of(Patch::mesh(points, lattice), NominalKind::Mesh))
+    }
+
+    /// Joins several surfaces into one of several patches; a point belongs to the patch that its foot lies on.
+    ///
+    /// # Errors
+    /// An empty list.
+    pub fn from_patches(surfaces: Vec<Nominal>) -> Result<Self, SurfaceError> {
+        let patches: Vec<Patch> = surfaces.into_iter().flat_map(|s| s.patches).collect();
+        if patches.is_empty() {
+            return Err(SurfaceError::NoPatches);
+        }
+        let kind = NominalKind::Patches { count: patches.len() };
+        Ok(Self { patches, kind, outline: None, features: OnceLock::new(), extent_mm: OnceLock::new() })
+    }
+
+    /// States the outline of the part in xy: a point whose foot lies outside it is off the part.
+    pub fn with_outline(self, outline: Aperture) -> Self {
+        Self { outline: Some(outline), ..self }
+    }
+
+    fn grid(lattice: GridLattice, points: &[Point]) -> Self {
+        let kind = NominalKind::Grid { columns: lattice.columns(), rows: lattice.rows() };
+        Self::of(Patch::grid(grid_nodes(points, &lattice), lattice), kind)
+    }
+
+    fn of(patch: Patch, kind: NominalKind) -> Self {
+        Self { patches: vec![patch], kind, outline: None, features: OnceLock::new(), extent_mm: OnceLock::new() }
+    }
+
+    /// Returns what the surface was made from.
+    pub fn kind(&self) -> NominalKind {
+        self.kind
+    }
+
+    /// Returns the outline of the part, where one was stated.
+    pub fn outline(&self) -> Option<&Aperture> {
+        self.outline.as_ref()
+    }
+
+    pub(crate) fn patches(&self) -> &[Patch] {
+        &self.patches
+    }
+
+    /// Returns every point of the surface, holes left out.
+    pub fn points(&self) -> impl Iterator<Item = &Point> {
+        self.patches
+            .iter()
+            .flat_map(|patch| (0..patch.len()).map(move |v| patch.point(v as u32)))
+            .filter(|p| p.x.is_finite())
+    }
+
+    /// Returns every point moved along its normal by a length in millimetres, eq. (3); holes left out.
+    pub fn offset_points(&self, by_mm: f64) -> impl Iterator<Item = Point> {
+        let moved = move |vertex: Vertex| vertex.point + vertex.normal * by_mm;
+        self.patches
+            .iter()
+            .flat_map(move |patch| (0..patch.len()).map(move |v| moved(patch.vertex(v as u32))))
+            .filter(|p| p.x.is_finite())
+    }
+
+    /// Returns the number of points, holes left out.
+    pub fn len(&self) -> usize {
+        self.points().count()
+    }
+
+    /// Whether there is no point; never so for a surface that was made.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Returns some vertices and their normals, spread over the surface.
+    fn sampled_vertices(&self, count: usize) -> Vec<(Point, Vector)> {
+        let share = count / self.patches.len();
+        self.patches
+            .iter()
+            .flat_map(|patch| patch.sample(share.max(1)).map(|v| patch.vertex(v)))
+            .map(|vertex| (vertex.point, vertex.normal))
+            .collect()
+    }
+
+    /// Returns the steepest slope against the plane of x and y that some places spread over the surface have, in radians.
+    pub fn steepest_rad(&self) -> f64 {
+        let normals = self.sampled_vertices(SAMPLE).into_iter().map(|(_, n)| n.z.clamp(-1.0, 1.0).acos());
+        normals.fold(0.0, f64::max)
+    }
+
+    /// Returns some points spread over the surface.
+    pub(crate) fn sample(&self, count: usize) -> Vec<Point> {
+        let share = (count / self.patches.len()).max(1);
+        self.patches.iter().flat_map(|patch| patch.sample(share).map(|v| *patch.point(v))).collect()
+    }
+
+    /// Returns the rms distance of the points from their middle, in millimetres.
+    pub fn size_mm(&self) -> f64 {
+        self.extent_mm()[0]
+    }
+
+    /// Returns the rms distance of the points from their best plane, in millimetres: how much shape there is to register by.
+    pub fn relief_mm(&self) -> f64 {
+        self.extent_mm()[1]
+    }
+
+    fn extent_mm(&self) -> [f64; 2] {
+        *self.extent_mm.get_or_init(|| {
+            let sample = self.sample(SAMPLE);
+            let (middle, eigen) = principal_axes(&sample);
+            let squares = sample.iter().map(|p| (p - middle).norm_squared()).sum::<f64>();
+            [squares, eigen.eigenvalues.min().max(0.0)].map(|sum| (sum / sample.len() as f64).sqrt())
+        })
+    }
+
+    /// Returns the mean of the normals, of unit length; z for a closed surface, which has none.
+    pub(crate) fn mean_normal(&self) -> Vector {
+        let sum: Vector = self.sampled_vertices(512).iter().map(|(_, n)| n).sum();
+        if sum.norm() > 1e-6 { sum.normalize() } else { Vector::z() }
+    }
+
+    /// Returns how wrong fitted normals may be, in radians: 0 for a grid and for normals that are given.
+    ///
+    /// Estimated as the rms change of the normal when its fit takes in one ring of neighbours more.
+    pub(crate) fn normal_error(&self) -> f64 {
+        let (mut sum, mut count) = (0.0, 0);
+        for patch in self.patches.iter().filter(|p| p.has_scattered_normals()) {
+            let Lattice::Mesh(mesh) = &patch.lattice else { continue };
+            for vertex in patch.sample(256) {
+                let wider = normals::fit_to_ring(patch.mesh_points(), mesh, vertex, 2 * normals::NEIGHBOURS);
+                sum += (wider.normal - patch.normal(vertex)).norm_squared();
+                count += 1;
+            }
+        }
+        if count == 0 { 0.0 } else { (sum / f64::from(count)).sqrt() }
+    }
+
+    /// Returns how the surface bends at some places spread over it.
+    pub(crate) fn features(&self) -> &[Feature] {
+        self.features.get_or_init(|| {
+            let (points, normals): (Vec<_>, Vec<_>) = self.sampled_vertices(FEATURES).into_iter().unzip();
+            features(&points, Some(&normals))
+        })
+    }
+}
+
+/// Points that a size is taken from, and places that a pose is searched by.
+const SAMPLE: usize = 4096;
+const FEATURES: usize = 3000;
+
+pub(super) fn check_grid(columns: usize, rows: usize, points: usize) -> Result<(), SurfaceError> {
+    if columns < 3 || rows < 3 || columns.checked_mul(rows) != Some(points) {
+        return Err(SurfaceError::GridSize { columns, rows, points });
+    }
+    Ok(())
+}
