@@ -63,6 +63,7 @@ pub enum Aperture {
 
 /// Why a set of numbers is no outline.
 #[derive(Clone, Debug, Error, PartialEq)]
+#[non_exhaustive]
 pub enum ApertureError {
     /// A coordinate is NaN, infinite or absurd.
     #[error("`{key}` is {value} mm; it must be a number between -{LARGEST_MM:e} and {LARGEST_MM:e} mm")]

@@ -32,6 +32,7 @@ pub struct Pose {
 
 /// Why sixteen numbers are not a rigid pose.
 #[derive(Clone, Debug, Error, PartialEq)]
+#[non_exhaustive]
 pub enum PoseError {
     /// An entry is NaN or infinite.
     #[error("row {row}, column {column} of the pose is {value}; every entry must be a finite number")]

@@ -37,6 +37,7 @@ impl RigidFit {
 
 /// Why two sets of points have no rigid fit.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
+#[non_exhaustive]
 pub enum RigidError {
     /// The sets are not pairs.
     #[error("{from} points cannot be laid on {to}; give every point its partner")]

@@ -41,6 +41,7 @@ pub enum Layout {
 /// Why there are no targets.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
+#[non_exhaustive]
 pub enum PatternError {
     #[error("the measuring pattern has a spacing of {spacing_mm} mm; it must be above 0")]
     Spacing { spacing_mm: f64 },

@@ -21,6 +21,7 @@ pub struct SphereFit {
 /// Why there is no sphere.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
+#[non_exhaustive]
 pub enum SphereFitError {
     #[error(
         "{points} points were touched on the reference sphere and at least {LEAST} are needed; look at the sphere and its place in the cell file"

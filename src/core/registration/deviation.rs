@@ -19,6 +19,7 @@ pub struct Deviation {
 
 /// What became of a measured point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum PointStatus {
     /// It took part in the fit.
     Used,

@@ -7,6 +7,7 @@ use crate::surface::SurfaceError;
 /// Why a registration cannot be had.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
+#[non_exhaustive]
 pub enum RegistrationError {
     #[error(transparent)]
     Surface(#[from] SurfaceError),

@@ -5,6 +5,7 @@ use thiserror::Error;
 /// Why a nominal surface or its offset cannot be had.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[allow(missing_docs)]
+#[non_exhaustive]
 pub enum SurfaceError {
     #[error("the nominal surface has {points} points and needs at least {least}; give a denser nominal")]
     TooFewPoints { points: usize, least: usize },

@@ -8,6 +8,7 @@ use crate::geometry::ApertureError;
 ///
 /// A key is written as the path in the definition, such as `surface.radius_mm`.
 #[derive(Clone, Debug, Error, PartialEq)]
+#[non_exhaustive]
 pub enum DefinitionError {
     /// The text is no TOML, or a key is missing, unknown or of the wrong type.
     #[error("line {line}, column {column}: {message}")]

@@ -29,7 +29,7 @@ pub use forbes::{Qbfs, QbfsDefinition, Qcon, QconDefinition};
 pub(crate) use jacobi::values as jacobi_values;
 pub use off_axis::{OffAxis, OffAxisDefinition, SectionFrame};
 pub use polynomial::{XyPolynomial, XyPolynomialDefinition};
-pub use sampling::{SampledSurface, curved_triangle_sag};
+pub use sampling::SampledSurface;
 pub use toroid::{Biconic, BiconicDefinition, Toroid, ToroidDefinition};
 pub use zernike::{Zernike, ZernikeDefinition, ZernikeNormalisation, ZernikeNumbering};
 

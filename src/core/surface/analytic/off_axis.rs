@@ -108,7 +108,7 @@ impl OffAxis {
     /// Returns the place in the parent's plane that lies under a place of the section.
     ///
     /// Units: millimetres.
-    pub fn parent_place(&self, x: f64, y: f64) -> Option<[f64; 2]> {
+    pub(super) fn parent_place(&self, x: f64, y: f64) -> Option<[f64; 2]> {
         match self.frame {
             SectionFrame::Parent => Some([x, y]),
             SectionFrame::Shifted => Some([self.centre.x + x, self.centre.y + y]),

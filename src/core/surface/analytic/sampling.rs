@@ -84,7 +84,7 @@ impl DefinedSurface {
     /// Returns a spacing at which the distance to the curved triangles between the nodes is as exact as asked for.
     ///
     /// Units: millimetres. The error is measured: in cells about fixed places all over the aperture and along its outline, the
-    /// formula is compared with [`curved_triangle_sag`], along the normal, and the spacing is halved and bisected until
+    /// formula is compared with the cubic triangles, along the normal, and the spacing is halved and bisected until
     /// twice the largest error is within the accuracy.
     ///
     /// # Errors
@@ -186,7 +186,7 @@ const INSIDE: [[f64; 3]; 7] = [
 /// Hermite. The one coefficient that is left in the middle is chosen so that quadratics are exact: in Bernstein's form a
 /// quarter of the sum of the six edge coefficients less a sixth of the sum of the three at the corners. The error is O(h^4)
 /// on the edges and O(h^3) within.
-pub fn curved_triangle_sag(places: [[f64; 2]; 3], sags: [f64; 3], gradients: [[f64; 2]; 3], weights: [f64; 3]) -> f64 {
+fn curved_triangle_sag(places: [[f64; 2]; 3], sags: [f64; 3], gradients: [[f64; 2]; 3], weights: [f64; 3]) -> f64 {
     let (mut sag, mut edge_sum) = (0.0, 0.0);
     for i in 0..3 {
         sag += weights[i].powi(3) * sags[i];
