@@ -16,9 +16,10 @@ use std::fs;
 use std::path::Path;
 use std::time::Instant;
 
+use nabo::{KDTree, NotNan};
 use nalgebra::{Matrix6, Vector6};
 use rayon::prelude::*;
-use regrind::geometry::{Point, Pose, Twist, Vector};
+use regrind::geometry::{Point, Pose, Twist, Vector, fit_rigid};
 use regrind::registration::{
     Deviation, Method, Options, PointStatus, ProbeSide, Registration, RegistrationError, Start, register,
 };
@@ -47,6 +48,7 @@ fn main() -> Outcome {
     row("nominal points", "451401", nominal.len());
     robustness(&nominal, figures)?;
     let after = corrective_grinding(&nominal, figures)?;
+    closest_points(&nominal, &after)?;
     equivalence(&nominal, &after, figures)?;
     subtracting_the_radius(&nominal, &after, figures)?;
 
@@ -374,6 +376,64 @@ fn shift_and_turn(twist: &Twist) -> String {
     let shift_um = 1e3 * twist.fixed_rows::<3>(0).norm();
     let turn_urad = 1e6 * twist.fixed_rows::<3>(3).norm();
     format!("{shift_um:.4}, {turn_urad:.4}")
+}
+
+/// What section 1 advises against: centres drawn to the closest points of the offset cloud (Besl and McKay, 1992). The two
+/// sampling grids slide along each other.
+fn closest_points(nominal: &Nominal, (measured, after): &(Measurement, Registration)) -> Outcome {
+    const MOST_TURNS: usize = 500;
+    heading("section 1: centres to the closest points of the offset cloud");
+    let cloud: Vec<Point> = nominal.offset_points(PROBE_RADIUS_MM).collect();
+    let tree = KDTree::new(&cloud.iter().map(Entry::from).collect::<Vec<_>>());
+    let (mut pose, mut before, mut turns) = (Pose::identity(), f64::INFINITY, 0);
+    loop {
+        let inverse = pose.inverse();
+        let nearest = |y: &Point| tree.knn(1, &Entry::from(&inverse.point(y))).pop().expect("the cloud has points");
+        let nearest: Vec<(Point, f64)> =
+            measured.centres.par_iter().map(nearest).map(|n| (cloud[n.index as usize], *n.dist2)).collect();
+        let objective = nearest.iter().map(|n| n.1).sum::<f64>();
+        if 1.0 - objective / before <= 1e-9 || turns == MOST_TURNS {
+            break;
+        }
+        let closest: Vec<Point> = nearest.iter().map(|n| n.0).collect();
+        pose = fit_rigid(&closest, &measured.centres)?.pose;
+        (before, turns) = (objective, turns + 1);
+    }
+    let (twist, _) = best_fit(measured).ok_or("the part has a symmetry")?;
+    let off = ((measured.cmm_from_model * Pose::exp(&twist)).inverse() * pose).log();
+    row(
+        &format!("pose against the exact best fit / um, urad ({turns} turns)"),
+        "considerable error",
+        shift_and_turn(&off),
+    );
+    let surface = OffsetSurface::new(nominal, PROBE_RADIUS_MM, Side::Normal)?;
+    let inverse = pose.inverse();
+    let map_off = measured.centres.iter().zip(&after.deviations);
+    let map_off = map_off.map(|(y, d)| surface.foot(&inverse.point(y), Place::UNKNOWN).distance_mm - d.deviation_mm);
+    row("map against the right one, PV / um", "-", format!("{:.3}", 1e3 * pv(map_off)));
+    Ok(())
+}
+
+/// A point in the form that the tree of closest points takes.
+#[derive(Default)]
+struct Entry([NotNan<f64>; 3]);
+
+impl From<&Point> for Entry {
+    fn from(p: &Point) -> Self {
+        Self(<[f64; 3]>::from(*p).map(|c| NotNan::new(c).expect("points are finite")))
+    }
+}
+
+impl nabo::Point<f64> for Entry {
+    const DIM: u32 = 3;
+
+    fn set(&mut self, axis: u32, value: NotNan<f64>) {
+        self.0[axis as usize] = value;
+    }
+
+    fn get(&self, axis: u32) -> NotNan<f64> {
+        self.0[axis as usize]
+    }
 }
 
 /// Eq. (18), figure 12a: the contact points found are already at rest on the nominal surface.

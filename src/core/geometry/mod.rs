@@ -5,6 +5,7 @@
 pub mod aperture;
 pub mod grid;
 pub mod grid_order;
+mod nearest;
 pub mod pose;
 pub mod rigid;
 pub mod sample;
@@ -12,6 +13,7 @@ pub mod sample;
 pub use aperture::{Aperture, ApertureError};
 pub use grid::{Grid, GridError};
 pub use grid_order::{GridOrder, recognise_grid};
+pub(crate) use nearest::Nearest;
 pub use pose::{Pose, PoseError, Twist};
 pub use rigid::{RigidError, RigidFit, fit_rigid};
 pub use sample::Sample;

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::{Point, Pose};
+use crate::geometry::{Nearest, Point, Pose};
 
 use super::correspond::{Correspondence, middle_and_size};
 use super::error::RegistrationError;
@@ -163,21 +163,13 @@ fn screen(problem: &Problem, options: &Options, correspondences: &mut [Correspon
 /// asked. A suspect with nothing but twins around it is isolated.
 fn isolated(measured: &[Point], correspondences: &[Correspondence], suspects: &[usize], limit_mm: f64) -> Vec<bool> {
     const ASKED: usize = 8;
-    const NEAREST: std::num::NonZero<usize> = std::num::NonZero::new(64).expect("not zero");
-    let coordinates: Vec<[f64; 3]> = measured.iter().map(|p| (*p).into()).collect();
-    let Ok(tree) = kiddo::ImmutableKdTree::<f64, 3>::new_from_slice(&coordinates) else {
-        return vec![true; suspects.len()];
-    };
+    const NEAREST: u32 = 64;
+    let tree = Nearest::of(measured.iter().copied());
     // Points spread over a square of rms size s stand s sqrt(6 / n) apart.
     let twin_mm = 0.5 * middle_and_size(measured).1 * (6.0 / measured.len() as f64).sqrt();
     let is_isolated = |&k: &usize| {
-        let nearest = tree.query(&coordinates[k]).nearest_n::<kiddo::SquaredEuclidean<f64>>(NEAREST).execute();
-        let mut around: Vec<f64> = nearest
-            .iter()
-            .filter(|n| n.distance > twin_mm * twin_mm)
-            .take(ASKED)
-            .map(|n| correspondences[n.item as usize].distance_mm)
-            .collect();
+        let others = tree.to(&measured[k], NEAREST).filter(|(_, square)| *square > twin_mm * twin_mm);
+        let mut around: Vec<f64> = others.take(ASKED).map(|(n, _)| correspondences[n].distance_mm).collect();
         around.sort_unstable_by(f64::total_cmp);
         around.get(around.len() / 2).is_none_or(|median| (correspondences[k].distance_mm - median).abs() > limit_mm)
     };

@@ -1,9 +1,8 @@
 //! What tells one place of a surface from another whatever its pose: how it bends.
 
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
 
-use crate::geometry::{Point, Vector};
+use crate::geometry::{Nearest, Point, Vector};
 
 use super::facet::Side;
 use super::normals::fit;
@@ -51,22 +50,20 @@ impl Feature {
 }
 
 /// Neighbours of a local fit.
-const NEIGHBOURS: std::num::NonZero<usize> = std::num::NonZero::new(25).expect("not zero");
+const NEIGHBOURS: u32 = 25;
 
 /// Fits the curvature at each of some scattered points; with their normals where these are known.
 ///
 /// Neighbours that a first fit contradicts are left out of the second, so that an outlier spoils itself and not the places
 /// around it. Points whose own neighbours are not a surface are left out altogether.
 pub(crate) fn features(points: &[Point], normals: Option<&[Vector]>) -> Vec<Feature> {
-    let coordinates: Vec<[f64; 3]> = points.iter().map(|p| (*p).into()).collect();
-    let Ok(tree) = ImmutableKdTree::<f64, 3>::new_from_slice(&coordinates) else { return Vec::new() };
+    let tree = Nearest::of(points.iter().copied());
     (0..points.len())
         .into_par_iter()
         .with_min_len(64)
         .filter_map(|k| {
-            let nearest = tree.query(&coordinates[k]).nearest_n::<SquaredEuclidean<f64>>(NEIGHBOURS).execute();
-            let around: Vec<Point> =
-                nearest.iter().map(|n| points[n.item as usize]).filter(|p| *p != points[k]).collect();
+            let nearest = tree.to(&points[k], NEIGHBOURS).map(|(n, _)| points[n]);
+            let around: Vec<Point> = nearest.filter(|p| *p != points[k]).collect();
             feature(points[k], &around, normals.map(|n| n[k]))
         })
         .collect()

@@ -1,8 +1,6 @@
 //! Triangles in flat arrays: corners, neighbours, and a way round a vertex.
 
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
-
-use crate::geometry::{Point, Vector};
+use crate::geometry::{Nearest, Point, Vector};
 
 use super::error::SurfaceError;
 use super::facet::Facets;
@@ -11,7 +9,7 @@ use super::facet::Facets;
 pub(crate) const BORDER: u32 = u32::MAX;
 
 /// At most this many facets are entered in the tree that a search without a past begins from.
-const STARTS: usize = 1 << 16;
+const STARTS: usize = 1 << 15;
 
 /// A triangle mesh whose facets know their neighbours.
 #[derive(Debug)]
@@ -21,7 +19,7 @@ pub(crate) struct MeshLattice {
     neighbours: Vec<[u32; 3]>,
     /// One facet at each vertex, the first one counter-clockwise where the vertex lies on the border.
     facet_of: Vec<u32>,
-    starts: ImmutableKdTree<f64, 3>,
+    starts: Nearest,
     start_facets: Vec<u32>,
 }
 
@@ -50,7 +48,7 @@ impl MeshLattice {
         if corners.is_empty() {
             return Err(SurfaceError::NoTriangles);
         }
-        let (facet_of, starts) = rayon::join(
+        let (facet_of, (starts, start_facets)) = rayon::join(
             || first_facets(points.len(), &corners, &neighbours),
             || {
                 let stride = corners.len().div_ceil(STARTS);
@@ -59,11 +57,9 @@ impl MeshLattice {
                     let sum: Vector = corners[*f as usize].iter().map(|&c| points[c as usize].coords).sum();
                     (sum / 3.0).into()
                 };
-                let centres: Vec<[f64; 3]> = start_facets.iter().map(centre).collect();
-                ImmutableKdTree::new_from_slice(&centres).map(|tree| (tree, start_facets))
+                (Nearest::of(start_facets.iter().map(centre)), start_facets)
             },
         );
-        let (starts, start_facets) = starts.map_err(|_| SurfaceError::NoTriangles)?;
         Ok(Self { corners, neighbours, facet_of, starts, start_facets })
     }
 
@@ -177,8 +173,8 @@ impl Facets for MeshLattice {
     }
 
     fn start(&self, p: &Point) -> u32 {
-        let nearest = self.starts.query(&[p.x, p.y, p.z]).nearest_one::<SquaredEuclidean<f64>>().execute();
-        self.start_facets[nearest.item as usize]
+        let nearest = self.starts.to(p, 1).next();
+        nearest.map_or(0, |(k, _)| self.start_facets[k])
     }
 }
 
