@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use crate::geometry::Point;
 
-use super::edges::{Strewn, Triangulation};
+use super::edges::{SortedSites, Triangulation};
 use super::error::SurfaceError;
 use super::mesh::BORDER;
 use super::projection::Map;
@@ -42,7 +42,7 @@ pub(crate) fn triangulate(points: &[Point], map: &Map) -> Result<(Vec<Point>, Tr
     if ordered.windows(2).any(|w| w[0] == w[1]) {
         return Err(first_duplicate(points, &places));
     }
-    let (corners, neighbours) = Triangulation::new(Strewn { places: &ordered, keys: &keys }).faces();
+    let (corners, neighbours) = Triangulation::new(SortedSites { places: &ordered, keys: &keys }).faces();
     if corners.is_empty() {
         return Err(SurfaceError::Collinear { points: points.len() });
     }
@@ -254,6 +254,15 @@ mod tests {
             let p = |i: u32| points[i as usize];
             (p(b) - p(a)).cross(&(p(c) - p(a))).z > 0.0
         }));
+    }
+
+    #[test]
+    fn a_shuffled_grid_has_the_triangles_of_the_grid_in_order() {
+        let node = |k: usize| Point::new((k % 173) as f64 * 0.1, (k / 173) as f64 * 0.1, 0.0);
+        let in_order: Vec<Point> = (0..173 * 149).map(node).collect();
+        let shuffled: Vec<Point> = (0..173 * 149).map(|k| node(k * 7919 % (173 * 149))).collect();
+        let (a, b) = (triangulated(&in_order), triangulated(&shuffled));
+        assert_eq!((a.0, a.1.corners, a.1.neighbours), (b.0, b.1.corners, b.1.neighbours));
     }
 
     #[test]
