@@ -145,6 +145,8 @@ fn map_options(recipe: &Recipe) -> MapOptions {
         level_off_mm: wheel_radius_mm,
         contact_width_mm: contact_width_mm(wheel_radius_mm, compensation.depth_of_cut_mm),
         smoothing: compensation.smoothing,
+        order: compensation.filter_order,
+        roughness: compensation.roughness,
         ..MapOptions::new(compensation.cutoff_mm, compensation.spacing_mm)
     }
 }
@@ -169,6 +171,10 @@ fn setting(recipe: &Recipe, cell: &CellConfig, part: &[u8; 32], targets: usize) 
         map.smoothing,
         map.gain
     );
+    // What stands as it always did is not said, so that what was learned before still counts.
+    if (map.filter_order, map.roughness) != Default::default() {
+        let _ = write!(said, "; order {:?}, {:?}", map.filter_order, map.roughness);
+    }
     // Another simulated world is another grinder.
     if let Some(world) = recipe.simulation.as_ref().filter(|_| cell.simulated) {
         let _ = write!(said, "; simulation {}", serde_json::json!(world));
@@ -423,13 +429,13 @@ fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
         on_refusal: Disposal::Stop,
         gates: Gates {
             least_found: recipe.measure.minimum_coverage,
-            least_coverage: 0.0,
+            least_coverage: recipe.registration.least_coverage,
             most_shift_mm: recipe.registration.largest_shift_mm,
             most_turn_rad: recipe.registration.largest_turn_rad,
             most_radius_error_mm: recipe.measure.qualify.then_some(recipe.measure.radius_tolerance_mm),
         },
         removal_budget_mm: recipe.compensation.removal_budget_mm,
-        least_depth_mm: 0.0,
+        least_depth_mm: recipe.compensation.least_depth_mm,
         clear_at_start: cell.simulated,
         deadlines,
     }

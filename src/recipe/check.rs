@@ -280,6 +280,7 @@ fn registration(written: &RegistrationTable, document: &mut Document) -> Registr
         start: written.start,
         largest_shift_mm: written.largest_shift_mm,
         largest_turn_rad: written.largest_turn_deg.to_radians(),
+        least_coverage: written.least_coverage,
         max_rms_mm: written.max_rms_um.map(|um| MM_PER_UM * um),
     }
 }
@@ -349,6 +350,8 @@ fn compensation(written: &CompensationTable, document: &mut Document) -> Option<
         least_depth_mm: MM_PER_UM * written.least_depth_um,
         cutoff_mm: written.cutoff_mm?,
         smoothing: written.smoothing,
+        filter_order: written.filter_order,
+        roughness: written.roughness,
         largest_correction_mm: MM_PER_UM * written.largest_correction_um?,
         removal_budget_mm: MM_PER_UM * written.removal_budget_um?,
         depth_of_cut_mm: MM_PER_UM * written.depth_of_cut_um?,

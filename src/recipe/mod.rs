@@ -16,7 +16,7 @@ mod written;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
-use crate::compensation::{GainRule, Smoothing};
+use crate::compensation::{GainRule, Order, Roughness, Smoothing};
 use crate::document::{Document, Problems, problem_at, read_text, schema_of, sha256};
 use crate::geometry::{Aperture, Pose};
 use crate::registration::{self, Loss, ProbeSide, Start};
@@ -147,6 +147,8 @@ pub struct RegistrationSettings {
     pub largest_shift_mm: f64,
     /// The most that the part may be turned from how the fixture holds it.
     pub largest_turn_rad: f64,
+    /// The least share of the surface that must be covered, 0 to 1.
+    pub least_coverage: f64,
     /// Refuse a fit whose rms deviation is above this; `None` for the registration's own limit.
     pub max_rms_mm: Option<f64>,
 }
@@ -189,6 +191,10 @@ pub struct Compensation {
     pub cutoff_mm: f64,
     /// What makes the map smooth.
     pub smoothing: Smoothing,
+    /// What the Gaussian filters let pass unchanged.
+    pub filter_order: Order,
+    /// How a spline's smoothness is chosen.
+    pub roughness: Roughness,
     /// The correction is nowhere larger than this.
     pub largest_correction_mm: f64,
     /// The most that may be taken off anywhere, over all passes.

@@ -4,7 +4,7 @@ use schemars::{JsonSchema, Schema, json_schema};
 use serde::Deserialize;
 
 use super::{BeginWith, GainBy, OnTrouble, PvOf, StartAt};
-use crate::compensation::Smoothing;
+use crate::compensation::{Order, Roughness, Smoothing};
 use crate::registration::Loss;
 use crate::surface::Projection;
 
@@ -202,6 +202,9 @@ pub(super) struct RegistrationTable {
     /// The most that the part may be turned from how the fixture holds it.
     #[schemars(range(min = 0.0001, max = 180.0))]
     pub largest_turn_deg: f64,
+    /// The least share of the part's surface that the measured points must cover; below, nothing is made of them.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub least_coverage: f64,
     /// Refuse a fit whose rms deviation is above this.
     #[schemars(range(min = 0.01, max = 1000000.0))]
     pub max_rms_um: Option<f64>,
@@ -246,6 +249,10 @@ pub(super) struct CompensationTable {
     pub cutoff_mm: Option<f64>,
     /// What makes the map of the deviations smooth.
     pub smoothing: Smoothing,
+    /// What the Gaussian filters let pass unchanged.
+    pub filter_order: Order,
+    /// How the spline's smoothness is chosen, where it is a spline.
+    pub roughness: Roughness,
     /// The correction is nowhere larger than this.
     #[schemars(range(min = 0.01, max = 10000.0), extend("x-required" = true), example = 60.0)]
     pub largest_correction_um: Option<f64>,
@@ -440,6 +447,7 @@ impl Default for RegistrationTable {
             start: StartAt::Search,
             largest_shift_mm: 5.0,
             largest_turn_deg: 5.0,
+            least_coverage: 0.5,
             max_rms_um: None,
         }
     }
@@ -459,6 +467,8 @@ impl Default for CompensationTable {
             repeatability_um: None,
             learn: false,
             smoothing: Smoothing::default(),
+            filter_order: Order::default(),
+            roughness: Roughness::default(),
             least_depth_um: 0.5,
             cutoff_mm: None,
             largest_correction_um: None,

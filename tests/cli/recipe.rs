@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use proptest::prelude::*;
+use regrind::compensation::{Order, Roughness};
 use regrind::config::{CellConfig, PointKind, Wire, WordOrder};
 use regrind::document::Problems;
 use regrind::formats::read_points;
@@ -95,6 +96,22 @@ fn the_default_recipe_is_what_it_says() {
     let again = self::recipe(&RECIPE.replace("12.5", "12.6")).unwrap();
     assert_eq!(hash.len(), 64);
     assert_ne!(recipe.source_sha256(), again.source_sha256());
+}
+
+#[test]
+fn the_filter_and_the_gate_of_coverage_are_chosen_by_the_recipe() {
+    let told = |recipe: &Recipe| {
+        let map = &recipe.compensation;
+        (map.filter_order, map.roughness, recipe.registration.least_coverage)
+    };
+    assert_eq!(told(&recipe(RECIPE).unwrap()), (Order::Plane, Roughness::Cutoff, 0.5));
+    let text = changed(
+        RECIPE,
+        "[compensation]\n",
+        "[compensation]\nfilter_order = \"quadric\"\nroughness = \"cross-validation\"\n",
+    );
+    let text = changed(&text, "[registration]\n", "[registration]\nleast_coverage = 0.8\n");
+    assert_eq!(told(&recipe(&text).unwrap()), (Order::Quadric, Roughness::CrossValidation, 0.8));
 }
 
 /// The simulator is told the same surface in its own words.

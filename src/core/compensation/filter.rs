@@ -17,7 +17,8 @@ use std::f64::consts::PI;
 
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 use rayon::prelude::*;
-use serde::Serialize;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 
 use crate::geometry::Grid;
 
@@ -41,7 +42,7 @@ const MOST_VARIANCE: f64 = 2.0;
 const MOST_SPREAD: f64 = 4.5;
 
 /// Order of the polynomial that the filter lets pass unchanged.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Order {
     /// Constants pass: the plain weighted mean, which is pulled askew by slopes at edges.

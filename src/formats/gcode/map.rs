@@ -59,62 +59,80 @@ pub struct ProgramMap {
 /// A file that cannot be read, other columns, rows that are no numbers, nodes that are no whole grid.
 pub fn read_program_map(path: &Path) -> Result<ProgramMap, GcodeError> {
     let unreadable = |source| GcodeError::File(FormatError::Unreadable { path: path.to_owned(), source });
-    let line_error = |line: u64, what: String| {
-        let remedy = "give the error_map.csv or correction.csv of a run, or a file like it";
-        GcodeError::Line { path: path.to_owned(), line, what, remedy }
-    };
     let file = std::fs::File::open(path).map_err(unreadable)?;
     let mut reader = BufReader::new(file.take(MOST_BYTES + 1));
-    let (mut hash, mut line, mut number, mut bytes) = (Sha256::new(), Vec::new(), 0u64, 0u64);
-    let (mut kind, mut points, mut part, mut stated, mut simulation) = (None, Vec::new(), None, None, false);
-    let mut ground_with = None;
+    let (mut lines, mut line, mut number, mut bytes) = (MapLines::default(), Vec::new(), 0u64, 0u64);
     loop {
         line.clear();
         // A file without lines is not read into one.
         let taken = (&mut reader).take(4096).read_until(b'\n', &mut line).map_err(unreadable)?;
         if taken == 0 {
-            break;
+            return lines.into_map(path);
         }
         (number, bytes) = (number + 1, bytes + taken as u64);
-        hash.update(&line);
         if bytes > MOST_BYTES {
-            return Err(GcodeError::File(FormatError::TooLarge {
-                path: path.to_owned(),
-                found: bytes,
-                limit: MOST_BYTES,
-                unit: "bytes",
-            }));
+            let (path, found, limit, unit) = (path.to_owned(), bytes, MOST_BYTES, "bytes");
+            return Err(GcodeError::File(FormatError::TooLarge { path, found, limit, unit }));
         }
-        let text = std::str::from_utf8(&line).map_err(|_| line_error(number, "the line is no text".into()))?.trim();
-        if let Some(comment) = text.strip_prefix('#') {
-            simulation |= comment.trim() == "SIMULATION";
-            part = part.or(identity_in(comment, "part:"));
-            stated = stated.or(identity_in(comment, "map:"));
-            ground_with = ground_with.or(identity_in(comment, "ground with:"));
-        } else if !text.is_empty() && kind.is_none() {
-            kind = Some(columns(text).ok_or_else(|| line_error(number, format!("the columns are {text:?}")))?);
-        } else if !text.is_empty() {
-            points.push(node(text).ok_or_else(|| line_error(number, format!("{text:?} is no node of a map")))?);
-        }
+        lines.take(&line).map_err(|what| {
+            let remedy = "give the error_map.csv or correction.csv of a run, or a file like it";
+            GcodeError::Line { path: path.to_owned(), line: number, what, remedy }
+        })?;
     }
-    let remedy = "every node of a regular grid needs its row";
-    let no_grid = |what: String| GcodeError::Program { path: path.to_owned(), what, remedy };
-    let kind = kind.ok_or_else(|| no_grid("the map is empty".into()))?;
-    let (grid, values_mm) =
-        grid(&points).ok_or_else(|| no_grid(format!("its {} nodes are no whole grid", points.len())))?;
-    Ok(ProgramMap {
-        grid,
-        values_mm,
-        kind,
-        identity: stated.unwrap_or_else(|| hash.finalize().into()),
-        part,
-        base: match (kind, ground_with) {
-            (MapKind::Correction, _) => MapBase::Nothing,
-            (MapKind::Error, Some(identity)) => MapBase::Map(identity),
-            (MapKind::Error, None) => MapBase::Anything,
-        },
-        simulation,
-    })
+}
+
+/// What the lines of a map have told so far.
+#[derive(Default)]
+struct MapLines {
+    hash: Sha256,
+    kind: Option<MapKind>,
+    nodes: Vec<Point>,
+    simulation: bool,
+    part: Option<[u8; 32]>,
+    /// The map's own identity.
+    stated: Option<[u8; 32]>,
+    ground_with: Option<[u8; 32]>,
+}
+
+impl MapLines {
+    /// Takes one line; the error says what is wrong with it.
+    fn take(&mut self, line: &[u8]) -> Result<(), String> {
+        self.hash.update(line);
+        let text = std::str::from_utf8(line).map_err(|_| "the line is no text")?.trim();
+        if let Some(comment) = text.strip_prefix('#') {
+            self.simulation |= comment.trim() == "SIMULATION";
+            self.part = self.part.or(identity_in(comment, "part:"));
+            self.stated = self.stated.or(identity_in(comment, "map:"));
+            self.ground_with = self.ground_with.or(identity_in(comment, "ground with:"));
+        } else if !text.is_empty() && self.kind.is_none() {
+            self.kind = Some(columns(text).ok_or_else(|| format!("the columns are {text:?}"))?);
+        } else if !text.is_empty() {
+            self.nodes.push(node(text).ok_or_else(|| format!("{text:?} is no node of a map"))?);
+        }
+        Ok(())
+    }
+
+    /// Lays the nodes on their grid once all lines are told.
+    fn into_map(self, path: &Path) -> Result<ProgramMap, GcodeError> {
+        let remedy = "every node of a regular grid needs its row";
+        let no_grid = |what: String| GcodeError::Program { path: path.to_owned(), what, remedy };
+        let kind = self.kind.ok_or_else(|| no_grid("the map is empty".into()))?;
+        let (grid, values_mm) =
+            grid(&self.nodes).ok_or_else(|| no_grid(format!("its {} nodes are no whole grid", self.nodes.len())))?;
+        Ok(ProgramMap {
+            grid,
+            values_mm,
+            kind,
+            identity: self.stated.unwrap_or_else(|| self.hash.finalize().into()),
+            part: self.part,
+            base: match (kind, self.ground_with) {
+                (MapKind::Correction, _) => MapBase::Nothing,
+                (MapKind::Error, Some(identity)) => MapBase::Map(identity),
+                (MapKind::Error, None) => MapBase::Anything,
+            },
+            simulation: self.simulation,
+        })
+    }
 }
 
 fn columns(header: &str) -> Option<MapKind> {
