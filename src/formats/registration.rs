@@ -15,7 +15,7 @@ use super::error::FormatError;
 use regrind_core::geometry::Point;
 
 /// The first line of `deviations.csv`. These names are a contract.
-pub const DEVIATIONS_HEADER: &str = "x_mm,y_mm,z_mm,nx,ny,nz,deviation_mm,used";
+const DEVIATIONS_HEADER: &str = "x_mm,y_mm,z_mm,nx,ny,nz,deviation_mm,used";
 
 /// Rows that one thread formats at a time, and that are held in memory at a time.
 const SHARE: usize = 4096;
@@ -34,7 +34,7 @@ pub struct DeviationRow {
     pub used: bool,
 }
 
-/// Writes `deviations.csv`: [`DEVIATIONS_HEADER`], then a row per measured point in the order given.
+/// Writes `deviations.csv`: `x_mm,y_mm,z_mm,nx,ny,nz,deviation_mm,used`, then a row per measured point in the order given.
 ///
 /// Numbers read back to the same bits; `used` is 1 or 0.
 ///

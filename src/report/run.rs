@@ -21,7 +21,7 @@ use crate::cell::{Alarm, Command, Ending, Event, Figures, Judgement};
 use crate::journal::{Kind, Reader, Record, Verified, verify};
 
 /// The report in a run folder.
-pub const RUN_REPORT: &str = "report.html";
+const RUN_REPORT: &str = "report.html";
 
 /// The picture of a cycle.
 const PICTURE: &str = "error_map.png";

@@ -46,16 +46,6 @@ pub enum X3pFile {
     Points(Vec<Point>),
 }
 
-impl X3pFile {
-    /// Returns the measured points in millimetres, whatever the file holds.
-    pub fn into_points(self) -> Vec<Point> {
-        match self {
-            Self::Map(map) => map.points(),
-            Self::Points(points) => points,
-        }
-    }
-}
-
 /// X3P, told by its first bytes.
 pub(super) const FORMAT: MapFormat = MapFormat {
     begins: is_zip,
