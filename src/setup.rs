@@ -15,19 +15,10 @@ use crate::compensation::path::{
     Limits, PathError, PathOptions, Pattern as TrackPattern, TrackSpacing, Wheel as PathWheel,
 };
 use crate::compensation::{CorrectionLimits, MapOptions, contact_width_mm};
-use crate::config::{self, CellConfig, PointKind, SignalKind, WordOrder};
-use crate::device::exchange::{
-    CmmExchange, CmmFolders, ExchangeCmm, ExchangeGrinder, ExchangeTiming, GrinderExchange, GrinderFolders,
-    Pattern as NamePattern, StationFiles, Stations,
-};
-use crate::device::{
-    self, AnyCmm, AnyGrinder, Coordinates, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, Pass, RegisterMap,
-    Signal, SignalType,
-};
+use crate::config::{CellConfig, Link};
+use crate::device::{AnyCmm, AnyGrinder, Making, MakingError, ModbusSettings, Pass};
 use crate::drive::{Probing, Programs, Sphere, Task};
 use crate::formats::gcode;
-use crate::formats::references::read_references;
-use crate::formats::result as files;
 use crate::formats::{self, FormatError, NominalFile};
 use crate::geometry::{Point, Vector};
 use crate::measuring::{Layout, PatternError, Target, targets};
@@ -69,22 +60,18 @@ pub enum SetupError {
         "{recipe}: the measuring pattern is `free`, and {cell} reaches its CMM over a wire that needs a plan; choose grid, spiral or file"
     )]
     NeedsPlan { recipe: PathBuf, cell: PathBuf },
-    #[error(
-        "{cell}: {key}: the folder {path} is not there; make it where the {machine} finds it (mkdir -p {path}), or correct the cell file"
-    )]
-    Folder { cell: PathBuf, key: String, path: PathBuf, machine: &'static str },
-    #[error("{cell}: {key}: {source}")]
-    References { cell: PathBuf, key: &'static str, source: Box<FormatError> },
-    #[error("{path}: {wire} cannot be opened: {source}; check the cell file and the machine")]
-    Wire { path: PathBuf, wire: String, source: std::io::Error },
+    #[error("{cell}: {source}")]
+    Machine { cell: PathBuf, source: MakingError },
 }
 
 /// How long a machine without a wire may take, with the person who serves it.
 const WAIT_FOR_PEOPLE: Duration = Duration::from_secs(7 * 86_400);
-/// A folder, perhaps on another computer, answers within this, a large file read included.
-const FOLDER_ANSWERS_WITHIN: Duration = Duration::from_secs(30);
-/// A folder is looked at no more often than this.
-const FOLDER_POLL: Duration = Duration::from_millis(250);
+/// How long a person may take to hold or to stop a machine and to come back and say so.
+const WAIT_FOR_STILL: Duration = Duration::from_secs(600);
+/// What stands for such a machine, perhaps a folder on another computer, answers within this, a large file read included.
+const ANSWERS_WITHIN: Duration = Duration::from_secs(90);
+/// And is looked at no more often than this.
+const SLOW_POLL: Duration = Duration::from_millis(250);
 
 /// Makes what a run computes from, and what its cell decides by.
 ///
@@ -116,7 +103,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         fixture_cmm_from_model: cell.cmm.fixture_cmm_from_model,
         registration: recipe.registration_options(cell.cmm.fixture_cmm_from_model),
         start_at_fixture: recipe.registration.start == StartAt::Fixture,
-        coordinates: coordinates(cell),
+        coordinates: cell.cmm.link.wire.coordinates(),
         place: MapLimits { place_mm: recipe.compensation.largest_displacement_mm, ..MapLimits::default() },
         map: map_options(recipe),
         gain: recipe.compensation.gain,
@@ -255,17 +242,6 @@ fn sphere(recipe: &Recipe, cell: &CellConfig) -> Result<Option<Sphere>, SetupErr
     }
 }
 
-/// What the measuring machine is expected to give; a machine with a wire of its own gives centres.
-fn coordinates(cell: &CellConfig) -> Option<Coordinates> {
-    match &cell.cmm.link.wire {
-        config::Wire::FileExchange(exchange) => exchange.content.what.map(|what| match what {
-            PointKind::Centres => Coordinates::Centres,
-            PointKind::Contacts => Coordinates::Contacts,
-        }),
-        _ => Some(Coordinates::Centres),
-    }
-}
-
 fn check_limits(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Result<(), SetupError> {
     let limits = &cell.grinder.limits;
     let beyond = |key: &'static str, found: f64, least: f64, most: f64, limit: &'static str| {
@@ -284,7 +260,7 @@ fn check_limits(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
     // Both as they are written: the recipe in micrometres, the cell file in millimetres.
     let (depth_um, most_um) = (1e3 * recipe.compensation.depth_of_cut_mm, 1e3 * limits.largest_depth_mm);
     beyond("compensation.depth_of_cut_um", depth_um, 0.0, most_um, "1000 times grinder.limits.largest_depth_mm")?;
-    if targets.is_empty() && !matches!(cell.cmm.link.wire, config::Wire::FileExchange(_)) {
+    if targets.is_empty() && !cell.cmm.link.wire.is_by_person() {
         return Err(SetupError::NeedsPlan { recipe: recipe.path().to_owned(), cell: cell.path().to_owned() });
     }
     check_travel(recipe, cell, targets)
@@ -402,13 +378,13 @@ fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
         OnTrouble::Hold => Disposal::Hold,
         OnTrouble::Stop => Disposal::Stop,
     };
-    // A file that a person brings may take days, and then the cell is held and still waits; everything else a folder answers at once.
+    // What a person brings may take days, and then the cell is held and still waits.
     let mut deadlines = Deadlines::default();
-    for (progress, link) in deadlines.progress.iter_mut().zip([&cell.cmm.link, &cell.grinder.link]) {
-        if matches!(link.wire, config::Wire::FileExchange(_)) {
-            (*progress, deadlines.answer) = (WAIT_FOR_PEOPLE, 3 * FOLDER_ANSWERS_WITHIN);
-            deadlines.connect = deadlines.answer;
-        }
+    let by_person = [&cell.cmm.link, &cell.grinder.link].map(|link| link.wire.is_by_person());
+    for k in (0..2).filter(|k| by_person[*k]) {
+        (deadlines.progress[k], deadlines.hold[k], deadlines.stop[k]) =
+            (WAIT_FOR_PEOPLE, WAIT_FOR_STILL, WAIT_FOR_STILL);
+        (deadlines.answer, deadlines.connect) = (ANSWERS_WITHIN, ANSWERS_WITHIN);
     }
     CellPlan {
         begin_with: match recipe.cycle.begin_with {
@@ -441,13 +417,8 @@ fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
     }
 }
 
-/// A measuring machine of a cell, by whatever wire.
-pub type CellCmm = AnyCmm<CmmFolders>;
-/// A grinder of a cell, by whatever wire.
-pub type CellGrinder = AnyGrinder<GrinderFolders>;
-
-/// Makes the drivers of both machines; nothing is asked of a machine yet. `part` is what the part is called in files, `owner` and `epoch`
-/// are those of [`modbus`].
+/// Makes the drivers of both machines; nothing is asked of a machine yet. `part` is what the part is called in files, `folder` the folder
+/// of the run, `owner` and `epoch` name this client to machines that more than one can reach; the epoch rises with each start.
 ///
 /// # Errors
 /// A wire that cannot be opened, a folder that is not there, reference points that cannot be read.
@@ -455,209 +426,53 @@ pub fn machines(
     recipe: &Recipe,
     cell: &CellConfig,
     part: &str,
-    owner: u32,
-    epoch: u32,
-) -> Result<(CellCmm, CellGrinder), SetupError> {
-    let (cmm, grinder) = (&cell.cmm.link, &cell.grinder.link);
-    let failed = |link: &config::Link| {
-        let (path, wire) = (cell.path().to_owned(), format!("{:?}", link.wire));
-        move |source| SetupError::Wire { path, wire, source }
+    folder: &Path,
+    [owner, epoch]: [u32; 2],
+) -> Result<(AnyCmm, AnyGrinder), SetupError> {
+    let failed = |source| SetupError::Machine { cell: cell.path().to_owned(), source };
+    let making = |link| Making {
+        part,
+        cell_folder: cell.path().parent().unwrap_or(Path::new("")),
+        run_folder: folder,
+        free_points: match &recipe.measure.pattern {
+            Pattern::Free { least_points } => Some(usize::try_from(*least_points).unwrap_or(usize::MAX)),
+            _ => None,
+        },
+        ..making(link, cell.simulated, [owner, epoch])
     };
-    let [of_cmm, of_grinder] = [cmm, grinder].map(|link| modbus(link, cell.simulated, owner, epoch));
-    // Two machines on one line share its driver.
-    if let (Some(of_cmm), Some(of_grinder)) = (&of_cmm, &of_grinder)
-        && of_cmm.wire == of_grinder.wire
-    {
-        let cmm = ModbusCmm::new(of_cmm.clone()).map_err(failed(cmm))?;
-        let grinder = ModbusGrinder::on(cmm.link().clone(), of_grinder.clone());
-        return Ok((cmm.into(), grinder.into()));
+    let cmm = cell.cmm.link.wire.cmm(&making(&cell.cmm.link)).map_err(failed)?;
+    let beside = Making { beside: cmm.link(), ..making(&cell.grinder.link) };
+    let grinder = cell.grinder.link.wire.grinder(&beside).map_err(failed)?;
+    Ok((cmm, grinder))
+}
+
+/// Returns the settings of a machine on Modbus; `None` for any other.
+///
+/// `simulated` says whether the cell's machines are simulations: one that says otherwise is refused.
+pub fn modbus(link: &Link, simulated: bool, owner: u32, epoch: u32) -> Option<ModbusSettings> {
+    let (line, unit) = link.wire.line()?;
+    Some(ModbusSettings::of(line, unit, &making(link, simulated, [owner, epoch])))
+}
+
+/// What a machine of a cell is made of besides its wire, for no part yet.
+fn making(link: &Link, simulated: bool, [owner, epoch]: [u32; 2]) -> Making<'_> {
+    Making {
+        part: "",
+        cell_folder: Path::new(""),
+        run_folder: Path::new(""),
+        simulated,
+        owner,
+        epoch,
+        free_points: None,
+        timing: &link.timing,
+        registers: &link.registers,
+        signals: &link.signals,
+        expected_name: link.expected_name.as_deref(),
+        beside: None,
     }
-    let made_cmm = match (of_cmm, &cmm.wire) {
-        (Some(settings), _) => ModbusCmm::new(settings).map_err(failed(cmm))?.into(),
-        (None, config::Wire::FileExchange(exchange)) => cmm_by_files(recipe, cell, exchange, part)?.into(),
-        (None, _) => unreachable!("every other wire is Modbus"),
-    };
-    let made_grinder = match (of_grinder, &grinder.wire) {
-        (Some(settings), _) => ModbusGrinder::new(settings).map_err(failed(grinder))?.into(),
-        (None, config::Wire::FileExchange(exchange)) => grinder_by_files(cell, exchange, part)?.into(),
-        (None, _) => unreachable!("every other wire is Modbus"),
-    };
-    Ok((made_cmm, made_grinder))
 }
 
 /// Returns the time between two looks at a machine.
-pub fn poll(link: &config::Link) -> Duration {
-    match link.wire {
-        config::Wire::FileExchange(_) => link.timing.poll.max(FOLDER_POLL),
-        _ => link.timing.poll,
-    }
-}
-
-/// A folder that Regrind made itself would be one that nobody looks into: both must be there.
-fn check_folders(
-    cell: &CellConfig,
-    exchange: &config::FileExchange,
-    table: &'static str,
-    machine: &'static str,
-) -> Result<(), SetupError> {
-    for (name, path) in [("outbox", &exchange.outbox), ("inbox", &exchange.inbox)] {
-        if !path.is_dir() {
-            let (cell, key, path) = (cell.path().to_owned(), format!("{table}.wire.{name}"), path.clone());
-            return Err(SetupError::Folder { cell, key, path, machine });
-        }
-    }
-    Ok(())
-}
-
-fn cmm_by_files(
-    recipe: &Recipe,
-    cell: &CellConfig,
-    exchange: &config::FileExchange,
-    part: &str,
-) -> Result<ExchangeCmm<CmmFolders>, SetupError> {
-    check_folders(cell, exchange, "cmm", "measuring machine")?;
-    let stations = match &exchange.reference_points {
-        Some(nominal) => Some(stations(cell, exchange, nominal)?),
-        None => None,
-    };
-    let free = matches!(recipe.measure.pattern, Pattern::Free { .. });
-    let settings = CmmExchange {
-        stable_for: exchange.stable_for,
-        content: files::Content {
-            coordinates: exchange.content.what.map(|what| match what {
-                PointKind::Centres => files::Coordinates::Centres,
-                PointKind::Contacts => files::Coordinates::Contacts,
-            }),
-            decimal: match exchange.content.decimal {
-                config::Decimal::Auto => files::DecimalMark::Auto,
-                config::Decimal::Point => files::DecimalMark::Point,
-                config::Decimal::Comma => files::DecimalMark::Comma,
-            },
-            unit_mm: exchange.content.unit_mm,
-        },
-        result: NamePattern::new(&*exchange.result),
-        stations,
-        free_count: free,
-        least_points: match &recipe.measure.pattern {
-            Pattern::Free { least_points } => usize::try_from(*least_points).unwrap_or(usize::MAX),
-            _ => 1,
-        },
-        take_earlier: exchange.take_earlier,
-        probe_tolerance_mm: exchange.probe_tolerance_mm,
-        ..CmmExchange::new(part, &exchange.outbox, &exchange.inbox)
-    };
-    let name = format!("cmm by files, {}", exchange.inbox.display());
-    Ok(ExchangeCmm::new(name, MachineKind::Cmm, CmmFolders::new(settings), folder_timing()))
-}
-
-/// The reference points are read at once: an error in them must not come to light when a day's measuring is done.
-fn stations(cell: &CellConfig, exchange: &config::FileExchange, nominal: &Path) -> Result<Stations, SetupError> {
-    let group = exchange.reference_group.clone();
-    read_references(nominal, group.as_deref()).map_err(|source| SetupError::References {
-        cell: cell.path().to_owned(),
-        key: "cmm.wire.reference_points",
-        source: Box::new(source),
-    })?;
-    let files = exchange.stations.iter().map(|station| StationFiles {
-        points: NamePattern::new(&*station.points),
-        references: NamePattern::new(&*station.reference),
-    });
-    Ok(Stations { files: files.collect(), nominal: nominal.to_owned(), group, limit_mm: exchange.reference_limit_mm })
-}
-
-fn grinder_by_files(
-    cell: &CellConfig,
-    exchange: &config::FileExchange,
-    part: &str,
-) -> Result<ExchangeGrinder<GrinderFolders>, SetupError> {
-    check_folders(cell, exchange, "grinder", "grinder")?;
-    let settings = GrinderExchange {
-        part: part.to_owned(),
-        outbox: exchange.outbox.clone(),
-        inbox: exchange.inbox.clone(),
-        stable_for: exchange.stable_for,
-    };
-    let name = format!("grinder by files, {}", exchange.inbox.display());
-    Ok(ExchangeGrinder::new(name, MachineKind::Grinder, GrinderFolders::new(settings), folder_timing()))
-}
-
-fn folder_timing() -> ExchangeTiming {
-    ExchangeTiming { request_timeout: FOLDER_ANSWERS_WITHIN }
-}
-
-/// Returns the settings of a Modbus driver; `None` for a machine that is reached by files.
-///
-/// `simulated` says whether the cell's machines are simulations: one that says otherwise is refused. `owner` and `epoch` name this client
-/// to the machine; the epoch rises with each start.
-pub fn modbus(link: &config::Link, simulated: bool, owner: u32, epoch: u32) -> Option<ModbusSettings> {
-    let (wire, unit) = match &link.wire {
-        config::Wire::ModbusTcp { host, port, unit } => (device::Wire::Tcp { host: host.clone(), port: *port }, *unit),
-        config::Wire::ModbusRtu { device, baud, parity, stop_bits, unit } => {
-            let parity = match parity {
-                config::Parity::None => device::Parity::None,
-                config::Parity::Even => device::Parity::Even,
-                config::Parity::Odd => device::Parity::Odd,
-            };
-            (device::Wire::Rtu { device: device.clone(), baud: *baud, parity, stop_bits: *stop_bits }, *unit)
-        }
-        config::Wire::FileExchange(_) => return None,
-    };
-    let r = &link.registers;
-    Some(ModbusSettings {
-        unit,
-        word_order: order(r.word_order),
-        registers: RegisterMap {
-            identity: r.identity,
-            sync: r.sync,
-            beat: r.beat,
-            command: r.command,
-            status: r.status,
-            in_force: r.in_force,
-            inbox_header: r.inbox_header,
-            inbox_page: r.inbox_page,
-            inbox_state: r.inbox_state,
-            outbox_header: r.outbox_header,
-            outbox_select: r.outbox_select,
-            outbox_page: r.outbox_page,
-        },
-        request_timeout: link.timing.request_timeout,
-        retries: u32::from(link.timing.retries),
-        lost_after: link.timing.lost_after,
-        quarantine: link.timing.quarantine,
-        owner,
-        epoch,
-        signals: link.signals.iter().map(signal).collect(),
-        beat_every: link.timing.heartbeat,
-        expected_name: link.expected_name.clone(),
-        simulation: Some(simulated),
-        ..ModbusSettings::new(wire)
-    })
-}
-
-fn order(order: WordOrder) -> device::WordOrder {
-    match order {
-        WordOrder::Big => device::WordOrder::Big,
-        WordOrder::Little => device::WordOrder::Little,
-    }
-}
-
-fn signal(signal: &config::Signal) -> Signal {
-    let kind = match signal.kind {
-        SignalKind::U16 => SignalType::U16,
-        SignalKind::I16 => SignalType::I16,
-        SignalKind::U32 => SignalType::U32,
-        SignalKind::I32 => SignalType::I32,
-        SignalKind::F32 => SignalType::F32,
-        SignalKind::F64 => SignalType::F64,
-    };
-    let [least, most] = signal.range;
-    Signal {
-        name: signal.name.clone(),
-        address: signal.address,
-        kind,
-        scale: signal.scale,
-        unit: signal.unit.clone(),
-        least,
-        most,
-    }
+pub fn poll(link: &Link) -> Duration {
+    if link.wire.is_by_person() { link.timing.poll.max(SLOW_POLL) } else { link.timing.poll }
 }

@@ -18,8 +18,8 @@ const ARROWS: [(&str, &str, &[&str]); 16] = [
     ("journal", "src/journal", &[]),
     ("formats", "src/formats", &CORE),
     ("recipe", "src/recipe", &["document", "geometry", "surface", "registration", "compensation"]),
-    ("config", "src/config", &["document", "geometry"]),
-    ("device", "src/device", &["formats", "geometry"]),
+    ("device", "src/device", &["document", "formats", "geometry"]),
+    ("config", "src/config", &["device", "document", "geometry"]),
     ("report", "src/report", &["cell", "journal", "formats", "geometry", "registration"]),
     (
         "drive",

@@ -68,15 +68,18 @@ impl Cell {
         let limits = &self.plan.deadlines;
         let job = self.state.phase().and_then(Phase::job).map(|(_, step)| step);
         match (self.state, job) {
+            (Execute(phase), _) if self.asks_whether_clear(phase) => limits.load,
             (Idle | Stopped | Aborted | Complete | Execute(Judge), _) => None,
             (Starting, _) => Some(limits.connect),
             (Execute(Load), _) => limits.load,
             (Held(_), _) => limits.held,
             (Suspended(_), _) => Some(limits.suspended),
-            (Stopping, _) => Some(limits.stop),
+            (Stopping, _) => self.stopping.map(|device| limits.stop[device as usize]),
             (Aborting, _) => Some(limits.abort),
             (Execute(phase), Some(JobStep::Run)) => phase.moving().map(|device| limits.progress[device as usize]),
-            (Holding(_) | Suspending(_), Some(JobStep::Run)) => Some(limits.hold),
+            (Holding(phase) | Suspending(phase), Some(JobStep::Run)) => {
+                phase.moving().map(|device| limits.hold[device as usize])
+            }
             (_, Some(JobStep::Send | JobStep::Collect)) => Some(limits.transfer),
             (_, Some(JobStep::Qualify)) => Some(limits.compute),
             (Execute(Register | Compensate) | Holding(Register | Compensate), _) => Some(limits.compute),
@@ -144,6 +147,8 @@ impl Cell {
 
     pub(super) fn first_cycle(&mut self) {
         self.cycle = 1;
+        // Who loaded the part has seen both machines clear of it.
+        self.known.iter_mut().for_each(|known| known.said_clear = true);
         self.enter(match self.plan.begin_with {
             Beginning::Grind => Grind(JobStep::Send),
             Beginning::Measure => Measure(JobStep::Send),
@@ -197,8 +202,46 @@ impl Cell {
     }
 
     fn verify_clear(&mut self, device: Device) {
-        self.know(device).clear = false;
+        let known = self.know(device);
+        (known.clear, known.asked_clear) = (false, false);
         self.push(Command::VerifyClear { device });
+    }
+
+    /// The machine is clear of the part: the job that waited for it goes on.
+    pub(super) fn cleared(&mut self, phase: Phase, device: Device) {
+        let known = self.know(device);
+        (known.clear, known.asked_clear) = (true, false);
+        self.advance(phase.job().map_or(Measure(JobStep::Send), |(job, _)| Phase::of(job, JobStep::Prepare)));
+    }
+
+    /// The machine cannot tell: a person's word counts from its last start on, and without one a person is asked.
+    pub(super) fn clear_unknown(&mut self, phase: Phase, device: Device) {
+        if self.knows(device).said_clear {
+            return self.cleared(phase, device);
+        }
+        match self.state {
+            Execute(_) => {
+                self.know(device).asked_clear = true;
+                self.go(self.state);
+                self.push(Command::AskWhetherClear { device });
+            }
+            _ => self.go(Held(restart_of(phase))),
+        }
+    }
+
+    pub(super) fn said_clear(&mut self, device: Device) {
+        self.know(device).said_clear = true;
+        if let Execute(phase) = self.state
+            && self.asks_whether_clear(phase)
+            && awaits_clear(phase) == Some(device)
+        {
+            self.cleared(phase, device);
+        }
+    }
+
+    /// Whether a person is being asked if the machine that has to be clear is.
+    fn asks_whether_clear(&self, phase: Phase) -> bool {
+        awaits_clear(phase).is_some_and(|device| self.knows(device).asked_clear)
     }
 
     /// The interlock: the other machine was seen clear since this job began, and nothing has been heard to the contrary.
@@ -208,7 +251,8 @@ impl Cell {
             self.raise(AlarmId::NotClear, &format!("{other}, no longer, before the {device} was started"));
             return self.go(Held(Phase::of(device, JobStep::Send)));
         }
-        self.know(device).clear = false;
+        let known = self.know(device);
+        (known.clear, known.said_clear) = (false, false);
         self.passes += u32::from(device == Device::Grinder);
         self.push(Command::StartMachine { device, cycle: self.cycle });
     }
@@ -396,7 +440,7 @@ impl Cell {
                 self.go(Holding(phase));
                 self.push(Command::HoldMachine { device });
             }
-            _ if phase == Load => self.go(Held(Load)),
+            _ if phase == Load || self.asks_whether_clear(phase) => self.go(Held(restart_of(phase))),
             _ => self.go(Holding(phase)),
         }
     }
@@ -639,7 +683,9 @@ impl Cell {
     pub(super) fn stop(&mut self, reason: &str, judged_out: bool) {
         reason.clone_into(&mut self.reason);
         self.judged_out = judged_out;
-        match self.state.phase().and_then(Phase::job) {
+        let job = self.state.phase().and_then(Phase::job);
+        self.stopping = job.map(|(device, _)| device);
+        match job {
             Some((device, JobStep::Prepare | JobStep::Start | JobStep::Run | JobStep::Reconcile)) => {
                 self.go(Stopping);
                 self.push(Command::StopMachine { device });

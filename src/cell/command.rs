@@ -28,8 +28,13 @@ pub enum Command {
         /// The cycle.
         cycle: u32,
     },
-    /// Read a fresh status, moving nothing: `Cleared` or `Obstructed`.
+    /// Read a fresh status, moving nothing: `Cleared`, `Obstructed` or `ClearUnknown`.
     VerifyClear {
+        /// The machine.
+        device: Device,
+    },
+    /// Ask a person to see whether a machine that cannot tell it is clear of the part: `ClearConfirmed`.
+    AskWhetherClear {
         /// The machine.
         device: Device,
     },
@@ -205,6 +210,7 @@ impl Command {
             Self::LoadPass { .. } => ("load_pass", None),
             Self::LoadPlan { .. } => ("load_plan", None),
             Self::VerifyClear { device } => ("verify_clear", Some(device)),
+            Self::AskWhetherClear { device } => ("ask_whether_clear", Some(device)),
             Self::Prepare { device, .. } => ("prepare", Some(device)),
             Self::StartMachine { device, .. } => ("start_machine", Some(device)),
             Self::HoldMachine { device } => ("hold_machine", Some(device)),

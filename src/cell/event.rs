@@ -27,7 +27,7 @@ pub enum Event {
         /// Who gave the order.
         actor: Actor,
     },
-    /// The right part is loaded and clamped.
+    /// The right part is loaded and clamped, and no machine touches it.
     LoadConfirmed {
         /// Who gave the order.
         actor: Actor,
@@ -59,6 +59,13 @@ pub enum Event {
         actor: Actor,
         /// Why, in the words of the person; may be empty.
         reason: String,
+    },
+    /// A person has looked at a machine that cannot tell it: it is clear of the part.
+    ClearConfirmed {
+        /// Who looked.
+        actor: Actor,
+        /// The machine.
+        device: Device,
     },
     /// A person has looked at a machine that cannot tell what became of its START: the job is over, the machine stands still and
     /// is clear of the part. The START is never repeated; the part is measured as it is.
@@ -195,6 +202,11 @@ pub enum Event {
         /// What was seen, in words.
         #[serde(rename = "words")]
         message: String,
+    },
+    /// The machine stands, and nothing tells whether it is clear of the part. Answers `VerifyClear`.
+    ClearUnknown {
+        /// The machine.
+        device: Device,
     },
     /// The machine was asked and said no.
     Refused {
@@ -608,6 +620,8 @@ impl Event {
     pub fn device(&self) -> Option<Device> {
         match self {
             Self::DeclaredOver { device, .. }
+            | Self::ClearConfirmed { device, .. }
+            | Self::ClearUnknown { device }
             | Self::Connected { device, .. }
             | Self::NotConnected { device, .. }
             | Self::LinkLost { device, .. }
@@ -648,6 +662,7 @@ impl Event {
     pub(super) fn in_words(&self) -> String {
         match self {
             Self::LoadConfirmed { .. } => "the word that the part is loaded".to_owned(),
+            Self::ClearConfirmed { device, .. } => format!("the word that the {device} is clear of the part"),
             Self::DeclaredOver { device, .. } => format!("the word that the job of the {device} is over"),
             event if event.is_order() => format!("the order to {}", event.name()),
             event => match event.device() {
@@ -667,6 +682,7 @@ impl Event {
             | Self::Stop { actor, .. }
             | Self::Abort { actor, .. }
             | Self::DeclaredOver { actor, .. }
+            | Self::ClearConfirmed { actor, .. }
             | Self::Restarted { actor } => Some(actor),
             _ => None,
         }
@@ -700,6 +716,8 @@ impl Event {
             Self::Ended { .. } => "ended",
             Self::Cleared { .. } => "cleared",
             Self::Obstructed { .. } => "obstructed",
+            Self::ClearUnknown { .. } => "clear_unknown",
+            Self::ClearConfirmed { .. } => "clear_confirmed",
             Self::Refused { .. } => "refused",
             Self::Fault { .. } => "fault",
             Self::Acknowledged { .. } => "acknowledged",

@@ -60,6 +60,9 @@ impl Cell {
             (Aborting, Event::Obstructed { device, message }) if self.knows(*device).stands => {
                 self.seen(*device, false, message);
             }
+            (Aborting, Event::ClearUnknown { device }) if self.knows(*device).stands => {
+                self.seen(*device, self.knows(*device).said_clear, "nothing tells whether it is");
+            }
             (Aborting, Event::LinkLost { device, .. } | Event::LinkBack { device, .. }) => {
                 let lost = matches!(event, Event::LinkLost { .. });
                 self.note_link(*device, lost);
@@ -88,6 +91,11 @@ impl Cell {
             }
             (Held(Measure(JobStep::Reconcile)), Event::DeclaredOver { device: Device::Cmm, .. }) => self.measure_anew(),
             (Execute(Load), Event::LoadConfirmed { .. }) => self.first_cycle(),
+            (state, Event::ClearConfirmed { device, .. })
+                if state.phase().is_some() && running(state) != Some(*device) =>
+            {
+                self.said_clear(*device);
+            }
             (Idle, Event::Restarted { .. }) => {}
             (Stopping, Event::Restarted { .. }) => {
                 self.abort("the program was started again while the run was being stopped")
@@ -141,8 +149,10 @@ impl Cell {
                 self.advance(Measure(JobStep::Clear));
             }
             (Execute(p) | Holding(p), Event::Cleared { device }) if awaits_clear(p) == Some(*device) => {
-                self.know(*device).clear = true;
-                self.advance(p.job().map_or(Measure(JobStep::Send), |(job, _)| Phase::of(job, JobStep::Prepare)));
+                self.cleared(p, *device);
+            }
+            (Execute(p) | Holding(p), Event::ClearUnknown { device }) if awaits_clear(p) == Some(*device) => {
+                self.clear_unknown(p, *device);
             }
             (Execute(p) | Holding(p), Event::Obstructed { device, message }) if awaits_clear(p) == Some(*device) => {
                 self.raise(AlarmId::NotClear, &format!("{device}, {message}"));
@@ -222,6 +232,9 @@ impl Cell {
             }
             (Completing, Event::Obstructed { device, message }) => self.seen(*device, false, message),
             (_, Event::Obstructed { device, .. }) => self.know(*device).clear = false,
+            // Nothing is to be started any more: who takes the part out sees for himself.
+            (Completing, Event::ClearUnknown { device }) => self.seen(*device, true, ""),
+            (_, Event::ClearUnknown { device }) => self.know(*device).clear = false,
 
             // Computations.
             (Execute(Register) | Holding(Register), Event::Registered { figures, .. }) => self.registered(figures),

@@ -27,6 +27,10 @@ pub(super) struct Known {
     pub(super) ready: bool,
     /// Whether a fresh status has shown it clear of the part, and it has not been started since.
     pub(super) clear: bool,
+    /// Whether a person has seen it clear of the part, and it has not been started since.
+    pub(super) said_clear: bool,
+    /// Whether it cannot tell, and a person is being asked.
+    pub(super) asked_clear: bool,
     /// Whether it has ended its safe sequence.
     pub(super) stands: bool,
 }
@@ -51,6 +55,8 @@ pub struct Cell {
     pub(super) reason: String,
     pub(super) judged_out: bool,
     pub(super) repeated: bool,
+    /// The machine that is being stopped, while the cell is.
+    pub(super) stopping: Option<Device>,
     /// The time of the event that is being handled, and when the next deadline is due.
     pub(super) now: Duration,
     pub(super) deadline: Option<Duration>,
@@ -74,6 +80,7 @@ impl Cell {
             reason: String::new(),
             judged_out: false,
             repeated: false,
+            stopping: None,
             now: Duration::ZERO,
             deadline: None,
             commands: Vec::new(),

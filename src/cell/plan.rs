@@ -98,10 +98,10 @@ pub struct Deadlines {
     pub answer: Duration,
     /// Between two signs of progress of a running job of each machine: CMM, grinder. A job done by hand gives none before its end.
     pub progress: [Duration; 2],
-    /// From HOLD to the safe place.
-    pub hold: Duration,
-    /// From STOP to the end of the job.
-    pub stop: Duration,
+    /// From HOLD to the safe place of each machine: CMM, grinder.
+    pub hold: [Duration; 2],
+    /// From STOP to the end of the job of each machine: CMM, grinder.
+    pub stop: [Duration; 2],
     /// From ABORT to its confirmation; then the alarm, one repetition, and as long again.
     pub abort: Duration,
     /// For a registration or a compensation.
@@ -121,8 +121,8 @@ impl Default for Deadlines {
             transfer: s(120),
             answer: s(10),
             progress: [s(60); 2],
-            hold: s(30),
-            stop: s(60),
+            hold: [s(30); 2],
+            stop: [s(60); 2],
             abort: s(2),
             compute: s(600),
             suspended: s(600),

@@ -67,7 +67,7 @@ pub fn table() -> Vec<Row> {
 /// What decides how a cell answers, without times and counts, and no finer than the table needs.
 fn key(cell: &Cell) -> impl Ord + use<> {
     let known = cell.known.map(|known| (known.ready, known.met && known.stands));
-    let clear = cell.known.map(|known| known.clear);
+    let clear = cell.known.map(|known| (known.clear, known.said_clear, known.asked_clear));
     let memory = (cell.worse.min(1), cell.repeated, cell.previous.is_some(), cell.passes >= cell.plan.max_cycles);
     (cell.state, known, clear, cell.causes.is_empty(), memory, cell.plan.on_stall == Disposal::Hold)
 }
@@ -130,6 +130,8 @@ fn orders() -> Vec<Event> {
         Event::Resume { actor: actor.clone(), reason: reason.clone() },
         Event::Stop { actor: actor.clone(), reason: reason.clone() },
         Event::Abort { actor: actor.clone(), reason },
+        Event::ClearConfirmed { actor: actor.clone(), device: Device::Cmm },
+        Event::ClearConfirmed { actor: actor.clone(), device: Device::Grinder },
         Event::DeclaredOver { actor: actor.clone(), device: Device::Cmm, evidence: evidence.clone() },
         Event::DeclaredOver { actor: actor.clone(), device: Device::Grinder, evidence },
         Event::Restarted { actor },
@@ -150,6 +152,7 @@ fn of_machine(device: Device, cycle: u32) -> Vec<Event> {
         Event::MachineResumed { device },
         Event::Cleared { device },
         Event::Obstructed { device, message: text() },
+        Event::ClearUnknown { device },
         Event::Fault { device, code: 5, message: text() },
         Event::Acknowledged { device },
         Event::AbortConfirmed { device },

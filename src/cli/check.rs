@@ -43,7 +43,15 @@ struct Found {
     kind: &'static str,
     good: bool,
     sha256: Option<String>,
+    /// What is so on this computer and makes the file no worse: a serial port that is not here.
+    notes: Vec<String>,
     problems: Vec<Told>,
+}
+
+/// A good file.
+struct Good {
+    sha256: String,
+    notes: Vec<String>,
 }
 
 /// One problem, for a program.
@@ -63,15 +71,21 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         let (kind, checked) = check(path);
         if !arguments.json {
             match &checked {
-                Ok(_) => super::print(&format!("{}: a good {kind}\n", path.display()))?,
+                Ok(good) => {
+                    super::print(&format!("{}: a good {kind}\n", path.display()))?;
+                    for note in &good.notes {
+                        super::print(&format!("    note: {note}\n"))?;
+                    }
+                }
                 Err(problems) => show(problems)?,
             }
         }
         let (sha256, problems) = match &checked {
-            Ok(sha256) => (Some(sha256.clone()), Vec::new()),
+            Ok(good) => (Some(good.sha256.clone()), Vec::new()),
             Err(problems) => (None, problems.problems.iter().map(|problem| Told::new(problems, problem)).collect()),
         };
-        found.push(Found { file: path.clone(), kind, good: checked.is_ok(), sha256, problems });
+        let notes = checked.as_ref().map_or(Vec::new(), |good| good.notes.clone());
+        found.push(Found { file: path.clone(), kind, good: checked.is_ok(), sha256, notes, problems });
     }
     if arguments.json {
         super::print_json(&found)?;
@@ -82,15 +96,16 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     }
 }
 
-/// Checks one file; returns its kind and the SHA-256 of a good one.
-fn check(path: &Path) -> (&'static str, Result<String, Problems>) {
+/// Checks one file; returns its kind and what is to be said of a good one.
+fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
     if is_cell_file(path) {
-        return ("cell file", CellConfig::read(path).map(|cell| hex(cell.source_sha256())));
+        let good = |cell: CellConfig| Good { sha256: hex(cell.source_sha256()), notes: cell.notes() };
+        return ("cell file", CellConfig::read(path).map(good));
     }
     let checked = Recipe::read(path).and_then(|recipe| {
         check_files(&recipe)?;
         check_simulation(&recipe)?;
-        Ok(hex(recipe.source_sha256()))
+        Ok(Good { sha256: hex(recipe.source_sha256()), notes: Vec::new() })
     });
     ("recipe", checked)
 }

@@ -47,8 +47,10 @@ pub(super) enum Order {
 #[command(after_help = "\
 Examples:
   regrind confirm loaded
-  regrind confirm started --map 3fa9c210        the grinder works by the map that begins so; only for a grinder
-  regrind confirm done --map 3fa9c210           that takes files, see docs/file-exchange.md
+  regrind confirm started                       for machines that a person serves, see docs/manual.md
+  regrind confirm done --file points.csv
+  regrind confirm done --map 3fa9c210           for machines that take files, see docs/file-exchange.md
+  regrind confirm clear --machine cmm
   regrind confirm over --machine grinder --evidence \"stands, wheel up, one pass was ground\"
 
 Exit codes: 0 it was taken; 2 no such run; 3 the cell refused it.")]
@@ -59,12 +61,15 @@ pub(super) struct Confirmation {
     /// Folder of the run
     #[arg(value_name = "RUN")]
     run: Option<PathBuf>,
-    /// The machine that was looked at, for `over`
+    /// The machine that was looked at, for `clear`, `still` and `over`
     #[arg(long, value_enum)]
     machine: Option<MachineName>,
     /// First 8 digits, or more, of the map that the grinder works by, for `started` and `done`
     #[arg(long, value_name = "DIGITS")]
     map: Option<String>,
+    /// File of the measurement, for `done` of a measuring machine that a person serves
+    #[arg(long, value_name = "FILE")]
+    file: Option<PathBuf>,
     /// What was seen at the machine, for `over`
     #[arg(long, value_name = "TEXT", default_value = "")]
     evidence: String,
@@ -75,12 +80,16 @@ pub(super) struct Confirmation {
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum What {
-    /// The right part is loaded and clamped
+    /// The right part is loaded and clamped, wheel and probe are clear of it
     Loaded,
-    /// The grinder has begun the pass that was handed over to it as files
+    /// The machine that a person serves has begun what was asked
     Started,
-    /// The grinder has ended that pass, and the part is clear
+    /// It has ended that, and is clear of the part
     Done,
+    /// A machine that cannot tell it is clear of the part
+    Clear,
+    /// A machine that was to hold or to stop stands still
+    Still,
     /// A job that no machine can tell about is over: the machine stands, clear of the part
     Over,
 }
@@ -104,24 +113,37 @@ pub(super) fn order(arguments: &Arguments, order: Order) -> Result<Outcome, Fail
 }
 
 pub(super) fn confirm(arguments: &Confirmation) -> Result<Outcome, Failure> {
-    let request = match (arguments.what, arguments.machine) {
+    let device = arguments.machine.map(|machine| match machine {
+        MachineName::Cmm => Device::Cmm,
+        MachineName::Grinder => Device::Grinder,
+    });
+    let request = match (arguments.what, device) {
         (What::Loaded, _) => Request::Loaded,
         (What::Started, _) => Request::Started { map: named_map(arguments)? },
-        (What::Done, _) => Request::Done { map: named_map(arguments)? },
-        (What::Over, Some(machine)) if !arguments.evidence.trim().is_empty() => Request::Over {
-            device: match machine {
-                MachineName::Cmm => Device::Cmm,
-                MachineName::Grinder => Device::Grinder,
-            },
-            evidence: arguments.evidence.clone(),
-        },
+        (What::Done, _) => Request::Done { map: named_map(arguments)?, file: named_file(arguments)? },
+        (What::Clear, Some(device)) => Request::Clear { device },
+        (What::Clear, None) => return Err(Failure::NoMachine),
+        (What::Still, device) => Request::Still { device },
+        (What::Over, Some(device)) if !arguments.evidence.trim().is_empty() => {
+            Request::Over { device, evidence: arguments.evidence.clone() }
+        }
         (What::Over, _) => return Err(Failure::Evidence),
     };
     give(arguments.run.as_deref(), &request, arguments.json)
 }
 
-fn named_map(arguments: &Confirmation) -> Result<String, Failure> {
-    arguments.map.clone().filter(|map| map.trim().len() >= 8).ok_or(Failure::NoMap)
+fn named_map(arguments: &Confirmation) -> Result<Option<String>, Failure> {
+    match &arguments.map {
+        Some(map) if map.trim().len() < 8 => Err(Failure::ShortMap),
+        map => Ok(map.clone()),
+    }
+}
+
+/// The file as the running cell finds it, which may have been started in another folder.
+fn named_file(arguments: &Confirmation) -> Result<Option<PathBuf>, Failure> {
+    let absolute =
+        |path: &PathBuf| path.canonicalize().map_err(|source| Failure::NoFile { path: path.clone(), source });
+    arguments.file.as_ref().map(absolute).transpose()
 }
 
 fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<Outcome, Failure> {

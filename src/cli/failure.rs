@@ -4,10 +4,12 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use regrind::compensation::NextPassError;
+use regrind::device::MakingError;
 use regrind::formats::FormatError;
 use regrind::journal::JournalError;
 use regrind::registration::RegistrationError;
 use regrind::report::ReportError;
+use regrind::setup::SetupError;
 use regrind::surface::{DefinitionError, SurfaceError};
 use thiserror::Error;
 
@@ -54,7 +56,7 @@ pub(super) enum Failure {
     #[error("{bad} of {files} files {} problems; they are listed above", if *bad == 1 { "has" } else { "have" })]
     Checked { bad: usize, files: usize },
     #[error(transparent)]
-    Setup(regrind::setup::SetupError),
+    Setup(SetupError),
     #[error("what {run} learned cannot be begun with: {source}; or write learn = false")]
     TooMuchLearned { run: String, source: NextPassError },
     #[error("{path}: {reason}")]
@@ -80,10 +82,12 @@ pub(super) enum Failure {
     OrderRefused { message: String },
     #[error("`confirm over` needs --machine and --evidence: which machine was looked at, and what was seen")]
     Evidence,
-    #[error(
-        "`confirm started` and `confirm done` need --map: the first 8 digits, or more, of the map at the grinder, as in correction.json"
-    )]
-    NoMap,
+    #[error("--map is too short: the first 8 digits, or more, of the map at the grinder, as in correction.json")]
+    ShortMap,
+    #[error("`confirm clear` needs --machine: which machine was looked at")]
+    NoMachine,
+    #[error("{path} cannot be found: {source}; name the file of the measurement")]
+    NoFile { path: PathBuf, source: std::io::Error },
     #[error("the run did not come to its end: {reason}")]
     Ended { reason: String },
     #[error("the result cannot be told: {what} is not a finite number; please report it with the files that led to it")]
@@ -103,7 +107,9 @@ impl Failure {
             | Self::NotSaved(_)
             | Self::Terminal(_)
             | Self::OrderRefused { .. }
-            | Self::Setup(regrind::setup::SetupError::Wire { .. })
+            | Self::Setup(SetupError::Machine {
+                source: MakingError::Line { .. } | MakingError::NoPort { .. }, ..
+            })
             | Self::Ended { .. } => FAULT,
             Self::Broken(_) | Self::Report(ReportError::Record(JournalError::Broken { .. })) => NOT_AS_IT_SHOULD_BE,
             _ => BAD_INPUT,

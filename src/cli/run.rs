@@ -6,12 +6,13 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use regrind::cell::{Actor, Beginning, Ending};
 use regrind::config::{CellConfig, Link};
+use regrind::device::{AnyCmm, AnyGrinder, Line};
 use regrind::document::Problems;
 use regrind::drive::{Drive, Orders, Request, Run, Task};
 use regrind::formats::{LEARNED, Learned, LearnedError};
 use regrind::journal::{Header, Journal};
 use regrind::recipe::Recipe;
-use regrind::setup::{self, CellCmm, CellGrinder};
+use regrind::setup;
 use serde_json::json;
 use tokio::sync::mpsc;
 
@@ -46,7 +47,7 @@ pub(super) struct Arguments {
     /// Folder that the run's own folder is made in
     #[arg(long, value_name = "DIR", default_value = "runs")]
     runs: PathBuf,
-    /// The right part is loaded already: do not ask for it
+    /// The right part is loaded and clamped already, wheel and probe are clear of it: do not ask
     #[arg(long)]
     loaded: bool,
     /// Draw another simulated part and run from this number
@@ -91,7 +92,9 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         let job = u32::try_from(began.as_second() & 0x7fff_ffff).unwrap_or(1).max(1);
         // Before the record begins: a folder that is not there, or a line that is in use, is no run.
         let part = arguments.part.clone().unwrap_or_else(|| recipe_name(&recipe));
-        let (cmm, grinder) = setup::machines(&recipe, &cell, &part, owner(&actor), job).map_err(Failure::Setup)?;
+        let folder = free_folder(&arguments.runs, &recipe_name(&recipe), began, cell.simulated);
+        let client = [owner(&actor), job];
+        let (cmm, grinder) = setup::machines(&recipe, &cell, &part, &folder, client).map_err(Failure::Setup)?;
         if recipe.compensation.learn && !arguments.json {
             for error in &left_alone {
                 super::print(&format!("left alone: {error}\n"))?;
@@ -105,13 +108,12 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             })?;
         }
         let left_alone = left_alone.iter().map(ToString::to_string).collect();
-        let mut journal = journal(arguments, &recipe, &cell, &actor, began, learned_from, left_alone)?;
-        if task.learned.is_some() {
+        let mut journal = journal(arguments, &folder, &recipe, &cell, &actor, learned_from, left_alone)?;
+        if task.learned.is_some() || cell.grinder.link.wire.works_from_run() {
             record_first_correction(&task, &mut journal)?;
         }
         let (notices, shown) = mpsc::unbounded_channel();
         let poll = [setup::poll(&cell.cmm.link), setup::poll(&cell.grinder.link)];
-        let folder = journal.folder().to_owned();
         let loaded = arguments.loaded || cell.simulated;
         let run = Run { plan, task, journal, job, actor: actor.clone(), loaded, poll, notices, interrupted: None };
         let show = Show::new(arguments.json, cell.simulated, &recipe, &folder);
@@ -148,7 +150,7 @@ fn newest_learned(runs: &Path, setting: &str, simulated: bool) -> (LearnedFrom, 
 }
 
 /// Gives the run its machines and lets it go.
-async fn go(run: Run, cmm: CellCmm, grinder: CellGrinder, actor: Actor) -> Result<Ending, Failure> {
+async fn go(run: Run, cmm: AnyCmm, grinder: AnyGrinder, actor: Actor) -> Result<Ending, Failure> {
     let folder = run.journal.folder().to_owned();
     let (drive, orders) =
         Drive::new(run, cmm, grinder).map_err(|source| Failure::ControlSocket { path: folder, source })?;
@@ -175,21 +177,20 @@ async fn heed_ctrl_c(orders: Orders, actor: Actor) {
 
 /// Whether the machines of a cell are simulated in this process: only there a port may be left open.
 fn within(cell: &CellConfig) -> bool {
-    let open = |link: &Link| matches!(link.wire, regrind::config::Wire::ModbusTcp { port: 0, .. });
+    let open = |link: &Link| matches!(link.wire.line(), Some((Line::Tcp { port: 0, .. }, _)));
     cell.simulated && (open(&cell.cmm.link) || open(&cell.grinder.link))
 }
 
 fn journal(
     arguments: &Arguments,
+    folder: &Path,
     recipe: &Recipe,
     cell: &CellConfig,
     actor: &Actor,
-    began: jiff::Timestamp,
     learned_from: LearnedFrom,
     left_alone: Vec<String>,
 ) -> Result<Journal, Failure> {
     let part = arguments.part.clone().unwrap_or_else(|| "unnamed".into());
-    let folder = free_folder(&arguments.runs, &recipe_name(recipe), began, cell.simulated);
     let hex = |bytes: &[u8; 32]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
     let header = Header {
         run: folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
@@ -205,7 +206,7 @@ fn journal(
             "left_alone": left_alone,
         }),
     };
-    let mut journal = Journal::create(&folder, header).map_err(Failure::Journal)?;
+    let mut journal = Journal::create(folder, header).map_err(Failure::Journal)?;
     journal.store("recipe.toml", recipe.text().as_bytes(), 0, 0).map_err(Failure::Journal)?;
     journal.store("cell.toml", cell.text().as_bytes(), 0, 0).map_err(Failure::Journal)?;
     if let Some((_, text)) = learned_from {

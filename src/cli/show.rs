@@ -88,7 +88,13 @@ impl Show {
                 "cycle {cycle}: {points} points fetched in {seconds:.2} s, {} ms a point",
                 three_digits(*ms_per_point)
             )),
-            Notice::LoadPart => self.line("load the part, clamp it, then: regrind confirm loaded"),
+            Notice::LoadPart => self.line(
+                "load the part, clamp it, see that wheel and probe are clear of it,\nthen: regrind confirm loaded",
+            ),
+            Notice::AskWhetherClear { device } => self.line(&format!(
+                "{device}: nothing tells whether it is clear of the part; see that it is,\nthen: regrind confirm clear --machine {}",
+                device.to_string().to_lowercase()
+            )),
             Notice::Note { device, messages } => {
                 messages.iter().try_for_each(|message| self.line(&format!("{device}: {message}")))
             }

@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use regrind::config::{CellConfig, Link, Wire};
+use regrind::config::{CellConfig, Link};
+use regrind::device::Line;
 use regrind::recipe::Recipe;
 use serde_json::{Value, json};
 
@@ -62,9 +63,9 @@ async fn until_stopped() -> Result<Outcome, Failure> {
 
 /// Where a machine answers, after a port that was left open has become one.
 fn wire(link: &Link) -> Value {
-    match &link.wire {
-        Wire::ModbusTcp { host, port, unit } => json!({ "host": host, "port": port, "unit": unit }),
-        Wire::ModbusRtu { device, baud, unit, .. } => json!({ "device": device, "baud": baud, "unit": unit }),
-        Wire::FileExchange(_) => Value::Null,
+    match link.wire.line() {
+        Some((Line::Tcp { host, port }, unit)) => json!({ "host": host, "port": port, "unit": unit }),
+        Some((Line::Rtu { device, baud, .. }, unit)) => json!({ "device": device, "baud": baud, "unit": unit }),
+        None => Value::Null,
     }
 }

@@ -2,14 +2,15 @@
 
 use std::path::{Path, PathBuf};
 
-use regrind::config::{CellConfig, Link, RegisterMap, Wire, WordOrder};
+use regrind::config::{CellConfig, Link};
+use regrind::device::{Line, RegisterMap, Wire, WordOrder};
 use regrind::formats::{place_link, remove_link};
 use regrind::recipe::Recipe;
 use regrind_sim::options::{Layout, MachineOptions};
 use regrind_sim::registers::Machine;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::faults::Faults;
-use regrind_sim::wire::rtu::Line;
+use regrind_sim::wire::rtu;
 use regrind_sim::wire::{Serving, SharedMachine};
 use regrind_sim::words;
 use regrind_sim::world::World;
@@ -72,27 +73,30 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig) -> Result<Simu
     let grinder =
         machine(Machine::new(Box::new(world.grinder()), boot_id(), options(&cell.grinder.link, speed, seed + 1)));
     let mut simulated = SimulatedCell { servings: Vec::new(), places: Vec::new(), links: Vec::new(), _world: world };
-    let wires = [cell.cmm.link.wire.clone(), cell.grinder.link.wire.clone()];
-    let units = [(unit(&wires[0]), cmm), (unit(&wires[1]), grinder)];
-    if same_line(&wires[0], &wires[1]) {
-        let port = simulated.serve(&wires[0], units.to_vec()).await.map_err(failed)?;
+    let line = |link: &Link| {
+        let none = "a machine that a person serves cannot be simulated; its part is yours to play";
+        link.wire.line().ok_or_else(|| failed(none.into()))
+    };
+    let [(of_cmm, cmm_unit), (of_grinder, grinder_unit)] = [line(&cell.cmm.link)?, line(&cell.grinder.link)?];
+    let (cmm, grinder) = ((cmm_unit, cmm), (grinder_unit, grinder));
+    if of_cmm == of_grinder {
+        let port = simulated.serve(&of_cmm, vec![cmm, grinder]).await.map_err(failed)?;
         set_port(&mut cell.cmm.link.wire, port);
         set_port(&mut cell.grinder.link.wire, port);
     } else {
-        let [of_cmm, of_grinder] = units;
-        let port = simulated.serve(&wires[0], vec![of_cmm]).await.map_err(&failed)?;
+        let port = simulated.serve(&of_cmm, vec![cmm]).await.map_err(&failed)?;
         set_port(&mut cell.cmm.link.wire, port);
-        let port = simulated.serve(&wires[1], vec![of_grinder]).await.map_err(&failed)?;
+        let port = simulated.serve(&of_grinder, vec![grinder]).await.map_err(&failed)?;
         set_port(&mut cell.grinder.link.wire, port);
     }
     Ok(simulated)
 }
 
 impl SimulatedCell {
-    async fn serve(&mut self, wire: &Wire, units: Vec<(u8, SharedMachine)>) -> Result<u16, String> {
+    async fn serve(&mut self, line: &Line, units: Vec<(u8, SharedMachine)>) -> Result<u16, String> {
         let names: Vec<String> = units.iter().map(|(unit, _)| format!("unit {unit}")).collect();
-        match wire {
-            Wire::ModbusTcp { host, port, .. } => {
+        match line {
+            Line::Tcp { host, port } => {
                 let serving = Serving::tcp((host.as_str(), *port), units).await.map_err(|e| {
                     format!("{host}:{port} cannot be served: {e}; choose another port, or end what holds it")
                 })?;
@@ -101,8 +105,8 @@ impl SimulatedCell {
                 self.servings.push(serving);
                 Ok(bound)
             }
-            Wire::ModbusRtu { device, baud, .. } => {
-                let serving = Serving::rtu(units, Line::paced(*baud), Faults::none())
+            Line::Rtu { device, baud, .. } => {
+                let serving = Serving::rtu(units, rtu::Line::paced(*baud), Faults::none())
                     .map_err(|e| format!("no pseudo-terminal can be had for {device}: {e}"))?;
                 let terminal = serving.path().map(Path::to_owned).unwrap_or_default();
                 place_link(&terminal, Path::new(device)).map_err(|e| {
@@ -115,9 +119,6 @@ impl SimulatedCell {
                 self.places.push(format!("Modbus RTU {device} at {baud} baud, {}", names.join(" and ")));
                 self.servings.push(serving);
                 Ok(0)
-            }
-            Wire::FileExchange(_) => {
-                Err("a machine that is reached by files cannot be simulated; its files are yours to write".into())
             }
         }
     }
@@ -163,24 +164,8 @@ fn layout(r: &RegisterMap) -> Layout {
     }
 }
 
-fn unit(wire: &Wire) -> u8 {
-    match wire {
-        Wire::ModbusTcp { unit, .. } | Wire::ModbusRtu { unit, .. } => *unit,
-        Wire::FileExchange(_) => 0,
-    }
-}
-
-/// Whether two machines answer on one line.
-fn same_line(a: &Wire, b: &Wire) -> bool {
-    match (a, b) {
-        (Wire::ModbusTcp { host: h, port: p, .. }, Wire::ModbusTcp { host, port, .. }) => h == host && p == port,
-        (Wire::ModbusRtu { device: d, .. }, Wire::ModbusRtu { device, .. }) => d == device,
-        _ => false,
-    }
-}
-
 fn set_port(wire: &mut Wire, bound: u16) {
-    if let Wire::ModbusTcp { port, .. } = wire {
-        *port = bound;
+    if let Wire::ModbusTcp(tcp) = wire {
+        tcp.port = bound;
     }
 }

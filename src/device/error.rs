@@ -164,6 +164,20 @@ pub enum DeviceError {
         /// The machine.
         machine: Arc<str>,
     },
+    /// A person's word did not say which map the machine works by.
+    #[error("{machine} takes a word only with the map that it is about: --map and the first 8 digits of it, or more")]
+    MapUnnamed {
+        /// The machine.
+        machine: Arc<str>,
+    },
+    /// A file that a person named is not the measurement that was asked for, or could not be kept.
+    #[error("{machine}: {why}")]
+    NotTaken {
+        /// The machine.
+        machine: Arc<str>,
+        /// The reason and the remedy, in words.
+        why: String,
+    },
 
     /// The folders that stand for the machine cannot be read or written, or hold something that must not be touched.
     #[error("{machine}: {why}")]

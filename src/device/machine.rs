@@ -4,10 +4,9 @@ use std::future::Future;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::exchange::Step;
-use super::{
-    Armed, CorrectionMap, DeviceError, Identity, Job, Measurement, Pass, PassRecord, Plan, Reconciled, Started, Status,
-};
+use super::error::DeviceError;
+use super::payload::{CorrectionMap, Measurement, Pass, PassRecord, Plan};
+use super::words::{Armed, Identity, Job, Reconciled, Started, Status, Word};
 
 /// What every machine of a cell can be asked, whatever its wire.
 ///
@@ -69,6 +68,13 @@ pub trait Machine: Send {
     /// and has found the intent in its journal. Moves nothing. Takes a second or more when the answer is "not started", for that has to
     /// be seen twice.
     fn reconcile(&mut self, intended: &Armed) -> impl Future<Output = Result<Reconciled, DeviceError>> + Send;
+
+    /// Takes a person's word about a machine that cannot tell itself; any other refuses. Returns what of it was kept, by its path in the
+    /// folder of the run.
+    fn confirm(&mut self, _word: Word) -> impl Future<Output = Result<Vec<String>, DeviceError>> + Send {
+        let machine: Arc<str> = Arc::from(self.name());
+        async move { Err(DeviceError::TellsItself { machine }) }
+    }
 }
 
 /// A machine that measures.
@@ -102,17 +108,6 @@ pub trait Grinder: Machine {
         job: Job,
         interrupt: &Interrupt,
     ) -> impl Future<Output = Result<PassRecord, DeviceError>> + Send;
-
-    /// Takes a person's word that the job with this map has begun, or that it has ended and the part is clear. Only a grinder that
-    /// cannot tell it itself needs it; any other refuses.
-    fn confirm(
-        &mut self,
-        _step: Step,
-        _map_identity: [u8; 32],
-    ) -> impl Future<Output = Result<(), DeviceError>> + Send {
-        let machine: Arc<str> = Arc::from(self.name());
-        async move { Err(DeviceError::TellsItself { machine }) }
-    }
 }
 
 /// A flag that breaks off a long transfer between two requests, so that a hold or an abort can reach the wire at once.

@@ -13,34 +13,39 @@
 //! ```
 //!
 //! Everything is in millimetres, seconds and degrees Celsius, and no number that is not finite comes through. This room knows nothing of
-//! recipes, cells, surfaces or journals.
+//! recipes, cells, surfaces or journals. What a machine cannot tell is unknown, and is never filled in here.
+//!
+//! A driver is a folder of this room and a line in [`table`](self::Wire): the folder owns what a cell file says of it ([`Wired`]), how
+//! that is checked, and the machines that are made of it.
 //!
 //! One value of a driver is used by one task. Its futures may be dropped at any `.await`: a request that is on its way is finished and
 //! its answer forgotten, the connection stays in order (but a `start` that is dropped has to be reconciled). To break off a long transfer
 //! politely raise its [`Interrupt`].
 
-mod any;
-mod codec;
 mod error;
 pub mod exchange;
-mod link;
 mod machine;
+mod manual;
 mod modbus;
 mod payload;
-mod station;
+mod table;
+mod wiring;
 mod words;
 
-pub use any::{AnyCmm, AnyGrinder};
-pub use codec::WordOrder;
+pub use crate::formats::result::Coordinates;
 pub use error::DeviceError;
-pub use link::{Link, LinkFigures, Parity, Wire};
 pub use machine::{Cmm, Grinder, Interrupt, Machine};
-pub use modbus::{ModbusCmm, ModbusGrinder, ModbusMachine, ModbusSettings, RegisterMap, Signal, SignalType};
-pub use payload::{
-    Coordinates, CorrectionMap, Identified, MeasuredPoint, Measurement, Pass, PassRecord, Plan, PointStatus, Target,
-    TargetKind,
+pub use manual::{ManualMachine, ManualSettings, ManualWire};
+pub use modbus::{
+    Line, Link, LinkFigures, ModbusCmm, ModbusGrinder, ModbusMachine, ModbusSettings, Parity, RegisterMap, RtuWire,
+    Signal, SignalTable, SignalType, TcpWire, WordOrder,
 };
+pub use payload::{
+    CorrectionMap, Identified, MeasuredPoint, Measurement, Pass, PassRecord, Plan, PointStatus, Target, TargetKind,
+};
+pub use table::{AnyCmm, AnyGrinder, Wire};
+pub use wiring::{Making, MakingError, Place, Timing, Wired};
 pub use words::{
-    Answer, Armed, Beats, Command, Fault, Identity, Interlocks, Job, MachineKind, Mode, Outcome, Reading, Reconciled,
-    Started, State, Status, digest,
+    Answer, Armed, Command, Fault, Identity, Job, MachineKind, Outcome, Reconciled, SignalValue, Started, State,
+    Status, Word, digest,
 };

@@ -1,5 +1,6 @@
 //! What is carried to a machine and what comes back.
 
+use crate::formats::result::Coordinates;
 use crate::geometry::Grid;
 
 /// Something that is carried as one string of bytes and known by the SHA-256 of it.
@@ -107,15 +108,6 @@ pub struct MeasuredPoint {
     pub at_mm: [f64; 3],
 }
 
-/// What the coordinates of a measurement are.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Coordinates {
-    /// Centres of the probe's ball.
-    Centres,
-    /// Points of contact, which the machine worked out itself.
-    Contacts,
-}
-
 /// What a CMM measured: a point for every target, in the order of the plan.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Measurement {
@@ -123,12 +115,12 @@ pub struct Measurement {
     pub points: Vec<MeasuredPoint>,
     /// What their coordinates are.
     pub coordinates: Coordinates,
-    /// The radius of the probe that was used.
-    pub probe_radius_mm: f64,
-    /// Mean temperature of the part during the job.
-    pub temperature_c: f64,
-    /// How long the job took.
-    pub duration_s: f64,
+    /// The radius of the probe that was used, where that is told.
+    pub probe_radius_mm: Option<f64>,
+    /// Mean temperature of the part during the job, where that is told.
+    pub temperature_c: Option<f64>,
+    /// How long the job took, where that is told.
+    pub duration_s: Option<f64>,
     /// The identity of the plan that was used.
     pub plan_identity: [u8; 32],
     /// The job it belongs to.
@@ -139,27 +131,27 @@ pub struct Measurement {
     pub done: u32,
 }
 
-/// What a grinder says of a pass.
+/// What a grinder, or the person who serves it, says of a pass; `None` is what nobody told.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PassRecord {
     /// How the job ended.
     pub outcome: super::Outcome,
     /// Path travelled.
-    pub path_mm: f64,
+    pub path_mm: Option<f64>,
     /// Volume removed.
-    pub removed_mm3: f64,
+    pub removed_mm3: Option<f64>,
     /// Largest depth taken off.
-    pub deepest_mm: f64,
+    pub deepest_mm: Option<f64>,
     /// Share of the path that cut nothing, 0 to 1.
-    pub idle_share: f64,
+    pub idle_share: Option<f64>,
     /// Mean spindle load, 1 is full.
-    pub spindle_load: f64,
+    pub spindle_load: Option<f64>,
     /// Radius of the wheel in use.
-    pub wheel_radius_mm: f64,
+    pub wheel_radius_mm: Option<f64>,
     /// Mean temperature of the part during the job.
-    pub temperature_c: f64,
+    pub temperature_c: Option<f64>,
     /// How long the job took.
-    pub duration_s: f64,
+    pub duration_s: Option<f64>,
     /// The identity of the map that was used.
     pub map_identity: [u8; 32],
     /// The job it belongs to.

@@ -1,6 +1,7 @@
 //! The words of a machine's handshake: who it is, what it is doing, what it answers.
 
 use std::fmt;
+use std::path::PathBuf;
 
 /// What a machine is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -32,7 +33,7 @@ pub struct Identity {
     /// Whether it is a simulation. Has to be said wherever its results are shown or stored.
     pub simulation: bool,
     /// After how many seconds of silence the machine takes its client for lost and holds.
-    pub silence_limit_s: f64,
+    pub silence_limit_s: Option<f64>,
 }
 
 /// One run of one machine: the part's run, the cycle in it, and a check number of the payloads it is about.
@@ -186,35 +187,6 @@ impl fmt::Display for State {
     }
 }
 
-/// Who may move the machine.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Mode {
-    /// The client.
-    Automatic,
-    /// A person at the machine.
-    Manual,
-}
-
-/// What has to be good before anything may move. The machine's own circuits guard people; this is only what they say.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct Interlocks {
-    /// Guards and doors are closed.
-    pub guards_closed: bool,
-    /// Wheel or probe is parked clear of the part.
-    pub clear_of_part: bool,
-    /// The part is clamped.
-    pub part_clamped: bool,
-    /// Air, coolant and the like are there.
-    pub supplies: bool,
-}
-
-impl Interlocks {
-    /// Everything is good.
-    pub fn all_good(&self) -> bool {
-        self.guards_closed && self.clear_of_part && self.part_clamped && self.supplies
-    }
-}
-
 /// What a machine answers to a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Answer {
@@ -324,18 +296,9 @@ pub enum Outcome {
     Failed,
 }
 
-/// The two counters by which client and machine see each other alive.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct Beats {
-    /// The machine's own.
-    pub machine: u16,
-    /// The client's, as the machine has seen it.
-    pub echo: u16,
-}
-
 /// A signal that a cell file asks for besides the contract's own, in its unit.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Reading {
+pub struct SignalValue {
     /// Its name in the cell file.
     pub name: String,
     /// Its value.
@@ -344,47 +307,49 @@ pub struct Reading {
     pub unit: String,
 }
 
-/// What a machine says of itself, all of one moment.
+/// What a machine says of itself, all of one moment; `None` is what it cannot tell, and nobody fills that in: what has to be known
+/// and is not, a person is asked.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Status {
     /// Where it stands.
     pub state: State,
-    /// Who may move it.
-    pub mode: Mode,
-    /// What has to be good.
-    pub interlocks: Interlocks,
-    /// The sequence number of the last command it acted upon.
-    pub acknowledged: u32,
-    /// Its answer to that command.
-    pub answer: Answer,
-    /// Why it stands.
-    pub fault: Fault,
     /// The job prepared, running or finished.
     pub job: Option<Job>,
-    /// The token of the prepared job; 0 when there is none.
-    pub token: u32,
     /// The number of the START whose job ended last; 0 when there is none.
     pub done: u32,
     /// How that job ended.
     pub outcome: Outcome,
-    /// Points measured, or thousandths of the path.
-    pub progress: u32,
-    /// Of how many.
-    pub total: u32,
-    /// The owner; 0 when there is none.
-    pub owner: u32,
-    /// The owner's epoch.
-    pub epoch: u32,
-    /// The two counters.
-    pub beats: Beats,
-    /// The job and cycle begun last, kept over a restart of the machine; job 0 when there is none.
-    pub last_begun: (u32, u16),
-    /// The START that began the running or last job; 0 when there is none.
-    pub begun_by: u32,
+    /// Whether wheel or probe is clear of the part.
+    pub clear_of_part: Option<bool>,
+    /// Whether air, coolant and the like are there.
+    pub supplies: Option<bool>,
+    /// Why it stands.
+    pub fault: Option<Fault>,
+    /// Points measured, or thousandths of the path, and of how many.
+    pub progress: Option<(u32, u32)>,
     /// Temperature of the part or the machine.
-    pub temperature_c: f64,
-    /// The machine's boot id.
-    pub boot_id: u32,
+    pub temperature_c: Option<f64>,
+    /// The number that changes whenever the machine's application starts.
+    pub boot_id: Option<u32>,
     /// The signals that the cell file asks for besides.
-    pub signals: Vec<Reading>,
+    pub signals: Vec<SignalValue>,
+}
+
+/// A person's word about a machine that cannot tell it itself.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Word {
+    /// It has begun its job.
+    Started {
+        /// The identity of the map that it works by, where that was named.
+        map_identity: Option<[u8; 32]>,
+    },
+    /// It has ended its job, and is clear of the part.
+    Done {
+        /// The identity of the map that it worked by, where that was named.
+        map_identity: Option<[u8; 32]>,
+        /// The file that the measurement came as.
+        file: Option<PathBuf>,
+    },
+    /// It stands still.
+    Still,
 }

@@ -14,7 +14,8 @@ use std::fmt;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-pub(crate) use read::{Document, problem_at, read_text, sha256};
+pub use read::Document;
+pub(crate) use read::{problem_at, read_text, sha256};
 pub(crate) use schema::schema_of;
 
 /// Everything that is wrong with one file.

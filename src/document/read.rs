@@ -27,7 +27,7 @@ enum Step {
 }
 
 /// A file on its way to what it says.
-pub(crate) struct Document<'t> {
+pub struct Document<'t> {
     file: &'t Path,
     text: &'t str,
     places: DeTable<'t>,

@@ -37,7 +37,10 @@ fn tidy(schema: &mut Schema) {
     }
     if let Some(properties) = schema.get_mut("properties").and_then(Value::as_object_mut) {
         properties.values_mut().filter_map(Value::as_object_mut).for_each(|property| {
-            property.remove("x-required");
+            // What must stand has no default.
+            if property.remove("x-required").is_some() {
+                property.remove("default");
+            }
         });
     }
 }

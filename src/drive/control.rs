@@ -49,8 +49,13 @@ pub enum Request {
         #[serde(default)]
         reason: String,
     },
-    /// The right part is loaded and clamped.
+    /// The right part is loaded and clamped, and no machine touches it.
     Loaded,
+    /// A machine that cannot tell it was looked at: it is clear of the part.
+    Clear {
+        /// The machine.
+        device: Device,
+    },
     /// A machine that cannot tell what became of its job was looked at: it stands, clear of the part.
     Over {
         /// The machine.
@@ -58,15 +63,26 @@ pub enum Request {
         /// What was seen.
         evidence: String,
     },
-    /// The grinder has begun the job whose map is this one; for a grinder that takes files.
+    /// The machine that a person serves has begun its job.
     Started {
-        /// Identity of the map: its first 8 hexadecimal digits, or more.
-        map: String,
+        /// Identity of the map that it works by: its first 8 hexadecimal digits, or more.
+        #[serde(default)]
+        map: Option<String>,
     },
-    /// The grinder has ended that job, and the part is clear.
+    /// It has ended that job, and is clear of the part.
     Done {
-        /// Identity of the map: its first 8 hexadecimal digits, or more.
-        map: String,
+        /// Identity of the map that it worked by: its first 8 hexadecimal digits, or more.
+        #[serde(default)]
+        map: Option<String>,
+        /// The file that the measurement came as.
+        #[serde(default)]
+        file: Option<PathBuf>,
+    },
+    /// A machine that was to hold or to stop was looked at: it stands still.
+    Still {
+        /// The machine; that of the job under way where it is not named.
+        #[serde(default)]
+        device: Option<Device>,
     },
     /// How is it?
     Status,

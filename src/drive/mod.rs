@@ -32,8 +32,7 @@ use tokio::task::JoinSet;
 use tokio::time::Instant;
 
 use crate::cell::{Actor, Cell, CellPlan, Command, Device, Ending, Event, Phase, RecordFailure, State, StateName};
-use crate::device::exchange::Step;
-use crate::device::{Armed, Cmm, Grinder, Identified, Interrupt, Measurement};
+use crate::device::{Armed, Cmm, Grinder, Identified, Interrupt, Measurement, Word};
 use crate::formats::{LEARNED, write_json_atomic};
 use crate::journal::{Artefact, Entry, Journal, Kind};
 
@@ -58,7 +57,7 @@ pub struct Run {
     pub job: u32,
     /// Who began it.
     pub actor: Actor,
-    /// Whether loading the part needs nobody's word: the cell is simulated, or the recipe says so.
+    /// Whether loading the part is not asked for: the cell is simulated, or who begins the run has said it.
     pub loaded: bool,
     /// Time between two looks at each machine: CMM, grinder.
     pub poll: [Duration; 2],
@@ -276,8 +275,10 @@ impl Drive {
     /// Handles an order and answers who gave it.
     async fn order(&mut self, Ordered { request, actor, answer }: Ordered) {
         let event = match request {
-            Request::Started { map } => return self.confirm(Step::Started, &map, &actor, answer).await,
-            Request::Done { map } => return self.confirm(Step::Done, &map, &actor, answer).await,
+            Request::Started { .. } | Request::Done { .. } | Request::Still { .. } => {
+                return self.confirm(&request, &actor, answer).await;
+            }
+            Request::Clear { device } => Event::ClearConfirmed { actor, device },
             Request::Hold { reason } => Event::Hold { actor, reason },
             Request::Resume { reason } => Event::Resume { actor, reason },
             Request::Stop { reason } => Event::Stop { actor, reason },
@@ -294,12 +295,15 @@ impl Drive {
         }
     }
 
-    /// Takes a person's word for the pass that is under way, if it names the map of that pass.
-    async fn confirm(&mut self, step: Step, map: &str, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
-        let mut asked = self.confirmable(map);
-        if asked.is_ok() {
-            let done = if step == Step::Started { "started" } else { "done" };
-            let payload = json!({ "confirmed": done, "device": Device::Grinder, "map": map });
+    /// Takes a person's word about a machine that cannot tell it itself.
+    async fn confirm(&mut self, request: &Request, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
+        let mut asked = self.word(request);
+        if let Ok((device, confirmed, _)) = &asked {
+            let mut payload = serde_json::to_value(request).unwrap_or_default();
+            if let Some(payload) = payload.as_object_mut() {
+                payload.remove("order");
+                payload.extend([("confirmed".to_owned(), json!(confirmed)), ("device".to_owned(), json!(device))]);
+            }
             self.note(Kind::Note, (actor.name.clone(), actor.station.clone()), payload).await;
             if self.record_failed {
                 asked = Err("the journal cannot be written, and what is not recorded is not done".into());
@@ -307,17 +311,17 @@ impl Drive {
         }
         let asked = match asked {
             Err(why) => Err(why),
-            Ok(map_identity) => {
-                let (told, word) = oneshot::channel();
-                self.ask(Device::Grinder, Ask::Confirm { step, map_identity, answer: told }).await;
-                Ok(word)
+            Ok((device, _, word)) => {
+                let (told, taken) = oneshot::channel();
+                self.ask(device, Ask::Confirm { word, answer: told }).await;
+                Ok(taken)
             }
         };
         let status = self.snapshot();
         // The station answers in its turn; the loop does not wait for it.
         tokio::spawn(async move {
             let told = match asked {
-                Ok(word) => word.await.unwrap_or_else(|_| Err("the run is over".into())),
+                Ok(taken) => taken.await.unwrap_or_else(|_| Err("the run is over".into())),
                 Err(why) => Err(why),
             };
             let message = told.as_ref().err().unwrap_or(&status.message).clone();
@@ -326,8 +330,26 @@ impl Drive {
         });
     }
 
+    /// Returns which machine a person's word is about, how the record calls it, and the word.
+    fn word(&self, request: &Request) -> Result<(Device, &'static str, Word), String> {
+        let at_work = self.cell.state().phase().and_then(Phase::moving);
+        let job = || at_work.ok_or("no job of a machine is under way");
+        let identity = |map: &Option<String>| map.as_ref().map(|digits| self.named_map(digits)).transpose();
+        Ok(match request {
+            Request::Started { map } => (job()?, "started", Word::Started { map_identity: identity(map)? }),
+            Request::Done { map, file } => {
+                (job()?, "done", Word::Done { map_identity: identity(map)?, file: file.clone() })
+            }
+            Request::Still { device } => {
+                let device = device.or(at_work).ok_or("say which machine stands: --machine cmm, or grinder")?;
+                (device, "still", Word::Still)
+            }
+            _ => return Err("that is no word about a machine".into()),
+        })
+    }
+
     /// Returns the whole identity of the map of this cycle, if that is what the digits begin.
-    fn confirmable(&self, digits: &str) -> Result<[u8; 32], String> {
+    fn named_map(&self, digits: &str) -> Result<[u8; 32], String> {
         let digits = digits.trim().to_lowercase();
         let grinds = self.cell.state().phase().and_then(Phase::moving) == Some(Device::Grinder);
         let cycle = self.cycles.get(&self.cell.cycle()).filter(|_| grinds);
@@ -346,7 +368,8 @@ impl Drive {
         Ok(identity)
     }
 
-    async fn reported(&mut self, StationReport { event, detail, fetched, notes }: StationReport) {
+    async fn reported(&mut self, StationReport { event, detail, fetched, notes, files }: StationReport) {
+        self.adopt(self.cell.cycle(), record::describe(&self.folder, &files)).await;
         if let Some((device, messages)) = notes {
             let payload = json!({ "device": device, "notes": messages });
             self.note(Kind::Note, (device.to_string(), "wire".into()), payload).await;
@@ -507,6 +530,7 @@ impl Drive {
             Command::LoadPass { cycle } => self.load_pass(cycle).await,
             Command::LoadPlan { cycle } => self.load_plan(cycle).await,
             Command::VerifyClear { device } => self.ask(device, Ask::VerifyClear).await,
+            Command::AskWhetherClear { device } => self.notify(Notice::AskWhetherClear { device }),
             Command::Prepare { device, cycle } => self.ask(device, Ask::Prepare { cycle }).await,
             Command::StartMachine { device, cycle } => self.ask(device, Ask::Start { cycle }).await,
             Command::HoldMachine { device } => self.ask_at_once(device, Ask::Hold).await,
@@ -576,8 +600,8 @@ impl Drive {
 
     async fn ask_to_load(&mut self) {
         if self.loaded {
-            let name = if self.task.simulation { "simulation" } else { "recipe" };
-            let actor = Actor { name: name.into(), station: "regrind".into() };
+            let simulation = || Actor { name: "simulation".into(), station: "regrind".into() };
+            let actor = if self.task.simulation { simulation() } else { self.actor.clone() };
             self.answer(0, Event::LoadConfirmed { actor });
         } else {
             self.notify(Notice::LoadPart);

@@ -13,6 +13,8 @@ pub enum Notice {
     State { state: String, cycle: u32, event: String },
     /// The right part is to be loaded, and that to be confirmed.
     LoadPart,
+    /// A machine cannot tell whether it is clear of the part: a person is to look, and to confirm it.
+    AskWhetherClear { device: Device },
     /// What a person should know of a machine: what it waits for, which files were left alone and why.
     Note {
         device: Device,

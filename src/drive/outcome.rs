@@ -24,7 +24,11 @@ pub(super) fn answers(event: &Event, command: &Command) -> bool {
         (C::Connect { device }, E::NotConnected { device: d, .. }) => device == d,
         (C::LoadPass { cycle }, E::PassLoaded { cycle: c }) => cycle == c,
         (C::LoadPlan { cycle }, E::PlanLoaded { cycle: c }) => cycle == c,
-        (C::VerifyClear { device }, E::Cleared { device: d } | E::Obstructed { device: d, .. }) => device == d,
+        (
+            C::VerifyClear { device },
+            E::Cleared { device: d } | E::Obstructed { device: d, .. } | E::ClearUnknown { device: d },
+        ) => device == d,
+        (C::AskWhetherClear { device }, E::ClearConfirmed { device: d, .. }) => device == d,
         (C::Prepare { device, .. }, E::Prepared { device: d, .. }) => device == d,
         (C::StartMachine { device, cycle }, E::Started { device: d, cycle: c }) => device == d && cycle == c,
         (C::StartMachine { device, cycle }, E::Reconciled { device: d, cycle: c, .. }) => device == d && cycle == c,

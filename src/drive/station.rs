@@ -15,10 +15,9 @@ use tokio::time::{Instant, MissedTickBehavior, interval};
 use crate::cell::{
     Asked, Condition, Device, Event, Gate, GateFailure, JobResult, Mismatch, Occupation, Reconciliation,
 };
-use crate::device::exchange::Step;
 use crate::device::{
     Armed, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, Measurement, Outcome,
-    Pass, PassRecord, Plan, Reconciled, State, Status, digest,
+    Pass, PassRecord, Plan, Reconciled, State, Status, Word, digest,
 };
 
 /// What a machine is asked. Answers are the events that [`crate::cell::Command`] names.
@@ -36,7 +35,7 @@ pub(super) enum Ask {
     Reconcile { cycle: u32 },
     Collect { cycle: u32 },
     Acknowledge,
-    Confirm { step: Step, map_identity: [u8; 32], answer: oneshot::Sender<Result<(), String>> },
+    Confirm { word: Word, answer: oneshot::Sender<Result<(), String>> },
 }
 
 /// A payload for one machine or the other.
@@ -62,6 +61,8 @@ pub(super) struct StationReport {
     pub(super) fetched: Option<Fetched>,
     /// What a person should know of a machine, where that is new.
     pub(super) notes: Option<(Device, Vec<String>)>,
+    /// Files of the run folder that came with a person's word, to be brought on record.
+    pub(super) files: Vec<String>,
 }
 
 /// The drivers of both kinds, seen alike.
@@ -72,8 +73,6 @@ pub(super) trait StationDriver: Send + 'static {
     /// Carries the payloads and returns the digest of their identities.
     fn load(&mut self, load: &Load, interrupt: &Interrupt) -> impl Future<Output = Result<u32, DeviceError>> + Send;
     fn fetch(&mut self, job: Job, interrupt: &Interrupt) -> impl Future<Output = Result<Fetched, DeviceError>> + Send;
-    /// Takes a person's word for the job with this map.
-    fn confirm(&mut self, step: Step, map_identity: [u8; 32]) -> impl Future<Output = Result<(), DeviceError>> + Send;
 }
 
 pub(super) struct CmmDriver<C>(pub(super) C);
@@ -98,10 +97,6 @@ impl<C: Cmm + 'static> StationDriver for CmmDriver<C> {
         let measurement = self.0.collect(job, interrupt).await?;
         Ok(Fetched::Points(Box::new(measurement), began.elapsed()))
     }
-
-    async fn confirm(&mut self, _: Step, _: [u8; 32]) -> Result<(), DeviceError> {
-        Err(DeviceError::TellsItself { machine: self.0.name().into() })
-    }
 }
 
 impl<G: Grinder + 'static> StationDriver for GrinderDriver<G> {
@@ -120,10 +115,6 @@ impl<G: Grinder + 'static> StationDriver for GrinderDriver<G> {
 
     async fn fetch(&mut self, job: Job, interrupt: &Interrupt) -> Result<Fetched, DeviceError> {
         Ok(Fetched::Record(Box::new(self.0.collect(job, interrupt).await?)))
-    }
-
-    async fn confirm(&mut self, step: Step, map_identity: [u8; 32]) -> Result<(), DeviceError> {
-        self.0.confirm(step, map_identity).await
     }
 }
 
@@ -274,10 +265,16 @@ impl<B: StationDriver> Station<B> {
             Ask::Reconcile { cycle } => self.reconcile(cycle).await,
             Ask::Collect { cycle } => self.collect(cycle).await,
             Ask::Acknowledge => self.acknowledge().await,
-            Ask::Confirm { step, map_identity, answer } => {
-                let told = self.driver.confirm(step, map_identity).await;
+            Ask::Confirm { word, answer } => {
+                let told = match self.driver.machine().confirm(word).await {
+                    Ok(files) => {
+                        let _ = self.reports.send(StationReport { files, ..StationReport::default() }).await;
+                        Ok(())
+                    }
+                    Err(error) => Err(error.to_string()),
+                };
                 // Who asked may have gone.
-                let _ = answer.send(told.map_err(|error| error.to_string()));
+                let _ = answer.send(told);
             }
         }
         if urgent {
@@ -339,13 +336,17 @@ impl<B: StationDriver> Station<B> {
 
     async fn verify_clear(&mut self) {
         match self.driver.machine().status().await {
-            Ok(status) if status.interlocks.clear_of_part && !status.state.moves() => {
-                self.tell(Event::Cleared { device: B::DEVICE }).await;
-            }
             Ok(status) => {
-                let clear = if status.interlocks.clear_of_part { "clear of the part" } else { "not clear of the part" };
-                let message = format!("{} is {} and {clear}", self.driver.machine().name(), status.state);
-                self.tell(Event::Obstructed { device: B::DEVICE, message }).await;
+                let device = B::DEVICE;
+                let name = self.driver.machine().name().to_owned();
+                let message = |clear: &str| format!("{name} is {} and {clear}", status.state);
+                self.tell(match status.clear_of_part {
+                    Some(false) => Event::Obstructed { device, message: message("not clear of the part") },
+                    _ if status.state.moves() => Event::Obstructed { device, message: message("may be moving") },
+                    Some(true) => Event::Cleared { device },
+                    None => Event::ClearUnknown { device },
+                })
+                .await;
             }
             Err(error) => self.lost(&error).await,
         }
@@ -617,13 +618,13 @@ impl<B: StationDriver> Station<B> {
             }
             State::Idle if self.seen.clearing => {
                 self.seen.clearing = false;
-                let (device, boot_id) = (B::DEVICE, status.boot_id);
+                let (device, boot_id) = (B::DEVICE, status.boot_id.unwrap_or_default());
                 self.tell(Event::Connected { device, boot_id, simulated: false, found: Occupation::Idle }).await;
             }
             State::Aborted => self.note_abort(before).await,
             State::Faulted if before != Some(State::Faulted) => {
-                let (device, code) = (B::DEVICE, fault_code(status.fault));
-                let message = fault_words(device, status.fault);
+                let fault = status.fault.unwrap_or(Fault::Other(0));
+                let (device, code, message) = (B::DEVICE, fault_code(fault), fault_words(B::DEVICE, fault));
                 self.tell(Event::Fault { device, code, message }).await;
             }
             _ => {}
@@ -631,7 +632,7 @@ impl<B: StationDriver> Station<B> {
     }
 
     async fn note_supplies(&mut self, status: &Status) {
-        let missing = !status.interlocks.supplies;
+        let Some(missing) = status.supplies.map(|there| !there) else { return };
         if std::mem::replace(&mut self.seen.supplies_missing, missing) == missing {
             return;
         }
@@ -646,7 +647,7 @@ impl<B: StationDriver> Station<B> {
     }
 
     async fn note_progress(&mut self, status: &Status) {
-        let (progress, now) = ((status.progress, status.total), Instant::now());
+        let (Some(progress), now) = (status.progress, Instant::now()) else { return };
         let due = self.seen.told_progress.is_none_or(|at| now - at >= PROGRESS_EVERY);
         if due && self.seen.progress != Some(progress) {
             (self.seen.progress, self.seen.told_progress) = (Some(progress), Some(now));

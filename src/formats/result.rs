@@ -16,6 +16,9 @@
 use std::borrow::Cow;
 use std::path::Path;
 
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
 use super::error::excerpt;
 use super::height_map::MapPoints;
 use super::layout::{Fields, Preamble, is_comment};
@@ -33,11 +36,12 @@ const PREAMBLE_BYTES: usize = 64 << 10;
 const INCH_MM: f64 = 25.4;
 
 /// What measured coordinates are.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
 pub enum Coordinates {
     /// Centres of the probe.
     Centres,
-    /// Points of contact.
+    /// Points of the surface.
     Contacts,
 }
 
@@ -51,15 +55,36 @@ impl Coordinates {
 }
 
 /// The decimal mark of a file.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
 pub enum DecimalMark {
-    /// Told from the file; a file that does not tell it is refused.
+    /// Told from the file.
     #[default]
     Auto,
-    /// A point.
+    /// A point; commas group thousands.
     Point,
-    /// A comma.
+    /// A comma; points group thousands.
     Comma,
+}
+
+/// Unit of length of files.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+#[allow(missing_docs)]
+pub enum LengthUnit {
+    #[default]
+    Mm,
+    Inch,
+}
+
+impl LengthUnit {
+    /// Millimetres per unit.
+    pub fn mm(self) -> f64 {
+        match self {
+            Self::Mm => 1.0,
+            Self::Inch => INCH_MM,
+        }
+    }
 }
 
 /// What the cell knows of its result files.

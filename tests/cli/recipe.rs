@@ -6,7 +6,8 @@ use std::process::Command;
 
 use proptest::prelude::*;
 use regrind::compensation::{Order, Roughness};
-use regrind::config::{CellConfig, PointKind, Wire, WordOrder};
+use regrind::config::CellConfig;
+use regrind::device::{Coordinates, TcpWire, Wire, WordOrder};
 use regrind::document::Problems;
 use regrind::formats::read_points;
 use regrind::geometry::{Point, Pose};
@@ -169,9 +170,9 @@ fn the_telescope_holds_what_it_cannot_see() {
     let (y, z) = (p.y, p.z - 3600.0);
     assert!((back - Point::new(p.x, cosine * y - sine * z, sine * y + cosine * z)).norm() < 1e-9);
     let Wire::FileExchange(files) = &cell.cmm.link.wire else { panic!("files") };
-    assert_eq!((files.stations.len(), files.content.unit_mm), (1, 1.0));
-    assert_eq!(files.inbox, root().join("config/../exchange/cmm/in"));
-    assert_eq!((files.content.what, files.reference_limit_mm), (Some(PointKind::Centres), 1.0));
+    assert_eq!((files.stations.len(), files.unit.mm()), (1, 1.0));
+    assert_eq!(files.inbox, "../exchange/cmm/in");
+    assert_eq!((files.what, files.reference_limit_mm), (Some(Coordinates::Centres), 1.0));
     assert_eq!((files.take_earlier, files.probe_tolerance_mm), (false, 1e-3));
     assert_eq!(recipe.cycle.begin_with, BeginWith::Measure);
     assert_eq!(recipe.compensation.largest_displacement_mm, 1.0);
@@ -183,7 +184,7 @@ fn what_a_file_wire_leaves_out_is_not_guessed() {
     let text = changed(&text, "take_earlier = false", "take_earlier = true\nresult = \"{part}-{job}-{cycle}_*.ply\"");
     let cell = cell(&text).unwrap();
     let Wire::FileExchange(files) = &cell.cmm.link.wire else { panic!("files") };
-    assert_eq!((files.content.what, files.take_earlier), (None, true));
+    assert_eq!((files.what, files.take_earlier), (None, true));
     assert_eq!(files.result, "{part}-{job}-{cycle}_*.ply");
     let Wire::FileExchange(files) = &cell.grinder.link.wire else { panic!("files") };
     assert_eq!((files.result.as_str(), files.reference_limit_mm), ("{part}_c{cycle}.*", 0.1));
@@ -203,7 +204,7 @@ fn registers_and_signals_are_read() {
     assert_eq!((cell.cmm.link.registers.status, cell.cmm.link.registers.command), (600, 40));
     assert_eq!(cell.cmm.link.signals[0].range, [4.0, 8.0]);
     assert_eq!(cell.cmm.link.signals[0].word_order, WordOrder::Big);
-    assert_eq!(cell.grinder.link.wire, Wire::ModbusTcp { host: "127.0.0.1".into(), port: 15022, unit: 2 });
+    assert_eq!(cell.grinder.link.wire, Wire::ModbusTcp(TcpWire { host: "127.0.0.1".into(), port: 15022, unit: 2 }));
 }
 
 /// File, what is changed into what, and the one problem: its key, what stands where it is, and a word of its remedy or limit.

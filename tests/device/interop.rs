@@ -12,8 +12,8 @@ use std::time::{Duration, Instant};
 
 use regrind::compensation::ErrorMap;
 use regrind::device::{
-    Cmm, Coordinates, CorrectionMap, Grinder, Identified, Interrupt, Job, Machine, MachineKind, ModbusCmm,
-    ModbusGrinder, ModbusSettings, Outcome, Pass, Plan, PointStatus, State, Status, Target, TargetKind, Wire, digest,
+    Cmm, Coordinates, CorrectionMap, Grinder, Identified, Interrupt, Job, Line, Machine, MachineKind, ModbusCmm,
+    ModbusGrinder, ModbusSettings, Outcome, Pass, Plan, PointStatus, State, Status, Target, TargetKind, digest,
 };
 use regrind::formats::write_error_map_x3p;
 use regrind::geometry::Grid;
@@ -84,7 +84,7 @@ impl Process {
         let port = port.unwrap_or_else(|| panic!("{script} said {line:?}"));
         let settings = ModbusSettings {
             request_timeout: Duration::from_secs(5),
-            ..ModbusSettings::new(Wire::Tcp { host: "127.0.0.1".into(), port })
+            ..ModbusSettings::new(Line::Tcp { host: "127.0.0.1".into(), port })
         };
         Self { child, settings }
     }
@@ -146,7 +146,7 @@ async fn our_driver_has_a_pymodbus_cmm_measure() {
         let status = until_complete(&mut cmm).await;
         assert_eq!((status.done, status.outcome), (armed.start_sequence, Outcome::Complete));
         let measured = cmm.collect(job, &calm).await.unwrap();
-        assert_eq!((measured.coordinates, measured.probe_radius_mm), (Coordinates::Centres, 2.5));
+        assert_eq!((measured.coordinates, measured.probe_radius_mm), (Coordinates::Centres, Some(2.5)));
         for (target, point) in plan.targets.iter().zip(&measured.points) {
             // The machine's own known error: 0.1 um along x at every odd index.
             let x_mm = target.point_mm[0] + 1e-4 * f64::from(target.index % 2) + 2.5 * target.normal[0];
@@ -194,7 +194,7 @@ async fn our_driver_has_a_pymodbus_grinder_grind() {
     grinder.resume().await.unwrap();
     until_complete(&mut grinder).await;
     let record = grinder.collect(job, &calm).await.unwrap();
-    assert_eq!((record.outcome, record.wheel_radius_mm, record.idle_share), (Outcome::Complete, 25.0, 1.0));
+    assert_eq!((record.outcome, record.wheel_radius_mm, record.idle_share), (Outcome::Complete, Some(25.0), Some(1.0)));
     assert_eq!(record.map_identity, map.identity());
     grinder.acknowledge(record.done).await.unwrap();
     grinder.release().await.unwrap();
@@ -211,9 +211,9 @@ fn a_whole_run_on_a_pymodbus_cmm_and_grinder() {
     let part = part.to_str().unwrap();
     let cmm = Process::of(python, "cmm.py", &["--part", part]);
     let grinder = Process::of(python, "grinder.py", &["--part", part, "--unit", "2"]);
-    let port = |process: &Process| match &process.settings.wire {
-        Wire::Tcp { port, .. } => format!("port = {port}"),
-        Wire::Rtu { .. } => unreachable!("both serve TCP"),
+    let port = |process: &Process| match &process.settings.line {
+        Line::Tcp { port, .. } => format!("port = {port}"),
+        Line::Rtu { .. } => unreachable!("both serve TCP"),
     };
     let recipe = crate::program::small_recipe(home.path(), 1.0);
     let named = "# expected_name = \"CMM 7, serial 12345\"";

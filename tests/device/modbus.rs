@@ -7,16 +7,16 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use regrind::device::{
-    Answer, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Link, Machine,
+    Answer, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Line, Link, Machine,
     MachineKind, Measurement, ModbusCmm, ModbusGrinder, ModbusSettings, Outcome, Parity, Pass, Plan, PointStatus,
-    Reconciled, RegisterMap, Signal, SignalType, State, Target, TargetKind, Wire, WordOrder, digest,
+    Reconciled, RegisterMap, Signal, SignalType, State, Target, TargetKind, WordOrder, digest,
 };
 use regrind::geometry::Grid;
 use regrind_sim::body::Kind;
 use regrind_sim::options::{Layout, MachineOptions};
 use regrind_sim::wire::Serving;
 use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, When};
-use regrind_sim::wire::rtu::Line;
+use regrind_sim::wire::rtu::Line as SerialLine;
 use regrind_sim::{registers, words};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpSocket};
@@ -44,7 +44,7 @@ fn settings(serving: &Serving) -> ModbusSettings {
         quarantine: Duration::from_millis(20),
         retries: 6,
         lost_after: Duration::from_secs(20),
-        ..ModbusSettings::new(Wire::Tcp { host: "127.0.0.1".into(), port })
+        ..ModbusSettings::new(Line::Tcp { host: "127.0.0.1".into(), port })
     }
 }
 
@@ -154,7 +154,7 @@ async fn a_plan_is_measured_and_comes_back_to_the_last_bit() {
     for cycle in 1..=2 {
         let measured = measure(&mut cmm, &plan, cycle).await.unwrap();
         assert_exact(&plan, &measured, "in order");
-        assert_eq!((measured.job, measured.cycle, measured.temperature_c), (42, cycle, 20.5));
+        assert_eq!((measured.job, measured.cycle, measured.temperature_c), (42, cycle, Some(20.5)));
     }
     assert_eq!(cmm.status().await.unwrap().state, State::Idle);
     assert_eq!(began(&serving).len(), 2);
@@ -176,8 +176,8 @@ async fn a_pass_is_ground_and_recorded() {
     grinder.start(armed).await.unwrap();
     until_complete(&mut grinder).await.unwrap();
     let record = grinder.collect(job, &calm).await.unwrap();
-    assert_eq!((record.outcome, record.path_mm, record.removed_mm3), (Outcome::Complete, 1234.5, 67.8));
-    assert_eq!((record.map_identity, record.wheel_radius_mm), (map.identity(), 25.0));
+    assert_eq!((record.outcome, record.path_mm, record.removed_mm3), (Outcome::Complete, Some(1234.5), Some(67.8)));
+    assert_eq!((record.map_identity, record.wheel_radius_mm), (map.identity(), Some(25.0)));
     grinder.acknowledge(record.done).await.unwrap();
     // The same job and cycle are not begun twice, however well they are prepared.
     let armed = grinder.prepare(job).await.unwrap();
@@ -191,8 +191,10 @@ async fn low_words_first_and_other_addresses_are_as_good() {
     let layout = Layout { status: 1064, command: 1040, outbox_page: 2462, ..Layout::default() };
     let options = MachineOptions { word_order: words::WordOrder::Little, layout, ..MachineOptions::default() };
     let serving = Serving::tcp("127.0.0.1:0", vec![(7, toy(Kind::Cmm, AT_ONCE, options))]).await.unwrap();
-    let registers = RegisterMap { status: 1064, command: 1040, outbox_page: 2462, ..RegisterMap::default() };
-    let settings = ModbusSettings { unit: 7, word_order: WordOrder::Little, registers, ..settings(&serving) };
+    let word_order = WordOrder::Little;
+    let registers =
+        RegisterMap { word_order, status: 1064, command: 1040, outbox_page: 2462, ..RegisterMap::default() };
+    let settings = ModbusSettings { unit: 7, registers, ..settings(&serving) };
     let mut cmm = ModbusCmm::new(settings).unwrap();
     cmm.connect().await.unwrap();
     let plan = plan(50);
@@ -227,7 +229,9 @@ async fn hold_resume_stop_abort_and_clear_are_obeyed() {
     let refused = cmm.hold().await;
     assert!(matches!(refused, Err(DeviceError::Refused { answer: Answer::WrongState, .. })), "{refused:?}");
     cmm.release().await.unwrap();
-    assert_eq!(cmm.status().await.unwrap().owner, 0);
+    let mut next = ModbusCmm::new(ModbusSettings { owner: 0x9999, ..settings(&serving) }).unwrap();
+    next.connect().await.unwrap();
+    next.claim().await.unwrap();
 }
 
 async fn reaches(cmm: &mut ModbusCmm, state: State) {
@@ -290,15 +294,15 @@ async fn further_signals_are_read_scaled_and_held_against_their_range() {
         address: 97,
         kind: SignalType::I16,
         scale: 0.01,
+        word_order: WordOrder::Big,
         unit: "C".into(),
-        least: 15.0,
-        most: 25.0,
+        range: [15.0, 25.0],
     };
-    let narrow = Signal { most: 19.0, ..temperature.clone() };
+    let narrow = Signal { range: [15.0, 19.0], ..temperature.clone() };
     let mut cmm = ModbusCmm::new(ModbusSettings { signals: vec![temperature], ..settings(&serving) }).unwrap();
     cmm.connect().await.unwrap();
     let status = cmm.status().await.unwrap();
-    assert_eq!((status.signals[0].value, status.temperature_c), (20.25, 20.25));
+    assert_eq!((status.signals[0].value, status.temperature_c), (20.25, Some(20.25)));
     let mut cmm = ModbusCmm::new(ModbusSettings { signals: vec![narrow], ..settings(&serving) }).unwrap();
     cmm.connect().await.unwrap();
     let refused = cmm.status().await.unwrap_err();
@@ -331,7 +335,7 @@ async fn impostor(image: Vec<u16>) -> (ModbusSettings, Arc<AtomicU32>) {
             }
         }
     });
-    (ModbusSettings::new(Wire::Tcp { host: "127.0.0.1".into(), port }), writes)
+    (ModbusSettings::new(Line::Tcp { host: "127.0.0.1".into(), port }), writes)
 }
 
 fn true_identity() -> Vec<u16> {
@@ -387,10 +391,10 @@ async fn nobody_there_is_said_so() {
     let taken = TcpSocket::new_v4().unwrap();
     taken.bind("127.0.0.1:0".parse().unwrap()).unwrap();
     let port = taken.local_addr().unwrap().port();
-    let wire = Wire::Tcp { host: "127.0.0.1".into(), port };
+    let wire = Line::Tcp { host: "127.0.0.1".into(), port };
     let absent = ModbusCmm::new(ModbusSettings { retries: 1, ..ModbusSettings::new(wire) }).unwrap().connect().await;
     assert!(matches!(absent, Err(DeviceError::Unreachable { .. })), "{absent:?}");
-    let wire = Wire::Rtu { device: "/dev/no-such-port".into(), baud: 9600, parity: Parity::Even, stop_bits: 1 };
+    let wire = Line::Rtu { device: "/dev/no-such-port".into(), baud: 9600, parity: Parity::Even, stop_bits: 1 };
     let absent = ModbusCmm::new(ModbusSettings { retries: 1, ..ModbusSettings::new(wire) }).unwrap().connect().await;
     assert!(matches!(absent, Err(DeviceError::Unreachable { .. })), "{absent:?}");
 }
@@ -585,10 +589,10 @@ async fn a_frozen_application_behind_a_living_wire_is_found() {
 
 // ---- serial lines -------------------------------------------------------------------------------------------------------------------
 
-fn rtu(units: Vec<(u8, registers::Machine)>, line: Line, faults: Faults) -> (Serving, ModbusSettings) {
+fn rtu(units: Vec<(u8, registers::Machine)>, line: SerialLine, faults: Faults) -> (Serving, ModbusSettings) {
     let serving = Serving::rtu(units, line, faults).unwrap();
     let device = serving.path().unwrap().to_string_lossy().into_owned();
-    let wire = Wire::Rtu { device, baud: line.baud, parity: Parity::None, stop_bits: 1 };
+    let wire = Line::Rtu { device, baud: line.baud, parity: Parity::None, stop_bits: 1 };
     let settings = ModbusSettings {
         request_timeout: Duration::from_millis(300),
         quarantine: Duration::from_millis(200),
@@ -603,9 +607,9 @@ fn rtu(units: Vec<(u8, registers::Machine)>, line: Line, faults: Faults) -> (Ser
 async fn two_machines_share_a_serial_line() {
     let options = MachineOptions::default;
     let units = vec![(1, toy(Kind::Cmm, AT_ONCE, options())), (2, toy(Kind::Grinder, AT_ONCE, options()))];
-    let (_serving, settings) = rtu(units, Line::unpaced(115_200), Faults::none());
+    let (_serving, settings) = rtu(units, SerialLine::unpaced(115_200), Faults::none());
     let settings = patient(settings);
-    let link = Link::new(settings.wire.clone(), settings.request_timeout, settings.quarantine).unwrap();
+    let link = Link::new(settings.line.clone(), settings.request_timeout, settings.quarantine).unwrap();
     let mut cmm = ModbusCmm::on(link.clone(), settings.clone());
     let mut grinder = ModbusGrinder::on(link.clone(), ModbusSettings { unit: 2, ..settings });
     cmm.connect().await.unwrap();
@@ -627,7 +631,7 @@ async fn faults_on_a_serial_line_end_in_the_right_points() {
     for fault in faults {
         let rules = FaultPlan::new(5).always(When::Every(23), fault.clone());
         let machine = toy(Kind::Cmm, AT_ONCE, MachineOptions::default());
-        let (serving, settings) = rtu(vec![(1, machine)], Line::unpaced(115_200), rules.into());
+        let (serving, settings) = rtu(vec![(1, machine)], SerialLine::unpaced(115_200), rules.into());
         let mut cmm = ModbusCmm::new(settings).unwrap();
         let hint = format!("{fault:?}");
         cmm.connect().await.unwrap_or_else(|error| panic!("{hint}: {error}"));
@@ -647,7 +651,7 @@ async fn an_answer_that_comes_after_the_quarantine_is_not_taken_for_the_next_one
         Fault::DelayReply(Duration::from_millis(900)),
     );
     let machine = toy(Kind::Cmm, AT_ONCE, MachineOptions::default());
-    let (serving, settings) = rtu(vec![(1, machine)], Line::unpaced(115_200), rules.into());
+    let (serving, settings) = rtu(vec![(1, machine)], SerialLine::unpaced(115_200), rules.into());
     let mut cmm = ModbusCmm::new(settings).unwrap();
     cmm.connect().await.unwrap();
     assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), "late");
@@ -694,7 +698,7 @@ async fn a_hold_comes_before_the_next_page_of_whatever_is_being_transferred() {
 #[ignore = "takes as long as a line of 115,200 baud takes, half a minute"]
 async fn eighteen_hundred_points_over_a_serial_line() {
     let machine = toy(Kind::Cmm, AT_ONCE, MachineOptions::default());
-    let (_serving, settings) = rtu(vec![(1, machine)], Line::paced(115_200), Faults::none());
+    let (_serving, settings) = rtu(vec![(1, machine)], SerialLine::paced(115_200), Faults::none());
     let mut cmm = ModbusCmm::new(ModbusSettings { request_timeout: Duration::from_secs(2), ..settings }).unwrap();
     cmm.connect().await.unwrap();
     cmm.claim().await.unwrap();

@@ -180,7 +180,7 @@ fn recipe() -> Recipe {
 fn cell(shop: &Path, port: u16) -> CellConfig {
     let (inbox, outbox) = (shop.join("in"), shop.join("out"));
     let wire = format!(
-        "kind = \"file-exchange\"\noutbox = \"{}\"\ninbox = \"{}\"\nstable_for_s = 0.05\n",
+        "kind = \"file-exchange\"\noutbox = \"{}\"\ninbox = \"{}\"\nstable_for_s = 0.05\napart = true\n",
         outbox.display(),
         inbox.display()
     );
@@ -225,7 +225,7 @@ async fn run(seed: u64) -> Ran {
     let serving = Serving::tcp("127.0.0.1:0", vec![(2, grinder)]).await.unwrap();
     let cell = cell(&shop, serving.local_addr().unwrap().port());
     let (task, plan) = setup::prepare(&recipe, &cell).unwrap();
-    let (cmm, grinder) = setup::machines(&recipe, &cell, "FFM", 7, 1).unwrap();
+    let (cmm, grinder) = setup::machines(&recipe, &cell, "FFM", &folder, [7, 1]).unwrap();
     let header = Header {
         run: "run".into(),
         part: "FFM".into(),

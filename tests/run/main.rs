@@ -10,6 +10,7 @@ mod faults;
 mod heartbeats;
 mod height_maps;
 mod learning;
+mod manual;
 mod mirror_cell;
 mod mirror_run;
 mod orders;

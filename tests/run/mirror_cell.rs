@@ -100,7 +100,7 @@ fn raw_tracker_files_become_a_measurement_and_no_map_while_the_plane_is_free() {
         let found = found.unwrap_or_else(|| panic!("{said:#?}"));
         println!("{session}\n{}", said.join("\n"));
         assert_eq!((found.points.len(), found.coordinates), (points, Coordinates::Centres));
-        assert!((found.probe_radius_mm - REFLECTOR_MM).abs() < 1e-12, "{}", found.probe_radius_mm);
+        assert_eq!(found.probe_radius_mm, Some(REFLECTOR_MM));
         let cloud: Vec<Point> = found.points.iter().map(|p| Point::from(p.at_mm)).collect();
         let free = registered(&nominal, &cloud, [false; 6]);
         let v = &free.verdict;

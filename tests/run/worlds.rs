@@ -8,7 +8,8 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use regrind::cell::{Actor, Alarm, AlarmId, Ending, Role, StateName};
-use regrind::config::{CellConfig, Wire};
+use regrind::config::CellConfig;
+use regrind::device::Wire;
 use regrind::device::{ModbusCmm, ModbusGrinder, ModbusSettings};
 use regrind::drive::{CycleRow, Drive, Notice, Request, Run, ask};
 use regrind::journal::{Header, Journal};
@@ -345,8 +346,8 @@ async fn serve(
         ports.reverse();
     }
     for (link, bound) in links.iter_mut().zip(ports) {
-        if let Wire::ModbusTcp { port, .. } = &mut link.wire {
-            *port = bound;
+        if let Wire::ModbusTcp(tcp) = &mut link.wire {
+            tcp.port = bound;
         }
         link.timing.request_timeout = Duration::from_secs(5);
         link.timing.lost_after = Duration::from_secs(60);

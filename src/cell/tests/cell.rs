@@ -81,6 +81,7 @@ fn answer(command: &Command, figures: &mut dyn FnMut(u32) -> Figures) -> Option<
         Command::LoadPass { cycle } => Event::PassLoaded { cycle },
         Command::LoadPlan { cycle } => Event::PlanLoaded { cycle },
         Command::VerifyClear { device } => Event::Cleared { device },
+        Command::AskWhetherClear { device } => Event::ClearConfirmed { actor: actor(), device },
         Command::Prepare { device, cycle } => Event::Prepared { device, cycle },
         Command::StartMachine { device, cycle } => Event::Started { device, cycle },
         Command::HoldMachine { device } => Event::MachineHeld { device },
@@ -653,13 +654,48 @@ fn every_alarm_says_what_to_do() {
     assert!(AlarmId::ALL.len() > 30);
 }
 
+#[test]
+fn a_machine_that_cannot_tell_is_clear_by_a_persons_word_and_only_until_its_next_start() {
+    let asked = |commands: &[Command]| commands.iter().any(|c| matches!(c, Command::AskWhetherClear { .. }));
+    let word = |device| Event::ClearConfirmed { actor: actor(), device };
+    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    // Who loaded the part has seen both machines clear of it: nobody is asked before the first start.
+    run.start().until(State::Execute(Phase::Grind(JobStep::Clear)));
+    run.waiting.clear();
+    assert!(!asked(&run.send(Event::ClearUnknown { device: Device::Cmm })));
+    run.until(State::Execute(Phase::Transfer));
+    // The grinder was started since: nothing opens the gate but a word, and that is waited for without end.
+    run.waiting.clear();
+    assert!(asked(&run.send(Event::ClearUnknown { device: Device::Grinder })));
+    assert_eq!((run.cell.state(), run.cell.next_deadline()), (State::Execute(Phase::Transfer), None));
+    run.send(word(Device::Cmm));
+    assert_eq!(run.cell.state(), State::Execute(Phase::Transfer), "the word was about the other machine");
+    // A hold while a person is asked takes no answer.
+    run.send(Event::Hold { actor: actor(), reason: String::new() });
+    assert_eq!(run.cell.state(), State::Held(Phase::Transfer));
+    run.waiting.clear();
+    // An early word counts: the fresh look that follows asks nobody.
+    run.send(word(Device::Grinder));
+    run.send(Event::Resume { actor: actor(), reason: String::new() });
+    run.waiting.clear();
+    assert!(!asked(&run.send(Event::ClearUnknown { device: Device::Grinder })));
+    assert_eq!(run.cell.state(), State::Execute(Phase::Measure(JobStep::Send)));
+    // Nobody has to look once more when the part is accepted.
+    run.until(State::Completing).waiting.clear();
+    for device in Device::BOTH {
+        assert!(!asked(&run.send(Event::ClearUnknown { device })));
+    }
+    assert!(matches!(run.ending(), Some(Ending::Accepted { .. })), "{:?}", run.ending());
+}
+
 /// Plays events chosen by chance, half of them the right answers, and returns the commands with what came before.
 fn play(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> {
     let mut run = Run::new(plan(), |cycle| figures(30.0 / f64::from(cycle), 6.0 / f64::from(cycle)));
     run.start();
     let mut excused = std::collections::BTreeMap::<Device, u32>::new();
     let mut seen = 0;
-    let mut clear = [false; 2];
+    // What was seen of each machine, whether it said that it cannot tell, and what a person said of it since its last start.
+    let (mut clear, mut unknown, mut said) = ([false; 2], [false; 2], [false; 2]);
     let mut aborted = false;
     for (choice, good, wait) in choices {
         let before = run.cell.state();
@@ -673,8 +709,11 @@ fn play(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> {
         };
         let Some(event) = event else { continue };
         match &event {
-            Event::Cleared { device } => clear[*device as usize] = true,
+            Event::Cleared { device } => (clear[*device as usize], unknown[*device as usize]) = (true, false),
             Event::Obstructed { device, .. } | Event::LinkLost { device, .. } => clear[*device as usize] = false,
+            Event::ClearUnknown { device } => (clear[*device as usize], unknown[*device as usize]) = (false, true),
+            Event::ClearConfirmed { device, .. } => said[*device as usize] = true,
+            Event::LoadConfirmed { .. } if before == State::Execute(Phase::Load) => said = [true; 2],
             Event::Reconciled { device, outcome: Reconciliation::NotStarted, .. }
             | Event::Refused { device, what: Asked::Start, .. } => *excused.entry(*device).or_default() += 1,
             _ => {}
@@ -684,8 +723,9 @@ fn play(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> {
         prop_assert!(!before.is_end() || commands.is_empty());
         for command in &commands {
             if let Command::StartMachine { device, .. } = command {
-                prop_assert!(clear[device.other() as usize], "{device} started while the other is not clear");
-                clear[*device as usize] = false;
+                let other = device.other() as usize;
+                prop_assert!(clear[other] || unknown[other] && said[other], "{device} started, the other not clear");
+                (clear[*device as usize], said[*device as usize]) = (false, false);
             }
             let safe = !matches!(
                 command.name().split(' ').next(),
@@ -715,7 +755,11 @@ fn play(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> {
         }
     }
     let state = run.cell.state();
-    let at_rest = state.is_end() || matches!(state, State::Held(_) | State::Execute(Phase::Load));
+    let asks = matches!(
+        state,
+        State::Execute(Phase::Grind(JobStep::Clear) | Phase::Measure(JobStep::Clear) | Phase::Transfer)
+    );
+    let at_rest = asks || state.is_end() || matches!(state, State::Held(_) | State::Execute(Phase::Load));
     prop_assert!(at_rest && run.cell.next_deadline().is_none(), "hangs in {state}");
     Ok(())
 }

@@ -10,19 +10,15 @@ use std::time::Duration;
 
 use sha2::{Digest, Sha256};
 
+use super::measured::{Measured, Wanted, foreign, measurement};
 use super::outbox::{Lying, Outbox, Taken, Ticket, hand_over, hex, nanoseconds, told, unhex};
 use super::stations::{PlacedStation, place_station};
 use super::watch::{Found, Look as FileLook, Watch};
 use super::{ExchangeError, HandOver, Look, Mailbox, MailboxError, MeasureOrder, Pattern, Standing};
-use crate::device::{self, Job, MeasuredPoint, Measurement, Plan, PointStatus};
+use crate::device::{Job, MeasuredPoint, Measurement, Plan};
 use crate::formats::references::{References, parse_references, read_references};
-use crate::formats::result::{
-    Content, Coordinates, ResultFile, check_ended, parse_result, read_bytes, read_statements,
-};
+use crate::formats::result::{Content, Coordinates, ResultFile, parse_result, read_bytes, read_statements};
 use crate::formats::{FormatError, try_writing};
-
-/// What is taken for the part's temperature where no file tells it.
-const REFERENCE_TEMPERATURE_C: f64 = 20.0;
 
 /// How a measuring machine exchanges files.
 #[derive(Clone, Debug)]
@@ -209,24 +205,20 @@ impl CmmFolders {
     /// Returns why a file does not belong to a hand-over, or nothing if it does.
     fn belongs(&self, ticket: &Ticket, pattern: &Pattern, file: &Found) -> Result<Option<String>, ExchangeError> {
         let says = read_statements(&file.path, &read_bytes(&file.path)?)?;
-        let same_part = says.part.as_ref().map(|part| *part == ticket.part);
-        let same_cycle = says.cycle.map(|cycle| cycle == ticket.cycle);
-        let same_plan = says.plan.as_ref().map(|plan| *plan == ticket.identity);
-        Ok(match (same_part, same_cycle, same_plan) {
-            (Some(false), ..) => Some(format!("is of part {}, not {}", says.part.unwrap_or_default(), ticket.part)),
-            (_, Some(false), _) => {
-                Some(format!("is of cycle {}, not {}", says.cycle.unwrap_or_default(), ticket.cycle))
+        let says_so = says.part.is_some() && says.cycle.is_some() || says.plan.is_some();
+        Ok(foreign(&says, &ticket.part, ticket.cycle, &ticket.identity).or_else(|| {
+            match says_so || pattern.fits(&file.name) {
+                true => None,
+                false => {
+                    Some(format!("does not say that it belongs here and its name does not fit {}", pattern.as_str()))
+                }
             }
-            (.., Some(false)) => Some("was measured by another plan".to_owned()),
-            (Some(true), Some(true), _) | (.., Some(true)) => None,
-            _ if pattern.fits(&file.name) => None,
-            _ => Some(format!("does not say that it belongs here and its name does not fit {}", pattern.as_str())),
-        })
+        }))
     }
 
     fn accept_single(&self, expected: &Expected, file: &Found) -> Result<Accepted, ExchangeError> {
         let (result, sha) = self.read(expected, &file.path)?;
-        let points = self.matched(expected, file, &result)?;
+        let points = self.wanted(expected).matched(&file.path, &result)?;
         let mut said: Vec<String> = result.notes.iter().map(|note| format!("{}: {note}", file.name)).collect();
         said.extend(switched_off(&file.name, &result));
         let measurement = self.measurement(expected, points, &[result]);
@@ -236,20 +228,18 @@ impl CmmFolders {
     /// Reads a file of points and holds it against plan and cell.
     fn read(&self, expected: &Expected, path: &Path) -> Result<(ResultFile, String), ExchangeError> {
         let bytes = read_bytes(path)?;
-        check_ended(path, &bytes)?;
-        let sha = hex(&Sha256::digest(&bytes));
-        self.check_not_taken(expected, path, &sha)?;
-        let result = parse_result(path, &bytes, &self.settings.content)?;
-        if result.coordinates.is_none() {
-            return Err(ExchangeError::CoordinatesUnstated { path: path.to_owned() });
-        }
-        let expected_mm = expected.lying.ticket.tool_radius_mm;
-        let limit_mm = self.settings.probe_tolerance_mm;
-        match result.probe_radius_mm.filter(|found| (found - expected_mm).abs() > limit_mm) {
-            Some(found_mm) => {
-                Err(ExchangeError::ProbeRadius { path: path.to_owned(), found_mm, expected_mm, limit_mm })
-            }
-            None => Ok((result, sha)),
+        self.check_not_taken(expected, path, &hex(&Sha256::digest(&bytes)))?;
+        let Measured { file, sha256 } = self.wanted(expected).read(path, &bytes)?;
+        Ok((file, hex(&sha256)))
+    }
+
+    /// What a result of a hand-over must fit.
+    fn wanted<'a>(&'a self, expected: &'a Expected) -> Wanted<'a> {
+        Wanted {
+            targets: (!self.settings.free_count).then_some(&expected.targets),
+            content: &self.settings.content,
+            probe_radius_mm: expected.lying.ticket.tool_radius_mm,
+            probe_tolerance_mm: self.settings.probe_tolerance_mm,
         }
     }
 
@@ -267,55 +257,9 @@ impl CmmFolders {
         }
     }
 
-    /// Gives every point its target.
-    fn matched(
-        &self,
-        expected: &Expected,
-        file: &Found,
-        result: &ResultFile,
-    ) -> Result<Vec<MeasuredPoint>, ExchangeError> {
-        if self.settings.free_count {
-            return Ok(numbered(&result.points));
-        }
-        let (targets, path) = (&expected.targets, || file.path.clone());
-        let Some(indices) = &result.indices else {
-            if result.points.len() != targets.len() {
-                return Err(ExchangeError::Count { path: path(), found: result.points.len(), expected: targets.len() });
-            }
-            return Ok(targets.iter().zip(&result.points).map(|(&index, p)| touched(index, (*p).into())).collect());
-        };
-        // In the order of the plan; a target without a row was not found.
-        let mut all: Vec<MeasuredPoint> = targets.iter().map(|&index| not_found(index)).collect();
-        let place: std::collections::HashMap<u32, usize> = targets.iter().enumerate().map(|(k, &t)| (t, k)).collect();
-        for (row, (index, point)) in indices.iter().zip(&result.points).enumerate() {
-            let wrong = |why| FormatError::Index { path: path(), line: row as u64 + 1, found: index.to_string(), why };
-            let slot = *place.get(index).ok_or_else(|| wrong("is not a target of the plan"))?;
-            if all[slot].status == PointStatus::Touched {
-                return Err(wrong("came before").into());
-            }
-            all[slot] = touched(*index, (*point).into());
-        }
-        Ok(all)
-    }
-
     fn measurement(&self, expected: &Expected, points: Vec<MeasuredPoint>, results: &[ResultFile]) -> Measurement {
         let ticket = &expected.lying.ticket;
-        let coordinates = match results.iter().find_map(|r| r.coordinates) {
-            Some(Coordinates::Contacts) => device::Coordinates::Contacts,
-            _ => device::Coordinates::Centres,
-        };
-        let plan_identity = unhex(&ticket.identity);
-        Measurement {
-            points,
-            coordinates,
-            probe_radius_mm: results.iter().find_map(|r| r.probe_radius_mm).unwrap_or(ticket.tool_radius_mm),
-            temperature_c: results.iter().find_map(|r| r.statements.temperature_c).unwrap_or(REFERENCE_TEMPERATURE_C),
-            duration_s: 0.0,
-            plan_identity,
-            job: ticket.job,
-            cycle: ticket.cycle,
-            done: ticket.start_number,
-        }
+        measurement(points, results, ticket.job(), unhex(&ticket.identity), ticket.start_number)
     }
 
     // ---- several stations -----------------------------------------------------------------------------------------------------
@@ -439,16 +383,7 @@ impl CmmFolders {
             }
             results.push(result);
         }
-        let targets = expected.targets.len();
-        if !self.settings.free_count && points.len() != targets {
-            let path = self.settings.inbox.clone();
-            return Err(ExchangeError::Count { path, found: points.len(), expected: targets });
-        }
-        let points = if self.settings.free_count {
-            numbered(&points)
-        } else {
-            expected.targets.iter().zip(&points).map(|(&index, p)| touched(index, (*p).into())).collect()
-        };
+        let points = self.wanted(expected).in_order(&self.settings.inbox, &points)?;
         Ok(Accepted { measurement: self.measurement(expected, points, &results), files, said })
     }
 
@@ -505,7 +440,7 @@ impl Mailbox for CmmFolders {
         };
         let expects = self.settings.result.filled(&ticket.part, ticket.job, ticket.cycle);
         let files = [
-            ("plan.csv", plan_csv(&ticket, &order.plan).into_bytes()),
+            ("plan.csv", plan_csv(&ticket.part, job, &ticket.identity, &order.plan).into_bytes()),
             ("plan.json", plan_json(&ticket, order, &self.settings, expects.as_str())),
         ];
         self.outbox.publish(&ticket, &files).map_err(told)?;
@@ -538,7 +473,7 @@ impl Mailbox for CmmFolders {
                 self.outbox.note_taken(&expected.lying, &taken).map_err(told)?;
                 said.extend(accepted.said);
                 let duration_s = now.saturating_sub(since).as_secs_f64();
-                Some(Measurement { duration_s, ..accepted.measurement })
+                Some(Measurement { duration_s: Some(duration_s), ..accepted.measurement })
             }
         };
         let look = Look { begun: answer.is_some(), answer, said };
@@ -562,24 +497,13 @@ fn switched_off(name: &str, result: &ResultFile) -> Option<String> {
     (off > 0).then(|| format!("{name}: {off} rows are switched off and were left out"))
 }
 
-fn touched(index: u32, at_mm: [f64; 3]) -> MeasuredPoint {
-    MeasuredPoint { index, status: PointStatus::Touched, quality: 0, at_mm }
-}
-
-fn not_found(index: u32) -> MeasuredPoint {
-    MeasuredPoint { index, status: PointStatus::NotFound, quality: 100, at_mm: [0.0; 3] }
-}
-
-fn numbered(points: &[crate::geometry::Point]) -> Vec<MeasuredPoint> {
-    points.iter().zip(0..).map(|(p, index)| touched(index, (*p).into())).collect()
-}
-
-fn plan_csv(ticket: &Ticket, plan: &Plan) -> String {
+/// The plan as a table, with what it is about above it.
+pub(in crate::device) fn plan_csv(part: &str, job: Job, identity: &str, plan: &Plan) -> String {
     let mut text = format!(
         "# Regrind measuring plan\n# part: {}\n# job: {}\n# cycle: {}\n# plan: {}\n# units: mm\n# probe_radius_mm: {}\n\
          # frame: that of the measuring machine; x y z nominal contact point, nx ny nz outward unit normal\n\
          # what: 1 the part, 2 the reference sphere\nindex,x,y,z,nx,ny,nz,what\n",
-        ticket.part, ticket.job, ticket.cycle, ticket.identity, plan.probe_radius_mm
+        part, job.job, job.cycle, identity, plan.probe_radius_mm
     );
     for target in &plan.targets {
         let ([x, y, z], [nx, ny, nz]) = (target.point_mm, target.normal);

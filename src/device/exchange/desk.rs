@@ -5,19 +5,11 @@ use std::time::Duration;
 
 use tokio::time::{Instant, timeout};
 
-use super::{
-    CmmMailbox, Confirmable, GrindOrder, GrinderMailbox, HandOver, Mailbox, MailboxError, MeasureOrder, Standing, Step,
-};
+use super::{CmmMailbox, GrindOrder, GrinderMailbox, HandOver, Mailbox, MailboxError, MeasureOrder, Standing, Step};
 use crate::device::{
-    Answer, Armed, Beats, Cmm, Command, CorrectionMap, DeviceError, Fault, Grinder, Identified, Identity, Interlocks,
-    Interrupt, Job, Machine, MachineKind, Measurement, Mode, Outcome, Pass, PassRecord, Plan, Reconciled, Started,
-    State, Status, digest,
+    Answer, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Identity, Interrupt, Job, Machine,
+    MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, Reconciled, Started, State, Status, Word, digest,
 };
-
-/// A person is never lost by silence.
-const SILENCE_LIMIT_S: f64 = 1e9;
-/// What is said of the temperature where nothing tells it.
-const REFERENCE_TEMPERATURE_C: f64 = 20.0;
 
 /// How long to wait for what.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -63,9 +55,10 @@ struct Desk<M: Mailbox> {
     begun: bool,
     said: Vec<String>,
     owned: bool,
-    /// Commands acted upon.
-    acknowledged: u32,
-    answered: Answer,
+    /// Whether the machine cannot reach the part where the other one works.
+    apart: bool,
+    /// Whether it is clear of the part: a person who confirms the end of a pass says so, a file that arrives does not.
+    clear: Option<bool>,
 }
 
 type Told<T> = Result<T, DeviceError>;
@@ -89,10 +82,17 @@ impl<M: Mailbox> ExchangeMachine<M> {
             begun: false,
             said: Vec::new(),
             owned: false,
-            acknowledged: 0,
-            answered: Answer::None,
+            apart: false,
+            clear: None,
         };
         Self { name, timing, made: Instant::now(), desk: Arc::new(Mutex::new(desk)) }
+    }
+
+    /// Says whether the machine stands apart, so that it is always clear of the part.
+    #[must_use]
+    pub fn apart(self, apart: bool) -> Self {
+        self.desk.lock().unwrap_or_else(PoisonError::into_inner).apart = apart;
+        self
     }
 
     /// What a person should know now: what is waited for, which files were left alone and why. Nothing while the folders are being
@@ -136,7 +136,6 @@ impl<M: Mailbox> ExchangeMachine<M> {
                 return Err(desk.refused(command, Answer::NotOwner));
             }
             work(desk)?;
-            desk.accepted();
             Ok(desk.status())
         })
         .await
@@ -169,7 +168,7 @@ impl<M: Mailbox> ExchangeMachine<M> {
     }
 }
 
-impl<M: Confirmable> ExchangeMachine<M> {
+impl<M: Mailbox> ExchangeMachine<M> {
     /// Takes a person's word that the job whose map has this identity has begun.
     ///
     /// # Errors
@@ -189,6 +188,9 @@ impl<M: Confirmable> ExchangeMachine<M> {
     async fn confirmed(&self, step: Step, map_identity: [u8; 32]) -> Told<()> {
         self.at_desk("a confirmation", move |desk, _| {
             desk.check_connected("a confirmation")?;
+            if desk.kind == MachineKind::Cmm {
+                return Err(DeviceError::TellsItself { machine: Arc::clone(&desk.name) });
+            }
             let Some((job, _)) = desk.job.filter(|_| desk.state == State::Execute) else {
                 return Err(desk.refused(Command::Start, Answer::WrongState));
             };
@@ -223,38 +225,18 @@ impl<M: Mailbox> Desk<M> {
         }
     }
 
-    fn accepted(&mut self) {
-        self.acknowledged += 1;
-        self.answered = Answer::Accepted;
-    }
-
     fn status(&self) -> Status {
-        let last = self.handed.last();
-        let (progress, total) = match self.state {
-            State::Complete => (1, 1),
-            _ => (0, 1),
-        };
         Status {
             state: self.state,
-            mode: Mode::Automatic,
-            // Nobody tells; the person who confirms a start answers for them.
-            interlocks: Interlocks { guards_closed: true, clear_of_part: true, part_clamped: true, supplies: true },
-            acknowledged: self.acknowledged,
-            answer: self.answered,
-            fault: Fault::None,
             job: self.job.map(|(job, _)| job),
-            token: 0,
             done: self.done,
             outcome: self.outcome,
-            progress,
-            total,
-            owner: u32::from(self.owned),
-            epoch: u32::from(self.owned),
-            beats: Beats { machine: 0, echo: 0 },
-            last_begun: last.map_or((0, 0), |h| (h.job.job, h.job.cycle)),
-            begun_by: last.map_or(0, |h| h.sequence),
-            temperature_c: REFERENCE_TEMPERATURE_C,
-            boot_id: 0,
+            clear_of_part: if self.apart { Some(true) } else { self.clear },
+            supplies: None,
+            fault: None,
+            progress: None,
+            temperature_c: None,
+            boot_id: None,
             signals: Vec::new(),
         }
     }
@@ -280,6 +262,7 @@ impl<M: Mailbox> Desk<M> {
         self.begun = look.begun;
         if look.answer.is_some() {
             self.answer = look.answer;
+            self.clear = (self.kind == MachineKind::Grinder).then_some(true);
             self.finish(Outcome::Complete, sequence);
         }
         Ok(())
@@ -307,7 +290,6 @@ impl<M: Mailbox> Desk<M> {
         let start_sequence = self.handed.last().map_or(0, |h| h.sequence) + 1;
         (self.job, self.state) = (Some((job, start_sequence)), State::Prepared);
         (self.outcome, self.answer, self.begun) = (Outcome::None, None, false);
-        self.accepted();
         Ok(Armed { job, start_sequence, token: 0, boot_id: 0 })
     }
 
@@ -327,9 +309,8 @@ impl<M: Mailbox> Desk<M> {
     }
 
     fn started(&mut self, armed: &Armed) -> Told<Started> {
-        self.state = State::Execute;
+        (self.state, self.clear) = (State::Execute, None);
         self.said = vec!["handed over; waiting for the answer".to_owned()];
-        self.accepted();
         Ok(Started { job: armed.job, start_sequence: armed.start_sequence, status: self.status() })
     }
 
@@ -498,7 +479,8 @@ impl<M: Mailbox> Machine for ExchangeMachine<M> {
                 name: desk.name.to_string(),
                 boot_id: 0,
                 simulation: false,
-                silence_limit_s: SILENCE_LIMIT_S,
+                // A person is never lost by silence.
+                silence_limit_s: None,
             })
         })
         .await
@@ -597,6 +579,16 @@ impl<M: Mailbox> Machine for ExchangeMachine<M> {
         let intended = intended.clone();
         self.at_desk("what became of a start", move |desk, _| desk.reconcile(&intended)).await
     }
+
+    async fn confirm(&mut self, word: Word) -> Told<Vec<String>> {
+        let (step, map_identity) = match word {
+            Word::Started { map_identity } => (Step::Started, map_identity),
+            Word::Done { map_identity, .. } => (Step::Done, map_identity),
+            Word::Still => return Err(DeviceError::TellsItself { machine: Arc::clone(&self.name) }),
+        };
+        let map_identity = map_identity.ok_or_else(|| DeviceError::MapUnnamed { machine: Arc::clone(&self.name) })?;
+        self.confirmed(step, map_identity).await.map(|()| Vec::new())
+    }
 }
 
 impl<M: CmmMailbox> Cmm for ExchangeMachine<M> {
@@ -621,9 +613,5 @@ impl<M: GrinderMailbox> Grinder for ExchangeMachine<M> {
     async fn collect(&mut self, job: Job, _: &Interrupt) -> Told<PassRecord> {
         let (record, done) = self.answer(job).await?;
         Ok(PassRecord { done, ..record })
-    }
-
-    async fn confirm(&mut self, step: Step, map_identity: [u8; 32]) -> Told<()> {
-        self.confirmed(step, map_identity).await
     }
 }

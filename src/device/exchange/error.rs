@@ -150,4 +150,18 @@ pub enum ExchangeError {
         /// Where it should be.
         folder: PathBuf,
     },
+    /// A file that says it is of something else.
+    #[error("{path}: {why}; export the measurement that was asked for")]
+    Foreign {
+        /// The file.
+        path: PathBuf,
+        /// What it says.
+        why: String,
+    },
+    /// A file that was a measurement of this run already.
+    #[error("{path}: the same bytes were a measurement of this run before; export the new one")]
+    Offered {
+        /// The file.
+        path: PathBuf,
+    },
 }

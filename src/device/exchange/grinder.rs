@@ -14,13 +14,11 @@ use sha2::{Digest, Sha256};
 use super::cmm::earlier_files;
 use super::outbox::{Lying, Outbox, Taken, Ticket, hand_over, hex, told, unhex};
 use super::watch::{Found, Watch};
-use super::{Confirmable, ExchangeError, GrindOrder, HandOver, Look, Mailbox, MailboxError, Standing, Step};
+use super::{ExchangeError, GrindOrder, HandOver, Look, Mailbox, MailboxError, Standing, Step};
 use crate::device::{CorrectionMap, Job, Outcome, PassRecord};
 use crate::formats::result::read_bytes;
 use crate::formats::{try_writing, write_atomic};
 
-/// What is taken for the part's temperature where no file tells it.
-const REFERENCE_TEMPERATURE_C: f64 = 20.0;
 /// The two files of a person's word, in the inbox.
 const STARTED: &str = "started.json";
 const DONE: &str = "done.json";
@@ -47,8 +45,6 @@ pub struct GrinderFolders {
     expected: Option<Lying>,
     /// When the start was seen, by the driver's clock.
     started: Option<Duration>,
-    /// When a confirmation was looked for first.
-    since: Option<Duration>,
 }
 
 /// A person's word that a job has begun or ended.
@@ -104,7 +100,7 @@ impl GrinderFolders {
     pub fn new(settings: GrinderExchange) -> Self {
         let outbox = Outbox { folder: settings.outbox.clone() };
         let watch = Watch::new(&settings.inbox, settings.stable_for);
-        Self { settings, outbox, watch, expected: None, started: None, since: None }
+        Self { settings, outbox, watch, expected: None, started: None }
     }
 
     fn expect(&mut self, job: Job) -> Result<Lying, ExchangeError> {
@@ -145,19 +141,19 @@ impl GrinderFolders {
 
     fn record(&self, lying: &Lying, done: &Confirmation, now: Duration) -> PassRecord {
         let ticket = &lying.ticket;
-        let begun = self.started.or(self.since).unwrap_or(now);
+        let begun = self.started;
         let map_identity = unhex(&ticket.identity);
         PassRecord {
             outcome: Outcome::Complete,
-            // Nobody measures these; 0 where they are not told.
-            path_mm: 0.0,
-            removed_mm3: done.removed_mm3.unwrap_or(0.0),
-            deepest_mm: 0.0,
-            idle_share: 0.0,
-            spindle_load: 0.0,
-            wheel_radius_mm: done.wheel_radius_mm.unwrap_or(ticket.tool_radius_mm),
-            temperature_c: done.temperature_c.unwrap_or(REFERENCE_TEMPERATURE_C),
-            duration_s: now.saturating_sub(begun).as_secs_f64(),
+            removed_mm3: done.removed_mm3,
+            wheel_radius_mm: done.wheel_radius_mm,
+            temperature_c: done.temperature_c,
+            duration_s: begun.map(|begun| now.saturating_sub(begun).as_secs_f64()),
+            // Nobody measures these.
+            path_mm: None,
+            deepest_mm: None,
+            idle_share: None,
+            spindle_load: None,
             map_identity,
             job: ticket.job,
             cycle: ticket.cycle,
@@ -196,7 +192,7 @@ impl Mailbox for GrinderFolders {
             (DONE, word),
         ];
         self.outbox.publish(&ticket, &files).map_err(told)?;
-        (self.expected, self.started, self.since) = (None, None, None);
+        (self.expected, self.started) = (None, None);
         Ok(())
     }
 
@@ -207,7 +203,6 @@ impl Mailbox for GrinderFolders {
 
     fn look(&mut self, now: Duration, job: Job) -> Result<Look<PassRecord>, MailboxError> {
         let lying = self.expect(job).map_err(told)?;
-        self.since.get_or_insert(now);
         let found = self.watch.look(now).map_err(told)?;
         let mut said = Vec::new();
         if self.confirmation(STARTED, &lying, &found, &mut said).is_some() {
@@ -232,9 +227,7 @@ impl Mailbox for GrinderFolders {
         self.outbox.note_taken(&lying, &taken).map_err(told)?;
         Ok(Look { answer: Some(self.record(&lying, &done, now)), begun, said })
     }
-}
 
-impl Confirmable for GrinderFolders {
     fn confirm(&mut self, job: Job, step: Step, map_identity: [u8; 32]) -> Result<(), MailboxError> {
         let lying = self.expect(job).map_err(told)?;
         if hex(&map_identity) != lying.ticket.identity {

@@ -24,12 +24,12 @@ pub trait Mailbox: std::fmt::Debug + Send + 'static {
 
     /// Looks for what has come back for a hand-over that is open. `now` is the time since the driver was made.
     fn look(&mut self, now: Duration, job: Job) -> Result<Look<Self::Answer>, MailboxError>;
-}
 
-/// Folders whose jobs a person begins and ends.
-pub trait Confirmable: Mailbox {
-    /// Writes down that a person has begun or ended the job whose map has this identity.
-    fn confirm(&mut self, job: Job, step: Step, map_identity: [u8; 32]) -> Result<(), MailboxError>;
+    /// Writes down that a person has begun or ended the job whose map has this identity; where jobs are told by files alone, no job
+    /// is open for it.
+    fn confirm(&mut self, job: Job, _step: Step, _map_identity: [u8; 32]) -> Result<(), MailboxError> {
+        Err(MailboxError::NotOpen { job: job.job, cycle: job.cycle })
+    }
 }
 
 /// What a person confirms.

@@ -24,17 +24,22 @@ mod desk;
 mod error;
 mod grinder;
 mod mailbox;
+mod measured;
 mod outbox;
 mod pattern;
+mod settings;
 mod stations;
 mod watch;
 
+pub(super) use cmm::plan_csv;
 pub use cmm::{CmmExchange, CmmFolders, StationFiles, Stations};
 pub use desk::{ExchangeMachine, ExchangeTiming};
 pub use error::ExchangeError;
 pub use grinder::{GrinderExchange, GrinderFolders};
-pub use mailbox::{Confirmable, HandOver, Look, Mailbox, MailboxError, Standing, Step};
+pub use mailbox::{HandOver, Look, Mailbox, MailboxError, Standing, Step};
+pub use measured::{Measured, Wanted, foreign, measurement};
 pub use pattern::{Pattern, file_word};
+pub use settings::{ExchangeWire, StationTable};
 pub use stations::{PlacedStation, place_station};
 pub use watch::Watch;
 
@@ -65,10 +70,5 @@ pub trait CmmMailbox: Mailbox<Request = MeasureOrder, Answer = Measurement> {}
 impl<M: Mailbox<Request = MeasureOrder, Answer = Measurement>> CmmMailbox for M {}
 
 /// Folders of a grinder.
-pub trait GrinderMailbox: Confirmable + Mailbox<Request = GrindOrder, Answer = PassRecord> {}
-impl<M: Confirmable + Mailbox<Request = GrindOrder, Answer = PassRecord>> GrinderMailbox for M {}
-
-/// A measuring machine behind two folders.
-pub type ExchangeCmm<M> = ExchangeMachine<M>;
-/// A grinder behind two folders.
-pub type ExchangeGrinder<M> = ExchangeMachine<M>;
+pub trait GrinderMailbox: Mailbox<Request = GrindOrder, Answer = PassRecord> {}
+impl<M: Mailbox<Request = GrindOrder, Answer = PassRecord>> GrinderMailbox for M {}

@@ -5,36 +5,11 @@
 
 use sha2::{Digest, Sha256};
 
-use super::{Command, CorrectionMap, Identified, Job, MeasuredPoint, Outcome, Pass, Plan, PointStatus};
+use super::settings::WordOrder;
+use crate::device::{Command, CorrectionMap, Identified, Job, MeasuredPoint, Outcome, Pass, Plan, PointStatus};
 use crate::geometry::Grid;
 
-/// In which order the registers of a longer value are sent. The bytes within a register are high byte first always.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub enum WordOrder {
-    /// High word first.
-    #[default]
-    Big,
-    /// Low word first.
-    Little,
-}
-
 impl WordOrder {
-    /// As it is written in a cell file.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Big => "big",
-            Self::Little => "little",
-        }
-    }
-
-    /// The other order.
-    pub fn other(self) -> Self {
-        match self {
-            Self::Big => Self::Little,
-            Self::Little => Self::Big,
-        }
-    }
-
     fn bits(self, words: &[u16]) -> u64 {
         let shift_in = |bits: u64, word: &u16| (bits << 16) | u64::from(*word);
         match self {

@@ -5,20 +5,29 @@
 //! results come down in pages between two readings of their header. The one thing that is never repeated is START: its frame may be written
 //! again, with its number, and if that too does not tell, the outcome is unknown and stays so until the machine is asked.
 
+mod codec;
+mod link;
+mod settings;
+mod unit;
+mod wire;
+
 use std::collections::BTreeMap;
 use std::io;
 use std::time::Duration;
 
 use tokio::time::{Instant, sleep};
 
-use super::codec::{self, CommandFrame, Payload, RecordFlaw, WordOrder, crc32};
-use super::link::{Link, Wire};
-use super::station::{Station, StationSettings};
 use super::{
-    Answer, Armed, Beats, Cmm, Command, Coordinates, CorrectionMap, DeviceError, Fault, Grinder, Identity, Interlocks,
-    Interrupt, Job, Machine, MachineKind, Measurement, Mode, Outcome, Pass, PassRecord, Plan, Reading, Reconciled,
-    Started, State, Status, digest,
+    Answer, Armed, Cmm, Command, Coordinates, CorrectionMap, DeviceError, Fault, Grinder, Identity, Interrupt, Job,
+    Machine, MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, Reconciled, SignalValue, Started, State,
+    Status, digest,
 };
+use codec::{CommandFrame, Payload, RecordFlaw, Registers, crc32};
+pub use link::{Link, LinkFigures};
+pub use settings::{
+    Line, ModbusSettings, Parity, RegisterMap, RtuWire, Signal, SignalTable, SignalType, TcpWire, WordOrder,
+};
+use unit::{Unit, UnitSettings};
 
 /// Registers of data in a full page.
 const PAGE: usize = 112;
@@ -33,139 +42,6 @@ const SEEN_TWICE_OVER: Duration = Duration::from_millis(1050);
 /// More than this is no result of a measuring machine.
 const RESULT_BYTES: u32 = 64 << 20;
 
-/// Base addresses of the blocks, 0-based. The default is that of docs/modbus.md.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[expect(missing_docs, reason = "the names of the blocks in docs/modbus.md")]
-pub struct RegisterMap {
-    pub identity: u16,
-    pub sync: u16,
-    pub beat: u16,
-    pub command: u16,
-    pub status: u16,
-    pub in_force: u16,
-    pub inbox_header: u16,
-    pub inbox_page: u16,
-    pub inbox_state: u16,
-    pub outbox_header: u16,
-    pub outbox_select: u16,
-    pub outbox_page: u16,
-}
-
-impl Default for RegisterMap {
-    fn default() -> Self {
-        Self {
-            identity: 0,
-            sync: 32,
-            beat: 36,
-            command: 40,
-            status: 64,
-            in_force: 120,
-            inbox_header: 200,
-            inbox_page: 224,
-            inbox_state: 350,
-            outbox_header: 400,
-            outbox_select: 460,
-            outbox_page: 462,
-        }
-    }
-}
-
-/// How the value of a signal is kept in its registers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-#[expect(missing_docs, reason = "they say it")]
-pub enum SignalType {
-    U16,
-    I16,
-    U32,
-    I32,
-    F32,
-    F64,
-}
-
-impl SignalType {
-    fn registers(self) -> u16 {
-        match self {
-            Self::U16 | Self::I16 => 1,
-            Self::U32 | Self::I32 | Self::F32 => 2,
-            Self::F64 => 4,
-        }
-    }
-}
-
-/// A register of the machine that the cell file asks for besides the contract's own: read with every status, checked against its range.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Signal {
-    /// Its name.
-    pub name: String,
-    /// The 0-based address of its first register.
-    pub address: u16,
-    /// How the value is kept.
-    pub kind: SignalType,
-    /// What the kept value is multiplied with.
-    pub scale: f64,
-    /// The unit of the product.
-    pub unit: String,
-    /// The least that can be.
-    pub least: f64,
-    /// The most that can be.
-    pub most: f64,
-}
-
-/// Everything that has to be known to drive a machine over Modbus.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ModbusSettings {
-    /// Where it is.
-    pub wire: Wire,
-    /// Its unit number.
-    pub unit: u8,
-    /// The order of its words.
-    pub word_order: WordOrder,
-    /// Where its blocks begin.
-    pub registers: RegisterMap,
-    /// How long an answer may take.
-    pub request_timeout: Duration,
-    /// How often a request is asked again.
-    pub retries: u32,
-    /// After how long without an answer a request is given up, however often it was asked.
-    pub lost_after: Duration,
-    /// How long the machine may need for an answer at worst: after an error the line is left alone for so long.
-    pub quarantine: Duration,
-    /// The number of this client; not 0.
-    pub owner: u32,
-    /// Rises with each start of this client.
-    pub epoch: u32,
-    /// What to read besides.
-    pub signals: Vec<Signal>,
-    /// A beat is written when the last one is so old; a machine takes its client for lost after a second and a half without one.
-    pub beat_every: Duration,
-    /// The name that the machine must give of itself; `None` takes any.
-    pub expected_name: Option<String>,
-    /// Whether the machine must be a simulation or must not be one; `None` takes either.
-    pub simulation: Option<bool>,
-}
-
-impl ModbusSettings {
-    /// Settings that suit a machine on a quiet network, to be changed field by field.
-    pub fn new(wire: Wire) -> Self {
-        Self {
-            wire,
-            unit: 1,
-            word_order: WordOrder::Big,
-            registers: RegisterMap::default(),
-            request_timeout: Duration::from_millis(500),
-            retries: 3,
-            lost_after: Duration::from_secs(5),
-            quarantine: Duration::from_millis(100),
-            owner: 1,
-            epoch: 1,
-            signals: Vec::new(),
-            beat_every: Duration::from_millis(250),
-            expected_name: None,
-            simulation: None,
-        }
-    }
-}
-
 /// A payload that is in force at the machine, as far as this driver has brought it there.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Slot {
@@ -177,7 +53,7 @@ struct Slot {
 /// What the drivers of both machines have in common.
 #[derive(Debug)]
 pub struct ModbusMachine {
-    station: Station,
+    unit: Unit,
     owner: u32,
     epoch: u32,
     retries: u32,
@@ -194,15 +70,14 @@ pub struct ModbusMachine {
 
 impl ModbusMachine {
     fn new(kind: MachineKind, link: Link, settings: ModbusSettings) -> Self {
-        let station = StationSettings {
+        let unit = UnitSettings {
             unit: settings.unit,
-            order: settings.word_order,
             map: settings.registers,
             retries: settings.retries,
             lost_after: settings.lost_after,
         };
         Self {
-            station: Station::new(kind, link, station),
+            unit: Unit::new(kind, link, unit),
             owner: settings.owner,
             epoch: settings.epoch,
             retries: settings.retries,
@@ -219,12 +94,12 @@ impl ModbusMachine {
     }
 
     fn machine(&self) -> std::sync::Arc<str> {
-        self.station.name.clone()
+        self.unit.name.clone()
     }
 
     /// The line of this machine.
     pub fn link(&self) -> &Link {
-        &self.station.link
+        &self.unit.link
     }
 
     // ---- status and beats --------------------------------------------------------------------------------------------------------
@@ -232,7 +107,7 @@ impl ModbusMachine {
     async fn connect(&mut self) -> Result<Identity, DeviceError> {
         self.seen_beat = None;
         self.loaded.clear();
-        let identity = self.station.meet().await?;
+        let identity = self.unit.meet().await?;
         // Before the first write that means anything to a machine that may be another one.
         self.check_identity(&identity)?;
         let status = self.look().await?;
@@ -261,41 +136,38 @@ impl ModbusMachine {
         }
         self.beat = self.beat.wrapping_add(1);
         self.beaten = Some(Instant::now());
-        let address = self.station.map.beat;
-        self.station.write("beat", address, &[self.beat]).await
+        let address = self.unit.map.beat;
+        self.unit.write("beat", address, &[self.beat]).await
     }
 
     /// Reads the status block, of one moment, without the further signals.
-    async fn look(&mut self) -> Result<Status, DeviceError> {
+    async fn look(&mut self) -> Result<Block, DeviceError> {
         self.beat().await?;
-        let address = self.station.map.status;
-        let mut words = self.station.read("status", address, 48).await?;
+        let address = self.unit.map.status;
+        let mut words = self.unit.read("status", address, 48).await?;
         for _ in 0..5 {
             if words[0] == words[47] {
                 return self.understand(&words);
             }
-            words = self.station.read("status", address, 48).await?;
+            words = self.unit.read("status", address, 48).await?;
         }
-        Err(self.station.distrust("status block (its two snapshot numbers)", words[0].into(), words[47].into()).await)
+        Err(self.unit.distrust("status block (its two snapshot numbers)", words[0].into(), words[47].into()).await)
     }
 
-    fn understand(&mut self, words: &[u16]) -> Result<Status, DeviceError> {
+    fn understand(&mut self, words: &[u16]) -> Result<Block, DeviceError> {
         let machine = self.machine();
         let unlisted =
             |field, found: u16| DeviceError::Unlisted { machine: machine.clone(), field, found: found.into() };
-        let block = self.station.registers(words);
+        let block = self.unit.registers(words);
         let state = state_of(words[1]).ok_or_else(|| unlisted("its state", words[1]))?;
-        let mode = match words[2] {
-            1 => Mode::Automatic,
-            2 => Mode::Manual,
-            other => return Err(unlisted("its mode", other)),
-        };
+        if !matches!(words[2], 1 | 2) {
+            return Err(unlisted("its mode", words[2]));
+        }
         let outcome = codec::outcome(words[18]).map_err(|_| unlisted("the result of its job", words[18]))?;
         let job = Job { job: block.u32(8), cycle: words[10], digest: block.u32(12) };
-        let status = Status {
+        let block = Block {
             state,
-            mode,
-            interlocks: interlocks_of(words[3]),
+            interlocks: words[3],
             acknowledged: block.u32(4),
             answer: answer_of(words[6]),
             fault: fault_of(words[7]),
@@ -303,28 +175,24 @@ impl ModbusMachine {
             token: block.u32(14),
             done: block.u32(16),
             outcome,
-            progress: block.u32(20),
-            total: block.u32(22),
-            owner: block.u32(24),
-            epoch: block.u32(26),
-            beats: Beats { machine: words[28], echo: words[29] },
+            progress: (block.u32(20), block.u32(22)),
+            beat: words[28],
             last_begun: (block.u32(30), words[32]),
             begun_by: block.u32(36),
             temperature_c: f64::from(block.i16(33)) / 100.0,
             boot_id: block.u32(34),
-            signals: Vec::new(),
         };
-        self.check_alive(&status)?;
-        Ok(status)
+        self.check_alive(&block)?;
+        Ok(block)
     }
 
-    fn check_alive(&mut self, status: &Status) -> Result<(), DeviceError> {
+    fn check_alive(&mut self, status: &Block) -> Result<(), DeviceError> {
         let machine = self.machine();
-        let known = self.station.identity().map_or(0, |identity| identity.boot_id);
+        let known = self.unit.identity().map_or(0, |identity| identity.boot_id);
         if status.boot_id != known {
             return Err(DeviceError::Restarted { machine, was: known, is: status.boot_id });
         }
-        let beat = status.beats.machine;
+        let beat = status.beat;
         match self.seen_beat {
             Some((seen, since)) if seen == beat => {
                 let still = since.elapsed();
@@ -338,7 +206,7 @@ impl ModbusMachine {
     }
 
     async fn status(&mut self) -> Result<Status, DeviceError> {
-        let mut status = self.look().await?;
+        let mut status = Status::from(self.look().await?);
         for k in 0..self.signals.len() {
             let reading = self.signal(k).await?;
             status.signals.push(reading);
@@ -346,10 +214,10 @@ impl ModbusMachine {
         Ok(status)
     }
 
-    async fn signal(&mut self, k: usize) -> Result<Reading, DeviceError> {
+    async fn signal(&mut self, k: usize) -> Result<SignalValue, DeviceError> {
         let signal = self.signals[k].clone();
-        let words = self.station.read("signal", signal.address, signal.kind.registers()).await?;
-        let block = self.station.registers(&words);
+        let words = self.unit.read("signal", signal.address, signal.kind.registers()).await?;
+        let block = Registers::new(&words, signal.word_order);
         let kept = match signal.kind {
             SignalType::U16 => f64::from(words[0]),
             SignalType::I16 => f64::from(block.i16(0)),
@@ -359,14 +227,14 @@ impl ModbusMachine {
             SignalType::F64 => block.f64(0),
         };
         let value = kept * signal.scale;
-        let (machine, Signal { name, unit, least, most, .. }) = (self.machine(), signal);
+        let (machine, Signal { name, unit, range: [least, most], .. }) = (self.machine(), signal);
         if !value.is_finite() {
             return Err(DeviceError::NotFinite { machine, field: name, value });
         }
         if value < least || value > most {
             return Err(DeviceError::OutOfRange { machine, field: name, value, least, most, unit });
         }
-        Ok(Reading { name, value, unit })
+        Ok(SignalValue { name, value, unit })
     }
 
     // ---- commands ----------------------------------------------------------------------------------------------------------------
@@ -381,13 +249,13 @@ impl ModbusMachine {
         CommandFrame { sequence, command, job: None, owner: self.owner, epoch: self.epoch, token: 0, argument: 0 }
     }
 
-    async fn simply(&mut self, command: Command) -> Result<Status, DeviceError> {
+    async fn simply(&mut self, command: Command) -> Result<Block, DeviceError> {
         let frame = self.frame(command);
         self.order(frame).await
     }
 
     /// Writes a command until it is acknowledged, and tells a no from a yes. The same frame every time.
-    async fn order(&mut self, frame: CommandFrame) -> Result<Status, DeviceError> {
+    async fn order(&mut self, frame: CommandFrame) -> Result<Block, DeviceError> {
         let CommandFrame { command, sequence, .. } = frame;
         let status = self.acknowledged(frame).await?;
         self.sequence = self.sequence.max(sequence);
@@ -397,13 +265,13 @@ impl ModbusMachine {
         }
     }
 
-    async fn acknowledged(&mut self, frame: CommandFrame) -> Result<Status, DeviceError> {
+    async fn acknowledged(&mut self, frame: CommandFrame) -> Result<Block, DeviceError> {
         let CommandFrame { command, sequence, .. } = frame;
-        let words = frame.words(self.station.order);
-        let address = self.station.map.command;
+        let words = frame.words(self.unit.map.word_order);
+        let address = self.unit.map.command;
         let mut tries = 0;
         loop {
-            self.station.write("command", address, &words).await?;
+            self.unit.write("command", address, &words).await?;
             tries += 1;
             let written = Instant::now();
             let mut pause = Duration::from_millis(1);
@@ -448,7 +316,7 @@ impl ModbusMachine {
     }
 
     /// The first status of which something holds; a fault, or another state than the way there, ends the wait.
-    async fn reaches(&mut self, holds: impl Fn(&Status) -> bool) -> Result<Status, DeviceError> {
+    async fn reaches(&mut self, holds: impl Fn(&Block) -> bool) -> Result<Block, DeviceError> {
         let began = Instant::now();
         loop {
             let status = self.look().await?;
@@ -467,7 +335,7 @@ impl ModbusMachine {
     }
 
     /// Whether the machine is at the job that is meant.
-    fn agree(&self, job: Job, status: &Status) -> Result<(), DeviceError> {
+    fn agree(&self, job: Job, status: &Block) -> Result<(), DeviceError> {
         let held = status.job.unwrap_or(Job { job: 0, cycle: 0, digest: 0 });
         let fields = [
             ("the job", u64::from(job.job), u64::from(held.job)),
@@ -482,7 +350,7 @@ impl ModbusMachine {
 
     async fn start(&mut self, armed: Armed) -> Result<Started, DeviceError> {
         let Armed { job, start_sequence, token, boot_id } = armed;
-        let known = self.station.identity().map_or(0, |identity| identity.boot_id);
+        let known = self.unit.identity().map_or(0, |identity| identity.boot_id);
         if boot_id != known {
             // Nothing has been sent: whatever was prepared died with the machine's restart.
             return Err(DeviceError::Restarted { machine: self.machine(), was: boot_id, is: known });
@@ -508,7 +376,7 @@ impl ModbusMachine {
             |machine, why| DeviceError::StartUnknown { machine, job, sequence: start_sequence, why: Box::new(why) };
         match self.order(frame).await {
             Ok(status) if status.begun_by == start_sequence && status.job == Some(job) => {
-                Ok(Started { job, start_sequence, status })
+                Ok(Started { job, start_sequence, status: status.into() })
             }
             Ok(status) => {
                 let (sent, held) = (u64::from(start_sequence), u64::from(status.begun_by));
@@ -527,7 +395,7 @@ impl ModbusMachine {
         }
     }
 
-    async fn abort(&mut self) -> Result<Status, DeviceError> {
+    async fn abort(&mut self) -> Result<Block, DeviceError> {
         match self.simply(Command::Abort).await {
             // Somebody else has counted further; an abort is worth going past them.
             Err(DeviceError::NotAcknowledged { acknowledged, .. }) if acknowledged > self.sequence => {
@@ -538,7 +406,7 @@ impl ModbusMachine {
         }
     }
 
-    async fn acknowledge(&mut self, done: u32) -> Result<Status, DeviceError> {
+    async fn acknowledge(&mut self, done: u32) -> Result<Block, DeviceError> {
         let frame = CommandFrame { argument: done, ..self.frame(Command::Acknowledge) };
         self.order(frame).await
     }
@@ -556,7 +424,7 @@ impl ModbusMachine {
             }
         }
         let second = self.look().await?;
-        Ok(what_became(intended, &second).unwrap_or(Reconciled::NotStarted(second)))
+        Ok(what_became(intended, &second).unwrap_or(Reconciled::NotStarted(second.into())))
     }
 
     // ---- payloads ----------------------------------------------------------------------------------------------------------------
@@ -566,7 +434,7 @@ impl ModbusMachine {
             return Err(DeviceError::BadPayload { machine: self.machine(), what: P::WHAT, field, value, limit });
         }
         self.loaded.remove(&P::KIND);
-        let words = payload.words(self.station.order);
+        let words = payload.words(self.unit.map.word_order);
         let bytes = 2 * words.len() as u64;
         let Ok(bytes) = u32::try_from(bytes) else {
             let (field, limit) = ("its size in bytes".to_owned(), "less than 4 GiB");
@@ -603,10 +471,10 @@ impl ModbusMachine {
     }
 
     async fn announce<P: Payload>(&mut self, slot: Slot) -> Result<(), DeviceError> {
-        let mut header = self.station.writer();
+        let mut header = self.unit.writer();
         header.u16(P::KIND).u16(0).u32(slot.bytes).u32(slot.crc).zeros(2).identity(&slot.identity);
-        let address = self.station.map.inbox_header;
-        match self.station.write("inbox header", address, header.words()).await {
+        let address = self.unit.map.inbox_header;
+        match self.unit.write("inbox header", address, header.words()).await {
             Err(DeviceError::Exception { code: 3, .. }) => {
                 let state = self.look().await?.state;
                 let busy = matches!(state, State::Execute | State::Holding | State::Held);
@@ -618,21 +486,21 @@ impl ModbusMachine {
     }
 
     async fn send_pages<P: Payload>(&mut self, words: &[u16], interrupt: &Interrupt) -> Result<(), DeviceError> {
-        let address = self.station.map.inbox_page;
+        let address = self.unit.map.inbox_page;
         let of = words.len().div_ceil(PAGE) as u32;
         for (number, data) in words.chunks(PAGE).enumerate() {
             let done = number as u32;
             self.break_off(interrupt, P::WHAT, done, of)?;
             self.beat().await?;
-            let mut page = self.station.writer();
+            let mut page = self.unit.writer();
             page.u32(done).u16(data.len() as u16).zeros(5);
             let page = [page.words(), data].concat();
-            match self.station.write("inbox page", address, &page).await {
+            match self.unit.write("inbox page", address, &page).await {
                 // Out of turn: an older write has come late and emptied the inbox.
                 Err(DeviceError::Exception { code: 3, .. }) => {
-                    let state = self.station.read("inbox state", self.station.map.inbox_state, 12).await?;
-                    let next = self.station.registers(&state).u32(2);
-                    return Err(self.station.distrust("number of the page it expects", done.into(), next.into()).await);
+                    let state = self.unit.read("inbox state", self.unit.map.inbox_state, 12).await?;
+                    let next = self.unit.registers(&state).u32(2);
+                    return Err(self.unit.distrust("number of the page it expects", done.into(), next.into()).await);
                 }
                 written => written?,
             }
@@ -652,14 +520,14 @@ impl ModbusMachine {
         let began = Instant::now();
         loop {
             self.beat().await?;
-            let words = self.station.read("inbox state", self.station.map.inbox_state, 12).await?;
-            let block = self.station.registers(&words);
+            let words = self.unit.read("inbox state", self.unit.map.inbox_state, 12).await?;
+            let block = self.unit.registers(&words);
             let (bytes, crc) = (block.u32(4), block.u32(6));
             match words[1] {
                 2 if words[0] == P::KIND && bytes == slot.bytes && crc == slot.crc => return Ok(()),
                 2 | 3 => {
                     let (expected, found) = (u64::from(slot.crc), u64::from(crc));
-                    return Err(self.station.distrust("check number of a payload", expected, found).await);
+                    return Err(self.unit.distrust("check number of a payload", expected, found).await);
                 }
                 4 => {
                     let answer = answer_of(words[8]);
@@ -678,9 +546,9 @@ impl ModbusMachine {
     /// Whether the machine would use what was brought there.
     async fn compare_slot(&mut self, kind: u16) -> Result<(), DeviceError> {
         let Some(slot) = self.loaded.get(&kind).copied() else { return Ok(()) };
-        let address = self.station.map.in_force + 24 * (kind - 1);
-        let words = self.station.read("slots in force", address, 24).await?;
-        let block = self.station.registers(&words);
+        let address = self.unit.map.in_force + 24 * (kind - 1);
+        let words = self.unit.read("slots in force", address, 24).await?;
+        let block = self.unit.registers(&words);
         let identity = block.identity(8);
         let head = |identity: &[u8; 32]| identity[..8].iter().fold(0, |bits, byte| (bits << 8) | u64::from(*byte));
         let fields = [
@@ -709,7 +577,7 @@ impl ModbusMachine {
         job: Job,
         kind: u16,
         interrupt: &Interrupt,
-    ) -> Result<(Status, Header, Vec<u16>), DeviceError> {
+    ) -> Result<(Block, Header, Vec<u16>), DeviceError> {
         let mut tries = 0;
         loop {
             let status = self.look().await?;
@@ -746,22 +614,22 @@ impl ModbusMachine {
         let after = self.header_words().await?;
         if before != after {
             let (expected, found) = (u64::from(crc32(&before)), u64::from(crc32(&after)));
-            return Err(self.station.distrust("header of a result (read twice)", expected, found).await);
+            return Err(self.unit.distrust("header of a result (read twice)", expected, found).await);
         }
         let crc = crc32(&words);
         if crc != header.crc {
-            return Err(self.station.distrust("check number of a result", header.crc.into(), crc.into()).await);
+            return Err(self.unit.distrust("check number of a result", header.crc.into(), crc.into()).await);
         }
         Ok((header, words))
     }
 
     async fn header_words(&mut self) -> Result<Vec<u16>, DeviceError> {
-        self.station.read("outbox header", self.station.map.outbox_header, 56).await
+        self.unit.read("outbox header", self.unit.map.outbox_header, 56).await
     }
 
     fn header(&self, words: &[u16], job: Job, kind: u16, done: u32) -> Result<Header, DeviceError> {
         let machine = self.machine();
-        let block = self.station.registers(words);
+        let block = self.unit.registers(words);
         let fields = [
             ("the kind of the result", u64::from(kind), u64::from(words[0])),
             ("the job of the result", u64::from(job.job), u64::from(block.u32(6))),
@@ -810,23 +678,23 @@ impl ModbusMachine {
 
     /// Fetches one page. A machine may need a turn of its program to put it there, so another page's number is asked again for a while.
     async fn fetch_page(&mut self, page: u32, due: usize, words: &mut Vec<u16>) -> Result<(), DeviceError> {
-        let map = self.station.map;
-        let mut select = self.station.writer();
+        let map = self.unit.map;
+        let mut select = self.unit.writer();
         select.u32(page);
         let began = Instant::now();
         loop {
-            self.station.write("outbox select", map.outbox_select, select.words()).await?;
-            let read = self.station.read("outbox page", map.outbox_page, 4 + due as u16).await?;
-            let found = self.station.registers(&read).u32(0);
+            self.unit.write("outbox select", map.outbox_select, select.words()).await?;
+            let read = self.unit.read("outbox page", map.outbox_page, 4 + due as u16).await?;
+            let found = self.unit.registers(&read).u32(0);
             if found == page && usize::from(read[2]) == due {
                 words.extend_from_slice(&read[4..]);
                 return Ok(());
             }
             if found == page {
-                return Err(self.station.distrust("number of registers in a page", due as u64, read[2].into()).await);
+                return Err(self.unit.distrust("number of registers in a page", due as u64, read[2].into()).await);
             }
             if began.elapsed() > ACKNOWLEDGED_WITHIN {
-                return Err(self.station.distrust("number of a page", page.into(), found.into()).await);
+                return Err(self.unit.distrust("number of a page", page.into(), found.into()).await);
             }
             sleep(Duration::from_millis(2)).await;
         }
@@ -848,6 +716,59 @@ impl ModbusMachine {
     }
 }
 
+/// The status block of docs/modbus.md, as far as it is used, all of one moment.
+#[derive(Debug, Clone, PartialEq)]
+struct Block {
+    state: State,
+    /// Guards closed, clear of the part, part clamped, supplies there; from bit 0.
+    interlocks: u16,
+    /// The sequence number of the last command it acted upon, and its answer.
+    acknowledged: u32,
+    answer: Answer,
+    fault: Fault,
+    /// The job prepared, running or finished.
+    job: Option<Job>,
+    /// Of the prepared job; 0 when there is none.
+    token: u32,
+    /// The START whose job ended last, and how; 0 when there is none.
+    done: u32,
+    outcome: Outcome,
+    progress: (u32, u32),
+    /// The machine's own beat.
+    beat: u16,
+    /// The job and cycle begun last, kept over a restart of the machine.
+    last_begun: (u32, u16),
+    /// The START that began the running or last job; 0 when there is none.
+    begun_by: u32,
+    temperature_c: f64,
+    boot_id: u32,
+}
+
+impl From<&Block> for Status {
+    fn from(block: &Block) -> Self {
+        let good = |bit: u16| Some(block.interlocks & (1 << bit) != 0);
+        Self {
+            state: block.state,
+            job: block.job,
+            done: block.done,
+            outcome: block.outcome,
+            clear_of_part: good(1),
+            supplies: good(3),
+            fault: Some(block.fault),
+            progress: Some(block.progress),
+            temperature_c: Some(block.temperature_c),
+            boot_id: Some(block.boot_id),
+            signals: Vec::new(),
+        }
+    }
+}
+
+impl From<Block> for Status {
+    fn from(block: Block) -> Self {
+        Self::from(&block)
+    }
+}
+
 /// The header of a result.
 struct Header {
     format: u16,
@@ -864,7 +785,7 @@ struct Header {
 }
 
 /// What a status tells of a start, or nothing when it looks as if the start was not taken, which has to be seen twice.
-fn what_became(intended: &Armed, status: &Status) -> Option<Reconciled> {
+fn what_became(intended: &Armed, status: &Block) -> Option<Reconciled> {
     let Armed { job, start_sequence, boot_id, .. } = *intended;
     let unknown = |why: String| Some(Reconciled::Unknown { why });
     if status.boot_id != boot_id {
@@ -878,12 +799,12 @@ fn what_became(intended: &Armed, status: &Status) -> Option<Reconciled> {
             Some(held) if held != job => {
                 unknown(format!("START {start_sequence} has begun {held} there, {job} was meant"))
             }
-            _ if status.done == start_sequence => Some(Reconciled::Finished(status.clone())),
+            _ if status.done == start_sequence => Some(Reconciled::Finished(status.into())),
             _ => match status.state {
                 State::Execute | State::Holding | State::Held | State::Stopping | State::Aborting => {
-                    Some(Reconciled::Running(status.clone()))
+                    Some(Reconciled::Running(status.into()))
                 }
-                State::Aborted | State::Faulted => Some(Reconciled::Finished(status.clone())),
+                State::Aborted | State::Faulted => Some(Reconciled::Finished(status.into())),
                 state => unknown(format!(
                     "START {start_sequence} was taken, but the machine is {state} and keeps no result of it"
                 )),
@@ -912,11 +833,6 @@ fn state_of(number: u16) -> Option<State> {
         State::Faulted,
     ];
     STATES.get(usize::from(number).checked_sub(1)?).copied()
-}
-
-fn interlocks_of(bits: u16) -> Interlocks {
-    let good = |bit: u16| bits & (1 << bit) != 0;
-    Interlocks { guards_closed: good(0), clear_of_part: good(1), part_clamped: good(2), supplies: good(3) }
 }
 
 fn answer_of(number: u16) -> Answer {
@@ -961,7 +877,7 @@ macro_rules! modbus_driver {
         impl $driver {
             /// A driver on a line of its own. Nothing is sent before it is connected.
             pub fn new(settings: ModbusSettings) -> io::Result<Self> {
-                let link = Link::new(settings.wire.clone(), settings.request_timeout, settings.quarantine)?;
+                let link = Link::new(settings.line.clone(), settings.request_timeout, settings.quarantine)?;
                 Ok(Self::on(link, settings))
             }
 
@@ -978,7 +894,7 @@ macro_rules! modbus_driver {
 
         impl Machine for $driver {
             fn name(&self) -> &str {
-                &self.0.station.name
+                &self.0.unit.name
             }
             async fn connect(&mut self) -> Result<Identity, DeviceError> {
                 self.0.connect().await
@@ -987,7 +903,7 @@ macro_rules! modbus_driver {
                 self.0.status().await
             }
             async fn claim(&mut self) -> Result<Status, DeviceError> {
-                self.0.simply(Command::Claim).await
+                self.0.simply(Command::Claim).await.map(Status::from)
             }
             async fn prepare(&mut self, job: Job) -> Result<Armed, DeviceError> {
                 self.0.prepare(job).await
@@ -996,25 +912,25 @@ macro_rules! modbus_driver {
                 self.0.start(armed).await
             }
             async fn hold(&mut self) -> Result<Status, DeviceError> {
-                self.0.simply(Command::Hold).await
+                self.0.simply(Command::Hold).await.map(Status::from)
             }
             async fn resume(&mut self) -> Result<Status, DeviceError> {
-                self.0.simply(Command::Resume).await
+                self.0.simply(Command::Resume).await.map(Status::from)
             }
             async fn stop(&mut self) -> Result<Status, DeviceError> {
-                self.0.simply(Command::Stop).await
+                self.0.simply(Command::Stop).await.map(Status::from)
             }
             async fn abort(&mut self) -> Result<Status, DeviceError> {
-                self.0.abort().await
+                self.0.abort().await.map(Status::from)
             }
             async fn clear(&mut self) -> Result<Status, DeviceError> {
-                self.0.simply(Command::Clear).await
+                self.0.simply(Command::Clear).await.map(Status::from)
             }
             async fn acknowledge(&mut self, done: u32) -> Result<Status, DeviceError> {
-                self.0.acknowledge(done).await
+                self.0.acknowledge(done).await.map(Status::from)
             }
             async fn release(&mut self) -> Result<Status, DeviceError> {
-                self.0.simply(Command::Release).await
+                self.0.simply(Command::Release).await.map(Status::from)
             }
             async fn reconcile(&mut self, intended: &Armed) -> Result<Reconciled, DeviceError> {
                 self.0.reconcile(intended).await
@@ -1063,15 +979,15 @@ impl Cmm for ModbusCmm {
             }
         };
         let points = words.chunks_exact(header.registers).map(|record| {
-            let record = machine.station.registers(record);
+            let record = machine.unit.registers(record);
             codec::point(record, header.format, header.scale_mm).map_err(|flaw| machine.flawed(flaw))
         });
         Ok(Measurement {
             points: points.collect::<Result<_, _>>()?,
             coordinates,
-            probe_radius_mm: header.probe_radius_mm,
-            temperature_c: header.temperature_c,
-            duration_s: header.duration_s,
+            probe_radius_mm: Some(header.probe_radius_mm),
+            temperature_c: Some(header.temperature_c),
+            duration_s: Some(header.duration_s),
             plan_identity: header.identity,
             job: job.job,
             cycle: job.cycle,
@@ -1090,7 +1006,7 @@ impl Grinder for ModbusGrinder {
         let machine = &mut self.0;
         let (status, header, words) = machine.fetch(job, 5, interrupt).await?;
         machine.count("pass records", 1, header.records.into())?;
-        let figures = codec::pass_figures(machine.station.registers(&words)).map_err(|flaw| machine.flawed(flaw))?;
+        let figures = codec::pass_figures(machine.unit.registers(&words)).map_err(|flaw| machine.flawed(flaw))?;
         let (number, cycle, outcome, [path_mm, removed_mm3, deepest_mm, idle_share, spindle_load, wheel_radius_mm]) =
             figures;
         let fields = [
@@ -1108,14 +1024,14 @@ impl Grinder for ModbusGrinder {
         }
         Ok(PassRecord {
             outcome,
-            path_mm,
-            removed_mm3,
-            deepest_mm,
-            idle_share,
-            spindle_load,
-            wheel_radius_mm,
-            temperature_c: header.temperature_c,
-            duration_s: header.duration_s,
+            path_mm: Some(path_mm),
+            removed_mm3: Some(removed_mm3),
+            deepest_mm: Some(deepest_mm),
+            idle_share: Some(idle_share),
+            spindle_load: Some(spindle_load),
+            wheel_radius_mm: Some(wheel_radius_mm),
+            temperature_c: Some(header.temperature_c),
+            duration_s: Some(header.duration_s),
             map_identity: header.identity,
             job: job.job,
             cycle: job.cycle,

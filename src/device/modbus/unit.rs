@@ -1,17 +1,17 @@
 //! One machine on a line: proved before it is believed, proved again whenever the line was opened anew, and asked again when an answer
 //! failed to come.
 //!
-//! Everything that is asked through a station may be asked twice: reads, and writes of values. Nothing here is a pulse.
+//! Everything that is asked through a unit may be asked twice: reads, and writes of values. Nothing here is a pulse.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::time::{Instant, sleep};
 
-use super::codec::{Registers, WordOrder, Writer};
+use super::codec::{Registers, Writer};
 use super::link::{Ask, Link, LinkFault};
-use super::modbus::RegisterMap;
-use super::{DeviceError, Identity, MachineKind};
+use super::settings::RegisterMap;
+use crate::device::{DeviceError, Identity, MachineKind};
 
 /// The first words of an identity block.
 const MAGIC: [u16; 2] = [0x5247, 0x4431];
@@ -27,10 +27,9 @@ const SENTINEL_REAL: f64 = -2.5e-7;
 
 /// One machine on a line.
 #[derive(Debug)]
-pub(super) struct Station {
+pub(super) struct Unit {
     pub(super) name: Arc<str>,
     pub(super) link: Link,
-    pub(super) order: WordOrder,
     pub(super) map: RegisterMap,
     unit: u8,
     kind: MachineKind,
@@ -41,20 +40,19 @@ pub(super) struct Station {
     identity: Option<Identity>,
 }
 
-/// What a station is told about its machine.
-pub(super) struct StationSettings {
+/// What a unit is told about its machine.
+pub(super) struct UnitSettings {
     pub(super) unit: u8,
-    pub(super) order: WordOrder,
     pub(super) map: RegisterMap,
     pub(super) retries: u32,
     pub(super) lost_after: Duration,
 }
 
-impl Station {
-    pub(super) fn new(kind: MachineKind, link: Link, settings: StationSettings) -> Self {
-        let StationSettings { unit, order, map, retries, lost_after } = settings;
-        let name = format!("{kind} at {}, unit {unit}", link.wire()).into();
-        Self { name, link, order, map, unit, kind, retries, lost_after, trusted: None, identity: None }
+impl Unit {
+    pub(super) fn new(kind: MachineKind, link: Link, settings: UnitSettings) -> Self {
+        let UnitSettings { unit, map, retries, lost_after } = settings;
+        let name = format!("{kind} at {}, unit {unit}", link.line()).into();
+        Self { name, link, map, unit, kind, retries, lost_after, trusted: None, identity: None }
     }
 
     /// Who was proved to be there.
@@ -63,11 +61,11 @@ impl Station {
     }
 
     pub(super) fn registers<'a>(&self, words: &'a [u16]) -> Registers<'a> {
-        Registers::new(words, self.order)
+        Registers::new(words, self.map.word_order)
     }
 
     pub(super) fn writer(&self) -> Writer {
-        Writer::new(self.order)
+        Writer::new(self.map.word_order)
     }
 
     /// Forgets who was there and proves who is there now.
@@ -227,9 +225,9 @@ impl Station {
             let block = Registers::new(words, order);
             block.u32(4) == SENTINEL_WHOLE && block.f64(6).to_bits() == SENTINEL_REAL.to_bits()
         };
-        if !sentinels_fit(self.order) {
-            let fits = sentinels_fit(self.order.other()).then_some(self.order.other().name());
-            return Err(DeviceError::WrongWordOrder { machine, configured: self.order.name(), fits });
+        if !sentinels_fit(self.map.word_order) {
+            let fits = sentinels_fit(self.map.word_order.other()).then_some(self.map.word_order.other().name());
+            return Err(DeviceError::WrongWordOrder { machine, configured: self.map.word_order.name(), fits });
         }
         let block = self.registers(words);
         let kind = match words[3] {
@@ -249,7 +247,7 @@ impl Station {
             name: block.text(16, 16),
             boot_id: block.u32(10),
             simulation: words[12] & 1 == 1,
-            silence_limit_s: f64::from(silence_ms) / 1e3,
+            silence_limit_s: Some(f64::from(silence_ms) / 1e3),
         })
     }
 }

@@ -28,56 +28,14 @@ use tokio_modbus::slave::{Slave, SlaveContext as _};
 use tokio_modbus::{ProtocolError, Request, Response};
 use tokio_serial::{SerialPort as _, SerialPortBuilderExt as _, SerialStream};
 
+use super::settings::{Line, Parity};
+
 /// The first wait before a line is opened again; it doubles up to [`LONGEST_BACKOFF`].
 const FIRST_BACKOFF: Duration = Duration::from_millis(100);
 /// The longest wait before a line is opened again.
 const LONGEST_BACKOFF: Duration = Duration::from_secs(5);
 /// A line that is not silent for so long is not going to be.
 const LONGEST_DRAIN: Duration = Duration::from_secs(2);
-
-/// The parity of a serial line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub enum Parity {
-    /// No parity bit.
-    None,
-    /// Even, the default of Modbus.
-    #[default]
-    Even,
-    /// Odd.
-    Odd,
-}
-
-/// Where a line leads.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub enum Wire {
-    /// Modbus TCP.
-    Tcp {
-        /// Host name or address.
-        host: String,
-        /// The port, 502 by the standard.
-        port: u16,
-    },
-    /// Modbus RTU on a serial port.
-    Rtu {
-        /// The port, best by its lasting name under /dev/serial/by-id.
-        device: String,
-        /// Bits per second.
-        baud: u32,
-        /// The parity.
-        parity: Parity,
-        /// Stop bits, 1 or 2.
-        stop_bits: u8,
-    },
-}
-
-impl std::fmt::Display for Wire {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Tcp { host, port } => write!(f, "{host}:{port}"),
-            Self::Rtu { device, baud, .. } => write!(f, "{device} ({baud} baud)"),
-        }
-    }
-}
 
 /// What a line has seen since it was made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -169,7 +127,7 @@ struct Question {
 /// A handle to one line. Clones share it; the line ends with its last handle.
 #[derive(Debug, Clone)]
 pub struct Link {
-    wire: Wire,
+    line: Line,
     request_timeout: Duration,
     questions: mpsc::Sender<Question>,
     counters: Arc<Counters>,
@@ -178,18 +136,20 @@ pub struct Link {
 impl Link {
     /// A line that is opened when it is first asked. `quarantine` is how long a machine on it may need for an answer at worst: after an
     /// error the line is left alone for so long.
-    pub fn new(wire: Wire, request_timeout: Duration, quarantine: Duration) -> io::Result<Self> {
+    pub fn new(line: Line, request_timeout: Duration, quarantine: Duration) -> io::Result<Self> {
         let (questions, inbox) = mpsc::channel(16);
         let counters = Arc::new(Counters::default());
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-        let line = Line::new(wire.clone(), request_timeout, quarantine, counters.clone());
-        std::thread::Builder::new().name(format!("line {wire}")).spawn(move || runtime.block_on(line.run(inbox)))?;
-        Ok(Self { wire, request_timeout, questions, counters })
+        let connection = Connection::new(line.clone(), request_timeout, quarantine, counters.clone());
+        std::thread::Builder::new()
+            .name(format!("line {line}"))
+            .spawn(move || runtime.block_on(connection.run(inbox)))?;
+        Ok(Self { line, request_timeout, questions, counters })
     }
 
     /// Where it leads.
-    pub fn wire(&self) -> &Wire {
-        &self.wire
+    pub fn line(&self) -> &Line {
+        &self.line
     }
 
     /// What it has seen so far.
@@ -235,8 +195,8 @@ impl Link {
 }
 
 /// The far side of the channel: the connection and its history.
-struct Line {
-    wire: Wire,
+struct Connection {
+    line: Line,
     request_timeout: Duration,
     quarantine: Duration,
     counters: Arc<Counters>,
@@ -247,11 +207,11 @@ struct Line {
     silent_from: Instant,
 }
 
-impl Line {
-    fn new(wire: Wire, request_timeout: Duration, quarantine: Duration, counters: Arc<Counters>) -> Self {
+impl Connection {
+    fn new(line: Line, request_timeout: Duration, quarantine: Duration, counters: Arc<Counters>) -> Self {
         let now = Instant::now();
         Self {
-            wire,
+            line,
             request_timeout,
             quarantine,
             counters,
@@ -326,7 +286,7 @@ impl Line {
     async fn open(&mut self) -> Result<(), LinkFault> {
         sleep_until(self.not_before).await;
         let limit = self.request_timeout.max(Duration::from_secs(1)) + LONGEST_DRAIN;
-        let opened = timeout(limit, connect(&self.wire)).await;
+        let opened = timeout(limit, connect(&self.line)).await;
         let opened = opened.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()));
         match opened {
             Ok(connection) => {
@@ -352,13 +312,13 @@ impl Line {
             }
             Ask::Distrust => return Ok(Vec::new()),
         };
-        let limit = self.request_timeout + self.wire.transmission_at_most();
+        let limit = self.request_timeout + self.line.transmission_at_most();
         let Some(connection) = &mut self.connection else { return Err(LinkFault::Stale) };
         connection.set_slave(Slave(unit));
         count(&self.counters.requests);
         let asked = Instant::now();
         let response = timeout(limit, connection.call(request)).await;
-        self.silent_from = Instant::now() + self.wire.silence();
+        self.silent_from = Instant::now() + self.line.silence();
         let words = check(ask, response.map_err(|_| LinkFault::TimedOut)?)?;
         let taken_ns = u64::try_from(asked.elapsed().as_nanos()).unwrap_or(u64::MAX);
         count(&self.counters.answers);
@@ -421,7 +381,7 @@ fn fault_of(error: tokio_modbus::Error) -> LinkFault {
     }
 }
 
-impl Wire {
+impl Line {
     /// The silence of three and a half characters that parts two frames; nothing on TCP.
     fn silence(&self) -> Duration {
         match self {
@@ -440,14 +400,14 @@ impl Wire {
     }
 }
 
-async fn connect(wire: &Wire) -> io::Result<tokio_modbus::client::Context> {
+async fn connect(wire: &Line) -> io::Result<tokio_modbus::client::Context> {
     match wire {
-        Wire::Tcp { host, port } => {
+        Line::Tcp { host, port } => {
             let stream = TcpStream::connect((host.as_str(), *port)).await?;
             stream.set_nodelay(true)?;
             Ok(tokio_modbus::client::tcp::attach(Listening::new(stream)))
         }
-        Wire::Rtu { device, baud, parity, stop_bits } => {
+        Line::Rtu { device, baud, parity, stop_bits } => {
             let parity = match parity {
                 Parity::None => tokio_serial::Parity::None,
                 Parity::Even => tokio_serial::Parity::Even,
@@ -571,15 +531,15 @@ mod tests {
 
     #[test]
     fn frames_on_a_serial_line_are_three_and_a_half_characters_apart() {
-        let line = |baud| Wire::Rtu { device: "x".into(), baud, parity: Parity::Even, stop_bits: 1 };
+        let line = |baud| Line::Rtu { device: "x".into(), baud, parity: Parity::Even, stop_bits: 1 };
         assert_eq!(line(115_200).silence(), Duration::from_micros(1750));
         assert!((line(9_600).silence().as_secs_f64() - 4.0104e-3).abs() < 1e-6);
-        assert_eq!(Wire::Tcp { host: "x".into(), port: 502 }.silence(), Duration::ZERO);
+        assert_eq!(Line::Tcp { host: "x".into(), port: 502 }.silence(), Duration::ZERO);
     }
 
     #[tokio::test]
     async fn a_line_waits_longer_after_every_failure_and_says_what_the_system_said() {
-        let wire = Wire::Rtu { device: "/dev/no-such-port".into(), baud: 9600, parity: Parity::Even, stop_bits: 1 };
+        let wire = Line::Rtu { device: "/dev/no-such-port".into(), baud: 9600, parity: Parity::Even, stop_bits: 1 };
         let link = Link::new(wire, Duration::from_millis(50), Duration::ZERO).unwrap();
         let began = Instant::now();
         for _ in 0..3 {

@@ -1,0 +1,139 @@
+//! A file as the measurement by a plan: what it must fit, whoever brings it.
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use sha2::{Digest, Sha256};
+
+use super::ExchangeError;
+use crate::device::{Job, MeasuredPoint, Measurement, PointStatus};
+use crate::formats::FormatError;
+use crate::formats::result::{Content, Coordinates, ResultFile, Statements, check_ended, parse_result};
+use crate::geometry::Point;
+
+/// What a measurement is held against.
+#[derive(Clone, Copy, Debug)]
+pub struct Wanted<'a> {
+    /// The numbers of the plan's targets, in its order; `None` where any number of points will do.
+    pub targets: Option<&'a [u32]>,
+    /// What is known of the files.
+    pub content: &'a Content,
+    /// The radius of the probe in the plan, and by how much that of a file may differ.
+    pub probe_radius_mm: f64,
+    /// By how much that of a file may differ.
+    pub probe_tolerance_mm: f64,
+}
+
+/// A file that fits, as far as a file by itself can tell.
+#[derive(Clone, Debug)]
+pub struct Measured {
+    /// The file as it was read.
+    pub file: ResultFile,
+    /// The SHA-256 of its bytes.
+    pub sha256: [u8; 32],
+}
+
+impl Wanted<'_> {
+    /// Reads the bytes of a file of points and holds it against plan and cell; `path` is what messages call it.
+    ///
+    /// # Errors
+    /// A file that was cut short, that does not say what its coordinates are, or that was measured with another probe.
+    pub fn read(&self, path: &Path, bytes: &[u8]) -> Result<Measured, ExchangeError> {
+        check_ended(path, bytes)?;
+        let file = parse_result(path, bytes, self.content)?;
+        if file.coordinates.is_none() {
+            return Err(ExchangeError::CoordinatesUnstated { path: path.to_owned() });
+        }
+        let (expected_mm, limit_mm) = (self.probe_radius_mm, self.probe_tolerance_mm);
+        match file.probe_radius_mm.filter(|found| (found - expected_mm).abs() > limit_mm) {
+            Some(found_mm) => {
+                Err(ExchangeError::ProbeRadius { path: path.to_owned(), found_mm, expected_mm, limit_mm })
+            }
+            None => Ok(Measured { file, sha256: Sha256::digest(bytes).into() }),
+        }
+    }
+
+    /// Gives every point its target.
+    ///
+    /// # Errors
+    /// Another number of points than the plan has targets, and numbers of targets that the plan does not have.
+    pub fn matched(&self, path: &Path, result: &ResultFile) -> Result<Vec<MeasuredPoint>, ExchangeError> {
+        let Some(targets) = self.targets else { return Ok(numbered(&result.points)) };
+        let Some(indices) = &result.indices else { return self.in_order(path, &result.points) };
+        // In the order of the plan; a target without a row was not found.
+        let mut all: Vec<MeasuredPoint> = targets.iter().map(|&index| not_found(index)).collect();
+        let place: HashMap<u32, usize> = targets.iter().enumerate().map(|(k, &t)| (t, k)).collect();
+        for (row, (index, point)) in indices.iter().zip(&result.points).enumerate() {
+            let wrong = |why| {
+                let (path, line) = (path.to_owned(), row as u64 + 1);
+                ExchangeError::from(FormatError::Index { path, line, found: index.to_string(), why })
+            };
+            let slot = *place.get(index).ok_or_else(|| wrong("is not a target of the plan"))?;
+            if all[slot].status == PointStatus::Touched {
+                return Err(wrong("came before"));
+            }
+            all[slot] = touched(*index, (*point).into());
+        }
+        Ok(all)
+    }
+
+    /// Gives points their targets in the order of the plan.
+    ///
+    /// # Errors
+    /// Another number of points than the plan has targets.
+    pub fn in_order(&self, path: &Path, points: &[Point]) -> Result<Vec<MeasuredPoint>, ExchangeError> {
+        match self.targets {
+            None => Ok(numbered(points)),
+            Some(targets) if points.len() != targets.len() => {
+                let (found, expected) = (points.len(), targets.len());
+                Err(ExchangeError::Count { path: path.to_owned(), found, expected })
+            }
+            Some(targets) => Ok(targets.iter().zip(points).map(|(&index, p)| touched(index, (*p).into())).collect()),
+        }
+    }
+}
+
+/// Puts a measurement together from its files; what none of them tells stays unknown.
+pub fn measurement(
+    points: Vec<MeasuredPoint>,
+    results: &[ResultFile],
+    job: Job,
+    plan_identity: [u8; 32],
+    done: u32,
+) -> Measurement {
+    Measurement {
+        points,
+        // Files that say nothing of it were refused.
+        coordinates: results.iter().find_map(|r| r.coordinates).unwrap_or(Coordinates::Centres),
+        probe_radius_mm: results.iter().find_map(|r| r.probe_radius_mm),
+        temperature_c: results.iter().find_map(|r| r.statements.temperature_c),
+        duration_s: None,
+        plan_identity,
+        job: job.job,
+        cycle: job.cycle,
+        done,
+    }
+}
+
+/// Returns why a file that says something of itself does not belong to a plan; nothing if it does not say otherwise.
+pub fn foreign(says: &Statements, part: &str, cycle: u16, plan: &str) -> Option<String> {
+    if let Some(other) = says.part.as_ref().filter(|other| *other != part) {
+        return Some(format!("is of part {other}, not {part}"));
+    }
+    if let Some(other) = says.cycle.filter(|other| *other != cycle) {
+        return Some(format!("is of cycle {other}, not {cycle}"));
+    }
+    says.plan.as_ref().filter(|other| *other != plan).map(|_| "was measured by another plan".to_owned())
+}
+
+fn touched(index: u32, at_mm: [f64; 3]) -> MeasuredPoint {
+    MeasuredPoint { index, status: PointStatus::Touched, quality: 0, at_mm }
+}
+
+fn not_found(index: u32) -> MeasuredPoint {
+    MeasuredPoint { index, status: PointStatus::NotFound, quality: 100, at_mm: [0.0; 3] }
+}
+
+fn numbered(points: &[Point]) -> Vec<MeasuredPoint> {
+    points.iter().zip(0..).map(|(p, index)| touched(index, (*p).into())).collect()
+}

@@ -1,0 +1,231 @@
+//! What a cell file says of a machine that is reached by files, and the machines that are made of it.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use schemars::JsonSchema;
+use serde::Deserialize;
+
+use super::cmm::{CmmExchange, CmmFolders, StationFiles, Stations};
+use super::desk::{ExchangeMachine, ExchangeTiming};
+use super::grinder::{GrinderExchange, GrinderFolders};
+use super::pattern::Pattern;
+use crate::device::MachineKind;
+use crate::device::wiring::{Making, MakingError, Place, Wired};
+use crate::document::Document;
+use crate::formats::references::read_references;
+use crate::formats::result::{Content, Coordinates, DecimalMark, LengthUnit};
+
+/// A folder, perhaps on another computer, answers within this, a large file read included.
+const ANSWERS_WITHIN: Duration = Duration::from_secs(30);
+
+/// Files in two folders, and a person.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct ExchangeWire {
+    /// Folder into which Regrind writes what the machine shall do; relative to this file.
+    #[schemars(length(min = 1, max = 400), extend("x-required" = true), example = "exchange/cmm/out")]
+    pub outbox: String,
+    /// Folder in which results appear; relative to this file.
+    #[schemars(length(min = 1, max = 400), extend("x-required" = true), example = "exchange/cmm/in")]
+    pub inbox: String,
+    /// A file that has not changed for so long is complete.
+    #[schemars(range(min = 0.05, max = 3600.0))]
+    pub stable_for_s: f64,
+    /// What the coordinates of results are, where the files do not say so themselves; said nowhere, they are refused.
+    pub what: Option<Coordinates>,
+    /// Decimal mark of results.
+    pub decimal: DecimalMark,
+    /// Unit of length of results.
+    pub unit: LengthUnit,
+    /// Stations of a measurement, each with its own frame.
+    #[schemars(length(max = 64))]
+    pub stations: Vec<StationTable>,
+    /// File of the reference points in the CMM frame, to which stations are merged; relative to this file.
+    #[schemars(length(min = 1, max = 400))]
+    pub reference_points: Option<String>,
+    /// Name of the group of reference points within the file.
+    #[schemars(length(min = 1, max = 80))]
+    pub reference_group: Option<String>,
+    /// By how much a reference point may be off after the best fit of its station.
+    #[schemars(range(min = 0.0001, max = 100.0))]
+    pub reference_limit_mm: f64,
+    /// Names of result files: `{part}`, `{job}` and `{cycle}` are filled in, one `*` stands for any characters.
+    #[schemars(length(min = 1, max = 200))]
+    pub result: String,
+    /// Whether files may be taken that lay in the inbox before the plan was handed over.
+    pub take_earlier: bool,
+    /// By how much the probe radius that a file states may differ from the recipe's.
+    #[schemars(range(min = 0.0, max = 10.0))]
+    pub probe_tolerance_mm: f64,
+    /// Whether the machine stands apart and cannot reach the part where the other one works: then nobody is asked whether it is clear.
+    pub apart: bool,
+}
+
+impl Default for ExchangeWire {
+    fn default() -> Self {
+        Self {
+            outbox: String::new(),
+            inbox: String::new(),
+            stable_for_s: 2.0,
+            what: None,
+            decimal: DecimalMark::Auto,
+            unit: LengthUnit::Mm,
+            stations: Vec::new(),
+            reference_points: None,
+            reference_group: None,
+            reference_limit_mm: 0.1,
+            result: "{part}_c{cycle}.*".to_owned(),
+            take_earlier: false,
+            probe_tolerance_mm: 0.001,
+            apart: false,
+        }
+    }
+}
+
+/// A station of a measurement.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct StationTable {
+    /// File of its points in the inbox; one `*` stands for any characters.
+    #[schemars(length(min = 1, max = 200), extend("x-required" = true), example = "M1_*.txt")]
+    pub points: String,
+    /// File of the reference points as it sees them, in the inbox; `*` for the same characters.
+    #[schemars(length(min = 1, max = 200), extend("x-required" = true), example = "ref_*.yaml")]
+    pub reference: String,
+}
+
+impl Wired for ExchangeWire {
+    type Cmm = ExchangeMachine<CmmFolders>;
+    type Grinder = ExchangeMachine<GrinderFolders>;
+    const BY_PERSON: bool = true;
+
+    fn check(&self, place: &Place<'_>, document: &mut Document) {
+        if self.outbox == self.inbox && !self.outbox.is_empty() {
+            let allowed = "what is written and what is awaited must be told apart";
+            document.report(&place.key("wire.inbox"), "is the same folder as `outbox`", allowed, "give each a folder");
+        }
+        self.check_result(place, document);
+        self.check_stations(place, document);
+    }
+
+    fn check_beside(&self, grinder: &Self, document: &mut Document) {
+        if self.inbox == grinder.inbox && !self.inbox.is_empty() {
+            let allowed = "a result must be told to one machine";
+            document.report("grinder.wire.inbox", "is the inbox of the CMM too", allowed, "give each machine its own");
+        }
+    }
+
+    fn coordinates(&self) -> Option<Coordinates> {
+        self.what
+    }
+
+    fn cmm(&self, making: &Making<'_>) -> Result<Self::Cmm, MakingError> {
+        let [outbox, inbox] = self.folders(making, MachineKind::Cmm)?;
+        let settings = CmmExchange {
+            stable_for: Duration::from_secs_f64(self.stable_for_s),
+            content: Content { coordinates: self.what, decimal: self.decimal, unit_mm: self.unit.mm() },
+            result: Pattern::new(&*self.result),
+            stations: self.stations(making)?,
+            free_count: making.free_points.is_some(),
+            least_points: making.free_points.unwrap_or(1),
+            take_earlier: self.take_earlier,
+            probe_tolerance_mm: self.probe_tolerance_mm,
+            ..CmmExchange::new(making.part, outbox, &inbox)
+        };
+        Ok(self.machine(MachineKind::Cmm, &inbox, CmmFolders::new(settings)))
+    }
+
+    fn grinder(&self, making: &Making<'_>) -> Result<Self::Grinder, MakingError> {
+        let [outbox, inbox] = self.folders(making, MachineKind::Grinder)?;
+        let stable_for = Duration::from_secs_f64(self.stable_for_s);
+        let settings = GrinderExchange { part: making.part.to_owned(), outbox, inbox: inbox.clone(), stable_for };
+        Ok(self.machine(MachineKind::Grinder, &inbox, GrinderFolders::new(settings)))
+    }
+}
+
+impl ExchangeWire {
+    fn machine<M: super::Mailbox>(&self, kind: MachineKind, inbox: &Path, folders: M) -> ExchangeMachine<M> {
+        let name = match kind {
+            MachineKind::Cmm => "cmm",
+            MachineKind::Grinder => "grinder",
+        };
+        let timing = ExchangeTiming { request_timeout: ANSWERS_WITHIN };
+        ExchangeMachine::new(format!("{name} by files, {}", inbox.display()), kind, folders, timing).apart(self.apart)
+    }
+
+    /// A folder that Regrind made itself would be one that nobody looks into: both must be there.
+    fn folders(&self, making: &Making<'_>, machine: MachineKind) -> Result<[PathBuf; 2], MakingError> {
+        let table = if machine == MachineKind::Cmm { "cmm" } else { "grinder" };
+        let folder = |name: &str, path: &String| {
+            let path = making.cell_folder.join(path);
+            match path.is_dir() {
+                true => Ok(path),
+                false => Err(MakingError::Folder { key: format!("{table}.wire.{name}"), path, machine }),
+            }
+        };
+        Ok([folder("outbox", &self.outbox)?, folder("inbox", &self.inbox)?])
+    }
+
+    /// The reference points are read at once: an error in them must not come to light when a day's measuring is done.
+    fn stations(&self, making: &Making<'_>) -> Result<Option<Stations>, MakingError> {
+        let Some(nominal) = self.reference_points.as_ref().map(|file| making.cell_folder.join(file)) else {
+            return Ok(None);
+        };
+        let group = self.reference_group.clone();
+        read_references(&nominal, group.as_deref())
+            .map_err(|source| MakingError::References { source: Box::new(source) })?;
+        let files = self.stations.iter().map(|station| StationFiles {
+            points: Pattern::new(&*station.points),
+            references: Pattern::new(&*station.reference),
+        });
+        Ok(Some(Stations { files: files.collect(), nominal, group, limit_mm: self.reference_limit_mm }))
+    }
+
+    fn check_result(&self, place: &Place<'_>, document: &mut Document) {
+        let name = &self.result;
+        let mut plain = name.to_owned();
+        for word in ["{part}", "{job}", "{cycle}"] {
+            plain = plain.replace(word, "");
+        }
+        if plain.contains(['/', '\\', '{', '}']) || plain.matches('*').count() > 1 {
+            let allowed =
+                "it must be the name of a file in the inbox, with `{part}`, `{job}`, `{cycle}` and one `*` at most";
+            let remedy = "\"{part}_c{cycle}.*\" is usual";
+            document.report(&place.key("wire.result"), format!("is {name:?}"), allowed, remedy);
+        }
+    }
+
+    fn check_stations(&self, place: &Place<'_>, document: &mut Document) {
+        let (stations, reference) = (place.key("wire.stations"), place.key("wire.reference_points"));
+        match (self.stations.is_empty(), self.reference_points.is_some()) {
+            (false, false) if !document.has_problem(&reference) => {
+                let allowed = "stations are merged by reference points";
+                document.report(&stations, "have no `reference_points`", allowed, "name their file");
+            }
+            (true, true) if !document.has_problem(&stations) => {
+                let allowed = "they merge stations, and there is none";
+                document.report(&reference, "is given without stations", allowed, "add [[cmm.wire.stations]]");
+            }
+            _ => {}
+        }
+        for (k, StationTable { points, reference }) in self.stations.iter().enumerate() {
+            if points.is_empty() || reference.is_empty() {
+                continue; // told by the schema
+            }
+            let stars = [points, reference].map(|name| name.matches('*').count());
+            for (name, key) in [(points, "points"), (reference, "reference")] {
+                let key = place.key(&format!("wire.stations[{k}].{key}"));
+                if name.contains(['/', '\\']) || name.matches('*').count() > 1 {
+                    let allowed = "it must be the name of a file in the inbox, with one `*` at most";
+                    document.report(&key, format!("is {name:?}"), allowed, "leave the folder out");
+                }
+            }
+            if stars[0] != stars[1] && stars[0].max(stars[1]) == 1 {
+                let key = place.key(&format!("wire.stations[{k}].reference"));
+                let found = format!("is {reference:?} where `points` is {points:?}");
+                document.report(&key, found, "`*` must stand in both names or in none", "add the `*`");
+            }
+        }
+    }
+}

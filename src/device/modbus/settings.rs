@@ -1,0 +1,525 @@
+//! What a cell file says of a machine on Modbus, and everything that has to be known to drive it.
+
+use std::net::IpAddr;
+use std::path::Path;
+use std::time::Duration;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::device::wiring::{Making, Place};
+use crate::document::Document;
+
+/// Registers that a Modbus device can have.
+const REGISTERS: u32 = 1 << 16;
+
+/// Which word of a value of several registers comes first. The bytes within a register are high byte first always.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum WordOrder {
+    /// The high one.
+    #[default]
+    Big,
+    /// The low one.
+    Little,
+}
+
+impl WordOrder {
+    /// As it is written in a cell file.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Big => "big",
+            Self::Little => "little",
+        }
+    }
+
+    /// The other order.
+    pub fn other(self) -> Self {
+        match self {
+            Self::Big => Self::Little,
+            Self::Little => Self::Big,
+        }
+    }
+}
+
+/// Parity of a serial line.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Parity {
+    /// None.
+    None,
+    /// Even.
+    #[default]
+    Even,
+    /// Odd.
+    Odd,
+}
+
+/// Where a line leads.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub enum Line {
+    /// Modbus TCP.
+    Tcp {
+        /// Host name or address.
+        host: String,
+        /// The port, 502 by the standard.
+        port: u16,
+    },
+    /// Modbus RTU on a serial port.
+    Rtu {
+        /// The port, best by its lasting name under /dev/serial/by-id.
+        device: String,
+        /// Bits per second.
+        baud: u32,
+        /// The parity.
+        parity: Parity,
+        /// Stop bits, 1 or 2.
+        stop_bits: u8,
+    },
+}
+
+impl std::fmt::Display for Line {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Tcp { host, port } => write!(f, "{host}:{port}"),
+            Self::Rtu { device, baud, .. } => write!(f, "{device} ({baud} baud)"),
+        }
+    }
+}
+
+/// Modbus over TCP.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct TcpWire {
+    /// Name or address.
+    #[schemars(length(min = 1, max = 253), extend("x-required" = true), example = "192.168.0.10")]
+    pub host: String,
+    /// Port; 0, in a simulated cell only, for one that is free at the start.
+    #[schemars(range(min = 0, max = 65535))]
+    pub port: u16,
+    /// Unit identifier.
+    #[schemars(range(min = 0, max = 255))]
+    pub unit: u8,
+}
+
+impl Default for TcpWire {
+    fn default() -> Self {
+        Self { host: String::new(), port: 502, unit: 1 }
+    }
+}
+
+impl TcpWire {
+    pub(super) fn line(&self) -> Line {
+        Line::Tcp { host: self.host.clone(), port: self.port }
+    }
+
+    pub(super) fn check_address(&self, place: &Place<'_>, document: &mut Document) {
+        let host = &self.host;
+        let is_here = host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback());
+        if host.is_empty() {
+            // Told by the schema.
+        } else if host.chars().any(|c| c.is_whitespace() || c == '/' || c == '@') {
+            let allowed = "it must be a name or an address alone, such as \"192.168.0.10\"";
+            document.report(&place.key("wire.host"), format!("is {host:?}"), allowed, "the port has a key of its own");
+        } else if place.simulated == Some(true) && !is_here {
+            document.report(
+                &place.key("wire.host"),
+                format!("is {host:?} in a simulated cell"),
+                "simulated machines are on this computer: 127.0.0.1, ::1 or localhost",
+                "is the machine real? then write `simulated = false`",
+            );
+        }
+        if self.port == 0 && place.simulated == Some(false) {
+            document.report(
+                &place.key("wire.port"),
+                "is 0 in a cell that is not simulated",
+                "it must be a whole number from 1 to 65535",
+                "502 is usual for Modbus TCP",
+            );
+        }
+    }
+
+    /// Of a network nothing is known before it is asked.
+    pub(super) fn missing(&self) -> Option<String> {
+        None
+    }
+
+    /// Two machines must not be one.
+    pub(super) fn compare(&self, grinder: &Self, document: &mut Document) {
+        if self == grinder && self.port != 0 {
+            let found = format!("is {}, as that of the CMM at the same host and port", grinder.unit);
+            let allowed = "two machines need two units or two ports";
+            document.report("grinder.wire.unit", found, allowed, "correct one of them");
+        }
+    }
+}
+
+/// Modbus over a serial line, eight data bits.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct RtuWire {
+    /// Device of the line, as the operating system calls it.
+    #[schemars(length(min = 1, max = 400), extend("x-required" = true), example = "/dev/ttyUSB0")]
+    pub device: String,
+    /// Bits a second.
+    #[schemars(range(min = 1200, max = 4000000))]
+    pub baud: u32,
+    /// Parity.
+    pub parity: Parity,
+    /// Stop bits.
+    #[schemars(range(min = 1, max = 2))]
+    pub stop_bits: u8,
+    /// Unit identifier.
+    #[schemars(range(min = 1, max = 247))]
+    pub unit: u8,
+}
+
+impl Default for RtuWire {
+    fn default() -> Self {
+        Self { device: String::new(), baud: 115_200, parity: Parity::Even, stop_bits: 1, unit: 1 }
+    }
+}
+
+impl RtuWire {
+    pub(super) fn line(&self) -> Line {
+        let Self { device, baud, parity, stop_bits, .. } = self.clone();
+        Line::Rtu { device, baud, parity, stop_bits }
+    }
+
+    /// A name of a port is as good as it is there.
+    pub(super) fn check_address(&self, _: &Place<'_>, _: &mut Document) {}
+
+    /// Two machines must not be one, and one line has one speed.
+    pub(super) fn compare(&self, grinder: &Self, document: &mut Document) {
+        if self.device != grinder.device {
+            return;
+        }
+        if self.unit == grinder.unit {
+            let found = format!("is {}, as that of the CMM on the same line", grinder.unit);
+            let allowed = "two machines on one line need two units";
+            document.report("grinder.wire.unit", found, allowed, "correct one of them");
+        }
+        if self.line() != grinder.line() {
+            let found = "has another speed, parity or stop bits than the CMM on the same line";
+            document.report("grinder.wire", found, "a line has one setting", "make them the same");
+        }
+    }
+
+    /// Says that the port is not on this computer, and which are; nothing where it is there.
+    pub(super) fn missing(&self) -> Option<String> {
+        if self.device.is_empty() || Path::new(&self.device).exists() {
+            return None;
+        }
+        let ports = serialport::available_ports().unwrap_or_default();
+        let names: Vec<String> = ports.into_iter().map(|port| port.port_name).collect();
+        let there = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
+        Some(format!("{} is not on this computer; the serial ports here: {there}", self.device))
+    }
+}
+
+/// Where the blocks of docs/modbus.md stand: 0-based addresses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct RegisterMap {
+    /// Which word of a value of several registers comes first: big is the high one.
+    pub word_order: WordOrder,
+    /// Identity, 32 registers.
+    #[schemars(range(min = 0, max = 65535))]
+    pub identity: u16,
+    /// Sync, 4 registers.
+    #[schemars(range(min = 0, max = 65535))]
+    pub sync: u16,
+    /// Beat, 1 register.
+    #[schemars(range(min = 0, max = 65535))]
+    pub beat: u16,
+    /// Command, 20 registers.
+    #[schemars(range(min = 0, max = 65535))]
+    pub command: u16,
+    /// Status, 48 registers.
+    #[schemars(range(min = 0, max = 65535))]
+    pub status: u16,
+    /// In force, 72 registers.
+    #[schemars(range(min = 0, max = 65535))]
+    pub in_force: u16,
+    /// Inbox header, 24 registers.
+    #[schemars(range(min = 0, max = 65535))]
+    pub inbox_header: u16,
+    /// Inbox page, 120 registers.
+    #[schemars(range(min = 0, max = 65535))]
+    pub inbox_page: u16,
+    /// Inbox state, 12 registers.
+    #[schemars(range(min = 0, max = 65535))]
+    pub inbox_state: u16,
+    /// Outbox header, 56 registers.
+    #[schemars(range(min = 0, max = 65535))]
+    pub outbox_header: u16,
+    /// Outbox select, 2 registers.
+    #[schemars(range(min = 0, max = 65535))]
+    pub outbox_select: u16,
+    /// Outbox page, 116 registers.
+    #[schemars(range(min = 0, max = 65535))]
+    pub outbox_page: u16,
+}
+
+impl Default for RegisterMap {
+    fn default() -> Self {
+        Self {
+            word_order: WordOrder::Big,
+            identity: 0,
+            sync: 32,
+            beat: 36,
+            command: 40,
+            status: 64,
+            in_force: 120,
+            inbox_header: 200,
+            inbox_page: 224,
+            inbox_state: 350,
+            outbox_header: 400,
+            outbox_select: 460,
+            outbox_page: 462,
+        }
+    }
+}
+
+impl RegisterMap {
+    /// Returns every block: its key in a cell file, its first register, and how many it has.
+    pub fn blocks(&self) -> [(&'static str, u16, u16); 12] {
+        [
+            ("identity", self.identity, 32),
+            ("sync", self.sync, 4),
+            ("beat", self.beat, 1),
+            ("command", self.command, 20),
+            ("status", self.status, 48),
+            ("in_force", self.in_force, 72),
+            ("inbox_header", self.inbox_header, 24),
+            ("inbox_page", self.inbox_page, 120),
+            ("inbox_state", self.inbox_state, 12),
+            ("outbox_header", self.outbox_header, 56),
+            ("outbox_select", self.outbox_select, 2),
+            ("outbox_page", self.outbox_page, 116),
+        ]
+    }
+
+    /// Tells the document which blocks overlap or end outside.
+    pub fn check(&self, place: &Place<'_>, document: &mut Document) {
+        let blocks = self.blocks();
+        for (k, &(name, first, count)) in blocks.iter().enumerate() {
+            let end = u32::from(first) + u32::from(count);
+            let key = place.key(&format!("registers.{name}"));
+            if end > REGISTERS {
+                let found = format!("is {first}; the block has {count} registers and would end at {}", end - 1);
+                document.report(&key, found, "the last register of a device is 65535", "lower it");
+            }
+            for &(other, start, length) in &blocks[..k] {
+                if u32::from(start) < end && u32::from(first) < u32::from(start) + u32::from(length) {
+                    // Where only the earlier block was moved, that is the one to correct.
+                    let moved = document.is_there(&key);
+                    let (key, of) =
+                        if moved { (key.clone(), other) } else { (place.key(&format!("registers.{other}")), name) };
+                    let found = format!("overlaps the block `{of}`");
+                    let allowed = format!(
+                        "`{other}` is {start} to {}, `{name}` is {first} to {}",
+                        u32::from(start) + u32::from(length) - 1,
+                        end - 1
+                    );
+                    document.report(&key, found, &allowed, "move one of them");
+                }
+            }
+        }
+    }
+}
+
+/// How the value of a signal is kept in its registers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+#[expect(missing_docs, reason = "they say it")]
+pub enum SignalType {
+    U16,
+    I16,
+    U32,
+    I32,
+    F32,
+    F64,
+}
+
+impl SignalType {
+    /// Returns how many registers a value takes.
+    pub fn registers(self) -> u16 {
+        match self {
+            Self::U16 | Self::I16 => 1,
+            Self::U32 | Self::I32 | Self::F32 => 2,
+            Self::F64 => 4,
+        }
+    }
+}
+
+/// A further value, read only.
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct SignalTable {
+    /// Its name.
+    #[schemars(length(min = 1, max = 60), extend("x-required" = true), example = &"spindle_load")]
+    pub name: Option<String>,
+    /// Address of its first register, from 0.
+    #[schemars(range(min = 0, max = 65535), extend("x-required" = true), example = 1000)]
+    pub address: Option<u16>,
+    /// How it is coded.
+    #[serde(rename = "type")]
+    #[schemars(extend("x-required" = true), example = &"u16")]
+    pub kind: Option<SignalType>,
+    /// Which word comes first; as `registers.word_order` when left out.
+    pub word_order: Option<WordOrder>,
+    /// What the number is multiplied by.
+    pub scale: f64,
+    /// Its unit after that.
+    #[schemars(length(max = 20))]
+    pub unit: String,
+    /// Least and largest value that is believed.
+    #[schemars(extend("x-required" = true), example = [0.0, 100.0])]
+    pub range: Option<[f64; 2]>,
+}
+
+impl Default for SignalTable {
+    fn default() -> Self {
+        Self { name: None, address: None, kind: None, word_order: None, scale: 1.0, unit: String::new(), range: None }
+    }
+}
+
+/// A register of the machine that the cell file asks for besides the contract's own: read with every status, checked against its range.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Signal {
+    /// Its name.
+    pub name: String,
+    /// The 0-based address of its first register.
+    pub address: u16,
+    /// How the value is kept.
+    pub kind: SignalType,
+    /// Which of its words comes first.
+    pub word_order: WordOrder,
+    /// What the kept value is multiplied with.
+    pub scale: f64,
+    /// The unit of the product.
+    pub unit: String,
+    /// The least and the most that can be.
+    pub range: [f64; 2],
+}
+
+impl Signal {
+    /// Checks the signals as they are written; none where one is incomplete, which has been told.
+    pub fn all(
+        written: &[SignalTable],
+        word_order: WordOrder,
+        place: &Place<'_>,
+        document: &mut Document,
+    ) -> Option<Vec<Self>> {
+        let mut signals = Vec::new();
+        for (k, table) in written.iter().enumerate() {
+            let key = |name: &str| place.key(&format!("signals[{k}].{name}"));
+            if let Some(name) = &table.name
+                && written[..k].iter().any(|other| other.name.as_ref() == Some(name))
+            {
+                let found = format!("is {name:?} a second time");
+                document.report(&key("name"), found, "", "give every signal its own name");
+            }
+            if table.scale == 0.0 {
+                document.report(&key("scale"), "is 0", "every value would be 0", "1 leaves the number as it is");
+            }
+            let Some(signal) = Self::of(table, word_order) else { continue };
+            if signal.range[0] >= signal.range[1] {
+                let found = format!("is [{}, {}]", signal.range[0], signal.range[1]);
+                document.report(&key("range"), found, "the first must be less than the second", "interchange them");
+            }
+            let last = u32::from(signal.address) + u32::from(signal.kind.registers()) - 1;
+            if last >= REGISTERS {
+                let found = format!("is {}; the value would end at {last}", signal.address);
+                document.report(&key("address"), found, "the last register of a device is 65535", "lower it");
+            }
+            signals.push(signal);
+        }
+        (signals.len() == written.len()).then_some(signals)
+    }
+
+    fn of(table: &SignalTable, word_order: WordOrder) -> Option<Self> {
+        Some(Self {
+            name: table.name.clone()?,
+            address: table.address?,
+            kind: table.kind?,
+            word_order: table.word_order.unwrap_or(word_order),
+            scale: table.scale,
+            unit: table.unit.clone(),
+            range: table.range?,
+        })
+    }
+}
+
+/// Everything that has to be known to drive a machine over Modbus.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModbusSettings {
+    /// Where it is.
+    pub line: Line,
+    /// Its unit number.
+    pub unit: u8,
+    /// Where its blocks begin, and the order of its words.
+    pub registers: RegisterMap,
+    /// How long an answer may take.
+    pub request_timeout: Duration,
+    /// How often a request is asked again.
+    pub retries: u32,
+    /// After how long without an answer a request is given up, however often it was asked.
+    pub lost_after: Duration,
+    /// How long the machine may need for an answer at worst: after an error the line is left alone for so long.
+    pub quarantine: Duration,
+    /// The number of this client; not 0.
+    pub owner: u32,
+    /// Rises with each start of this client.
+    pub epoch: u32,
+    /// What to read besides.
+    pub signals: Vec<Signal>,
+    /// A beat is written when the last one is so old; a machine takes its client for lost after a second and a half without one.
+    pub beat_every: Duration,
+    /// The name that the machine must give of itself; `None` takes any.
+    pub expected_name: Option<String>,
+    /// Whether the machine must be a simulation or must not be one; `None` takes either.
+    pub simulation: Option<bool>,
+}
+
+impl ModbusSettings {
+    /// Settings that suit a machine on a quiet network, to be changed field by field.
+    pub fn new(line: Line) -> Self {
+        Self {
+            line,
+            unit: 1,
+            registers: RegisterMap::default(),
+            request_timeout: Duration::from_millis(500),
+            retries: 3,
+            lost_after: Duration::from_secs(5),
+            quarantine: Duration::from_millis(100),
+            owner: 1,
+            epoch: 1,
+            signals: Vec::new(),
+            beat_every: Duration::from_millis(250),
+            expected_name: None,
+            simulation: None,
+        }
+    }
+
+    /// Settings for a unit on a line, as the cell file has them.
+    pub fn of(line: Line, unit: u8, making: &Making<'_>) -> Self {
+        let timing = making.timing;
+        Self {
+            unit,
+            registers: *making.registers,
+            request_timeout: timing.request_timeout,
+            retries: u32::from(timing.retries),
+            lost_after: timing.lost_after,
+            quarantine: timing.quarantine,
+            owner: making.owner,
+            epoch: making.epoch,
+            signals: making.signals.to_vec(),
+            beat_every: timing.heartbeat,
+            expected_name: making.expected_name.map(str::to_owned),
+            simulation: Some(making.simulated),
+            ..Self::new(line)
+        }
+    }
+}

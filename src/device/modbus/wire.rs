@@ -1,0 +1,68 @@
+//! The two wires of Modbus, as the table of drivers knows them.
+
+use super::settings::{Line, ModbusSettings, RtuWire, TcpWire};
+use super::{Link, ModbusCmm, ModbusGrinder};
+use crate::device::wiring::{Making, MakingError, Place, Wired};
+use crate::document::Document;
+
+macro_rules! modbus_wire {
+    ($wire:ident) => {
+        impl Wired for $wire {
+            type Cmm = ModbusCmm;
+            type Grinder = ModbusGrinder;
+            const HAS_REGISTERS: bool = true;
+
+            fn check(&self, place: &Place<'_>, document: &mut Document) {
+                self.check_address(place, document);
+            }
+
+            fn check_beside(&self, grinder: &Self, document: &mut Document) {
+                self.compare(grinder, document);
+            }
+
+            fn notes(&self) -> Vec<String> {
+                self.missing().into_iter().collect()
+            }
+
+            fn cmm(&self, making: &Making<'_>) -> Result<ModbusCmm, MakingError> {
+                let (link, settings) = link(self.line(), self.unit, self.missing(), making)?;
+                Ok(ModbusCmm::on(link, settings))
+            }
+
+            fn grinder(&self, making: &Making<'_>) -> Result<ModbusGrinder, MakingError> {
+                let (link, settings) = link(self.line(), self.unit, self.missing(), making)?;
+                Ok(ModbusGrinder::on(link, settings))
+            }
+
+            fn link(cmm: &ModbusCmm) -> Option<&Link> {
+                Some(cmm.link())
+            }
+
+            fn line(&self) -> Option<(Line, u8)> {
+                Some((self.line(), self.unit))
+            }
+        }
+    };
+}
+
+modbus_wire!(TcpWire);
+modbus_wire!(RtuWire);
+
+/// Makes the line of a machine, or shares that of the other one, and everything that has to be known to drive it.
+fn link(
+    line: Line,
+    unit: u8,
+    missing: Option<String>,
+    making: &Making<'_>,
+) -> Result<(Link, ModbusSettings), MakingError> {
+    if let Some(missing) = missing {
+        return Err(MakingError::NoPort { missing });
+    }
+    let settings = ModbusSettings::of(line, unit, making);
+    let link = match making.beside.filter(|link| *link.line() == settings.line) {
+        Some(link) => link.clone(),
+        None => Link::new(settings.line.clone(), settings.request_timeout, settings.quarantine)
+            .map_err(|source| MakingError::Line { line: settings.line.to_string(), source })?,
+    };
+    Ok((link, settings))
+}

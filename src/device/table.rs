@@ -1,0 +1,203 @@
+//! Every driver, one line each: what a cell file calls it, and the folder that owns the rest.
+
+use schemars::JsonSchema;
+use serde::Deserialize;
+
+use super::exchange::ExchangeWire;
+use super::machine::{Cmm, Grinder, Interrupt, Machine};
+use super::manual::ManualWire;
+use super::modbus::{Line, Link, RtuWire, TcpWire};
+use super::wiring::{Making, MakingError, Place, Wired};
+use super::{
+    Armed, CorrectionMap, DeviceError, Identity, Job, Measurement, Pass, PassRecord, Plan, Reconciled, Started, Status,
+    Word,
+};
+use crate::document::Document;
+use crate::formats::result::Coordinates;
+
+macro_rules! drivers {
+    ($($(#[$doc:meta])* $wire:ident($table:ty)),+ $(,)?) => {
+        /// The wire to a machine.
+        #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+        #[serde(tag = "kind", rename_all = "kebab-case")]
+        pub enum Wire {
+            $($(#[$doc])* $wire($table)),+
+        }
+
+        /// A measuring machine by whatever wire.
+        #[derive(Debug)]
+        // There are two of these in a program; nothing is gained by a box.
+        #[allow(clippy::large_enum_variant)]
+        pub enum AnyCmm {
+            $($(#[$doc])* $wire(<$table as Wired>::Cmm)),+
+        }
+
+        /// A grinder by whatever wire.
+        #[derive(Debug)]
+        #[allow(clippy::large_enum_variant)]
+        pub enum AnyGrinder {
+            $($(#[$doc])* $wire(<$table as Wired>::Grinder)),+
+        }
+
+        impl Wire {
+            /// Tells what is wrong with it beyond what the schema holds it to.
+            pub fn check(&self, place: &Place<'_>, document: &mut Document) {
+                match self { $(Self::$wire(wire) => Wired::check(wire, place, document)),+ }
+            }
+
+            /// Tells what is wrong with this wire, the CMM's, beside that of the grinder.
+            pub fn check_beside(&self, grinder: &Self, document: &mut Document) {
+                match (self, grinder) {
+                    $((Self::$wire(cmm), Self::$wire(grinder)) => Wired::check_beside(cmm, grinder, document),)+
+                    _ => {}
+                }
+            }
+
+            /// What a person should know of it on this computer.
+            pub fn notes(&self) -> Vec<String> {
+                match self { $(Self::$wire(wire) => wire.notes()),+ }
+            }
+
+            /// Whether a person serves the machine.
+            pub fn is_by_person(&self) -> bool {
+                match self { $(Self::$wire(_) => <$table>::BY_PERSON),+ }
+            }
+
+            /// Whether the tables `registers` and `signals` say something of it.
+            pub fn has_registers(&self) -> bool {
+                match self { $(Self::$wire(_) => <$table>::HAS_REGISTERS),+ }
+            }
+
+            /// Whether its grinder works by what lies in the folder of the run.
+            pub fn works_from_run(&self) -> bool {
+                match self { $(Self::$wire(_) => <$table>::WORKS_FROM_RUN),+ }
+            }
+
+            /// What the coordinates of a measurement are; none where each result says so itself.
+            pub fn coordinates(&self) -> Option<Coordinates> {
+                match self { $(Self::$wire(wire) => wire.coordinates()),+ }
+            }
+
+            /// The Modbus line and the unit on it, where it is one.
+            pub fn line(&self) -> Option<(Line, u8)> {
+                match self { $(Self::$wire(wire) => Wired::line(wire)),+ }
+            }
+
+            /// Makes the driver of a measuring machine; nothing is asked of the machine yet.
+            ///
+            /// # Errors
+            /// Those of [`Wired::cmm`].
+            pub fn cmm(&self, making: &Making<'_>) -> Result<AnyCmm, MakingError> {
+                Ok(match self { $(Self::$wire(wire) => AnyCmm::$wire(wire.cmm(making)?)),+ })
+            }
+
+            /// Makes the driver of a grinder; nothing is asked of the machine yet.
+            ///
+            /// # Errors
+            /// Those of [`Wired::grinder`].
+            pub fn grinder(&self, making: &Making<'_>) -> Result<AnyGrinder, MakingError> {
+                Ok(match self { $(Self::$wire(wire) => AnyGrinder::$wire(wire.grinder(making)?)),+ })
+            }
+        }
+
+        impl AnyCmm {
+            /// The line that another machine may share.
+            pub fn link(&self) -> Option<&Link> {
+                match self { $(Self::$wire(cmm) => <$table>::link(cmm)),+ }
+            }
+        }
+
+        machine!(AnyCmm: $($wire),+);
+        machine!(AnyGrinder: $($wire),+);
+
+        impl Cmm for AnyCmm {
+            async fn load_plan(&mut self, plan: &Plan, interrupt: &Interrupt) -> Result<(), DeviceError> {
+                match self { $(Self::$wire(cmm) => cmm.load_plan(plan, interrupt).await),+ }
+            }
+            async fn collect(&mut self, job: Job, interrupt: &Interrupt) -> Result<Measurement, DeviceError> {
+                match self { $(Self::$wire(cmm) => Cmm::collect(cmm, job, interrupt).await),+ }
+            }
+        }
+
+        impl Grinder for AnyGrinder {
+            async fn load_pass(
+                &mut self,
+                map: &CorrectionMap,
+                pass: &Pass,
+                interrupt: &Interrupt,
+            ) -> Result<(), DeviceError> {
+                match self { $(Self::$wire(grinder) => grinder.load_pass(map, pass, interrupt).await),+ }
+            }
+            async fn collect(&mut self, job: Job, interrupt: &Interrupt) -> Result<PassRecord, DeviceError> {
+                match self { $(Self::$wire(grinder) => Grinder::collect(grinder, job, interrupt).await),+ }
+            }
+        }
+    };
+}
+
+/// A choice between drivers, which answers as the one that was chosen.
+macro_rules! machine {
+    ($any:ident: $($wire:ident),+) => {
+        impl Machine for $any {
+            fn name(&self) -> &str {
+                match self { $(Self::$wire(machine) => machine.name()),+ }
+            }
+            fn notes(&self) -> Vec<String> {
+                match self { $(Self::$wire(machine) => Machine::notes(machine)),+ }
+            }
+            async fn connect(&mut self) -> Result<Identity, DeviceError> {
+                match self { $(Self::$wire(machine) => machine.connect().await),+ }
+            }
+            async fn status(&mut self) -> Result<Status, DeviceError> {
+                match self { $(Self::$wire(machine) => machine.status().await),+ }
+            }
+            async fn claim(&mut self) -> Result<Status, DeviceError> {
+                match self { $(Self::$wire(machine) => machine.claim().await),+ }
+            }
+            async fn prepare(&mut self, job: Job) -> Result<Armed, DeviceError> {
+                match self { $(Self::$wire(machine) => machine.prepare(job).await),+ }
+            }
+            async fn start(&mut self, armed: Armed) -> Result<Started, DeviceError> {
+                match self { $(Self::$wire(machine) => machine.start(armed).await),+ }
+            }
+            async fn hold(&mut self) -> Result<Status, DeviceError> {
+                match self { $(Self::$wire(machine) => machine.hold().await),+ }
+            }
+            async fn resume(&mut self) -> Result<Status, DeviceError> {
+                match self { $(Self::$wire(machine) => machine.resume().await),+ }
+            }
+            async fn stop(&mut self) -> Result<Status, DeviceError> {
+                match self { $(Self::$wire(machine) => machine.stop().await),+ }
+            }
+            async fn abort(&mut self) -> Result<Status, DeviceError> {
+                match self { $(Self::$wire(machine) => machine.abort().await),+ }
+            }
+            async fn clear(&mut self) -> Result<Status, DeviceError> {
+                match self { $(Self::$wire(machine) => machine.clear().await),+ }
+            }
+            async fn acknowledge(&mut self, done: u32) -> Result<Status, DeviceError> {
+                match self { $(Self::$wire(machine) => machine.acknowledge(done).await),+ }
+            }
+            async fn release(&mut self) -> Result<Status, DeviceError> {
+                match self { $(Self::$wire(machine) => machine.release().await),+ }
+            }
+            async fn reconcile(&mut self, intended: &Armed) -> Result<Reconciled, DeviceError> {
+                match self { $(Self::$wire(machine) => machine.reconcile(intended).await),+ }
+            }
+            async fn confirm(&mut self, word: Word) -> Result<Vec<String>, DeviceError> {
+                match self { $(Self::$wire(machine) => machine.confirm(word).await),+ }
+            }
+        }
+    };
+}
+
+drivers! {
+    /// Modbus over TCP.
+    ModbusTcp(TcpWire),
+    /// Modbus over a serial line.
+    ModbusRtu(RtuWire),
+    /// Files in two folders, and a person.
+    FileExchange(ExchangeWire),
+    /// A person, step by step.
+    Manual(ManualWire),
+}

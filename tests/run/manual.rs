@@ -1,0 +1,238 @@
+//! A whole part on machines that a person serves. The test is the person: it does what the prompts ask, types what they say, and has the
+//! simulated machines grind by the files of the run and measure by its plan.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use regrind::journal::{Reader, Record};
+use regrind_sim::body::{Body, Payload, Payloads};
+use regrind_sim::payload::{Feature, Map, Pass, Plan, Status, Target, decode_points};
+use regrind_sim::spec::WorldSpec;
+use regrind_sim::world::World;
+use serde::Deserialize;
+use sha2::{Digest, Sha256};
+
+use crate::program::{PATIENCE, Running, changed, regrind, root, run};
+
+const RADIUS_MM: f64 = 1.5;
+
+/// The shipped mirror with 300 points; the probe is not checked on a sphere.
+fn recipe(home: &Path) -> (PathBuf, WorldSpec) {
+    let text = changed(
+        "recipes/freeform-mirror.toml",
+        &[
+            ("columns = 60", "columns = 20"),
+            ("rows = 30", "rows = 15"),
+            ("accuracy_nm = 0.5", "spacing_mm = 0.5"),
+            ("cutoff_mm = 5.0", "cutoff_mm = 11.0"),
+            ("qualify = true", "qualify = false"),
+        ],
+    );
+    let path = home.join("mirror.toml");
+    fs::write(&path, &text).unwrap();
+    let table: toml::Table = toml::from_str(&text).unwrap();
+    assert_eq!(table["measure"]["probe_radius_mm"].as_float(), Some(RADIUS_MM));
+    (path, WorldSpec::deserialize(table["simulation"].clone()).unwrap())
+}
+
+/// Rows of numbers below the comments and the header of a file.
+fn rows(path: &Path) -> Vec<Vec<f64>> {
+    let text = fs::read_to_string(path).unwrap();
+    let lines = text.lines().filter(|l| l.starts_with(|c: char| c.is_ascii_digit() || c == '-'));
+    lines.map(|line| line.split(',').map(|field| field.parse().unwrap()).collect()).collect()
+}
+
+/// What stands above the numbers behind these words.
+fn stated(path: &Path, words: &str) -> String {
+    let text = fs::read_to_string(path).unwrap();
+    let line = text.lines().find(|line| line.contains(words)).unwrap_or_else(|| panic!("no {words:?} in {path:?}"));
+    line.split(words).nth(1).unwrap().trim().to_owned()
+}
+
+struct Person {
+    home: tempfile::TempDir,
+    world: World,
+    measured: u32,
+}
+
+impl Person {
+    /// Types a command as a prompt has it.
+    fn types(&self, command: &str) -> (i32, String) {
+        let words: Vec<&str> = command.split(' ').collect();
+        let (code, out, err) = run(&words, self.home.path());
+        (code, out + &err)
+    }
+
+    fn does(&self, command: &str) {
+        let (code, told) = self.types(command);
+        assert_eq!(code, 0, "{command}: {told}");
+    }
+
+    /// Grinds by the map of a cycle's folder, as the prompt names it.
+    fn grinds(&self, correction: &Path, cycle: u16) {
+        let nodes = rows(correction);
+        let columns = nodes.iter().take_while(|node| node[1] == nodes[0][1]).count();
+        let spacing_mm = [nodes[1][0] - nodes[0][0], nodes[columns][1] - nodes[0][1]];
+        let map = Map {
+            columns: columns as u32,
+            rows: (nodes.len() / columns) as u32,
+            first_mm: [nodes[0][0], nodes[0][1]],
+            spacing_mm,
+            nominal: [7; 32],
+            values_mm: nodes.iter().map(|node| node[2]).collect(),
+        };
+        let level = stated(correction, "# level over the nominal surface:");
+        let pass = Pass {
+            spark_out: 1,
+            wheel_radius_mm: 25.0,
+            feed_mm_min: 1000.0,
+            track_spacing_mm: 0.5,
+            level_mm: level.trim_end_matches("mm").trim().parse().unwrap(),
+            depth_of_cut_mm: 0.02,
+            extent_mm: [-51.0, 51.0, -31.0, 31.0],
+            nominal: [7; 32],
+        };
+        let payload = |bytes: Vec<u8>, kind: u8| Some(Payload { bytes, identity: [kind; 32] });
+        let payloads = Payloads { plan: None, map: payload(map.encode(), 2), pass: payload(pass.encode(), 3) };
+        let mut grinder = self.world.grinder();
+        grinder.prepare(1, cycle, &payloads).unwrap();
+        grinder.begin();
+        while !grinder.advance(1000.0).finished {}
+    }
+
+    /// Measures by the plan that the prompt names, and saves the points as a measuring program would.
+    fn measures(&mut self, plan: &Path) -> PathBuf {
+        let target = |row: Vec<f64>| Target {
+            index: row[0] as u32,
+            feature: Feature::Part,
+            point_mm: [row[1], row[2], row[3]],
+            normal: [row[4], row[5], row[6]],
+        };
+        let (approach_mm, search_mm, speed_mm_s, safe_height_mm) = (2.0, 2.0, 5.0, 50.0);
+        let targets = rows(plan).into_iter().map(target).collect();
+        let plan = Plan { probe_radius_mm: RADIUS_MM, approach_mm, search_mm, speed_mm_s, safe_height_mm, targets };
+        let payload = Payload { bytes: plan.encode(), identity: [1; 32] };
+        let mut cmm = self.world.cmm();
+        cmm.prepare(1, 0, &Payloads { plan: Some(payload), ..Payloads::default() }).unwrap();
+        cmm.begin();
+        while !cmm.advance(1000.0).finished {}
+        let outcome = cmm.outcome(1);
+        let points = decode_points(&outcome.bytes, (outcome.format == 2).then_some(outcome.scale_mm)).unwrap();
+        let touched = points.iter().zip(&plan.targets).filter(|(point, _)| point.status == Status::Touched);
+        let row = |(p, t): (&regrind_sim::payload::PointRecord, &Target)| {
+            format!("{},{},{},{}\n", t.index, p.position_mm[0], p.position_mm[1], p.position_mm[2])
+        };
+        self.measured += 1;
+        let path = self.home.path().join(format!("measured-{}.csv", self.measured));
+        fs::write(&path, "index,x,y,z\n".to_owned() + &touched.map(row).collect::<String>()).unwrap();
+        path
+    }
+}
+
+/// Has the run held in the middle of a pass: it is not held before a person has seen the grinder stand.
+fn hold_and_go_on(person: &Person, program: &mut Running) {
+    person.does("hold");
+    let still = program.line("prompt to hold", |line| line.contains("then: regrind confirm still"));
+    let state = || person.types("status").1;
+    assert!(state().starts_with("Holding"), "{}", state());
+    person.does(still.split("then: regrind ").nth(1).unwrap());
+    let began = Instant::now();
+    while !state().starts_with("Held") {
+        assert!(began.elapsed() < PATIENCE, "{}", state());
+    }
+    person.does("resume");
+}
+
+#[test]
+fn a_person_makes_a_part_step_by_step_and_the_record_says_who_and_when() {
+    let home = tempfile::tempdir().unwrap();
+    let (recipe, spec) = recipe(home.path());
+    let cell = root().join("config/manual.toml");
+    let (recipe, cell) = (recipe.display().to_string(), cell.display().to_string());
+    let begin = ["run", &*recipe, "--cell", &*cell, "--part", "SN-7"];
+    let mut program = Running::new(regrind(&begin, home.path()));
+    let folder = program.folder(home.path());
+    let mut person = Person { home, world: World::new(spec).unwrap(), measured: 0 };
+    let (mut cycle, mut said) = (1, Vec::new());
+    loop {
+        let line = program.line("prompt", |line| line.contains("then: regrind ") || line.starts_with("ACCEPTED"));
+        let Some(command) = line.split("then: regrind ").nth(1) else { break };
+        let asks = |line: &&String| line.contains("GRIND SN-7") || line.contains("MEASURE SN-7");
+        let asked = program.said.iter().rev().find(asks).cloned().unwrap_or_default();
+        // The file that the prompt names.
+        let file = |before: &str, after: &str| {
+            let rest = asked.split(before).nth(1).unwrap_or_else(|| panic!("no {before:?} in {asked:?}"));
+            person.home.path().join(rest.split(after).next().unwrap())
+        };
+        match command {
+            "confirm started" => {
+                // Nothing has ended that was not begun, and no word counts that names another map.
+                let (code, told) = person.types("confirm done");
+                assert!(code == 3 && told.contains("confirm first that it has begun"), "{told}");
+                let (code, told) = person.types("confirm started --map 0123456789abcdef");
+                assert!(code == 3 && told.contains("is another one"), "{told}");
+                let ngc = file(": by ", " (map");
+                let correction = ngc.with_file_name("correction.csv");
+                let map = stated(&correction, "# map: sha256");
+                assert!(asked.contains(&format!("(map {})", &map[..8])), "{asked}");
+                assert!(ngc.ends_with("toolpath.ngc") && fs::read_to_string(&ngc).unwrap().contains(&map));
+                person.does(command);
+                if cycle == 1 {
+                    hold_and_go_on(&person, &mut program);
+                }
+                person.grinds(&correction, cycle);
+            }
+            "confirm done --file RESULT" => {
+                let plan = file(" points of ", "\n");
+                let measured = person.measures(&plan);
+                if cycle == 1 {
+                    let whole = fs::read_to_string(&measured).unwrap();
+                    fs::write(person.home.path().join("half.csv"), &whole[..whole.len() / 2]).unwrap();
+                    for (command, why) in [("confirm done --file half.csv", "half.csv"), ("confirm done", "--file")] {
+                        let (code, told) = person.types(command);
+                        assert!(code == 3 && told.contains(why), "{told}");
+                    }
+                }
+                person.does(&command.replace("RESULT", &format!("measured-{cycle}.csv")));
+                cycle += 1;
+            }
+            _ => person.does(command),
+        }
+        said.push(command.to_owned());
+    }
+    let (code, errors) = program.end();
+    assert_eq!(code, 0, "{errors}");
+    println!("{}", program.said.join("\n"));
+    assert!(cycle > 2 && said[0] == "confirm loaded", "{said:?}");
+
+    // Who and when, for each step.
+    let reader = Reader::open(&folder).unwrap();
+    let records: Vec<Record> = reader.records(1).map(Result::unwrap).collect();
+    let by_a_person = |record: &&Record| {
+        assert!(record.actor.contains("uid") && record.utc.ends_with('Z'), "{record:?}");
+        true
+    };
+    let count = |device: &str, confirmed: &str| {
+        let is = |r: &&Record| r.value()["confirmed"] == confirmed && r.value()["device"] == device;
+        records.iter().filter(is).filter(by_a_person).count()
+    };
+    let cycles = usize::from(cycle - 1);
+    // The three that were refused are on record too.
+    assert_eq!((count("grinder", "started"), count("grinder", "still")), (cycles, 1));
+    assert_eq!((count("grinder", "done"), count("cmm", "done")), (2 * cycles, cycles + 2));
+    let loaded = |r: &&Record| r.value()["event"] == "load_confirmed" && r.value()["actor"].is_object();
+    assert_eq!(records.iter().filter(loaded).filter(by_a_person).count(), 1);
+    // The files that came are kept as they came, by their hashes; what nobody told is not there.
+    for k in 1..cycle {
+        let bytes = fs::read(person.home.path().join(format!("measured-{k}.csv"))).unwrap();
+        assert!(fs::read(folder.join(format!("cycle-{k}/result.csv"))).unwrap() == bytes);
+        let hash: String = Sha256::digest(&bytes).iter().map(|b| format!("{b:02x}")).collect();
+        let kept = |r: &Record| r.payload.contains(&format!("cycle-{k}/result.csv")) && r.payload.contains(&hash);
+        assert!(records.iter().any(kept), "{k}");
+    }
+    let pass = records.iter().find(|r| r.value().get("pass_record").is_some()).unwrap().value();
+    assert!(pass["pass_record"]["removed_mm3"].is_null() && pass["pass_record"]["duration_s"].is_number(), "{pass}");
+    let (code, told) = person.types("audit verify");
+    assert_eq!(code, 0, "{told}");
+}
