@@ -1,6 +1,4 @@
-//! What a client and a machine say to each other by docs/modbus.md: states, commands, answers, and the registers of a command.
-//!
-//! The controller has the same numbers in types of its own: one wrong number must not stand at both ends of the wire.
+//! States, commands and answers of docs/modbus.md of its own, for an error in one must not stand at both ends of the wire.
 
 use crate::words::{Image, WordOrder, bytes_of, crc16};
 

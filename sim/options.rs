@@ -1,6 +1,4 @@
-//! How a simulated machine is set up: where its blocks of registers are, and how it behaves.
-//!
-//! The controller has a register map of its own, read from its cell file: here stands what the machine really has.
+//! How a machine is set up, with a register map of its own: what the machine really has, where a cell file says what it should have.
 
 use std::time::Duration;
 

@@ -1,4 +1,6 @@
-//! The part as it really is: a closed form plus a height error that grinding changes, and the ball that touches it.
+//! The part as it really is, with an aperture and a grid of its own, for the truth must share no error with the code under test.
+//!
+//! It is a closed form plus a height error that grinding changes, and the ball that touches it.
 //!
 //! The height error h stands on a fine grid over the part and a little beyond, in millimetres along the nominal normal,
 //! and is interpolated by bicubic convolution (Catmull-Rom), which has a continuous gradient. That interpolation is the

@@ -1,4 +1,6 @@
-//! The payloads of docs/modbus.md as bytes, high word first: plan, map and pass in, points and pass record out.
+//! The payloads of docs/modbus.md by a reader and writer of its own, for an error in one must not stand at both ends of the wire.
+//!
+//! Plan, map and pass come in, points and pass record go out, as bytes, high word first.
 //!
 //! What comes in is trusted in nothing: format, length, count, reserved zeros, finite numbers and declared extremes are
 //! checked before anything of that size is set aside, and what does not hold is a [`Refusal`] in words. The other way

@@ -1,4 +1,6 @@
-//! What the part should be: closed-form surfaces z(x, y) with exact derivatives.
+//! What the part should be, by formulas of its own, for the truth must share no error with the code under test.
+//!
+//! Closed-form surfaces z(x, y) with exact derivatives.
 
 use crate::Vec3;
 

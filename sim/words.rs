@@ -1,4 +1,4 @@
-//! How values lie in registers: word order, checksums, and the fields of every payload.
+//! How values lie in registers: word order and checksums of its own, for an error in one must not stand at both ends of the wire.
 //!
 //! A machine that stands low word first does so in its payloads too, while the physics behind it reads them high word first.
 //! So the machine must know where in a payload the values of more than one register begin; that is the table at the end.

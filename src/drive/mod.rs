@@ -41,7 +41,9 @@ pub use control::{Reply, Request, Snapshot, ask};
 pub use notice::{CycleRow, Notice};
 pub use program::{ProgramError, Programs};
 use record::{Files, Recorder, entry};
-use station::{Aborts, Ask, CmmDriver, Fetched, GrinderDriver, Intent, Load, Station, StationDriver, StationReport};
+use station::{
+    Aborts, Ask, CmmDriver, Fetched, GrinderDriver, Intent, Load, MachineTask, StationDriver, StationReport,
+};
 use work::{Cycle, Product};
 pub use work::{Probing, Sphere, Task};
 
@@ -735,7 +737,7 @@ fn spawn<D: StationDriver>(
     poll: Duration,
 ) -> (mpsc::Sender<Ask>, tokio::task::JoinHandle<()>) {
     let (asks, asked) = mpsc::channel(16);
-    let station = Station::new(driver, job, interrupt.clone(), reports.clone()).with_intent(armed);
+    let station = MachineTask::new(driver, job, interrupt.clone(), reports.clone()).with_intent(armed);
     (asks, tokio::spawn(station.attend(asked, poll, Aborts::new(aborts.subscribe()))))
 }
 

@@ -140,7 +140,7 @@ impl Aborts {
 }
 
 /// A task that attends to one machine.
-pub(super) struct Station<B> {
+pub(super) struct MachineTask<B> {
     driver: B,
     job: u32,
     interrupt: Interrupt,
@@ -182,7 +182,7 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(5);
 /// Progress is told at most this often, so that the journal stays readable.
 const PROGRESS_EVERY: Duration = Duration::from_millis(250);
 
-impl<B: StationDriver> Station<B> {
+impl<B: StationDriver> MachineTask<B> {
     pub(super) fn new(driver: B, job: u32, interrupt: Interrupt, reports: mpsc::Sender<StationReport>) -> Self {
         Self {
             driver,

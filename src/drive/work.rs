@@ -72,7 +72,7 @@ pub struct Task {
     pub place: MapLimits,
     /// How a pass is ground; level and identity are set for each cycle.
     pub pass: Pass,
-    /// Half the largest PV that is accepted: what lies within it about zero is drawn as within tolerance.
+    /// Half the largest PV that is accepted: what lies within it about zero is drawn as in tolerance.
     pub tolerance_mm: Option<f64>,
     /// How programs are made, or why there are none.
     pub programs: Result<Programs, PathError>,
@@ -382,8 +382,8 @@ fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFa
     match (measurement.coordinates, task.coordinates) {
         (Coordinates::Contacts, Some(Coordinates::Centres)) => return Some(GateFailure::Contacts),
         (Coordinates::Centres, Some(Coordinates::Contacts)) => {
-            let words = "the machine gives probe centres where the cell file expects contact points";
-            return Some(GateFailure::Broken(words.into()));
+            let message = "the machine gives probe centres where the cell file expects contact points";
+            return Some(GateFailure::Broken(message.into()));
         }
         _ => {}
     }

@@ -77,7 +77,7 @@ fn header(title: &str, points: usize, triangles: usize, tones: &Tones, remarks: 
     remarks.iter().for_each(|remark| comment(remark));
     comment(&format!("colours: blue {} um to red {} um", 1e3 * tones.range[0], 1e3 * tones.range[1]));
     if let Some(band) = tones.tolerance {
-        comment(&format!("within tolerance: {} um on either side of zero, a tint", 1e3 * band));
+        comment(&format!("in tolerance: {} um on either side of zero, a tint", 1e3 * band));
     }
     text.push_str(&format!(
         "element vertex {points}\nproperty double x\nproperty double y\nproperty double z\nproperty uchar red\nproperty uchar \
@@ -107,7 +107,7 @@ mod tests {
         let row = |k: usize| &bytes[begin + 35 * k + 24..][..11];
         assert_eq!(row(1)[..3], [0x05, 0x30, 0x61]);
         assert_eq!(row(2)[..3], [0xf7; 3]);
-        assert!(row(0)[..3].iter().all(|c| *c > 0xe0), "within tolerance: {:?}", row(0));
+        assert!(row(0)[..3].iter().all(|c| *c > 0xe0), "in tolerance: {:?}", row(0));
         assert_eq!(f64::from_le_bytes(row(1)[3..].try_into().unwrap()), -2.0);
     }
 

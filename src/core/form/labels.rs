@@ -52,7 +52,7 @@ pub const EVERY_POINT: &str = "none: every point used";
 
 /// Returns the figures of points with their labels, in the order of a report.
 ///
-/// Units: micrometres; coverage in per cent.
+/// Units: micrometres; coverage in percent.
 pub fn labelled(figures: &Figures, taken_out: &TakenOut) -> Vec<Labelled> {
     let Figures { pvr, highest, lowest, coverage, .. } = figures;
     let removed = taken_out.removed(&figures.removed);

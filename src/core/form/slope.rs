@@ -97,7 +97,7 @@ mod tests {
         for length in [2.0, 4.0, 6.0] {
             let expected = (0.5 * k * length).sin() / (0.5 * k * length) * k * 1e-6 / 2f64.sqrt();
             let found = of(|x, _| 1e-6 * (k * x).sin(), &all, length).unwrap().rms_along_rad[0];
-            // Not whole waves: a few per cent.
+            // Not whole waves: a few percent.
             assert!((found / expected - 1.0).abs() < 0.05, "{length}: {found} {expected}");
         }
     }

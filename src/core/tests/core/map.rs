@@ -117,7 +117,7 @@ fn strewn_readings_pass_half_of_a_wave_too() {
         let readings = strewn(30_000, [90.0, 70.0], 3, |x, y| wave([x, y]));
         let map = made(&readings, &plain(cutoff, spacing));
         let share = passed(&map, wave, |[x, y]| x.abs() < 45.0 - cutoff && y.abs() < 35.0 - cutoff);
-        // Chance thins the readings out here and there, which is worth half a per cent by itself.
+        // Chance thins the readings out here and there, which is worth half a percent by itself.
         assert!((share - 0.5).abs() < 0.01, "{spacing} {cutoff}: {share}");
     }
 }
