@@ -7,9 +7,9 @@ use std::path::Path;
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
-use regrind::compensation::path::{Field, Move, PathOptions, Summary, ToolPath, Wanted, Wheel};
+use regrind::compensation::path::{Field, Move, PathMode, PathOptions, Summary, ToolPath, Wanted, Wheel};
 use regrind::compensation::{Correction, CorrectionLimits, GainRule, LearningState, MapOptions, Seen, error_map};
-use regrind::formats::gcode::{PathMode, ProgramHeader, write_program};
+use regrind::formats::gcode::{ProgramHeader, write_program};
 use regrind::geometry::{Aperture, Grid, Sample};
 
 fn main() {
@@ -103,7 +103,8 @@ fn write(path: &ToolPath, summary: &Summary, file: &Path) {
         tracks: String::new(),
         spark_out_passes: 0,
         simulation: true,
-        mode: PathMode::default(),
+        mode: PathMode::Blend,
+        path_tolerance_mm: 1e-4,
     };
     write_program(file, &header, summary, &path.moves_by_track()).expect("a program");
 }

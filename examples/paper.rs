@@ -202,7 +202,7 @@ const MISALIGNMENTS: [Misalignment; 8] = [
 fn as_in_the_paper(distance: Distance) -> Options {
     Options {
         start: Start::Pose(Pose::identity()),
-        side: ProbeSide::Known(Side::Normal),
+        side: ProbeSide::Above,
         outlier_sigmas: f64::INFINITY,
         distance,
         ..Options::new(PROBE_RADIUS_MM)

@@ -10,22 +10,17 @@ use std::time::Duration;
 use sha2::{Digest, Sha256};
 use thiserror::Error;
 
-use crate::cell::{Beginning, CellPlan, Deadlines, Disposal, Gates, Tolerance};
-use crate::compensation::path::{
-    Limits, PathError, PathOptions, Pattern as TrackPattern, TrackSpacing, Wheel as PathWheel,
-};
+use crate::cell::{CellPlan, Deadlines, Disposal, Gates, Tolerance};
+use crate::compensation::path::{Limits, PathError, PathOptions, TrackSpacing, Wheel as PathWheel};
 use crate::compensation::{CorrectionLimits, MapOptions, contact_width_mm};
 use crate::config::{CellConfig, Link};
 use crate::device::{AnyCmm, AnyGrinder, Making, MakingError, ModbusSettings, Pass};
 use crate::drive::{Probing, Programs, Sphere, Task};
-use crate::formats::gcode;
 use crate::formats::{self, FormatError, NominalFile};
 use crate::geometry::{Point, Vector};
 use crate::measuring::{Layout, PatternError, Target, targets};
-use crate::recipe::{
-    BeginWith, Density, NominalSource, OnTrouble, PathMode, Pattern, PvOf, Recipe, StartAt, Tracks, Wheel,
-};
-use crate::registration::{MapLimits, ProbeSide};
+use crate::recipe::{NominalSource, Pattern, Recipe, SpindleAxis, StartAt, Um, Wheel};
+use crate::registration::{Coordinate, MapLimits};
 use crate::surface::{DefinedSurface, DefinitionError, Nominal, Side, SurfaceError};
 
 /// Why a recipe and a cell do not make a run.
@@ -79,10 +74,7 @@ const SLOW_POLL: Duration = Duration::from_millis(250);
 /// A nominal surface or a pattern that cannot be had, and limits of the cell that the recipe goes beyond.
 pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), SetupError> {
     let (nominal, nominal_file, part_identity) = nominal(recipe)?;
-    let side = match recipe.measure.side {
-        ProbeSide::Known(side) => side,
-        ProbeSide::Auto => Side::Normal,
-    };
+    let side = recipe.measure.side.given().unwrap_or_default();
     let targets = lay(recipe, &nominal, side)?;
     check_limits(recipe, cell, &targets)?;
     let task = Task {
@@ -106,20 +98,20 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         coordinates: cell.cmm.link.wire.coordinates(),
         place: MapLimits { place_mm: recipe.compensation.largest_displacement_mm, ..MapLimits::default() },
         map: map_options(recipe),
-        gain: recipe.compensation.gain,
-        repeatability_mm: recipe.compensation.repeatability_mm,
+        gain: recipe.compensation.gain(),
+        repeatability_mm: recipe.compensation.repeatability_um.map(Um::mm),
         learned: None,
         setting: setting(recipe, cell, &part_identity, targets.len()),
         targets,
         limits: CorrectionLimits {
             largest_depth_mm: cell.grinder.limits.largest_depth_mm,
-            least_depth_mm: recipe.compensation.least_depth_mm,
-            depth_of_cut_mm: recipe.compensation.depth_of_cut_mm,
-            largest_correction_mm: recipe.compensation.largest_correction_mm,
-            allowance_mm: recipe.grinding.allowance_mm,
-            removal_budget_mm: recipe.compensation.removal_budget_mm,
+            least_depth_mm: recipe.compensation.least_depth_um.mm(),
+            depth_of_cut_mm: recipe.compensation.depth_of_cut_um.mm(),
+            largest_correction_mm: recipe.compensation.largest_correction_um.mm(),
+            allowance_mm: recipe.grinding.allowance_um.mm(),
+            removal_budget_mm: recipe.compensation.removal_budget_um.mm(),
         },
-        tolerance_mm: recipe.acceptance.pv_mm.map(|pv_mm| 0.5 * pv_mm),
+        tolerance_mm: recipe.acceptance.pv_um.map(|pv| 0.5 * pv.mm()),
         least_found: recipe.measure.minimum_coverage,
         simulation: cell.simulated,
     };
@@ -130,7 +122,7 @@ fn map_options(recipe: &Recipe) -> MapOptions {
     let (wheel_radius_mm, compensation) = (recipe.grinding.wheel.radius_mm(), &recipe.compensation);
     MapOptions {
         level_off_mm: wheel_radius_mm,
-        contact_width_mm: contact_width_mm(wheel_radius_mm, compensation.depth_of_cut_mm),
+        contact_width_mm: contact_width_mm(wheel_radius_mm, compensation.depth_of_cut_um.mm()),
         smoothing: compensation.smoothing,
         order: compensation.filter_order,
         roughness: compensation.roughness,
@@ -151,12 +143,12 @@ fn setting(recipe: &Recipe, cell: &CellConfig, part: &[u8; 32], targets: usize) 
         grinding.feed_mm_min,
         grinding.track_mm,
         grinding.spark_out_passes,
-        map.depth_of_cut_mm,
+        map.depth_of_cut_um.mm(),
         measure.probe_radius_mm,
-        recipe.registration.held,
+        Coordinate::locked(&recipe.registration.hold),
         map.cutoff_mm,
         map.smoothing,
-        map.gain
+        map.gain()
     );
     // What stands as it always did is not said, so that what was learned before still counts.
     if (map.filter_order, map.roughness) != Default::default() {
@@ -182,7 +174,7 @@ fn nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> 
             .map(|nominal| nominal.with_outline(surface.aperture().clone()))
             .map_err(|source| SetupError::Nominal { path: path.to_owned(), source })
     };
-    match recipe.nominal_source() {
+    match &recipe.nominal {
         NominalSource::Surface(surface) => {
             let nominal = sampled(surface, recipe.path())?;
             let identity = identity_of(&nominal);
@@ -220,15 +212,12 @@ fn identity_of(nominal: &Nominal) -> [u8; 32] {
 }
 
 fn lay(recipe: &Recipe, nominal: &Nominal, side: Side) -> Result<Vec<Target>, SetupError> {
-    let layout = match &recipe.measure.pattern {
-        Pattern::Grid(Density::SpacingMm(spacing)) => Layout::GridSpacing(*spacing),
-        Pattern::Grid(Density::Points(counts)) => Layout::GridPoints(*counts),
-        Pattern::Spiral(Density::SpacingMm(spacing)) => Layout::SpiralSpacing(*spacing),
-        Pattern::Spiral(Density::Points(count)) => Layout::SpiralPoints(*count),
-        Pattern::File { path } => Layout::Points(formats::read_measured(path)?),
+    let layout = match &recipe.pattern {
+        Pattern::Laid(layout) => layout,
+        Pattern::File(path) => &Layout::Points(formats::read_measured(path)?),
         Pattern::Free { .. } => return Ok(Vec::new()),
     };
-    targets(nominal, side, &layout, recipe.measure.edge_margin_mm)
+    targets(nominal, side, layout, recipe.measure.edge_margin_mm)
         .map_err(|source| SetupError::Pattern { path: recipe.path().to_owned(), source })
 }
 
@@ -258,7 +247,7 @@ fn check_limits(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
     let feed = recipe.grinding.feed_mm_min;
     beyond("grinding.feed_mm_min", feed, 0.0, limits.largest_feed_mm_min, "grinder.limits.largest_feed_mm_min")?;
     // Both as they are written: the recipe in micrometres, the cell file in millimetres.
-    let (depth_um, most_um) = (1e3 * recipe.compensation.depth_of_cut_mm, 1e3 * limits.largest_depth_mm);
+    let (depth_um, most_um) = (recipe.compensation.depth_of_cut_um.0, 1e3 * limits.largest_depth_mm);
     beyond("compensation.depth_of_cut_um", depth_um, 0.0, most_um, "1000 times grinder.limits.largest_depth_mm")?;
     if targets.is_empty() && !cell.cmm.link.wire.is_by_person() {
         return Err(SetupError::NeedsPlan { recipe: recipe.path().to_owned(), cell: cell.path().to_owned() });
@@ -296,8 +285,8 @@ fn pass(recipe: &Recipe, nominal: &Nominal, part_identity: [u8; 32]) -> Pass {
         wheel_radius_mm: recipe.grinding.wheel.radius_mm(),
         feed_mm_min: recipe.grinding.feed_mm_min,
         track_spacing_mm: recipe.grinding.track_mm,
-        level_mm: recipe.grinding.allowance_mm,
-        depth_of_cut_mm: recipe.compensation.depth_of_cut_mm,
+        level_mm: recipe.grinding.allowance_um.mm(),
+        depth_of_cut_mm: recipe.compensation.depth_of_cut_um.mm(),
         x_mm: [low[0], high[0]],
         y_mm: [low[1], high[1]],
         part_identity,
@@ -312,7 +301,7 @@ fn programs(
     part_identity: [u8; 32],
 ) -> Result<Programs, PathError> {
     let (grinding, limits) = (&recipe.grinding, &cell.grinder.limits);
-    if recipe.measure.side == ProbeSide::Known(Side::Opposite) {
+    if recipe.measure.side.given() == Some(Side::Opposite) {
         return Err(PathError::OtherSide);
     }
     let ground = Programs::ground(nominal)?;
@@ -321,15 +310,13 @@ fn programs(
     let run_up_mm =
         limits.largest_acceleration_mm_s2.map_or(0.0, |a| 1.1 * (grinding.feed_mm_min / 60.0).powi(2) / (2.0 * a));
     let options = PathOptions {
-        pattern: match grinding.tracks {
-            Tracks::Raster { one_way } => TrackPattern::Raster { one_way },
-            Tracks::Spiral => TrackPattern::Spiral,
-        },
-        spacing: match grinding.scallop_mm {
-            Some(height_mm) => TrackSpacing::Scallop { height_mm, widest_mm: grinding.track_mm },
+        pattern: grinding.pattern,
+        one_way: grinding.one_way,
+        spacing: match grinding.scallop_nm {
+            Some(nm) => TrackSpacing::Scallop { height_mm: 1e-6 * nm, widest_mm: grinding.track_mm },
             None => TrackSpacing::Distance(grinding.track_mm),
         },
-        chord_error_mm: grinding.chord_error_mm,
+        chord_error_mm: grinding.chord_error_um.mm(),
         overrun_mm: grinding.overrun_mm,
         lead_mm: plain.lead_mm.max(run_up_mm - grinding.overrun_mm),
         safe_height_mm: grinding.safe_height_mm,
@@ -346,11 +333,8 @@ fn programs(
             speed_mm_s: limits.largest_speed_mm_s,
             acceleration_mm_s2: limits.largest_acceleration_mm_s2,
         },
-        mode: match grinding.path_mode {
-            PathMode::Blend { tolerance_mm } => gcode::PathMode::Blend { tolerance_mm, naive_mm: 0.0 },
-            PathMode::ExactPath => gcode::PathMode::ExactPath,
-            PathMode::ExactStop => gcode::PathMode::ExactStop,
-        },
+        mode: grinding.path_mode,
+        path_tolerance_mm: grinding.path_tolerance_um.mm(),
         spark_out_passes: grinding.spark_out_passes,
         simulation: cell.simulated,
     })
@@ -361,23 +345,22 @@ fn path_wheel(wheel: &Wheel, nominal: &Nominal) -> PathWheel {
     const BEYOND_THE_SLOPE_RAD: f64 = 0.0873;
     match *wheel {
         Wheel::Sphere { radius_mm } => PathWheel::Sphere { radius_mm },
-        Wheel::Torus { radius_mm, minor_radius_mm, spindle_along_x } => PathWheel::Torus {
+        Wheel::Torus { radius_mm, minor_radius_mm, spindle } => PathWheel::Torus {
             ring_mm: radius_mm - minor_radius_mm,
             tube_mm: minor_radius_mm,
-            spindle: if spindle_along_x { Vector::x() } else { Vector::y() },
+            spindle: match spindle {
+                SpindleAxis::X => Vector::x(),
+                SpindleAxis::Y => Vector::y(),
+            },
         },
-        Wheel::Cup { radius_mm, minor_radius_mm, tilt_rad } => {
-            let tilt = tilt_rad.unwrap_or_else(|| nominal.steepest_rad() + BEYOND_THE_SLOPE_RAD);
-            PathWheel::tilted_cup(radius_mm, minor_radius_mm, tilt)
+        Wheel::Cup { radius_mm, minor_radius_mm, tilt_deg } => {
+            let sloped = || nominal.steepest_rad() + BEYOND_THE_SLOPE_RAD;
+            PathWheel::tilted_cup(radius_mm, minor_radius_mm, tilt_deg.map_or_else(sloped, f64::to_radians))
         }
     }
 }
 
 fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
-    let disposal = |trouble| match trouble {
-        OnTrouble::Hold => Disposal::Hold,
-        OnTrouble::Stop => Disposal::Stop,
-    };
     // What a person brings may take days, and then the cell is held and still waits.
     let mut deadlines = Deadlines::default();
     let by_person = [&cell.cmm.link, &cell.grinder.link].map(|link| link.wire.is_by_person());
@@ -387,31 +370,28 @@ fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
         (deadlines.answer, deadlines.connect) = (ANSWERS_WITHIN, ANSWERS_WITHIN);
     }
     CellPlan {
-        begin_with: match recipe.cycle.begin_with {
-            BeginWith::Grind => Beginning::Grind,
-            BeginWith::Measure => Beginning::Measure,
-        },
+        begin_with: recipe.cycle.begin_with,
         max_cycles: u32::from(recipe.cycle.most_cycles),
         tolerance: Tolerance {
-            pv_mm: recipe.acceptance.pv_mm.unwrap_or(f64::INFINITY),
-            rms_mm: recipe.acceptance.rms_mm.unwrap_or(f64::INFINITY),
+            pv_mm: recipe.acceptance.pv_um.map_or(f64::INFINITY, Um::mm),
+            rms_mm: recipe.acceptance.rms_um.map_or(f64::INFINITY, Um::mm),
             with_uncertainty: recipe.acceptance.expanded_uncertainty,
-            robust_pv: recipe.acceptance.pv_of == PvOf::MostPoints,
+            pv_of: recipe.acceptance.pv_of,
         },
         stall_share: 0.02,
-        stall_mm: recipe.cycle.stall_mm,
-        on_stall: disposal(recipe.cycle.on_stall),
-        on_divergence: disposal(recipe.cycle.on_divergence),
+        stall_mm: recipe.cycle.stall_um.mm(),
+        on_stall: recipe.cycle.on_stall,
+        on_divergence: recipe.cycle.on_divergence,
         on_refusal: Disposal::Stop,
         gates: Gates {
             least_found: recipe.measure.minimum_coverage,
             least_coverage: recipe.registration.least_coverage,
             most_shift_mm: recipe.registration.largest_shift_mm,
-            most_turn_rad: recipe.registration.largest_turn_rad,
-            most_radius_error_mm: recipe.measure.qualify.then_some(recipe.measure.radius_tolerance_mm),
+            most_turn_rad: recipe.registration.largest_turn_deg.to_radians(),
+            most_radius_error_mm: recipe.measure.qualify.then_some(recipe.measure.radius_tolerance_um.mm()),
         },
-        removal_budget_mm: recipe.compensation.removal_budget_mm,
-        least_depth_mm: recipe.compensation.least_depth_mm,
+        removal_budget_mm: recipe.compensation.removal_budget_um.mm(),
+        least_depth_mm: recipe.compensation.least_depth_um.mm(),
         clear_at_start: cell.simulated,
         deadlines,
     }
@@ -434,7 +414,7 @@ pub fn machines(
         part,
         cell_folder: cell.path().parent().unwrap_or(Path::new("")),
         run_folder: folder,
-        free_points: match &recipe.measure.pattern {
+        free_points: match &recipe.pattern {
             Pattern::Free { least_points } => Some(usize::try_from(*least_points).unwrap_or(usize::MAX)),
             _ => None,
         },

@@ -2,7 +2,7 @@
 
 use super::command::Verdict;
 use super::event::{Figures, Response};
-use super::plan::CellPlan;
+use super::plan::{CellPlan, PvOf};
 
 /// A figure that is worse than the one before by more than this share makes a cycle worse.
 const WORSE: f64 = 1.05;
@@ -127,7 +127,7 @@ fn conformity(plan: &CellPlan, now: &Figures) -> Conformity {
 
 /// The peak to valley that is judged: of all points, or of all but the outermost.
 fn judged_pv(plan: &CellPlan, figures: &Figures) -> f64 {
-    figures.pv_robust_mm.filter(|_| plan.tolerance.robust_pv).unwrap_or(figures.pv_mm)
+    figures.pv_robust_mm.filter(|_| plan.tolerance.pv_of == PvOf::MostPoints).unwrap_or(figures.pv_mm)
 }
 
 fn has_stalled(plan: &CellPlan, before: &Figures, now: &Figures) -> bool {
@@ -150,7 +150,7 @@ fn wrong(response: Response) -> Option<&'static str> {
 fn told(plan: &CellPlan, now: &Figures) -> String {
     let tolerance = &plan.tolerance;
     let (pv, rms) = (um(judged_pv(plan, now)), um(now.rms_mm));
-    let which = if tolerance.robust_pv && now.pv_robust_mm.is_some() { "PV 99.8 %" } else { "PV" };
+    let which = if tolerance.pv_of == PvOf::MostPoints && now.pv_robust_mm.is_some() { "PV 99.8 %" } else { "PV" };
     let (pv_u, rms_u) = (um(now.pv_expanded_mm), um(now.rms_expanded_mm));
     let counts = if tolerance.with_uncertainty { "with" } else { "without" };
     format!(

@@ -34,6 +34,6 @@ pub use event::{
     JobResult, Mismatch, Occupation, Reconciliation, RecordFailure, Response,
 };
 pub use memory::Cell;
-pub use plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, Tolerance};
+pub use plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, PvOf, Tolerance};
 pub use state::{Device, JobStep, Phase, State, StateName};
 pub use table::{Answer, Row, samples, table};

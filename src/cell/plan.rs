@@ -36,13 +36,14 @@ pub struct CellPlan {
     pub deadlines: Deadlines,
 }
 
-/// Where the first cycle begins.
+/// What the first cycle begins with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Beginning {
-    /// With a pass.
+    /// A pass of the grinder.
     Grind,
-    /// With a measurement of the part as it is.
+    /// A measurement of the part as it is; its surface stands over the nominal one by the allowance.
     Measure,
 }
 
@@ -55,18 +56,31 @@ pub struct Tolerance {
     pub rms_mm: f64,
     /// Whether the expanded uncertainty is added to the figures first.
     pub with_uncertainty: bool,
-    /// Whether the peak to valley is taken without the outermost 0.2 % of the points.
-    #[serde(default)]
-    pub robust_pv: bool,
+    /// Which points the peak to valley is taken of.
+    pub pv_of: PvOf,
 }
 
-/// What to do when a run does not get on.
+/// Which points a peak to valley is taken of.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub enum PvOf {
+    /// All that were used.
+    #[serde(rename = "all")]
+    All,
+    /// All but the outermost 0.2 %, so that no two points decide.
+    #[default]
+    #[serde(rename = "99.8 %")]
+    MostPoints,
+}
+
+/// What to do when a run does not get on, or a part does not get better.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Disposal {
-    /// Hold, and let a person decide.
+    /// Hold with an alarm; a person decides.
     Hold,
-    /// End the run in order.
+    /// End the run in order; the part is not in tolerance.
     Stop,
 }
 

@@ -10,7 +10,7 @@ use super::event::{
     Mismatch, Occupation, Reconciliation, RecordFailure, Response,
 };
 use super::memory::Cell;
-use super::plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, Tolerance};
+use super::plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, PvOf, Tolerance};
 use super::state::{Device, State};
 
 /// What an event does in a state.
@@ -83,7 +83,7 @@ fn plan(disposal: Disposal) -> CellPlan {
     CellPlan {
         begin_with: Beginning::Grind,
         max_cycles: 3,
-        tolerance: Tolerance { pv_mm: 0.010, rms_mm: 0.002, with_uncertainty: false, robust_pv: false },
+        tolerance: Tolerance { pv_mm: 0.010, rms_mm: 0.002, with_uncertainty: false, pv_of: PvOf::All },
         stall_share: 0.05,
         stall_mm: 0.0,
         on_stall: disposal,

@@ -130,12 +130,12 @@ fn check_files(recipe: &Recipe) -> Result<(), Problems> {
             Some(problems) => problems.problems.extend(more.problems),
         }
     };
-    if let NominalSource::File { path, .. } = recipe.nominal_source()
+    if let NominalSource::File { path, .. } = &recipe.nominal
         && let Err(failure) = nominal::read(path, ProjectionName::Auto)
     {
         add("nominal.file", failure);
     }
-    if let Pattern::File { path } = &recipe.measure.pattern
+    if let Pattern::File(path) = &recipe.pattern
         && let Err(failure) = regrind::formats::read_points(path)
     {
         add("measure.file", failure.into());

@@ -9,7 +9,7 @@ use regrind::formats::{
 };
 use regrind::geometry::{Point, Pose};
 use regrind::registration::{Loss, Method, Options, ProbeSide, Start, register};
-use regrind::surface::{Distance, Nominal, NominalKind, Side};
+use regrind::surface::{Distance, Nominal, NominalKind};
 
 use super::failure::Failure;
 use super::initial::read_pose;
@@ -178,8 +178,8 @@ fn options(arguments: &Arguments) -> Result<Options, Failure> {
     };
     options.side = match arguments.side {
         SideName::Auto => ProbeSide::Auto,
-        SideName::Normal => ProbeSide::Known(Side::Normal),
-        SideName::Opposite => ProbeSide::Known(Side::Opposite),
+        SideName::Normal => ProbeSide::Above,
+        SideName::Opposite => ProbeSide::Below,
     };
     for &coordinate in &arguments.lock {
         options.locked[coordinate as usize] = true;

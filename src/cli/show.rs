@@ -8,7 +8,7 @@ use std::time::Instant;
 use indicatif::{ProgressBar, ProgressStyle};
 use regrind::cell::{Alarm, Device, Ending, Figures, Judgement};
 use regrind::drive::{CycleRow, Notice};
-use regrind::recipe::Recipe;
+use regrind::recipe::{Recipe, Um};
 use tokio::sync::mpsc;
 
 use super::failure::Failure;
@@ -32,8 +32,8 @@ pub(super) struct Show {
 
 impl Show {
     pub(super) fn new(json: bool, simulated: bool, recipe: &Recipe, folder: &Path) -> Self {
-        let limit = |name: &str, mm: Option<f64>| mm.map(|mm| format!("{name} {} um", three_digits(1e3 * mm)));
-        let limits = [limit("PV", recipe.acceptance.pv_mm), limit("rms", recipe.acceptance.rms_mm)];
+        let limit = |name: &str, um: Option<Um>| um.map(|um| format!("{name} {} um", three_digits(um.0)));
+        let limits = [limit("PV", recipe.acceptance.pv_um), limit("rms", recipe.acceptance.rms_um)];
         Self {
             json,
             simulated,

@@ -7,8 +7,8 @@ use serde_json::Value;
 
 /// Makes the schema of a file.
 ///
-/// A key that may be left out is an `Option`, whose null TOML cannot write: it is taken away. A key that must stand is an
-/// `Option` too, so that what is wrong with it can be told with the rest; it says `x-required`.
+/// A key that may be left out is an `Option`, whose null TOML cannot write: it is taken away. A key that must stand can be left out too, so
+/// that what is wrong with it is told with the rest: its default is no value (a number that is NaN), or it says `x-required`.
 pub(crate) fn schema_of<File: JsonSchema>() -> Value {
     let settings = SchemaSettings::draft2020_12().with(|settings| settings.inline_subschemas = true);
     let mut schema = settings.into_generator().into_root_schema_for::<File>();
@@ -28,7 +28,9 @@ fn tidy(schema: &mut Schema) {
     schema.remove("format");
     schema.remove("title");
     let Some(properties) = schema.get("properties").and_then(Value::as_object) else { return };
-    let must = |value: &Value| value.get("x-required").is_some() || value.get("const").is_some();
+    let no_value =
+        |value: &Value| value.get("default").is_some_and(Value::is_null) && value.get("type") == Some(&"number".into());
+    let must = |value: &Value| value.get("x-required").is_some() || value.get("const").is_some() || no_value(value);
     let required: Vec<Value> =
         properties.iter().filter(|(_, value)| must(value)).map(|(key, _)| Value::from(key.as_str())).collect();
     schema.remove("required");

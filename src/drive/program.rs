@@ -6,9 +6,10 @@ use thiserror::Error;
 
 use crate::compensation::Correction;
 use crate::compensation::path::{
-    Field, Limits, PathError, PathOptions, Pattern, Summary, ToolPath, TrackSpacing, Wanted, axis_offsets, height_of,
+    Field, Limits, PathError, PathMode, PathOptions, Pattern, Summary, ToolPath, TrackSpacing, Wanted, axis_offsets,
+    height_of,
 };
-use crate::formats::gcode::{GcodeError, PathMode, ProgramHeader, write_axis_table, write_program};
+use crate::formats::gcode::{GcodeError, ProgramHeader, write_axis_table, write_program};
 use crate::geometry::Aperture;
 use crate::surface::Nominal;
 
@@ -35,6 +36,8 @@ pub struct Programs {
     pub limits: Limits,
     /// How exactly its controller keeps to a program.
     pub mode: PathMode,
+    /// How far it may round corners off with [`PathMode::Blend`], in millimetres.
+    pub path_tolerance_mm: f64,
     /// Passes without in-feed.
     pub spark_out_passes: u16,
     /// Whether the cell is simulated.
@@ -146,6 +149,7 @@ impl Programs {
             spark_out_passes: self.spark_out_passes,
             simulation: self.simulation,
             mode: self.mode,
+            path_tolerance_mm: self.path_tolerance_mm,
         };
         Ok(write_program(file, &header, summary, &path.moves_by_track())?)
     }
@@ -153,10 +157,10 @@ impl Programs {
 
 fn tracks_in_words(path: &ToolPath) -> String {
     let options = path.options();
-    let pattern = match options.pattern {
-        Pattern::Raster { one_way: true } => "raster along +x",
-        Pattern::Raster { one_way: false } => "raster along x, to and fro",
-        Pattern::Spiral => "spiral inwards",
+    let pattern = match (options.pattern, options.one_way) {
+        (Pattern::Raster, true) => "raster along +x",
+        (Pattern::Raster, false) => "raster along x, to and fro",
+        (Pattern::Spiral, _) => "spiral inwards",
     };
     let scallop = match options.spacing {
         TrackSpacing::Scallop { height_mm, .. } => format!(", ridges of {:.3} um at most", 1e3 * height_mm),

@@ -1,84 +1,42 @@
-//! From a recipe as written to a checked one: units, and what one key says against another.
+//! What one key of a recipe says against another, and what several make together.
 
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
 use super::curvature;
-use super::written::{
-    AcceptanceTable, AxisWord, CompensationTable, CoordinateWord, CycleTable, DistanceWord, GrindingTable,
-    MeasureTable, NominalTable, PartTable, PathModeWord, PatternWord, RecipeFile, RegistrationTable, SideWord,
-    TracksWord, WheelTable,
+use super::tables::{
+    Acceptance, Compensation, Grinding, Measure, NominalTable, PatternWord, RecipeFile, RegistrationSettings, StartAt,
+    Um, Wheel,
 };
-use super::{
-    Acceptance, BeginWith, Compensation, Cycle, Density, GainBy, Grinding, Measure, NominalSource, Part, PathMode,
-    Pattern, Recipe, RegistrationSettings, StartAt, Tracks, Wheel,
-};
-use crate::compensation::GainRule;
+use super::{NominalSource, Pattern};
+use crate::cell::Beginning;
+use crate::compensation::path::Pattern as TrackPattern;
 use crate::document::Document;
 use crate::geometry::Aperture;
-use crate::registration::ProbeSide;
-use crate::surface::{DefinedSurface, Distance, Side, SurfaceDefinition};
+use crate::measuring::Layout;
+use crate::registration::{Coordinate, ProbeSide};
+use crate::surface::{DefinedSurface, SurfaceDefinition};
 
 /// More points than a part is ever measured with.
 const MOST_POINTS: f64 = 1e6;
 
-const MM_PER_UM: f64 = 1e-3;
-
-/// Everything of a recipe but where it came from; `None` where something is missing, which has been told.
-pub(super) struct Checked {
-    part: Option<Part>,
-    nominal: Option<NominalSource>,
-    measure: Option<Measure>,
-    registration: RegistrationSettings,
-    acceptance: Acceptance,
-    compensation: Option<Compensation>,
-    grinding: Option<Grinding>,
-    cycle: Cycle,
-    simulation: Option<toml::Table>,
-}
-
-impl Checked {
-    /// Puts the recipe together, if nothing is missing.
-    pub(super) fn into_recipe(self, path: &Path, text: &str, source_sha256: [u8; 32]) -> Option<Recipe> {
-        Some(Recipe {
-            part: self.part?,
-            nominal: self.nominal?,
-            measure: self.measure?,
-            registration: self.registration,
-            acceptance: self.acceptance,
-            compensation: self.compensation?,
-            grinding: self.grinding?,
-            cycle: self.cycle,
-            simulation: self.simulation,
-            path: path.to_owned(),
-            text: text.to_owned(),
-            source_sha256,
-        })
-    }
-}
-
-/// Checks a recipe as written; what is wrong is told to the document.
-pub(super) fn check(written: RecipeFile, path: &Path, document: &mut Document) -> Checked {
+/// Checks a recipe as written; what is wrong is told to the document. Returns what several keys make together, `None` where they do not.
+pub(super) fn check(
+    written: &RecipeFile,
+    path: &Path,
+    document: &mut Document,
+) -> (Option<NominalSource>, Option<Pattern>) {
     let folder = path.parent().unwrap_or(Path::new(""));
     let nominal = nominal(&written.nominal, folder, document);
-    compare_with_part(&written, nominal.as_ref(), document);
-    compare_tables(&written, document);
-    Checked {
-        part: part(written.part),
-        measure: measure(&written.measure, folder, document),
-        registration: registration(&written.registration, document),
-        acceptance: acceptance(&written.acceptance, document),
-        compensation: compensation(&written.compensation, document),
-        grinding: grinding(&written.grinding, document),
-        cycle: cycle(&written.cycle),
-        simulation: written.simulation,
-        nominal,
-    }
-}
-
-fn part(written: PartTable) -> Option<Part> {
-    Some(Part { name: written.name?, material: written.material, drawing: written.drawing })
+    compare_with_part(written, nominal.as_ref(), document);
+    compare_tables(written, document);
+    measure(&written.measure, document);
+    registration(&written.registration, document);
+    acceptance(&written.acceptance, document);
+    compensation(&written.compensation, document);
+    grinding(&written.grinding, document);
+    (nominal, pattern(&written.measure, folder, document))
 }
 
 /// Joins a path of a recipe to the recipe's folder; an absolute one stays.
@@ -166,7 +124,7 @@ fn in_place(key: &str, sentence: &str) -> String {
     }
 }
 
-fn measure(written: &MeasureTable, folder: &Path, document: &mut Document) -> Option<Measure> {
+fn measure(written: &Measure, document: &mut Document) {
     if written.safe_height_mm < written.approach_mm {
         document.report(
             "measure.safe_height_mm",
@@ -175,27 +133,9 @@ fn measure(written: &MeasureTable, folder: &Path, document: &mut Document) -> Op
             "raise it, or approach from nearer",
         );
     }
-    let pattern = pattern(written, folder, document);
-    Some(Measure {
-        probe_radius_mm: written.probe_radius_mm?,
-        side: match written.side {
-            SideWord::Auto => ProbeSide::Auto,
-            SideWord::Above => ProbeSide::Known(Side::Normal),
-            SideWord::Below => ProbeSide::Known(Side::Opposite),
-        },
-        pattern: pattern?,
-        edge_margin_mm: written.edge_margin_mm,
-        approach_mm: written.approach_mm,
-        search_mm: written.search_mm,
-        speed_mm_s: written.speed_mm_s,
-        safe_height_mm: written.safe_height_mm,
-        minimum_coverage: written.minimum_coverage,
-        qualify: written.qualify,
-        radius_tolerance_mm: MM_PER_UM * written.radius_tolerance_um,
-    })
 }
 
-fn pattern(written: &MeasureTable, folder: &Path, document: &mut Document) -> Option<Pattern> {
+fn pattern(written: &Measure, folder: &Path, document: &mut Document) -> Option<Pattern> {
     let keys = [
         ("spacing_mm", written.spacing_mm.is_some()),
         ("columns", written.columns.is_some()),
@@ -219,13 +159,13 @@ fn pattern(written: &MeasureTable, folder: &Path, document: &mut Document) -> Op
         );
     }
     let found = match (written.pattern, written.spacing_mm, (written.columns, written.rows), written.points) {
-        (PatternWord::Grid, Some(spacing), (None, None), _) => Some(Pattern::Grid(Density::SpacingMm(spacing))),
+        (PatternWord::Grid, Some(spacing), (None, None), _) => Some(Pattern::Laid(Layout::GridSpacing(spacing))),
         (PatternWord::Grid, None, (Some(columns), Some(rows)), _) => {
-            Some(Pattern::Grid(Density::Points([columns, rows])))
+            Some(Pattern::Laid(Layout::GridPoints([columns, rows])))
         }
-        (PatternWord::Spiral, Some(spacing), _, None) => Some(Pattern::Spiral(Density::SpacingMm(spacing))),
-        (PatternWord::Spiral, None, _, Some(points)) => Some(Pattern::Spiral(Density::Points(points))),
-        (PatternWord::File, ..) => written.file.as_ref().map(|file| Pattern::File { path: beside(folder, file) }),
+        (PatternWord::Spiral, Some(spacing), _, None) => Some(Pattern::Laid(Layout::SpiralSpacing(spacing))),
+        (PatternWord::Spiral, None, _, Some(points)) => Some(Pattern::Laid(Layout::SpiralPoints(points))),
+        (PatternWord::File, ..) => written.file.as_ref().map(|file| Pattern::File(beside(folder, file))),
         (PatternWord::Free, _, _, Some(least_points)) => Some(Pattern::Free { least_points }),
         _ => None,
     };
@@ -246,18 +186,7 @@ fn pattern(written: &MeasureTable, folder: &Path, document: &mut Document) -> Op
     found
 }
 
-fn registration(written: &RegistrationTable, document: &mut Document) -> RegistrationSettings {
-    let mut held = [false; 6];
-    for coordinate in &written.hold {
-        held[match coordinate {
-            CoordinateWord::X => 0,
-            CoordinateWord::Y => 1,
-            CoordinateWord::Z => 2,
-            CoordinateWord::Rx => 3,
-            CoordinateWord::Ry => 4,
-            CoordinateWord::Rz => 5,
-        }] = true;
-    }
+fn registration(written: &RegistrationSettings, document: &mut Document) {
     if !written.hold.is_empty() && written.start == StartAt::Search {
         document.report(
             "registration.hold",
@@ -266,26 +195,12 @@ fn registration(written: &RegistrationTable, document: &mut Document) -> Registr
             "write `start = \"fixture\"`, or hold nothing",
         );
     }
-    if held.iter().all(|held| *held) {
+    if Coordinate::locked(&written.hold) == [true; 6] {
         document.report("registration.hold", "holds all six coordinates", "at least one must be free", "leave one out");
-    }
-    RegistrationSettings {
-        distance: match written.distance {
-            DistanceWord::Curved => Distance::Curved,
-            DistanceWord::Triangle => Distance::Triangle,
-        },
-        loss: written.loss,
-        outlier_sigmas: written.outlier_sigmas,
-        held,
-        start: written.start,
-        largest_shift_mm: written.largest_shift_mm,
-        largest_turn_rad: written.largest_turn_deg.to_radians(),
-        least_coverage: written.least_coverage,
-        max_rms_mm: written.max_rms_um.map(|um| MM_PER_UM * um),
     }
 }
 
-fn acceptance(written: &AcceptanceTable, document: &mut Document) -> Acceptance {
+fn acceptance(written: &Acceptance, document: &mut Document) {
     let broken = ["acceptance.pv_um", "acceptance.rms_um", "acceptance"].iter().any(|key| document.has_problem(key));
     match (written.pv_um, written.rms_um) {
         (None, None) if !broken && document.is_there("acceptance") => {
@@ -294,39 +209,33 @@ fn acceptance(written: &AcceptanceTable, document: &mut Document) -> Acceptance 
         }
         (Some(pv), Some(rms)) if pv < rms => document.report(
             "acceptance.pv_um",
-            format!("is {pv} um, less than `rms_um`, {rms} um"),
+            format!("is {} um, less than `rms_um`, {} um", pv.0, rms.0),
             "a peak to valley is never less than the rms",
             "raise it, or are the two interchanged?",
         ),
         _ => {}
     }
-    Acceptance {
-        pv_mm: written.pv_um.map(|um| MM_PER_UM * um),
-        pv_of: written.pv_of,
-        rms_mm: written.rms_um.map(|um| MM_PER_UM * um),
-        expanded_uncertainty: written.expanded_uncertainty,
-    }
 }
 
-fn compensation(written: &CompensationTable, document: &mut Document) -> Option<Compensation> {
-    if let Some(budget) = written.removal_budget_um {
-        let parts =
-            [("depth_of_cut_um", written.depth_of_cut_um), ("largest_correction_um", written.largest_correction_um)];
-        for (key, um) in parts {
-            if let Some(um) = um.filter(|um| *um > budget) {
-                document.report(
-                    &format!("compensation.{key}"),
-                    format!("is {um} um, more than `removal_budget_um`, {budget} um"),
-                    "nothing may take off more than the budget",
-                    "lower it, or raise the budget",
-                );
-            }
+fn compensation(written: &Compensation, document: &mut Document) {
+    let budget = written.removal_budget_um;
+    for (key, um) in
+        [("depth_of_cut_um", written.depth_of_cut_um), ("largest_correction_um", written.largest_correction_um)]
+    {
+        if um > budget {
+            document.report(
+                &format!("compensation.{key}"),
+                format!("is {} um, more than `removal_budget_um`, {} um", um.0, budget.0),
+                "nothing may take off more than the budget",
+                "lower it, or raise the budget",
+            );
         }
     }
-    if let Some(cutoff) = written.cutoff_mm.filter(|cutoff| *cutoff < 2.0 * written.spacing_mm) {
+    let (cutoff, least) = (written.cutoff_mm, 2.0 * written.spacing_mm);
+    if cutoff < least {
         document.report(
             "compensation.cutoff_mm",
-            format!("is {cutoff} mm, less than two nodes of the map, {} mm", 2.0 * written.spacing_mm),
+            format!("is {cutoff} mm, less than two nodes of the map, {least} mm"),
             "a wavelength takes two nodes at least",
             "raise it, or lower `compensation.spacing_mm`",
         );
@@ -339,41 +248,10 @@ fn compensation(written: &CompensationTable, document: &mut Document) -> Option<
             "leave one of the two out",
         );
     }
-    Some(Compensation {
-        gain: match (written.gain, written.gain_by.unwrap_or_default()) {
-            (Some(share), _) => GainRule::Fixed(share),
-            (None, GainBy::Adaptive) => GainRule::Adaptive,
-            (None, GainBy::Wavelength) => GainRule::Wavelength,
-        },
-        repeatability_mm: written.repeatability_um.map(|um| MM_PER_UM * um),
-        learn: written.learn,
-        least_depth_mm: MM_PER_UM * written.least_depth_um,
-        cutoff_mm: written.cutoff_mm?,
-        smoothing: written.smoothing,
-        filter_order: written.filter_order,
-        roughness: written.roughness,
-        largest_correction_mm: MM_PER_UM * written.largest_correction_um?,
-        removal_budget_mm: MM_PER_UM * written.removal_budget_um?,
-        depth_of_cut_mm: MM_PER_UM * written.depth_of_cut_um?,
-        spacing_mm: written.spacing_mm,
-        largest_displacement_mm: written.largest_displacement_mm,
-    })
 }
 
-fn grinding(written: &GrindingTable, document: &mut Document) -> Option<Grinding> {
-    let wheel = match written.wheel.as_ref()? {
-        WheelTable::Sphere(ball) => Wheel::Sphere { radius_mm: ball.radius_mm? },
-        WheelTable::Torus(rim) => Wheel::Torus {
-            radius_mm: rim.radius_mm?,
-            minor_radius_mm: rim.minor_radius_mm?,
-            spindle_along_x: rim.spindle == AxisWord::X,
-        },
-        WheelTable::Cup(cup) => Wheel::Cup {
-            radius_mm: cup.radius_mm?,
-            minor_radius_mm: cup.minor_radius_mm?,
-            tilt_rad: cup.tilt_deg.map(f64::to_radians),
-        },
-    };
+fn grinding(written: &Grinding, document: &mut Document) {
+    let wheel = written.wheel;
     if let Wheel::Torus { radius_mm, minor_radius_mm, .. } | Wheel::Cup { radius_mm, minor_radius_mm, .. } = wheel
         && minor_radius_mm > radius_mm
     {
@@ -384,7 +262,7 @@ fn grinding(written: &GrindingTable, document: &mut Document) -> Option<Grinding
             "are the two interchanged?",
         );
     }
-    if written.one_way && written.pattern == TracksWord::Spiral {
+    if written.one_way && written.pattern == TrackPattern::Spiral {
         document.report(
             "grinding.one_way",
             "is set for a spiral",
@@ -392,44 +270,13 @@ fn grinding(written: &GrindingTable, document: &mut Document) -> Option<Grinding
             "leave it out",
         );
     }
-    let track_mm = written.track_mm?;
-    if track_mm > wheel.radius_mm() {
+    if written.track_mm > wheel.radius_mm() {
         document.report(
             "grinding.track_mm",
-            format!("is {track_mm} mm, more than the wheel's radius, {} mm", wheel.radius_mm()),
+            format!("is {} mm, more than the wheel's radius, {} mm", written.track_mm, wheel.radius_mm()),
             "tracks must overlap",
             "lower it",
         );
-    }
-    Some(Grinding {
-        wheel,
-        feed_mm_min: written.feed_mm_min?,
-        track_mm,
-        tracks: match written.pattern {
-            TracksWord::Raster => Tracks::Raster { one_way: written.one_way },
-            TracksWord::Spiral => Tracks::Spiral,
-        },
-        scallop_mm: written.scallop_nm.map(|nm| 1e-6 * nm),
-        chord_error_mm: MM_PER_UM * written.chord_error_um,
-        overrun_mm: written.overrun_mm,
-        safe_height_mm: written.safe_height_mm,
-        path_mode: match written.path_mode {
-            PathModeWord::Blend => PathMode::Blend { tolerance_mm: MM_PER_UM * written.path_tolerance_um },
-            PathModeWord::ExactPath => PathMode::ExactPath,
-            PathModeWord::ExactStop => PathMode::ExactStop,
-        },
-        spark_out_passes: written.spark_out_passes,
-        allowance_mm: MM_PER_UM * written.allowance_um,
-    })
-}
-
-fn cycle(written: &CycleTable) -> Cycle {
-    Cycle {
-        begin_with: written.begin_with,
-        most_cycles: written.most_cycles,
-        on_stall: written.on_stall,
-        on_divergence: written.on_divergence,
-        stall_mm: MM_PER_UM * written.stall_um,
     }
 }
 
@@ -440,12 +287,12 @@ fn compare_tables(written: &RecipeFile, document: &mut Document) {
     {
         document.report(
             "registration.max_rms_um",
-            format!("is {most} um, less than `acceptance.rms_um`, {rms} um"),
+            format!("is {} um, less than `acceptance.rms_um`, {} um", most.0, rms.0),
             "a good part would be refused",
             "raise it well above the first cycle's rms, or leave it out",
         );
     }
-    if written.compensation.learn && written.cycle.begin_with == BeginWith::Measure {
+    if written.compensation.learn && written.cycle.begin_with == Beginning::Measure {
         document.report(
             "compensation.learn",
             "is true, and `cycle.begin_with` is \"measure\"".to_owned(),
@@ -453,10 +300,9 @@ fn compare_tables(written: &RecipeFile, document: &mut Document) {
             "leave one of the two out",
         );
     }
-    let (allowance, cycles) = (written.grinding.allowance_um, written.cycle.most_cycles);
-    if let Some(depth) = written.compensation.depth_of_cut_um
-        && allowance > depth * f64::from(cycles.saturating_sub(1))
-    {
+    let (Um(allowance), Um(depth)) = (written.grinding.allowance_um, written.compensation.depth_of_cut_um);
+    let cycles = written.cycle.most_cycles;
+    if allowance > depth * f64::from(cycles.saturating_sub(1)) {
         document.report(
             "grinding.allowance_um",
             format!("is {allowance} um, which {cycles} cycles of {depth} um never take off"),
@@ -498,26 +344,23 @@ fn compare_with_size(written: &RecipeFile, size_mm: [f64; 2], document: &mut Doc
     }
     let lengths = [
         ("measure.probe_radius_mm", measure.probe_radius_mm, 0.5),
-        ("compensation.spacing_mm", Some(written.compensation.spacing_mm), 1.0),
+        ("compensation.spacing_mm", written.compensation.spacing_mm, 1.0),
         ("compensation.cutoff_mm", written.compensation.cutoff_mm, 2.0),
         ("grinding.track_mm", written.grinding.track_mm, 1.0),
     ];
     for (key, length_mm, share) in lengths {
         let limit_mm = share * smaller_mm;
-        if let Some(length_mm) = length_mm.filter(|length| *length > limit_mm) {
+        if length_mm > limit_mm {
             let found = format!("is {length_mm} mm on a part of {:.4} x {:.4} mm", size_mm[0], size_mm[1]);
             document.report(key, found, &format!("it must be at most {limit_mm:.4} mm here"), "lower it");
         }
     }
-    if let (PatternWord::Grid, Some(columns), Some(rows), Some(cutoff)) =
-        (measure.pattern, measure.columns, measure.rows, written.compensation.cutoff_mm)
-    {
+    let cutoff_mm = written.compensation.cutoff_mm;
+    if let (PatternWord::Grid, Some(columns), Some(rows)) = (measure.pattern, measure.columns, measure.rows) {
         let apart = |size: f64, n: u32| size / f64::from(n.max(2) - 1);
-        compare_cutoff(cutoff, apart(left_mm[0], columns).max(apart(left_mm[1], rows)), document);
-    } else if let (Some(spacing), Some(cutoff)) = (measure.spacing_mm, written.compensation.cutoff_mm)
-        && spacing <= left_mm[0].min(left_mm[1])
-    {
-        compare_cutoff(cutoff, spacing, document);
+        compare_cutoff(cutoff_mm, apart(left_mm[0], columns).max(apart(left_mm[1], rows)), document);
+    } else if let Some(spacing) = measure.spacing_mm.filter(|spacing| *spacing <= left_mm[0].min(left_mm[1])) {
+        compare_cutoff(cutoff_mm, spacing, document);
     }
 }
 
@@ -548,10 +391,10 @@ fn compare_cutoff(cutoff_mm: f64, apart_mm: f64, document: &mut Document) {
 fn compare_with_curvature(written: &RecipeFile, surface: &DefinedSurface, document: &mut Document) {
     let hollows = curvature::sharpest_hollows_mm(surface);
     let (radius_mm, place) = match written.measure.side {
-        SideWord::Above => hollows[0],
-        SideWord::Below => hollows[1],
+        ProbeSide::Above => hollows[0],
+        ProbeSide::Below => hollows[1],
         // The side is not known before points are; the flatter one is the least that can be said.
-        SideWord::Auto => {
+        ProbeSide::Auto => {
             if hollows[0].0 > hollows[1].0 {
                 hollows[0]
             } else {
@@ -559,14 +402,11 @@ fn compare_with_curvature(written: &RecipeFile, surface: &DefinedSurface, docume
             }
         }
     };
-    let ball = match &written.grinding.wheel {
-        Some(WheelTable::Sphere(ball)) => ball.radius_mm,
-        _ => None,
-    };
+    let ball_mm = if let Wheel::Sphere { radius_mm } = written.grinding.wheel { radius_mm } else { 0.0 };
     for (key, ball_mm) in
-        [("measure.probe_radius_mm", written.measure.probe_radius_mm), ("grinding.wheel.radius_mm", ball)]
+        [("measure.probe_radius_mm", written.measure.probe_radius_mm), ("grinding.wheel.radius_mm", ball_mm)]
     {
-        if let Some(ball_mm) = ball_mm.filter(|ball| *ball >= radius_mm) {
+        if ball_mm >= radius_mm {
             document.report(
                 key,
                 format!(

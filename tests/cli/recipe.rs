@@ -5,15 +5,17 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use proptest::prelude::*;
+use regrind::cell::{Beginning, Disposal};
 use regrind::compensation::{Order, Roughness};
 use regrind::config::CellConfig;
 use regrind::device::{Coordinates, TcpWire, Wire, WordOrder};
 use regrind::document::Problems;
 use regrind::formats::read_points;
 use regrind::geometry::{Point, Pose};
-use regrind::recipe::{BeginWith, Density, NominalSource, OnTrouble, Pattern, Recipe, StartAt, Wheel};
-use regrind::registration::{ProbeSide, Start};
-use regrind::surface::{DefinedSurface, Side};
+use regrind::measuring::Layout;
+use regrind::recipe::{NominalSource, Pattern, Recipe, StartAt, Um, Wheel};
+use regrind::registration::{Coordinate, ProbeSide, Start};
+use regrind::surface::DefinedSurface;
 use serde_json::Value;
 
 const RECIPE: &str = include_str!("../../recipes/freeform-mirror.toml");
@@ -77,16 +79,16 @@ fn the_default_recipe_is_what_it_says() {
     let recipe = recipe(RECIPE).unwrap();
     assert_eq!(recipe.part.name, "free-form mirror");
     assert_eq!(recipe.measure.probe_radius_mm, 1.5);
-    assert_eq!(recipe.measure.pattern, Pattern::Grid(Density::Points([60, 30])));
-    assert_eq!(recipe.measure.side, ProbeSide::Known(Side::Normal));
-    assert_eq!((recipe.acceptance.pv_mm, recipe.acceptance.rms_mm), (Some(7e-3), Some(1e-3)));
-    assert!((recipe.registration.largest_turn_rad - 5f64.to_radians()).abs() < 1e-15);
-    assert!((recipe.compensation.removal_budget_mm - 0.4).abs() < 1e-15);
+    assert_eq!(recipe.pattern, Pattern::Laid(Layout::GridPoints([60, 30])));
+    assert_eq!(recipe.measure.side, ProbeSide::Above);
+    assert_eq!((recipe.acceptance.pv_um, recipe.acceptance.rms_um), (Some(Um(7.0)), Some(Um(1.0))));
+    assert_eq!(recipe.registration.largest_turn_deg, 5.0);
+    assert!((recipe.compensation.removal_budget_um.mm() - 0.4).abs() < 1e-15);
     assert_eq!(recipe.grinding.wheel, Wheel::Sphere { radius_mm: 12.5 });
-    assert_eq!((recipe.cycle.on_stall, recipe.cycle.on_divergence), (OnTrouble::Stop, OnTrouble::Hold));
+    assert_eq!((recipe.cycle.on_stall, recipe.cycle.on_divergence), (Disposal::Stop, Disposal::Hold));
     let options = recipe.registration_options(Pose::identity());
     assert_eq!((options.probe_radius_mm, options.start, options.rms_limit_mm), (1.5, Start::Search, Some(0.1)));
-    let NominalSource::Surface(surface) = recipe.nominal_source() else { panic!("a formula") };
+    let NominalSource::Surface(surface) = &recipe.nominal else { panic!("a formula") };
     let steepest = (0..=40)
         .flat_map(|j| (0..=40).map(move |i| (2.55 * f64::from(i) - 51.0, 1.55 * f64::from(j) - 31.0)))
         .map(|(x, y)| surface.formula().sag_and_gradient(x, y).unwrap().1)
@@ -120,7 +122,7 @@ fn the_filter_and_the_gate_of_coverage_are_chosen_by_the_recipe() {
 fn the_simulated_part_of_every_polynomial_is_the_nominal_one() {
     for name in ["freeform-mirror", "shallow-wave"] {
         let recipe = Recipe::read(&root().join(format!("recipes/{name}.toml"))).unwrap();
-        let NominalSource::Surface(surface) = recipe.nominal_source() else { panic!("a formula") };
+        let NominalSource::Surface(surface) = &recipe.nominal else { panic!("a formula") };
         let shape = &recipe.simulation.as_ref().unwrap()["part"]["shape"];
         let radius_mm = shape["normalisation_radius_mm"].as_float().unwrap();
         for (x, y) in [(0.0, 0.0), (40.0, 30.0), (-39.0, 12.0), (7.0, -29.0)] {
@@ -150,7 +152,7 @@ fn the_points_of_the_biconic_are_its_formula() {
         assert!((surface.formula().sag(p.x, p.y).unwrap() - p.z).abs() < 1e-9);
     }
     let recipe = recipe(BICONIC).unwrap();
-    assert!(matches!(recipe.nominal_source(), NominalSource::File { path: file, .. } if *file == path));
+    assert!(matches!(&recipe.nominal, NominalSource::File { path: file, .. } if *file == path));
     let shape = &recipe.simulation.as_ref().unwrap()["part"]["shape"];
     assert_eq!(shape["radius_mm"].as_array().unwrap(), &[140.0.into(), 90.0.into()]);
     assert_eq!(shape["conic"].as_array().unwrap(), &[(-0.5).into(), 0.3.into()]);
@@ -159,9 +161,9 @@ fn the_points_of_the_biconic_are_its_formula() {
 #[test]
 fn the_telescope_holds_what_it_cannot_see() {
     let recipe = recipe(TELESCOPE).unwrap();
-    assert_eq!(recipe.registration.held, [true, true, false, false, false, true]);
+    assert_eq!(recipe.registration.hold, [Coordinate::X, Coordinate::Y, Coordinate::Rz]);
     assert_eq!(recipe.registration.start, StartAt::Fixture);
-    assert_eq!(recipe.measure.side, ProbeSide::Known(Side::Opposite));
+    assert_eq!(recipe.measure.side, ProbeSide::Below);
     let cell = cell(FILES).unwrap();
     // opt_global -> mirror frame is p' = Rx (p - s), Rx = [[1, 0, 0], [0, c, -s], [0, s, c]] with tan = 1/2.
     let (sine, cosine) = (0.5f64.atan().sin(), 0.5f64.atan().cos());
@@ -174,7 +176,7 @@ fn the_telescope_holds_what_it_cannot_see() {
     assert_eq!(files.inbox, "../exchange/cmm/in");
     assert_eq!((files.what, files.reference_limit_mm), (Some(Coordinates::Centres), 1.0));
     assert_eq!((files.take_earlier, files.probe_tolerance_mm), (false, 1e-3));
-    assert_eq!(recipe.cycle.begin_with, BeginWith::Measure);
+    assert_eq!(recipe.cycle.begin_with, Beginning::Measure);
     assert_eq!(recipe.compensation.largest_displacement_mm, 1.0);
 }
 
@@ -189,7 +191,7 @@ fn what_a_file_wire_leaves_out_is_not_guessed() {
     let Wire::FileExchange(files) = &cell.grinder.link.wire else { panic!("files") };
     assert_eq!((files.result.as_str(), files.reference_limit_mm), ("{part}_c{cycle}.*", 0.1));
     let recipe = recipe(RECIPE).unwrap();
-    assert_eq!(recipe.cycle.begin_with, BeginWith::Grind);
+    assert_eq!(recipe.cycle.begin_with, Beginning::Grind);
     assert_eq!(recipe.compensation.largest_displacement_mm, 1.0);
 }
 

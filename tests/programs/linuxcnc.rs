@@ -6,8 +6,7 @@ use std::process::{Command, Stdio};
 
 use crate::compensate::Shop;
 use crate::path::{correction, error_mm, part, read, wheels, with};
-use regrind::compensation::path::Pattern;
-use regrind::formats::gcode::PathMode;
+use regrind::compensation::path::{PathMode, Pattern};
 
 /// Lets the interpreter read a program; returns what it would have the machine do, or what it said against it. It writes files into the
 /// program's folder.
@@ -48,10 +47,10 @@ fn every_program_of_every_recipe_is_read_point_by_point() {
         let mut part = part(name);
         let plain = part.programs.options;
         for (wheel_name, wheel) in wheels(0.8) {
-            for pattern in [Pattern::Raster { one_way: false }, Pattern::Raster { one_way: true }, Pattern::Spiral] {
+            for (pattern, one_way) in [(Pattern::Raster, false), (Pattern::Raster, true), (Pattern::Spiral, false)] {
                 let spaced = if pattern == Pattern::Spiral { 3.0 } else { 6.0 };
                 part.programs.options =
-                    regrind::compensation::path::PathOptions { pattern, ..with(&plain, wheel, spaced) };
+                    regrind::compensation::path::PathOptions { pattern, one_way, ..with(&plain, wheel, spaced) };
                 let file = folder.path().join("part.ngc");
                 part.programs.write(&file, &correction(part.half_mm), [9; 32]).unwrap();
                 let text = fs::read_to_string(&file).unwrap();
@@ -76,9 +75,9 @@ fn every_path_mode_is_read() {
     let file = folder.path().join("part.ngc");
     let mut part = part("shallow-wave");
     part.programs.options = with(&part.programs.options, part.programs.options.wheel, 6.0);
-    let rounded = PathMode::Blend { tolerance_mm: 0.01, naive_mm: 0.001 };
-    for mode in [PathMode::default(), rounded, PathMode::ExactPath, PathMode::ExactStop] {
-        part.programs.mode = mode;
+    let blend = PathMode::Blend;
+    for (mode, tolerance_mm) in [(blend, 1e-4), (blend, 0.01), (PathMode::ExactPath, 0.0), (PathMode::ExactStop, 0.0)] {
+        (part.programs.mode, part.programs.path_tolerance_mm) = (mode, tolerance_mm);
         part.programs.write(&file, &correction(part.half_mm), [9; 32]).unwrap();
         let ends = interpreted(&file);
         assert!(!ends.unwrap_or_else(|said| panic!("{mode:?}: {said}")).is_empty());

@@ -11,7 +11,7 @@ fn plan() -> CellPlan {
     CellPlan {
         begin_with: Beginning::Grind,
         max_cycles: 4,
-        tolerance: Tolerance { pv_mm: 0.007, rms_mm: 0.001, with_uncertainty: true, robust_pv: false },
+        tolerance: Tolerance { pv_mm: 0.007, rms_mm: 0.001, with_uncertainty: true, pv_of: PvOf::All },
         stall_share: 0.02,
         stall_mm: 0.0,
         on_stall: Disposal::Stop,

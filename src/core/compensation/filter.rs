@@ -17,7 +17,6 @@ use std::f64::consts::PI;
 
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 use rayon::prelude::*;
-use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::Grid;
@@ -42,7 +41,8 @@ const MOST_VARIANCE: f64 = 2.0;
 const MOST_SPREAD: f64 = 4.5;
 
 /// Order of the polynomial that the filter lets pass unchanged.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Order {
     /// Constants pass: the plain weighted mean, which is pulled askew by slopes at edges.

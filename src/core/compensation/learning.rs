@@ -42,14 +42,17 @@ const RESPONSE_SIGMA_OF_NEXT_PART: f64 = 0.02;
 const RESPONSE_LIMITS: [f64; 2] = [0.5, 1.5];
 
 /// By what is chosen how much of an error is taken back.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum GainRule {
     /// Always the same share of the newest error.
+    #[cfg_attr(feature = "schema", schemars(skip))]
     Fixed(f64),
-    /// By what passes have told so far, one share for all wavelengths.
+    /// What the passes have told of what comes back and what does not, one share for all wavelengths.
     Adaptive,
-    /// By what passes have told so far, for each octave of wavelengths by itself.
+    /// The same for each octave of wavelengths by itself.
+    #[default]
     Wavelength,
 }
 

@@ -4,7 +4,6 @@
 //!  readings -> outliers out -> filter (Gaussian, robust, spline) -> levelled off outside -> ErrorMap
 //! ```
 
-use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::MapError;
@@ -20,7 +19,8 @@ use crate::geometry::{Grid, Sample};
 const WIDE: f64 = 4.0;
 
 /// What makes the deviations smooth.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Smoothing {
     /// The areal Gaussian filter, ISO 16610-61.

@@ -20,7 +20,6 @@
 use std::f64::consts::TAU;
 
 use rayon::prelude::*;
-use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -39,7 +38,8 @@ const STEP: f64 = 0.02;
 const RIDGE: f64 = 1e-13;
 
 /// How the smoothness of a spline is chosen.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Roughness {
     /// Half of a wave as long as the cut-off passes.

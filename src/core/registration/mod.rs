@@ -40,7 +40,7 @@ pub use error::RegistrationError;
 pub use iterate::Iteration;
 use iterate::{Descent, Problem};
 pub use lateral::{LateralError, MapLimits, lateral_error, weak_for_compensation};
-pub use options::{Method, Options, ProbeSide, Start};
+pub use options::{Coordinate, Method, Options, ProbeSide, Start};
 use part::Part;
 use refit::{LEAST_SIGMA_MM, trim_and_refit};
 pub use result::Registration;
@@ -58,7 +58,7 @@ pub use verdict::{Verdict, WeakDirection};
 /// Input that cannot be registered, a cloud that does not fit the surface, and an iteration that does not converge.
 pub fn register(nominal: &Nominal, measured: &[Point], options: &Options) -> Result<Registration, RegistrationError> {
     let part = Part::check(nominal, measured, options)?;
-    if let ProbeSide::Known(side) = options.side {
+    if let Some(side) = options.side.given() {
         part.check_fold(options, side)?;
     }
     let initial = initial_pose(&part, measured, options)?;

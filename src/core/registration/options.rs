@@ -7,6 +7,7 @@ use super::robust::Loss;
 
 /// What the measured points are taken for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Method {
     /// Probe centres, registered to the offset surface: the method of the paper.
@@ -30,13 +31,62 @@ pub enum Start {
 }
 
 /// On which side of the nominal surface the probe centres lie.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+///
+/// A side that is given is refused if the points fit the other one much better.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "kebab-case")]
 pub enum ProbeSide {
     /// The side on which the measured points fit; the side of the normals where both fit alike.
     #[default]
     Auto,
-    /// This side; refused if the points fit the other one much better.
-    Known(Side),
+    /// Where the normals point: +z for a height over the plane, outwards for a mesh.
+    #[serde(alias = "normal")]
+    Above,
+    /// The other side.
+    #[serde(alias = "opposite")]
+    Below,
+}
+
+impl ProbeSide {
+    /// Returns the side, if it is given.
+    pub fn given(self) -> Option<Side> {
+        match self {
+            Self::Auto => None,
+            Self::Above => Some(Side::Normal),
+            Self::Below => Some(Side::Opposite),
+        }
+    }
+}
+
+impl From<Side> for ProbeSide {
+    fn from(side: Side) -> Self {
+        match side {
+            Side::Normal => Self::Above,
+            Side::Opposite => Self::Below,
+        }
+    }
+}
+
+/// A coordinate of a pose in the model frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "kebab-case")]
+#[allow(missing_docs)]
+pub enum Coordinate {
+    X,
+    Y,
+    Z,
+    Rx,
+    Ry,
+    Rz,
+}
+
+impl Coordinate {
+    /// Returns which of x, y, z, rx, ry, rz are among some coordinates, as [`Options::locked`] has them.
+    pub fn locked(coordinates: &[Self]) -> [bool; 6] {
+        [Self::X, Self::Y, Self::Z, Self::Rx, Self::Ry, Self::Rz].map(|coordinate| coordinates.contains(&coordinate))
+    }
 }
 
 /// How to register.

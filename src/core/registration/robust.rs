@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 /// How the distance of a point counts in the objective.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Loss {
     /// As its square, eq. (7).

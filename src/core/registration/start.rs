@@ -13,7 +13,7 @@ use crate::surface::{Feature, OffsetSurface, Place, Side, features, principal_ax
 use super::correspond::{Correspondence, middle_and_size};
 use super::error::RegistrationError;
 use super::iterate::Problem;
-use super::options::{Options, ProbeSide, Start};
+use super::options::{Options, Start};
 use super::part::Part;
 use super::robust::{Loss, ScaledLoss, robust_sigma};
 
@@ -84,7 +84,7 @@ pub(crate) fn initial_pose(
 pub(crate) fn mirrored_rms(part: &Part, measured: &[Point], options: &Options, side: Side) -> Option<f64> {
     // Mirrored in the plane x = 0 of the CMM frame: which plane does not matter to a search over all poses.
     let mirrored: Vec<Point> = spread(measured, 4 * COMPARED).map(|p| Point::new(-p.x, p.y, p.z)).collect();
-    let options = Options { side: ProbeSide::Known(side), ..*options };
+    let options = Options { side: side.into(), ..*options };
     let search = Search::new(part, &mirrored, &options);
     search.compared(&search.candidates(side), side).first().map(|c| c.rms_mm)
 }
@@ -142,10 +142,7 @@ impl<'a> Search<'a> {
     /// The candidates are refined on one side of the surface: on the other the probe centres lie two radii away, which is
     /// little against the differences between right and wrong poses. Only the best are compared on both.
     fn search(&self) -> Result<InitialPose, RegistrationError> {
-        let side = match self.options.side {
-            ProbeSide::Known(side) => side,
-            ProbeSide::Auto => Side::Normal,
-        };
+        let side = self.options.side.given().unwrap_or_default();
         let candidates = self.candidates(side);
         let there = self.compared(&candidates, side);
         let through: Vec<Candidate> = candidates
@@ -172,12 +169,10 @@ impl<'a> Search<'a> {
         let told = |better: &Candidate, worse: &Candidate| {
             self.part.offset_mm == 0.0 || better.rms_mm * SIDE_RATIO < worse.rms_mm
         };
-        match self.options.side {
-            ProbeSide::Auto if self.part.offset_mm > 0.0 && told(&opposite, &normal) => {
-                Ok((Side::Opposite, opposite, true))
-            }
-            ProbeSide::Auto => Ok((Side::Normal, normal, told(&normal, &opposite))),
-            ProbeSide::Known(side) => {
+        match self.options.side.given() {
+            None if self.part.offset_mm > 0.0 && told(&opposite, &normal) => Ok((Side::Opposite, opposite, true)),
+            None => Ok((Side::Normal, normal, told(&normal, &opposite))),
+            Some(side) => {
                 let (given, other) = if side == Side::Normal { (normal, opposite) } else { (opposite, normal) };
                 // Clearly better there, and by more than a form error could explain.
                 if other.rms_mm * 4.0 * SIDE_RATIO < given.rms_mm && self.part.offset_mm > 0.0 {

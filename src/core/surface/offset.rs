@@ -9,7 +9,8 @@ use super::patch::{Lattice, Patch};
 use super::simd::{dot, minus};
 
 /// How the surface runs between the corners of a facet.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Distance {
     /// As the cubic that its corners and normals define.

@@ -10,6 +10,7 @@ use super::normals::tangents;
 
 /// What to project scattered points onto before they are triangulated.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Projection {
     /// The first of the others, in their order, that is one-to-one.

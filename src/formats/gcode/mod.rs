@@ -14,7 +14,6 @@ mod read;
 mod table;
 mod write;
 
-use std::fmt;
 use std::io::Read as _;
 use std::path::Path;
 
@@ -25,42 +24,6 @@ pub use error::GcodeError;
 pub use map::{MapBase, MapKind, ProgramMap, read_program_map};
 pub use table::write_axis_table;
 pub use write::{ProgramHeader, write_program};
-
-/// How exactly a controller keeps to the path that a program describes.
-///
-/// LinuxCNC's default at power-on is `G64` without a tolerance, which cuts corners by a tenth of a millimetre and more: a program must say.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum PathMode {
-    /// G64: corners are rounded within a tolerance, and points on a line within another are joined; 0 joins none.
-    Blend {
-        /// P, in millimetres.
-        tolerance_mm: f64,
-        /// Q, in millimetres.
-        naive_mm: f64,
-    },
-    /// G61: every point is passed through exactly.
-    ExactPath,
-    /// G61.1: every point is stopped at.
-    ExactStop,
-}
-
-impl Default for PathMode {
-    fn default() -> Self {
-        Self::Blend { tolerance_mm: 1e-4, naive_mm: 0.0 }
-    }
-}
-
-impl fmt::Display for PathMode {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Blend { tolerance_mm, naive_mm } => {
-                write!(f, "G64 P{} Q{}", number::short(*tolerance_mm), number::short(*naive_mm))
-            }
-            Self::ExactPath => f.write_str("G61"),
-            Self::ExactStop => f.write_str("G61.1"),
-        }
-    }
-}
 
 pub(super) fn hex(bytes: &[u8; 32]) -> String {
     bytes.iter().map(|b| format!("{b:02x}")).collect()

@@ -6,9 +6,9 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use super::number::{LARGEST_MM, push_fixed, rounded, short};
-use super::{GcodeError, PathMode, hex};
+use super::{GcodeError, hex};
 use crate::registration::Draft;
-use regrind_core::compensation::path::{Move, Summary};
+use regrind_core::compensation::path::{Move, PathMode, Summary};
 
 /// Bytes that are gathered before they go to the file.
 const CHUNK: usize = 1 << 16;
@@ -43,6 +43,8 @@ pub struct ProgramHeader {
     pub simulation: bool,
     /// How exactly the controller keeps to the path.
     pub mode: PathMode,
+    /// How far it may round corners off with [`PathMode::Blend`], in millimetres.
+    pub path_tolerance_mm: f64,
 }
 
 /// Writes a program: the header, the moves track by track, the end.
@@ -208,7 +210,13 @@ fn header_lines(h: &ProgramHeader, s: &Summary, lines: u64) -> String {
     say(format_args!("points: {}", s.points));
     say(format_args!("lines: {lines}"));
     say(format_args!("spindle and coolant are the machine's own; start them before"));
-    let _ = writeln!(text, "G21 G90 G94 G17 G40 G49 G80 G54\n{}", h.mode);
+    // LinuxCNC's default at power-on is G64 without a tolerance, which cuts corners by a tenth of a millimetre and more: a program must say.
+    let mode = match h.mode {
+        PathMode::Blend => format!("G64 P{} Q0", short(h.path_tolerance_mm)),
+        PathMode::ExactPath => "G61".into(),
+        PathMode::ExactStop => "G61.1".into(),
+    };
+    let _ = writeln!(text, "G21 G90 G94 G17 G40 G49 G80 G54\n{mode}");
     text
 }
 
@@ -252,7 +260,8 @@ mod tests {
             tracks: "raster".into(),
             spark_out_passes: 0,
             simulation: true,
-            mode: PathMode::default(),
+            mode: PathMode::Blend,
+            path_tolerance_mm: 1e-4,
         };
         let summary = Summary {
             moves: 5 * tracks.len() as u64,

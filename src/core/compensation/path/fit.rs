@@ -78,12 +78,12 @@ fn fit_at(bend: &Bend, place: [f64; 2], options: &PathOptions) -> Result<f64, Pa
     // Across a raster is y, whatever the surface's slant; a spiral crosses everything.
     let gap = std::array::from_fn::<f64, 3, _>(|k| wheel[k] - bend.curvature[k]);
     let across = match options.pattern {
-        Pattern::Raster { .. } => gap[2],
+        Pattern::Raster => gap[2],
         Pattern::Spiral => 0.5 * (gap[0] + gap[2]) + (0.25 * (gap[0] - gap[2]).powi(2) + gap[1] * gap[1]).sqrt(),
     };
     // A millimetre along the surface is less over x and y.
     let shortened = match options.pattern {
-        Pattern::Raster { .. } => (1.0 - bend.along[1].z.powi(2)).sqrt(),
+        Pattern::Raster => (1.0 - bend.along[1].z.powi(2)).sqrt(),
         Pattern::Spiral => normal.z,
     };
     Ok((8.0 * height / across).sqrt() * shortened)

@@ -27,7 +27,7 @@ pub use axis_table::axis_offsets;
 pub use error::PathError;
 pub use field::{Field, Jet};
 pub use nominal::height_of;
-pub use options::{PathOptions, Pattern, TrackSpacing};
+pub use options::{PathMode, PathOptions, Pattern, TrackSpacing};
 pub use summary::{Limits, Peak, Summary};
 pub use tool_path::ToolPath;
 pub use walk::{Move, Moves};

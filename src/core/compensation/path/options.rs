@@ -1,15 +1,17 @@
 //! How a path is laid.
 
+use serde::{Deserialize, Serialize};
+
 use super::{PathError, Wheel};
 
 /// How tracks run.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "kebab-case")]
 pub enum Pattern {
     /// Along x, one beside the other in y from the least to the largest.
-    Raster {
-        /// Whether every track runs towards +x; else they alternate.
-        one_way: bool,
-    },
+    #[default]
+    Raster,
     /// On a spiral about the middle of the outline, from outside inwards, turning clockwise seen from +z.
     Spiral,
 }
@@ -29,6 +31,20 @@ pub enum TrackSpacing {
     },
 }
 
+/// How exactly a controller keeps to the path that a program describes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "kebab-case")]
+pub enum PathMode {
+    /// G64: corners are rounded off within a tolerance.
+    #[default]
+    Blend,
+    /// G61: every point is passed through.
+    ExactPath,
+    /// G61.1: every point is stopped at.
+    ExactStop,
+}
+
 /// How a path is laid.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PathOptions {
@@ -36,6 +52,8 @@ pub struct PathOptions {
     pub wheel: Wheel,
     /// How the tracks run.
     pub pattern: Pattern,
+    /// Whether every track of a raster runs towards +x; else they alternate.
+    pub one_way: bool,
     /// How far apart they are.
     pub spacing: TrackSpacing,
     /// How far the straight lines between points may be from the path of the wheel's centre, in millimetres.
@@ -61,7 +79,8 @@ impl PathOptions {
     pub fn new(wheel: Wheel, track_mm: f64, feed_mm_min: f64) -> Self {
         Self {
             wheel,
-            pattern: Pattern::Raster { one_way: false },
+            pattern: Pattern::Raster,
+            one_way: false,
             spacing: TrackSpacing::Distance(track_mm),
             chord_error_mm: 1e-4,
             longest_step_mm: 1.0,

@@ -108,7 +108,7 @@ impl Tracks {
             return Err(PathError::TooManyTracks { tracks: turns, track_mm, limit: MOST_TRACKS });
         }
         let tracks = match options.pattern {
-            Pattern::Raster { one_way } => raster(outline, options.overrun_mm, track_mm, one_way),
+            Pattern::Raster => raster(outline, options.overrun_mm, track_mm, options.one_way),
             Pattern::Spiral => spiral(outline, options.overrun_mm, track_mm),
         };
         if tracks.spans.is_empty() { Err(PathError::Empty) } else { Ok(tracks) }

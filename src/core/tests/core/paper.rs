@@ -2,7 +2,7 @@
 
 use regrind_core::geometry::{Point, Pose};
 use regrind_core::registration::{Method, Options, ProbeSide, Registration, Start, register};
-use regrind_core::surface::{Distance, Nominal, Projection, Side};
+use regrind_core::surface::{Distance, Nominal, Projection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, centre};
 use regrind_sim::shape::{FreeForm, Shape};
@@ -29,7 +29,7 @@ fn centres(form: &FormError, [width, depth]: [f64; 2], placement: &Placement) ->
 fn as_in_the_paper() -> Options {
     Options {
         start: Start::Pose(Pose::identity()),
-        side: ProbeSide::Known(Side::Normal),
+        side: ProbeSide::Above,
         outlier_sigmas: f64::INFINITY,
         ..Options::new(PROBE_RADIUS_MM)
     }

@@ -231,7 +231,7 @@ fn an_offset_that_folds_is_refused_with_place_and_radius() {
     let cloud = measured(&Sphere { radius_mm: 40.0 }, [0.5, 0.5], [10, 10], &Placement::IDENTITY, 0.0);
     let mut options = Options::new(0.3);
     options.start = Start::Pose(Pose::identity());
-    options.side = ProbeSide::Known(Side::Normal);
+    options.side = ProbeSide::Above;
     // A probe that fits is not refused for folding.
     assert!(!matches!(
         register(&nominal, &cloud, &options),
