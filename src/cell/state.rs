@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 /// One of the two machines of a cell.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Device {
     /// The coordinate measuring machine.

@@ -5,11 +5,13 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::formats::NominalFile;
+use regrind::surface::Projection;
 use regrind::surface::accuracy::{Accuracy, Estimate, Figures, Samples, Trust, accuracy};
 use serde::Serialize;
 
+use super::choice::word_of;
 use super::failure::Failure;
-use super::nominal::{self, ProjectionName};
+use super::nominal;
 use super::words::{counted, three_digits};
 use super::{Outcome, finite_above_zero};
 
@@ -28,8 +30,8 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "FILE")]
     nominal: PathBuf,
     /// What scattered points are projected onto
-    #[arg(long, value_enum, default_value_t)]
-    projection: ProjectionName,
+    #[arg(long, value_parser = word_of::<Projection>(), default_value = "auto")]
+    projection: Projection,
     /// Wanted error of the distance, peak to valley, in nm
     #[arg(long, value_name = "NM", allow_negative_numbers = true, value_parser = finite_above_zero)]
     want: Option<f64>,
@@ -88,7 +90,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 
 fn judge(arguments: &Arguments) -> Result<Accuracy, Failure> {
     let path = &arguments.nominal;
-    let projection = arguments.projection.into();
+    let projection = arguments.projection;
     match nominal::read(path, arguments.projection)? {
         NominalFile::Points(points) | NominalFile::Mesh { points, .. } => {
             accuracy(Samples::Points { points: &points, projection })

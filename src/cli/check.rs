@@ -9,13 +9,14 @@ use miette::{Diagnostic, GraphicalReportHandler, GraphicalTheme, LabeledSpan, Na
 use regrind::config::CellConfig;
 use regrind::document::{Problem, Problems};
 use regrind::recipe::{NominalSource, Pattern, Recipe};
+use regrind::surface::Projection;
 use regrind_sim::spec::WorldSpec;
 use serde::Serialize;
 use thiserror::Error;
 
 use super::Outcome;
 use super::failure::Failure;
-use super::nominal::{self, ProjectionName};
+use super::nominal;
 
 /// Check recipes and cell files: every problem with line, column and remedy
 #[derive(Args, Debug)]
@@ -131,7 +132,7 @@ fn check_files(recipe: &Recipe) -> Result<(), Problems> {
         }
     };
     if let NominalSource::File { path, .. } = &recipe.nominal
-        && let Err(failure) = nominal::read(path, ProjectionName::Auto)
+        && let Err(failure) = nominal::read(path, Projection::Auto)
     {
         add("nominal.file", failure);
     }
@@ -156,8 +157,16 @@ fn check_simulation(recipe: &Recipe) -> Result<(), Problems> {
     })
 }
 
+/// Shows every problem of a file at its place.
+pub(super) fn or_show<T>(read: Result<T, Problems>) -> Result<T, Failure> {
+    read.map_err(|problems| match show(&problems) {
+        Ok(()) => Failure::Checked { bad: 1, files: 1 },
+        Err(failure) => failure,
+    })
+}
+
 /// Shows problems: with the lines they stand in on a terminal, one line each elsewhere.
-pub(super) fn show(problems: &Problems) -> Result<(), Failure> {
+fn show(problems: &Problems) -> Result<(), Failure> {
     let mut text = String::new();
     if io::stderr().is_terminal() {
         let handler = GraphicalReportHandler::new_themed(GraphicalTheme::unicode());

@@ -7,10 +7,11 @@ use regrind::compensation::Correction;
 use regrind::compensation::path::{Wanted, height_of, spline_of};
 use regrind::formats::gcode::{AlongNormals, Amendment, MapKind, correct_program, read_program_map};
 use regrind::geometry::Grid;
+use regrind::surface::Projection;
 use serde::Serialize;
 
 use super::failure::Failure;
-use super::nominal::{self, ProjectionName};
+use super::nominal;
 use super::words::three_digits;
 use super::{Outcome, finite_above_zero};
 
@@ -116,8 +117,8 @@ const LEVEL_OFF_NODES: f64 = 5.0;
 
 /// Reads the nominal surface.
 fn ground(file: &std::path::Path) -> Result<Wanted, Failure> {
-    let read = nominal::read(file, ProjectionName::Auto)?;
-    let surface = nominal::surface(file, read, ProjectionName::Auto)?;
+    let read = nominal::read(file, Projection::Auto)?;
+    let surface = nominal::surface(file, read, Projection::Auto)?;
     let failed = |source| Failure::Path { path: file.to_owned(), source };
     let (field, _) = height_of(&surface).map_err(failed)?;
     let grid = Grid { columns: 1, rows: 1, first_mm: [0.0; 2], spacing_mm: [1.0; 2] };

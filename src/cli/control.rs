@@ -8,6 +8,7 @@ use regrind::cell::Device;
 use regrind::drive::{CycleRow, Reply, Request, Snapshot, ask};
 
 use super::Outcome;
+use super::choice::word_of;
 use super::failure::Failure;
 
 /// An order to a running cell.
@@ -62,8 +63,8 @@ pub(super) struct Confirmation {
     #[arg(value_name = "RUN")]
     run: Option<PathBuf>,
     /// The machine that was looked at, for `clear`, `still` and `over`
-    #[arg(long, value_enum)]
-    machine: Option<MachineName>,
+    #[arg(long, value_parser = word_of::<Device>())]
+    machine: Option<Device>,
     /// First 8 digits, or more, of the map that the grinder works by, for `started` and `done`
     #[arg(long, value_name = "DIGITS")]
     map: Option<String>,
@@ -94,12 +95,6 @@ enum What {
     Over,
 }
 
-#[derive(Clone, Copy, Debug, ValueEnum)]
-enum MachineName {
-    Cmm,
-    Grinder,
-}
-
 pub(super) fn order(arguments: &Arguments, order: Order) -> Result<Outcome, Failure> {
     let reason = arguments.reason.clone();
     let request = match order {
@@ -113,11 +108,7 @@ pub(super) fn order(arguments: &Arguments, order: Order) -> Result<Outcome, Fail
 }
 
 pub(super) fn confirm(arguments: &Confirmation) -> Result<Outcome, Failure> {
-    let device = arguments.machine.map(|machine| match machine {
-        MachineName::Cmm => Device::Cmm,
-        MachineName::Grinder => Device::Grinder,
-    });
-    let request = match (arguments.what, device) {
+    let request = match (arguments.what, arguments.machine) {
         (What::Loaded, _) => Request::Loaded,
         (What::Started, _) => Request::Started { map: named_map(arguments)? },
         (What::Done, _) => Request::Done { map: named_map(arguments)?, file: named_file(arguments)? },

@@ -3,6 +3,7 @@
 mod accuracy;
 mod audit;
 mod check;
+mod choice;
 mod compensate;
 mod control;
 mod failure;

@@ -2,7 +2,6 @@
 
 use std::path::Path;
 
-use clap::ValueEnum;
 use regrind::formats::{NominalFile, read_nominal};
 use regrind::geometry::Aperture;
 use regrind::surface::{DefinedSurface, Nominal, NominalKind, Projection, SampledSurface};
@@ -10,43 +9,18 @@ use regrind::surface::{DefinedSurface, Nominal, NominalKind, Projection, Sampled
 use super::failure::Failure;
 use super::words::count;
 
-/// `--projection` as written.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
-pub(super) enum ProjectionName {
-    /// The first of the others that is one-to-one
-    #[default]
-    Auto,
-    /// The xy plane
-    Xy,
-    /// The plane that fits the points best
-    BestFit,
-    /// Latitude and longitude, for more than a hemisphere
-    Spherical,
-}
-
-impl From<ProjectionName> for Projection {
-    fn from(name: ProjectionName) -> Self {
-        match name {
-            ProjectionName::Auto => Self::Auto,
-            ProjectionName::Xy => Self::Xy,
-            ProjectionName::BestFit => Self::BestFit,
-            ProjectionName::Spherical => Self::Spherical,
-        }
-    }
-}
-
 /// Reads a nominal file.
 ///
 /// # Errors
 /// A file that cannot be read, and a projection for what is no cloud of points.
-pub(super) fn read(path: &Path, projection: ProjectionName) -> Result<NominalFile, Failure> {
+pub(super) fn read(path: &Path, projection: Projection) -> Result<NominalFile, Failure> {
     let file = read_nominal(path)?;
     let what = match file {
         NominalFile::Points(_) => return Ok(file),
         NominalFile::Mesh { .. } => "a mesh",
         NominalFile::Definition(_) => "a definition",
     };
-    if projection != ProjectionName::Auto {
+    if projection != Projection::Auto {
         return Err(Failure::Projection { path: path.to_owned(), what });
     }
     Ok(file)
@@ -56,10 +30,10 @@ pub(super) fn read(path: &Path, projection: ProjectionName) -> Result<NominalFil
 ///
 /// # Errors
 /// What makes no surface, by file name.
-pub(super) fn surface(path: &Path, file: NominalFile, projection: ProjectionName) -> Result<Nominal, Failure> {
+pub(super) fn surface(path: &Path, file: NominalFile, projection: Projection) -> Result<Nominal, Failure> {
     let of_surface = |source| Failure::Nominal { path: path.to_owned(), source };
     match file {
-        NominalFile::Points(points) => Nominal::from_points(points, projection.into()),
+        NominalFile::Points(points) => Nominal::from_points(points, projection),
         NominalFile::Mesh { points, triangles } => Nominal::from_mesh(points, triangles),
         NominalFile::Definition(text) => {
             let (grid, outline) = sampled(path, &text)?;

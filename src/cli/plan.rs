@@ -11,8 +11,8 @@ use regrind::setup;
 use serde::Serialize;
 
 use super::Outcome;
+use super::check::or_show;
 use super::failure::Failure;
-use super::run::or_show;
 use super::words::{counted, three_digits};
 
 /// Print what a run would command, checked against every limit, without a device

@@ -3,17 +3,18 @@
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
-use clap::{Args, ValueEnum};
+use clap::Args;
 use regrind::formats::{
     Alternative, NominalInput, RegistrationDocument, ResultFolder, is_map, read_measured, save_registration,
 };
 use regrind::geometry::{Point, Pose};
-use regrind::registration::{Loss, Method, Options, ProbeSide, Start, register};
-use regrind::surface::{Distance, Nominal, NominalKind};
+use regrind::registration::{Coordinate, Loss, Method, Options, ProbeSide, Start, register};
+use regrind::surface::{Distance, Nominal, NominalKind, Projection};
 
+use super::choice::word_of;
 use super::failure::Failure;
 use super::initial::read_pose;
-use super::nominal::{self, ProjectionName, kind_in_words};
+use super::nominal::{self, kind_in_words};
 use super::words::{count, counted, three_digits};
 use super::{Outcome, above_zero, finite_above_zero};
 
@@ -35,26 +36,26 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// How the surface runs between the nominal points
-    #[arg(long, value_enum, default_value_t)]
-    distance: DistanceName,
+    #[arg(long, value_parser = word_of::<Distance>(), default_value = "curved")]
+    distance: Distance,
     /// What the measured points are taken for
-    #[arg(long, value_enum, default_value_t)]
-    method: MethodName,
+    #[arg(long, value_parser = word_of::<Method>(), default_value = "offset")]
+    method: Method,
     /// What scattered nominal points are projected onto
-    #[arg(long, value_enum, default_value_t)]
-    projection: ProjectionName,
+    #[arg(long, value_parser = word_of::<Projection>(), default_value = "auto")]
+    projection: Projection,
     /// Coordinates of the pose that stay as they are in --initial, or at zero, separated by commas; no search is made
-    #[arg(long, value_enum, value_delimiter = ',', value_name = "x,y,z,rx,ry,rz")]
+    #[arg(long, value_parser = word_of::<Coordinate>(), value_delimiter = ',', value_name = "x,y,z,rx,ry,rz")]
     lock: Vec<Coordinate>,
     /// How the distance of a point counts
-    #[arg(long, value_enum, default_value_t)]
-    loss: LossName,
+    #[arg(long, value_parser = word_of::<Loss>(), default_value = "none")]
+    loss: Loss,
     /// Start at this pose cmm_from_model instead of searching for one
     #[arg(long, value_name = "FILE")]
     initial: Option<PathBuf>,
     /// Side of the nominal surface on which the probe is
-    #[arg(long, value_enum, default_value_t)]
-    side: SideName,
+    #[arg(long, value_parser = word_of::<ProbeSide>(), default_value = "auto")]
+    side: ProbeSide,
     /// Refuse a fit with a larger rms deviation
     #[arg(long, value_name = "MM", allow_negative_numbers = true, value_parser = finite_above_zero)]
     max_rms: Option<f64>,
@@ -83,58 +84,6 @@ many points took part in it. `outliers` and `off_part` count the measured points
 
 Exit codes: 0 registered; 2 bad arguments or data; 3 fault.";
 
-#[derive(Clone, Copy, Debug, Default, ValueEnum)]
-enum DistanceName {
-    /// As the cubic that points and normals define
-    #[default]
-    Curved,
-    /// As flat triangles
-    Triangle,
-}
-
-#[derive(Clone, Copy, Debug, Default, PartialEq, ValueEnum)]
-enum MethodName {
-    /// Probe centres, registered to the offset surface
-    #[default]
-    Offset,
-    /// Contact points, registered to the nominal surface
-    Contact,
-    /// Probe centres, the radius subtracted from the distance; wrong by micrometres, for comparison
-    SubtractRadius,
-}
-
-#[derive(Clone, Copy, Debug, Default, ValueEnum)]
-enum LossName {
-    /// As its square
-    #[default]
-    None,
-    /// Linearly beyond 1.345 robust standard deviations
-    Huber,
-    /// Not at all beyond 4.685 robust standard deviations
-    Tukey,
-}
-
-#[derive(Clone, Copy, Debug, Default, ValueEnum)]
-enum SideName {
-    /// The one that fits
-    #[default]
-    Auto,
-    /// Where the normals point: +z, or outside a mesh
-    Normal,
-    /// The other one
-    Opposite,
-}
-
-#[derive(Clone, Copy, Debug, ValueEnum)]
-enum Coordinate {
-    X,
-    Y,
-    Z,
-    Rx,
-    Ry,
-    Rz,
-}
-
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let options = options(arguments)?;
     let folder = ResultFolder::prepare(&arguments.out)?;
@@ -158,47 +107,31 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 fn options(arguments: &Arguments) -> Result<Options, Failure> {
     let radius_mm = match (arguments.probe_radius, arguments.method) {
         (Some(radius_mm), _) => radius_mm,
-        (None, MethodName::Contact) => 0.0,
+        (None, Method::Contact) => 0.0,
         (None, _) => return Err(Failure::NoProbeRadius),
     };
-    let mut options = Options::new(radius_mm);
-    options.method = match arguments.method {
-        MethodName::Offset => Method::Offset,
-        MethodName::Contact => Method::Contact,
-        MethodName::SubtractRadius => Method::SubtractRadius,
-    };
-    options.distance = match arguments.distance {
-        DistanceName::Curved => Distance::Curved,
-        DistanceName::Triangle => Distance::Triangle,
-    };
-    options.loss = match arguments.loss {
-        LossName::None => Loss::None,
-        LossName::Huber => Loss::Huber,
-        LossName::Tukey => Loss::Tukey,
-    };
-    options.side = match arguments.side {
-        SideName::Auto => ProbeSide::Auto,
-        SideName::Normal => ProbeSide::Above,
-        SideName::Opposite => ProbeSide::Below,
-    };
-    for &coordinate in &arguments.lock {
-        options.locked[coordinate as usize] = true;
-    }
-    options.start = match &arguments.initial {
-        Some(path) => Start::Pose(read_pose(path)?),
-        None if arguments.lock.is_empty() => Start::Search,
-        // A search would choose the locked coordinates at random.
-        None => Start::Pose(Pose::identity()),
-    };
-    options.outlier_sigmas = arguments.outlier_sigmas;
-    options.rms_limit_mm = arguments.max_rms;
-    Ok(options)
+    Ok(Options {
+        method: arguments.method,
+        distance: arguments.distance,
+        loss: arguments.loss,
+        side: arguments.side,
+        locked: Coordinate::locked(&arguments.lock),
+        start: match &arguments.initial {
+            Some(path) => Start::Pose(read_pose(path)?),
+            None if arguments.lock.is_empty() => Start::Search,
+            // A search would choose the locked coordinates at random.
+            None => Start::Pose(Pose::identity()),
+        },
+        outlier_sigmas: arguments.outlier_sigmas,
+        rms_limit_mm: arguments.max_rms,
+        ..Options::new(radius_mm)
+    })
 }
 
 /// Reads both files at once; the nominal surface is made while the measured points are still read.
 fn read_inputs(arguments: &Arguments) -> Result<(Nominal, Vec<Point>), Failure> {
     let (path, projection) = (&arguments.nominal, arguments.projection);
-    if is_map(&arguments.measured)? && !matches!(arguments.method, MethodName::Contact) {
+    if is_map(&arguments.measured)? && !matches!(arguments.method, Method::Contact) {
         return Err(Failure::MapOfContacts { path: arguments.measured.clone() });
     }
     std::thread::scope(|scope| {

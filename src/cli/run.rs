@@ -7,7 +7,6 @@ use clap::Args;
 use regrind::cell::{Actor, Beginning, Ending};
 use regrind::config::{CellConfig, Link};
 use regrind::device::{AnyCmm, AnyGrinder, Line};
-use regrind::document::Problems;
 use regrind::drive::{Drive, Orders, Request, Run, Task};
 use regrind::formats::{LEARNED, Learned, LearnedError};
 use regrind::journal::{Header, Journal};
@@ -59,8 +58,8 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let recipe = or_show(Recipe::read(&arguments.recipe))?;
-    let cell = or_show(CellConfig::read(&arguments.cell))?;
+    let recipe = check::or_show(Recipe::read(&arguments.recipe))?;
+    let cell = check::or_show(CellConfig::read(&arguments.cell))?;
     let (mut task, plan) = setup::prepare(&recipe, &cell).map_err(Failure::Setup)?;
     if let Some(seed) = arguments.seed {
         task.setting.push_str(&format!(", seed {seed}"));
@@ -265,15 +264,5 @@ fn outcome(ending: &Ending) -> Result<Outcome, Failure> {
     }
 }
 
-/// Shows every problem of a file at its place.
-pub(super) fn or_show<T>(read: Result<T, Problems>) -> Result<T, Failure> {
-    read.map_err(|problems| match check::show(&problems) {
-        Ok(()) => Failure::Checked { bad: 1, files: 1 },
-        Err(failure) => failure,
-    })
-}
-
 /// Two presses within this are one wish, whatever the cell has made of the first by then.
 const IN_ONE_GO: Duration = Duration::from_secs(3);
-/// How long a line that says nothing new may be left out.
-pub(super) const QUIET: Duration = Duration::from_secs(2);

@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 use std::io::{self, IsTerminal};
 use std::path::Path;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use regrind::cell::{Alarm, Device, Ending, Figures, Judgement};
@@ -12,8 +12,10 @@ use regrind::recipe::{Recipe, Um};
 use tokio::sync::mpsc;
 
 use super::failure::Failure;
-use super::run::QUIET;
 use super::words::three_digits;
+
+/// How long a line that says nothing new may be left out.
+const QUIET: Duration = Duration::from_secs(2);
 
 /// Shows a run.
 pub(super) struct Show {

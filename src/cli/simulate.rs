@@ -8,8 +8,8 @@ use regrind::device::Line;
 use regrind::recipe::Recipe;
 use serde_json::{Value, json};
 
+use super::check::or_show;
 use super::failure::Failure;
-use super::run::or_show;
 use super::{Outcome, simulated};
 
 /// Serve the simulated CMM and grinder of a cell on their wires until stopped
