@@ -4,15 +4,16 @@ use std::fs::File;
 use std::io::{self, IsTerminal, Read, Write};
 use std::path::{Path, PathBuf};
 
+use annotate_snippets::renderer::DecorStyle;
+use annotate_snippets::{AnnotationKind, Level, Origin, Renderer, Snippet};
 use clap::Args;
-use miette::{Diagnostic, GraphicalReportHandler, GraphicalTheme, LabeledSpan, NamedSource, SourceCode};
+use console::Term;
 use regrind::config::CellConfig;
 use regrind::document::{Problem, Problems};
 use regrind::recipe::{NominalSource, Pattern, Recipe};
 use regrind::surface::Projection;
 use regrind_sim::spec::WorldSpec;
 use serde::Serialize;
-use thiserror::Error;
 
 use super::Outcome;
 use super::failure::Failure;
@@ -167,60 +168,33 @@ pub(super) fn or_show<T>(read: Result<T, Problems>) -> Result<T, Failure> {
 
 /// Shows problems: with the lines they stand in on a terminal, one line each elsewhere.
 fn show(problems: &Problems) -> Result<(), Failure> {
-    let mut text = String::new();
-    if io::stderr().is_terminal() {
-        let handler = GraphicalReportHandler::new_themed(GraphicalTheme::unicode());
-        for problem in &problems.problems {
-            // A report that cannot be drawn is told in one line.
-            if handler.render_report(&mut text, &Shown::new(problems, problem)).is_err() {
-                text.push_str(&format!("{}: {problem}\n", problems.file.display()));
-            }
-            text.push('\n');
-        }
+    let text = if io::stderr().is_terminal() {
+        let columns = Term::stderr().size_checked().map_or(100, |(_, columns)| usize::from(columns));
+        let renderer = Renderer::styled().decor_style(DecorStyle::Unicode).term_width(columns);
+        problems.problems.iter().map(|problem| picture(problems, problem, &renderer)).collect()
     } else {
-        text = format!("{problems}\n");
-    }
+        format!("{problems}\n")
+    };
     match io::stderr().lock().write_all(text.as_bytes()) {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(Failure::Terminal(error)),
         _ => Ok(()),
     }
 }
 
-/// One problem as a report with its lines.
-#[derive(Debug, Error)]
-#[error("{message}")]
-struct Shown {
-    message: String,
-    source_code: NamedSource<String>,
-    label: LabeledSpan,
-    remedy: String,
-}
-
-impl Shown {
-    fn new(problems: &Problems, problem: &Problem) -> Self {
-        let key = if problem.key.is_empty() { String::new() } else { format!("`{}` ", problem.key) };
-        let span = problem.span.start..problem.span.end.max(problem.span.start);
-        Self {
-            message: format!("{key}{}", problem.found),
-            source_code: NamedSource::new(problems.file.display().to_string(), problems.text.clone()),
-            label: LabeledSpan::new_with_span(Some(problem.allowed.clone()), span),
-            remedy: problem.remedy.clone(),
-        }
-    }
-}
-
-impl Diagnostic for Shown {
-    fn help<'a>(&'a self) -> Option<Box<dyn std::fmt::Display + 'a>> {
-        (!self.remedy.is_empty()).then(|| Box::new(&self.remedy) as Box<dyn std::fmt::Display>)
-    }
-
-    fn source_code(&self) -> Option<&dyn SourceCode> {
-        Some(&self.source_code)
-    }
-
-    fn labels(&self) -> Option<Box<dyn Iterator<Item = LabeledSpan> + '_>> {
-        Some(Box::new(std::iter::once(self.label.clone())))
-    }
+/// Draws one problem: what is wrong, where, the line itself with what is allowed there, and the remedy.
+fn picture(problems: &Problems, problem: &Problem, renderer: &Renderer) -> String {
+    let key = if problem.key.is_empty() { String::new() } else { format!("`{}` ", problem.key) };
+    let title = Level::ERROR.primary_title(format!("{key}{}", problem.found));
+    let file = problems.file.display().to_string();
+    let place = AnnotationKind::Primary.span(problem.span.clone());
+    let place = if problem.allowed.is_empty() { place } else { place.label(&problem.allowed) };
+    let group = if problems.text.is_empty() {
+        title.element(Origin::path(file))
+    } else {
+        title.element(Snippet::source(&problems.text).path(file).annotation(place))
+    };
+    let remedy = (!problem.remedy.is_empty()).then(|| Level::HELP.message(&problem.remedy));
+    format!("{}\n\n", renderer.render(&[group.elements(remedy)]))
 }
 
 impl Told {
@@ -233,4 +207,31 @@ impl Told {
 
 fn hex(bytes: &[u8; 32]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_picture_has_place_line_marker_limit_and_remedy() {
+        let text = "[measure]\nprobe_radius_mm = 1500\n".to_owned();
+        let problem = Problem {
+            span: 28..32,
+            key: "measure.probe_radius_mm".into(),
+            found: "is 1500".into(),
+            allowed: "it must be at most 50 mm".into(),
+            remedy: "write 1.5".into(),
+        };
+        let mut problems = Problems { file: "part.toml".into(), text, problems: vec![problem.clone()] };
+        let drawn = picture(&problems, &problem, &Renderer::plain());
+        let lines: Vec<&str> = drawn.lines().collect();
+        assert_eq!(lines[0], "error: `measure.probe_radius_mm` is 1500");
+        assert!(lines[1].ends_with("part.toml:2:19"), "{drawn}");
+        let at = |line: &str, what: &str| lines.iter().find(|l| l.contains(line)).and_then(|l| l.find(what));
+        assert_eq!(at("probe_radius_mm =", "1500"), at("^^^^", "^^^^"), "{drawn}");
+        assert!(drawn.contains("^^^^ it must be at most 50 mm") && drawn.contains("help: write 1.5"), "{drawn}");
+        problems.text.clear();
+        assert!(picture(&problems, &problem, &Renderer::plain()).contains("part.toml"));
+    }
 }

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use clap::Args;
-use regrind::cell::{Actor, Beginning, Ending};
+use regrind::cell::{Actor, Beginning, CellPlan, Ending};
 use regrind::config::{CellConfig, Link};
 use regrind::device::{AnyCmm, AnyGrinder, Line};
 use regrind::drive::{Drive, Orders, Request, Run, Task};
@@ -64,14 +64,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     if let Some(seed) = arguments.seed {
         task.setting.push_str(&format!(", seed {seed}"));
     }
-    let (learned_from, left_alone) = match recipe.compensation.learn {
-        true => newest_learned(&arguments.runs, &task.setting, cell.simulated),
-        false => (None, Vec::new()),
+    let earlier = match recipe.compensation.learn {
+        true => Some(Earlier::begun_with(&mut task, &arguments.runs)?),
+        false => None,
     };
-    if let Some((learned, _)) = &learned_from {
-        let run = learned.run.clone();
-        task.begin_with(learned.clone()).map_err(|source| Failure::TooMuchLearned { run, source })?;
-    }
     // What a run begins with is checked before anything opens; the path of any other pass when its map is made, and it may come to none.
     if plan.begin_with == Beginning::Grind {
         plan::first_path(&task, &recipe, &cell)?;
@@ -86,66 +82,97 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             Some(spec) => Some(simulated::serve(spec, &mut cell).await?),
             None => None,
         };
-        let actor = operator(arguments.operator.as_deref());
-        let began = jiff::Timestamp::now();
-        let job = u32::try_from(began.as_second() & 0x7fff_ffff).unwrap_or(1).max(1);
-        // Before the record begins: a folder that is not there, or a line that is in use, is no run.
-        let part = arguments.part.clone().unwrap_or_else(|| recipe_name(&recipe));
-        let folder = free_folder(&arguments.runs, &recipe_name(&recipe), began, cell.simulated);
-        let client = [owner(&actor), job];
-        let (cmm, grinder) = setup::machines(&recipe, &cell, &part, &folder, client).map_err(Failure::Setup)?;
-        if recipe.compensation.learn && !arguments.json {
-            for error in &left_alone {
-                super::print(&format!("left alone: {error}\n"))?;
-            }
-            super::print(&match &learned_from {
-                Some((learned, _)) => format!("begins with what {} found to come back in every pass\n", learned.run),
-                None => format!(
-                    "begins from nothing: no finished run in {} has this part, cell, wheel, gain and way of measuring\n",
-                    arguments.runs.display()
-                ),
-            })?;
-        }
-        let left_alone = left_alone.iter().map(ToString::to_string).collect();
-        let mut journal = journal(arguments, &folder, &recipe, &cell, &actor, learned_from, left_alone)?;
-        if task.learned.is_some() || cell.grinder.link.wire.works_from_run() {
-            record_first_correction(&task, &mut journal)?;
-        }
-        let (notices, shown) = mpsc::unbounded_channel();
-        let poll = [setup::poll(&cell.cmm.link), setup::poll(&cell.grinder.link)];
-        let loaded = arguments.loaded || cell.simulated;
-        let run = Run { plan, task, journal, job, actor: actor.clone(), loaded, poll, notices, interrupted: None };
-        let show = Show::new(arguments.json, cell.simulated, &recipe, &folder);
-        let showing = tokio::spawn(show.follow(shown));
-        let ending = go(run, cmm, grinder, actor).await?;
-        showing.await.map_err(|e| Failure::Terminal(e.into()))??;
-        // The record is closed; a report that cannot be written must not change how the run ended.
-        if let Err(error) = regrind::report::write_run_report(&folder) {
-            super::print(&format!("no report: {error}\n"))?;
-        }
+        let ending = carry_out(arguments, &recipe, &cell, task, plan, earlier).await?;
         outcome(&ending)
     })
 }
 
-/// What an earlier run left, and the file as it is.
-type LearnedFrom = Option<(Learned, Vec<u8>)>;
-
-/// Returns what the newest finished run of the same setting left to learn from, and which files could not be read on the way to it.
-fn newest_learned(runs: &Path, setting: &str, simulated: bool) -> (LearnedFrom, Vec<LearnedError>) {
-    // No folder is no run yet.
-    let Ok(entries) = std::fs::read_dir(runs) else { return (None, Vec::new()) };
-    let written = |run: PathBuf| Some((std::fs::metadata(run.join(LEARNED)).and_then(|m| m.modified()).ok()?, run));
-    let mut all: Vec<_> = entries.filter_map(|entry| written(entry.ok()?.path())).collect();
-    all.sort();
-    let mut left_alone = Vec::new();
-    for (_, run) in all.into_iter().rev() {
-        match Learned::read(&run, setting, simulated) {
-            Ok(None) => {}
-            Ok(found) => return (found, left_alone),
-            Err(error) => left_alone.push(error),
-        }
+/// Opens the machines, begins the record, and lets the run go to its end and its report.
+async fn carry_out(
+    arguments: &Arguments,
+    recipe: &Recipe,
+    cell: &CellConfig,
+    task: Task,
+    plan: CellPlan,
+    earlier: Option<Earlier>,
+) -> Result<Ending, Failure> {
+    let actor = operator(arguments.operator.as_deref());
+    let began = jiff::Timestamp::now();
+    let job = u32::try_from(began.as_second() & 0x7fff_ffff).unwrap_or(1).max(1);
+    // Before the record begins: a folder that is not there, or a line that is in use, is no run.
+    let part = arguments.part.clone().unwrap_or_else(|| recipe_name(recipe));
+    let folder = free_folder(&arguments.runs, &recipe_name(recipe), began, cell.simulated);
+    let client = [owner(&actor), job];
+    let (cmm, grinder) = setup::machines(recipe, cell, &part, &folder, client).map_err(Failure::Setup)?;
+    if let Some(earlier) = earlier.as_ref().filter(|_| !arguments.json) {
+        super::print(&earlier.in_words(&arguments.runs))?;
     }
-    (None, left_alone)
+    let mut journal = journal(arguments, &folder, recipe, cell, &actor, earlier.unwrap_or_default())?;
+    if task.learned.is_some() || cell.grinder.link.wire.works_from_run() {
+        record_first_correction(&task, &mut journal)?;
+    }
+    let (notices, shown) = mpsc::unbounded_channel();
+    let showing = tokio::spawn(Show::new(arguments.json, cell.simulated, recipe, &folder).follow(shown));
+    let poll = [setup::poll(&cell.cmm.link), setup::poll(&cell.grinder.link)];
+    let loaded = arguments.loaded || cell.simulated;
+    let run = Run { plan, task, journal, job, actor: actor.clone(), loaded, poll, notices, interrupted: None };
+    let ending = go(run, cmm, grinder, actor).await?;
+    showing.await.map_err(|e| Failure::Terminal(e.into()))??;
+    // The record is closed; a report that cannot be written must not change how the run ended.
+    if let Err(error) = regrind::report::write_run_report(&folder) {
+        super::print(&format!("no report: {error}\n"))?;
+    }
+    Ok(ending)
+}
+
+/// What earlier runs left to learn from.
+#[derive(Default)]
+struct Earlier {
+    /// What the newest finished run of the same setting left, and the file as it is.
+    learned: Option<(Learned, Vec<u8>)>,
+    /// What could not be read on the way to it.
+    left_alone: Vec<LearnedError>,
+}
+
+impl Earlier {
+    /// Lets a task begin with what the newest run left that is like it.
+    fn begun_with(task: &mut Task, runs: &Path) -> Result<Self, Failure> {
+        let earlier = Self::newest(runs, &task.setting, task.simulation);
+        if let Some((learned, _)) = &earlier.learned {
+            let run = learned.run.clone();
+            task.begin_with(learned.clone()).map_err(|source| Failure::TooMuchLearned { run, source })?;
+        }
+        Ok(earlier)
+    }
+
+    fn newest(runs: &Path, setting: &str, simulated: bool) -> Self {
+        let mut earlier = Self::default();
+        // No folder is no run yet.
+        let Ok(entries) = std::fs::read_dir(runs) else { return earlier };
+        let written = |run: PathBuf| Some((std::fs::metadata(run.join(LEARNED)).and_then(|m| m.modified()).ok()?, run));
+        let mut all: Vec<_> = entries.filter_map(|entry| written(entry.ok()?.path())).collect();
+        all.sort();
+        for (_, run) in all.into_iter().rev() {
+            match Learned::read(&run, setting, simulated) {
+                Ok(None) => {}
+                Ok(found) => return Self { learned: found, ..earlier },
+                Err(error) => earlier.left_alone.push(error),
+            }
+        }
+        earlier
+    }
+
+    fn in_words(&self, runs: &Path) -> String {
+        let mut text: String = self.left_alone.iter().map(|error| format!("left alone: {error}\n")).collect();
+        text += &match &self.learned {
+            Some((learned, _)) => format!("begins with what {} found to come back in every pass\n", learned.run),
+            None => format!(
+                "begins from nothing: no finished run in {} has this part, cell, wheel, gain and way of measuring\n",
+                runs.display()
+            ),
+        };
+        text
+    }
 }
 
 /// Gives the run its machines and lets it go.
@@ -186,8 +213,7 @@ fn journal(
     recipe: &Recipe,
     cell: &CellConfig,
     actor: &Actor,
-    learned_from: LearnedFrom,
-    left_alone: Vec<String>,
+    Earlier { learned, left_alone }: Earlier,
 ) -> Result<Journal, Failure> {
     let part = arguments.part.clone().unwrap_or_else(|| "unnamed".into());
     let hex = |bytes: &[u8; 32]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
@@ -201,14 +227,14 @@ fn journal(
         content: json!({
             "recipe": recipe.path(), "recipe_sha256": hex(recipe.source_sha256()),
             "cell": cell.path(), "cell_sha256": hex(cell.source_sha256()),
-            "part_name": recipe.part.name, "seed": arguments.seed, "learned_from": learned_from.as_ref().map(|(learned, _)| &learned.run),
-            "left_alone": left_alone,
+            "part_name": recipe.part.name, "seed": arguments.seed, "learned_from": learned.as_ref().map(|(learned, _)| &learned.run),
+            "left_alone": left_alone.iter().map(ToString::to_string).collect::<Vec<_>>(),
         }),
     };
     let mut journal = Journal::create(folder, header).map_err(Failure::Journal)?;
     journal.store("recipe.toml", recipe.text().as_bytes(), 0, 0).map_err(Failure::Journal)?;
     journal.store("cell.toml", cell.text().as_bytes(), 0, 0).map_err(Failure::Journal)?;
-    if let Some((_, text)) = learned_from {
+    if let Some((_, text)) = learned {
         journal.store("learned_from.json", &text, 0, 0).map_err(Failure::Journal)?;
     }
     Ok(journal)

@@ -8,7 +8,7 @@ use serde_json::Value;
 /// Makes the schema of a file.
 ///
 /// A key that may be left out is an `Option`, whose null TOML cannot write: it is taken away. A key that must stand can be left out too, so
-/// that what is wrong with it is told with the rest: its default is no value (a number that is NaN), or it says `x-required`.
+/// that what is wrong with it is told with the rest: its default is NaN, which JSON has not, or it says `x-required`.
 pub(crate) fn schema_of<File: JsonSchema>() -> Value {
     let settings = SchemaSettings::draft2020_12().with(|settings| settings.inline_subschemas = true);
     let mut schema = settings.into_generator().into_root_schema_for::<File>();
@@ -18,19 +18,16 @@ pub(crate) fn schema_of<File: JsonSchema>() -> Value {
 
 fn tidy(schema: &mut Schema) {
     without_null(schema);
-    if schema.get("default").is_some_and(Value::is_null) {
-        schema.remove("default");
-    }
     // A table's keys have their own defaults.
-    if schema.get("default").is_some_and(Value::is_object) {
+    if schema.get("default").is_some_and(|default| default.is_null() || default.is_object()) {
         schema.remove("default");
     }
     schema.remove("format");
     schema.remove("title");
     let Some(properties) = schema.get("properties").and_then(Value::as_object) else { return };
-    let no_value =
-        |value: &Value| value.get("default").is_some_and(Value::is_null) && value.get("type") == Some(&"number".into());
-    let must = |value: &Value| value.get("x-required").is_some() || value.get("const").is_some() || no_value(value);
+    // A key that is an `Option` has more than one type here.
+    let is_nan = |value: &Value| value["type"] == "number" && value.get("default").is_some_and(Value::is_null);
+    let must = |value: &Value| value.get("x-required").is_some() || value.get("const").is_some() || is_nan(value);
     let required: Vec<Value> =
         properties.iter().filter(|(_, value)| must(value)).map(|(key, _)| Value::from(key.as_str())).collect();
     schema.remove("required");
