@@ -27,9 +27,12 @@ fn tidy(schema: &mut Schema) {
     let Some(properties) = schema.get("properties").and_then(Value::as_object) else { return };
     // A key that is an `Option` has more than one type here.
     let is_nan = |value: &Value| value["type"] == "number" && value.get("default").is_some_and(Value::is_null);
-    let must = |value: &Value| value.get("x-required").is_some() || value.get("const").is_some() || is_nan(value);
-    let required: Vec<Value> =
-        properties.iter().filter(|(_, value)| must(value)).map(|(key, _)| Value::from(key.as_str())).collect();
+    let by_type = schema.get("required").and_then(Value::as_array).cloned().unwrap_or_default();
+    let must = |(key, value): &(&String, &Value)| {
+        let is_said = value.get("x-required").is_some() || value.get("const").is_some();
+        is_said || is_nan(value) || by_type.iter().any(|name| name == *key)
+    };
+    let required: Vec<Value> = properties.iter().filter(must).map(|(key, _)| Value::from(key.as_str())).collect();
     schema.remove("required");
     if !required.is_empty() {
         schema.insert("required".into(), Value::Array(required));

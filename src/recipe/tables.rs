@@ -10,7 +10,9 @@ use serde::{Deserialize, Serialize};
 use crate::cell::{Beginning, Disposal, PvOf};
 use crate::compensation::path::{PathMode, Pattern as TrackPattern};
 use crate::compensation::{GainRule, Order, Roughness, Smoothing};
+use crate::geometry::Aperture;
 use crate::registration::{Coordinate, Loss, ProbeSide};
+use crate::surface::analytic::{Formula, SamplingDefinition};
 use crate::surface::{Distance, Projection};
 
 /// A length in micrometres, as recipes have it.
@@ -83,13 +85,13 @@ pub(super) struct NominalTable {
     /// What scattered points of a file are projected onto.
     pub projection: Option<Projection>,
     /// A formula z(x, y).
-    #[schemars(schema_with = "surface")]
+    #[schemars(with = "Option<Formula>")]
     pub surface: Option<toml::Table>,
     /// The outline of the part in x, y.
-    #[schemars(schema_with = "aperture")]
+    #[schemars(with = "Option<Aperture>")]
     pub aperture: Option<toml::Table>,
     /// How finely a formula is sampled: one of the two.
-    #[schemars(schema_with = "sampling")]
+    #[schemars(with = "Option<SamplingDefinition>")]
     pub sampling: Option<toml::Table>,
 }
 
@@ -496,169 +498,4 @@ impl Default for Cycle {
 
 fn any_table(_: &mut schemars::SchemaGenerator) -> Schema {
     json_schema!({ "type": "object", "additionalProperties": true })
-}
-
-/// What a key of a formula or an outline takes.
-#[derive(Clone, Copy)]
-enum Takes {
-    Number,
-    /// A radius of curvature, infinite where there is no curvature.
-    Radius,
-    Numbers,
-    Pair,
-    /// Coefficients by the name of their term.
-    Named,
-    /// [i, j, coefficient].
-    Terms,
-    Corners,
-    Words(&'static [&'static str]),
-    Conic,
-    Parent,
-}
-
-/// A key: its name, whether it must stand, what it takes.
-type Key = (&'static str, bool, Takes);
-
-const CONIC: [Key; 2] = [("radius_mm", true, Takes::Radius), ("conic", false, Takes::Number)];
-
-/// The keys of every formula.
-const FORMULAS: [(&str, &[Key]); 11] = {
-    use Takes::*;
-    [
-        ("plane", &[]),
-        ("sphere", &[("radius_mm", true, Radius)]),
-        ("conic", &CONIC),
-        ("asphere", &[("radius_mm", true, Radius), ("conic", false, Number), ("coefficients", false, Named)]),
-        (
-            "off-axis",
-            &[
-                ("distance_mm", true, Number),
-                ("azimuth_deg", false, Number),
-                ("frame", true, Words(&["parent", "shifted", "tilted"])),
-                ("parent", true, Parent),
-            ],
-        ),
-        (
-            "toroid",
-            &[
-                ("radius_x_mm", true, Radius),
-                ("radius_y_mm", true, Radius),
-                ("conic_y", false, Number),
-                ("coefficients", false, Named),
-            ],
-        ),
-        (
-            "biconic",
-            &[
-                ("radius_x_mm", true, Radius),
-                ("radius_y_mm", true, Radius),
-                ("conic_x", false, Number),
-                ("conic_y", false, Number),
-            ],
-        ),
-        ("xy-polynomial", &[("normalisation_radius_mm", true, Number), ("terms", true, Terms), ("base", false, Conic)]),
-        (
-            "zernike",
-            &[
-                ("numbering", true, Words(&["noll", "ansi", "fringe"])),
-                ("normalisation_radius_mm", true, Number),
-                ("coefficients_mm", true, Named),
-                ("normalisation", false, Words(&["orthonormal", "unnormalised"])),
-                ("base", false, Conic),
-            ],
-        ),
-        (
-            "qcon",
-            &[
-                ("radius_mm", true, Radius),
-                ("conic", false, Number),
-                ("normalisation_radius_mm", true, Number),
-                ("coefficients_mm", true, Numbers),
-            ],
-        ),
-        (
-            "qbfs",
-            &[
-                ("radius_mm", true, Radius),
-                ("normalisation_radius_mm", true, Number),
-                ("coefficients_mm", true, Numbers),
-            ],
-        ),
-    ]
-};
-
-/// The keys of every outline.
-const OUTLINES: [(&str, &[Key]); 5] = {
-    use Takes::*;
-    [
-        ("rectangle", &[("centre_mm", false, Pair), ("width_mm", true, Number), ("height_mm", true, Number)]),
-        ("circle", &[("centre_mm", false, Pair), ("radius_mm", true, Number)]),
-        ("ellipse", &[("centre_mm", false, Pair), ("semi_axes_mm", true, Pair)]),
-        (
-            "annulus",
-            &[("centre_mm", false, Pair), ("inner_radius_mm", true, Number), ("outer_radius_mm", true, Number)],
-        ),
-        ("polygon", &[("corners_mm", true, Corners)]),
-    ]
-};
-
-fn surface(_: &mut schemars::SchemaGenerator) -> Schema {
-    by_kind(&FORMULAS)
-}
-
-fn aperture(_: &mut schemars::SchemaGenerator) -> Schema {
-    by_kind(&OUTLINES)
-}
-
-fn sampling(_: &mut schemars::SchemaGenerator) -> Schema {
-    object(None, &[("spacing_mm", false, Takes::Number), ("accuracy_nm", false, Takes::Number)])
-}
-
-fn by_kind(kinds: &[(&str, &[Key])]) -> Schema {
-    let variants: Vec<Schema> = kinds.iter().map(|(kind, keys)| object(Some(kind), keys)).collect();
-    json_schema!({ "oneOf": variants })
-}
-
-fn object(kind: Option<&str>, keys: &[Key]) -> Schema {
-    let mut properties = serde_json::Map::new();
-    if let Some(kind) = kind {
-        properties.insert("kind".into(), serde_json::json!({ "type": "string", "const": kind }));
-    }
-    for (name, required, takes) in keys {
-        let mut schema = takes.schema();
-        if *required {
-            schema.insert("x-required".into(), true.into());
-        }
-        properties.insert((*name).to_owned(), schema.to_value());
-    }
-    json_schema!({ "type": "object", "properties": properties, "additionalProperties": false })
-}
-
-impl Takes {
-    fn schema(self) -> Schema {
-        let number = || json_schema!({ "type": "number" });
-        let pair = || json_schema!({ "type": "array", "items": number(), "minItems": 2, "maxItems": 2 });
-        match self {
-            Self::Number => number(),
-            Self::Radius => json_schema!({ "type": "number", "x-infinite": true }),
-            Self::Numbers => json_schema!({ "type": "array", "items": number() }),
-            Self::Pair => pair(),
-            Self::Named => json_schema!({ "type": "object", "additionalProperties": number() }),
-            Self::Corners => json_schema!({ "type": "array", "items": pair(), "minItems": 3 }),
-            Self::Words(words) => json_schema!({ "type": "string", "enum": words }),
-            Self::Conic => object(None, &CONIC),
-            Self::Parent => {
-                let sections = |kinds: &(&str, &[Key])| kinds.0 == "off-axis";
-                by_kind(&FORMULAS.iter().filter(|kind| !sections(kind)).copied().collect::<Vec<_>>())
-            }
-            Self::Terms => {
-                let power = json_schema!({ "type": "integer", "minimum": 0, "maximum": 60 });
-                let term = [power.clone(), power, number()];
-                json_schema!({
-                    "type": "array",
-                    "items": { "type": "array", "prefixItems": term.as_slice(), "minItems": 3, "maxItems": 3 }
-                })
-            }
-        }
-    }
 }

@@ -16,6 +16,7 @@ const MOST_CORNERS: usize = 4000;
 ///
 /// Units: millimetres. As written in TOML: `kind = "circle"`, `radius_mm = 30.0`; a centre left out is the origin.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Aperture {
     /// A rectangle along the axes.
@@ -57,6 +58,7 @@ pub enum Aperture {
     /// A simple polygon, convex or not, its corners in either sense of turning; the last corner joins the first.
     Polygon {
         /// The corners in order, each once.
+        #[cfg_attr(feature = "schema", schemars(length(min = 3)))]
         corners_mm: Vec<[f64; 2]>,
     },
 }

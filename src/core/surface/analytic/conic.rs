@@ -24,9 +24,11 @@ pub struct Conic {
 ///
 /// Units: millimetres; the conic constant has none.
 #[derive(Clone, Copy, Debug, Deserialize, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ConicDefinition {
     /// Radius of curvature at the vertex, positive with the centre at +z; `inf` for none.
+    #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_mm: f64,
     /// Conic constant k: 0 sphere, -1 paraboloid, less than -1 hyperboloid.
     #[serde(default)]
@@ -91,9 +93,11 @@ pub struct Asphere {
 
 /// An asphere as written.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct AsphereDefinition {
     /// Radius of curvature at the vertex in millimetres, positive with the centre at +z; `inf` for none.
+    #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_mm: f64,
     /// Conic constant.
     #[serde(default)]

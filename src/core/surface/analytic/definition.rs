@@ -37,6 +37,7 @@ const DEFAULT_ACCURACY_NM: f64 = 0.1;
 
 /// A nominal surface as written.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SurfaceDefinition {
     /// The formula.
@@ -49,6 +50,7 @@ pub struct SurfaceDefinition {
 
 /// A formula as written, told apart by `kind`.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(tag = "kind", rename_all = "kebab-case")]
 pub enum Formula {
     /// The plane z = 0.
@@ -72,6 +74,24 @@ pub enum Formula {
     /// Forbes' polynomials for strong aspheres.
     Qcon(QconDefinition),
     /// Forbes' polynomials for mild aspheres.
+    Qbfs(QbfsDefinition),
+}
+
+/// The kinds of [`Formula`] that a section may be cut from, for the schema alone: all but the section itself.
+#[cfg(feature = "schema")]
+#[derive(schemars::JsonSchema)]
+#[serde(tag = "kind", rename_all = "kebab-case")]
+#[expect(dead_code, reason = "only its schema is used")]
+pub(super) enum WholeFormula {
+    Plane(PlaneDefinition),
+    Sphere(SphereDefinition),
+    Conic(ConicDefinition),
+    Asphere(AsphereDefinition),
+    Toroid(ToroidDefinition),
+    Biconic(BiconicDefinition),
+    XyPolynomial(XyPolynomialDefinition),
+    Zernike(ZernikeDefinition),
+    Qcon(QconDefinition),
     Qbfs(QbfsDefinition),
 }
 
@@ -126,19 +146,23 @@ enum ApertureByKind {
 
 /// A plane as written: it has no numbers.
 #[derive(Clone, Copy, Debug, Deserialize, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct PlaneDefinition {}
 
 /// A sphere as written.
 #[derive(Clone, Copy, Debug, Deserialize, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SphereDefinition {
     /// Radius in millimetres, positive with the centre at +z.
+    #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_mm: f64,
 }
 
 /// How finely a surface is sampled, as written: one of the two.
 #[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SamplingDefinition {
     /// Distance between nodes along x and y, in millimetres.

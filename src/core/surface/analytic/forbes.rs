@@ -26,9 +26,11 @@ pub struct Qcon {
 
 /// A Qcon asphere as written.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct QconDefinition {
     /// Radius of curvature at the vertex in millimetres, positive with the centre at +z; `inf` for none.
+    #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_mm: f64,
     /// Conic constant.
     #[serde(default)]
@@ -85,9 +87,11 @@ pub struct Qbfs {
 
 /// A Qbfs asphere as written.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct QbfsDefinition {
     /// Radius of the best-fit sphere in millimetres, positive with the centre at +z; `inf` for a plane.
+    #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_mm: f64,
     /// Radius at which u is 1, in millimetres.
     pub normalisation_radius_mm: f64,

@@ -12,6 +12,7 @@ const WAY_STEPS: u32 = 64;
 
 /// The frame in which a section and its aperture are described.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum SectionFrame {
     /// The parent's own.
@@ -36,9 +37,11 @@ pub struct OffAxis {
 
 /// An off-axis section as written.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct OffAxisDefinition {
     /// The whole surface, of any other kind.
+    #[cfg_attr(feature = "schema", schemars(with = "super::definition::WholeFormula"))]
     pub parent: Box<Formula>,
     /// Distance from the parent's axis to the section's centre, measured across the axis, in millimetres.
     pub distance_mm: f64,

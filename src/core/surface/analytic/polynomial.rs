@@ -21,14 +21,27 @@ pub struct XyPolynomial {
 
 /// An XY polynomial as written.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct XyPolynomialDefinition {
     /// What x and y are divided by, in millimetres; 1 for coefficients in mm^(1 - i - j).
     pub normalisation_radius_mm: f64,
     /// Terms [i, j, coefficient in millimetres].
+    #[cfg_attr(feature = "schema", schemars(schema_with = "terms_schema"))]
     pub terms: Vec<(u32, u32, f64)>,
     /// The conic the polynomial is added to; none for a plane.
     pub base: Option<ConicDefinition>,
+}
+
+/// What a list of terms looks like: powers up to [`LARGEST_POWER`].
+#[cfg(feature = "schema")]
+fn terms_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
+    let power = schemars::json_schema!({ "type": "integer", "minimum": 0, "maximum": LARGEST_POWER });
+    let term = [power.clone(), power, schemars::json_schema!({ "type": "number" })];
+    schemars::json_schema!({
+        "type": "array",
+        "items": { "type": "array", "prefixItems": term.as_slice(), "minItems": 3, "maxItems": 3 }
+    })
 }
 
 impl XyPolynomial {

@@ -20,11 +20,14 @@ pub struct Toroid {
 
 /// A toroid as written.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ToroidDefinition {
     /// Radius of rotation in millimetres, which is the radius of the section y = 0; `inf` for a cylinder.
+    #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_x_mm: f64,
     /// Radius of the curve in the (y, z) plane at its vertex, in millimetres; `inf` for none.
+    #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_y_mm: f64,
     /// Conic constant of that curve.
     #[serde(default)]
@@ -89,11 +92,14 @@ pub struct Biconic {
 
 /// A biconic as written.
 #[derive(Clone, Copy, Debug, Deserialize, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct BiconicDefinition {
     /// Radius of the section y = 0 at the vertex in millimetres; `inf` for none.
+    #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_x_mm: f64,
     /// Radius of the section x = 0 at the vertex in millimetres; `inf` for none.
+    #[cfg_attr(feature = "schema", schemars(extend("x-infinite" = true)))]
     pub radius_y_mm: f64,
     /// Conic constant of the section y = 0.
     #[serde(default)]

@@ -21,6 +21,7 @@ const LARGEST_DEGREE: u32 = 100;
 
 /// Which degree and azimuthal order an index stands for.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum ZernikeNumbering {
     /// Noll 1976, from 1; orthonormal by default.
@@ -53,6 +54,7 @@ impl ZernikeNumbering {
 
 /// How large a term is.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum ZernikeNormalisation {
     /// Mean square 1 over the disc.
@@ -72,6 +74,7 @@ pub struct Zernike {
 
 /// A Zernike surface as written.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct ZernikeDefinition {
     /// Which numbering the coefficients follow.
