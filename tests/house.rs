@@ -17,7 +17,7 @@ const ARROWS: [(&str, &str, &[&str]); 16] = [
     ("document", "src/document", &[]),
     ("journal", "src/journal", &[]),
     ("formats", "src/formats", &CORE),
-    ("recipe", "src/recipe", &["document", "geometry", "surface", "registration", "compensation"]),
+    ("recipe", "src/recipe", &["document", "cell", "measuring", "geometry", "surface", "registration", "compensation"]),
     ("device", "src/device", &["document", "formats", "geometry"]),
     ("config", "src/config", &["device", "document", "geometry"]),
     ("report", "src/report", &["cell", "journal", "formats", "geometry", "registration"]),

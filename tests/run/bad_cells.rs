@@ -173,13 +173,9 @@ fn machines_that_are_not_there() {
     let nowhere = nobody
         .replace("host = \"127.0.0.1\"", "host = \"no-such-host.invalid\"")
         .replace("simulated = true", "simulated = false");
-    let devices = format!("device = \"{}/absent-", home.path().display());
-    let absent = changed("config/serial-rtu.toml", &[("device = \"/tmp/regrind-", &devices)]);
-    for (name, cell, named) in [
-        ("nobody", nobody, format!("127.0.0.1:{free}")),
-        ("nowhere", nowhere, "no-such-host.invalid".to_owned()),
-        ("absent", absent, "absent-".to_owned()),
-    ] {
+    for (name, cell, named) in
+        [("nobody", nobody, format!("127.0.0.1:{free}")), ("nowhere", nowhere, "no-such-host.invalid".to_owned())]
+    {
         let cell_file = format!("{name}.toml");
         fs::write(home.path().join(&cell_file), cell).unwrap();
         let (code, said, errors) = in_time(&["run", &recipe, "--cell", &cell_file, "--runs", name], home.path());
@@ -189,6 +185,20 @@ fn machines_that_are_not_there() {
         assert!(verify(&folder).unwrap().closed, "{name}");
         assert!(!records_with(&folder, "event").is_empty());
     }
+}
+
+/// A serial port that is not there is told at once, with those that are; nothing has begun.
+#[test]
+fn a_serial_port_that_is_not_there() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = recipe(home.path(), 1e4);
+    let devices = format!("device = \"{}/absent-", home.path().display());
+    let cell = changed("config/serial-rtu.toml", &[("device = \"/tmp/regrind-", &devices)]);
+    fs::write(home.path().join("cell.toml"), cell).unwrap();
+    let (code, said, errors) = in_time(&["run", &recipe, "--cell", "cell.toml", "--runs", "runs"], home.path());
+    assert_eq!(code, 2, "{said}\n{errors}");
+    assert!(errors.contains("absent-") && errors.contains("the serial ports here: "), "{errors}");
+    assert!(!home.path().join("runs").exists());
 }
 
 #[test]
