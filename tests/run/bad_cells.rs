@@ -196,7 +196,7 @@ fn a_serial_port_that_is_not_there() {
     let cell = changed("config/serial-rtu.toml", &[("device = \"/tmp/regrind-", &devices)]);
     fs::write(home.path().join("cell.toml"), cell).unwrap();
     let (code, said, errors) = in_time(&["run", &recipe, "--cell", "cell.toml", "--runs", "runs"], home.path());
-    assert_eq!(code, 2, "{said}\n{errors}");
+    assert_eq!(code, 3, "{said}\n{errors}");
     assert!(errors.contains("absent-") && errors.contains("the serial ports here: "), "{errors}");
     assert!(!home.path().join("runs").exists());
 }
