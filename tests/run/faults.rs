@@ -14,9 +14,9 @@ fn broken(faults: Faults) -> Setup {
 }
 
 /// The first alarm must be this one, say these words, and come after so many passes; nothing is accepted, and no further pass is begun.
-fn caught(setup: Setup, alarm: AlarmId, words: &[&str], passes: usize) -> Ran {
+fn caught(what: &str, setup: Setup, alarm: AlarmId, words: &[&str], passes: usize) -> Ran {
     let ran = run(setup);
-    let told = ran.told();
+    let told = format!("{what}: {}", ran.told());
     println!("{told}");
     assert!(!ran.accepted(), "{told}");
     let alarms = ran.alarms();
@@ -25,7 +25,7 @@ fn caught(setup: Setup, alarm: AlarmId, words: &[&str], passes: usize) -> Ran {
     assert_eq!(first.id, alarm, "{told}");
     let said = format!("{} {} {}", first.what, first.consequence, first.remedy.join(" "));
     for word in words {
-        assert!(said.contains(word), "`{word}` is missing in: {said}");
+        assert!(said.contains(word), "{what}: `{word}` is missing in: {said}");
     }
     assert_eq!(ran.passes_at_alarm, Some(passes), "{told}");
     assert_eq!(ran.world.history().len(), passes, "a pass was begun after the alarm\n{told}");
@@ -35,90 +35,82 @@ fn caught(setup: Setup, alarm: AlarmId, words: &[&str], passes: usize) -> Ran {
     ran
 }
 
-#[test]
-fn another_word_order_is_told_before_anything_is_written() {
-    let setup = Setup { other_word_order: true, ..Setup::new(RECIPE, 1) };
-    let ran =
-        caught(setup, AlarmId::WordOrder, &["word order", "nothing was written", "word_order in the cell file"], 0);
-    assert!(matches!(ran.ending, Ending::Stopped { cycle: 0, .. }), "{}", ran.told());
-    assert_eq!(ran.world.measurements_begun(), 0);
+/// What is wrong in words and as a fault of the world, the first alarm, and words that it says.
+type Case = (&'static str, Faults, AlarmId, &'static [&'static str]);
+
+fn each_is_caught<const N: usize>(cases: [Case; N], passes: usize) {
+    for (what, faults, alarm, words) in cases {
+        caught(what, broken(faults), alarm, words, passes);
+    }
 }
 
 #[test]
-fn exchanged_machines_are_told_before_anything_is_written() {
-    let setup = Setup { exchanged: true, ..Setup::new(RECIPE, 1) };
-    let ran = caught(setup, AlarmId::WrongDevice, &["Another device answers", "address in the cell file"], 0);
-    assert!(matches!(ran.ending, Ending::Stopped { cycle: 0, .. }), "{}", ran.told());
-    assert_eq!(ran.world.measurements_begun(), 0);
+fn machines_that_answer_wrongly_are_told_before_anything_is_written() {
+    let usual = || Setup::new(RECIPE, 1);
+    let (other_order, exchanged) = (Setup { other_word_order: true, ..usual() }, Setup { exchanged: true, ..usual() });
+    let order_words = &["word order", "nothing was written", "word_order in the cell file"];
+    let cases: [(&str, Setup, AlarmId, &[&str]); 2] = [
+        ("word order", other_order, AlarmId::WordOrder, order_words),
+        ("exchanged", exchanged, AlarmId::WrongDevice, &["Another device answers", "address in the cell file"]),
+    ];
+    for (what, setup, alarm, words) in cases {
+        let ran = caught(what, setup, alarm, words, 0);
+        assert!(matches!(ran.ending, Ending::Stopped { cycle: 0, .. }), "{what}: {}", ran.told());
+        assert_eq!(ran.world.measurements_begun(), 0, "{what}");
+    }
 }
 
 #[test]
 fn a_map_of_another_part_is_not_ground() {
     let faults = Faults { wrong_part: true, ..Faults::default() };
-    caught(broken(faults), AlarmId::MachineRefused, &["grinder", "another part"], 0);
+    each_is_caught([("a map of another part", faults, AlarmId::MachineRefused, &["grinder", "another part"])], 0);
 }
 
 #[test]
-fn a_flipped_sign_is_told_at_the_first_pass_with_a_map() {
-    let faults = Faults { map_sign_flipped: true, ..Faults::default() };
-    caught(broken(faults), AlarmId::SignFlipped, &["the other way round", "sign"], 2);
+fn what_is_done_to_a_map_is_told_at_the_first_pass_with_one() {
+    let none = Faults::default;
+    let mirrored = |map_mirrored| Faults { map_mirrored, ..none() };
+    let turned = &["turned map", "how the part is turned"];
+    let flipped = Faults { map_sign_flipped: true, ..none() };
+    each_is_caught(
+        [
+            ("sign flipped", flipped, AlarmId::SignFlipped, &["the other way round", "sign"]),
+            ("x mirrored", mirrored(Mirrored::X), AlarmId::Mirrored, &["mirrored", "direction of x and y"]),
+            ("y mirrored", mirrored(Mirrored::Y), AlarmId::Mirrored, &["mirrored", "direction of x and y"]),
+            ("half a turn", mirrored(Mirrored::HalfTurn), AlarmId::Mirrored, turned),
+            ("a quarter", mirrored(Mirrored::QuarterTurn), AlarmId::Mirrored, turned),
+            ("twice", Faults { map_doubled: true, ..none() }, AlarmId::Doubled, &["two times", "in one place only"]),
+            ("ignored", Faults { map_ignored: true, ..none() }, AlarmId::NoEffect, &["did not answer to the map"]),
+        ],
+        2,
+    );
 }
 
 #[test]
-fn a_mirrored_x_is_told_at_the_first_pass_with_a_map() {
-    let faults = Faults { map_mirrored: Mirrored::X, ..Faults::default() };
-    caught(broken(faults), AlarmId::Mirrored, &["mirrored", "direction of x and y"], 2);
-}
-
-#[test]
-fn a_mirrored_y_is_told_at_the_first_pass_with_a_map() {
-    let faults = Faults { map_mirrored: Mirrored::Y, ..Faults::default() };
-    caught(broken(faults), AlarmId::Mirrored, &["mirrored", "direction of x and y"], 2);
-}
-
-#[test]
-fn a_turned_map_is_told_at_the_first_pass_with_a_map() {
-    for map_mirrored in [Mirrored::HalfTurn, Mirrored::QuarterTurn] {
-        let faults = Faults { map_mirrored, ..Faults::default() };
-        caught(broken(faults), AlarmId::Mirrored, &["turned map", "how the part is turned"], 2);
-    }
-}
-
-#[test]
-fn a_map_that_is_applied_twice_is_told_at_the_first_pass_with_one() {
-    let faults = Faults { map_doubled: true, ..Faults::default() };
-    caught(broken(faults), AlarmId::Doubled, &["two times", "in one place only"], 2);
-}
-
-#[test]
-fn a_map_that_is_ignored_is_told_at_the_first_pass_with_one() {
-    let faults = Faults { map_ignored: true, ..Faults::default() };
-    caught(broken(faults), AlarmId::NoEffect, &["did not answer to the map"], 2);
-}
-
-#[test]
-fn contact_points_are_told_from_the_reference_sphere() {
-    let faults = Faults { returns_contact_points: true, ..Faults::default() };
-    caught(broken(faults), AlarmId::Contacts, &["contact points", "radius compensation"], 1);
-}
-
-#[test]
-fn contact_points_are_told_from_their_header() {
-    let faults = Faults { returns_contact_points: true, contact_points_declared: true, ..Faults::default() };
-    caught(broken(faults), AlarmId::Contacts, &["contact points", "radius compensation"], 1);
-}
-
-#[test]
-fn inches_are_told_from_the_reference_sphere() {
-    let faults = Faults { inches: true, ..Faults::default() };
-    caught(broken(faults), AlarmId::Inches, &["inches", "millimetres"], 1);
+fn what_is_wrong_with_a_measurement_is_told_from_it() {
+    let none = Faults::default;
+    let contacts = Faults { returns_contact_points: true, ..none() };
+    let declared = Faults { contact_points_declared: true, ..contacts.clone() };
+    let nothing_there = &["No part was found", "loaded and clamped"];
+    each_is_caught(
+        [
+            ("contacts, by the sphere", contacts, AlarmId::Contacts, &["contact points", "radius compensation"]),
+            ("contacts, by the header", declared, AlarmId::Contacts, &["contact points", "radius compensation"]),
+            ("inches, by the sphere", Faults { inches: true, ..none() }, AlarmId::Inches, &["inches", "millimetres"]),
+            ("no part", Faults { no_part: true, ..none() }, AlarmId::NoPart, nothing_there),
+            ("no number", Faults { non_finite_point: true, ..none() }, AlarmId::BrokenResult, &["broken", "not"]),
+            ("missing records", Faults { missing_records: 3, ..none() }, AlarmId::BrokenResult, &["broken"]),
+        ],
+        1,
+    );
 }
 
 #[test]
 fn a_probe_that_is_10_um_off_is_told_from_the_reference_sphere() {
     for error_um in [10.0, -10.0] {
         let setup = Setup::new(RECIPE, 1).with(move |world| world.cmm.probe_radius_error_um = error_um);
-        caught(setup, AlarmId::ProbeRadius, &["radius of the probe", "off by", "Qualify the probe"], 1);
+        let words = ["radius of the probe", "off by", "Qualify the probe"];
+        caught(&format!("{error_um} um"), setup, AlarmId::ProbeRadius, &words, 1);
     }
 }
 
@@ -126,31 +118,9 @@ fn a_probe_that_is_10_um_off_is_told_from_the_reference_sphere() {
 fn a_part_that_lies_turned_round_is_told() {
     let faults = Faults { part_turned_180: true, ..Faults::default() };
     // The probe meets the steep part in the air, and the machine stops by itself; the alarm must still send a person to the part.
-    let ran = caught(broken(faults), AlarmId::MachineFault, &["see how the part lies", "turned round"], 1);
+    let words = ["see how the part lies", "turned round"];
+    let ran = caught("a steep part", broken(faults.clone()), AlarmId::MachineFault, &words, 1);
     assert!(matches!(ran.ending, Ending::Aborted { cycle: 1, confirmed: true, .. }), "{}", ran.told());
-}
-
-#[test]
-fn a_shallow_part_that_lies_turned_round_is_told() {
-    let faults = Faults { part_turned_180: true, ..Faults::default() };
     let setup = Setup::new("shallow-wave", 1).with(move |world| world.faults = faults.clone());
-    caught(setup, AlarmId::PartMisplaced, &["turned round", "degrees"], 1);
-}
-
-#[test]
-fn a_missing_part_is_told() {
-    let faults = Faults { no_part: true, ..Faults::default() };
-    caught(broken(faults), AlarmId::NoPart, &["No part was found", "loaded and clamped"], 1);
-}
-
-#[test]
-fn a_number_that_is_none_does_not_come_in() {
-    let faults = Faults { non_finite_point: true, ..Faults::default() };
-    caught(broken(faults), AlarmId::BrokenResult, &["broken", "not"], 1);
-}
-
-#[test]
-fn missing_records_are_told() {
-    let faults = Faults { missing_records: 3, ..Faults::default() };
-    caught(broken(faults), AlarmId::BrokenResult, &["broken"], 1);
+    caught("a shallow part", setup, AlarmId::PartMisplaced, &["turned round", "degrees"], 1);
 }
