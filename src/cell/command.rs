@@ -7,126 +7,57 @@ use super::alarm::{Alarm, AlarmId};
 use super::event::Event;
 use super::state::{Device, State};
 
-/// An imperative, and the event that answers it.
+/// An imperative to a machine or about a cycle, and the event that answers it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[expect(missing_docs, reason = "the fields are named for what they are")]
 #[serde(tag = "command", rename_all = "snake_case")]
 pub enum Command {
     /// Open the link and prove which machine is there: `Connected` or `NotConnected`.
-    Connect {
-        /// The machine.
-        device: Device,
-    },
+    Connect { device: Device },
     /// Ask a person, or the recipe, for the part: `LoadConfirmed`.
     AskToLoad,
     /// Send the pass and the map of this cycle to the grinder, read them back and compare: `PassLoaded` or `Refused`.
-    LoadPass {
-        /// The cycle.
-        cycle: u32,
-    },
+    LoadPass { cycle: u32 },
     /// Send the plan of this cycle to the CMM, read it back and compare: `PlanLoaded` or `Refused`.
-    LoadPlan {
-        /// The cycle.
-        cycle: u32,
-    },
+    LoadPlan { cycle: u32 },
     /// Read a fresh status, moving nothing: `Cleared`, `Obstructed` or `ClearUnknown`.
-    VerifyClear {
-        /// The machine.
-        device: Device,
-    },
+    VerifyClear { device: Device },
     /// Ask a person to see whether a machine that cannot tell it is clear of the part: `ClearConfirmed`.
-    AskWhetherClear {
-        /// The machine.
-        device: Device,
-    },
+    AskWhetherClear { device: Device },
     /// Prepare the job; a preparation that still stands is taken back first: `Prepared` or `Refused`.
-    Prepare {
-        /// The machine.
-        device: Device,
-        /// The cycle.
-        cycle: u32,
-    },
+    Prepare { device: Device, cycle: u32 },
     /// Start the prepared job, at most once: `Started`, `StartUnknown` or, if the machine said no, `Refused`.
-    StartMachine {
-        /// The machine.
-        device: Device,
-        /// The cycle.
-        cycle: u32,
-    },
+    StartMachine { device: Device, cycle: u32 },
     /// Bring the machine to its safe place: `MachineHeld`, or `Ended` if the job was over before.
-    HoldMachine {
-        /// The machine.
-        device: Device,
-    },
+    HoldMachine { device: Device },
     /// Let the held machine go on: `MachineResumed` or `Refused`.
-    ResumeMachine {
-        /// The machine.
-        device: Device,
-    },
+    ResumeMachine { device: Device },
     /// End the job in order, also one that is only prepared: `Ended`.
-    StopMachine {
-        /// The machine.
-        device: Device,
-    },
+    StopMachine { device: Device },
     /// End at once, by the machine's own safe sequence: `AbortConfirmed`.
-    AbortMachine {
-        /// The machine.
-        device: Device,
-    },
+    AbortMachine { device: Device },
     /// Bring a machine that was aborted or faulted in an earlier run back to idle: `Connected` or `Refused`.
-    ClearMachine {
-        /// The machine.
-        device: Device,
-    },
+    ClearMachine { device: Device },
     /// Find out what became of the job: `Reconciled`.
-    Reconcile {
-        /// The machine.
-        device: Device,
-        /// The cycle.
-        cycle: u32,
-    },
+    Reconcile { device: Device, cycle: u32 },
     /// Read, check and store the points of this cycle: `Collected`.
-    Collect {
-        /// The cycle.
-        cycle: u32,
-    },
+    Collect { cycle: u32 },
     /// Compare the probe with the reference sphere: `Qualified`.
-    Qualify {
-        /// The cycle.
-        cycle: u32,
-    },
+    Qualify { cycle: u32 },
     /// Let the machine forget its result, also where it has none: `Acknowledged`.
-    Acknowledge {
-        /// The machine.
-        device: Device,
-    },
+    Acknowledge { device: Device },
     /// Register the measurement of this cycle: `Registered` or `RegistrationFailed`.
-    Register {
-        /// The cycle.
-        cycle: u32,
-    },
+    Register { cycle: u32 },
     /// Compute the map of the next pass from this cycle: `Compensated` or `CompensationRefused`.
-    Compensate {
-        /// The cycle.
-        cycle: u32,
-    },
+    Compensate { cycle: u32 },
     /// Tell how the cycle was judged. No answer.
     Announce(Judgement),
     /// Show an alarm. No answer.
     Raise(Alarm),
     /// Take an alarm back. No answer.
-    Withdraw {
-        /// Which.
-        alarm: AlarmId,
-    },
-    /// Tell that an event did not fit. No answer.
-    Refuse {
-        /// The event.
-        event: Box<Event>,
-        /// The state in which it came.
-        state: State,
-        /// Why it does not fit, for the person who sent it.
-        why: String,
-    },
+    Withdraw { alarm: AlarmId },
+    /// Tell that an event did not fit in this state, and why, for the person who sent it. No answer.
+    Refuse { event: Box<Event>, state: State, why: String },
     /// The run is over: the last command. No answer.
     Finish(Ending),
 }
@@ -165,40 +96,19 @@ pub enum Verdict {
     BudgetSpent,
 }
 
-/// How a run ended.
+/// How a run ended: the last cycle, 0 if none had begun, and why, for the operator.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[expect(missing_docs, reason = "the fields are told above")]
 #[serde(tag = "ending", rename_all = "snake_case")]
 pub enum Ending {
     /// The part is accepted.
-    Accepted {
-        /// The last cycle.
-        cycle: u32,
-        /// Why, for the operator.
-        reason: String,
-    },
+    Accepted { cycle: u32, reason: String },
     /// The run came to its end in order and the part is not in tolerance, or was never judged to be.
-    NotAccepted {
-        /// The last cycle.
-        cycle: u32,
-        /// Why, for the operator.
-        reason: String,
-    },
+    NotAccepted { cycle: u32, reason: String },
     /// The run could not begin, or a person stopped it.
-    Stopped {
-        /// The last cycle; 0 if none had begun.
-        cycle: u32,
-        /// Why, for the operator.
-        reason: String,
-    },
-    /// The run was aborted.
-    Aborted {
-        /// The last cycle; 0 if none had begun.
-        cycle: u32,
-        /// Whether both machines confirmed that they stand.
-        confirmed: bool,
-        /// Why, for the operator.
-        reason: String,
-    },
+    Stopped { cycle: u32, reason: String },
+    /// The run was aborted; `confirmed` where both machines said that they stand.
+    Aborted { cycle: u32, confirmed: bool, reason: String },
 }
 
 impl Command {

@@ -17,289 +17,111 @@ pub struct Actor {
 
 /// A fact, an order or a result.
 ///
-/// The number of the cycle travels with everything that belongs to one: what belongs to another cycle is refused.
+/// `device` is the machine that it comes from or is about, and `boot_id` the number of this start of its application. `cycle` travels with
+/// everything that belongs to one: what belongs to another cycle is refused. `actor` gave the order, looked, or started the program, and
+/// says `reason`, which may be empty, and `evidence`. What was seen stands in words, with the value and the limit, in `why` and `message`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[expect(missing_docs, reason = "the fields are told above")]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub enum Event {
     // Orders of people.
     /// Begin the run.
-    Start {
-        /// Who gave the order.
-        actor: Actor,
-    },
+    Start { actor: Actor },
     /// The right part is loaded and clamped, and no machine touches it.
-    LoadConfirmed {
-        /// Who gave the order.
-        actor: Actor,
-    },
+    LoadConfirmed { actor: Actor },
     /// Come to the next safe place and wait for a person.
-    Hold {
-        /// Who gave the order.
-        actor: Actor,
-        /// Why, in the words of the person; may be empty.
-        reason: String,
-    },
+    Hold { actor: Actor, reason: String },
     /// Go on from where the cell was held.
-    Resume {
-        /// Who gave the order.
-        actor: Actor,
-        /// Why, in the words of the person; may be empty.
-        reason: String,
-    },
+    Resume { actor: Actor, reason: String },
     /// End in order.
-    Stop {
-        /// Who gave the order.
-        actor: Actor,
-        /// Why, in the words of the person; may be empty.
-        reason: String,
-    },
+    Stop { actor: Actor, reason: String },
     /// End at once: the safe sequence only.
-    Abort {
-        /// Who gave the order.
-        actor: Actor,
-        /// Why, in the words of the person; may be empty.
-        reason: String,
-    },
+    Abort { actor: Actor, reason: String },
     /// A person has looked at a machine that cannot tell it: it is clear of the part.
-    ClearConfirmed {
-        /// Who looked.
-        actor: Actor,
-        /// The machine.
-        device: Device,
-    },
+    ClearConfirmed { actor: Actor, device: Device },
     /// A person has looked at a machine that cannot tell what became of its START: the job is over, the machine stands still and
     /// is clear of the part. The START is never repeated; the part is measured as it is.
-    DeclaredOver {
-        /// Who looked.
-        actor: Actor,
-        /// The machine.
-        device: Device,
-        /// What was seen.
-        evidence: String,
-    },
+    DeclaredOver { actor: Actor, device: Device, evidence: String },
     /// The program was started again in the middle of this run; the links are new.
-    Restarted {
-        /// Who started it.
-        actor: Actor,
-    },
+    Restarted { actor: Actor },
 
     // Facts from machines.
     /// The machine is the right one, its signature is sound and it is owned. Answers `Connect` and `ClearMachine`.
-    Connected {
-        /// The machine.
-        device: Device,
-        /// The number of this start of its application.
-        boot_id: u32,
-        /// Whether it says that it is a simulation.
-        simulated: bool,
-        /// What it was found doing.
-        found: Occupation,
-    },
+    Connected { device: Device, boot_id: u32, simulated: bool, found: Occupation },
     /// The machine cannot be used. Answers `Connect`.
-    NotConnected {
-        /// The machine.
-        device: Device,
-        /// Why.
-        why: Mismatch,
-    },
+    NotConnected { device: Device, why: Mismatch },
     /// The machine cannot be reached, or its application stands still.
-    LinkLost {
-        /// The machine.
-        device: Device,
-        /// What was seen, in words.
-        why: String,
-    },
+    LinkLost { device: Device, why: String },
     /// The link is open again, its signature and its sync are proven.
-    LinkBack {
-        /// The machine.
-        device: Device,
-        /// The number of this start of its application.
-        boot_id: u32,
-    },
+    LinkBack { device: Device, boot_id: u32 },
     /// Something that the cell needs from outside is missing. Reported as a level: again after every reconnection.
     ConditionLost {
-        /// What.
         condition: Condition,
-        /// In words, with the value and the limit.
         #[serde(rename = "words")]
         message: String,
     },
     /// It is there again; hysteresis is the business of who reports.
-    ConditionBack {
-        /// What.
-        condition: Condition,
-    },
+    ConditionBack { condition: Condition },
     /// The grinder holds the pass and the map of this cycle, read back and compared. Answers `LoadPass`.
-    PassLoaded {
-        /// The cycle.
-        cycle: u32,
-    },
+    PassLoaded { cycle: u32 },
     /// The CMM holds the plan of this cycle, read back and compared. Answers `LoadPlan`.
-    PlanLoaded {
-        /// The cycle.
-        cycle: u32,
-    },
+    PlanLoaded { cycle: u32 },
     /// The machine is prepared for this cycle. Answers `Prepare`.
-    Prepared {
-        /// The machine.
-        device: Device,
-        /// The cycle.
-        cycle: u32,
-    },
+    Prepared { device: Device, cycle: u32 },
     /// START was taken. Answers `StartMachine`.
-    Started {
-        /// The machine.
-        device: Device,
-        /// The cycle.
-        cycle: u32,
-    },
+    Started { device: Device, cycle: u32 },
     /// It is not known whether START was taken. Answers `StartMachine`.
-    StartUnknown {
-        /// The machine.
-        device: Device,
-        /// The cycle.
-        cycle: u32,
-        /// What was seen, in words.
-        why: String,
-    },
-    /// The job goes on.
-    Progressed {
-        /// The machine.
-        device: Device,
-        /// Points measured, or thousandths of the path.
-        done: u32,
-        /// Of how many.
-        total: u32,
-    },
+    StartUnknown { device: Device, cycle: u32, why: String },
+    /// The job goes on: so many points measured, or thousandths of the path, of so many.
+    Progressed { device: Device, done: u32, total: u32 },
     /// The machine stands in its safe place. Answers `HoldMachine`, also where it was held already, or comes by itself.
-    MachineHeld {
-        /// The machine.
-        device: Device,
-    },
+    MachineHeld { device: Device },
     /// The machine moves again. Answers `ResumeMachine`, or comes by itself.
-    MachineResumed {
-        /// The machine.
-        device: Device,
-    },
+    MachineResumed { device: Device },
     /// The job is over; for the grinder its pass record has been read. Answers `StopMachine` too, also where nothing ran.
-    Ended {
-        /// The machine.
-        device: Device,
-        /// The cycle.
-        cycle: u32,
-        /// How.
-        result: JobResult,
-    },
+    Ended { device: Device, cycle: u32, result: JobResult },
     /// A fresh status shows the machine standing clear of the part. Answers `VerifyClear`.
-    Cleared {
-        /// The machine.
-        device: Device,
-    },
+    Cleared { device: Device },
     /// A fresh status shows that it is not. Answers `VerifyClear`, or comes by itself.
     Obstructed {
-        /// The machine.
         device: Device,
-        /// What was seen, in words.
         #[serde(rename = "words")]
         message: String,
     },
     /// The machine stands, and nothing tells whether it is clear of the part. Answers `VerifyClear`.
-    ClearUnknown {
-        /// The machine.
-        device: Device,
-    },
+    ClearUnknown { device: Device },
     /// The machine was asked and said no.
-    Refused {
-        /// The machine.
-        device: Device,
-        /// What it was asked for.
-        what: Asked,
-        /// Its answer in words.
-        why: String,
-    },
+    Refused { device: Device, what: Asked, why: String },
     /// The machine is in FAULTED. (A machine that held itself because the link was silent is `MachineHeld`.)
     Fault {
-        /// The machine.
         device: Device,
-        /// The number of the fault.
         code: u16,
-        /// What it means.
         #[serde(rename = "words")]
         message: String,
     },
     /// The machine has forgotten its result and is idle. Answers `Acknowledge`.
-    Acknowledged {
-        /// The machine.
-        device: Device,
-    },
+    Acknowledged { device: Device },
     /// The machine has ended its own safe sequence and stands. Answers `AbortMachine`.
-    AbortConfirmed {
-        /// The machine.
-        device: Device,
-    },
+    AbortConfirmed { device: Device },
     /// What became of the job. Answers `Reconcile`.
-    Reconciled {
-        /// The machine.
-        device: Device,
-        /// The cycle.
-        cycle: u32,
-        /// What became of it.
-        outcome: Reconciliation,
-    },
+    Reconciled { device: Device, cycle: u32, outcome: Reconciliation },
 
     // Results of computations.
-    /// The points of this cycle are read and stored. Answers `Collect`.
-    Collected {
-        /// The cycle.
-        cycle: u32,
-        /// Points planned.
-        targets: u32,
-        /// Points found.
-        found: u32,
-        /// Whether the measurement may be used.
-        gate: Gate,
-    },
-    /// The radius of the probe was compared with the reference sphere. Answers `Qualify`.
-    Qualified {
-        /// The cycle.
-        cycle: u32,
-        /// The radius found minus the radius in the recipe.
-        radius_error_mm: f64,
-    },
+    /// The points of this cycle, so many found of the planned, are read and stored. Answers `Collect`.
+    Collected { cycle: u32, targets: u32, found: u32, gate: Gate },
+    /// The radius of the probe was compared with the reference sphere: the one found minus the one in the recipe. Answers `Qualify`.
+    Qualified { cycle: u32, radius_error_mm: f64 },
     /// The measurement is registered. Answers `Register`.
-    Registered {
-        /// The cycle.
-        cycle: u32,
-        /// What came out.
-        figures: Figures,
-    },
+    Registered { cycle: u32, figures: Figures },
     /// It could not be registered. Answers `Register`.
-    RegistrationFailed {
-        /// The cycle.
-        cycle: u32,
-        /// Why, in words.
-        why: String,
-    },
+    RegistrationFailed { cycle: u32, why: String },
     /// The next map is computed and stored. Answers `Compensate`.
-    Compensated {
-        /// The cycle.
-        cycle: u32,
-        /// What it will do.
-        summary: CompensationSummary,
-    },
+    Compensated { cycle: u32, summary: CompensationSummary },
     /// There is no next map. Answers `Compensate`.
-    CompensationRefused {
-        /// The cycle.
-        cycle: u32,
-        /// Why.
-        why: CompensationRefusal,
-    },
+    CompensationRefused { cycle: u32, why: CompensationRefusal },
 
     /// The journal or the run folder cannot be written: nothing may begin to move.
-    RecordFailed {
-        /// Why.
-        why: RecordFailure,
-    },
+    RecordFailed { why: RecordFailure },
     /// Time has passed; what is due is done.
     Deadline,
 }

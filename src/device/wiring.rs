@@ -129,38 +129,21 @@ pub trait Wired {
 
 /// Why a machine cannot be made of what a cell file says.
 #[derive(Debug, Error)]
+#[expect(missing_docs, reason = "the message of each tells what its fields are")]
 #[non_exhaustive]
 pub enum MakingError {
     /// A folder that must be there.
     #[error(
         "{key}: the folder {path} is not there; make it where the {machine} finds it (mkdir -p {path}), or correct the cell file"
     )]
-    Folder {
-        /// The key that names it.
-        key: String,
-        /// The folder.
-        path: PathBuf,
-        /// Whose it is.
-        machine: MachineKind,
-    },
+    Folder { key: String, path: PathBuf, machine: MachineKind },
     /// A file of reference points that is not good.
     #[error("cmm.wire.reference_points: {source}")]
-    References {
-        /// What is wrong with it.
-        source: Box<FormatError>,
-    },
+    References { source: Box<FormatError> },
     /// A serial port that is not there.
     #[error("{missing}; connect it, or name one of these in the cell file")]
-    NoPort {
-        /// Which, and what there is.
-        missing: String,
-    },
+    NoPort { missing: String },
     /// A line that cannot be opened.
     #[error("{line} cannot be opened: {source}; check the cell file and the machine")]
-    Line {
-        /// The line.
-        line: String,
-        /// The reason.
-        source: std::io::Error,
-    },
+    Line { line: String, source: std::io::Error },
 }

@@ -7,132 +7,64 @@ use thiserror::Error;
 
 /// Why a journal could not be opened, written or believed.
 #[derive(Debug, Error)]
+#[expect(missing_docs, reason = "the message of each tells what its fields are")]
 #[non_exhaustive]
 pub enum JournalError {
     /// The run folder is in use by an earlier run.
     #[error(
         "{path}: a run folder must be new or empty, and this one is not; give the run another name, or resume the run that is there"
     )]
-    Exists {
-        /// The run folder.
-        path: PathBuf,
-    },
+    Exists { path: PathBuf },
     /// There is no journal.
     #[error("{path}: there is no journal.sqlite in this folder; give the folder of a run")]
-    Absent {
-        /// The run folder.
-        path: PathBuf,
-    },
+    Absent { path: PathBuf },
     /// The file is not a journal.
     #[error("{path}: this is no journal of Regrind: {what}; give the folder of a run")]
-    Foreign {
-        /// The database.
-        path: PathBuf,
-        /// What was found.
-        what: &'static str,
-    },
+    Foreign { path: PathBuf, what: &'static str },
     /// The journal was made by a later version.
     #[error(
         "{path}: the journal has layout {found}, and this program knows {limit}; use the version of Regrind that wrote it or a later one"
     )]
-    Newer {
-        /// The database.
-        path: PathBuf,
-        /// Its layout.
-        found: u32,
-        /// The layout that this program writes.
-        limit: u32,
-    },
+    Newer { path: PathBuf, found: u32, limit: u32 },
     /// Somebody else drives the run.
     #[error("{path}: another process drives this run; wait for it, or order it to hold or stop")]
-    Busy {
-        /// The run folder.
-        path: PathBuf,
-    },
+    Busy { path: PathBuf },
     /// The run is over.
     #[error("{path}: the journal is closed, its run is over; begin another run")]
-    Closed {
-        /// The run folder.
-        path: PathBuf,
-    },
+    Closed { path: PathBuf },
     /// The folder or a file in it cannot be written or read.
     #[error(
         "{path}: {action} failed: {source}; check that the folder exists, is yours to write and its disk is in order"
     )]
-    File {
-        /// The folder or file.
-        path: PathBuf,
-        /// What was tried.
-        action: &'static str,
-        /// What the system says.
-        source: io::Error,
-    },
+    File { path: PathBuf, action: &'static str, source: io::Error },
     /// No room.
     #[error("{path}: the disk is full; free space on it and resume the run")]
-    DiskFull {
-        /// The folder or file.
-        path: PathBuf,
-    },
+    DiskFull { path: PathBuf },
     /// A setting that the promises rest on did not hold.
     #[error(
         "{path}: the database did not take {setting} = {wanted} (it says {found}); put the run folder on a local disk"
     )]
-    Setting {
-        /// The database.
-        path: PathBuf,
-        /// The setting.
-        setting: &'static str,
-        /// The value wanted.
-        wanted: &'static str,
-        /// The value found.
-        found: String,
-    },
+    Setting { path: PathBuf, setting: &'static str, wanted: &'static str, found: String },
     /// The database said no.
     #[error("{path}: the database failed: {source}; check that the folder is yours to write and its disk is in order")]
-    Database {
-        /// The database.
-        path: PathBuf,
-        /// What it says.
-        source: rusqlite::Error,
-    },
+    Database { path: PathBuf, source: rusqlite::Error },
     /// The journal was changed, or the disk has damaged it.
     #[error(
         "{path}: the journal is broken at record {seq}: {what}; keep the folder as it is and compare it with its copies"
     )]
-    Broken {
-        /// The run folder.
-        path: PathBuf,
-        /// The first record that cannot be believed.
-        seq: u64,
-        /// Why.
-        what: String,
-    },
+    Broken { path: PathBuf, seq: u64, what: String },
     /// A name that may lead out of the run folder.
     #[error("`{name}` cannot be the name of a file in a run folder; give a relative path of plain names")]
-    Name {
-        /// The name.
-        name: String,
-    },
+    Name { name: String },
     /// The file is on record already, with another content.
     #[error("{path}: this file is on record with another content; what is on record is never written over")]
-    Recorded {
-        /// The file.
-        path: PathBuf,
-    },
+    Recorded { path: PathBuf },
     /// An entry that cannot stand.
     #[error("a record of kind {kind} {what}; this is a fault of the program itself, please report it")]
-    Entry {
-        /// Its kind.
-        kind: &'static str,
-        /// What is wrong.
-        what: &'static str,
-    },
+    Entry { kind: &'static str, what: &'static str },
     /// All command numbers are used up.
     #[error("no command number is left after {limit}; begin another run")]
-    CommandNumbers {
-        /// The last number.
-        limit: u32,
-    },
+    CommandNumbers { limit: u32 },
 }
 
 impl JournalError {

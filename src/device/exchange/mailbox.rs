@@ -80,37 +80,21 @@ pub struct Look<A> {
 
 /// Why the folders did not do what they were asked.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[expect(missing_docs, reason = "the message of each tells what its fields are")]
+#[non_exhaustive]
 pub enum MailboxError {
     /// A file or a folder is not as it has to be.
     #[error("{why}")]
-    Files {
-        /// The reason and the remedy, in words.
-        why: String,
-    },
+    Files { why: String },
     /// The job and cycle were handed over before.
     #[error("job {job} cycle {cycle} was handed over before")]
-    HandedOver {
-        /// The job.
-        job: u32,
-        /// The cycle.
-        cycle: u16,
-    },
+    HandedOver { job: u32, cycle: u16 },
     /// A confirmation names another map.
     #[error("the confirmation names the map {}, handed over was {}", hex(.found), hex(.expected))]
-    OtherMap {
-        /// What was handed over.
-        expected: [u8; 32],
-        /// What the confirmation names.
-        found: [u8; 32],
-    },
+    OtherMap { expected: [u8; 32], found: [u8; 32] },
     /// No hand-over of this job is open.
     #[error("no hand-over of job {job} cycle {cycle} is open")]
-    NotOpen {
-        /// The job.
-        job: u32,
-        /// The cycle.
-        cycle: u16,
-    },
+    NotOpen { job: u32, cycle: u16 },
 }
 
 fn hex(bytes: &[u8; 32]) -> String {
