@@ -5,6 +5,9 @@ use std::time::Duration;
 
 use super::{Answer, Command, Fault, Job, MachineKind, State};
 
+/// What a machine answered, or why there is no answer.
+pub(super) type Answered<T> = Result<T, DeviceError>;
+
 /// Why a machine could not be asked, or what it refused.
 ///
 /// [`DeviceError::is_link`] parts the two layers. Nothing here ever means "the job was not begun", save where a variant says so.

@@ -33,6 +33,7 @@ mod wiring;
 mod words;
 
 pub use crate::formats::result::Coordinates;
+use error::Answered;
 pub use error::DeviceError;
 pub use machine::{Cmm, Grinder, Interrupt, Machine};
 pub use manual::{ManualMachine, ManualSettings, ManualWire};
@@ -45,6 +46,7 @@ pub use payload::{
 };
 pub use table::{AnyCmm, AnyGrinder, Wire};
 pub use wiring::{Making, MakingError, Place, Timing, Wired};
+pub(crate) use words::hex;
 pub use words::{
     Answer, Armed, Command, Fault, Identity, Job, MachineKind, Outcome, Reconciled, SignalValue, Started, State,
     Status, Word, digest,

@@ -161,3 +161,24 @@ pub struct PassRecord {
     /// The number to acknowledge it by.
     pub done: u32,
 }
+
+impl PassRecord {
+    /// The record of a pass of which nobody measured anything.
+    pub(super) fn unmeasured(outcome: super::Outcome, map_identity: [u8; 32], job: super::Job, done: u32) -> Self {
+        Self {
+            outcome,
+            path_mm: None,
+            removed_mm3: None,
+            deepest_mm: None,
+            idle_share: None,
+            spindle_load: None,
+            wheel_radius_mm: None,
+            temperature_c: None,
+            duration_s: None,
+            map_identity,
+            job: job.job,
+            cycle: job.cycle,
+            done,
+        }
+    }
+}

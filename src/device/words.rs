@@ -36,6 +36,13 @@ pub struct Identity {
     pub silence_limit_s: Option<f64>,
 }
 
+impl Identity {
+    /// A machine whose wire is a person, who is never lost by silence.
+    pub(super) fn by_person(kind: MachineKind, name: &str) -> Self {
+        Self { kind, name: name.to_owned(), boot_id: 0, simulation: false, silence_limit_s: None }
+    }
+}
+
 /// One run of one machine: the part's run, the cycle in it, and a check number of the payloads it is about.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Job {
@@ -60,6 +67,11 @@ pub fn digest(identities: &[[u8; 32]]) -> u32 {
         crc.update(identity);
     }
     crc.finalize()
+}
+
+/// Returns bytes as hexadecimal digits.
+pub(crate) fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|b| format!("{b:02x}")).collect()
 }
 
 /// A job that the machine has checked and would begin: the intent, to be journaled before [`start`](super::Machine::start).
@@ -333,6 +345,25 @@ pub struct Status {
     pub boot_id: Option<u32>,
     /// The signals that the cell file asks for besides.
     pub signals: Vec<SignalValue>,
+}
+
+impl Status {
+    /// The status of a machine that tells nothing but where it stands.
+    pub(super) fn of(state: State) -> Self {
+        Self {
+            state,
+            job: None,
+            done: 0,
+            outcome: Outcome::None,
+            clear_of_part: None,
+            supplies: None,
+            fault: None,
+            progress: None,
+            temperature_c: None,
+            boot_id: None,
+            signals: Vec::new(),
+        }
+    }
 }
 
 /// A person's word about a machine that cannot tell it itself.

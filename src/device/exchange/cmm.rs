@@ -11,14 +11,14 @@ use std::time::Duration;
 use sha2::{Digest, Sha256};
 
 use super::measured::{Measured, Wanted, foreign, measurement};
-use super::outbox::{Lying, Outbox, Taken, Ticket, hand_over, hex, nanoseconds, told, unhex};
+use super::outbox::{Outbox, StoredHandover, Taken, Ticket, json_lines, unhex};
 use super::stations::{PlacedStation, place_station};
-use super::watch::{Found, Look as FileLook, Watch};
-use super::{ExchangeError, HandOver, Look, Mailbox, MailboxError, MeasureOrder, Pattern, Standing};
-use crate::device::{Job, MeasuredPoint, Measurement, Plan};
+use super::watch::{Watch, WatchedFile};
+use super::{Exchange, ExchangeError, HandOver, Look, MeasureOrder, Pattern, Standing};
+use crate::device::{Job, MeasuredPoint, Measurement, Plan, hex};
+use crate::formats::FormatError;
 use crate::formats::references::{References, parse_references, read_references};
 use crate::formats::result::{Content, Coordinates, ResultFile, parse_result, read_bytes, read_statements};
-use crate::formats::{FormatError, try_writing};
 
 /// How a measuring machine exchanges files.
 #[derive(Clone, Debug)]
@@ -99,13 +99,13 @@ pub struct CmmFolders {
     /// What is waited for, once it was handed over or found again.
     expected: Option<Expected>,
     /// What the folder looked like when it was judged last, and how.
-    judged: Option<(Vec<Found>, Look<Measurement>)>,
+    judged: Option<(Vec<WatchedFile>, Look<Measurement>)>,
 }
 
 /// What is waited for.
 #[derive(Clone, Debug)]
 struct Expected {
-    lying: Lying,
+    stored: StoredHandover,
     /// The numbers of the targets, in the order of the plan.
     targets: Vec<u32>,
     since: Option<Duration>,
@@ -115,11 +115,14 @@ struct Expected {
 struct Accepted {
     measurement: Measurement,
     files: Vec<(String, String)>,
-    said: Vec<String>,
+    notes: Vec<String>,
 }
 
 /// What a judgement of the folder comes to: an answer, or only words.
 type Judgement = Result<Option<Accepted>, ExchangeError>;
+
+/// The files of a station: its points, and the reference points as it sees them.
+type Pair<'f> = (&'f WatchedFile, &'f WatchedFile);
 
 impl CmmFolders {
     /// Takes the settings; nothing is looked at before the driver opens the folders.
@@ -131,51 +134,50 @@ impl CmmFolders {
 
     /// Finds a hand-over again that was made before a restart.
     fn expect(&mut self, job: Job) -> Result<Expected, ExchangeError> {
-        if let Some(expected) = self.expected.as_ref().filter(|e| e.lying.ticket.job() == job) {
+        if let Some(expected) = self.expected.as_ref().filter(|e| e.stored.ticket.job() == job) {
             return Ok(expected.clone());
         }
-        let missing = || ExchangeError::Missing { folder: self.settings.outbox.clone() };
-        let lying = self.outbox.find(job)?.ok_or_else(missing)?;
+        let stored = self.outbox.handed_over(job)?;
         // Where any number of points will do the plan may name none.
         let targets = if self.settings.free_count {
             Vec::new()
         } else {
-            let path = lying.path.join("plan.csv");
+            let path = stored.path.join("plan.csv");
             parse_result(&path, &read_bytes(&path)?, &Content::default())?.indices.unwrap_or_default()
         };
-        let expected = Expected { lying, targets, since: None };
+        let expected = Expected { stored, targets, since: None };
         self.expected = Some(expected.clone());
         Ok(expected)
     }
 
-    fn judge(&self, expected: &Expected, found: &[Found], said: &mut Vec<String>) -> Judgement {
+    fn judge(&self, expected: &Expected, found: &[WatchedFile], notes: &mut Vec<String>) -> Judgement {
         match &self.settings.stations {
-            None => self.judge_single(expected, found, said),
-            Some(stations) => self.judge_stations(expected, stations, found, said),
+            None => self.judge_single(expected, found, notes),
+            Some(stations) => self.judge_stations(expected, stations, found, notes),
         }
     }
 
     /// Returns whether a file may be looked at, and says why not.
-    fn is_new(&self, expected: &Expected, file: &Found, said: &mut Vec<String>) -> bool {
-        let earlier = !self.settings.take_earlier && expected.lying.ticket.is_earlier(&file.name, &file.look);
+    fn is_new(&self, expected: &Expected, file: &WatchedFile, notes: &mut Vec<String>) -> bool {
+        let earlier = !self.settings.take_earlier && expected.stored.ticket.is_earlier(&file.name, &file.look);
         if earlier {
-            said.push(format!("{} lay there before the plan was handed over; left alone", file.name));
+            notes.push(format!("{} lay there before the plan was handed over; left alone", file.name));
         }
         !earlier
     }
 
     // ---- one file -------------------------------------------------------------------------------------------------------------
 
-    fn judge_single(&self, expected: &Expected, found: &[Found], said: &mut Vec<String>) -> Judgement {
-        let ticket = &expected.lying.ticket;
+    fn judge_single(&self, expected: &Expected, found: &[WatchedFile], notes: &mut Vec<String>) -> Judgement {
+        let ticket = &expected.stored.ticket;
         let pattern = self.settings.result.filled(&ticket.part, ticket.job, ticket.cycle);
-        let mut ours: Vec<&Found> = Vec::new();
+        let mut ours: Vec<&WatchedFile> = Vec::new();
         for file in found {
-            if !self.is_new(expected, file, said) {
+            if !self.is_new(expected, file, notes) {
                 continue;
             }
             if !file.settled {
-                said.push(format!("{} is still changing, or has only just stopped; waiting", file.name));
+                notes.push(format!("{} is still changing, or has only just stopped; waiting", file.name));
                 // A file that will be ours must not be overtaken by another one.
                 if pattern.fits(&file.name) {
                     return Ok(None);
@@ -184,26 +186,30 @@ impl CmmFolders {
             }
             match self.belongs(ticket, &pattern, file) {
                 Ok(None) => ours.push(file),
-                Ok(Some(why)) => said.push(format!("{} {why}; left alone", file.name)),
-                Err(error) => said.push(error.to_string()),
+                Ok(Some(why)) => notes.push(format!("{} {why}; left alone", file.name)),
+                Err(error) => notes.push(error.to_string()),
             }
         }
         match ours[..] {
             [] => {
-                said.push(format!("waiting for {} in {}", pattern.as_str(), self.settings.inbox.display()));
+                notes.push(format!("waiting for {} in {}", pattern.as_str(), self.settings.inbox.display()));
                 Ok(None)
             }
             [file] => self.accept_single(expected, file).map(Some),
-            _ => Err(ExchangeError::Several {
-                folder: self.settings.inbox.clone(),
-                pattern: pattern.as_str().to_owned(),
-                names: ours.iter().map(|f| f.name.clone()).collect(),
-            }),
+            _ => Err(self.several(&pattern, &ours)),
+        }
+    }
+
+    fn several(&self, pattern: &Pattern, files: &[&WatchedFile]) -> ExchangeError {
+        ExchangeError::Several {
+            folder: self.settings.inbox.clone(),
+            pattern: pattern.as_str().to_owned(),
+            names: files.iter().map(|f| f.name.clone()).collect(),
         }
     }
 
     /// Returns why a file does not belong to a hand-over, or nothing if it does.
-    fn belongs(&self, ticket: &Ticket, pattern: &Pattern, file: &Found) -> Result<Option<String>, ExchangeError> {
+    fn belongs(&self, ticket: &Ticket, pattern: &Pattern, file: &WatchedFile) -> Result<Option<String>, ExchangeError> {
         let says = read_statements(&file.path, &read_bytes(&file.path)?)?;
         let says_so = says.part.is_some() && says.cycle.is_some() || says.plan.is_some();
         Ok(foreign(&says, &ticket.part, ticket.cycle, &ticket.identity).or_else(|| {
@@ -216,13 +222,13 @@ impl CmmFolders {
         }))
     }
 
-    fn accept_single(&self, expected: &Expected, file: &Found) -> Result<Accepted, ExchangeError> {
+    fn accept_single(&self, expected: &Expected, file: &WatchedFile) -> Result<Accepted, ExchangeError> {
         let (result, sha) = self.read(expected, &file.path)?;
         let points = self.wanted(expected).matched(&file.path, &result)?;
-        let mut said: Vec<String> = result.notes.iter().map(|note| format!("{}: {note}", file.name)).collect();
-        said.extend(switched_off(&file.name, &result));
+        let mut notes: Vec<String> = result.notes.iter().map(|note| format!("{}: {note}", file.name)).collect();
+        notes.extend(switched_off(&file.name, &result));
         let measurement = self.measurement(expected, points, &[result]);
-        Ok(Accepted { measurement, files: vec![(file.name.clone(), sha)], said })
+        Ok(Accepted { measurement, files: vec![(file.name.clone(), sha)], notes })
     }
 
     /// Reads a file of points and holds it against plan and cell.
@@ -238,15 +244,15 @@ impl CmmFolders {
         Wanted {
             targets: (!self.settings.free_count).then_some(&expected.targets),
             content: &self.settings.content,
-            probe_radius_mm: expected.lying.ticket.tool_radius_mm,
+            probe_radius_mm: expected.stored.ticket.tool_radius_mm,
             probe_tolerance_mm: self.settings.probe_tolerance_mm,
         }
     }
 
     /// Refuses bytes that were the answer to another hand-over.
     fn check_not_taken(&self, expected: &Expected, path: &Path, sha: &str) -> Result<(), ExchangeError> {
-        let own = (expected.lying.ticket.job, expected.lying.ticket.cycle);
-        let taken = self.outbox.list()?.into_iter().filter_map(|lying| lying.taken);
+        let own = (expected.stored.ticket.job, expected.stored.ticket.cycle);
+        let taken = self.outbox.list()?.into_iter().filter_map(|stored| stored.taken);
         let before = taken.filter(|t| (t.job, t.cycle) != own).find(|t| t.files.iter().any(|(_, s)| s == sha));
         match before {
             // Another run may be fed with the same measurement where the cell says so; another cycle never.
@@ -258,7 +264,7 @@ impl CmmFolders {
     }
 
     fn measurement(&self, expected: &Expected, points: Vec<MeasuredPoint>, results: &[ResultFile]) -> Measurement {
-        let ticket = &expected.lying.ticket;
+        let ticket = &expected.stored.ticket;
         measurement(points, results, ticket.job(), unhex(&ticket.identity), ticket.start_number)
     }
 
@@ -268,59 +274,26 @@ impl CmmFolders {
         &self,
         expected: &Expected,
         stations: &Stations,
-        found: &[Found],
-        said: &mut Vec<String>,
+        found: &[WatchedFile],
+        notes: &mut Vec<String>,
     ) -> Judgement {
-        let mut new: Vec<&Found> = Vec::new();
-        for file in found {
-            if self.is_new(expected, file, said) {
-                new.push(file);
-            }
-        }
-        let ticket = &expected.lying.ticket;
-        let pick = |pattern: &Pattern| -> Result<Result<Found, String>, ExchangeError> {
-            let pattern = pattern.filled(&ticket.part, ticket.job, ticket.cycle);
-            let fits: Vec<&&Found> = new.iter().filter(|f| pattern.fits(&f.name)).collect();
-            match fits[..] {
-                [] => Ok(Err(pattern.as_str().to_owned())),
-                [file] if !file.settled => Ok(Err(format!("{} to stop changing", file.name))),
-                [file] => Ok(Ok((*file).clone())),
-                _ => Err(ExchangeError::Several {
-                    folder: self.settings.inbox.clone(),
-                    pattern: pattern.as_str().to_owned(),
-                    names: fits.iter().map(|f| f.name.clone()).collect(),
-                }),
-            }
-        };
-        let (mut pairs, mut waiting) = (Vec::new(), Vec::new());
-        for station in self.named_stations(ticket, stations, &new) {
-            match (pick(&station.points)?, pick(&station.references)?) {
-                (Ok(points), Ok(references)) => pairs.push((points, references)),
-                (points, references) => waiting.extend([points.err(), references.err()].into_iter().flatten()),
-            }
-        }
-        if waiting.is_empty() && pairs.is_empty() {
-            waiting.push("the first station".to_owned());
+        let new: Vec<&WatchedFile> = found.iter().filter(|file| self.is_new(expected, file, notes)).collect();
+        let (pairs, waiting) = self.paired(&expected.stored.ticket, stations, &new)?;
+        if !waiting.is_empty() {
+            let (there, of, waiting) = (pairs.len(), stations.files.len(), waiting.join(", "));
+            notes.push(format!("{there} of {of} stations are there; waiting for {waiting}"));
+            return Ok(None);
         }
         let used = |name: &str| pairs.iter().any(|(p, r)| p.name == name || r.name == name);
         let left: Vec<&str> = new.iter().map(|f| f.name.as_str()).filter(|name| !used(name)).collect();
-        if !waiting.is_empty() {
-            said.push(format!(
-                "{} of {} stations are there; waiting for {}",
-                pairs.len(),
-                stations.files.len(),
-                waiting.join(", ")
-            ));
-            return Ok(None);
-        }
         if !left.is_empty() {
-            said.push(format!("left alone, no station's: {}", left.join(", ")));
+            notes.push(format!("left alone, no station's: {}", left.join(", ")));
         }
         let accepted = self.merge(expected, stations, &pairs)?;
         let (there, least) = (accepted.measurement.points.len(), self.settings.least_points);
         if self.settings.free_count && there < least {
-            said.extend(accepted.said);
-            said.push(format!(
+            notes.extend(accepted.notes);
+            notes.push(format!(
                 "{there} points of {} stations; at least {least} are needed, waiting for further stations",
                 pairs.len()
             ));
@@ -329,8 +302,43 @@ impl CmmFolders {
         Ok(Some(accepted))
     }
 
+    /// Returns the files of the stations that are there, points and references, and what is waited for.
+    fn paired<'f>(
+        &self,
+        ticket: &Ticket,
+        stations: &Stations,
+        new: &[&'f WatchedFile],
+    ) -> Result<(Vec<Pair<'f>>, Vec<String>), ExchangeError> {
+        let (mut pairs, mut waiting) = (Vec::new(), Vec::new());
+        for station in self.named_stations(ticket, stations, new) {
+            match (self.settled(&station.points, new)?, self.settled(&station.references, new)?) {
+                (Ok(points), Ok(references)) => pairs.push((points, references)),
+                (points, references) => waiting.extend([points.err(), references.err()].into_iter().flatten()),
+            }
+        }
+        if waiting.is_empty() && pairs.is_empty() {
+            waiting.push("the first station".to_owned());
+        }
+        Ok((pairs, waiting))
+    }
+
+    /// Returns the one file whose name fits once it has settled, or what is waited for.
+    fn settled<'f>(
+        &self,
+        pattern: &Pattern,
+        new: &[&'f WatchedFile],
+    ) -> Result<Result<&'f WatchedFile, String>, ExchangeError> {
+        let fits: Vec<&WatchedFile> = new.iter().copied().filter(|f| pattern.fits(&f.name)).collect();
+        match fits[..] {
+            [] => Ok(Err(pattern.as_str().to_owned())),
+            [file] if !file.settled => Ok(Err(format!("{} to stop changing", file.name))),
+            [file] => Ok(Ok(file)),
+            _ => Err(self.several(pattern, &fits)),
+        }
+    }
+
     /// Returns the stations with their stars replaced by what they stand for, in the order of their names.
-    fn named_stations(&self, ticket: &Ticket, stations: &Stations, files: &[&Found]) -> Vec<StationFiles> {
+    fn named_stations(&self, ticket: &Ticket, stations: &Stations, files: &[&WatchedFile]) -> Vec<StationFiles> {
         let mut named = Vec::new();
         for station in &stations.files {
             let [points, references] =
@@ -349,15 +357,10 @@ impl CmmFolders {
         named
     }
 
-    fn merge(
-        &self,
-        expected: &Expected,
-        stations: &Stations,
-        pairs: &[(Found, Found)],
-    ) -> Result<Accepted, ExchangeError> {
+    fn merge(&self, expected: &Expected, stations: &Stations, pairs: &[Pair<'_>]) -> Result<Accepted, ExchangeError> {
         let nominal = read_references(&stations.nominal, stations.group.as_deref())?;
         let (mut points, mut results) = (Vec::new(), Vec::<ResultFile>::new());
-        let (mut files, mut said) = (Vec::new(), Vec::new());
+        let (mut files, mut notes) = (Vec::new(), Vec::new());
         for (k, (file, reference_file)) in pairs.iter().enumerate() {
             let (result, sha) = self.read(expected, &file.path)?;
             if let Some(why) = self.says_otherwise(expected, file)? {
@@ -366,8 +369,8 @@ impl CmmFolders {
             let bytes = read_bytes(&reference_file.path)?;
             let seen = parse_references(&reference_file.path, &bytes, stations.group.as_deref())?;
             let placed = self.place(k, &seen, &nominal, stations)?;
-            said.extend(switched_off(&file.name, &result));
-            said.push(placed.words());
+            notes.extend(switched_off(&file.name, &result));
+            notes.push(placed.words());
             points.extend(result.points.iter().map(|p| placed.cmm_from_station.point(p)));
             files.extend([(file.name.clone(), sha), (reference_file.name.clone(), hex(&Sha256::digest(&bytes)))]);
             if let Some(first) = results.first().filter(|first| first.coordinates != result.coordinates) {
@@ -384,7 +387,7 @@ impl CmmFolders {
             results.push(result);
         }
         let points = self.wanted(expected).in_order(&self.settings.inbox, &points)?;
-        Ok(Accepted { measurement: self.measurement(expected, points, &results), files, said })
+        Ok(Accepted { measurement: self.measurement(expected, points, &results), files, notes })
     }
 
     fn place(
@@ -399,8 +402,8 @@ impl CmmFolders {
     }
 
     /// Refuses a station's file that says it is of another part, cycle or plan.
-    fn says_otherwise(&self, expected: &Expected, file: &Found) -> Result<Option<ExchangeError>, ExchangeError> {
-        let ticket = &expected.lying.ticket;
+    fn says_otherwise(&self, expected: &Expected, file: &WatchedFile) -> Result<Option<ExchangeError>, ExchangeError> {
+        let ticket = &expected.stored.ticket;
         let why = self.belongs(ticket, &Pattern::new("*"), file)?;
         Ok(why.map(|found| {
             FormatError::Contradiction {
@@ -415,81 +418,59 @@ impl CmmFolders {
     }
 }
 
-impl Mailbox for CmmFolders {
+impl Exchange for CmmFolders {
     type Request = MeasureOrder;
     type Answer = Measurement;
 
-    fn open(&mut self) -> Result<Vec<HandOver>, MailboxError> {
-        try_writing(&self.settings.outbox).map_err(told)?;
-        self.watch.look(Duration::ZERO).map_err(told)?;
-        Ok(self.outbox.list().map_err(told)?.iter().map(hand_over).collect())
+    fn open(&mut self) -> Result<Vec<HandOver>, ExchangeError> {
+        self.outbox.open(&mut self.watch)
     }
 
-    fn publish(&mut self, job: Job, sequence: u32, order: &MeasureOrder) -> Result<(), MailboxError> {
-        let earlier = earlier_files(&self.settings.inbox).map_err(told)?;
-        let ticket = Ticket {
-            format: 1,
-            part: self.settings.part.clone(),
-            job: job.job,
-            cycle: job.cycle,
-            digest: job.digest,
-            start_number: sequence,
-            identity: hex(&order.plan_identity),
-            tool_radius_mm: order.plan.probe_radius_mm,
-            earlier,
-        };
+    fn publish(&mut self, job: Job, sequence: u32, order: &MeasureOrder) -> Result<(), ExchangeError> {
+        let CmmExchange { part, inbox, .. } = &self.settings;
+        let ticket = Ticket::new(part, job, sequence, &order.plan_identity, order.plan.probe_radius_mm, inbox)?;
         let expects = self.settings.result.filled(&ticket.part, ticket.job, ticket.cycle);
         let files = [
             ("plan.csv", plan_csv(&ticket.part, job, &ticket.identity, &order.plan).into_bytes()),
             ("plan.json", plan_json(&ticket, order, &self.settings, expects.as_str())),
         ];
-        self.outbox.publish(&ticket, &files).map_err(told)?;
+        self.outbox.publish(&ticket, &files)?;
         (self.expected, self.judged) = (None, None);
         Ok(())
     }
 
-    fn mark(&mut self, job: Job, standing: Standing) -> Result<(), MailboxError> {
+    fn mark(&mut self, job: Job, standing: Standing) -> Result<(), ExchangeError> {
         (self.expected, self.judged) = (None, None);
-        self.outbox.mark(job, standing).map_err(told)
+        self.outbox.mark(job, standing)
     }
 
-    fn look(&mut self, now: Duration, job: Job) -> Result<Look<Measurement>, MailboxError> {
-        let mut expected = self.expect(job).map_err(told)?;
+    fn look(&mut self, now: Duration, job: Job) -> Result<Look<Measurement>, ExchangeError> {
+        let mut expected = self.expect(job)?;
         let since = *expected.since.get_or_insert(now);
         self.expected = Some(expected.clone());
-        let found = self.watch.look(now).map_err(told)?;
+        let found = self.watch.look(now)?;
         if let Some((_, look)) = self.judged.as_ref().filter(|(before, _)| *before == found) {
             return Ok(look.clone());
         }
-        let mut said = Vec::new();
-        let answer = match self.judge(&expected, &found, &mut said) {
+        let mut notes = Vec::new();
+        let answer = match self.judge(&expected, &found, &mut notes) {
             Ok(None) => None,
             Err(error) => {
-                said.push(format!("not taken: {error}"));
+                notes.push(format!("not taken: {error}"));
                 None
             }
             Ok(Some(accepted)) => {
                 let taken = Taken { job: job.job, cycle: job.cycle, files: accepted.files };
-                self.outbox.note_taken(&expected.lying, &taken).map_err(told)?;
-                said.extend(accepted.said);
+                self.outbox.note_taken(&expected.stored, &taken)?;
+                notes.extend(accepted.notes);
                 let duration_s = now.saturating_sub(since).as_secs_f64();
                 Some(Measurement { duration_s: Some(duration_s), ..accepted.measurement })
             }
         };
-        let look = Look { begun: answer.is_some(), answer, said };
+        let look = Look { begun: answer.is_some(), answer, notes };
         self.judged = Some((found, look.clone()));
         Ok(look)
     }
-}
-
-/// What lies in a folder now: name, length, time of change.
-pub(super) fn earlier_files(inbox: &Path) -> Result<Vec<(String, u64, u128)>, ExchangeError> {
-    let found = Watch::new(inbox, Duration::ZERO).look(Duration::ZERO)?;
-    let plain = |f: Found| {
-        let FileLook { bytes, modified } = f.look;
-        (f.name, bytes, nanoseconds(modified))
-    };
-    Ok(found.into_iter().map(plain).collect())
 }
 
 fn switched_off(name: &str, result: &ResultFile) -> Option<String> {
@@ -531,16 +512,10 @@ fn plan_json(ticket: &Ticket, order: &MeasureOrder, settings: &CmmExchange, expe
             "stations": stations.files.iter().map(|s| [s.points.as_str(), s.references.as_str()]).collect::<Vec<_>>(),
         }),
     };
-    let value = serde_json::json!({
+    json_lines(&serde_json::json!({
         "kind": "measuring plan", "part": ticket.part, "job": ticket.job, "cycle": ticket.cycle, "plan": ticket.identity,
         "units": "mm", "frame": "measuring machine", "targets": plan.targets.len(), "probe_radius_mm": plan.probe_radius_mm,
         "approach_mm": plan.approach_mm, "search_mm": plan.search_mm, "speed_mm_s": plan.speed_mm_s,
         "safe_height_mm": plan.safe_height_mm, "expected_back": expects,
-    });
-    let mut text = value.to_string().into_bytes();
-    if let Ok(pretty) = serde_json::to_vec_pretty(&value) {
-        text = pretty;
-    }
-    text.push(b'\n');
-    text
+    }))
 }

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
+use crate::device::hex;
 use crate::formats::FormatError;
 use crate::geometry::RigidError;
 
@@ -63,6 +64,12 @@ pub enum ExchangeError {
     /// The same job and cycle a second time.
     #[error("job {job} cycle {cycle} was handed over before, see {folder}; it is never handed over twice")]
     HandedOver { job: u32, cycle: u16, folder: PathBuf },
+    /// A confirmation that names another map than was handed over.
+    #[error("the confirmation names the map {}, handed over was {}", hex(&found[..8]), hex(&expected[..8]))]
+    OtherMap { expected: [u8; 32], found: [u8; 32] },
+    /// No hand-over of a job is open.
+    #[error("no hand-over of job {job} cycle {cycle} is open")]
+    NotOpen { job: u32, cycle: u16 },
     /// A hand-over that is not where it was put.
     #[error("{folder}: the hand-over is not there; was it moved or deleted? put it back or stop the job")]
     Missing { folder: PathBuf },

@@ -11,13 +11,12 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use super::cmm::earlier_files;
-use super::outbox::{Lying, Outbox, Taken, Ticket, hand_over, hex, told, unhex};
-use super::watch::{Found, Watch};
-use super::{ExchangeError, GrindOrder, HandOver, Look, Mailbox, MailboxError, Standing, Step};
-use crate::device::{CorrectionMap, Job, Outcome, PassRecord};
+use super::outbox::{Outbox, StoredHandover, Taken, Ticket, json_lines, read_json, unhex};
+use super::watch::{Watch, WatchedFile};
+use super::{Confirmed, Exchange, ExchangeError, GrindOrder, HandOver, Look, Standing};
+use crate::device::{CorrectionMap, Job, Outcome, PassRecord, hex};
 use crate::formats::result::read_bytes;
-use crate::formats::{try_writing, write_atomic};
+use crate::formats::write_atomic;
 
 /// The two files of a person's word, in the inbox.
 const STARTED: &str = "started.json";
@@ -42,7 +41,7 @@ pub struct GrinderFolders {
     settings: GrinderExchange,
     outbox: Outbox,
     watch: Watch,
-    expected: Option<Lying>,
+    expected: Option<StoredHandover>,
     /// When the start was seen, by the driver's clock.
     started: Option<Duration>,
 }
@@ -103,147 +102,120 @@ impl GrinderFolders {
         Self { settings, outbox, watch, expected: None, started: None }
     }
 
-    fn expect(&mut self, job: Job) -> Result<Lying, ExchangeError> {
-        if let Some(lying) = self.expected.as_ref().filter(|l| l.ticket.job() == job) {
-            return Ok(lying.clone());
+    fn expect(&mut self, job: Job) -> Result<StoredHandover, ExchangeError> {
+        if let Some(stored) = self.expected.as_ref().filter(|l| l.ticket.job() == job) {
+            return Ok(stored.clone());
         }
-        let missing = || ExchangeError::Missing { folder: self.settings.outbox.clone() };
-        let lying = self.outbox.find(job)?.ok_or_else(missing)?;
-        self.expected = Some(lying.clone());
-        Ok(lying)
+        let stored = self.outbox.handed_over(job)?;
+        self.expected = Some(stored.clone());
+        Ok(stored)
     }
 
     /// Returns the confirmation in a file of this name, if it is there, settled and for this hand-over; says why not.
     fn confirmation(
         &self,
         name: &str,
-        lying: &Lying,
-        found: &[Found],
-        said: &mut Vec<String>,
+        stored: &StoredHandover,
+        found: &[WatchedFile],
+        notes: &mut Vec<String>,
     ) -> Option<(Confirmation, String)> {
         let file = found.iter().find(|f| f.name == name)?;
-        if lying.ticket.is_earlier(name, &file.look) {
-            said.push(format!("{name} lay there before the map was handed over; left alone"));
+        if stored.ticket.is_earlier(name, &file.look) {
+            notes.push(format!("{name} lay there before the map was handed over; left alone"));
             return None;
         }
         if !file.settled {
-            said.push(format!("{name} is still changing, or has only just stopped; waiting"));
+            notes.push(format!("{name} is still changing, or has only just stopped; waiting"));
             return None;
         }
         let read = || -> Result<(Confirmation, String), ExchangeError> {
             let bytes = read_bytes(&file.path)?;
-            let confirmation: Confirmation = super::outbox::read_json(&file.path)?;
-            confirmation.check(&file.path, &lying.ticket)?;
+            let confirmation: Confirmation = read_json(&file.path)?;
+            confirmation.check(&file.path, &stored.ticket)?;
             Ok((confirmation, hex(&Sha256::digest(&bytes))))
         };
-        read().map_err(|error| said.push(format!("not taken: {error}"))).ok()
+        read().map_err(|error| notes.push(format!("not taken: {error}"))).ok()
     }
 
-    fn record(&self, lying: &Lying, done: &Confirmation, now: Duration) -> PassRecord {
-        let ticket = &lying.ticket;
-        let begun = self.started;
-        let map_identity = unhex(&ticket.identity);
+    fn record(&self, stored: &StoredHandover, done: &Confirmation, now: Duration) -> PassRecord {
+        let ticket = &stored.ticket;
         PassRecord {
-            outcome: Outcome::Complete,
             removed_mm3: done.removed_mm3,
             wheel_radius_mm: done.wheel_radius_mm,
             temperature_c: done.temperature_c,
-            duration_s: begun.map(|begun| now.saturating_sub(begun).as_secs_f64()),
-            // Nobody measures these.
-            path_mm: None,
-            deepest_mm: None,
-            idle_share: None,
-            spindle_load: None,
-            map_identity,
-            job: ticket.job,
-            cycle: ticket.cycle,
-            done: ticket.start_number,
+            duration_s: self.started.map(|begun| now.saturating_sub(begun).as_secs_f64()),
+            ..PassRecord::unmeasured(Outcome::Complete, unhex(&ticket.identity), ticket.job(), ticket.start_number)
         }
     }
 }
 
-impl Mailbox for GrinderFolders {
+impl Exchange for GrinderFolders {
     type Request = GrindOrder;
     type Answer = PassRecord;
 
-    fn open(&mut self) -> Result<Vec<HandOver>, MailboxError> {
-        try_writing(&self.settings.outbox).map_err(told)?;
-        self.watch.look(Duration::ZERO).map_err(told)?;
-        Ok(self.outbox.list().map_err(told)?.iter().map(hand_over).collect())
+    fn open(&mut self) -> Result<Vec<HandOver>, ExchangeError> {
+        self.outbox.open(&mut self.watch)
     }
 
-    fn publish(&mut self, job: Job, sequence: u32, order: &GrindOrder) -> Result<(), MailboxError> {
-        let ticket = Ticket {
-            format: 1,
-            part: self.settings.part.clone(),
-            job: job.job,
-            cycle: job.cycle,
-            digest: job.digest,
-            start_number: sequence,
-            identity: hex(&order.map_identity),
-            tool_radius_mm: order.pass.wheel_radius_mm,
-            earlier: earlier_files(&self.settings.inbox).map_err(told)?,
-        };
+    fn publish(&mut self, job: Job, sequence: u32, order: &GrindOrder) -> Result<(), ExchangeError> {
+        let GrinderExchange { part, inbox, .. } = &self.settings;
+        let ticket = Ticket::new(part, job, sequence, &order.map_identity, order.pass.wheel_radius_mm, inbox)?;
         let word = json_lines(&serde_json::json!(Confirmation::of(&ticket)));
         let files = [
             ("correction.csv", correction_csv(&ticket, &order.map).into_bytes()),
-            ("correction.json", json_lines(&correction_json(&ticket, order, &self.settings.inbox))),
+            ("correction.json", json_lines(&correction_json(&ticket, order, inbox))),
             (STARTED, word.clone()),
             (DONE, word),
         ];
-        self.outbox.publish(&ticket, &files).map_err(told)?;
+        self.outbox.publish(&ticket, &files)?;
         (self.expected, self.started) = (None, None);
         Ok(())
     }
 
-    fn mark(&mut self, job: Job, standing: Standing) -> Result<(), MailboxError> {
+    fn mark(&mut self, job: Job, standing: Standing) -> Result<(), ExchangeError> {
         self.expected = None;
-        self.outbox.mark(job, standing).map_err(told)
+        self.outbox.mark(job, standing)
     }
 
-    fn look(&mut self, now: Duration, job: Job) -> Result<Look<PassRecord>, MailboxError> {
-        let lying = self.expect(job).map_err(told)?;
-        let found = self.watch.look(now).map_err(told)?;
-        let mut said = Vec::new();
-        if self.confirmation(STARTED, &lying, &found, &mut said).is_some() {
+    fn look(&mut self, now: Duration, job: Job) -> Result<Look<PassRecord>, ExchangeError> {
+        let stored = self.expect(job)?;
+        let found = self.watch.look(now)?;
+        let mut notes = Vec::new();
+        if self.confirmation(STARTED, &stored, &found, &mut notes).is_some() {
             self.started.get_or_insert(now);
         }
-        let done = self.confirmation(DONE, &lying, &found, &mut said);
+        let done = self.confirmation(DONE, &stored, &found, &mut notes);
         let begun = self.started.is_some() || done.is_some();
         let Some((done, sha)) = done else {
             let (what, word, file) = if begun { ("end", "done", DONE) } else { ("start", "started", STARTED) };
-            let map = lying.ticket.identity.get(..8).unwrap_or_default();
-            said.push(format!(
+            let map = stored.ticket.identity.get(..8).unwrap_or_default();
+            notes.push(format!(
                 "waiting for the {what} to be confirmed: regrind confirm {word} --map {map}, or copy {file} from {} to {}",
-                lying.path.display(),
+                stored.path.display(),
                 self.settings.inbox.display()
             ));
-            return Ok(Look { answer: None, begun, said });
+            return Ok(Look { answer: None, begun, notes });
         };
         if self.started.is_none() {
-            said.push("the end was confirmed without a start".to_owned());
+            notes.push("the end was confirmed without a start".to_owned());
         }
         let taken = Taken { job: job.job, cycle: job.cycle, files: vec![(DONE.to_owned(), sha)] };
-        self.outbox.note_taken(&lying, &taken).map_err(told)?;
-        Ok(Look { answer: Some(self.record(&lying, &done, now)), begun, said })
+        self.outbox.note_taken(&stored, &taken)?;
+        Ok(Look { answer: Some(self.record(&stored, &done, now)), begun, notes })
     }
 
-    fn confirm(&mut self, job: Job, step: Step, map_identity: [u8; 32]) -> Result<(), MailboxError> {
-        let lying = self.expect(job).map_err(told)?;
-        if hex(&map_identity) != lying.ticket.identity {
-            return Err(MailboxError::OtherMap { expected: unhex(&lying.ticket.identity), found: map_identity });
+    fn confirm(&mut self, job: Job, what: Confirmed, map_identity: [u8; 32]) -> Result<(), ExchangeError> {
+        let stored = self.expect(job)?;
+        if hex(&map_identity) != stored.ticket.identity {
+            return Err(ExchangeError::OtherMap { expected: unhex(&stored.ticket.identity), found: map_identity });
         }
-        if lying.standing != Standing::Open {
-            return Err(MailboxError::NotOpen { job: job.job, cycle: job.cycle });
+        if stored.standing != Standing::Open {
+            return Err(ExchangeError::NotOpen { job: job.job, cycle: job.cycle });
         }
-        let name = if step == Step::Started { STARTED } else { DONE };
-        let word = json_lines(&serde_json::json!(Confirmation::of(&lying.ticket)));
-        write_atomic(&self.settings.inbox.join(name), &word).map_err(told)
+        let name = if what == Confirmed::Started { STARTED } else { DONE };
+        let word = json_lines(&serde_json::json!(Confirmation::of(&stored.ticket)));
+        Ok(write_atomic(&self.settings.inbox.join(name), &word)?)
     }
-}
-
-fn json_lines(value: &serde_json::Value) -> Vec<u8> {
-    format!("{value:#}\n").into_bytes()
 }
 
 fn correction_csv(ticket: &Ticket, map: &CorrectionMap) -> String {

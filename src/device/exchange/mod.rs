@@ -17,13 +17,13 @@
 //!
 //! A hand-over is a folder that appears whole; a result is taken when it has stopped growing, has an end, and says, by its name or in
 //! itself, that it belongs to this part and this cycle; what does not belong is left where it is, and said. The files themselves are read
-//! and written behind [`Mailbox`].
+//! and written behind [`Exchange`].
 
 mod cmm;
-mod desk;
 mod error;
 mod grinder;
-mod mailbox;
+mod hand_over;
+mod machine;
 mod measured;
 mod outbox;
 mod pattern;
@@ -33,17 +33,17 @@ mod watch;
 
 pub(super) use cmm::plan_csv;
 pub use cmm::{CmmExchange, CmmFolders, StationFiles, Stations};
-pub use desk::{ExchangeMachine, ExchangeTiming};
 pub use error::ExchangeError;
 pub use grinder::{GrinderExchange, GrinderFolders};
-pub use mailbox::{HandOver, Look, Mailbox, MailboxError, Standing, Step};
+pub use hand_over::{Confirmed, Exchange, HandOver, Look, Standing};
+pub use machine::ExchangeMachine;
 pub use measured::{Measured, Wanted, foreign, measurement};
 pub use pattern::{Pattern, file_word};
 pub use settings::{ExchangeWire, StationTable};
 pub use stations::{PlacedStation, place_station};
 pub use watch::Watch;
 
-use crate::device::{CorrectionMap, Measurement, Pass, PassRecord, Plan};
+use crate::device::{CorrectionMap, Pass, Plan};
 
 /// What a grinder is handed.
 #[derive(Debug, Clone, PartialEq)]
@@ -64,11 +64,3 @@ pub struct MeasureOrder {
     /// Its identity.
     pub plan_identity: [u8; 32],
 }
-
-/// Folders of a measuring machine.
-pub trait CmmMailbox: Mailbox<Request = MeasureOrder, Answer = Measurement> {}
-impl<M: Mailbox<Request = MeasureOrder, Answer = Measurement>> CmmMailbox for M {}
-
-/// Folders of a grinder.
-pub trait GrinderMailbox: Mailbox<Request = GrindOrder, Answer = PassRecord> {}
-impl<M: Mailbox<Request = GrindOrder, Answer = PassRecord>> GrinderMailbox for M {}

@@ -12,14 +12,14 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use serde::{Deserialize, Serialize};
 
-use super::watch::Look;
-use super::{ExchangeError, HandOver, MailboxError, Standing, file_word};
-use crate::device::Job;
-use crate::formats::{FormatError, read_whole, sync_folder, write_atomic, write_json_atomic};
+use super::watch::{FileLook, Watch};
+use super::{ExchangeError, HandOver, Standing, file_word};
+use crate::device::{Job, hex};
+use crate::formats::{FormatError, read_whole, sync_folder, try_writing, write_atomic, write_json_atomic};
 
 /// What every folder of a hand-over holds.
 const TICKET: &str = "handover.json";
@@ -55,18 +55,41 @@ pub(super) struct Ticket {
 }
 
 impl Ticket {
+    /// Says what is handed over for a job now, with what lies in the inbox already.
+    pub(super) fn new(
+        part: &str,
+        job: Job,
+        start_number: u32,
+        identity: &[u8; 32],
+        tool_radius_mm: f64,
+        inbox: &Path,
+    ) -> Result<Self, ExchangeError> {
+        let earlier = Watch::new(inbox, Duration::ZERO).look(Duration::ZERO)?.into_iter();
+        Ok(Self {
+            format: 1,
+            part: part.to_owned(),
+            job: job.job,
+            cycle: job.cycle,
+            digest: job.digest,
+            start_number,
+            identity: hex(identity),
+            tool_radius_mm,
+            earlier: earlier.map(|file| (file.name, file.look.bytes, nanoseconds(file.look.modified))).collect(),
+        })
+    }
+
     pub(super) fn job(&self) -> Job {
         Job { job: self.job, cycle: self.cycle, digest: self.digest }
     }
 
     /// Returns whether a file lay in the inbox before the hand-over, and has not been changed since.
-    pub(super) fn is_earlier(&self, name: &str, look: &Look) -> bool {
+    pub(super) fn is_earlier(&self, name: &str, look: &FileLook) -> bool {
         self.earlier.iter().any(|(n, bytes, at)| n == name && *bytes == look.bytes && *at == nanoseconds(look.modified))
     }
 }
 
 /// Time of change since 1970, in nanoseconds.
-pub(super) fn nanoseconds(at: SystemTime) -> u128 {
+fn nanoseconds(at: SystemTime) -> u128 {
     at.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |d| d.as_nanos())
 }
 
@@ -81,7 +104,7 @@ pub(super) struct Taken {
 
 /// A hand-over as it lies in the folder.
 #[derive(Clone, Debug)]
-pub(super) struct Lying {
+pub(super) struct StoredHandover {
     pub path: PathBuf,
     pub ticket: Ticket,
     pub standing: Standing,
@@ -95,8 +118,21 @@ pub(super) struct Outbox {
 }
 
 impl Outbox {
+    /// Tries this folder and the one that answers come out of, and returns every hand-over, the oldest first.
+    pub(super) fn open(&self, inbox: &mut Watch) -> Result<Vec<HandOver>, ExchangeError> {
+        try_writing(&self.folder)?;
+        inbox.look(Duration::ZERO)?;
+        let handed = self.list()?.into_iter();
+        let hand_over = |StoredHandover { ticket, standing, .. }| HandOver {
+            job: ticket.job(),
+            sequence: ticket.start_number,
+            standing,
+        };
+        Ok(handed.map(hand_over).collect())
+    }
+
     /// Returns every hand-over in the folder, in the order of their start numbers.
-    pub(super) fn list(&self) -> Result<Vec<Lying>, ExchangeError> {
+    pub(super) fn list(&self) -> Result<Vec<StoredHandover>, ExchangeError> {
         let unreadable = |source| FormatError::Unreadable { path: self.folder.clone(), source };
         let mut found = Vec::new();
         for entry in fs::read_dir(&self.folder).map_err(unreadable)? {
@@ -119,15 +155,20 @@ impl Outbox {
                 }
                 .into());
             };
-            found.push(Lying { path, ticket, standing, taken });
+            found.push(StoredHandover { path, ticket, standing, taken });
         }
-        found.sort_by_key(|lying| lying.ticket.start_number);
+        found.sort_by_key(|stored| stored.ticket.start_number);
         Ok(found)
     }
 
     /// Returns the hand-over of a job and cycle.
-    pub(super) fn find(&self, job: Job) -> Result<Option<Lying>, ExchangeError> {
+    fn find(&self, job: Job) -> Result<Option<StoredHandover>, ExchangeError> {
         Ok(self.list()?.into_iter().find(|l| (l.ticket.job, l.ticket.cycle) == (job.job, job.cycle)))
+    }
+
+    /// Returns the hand-over of a job and cycle that was put here.
+    pub(super) fn handed_over(&self, job: Job) -> Result<StoredHandover, ExchangeError> {
+        self.find(job)?.ok_or_else(|| ExchangeError::Missing { folder: self.folder.clone() })
     }
 
     /// Puts a hand-over into the folder: its ticket, and files by name.
@@ -149,31 +190,18 @@ impl Outbox {
 
     /// Gives a hand-over the name that tells where it stands.
     pub(super) fn mark(&self, job: Job, standing: Standing) -> Result<(), ExchangeError> {
-        let Some(lying) = self.find(job)? else { return Err(ExchangeError::Missing { folder: self.folder.clone() }) };
+        let stored = self.handed_over(job)?;
         let ending = ENDINGS.iter().find(|(s, _)| *s == standing).map_or("", |(_, e)| *e);
-        let target = self.folder.join(base_name(&lying.ticket.part, lying.ticket.job()) + ending);
-        if target != lying.path { Ok(rename(&lying.path, &target)?) } else { Ok(()) }
+        let target = self.folder.join(base_name(&stored.ticket.part, stored.ticket.job()) + ending);
+        if target != stored.path { Ok(rename(&stored.path, &target)?) } else { Ok(()) }
     }
 
     /// Writes down what was accepted as an answer.
-    pub(super) fn note_taken(&self, lying: &Lying, taken: &Taken) -> Result<(), ExchangeError> {
-        if lying.taken.as_ref() == Some(taken) {
+    pub(super) fn note_taken(&self, stored: &StoredHandover, taken: &Taken) -> Result<(), ExchangeError> {
+        if stored.taken.as_ref() == Some(taken) {
             return Ok(());
         }
-        Ok(write_json_atomic(lying.path.join(TAKEN), taken)?)
-    }
-}
-
-/// What the driver wants to know of a hand-over.
-pub(super) fn hand_over(lying: &Lying) -> HandOver {
-    HandOver { job: lying.ticket.job(), sequence: lying.ticket.start_number, standing: lying.standing }
-}
-
-/// Says an error of this room in the driver's words.
-pub(super) fn told(error: impl Into<ExchangeError>) -> MailboxError {
-    match error.into() {
-        ExchangeError::HandedOver { job, cycle, .. } => MailboxError::HandedOver { job, cycle },
-        other => MailboxError::Files { why: other.to_string() },
+        Ok(write_json_atomic(stored.path.join(TAKEN), taken)?)
     }
 }
 
@@ -219,9 +247,9 @@ pub(super) fn read_json<T: for<'de> Deserialize<'de>>(path: &Path) -> Result<T, 
     })
 }
 
-/// Returns bytes as hexadecimal digits.
-pub(super) fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|b| format!("{b:02x}")).collect()
+/// Returns a small document of JSON as it stands in a file.
+pub(super) fn json_lines(value: &serde_json::Value) -> Vec<u8> {
+    format!("{value:#}\n").into_bytes()
 }
 
 /// Returns the identity that 64 hexadecimal digits spell; what is no digit counts 0, and then it is nobody's identity.

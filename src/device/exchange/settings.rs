@@ -7,8 +7,8 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use super::cmm::{CmmExchange, CmmFolders, StationFiles, Stations};
-use super::desk::{ExchangeMachine, ExchangeTiming};
 use super::grinder::{GrinderExchange, GrinderFolders};
+use super::machine::ExchangeMachine;
 use super::pattern::Pattern;
 use crate::device::MachineKind;
 use crate::device::wiring::{Making, MakingError, Place, Wired};
@@ -145,13 +145,13 @@ impl Wired for ExchangeWire {
 }
 
 impl ExchangeWire {
-    fn machine<M: super::Mailbox>(&self, kind: MachineKind, inbox: &Path, folders: M) -> ExchangeMachine<M> {
+    fn machine<M: super::Exchange>(&self, kind: MachineKind, inbox: &Path, folders: M) -> ExchangeMachine<M> {
         let name = match kind {
             MachineKind::Cmm => "cmm",
             MachineKind::Grinder => "grinder",
         };
-        let timing = ExchangeTiming { request_timeout: ANSWERS_WITHIN };
-        ExchangeMachine::new(format!("{name} by files, {}", inbox.display()), kind, folders, timing).apart(self.apart)
+        let name = format!("{name} by files, {}", inbox.display());
+        ExchangeMachine::new(name, kind, folders, ANSWERS_WITHIN).apart(self.apart)
     }
 
     /// A folder that Regrind made itself would be one that nobody looks into: both must be there.

@@ -12,7 +12,7 @@ use crate::formats::FormatError;
 
 /// How a file looked at one moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Look {
+pub struct FileLook {
     /// Its length.
     pub bytes: u64,
     /// When it was changed last, by the clock of its file system.
@@ -22,7 +22,7 @@ pub struct Look {
 /// A file in the folder, and since when it has looked as it does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Known {
-    look: Look,
+    look: FileLook,
     since: Duration,
 }
 
@@ -36,13 +36,13 @@ pub struct Watch {
 
 /// A file as the last look found it.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Found {
+pub struct WatchedFile {
     /// Its name in the folder.
     pub name: String,
     /// Where it is.
     pub path: PathBuf,
     /// How it looks.
-    pub look: Look,
+    pub look: FileLook,
     /// Whether it has looked so for long enough.
     pub settled: bool,
 }
@@ -64,7 +64,7 @@ impl Watch {
     ///
     /// # Errors
     /// A folder that cannot be read.
-    pub fn look(&mut self, now: Duration) -> Result<Vec<Found>, FormatError> {
+    pub fn look(&mut self, now: Duration) -> Result<Vec<WatchedFile>, FormatError> {
         let unreadable = |source| FormatError::Unreadable { path: self.folder.clone(), source };
         let mut known = BTreeMap::new();
         for entry in std::fs::read_dir(&self.folder).map_err(unreadable)? {
@@ -75,12 +75,12 @@ impl Watch {
             if name.starts_with('.') || !metadata.is_file() {
                 continue;
             }
-            let look = Look { bytes: metadata.len(), modified: metadata.modified().map_err(unreadable)? };
+            let look = FileLook { bytes: metadata.len(), modified: metadata.modified().map_err(unreadable)? };
             let before = self.known.get(&name).filter(|k| k.look == look);
             known.insert(name, Known { look, since: before.map_or(now, |k| k.since) });
         }
         self.known = known;
-        let found = self.known.iter().map(|(name, known)| Found {
+        let found = self.known.iter().map(|(name, known)| WatchedFile {
             name: name.clone(),
             path: self.folder.join(name),
             look: known.look,

@@ -20,8 +20,9 @@ use tokio::time::Instant;
 
 use super::exchange::{ExchangeError, Wanted, file_word, foreign, measurement, plan_csv};
 use super::{
-    Answer, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Identity, Interrupt, Job, Machine,
-    MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, Reconciled, Started, State, Status, Word, digest,
+    Answer, Answered, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Identity, Interrupt, Job,
+    Machine, MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, Reconciled, Started, State, Status, Word,
+    digest, hex,
 };
 use crate::formats::result::{Content, read_bytes};
 use crate::formats::{FormatError, ResultFolder, write_atomic};
@@ -75,8 +76,6 @@ pub struct ManualMachine {
     taken: Vec<[u8; 32]>,
 }
 
-type Answered<T> = Result<T, DeviceError>;
-
 impl ManualMachine {
     /// A machine that a person serves, in one run.
     pub fn new(kind: MachineKind, settings: ManualSettings) -> Self {
@@ -100,17 +99,11 @@ impl ManualMachine {
 
     fn told(&self) -> Status {
         Status {
-            state: self.state,
             job: self.job.map(|(job, _)| job),
             done: self.job.filter(|_| self.outcome != Outcome::None).map_or(0, |(_, sequence)| sequence),
             outcome: self.outcome,
             clear_of_part: self.clear,
-            supplies: None,
-            fault: None,
-            progress: None,
-            temperature_c: None,
-            boot_id: None,
-            signals: Vec::new(),
+            ..Status::of(self.state)
         }
     }
 
@@ -176,7 +169,7 @@ impl ManualMachine {
         let folder = self.cycle_folder(job.cycle.saturating_sub(1));
         let there = ["toolpath.ngc", "correction.csv"].map(|name| folder.join(name)).into_iter().find(|f| f.is_file());
         let by = there.map_or("your own program".to_owned(), |file| file.display().to_string());
-        let map: String = map[..4].iter().map(|b| format!("{b:02x}")).collect();
+        let map = hex(&map[..4]);
         vec![
             format!("GRIND {}, cycle {}: by {by} (map {map})", self.settings.part, job.cycle),
             format!(
@@ -301,10 +294,6 @@ fn measured(
     Ok(measurement(points, &[file], job, identity, done))
 }
 
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|b| format!("{b:02x}")).collect()
-}
-
 /// Writes the plan for the person who measures.
 fn write_plan(settings: &ManualSettings, folder: &Path, plan: &Plan, job: Job) -> Result<(), FormatError> {
     ResultFolder::prepare(folder)?.keep();
@@ -323,13 +312,7 @@ impl Machine for ManualMachine {
 
     async fn connect(&mut self) -> Answered<Identity> {
         self.connected = true;
-        Ok(Identity {
-            kind: self.kind,
-            name: self.name.to_string(),
-            boot_id: 0,
-            simulation: false,
-            silence_limit_s: None,
-        })
+        Ok(Identity::by_person(self.kind, &self.name))
     }
 
     async fn status(&mut self) -> Answered<Status> {
@@ -452,19 +435,8 @@ impl Grinder for ManualMachine {
     async fn collect(&mut self, job: Job, _: &Interrupt) -> Answered<PassRecord> {
         match (self.job, &self.work) {
             (Some((own, done)), Some((Work::Grind(_, map_identity), _))) if own == job => Ok(PassRecord {
-                outcome: self.outcome,
-                path_mm: None,
-                removed_mm3: None,
-                deepest_mm: None,
-                idle_share: None,
-                spindle_load: None,
-                wheel_radius_mm: None,
-                temperature_c: None,
                 duration_s: self.duration_s,
-                map_identity: *map_identity,
-                job: job.job,
-                cycle: job.cycle,
-                done,
+                ..PassRecord::unmeasured(self.outcome, *map_identity, job, done)
             }),
             _ => Err(DeviceError::NoResult { machine: Arc::clone(&self.name), job, state: self.state }),
         }

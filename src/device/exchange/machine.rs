@@ -5,42 +5,30 @@ use std::time::Duration;
 
 use tokio::time::{Instant, timeout};
 
-use super::{CmmMailbox, GrindOrder, GrinderMailbox, HandOver, Mailbox, MailboxError, MeasureOrder, Standing, Step};
+use super::{Confirmed, Exchange, ExchangeError, GrindOrder, HandOver, MeasureOrder, Standing};
 use crate::device::{
-    Answer, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Identity, Interrupt, Job, Machine,
-    MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, Reconciled, Started, State, Status, Word, digest,
+    Answer, Answered, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Identity, Interrupt, Job,
+    Machine, MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, Reconciled, Started, State, Status, Word,
+    digest,
 };
-
-/// How long to wait for what.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ExchangeTiming {
-    /// For the folders to answer; a lost network drive may never do.
-    pub request_timeout: Duration,
-}
-
-impl Default for ExchangeTiming {
-    fn default() -> Self {
-        Self { request_timeout: Duration::from_secs(10) }
-    }
-}
 
 /// A machine behind two folders.
 ///
 /// Every method does its work on a thread for blocking work and to its end, even if its future is dropped.
 #[derive(Debug)]
-pub struct ExchangeMachine<M: Mailbox> {
+pub struct ExchangeMachine<M: Exchange> {
     name: Arc<str>,
-    timing: ExchangeTiming,
+    answers_within: Duration,
     made: Instant,
-    desk: Arc<Mutex<Desk<M>>>,
+    machine: Arc<Mutex<FolderMachine<M>>>,
 }
 
 /// Where the machine stands, by what is in the folders.
 #[derive(Debug)]
-struct Desk<M: Mailbox> {
+struct FolderMachine<M: Exchange> {
     name: Arc<str>,
     kind: MachineKind,
-    mailbox: M,
+    exchange: M,
     connected: bool,
     state: State,
     /// What would be handed over, and its digest.
@@ -53,7 +41,7 @@ struct Desk<M: Mailbox> {
     done: u32,
     answer: Option<M::Answer>,
     begun: bool,
-    said: Vec<String>,
+    notes: Vec<String>,
     owned: bool,
     /// Whether the machine cannot reach the part where the other one works.
     apart: bool,
@@ -61,16 +49,15 @@ struct Desk<M: Mailbox> {
     clear: Option<bool>,
 }
 
-type Told<T> = Result<T, DeviceError>;
-
-impl<M: Mailbox> ExchangeMachine<M> {
-    /// Takes the folders of a machine; `name` is what messages call it.
-    pub fn new(name: impl Into<Arc<str>>, kind: MachineKind, mailbox: M, timing: ExchangeTiming) -> Self {
+impl<M: Exchange> ExchangeMachine<M> {
+    /// Takes the folders of a machine; `name` is what messages call it. Folders that do not answer in time, such as those of a lost
+    /// network drive, are a lost machine.
+    pub fn new(name: impl Into<Arc<str>>, kind: MachineKind, exchange: M, answers_within: Duration) -> Self {
         let name = name.into();
-        let desk = Desk {
+        let machine = FolderMachine {
             name: Arc::clone(&name),
             kind,
-            mailbox,
+            exchange,
             connected: false,
             state: State::Idle,
             loaded: None,
@@ -80,43 +67,33 @@ impl<M: Mailbox> ExchangeMachine<M> {
             done: 0,
             answer: None,
             begun: false,
-            said: Vec::new(),
+            notes: Vec::new(),
             owned: false,
             apart: false,
             clear: None,
         };
-        Self { name, timing, made: Instant::now(), desk: Arc::new(Mutex::new(desk)) }
+        Self { name, answers_within, made: Instant::now(), machine: Arc::new(Mutex::new(machine)) }
     }
 
     /// Says whether the machine stands apart, so that it is always clear of the part.
     #[must_use]
     pub fn apart(self, apart: bool) -> Self {
-        self.desk.lock().unwrap_or_else(PoisonError::into_inner).apart = apart;
+        self.machine.lock().unwrap_or_else(PoisonError::into_inner).apart = apart;
         self
     }
 
-    /// What a person should know now: what is waited for, which files were left alone and why. Nothing while the folders are being
-    /// looked at.
-    pub fn notes(&self) -> Vec<String> {
-        match self.desk.try_lock() {
-            Ok(desk) => desk.said.clone(),
-            Err(TryLockError::Poisoned(desk)) => desk.into_inner().said.clone(),
-            Err(TryLockError::WouldBlock) => Vec::new(),
-        }
-    }
-
     /// Runs a piece of work on the folders, off the threads that must not wait.
-    async fn at_desk<T: Send + 'static>(
+    async fn at_work<T: Send + 'static>(
         &self,
         what: &'static str,
-        work: impl FnOnce(&mut Desk<M>, Duration) -> Told<T> + Send + 'static,
-    ) -> Told<T> {
-        let (desk, now) = (Arc::clone(&self.desk), self.made.elapsed());
+        work: impl FnOnce(&mut FolderMachine<M>, Duration) -> Answered<T> + Send + 'static,
+    ) -> Answered<T> {
+        let (machine, now) = (Arc::clone(&self.machine), self.made.elapsed());
         let job = tokio::task::spawn_blocking(move || {
-            let mut desk = desk.lock().unwrap_or_else(PoisonError::into_inner);
-            work(&mut desk, now)
+            let mut machine = machine.lock().unwrap_or_else(PoisonError::into_inner);
+            work(&mut machine, now)
         });
-        let limit = self.timing.request_timeout;
+        let limit = self.answers_within;
         match timeout(limit, job).await {
             Ok(Ok(told)) => told,
             Ok(Err(broken)) if broken.is_panic() => std::panic::resume_unwind(broken.into_panic()),
@@ -128,80 +105,48 @@ impl<M: Mailbox> ExchangeMachine<M> {
     async fn command(
         &self,
         command: Command,
-        work: impl FnOnce(&mut Desk<M>) -> Told<()> + Send + 'static,
-    ) -> Told<Status> {
-        self.at_desk("a command", move |desk, _| {
-            desk.check_connected("a command")?;
-            if !desk.owned && !matches!(command, Command::Claim | Command::Abort) {
-                return Err(desk.refused(command, Answer::NotOwner));
+        work: impl FnOnce(&mut FolderMachine<M>) -> Answered<()> + Send + 'static,
+    ) -> Answered<Status> {
+        self.at_work("a command", move |machine, _| {
+            machine.check_connected("a command")?;
+            if !machine.owned && !matches!(command, Command::Claim | Command::Abort) {
+                return Err(machine.refused(command, Answer::NotOwner));
             }
-            work(desk)?;
-            Ok(desk.status())
+            work(machine)?;
+            Ok(machine.status())
         })
         .await
     }
 
-    async fn load(&self, request: M::Request, digest: u32) -> Told<()> {
-        self.at_desk("a payload", move |desk, _| {
-            desk.check_connected("a payload")?;
-            if matches!(desk.state, State::Execute | State::Holding | State::Held) {
-                return Err(desk.refused(Command::Prepare, Answer::WrongState));
+    async fn load(&self, request: M::Request, digest: u32) -> Answered<()> {
+        self.at_work("a payload", move |machine, _| {
+            machine.check_connected("a payload")?;
+            if matches!(machine.state, State::Execute | State::Holding | State::Held) {
+                return Err(machine.refused(Command::Prepare, Answer::WrongState));
             }
-            desk.loaded = Some((request, digest));
-            if desk.state == State::Prepared {
-                (desk.state, desk.job) = (State::Idle, None);
+            machine.loaded = Some((request, digest));
+            if machine.state == State::Prepared {
+                (machine.state, machine.job) = (State::Idle, None);
             }
             Ok(())
         })
         .await
     }
 
-    async fn answer(&self, job: Job) -> Told<(M::Answer, u32)> {
-        self.at_desk("a result", move |desk, _| {
-            let same = desk.job.is_some_and(|(own, _)| own == job);
-            match &desk.answer {
-                Some(answer) if desk.state == State::Complete && same => Ok((answer.clone(), desk.done)),
-                _ => Err(DeviceError::NoResult { machine: Arc::clone(&desk.name), job, state: desk.state }),
+    async fn answer(&self, job: Job) -> Answered<(M::Answer, u32)> {
+        self.at_work("a result", move |machine, _| {
+            let same = machine.job.is_some_and(|(own, _)| own == job);
+            match &machine.answer {
+                Some(answer) if machine.state == State::Complete && same => Ok((answer.clone(), machine.done)),
+                _ => Err(DeviceError::NoResult { machine: Arc::clone(&machine.name), job, state: machine.state }),
             }
         })
         .await
     }
 }
 
-impl<M: Mailbox> ExchangeMachine<M> {
-    /// Takes a person's word that the job whose map has this identity has begun.
-    ///
-    /// # Errors
-    /// A map other than the one handed over, no open hand-over, a folder that cannot be written.
-    pub async fn confirm_started(&self, map_identity: [u8; 32]) -> Told<()> {
-        self.confirmed(Step::Started, map_identity).await
-    }
-
-    /// Takes a person's word that the job whose map has this identity has ended and the part is clear.
-    ///
-    /// # Errors
-    /// Those of [`ExchangeMachine::confirm_started`].
-    pub async fn confirm_done(&self, map_identity: [u8; 32]) -> Told<()> {
-        self.confirmed(Step::Done, map_identity).await
-    }
-
-    async fn confirmed(&self, step: Step, map_identity: [u8; 32]) -> Told<()> {
-        self.at_desk("a confirmation", move |desk, _| {
-            desk.check_connected("a confirmation")?;
-            if desk.kind == MachineKind::Cmm {
-                return Err(DeviceError::TellsItself { machine: Arc::clone(&desk.name) });
-            }
-            let Some((job, _)) = desk.job.filter(|_| desk.state == State::Execute) else {
-                return Err(desk.refused(Command::Start, Answer::WrongState));
-            };
-            desk.mailbox.confirm(job, step, map_identity).map_err(|error| desk.failed(Command::Start, error))
-        })
-        .await
-    }
-}
-
-impl<M: Mailbox> Desk<M> {
-    fn check_connected(&self, what: &'static str) -> Told<()> {
+impl<M: Exchange> FolderMachine<M> {
+    fn check_connected(&self, what: &'static str) -> Answered<()> {
         if self.connected { Ok(()) } else { Err(DeviceError::NotConnected { machine: Arc::clone(&self.name), what }) }
     }
 
@@ -209,41 +154,35 @@ impl<M: Mailbox> Desk<M> {
         DeviceError::Refused { machine: Arc::clone(&self.name), command, answer, state: self.state }
     }
 
-    fn failed(&self, command: Command, error: MailboxError) -> DeviceError {
+    fn failed(&self, command: Command, error: ExchangeError) -> DeviceError {
         let machine = Arc::clone(&self.name);
         let short = |identity: &[u8; 32]| identity[..8].iter().fold(0, |sum, &b| sum << 8 | u64::from(b));
         match error {
-            MailboxError::HandedOver { .. } => self.refused(command, Answer::AlreadyBegun),
-            MailboxError::NotOpen { .. } => self.refused(command, Answer::WrongState),
-            MailboxError::OtherMap { expected, found } => DeviceError::Mismatch {
+            ExchangeError::HandedOver { .. } => self.refused(command, Answer::AlreadyBegun),
+            ExchangeError::NotOpen { .. } => self.refused(command, Answer::WrongState),
+            ExchangeError::OtherMap { expected, found } => DeviceError::Mismatch {
                 machine,
                 field: "the identity of the map",
                 sent: short(&expected),
                 held: short(&found),
             },
-            MailboxError::Files { why } => DeviceError::Folder { machine, why },
+            error => DeviceError::Folder { machine, why: error.to_string() },
         }
     }
 
     fn status(&self) -> Status {
         Status {
-            state: self.state,
             job: self.job.map(|(job, _)| job),
             done: self.done,
             outcome: self.outcome,
             clear_of_part: if self.apart { Some(true) } else { self.clear },
-            supplies: None,
-            fault: None,
-            progress: None,
-            temperature_c: None,
-            boot_id: None,
-            signals: Vec::new(),
+            ..Status::of(self.state)
         }
     }
 
     /// Reads the folders' memory; what stands open there is what this machine is doing.
-    fn open(&mut self) -> Told<()> {
-        self.handed = self.mailbox.open().map_err(|error| self.failed(Command::Claim, error))?;
+    fn open(&mut self) -> Answered<()> {
+        self.handed = self.exchange.open().map_err(|error| self.failed(Command::Claim, error))?;
         if !self.connected
             && let Some(last) = self.handed.last().filter(|h| matches!(h.standing, Standing::Open | Standing::Held))
         {
@@ -255,10 +194,10 @@ impl<M: Mailbox> Desk<M> {
     }
 
     /// Looks for the answer while one is waited for.
-    fn look(&mut self, now: Duration) -> Told<()> {
+    fn look(&mut self, now: Duration) -> Answered<()> {
         let Some((job, sequence)) = self.job.filter(|_| self.state == State::Execute) else { return Ok(()) };
-        let look = self.mailbox.look(now, job).map_err(|error| self.failed(Command::Start, error))?;
-        self.said = look.said;
+        let look = self.exchange.look(now, job).map_err(|error| self.failed(Command::Start, error))?;
+        self.notes = look.notes;
         self.begun = look.begun;
         if look.answer.is_some() {
             self.answer = look.answer;
@@ -272,7 +211,7 @@ impl<M: Mailbox> Desk<M> {
         (self.state, self.outcome, self.done) = (State::Complete, outcome, sequence);
     }
 
-    fn prepare(&mut self, job: Job) -> Told<Armed> {
+    fn prepare(&mut self, job: Job) -> Answered<Armed> {
         if self.state != State::Idle {
             return Err(self.refused(Command::Prepare, Answer::WrongState));
         }
@@ -293,7 +232,7 @@ impl<M: Mailbox> Desk<M> {
         Ok(Armed { job, start_sequence, token: 0, boot_id: 0 })
     }
 
-    fn start(&mut self, armed: &Armed) -> Told<Started> {
+    fn start(&mut self, armed: &Armed) -> Answered<Started> {
         if self.state != State::Prepared {
             return Err(self.refused(Command::Start, Answer::WrongState));
         }
@@ -301,23 +240,23 @@ impl<M: Mailbox> Desk<M> {
         let Some((request, _)) = self.loaded.as_ref().filter(|_| self.job == Some((job, sequence))) else {
             return Err(self.refused(Command::Start, Answer::OtherJob));
         };
-        if let Err(error) = self.mailbox.publish(job, sequence, request) {
+        if let Err(error) = self.exchange.publish(job, sequence, request) {
             return self.after_failed_start(armed, error);
         }
         self.handed.push(HandOver { job, sequence, standing: Standing::Open });
         self.started(armed)
     }
 
-    fn started(&mut self, armed: &Armed) -> Told<Started> {
+    fn started(&mut self, armed: &Armed) -> Answered<Started> {
         (self.state, self.clear) = (State::Execute, None);
-        self.said = vec!["handed over; waiting for the answer".to_owned()];
+        self.notes = vec!["handed over; waiting for the answer".to_owned()];
         Ok(Started { job: armed.job, start_sequence: armed.start_sequence, status: self.status() })
     }
 
     /// Something went wrong while the hand-over was published: whether it is there is read from the folder.
-    fn after_failed_start(&mut self, armed: &Armed, error: MailboxError) -> Told<Started> {
+    fn after_failed_start(&mut self, armed: &Armed, error: ExchangeError) -> Answered<Started> {
         let why = self.failed(Command::Start, error);
-        match self.mailbox.open() {
+        match self.exchange.open() {
             Ok(handed) => {
                 self.handed = handed;
                 let ours = |h: &HandOver| (h.job, h.sequence) == (armed.job, armed.start_sequence);
@@ -336,26 +275,26 @@ impl<M: Mailbox> Desk<M> {
         }
     }
 
-    fn mark(&mut self, command: Command, standing: Standing) -> Told<()> {
+    fn mark(&mut self, command: Command, standing: Standing) -> Answered<()> {
         let Some((job, sequence)) = self.job else { return Err(self.refused(command, Answer::WrongState)) };
-        self.mailbox.mark(job, standing).map_err(|error| self.failed(command, error))?;
+        self.exchange.mark(job, standing).map_err(|error| self.failed(command, error))?;
         for handed in self.handed.iter_mut().filter(|h| h.sequence == sequence) {
             handed.standing = standing;
         }
         Ok(())
     }
 
-    fn hold(&mut self) -> Told<()> {
+    fn hold(&mut self) -> Answered<()> {
         if self.state != State::Execute {
             return Err(self.refused(Command::Hold, Answer::WrongState));
         }
         self.mark(Command::Hold, Standing::Held)?;
         self.state = State::Held;
-        self.said = self.taken_back();
+        self.notes = self.taken_back();
         Ok(())
     }
 
-    fn resume(&mut self) -> Told<()> {
+    fn resume(&mut self) -> Answered<()> {
         if self.state != State::Held {
             return Err(self.refused(Command::Resume, Answer::WrongState));
         }
@@ -364,12 +303,12 @@ impl<M: Mailbox> Desk<M> {
         Ok(())
     }
 
-    fn stop(&mut self) -> Told<()> {
+    fn stop(&mut self) -> Answered<()> {
         match (self.state, self.job) {
             (State::Prepared, _) => (self.state, self.job) = (State::Idle, None),
             (State::Execute | State::Held, Some((_, sequence))) => {
                 self.mark(Command::Stop, Standing::Stopped)?;
-                self.said = self.taken_back();
+                self.notes = self.taken_back();
                 self.finish(Outcome::Stopped, sequence);
             }
             _ => return Err(self.refused(Command::Stop, Answer::WrongState)),
@@ -377,14 +316,14 @@ impl<M: Mailbox> Desk<M> {
         Ok(())
     }
 
-    fn abort(&mut self) -> Told<()> {
+    fn abort(&mut self) -> Answered<()> {
         let was = std::mem::replace(&mut self.state, State::Aborted);
         let lies = |h: &&HandOver| matches!(h.standing, Standing::Open | Standing::Held);
         let ours = self.job.filter(|(_, sequence)| self.handed.iter().filter(lies).any(|h| h.sequence == *sequence));
         if was == State::Prepared || ours.is_none() {
             return Ok(());
         }
-        self.said = self.taken_back();
+        self.notes = self.taken_back();
         (self.outcome, self.answer) = (Outcome::Aborted, None);
         // ABORTED is entered even if the folder cannot be reached; the error says that the hand-over may still lie there.
         self.mark(Command::Abort, Standing::Aborted)
@@ -405,7 +344,7 @@ impl<M: Mailbox> Desk<M> {
         vec![words.to_owned()]
     }
 
-    fn acknowledge(&mut self, done: u32) -> Told<()> {
+    fn acknowledge(&mut self, done: u32) -> Answered<()> {
         if self.state != State::Complete {
             return Err(self.refused(Command::Acknowledge, Answer::WrongState));
         }
@@ -417,11 +356,24 @@ impl<M: Mailbox> Desk<M> {
         }
         (self.state, self.job, self.answer) = (State::Idle, None, None);
         (self.outcome, self.done, self.begun) = (Outcome::None, 0, false);
-        self.said.clear();
+        self.notes.clear();
         Ok(())
     }
 
-    fn reconcile(&mut self, intended: &Armed) -> Told<Reconciled> {
+    /// Takes a person's word that the job whose map has this identity has begun, or has ended and the part is clear.
+    fn confirm(&mut self, what: Confirmed, map_identity: [u8; 32]) -> Answered<Vec<String>> {
+        self.check_connected("a confirmation")?;
+        if self.kind == MachineKind::Cmm {
+            return Err(DeviceError::TellsItself { machine: Arc::clone(&self.name) });
+        }
+        let Some((job, _)) = self.job.filter(|_| self.state == State::Execute) else {
+            return Err(self.refused(Command::Start, Answer::WrongState));
+        };
+        self.exchange.confirm(job, what, map_identity).map_err(|error| self.failed(Command::Start, error))?;
+        Ok(Vec::new())
+    }
+
+    fn reconcile(&mut self, intended: &Armed) -> Answered<Reconciled> {
         self.open()?;
         let Job { job, cycle, .. } = intended.job;
         let Some(handed) = self.handed.iter().find(|h| (h.job.job, h.job.cycle) == (job, cycle)).copied() else {
@@ -462,64 +414,62 @@ impl<M: Mailbox> Desk<M> {
     }
 }
 
-impl<M: Mailbox> Machine for ExchangeMachine<M> {
+impl<M: Exchange> Machine for ExchangeMachine<M> {
     fn name(&self) -> &str {
         &self.name
     }
 
+    /// Nothing while the folders are being looked at.
     fn notes(&self) -> Vec<String> {
-        Self::notes(self)
+        match self.machine.try_lock() {
+            Ok(machine) => machine.notes.clone(),
+            Err(TryLockError::Poisoned(machine)) => machine.into_inner().notes.clone(),
+            Err(TryLockError::WouldBlock) => Vec::new(),
+        }
     }
 
-    async fn connect(&mut self) -> Told<Identity> {
-        self.at_desk("who it is", |desk, _| {
-            desk.open()?;
-            Ok(Identity {
-                kind: desk.kind,
-                name: desk.name.to_string(),
-                boot_id: 0,
-                simulation: false,
-                // A person is never lost by silence.
-                silence_limit_s: None,
-            })
+    async fn connect(&mut self) -> Answered<Identity> {
+        self.at_work("who it is", |machine, _| {
+            machine.open()?;
+            Ok(Identity::by_person(machine.kind, &machine.name))
         })
         .await
     }
 
-    async fn status(&mut self) -> Told<Status> {
-        self.at_desk("its status", |desk, now| {
-            desk.check_connected("its status")?;
-            desk.look(now)?;
-            Ok(desk.status())
+    async fn status(&mut self) -> Answered<Status> {
+        self.at_work("its status", |machine, now| {
+            machine.check_connected("its status")?;
+            machine.look(now)?;
+            Ok(machine.status())
         })
         .await
     }
 
-    async fn claim(&mut self) -> Told<Status> {
-        self.command(Command::Claim, |desk| {
-            desk.owned = true;
+    async fn claim(&mut self) -> Answered<Status> {
+        self.command(Command::Claim, |machine| {
+            machine.owned = true;
             Ok(())
         })
         .await
     }
 
-    async fn prepare(&mut self, job: Job) -> Told<Armed> {
-        self.at_desk("PREPARE", move |desk, _| {
-            desk.check_connected("PREPARE")?;
-            if !desk.owned {
-                return Err(desk.refused(Command::Prepare, Answer::NotOwner));
+    async fn prepare(&mut self, job: Job) -> Answered<Armed> {
+        self.at_work("PREPARE", move |machine, _| {
+            machine.check_connected("PREPARE")?;
+            if !machine.owned {
+                return Err(machine.refused(Command::Prepare, Answer::NotOwner));
             }
-            desk.prepare(job)
+            machine.prepare(job)
         })
         .await
     }
 
-    async fn start(&mut self, armed: Armed) -> Told<Started> {
+    async fn start(&mut self, armed: Armed) -> Answered<Started> {
         let (job, sequence) = (armed.job, armed.start_sequence);
         let told = self
-            .at_desk("START", move |desk, _| {
-                desk.check_connected("START")?;
-                desk.start(&armed)
+            .at_work("START", move |machine, _| {
+                machine.check_connected("START")?;
+                machine.start(&armed)
             })
             .await;
         match told {
@@ -532,85 +482,85 @@ impl<M: Mailbox> Machine for ExchangeMachine<M> {
         }
     }
 
-    async fn hold(&mut self) -> Told<Status> {
-        self.command(Command::Hold, Desk::hold).await
+    async fn hold(&mut self) -> Answered<Status> {
+        self.command(Command::Hold, FolderMachine::hold).await
     }
 
-    async fn resume(&mut self) -> Told<Status> {
-        self.command(Command::Resume, Desk::resume).await
+    async fn resume(&mut self) -> Answered<Status> {
+        self.command(Command::Resume, FolderMachine::resume).await
     }
 
-    async fn stop(&mut self) -> Told<Status> {
-        self.command(Command::Stop, Desk::stop).await
+    async fn stop(&mut self) -> Answered<Status> {
+        self.command(Command::Stop, FolderMachine::stop).await
     }
 
-    async fn abort(&mut self) -> Told<Status> {
-        self.command(Command::Abort, Desk::abort).await
+    async fn abort(&mut self) -> Answered<Status> {
+        self.command(Command::Abort, FolderMachine::abort).await
     }
 
-    async fn clear(&mut self) -> Told<Status> {
-        self.command(Command::Clear, |desk| {
-            if !matches!(desk.state, State::Aborted | State::Faulted) {
-                return Err(desk.refused(Command::Clear, Answer::WrongState));
+    async fn clear(&mut self) -> Answered<Status> {
+        self.command(Command::Clear, |machine| {
+            if !matches!(machine.state, State::Aborted | State::Faulted) {
+                return Err(machine.refused(Command::Clear, Answer::WrongState));
             }
-            (desk.state, desk.job, desk.outcome) = (State::Idle, None, Outcome::None);
-            desk.said.clear();
+            (machine.state, machine.job, machine.outcome) = (State::Idle, None, Outcome::None);
+            machine.notes.clear();
             Ok(())
         })
         .await
     }
 
-    async fn acknowledge(&mut self, done: u32) -> Told<Status> {
-        self.command(Command::Acknowledge, move |desk| desk.acknowledge(done)).await
+    async fn acknowledge(&mut self, done: u32) -> Answered<Status> {
+        self.command(Command::Acknowledge, move |machine| machine.acknowledge(done)).await
     }
 
-    async fn release(&mut self) -> Told<Status> {
-        self.command(Command::Release, |desk| {
-            if desk.state == State::Execute {
-                return Err(desk.refused(Command::Release, Answer::WrongState));
+    async fn release(&mut self) -> Answered<Status> {
+        self.command(Command::Release, |machine| {
+            if machine.state == State::Execute {
+                return Err(machine.refused(Command::Release, Answer::WrongState));
             }
-            desk.owned = false;
+            machine.owned = false;
             Ok(())
         })
         .await
     }
 
-    async fn reconcile(&mut self, intended: &Armed) -> Told<Reconciled> {
+    async fn reconcile(&mut self, intended: &Armed) -> Answered<Reconciled> {
         let intended = intended.clone();
-        self.at_desk("what became of a start", move |desk, _| desk.reconcile(&intended)).await
+        self.at_work("what became of a start", move |machine, _| machine.reconcile(&intended)).await
     }
 
-    async fn confirm(&mut self, word: Word) -> Told<Vec<String>> {
-        let (step, map_identity) = match word {
-            Word::Started { map_identity } => (Step::Started, map_identity),
-            Word::Done { map_identity, .. } => (Step::Done, map_identity),
+    async fn confirm(&mut self, word: Word) -> Answered<Vec<String>> {
+        let (what, map_identity) = match word {
+            Word::Started { map_identity } => (Confirmed::Started, map_identity),
+            Word::Done { map_identity, .. } => (Confirmed::Done, map_identity),
             Word::Still => return Err(DeviceError::TellsItself { machine: Arc::clone(&self.name) }),
         };
         let map_identity = map_identity.ok_or_else(|| DeviceError::MapUnnamed { machine: Arc::clone(&self.name) })?;
-        self.confirmed(step, map_identity).await.map(|()| Vec::new())
+        self.at_work("a confirmation", move |machine, _| machine.confirm(what, map_identity)).await
     }
 }
 
-impl<M: CmmMailbox> Cmm for ExchangeMachine<M> {
-    async fn load_plan(&mut self, plan: &Plan, _: &Interrupt) -> Told<()> {
+impl<M: Exchange<Request = MeasureOrder, Answer = Measurement>> Cmm for ExchangeMachine<M> {
+    async fn load_plan(&mut self, plan: &Plan, _: &Interrupt) -> Answered<()> {
         let plan_identity = plan.identity();
         self.load(MeasureOrder { plan: plan.clone(), plan_identity }, digest(&[plan_identity])).await
     }
 
-    async fn collect(&mut self, job: Job, _: &Interrupt) -> Told<Measurement> {
+    async fn collect(&mut self, job: Job, _: &Interrupt) -> Answered<Measurement> {
         let (measurement, done) = self.answer(job).await?;
         Ok(Measurement { done, ..measurement })
     }
 }
 
-impl<M: GrinderMailbox> Grinder for ExchangeMachine<M> {
-    async fn load_pass(&mut self, map: &CorrectionMap, pass: &Pass, _: &Interrupt) -> Told<()> {
+impl<M: Exchange<Request = GrindOrder, Answer = PassRecord>> Grinder for ExchangeMachine<M> {
+    async fn load_pass(&mut self, map: &CorrectionMap, pass: &Pass, _: &Interrupt) -> Answered<()> {
         let map_identity = map.identity();
         let order = GrindOrder { map: map.clone(), pass: *pass, map_identity };
         self.load(order, digest(&[map_identity, pass.identity()])).await
     }
 
-    async fn collect(&mut self, job: Job, _: &Interrupt) -> Told<PassRecord> {
+    async fn collect(&mut self, job: Job, _: &Interrupt) -> Answered<PassRecord> {
         let (record, done) = self.answer(job).await?;
         Ok(PassRecord { done, ..record })
     }

@@ -2,39 +2,40 @@
 
 use std::time::Duration;
 
+use super::ExchangeError;
 use crate::device::Job;
 
 /// Two folders that stand for a machine: one that hand-overs are put into, one that answers come out of.
 ///
 /// Everything may be asked again: publishing apart, asking twice is the same as asking once.
-pub trait Mailbox: std::fmt::Debug + Send + 'static {
+pub trait Exchange: std::fmt::Debug + Send + 'static {
     /// What is handed over.
     type Request: std::fmt::Debug + Send + 'static;
     /// What comes back.
     type Answer: std::fmt::Debug + Clone + Send + 'static;
 
     /// Tries both folders, and returns every hand-over that was ever made there, the oldest first.
-    fn open(&mut self) -> Result<Vec<HandOver>, MailboxError>;
+    fn open(&mut self) -> Result<Vec<HandOver>, ExchangeError>;
 
     /// Makes a hand-over appear, whole, by one rename. Never a second time for a job and cycle.
-    fn publish(&mut self, job: Job, sequence: u32, request: &Self::Request) -> Result<(), MailboxError>;
+    fn publish(&mut self, job: Job, sequence: u32, request: &Self::Request) -> Result<(), ExchangeError>;
 
     /// Moves a hand-over on to where it stands now.
-    fn mark(&mut self, job: Job, standing: Standing) -> Result<(), MailboxError>;
+    fn mark(&mut self, job: Job, standing: Standing) -> Result<(), ExchangeError>;
 
     /// Looks for what has come back for a hand-over that is open. `now` is the time since the driver was made.
-    fn look(&mut self, now: Duration, job: Job) -> Result<Look<Self::Answer>, MailboxError>;
+    fn look(&mut self, now: Duration, job: Job) -> Result<Look<Self::Answer>, ExchangeError>;
 
     /// Writes down that a person has begun or ended the job whose map has this identity; where jobs are told by files alone, no job
     /// is open for it.
-    fn confirm(&mut self, job: Job, _step: Step, _map_identity: [u8; 32]) -> Result<(), MailboxError> {
-        Err(MailboxError::NotOpen { job: job.job, cycle: job.cycle })
+    fn confirm(&mut self, job: Job, _what: Confirmed, _map_identity: [u8; 32]) -> Result<(), ExchangeError> {
+        Err(ExchangeError::NotOpen { job: job.job, cycle: job.cycle })
     }
 }
 
 /// What a person confirms.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Step {
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Confirmed {
     /// The machine has begun.
     Started,
     /// The machine has ended, the part is clear.
@@ -75,28 +76,5 @@ pub struct Look<A> {
     /// Whether a person has confirmed that the machine has begun.
     pub begun: bool,
     /// What a person should know: files left alone, and why; what is waited for.
-    pub said: Vec<String>,
-}
-
-/// Why the folders did not do what they were asked.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[expect(missing_docs, reason = "the message of each tells what its fields are")]
-#[non_exhaustive]
-pub enum MailboxError {
-    /// A file or a folder is not as it has to be.
-    #[error("{why}")]
-    Files { why: String },
-    /// The job and cycle were handed over before.
-    #[error("job {job} cycle {cycle} was handed over before")]
-    HandedOver { job: u32, cycle: u16 },
-    /// A confirmation names another map.
-    #[error("the confirmation names the map {}, handed over was {}", hex(.found), hex(.expected))]
-    OtherMap { expected: [u8; 32], found: [u8; 32] },
-    /// No hand-over of this job is open.
-    #[error("no hand-over of job {job} cycle {cycle} is open")]
-    NotOpen { job: u32, cycle: u16 },
-}
-
-fn hex(bytes: &[u8; 32]) -> String {
-    bytes[..8].iter().map(|b| format!("{b:02x}")).collect()
+    pub notes: Vec<String>,
 }
