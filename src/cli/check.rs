@@ -40,14 +40,14 @@ pub(super) struct Arguments {
 
 /// What was found in one file.
 #[derive(Serialize)]
-struct Found {
+struct CheckedFile {
     file: PathBuf,
     kind: &'static str,
     good: bool,
     sha256: Option<String>,
     /// What is so on this computer and makes the file no worse: a serial port that is not here.
     notes: Vec<String>,
-    problems: Vec<Told>,
+    problems: Vec<ToldProblem>,
 }
 
 /// A good file.
@@ -58,7 +58,7 @@ struct Good {
 
 /// One problem, for a program.
 #[derive(Serialize)]
-struct Told {
+struct ToldProblem {
     line: usize,
     column: usize,
     key: String,
@@ -84,10 +84,12 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         }
         let (sha256, problems) = match &checked {
             Ok(good) => (Some(good.sha256.clone()), Vec::new()),
-            Err(problems) => (None, problems.problems.iter().map(|problem| Told::new(problems, problem)).collect()),
+            Err(problems) => {
+                (None, problems.problems.iter().map(|problem| ToldProblem::new(problems, problem)).collect())
+            }
         };
         let notes = checked.as_ref().map_or(Vec::new(), |good| good.notes.clone());
-        found.push(Found { file: path.clone(), kind, good: checked.is_ok(), sha256, notes, problems });
+        found.push(CheckedFile { file: path.clone(), kind, good: checked.is_ok(), sha256, notes, problems });
     }
     if arguments.json {
         super::print_json(&found)?;
@@ -197,7 +199,7 @@ fn picture(problems: &Problems, problem: &Problem, renderer: &Renderer) -> Strin
     format!("{}\n\n", renderer.render(&[group.elements(remedy)]))
 }
 
-impl Told {
+impl ToldProblem {
     fn new(problems: &Problems, problem: &Problem) -> Self {
         let (line, column) = problems.place(problem);
         let Problem { key, found, allowed, remedy, .. } = problem.clone();

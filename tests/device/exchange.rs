@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
 use regrind::device::exchange::{
-    CmmExchange, CmmFolders, ExchangeMachine, ExchangeTiming, GrindOrder, GrinderExchange, GrinderFolders, Look,
-    Mailbox, MailboxError, MeasureOrder, Pattern, Standing, StationFiles, Stations, Step,
+    CmmExchange, CmmFolders, Confirmed, Exchange, ExchangeError, ExchangeMachine, GrindOrder, GrinderExchange,
+    GrinderFolders, Look, MeasureOrder, Pattern, Standing, StationFiles, Stations,
 };
 use regrind::device::{
     Answer, Cmm, Coordinates, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Machine, MachineKind,
@@ -117,7 +117,7 @@ impl Bench {
 
     fn refused(&mut self, expected: &str) {
         let look = self.settled();
-        let said = look.said.join("\n");
+        let said = look.notes.join("\n");
         assert!(look.answer.is_none() && said.contains(expected), "said\n{said}\nnot {expected}");
     }
 }
@@ -157,13 +157,13 @@ fn the_plan_says_everything_and_reads_back_to_the_same_bits() {
 fn a_result_is_taken_when_it_has_settled_and_ended_and_not_before() {
     let shop = Shop::new();
     let mut bench = Bench::new(shop.cmm());
-    assert!(bench.look().said[0].contains("waiting for SN_7_c2.* in"));
+    assert!(bench.look().notes[0].contains("waiting for SN_7_c2.* in"));
     shop.put("SN_7_c2.csv", "# coordinates: centres\nx,y,z\n1,2,3\n");
     assert!(bench.look().answer.is_none());
     // It grows while it is looked at: the time begins anew.
     shop.put("SN_7_c2.csv", "# coordinates: centres\nx,y,z\n1,2,3\n4,5,6\n7,8,9.1");
     let look = bench.look();
-    assert!(look.answer.is_none() && look.said[0].contains("still changing"), "{:?}", look.said);
+    assert!(look.answer.is_none() && look.notes[0].contains("still changing"), "{:?}", look.notes);
     // The last line has three numbers, and is not the end all the same.
     bench.refused("cut in the middle of a line, found `7,8,9.1`");
     shop.put("SN_7_c2.csv", &three());
@@ -267,14 +267,16 @@ fn a_job_and_cycle_is_handed_over_once_and_its_bytes_answer_no_other_cycle() {
     let (order, digest) = order(3);
     let job = bench.job;
     let again = |folders: &mut CmmFolders| folders.publish(job, 2, &order);
-    assert_eq!(again(&mut bench.folders), Err(MailboxError::HandedOver { job: 3, cycle: 2 }));
+    let refused = again(&mut bench.folders);
+    assert!(matches!(refused, Err(ExchangeError::HandedOver { job: 3, cycle: 2, .. })), "{refused:?}");
     shop.put("SN_7_c2.csv", &three());
     assert!(bench.settled().answer.is_some());
     bench.folders.mark(bench.job, Standing::Closed).unwrap();
     assert_eq!(shop.handed(), ["SN_7_j3_c2.done"]);
     // Nor by another process, nor once it was acknowledged.
     let mut other = CmmFolders::new(shop.cmm());
-    assert_eq!(again(&mut other), Err(MailboxError::HandedOver { job: 3, cycle: 2 }));
+    let refused = again(&mut other);
+    assert!(matches!(refused, Err(ExchangeError::HandedOver { job: 3, cycle: 2, .. })), "{refused:?}");
     let handed = other.open().unwrap();
     assert_eq!((handed.len(), handed[0].sequence, handed[0].standing), (1, 1, Standing::Closed));
     let next = Job { job: 3, cycle: 3, digest };
@@ -297,7 +299,7 @@ fn a_restart_finds_what_is_open() {
     assert_eq!(shop.handed(), ["SN_7_j3_c2.held"]);
     bench.folders.mark(job, Standing::Open).unwrap();
     fs::rename(shop.outbox.join("SN_7_j3_c2"), shop.outbox.join("mine")).unwrap();
-    let MailboxError::Files { why } = bench.folders.open().unwrap_err() else { panic!() };
+    let why = bench.folders.open().unwrap_err().to_string();
     assert!(why.contains("expected a folder with the name that was given to it"), "{why}");
 }
 
@@ -345,7 +347,7 @@ fn stations_are_merged_by_their_reference_points() {
     shop.put("P_2.txt", &points(2));
     shop.put("ref_2.yaml", &references([0, 2, 1, 3], 2));
     bench.refused("station 2 (ref_2.yaml): reference point right is off by");
-    assert!(bench.look().said.join(" ").contains("right and upper seem exchanged"));
+    assert!(bench.look().notes.join(" ").contains("right and upper seem exchanged"));
     shop.put("ref_2.yaml", &references([0, 1, 2, 3], 2));
     let look = bench.settled();
     let found = look.answer.unwrap();
@@ -353,7 +355,7 @@ fn stations_are_merged_by_their_reference_points() {
         let at = found.points[k].at_mm;
         assert!(at.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-9), "{at:?} not {expected:?}");
     }
-    let said = look.said.join("\n");
+    let said = look.notes.join("\n");
     assert!(said.contains("left alone, no station's: ref_9.yaml"), "{said}");
     assert!(
         said.contains("station 1 (ref_1.yaml): reference points fit to 0.000 mm rms (left 0.000, right 0.000"),
@@ -402,7 +404,7 @@ fn a_pass_is_confirmed_by_files_that_name_its_map() {
         grinder.look(Duration::from_secs(now), job).unwrap();
         grinder.look(Duration::from_secs(now + 2), job).unwrap()
     };
-    let said = settled(&mut grinder).said.join("\n");
+    let said = settled(&mut grinder).notes.join("\n");
     assert!(
         said.contains("done.json lay there before") && said.contains("waiting for the start to be confirmed"),
         "{said}"
@@ -410,37 +412,42 @@ fn a_pass_is_confirmed_by_files_that_name_its_map() {
     shop.put("started.json", r#"{"map": "0123456789abcdef"}"#);
     let look = settled(&mut grinder);
     assert!(
-        !look.begun && look.said.join("\n").contains("confirms map `0123456789abcdef`, handed over was map"),
+        !look.begun && look.notes.join("\n").contains("confirms map `0123456789abcdef`, handed over was map"),
         "{:?}",
-        look.said
+        look.notes
     );
     fs::copy(folder.join("started.json"), shop.inbox.join("started.json")).unwrap();
     let look = settled(&mut grinder);
     assert!(
-        look.begun && look.answer.is_none() && look.said.join("\n").contains("waiting for the end"),
+        look.begun && look.answer.is_none() && look.notes.join("\n").contains("waiting for the end"),
         "{:?}",
-        look.said
+        look.notes
     );
     shop.put(
         "done.json",
         &fs::read_to_string(folder.join("done.json")).unwrap().replace("\"cycle\": 2", "\"cycle\": 1"),
     );
-    assert!(settled(&mut grinder).said.join("\n").contains("confirms job 3 cycle 1, handed over was job 3 cycle 2"));
+    assert!(settled(&mut grinder).notes.join("\n").contains("confirms job 3 cycle 1, handed over was job 3 cycle 2"));
     shop.put("done.json", "{\"map\"");
-    assert!(settled(&mut grinder).said.join("\n").contains("expected JSON"));
+    assert!(settled(&mut grinder).notes.join("\n").contains("expected JSON"));
     fs::copy(folder.join("done.json"), shop.inbox.join("done.json")).unwrap();
     let record = settled(&mut grinder).answer.unwrap();
     assert_eq!((record.map_identity, record.outcome, record.wheel_radius_mm), (map_identity, Outcome::Complete, None));
     assert!(record.duration_s > Some(0.0) && record.cycle == 2);
     assert!(matches!(
         grinder.publish(job, 5, &GrindOrder { map: map(), pass: pass(), map_identity }),
-        Err(MailboxError::HandedOver { .. })
+        Err(ExchangeError::HandedOver { .. })
     ));
-    let wrong = grinder.confirm(job, Step::Done, [1; 32]);
-    assert_eq!(wrong, Err(MailboxError::OtherMap { expected: map_identity, found: [1; 32] }));
+    match grinder.confirm(job, Confirmed::Done, [1; 32]) {
+        Err(ExchangeError::OtherMap { expected, found }) => assert_eq!((expected, found), (map_identity, [1; 32])),
+        other => panic!("{other:?}"),
+    }
 }
 
 // ---- the drivers -----------------------------------------------------------------------------------------------------------------
+
+/// Folders of a test are on this computer.
+const ANSWERS_WITHIN: Duration = Duration::from_secs(10);
 
 fn at_once(settings: CmmExchange) -> CmmExchange {
     CmmExchange { stable_for: Duration::ZERO, ..settings }
@@ -448,7 +455,7 @@ fn at_once(settings: CmmExchange) -> CmmExchange {
 
 async fn connected(shop: &Shop) -> ExchangeMachine<CmmFolders> {
     let folders = CmmFolders::new(at_once(shop.cmm()));
-    let mut cmm = ExchangeMachine::new("cmm", MachineKind::Cmm, folders, ExchangeTiming::default());
+    let mut cmm = ExchangeMachine::new("cmm", MachineKind::Cmm, folders, ANSWERS_WITHIN);
     assert_eq!(cmm.connect().await.unwrap().kind, MachineKind::Cmm);
     cmm.claim().await.unwrap();
     cmm
@@ -532,7 +539,7 @@ async fn a_grinder_is_begun_and_ended_by_a_persons_word() {
     let stable_for = Duration::ZERO;
     let (outbox, inbox) = (shop.outbox.clone(), shop.inbox.clone());
     let folders = GrinderFolders::new(GrinderExchange { part: "SN 7".into(), outbox, inbox, stable_for });
-    let mut grinder = ExchangeMachine::new("grinder", MachineKind::Grinder, folders, ExchangeTiming::default());
+    let mut grinder = ExchangeMachine::new("grinder", MachineKind::Grinder, folders, ANSWERS_WITHIN);
     assert!(matches!(grinder.status().await, Err(DeviceError::NotConnected { .. })));
     grinder.connect().await.unwrap();
     let (map, pass) = (map(), pass());
@@ -541,12 +548,14 @@ async fn a_grinder_is_begun_and_ended_by_a_persons_word() {
     assert_eq!(answer_of(grinder.prepare(job).await), Answer::NotOwner);
     grinder.claim().await.unwrap();
     let armed = grinder.prepare(job).await.unwrap();
-    assert_eq!(answer_of(grinder.confirm_done(map.identity()).await), Answer::WrongState);
+    let started = |map_identity| Word::Started { map_identity: Some(map_identity) };
+    let done = Word::Done { map_identity: Some(map.identity()), file: None };
+    assert_eq!(answer_of(grinder.confirm(done.clone()).await), Answer::WrongState);
     grinder.start(armed).await.unwrap();
-    assert!(matches!(grinder.confirm_started([9; 32]).await, Err(DeviceError::Mismatch { .. })));
-    grinder.confirm_started(map.identity()).await.unwrap();
+    assert!(matches!(grinder.confirm(started([9; 32])).await, Err(DeviceError::Mismatch { .. })));
+    grinder.confirm(started(map.identity())).await.unwrap();
     assert_eq!(grinder.status().await.unwrap().state, State::Execute);
-    grinder.confirm_done(map.identity()).await.unwrap();
+    grinder.confirm(done).await.unwrap();
     let status = grinder.status().await.unwrap();
     assert_eq!(status.state, State::Complete);
     let record = Grinder::collect(&mut grinder, job, &Interrupt::new()).await.unwrap();
@@ -559,7 +568,7 @@ async fn a_grinder_is_begun_and_ended_by_a_persons_word() {
 #[tokio::test]
 async fn a_folder_that_is_not_there_is_named() {
     let settings = CmmExchange::new("p", "/nowhere/out", Path::new("/nowhere/in"));
-    let mut cmm = ExchangeMachine::new("cmm", MachineKind::Cmm, CmmFolders::new(settings), ExchangeTiming::default());
+    let mut cmm = ExchangeMachine::new("cmm", MachineKind::Cmm, CmmFolders::new(settings), ANSWERS_WITHIN);
     let error = cmm.connect().await.unwrap_err();
     assert!(error.is_link() && error.to_string().contains("/nowhere/out"), "{error}");
 }

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::PathBuf;
 
-use crate::path::{Step, error_mm, read};
+use crate::path::{ProgramStep, error_mm, read};
 use crate::program::run;
 use regrind::compensation::{Correction, ErrorMap};
 use regrind::formats::{CorrectionIdentities, ErrorMapOrigin, write_correction, write_error_map};
@@ -283,7 +283,7 @@ fn along_the_normals_the_ball_leaves_the_corrected_surface() {
     }
     fs::write(bench.path("nominal.csv"), nominal).unwrap();
     let text = bench.compensate(&["--nominal", "nominal.csv", "--tip-of-radius", "5"]).unwrap();
-    let steps: Vec<Step> = read(&text);
+    let steps: Vec<ProgramStep> = read(&text);
     let gap = |q: [f64; 3]| {
         let segments = steps.windows(2).filter(|pair| pair[1].feed && !pair[0].at[0].is_nan());
         let off = segments.map(|pair| {

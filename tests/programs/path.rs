@@ -68,13 +68,13 @@ pub fn with(options: &PathOptions, wheel: Wheel, track_mm: f64) -> PathOptions {
 
 /// A move of a program: where it ends, and whether it is at feed.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Step {
+pub struct ProgramStep {
     pub at: [f64; 3],
     pub feed: bool,
 }
 
 /// Reads a program of G0 and G1 by itself: words and what stays in force.
-pub fn read(text: &str) -> Vec<Step> {
+pub fn read(text: &str) -> Vec<ProgramStep> {
     let (mut steps, mut at, mut feed) = (Vec::new(), [f64::NAN; 3], false);
     for line in text.lines().filter(|line| !line.starts_with('(')) {
         let mut moved = false;
@@ -92,7 +92,7 @@ pub fn read(text: &str) -> Vec<Step> {
             }
         }
         if moved {
-            steps.push(Step { at, feed });
+            steps.push(ProgramStep { at, feed });
         }
     }
     steps

@@ -2,7 +2,7 @@
 //!
 //! The surface is that of the simulator's shapes, the wheel a distance of its own, the program is read back from its text.
 
-use crate::path::{Part, Step, correction, part, read, truth, wheels, with};
+use crate::path::{Part, ProgramStep, correction, part, read, truth, wheels, with};
 use regrind::compensation::path::{PathOptions, Pattern, TrackSpacing, Wheel};
 
 const PARTS: [&str; 4] = ["freeform-mirror", "off-axis-asphere", "shallow-wave", "biconic"];
@@ -26,7 +26,7 @@ fn distance(wheel: &Wheel, d: [f64; 3]) -> f64 {
 }
 
 /// How far a point stays from a wheel that goes through a program, rapid moves included.
-fn clearance(wheel: &Wheel, steps: &[Step], q: [f64; 3]) -> f64 {
+fn clearance(wheel: &Wheel, steps: &[ProgramStep], q: [f64; 3]) -> f64 {
     let reach = wheel.reach_mm() + 0.1;
     let mut nearest = f64::INFINITY;
     for pair in steps.windows(2) {
@@ -56,7 +56,7 @@ fn clearance(wheel: &Wheel, steps: &[Step], q: [f64; 3]) -> f64 {
 }
 
 /// Writes a program and reads it back.
-fn program(part: &Part) -> (Vec<Step>, f64) {
+fn program(part: &Part) -> (Vec<ProgramStep>, f64) {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("part.ngc");
     let correction = correction(part.half_mm);
@@ -166,11 +166,11 @@ fn with_the_normals_of_the_nominal_surface_it_would_not_hold() {
     let correction = correction(part.half_mm);
     let flat = regrind::compensation::Correction { values_mm: vec![0.0; correction.grid.len()], ..correction };
     let (path, _) = part.programs.path(&flat).unwrap();
-    let steps: Vec<Step> = path
+    let steps: Vec<ProgramStep> = path
         .moves()
         .filter_map(|one| match one {
             regrind::compensation::path::Move::Feed { at, .. } => {
-                Some(Step { at: [at.x, at.y, at.z + crate::path::error_mm(at.x, at.y)], feed: true })
+                Some(ProgramStep { at: [at.x, at.y, at.z + crate::path::error_mm(at.x, at.y)], feed: true })
             }
             _ => None,
         })

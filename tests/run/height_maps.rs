@@ -10,7 +10,7 @@ use std::time::Duration;
 use nalgebra::{Matrix6, Vector6};
 use regrind::cell::{Actor, Ending, Role};
 use regrind::config::CellConfig;
-use regrind::device::exchange::{CmmExchange, CmmFolders, Mailbox, MeasureOrder};
+use regrind::device::exchange::{CmmExchange, CmmFolders, Exchange, MeasureOrder};
 use regrind::device::{Coordinates, Identified, Job, Measurement, Plan, digest};
 use regrind::drive::{CycleRow, Drive, Notice, Run};
 use regrind::formats::result::{Content, Coordinates as Said};
@@ -406,7 +406,7 @@ fn exchanged(map: &Path, content: Content) -> (Option<Measurement>, Vec<String>)
     folders.publish(job, 1, &MeasureOrder { plan, plan_identity }).unwrap();
     fs::copy(map, inbox.join("P_c0").with_extension(map.extension().unwrap())).unwrap();
     let look = folders.look(Duration::from_secs(1), job).unwrap();
-    (look.answer, look.said)
+    (look.answer, look.notes)
 }
 
 #[test]

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use crate::data::data;
-use regrind::device::exchange::{CmmExchange, CmmFolders, Mailbox, MeasureOrder, Pattern, StationFiles, Stations};
+use regrind::device::exchange::{CmmExchange, CmmFolders, Exchange, MeasureOrder, Pattern, StationFiles, Stations};
 use regrind::device::{Coordinates, Identified, Job, Measurement, Plan, digest};
 use regrind::formats::result::{Content, Coordinates as Said};
 use regrind::geometry::{Point, Pose, Twist, Vector};
@@ -50,7 +50,7 @@ fn measured(settings: CmmExchange, radius_mm: f64) -> (Option<Measurement>, Vec<
     let job = Job { job: 1, cycle: 0, digest: digest(&[order.plan_identity]) };
     folders.publish(job, 1, &order).unwrap();
     let look = folders.look(Duration::from_secs(1), job).unwrap();
-    (look.answer, look.said)
+    (look.answer, look.notes)
 }
 
 /// Where the fixture holds the mirror in the telescope's frame: turned about x by -atan(1/2), 3600 mm up.
