@@ -83,7 +83,6 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         nominal: Arc::new(nominal),
         nominal_file,
         part_identity,
-        side,
         probing: Probing {
             probe_radius_mm: recipe.measure.probe_radius_mm,
             approach_mm: recipe.measure.approach_mm,

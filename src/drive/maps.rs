@@ -3,14 +3,13 @@
 use serde_json::json;
 
 use super::record::Files;
-use super::work::{Cycle, Task};
+use super::task::{Cycle, Task, readings, used};
 use crate::compensation::{self, Contact, ErrorMap, ParameterOptions, Smoothing};
 use crate::form::{FormOptions, TakenOut, figures, slope};
 use crate::formats::{
     ErrorMapOrigin, FormatError, write_error_map, write_error_map_x3p, write_figures, write_json_atomic,
 };
-use crate::geometry::Sample;
-use crate::registration::{PointStatus, Registration};
+use crate::registration::{Deviation, Registration};
 use crate::report::{HeatMap, ReportError, save_coloured_ply};
 
 /// Length over which slopes are taken, in cut-offs of the map's filter: shorter waves are not in the map.
@@ -23,11 +22,8 @@ pub(super) fn save_figures(
     map: Option<&ErrorMap>,
     found: &Registration,
 ) -> Result<(), FormatError> {
-    let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
-    let samples: Vec<Sample> =
-        used.map(|d| Sample { at_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect();
     let options = FormOptions { aperture: task.nominal.outline().cloned(), ..FormOptions::default() };
-    let made = figures(&samples, &options);
+    let made = figures(&readings(found), &options);
     let cutoff_mm = task.map.cutoff_mm;
     let slopes = map.map(|map| slope(&map.grid, &map.values_mm, &map.valid, INTEGRATION * cutoff_mm));
     let slopes = slopes.as_ref().map(Result::as_ref);
@@ -54,10 +50,8 @@ fn taken_out(task: &Task) -> TakenOut {
 /// Says what of the deviations the machine's parameters explain: the wheel's radius and setting, its wear. What is offered is better
 /// corrected there than ground in with every map.
 pub(super) fn parameters(task: &Task, files: &mut Files, found: &Registration) -> Result<Vec<String>, FormatError> {
-    let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
-    let contact =
-        |d: &crate::registration::Deviation| Contact { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
-    let contacts: Vec<Contact> = used.map(contact).collect();
+    let contact = |d: &Deviation| Contact { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
+    let contacts: Vec<Contact> = used(found).map(contact).collect();
     let options = ParameterOptions {
         free_motions: task.registration.locked.map(|locked| !locked),
         ..ParameterOptions::new(task.pass.wheel_radius_mm)
@@ -112,8 +106,7 @@ fn save_pictures(task: &Task, files: &mut Files, map: &ErrorMap) -> Result<(), R
 }
 
 fn save_points(task: &Task, files: &mut Files, found: &Registration) -> Result<(), ReportError> {
-    let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
-    let rows: Vec<[f64; 4]> = used.map(|d| [d.point.x, d.point.y, d.point.z, d.deviation_mm]).collect();
+    let rows: Vec<[f64; 4]> = used(found).map(|d| [d.point.x, d.point.y, d.point.z, d.deviation_mm]).collect();
     let remarks: &[&str] = if task.simulation { &["SIMULATION", "frame: model"] } else { &["frame: model"] };
     save_coloured_ply(&files.place("deviations.ply"), "Deviations", &rows, &[], task.tolerance_mm, remarks)
 }

@@ -18,6 +18,7 @@ mod outcome;
 mod program;
 mod record;
 mod station;
+mod task;
 mod work;
 
 use std::collections::BTreeMap;
@@ -44,8 +45,8 @@ use record::{Files, Recorder, entry};
 use station::{
     Aborts, Ask, CmmDriver, Fetched, GrinderDriver, Intent, Load, MachineTask, StationDriver, StationReport,
 };
-use work::{Cycle, Product};
-pub use work::{Probing, Sphere, Task};
+use task::{Cycle, Product};
+pub use task::{Probing, Sphere, Task};
 
 /// Everything a run needs besides its machines.
 pub struct Run {

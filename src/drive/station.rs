@@ -152,7 +152,7 @@ pub(super) struct MachineTask<B> {
     cycle: u32,
     seen: Seen,
     /// What a person was told last.
-    said: Vec<String>,
+    notes: Vec<String>,
 }
 
 /// What the last look showed, so that only changes are told.
@@ -193,7 +193,7 @@ impl<B: StationDriver> MachineTask<B> {
             armed: None,
             cycle: 0,
             seen: Seen::default(),
-            said: Vec::new(),
+            notes: Vec::new(),
         }
     }
 
@@ -566,8 +566,8 @@ impl<B: StationDriver> MachineTask<B> {
     /// Tells what is new of what a person should know.
     async fn pass_on_notes(&mut self) {
         let notes = self.driver.machine().notes();
-        let new: Vec<String> = notes.iter().filter(|message| !self.said.contains(message)).cloned().collect();
-        self.said = notes;
+        let new: Vec<String> = notes.iter().filter(|message| !self.notes.contains(message)).cloned().collect();
+        self.notes = notes;
         if !new.is_empty() {
             let _ =
                 self.reports.send(StationReport { notes: Some((B::DEVICE, new)), ..StationReport::default() }).await;

@@ -1,0 +1,335 @@
+//! What a run is made of, and what is known of each of its cycles.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use crate::cell::Figures;
+use crate::compensation::path::{PathError, Summary, ToolPath};
+use crate::compensation::{Correction, CorrectionLimits, ErrorMap, GainRule, LearningState, MapOptions, NextPassError};
+use crate::device::{Coordinates, CorrectionMap, Identified, Pass, Plan, Target, TargetKind};
+use crate::formats::gcode::GcodeError;
+use crate::formats::{CorrectionIdentities, FormatError, Learned, ResultFolder, write_correction};
+use crate::geometry::{Grid, Point, Pose, Sample};
+use crate::measuring::{self, sphere_targets};
+use crate::registration::{
+    Deviation, MapLimits, Method, Options, PointStatus, Registration, RegistrationError, Start, register,
+};
+use crate::surface::Nominal;
+
+use super::program::{PROGRAM_FILE, ProgramError, Programs};
+use super::record::Files;
+
+/// Everything that does not change during a run.
+#[derive(Debug)]
+pub struct Task {
+    /// The nominal surface.
+    pub nominal: Arc<Nominal>,
+    /// Where it came from, for the record.
+    pub nominal_file: PathBuf,
+    /// SHA-256 of what it came from: the identity of the part.
+    pub part_identity: [u8; 32],
+    /// Where the probe shall touch; none where the machine has no plan of ours.
+    pub targets: Vec<measuring::Target>,
+    /// How the probe goes about it.
+    pub probing: Probing,
+    /// The sphere on which the probe is checked.
+    pub sphere: Option<Sphere>,
+    /// Where the fixture holds the part.
+    pub fixture_cmm_from_model: Pose,
+    /// How measured points are registered; the start and the level are set for each cycle.
+    pub registration: Options,
+    /// Whether a registration begins where the fixture holds the part.
+    pub start_at_fixture: bool,
+    /// What the machine is expected to give; `None` where each result says it itself.
+    pub coordinates: Option<Coordinates>,
+    /// How a map is made.
+    pub map: MapOptions,
+    /// By what the share of an error that is taken back is chosen.
+    pub gain: GainRule,
+    /// What a pass adds by itself (rms), where the recipe knows it.
+    pub repeatability_mm: Option<f64>,
+    /// What an earlier run of this part found to come back in every pass.
+    pub learned: Option<Learned>,
+    /// What a run has to have in common with another to learn from it.
+    pub setting: String,
+    /// What a correction must keep to.
+    pub limits: CorrectionLimits,
+    /// What uncertainty of the place of a correction on the part is put up with.
+    pub place: MapLimits,
+    /// How a pass is ground; level and identity are set for each cycle.
+    pub pass: Pass,
+    /// Half the largest PV that is accepted: what lies within it about zero is drawn as in tolerance.
+    pub tolerance_mm: Option<f64>,
+    /// How programs are made, or why there are none.
+    pub programs: Result<Programs, PathError>,
+    /// Least share of the targets that must be touched.
+    pub least_found: f64,
+    /// Whether the cell is simulated; everything stored is marked so.
+    pub simulation: bool,
+}
+
+/// How the probe goes about it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[allow(missing_docs)]
+pub struct Probing {
+    pub probe_radius_mm: f64,
+    pub approach_mm: f64,
+    pub search_mm: f64,
+    pub speed_mm_s: f64,
+    pub safe_height_mm: f64,
+}
+
+/// The reference sphere, in the CMM frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[allow(missing_docs)]
+pub struct Sphere {
+    pub centre: Point,
+    pub radius_mm: f64,
+    pub points: usize,
+}
+
+/// What is known of one cycle.
+#[derive(Clone, Debug)]
+pub(super) struct Cycle {
+    pub(super) correction: Arc<Correction>,
+    pub(super) plan: Option<Arc<Plan>>,
+    pub(super) points: Option<Arc<Points>>,
+    pub(super) registration: Option<Arc<Registration>>,
+    pub(super) error: Option<Arc<ErrorMap>>,
+    /// What is known of the grinder with this cycle taken in.
+    pub(super) known: Option<Arc<LearningState>>,
+    pub(super) figures: Option<Figures>,
+    /// Whether it was judged: a measurement that a gate refused tells nothing of the grinder.
+    pub(super) judged: bool,
+}
+
+impl Cycle {
+    /// A cycle of which nothing is known but how its pass is corrected.
+    pub(super) fn new(correction: Correction) -> Self {
+        Self {
+            correction: Arc::new(correction),
+            plan: None,
+            points: None,
+            registration: None,
+            error: None,
+            known: None,
+            figures: None,
+            judged: false,
+        }
+    }
+
+    /// Takes what a computation found.
+    pub(super) fn take(&mut self, product: Product) {
+        match product {
+            Product::Points(points) => self.points = Some(Arc::new(points)),
+            Product::Registered(found) => {
+                let Registered { registration, error, known, figures } = *found;
+                self.registration = Some(Arc::new(registration));
+                self.error = error.map(Arc::new);
+                self.known = known.map(Arc::new);
+                self.figures = Some(figures);
+            }
+            Product::Correction(_) | Product::Nothing => {}
+        }
+    }
+}
+
+/// What a computation leaves for those that follow, besides its event and its files.
+pub(super) enum Product {
+    Nothing,
+    Points(Points),
+    Registered(Box<Registered>),
+    /// The correction of the next cycle.
+    Correction(Correction),
+}
+
+/// What a registration gives besides its event.
+pub(super) struct Registered {
+    pub(super) registration: Registration,
+    pub(super) error: Option<ErrorMap>,
+    pub(super) known: Option<LearningState>,
+    pub(super) figures: Figures,
+}
+
+/// The points of a measurement that may be used.
+#[derive(Debug)]
+pub(super) struct Points {
+    pub(super) part: Vec<Point>,
+    pub(super) sphere: Vec<Point>,
+    /// Radius that the probe really has, where a sphere was touched.
+    pub(super) radius_mm: Option<f64>,
+    /// Centres of the probe, or points of contact.
+    pub(super) coordinates: Coordinates,
+    /// Standard uncertainty of that; 0 where the radius is the recipe's, which states none.
+    pub(super) radius_sigma_mm: f64,
+}
+
+impl Task {
+    /// Begins with what an earlier part told of the grinder: the first pass is ground with its correction.
+    ///
+    /// # Errors
+    /// A first correction beyond the limits of this run; the task is left as it was.
+    pub fn begin_with(&mut self, learned: Learned) -> Result<(), NextPassError> {
+        let before = self.learned.replace(learned);
+        let within = self.first_correction().removed_mm(&self.limits).map_err(|error| match error {
+            NextPassError::BudgetSpent { removed_mm, budget_mm } => {
+                NextPassError::BudgetAtOnce { removed_mm, budget_mm }
+            }
+            error => error,
+        });
+        if within.is_err() {
+            self.learned = before;
+        }
+        within.map(|_| ())
+    }
+
+    /// Writes correction and program of a first pass that begins with what was learned; returns the names of the files.
+    ///
+    /// # Errors
+    /// Those of [`Task::first_path`], and files that cannot be written.
+    pub fn save_first(&self, folder: &Path) -> Result<Vec<&'static str>, ProgramError> {
+        ResultFolder::prepare(folder).map_err(GcodeError::from)?.keep();
+        let (first, none) = (self.first_correction(), self.uncorrected());
+        let mut files = Files::new(folder.to_owned());
+        self.save_correction(&mut files, &first, &none).map_err(GcodeError::from)?;
+        self.save_program(&mut files, &first)?;
+        Ok(files.made())
+    }
+
+    /// Returns the correction of the first pass: none, or what an earlier part left.
+    pub fn first_correction(&self) -> Correction {
+        let none = self.uncorrected();
+        match &self.learned {
+            Some(learned) => learned.first_correction(none),
+            None => none,
+        }
+    }
+
+    fn uncorrected(&self) -> Correction {
+        let corners = [[self.pass.x_mm[0], self.pass.y_mm[0]], [self.pass.x_mm[1], self.pass.y_mm[1]]];
+        let grid = Grid::over(corners.into_iter(), self.map.spacing_mm).unwrap_or(Grid {
+            columns: 2,
+            rows: 2,
+            first_mm: corners[0],
+            spacing_mm: [corners[1][0] - corners[0][0], corners[1][1] - corners[0][1]],
+        });
+        Correction::none(grid, self.limits.allowance_mm)
+    }
+
+    /// Lays the path of the first pass; `None` where only the grinder's controller can, and `programs` says why.
+    ///
+    /// # Errors
+    /// A surface that the wheel cannot grind, and limits of the grinder that the path goes beyond.
+    pub fn first_path(&self) -> Result<Option<(ToolPath, Summary)>, PathError> {
+        match &self.programs {
+            Ok(programs) => programs.path(&self.first_correction()).map(Some),
+            Err(error) if error.is_ours() => Ok(None),
+            Err(error) => Err(error.clone()),
+        }
+    }
+
+    /// What is known of the grinder before the first pass.
+    pub(super) fn beginning(&self) -> LearningState {
+        let Pass { x_mm, y_mm, .. } = self.pass;
+        let size_mm = [x_mm[1] - x_mm[0], y_mm[1] - y_mm[0]];
+        let fresh = || LearningState::new(self.gain, &self.map, size_mm, self.repeatability_mm);
+        self.learned.as_ref().map_or_else(fresh, |learned| learned.known.for_next_part())
+    }
+
+    /// Registers points to the surface offset by a radius, and returns the options that it was done with.
+    ///
+    /// A search leaves the part anywhere along a direction that the surface cannot see, and a correction would be ground in there. Only
+    /// the fixture knows better, so that is begun at then.
+    ///
+    /// # Errors
+    /// Those of [`register`].
+    pub fn register(
+        &self,
+        points: &[Point],
+        probe_radius_mm: f64,
+    ) -> Result<(Registration, Options), RegistrationError> {
+        let at_fixture = Start::Pose(self.fixture_cmm_from_model);
+        let start = if self.start_at_fixture { at_fixture } else { Start::Search };
+        // Without a ball and at the nominal surface, or below it by the last in-feed, there is no offset: the points lie on the surface.
+        let method = if probe_radius_mm == 0.0 { Method::Contact } else { self.registration.method };
+        let options = Options { probe_radius_mm, method, start, ..self.registration };
+        let found = register(&self.nominal, points, &options)?;
+        if self.start_at_fixture || !found.verdict.weak_directions.iter().any(|weak| weak.held) {
+            return Ok((found, options));
+        }
+        let options = Options { start: at_fixture, ..options };
+        Ok((register(&self.nominal, points, &options)?, options))
+    }
+
+    /// Returns the identity of the map that a pass is given.
+    pub fn map_identity(&self, correction: &Correction) -> [u8; 32] {
+        self.payloads(correction).0.identity()
+    }
+
+    /// Returns the payloads of a pass.
+    pub(super) fn payloads(&self, correction: &Correction) -> (CorrectionMap, Pass) {
+        let map = CorrectionMap {
+            grid: correction.grid,
+            values_mm: correction.values_mm.clone(),
+            part_identity: self.part_identity,
+        };
+        (map, Pass { level_mm: correction.level_mm, part_identity: self.part_identity, ..self.pass })
+    }
+
+    /// Lays the plan: the reference sphere first, then the part where it was found last, at the level it was ground to.
+    pub(super) fn plan(&self, level_mm: f64, cmm_from_model: &Pose) -> Plan {
+        let sphere = self.sphere.iter().flat_map(|s| sphere_targets(s.centre, s.radius_mm, s.points));
+        let sphere = sphere.map(|t| (TargetKind::ReferenceSphere, t.point, t.normal));
+        let part = self.targets.iter().map(|t| {
+            let point = cmm_from_model.point(&(t.point + level_mm * t.normal));
+            (TargetKind::Part, point, cmm_from_model.direction(&t.normal))
+        });
+        let targets = sphere.chain(part).enumerate().map(|(index, (what, point, normal))| Target {
+            index: index as u32,
+            what,
+            point_mm: point.into(),
+            normal: normal.into(),
+        });
+        let Probing { probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm } = self.probing;
+        Plan { targets: targets.collect(), probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm }
+    }
+
+    /// Writes the correction of a pass beside the one that it replaces.
+    pub(super) fn save_correction(
+        &self,
+        files: &mut Files,
+        correction: &Correction,
+        base: &Correction,
+    ) -> Result<(), FormatError> {
+        let [identity, replaces] = [correction, base].map(|correction| self.map_identity(correction));
+        let identities = CorrectionIdentities { part: self.part_identity, map: identity, replaces };
+        write_correction(&files.place("correction.csv"), correction, &identities, self.simulation)
+    }
+
+    /// Writes the program of the next pass, if there is one, and returns why not all of it is there: a pass without it can be ground all the
+    /// same, as the grinder gets the map.
+    ///
+    /// # Errors
+    /// A surface that the wheel cannot grind, limits of the grinder that the path goes beyond, files that cannot be written.
+    pub(super) fn save_program(
+        &self,
+        files: &mut Files,
+        correction: &Correction,
+    ) -> Result<Option<String>, ProgramError> {
+        match &self.programs {
+            Ok(programs) => programs.keep(files, correction, self.map_identity(correction)),
+            Err(error) if error.is_ours() => Ok(Some(format!("there is no {PROGRAM_FILE}: {error}"))),
+            Err(error) => Err(error.clone().into()),
+        }
+    }
+}
+
+/// The points that took part in a registration.
+pub(super) fn used(found: &Registration) -> impl Iterator<Item = &Deviation> {
+    found.deviations.iter().filter(|d| d.status == PointStatus::Used)
+}
+
+/// What they deviate, over the plane of the model frame.
+pub(super) fn readings(found: &Registration) -> Vec<Sample> {
+    used(found).map(|d| Sample { at_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect()
+}
