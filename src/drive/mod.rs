@@ -245,11 +245,11 @@ impl Drive {
                 self.take(Event::RecordFailed { why }, None).await;
             }
         }
-        self.conclude().await
+        self.end_run().await
     }
 
     /// Writes the end of the run and gives the machines back.
-    async fn conclude(mut self) -> Ending {
+    async fn end_run(mut self) -> Ending {
         let ending = self.ending.take().expect("the loop ended with one");
         self.orders.close();
         // Whatever is still computed leaves files in the run folder, so it is waited for.
@@ -421,7 +421,7 @@ impl Drive {
             Ok(files) => self.recorder.adopt(files, self.now(), cycle).await,
             Err(failure) => Err(failure),
         };
-        self.settle(adopted);
+        self.keep_failure(adopted);
     }
 
     /// Records an event, lets the cell handle it, and carries out what it decides. Returns why it was refused, if it was.
@@ -455,7 +455,7 @@ impl Drive {
             map.insert("detail".into(), detail);
         }
         let written = self.recorder.append(entry(Kind::Event, now, self.cell.cycle(), event.origin(), payload)).await;
-        self.settle(written);
+        self.keep_failure(written);
         self.close_answered(now, event).await;
     }
 
@@ -468,12 +468,12 @@ impl Drive {
             let payload = json!({ "event": event.name() });
             let record = entry(Kind::Outcome, now, self.cell.cycle(), event.origin(), payload);
             let written = self.recorder.append(Entry { command_id: Some(id), ..record }).await;
-            self.settle(written);
+            self.keep_failure(written);
         }
     }
 
     /// Keeps the first failure to record for the cell, whatever was to be recorded; those that follow from it say nothing new.
-    fn settle(&mut self, written: Result<(), RecordFailure>) {
+    fn keep_failure(&mut self, written: Result<(), RecordFailure>) {
         if let Err(failure) = written
             && !std::mem::replace(&mut self.record_failed, true)
         {
@@ -484,7 +484,7 @@ impl Drive {
 
     async fn note(&mut self, kind: Kind, actor: (String, String), payload: Value) {
         let written = self.recorder.append(entry(kind, self.now(), self.cell.cycle(), actor, payload)).await;
-        self.settle(written);
+        self.keep_failure(written);
     }
 
     /// Writes a small document of the loop's own into the run folder and brings it on record.
@@ -504,26 +504,26 @@ impl Drive {
         let record = Entry::new(Kind::Intent, record::nanoseconds(self.now()), self.cell.cycle(), payload);
         if !outcome::is_answered(&command) {
             let written = self.recorder.append(Entry { kind: Kind::Note, ..record }).await;
-            self.settle(written);
+            self.keep_failure(written);
             return self.execute(command).await;
         }
         if makes_safe(&command) {
             // It has been carried out already.
-            return self.settle_intent(record, command).await;
+            return self.record_intent(record, command).await;
         }
-        self.settle_intent(record, command.clone()).await;
+        self.record_intent(record, command.clone()).await;
         if !self.record_failed || !moves(&command) {
             self.execute(command).await;
         }
     }
 
-    async fn settle_intent(&mut self, record: Entry, command: Command) {
+    async fn record_intent(&mut self, record: Entry, command: Command) {
         let written = self.recorder.intend(record).await;
         if let Ok(id) = &written {
             self.record_failed = false;
             self.open.push((*id, command));
         }
-        self.settle(written.map(|_| ()));
+        self.keep_failure(written.map(|_| ()));
     }
 
     async fn execute(&mut self, command: Command) {

@@ -46,7 +46,7 @@ pub(super) fn create(folder: &Path) -> Result<Connection, JournalError> {
     let connection = Connection::open(&path).map_err(&failed)?;
     let marks = format!("PRAGMA application_id = {APPLICATION_ID}; PRAGMA user_version = {LAYOUT};");
     connection.execute_batch(&format!("BEGIN IMMEDIATE; {marks} {SCHEMA} COMMIT;")).map_err(&failed)?;
-    settle(&connection, &path)?;
+    configure(&connection, &path)?;
     Ok(connection)
 }
 
@@ -56,7 +56,7 @@ pub(super) fn read_write(folder: &Path) -> Result<Connection, JournalError> {
     recognise(folder, &path)?;
     let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_NO_MUTEX;
     let connection = Connection::open_with_flags(&path, flags).map_err(JournalError::database(&path))?;
-    settle(&connection, &path)?;
+    configure(&connection, &path)?;
     Ok(connection)
 }
 
@@ -127,7 +127,7 @@ fn recognise(folder: &Path, path: &Path) -> Result<(), JournalError> {
 }
 
 /// Sets what the promises rest on, and reads it back.
-fn settle(connection: &Connection, path: &Path) -> Result<(), JournalError> {
+fn configure(connection: &Connection, path: &Path) -> Result<(), JournalError> {
     set(connection, path, "journal_mode", "wal")?;
     // FULL is 2: with less the last records could be lost when the power fails.
     set(connection, path, "synchronous", "2")?;

@@ -162,7 +162,7 @@ impl Journal {
     /// # Errors
     /// As [`Journal::append`]: then the command must not be carried out.
     pub fn intend(&mut self, entry: Entry) -> Result<u32, JournalError> {
-        self.settle_doubt()?;
+        self.ask_where_it_ends()?;
         let id = match self.tail.last_command_id {
             None => self.first_command_id,
             Some(last) => last.checked_add(1).ok_or(JournalError::CommandNumbers { limit: u32::MAX })?,
@@ -219,7 +219,7 @@ impl Journal {
     /// # Errors
     /// A full or unwritable disk.
     pub fn anchor(&mut self) -> Result<Anchor, JournalError> {
-        self.settle_doubt()?;
+        self.ask_where_it_ends()?;
         let anchor = Anchor { records: self.tail.seq, head: self.tail.hash.clone() };
         let mut text = canonical_json(&json!({ "records": anchor.records, "head": anchor.head }));
         text.push('\n');
@@ -232,7 +232,7 @@ impl Journal {
     /// # Errors
     /// As [`Journal::append`].
     pub fn close(mut self, mono_ns: u64, cycle: u32, ending: Value) -> Result<Anchor, JournalError> {
-        self.settle_doubt()?;
+        self.ask_where_it_ends()?;
         let payload = json!({ "ending": ending, "records_before": self.tail.seq, "head_before": self.tail.hash });
         self.append(Entry::new(Kind::End, mono_ns, cycle, payload))?;
         self.anchor()
@@ -248,7 +248,7 @@ impl Journal {
     }
 
     fn insert(&mut self, entry: Entry) -> Result<Record, JournalError> {
-        self.settle_doubt()?;
+        self.ask_where_it_ends()?;
         if self.tail.closed {
             return Err(JournalError::Closed { path: self.folder.clone() });
         }
@@ -313,7 +313,7 @@ impl Journal {
     }
 
     /// After a failed write the record may stand or not; the database is asked.
-    fn settle_doubt(&mut self) -> Result<(), JournalError> {
+    fn ask_where_it_ends(&mut self) -> Result<(), JournalError> {
         if self.doubtful {
             self.tail = read_tail(&self.connection, &self.folder)?;
             self.doubtful = false;
