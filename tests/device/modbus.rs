@@ -15,7 +15,7 @@ use regrind::geometry::Grid;
 use regrind_sim::body::Kind;
 use regrind_sim::options::{Layout, MachineOptions};
 use regrind_sim::wire::Serving;
-use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, When};
+use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, Request, When};
 use regrind_sim::wire::rtu::Line as SerialLine;
 use regrind_sim::{registers, words};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -116,14 +116,27 @@ fn assert_exact(plan: &Plan, measured: &Measurement, hint: &str) {
     }
 }
 
-async fn until_complete<M: Machine>(machine: &mut M) -> Result<(), DeviceError> {
+/// A measuring machine that is connected, and its own.
+async fn claimed(settings: ModbusSettings) -> ModbusCmm {
+    let mut cmm = connected(settings).await;
+    cmm.claim().await.unwrap();
+    cmm
+}
+
+async fn connected(settings: ModbusSettings) -> ModbusCmm {
+    let mut cmm = ModbusCmm::new(settings).unwrap();
+    cmm.connect().await.unwrap();
+    cmm
+}
+
+async fn reaches<M: Machine>(machine: &mut M, state: State) -> Result<(), DeviceError> {
     let began = Instant::now();
     loop {
         let status = machine.status().await?;
-        if status.state == State::Complete {
+        if status.state == state {
             return Ok(());
         }
-        assert!(began.elapsed() < Duration::from_secs(60), "not complete after a minute: {status:?}");
+        assert!(began.elapsed() < Duration::from_secs(60), "not {state} after a minute: {status:?}");
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
 }
@@ -135,7 +148,7 @@ async fn measure(cmm: &mut ModbusCmm, plan: &Plan, cycle: u16) -> Result<Measure
     let armed = cmm.prepare(job).await?;
     let started = cmm.start(armed).await?;
     assert_eq!(started.job, job);
-    until_complete(cmm).await?;
+    reaches(cmm, State::Complete).await?;
     let measured = cmm.collect(job, &calm).await?;
     assert_eq!(cmm.collect(job, &calm).await?, measured);
     cmm.acknowledge(measured.done).await?;
@@ -174,7 +187,7 @@ async fn a_pass_is_ground_and_recorded() {
     let job = Job { job: 9, cycle: 3, digest: digest(&[map.identity(), pass.identity()]) };
     let armed = grinder.prepare(job).await.unwrap();
     grinder.start(armed).await.unwrap();
-    until_complete(&mut grinder).await.unwrap();
+    reaches(&mut grinder, State::Complete).await.unwrap();
     let record = grinder.collect(job, &calm).await.unwrap();
     assert_eq!((record.outcome, record.path_mm, record.removed_mm3), (Outcome::Complete, Some(1234.5), Some(67.8)));
     assert_eq!((record.map_identity, record.wheel_radius_mm), (map.identity(), Some(25.0)));
@@ -195,8 +208,7 @@ async fn low_words_first_and_other_addresses_are_as_good() {
     let registers =
         RegisterMap { word_order, status: 1064, command: 1040, outbox_page: 2462, ..RegisterMap::default() };
     let settings = ModbusSettings { unit: 7, registers, ..settings(&serving) };
-    let mut cmm = ModbusCmm::new(settings).unwrap();
-    cmm.connect().await.unwrap();
+    let mut cmm = connected(settings).await;
     let plan = plan(50);
     assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), "low words first");
 }
@@ -204,42 +216,30 @@ async fn low_words_first_and_other_addresses_are_as_good() {
 #[tokio::test]
 async fn hold_resume_stop_abort_and_clear_are_obeyed() {
     let serving = serve(Kind::Cmm, 20.0, Faults::none()).await;
-    let mut cmm = ModbusCmm::new(settings(&serving)).unwrap();
-    cmm.connect().await.unwrap();
-    cmm.claim().await.unwrap();
+    let mut cmm = claimed(settings(&serving)).await;
     let (plan, calm) = (plan(200), Interrupt::new());
     cmm.load_plan(&plan, &calm).await.unwrap();
     let armed = cmm.prepare(job_of(&plan, 1)).await.unwrap();
     cmm.start(armed.clone()).await.unwrap();
     cmm.hold().await.unwrap();
-    reaches(&mut cmm, State::Held).await;
+    reaches(&mut cmm, State::Held).await.unwrap();
     cmm.resume().await.unwrap();
-    reaches(&mut cmm, State::Execute).await;
+    reaches(&mut cmm, State::Execute).await.unwrap();
     cmm.stop().await.unwrap();
-    reaches(&mut cmm, State::Complete).await;
+    reaches(&mut cmm, State::Complete).await.unwrap();
     let status = cmm.status().await.unwrap();
     assert_eq!((status.outcome, status.done), (Outcome::Stopped, armed.start_sequence));
     cmm.acknowledge(status.done).await.unwrap();
     let armed = cmm.prepare(job_of(&plan, 2)).await.unwrap();
     cmm.start(armed).await.unwrap();
     cmm.abort().await.unwrap();
-    reaches(&mut cmm, State::Aborted).await;
+    reaches(&mut cmm, State::Aborted).await.unwrap();
     cmm.clear().await.unwrap();
-    reaches(&mut cmm, State::Idle).await;
+    reaches(&mut cmm, State::Idle).await.unwrap();
     let refused = cmm.hold().await;
     assert!(matches!(refused, Err(DeviceError::Refused { answer: Answer::WrongState, .. })), "{refused:?}");
     cmm.release().await.unwrap();
-    let mut next = ModbusCmm::new(ModbusSettings { owner: 0x9999, ..settings(&serving) }).unwrap();
-    next.connect().await.unwrap();
-    next.claim().await.unwrap();
-}
-
-async fn reaches(cmm: &mut ModbusCmm, state: State) {
-    let began = Instant::now();
-    while cmm.status().await.unwrap().state != state {
-        assert!(began.elapsed() < Duration::from_secs(60), "{state} was not reached");
-        tokio::time::sleep(Duration::from_millis(5)).await;
-    }
+    let mut next = claimed(ModbusSettings { owner: 0x9999, ..settings(&serving) }).await;
 }
 
 #[tokio::test]
@@ -257,26 +257,27 @@ async fn another_client_is_refused_and_an_abort_is_not() {
     assert!(matches!(state, State::Aborting | State::Aborted), "{state}");
 }
 
+/// Raises a flag when a machine is sent the page of this number, so that the break comes in the middle for certain; counts the pages.
+fn interrupt_at_page(serving: &Serving, number: u32) -> (Interrupt, Arc<AtomicU32>) {
+    let (interrupt, pages) = (Interrupt::new(), Arc::new(AtomicU32::new(0)));
+    let (raiser, counted) = (interrupt.clone(), Arc::clone(&pages));
+    let look = move |request: &Request| {
+        if request.function == 16 && request.address == 224 && counted.fetch_add(1, Ordering::SeqCst) == number {
+            raiser.raise();
+        }
+        false
+    };
+    serving.faults().set(FaultPlan::new(0).always(When::Matching(Box::new(look)), Fault::DropReply));
+    (interrupt, pages)
+}
+
 #[tokio::test]
 async fn a_transfer_breaks_off_between_two_pages_and_leaves_nothing_in_force() {
     let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
     let mut cmm = ModbusCmm::new(patient(settings(&serving))).unwrap();
     cmm.connect().await.unwrap();
     cmm.claim().await.unwrap();
-    let (interrupt, plan) = (Interrupt::new(), plan(20_000));
-    let raiser = interrupt.clone();
-    let page_written = Arc::new(AtomicU32::new(0));
-    let seen = page_written.clone();
-    serving.faults().set(FaultPlan::new(0).always(
-        When::Matching(Box::new(move |request| {
-            // The hundredth page raises the flag, so that the break comes in the middle for certain.
-            if request.function == 16 && request.address == 224 && seen.fetch_add(1, Ordering::SeqCst) == 100 {
-                raiser.raise();
-            }
-            false
-        })),
-        Fault::DropReply,
-    ));
+    let ((interrupt, _), plan) = (interrupt_at_page(&serving, 100), plan(20_000));
     let broken = cmm.load_plan(&plan, &interrupt).await;
     assert!(matches!(broken, Err(DeviceError::Interrupted { done: 101, of: 5001, .. })), "{broken:?}");
     let asked = Instant::now();
@@ -299,12 +300,10 @@ async fn further_signals_are_read_scaled_and_held_against_their_range() {
         range: [15.0, 25.0],
     };
     let narrow = Signal { range: [15.0, 19.0], ..temperature.clone() };
-    let mut cmm = ModbusCmm::new(ModbusSettings { signals: vec![temperature], ..settings(&serving) }).unwrap();
-    cmm.connect().await.unwrap();
+    let mut cmm = connected(ModbusSettings { signals: vec![temperature], ..settings(&serving) }).await;
     let status = cmm.status().await.unwrap();
     assert_eq!((status.signals[0].value, status.temperature_c), (20.25, Some(20.25)));
-    let mut cmm = ModbusCmm::new(ModbusSettings { signals: vec![narrow], ..settings(&serving) }).unwrap();
-    cmm.connect().await.unwrap();
+    let mut cmm = connected(ModbusSettings { signals: vec![narrow], ..settings(&serving) }).await;
     let refused = cmm.status().await.unwrap_err();
     assert!(matches!(refused, DeviceError::OutOfRange { most: 19.0, .. }), "{refused}");
 }
@@ -470,8 +469,7 @@ async fn a_bit_that_every_check_sum_of_the_wire_passes_is_still_found() {
     // In the pages, where the CRC-32 over the whole stands; once, so that the second fetch comes through.
     let rules = FaultPlan::new(1).once(When::Reading(462), Fault::FlipData);
     let serving = serve(Kind::Cmm, AT_ONCE, rules.into()).await;
-    let mut cmm = ModbusCmm::new(settings(&serving)).unwrap();
-    cmm.connect().await.unwrap();
+    let mut cmm = connected(settings(&serving)).await;
     let plan = plan(40);
     assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), "a flipped bit");
     assert_eq!((serving.faults().fired().len(), cmm.link().figures().corrupt), (1, 1));
@@ -483,9 +481,7 @@ async fn a_bit_that_every_check_sum_of_the_wire_passes_is_still_found() {
 
 async fn armed(serving: &Serving, plan: &Plan) -> (ModbusCmm, Armed) {
     let settings = ModbusSettings { retries: 2, lost_after: Duration::from_secs(2), ..settings(serving) };
-    let mut cmm = ModbusCmm::new(settings).unwrap();
-    cmm.connect().await.unwrap();
-    cmm.claim().await.unwrap();
+    let mut cmm = claimed(settings).await;
     cmm.load_plan(plan, &Interrupt::new()).await.unwrap();
     let armed = cmm.prepare(job_of(plan, 1)).await.unwrap();
     (cmm, armed)
@@ -536,8 +532,7 @@ async fn a_start_that_never_arrived_is_seen_twice_not_to_have() {
     assert!(matches!(unknown, Err(DeviceError::StartUnknown { .. })), "{unknown:?}");
     serving.faults().set(FaultPlan::new(0));
     // A client that has been started anew knows of the start from its journal only.
-    let mut after = ModbusCmm::new(settings(&serving)).unwrap();
-    after.connect().await.unwrap();
+    let mut after = connected(settings(&serving)).await;
     let asked = Instant::now();
     let found = after.reconcile(&armed).await.unwrap();
     assert!(matches!(found, Reconciled::NotStarted(_)), "{found:?}");
@@ -550,7 +545,7 @@ async fn a_finished_start_is_found_and_a_restarted_machine_is_not_trusted() {
     let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, Faults::none()).await, plan(10));
     let (mut cmm, armed) = armed(&serving, &plan).await;
     cmm.start(armed.clone()).await.unwrap();
-    until_complete(&mut cmm).await.unwrap();
+    reaches(&mut cmm, State::Complete).await.unwrap();
     let found = cmm.reconcile(&armed).await.unwrap();
     assert!(matches!(found, Reconciled::Finished(_)), "{found:?}");
     serving.machine(1).unwrap().with(registers::Machine::reboot);
@@ -567,8 +562,7 @@ async fn a_finished_start_is_found_and_a_restarted_machine_is_not_trusted() {
 #[tokio::test]
 async fn a_frozen_application_behind_a_living_wire_is_found() {
     let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
-    let mut cmm = ModbusCmm::new(settings(&serving)).unwrap();
-    cmm.connect().await.unwrap();
+    let mut cmm = connected(settings(&serving)).await;
     serving.machine(1).unwrap().with(|machine| machine.freeze(true));
     let began = Instant::now();
     let frozen = loop {
@@ -652,8 +646,7 @@ async fn an_answer_that_comes_after_the_quarantine_is_not_taken_for_the_next_one
     );
     let machine = toy(Kind::Cmm, AT_ONCE, MachineOptions::default());
     let (serving, settings) = rtu(vec![(1, machine)], SerialLine::unpaced(115_200), rules.into());
-    let mut cmm = ModbusCmm::new(settings).unwrap();
-    cmm.connect().await.unwrap();
+    let mut cmm = connected(settings).await;
     assert_exact(&plan, &measure(&mut cmm, &plan, 1).await.unwrap(), "late");
     assert_eq!((serving.faults().fired().len(), began(&serving).len()), (4, 1));
     assert!(cmm.link().figures().timeouts >= 4, "{:?}", cmm.link().figures());
@@ -672,20 +665,8 @@ async fn a_prepared_job_that_has_died_is_not_started() {
 #[tokio::test]
 async fn a_hold_comes_before_the_next_page_of_whatever_is_being_transferred() {
     let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
-    let mut cmm = ModbusCmm::new(settings(&serving)).unwrap();
-    cmm.connect().await.unwrap();
-    cmm.claim().await.unwrap();
-    let (interrupt, pages) = (Interrupt::new(), Arc::new(AtomicU32::new(0)));
-    let (raiser, counted) = (interrupt.clone(), Arc::clone(&pages));
-    serving.faults().set(FaultPlan::new(0).always(
-        When::Matching(Box::new(move |request| {
-            if request.function == 16 && request.address == 224 && counted.fetch_add(1, Ordering::SeqCst) == 30 {
-                raiser.raise();
-            }
-            false
-        })),
-        Fault::DropReply,
-    ));
+    let mut cmm = claimed(settings(&serving)).await;
+    let (interrupt, pages) = interrupt_at_page(&serving, 30);
     let broken = cmm.load_plan(&plan(4000), &interrupt).await;
     assert!(matches!(broken, Err(DeviceError::Interrupted { .. })), "{broken:?}");
     let refused = cmm.hold().await; // it is idle, so it says no, but it says so
@@ -699,9 +680,7 @@ async fn a_hold_comes_before_the_next_page_of_whatever_is_being_transferred() {
 async fn eighteen_hundred_points_over_a_serial_line() {
     let machine = toy(Kind::Cmm, AT_ONCE, MachineOptions::default());
     let (_serving, settings) = rtu(vec![(1, machine)], SerialLine::paced(115_200), Faults::none());
-    let mut cmm = ModbusCmm::new(ModbusSettings { request_timeout: Duration::from_secs(2), ..settings }).unwrap();
-    cmm.connect().await.unwrap();
-    cmm.claim().await.unwrap();
+    let mut cmm = claimed(ModbusSettings { request_timeout: Duration::from_secs(2), ..settings }).await;
     let (plan, calm) = (plan(1800), Interrupt::new());
     let began = Instant::now();
     cmm.load_plan(&plan, &calm).await.unwrap();
@@ -709,7 +688,7 @@ async fn eighteen_hundred_points_over_a_serial_line() {
     let job = job_of(&plan, 1);
     let armed = cmm.prepare(job).await.unwrap();
     cmm.start(armed).await.unwrap();
-    until_complete(&mut cmm).await.unwrap();
+    reaches(&mut cmm, State::Complete).await.unwrap();
     let began = Instant::now();
     let measured = cmm.collect(job, &calm).await.unwrap();
     let collected = began.elapsed();
