@@ -28,6 +28,7 @@ mod machine;
 mod manual;
 mod modbus;
 mod payload;
+mod place;
 mod table;
 mod wiring;
 mod words;
@@ -44,8 +45,9 @@ pub use modbus::{
 pub use payload::{
     CorrectionMap, Identified, MeasuredPoint, Measurement, Pass, PassRecord, Plan, PointStatus, Target, TargetKind,
 };
+pub use place::Place;
 pub use table::{AnyCmm, AnyGrinder, Wire};
-pub use wiring::{Making, MakingError, Place, Timing, Wired};
+pub use wiring::{Making, MakingError, Timing, Wired};
 pub(crate) use words::hex;
 pub use words::{
     Answer, Armed, Command, Fault, Identity, Job, MachineKind, Outcome, Reconciled, SignalValue, Started, State,

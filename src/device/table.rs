@@ -7,7 +7,8 @@ use super::exchange::ExchangeWire;
 use super::machine::{Cmm, Grinder, Interrupt, Machine};
 use super::manual::ManualWire;
 use super::modbus::{Line, Link, RtuWire, TcpWire};
-use super::wiring::{Making, MakingError, Place, Wired};
+use super::place::Place;
+use super::wiring::{Making, MakingError, Wired};
 use super::{
     Armed, CorrectionMap, DeviceError, Identity, Job, Measurement, Pass, PassRecord, Plan, Reconciled, Started, Status,
     Word,

@@ -7,6 +7,7 @@ use thiserror::Error;
 
 use super::machine::{Cmm, Grinder};
 use super::modbus::{Line, Link, RegisterMap, Signal};
+use super::place::Place;
 use super::words::MachineKind;
 use crate::document::Document;
 use crate::formats::FormatError;
@@ -27,22 +28,6 @@ pub struct Timing {
     pub lost_after: Duration,
     /// Of silence after a broken answer, so that late bytes die out.
     pub quarantine: Duration,
-}
-
-/// Where a machine stands in a cell file.
-#[derive(Clone, Copy, Debug)]
-pub struct Place<'a> {
-    /// Its table: `cmm` or `grinder`.
-    pub table: &'a str,
-    /// Whether the cell is simulated, where the file says it.
-    pub simulated: Option<bool>,
-}
-
-impl Place<'_> {
-    /// Returns a key of the machine's table as messages call it.
-    pub fn key(&self, rest: &str) -> String {
-        format!("{}.{rest}", self.table)
-    }
 }
 
 /// What a machine is made of besides its wire.

@@ -277,6 +277,33 @@ pub enum Fault {
     Other(u16),
 }
 
+impl Fault {
+    /// The numbers of docs/modbus.md.
+    const NUMBERS: [(Self, u16); 8] = [
+        (Self::None, 0),
+        (Self::StopCircuit, 1),
+        (Self::Collision, 2),
+        (Self::Supplies, 3),
+        (Self::TravelLimit, 4),
+        (Self::Drive, 5),
+        (Self::Tool, 6),
+        (Self::ClientSilent, 20),
+    ];
+
+    /// The fault with a number.
+    pub(crate) fn of(number: u16) -> Self {
+        Self::NUMBERS.iter().find(|(_, known)| *known == number).map_or(Self::Other(number), |(fault, _)| *fault)
+    }
+
+    /// The number of a fault.
+    pub(crate) fn number(self) -> u16 {
+        match self {
+            Self::Other(number) => number,
+            listed => Self::NUMBERS.iter().find(|(fault, _)| *fault == listed).map_or(0, |(_, number)| *number),
+        }
+    }
+}
+
 impl fmt::Display for Fault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
@@ -368,19 +395,12 @@ impl Status {
 
 /// A person's word about a machine that cannot tell it itself.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[expect(missing_docs, reason = "the fields are told above them")]
 pub enum Word {
-    /// It has begun its job.
-    Started {
-        /// The identity of the map that it works by, where that was named.
-        map_identity: Option<[u8; 32]>,
-    },
-    /// It has ended its job, and is clear of the part.
-    Done {
-        /// The identity of the map that it worked by, where that was named.
-        map_identity: Option<[u8; 32]>,
-        /// The file that the measurement came as.
-        file: Option<PathBuf>,
-    },
+    /// It has begun its job, by this map where one was named.
+    Started { map_identity: Option<[u8; 32]> },
+    /// It has ended its job, by this map where one was named, and is clear of the part; a measurement came as a file.
+    Done { map_identity: Option<[u8; 32]>, file: Option<PathBuf> },
     /// It stands still.
     Still,
 }

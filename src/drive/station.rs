@@ -528,7 +528,7 @@ impl<B: StationDriver> MachineTask<B> {
         match error {
             DeviceError::Faulted { fault, .. } if fault != Fault::None => {
                 let (device, message) = (B::DEVICE, fault_words(B::DEVICE, fault));
-                self.tell(Event::Fault { device, code: fault_code(fault), message }).await;
+                self.tell(Event::Fault { device, code: fault.number(), message }).await;
             }
             _ => self.tell(Event::Refused { device: B::DEVICE, what, why: error.to_string() }).await,
         }
@@ -624,7 +624,7 @@ impl<B: StationDriver> MachineTask<B> {
             State::Aborted => self.note_abort(before).await,
             State::Faulted if before != Some(State::Faulted) => {
                 let fault = status.fault.unwrap_or(Fault::Other(0));
-                let (device, code, message) = (B::DEVICE, fault_code(fault), fault_words(B::DEVICE, fault));
+                let (device, code, message) = (B::DEVICE, fault.number(), fault_words(B::DEVICE, fault));
                 self.tell(Event::Fault { device, code, message }).await;
             }
             _ => {}
@@ -705,20 +705,6 @@ fn job_result(outcome: Outcome) -> JobResult {
         Outcome::Stopped => JobResult::Stopped,
         Outcome::Aborted => JobResult::Aborted,
         Outcome::None | Outcome::Failed => JobResult::Failed,
-    }
-}
-
-fn fault_code(fault: Fault) -> u16 {
-    match fault {
-        Fault::None => 0,
-        Fault::StopCircuit => 1,
-        Fault::Collision => 2,
-        Fault::Supplies => 3,
-        Fault::TravelLimit => 4,
-        Fault::Drive => 5,
-        Fault::Tool => 6,
-        Fault::ClientSilent => 20,
-        Fault::Other(number) => number,
     }
 }
 

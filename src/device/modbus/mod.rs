@@ -170,7 +170,7 @@ impl ModbusMachine {
             interlocks: words[3],
             acknowledged: block.u32(4),
             answer: answer_of(words[6]),
-            fault: fault_of(words[7]),
+            fault: Fault::of(words[7]),
             job: (job.job != 0).then_some(job),
             token: block.u32(14),
             done: block.u32(16),
@@ -342,6 +342,11 @@ impl ModbusMachine {
             ("the cycle", u64::from(job.cycle), u64::from(held.cycle)),
             ("the digest of the payloads", u64::from(job.digest), u64::from(held.digest)),
         ];
+        self.compare(fields)
+    }
+
+    /// Refuses the first field in which the machine holds something else than was sent or is meant.
+    fn compare<const N: usize>(&self, fields: [(&'static str, u64, u64); N]) -> Result<(), DeviceError> {
         match fields.into_iter().find(|(_, sent, held)| sent != held) {
             Some((field, sent, held)) => Err(DeviceError::Mismatch { machine: self.machine(), field, sent, held }),
             None => Ok(()),
@@ -380,13 +385,8 @@ impl ModbusMachine {
             }
             Ok(status) => {
                 let (sent, held) = (u64::from(start_sequence), u64::from(status.begun_by));
-                let why = DeviceError::Mismatch {
-                    machine: self.machine(),
-                    field: "the START that began the job",
-                    sent,
-                    held,
-                };
-                Err(unknown(self.machine(), why))
+                let (machine, field) = (self.machine(), "the START that began the job");
+                Err(unknown(self.machine(), DeviceError::Mismatch { machine, field, sent, held }))
             }
             // The machine has answered this very START, and the answer was no.
             Err(refused @ DeviceError::Refused { .. }) => Err(refused),
@@ -551,22 +551,19 @@ impl ModbusMachine {
         let block = self.unit.registers(&words);
         let identity = block.identity(8);
         let head = |identity: &[u8; 32]| identity[..8].iter().fold(0, |bits, byte| (bits << 8) | u64::from(*byte));
-        let fields = [
+        self.compare([
             ("the kind of the payload in force", u64::from(kind), u64::from(words[0])),
             ("the state of the slot in force", 1, u64::from(words[1])),
             ("the size of the payload in force", u64::from(slot.bytes), u64::from(block.u32(2))),
             ("the CRC-32 of the payload in force", u64::from(slot.crc), u64::from(block.u32(4))),
             ("the identity of the payload in force (first 8 bytes)", head(&slot.identity), head(&identity)),
-        ];
-        let differs = fields.into_iter().find(|(_, sent, held)| sent != held).or_else(|| {
-            let tail = |identity: &[u8; 32]| u64::from(crc32fast::hash(identity));
-            let field = "the identity of the payload in force (its CRC-32)";
-            (identity != slot.identity).then(|| (field, tail(&slot.identity), tail(&identity)))
-        });
-        match differs {
-            Some((field, sent, held)) => Err(DeviceError::Mismatch { machine: self.machine(), field, sent, held }),
-            None => Ok(()),
+        ])?;
+        if identity == slot.identity {
+            return Ok(());
         }
+        let [sent, held] = [slot.identity, identity].map(|identity| u64::from(crc32fast::hash(&identity)));
+        let field = "the identity of the payload in force (its CRC-32)";
+        Err(DeviceError::Mismatch { machine: self.machine(), field, sent, held })
     }
 
     // ---- results -----------------------------------------------------------------------------------------------------------------
@@ -630,15 +627,12 @@ impl ModbusMachine {
     fn header(&self, words: &[u16], job: Job, kind: u16, done: u32) -> Result<Header, DeviceError> {
         let machine = self.machine();
         let block = self.unit.registers(words);
-        let fields = [
+        self.compare([
             ("the kind of the result", u64::from(kind), u64::from(words[0])),
             ("the job of the result", u64::from(job.job), u64::from(block.u32(6))),
             ("the cycle of the result", u64::from(job.cycle), u64::from(words[8])),
             ("the number of the finished job", u64::from(done), u64::from(block.u32(46))),
-        ];
-        if let Some((field, sent, held)) = fields.into_iter().find(|(_, sent, held)| sent != held) {
-            return Err(DeviceError::Mismatch { machine, field, sent, held });
-        }
+        ])?;
         if words[28] != 1 {
             return Err(DeviceError::Inches { machine, unit: words[28] });
         }
@@ -853,20 +847,6 @@ fn answer_of(number: u16) -> Answer {
     }
 }
 
-fn fault_of(number: u16) -> Fault {
-    match number {
-        0 => Fault::None,
-        1 => Fault::StopCircuit,
-        2 => Fault::Collision,
-        3 => Fault::Supplies,
-        4 => Fault::TravelLimit,
-        5 => Fault::Drive,
-        6 => Fault::Tool,
-        20 => Fault::ClientSilent,
-        other => Fault::Other(other),
-    }
-}
-
 /// A driver that is a [`ModbusMachine`] and answers as a [`Machine`] by it.
 macro_rules! modbus_driver {
     ($(#[$doc:meta])* $driver:ident, $kind:expr) => {
@@ -961,11 +941,8 @@ impl Cmm for ModbusCmm {
         if status.outcome != Outcome::Complete {
             return Err(DeviceError::NoResult { machine: machine.machine(), job, state: status.state });
         }
-        if digest(&[header.identity]) != job.digest {
-            let (sent, held) = (job.digest.into(), digest(&[header.identity]).into());
-            let field = "the digest of the plan that was measured";
-            return Err(DeviceError::Mismatch { machine: machine.machine(), field, sent, held });
-        }
+        let measured = digest(&[header.identity]);
+        machine.compare([("the digest of the plan that was measured", job.digest.into(), measured.into())])?;
         if let Some(slot) = machine.loaded.get(&Plan::KIND) {
             let targets = (u64::from(slot.bytes) - 64) / 56;
             machine.count("points of the measurement", targets, header.records.into())?;
@@ -1009,14 +986,11 @@ impl Grinder for ModbusGrinder {
         let figures = codec::pass_figures(machine.unit.registers(&words)).map_err(|flaw| machine.flawed(flaw))?;
         let (number, cycle, outcome, [path_mm, removed_mm3, deepest_mm, idle_share, spindle_load, wheel_radius_mm]) =
             figures;
-        let fields = [
+        machine.compare([
             ("the job in the pass record", u64::from(job.job), u64::from(number)),
             ("the cycle in the pass record", u64::from(job.cycle), u64::from(cycle)),
             ("the result in the pass record", status.outcome as u64, outcome as u64),
-        ];
-        if let Some((field, sent, held)) = fields.into_iter().find(|(_, sent, held)| sent != held) {
-            return Err(DeviceError::Mismatch { machine: machine.machine(), field, sent, held });
-        }
+        ])?;
         if let Some(map) = machine.loaded.get(&CorrectionMap::KIND).filter(|map| map.identity != header.identity) {
             let (sent, held) = (digest(&[map.identity]).into(), digest(&[header.identity]).into());
             let field = "the identity of the map that was ground (its CRC-32)";

@@ -7,7 +7,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::device::wiring::{Making, Place};
+use crate::device::place::Place;
 use crate::document::Document;
 
 /// Registers that a Modbus device can have.
@@ -57,25 +57,12 @@ pub enum Parity {
 
 /// Where a line leads.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
+#[expect(missing_docs, reason = "the fields are told above them")]
 pub enum Line {
-    /// Modbus TCP.
-    Tcp {
-        /// Host name or address.
-        host: String,
-        /// The port, 502 by the standard.
-        port: u16,
-    },
-    /// Modbus RTU on a serial port.
-    Rtu {
-        /// The port, best by its lasting name under /dev/serial/by-id.
-        device: String,
-        /// Bits per second.
-        baud: u32,
-        /// The parity.
-        parity: Parity,
-        /// Stop bits, 1 or 2.
-        stop_bits: u8,
-    },
+    /// Modbus TCP: a host by name or address, and a port, 502 by the standard.
+    Tcp { host: String, port: u16 },
+    /// Modbus RTU on a serial port, best by its lasting name under /dev/serial/by-id, at so many bits per second, with 1 or 2 stop bits.
+    Rtu { device: String, baud: u32, parity: Parity, stop_bits: u8 },
 }
 
 impl std::fmt::Display for Line {
@@ -500,26 +487,6 @@ impl ModbusSettings {
             beat_every: Duration::from_millis(250),
             expected_name: None,
             simulation: None,
-        }
-    }
-
-    /// Settings for a unit on a line, as the cell file has them.
-    pub fn of(line: Line, unit: u8, making: &Making<'_>) -> Self {
-        let timing = making.timing;
-        Self {
-            unit,
-            registers: *making.registers,
-            request_timeout: timing.request_timeout,
-            retries: u32::from(timing.retries),
-            lost_after: timing.lost_after,
-            quarantine: timing.quarantine,
-            owner: making.owner,
-            epoch: making.epoch,
-            signals: making.signals.to_vec(),
-            beat_every: timing.heartbeat,
-            expected_name: making.expected_name.map(str::to_owned),
-            simulation: Some(making.simulated),
-            ..Self::new(line)
         }
     }
 }

@@ -2,7 +2,8 @@
 
 use super::settings::{Line, ModbusSettings, RtuWire, TcpWire};
 use super::{Link, ModbusCmm, ModbusGrinder};
-use crate::device::wiring::{Making, MakingError, Place, Wired};
+use crate::device::place::Place;
+use crate::device::wiring::{Making, MakingError, Wired};
 use crate::document::Document;
 
 macro_rules! modbus_wire {
@@ -47,6 +48,28 @@ macro_rules! modbus_wire {
 
 modbus_wire!(TcpWire);
 modbus_wire!(RtuWire);
+
+impl ModbusSettings {
+    /// Settings for a unit on a line, as the cell file has them.
+    pub fn of(line: Line, unit: u8, making: &Making<'_>) -> Self {
+        let timing = making.timing;
+        Self {
+            unit,
+            registers: *making.registers,
+            request_timeout: timing.request_timeout,
+            retries: u32::from(timing.retries),
+            lost_after: timing.lost_after,
+            quarantine: timing.quarantine,
+            owner: making.owner,
+            epoch: making.epoch,
+            signals: making.signals.to_vec(),
+            beat_every: timing.heartbeat,
+            expected_name: making.expected_name.map(str::to_owned),
+            simulation: Some(making.simulated),
+            ..Self::new(line)
+        }
+    }
+}
 
 /// Makes the line of a machine, or shares that of the other one, and everything that has to be known to drive it.
 fn link(
