@@ -239,7 +239,7 @@ async fn hold_resume_stop_abort_and_clear_are_obeyed() {
     let refused = cmm.hold().await;
     assert!(matches!(refused, Err(DeviceError::Refused { answer: Answer::WrongState, .. })), "{refused:?}");
     cmm.release().await.unwrap();
-    let mut next = claimed(ModbusSettings { owner: 0x9999, ..settings(&serving) }).await;
+    claimed(ModbusSettings { owner: 0x9999, ..settings(&serving) }).await;
 }
 
 #[tokio::test]
