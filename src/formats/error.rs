@@ -7,458 +7,170 @@ use thiserror::Error;
 
 use super::number::LIMIT_MM;
 
-/// Why a file could not be read or written. Lines and columns count from 1, bytes from 0.
+/// Why a file could not be read or written. Lines, columns and rows count from 1, bytes and vertices from 0; a place is a line or
+/// a byte in words, and what was found is shortened.
 #[derive(Debug, Error)]
+#[allow(missing_docs)]
+#[non_exhaustive]
 pub enum FormatError {
     /// The file could not be opened or read.
     #[error("{path}: cannot be read: {source}; check the name and the permissions")]
-    Unreadable {
-        /// The file.
-        path: PathBuf,
-        /// The system's reason.
-        source: io::Error,
-    },
-    /// The file is larger than what is read at all.
+    Unreadable { path: PathBuf, source: io::Error },
+    /// More of something, which the unit names, than is read at all: bytes, points, triangles.
     #[error("{path}: {found} is more than the limit of {limit} {unit}; thin the file out or split it")]
-    TooLarge {
-        /// The file.
-        path: PathBuf,
-        /// How many there are, or are said to be.
-        found: u64,
-        /// How many are read at most.
-        limit: u64,
-        /// What is counted: bytes, points, triangles.
-        unit: &'static str,
-    },
+    TooLarge { path: PathBuf, found: u64, limit: u64, unit: &'static str },
     /// The file has no content at all.
     #[error("{path}: the file is empty, expected {expected}; export it again")]
-    Empty {
-        /// The file.
-        path: PathBuf,
-        /// What was expected.
-        expected: &'static str,
-    },
+    Empty { path: PathBuf, expected: &'static str },
     /// The file is well formed and holds nothing.
     #[error("{path}: a header but no {expected} after it; export the file again with its data")]
-    NoData {
-        /// The file.
-        path: PathBuf,
-        /// What was expected: points, triangles.
-        expected: &'static str,
-    },
+    NoData { path: PathBuf, expected: &'static str },
     /// A byte that no text file holds.
     #[error(
         "{path}, line {line}: expected text, found byte 0x{value:02x}: the file is binary or damaged; export the points as \
          text, one point a line, or as PLY"
     )]
-    NotText {
-        /// The file.
-        path: PathBuf,
-        /// Line of the byte.
-        line: u64,
-        /// The byte.
-        value: u8,
-    },
+    NotText { path: PathBuf, line: u64, value: u8 },
     /// Text of two bytes a character.
     #[error("{path}: expected plain text, found UTF-16; save the file as UTF-8")]
-    Utf16 {
-        /// The file.
-        path: PathBuf,
-    },
+    Utf16 { path: PathBuf },
     /// A line so long that it cannot be a point.
     #[error("{path}, line {line}: longer than {limit_bytes} bytes; expected one point a line")]
-    LineTooLong {
-        /// The file.
-        path: PathBuf,
-        /// The line.
-        line: u64,
-        /// The limit.
-        limit_bytes: usize,
-    },
+    LineTooLong { path: PathBuf, line: u64, limit_bytes: usize },
     /// Text where a number should be.
     #[error(
         "{path}, line {line}, column {column}: expected a number in millimetres, found {}; remove the text or give the \
          column a header",
         quoted(found)
     )]
-    NotANumber {
-        /// The file.
-        path: PathBuf,
-        /// Line.
-        line: u64,
-        /// Column.
-        column: usize,
-        /// What stands there.
-        found: String,
-    },
+    NotANumber { path: PathBuf, line: u64, column: usize, found: String },
     /// NaN or an infinity.
     #[error(
         "{path}, line {line}, column {column}: expected a finite number in millimetres, found `{found}`; remove the line"
     )]
-    NotFinite {
-        /// The file.
-        path: PathBuf,
-        /// Line.
-        line: u64,
-        /// Column.
-        column: usize,
-        /// What stands there.
-        found: String,
-    },
+    NotFinite { path: PathBuf, line: u64, column: usize, found: String },
     /// A number no part is large enough for.
     #[error(
         "{path}, line {line}, column {column}: expected at most {LIMIT_MM:e} mm in size, found `{found}`; correct the number \
          or the unit"
     )]
-    OutOfRange {
-        /// The file.
-        path: PathBuf,
-        /// Line.
-        line: u64,
-        /// Column.
-        column: usize,
-        /// What stands there.
-        found: String,
-    },
+    OutOfRange { path: PathBuf, line: u64, column: usize, found: String },
     /// A comma that may separate decimals or thousands.
     #[error(
         "{path}, line {line}, column {column}: `{found}` may have a decimal comma or a thousands comma; write all numbers with a \
          decimal point and without thousands separators"
     )]
-    AmbiguousComma {
-        /// The file.
-        path: PathBuf,
-        /// Line.
-        line: u64,
-        /// Column.
-        column: usize,
-        /// What stands there.
-        found: String,
-    },
+    AmbiguousComma { path: PathBuf, line: u64, column: usize, found: String },
     /// Decimal points and decimal commas in one file.
     #[error(
         "{path}, line {line}, column {column}: expected a number with a decimal {expected} like those before it, found \
          `{found}`; write all numbers with a decimal point"
     )]
-    DecimalMark {
-        /// The file.
-        path: PathBuf,
-        /// Line.
-        line: u64,
-        /// Column.
-        column: usize,
-        /// What stands there.
-        found: String,
-        /// Point or comma.
-        expected: &'static str,
-    },
+    DecimalMark { path: PathBuf, line: u64, column: usize, found: String, expected: &'static str },
     /// Too few columns for a point.
     #[error(
         "{path}, line {line}: expected three columns x, y, z separated by comma, semicolon, tab or blank, found {columns}: \
          {}; export the points with one of these separators",
         quoted(found)
     )]
-    TooFewColumns {
-        /// The file.
-        path: PathBuf,
-        /// Line.
-        line: u64,
-        /// How many there are.
-        columns: usize,
-        /// The line, shortened.
-        found: String,
-    },
+    TooFewColumns { path: PathBuf, line: u64, columns: usize, found: String },
     /// A line with another number of columns than the first one.
     #[error(
         "{path}, line {line}: expected {expected} columns separated by {separator} as in line {first_line}, found {found}; \
          correct or remove the line"
     )]
-    ColumnCount {
-        /// The file.
-        path: PathBuf,
-        /// Line.
-        line: u64,
-        /// Columns of this line.
-        found: usize,
-        /// Columns of the first data line.
-        expected: usize,
-        /// Name of the separator.
-        separator: &'static str,
-        /// The first data line.
-        first_line: u64,
-    },
+    ColumnCount { path: PathBuf, line: u64, found: usize, expected: usize, separator: &'static str, first_line: u64 },
     /// A header that does not fit the data under it.
     #[error(
         "{path}, line {line}: the header has {found} columns separated by {separator}, the data under it has {expected}; \
          give every column one name"
     )]
-    HeaderColumns {
-        /// The file.
-        path: PathBuf,
-        /// Line of the header.
-        line: u64,
-        /// Columns of the header.
-        found: usize,
-        /// Columns of the data.
-        expected: usize,
-        /// Name of the separator.
-        separator: &'static str,
-    },
+    HeaderColumns { path: PathBuf, line: u64, found: usize, expected: usize, separator: &'static str },
     /// A header from which the three coordinates cannot be told.
     #[error("{path}, line {line}: the header {reason}; name exactly one column each x, y and z")]
-    HeaderNames {
-        /// The file.
-        path: PathBuf,
-        /// Line of the header.
-        line: u64,
-        /// What is wrong with it.
-        reason: String,
-    },
+    HeaderNames { path: PathBuf, line: u64, reason: String },
     /// A unit other than the millimetre.
     #[error(
         "{path}, line {line}: expected coordinates in mm, found the unit {}; convert the file to mm",
         quoted(found)
     )]
-    Unit {
-        /// The file.
-        path: PathBuf,
-        /// Line of the statement.
-        line: u64,
-        /// The unit as written.
-        found: String,
-    },
+    Unit { path: PathBuf, line: u64, found: String },
     /// A text file that stops in the middle.
     #[error(
         "{path}, line {line}: the file is cut in the middle of a line, found {}; copy or export it again",
         quoted(found)
     )]
-    CutLine {
-        /// The file.
-        path: PathBuf,
-        /// The last line.
-        line: u64,
-        /// What there is of it, shortened.
-        found: String,
-    },
+    CutLine { path: PathBuf, line: u64, found: String },
     /// A file that stops before what it announced.
     #[error("{path}, {place}: the file is cut, expected {expected}; copy or export it again")]
-    Cut {
-        /// The file.
-        path: PathBuf,
-        /// Line or byte.
-        place: String,
-        /// What should have followed.
-        expected: String,
-    },
+    Cut { path: PathBuf, place: String, expected: String },
     /// Something else than the format asks for.
     #[error("{path}, {place}: expected {expected}, found {}; export the file again", quoted(found))]
-    Unexpected {
-        /// The file.
-        path: PathBuf,
-        /// Line or byte.
-        place: String,
-        /// What the format asks for.
-        expected: String,
-        /// What stands there.
-        found: String,
-    },
+    Unexpected { path: PathBuf, place: String, expected: String, found: String },
     /// A face that names a vertex which is not there.
     #[error(
         "{path}, {place}: face names vertex {index}, but there are {vertices}, counted from 0; export the mesh again"
     )]
-    IndexOutOfRange {
-        /// The file.
-        path: PathBuf,
-        /// Line or byte.
-        place: String,
-        /// The index as it stands there.
-        index: f64,
-        /// Number of vertices.
-        vertices: u64,
-    },
+    IndexOutOfRange { path: PathBuf, place: String, index: f64, vertices: u64 },
     /// A vertex that is no position.
     #[error(
         "{path}, {place}: expected {what} as a finite number of at most {LIMIT_MM:e} mm, found {value}; repair the mesh or the \
          unit"
     )]
-    BadCoordinate {
-        /// The file.
-        path: PathBuf,
-        /// Line or byte.
-        place: String,
-        /// Which coordinate.
-        what: &'static str,
-        /// What stands there.
-        value: f64,
-    },
+    BadCoordinate { path: PathBuf, place: String, what: &'static str, value: f64 },
     /// The file is a good one of another kind.
     #[error("{path}: expected {expected}, found {found}; {remedy}")]
-    WrongKind {
-        /// The file.
-        path: PathBuf,
-        /// What is wanted here.
-        expected: &'static str,
-        /// What the file is.
-        found: &'static str,
-        /// What to do.
-        remedy: &'static str,
-    },
+    WrongKind { path: PathBuf, expected: &'static str, found: &'static str, remedy: &'static str },
     /// A container that is damaged, encrypted or packed in a way that is not read.
     #[error("{path}: the zip container cannot be read: {source}; copy or export the file again")]
-    Container {
-        /// The file.
-        path: PathBuf,
-        /// The reason.
-        source: zip::result::ZipError,
-    },
+    Container { path: PathBuf, source: zip::result::ZipError },
     /// A container without something that belongs into it.
     #[error("{path}: the container has no {expected}; export the file again")]
-    Missing {
-        /// The file.
-        path: PathBuf,
-        /// What is not there.
-        expected: String,
-    },
+    Missing { path: PathBuf, expected: String },
     /// XML that is none.
     #[error("{path}, {entry}: no readable XML: {source}; export the file again")]
-    Xml {
-        /// The file.
-        path: PathBuf,
-        /// The entry of the container.
-        entry: String,
-        /// The reason.
-        source: roxmltree::Error,
-    },
-    /// Bytes that are not those that were sealed.
+    Xml { path: PathBuf, entry: String, source: roxmltree::Error },
+    /// Bytes that are not those that were sealed; the sums are in lower case.
     #[error(
         "{path}: {entry} was changed or damaged after it was written: its MD5 is {found}, sealed was {expected}; copy or export \
          the file again"
     )]
-    Checksum {
-        /// The file.
-        path: PathBuf,
-        /// The entry of the container.
-        entry: String,
-        /// The sum on record, in lower case.
-        expected: String,
-        /// The sum of what is there.
-        found: String,
-    },
+    Checksum { path: PathBuf, entry: String, expected: String, found: String },
     /// A map of which nobody knows how large it is.
     #[error(
         "{path}: the map has no lateral scale (the resolution in the file is {found} m a pixel), so that its size in x and y is \
          not known; calibrate the lateral resolution in the instrument's program and save the map again"
     )]
-    NoLateralScale {
-        /// The file.
-        path: PathBuf,
-        /// What stands for it in the file.
-        found: f64,
-    },
+    NoLateralScale { path: PathBuf, found: f64 },
     /// A file could not be written; nothing of that name was changed.
     #[error("{path}: cannot be written, {action}: {source}; check the name, the permissions and the space left")]
-    Unwritable {
-        /// The file.
-        path: PathBuf,
-        /// What was being done.
-        action: &'static str,
-        /// The system's reason.
-        source: io::Error,
-    },
+    Unwritable { path: PathBuf, action: &'static str, source: io::Error },
     /// A row to be written holds NaN or an infinity.
     #[error("{path}: row {row} of the result holds {value}, which is not a finite number; nothing was written")]
-    RowNotFinite {
-        /// The file.
-        path: PathBuf,
-        /// The row, from 1.
-        row: usize,
-        /// The value.
-        value: f64,
-    },
+    RowNotFinite { path: PathBuf, row: usize, value: f64 },
     /// A value has no form in JSON.
     #[error("{path}: cannot be written as JSON: {source}")]
-    Json {
-        /// The file.
-        path: PathBuf,
-        /// The reason.
-        source: serde_json::Error,
-    },
+    Json { path: PathBuf, source: serde_json::Error },
     /// A statement such as `# cycle: 3` that says something impossible.
     #[error("{path}, line {line}: `{key}` says `{found}`, expected {expected}; correct the line")]
-    Statement {
-        /// The file.
-        path: PathBuf,
-        /// The line.
-        line: u64,
-        /// What it is about.
-        key: &'static str,
-        /// What it says.
-        found: String,
-        /// What it may say.
-        expected: &'static str,
-    },
-    /// File and cell contradict each other.
+    Statement { path: PathBuf, line: u64, key: &'static str, found: String, expected: &'static str },
+    /// The file contradicts another one: the cell file, the plan.
     #[error("{path}: the file says that {key} is {found}, the {by} says {expected}; correct one of them")]
-    Contradiction {
-        /// The file.
-        path: PathBuf,
-        /// What it is about.
-        key: &'static str,
-        /// What the file says.
-        found: String,
-        /// Who says otherwise: cell file, plan.
-        by: &'static str,
-        /// What that says.
-        expected: String,
-    },
+    Contradiction { path: PathBuf, key: &'static str, found: String, by: &'static str, expected: String },
     /// A number of a target that the plan does not have, or that came before.
     #[error("{path}, line {line}: index `{found}` {why}; export the measurement of this plan")]
-    Index {
-        /// The file.
-        path: PathBuf,
-        /// The line.
-        line: u64,
-        /// What stands there.
-        found: String,
-        /// What is wrong with it.
-        why: &'static str,
-    },
+    Index { path: PathBuf, line: u64, found: String, why: &'static str },
     /// More than one probe in one file.
     #[error("{path}, line {line}: probe `{found}`, the lines above have `{first}`; export one file a probe")]
-    ProbeVaries {
-        /// The file.
-        path: PathBuf,
-        /// The line.
-        line: u64,
-        /// What stands there.
-        found: String,
-        /// What stood before.
-        first: String,
-    },
+    ProbeVaries { path: PathBuf, line: u64, found: String, first: String },
     /// A file of reference points that cannot be understood.
     #[error("{path}, line {line}: expected {expected}, found {found}; correct the file of reference points")]
-    Reference {
-        /// The file.
-        path: PathBuf,
-        /// The line.
-        line: usize,
-        /// What belongs there.
-        expected: &'static str,
-        /// What stands there.
-        found: String,
-    },
+    Reference { path: PathBuf, line: usize, expected: &'static str, found: String },
     /// A group of reference points that is not there or not unique.
     #[error(
         "{path}: no single group `{wanted}` of reference points; there are {there}; name one of them in the cell file"
     )]
-    Group {
-        /// The file.
-        path: PathBuf,
-        /// The group asked for.
-        wanted: String,
-        /// The groups in the file.
-        there: String,
-    },
+    Group { path: PathBuf, wanted: String, there: String },
 }
 
 impl FormatError {

@@ -36,96 +36,41 @@ pub use run::write_run_report;
 pub use states::state_picture;
 pub use words::{ending_words, words};
 
-/// Why a figure could not be drawn or saved.
+/// Why a figure could not be drawn or saved. A figure goes by its title, a line of it by its name; an index counts from 0.
 #[derive(Debug, Error)]
+#[allow(missing_docs)]
+#[non_exhaustive]
 pub enum ReportError {
     /// There is nothing to draw.
     #[error("{figure}: there is nothing to draw; at least {least} points are needed, {found} were given")]
-    TooFewPoints {
-        /// Title of the figure.
-        figure: String,
-        /// How many there are.
-        found: usize,
-        /// How many are needed.
-        least: usize,
-    },
+    TooFewPoints { figure: String, found: usize, least: usize },
     /// A number that no figure can show.
     #[error("{figure}: point {} has the {what} {value}; a figure shows finite numbers only", index + 1)]
-    NotFinite {
-        /// Title of the figure, or name of the series.
-        figure: String,
-        /// Index of the point, from 0.
-        index: usize,
-        /// Which of its numbers.
-        what: &'static str,
-        /// What it is.
-        value: f64,
-    },
+    NotFinite { figure: String, index: usize, what: &'static str, value: f64 },
     /// A number that has no logarithm.
     #[error("{figure}: point {} has the {what} {value}; a logarithmic axis shows numbers above 0 only", index + 1)]
-    NoLogarithm {
-        /// Name of the series.
-        figure: String,
-        /// Index of the point, from 0.
-        index: usize,
-        /// Which of its numbers.
-        what: &'static str,
-        /// What it is.
-        value: f64,
-    },
+    NoLogarithm { figure: String, index: usize, what: &'static str, value: f64 },
     /// All points lie at one place.
     #[error("{figure}: all {points} points share one place in x and y; a map needs an extent")]
-    NoExtent {
-        /// Title of the figure.
-        figure: String,
-        /// How many points there are.
-        points: usize,
-    },
+    NoExtent { figure: String, points: usize },
     /// The limit of a colour bar is no limit.
     #[error("{figure}: the colour bar was to end at {limit}; give a finite number above 0")]
-    ColourLimit {
-        /// Title of the figure.
-        figure: String,
-        /// What was given.
-        limit: f64,
-    },
+    ColourLimit { figure: String, limit: f64 },
     /// A triangle has a corner that is no point.
     #[error("{figure}: a triangle has the corner {corner}, and there are {points} points, counted from 0")]
-    Corner {
-        /// Title of the figure.
-        figure: String,
-        /// The corner.
-        corner: u32,
-        /// How many points there are.
-        points: usize,
-    },
+    Corner { figure: String, corner: u32, points: usize },
     /// The pixels could not be encoded.
     #[error("{figure}: the picture could not be encoded: {source}")]
-    Encoding {
-        /// Title of the figure.
-        figure: String,
-        /// The encoder's reason.
-        source: png::EncodingError,
-    },
+    Encoding { figure: String, source: png::EncodingError },
     /// The record of the run cannot be read or believed.
     #[error(transparent)]
     Record(#[from] crate::journal::JournalError),
     /// A file on record could not be read.
     #[error("{path}: cannot be read: {source}; check the folder and its permissions")]
-    Unreadable {
-        /// The file.
-        path: PathBuf,
-        /// The system's reason.
-        source: io::Error,
-    },
+    Unreadable { path: PathBuf, source: io::Error },
     /// The file could not be written.
     #[error("{path}: cannot be written: {source}; check the folder, the permissions and the space left")]
-    Unwritable {
-        /// The file.
-        path: PathBuf,
-        /// The system's reason.
-        source: io::Error,
-    },
+    Unwritable { path: PathBuf, source: io::Error },
 }
 
 /// Writes a text as a whole file.

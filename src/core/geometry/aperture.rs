@@ -63,61 +63,34 @@ pub enum Aperture {
     },
 }
 
-/// Why a set of numbers is no outline.
+/// Why a set of numbers is no outline. A key is written as in TOML; corners count from 1.
 #[derive(Clone, Debug, Error, PartialEq)]
+#[allow(missing_docs)]
 #[non_exhaustive]
 pub enum ApertureError {
     /// A coordinate is NaN, infinite or absurd.
-    #[error("`{key}` is {value} mm; it must be a number between -{LARGEST_MM:e} and {LARGEST_MM:e} mm")]
-    Coordinate {
-        /// The key as written.
-        key: &'static str,
-        /// What stands there, in millimetres.
-        value: f64,
-    },
+    #[error("`{key}` is {value_mm} mm; it must be a number between -{LARGEST_MM:e} and {LARGEST_MM:e} mm")]
+    Coordinate { key: &'static str, value_mm: f64 },
     /// A size is zero, negative, NaN or absurd.
-    #[error("`{key}` is {value} mm; it must be greater than 0 and at most {LARGEST_MM:e} mm")]
-    Size {
-        /// The key as written.
-        key: &'static str,
-        /// What stands there, in millimetres.
-        value: f64,
-    },
+    #[error("`{key}` is {value_mm} mm; it must be greater than 0 and at most {LARGEST_MM:e} mm")]
+    Size { key: &'static str, value_mm: f64 },
     /// The hole of an annulus leaves nothing.
     #[error(
-        "`inner_radius_mm` is {inner} mm; it must be at least 0 and less than `outer_radius_mm`, which is {outer} mm"
+        "`inner_radius_mm` is {inner_mm} mm; it must be at least 0 and less than `outer_radius_mm`, which is {outer_mm} mm"
     )]
-    Hole {
-        /// The inner radius in millimetres.
-        inner: f64,
-        /// The outer radius in millimetres.
-        outer: f64,
-    },
+    Hole { inner_mm: f64, outer_mm: f64 },
     /// Too few or too many corners.
     #[error("`corners_mm` has {count} corners; a polygon has from 3 to {MOST_CORNERS}")]
-    CornerCount {
-        /// How many there are.
-        count: usize,
-    },
+    CornerCount { count: usize },
     /// Two neighbouring corners coincide; often the first is repeated at the end.
     #[error("corners {first} and {second} of `corners_mm` are the same point; write each corner once")]
-    RepeatedCorner {
-        /// Number of the first, from 1.
-        first: usize,
-        /// Number of the second, from 1.
-        second: usize,
-    },
+    RepeatedCorner { first: usize, second: usize },
     /// Two edges of the polygon meet where they should not.
     #[error(
         "the edges after corners {first} and {second} of `corners_mm` cross or touch; give the corners in order around \
          the outline"
     )]
-    Crossing {
-        /// Number of the corner the first edge starts from, from 1.
-        first: usize,
-        /// Number of the corner the second edge starts from, from 1.
-        second: usize,
-    },
+    Crossing { first: usize, second: usize },
 }
 
 impl ApertureError {
@@ -158,7 +131,7 @@ impl Aperture {
                 if (0.0..*outer_radius_mm).contains(inner_radius_mm) {
                     return Ok(());
                 }
-                Err(ApertureError::Hole { inner: *inner_radius_mm, outer: *outer_radius_mm })
+                Err(ApertureError::Hole { inner_mm: *inner_radius_mm, outer_mm: *outer_radius_mm })
             }
             Self::Polygon { corners_mm } => validate_polygon(corners_mm),
         }
@@ -280,14 +253,14 @@ impl Aperture {
 /// Checks the coordinates of a point.
 fn coordinates(key: &'static str, point: &[f64; 2]) -> Result<(), ApertureError> {
     match point.iter().find(|v| v.is_nan() || v.abs() > LARGEST_MM) {
-        Some(&value) => Err(ApertureError::Coordinate { key, value }),
+        Some(&value_mm) => Err(ApertureError::Coordinate { key, value_mm }),
         None => Ok(()),
     }
 }
 
 /// Checks a size.
-fn size(key: &'static str, value: f64) -> Result<(), ApertureError> {
-    if value > 0.0 && value <= LARGEST_MM { Ok(()) } else { Err(ApertureError::Size { key, value }) }
+fn size(key: &'static str, value_mm: f64) -> Result<(), ApertureError> {
+    if value_mm > 0.0 && value_mm <= LARGEST_MM { Ok(()) } else { Err(ApertureError::Size { key, value_mm }) }
 }
 
 /// Checks that corners in order make a simple polygon.

@@ -30,34 +30,23 @@ pub struct Pose {
     pub translation_mm: Vector,
 }
 
-/// Why sixteen numbers are not a rigid pose.
+/// Why sixteen numbers are not a rigid pose. Rows and columns count from 1.
 #[derive(Clone, Debug, Error, PartialEq)]
+#[allow(missing_docs)]
 #[non_exhaustive]
 pub enum PoseError {
     /// An entry is NaN or infinite.
     #[error("row {row}, column {column} of the pose is {value}; every entry must be a finite number")]
-    NotFinite {
-        /// Row, from 1.
-        row: usize,
-        /// Column, from 1.
-        column: usize,
-        /// What stands there.
-        value: f64,
-    },
+    NotFinite { row: usize, column: usize, value: f64 },
     /// The last row is not 0 0 0 1.
     #[error("the last row of a pose must be 0 0 0 1, not {0:?}")]
     LastRow([f64; 4]),
-    /// The upper left block is not a rotation.
+    /// The upper left block is not a rotation: the largest entry of R R^T - 1 is off, or the determinant, -1 for a mirror image.
     #[error(
         "the upper left 3 x 3 block is not a rotation: it is off by {off:.3e} (limit {ROTATION_TOLERANCE:.0e}) and its \
          determinant is {determinant:.6}; scale, shear and mirror images are not rigid"
     )]
-    NotARotation {
-        /// Largest entry of R R^T - 1.
-        off: f64,
-        /// Determinant of the block; -1 is a mirror image.
-        determinant: f64,
-    },
+    NotARotation { off: f64, determinant: f64 },
 }
 
 impl Pose {

@@ -35,50 +35,32 @@ impl RigidFit {
     }
 }
 
-/// Why two sets of points have no rigid fit.
+/// Why two sets of points have no rigid fit. An index counts from 0.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
+#[allow(missing_docs)]
 #[non_exhaustive]
 pub enum RigidError {
     /// The sets are not pairs.
     #[error("{from} points cannot be laid on {to}; give every point its partner")]
-    Counts {
-        /// Points of the first set.
-        from: usize,
-        /// Points of the second set.
-        to: usize,
-    },
+    Counts { from: usize, to: usize },
     /// Fewer points than fix a pose.
     #[error("{points} pairs of points do not fix a pose, at least 3 are needed; measure more reference points")]
-    TooFew {
-        /// Pairs given.
-        points: usize,
-    },
+    TooFew { points: usize },
     /// A coordinate is NaN or infinite.
     #[error("pair {} of the points holds a coordinate that is not finite; remove it", index + 1)]
-    NotFinite {
-        /// Its index.
-        index: usize,
-    },
+    NotFinite { index: usize },
     /// All points on a line.
     #[error(
         "the points lie on one line: their width is {share:.1e} of their length, at least {LEAST_WIDTH_SHARE:.0e} is needed to fix \
          the rotation about it; add a reference point off the line"
     )]
-    Collinear {
-        /// Spread across the line over the spread along it.
-        share: f64,
-    },
+    Collinear { share: f64 },
     /// One set is a mirror image of the other.
     #[error(
         "one set of points is a mirror image of the other: as given they fit to {rms_mm:.4} mm, mirrored to {mirrored_rms_mm:.4} mm \
          rms; an axis is reversed or two points are exchanged"
     )]
-    Mirrored {
-        /// Rms of the best rotation.
-        rms_mm: f64,
-        /// Rms of the best mirror image.
-        mirrored_rms_mm: f64,
-    },
+    Mirrored { rms_mm: f64, mirrored_rms_mm: f64 },
 }
 
 /// Returns the rigid motion that lays `from` on `to` with the least sum of squared distances.

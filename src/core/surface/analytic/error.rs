@@ -6,86 +6,43 @@ use crate::geometry::ApertureError;
 
 /// Why a nominal surface given by a formula could not be defined or sampled.
 ///
-/// A key is written as the path in the definition, such as `surface.radius_mm`.
+/// A key is written as the path in the definition, such as `surface.radius_mm`; lines and columns count from 1.
 #[derive(Clone, Debug, Error, PartialEq)]
+#[allow(missing_docs)]
 #[non_exhaustive]
 pub enum DefinitionError {
     /// The text is no TOML, or a key is missing, unknown or of the wrong type.
     #[error("line {line}, column {column}: {message}")]
-    Toml {
-        /// Line, from 1.
-        line: usize,
-        /// Column, from 1.
-        column: usize,
-        /// What was found and what was expected.
-        message: String,
-    },
+    Toml { line: usize, column: usize, message: String },
     /// An error of value, with the place where the value stands.
     #[error("line {line}, column {column}: {source}")]
-    At {
-        /// Line, from 1.
-        line: usize,
-        /// Column, from 1.
-        column: usize,
-        /// What is wrong there.
-        source: Box<DefinitionError>,
-    },
-    /// A number lies outside what the formula can take.
+    At { line: usize, column: usize, source: Box<DefinitionError> },
+    /// A number lies outside what the formula can take; value and limit are in the unit that the key ends with.
     #[error("`{key}` is {value}; it must be {limit}; {remedy}")]
-    OutOfRange {
-        /// The key.
-        key: String,
-        /// What stands there, in the unit the key ends with.
-        value: f64,
-        /// What is allowed, in the same unit.
-        limit: &'static str,
-        /// What to write instead.
-        remedy: &'static str,
-    },
+    OutOfRange { key: String, value: f64, limit: &'static str, remedy: &'static str },
     /// A coefficient's key is no power or index of this formula.
     #[error("`{key}` names no term; {expected}")]
-    Term {
-        /// The key of the coefficient.
-        key: String,
-        /// What a term is named by.
-        expected: &'static str,
-    },
+    Term { key: String, expected: &'static str },
     /// Two coefficients are given for one term.
     #[error("`{key}` is given twice; add the two coefficients, or remove one")]
-    RepeatedTerm {
-        /// The key of the second one.
-        key: String,
-    },
+    RepeatedTerm { key: String },
     /// A section is cut from another section.
     #[error(
         "`{key}` is itself an off-axis section; give the whole surface as the parent, and one distance and azimuth"
     )]
-    NestedSection {
-        /// The key of the parent.
-        key: String,
-    },
-    /// The formula is not defined, or infinitely steep, at the centre of an off-axis section.
+    NestedSection { key: String },
+    /// The formula is not defined, or infinitely steep, at the centre of an off-axis section, in the parent's frame.
     #[error(
         "the parent surface is not defined at the section's centre ({x_mm} mm, {y_mm} mm); `surface.distance_mm` must be \
          less than the parent's radial extent"
     )]
-    SectionOffParent {
-        /// Centre in the parent's frame.
-        x_mm: f64,
-        /// Centre in the parent's frame.
-        y_mm: f64,
-    },
+    SectionOffParent { x_mm: f64, y_mm: f64 },
     /// In the parent's frame, the aperture misses the section.
     #[error(
         "the aperture does not hold the section's centre ({x_mm} mm, {y_mm} mm); with `frame = \"parent\"` the aperture is \
          given in the parent's frame: write `centre_mm = [{x_mm}, {y_mm}]`, or choose the frame \"shifted\" or \"tilted\""
     )]
-    SectionOutsideAperture {
-        /// Centre in the parent's frame.
-        x_mm: f64,
-        /// Centre in the parent's frame.
-        y_mm: f64,
-    },
+    SectionOutsideAperture { x_mm: f64, y_mm: f64 },
     /// The outline is none.
     #[error("in [aperture]: {0}")]
     Aperture(#[from] ApertureError),
@@ -94,70 +51,34 @@ pub enum DefinitionError {
         "the aperture reaches {reach_mm} mm from the axis, beyond `surface.normalisation_radius_mm`, which is {limit_mm} mm; \
          the polynomials mean nothing there: make the aperture smaller, or fit the coefficients to a larger radius"
     )]
-    BeyondNormalisation {
-        /// Distance from the axis to the farthest point of the aperture.
-        reach_mm: f64,
-        /// The normalisation radius.
-        limit_mm: f64,
-    },
+    BeyondNormalisation { reach_mm: f64, limit_mm: f64 },
     /// The formula has no value somewhere in the aperture.
     #[error(
         "the surface is not defined, or is infinitely steep, at ({x_mm} mm, {y_mm} mm) in the aperture; make the aperture \
          smaller, or check the radii and conic constants"
     )]
-    NotDefined {
-        /// Where.
-        x_mm: f64,
-        /// Where.
-        y_mm: f64,
-    },
+    NotDefined { x_mm: f64, y_mm: f64 },
     /// Both ways of choosing the spacing are given, or none.
     #[error("[sampling] takes either `spacing_mm` or `accuracy_nm`, and has {count} of them; keep one")]
-    Sampling {
-        /// How many are given.
-        count: usize,
-    },
+    Sampling { count: usize },
     /// The sampling would be too large.
     #[error(
         "a spacing of {spacing_mm} mm makes {nodes:.3e} nodes; at most {limit:.0e} are allowed: choose a coarser spacing, or \
          a less strict `accuracy_nm`"
     )]
-    TooManyNodes {
-        /// The spacing asked for.
-        spacing_mm: f64,
-        /// Nodes it would take.
-        nodes: f64,
-        /// Nodes allowed.
-        limit: f64,
-    },
+    TooManyNodes { spacing_mm: f64, nodes: f64, limit: f64 },
     /// The sampling would take too long.
     #[error(
         "{nodes:.3e} nodes of a formula and an outline of {terms} terms are {work:.1e} steps; at most {limit:.0e} are \
          allowed: choose a coarser spacing, fewer terms or fewer corners"
     )]
-    TooMuchWork {
-        /// Nodes of the sampling.
-        nodes: f64,
-        /// Terms of the formula, and corners of the outline.
-        terms: usize,
-        /// Their product.
-        work: f64,
-        /// What is allowed.
-        limit: f64,
-    },
-    /// No spacing is fine enough.
+    TooMuchWork { nodes: f64, terms: usize, work: f64, limit: f64 },
+    /// No spacing is fine enough; reached is twice the largest error found at the finest spacing tried.
     #[error(
         "an accuracy of {accuracy_nm} nm is out of reach: at a spacing of {spacing_mm} mm the error is still {reached_nm} nm; \
          ask for less, or keep the aperture away from where the surface becomes infinitely steep or has a kink"
     )]
-    AccuracyOutOfReach {
-        /// What was asked for.
-        accuracy_nm: f64,
-        /// Twice the largest error found at the finest spacing.
-        reached_nm: f64,
-        /// The finest spacing tried.
-        spacing_mm: f64,
-    },
+    AccuracyOutOfReach { accuracy_nm: f64, reached_nm: f64, spacing_mm: f64 },
 }
 
 impl DefinitionError {
