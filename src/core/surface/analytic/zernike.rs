@@ -208,62 +208,31 @@ mod tests {
 
     #[test]
     fn the_first_fifteen_indices_are_those_of_the_published_tables() {
-        let noll = [
-            (0, 0),
-            (1, 1),
-            (1, -1),
-            (2, 0),
-            (2, -2),
-            (2, 2),
-            (3, -1),
-            (3, 1),
-            (3, -3),
-            (3, 3),
-            (4, 0),
-            (4, 2),
-            (4, -2),
-            (4, 4),
-            (4, -4),
+        // Numbering and first index, then the degrees and the azimuthal orders.
+        let tables = [
+            (
+                ZernikeNumbering::Noll,
+                1,
+                [0, 1, 1, 2, 2, 2, 3, 3, 3, 3, 4, 4, 4, 4, 4],
+                [0, 1, -1, 0, -2, 2, -1, 1, -3, 3, 0, 2, -2, 4, -4],
+            ),
+            (
+                ZernikeNumbering::Ansi,
+                0,
+                [0, 1, 1, 2, 2, 2, 3, 3, 3, 3, 4, 4, 4, 4, 4],
+                [0, -1, 1, -2, 0, 2, -3, -1, 1, 3, -4, -2, 0, 2, 4],
+            ),
+            (
+                ZernikeNumbering::Fringe,
+                1,
+                [0, 1, 1, 2, 2, 2, 3, 3, 4, 3, 3, 4, 4, 5, 5],
+                [0, 1, -1, 0, 2, -2, 1, -1, 0, 3, -3, 2, -2, 1, -1],
+            ),
         ];
-        let ansi = [
-            (0, 0),
-            (1, -1),
-            (1, 1),
-            (2, -2),
-            (2, 0),
-            (2, 2),
-            (3, -3),
-            (3, -1),
-            (3, 1),
-            (3, 3),
-            (4, -4),
-            (4, -2),
-            (4, 0),
-            (4, 2),
-            (4, 4),
-        ];
-        let fringe = [
-            (0, 0),
-            (1, 1),
-            (1, -1),
-            (2, 0),
-            (2, 2),
-            (2, -2),
-            (3, 1),
-            (3, -1),
-            (4, 0),
-            (3, 3),
-            (3, -3),
-            (4, 2),
-            (4, -2),
-            (5, 1),
-            (5, -1),
-        ];
-        for i in 0..15 {
-            let index = i as u32;
-            assert_eq!(ZernikeNumbering::Noll.degree_and_order(index + 1), Some(noll[i]), "Noll {}", i + 1);
-            assert_eq!(ZernikeNumbering::Ansi.degree_and_order(index), Some(ansi[i]), "ANSI {i}");
-            assert_eq!(ZernikeNumbering::Fringe.degree_and_order(index + 1), Some(fringe[i]), "Fringe {}", i + 1);
+        for (numbering, first, degrees, orders) in tables {
+            for (index, term) in (first..).zip(degrees.into_iter().zip(orders)) {
+                assert_eq!(numbering.degree_and_order(index), Some(term), "{numbering:?} {index}");
+            }
         }
         // The last of each group, and the one that breaks the rule.
         for (index, term) in [(16, (6, 0)), (25, (8, 0)), (36, (10, 0)), (37, (12, 0)), (26, (5, 5)), (35, (9, -1))] {

@@ -8,104 +8,36 @@ fn is_about(found: f64, expected: f64) -> bool {
     (found - expected).abs() <= 1e-12 * expected.abs()
 }
 
-/// What a real map holds: columns and rows, spacing, measured samples, the first sample as (column, row, height), least and largest height; mm.
-struct Known {
-    file: &'static str,
-    size: [usize; 2],
-    spacing_mm: [f64; 2],
-    measured: usize,
-    sample: (usize, usize, f64),
-    range_mm: [f64; 2],
-}
+/// A file, and what its map holds: columns and rows, spacing, measured samples, a sample as (column, row, height), least and largest height; mm.
+type Known = (&'static str, [usize; 2], [f64; 2], usize, (usize, usize, f64), [f64; 2]);
 
+#[rustfmt::skip]
 const KNOWN: [Known; 8] = [
-    Known {
-        file: "openfmc/ISO5436-sample1.x3p",
-        size: [4, 4],
-        spacing_mm: [16.016, 16.016],
-        measured: 15,
-        sample: (0, 0, 486.219120804151),
-        range_mm: [-808.368571682830, 1047.59602566142],
-    },
-    Known {
-        file: "openfmc/ISO5436-sample1_bin.x3p",
-        size: [4, 4],
-        spacing_mm: [16.016, 16.016],
-        measured: 15,
-        sample: (3, 3, -215.696638464903),
-        range_mm: [-808.368571682830, 1047.59602566142],
-    },
+    ("openfmc/ISO5436-sample1.x3p", [4, 4], [16.016; 2], 15, (0, 0, 486.219120804151), [-808.368571682830, 1047.59602566142]),
+    ("openfmc/ISO5436-sample1_bin.x3p", [4, 4], [16.016; 2], 15, (3, 3, -215.696638464903), [-808.368571682830, 1047.59602566142]),
     // 16-bit integers of 1 mm, from -500 mm on.
-    Known {
-        file: "openfmc/ISO5436-sample4.x3p",
-        size: [4, 4],
-        spacing_mm: [16.016, 16.016],
-        measured: 15,
-        sample: (1, 2, 798.0),
-        range_mm: [-808.0, 1048.0],
-    },
-    Known {
-        file: "openfmc/ISO5436-sample4_bin.x3p",
-        size: [4, 4],
-        spacing_mm: [16.016, 16.016],
-        measured: 15,
-        sample: (1, 2, 798.0),
-        range_mm: [-808.0, 1048.0],
-    },
+    ("openfmc/ISO5436-sample4.x3p", [4, 4], [16.016; 2], 15, (1, 2, 798.0), [-808.0, 1048.0]),
+    ("openfmc/ISO5436-sample4_bin.x3p", [4, 4], [16.016; 2], 15, (1, 2, 798.0), [-808.0, 1048.0]),
     // A real measurement; infinity where nothing was seen, its sum in capital letters.
-    Known {
-        file: "openfmc/KautschukInfiniteFocus.x3p",
-        size: [860, 634],
-        spacing_mm: [0.002279984215, 0.002279794519],
-        measured: 539_944,
-        sample: (0, 0, f64::NAN),
-        range_mm: [-9.590286936145276e-3, 1.6094123566290364e-2],
-    },
+    ("openfmc/KautschukInfiniteFocus.x3p", [860, 634], [0.002279984215, 0.002279794519], 539_944, (0, 0, f64::NAN), [-9.590286936145276e-3, 1.6094123566290364e-2]),
     // An en dash in the revision, dates and types that are none.
-    Known {
-        file: "x3ptools/pyramid.x3p",
-        size: [5, 5],
-        spacing_mm: [1000.0, 1000.0],
-        measured: 25,
-        sample: (1, 1, 6000.0),
-        range_mm: [2000.0, 10_000.0],
-    },
-    Known {
-        file: "x3ptools/testing.x3p",
-        size: [30, 20],
-        spacing_mm: [27.4999996026357, 27.4999996026357],
-        measured: 600,
-        sample: (0, 0, f64::NAN),
-        range_mm: [-23.818902671337128, 8.962339721620083],
-    },
+    ("x3ptools/pyramid.x3p", [5, 5], [1000.0; 2], 25, (1, 1, 6000.0), [2000.0, 10_000.0]),
+    ("x3ptools/testing.x3p", [30, 20], [27.4999996026357; 2], 600, (0, 0, f64::NAN), [-23.818902671337128, 8.962339721620083]),
     // In a folder of its own beside what macOS left there; the first row is the uppermost one.
-    Known {
-        file: "x3ptools/sample-land.x3p",
-        size: [918, 256],
-        spacing_mm: [0.00258, 0.00258],
-        measured: 209_716,
-        sample: (0, 255, -0.05421108289738186),
-        range_mm: [-7.947348058223724e-2, 5.249858077149838e-2],
-    },
+    ("x3ptools/sample-land.x3p", [918, 256], [0.00258; 2], 209_716, (0, 255, -0.05421108289738186), [-7.947348058223724e-2, 5.249858077149838e-2]),
 ];
 
 #[test]
 #[ignore = "needs real measurements: REGRIND_DATA"]
 fn every_valid_x3p_map_is_read() {
     let folder = data("x3p-sdf-samples");
-    for known in KNOWN {
-        let file = known.file;
+    for (file, size, spacing_mm, samples, (column, row, height), range_mm) in KNOWN {
         let X3pFile::Map(map) = read_x3p(folder.join(file)).unwrap() else { panic!("{file} is a map") };
-        assert_eq!(([map.grid.columns, map.grid.rows], map.measured_count()), (known.size, known.measured), "{file}");
-        assert!(
-            (0..2).all(|k| is_about(map.grid.spacing_mm[k], known.spacing_mm[k])),
-            "{file}: {:?}",
-            map.grid.spacing_mm
-        );
+        assert_eq!(([map.grid.columns, map.grid.rows], map.measured_count()), (size, samples), "{file}");
+        assert!((0..2).all(|k| is_about(map.grid.spacing_mm[k], spacing_mm[k])), "{file}: {:?}", map.grid.spacing_mm);
         let measured = map.points();
         let (low, high) = measured.iter().fold((f64::MAX, f64::MIN), |(l, h), p| (l.min(p.z), h.max(p.z)));
-        assert!(is_about(low, known.range_mm[0]) && is_about(high, known.range_mm[1]), "{file}: {low} {high}");
-        let (column, row, height) = known.sample;
+        assert!(is_about(low, range_mm[0]) && is_about(high, range_mm[1]), "{file}: {low} {high}");
         let found = map.heights_mm[row * map.grid.columns + column];
         assert!(height.is_nan() || (found / height - 1.0).abs() < 1e-8, "{file}: {found}");
         assert_eq!(read_measured(folder.join(file)).unwrap(), measured);
