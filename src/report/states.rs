@@ -55,12 +55,16 @@ const STATES: [(&str, [f64; 2]); 15] = [
     ("Aborted", [1210.0, 770.0]),
 ];
 
+/// The states in which a run goes on, or can.
+const AT_WORK: [&str; 9] =
+    ["Idle", "Starting", "Execute", "Holding", "Held", "Unholding", "Suspending", "Suspended", "Unsuspending"];
+
 /// A frame around states that all have the same way out.
 struct Frame {
     corner: [f64; 2],
     size: [f64; 2],
-    /// What lies within.
-    around: &'static [&'static str],
+    /// What lies within besides the states at work.
+    and: &'static [&'static str],
     /// The two states that the way leads to, by way of the machines or at once.
     to: [&'static str; 2],
     label: [&'static str; 2],
@@ -70,43 +74,21 @@ const FRAMES: [Frame; 2] = [
     Frame {
         corner: [20.0, 78.0],
         size: [880.0, 512.0],
-        around: &[
-            "Idle",
-            "Starting",
-            "Execute",
-            "Holding",
-            "Held",
-            "Unholding",
-            "Suspending",
-            "Suspended",
-            "Unsuspending",
-        ],
+        and: &[],
         to: ["Stopping", "Stopped"],
         label: ["Stop", "Stop; no job is under way"],
     },
     Frame {
         corner: [8.0, 66.0],
         size: [1072.0, 644.0],
-        around: &[
-            "Idle",
-            "Starting",
-            "Execute",
-            "Holding",
-            "Held",
-            "Unholding",
-            "Suspending",
-            "Suspended",
-            "Unsuspending",
-            "Completing",
-            "Stopping",
-        ],
+        and: &["Completing", "Stopping"],
         to: ["Aborting", "Aborted"],
         label: ["Abort, Fault", "Abort; no machine was met"],
     },
 ];
 
 /// The phases and steps within `Execute`, and the middles of their boxes within the second drawing.
-const PHASES: [(&str, [f64; 2]); 21] = [
+const PHASES: [(&str, [f64; 2]); 22] = [
     ("Load", [0.0, 0.0]),
     ("Grind, Send", [1.0, 0.0]),
     ("Grind, Clear", [2.0, 0.0]),
@@ -128,10 +110,9 @@ const PHASES: [(&str, [f64; 2]); 21] = [
     ("Measure, Reconcile", [6.0, 2.0]),
     ("Measure, Discard", [3.0, 2.0]),
     ("Register", [1.0, 3.0]),
+    // What it makes leads back to the first step of the next pass.
+    ("Compensate", [0.0, 2.0]),
 ];
-
-/// The last phase stands apart: what it makes leads back to the first step of the next pass.
-const COMPENSATE: (&str, [f64; 2]) = ("Compensate", [0.0, 2.0]);
 
 /// Half of width and height of a box.
 const HALF_STATE: [f64; 2] = [62.0, 21.0];
@@ -139,7 +120,7 @@ const HALF_PHASE: [f64; 2] = [47.0, 18.0];
 
 /// A box with a name.
 struct Node {
-    name: String,
+    name: &'static str,
     middle: [f64; 2],
     half: [f64; 2],
 }
@@ -201,28 +182,26 @@ fn legend(svg: &mut Svg) {
 }
 
 fn draw_states(svg: &mut Svg, ways: &Ways) {
-    let nodes: Vec<Node> = STATES
-        .iter()
-        .map(|(name, middle)| Node { name: (*name).to_owned(), middle: *middle, half: HALF_STATE })
-        .collect();
+    let nodes = STATES.map(|(name, middle)| Node { name, middle, half: HALF_STATE });
     let mut ways = ways.clone();
     let mut taken = boxes(&nodes);
     for frame in &FRAMES {
+        let around = [&AT_WORK[..], frame.and].concat();
         let leads = |from: &&str| frame.to.iter().any(|to| ways.contains_key(&((**from).to_owned(), (*to).to_owned())));
         // A frame stands only for a way that all within it have.
-        if frame.around.iter().all(leads) {
-            ways.retain(|(from, to), _| !(frame.around.contains(&from.as_str()) && frame.to.contains(&to.as_str())));
+        if around.iter().all(leads) {
+            ways.retain(|(from, to), _| !(around.contains(&from.as_str()) && frame.to.contains(&to.as_str())));
             draw_frame(svg, frame, &mut taken);
         }
     }
     draw(svg, &nodes, &edges(&nodes, &ways), &mut taken);
     for node in &nodes {
-        let fill = match node.name.as_str() {
+        let fill = match node.name {
             "Complete" | "Stopped" | "Aborted" => "#cccccc",
             "Execute" => "#d1e5f0",
             _ => "#ffffff",
         };
-        draw_box(svg, node, fill, &[&node.name]);
+        draw_box(svg, node, fill, &[node.name]);
     }
 }
 
@@ -243,9 +222,7 @@ fn draw_frame(svg: &mut Svg, frame: &Frame, taken: &mut Vec<Taken>) {
 
 fn draw_phases(svg: &mut Svg, ways: &Ways) {
     let at = |[column, row]: [f64; 2]| [70.0 + 128.0 * column, CYCLE_TOP_PX + 80.0 + 100.0 * row];
-    let all = PHASES.iter().chain(std::iter::once(&COMPENSATE));
-    let nodes: Vec<Node> =
-        all.map(|(name, place)| Node { name: (*name).to_owned(), middle: at(*place), half: HALF_PHASE }).collect();
+    let nodes = PHASES.map(|(name, place)| Node { name, middle: at(place), half: HALF_PHASE });
     let mut taken = boxes(&nodes);
     draw(svg, &nodes, &edges(&nodes, ways), &mut taken);
     for node in &nodes {
