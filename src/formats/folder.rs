@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::error::FormatError;
-use super::registration::Draft;
+use super::registration::try_writing;
 
 /// A folder that can be written to; what was created for it goes away again unless it is kept.
 #[derive(Debug)]
@@ -30,8 +30,7 @@ impl ResultFolder {
             action: "creating the folder",
             source,
         })?;
-        // A draft that is not published leaves nothing behind.
-        drop(Draft::create(&folder.path.join("probe"))?);
+        try_writing(&folder.path)?;
         Ok(folder)
     }
 

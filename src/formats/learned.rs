@@ -5,6 +5,8 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use super::FormatError;
+use super::whole::read_whole;
 use regrind_core::compensation::{Correction, LearningState};
 
 /// The file in a run folder.
@@ -43,11 +45,10 @@ struct Head {
 /// Why nothing is learned from a file.
 #[derive(Debug, Error)]
 #[allow(missing_docs)]
+#[non_exhaustive]
 pub enum LearnedError {
-    #[error("{path}: {source}")]
-    Unreadable { path: PathBuf, source: std::io::Error },
-    #[error("{path}: {bytes} bytes, more than the {MOST_BYTES} of any run; it is not one that Regrind wrote")]
-    TooLarge { path: PathBuf, bytes: u64 },
+    #[error(transparent)]
+    File(#[from] FormatError),
     #[error("{path}: {why}; copy the run again from its archive")]
     Broken { path: PathBuf, why: String },
 }
@@ -64,34 +65,26 @@ impl Learned {
     /// A file that cannot be read, that is none of ours, or whose numbers cannot be.
     pub fn read(run: &Path, setting: &str, simulation: bool) -> Result<Option<(Self, Vec<u8>)>, LearnedError> {
         let path = run.join(LEARNED);
-        let bytes = match std::fs::metadata(&path) {
-            Ok(metadata) => metadata.len(),
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-            Err(source) => return Err(LearnedError::Unreadable { path, source }),
-        };
-        if bytes > MOST_BYTES {
-            return Err(LearnedError::TooLarge { path, bytes });
-        }
-        let text = match std::fs::read(&path) {
+        let broken = |why| LearnedError::Broken { path: path.clone(), why };
+        let text = match read_whole(&path, MOST_BYTES) {
             Ok(text) => text,
-            Err(source) => return Err(LearnedError::Unreadable { path, source }),
-        };
-        let broken = |path, why| Err(LearnedError::Broken { path, why });
-        // First whether it is meant at all: what another part left, or an earlier version, is in nobody's way.
-        match serde_json::from_slice::<Head>(&text) {
-            Ok(head) if head.layout != LAYOUT || head.simulation != simulation || head.setting != setting => {
+            Err(FormatError::Unreadable { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {
                 return Ok(None);
             }
-            Ok(_) => {}
-            Err(error) => return broken(path, error.to_string()),
-        }
-        let learned: Self = match serde_json::from_slice(&text) {
-            Ok(learned) => learned,
-            Err(error) => return broken(path, error.to_string()),
+            Err(FormatError::TooLarge { found, .. }) => {
+                return Err(broken(format!("{found} bytes, more than the {MOST_BYTES} of any run")));
+            }
+            Err(error) => return Err(error.into()),
         };
+        // First whether it is meant at all: what another part left, or an earlier version, is in nobody's way.
+        let head: Head = serde_json::from_slice(&text).map_err(|error| broken(error.to_string()))?;
+        if head.layout != LAYOUT || head.simulation != simulation || head.setting != setting {
+            return Ok(None);
+        }
+        let learned: Self = serde_json::from_slice(&text).map_err(|error| broken(error.to_string()))?;
         match learned.flaw() {
             None => Ok(Some((learned, text))),
-            Some(why) => broken(path, why),
+            Some(why) => Err(broken(why)),
         }
     }
 

@@ -16,6 +16,7 @@ use super::read::{Block, Refusal, Word, block};
 use super::write::UNCORRECTED;
 use super::{GcodeError, hex};
 use crate::registration::Draft;
+use crate::whole::read_whole;
 use regrind_core::compensation::path::{Field, Wanted, displaced};
 use regrind_core::geometry::{Point, Vector};
 
@@ -78,7 +79,7 @@ pub struct Amended {
 /// A program that has the map in it already, that belongs to another part or has another correction in it than the map takes up, or that
 /// holds what cannot be corrected; files.
 pub fn correct_program(base: &Path, out: &Path, amendment: &Amendment) -> Result<Amended, GcodeError> {
-    let bytes = crate::gcode::read_bytes(base, MOST_BYTES)?;
+    let bytes = read_whole(base, MOST_BYTES)?;
     let text = std::str::from_utf8(&bytes).map_err(|_| GcodeError::Program {
         path: base.to_owned(),
         what: "the program is no plain text".into(),

@@ -9,6 +9,7 @@ use crate::FormatError;
 /// Why a program could not be written, read or corrected. Lines count from 1.
 #[derive(Debug, Error)]
 #[allow(missing_docs)]
+#[non_exhaustive]
 pub enum GcodeError {
     #[error(transparent)]
     File(#[from] FormatError),

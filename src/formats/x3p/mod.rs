@@ -17,7 +17,6 @@ mod write;
 use std::io::{Cursor, Read};
 use std::path::Path;
 
-use md5::{Digest, Md5};
 use zip::ZipArchive;
 
 use super::error::{FormatError, excerpt};
@@ -184,7 +183,7 @@ fn points(path: &Path, places: impl Iterator<Item = [f64; 3]>) -> Result<X3pFile
 }
 
 fn check_sum(path: &Path, entry: &str, bytes: &[u8], expected: &str) -> Result<(), FormatError> {
-    let found: String = Md5::digest(bytes).iter().map(|b| format!("{b:02x}")).collect();
+    let found = write::sum(bytes);
     if found.eq_ignore_ascii_case(expected) {
         return Ok(());
     }

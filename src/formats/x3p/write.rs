@@ -9,7 +9,7 @@ use zip::{CompressionMethod, ZipWriter};
 
 use crate::error::FormatError;
 use crate::height_map::HeightMap;
-use crate::registration::Draft;
+use crate::registration::write_atomic;
 use regrind_core::compensation::ErrorMap;
 use regrind_core::geometry::Grid;
 
@@ -58,10 +58,7 @@ pub fn write_x3p(path: &Path, map: &HeightMap, record: &MapRecord) -> Result<(),
         action: "packing it",
         source: source.into(),
     };
-    let bytes = packed(map, record).map_err(failed)?;
-    let mut draft = Draft::create(path)?;
-    draft.write(&bytes)?;
-    draft.publish()
+    write_atomic(path, &packed(map, record).map_err(failed)?)
 }
 
 fn packed(map: &HeightMap, record: &MapRecord) -> Result<Vec<u8>, zip::result::ZipError> {
@@ -88,7 +85,7 @@ fn packed(map: &HeightMap, record: &MapRecord) -> Result<Vec<u8>, zip::result::Z
     Ok(zip.finish()?.into_inner())
 }
 
-fn sum(bytes: &[u8]) -> String {
+pub(super) fn sum(bytes: &[u8]) -> String {
     Md5::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
 }
 
