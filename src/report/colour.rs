@@ -53,7 +53,7 @@ impl ColourMap {
     }
 }
 
-/// How values become colours: a range, and perhaps a band of values that are within tolerance.
+/// How values become colours: a range, and perhaps a band of values that are in tolerance.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Tones {
     pub(super) colours: ColourMap,
@@ -63,7 +63,7 @@ pub(super) struct Tones {
     pub(super) tolerance: Option<f64>,
 }
 
-/// Share of an arm of the diverging map that a value within tolerance takes: no more than a tint.
+/// Share of an arm of the diverging map that a value in tolerance takes: no more than a tint.
 const TINT: f64 = 0.12;
 /// Share of an arm at which a value just beyond the tolerance stands: a step that is seen in print and with every eye.
 const STEP: f64 = 0.4;

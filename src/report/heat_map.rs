@@ -5,6 +5,7 @@ use std::path::Path;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
+use crate::formats::write_atomic;
 use crate::geometry::{Aperture, Grid};
 use crate::registration::{Deviation, PointStatus};
 
@@ -12,7 +13,7 @@ use super::axis::{Ruler, Scale, grouped, three_digits};
 use super::colour::{ColourMap, Tones};
 use super::raster::Raster;
 use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
-use super::{ReportError, save};
+use super::{ReportError, range};
 
 /// A map of scattered samples in colours, with its peak to valley and root mean square.
 #[derive(Clone, Debug)]
@@ -38,8 +39,7 @@ impl HeatMap {
     /// Too few samples, one that is not finite, or all at one place.
     pub fn new(title: &str, quantity: &str, unit: &str, samples: &[[f64; 3]]) -> Result<Self, ReportError> {
         let raster = Raster::new(title, samples)?;
-        let (low, high) =
-            samples.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), s| (l.min(s[2]), h.max(s[2])));
+        let [low, high] = range(samples.iter().map(|s| s[2]));
         let squares: f64 = samples.iter().map(|s| s[2] * s[2]).sum();
         let map = Self {
             title: title.into(),
@@ -62,8 +62,7 @@ impl HeatMap {
     /// # Errors
     /// As [`HeatMap::new`].
     pub fn of_lengths(title: &str, quantity: &str, samples_mm: &[[f64; 3]]) -> Result<Self, ReportError> {
-        let (low, high) =
-            samples_mm.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), s| (l.min(s[2]), h.max(s[2])));
+        let [low, high] = range(samples_mm.iter().map(|s| s[2]));
         let (per_mm, unit) = if high - low < 1e-4 { (1e6, "nm") } else { (1e3, "µm") };
         let samples: Vec<[f64; 3]> = samples_mm.iter().map(|&[x, y, value]| [x, y, value * per_mm]).collect();
         Ok(Self { per_mm, ..Self::new(title, quantity, unit, &samples)? })
@@ -83,8 +82,7 @@ impl HeatMap {
 
     /// Chooses the colours, and with them the range: symmetric about zero, or from the least value to the largest.
     pub fn with_colours(self, colours: ColourMap) -> Self {
-        let samples = self.raster.values.iter().copied().filter(|v| !v.is_nan());
-        let (low, high) = samples.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
+        let [low, high] = range(self.raster.values.iter().copied());
         let range = match colours {
             ColourMap::Diverging => [-low.abs().max(high.abs()), low.abs().max(high.abs())],
             ColourMap::Sequential => [low, high],
@@ -92,20 +90,6 @@ impl HeatMap {
         // A map of one value has no range of its own.
         let range = if range[1] > range[0] { range } else { [range[0] - 1.0, range[1] + 1.0] };
         Self { tones: Tones { colours, range, tolerance: None }, ..self }
-    }
-
-    /// Ends the colour bar at plus and minus a limit, so that several maps can be compared; what lies beyond takes the colour
-    /// of the end.
-    ///
-    /// Units: those of the map.
-    ///
-    /// # Errors
-    /// A limit that is not a finite number above 0.
-    pub fn with_limit(self, limit: f64) -> Result<Self, ReportError> {
-        if !(limit > 0.0 && limit.is_finite()) {
-            return Err(ReportError::ColourLimit { figure: self.title, limit });
-        }
-        Ok(Self { tones: Tones::symmetric(limit, self.tones.tolerance), ..self })
     }
 
     /// Draws what lies within plus and minus a tolerance as no more than a tint, and marks the band on the colour bar; where the
@@ -270,7 +254,7 @@ impl HeatMap {
     /// # Errors
     /// A file that cannot be written.
     pub fn save_svg(&self, path: &Path) -> Result<(), ReportError> {
-        save(path, self.to_svg()?.as_bytes())
+        Ok(write_atomic(path, self.to_svg()?.as_bytes())?)
     }
 
     /// Saves the bare pixels.
@@ -278,7 +262,7 @@ impl HeatMap {
     /// # Errors
     /// A file that cannot be written.
     pub fn save_png(&self, path: &Path) -> Result<(), ReportError> {
-        save(path, &self.to_png()?)
+        Ok(write_atomic(path, &self.to_png()?)?)
     }
 }
 
@@ -322,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_within_tolerance_is_a_tint_and_the_bar_says_so() {
+    fn what_is_in_tolerance_is_a_tint_and_the_bar_says_so() {
         let map = HeatMap::of_lengths("band", "height", &SMALL_MAP).unwrap().with_tolerance(1.5e-3).unwrap();
         assert_eq!((map.limit(), map.tones.tolerance), (2.0, Some(1.5)));
         let (_, pixels) = decoded(&map.to_png().unwrap());
@@ -383,14 +367,11 @@ mod tests {
     }
 
     #[test]
-    fn not_a_number_and_no_limit_are_refused() {
+    fn not_a_number_is_refused() {
         let mut samples = SMALL_MAP;
         samples[4][2] = f64::NAN;
         let error = HeatMap::of_lengths("map", "height", &samples).unwrap_err();
         assert!(matches!(error, ReportError::NotFinite { index: 4, what: "value", .. }), "{error}");
-        let map = HeatMap::of_lengths("map", "height", &SMALL_MAP).unwrap();
-        assert!(map.clone().with_limit(0.0).is_err() && map.clone().with_limit(f64::NAN).is_err());
-        assert!(map.with_limit(1.0).is_ok());
     }
 
     #[test]
@@ -409,6 +390,6 @@ mod tests {
         map.save_png(&folder.path().join("a.png")).unwrap();
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 2);
         let error = map.save_png(&folder.path().join("none/a.png")).unwrap_err();
-        assert!(matches!(error, ReportError::Unwritable { .. }), "{error}");
+        assert!(matches!(error, ReportError::File(_)), "{error}");
     }
 }

@@ -21,11 +21,11 @@ mod states;
 mod svg;
 mod words;
 
-use std::fs;
-use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use thiserror::Error;
+
+use crate::formats::{FormatError, write_atomic};
 
 pub use axis::Scale;
 pub use colour::ColourMap;
@@ -65,12 +65,9 @@ pub enum ReportError {
     /// The record of the run cannot be read or believed.
     #[error(transparent)]
     Record(#[from] crate::journal::JournalError),
-    /// A file on record could not be read.
-    #[error("{path}: cannot be read: {source}; check the folder and its permissions")]
-    Unreadable { path: PathBuf, source: io::Error },
-    /// The file could not be written.
-    #[error("{path}: cannot be written: {source}; check the folder, the permissions and the space left")]
-    Unwritable { path: PathBuf, source: io::Error },
+    /// A file could not be read or written.
+    #[error(transparent)]
+    File(#[from] FormatError),
 }
 
 /// Writes a text as a whole file.
@@ -78,20 +75,10 @@ pub enum ReportError {
 /// # Errors
 /// A file that cannot be written.
 pub fn save_text(path: &Path, text: &str) -> Result<(), ReportError> {
-    save(path, text.as_bytes())
+    Ok(write_atomic(path, text.as_bytes())?)
 }
 
-/// Writes a whole file under a temporary name and then gives it its own, so that no half figure is ever found.
-fn save(path: &Path, bytes: &[u8]) -> Result<(), ReportError> {
-    let failed = |source| ReportError::Unwritable { path: path.to_owned(), source };
-    let name = path.file_name().ok_or_else(|| failed(io::Error::from(io::ErrorKind::InvalidFilename)))?;
-    let mut hidden = std::ffi::OsString::from(".");
-    hidden.push(name);
-    hidden.push(format!(".{}.tmp", std::process::id()));
-    let temporary = path.with_file_name(hidden);
-    fs::write(&temporary, bytes).and_then(|()| fs::rename(&temporary, path)).map_err(|source| {
-        // The error that brought us here is the one to report.
-        let _ = fs::remove_file(&temporary);
-        failed(source)
-    })
+/// Returns the least and the largest of some values, of those that are numbers.
+fn range(values: impl Iterator<Item = f64>) -> [f64; 2] {
+    values.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| [low.min(value), high.max(value)])
 }

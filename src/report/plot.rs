@@ -2,9 +2,10 @@
 
 use std::path::Path;
 
+use super::ReportError;
 use super::axis::{Ruler, Scale};
 use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
-use super::{ReportError, save};
+use crate::formats::write_atomic;
 
 /// One axis of a plot.
 #[derive(Clone, Debug, Default)]
@@ -78,7 +79,7 @@ impl Plot {
     /// # Errors
     /// As [`Plot::to_svg`], and a file that cannot be written.
     pub fn save_svg(&self, path: &Path) -> Result<(), ReportError> {
-        save(path, self.to_svg()?.as_bytes())
+        Ok(write_atomic(path, self.to_svg()?.as_bytes())?)
     }
 
     /// Checks one coordinate of all points and lays their range on the page.

@@ -2,8 +2,9 @@
 
 use std::path::Path;
 
+use super::ReportError;
 use super::colour::Tones;
-use super::{ReportError, save};
+use crate::formats::write_atomic;
 
 /// Returns points, and triangles between them if there are any, as binary PLY with a colour and the deviation at every point.
 ///
@@ -63,7 +64,7 @@ pub fn save_coloured_ply(
     tolerance_mm: Option<f64>,
     remarks: &[&str],
 ) -> Result<(), ReportError> {
-    save(path, &coloured_ply(title, rows_mm, triangles, tolerance_mm, remarks)?)
+    Ok(write_atomic(path, &coloured_ply(title, rows_mm, triangles, tolerance_mm, remarks)?)?)
 }
 
 fn header(title: &str, points: usize, triangles: usize, tones: &Tones, remarks: &[&str]) -> String {

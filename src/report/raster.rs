@@ -1,6 +1,6 @@
 //! From scattered samples to pixels.
 
-use super::ReportError;
+use super::{ReportError, range};
 use crate::geometry::Grid;
 
 /// A picture of values: NaN where nothing is known.
@@ -30,7 +30,7 @@ impl Raster {
     /// A pixel is about as wide as the samples are apart. Gaps within the cloud are filled from their neighbours.
     pub(super) fn new(title: &str, samples: &[[f64; 3]]) -> Result<Self, ReportError> {
         check(title, samples)?;
-        let (low, size) = bounds(samples);
+        let (low, size) = extent(samples);
         let points = samples.len();
         let spacing = spacing(size, points).max(size[0].max(size[1]) / (MOST_PIXELS - 1) as f64);
         if !(spacing > 0.0 && spacing.is_finite()) {
@@ -137,10 +137,9 @@ fn spacing([width, height]: [f64; 2], points: usize) -> f64 {
     (sum + (sum * sum + 4.0 * n * width * height).sqrt()) / (2.0 * n)
 }
 
-fn bounds(samples: &[[f64; 3]]) -> ([f64; 2], [f64; 2]) {
-    let axis =
-        |k: usize| samples.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), s| (s[k].min(l), s[k].max(h)));
-    let ((x0, x1), (y0, y1)) = (axis(0), axis(1));
+/// The least x and y, and how far it is to the largest.
+fn extent(samples: &[[f64; 3]]) -> ([f64; 2], [f64; 2]) {
+    let [[x0, x1], [y0, y1]] = [0, 1].map(|k| range(samples.iter().map(|s| s[k])));
     ([x0, y0], [x1 - x0, y1 - y0])
 }
 

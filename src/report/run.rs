@@ -13,11 +13,12 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::Value;
 
+use super::ReportError;
 use super::axis::three_digits;
 use super::svg::escaped;
 use super::words::{ending_words, words};
-use super::{ReportError, save};
 use crate::cell::{Alarm, Command, Ending, Event, Figures, Judgement};
+use crate::formats::{FormatError, write_atomic};
 use crate::journal::{Kind, Reader, Record, Verified, verify};
 
 /// The report in a run folder.
@@ -71,7 +72,7 @@ pub fn write_run_report(folder: &Path) -> Result<PathBuf, ReportError> {
         story.take(record?);
     }
     let path = folder.join(RUN_REPORT);
-    save(&path, story.html(folder, &verified)?.as_bytes())?;
+    write_atomic(&path, story.html(folder, &verified)?.as_bytes())?;
     Ok(path)
 }
 
@@ -212,9 +213,9 @@ impl Story {
         for (number, cycle) in &self.cycles {
             let Some(name) = &cycle.form else { continue };
             let path = folder.join(name);
-            let bytes = fs::read(&path).map_err(|source| ReportError::Unreadable { path: path.clone(), source })?;
+            let bytes = fs::read(&path).map_err(|source| FormatError::Unreadable { path: path.clone(), source })?;
             let figures: Value = serde_json::from_slice(&bytes)
-                .map_err(|source| ReportError::Unreadable { path, source: io::Error::from(source) })?;
+                .map_err(|source| FormatError::Unreadable { path, source: io::Error::from(source) })?;
             cycles.push((number, figures));
         }
         let listed = |figures: &Value| figures["figures"].as_array().cloned().unwrap_or_default();
@@ -258,7 +259,7 @@ impl Story {
         for (number, cycle) in &self.cycles {
             let Some(name) = &cycle.picture else { continue };
             let path = folder.join(name);
-            let bytes = fs::read(&path).map_err(|source| ReportError::Unreadable { path, source })?;
+            let bytes = fs::read(&path).map_err(|source| FormatError::Unreadable { path, source })?;
             let data = STANDARD.encode(bytes);
             let _ = writeln!(
                 html,
