@@ -48,7 +48,7 @@ pub use registration::{
 pub use sdf::{parse_sdf, read_sdf};
 pub use stl::{StlFile, parse_stl, read_stl};
 pub use whole::read_whole;
-pub use x3p::{MapRecord, X3pFile, parse_x3p, read_x3p, write_error_map_x3p, write_x3p};
+pub use x3p::{MapRecord, X3pFile, escaped, parse_x3p, read_x3p, write_error_map_x3p, write_x3p};
 
 use height_map::MapFormat;
 use measured_map::map_format;

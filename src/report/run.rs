@@ -15,10 +15,9 @@ use serde_json::Value;
 
 use super::ReportError;
 use super::axis::three_digits;
-use super::svg::escaped;
 use super::words::{ending_words, words};
 use crate::cell::{Alarm, Command, Ending, Event, Figures, Judgement};
-use crate::formats::{FormatError, write_atomic};
+use crate::formats::{FormatError, escaped, write_atomic};
 use crate::journal::{Kind, Reader, Record, Verified, verify};
 
 /// The report in a run folder.

@@ -3,6 +3,7 @@
 use std::fmt::Write;
 
 use super::axis::Tick;
+use crate::formats::escaped;
 
 /// Ink of axes and text.
 pub(super) const INK: &str = "#222222";
@@ -201,21 +202,6 @@ impl Svg {
         }
         self.put(format_args!("</linearGradient></defs>\n"));
     }
-}
-
-/// Replaces what XML reserves or forbids.
-pub(super) fn escaped(text: &str) -> String {
-    let mut out = String::with_capacity(text.len());
-    for c in text.chars() {
-        match c {
-            '<' => out.push_str("&lt;"),
-            '>' => out.push_str("&gt;"),
-            '&' => out.push_str("&amp;"),
-            c if c.is_control() || ('\u{fffe}'..='\u{ffff}').contains(&c) => out.push('\u{fffd}'),
-            c => out.push(c),
-        }
-    }
-    out
 }
 
 #[cfg(test)]

@@ -98,8 +98,7 @@ pub struct ErrorMap {
 ///
 /// Shapes: readings in any order. Frames: x and y of the model frame. Units: millimetres. Equation: weighted least squares of a
 /// polynomial at every node with weights exp(-pi (r / (alpha cutoff))^2), see [`Order::alpha`]; or the smoothing spline. A cut-off that is
-/// short for the wheel or the distance of the points is no error but is said in [`ErrorMap::advice`]: [`check_cutoff`] refuses it
-/// before anything is measured.
+/// short for the wheel or the distance of the points is no error but is said in [`ErrorMap::advice`].
 ///
 /// # Errors
 /// Deviations that are not finite, too few of them for the cut-off, options out of range, and a grid that cannot be.

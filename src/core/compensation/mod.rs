@@ -37,5 +37,5 @@ pub use parameters::{
     Contact, Parameter, ParameterError, ParameterKind, ParameterOptions, Parameters, WheelTerm, parameters,
 };
 pub use response::{Response, Sense, response};
-pub use sampling::{check_cutoff, contact_width_mm, least_cutoff_mm, point_spacing_mm};
+pub use sampling::{contact_width_mm, point_spacing_mm};
 pub use spline::{Roughness, SplineError};

@@ -17,19 +17,13 @@ pub fn contact_width_mm(wheel_radius_mm: f64, depth_mm: f64) -> f64 {
     2.0 * (2.0 * wheel_radius_mm * depth_mm - depth_mm * depth_mm).max(0.0).sqrt()
 }
 
-/// Returns the least cut-off of a map in millimetres: twice the larger of contact width and distance of the points.
-///
-/// A shorter wave is either not seen by the points or cannot be ground by the wheel.
-pub fn least_cutoff_mm(contact_width_mm: f64, point_spacing_mm: f64) -> f64 {
-    2.0 * contact_width_mm.max(point_spacing_mm)
-}
-
-/// Compares a cut-off with [`least_cutoff_mm`].
+/// Compares a cut-off with twice the larger of contact width and distance of the points: a shorter wave is either not seen by the points or
+/// cannot be ground by the wheel.
 ///
 /// # Errors
 /// A cut-off below it, with what limits it and the remedy.
-pub fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_mm: f64) -> Result<(), MapError> {
-    let least_mm = least_cutoff_mm(contact_width_mm, point_spacing_mm);
+pub(super) fn check_cutoff(cutoff_mm: f64, contact_width_mm: f64, point_spacing_mm: f64) -> Result<(), MapError> {
+    let least_mm = 2.0 * contact_width_mm.max(point_spacing_mm);
     // A tenth is the uncertainty of a spacing that is estimated.
     if cutoff_mm >= 0.9 * least_mm {
         return Ok(());
@@ -109,8 +103,8 @@ mod tests {
     fn the_cutoff_must_suit_wheel_and_points() {
         let contact = contact_width_mm(12.5, 0.02);
         assert!(check_cutoff(5.0, contact, 2.14).is_ok());
-        assert_eq!(least_cutoff_mm(contact, 2.14), 4.28);
-        assert!(matches!(check_cutoff(3.0, contact, 2.14), Err(MapError::CutoffBelowSpacing { .. })));
+        let Err(MapError::CutoffBelowSpacing { least_mm, .. }) = check_cutoff(3.0, contact, 2.14) else { panic!() };
+        assert_eq!(least_mm, 4.28);
         assert!(matches!(check_cutoff(2.0, contact, 0.5), Err(MapError::CutoffBelowContact { .. })));
     }
 }

@@ -25,7 +25,7 @@ pub struct GridOrder {
 
 impl GridOrder {
     /// Whether the points already come row by row, x fastest, without a hole.
-    pub fn is_in_order(&self) -> bool {
+    pub(crate) fn is_in_order(&self) -> bool {
         self.holes == 0 && self.point_at.iter().enumerate().all(|(node, &point)| node as u32 == point)
     }
 }

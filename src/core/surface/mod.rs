@@ -37,6 +37,7 @@ pub(crate) use facet::side_by_side;
 pub(crate) use feature::{Feature, features};
 pub(crate) use four_feet::FourFeet;
 pub use nominal::{Nominal, NominalKind};
-pub use offset::{Distance, Foot, Lookup, OffsetSurface, Place};
+pub(crate) use offset::Lookup;
+pub use offset::{Distance, Foot, OffsetSurface, Place};
 pub use projection::Projection;
 pub(crate) use projection::{is_line, principal_axes};

@@ -230,7 +230,7 @@ impl Nominal {
     }
 
     /// Returns the rms distance of the points from their best plane, in millimetres: how much shape there is to register by.
-    pub fn relief_mm(&self) -> f64 {
+    pub(crate) fn relief_mm(&self) -> f64 {
         self.extent_mm()[1]
     }
 

@@ -22,7 +22,7 @@ pub enum Distance {
 
 /// Which facet a point belongs to.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Lookup {
+pub(crate) enum Lookup {
     /// The one that holds the foot of its perpendicular.
     #[default]
     Foot,
@@ -110,7 +110,7 @@ impl<'a> OffsetSurface<'a> {
     }
 
     /// Chooses which facet a point belongs to.
-    pub fn with_lookup(self, lookup: Lookup) -> Self {
+    pub(crate) fn with_lookup(self, lookup: Lookup) -> Self {
         Self { lookup, ..self }
     }
 

@@ -25,7 +25,7 @@ use super::number::is_believable;
 use super::whole::{MOST_BYTES, open};
 use document::{Axis, Extent, Main, Record, Samples, Sealed, is_sum};
 use regrind_core::geometry::{Grid, Point};
-pub use write::{MapRecord, write_error_map_x3p, write_x3p};
+pub use write::{MapRecord, escaped, write_error_map_x3p, write_x3p};
 
 /// Largest `main.xml`, heights included.
 const MOST_XML_BYTES: u64 = 64 << 20;

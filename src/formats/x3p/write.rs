@@ -119,8 +119,8 @@ fn main_xml(map: &HeightMap, record: &MapRecord, data: &str, mask: &str) -> Stri
     )
 }
 
-/// Replaces what XML reserves or forbids.
-fn escaped(text: &str) -> String {
+/// Replaces what XML and HTML reserve or forbid in a text.
+pub fn escaped(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
         match c {

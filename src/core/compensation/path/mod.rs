@@ -31,5 +31,5 @@ pub use options::{PathMode, PathOptions, Pattern, TrackSpacing};
 pub use summary::{Limits, Peak, Summary};
 pub use tool_path::ToolPath;
 pub use walk::{Move, Moves};
-pub use wanted::{Bend, Contact, Wanted, displaced, spline_of};
+pub use wanted::{Contact, Wanted, displaced, spline_of};
 pub use wheel::Wheel;

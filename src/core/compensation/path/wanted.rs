@@ -32,7 +32,7 @@ pub struct Contact {
 
 /// How the wanted surface bends at a place.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Bend {
+pub(super) struct Bend {
     /// The place and its normal.
     pub contact: Contact,
     /// Two unit vectors along the surface, at right angles: along x, and across.
@@ -85,7 +85,7 @@ impl Wanted {
     }
 
     /// Returns how the surface bends at a place, from differences of its normals over a thousandth of a cell.
-    pub fn bend(&self, place_mm: [f64; 2]) -> Bend {
+    pub(super) fn bend(&self, place_mm: [f64; 2]) -> Bend {
         let (point, [by_x, by_y]) = self.tangents(place_mm);
         let normal = by_x.cross(&by_y).normalize();
         let first = by_x.normalize();
@@ -118,7 +118,7 @@ impl Wanted {
     }
 
     /// Returns the shorter distance of the nodes of both fields, in millimetres: nothing of the surface is finer.
-    pub fn grain_mm(&self) -> f64 {
+    pub(super) fn grain_mm(&self) -> f64 {
         let [a, b] = [self.nominal.spacing_mm(), self.correction.spacing_mm()].map(|[x, y]| x.min(y));
         a.min(b)
     }

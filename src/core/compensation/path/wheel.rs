@@ -21,7 +21,7 @@ use crate::geometry::{Point, Vector};
 use super::wanted::Contact;
 
 /// The least angle between the normal and the spindle of a rim or a ring, sine: nearer, the place of contact runs around the wheel.
-pub const LEAST_LEAN: f64 = 0.035;
+const LEAST_LEAN: f64 = 0.035;
 
 /// A wheel.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -72,7 +72,7 @@ impl Wheel {
     }
 
     /// Returns the curvatures of the wheel where it touches, 1/mm, and the direction of the first: around the spindle, and across.
-    pub fn curvatures(&self, normal: &Vector) -> ([f64; 2], Vector) {
+    pub(super) fn curvatures(&self, normal: &Vector) -> ([f64; 2], Vector) {
         match self {
             Self::Sphere { radius_mm } => ([1.0 / radius_mm; 2], normal.cross(&Vector::y()).normalize()),
             Self::Torus { ring_mm, tube_mm, spindle } | Self::Cup { ring_mm, tube_mm, spindle } => {

@@ -327,14 +327,6 @@ impl DefinedSurface {
     }
 }
 
-impl TryFrom<&SurfaceDefinition> for DefinedSurface {
-    type Error = DefinitionError;
-
-    fn try_from(written: &SurfaceDefinition) -> Result<Self, DefinitionError> {
-        written.resolve()
-    }
-}
-
 /// Adds line and column to an error of value, where its key stands in the text; else the error stays as it is.
 fn at_its_place(text: &str, error: DefinitionError) -> DefinitionError {
     let Some(span) = error.key().and_then(|key| place_of(text, &key)) else { return error };

@@ -20,7 +20,7 @@ const MOST_COEFFICIENTS: usize = 200;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Qcon {
     base: Conic,
-    normalisation_radius_mm: f64,
+    pub(super) normalisation_radius_mm: f64,
     coefficients_mm: Vec<[f64; 1]>,
 }
 
@@ -53,11 +53,6 @@ impl Qcon {
         Some((sag + v * v * sum, slope + 2.0 * v * (sum + v * sum_slope) * per_mm2))
     }
 
-    /// The radius of the disc on which the polynomials are meant.
-    pub fn normalisation_radius_mm(&self) -> f64 {
-        self.normalisation_radius_mm
-    }
-
     /// How many terms an evaluation sums.
     pub(super) fn terms(&self) -> usize {
         1 + self.coefficients_mm.len()
@@ -80,7 +75,7 @@ impl TryFrom<&QconDefinition> for Qcon {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Qbfs {
     sphere: Conic,
-    normalisation_radius_mm: f64,
+    pub(super) normalisation_radius_mm: f64,
     /// Coefficients of the polynomials P_m of [`p_coefficients`], in millimetres.
     p_coefficients_mm: Vec<f64>,
 }
@@ -114,11 +109,6 @@ impl Qbfs {
         let bump_slope = ((1.0 - 2.0 * v) * sum + v * (1.0 - v) * sum_slope) * per_mm2;
         let steeper = 0.5 * c * c * bump / (cosine * cosine);
         Some((sag + bump / cosine, slope + (bump_slope + steeper) / cosine))
-    }
-
-    /// The radius of the disc on which the polynomials are meant.
-    pub fn normalisation_radius_mm(&self) -> f64 {
-        self.normalisation_radius_mm
     }
 
     /// How many terms an evaluation sums.

@@ -96,9 +96,9 @@ impl AnalyticSurface {
     /// The radius of the disc on which the polynomials are meant, if they are meant on a disc.
     fn normalisation_radius_mm(&self) -> Option<f64> {
         match self {
-            Self::Zernike(zernike) => Some(zernike.normalisation_radius_mm()),
-            Self::Qcon(qcon) => Some(qcon.normalisation_radius_mm()),
-            Self::Qbfs(qbfs) => Some(qbfs.normalisation_radius_mm()),
+            Self::Zernike(zernike) => Some(zernike.normalisation_radius_mm),
+            Self::Qcon(qcon) => Some(qcon.normalisation_radius_mm),
+            Self::Qbfs(qbfs) => Some(qbfs.normalisation_radius_mm),
             Self::OffAxis(section) => section.parent().normalisation_radius_mm(),
             _ => None,
         }

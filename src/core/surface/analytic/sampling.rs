@@ -89,7 +89,7 @@ impl DefinedSurface {
     ///
     /// # Errors
     /// An accuracy that is not positive, or one that no spacing reaches.
-    pub fn spacing_for_accuracy(&self, accuracy_mm: f64) -> Result<f64, DefinitionError> {
+    fn spacing_for_accuracy(&self, accuracy_mm: f64) -> Result<f64, DefinitionError> {
         error::positive("sampling.accuracy_mm", accuracy_mm)?;
         let [least, most] = self.aperture().bounds();
         let places = self.aperture().places_mm();

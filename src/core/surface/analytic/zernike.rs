@@ -67,7 +67,7 @@ pub enum ZernikeNormalisation {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Zernike {
     base: Conic,
-    normalisation_radius_mm: f64,
+    pub(super) normalisation_radius_mm: f64,
     /// Azimuthal order m and, for k = (n - m) / 2 from 0 up, the coefficients of cosine and sine in millimetres.
     orders: Vec<(u32, Vec<[f64; 2]>)>,
 }
@@ -116,11 +116,6 @@ impl Zernike {
             gv += radial * v + order[0] * (sine.0 * below[0] - cosine.0 * below[1]);
         }
         Some((sag + z, [2.0 * x * slope + gu * scale, 2.0 * y * slope + gv * scale]))
-    }
-
-    /// The radius of the disc on which the polynomials are meant.
-    pub fn normalisation_radius_mm(&self) -> f64 {
-        self.normalisation_radius_mm
     }
 
     /// How many terms an evaluation sums.

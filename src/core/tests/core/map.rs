@@ -266,28 +266,20 @@ fn scatter_over_stated(readings: &[Sample], options: &MapOptions, noise_mm: f64,
 }
 
 #[test]
-fn the_uncertainty_of_the_filter_is_the_scatter() {
-    for (readings, options) in [
-        (trial(form), plain(5.0, 2.0)),
-        (strewn(1500, [40.0, 30.0], 4, form), MapOptions { order: Order::Quadric, ..plain(9.0, 2.0) }),
+fn the_stated_uncertainty_is_the_scatter() {
+    let quadric = MapOptions { order: Order::Quadric, ..plain(9.0, 2.0) };
+    let spline = |cutoff_mm| MapOptions { smoothing: Smoothing::Spline, ..plain(cutoff_mm, 2.0) };
+    for (name, readings, options, of_a_point) in [
+        ("filter", trial(form), plain(5.0, 2.0), 0.15),
+        ("quadric filter", strewn(1500, [40.0, 30.0], 4, form), quadric, 0.15),
+        ("spline", trial(form), spline(20.0), 0.1),
+        ("spline on a few", strewn(700, [40.0, 30.0], 4, form), spline(8.0), 0.1),
     ] {
         let (ratio, outside, point) = scatter_over_stated(&readings, &options, 3e-4, 200);
-        println!("filter: scatter over stated {ratio}, outside {outside}, point {point}");
-        assert!((ratio - 1.0).abs() < 0.1, "scatter over stated {ratio}");
-        assert!(outside < 0.02, "{outside} of the nodes are off by more than 20 %");
-        assert!((point - 1.0).abs() < 0.15, "scatter of a point {point}");
-    }
-}
-
-#[test]
-fn the_uncertainty_of_the_spline_is_the_scatter() {
-    for (readings, cutoff_mm) in [(trial(form), 20.0), (strewn(700, [40.0, 30.0], 4, form), 8.0)] {
-        let options = MapOptions { smoothing: Smoothing::Spline, ..plain(cutoff_mm, 2.0) };
-        let (ratio, outside, point) = scatter_over_stated(&readings, &options, 3e-4, 200);
-        println!("spline: scatter over stated {ratio}, outside {outside}, point {point}");
-        assert!((ratio - 1.0).abs() < 0.1, "scatter over stated {ratio}");
-        assert!(outside < 0.02, "{outside} of the nodes are off by more than 20 %");
-        assert!((point - 1.0).abs() < 0.1, "scatter of a point {point}");
+        println!("{name}: scatter over stated {ratio}, outside {outside}, point {point}");
+        assert!((ratio - 1.0).abs() < 0.1, "{name}: scatter over stated {ratio}");
+        assert!(outside < 0.02, "{name}: {outside} of the nodes are off by more than 20 %");
+        assert!((point - 1.0).abs() < of_a_point, "{name}: scatter of a point {point}");
     }
 }
 
