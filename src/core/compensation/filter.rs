@@ -19,7 +19,7 @@ use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::geometry::Grid;
+use crate::geometry::{Grid, bounds};
 
 /// Width of the spreading Gaussian in steps.
 const SPREAD: f64 = 0.75;
@@ -500,10 +500,7 @@ pub(super) struct Trend {
 impl Trend {
     /// Fits a polynomial of a degree up to 2, or of a lower one where the readings have no such.
     pub fn fit(places: &[[f64; 2]], values: &[f64], degree: usize) -> Self {
-        let fold = |pick: fn(f64, f64) -> f64, start: f64| {
-            places.iter().fold([start; 2], |b, p| [pick(b[0], p[0]), pick(b[1], p[1])])
-        };
-        let (low, high) = (fold(f64::min, f64::INFINITY), fold(f64::max, f64::NEG_INFINITY));
+        let [low, high] = bounds(places.iter().copied());
         let middle = [0, 1].map(|k| 0.5 * (low[k] + high[k]));
         let size = 0.5 * (high[0] - low[0]).max(high[1] - low[1]).max(f64::MIN_POSITIVE);
         let mut trend = Self { middle, size, terms: Vec::new() };

@@ -25,7 +25,7 @@ use nalgebra::{DMatrix, DVector};
 use serde::Serialize;
 use thiserror::Error;
 
-use crate::geometry::{Point, Vector};
+use crate::geometry::{Point, Vector, bounds};
 
 /// Fewer points than this say nothing about ten unknowns.
 const LEAST_POINTS: usize = 30;
@@ -259,9 +259,7 @@ fn candidates(contacts: &[Contact], progress: Option<&[f64]>, term: WheelTerm) -
         WheelTerm::InHeight => 1.0 - 1.0 / c.normal.z,
         WheelTerm::AlongNormal => c.normal.z - 1.0,
     };
-    let (low, high) = contacts
-        .iter()
-        .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), c| (low.min(c.point.y), high.max(c.point.y)));
+    let [[_, low], [_, high]] = over_xy(contacts);
     let along_y = |c: &Contact| (c.point.y - low) / (high - low).max(f64::MIN_POSITIVE);
     let wear = progress.map_or_else(|| each(&along_y), <[f64]>::to_vec);
     vec![
@@ -271,6 +269,10 @@ fn candidates(contacts: &[Contact], progress: Option<&[f64]>, term: WheelTerm) -
         Column { kind: ParameterKind::SettingY, values: each(&|c| -c.normal.y) },
         Column { kind: ParameterKind::Wear, values: wear },
     ]
+}
+
+fn over_xy(contacts: &[Contact]) -> [[f64; 2]; 2] {
+    bounds(contacts.iter().map(|c| [c.point.x, c.point.y]))
 }
 
 /// Orthonormal columns.
@@ -442,10 +444,7 @@ fn jackknife(columns: &[Vec<f64>], deviations: &[f64], all: &Sums, values: &DVec
 
 /// Cuts the surface into tiles of several sizes: for each the tile of every point.
 fn tilings(contacts: &[Contact]) -> Vec<Vec<u32>> {
-    let fold = |pick: fn(f64, f64) -> f64, start: f64| {
-        contacts.iter().fold([start; 2], |b, c| [pick(b[0], c.point.x), pick(b[1], c.point.y)])
-    };
-    let (low, high) = (fold(f64::min, f64::INFINITY), fold(f64::max, f64::NEG_INFINITY));
+    let [low, high] = over_xy(contacts);
     let size = (high[0] - low[0]).max(high[1] - low[1]).max(f64::MIN_POSITIVE);
     let cut = |tiles: f64| {
         let counts = [0, 1].map(|k| ((high[k] - low[k]) / size * tiles).ceil().max(1.0));

@@ -7,8 +7,8 @@ use super::basis::Basis;
 use super::error::check;
 use super::fit::{Fit, fit_most};
 use super::iso::{Iso10110, iso_10110};
-use super::removed::{Removed, bounds, pv, without};
-use crate::geometry::{Aperture, Sample};
+use super::removed::{Removed, pv, without};
+use crate::geometry::{Aperture, Sample, bounds};
 
 /// Terms of the fit in PVr (Evans 2009: the first 36 Fringe Zernike polynomials).
 const PVR_TERMS: usize = 36;
@@ -111,7 +111,7 @@ pub fn figures(samples: &[Sample], options: &FormOptions) -> Result<Figures, For
     check(samples, 4)?;
     let aperture = match &options.aperture {
         Some(aperture) => aperture.clone(),
-        None => rectangle(bounds(samples))?,
+        None => rectangle(bounds(samples.iter().map(|s| s.at_mm)))?,
     };
     let mut removed = options.removed.clone();
     removed.sort();
@@ -147,12 +147,8 @@ pub fn figures(samples: &[Sample], options: &FormOptions) -> Result<Figures, For
 }
 
 fn rectangle([low, high]: [[f64; 2]; 2]) -> Result<Aperture, FormError> {
-    let (width_mm, height_mm) = (high[0] - low[0], high[1] - low[1]);
-    if !(width_mm > 0.0 && height_mm > 0.0) {
-        return Err(FormError::NoArea);
-    }
-    let centre_mm = [0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1])];
-    Ok(Aperture::Rectangle { centre_mm, width_mm, height_mm })
+    let has_area = (0..2).all(|k| high[k] - low[k] > 0.0);
+    if has_area { Ok(Aperture::between([low, high])) } else { Err(FormError::NoArea) }
 }
 
 fn robust_pv(fit: &Fit, samples: &[Sample]) -> Result<RobustPv, FormError> {

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::FormError;
 use super::error::check;
 use super::fit::solve;
-use crate::geometry::Sample;
+use crate::geometry::{Sample, bounds};
 
 /// A simple form that is taken off before anything else.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -42,7 +42,7 @@ impl Removed {
 
 /// Takes simple forms off by least squares, all at once.
 pub(super) fn without(removed: &[Removed], samples: &[Sample]) -> Result<Vec<Sample>, FormError> {
-    let [low, high] = bounds(samples);
+    let [low, high] = bounds(samples.iter().map(|s| s.at_mm));
     let middle: [f64; 2] = std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
     let half = 0.5 * (high[0] - low[0]).max(high[1] - low[1]);
     if removed.is_empty() {
@@ -88,14 +88,6 @@ pub(super) fn without(removed: &[Removed], samples: &[Sample]) -> Result<Vec<Sam
 /// How many terms a form has.
 fn values_of(form: Removed) -> usize {
     if matches!(form, Removed::Tilt | Removed::Astigmatism | Removed::Coma) { 2 } else { 1 }
-}
-
-/// Returns the smallest rectangle along the axes that holds all samples: [[x least, y least], [x most, y most]].
-pub(super) fn bounds(samples: &[Sample]) -> [[f64; 2]; 2] {
-    samples.iter().fold([[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]], |[low, high], s| {
-        let [x, y] = s.at_mm;
-        [[low[0].min(x), low[1].min(y)], [high[0].max(x), high[1].max(y)]]
-    })
 }
 
 /// Returns the largest less the least value.

@@ -105,6 +105,12 @@ impl ApertureError {
 }
 
 impl Aperture {
+    /// Returns the rectangle between two corners, the least and the largest.
+    pub(crate) fn between([low, high]: [[f64; 2]; 2]) -> Self {
+        let centre_mm = [0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1])];
+        Self::Rectangle { centre_mm, width_mm: high[0] - low[0], height_mm: high[1] - low[1] }
+    }
+
     /// Checks that the numbers describe an outline with an inside.
     ///
     /// # Errors
@@ -189,11 +195,7 @@ impl Aperture {
             Self::Circle { centre_mm, radius_mm } => around(*centre_mm, *radius_mm, *radius_mm),
             Self::Ellipse { centre_mm, semi_axes_mm: [a, b] } => around(*centre_mm, *a, *b),
             Self::Annulus { centre_mm, outer_radius_mm, .. } => around(*centre_mm, *outer_radius_mm, *outer_radius_mm),
-            Self::Polygon { corners_mm } => {
-                corners_mm.iter().fold([[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]], |[[x0, y0], [x1, y1]], &[x, y]| {
-                    [[x0.min(x), y0.min(y)], [x1.max(x), y1.max(y)]]
-                })
-            }
+            Self::Polygon { corners_mm } => super::bounds(corners_mm.iter().copied()),
         }
     }
 

@@ -99,10 +99,7 @@ enum Wanted {
 }
 
 fn bounds(nominal: &Nominal) -> [[f64; 2]; 2] {
-    let whole = [[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]];
-    let of_points = nominal
-        .points()
-        .fold(whole, |[low, high], p| [[low[0].min(p.x), low[1].min(p.y)], [high[0].max(p.x), high[1].max(p.y)]]);
+    let of_points = crate::geometry::bounds(nominal.points().map(|p| [p.x, p.y]));
     // A nominal sampled a ring beyond its aperture must not put targets there.
     match nominal.outline() {
         Some(outline) => {

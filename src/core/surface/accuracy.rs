@@ -10,7 +10,7 @@
 use rayon::prelude::*;
 
 use crate::geometry::grid_order::NO_POINT;
-use crate::geometry::{Point, Vector, recognise_grid};
+use crate::geometry::{Point, Vector, bounds, recognise_grid};
 
 use super::error::SurfaceError;
 use super::facet::Side;
@@ -234,9 +234,7 @@ fn kept_of_points(points: &[Point], projection: Projection) -> Result<(usize, [V
 /// that every fourth is a quarter of them well spread.
 fn along_the_plane(points: &[Point], map: &Map) -> Vec<u32> {
     let placed: Vec<[f64; 2]> = points.par_iter().map(|p| map.project(p).0).collect();
-    let (low, high) = placed.iter().fold(([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]), |(l, h), p| {
-        ([l[0].min(p[0]), l[1].min(p[1])], [h[0].max(p[0]), h[1].max(p[1])])
-    });
+    let [low, high] = bounds(placed.iter().copied());
     let size = (high[0] - low[0]).max(high[1] - low[1]).max(f64::MIN_POSITIVE);
     let spread = |c: f64| {
         let cell = (c / size * 65535.0) as u64;

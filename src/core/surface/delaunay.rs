@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::Point;
+use crate::geometry::{Point, bounds};
 
 use super::edges::{SortedSites, Triangulation};
 use super::error::SurfaceError;
@@ -52,9 +52,7 @@ pub(crate) fn triangulate(points: &[Point], map: &Map) -> Result<(Vec<Point>, Tr
 
 /// Returns the keys and the numbers of places in the order of a Z-curve; places of one key by u, then v.
 pub(crate) fn along_a_z_curve(places: &[[f64; 2]]) -> Vec<(u64, u32)> {
-    let (low, high) = places.iter().fold(([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]), |(l, h), p| {
-        ([l[0].min(p[0]), l[1].min(p[1])], [h[0].max(p[0]), h[1].max(p[1])])
-    });
+    let [low, high] = bounds(places.iter().copied());
     let per_mm = [0, 1].map(|k: usize| f64::from(u32::MAX) / (high[k] - low[k]));
     let key = |p: &[f64; 2]| {
         // Rounding keeps the order, so that of two cells the lower has the lower places.

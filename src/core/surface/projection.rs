@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, Matrix4, SymmetricEigen, Vector4};
 use serde::{Deserialize, Serialize};
 
-use crate::geometry::{Point, Vector};
+use crate::geometry::{Point, Vector, bounds};
 
 use super::error::SurfaceError;
 use super::normals::tangents;
@@ -107,9 +107,7 @@ impl Map {
     fn folded_share(&self, points: &[Point]) -> f64 {
         let stride = points.len().div_ceil(200_000);
         let placed: Vec<_> = points.iter().step_by(stride).map(|p| self.project(p)).collect();
-        let (low, high) = placed.iter().fold(([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]), |(l, h), ([u, v], _)| {
-            ([l[0].min(*u), l[1].min(*v)], [h[0].max(*u), h[1].max(*v)])
-        });
+        let [low, high] = bounds(placed.iter().map(|(place, _)| *place));
         let (width, depth) = (high[0] - low[0], high[1] - low[1]);
         let size = (width * depth * 10.0 / placed.len() as f64).sqrt();
         if size.is_nan() || size <= 0.0 {

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::{Aperture, Grid, Point};
+use crate::geometry::{Aperture, Grid, Point, bounds};
 use crate::surface::{Nominal, NominalKind, OffsetSurface, Place, Side};
 
 use super::PathError;
@@ -22,23 +22,13 @@ const LEAST_UPRIGHT: f64 = 0.1;
 /// # Errors
 /// A surface that is steeper than 84 degrees somewhere, or turned away from +z.
 pub fn height_of(nominal: &Nominal) -> Result<(Field, Aperture), PathError> {
-    let [low, high] = bounds(nominal);
-    let outline = nominal.outline().cloned().unwrap_or(Aperture::Rectangle {
-        centre_mm: [0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1])],
-        width_mm: high[0] - low[0],
-        height_mm: high[1] - low[1],
-    });
+    let [low, high] = bounds(nominal.points().map(|p| [p.x, p.y]));
+    let outline = nominal.outline().cloned().unwrap_or(Aperture::between([low, high]));
     let field = match regular(nominal)? {
         Some(field) => field,
         None => sampled(nominal, [low, high])?,
     };
     Ok((field, outline))
-}
-
-fn bounds(nominal: &Nominal) -> [[f64; 2]; 2] {
-    nominal.points().fold([[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]], |[low, high], p| {
-        [[low[0].min(p.x), low[1].min(p.y)], [high[0].max(p.x), high[1].max(p.y)]]
-    })
 }
 
 /// The field of a surface whose nodes are a regular grid already.
