@@ -21,7 +21,7 @@ use serde::{Deserialize, Serialize};
 
 use super::error::excerpt;
 use super::height_map::MapPoints;
-use super::layout::{Fields, Preamble, is_comment};
+use super::layout::{Fields, Layout, Preamble, is_comment};
 use super::measured_map::map_format;
 use super::number::{Decimal, coordinate};
 use super::points::parse_points_with;
@@ -124,7 +124,7 @@ pub struct Statements {
 }
 
 /// A result file as it was read.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct ResultFile {
     /// The points in millimetres, in the order of the file, rows that are switched off left out.
     pub points: Vec<Point>,
@@ -256,17 +256,7 @@ pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<Resul
     let coordinates = agreed_coordinates(path, &statements, content)?;
     if let Some(format) = map_format(text) {
         let MapPoints { points, notes } = (format.parse)(path, text)?;
-        let (indices, names, probe_radius_mm) = (None, None, None);
-        return Ok(ResultFile {
-            points,
-            indices,
-            names,
-            coordinates,
-            probe_radius_mm,
-            switched_off: 0,
-            notes,
-            statements,
-        });
+        return Ok(ResultFile { points, coordinates, notes, statements, ..ResultFile::default() });
     }
     let unit_mm = agreed_unit(path, &statements, content)?;
     let is_ply = ply::is_ply(text);
@@ -360,36 +350,42 @@ struct Columns {
     probe_radius_mm: Option<f64>,
 }
 
+/// Returns where a header names what is read beside the coordinates: index, name, enabled, radius and diameter of the probe.
+fn beside(names: &[String]) -> [Option<usize>; 5] {
+    let wanted: [&[&str]; 5] = [
+        &["index", "target"],
+        &["name", "point", "feature"],
+        &["enabled"],
+        &["probe_radius_mm", "probe radius [mm]"],
+        &["probe"],
+    ];
+    wanted.map(|wanted| names.iter().position(|name| wanted.contains(&name.trim())))
+}
+
 impl Columns {
     /// Goes through the lines again for the columns that the header names; the points have been read from the same lines.
     fn read(path: &Path, text: &[u8], points: usize) -> Result<Self, FormatError> {
         let text = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(text);
         let mut preamble = Preamble::new(path);
         let mut lines = text.split(|&b| b == b'\n').map(|l| l.strip_suffix(b"\r").unwrap_or(l)).zip(1..);
-        let layout = loop {
+        let (first, layout) = loop {
             let Some((line, number)) = lines.next() else { return Ok(Self::default()) };
             if let Some(layout) = preamble.take(line, number)? {
-                break layout;
+                break ((line, number), layout);
             }
         };
-        let names = preamble.names(layout.separator);
-        let column = |wanted: &[&str]| names.iter().position(|n| wanted.contains(&n.trim()));
-        let index = column(&["index", "target"]);
-        let name = column(&["name", "point", "feature"]);
-        let enabled = column(&["enabled"]);
-        let radius = column(&["probe_radius_mm", "probe radius [mm]"]);
-        let diameter = column(&["probe"]);
-        if [index, name, enabled, radius, diameter].iter().all(Option::is_none) {
+        let columns = beside(&preamble.names(layout.separator));
+        if columns.iter().all(Option::is_none) {
             return Ok(Self::default());
         }
+        let [index, name, enabled, radius, diameter] = columns;
         let mut found = Self {
             indices: index.map(|_| Vec::with_capacity(points)),
             names: name.map(|_| Vec::with_capacity(points)),
             ..Self::default()
         };
         let mut probe: Option<Vec<u8>> = None;
-        for (line, number) in text.split(|&b| b == b'\n').zip(1..).skip(layout.first_line as usize - 1) {
-            let line = line.strip_suffix(b"\r").unwrap_or(line);
+        for (line, number) in std::iter::once(first).chain(lines) {
             if line.trim_ascii().is_empty() || is_comment(line) {
                 continue;
             }
@@ -406,21 +402,26 @@ impl Columns {
             }
         }
         if let Some(text) = probe {
-            let size = coordinate(&layout.separator.ungrouped(&text), layout.decimal)
-                .ok()
-                .or_else(|| coordinate(&text, Decimal::Point).ok())
-                .filter(|v| *v > 0.0)
-                .ok_or_else(|| FormatError::Statement {
-                    path: path.to_owned(),
-                    line: layout.first_line,
-                    key: "probe",
-                    found: excerpt(&text),
-                    expected: "a size in millimetres",
-                })?;
-            found.probe_radius_mm = Some(if radius.is_some() { size } else { 0.5 * size });
+            let size_mm = probe_size_mm(path, &layout, &text)?;
+            found.probe_radius_mm = Some(if radius.is_some() { size_mm } else { 0.5 * size_mm });
         }
         Ok(found)
     }
+}
+
+/// Reads the size of a probe in the notation of the file, or else with a decimal point.
+fn probe_size_mm(path: &Path, layout: &Layout, text: &[u8]) -> Result<f64, FormatError> {
+    let size_mm = coordinate(&layout.separator.ungrouped(text), layout.decimal)
+        .or_else(|_| coordinate(text, Decimal::Point))
+        .ok()
+        .filter(|v| *v > 0.0);
+    size_mm.ok_or_else(|| FormatError::Statement {
+        path: path.to_owned(),
+        line: layout.first_line,
+        key: "probe",
+        found: excerpt(text),
+        expected: "a size in millimetres",
+    })
 }
 
 fn is_on(field: &[u8]) -> bool {
