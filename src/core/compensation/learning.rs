@@ -476,29 +476,6 @@ mod tests {
     }
 
     #[test]
-    fn what_comes_back_is_found_to_the_scatter_of_the_mean() {
-        // After k passes the mean of k scatters that have nothing in common is what is left, N / sqrt(k); and N itself is told.
-        let form = map(|[x, y]| 0.02 * (0.1 * x).sin() * (0.15 * y).cos()).values_mm;
-        let mut known = begin(GainRule::Adaptive, None);
-        let mut correction = none();
-        for pass in 1..=6 {
-            let scatter = scatter(pass, 1e-3);
-            let left = |k: usize| form[k] + correction.values_mm[k];
-            known = after(&known, &correction, &of((0..GRID.len()).map(|k| left(k) + scatter[k]).collect()));
-            correction = correction.changed(&known);
-            let left: Vec<f64> = form.iter().zip(&correction.values_mm).map(|(r, u)| r + u).collect();
-            let expected = 1e-3 / f64::from(pass).sqrt();
-            assert!(
-                (rms(&left) / expected - 1.0).abs() < 0.08,
-                "{pass} passes leave {:e}, not {expected:e}",
-                rms(&left)
-            );
-        }
-        let told = known.scatter_mm().unwrap();
-        assert!((told / 1e-3 - 1.0).abs() < 0.02, "{told}");
-    }
-
-    #[test]
     fn where_nothing_stands_out_of_the_scatter_nothing_is_taken_back() {
         // Known scatter of 1 um in one band: of 2 um rms Wiener takes 1 - 1.02 / 4, of 0.5 um nothing.
         let gain = |rms_mm: f64| after(&begin(GainRule::Adaptive, Some(1e-3)), &none(), &map(|_| rms_mm)).gains()[0][1];

@@ -1,16 +1,13 @@
 //! What is predicted of the distance from the nominal points alone, against what it is.
 
+use crate::common::points;
 use regrind_core::geometry::Point;
 use regrind_core::surface::accuracy::{Accuracy, Samples, Trust, accuracy};
 use regrind_core::surface::{Distance, Nominal, OffsetSurface, Place, Projection, Side, SurfaceError};
 use regrind_sim::shape::{FreeForm, Shape};
 
 fn free_form(columns: usize, rows: usize) -> Vec<Point> {
-    FreeForm::default()
-        .grid(FreeForm::WIDTH_MM, FreeForm::DEPTH_MM, columns, rows)
-        .into_iter()
-        .map(Point::from)
-        .collect()
+    points(&FreeForm::default().grid(FreeForm::WIDTH_MM, FreeForm::DEPTH_MM, columns, rows))
 }
 
 /// Points of a deterministic scatter: a grid with every node moved by up to 0.4 of a spacing.

@@ -1,5 +1,7 @@
 //! What the tests share: clouds from the simulated truth, and how far a pose is from it.
 
+use rand::RngExt;
+use rand::rngs::StdRng;
 use regrind_core::geometry::{Point, Pose};
 use regrind_core::surface::{Nominal, Projection};
 use regrind_sim::Vec3;
@@ -45,6 +47,12 @@ pub fn centres(
         .flat_map(|j| (0..columns).map(move |i| (i, j)))
         .map(|(i, j)| centre(shape, form, RADIUS_MM, at(i, columns, 0), at(j, rows, 1)))
         .collect()
+}
+
+/// A number of the standard normal distribution.
+pub fn normal(rng: &mut StdRng) -> f64 {
+    let (u, v): (f64, f64) = (rng.random(), rng.random());
+    (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
 }
 
 /// Moves centres into the CMM frame.

@@ -1,16 +1,10 @@
 //! The distance of a probe centre from the offset surface, against the exact one.
 
+use crate::common::{RADIUS_MM, free_form};
 use regrind_core::geometry::Point;
-use regrind_core::surface::{Distance, Nominal, OffsetSurface, Place, Projection, Side};
+use regrind_core::surface::{Distance, Nominal, OffsetSurface, Place, Side};
 use regrind_sim::form::FormError;
 use regrind_sim::shape::{FreeForm, Shape};
-
-const RADIUS_MM: f64 = 1.5;
-
-fn nominal(columns: usize, rows: usize) -> Nominal {
-    let points = FreeForm::default().grid(FreeForm::WIDTH_MM, FreeForm::DEPTH_MM, columns, rows);
-    Nominal::from_points(points.into_iter().map(Point::from).collect(), Projection::Auto).unwrap()
-}
 
 /// Largest and least error of the distance over points whose exact distance is known, inside and within two steps of the edge.
 fn errors_nm(nominal: &Nominal, distance: Distance, step: [f64; 2]) -> [f64; 2] {
@@ -38,7 +32,7 @@ fn errors_nm(nominal: &Nominal, distance: Distance, step: [f64; 2]) -> [f64; 2] 
 
 #[test]
 fn on_the_grid_of_the_paper_flat_errs_by_tens_of_nanometres_and_curved_by_hundredths_of_one() {
-    let (nominal, step) = (nominal(1021, 1241), [0.1, 0.05]);
+    let (nominal, step) = (free_form(1021, 1241), [0.1, 0.05]);
     let flat = errors_nm(&nominal, Distance::Triangle, step);
     let curved = errors_nm(&nominal, Distance::Curved, step);
     println!("flat {flat:.3?} nm, curved {curved:.5?} nm");
@@ -48,7 +42,7 @@ fn on_the_grid_of_the_paper_flat_errs_by_tens_of_nanometres_and_curved_by_hundre
 
 #[test]
 fn on_a_grid_eight_times_coarser_the_curved_distance_errs_by_nanometres() {
-    let (nominal, step) = (nominal(128, 156), [102.0 / 127.0, 62.0 / 155.0]);
+    let (nominal, step) = (free_form(128, 156), [102.0 / 127.0, 62.0 / 155.0]);
     let flat = errors_nm(&nominal, Distance::Triangle, step);
     let curved = errors_nm(&nominal, Distance::Curved, step);
     println!("flat {flat:.1?} nm, curved {curved:.3?} nm");

@@ -30,26 +30,28 @@ fn rms(values: &[f64]) -> f64 {
 #[test]
 fn what_comes_back_is_found_to_the_scatter_of_the_mean() {
     // k passes leave N / sqrt(k) of an error that stands far above N; and N itself is told.
-    let (mut left, mut told) = ([0.0; 4], 0.0);
-    for world in 0..WORLDS {
-        let mut random = StdRng::seed_from_u64(SEED + world);
-        let form = drawn(&mut random, 0.02);
-        let mut known = LearningState::new(GainRule::Wavelength, &MapOptions::new(2.5, 1.0), [40.0, 30.0], None);
-        let mut correction = Correction::none(GRID, 0.0);
-        for left in &mut left {
-            let scatter = drawn(&mut random, SCATTER_MM);
-            let sum = |k: usize| form[k] + correction.values_mm[k] + scatter[k];
-            let error = ErrorMap::known(GRID, (0..GRID.len()).map(sum).collect(), vec![true; GRID.len()]);
-            known = known.after(&Seen { correction: &correction, error: &error, answer: None });
-            correction = correction.changed(&known);
-            let rest: Vec<f64> = form.iter().zip(&correction.values_mm).map(|(r, u)| r + u).collect();
-            *left += rms(&rest).powi(2) / WORLDS as f64;
+    for rule in [GainRule::Wavelength, GainRule::Adaptive] {
+        let (mut left, mut told) = ([0.0; 6], 0.0);
+        for world in 0..WORLDS {
+            let mut random = StdRng::seed_from_u64(SEED + world);
+            let form = drawn(&mut random, 0.02);
+            let mut known = LearningState::new(rule, &MapOptions::new(2.5, 1.0), [40.0, 30.0], None);
+            let mut correction = Correction::none(GRID, 0.0);
+            for left in &mut left {
+                let scatter = drawn(&mut random, SCATTER_MM);
+                let sum = |k: usize| form[k] + correction.values_mm[k] + scatter[k];
+                let error = ErrorMap::known(GRID, (0..GRID.len()).map(sum).collect(), vec![true; GRID.len()]);
+                known = known.after(&Seen { correction: &correction, error: &error, answer: None });
+                correction = correction.changed(&known);
+                let rest: Vec<f64> = form.iter().zip(&correction.values_mm).map(|(r, u)| r + u).collect();
+                *left += rms(&rest).powi(2) / WORLDS as f64;
+            }
+            told += known.scatter_mm().expect("six passes tell it") / WORLDS as f64;
         }
-        told += known.scatter_mm().expect("four passes tell it") / WORLDS as f64;
+        for (k, left) in (1..).zip(left) {
+            let found = left.sqrt() / (SCATTER_MM / f64::from(k).sqrt());
+            assert!((found - 1.0).abs() < 0.1, "{rule:?}: {k} passes leave {found} of N / sqrt(k), seed {SEED}");
+        }
+        assert!((told / SCATTER_MM - 1.0).abs() < 0.1, "{rule:?}: {told}, seed {SEED}");
     }
-    for (k, left) in (1..).zip(left) {
-        let expected = SCATTER_MM / f64::from(k).sqrt();
-        assert!((left.sqrt() / expected - 1.0).abs() < 0.1, "{k} passes leave {:e}, seed {SEED}", left.sqrt());
-    }
-    assert!((told / SCATTER_MM - 1.0).abs() < 0.1, "{told}, seed {SEED}");
 }

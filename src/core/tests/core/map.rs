@@ -2,6 +2,7 @@
 
 use std::f64::consts::{PI, TAU};
 
+use crate::common::normal;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use regrind_core::compensation::{ErrorMap, MapError, MapOptions, Order, Roughness, Smoothing, error_map, filter_grid};
@@ -26,11 +27,6 @@ fn strewn(count: usize, size_mm: [f64; 2], seed: u64, f: impl Fn(f64, f64) -> f6
     let mut place = || size_mm.map(|size| size * (rng.random::<f64>() - 0.5));
     let reading = |at_mm: [f64; 2]| Sample { at_mm, deviation_mm: f(at_mm[0], at_mm[1]) };
     (0..count).map(|_| place()).map(reading).collect()
-}
-
-fn normal(rng: &mut StdRng) -> f64 {
-    let (u, v): (f64, f64) = (rng.random(), rng.random());
-    (-2.0 * (1.0 - u).ln()).sqrt() * (TAU * v).cos()
 }
 
 fn with_noise(readings: &[Sample], sigma_mm: f64, seed: u64) -> Vec<Sample> {

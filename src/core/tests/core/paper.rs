@@ -1,28 +1,23 @@
 //! The main numbers of sections 3.2 and 4 of the paper, on the simulated free form; `examples/paper.rs` shows them all.
 
+use crate::common::{RADIUS_MM, free_form, placed, points};
 use regrind_core::geometry::{Point, Pose};
 use regrind_core::registration::{Method, Options, ProbeSide, Registration, Start, register};
-use regrind_core::surface::{Distance, Nominal, Projection};
+use regrind_core::surface::{Distance, Nominal};
+use regrind_sim::Vec3;
 use regrind_sim::form::FormError;
-use regrind_sim::probe::{Placement, centre};
-use regrind_sim::shape::{FreeForm, Shape};
-
-const PROBE_RADIUS_MM: f64 = 1.5;
+use regrind_sim::probe::Placement;
+use regrind_sim::shape::FreeForm;
 
 fn nominal() -> Nominal {
     let (columns, rows) = FreeForm::PAPER_GRID;
-    let points = FreeForm::default().grid(FreeForm::WIDTH_MM, FreeForm::DEPTH_MM, columns, rows);
-    Nominal::from_points(points.into_iter().map(Point::from).collect(), Projection::Auto).unwrap()
+    free_form(columns, rows)
 }
 
-/// Probe centres over 226 x 126 nodes of a rectangle, moved to the machine.
-fn centres(form: &FormError, [width, depth]: [f64; 2], placement: &Placement) -> Vec<Point> {
-    let at = |i: i32, last: i32, size: f64| size * (f64::from(i) / f64::from(last) - 0.5);
-    let probe = |x, y| Point::from(placement.apply(centre(&FreeForm::default(), form, PROBE_RADIUS_MM, x, y)));
-    (0..126)
-        .flat_map(|j| (0..226).map(move |i| (i, j)))
-        .map(|(i, j)| probe(at(i, 225, width), at(j, 125, depth)))
-        .collect()
+/// Probe centres over 226 x 126 nodes of a rectangle, in the model frame.
+fn centres(form: &FormError, [width, depth]: [f64; 2]) -> Vec<Vec3> {
+    let corner = [0.5 * width, 0.5 * depth];
+    crate::common::centres(&FreeForm::default(), form, [corner.map(|c| -c), corner], [226, 126])
 }
 
 /// The method as it stands in the paper: from the identity, on a known side, every point counted.
@@ -31,7 +26,7 @@ fn as_in_the_paper() -> Options {
         start: Start::Pose(Pose::identity()),
         side: ProbeSide::Above,
         outlier_sigmas: f64::INFINITY,
-        ..Options::new(PROBE_RADIUS_MM)
+        ..Options::new(RADIUS_MM)
     }
 }
 
@@ -42,7 +37,7 @@ fn taken(found: &Registration) -> Vec<f64> {
 #[test]
 fn tens_of_millimetres_and_degrees_are_undone_to_rounding() {
     let nominal = nominal();
-    let exact = centres(&FormError::none(), [FreeForm::WIDTH_MM, FreeForm::DEPTH_MM], &Placement::IDENTITY);
+    let exact = centres(&FormError::none(), [FreeForm::WIDTH_MM, FreeForm::DEPTH_MM]);
     let cases = [
         ([20.0, 0.0, 0.0], [0.0; 3]),
         ([0.0, 10.0, 0.0], [0.0; 3]),
@@ -55,7 +50,7 @@ fn tens_of_millimetres_and_degrees_are_undone_to_rounding() {
     ];
     for (shift_mm, degrees) in cases {
         let placement = Placement::new(shift_mm, degrees);
-        let measured: Vec<Point> = exact.iter().map(|p| Point::from(placement.apply((*p).into()))).collect();
+        let measured = points(&placed(&placement, &exact));
         for distance in [Distance::Curved, Distance::Triangle] {
             let case = format!("{shift_mm:?} mm, {degrees:?} degrees, {distance:?}");
             let found = register(&nominal, &measured, &Options { distance, ..as_in_the_paper() }).expect(&case);
@@ -74,7 +69,7 @@ fn centres_on_the_offset_are_contacts_on_the_nominal() {
     let nominal = nominal();
     let form = FormError::new(12, 12.0, 6.9e-3, FreeForm::WIDTH_MM, FreeForm::DEPTH_MM);
     let placement = Placement::new([-0.068_855, 0.065_762, 0.195_464], [-0.4587, 0.0646, -0.0095]); // eq. (17)
-    let measured = centres(&form, [101.9, 61.9], &placement);
+    let measured = points(&placed(&placement, &centres(&form, [101.9, 61.9])));
     let found = register(&nominal, &measured, &as_in_the_paper()).unwrap();
 
     let contacts: Vec<Point> = found.deviations.iter().map(|d| d.point).collect();

@@ -1,7 +1,8 @@
 //! Planted wheel and setting errors on known surfaces, under form and noise.
 
+use crate::common::normal;
+use rand::SeedableRng;
 use rand::rngs::StdRng;
-use rand::{RngExt, SeedableRng};
 use regrind_core::compensation::{
     Contact, Parameter, ParameterError, ParameterKind, ParameterOptions, Parameters, WheelTerm, parameters,
 };
@@ -11,11 +12,6 @@ use regrind_sim::shape::{FreeForm, Shape, Sphere};
 
 const WHEEL_MM: f64 = 12.5;
 const DATUM: [bool; 6] = [false, false, true, true, true, true];
-
-fn normal(rng: &mut StdRng) -> f64 {
-    let (u, v): (f64, f64) = (rng.random(), rng.random());
-    (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
-}
 
 /// Contacts on a shape, 60 x 40 over 100 x 60 mm, off by a function of the contact and its progress along y.
 fn on(shape: &dyn Shape, off: impl Fn(&Contact, f64) -> f64) -> Vec<Contact> {

@@ -35,6 +35,10 @@ fn normal_error_mm(found: &Pose, truth: &Pose, shape: &dyn Shape, half: [f64; 2]
         .fold(0.0, f64::max)
 }
 
+fn from_identity(probe_radius_mm: f64) -> Options {
+    Options { start: Start::Pose(Pose::identity()), ..Options::new(probe_radius_mm) }
+}
+
 fn words(found: &Registration) -> String {
     found.verdict.weak_directions.iter().map(|w| w.words.as_str()).collect::<Vec<_>>().join("; ")
 }
@@ -44,9 +48,8 @@ fn a_steep_off_axis_asphere() {
     let shape = OffAxisAsphere { radius_mm: 120.0, conic: -1.2, fourth: 3e-8, shift_mm: 70.0 };
     let nominal = gridded(&shape, [80.0, 60.0], [401, 301]);
     let placement = Placement::new([30.0, -80.0, 12.0], [15.0, -100.0, 60.0]);
-    let found =
-        register(&nominal, &measured(&shape, [39.0, 29.0], [60, 45], &placement, 3e-4), &Options::new(RADIUS_MM))
-            .unwrap();
+    let cloud = measured(&shape, [39.0, 29.0], [60, 45], &placement, 3e-4);
+    let found = register(&nominal, &cloud, &Options::new(RADIUS_MM)).unwrap();
     let error = normal_error_mm(&found.cmm_from_model, &pose(&placement), &shape, [39.0, 29.0]);
     assert!(error < 2e-4, "{error} mm");
     // The parent is a surface of revolution about the line x = -70.
@@ -60,9 +63,8 @@ fn a_biconic_fits_in_two_poses_and_says_so() {
     let shape = Biconic { radius_mm: [90.0, -140.0], conic: [-0.7, 1.2] };
     let nominal = gridded(&shape, [60.0, 60.0], [301, 301]);
     let placement = Placement::new([-5.0, 8.0, 100.0], [3.0, 170.0, 40.0]);
-    let found =
-        register(&nominal, &measured(&shape, [29.0, 29.0], [45, 45], &placement, 3e-4), &Options::new(RADIUS_MM))
-            .unwrap();
+    let cloud = measured(&shape, [29.0, 29.0], [45, 45], &placement, 3e-4);
+    let found = register(&nominal, &cloud, &Options::new(RADIUS_MM)).unwrap();
     // Half a turn about z carries the surface into itself: either pose is right, and the other one is named.
     let half_turn = Pose::exp(&regrind_core::geometry::Twist::new(0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI));
     let truths = [pose(&placement), pose(&placement) * half_turn];
@@ -80,8 +82,7 @@ fn a_shallow_wave_is_registered_in_height_and_its_weak_directions_are_named() {
     let shape = Wave { height_mm: 0.01 };
     let nominal = gridded(&shape, [100.0, 80.0], [401, 321]);
     let placement = Placement::new([0.4, -0.3, 0.8], [0.02, -0.03, 0.2]);
-    let mut options = Options::new(RADIUS_MM);
-    options.start = Start::Pose(Pose::identity());
+    let options = from_identity(RADIUS_MM);
     let found = register(&nominal, &measured(&shape, [48.0, 38.0], [50, 40], &placement, 3e-4), &options).unwrap();
     let error = normal_error_mm(&found.cmm_from_model, &pose(&placement), &shape, [48.0, 38.0]);
     assert!(error < 1e-4, "{error}");
@@ -100,8 +101,7 @@ fn a_sphere_cap_holds_its_three_rotations() {
     let shape = Sphere { radius_mm: -60.0 };
     let nominal = gridded(&shape, [50.0, 50.0], [201, 201]);
     let placement = Placement::new([1.0, 2.0, -1.5], [0.0, 0.0, 0.0]);
-    let mut options = Options::new(RADIUS_MM);
-    options.start = Start::Pose(Pose::identity());
+    let options = from_identity(RADIUS_MM);
     let found = register(&nominal, &measured(&shape, [22.0, 22.0], [40, 40], &placement, 3e-4), &options).unwrap();
     let said = words(&found);
     assert!(said.contains("every rotation about (") && said.contains("-60.0"), "{said}");
@@ -118,8 +118,7 @@ fn a_scattered_sphere_holds_its_three_rotations_too() {
     let nominal = Nominal::from_points(polar_cap(60.0, 6000, 25.0, 0.0), Projection::Auto).unwrap();
     assert_eq!(nominal.kind(), NominalKind::Scattered { projection: Projection::Xy });
     let centres: Vec<Point> = polar_cap(61.5, 900, 22.0, 0.3);
-    let mut options = Options::new(RADIUS_MM);
-    options.start = Start::Pose(Pose::identity());
+    let options = from_identity(RADIUS_MM);
     let found = register(&nominal, &centres, &options).unwrap();
     assert!(words(&found).contains("every rotation about ("), "{}", words(&found));
 }
@@ -130,8 +129,7 @@ fn a_plane_and_a_cylinder_hold_what_they_cannot_see() {
     let nominal = Nominal::from_points(plane, Projection::Auto).unwrap();
     let tilted = Placement::new([0.0, 0.0, 0.3], [1.0, -2.0, 0.0]);
     let on_plane: Vec<_> = (0..400).map(|k| [4.0 + f64::from(k % 20), 4.0 + f64::from(k / 20), RADIUS_MM]).collect();
-    let mut options = Options::new(RADIUS_MM);
-    options.start = Start::Pose(Pose::identity());
+    let options = from_identity(RADIUS_MM);
     let found = register(&nominal, &points(&placed(&tilted, &on_plane)), &options).unwrap();
     let said = words(&found);
     assert!(said.contains("shift along") && said.contains("rotation about z"), "{said}");
@@ -217,9 +215,8 @@ fn several_patches_are_one_surface() {
     };
     let nominal = Nominal::from_patches(vec![part(-51.0, 1.0), part(-1.0, 51.0)]).unwrap();
     let placement = Placement::new([10.0, 5.0, 3.0], [5.0, -5.0, 8.0]);
-    let found =
-        register(&nominal, &measured(&shape, [50.0, 30.0], [50, 30], &placement, 0.0), &Options::new(RADIUS_MM))
-            .unwrap();
+    let cloud = measured(&shape, [50.0, 30.0], [50, 30], &placement, 0.0);
+    let found = register(&nominal, &cloud, &Options::new(RADIUS_MM)).unwrap();
     assert_eq!(found.verdict.used, 1500);
     assert!(normal_error_mm(&found.cmm_from_model, &pose(&placement), &shape, [50.0, 30.0]) < 1e-7);
 }
@@ -229,9 +226,7 @@ fn an_offset_that_folds_is_refused_with_place_and_radius() {
     let bowl = Sphere { radius_mm: 1.2 };
     let nominal = gridded(&bowl, [1.2, 1.2], [61, 61]);
     let cloud = measured(&Sphere { radius_mm: 40.0 }, [0.5, 0.5], [10, 10], &Placement::IDENTITY, 0.0);
-    let mut options = Options::new(0.3);
-    options.start = Start::Pose(Pose::identity());
-    options.side = ProbeSide::Above;
+    let mut options = Options { side: ProbeSide::Above, ..from_identity(0.3) };
     // A probe that fits is not refused for folding.
     assert!(!matches!(
         register(&nominal, &cloud, &options),
@@ -315,23 +310,15 @@ fn robust_losses_from_a_given_pose() {
 }
 
 #[test]
-fn contact_points_and_the_subtracted_radius() {
+fn the_radius_subtracted_is_wrong_by_micrometres() {
     let shape = regrind_sim::shape::FreeForm::default();
     let nominal = crate::common::free_form(451, 251);
     let placement = Placement::new([0.1, -0.2, 0.15], [0.1, 0.05, -0.1]);
     let form = FormError::new(8, 30.0, 6.657e-3, 102.0, 62.0);
     let cloud = points(&placed(&placement, &centres(&shape, &form, [[-50.0, -30.0], [50.0, 30.0]], [90, 60])));
     let offset = register(&nominal, &cloud, &Options::new(RADIUS_MM)).unwrap();
-    // Eq. (18): the contact points that follow from the registration already lie where the nominal surface has them.
-    let contacts: Vec<Point> = offset.deviations.iter().map(|d| d.point).collect();
-    let mut options = Options::new(RADIUS_MM);
-    options.start = Start::Pose(Pose::identity());
-    options.method = Method::Contact;
-    let again = register(&nominal, &contacts, &options).unwrap();
-    let off = again.cmm_from_model.log();
-    assert!(off.fixed_rows::<3>(0).norm() < 3.7e-5 && off.fixed_rows::<3>(3).norm() < 2.4e-6, "{off}");
-    // Fig. 12b: the radius subtracted, the facet looked up below the centre; wrong by micrometres.
-    options.method = Method::SubtractRadius;
+    // Fig. 12b: the facet is looked up below the centre.
+    let options = Options { method: Method::SubtractRadius, ..from_identity(RADIUS_MM) };
     let subtracted = register(&nominal, &cloud, &options).unwrap();
     let (low, high) = subtracted
         .deviations
