@@ -14,7 +14,7 @@ use crate::cell::{CellPlan, Deadlines, Disposal, Gates, Tolerance};
 use crate::compensation::path::{Limits, PathError, PathOptions, TrackSpacing, Wheel as PathWheel};
 use crate::compensation::{CorrectionLimits, MapOptions, contact_width_mm};
 use crate::config::{CellConfig, Link};
-use crate::device::{AnyCmm, AnyGrinder, Making, MakingError, ModbusSettings, Pass};
+use crate::device::{AnyCmm, AnyGrinder, Making, MakingError, ModbusSettings, Pass, hex};
 use crate::drive::{Probing, Programs, Sphere, Task};
 use crate::formats::{self, FormatError, NominalFile};
 use crate::geometry::{Point, Vector};
@@ -131,7 +131,7 @@ fn map_options(recipe: &Recipe) -> MapOptions {
 
 /// Says what a run has to have in common with another to learn from it: the cell, the part, and how it is ground, looked at and corrected.
 fn setting(recipe: &Recipe, cell: &CellConfig, part: &[u8; 32], targets: usize) -> String {
-    let part: String = part.iter().map(|byte| format!("{byte:02x}")).collect();
+    let part = hex(part);
     let (grinding, measure, map) = (&recipe.grinding, &recipe.measure, &recipe.compensation);
     let mut said = format!(
         "cell {:?}, part {part}, begin with {:?}; {:?}, feed {} mm/min, tracks {} mm, spark-out {}, depth {} mm; {targets} targets, probe {} mm, \

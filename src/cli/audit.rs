@@ -9,7 +9,7 @@ use regrind::report::words;
 use serde_json::{Value, json};
 
 use super::Outcome;
-use super::control::newest;
+use super::control::folder_of;
 use super::failure::Failure;
 
 /// Verify, show or export the record of a run
@@ -103,13 +103,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     match &arguments.what {
         What::Verify(of) => prove(of),
         What::Show(of) => show(of),
-        What::Export(of) => print_lines(folder(of.run.as_deref())?, None, |_| true, Record::json_line),
+        What::Export(of) => print_lines(folder_of(of.run.as_deref())?, None, |_| true, Record::json_line),
     }
-}
-
-/// Returns the folder that was named, or that of the newest run.
-fn folder(run: Option<&Path>) -> Result<PathBuf, Failure> {
-    run.map(Path::to_owned).or_else(|| newest(Path::new("runs"))).ok_or_else(|| Failure::NoRun { path: "runs".into() })
 }
 
 fn failure(error: JournalError) -> Failure {
@@ -120,7 +115,7 @@ fn failure(error: JournalError) -> Failure {
 }
 
 fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
-    let folder = folder(arguments.run.as_deref())?;
+    let folder = folder_of(arguments.run.as_deref())?;
     let found = match &arguments.anchor {
         Some(path) => verify_against(&folder, &read_anchor(path)?),
         None => verify(&folder),
@@ -179,7 +174,7 @@ fn sound(folder: &Path, begin: &Value, verified: &Verified) -> String {
 }
 
 fn show(arguments: &ToShow) -> Result<Outcome, Failure> {
-    let folder = folder(arguments.run.as_deref())?;
+    let folder = folder_of(arguments.run.as_deref())?;
     let wanted = |record: &Record| {
         (arguments.kind.is_empty() || arguments.kind.contains(&record.kind))
             && arguments.cycle.is_none_or(|cycle| record.cycle == cycle)

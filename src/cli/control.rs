@@ -33,16 +33,6 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-/// Which order.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Order {
-    Hold,
-    Resume,
-    Stop,
-    Abort,
-    Status,
-}
-
 /// What a person confirms to a running cell.
 #[derive(Args, Debug)]
 #[command(after_help = "\
@@ -95,16 +85,9 @@ enum What {
     Over,
 }
 
-pub(super) fn order(arguments: &Arguments, order: Order) -> Result<Outcome, Failure> {
-    let reason = arguments.reason.clone();
-    let request = match order {
-        Order::Hold => Request::Hold { reason },
-        Order::Resume => Request::Resume { reason },
-        Order::Stop => Request::Stop { reason },
-        Order::Abort => Request::Abort { reason },
-        Order::Status => Request::Status,
-    };
-    give(arguments.run.as_deref(), &request, arguments.json)
+/// Gives an order that is made of the reason for it.
+pub(super) fn order(arguments: &Arguments, order: fn(String) -> Request) -> Result<Outcome, Failure> {
+    give(arguments.run.as_deref(), &order(arguments.reason.clone()), arguments.json)
 }
 
 pub(super) fn confirm(arguments: &Confirmation) -> Result<Outcome, Failure> {
@@ -138,10 +121,7 @@ fn named_file(arguments: &Confirmation) -> Result<Option<PathBuf>, Failure> {
 }
 
 fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<Outcome, Failure> {
-    let folder = match run {
-        Some(run) => run.to_owned(),
-        None => newest(Path::new("runs")).ok_or_else(|| Failure::NoRun { path: "runs".into() })?,
-    };
+    let folder = folder_of(run)?;
     let reply = ask(&folder, request).map_err(|source| Failure::NotRunning { path: folder.clone(), source })?;
     show(&reply, request, json)?;
     if reply.accepted { Ok(Outcome::Accepted) } else { Err(Failure::OrderRefused { message: reply.message }) }
@@ -162,8 +142,13 @@ fn show(reply: &Reply, request: &Request, json: bool) -> Result<(), Failure> {
     super::print(&text)
 }
 
+/// Returns the folder of a run that was named, or that of the newest run.
+pub(super) fn folder_of(run: Option<&Path>) -> Result<PathBuf, Failure> {
+    run.map(Path::to_owned).or_else(|| newest(Path::new("runs"))).ok_or_else(|| Failure::NoRun { path: "runs".into() })
+}
+
 /// Returns the run folder that was made last.
-pub(super) fn newest(runs: &Path) -> Option<PathBuf> {
+fn newest(runs: &Path) -> Option<PathBuf> {
     let folders = std::fs::read_dir(runs).ok()?.filter_map(io::Result::ok).filter(|entry| entry.path().is_dir());
     folders.max_by_key(|entry| entry.metadata().and_then(|m| m.modified()).ok()).map(|entry| entry.path())
 }

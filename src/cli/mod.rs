@@ -25,8 +25,8 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-use control::Order;
 use failure::Failure;
+use regrind::drive::Request;
 
 /// Closed-loop grinding: register measured probe centres to the offset of a nominal surface.
 #[derive(Debug, Parser)]
@@ -93,12 +93,12 @@ fn run() -> ExitCode {
         Command::Run(arguments) => run::run(&arguments),
         Command::Plan(arguments) => plan::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
-        Command::Hold(arguments) => control::order(&arguments, Order::Hold),
-        Command::Resume(arguments) => control::order(&arguments, Order::Resume),
-        Command::Stop(arguments) => control::order(&arguments, Order::Stop),
-        Command::Abort(arguments) => control::order(&arguments, Order::Abort),
+        Command::Hold(arguments) => control::order(&arguments, |reason| Request::Hold { reason }),
+        Command::Resume(arguments) => control::order(&arguments, |reason| Request::Resume { reason }),
+        Command::Stop(arguments) => control::order(&arguments, |reason| Request::Stop { reason }),
+        Command::Abort(arguments) => control::order(&arguments, |reason| Request::Abort { reason }),
         Command::Confirm(arguments) => control::confirm(&arguments),
-        Command::Status(arguments) => control::order(&arguments, Order::Status),
+        Command::Status(arguments) => control::order(&arguments, |_| Request::Status),
         Command::Audit(arguments) => audit::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
         Command::Register(arguments) => register::run(&arguments),

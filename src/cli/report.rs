@@ -1,12 +1,12 @@
 //! `regrind report`: one HTML file that tells a run.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::Args;
 use regrind::report::write_run_report;
 
 use super::Outcome;
-use super::control::newest;
+use super::control::folder_of;
 use super::failure::Failure;
 
 /// Write the report of a run: one HTML file that opens without a network
@@ -28,9 +28,7 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let folder = arguments.run.clone().or_else(|| newest(Path::new("runs")));
-    let folder = folder.ok_or_else(|| Failure::NoRun { path: "runs".into() })?;
-    let path = write_run_report(&folder).map_err(Failure::Report)?;
+    let path = write_run_report(&folder_of(arguments.run.as_deref())?).map_err(Failure::Report)?;
     if arguments.json {
         super::print_json(&serde_json::json!({ "report": path }))?;
     } else {

@@ -69,16 +69,15 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig) -> Result<Simu
     let speed = spec.speed;
     let seed = spec.seed;
     let world = World::new(spec).map_err(|e| failed(e.to_string()))?;
-    let cmm = machine(Machine::new(Box::new(world.cmm()), boot_id(), options(&cell.cmm.link, speed, seed)));
-    let grinder =
-        machine(Machine::new(Box::new(world.grinder()), boot_id(), options(&cell.grinder.link, speed, seed + 1)));
+    let cmm = Machine::new(Box::new(world.cmm()), boot_id(), options(&cell.cmm.link, speed, seed));
+    let grinder = Machine::new(Box::new(world.grinder()), boot_id(), options(&cell.grinder.link, speed, seed + 1));
     let mut simulated = SimulatedCell { servings: Vec::new(), places: Vec::new(), links: Vec::new(), _world: world };
     let line = |link: &Link| {
         let none = "a machine that a person serves cannot be simulated; its part is yours to play";
         link.wire.line().ok_or_else(|| failed(none.into()))
     };
     let [(of_cmm, cmm_unit), (of_grinder, grinder_unit)] = [line(&cell.cmm.link)?, line(&cell.grinder.link)?];
-    let (cmm, grinder) = ((cmm_unit, cmm), (grinder_unit, grinder));
+    let (cmm, grinder) = ((cmm_unit, cmm.into()), (grinder_unit, grinder.into()));
     if of_cmm == of_grinder {
         let port = simulated.serve(&of_cmm, vec![cmm, grinder]).await.map_err(failed)?;
         set_port(&mut cell.cmm.link.wire, port);
@@ -122,10 +121,6 @@ impl SimulatedCell {
             }
         }
     }
-}
-
-fn machine(machine: Machine) -> SharedMachine {
-    machine.into()
 }
 
 /// A number that differs from start to start, as that of a real machine does.

@@ -21,66 +21,53 @@ const LONGEST_LINE: u64 = 4096;
 /// A client that says nothing for so long is gone.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// What can be asked of a running cell.
+/// What can be asked of a running cell: which machine it is about, and why, which may be empty.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[expect(missing_docs, reason = "the fields are told above them")]
 #[serde(tag = "order", rename_all = "snake_case")]
 pub enum Request {
     /// Come to the next safe place and wait.
     Hold {
-        /// Why; may be empty.
         #[serde(default)]
         reason: String,
     },
     /// Go on.
     Resume {
-        /// Why; may be empty.
         #[serde(default)]
         reason: String,
     },
     /// End in order.
     Stop {
-        /// Why; may be empty.
         #[serde(default)]
         reason: String,
     },
     /// End at once: the safe sequence only.
     Abort {
-        /// Why; may be empty.
         #[serde(default)]
         reason: String,
     },
     /// The right part is loaded and clamped, and no machine touches it.
     Loaded,
     /// A machine that cannot tell it was looked at: it is clear of the part.
-    Clear {
-        /// The machine.
-        device: Device,
-    },
-    /// A machine that cannot tell what became of its job was looked at: it stands, clear of the part.
-    Over {
-        /// The machine.
-        device: Device,
-        /// What was seen.
-        evidence: String,
-    },
+    Clear { device: Device },
+    /// A machine that cannot tell what became of its job was looked at: it stands, clear of the part, and so it was seen.
+    Over { device: Device, evidence: String },
     /// The machine that a person serves has begun its job.
     Started {
         /// Identity of the map that it works by: its first 8 hexadecimal digits, or more.
         #[serde(default)]
         map: Option<String>,
     },
-    /// It has ended that job, and is clear of the part.
+    /// It has ended that job, and is clear of the part; a measurement came as a file.
     Done {
         /// Identity of the map that it worked by: its first 8 hexadecimal digits, or more.
         #[serde(default)]
         map: Option<String>,
-        /// The file that the measurement came as.
         #[serde(default)]
         file: Option<PathBuf>,
     },
-    /// A machine that was to hold or to stop was looked at: it stands still.
+    /// A machine that was to hold or to stop was looked at: it stands still. Not named, it is that of the job under way.
     Still {
-        /// The machine; that of the job under way where it is not named.
         #[serde(default)]
         device: Option<Device>,
     },

@@ -33,7 +33,7 @@ use tokio::task::JoinSet;
 use tokio::time::Instant;
 
 use crate::cell::{Actor, Cell, CellPlan, Command, Device, Ending, Event, Phase, RecordFailure, State, StateName};
-use crate::device::{Armed, Cmm, Grinder, Identified, Interrupt, Measurement, Word};
+use crate::device::{Armed, Cmm, Grinder, Identified, Interrupt, Measurement, Word, hex};
 use crate::formats::{LEARNED, write_json_atomic};
 use crate::journal::{Artefact, Entry, Journal, Kind};
 
@@ -138,13 +138,6 @@ struct Computed {
     product: Product,
     /// The files that it made, on the disk and read.
     files: Result<Vec<Artefact>, RecordFailure>,
-}
-
-fn index(device: Device) -> usize {
-    match device {
-        Device::Cmm => 0,
-        Device::Grinder => 1,
-    }
 }
 
 impl Drive {
@@ -358,7 +351,7 @@ impl Drive {
         let cycle = self.cycles.get(&self.cell.cycle()).filter(|_| grinds);
         let Some(cycle) = cycle else { return Err("no pass is under way".into()) };
         let identity = self.task.payloads(&cycle.correction).0.identity();
-        let whole: String = identity.iter().map(|b| format!("{b:02x}")).collect();
+        let whole = hex(&identity);
         if digits.len() < 8 {
             return Err("give the first 8 digits of the map, or more; they stand in correction.json".into());
         }
@@ -388,7 +381,7 @@ impl Drive {
         }
         if let Some(event) = event {
             if let Event::Prepared { device, .. } = &event {
-                self.armed[index(*device)].clone_from(&detail);
+                self.armed[*device as usize].clone_from(&detail);
             }
             self.take(event, detail).await;
         }
@@ -499,7 +492,7 @@ impl Drive {
     async fn carry_out(&mut self, command: Command) {
         let mut payload = serde_json::to_value(&command).unwrap_or(Value::Null);
         if let (Command::StartMachine { device, .. }, Some(map)) = (&command, payload.as_object_mut()) {
-            map.insert("intent".into(), self.armed[index(*device)].clone().unwrap_or(Value::Null));
+            map.insert("intent".into(), self.armed[*device as usize].clone().unwrap_or(Value::Null));
         }
         let record = Entry::new(Kind::Intent, record::nanoseconds(self.now()), self.cell.cycle(), payload);
         if !outcome::is_answered(&command) {
@@ -540,7 +533,7 @@ impl Drive {
             Command::ResumeMachine { device } => self.ask(device, Ask::Resume).await,
             Command::StopMachine { device } => self.ask_at_once(device, Ask::Stop).await,
             Command::AbortMachine { device } => {
-                self.aborts[index(device)].send_modify(|ordered| *ordered += 1);
+                self.aborts[device as usize].send_modify(|ordered| *ordered += 1);
                 self.ask_at_once(device, Ask::Abort).await;
             }
             Command::ClearMachine { device } => self.ask(device, Ask::Clear).await,
@@ -593,11 +586,11 @@ impl Drive {
 
     async fn ask(&mut self, device: Device, ask: Ask) {
         // A station lives as long as the drive; its channel is wide enough for what one cell has under way.
-        let _ = self.asks[index(device)].send(ask).await;
+        let _ = self.asks[device as usize].send(ask).await;
     }
 
     async fn ask_at_once(&mut self, device: Device, ask: Ask) {
-        self.interrupts[index(device)].raise();
+        self.interrupts[device as usize].raise();
         self.ask(device, ask).await;
     }
 

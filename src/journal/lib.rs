@@ -65,11 +65,3 @@ impl Reader {
         Records::new(&self.connection, &self.folder, from)
     }
 }
-
-/// Opens the journal of a run folder for reading.
-///
-/// # Errors
-/// No journal there, or a file that is none.
-pub fn open_read_only(folder: impl AsRef<Path>) -> Result<Reader, JournalError> {
-    Reader::open(folder)
-}

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use sha2::{Digest, Sha256};
 
-use super::measured::{Measured, Wanted, foreign, measurement};
+use super::measured::{Wanted, foreign, measurement};
 use super::outbox::{Outbox, StoredHandover, Taken, Ticket, json_lines, unhex};
 use super::stations::{PlacedStation, place_station};
 use super::watch::{Watch, WatchedFile};
@@ -234,9 +234,9 @@ impl CmmFolders {
     /// Reads a file of points and holds it against plan and cell.
     fn read(&self, expected: &Expected, path: &Path) -> Result<(ResultFile, String), ExchangeError> {
         let bytes = read_bytes(path)?;
-        self.check_not_taken(expected, path, &hex(&Sha256::digest(&bytes)))?;
-        let Measured { file, sha256 } = self.wanted(expected).read(path, &bytes)?;
-        Ok((file, hex(&sha256)))
+        let sha = hex(&Sha256::digest(&bytes));
+        self.check_not_taken(expected, path, &sha)?;
+        Ok((self.wanted(expected).read(path, &bytes)?, sha))
     }
 
     /// What a result of a hand-over must fit.

@@ -3,8 +3,6 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use sha2::{Digest, Sha256};
-
 use super::ExchangeError;
 use crate::device::{Job, MeasuredPoint, Measurement, PointStatus};
 use crate::formats::FormatError;
@@ -24,21 +22,12 @@ pub struct Wanted<'a> {
     pub probe_tolerance_mm: f64,
 }
 
-/// A file that fits, as far as a file by itself can tell.
-#[derive(Clone, Debug)]
-pub struct Measured {
-    /// The file as it was read.
-    pub file: ResultFile,
-    /// The SHA-256 of its bytes.
-    pub sha256: [u8; 32],
-}
-
 impl Wanted<'_> {
     /// Reads the bytes of a file of points and holds it against plan and cell; `path` is what messages call it.
     ///
     /// # Errors
     /// A file that was cut short, that does not say what its coordinates are, or that was measured with another probe.
-    pub fn read(&self, path: &Path, bytes: &[u8]) -> Result<Measured, ExchangeError> {
+    pub fn read(&self, path: &Path, bytes: &[u8]) -> Result<ResultFile, ExchangeError> {
         check_ended(path, bytes)?;
         let file = parse_result(path, bytes, self.content)?;
         if file.coordinates.is_none() {
@@ -49,7 +38,7 @@ impl Wanted<'_> {
             Some(found_mm) => {
                 Err(ExchangeError::ProbeRadius { path: path.to_owned(), found_mm, expected_mm, limit_mm })
             }
-            None => Ok(Measured { file, sha256: Sha256::digest(bytes).into() }),
+            None => Ok(file),
         }
     }
 

@@ -37,7 +37,7 @@ pub use error::ExchangeError;
 pub use grinder::{GrinderExchange, GrinderFolders};
 pub use hand_over::{Confirmed, Exchange, HandOver, Look, Standing};
 pub use machine::ExchangeMachine;
-pub use measured::{Measured, Wanted, foreign, measurement};
+pub use measured::{Wanted, foreign, measurement};
 pub use pattern::{Pattern, file_word};
 pub use settings::{ExchangeWire, StationTable};
 pub use stations::{PlacedStation, place_station};

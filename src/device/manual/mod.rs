@@ -283,7 +283,7 @@ fn measured(
         probe_tolerance_mm: settings.probe_tolerance_mm,
     };
     let identity = plan.identity();
-    let file = wanted.read(path, bytes)?.file;
+    let file = wanted.read(path, bytes)?;
     if let Some(why) = foreign(&file.statements, &settings.part, job.cycle, &hex(&identity)) {
         return Err(ExchangeError::Foreign { path: path.to_owned(), why });
     }

@@ -5,8 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use regrind_journal::{
-    Anchor, Entry, Header, Journal, JournalError, Kind, canonical_json, open_read_only, sha256_hex, verify,
-    verify_against,
+    Anchor, Entry, Header, Journal, JournalError, Kind, Reader, canonical_json, sha256_hex, verify, verify_against,
 };
 use rusqlite::Connection;
 use serde_json::json;
@@ -59,7 +58,7 @@ fn what_was_written_is_read_and_verified() {
     let verified = verify(&folder).unwrap();
     assert_eq!((verified.records, verified.artefacts, verified.closed, verified.anchored), (11, 3, true, 11));
     assert_eq!(verified.head, anchor.head);
-    let records: Vec<_> = open_read_only(&folder).unwrap().records(0).map(Result::unwrap).collect();
+    let records: Vec<_> = Reader::open(&folder).unwrap().records(0).map(Result::unwrap).collect();
     assert_eq!(records[2].payload, r#"{"a":"ü\n","z":1.5}"#);
     assert_eq!(records[2].part, "SN 7");
     assert!(matches!(Journal::open(&folder).map(|_| ()), Err(JournalError::Closed { .. })));
@@ -331,7 +330,7 @@ fn long_journal(records: u64) -> (TempDir, PathBuf) {
     let home = tempfile::tempdir().unwrap();
     let folder = home.path().join("run");
     Journal::create(&folder, header()).unwrap();
-    let first = open_read_only(&folder).unwrap().records(0).next().unwrap().unwrap();
+    let first = Reader::open(&folder).unwrap().records(0).next().unwrap().unwrap();
     let mut database = Connection::open(folder.join("journal.sqlite")).unwrap();
     let transaction = database.transaction().unwrap();
     let mut previous = first.hash;
@@ -358,7 +357,7 @@ fn a_journal_of_many_pages_is_read_whole_and_a_change_in_any_of_them_is_found() 
     const RECORDS: u64 = 2_100;
     let (_home, folder) = long_journal(RECORDS);
     assert_eq!(verify(&folder).unwrap().records, RECORDS);
-    let reader = open_read_only(&folder).unwrap();
+    let reader = Reader::open(&folder).unwrap();
     for from in [0, 1, 2, 1_023, 1_024, RECORDS, RECORDS + 1, u64::MAX] {
         let numbers: Vec<u64> = reader.records(from).map(|r| r.unwrap().seq).collect();
         assert_eq!(numbers, (from.max(1)..=RECORDS).collect::<Vec<_>>(), "from {from}");
@@ -369,7 +368,7 @@ fn a_journal_of_many_pages_is_read_whole_and_a_change_in_any_of_them_is_found() 
         tamper(&folder, &format!("UPDATE record SET kind = 'nothing' WHERE seq = {seq}"));
         let found = verify(&folder);
         assert!(matches!(found, Err(JournalError::Broken { seq: at, .. }) if at == seq), "{seq}: {found:?}");
-        let mut given = open_read_only(&folder).unwrap().records(0).map(|r| r.is_ok()).collect::<Vec<_>>();
+        let mut given = Reader::open(&folder).unwrap().records(0).map(|r| r.is_ok()).collect::<Vec<_>>();
         assert_eq!(
             (given.len() as u64, given.pop()),
             (seq, Some(false)),
@@ -383,7 +382,7 @@ fn what_a_writer_adds_is_found_by_a_reader_that_has_begun() {
     let home = tempfile::tempdir().unwrap();
     let folder = home.path().join("run");
     let mut journal = Journal::create(&folder, header()).unwrap();
-    let reader = open_read_only(&folder).unwrap();
+    let reader = Reader::open(&folder).unwrap();
     let mut records = reader.records(0);
     for seq in 1..40 {
         assert_eq!(records.next().unwrap().unwrap().seq, seq);
