@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use serde_json::Value;
 
 /// Longest wait for anything that must happen.
-pub const PATIENCE: Duration = Duration::from_secs(120);
+pub const PATIENCE: Duration = Duration::from_secs(300);
 
 pub fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -25,6 +25,12 @@ pub fn changed(file: &str, changes: &[(&str, &str)]) -> String {
         text = text.replace(from, to);
     }
     text
+}
+
+/// Returns a text with some of it replaced, wherever it stands.
+pub fn replaced(text: &str, from: &str, to: &str) -> String {
+    assert!(text.contains(from), "no {from:?}");
+    text.replace(from, to)
 }
 
 /// The shipped free-form mirror with 300 points; its machines take no second for a job.
@@ -83,6 +89,21 @@ impl Running {
         }
         let _ = self.child.kill();
         panic!("no {what}:\n{}\n{}", self.said.join("\n"), self.errors.take().unwrap().join().unwrap());
+    }
+
+    /// Waits until something is so, while the program runs.
+    pub fn until<T>(&mut self, what: &str, mut is_so: impl FnMut(&[String]) -> Option<T>) -> T {
+        let began = Instant::now();
+        loop {
+            self.said.extend(self.lines.try_iter());
+            if let Some(found) = is_so(&self.said) {
+                return found;
+            }
+            let ended = self.child.try_wait().unwrap();
+            assert!(ended.is_none(), "the program ended with {ended:?} before {what}: {:#?}", self.said);
+            assert!(began.elapsed() < PATIENCE, "no {what}: {:#?}", self.said);
+            std::thread::park_timeout(Duration::from_millis(20));
+        }
     }
 
     /// Presses Ctrl-C.

@@ -2,11 +2,12 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use crate::program::{self, changed, root};
+use crate::worlds::header;
 use nalgebra::{Matrix6, Vector6};
 use regrind::cell::{Actor, Ending, Role};
 use regrind::config::CellConfig;
@@ -16,7 +17,7 @@ use regrind::drive::{CycleRow, Drive, Notice, Run};
 use regrind::formats::result::{Content, Coordinates as Said};
 use regrind::formats::{self, HeightMap, MapRecord, X3pFile, read_measured, read_x3p, write_x3p};
 use regrind::geometry::{Grid, Pose};
-use regrind::journal::{Header, Journal};
+use regrind::journal::Journal;
 use regrind::recipe::Recipe;
 use regrind::setup;
 use regrind_sim::Vec3;
@@ -27,25 +28,12 @@ use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::Serving;
 use regrind_sim::world::World;
 use serde::Deserialize;
-use serde_json::{Value, json};
+use serde_json::Value;
 use tokio::sync::mpsc;
 
 /// No run takes so long, however loaded the computer is.
 const PATIENCE: Duration = Duration::from_secs(300);
 const SPEED: f64 = 50_000.0;
-
-fn root() -> &'static Path {
-    Path::new(env!("CARGO_MANIFEST_DIR"))
-}
-
-fn changed(file: &str, changes: &[(&str, &str)]) -> String {
-    let mut text = fs::read_to_string(root().join(file)).unwrap();
-    for (from, to) in changes {
-        assert!(text.contains(from), "{file} has no {from:?}");
-        text = text.replace(from, to);
-    }
-    text
-}
 
 // ---- the interferometer -------------------------------------------------------------------------------------------------------------
 
@@ -226,16 +214,7 @@ async fn run(seed: u64) -> Ran {
     let cell = cell(&shop, serving.local_addr().unwrap().port());
     let (task, plan) = setup::prepare(&recipe, &cell).unwrap();
     let (cmm, grinder) = setup::machines(&recipe, &cell, "FFM", &folder, [7, 1]).unwrap();
-    let header = Header {
-        run: "run".into(),
-        part: "FFM".into(),
-        actor: "test".into(),
-        station: "here".into(),
-        simulation: true,
-        first_command_id: 1,
-        content: json!({}),
-    };
-    let journal = Journal::create(&folder, header).unwrap();
+    let journal = Journal::create(&folder, header("FFM")).unwrap();
     let (notices, mut shown) = mpsc::unbounded_channel();
     let actor = Actor { name: "test".into(), station: "here".into() };
     let poll = [Duration::from_millis(20); 2];
@@ -332,6 +311,16 @@ async fn an_interferometers_maps_close_the_loop() {
 
 // ---- the folders --------------------------------------------------------------------------------------------------------------------
 
+/// What an X3P file says of its map.
+fn record() -> MapRecord {
+    MapRecord {
+        date: "2026-03-01T12:00:00Z".into(),
+        creator: "a test".into(),
+        instrument: "interferometer".into(),
+        comment: String::new(),
+    }
+}
+
 /// The maps of a small surface in each format, with one sample that was not measured.
 fn small_maps(folder: &Path) -> Vec<(PathBuf, HeightMap)> {
     let sample = |k: usize| (k != 7).then_some(1e-3 * (k as f64 - 5.0));
@@ -341,14 +330,8 @@ fn small_maps(folder: &Path) -> Vec<(PathBuf, HeightMap)> {
         (0..20).map(sample),
     )
     .unwrap();
-    let record = MapRecord {
-        date: "2026-03-01T12:00:00Z".into(),
-        creator: "a test".into(),
-        instrument: "interferometer".into(),
-        comment: String::new(),
-    };
     let [x3p, sdf, dat] = ["x3p", "sdf", "dat"].map(|end| folder.join(format!("map.{end}")));
-    write_x3p(&x3p, &map, &record).unwrap();
+    write_x3p(&x3p, &map, &record()).unwrap();
     let heights = |k: usize| sample(k).map_or("BAD".to_owned(), |z| format!("{z}"));
     let rows: Vec<String> = (0..4).map(|j| (0..5).map(|i| heights(5 * j + i)).collect::<Vec<_>>().join(" ")).collect();
     let text = format!(
@@ -441,20 +424,13 @@ fn a_map_is_registered_from_the_command_line_as_contact_points() {
         (0..6000).map(height),
     )
     .unwrap();
-    let record = MapRecord {
-        date: "2026-03-01T12:00:00Z".into(),
-        creator: "a test".into(),
-        instrument: "interferometer".into(),
-        comment: String::new(),
-    };
-    write_x3p(&home.path().join("map.x3p"), &map, &record).unwrap();
+    write_x3p(&home.path().join("map.x3p"), &map, &record()).unwrap();
     let register = |more: &[&str]| {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_regrind"));
-        command.current_dir(home.path()).args(["register", "--nominal", "nominal.csv", "--measured", "map.x3p"]);
-        command.args(["--out", "out"]).args(more).output().unwrap()
+        let files = ["register", "--nominal", "nominal.csv", "--measured", "map.x3p", "--out", "out"];
+        program::run(&[&files, more].concat(), home.path())
     };
-    let done = register(&["--method", "contact"]);
-    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    let (code, _, told) = register(&["--method", "contact"]);
+    assert_eq!(code, 0, "{told}");
     let text = fs::read_to_string(home.path().join("out/registration.json")).unwrap();
     let json: Value = serde_json::from_str(&text).unwrap();
     let rows: [[f64; 4]; 4] = serde_json::from_value(json["cmm_from_model"].clone()).unwrap();
@@ -464,8 +440,7 @@ fn a_map_is_registered_from_the_command_line_as_contact_points() {
     assert!((0..3).all(|k| (pose.translation_mm[k] - truth[k]).abs() < 1e-3) && pose.angle_rad() < 1e-4, "{pose:?}");
     assert_eq!(json["points"], map.measured_count());
     // A ball that never was there must not be taken off.
-    let refused = register(&["--probe-radius", "1.5"]);
-    let told = String::from_utf8_lossy(&refused.stderr).into_owned();
-    assert_eq!(refused.status.code(), Some(2), "{told}");
+    let (code, _, told) = register(&["--probe-radius", "1.5"]);
+    assert_eq!(code, 2, "{told}");
     assert!(told.contains("--method contact"), "{told}");
 }

@@ -2,9 +2,10 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
 
 use serde_json::Value;
+
+use crate::program::{replaced, root, run};
 
 /// A folder of runs, and a recipe that learns.
 struct Shop {
@@ -14,29 +15,26 @@ struct Shop {
 
 impl Shop {
     fn new() -> Self {
-        let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("recipes/shallow-wave.toml");
-        let recipe = fs::read_to_string(shipped).unwrap();
-        let recipe = changed(&recipe, "columns = 50\nrows = 40", "columns = 34\nrows = 26");
-        let recipe = changed(&recipe, "cutoff_mm = 5.0", "cutoff_mm = 8.0\nlearn = true");
-        let recipe = changed(&recipe, "most_cycles = 5", "most_cycles = 2");
+        let recipe = fs::read_to_string(root().join("recipes/shallow-wave.toml")).unwrap();
+        let recipe = replaced(&recipe, "columns = 50\nrows = 40", "columns = 34\nrows = 26");
+        let recipe = replaced(&recipe, "cutoff_mm = 5.0", "cutoff_mm = 8.0\nlearn = true");
+        let recipe = replaced(&recipe, "most_cycles = 5", "most_cycles = 2");
         Self { home: tempfile::tempdir().unwrap(), recipe }
     }
 
-    fn run(&self, recipe: &str) -> Output {
-        let path = self.home.path().join("wave.toml");
-        fs::write(&path, recipe).unwrap();
-        let cell = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/sim.toml");
-        let mut program = Command::new(env!("CARGO_BIN_EXE_regrind"));
-        program.arg("run").arg(path).arg("--cell").arg(cell).arg("--runs").arg(self.home.path().join("runs"));
-        program.output().unwrap()
+    /// Runs a recipe, or plans it; returns the exit code and all that was said.
+    fn give(&self, command: &str, recipe: &str) -> (i32, String) {
+        fs::write(self.home.path().join("wave.toml"), recipe).unwrap();
+        let cell = root().join("config/sim.toml");
+        let (code, out, err) = run(&[command, "wave.toml", "--cell", cell.to_str().unwrap()], self.home.path());
+        (code, format!("{out}\n{err}"))
     }
 
     /// Runs a recipe to its end and returns its folder.
     fn ran(&self, recipe: &str) -> (PathBuf, String) {
         let before = self.folders();
-        let output = self.run(recipe);
-        let said = told(&output);
-        assert!(matches!(output.status.code(), Some(0 | 1)), "{said}");
+        let (code, said) = self.give("run", recipe);
+        assert!(matches!(code, 0 | 1), "{said}");
         let mut new = self.folders();
         new.retain(|folder| !before.contains(folder));
         (new.pop().expect("a run has a folder"), said)
@@ -46,15 +44,6 @@ impl Shop {
         let Ok(entries) = fs::read_dir(self.home.path().join("runs")) else { return Vec::new() };
         entries.map(|entry| entry.unwrap().path()).collect()
     }
-}
-
-fn changed(text: &str, from: &str, to: &str) -> String {
-    assert!(text.contains(from), "no {from:?}");
-    text.replace(from, to)
-}
-
-fn told(output: &Output) -> String {
-    format!("{}\n{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
 }
 
 /// RMS of the part after the first pass, as it was measured.
@@ -75,10 +64,7 @@ fn a_part_begins_with_what_the_one_before_it_told() {
     let [before, after] = [&first, &second].map(|run| first_rms_mm(run));
     assert!(after < 0.5 * before, "the first pass left {before} mm, and that of the next part {after} mm");
     // The record holds what it began with, and what the first pass was ground by.
-    let recorded = |run: &Path| {
-        let export = Command::new(env!("CARGO_BIN_EXE_regrind")).args(["audit", "export"]).arg(run).output().unwrap();
-        String::from_utf8(export.stdout).unwrap()
-    };
+    let recorded = |folder: &Path| run(&["audit", "export", folder.to_str().unwrap()], shop.home.path()).1;
     for name in ["correction.csv", "toolpath.ngc", "toolpath_z.csv"] {
         for (run, cycle, there) in [(&first, 0, false), (&first, 1, true), (&second, 0, true)] {
             let name = format!("cycle-{cycle}/{name}");
@@ -87,21 +73,16 @@ fn a_part_begins_with_what_the_one_before_it_told() {
         }
     }
     assert_eq!(fs::read(first.join("learned.json")).unwrap(), fs::read(second.join("learned_from.json")).unwrap());
-    let audited = Command::new(env!("CARGO_BIN_EXE_regrind")).args(["audit", "verify"]).arg(&second).output().unwrap();
-    assert!(audited.status.success(), "{}", told(&audited));
+    let (code, _, errors) = run(&["audit", "verify", second.to_str().unwrap()], shop.home.path());
+    assert_eq!(code, 0, "{errors}");
 
     // A plan does not know which run that will be.
-    let plan = |recipe: &str| {
-        fs::write(shop.home.path().join("wave.toml"), recipe).unwrap();
-        let cell = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/sim.toml");
-        let mut program = Command::new(env!("CARGO_BIN_EXE_regrind"));
-        told(&program.arg("plan").arg(shop.home.path().join("wave.toml")).arg("--cell").arg(cell).output().unwrap())
-    };
+    let plan = |recipe: &str| shop.give("plan", recipe).1;
     assert!(plan(&shop.recipe).contains("begins with the correction that the last one like it left"));
-    assert!(!plan(&changed(&shop.recipe, "learn = true", "learn = false")).contains("begins with"));
+    assert!(!plan(&replaced(&shop.recipe, "learn = true", "learn = false")).contains("begins with"));
 
     // Another way of choosing the gain is another thing to learn.
-    let (_, said) = shop.ran(&changed(&shop.recipe, "learn = true", "learn = true\ngain = 0.8"));
+    let (_, said) = shop.ran(&replaced(&shop.recipe, "learn = true", "learn = true\ngain = 0.8"));
     assert!(said.contains("begins from nothing"), "{said}");
 }
 
@@ -111,15 +92,14 @@ fn what_cannot_be_begun_with_is_refused() {
     let (first, _) = shop.ran(&shop.recipe);
     let refused = |recipe: &str, words: &[&str]| {
         let runs = shop.folders().len();
-        let output = shop.run(recipe);
-        let said = told(&output);
-        assert_eq!(output.status.code(), Some(2), "{said}");
+        let (code, said) = shop.give("run", recipe);
+        assert_eq!(code, 2, "{said}");
         assert!(words.iter().all(|word| said.contains(word)), "{said}");
         assert_eq!(shop.folders().len(), runs, "a refused run leaves no folder");
     };
-    let small = changed(&shop.recipe, "largest_correction_um = 60.0", "largest_correction_um = 0.5");
+    let small = replaced(&shop.recipe, "largest_correction_um = 60.0", "largest_correction_um = 0.5");
     refused(&small, &["more than the 0.50 um", "raise largest_correction_um", "learn = false"]);
-    let measured_first = changed(&shop.recipe, "most_cycles = 2", "most_cycles = 2\nbegin_with = \"measure\"");
+    let measured_first = replaced(&shop.recipe, "most_cycles = 2", "most_cycles = 2\nbegin_with = \"measure\"");
     refused(&measured_first, &["compensation.learn", "leave one of the two out"]);
     // A file that has come to harm is told, and in nobody's way.
     fs::write(first.join("learned.json"), "{").unwrap();

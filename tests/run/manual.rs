@@ -6,14 +6,14 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use regrind::journal::{Reader, Record};
-use regrind_sim::body::{Body, Payload, Payloads};
-use regrind_sim::payload::{Feature, Map, Pass, Plan, Status, Target, decode_points};
+use regrind_sim::payload::{Feature, Map, Pass, Plan, PointRecord, Status, Target};
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::world::World;
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use crate::program::{PATIENCE, Running, changed, regrind, root, run};
+use crate::study::{grind, touch};
 
 const RADIUS_MM: f64 = 1.5;
 
@@ -93,12 +93,7 @@ impl Person {
             extent_mm: [-51.0, 51.0, -31.0, 31.0],
             nominal: [7; 32],
         };
-        let payload = |bytes: Vec<u8>, kind: u8| Some(Payload { bytes, identity: [kind; 32] });
-        let payloads = Payloads { plan: None, map: payload(map.encode(), 2), pass: payload(pass.encode(), 3) };
-        let mut grinder = self.world.grinder();
-        grinder.prepare(1, cycle, &payloads).unwrap();
-        grinder.begin();
-        while !grinder.advance(1000.0).finished {}
+        grind(&mut self.world.grinder(), 1, cycle, &map, &pass);
     }
 
     /// Measures by the plan that the prompt names, and saves the points as a measuring program would.
@@ -112,15 +107,9 @@ impl Person {
         let (approach_mm, search_mm, speed_mm_s, safe_height_mm) = (2.0, 2.0, 5.0, 50.0);
         let targets = rows(plan).into_iter().map(target).collect();
         let plan = Plan { probe_radius_mm: RADIUS_MM, approach_mm, search_mm, speed_mm_s, safe_height_mm, targets };
-        let payload = Payload { bytes: plan.encode(), identity: [1; 32] };
-        let mut cmm = self.world.cmm();
-        cmm.prepare(1, 0, &Payloads { plan: Some(payload), ..Payloads::default() }).unwrap();
-        cmm.begin();
-        while !cmm.advance(1000.0).finished {}
-        let outcome = cmm.outcome(1);
-        let points = decode_points(&outcome.bytes, (outcome.format == 2).then_some(outcome.scale_mm)).unwrap();
+        let points = touch(&self.world, 1, &plan);
         let touched = points.iter().zip(&plan.targets).filter(|(point, _)| point.status == Status::Touched);
-        let row = |(p, t): (&regrind_sim::payload::PointRecord, &Target)| {
+        let row = |(p, t): (&PointRecord, &Target)| {
             format!("{},{},{},{}\n", t.index, p.position_mm[0], p.position_mm[1], p.position_mm[2])
         };
         self.measured += 1;

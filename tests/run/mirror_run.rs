@@ -3,18 +3,14 @@
 //! The data stand outside of the project, in the folder that REGRIND_DATA names.
 
 use std::fs;
-use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
-use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::process::Command;
 
 use crate::data::data;
+use crate::program::{Running, changed, run};
 use regrind::journal;
 use serde_json::Value;
 
-/// Generous: the machine that tests may be busy with something else.
-const PATIENCE: Duration = Duration::from_secs(300);
 const SESSION: &str = "20250824_M1_1";
 const POINTS: usize = 1161;
 
@@ -25,15 +21,9 @@ struct Shop {
     cell: PathBuf,
 }
 
-fn changed(text: &str, from: &str, to: &str) -> String {
-    assert!(text.contains(from), "no {from:?}");
-    text.replace(from, to)
-}
-
 impl Shop {
     /// Takes what ships, with folders of its own; `hold` is the recipe's line of that name.
     fn new(data: &Path, hold: &str) -> Self {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR"));
         let home = tempfile::tempdir().unwrap();
         for machine in ["cmm", "grinder"] {
             for folder in ["in", "out"] {
@@ -41,19 +31,22 @@ impl Shop {
             }
         }
         fs::create_dir(home.path().join("config")).unwrap();
-        let cell = fs::read_to_string(root.join("config/file-exchange.toml")).unwrap();
         let nominal = data.join("nominal/reference.yaml");
-        let cell = changed(&cell, "../exchange/cmm/reference.yaml", nominal.to_str().unwrap());
-        let cell = changed(&cell, "stable_for_s = 2.0", "stable_for_s = 0.2");
+        let inbox = "inbox = \"../exchange/grinder/in\"";
         let cell = changed(
-            &cell,
-            "inbox = \"../exchange/grinder/in\"",
-            "inbox = \"../exchange/grinder/in\"\nstable_for_s = 0.2",
+            "config/file-exchange.toml",
+            &[
+                ("../exchange/cmm/reference.yaml", nominal.to_str().unwrap()),
+                ("stable_for_s = 2.0", "stable_for_s = 0.2"),
+                (inbox, &format!("{inbox}\nstable_for_s = 0.2")),
+            ],
         );
-        let recipe = fs::read_to_string(root.join("recipes/telescope-panel.toml")).unwrap();
-        let recipe = changed(&recipe, "hold = [\"x\", \"y\", \"rz\"]", hold);
-        // As many as the files hold, so that a measurement is never taken before the last file is there.
-        let recipe = changed(&recipe, "points = 1100", &format!("points = {POINTS}"));
+        // As many points as the files hold, so that a measurement is never taken before the last file is there.
+        let points = format!("points = {POINTS}");
+        let recipe = changed(
+            "recipes/telescope-panel.toml",
+            &[("hold = [\"x\", \"y\", \"rz\"]", hold), ("points = 1100", &points)],
+        );
         let (recipe_path, cell_path) = (home.path().join("mirror.toml"), home.path().join("config/cell.toml"));
         fs::write(&recipe_path, recipe).unwrap();
         fs::write(&cell_path, cell).unwrap();
@@ -67,20 +60,12 @@ impl Shop {
     fn command(&self) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_regrind"));
         command.arg("run").arg(&self.recipe).arg("--cell").arg(&self.cell).args(["--part", "M1", "--loaded", "--json"]);
-        command.arg("--runs").arg(self.home.path().join("runs")).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command.arg("--runs").arg(self.home.path().join("runs"));
         command
     }
 
     fn run(&self) -> Running {
-        let mut child = self.command().spawn().unwrap();
-        let lines = Arc::new(Mutex::new(Vec::new()));
-        let (seen, out) = (Arc::clone(&lines), child.stdout.take().unwrap());
-        let reading = std::thread::spawn(move || {
-            for line in BufReader::new(out).lines().map_while(Result::ok) {
-                seen.lock().unwrap().push(line);
-            }
-        });
-        Running { child, lines, reading: Some(reading) }
+        Running::new(self.command())
     }
 
     /// Puts the raw files of all stations into the inbox, as they are.
@@ -113,60 +98,15 @@ impl Shop {
     }
 
     fn confirm(&self, what: &str, map: &str) -> (bool, String) {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_regrind"));
-        let output = command.args(["confirm", what, "--map", map]).arg(self.run_folder()).output().unwrap();
-        let text = [output.stdout, output.stderr].concat();
-        (output.status.success(), String::from_utf8_lossy(&text).into_owned())
+        let folder = self.run_folder();
+        let (code, told, errors) = run(&["confirm", what, "--map", map, folder.to_str().unwrap()], self.home.path());
+        (code == 0, told + &errors)
     }
 }
 
-/// A run of the program that goes on, and what it has said.
-struct Running {
-    child: Child,
-    lines: Arc<Mutex<Vec<String>>>,
-    reading: Option<std::thread::JoinHandle<()>>,
-}
-
-impl Running {
-    fn said(&self) -> Vec<Value> {
-        self.lines.lock().unwrap().iter().map(|line| serde_json::from_str(line).unwrap()).collect()
-    }
-
-    /// Waits until something is so, while the program runs.
-    fn until<T>(&mut self, what: &str, mut is_so: impl FnMut() -> Option<T>) -> T {
-        let began = Instant::now();
-        loop {
-            if let Some(found) = is_so() {
-                return found;
-            }
-            if let Some(status) = self.child.try_wait().unwrap() {
-                panic!("the program ended with {status} before {what}: {:#?}", self.said());
-            }
-            assert!(began.elapsed() < PATIENCE, "no {what}: {:#?}", self.said());
-            std::thread::park_timeout(Duration::from_millis(20));
-        }
-    }
-
-    /// Waits for the end, and returns the exit code and everything said.
-    fn end(mut self) -> (i32, Vec<Value>) {
-        let began = Instant::now();
-        let status = loop {
-            if let Some(status) = self.child.try_wait().unwrap() {
-                break status;
-            }
-            assert!(began.elapsed() < PATIENCE, "no end: {:#?}", self.said());
-            std::thread::park_timeout(Duration::from_millis(20));
-        };
-        self.reading.take().unwrap().join().unwrap();
-        (status.code().unwrap(), self.said())
-    }
-}
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        // Ended already, unless the test failed.
-        let _ = self.child.kill();
-    }
+/// What a program with `--json` has said.
+fn notices_of(program: &Running) -> Vec<Value> {
+    program.said.iter().map(|line| serde_json::from_str(line).unwrap()).collect()
 }
 
 fn notices<'s>(said: &'s [Value], kind: &str) -> Vec<&'s Value> {
@@ -182,11 +122,12 @@ fn is_about(found: f64, expected: f64) -> bool {
 fn a_real_mirror_is_measured_and_judged_and_its_correction_refused_in_words() {
     let data = data("lat-freeform-mirror");
     let shop = Shop::new(&data, "");
-    let mut run = shop.run();
-    let plan = run.until("the plan", || shop.handed_over("cmm/out", ""));
+    let mut program = shop.run();
+    let plan = program.until("the plan", |_| shop.handed_over("cmm/out", ""));
     assert_eq!(plan.file_name().unwrap().to_str().unwrap().split("_j").next(), Some("M1"));
     shop.deliver(&data);
-    let (code, said) = run.end();
+    let (code, _) = program.end();
+    let said = notices_of(&program);
     // Finished in order, not in tolerance.
     assert_eq!(code, 1, "{said:#?}");
     let figures = &notices(&said, "figures")[0]["figures"];
@@ -218,10 +159,10 @@ fn a_real_mirror_is_measured_and_judged_and_its_correction_refused_in_words() {
 fn with_its_place_held_the_mirror_gets_a_map_that_is_handed_over_once_and_confirmed() {
     let data = data("lat-freeform-mirror");
     let shop = Shop::new(&data, "hold = [\"x\", \"y\", \"rz\"]");
-    let mut run = shop.run();
-    run.until("the plan", || shop.handed_over("cmm/out", ""));
+    let mut program = shop.run();
+    program.until("the plan", |_| shop.handed_over("cmm/out", ""));
     shop.deliver(&data);
-    let handed = run.until("the map", || shop.handed_over("grinder/out", "_c2"));
+    let handed = program.until("the map", |_| shop.handed_over("grinder/out", "_c2"));
     let folder = shop.run_folder();
     let json: Value = serde_json::from_slice(&fs::read(handed.join("correction.json")).unwrap()).unwrap();
     let map = json["map"].as_str().unwrap().to_owned();
@@ -240,24 +181,23 @@ fn with_its_place_held_the_mirror_gets_a_map_that_is_handed_over_once_and_confir
     assert!(largest_um > 20.0 && largest_um < 400.0);
     assert!(folder.join("cycle-1/error_map.csv").is_file());
     // The word of a person who works by another map is not taken.
-    run.until("a pass that is under way", || match shop.confirm("started", "00000000") {
+    program.until("a pass that is under way", |_| match shop.confirm("started", "00000000") {
         (false, text) if text.contains("is another one") => Some(()),
         (false, text) if text.contains("no pass is under way") => None,
         told => panic!("{told:?}"),
     });
-    run.until("the start to be confirmed", || shop.confirm("started", &map[..8]).0.then_some(()));
+    program.until("the start to be confirmed", |_| shop.confirm("started", &map[..8]).0.then_some(()));
     assert!(shop.folder("grinder/in").join("started.json").is_file());
     // The end is told the other way: the file of the hand-over, copied by hand.
     fs::copy(handed.join("done.json"), shop.folder("grinder/in").join("done.json")).unwrap();
-    run.until("the pass to be over", || shop.handed_over("grinder/out", "_c2.done"));
+    program.until("the pass to be over", |_| shop.handed_over("grinder/out", "_c2.done"));
     // The next plan; the old files are no answer to it.
-    run.until("the next plan", || shop.handed_over("cmm/out", "_c2"));
-    let lines = Arc::clone(&run.lines);
-    let left_alone = || lines.lock().unwrap().iter().any(|line| line.contains("lay there before the plan"));
-    run.until("the old files to be left alone", || left_alone().then_some(()));
-    let mut stop = Command::new(env!("CARGO_BIN_EXE_regrind"));
-    assert!(stop.arg("stop").arg(&folder).output().unwrap().status.success());
-    let (code, said) = run.end();
+    program.until("the next plan", |_| shop.handed_over("cmm/out", "_c2"));
+    let left_alone = |line: &String| line.contains("lay there before the plan");
+    program.until("the old files to be left alone", |said| said.iter().any(left_alone).then_some(()));
+    assert_eq!(run(&["stop", folder.to_str().unwrap()], shop.home.path()).0, 0);
+    let (code, _) = program.end();
+    let said = notices_of(&program);
     assert_eq!(code, 3, "{said:#?}");
     assert_eq!(notices(&said, "figures").len(), 1, "one measurement");
     let notes: Vec<String> = notices(&said, "note").iter().map(|note| note["words"].to_string()).collect();

@@ -13,7 +13,7 @@ use regrind::recipe::Recipe;
 use regrind::registration::{PointStatus, Registration};
 use regrind::setup;
 use regrind_sim::body::{Body, Payload, Payloads};
-use regrind_sim::payload::{Feature, Map, Pass, Plan, Status, Target, decode_points};
+use regrind_sim::payload::{Feature, Map, Pass, Plan, PointRecord, Status, Target, decode_points};
 use regrind_sim::process::Grinder;
 use regrind_sim::spec::GrinderSpec;
 use regrind_sim::spec::WorldSpec;
@@ -187,13 +187,7 @@ impl<'a> Line<'a> {
             safe_height_mm: task.probing.safe_height_mm,
             targets: self.bench.plan_of.iter().enumerate().map(target).collect(),
         };
-        let mut cmm = self.worlds[0].cmm();
-        let payload = Payload { bytes: plan.encode(), identity: [1; 32] };
-        cmm.prepare(self.job, 0, &Payloads { plan: Some(payload), ..Payloads::default() }).unwrap();
-        cmm.begin();
-        while !cmm.advance(1000.0).finished {}
-        let outcome = cmm.outcome(1);
-        let records = decode_points(&outcome.bytes, (outcome.format == 2).then_some(outcome.scale_mm)).unwrap();
+        let records = touch(self.worlds[0], self.job, &plan);
         let points: Vec<Point> =
             records.iter().filter(|r| r.status == Status::Touched).map(|r| Point::from(r.position_mm)).collect();
         // The true radius, as the reference sphere tells it in a run.
@@ -277,7 +271,19 @@ fn pass_of(task: &Task, level_mm: f64) -> Pass {
     }
 }
 
-fn grind(grinder: &mut Grinder, job: u32, cycle: u16, map: &Map, pass: &Pass) {
+/// Measures a part by a plan.
+pub fn touch(world: &World, job: u32, plan: &Plan) -> Vec<PointRecord> {
+    let mut cmm = world.cmm();
+    let payload = Payload { bytes: plan.encode(), identity: [1; 32] };
+    cmm.prepare(job, 0, &Payloads { plan: Some(payload), ..Payloads::default() }).unwrap();
+    cmm.begin();
+    while !cmm.advance(1000.0).finished {}
+    let outcome = cmm.outcome(1);
+    decode_points(&outcome.bytes, (outcome.format == 2).then_some(outcome.scale_mm)).unwrap()
+}
+
+/// Grinds a part once, by a map.
+pub fn grind(grinder: &mut Grinder, job: u32, cycle: u16, map: &Map, pass: &Pass) {
     let payload = |bytes: Vec<u8>, kind: u8| Some(Payload { bytes, identity: [kind; 32] });
     let payloads = Payloads { plan: None, map: payload(map.encode(), 2), pass: payload(pass.encode(), 3) };
     grinder.prepare(job, cycle, &payloads).unwrap();

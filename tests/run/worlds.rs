@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use crate::program::root;
 use regrind::cell::{Actor, Alarm, AlarmId, Ending, Role, StateName};
 use regrind::config::CellConfig;
 use regrind::device::Wire;
@@ -221,11 +222,6 @@ pub fn table(path: &std::path::Path) -> Vec<Vec<f64>> {
     text.lines().filter(|line| !line.starts_with('#')).skip(1).map(row).collect()
 }
 
-/// The project's own folder.
-pub fn root() -> PathBuf {
-    env!("CARGO_MANIFEST_DIR").into()
-}
-
 /// Runs a cell in a runtime of its own.
 pub fn run(setup: Setup) -> Ran {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
@@ -247,7 +243,7 @@ async fn go(setup: Setup) -> Ran {
     let world = world(&setup, &recipe);
     let taken = Arc::new(Mutex::new(Vec::new()));
     let (servings, [of_cmm, of_grinder]) = serve(&setup, &world, &cell, &folder, &taken).await;
-    let journal = Journal::create(&folder, header()).unwrap();
+    let journal = Journal::create(&folder, header("test part")).unwrap();
     let (notices, mut shown) = mpsc::unbounded_channel();
     let poll = [Duration::from_millis(10); 2];
     let actor = Actor { name: "test".into(), station: "here".into() };
@@ -294,10 +290,11 @@ async fn rests(folder: PathBuf) -> bool {
     }
 }
 
-fn header() -> Header {
+/// How a run of a part begins on record.
+pub fn header(part: &str) -> Header {
     Header {
         run: "run".into(),
-        part: "test part".into(),
+        part: part.into(),
         actor: "test".into(),
         station: "here".into(),
         simulation: true,
