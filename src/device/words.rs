@@ -12,6 +12,16 @@ pub enum MachineKind {
     Grinder,
 }
 
+impl MachineKind {
+    /// Returns its table in a cell file, and its name in commands.
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::Cmm => "cmm",
+            Self::Grinder => "grinder",
+        }
+    }
+}
+
 impl fmt::Display for MachineKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {

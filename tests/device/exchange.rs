@@ -38,8 +38,7 @@ impl Shop {
         CmmExchange::new("SN 7", &self.outbox, &self.inbox)
     }
 
-    fn grinder(&self) -> GrinderFolders {
-        let stable_for = Duration::from_secs(2);
+    fn grinder(&self, stable_for: Duration) -> GrinderFolders {
         let (outbox, inbox) = (self.outbox.clone(), self.inbox.clone());
         GrinderFolders::new(GrinderExchange { part: "SN 7".into(), outbox, inbox, stable_for })
     }
@@ -117,8 +116,16 @@ impl Bench {
 
     fn refused(&mut self, expected: &str) {
         let look = self.settled();
-        let said = look.notes.join("\n");
-        assert!(look.answer.is_none() && said.contains(expected), "said\n{said}\nnot {expected}");
+        assert!(look.answer.is_none(), "{expected}");
+        assert_says(&look, &[expected]);
+    }
+}
+
+/// The notes of a look say these words.
+fn assert_says<A>(look: &Look<A>, words: &[&str]) {
+    let said = look.notes.join("\n");
+    for word in words {
+        assert!(said.contains(word), "said\n{said}\nnot {word}");
     }
 }
 
@@ -157,13 +164,14 @@ fn the_plan_says_everything_and_reads_back_to_the_same_bits() {
 fn a_result_is_taken_when_it_has_settled_and_ended_and_not_before() {
     let shop = Shop::new();
     let mut bench = Bench::new(shop.cmm());
-    assert!(bench.look().notes[0].contains("waiting for SN_7_c2.* in"));
+    assert_says(&bench.look(), &["waiting for SN_7_c2.* in"]);
     shop.put("SN_7_c2.csv", "# coordinates: centres\nx,y,z\n1,2,3\n");
     assert!(bench.look().answer.is_none());
     // It grows while it is looked at: the time begins anew.
     shop.put("SN_7_c2.csv", "# coordinates: centres\nx,y,z\n1,2,3\n4,5,6\n7,8,9.1");
     let look = bench.look();
-    assert!(look.answer.is_none() && look.notes[0].contains("still changing"), "{:?}", look.notes);
+    assert!(look.answer.is_none());
+    assert_says(&look, &["still changing"]);
     // The last line has three numbers, and is not the end all the same.
     bench.refused("cut in the middle of a line, found `7,8,9.1`");
     shop.put("SN_7_c2.csv", &three());
@@ -347,20 +355,16 @@ fn stations_are_merged_by_their_reference_points() {
     shop.put("P_2.txt", &points(2));
     shop.put("ref_2.yaml", &references([0, 2, 1, 3], 2));
     bench.refused("station 2 (ref_2.yaml): reference point right is off by");
-    assert!(bench.look().notes.join(" ").contains("right and upper seem exchanged"));
+    assert_says(&bench.look(), &["right and upper seem exchanged"]);
     shop.put("ref_2.yaml", &references([0, 1, 2, 3], 2));
     let look = bench.settled();
+    assert_says(&look, &["left alone, no station's: ref_9.yaml"]);
+    assert_says(&look, &["station 1 (ref_1.yaml): reference points fit to 0.000 mm rms (left 0.000, right 0.000"]);
     let found = look.answer.unwrap();
     for (k, expected) in [[10.0, 20.0, 30.0], [40.0, 50.0, 61.0]].iter().cycle().take(4).enumerate() {
         let at = found.points[k].at_mm;
         assert!(at.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-9), "{at:?} not {expected:?}");
     }
-    let said = look.notes.join("\n");
-    assert!(said.contains("left alone, no station's: ref_9.yaml"), "{said}");
-    assert!(
-        said.contains("station 1 (ref_1.yaml): reference points fit to 0.000 mm rms (left 0.000, right 0.000"),
-        "{said}"
-    );
 }
 
 // ---- the grinder -----------------------------------------------------------------------------------------------------------------
@@ -390,7 +394,7 @@ fn pass() -> Pass {
 #[test]
 fn a_pass_is_confirmed_by_files_that_name_its_map() {
     let shop = Shop::new();
-    let mut grinder = shop.grinder();
+    let mut grinder = shop.grinder(Duration::from_secs(2));
     let map_identity = map().identity();
     let job = Job { job: 3, cycle: 2, digest: digest(&[map_identity, pass().identity()]) };
     shop.put("done.json", "{}");
@@ -404,32 +408,20 @@ fn a_pass_is_confirmed_by_files_that_name_its_map() {
         grinder.look(Duration::from_secs(now), job).unwrap();
         grinder.look(Duration::from_secs(now + 2), job).unwrap()
     };
-    let said = settled(&mut grinder).notes.join("\n");
-    assert!(
-        said.contains("done.json lay there before") && said.contains("waiting for the start to be confirmed"),
-        "{said}"
-    );
+    assert_says(&settled(&mut grinder), &["done.json lay there before", "waiting for the start to be confirmed"]);
     shop.put("started.json", r#"{"map": "0123456789abcdef"}"#);
     let look = settled(&mut grinder);
-    assert!(
-        !look.begun && look.notes.join("\n").contains("confirms map `0123456789abcdef`, handed over was map"),
-        "{:?}",
-        look.notes
-    );
+    assert!(!look.begun);
+    assert_says(&look, &["confirms map `0123456789abcdef`, handed over was map"]);
     fs::copy(folder.join("started.json"), shop.inbox.join("started.json")).unwrap();
     let look = settled(&mut grinder);
-    assert!(
-        look.begun && look.answer.is_none() && look.notes.join("\n").contains("waiting for the end"),
-        "{:?}",
-        look.notes
-    );
-    shop.put(
-        "done.json",
-        &fs::read_to_string(folder.join("done.json")).unwrap().replace("\"cycle\": 2", "\"cycle\": 1"),
-    );
-    assert!(settled(&mut grinder).notes.join("\n").contains("confirms job 3 cycle 1, handed over was job 3 cycle 2"));
+    assert!(look.begun && look.answer.is_none());
+    assert_says(&look, &["waiting for the end"]);
+    let done = fs::read_to_string(folder.join("done.json")).unwrap();
+    shop.put("done.json", &done.replace("\"cycle\": 2", "\"cycle\": 1"));
+    assert_says(&settled(&mut grinder), &["confirms job 3 cycle 1, handed over was job 3 cycle 2"]);
     shop.put("done.json", "{\"map\"");
-    assert!(settled(&mut grinder).notes.join("\n").contains("expected JSON"));
+    assert_says(&settled(&mut grinder), &["expected JSON"]);
     fs::copy(folder.join("done.json"), shop.inbox.join("done.json")).unwrap();
     let record = settled(&mut grinder).answer.unwrap();
     assert_eq!((record.map_identity, record.outcome, record.wheel_radius_mm), (map_identity, Outcome::Complete, None));
@@ -536,9 +528,7 @@ async fn a_restarted_client_learns_what_became_of_its_start() {
 #[tokio::test]
 async fn a_grinder_is_begun_and_ended_by_a_persons_word() {
     let shop = Shop::new();
-    let stable_for = Duration::ZERO;
-    let (outbox, inbox) = (shop.outbox.clone(), shop.inbox.clone());
-    let folders = GrinderFolders::new(GrinderExchange { part: "SN 7".into(), outbox, inbox, stable_for });
+    let folders = shop.grinder(Duration::ZERO);
     let mut grinder = ExchangeMachine::new("grinder", MachineKind::Grinder, folders, ANSWERS_WITHIN);
     assert!(matches!(grinder.status().await, Err(DeviceError::NotConnected { .. })));
     grinder.connect().await.unwrap();

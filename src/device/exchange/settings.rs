@@ -147,17 +147,13 @@ impl Wired for ExchangeWire {
 
 impl ExchangeWire {
     fn machine<M: super::Exchange>(&self, kind: MachineKind, inbox: &Path, folders: M) -> ExchangeMachine<M> {
-        let name = match kind {
-            MachineKind::Cmm => "cmm",
-            MachineKind::Grinder => "grinder",
-        };
-        let name = format!("{name} by files, {}", inbox.display());
+        let name = format!("{} by files, {}", kind.name(), inbox.display());
         ExchangeMachine::new(name, kind, folders, ANSWERS_WITHIN).apart(self.apart)
     }
 
     /// A folder that Regrind made itself would be one that nobody looks into: both must be there.
     fn folders(&self, making: &Making<'_>, machine: MachineKind) -> Result<[PathBuf; 2], MakingError> {
-        let table = if machine == MachineKind::Cmm { "cmm" } else { "grinder" };
+        let table = machine.name();
         let folder = |name: &str, path: &String| {
             let path = making.cell_folder.join(path);
             match path.is_dir() {

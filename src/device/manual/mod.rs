@@ -133,7 +133,7 @@ impl ManualMachine {
     /// What to do and what to check now, and what to type then.
     fn prompt(&self) -> Vec<String> {
         let Some((job, _)) = self.job else { return Vec::new() };
-        let name = if self.kind == MachineKind::Cmm { "cmm" } else { "grinder" };
+        let name = self.kind.name();
         let confirm = |what: &str| format!("then: regrind confirm {what}{}", self.run());
         let still =
             |what: &str| vec![format!("{what} it at its own panel"), confirm(&format!("still --machine {name}"))];
