@@ -11,9 +11,11 @@ use regrind::device::exchange::{
 };
 use regrind::device::{
     Answer, Cmm, Coordinates, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Machine, MachineKind,
-    Measurement, Outcome, Pass, Plan, PointStatus, Reconciled, State, Target, TargetKind, Word, digest,
+    Measurement, Outcome, Plan, PointStatus, Reconciled, State, Target, TargetKind, Word, digest,
 };
 use regrind::geometry::Grid;
+
+use crate::toy::pass;
 
 /// When the next file is said to have been written.
 static WRITTEN_S: AtomicU64 = AtomicU64::new(1_700_000_000);
@@ -373,20 +375,6 @@ fn map() -> CorrectionMap {
     CorrectionMap {
         grid: Grid { columns: 3, rows: 2, first_mm: [-1.0, 5.0], spacing_mm: [0.5, 2.0] },
         values_mm: vec![0.0, 1e-4, -2e-4, 0.0, 3e-3, 0.25],
-        part_identity: [7; 32],
-    }
-}
-
-fn pass() -> Pass {
-    Pass {
-        spark_out_passes: 1,
-        wheel_radius_mm: 100.0,
-        feed_mm_min: 900.0,
-        track_spacing_mm: 0.2,
-        level_mm: 0.01,
-        depth_of_cut_mm: 0.02,
-        x_mm: [-1.0, 0.0],
-        y_mm: [5.0, 7.0],
         part_identity: [7; 32],
     }
 }

@@ -173,17 +173,7 @@ async fn our_driver_has_a_pymodbus_grinder_grind() {
         values_mm: (0..600).map(|k| 1e-5 * f64::from(k)).collect(),
         part_identity: [3; 32],
     };
-    let pass = Pass {
-        spark_out_passes: 1,
-        wheel_radius_mm: 25.0,
-        feed_mm_min: 600.0,
-        track_spacing_mm: 0.2,
-        level_mm: 0.0,
-        depth_of_cut_mm: 0.01,
-        x_mm: [0.0, 29.0],
-        y_mm: [0.0, 28.5],
-        part_identity: [3; 32],
-    };
+    let pass = Pass { x_mm: [0.0, 29.0], y_mm: [0.0, 28.5], part_identity: [3; 32], ..crate::toy::pass() };
     let calm = Interrupt::new();
     grinder.load_pass(&map, &pass, &calm).await.unwrap();
     let job = Job { job: 6, cycle: 1, digest: digest(&[map.identity(), pass.identity()]) };

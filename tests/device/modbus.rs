@@ -21,7 +21,7 @@ use regrind_sim::{registers, words};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpSocket};
 
-use crate::toy::Toy;
+use crate::toy::{Toy, pass};
 
 // ---- machines to talk to ------------------------------------------------------------------------------------------------------------
 
@@ -86,18 +86,7 @@ fn map_and_pass() -> (CorrectionMap, Pass) {
         values_mm: (0..600).map(|k| 1e-3 * f64::from(k % 17)).collect(),
         part_identity: [7; 32],
     };
-    let pass = Pass {
-        spark_out_passes: 1,
-        wheel_radius_mm: 25.0,
-        feed_mm_min: 300.0,
-        track_spacing_mm: 0.2,
-        level_mm: 0.1,
-        depth_of_cut_mm: 0.02,
-        x_mm: [-10.0, 9.0],
-        y_mm: [-15.0, 14.0],
-        part_identity: [7; 32],
-    };
-    (map, pass)
+    (map, pass())
 }
 
 fn job_of(plan: &Plan, cycle: u16) -> Job {

@@ -1,6 +1,22 @@
-//! A machine that does exactly what it is told, for tests of the wire.
+//! A machine that does exactly what it is told, for tests of the wire, and a pass that it can be told.
 
+use regrind::device::Pass;
 use regrind_sim::body::{self, Body, Kind, Payload, Payloads, Progress, Refusal};
+
+/// How a small part is ground.
+pub fn pass() -> Pass {
+    Pass {
+        spark_out_passes: 1,
+        wheel_radius_mm: 25.0,
+        feed_mm_min: 300.0,
+        track_spacing_mm: 0.2,
+        level_mm: 0.1,
+        depth_of_cut_mm: 0.02,
+        x_mm: [-10.0, 9.0],
+        y_mm: [-15.0, 14.0],
+        part_identity: [7; 32],
+    }
+}
 
 /// A measuring machine whose probe touches exactly where it was told to, or a grinder that only says what it did.
 pub struct Toy {
