@@ -21,7 +21,7 @@ use crate::geometry::{Point, Vector};
 use crate::measuring::{Layout, PatternError, Target, targets};
 use crate::recipe::{NominalSource, Pattern, Recipe, SpindleAxis, StartAt, Um, Wheel};
 use crate::registration::{Coordinate, MapLimits};
-use crate::surface::{DefinedSurface, DefinitionError, Nominal, Side, SurfaceError};
+use crate::surface::{DefinedSurface, DefinitionError, Nominal, Projection, Side, SurfaceError};
 
 /// Why a recipe and a cell do not make a run.
 #[derive(Debug, Error)]
@@ -162,34 +162,15 @@ fn setting(recipe: &Recipe, cell: &CellConfig, part: &[u8; 32], targets: usize) 
 
 /// Reads or samples the nominal surface, and names the part by the SHA-256 of what it came from.
 fn nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> {
-    let of_definition = |path: &Path| {
-        let path = path.to_owned();
-        move |source| SetupError::Definition { path, source }
-    };
-    let sampled = |surface: &DefinedSurface, path: &Path| {
-        let spacing = surface.spacing_mm().map_err(of_definition(path))?;
-        let grid = surface.sample(spacing).map_err(of_definition(path))?;
-        Nominal::from_grid_with_normals(grid.columns, grid.rows, grid.points, grid.normals)
-            .map(|nominal| nominal.with_outline(surface.aperture().clone()))
-            .map_err(|source| SetupError::Nominal { path: path.to_owned(), source })
-    };
     match &recipe.nominal {
         NominalSource::Surface(surface) => {
-            let nominal = sampled(surface, recipe.path())?;
+            let nominal = sampled(recipe.path(), surface)?;
             let identity = identity_of(&nominal);
             Ok((nominal, recipe.path().to_owned(), identity))
         }
         NominalSource::File { path, projection, aperture } => {
-            let of_surface = |source| SetupError::Nominal { path: path.clone(), source };
             let (file, identity) = formats::read_nominal_with_identity(path)?;
-            let nominal = match file {
-                NominalFile::Points(points) => Nominal::from_points(points, *projection).map_err(of_surface)?,
-                NominalFile::Mesh { points, triangles } => Nominal::from_mesh(points, triangles).map_err(of_surface)?,
-                NominalFile::Definition(text) => {
-                    let surface = DefinedSurface::from_toml(&text).map_err(of_definition(path))?;
-                    sampled(&surface, path)?
-                }
-            };
+            let nominal = surface(path, file, *projection)?;
             let nominal = match aperture {
                 Some(outline) => nominal.with_outline(outline.clone()),
                 None => nominal,
@@ -197,6 +178,31 @@ fn nominal(recipe: &Recipe) -> Result<(Nominal, PathBuf, [u8; 32]), SetupError> 
             Ok((nominal, path.clone(), identity))
         }
     }
+}
+
+/// Makes the nominal surface of what a file holds; only points are projected.
+///
+/// # Errors
+/// What makes no surface, with the path of the file.
+pub fn surface(path: &Path, file: NominalFile, projection: Projection) -> Result<Nominal, SetupError> {
+    let of_surface = |source| SetupError::Nominal { path: path.to_owned(), source };
+    match file {
+        NominalFile::Points(points) => Nominal::from_points(points, projection).map_err(of_surface),
+        NominalFile::Mesh { points, triangles } => Nominal::from_mesh(points, triangles).map_err(of_surface),
+        NominalFile::Definition(text) => match DefinedSurface::from_toml(&text) {
+            Ok(surface) => sampled(path, &surface),
+            Err(source) => Err(SetupError::Definition { path: path.to_owned(), source }),
+        },
+    }
+}
+
+/// Samples a defined surface at its spacing, within its outline.
+fn sampled(path: &Path, surface: &DefinedSurface) -> Result<Nominal, SetupError> {
+    let grid = surface.spacing_mm().and_then(|spacing_mm| surface.sample(spacing_mm));
+    let grid = grid.map_err(|source| SetupError::Definition { path: path.to_owned(), source })?;
+    Nominal::from_grid_with_normals(grid.columns, grid.rows, grid.points, grid.normals)
+        .map(|nominal| nominal.with_outline(surface.aperture().clone()))
+        .map_err(|source| SetupError::Nominal { path: path.to_owned(), source })
 }
 
 /// Names a formula by the nodes that it gives: the same surface has the same name however it is written.

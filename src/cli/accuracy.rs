@@ -96,7 +96,7 @@ fn judge(arguments: &Arguments) -> Result<Accuracy, Failure> {
             accuracy(Samples::Points { points: &points, projection })
         }
         NominalFile::Definition(text) => {
-            let (grid, _) = nominal::sampled(path, &text)?;
+            let grid = nominal::sampled(path, &text)?;
             let (columns, rows) = (grid.columns, grid.rows);
             accuracy(Samples::Grid { columns, rows, points: &grid.points, normals: &grid.normals })
         }

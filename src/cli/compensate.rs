@@ -117,8 +117,7 @@ const LEVEL_OFF_NODES: f64 = 5.0;
 
 /// Reads the nominal surface.
 fn ground(file: &std::path::Path) -> Result<Wanted, Failure> {
-    let read = nominal::read(file, Projection::Auto)?;
-    let surface = nominal::surface(file, read, Projection::Auto)?;
+    let surface = nominal::surface(file, Projection::Auto)?;
     let failed = |source| Failure::Path { path: file.to_owned(), source };
     let (field, _) = height_of(&surface).map_err(failed)?;
     let grid = Grid { columns: 1, rows: 1, first_mm: [0.0; 2], spacing_mm: [1.0; 2] };

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use regrind::formats::{NominalFile, read_nominal};
-use regrind::geometry::Aperture;
+use regrind::setup;
 use regrind::surface::{DefinedSurface, Nominal, NominalKind, Projection, SampledSurface};
 
 use super::failure::Failure;
@@ -26,32 +26,22 @@ pub(super) fn read(path: &Path, projection: Projection) -> Result<NominalFile, F
     Ok(file)
 }
 
-/// Makes the nominal surface from a nominal file.
+/// Reads a nominal file and makes the surface of it.
 ///
 /// # Errors
-/// What makes no surface, by file name.
-pub(super) fn surface(path: &Path, file: NominalFile, projection: Projection) -> Result<Nominal, Failure> {
-    let of_surface = |source| Failure::Nominal { path: path.to_owned(), source };
-    match file {
-        NominalFile::Points(points) => Nominal::from_points(points, projection),
-        NominalFile::Mesh { points, triangles } => Nominal::from_mesh(points, triangles),
-        NominalFile::Definition(text) => {
-            let (grid, outline) = sampled(path, &text)?;
-            Nominal::from_grid_with_normals(grid.columns, grid.rows, grid.points, grid.normals)
-                .map(|nominal| nominal.with_outline(outline))
-        }
-    }
-    .map_err(of_surface)
+/// Those of [`read`], and what makes no surface, by file name.
+pub(super) fn surface(path: &Path, projection: Projection) -> Result<Nominal, Failure> {
+    setup::surface(path, read(path, projection)?, projection).map_err(Failure::Setup)
 }
 
 /// Samples a defined surface at its spacing.
 ///
 /// # Errors
 /// Whatever is wrong with the definition, by file name.
-pub(super) fn sampled(path: &Path, text: &str) -> Result<(SampledSurface, Aperture), Failure> {
+pub(super) fn sampled(path: &Path, text: &str) -> Result<SampledSurface, Failure> {
     let sample = || {
         let defined = DefinedSurface::from_toml(text)?;
-        Ok((defined.sample(defined.spacing_mm()?)?, defined.aperture().clone()))
+        defined.sample(defined.spacing_mm()?)
     };
     sample().map_err(|source| Failure::Definition { path: path.to_owned(), source })
 }

@@ -135,8 +135,7 @@ fn read_inputs(arguments: &Arguments) -> Result<(Nominal, Vec<Point>), Failure> 
         return Err(Failure::MapOfContacts { path: arguments.measured.clone() });
     }
     std::thread::scope(|scope| {
-        let nominal = scope
-            .spawn(move || nominal::read(path, projection).and_then(|file| nominal::surface(path, file, projection)));
+        let nominal = scope.spawn(move || nominal::surface(path, projection));
         let measured = read_measured(&arguments.measured);
         let nominal = nominal.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
         Ok((nominal, measured?))
