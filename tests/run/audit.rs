@@ -2,8 +2,8 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
 
+use crate::program::run;
 use regrind::cell::{
     Actor, Alarm, AlarmId, Command as Order, Device, Ending, Event, Figures, Judgement, Occupation, Role, Verdict,
     table,
@@ -13,19 +13,20 @@ use regrind::report::state_picture;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-fn regrind(folder: &Path, arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_regrind")).args(arguments).current_dir(folder).output().unwrap()
-}
-
-fn text(bytes: &[u8]) -> String {
-    String::from_utf8(bytes.to_vec()).unwrap()
-}
-
 /// What a command prints when it ends with a code.
 fn printed(folder: &Path, arguments: &[&str], code: i32) -> String {
-    let output = regrind(folder, arguments);
-    assert_eq!(output.status.code(), Some(code), "{arguments:?}: {}{}", text(&output.stdout), text(&output.stderr));
-    text(&output.stdout)
+    ended(folder, arguments, code).0
+}
+
+/// What a command says of its failure when it ends with a code.
+fn refused(folder: &Path, arguments: &[&str], code: i32) -> String {
+    ended(folder, arguments, code).1
+}
+
+fn ended(folder: &Path, arguments: &[&str], code: i32) -> (String, String) {
+    let (found, out, errors) = run(arguments, folder);
+    assert_eq!(found, code, "{arguments:?}: {out}{errors}");
+    (out, errors)
 }
 
 fn figures() -> Figures {
@@ -134,9 +135,7 @@ fn a_sound_record_is_proven_in_words_and_json() {
 fn a_broken_record_is_named_and_ends_with_1() {
     let (home, folder) = recorded(true);
     fs::write(folder.join("cycle-2/measured.csv"), "1,2,4\n").unwrap();
-    let output = regrind(home.path(), &["audit", "verify"]);
-    assert_eq!(output.status.code(), Some(1));
-    let error = text(&output.stderr);
+    let error = refused(home.path(), &["audit", "verify"], 1);
     assert!(error.contains("broken at record 12: the file cycle-2/measured.csv is not what was written"), "{error}");
     let value: Value = serde_json::from_str(&printed(home.path(), &["audit", "verify", "--json"], 1)).unwrap();
     assert_eq!((&value["sound"], &value["record"]), (&json!(false), &json!(12)));
@@ -146,9 +145,8 @@ fn a_broken_record_is_named_and_ends_with_1() {
     database.execute_batch("DROP TRIGGER record_is_not_changed; UPDATE record SET kind = 'x' WHERE seq = 4").unwrap();
     drop(database);
     for what in ["verify", "show", "export"] {
-        let output = regrind(home.path(), &["audit", what]);
-        assert_eq!(output.status.code(), Some(1), "{what}");
-        assert!(text(&output.stderr).contains("broken at record 4"), "{what}: {}", text(&output.stderr));
+        let error = refused(home.path(), &["audit", what], 1);
+        assert!(error.contains("broken at record 4"), "{what}: {error}");
     }
     assert_eq!(printed(home.path(), &["audit", "export"], 1).lines().count(), 3, "what stands before it is given");
 }
@@ -158,17 +156,15 @@ fn folders_without_a_record_end_with_2() {
     let home = tempfile::tempdir().unwrap();
     for what in ["verify", "show", "export"] {
         for arguments in [vec!["audit", what], vec!["audit", what, "nowhere"], vec!["audit", what, "."]] {
-            let output = regrind(home.path(), &arguments);
-            assert_eq!((output.status.code(), output.stdout.is_empty()), (Some(2), true), "{arguments:?}");
-            assert!(text(&output.stderr).contains("folder of a run"), "{arguments:?}: {}", text(&output.stderr));
+            let (out, error) = ended(home.path(), &arguments, 2);
+            assert!(out.is_empty() && error.contains("folder of a run"), "{arguments:?}: {out}{error}");
         }
     }
     let (home, _) = recorded(true);
     fs::write(home.path().join("text"), "x").unwrap();
     for anchor in ["text", "absent"] {
-        let output = regrind(home.path(), &["audit", "verify", "--anchor", anchor]);
-        assert_eq!(output.status.code(), Some(2));
-        assert!(text(&output.stderr).contains("journal.anchor"), "{}", text(&output.stderr));
+        let error = refused(home.path(), &["audit", "verify", "--anchor", anchor], 2);
+        assert!(error.contains("journal.anchor"), "{error}");
     }
 }
 
@@ -201,9 +197,8 @@ fn the_table_says_what_happened_and_is_marked() {
     assert_eq!(rows(&["--kind", "intent,note", "--cycle", "2"]), 5);
     assert_eq!(rows(&["--cycle", "9"]), 0);
     assert_eq!(printed(home.path(), &["audit", "show", "--kind", "event", "--json"], 0).lines().count(), 4);
-    let output = regrind(home.path(), &["audit", "show", "--kind", "evnt"]);
-    assert_eq!(output.status.code(), Some(2));
-    assert!(text(&output.stderr).contains("begin, reopen, intent"), "{}", text(&output.stderr));
+    let error = refused(home.path(), &["audit", "show", "--kind", "evnt"], 2);
+    assert!(error.contains("begin, reopen, intent"), "{error}");
 }
 
 #[test]
@@ -256,8 +251,7 @@ fn the_report_of_a_run_is_one_file_that_needs_nothing_else() {
     printed(other.path(), &["report"], 0);
     assert!(!fs::read_to_string(other.path().join("runs/mirror-1/report.html")).unwrap().contains("SIMULATION"));
     fs::remove_file(folder.join("cycle-1/error_map.png")).unwrap();
-    assert!(text(&regrind(home.path(), &["report"]).stderr).contains("cycle-1/error_map.png is missing"));
-    printed(home.path(), &["report"], 1);
+    assert!(refused(home.path(), &["report"], 1).contains("cycle-1/error_map.png is missing"));
     printed(home.path(), &["report", "."], 2);
 }
 
@@ -287,9 +281,8 @@ fn states_are_printed_and_the_picture_in_the_documentation_is_current() {
     assert!(idle.starts_with("Idle\n"), "{idle}");
     assert!(idle.contains("  start                          -> Starting"), "{idle}");
     assert!(!idle.contains("refuse"), "{idle}");
-    let unknown = regrind(home.path(), &["states", "--state", "x"]);
-    assert_eq!(unknown.status.code(), Some(2));
-    assert!(text(&unknown.stderr).contains("give one of Idle, Starting, Execute"), "{}", text(&unknown.stderr));
+    let unknown = refused(home.path(), &["states", "--state", "x"], 2);
+    assert!(unknown.contains("give one of Idle, Starting, Execute"), "{unknown}");
 
     printed(home.path(), &["states", "--svg", "states.svg"], 0);
     let drawn = fs::read_to_string(home.path().join("states.svg")).unwrap();
