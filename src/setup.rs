@@ -26,6 +26,7 @@ use crate::surface::{DefinedSurface, DefinitionError, Nominal, Projection, Side,
 /// Why a recipe and a cell do not make a run.
 #[derive(Debug, Error)]
 #[allow(missing_docs)]
+#[non_exhaustive]
 pub enum SetupError {
     #[error(transparent)]
     File(#[from] FormatError),

@@ -112,6 +112,7 @@ pub struct Started {
 
 /// What became of a start.
 #[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
 pub enum Reconciled {
     /// It was taken and the job is not at its end; the state in the status says whether it runs, holds or is ending.
     Running(Status),
@@ -211,6 +212,7 @@ impl fmt::Display for State {
 
 /// What a machine answers to a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
 pub enum Answer {
     /// None yet.
     None,
@@ -266,6 +268,7 @@ impl fmt::Display for Answer {
 
 /// Why a machine stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
 pub enum Fault {
     /// No fault.
     None,
@@ -332,6 +335,7 @@ impl fmt::Display for Fault {
 
 /// How a job ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
 pub enum Outcome {
     /// It has not.
     None,
