@@ -10,17 +10,12 @@ use tokio::sync::{mpsc, oneshot};
 use crate::cell::RecordFailure;
 use crate::journal::{Artefact, Entry, Journal, JournalError, Kind};
 
-/// What the thread of the journal is asked to do.
-enum JournalRequest {
-    Append(Box<Entry>, oneshot::Sender<Result<(), RecordFailure>>),
-    Intend(Box<Entry>, oneshot::Sender<Result<u32, RecordFailure>>),
-    Adopt(Vec<Artefact>, Duration, u32, oneshot::Sender<Result<(), RecordFailure>>),
-    Close(Duration, u32, Value, oneshot::Sender<Result<(), RecordFailure>>),
-}
+/// What the thread of the journal is asked to do, while there is one that is open.
+type JournalWork = Box<dyn FnOnce(&mut Option<Journal>) + Send>;
 
 /// The journal as the loop sees it.
 pub(super) struct Recorder {
-    requests: Option<mpsc::UnboundedSender<JournalRequest>>,
+    requests: Option<mpsc::UnboundedSender<JournalWork>>,
     thread: Option<JoinHandle<()>>,
     folder: PathBuf,
 }
@@ -39,32 +34,42 @@ impl Recorder {
 
     /// Records what happened; on return it is on the disk.
     pub(super) async fn append(&self, entry: Entry) -> Result<(), RecordFailure> {
-        self.ask(|answer| JournalRequest::Append(Box::new(entry), answer)).await
+        self.ask(|journal| Some(journal.as_mut()?.append(entry).map(|_| ()))).await
     }
 
     /// Records a command before it is carried out and returns its number.
     pub(super) async fn intend(&self, entry: Entry) -> Result<u32, RecordFailure> {
-        self.ask(|answer| JournalRequest::Intend(Box::new(entry), answer)).await
+        self.ask(|journal| Some(journal.as_mut()?.intend(entry))).await
     }
 
     /// Brings files of the run folder on record.
     pub(super) async fn adopt(&self, files: Vec<Artefact>, now: Duration, cycle: u32) -> Result<(), RecordFailure> {
-        self.ask(|answer| JournalRequest::Adopt(files, now, cycle, answer)).await
+        self.ask(move |journal| {
+            let open = journal.as_mut()?;
+            let mut files = files.into_iter();
+            Some(files.try_for_each(|file| open.adopt_known(file, nanoseconds(now), cycle).map(|_| ())))
+        })
+        .await
     }
 
     /// Writes the last record.
     pub(super) async fn close(&self, now: Duration, cycle: u32, ending: Value) -> Result<(), RecordFailure> {
-        self.ask(|answer| JournalRequest::Close(now, cycle, ending, answer)).await
+        self.ask(move |journal| Some(journal.take()?.close(nanoseconds(now), cycle, ending).map(|_| ()))).await
     }
 
-    async fn ask<T>(
+    /// Has the journal's thread do some work, and returns what came of it; none comes of a journal that is closed.
+    async fn ask<T: Send + 'static>(
         &self,
-        request: impl FnOnce(oneshot::Sender<Result<T, RecordFailure>>) -> JournalRequest,
+        work: impl FnOnce(&mut Option<Journal>) -> Option<Result<T, JournalError>> + Send + 'static,
     ) -> Result<T, RecordFailure> {
         let gone = || RecordFailure::Unwritable("the thread of the journal has ended".into());
         let (answer, answered) = oneshot::channel();
+        let work = move |journal: &mut Option<Journal>| {
+            // Who asked may have gone; the record stands all the same.
+            let _ = work(journal).map(|done| answer.send(done.map_err(failure)));
+        };
         let requests = self.requests.as_ref().expect("open until dropped");
-        requests.send(request(answer)).map_err(|_| gone())?;
+        requests.send(Box::new(work)).map_err(|_| gone())?;
         answered.await.map_err(|_| gone())?
     }
 }
@@ -79,26 +84,10 @@ impl Drop for Recorder {
     }
 }
 
-fn keep(journal: Journal, mut asked: mpsc::UnboundedReceiver<JournalRequest>) {
+fn keep(journal: Journal, mut asked: mpsc::UnboundedReceiver<JournalWork>) {
     let mut journal = Some(journal);
-    // Who asked may have gone; the record stands all the same.
-    while let Some(request) = asked.blocking_recv() {
-        let Some(open) = journal.as_mut() else { continue };
-        match request {
-            JournalRequest::Append(entry, answer) => {
-                drop(answer.send(open.append(*entry).map(|_| ()).map_err(failure)))
-            }
-            JournalRequest::Intend(entry, answer) => drop(answer.send(open.intend(*entry).map_err(failure))),
-            JournalRequest::Adopt(files, now, cycle, answer) => {
-                let mut files = files.into_iter();
-                let adopted = files.try_for_each(|file| open.adopt_known(file, nanoseconds(now), cycle).map(|_| ()));
-                drop(answer.send(adopted.map_err(failure)));
-            }
-            JournalRequest::Close(now, cycle, ending, answer) => {
-                let open = journal.take().expect("it was open");
-                drop(answer.send(open.close(nanoseconds(now), cycle, ending).map(|_| ()).map_err(failure)));
-            }
-        }
+    while let Some(work) = asked.blocking_recv() {
+        work(&mut journal);
     }
 }
 

@@ -14,8 +14,7 @@
 
 use std::io;
 use std::pin::Pin;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
@@ -64,23 +63,14 @@ pub struct LinkFigures {
     pub slowest_ns: u64,
 }
 
-#[derive(Debug, Default)]
-struct Counters {
-    requests: AtomicU64,
-    answers: AtomicU64,
-    exceptions: AtomicU64,
-    timeouts: AtomicU64,
-    corrupt: AtomicU64,
-    disconnects: AtomicU64,
-    refused: AtomicU64,
-    opened: AtomicU64,
-    retries: AtomicU64,
-    answer_ns: AtomicU64,
-    slowest_ns: AtomicU64,
-}
+/// The figures of a line, which its thread writes and its handles read.
+#[derive(Debug, Clone, Default)]
+struct Counters(Arc<Mutex<LinkFigures>>);
 
-fn count(counter: &AtomicU64) {
-    counter.fetch_add(1, Ordering::Relaxed);
+impl Counters {
+    fn count(&self, change: impl FnOnce(&mut LinkFigures)) {
+        change(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner));
+    }
 }
 
 /// What can be wrong with one request.
@@ -130,7 +120,7 @@ pub struct Link {
     line: Line,
     request_timeout: Duration,
     questions: mpsc::Sender<Question>,
-    counters: Arc<Counters>,
+    counters: Counters,
 }
 
 impl Link {
@@ -138,7 +128,7 @@ impl Link {
     /// error the line is left alone for so long.
     pub fn new(line: Line, request_timeout: Duration, quarantine: Duration) -> io::Result<Self> {
         let (questions, inbox) = mpsc::channel(16);
-        let counters = Arc::new(Counters::default());
+        let counters = Counters::default();
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let connection = Connection::new(line.clone(), request_timeout, quarantine, counters.clone());
         std::thread::Builder::new()
@@ -154,21 +144,7 @@ impl Link {
 
     /// What it has seen so far.
     pub fn figures(&self) -> LinkFigures {
-        let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
-        let c = &*self.counters;
-        LinkFigures {
-            requests: read(&c.requests),
-            answers: read(&c.answers),
-            exceptions: read(&c.exceptions),
-            timeouts: read(&c.timeouts),
-            corrupt: read(&c.corrupt),
-            disconnects: read(&c.disconnects),
-            refused: read(&c.refused),
-            opened: read(&c.opened),
-            retries: read(&c.retries),
-            answer_ns: read(&c.answer_ns),
-            slowest_ns: read(&c.slowest_ns),
-        }
+        *self.counters.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     pub(super) fn request_timeout(&self) -> Duration {
@@ -176,7 +152,7 @@ impl Link {
     }
 
     pub(super) fn count_retry(&self) {
-        count(&self.counters.retries);
+        self.counters.count(|figures| figures.retries += 1);
     }
 
     /// Asks one thing of one unit. With a generation, only on that connection; without, the line is opened if need be. Gives the
@@ -199,7 +175,7 @@ struct Connection {
     line: Line,
     request_timeout: Duration,
     quarantine: Duration,
-    counters: Arc<Counters>,
+    counters: Counters,
     connection: Option<tokio_modbus::client::Context>,
     generation: u64,
     failures: u32,
@@ -208,7 +184,7 @@ struct Connection {
 }
 
 impl Connection {
-    fn new(line: Line, request_timeout: Duration, quarantine: Duration, counters: Arc<Counters>) -> Self {
+    fn new(line: Line, request_timeout: Duration, quarantine: Duration, counters: Counters) -> Self {
         let now = Instant::now();
         Self {
             line,
@@ -239,7 +215,7 @@ impl Connection {
             return Err(LinkFault::Stale);
         }
         if question.ask == Ask::Distrust {
-            count(&self.counters.corrupt);
+            self.counters.count(|figures| figures.corrupt += 1);
             self.give_up();
             return Ok((self.generation, Vec::new()));
         }
@@ -262,12 +238,11 @@ impl Connection {
     }
 
     fn account(&mut self, fault: LinkFault) {
-        let counters = &self.counters;
-        count(match fault {
-            LinkFault::Exception(_) => &counters.exceptions,
-            LinkFault::TimedOut => &counters.timeouts,
-            LinkFault::Corrupt { .. } => &counters.corrupt,
-            LinkFault::Unreachable(_) | LinkFault::Disconnected | LinkFault::Stale => &counters.disconnects,
+        self.counters.count(|figures| match fault {
+            LinkFault::Exception(_) => figures.exceptions += 1,
+            LinkFault::TimedOut => figures.timeouts += 1,
+            LinkFault::Corrupt { .. } => figures.corrupt += 1,
+            LinkFault::Unreachable(_) | LinkFault::Disconnected | LinkFault::Stale => figures.disconnects += 1,
         });
         if !matches!(fault, LinkFault::Exception(_)) {
             self.give_up();
@@ -290,13 +265,13 @@ impl Connection {
         let opened = opened.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()));
         match opened {
             Ok(connection) => {
-                count(&self.counters.opened);
+                self.counters.count(|figures| figures.opened += 1);
                 self.generation += 1;
                 self.connection = Some(connection);
                 Ok(())
             }
             Err(error) => {
-                count(&self.counters.refused);
+                self.counters.count(|figures| figures.refused += 1);
                 self.give_up();
                 Err(LinkFault::Unreachable(error.kind()))
             }
@@ -315,15 +290,17 @@ impl Connection {
         let limit = self.request_timeout + self.line.transmission_at_most();
         let Some(connection) = &mut self.connection else { return Err(LinkFault::Stale) };
         connection.set_slave(Slave(unit));
-        count(&self.counters.requests);
+        self.counters.count(|figures| figures.requests += 1);
         let asked = Instant::now();
         let response = timeout(limit, connection.call(request)).await;
         self.silent_from = Instant::now() + self.line.silence();
         let words = check(ask, response.map_err(|_| LinkFault::TimedOut)?)?;
         let taken_ns = u64::try_from(asked.elapsed().as_nanos()).unwrap_or(u64::MAX);
-        count(&self.counters.answers);
-        self.counters.answer_ns.fetch_add(taken_ns, Ordering::Relaxed);
-        self.counters.slowest_ns.fetch_max(taken_ns, Ordering::Relaxed);
+        self.counters.count(|figures| {
+            figures.answers += 1;
+            figures.answer_ns += taken_ns;
+            figures.slowest_ns = figures.slowest_ns.max(taken_ns);
+        });
         Ok(words)
     }
 }
