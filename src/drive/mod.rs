@@ -731,7 +731,7 @@ fn spawn<D: StationDriver>(
     poll: Duration,
 ) -> (mpsc::Sender<Ask>, tokio::task::JoinHandle<()>) {
     let (asks, asked) = mpsc::channel(16);
-    let station = MachineTask::new(driver, job, interrupt.clone(), reports.clone()).with_intent(armed);
+    let station = MachineTask::new(driver, job, interrupt.clone(), reports.clone(), armed);
     (asks, tokio::spawn(station.attend(asked, poll, Aborts::new(aborts.subscribe()))))
 }
 

@@ -183,26 +183,17 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(5);
 const PROGRESS_EVERY: Duration = Duration::from_millis(250);
 
 impl<B: StationDriver> MachineTask<B> {
-    pub(super) fn new(driver: B, job: u32, interrupt: Interrupt, reports: mpsc::Sender<StationReport>) -> Self {
-        Self {
-            driver,
-            job,
-            interrupt,
-            reports,
-            loaded: None,
-            armed: None,
-            cycle: 0,
-            seen: Seen::default(),
-            notes: Vec::new(),
-        }
-    }
-
-    /// Restores the intent of an interrupted run, so that it can be reconciled.
-    pub(super) fn with_intent(mut self, armed: Option<(u32, Armed)>) -> Self {
-        if let Some((cycle, armed)) = armed {
-            (self.cycle, self.armed) = (cycle, Some(armed));
-        }
-        self
+    /// Takes a machine for a job, with the intent of an interrupted run where there is one, so that it can be reconciled.
+    pub(super) fn new(
+        driver: B,
+        job: u32,
+        interrupt: Interrupt,
+        reports: mpsc::Sender<StationReport>,
+        intent: Option<(u32, Armed)>,
+    ) -> Self {
+        let (cycle, armed) = intent.unzip();
+        let (cycle, seen, notes) = (cycle.unwrap_or(0), Seen::default(), Vec::new());
+        Self { driver, job, interrupt, reports, loaded: None, armed, cycle, seen, notes }
     }
 
     /// Attends until nobody can ask any more, then gives the machine back.
