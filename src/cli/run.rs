@@ -179,7 +179,7 @@ impl Earlier {
 async fn go(run: Run, cmm: AnyCmm, grinder: AnyGrinder, actor: Actor) -> Result<Ending, Failure> {
     let folder = run.journal.folder().to_owned();
     let (drive, orders) =
-        Drive::new(run, cmm, grinder).map_err(|source| Failure::ControlSocket { path: folder, source })?;
+        Drive::with_cell(run, cmm, grinder).map_err(|source| Failure::ControlSocket { path: folder, source })?;
     let keys = tokio::spawn(heed_ctrl_c(orders, actor));
     let ending = drive.run().await;
     keys.abort();

@@ -23,6 +23,7 @@ mod work;
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -33,7 +34,7 @@ use tokio::task::JoinSet;
 use tokio::time::Instant;
 
 use crate::cell::{Actor, Cell, CellPlan, Command, Device, Ending, Event, Phase, RecordFailure, State, StateName};
-use crate::device::{Armed, Cmm, Grinder, Identified, Interrupt, Measurement, Word, hex};
+use crate::device::{AnyCmm, AnyGrinder, Armed, Cmm, Grinder, Identified, Interrupt, Measurement, Word, hex};
 use crate::formats::{LEARNED, write_json_atomic};
 use crate::journal::{Artefact, Entry, Journal, Kind};
 
@@ -141,6 +142,15 @@ struct Computed {
 }
 
 impl Drive {
+    /// Makes ready with the machines of a cell file, as [`Drive::new`] does with any. Compiled here once: not anew with every line of
+    /// whoever calls it.
+    ///
+    /// # Errors
+    /// Those of [`Drive::new`].
+    pub fn with_cell(run: Run, cmm: AnyCmm, grinder: AnyGrinder) -> std::io::Result<(Self, Orders)> {
+        Self::new(run, cmm, grinder)
+    }
+
     /// Makes ready: a task for each machine, the control socket, the thread of the journal. Nothing is commanded yet.
     ///
     /// # Errors
@@ -208,8 +218,12 @@ impl Drive {
         self.before + self.began.elapsed()
     }
 
-    /// Runs until the cell has come to an end, and returns it.
-    pub async fn run(mut self) -> Ending {
+    /// Runs until the cell has come to an end, and returns it. Boxed so that it is compiled here.
+    pub fn run(self) -> Pin<Box<dyn Future<Output = Ending> + Send>> {
+        Box::pin(self.run_to_its_end())
+    }
+
+    async fn run_to_its_end(mut self) -> Ending {
         let first = match self.cell.state() {
             State::Idle => Event::Start { actor: self.actor.clone() },
             _ => Event::Restarted { actor: self.actor.clone() },
