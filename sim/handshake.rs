@@ -117,7 +117,7 @@ impl Handshake {
         if sequence == self.acknowledged {
             return self.note(What::Repeated { sequence });
         }
-        if sequence < self.acknowledged && command != Some(Command::Claim) {
+        if sequence < self.acknowledged && !matches!(command, Some(Command::Claim | Command::Abort)) {
             return self.note(What::Old { sequence });
         }
         let answer = command.map_or(Answer::Unknown, |command| self.judge(command, &frame));

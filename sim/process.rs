@@ -31,7 +31,7 @@ use crate::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
 use crate::form::FormError;
 use crate::part::Part;
 use crate::payload::{BROKEN, INTERLOCK, Map, Pass, PassRecord, outside};
-use crate::spec::{GrinderSpec, Mirrored, WorldSpec};
+use crate::spec::{GrinderSpec, Mirrored, Misreported, WorldSpec};
 use crate::truth::{GrindEntry, Source, State, locked, nothing_done, stream};
 
 /// Most strokes of one pass, roughing and finishing.
@@ -188,6 +188,18 @@ impl Run {
             spindle_load: (0.1 + 0.6 * (1.0 - air_share) * (each_mm / self.pass.depth_of_cut_mm).min(1.0)).min(1.0),
             wheel_radius_mm: self.pass.wheel_radius_mm,
         }
+    }
+}
+
+/// Puts what is not so into a record.
+fn misreporting(record: PassRecord, misreported: Misreported) -> PassRecord {
+    match misreported {
+        Misreported::Nothing | Misreported::Duration => record,
+        Misreported::Job => PassRecord { job: record.job.wrapping_sub(1), ..record },
+        Misreported::Result => PassRecord { result: 4, ..record },
+        Misreported::Depth => PassRecord { depth_mm: 3.0, ..record },
+        Misreported::Path => PassRecord { path_mm: -1.0, ..record },
+        Misreported::Wheel => PassRecord { wheel_radius_mm: record.wheel_radius_mm * 0.875, ..record },
     }
 }
 
@@ -470,6 +482,7 @@ impl Body for Grinder {
         let Some(run) = self.running.take() else { return nothing_done(state.spec.cmm.part_temperature_c) };
         let record = run.record(&state, result);
         let duration_s = run.elapsed_s.min(run.total_s);
+        let misreported = state.spec.faults.misreported;
         let spec = &state.spec.grinder;
         state.heat = run.heat_at(spec, duration_s);
         state.worn_strokes += (duration_s - run.finishing_s).max(0.0) * run.pass.feed_mm_min / 60.0 / run.stroke_mm;
@@ -480,13 +493,13 @@ impl Body for Grinder {
         Outcome {
             kind: 5,
             format: 1,
-            bytes: record.encode(),
+            bytes: misreporting(record, misreported).encode(),
             records: 1,
             coordinates: 0,
             probe_radius_mm: 0.0,
             scale_mm: 1.0,
             temperature_c: state.spec.cmm.part_temperature_c,
-            duration_s,
+            duration_s: if misreported == Misreported::Duration { 0.0 } else { duration_s },
         }
     }
 

@@ -236,6 +236,27 @@ pub enum Mirrored {
     QuarterTurn,
 }
 
+/// What the grinder says of its passes that is not so.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Misreported {
+    /// Nothing.
+    #[default]
+    Nothing,
+    /// The number of the job before.
+    Job,
+    /// That it failed, where the status says that it is complete.
+    Result,
+    /// Three millimetres as the largest depth.
+    Depth,
+    /// A path of -1 mm.
+    Path,
+    /// A wheel that is smaller by an eighth.
+    Wheel,
+    /// No time at all.
+    Duration,
+}
+
 /// What is broken, for tests.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, Serialize)]
 #[serde(default, deny_unknown_fields)]
@@ -248,6 +269,8 @@ pub struct Faults {
     pub map_doubled: bool,
     /// The grinder grinds as if the map were zero.
     pub map_ignored: bool,
+    /// The record of a pass is wrong.
+    pub misreported: Misreported,
     /// The CMM reports contact points (centre less stated radius along the target's normal).
     pub returns_contact_points: bool,
     /// And says so in the header of the outbox; else the header says centres.

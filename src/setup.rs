@@ -14,7 +14,7 @@ use crate::cell::{CellPlan, Deadlines, Disposal, Gates, Tolerance};
 use crate::compensation::path::{Limits, PathError, PathOptions, TrackSpacing, Wheel as PathWheel};
 use crate::compensation::{CorrectionLimits, MapOptions, contact_width_mm};
 use crate::config::{CellConfig, Link};
-use crate::device::{AnyCmm, AnyGrinder, Making, MakingError, ModbusSettings, Pass, hex};
+use crate::device::{AnyCmm, AnyGrinder, Line, Making, MakingError, ModbusSettings, Pass, hex};
 use crate::drive::{Probing, Programs, Sphere, Task};
 use crate::formats::{self, FormatError, NominalFile};
 use crate::geometry::{Point, Vector};
@@ -47,6 +47,12 @@ pub enum SetupError {
     )]
     NoSphere { recipe: PathBuf, cell: PathBuf },
     #[error(
+        "{}: the reference sphere at {at} mm leaves {gap_mm:.1} mm beside the part of {} where the fixture holds it, and the probe needs \
+         {needed_mm:.1} mm; correct [cmm.reference_sphere] or [cmm.fixture]",
+        .cell.display(), .recipe.display()
+    )]
+    SphereInPart { recipe: Box<Path>, cell: Box<Path>, at: Box<str>, gap_mm: f64, needed_mm: f64 },
+    #[error(
         "{}: target {number} of the measuring pattern lies at {at} mm in the CMM frame, outside the travel of {} ({allowed}); move \
          [cmm.fixture], or measure less of the part",
         .recipe.display(), .cell.display()
@@ -66,6 +72,10 @@ const WAIT_FOR_PEOPLE: Duration = Duration::from_secs(7 * 86_400);
 const WAIT_FOR_STILL: Duration = Duration::from_secs(600);
 /// What stands for such a machine, perhaps a folder on another computer, answers within this, a large file read included.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(90);
+/// Registers of a target in a plan, in bytes; a point of a result takes less.
+const LARGEST_TARGET: usize = 56;
+/// A transfer may take so many times what it takes when nothing goes wrong.
+const TRANSFER_ROOM: f64 = 3.0;
 /// And is looked at no more often than this.
 const SLOW_POLL: Duration = Duration::from_millis(250);
 
@@ -78,6 +88,10 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
     let side = recipe.measure.side.given().unwrap_or_default();
     let targets = lay(recipe, &nominal, side)?;
     check_limits(recipe, cell, &targets)?;
+    let sphere = sphere(recipe, cell)?;
+    if let Some(sphere) = &sphere {
+        check_sphere(recipe, cell, &nominal, sphere)?;
+    }
     let task = Task {
         pass: pass(recipe, &nominal, part_identity),
         programs: programs(recipe, cell, &nominal, part_identity),
@@ -91,7 +105,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
             speed_mm_s: recipe.measure.speed_mm_s,
             safe_height_mm: recipe.measure.safe_height_mm,
         },
-        sphere: sphere(recipe, cell)?,
+        sphere,
         fixture_cmm_from_model: cell.cmm.fixture_cmm_from_model,
         registration: recipe.registration_options(cell.cmm.fixture_cmm_from_model),
         start_at_fixture: recipe.registration.start == StartAt::Fixture,
@@ -115,7 +129,21 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         least_found: recipe.measure.minimum_coverage,
         simulation: cell.simulated,
     };
-    Ok((task, plan(recipe, cell)))
+    let mut plan = plan(recipe, cell);
+    let [map, targets] = [8 * task.first_correction().grid.len(), LARGEST_TARGET * task.targets.len()];
+    for (link, bytes) in [(&cell.grinder.link, map), (&cell.cmm.link, targets)] {
+        plan.deadlines.transfer = plan.deadlines.transfer.max(transfer_within(link, bytes));
+    }
+    Ok((task, plan))
+}
+
+/// Returns how long so many bytes may take over the line of a machine, with room for it to be sent anew.
+fn transfer_within(link: &Link, bytes: usize) -> Duration {
+    let Some((Line::Rtu { baud, .. }, _)) = link.wire.line() else { return Duration::ZERO };
+    // A page has 224 bytes of data in a frame of 249, is answered by 8, and the machine takes some time for it.
+    let pages = bytes.div_ceil(224) as f64;
+    let page_s = (249.0 + 8.0) * 11.0 / f64::from(baud.max(1)) + 0.05;
+    Duration::from_secs_f64(TRANSFER_ROOM * pages * page_s)
 }
 
 fn map_options(recipe: &Recipe) -> MapOptions {
@@ -235,6 +263,27 @@ fn sphere(recipe: &Recipe, cell: &CellConfig) -> Result<Option<Sphere>, SetupErr
         }
         (true, None) => Err(SetupError::NoSphere { recipe: recipe.path().to_owned(), cell: cell.path().to_owned() }),
     }
+}
+
+/// Sees that the probe does not look for the reference sphere in the part: the part fills the box under its surface, where the fixture holds it.
+fn check_sphere(recipe: &Recipe, cell: &CellConfig, nominal: &Nominal, sphere: &Sphere) -> Result<(), SetupError> {
+    let centre = cell.cmm.fixture_cmm_from_model.inverse().point(&sphere.centre);
+    let mut nearest = Point::from([f64::INFINITY; 3]);
+    let mut farthest = -nearest;
+    for p in nominal.points() {
+        (nearest, farthest) = (nearest.inf(p), farthest.sup(p));
+    }
+    let beside = |at: f64, low: f64, high: f64| (low - at).max(at - high).max(0.0);
+    let [x, y] = [0, 1].map(|k| beside(centre[k], nearest[k], farthest[k]));
+    let gap_mm = x.hypot(y).hypot((centre.z - farthest.z).max(0.0)) - sphere.radius_mm;
+    // The stylus goes round it with its ball.
+    let needed_mm = 2.0 * recipe.measure.probe_radius_mm + recipe.measure.approach_mm;
+    if gap_mm >= needed_mm {
+        return Ok(());
+    }
+    let (recipe, cell) = (recipe.path().into(), cell.path().into());
+    let at = format!("{:.1}, {:.1}, {:.1}", sphere.centre.x, sphere.centre.y, sphere.centre.z).into();
+    Err(SetupError::SphereInPart { recipe, cell, at, gap_mm: gap_mm.max(0.0), needed_mm })
 }
 
 fn check_limits(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Result<(), SetupError> {

@@ -44,10 +44,19 @@ impl Cell {
         }
     }
 
-    /// Takes a state, and the deadline that goes with it.
+    /// Takes a state, and the deadline that goes with it. The time to come to a stand counts from the first HOLD, whatever becomes of
+    /// the link meanwhile.
     pub(super) fn go(&mut self, state: State) {
         self.state = state;
         self.deadline = self.limit().map(|limit| self.now.saturating_add(limit));
+        match (state, state.phase().and_then(Phase::job)) {
+            (Holding(_) | Suspending(_), Some((_, JobStep::Run))) => {
+                self.hold_due = self.hold_due.or(self.deadline);
+                self.deadline = self.hold_due;
+            }
+            (Holding(_), Some((_, JobStep::Reconcile))) => self.deadline = self.hold_due.or(self.deadline),
+            _ => self.hold_due = None,
+        }
     }
 
     /// Returns the present state around another phase.
@@ -254,6 +263,7 @@ impl Cell {
         let known = self.know(device);
         (known.clear, known.said_clear) = (false, false);
         self.passes += u32::from(device == Device::Grinder);
+        self.doubted = false;
         self.push(Command::StartMachine { device, cycle: self.cycle });
     }
 
@@ -272,6 +282,7 @@ impl Cell {
 
     pub(super) fn ended(&mut self, device: Device, result: JobResult) {
         match (result, device) {
+            (JobResult::Complete, Device::Grinder) if self.doubted => self.advance(Grind(JobStep::Discard)),
             (JobResult::Complete, Device::Grinder) => self.advance(Grind(JobStep::Acknowledge)),
             (JobResult::Complete, Device::Cmm) => self.advance(Measure(JobStep::Collect)),
             (JobResult::Stopped | JobResult::Failed, _) => {
@@ -445,6 +456,26 @@ impl Cell {
         }
     }
 
+    /// A hold while the cell is suspended. A machine that is out of sight may still be moving, and is not called held.
+    pub(super) fn hold_suspended(&mut self, phase: Phase) {
+        let unseen = matches!(phase.job(), Some((_, JobStep::Reconcile)));
+        self.go(if unseen { Holding(phase) } else { Held(phase) });
+    }
+
+    /// A machine moves while the cell shows that it stands: it is told to hold, and a person is told.
+    pub(super) fn moves_unasked(&mut self, phase: Phase, device: Device) {
+        let told = self.raised.contains(&AlarmId::MovesUnasked);
+        if phase.job().map(|(job, _)| job) == Some(device) {
+            let run = Phase::of(device, JobStep::Run);
+            self.go(if matches!(self.state, Held(_)) { Holding(run) } else { Suspending(run) });
+        } else if told {
+            return;
+        }
+        self.know(device).clear = false;
+        self.raise(AlarmId::MovesUnasked, &device.to_string());
+        self.push(Command::HoldMachine { device });
+    }
+
     pub(super) fn resume(&mut self, phase: Phase) -> Result<(), String> {
         let absent: Vec<_> = Device::BOTH.into_iter().filter(|device| !self.knows(*device).ready).collect();
         if !absent.is_empty() && self.cycle == 0 {
@@ -511,9 +542,9 @@ impl Cell {
         }
     }
 
-    pub(super) fn condition_lost(&mut self, condition: Condition, message: &str) {
-        if self.causes.insert(Cause::Condition(condition)) {
-            self.raise(AlarmId::ConditionLost, &format!("{condition}, {message}"));
+    pub(super) fn condition_lost(&mut self, device: Device, condition: Condition, message: &str) {
+        if self.causes.insert(Cause::Condition(device, condition)) {
+            self.raise(AlarmId::ConditionLost, &format!("{device}, {condition}, {message}"));
         }
     }
 
@@ -527,11 +558,15 @@ impl Cell {
     }
 
     /// A link is lost: a phase that needs it waits at a place from which it can be taken up again; a job of the other machine goes on.
+    /// A machine that was told to hold is not called held before it has said that it stands.
     pub(super) fn link_lost(&mut self, phase: Phase, device: Device, why: &str, wait: fn(Phase) -> State) {
         self.note_link(device, true);
         self.raise(AlarmId::LinkLost, &format!("{device}, {why}"));
         let needed = phase.job().map(|(job, _)| job) == Some(device) || awaits_clear(phase) == Some(device);
-        if needed {
+        let is_holding = matches!(self.state, Holding(_)) && phase.moving() == Some(device);
+        if is_holding {
+            self.go(Holding(out_of_sight(phase)));
+        } else if needed {
             self.go(wait(out_of_sight(phase)));
         }
     }
@@ -547,6 +582,13 @@ impl Cell {
             self.machine_restarted(device);
         }
         self.cause_gone(Cause::Link(device), AlarmId::LinkLost);
+        match self.state {
+            Holding(phase) | Held(phase) if same && phase.job() == Some((device, JobStep::Reconcile)) => {
+                self.go(Holding(phase));
+                self.push(Command::Reconcile { device, cycle: self.cycle });
+            }
+            _ => {}
+        }
     }
 
     fn machine_restarted(&mut self, device: Device) {
@@ -576,7 +618,7 @@ impl Cell {
         match self.state {
             Execute(phase) | Unholding(phase) | Unsuspending(phase) => self.hold(phase),
             Suspending(phase) => self.go(Holding(phase)),
-            Suspended(phase) => self.go(Held(phase)),
+            Suspended(phase) => self.hold_suspended(phase),
             Starting => self.go(Held(Load)),
             _ => {}
         }
@@ -619,7 +661,7 @@ impl Cell {
     /// The machine moves. If a condition went missing meanwhile it is held again.
     pub(super) fn runs(&mut self, run: Phase) {
         self.go(Execute(run));
-        if self.causes.iter().any(|cause| matches!(cause, Cause::Condition(_))) {
+        if self.causes.iter().any(|cause| matches!(cause, Cause::Condition(..))) {
             self.suspend(run);
         }
     }
@@ -633,10 +675,10 @@ impl Cell {
             }
             (Reconciliation::Running, _) => self.runs(run),
             (Reconciliation::Held, Holding(_)) => self.go(Held(run)),
-            (Reconciliation::Held, Suspending(_)) => self.suspended(run),
-            (Reconciliation::Held, state) => {
-                self.go(if matches!(state, Unsuspending(_)) { Unsuspending(run) } else { Unholding(run) });
-                self.push(Command::ResumeMachine { device });
+            // It held itself, as it should when nobody talks to it: that it moves again is a person's decision.
+            (Reconciliation::Held, _) => {
+                self.raise(AlarmId::MachineHeldItself, &device.to_string());
+                self.go(Held(run));
             }
             (Reconciliation::Ended(result), _) => self.ended(device, *result),
             (Reconciliation::NotStarted, _) => {
@@ -804,7 +846,9 @@ impl Cell {
 
     fn phase_is_due(&mut self, phase: Phase) {
         match (phase.job(), self.state) {
-            (Some((device, JobStep::Run)), Holding(_) | Suspending(_)) => {
+            (Some((device, JobStep::Run | JobStep::Reconcile)), Holding(_) | Suspending(_))
+                if self.hold_due.is_some() =>
+            {
                 self.raise(AlarmId::HoldNotConfirmed, &device.to_string());
                 self.abort(&format!("the {device} did not confirm in time that it holds"));
             }

@@ -120,6 +120,12 @@ catalogue! {
         "A held machine was let go at its own panel", "The job goes on, and the cell with it.", Operator,
         ["Hold and resume here, so that the record names who did it."]
     }
+    /// The machine moves while it should stand.
+    MovesUnasked {
+        "A machine moves that should stand", "It is told to hold, and the cell is held.", Operator,
+        ["Look at the machine: who let it go?", "If it does not come to a stand, use the machine's own emergency circuit.",
+         "Resume when it is known why it moved."]
+    }
     /// The machine said no.
     MachineRefused {
         "A machine refused what it was asked for", "The cell is held before that step.", Operator,
@@ -136,6 +142,13 @@ catalogue! {
         "A job of a machine ended before it was complete", "Its result is not used. A pass is not repeated: the part is measured as it is.",
         Operator,
         ["Look at the machine and the part.", "Resume to measure the part as it is."]
+    }
+    /// Pass record.
+    PassRecord {
+        "What the grinder says of the pass cannot be", "The cell is held after it. The pass is not repeated: the part is measured as it is.",
+        ProcessEngineer,
+        ["Look at the part and the wheel: was this pass ground, with this map and this wheel?",
+         "Compare the figure and its limit with the machine's program and the recipe.", "Resume to measure the part as it is, or stop the run."]
     }
     /// Unknown start.
     StartUnknown {

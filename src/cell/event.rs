@@ -56,12 +56,13 @@ pub enum Event {
     LinkBack { device: Device, boot_id: u32 },
     /// Something that the cell needs from outside is missing. Reported as a level: again after every reconnection.
     ConditionLost {
+        device: Device,
         condition: Condition,
         #[serde(rename = "words")]
         message: String,
     },
     /// It is there again; hysteresis is the business of who reports.
-    ConditionBack { condition: Condition },
+    ConditionBack { device: Device, condition: Condition },
     /// The grinder holds the pass and the map of this cycle, read back and compared. Answers `LoadPass`.
     PassLoaded { cycle: u32 },
     /// The CMM holds the plan of this cycle, read back and compared. Answers `LoadPlan`.
@@ -80,6 +81,8 @@ pub enum Event {
     MachineResumed { device: Device },
     /// The job is over; for the grinder its pass record has been read. Answers `StopMachine` too, also where nothing ran.
     Ended { device: Device, cycle: u32, result: JobResult },
+    /// What the grinder says of the pass that is over cannot be, or is of another pass. Comes before `Ended` or `Reconciled`.
+    RecordDoubted { cycle: u32, why: String },
     /// A fresh status shows the machine standing clear of the part. Answers `VerifyClear`.
     Cleared { device: Device },
     /// A fresh status shows that it is not. Answers `VerifyClear`, or comes by itself.
@@ -160,8 +163,9 @@ pub enum Mismatch {
 pub enum Condition {
     /// Air, coolant.
     Supplies,
-    /// The temperature of the part or of a machine is within its window.
-    Temperature,
+    /// Every signal that the cell file asks for, a temperature for one, is within its range.
+    #[serde(alias = "temperature")]
+    Signals,
 }
 
 /// What a machine was asked for.
@@ -384,7 +388,7 @@ impl fmt::Display for Condition {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Supplies => "supplies",
-            Self::Temperature => "temperature",
+            Self::Signals => "signals",
         })
     }
 }
@@ -427,6 +431,7 @@ impl Event {
             | Self::Started { cycle, .. }
             | Self::StartUnknown { cycle, .. }
             | Self::Ended { cycle, .. }
+            | Self::RecordDoubted { cycle, .. }
             | Self::Reconciled { cycle, .. }
             | Self::Collected { cycle, .. }
             | Self::Qualified { cycle, .. }
@@ -448,6 +453,8 @@ impl Event {
             | Self::NotConnected { device, .. }
             | Self::LinkLost { device, .. }
             | Self::LinkBack { device, .. }
+            | Self::ConditionLost { device, .. }
+            | Self::ConditionBack { device, .. }
             | Self::Prepared { device, .. }
             | Self::Started { device, .. }
             | Self::StartUnknown { device, .. }
@@ -536,6 +543,7 @@ impl Event {
             Self::MachineHeld { .. } => "machine_held",
             Self::MachineResumed { .. } => "machine_resumed",
             Self::Ended { .. } => "ended",
+            Self::RecordDoubted { .. } => "record_doubted",
             Self::Cleared { .. } => "cleared",
             Self::Obstructed { .. } => "obstructed",
             Self::ClearUnknown { .. } => "clear_unknown",

@@ -83,7 +83,7 @@ impl Cell {
             (Starting, Event::Hold { .. }) => self.go(Held(Load)),
             (Execute(phase) | Unholding(phase) | Unsuspending(phase), Event::Hold { .. }) => self.hold(phase),
             (Suspending(phase), Event::Hold { .. }) => self.go(Holding(phase)),
-            (Suspended(phase), Event::Hold { .. }) => self.go(Held(phase)),
+            (Suspended(phase), Event::Hold { .. }) => self.hold_suspended(phase),
             (Holding(_) | Held(_), Event::Hold { .. }) => {}
             (Held(phase), Event::Resume { .. }) => self.resume(phase)?,
             (Held(Grind(JobStep::Reconcile)), Event::DeclaredOver { device: Device::Grinder, .. }) => {
@@ -119,15 +119,17 @@ impl Cell {
                 self.raise(AlarmId::LinkLost, &format!("{device}, {why}"));
             }
             (_, Event::LinkBack { device, boot_id }) => self.link_back(*device, *boot_id),
-            (Execute(phase), Event::ConditionLost { condition, message }) => {
-                self.condition_lost(*condition, message);
+            (Execute(phase), Event::ConditionLost { device, condition, message }) => {
+                self.condition_lost(*device, *condition, message);
                 if phase.moving().is_some() {
                     self.suspend(phase);
                 }
             }
-            (_, Event::ConditionLost { condition, message }) => self.condition_lost(*condition, message),
-            (_, Event::ConditionBack { condition }) => {
-                self.cause_gone(Cause::Condition(*condition), AlarmId::ConditionLost)
+            (_, Event::ConditionLost { device, condition, message }) => {
+                self.condition_lost(*device, *condition, message)
+            }
+            (_, Event::ConditionBack { device, condition }) => {
+                self.cause_gone(Cause::Condition(*device, *condition), AlarmId::ConditionLost)
             }
 
             // Connecting.
@@ -184,6 +186,7 @@ impl Cell {
                 Execute(p) | Holding(p) | Suspending(p) | Unholding(p) | Unsuspending(p),
                 Event::Progressed { device, .. },
             ) if p.moving() == Some(*device) => {}
+            (Held(p) | Suspended(p), Event::Progressed { device, .. }) => self.moves_unasked(p, *device),
             (_, Event::MachineHeld { device }) => self.machine_held(*device)?,
             (_, Event::MachineResumed { device }) => self.machine_resumed(*device)?,
             (Stopping, Event::Ended { device, result, .. }) if *result != JobResult::Aborted => {
@@ -192,6 +195,11 @@ impl Cell {
             (state, Event::Ended { device, result, .. }) if running(state) == Some(*device) => {
                 self.ended(*device, *result)
             }
+            (state, Event::RecordDoubted { why, .. }) if running(state) == Some(Device::Grinder) => {
+                self.doubted = true;
+                self.raise(AlarmId::PassRecord, why);
+            }
+            (Stopping, Event::RecordDoubted { why, .. }) => self.raise(AlarmId::PassRecord, why),
             (state, Event::Reconciled { device, outcome, .. }) if reconciling(state) == Some(*device) => {
                 self.reconciled(*device, outcome);
             }
@@ -210,9 +218,10 @@ impl Cell {
             (Execute(p) | Holding(p), Event::Refused { device, what, why }) if awaits(p, *device, *what) => {
                 self.said_no(p, *device, *what, why);
             }
-            (Holding(p) | Suspending(p), Event::Refused { device, what: Asked::Hold, why })
-                if p.moving() == Some(*device) =>
-            {
+            (
+                Holding(_) | Suspending(_) | Held(_) | Suspended(_),
+                Event::Refused { device, what: Asked::Hold, why },
+            ) => {
                 self.raise(AlarmId::HoldNotConfirmed, &format!("{device}, {why}"));
                 self.abort(&format!("the {device} refused to hold: {why}"));
             }

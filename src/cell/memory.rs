@@ -7,13 +7,13 @@ use super::alarm::AlarmId;
 use super::command::Command;
 use super::event::{Condition, Figures};
 use super::plan::CellPlan;
-use super::state::{Device, State};
+use super::state::{Device, JobStep, Phase, State};
 
 /// Why the cell is suspended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Cause {
     Link(Device),
-    Condition(Condition),
+    Condition(Device, Condition),
 }
 
 /// What the cell knows of one machine.
@@ -43,6 +43,8 @@ pub struct Cell {
     pub(super) cycle: u32,
     /// Passes of the grinder begun.
     pub(super) passes: u32,
+    /// What the grinder said of the pass of this cycle cannot be.
+    pub(super) doubted: bool,
     pub(super) known: [Known; 2],
     pub(super) causes: BTreeSet<Cause>,
     pub(super) raised: BTreeSet<AlarmId>,
@@ -60,6 +62,8 @@ pub struct Cell {
     /// The time of the event that is being handled, and when the next deadline is due.
     pub(super) now: Duration,
     pub(super) deadline: Option<Duration>,
+    /// When a machine that was told to hold has to stand.
+    pub(super) hold_due: Option<Duration>,
     pub(super) commands: Vec<Command>,
 }
 
@@ -71,6 +75,7 @@ impl Cell {
             state: State::Idle,
             cycle: 0,
             passes: 0,
+            doubted: false,
             known: [Known::default(); 2],
             causes: BTreeSet::new(),
             raised: BTreeSet::new(),
@@ -83,6 +88,7 @@ impl Cell {
             stopping: None,
             now: Duration::ZERO,
             deadline: None,
+            hold_due: None,
             commands: Vec::new(),
         }
     }
@@ -105,6 +111,29 @@ impl Cell {
     /// Returns the figures of the last measurement that was registered.
     pub fn figures(&self) -> Option<&Figures> {
         self.figures.as_ref().or(self.previous.as_ref())
+    }
+
+    /// Returns whether a command that was given earlier, and has waited, is still to be carried out. What sets something in motion is
+    /// wanted in the very state that asked for it only; on the way to an end nothing is that does not lead there.
+    pub fn wants(&self, command: &Command) -> bool {
+        let at = |device, step| self.state.phase() == Some(Phase::of(device, step));
+        match (self.state, command) {
+            (State::Aborting, Command::Connect { .. } | Command::AbortMachine { .. } | Command::VerifyClear { .. }) => {
+                true
+            }
+            (State::Stopping, Command::StopMachine { .. } | Command::Acknowledge { .. }) => true,
+            (State::Completing, Command::VerifyClear { .. }) => true,
+            (state, _) if state.is_end() => matches!(command, Command::Announce(_)),
+            (State::Aborting | State::Stopping | State::Completing, _) => matches!(command, Command::Announce(_)),
+            (State::Execute(_), Command::StartMachine { device, cycle }) => {
+                at(*device, JobStep::Start) && *cycle == self.cycle
+            }
+            (State::Unholding(_) | State::Unsuspending(_), Command::ResumeMachine { device }) => {
+                at(*device, JobStep::Run)
+            }
+            (_, Command::StartMachine { .. } | Command::ResumeMachine { .. }) => false,
+            _ => true,
+        }
     }
 
     /// Returns the alarms that stand.

@@ -195,6 +195,17 @@ impl State {
         }
     }
 
+    /// Returns the machine that has not confirmed that it stands, while the cell is held or suspended: it was last seen, or may
+    /// have been started, at a job that nobody has told the end of.
+    pub fn unconfirmed(self) -> Option<Device> {
+        match self {
+            Self::Held(phase) | Self::Suspended(phase) => {
+                phase.job().filter(|(_, step)| *step == JobStep::Reconcile).map(|(device, _)| device)
+            }
+            _ => None,
+        }
+    }
+
     /// Returns PackML's name.
     pub fn name(self) -> StateName {
         match self {
@@ -247,9 +258,12 @@ impl fmt::Display for StateName {
 
 impl fmt::Display for State {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self.phase() {
-            Some(phase) => write!(f, "{} ({phase})", self.name()),
-            None => self.name().fmt(f),
+        match (self.phase(), self.unconfirmed()) {
+            (Some(phase), Some(device)) => {
+                write!(f, "{} ({phase}): the {device} has not confirmed that it stands", self.name())
+            }
+            (Some(phase), None) => write!(f, "{} ({phase})", self.name()),
+            (None, _) => self.name().fmt(f),
         }
     }
 }

@@ -69,6 +69,7 @@ fn key(cell: &Cell) -> impl Ord + use<> {
     let known = cell.known.map(|known| (known.ready, known.met && known.stands));
     let clear = cell.known.map(|known| (known.clear, known.said_clear, known.asked_clear));
     let memory = (cell.worse.min(1), cell.repeated, cell.previous.is_some(), cell.passes >= cell.plan.max_cycles);
+    let memory = (memory, cell.hold_due.is_some(), cell.doubted);
     (cell.state, known, clear, cell.causes.is_empty(), memory, cell.plan.on_stall == Disposal::Hold)
 }
 
@@ -110,10 +111,6 @@ pub fn samples(cycle: u32) -> Vec<Event> {
         events.extend(of_machine(device, cycle));
     }
     events.extend(of_computations(cycle));
-    for condition in [Condition::Supplies, Condition::Temperature] {
-        events.push(Event::ConditionLost { condition, message: String::new() });
-        events.push(Event::ConditionBack { condition });
-    }
     events.push(Event::RecordFailed { why: RecordFailure::DiskFull(String::new()) });
     events.push(Event::RecordFailed { why: RecordFailure::Unwritable(String::new()) });
     events.push(Event::Deadline);
@@ -157,6 +154,10 @@ fn of_machine(device: Device, cycle: u32) -> Vec<Event> {
         Event::Acknowledged { device },
         Event::AbortConfirmed { device },
     ];
+    for condition in [Condition::Supplies, Condition::Signals] {
+        events.push(Event::ConditionLost { device, condition, message: text() });
+        events.push(Event::ConditionBack { device, condition });
+    }
     for found in [Occupation::Idle, Occupation::ToClear, Occupation::Busy(text())] {
         events.push(Event::Connected { device, boot_id: 1, simulated: true, found });
     }
@@ -187,6 +188,7 @@ fn of_computations(cycle: u32) -> Vec<Event> {
     let mut events: Vec<_> = gates.map(|gate| Event::Collected { cycle, targets: 100, found: 99, gate }).collect();
     events.push(Event::Collected { cycle, targets: 100, found: 10, gate: Gate::Passed });
     events.push(Event::PassLoaded { cycle });
+    events.push(Event::RecordDoubted { cycle, why: text() });
     events.push(Event::PlanLoaded { cycle });
     for radius_error_mm in [0.0, 0.010, f64::NAN] {
         events.push(Event::Qualified { cycle, radius_error_mm });

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use regrind::cell::Device;
-use regrind::drive::{CycleRow, Reply, Request, Snapshot, ask};
+use regrind::drive::{CycleRow, Reply, Request, Snapshot, ask, is_live};
 
 use super::Outcome;
 use super::choice::word_of;
@@ -14,7 +14,7 @@ use super::failure::Failure;
 /// An order to a running cell.
 #[derive(Args, Debug)]
 #[command(after_help = "\
-RUN is the folder of a run; without it, the newest under runs/. Who gave the order is recorded as the operating
+RUN is the folder of a run; without it, the one under runs/ that goes on now. Who gave the order is recorded as the operating
 system knows them.
 
 Example:
@@ -121,8 +121,18 @@ fn named_file(arguments: &Confirmation) -> Result<Option<PathBuf>, Failure> {
 }
 
 fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<Outcome, Failure> {
-    let folder = folder_of(run)?;
-    let reply = ask(&folder, request).map_err(|source| Failure::NotRunning { path: folder.clone(), source })?;
+    let folder = run.map_or_else(|| live(Path::new("runs")), |run| Ok(run.to_owned()))?;
+    let asked = |request: &Request| {
+        ask(&folder, request).map_err(|source| Failure::NotRunning { path: folder.clone(), source })
+    };
+    let reply = match request {
+        // Meant for the state in which the cell is now: another terminal may hold it meanwhile, and then the hold stands.
+        Request::Resume { reason, seen: None } => {
+            let seen = Some(asked(&Request::Status)?.status.number);
+            asked(&Request::Resume { reason: reason.clone(), seen })?
+        }
+        request => asked(request)?,
+    };
     show(&reply, request, json)?;
     if reply.accepted { Ok(Outcome::Accepted) } else { Err(Failure::OrderRefused { message: reply.message }) }
 }
@@ -147,8 +157,26 @@ pub(super) fn folder_of(run: Option<&Path>) -> Result<PathBuf, Failure> {
     run.map(Path::to_owned).or_else(|| newest(Path::new("runs"))).ok_or_else(|| Failure::NoRun { path: "runs".into() })
 }
 
+/// Returns the folder of the run that goes on now; where none does, of the one that was made last.
+fn live(runs: &Path) -> Result<PathBuf, Failure> {
+    let mut live: Vec<_> = folders(runs).filter(|folder| is_live(folder)).collect();
+    match live.len() {
+        0 => newest(runs).ok_or_else(|| Failure::NoRun { path: runs.to_owned() }),
+        1 => Ok(live.remove(0)),
+        _ => {
+            live.sort();
+            Err(Failure::SeveralRuns { runs: live })
+        }
+    }
+}
+
+fn folders(runs: &Path) -> impl Iterator<Item = PathBuf> {
+    let entries = std::fs::read_dir(runs).into_iter().flatten().filter_map(io::Result::ok);
+    entries.map(|entry| entry.path()).filter(|path| path.is_dir())
+}
+
 /// Returns the run folder that was made last.
 fn newest(runs: &Path) -> Option<PathBuf> {
-    let folders = std::fs::read_dir(runs).ok()?.filter_map(io::Result::ok).filter(|entry| entry.path().is_dir());
-    folders.max_by_key(|entry| entry.metadata().and_then(|m| m.modified()).ok()).map(|entry| entry.path())
+    let made = |folder: &PathBuf| std::fs::metadata(folder).and_then(|m| m.modified()).ok();
+    folders(runs).max_by_key(made)
 }

@@ -72,13 +72,17 @@ pub(super) enum Failure {
     NoState { name: String, known: String },
     #[error(transparent)]
     Journal(JournalError),
+    #[error(transparent)]
+    Machine(JournalError),
     #[error("{path}: no control socket can be made there: {source}; give --runs a local folder with a shorter name")]
     ControlSocket { path: PathBuf, source: io::Error },
     #[error("{path}: no run was made there; name the folder of a run")]
     NoRun { path: PathBuf },
     #[error("{path}: no cell runs there ({source}); `regrind audit show` tells how the run ended")]
     NotRunning { path: PathBuf, source: io::Error },
-    #[error("the cell did not take the order: {message}")]
+    #[error("{} runs go on: name one of {}", .runs.len(), .runs.iter().map(|run| run.display().to_string()).collect::<Vec<_>>().join(", "))]
+    SeveralRuns { runs: Vec<PathBuf> },
+    #[error("the order is not acknowledged: {message}")]
     OrderRefused { message: String },
     #[error("`confirm over` needs --machine and --evidence: which machine was looked at, and what was seen")]
     Evidence,
@@ -95,6 +99,8 @@ pub(super) enum Failure {
     /// The input was good and the place was writable before; now it is not.
     #[error("the result could not be saved: {0}")]
     NotSaved(FormatError),
+    #[error("signals of the operating system cannot be heard: {0}")]
+    Signals(io::Error),
     #[error("the terminal cannot be written to: {0}")]
     Terminal(io::Error),
 }
@@ -105,6 +111,8 @@ impl Failure {
         match self {
             Self::NotFinite { .. }
             | Self::NotSaved(_)
+            | Self::Machine(_)
+            | Self::Signals(_)
             | Self::Terminal(_)
             | Self::OrderRefused { .. }
             | Self::Setup(SetupError::Machine {

@@ -94,7 +94,7 @@ fn run() -> ExitCode {
         Command::Plan(arguments) => plan::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Hold(arguments) => control::order(&arguments, |reason| Request::Hold { reason }),
-        Command::Resume(arguments) => control::order(&arguments, |reason| Request::Resume { reason }),
+        Command::Resume(arguments) => control::order(&arguments, |reason| Request::Resume { reason, seen: None }),
         Command::Stop(arguments) => control::order(&arguments, |reason| Request::Stop { reason }),
         Command::Abort(arguments) => control::order(&arguments, |reason| Request::Abort { reason }),
         Command::Confirm(arguments) => control::confirm(&arguments),

@@ -1,18 +1,20 @@
 //! `regrind run`: grind, measure, register, judge, compensate, until the part is accepted or the loop must stop.
 
+use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use clap::Args;
 use regrind::cell::{Actor, Beginning, CellPlan, Ending};
 use regrind::config::{CellConfig, Link};
-use regrind::device::{AnyCmm, AnyGrinder, Line};
+use regrind::device::{AnyCmm, AnyGrinder, Line, Machine as _};
 use regrind::drive::{Drive, Orders, Request, Run, Task};
 use regrind::formats::{LEARNED, Learned, LearnedError};
-use regrind::journal::{Header, Journal};
+use regrind::journal::{Header, Journal, MachineLock};
 use regrind::recipe::Recipe;
 use regrind::setup;
 use serde_json::json;
+use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::mpsc;
 
 use super::failure::Failure;
@@ -23,7 +25,8 @@ use super::{Outcome, check, plan, simulated};
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Without --cell everything is simulated, on real Modbus TCP connections within this program, and marked SIMULATION.
-Ctrl-C once holds the cell at the next safe place; twice aborts it.
+Ctrl-C once holds the cell at the next safe place; twice aborts it. A terminal that is closed (SIGHUP) and a service that
+is stopped (SIGTERM) end the run in order; told again, they abort it.
 
 Example:
   regrind run recipes/freeform-mirror.toml
@@ -102,8 +105,9 @@ async fn carry_out(
     // Before the record begins: a folder that is not there, or a line that is in use, is no run.
     let part = arguments.part.clone().unwrap_or_else(|| recipe_name(recipe));
     let folder = free_folder(&arguments.runs, &recipe_name(recipe), began, cell.simulated);
-    let client = [owner(&actor), job];
+    let client = [owner(&actor, &folder), job];
     let (cmm, grinder) = setup::machines(recipe, cell, &part, &folder, client).map_err(Failure::Setup)?;
+    let _taken = [take(&cell.cmm.link, cmm.name(), &folder)?, take(&cell.grinder.link, grinder.name(), &folder)?];
     if let Some(earlier) = earlier.as_ref().filter(|_| !arguments.json) {
         super::print(&earlier.in_words(&arguments.runs))?;
     }
@@ -117,9 +121,11 @@ async fn carry_out(
     let loaded = arguments.loaded || cell.simulated;
     let run = Run { plan, task, journal, job, actor: actor.clone(), loaded, poll, notices, interrupted: None };
     let ending = go(run, cmm, grinder, actor).await?;
-    showing.await.map_err(|e| Failure::Terminal(e.into()))??;
-    // The record is closed; a report that cannot be written must not change how the run ended.
-    if let Err(error) = regrind::report::write_run_report(&folder) {
+    let shown = showing.await.map_err(|e| Failure::Terminal(e.into()));
+    // The record is closed; a report that cannot be written must not change how the run ended, nor a terminal that has gone.
+    let report = regrind::report::write_run_report(&folder);
+    shown??;
+    if let Err(error) = report {
         super::print(&format!("no report: {error}\n"))?;
     }
     Ok(ending)
@@ -180,9 +186,10 @@ async fn go(run: Run, cmm: AnyCmm, grinder: AnyGrinder, actor: Actor) -> Result<
     let folder = run.journal.folder().to_owned();
     let (drive, orders) =
         Drive::with_cell(run, cmm, grinder).map_err(|source| Failure::ControlSocket { path: folder, source })?;
-    let keys = tokio::spawn(heed_ctrl_c(orders, actor));
+    let signals = Signals::new().map_err(Failure::Signals)?;
+    let heeding = [tokio::spawn(heed_ctrl_c(orders.clone(), actor.clone())), tokio::spawn(signals.heed(orders, actor))];
     let ending = drive.run().await;
-    keys.abort();
+    heeding.iter().for_each(tokio::task::JoinHandle::abort);
     Ok(ending)
 }
 
@@ -198,6 +205,38 @@ async fn heed_ctrl_c(orders: Orders, actor: Actor) {
             Request::Hold { reason: "Ctrl-C".into() }
         };
         orders.give(request, actor.clone()).await;
+    }
+}
+
+/// What ends a program from outside: a terminal that is closed, a service that is stopped.
+struct Signals {
+    hangup: Signal,
+    terminate: Signal,
+}
+
+impl Signals {
+    fn new() -> io::Result<Self> {
+        Ok(Self { hangup: signal(SignalKind::hangup())?, terminate: signal(SignalKind::terminate())? })
+    }
+
+    /// The first ends the run in order, the next one aborts it. A terminal that closes may say so twice.
+    async fn heed(mut self, orders: Orders, actor: Actor) {
+        let mut first: Option<Instant> = None;
+        loop {
+            let (name, hung_up) = tokio::select! {
+                Some(()) = self.terminate.recv() => ("SIGTERM", false),
+                Some(()) = self.hangup.recv() => ("SIGHUP, the terminal was closed", true),
+                else => return,
+            };
+            let reason = name.to_owned();
+            let request = match first {
+                None => Request::Stop { reason },
+                Some(at) if hung_up && at.elapsed() < IN_ONE_GO => continue,
+                Some(_) => Request::Abort { reason: format!("{reason}, again") },
+            };
+            first = first.or_else(|| Some(Instant::now()));
+            orders.give(request, actor.clone()).await;
+        }
     }
 }
 
@@ -272,11 +311,19 @@ fn operator(named: Option<&str>) -> Actor {
     Actor { name: named.map_or_else(user, str::to_owned), station: host }
 }
 
-/// A number for this client: the same for every run on this computer.
-fn owner(actor: &Actor) -> u32 {
+/// Keeps a machine on a line from every other run on this computer.
+fn take(link: &Link, name: &str, run: &Path) -> Result<Option<MachineLock>, Failure> {
+    let run = std::path::absolute(run).unwrap_or_else(|_| run.to_owned());
+    let taken = link.wire.line().map(|_| MachineLock::take(name, &run));
+    taken.transpose().map_err(Failure::Machine)
+}
+
+/// A number for this run as a client of its machines.
+fn owner(actor: &Actor, run: &Path) -> u32 {
     let mut hash = crc32fast::Hasher::new();
     hash.update(b"regrind ");
     hash.update(actor.station.as_bytes());
+    hash.update(run.as_os_str().as_encoded_bytes());
     hash.finalize().max(1)
 }
 

@@ -349,15 +349,29 @@ pub enum Outcome {
     Failed,
 }
 
-/// A signal that a cell file asks for besides the contract's own, in its unit.
+/// A signal that a cell file asks for besides the contract's own: its value and whether that is good come apart.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SignalValue {
     /// Its name in the cell file.
     pub name: String,
-    /// Its value.
-    pub value: f64,
+    /// Its value in its unit; none where the machine gives no number.
+    pub value: Option<f64>,
     /// Its unit, as written in the cell file.
     pub unit: String,
+    /// Least and most that it may be.
+    pub range: [f64; 2],
+}
+
+impl SignalValue {
+    /// Says what is wrong with it, if anything is.
+    pub fn flaw(&self) -> Option<String> {
+        let Self { name, value, unit, range: [least, most] } = self;
+        match value {
+            None => Some(format!("{name}: the machine gives no number")),
+            Some(value) if (least..=most).contains(&value) => None,
+            Some(value) => Some(format!("{name} is {value} {unit}, and {least} to {most} {unit} are wanted")),
+        }
+    }
 }
 
 /// What a machine says of itself, all of one moment; `None` is what it cannot tell, and nobody fills that in: what has to be known

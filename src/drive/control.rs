@@ -21,6 +21,9 @@ const LONGEST_LINE: u64 = 4096;
 /// A client that says nothing for so long is gone.
 const PATIENCE: Duration = Duration::from_secs(10);
 
+/// Between two tries to let a client in.
+const BETWEEN_TRIES: Duration = Duration::from_millis(50);
+
 /// What can be asked of a running cell: which machine it is about, and why, which may be empty.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[expect(missing_docs, reason = "the fields are told above them")]
@@ -35,6 +38,9 @@ pub enum Request {
     Resume {
         #[serde(default)]
         reason: String,
+        /// The state that the person saw, by [`Snapshot::number`]: an order that was meant for another one is refused.
+        #[serde(default)]
+        seen: Option<u64>,
     },
     /// End in order.
     Stop {
@@ -100,6 +106,9 @@ pub struct Snapshot {
     /// State and phase, for people.
     #[serde(rename = "words")]
     pub message: String,
+    /// Counts the states since the run began, so that an order can say which one it is meant for.
+    #[serde(default)]
+    pub number: u64,
     /// The number of the cycle; 0 before the first.
     pub cycle: u32,
     /// Time since the run began.
@@ -139,7 +148,12 @@ impl Control {
         }
         let listener = UnixListener::bind(&path)?;
         let task = tokio::spawn(async move {
-            while let Ok((stream, _)) = listener.accept().await {
+            loop {
+                let Ok((stream, _)) = listener.accept().await else {
+                    // No descriptor is left, or the client has gone: that passes, and orders must get through when it has.
+                    tokio::time::sleep(BETWEEN_TRIES).await;
+                    continue;
+                };
                 let (orders, status) = (orders.clone(), status.clone());
                 // A client that misbehaves hurts itself only.
                 tokio::spawn(async move { drop(tokio::time::timeout(PATIENCE, answer(stream, orders, status)).await) });
@@ -199,6 +213,11 @@ fn actor_of(stream: &UnixStream) -> io::Result<Actor> {
 fn own_uid() -> Option<u32> {
     use std::os::unix::fs::MetadataExt;
     std::fs::metadata("/proc/self").ok().map(|m| m.uid())
+}
+
+/// Whether a run goes on in a folder: somebody listens to its orders.
+pub fn is_live(folder: &Path) -> bool {
+    std::os::unix::net::UnixStream::connect(folder.join(SOCKET)).is_ok()
 }
 
 /// Asks a running cell; blocks for its answer.

@@ -8,20 +8,21 @@
 //!                                        journal: every event before it is handled, every command before it is carried out
 //! ```
 //!
-//! A command that could move a machine is not carried out unless the journal has it. Hold, stop and abort are carried out
-//! whether it can be written or not.
+//! The loop never waits for the disk. An event is decided upon at once, and what makes safe goes out at once; everything else that
+//! follows, the answer to who gave an order among it, waits in line until the journal has all that came before it.
 
 mod control;
 mod maps;
 mod notice;
 mod outcome;
+mod pass_record;
 mod program;
 mod record;
 mod station;
 mod task;
 mod work;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::path::PathBuf;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -30,21 +31,27 @@ use std::time::Duration;
 use serde::Serialize;
 use serde_json::{Value, json};
 use tokio::sync::{mpsc, oneshot, watch};
-use tokio::task::JoinSet;
+use tokio::task::{JoinError, JoinSet};
 use tokio::time::Instant;
 
-use crate::cell::{Actor, Cell, CellPlan, Command, Device, Ending, Event, Phase, RecordFailure, State, StateName};
-use crate::device::{AnyCmm, AnyGrinder, Armed, Cmm, Grinder, Identified, Interrupt, Measurement, Word, hex};
+use crate::cell::{
+    Actor, Asked, Cell, CellPlan, Command, CompensationRefusal, Device, Ending, Event, Gate, GateFailure, Phase,
+    RecordFailure, State, StateName,
+};
+use crate::device::{
+    AnyCmm, AnyGrinder, Armed, Cmm, Grinder, Identified, Interrupt, Job, Measurement, PassRecord, Word, hex,
+};
 use crate::formats::{LEARNED, write_json_atomic};
 use crate::journal::{Artefact, Entry, Journal, Kind};
 
 use control::{Control, Ordered};
-pub use control::{Reply, Request, Snapshot, ask};
+pub use control::{Reply, Request, Snapshot, ask, is_live};
 pub use notice::{CycleRow, Notice};
 pub use program::{ProgramError, Programs};
-use record::{Files, Recorder, entry};
+use record::{Files, Recorder, Ticket, entry};
 use station::{
-    Aborts, Ask, CmmDriver, Fetched, GrinderDriver, Intent, Load, MachineTask, StationDriver, StationReport,
+    Aborts, Ask, CmmDriver, Fetched, GrinderDriver, Intent, Load, MachineTask, PULSE_EVERY, Pulse, StationDriver,
+    StationReport,
 };
 use task::{Cycle, Product};
 pub use task::{Probing, Sphere, Task};
@@ -106,6 +113,7 @@ pub struct Drive {
     task: Arc<Task>,
     recorder: Recorder,
     folder: PathBuf,
+    job: u32,
     actor: Actor,
     loaded: bool,
     began: Instant,
@@ -115,21 +123,58 @@ pub struct Drive {
     interrupts: [Interrupt; 2],
     /// Counts the aborts of each station, which so gives up what it is at.
     aborts: [watch::Sender<u64>; 2],
+    pulse: Pulse,
     reports: mpsc::Receiver<StationReport>,
     computations: JoinSet<Computed>,
+    /// Which of them computes what.
+    computing: HashMap<tokio::task::Id, (u32, Computation)>,
     orders: mpsc::Receiver<Ordered>,
     status: watch::Sender<Snapshot>,
     notices: mpsc::UnboundedSender<Notice>,
     cycles: BTreeMap<u32, Cycle>,
+    /// Counts the states of the cell.
+    states: u64,
+    /// Counts what was computed for each cycle.
+    attempts: BTreeMap<(u32, Computation), u32>,
     armed: [Option<Value>; 2],
-    /// Commands on record that no event has answered yet.
-    open: Vec<(u32, Command)>,
-    record_failed: bool,
-    /// A failure to record that the cell has not heard of yet.
-    untold: Option<RecordFailure>,
+    /// Commands that no event has answered yet, by the numbers that the recorder gave them.
+    open: Vec<(u64, Command)>,
+    /// What waits to be on record, in order.
+    backlog: VecDeque<Waiting>,
+    /// Why nothing comes on record at present.
+    failing: Option<String>,
     ending: Option<Ending>,
     stations: Vec<tokio::task::JoinHandle<()>>,
     _control: Control,
+}
+
+/// What is computed for a cycle.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Computation {
+    Gate,
+    Registration,
+    Compensation,
+}
+
+/// The folder of a cycle, below that of the run. What is on record is never written again: another attempt has a folder of its own.
+fn folder_of(cycle: u32, attempt: u32) -> String {
+    match attempt {
+        0 | 1 => format!("cycle-{cycle}"),
+        attempt => format!("cycle-{cycle}/attempt-{attempt}"),
+    }
+}
+
+/// Something that waits to be on record, and what follows then.
+struct Waiting {
+    ticket: Ticket,
+    then: Then,
+}
+
+enum Then {
+    Nothing,
+    Execute(Box<Command>),
+    Answer { answer: oneshot::Sender<Reply>, accepted: bool, message: String },
+    Confirm { device: Device, word: Word, answer: oneshot::Sender<Result<(), String>> },
 }
 
 /// What a computation brought.
@@ -169,17 +214,26 @@ impl Drive {
         let interrupted = run.interrupted.unwrap_or_default();
         let interrupts = [Interrupt::new(), Interrupt::new()];
         let aborts = [watch::Sender::new(0), watch::Sender::new(0)];
+        let pulse = Pulse::new();
         let armed = interrupted.intents.clone().map(|intent| intent.as_ref().and_then(restored));
         let [of_cmm, of_grinder] = armed;
         let [poll_cmm, poll_grinder] = run.poll;
-        let (cmm, cmm_task) = spawn(CmmDriver(cmm), run.job, (&interrupts[0], &aborts[0]), &reports, of_cmm, poll_cmm);
-        let (grinder, grinder_task) =
-            spawn(GrinderDriver(grinder), run.job, (&interrupts[1], &aborts[1]), &reports, of_grinder, poll_grinder);
+        let (cmm, cmm_task) =
+            spawn(CmmDriver(cmm), run.job, (&interrupts[0], &aborts[0], &pulse), &reports, of_cmm, poll_cmm);
+        let (grinder, grinder_task) = spawn(
+            GrinderDriver(grinder),
+            run.job,
+            (&interrupts[1], &aborts[1], &pulse),
+            &reports,
+            of_grinder,
+            poll_grinder,
+        );
         let mut drive = Self {
             cell: Cell::new(run.plan),
             task: Arc::new(run.task),
             recorder,
             folder,
+            job: run.job,
             actor: run.actor,
             loaded: run.loaded,
             began: Instant::now(),
@@ -187,16 +241,20 @@ impl Drive {
             asks: [cmm, grinder],
             interrupts,
             aborts,
+            pulse,
             reports: reported,
             computations: JoinSet::new(),
+            computing: HashMap::new(),
             orders: ordered,
             status,
             notices: run.notices,
             cycles: BTreeMap::new(),
+            states: 0,
+            attempts: BTreeMap::new(),
             armed: interrupted.intents,
             open: Vec::new(),
-            record_failed: false,
-            untold: None,
+            backlog: VecDeque::new(),
+            failing: None,
             ending: None,
             stations: vec![cmm_task, grinder_task],
             _control: control,
@@ -229,7 +287,9 @@ impl Drive {
             _ => Event::Restarted { actor: self.actor.clone() },
         };
         self.take(first, None).await;
+        let mut beats = tokio::time::interval(PULSE_EVERY);
         while self.ending.is_none() {
+            self.pulse.beat();
             let due = self.cell.next_deadline().map(|at| self.began + at.saturating_sub(self.before));
             let deadline = async {
                 match due {
@@ -240,25 +300,98 @@ impl Drive {
             tokio::select! {
                 biased;
                 Some(ordered) = self.orders.recv() => self.order(ordered).await,
-                // One that panicked brings nothing, and the cell finds it late.
-                Some(computed) = self.computations.join_next() => if let Ok(computed) = computed {
-                    self.computed(computed).await;
+                why = self.recorder.failure() => self.record_failed(why).await,
+                recorded = on_record(&mut self.backlog) => self.recorded(recorded).await,
+                Some(computed) = self.computations.join_next_with_id() => match computed {
+                    Ok((id, computed)) => {
+                        self.computing.remove(&id);
+                        self.computed(computed).await;
+                    }
+                    Err(error) => self.panicked(error).await,
                 },
                 Some(report) = self.reports.recv() => self.reported(report).await,
                 () = deadline => drop(self.take(Event::Deadline, None).await),
-            }
-            // What failed beside an event: a file that was to be adopted, a note.
-            if let Some(why) = self.untold.take() {
-                self.take(Event::RecordFailed { why }, None).await;
+                _ = beats.tick() => {}
             }
         }
         self.end_run().await
+    }
+
+    /// Tells of a computation that panicked what it is: a fault of this program, and nothing of the part.
+    async fn panicked(&mut self, error: JoinError) {
+        let Some((cycle, kind)) = self.computing.remove(&error.id()) else { return };
+        let why =
+            format!("the computation failed by a fault of the program itself, please report it: {}", words_of(error));
+        let event = match kind {
+            Computation::Gate => {
+                let gate = Gate::Failed(GateFailure::Broken(why));
+                Event::Collected { cycle, targets: 0, found: 0, gate }
+            }
+            Computation::Registration => Event::RegistrationFailed { cycle, why },
+            Computation::Compensation => Event::CompensationRefused { cycle, why: CompensationRefusal::Failed(why) },
+        };
+        self.take(event, None).await;
+    }
+
+    /// Goes on with what has waited to be on record. What never comes there is not done.
+    async fn recorded(&mut self, recorded: Result<(), RecordFailure>) {
+        let Some(Waiting { then, .. }) = self.backlog.pop_front() else { return };
+        match recorded {
+            Ok(()) => self.failing = None,
+            Err(why) => return self.record_failed(why).await,
+        }
+        match then {
+            Then::Nothing => {}
+            Then::Execute(command) if self.cell.wants(&command) => self.execute(*command).await,
+            Then::Execute(command) => self.not_carried_out(*command).await,
+            // Who asked may have gone.
+            Then::Answer { answer, accepted, message } => {
+                drop(answer.send(Reply { accepted, message, status: self.snapshot() }))
+            }
+            Then::Confirm { device, word, answer } => self.ask(device, Ask::Confirm { word, answer }).await,
+        }
+    }
+
+    /// Tells of a START that it was not given: the cell has come elsewhere while it waited to be on record.
+    async fn not_carried_out(&mut self, command: Command) {
+        if let Command::StartMachine { device, .. } = command {
+            let why = "it was not given: the cell was held before it was on record".to_owned();
+            self.take(Event::Refused { device, what: Asked::Start, why }, None).await;
+        }
+    }
+
+    /// Lets the cell and people know that something cannot be recorded.
+    async fn record_failed(&mut self, why: RecordFailure) {
+        let message = message_of(&why);
+        self.notify(Notice::RecordFailed { message: message.clone() });
+        self.failing = Some(message);
+        self.take(Event::RecordFailed { why }, None).await;
+        self.answer_without_record();
+    }
+
+    /// While nothing comes on record, who gave an order is not kept waiting, and is told what became of it and what did not.
+    fn answer_without_record(&mut self) {
+        let Some(why) = &self.failing else { return };
+        let status = self.snapshot();
+        for waiting in &mut self.backlog {
+            match std::mem::replace(&mut waiting.then, Then::Nothing) {
+                Then::Answer { answer, message, .. } => {
+                    let message = format!(
+                        "{message}; what makes safe was carried out, and nothing else is: it is not on record, {why}"
+                    );
+                    // Who asked may have gone.
+                    drop(answer.send(Reply { accepted: false, message, status: status.clone() }));
+                }
+                then => waiting.then = then,
+            }
+        }
     }
 
     /// Writes the end of the run and gives the machines back.
     async fn end_run(mut self) -> Ending {
         let ending = self.ending.take().expect("the loop ended with one");
         self.orders.close();
+        self.finish_backlog().await;
         // Whatever is still computed leaves files in the run folder, so it is waited for.
         while let Some(computed) = self.computations.join_next().await {
             if let Ok(Computed { cycle, files, .. }) = computed {
@@ -284,49 +417,50 @@ impl Drive {
 
     /// Handles an order and answers who gave it.
     async fn order(&mut self, Ordered { request, actor, answer }: Ordered) {
+        if let Request::Resume { seen: Some(seen), .. } = request
+            && seen != self.states
+        {
+            let message = format!("the cell has changed since you saw it; now it is {}", self.cell.state());
+            // Who asked may have gone.
+            drop(answer.map(|answer| answer.send(Reply { accepted: false, message, status: self.snapshot() })));
+            return;
+        }
         let event = match request {
             Request::Started { .. } | Request::Done { .. } | Request::Still { .. } => {
-                return self.confirm(&request, &actor, answer).await;
+                return self.confirm(&request, &actor, answer);
             }
             Request::Clear { device } => Event::ClearConfirmed { actor, device },
             Request::Hold { reason } => Event::Hold { actor, reason },
-            Request::Resume { reason } => Event::Resume { actor, reason },
+            Request::Resume { reason, .. } => Event::Resume { actor, reason },
             Request::Stop { reason } => Event::Stop { actor, reason },
             Request::Abort { reason } => Event::Abort { actor, reason },
             Request::Loaded => Event::LoadConfirmed { actor },
             Request::Over { device, evidence } => Event::DeclaredOver { actor, device, evidence },
             Request::Status => return,
         };
-        let refusal = self.take(event, None).await;
+        let (refusal, ticket) = self.take(event, None).await;
         if let Some(answer) = answer {
-            let message = refusal.clone().unwrap_or_else(|| self.cell.state().to_string());
-            // Who asked may have gone.
-            let _ = answer.send(Reply { accepted: refusal.is_none(), message, status: self.snapshot() });
+            let accepted = refusal.is_none();
+            let message = refusal.unwrap_or_else(|| self.cell.state().to_string());
+            self.backlog.push_back(Waiting { ticket, then: Then::Answer { answer, accepted, message } });
+            self.answer_without_record();
         }
     }
 
     /// Takes a person's word about a machine that cannot tell it itself.
-    async fn confirm(&mut self, request: &Request, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
-        let mut asked = self.word(request);
-        if let Ok((device, confirmed, _)) = &asked {
+    fn confirm(&mut self, request: &Request, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
+        let asked = self.word(request).map(|(device, confirmed, word)| {
             let mut payload = serde_json::to_value(request).unwrap_or_default();
             if let Some(payload) = payload.as_object_mut() {
                 payload.remove("order");
                 payload.extend([("confirmed".to_owned(), json!(confirmed)), ("device".to_owned(), json!(device))]);
             }
-            self.note(Kind::Note, (actor.name.clone(), actor.station.clone()), payload).await;
-            if self.record_failed {
-                asked = Err("the journal cannot be written, and what is not recorded is not done".into());
-            }
-        }
-        let asked = match asked {
-            Err(why) => Err(why),
-            Ok((device, _, word)) => {
-                let (told, taken) = oneshot::channel();
-                self.ask(device, Ask::Confirm { word, answer: told }).await;
-                Ok(taken)
-            }
-        };
+            let origin = (actor.name.clone(), actor.station.clone());
+            let ticket = self.recorder.append(entry(Kind::Note, self.now(), self.cell.cycle(), origin, payload));
+            let (told, taken) = oneshot::channel();
+            self.backlog.push_back(Waiting { ticket, then: Then::Confirm { device, word, answer: told } });
+            taken
+        });
         let status = self.snapshot();
         // The station answers in its turn; the loop does not wait for it.
         tokio::spawn(async move {
@@ -382,12 +516,15 @@ impl Drive {
         self.adopt(self.cell.cycle(), record::describe(&self.folder, &files)).await;
         if let Some((device, messages)) = notes {
             let payload = json!({ "device": device, "notes": messages });
-            self.note(Kind::Note, (device.to_string(), "wire".into()), payload).await;
+            self.note(Kind::Note, (device.to_string(), "wire".into()), payload);
             self.notify(Notice::Note { device, messages });
         }
         if let Some(Fetched::Record(record)) = &fetched {
-            let payload = json!({ "pass_record": pass_record(record) });
-            self.note(Kind::Note, ("grinder".into(), "wire".into()), payload).await;
+            let payload = json!({ "pass_record": pass_record::document(record) });
+            self.note(Kind::Note, ("grinder".into(), "wire".into()), payload);
+            if let Some(why) = self.flaw_of(record) {
+                self.take(Event::RecordDoubted { cycle: self.cell.cycle(), why }, None).await;
+            }
         }
         if let Some(Fetched::Points(measurement, taken)) = fetched {
             self.transferred(&measurement, taken).await;
@@ -401,12 +538,23 @@ impl Drive {
         }
     }
 
+    /// Tells what of a pass record cannot be, beside the pass that was commanded.
+    fn flaw_of(&self, record: &PassRecord) -> Option<String> {
+        let number = self.cell.cycle();
+        let Some(cycle) = self.cycles.get(&number) else { return Some(format!("there is no pass of cycle {number}")) };
+        let (map, pass) = self.task.payloads(&cycle.correction);
+        let job = Job { job: self.job, cycle: number as u16, digest: 0 };
+        let largest_depth_mm = self.task.limits.largest_depth_mm;
+        let told = pass_record::Told { job, pass: &pass, map_identity: map.identity(), largest_depth_mm };
+        pass_record::flaw(&told, record)
+    }
+
     /// Records and shows how fast points came over the wire.
     async fn transferred(&mut self, measurement: &Measurement, taken: Duration) {
         let (cycle, points, seconds) = (u32::from(measurement.cycle), measurement.points.len(), taken.as_secs_f64());
         let ms_per_point = 1e3 * seconds / points.max(1) as f64;
         let payload = json!({ "transfer": { "points": points, "seconds": seconds, "ms_per_point": ms_per_point } });
-        self.note(Kind::Note, ("cmm".into(), "wire".into()), payload).await;
+        self.note(Kind::Note, ("cmm".into(), "wire".into()), payload);
         self.notify(Notice::Transferred { cycle, points, seconds, ms_per_point });
     }
 
@@ -423,75 +571,63 @@ impl Drive {
 
     /// Brings files on record.
     async fn adopt(&mut self, cycle: u32, files: Result<Vec<Artefact>, RecordFailure>) {
-        let adopted = match files {
-            Ok(files) if files.is_empty() => return,
-            Ok(files) => self.recorder.adopt(files, self.now(), cycle).await,
-            Err(failure) => Err(failure),
-        };
-        self.keep_failure(adopted);
-    }
-
-    /// Records an event, lets the cell handle it, and carries out what it decides. Returns why it was refused, if it was.
-    async fn take(&mut self, event: Event, detail: Option<Value>) -> Option<String> {
-        let mut refusal = None;
-        let mut events = std::collections::VecDeque::from([(event, detail)]);
-        while let Some((event, detail)) = events.pop_front() {
-            let now = self.now();
-            self.journal_event(now, &event, detail).await;
-            self.show_event(&event);
-            let commands = self.cell.handle(now, event);
-            // What makes safe waits neither for the disk nor for the record of what comes before it.
-            for command in commands.iter().filter(|command| makes_safe(command)) {
-                self.execute(command.clone()).await;
+        match files {
+            Ok(files) if files.is_empty() => {}
+            Ok(files) => {
+                let ticket = self.recorder.adopt(files, self.now(), cycle);
+                self.backlog.push_back(Waiting { ticket, then: Then::Nothing });
             }
-            for command in commands {
-                if let Command::Refuse { why, .. } = &command {
-                    refusal = Some(why.clone());
-                }
-                self.carry_out(command).await;
-            }
-            events.extend(self.untold.take().map(|why| (Event::RecordFailed { why }, None)));
-            self.status.send_replace(self.snapshot());
+            // Of what the loop itself leaves at the end nobody is told anew.
+            Err(why) if self.ending.is_some() => self.notify(Notice::RecordFailed { message: message_of(&why) }),
+            Err(why) => Box::pin(self.record_failed(why)).await,
         }
-        refusal
     }
 
-    async fn journal_event(&mut self, now: Duration, event: &Event, detail: Option<Value>) {
+    /// Gives an event to the record, lets the cell handle it, and has carried out what it decides. Returns why it was refused, if it
+    /// was, and a ticket for its record.
+    async fn take(&mut self, event: Event, detail: Option<Value>) -> (Option<String>, Ticket) {
+        let now = self.now();
+        let ticket = self.record_event(now, &event, detail);
+        self.show_event(&event);
+        let before = self.cell.state();
+        let commands = self.cell.handle(now, event);
+        self.states += u64::from(self.cell.state() != before);
+        for command in commands.iter().filter(|command| waits_for_nothing(command)) {
+            self.execute(command.clone()).await;
+        }
+        let mut refusal = None;
+        for command in commands {
+            if let Command::Refuse { why, .. } = &command {
+                refusal = Some(why.clone());
+            }
+            self.line_up(command);
+        }
+        self.status.send_replace(self.snapshot());
+        (refusal, ticket)
+    }
+
+    fn record_event(&mut self, now: Duration, event: &Event, detail: Option<Value>) -> Ticket {
         let mut payload = serde_json::to_value(event).unwrap_or(Value::Null);
         if let (Some(map), Some(detail)) = (payload.as_object_mut(), detail) {
             map.insert("detail".into(), detail);
         }
-        let written = self.recorder.append(entry(Kind::Event, now, self.cell.cycle(), event.origin(), payload)).await;
-        self.keep_failure(written);
-        self.close_answered(now, event).await;
-    }
-
-    /// Records what became of the commands that an event answers.
-    async fn close_answered(&mut self, now: Duration, event: &Event) {
-        let (answered, open) =
+        let ticket = self.recorder.append(entry(Kind::Event, now, self.cell.cycle(), event.origin(), payload));
+        // What became of the commands that it answers.
+        let (answered, open): (Vec<_>, Vec<_>) =
             std::mem::take(&mut self.open).into_iter().partition(|(_, c)| outcome::answers(event, c));
         self.open = open;
-        for (id, _) in answered as Vec<(u32, Command)> {
+        for (intent, _) in answered {
             let payload = json!({ "event": event.name() });
             let record = entry(Kind::Outcome, now, self.cell.cycle(), event.origin(), payload);
-            let written = self.recorder.append(Entry { command_id: Some(id), ..record }).await;
-            self.keep_failure(written);
+            let ticket = self.recorder.outcome(intent, record);
+            self.backlog.push_back(Waiting { ticket, then: Then::Nothing });
         }
+        ticket
     }
 
-    /// Keeps the first failure to record for the cell, whatever was to be recorded; those that follow from it say nothing new.
-    fn keep_failure(&mut self, written: Result<(), RecordFailure>) {
-        if let Err(failure) = written
-            && !std::mem::replace(&mut self.record_failed, true)
-        {
-            self.notify(Notice::RecordFailed { message: message_of(&failure) });
-            self.untold = Some(failure);
-        }
-    }
-
-    async fn note(&mut self, kind: Kind, actor: (String, String), payload: Value) {
-        let written = self.recorder.append(entry(kind, self.now(), self.cell.cycle(), actor, payload)).await;
-        self.keep_failure(written);
+    fn note(&mut self, kind: Kind, actor: (String, String), payload: Value) {
+        let ticket = self.recorder.append(entry(kind, self.now(), self.cell.cycle(), actor, payload));
+        self.backlog.push_back(Waiting { ticket, then: Then::Nothing });
     }
 
     /// Writes a small document of the loop's own into the run folder and brings it on record.
@@ -502,35 +638,37 @@ impl Drive {
         }
     }
 
-    /// Carries a command out, after it is on record.
-    async fn carry_out(&mut self, command: Command) {
+    /// Gives a command to the record, after which it is carried out if that has not been done already.
+    fn line_up(&mut self, command: Command) {
         let mut payload = serde_json::to_value(&command).unwrap_or(Value::Null);
         if let (Command::StartMachine { device, .. }, Some(map)) = (&command, payload.as_object_mut()) {
             map.insert("intent".into(), self.armed[*device as usize].clone().unwrap_or(Value::Null));
         }
         let record = Entry::new(Kind::Intent, record::nanoseconds(self.now()), self.cell.cycle(), payload);
-        if !outcome::is_answered(&command) {
-            let written = self.recorder.append(Entry { kind: Kind::Note, ..record }).await;
-            self.keep_failure(written);
-            return self.execute(command).await;
-        }
-        if makes_safe(&command) {
-            // It has been carried out already.
-            return self.record_intent(record, command).await;
-        }
-        self.record_intent(record, command.clone()).await;
-        if !self.record_failed || !moves(&command) {
-            self.execute(command).await;
-        }
+        let ticket = if outcome::is_answered(&command) {
+            let (intent, ticket) = self.recorder.intend(record);
+            self.open.push((intent, command.clone()));
+            ticket
+        } else {
+            self.recorder.append(Entry { kind: Kind::Note, ..record })
+        };
+        let then = if waits_for_nothing(&command) { Then::Nothing } else { Then::Execute(Box::new(command)) };
+        self.backlog.push_back(Waiting { ticket, then });
     }
 
-    async fn record_intent(&mut self, record: Entry, command: Command) {
-        let written = self.recorder.intend(record).await;
-        if let Ok(id) = &written {
-            self.record_failed = false;
-            self.open.push((*id, command));
+    /// The run is over: what is on record by now is shown and kept, and no machine hears of it any more.
+    async fn finish_backlog(&mut self) {
+        let by = Instant::now() + record::PATIENCE;
+        while !self.backlog.is_empty() {
+            let Ok(recorded) = tokio::time::timeout_at(by, on_record(&mut self.backlog)).await else { return };
+            match self.backlog.front().map(|next| &next.then) {
+                Some(Then::Execute(command)) if matches!(**command, Command::Announce(_)) => {
+                    self.recorded(recorded).await
+                }
+                Some(Then::Answer { .. }) if recorded.is_ok() => self.recorded(recorded).await,
+                _ => drop(self.backlog.pop_front()),
+            }
         }
-        self.keep_failure(written.map(|_| ()));
     }
 
     async fn execute(&mut self, command: Command) {
@@ -570,8 +708,11 @@ impl Drive {
     /// Shows how a cycle was judged and leaves it beside its measurement.
     async fn announce(&mut self, judgement: crate::cell::Judgement) {
         let number = judgement.cycle;
-        // A judgement that is amended stands in the journal; the file of the first one is on record and stays.
-        let amended = self.cycles.get_mut(&number).is_some_and(|cycle| std::mem::replace(&mut cycle.judged, true));
+        let cycle = self.cycles.get_mut(&number);
+        let attempt = cycle.map_or(1, |cycle| {
+            cycle.judgements += 1;
+            cycle.judgements
+        });
         let cycle = self.cycles.get(&number);
         let result = json!({
             "simulation": self.task.simulation,
@@ -581,9 +722,7 @@ impl Drive {
             "figures": cycle.and_then(|c| c.figures.as_ref()),
             "level_mm": cycle.map(|c| c.correction.level_mm),
         });
-        if !amended {
-            self.leave(format!("cycle-{number}/result.json"), number, &result).await;
-        }
+        self.leave(format!("{}/result.json", folder_of(number, attempt)), number, &result).await;
         self.notify(Notice::Judged(judgement));
     }
 
@@ -593,7 +732,7 @@ impl Drive {
             return;
         }
         let run = self.folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-        let last = self.cycles.values().rev().find(|cycle| cycle.judged && cycle.known.is_some()).cloned();
+        let last = self.cycles.values().rev().find(|cycle| cycle.is_judged() && cycle.known.is_some()).cloned();
         let Some(learned) = last.and_then(|cycle| work::learned(&self.task, run, &cycle)) else { return };
         self.leave(LEARNED.into(), self.cell.cycle(), &learned).await;
     }
@@ -631,8 +770,10 @@ impl Drive {
         // A part that is measured before any pass, or measured once more, stands as the last pass left it.
         let last = self.cycles.range(..=number).next_back().map(|(_, c)| Arc::clone(&c.correction));
         let correction = last.unwrap_or_else(|| Arc::new(self.task.first_correction()));
-        let found = self.cycles.values().rev().find_map(|c| c.registration.as_ref().map(|r| r.cmm_from_model));
-        let pose = found.unwrap_or(self.task.fixture_cmm_from_model);
+        // Where the part was found by a measurement that was judged. After one that a gate refused it may have been seated anew.
+        let last = self.cycles.range(..number).next_back().map(|(_, cycle)| cycle);
+        let judged = last.filter(|cycle| cycle.is_judged()).and_then(|cycle| cycle.registration.as_ref());
+        let pose = judged.map_or(self.task.fixture_cmm_from_model, |found| found.cmm_from_model);
         let plan = Arc::new(self.task.plan(correction.level_mm, &pose));
         let cycle = self.cycles.entry(number).or_insert_with(|| Cycle::new((*correction).clone()));
         cycle.plan = Some(Arc::clone(&plan));
@@ -643,7 +784,9 @@ impl Drive {
     fn gate(&mut self, measurement: Box<Measurement>) {
         let number = u32::from(measurement.cycle);
         let plan = self.cycles.get(&number).and_then(|cycle| cycle.plan.clone());
-        self.compute(number, move |task, files| work::gate_cycle(task, files, number, plan.as_deref(), &measurement));
+        self.compute(Computation::Gate, number, move |task, files| {
+            work::gate_cycle(task, files, number, plan.as_deref(), &measurement)
+        });
     }
 
     fn qualify(&mut self, number: u32) {
@@ -657,26 +800,39 @@ impl Drive {
         let Some(cycle) = self.cycles.get(&number).cloned() else { return };
         // What a gate refused, and what was measured once more after the same pass, is no pass before this one.
         let pass = cycle.correction.cycle;
-        let earlier = |c: &&Cycle| c.judged && c.known.is_some() && c.correction.cycle < pass;
+        let earlier = |c: &&Cycle| c.is_judged() && c.known.is_some() && c.correction.cycle < pass;
         let before = self.cycles.range(..number).rev().map(|(_, c)| c).find(earlier).cloned();
-        self.compute(number, move |task, files| work::register_cycle(task, files, number, &cycle, before.as_ref()));
+        self.compute(Computation::Registration, number, move |task, files| {
+            work::register_cycle(task, files, number, &cycle, before.as_ref())
+        });
     }
 
     fn compensate(&mut self, number: u32) {
         let Some(cycle) = self.cycles.get(&number).cloned() else { return };
-        self.compute(number, move |task, files| work::compensate_cycle(task, files, number, &cycle));
+        self.compute(Computation::Compensation, number, move |task, files| {
+            work::compensate_cycle(task, files, number, &cycle)
+        });
     }
 
     /// Computes off the asynchronous threads. The files are brought to the disk and read there too: those of a fine measurement are
     /// large, and neither the loop nor the journal waits for them.
-    fn compute(&mut self, cycle: u32, work: impl FnOnce(&Task, &mut Files) -> (Event, Product) + Send + 'static) {
+    fn compute(
+        &mut self,
+        kind: Computation,
+        cycle: u32,
+        work: impl FnOnce(&Task, &mut Files) -> (Event, Product) + Send + 'static,
+    ) {
         let (task, folder) = (Arc::clone(&self.task), self.folder.clone());
-        self.computations.spawn_blocking(move || {
-            let mut files = Files::new(folder.join(format!("cycle-{cycle}")));
+        let attempt = self.attempts.entry((cycle, kind)).or_insert(0);
+        *attempt += 1;
+        let below = folder_of(cycle, *attempt);
+        let computing = self.computations.spawn_blocking(move || {
+            let mut files = Files::new(folder.join(&below));
             let (event, product) = work(&task, &mut files);
-            let names: Vec<String> = files.made().iter().map(|name| format!("cycle-{cycle}/{name}")).collect();
+            let names: Vec<String> = files.made().iter().map(|name| format!("{below}/{name}")).collect();
             Computed { cycle, event, product, files: record::describe(&folder, &names) }
         });
+        self.computing.insert(computing.id(), (cycle, kind));
     }
 
     /// Lets the cell hear of an event in its turn, like everything else that it hears.
@@ -729,6 +885,7 @@ impl Drive {
             state: state.name(),
             phase: state.phase(),
             message: state.to_string(),
+            number: self.states,
             cycle: self.cell.cycle(),
             seconds: self.now().as_secs_f64(),
             cycles: self.rows(),
@@ -739,14 +896,14 @@ impl Drive {
 fn spawn<D: StationDriver>(
     driver: D,
     job: u32,
-    (interrupt, aborts): (&Interrupt, &watch::Sender<u64>),
+    (interrupt, aborts, pulse): (&Interrupt, &watch::Sender<u64>, &Pulse),
     reports: &mpsc::Sender<StationReport>,
     armed: Option<(u32, Armed)>,
     poll: Duration,
 ) -> (mpsc::Sender<Ask>, tokio::task::JoinHandle<()>) {
     let (asks, asked) = mpsc::channel(16);
     let station = MachineTask::new(driver, job, interrupt.clone(), reports.clone(), armed);
-    (asks, tokio::spawn(station.attend(asked, poll, Aborts::new(aborts.subscribe()))))
+    (asks, tokio::spawn(station.attend(asked, poll, Aborts::new(aborts.subscribe()), pulse.clone())))
 }
 
 fn restored(intent: &Value) -> Option<(u32, Armed)> {
@@ -754,31 +911,40 @@ fn restored(intent: &Value) -> Option<(u32, Armed)> {
     Some((u32::from(intent.cycle), intent.armed()))
 }
 
-/// Commands that may set something in motion.
-fn moves(command: &Command) -> bool {
-    matches!(command, Command::StartMachine { .. } | Command::ResumeMachine { .. })
+/// Commands that wait neither for the disk nor for the record of what came before them: they bring machines to rest, tell people, or
+/// end the run.
+fn waits_for_nothing(command: &Command) -> bool {
+    matches!(
+        command,
+        Command::HoldMachine { .. }
+            | Command::StopMachine { .. }
+            | Command::AbortMachine { .. }
+            | Command::Raise(_)
+            | Command::Withdraw { .. }
+            | Command::Refuse { .. }
+            | Command::Finish(_)
+    )
 }
 
-/// Commands that bring machines to rest.
-fn makes_safe(command: &Command) -> bool {
-    matches!(command, Command::HoldMachine { .. } | Command::StopMachine { .. } | Command::AbortMachine { .. })
+/// What a task said as it panicked.
+fn words_of(error: JoinError) -> String {
+    let Ok(panic) = error.try_into_panic() else { return "it was ended".into() };
+    let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
+    text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "it says no more".into())
+}
+
+/// Waits until the first in line is on record.
+async fn on_record(backlog: &mut VecDeque<Waiting>) -> Result<(), RecordFailure> {
+    match backlog.front_mut() {
+        Some(next) => (&mut next.ticket)
+            .await
+            .unwrap_or_else(|_| Err(RecordFailure::Unwritable("the thread of the journal has ended".into()))),
+        None => std::future::pending().await,
+    }
 }
 
 fn message_of(failure: &RecordFailure) -> String {
     match failure {
         RecordFailure::DiskFull(message) | RecordFailure::Unwritable(message) => message.clone(),
     }
-}
-
-fn pass_record(record: &crate::device::PassRecord) -> Value {
-    json!({
-        "path_mm": record.path_mm,
-        "removed_mm3": record.removed_mm3,
-        "deepest_mm": record.deepest_mm,
-        "idle_share": record.idle_share,
-        "spindle_load": record.spindle_load,
-        "wheel_radius_mm": record.wheel_radius_mm,
-        "temperature_c": record.temperature_c,
-        "duration_s": record.duration_s,
-    })
 }

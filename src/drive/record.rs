@@ -1,6 +1,10 @@
-//! The journal's own thread: the loop asks it and waits for the disk, the asynchronous threads do not.
+//! The journal's own thread. The loop gives it what is to be recorded, in order, and goes on; what may only be done once it is on
+//! record waits for its [`Ticket`]. What cannot be written stays first in the queue and is tried again until it can.
 
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -10,84 +14,173 @@ use tokio::sync::{mpsc, oneshot};
 use crate::cell::RecordFailure;
 use crate::journal::{Artefact, Entry, Journal, JournalError, Kind};
 
-/// What the thread of the journal is asked to do, while there is one that is open.
-type JournalWork = Box<dyn FnOnce(&mut Option<Journal>) + Send>;
+/// Resolves once what was given is on the disk, or is known never to come there.
+pub(super) type Ticket = oneshot::Receiver<Result<(), RecordFailure>>;
+
+/// Between two tries to write what could not be written.
+const BETWEEN_TRIES: Duration = Duration::from_millis(100);
+/// How long the end of a run waits for its record.
+pub(super) const PATIENCE: Duration = Duration::from_secs(5);
+
+/// What is to be recorded.
+enum Job {
+    Append(Box<Entry>),
+    /// With the number by which [`Job::Outcome`] names it.
+    Intend(u64, Box<Entry>),
+    /// What became of an intent.
+    Outcome(u64, Box<Entry>),
+    Adopt(Vec<Artefact>, Duration, u32),
+    Close(Duration, u32, Value),
+}
+
+type Given = (Job, oneshot::Sender<Result<(), RecordFailure>>);
 
 /// The journal as the loop sees it.
 pub(super) struct Recorder {
-    requests: Option<mpsc::UnboundedSender<JournalWork>>,
+    given: Option<mpsc::UnboundedSender<Given>>,
+    /// Hears of the first failure of each row of failures.
+    failures: mpsc::UnboundedReceiver<RecordFailure>,
+    /// Nobody waits any more: what cannot be written now is given up.
+    given_up: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
     folder: PathBuf,
+    intents: u64,
 }
 
 impl Recorder {
     pub(super) fn new(journal: Journal) -> Self {
-        let (requests, asked) = mpsc::unbounded_channel();
+        let (given, jobs) = mpsc::unbounded_channel();
+        let (failed, failures) = mpsc::unbounded_channel();
+        let given_up = Arc::new(AtomicBool::new(false));
         let folder = journal.folder().to_owned();
-        let thread = std::thread::Builder::new().name("journal".into()).spawn(move || keep(journal, asked));
-        Self { requests: Some(requests), thread: Some(thread.expect("a thread can be had")), folder }
+        let scribe = Scribe { journal: Some(journal), ids: HashMap::new(), failed, given_up: given_up.clone() };
+        let thread = std::thread::Builder::new().name("journal".into()).spawn(move || scribe.keep(jobs));
+        let thread = Some(thread.expect("a thread can be had"));
+        Self { given: Some(given), failures, given_up, thread, folder, intents: 0 }
     }
 
     pub(super) fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// Records what happened; on return it is on the disk.
-    pub(super) async fn append(&self, entry: Entry) -> Result<(), RecordFailure> {
-        self.ask(|journal| Some(journal.as_mut()?.append(entry).map(|_| ()))).await
+    /// Waits for a failure to record.
+    pub(super) async fn failure(&mut self) -> RecordFailure {
+        match self.failures.recv().await {
+            Some(failure) => failure,
+            None => std::future::pending().await,
+        }
     }
 
-    /// Records a command before it is carried out and returns its number.
-    pub(super) async fn intend(&self, entry: Entry) -> Result<u32, RecordFailure> {
-        self.ask(|journal| Some(journal.as_mut()?.intend(entry))).await
+    /// Records what happened.
+    pub(super) fn append(&self, entry: Entry) -> Ticket {
+        self.give(Job::Append(Box::new(entry)))
+    }
+
+    /// Records a command before it is carried out. Returns the number by which [`Recorder::outcome`] names it.
+    pub(super) fn intend(&mut self, entry: Entry) -> (u64, Ticket) {
+        self.intents += 1;
+        (self.intents, self.give(Job::Intend(self.intents, Box::new(entry))))
+    }
+
+    /// Records what became of an intent.
+    pub(super) fn outcome(&self, intent: u64, entry: Entry) -> Ticket {
+        self.give(Job::Outcome(intent, Box::new(entry)))
     }
 
     /// Brings files of the run folder on record.
-    pub(super) async fn adopt(&self, files: Vec<Artefact>, now: Duration, cycle: u32) -> Result<(), RecordFailure> {
-        self.ask(move |journal| {
-            let open = journal.as_mut()?;
-            let mut files = files.into_iter();
-            Some(files.try_for_each(|file| open.adopt_known(file, nanoseconds(now), cycle).map(|_| ())))
-        })
-        .await
+    pub(super) fn adopt(&self, files: Vec<Artefact>, now: Duration, cycle: u32) -> Ticket {
+        self.give(Job::Adopt(files, now, cycle))
     }
 
-    /// Writes the last record.
-    pub(super) async fn close(&self, now: Duration, cycle: u32, ending: Value) -> Result<(), RecordFailure> {
-        self.ask(move |journal| Some(journal.take()?.close(nanoseconds(now), cycle, ending).map(|_| ()))).await
+    /// Writes the last record, if that can be done within a bounded time.
+    pub(super) async fn close(&mut self, now: Duration, cycle: u32, ending: Value) -> Result<(), RecordFailure> {
+        let closed = tokio::time::timeout(PATIENCE, self.give(Job::Close(now, cycle, ending))).await;
+        self.given_up.store(true, Ordering::Release);
+        if let Ok(Ok(closed)) = closed {
+            return closed;
+        }
+        // It may hang in the operating system, and is not waited for.
+        self.thread = None;
+        let (folder, limit) = (self.folder.display(), PATIENCE.as_secs());
+        Err(RecordFailure::Unwritable(format!("{folder}: the record could not be brought to its end within {limit} s")))
     }
 
-    /// Has the journal's thread do some work, and returns what came of it; none comes of a journal that is closed.
-    async fn ask<T: Send + 'static>(
-        &self,
-        work: impl FnOnce(&mut Option<Journal>) -> Option<Result<T, JournalError>> + Send + 'static,
-    ) -> Result<T, RecordFailure> {
-        let gone = || RecordFailure::Unwritable("the thread of the journal has ended".into());
-        let (answer, answered) = oneshot::channel();
-        let work = move |journal: &mut Option<Journal>| {
-            // Who asked may have gone; the record stands all the same.
-            let _ = work(journal).map(|done| answer.send(done.map_err(failure)));
-        };
-        let requests = self.requests.as_ref().expect("open until dropped");
-        requests.send(Box::new(work)).map_err(|_| gone())?;
-        answered.await.map_err(|_| gone())?
+    fn give(&self, job: Job) -> Ticket {
+        let (answer, ticket) = oneshot::channel();
+        // A thread that has ended drops the ticket, which is a failure too.
+        let _ = self.given.as_ref().expect("open until dropped").send((job, answer));
+        ticket
     }
 }
 
 impl Drop for Recorder {
     fn drop(&mut self) {
         // The lock on the run folder is free once this returns.
-        drop(self.requests.take());
+        self.given_up.store(true, Ordering::Release);
+        drop(self.given.take());
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
     }
 }
 
-fn keep(journal: Journal, mut asked: mpsc::UnboundedReceiver<JournalWork>) {
-    let mut journal = Some(journal);
-    while let Some(work) = asked.blocking_recv() {
-        work(&mut journal);
+/// Who writes.
+struct Scribe {
+    journal: Option<Journal>,
+    /// The command numbers of the intents that no outcome has named.
+    ids: HashMap<u64, u32>,
+    failed: mpsc::UnboundedSender<RecordFailure>,
+    given_up: Arc<AtomicBool>,
+}
+
+impl Scribe {
+    fn keep(mut self, mut jobs: mpsc::UnboundedReceiver<Given>) {
+        while let Some((job, answer)) = jobs.blocking_recv() {
+            // Who asked may have gone; the record stands all the same.
+            let _ = answer.send(self.until_written(&job).map_err(failure));
+        }
+    }
+
+    /// Writes a job, however often that has to be tried. The loop is told once that it does not go on.
+    fn until_written(&mut self, job: &Job) -> Result<(), JournalError> {
+        let mut told = false;
+        loop {
+            let error = match self.write(job) {
+                Ok(()) => return Ok(()),
+                Err(error) if !error.may_pass() || self.given_up.load(Ordering::Acquire) => return Err(error),
+                Err(error) => error,
+            };
+            if !std::mem::replace(&mut told, true) {
+                let _ = self.failed.send(failure(error));
+            }
+            std::thread::sleep(BETWEEN_TRIES);
+        }
+    }
+
+    fn write(&mut self, job: &Job) -> Result<(), JournalError> {
+        let Some(journal) = self.journal.as_mut() else { return Ok(()) };
+        match job {
+            Job::Append(entry) => journal.append(Entry::clone(entry)).map(drop),
+            Job::Intend(intent, entry) => {
+                let id = journal.intend(Entry::clone(entry))?;
+                self.ids.insert(*intent, id);
+                Ok(())
+            }
+            Job::Outcome(intent, entry) => {
+                let command_id = self.ids.get(intent).copied();
+                journal.append(Entry { kind: Kind::Outcome, command_id, ..Entry::clone(entry) })?;
+                self.ids.remove(intent);
+                Ok(())
+            }
+            Job::Adopt(files, now, cycle) => {
+                files.iter().try_for_each(|file| journal.adopt_known(file.clone(), nanoseconds(*now), *cycle).map(drop))
+            }
+            Job::Close(now, cycle, ending) => {
+                journal.end(nanoseconds(*now), *cycle, ending.clone())?;
+                self.journal = None;
+                Ok(())
+            }
+        }
     }
 }
 

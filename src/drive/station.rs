@@ -6,6 +6,7 @@
 
 use std::future::Future;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use serde::Serialize;
@@ -17,7 +18,7 @@ use crate::cell::{
 };
 use crate::device::{
     Armed, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, Measurement, Outcome,
-    Pass, PassRecord, Plan, Reconciled, State, Status, Word, digest,
+    Pass, PassRecord, Plan, Reconciled, SignalValue, State, Status, Word, digest,
 };
 
 /// What a machine is asked. Answers are the events that [`crate::cell::Command`] names.
@@ -139,6 +140,32 @@ impl Aborts {
     }
 }
 
+/// The sign of life of the loop that decides. While it is not felt no machine is looked at, and so none is told that its client is
+/// alive: it holds by itself.
+#[derive(Clone)]
+pub(super) struct Pulse {
+    began: Instant,
+    last_ms: Arc<AtomicU64>,
+}
+
+impl Pulse {
+    pub(super) fn new() -> Self {
+        Self { began: Instant::now(), last_ms: Arc::default() }
+    }
+
+    pub(super) fn beat(&self) {
+        self.last_ms.store(self.now_ms(), Ordering::Release);
+    }
+
+    fn is_felt(&self) -> bool {
+        self.now_ms().saturating_sub(self.last_ms.load(Ordering::Acquire)) < HUNG_AFTER.as_millis() as u64
+    }
+
+    fn now_ms(&self) -> u64 {
+        self.began.elapsed().as_millis() as u64
+    }
+}
+
 /// A task that attends to one machine.
 pub(super) struct MachineTask<B> {
     driver: B,
@@ -164,8 +191,9 @@ struct Seen {
     progress: Option<(u32, u32)>,
     told_progress: Option<Instant>,
     supplies_missing: bool,
-    /// A signal of the cell file is outside its range.
+    /// A signal of the cell file is outside its range; and since when all are within, while that is not yet believed.
     signal_out: bool,
+    signals_good_since: Option<Instant>,
     aborting: bool,
     stopping: bool,
     clearing: bool,
@@ -177,8 +205,14 @@ struct Seen {
     tries: u32,
 }
 
+/// Between two beats of the loop that decides.
+pub(super) const PULSE_EVERY: Duration = Duration::from_millis(250);
+/// A loop that has not beaten for so long hangs.
+const HUNG_AFTER: Duration = Duration::from_secs(2);
 /// Longest time between two attempts to reach a machine that is lost.
 const LONGEST_PAUSE: Duration = Duration::from_secs(5);
+/// How long signals must be within their ranges before a machine goes on by them: one at its limit does not flap.
+const BELIEVED_AFTER: Duration = Duration::from_secs(1);
 /// Progress is told at most this often, so that the journal stays readable.
 const PROGRESS_EVERY: Duration = Duration::from_millis(250);
 
@@ -197,7 +231,13 @@ impl<B: StationDriver> MachineTask<B> {
     }
 
     /// Attends until nobody can ask any more, then gives the machine back.
-    pub(super) async fn attend(mut self, mut asks: mpsc::Receiver<Ask>, poll: Duration, mut aborts: Aborts) {
+    pub(super) async fn attend(
+        mut self,
+        mut asks: mpsc::Receiver<Ask>,
+        poll: Duration,
+        mut aborts: Aborts,
+        pulse: Pulse,
+    ) {
         let mut ticks = interval(poll);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
@@ -215,7 +255,7 @@ impl<B: StationDriver> MachineTask<B> {
                     },
                     None => break,
                 },
-                _ = ticks.tick(), if self.seen.connected => tokio::select! {
+                _ = ticks.tick(), if self.seen.connected && pulse.is_felt() => tokio::select! {
                     biased;
                     () = aborts.ordered() => {}
                     () = self.look() => {}
@@ -277,6 +317,11 @@ impl<B: StationDriver> MachineTask<B> {
     async fn connect(&mut self) {
         let connected = async {
             let identity = self.driver.machine().connect().await?;
+            let status = self.driver.machine().status().await?;
+            // What is at somebody else's job is not taken from him.
+            if self.is_at_another_job(&status) {
+                return Ok((identity, status));
+            }
             let status = self.driver.machine().claim().await?;
             Ok::<_, DeviceError>((identity, status))
         };
@@ -291,6 +336,11 @@ impl<B: StationDriver> MachineTask<B> {
             }
             Err(error) => self.tell(Event::NotConnected { device: B::DEVICE, why: mismatch(&error) }).await,
         }
+    }
+
+    fn is_at_another_job(&self, status: &Status) -> bool {
+        let at_a_job = status.state.moves() || matches!(status.state, State::Held | State::Complete);
+        at_a_job && status.job.is_none_or(|job| job.job != self.job)
     }
 
     /// Tells what a machine was found doing; a preparation of somebody who is gone is taken back.
@@ -373,8 +423,15 @@ impl<B: StationDriver> MachineTask<B> {
             let why = "it is not prepared".to_owned();
             return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Start, why }).await;
         };
-        self.seen =
-            Seen { connected: true, running: true, supplies_missing: self.seen.supplies_missing, ..Seen::default() };
+        let Seen { supplies_missing, signal_out, signals_good_since, .. } = self.seen;
+        self.seen = Seen {
+            connected: true,
+            running: true,
+            supplies_missing,
+            signal_out,
+            signals_good_since,
+            ..Seen::default()
+        };
         match self.driver.machine().start(armed).await {
             Ok(started) => {
                 self.seen.state = Some(State::Execute);
@@ -451,6 +508,9 @@ impl<B: StationDriver> MachineTask<B> {
             Ok(Reconciled::Running(status)) if status.state == State::Held => Reconciliation::Held,
             Ok(Reconciled::Running(_)) => Reconciliation::Running,
             Ok(Reconciled::Finished(status)) => {
+                if status.state == State::Complete && self.fetch_record().await.is_err() {
+                    return;
+                }
                 self.seen.ended = true;
                 Reconciliation::Ended(job_result(status.outcome))
             }
@@ -539,16 +599,7 @@ impl<B: StationDriver> MachineTask<B> {
         match self.driver.machine().status().await {
             Ok(status) => {
                 self.pass_on_notes().await;
-                if std::mem::replace(&mut self.seen.signal_out, false) {
-                    self.tell(Event::ConditionBack { condition: Condition::Temperature }).await;
-                }
                 self.note(&status).await;
-            }
-            Err(error @ DeviceError::OutOfRange { .. }) => {
-                if !std::mem::replace(&mut self.seen.signal_out, true) {
-                    let (condition, message) = (Condition::Temperature, error.to_string());
-                    self.tell(Event::ConditionLost { condition, message }).await;
-                }
             }
             Err(error) => self.lost(&error).await,
         }
@@ -593,6 +644,7 @@ impl<B: StationDriver> MachineTask<B> {
     async fn note(&mut self, status: &Status) {
         let before = self.seen.state.replace(status.state);
         self.note_supplies(status).await;
+        self.note_signals(status).await;
         match status.state {
             State::Execute => {
                 if before == Some(State::Held) {
@@ -605,7 +657,7 @@ impl<B: StationDriver> MachineTask<B> {
             State::Idle if self.seen.stopping => {
                 self.seen.stopping = false;
                 self.seen.running = false;
-                self.end(JobResult::Stopped, None).await;
+                self.end(JobResult::Stopped).await;
             }
             State::Idle if self.seen.clearing => {
                 self.seen.clearing = false;
@@ -627,14 +679,32 @@ impl<B: StationDriver> MachineTask<B> {
         if std::mem::replace(&mut self.seen.supplies_missing, missing) == missing {
             return;
         }
-        let condition = Condition::Supplies;
+        let (device, condition) = (B::DEVICE, Condition::Supplies);
         let event = if missing {
             let message = format!("{} says that air or coolant is missing", self.driver.machine().name());
-            Event::ConditionLost { condition, message }
+            Event::ConditionLost { device, condition, message }
         } else {
-            Event::ConditionBack { condition }
+            Event::ConditionBack { device, condition }
         };
         self.tell(event).await;
+    }
+
+    /// Tells when a signal leaves its range, and when all have been within theirs for a while.
+    async fn note_signals(&mut self, status: &Status) {
+        let flaws: Vec<String> = status.signals.iter().filter_map(SignalValue::flaw).collect();
+        let (device, condition) = (B::DEVICE, Condition::Signals);
+        if !flaws.is_empty() {
+            self.seen.signals_good_since = None;
+            if !std::mem::replace(&mut self.seen.signal_out, true) {
+                self.tell(Event::ConditionLost { device, condition, message: flaws.join("; ") }).await;
+            }
+        } else if self.seen.signal_out {
+            let since = *self.seen.signals_good_since.get_or_insert_with(Instant::now);
+            if since.elapsed() >= BELIEVED_AFTER {
+                self.seen.signal_out = false;
+                self.tell(Event::ConditionBack { device, condition }).await;
+            }
+        }
     }
 
     async fn note_progress(&mut self, status: &Status) {
@@ -655,25 +725,33 @@ impl<B: StationDriver> MachineTask<B> {
         if !self.seen.running && !self.seen.stopping {
             return;
         }
-        let record = match (B::DEVICE, self.armed.as_ref().map(|armed| armed.job)) {
-            (Device::Grinder, Some(job)) if !self.seen.ended => match self.driver.fetch(job, &self.interrupt).await {
-                Ok(record) => Some(record),
-                // The next look tries again; a link that is lost is told.
-                Err(error) if error.is_link() => return self.lost(&error).await,
-                Err(_) => None,
-            },
-            _ => None,
-        };
+        if !self.seen.ended && self.fetch_record().await.is_err() {
+            return; // The next look tries again.
+        }
         self.seen.stopping = false;
         self.seen.running = false;
-        self.end(job_result(status.outcome), record).await;
+        self.end(job_result(status.outcome)).await;
     }
 
-    async fn end(&mut self, result: JobResult, record: Option<Fetched>) {
-        self.seen.ended = true;
-        if let Some(record) = record {
-            self.hand_over(record).await;
+    /// Reads the record of a pass that is over and hands it over; one that cannot be read as that of this job is doubted.
+    ///
+    /// # Errors
+    /// A link that is lost, which is told.
+    async fn fetch_record(&mut self) -> Result<(), ()> {
+        let (Device::Grinder, Some(armed)) = (B::DEVICE, &self.armed) else { return Ok(()) };
+        match self.driver.fetch(armed.job, &self.interrupt).await {
+            Ok(record) => self.hand_over(record).await,
+            Err(error) if error.is_link() => {
+                self.lost(&error).await;
+                return Err(());
+            }
+            Err(error) => self.tell(Event::RecordDoubted { cycle: self.cycle, why: error.to_string() }).await,
         }
+        Ok(())
+    }
+
+    async fn end(&mut self, result: JobResult) {
+        self.seen.ended = true;
         self.tell(Event::Ended { device: B::DEVICE, cycle: self.cycle, result }).await;
     }
 
@@ -685,7 +763,7 @@ impl<B: StationDriver> MachineTask<B> {
             || std::mem::replace(&mut self.seen.stopping, false)
         {
             self.seen.running = false;
-            self.end(JobResult::Aborted, None).await;
+            self.end(JobResult::Aborted).await;
         }
     }
 }
@@ -757,4 +835,19 @@ impl Intent {
 fn intent(armed: &Armed) -> serde_json::Value {
     let Armed { job: Job { job, cycle, digest }, start_sequence, token, boot_id } = *armed;
     serde_json::to_value(Intent { job, cycle, digest, start_sequence, token, boot_id }).expect("numbers are JSON")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test(start_paused = true)]
+    async fn a_loop_that_hangs_is_not_felt() {
+        let pulse = Pulse::new();
+        assert!(pulse.is_felt());
+        tokio::time::advance(HUNG_AFTER).await;
+        assert!(!pulse.is_felt());
+        pulse.beat();
+        assert!(pulse.clone().is_felt());
+    }
 }

@@ -99,8 +99,8 @@ pub(super) struct Cycle {
     /// What is known of the grinder with this cycle taken in.
     pub(super) known: Option<Arc<LearningState>>,
     pub(super) figures: Option<Figures>,
-    /// Whether it was judged: a measurement that a gate refused tells nothing of the grinder.
-    pub(super) judged: bool,
+    /// How often it was judged; a measurement that a gate refused never was, and tells nothing of the grinder.
+    pub(super) judgements: u32,
 }
 
 impl Cycle {
@@ -114,8 +114,12 @@ impl Cycle {
             error: None,
             known: None,
             figures: None,
-            judged: false,
+            judgements: 0,
         }
+    }
+
+    pub(super) fn is_judged(&self) -> bool {
+        self.judgements > 0
     }
 
     /// Takes what a computation found.

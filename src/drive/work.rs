@@ -86,6 +86,9 @@ fn gate(
     Ok(Points { part, sphere, radius_mm, radius_sigma_mm, coordinates })
 }
 
+/// Share of its stated radius by which a qualified probe may differ: more is another stylus.
+const PROBE_SHARE: f64 = 0.01;
+
 /// A result that belongs to another plan, or whose numbers cannot be.
 fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFailure> {
     if measurement.plan_identity != plan.identity() {
@@ -98,6 +101,13 @@ fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFa
             return Some(GateFailure::Broken(message.into()));
         }
         _ => {}
+    }
+    let stated_mm = task.probing.probe_radius_mm;
+    let told = measurement.probe_radius_mm.filter(|told| *told > 0.0);
+    if let Some(told_mm) = told.filter(|told| (told - stated_mm).abs() > PROBE_SHARE * stated_mm) {
+        let message =
+            format!("it was touched with a probe of {told_mm:.4} mm radius, and the recipe says {stated_mm:.4} mm");
+        return Some(GateFailure::Broken(message));
     }
     if !plan.targets.is_empty() && measurement.points.len() != plan.targets.len() {
         let (found, planned) = (measurement.points.len(), plan.targets.len());

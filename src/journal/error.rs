@@ -29,6 +29,11 @@ pub enum JournalError {
     /// Somebody else drives the run.
     #[error("{path}: another process drives this run; wait for it, or order it to hold or stop")]
     Busy { path: PathBuf },
+    /// Another run has the machine.
+    #[error(
+        "{address}: another run has this machine: {holder}; wait for it, or stop it with `regrind stop` and its folder"
+    )]
+    MachineTaken { address: String, holder: String },
     /// The run is over.
     #[error("{path}: the journal is closed, its run is over; begin another run")]
     Closed { path: PathBuf },
@@ -71,6 +76,11 @@ impl JournalError {
     /// Returns whether the disk is full.
     pub fn is_disk_full(&self) -> bool {
         matches!(self, Self::DiskFull { .. })
+    }
+
+    /// Returns whether the same may be written later: the disk is full, busy or out of reach, and nothing is wrong with what is written.
+    pub fn may_pass(&self) -> bool {
+        matches!(self, Self::DiskFull { .. } | Self::File { .. } | Self::Database { .. })
     }
 
     /// Names what an operation of the system failed for.

@@ -15,6 +15,7 @@
 mod artefact;
 mod canonical;
 mod error;
+mod machine;
 mod open;
 mod record;
 mod verify;
@@ -23,6 +24,7 @@ mod write;
 pub use artefact::Artefact;
 pub use canonical::{canonical_json, sha256_hex};
 pub use error::JournalError;
+pub use machine::MachineLock;
 pub use record::{Entry, Kind, Record, Records};
 pub use verify::{Anchor, Verified, verify, verify_against};
 pub use write::{Header, Journal};

@@ -3,6 +3,7 @@
 use std::fs::{self, File};
 use std::io::Read;
 use std::path::Path;
+use std::time::Duration;
 
 use rusqlite::{Connection, OpenFlags};
 
@@ -11,6 +12,8 @@ use super::error::JournalError;
 
 /// `RGrd`: says in the header of the file whose database this is.
 const APPLICATION_ID: u32 = 0x5247_7264;
+/// How long a write waits for another process to let go of the file; who records tries again.
+const BUSY_FOR: Duration = Duration::from_millis(200);
 /// The layout of the tables.
 const LAYOUT: u32 = 1;
 
@@ -128,6 +131,7 @@ fn recognise(folder: &Path, path: &Path) -> Result<(), JournalError> {
 
 /// Sets what the promises rest on, and reads it back.
 fn configure(connection: &Connection, path: &Path) -> Result<(), JournalError> {
+    connection.busy_timeout(BUSY_FOR).map_err(JournalError::database(path))?;
     set(connection, path, "journal_mode", "wal")?;
     // FULL is 2: with less the last records could be lost when the power fails.
     set(connection, path, "synchronous", "2")?;

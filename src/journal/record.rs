@@ -8,7 +8,7 @@ use rusqlite::{Connection, Row, params};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::canonical::{chain, write_string};
+use super::canonical::{canonical_json, chain, write_string};
 use super::error::JournalError;
 
 /// What a record tells.
@@ -124,6 +124,13 @@ pub struct Record {
 }
 
 impl Record {
+    /// Returns whether this is what an entry became.
+    pub(super) fn is_of(&self, entry: &Entry) -> bool {
+        (self.kind, self.cycle, &self.actor, &self.station) == (entry.kind, entry.cycle, &entry.actor, &entry.station)
+            && self.mono_ns == entry.mono_ns.min(i64::MAX as u64)
+            && self.payload == canonical_json(&entry.payload)
+    }
+
     /// Returns the content as a value; null if it is not JSON.
     pub fn value(&self) -> Value {
         serde_json::from_str(&self.payload).unwrap_or(Value::Null)

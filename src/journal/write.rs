@@ -44,8 +44,8 @@ pub struct Journal {
     part: String,
     first_command_id: u32,
     tail: Tail,
-    /// A write failed, so that only the database knows where it ends.
-    doubtful: bool,
+    /// A record whose write failed: only the database knows whether it stands.
+    doubtful: Option<Record>,
     artefacts: BTreeMap<String, String>,
 }
 
@@ -88,7 +88,7 @@ impl Journal {
             part,
             first_command_id,
             tail: Tail::of_nothing(),
-            doubtful: false,
+            doubtful: None,
             artefacts: BTreeMap::new(),
         };
         let payload = json!({
@@ -114,7 +114,7 @@ impl Journal {
         let (part, first_command_id) = first_of(&connection, &folder)?;
         let artefacts = artefacts_of(&connection, &folder)?;
         let tail = read_tail(&connection, &folder)?;
-        let doubtful = false;
+        let doubtful = None;
         let boot_id = boot_id();
         let mut journal =
             Self { connection, folder, _lock: lock, boot_id, part, first_command_id, tail, doubtful, artefacts };
@@ -143,7 +143,8 @@ impl Journal {
         Records::new(&self.connection, &self.folder, from)
     }
 
-    /// Records something and returns its number. On return it is on the disk.
+    /// Records something and returns its number. On return it is on the disk. After an error the same entry may be given again: it
+    /// is written once, whatever became of the first try.
     ///
     /// # Errors
     /// A full or unwritable disk: then nothing may be done that needed this record. A closed journal.
@@ -162,12 +163,16 @@ impl Journal {
     /// # Errors
     /// As [`Journal::append`]: then the command must not be carried out.
     pub fn intend(&mut self, entry: Entry) -> Result<u32, JournalError> {
-        self.ask_where_it_ends()?;
+        let entry = Entry { kind: Kind::Intent, ..entry };
+        let stands = self.ask_where_it_ends()?.filter(|record| record.is_of(&entry));
+        if let Some(id) = stands.and_then(|record| record.command_id) {
+            return Ok(id);
+        }
         let id = match self.tail.last_command_id {
             None => self.first_command_id,
             Some(last) => last.checked_add(1).ok_or(JournalError::CommandNumbers { limit: u32::MAX })?,
         };
-        self.insert(Entry { kind: Kind::Intent, command_id: Some(id), ..entry })?;
+        self.insert(Entry { command_id: Some(id), ..entry })?;
         Ok(id)
     }
 
@@ -232,9 +237,19 @@ impl Journal {
     /// # Errors
     /// As [`Journal::append`].
     pub fn close(mut self, mono_ns: u64, cycle: u32, ending: Value) -> Result<Anchor, JournalError> {
+        self.end(mono_ns, cycle, ending)
+    }
+
+    /// As [`Journal::close`], for who may have to try again.
+    ///
+    /// # Errors
+    /// As [`Journal::append`].
+    pub fn end(&mut self, mono_ns: u64, cycle: u32, ending: Value) -> Result<Anchor, JournalError> {
         self.ask_where_it_ends()?;
-        let payload = json!({ "ending": ending, "records_before": self.tail.seq, "head_before": self.tail.hash });
-        self.append(Entry::new(Kind::End, mono_ns, cycle, payload))?;
+        if !self.tail.closed {
+            let payload = json!({ "ending": ending, "records_before": self.tail.seq, "head_before": self.tail.hash });
+            self.append(Entry::new(Kind::End, mono_ns, cycle, payload))?;
+        }
         self.anchor()
     }
 
@@ -248,12 +263,17 @@ impl Journal {
     }
 
     fn insert(&mut self, entry: Entry) -> Result<Record, JournalError> {
-        self.ask_where_it_ends()?;
+        if let Some(stands) = self.ask_where_it_ends()?.filter(|record| record.is_of(&entry)) {
+            return Ok(stands);
+        }
         if self.tail.closed {
             return Err(JournalError::Closed { path: self.folder.clone() });
         }
         let record = self.record_of(entry);
-        self.write(&record).inspect_err(|_| self.doubtful = true)?;
+        if let Err(error) = self.write(&record) {
+            self.doubtful = Some(record);
+            return Err(error);
+        }
         self.tail.seq = record.seq;
         self.tail.hash.clone_from(&record.hash);
         self.tail.closed = record.kind == Kind::End;
@@ -312,13 +332,12 @@ impl Journal {
         statement.execute(values).map(|_| ()).map_err(failed)
     }
 
-    /// After a failed write the record may stand or not; the database is asked.
-    fn ask_where_it_ends(&mut self) -> Result<(), JournalError> {
-        if self.doubtful {
-            self.tail = read_tail(&self.connection, &self.folder)?;
-            self.doubtful = false;
-        }
-        Ok(())
+    /// After a failed write the record may stand or not; the database is asked. Returns it if it does.
+    fn ask_where_it_ends(&mut self) -> Result<Option<Record>, JournalError> {
+        let Some(record) = &self.doubtful else { return Ok(None) };
+        self.tail = read_tail(&self.connection, &self.folder)?;
+        let stands = self.tail.hash == record.hash;
+        Ok(self.doubtful.take().filter(|_| stands))
     }
 
     /// A journal that ends before its anchor was cut, and is not gone on with.

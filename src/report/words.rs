@@ -117,8 +117,8 @@ fn event_words(event: &Event) -> String {
         Event::LinkLost { why, .. } | Event::StartUnknown { why, .. } | Event::RegistrationFailed { why, .. } => {
             why.clone()
         }
-        Event::ConditionLost { condition, message } => format!("{condition}: {message}"),
-        Event::ConditionBack { condition } => condition.to_string(),
+        Event::ConditionLost { condition, message, .. } => format!("{condition}: {message}"),
+        Event::ConditionBack { condition, .. } => condition.to_string(),
         Event::Progressed { done, total, .. } => format!("{done} of {total}"),
         Event::Ended { result, .. } => result.to_string(),
         Event::Obstructed { message, .. } => message.clone(),

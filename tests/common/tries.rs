@@ -104,7 +104,7 @@ async fn hold_and_resume(rig: &Rig, folder: &std::path::Path, tried: &mut Tried)
     tried.hold = [CMM, GRINDER].iter().find_map(|m| rig.command_at(*m, 4, began)).map(|at| at - began);
     tried.state = words(folder).await;
     let began = Instant::now();
-    let (reply, began_order, took) = order(folder, Request::Resume { reason: "a try".into() }).await;
+    let (reply, began_order, took) = order(folder, Request::Resume { reason: "a try".into(), seen: None }).await;
     assert!(reply.accepted, "{reply:?}, {began:?}");
     tried.resume_answered = Some(took);
     if reply.message.starts_with("Unholding") {

@@ -289,12 +289,23 @@ async fn further_signals_are_read_scaled_and_held_against_their_range() {
         range: [15.0, 25.0],
     };
     let narrow = Signal { range: [15.0, 19.0], ..temperature.clone() };
-    let mut cmm = connected(ModbusSettings { signals: vec![temperature], ..settings(&serving) }).await;
+    let mut cmm = connected(ModbusSettings { signals: vec![temperature.clone()], ..settings(&serving) }).await;
     let status = cmm.status().await.unwrap();
-    assert_eq!((status.signals[0].value, status.temperature_c), (20.25, Some(20.25)));
+    assert_eq!((status.signals[0].value, status.temperature_c), (Some(20.25), Some(20.25)));
+    assert_eq!(status.signals[0].flaw(), None);
     let mut cmm = connected(ModbusSettings { signals: vec![narrow], ..settings(&serving) }).await;
-    let refused = cmm.status().await.unwrap_err();
-    assert!(matches!(refused, DeviceError::OutOfRange { most: 19.0, .. }), "{refused}");
+    // A bad signal hides nothing of what else the machine says.
+    let status = cmm.status().await.unwrap();
+    let flaw = status.signals[0].flaw().unwrap();
+    assert_eq!(flaw, "part_temperature is 20.25 C, and 15 to 19 C are wanted");
+    assert_eq!((status.state, status.temperature_c), (State::Idle, Some(20.25)));
+    // A register that is not there, and one that holds no number.
+    for (address, kind, scale) in [(60_000, SignalType::I16, 0.01), (97, SignalType::I16, f64::NAN)] {
+        let absent = Signal { address, kind, scale, ..temperature.clone() };
+        let mut cmm = connected(ModbusSettings { signals: vec![absent], ..settings(&serving) }).await;
+        let status = cmm.status().await.unwrap();
+        assert_eq!(status.signals[0].flaw().as_deref(), Some("part_temperature: the machine gives no number"));
+    }
 }
 
 // ---- not the machine that is meant --------------------------------------------------------------------------------------------------

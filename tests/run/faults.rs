@@ -5,7 +5,7 @@
 
 use crate::worlds::{JOB, Ran, Setup, run};
 use regrind::cell::{AlarmId, Ending};
-use regrind_sim::spec::{Faults, Mirrored};
+use regrind_sim::spec::{Faults, Mirrored, Misreported};
 
 const RECIPE: &str = "freeform-mirror";
 
@@ -83,6 +83,23 @@ fn what_is_done_to_a_map_is_told_at_the_first_pass_with_one() {
             ("ignored", Faults { map_ignored: true, ..none() }, AlarmId::NoEffect, &["did not answer to the map"]),
         ],
         2,
+    );
+}
+
+#[test]
+fn what_a_grinder_says_of_its_pass_is_held_against_what_it_was_told() {
+    let says = |misreported| Faults { misreported, ..Faults::default() };
+    let alarm = AlarmId::PassRecord;
+    each_is_caught(
+        [
+            ("another job", says(Misreported::Job), alarm, &["the job in the pass record"]),
+            ("failed", says(Misreported::Result), alarm, &["the result in the pass record"]),
+            ("too deep", says(Misreported::Depth), alarm, &["largest depth taken off is 3.000 mm", "at most 0.500 mm"]),
+            ("no path", says(Misreported::Path), alarm, &["the path travelled is -1.000 mm", "are needed"]),
+            ("another wheel", says(Misreported::Wheel), alarm, &["the radius of the wheel is", "are possible"]),
+            ("no time", says(Misreported::Duration), alarm, &["its duration is 0.000 s", "are needed"]),
+        ],
+        1,
     );
 }
 

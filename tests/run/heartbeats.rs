@@ -135,7 +135,7 @@ async fn beats_and_orders_stay_on_time_while_451_401_points_are_computed() {
         assert!(came >= 2, "{came} beats came to machine {machine} while the points were registered");
     }
     until(&folder, |words| words.starts_with("Held")).await;
-    order(&folder, Request::Resume { reason: String::new() }).await;
+    order(&folder, Request::Resume { reason: String::new(), seen: None }).await;
     // Judged at once; now the map is made of 451,401 deviations.
     let (reply, asked, _) = order(&folder, Request::Abort { reason: "while it computes".into() }).await;
     assert!(reply.accepted, "{reply:?}");

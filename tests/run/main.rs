@@ -14,6 +14,7 @@ mod manual;
 mod mirror_cell;
 mod mirror_run;
 mod orders;
+mod outside;
 #[path = "../common/program.rs"]
 mod program;
 #[path = "../common/rig.rs"]

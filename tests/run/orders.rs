@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
-use crate::rig::{CMM, GRINDER, Ready, Rig};
+use crate::rig::{CMM, GRINDER, Ready, Rig, event, order};
 use crate::tries::{MOMENTS, attempt, attempt_with};
 use regrind::cell::Ending;
 use regrind::drive::{Drive, Orders, Request};
@@ -154,6 +154,44 @@ async fn abort_at_every_phase() {
     at_every_phase(false).await;
 }
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_abort_is_given_while_another_process_has_the_journal_and_answered_when_it_is_on_record() {
+    let mut rig = Rig::new(crate::rig::small(12, 8, 100.0)).await;
+    let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
+    let (drive, _orders) = Drive::new(run, cmm, grinder).unwrap();
+    let running = tokio::spawn(drive.run());
+    event(&mut notices, "started", 1).await;
+
+    let other = rusqlite::Connection::open(folder.join("journal.sqlite")).unwrap();
+    other.busy_timeout(crate::rig::PATIENCE).unwrap();
+    other.execute_batch("BEGIN IMMEDIATE").unwrap();
+    let since = std::time::Instant::now();
+    let ordered = tokio::spawn({
+        let folder = folder.clone();
+        async move { order(&folder, Request::Abort { reason: "smoke".into() }).await.0 }
+    });
+    let aborted = async {
+        while [CMM, GRINDER].iter().any(|machine| rig.command_at(*machine, 7, since).is_none()) {
+            tokio::task::yield_now().await;
+        }
+    };
+    tokio::time::timeout(crate::rig::PATIENCE, aborted).await.expect("both machines hear of the abort");
+    let on_record = |folder: &Path| records(folder, Kind::Event).iter().any(|event| event["event"] == "abort");
+    assert!(
+        !on_record(&folder) && !ordered.is_finished(),
+        "the journal cannot have it yet, and nobody is told that it has"
+    );
+
+    other.execute_batch("ROLLBACK").unwrap();
+    drop(other);
+    let reply = ordered.await.unwrap();
+    assert!(reply.accepted, "{reply:?}");
+    assert!(on_record(&folder), "what was answered is on record");
+    let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
+    assert!(matches!(ending, Ending::Aborted { confirmed: true, .. }), "{ending:?}");
+    assert!(verify(&folder).unwrap().closed);
+}
+
 /// Every file of a folder and of those in it, by its path from the first.
 fn files_below(folder: &Path, name: &str, files: &mut BTreeSet<String>) {
     for entry in std::fs::read_dir(folder.join(name)).unwrap().map(Result::unwrap) {
@@ -193,6 +231,20 @@ async fn run_to_its_end(ready: Ready) -> (Ending, PathBuf) {
         }
     }
     (tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap(), folder)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_judgement_that_is_amended_leaves_the_file_of_the_first() {
+    let mut rig = Rig::new(crate::rig::small(12, 8, 5000.0)).await;
+    let mut ready = rig.next(true);
+    // Another pass is wanted, and then it turns out that the material for it is not there.
+    ready.run.task.limits.removal_budget_mm = 1e-6;
+    let (ending, folder) = run_to_its_end(ready).await;
+    assert!(matches!(ending, Ending::NotAccepted { .. }), "{ending:?}");
+    let announced = records(&folder, Kind::Note).into_iter().filter(|note| note["command"] == "announce");
+    let verdicts: Vec<_> = announced.map(|note| note["verdict"].clone()).collect();
+    assert_eq!(verdicts, ["continue", "budget_spent"]);
+    all_on_record(&folder, &["result.json", "cycle-1/result.json", "cycle-1/attempt-2/result.json"]);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

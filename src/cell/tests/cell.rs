@@ -456,7 +456,7 @@ fn an_abort_that_nobody_confirms_names_the_emergency_circuit_and_ends() {
 fn a_lost_link_suspends_and_the_machine_is_asked_what_became_of_its_job() {
     let cases = [
         (Reconciliation::Running, State::Execute(Phase::Grind(JobStep::Run))),
-        (Reconciliation::Held, State::Unsuspending(Phase::Grind(JobStep::Run))),
+        (Reconciliation::Held, State::Held(Phase::Grind(JobStep::Run))),
         (Reconciliation::Ended(JobResult::Complete), State::Execute(Phase::Grind(JobStep::Acknowledge))),
         (Reconciliation::NotStarted, State::Execute(Phase::Grind(JobStep::Send))),
         (Reconciliation::Unknown("no memory".into()), State::Held(Phase::Grind(JobStep::Reconcile))),
@@ -495,10 +495,15 @@ fn a_machine_that_was_restarted_is_looked_at_by_a_person() {
 fn a_missing_condition_holds_the_machine_and_goes_on_by_itself() {
     let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
     run.start().until(State::Execute(Phase::Measure(JobStep::Run)));
-    let condition = Condition::Temperature;
-    run.send(Event::ConditionLost { condition, message: "22.3 of at most 21 degrees".into() });
+    let condition = Condition::Signals;
+    // What is missing at one machine is not back because the other one has it.
+    for device in Device::BOTH {
+        run.send(Event::ConditionLost { device, condition, message: "22.3 of at most 21 degrees".into() });
+    }
     run.until(State::Suspended(Phase::Measure(JobStep::Run)));
-    run.send(Event::ConditionBack { condition });
+    run.send(Event::ConditionBack { device: Device::Cmm, condition });
+    assert_eq!(run.cell.state(), State::Suspended(Phase::Measure(JobStep::Run)));
+    run.send(Event::ConditionBack { device: Device::Grinder, condition });
     run.go_on();
     assert_eq!(run.cell.state(), State::Complete);
 }
@@ -674,6 +679,126 @@ fn a_machine_that_cannot_tell_is_clear_by_a_persons_word_and_only_until_its_next
     assert!(matches!(run.ending(), Some(Ending::Accepted { .. })), "{:?}", run.ending());
 }
 
+/// A pass that was told to hold, and the link lost before the machine said that it stands.
+fn lost_while_holding<'f>() -> Run<'f> {
+    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    let commands = run.send(hold());
+    assert!(commands.contains(&Command::HoldMachine { device: Device::Grinder }), "{commands:?}");
+    run.waiting.clear();
+    run.send(Event::LinkLost { device: Device::Grinder, why: "silent".into() });
+    run
+}
+
+#[test]
+fn a_machine_that_was_told_to_hold_is_not_called_held_before_it_says_so() {
+    let device = Device::Grinder;
+    let mut run = lost_while_holding();
+    let due = run.cell.next_deadline().unwrap();
+    assert_eq!(run.cell.state(), State::Holding(Phase::Grind(JobStep::Reconcile)), "nobody has seen it stand");
+    // The link flaps, and the machine grinds on: it is told again, and the time to stand is not given anew.
+    for _ in 0..3 {
+        assert_eq!(
+            run.send(Event::LinkBack { device, boot_id: 7 }).last(),
+            Some(&Command::Reconcile { device, cycle: 1 })
+        );
+        let commands = run.send(Event::Reconciled { device, cycle: 1, outcome: Reconciliation::Running });
+        assert_eq!(commands, [Command::HoldMachine { device }]);
+        assert_eq!(run.cell.state(), State::Holding(Phase::Grind(JobStep::Run)));
+        assert_eq!(run.cell.next_deadline(), Some(due));
+        run.send(Event::LinkLost { device, why: "silent".into() });
+        assert_eq!(run.cell.next_deadline(), Some(due));
+    }
+    run.send(Event::LinkBack { device, boot_id: 7 });
+    run.send(Event::Reconciled { device, cycle: 1, outcome: Reconciliation::Held });
+    assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Run)));
+}
+
+#[test]
+fn a_machine_that_stays_out_of_sight_while_it_should_hold_ends_in_the_safe_sequence() {
+    let mut run = lost_while_holding();
+    run.now = run.cell.next_deadline().unwrap();
+    let commands = run.send(Event::Deadline);
+    assert!(commands.contains(&Command::AbortMachine { device: Device::Grinder }), "{commands:?}");
+    assert!(run.alarms().contains(&AlarmId::HoldNotConfirmed));
+}
+
+#[test]
+fn a_machine_that_is_found_moving_when_its_link_is_back_is_held() {
+    // Suspended by the lost link, then held by a person: the machine may still grind.
+    let device = Device::Grinder;
+    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    run.send(Event::LinkLost { device, why: "silent".into() });
+    run.send(hold());
+    assert_eq!(run.cell.state(), State::Holding(Phase::Grind(JobStep::Reconcile)));
+    run.now = run.cell.next_deadline().unwrap();
+    run.send(Event::Deadline);
+    assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Reconcile)));
+    let message = run.cell.state().to_string();
+    assert!(message.ends_with("the grinder has not confirmed that it stands"), "{message}");
+    run.send(Event::LinkBack { device, boot_id: 7 });
+    let commands = run.send(Event::Reconciled { device, cycle: 1, outcome: Reconciliation::Running });
+    assert_eq!(commands, [Command::HoldMachine { device }]);
+    run.send(Event::MachineHeld { device });
+    assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Run)));
+    assert_eq!(run.cell.state().unconfirmed(), None);
+}
+
+#[test]
+fn a_machine_that_moves_while_the_cell_is_held_is_told_to_hold_and_a_person_is_told() {
+    let device = Device::Grinder;
+    let moves = Event::Progressed { device, done: 17, total: 1000 };
+    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    run.send(hold());
+    run.until(State::Held(Phase::Grind(JobStep::Run)));
+    let commands = run.send(moves.clone());
+    assert_eq!(commands.last(), Some(&Command::HoldMachine { device }));
+    assert_eq!(run.cell.state(), State::Holding(Phase::Grind(JobStep::Run)), "what moves is not held");
+    assert!(run.alarms().contains(&AlarmId::MovesUnasked));
+    // It says no: only the safe sequence is left.
+    let commands = run.send(Event::Refused { device, what: Asked::Hold, why: "local".into() });
+    assert!(commands.contains(&Command::AbortMachine { device }), "{commands:?}");
+    // The machine that has no job of this phase.
+    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    run.start().until(State::Execute(Phase::Measure(JobStep::Send)));
+    run.send(hold());
+    run.until(State::Held(Phase::Measure(JobStep::Send)));
+    run.waiting.clear();
+    assert_eq!(run.send(moves.clone()).last(), Some(&Command::HoldMachine { device }));
+    assert_eq!(run.send(moves), [], "told once");
+}
+
+#[test]
+fn a_command_that_has_waited_is_given_only_where_it_is_still_wanted() {
+    let device = Device::Grinder;
+    let start = Command::StartMachine { device, cycle: 1 };
+    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    run.start().until(State::Execute(Phase::Grind(JobStep::Start)));
+    assert!(run.cell.wants(&start) && !run.cell.wants(&Command::StartMachine { device, cycle: 2 }));
+    run.send(hold());
+    assert!(!run.cell.wants(&start), "held before it was given");
+    run.waiting.clear();
+    run.send(Event::Refused { device, what: Asked::Start, why: "not given".into() });
+    assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Send)));
+    run.send(resume());
+    run.until(State::Execute(Phase::Grind(JobStep::Run)));
+    run.send(hold());
+    run.until(State::Held(Phase::Grind(JobStep::Run)));
+    let go_on = Command::ResumeMachine { device };
+    assert!(!run.cell.wants(&go_on));
+    run.send(resume());
+    assert!(run.cell.wants(&go_on));
+    run.send(hold());
+    assert!(!run.cell.wants(&go_on));
+    run.send(abort());
+    for command in [start, go_on, Command::Prepare { device, cycle: 1 }, Command::LoadPass { cycle: 1 }] {
+        assert!(!run.cell.wants(&command), "{command:?} after an abort");
+    }
+    assert!(run.cell.wants(&Command::VerifyClear { device }));
+}
+
 /// Plays events chosen by chance, half of them the right answers, and returns the commands with what came before.
 fn play(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> {
     let mut run = Run::new(plan(), |cycle| figures(30.0 / f64::from(cycle), 6.0 / f64::from(cycle)));
@@ -683,6 +808,8 @@ fn play(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> {
     // What was seen of each machine, whether it said that it cannot tell, and what a person said of it since its last start.
     let (mut clear, mut unknown, mut said) = ([false; 2], [false; 2], [false; 2]);
     let mut aborted = false;
+    // Whether each machine was last seen at a stand.
+    let mut stands = [true; 2];
     for (choice, good, wait) in choices {
         let before = run.cell.state();
         run.now += Duration::from_secs(u64::from(*wait));
@@ -705,8 +832,28 @@ fn play(choices: &[(u16, bool, u8)]) -> Result<(), TestCaseError> {
             _ => {}
         }
         let restarted = matches!(event, Event::Restarted { .. });
+        let told = event.clone();
         let commands = run.send(event);
         prop_assert!(!before.is_end() || commands.is_empty());
+        if !commands.iter().any(|command| matches!(command, Command::Refuse { .. })) {
+            match told {
+                Event::Started { device, .. }
+                | Event::Progressed { device, .. }
+                | Event::MachineResumed { device }
+                | Event::Reconciled { device, outcome: Reconciliation::Running, .. } => stands[device as usize] = false,
+                Event::MachineHeld { device }
+                | Event::Ended { device, .. }
+                | Event::DeclaredOver { device, .. }
+                | Event::Refused { device, what: Asked::Start, .. }
+                | Event::Reconciled { device, .. } => stands[device as usize] = true,
+                _ => {}
+            }
+        }
+        // Held means still, or says which machine has not confirmed it.
+        if let State::Held(phase) = run.cell.state() {
+            let at = phase.job().map(|(device, _)| device).filter(|device| !stands[*device as usize]);
+            prop_assert_eq!(run.cell.state().unconfirmed().or(at), run.cell.state().unconfirmed(), "{}", phase);
+        }
         for command in &commands {
             if let Command::StartMachine { device, .. } = command {
                 let other = device.other() as usize;

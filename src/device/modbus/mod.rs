@@ -62,6 +62,10 @@ pub struct ModbusMachine {
     expected_name: Option<String>,
     simulation: Option<bool>,
     sequence: u32,
+    /// Whether the machine has acknowledged this client as its owner on this connection: only an owner's beat says that all is well.
+    owned: bool,
+    /// The START that was given last, or asked about: only what it has begun is this client's.
+    began: Option<u32>,
     beat: u16,
     beaten: Option<Instant>,
     seen_beat: Option<(u16, Instant)>,
@@ -86,6 +90,8 @@ impl ModbusMachine {
             expected_name: settings.expected_name,
             simulation: settings.simulation,
             sequence: 0,
+            owned: false,
+            began: None,
             beat: 0,
             beaten: None,
             seen_beat: None,
@@ -106,6 +112,7 @@ impl ModbusMachine {
 
     async fn connect(&mut self) -> Result<Identity, DeviceError> {
         self.seen_beat = None;
+        self.owned = false;
         self.loaded.clear();
         let identity = self.unit.meet().await?;
         // Before the first write that means anything to a machine that may be another one.
@@ -131,6 +138,9 @@ impl ModbusMachine {
 
     /// Tells the machine that its client is alive, if that has not been said just now.
     async fn beat(&mut self) -> Result<(), DeviceError> {
+        if !self.owned {
+            return Ok(());
+        }
         if self.beaten.is_some_and(|last| last.elapsed() < self.beat_every) {
             return Ok(());
         }
@@ -215,8 +225,18 @@ impl ModbusMachine {
     }
 
     async fn signal(&mut self, k: usize) -> Result<SignalValue, DeviceError> {
+        let Signal { name, unit, range, .. } = self.signals[k].clone();
+        let value = self.signal_value(k).await?.filter(|value| value.is_finite());
+        Ok(SignalValue { name, value, unit, range })
+    }
+
+    /// Returns the value of a signal; none where the machine has no such register now.
+    async fn signal_value(&mut self, k: usize) -> Result<Option<f64>, DeviceError> {
         let signal = self.signals[k].clone();
-        let words = self.unit.read("signal", signal.address, signal.kind.registers()).await?;
+        let words = match self.unit.read("signal", signal.address, signal.kind.registers()).await {
+            Err(DeviceError::Exception { .. }) => return Ok(None),
+            words => words?,
+        };
         let block = Registers::new(&words, signal.word_order);
         let kept = match signal.kind {
             SignalType::U16 => f64::from(words[0]),
@@ -226,15 +246,7 @@ impl ModbusMachine {
             SignalType::F32 => f64::from(block.f32(0)),
             SignalType::F64 => block.f64(0),
         };
-        let value = kept * signal.scale;
-        let (machine, Signal { name, unit, range: [least, most], .. }) = (self.machine(), signal);
-        if !value.is_finite() {
-            return Err(DeviceError::NotFinite { machine, field: name, value });
-        }
-        if value < least || value > most {
-            return Err(DeviceError::OutOfRange { machine, field: name, value, least, most, unit });
-        }
-        Ok(SignalValue { name, value, unit })
+        Ok(Some(kept * signal.scale))
     }
 
     // ---- commands ----------------------------------------------------------------------------------------------------------------
@@ -367,6 +379,7 @@ impl ModbusMachine {
             let (command, answer, state) = (Command::Start, Answer::DeadToken, before.state);
             return Err(DeviceError::Refused { machine: self.machine(), command, answer, state });
         }
+        self.began = Some(start_sequence);
         let (owner, epoch) = (self.owner, self.epoch);
         let frame = CommandFrame {
             sequence: start_sequence,
@@ -395,13 +408,32 @@ impl ModbusMachine {
         }
     }
 
+    async fn claim(&mut self) -> Result<Block, DeviceError> {
+        let status = self.simply(Command::Claim).await?;
+        self.owned = true;
+        Ok(status)
+    }
+
+    async fn release(&mut self) -> Result<Block, DeviceError> {
+        self.owned = false;
+        self.simply(Command::Release).await
+    }
+
+    /// Ends at once, whatever became of the connection and whoever has counted further meanwhile: it connects by itself, without
+    /// the pause that others keep, and goes past the number that the machine has now.
     async fn abort(&mut self) -> Result<Block, DeviceError> {
+        self.unit.link.hurry();
+        if self.unit.identity().is_none() {
+            self.unit.meet().await?;
+        }
+        let before = self.look().await?;
+        self.sequence = self.sequence.max(before.acknowledged);
         match self.simply(Command::Abort).await {
-            // Somebody else has counted further; an abort is worth going past them.
-            Err(DeviceError::NotAcknowledged { acknowledged, .. }) if acknowledged > self.sequence => {
-                self.sequence = acknowledged;
-                self.simply(Command::Abort).await
-            }
+            Err(error @ DeviceError::NotAcknowledged { .. }) => match self.look().await? {
+                // Another number came in between; what counts is where it led.
+                status if matches!(status.state, State::Aborting | State::Aborted) => Ok(status),
+                _ => Err(error),
+            },
             answer => answer,
         }
     }
@@ -412,6 +444,7 @@ impl ModbusMachine {
     }
 
     async fn reconcile(&mut self, intended: &Armed) -> Result<Reconciled, DeviceError> {
+        self.began = Some(intended.start_sequence);
         let first = self.look().await?;
         match what_became(intended, &first) {
             Some(verdict) => return Ok(verdict),
@@ -423,6 +456,9 @@ impl ModbusMachine {
                 }
             }
         }
+        // A START may still be under way in the network. Once a higher number is acknowledged the machine takes it no more.
+        self.sequence = self.sequence.max(intended.start_sequence).max(first.acknowledged);
+        self.claim().await?;
         let second = self.look().await?;
         Ok(what_became(intended, &second).unwrap_or(Reconciled::NotStarted(second.into())))
     }
@@ -582,6 +618,11 @@ impl ModbusMachine {
                 return Err(DeviceError::NoResult { machine: self.machine(), job, state: status.state });
             }
             self.agree(job, &status)?;
+            if let Some(began) = self.began.filter(|began| *began != status.done) {
+                let (sent, held) = (u64::from(began), u64::from(status.done));
+                let field = "the START whose job has ended";
+                return Err(DeviceError::Mismatch { machine: self.machine(), field, sent, held });
+            }
             match self.fetch_once(job, kind, status.done, interrupt).await {
                 Ok((header, words)) => return Ok((status, header, words)),
                 Err(error) if !error.is_link() || tries >= self.retries => return Err(error),
@@ -883,7 +924,7 @@ macro_rules! modbus_driver {
                 self.0.status().await
             }
             async fn claim(&mut self) -> Result<Status, DeviceError> {
-                self.0.simply(Command::Claim).await.map(Status::from)
+                self.0.claim().await.map(Status::from)
             }
             async fn prepare(&mut self, job: Job) -> Result<Armed, DeviceError> {
                 self.0.prepare(job).await
@@ -910,7 +951,7 @@ macro_rules! modbus_driver {
                 self.0.acknowledge(done).await.map(Status::from)
             }
             async fn release(&mut self) -> Result<Status, DeviceError> {
-                self.0.simply(Command::Release).await.map(Status::from)
+                self.0.release().await.map(Status::from)
             }
             async fn reconcile(&mut self, intended: &Armed) -> Result<Reconciled, DeviceError> {
                 self.0.reconcile(intended).await

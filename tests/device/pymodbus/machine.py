@@ -89,6 +89,9 @@ class Machine:
     def total(self):
         return 1000
 
+    def duration_s(self):
+        return self.moved
+
     def work(self):
         """The result: kind, format, bytes, records, what the coordinates are, probe radius, identity of what was used."""
         raise NotImplementedError
@@ -189,7 +192,7 @@ class Machine:
         kind, form, data, records, coordinates, radius, identity = self.outbox
         job, cycle, _ = self.job
         head = struct.pack(">HHIIIHHI", kind, form, len(data), binascii.crc32(data), job, cycle, coordinates, records)
-        head += struct.pack(">ddddHH", radius, 1.0, 20.0, self.moved, 1, 0) + identity
+        head += struct.pack(">ddddHH", radius, 1.0, 20.0, self.duration_s(), 1, 0) + identity
         return head + struct.pack(">I16x", self.done)
 
     def outbox_page(self, number):
@@ -203,7 +206,7 @@ class Machine:
         crc, _, again = struct.unpack(">HHI", frame[32:40])
         if crc != crc16(frame[:32]) or again != sequence or sequence in (0, self.acknowledged):
             return
-        if sequence < self.acknowledged and command != CLAIM:
+        if sequence < self.acknowledged and command not in (CLAIM, ABORT):
             return
         self.acknowledged = sequence
         self.answer = self.judge(command, (job, cycle, digest), owner, epoch, token, argument)

@@ -1,0 +1,143 @@
+//! What comes from outside of a run: a terminal that is closed, a service that is stopped, strangers at the control socket, a second run.
+
+use std::fs;
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::Instant;
+
+use crate::program::{PATIENCE, Running, changed, records_with, regrind, root, run, small_recipe};
+use regrind::journal::verify;
+
+fn sim_cell() -> String {
+    root().join("config/sim.toml").display().to_string()
+}
+
+/// A run that grinds, slowly enough that it still does when the test has done with it.
+fn grinding(home: &Path, command: impl Fn(&[&str]) -> Command) -> (Running, PathBuf) {
+    let recipe = small_recipe(home, 100.0).display().to_string();
+    let mut running = Running::new(command(&["run", &recipe, "--cell", &sim_cell(), "--runs", "runs"]));
+    let folder = running.folder(home);
+    running.line("grinding", |line| line.contains("grinding"));
+    (running, folder)
+}
+
+fn orders(folder: &Path) -> Vec<(String, String)> {
+    let text = |value: &serde_json::Value| value.as_str().unwrap_or_default().to_owned();
+    let orders = records_with(folder, "event").into_iter().filter(|event| !event["reason"].is_null());
+    orders.map(|event| (text(&event["event"]), text(&event["reason"]))).collect()
+}
+
+#[test]
+fn a_closed_terminal_and_a_stopped_service_end_the_run_in_order() {
+    for (signal, reason) in [("TERM", "SIGTERM"), ("HUP", "SIGHUP, the terminal was closed")] {
+        let home = tempfile::tempdir().unwrap();
+        let (mut running, folder) = grinding(home.path(), |arguments| regrind(arguments, home.path()));
+        running.signal(signal);
+        let (code, errors) = running.end();
+        assert_eq!(code, 3, "{signal}: {errors}");
+        assert_eq!(orders(&folder), [("stop".to_owned(), reason.to_owned())]);
+        let verified = verify(&folder).unwrap();
+        assert!(verified.closed, "{signal}: {verified:?}");
+        assert!(folder.join("result.json").exists() && folder.join("report.html").exists(), "{signal}");
+    }
+}
+
+#[test]
+fn a_service_that_is_told_twice_aborts() {
+    let home = tempfile::tempdir().unwrap();
+    let (mut running, folder) = grinding(home.path(), |arguments| regrind(arguments, home.path()));
+    // The order of the two is kept by the operating system only if the first has been heard.
+    running.signal("TERM");
+    let began = Instant::now();
+    while orders(&folder).is_empty() {
+        assert!(began.elapsed() < PATIENCE, "the first was not heard");
+    }
+    running.signal("TERM");
+    let (code, errors) = running.end();
+    assert_eq!(code, 3, "{errors}");
+    assert!(verify(&folder).unwrap().closed);
+    let reasons: Vec<_> = orders(&folder).into_iter().map(|(_, reason)| reason).collect();
+    // The machine may have stood before the second one came.
+    assert!(reasons == ["SIGTERM"] || reasons == ["SIGTERM", "SIGTERM, again"], "{reasons:?}");
+}
+
+#[test]
+fn orders_get_through_after_all_descriptors_were_taken() {
+    let home = tempfile::tempdir().unwrap();
+    let few = |arguments: &[&str]| {
+        let mut shell = Command::new("sh");
+        let program = env!("CARGO_BIN_EXE_regrind");
+        shell.args(["-c", "ulimit -n 48; exec \"$0\" \"$@\"", program]).args(arguments);
+        shell.current_dir(home.path()).stdin(Stdio::null());
+        shell
+    };
+    let (mut running, folder) = grinding(home.path(), few);
+    let clients: Vec<UnixStream> =
+        (0..64).map_while(|_| UnixStream::connect(folder.join("control.sock")).ok()).collect();
+    let open = || fs::read_dir(format!("/proc/{}/fd", running.id())).map_or(0, Iterator::count);
+    let began = Instant::now();
+    while open() < 48 {
+        assert!(began.elapsed() < PATIENCE, "{} descriptors are open, {} clients", open(), clients.len());
+        std::thread::yield_now();
+    }
+    drop(clients);
+    let (code, out, errors) = run(&["abort", folder.to_str().unwrap(), "--reason", "enough"], home.path());
+    assert_eq!(code, 0, "{out}{errors}");
+    assert_eq!(running.end().0, 3);
+    assert_eq!(orders(&folder), [("abort".to_owned(), "enough".to_owned())]);
+}
+
+#[test]
+fn an_order_goes_to_the_run_that_goes_on_and_not_to_the_newest_folder() {
+    let home = tempfile::tempdir().unwrap();
+    let (mut running, folder) = grinding(home.path(), |arguments| regrind(arguments, home.path()));
+    fs::create_dir(home.path().join("runs/newer")).unwrap();
+    let (code, out, errors) = run(&["hold", "--reason", "coffee"], home.path());
+    assert_eq!(code, 0, "{out}{errors}");
+    let (code, _, errors) = run(&["abort"], home.path());
+    assert_eq!(code, 0, "{errors}");
+    assert_eq!(running.end().0, 3);
+    assert_eq!(orders(&folder)[0], ("hold".to_owned(), "coffee".to_owned()));
+}
+
+#[test]
+fn two_runs_that_go_on_are_named_and_none_is_taken() {
+    let home = tempfile::tempdir().unwrap();
+    let (mut first, _) = grinding(home.path(), |arguments| regrind(arguments, home.path()));
+    let (mut second, _) = grinding(home.path(), |arguments| regrind(arguments, home.path()));
+    let (code, _, errors) = run(&["abort"], home.path());
+    assert_eq!(code, 2, "{errors}");
+    assert!(errors.contains("2 runs go on") && errors.matches("SIMULATION").count() == 2, "{errors}");
+    for running in [&mut first, &mut second] {
+        running.signal("TERM");
+        assert_eq!(running.end().0, 3);
+    }
+}
+
+#[test]
+fn a_second_run_does_not_take_the_machines_of_the_first() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = small_recipe(home.path(), 100.0).display().to_string();
+    let open = changed("config/modbus-tcp.toml", &[("15021", "0"), ("15022", "0")]);
+    fs::write(home.path().join("open.toml"), open).unwrap();
+    let mut serving = Running::new(regrind(&["simulate", &recipe, "--cell", "open.toml", "--json"], home.path()));
+    let wires: serde_json::Value = serde_json::from_str(&serving.line("wires", |_| true)).unwrap();
+    let port = |machine: &str| wires[machine]["port"].to_string();
+    let bound = changed("config/modbus-tcp.toml", &[("15021", &port("cmm")), ("15022", &port("grinder"))]);
+    fs::write(home.path().join("cell.toml"), bound).unwrap();
+    let begin = ["run", &*recipe, "--cell", "cell.toml", "--runs", "runs"];
+    let mut first = Running::new(regrind(&begin, home.path()));
+    let folder = first.folder(home.path());
+    first.line("grinding", |line| line.contains("grinding"));
+    let (code, _, errors) = run(&begin, home.path());
+    let name = folder.file_name().unwrap().to_str().unwrap();
+    assert!(code == 3 && errors.contains("another run has this machine") && errors.contains(name), "{code} {errors}");
+    // The first is still the one that says when it ends.
+    let (code, _, errors) = run(&["abort"], home.path());
+    assert_eq!(code, 0, "{errors}");
+    assert_eq!(first.end().0, 3);
+    assert!(first.said.iter().any(|line| line.contains("ABORTED")), "{}", first.said.join("\n"));
+    serving.interrupt();
+    serving.end();
+}
