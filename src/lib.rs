@@ -22,12 +22,12 @@
 
 pub use regrind_cell as cell;
 pub use regrind_core::{compensation, form, geometry, measuring, registration, surface};
+pub use regrind_device as device;
+pub use regrind_document as document;
 pub use regrind_formats as formats;
 pub use regrind_journal as journal;
 
 pub mod config;
-pub mod device;
-pub mod document;
 pub mod drive;
 pub mod recipe;
 pub mod report;

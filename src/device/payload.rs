@@ -1,7 +1,7 @@
 //! What is carried to a machine and what comes back.
 
-use crate::formats::result::Coordinates;
-use crate::geometry::Grid;
+use regrind_core::geometry::Grid;
+use regrind_formats::result::Coordinates;
 
 /// Something that is carried as one string of bytes and known by the SHA-256 of it.
 pub trait Identified {

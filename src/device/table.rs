@@ -13,8 +13,8 @@ use super::{
     Armed, CorrectionMap, DeviceError, Identity, Job, Measurement, Pass, PassRecord, Plan, Reconciled, Started, Status,
     Word,
 };
-use crate::document::Document;
-use crate::formats::result::Coordinates;
+use regrind_document::Document;
+use regrind_formats::result::Coordinates;
 
 macro_rules! drivers {
     ($($(#[$doc:meta])* $wire:ident($table:ty)),+ $(,)?) => {

@@ -9,9 +9,9 @@ use super::machine::{Cmm, Grinder};
 use super::modbus::{Line, Link, RegisterMap, Signal};
 use super::place::Place;
 use super::words::MachineKind;
-use crate::document::Document;
-use crate::formats::FormatError;
-use crate::formats::result::Coordinates;
+use regrind_document::Document;
+use regrind_formats::FormatError;
+use regrind_formats::result::Coordinates;
 
 /// How long to wait for what.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -80,7 +80,7 @@ pub fn digest(identities: &[[u8; 32]]) -> u32 {
 }
 
 /// Returns bytes as hexadecimal digits.
-pub(crate) fn hex(bytes: &[u8]) -> String {
+pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|b| format!("{b:02x}")).collect()
 }
 
@@ -304,12 +304,12 @@ impl Fault {
     ];
 
     /// The fault with a number.
-    pub(crate) fn of(number: u16) -> Self {
+    pub fn of(number: u16) -> Self {
         Self::NUMBERS.iter().find(|(_, known)| *known == number).map_or(Self::Other(number), |(fault, _)| *fault)
     }
 
     /// The number of a fault.
-    pub(crate) fn number(self) -> u16 {
+    pub fn number(self) -> u16 {
         match self {
             Self::Other(number) => number,
             listed => Self::NUMBERS.iter().find(|(fault, _)| *fault == listed).map_or(0, |(_, number)| *number),

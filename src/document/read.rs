@@ -39,7 +39,7 @@ pub struct Document<'t> {
 ///
 /// # Errors
 /// A file that cannot be read, that is too large or that is not text.
-pub(crate) fn read_text(path: &Path) -> Result<String, Problems> {
+pub fn read_text(path: &Path) -> Result<String, Problems> {
     let failed = |found: String, remedy: &str| Problems::whole(path, "", found, remedy);
     let mut bytes = Vec::new();
     let read = File::open(path).and_then(|file| file.take(MOST_BYTES as u64 + 1).read_to_end(&mut bytes));
@@ -59,7 +59,7 @@ fn too_large(path: &Path) -> Problems {
 }
 
 /// Returns the SHA-256 of a text.
-pub(crate) fn sha256(text: &str) -> [u8; 32] {
+pub fn sha256(text: &str) -> [u8; 32] {
     Sha256::digest(text.as_bytes()).into()
 }
 
@@ -68,7 +68,7 @@ impl<'t> Document<'t> {
     ///
     /// # Errors
     /// Every place where the text is no TOML.
-    pub(crate) fn parse(file: &'t Path, text: &'t str) -> Result<Self, Problems> {
+    pub fn parse(file: &'t Path, text: &'t str) -> Result<Self, Problems> {
         if text.len() > MOST_BYTES {
             return Err(too_large(file));
         }
@@ -101,7 +101,7 @@ impl<'t> Document<'t> {
     }
 
     /// Holds the values against a schema; what does not fit is told and left out.
-    pub(crate) fn hold_against(&mut self, schema: &Schema) {
+    pub fn hold_against(&mut self, schema: &Schema) {
         let mut values = toml::Value::Table(std::mem::take(&mut self.values));
         Shape { document: self, root: schema, path: Vec::new() }.fits(schema, &mut values);
         if let toml::Value::Table(values) = values {
@@ -113,7 +113,7 @@ impl<'t> Document<'t> {
     ///
     /// # Errors
     /// Values that fit the schema and still cannot be read; told with the rest.
-    pub(crate) fn as_written<File: DeserializeOwned>(&mut self) -> Option<File> {
+    pub fn as_written<File: DeserializeOwned>(&mut self) -> Option<File> {
         match self.values.clone().try_into() {
             Ok(written) => Some(written),
             Err(error) => {
@@ -125,14 +125,14 @@ impl<'t> Document<'t> {
     }
 
     /// Returns whether something is wrong with the value of a key, or within it.
-    pub(crate) fn has_problem(&self, key: &str) -> bool {
+    pub fn has_problem(&self, key: &str) -> bool {
         let within =
             |found: &str| found.strip_prefix(key).is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', '[']));
         self.problems.iter().any(|problem| within(&problem.key))
     }
 
     /// Returns whether a key stands in the text.
-    pub(crate) fn is_there(&self, key: &str) -> bool {
+    pub fn is_there(&self, key: &str) -> bool {
         let steps = steps(key);
         let Some((Step::Key(last), before)) = steps.split_last() else { return false };
         let mut table = Some(&self.places);
@@ -148,7 +148,7 @@ impl<'t> Document<'t> {
     }
 
     /// Tells what is wrong with the value of a key.
-    pub(crate) fn report(&mut self, key: &str, found: impl Into<String>, allowed: &str, remedy: &str) {
+    pub fn report(&mut self, key: &str, found: impl Into<String>, allowed: &str, remedy: &str) {
         let span = span_of(&self.places, &steps(key));
         self.push(span, key.to_owned(), found.into(), allowed, remedy);
     }
@@ -158,7 +158,7 @@ impl<'t> Document<'t> {
     }
 
     /// Returns everything that was wrong, if anything was.
-    pub(crate) fn finish(self) -> Result<(), Problems> {
+    pub fn finish(self) -> Result<(), Problems> {
         if self.problems.is_empty() { Ok(()) } else { Err(self.into_problems()) }
     }
 
@@ -182,7 +182,7 @@ impl<'t> Document<'t> {
 }
 
 /// Returns one problem with a value of a text that was read before.
-pub(crate) fn problem_at(file: &Path, text: &str, key: &str, [found, allowed, remedy]: [&str; 3]) -> Problems {
+pub fn problem_at(file: &Path, text: &str, key: &str, [found, allowed, remedy]: [&str; 3]) -> Problems {
     let (places, _) = DeTable::parse_recoverable(text);
     let span = span_of(places.get_ref(), &steps(key));
     let [found, allowed, remedy] = [found, allowed, remedy].map(str::to_owned);

@@ -9,7 +9,7 @@ use serde_json::Value;
 ///
 /// A key that may be left out is an `Option`, whose null TOML cannot write: it is taken away. A key that must stand can be left out too, so
 /// that what is wrong with it is told with the rest: its default is NaN, which JSON has not, or it says `x-required`.
-pub(crate) fn schema_of<File: JsonSchema>() -> Value {
+pub fn schema_of<File: JsonSchema>() -> Value {
     let settings = SchemaSettings::draft2020_12().with(|settings| settings.inline_subschemas = true);
     let mut schema = settings.into_generator().into_root_schema_for::<File>();
     RecursiveTransform(tidy).transform(&mut schema);
@@ -73,7 +73,7 @@ fn without_null(schema: &mut Schema) {
 }
 
 /// Returns the words that a schema allows, if it is a choice among words.
-pub(crate) fn choices(schema: &Value) -> Option<Vec<&str>> {
+pub fn choices(schema: &Value) -> Option<Vec<&str>> {
     if let Some(values) = schema.get("enum").and_then(Value::as_array) {
         return values.iter().map(Value::as_str).collect();
     }

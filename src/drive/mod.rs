@@ -23,7 +23,7 @@ mod task;
 mod work;
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
@@ -41,7 +41,7 @@ use crate::cell::{
 use crate::device::{
     AnyCmm, AnyGrinder, Armed, Cmm, Grinder, Identified, Interrupt, Job, Measurement, PassRecord, Word, hex,
 };
-use crate::formats::{LEARNED, write_json_atomic};
+use crate::formats::{FormatError, LEARNED, ResultFolder, write_json_atomic};
 use crate::journal::{Artefact, Entry, Journal, Kind};
 
 use control::{Control, Ordered};
@@ -175,6 +175,11 @@ enum Then {
     Execute(Box<Command>),
     Answer { answer: oneshot::Sender<Reply>, accepted: bool, message: String },
     Confirm { device: Device, word: Word, answer: oneshot::Sender<Result<(), String>> },
+}
+
+/// Makes a folder for results, where it is not there.
+fn made(folder: &Path) -> Result<(), FormatError> {
+    ResultFolder::prepare(folder).map(ResultFolder::keep)
 }
 
 /// What a computation brought.
@@ -632,7 +637,9 @@ impl Drive {
 
     /// Writes a small document of the loop's own into the run folder and brings it on record.
     async fn leave(&mut self, name: String, cycle: u32, document: &impl Serialize) {
-        match write_json_atomic(self.folder.join(&name), document) {
+        let path = self.folder.join(&name);
+        let made = made(path.parent().unwrap_or(&self.folder));
+        match made.and_then(|()| write_json_atomic(path, document)) {
             Ok(()) => self.adopt(cycle, record::describe(&self.folder, &[name])).await,
             Err(error) => self.notify(Notice::RecordFailed { message: error.to_string() }),
         }
@@ -828,6 +835,8 @@ impl Drive {
         let below = folder_of(cycle, *attempt);
         let computing = self.computations.spawn_blocking(move || {
             let mut files = Files::new(folder.join(&below));
+            // What cannot be made is told by the first file that cannot be written into it.
+            let _ = made(files.folder());
             let (event, product) = work(&task, &mut files);
             let names: Vec<String> = files.made().iter().map(|name| format!("{below}/{name}")).collect();
             Computed { cycle, event, product, files: record::describe(&folder, &names) }

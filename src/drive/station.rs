@@ -519,6 +519,7 @@ impl<B: StationDriver> MachineTask<B> {
                 Reconciliation::NotStarted
             }
             Ok(Reconciled::Unknown { why }) => Reconciliation::Unknown(why),
+            Ok(answer) => Reconciliation::Unknown(format!("an answer that nobody here knows: {answer:?}")),
             Err(error) if error.is_link() => return self.lost(&error).await,
             Err(error) => Reconciliation::Unknown(error.to_string()),
         };
@@ -773,7 +774,8 @@ fn job_result(outcome: Outcome) -> JobResult {
         Outcome::Complete => JobResult::Complete,
         Outcome::Stopped => JobResult::Stopped,
         Outcome::Aborted => JobResult::Aborted,
-        Outcome::None | Outcome::Failed => JobResult::Failed,
+        // None told, failed, or one that nobody here knows.
+        _ => JobResult::Failed,
     }
 }
 

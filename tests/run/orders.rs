@@ -241,10 +241,10 @@ async fn a_judgement_that_is_amended_leaves_the_file_of_the_first() {
     ready.run.task.limits.removal_budget_mm = 1e-6;
     let (ending, folder) = run_to_its_end(ready).await;
     assert!(matches!(ending, Ending::NotAccepted { .. }), "{ending:?}");
+    all_on_record(&folder, &["result.json", "cycle-1/result.json", "cycle-1/attempt-2/result.json"]);
     let announced = records(&folder, Kind::Note).into_iter().filter(|note| note["command"] == "announce");
     let verdicts: Vec<_> = announced.map(|note| note["verdict"].clone()).collect();
     assert_eq!(verdicts, ["continue", "budget_spent"]);
-    all_on_record(&folder, &["result.json", "cycle-1/result.json", "cycle-1/attempt-2/result.json"]);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

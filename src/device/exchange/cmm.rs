@@ -15,10 +15,10 @@ use super::outbox::{Outbox, StoredHandover, Taken, Ticket, json_lines, unhex};
 use super::stations::{PlacedStation, place_station};
 use super::watch::{Watch, WatchedFile};
 use super::{Exchange, ExchangeError, HandOver, Look, MeasureOrder, Pattern, Standing};
-use crate::device::{Job, MeasuredPoint, Measurement, Plan, hex};
-use crate::formats::FormatError;
-use crate::formats::references::{References, parse_references, read_references};
-use crate::formats::result::{Content, Coordinates, ResultFile, parse_result, read_bytes, read_statements};
+use crate::{Job, MeasuredPoint, Measurement, Plan, hex};
+use regrind_formats::FormatError;
+use regrind_formats::references::{References, parse_references, read_references};
+use regrind_formats::result::{Content, Coordinates, ResultFile, parse_result, read_bytes, read_statements};
 
 /// How a measuring machine exchanges files.
 #[derive(Clone, Debug)]
@@ -479,7 +479,7 @@ fn switched_off(name: &str, result: &ResultFile) -> Option<String> {
 }
 
 /// The plan as a table, with what it is about above it.
-pub(in crate::device) fn plan_csv(part: &str, job: Job, identity: &str, plan: &Plan) -> String {
+pub(crate) fn plan_csv(part: &str, job: Job, identity: &str, plan: &Plan) -> String {
     let mut text = format!(
         "# Regrind measuring plan\n# part: {}\n# job: {}\n# cycle: {}\n# plan: {}\n# units: mm\n# probe_radius_mm: {}\n\
          # frame: that of the measuring machine; x y z nominal contact point, nx ny nz outward unit normal\n\

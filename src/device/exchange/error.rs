@@ -4,9 +4,9 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-use crate::device::hex;
-use crate::formats::FormatError;
-use crate::geometry::RigidError;
+use crate::hex;
+use regrind_core::geometry::RigidError;
+use regrind_formats::FormatError;
 
 /// Why a file that was exchanged with a machine is not taken. Lines count from 1.
 #[derive(Debug, Error)]

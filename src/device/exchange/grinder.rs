@@ -14,9 +14,9 @@ use sha2::{Digest, Sha256};
 use super::outbox::{Outbox, StoredHandover, Taken, Ticket, json_lines, read_json, unhex};
 use super::watch::{Watch, WatchedFile};
 use super::{Confirmed, Exchange, ExchangeError, GrindOrder, HandOver, Look, Standing};
-use crate::device::{CorrectionMap, Job, Outcome, PassRecord, hex};
-use crate::formats::result::read_bytes;
-use crate::formats::write_atomic;
+use crate::{CorrectionMap, Job, Outcome, PassRecord, hex};
+use regrind_formats::result::read_bytes;
+use regrind_formats::write_atomic;
 
 /// The two files of a person's word, in the inbox.
 const STARTED: &str = "started.json";

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::ExchangeError;
-use crate::device::Job;
+use crate::Job;
 
 /// Two folders that stand for a machine: one that hand-overs are put into, one that answers come out of.
 ///

@@ -4,10 +4,10 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use super::ExchangeError;
-use crate::device::{Job, MeasuredPoint, Measurement, PointStatus};
-use crate::formats::FormatError;
-use crate::formats::result::{Content, Coordinates, ResultFile, Statements, check_ended, parse_result};
-use crate::geometry::Point;
+use crate::{Job, MeasuredPoint, Measurement, PointStatus};
+use regrind_core::geometry::Point;
+use regrind_formats::FormatError;
+use regrind_formats::result::{Content, Coordinates, ResultFile, Statements, check_ended, parse_result};
 
 /// What a measurement is held against.
 #[derive(Clone, Copy, Debug)]

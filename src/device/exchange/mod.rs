@@ -43,7 +43,7 @@ pub use settings::{ExchangeWire, StationTable};
 pub use stations::{PlacedStation, place_station};
 pub use watch::Watch;
 
-use crate::device::{CorrectionMap, Pass, Plan};
+use crate::{CorrectionMap, Pass, Plan};
 
 /// What a grinder is handed.
 #[derive(Debug, Clone, PartialEq)]

@@ -18,8 +18,8 @@ use serde::{Deserialize, Serialize};
 
 use super::watch::{FileLook, Watch};
 use super::{ExchangeError, HandOver, Standing, file_word};
-use crate::device::{Job, hex};
-use crate::formats::{FormatError, read_whole, sync_folder, try_writing, write_atomic, write_json_atomic};
+use crate::{Job, hex};
+use regrind_formats::{FormatError, read_whole, sync_folder, try_writing, write_atomic, write_json_atomic};
 
 /// What every folder of a hand-over holds.
 const TICKET: &str = "handover.json";

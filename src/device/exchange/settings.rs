@@ -10,12 +10,12 @@ use super::cmm::{CmmExchange, CmmFolders, StationFiles, Stations};
 use super::grinder::{GrinderExchange, GrinderFolders};
 use super::machine::ExchangeMachine;
 use super::pattern::Pattern;
-use crate::device::MachineKind;
-use crate::device::place::Place;
-use crate::device::wiring::{Making, MakingError, Wired};
-use crate::document::Document;
-use crate::formats::references::read_references;
-use crate::formats::result::{Content, Coordinates, DecimalMark, LengthUnit};
+use crate::MachineKind;
+use crate::place::Place;
+use crate::wiring::{Making, MakingError, Wired};
+use regrind_document::Document;
+use regrind_formats::references::read_references;
+use regrind_formats::result::{Content, Coordinates, DecimalMark, LengthUnit};
 
 /// A folder, perhaps on another computer, answers within this, a large file read included.
 const ANSWERS_WITHIN: Duration = Duration::from_secs(30);

@@ -5,8 +5,8 @@
 //! then has to look for.
 
 use super::ExchangeError;
-use crate::formats::references::{Reference, References};
-use crate::geometry::{Point, Pose, RigidFit, Vector, fit_rigid};
+use regrind_core::geometry::{Point, Pose, RigidFit, Vector, fit_rigid};
+use regrind_formats::references::{Reference, References};
 
 /// With more nominal points than this no subsets are tried for a station that names none.
 const MOST_NOMINAL: usize = 12;
@@ -189,7 +189,7 @@ fn off_without(from: &[Point], to: &[Point], index: usize) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::Twist;
+    use regrind_core::geometry::Twist;
     use std::path::PathBuf;
 
     const AT: [(&str, [f64; 3]); 5] = [

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
-use crate::formats::FormatError;
+use regrind_formats::FormatError;
 
 /// How a file looked at one moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

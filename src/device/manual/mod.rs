@@ -24,8 +24,8 @@ use super::{
     Machine, MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, Reconciled, Started, State, Status, Word,
     digest, hex,
 };
-use crate::formats::result::{Content, read_bytes};
-use crate::formats::{FormatError, ResultFolder, write_atomic};
+use regrind_formats::result::{Content, read_bytes};
+use regrind_formats::{FormatError, ResultFolder, write_atomic};
 
 pub use settings::ManualWire;
 

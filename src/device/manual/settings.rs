@@ -4,9 +4,9 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use super::{ManualMachine, ManualSettings};
-use crate::device::MachineKind;
-use crate::device::wiring::{Making, MakingError, Wired};
-use crate::formats::result::{Content, Coordinates, DecimalMark, LengthUnit};
+use crate::MachineKind;
+use crate::wiring::{Making, MakingError, Wired};
+use regrind_formats::result::{Content, Coordinates, DecimalMark, LengthUnit};
 
 /// A person, step by step.
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]

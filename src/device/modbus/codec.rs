@@ -6,8 +6,8 @@
 use sha2::{Digest, Sha256};
 
 use super::settings::WordOrder;
-use crate::device::{Command, CorrectionMap, Identified, Job, MeasuredPoint, Outcome, Pass, Plan, PointStatus};
-use crate::geometry::Grid;
+use crate::{Command, CorrectionMap, Identified, Job, MeasuredPoint, Outcome, Pass, Plan, PointStatus};
+use regrind_core::geometry::Grid;
 
 impl WordOrder {
     fn bits(self, words: &[u16]) -> u64 {
@@ -397,7 +397,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::device::{Target, TargetKind};
+    use crate::{Target, TargetKind};
 
     #[test]
     fn words_go_high_first_or_low_first_and_bytes_always_high_first() {

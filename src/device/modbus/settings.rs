@@ -7,8 +7,8 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::device::place::Place;
-use crate::document::Document;
+use crate::place::Place;
+use regrind_document::Document;
 
 /// Registers that a Modbus device can have.
 const REGISTERS: u32 = 1 << 16;

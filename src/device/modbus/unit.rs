@@ -11,7 +11,7 @@ use tokio::time::{Instant, sleep};
 use super::codec::{Registers, Writer};
 use super::link::{Ask, Link, LinkFault};
 use super::settings::RegisterMap;
-use crate::device::{DeviceError, Identity, MachineKind};
+use crate::{DeviceError, Identity, MachineKind};
 
 /// The first words of an identity block.
 const MAGIC: [u16; 2] = [0x5247, 0x4431];

@@ -2,9 +2,9 @@
 
 use super::settings::{Line, ModbusSettings, RtuWire, TcpWire};
 use super::{Link, ModbusCmm, ModbusGrinder};
-use crate::device::place::Place;
-use crate::device::wiring::{Making, MakingError, Wired};
-use crate::document::Document;
+use crate::place::Place;
+use crate::wiring::{Making, MakingError, Wired};
+use regrind_document::Document;
 
 macro_rules! modbus_wire {
     ($wire:ident) => {

@@ -15,8 +15,8 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 pub use read::Document;
-pub(crate) use read::{problem_at, read_text, sha256};
-pub(crate) use schema::schema_of;
+pub use read::{problem_at, read_text, sha256};
+pub use schema::schema_of;
 
 /// Everything that is wrong with one file.
 #[derive(Clone, Debug, PartialEq)]
@@ -46,7 +46,7 @@ pub struct Problem {
 
 impl Problems {
     /// A file with one problem that has no place in its text.
-    pub(crate) fn whole(file: &Path, text: &str, found: String, remedy: &str) -> Self {
+    pub fn whole(file: &Path, text: &str, found: String, remedy: &str) -> Self {
         let problem =
             Problem { span: 0..0, key: String::new(), found, allowed: String::new(), remedy: remedy.to_owned() };
         Self { file: file.to_owned(), text: text.to_owned(), problems: vec![problem] }

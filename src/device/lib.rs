@@ -33,7 +33,6 @@ mod table;
 mod wiring;
 mod words;
 
-pub use crate::formats::result::Coordinates;
 use error::Answered;
 pub use error::DeviceError;
 pub use machine::{Cmm, Grinder, Interrupt, Machine};
@@ -46,9 +45,10 @@ pub use payload::{
     CorrectionMap, Identified, MeasuredPoint, Measurement, Pass, PassRecord, Plan, PointStatus, Target, TargetKind,
 };
 pub use place::Place;
+pub use regrind_formats::result::Coordinates;
 pub use table::{AnyCmm, AnyGrinder, Wire};
 pub use wiring::{Making, MakingError, Timing, Wired};
-pub(crate) use words::hex;
+pub use words::hex;
 pub use words::{
     Answer, Armed, Command, Fault, Identity, Job, MachineKind, Outcome, Reconciled, SignalValue, Started, State,
     Status, Word, digest,
