@@ -609,12 +609,16 @@ impl Cell {
         self.unsuspend_if_free();
     }
 
-    pub(super) fn record_failed(&mut self, why: &RecordFailure) {
+    pub(super) fn raise_record_failed(&mut self, why: &RecordFailure) {
         let (id, message) = match why {
             RecordFailure::DiskFull(message) => (AlarmId::DiskFull, message),
             RecordFailure::Unwritable(message) => (AlarmId::JournalUnwritable, message),
         };
         self.raise(id, message);
+    }
+
+    pub(super) fn record_failed(&mut self, why: &RecordFailure) {
+        self.raise_record_failed(why);
         match self.state {
             Execute(phase) | Unholding(phase) | Unsuspending(phase) => self.hold(phase),
             Suspending(phase) => self.go(Holding(phase)),

@@ -295,7 +295,7 @@ catalogue! {
     }
     /// Journal.
     JournalUnwritable {
-        "The journal cannot be written", "Nothing new begins to move: what is not recorded is not done.", ProcessEngineer,
+        "The record of the run cannot be written", "Nothing new begins to move: what is not recorded is not done.", ProcessEngineer,
         ["Check the run folder: permissions, network drive, disk.", "Resume."]
     }
     /// Disk full.

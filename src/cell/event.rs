@@ -123,6 +123,10 @@ pub enum Event {
     /// There is no next map. Answers `Compensate`.
     CompensationRefused { cycle: u32, why: CompensationRefusal },
 
+    /// What was computed from a measurement cannot be written: nothing is made of it before it can. Answers `Collect`, `Register` and
+    /// `Compensate`.
+    NotSaved { cycle: u32, why: RecordFailure },
+
     /// The journal or the run folder cannot be written: nothing may begin to move.
     RecordFailed { why: RecordFailure },
     /// Time has passed; what is due is done.
@@ -432,6 +436,7 @@ impl Event {
             | Self::StartUnknown { cycle, .. }
             | Self::Ended { cycle, .. }
             | Self::RecordDoubted { cycle, .. }
+            | Self::NotSaved { cycle, .. }
             | Self::Reconciled { cycle, .. }
             | Self::Collected { cycle, .. }
             | Self::Qualified { cycle, .. }
@@ -559,6 +564,7 @@ impl Event {
             Self::RegistrationFailed { .. } => "registration_failed",
             Self::Compensated { .. } => "compensated",
             Self::CompensationRefused { .. } => "compensation_refused",
+            Self::NotSaved { .. } => "not_saved",
             Self::RecordFailed { .. } => "record_failed",
             Self::Deadline => "deadline",
         }

@@ -250,6 +250,14 @@ impl Cell {
             (Execute(Register) | Holding(Register), Event::RegistrationFailed { why, .. }) => {
                 self.useless(AlarmId::RegistrationFailed, why);
             }
+            (
+                Execute(p @ (Register | Compensate | Measure(JobStep::Collect)))
+                | Holding(p @ (Register | Compensate | Measure(JobStep::Collect))),
+                Event::NotSaved { why, .. },
+            ) => {
+                self.raise_record_failed(why);
+                self.go(Held(p));
+            }
             (Execute(Compensate) | Holding(Compensate), Event::Compensated { .. }) => {
                 self.cycle += 1;
                 self.advance(Grind(JobStep::Send));

@@ -195,6 +195,7 @@ fn of_computations(cycle: u32) -> Vec<Event> {
     }
     events.extend(sample_figures().into_iter().map(|figures| Event::Registered { cycle, figures }));
     events.push(Event::RegistrationFailed { cycle, why: text() });
+    events.push(Event::NotSaved { cycle, why: RecordFailure::DiskFull(text()) });
     let (largest_mm, depth_mm, predicted_pv_mm) = (0.02, 0.03, 0.005);
     let summary = CompensationSummary { largest_mm, depth_mm, predicted_pv_mm, ..CompensationSummary::default() };
     events.push(Event::Compensated { cycle, summary });

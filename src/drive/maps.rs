@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use super::record::Files;
+use super::record::{Files, Unfinished, unfinished};
 use super::task::{Cycle, Task, readings, used};
 use crate::compensation::{self, Contact, ErrorMap, ParameterOptions, Smoothing};
 use crate::form::{FormOptions, TakenOut, figures, slope};
@@ -81,14 +81,14 @@ pub(super) fn save(
     (number, cycle): (u32, &Cycle),
     map: &ErrorMap,
     found: &Registration,
-) -> Result<(), String> {
+) -> Result<(), Unfinished<String>> {
     let ground_with = (!cycle.correction.is_none()).then(|| task.map_identity(&cycle.correction));
     let origin = ErrorMapOrigin { part: task.part_identity, cycle: number, ground_with };
     let date = jiff::Timestamp::now().strftime("%Y-%m-%dT%H:%M:%SZ").to_string();
     write_error_map(&files.place("error_map.csv"), map, &origin, task.simulation)
         .and_then(|()| write_error_map_x3p(&files.place("error_map.x3p"), map, &date, task.simulation))
-        .map_err(|error| error.to_string())?;
-    save_pictures(task, files, map).and_then(|()| save_points(task, files, found)).map_err(|error| error.to_string())
+        .map_err(unfinished)?;
+    save_pictures(task, files, map).and_then(|()| save_points(task, files, found)).map_err(unfinished)
 }
 
 fn save_pictures(task: &Task, files: &mut Files, map: &ErrorMap) -> Result<(), ReportError> {

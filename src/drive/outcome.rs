@@ -39,6 +39,9 @@ pub(super) fn answers(event: &Event, command: &Command) -> bool {
         (C::AbortMachine { device }, E::AbortConfirmed { device: d }) => device == d,
         (C::Reconcile { device, cycle }, E::Reconciled { device: d, cycle: c, .. }) => device == d && cycle == c,
         (C::Collect { cycle }, E::Collected { cycle: c, .. }) => cycle == c,
+        (C::Collect { cycle } | C::Register { cycle } | C::Compensate { cycle }, E::NotSaved { cycle: c, .. }) => {
+            cycle == c
+        }
         (C::Qualify { cycle }, E::Qualified { cycle: c, .. }) => cycle == c,
         (C::Acknowledge { device }, E::Acknowledged { device: d }) => device == d,
         (C::Register { cycle }, E::Registered { cycle: c, .. } | E::RegistrationFailed { cycle: c, .. }) => cycle == c,

@@ -223,6 +223,27 @@ impl Files {
     }
 }
 
+/// Why a computation brought nothing: its files cannot be written, or for a reason of its own.
+pub(super) enum Unfinished<T> {
+    NotSaved(RecordFailure),
+    For(T),
+}
+
+/// Tells an error of writing from any other by what the operating system said.
+pub(super) fn unfinished<E: std::error::Error + 'static>(error: E) -> Unfinished<String> {
+    let mut cause: Option<&(dyn std::error::Error + 'static)> = Some(&error);
+    while let Some(next) = cause {
+        if let Some(io) = next.downcast_ref::<std::io::Error>() {
+            use std::io::ErrorKind::{QuotaExceeded, StorageFull};
+            let is_full = matches!(io.kind(), StorageFull | QuotaExceeded);
+            let why = if is_full { RecordFailure::DiskFull } else { RecordFailure::Unwritable };
+            return Unfinished::NotSaved(why(error.to_string()));
+        }
+        cause = next.source();
+    }
+    Unfinished::For(error.to_string())
+}
+
 fn failure(error: JournalError) -> RecordFailure {
     if error.is_disk_full() {
         RecordFailure::DiskFull(error.to_string())

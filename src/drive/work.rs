@@ -18,7 +18,7 @@ use crate::measuring::fit_sphere;
 use crate::registration::{Options, PointStatus as Fate, Registration, weak_for_compensation};
 
 use super::maps;
-use super::record::Files;
+use super::record::{Files, Unfinished, unfinished};
 use super::task::{Cycle, Points, Product, Registered, Task, readings, used};
 
 /// Looks whether the measurement of a cycle may be used, and writes its points.
@@ -39,14 +39,18 @@ pub(super) fn gate_cycle(
             (part.len() as u32, gate(task, planned, part, sphere, measurement.coordinates))
         }
     };
-    let saved = usable.and_then(|points| {
+    let saved = usable.map_err(Unfinished::For).and_then(|points| {
         let made = ResultFolder::prepare(files.folder()).map(ResultFolder::keep);
         let saved = made.and_then(|()| save_points(files, &points, task.simulation));
-        saved.map(|()| points).map_err(|error| GateFailure::Broken(error.to_string()))
+        saved.map(|()| points).map_err(|error| match unfinished(error) {
+            Unfinished::NotSaved(why) => Unfinished::NotSaved(why),
+            Unfinished::For(message) => Unfinished::For(GateFailure::Broken(message)),
+        })
     });
     let (gate, product) = match saved {
         Ok(points) => (Gate::Passed, Product::Points(points)),
-        Err(failure) => (Gate::Failed(failure), Product::Nothing),
+        Err(Unfinished::For(failure)) => (Gate::Failed(failure), Product::Nothing),
+        Err(Unfinished::NotSaved(why)) => return (Event::NotSaved { cycle: number, why }, Product::Nothing),
     };
     (Event::Collected { cycle: number, targets: planned.max(found), found, gate }, product)
 }
@@ -151,7 +155,8 @@ pub(super) fn register_cycle(
             let event = Event::Registered { cycle: number, figures: found.figures.clone() };
             (event, Product::Registered(Box::new(found)))
         }
-        Err(why) => (Event::RegistrationFailed { cycle: number, why }, Product::Nothing),
+        Err(Unfinished::For(why)) => (Event::RegistrationFailed { cycle: number, why }, Product::Nothing),
+        Err(Unfinished::NotSaved(why)) => (Event::NotSaved { cycle: number, why }, Product::Nothing),
     }
 }
 
@@ -161,18 +166,19 @@ fn registered(
     number: u32,
     cycle: &Cycle,
     before: Option<&Cycle>,
-) -> Result<Registered, String> {
-    let points = cycle.points.as_ref().ok_or("there are no points of this cycle")?;
+) -> Result<Registered, Unfinished<String>> {
+    let none = || Unfinished::For("there are no points of this cycle".to_owned());
+    let points = cycle.points.as_ref().ok_or_else(none)?;
     // The surface wanted by this pass stands above the nominal one by its level, and the ball rolls on that.
     let radius_mm = points.radius_mm.unwrap_or(task.probing.probe_radius_mm);
     let ball_mm = if points.coordinates == Coordinates::Contacts { 0.0 } else { radius_mm };
     let probe_radius_mm = (ball_mm + cycle.correction.level_mm).max(0.0);
-    let (mut found, options) = task.register(&points.part, probe_radius_mm).map_err(|error| error.to_string())?;
+    let (mut found, options) = task.register(&points.part, probe_radius_mm).map_err(unfinished)?;
     found.allow_for_radius(points.radius_sigma_mm);
-    save(task, files, &found, &options).map_err(|error| error.to_string())?;
+    save(task, files, &found, &options).map_err(unfinished)?;
     let error = error_map(&readings(&found), &task.map).ok();
-    maps::save_figures(task, files, error.as_ref(), &found).map_err(|error| error.to_string())?;
-    let offered = maps::parameters(task, files, &found).map_err(|error| error.to_string())?;
+    maps::save_figures(task, files, error.as_ref(), &found).map_err(unfinished)?;
+    let offered = maps::parameters(task, files, &found).map_err(unfinished)?;
     // Every measurement leaves its map, whatever becomes of the correction.
     error.as_ref().map_or(Ok(()), |map| maps::save(task, files, (number, cycle), map, &found))?;
     let answer = error.as_ref().and_then(|error| answer(before?, cycle, &found, error));
@@ -274,7 +280,8 @@ fn in_words_of_the_cell(sense: Sense) -> Response {
 pub(super) fn compensate_cycle(task: &Task, files: &mut Files, number: u32, cycle: &Cycle) -> (Event, Product) {
     match compensated(task, files, cycle) {
         Ok((summary, next)) => (Event::Compensated { cycle: number, summary }, Product::Correction(next)),
-        Err(why) => (Event::CompensationRefused { cycle: number, why }, Product::Nothing),
+        Err(Unfinished::For(why)) => (Event::CompensationRefused { cycle: number, why }, Product::Nothing),
+        Err(Unfinished::NotSaved(why)) => (Event::NotSaved { cycle: number, why }, Product::Nothing),
     }
 }
 
@@ -282,13 +289,13 @@ fn compensated(
     task: &Task,
     files: &mut Files,
     cycle: &Cycle,
-) -> Result<(CompensationSummary, Correction), CompensationRefusal> {
-    let failed = |why: &dyn std::fmt::Display| CompensationRefusal::Failed(why.to_string());
+) -> Result<(CompensationSummary, Correction), Unfinished<CompensationRefusal>> {
+    let failed = |why: &dyn std::fmt::Display| Unfinished::For(CompensationRefusal::Failed(why.to_string()));
     let found =
         cycle.registration.as_ref().ok_or_else(|| failed(&"the measurement of this cycle is not registered"))?;
     // Where the part may slide in its own surface, nobody knows where on the part a map would be ground in.
     if let Some(why) = weak_for_compensation(found, &task.place) {
-        return Err(CompensationRefusal::WeakDirections(vec![why]));
+        return Err(Unfinished::For(CompensationRefusal::WeakDirections(vec![why])));
     }
     let map = match &cycle.error {
         Some(map) => Arc::clone(map),
@@ -299,14 +306,18 @@ fn compensated(
         None => Arc::new(learned_from(task, cycle, None, &map, None)),
     };
     let step = cycle.correction.next(&map, &known, &task.limits).map_err(|error| match error {
-        NextPassError::BudgetSpent { .. } => CompensationRefusal::BudgetSpent(error.to_string()),
+        NextPassError::BudgetSpent { .. } => Unfinished::For(CompensationRefusal::BudgetSpent(error.to_string())),
         error => failed(&error),
     })?;
     // A pass that cannot be ground leaves no correction that somebody might take for one.
-    let warning = task
-        .save_program(files, &step.correction)
-        .map_err(|error| failed(&format_args!("the next pass cannot be ground: {error}")))?;
-    task.save_correction(files, &step.correction, &cycle.correction).map_err(|error| failed(&error))?;
+    let warning = task.save_program(files, &step.correction).map_err(|error| match unfinished(error) {
+        Unfinished::For(why) => failed(&format_args!("the next pass cannot be ground: {why}")),
+        Unfinished::NotSaved(why) => Unfinished::NotSaved(why),
+    })?;
+    task.save_correction(files, &step.correction, &cycle.correction).map_err(|error| match unfinished(error) {
+        Unfinished::For(why) => failed(&why),
+        Unfinished::NotSaved(why) => Unfinished::NotSaved(why),
+    })?;
     let largest_mm = step.correction.values_mm.iter().fold(0.0f64, |most, v| most.max(v.abs()));
     let ratio = found.verdict.pv_mm / found.verdict.rms_mm.max(f64::MIN_POSITIVE);
     let forecast = known.forecast(&map);

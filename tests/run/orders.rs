@@ -234,6 +234,25 @@ async fn run_to_its_end(ready: Ready) -> (Ending, PathBuf) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_was_computed_and_cannot_be_written_holds_the_cell_and_is_computed_again() {
+    let mut rig = Rig::new(crate::rig::small(12, 8, 5000.0)).await;
+    let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
+    // A folder stands where the deviations of the first cycle should.
+    std::fs::create_dir_all(folder.join("cycle-1/deviations.csv")).unwrap();
+    let actor = run.actor.clone();
+    let (drive, orders): (_, Orders) = Drive::new(run, cmm, grinder).unwrap();
+    let running = tokio::spawn(drive.run());
+    event(&mut notices, "not_saved", 1).await;
+    orders.give(Request::Resume { reason: "the disk is well again".into(), seen: None }, actor).await;
+    let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
+    assert!(matches!(ending, Ending::Accepted { .. } | Ending::NotAccepted { .. }), "{ending:?}");
+    assert!(folder.join("cycle-1/attempt-2/deviations.csv").is_file());
+    let raised = records(&folder, Kind::Note).into_iter().filter(|note| note["command"] == "raise");
+    let alarms: Vec<_> = raised.map(|note| note["id"].clone()).collect();
+    assert_eq!(alarms.first(), Some(&Value::from("journal_unwritable")), "{alarms:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_judgement_that_is_amended_leaves_the_file_of_the_first() {
     let mut rig = Rig::new(crate::rig::small(12, 8, 5000.0)).await;
     let mut ready = rig.next(true);
