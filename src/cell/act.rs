@@ -282,7 +282,9 @@ impl Cell {
 
     pub(super) fn ended(&mut self, device: Device, result: JobResult) {
         match (result, device) {
-            (JobResult::Complete, Device::Grinder) if self.doubted => self.advance(Grind(JobStep::Discard)),
+            (JobResult::Complete, Device::Grinder) if std::mem::take(&mut self.doubted) => {
+                self.advance(Grind(JobStep::Discard));
+            }
             (JobResult::Complete, Device::Grinder) => self.advance(Grind(JobStep::Acknowledge)),
             (JobResult::Complete, Device::Cmm) => self.advance(Measure(JobStep::Collect)),
             (JobResult::Stopped | JobResult::Failed, _) => {

@@ -11,7 +11,7 @@ use super::event::{
 };
 use super::memory::Cell;
 use super::plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, PvOf, Tolerance};
-use super::state::{Device, State};
+use super::state::{Device, Phase, State};
 
 /// What an event does in a state.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -69,7 +69,8 @@ fn key(cell: &Cell) -> impl Ord + use<> {
     let known = cell.known.map(|known| (known.ready, known.met && known.stands));
     let clear = cell.known.map(|known| (known.clear, known.said_clear, known.asked_clear));
     let memory = (cell.worse.min(1), cell.repeated, cell.previous.is_some(), cell.passes >= cell.plan.max_cycles);
-    let memory = (memory, cell.hold_due.is_some(), cell.doubted);
+    let grinds = cell.state().phase().and_then(Phase::moving) == Some(Device::Grinder);
+    let memory = (memory, cell.hold_due.is_some(), grinds && cell.doubted);
     (cell.state, known, clear, cell.causes.is_empty(), memory, cell.plan.on_stall == Disposal::Hold)
 }
 

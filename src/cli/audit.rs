@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
 use regrind::journal::{Anchor, JournalError, Kind, Reader, Record, Verified, verify, verify_against};
-use regrind::report::words;
+use regrind::report::{RUN_REPORT, run_report, words};
 use serde_json::{Value, json};
 
 use super::Outcome;
@@ -40,7 +40,8 @@ found only with --anchor and a copy of journal.anchor that was kept elsewhere.
 Example:
   regrind audit verify runs/freeform-mirror-20260704T120000Z --anchor /mnt/quality/SN-0042.anchor
 
-Exit codes: 0 sound; 1 broken: the first record that cannot be believed is named; 2 no such run, or no record in it.")]
+Exit codes: 0 sound, and closed or under way; 1 broken: the first record that cannot be believed is named, or the run broke
+off, or its anchor is missing; 2 no such run, or no record in it.")]
 struct ToVerify {
     /// Folder of the run
     #[arg(value_name = "RUN")]
@@ -129,12 +130,32 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
         super::print_json(&json!({
             "run": folder, "simulation": begin["simulation"], "sound": true, "records": verified.records,
             "head": verified.head, "anchored": verified.anchored, "closed": verified.closed,
-            "artefacts": verified.artefacts,
+            "under_way": verified.under_way, "artefacts": verified.artefacts, "unrecorded": verified.unrecorded,
         }))?;
     } else {
         super::print(&sound(&folder, &begin, &verified))?;
     }
-    Ok(Outcome::Accepted)
+    let lacks = match &verified {
+        Verified { anchored: 0, .. } => "journal.anchor is missing: whether its end was cut off cannot be told",
+        Verified { closed: false, under_way: false, .. } => {
+            "the run broke off: nobody drives it, and it has no end; what happened behind its last record is not known"
+        }
+        _ => return Ok(Outcome::Accepted),
+    };
+    Err(Failure::NotWhole { run: folder, lacks })
+}
+
+/// Says what else lies in the folder of a run, of which its record knows nothing.
+fn beside(folder: &Path, unrecorded: &[String]) -> String {
+    let report = |name: &&String| **name == RUN_REPORT;
+    let edited = unrecorded.iter().any(|name| report(&name))
+        && std::fs::read_to_string(folder.join(RUN_REPORT)).ok() != run_report(folder).ok();
+    let report = if edited { "report      report.html is not what the record gives\n" } else { "" };
+    let others: Vec<&str> = unrecorded.iter().filter(|name| *name != RUN_REPORT).map(String::as_str).collect();
+    match others.len() {
+        0 => report.to_owned(),
+        _ => format!("{report}beside      not on record: {}\n", others.join(", ")),
+    }
 }
 
 fn read_anchor(path: &Path) -> Result<Anchor, Failure> {
@@ -154,7 +175,7 @@ fn mark(begin: &Value) -> &'static str {
 }
 
 fn sound(folder: &Path, begin: &Value, verified: &Verified) -> String {
-    let Verified { records, head, anchored, closed, artefacts, .. } = verified;
+    let Verified { records, head, anchored, closed, artefacts, unrecorded, .. } = verified;
     let records = super::words::counted(*records as usize, "record");
     let files = super::words::counted(*artefacts as usize, "file");
     let end = match (closed, anchored) {
@@ -167,9 +188,10 @@ fn sound(folder: &Path, begin: &Value, verified: &Verified) -> String {
         }
     };
     format!(
-        "{}{}\nsound       {records} in an unbroken chain, {files} unchanged\nend         {end}\nhead        {head}\n",
+        "{}{}\nsound       {records} in an unbroken chain, {files} unchanged\nend         {end}\nhead        {head}\n{}",
         mark(begin),
-        folder.display()
+        folder.display(),
+        beside(folder, unrecorded)
     )
 }
 

@@ -64,6 +64,8 @@ pub(super) enum Failure {
     /// The record was read and cannot be believed.
     #[error(transparent)]
     Broken(JournalError),
+    #[error("{}: the record is not whole: {lacks}", .run.display())]
+    NotWhole { run: PathBuf, lacks: &'static str },
     #[error("{path}: {reason}; give a copy of the journal.anchor of this run")]
     Anchor { path: PathBuf, reason: String },
     #[error(transparent)]
@@ -119,7 +121,9 @@ impl Failure {
                 source: MakingError::Line { .. } | MakingError::NoPort { .. }, ..
             })
             | Self::Ended { .. } => FAULT,
-            Self::Broken(_) | Self::Report(ReportError::Record(JournalError::Broken { .. })) => NOT_AS_IT_SHOULD_BE,
+            Self::Broken(_)
+            | Self::NotWhole { .. }
+            | Self::Report(ReportError::Record(JournalError::Broken { .. })) => NOT_AS_IT_SHOULD_BE,
             _ => BAD_INPUT,
         }
     }

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::artefact::{Artefact, describe, path_within};
 use super::error::JournalError;
 use super::record::{Kind, Record};
-use super::{ANCHOR, Reader};
+use super::{ANCHOR, DATABASE, LOCK, Reader};
 
 /// How long the journal was at some time, and the hash of its last record then. Kept elsewhere it proves that nothing was cut.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -36,6 +36,10 @@ pub struct Verified {
     pub artefacts: u64,
     /// The numbers of the commands without an outcome.
     pub open_intents: Vec<u32>,
+    /// Whether a process drives the run now, so that its end is still to come.
+    pub under_way: bool,
+    /// Files of the folder that stand in no record, in order; the journal's own left out.
+    pub unrecorded: Vec<String>,
 }
 
 /// Verifies the journal of a run folder, the files on record, and the anchor beside it.
@@ -82,6 +86,7 @@ struct Seen<'a> {
     head: String,
     closed: bool,
     artefacts: u64,
+    names: BTreeSet<String>,
     last_intent: Option<u32>,
     open: BTreeSet<u32>,
     answered: BTreeSet<u32>,
@@ -90,8 +95,9 @@ struct Seen<'a> {
 fn examine(folder: &Path, anchor: Option<&Anchor>) -> Result<Verified, JournalError> {
     let reader = Reader::open(folder)?;
     let head = "0".repeat(64);
-    let (open, answered) = (BTreeSet::new(), BTreeSet::new());
-    let mut seen = Seen { folder, records: 0, head, closed: false, artefacts: 0, last_intent: None, open, answered };
+    let (names, open, answered) = (BTreeSet::new(), BTreeSet::new(), BTreeSet::new());
+    let mut seen =
+        Seen { folder, records: 0, head, closed: false, artefacts: 0, names, last_intent: None, open, answered };
     let mut anchored = 0;
     for record in reader.records(0) {
         seen.take(&record?)?;
@@ -114,8 +120,35 @@ fn examine(folder: &Path, anchor: Option<&Anchor>) -> Result<Verified, JournalEr
             format!("{} records were written, and {} are there: the end was cut off", anchor.records, seen.records);
         return Err(broken(folder, seen.records + 1, what));
     }
-    let Seen { records, head, closed, artefacts, open, .. } = seen;
-    Ok(Verified { records, head, anchored, closed, artefacts, open_intents: open.into_iter().collect() })
+    let Seen { records, head, closed, artefacts, names, open, .. } = seen;
+    let mut unrecorded = Vec::new();
+    files_below(folder, "", &mut unrecorded)?;
+    unrecorded.retain(|name| !names.contains(name));
+    unrecorded.sort();
+    let open_intents = open.into_iter().collect();
+    let under_way = is_driven(folder);
+    Ok(Verified { records, head, anchored, closed, artefacts, open_intents, under_way, unrecorded })
+}
+
+/// Whether somebody holds the lock of a run folder.
+fn is_driven(folder: &Path) -> bool {
+    let lock = fs::File::open(folder.join(LOCK));
+    lock.is_ok_and(|lock| matches!(lock.try_lock_shared(), Err(fs::TryLockError::WouldBlock)))
+}
+
+/// Finds the files in a run folder, by their paths from it; those of the journal itself are left out, and what is no file.
+fn files_below(folder: &Path, below: &str, found: &mut Vec<String>) -> Result<(), JournalError> {
+    let at = folder.join(below);
+    for entry in fs::read_dir(&at).map_err(JournalError::file(&at, "looking into it"))? {
+        let entry = entry.map_err(JournalError::file(&at, "looking into it"))?;
+        let name = format!("{below}{}", entry.file_name().to_string_lossy());
+        match entry.file_type().map_err(JournalError::file(&at, "looking into it"))? {
+            kind if kind.is_dir() => files_below(folder, &format!("{name}/"), found)?,
+            kind if kind.is_file() && !name.starts_with(DATABASE) && name != ANCHOR && name != LOCK => found.push(name),
+            _ => {}
+        }
+    }
+    Ok(())
 }
 
 impl Seen<'_> {
@@ -187,6 +220,7 @@ impl Seen<'_> {
             return wrong(format!("the file {} is not what was written", known.name));
         }
         self.artefacts += 1;
+        self.names.insert(known.name);
         Ok(())
     }
 }

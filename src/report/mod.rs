@@ -32,7 +32,7 @@ pub use colour::ColourMap;
 pub use heat_map::HeatMap;
 pub use plot::{Axis, Plot, Series};
 pub use ply::{coloured_ply, save_coloured_ply};
-pub use run::write_run_report;
+pub use run::{RUN_REPORT, run_report, write_run_report};
 pub use states::state_picture;
 pub use words::{ending_words, words};
 

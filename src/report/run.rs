@@ -21,7 +21,7 @@ use crate::formats::{FormatError, escaped, write_atomic};
 use crate::journal::{Kind, Reader, Record, Verified, verify};
 
 /// The report in a run folder.
-const RUN_REPORT: &str = "report.html";
+pub const RUN_REPORT: &str = "report.html";
 
 /// The picture of a cycle.
 const PICTURE: &str = "error_map.png";
@@ -65,14 +65,22 @@ struct CycleStory {
 /// # Errors
 /// A record that is not there or cannot be believed, a picture that cannot be read, a folder that cannot be written.
 pub fn write_run_report(folder: &Path) -> Result<PathBuf, ReportError> {
+    let path = folder.join(RUN_REPORT);
+    write_atomic(&path, run_report(folder)?.as_bytes())?;
+    Ok(path)
+}
+
+/// Makes the report of a run from its record.
+///
+/// # Errors
+/// A record that cannot be believed, a picture that cannot be read.
+pub fn run_report(folder: &Path) -> Result<String, ReportError> {
     let verified = verify(folder)?;
     let mut story = Story::default();
     for record in Reader::open(folder)?.records(0).take(verified.records as usize) {
         story.take(record?);
     }
-    let path = folder.join(RUN_REPORT);
-    write_atomic(&path, story.html(folder, &verified)?.as_bytes())?;
-    Ok(path)
+    story.html(folder, &verified)
 }
 
 impl Story {

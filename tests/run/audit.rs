@@ -152,6 +152,36 @@ fn a_broken_record_is_named_and_ends_with_1() {
 }
 
 #[test]
+fn a_record_without_its_anchor_or_its_end_is_not_whole_and_ends_with_1() {
+    let (home, folder) = recorded(true);
+    fs::remove_file(folder.join("journal.anchor")).unwrap();
+    assert!(refused(home.path(), &["audit", "verify"], 1).contains("journal.anchor is missing"));
+
+    // The end was cut off and the anchor rewritten to fit.
+    let (home, folder) = recorded(true);
+    let database = rusqlite::Connection::open(folder.join("journal.sqlite")).unwrap();
+    database.execute_batch("DROP TRIGGER record_is_not_deleted; DELETE FROM record WHERE seq > 12").unwrap();
+    let head: String = database.query_row("SELECT hash FROM record WHERE seq = 12", [], |row| row.get(0)).unwrap();
+    drop(database);
+    fs::write(folder.join("journal.anchor"), json!({ "records": 12, "head": head }).to_string()).unwrap();
+    assert!(refused(home.path(), &["audit", "verify"], 1).contains("the run broke off"));
+}
+
+#[test]
+fn what_lies_beside_the_record_is_told() {
+    let (home, folder) = recorded(true);
+    printed(home.path(), &["report"], 0);
+    let words = printed(home.path(), &["audit", "verify"], 0);
+    assert!(!words.contains("beside") && !words.contains("report.html"), "{words}");
+    fs::write(folder.join("cycle-2/more.csv"), "1,2,3\n").unwrap();
+    let html = fs::read_to_string(folder.join("report.html")).unwrap();
+    fs::write(folder.join("report.html"), html.replace("0.812", "0.212")).unwrap();
+    let words = printed(home.path(), &["audit", "verify"], 0);
+    assert!(words.contains("not on record: cycle-2/more.csv"), "{words}");
+    assert!(words.contains("report.html is not what the record gives"), "{words}");
+}
+
+#[test]
 fn folders_without_a_record_end_with_2() {
     let home = tempfile::tempdir().unwrap();
     for what in ["verify", "show", "export"] {
