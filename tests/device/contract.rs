@@ -1,0 +1,305 @@
+//! docs/modbus.md held against the wire: its registers and, to the last digit, its test vectors. A driver works off a job against a
+//! simulated machine, and what it sent and was answered has to be what the page says.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use regrind::device::{
+    Cmm, CorrectionMap, Grinder, Identified, Interrupt, Job, Line, Machine as _, ModbusCmm, ModbusGrinder,
+    ModbusSettings, Outcome, Plan, PointStatus, RegisterMap, State, Status, Target, TargetKind, WordOrder, digest,
+};
+use regrind::geometry::Grid;
+use regrind_sim::body::Kind;
+use regrind_sim::command::{Command, Frame};
+use regrind_sim::options::MachineOptions;
+use regrind_sim::payload::{self, PointRecord, encode_points};
+use regrind_sim::registers::Machine;
+use regrind_sim::words::{self, bytes_of, crc16, registers_of, turn_payload};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+
+use crate::toy::{Toy, pass};
+
+const PAGE: &str = include_str!("../../docs/modbus.md");
+
+/// Time that passes at the machine with every request.
+const TURN: Duration = Duration::from_millis(50);
+
+const OWNER: u32 = 0x12ab_34cd;
+const BOOT_ID: u32 = 0x4a6f_6231;
+/// The number that the machine has acknowledged before the client comes.
+const NUMBER_BEFORE: u32 = 0x0001_0001;
+const JOB: u32 = 70_001;
+const CYCLE: u16 = 3;
+
+// ---- the page -----------------------------------------------------------------------------------------------------------------------
+
+/// The frames of the page by their names: the fenced blocks of hexadecimal digits.
+fn vectors() -> BTreeMap<String, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    let mut lines = PAGE.lines();
+    while let Some(line) = lines.next() {
+        let Some(name) = line.strip_prefix("```hex ") else { continue };
+        let digits = lines.by_ref().take_while(|line| *line != "```").flat_map(str::split_whitespace);
+        let bytes = digits.map(|byte| u8::from_str_radix(byte, 16).unwrap()).collect();
+        assert!(found.insert(name.to_owned(), bytes).is_none(), "{name} stands there twice");
+    }
+    found
+}
+
+/// The cells of a row of a table; none of another line.
+fn cells(line: &str) -> Vec<&str> {
+    let row = line.strip_prefix("| ").and_then(|line| line.strip_suffix(" |"));
+    row.map(|row| row.split(" | ").collect()).unwrap_or_default()
+}
+
+// ---- the wire -----------------------------------------------------------------------------------------------------------------------
+
+/// Every request and every answer, as Modbus TCP carries them, each as the first transaction.
+type Record = Arc<Mutex<Vec<Vec<u8>>>>;
+
+/// Serves a machine to one client and keeps what goes over the wire.
+async fn record(machine: Machine, word_order: WordOrder) -> (ModbusSettings, Record) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let port = listener.local_addr().unwrap().port();
+    let record = Record::default();
+    let kept = Arc::clone(&record);
+    tokio::spawn(async move {
+        let (client, _) = listener.accept().await.unwrap();
+        serve(client, machine, &kept).await;
+    });
+    let settings = ModbusSettings {
+        registers: RegisterMap { word_order, ..RegisterMap::default() },
+        request_timeout: Duration::from_secs(30),
+        owner: OWNER,
+        epoch: 7,
+        ..ModbusSettings::new(Line::Tcp { host: "127.0.0.1".into(), port })
+    };
+    (settings, record)
+}
+
+async fn serve(mut client: TcpStream, mut machine: Machine, record: &Record) {
+    let mut head = [0; 7];
+    while client.read_exact(&mut head).await.is_ok() {
+        let mut asked = vec![0; usize::from(u16::from_be_bytes([head[4], head[5]])) - 1];
+        client.read_exact(&mut asked).await.unwrap();
+        machine.tick(TURN);
+        let answer = answer(&mut machine, &asked);
+        record.lock().unwrap().extend([tcp(&asked), tcp(&answer)]);
+        let mut sent = tcp(&answer);
+        sent[..2].copy_from_slice(&head[..2]);
+        client.write_all(&sent).await.unwrap();
+    }
+}
+
+fn answer(machine: &mut Machine, asked: &[u8]) -> Vec<u8> {
+    let word = |at: usize| u16::from_be_bytes([asked[at], asked[at + 1]]);
+    match asked[0] {
+        3 => {
+            let bytes = bytes_of(&machine.read(word(1), word(3)).unwrap());
+            [&[3, bytes.len() as u8], &bytes[..]].concat()
+        }
+        16 => {
+            machine.write(word(1), &registers_of(&asked[6..])).unwrap();
+            asked[..5].to_vec()
+        }
+        other => panic!("function {other}"),
+    }
+}
+
+/// The frame of Modbus TCP: transaction 1, unit 1.
+fn tcp(pdu: &[u8]) -> Vec<u8> {
+    [&[0, 1, 0, 0, 0, pdu.len() as u8 + 1, 1], pdu].concat()
+}
+
+/// The frame of Modbus RTU for what a frame of Modbus TCP carries.
+fn rtu(tcp: &[u8]) -> Vec<u8> {
+    [&tcp[6..], &crc16(&tcp[6..]).to_le_bytes()].concat()
+}
+
+// ---- what is sent -------------------------------------------------------------------------------------------------------------------
+
+fn plan() -> Plan {
+    let target =
+        Target { index: 70_000, what: TargetKind::Part, point_mm: [1.1, -2.3, 0.7], normal: [0.0, 0.0, 1.0] };
+    Plan {
+        targets: vec![target],
+        probe_radius_mm: 2.0,
+        approach_mm: 1.0,
+        search_mm: 0.5,
+        speed_mm_s: 4.0,
+        safe_height_mm: 8.0,
+    }
+}
+
+fn map() -> CorrectionMap {
+    CorrectionMap {
+        grid: Grid { columns: 3, rows: 2, first_mm: [-10.0, -15.0], spacing_mm: [10.0, 30.0] },
+        values_mm: vec![0.0012, -0.0025, 0.0003, 0.0, 0.0021, -0.0004],
+        part_identity: [7; 32],
+    }
+}
+
+/// A machine to which a stranger has spoken, so that the numbers of its client fill both words.
+fn machine(kind: Kind, word_order: words::WordOrder) -> Machine {
+    let options = MachineOptions { word_order, ..MachineOptions::default() };
+    let mut machine = Machine::new(Box::new(Toy::new(kind, 1e9)), BOOT_ID, options);
+    let stranger = Frame { sequence: NUMBER_BEFORE, command: Command::Release as u16, owner: 1, ..Frame::default() };
+    machine.write(40, &stranger.registers(word_order)).unwrap();
+    machine
+}
+
+/// What goes over the wire while a point is measured.
+async fn measured(order: WordOrder, sim_order: words::WordOrder) -> Vec<Vec<u8>> {
+    let (settings, record) = record(machine(Kind::Cmm, sim_order), order).await;
+    let (mut cmm, plan, calm) = (ModbusCmm::new(settings).unwrap(), plan(), Interrupt::new());
+    let job = Job { job: JOB, cycle: CYCLE, digest: digest(&[plan.identity()]) };
+    cmm.connect().await.unwrap();
+    cmm.claim().await.unwrap();
+    cmm.load_plan(&plan, &calm).await.unwrap();
+    let armed = cmm.prepare(job).await.unwrap();
+    assert_eq!(armed.start_sequence, NUMBER_BEFORE + 3);
+    cmm.start(armed).await.unwrap();
+    let status = complete(&mut cmm).await;
+    assert_eq!((status.job, status.done, status.outcome), (Some(job), NUMBER_BEFORE + 3, Outcome::Complete));
+    assert_eq!((status.clear_of_part, status.supplies, status.progress), (Some(true), Some(true), Some((1, 1))));
+    assert_eq!((status.temperature_c, status.boot_id), (Some(20.25), Some(BOOT_ID)));
+    let points = cmm.collect(job, &calm).await.unwrap().points;
+    assert_eq!((points.len(), points[0].index, points[0].status), (1, 70_000, PointStatus::Touched));
+    assert_eq!(points[0].at_mm, [1.1, -2.3, 2.7]);
+    record.lock().unwrap().clone()
+}
+
+async fn complete(cmm: &mut ModbusCmm) -> Status {
+    for _ in 0..200 {
+        let status = cmm.status().await.unwrap();
+        if status.state == State::Complete {
+            return status;
+        }
+        tokio::time::sleep(Duration::from_millis(2)).await;
+    }
+    panic!("the job does not end");
+}
+
+/// What goes over the wire while a map and a pass are handed over.
+async fn handed_over(order: WordOrder, sim_order: words::WordOrder) -> Vec<Vec<u8>> {
+    let (settings, record) = record(machine(Kind::Grinder, sim_order), order).await;
+    let mut grinder = ModbusGrinder::new(settings).unwrap();
+    grinder.connect().await.unwrap();
+    grinder.load_pass(&map(), &pass(), &Interrupt::new()).await.unwrap();
+    record.lock().unwrap().clone()
+}
+
+/// The answer to a look at the status with the snapshot number and the beats of the page, which are as it happens.
+fn as_on_the_page(frame: &[u8]) -> Vec<u8> {
+    let mut frame = frame.to_vec();
+    if frame.len() == 9 + 96 && frame[7..9] == [3, 96] {
+        for (register, value) in [(0, 0x0102_u16), (28, 0x0345), (29, 0x0019), (47, 0x0102)] {
+            frame[9 + 2 * register..][..2].copy_from_slice(&value.to_be_bytes());
+        }
+    }
+    frame
+}
+
+/// The pieces of the page that stand in one word order, and those that stand in both.
+const TURNED: [&str; 5] = ["claim", "status", "header", "page", "point"];
+const UNTURNED: [&str; 7] = [
+    "claim.answer",
+    "status.request",
+    "header.answer",
+    "page.answer",
+    "select.request",
+    "select.answer",
+    "point.request",
+];
+
+#[tokio::test]
+async fn the_frames_of_the_page_are_those_on_the_wire() {
+    let page = vectors();
+    let mut looked_at = BTreeSet::new();
+    for (name, order, sim_order) in
+        [("big", WordOrder::Big, words::WordOrder::Big), ("little", WordOrder::Little, words::WordOrder::Little)]
+    {
+        let mut sent = measured(order, sim_order).await;
+        sent.extend(handed_over(order, sim_order).await);
+        let sent: BTreeSet<_> = sent.iter().map(|frame| as_on_the_page(frame)).collect();
+        let names = TURNED.map(|frame| format!("{frame}.{name}")).into_iter().chain(UNTURNED.map(str::to_owned));
+        for name in names {
+            let [of_tcp, of_rtu] = ["tcp", "rtu"].map(|wire| format!("{name}.{wire}"));
+            assert!(sent.contains(&page[&of_tcp]), "{of_tcp} was not on the wire: {:02X?}", page[&of_tcp]);
+            assert_eq!(page[&of_rtu], rtu(&page[&of_tcp]), "{of_rtu}");
+            looked_at.extend([of_tcp, of_rtu]);
+        }
+        looked_at.insert(format!("count.{name}"));
+        assert_eq!(page[&format!("count.{name}")], point_in_counts(sim_order), "count.{name}");
+    }
+    assert_eq!(looked_at, page.into_keys().collect(), "frames that are looked at, and frames of the page");
+}
+
+fn point_record() -> PointRecord {
+    PointRecord { index: 70_000, status: payload::Status::Touched, quality: 0, position_mm: [1.1, -2.3, 2.7] }
+}
+
+fn point_in_counts(order: words::WordOrder) -> Vec<u8> {
+    let mut bytes = encode_points(&[point_record()], Some(1e-6));
+    if order == words::WordOrder::Little {
+        turn_payload(4, 2, &mut bytes);
+    }
+    bytes
+}
+
+#[test]
+fn the_check_numbers_in_the_text_are_those_of_the_frames() {
+    let page = vectors();
+    let mut told = vec![
+        format!("digest 0x{:08X}", digest(&[plan().identity()])),
+        format!("identity `{}`", map().identity().map(|byte| format!("{byte:02x}")).concat()),
+        format!("`123456789` gives 0x{:08X}", crc32fast::hash(b"123456789")),
+        format!("`123456789` gives 0x{:04X}", crc16(b"123456789")),
+    ];
+    for (name, order) in [("big", words::WordOrder::Big), ("little", words::WordOrder::Little)] {
+        let of = |frame: &str| &page[&format!("{frame}.{name}.tcp")];
+        told.push(format!("0x{}", of("claim")[13 + 32..][..2].iter().map(|b| format!("{b:02X}")).collect::<String>()));
+        told.push(format!("0x{:08X}", crc32fast::hash(&of("page")[13 + 16..])));
+        let mut point = encode_points(&[point_record()], None);
+        if order == words::WordOrder::Little {
+            turn_payload(4, 1, &mut point);
+        }
+        assert_eq!(of("point")[9 + 8..], point, "{name}");
+        told.push(format!("0x{:08X}", crc32fast::hash(&point)));
+    }
+    for told in told {
+        assert!(PAGE.contains(&told), "the page does not say {told}");
+    }
+}
+
+#[test]
+fn the_blocks_of_the_page_are_those_of_the_driver() {
+    let told: Vec<_> = PAGE.lines().map(cells).filter(|cells| cells.len() == 5).collect();
+    for (name, first, registers) in RegisterMap::default().blocks() {
+        let row = [name.replace('_', " "), first.to_string(), (40_001 + first).to_string(), registers.to_string()];
+        assert!(told.iter().any(|cells| cells[..4] == row), "{row:?}");
+    }
+}
+
+#[test]
+fn the_second_number_of_every_register_is_40001_more_than_its_address() {
+    let blocks = RegisterMap::default().blocks();
+    let (mut first, mut rows) = (None, 0);
+    for cells in PAGE.lines().map(cells) {
+        match (cells.first(), cells.get(1).map(|cell| cell.parse::<u16>())) {
+            (Some(&"offset"), _) => first = None,
+            (Some(offset), Some(Ok(number))) if cells.len() == 4 && number > 40_000 => {
+                let offset: u16 = offset.parse().unwrap();
+                let base = *first.get_or_insert(number - 40_001);
+                let (_, _, registers) = blocks.iter().find(|(_, first, _)| *first == base).unwrap();
+                assert_eq!(number, 40_001 + base + offset);
+                assert!(offset < *registers, "{number}");
+                rows += 1;
+            }
+            _ => {}
+        }
+    }
+    assert!(rows > 70, "only {rows} registers");
+}
