@@ -2,7 +2,8 @@
 //! simulated machine, and what it sent and was answered has to be what the page says.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::{Arc, Mutex};
+use std::path::Path;
+use std::sync::{Arc, LazyLock, Mutex};
 use std::time::Duration;
 
 use regrind::device::{
@@ -21,7 +22,8 @@ use tokio::net::{TcpListener, TcpStream};
 
 use crate::toy::{Toy, pass};
 
-const PAGE: &str = include_str!("../../docs/modbus.md");
+static PAGE: LazyLock<String> =
+    LazyLock::new(|| std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/modbus.md")).unwrap());
 
 /// Time that passes at the machine with every request.
 const TURN: Duration = Duration::from_millis(50);
@@ -121,8 +123,7 @@ fn rtu(tcp: &[u8]) -> Vec<u8> {
 // ---- what is sent -------------------------------------------------------------------------------------------------------------------
 
 fn plan() -> Plan {
-    let target =
-        Target { index: 70_000, what: TargetKind::Part, point_mm: [1.1, -2.3, 0.7], normal: [0.0, 0.0, 1.0] };
+    let target = Target { index: 70_000, what: TargetKind::Part, point_mm: [1.1, -2.3, 0.7], normal: [0.0, 0.0, 1.0] };
     Plan {
         targets: vec![target],
         probe_radius_mm: 2.0,
@@ -269,8 +270,9 @@ fn the_check_numbers_in_the_text_are_those_of_the_frames() {
         assert_eq!(of("point")[9 + 8..], point, "{name}");
         told.push(format!("0x{:08X}", crc32fast::hash(&point)));
     }
+    let text = PAGE.split_whitespace().collect::<Vec<_>>().join(" ");
     for told in told {
-        assert!(PAGE.contains(&told), "the page does not say {told}");
+        assert!(text.contains(&told), "the page does not say {told}");
     }
 }
 
