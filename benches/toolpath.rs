@@ -106,7 +106,7 @@ fn write(path: &ToolPath, summary: &Summary, file: &Path) {
         mode: PathMode::Blend,
         path_tolerance_mm: 1e-4,
     };
-    write_program(file, &header, summary, &path.moves_by_track()).expect("a program");
+    write_program(file, &header, summary, path).expect("a program");
 }
 
 /// All together: 28,476 deviations, their map, what they tell, the correction, the path and its program of a million points.

@@ -89,7 +89,7 @@ impl Programs {
     /// Those of [`Programs::path`], and a file that cannot be written.
     pub fn write(&self, file: &Path, correction: &Correction, map_identity: [u8; 32]) -> Result<Summary, ProgramError> {
         let (path, summary) = self.path(correction)?;
-        self.write_path(file, correction, map_identity, &path, &summary)?;
+        self.write_program(file, correction, map_identity, &path, &summary)?;
         Ok(summary)
     }
 
@@ -106,7 +106,7 @@ impl Programs {
             let error = ProgramError::TooLong { points: summary.points };
             return Ok(Some(format!("there is no {PROGRAM_FILE}: {error}")));
         }
-        self.write_path(&files.place(PROGRAM_FILE), correction, map_identity, &path, &summary)?;
+        self.write_program(&files.place(PROGRAM_FILE), correction, map_identity, &path, &summary)?;
         match self.keep_table(&files.place(TABLE_FILE), correction, map_identity, &path) {
             Ok(()) => Ok(None),
             Err(ProgramError::Path(error)) => Ok(Some(format!("there is no {TABLE_FILE}: {error}"))),
@@ -129,7 +129,7 @@ impl Programs {
         Ok(())
     }
 
-    fn write_path(
+    fn write_program(
         &self,
         file: &Path,
         correction: &Correction,
@@ -151,7 +151,7 @@ impl Programs {
             mode: self.mode,
             path_tolerance_mm: self.path_tolerance_mm,
         };
-        Ok(write_program(file, &header, summary, &path.moves_by_track())?)
+        Ok(write_program(file, &header, summary, path)?)
     }
 }
 

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use super::number::{LARGEST_MM, push_fixed, rounded, short};
 use super::{GcodeError, hex};
 use crate::registration::Draft;
-use regrind_core::compensation::path::{Move, PathMode, Summary};
+use regrind_core::compensation::path::{Move, PathMode, Summary, ToolPath};
 
 /// Bytes that are gathered before they go to the file.
 const CHUNK: usize = 1 << 16;
@@ -55,7 +55,16 @@ pub struct ProgramHeader {
 ///
 /// # Errors
 /// A coordinate that is not finite or beyond a kilometre; a number of moves other than the summary has; a file that cannot be written.
-pub fn write_program<T>(path: &Path, header: &ProgramHeader, summary: &Summary, tracks: &[T]) -> Result<(), GcodeError>
+pub fn write_program(
+    file: &Path,
+    header: &ProgramHeader,
+    summary: &Summary,
+    path: &ToolPath,
+) -> Result<(), GcodeError> {
+    write_tracks(file, header, summary, &path.moves_by_track())
+}
+
+fn write_tracks<T>(path: &Path, header: &ProgramHeader, summary: &Summary, tracks: &[T]) -> Result<(), GcodeError>
 where
     T: Iterator<Item = Move> + Clone + Sync,
 {
@@ -278,7 +287,7 @@ mod tests {
         };
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("part.ngc");
-        write_program(&file, &header, &summary, tracks)?;
+        write_tracks(&file, &header, &summary, tracks)?;
         let text = std::fs::read_to_string(file).unwrap();
         Ok(text[text.find("G54").unwrap()..].to_owned())
     }
