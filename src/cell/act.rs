@@ -467,9 +467,9 @@ impl Cell {
     /// A machine moves while the cell shows that it stands: it is told to hold, and a person is told.
     pub(super) fn moves_unasked(&mut self, phase: Phase, device: Device) {
         let told = self.raised.contains(&AlarmId::MovesUnasked);
-        if phase.job().map(|(job, _)| job) == Some(device) {
-            let run = Phase::of(device, JobStep::Run);
-            self.go(if matches!(self.state, Held(_)) { Holding(run) } else { Suspending(run) });
+        if phase.moving() == Some(device) {
+            // That it goes on is then a person's decision, whatever it was suspended for.
+            self.go(Holding(Phase::of(device, JobStep::Run)));
         } else if told {
             return;
         }

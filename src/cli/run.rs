@@ -210,13 +210,15 @@ async fn heed_ctrl_c(orders: Orders, actor: Actor) {
 
 /// What ends a program from outside: a terminal that is closed, a service that is stopped.
 struct Signals {
-    hangup: Signal,
+    /// None where whoever started the program wants it to outlive its terminal (`nohup`).
+    hangup: Option<Signal>,
     terminate: Signal,
 }
 
 impl Signals {
     fn new() -> io::Result<Self> {
-        Ok(Self { hangup: signal(SignalKind::hangup())?, terminate: signal(SignalKind::terminate())? })
+        let hangup = if ignores_hangup() { None } else { Some(signal(SignalKind::hangup())?) };
+        Ok(Self { hangup, terminate: signal(SignalKind::terminate())? })
     }
 
     /// The first ends the run in order, the next one aborts it. A terminal that closes may say so twice.
@@ -225,7 +227,9 @@ impl Signals {
         loop {
             let (name, hung_up) = tokio::select! {
                 Some(()) = self.terminate.recv() => ("SIGTERM", false),
-                Some(()) = self.hangup.recv() => ("SIGHUP, the terminal was closed", true),
+                Some(()) = async { self.hangup.as_mut()?.recv().await }, if self.hangup.is_some() => {
+                    ("SIGHUP, the terminal was closed", true)
+                }
                 else => return,
             };
             let reason = name.to_owned();
@@ -238,6 +242,13 @@ impl Signals {
             orders.give(request, actor.clone()).await;
         }
     }
+}
+
+/// Whether SIGHUP, the first signal, is ignored by who started this program.
+fn ignores_hangup() -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).is_some_and(|mask| mask & 1 == 1)
 }
 
 /// Whether the machines of a cell are simulated in this process: only there a port may be left open.

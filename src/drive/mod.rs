@@ -343,7 +343,19 @@ impl Drive {
         let Some(Waiting { then, .. }) = self.backlog.pop_front() else { return };
         match recorded {
             Ok(()) => self.failing = None,
-            Err(why) => return self.record_failed(why).await,
+            Err(why) => {
+                let reason = message_of(&why);
+                match then {
+                    Then::Execute(command) => self.not_carried_out(*command).await,
+                    Then::Answer { answer, message, .. } => {
+                        let message = format!("{message}; it is not on record, {reason}");
+                        drop(answer.send(Reply { accepted: false, message, status: self.snapshot() }));
+                    }
+                    Then::Confirm { answer, .. } => drop(answer.send(Err(format!("it is not on record: {reason}")))),
+                    Then::Nothing => {}
+                }
+                return self.record_failed(why).await;
+            }
         }
         match then {
             Then::Nothing => {}
@@ -360,7 +372,7 @@ impl Drive {
     /// Tells of a START that it was not given: the cell has come elsewhere while it waited to be on record.
     async fn not_carried_out(&mut self, command: Command) {
         if let Command::StartMachine { device, .. } = command {
-            let why = "it was not given: the cell was held before it was on record".to_owned();
+            let why = "it was not given: it was not on record, or the cell was held before it was".to_owned();
             self.take(Event::Refused { device, what: Asked::Start, why }, None).await;
         }
     }

@@ -6,8 +6,11 @@ use crate::device::{Job, Outcome, Pass, PassRecord};
 
 /// Share of its stated radius by which a wheel may differ from the recipe's: wear and dressing, not another wheel.
 const WHEEL_SHARE: f64 = 0.01;
-/// Least share of the tracks' length that a pass travels: an aperture leaves corners out.
-const LEAST_PATH_SHARE: f64 = 0.5;
+/// Least share of the tracks over the whole rectangle that a pass travels: an aperture leaves corners and holes out.
+const LEAST_PATH_SHARE: f64 = 0.25;
+/// What a pass may have taken off beyond the most that it is planned with: scatter, and the rounding of who measured it.
+const DEPTH_SHARE: f64 = 1.05;
+const DEPTH_SLACK_MM: f64 = 0.01;
 
 /// What a pass was to be.
 pub(super) struct Told<'t> {
@@ -50,9 +53,10 @@ pub(super) fn flaw(told: &Told, record: &PassRecord) -> Option<String> {
     let measured_s = record.duration_s.filter(|_| record.path_mm.is_some());
     let wheel = [1.0 - WHEEL_SHARE, 1.0 + WHEEL_SHARE].map(|share| share * pass.wheel_radius_mm);
     let any = f64::INFINITY;
+    let most_mm = DEPTH_SHARE * largest_depth_mm + DEPTH_SLACK_MM;
     range(record.path_mm, "the path travelled", least_path_mm, any, "mm")
         .or_else(|| range(measured_s, "its duration", least_s, any, "s"))
-        .or_else(|| range(record.deepest_mm, "the largest depth taken off", -any, *largest_depth_mm, "mm"))
+        .or_else(|| range(record.deepest_mm, "the largest depth taken off", -any, most_mm, "mm"))
         .or_else(|| range(record.wheel_radius_mm, "the radius of the wheel", wheel[0], wheel[1], "mm"))
         .or_else(|| range(record.removed_mm3, "the volume removed", 0.0, any, "mm3"))
         .or_else(|| range(record.idle_share, "the share of the path that cut nothing", 0.0, 1.0, ""))
@@ -120,16 +124,16 @@ mod tests {
             (PassRecord { map_identity: [4; 32], ..record() }, "map 04040404 was ground, and 03030303 was handed over"),
             (PassRecord { job: 40, ..record() }, "it is of job 40, cycle 2; 41, 2 was ground"),
             (PassRecord { cycle: 1, ..record() }, "it is of job 41, cycle 1; 41, 2 was ground"),
-            (PassRecord { deepest_mm: Some(3.0), ..record() }, "3.000 mm, and at most 0.500 mm are allowed"),
+            (PassRecord { deepest_mm: Some(3.0), ..record() }, "3.000 mm, and at most 0.535 mm are allowed"),
             (
                 PassRecord { path_mm: Some(-1.0), ..record() },
-                "the path travelled is -1.000 mm, and at least 6324.000 mm",
+                "the path travelled is -1.000 mm, and at least 3162.000 mm",
             ),
             (
                 PassRecord { wheel_radius_mm: Some(11.0), ..record() },
                 "is 11.000 mm, and 12.375 to 12.625 mm are possible",
             ),
-            (PassRecord { duration_s: Some(0.0), ..record() }, "its duration is 0.000 s, and at least 379.440 s"),
+            (PassRecord { duration_s: Some(0.0), ..record() }, "its duration is 0.000 s, and at least 189.720 s"),
             (PassRecord { idle_share: Some(1.5), ..record() }, "1.500 , and 0.000 to 1.000"),
             (PassRecord { removed_mm3: Some(-2.0), ..record() }, "the volume removed is -2.000 mm3"),
         ];

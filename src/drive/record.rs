@@ -53,7 +53,13 @@ impl Recorder {
         let (failed, failures) = mpsc::unbounded_channel();
         let given_up = Arc::new(AtomicBool::new(false));
         let folder = journal.folder().to_owned();
-        let scribe = Scribe { journal: Some(journal), ids: HashMap::new(), failed, given_up: given_up.clone() };
+        let scribe = Scribe {
+            journal: Some(journal),
+            ids: HashMap::new(),
+            failed,
+            given_up: given_up.clone(),
+            broken_off: false,
+        };
         let thread = std::thread::Builder::new().name("journal".into()).spawn(move || scribe.keep(jobs));
         let thread = Some(thread.expect("a thread can be had"));
         Self { given: Some(given), failures, given_up, thread, folder, intents: 0 }
@@ -131,6 +137,8 @@ struct Scribe {
     ids: HashMap<u64, u32>,
     failed: mpsc::UnboundedSender<RecordFailure>,
     given_up: Arc<AtomicBool>,
+    /// Something was given up, and nothing is written behind it.
+    broken_off: bool,
 }
 
 impl Scribe {
@@ -147,7 +155,12 @@ impl Scribe {
         loop {
             let error = match self.write(job) {
                 Ok(()) => return Ok(()),
-                Err(error) if !error.may_pass() || self.given_up.load(Ordering::Acquire) => return Err(error),
+                Err(error) if !error.may_pass() => return Err(error),
+                Err(error) if self.given_up.load(Ordering::Acquire) => {
+                    // What follows would stand in the record as if nothing were missing before it.
+                    self.broken_off = true;
+                    return Err(error);
+                }
                 Err(error) => error,
             };
             if !std::mem::replace(&mut told, true) {
@@ -159,6 +172,9 @@ impl Scribe {
 
     fn write(&mut self, job: &Job) -> Result<(), JournalError> {
         let Some(journal) = self.journal.as_mut() else { return Ok(()) };
+        if self.broken_off {
+            return Err(JournalError::Closed { path: journal.folder().to_owned() });
+        }
         match job {
             Job::Append(entry) => journal.append(Entry::clone(entry)).map(drop),
             Job::Intend(intent, entry) => {

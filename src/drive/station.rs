@@ -740,7 +740,8 @@ impl<B: StationDriver> MachineTask<B> {
     /// A link that is lost, which is told.
     async fn fetch_record(&mut self) -> Result<(), ()> {
         let (Device::Grinder, Some(armed)) = (B::DEVICE, &self.armed) else { return Ok(()) };
-        match self.driver.fetch(armed.job, &self.interrupt).await {
+        // A page or two: nothing is broken off for it, and an abort gives it up.
+        match self.driver.fetch(armed.job, &Interrupt::new()).await {
             Ok(record) => self.hand_over(record).await,
             Err(error) if error.is_link() => {
                 self.lost(&error).await;

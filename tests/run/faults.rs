@@ -94,7 +94,7 @@ fn what_a_grinder_says_of_its_pass_is_held_against_what_it_was_told() {
         [
             ("another job", says(Misreported::Job), alarm, &["the job in the pass record"]),
             ("failed", says(Misreported::Result), alarm, &["the result in the pass record"]),
-            ("too deep", says(Misreported::Depth), alarm, &["largest depth taken off is 3.000 mm", "at most 0.500 mm"]),
+            ("too deep", says(Misreported::Depth), alarm, &["largest depth taken off is 3.000 mm", "at most 0.535 mm"]),
             ("no path", says(Misreported::Path), alarm, &["the path travelled is -1.000 mm", "are needed"]),
             ("another wheel", says(Misreported::Wheel), alarm, &["the radius of the wheel is", "are possible"]),
             ("no time", says(Misreported::Duration), alarm, &["its duration is 0.000 s", "are needed"]),

@@ -426,13 +426,14 @@ impl ModbusMachine {
         if self.unit.identity().is_none() {
             self.unit.meet().await?;
         }
-        let before = self.look().await?;
-        self.sequence = self.sequence.max(before.acknowledged);
         match self.simply(Command::Abort).await {
-            Err(error @ DeviceError::NotAcknowledged { .. }) => match self.look().await? {
-                // Another number came in between; what counts is where it led.
+            // Somebody else has counted further: what counts is where it led, and else an abort is worth going past them.
+            Err(DeviceError::NotAcknowledged { acknowledged, .. }) => match self.look().await? {
                 status if matches!(status.state, State::Aborting | State::Aborted) => Ok(status),
-                _ => Err(error),
+                _ => {
+                    self.sequence = self.sequence.max(acknowledged);
+                    self.simply(Command::Abort).await
+                }
             },
             answer => answer,
         }
