@@ -73,7 +73,7 @@ impl DefinedSurface {
     /// Returns the spacing the definition asks for, in millimetres.
     ///
     /// # Errors
-    /// Those of [`DefinedSurface::spacing_for_accuracy`].
+    /// An accuracy that is not positive, or one that no spacing reaches.
     pub fn spacing_mm(&self) -> Result<f64, DefinitionError> {
         match self.sampling() {
             Sampling::Spacing { spacing_mm } => Ok(spacing_mm),
