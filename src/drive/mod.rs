@@ -679,12 +679,24 @@ impl Drive {
     async fn finish_backlog(&mut self) {
         let by = Instant::now() + record::PATIENCE;
         while !self.backlog.is_empty() {
-            let Ok(recorded) = tokio::time::timeout_at(by, on_record(&mut self.backlog)).await else { return };
+            let recorded = tokio::select! {
+                biased;
+                recorded = on_record(&mut self.backlog) => recorded,
+                why = self.recorder.failure() => {
+                    self.failing = Some(message_of(&why));
+                    self.answer_without_record();
+                    continue;
+                }
+                () = tokio::time::sleep_until(by) => {
+                    self.failing.get_or_insert_with(|| "the disk does not answer".to_owned());
+                    return self.answer_without_record();
+                }
+            };
             match self.backlog.front().map(|next| &next.then) {
                 Some(Then::Execute(command)) if matches!(**command, Command::Announce(_)) => {
                     self.recorded(recorded).await
                 }
-                Some(Then::Answer { .. }) if recorded.is_ok() => self.recorded(recorded).await,
+                Some(Then::Answer { .. }) => self.recorded(recorded).await,
                 _ => drop(self.backlog.pop_front()),
             }
         }
