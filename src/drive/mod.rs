@@ -380,9 +380,12 @@ impl Drive {
     /// Lets the cell and people know that something cannot be recorded.
     async fn record_failed(&mut self, why: RecordFailure) {
         let message = message_of(&why);
-        self.notify(Notice::RecordFailed { message: message.clone() });
-        self.failing = Some(message);
-        self.take(Event::RecordFailed { why }, None).await;
+        let is_known = self.failing.replace(message.clone()).is_some();
+        // What follows from a failure fails too, the record of the failure itself among it, and says nothing new.
+        if !is_known {
+            self.notify(Notice::RecordFailed { message });
+            self.take(Event::RecordFailed { why }, None).await;
+        }
         self.answer_without_record();
     }
 

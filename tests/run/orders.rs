@@ -189,6 +189,29 @@ async fn an_abort_is_given_while_another_process_has_the_journal_and_answered_wh
     assert!(on_record(&folder) && verify(&folder).unwrap().closed);
 }
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_journal_that_is_broken_for_good_holds_the_cell_and_an_abort_ends_the_run() {
+    let mut rig = Rig::new(crate::rig::small(12, 8, 100.0)).await;
+    let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
+    let actor = run.actor.clone();
+    let (drive, orders): (_, Orders) = Drive::new(run, cmm, grinder).unwrap();
+    let running = tokio::spawn(drive.run());
+    event(&mut notices, "started", 1).await;
+    let damage = "PRAGMA writable_schema = ON; UPDATE sqlite_schema SET sql = 'no table at all';
+        PRAGMA schema_version = 1000";
+    rusqlite::Connection::open(folder.join("journal.sqlite")).unwrap().execute_batch(damage).unwrap();
+    // Progress is recorded, so the loop finds out by itself. Told once: the failure of each further record is no news.
+    event(&mut notices, "record_failed", 1).await;
+    orders.give(Request::Abort { reason: "the record is gone".into() }, actor).await;
+    let ending = tokio::time::timeout(crate::rig::PATIENCE, running).await.expect("it ends").unwrap();
+    assert!(matches!(ending, Ending::Aborted { confirmed: true, .. }), "{ending:?}");
+    let mut told = 0;
+    while let Some(notice) = notices.recv().await {
+        told += u32::from(matches!(&notice, regrind::drive::Notice::State { event, .. } if event == "record_failed"));
+    }
+    assert!(told <= 1, "the same failure was told {told} times more");
+}
+
 /// Every file of a folder and of those in it, by its path from the first.
 fn files_below(folder: &Path, name: &str, files: &mut BTreeSet<String>) {
     for entry in std::fs::read_dir(folder.join(name)).unwrap().map(Result::unwrap) {
