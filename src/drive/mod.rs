@@ -947,14 +947,15 @@ fn restored(intent: &Value) -> Option<(u32, Armed)> {
     Some((u32::from(intent.cycle), intent.armed()))
 }
 
-/// Commands that wait neither for the disk nor for the record of what came before them: they bring machines to rest, tell people, or
-/// end the run.
+/// Commands that wait neither for the disk nor for the record of what came before them: they bring machines to rest, only look at
+/// one, tell people, or end the run.
 fn waits_for_nothing(command: &Command) -> bool {
     matches!(
         command,
         Command::HoldMachine { .. }
             | Command::StopMachine { .. }
             | Command::AbortMachine { .. }
+            | Command::VerifyClear { .. }
             | Command::Raise(_)
             | Command::Withdraw { .. }
             | Command::Refuse { .. }
