@@ -137,6 +137,11 @@ impl Cell {
         if !known.ready {
             self.raise(AlarmId::NotIdle, &format!("{device}, {found}"));
         }
+        // Held means still: what became of a job that was out of sight is asked before a person is, and what moves is held.
+        if phase.job() == Some((device, JobStep::Reconcile)) {
+            self.go(Holding(phase));
+            self.push(Command::Reconcile { device, cycle: self.cycle });
+        }
     }
 
     pub(super) fn not_connected(&mut self, device: Device, why: &Mismatch) {

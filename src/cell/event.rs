@@ -113,7 +113,11 @@ pub enum Event {
     /// The points of this cycle, so many found of the planned, are read and stored. Answers `Collect`.
     Collected { cycle: u32, targets: u32, found: u32, gate: Gate },
     /// The radius of the probe was compared with the reference sphere: the one found minus the one in the recipe. Answers `Qualify`.
-    Qualified { cycle: u32, radius_error_mm: f64 },
+    Qualified {
+        cycle: u32,
+        #[serde(with = "super::number")]
+        radius_error_mm: f64,
+    },
     /// The measurement is registered. Answers `Register`.
     Registered { cycle: u32, figures: Figures },
     /// It could not be registered. Answers `Register`.
@@ -262,25 +266,32 @@ pub enum GateFailure {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Figures {
     /// Peak to valley of the deviations.
+    #[serde(with = "super::number")]
     pub pv_mm: f64,
     /// Peak to valley of all deviations but the outermost 0.2 %; none where it was not worked out.
-    #[serde(default)]
+    #[serde(default, with = "super::number::optional")]
     pub pv_robust_mm: Option<f64>,
     /// Root mean square of the deviations.
+    #[serde(with = "super::number")]
     pub rms_mm: f64,
     /// Expanded measuring uncertainty (k = 2) of the peak to valley.
+    #[serde(with = "super::number")]
     pub pv_expanded_mm: f64,
     /// Expanded measuring uncertainty (k = 2) of the root mean square.
+    #[serde(with = "super::number")]
     pub rms_expanded_mm: f64,
     /// Share of the aperture that is covered, 0 to 1.
+    #[serde(with = "super::number")]
     pub coverage: f64,
     /// Points used.
     pub points: u32,
     /// Points left out as outliers.
     pub outliers: u32,
     /// How far the part lies from where it was expected.
+    #[serde(with = "super::number")]
     pub shift_mm: f64,
     /// How far it is turned from how it was expected.
+    #[serde(with = "super::number")]
     pub turn_rad: f64,
     /// The directions in which the surface does not hold the part, in words.
     pub weak_directions: Vec<String>,
@@ -292,6 +303,7 @@ pub struct Figures {
     #[serde(default)]
     pub forecast: Option<Forecast>,
     /// The most that was taken off anywhere since the run began; none where nobody knows.
+    #[serde(default, with = "super::number::optional")]
     pub removed_mm: Option<f64>,
 }
 
@@ -299,10 +311,13 @@ pub struct Figures {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Forecast {
     /// Root mean square of the deviations.
+    #[serde(with = "super::number")]
     pub rms_mm: f64,
     /// Its standard deviation.
+    #[serde(with = "super::number")]
     pub sigma_mm: f64,
     /// What no correction can go below, as far as the passes have told.
+    #[serde(default, with = "super::number::optional")]
     pub floor_mm: Option<f64>,
 }
 
@@ -329,22 +344,25 @@ pub enum Response {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct CompensationSummary {
     /// Largest absolute value of the map.
+    #[serde(with = "super::number")]
     pub largest_mm: f64,
     /// The most that the next pass takes off anywhere.
+    #[serde(with = "super::number")]
     pub depth_mm: f64,
     /// The PV that is expected after it.
+    #[serde(with = "super::number")]
     pub predicted_pv_mm: f64,
     /// The RMS that is expected after it.
-    #[serde(default)]
+    #[serde(default, with = "super::number")]
     pub predicted_rms_mm: f64,
     /// Share of the part where the wheel will cut air, as far as it can be foreseen.
-    #[serde(default)]
+    #[serde(default, with = "super::number")]
     pub air_share: f64,
     /// Share of the error that is taken back, with the wavelength in millimetres from which each counts.
-    #[serde(default)]
+    #[serde(default, with = "super::number::pairs")]
     pub gains: Vec<[f64; 2]>,
     /// Share of a correction that the part answers with.
-    #[serde(default)]
+    #[serde(default, with = "super::number")]
     pub response: f64,
     /// What else a person should know.
     pub warnings: Vec<String>,

@@ -23,6 +23,7 @@ mod event;
 mod judge;
 mod machine;
 mod memory;
+mod number;
 mod plan;
 mod state;
 mod table;
@@ -36,4 +37,4 @@ pub use event::{
 pub use memory::Cell;
 pub use plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, PvOf, Tolerance};
 pub use state::{Device, JobStep, Phase, State, StateName};
-pub use table::{Answer, Row, samples, table};
+pub use table::{Answer, Row, TABLE_VERSION, samples, table};

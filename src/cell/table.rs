@@ -13,6 +13,10 @@ use super::memory::Cell;
 use super::plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, PvOf, Tolerance};
 use super::state::{Device, Phase, State};
 
+/// The version of the table. A run is gone on with by a program of the version that began it only; a change of what follows from
+/// anything is another version.
+pub const TABLE_VERSION: u32 = 1;
+
 /// What an event does in a state.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Row {

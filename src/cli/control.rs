@@ -1,4 +1,4 @@
-//! `regrind hold | resume | stop | abort | confirm | status`: a running cell from another terminal.
+//! `regrind hold | stop | abort | confirm | status`: a running cell from another terminal.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -120,7 +120,7 @@ fn named_file(arguments: &Confirmation) -> Result<Option<PathBuf>, Failure> {
     arguments.file.as_ref().map(absolute).transpose()
 }
 
-fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<Outcome, Failure> {
+pub(super) fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<Outcome, Failure> {
     let folder = run.map_or_else(|| live(Path::new("runs")), |run| Ok(run.to_owned()))?;
     let asked = |request: &Request| {
         ask(&folder, request).map_err(|source| Failure::NotRunning { path: folder.clone(), source })
@@ -158,7 +158,7 @@ pub(super) fn folder_of(run: Option<&Path>) -> Result<PathBuf, Failure> {
 }
 
 /// Returns the folder of the run that goes on now; where none does, of the one that was made last.
-fn live(runs: &Path) -> Result<PathBuf, Failure> {
+pub(super) fn live(runs: &Path) -> Result<PathBuf, Failure> {
     let mut live: Vec<_> = folders(runs).filter(|folder| is_live(folder)).collect();
     match live.len() {
         0 => newest(runs).ok_or_else(|| Failure::NoRun { path: runs.to_owned() }),

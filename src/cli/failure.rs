@@ -84,6 +84,26 @@ pub(super) enum Failure {
     NotRunning { path: PathBuf, source: io::Error },
     #[error("{} runs go on: name one of {}", .runs.len(), .runs.iter().map(|run| run.display().to_string()).collect::<Vec<_>>().join(", "))]
     SeveralRuns { runs: Vec<PathBuf> },
+    #[error("{}: the run is over, there is nothing to go on with; `regrind report` tells how it ended", .run.display())]
+    Over { run: PathBuf },
+    #[error("{}: its simulated machines ended with the program that ran it; begin a new run", .run.display())]
+    WorldGone { run: PathBuf },
+    #[error(
+        "{}: it was begun by regrind {program}, and this program cannot go on with it ({what}); go on with that one, or bring the machines home \
+         by `regrind recover` and begin a new run",
+        .run.display()
+    )]
+    EarlierRun { run: PathBuf, program: String, what: String },
+    #[error("{}: {what} is not what the run began with; put back the files that the recipe and the cell file name", .run.display())]
+    OtherTask { run: PathBuf, what: &'static str },
+    #[error(
+        "{path}: the folder that the run was begun in cannot be entered: {source}; its recipe names files from there"
+    )]
+    WorkingFolder { path: PathBuf, source: io::Error },
+    #[error(transparent)]
+    Learned(regrind::formats::LearnedError),
+    #[error(transparent)]
+    Replay(regrind::drive::ReplayError),
     #[error("the order is not acknowledged: {message}")]
     OrderRefused { message: String },
     #[error("`confirm over` needs --machine and --evidence: which machine was looked at, and what was seen")]

@@ -8,10 +8,12 @@ mod compensate;
 mod control;
 mod failure;
 mod initial;
+mod live;
 mod nominal;
 mod plan;
 mod register;
 mod report;
+mod resume;
 mod run;
 mod schema;
 mod show;
@@ -43,8 +45,7 @@ enum Command {
     Simulate(simulate::Arguments),
     /// Hold a running cell at the next safe place
     Hold(control::Arguments),
-    /// Let a held cell go on
-    Resume(control::Arguments),
+    Resume(resume::Arguments),
     /// End a running cell in order
     Stop(control::Arguments),
     /// End a running cell at once: the safe sequence only
@@ -94,7 +95,7 @@ fn run() -> ExitCode {
         Command::Plan(arguments) => plan::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Hold(arguments) => control::order(&arguments, |reason| Request::Hold { reason }),
-        Command::Resume(arguments) => control::order(&arguments, |reason| Request::Resume { reason, seen: None }),
+        Command::Resume(arguments) => resume::run(&arguments),
         Command::Stop(arguments) => control::order(&arguments, |reason| Request::Stop { reason }),
         Command::Abort(arguments) => control::order(&arguments, |reason| Request::Abort { reason }),
         Command::Confirm(arguments) => control::confirm(&arguments),

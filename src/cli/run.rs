@@ -1,25 +1,24 @@
 //! `regrind run`: grind, measure, register, judge, compensate, until the part is accepted or the loop must stop.
 
-use std::io;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
 
 use clap::Args;
-use regrind::cell::{Actor, Beginning, CellPlan, Ending};
+use regrind::cell::{Actor, Beginning, CellPlan, Ending, TABLE_VERSION};
 use regrind::config::{CellConfig, Link};
-use regrind::device::{AnyCmm, AnyGrinder, Line, Machine as _};
-use regrind::drive::{Drive, Orders, Request, Run, Task};
+use regrind::device::Line;
+use regrind::drive::Task;
 use regrind::formats::{LEARNED, Learned, LearnedError};
-use regrind::journal::{Header, Journal, MachineLock};
+use regrind::journal::{Header, Journal};
 use regrind::recipe::Recipe;
 use regrind::setup;
 use serde_json::json;
-use tokio::signal::unix::{Signal, SignalKind, signal};
-use tokio::sync::mpsc;
 
 use super::failure::Failure;
-use super::show::Show;
+use super::live::{Live, Work, outcome};
 use super::{Outcome, check, plan, simulated};
+
+/// What a run began with of what an earlier one had learned, in its folder.
+pub(super) const LEARNED_FROM: &str = "learned_from.json";
 
 /// Run correction cycles from a recipe until the part is accepted
 #[derive(Args, Debug)]
@@ -90,7 +89,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     })
 }
 
-/// Opens the machines, begins the record, and lets the run go to its end and its report.
+/// Opens the machines, begins the record, and lets the run go to its end.
 async fn carry_out(
     arguments: &Arguments,
     recipe: &Recipe,
@@ -101,34 +100,27 @@ async fn carry_out(
 ) -> Result<Ending, Failure> {
     let actor = operator(arguments.operator.as_deref());
     let began = jiff::Timestamp::now();
-    let job = u32::try_from(began.as_second() & 0x7fff_ffff).unwrap_or(1).max(1);
+    let job = epoch(began);
     // Before the record begins: a folder that is not there, or a line that is in use, is no run.
     let part = arguments.part.clone().unwrap_or_else(|| recipe_name(recipe));
     let folder = free_folder(&arguments.runs, &recipe_name(recipe), began, cell.simulated);
-    let client = [owner(&actor, &folder), job];
-    let (cmm, grinder) = setup::machines(recipe, cell, &part, &folder, client).map_err(Failure::Setup)?;
-    let _taken = [take(&cell.cmm.link, cmm.name(), &folder)?, take(&cell.grinder.link, grinder.name(), &folder)?];
+    let live = Live { recipe, cell, part: &part, folder: &folder, job, actor, json: arguments.json };
+    let machines = live.open(job)?;
     if let Some(earlier) = earlier.as_ref().filter(|_| !arguments.json) {
         super::print(&earlier.in_words(&arguments.runs))?;
     }
-    let mut journal = journal(arguments, &folder, recipe, cell, &actor, earlier.unwrap_or_default())?;
+    let header = header(arguments, &live, (&task, &plan), earlier.as_ref());
+    let mut journal = begin(header, &live, earlier.and_then(|earlier| earlier.learned))?;
     if task.learned.is_some() || cell.grinder.link.wire.works_from_run() {
         record_first_correction(&task, &mut journal)?;
     }
-    let (notices, shown) = mpsc::unbounded_channel();
-    let showing = tokio::spawn(Show::new(arguments.json, cell.simulated, recipe, &folder).follow(shown));
-    let poll = [setup::poll(&cell.cmm.link), setup::poll(&cell.grinder.link)];
     let loaded = arguments.loaded || cell.simulated;
-    let run = Run { plan, task, journal, job, actor: actor.clone(), loaded, poll, notices, interrupted: None };
-    let ending = go(run, cmm, grinder, actor).await?;
-    let shown = showing.await.map_err(|e| Failure::Terminal(e.into()));
-    // The record is closed; a report that cannot be written must not change how the run ended, nor a terminal that has gone.
-    let report = regrind::report::write_run_report(&folder);
-    shown??;
-    if let Err(error) = report {
-        super::print(&format!("no report: {error}\n"))?;
-    }
-    Ok(ending)
+    live.carry_out(machines, Work { task, plan, journal, loaded, interrupted: None }).await
+}
+
+/// A number that rises from program to program.
+pub(super) fn epoch(now: jiff::Timestamp) -> u32 {
+    u32::try_from(now.as_second() & 0x7fff_ffff).unwrap_or(1).max(1)
 }
 
 /// What earlier runs left to learn from.
@@ -181,95 +173,21 @@ impl Earlier {
     }
 }
 
-/// Gives the run its machines and lets it go.
-async fn go(run: Run, cmm: AnyCmm, grinder: AnyGrinder, actor: Actor) -> Result<Ending, Failure> {
-    let folder = run.journal.folder().to_owned();
-    let (drive, orders) =
-        Drive::with_cell(run, cmm, grinder).map_err(|source| Failure::ControlSocket { path: folder, source })?;
-    let signals = Signals::new().map_err(Failure::Signals)?;
-    let heeding = [tokio::spawn(heed_ctrl_c(orders.clone(), actor.clone())), tokio::spawn(signals.heed(orders, actor))];
-    let ending = drive.run().await;
-    heeding.iter().for_each(tokio::task::JoinHandle::abort);
-    Ok(ending)
-}
-
-/// Ctrl-C once holds at the next safe place, twice aborts. After a resume it counts from one again.
-async fn heed_ctrl_c(orders: Orders, actor: Actor) {
-    let mut held_at: Option<Instant> = None;
-    while tokio::signal::ctrl_c().await.is_ok() {
-        let again = held_at.is_some_and(|at| at.elapsed() < IN_ONE_GO || !orders.is_working());
-        held_at = if again { held_at } else { Some(Instant::now()) };
-        let request = if again {
-            Request::Abort { reason: "Ctrl-C, twice".into() }
-        } else {
-            Request::Hold { reason: "Ctrl-C".into() }
-        };
-        orders.give(request, actor.clone()).await;
-    }
-}
-
-/// What ends a program from outside: a terminal that is closed, a service that is stopped.
-struct Signals {
-    /// None where whoever started the program wants it to outlive its terminal (`nohup`).
-    hangup: Option<Signal>,
-    terminate: Signal,
-}
-
-impl Signals {
-    fn new() -> io::Result<Self> {
-        let hangup = if ignores_hangup() { None } else { Some(signal(SignalKind::hangup())?) };
-        Ok(Self { hangup, terminate: signal(SignalKind::terminate())? })
-    }
-
-    /// The first ends the run in order, the next one aborts it. A terminal that closes may say so twice.
-    async fn heed(mut self, orders: Orders, actor: Actor) {
-        let mut first: Option<Instant> = None;
-        loop {
-            let (name, hung_up) = tokio::select! {
-                Some(()) = self.terminate.recv() => ("SIGTERM", false),
-                Some(()) = async { self.hangup.as_mut()?.recv().await }, if self.hangup.is_some() => {
-                    ("SIGHUP, the terminal was closed", true)
-                }
-                else => return,
-            };
-            let reason = name.to_owned();
-            let request = match first {
-                None => Request::Stop { reason },
-                Some(at) if hung_up && at.elapsed() < IN_ONE_GO => continue,
-                Some(_) => Request::Abort { reason: format!("{reason}, again") },
-            };
-            first = first.or_else(|| Some(Instant::now()));
-            orders.give(request, actor.clone()).await;
-        }
-    }
-}
-
-/// Whether SIGHUP, the first signal, is ignored by who started this program.
-fn ignores_hangup() -> bool {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
-    ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).is_some_and(|mask| mask & 1 == 1)
-}
-
 /// Whether the machines of a cell are simulated in this process: only there a port may be left open.
-fn within(cell: &CellConfig) -> bool {
+pub(super) fn within(cell: &CellConfig) -> bool {
     let open = |link: &Link| matches!(link.wire.line(), Some((Line::Tcp { port: 0, .. }, _)));
     cell.simulated && (open(&cell.cmm.link) || open(&cell.grinder.link))
 }
 
-fn journal(
-    arguments: &Arguments,
-    folder: &Path,
-    recipe: &Recipe,
-    cell: &CellConfig,
-    actor: &Actor,
-    Earlier { learned, left_alone }: Earlier,
-) -> Result<Journal, Failure> {
-    let part = arguments.part.clone().unwrap_or_else(|| "unnamed".into());
+/// What the record begins with: all that a program needs to go on with the run.
+fn header(arguments: &Arguments, live: &Live, (task, plan): (&Task, &CellPlan), earlier: Option<&Earlier>) -> Header {
+    let Live { recipe, cell, folder, actor, .. } = live;
     let hex = |bytes: &[u8; 32]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
-    let header = Header {
+    let learned_from = earlier.and_then(|earlier| earlier.learned.as_ref()).map(|(learned, _)| &learned.run);
+    let left_alone = earlier.iter().flat_map(|earlier| &earlier.left_alone);
+    Header {
         run: folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
-        part,
+        part: arguments.part.clone().unwrap_or_else(|| "unnamed".into()),
         actor: actor.name.clone(),
         station: actor.station.clone(),
         simulation: cell.simulated,
@@ -277,15 +195,21 @@ fn journal(
         content: json!({
             "recipe": recipe.path(), "recipe_sha256": hex(recipe.source_sha256()),
             "cell": cell.path(), "cell_sha256": hex(cell.source_sha256()),
-            "part_name": recipe.part.name, "seed": arguments.seed, "learned_from": learned.as_ref().map(|(learned, _)| &learned.run),
-            "left_alone": left_alone.iter().map(ToString::to_string).collect::<Vec<_>>(),
+            "working_folder": std::env::current_dir().unwrap_or_default(),
+            "nominal_sha256": hex(&task.part_identity), "setting": task.setting,
+            "part_name": recipe.part.name, "part_in_files": live.part, "job": live.job, "seed": arguments.seed,
+            "plan": plan, "table_version": TABLE_VERSION,
+            "learned_from": learned_from, "left_alone": left_alone.map(ToString::to_string).collect::<Vec<_>>(),
         }),
-    };
-    let mut journal = Journal::create(folder, header).map_err(Failure::Journal)?;
-    journal.store("recipe.toml", recipe.text().as_bytes(), 0, 0).map_err(Failure::Journal)?;
-    journal.store("cell.toml", cell.text().as_bytes(), 0, 0).map_err(Failure::Journal)?;
+    }
+}
+
+fn begin(header: Header, live: &Live, learned: Option<(Learned, Vec<u8>)>) -> Result<Journal, Failure> {
+    let mut journal = Journal::create(live.folder, header).map_err(Failure::Journal)?;
+    journal.store("recipe.toml", live.recipe.text().as_bytes(), 0, 0).map_err(Failure::Journal)?;
+    journal.store("cell.toml", live.cell.text().as_bytes(), 0, 0).map_err(Failure::Journal)?;
     if let Some((_, text)) = learned {
-        journal.store("learned_from.json", &text, 0, 0).map_err(Failure::Journal)?;
+        journal.store(LEARNED_FROM, &text, 0, 0).map_err(Failure::Journal)?;
     }
     Ok(journal)
 }
@@ -315,38 +239,9 @@ fn free_folder(runs: &Path, name: &str, began: jiff::Timestamp, simulated: bool)
     (0..).map(named).find(|folder| !folder.exists()).expect("some number is free")
 }
 
-fn operator(named: Option<&str>) -> Actor {
+pub(super) fn operator(named: Option<&str>) -> Actor {
     let user = || std::env::var("USER").or_else(|_| std::env::var("USERNAME")).unwrap_or_else(|_| "unknown".into());
     let host = std::fs::read_to_string("/etc/hostname").unwrap_or_default();
     let host = if host.trim().is_empty() { "this computer".to_owned() } else { host.trim().to_owned() };
     Actor { name: named.map_or_else(user, str::to_owned), station: host }
 }
-
-/// Keeps a machine on a line from every other run on this computer.
-fn take(link: &Link, name: &str, run: &Path) -> Result<Option<MachineLock>, Failure> {
-    let run = std::path::absolute(run).unwrap_or_else(|_| run.to_owned());
-    let taken = link.wire.line().map(|_| MachineLock::take(name, &run));
-    taken.transpose().map_err(Failure::Machine)
-}
-
-/// A number for this run as a client of its machines.
-fn owner(actor: &Actor, run: &Path) -> u32 {
-    let mut hash = crc32fast::Hasher::new();
-    hash.update(b"regrind ");
-    hash.update(actor.station.as_bytes());
-    hash.update(run.as_os_str().as_encoded_bytes());
-    hash.finalize().max(1)
-}
-
-fn outcome(ending: &Ending) -> Result<Outcome, Failure> {
-    match ending {
-        Ending::Accepted { .. } => Ok(Outcome::Accepted),
-        Ending::NotAccepted { .. } => Ok(Outcome::NotInTolerance),
-        Ending::Stopped { reason, .. } | Ending::Aborted { reason, .. } => {
-            Err(Failure::Ended { reason: reason.clone() })
-        }
-    }
-}
-
-/// Two presses within this are one wish, whatever the cell has made of the first by then.
-const IN_ONE_GO: Duration = Duration::from_secs(3);

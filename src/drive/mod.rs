@@ -12,12 +12,14 @@
 //! follows, the answer to who gave an order among it, waits in line until the journal has all that came before it.
 
 mod control;
+mod cycles;
 mod maps;
 mod notice;
 mod outcome;
 mod pass_record;
 mod program;
 mod record;
+mod replay;
 mod station;
 mod task;
 mod work;
@@ -35,8 +37,8 @@ use tokio::task::{JoinError, JoinSet};
 use tokio::time::Instant;
 
 use crate::cell::{
-    Actor, Asked, Cell, CellPlan, Command, CompensationRefusal, Device, Ending, Event, Gate, GateFailure, Phase,
-    RecordFailure, State, StateName,
+    Actor, Asked, Cell, CellPlan, Command, CompensationRefusal, Device, Ending, Event, Gate, GateFailure, Judgement,
+    Phase, RecordFailure, State, StateName,
 };
 use crate::device::{
     AnyCmm, AnyGrinder, Armed, Cmm, Grinder, Identified, Interrupt, Job, Measurement, PassRecord, Word, hex,
@@ -46,14 +48,16 @@ use crate::journal::{Artefact, Entry, Journal, Kind};
 
 use control::{Control, Ordered};
 pub use control::{Reply, Request, Snapshot, ask, is_live};
+use cycles::Cycles;
 pub use notice::{CycleRow, Notice};
 pub use program::{ProgramError, Programs};
 use record::{Files, Recorder, Ticket, entry};
+pub use replay::{Interrupted, ReplayError};
 use station::{
     Aborts, Ask, CmmDriver, Fetched, GrinderDriver, Intent, Load, MachineTask, PULSE_EVERY, Pulse, StationDriver,
     StationReport,
 };
-use task::{Cycle, Product};
+use task::Product;
 pub use task::{Probing, Sphere, Task};
 
 /// Everything a run needs besides its machines.
@@ -74,17 +78,8 @@ pub struct Run {
     pub poll: [Duration; 2],
     /// Where notices go.
     pub notices: mpsc::UnboundedSender<Notice>,
-    /// An interrupted run that is gone on with.
+    /// A run that was interrupted and is gone on with.
     pub interrupted: Option<Interrupted>,
-}
-
-/// What the journal of an interrupted run tells.
-#[derive(Default)]
-pub struct Interrupted {
-    /// The events that the cell took in, to be handled again.
-    pub events: Vec<(Duration, Event)>,
-    /// The last intent of a START for each machine: CMM, grinder.
-    pub intents: [Option<Value>; 2],
 }
 
 /// Orders from this process itself: Ctrl-C, a prompt.
@@ -131,7 +126,7 @@ pub struct Drive {
     orders: mpsc::Receiver<Ordered>,
     status: watch::Sender<Snapshot>,
     notices: mpsc::UnboundedSender<Notice>,
-    cycles: BTreeMap<u32, Cycle>,
+    cycles: Cycles,
     /// Counts the states of the cell.
     states: u64,
     /// Counts what was computed for each cycle.
@@ -143,17 +138,30 @@ pub struct Drive {
     backlog: VecDeque<Waiting>,
     /// Why nothing comes on record at present.
     failing: Option<String>,
+    /// A judgement that the program did not come to leave before it ended.
+    unannounced: Option<(u32, Judgement)>,
     ending: Option<Ending>,
     stations: Vec<tokio::task::JoinHandle<()>>,
     _control: Control,
 }
 
 /// What is computed for a cycle.
-#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Computation {
     Gate,
     Registration,
     Compensation,
+}
+
+impl Computation {
+    /// Returns which makes a file of this name.
+    fn of(file: &str) -> Self {
+        match file {
+            "measured.csv" | "reference_sphere.csv" => Self::Gate,
+            "correction.csv" | "correction.json" | "toolpath.ngc" | "toolpath_z.csv" => Self::Compensation,
+            _ => Self::Registration,
+        }
+    }
 }
 
 /// The folder of a cycle, below that of the run. What is on record is never written again: another attempt has a folder of its own.
@@ -213,14 +221,15 @@ impl Drive {
         let (reports, reported) = mpsc::channel(64);
         let (orders, ordered) = mpsc::channel(16);
         let (status, seen) = watch::channel(Snapshot::default());
-        let recorder = Recorder::new(run.journal);
+        let interrupted = run.interrupted.unwrap_or_else(|| Interrupted::none(run.plan));
+        let (ids, open): (Vec<u32>, Vec<Command>) = interrupted.open.into_iter().unzip();
+        let recorder = Recorder::new(run.journal, &ids);
         let folder = recorder.folder().to_owned();
         let control = Control::listen(&folder, orders.clone(), seen.clone())?;
-        let interrupted = run.interrupted.unwrap_or_default();
         let interrupts = [Interrupt::new(), Interrupt::new()];
         let aborts = [watch::Sender::new(0), watch::Sender::new(0)];
         let pulse = Pulse::new();
-        let armed = interrupted.intents.clone().map(|intent| intent.as_ref().and_then(restored));
+        let armed = interrupted.armed.clone().map(|intent| intent.as_ref().and_then(restored));
         let [of_cmm, of_grinder] = armed;
         let [poll_cmm, poll_grinder] = run.poll;
         let (cmm, cmm_task) =
@@ -233,8 +242,8 @@ impl Drive {
             of_grinder,
             poll_grinder,
         );
-        let mut drive = Self {
-            cell: Cell::new(run.plan),
+        let drive = Self {
+            cell: interrupted.cell,
             task: Arc::new(run.task),
             recorder,
             folder,
@@ -242,7 +251,7 @@ impl Drive {
             actor: run.actor,
             loaded: run.loaded,
             began: Instant::now(),
-            before: Duration::ZERO,
+            before: interrupted.before,
             asks: [cmm, grinder],
             interrupts,
             aborts,
@@ -253,28 +262,20 @@ impl Drive {
             orders: ordered,
             status,
             notices: run.notices,
-            cycles: BTreeMap::new(),
-            states: 0,
-            attempts: BTreeMap::new(),
-            armed: interrupted.intents,
-            open: Vec::new(),
+            cycles: interrupted.cycles,
+            states: interrupted.states,
+            attempts: interrupted.attempts,
+            armed: interrupted.armed,
+            open: (1..).zip(open).collect(),
             backlog: VecDeque::new(),
             failing: None,
-            ending: None,
+            unannounced: interrupted.unannounced,
+            ending: interrupted.ending,
             stations: vec![cmm_task, grinder_task],
             _control: control,
         };
-        drive.replay(interrupted.events);
         drive.status.send_replace(drive.snapshot());
         Ok((drive, Orders { orders, status: seen }))
-    }
-
-    /// Takes the cell to where the interrupted run was, carrying nothing out.
-    fn replay(&mut self, events: Vec<(Duration, Event)>) {
-        for (now, event) in events {
-            self.before = self.before.max(now);
-            self.cell.handle(now, event);
-        }
     }
 
     fn now(&self) -> Duration {
@@ -292,6 +293,9 @@ impl Drive {
             _ => Event::Restarted { actor: self.actor.clone() },
         };
         self.take(first, None).await;
+        if let Some((which, judgement)) = self.unannounced.take() {
+            self.leave_judgement(which, &judgement).await;
+        }
         let mut beats = tokio::time::interval(PULSE_EVERY);
         while self.ending.is_none() {
             self.pulse.beat();
@@ -418,7 +422,7 @@ impl Drive {
                 self.adopt(cycle, files).await;
             }
         }
-        let rows: Vec<CycleRow> = self.rows();
+        let rows: Vec<CycleRow> = self.cycles.rows();
         let result = json!({ "simulation": self.task.simulation, "ending": ending, "cycles": rows });
         let now = self.now();
         self.leave("result.json".into(), self.cell.cycle(), &result).await;
@@ -516,7 +520,7 @@ impl Drive {
     fn named_map(&self, digits: &str) -> Result<[u8; 32], String> {
         let digits = digits.trim().to_lowercase();
         let grinds = self.cell.state().phase().and_then(Phase::moving) == Some(Device::Grinder);
-        let cycle = self.cycles.get(&self.cell.cycle()).filter(|_| grinds);
+        let cycle = self.cycles.get(self.cell.cycle()).filter(|_| grinds);
         let Some(cycle) = cycle else { return Err("no pass is under way".into()) };
         let identity = self.task.payloads(&cycle.correction).0.identity();
         let whole = hex(&identity);
@@ -561,7 +565,7 @@ impl Drive {
     /// Tells what of a pass record cannot be, beside the pass that was commanded.
     fn flaw_of(&self, record: &PassRecord) -> Option<String> {
         let number = self.cell.cycle();
-        let Some(cycle) = self.cycles.get(&number) else { return Some(format!("there is no pass of cycle {number}")) };
+        let Some(cycle) = self.cycles.get(number) else { return Some(format!("there is no pass of cycle {number}")) };
         let (map, pass) = self.task.payloads(&cycle.correction);
         let job = Job { job: self.job, cycle: number as u16, digest: 0 };
         let largest_depth_mm = self.task.limits.largest_depth_mm;
@@ -573,18 +577,14 @@ impl Drive {
     async fn transferred(&mut self, measurement: &Measurement, taken: Duration) {
         let (cycle, points, seconds) = (u32::from(measurement.cycle), measurement.points.len(), taken.as_secs_f64());
         let ms_per_point = 1e3 * seconds / points.max(1) as f64;
-        let payload = json!({ "transfer": { "points": points, "seconds": seconds, "ms_per_point": ms_per_point } });
+        let payload = json!({ "transfer": { "points": points, "seconds": seconds, "ms_per_point": ms_per_point, "coordinates": measurement.coordinates } });
         self.note(Kind::Note, ("cmm".into(), "wire".into()), payload);
         self.notify(Notice::Transferred { cycle, points, seconds, ms_per_point });
     }
 
     async fn computed(&mut self, computed: Computed) {
         let Computed { cycle: number, event, product, files } = computed;
-        if let Product::Correction(next) = product {
-            self.cycles.insert(number + 1, Cycle::new(next));
-        } else if let Some(cycle) = self.cycles.get_mut(&number) {
-            cycle.take(product);
-        }
+        self.cycles.take(number, product);
         self.adopt(number, files).await;
         self.take(event, None).await;
     }
@@ -740,14 +740,15 @@ impl Drive {
     }
 
     /// Shows how a cycle was judged and leaves it beside its measurement.
-    async fn announce(&mut self, judgement: crate::cell::Judgement) {
+    async fn announce(&mut self, judgement: Judgement) {
+        let which = self.cycles.judged(judgement.cycle);
+        self.leave_judgement(which, &judgement).await;
+        self.notify(Notice::Judged(judgement));
+    }
+
+    async fn leave_judgement(&mut self, which: u32, judgement: &Judgement) {
         let number = judgement.cycle;
-        let cycle = self.cycles.get_mut(&number);
-        let attempt = cycle.map_or(1, |cycle| {
-            cycle.judgements += 1;
-            cycle.judgements
-        });
-        let cycle = self.cycles.get(&number);
+        let cycle = self.cycles.get(number);
         let result = json!({
             "simulation": self.task.simulation,
             "cycle": number,
@@ -756,8 +757,7 @@ impl Drive {
             "figures": cycle.and_then(|c| c.figures.as_ref()),
             "level_mm": cycle.map(|c| c.correction.level_mm),
         });
-        self.leave(format!("{}/result.json", folder_of(number, attempt)), number, &result).await;
-        self.notify(Notice::Judged(judgement));
+        self.leave(format!("{}/result.json", folder_of(number, which)), number, &result).await;
     }
 
     /// Leaves what the next part of this kind can begin with, where the run got to its end.
@@ -766,7 +766,7 @@ impl Drive {
             return;
         }
         let run = self.folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-        let last = self.cycles.values().rev().find(|cycle| cycle.is_judged() && cycle.known.is_some()).cloned();
+        let last = self.cycles.last_known().cloned();
         let Some(learned) = last.and_then(|cycle| work::learned(&self.task, run, &cycle)) else { return };
         self.leave(LEARNED.into(), self.cell.cycle(), &learned).await;
     }
@@ -792,32 +792,20 @@ impl Drive {
     }
 
     async fn load_pass(&mut self, number: u32) {
-        let task = Arc::clone(&self.task);
-        let cycle = self.cycles.entry(number).or_insert_with(|| Cycle::new(task.first_correction()));
-        let correction = Arc::clone(&cycle.correction);
-        let (map, pass) = task.payloads(&correction);
+        let (map, pass) = self.cycles.pass(&self.task, number);
         let load = Load::Pass(Arc::new(map), Box::new(pass));
         self.ask(Device::Grinder, Ask::Load { cycle: number, load }).await;
     }
 
     async fn load_plan(&mut self, number: u32) {
-        // A part that is measured before any pass, or measured once more, stands as the last pass left it.
-        let last = self.cycles.range(..=number).next_back().map(|(_, c)| Arc::clone(&c.correction));
-        let correction = last.unwrap_or_else(|| Arc::new(self.task.first_correction()));
-        // Where the part was found by a measurement that was judged. After one that a gate refused it may have been seated anew.
-        let last = self.cycles.range(..number).next_back().map(|(_, cycle)| cycle);
-        let judged = last.filter(|cycle| cycle.is_judged()).and_then(|cycle| cycle.registration.as_ref());
-        let pose = judged.map_or(self.task.fixture_cmm_from_model, |found| found.cmm_from_model);
-        let plan = Arc::new(self.task.plan(correction.level_mm, &pose));
-        let cycle = self.cycles.entry(number).or_insert_with(|| Cycle::new((*correction).clone()));
-        cycle.plan = Some(Arc::clone(&plan));
-        self.ask(Device::Cmm, Ask::Load { cycle: number, load: Load::Plan(plan) }).await;
+        let load = Load::Plan(self.cycles.plan(&self.task, number));
+        self.ask(Device::Cmm, Ask::Load { cycle: number, load }).await;
     }
 
     /// Looks through the points of a measurement and writes them.
     fn gate(&mut self, measurement: Box<Measurement>) {
         let number = u32::from(measurement.cycle);
-        let plan = self.cycles.get(&number).and_then(|cycle| cycle.plan.clone());
+        let plan = self.cycles.get(number).and_then(|cycle| cycle.plan.clone());
         self.compute(Computation::Gate, number, move |task, files| {
             work::gate_cycle(task, files, number, plan.as_deref(), &measurement)
         });
@@ -825,24 +813,21 @@ impl Drive {
 
     fn qualify(&mut self, number: u32) {
         let stated = self.task.probing.probe_radius_mm;
-        let found = self.cycles.get(&number).and_then(|c| c.points.as_ref()?.radius_mm);
+        let found = self.cycles.get(number).and_then(|c| c.points.as_ref()?.radius_mm);
         let radius_error_mm = found.map_or(0.0, |radius| radius - stated);
         self.answer(number, Event::Qualified { cycle: number, radius_error_mm });
     }
 
     fn register(&mut self, number: u32) {
-        let Some(cycle) = self.cycles.get(&number).cloned() else { return };
-        // What a gate refused, and what was measured once more after the same pass, is no pass before this one.
-        let pass = cycle.correction.cycle;
-        let earlier = |c: &&Cycle| c.is_judged() && c.known.is_some() && c.correction.cycle < pass;
-        let before = self.cycles.range(..number).rev().map(|(_, c)| c).find(earlier).cloned();
+        let Some(cycle) = self.cycles.get(number).cloned() else { return };
+        let before = self.cycles.before(number).cloned();
         self.compute(Computation::Registration, number, move |task, files| {
             work::register_cycle(task, files, number, &cycle, before.as_ref())
         });
     }
 
     fn compensate(&mut self, number: u32) {
-        let Some(cycle) = self.cycles.get(&number).cloned() else { return };
+        let Some(cycle) = self.cycles.get(number).cloned() else { return };
         self.compute(Computation::Compensation, number, move |task, files| {
             work::compensate_cycle(task, files, number, &cycle)
         });
@@ -898,21 +883,6 @@ impl Drive {
         self.notify(notice);
     }
 
-    fn rows(&self) -> Vec<CycleRow> {
-        let rows = self.cycles.iter().filter_map(|(&cycle, c)| {
-            let figures = c.figures.as_ref()?;
-            Some(CycleRow {
-                cycle,
-                pv_um: 1e3 * figures.pv_mm,
-                rms_um: 1e3 * figures.rms_mm,
-                points: figures.points,
-                outliers: figures.outliers,
-                level_um: 1e3 * c.correction.level_mm,
-            })
-        });
-        rows.collect()
-    }
-
     /// How the cell is, as the control socket tells it.
     fn snapshot(&self) -> Snapshot {
         let state = self.cell.state();
@@ -924,7 +894,7 @@ impl Drive {
             number: self.states,
             cycle: self.cell.cycle(),
             seconds: self.now().as_secs_f64(),
-            cycles: self.rows(),
+            cycles: self.cycles.rows(),
         }
     }
 }

@@ -48,21 +48,22 @@ pub(super) struct Recorder {
 }
 
 impl Recorder {
-    pub(super) fn new(journal: Journal) -> Self {
+    /// Takes a journal, with the numbers of the commands on it that no outcome has named, which are named by 1, 2, 3 from here on.
+    pub(super) fn new(journal: Journal, open: &[u32]) -> Self {
         let (given, jobs) = mpsc::unbounded_channel();
         let (failed, failures) = mpsc::unbounded_channel();
         let given_up = Arc::new(AtomicBool::new(false));
         let folder = journal.folder().to_owned();
         let scribe = Scribe {
             journal: Some(journal),
-            ids: HashMap::new(),
+            ids: (1..).zip(open.iter().copied()).collect(),
             failed,
             given_up: given_up.clone(),
             broken_off: false,
         };
         let thread = std::thread::Builder::new().name("journal".into()).spawn(move || scribe.keep(jobs));
         let thread = Some(thread.expect("a thread can be had"));
-        Self { given: Some(given), failures, given_up, thread, folder, intents: 0 }
+        Self { given: Some(given), failures, given_up, thread, folder, intents: open.len() as u64 }
     }
 
     pub(super) fn folder(&self) -> &Path {
@@ -229,6 +230,11 @@ impl Files {
     pub(super) fn place(&mut self, name: &'static str) -> PathBuf {
         self.names.push(name);
         self.folder.join(name)
+    }
+
+    /// Returns the names of all that were to be made.
+    pub(super) fn names(&self) -> &[&'static str] {
+        &self.names
     }
 
     /// Returns the names of those that were made.

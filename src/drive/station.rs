@@ -501,7 +501,9 @@ impl<B: StationDriver> MachineTask<B> {
 
     async fn reconcile(&mut self, cycle: u32) {
         let Some(armed) = self.armed.clone().filter(|armed| u32::from(armed.job.cycle) == cycle) else {
-            let outcome = Reconciliation::NotStarted;
+            // Of what nobody here has prepared the machine cannot be asked, and nothing is concluded.
+            let why = "this program has no preparation of this cycle to ask it for".to_owned();
+            let outcome = Reconciliation::Unknown(why);
             return self.tell(Event::Reconciled { device: B::DEVICE, cycle, outcome }).await;
         };
         let outcome = match self.driver.machine().reconcile(&armed).await {

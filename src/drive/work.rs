@@ -90,6 +90,16 @@ fn gate(
     Ok(Points { part, sphere, radius_mm, radius_sigma_mm, coordinates })
 }
 
+/// Returns the points of a measurement that a gate has let through before, from its files.
+pub(super) fn recorded_points(
+    task: &Task,
+    part: Vec<Point>,
+    sphere: Vec<Point>,
+    coordinates: Coordinates,
+) -> Result<Points, GateFailure> {
+    gate(task, 0, part, sphere, coordinates)
+}
+
 /// Share of its stated radius by which a qualified probe may differ: more is another stylus.
 const PROBE_SHARE: f64 = 0.01;
 

@@ -81,9 +81,22 @@ impl Learned {
         if head.layout != LAYOUT || head.simulation != simulation || head.setting != setting {
             return Ok(None);
         }
-        let learned: Self = serde_json::from_slice(&text).map_err(|error| broken(error.to_string()))?;
+        Self::of(&path, &text).map(|learned| Some((learned, text)))
+    }
+
+    /// Reads a copy that a run kept of what it began with.
+    ///
+    /// # Errors
+    /// Those of [`Learned::read`].
+    pub fn from_file(path: &Path) -> Result<Self, LearnedError> {
+        Self::of(path, &read_whole(path, MOST_BYTES)?)
+    }
+
+    fn of(path: &Path, text: &[u8]) -> Result<Self, LearnedError> {
+        let broken = |why| LearnedError::Broken { path: path.to_owned(), why };
+        let learned: Self = serde_json::from_slice(text).map_err(|error| broken(error.to_string()))?;
         match learned.flaw() {
-            None => Ok(Some((learned, text))),
+            None => Ok(learned),
             Some(why) => Err(broken(why)),
         }
     }

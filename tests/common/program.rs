@@ -106,6 +106,16 @@ impl Running {
         }
     }
 
+    /// How many lines it has said so far.
+    pub fn has_said(&mut self) -> usize {
+        self.said.extend(self.lines.try_iter());
+        self.said.len()
+    }
+
+    pub fn is_over(&mut self) -> bool {
+        self.child.try_wait().unwrap().is_some()
+    }
+
     /// Presses Ctrl-C.
     pub fn interrupt(&self) {
         self.signal("INT");

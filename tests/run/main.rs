@@ -9,6 +9,7 @@ mod data;
 mod faults;
 mod heartbeats;
 mod height_maps;
+mod killed;
 mod learning;
 mod manual;
 mod mirror_cell;
@@ -17,6 +18,7 @@ mod orders;
 mod outside;
 #[path = "../common/program.rs"]
 mod program;
+mod replay;
 #[path = "../common/rig.rs"]
 mod rig;
 mod study;

@@ -1,0 +1,104 @@
+//! How a number that may be none stands in the record: JSON has no NaN and no infinity, and a run is replayed from what stands there.
+
+use serde::de::Error;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+/// A number as it is recorded.
+#[derive(Serialize, Deserialize)]
+#[serde(untagged)]
+enum Recorded {
+    Number(f64),
+    Word(String),
+    /// As records of earlier versions have a NaN.
+    Nothing(()),
+}
+
+impl Recorded {
+    fn of(value: f64) -> Self {
+        if value.is_finite() { Self::Number(value) } else { Self::Word(value.to_string()) }
+    }
+
+    fn value<E: Error>(self) -> Result<f64, E> {
+        match self {
+            Self::Number(value) => Ok(value),
+            Self::Word(word) => word.parse().map_err(|_| E::custom(format!("{word:?} is no number"))),
+            Self::Nothing(()) => Ok(f64::NAN),
+        }
+    }
+}
+
+pub(super) fn serialize<S: Serializer>(value: &f64, to: S) -> Result<S::Ok, S::Error> {
+    Recorded::of(*value).serialize(to)
+}
+
+pub(super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+    Recorded::deserialize(from)?.value()
+}
+
+/// The same for a number that may be missing.
+pub(super) mod optional {
+    use super::{Deserialize, Deserializer, Recorded, Serialize, Serializer};
+
+    pub(in super::super) fn serialize<S: Serializer>(value: &Option<f64>, to: S) -> Result<S::Ok, S::Error> {
+        value.map(Recorded::of).serialize(to)
+    }
+
+    pub(in super::super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>, D::Error> {
+        Option::<Recorded>::deserialize(from)?.map(Recorded::value).transpose()
+    }
+}
+
+/// The same for pairs of numbers.
+pub(super) mod pairs {
+    use super::{Deserialize, Deserializer, Recorded, Serialize, Serializer};
+
+    pub(in super::super) fn serialize<S: Serializer>(pairs: &[[f64; 2]], to: S) -> Result<S::Ok, S::Error> {
+        let recorded: Vec<_> = pairs.iter().map(|pair| pair.map(Recorded::of)).collect();
+        recorded.serialize(to)
+    }
+
+    pub(in super::super) fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<[f64; 2]>, D::Error> {
+        let recorded = Vec::<[Recorded; 2]>::deserialize(from)?;
+        recorded.into_iter().map(|[a, b]| Ok([a.value()?, b.value()?])).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::event::{Event, Figures};
+    use crate::table::samples;
+
+    #[test]
+    fn every_event_comes_back_from_the_record_as_it_was() {
+        let recorded = |event: &Event| serde_json::to_string(event).unwrap();
+        for event in samples(3) {
+            let text = recorded(&event);
+            let back: Event = serde_json::from_str(&text).unwrap_or_else(|error| panic!("{text}: {error}"));
+            assert_eq!(recorded(&back), text);
+        }
+        for (value, stands) in [(f64::NAN, "\"NaN\""), (f64::INFINITY, "\"inf\""), (-0.1, "-0.1"), (5e-324, "5e-324")] {
+            let text = recorded(&Event::Qualified { cycle: 1, radius_error_mm: value });
+            assert!(text.contains(&format!(":{stands}")), "{text}");
+            let Ok(Event::Qualified { radius_error_mm: back, .. }) = serde_json::from_str(&text) else { panic!() };
+            assert!(back == value || back.is_nan() && value.is_nan());
+        }
+        let old = r#"{"event":"qualified","cycle":1,"radius_error_mm":null}"#;
+        let Ok(Event::Qualified { radius_error_mm, .. }) = serde_json::from_str(old) else { panic!() };
+        assert!(radius_error_mm.is_nan());
+        assert!(serde_json::from_str::<Event>(&old.replace("null", "\"much\"")).is_err());
+    }
+
+    #[test]
+    fn a_number_that_is_missing_stays_missing() {
+        let Some(Event::Registered { figures, .. }) =
+            samples(1).into_iter().find(|event| matches!(event, Event::Registered { .. }))
+        else {
+            panic!("there is one")
+        };
+        for removed_mm in [None, Some(f64::NAN), Some(0.25)] {
+            let text = serde_json::to_string(&Figures { removed_mm, ..figures.clone() }).unwrap();
+            let back: Figures = serde_json::from_str(&text).unwrap();
+            assert_eq!(format!("{:?}", back.removed_mm), format!("{removed_mm:?}"));
+        }
+    }
+}

@@ -1,0 +1,181 @@
+//! A run in this process: its machines, its terminal, and what is done from outside to end it.
+
+use std::io;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use regrind::cell::{Actor, Ending};
+use regrind::config::{CellConfig, Link};
+use regrind::device::{AnyCmm, AnyGrinder, Machine as _};
+use regrind::drive::{Drive, Interrupted, Orders, Request, Run, Task};
+use regrind::journal::{Journal, MachineLock};
+use regrind::recipe::Recipe;
+use regrind::setup;
+use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::sync::mpsc;
+
+use super::Outcome;
+use super::failure::Failure;
+use super::show::Show;
+
+/// What a run is driven by.
+pub(super) struct Live<'a> {
+    pub(super) recipe: &'a Recipe,
+    pub(super) cell: &'a CellConfig,
+    /// What the part is called in files.
+    pub(super) part: &'a str,
+    /// The folder of the run.
+    pub(super) folder: &'a Path,
+    /// The number of the part's run, for the machines.
+    pub(super) job: u32,
+    pub(super) actor: Actor,
+    pub(super) json: bool,
+}
+
+/// The machines of a run. Until this is dropped no other run on this computer has them.
+pub(super) struct Machines {
+    cmm: AnyCmm,
+    grinder: AnyGrinder,
+    _taken: [Option<MachineLock>; 2],
+}
+
+/// What a run is made of besides its machines.
+pub(super) struct Work {
+    pub(super) task: Task,
+    pub(super) plan: regrind::cell::CellPlan,
+    pub(super) journal: Journal,
+    /// Whether loading the part is not asked for.
+    pub(super) loaded: bool,
+    pub(super) interrupted: Option<Interrupted>,
+}
+
+impl Live<'_> {
+    /// Opens the machines; nothing is asked of them yet. `epoch` rises from program to program.
+    pub(super) fn open(&self, epoch: u32) -> Result<Machines, Failure> {
+        let Self { recipe, cell, part, folder, .. } = self;
+        let client = [owner(&self.actor, folder), epoch];
+        let (cmm, grinder) = setup::machines(recipe, cell, part, folder, client).map_err(Failure::Setup)?;
+        let _taken = [take(&cell.cmm.link, cmm.name(), folder)?, take(&cell.grinder.link, grinder.name(), folder)?];
+        Ok(Machines { cmm, grinder, _taken })
+    }
+
+    /// Lets the run go to its end and its report.
+    pub(super) async fn carry_out(self, machines: Machines, work: Work) -> Result<Ending, Failure> {
+        let (cell, actor) = (self.cell, self.actor);
+        let (notices, shown) = mpsc::unbounded_channel();
+        let showing = tokio::spawn(Show::new(self.json, cell.simulated, self.recipe, self.folder).follow(shown));
+        let poll = [setup::poll(&cell.cmm.link), setup::poll(&cell.grinder.link)];
+        let Work { task, plan, journal, loaded, interrupted } = work;
+        let run = Run { plan, task, journal, job: self.job, actor: actor.clone(), loaded, poll, notices, interrupted };
+        let ending = go(run, machines, actor).await?;
+        let shown = showing.await.map_err(|e| Failure::Terminal(e.into()));
+        // The record is closed; a report that cannot be written must not change how the run ended, nor a terminal that has gone.
+        let report = regrind::report::write_run_report(self.folder);
+        shown??;
+        if let Err(error) = report {
+            super::print(&format!("no report: {error}\n"))?;
+        }
+        Ok(ending)
+    }
+}
+
+/// Gives the run its machines and lets it go.
+async fn go(run: Run, machines: Machines, actor: Actor) -> Result<Ending, Failure> {
+    let folder = run.journal.folder().to_owned();
+    let Machines { cmm, grinder, _taken } = machines;
+    let (drive, orders) =
+        Drive::with_cell(run, cmm, grinder).map_err(|source| Failure::ControlSocket { path: folder, source })?;
+    let signals = Signals::new().map_err(Failure::Signals)?;
+    let heeding = [tokio::spawn(heed_ctrl_c(orders.clone(), actor.clone())), tokio::spawn(signals.heed(orders, actor))];
+    let ending = drive.run().await;
+    heeding.iter().for_each(tokio::task::JoinHandle::abort);
+    Ok(ending)
+}
+
+/// Ctrl-C once holds at the next safe place, twice aborts. After a resume it counts from one again.
+async fn heed_ctrl_c(orders: Orders, actor: Actor) {
+    let mut held_at: Option<Instant> = None;
+    while tokio::signal::ctrl_c().await.is_ok() {
+        let again = held_at.is_some_and(|at| at.elapsed() < IN_ONE_GO || !orders.is_working());
+        held_at = if again { held_at } else { Some(Instant::now()) };
+        let request = if again {
+            Request::Abort { reason: "Ctrl-C, twice".into() }
+        } else {
+            Request::Hold { reason: "Ctrl-C".into() }
+        };
+        orders.give(request, actor.clone()).await;
+    }
+}
+
+/// What ends a program from outside: a terminal that is closed, a service that is stopped.
+struct Signals {
+    /// None where whoever started the program wants it to outlive its terminal (`nohup`).
+    hangup: Option<Signal>,
+    terminate: Signal,
+}
+
+impl Signals {
+    fn new() -> io::Result<Self> {
+        let hangup = if ignores_hangup() { None } else { Some(signal(SignalKind::hangup())?) };
+        Ok(Self { hangup, terminate: signal(SignalKind::terminate())? })
+    }
+
+    /// The first ends the run in order, the next one aborts it. A terminal that closes may say so twice.
+    async fn heed(mut self, orders: Orders, actor: Actor) {
+        let mut first: Option<Instant> = None;
+        loop {
+            let (name, hung_up) = tokio::select! {
+                Some(()) = self.terminate.recv() => ("SIGTERM", false),
+                Some(()) = async { self.hangup.as_mut()?.recv().await }, if self.hangup.is_some() => {
+                    ("SIGHUP, the terminal was closed", true)
+                }
+                else => return,
+            };
+            let reason = name.to_owned();
+            let request = match first {
+                None => Request::Stop { reason },
+                Some(at) if hung_up && at.elapsed() < IN_ONE_GO => continue,
+                Some(_) => Request::Abort { reason: format!("{reason}, again") },
+            };
+            first = first.or_else(|| Some(Instant::now()));
+            orders.give(request, actor.clone()).await;
+        }
+    }
+}
+
+/// Whether SIGHUP, the first signal, is ignored by who started this program.
+fn ignores_hangup() -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).is_some_and(|mask| mask & 1 == 1)
+}
+
+/// Keeps a machine on a line from every other run on this computer.
+fn take(link: &Link, name: &str, run: &Path) -> Result<Option<MachineLock>, Failure> {
+    let run = std::path::absolute(run).unwrap_or_else(|_| run.to_owned());
+    let taken = link.wire.line().map(|_| MachineLock::take(name, &run));
+    taken.transpose().map_err(Failure::Machine)
+}
+
+/// A number for this run as a client of its machines, the same whoever goes on with it.
+fn owner(actor: &Actor, run: &Path) -> u32 {
+    let mut hash = crc32fast::Hasher::new();
+    hash.update(b"regrind ");
+    hash.update(actor.station.as_bytes());
+    let run = std::path::absolute(run).unwrap_or_else(|_| run.to_owned());
+    hash.update(run.as_os_str().as_encoded_bytes());
+    hash.finalize().max(1)
+}
+
+pub(super) fn outcome(ending: &Ending) -> Result<Outcome, Failure> {
+    match ending {
+        Ending::Accepted { .. } => Ok(Outcome::Accepted),
+        Ending::NotAccepted { .. } => Ok(Outcome::NotInTolerance),
+        Ending::Stopped { reason, .. } | Ending::Aborted { reason, .. } => {
+            Err(Failure::Ended { reason: reason.clone() })
+        }
+    }
+}
+
+/// Two presses within this are one wish, whatever the cell has made of the first by then.
+const IN_ONE_GO: Duration = Duration::from_secs(3);

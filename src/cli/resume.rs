@@ -1,0 +1,170 @@
+//! `regrind resume`: let a held cell go on, or go on with a run whose program ended in the middle of it.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use regrind::cell::{CellPlan, TABLE_VERSION};
+use regrind::config::CellConfig;
+use regrind::drive::{Interrupted, Request, Task, is_live};
+use regrind::formats::{FormatError, Learned};
+use regrind::journal::{Journal, JournalError, Reader, verify};
+use regrind::recipe::Recipe;
+use regrind::setup;
+use serde::Deserialize;
+use serde_json::Value;
+
+use super::failure::Failure;
+use super::live::{Live, Work, outcome};
+use super::run::{LEARNED_FROM, epoch, operator, within};
+use super::{Outcome, check, control};
+
+/// Let a held cell go on, or take up a run that broke off
+#[derive(Args, Debug)]
+#[command(after_help = "\
+RUN is the folder of a run; without it, the one under runs/ that goes on now, or else the newest.
+
+A run whose program has ended without an end on record (a crash, a cut of the power) is taken up in this terminal: the record is
+verified and done again without commanding anything, the machines are asked what became of their jobs, and the cell comes to
+Held, \"the program was started again\". Then look at the machines, and give the same command from another terminal: it goes on.
+
+Examples:
+  regrind resume
+  regrind resume runs/freeform-mirror-20260704T120000Z --reason \"coolant is filled up\"
+
+Exit codes: 0 the order was taken, or the part is accepted; 1 finished, not in tolerance, or the record is broken; 2 no such run, or
+one that is over; 3 the cell refused the order, fault or abort.")]
+pub(super) struct Arguments {
+    /// Folder of the run
+    #[arg(value_name = "RUN")]
+    run: Option<PathBuf>,
+    /// Why, for the record
+    #[arg(long, value_name = "TEXT", default_value = "")]
+    reason: String,
+    /// Who takes the run up
+    #[arg(long, value_name = "NAME")]
+    operator: Option<String>,
+    /// Print the answer, or a line for everything that happens, as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let folder = match &arguments.run {
+        Some(run) => run.clone(),
+        None => control::live(Path::new("runs"))?,
+    };
+    if is_live(&folder) {
+        let request = Request::Resume { reason: arguments.reason.clone(), seen: None };
+        return control::give(Some(&folder), &request, arguments.json);
+    }
+    take_up(arguments, &std::path::absolute(&folder).unwrap_or(folder))
+}
+
+/// Takes up a run that broke off: all of it is looked through before anything is opened.
+fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
+    let begun = Begun::read(folder)?;
+    std::env::set_current_dir(&begun.working_folder)
+        .map_err(|source| Failure::WorkingFolder { path: begun.working_folder.clone(), source })?;
+    let recipe = check::or_show(Recipe::parse(&begun.recipe, &text(folder, "recipe.toml")?))?;
+    let cell = check::or_show(CellConfig::parse(&begun.cell, &text(folder, "cell.toml")?))?;
+    if within(&cell) {
+        return Err(Failure::WorldGone { run: folder.to_owned() });
+    }
+    let (task, plan) = begun.prepared(folder, &recipe, &cell)?;
+    let interrupted = Interrupted::read(folder, plan.clone(), &task).map_err(Failure::Replay)?;
+    if !arguments.json {
+        let marked = if cell.simulated { "SIMULATION  " } else { "" };
+        let state = interrupted.state();
+        super::print(&format!(
+            "{marked}broke off: {state}; the record is whole and was done again without a difference\n"
+        ))?;
+    }
+    super::runtime()?.block_on(async {
+        let (part, actor) = (&begun.part_in_files, operator(arguments.operator.as_deref()));
+        let (recipe, cell, json) = (&recipe, &cell, arguments.json);
+        let live = Live { recipe, cell, part, folder, job: begun.job, actor, json };
+        let machines = live.open(epoch(jiff::Timestamp::now()))?;
+        let journal = Journal::open(folder).map_err(Failure::Journal)?;
+        let (loaded, interrupted) = (cell.simulated, Some(interrupted));
+        outcome(&live.carry_out(machines, Work { task, plan, journal, loaded, interrupted }).await?)
+    })
+}
+
+/// Reads a file that a run keeps.
+fn text(run: &Path, name: &str) -> Result<String, Failure> {
+    let path = run.join(name);
+    std::fs::read_to_string(&path).map_err(|source| Failure::File(FormatError::Unreadable { path, source }))
+}
+
+/// What the first record of a run tells of how to go on with it.
+#[derive(Deserialize)]
+struct Begun {
+    recipe: PathBuf,
+    cell: PathBuf,
+    /// Where relative paths begin.
+    working_folder: PathBuf,
+    nominal_sha256: String,
+    setting: String,
+    part_in_files: String,
+    job: u32,
+    seed: Option<u64>,
+    plan: Value,
+    table_version: u32,
+}
+
+impl Begun {
+    /// Verifies the record of a run that nobody drives and that has no end, and reads how it began.
+    fn read(run: &Path) -> Result<Self, Failure> {
+        let verified = verify(run).map_err(|error| match error {
+            JournalError::Broken { .. } => Failure::Broken(error),
+            error => Failure::Journal(error),
+        })?;
+        if verified.under_way {
+            return Err(Failure::Journal(JournalError::Busy { path: run.to_owned() }));
+        }
+        if verified.closed {
+            return Err(Failure::Over { run: run.to_owned() });
+        }
+        let first = Reader::open(run).map_err(Failure::Journal)?.records(0).next().transpose();
+        let first = first.map_err(Failure::Journal)?.map(|record| record.value());
+        let content = first.as_ref().map_or(Value::Null, |first| first["content"].clone());
+        let program = first.as_ref().and_then(|first| first["regrind"].as_str()).unwrap_or("unknown").to_owned();
+        let begun: Self = serde_json::from_value(content).map_err(|error| Failure::EarlierRun {
+            run: run.to_owned(),
+            program: program.clone(),
+            what: error.to_string(),
+        })?;
+        if begun.table_version != TABLE_VERSION {
+            let what =
+                format!("it decides by table {}, and this program by table {TABLE_VERSION}", begun.table_version);
+            return Err(Failure::EarlierRun { run: run.to_owned(), program, what });
+        }
+        Ok(begun)
+    }
+
+    /// Makes the task and the plan of the run again, and sees that they are the same.
+    fn prepared(&self, run: &Path, recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), Failure> {
+        let (mut task, plan) = setup::prepare(recipe, cell).map_err(Failure::Setup)?;
+        if let Some(seed) = self.seed {
+            task.setting.push_str(&format!(", seed {seed}"));
+        }
+        let learned = run.join(LEARNED_FROM);
+        if learned.is_file() {
+            let learned = Learned::from_file(&learned).map_err(Failure::Learned)?;
+            let from = learned.run.clone();
+            task.begin_with(learned).map_err(|source| Failure::TooMuchLearned { run: from, source })?;
+        }
+        let identity: String = task.part_identity.iter().map(|b| format!("{b:02x}")).collect();
+        let differs = |what: &'static str| Err(Failure::OtherTask { run: run.to_owned(), what });
+        if identity != self.nominal_sha256 {
+            return differs("the nominal surface");
+        }
+        if task.setting != self.setting {
+            return differs("how the part is ground, measured and corrected");
+        }
+        if serde_json::to_value(&plan).ok().as_ref() != Some(&self.plan) {
+            return differs("what the cell decides by");
+        }
+        Ok((task, plan))
+    }
+}

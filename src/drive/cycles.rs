@@ -1,0 +1,86 @@
+//! What is known of the cycles of a run, and what each next step begins with.
+//!
+//! The loop and the replay of a record go through here alike, so that a run that is gone on with has what it had.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use super::CycleRow;
+use super::task::{Cycle, Product, Task};
+use crate::device::{CorrectionMap, Pass, Plan};
+
+/// The cycles, by number.
+#[derive(Default)]
+pub(super) struct Cycles(BTreeMap<u32, Cycle>);
+
+impl Cycles {
+    pub(super) fn get(&self, number: u32) -> Option<&Cycle> {
+        self.0.get(&number)
+    }
+
+    /// Returns the payloads of the pass of a cycle; the first begins with what the task does.
+    pub(super) fn pass(&mut self, task: &Task, number: u32) -> (CorrectionMap, Pass) {
+        let cycle = self.0.entry(number).or_insert_with(|| Cycle::new(task.first_correction()));
+        task.payloads(&cycle.correction)
+    }
+
+    /// Lays the plan of a cycle and keeps it.
+    pub(super) fn plan(&mut self, task: &Task, number: u32) -> Arc<Plan> {
+        // A part that is measured before any pass, or measured once more, stands as the last pass left it.
+        let last = self.0.range(..=number).next_back().map(|(_, c)| Arc::clone(&c.correction));
+        let correction = last.unwrap_or_else(|| Arc::new(task.first_correction()));
+        // Where the part was found by a measurement that was judged. After one that a gate refused it may have been seated anew.
+        let last = self.0.range(..number).next_back().map(|(_, cycle)| cycle);
+        let judged = last.filter(|cycle| cycle.is_judged()).and_then(|cycle| cycle.registration.as_ref());
+        let pose = judged.map_or(task.fixture_cmm_from_model, |found| found.cmm_from_model);
+        let plan = Arc::new(task.plan(correction.level_mm, &pose));
+        let cycle = self.0.entry(number).or_insert_with(|| Cycle::new((*correction).clone()));
+        cycle.plan = Some(Arc::clone(&plan));
+        plan
+    }
+
+    /// Returns the last measurement of an earlier pass that was judged. What a gate refused, and what was measured once more after
+    /// the same pass, is no pass before this one.
+    pub(super) fn before(&self, number: u32) -> Option<&Cycle> {
+        let pass = self.get(number)?.correction.cycle;
+        let earlier = |c: &&Cycle| c.is_judged() && c.known.is_some() && c.correction.cycle < pass;
+        self.0.range(..number).rev().map(|(_, c)| c).find(earlier)
+    }
+
+    /// Takes what was computed of a cycle.
+    pub(super) fn take(&mut self, number: u32, product: Product) {
+        if let Product::Correction(next) = product {
+            self.0.insert(number + 1, Cycle::new(next));
+        } else if let Some(cycle) = self.0.get_mut(&number) {
+            cycle.take(product);
+        }
+    }
+
+    /// Counts a judgement of a cycle and returns how many it has had.
+    pub(super) fn judged(&mut self, number: u32) -> u32 {
+        let Some(cycle) = self.0.get_mut(&number) else { return 1 };
+        cycle.judgements += 1;
+        cycle.judgements
+    }
+
+    /// Returns the last cycle that tells something of the grinder.
+    pub(super) fn last_known(&self) -> Option<&Cycle> {
+        self.0.values().rev().find(|cycle| cycle.is_judged() && cycle.known.is_some())
+    }
+
+    /// What is shown of them.
+    pub(super) fn rows(&self) -> Vec<CycleRow> {
+        let rows = self.0.iter().filter_map(|(&cycle, c)| {
+            let figures = c.figures.as_ref()?;
+            Some(CycleRow {
+                cycle,
+                pv_um: 1e3 * figures.pv_mm,
+                rms_um: 1e3 * figures.rms_mm,
+                points: figures.points,
+                outliers: figures.outliers,
+                level_um: 1e3 * c.correction.level_mm,
+            })
+        });
+        rows.collect()
+    }
+}

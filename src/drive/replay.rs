@@ -1,0 +1,368 @@
+//! From the record of a run that broke off to where it was: every event is handled again, every command held against the one on
+//! record, and every computation done again from the recorded points and held against the recorded files.
+//!
+//! ```text
+//!  record --> event  --> Cell::handle --> commands == those on record?
+//!             points --> the same computations --> event and files == those on record?
+//!             intent --> the payloads that it names == those computed again?
+//! ```
+//!
+//! Nothing is commanded here. At the first difference it stops: a program that would have decided or computed otherwise cannot know
+//! what the machines hold.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use serde_json::Value;
+use thiserror::Error;
+
+use super::cycles::Cycles;
+use super::outcome;
+use super::record::Files;
+use super::station::Intent;
+use super::task::Product;
+use super::work;
+use super::{Computation, Task, folder_of, made};
+use crate::cell::{Cell, CellPlan, Command, Device, Ending, Event, Gate, Judgement};
+use crate::device::{Coordinates, Identified, digest};
+use crate::formats::{self, FormatError};
+use crate::journal::{Artefact, JournalError, Kind, Reader, Record, sha256_hex};
+
+/// Where computations are done again, below the run folder; gone when that is over.
+const SCRATCH: &str = "replay";
+
+/// A run that was interrupted, as its record tells it.
+pub struct Interrupted {
+    pub(super) cell: Cell,
+    pub(super) cycles: Cycles,
+    /// The last preparation of each machine: CMM, grinder.
+    pub(super) armed: [Option<Value>; 2],
+    /// How often each thing was computed, so that no file is written again.
+    pub(super) attempts: BTreeMap<(u32, Computation), u32>,
+    pub(super) states: u64,
+    /// Time since the run began.
+    pub(super) before: Duration,
+    /// Commands without an outcome, by their numbers.
+    pub(super) open: BTreeMap<u32, Command>,
+    /// How it ended, where only the last record is missing.
+    pub(super) ending: Option<Ending>,
+    /// A judgement whose file is not on record, and which of its cycle it is.
+    pub(super) unannounced: Option<(u32, Judgement)>,
+}
+
+/// Why a run cannot be gone on with.
+#[derive(Debug, Error)]
+#[allow(missing_docs)]
+#[non_exhaustive]
+pub enum ReplayError {
+    #[error(transparent)]
+    Journal(#[from] JournalError),
+    #[error(transparent)]
+    File(#[from] FormatError),
+    #[error("{}: {source}; nothing was commanded: see to the disk and try again", .path.display())]
+    Scratch { path: PathBuf, source: io::Error },
+    #[error("{}: record {seq} cannot be read back ({what}); this run cannot be gone on with, bring its machines home by `regrind recover`", .run.display())]
+    Unreadable { run: PathBuf, seq: u64, what: String },
+    #[error(
+        "{}: at record {seq} this program comes to something else than the one that began the run: {what}; nothing was commanded. Go on with \
+         the program that began it, or bring its machines home by `regrind recover` and begin a new run",
+        .run.display()
+    )]
+    Differs { run: PathBuf, seq: u64, what: String },
+}
+
+impl Interrupted {
+    /// Reads the record of a run and does again what it tells, for the plan and the task that the run began with.
+    ///
+    /// # Errors
+    /// A record that cannot be read, a disk that fails, and the first difference to what this program would have done.
+    pub fn read(run: &Path, plan: CellPlan, task: &Task) -> Result<Self, ReplayError> {
+        let reader = Reader::open(run)?;
+        let mut replay = Replay::new(run, plan, task)?;
+        for record in reader.records(0) {
+            replay.take(&record?)?;
+        }
+        replay.end()
+    }
+
+    /// A run of which nothing has happened.
+    pub(super) fn none(plan: CellPlan) -> Self {
+        Self {
+            cell: Cell::new(plan),
+            cycles: Cycles::default(),
+            armed: [None, None],
+            attempts: BTreeMap::new(),
+            states: 0,
+            before: Duration::ZERO,
+            open: BTreeMap::new(),
+            ending: None,
+            unannounced: None,
+        }
+    }
+
+    /// Returns the state in words in which the run broke off.
+    pub fn state(&self) -> String {
+        format!("{}, cycle {}", self.cell.state(), self.cell.cycle())
+    }
+}
+
+struct Replay<'t> {
+    run: &'t Path,
+    task: &'t Task,
+    found: Interrupted,
+    /// What followed from the last event and has not been seen on record.
+    due: VecDeque<Command>,
+    /// The newest file of each name in the folder of a cycle.
+    files: BTreeMap<(u32, String), Artefact>,
+    /// What the last measurement said that its coordinates are.
+    coordinates: Option<Coordinates>,
+    scratch: Scratch,
+    last: u64,
+}
+
+impl<'t> Replay<'t> {
+    fn new(run: &'t Path, plan: CellPlan, task: &'t Task) -> Result<Self, ReplayError> {
+        let found = Interrupted::none(plan);
+        let scratch = Scratch::new(run)?;
+        let (due, files) = (VecDeque::new(), BTreeMap::new());
+        Ok(Self { run, task, found, due, files, coordinates: None, scratch, last: 0 })
+    }
+
+    fn take(&mut self, record: &Record) -> Result<(), ReplayError> {
+        self.last = record.seq;
+        self.found.before = self.found.before.max(Duration::from_nanos(record.mono_ns));
+        let payload = record.value();
+        match record.kind {
+            Kind::Begin | Kind::End => Ok(()),
+            // What the program had decided and not brought on record when it ended was not carried out.
+            Kind::Reopen => {
+                self.due.clear();
+                Ok(())
+            }
+            Kind::Artefact => {
+                self.file(serde_json::from_value(payload).map_err(|error| self.unreadable(&error))?);
+                Ok(())
+            }
+            Kind::Outcome => {
+                self.found.open.retain(|id, _| Some(*id) != record.command_id);
+                Ok(())
+            }
+            Kind::Event => self.event(Duration::from_nanos(record.mono_ns), payload),
+            Kind::Intent | Kind::Note if payload["command"].is_string() => self.command(record.command_id, payload),
+            Kind::Intent | Kind::Note => {
+                let told = &payload["transfer"]["coordinates"];
+                if !told.is_null() {
+                    let told = serde_json::from_value(told.clone()).map_err(|error| self.unreadable(&error))?;
+                    self.coordinates = Some(told);
+                }
+                Ok(())
+            }
+        }
+    }
+
+    fn file(&mut self, file: Artefact) {
+        let path = Path::new(&file.name);
+        let cycle = file.name.split('/').next().and_then(|folder| folder.strip_prefix("cycle-")?.parse().ok());
+        let (Some(cycle), Some(name)) = (cycle, path.file_name().and_then(|name| name.to_str())) else { return };
+        if name == "result.json" && self.found.unannounced.as_ref().is_some_and(|(_, of)| of.cycle == cycle) {
+            self.found.unannounced = None;
+        }
+        self.files.insert((cycle, name.to_owned()), file);
+    }
+
+    fn event(&mut self, now: Duration, payload: Value) -> Result<(), ReplayError> {
+        if let Some(missing) = self.due.front() {
+            return Err(self.differs(format!("it commands {}, and the record has another event", missing.name())));
+        }
+        let event: Event = serde_json::from_value(payload.clone()).map_err(|error| self.unreadable(&error))?;
+        if let Event::Prepared { device, .. } = &event {
+            self.found.armed[*device as usize] = payload.get("detail").cloned();
+        }
+        self.compute(&event)?;
+        let before = self.found.cell.state();
+        self.due = self.found.cell.handle(now, event).into();
+        self.found.states += u64::from(self.found.cell.state() != before);
+        let commands: Vec<Command> = self.due.iter().cloned().collect();
+        commands.iter().for_each(|command| self.follow(command));
+        Ok(())
+    }
+
+    /// What a command leaves in this program.
+    fn follow(&mut self, command: &Command) {
+        let (cycles, task) = (&mut self.found.cycles, self.task);
+        match command {
+            Command::LoadPass { cycle } => drop(cycles.pass(task, *cycle)),
+            Command::LoadPlan { cycle } => drop(cycles.plan(task, *cycle)),
+            Command::Announce(judgement) => {
+                let which = cycles.judged(judgement.cycle);
+                self.found.unannounced = Some((which, judgement.clone()));
+            }
+            Command::Finish(ending) => self.found.ending = Some(ending.clone()),
+            _ => {}
+        }
+    }
+
+    /// Holds a command on record against the one that is due.
+    fn command(&mut self, id: Option<u32>, mut recorded: Value) -> Result<(), ReplayError> {
+        let name = recorded["command"].as_str().unwrap_or_default().to_owned();
+        let Some(command) = self.due.pop_front() else {
+            return Err(self.differs(format!("nothing is to be commanded, and the record has {name}")));
+        };
+        if let (Command::StartMachine { .. }, Some(recorded)) = (&command, recorded.as_object_mut()) {
+            recorded.remove("intent");
+        }
+        if serde_json::to_value(&command).unwrap_or_default() != recorded {
+            return Err(self.differs(format!("it commands {command:?}, and the record has {recorded}")));
+        }
+        if let Some(id) = id.filter(|_| outcome::is_answered(&command)) {
+            self.found.open.insert(id, command);
+        }
+        Ok(())
+    }
+
+    /// Does again what was computed, from what is on record.
+    fn compute(&mut self, event: &Event) -> Result<(), ReplayError> {
+        let (number, kind) = match event {
+            Event::Collected { cycle, gate: Gate::Passed, .. } => (*cycle, Computation::Gate),
+            Event::Registered { cycle, .. } => (*cycle, Computation::Registration),
+            Event::Compensated { cycle, .. } => (*cycle, Computation::Compensation),
+            _ => return Ok(()),
+        };
+        let Some(cycle) = self.found.cycles.get(number).cloned() else { return Ok(()) };
+        if kind == Computation::Gate {
+            let points = self.points(number)?;
+            self.found.cycles.take(number, Product::Points(points));
+            return Ok(());
+        }
+        let mut files = self.scratch.files(number)?;
+        let (again, product) = match kind {
+            Computation::Registration => {
+                work::register_cycle(self.task, &mut files, number, &cycle, self.found.cycles.before(number))
+            }
+            _ => work::compensate_cycle(self.task, &mut files, number, &cycle),
+        };
+        let [recorded, again] = [event, &again].map(|event| serde_json::to_value(event).unwrap_or_default());
+        if recorded != again {
+            return Err(
+                self.differs(format!("computed again, cycle {number} gives {again}, and the record has {recorded}"))
+            );
+        }
+        self.compare(number, &files)?;
+        self.found.cycles.take(number, product);
+        Ok(())
+    }
+
+    /// The points of a measurement as they were written.
+    fn points(&self, number: u32) -> Result<super::task::Points, ReplayError> {
+        let read = |name: &str| match self.files.get(&(number, name.to_owned())) {
+            Some(file) => formats::read_measured(self.run.join(&file.name)).map_err(ReplayError::from),
+            None => Ok(Vec::new()),
+        };
+        let (part, sphere) = (read("measured.csv")?, read("reference_sphere.csv")?);
+        let coordinates = self.coordinates.unwrap_or(Coordinates::Centres);
+        work::recorded_points(self.task, part, sphere, coordinates).map_err(|why| {
+            self.differs(format!("the points of cycle {number} are not what a gate lets through: {why:?}"))
+        })
+    }
+
+    /// Holds the files that a computation made again against those on record.
+    fn compare(&self, number: u32, files: &Files) -> Result<(), ReplayError> {
+        // A file of this format carries the time at which it was written.
+        let dated = |name: &str| name.ends_with(".x3p");
+        for name in files.names().iter().filter(|name| !dated(name)) {
+            let path = files.folder().join(name);
+            let Some(recorded) = self.files.get(&(number, (*name).to_owned())) else { continue };
+            if !path.is_file() {
+                return Err(self.differs(format!("computed again, there is no {}", recorded.name)));
+            }
+            let bytes = fs::read(&path).map_err(|source| ReplayError::Scratch { path, source })?;
+            if sha256_hex(&bytes) != recorded.sha256 {
+                return Err(self.differs(format!("computed again, {} is not the one on record", recorded.name)));
+            }
+        }
+        Ok(())
+    }
+
+    /// Sees that what each machine was prepared for is what is known of that cycle, and counts what lies in the run folder.
+    fn end(mut self) -> Result<Interrupted, ReplayError> {
+        for device in Device::BOTH {
+            self.check_armed(device)?;
+        }
+        for number in 1..=self.found.cell.cycle() + 1 {
+            for kind in [Computation::Gate, Computation::Registration, Computation::Compensation] {
+                let begun = (1..).take_while(|attempt| self.run.join(folder_of(number, *attempt)).is_dir());
+                let attempts = begun.filter(|attempt| self.has_begun(number, *attempt, kind)).last().unwrap_or(0);
+                self.found.attempts.insert((number, kind), attempts);
+            }
+        }
+        Ok(self.found)
+    }
+
+    /// Whether a computation has left a file, on record or not, in the folder of an attempt.
+    fn has_begun(&self, number: u32, attempt: u32, kind: Computation) -> bool {
+        let folder = self.run.join(folder_of(number, attempt));
+        let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+        let mut names = entries.filter_map(|entry| entry.file_name().into_string().ok());
+        names.any(|name| name != "result.json" && Computation::of(&name) == kind)
+    }
+
+    fn check_armed(&mut self, device: Device) -> Result<(), ReplayError> {
+        let Some(value) = self.found.armed[device as usize].clone() else { return Ok(()) };
+        let intent: Intent = serde_json::from_value(value).map_err(|error| self.unreadable(&error))?;
+        let number = u32::from(intent.cycle);
+        let Some(cycle) = self.found.cycles.get(number) else { return Ok(()) };
+        let due = match (device, &cycle.plan) {
+            (Device::Grinder, _) => {
+                let (map, pass) = self.task.payloads(&cycle.correction);
+                digest(&[map.identity(), pass.identity()])
+            }
+            (Device::Cmm, Some(plan)) => digest(&[plan.identity()]),
+            (Device::Cmm, None) => return Ok(()),
+        };
+        if due == intent.digest {
+            return Ok(());
+        }
+        let told = intent.digest;
+        Err(self.differs(format!(
+            "the {device} was prepared in cycle {number} for {told:08x}, and what is known of that cycle gives {due:08x}"
+        )))
+    }
+
+    fn unreadable(&self, what: &dyn std::fmt::Display) -> ReplayError {
+        ReplayError::Unreadable { run: self.run.to_owned(), seq: self.last, what: what.to_string() }
+    }
+
+    fn differs(&self, what: String) -> ReplayError {
+        ReplayError::Differs { run: self.run.to_owned(), seq: self.last, what }
+    }
+}
+
+/// A folder for what is computed again.
+struct Scratch(PathBuf);
+
+impl Scratch {
+    fn new(run: &Path) -> Result<Self, ReplayError> {
+        let path = run.join(SCRATCH);
+        // A replay that was interrupted itself left it.
+        match fs::remove_dir_all(&path) {
+            Err(source) if source.kind() != io::ErrorKind::NotFound => Err(ReplayError::Scratch { path, source }),
+            _ => Ok(Self(path)),
+        }
+    }
+
+    fn files(&self, number: u32) -> Result<Files, ReplayError> {
+        let folder = self.0.join(folder_of(number, 1));
+        made(&folder)?;
+        Ok(Files::new(folder))
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        // Nothing of it is needed by anybody, and the next replay begins by taking it away.
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}

@@ -1,0 +1,128 @@
+//! The record of a run, done again: without a difference from wherever it broke off, and with the first one named where there is one.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::rig::{PATIENCE, Ready, Rig, small};
+use regrind::drive::{Drive, Interrupted, Notice, Orders, ReplayError, Request};
+use regrind::journal::{Reader, verify};
+use regrind::setup;
+
+/// Runs a part of three passes with a hold on the way, and returns the rig and the folder of the run.
+async fn finished() -> (Rig, PathBuf) {
+    let mut rig = Rig::new(small(12, 8, 5000.0)).await;
+    let Ready { mut run, cmm, grinder, mut notices, folder } = rig.next(true);
+    // Nothing is good enough, so that it goes on to the last pass that the plan allows.
+    (run.plan.tolerance.pv_mm, run.plan.max_cycles, run.plan.stall_share) = (1e-6, 3, 0.0);
+    let actor = run.actor.clone();
+    let (drive, orders): (_, Orders) = Drive::new(run, cmm, grinder).unwrap();
+    let running = tokio::spawn(drive.run());
+    let mut held = false;
+    while let Some(notice) = notices.recv().await {
+        match notice {
+            Notice::Figures { .. } if !held => {
+                held = true;
+                orders.give(Request::Hold { reason: "tea".into() }, actor.clone()).await;
+                orders.give(Request::Resume { reason: "tea is over".into(), seen: None }, actor.clone()).await;
+            }
+            Notice::Alarm(_) => orders.give(Request::Resume { reason: "seen".into(), seen: None }, actor.clone()).await,
+            _ => {}
+        }
+    }
+    tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
+    assert!(verify(&folder).unwrap().closed);
+    (rig, folder)
+}
+
+/// Reads the record as the program that made it would.
+fn again(
+    rig: &Rig,
+    folder: &Path,
+    change: impl FnOnce(&mut regrind::drive::Task, &mut regrind::cell::CellPlan),
+) -> Result<Interrupted, ReplayError> {
+    let (mut task, mut plan) = setup::prepare(&rig.recipe, &rig.cell).unwrap();
+    (plan.tolerance.pv_mm, plan.max_cycles, plan.stall_share) = (1e-6, 3, 0.0);
+    change(&mut task, &mut plan);
+    Interrupted::read(folder, plan, &task)
+}
+
+/// Copies the record of a run up to a record, and its files: what lies there when the program ended behind it.
+fn broken_off(folder: &Path, at: u64) -> tempfile::TempDir {
+    let copy = tempfile::tempdir().unwrap();
+    copy_files(folder, copy.path());
+    let database = rusqlite::Connection::open(copy.path().join("journal.sqlite")).unwrap();
+    // Records are guarded against change: a copy that is cut has to be let.
+    let guards: Vec<String> = database
+        .prepare("SELECT name FROM sqlite_schema WHERE type = 'trigger'")
+        .and_then(|mut names| names.query_map([], |row| row.get(0))?.collect())
+        .unwrap();
+    guards.iter().for_each(|name| database.execute_batch(&format!("DROP TRIGGER {name}")).unwrap());
+    database.execute("DELETE FROM record WHERE seq > ?1", [at as i64]).unwrap();
+    copy
+}
+
+fn copy_files(from: &Path, to: &Path) {
+    for entry in fs::read_dir(from).unwrap().map(Result::unwrap) {
+        let to = to.join(entry.file_name());
+        let kind = entry.file_type().unwrap();
+        if kind.is_dir() {
+            fs::create_dir(&to).unwrap();
+            copy_files(&entry.path(), &to);
+        } else if kind.is_file() {
+            fs::copy(entry.path(), to).unwrap();
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_record_is_done_again_without_a_difference_wherever_it_broke_off() {
+    let (rig, folder) = finished().await;
+    let last = verify(&folder).unwrap().records;
+    let whole = again(&rig, &folder, |_, _| ()).unwrap_or_else(|error| panic!("{error}"));
+    assert!(whole.state().starts_with("Stopped"), "{}", whole.state());
+    assert!(!folder.join("replay").exists(), "what was computed again is taken away");
+    let mut states = std::collections::BTreeSet::new();
+    for at in (1..last).step_by(7).chain([last - 1]) {
+        let copy = broken_off(&folder, at);
+        let found =
+            again(&rig, copy.path(), |_, _| ()).unwrap_or_else(|error| panic!("cut behind record {at}: {error}"));
+        states.insert(found.state());
+    }
+    assert!(states.len() > 15, "{states:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_would_be_decided_or_computed_otherwise_is_named_and_nothing_is_gone_on_with() {
+    let (rig, folder) = finished().await;
+    let said = |change: fn(&mut regrind::drive::Task, &mut regrind::cell::CellPlan)| {
+        let error = again(&rig, &folder, change).err().expect("it differs");
+        assert!(matches!(error, ReplayError::Differs { .. }), "{error}");
+        error.to_string()
+    };
+    let decided = said(|_, plan| plan.max_cycles = 2);
+    assert!(decided.contains("max_cycles") && decided.contains("the record has"), "{decided}");
+    let computed = said(|task, _| task.map.cutoff_mm *= 1.01);
+    assert!(computed.contains("computed again"), "{computed}");
+    // Where it lies is nothing that any figure tells: only the plan that the machine was given names it.
+    let planned = said(|task, _| task.probing.safe_height_mm += 1.0);
+    assert!(planned.contains("the cmm was prepared"), "{planned}");
+    for words in [decided, computed, planned] {
+        assert!(words.contains("at record") && words.contains("regrind recover"), "{words}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_event_that_was_changed_on_record_is_found_although_its_chain_is_whole() {
+    let (rig, folder) = finished().await;
+    let reader = Reader::open(&folder).unwrap();
+    let records: Vec<_> = reader.records(0).map(Result::unwrap).collect();
+    let registered = records.iter().find(|r| r.value()["event"] == "registered").unwrap();
+    let copy = broken_off(&folder, registered.seq);
+    let changed = registered.payload.replacen("\"coverage\":", "\"coverage\":0.5,\"was\":", 1);
+    assert_ne!(changed, registered.payload);
+    let database = rusqlite::Connection::open(copy.path().join("journal.sqlite")).unwrap();
+    database.execute("UPDATE record SET payload = ?1 WHERE seq = ?2", (changed, registered.seq as i64)).unwrap();
+    drop(database);
+    let error = again(&rig, copy.path(), |_, _| ()).err().expect("it differs").to_string();
+    assert!(error.contains(&format!("at record {}", registered.seq)), "{error}");
+}
