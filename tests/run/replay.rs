@@ -3,8 +3,9 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::rig::{PATIENCE, Ready, Rig, small};
-use regrind::drive::{Drive, Interrupted, Notice, Orders, ReplayError, Request};
+use crate::rig::{PATIENCE, Ready, Rig, event, small, until};
+use regrind::cell::{CellPlan, Disposal};
+use regrind::drive::{Drive, Interrupted, Orders, ReplayError, Request, Task};
 use regrind::journal::{Reader, verify};
 use regrind::setup;
 
@@ -12,36 +13,29 @@ use regrind::setup;
 async fn finished() -> (Rig, PathBuf) {
     let mut rig = Rig::new(small(12, 8, 5000.0)).await;
     let Ready { mut run, cmm, grinder, mut notices, folder } = rig.next(true);
-    // Nothing is good enough, so that it goes on to the last pass that the plan allows.
-    (run.plan.tolerance.pv_mm, run.plan.max_cycles, run.plan.stall_share) = (1e-6, 3, 0.0);
+    never_content(&mut run.plan);
     let actor = run.actor.clone();
     let (drive, orders): (_, Orders) = Drive::new(run, cmm, grinder).unwrap();
     let running = tokio::spawn(drive.run());
-    let mut held = false;
-    while let Some(notice) = notices.recv().await {
-        match notice {
-            Notice::Figures { .. } if !held => {
-                held = true;
-                orders.give(Request::Hold { reason: "tea".into() }, actor.clone()).await;
-                orders.give(Request::Resume { reason: "tea is over".into(), seen: None }, actor.clone()).await;
-            }
-            Notice::Alarm(_) => orders.give(Request::Resume { reason: "seen".into(), seen: None }, actor.clone()).await,
-            _ => {}
-        }
-    }
+    event(&mut notices, "registered", 1).await;
+    orders.give(Request::Hold { reason: "tea".into() }, actor.clone()).await;
+    until(&folder, |words| words.starts_with("Held")).await;
+    orders.give(Request::Resume { reason: "tea is over".into(), seen: None }, actor).await;
     tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
     assert!(verify(&folder).unwrap().closed);
     (rig, folder)
 }
 
+/// Nothing is good enough and nothing holds, so that it goes on to the last pass that the plan allows.
+fn never_content(plan: &mut CellPlan) {
+    (plan.tolerance.pv_mm, plan.max_cycles, plan.stall_share) = (1e-6, 3, -1e9);
+    (plan.on_stall, plan.on_divergence, plan.on_refusal) = (Disposal::Stop, Disposal::Stop, Disposal::Stop);
+}
+
 /// Reads the record as the program that made it would.
-fn again(
-    rig: &Rig,
-    folder: &Path,
-    change: impl FnOnce(&mut regrind::drive::Task, &mut regrind::cell::CellPlan),
-) -> Result<Interrupted, ReplayError> {
+fn again(rig: &Rig, folder: &Path, change: impl FnOnce(&mut Task, &mut CellPlan)) -> Result<Interrupted, ReplayError> {
     let (mut task, mut plan) = setup::prepare(&rig.recipe, &rig.cell).unwrap();
-    (plan.tolerance.pv_mm, plan.max_cycles, plan.stall_share) = (1e-6, 3, 0.0);
+    never_content(&mut plan);
     change(&mut task, &mut plan);
     Interrupted::read(folder, plan, &task)
 }
@@ -94,7 +88,7 @@ async fn a_record_is_done_again_without_a_difference_wherever_it_broke_off() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_would_be_decided_or_computed_otherwise_is_named_and_nothing_is_gone_on_with() {
     let (rig, folder) = finished().await;
-    let said = |change: fn(&mut regrind::drive::Task, &mut regrind::cell::CellPlan)| {
+    let said = |change: fn(&mut Task, &mut CellPlan)| {
         let error = again(&rig, &folder, change).err().expect("it differs");
         assert!(matches!(error, ReplayError::Differs { .. }), "{error}");
         error.to_string()
