@@ -170,7 +170,7 @@ pub(super) fn live(runs: &Path) -> Result<PathBuf, Failure> {
     }
 }
 
-fn folders(runs: &Path) -> impl Iterator<Item = PathBuf> {
+pub(super) fn folders(runs: &Path) -> impl Iterator<Item = PathBuf> {
     let entries = std::fs::read_dir(runs).into_iter().flatten().filter_map(io::Result::ok);
     entries.map(|entry| entry.path()).filter(|path| path.is_dir())
 }

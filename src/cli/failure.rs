@@ -86,6 +86,8 @@ pub(super) enum Failure {
     SeveralRuns { runs: Vec<PathBuf> },
     #[error("{}: the run is over, there is nothing to go on with; `regrind report` tells how it ended", .run.display())]
     Over { run: PathBuf },
+    #[error("{}: its program ended before anything was asked of a machine; begin a new run", .run.display())]
+    NotBegun { run: PathBuf },
     #[error("{}: its simulated machines ended with the program that ran it; begin a new run", .run.display())]
     WorldGone { run: PathBuf },
     #[error(
@@ -100,6 +102,12 @@ pub(super) enum Failure {
         "{path}: the folder that the run was begun in cannot be entered: {source}; its recipe names files from there"
     )]
     WorkingFolder { path: PathBuf, source: io::Error },
+    #[error("the port of the {device} cannot be had: {source}")]
+    Port { device: regrind::cell::Device, source: io::Error },
+    #[error("{device}: {source}")]
+    Recover { device: regrind::cell::Device, source: regrind::drive::recover::RecoverError },
+    #[error("a machine was left as it is; begin again when it can be brought home")]
+    NotHome,
     #[error(transparent)]
     Learned(regrind::formats::LearnedError),
     #[error(transparent)]
@@ -134,6 +142,9 @@ impl Failure {
             Self::NotFinite { .. }
             | Self::NotSaved(_)
             | Self::Machine(_)
+            | Self::Port { .. }
+            | Self::Recover { .. }
+            | Self::NotHome
             | Self::Signals(_)
             | Self::Terminal(_)
             | Self::OrderRefused { .. }

@@ -158,7 +158,7 @@ fn take(link: &Link, name: &str, run: &Path) -> Result<Option<MachineLock>, Fail
 }
 
 /// A number for this run as a client of its machines, the same whoever goes on with it.
-fn owner(actor: &Actor, run: &Path) -> u32 {
+pub(super) fn owner(actor: &Actor, run: &Path) -> u32 {
     let mut hash = crc32fast::Hasher::new();
     hash.update(b"regrind ");
     hash.update(actor.station.as_bytes());

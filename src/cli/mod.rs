@@ -11,6 +11,7 @@ mod initial;
 mod live;
 mod nominal;
 mod plan;
+mod recover;
 mod register;
 mod report;
 mod resume;
@@ -46,6 +47,7 @@ enum Command {
     /// Hold a running cell at the next safe place
     Hold(control::Arguments),
     Resume(resume::Arguments),
+    Recover(recover::Arguments),
     /// End a running cell in order
     Stop(control::Arguments),
     /// End a running cell at once: the safe sequence only
@@ -96,6 +98,7 @@ fn run() -> ExitCode {
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Hold(arguments) => control::order(&arguments, |reason| Request::Hold { reason }),
         Command::Resume(arguments) => resume::run(&arguments),
+        Command::Recover(arguments) => recover::run(&arguments),
         Command::Stop(arguments) => control::order(&arguments, |reason| Request::Stop { reason }),
         Command::Abort(arguments) => control::order(&arguments, |reason| Request::Abort { reason }),
         Command::Confirm(arguments) => control::confirm(&arguments),

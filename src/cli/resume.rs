@@ -7,7 +7,7 @@ use regrind::cell::{CellPlan, TABLE_VERSION};
 use regrind::config::CellConfig;
 use regrind::drive::{Interrupted, Request, Task, is_live};
 use regrind::formats::{FormatError, Learned};
-use regrind::journal::{Journal, JournalError, Reader, verify};
+use regrind::journal::{Journal, JournalError, Kind, Reader, verify};
 use regrind::recipe::Recipe;
 use regrind::setup;
 use serde::Deserialize;
@@ -125,8 +125,12 @@ impl Begun {
         if verified.closed {
             return Err(Failure::Over { run: run.to_owned() });
         }
-        let first = Reader::open(run).map_err(Failure::Journal)?.records(0).next().transpose();
-        let first = first.map_err(Failure::Journal)?.map(|record| record.value());
+        let reader = Reader::open(run).map_err(Failure::Journal)?;
+        let records = || reader.records(0).filter_map(Result::ok);
+        if !records().any(|record| record.kind == Kind::Event) {
+            return Err(Failure::NotBegun { run: run.to_owned() });
+        }
+        let first = records().next().map(|record| record.value());
         let content = first.as_ref().map_or(Value::Null, |first| first["content"].clone());
         let program = first.as_ref().and_then(|first| first["regrind"].as_str()).unwrap_or("unknown").to_owned();
         let begun: Self = serde_json::from_value(content).map_err(|error| Failure::EarlierRun {

@@ -228,7 +228,7 @@ fn recipe_name(recipe: &Recipe) -> String {
 }
 
 /// Returns a folder for a run that began now: the recipe's name and the time, and a number if two begin in one second.
-fn free_folder(runs: &Path, name: &str, began: jiff::Timestamp, simulated: bool) -> PathBuf {
+pub(super) fn free_folder(runs: &Path, name: &str, began: jiff::Timestamp, simulated: bool) -> PathBuf {
     // Every file in it carries the mark in its path.
     let mark = if simulated { "-SIMULATION" } else { "" };
     let stamp = began.strftime("%Y%m%dT%H%M%SZ");

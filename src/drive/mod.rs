@@ -19,6 +19,7 @@ mod outcome;
 mod pass_record;
 mod program;
 mod record;
+pub mod recover;
 mod replay;
 mod station;
 mod task;
@@ -140,6 +141,8 @@ pub struct Drive {
     failing: Option<String>,
     /// A judgement that the program did not come to leave before it ended.
     unannounced: Option<(u32, Judgement)>,
+    /// Files that it did not come to bring on record.
+    left: Vec<String>,
     ending: Option<Ending>,
     stations: Vec<tokio::task::JoinHandle<()>>,
     _control: Control,
@@ -270,6 +273,7 @@ impl Drive {
             backlog: VecDeque::new(),
             failing: None,
             unannounced: interrupted.unannounced,
+            left: interrupted.left,
             ending: interrupted.ending,
             stations: vec![cmm_task, grinder_task],
             _control: control,
@@ -293,6 +297,8 @@ impl Drive {
             _ => Event::Restarted { actor: self.actor.clone() },
         };
         self.take(first, None).await;
+        let left = std::mem::take(&mut self.left);
+        self.adopt(self.cell.cycle(), record::describe(&self.folder, &left)).await;
         if let Some((which, judgement)) = self.unannounced.take() {
             self.leave_judgement(which, &judgement).await;
         }

@@ -10,7 +10,7 @@
 //! Nothing is commanded here. At the first difference it stops: a program that would have decided or computed otherwise cannot know
 //! what the machines hold.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -51,6 +51,8 @@ pub struct Interrupted {
     pub(super) ending: Option<Ending>,
     /// A judgement whose file is not on record, and which of its cycle it is.
     pub(super) unannounced: Option<(u32, Judgement)>,
+    /// Files that a computation left which did not come to bring them on record.
+    pub(super) left: Vec<String>,
 }
 
 /// Why a run cannot be gone on with.
@@ -100,6 +102,7 @@ impl Interrupted {
             open: BTreeMap::new(),
             ending: None,
             unannounced: None,
+            left: Vec::new(),
         }
     }
 
@@ -117,6 +120,8 @@ struct Replay<'t> {
     due: VecDeque<Command>,
     /// The newest file of each name in the folder of a cycle.
     files: BTreeMap<(u32, String), Artefact>,
+    /// All names on record.
+    names: BTreeSet<String>,
     /// What the last measurement said that its coordinates are.
     coordinates: Option<Coordinates>,
     scratch: Scratch,
@@ -127,8 +132,8 @@ impl<'t> Replay<'t> {
     fn new(run: &'t Path, plan: CellPlan, task: &'t Task) -> Result<Self, ReplayError> {
         let found = Interrupted::none(plan);
         let scratch = Scratch::new(run)?;
-        let (due, files) = (VecDeque::new(), BTreeMap::new());
-        Ok(Self { run, task, found, due, files, coordinates: None, scratch, last: 0 })
+        let (due, files, names) = (VecDeque::new(), BTreeMap::new(), BTreeSet::new());
+        Ok(Self { run, task, found, due, files, names, coordinates: None, scratch, last: 0 })
     }
 
     fn take(&mut self, record: &Record) -> Result<(), ReplayError> {
@@ -164,6 +169,7 @@ impl<'t> Replay<'t> {
     }
 
     fn file(&mut self, file: Artefact) {
+        self.names.insert(file.name.clone());
         let path = Path::new(&file.name);
         let cycle = file.name.split('/').next().and_then(|folder| folder.strip_prefix("cycle-")?.parse().ok());
         let (Some(cycle), Some(name)) = (cycle, path.file_name().and_then(|name| name.to_str())) else { return };
@@ -293,21 +299,33 @@ impl<'t> Replay<'t> {
             self.check_armed(device)?;
         }
         for number in 1..=self.found.cell.cycle() + 1 {
-            for kind in [Computation::Gate, Computation::Registration, Computation::Compensation] {
-                let begun = (1..).take_while(|attempt| self.run.join(folder_of(number, *attempt)).is_dir());
-                let attempts = begun.filter(|attempt| self.has_begun(number, *attempt, kind)).last().unwrap_or(0);
-                self.found.attempts.insert((number, kind), attempts);
+            for attempt in 1.. {
+                let folder = folder_of(number, attempt);
+                let Ok(entries) = fs::read_dir(self.run.join(&folder)) else { break };
+                let names = entries.flatten().filter(|entry| entry.path().is_file()).map(|entry| entry.file_name());
+                for name in names.filter_map(|name| name.into_string().ok()) {
+                    self.lies_there(&folder, number, attempt, &name);
+                }
             }
         }
         Ok(self.found)
     }
 
-    /// Whether a computation has left a file, on record or not, in the folder of an attempt.
-    fn has_begun(&self, number: u32, attempt: u32, kind: Computation) -> bool {
-        let folder = self.run.join(folder_of(number, attempt));
-        let entries = fs::read_dir(folder).into_iter().flatten().flatten();
-        let mut names = entries.filter_map(|entry| entry.file_name().into_string().ok());
-        names.any(|name| name != "result.json" && Computation::of(&name) == kind)
+    /// Takes in that a file lies in the folder of an attempt: it is not written again, and what is not on record is brought there.
+    fn lies_there(&mut self, folder: &str, number: u32, attempt: u32, name: &str) {
+        if name.starts_with('.') && name.ends_with(".tmp") {
+            // It was being written and never had its name: nothing refers to it.
+            let _ = fs::remove_file(self.run.join(folder).join(name));
+        }
+        if name == "result.json" || name.starts_with('.') {
+            return;
+        }
+        let attempts = self.found.attempts.entry((number, Computation::of(name))).or_default();
+        *attempts = attempt.max(*attempts);
+        let path = format!("{folder}/{name}");
+        if !self.names.contains(&path) {
+            self.found.left.push(path);
+        }
     }
 
     fn check_armed(&mut self, device: Device) -> Result<(), ReplayError> {

@@ -60,6 +60,8 @@ pub struct Running {
     lines: Receiver<String>,
     errors: Option<std::thread::JoinHandle<String>>,
     pub said: Vec<String>,
+    /// What came on the error stream, once it has ended.
+    pub told: String,
 }
 
 impl Running {
@@ -75,7 +77,7 @@ impl Running {
             let _ = errors.read_to_string(&mut text);
             text
         });
-        Self { child, lines, errors: Some(errors), said: Vec::new() }
+        Self { child, lines, errors: Some(errors), said: Vec::new(), told: String::new() }
     }
 
     /// Waits for a line that will do.
@@ -149,7 +151,13 @@ impl Running {
         while let Ok(line) = self.lines.recv() {
             self.said.push(line);
         }
-        (code, self.errors.take().map(|e| e.join().unwrap()).unwrap_or_default())
+        self.told = self.errors.take().map(|e| e.join().unwrap()).unwrap_or_default();
+        (code, self.told.clone())
+    }
+
+    /// Whether it was said on the error stream, once it has ended.
+    pub fn has_been_told(&self, words: &str) -> bool {
+        self.told.contains(words)
     }
 
     /// The folder of the run, once it is named.

@@ -99,7 +99,7 @@ async fn what_would_be_decided_or_computed_otherwise_is_named_and_nothing_is_gon
     assert!(computed.contains("computed again"), "{computed}");
     // Where it lies is nothing that any figure tells: only the plan that the machine was given names it.
     let planned = said(|task, _| task.probing.safe_height_mm += 1.0);
-    assert!(planned.contains("the cmm was prepared"), "{planned}");
+    assert!(planned.contains("the CMM was prepared"), "{planned}");
     for words in [decided, computed, planned] {
         assert!(words.contains("at record") && words.contains("regrind recover"), "{words}");
     }

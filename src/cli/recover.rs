@@ -1,0 +1,154 @@
+//! `regrind recover`: bring machines home that hold what no run knows.
+
+use std::io::{self, BufRead};
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::Args;
+use regrind::cell::{Actor, Device};
+use regrind::config::{CellConfig, Link};
+use regrind::device::{Machine, ModbusCmm, ModbusGrinder, ModbusSettings, State};
+use regrind::drive::recover::{RecoverError, Step, in_short, look, take};
+use regrind::journal::{Header, Journal, Kind, MachineLock, Reader};
+use regrind::setup;
+use serde_json::json;
+
+use super::failure::Failure;
+use super::run::{epoch, operator};
+use super::{Outcome, check, control};
+
+/// Bring the machines of a cell home that hold what no run knows
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Shows how each machine stands and what would bring it nearer to idle: STOP, ACKNOWLEDGE or CLEAR. Nothing is commanded before
+you type that word; anything else leaves the machine as it is. Each step is on record in a folder of its own below --runs. A job
+that a run there knows is better gone on with by `regrind resume`.
+
+Example:
+  regrind recover --cell config/modbus-tcp.toml
+
+Exit codes: 0 both machines are idle; 2 bad cell file; 3 a machine was left as it is, refused, or cannot be reached.")]
+pub(super) struct Arguments {
+    /// Cell whose machines are brought home
+    #[arg(long, value_name = "FILE")]
+    cell: PathBuf,
+    /// Folder of the runs, and of the record of what is done here
+    #[arg(long, value_name = "DIR", default_value = "runs")]
+    runs: PathBuf,
+    /// Who decides
+    #[arg(long, value_name = "NAME")]
+    operator: Option<String>,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let cell = check::or_show(CellConfig::read(&arguments.cell))?;
+    let actor = operator(arguments.operator.as_deref());
+    let began = jiff::Timestamp::now();
+    let folder = super::run::free_folder(&arguments.runs, "recover", began, cell.simulated);
+    let epoch = epoch(began);
+    let settings = |link| setup::modbus(link, cell.simulated, super::live::owner(&actor, &folder), epoch);
+    let [cmm, grinder] = [settings(&cell.cmm.link), settings(&cell.grinder.link)];
+    let header = Header {
+        run: folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
+        part: "unnamed".into(),
+        actor: actor.name.clone(),
+        station: actor.station.clone(),
+        simulation: cell.simulated,
+        first_command_id: 1,
+        content: json!({ "recover": true, "cell": cell.path() }),
+    };
+    let journal = Journal::create(&folder, header).map_err(Failure::Journal)?;
+    let mut recovery = Recovery { actor, journal, folder, runs: arguments.runs.clone(), simulated: cell.simulated };
+    super::runtime()?.block_on(async {
+        let cmm = recovery.bring_home(Device::Cmm, &cell.cmm.link, cmm, ModbusCmm::new).await;
+        let cmm = told(cmm)?;
+        let grinder = recovery.bring_home(Device::Grinder, &cell.grinder.link, grinder, ModbusGrinder::new).await;
+        recovery.end([cmm, told(grinder)?])
+    })
+}
+
+/// Says why a machine was not brought home; the other one may be all the same.
+fn told(home: Result<bool, Failure>) -> Result<bool, Failure> {
+    match home {
+        Err(failure @ Failure::Terminal(_)) => Err(failure),
+        Err(failure) => super::print(&format!("{failure}\n")).map(|()| false),
+        home => home,
+    }
+}
+
+/// What is done for the machines of a cell, and where it is recorded.
+struct Recovery {
+    actor: Actor,
+    journal: Journal,
+    folder: PathBuf,
+    runs: PathBuf,
+    simulated: bool,
+}
+
+impl Recovery {
+    /// Shows how a machine stands and asks for each step, until it is idle or is to be left as it is. Returns whether it is idle.
+    async fn bring_home<M: Machine>(
+        &mut self,
+        device: Device,
+        link: &Link,
+        settings: Option<ModbusSettings>,
+        machine: fn(ModbusSettings) -> io::Result<M>,
+    ) -> Result<bool, Failure> {
+        let Some(settings) = settings else {
+            super::print(&format!("{device}: it tells nothing over a wire; bring it home at the machine\n"))?;
+            return Ok(true);
+        };
+        let mut machine = machine(settings).map_err(|source| Failure::Port { device, source })?;
+        let _taken = MachineLock::take(machine.name(), &self.folder).map_err(Failure::Machine)?;
+        let limit = link.timing.lost_after.max(Duration::from_secs(60));
+        let mark = if self.simulated { "SIMULATION  " } else { "" };
+        let failed = |source| Failure::Recover { device, source };
+        loop {
+            let seen = look(&mut machine).await.map_err(failed)?;
+            super::print(&format!("{mark}{}: {}\n", machine.name(), in_short(&seen)))?;
+            let Some(step) = Step::after(seen.state) else { return Ok(true) };
+            if let Some(run) = seen.job.and_then(|job| self.run_of(job.job)) {
+                super::print(&format!(
+                    "  this is the job of {run}, which broke off: `regrind resume {run}` goes on with it; recover only if that is refused\n"
+                ))?;
+            }
+            super::print(&format!("  {} {}\n  type {0} to do it: ", step.name(), step.meaning(device)))?;
+            if answer()? != step.name() {
+                super::print("it is left as it is\n")?;
+                return Ok(false);
+            }
+            match take(&mut machine, device, step, &seen, limit, &mut self.journal, &self.actor).await {
+                // It came to another state in the end, which is shown; what did not change would be asked for ever.
+                Ok(now) if now.state == seen.state && now.state != State::Idle => return Ok(false),
+                Ok(_) | Err(RecoverError::Changed { .. }) => {}
+                Err(error) => return Err(failed(error)),
+            }
+        }
+    }
+
+    /// Returns the run that a job belongs to, if one here has no end on record.
+    fn run_of(&self, job: u32) -> Option<String> {
+        let is_open = |folder: &PathBuf| -> Option<bool> {
+            let reader = Reader::open(folder).ok()?;
+            let begin = reader.records(0).next()?.ok()?.value();
+            let ended = reader.records(0).any(|record| record.is_ok_and(|record| record.kind == Kind::End));
+            Some(begin["content"]["job"] == job && !ended)
+        };
+        let mut open = control::folders(&self.runs).filter(|folder| is_open(folder) == Some(true));
+        open.next().map(|folder| folder.display().to_string())
+    }
+
+    fn end(self, home: [bool; 2]) -> Result<Outcome, Failure> {
+        let idle = json!({ "cmm_home": home[0], "grinder_home": home[1] });
+        self.journal.close(0, 0, idle).map_err(Failure::Journal)?;
+        super::print(&format!("record in {}\n", self.folder.display()))?;
+        if home == [true, true] { Ok(Outcome::Accepted) } else { Err(Failure::NotHome) }
+    }
+}
+
+/// Reads what a person types; the end of the input is no word.
+fn answer() -> Result<String, Failure> {
+    let mut line = String::new();
+    io::stdin().lock().read_line(&mut line).map_err(Failure::Terminal)?;
+    Ok(line.trim().to_owned())
+}

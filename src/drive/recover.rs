@@ -1,0 +1,175 @@
+//! Bringing a machine home that holds what no run knows: one step after the other, each decided upon by a person who has seen how the
+//! machine stands, and each on record before it is given.
+
+use std::time::Duration;
+
+use serde_json::json;
+use thiserror::Error;
+use tokio::time::Instant;
+
+use super::record::nanoseconds;
+use crate::cell::{Actor, Device};
+use crate::device::{Answer, DeviceError, Fault, Machine, State, Status};
+use crate::journal::{Entry, Journal, JournalError, Kind};
+
+/// Between two looks at a machine that is on its way.
+const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
+
+/// A client that has died is forgotten by then.
+const GONE_AFTER: Duration = Duration::from_secs(10);
+/// Between two tries to become the client in its place.
+const BETWEEN_CLAIMS: Duration = Duration::from_millis(500);
+
+/// What brings a machine nearer to idle.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Step {
+    /// End its job in order, or take its preparation back.
+    Stop,
+    /// Let it forget its result.
+    Acknowledge,
+    /// Let it leave ABORTED or FAULTED.
+    Clear,
+}
+
+/// Why a machine was not brought home.
+#[derive(Debug, Error)]
+#[allow(missing_docs)]
+#[non_exhaustive]
+pub enum RecoverError {
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+    #[error(transparent)]
+    Journal(#[from] JournalError),
+    #[error("the {device} was {seen} when it was shown, and is {found} now: nothing was commanded; look again")]
+    Changed { device: Device, seen: String, found: String },
+    #[error("the {device} is still {found} after {} s; look at the machine, and begin again", .limit.as_secs())]
+    Late { device: Device, found: State, limit: Duration },
+}
+
+impl Step {
+    /// Returns what comes next for a machine in a state: a step, or nothing where it is home. One that moves is stopped.
+    pub fn after(state: State) -> Option<Self> {
+        match state {
+            State::Idle => None,
+            State::Complete => Some(Self::Acknowledge),
+            State::Aborted | State::Faulted => Some(Self::Clear),
+            _ => Some(Self::Stop),
+        }
+    }
+
+    /// Returns the name by which a person decides upon it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Stop => "STOP",
+            Self::Acknowledge => "ACKNOWLEDGE",
+            Self::Clear => "CLEAR",
+        }
+    }
+
+    /// Says what it does, and what is lost by it.
+    pub fn meaning(self, device: Device) -> &'static str {
+        match (self, device) {
+            (Self::Stop, _) => "ends its job in order, clear of the part, or takes its preparation back",
+            (Self::Acknowledge, Device::Cmm) => {
+                "lets it forget its result: a measurement that no run has collected is lost"
+            }
+            (Self::Acknowledge, Device::Grinder) => {
+                "lets it forget its result: the part has had this pass, and no run will know it"
+            }
+            (Self::Clear, _) => {
+                "lets it go to idle again: first see that it stands, clear of the part, and why it was stopped"
+            }
+        }
+    }
+}
+
+/// Opens the wire and returns how a machine stands. Nothing is written to it but the sign of life of its client.
+///
+/// # Errors
+/// A machine that cannot be reached, or is another one.
+pub async fn look<M: Machine>(machine: &mut M) -> Result<Status, RecoverError> {
+    machine.connect().await?;
+    Ok(machine.status().await?)
+}
+
+/// Gives a machine one step, if it still stands as a person has seen it, and returns how it stands once it has come to rest. The step is
+/// on record before it is given, and what became of it after. `by` says who decided, and where.
+///
+/// # Errors
+/// A machine that cannot be reached, is another client's, has changed, refuses, or does not come to rest within the limit; a record
+/// that cannot be written.
+pub async fn take<M: Machine>(
+    machine: &mut M,
+    device: Device,
+    step: Step,
+    seen: &Status,
+    limit: Duration,
+    journal: &mut Journal,
+    by: &Actor,
+) -> Result<Status, RecoverError> {
+    let began = Instant::now();
+    let found = look(machine).await?;
+    if in_short(&found) != in_short(seen) {
+        return Err(RecoverError::Changed { device, seen: in_short(seen), found: in_short(&found) });
+    }
+    claim(machine).await?;
+    let by = |kind, payload| {
+        let (actor, station) = (by.name.clone(), by.station.clone());
+        Entry { actor, station, ..Entry::new(kind, nanoseconds(began.elapsed()), 0, payload) }
+    };
+    let payload = json!({ "recover": step.name(), "device": device, "seen": in_short(&found) });
+    let intent = journal.intend(by(Kind::Intent, payload))?;
+    let given = match step {
+        Step::Stop => machine.stop().await,
+        Step::Acknowledge => machine.acknowledge(found.done).await,
+        Step::Clear => machine.clear().await,
+    };
+    let ended = match given {
+        Ok(status) => at_rest(machine, device, status, limit).await,
+        Err(error) => Err(error.into()),
+    };
+    let told = ended.as_ref().map_or_else(ToString::to_string, in_short);
+    journal.append(Entry { command_id: Some(intent), ..by(Kind::Outcome, json!({ "found": told })) })?;
+    // Nothing depends on it: a machine whose owner falls silent can be claimed by the next.
+    let _ = machine.release().await;
+    ended
+}
+
+/// Makes this program the machine's client. Whoever was it may have died this moment: then the machine waits for him a while.
+async fn claim<M: Machine>(machine: &mut M) -> Result<(), DeviceError> {
+    let by = Instant::now() + GONE_AFTER;
+    loop {
+        match machine.claim().await {
+            Err(DeviceError::Refused { answer: Answer::NotOwner, .. }) if Instant::now() < by => {
+                tokio::time::sleep(BETWEEN_CLAIMS).await;
+            }
+            claimed => return claimed.map(drop),
+        }
+    }
+}
+
+/// Says how a machine stands: its state, its job, and which result it holds.
+pub fn in_short(status: &Status) -> String {
+    let job = status.job.map_or(String::new(), |job| format!(" with {job}"));
+    let fault = status.fault.filter(|fault| *fault != Fault::None).map_or(String::new(), |fault| format!(", {fault}"));
+    let result = if status.state == State::Complete { format!(", result {}", status.done) } else { String::new() };
+    format!("{}{job}{fault}{result}", status.state)
+}
+
+/// Waits until a machine moves no more.
+async fn at_rest<M: Machine>(
+    machine: &mut M,
+    device: Device,
+    mut status: Status,
+    limit: Duration,
+) -> Result<Status, RecoverError> {
+    let by = Instant::now() + limit;
+    while status.state.moves() {
+        if Instant::now() > by {
+            return Err(RecoverError::Late { device, found: status.state, limit });
+        }
+        tokio::time::sleep(BETWEEN_LOOKS).await;
+        status = machine.status().await?;
+    }
+    Ok(status)
+}
