@@ -86,6 +86,11 @@ pub(super) enum Failure {
     SeveralRuns { runs: Vec<PathBuf> },
     #[error("{}: the run is over, there is nothing to go on with; `regrind report` tells how it ended", .run.display())]
     Over { run: PathBuf },
+    #[error(
+        "{path}: the disk has {} MB left, and the first cycle may take {} MB; make room, or name another folder by --runs",
+        .free >> 20, .needed.div_ceil(1 << 20)
+    )]
+    NoSpace { path: PathBuf, free: u64, needed: u64 },
     #[error("{}: its program ended before anything was asked of a machine; begin a new run", .run.display())]
     NotBegun { run: PathBuf },
     #[error("{}: its simulated machines ended with the program that ran it; begin a new run", .run.display())]

@@ -8,7 +8,7 @@ use regrind::config::{CellConfig, Link};
 use regrind::device::Line;
 use regrind::drive::Task;
 use regrind::formats::{LEARNED, Learned, LearnedError};
-use regrind::journal::{Header, Journal};
+use regrind::journal::{Header, Journal, free_bytes};
 use regrind::recipe::Recipe;
 use regrind::setup;
 use serde_json::json;
@@ -104,6 +104,10 @@ async fn carry_out(
     // Before the record begins: a folder that is not there, or a line that is in use, is no run.
     let part = arguments.part.clone().unwrap_or_else(|| recipe_name(recipe));
     let folder = free_folder(&arguments.runs, &recipe_name(recipe), began, cell.simulated);
+    let (free, needed) = (free_bytes(&folder).unwrap_or(u64::MAX), task.cycle_bytes());
+    if free < needed {
+        return Err(Failure::NoSpace { path: arguments.runs.clone(), free, needed });
+    }
     let live = Live { recipe, cell, part: &part, folder: &folder, job, actor, json: arguments.json };
     let machines = live.open(job)?;
     if let Some(earlier) = earlier.as_ref().filter(|_| !arguments.json) {

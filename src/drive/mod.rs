@@ -45,7 +45,7 @@ use crate::device::{
     AnyCmm, AnyGrinder, Armed, Cmm, Grinder, Identified, Interrupt, Job, Measurement, PassRecord, Word, hex,
 };
 use crate::formats::{FormatError, LEARNED, ResultFolder, write_json_atomic};
-use crate::journal::{Artefact, Entry, Journal, Kind};
+use crate::journal::{self, Artefact, Entry, Journal, Kind};
 
 use control::{Control, Ordered};
 pub use control::{Reply, Request, Snapshot, ask, is_live};
@@ -128,6 +128,9 @@ pub struct Drive {
     status: watch::Sender<Snapshot>,
     notices: mpsc::UnboundedSender<Notice>,
     cycles: Cycles,
+    /// What the files of each cycle take on the disk, and the most of them.
+    cycle_bytes: BTreeMap<u32, u64>,
+    largest_cycle_bytes: u64,
     /// Counts the states of the cell.
     states: u64,
     /// Counts what was computed for each cycle.
@@ -196,7 +199,8 @@ fn made(folder: &Path) -> Result<(), FormatError> {
 /// What a computation brought.
 struct Computed {
     cycle: u32,
-    event: Event,
+    /// None where nothing follows.
+    event: Option<Event>,
     product: Product,
     /// The files that it made, on the disk and read.
     files: Result<Vec<Artefact>, RecordFailure>,
@@ -266,6 +270,8 @@ impl Drive {
             status,
             notices: run.notices,
             cycles: interrupted.cycles,
+            cycle_bytes: BTreeMap::new(),
+            largest_cycle_bytes: 0,
             states: interrupted.states,
             attempts: interrupted.attempts,
             armed: interrupted.armed,
@@ -592,7 +598,9 @@ impl Drive {
         let Computed { cycle: number, event, product, files } = computed;
         self.cycles.take(number, product);
         self.adopt(number, files).await;
-        self.take(event, None).await;
+        if let Some(event) = event {
+            self.take(event, None).await;
+        }
     }
 
     /// Brings files on record.
@@ -600,6 +608,9 @@ impl Drive {
         match files {
             Ok(files) if files.is_empty() => {}
             Ok(files) => {
+                let bytes = self.cycle_bytes.entry(cycle).or_insert(0);
+                *bytes += files.iter().map(|file| file.bytes).sum::<u64>();
+                self.largest_cycle_bytes = self.largest_cycle_bytes.max(*bytes);
                 let ticket = self.recorder.adopt(files, self.now(), cycle);
                 self.backlog.push_back(Waiting { ticket, then: Then::Nothing });
             }
@@ -797,13 +808,26 @@ impl Drive {
         }
     }
 
+    /// Sees whether the disk has room for what this cycle will leave. Where it has not the cell is held before anything moves; the
+    /// machine may take its payload meanwhile.
+    fn check_space(&mut self, cycle: u32) {
+        let (folder, needed) = (self.folder.clone(), self.task.cycle_bytes().max(2 * self.largest_cycle_bytes));
+        self.computations.spawn_blocking(move || {
+            let short = short_of_space(&folder, needed).err();
+            let event = short.map(|why| Event::RecordFailed { why });
+            Computed { cycle, event, product: Product::Nothing, files: Ok(Vec::new()) }
+        });
+    }
+
     async fn load_pass(&mut self, number: u32) {
+        self.check_space(number);
         let (map, pass) = self.cycles.pass(&self.task, number);
         let load = Load::Pass(Arc::new(map), Box::new(pass));
         self.ask(Device::Grinder, Ask::Load { cycle: number, load }).await;
     }
 
     async fn load_plan(&mut self, number: u32) {
+        self.check_space(number);
         let load = Load::Plan(self.cycles.plan(&self.task, number));
         self.ask(Device::Cmm, Ask::Load { cycle: number, load }).await;
     }
@@ -857,14 +881,14 @@ impl Drive {
             let _ = made(files.folder());
             let (event, product) = work(&task, &mut files);
             let names: Vec<String> = files.made().iter().map(|name| format!("{below}/{name}")).collect();
-            Computed { cycle, event, product, files: record::describe(&folder, &names) }
+            Computed { cycle, event: Some(event), product, files: record::describe(&folder, &names) }
         });
         self.computing.insert(computing.id(), (cycle, kind));
     }
 
     /// Lets the cell hear of an event in its turn, like everything else that it hears.
     fn answer(&mut self, cycle: u32, event: Event) {
-        let computed = Computed { cycle, event, product: Product::Nothing, files: Ok(Vec::new()) };
+        let computed = Computed { cycle, event: Some(event), product: Product::Nothing, files: Ok(Vec::new()) };
         self.computations.spawn(std::future::ready(computed));
     }
 
@@ -937,6 +961,18 @@ fn waits_for_nothing(command: &Command) -> bool {
             | Command::Refuse { .. }
             | Command::Finish(_)
     )
+}
+
+/// Sees whether the disk of a folder has so many bytes left.
+fn short_of_space(folder: &Path, needed: u64) -> Result<(), RecordFailure> {
+    // A disk that does not tell is tried.
+    let free = journal::free_bytes(folder).unwrap_or(u64::MAX);
+    if free >= needed {
+        return Ok(());
+    }
+    let [free, needed] = [free, needed].map(|bytes| bytes.div_ceil(1 << 20));
+    let disk = folder.display();
+    Err(RecordFailure::DiskFull(format!("the disk of {disk} has {free} MB left, and a cycle may take {needed} MB")))
 }
 
 /// What a task said as it panicked.

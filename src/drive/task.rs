@@ -19,6 +19,12 @@ use crate::surface::Nominal;
 use super::program::{PROGRAM_FILE, ProgramError, Programs};
 use super::record::Files;
 
+/// What stays free for the journal and the program of a pass.
+const RESERVE_BYTES: u64 = 16 << 20;
+/// What a measured point takes in all the files of a cycle, and a node of its maps.
+const POINT_BYTES: u64 = 600;
+const NODE_BYTES: u64 = 250;
+
 /// Everything that does not change during a run.
 #[derive(Debug)]
 pub struct Task {
@@ -218,6 +224,12 @@ impl Task {
             spacing_mm: [corners[1][0] - corners[0][0], corners[1][1] - corners[0][1]],
         });
         Correction::none(grid, self.limits.allowance_mm)
+    }
+
+    /// Returns how much room a cycle takes on the disk, as far as it can be told beforehand, and the journal beside it.
+    pub fn cycle_bytes(&self) -> u64 {
+        let (points, nodes) = (self.targets.len() as u64, self.uncorrected().grid.len() as u64);
+        RESERVE_BYTES + POINT_BYTES * points + NODE_BYTES * nodes
     }
 
     /// Lays the path of the first pass; `None` where only the grinder's controller can, and `programs` says why.

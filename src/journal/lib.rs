@@ -25,6 +25,7 @@ pub use artefact::Artefact;
 pub use canonical::{canonical_json, sha256_hex};
 pub use error::JournalError;
 pub use machine::MachineLock;
+pub use open::free_bytes;
 pub use record::{Entry, Kind, Record, Records};
 pub use verify::{Anchor, Verified, verify, verify_against};
 pub use write::{Header, Journal};

@@ -178,3 +178,15 @@ pub(super) fn is_free(folder: &Path) -> Result<bool, JournalError> {
         Err(error) => Err(JournalError::file(folder, "looking into it")(error)),
     }
 }
+
+/// Returns how much room is left for the user of this program on the disk of a folder, or of the nearest one above it that is there.
+///
+/// # Errors
+/// A folder that cannot be looked at.
+pub fn free_bytes(folder: &Path) -> Result<u64, JournalError> {
+    let whole = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
+    let there = whole.ancestors().find(|folder| folder.is_dir()).unwrap_or(&whole);
+    let room = rustix::fs::statvfs(there)
+        .map_err(|error| JournalError::file(there, "asking for its free space")(error.into()))?;
+    Ok(room.f_bavail.saturating_mul(room.f_frsize))
+}
