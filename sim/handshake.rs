@@ -129,7 +129,12 @@ impl Handshake {
         }
     }
 
-    /// The client's beat has moved.
+    /// Says whether a client is the one that owns the machine.
+    pub(crate) fn is_owned_by(&self, owner: u32) -> bool {
+        owner != 0 && owner == self.owner
+    }
+
+    /// The owner's beat has moved.
     pub(crate) fn hear(&mut self) {
         self.silent = Duration::ZERO;
     }

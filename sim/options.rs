@@ -62,7 +62,7 @@ impl Layout {
         [
             (Block::Identity, self.identity, 32),
             (Block::Sync, self.sync, 4),
-            (Block::Beat, self.beat, 1),
+            (Block::Beat, self.beat, 3),
             (Block::Command, self.command, 20),
             (Block::Status, self.status, 48),
             (Block::InForce, self.in_force, 72),
@@ -101,6 +101,8 @@ pub struct MachineOptions {
     pub acting: Duration,
     /// The longest payload it holds.
     pub payload_limit_bytes: u32,
+    /// The version of the map that it says it keeps.
+    pub version: u16,
     /// The job and cycle it began before it was switched off.
     pub last_begun: Option<(u32, u16)>,
 }
@@ -115,6 +117,7 @@ impl Default for MachineOptions {
             lost_after_ms: 0,
             acting: Duration::from_millis(150),
             payload_limit_bytes: 64 << 20,
+            version: 2,
             last_begun: None,
         }
     }

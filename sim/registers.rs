@@ -39,6 +39,9 @@ pub struct Machine {
     options: MachineOptions,
     inbox: Inbox,
     sync: [u16; 2],
+    /// As it was written last, by whomever.
+    beat_block: [u16; 3],
+    /// The owner's counter, as it was heard last.
     beat: u16,
     command: [u16; 20],
     inbox_header: [u16; 24],
@@ -62,6 +65,7 @@ impl Machine {
             options,
             inbox: Inbox::default(),
             sync: [0; 2],
+            beat_block: [0; 3],
             beat: 0,
             command: [0; 20],
             inbox_header: [0; 24],
@@ -113,7 +117,7 @@ impl Machine {
         }
         match block {
             Block::Sync => self.sync[offset..offset + values.len()].copy_from_slice(values),
-            Block::Beat => self.write_beat(values[0]),
+            Block::Beat => self.write_beat(values)?,
             Block::Command => self.write_command(offset, values),
             Block::InboxHeader => self.write_header(offset, values)?,
             Block::InboxPage => self.write_page(offset, values)?,
@@ -153,11 +157,15 @@ impl Machine {
         self.publish();
     }
 
-    fn write_beat(&mut self, value: u16) {
-        if self.beat != value {
-            self.beat = value;
+    /// A beat says whose it is; only that of the owner is one.
+    fn write_beat(&mut self, values: &[u16]) -> Result<(), Exception> {
+        let [count, high, low]: [u16; 3] = values.try_into().map_err(|_| Exception::Value)?;
+        self.beat_block = [count, high, low];
+        if self.handshake.is_owned_by(self.options.word_order.to_u32([high, low])) && self.beat != count {
+            self.beat = count;
             self.handshake.hear();
         }
+        Ok(())
     }
 
     fn write_command(&mut self, offset: usize, values: &[u16]) {
@@ -210,7 +218,7 @@ impl Machine {
         match block {
             Block::Identity => self.identity_image(),
             Block::Sync => vec![self.sync[0], self.sync[1], !self.sync[0], !self.sync[1]],
-            Block::Beat => vec![self.beat],
+            Block::Beat => self.beat_block.to_vec(),
             Block::Command => self.command.to_vec(),
             Block::Status => self.status_image(),
             Block::InForce => slots_image(order, &self.handshake.slots),
@@ -231,7 +239,7 @@ impl Machine {
         Image::new(self.options.word_order, 32)
             .u16(0, 0x5247)
             .u16(1, 0x4431)
-            .u16(2, 1)
+            .u16(2, self.options.version)
             .u16(3, self.kind() as u16)
             .u32(4, 0x1234_5678)
             .f64(6, -2.5e-7)
@@ -330,6 +338,7 @@ impl Machine {
         self.handshake.reboot();
         self.inbox = Inbox::default();
         (self.sync, self.beat, self.command, self.select) = ([0; 2], 0, [0; 20], [0; 2]);
+        self.beat_block = [0; 3];
         (self.inbox_header, self.inbox_page) = ([0; 24], [0; 120]);
         (self.machine_beat, self.beat_echo, self.frozen, self.unseen) = (0, 0, false, false);
         self.publish();

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use regrind::cell::{Actor, Ending};
 use regrind::config::{CellConfig, Link};
-use regrind::device::{AnyCmm, AnyGrinder, Machine as _};
+use regrind::device::{AnyCmm, AnyGrinder, MachineKind};
 use regrind::drive::{Drive, Interrupted, Orders, Request, Run, Task};
 use regrind::journal::{Journal, MachineLock};
 use regrind::recipe::Recipe;
@@ -36,6 +36,7 @@ pub(super) struct Live<'a> {
 pub(super) struct Machines {
     cmm: AnyCmm,
     grinder: AnyGrinder,
+    /// Held, not read.
     _taken: [Option<MachineLock>; 2],
 }
 
@@ -50,13 +51,14 @@ pub(super) struct Work {
 }
 
 impl Live<'_> {
-    /// Opens the machines; nothing is asked of them yet. `epoch` rises from program to program.
-    pub(super) fn open(&self, epoch: u32) -> Result<Machines, Failure> {
+    /// Takes the machines and opens their wires; nothing is asked of them yet. `now` is the time as an epoch.
+    pub(super) fn open(&self, now: u32) -> Result<Machines, Failure> {
         let Self { recipe, cell, part, folder, .. } = self;
-        let client = [owner(&self.actor, folder), epoch];
+        let taken =
+            [take(&cell.cmm.link, MachineKind::Cmm, folder)?, take(&cell.grinder.link, MachineKind::Grinder, folder)?];
+        let client = [owner(&self.actor, folder), MachineLock::epoch(taken.iter().flatten(), now)];
         let (cmm, grinder) = setup::machines(recipe, cell, part, folder, client).map_err(Failure::Setup)?;
-        let _taken = [take(&cell.cmm.link, cmm.name(), folder)?, take(&cell.grinder.link, grinder.name(), folder)?];
-        Ok(Machines { cmm, grinder, _taken })
+        Ok(Machines { cmm, grinder, _taken: taken })
     }
 
     /// Lets the run go to its end and its report.
@@ -151,9 +153,9 @@ fn ignores_hangup() -> bool {
 }
 
 /// Keeps a machine on a line from every other run on this computer.
-fn take(link: &Link, name: &str, run: &Path) -> Result<Option<MachineLock>, Failure> {
+pub(super) fn take(link: &Link, kind: MachineKind, run: &Path) -> Result<Option<MachineLock>, Failure> {
     let run = std::path::absolute(run).unwrap_or_else(|_| run.to_owned());
-    let taken = link.wire.line().map(|_| MachineLock::take(name, &run));
+    let taken = link.wire.line().map(|(line, unit)| MachineLock::take(&format!("{kind} at {line}, unit {unit}"), &run));
     taken.transpose().map_err(Failure::Machine)
 }
 

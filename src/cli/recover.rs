@@ -7,14 +7,15 @@ use std::time::Duration;
 use clap::Args;
 use regrind::cell::{Actor, Device};
 use regrind::config::{CellConfig, Link};
-use regrind::device::{Machine, ModbusCmm, ModbusGrinder, ModbusSettings, State};
-use regrind::drive::recover::{RecoverError, Step, in_short, look, take};
+use regrind::device::{Machine, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, State};
+use regrind::drive::recover::{self, RecoverError, Step, in_short, look};
 use regrind::journal::{Header, Journal, Kind, MachineLock, Reader};
 use regrind::setup;
 use serde_json::json;
 
 use super::failure::Failure;
-use super::run::{epoch, operator};
+use super::live::{owner, take};
+use super::run::{epoch, free_folder, operator};
 use super::{Outcome, check, control};
 
 /// Bring the machines of a cell home that hold what no run knows
@@ -44,9 +45,11 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let cell = check::or_show(CellConfig::read(&arguments.cell))?;
     let actor = operator(arguments.operator.as_deref());
     let began = jiff::Timestamp::now();
-    let folder = super::run::free_folder(&arguments.runs, "recover", began, cell.simulated);
-    let epoch = epoch(began);
-    let settings = |link| setup::modbus(link, cell.simulated, super::live::owner(&actor, &folder), epoch);
+    let folder = free_folder(&arguments.runs, "recover", began, cell.simulated);
+    let taken =
+        [take(&cell.cmm.link, MachineKind::Cmm, &folder)?, take(&cell.grinder.link, MachineKind::Grinder, &folder)?];
+    let epoch = MachineLock::epoch(taken.iter().flatten(), epoch(began));
+    let settings = |link| setup::modbus(link, cell.simulated, owner(&actor, &folder), epoch);
     let [cmm, grinder] = [settings(&cell.cmm.link), settings(&cell.grinder.link)];
     let header = Header {
         run: folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
@@ -99,7 +102,6 @@ impl Recovery {
             return Ok(true);
         };
         let mut machine = machine(settings).map_err(|source| Failure::Port { device, source })?;
-        let _taken = MachineLock::take(machine.name(), &self.folder).map_err(Failure::Machine)?;
         let limit = link.timing.lost_after.max(Duration::from_secs(60));
         let mark = if self.simulated { "SIMULATION  " } else { "" };
         let failed = |source| Failure::Recover { device, source };
@@ -117,7 +119,7 @@ impl Recovery {
                 super::print("it is left as it is\n")?;
                 return Ok(false);
             }
-            match take(&mut machine, device, step, &seen, limit, &mut self.journal, &self.actor).await {
+            match recover::take(&mut machine, device, step, &seen, limit, &mut self.journal, &self.actor).await {
                 // It came to another state in the end, which is shown; what did not change would be asked for ever.
                 Ok(now) if now.state == seen.state && now.state != State::Idle => return Ok(false),
                 Ok(_) | Err(RecoverError::Changed { .. }) => {}

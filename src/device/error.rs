@@ -125,10 +125,14 @@ pub enum DeviceError {
     )]
     WrongWordOrder { machine: Arc<str>, configured: &'static str, fits: Option<&'static str> },
     /// The machine speaks another version of the map.
-    #[error(
-        "{machine} speaks version {found} of the register map, this program version {required}: bring the older of the two up to date"
-    )]
+    #[error("{machine} speaks version {found} of the register map, this program version {required}: {}; nothing was written to it", version_in_words(*.found, *.required))]
     WrongVersion { machine: Arc<str>, required: u16, found: u16 },
+    /// Another client has taken the machine.
+    #[error(
+        "{machine} belongs to another client now (owner {owner:08x}, this client is {ours:08x}): find out who commands it; one of the two \
+         must let it go"
+    )]
+    Taken { machine: Arc<str>, ours: u32, owner: u32 },
     /// The machine works in inches (unit code 2), or does not say what it works in (1 is mm).
     #[error("{machine} gives lengths in {}, and this program takes millimetres only: set the machine to millimetres", if *.unit == 2 { "inches" } else { "an unknown unit" })]
     Inches { machine: Arc<str>, unit: u16 },
@@ -180,11 +184,30 @@ impl DeviceError {
                 | Self::Frozen { .. }
                 | Self::NotAcknowledged { .. }
                 | Self::StartUnknown { .. }
+                | Self::Taken { .. }
                 // Busy, a gateway that finds nobody, a memory error: asked again it may go well.
                 | Self::Exception { code: 4 | 5 | 6 | 8 | 10 | 11, .. }
                 | Self::Folder { .. }
         )
     }
+}
+
+/// Says what a machine of another version lacks, and what is to be done.
+fn version_in_words(found: u16, required: u16) -> String {
+    if found > required {
+        return "this program is the older one: bring it up to date, for what the newer map means is not known here"
+            .to_owned();
+    }
+    let lacks = [
+        "a beat that names its owner, so that a stranger's beat keeps it moving",
+        "a CLAIM with a higher number that makes it refuse a late START",
+        "an ABORT that it takes from anyone, whatever its number",
+        "a `done` that outlives CLEAR and names the START that ended",
+    ];
+    format!(
+        "the machine's program lacks {}; bring it up to version {required} (docs/modbus.md, \"What version 2 changed\")",
+        lacks.join("; ")
+    )
 }
 
 fn kind_in_words(kind: std::io::ErrorKind) -> String {

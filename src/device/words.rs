@@ -390,6 +390,8 @@ pub struct Status {
     pub clear_of_part: Option<bool>,
     /// Whether air, coolant and the like are there.
     pub supplies: Option<bool>,
+    /// Whether it is in automatic mode; in manual mode a person may move it at its panel.
+    pub automatic: Option<bool>,
     /// Why it stands.
     pub fault: Option<Fault>,
     /// Points measured, or thousandths of the path, and of how many.
@@ -412,6 +414,7 @@ impl Status {
             outcome: Outcome::None,
             clear_of_part: None,
             supplies: None,
+            automatic: None,
             fault: None,
             progress: None,
             temperature_c: None,

@@ -1,4 +1,7 @@
 //! A machine serves one run at a time: on this computer by a lock, which goes away with the process that holds it.
+//!
+//! The file of the lock also keeps the last epoch that a client of this computer had for the machine, so that the next one is higher
+//! whatever the clock says.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::Write;
@@ -12,15 +15,33 @@ use super::sha256_hex;
 pub struct MachineLock {
     /// Held, not read.
     _file: File,
+    path: PathBuf,
+    holder: String,
+    last_epoch: u32,
 }
+
+/// Where locks may lie, the best first: a place that is the same for every user and every session of a computer. `TMPDIR` is not.
+const PLACES: [&str; 4] = ["/run/lock", "/var/lock", "/var/tmp", "/tmp"];
+const FOLDER: &str = "regrind-machines";
+/// Begins the line of the lock's file that keeps the epoch.
+const EPOCH: &str = "epoch ";
 
 impl MachineLock {
     /// Takes a machine, by the address by which every run would call it, for a run.
     ///
     /// # Errors
-    /// A machine that another run has, which is named; a folder for temporary files that cannot be written.
+    /// A machine that another run has, which is named; no folder for locks that can be written.
     pub fn take(address: &str, run: &Path) -> Result<Self, JournalError> {
-        Self::take_in(&std::env::temp_dir().join("regrind-machines"), address, run)
+        Self::take_in(&place(PLACES.iter().map(Path::new), &std::env::temp_dir()), address, run)
+    }
+
+    /// Returns an epoch for the client of these machines: higher than every one that a client of this computer had for any of them, and
+    /// not below the clock. The machines' files keep it.
+    pub fn epoch<'a>(machines: impl IntoIterator<Item = &'a Self> + Clone, clock: u32) -> u32 {
+        let last = machines.clone().into_iter().map(|machine| machine.last_epoch).max().unwrap_or(0);
+        let epoch = clock.max(last.saturating_add(1));
+        machines.into_iter().for_each(|machine| machine.write(epoch));
+        epoch
     }
 
     fn take_in(folder: &Path, address: &str, run: &Path) -> Result<Self, JournalError> {
@@ -30,19 +51,36 @@ impl MachineLock {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => {
                 let holder = fs::read_to_string(&path).unwrap_or_default();
-                return Err(JournalError::MachineTaken {
-                    address: address.to_owned(),
-                    holder: holder.trim().to_owned(),
-                });
+                let holder = holder.lines().next().unwrap_or_default().trim().to_owned();
+                return Err(JournalError::MachineTaken { address: address.to_owned(), holder });
             }
             Err(TryLockError::Error(error)) => return Err(JournalError::file(&path, "locking it")(error)),
         }
-        // Who holds it is for people; one that another user made cannot be written, and locks all the same.
-        let holder = format!("{}, process {}\n", run.display(), std::process::id());
-        let _ =
-            OpenOptions::new().write(true).truncate(true).open(&path).and_then(|mut f| f.write_all(holder.as_bytes()));
-        Ok(Self { _file: file })
+        let kept = fs::read_to_string(&path).unwrap_or_default();
+        let last_epoch = kept.lines().find_map(|line| line.strip_prefix(EPOCH)?.trim().parse().ok()).unwrap_or(0);
+        let holder = format!("{}, process {}", run.display(), std::process::id());
+        let lock = Self { _file: file, path, holder, last_epoch };
+        lock.write(last_epoch);
+        Ok(lock)
     }
+
+    /// Who holds it is for people, and the machine itself tells of its last epoch too: a file that another user made and that cannot be
+    /// written locks all the same.
+    fn write(&self, epoch: u32) {
+        let text = format!("{}\n{EPOCH}{epoch}\n", self.holder);
+        // Never empty in between: what was kept outlives a program that is killed here.
+        let _ = OpenOptions::new().write(true).open(&self.path).and_then(|mut file| {
+            file.write_all(text.as_bytes())?;
+            file.set_len(text.len() as u64)
+        });
+    }
+}
+
+/// Returns the folder of the locks: in the first place that is there and every user can write, or else among the temporary files.
+fn place<'a>(places: impl Iterator<Item = &'a Path>, temporary: &Path) -> PathBuf {
+    use std::os::unix::fs::PermissionsExt;
+    let for_all = |place: &Path| fs::metadata(place).is_ok_and(|m| m.is_dir() && m.permissions().mode() & 0o002 != 0);
+    places.into_iter().find(|place| for_all(place)).unwrap_or(temporary).join(FOLDER)
 }
 
 /// Opens the file that is locked; every user of the computer may.
@@ -82,5 +120,39 @@ mod tests {
         assert!(refused.contains("runs/a, process ") && refused.contains("10.0.0.6"), "{refused}");
         drop(first);
         take("grinder at 10.0.0.6:502, unit 1", "runs/b").unwrap();
+    }
+
+    #[test]
+    fn an_epoch_rises_for_each_machine_whatever_the_clock_does() {
+        let folder = tempfile::tempdir().unwrap();
+        let take = |address: &str| MachineLock::take_in(folder.path(), address, Path::new("runs/a")).unwrap();
+        let epoch = |addresses: &[&str], clock| {
+            let machines: Vec<_> = addresses.iter().map(|address| take(address)).collect();
+            MachineLock::epoch(&machines, clock)
+        };
+        assert_eq!(epoch(&["cmm", "grinder"], 1000), 1000);
+        assert_eq!(epoch(&["cmm", "grinder"], 1000), 1001, "twice in a second");
+        assert_eq!(epoch(&["grinder"], 500), 1002, "the clock was set back");
+        assert_eq!(epoch(&["cmm", "other"], 10), 1002, "each machine has its own");
+        assert_eq!(epoch(&["other"], 10), 1003);
+        assert_eq!(epoch(&["other"], 5000), 5000);
+        assert_eq!(epoch(&[], 7), 7);
+        drop(take("cmm"));
+        assert_eq!(epoch(&["cmm"], 0), 1003, "who only had it has kept it");
+    }
+
+    #[test]
+    fn locks_lie_where_every_user_and_session_finds_them() {
+        use std::os::unix::fs::PermissionsExt;
+        let home = tempfile::tempdir().unwrap();
+        let [shared, own, temporary] = ["shared", "own", "temporary"].map(|name| home.path().join(name));
+        for (folder, mode) in [(&shared, 0o1777), (&own, 0o755)] {
+            fs::create_dir(folder).unwrap();
+            fs::set_permissions(folder, fs::Permissions::from_mode(mode)).unwrap();
+        }
+        let missing = home.path().join("missing");
+        let places = |list: &[&Path]| place(list.iter().copied(), &temporary);
+        assert_eq!(places(&[&missing, &own, &shared]), shared.join(FOLDER));
+        assert_eq!(places(&[&own, &missing]), temporary.join(FOLDER));
     }
 }

@@ -204,9 +204,10 @@ fn as_on_the_page(frame: &[u8]) -> Vec<u8> {
 }
 
 /// The pieces of the page that stand in one word order, and those that stand in both.
-const TURNED: [&str; 5] = ["claim", "status", "header", "page", "point"];
-const UNTURNED: [&str; 7] = [
+const TURNED: [&str; 6] = ["claim", "status", "header", "page", "point", "beat"];
+const UNTURNED: [&str; 8] = [
     "claim.answer",
+    "beat.answer",
     "status.request",
     "header.answer",
     "page.answer",

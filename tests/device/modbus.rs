@@ -13,6 +13,7 @@ use regrind::device::{
 };
 use regrind::geometry::Grid;
 use regrind_sim::body::Kind;
+use regrind_sim::command::{Command as SimCommand, Frame as SimFrame};
 use regrind_sim::options::{Layout, MachineOptions};
 use regrind_sim::wire::Serving;
 use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, Request, When};
@@ -246,6 +247,65 @@ async fn another_client_is_refused_and_an_abort_is_not() {
     assert!(matches!(state, State::Aborting | State::Aborted), "{state}");
 }
 
+/// A command of a client that is not under test, straight at the machine's registers; returns the answer.
+fn put(serving: &Serving, frame: SimFrame) -> u16 {
+    serving.machine(1).unwrap().with(|machine| {
+        machine.write(40, &frame.registers(words::WordOrder::Big)).unwrap();
+        machine.read(70, 1).unwrap()[0]
+    })
+}
+
+fn of_first(command: SimCommand) -> SimFrame {
+    SimFrame { command: command as u16, owner: 1, epoch: 1, ..SimFrame::default() }
+}
+
+#[tokio::test]
+async fn an_abort_gets_through_a_line_that_broke_and_past_the_number_of_a_second_master() {
+    let (serving, plan) = (serve(Kind::Cmm, 1.0, Faults::none()).await, plan(100));
+    let (mut cmm, armed) = armed(&serving, &plan).await;
+    cmm.start(armed).await.unwrap();
+    // A second master is told no, and has counted the machine far ahead of its owner all the same.
+    let stranger = SimFrame { sequence: 0x7000_0000, owner: 2, ..of_first(SimCommand::Claim) };
+    assert_eq!(put(&serving, stranger), 2, "not the owner");
+    serving.faults().set(FaultPlan::new(0).once(When::Any, Fault::Disconnect(0)));
+    assert!(cmm.hold().await.is_err(), "the number of an owner's HOLD counts");
+    serving.faults().set(FaultPlan::new(0).once(When::Any, Fault::Disconnect(0)));
+    let aborting = cmm.abort().await.unwrap().state;
+    assert!(matches!(aborting, State::Aborting | State::Aborted), "{aborting}");
+    // The second master takes the machine over: the end of the abort is seen all the same.
+    assert_eq!(put(&serving, SimFrame { sequence: 0x7000_0001, ..of_first(SimCommand::Release) }), 1);
+    assert_eq!(put(&serving, SimFrame { sequence: 0x7000_0002, ..stranger }), 1);
+    reaches(&mut cmm, State::Aborted).await.unwrap();
+}
+
+#[tokio::test]
+async fn a_machine_that_another_client_has_taken_is_lost_in_these_words() {
+    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    let mut first = claimed(settings(&serving)).await;
+    first.status().await.unwrap();
+    assert_eq!(put(&serving, SimFrame { sequence: 1000, ..of_first(SimCommand::Release) }), 1);
+    claimed(ModbusSettings { owner: 0xbeef, ..settings(&serving) }).await;
+    let taken = first.status().await.unwrap_err();
+    assert!(matches!(taken, DeviceError::Taken { ours: 1, owner: 0xbeef, .. }) && taken.is_link(), "{taken}");
+    assert!(taken.to_string().contains("belongs to another client now (owner 0000beef"), "{taken}");
+}
+
+#[tokio::test]
+async fn a_clock_that_was_set_back_makes_nobody_a_stranger_to_his_own_machine() {
+    let serving = serve(Kind::Cmm, AT_ONCE, Faults::none()).await;
+    assert_eq!(put(&serving, SimFrame { sequence: 5, epoch: 50, ..of_first(SimCommand::Claim) }), 1);
+    let mut after = connected(ModbusSettings { epoch: 7, ..settings(&serving) }).await;
+    after.claim().await.unwrap();
+    let epoch = |serving: &Serving| serving.machine(1).unwrap().with(|machine| machine.read(90, 2).unwrap());
+    assert_eq!(epoch(&serving), [0, 51]);
+    // Who meets a higher epoch later than his own has been replaced, and does not outbid.
+    assert_eq!(put(&serving, SimFrame { sequence: 500, epoch: 60, ..of_first(SimCommand::Claim) }), 1);
+    after.connect().await.unwrap();
+    let refused = after.claim().await;
+    assert!(matches!(refused, Err(DeviceError::Refused { answer: Answer::NotOwner, .. })), "{refused:?}");
+    assert_eq!(epoch(&serving), [0, 60]);
+}
+
 /// Raises a flag when a machine is sent the page of this number, so that the break comes in the middle for certain; counts the pages.
 fn interrupt_at_page(serving: &Serving, number: u32) -> (Interrupt, Arc<AtomicU32>) {
     let (interrupt, pages) = (Interrupt::new(), Arc::new(AtomicU32::new(0)));
@@ -338,7 +398,7 @@ async fn impostor(image: Vec<u16>) -> (ModbusSettings, Arc<AtomicU32>) {
 }
 
 fn true_identity() -> Vec<u16> {
-    let mut image = vec![0x5247, 0x4431, 1, 1, 0x1234, 0x5678, 0xbe90, 0xc6f7, 0xa0b5, 0xed8d, 0, 9, 0, 1];
+    let mut image = vec![0x5247, 0x4431, 2, 1, 0x1234, 0x5678, 0xbe90, 0xc6f7, 0xa0b5, 0xed8d, 0, 9, 0, 1];
     image.resize(32, 0);
     image
 }
@@ -359,8 +419,17 @@ async fn what_is_not_the_machine_is_told_apart_and_never_written_to() {
     assert!(matches!(e, DeviceError::WrongDevice { address: 0, required: 0x5247, found: 0, .. }), "{e}");
     let e = refusal(|image| image[1] = 0x4432).await;
     assert!(matches!(e, DeviceError::WrongDevice { address: 1, .. }), "{e}");
-    let e = refusal(|image| image[2] = 2).await;
-    assert!(matches!(e, DeviceError::WrongVersion { required: 1, found: 2, .. }), "{e}");
+    let e = refusal(|image| image[2] = 1).await;
+    assert!(matches!(e, DeviceError::WrongVersion { required: 2, found: 1, .. }), "{e}");
+    let said = e.to_string();
+    for lacked in
+        ["a beat that names its owner", "refuse a late START", "an ABORT", "outlives CLEAR", "bring it up to version 2"]
+    {
+        assert!(said.contains(lacked), "{said}");
+    }
+    let e = refusal(|image| image[2] = 3).await;
+    assert!(matches!(e, DeviceError::WrongVersion { required: 2, found: 3, .. }), "{e}");
+    assert!(e.to_string().contains("this program is the older one"), "{e}");
     let e = refusal(|image| image[3] = 2).await;
     assert!(matches!(e, DeviceError::WrongKind { found: MachineKind::Grinder, .. }), "{e}");
     let e = refusal(|image| image[13] = 2).await;
@@ -538,6 +607,47 @@ async fn a_start_that_never_arrived_is_seen_twice_not_to_have() {
     assert!(matches!(found, Reconciled::NotStarted(_)), "{found:?}");
     assert!(asked.elapsed() >= Duration::from_secs(1));
     assert!(began(&serving).is_empty());
+}
+
+/// The START of a job that was prepared, as it would come out of a network in which it was delayed.
+fn delayed(armed: &Armed) -> SimFrame {
+    let Armed { job, start_sequence: sequence, token, .. } = *armed;
+    SimFrame { sequence, cycle: job.cycle, job: job.job, digest: job.digest, token, ..of_first(SimCommand::Start) }
+}
+
+#[tokio::test]
+async fn a_start_that_arrives_after_it_was_found_not_started_moves_nothing() {
+    let (serving, plan) = (serve(Kind::Cmm, AT_ONCE, Faults::none()).await, plan(10));
+    let (mut cmm, lost) = armed(&serving, &plan).await;
+    serving.faults().set(FaultPlan::new(0).always(When::Commanding(3), Fault::DropRequest));
+    let unknown = cmm.start(lost.clone()).await;
+    assert!(matches!(unknown, Err(DeviceError::StartUnknown { .. })), "{unknown:?}");
+    serving.faults().set(FaultPlan::new(0));
+    cmm.connect().await.unwrap();
+    let found = cmm.reconcile(&lost).await.unwrap();
+    assert!(matches!(found, Reconciled::NotStarted(_)), "{found:?}");
+    put(&serving, delayed(&lost));
+    assert!(began(&serving).is_empty(), "the CLAIM has fenced it off");
+    // Prepared anew the same job starts, and the old frame is too old again.
+    cmm.stop().await.unwrap();
+    cmm.load_plan(&plan, &Interrupt::new()).await.unwrap();
+    let again = cmm.prepare(job_of(&plan, 1)).await.unwrap();
+    put(&serving, delayed(&lost));
+    let sequence = again.start_sequence;
+    cmm.start(again).await.unwrap();
+    assert_eq!(began(&serving), [(sequence, 42, 1)]);
+}
+
+#[tokio::test]
+async fn a_start_that_arrives_while_it_is_asked_about_is_found_to_run() {
+    let (serving, plan) = (serve(Kind::Cmm, 1.0, Faults::none()).await, plan(100));
+    let (mut cmm, late) = armed(&serving, &plan).await;
+    serving.faults().set(FaultPlan::new(0).always(When::Commanding(3), Fault::DropRequest));
+    assert!(cmm.start(late.clone()).await.is_err());
+    put(&serving, delayed(&late));
+    let found = cmm.reconcile(&late).await.unwrap();
+    assert!(matches!(found, Reconciled::Running(_)), "{found:?}");
+    assert_eq!(began(&serving).len(), 1);
 }
 
 #[tokio::test]

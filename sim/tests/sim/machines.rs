@@ -82,7 +82,8 @@ impl Desk {
                 return;
             }
             self.beat = self.beat.wrapping_add(1);
-            self.machine.write(36, &[self.beat]).unwrap();
+            let [first, second] = self.order.from_u32(4);
+            self.machine.write(36, &[self.beat, first, second]).unwrap();
             self.machine.tick(Duration::from_millis(100));
         }
         panic!("{state:?} did not come; it is {:?}", self.machine.state());

@@ -197,9 +197,14 @@ impl Desk {
             let step = left.min(250 * MS);
             left -= step;
             self.beat = self.beat.wrapping_add(1);
-            self.machine.write(36, &[self.beat]).unwrap();
+            self.write_beat(self.beat, self.owner);
             self.machine.tick(step);
         }
+    }
+
+    fn write_beat(&mut self, count: u16, owner: u32) {
+        let [first, second] = self.order.from_u32(owner);
+        self.machine.write(36, &[count, first, second]).unwrap();
     }
 
     fn outbox(&mut self) -> (Vec<u16>, Vec<u8>) {
@@ -258,7 +263,7 @@ fn the_identity_says_what_it_is_in_both_orders() {
         let options = MachineOptions { word_order: order, lost_after_ms: 1200, ..MachineOptions::default() };
         let mut desk = Desk::at(Counter::new(kind, 1.0), options);
         let w = desk.read(0, 32);
-        assert_eq!(w[..4], [0x5247, 0x4431, 1, kind as u16]);
+        assert_eq!(w[..4], [0x5247, 0x4431, 2, kind as u16]);
         let constants: &[u16] = match order {
             WordOrder::Big => &[0x1234, 0x5678, 0xBE90, 0xC6F7, 0xA0B5, 0xED8D],
             WordOrder::Little => &[0x5678, 0x1234, 0xED8D, 0xA0B5, 0xC6F7, 0xBE90],
@@ -280,17 +285,17 @@ fn the_machine_answers_the_sync_words_with_their_complements() {
 #[test]
 fn addresses_outside_the_blocks_are_refused() {
     let mut machine = Desk::new(Kind::Cmm).machine;
-    for (address, count) in [(37, 1), (39, 1), (60, 4), (112, 1), (30, 10), (110, 3), (500, 100), (578, 1), (65535, 2)]
+    for (address, count) in [(39, 1), (36, 4), (60, 4), (112, 1), (30, 10), (110, 3), (500, 100), (578, 1), (65535, 2)]
     {
         assert_eq!(machine.read(address, count), Err(Exception::Address), "read {count} at {address}");
     }
     for count in [0, 126] {
         assert_eq!(machine.read(0, count), Err(Exception::Value));
     }
-    for (address, count) in [(0, 32), (0, 37), (64, 48), (120, 72), (200, 125), (350, 12), (400, 56), (460, 118)] {
+    for (address, count) in [(0, 32), (0, 39), (64, 48), (120, 72), (200, 125), (350, 12), (400, 56), (460, 118)] {
         assert_eq!(machine.read(address, count).unwrap().len(), usize::from(count), "read {count} at {address}");
     }
-    for (address, count) in [(0, 1), (31, 2), (32, 3), (34, 1), (36, 2), (37, 1), (40, 21), (59, 2), (64, 1), (120, 1)]
+    for (address, count) in [(0, 1), (31, 2), (32, 3), (34, 1), (36, 4), (39, 1), (40, 21), (59, 2), (64, 1), (120, 1)]
     {
         assert_eq!(machine.write(address, &vec![0; count]), Err(Exception::Address), "write {count} at {address}");
     }
@@ -729,10 +734,41 @@ fn a_machine_whose_client_is_silent_holds() {
     // The same number again is not a beat.
     for _ in 0..40 {
         let beat = desk.beat;
-        desk.machine.write(36, &[beat]).unwrap();
+        desk.write_beat(beat, 9);
         desk.machine.tick(100 * MS);
     }
     assert_eq!(desk.status().state, 4);
+}
+
+#[test]
+fn the_beats_of_a_stranger_keep_no_machine_moving() {
+    for order in [WordOrder::Big, WordOrder::Little] {
+        let options = MachineOptions { word_order: order, ..MachineOptions::default() };
+        let mut desk = Desk::at(Counter::new(Kind::Cmm, 5.0), options);
+        desk.get_ready();
+        desk.accept(Command::Prepare);
+        desk.accept(Command::Start);
+        desk.machine.set_speed(0.01);
+        desk.wait(10 * S);
+        assert_eq!((desk.machine.state(), desk.read(93, 1)), (State::Execute, vec![40]), "its owner beats");
+        for stranger in 0..28 {
+            desk.write_beat(1000 + stranger, 10);
+            desk.machine.tick(100 * MS);
+        }
+        let status = desk.status();
+        assert_eq!((status.state, status.fault, status.owner), (4, 20, 9), "{order:?}");
+        assert_eq!(desk.read(93, 1), [40], "the echo is of the beats that count");
+        // Whom the stranger's beats kept nothing from can claim.
+        desk.owner = 11;
+        desk.accept(Command::Claim);
+        // A beat without an owner, or half a beat, is none.
+        for half in [&[5][..], &[5, 0]] {
+            assert_eq!(desk.machine.write(36, half), Err(Exception::Value));
+        }
+        desk.write_beat(7, 0);
+        desk.machine.tick(100 * MS);
+        assert_eq!(desk.read(93, 1), [40]);
+    }
 }
 
 #[test]
@@ -900,7 +936,7 @@ fn the_snapshot_rises_with_every_change_and_can_be_torn() {
 #[test]
 fn beats_go_both_ways_until_the_application_freezes() {
     let mut desk = Desk::in_state(State::Execute);
-    desk.machine.write(36, &[4711]).unwrap();
+    desk.write_beat(4711, 9);
     let before = desk.read(92, 1)[0];
     desk.machine.tick(S);
     let beats = desk.read(92, 2);
@@ -909,7 +945,7 @@ fn beats_go_both_ways_until_the_application_freezes() {
     let frozen = desk.read(64, 48);
     let frame = desk.frame(Command::Hold);
     desk.machine.write(40, &frame.registers(WordOrder::Big)).unwrap();
-    desk.machine.write(36, &[4712]).unwrap();
+    desk.write_beat(4712, 9);
     desk.machine.tick(10 * S);
     assert_eq!(desk.read(64, 48), frozen, "the wire answers, nothing moves");
     desk.machine.freeze(false);

@@ -35,7 +35,7 @@ async fn patiently<T>(what: impl Future<Output = T>) -> T {
 async fn until(wire: &mut Context, state: State) -> Vec<u16> {
     patiently(async {
         for beat in 0.. {
-            wire.write_multiple_registers(36, &[beat]).await.unwrap().unwrap();
+            wire.write_multiple_registers(36, &[beat, 0, 3]).await.unwrap().unwrap();
             let status = wire.read_holding_registers(64, 48).await.unwrap().unwrap();
             if status[1] == state as u16 {
                 return status;
@@ -158,11 +158,11 @@ async fn unknown_functions_units_and_addresses_get_their_exceptions() {
     let mut wire = connect(&serving, 1).await;
     assert_eq!(wire.read_coils(0, 1).await.unwrap(), Err(ExceptionCode::IllegalFunction));
     assert_eq!(wire.read_input_registers(0, 1).await.unwrap(), Err(ExceptionCode::IllegalFunction));
-    assert_eq!(wire.read_holding_registers(37, 1).await.unwrap(), Err(ExceptionCode::IllegalDataAddress));
+    assert_eq!(wire.read_holding_registers(39, 1).await.unwrap(), Err(ExceptionCode::IllegalDataAddress));
     assert_eq!(wire.write_multiple_registers(64, &[1]).await.unwrap(), Err(ExceptionCode::IllegalDataAddress));
     assert_eq!(wire.write_multiple_registers(200, &[0; 24]).await.unwrap(), Err(ExceptionCode::IllegalDataValue));
-    wire.write_single_register(36, 99).await.unwrap().unwrap();
-    assert_eq!(wire.read_holding_registers(36, 1).await.unwrap().unwrap(), [99]);
+    wire.write_single_register(461, 99).await.unwrap().unwrap();
+    assert_eq!(wire.read_holding_registers(461, 1).await.unwrap().unwrap(), [99]);
     wire.set_slave(Slave(9));
     assert_eq!(wire.read_holding_registers(0, 1).await.unwrap(), Err(ExceptionCode::GatewayTargetDevice));
     wire.set_slave(Slave(0));
@@ -358,11 +358,15 @@ async fn a_command_can_be_lost_on_the_way_there_or_on_the_way_back() {
 #[tokio::test]
 async fn a_request_can_be_carried_out_again_later() {
     let serving = serve().await;
-    serving.faults().set(FaultPlan::new(0).once(When::Writing(36), Fault::CarryOutAgain(2)));
+    serving.faults().set(FaultPlan::new(0).once(When::Writing(460), Fault::CarryOutAgain(2)));
     let mut wire = connect(&serving, 1).await;
-    wire.write_multiple_registers(36, &[7]).await.unwrap().unwrap();
-    wire.write_multiple_registers(36, &[8]).await.unwrap().unwrap();
-    assert_eq!(wire.read_holding_registers(36, 1).await.unwrap().unwrap(), [7], "the old write came after the new one");
+    wire.write_multiple_registers(460, &[7, 0]).await.unwrap().unwrap();
+    wire.write_multiple_registers(460, &[8, 0]).await.unwrap().unwrap();
+    assert_eq!(
+        wire.read_holding_registers(460, 1).await.unwrap().unwrap(),
+        [7],
+        "the old write came after the new one"
+    );
 }
 
 #[tokio::test]
@@ -464,7 +468,7 @@ async fn a_serial_line_answers_only_what_is_sound_and_for_its_units() {
         assert_eq!(reply(&mut port, answer.len()).await, answer, "after {silent:?}");
     }
     assert_eq!(serving.machine(1).unwrap().with(|m| m.read(36, 1)), Ok(vec![0]), "a broadcast does nothing");
-    for (pdu, exception) in [(&[4u8, 0, 0, 0, 1][..], 1), (&[43, 14, 1, 0], 1), (&[3, 0, 37, 0, 1], 2)] {
+    for (pdu, exception) in [(&[4u8, 0, 0, 0, 1][..], 1), (&[43, 14, 1, 0], 1), (&[3, 0, 39, 0, 1], 2)] {
         port.write_all(&rtu_frame(2, pdu)).await.unwrap();
         let expected = rtu_frame(2, &[pdu[0] | 0x80, exception]);
         assert_eq!(reply(&mut port, expected.len()).await, expected, "{pdu:?}");

@@ -64,6 +64,8 @@ pub struct ModbusMachine {
     sequence: u32,
     /// Whether the machine has acknowledged this client as its owner on this connection: only an owner's beat says that all is well.
     owned: bool,
+    /// Whether this client has met the machine before.
+    met: bool,
     /// The START that was given last, or asked about: only what it has begun is this client's.
     began: Option<u32>,
     beat: u16,
@@ -91,6 +93,7 @@ impl ModbusMachine {
             simulation: settings.simulation,
             sequence: 0,
             owned: false,
+            met: false,
             began: None,
             beat: 0,
             beaten: None,
@@ -119,6 +122,11 @@ impl ModbusMachine {
         self.check_identity(&identity)?;
         let status = self.look().await?;
         self.sequence = self.sequence.max(status.acknowledged);
+        // The machine's memory counts for more than a clock: an earlier start of this client may have had a later one. Who comes back with
+        // a higher number than this start ever had is another client, and is not outbid.
+        if !std::mem::replace(&mut self.met, true) && status.owner == self.owner {
+            self.epoch = self.epoch.max(status.epoch.saturating_add(1));
+        }
         Ok(identity)
     }
 
@@ -146,8 +154,9 @@ impl ModbusMachine {
         }
         self.beat = self.beat.wrapping_add(1);
         self.beaten = Some(Instant::now());
-        let address = self.unit.map.beat;
-        self.unit.write("beat", address, &[self.beat]).await
+        let mut beat = self.unit.writer();
+        beat.u16(self.beat).u32(self.owner);
+        self.unit.write("beat", self.unit.map.beat, beat.words()).await
     }
 
     /// Reads the status block, of one moment, without the further signals.
@@ -177,6 +186,7 @@ impl ModbusMachine {
         let job = Job { job: block.u32(8), cycle: words[10], digest: block.u32(12) };
         let block = Block {
             state,
+            automatic: words[2] == 1,
             interlocks: words[3],
             acknowledged: block.u32(4),
             answer: answer_of(words[6]),
@@ -186,6 +196,8 @@ impl ModbusMachine {
             done: block.u32(16),
             outcome,
             progress: (block.u32(20), block.u32(22)),
+            owner: block.u32(24),
+            epoch: block.u32(26),
             beat: words[28],
             last_begun: (block.u32(30), words[32]),
             begun_by: block.u32(36),
@@ -216,12 +228,23 @@ impl ModbusMachine {
     }
 
     async fn status(&mut self) -> Result<Status, DeviceError> {
-        let mut status = Status::from(self.look().await?);
+        let block = self.look().await?;
+        self.check_owner(&block)?;
+        let mut status = Status::from(block);
         for k in 0..self.signals.len() {
             let reading = self.signal(k).await?;
             status.signals.push(reading);
         }
         Ok(status)
+    }
+
+    /// Tells when another client has taken the machine: what it does from then on is not ours to tell. An abort is anybody's.
+    fn check_owner(&self, status: &Block) -> Result<(), DeviceError> {
+        let aborts = matches!(status.state, State::Aborting | State::Aborted);
+        if !self.owned || status.owner == self.owner || aborts {
+            return Ok(());
+        }
+        Err(DeviceError::Taken { machine: self.machine(), ours: self.owner, owner: status.owner })
     }
 
     async fn signal(&mut self, k: usize) -> Result<SignalValue, DeviceError> {
@@ -756,6 +779,8 @@ impl ModbusMachine {
 #[derive(Debug, Clone, PartialEq)]
 struct Block {
     state: State,
+    /// In automatic mode, not in manual.
+    automatic: bool,
     /// Guards closed, clear of the part, part clamped, supplies there; from bit 0.
     interlocks: u16,
     /// The sequence number of the last command it acted upon, and its answer.
@@ -770,6 +795,9 @@ struct Block {
     done: u32,
     outcome: Outcome,
     progress: (u32, u32),
+    /// Whose it is; 0 when nobody's.
+    owner: u32,
+    epoch: u32,
     /// The machine's own beat.
     beat: u16,
     /// The job and cycle begun last, kept over a restart of the machine.
@@ -790,6 +818,7 @@ impl From<&Block> for Status {
             outcome: block.outcome,
             clear_of_part: good(1),
             supplies: good(3),
+            automatic: Some(block.automatic),
             fault: Some(block.fault),
             progress: Some(block.progress),
             temperature_c: Some(block.temperature_c),

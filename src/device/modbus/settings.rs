@@ -216,7 +216,7 @@ pub struct RegisterMap {
     /// Sync, 4 registers.
     #[schemars(range(min = 0, max = 65535))]
     pub sync: u16,
-    /// Beat, 1 register.
+    /// Beat, 3 registers.
     #[schemars(range(min = 0, max = 65535))]
     pub beat: u16,
     /// Command, 20 registers.
@@ -274,7 +274,7 @@ impl RegisterMap {
         [
             ("identity", self.identity, 32),
             ("sync", self.sync, 4),
-            ("beat", self.beat, 1),
+            ("beat", self.beat, 3),
             ("command", self.command, 20),
             ("status", self.status, 48),
             ("in_force", self.in_force, 72),
@@ -458,7 +458,7 @@ pub struct ModbusSettings {
     pub quarantine: Duration,
     /// The number of this client; not 0.
     pub owner: u32,
-    /// Rises with each start of this client.
+    /// Rises with each start of this client; raised above what the machine has of it.
     pub epoch: u32,
     /// What to read besides.
     pub signals: Vec<Signal>,

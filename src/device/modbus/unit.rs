@@ -16,7 +16,7 @@ use crate::{DeviceError, Identity, MachineKind};
 /// The first words of an identity block.
 const MAGIC: [u16; 2] = [0x5247, 0x4431];
 /// The version of the map that is spoken here.
-const VERSION: u16 = 1;
+const VERSION: u16 = 2;
 /// Registers of the identity block.
 const IDENTITY_REGISTERS: u16 = 32;
 /// A machine that says it is busy is asked again after this.

@@ -35,7 +35,7 @@ class Client:
     def meet(self):
         identity = self.read(0, 32)
         magic, version, kind, whole, real = struct.unpack(">IHHId", identity[:20])
-        assert (magic, version, kind, whole, real) == (0x52474431, 1, 1, 0x12345678, -2.5e-7), identity.hex()
+        assert (magic, version, kind, whole, real) == (0x52474431, 2, 1, 0x12345678, -2.5e-7), identity.hex()
         nonce = random.randbytes(4)
         self.write(32, nonce)
         assert self.read(32, 4) == nonce + bytes(byte ^ 0xFF for byte in nonce)
@@ -43,7 +43,7 @@ class Client:
 
     def status(self):
         self.beats = (self.beats + 1) & 0xFFFF
-        self.write(36, struct.pack(">H", self.beats))
+        self.write(36, struct.pack(">HI", self.beats, OWNER))
         while True:
             words = self.read(64, 48)
             if words[:2] == words[94:]:

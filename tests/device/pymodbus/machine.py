@@ -21,9 +21,9 @@ CLAIM, PREPARE, START, HOLD, RESUME, STOP, ABORT, CLEAR, ACKNOWLEDGE, RELEASE = 
 ACCEPTED, NOT_OWNER, WRONG_STATE, UNKNOWN, TOKEN, OTHER, BEGUN, PAYLOAD = range(1, 9)
 ARGUMENT = 11
 BLOCKS = [
-    (0, 32), (32, 4), (36, 1), (40, 20), (64, 48), (120, 72), (200, 24), (224, 120), (350, 12), (400, 56), (460, 2), (462, 116),
+    (0, 32), (32, 4), (36, 3), (40, 20), (64, 48), (120, 72), (200, 24), (224, 120), (350, 12), (400, 56), (460, 2), (462, 116),
 ]
-WRITABLE = [(32, 2), (36, 1), (40, 20), (200, 24), (224, 120), (460, 2)]
+WRITABLE = [(32, 2), (36, 3), (40, 20), (200, 24), (224, 120), (460, 2)]
 ALLOWED = {
     PREPARE: [IDLE],
     START: [PREPARED],
@@ -70,7 +70,7 @@ class Machine:
         self.state, self.answer, self.acknowledged = IDLE, 0, 0
         self.job = (0, 0, 0)
         self.token = self.done = self.result = self.begun_by = 0
-        self.owner = self.epoch = self.heard = 0
+        self.owner = self.epoch = self.heard = self.beaten = 0
         self.begun = []
         self.snapshot, self.shown = 0, b""
         self.slots = {}
@@ -116,8 +116,8 @@ class Machine:
             return None if count == 24 and self.header(bytes_of(values)) else ExcCodes.ILLEGAL_VALUE
         elif 224 <= address < 344:
             return None if address == 224 and count > 8 and self.page(bytes_of(values)) else ExcCodes.ILLEGAL_VALUE
-        elif address == 36:
-            self.heard = time.monotonic()
+        elif 36 <= address < 39:
+            return None if count == 3 and self.beat(bytes_of(values)) else ExcCodes.ILLEGAL_VALUE
         elif address >= 40 and address + count == 60:
             self.command(bytes_of(registers[40:address] + list(values)))
         return None
@@ -127,10 +127,10 @@ class Machine:
             words = registers_of(data)
             registers[at : at + len(words)] = words
 
-        identity = struct.pack(">4HId", 0x5247, 0x4431, 1, self.kind, 0x12345678, -2.5e-7)
+        identity = struct.pack(">4HId", 0x5247, 0x4431, 2, self.kind, 0x12345678, -2.5e-7)
         put(0, identity + struct.pack(">I4H", self.boot_id, 1, 1, 0, 0) + self.name.encode("ascii").ljust(32, b"\0"))
         registers[34], registers[35] = registers[32] ^ 0xFFFF, registers[33] ^ 0xFFFF
-        put(64, self.status(registers[36]))
+        put(64, self.status(self.beaten))
         put(120, b"".join(self.slot(kind) for kind in (1, 2, 3)))
         kind, _, _, _ = self.inbox
         pages = -(-len(self.received) // PAGE_BYTES)
@@ -198,6 +198,14 @@ class Machine:
     def outbox_page(self, number):
         data = self.outbox[2][number * PAGE_BYTES : (number + 1) * PAGE_BYTES] if self.state == COMPLETE and self.outbox else b""
         return (struct.pack(">IHH", number, len(data) // 2, 0) + data).ljust(232, b"\0")
+
+    # Beats: only those of the owner count.
+
+    def beat(self, data):
+        counter, owner = struct.unpack(">HI", data)
+        if owner == self.owner and owner and counter != self.beaten:
+            self.beaten, self.heard = counter, time.monotonic()
+        return True
 
     # Commands.
 
