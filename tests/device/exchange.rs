@@ -3,17 +3,19 @@
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc;
 use std::time::{Duration, SystemTime};
 
 use regrind::device::exchange::{
     CmmExchange, CmmFolders, Confirmed, Exchange, ExchangeError, ExchangeMachine, GrindOrder, GrinderExchange,
-    GrinderFolders, Look, MeasureOrder, Pattern, Standing, StationFiles, Stations,
+    GrinderFolders, HandOver, Look, MeasureOrder, Pattern, Permit, Standing, StationFiles, Stations,
 };
 use regrind::device::{
     Answer, Cmm, Coordinates, CorrectionMap, DeviceError, Grinder, Identified, Interrupt, Job, Machine, MachineKind,
     Measurement, Outcome, Plan, PointStatus, Reconciled, State, Target, TargetKind, Word, digest,
 };
 use regrind::geometry::Grid;
+use tokio::sync::oneshot;
 
 use crate::toy::pass;
 
@@ -99,7 +101,7 @@ impl Bench {
         let mut folders = CmmFolders::new(settings);
         let (order, digest) = order(3);
         let job = Job { job: 3, cycle: 2, digest };
-        folders.publish(job, 1, &order).unwrap();
+        folders.publish(job, 1, &order, &Permit::new()).unwrap();
         Self { folders, job, now_s: 0 }
     }
 
@@ -276,7 +278,7 @@ fn a_job_and_cycle_is_handed_over_once_and_its_bytes_answer_no_other_cycle() {
     let mut bench = Bench::new(shop.cmm());
     let (order, digest) = order(3);
     let job = bench.job;
-    let again = |folders: &mut CmmFolders| folders.publish(job, 2, &order);
+    let again = |folders: &mut CmmFolders| folders.publish(job, 2, &order, &Permit::new());
     let refused = again(&mut bench.folders);
     assert!(matches!(refused, Err(ExchangeError::HandedOver { job: 3, cycle: 2, .. })), "{refused:?}");
     shop.put("SN_7_c2.csv", &three());
@@ -290,7 +292,7 @@ fn a_job_and_cycle_is_handed_over_once_and_its_bytes_answer_no_other_cycle() {
     let handed = other.open().unwrap();
     assert_eq!((handed.len(), handed[0].sequence, handed[0].standing), (1, 1, Standing::Closed));
     let next = Job { job: 3, cycle: 3, digest };
-    other.publish(next, 2, &order).unwrap();
+    other.publish(next, 2, &order, &Permit::new()).unwrap();
     let mut bench = Bench { folders: other, job: next, now_s: 0 };
     shop.put("SN_7_c3.csv", &three());
     bench.refused("the same bytes were the result of job 3 cycle 2");
@@ -386,7 +388,7 @@ fn a_pass_is_confirmed_by_files_that_name_its_map() {
     let map_identity = map().identity();
     let job = Job { job: 3, cycle: 2, digest: digest(&[map_identity, pass().identity()]) };
     shop.put("done.json", "{}");
-    grinder.publish(job, 4, &GrindOrder { map: map(), pass: pass(), map_identity }).unwrap();
+    grinder.publish(job, 4, &GrindOrder { map: map(), pass: pass(), map_identity }, &Permit::new()).unwrap();
     let folder = shop.outbox.join("SN_7_j3_c2");
     let csv = fs::read_to_string(folder.join("correction.csv")).unwrap();
     assert!(csv.contains("positive leaves material") && csv.ends_with("-1,7,0\n-0.5,7,0.003\n0,7,0.25\n"), "{csv}");
@@ -415,7 +417,7 @@ fn a_pass_is_confirmed_by_files_that_name_its_map() {
     assert_eq!((record.map_identity, record.outcome, record.wheel_radius_mm), (map_identity, Outcome::Complete, None));
     assert!(record.duration_s > Some(0.0) && record.cycle == 2);
     assert!(matches!(
-        grinder.publish(job, 5, &GrindOrder { map: map(), pass: pass(), map_identity }),
+        grinder.publish(job, 5, &GrindOrder { map: map(), pass: pass(), map_identity }, &Permit::new()),
         Err(ExchangeError::HandedOver { .. })
     ));
     match grinder.confirm(job, Confirmed::Done, [1; 32]) {
@@ -461,6 +463,10 @@ async fn a_measuring_machine_goes_through_the_states_of_a_wire() {
     assert_eq!(cmm.status().await.unwrap().state, State::Prepared);
     assert!(shop.handed().is_empty());
     assert!(matches!(cmm.reconcile(&armed).await.unwrap(), Reconciled::NotStarted(_)));
+    // What was told not to have started does not start any more.
+    assert_eq!(answer_of(cmm.start(armed).await), Answer::WrongState);
+    assert!(shop.handed().is_empty());
+    let armed = cmm.prepare(job).await.unwrap();
     let started = cmm.start(armed.clone()).await.unwrap();
     assert_eq!((started.status.state, shop.handed().len()), (State::Execute, 1));
     assert_eq!(answer_of(cmm.start(armed.clone()).await), Answer::WrongState);
@@ -549,6 +555,96 @@ async fn a_folder_that_is_not_there_is_named() {
     let mut cmm = ExchangeMachine::new("cmm", MachineKind::Cmm, CmmFolders::new(settings), ANSWERS_WITHIN);
     let error = cmm.connect().await.unwrap_err();
     assert!(error.is_link() && error.to_string().contains("/nowhere/out"), "{error}");
+}
+
+/// Folders on a drive that hangs in the middle of the next hand-over, before or after it has appeared, until it is let go.
+#[derive(Debug)]
+struct Hanging {
+    folders: CmmFolders,
+    after: bool,
+    reached: Option<oneshot::Sender<()>>,
+    let_go: mpsc::Receiver<()>,
+}
+
+impl Hanging {
+    fn hang(&mut self) {
+        if let Some(reached) = self.reached.take() {
+            reached.send(()).unwrap();
+            self.let_go.recv().unwrap();
+        }
+    }
+}
+
+impl Exchange for Hanging {
+    type Request = MeasureOrder;
+    type Answer = Measurement;
+
+    fn open(&mut self) -> Result<Vec<HandOver>, ExchangeError> {
+        self.folders.open()
+    }
+
+    fn publish(&mut self, job: Job, number: u32, order: &MeasureOrder, permit: &Permit) -> Result<(), ExchangeError> {
+        if !self.after {
+            self.hang();
+        }
+        let published = self.folders.publish(job, number, order, permit);
+        self.hang();
+        published
+    }
+
+    fn mark(&mut self, job: Job, standing: Standing) -> Result<(), ExchangeError> {
+        self.folders.mark(job, standing)
+    }
+
+    fn look(&mut self, now: Duration, job: Job) -> Result<Look<Measurement>, ExchangeError> {
+        self.folders.look(now, job)
+    }
+}
+
+/// A START that takes longer than it may, and what the machine says of it when the drive answers again.
+async fn late_start(shop: &Shop, after: bool) -> (ExchangeMachine<Hanging>, DeviceError, Reconciled) {
+    let (reached, hangs) = oneshot::channel();
+    let (go, let_go) = mpsc::channel();
+    let folders = CmmFolders::new(at_once(shop.cmm()));
+    let folders = Hanging { folders, after, reached: Some(reached), let_go };
+    let mut cmm = ExchangeMachine::new("cmm", MachineKind::Cmm, folders, ANSWERS_WITHIN);
+    cmm.connect().await.unwrap();
+    cmm.claim().await.unwrap();
+    let plan = plan(3);
+    cmm.load_plan(&plan, &Interrupt::new()).await.unwrap();
+    let job = Job { job: 3, cycle: 2, digest: digest(&[plan.identity()]) };
+    let armed = cmm.prepare(job).await.unwrap();
+    let time_passes = async {
+        hangs.await.unwrap();
+        tokio::time::advance(ANSWERS_WITHIN + Duration::from_secs(1)).await;
+    };
+    let (told, ()) = tokio::join!(cmm.start(armed.clone()), time_passes);
+    go.send(()).unwrap();
+    let found = cmm.reconcile(&armed).await.unwrap();
+    (cmm, told.unwrap_err(), found)
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_start_that_timed_out_is_never_handed_over_later() {
+    let shop = Shop::new();
+    let (mut cmm, told, found) = late_start(&shop, false).await;
+    assert!(matches!(told, DeviceError::TimedOut { .. }), "{told}");
+    assert!(matches!(found, Reconciled::NotStarted(_)), "{found:?}");
+    assert_eq!(shop.handed(), [] as [&str; 0]);
+    // It can be prepared and started anew.
+    let job = Job { job: 3, cycle: 2, digest: digest(&[plan(3).identity()]) };
+    let armed = cmm.prepare(job).await.unwrap();
+    cmm.start(armed).await.unwrap();
+    assert_eq!(shop.handed(), ["SN_7_j3_c2"]);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_start_that_timed_out_while_it_appeared_is_taken_back_and_told() {
+    let shop = Shop::new();
+    let (_cmm, told, found) = late_start(&shop, true).await;
+    assert!(matches!(told, DeviceError::StartUnknown { .. }), "{told}");
+    assert!(matches!(&found, Reconciled::Finished(status) if status.outcome == Outcome::Stopped), "{found:?}");
+    assert_eq!(shop.handed(), ["SN_7_j3_c2.stopped"], "nothing stands open that nobody waits for");
 }
 
 // ---- whole cells ----------------------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ use crate::worlds::header;
 use nalgebra::{Matrix6, Vector6};
 use regrind::cell::{Actor, Ending, Role};
 use regrind::config::CellConfig;
-use regrind::device::exchange::{CmmExchange, CmmFolders, Exchange, MeasureOrder};
+use regrind::device::exchange::{CmmExchange, CmmFolders, Exchange, MeasureOrder, Permit};
 use regrind::device::{Coordinates, Identified, Job, Measurement, Plan, digest};
 use regrind::drive::{CycleRow, Drive, Notice, Run};
 use regrind::formats::result::{Content, Coordinates as Said};
@@ -386,7 +386,7 @@ fn exchanged(map: &Path, content: Content) -> (Option<Measurement>, Vec<String>)
     };
     let plan_identity = plan.identity();
     let job = Job { job: 1, cycle: 0, digest: digest(&[plan_identity]) };
-    folders.publish(job, 1, &MeasureOrder { plan, plan_identity }).unwrap();
+    folders.publish(job, 1, &MeasureOrder { plan, plan_identity }, &Permit::new()).unwrap();
     fs::copy(map, inbox.join("P_c0").with_extension(map.extension().unwrap())).unwrap();
     let look = folders.look(Duration::from_secs(1), job).unwrap();
     (look.answer, look.notes)

@@ -6,7 +6,9 @@ use std::path::Path;
 use std::time::Duration;
 
 use crate::data::data;
-use regrind::device::exchange::{CmmExchange, CmmFolders, Exchange, MeasureOrder, Pattern, StationFiles, Stations};
+use regrind::device::exchange::{
+    CmmExchange, CmmFolders, Exchange, MeasureOrder, Pattern, Permit, StationFiles, Stations,
+};
 use regrind::device::{Coordinates, Identified, Job, Measurement, Plan, digest};
 use regrind::formats::result::{Content, Coordinates as Said};
 use regrind::geometry::{Point, Pose, Twist, Vector};
@@ -48,7 +50,7 @@ fn measured(settings: CmmExchange, radius_mm: f64) -> (Option<Measurement>, Vec<
     assert!(folders.open().unwrap().is_empty());
     let order = plan(radius_mm);
     let job = Job { job: 1, cycle: 0, digest: digest(&[order.plan_identity]) };
-    folders.publish(job, 1, &order).unwrap();
+    folders.publish(job, 1, &order, &Permit::new()).unwrap();
     let look = folders.look(Duration::from_secs(1), job).unwrap();
     (look.answer, look.notes)
 }

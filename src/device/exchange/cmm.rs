@@ -14,7 +14,7 @@ use super::measured::{Wanted, foreign, measurement};
 use super::outbox::{Outbox, StoredHandover, Taken, Ticket, json_lines, unhex};
 use super::stations::{PlacedStation, place_station};
 use super::watch::{Watch, WatchedFile};
-use super::{Exchange, ExchangeError, HandOver, Look, MeasureOrder, Pattern, Standing};
+use super::{Exchange, ExchangeError, HandOver, Look, MeasureOrder, Pattern, Permit, Standing};
 use crate::{Job, MeasuredPoint, Measurement, Plan, hex};
 use regrind_formats::FormatError;
 use regrind_formats::references::{References, parse_references, read_references};
@@ -426,7 +426,7 @@ impl Exchange for CmmFolders {
         self.outbox.open(&mut self.watch)
     }
 
-    fn publish(&mut self, job: Job, sequence: u32, order: &MeasureOrder) -> Result<(), ExchangeError> {
+    fn publish(&mut self, job: Job, sequence: u32, order: &MeasureOrder, permit: &Permit) -> Result<(), ExchangeError> {
         let CmmExchange { part, inbox, .. } = &self.settings;
         let ticket = Ticket::new(part, job, sequence, &order.plan_identity, order.plan.probe_radius_mm, inbox)?;
         let expects = self.settings.result.filled(&ticket.part, ticket.job, ticket.cycle);
@@ -434,7 +434,7 @@ impl Exchange for CmmFolders {
             ("plan.csv", plan_csv(&ticket.part, job, &ticket.identity, &order.plan).into_bytes()),
             ("plan.json", plan_json(&ticket, order, &self.settings, expects.as_str())),
         ];
-        self.outbox.publish(&ticket, &files)?;
+        self.outbox.publish(&ticket, &files, permit)?;
         (self.expected, self.judged) = (None, None);
         Ok(())
     }

@@ -64,6 +64,9 @@ pub enum ExchangeError {
     /// The same job and cycle a second time.
     #[error("job {job} cycle {cycle} was handed over before, see {folder}; it is never handed over twice")]
     HandedOver { job: u32, cycle: u16, folder: PathBuf },
+    /// Nobody waits for the hand-over any more; it was not made.
+    #[error("job {job} cycle {cycle} was not handed over: it took too long, and nobody waited for it any more")]
+    Withdrawn { job: u32, cycle: u16 },
     /// A confirmation that names another map than was handed over.
     #[error("the confirmation names the map {}, handed over was {}", hex(&found[..8]), hex(&expected[..8]))]
     OtherMap { expected: [u8; 32], found: [u8; 32] },

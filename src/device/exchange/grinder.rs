@@ -13,7 +13,7 @@ use sha2::{Digest, Sha256};
 
 use super::outbox::{Outbox, StoredHandover, Taken, Ticket, json_lines, read_json, unhex};
 use super::watch::{Watch, WatchedFile};
-use super::{Confirmed, Exchange, ExchangeError, GrindOrder, HandOver, Look, Standing};
+use super::{Confirmed, Exchange, ExchangeError, GrindOrder, HandOver, Look, Permit, Standing};
 use crate::{CorrectionMap, Job, Outcome, PassRecord, hex};
 use regrind_formats::result::read_bytes;
 use regrind_formats::write_atomic;
@@ -157,7 +157,7 @@ impl Exchange for GrinderFolders {
         self.outbox.open(&mut self.watch)
     }
 
-    fn publish(&mut self, job: Job, sequence: u32, order: &GrindOrder) -> Result<(), ExchangeError> {
+    fn publish(&mut self, job: Job, sequence: u32, order: &GrindOrder, permit: &Permit) -> Result<(), ExchangeError> {
         let GrinderExchange { part, inbox, .. } = &self.settings;
         let ticket = Ticket::new(part, job, sequence, &order.map_identity, order.pass.wheel_radius_mm, inbox)?;
         let word = json_lines(&serde_json::json!(Confirmation::of(&ticket)));
@@ -167,7 +167,7 @@ impl Exchange for GrinderFolders {
             (STARTED, word.clone()),
             (DONE, word),
         ];
-        self.outbox.publish(&ticket, &files)?;
+        self.outbox.publish(&ticket, &files, permit)?;
         (self.expected, self.started) = (None, None);
         Ok(())
     }

@@ -1,5 +1,7 @@
 //! What the driver asks of the folders, so that it writes no file itself.
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU8, Ordering};
 use std::time::Duration;
 
 use super::ExchangeError;
@@ -17,8 +19,15 @@ pub trait Exchange: std::fmt::Debug + Send + 'static {
     /// Tries both folders, and returns every hand-over that was ever made there, the oldest first.
     fn open(&mut self) -> Result<Vec<HandOver>, ExchangeError>;
 
-    /// Makes a hand-over appear, whole, by one rename. Never a second time for a job and cycle.
-    fn publish(&mut self, job: Job, sequence: u32, request: &Self::Request) -> Result<(), ExchangeError>;
+    /// Makes a hand-over appear, whole, by one rename. Never a second time for a job and cycle, and not where the permit for it was
+    /// withdrawn before that rename.
+    fn publish(
+        &mut self,
+        job: Job,
+        sequence: u32,
+        request: &Self::Request,
+        permit: &Permit,
+    ) -> Result<(), ExchangeError>;
 
     /// Moves a hand-over on to where it stands now.
     fn mark(&mut self, job: Job, standing: Standing) -> Result<(), ExchangeError>;
@@ -30,6 +39,37 @@ pub trait Exchange: std::fmt::Debug + Send + 'static {
     /// is open for it.
     fn confirm(&mut self, job: Job, _what: Confirmed, _map_identity: [u8; 32]) -> Result<(), ExchangeError> {
         Err(ExchangeError::NotOpen { job: job.job, cycle: job.cycle })
+    }
+}
+
+/// Whether a hand-over may still appear. Who waits for it and gives up withdraws the permit; who makes it appear uses the permit up in the
+/// moment before. So a hand-over that nobody waits for any more either never appears, or it is known that it did.
+#[derive(Debug, Clone, Default)]
+pub struct Permit(Arc<AtomicU8>);
+
+const GIVEN: u8 = 0;
+const USED: u8 = 1;
+const WITHDRAWN: u8 = 2;
+
+impl Permit {
+    /// A permit that holds.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Uses the permit up; false where it was withdrawn.
+    pub fn use_up(&self) -> bool {
+        self.0.compare_exchange(GIVEN, USED, Ordering::AcqRel, Ordering::Acquire).is_ok()
+    }
+
+    /// Withdraws it; returns false where it was used before, so that the hand-over may have appeared.
+    pub(super) fn withdraw(&self) -> bool {
+        self.0.swap(WITHDRAWN, Ordering::AcqRel) == GIVEN
+    }
+
+    /// Whether nobody waits any more for what it was given for.
+    pub(super) fn is_withdrawn(&self) -> bool {
+        self.0.load(Ordering::Acquire) == WITHDRAWN
     }
 }
 

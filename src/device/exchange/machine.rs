@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use tokio::time::{Instant, timeout};
 
-use super::{Confirmed, Exchange, ExchangeError, GrindOrder, HandOver, MeasureOrder, Standing};
+use super::{Confirmed, Exchange, ExchangeError, GrindOrder, HandOver, MeasureOrder, Permit, Standing};
 use crate::{
     Answer, Answered, Armed, Cmm, Command, CorrectionMap, DeviceError, Grinder, Identified, Identity, Interrupt, Job,
     Machine, MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, Reconciled, Started, State, Status, Word,
@@ -232,7 +232,10 @@ impl<M: Exchange> FolderMachine<M> {
         Ok(Armed { job, start_sequence, token: 0, boot_id: 0 })
     }
 
-    fn start(&mut self, armed: &Armed) -> Answered<Started> {
+    fn start(&mut self, armed: &Armed, permit: &Permit) -> Answered<Started> {
+        if permit.is_withdrawn() {
+            return Err(self.refused(Command::Start, Answer::DeadToken));
+        }
         if self.state != State::Prepared {
             return Err(self.refused(Command::Start, Answer::WrongState));
         }
@@ -240,11 +243,23 @@ impl<M: Exchange> FolderMachine<M> {
         let Some((request, _)) = self.loaded.as_ref().filter(|_| self.job == Some((job, sequence))) else {
             return Err(self.refused(Command::Start, Answer::OtherJob));
         };
-        if let Err(error) = self.exchange.publish(job, sequence, request) {
-            return self.after_failed_start(armed, error);
+        if let Err(error) = self.exchange.publish(job, sequence, request, permit) {
+            return self.after_failed_start(armed, error, permit);
         }
         self.handed.push(HandOver { job, sequence, standing: Standing::Open });
+        if permit.is_withdrawn() {
+            return self.take_back_late(armed);
+        }
         self.started(armed)
+    }
+
+    /// The hand-over has appeared after it was given up: whoever waited for it may have gone on without it, so it must not stand open. That
+    /// it did for a moment is told by its ending to who asks what became of it.
+    fn take_back_late(&mut self, armed: &Armed) -> Answered<Started> {
+        self.mark(Command::Start, Standing::Stopped)?;
+        self.notes = self.taken_back();
+        self.finish(Outcome::Stopped, armed.start_sequence);
+        Err(self.refused(Command::Start, Answer::DeadToken))
     }
 
     fn started(&mut self, armed: &Armed) -> Answered<Started> {
@@ -254,14 +269,14 @@ impl<M: Exchange> FolderMachine<M> {
     }
 
     /// Something went wrong while the hand-over was published: whether it is there is read from the folder.
-    fn after_failed_start(&mut self, armed: &Armed, error: ExchangeError) -> Answered<Started> {
+    fn after_failed_start(&mut self, armed: &Armed, error: ExchangeError, permit: &Permit) -> Answered<Started> {
         let why = self.failed(Command::Start, error);
         match self.exchange.open() {
             Ok(handed) => {
                 self.handed = handed;
                 let ours = |h: &HandOver| (h.job, h.sequence) == (armed.job, armed.start_sequence);
                 if self.handed.iter().any(ours) {
-                    return self.started(armed);
+                    return if permit.is_withdrawn() { self.take_back_late(armed) } else { self.started(armed) };
                 }
                 (self.state, self.job) = (State::Idle, None);
                 Err(why)
@@ -377,6 +392,10 @@ impl<M: Exchange> FolderMachine<M> {
         self.open()?;
         let Job { job, cycle, .. } = intended.job;
         let Some(handed) = self.handed.iter().find(|h| (h.job.job, h.job.cycle) == (job, cycle)).copied() else {
+            // Nor will it be: what was prepared for it is forgotten.
+            if self.state == State::Prepared {
+                (self.state, self.job) = (State::Idle, None);
+            }
             return Ok(Reconciled::NotStarted(self.status()));
         };
         if handed.job != intended.job || handed.sequence != intended.start_sequence {
@@ -411,6 +430,15 @@ impl<M: Exchange> FolderMachine<M> {
                 Reconciled::Unknown { why }
             }
         })
+    }
+}
+
+/// Withdraws a permit when nobody waits any more for what it was given for.
+struct GivenUp(Permit);
+
+impl Drop for GivenUp {
+    fn drop(&mut self) {
+        self.0.withdraw();
     }
 }
 
@@ -466,14 +494,22 @@ impl<M: Exchange> Machine for ExchangeMachine<M> {
 
     async fn start(&mut self, armed: Armed) -> Answered<Started> {
         let (job, sequence) = (armed.job, armed.start_sequence);
+        let permit = Permit::new();
+        let kept = permit.clone();
+        // Who drops this future waits no longer either.
+        let _until_here = GivenUp(permit.clone());
         let told = self
             .at_work("START", move |machine, _| {
                 machine.check_connected("START")?;
-                machine.start(&armed)
+                machine.start(&armed, &kept)
             })
             .await;
         match told {
-            // The work goes on behind the time-out.
+            // The work goes on behind the time-out; but nothing appears any more.
+            Err(why @ (DeviceError::TimedOut { .. } | DeviceError::Disconnected { .. })) if permit.withdraw() => {
+                Err(why)
+            }
+            // It may have appeared in this moment, and is taken back if it has.
             Err(why @ (DeviceError::TimedOut { .. } | DeviceError::Disconnected { .. })) => {
                 let machine = Arc::clone(&self.name);
                 Err(DeviceError::StartUnknown { machine, job, sequence, why: Box::new(why) })

@@ -35,7 +35,7 @@ pub(super) use cmm::plan_csv;
 pub use cmm::{CmmExchange, CmmFolders, StationFiles, Stations};
 pub use error::ExchangeError;
 pub use grinder::{GrinderExchange, GrinderFolders};
-pub use hand_over::{Confirmed, Exchange, HandOver, Look, Standing};
+pub use hand_over::{Confirmed, Exchange, HandOver, Look, Permit, Standing};
 pub use machine::ExchangeMachine;
 pub use measured::{Wanted, foreign, measurement};
 pub use pattern::{Pattern, file_word};

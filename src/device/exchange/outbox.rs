@@ -17,7 +17,7 @@ use std::time::{Duration, SystemTime};
 use serde::{Deserialize, Serialize};
 
 use super::watch::{FileLook, Watch};
-use super::{ExchangeError, HandOver, Standing, file_word};
+use super::{ExchangeError, HandOver, Permit, Standing, file_word};
 use crate::{Job, hex};
 use regrind_formats::{FormatError, read_whole, sync_folder, try_writing, write_atomic, write_json_atomic};
 
@@ -171,8 +171,13 @@ impl Outbox {
         self.find(job)?.ok_or_else(|| ExchangeError::Missing { folder: self.folder.clone() })
     }
 
-    /// Puts a hand-over into the folder: its ticket, and files by name.
-    pub(super) fn publish(&self, ticket: &Ticket, files: &[(&str, Vec<u8>)]) -> Result<(), ExchangeError> {
+    /// Puts a hand-over into the folder: its ticket, and files by name. Where the permit was withdrawn nothing appears.
+    pub(super) fn publish(
+        &self,
+        ticket: &Ticket,
+        files: &[(&str, Vec<u8>)],
+        permit: &Permit,
+    ) -> Result<(), ExchangeError> {
         static COUNT: AtomicU64 = AtomicU64::new(0);
         if let Some(before) = self.find(ticket.job())? {
             return Err(ExchangeError::HandedOver { job: ticket.job, cycle: ticket.cycle, folder: before.path });
@@ -184,6 +189,9 @@ impl Outbox {
             write_atomic(&draft.0.join(name), bytes)?;
         }
         write_json_atomic(draft.0.join(TICKET), ticket)?;
+        if !permit.use_up() {
+            return Err(ExchangeError::Withdrawn { job: ticket.job, cycle: ticket.cycle });
+        }
         rename(&draft.0, &target)?;
         Ok(())
     }
