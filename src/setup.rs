@@ -127,6 +127,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         },
         tolerance_mm: recipe.acceptance.pv_um.map(|pv| 0.5 * pv.mm()),
         least_found: recipe.measure.minimum_coverage,
+        temperature_c: recipe.measure.temperature_c,
         simulation: cell.simulated,
     };
     let mut plan = plan(recipe, cell);
@@ -422,6 +423,7 @@ fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
     for k in (0..2).filter(|k| by_person[*k]) {
         (deadlines.progress[k], deadlines.hold[k], deadlines.stop[k]) =
             (WAIT_FOR_PEOPLE, WAIT_FOR_STILL, WAIT_FOR_STILL);
+        deadlines.progress_notice[k] = None;
         (deadlines.answer, deadlines.connect) = (ANSWERS_WITHIN, ANSWERS_WITHIN);
     }
     CellPlan {

@@ -47,6 +47,9 @@ impl Cell {
     /// Takes a state, and the deadline that goes with it. The time to come to a stand counts from the first HOLD, whatever becomes of
     /// the link meanwhile.
     pub(super) fn go(&mut self, state: State) {
+        if std::mem::take(&mut self.still) {
+            self.withdraw(AlarmId::ProgressStands);
+        }
         self.state = state;
         self.deadline = self.limit().map(|limit| self.now.saturating_add(limit));
         match (state, state.phase().and_then(Phase::job)) {
@@ -85,7 +88,7 @@ impl Cell {
             (Suspended(_), _) => Some(limits.suspended),
             (Stopping, _) => self.stopping.map(|device| limits.stop[device as usize]),
             (Aborting, _) => Some(limits.abort),
-            (Execute(phase), Some(JobStep::Run)) => phase.moving().map(|device| limits.progress[device as usize]),
+            (Execute(phase), Some(JobStep::Run)) => phase.moving().map(|device| self.progress_limit(device)),
             (Holding(phase) | Suspending(phase), Some(JobStep::Run)) => {
                 phase.moving().map(|device| limits.hold[device as usize])
             }
@@ -93,6 +96,17 @@ impl Cell {
             (_, Some(JobStep::Qualify)) => Some(limits.compute),
             (Execute(Register | Compensate) | Holding(Register | Compensate), _) => Some(limits.compute),
             _ => Some(limits.answer),
+        }
+    }
+
+    /// Returns how long a running job may be without progress: until a person is told, and then until it is held.
+    fn progress_limit(&self, device: Device) -> Duration {
+        let limit = self.plan.deadlines.progress[device as usize];
+        let notice = self.plan.deadlines.progress_notice[device as usize].map(|least| least.max(3 * self.pace));
+        match notice.filter(|notice| *notice < limit) {
+            Some(notice) if self.still => limit - notice,
+            Some(notice) => notice,
+            None => limit,
         }
     }
 
@@ -180,6 +194,10 @@ impl Cell {
 
     /// Enters a phase. Whether the surroundings allow it is looked at here, at every entry, and not only when they change.
     fn enter(&mut self, phase: Phase) {
+        if matches!(phase.job(), Some((_, JobStep::Prepare | JobStep::Start))) && self.is_by_hand() {
+            self.raise_by_hand();
+            return self.go(Held(restart_of(phase)));
+        }
         let alone = matches!(phase, Load | Register | Judge | Compensate);
         if !alone && !self.causes.is_empty() {
             return self.go(Suspended(restart_of(phase)));
@@ -269,6 +287,7 @@ impl Cell {
         (known.clear, known.said_clear) = (false, false);
         self.passes += u32::from(device == Device::Grinder);
         self.doubted = false;
+        (self.progressed, self.pace) = (None, Duration::ZERO);
         self.push(Command::StartMachine { device, cycle: self.cycle });
     }
 
@@ -483,7 +502,71 @@ impl Cell {
         self.push(Command::HoldMachine { device });
     }
 
+    /// A machine that no order of the cell has set going moves: it is told to hold, and so is what moves beside it.
+    pub(super) fn strays(&mut self, phase: Phase, device: Device) {
+        self.know(device).clear = false;
+        if self.raised.contains(&AlarmId::MovesUnasked) {
+            return;
+        }
+        let what = phase.moving().map_or(String::new(), |moves| format!(", while the {moves} is at its job"));
+        self.raise(AlarmId::MovesUnasked, &format!("{device}{what}"));
+        self.push(Command::HoldMachine { device });
+        match self.state {
+            Execute(_) | Unholding(_) | Unsuspending(_) => self.hold(phase),
+            Suspending(_) => self.go(Holding(phase)),
+            _ => {}
+        }
+    }
+
+    /// Returns whether a machine is in manual mode.
+    fn is_by_hand(&self) -> bool {
+        self.known.iter().any(|known| known.manual)
+    }
+
+    fn raise_by_hand(&mut self) {
+        let names: Vec<_> =
+            Device::BOTH.into_iter().filter(|device| self.knows(*device).manual).map(|d| d.to_string()).collect();
+        self.raise(AlarmId::NotAutomatic, &format!("{} in manual mode", names.join(" and ")));
+    }
+
+    /// A machine was taken out of automatic mode: nothing moves beside it, and nothing that waits goes on by itself.
+    pub(super) fn by_hand(&mut self, device: Device, message: &str) {
+        self.know(device).manual = true;
+        let Some((phase, moving)) = self.state.phase().and_then(|phase| Some((phase, phase.moving()?))) else { return };
+        if matches!(self.state, Held(_)) {
+            return;
+        }
+        let beside = if moving == device { String::new() } else { format!(", while the {moving} is at its job") };
+        self.raise(AlarmId::NotAutomatic, &format!("{device}, {message}{beside}"));
+        match self.state {
+            Execute(_) | Unholding(_) | Unsuspending(_) => self.hold(phase),
+            Suspending(_) => self.go(Holding(phase)),
+            Suspended(_) => self.hold_suspended(phase),
+            _ => {}
+        }
+    }
+
+    pub(super) fn automatic_again(&mut self, device: Device) {
+        self.know(device).manual = false;
+        if !self.is_by_hand() {
+            self.withdraw(AlarmId::NotAutomatic);
+        }
+    }
+
+    /// The job gives a sign of progress.
+    pub(super) fn progressed(&mut self) {
+        if let Some(last) = self.progressed.replace(self.now) {
+            self.pace = self.pace.max(self.now.saturating_sub(last));
+        }
+        self.go(self.state);
+    }
+
     pub(super) fn resume(&mut self, phase: Phase) -> Result<(), String> {
+        if let Some((_, JobStep::Run)) = phase.job()
+            && let Some(device) = Device::BOTH.into_iter().find(|device| self.knows(*device).manual)
+        {
+            return Err(format!("the {device} is in manual mode; turn its key to automatic, resume then"));
+        }
         let absent: Vec<_> = Device::BOTH.into_iter().filter(|device| !self.knows(*device).ready).collect();
         if !absent.is_empty() && self.cycle == 0 {
             self.go(Starting);
@@ -578,6 +661,25 @@ impl Cell {
         }
     }
 
+    /// This program can no longer speak to a machine. Nothing brings that back, so nothing waits for it but a person.
+    pub(super) fn station_failed(&mut self, device: Device, why: &str) {
+        self.note_link(device, true);
+        let case = format!("{device}, {why}");
+        self.raise(AlarmId::ProgramFailed, &case);
+        match self.state {
+            Starting => self.stop(&case, false),
+            state => {
+                let Some(phase) = state.phase() else { return };
+                let needed = phase.job().map(|(job, _)| job) == Some(device) || awaits_clear(phase) == Some(device);
+                if needed {
+                    self.go(Held(out_of_sight(phase)));
+                } else if let Execute(_) | Unholding(_) | Unsuspending(_) = state {
+                    self.hold(phase);
+                }
+            }
+        }
+    }
+
     pub(super) fn link_back(&mut self, device: Device, boot_id: u32) {
         let known = self.know(device);
         let same = known.boot_id.replace(boot_id).is_none_or(|before| before == boot_id);
@@ -647,6 +749,8 @@ impl Cell {
                 self.go(Held(run));
             }
             Held(_) | Suspended(_) if at_job => {}
+            // It had no job, moved, and was told to hold.
+            _ if !at_job && self.raised.contains(&AlarmId::MovesUnasked) => {}
             state => return Err(format!("the {device} has no job that could be held in the state {state}")),
         }
         Ok(())
@@ -672,6 +776,12 @@ impl Cell {
     /// The machine moves. If a condition went missing meanwhile it is held again.
     pub(super) fn runs(&mut self, run: Phase) {
         self.go(Execute(run));
+        // What passed while it stood says nothing of its pace.
+        self.progressed = None;
+        if self.is_by_hand() {
+            self.raise_by_hand();
+            return self.hold(run);
+        }
         if self.causes.iter().any(|cause| matches!(cause, Cause::Condition(..))) {
             self.suspend(run);
         }
@@ -863,6 +973,7 @@ impl Cell {
                 self.raise(AlarmId::HoldNotConfirmed, &device.to_string());
                 self.abort(&format!("the {device} did not confirm in time that it holds"));
             }
+            (Some((device, JobStep::Run)), Execute(_)) if self.is_to_be_told(device) => self.makes_no_progress(device),
             (Some((device, JobStep::Run)), _) => {
                 self.raise(AlarmId::NoAnswer, &format!("{device}, no sign of its job"));
                 self.hold(phase);
@@ -878,6 +989,22 @@ impl Cell {
                 self.go(Held(restart_of(phase)));
             }
         }
+    }
+
+    /// Returns whether a person is told of a job without progress before it is held.
+    fn is_to_be_told(&self, device: Device) -> bool {
+        !self.still && self.progress_limit(device) < self.plan.deadlines.progress[device as usize]
+    }
+
+    fn makes_no_progress(&mut self, device: Device) {
+        let told = self.progress_limit(device);
+        self.still = true;
+        let left = self.progress_limit(device);
+        self.raise(
+            AlarmId::ProgressStands,
+            &format!("{device}, for {} s; after {} s more it is held", told.as_secs(), left.as_secs()),
+        );
+        self.deadline = Some(self.now.saturating_add(left));
     }
 
     fn abort_is_due(&mut self) {

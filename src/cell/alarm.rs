@@ -94,6 +94,12 @@ catalogue! {
         ["Check the cable, the switch and whether the control is running.", "Wait: the cell goes on by itself.",
          "If it cannot be mended, stop or abort the run."]
     }
+    /// A fault of this program.
+    ProgramFailed {
+        "A part of this program has failed, and nothing speaks to a machine any more", "The machine hears no beat and holds itself by its own silence limit. The run cannot go on with it.", ProcessEngineer,
+        ["Look at the machine: what runs there ends at its own panel.", "Abort the run: the other machine hears it, this one does not.",
+         "Report the fault with the folder of the run.", "Begin a new run with a measurement of the part as it is."]
+    }
     /// Supplies or temperature.
     ConditionLost {
         "A condition for the work is missing", "The cell waits, and goes on by itself when the condition is back.", Nobody,
@@ -125,6 +131,16 @@ catalogue! {
         "A machine moves that should stand", "It is told to hold, and the cell is held.", Operator,
         ["Look at the machine: who let it go?", "If it does not come to a stand, use the machine's own emergency circuit.",
          "Resume when it is known why it moved."]
+    }
+    /// A machine in manual mode.
+    NotAutomatic {
+        "A machine is not in automatic mode", "Nothing is started, and what moved is held: at its panel a person may move it to where the other one works.", Operator,
+        ["Bring the machine out of the way of the other one, and turn its key to automatic.", "Resume here."]
+    }
+    /// No progress.
+    ProgressStands {
+        "A job makes no progress", "The machine answers and its job goes on; it is held if that lasts.", Nobody,
+        ["Look at the machine: does it wait for something at its own panel, or cut air?", "Hold the run if you doubt it."]
     }
     /// The machine said no.
     MachineRefused {

@@ -54,6 +54,8 @@ pub enum Event {
     LinkLost { device: Device, why: String },
     /// The link is open again, its signature and its sync are proven.
     LinkBack { device: Device, boot_id: u32 },
+    /// What attends to the machine in this program has failed: nothing speaks to the machine any more, whose own silence limit holds it.
+    StationFailed { device: Device, why: String },
     /// Something that the cell needs from outside is missing. Reported as a level: again after every reconnection.
     ConditionLost {
         device: Device,
@@ -63,6 +65,14 @@ pub enum Event {
     },
     /// It is there again; hysteresis is the business of who reports.
     ConditionBack { device: Device, condition: Condition },
+    /// The machine is not in automatic mode: a person may move it at its panel. Reported as a level, as a missing condition is.
+    NotAutomatic {
+        device: Device,
+        #[serde(rename = "words")]
+        message: String,
+    },
+    /// It is in automatic mode again.
+    AutomaticAgain { device: Device },
     /// The grinder holds the pass and the map of this cycle, read back and compared. Answers `LoadPass`.
     PassLoaded { cycle: u32 },
     /// The CMM holds the plan of this cycle, read back and compared. Answers `LoadPlan`.
@@ -73,7 +83,7 @@ pub enum Event {
     Started { device: Device, cycle: u32 },
     /// It is not known whether START was taken. Answers `StartMachine`.
     StartUnknown { device: Device, cycle: u32, why: String },
-    /// The job goes on: so many points measured, or thousandths of the path, of so many.
+    /// The job goes on: so many points measured, or thousandths of the path, of so many. Comes too from a machine that moves without one.
     Progressed { device: Device, done: u32, total: u32 },
     /// The machine stands in its safe place. Answers `HoldMachine`, also where it was held already, or comes by itself.
     MachineHeld { device: Device },
@@ -476,8 +486,11 @@ impl Event {
             | Self::NotConnected { device, .. }
             | Self::LinkLost { device, .. }
             | Self::LinkBack { device, .. }
+            | Self::StationFailed { device, .. }
             | Self::ConditionLost { device, .. }
             | Self::ConditionBack { device, .. }
+            | Self::NotAutomatic { device, .. }
+            | Self::AutomaticAgain { device }
             | Self::Prepared { device, .. }
             | Self::Started { device, .. }
             | Self::StartUnknown { device, .. }
@@ -555,8 +568,11 @@ impl Event {
             Self::NotConnected { .. } => "not_connected",
             Self::LinkLost { .. } => "link_lost",
             Self::LinkBack { .. } => "link_back",
+            Self::StationFailed { .. } => "station_failed",
             Self::ConditionLost { .. } => "condition_lost",
             Self::ConditionBack { .. } => "condition_back",
+            Self::NotAutomatic { .. } => "not_automatic",
+            Self::AutomaticAgain { .. } => "automatic_again",
             Self::PassLoaded { .. } => "pass_loaded",
             Self::PlanLoaded { .. } => "plan_loaded",
             Self::Prepared { .. } => "prepared",

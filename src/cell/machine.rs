@@ -118,6 +118,7 @@ impl Cell {
                 self.note_link(*device, true);
                 self.raise(AlarmId::LinkLost, &format!("{device}, {why}"));
             }
+            (_, Event::StationFailed { device, why }) => self.station_failed(*device, why),
             (_, Event::LinkBack { device, boot_id }) => self.link_back(*device, *boot_id),
             (Execute(phase), Event::ConditionLost { device, condition, message }) => {
                 self.condition_lost(*device, *condition, message);
@@ -131,6 +132,9 @@ impl Cell {
             (_, Event::ConditionBack { device, condition }) => {
                 self.cause_gone(Cause::Condition(*device, *condition), AlarmId::ConditionLost)
             }
+
+            (_, Event::NotAutomatic { device, message }) => self.by_hand(*device, message),
+            (_, Event::AutomaticAgain { device }) => self.automatic_again(*device),
 
             // Connecting.
             (Starting, Event::Connected { device, boot_id, found, .. }) => self.connected(*device, *boot_id, found),
@@ -180,13 +184,17 @@ impl Cell {
                 self.reconcile(*device);
             }
             (Execute(p), Event::Progressed { device, .. }) if p.job() == Some((*device, JobStep::Run)) => {
-                self.go(self.state)
+                self.progressed()
             }
             (
                 Execute(p) | Holding(p) | Suspending(p) | Unholding(p) | Unsuspending(p),
                 Event::Progressed { device, .. },
             ) if p.moving() == Some(*device) => {}
             (Held(p) | Suspended(p), Event::Progressed { device, .. }) => self.moves_unasked(p, *device),
+            (
+                Execute(p) | Holding(p) | Suspending(p) | Unholding(p) | Unsuspending(p),
+                Event::Progressed { device, .. },
+            ) => self.strays(p, *device),
             (_, Event::MachineHeld { device }) => self.machine_held(*device)?,
             (_, Event::MachineResumed { device }) => self.machine_resumed(*device)?,
             (Stopping, Event::Ended { device, result, .. }) if *result != JobResult::Aborted => {

@@ -33,6 +33,8 @@ pub(super) struct Known {
     pub(super) asked_clear: bool,
     /// Whether it has ended its safe sequence.
     pub(super) stands: bool,
+    /// Whether it is in manual mode.
+    pub(super) manual: bool,
 }
 
 /// A cell in the middle of a run.
@@ -64,6 +66,10 @@ pub struct Cell {
     pub(super) deadline: Option<Duration>,
     /// When a machine that was told to hold has to stand.
     pub(super) hold_due: Option<Duration>,
+    /// When the running job gave its last sign of progress, the longest that it took for one, and whether a person was told that none comes.
+    pub(super) progressed: Option<Duration>,
+    pub(super) pace: Duration,
+    pub(super) still: bool,
     pub(super) commands: Vec<Command>,
 }
 
@@ -89,6 +95,9 @@ impl Cell {
             now: Duration::ZERO,
             deadline: None,
             hold_due: None,
+            progressed: None,
+            pace: Duration::ZERO,
+            still: false,
             commands: Vec::new(),
         }
     }

@@ -112,6 +112,10 @@ pub struct Deadlines {
     pub answer: Duration,
     /// Between two signs of progress of a running job of each machine: CMM, grinder. A job done by hand gives none before its end.
     pub progress: [Duration; 2],
+    /// After how long without a sign of progress a person is told, or after three times the longest that this job took for one; none where
+    /// a job gives no such signs.
+    #[serde(default)]
+    pub progress_notice: [Option<Duration>; 2],
     /// From HOLD to the safe place of each machine: CMM, grinder.
     pub hold: [Duration; 2],
     /// From STOP to the end of the job of each machine: CMM, grinder.
@@ -135,6 +139,7 @@ impl Default for Deadlines {
             transfer: s(120),
             answer: s(10),
             progress: [s(60); 2],
+            progress_notice: [Some(s(30)); 2],
             hold: [s(30); 2],
             stop: [s(60); 2],
             abort: s(2),

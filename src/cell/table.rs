@@ -74,7 +74,8 @@ fn key(cell: &Cell) -> impl Ord + use<> {
     let clear = cell.known.map(|known| (known.clear, known.said_clear, known.asked_clear));
     let memory = (cell.worse.min(1), cell.repeated, cell.previous.is_some(), cell.passes >= cell.plan.max_cycles);
     let grinds = cell.state().phase().and_then(Phase::moving) == Some(Device::Grinder);
-    let memory = (memory, cell.hold_due.is_some(), grinds && cell.doubted);
+    let by_hand = cell.known.iter().any(|known| known.manual);
+    let memory = (memory, cell.hold_due.is_some(), grinds && cell.doubted, cell.still, by_hand);
     (cell.state, known, clear, cell.causes.is_empty(), memory, cell.plan.on_stall == Disposal::Hold)
 }
 
@@ -146,6 +147,7 @@ fn of_machine(device: Device, cycle: u32) -> Vec<Event> {
         Event::LinkLost { device, why: text() },
         Event::LinkBack { device, boot_id: 1 },
         Event::LinkBack { device, boot_id: 2 },
+        Event::StationFailed { device, why: text() },
         Event::Prepared { device, cycle },
         Event::Started { device, cycle },
         Event::StartUnknown { device, cycle, why: text() },
@@ -163,6 +165,8 @@ fn of_machine(device: Device, cycle: u32) -> Vec<Event> {
         events.push(Event::ConditionLost { device, condition, message: text() });
         events.push(Event::ConditionBack { device, condition });
     }
+    events.push(Event::NotAutomatic { device, message: text() });
+    events.push(Event::AutomaticAgain { device });
     for found in [Occupation::Idle, Occupation::ToClear, Occupation::Busy(text())] {
         events.push(Event::Connected { device, boot_id: 1, simulated: true, found });
     }

@@ -13,6 +13,7 @@ use serde::Serialize;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
+use super::words_of;
 use crate::cell::{
     Asked, Condition, Device, Event, Gate, GateFailure, JobResult, Mismatch, Occupation, Reconciliation,
 };
@@ -191,6 +192,9 @@ struct Seen {
     progress: Option<(u32, u32)>,
     told_progress: Option<Instant>,
     supplies_missing: bool,
+    manual: bool,
+    /// Whether it was clear of the part, where it tells that.
+    clear: Option<bool>,
     /// A signal of the cell file is outside its range; and since when all are within, while that is not yet believed.
     signal_out: bool,
     signals_good_since: Option<Instant>,
@@ -230,14 +234,18 @@ impl<B: StationDriver> MachineTask<B> {
         Self { driver, job, interrupt, reports, loaded: None, armed, cycle, seen, notes }
     }
 
+    /// Attends until nobody can ask any more. If that panics, which is a fault of this program, it is told as that, and the run goes on
+    /// without the machine, to which nobody speaks any more.
+    pub(super) async fn attend(self, asks: mpsc::Receiver<Ask>, poll: Duration, aborts: Aborts, pulse: Pulse) {
+        let (reports, name) = (self.reports.clone(), B::DEVICE);
+        let Err(error) = tokio::spawn(self.attends(asks, poll, aborts, pulse)).await else { return };
+        let why = format!("by a fault of the program itself, please report it: {}", words_of(error));
+        let event = Some(Event::StationFailed { device: name, why });
+        let _ = reports.send(StationReport { event, ..StationReport::default() }).await;
+    }
+
     /// Attends until nobody can ask any more, then gives the machine back.
-    pub(super) async fn attend(
-        mut self,
-        mut asks: mpsc::Receiver<Ask>,
-        poll: Duration,
-        mut aborts: Aborts,
-        pulse: Pulse,
-    ) {
+    async fn attends(mut self, mut asks: mpsc::Receiver<Ask>, poll: Duration, mut aborts: Aborts, pulse: Pulse) {
         let mut ticks = interval(poll);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
@@ -378,6 +386,7 @@ impl<B: StationDriver> MachineTask<B> {
     async fn verify_clear(&mut self) {
         match self.driver.machine().status().await {
             Ok(status) => {
+                self.note_mode(&status).await;
                 let device = B::DEVICE;
                 let name = self.driver.machine().name().to_owned();
                 let message = |clear: &str| format!("{name} is {} and {clear}", status.state);
@@ -423,11 +432,12 @@ impl<B: StationDriver> MachineTask<B> {
             let why = "it is not prepared".to_owned();
             return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Start, why }).await;
         };
-        let Seen { supplies_missing, signal_out, signals_good_since, .. } = self.seen;
+        let Seen { supplies_missing, manual, signal_out, signals_good_since, .. } = self.seen;
         self.seen = Seen {
             connected: true,
             running: true,
             supplies_missing,
+            manual,
             signal_out,
             signals_good_since,
             ..Seen::default()
@@ -456,6 +466,8 @@ impl<B: StationDriver> MachineTask<B> {
             // Not in EXECUTE: the status tells whether it holds already, has ended, or never ran.
             Err(error) => match self.driver.machine().status().await {
                 Ok(status) if status.state == State::Held => self.tell(Event::MachineHeld { device: B::DEVICE }).await,
+                // On its way there already, by its key or a button: the next looks see it arrive.
+                Ok(status) if status.state == State::Holding => self.note(&status).await,
                 Ok(status) if status.state == State::Complete => self.note(&status).await,
                 Ok(status) if !status.state.moves() => self.tell(Event::MachineHeld { device: B::DEVICE }).await,
                 // On its way already, by itself or by an earlier order: a look will show when it stands.
@@ -627,7 +639,10 @@ impl<B: StationDriver> MachineTask<B> {
         }
         let reached = async {
             let identity = self.driver.machine().connect().await?;
-            self.driver.machine().claim().await?;
+            // An abort needs no owner, and neither does seeing where it led.
+            if !self.seen.aborting {
+                self.driver.machine().claim().await?;
+            }
             Ok::<_, DeviceError>(identity)
         };
         match reached.await {
@@ -648,6 +663,8 @@ impl<B: StationDriver> MachineTask<B> {
     /// Tells what has changed.
     async fn note(&mut self, status: &Status) {
         let before = self.seen.state.replace(status.state);
+        self.note_mode(status).await;
+        self.note_clear(status).await;
         self.note_supplies(status).await;
         self.note_signals(status).await;
         match status.state {
@@ -676,6 +693,33 @@ impl<B: StationDriver> MachineTask<B> {
                 self.tell(Event::Fault { device, code, message }).await;
             }
             _ => {}
+        }
+    }
+
+    /// Tells when a person takes the machine into his hands, and when he gives it back.
+    async fn note_mode(&mut self, status: &Status) {
+        let Some(manual) = status.automatic.map(|automatic| !automatic) else { return };
+        if std::mem::replace(&mut self.seen.manual, manual) == manual {
+            return;
+        }
+        let device = B::DEVICE;
+        let event = if manual {
+            let message = format!("{} says that it is in manual mode", self.driver.machine().name());
+            Event::NotAutomatic { device, message }
+        } else {
+            Event::AutomaticAgain { device }
+        };
+        self.tell(event).await;
+    }
+
+    /// Tells when a machine without a job leaves its place clear of the part: somebody has moved it there.
+    async fn note_clear(&mut self, status: &Status) {
+        let Some(clear) = status.clear_of_part else { return };
+        let before = self.seen.clear.replace(clear);
+        if before == Some(true) && !clear && !self.seen.running {
+            let message =
+                format!("{} is {} and no longer clear of the part", self.driver.machine().name(), status.state);
+            self.tell(Event::Obstructed { device: B::DEVICE, message }).await;
         }
     }
 

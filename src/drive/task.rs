@@ -70,6 +70,8 @@ pub struct Task {
     pub programs: Result<Programs, PathError>,
     /// Least share of the targets that must be touched.
     pub least_found: f64,
+    /// Least and largest temperature of a measurement that is used, where the recipe has a window.
+    pub temperature_c: Option<[f64; 2]>,
     /// Whether the cell is simulated; everything stored is marked so.
     pub simulation: bool,
 }

@@ -32,7 +32,7 @@ pub(super) fn gate_cycle(
     let unplanned = || Plan { targets: Vec::new(), ..task.plan(0.0, &task.fixture_cmm_from_model) };
     let plan = plan.map_or_else(|| Cow::Owned(unplanned()), Cow::Borrowed);
     let planned = plan.targets.iter().filter(|t| t.what == TargetKind::Part).count() as u32;
-    let (found, usable) = match foreign(task, &plan, measurement) {
+    let (found, usable) = match foreign(task, &plan, measurement).or_else(|| out_of_window(task, measurement)) {
         Some(failure) => (0, Err(failure)),
         None => {
             let [part, sphere] = touched(&plan, planned, measurement);
@@ -135,6 +135,17 @@ fn foreign(task: &Task, plan: &Plan, measurement: &Measurement) -> Option<GateFa
     let touched = |p: &&crate::device::MeasuredPoint| p.status == PointStatus::Touched;
     let wrong = measurement.points.iter().filter(touched).find(|p| !p.at_mm.iter().all(|v| v.is_finite()))?;
     Some(GateFailure::Broken(format!("the coordinates of target {} are not finite numbers", wrong.index)))
+}
+
+/// A temperature outside the recipe's window, or one that is not told where there is a window.
+fn out_of_window(task: &Task, measurement: &Measurement) -> Option<GateFailure> {
+    let [least, most] = task.temperature_c?;
+    let wanted = format!("and {least:.2} to {most:.2} degrees Celsius are wanted (measure.temperature_c)");
+    match measurement.temperature_c {
+        Some(told) if (least..=most).contains(&told) => None,
+        Some(told) => Some(GateFailure::Temperature(format!("it was {told:.2} degrees Celsius, {wanted}"))),
+        None => Some(GateFailure::Temperature(format!("the measurement does not say its temperature, {wanted}"))),
+    }
 }
 
 /// Finds the radius of the probe and its standard uncertainty from the reference sphere: it tells contact points and inches from centres in millimetres.

@@ -133,6 +133,12 @@ fn measure(written: &Measure, document: &mut Document) {
             "raise it, or approach from nearer",
         );
     }
+    if let Some([least, most]) = written.temperature_c
+        && least >= most
+    {
+        let found = format!("is [{least}, {most}]");
+        document.report("measure.temperature_c", found, "the first must be less than the second", "interchange them");
+    }
 }
 
 fn pattern(written: &Measure, folder: &Path, document: &mut Document) -> Option<Pattern> {

@@ -159,6 +159,9 @@ pub struct Measure {
     /// How far the radius found on the reference sphere may be from the probe's.
     #[schemars(range(min = 0.05, max = 1000.0))]
     pub radius_tolerance_um: Um,
+    /// Least and largest temperature, in degrees Celsius, that a measurement may state of itself; one that states none is not used then.
+    #[schemars(inner(range(min = -40.0, max = 120.0)), example = [19.5, 20.5])]
+    pub temperature_c: Option<[f64; 2]>,
 }
 
 /// Where a registration begins.
@@ -410,6 +413,7 @@ impl Default for Measure {
             minimum_coverage: 0.95,
             qualify: true,
             radius_tolerance_um: Um(2.0),
+            temperature_c: None,
         }
     }
 }

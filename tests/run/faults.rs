@@ -49,7 +49,11 @@ fn machines_that_answer_wrongly_are_told_before_anything_is_written() {
     let usual = || Setup::new(RECIPE, 1);
     let (other_order, exchanged) = (Setup { other_word_order: true, ..usual() }, Setup { exchanged: true, ..usual() });
     let order_words = &["word order", "nothing was written", "word_order in the cell file"];
-    let cases: [(&str, Setup, AlarmId, &[&str]); 2] = [
+    let older = &["version 1 of the register map", "lacks a beat that names its owner", "bring it up to version 2"];
+    let newer = &["version 3 of the register map", "this program is the older one"];
+    let cases: [(&str, Setup, AlarmId, &[&str]); 4] = [
+        ("an older map", Setup { version: 1, ..usual() }, AlarmId::WrongDevice, older),
+        ("a newer map", Setup { version: 3, ..usual() }, AlarmId::WrongDevice, newer),
         ("word order", other_order, AlarmId::WordOrder, order_words),
         ("exchanged", exchanged, AlarmId::WrongDevice, &["Another device answers", "address in the cell file"]),
     ];
@@ -120,6 +124,16 @@ fn what_is_wrong_with_a_measurement_is_told_from_it() {
         ],
         1,
     );
+}
+
+#[test]
+fn a_measurement_outside_its_window_of_temperature_is_not_used() {
+    let window = |least: f64, most: f64| Setup { temperature_c: Some([least, most]), ..Setup::new(RECIPE, 1) };
+    let warm = window(19.5, 20.5).with(|world| world.cmm.part_temperature_c = 23.25);
+    let words = &["it was 23.25 degrees Celsius, and 19.50 to 20.50 degrees Celsius are wanted", "Let the part"];
+    caught("a warm part", warm, AlarmId::Temperature, words, 1);
+    let words = &["it was 20.00 degrees Celsius, and 20.50 to 21.00 degrees"];
+    caught("a window above the part", window(20.5, 21.0), AlarmId::Temperature, words, 1);
 }
 
 #[test]

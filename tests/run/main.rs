@@ -16,6 +16,7 @@ mod mirror_cell;
 mod mirror_run;
 mod orders;
 mod outside;
+mod panics;
 #[path = "../common/program.rs"]
 mod program;
 mod replay;
@@ -26,4 +27,5 @@ mod study;
 mod tries;
 mod truth;
 mod two_processes;
+mod watching;
 mod worlds;

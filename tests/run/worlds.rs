@@ -48,13 +48,17 @@ pub struct Setup {
     pub exchanged: bool,
     /// The words of the machines' values stand the other way round than the cell file says.
     pub other_word_order: bool,
+    /// The version of the register map that both machines say they keep.
+    pub version: u16,
+    /// What the recipe says of the temperature of a measurement.
+    pub temperature_c: Option<[f64; 2]>,
 }
 
 impl Setup {
     /// A recipe as it is, with a seed.
     pub fn new(recipe: &'static str, seed: u64) -> Self {
         let world = Box::new(|_: &mut WorldSpec| {});
-        Self { recipe, seed, world, exchanged: false, other_word_order: false }
+        Self { recipe, seed, world, exchanged: false, other_word_order: false, version: 2, temperature_c: None }
     }
 
     /// The same in another world.
@@ -235,7 +239,8 @@ pub fn run(setup: Setup) -> Ran {
 async fn go(setup: Setup) -> Ran {
     let home = tempfile::tempdir().unwrap();
     let folder = home.path().join("run");
-    let recipe = Recipe::read(&root().join(format!("recipes/{}.toml", setup.recipe))).unwrap();
+    let mut recipe = Recipe::read(&root().join(format!("recipes/{}.toml", setup.recipe))).unwrap();
+    recipe.measure.temperature_c = setup.temperature_c;
     let cell = CellConfig::read(&root().join("config/sim.toml")).unwrap();
     let (task, plan) = setup::prepare(&recipe, &cell).unwrap();
     let probe_radius_mm = recipe.measure.probe_radius_mm;
@@ -327,6 +332,7 @@ async fn serve(
         lost_after_ms: 30_000,
         acting: Duration::from_millis(10),
         word_order: if setup.other_word_order { words::WordOrder::Little } else { words::WordOrder::Big },
+        version: setup.version,
         ..MachineOptions::default()
     };
     let (seen, here, kept) = (world.clone(), folder.to_owned(), taken.clone());

@@ -771,6 +771,123 @@ fn a_machine_that_moves_while_the_cell_is_held_is_told_to_hold_and_a_person_is_t
 }
 
 #[test]
+fn a_machine_in_manual_mode_holds_what_moves_and_nothing_is_started_beside_it() {
+    let by_hand = |device| Event::NotAutomatic { device, message: "it is in manual mode".into() };
+    for device in Device::BOTH {
+        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+        run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+        let commands = run.send(by_hand(device));
+        let Some(Command::Raise(alarm)) = commands.first() else { panic!("{commands:?}") };
+        assert_eq!(alarm.id, AlarmId::NotAutomatic);
+        assert!(alarm.what.contains(&format!("{device}, it is in manual mode")), "{}", alarm.what);
+        assert_eq!(alarm.what.contains("while the grinder is at its job"), device == Device::Cmm, "{}", alarm.what);
+        assert_eq!(commands.last(), Some(&Command::HoldMachine { device: Device::Grinder }));
+        run.until(State::Held(Phase::Grind(JobStep::Run)));
+        // Nobody goes on beside it.
+        let commands = run.send(resume());
+        assert!(matches!(&commands[..], [Command::Refuse { why, .. }] if why.contains("manual mode")), "{commands:?}");
+        run.send(Event::AutomaticAgain { device });
+        assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Run)), "the key resumes nothing");
+        run.send(resume());
+        run.until(State::Complete);
+    }
+    // Found before a START: the machine is not even prepared.
+    for (device, at) in
+        [(Device::Cmm, JobStep::Send), (Device::Grinder, JobStep::Prepare), (Device::Cmm, JobStep::Prepare)]
+    {
+        let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+        run.start().until(State::Execute(Phase::Grind(at)));
+        run.send(by_hand(device));
+        run.go_on();
+        assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Send)), "{device} at {at:?}");
+        assert_eq!((run.starts(), run.alarms()), (vec![], vec![AlarmId::NotAutomatic]));
+        run.send(Event::AutomaticAgain { device });
+        run.send(resume());
+        run.until(State::Complete);
+        assert_eq!(run.starts().len(), 2);
+    }
+    // While nothing moves a person may have it.
+    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    run.start().until(State::Execute(Phase::Load));
+    assert_eq!(run.send(by_hand(Device::Cmm)), []);
+    assert_eq!(run.send(Event::AutomaticAgain { device: Device::Cmm }), []);
+    run.until(State::Complete);
+}
+
+#[test]
+fn a_suspended_machine_in_manual_mode_does_not_go_on_by_itself() {
+    let (device, condition) = (Device::Grinder, Condition::Supplies);
+    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    run.send(Event::ConditionLost { device, condition, message: "no air".into() });
+    run.until(State::Suspended(Phase::Grind(JobStep::Run)));
+    run.send(Event::NotAutomatic { device, message: "it is in manual mode".into() });
+    run.send(Event::ConditionBack { device, condition });
+    assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Run)));
+}
+
+#[test]
+fn an_idle_machine_that_is_found_at_a_job_is_held_and_so_is_what_moves() {
+    let (moves, strays) = (Device::Grinder, Device::Cmm);
+    let progress = Event::Progressed { device: strays, done: 3, total: 10 };
+    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    run.start().until(State::Execute(Phase::Grind(JobStep::Run)));
+    let commands = run.send(progress.clone());
+    assert_eq!(run.alarms(), [AlarmId::MovesUnasked]);
+    assert_eq!(commands[1..], [Command::HoldMachine { device: strays }, Command::HoldMachine { device: moves }]);
+    assert_eq!(run.cell.state(), State::Holding(Phase::Grind(JobStep::Run)));
+    assert_eq!(run.send(progress.clone()), [], "told once");
+    assert_eq!(run.send(Event::MachineHeld { device: strays }), []);
+    assert_eq!(run.cell.state(), State::Holding(Phase::Grind(JobStep::Run)), "it is the other one that stands");
+    run.send(Event::MachineHeld { device: moves });
+    assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Run)));
+    // It does not hold: only the safe sequence is left.
+    let why = "local".to_owned();
+    let commands = run.send(Event::Refused { device: strays, what: Asked::Hold, why });
+    assert!(commands.contains(&Command::AbortMachine { device: strays }), "{commands:?}");
+    // Before the START of the other one.
+    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    run.start().until(State::Execute(Phase::Grind(JobStep::Prepare)));
+    run.send(progress);
+    run.go_on();
+    assert_eq!((run.cell.state(), run.starts()), (State::Held(Phase::Grind(JobStep::Send)), vec![]));
+}
+
+#[test]
+fn a_job_without_progress_is_told_and_then_held() {
+    let device = Device::Grinder;
+    let run_state = State::Execute(Phase::Grind(JobStep::Run));
+    let due = |run: &Run<'_>| run.cell.next_deadline().unwrap() - run.now;
+    let mut run = Run::new(plan(), |_| figures(5.0, 0.5));
+    run.start().until(run_state);
+    assert_eq!(due(&run), 30 * S);
+    run.now += 30 * S;
+    let commands = run.send(Event::Deadline);
+    let Some(Command::Raise(alarm)) = commands.first() else { panic!("{commands:?}") };
+    assert_eq!((alarm.id, commands.len()), (AlarmId::ProgressStands, 1));
+    assert!(alarm.what.contains("grinder, for 30 s; after 30 s more it is held"), "{}", alarm.what);
+    assert_eq!((run.cell.state(), due(&run)), (run_state, 30 * S));
+    // It goes on: the alarm goes away by itself.
+    let progressed = |done| Event::Progressed { device, done, total: 1000 };
+    assert_eq!(run.send(progressed(1)), [Command::Withdraw { alarm: AlarmId::ProgressStands }]);
+    // A slow job is not slow again and again: three times its own pace is waited.
+    run.now += 15 * S;
+    run.send(progressed(2));
+    assert!((due(&run).as_secs_f64() - 45.0).abs() < 0.1, "{:?}", due(&run));
+    run.now += 46 * S;
+    assert_eq!(run.send(Event::Deadline).len(), 1);
+    run.now += 15 * S;
+    let commands = run.send(Event::Deadline);
+    assert_eq!(run.alarms()[1..], [AlarmId::ProgressStands, AlarmId::NoAnswer]);
+    assert_eq!(commands.last(), Some(&Command::HoldMachine { device }));
+    // A machine that a person serves gives no signs.
+    let deadlines = Deadlines { progress_notice: [None; 2], ..Deadlines::default() };
+    let mut run = Run::new(CellPlan { deadlines, ..plan() }, |_| figures(5.0, 0.5));
+    run.start().until(run_state);
+    assert_eq!(due(&run), 60 * S);
+}
+
+#[test]
 fn a_command_that_has_waited_is_given_only_where_it_is_still_wanted() {
     let device = Device::Grinder;
     let start = Command::StartMachine { device, cycle: 1 };

@@ -1,0 +1,115 @@
+//! A driver that panics: told as what it is, and the run comes to its end without that machine.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use crate::rig::{CMM, GRINDER, PATIENCE, Rig, event, order, small, until};
+use regrind::cell::{AlarmId, Ending};
+use regrind::device::{
+    Armed, CorrectionMap, DeviceError, Grinder, Identity, Interrupt, Job, Machine, ModbusGrinder, Pass, PassRecord,
+    Reconciled, Started, Status,
+};
+use regrind::drive::{Drive, Notice, Request};
+use regrind_sim::command::State;
+
+/// A grinder whose driver has a fault.
+struct Brittle {
+    grinder: ModbusGrinder,
+    breaks: Arc<AtomicBool>,
+}
+
+impl Machine for Brittle {
+    fn name(&self) -> &str {
+        self.grinder.name()
+    }
+    async fn connect(&mut self) -> Result<Identity, DeviceError> {
+        self.grinder.connect().await
+    }
+    async fn status(&mut self) -> Result<Status, DeviceError> {
+        assert!(!self.breaks.load(Ordering::Acquire), "an index that was out of bounds");
+        self.grinder.status().await
+    }
+    async fn claim(&mut self) -> Result<Status, DeviceError> {
+        self.grinder.claim().await
+    }
+    async fn prepare(&mut self, job: Job) -> Result<Armed, DeviceError> {
+        self.grinder.prepare(job).await
+    }
+    async fn start(&mut self, armed: Armed) -> Result<Started, DeviceError> {
+        self.grinder.start(armed).await
+    }
+    async fn hold(&mut self) -> Result<Status, DeviceError> {
+        self.grinder.hold().await
+    }
+    async fn resume(&mut self) -> Result<Status, DeviceError> {
+        self.grinder.resume().await
+    }
+    async fn stop(&mut self) -> Result<Status, DeviceError> {
+        self.grinder.stop().await
+    }
+    async fn abort(&mut self) -> Result<Status, DeviceError> {
+        self.grinder.abort().await
+    }
+    async fn clear(&mut self) -> Result<Status, DeviceError> {
+        self.grinder.clear().await
+    }
+    async fn acknowledge(&mut self, done: u32) -> Result<Status, DeviceError> {
+        self.grinder.acknowledge(done).await
+    }
+    async fn release(&mut self) -> Result<Status, DeviceError> {
+        self.grinder.release().await
+    }
+    async fn reconcile(&mut self, intended: &Armed) -> Result<Reconciled, DeviceError> {
+        self.grinder.reconcile(intended).await
+    }
+}
+
+impl Grinder for Brittle {
+    async fn load_pass(&mut self, map: &CorrectionMap, pass: &Pass, interrupt: &Interrupt) -> Result<(), DeviceError> {
+        self.grinder.load_pass(map, pass, interrupt).await
+    }
+    async fn collect(&mut self, job: Job, interrupt: &Interrupt) -> Result<PassRecord, DeviceError> {
+        self.grinder.collect(job, interrupt).await
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_driver_that_panics_is_told_as_a_fault_of_the_program_and_its_machine_holds_itself() {
+    let mut rig = Rig::new(small(20, 10, 1.0)).await;
+    let ready = rig.next(true);
+    let (folder, mut notices) = (ready.folder, ready.notices);
+    let breaks = Arc::new(AtomicBool::new(false));
+    let grinder = Brittle { grinder: ready.grinder, breaks: Arc::clone(&breaks) };
+    let (drive, _orders) = Drive::new(ready.run, ready.cmm, grinder).unwrap();
+    let running = tokio::spawn(drive.run());
+    event(&mut notices, "started", 1).await;
+    breaks.store(true, Ordering::Release);
+    let told = async {
+        loop {
+            match notices.recv().await.expect("the run goes on") {
+                Notice::Alarm(alarm) => return alarm,
+                Notice::Finished { ending, .. } => panic!("over: {ending:?}"),
+                _ => {}
+            }
+        }
+    };
+    let alarm = tokio::time::timeout(PATIENCE, told).await.expect("it is told");
+    assert_eq!(alarm.id, AlarmId::ProgramFailed, "{alarm:?}");
+    assert!(alarm.what.contains("grinder, by a fault of the program itself"), "{}", alarm.what);
+    assert!(alarm.what.contains("an index that was out of bounds"), "{}", alarm.what);
+    let said = until(&folder, |words| words.starts_with("Held")).await;
+    assert!(said.contains("the grinder has not confirmed that it stands"), "{said}");
+    // Nobody beats for it any more.
+    let held = async {
+        while rig.servings[GRINDER].machines()[0].1.with(|machine| machine.state()) != State::Held {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    };
+    tokio::time::timeout(PATIENCE, held).await.expect("the machine holds itself");
+    let (reply, asked, _) = order(&folder, Request::Abort { reason: "no way on".into() }).await;
+    assert!(reply.accepted, "{reply:?}");
+    let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
+    assert!(matches!(ending, Ending::Aborted { confirmed: false, .. }), "{ending:?}");
+    assert!(rig.command_at(CMM, 7, asked).is_some(), "the other machine hears the abort");
+}

@@ -1,0 +1,137 @@
+//! The machine that is not at its job is watched too: keys that are turned, jobs that nobody ordered, an older contract.
+
+use std::time::{Duration, Instant};
+
+use crate::rig::{CMM, GRINDER, PATIENCE, Ready, Rig, event, order, small, until};
+use regrind::cell::{Alarm, AlarmId, Ending};
+use regrind::drive::{Drive, Notice, Request};
+use regrind_sim::command::{Mode, State, interlock};
+use tokio::sync::mpsc::UnboundedReceiver;
+use tokio::task::JoinHandle;
+
+const HOLD: u16 = 4;
+const RESUME: u16 = 5;
+
+/// A run whose grinder has been started, slowly enough to be there for the whole test.
+async fn grinding(rig: &mut Rig) -> (Watched, JoinHandle<Ending>) {
+    let Ready { run, cmm, grinder, mut notices, folder } = rig.next(true);
+    let (drive, orders) = Drive::new(run, cmm, grinder).unwrap();
+    let running = tokio::spawn(drive.run());
+    event(&mut notices, "started", 1).await;
+    (Watched { notices, folder, _orders: orders }, running)
+}
+
+/// What a test keeps of a run that goes on.
+struct Watched {
+    notices: UnboundedReceiver<Notice>,
+    folder: std::path::PathBuf,
+    _orders: regrind::drive::Orders,
+}
+
+impl Watched {
+    async fn alarm(&mut self) -> Alarm {
+        let told = async {
+            loop {
+                match self.notices.recv().await.expect("the run goes on") {
+                    Notice::Alarm(alarm) => return alarm,
+                    Notice::Finished { ending, .. } => panic!("over: {ending:?}"),
+                    _ => {}
+                }
+            }
+        };
+        tokio::time::timeout(PATIENCE, told).await.expect("an alarm")
+    }
+
+    /// Resumes as often as it takes until that is accepted; returns the first answer.
+    async fn resume(&self) -> String {
+        let began = Instant::now();
+        let mut first = None;
+        loop {
+            let (reply, ..) = order(&self.folder, Request::Resume { reason: String::new(), seen: None }).await;
+            let said = first.get_or_insert(reply.message).clone();
+            if reply.accepted {
+                return said;
+            }
+            assert!(began.elapsed() < PATIENCE, "{said}");
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    }
+
+    async fn abort(self, running: JoinHandle<Ending>) {
+        order(&self.folder, Request::Abort { reason: "enough".into() }).await;
+        let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
+        assert!(matches!(ending, Ending::Aborted { confirmed: true, .. }), "{ending:?}");
+    }
+}
+
+fn turn(rig: &Rig, machine: usize, mode: Mode) {
+    rig.servings[machine].machines()[0].1.with(|machine| machine.set_mode(mode));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_key_of_the_idle_machine_holds_the_one_that_moves() {
+    let mut rig = Rig::new(small(20, 10, 1.0)).await;
+    let (mut run, running) = grinding(&mut rig).await;
+    let turned = Instant::now();
+    turn(&rig, CMM, Mode::Manual);
+    let alarm = run.alarm().await;
+    assert_eq!(alarm.id, AlarmId::NotAutomatic);
+    assert!(alarm.what.contains("says that it is in manual mode, while the grinder is at its job"), "{}", alarm.what);
+    until(&run.folder, |words| words.starts_with("Held (Grind, Run)")).await;
+    assert!(rig.command_at(GRINDER, HOLD, turned).is_some());
+    let (reply, ..) = order(&run.folder, Request::Resume { reason: String::new(), seen: None }).await;
+    assert!(!reply.accepted && reply.message.contains("the CMM is in manual mode"), "{reply:?}");
+    turn(&rig, CMM, Mode::Automatic);
+    run.resume().await;
+    until(&run.folder, |words| words.starts_with("Execute (Grind, Run)")).await;
+    assert!(rig.command_at(GRINDER, RESUME, turned).is_some());
+    run.abort(running).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_key_of_the_machine_that_moves_holds_it_and_aborts_nothing() {
+    let mut rig = Rig::new(small(20, 10, 1.0)).await;
+    let (mut run, running) = grinding(&mut rig).await;
+    let turned = Instant::now();
+    turn(&rig, GRINDER, Mode::Manual);
+    let alarm = run.alarm().await;
+    assert!(alarm.id == AlarmId::NotAutomatic && alarm.what.contains("grinder"), "{alarm:?}");
+    until(&run.folder, |words| words.starts_with("Held (Grind, Run)")).await;
+    turn(&rig, GRINDER, Mode::Automatic);
+    run.resume().await;
+    until(&run.folder, |words| words.starts_with("Execute (Grind, Run)")).await;
+    assert!(rig.command_at(GRINDER, 7, turned).is_none() && rig.command_at(CMM, 7, turned).is_none());
+    run.abort(running).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_machine_that_leaves_its_place_holds_the_one_that_moves() {
+    let mut rig = Rig::new(small(20, 10, 1.0)).await;
+    let (mut run, running) = grinding(&mut rig).await;
+    let moved = Instant::now();
+    rig.servings[CMM].machines()[0].1.with(|machine| machine.open_interlocks(interlock::CLEAR));
+    let alarm = run.alarm().await;
+    assert_eq!(alarm.id, AlarmId::NotClear);
+    assert!(alarm.what.contains("CMM") && alarm.what.contains("while the grinder moves"), "{}", alarm.what);
+    until(&run.folder, |words| words.starts_with("Held (Grind, Run)")).await;
+    assert!(rig.command_at(GRINDER, HOLD, moved).is_some());
+    rig.servings[CMM].machines()[0].1.with(|machine| machine.open_interlocks(0));
+    run.abort(running).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_machine_in_manual_mode_is_not_prepared() {
+    let mut rig = Rig::new(small(20, 10, 1.0)).await;
+    turn(&rig, CMM, Mode::Manual);
+    let Ready { run, cmm, grinder, notices, folder } = rig.next(true);
+    let began = Instant::now();
+    let (drive, orders) = Drive::new(run, cmm, grinder).unwrap();
+    let running = tokio::spawn(drive.run());
+    let mut run = Watched { notices, folder, _orders: orders };
+    let alarm = run.alarm().await;
+    assert!(alarm.id == AlarmId::NotAutomatic && alarm.what.contains("CMM"), "{alarm:?}");
+    until(&run.folder, |words| words.starts_with("Held (Grind, Send)")).await;
+    assert!(rig.command_at(GRINDER, 2, began).is_none(), "nothing was prepared");
+    assert_eq!(rig.servings[GRINDER].machines()[0].1.with(|machine| machine.state()), State::Idle);
+    run.abort(running).await;
+}
