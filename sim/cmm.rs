@@ -117,6 +117,14 @@ impl Run {
         self.not_found = draw(Source::NotFound);
     }
 
+    /// Returns how long so many targets take, those at the beginning slower than the others where the plan says so.
+    fn takes_s(&self, targets: usize, each_s: f64) -> f64 {
+        let (careful, speed_mm_s) = self.plan.careful;
+        let slowly = targets.min(careful as usize);
+        let slower = if slowly == 0 { 1.0 } else { self.plan.speed_mm_s / speed_mm_s };
+        each_s * ((targets - slowly) as f64 + slower * slowly as f64)
+    }
+
     fn finished(&self) -> bool {
         self.records.len() == self.plan.targets.len()
     }
@@ -272,7 +280,7 @@ impl Body for Cmm {
         }
         state.engaged = Some(Kind::Cmm);
         let (each_s, most) = (state.spec.cmm.seconds_per_point, state.spec.cmm.unexpected_touches_most);
-        while run.fault == 0 && !run.finished() && (run.records.len() + 1) as f64 * each_s <= run.elapsed_s {
+        while run.fault == 0 && !run.finished() && run.takes_s(run.records.len() + 1, each_s) <= run.elapsed_s {
             let target = run.plan.targets[run.records.len()];
             let record = run.measure(&state, &target);
             run.records.push(record);
@@ -296,7 +304,7 @@ impl Body for Cmm {
         let Some(mut run) = self.running.take() else { return nothing_done(state.spec.cmm.part_temperature_c) };
         state.release(Kind::Cmm);
         let (spec, faults) = (&state.spec.cmm, &state.spec.faults);
-        let duration_s = run.elapsed_s.min(run.plan.targets.len() as f64 * spec.seconds_per_point);
+        let duration_s = run.elapsed_s.min(run.takes_s(run.plan.targets.len(), spec.seconds_per_point));
         let rest = run.plan.targets[run.records.len()..].iter();
         run.records.extend(rest.map(|target| untouched(target, Status::NotReached)));
         let kept = run.records.len().saturating_sub(faults.missing_records as usize);

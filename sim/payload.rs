@@ -58,6 +58,8 @@ pub struct Plan {
     pub speed_mm_s: f64,
     /// Height over the highest target at which the probe travels, in millimetres.
     pub safe_height_mm: f64,
+    /// So many of the first targets are touched with care, at a speed of their own in millimetres per second; 0 for none.
+    pub careful: (u32, f64),
     /// The targets in the order in which they are touched.
     pub targets: Vec<Target>,
 }
@@ -249,14 +251,20 @@ impl Plan {
         }
         let [probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm] =
             reader.vector("header of the plan")?;
-        reader.zeros::<16>("safe height")?;
+        let careful = reader.u32()?;
+        reader.zeros::<4>("number of careful targets")?;
+        let [careful_mm_s] = reader.vector("header of the plan")?;
         within("probe radius in mm", probe_radius_mm, 0.01, 100.0)?;
         within("approach in mm", approach_mm, 0.0, 100.0)?;
         within("search in mm", search_mm, 0.0, 100.0)?;
         within("speed in mm/s", speed_mm_s, 1e-3, 1000.0)?;
         within("safe height in mm", safe_height_mm, 0.0, 1000.0)?;
+        within("number of careful targets", careful.into(), 0.0, count.into())?;
+        let slowest = if careful == 0 { 0.0 } else { 1e-4 };
+        within("careful speed in mm/s", careful_mm_s, slowest, if careful == 0 { 0.0 } else { speed_mm_s })?;
+        let careful = (careful, careful_mm_s);
         let targets = (0..count).map(|_| Target::decode(&mut reader)).collect::<Result<_, _>>()?;
-        Ok(Self { probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, targets })
+        Ok(Self { probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful, targets })
     }
 
     /// Writes a plan.
@@ -265,7 +273,9 @@ impl Plan {
         bytes.extend((self.targets.len() as u32).to_be_bytes());
         let header = [self.probe_radius_mm, self.approach_mm, self.search_mm, self.speed_mm_s, self.safe_height_mm];
         push(&mut bytes, &header);
-        bytes.extend([0; 16]);
+        bytes.extend(self.careful.0.to_be_bytes());
+        bytes.extend([0; 4]);
+        push(&mut bytes, &[self.careful.1]);
         for target in &self.targets {
             bytes.extend(target.index.to_be_bytes());
             bytes.extend((target.feature as u16).to_be_bytes());

@@ -140,7 +140,7 @@ fn turn_fields(bytes: &mut [u8], fields: &[isize]) {
 /// Lengths in bytes of the values of a payload's header and of its records; a negative length is raw bytes.
 fn fields(kind: u16, format: u16) -> (&'static [isize], &'static [isize]) {
     match (kind, format) {
-        (1, _) => (&[2, 2, 4, 8, 8, 8, 8, 8, -16], &[4, 2, 2, 8, 8, 8, 8, 8, 8]),
+        (1, _) => (&[2, 2, 4, 8, 8, 8, 8, 8, 4, -4, 8], &[4, 2, 2, 8, 8, 8, 8, 8, 8]),
         (2, _) => (&[2, 2, 4, 4, 4, 8, 8, 8, 8, 8, -8, -32], &[8]),
         (3, _) => (&[2, 2, 4, 8, 8, 8, 8, 8, 8, 8, 8, 8, -16, -32], &[]),
         (4, 2) => (&[], &[4, 2, 2, 4, 4, 4]),

@@ -203,6 +203,7 @@ fn version_in_words(found: u16, required: u16) -> String {
         "a CLAIM with a higher number that makes it refuse a late START",
         "an ABORT that it takes from anyone, whatever its number",
         "a `done` that outlives CLEAR and names the START that ended",
+        "a plan that begins slowly where the part may lie elsewhere",
     ];
     format!(
         "the machine's program lacks {}; bring it up to version {required} (docs/modbus.md, \"What version 2 changed\")",

@@ -42,7 +42,8 @@ pub use modbus::{
     Signal, SignalTable, SignalType, TcpWire, WordOrder,
 };
 pub use payload::{
-    CorrectionMap, Identified, MeasuredPoint, Measurement, Pass, PassRecord, Plan, PointStatus, Target, TargetKind,
+    Careful, CorrectionMap, Identified, MeasuredPoint, Measurement, Pass, PassRecord, Plan, PointStatus, Target,
+    TargetKind,
 };
 pub use place::Place;
 pub use regrind_formats::result::Coordinates;

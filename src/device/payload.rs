@@ -47,6 +47,17 @@ pub struct Plan {
     pub speed_mm_s: f64,
     /// How far above the highest target, along z of the CMM, the probe travels.
     pub safe_height_mm: f64,
+    /// How the plan begins where the part may lie elsewhere than it should; none where it lies as it was found before.
+    pub careful: Option<Careful>,
+}
+
+/// A careful beginning of a plan: few targets, and slowly.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Careful {
+    /// So many of the first targets are touched slowly.
+    pub targets: u32,
+    /// The probing speed for them, and that of every way to them and between them.
+    pub speed_mm_s: f64,
 }
 
 /// A correction map: by how much the ground surface is wanted displaced along the outward normal of the nominal surface. Positive leaves

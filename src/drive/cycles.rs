@@ -33,7 +33,8 @@ impl Cycles {
         let last = self.0.range(..number).next_back().map(|(_, cycle)| cycle);
         let judged = last.filter(|cycle| cycle.is_judged()).and_then(|cycle| cycle.registration.as_ref());
         let pose = judged.map_or(task.fixture_cmm_from_model, |found| found.cmm_from_model);
-        let plan = Arc::new(task.plan(correction.level_mm, &pose));
+        let seated_anew = last.is_some_and(|cycle| cycle.plan.is_some() && !cycle.is_judged());
+        let plan = Arc::new(task.plan(correction.level_mm, &pose, seated_anew));
         let cycle = self.0.entry(number).or_insert_with(|| Cycle::new((*correction).clone()));
         cycle.plan = Some(Arc::clone(&plan));
         plan

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use crate::cell::Figures;
 use crate::compensation::path::{PathError, Summary, ToolPath};
 use crate::compensation::{Correction, CorrectionLimits, ErrorMap, GainRule, LearningState, MapOptions, NextPassError};
-use crate::device::{Coordinates, CorrectionMap, Identified, Pass, Plan, Target, TargetKind};
+use crate::device::{Careful, Coordinates, CorrectionMap, Identified, Pass, Plan, Target, TargetKind};
 use crate::formats::gcode::GcodeError;
 use crate::formats::{CorrectionIdentities, FormatError, Learned, ResultFolder, write_correction};
 use crate::geometry::{Grid, Point, Pose, Sample};
@@ -295,21 +295,30 @@ impl Task {
     }
 
     /// Lays the plan: the reference sphere first, then the part where it was found last, at the level it was ground to.
-    pub(super) fn plan(&self, level_mm: f64, cmm_from_model: &Pose) -> Plan {
+    ///
+    /// Where the part may have been seated anew, a few targets as far apart as the part has them come first, and slowly: what lies
+    /// otherwise than expected is met at them.
+    pub fn plan(&self, level_mm: f64, cmm_from_model: &Pose, seated_anew: bool) -> Plan {
         let sphere = self.sphere.iter().flat_map(|s| sphere_targets(s.centre, s.radius_mm, s.points));
         let sphere = sphere.map(|t| (TargetKind::ReferenceSphere, t.point, t.normal));
-        let part = self.targets.iter().map(|t| {
+        let first = if seated_anew { spread(&self.targets, CAREFUL_TARGETS) } else { Vec::new() };
+        let on_part = |t: &measuring::Target| {
             let point = cmm_from_model.point(&(t.point + level_mm * t.normal));
             (TargetKind::Part, point, cmm_from_model.direction(&t.normal))
-        });
-        let targets = sphere.chain(part).enumerate().map(|(index, (what, point, normal))| Target {
+        };
+        let begin = first.iter().map(|k| on_part(&self.targets[*k]));
+        let rest = self.targets.iter().enumerate().filter(|(k, _)| !first.contains(k)).map(|(_, t)| on_part(t));
+        let targets = begin.chain(sphere).chain(rest).enumerate().map(|(index, (what, point, normal))| Target {
             index: index as u32,
             what,
             point_mm: point.into(),
             normal: normal.into(),
         });
         let Probing { probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm } = self.probing;
-        Plan { targets: targets.collect(), probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm }
+        let targets: Vec<_> = targets.collect();
+        let slowly = Careful { targets: first.len() as u32, speed_mm_s: CAREFUL_SHARE * speed_mm_s };
+        let careful = (!first.is_empty()).then_some(slowly);
+        Plan { targets, probe_radius_mm, approach_mm, search_mm, speed_mm_s, safe_height_mm, careful }
     }
 
     /// Writes the correction of a pass beside the one that it replaces.
@@ -340,6 +349,26 @@ impl Task {
             Err(error) => Err(error.clone().into()),
         }
     }
+}
+
+/// With so many targets a plan begins where the part may have been seated anew.
+const CAREFUL_TARGETS: usize = 9;
+/// At this share of the recipe's speed.
+const CAREFUL_SHARE: f64 = 0.2;
+
+/// Returns so many targets that lie as far apart as they can: each is the one farthest from those before it.
+fn spread(targets: &[measuring::Target], most: usize) -> Vec<usize> {
+    let mut chosen: Vec<usize> = Vec::new();
+    let mut apart_mm = vec![f64::INFINITY; targets.len()];
+    while chosen.len() < most.min(targets.len()) {
+        let next = (0..targets.len()).max_by(|a, b| apart_mm[*a].total_cmp(&apart_mm[*b]).then(b.cmp(a)));
+        let Some(next) = next else { break };
+        chosen.push(next);
+        for (apart, target) in apart_mm.iter_mut().zip(targets) {
+            *apart = apart.min((target.point - targets[next].point).norm());
+        }
+    }
+    chosen
 }
 
 /// The points that took part in a registration.

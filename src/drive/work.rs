@@ -29,7 +29,7 @@ pub(super) fn gate_cycle(
     plan: Option<&Plan>,
     measurement: &Measurement,
 ) -> (Event, Product) {
-    let unplanned = || Plan { targets: Vec::new(), ..task.plan(0.0, &task.fixture_cmm_from_model) };
+    let unplanned = || Plan { targets: Vec::new(), ..task.plan(0.0, &task.fixture_cmm_from_model, false) };
     let plan = plan.map_or_else(|| Cow::Owned(unplanned()), Cow::Borrowed);
     let planned = plan.targets.iter().filter(|t| t.what == TargetKind::Part).count() as u32;
     let (found, usable) = match foreign(task, &plan, measurement).or_else(|| out_of_window(task, measurement)) {

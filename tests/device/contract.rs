@@ -131,6 +131,7 @@ fn plan() -> Plan {
         search_mm: 0.5,
         speed_mm_s: 4.0,
         safe_height_mm: 8.0,
+        careful: None,
     }
 }
 

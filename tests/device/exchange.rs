@@ -80,6 +80,7 @@ fn plan(count: u32) -> Plan {
         search_mm: 1.0,
         speed_mm_s: 5.0,
         safe_height_mm: 50.0,
+        careful: None,
     }
 }
 

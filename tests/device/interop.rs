@@ -125,6 +125,7 @@ fn plan() -> Plan {
         search_mm: 1.0,
         speed_mm_s: 2.0,
         safe_height_mm: 20.0,
+        careful: None,
     }
 }
 

@@ -78,6 +78,7 @@ fn plan(points: u32) -> Plan {
         search_mm: 1.0,
         speed_mm_s: 2.0,
         safe_height_mm: 20.0,
+        careful: None,
     }
 }
 

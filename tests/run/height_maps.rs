@@ -383,6 +383,7 @@ fn exchanged(map: &Path, content: Content) -> (Option<Measurement>, Vec<String>)
         search_mm: 0.0,
         speed_mm_s: 0.0,
         safe_height_mm: 0.0,
+        careful: None,
     };
     let plan_identity = plan.identity();
     let job = Job { job: 1, cycle: 0, digest: digest(&[plan_identity]) };

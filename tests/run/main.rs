@@ -2,6 +2,7 @@
 
 mod audit;
 mod bad_cells;
+mod careful;
 mod convergence;
 mod cycles;
 #[path = "../common/data.rs"]

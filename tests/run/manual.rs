@@ -106,7 +106,15 @@ impl Person {
         };
         let (approach_mm, search_mm, speed_mm_s, safe_height_mm) = (2.0, 2.0, 5.0, 50.0);
         let targets = rows(plan).into_iter().map(target).collect();
-        let plan = Plan { probe_radius_mm: RADIUS_MM, approach_mm, search_mm, speed_mm_s, safe_height_mm, targets };
+        let plan = Plan {
+            probe_radius_mm: RADIUS_MM,
+            approach_mm,
+            search_mm,
+            speed_mm_s,
+            safe_height_mm,
+            targets,
+            careful: (0, 0.0),
+        };
         let points = touch(&self.world, 1, &plan);
         let touched = points.iter().zip(&plan.targets).filter(|(point, _)| point.status == Status::Touched);
         let row = |(p, t): (&PointRecord, &Target)| {

@@ -40,6 +40,7 @@ fn plan(radius_mm: f64) -> MeasureOrder {
         search_mm: 0.0,
         speed_mm_s: 0.0,
         safe_height_mm: 0.0,
+        careful: None,
     };
     let plan_identity = plan.identity();
     MeasureOrder { plan, plan_identity }

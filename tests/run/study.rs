@@ -185,6 +185,7 @@ impl<'a> Line<'a> {
             search_mm: task.probing.search_mm,
             speed_mm_s: task.probing.speed_mm_s,
             safe_height_mm: task.probing.safe_height_mm,
+            careful: (0, 0.0),
             targets: self.bench.plan_of.iter().enumerate().map(target).collect(),
         };
         let records = touch(self.worlds[0], self.job, &plan);

@@ -96,6 +96,7 @@ pub fn plan(world: &World, places_mm: &[[f64; 2]]) -> Plan {
         search_mm: 4.0,
         speed_mm_s: 3.0,
         safe_height_mm: 20.0,
+        careful: (0, 0.0),
         targets: places_mm.iter().enumerate().map(target).collect(),
     }
 }

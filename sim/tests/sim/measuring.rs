@@ -297,3 +297,13 @@ fn a_table_that_cannot_be_is_refused_with_its_key() {
     assert_eq!(bad(&|s| s.cmm.not_found_share = 1.1), "cmm.not_found_share");
     assert_eq!(bad(&|s| s.cmm.seconds_per_point = 0.0), "cmm.seconds_per_point");
 }
+
+#[test]
+fn the_careful_beginning_of_a_plan_is_slow_and_the_rest_is_not() {
+    let world = World::new(small_perfect()).unwrap();
+    let places: Vec<[f64; 2]> = (0..20).map(|k| [0.1 * f64::from(k) - 1.0, 0.0]).collect();
+    let plan = plan(&world, &places);
+    let took = |plan: &Plan| measure(&mut world.cmm(), plan).0.duration_s;
+    let (usual, careful) = (took(&plan), took(&Plan { careful: (5, 0.2 * plan.speed_mm_s), ..plan.clone() }));
+    assert!((careful / usual - (15.0 + 5.0 * 5.0) / 20.0).abs() < 1e-9, "{usual} s, and {careful} s with care");
+}

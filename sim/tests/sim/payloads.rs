@@ -23,6 +23,7 @@ fn plan() -> (Plan, Vec<u8>) {
         search_mm: 1.0,
         speed_mm_s: 2.0,
         safe_height_mm: 0.0,
+        careful: (0, 0.0),
         targets: vec![target],
     };
     let mut bytes = vec![0, 1, 0, 0, 0, 0, 0, 1];
@@ -148,7 +149,7 @@ fn a_payload_cut_anywhere_is_refused() {
 fn a_wrong_plan_is_refused_for_its_reason() {
     let bytes = plan().1;
     let nan = f64::NAN.to_be_bytes();
-    let cases: [(usize, &[u8], u16, &str); 14] = [
+    let cases: [(usize, &[u8], u16, &str); 16] = [
         (0, &[0, 2], 8, "format is 2"),
         (2, &[0, 1], 8, "reserved"),
         (4, &[0, 0, 0, 2], 8, "2 records make 176"),
@@ -157,7 +158,9 @@ fn a_wrong_plan_is_refused_for_its_reason() {
         (8, &ZERO, 10, "probe radius"),
         (16, &MINUS_TWO, 10, "approach"),
         (32, &f64::INFINITY.to_be_bytes(), 8, "not finite"),
-        (48, &[1], 8, "reserved"),
+        (48, &[0, 0, 0, 2], 10, "number of careful targets"),
+        (52, &[1], 8, "reserved"),
+        (56, &ONE, 10, "careful speed"),
         (68, &[0, 3], 8, "is on 3"),
         (70, &[0, 1], 8, "reserved"),
         (72, &nan, 8, "point"),

@@ -517,5 +517,8 @@ fn plan_json(ticket: &Ticket, order: &MeasureOrder, settings: &CmmExchange, expe
         "units": "mm", "frame": "measuring machine", "targets": plan.targets.len(), "probe_radius_mm": plan.probe_radius_mm,
         "approach_mm": plan.approach_mm, "search_mm": plan.search_mm, "speed_mm_s": plan.speed_mm_s,
         "safe_height_mm": plan.safe_height_mm, "expected_back": expects,
+        // After a measurement that could not be used: the part may lie elsewhere than it should.
+        "careful_targets": plan.careful.map_or(0, |careful| careful.targets),
+        "careful_speed_mm_s": plan.careful.map(|careful| careful.speed_mm_s),
     }))
 }

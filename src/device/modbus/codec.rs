@@ -6,7 +6,7 @@
 use sha2::{Digest, Sha256};
 
 use super::settings::WordOrder;
-use crate::{Command, CorrectionMap, Identified, Job, MeasuredPoint, Outcome, Pass, Plan, PointStatus};
+use crate::{Careful, Command, CorrectionMap, Identified, Job, MeasuredPoint, Outcome, Pass, Plan, PointStatus};
 use regrind_core::geometry::Grid;
 
 impl WordOrder {
@@ -214,7 +214,10 @@ impl Payload for Plan {
         let mut plan = Writer::new(order);
         plan.u16(1).u16(0).u32(self.targets.len() as u32);
         plan.f64s(&[self.probe_radius_mm, self.approach_mm, self.search_mm, self.speed_mm_s, self.safe_height_mm]);
-        plan.zeros(8);
+        match self.careful {
+            Some(Careful { targets, speed_mm_s }) => plan.u32(targets).zeros(2).f64(speed_mm_s),
+            None => plan.zeros(8),
+        };
         for target in &self.targets {
             plan.u32(target.index).u16(target.what as u16).u16(0).f64s(&target.point_mm).f64s(&target.normal);
         }
@@ -232,19 +235,36 @@ impl Payload for Plan {
             ("search_mm", self.search_mm),
             ("speed_mm_s", self.speed_mm_s),
         ];
-        not_positive(header).or_else(|| not_finite([("safe_height_mm", self.safe_height_mm)])).or_else(|| {
-            self.targets.iter().find_map(|target| {
-                let numbers = target.point_mm.iter().chain(&target.normal);
-                let length = target.normal.iter().map(|n| n * n).sum::<f64>().sqrt();
-                match numbers.copied().find(|value| !value.is_finite()) {
-                    Some(value) => Some((format!("a coordinate of target {}", target.index), value, "a finite number")),
-                    None if (length - 1.0).abs() > 1e-6 => {
-                        Some((format!("the length of the normal of target {}", target.index), length, "1 within 1e-6"))
+        let careful = self.careful.and_then(|careful| careful.flaw(count, self.speed_mm_s));
+        not_positive(header).or(careful).or_else(|| not_finite([("safe_height_mm", self.safe_height_mm)])).or_else(
+            || {
+                self.targets.iter().find_map(|target| {
+                    let numbers = target.point_mm.iter().chain(&target.normal);
+                    let length = target.normal.iter().map(|n| n * n).sum::<f64>().sqrt();
+                    match numbers.copied().find(|value| !value.is_finite()) {
+                        Some(value) => {
+                            Some((format!("a coordinate of target {}", target.index), value, "a finite number"))
+                        }
+                        None if (length - 1.0).abs() > 1e-6 => Some((
+                            format!("the length of the normal of target {}", target.index),
+                            length,
+                            "1 within 1e-6",
+                        )),
+                        None => None,
                     }
-                    None => None,
-                }
-            })
-        })
+                })
+            },
+        )
+    }
+}
+
+impl Careful {
+    fn flaw(self, targets: usize, speed_mm_s: f64) -> Option<(String, f64, &'static str)> {
+        if self.targets == 0 || self.targets as usize > targets {
+            return Some(("the number of careful targets".into(), self.targets.into(), "1 to all of them"));
+        }
+        let slower = self.speed_mm_s > 0.0 && self.speed_mm_s <= speed_mm_s;
+        (!slower).then(|| ("careful_speed_mm_s".into(), self.speed_mm_s, "above 0, and not above speed_mm_s"))
     }
 }
 
@@ -455,6 +475,7 @@ mod tests {
             search_mm: 0.5,
             speed_mm_s: 4.0,
             safe_height_mm: 8.0,
+            careful: None,
         }
     }
 
@@ -465,6 +486,14 @@ mod tests {
         assert_eq!(words[..4], [1, 0, 0, 1]);
         assert_eq!(words[4..8], [0x4000, 0, 0, 0]); // 2.0 at byte 8
         assert_eq!(words[20..24], [0x4020, 0, 0, 0]); // 8.0 at byte 40
+        assert_eq!(words[24..32], [0; 8]);
+        let careful = Plan { careful: Some(Careful { targets: 1, speed_mm_s: 2.0 }), ..plan() };
+        assert_eq!(careful.words(WordOrder::Big)[24..32], [0, 1, 0, 0, 0x4000, 0, 0, 0]); // at byte 48 and 56
+        assert_eq!(careful.words(WordOrder::Little)[24..32], [1, 0, 0, 0, 0, 0, 0, 0x4000]);
+        for (targets, speed_mm_s) in [(0, 2.0), (2, 2.0), (1, 0.0), (1, 4.5), (1, f64::NAN)] {
+            let flawed = Plan { careful: Some(Careful { targets, speed_mm_s }), ..plan() };
+            assert!(flawed.flaw().is_some(), "{targets} {speed_mm_s}");
+        }
         assert_eq!(words[32..36], [0, 9, 2, 0]); // the target at byte 64
         assert_eq!(words[40..44], [0xc000, 0, 0, 0]); // y = -2 at byte 64 + 16
         assert_eq!(words[56..60], [0x3ff0, 0, 0, 0]); // nz = 1 at byte 64 + 48

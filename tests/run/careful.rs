@@ -1,0 +1,153 @@
+//! After a measurement that a gate refused the part may have been seated anew: the next plan begins with few targets, and slowly.
+
+use std::collections::BTreeSet;
+use std::sync::{Arc, Mutex};
+use std::time::Instant;
+
+use crate::rig::{PATIENCE, Rig, event, order, small, until};
+use regrind::cell::AlarmId;
+use regrind::device::{
+    Armed, Cmm, DeviceError, Identity, Interrupt, Job, Machine, Measurement, ModbusCmm, Plan, Reconciled, Started,
+    Status, TargetKind,
+};
+use regrind::drive::{Drive, Notice, Request};
+
+/// A measuring machine whose first measurement says something else than it should, and which keeps the plans that it is given.
+struct Odd {
+    cmm: ModbusCmm,
+    first: Option<fn(&mut Measurement)>,
+    plans: Arc<Mutex<Vec<Plan>>>,
+}
+
+impl Machine for Odd {
+    fn name(&self) -> &str {
+        self.cmm.name()
+    }
+    async fn connect(&mut self) -> Result<Identity, DeviceError> {
+        self.cmm.connect().await
+    }
+    async fn status(&mut self) -> Result<Status, DeviceError> {
+        self.cmm.status().await
+    }
+    async fn claim(&mut self) -> Result<Status, DeviceError> {
+        self.cmm.claim().await
+    }
+    async fn prepare(&mut self, job: Job) -> Result<Armed, DeviceError> {
+        self.cmm.prepare(job).await
+    }
+    async fn start(&mut self, armed: Armed) -> Result<Started, DeviceError> {
+        self.cmm.start(armed).await
+    }
+    async fn hold(&mut self) -> Result<Status, DeviceError> {
+        self.cmm.hold().await
+    }
+    async fn resume(&mut self) -> Result<Status, DeviceError> {
+        self.cmm.resume().await
+    }
+    async fn stop(&mut self) -> Result<Status, DeviceError> {
+        self.cmm.stop().await
+    }
+    async fn abort(&mut self) -> Result<Status, DeviceError> {
+        self.cmm.abort().await
+    }
+    async fn clear(&mut self) -> Result<Status, DeviceError> {
+        self.cmm.clear().await
+    }
+    async fn acknowledge(&mut self, done: u32) -> Result<Status, DeviceError> {
+        self.cmm.acknowledge(done).await
+    }
+    async fn release(&mut self) -> Result<Status, DeviceError> {
+        self.cmm.release().await
+    }
+    async fn reconcile(&mut self, intended: &Armed) -> Result<Reconciled, DeviceError> {
+        self.cmm.reconcile(intended).await
+    }
+}
+
+impl Cmm for Odd {
+    async fn load_plan(&mut self, plan: &Plan, interrupt: &Interrupt) -> Result<(), DeviceError> {
+        self.plans.lock().unwrap().push(plan.clone());
+        self.cmm.load_plan(plan, interrupt).await
+    }
+
+    async fn collect(&mut self, job: Job, interrupt: &Interrupt) -> Result<Measurement, DeviceError> {
+        let mut measured = self.cmm.collect(job, interrupt).await?;
+        if let Some(change) = self.first.take() {
+            change(&mut measured);
+        }
+        Ok(measured)
+    }
+}
+
+/// The places of the part's targets, to the last bit.
+fn places(plan: &Plan) -> BTreeSet<[u64; 3]> {
+    let part = plan.targets.iter().filter(|target| target.what == TargetKind::Part);
+    part.map(|target| target.point_mm.map(f64::to_bits)).collect()
+}
+
+/// The least distance between two of some targets.
+fn least_apart_mm(plan: &Plan, of: usize) -> f64 {
+    let at = |k: usize| plan.targets[k].point_mm;
+    let apart = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt();
+    let pairs = (0..of).flat_map(|a| (0..a).map(move |b| (a, b)));
+    pairs.map(|(a, b)| apart(at(a), at(b))).fold(f64::INFINITY, f64::min)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn after_a_measurement_that_was_refused_the_first_touches_are_few_and_slow() {
+    let mut rig = Rig::new(small(20, 10, 5000.0)).await;
+    rig.recipe.measure.temperature_c = Some([19.0, 21.0]);
+    let ready = rig.next(true);
+    let (folder, mut notices, plans) = (ready.folder, ready.notices, Arc::default());
+    let first: fn(&mut Measurement) = |measured| measured.temperature_c = Some(30.0);
+    let cmm = Odd { cmm: ready.cmm, first: Some(first), plans: Arc::clone(&plans) };
+    let (drive, _orders) = Drive::new(ready.run, cmm, ready.grinder).unwrap();
+    let running = tokio::spawn(drive.run());
+    until(&folder, |words| words.starts_with("Held (Measure, Send)")).await;
+    order(&folder, Request::Resume { reason: "seated anew".into(), seen: None }).await;
+    event(&mut notices, "compensated", 1).await;
+    let began = Instant::now();
+    while plans.lock().unwrap().len() < 3 {
+        assert!(began.elapsed() < PATIENCE, "no measurement after the next pass");
+        tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+    }
+    order(&folder, Request::Abort { reason: "seen enough".into() }).await;
+    running.await.unwrap();
+    let plans: Vec<Plan> = plans.lock().unwrap().clone();
+    let [first, again, later] = &plans[..3] else { unreachable!() };
+    assert_eq!((first.careful, later.careful), (None, None), "where the part lies as it was found");
+    let careful = again.careful.expect("the part may lie elsewhere");
+    assert_eq!((careful.targets, careful.speed_mm_s), (9, 0.2 * again.speed_mm_s));
+    assert!(again.targets[..9].iter().all(|target| target.what == TargetKind::Part));
+    assert!(again.targets.iter().enumerate().all(|(k, target)| target.index as usize == k));
+    // The same places, the first of them far apart.
+    assert_eq!((places(again), again.targets.len()), (places(first), first.targets.len()));
+    let wide = least_apart_mm(again, 9);
+    assert!(wide > 10.0, "{wide} mm apart");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_result_of_another_probe_than_the_recipes_is_not_used() {
+    let mut rig = Rig::new(small(20, 10, 5000.0)).await;
+    let ready = rig.next(true);
+    let (folder, mut notices) = (ready.folder, ready.notices);
+    let first: fn(&mut Measurement) = |measured| measured.probe_radius_mm = measured.probe_radius_mm.map(|mm| 1.1 * mm);
+    let cmm = Odd { cmm: ready.cmm, first: Some(first), plans: Arc::default() };
+    let (drive, _orders) = Drive::new(ready.run, cmm, ready.grinder).unwrap();
+    let running = tokio::spawn(drive.run());
+    let told = async {
+        loop {
+            match notices.recv().await.expect("the run goes on") {
+                Notice::Alarm(alarm) => return alarm,
+                Notice::Finished { ending, .. } => panic!("over: {ending:?}"),
+                _ => {}
+            }
+        }
+    };
+    let alarm = tokio::time::timeout(PATIENCE, told).await.expect("an alarm");
+    assert_eq!(alarm.id, AlarmId::BrokenResult, "{alarm:?}");
+    assert!(alarm.what.contains("mm radius, and the recipe says"), "{}", alarm.what);
+    until(&folder, |words| words.starts_with("Held (Measure, Send)")).await;
+    order(&folder, Request::Abort { reason: "seen enough".into() }).await;
+    running.await.unwrap();
+}
