@@ -18,6 +18,7 @@ mod mirror_run;
 mod orders;
 mod outside;
 mod panics;
+mod prepared;
 #[path = "../common/program.rs"]
 mod program;
 mod replay;
