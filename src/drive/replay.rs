@@ -298,25 +298,33 @@ impl<'t> Replay<'t> {
         for device in Device::BOTH {
             self.check_armed(device)?;
         }
+        self.files_in("");
         for number in 1..=self.found.cell.cycle() + 1 {
             for attempt in 1.. {
                 let folder = folder_of(number, attempt);
-                let Ok(entries) = fs::read_dir(self.run.join(&folder)) else { break };
-                let names = entries.flatten().filter(|entry| entry.path().is_file()).map(|entry| entry.file_name());
-                for name in names.filter_map(|name| name.into_string().ok()) {
-                    self.lies_there(&folder, number, attempt, &name);
-                }
+                let Some(names) = self.files_in(&folder) else { break };
+                names.iter().for_each(|name| self.lies_there(&folder, number, attempt, name));
             }
         }
         Ok(self.found)
     }
 
+    /// Returns the names of the files in a folder of the run, if it is there. What was being written and never had its name is taken
+    /// away: nothing refers to it.
+    fn files_in(&self, folder: &str) -> Option<Vec<String>> {
+        let folder = self.run.join(folder);
+        let entries = fs::read_dir(&folder).ok()?.flatten().filter(|entry| entry.path().is_file());
+        let mut names: Vec<_> = entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();
+        names.retain(|name| {
+            let unfinished = name.starts_with('.') && name.ends_with(".tmp");
+            // It is in nobody's way where it cannot be taken away.
+            !unfinished || fs::remove_file(folder.join(name)).is_err()
+        });
+        Some(names)
+    }
+
     /// Takes in that a file lies in the folder of an attempt: it is not written again, and what is not on record is brought there.
     fn lies_there(&mut self, folder: &str, number: u32, attempt: u32, name: &str) {
-        if name.starts_with('.') && name.ends_with(".tmp") {
-            // It was being written and never had its name: nothing refers to it.
-            let _ = fs::remove_file(self.run.join(folder).join(name));
-        }
         if name == "result.json" || name.starts_with('.') {
             return;
         }

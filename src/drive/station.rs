@@ -470,8 +470,6 @@ impl<B: StationDriver> MachineTask<B> {
                 Ok(status) if status.state == State::Holding => self.note(&status).await,
                 Ok(status) if status.state == State::Complete => self.note(&status).await,
                 Ok(status) if !status.state.moves() => self.tell(Event::MachineHeld { device: B::DEVICE }).await,
-                // On its way already, by itself or by an earlier order: a look will show when it stands.
-                Ok(status) if status.state == State::Holding => self.note(&status).await,
                 Ok(_) => self.failed(Asked::Hold, error).await,
                 Err(error) => self.lost(&error).await,
             },
