@@ -6,7 +6,7 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 
-use crate::program::{PATIENCE, Running, changed, records_with, regrind};
+use crate::program::{PATIENCE, Running, changed, records_with, regrind, small_recipe};
 use crate::rig::{CMM, GRINDER, Rig, small};
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
@@ -85,13 +85,24 @@ fn run_with_kills(home: &Path, seed: u64) -> (PathBuf, usize) {
     }
 }
 
-/// Every pass and every measurement began at most once, in the record and at the machines.
-fn hold_against(rig: &Rig, folder: &Path, seed: u64) {
+/// The record is whole and all on it, and no START was taken twice.
+fn is_whole(folder: &Path, seed: u64) {
     let verified = verify(folder).unwrap();
     assert!(
         verified.closed && verified.unrecorded.iter().all(|name| name == "report.html"),
         "seed {seed}: {verified:?}"
     );
+    let mut started: Vec<_> = records_with(folder, "event").into_iter().filter(|e| e["event"] == "started").collect();
+    started.iter_mut().for_each(|event| drop(event.as_object_mut().unwrap().remove("detail")));
+    let all = started.len();
+    started.sort_by_key(ToString::to_string);
+    started.dedup();
+    assert_eq!(started.len(), all, "seed {seed}: a START was taken twice");
+}
+
+/// Every pass and every measurement began at most once, in the record and at the machines.
+fn hold_against(rig: &Rig, folder: &Path, seed: u64) {
+    is_whole(folder, seed);
     let begun = &Reader::open(folder).unwrap().records(0).next().unwrap().unwrap().value()["content"];
     let job = begun["job"].as_u64().unwrap() as u32;
     for (machine, device) in [(CMM, "cmm"), (GRINDER, "grinder")] {
@@ -129,6 +140,21 @@ async fn killed(seeds: impl Iterator<Item = u64>) {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_killed_program_is_taken_up_again_and_starts_every_pass_once() {
     killed(1..=10).await;
+}
+
+#[test]
+fn over_a_serial_line_too() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = small_recipe(home.path(), 2000.0);
+    fs::rename(&recipe, home.path().join("part.toml")).unwrap();
+    let devices = format!("device = \"{}/", home.path().display());
+    let text = changed("config/serial-rtu.toml", &[("device = \"/tmp/regrind-", &devices)]);
+    fs::write(home.path().join("cell.toml"), text).unwrap();
+    let mut serving = Running::new(regrind(&["simulate", "part.toml", "--cell", "cell.toml"], home.path()));
+    serving.line("its last word", |line| line.starts_with("Ctrl-C"));
+    let (folder, kills) = run_with_kills(home.path(), 21);
+    println!("{kills} kills");
+    is_whole(&folder, 21);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
