@@ -5,6 +5,8 @@
 //! ```
 //! The time runs from before the order is written to the control socket to the command at the simulated machine.
 
+#[path = "../tests/common/keep.rs"]
+mod keep;
 #[path = "../tests/common/rig.rs"]
 mod rig;
 #[path = "../tests/common/tries.rs"]

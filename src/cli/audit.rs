@@ -3,20 +3,22 @@
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use clap::{Args, Subcommand};
-use regrind::journal::{Anchor, JournalError, Kind, Reader, Record, Verified, verify, verify_against};
+use clap::{Args, Subcommand, ValueEnum};
+use regrind::journal::{Against, Anchor, JournalError, Kind, PublicKey, Reader, Record, Verified, verify_against};
 use regrind::report::{RUN_REPORT, run_report, words};
 use serde_json::{Value, json};
 
 use super::Outcome;
 use super::control::folder_of;
 use super::failure::Failure;
+use super::key;
 
-/// Verify, show or export the record of a run
+/// Verify, show or export the record of a run; make the key that signs it
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Examples:
   regrind audit verify
+  regrind audit key
   regrind audit show runs/freeform-mirror-20260704T120000Z --kind event --cycle 2
   regrind audit export runs/freeform-mirror-20260704T120000Z > record.jsonl")]
 pub(super) struct Arguments {
@@ -29,19 +31,23 @@ enum What {
     Verify(ToVerify),
     Show(ToShow),
     Export(ToExport),
+    Key(key::Arguments),
 }
 
 /// Prove that the record is what was written: every record, their order, the end, and every file by its hash
 #[derive(Args, Debug)]
 #[command(after_help = "\
 RUN is the folder of a run; without it, the newest under runs/. A record whose end was cut off together with its anchor is
-found only with --anchor and a copy of journal.anchor that was kept elsewhere.
+found only with --anchor and a copy of journal.anchor that was kept elsewhere; one that was written anew from its beginning,
+only with that or with --key and the public key that was kept elsewhere. Without --key the signatures are held against the
+key that the record itself names. How to prove a record without this program: docs/journal.md.
 
-Example:
+Examples:
+  regrind audit verify runs/freeform-mirror-20260704T120000Z --key /mnt/quality/grinding-cell-2.key
   regrind audit verify runs/freeform-mirror-20260704T120000Z --anchor /mnt/quality/SN-0042.anchor
 
 Exit codes: 0 sound, and closed or under way; 1 broken: the first record that cannot be believed is named, or the run broke
-off, or its anchor is missing; 2 no such run, or no record in it.")]
+off, its anchor is missing, or its end is not signed and the run names a key; 2 no such run, or no record in it.")]
 struct ToVerify {
     /// Folder of the run
     #[arg(value_name = "RUN")]
@@ -49,6 +55,9 @@ struct ToVerify {
     /// Copy of journal.anchor that was kept elsewhere
     #[arg(long, value_name = "FILE")]
     anchor: Option<PathBuf>,
+    /// Public key that may have signed, or the file that it was kept in; again for a run that was gone on with by another computer
+    #[arg(long, value_name = "PUBLIC|FILE", value_parser = key::public)]
+    key: Vec<PublicKey>,
     /// Print JSON instead of words
     #[arg(long)]
     json: bool,
@@ -68,7 +77,7 @@ struct ToShow {
     /// Folder of the run
     #[arg(value_name = "RUN")]
     run: Option<PathBuf>,
-    /// Only records of these kinds: begin, reopen, intent, outcome, event, artefact, note, end
+    /// Only records of these kinds: begin, reopen, intent, outcome, event, artefact, note, seal, end
     #[arg(long, value_name = "KIND,...", value_delimiter = ',', value_parser = kind)]
     kind: Vec<Kind>,
     /// Only records of this cycle
@@ -79,20 +88,34 @@ struct ToShow {
     json: bool,
 }
 
-/// Print the whole record, one line of JSON for each, as it was hashed
+/// Print the whole record: lines of JSON as they were hashed, or CSV
 #[derive(Args, Debug)]
 #[command(after_help = "\
 RUN is the folder of a run; without it, the newest under runs/. The members `prev_hash` and `hash` at the end of a line are
 the chain; `hash` is SHA-256 of \"regrind journal record 1\", a line feed, prev_hash, a line feed, and the line without these two.
+docs/verify_journal.py proves such a file. CSV is that of RFC 4180: a row for each record, its columns named in the first, the
+payload as its JSON text, every field as it is.
 
-Example:
+Examples:
   regrind audit export runs/freeform-mirror-20260704T120000Z > record.jsonl
+  regrind audit export --format csv > record.csv
 
 Exit codes: 0 printed; 1 a record cannot be read; 2 no such run, or no record in it.")]
 struct ToExport {
     /// Folder of the run
     #[arg(value_name = "RUN")]
     run: Option<PathBuf>,
+    /// How the records are written
+    #[arg(long, value_enum, default_value = "jsonl")]
+    format: Format,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Format {
+    /// A line of JSON for each record, which proves itself
+    Jsonl,
+    /// A row for each record, for spreadsheets and databases
+    Csv,
 }
 
 fn kind(word: &str) -> Result<Kind, String> {
@@ -104,7 +127,17 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     match &arguments.what {
         What::Verify(of) => prove(of),
         What::Show(of) => show(of),
-        What::Export(of) => print_lines(folder_of(of.run.as_deref())?, None, |_| true, Record::json_line),
+        What::Export(of) => export(of),
+        What::Key(of) => key::run(of),
+    }
+}
+
+fn export(arguments: &ToExport) -> Result<Outcome, Failure> {
+    let folder = folder_of(arguments.run.as_deref())?;
+    match arguments.format {
+        Format::Jsonl => print_lines(folder, None, |_| true, Record::json_line),
+        // Lines of CSV end with a carriage return, too.
+        Format::Csv => print_lines(folder, Some(Record::csv_head() + "\r"), |_| true, |record| record.csv_row() + "\r"),
     }
 }
 
@@ -117,10 +150,8 @@ fn failure(error: JournalError) -> Failure {
 
 fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
     let folder = folder_of(arguments.run.as_deref())?;
-    let found = match &arguments.anchor {
-        Some(path) => verify_against(&folder, &read_anchor(path)?),
-        None => verify(&folder),
-    };
+    let anchor = arguments.anchor.as_deref().map(read_anchor).transpose()?;
+    let found = verify_against(&folder, &Against { anchor, keys: arguments.key.clone() });
     if let (Err(JournalError::Broken { seq, what, .. }), true) = (&found, arguments.json) {
         super::print_json(&json!({ "run": folder, "sound": false, "record": seq, "what": what }))?;
     }
@@ -131,11 +162,15 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
             "run": folder, "simulation": begin["simulation"], "sound": true, "records": verified.records,
             "head": verified.head, "anchored": verified.anchored, "closed": verified.closed,
             "under_way": verified.under_way, "artefacts": verified.artefacts, "unrecorded": verified.unrecorded,
+            "keys": verified.keys, "seals": verified.seals, "signed": verified.signed,
         }))?;
     } else {
-        super::print(&sound(&folder, &begin, &verified))?;
+        super::print(&sound(&folder, &begin, &verified, !arguments.key.is_empty()))?;
     }
     let lacks = match &verified {
+        verified if verified.lacks_last_seal() => {
+            "its end is not signed, and the run names a key: who has no key may have written what follows the last seal"
+        }
         Verified { anchored: 0, .. } => "journal.anchor is missing: whether its end was cut off cannot be told",
         Verified { closed: false, under_way: false, .. } => {
             "the run broke off: nobody drives it, and it has no end; what happened behind its last record is not known"
@@ -174,7 +209,23 @@ fn mark(begin: &Value) -> &'static str {
     if begin["simulation"] == true { "SIMULATION  " } else { "" }
 }
 
-fn sound(folder: &Path, begin: &Value, verified: &Verified) -> String {
+/// Says who signed, and how far that reaches.
+fn signed(verified: &Verified, as_given: bool) -> String {
+    let Verified { keys, signed, records, .. } = verified;
+    let [first, others @ ..] = keys.as_slice() else {
+        return "no: who wrote it had no key (`regrind audit key` makes one)".to_owned();
+    };
+    let named = |key: &PublicKey| format!("{key} ({})", key.fingerprint());
+    let then: String = others.iter().map(|key| format!(", then by {}", named(key))).collect();
+    let given = if as_given { ", as given" } else { "; that this is the key of your cell, only --key can tell" };
+    let reach = match verified.closed && !verified.lacks_last_seal() {
+        true => "to its end".to_owned(),
+        false => format!("up to record {signed} of {records}"),
+    };
+    format!("{reach}, by {}{then}{given}", named(first))
+}
+
+fn sound(folder: &Path, begin: &Value, verified: &Verified, as_given: bool) -> String {
     let Verified { records, head, anchored, closed, artefacts, unrecorded, .. } = verified;
     let records = super::words::counted(*records as usize, "record");
     let files = super::words::counted(*artefacts as usize, "file");
@@ -188,9 +239,10 @@ fn sound(folder: &Path, begin: &Value, verified: &Verified) -> String {
         }
     };
     format!(
-        "{}{}\nsound       {records} in an unbroken chain, {files} unchanged\nend         {end}\nhead        {head}\n{}",
+        "{}{}\nsound       {records} in an unbroken chain, {files} unchanged\nend         {end}\nsigned      {}\nhead        {head}\n{}",
         mark(begin),
         folder.display(),
+        signed(verified, as_given),
         beside(folder, unrecorded)
     )
 }

@@ -68,6 +68,10 @@ pub(super) enum Failure {
     NotWhole { run: PathBuf, lacks: &'static str },
     #[error("{path}: {reason}; give a copy of the journal.anchor of this run")]
     Anchor { path: PathBuf, reason: String },
+    #[error(
+        "there is no place for a key: REGRIND_KEY is empty, or neither it nor HOME is set; name the file with --key"
+    )]
+    NoPlaceForKey,
     #[error(transparent)]
     Report(ReportError),
     #[error("--state {name}: no state begins so; give one of {known}")]

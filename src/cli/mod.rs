@@ -8,6 +8,7 @@ mod compensate;
 mod control;
 mod failure;
 mod initial;
+mod key;
 mod live;
 mod nominal;
 mod plan;

@@ -16,7 +16,7 @@ use serde_json::json;
 use super::failure::Failure;
 use super::live::{owner, take};
 use super::run::{epoch, free_folder, operator};
-use super::{Outcome, check, control};
+use super::{Outcome, check, control, key};
 
 /// Bring the machines of a cell home that hold what no run knows
 #[derive(Args, Debug)]
@@ -60,7 +60,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         first_command_id: 1,
         content: json!({ "recover": true, "cell": cell.path() }),
     };
-    let journal = Journal::create(&folder, header).map_err(Failure::Journal)?;
+    let journal = Journal::create_with(&folder, header, key::of_this_user()?).map_err(Failure::Journal)?;
     let mut recovery = Recovery { actor, journal, folder, runs: arguments.runs.clone(), simulated: cell.simulated };
     super::runtime()?.block_on(async {
         let cmm = recovery.bring_home(Device::Cmm, &cell.cmm.link, cmm, ModbusCmm::new).await;

@@ -16,7 +16,7 @@ use serde_json::Value;
 use super::failure::Failure;
 use super::live::{Live, Work, outcome};
 use super::run::{LEARNED_FROM, epoch, operator, within};
-use super::{Outcome, check, control};
+use super::{Outcome, check, control, key};
 
 /// Let a held cell go on, or take up a run that broke off
 #[derive(Args, Debug)]
@@ -62,7 +62,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 
 /// Takes up a run that broke off: all of it is looked through before anything is opened.
 fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
-    let begun = Begun::read(folder)?;
+    let (key, begun) = (key::of_this_user()?, Begun::read(folder)?);
     std::env::set_current_dir(&begun.working_folder)
         .map_err(|source| Failure::WorkingFolder { path: begun.working_folder.clone(), source })?;
     let recipe = check::or_show(Recipe::parse(&begun.recipe, &text(folder, "recipe.toml")?))?;
@@ -84,7 +84,7 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
         let (recipe, cell, json) = (&recipe, &cell, arguments.json);
         let live = Live { recipe, cell, part, folder, job: begun.job, actor, json };
         let machines = live.open(epoch(jiff::Timestamp::now()))?;
-        let journal = Journal::open(folder).map_err(Failure::Journal)?;
+        let journal = Journal::open_with(folder, key).map_err(Failure::Journal)?;
         let (loaded, interrupted) = (cell.simulated, Some(interrupted));
         outcome(&live.carry_out(machines, Work { task, plan, journal, loaded, interrupted }).await?)
     })

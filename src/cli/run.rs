@@ -8,14 +8,14 @@ use regrind::config::{CellConfig, Link};
 use regrind::device::Line;
 use regrind::drive::Task;
 use regrind::formats::{LEARNED, Learned, LearnedError};
-use regrind::journal::{Header, Journal, free_bytes};
+use regrind::journal::{AuditKey, Header, Journal, free_bytes};
 use regrind::recipe::Recipe;
 use regrind::setup;
 use serde_json::json;
 
 use super::failure::Failure;
 use super::live::{Live, Work, outcome};
-use super::{Outcome, check, plan, simulated};
+use super::{Outcome, check, key, plan, simulated};
 
 /// What a run began with of what an earlier one had learned, in its folder.
 pub(super) const LEARNED_FROM: &str = "learned_from.json";
@@ -70,6 +70,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         true => Some(Earlier::begun_with(&mut task, &arguments.runs)?),
         false => None,
     };
+    // A key that cannot be used is no reason to leave the record unsigned.
+    let key = key::of_this_user()?;
     // What a run begins with is checked before anything opens; the path of any other pass when its map is made, and it may come to none.
     if plan.begin_with == Beginning::Grind {
         plan::first_path(&task, &recipe, &cell)?;
@@ -84,7 +86,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             Some(spec) => Some(simulated::serve(spec, &mut cell).await?),
             None => None,
         };
-        let ending = carry_out(arguments, &recipe, &cell, task, plan, earlier).await?;
+        let ending = carry_out(arguments, &recipe, &cell, task, plan, earlier, key).await?;
         outcome(&ending)
     })
 }
@@ -97,6 +99,7 @@ async fn carry_out(
     task: Task,
     plan: CellPlan,
     earlier: Option<Earlier>,
+    key: Option<AuditKey>,
 ) -> Result<Ending, Failure> {
     let actor = operator(arguments.operator.as_deref());
     let began = jiff::Timestamp::now();
@@ -114,7 +117,7 @@ async fn carry_out(
         super::print(&earlier.in_words(&arguments.runs))?;
     }
     let header = header(arguments, &live, (&task, &plan), earlier.as_ref());
-    let mut journal = begin(header, &live, earlier.and_then(|earlier| earlier.learned))?;
+    let mut journal = begin(header, &live, earlier.and_then(|earlier| earlier.learned), key)?;
     if task.learned.is_some() || cell.grinder.link.wire.works_from_run() {
         record_first_correction(&task, &mut journal)?;
     }
@@ -208,8 +211,13 @@ fn header(arguments: &Arguments, live: &Live, (task, plan): (&Task, &CellPlan), 
     }
 }
 
-fn begin(header: Header, live: &Live, learned: Option<(Learned, Vec<u8>)>) -> Result<Journal, Failure> {
-    let mut journal = Journal::create(live.folder, header).map_err(Failure::Journal)?;
+fn begin(
+    header: Header,
+    live: &Live,
+    learned: Option<(Learned, Vec<u8>)>,
+    key: Option<AuditKey>,
+) -> Result<Journal, Failure> {
+    let mut journal = Journal::create_with(live.folder, header, key).map_err(Failure::Journal)?;
     journal.store("recipe.toml", live.recipe.text().as_bytes(), 0, 0).map_err(Failure::Journal)?;
     journal.store("cell.toml", live.cell.text().as_bytes(), 0, 0).map_err(Failure::Journal)?;
     if let Some((_, text)) = learned {

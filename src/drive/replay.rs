@@ -141,7 +141,7 @@ impl<'t> Replay<'t> {
         self.found.before = self.found.before.max(Duration::from_nanos(record.mono_ns));
         let payload = record.value();
         match record.kind {
-            Kind::Begin | Kind::End => Ok(()),
+            Kind::Begin | Kind::End | Kind::Seal => Ok(()),
             // What the program had decided and not brought on record when it ended was not carried out.
             Kind::Reopen => {
                 self.due.clear();

@@ -52,8 +52,13 @@ fn write_value(text: &mut String, value: &Value) {
 
 /// Writes a string as JSON does.
 pub(super) fn write_string(text: &mut String, string: &str) {
-    // A string always has a JSON form.
-    text.push_str(&serde_json::to_string(string).unwrap_or_default());
+    let is_plain = |byte: u8| byte >= 0x20 && byte != b'"' && byte != b'\\';
+    if string.bytes().all(is_plain) {
+        text.extend(["\"", string, "\""]);
+    } else {
+        // A string always has a JSON form.
+        text.push_str(&serde_json::to_string(string).unwrap_or_default());
+    }
 }
 
 /// Returns the SHA-256 of bytes in small hexadecimal digits.
@@ -68,6 +73,21 @@ pub(super) fn chain(prev_hash: &str, text: &str) -> String {
         digest.update(part.as_bytes());
     }
     hex(&digest.finalize())
+}
+
+/// Returns the bytes of so many pairs of hexadecimal digits, small ones only: one value has one text.
+pub(super) fn unhex<const N: usize>(digits: &str) -> Option<[u8; N]> {
+    let nibble = |digit: u8| match digit {
+        b'0'..=b'9' => Some(digit - b'0'),
+        b'a'..=b'f' => Some(digit - b'a' + 10),
+        _ => None,
+    };
+    let digits = digits.as_bytes();
+    let mut bytes = [0; N];
+    for (byte, pair) in bytes.iter_mut().zip(digits.chunks_exact(2)) {
+        *byte = nibble(pair[0])? << 4 | nibble(pair[1])?;
+    }
+    (digits.len() == 2 * N).then_some(bytes)
 }
 
 pub(super) fn hex(bytes: &[u8]) -> String {

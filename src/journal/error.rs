@@ -58,6 +58,16 @@ pub enum JournalError {
         "{path}: the journal is broken at record {seq}: {what}; keep the folder as it is and compare it with its copies"
     )]
     Broken { path: PathBuf, seq: u64, what: String },
+    /// The file of an audit key holds none.
+    #[error(
+        "{path}: this is no audit key: {what}; bring it back from a copy, or put it away and make another with `regrind audit key`"
+    )]
+    Key { path: PathBuf, what: &'static str },
+    /// Others may read the audit key.
+    #[error(
+        "{path}: others may read this audit key (mode {mode:03o}, at most 600): `chmod 600` it, and make another if somebody may have it"
+    )]
+    KeyIsOpen { path: PathBuf, mode: u32 },
     /// A name that may lead out of the run folder.
     #[error("`{name}` cannot be the name of a file in a run folder; give a relative path of plain names")]
     Name { name: String },

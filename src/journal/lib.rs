@@ -10,24 +10,33 @@
 //! deletion, insertion or reordering is found by [`verify`]. A cut of the tail is found with an [`Anchor`]: the number of records
 //! and the hash of the last, kept in `journal.anchor` and wherever else somebody wrote it down.
 //!
+//! Where the computer has an [`AuditKey`], the head is signed with it (Ed25519) every [`SEALED_EVERY`] records and at the end, in a
+//! record of its own, and the anchor is moved along with each: who wants to change what was written has to have the key too.
+//!
+//! All of it stands in docs/journal.md, for who wants to prove a record without this program.
+//!
 //! Calls block until the disk has answered; the drive calls from a thread of its own.
 
 mod artefact;
 mod canonical;
 mod error;
+mod key;
 mod machine;
 mod open;
 mod record;
+mod seal;
 mod verify;
 mod write;
 
 pub use artefact::Artefact;
 pub use canonical::{canonical_json, sha256_hex};
 pub use error::JournalError;
+pub use key::{AuditKey, PublicKey};
 pub use machine::MachineLock;
 pub use open::free_bytes;
 pub use record::{Entry, Kind, Record, Records};
-pub use verify::{Anchor, Verified, verify, verify_against};
+pub use seal::SEALED_EVERY;
+pub use verify::{Against, Anchor, Verified, verify, verify_against};
 pub use write::{Header, Journal};
 
 use std::path::Path;
@@ -66,5 +75,11 @@ impl Reader {
     /// Returns the records from a number on, in order.
     pub fn records(&self, from: u64) -> Records<'_> {
         Records::new(&self.connection, &self.folder, from)
+    }
+
+    /// Returns the least number of a record that stands before the first; none in a journal that was left as it is.
+    fn number_before_the_first(&self) -> Result<Option<i64>, JournalError> {
+        let least = self.connection.query_row("SELECT min(seq) FROM record WHERE seq < 1", [], |row| row.get(0));
+        least.map_err(JournalError::database(&self.folder))
     }
 }

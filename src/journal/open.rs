@@ -14,10 +14,10 @@ use super::error::JournalError;
 const APPLICATION_ID: u32 = 0x5247_7264;
 /// How long a write waits for another process to let go of the file; who records tries again.
 const BUSY_FOR: Duration = Duration::from_millis(200);
-/// The layout of the tables.
-const LAYOUT: u32 = 1;
+/// The layout of the tables and what stands in them. 1 knew no seals, and is read as well.
+const LAYOUT: u32 = 2;
 
-const SCHEMA: &str = "
+pub(super) const SCHEMA: &str = "
 CREATE TABLE record (
     seq INTEGER PRIMARY KEY,
     utc TEXT NOT NULL,
@@ -56,10 +56,15 @@ pub(super) fn create(folder: &Path) -> Result<Connection, JournalError> {
 /// Opens the database of a run for writing.
 pub(super) fn read_write(folder: &Path) -> Result<Connection, JournalError> {
     let path = folder.join(DATABASE);
-    recognise(folder, &path)?;
+    let layout = recognise(folder, &path)?;
     let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_NO_MUTEX;
-    let connection = Connection::open_with_flags(&path, flags).map_err(JournalError::database(&path))?;
+    let failed = JournalError::database(&path);
+    let connection = Connection::open_with_flags(&path, flags).map_err(&failed)?;
     configure(&connection, &path)?;
+    if layout < LAYOUT {
+        // What is written from here on, an earlier version may not know.
+        connection.execute_batch(&format!("PRAGMA user_version = {LAYOUT};")).map_err(&failed)?;
+    }
     Ok(connection)
 }
 
@@ -107,8 +112,8 @@ fn address(path: &Path) -> String {
     address + "?immutable=1"
 }
 
-/// Looks at the header of the file before SQLite may touch it.
-fn recognise(folder: &Path, path: &Path) -> Result<(), JournalError> {
+/// Looks at the header of the file before SQLite may touch it; returns the layout.
+fn recognise(folder: &Path, path: &Path) -> Result<u32, JournalError> {
     if !path.is_file() {
         return Err(JournalError::Absent { path: folder.to_owned() });
     }
@@ -124,7 +129,7 @@ fn recognise(folder: &Path, path: &Path) -> Result<(), JournalError> {
         return foreign("it is a database of another program");
     }
     match word(60) {
-        LAYOUT => Ok(()),
+        layout @ 1..=LAYOUT => Ok(layout),
         found => Err(JournalError::Newer { path: path.to_owned(), found, limit: LAYOUT }),
     }
 }

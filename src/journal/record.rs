@@ -1,6 +1,8 @@
 //! One record, and the way through all of them.
 
+use std::borrow::Cow;
 use std::collections::VecDeque;
+use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
@@ -29,14 +31,25 @@ pub enum Kind {
     Artefact,
     /// Anything else that somebody should read.
     Note,
-    /// The last record of a run, with the number of records before it.
+    /// The number of records before it and the hash of the last, signed. The journal writes it by itself.
+    Seal,
+    /// The last record of a run, with the number of records before it. Where the run is signed, its seal follows, and nothing else.
     End,
 }
 
 impl Kind {
     /// All kinds.
-    pub const ALL: [Self; 8] =
-        [Self::Begin, Self::Reopen, Self::Intent, Self::Outcome, Self::Event, Self::Artefact, Self::Note, Self::End];
+    pub const ALL: [Self; 9] = [
+        Self::Begin,
+        Self::Reopen,
+        Self::Intent,
+        Self::Outcome,
+        Self::Event,
+        Self::Artefact,
+        Self::Note,
+        Self::Seal,
+        Self::End,
+    ];
 
     /// Returns the word in the database.
     pub fn as_str(self) -> &'static str {
@@ -48,6 +61,7 @@ impl Kind {
             Self::Event => "event",
             Self::Artefact => "artefact",
             Self::Note => "note",
+            Self::Seal => "seal",
             Self::End => "end",
         }
     }
@@ -145,15 +159,19 @@ impl Record {
         };
         string(&mut text, "{\"actor\":", &self.actor);
         string(&mut text, ",\"boot_id\":", &self.boot_id);
-        let id = self.command_id.map_or("null".to_owned(), |id| id.to_string());
-        text.push_str(&format!(",\"command_id\":{id},\"cycle\":{}", self.cycle));
+        // Writing into a string does not fail.
+        let _ = match self.command_id {
+            Some(id) => write!(text, ",\"command_id\":{id}"),
+            None => write!(text, ",\"command_id\":null"),
+        };
+        let _ = write!(text, ",\"cycle\":{}", self.cycle);
         string(&mut text, ",\"kind\":", self.kind.as_str());
-        text.push_str(&format!(",\"mono_ns\":{}", self.mono_ns));
+        let _ = write!(text, ",\"mono_ns\":{}", self.mono_ns);
         string(&mut text, ",\"part\":", &self.part);
         text.push_str(",\"payload\":");
         text.push_str(&self.payload);
         string(&mut text, ",\"reason\":", &self.reason);
-        text.push_str(&format!(",\"seq\":{}", self.seq));
+        let _ = write!(text, ",\"seq\":{}", self.seq);
         string(&mut text, ",\"station\":", &self.station);
         string(&mut text, ",\"utc\":", &self.utc);
         text.push('}');
@@ -165,12 +183,66 @@ impl Record {
         chain(&self.prev_hash, &self.text())
     }
 
+    /// Returns the names of the columns as a row of CSV (RFC 4180), without its end of line.
+    pub fn csv_head() -> String {
+        COLUMNS.replace(", ", ",")
+    }
+
+    /// Returns the record as a row of CSV (RFC 4180), without its end of line: every field as it is, the payload as its JSON text,
+    /// and nothing where there is no command number.
+    pub fn csv_row(&self) -> String {
+        let id = self.command_id.map_or(String::new(), |id| id.to_string());
+        let (seq, mono_ns, cycle) = (self.seq.to_string(), self.mono_ns.to_string(), self.cycle.to_string());
+        let kind = self.kind.as_str();
+        let fields: [&str; 14] = [
+            &seq,
+            &self.utc,
+            &self.boot_id,
+            &mono_ns,
+            &self.actor,
+            &self.station,
+            kind,
+            &self.part,
+            &cycle,
+            &id,
+            &self.reason,
+            &self.payload,
+            &self.prev_hash,
+            &self.hash,
+        ];
+        fields.map(csv_field).join(",")
+    }
+
+    /// Tells what is wrong with this record as the one that comes behind `records` others, of which the last has the hash `head`.
+    pub(super) fn flaw_behind(&self, records: u64, head: &str) -> Option<String> {
+        let due = records + 1;
+        if self.seq != due {
+            Some(format!("it is missing: record {} follows {records}", self.seq))
+        } else if self.prev_hash != head {
+            Some(
+                "it does not follow the record before it: one of them was changed, moved, inserted or taken away"
+                    .into(),
+            )
+        } else if self.hash != self.hash_due() {
+            Some("its content is not what was written".into())
+        } else {
+            None
+        }
+    }
+
     /// Returns the record as one line of JSON: the text that is hashed, and the hashes.
     pub fn json_line(&self) -> String {
         let mut line = self.text();
         line.pop();
         line.push_str(&format!(",\"prev_hash\":\"{}\",\"hash\":\"{}\"}}", self.prev_hash, self.hash));
         line
+    }
+}
+
+fn csv_field(field: &str) -> Cow<'_, str> {
+    match field.contains(['"', ',', '\r', '\n']) {
+        true => format!("\"{}\"", field.replace('"', "\"\"")).into(),
+        false => field.into(),
     }
 }
 
@@ -225,7 +297,7 @@ pub struct Records<'j> {
 
 impl<'j> Records<'j> {
     pub(super) fn new(connection: &'j Connection, folder: &Path, from: u64) -> Self {
-        Self { connection, folder: folder.to_owned(), page: VecDeque::new(), next: from, size: 1, over: false }
+        Self { connection, folder: folder.to_owned(), page: VecDeque::new(), next: from.max(1), size: 1, over: false }
     }
 
     /// Reads the next page. An error ends it and stands behind the records before it.
@@ -245,16 +317,20 @@ impl<'j> Records<'j> {
         // A number too large for the database is past its end.
         let Ok(from) = i64::try_from(self.next) else { return Ok(()) };
         let mut rows = statement.query(params![from, self.size]).map_err(&failed)?;
-        while let Some(row) = rows.next().map_err(&failed)? {
+        loop {
+            let row = rows.next().map_err(|error| match failed(error) {
+                JournalError::Broken { path, what, .. } => JournalError::Broken { path, seq: self.next, what },
+                other => other,
+            })?;
+            let Some(row) = row else { return Ok(()) };
             let record = record_of(row).map_err(|unreadable| JournalError::Broken {
                 path: self.folder.clone(),
-                seq: self.next.max(1),
+                seq: self.next,
                 what: format!("a field cannot be read ({unreadable})"),
             })?;
             self.next = record.seq.saturating_add(1);
             self.page.push_back(Ok(record));
         }
-        Ok(())
     }
 }
 

@@ -6,10 +6,13 @@ use std::io;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use super::artefact::{Artefact, describe, path_within};
 use super::error::JournalError;
+use super::key::PublicKey;
 use super::record::{Kind, Record};
+use super::seal::{Seal, is_signed};
 use super::{ANCHOR, DATABASE, LOCK, Reader};
 
 /// How long the journal was at some time, and the hash of its last record then. Kept elsewhere it proves that nothing was cut.
@@ -19,6 +22,42 @@ pub struct Anchor {
     pub records: u64,
     /// The hash of the last.
     pub head: String,
+    /// The run, where the head was signed; what was not signed leaves this and what follows out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub run: Option<String>,
+    /// Who signed, 64 hexadecimal digits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub key: Option<String>,
+    /// The signature, 128 hexadecimal digits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub signature: Option<String>,
+}
+
+impl Anchor {
+    /// Returns an anchor that nobody signed.
+    pub fn new(records: u64, head: String) -> Self {
+        Self { records, head, run: None, key: None, signature: None }
+    }
+
+    /// Returns what a seal says.
+    pub(super) fn sealed(run: &str, seal: &Seal) -> Self {
+        Self {
+            records: seal.records,
+            head: seal.head.clone(),
+            run: Some(run.to_owned()),
+            key: Some(seal.key.clone()),
+            signature: Some(seal.signature.clone()),
+        }
+    }
+}
+
+/// What a journal is held against, besides itself and the anchor beside it.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Against {
+    /// An anchor that was kept elsewhere.
+    pub anchor: Option<Anchor>,
+    /// The keys that may have signed; with none, whichever the journal names.
+    pub keys: Vec<PublicKey>,
 }
 
 /// What a journal that can be believed holds.
@@ -40,6 +79,20 @@ pub struct Verified {
     pub under_way: bool,
     /// Files of the folder that stand in no record, in order; the journal's own left out.
     pub unrecorded: Vec<String>,
+    /// The keys that the run signed with, in the order in which the record names them; none if it is not signed.
+    pub keys: Vec<PublicKey>,
+    /// The number of seals.
+    pub seals: u64,
+    /// Up to which record a signature reaches; 0 if none does.
+    pub signed: u64,
+}
+
+impl Verified {
+    /// Returns whether the run names a key and has its end, and that is not sealed although nobody drives it: who has no key may
+    /// have written it.
+    pub fn lacks_last_seal(&self) -> bool {
+        !self.keys.is_empty() && self.closed && !self.under_way && self.signed + 1 != self.records
+    }
 }
 
 /// Verifies the journal of a run folder, the files on record, and the anchor beside it.
@@ -47,20 +100,18 @@ pub struct Verified {
 /// # Errors
 /// [`JournalError::Broken`] with the first record that cannot be believed; a journal that cannot be read.
 pub fn verify(folder: impl AsRef<Path>) -> Result<Verified, JournalError> {
-    let folder = folder.as_ref();
-    let anchor = read_anchor(folder)?;
-    examine(folder, anchor.as_ref())
+    verify_against(folder, &Against::default())
 }
 
-/// Verifies a journal against an anchor that was kept elsewhere, besides the one beside it.
+/// Verifies a journal as [`verify`] does, and against what was kept elsewhere.
 ///
 /// # Errors
 /// As [`verify`].
-pub fn verify_against(folder: impl AsRef<Path>, anchor: &Anchor) -> Result<Verified, JournalError> {
+pub fn verify_against(folder: impl AsRef<Path>, against: &Against) -> Result<Verified, JournalError> {
     let folder = folder.as_ref();
-    let beside = verify(folder)?;
-    let kept = examine(folder, Some(anchor))?;
-    Ok(if beside.anchored > kept.anchored { beside } else { kept })
+    let beside = read_anchor(folder)?;
+    let anchors: Vec<&Anchor> = beside.iter().chain(&against.anchor).collect();
+    examine(folder, &anchors, &against.keys)
 }
 
 /// Reads the anchor beside a journal.
@@ -80,60 +131,81 @@ fn broken(folder: &Path, seq: u64, what: impl Into<String>) -> JournalError {
 }
 
 /// What has been seen of a journal so far.
+#[derive(Clone)]
 struct Seen<'a> {
     folder: &'a Path,
+    /// Who may have signed; with nobody, whoever the journal names.
+    trusted: &'a [PublicKey],
     records: u64,
     head: String,
-    closed: bool,
-    artefacts: u64,
+    /// The number of the end.
+    ended: Option<u64>,
+    run: String,
+    /// The key that the newest beginning or reopening names.
+    key: Option<PublicKey>,
+    keys: Vec<PublicKey>,
+    seals: u64,
+    signed: u64,
     names: BTreeSet<String>,
+    artefacts: u64,
     last_intent: Option<u32>,
     open: BTreeSet<u32>,
     answered: BTreeSet<u32>,
 }
 
-fn examine(folder: &Path, anchor: Option<&Anchor>) -> Result<Verified, JournalError> {
+fn examine(folder: &Path, anchors: &[&Anchor], trusted: &[PublicKey]) -> Result<Verified, JournalError> {
     let reader = Reader::open(folder)?;
-    let head = "0".repeat(64);
-    let (names, open, answered) = (BTreeSet::new(), BTreeSet::new(), BTreeSet::new());
-    let mut seen =
-        Seen { folder, records: 0, head, closed: false, artefacts: 0, names, last_intent: None, open, answered };
+    // Asked before anything is read: what nobody drives does not change any more.
+    let under_way = is_driven(folder);
+    let mut seen = Seen::nothing(folder, trusted);
     let mut anchored = 0;
-    for record in reader.records(0) {
+    for record in reader.records(1) {
         seen.take(&record?)?;
-        if let Some(anchor) = anchor.filter(|anchor| anchor.records == seen.records) {
-            if anchor.head != seen.head {
-                return Err(broken(
-                    folder,
-                    seen.records,
-                    "its hash is not the one of the anchor: the journal was rewritten",
-                ));
-            }
+        for anchor in anchors.iter().filter(|anchor| anchor.records == seen.records) {
+            seen.take_anchor(anchor)?;
             anchored = seen.records;
         }
     }
     if seen.records == 0 {
         return Err(broken(folder, 1, "there is no record"));
     }
-    if let Some(anchor) = anchor.filter(|anchor| anchor.records > seen.records) {
+    if let Some(anchor) = anchors.iter().find(|anchor| anchor.records > seen.records) {
         let what =
             format!("{} records were written, and {} are there: the end was cut off", anchor.records, seen.records);
         return Err(broken(folder, seen.records + 1, what));
     }
-    let Seen { records, head, closed, artefacts, names, open, .. } = seen;
-    let mut unrecorded = Vec::new();
-    files_below(folder, "", &mut unrecorded)?;
-    unrecorded.retain(|name| !names.contains(name));
-    unrecorded.sort();
-    let open_intents = open.into_iter().collect();
-    let under_way = is_driven(folder);
-    Ok(Verified { records, head, anchored, closed, artefacts, open_intents, under_way, unrecorded })
+    if let Some(number) = reader.number_before_the_first()? {
+        return Err(broken(folder, 0, format!("a record with the number {number} stands before the first")));
+    }
+    let Seen { records, head, ended, artefacts, names, open, keys, seals, signed, .. } = seen;
+    Ok(Verified {
+        records,
+        head,
+        anchored,
+        closed: ended.is_some(),
+        artefacts,
+        open_intents: open.into_iter().collect(),
+        under_way,
+        unrecorded: unrecorded(folder, &names)?,
+        keys,
+        seals,
+        signed,
+    })
 }
 
 /// Whether somebody holds the lock of a run folder.
 fn is_driven(folder: &Path) -> bool {
     let lock = fs::File::open(folder.join(LOCK));
     lock.is_ok_and(|lock| matches!(lock.try_lock_shared(), Err(fs::TryLockError::WouldBlock)))
+}
+
+/// Returns the files of a run folder that stand in no record.
+fn unrecorded(folder: &Path, recorded: &BTreeSet<String>) -> Result<Vec<String>, JournalError> {
+    let mut names = Vec::new();
+    files_below(folder, "", &mut names)?;
+    names.retain(|name| !recorded.contains(name));
+    names.sort();
+    Ok(names)
 }
 
 /// Finds the files in a run folder, by their paths from it; those of the journal itself are left out, and what is no file.
@@ -151,36 +223,124 @@ fn files_below(folder: &Path, below: &str, found: &mut Vec<String>) -> Result<()
     Ok(())
 }
 
-impl Seen<'_> {
+impl<'a> Seen<'a> {
+    fn nothing(folder: &'a Path, trusted: &'a [PublicKey]) -> Self {
+        Self {
+            folder,
+            trusted,
+            records: 0,
+            head: "0".repeat(64),
+            ended: None,
+            run: String::new(),
+            key: None,
+            keys: Vec::new(),
+            seals: 0,
+            signed: 0,
+            names: BTreeSet::new(),
+            artefacts: 0,
+            last_intent: None,
+            open: BTreeSet::new(),
+            answered: BTreeSet::new(),
+        }
+    }
+
     fn take(&mut self, record: &Record) -> Result<(), JournalError> {
         let due = self.records + 1;
         let wrong = |what: &str| Err(broken(self.folder, due, what));
-        if record.seq != due {
-            return wrong(&format!("it is missing: record {} follows {}", record.seq, self.records));
-        }
-        if record.prev_hash != self.head {
-            return wrong(
-                "it does not follow the record before it: one of them was changed, moved, inserted or taken away",
-            );
-        }
-        if record.hash != record.hash_due() {
-            return wrong("its content is not what was written");
+        if let Some(flaw) = record.flaw_behind(self.records, &self.head) {
+            return wrong(&flaw);
         }
         if (record.kind == Kind::Begin) != (due == 1) {
             return wrong("a run begins with its first record, and only there");
         }
-        if self.closed {
+        // The end is sealed, once.
+        if self.ended.is_some_and(|end| record.kind != Kind::Seal || end < self.records) {
             return wrong("it stands behind the end of the run");
         }
         if serde_json::from_str::<serde::de::IgnoredAny>(&record.payload).is_err() {
             return wrong("its payload is no JSON");
         }
-        self.take_command(record)?;
-        self.take_artefact(record)?;
+        match record.kind {
+            Kind::Begin | Kind::Reopen => self.take_key(record)?,
+            Kind::Intent | Kind::Outcome => self.take_command(record)?,
+            Kind::Artefact => self.take_artefact(record)?,
+            Kind::Seal => self.take_seal(record)?,
+            Kind::Event | Kind::Note | Kind::End => {}
+        }
         self.records = due;
         self.head.clone_from(&record.hash);
-        self.closed = record.kind == Kind::End;
+        if record.kind == Kind::End {
+            self.ended = Some(due);
+        }
         Ok(())
+    }
+
+    fn take_key(&mut self, record: &Record) -> Result<(), JournalError> {
+        let wrong = |what: String| Err(broken(self.folder, record.seq, what));
+        let value = record.value();
+        if record.kind == Kind::Begin {
+            value["run"].as_str().unwrap_or_default().clone_into(&mut self.run);
+        }
+        self.key = match &value["key"] {
+            Value::Null => None,
+            key => match key.as_str().and_then(|key| key.parse().ok()) {
+                Some(key) => Some(key),
+                None => return wrong("it names a key that is none".to_owned()),
+            },
+        };
+        match self.key {
+            Some(key) if self.is_foreign(&key) => {
+                return wrong(format!("it names the key {key}, which is none of those given"));
+            }
+            Some(key) if !self.keys.contains(&key) => self.keys.push(key),
+            None if record.kind == Kind::Begin && !self.trusted.is_empty() => {
+                return wrong("it names no key, and one is given: the run is not signed".to_owned());
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn is_foreign(&self, key: &PublicKey) -> bool {
+        !self.trusted.is_empty() && !self.trusted.contains(key)
+    }
+
+    fn take_seal(&mut self, record: &Record) -> Result<(), JournalError> {
+        let wrong = |what: &str| Err(broken(self.folder, record.seq, what));
+        let Ok(seal) = serde_json::from_str::<Seal>(&record.payload) else { return wrong("it is no seal") };
+        let Some(key) = self.key.filter(|key| key.to_string() == seal.key) else {
+            return wrong("it is sealed with another key than the one that the run names");
+        };
+        if (seal.records, &seal.head) != (self.records, &self.head) {
+            return wrong("it seals another record than the one before it");
+        }
+        if !is_signed(&key, &self.run, seal.records, &seal.head, &seal.signature) {
+            return wrong("its signature is wrong: who wrote it or what stands before it did not have the key");
+        }
+        self.seals += 1;
+        self.signed = self.records;
+        Ok(())
+    }
+
+    /// Holds what has been seen against an anchor of as many records.
+    fn take_anchor(&self, anchor: &Anchor) -> Result<(), JournalError> {
+        let wrong = |what: &str| Err(broken(self.folder, self.records, what));
+        if anchor.run.as_ref().is_some_and(|run| *run != self.run) {
+            return wrong("the anchor is of another run");
+        }
+        if anchor.head != self.head {
+            return wrong("its hash is not the one of the anchor: the journal was rewritten");
+        }
+        let Some(key) = &self.key else { return Ok(()) };
+        match (&anchor.key, &anchor.signature) {
+            (Some(by), Some(signature)) if *by == key.to_string() => {
+                match is_signed(key, &self.run, anchor.records, &anchor.head, signature) {
+                    true => Ok(()),
+                    false => wrong("the signature of the anchor is wrong"),
+                }
+            }
+            _ => wrong("the anchor is not signed with the key that the run names"),
+        }
     }
 
     fn take_command(&mut self, record: &Record) -> Result<(), JournalError> {
@@ -194,25 +354,22 @@ impl Seen<'_> {
                 self.last_intent = Some(id);
                 self.open.insert(id);
             }
-            (Kind::Outcome, Some(id)) if self.open.contains(&id) || self.answered.contains(&id) => {
-                self.open.remove(&id);
+            (_, Some(id)) if self.open.remove(&id) || self.answered.contains(&id) => {
                 self.answered.insert(id);
             }
-            (Kind::Outcome, _) => return wrong("it is the outcome of a command that is not on record"),
-            _ => {}
+            _ => return wrong("it is the outcome of a command that is not on record"),
         }
         Ok(())
     }
 
     fn take_artefact(&mut self, record: &Record) -> Result<(), JournalError> {
-        if record.kind != Kind::Artefact {
-            return Ok(());
-        }
         let wrong = |what: String| Err(broken(self.folder, record.seq, what));
         let Ok(known) = serde_json::from_str::<Artefact>(&record.payload) else {
             return wrong("it names no file".to_owned());
         };
-        let path = path_within(self.folder, &known.name)?;
+        let Ok(path) = path_within(self.folder, &known.name) else {
+            return wrong(format!("{:?} cannot be the name of a file in a run folder", known.name));
+        };
         if !path.is_file() {
             return wrong(format!("the file {} is missing", known.name));
         }
@@ -222,5 +379,113 @@ impl Seen<'_> {
         self.artefacts += 1;
         self.names.insert(known.name);
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rusqlite::types::Value as Field;
+    use rusqlite::{Connection, params};
+    use serde_json::json;
+
+    use super::super::key::AuditKey;
+    use super::super::open::SCHEMA;
+    use super::super::record::{COLUMNS, Entry, Records};
+    use super::super::write::{Header, Journal};
+    use super::*;
+
+    /// A signed run of a hundred records.
+    fn run_of_a_hundred(folder: &Path) {
+        let header = Header {
+            run: "run-1".into(),
+            part: "SN 7".into(),
+            actor: "Ada".into(),
+            station: "console".into(),
+            simulation: true,
+            first_command_id: 1,
+            content: json!({ "recipe": "abc" }),
+        };
+        let mut journal = Journal::create_with(folder, header, Some(AuditKey::new())).unwrap();
+        for k in 0..48 {
+            let entry = |kind| Entry { reason: "why \u{b5}".into(), ..Entry::new(kind, k, 1, json!({ "k": k })) };
+            let id = journal.intend(entry(Kind::Intent)).unwrap();
+            match k {
+                7 => drop(journal.store("points.csv", b"1,2\n", k, 1).unwrap()),
+                _ => drop(journal.append(Entry { command_id: Some(id), ..entry(Kind::Outcome) }).unwrap()),
+            }
+        }
+        journal.close(99, 1, json!("accepted")).unwrap();
+    }
+
+    /// All values that differ from one in a single bit.
+    fn flipped(value: &Field) -> Vec<Field> {
+        match value {
+            Field::Integer(number) => (0..64).map(|bit| Field::Integer(number ^ 1_i64 << bit)).collect(),
+            Field::Text(text) => (0..8 * text.len())
+                .map(|bit| {
+                    let mut bytes = text.clone().into_bytes();
+                    bytes[bit / 8] ^= 1 << (bit % 8);
+                    Field::Blob(bytes)
+                })
+                .collect(),
+            _ => Vec::new(),
+        }
+    }
+
+    /// The number of the record at which a journal breaks, gone on with from what was seen before.
+    fn breaks_at(connection: &Connection, seen: &Seen<'_>, records: u64) -> Option<u64> {
+        let mut seen = seen.clone();
+        for record in Records::new(connection, seen.folder, seen.records + 1) {
+            if let Err(JournalError::Broken { seq, .. }) = record.and_then(|record| seen.take(&record)) {
+                return Some(seq);
+            }
+        }
+        // The anchor tells that the end is missing.
+        (seen.records < records).then_some(seen.records + 1)
+    }
+
+    #[test]
+    fn every_single_bit_of_every_field_of_a_hundred_records_is_found_at_its_record() {
+        let home = tempfile::tempdir().unwrap();
+        let folder = home.path().join("run");
+        run_of_a_hundred(&folder);
+        let records = verify(&folder).unwrap().records;
+        assert_eq!(records, 100);
+        // Changed and put right again in memory, by SQL.
+        let database = Connection::open_in_memory().unwrap();
+        let schema = SCHEMA.split("CREATE INDEX").next().unwrap();
+        database.execute_batch(schema).unwrap();
+        let file = folder.join(DATABASE);
+        database.execute("ATTACH ?1 AS written", [file.to_str().unwrap()]).unwrap();
+        database.execute_batch("INSERT INTO main.record SELECT * FROM written.record").unwrap();
+        let mut seen = Seen::nothing(&folder, &[]);
+        let (mut bits, mut impossible) = (0, 0);
+        for seq in 1..=records {
+            for column in COLUMNS.split(", ") {
+                let ask = format!("SELECT {column} FROM main.record WHERE seq = ?1");
+                let value: Field = database.query_row(&ask, [seq as i64], |row| row.get(0)).unwrap();
+                let is_text = matches!(value, Field::Text(_));
+                let text = if is_text { "CAST(?1 AS TEXT)" } else { "?1" };
+                let change = format!("UPDATE main.record SET {column} = {text} WHERE seq = ?2");
+                let mut change = database.prepare(&change).unwrap();
+                for other in flipped(&value) {
+                    // Two records cannot have one number.
+                    let Ok(1) = change.execute(params![other, seq as i64]) else {
+                        impossible += 1;
+                        continue;
+                    };
+                    assert_eq!(breaks_at(&database, &seen, records), Some(seq), "{column} of {seq}: {other:?}");
+                    let now = match (column, &other) {
+                        ("seq", Field::Integer(number)) => *number,
+                        _ => seq as i64,
+                    };
+                    change.execute(params![value, now]).unwrap();
+                    bits += 1;
+                }
+            }
+            let record = Records::new(&database, &folder, seq).next().unwrap().unwrap();
+            seen.take(&record).unwrap();
+        }
+        assert!(bits > 190_000 && impossible < 1_000, "{bits} bits, {impossible} impossible");
     }
 }

@@ -10,7 +10,9 @@ use serde_json::{Value, json};
 use super::artefact::{self, Artefact};
 use super::canonical::canonical_json;
 use super::error::JournalError;
+use super::key::AuditKey;
 use super::record::{COLUMNS, Entry, Kind, Record, Records, whole};
+use super::seal::{SEALED_EVERY, Seal};
 use super::verify::{Anchor, read_anchor};
 use super::{ANCHOR, DATABASE, LOCK, open};
 
@@ -41,9 +43,16 @@ pub struct Journal {
     /// Held, not read.
     _lock: File,
     boot_id: String,
+    run: String,
     part: String,
     first_command_id: u32,
+    /// Signs the head; without one nothing is signed.
+    key: Option<AuditKey>,
     tail: Tail,
+    /// The newest seal of this opening of the journal.
+    seal: Option<Seal>,
+    /// The number of records when the anchor was last written.
+    anchored: u64,
     /// A record whose write failed: only the database knows whether it stands.
     doubtful: Option<Record>,
     artefacts: BTreeMap<String, String>,
@@ -53,14 +62,17 @@ pub struct Journal {
 #[derive(Clone, Debug)]
 struct Tail {
     seq: u64,
+    mono_ns: u64,
+    cycle: u32,
     hash: String,
     last_command_id: Option<u32>,
+    /// Whether the run has its end. Only a seal may follow it.
     closed: bool,
 }
 
 impl Tail {
     fn of_nothing() -> Self {
-        Self { seq: 0, hash: "0".repeat(64), last_command_id: None, closed: false }
+        Self { seq: 0, mono_ns: 0, cycle: 0, hash: "0".repeat(64), last_command_id: None, closed: false }
     }
 }
 
@@ -70,6 +82,14 @@ impl Journal {
     /// # Errors
     /// A folder that is in use or cannot be written; a full disk.
     pub fn create(folder: impl AsRef<Path>, header: Header) -> Result<Self, JournalError> {
+        Self::create_with(folder, header, None)
+    }
+
+    /// As [`Journal::create`], and the head is signed with a key, if there is one: now, every [`SEALED_EVERY`] records, and at the end.
+    ///
+    /// # Errors
+    /// As [`Journal::create`].
+    pub fn create_with(folder: impl AsRef<Path>, header: Header, key: Option<AuditKey>) -> Result<Self, JournalError> {
         let folder = folder.as_ref().to_owned();
         if !open::is_free(&folder)? {
             return Err(JournalError::Exists { path: folder });
@@ -85,15 +105,19 @@ impl Journal {
             folder,
             _lock: lock,
             boot_id: boot_id(),
+            run,
             part,
             first_command_id,
+            key,
             tail: Tail::of_nothing(),
+            seal: None,
+            anchored: 0,
             doubtful: None,
             artefacts: BTreeMap::new(),
         };
         let payload = json!({
-            "run": run, "simulation": simulation, "first_command_id": first_command_id, "content": content,
-            "regrind": env!("CARGO_PKG_VERSION"),
+            "run": journal.run, "simulation": simulation, "first_command_id": first_command_id, "content": content,
+            "regrind": env!("CARGO_PKG_VERSION"), "key": journal.key.as_ref().map(AuditKey::public),
         });
         journal.append(Entry { actor, station, ..Entry::new(Kind::Begin, 0, 0, payload) })?;
         journal.anchor()?;
@@ -105,21 +129,42 @@ impl Journal {
     /// # Errors
     /// No journal there, one of another program, one that is in use, or closed.
     pub fn open(folder: impl AsRef<Path>) -> Result<Self, JournalError> {
+        Self::open_with(folder, None)
+    }
+
+    /// As [`Journal::open`], and the head is signed from here on with a key, if there is one: that of the beginning or another, and
+    /// what is recorded says which.
+    ///
+    /// # Errors
+    /// As [`Journal::open`].
+    pub fn open_with(folder: impl AsRef<Path>, key: Option<AuditKey>) -> Result<Self, JournalError> {
         let folder = folder.as_ref().to_owned();
         if !folder.join(DATABASE).is_file() {
             return Err(JournalError::Absent { path: folder });
         }
         let lock = lock(&folder)?;
         let connection = open::read_write(&folder)?;
-        let (part, first_command_id) = first_of(&connection, &folder)?;
-        let artefacts = artefacts_of(&connection, &folder)?;
-        let tail = read_tail(&connection, &folder)?;
-        let doubtful = None;
-        let boot_id = boot_id();
-        let mut journal =
-            Self { connection, folder, _lock: lock, boot_id, part, first_command_id, tail, doubtful, artefacts };
+        let (run, part, first_command_id) = first_of(&connection, &folder)?;
+        let mut journal = Self {
+            boot_id: boot_id(),
+            run,
+            part,
+            first_command_id,
+            key,
+            tail: read_tail(&connection, &folder)?,
+            seal: None,
+            anchored: 0,
+            doubtful: None,
+            artefacts: artefacts_of(&connection, &folder)?,
+            connection,
+            folder,
+            _lock: lock,
+        };
         journal.is_whole()?;
-        journal.append(Entry::new(Kind::Reopen, 0, 0, json!({ "regrind": env!("CARGO_PKG_VERSION") })))?;
+        let payload =
+            json!({ "regrind": env!("CARGO_PKG_VERSION"), "key": journal.key.as_ref().map(AuditKey::public) });
+        journal.append(Entry::new(Kind::Reopen, 0, 0, payload))?;
+        journal.anchor()?;
         Ok(journal)
     }
 
@@ -154,6 +199,7 @@ impl Journal {
             (Kind::Intent, _) => wrong("gets its command number from `intend`"),
             (Kind::Outcome, None) => wrong("needs the command number of its intent"),
             (Kind::Begin, _) if self.tail.seq > 0 => wrong("stands first only"),
+            (Kind::Seal, _) => wrong("is written by the journal itself"),
             _ => self.insert(entry).map(|record| record.seq),
         }
     }
@@ -219,17 +265,15 @@ impl Journal {
         self.register(found, mono_ns, cycle)
     }
 
-    /// Writes the number of records and the hash of the last beside the journal, and returns them to be kept elsewhere too.
+    /// Seals the journal if it has a key, writes the number of records and the hash of the last beside it, with the signature, and
+    /// returns them to be kept elsewhere too.
     ///
     /// # Errors
     /// A full or unwritable disk.
     pub fn anchor(&mut self) -> Result<Anchor, JournalError> {
         self.ask_where_it_ends()?;
-        let anchor = Anchor { records: self.tail.seq, head: self.tail.hash.clone() };
-        let mut text = canonical_json(&json!({ "records": anchor.records, "head": anchor.head }));
-        text.push('\n');
-        artefact::write_file(&self.folder.join(ANCHOR), text.as_bytes())?;
-        Ok(anchor)
+        self.seal()?;
+        self.write_anchor()
     }
 
     /// Writes the last record of the run and the anchor. Nothing can be recorded after it.
@@ -262,11 +306,58 @@ impl Journal {
         Ok(artefact)
     }
 
+    /// Records the head and its signature, unless nothing was recorded since.
+    fn seal(&mut self) -> Result<(), JournalError> {
+        let Some(key) = self.key.as_ref().filter(|_| self.tail.seq > self.sealed()) else { return Ok(()) };
+        let seal = Seal::new(key, &self.run, self.tail.seq, &self.tail.hash);
+        self.put(Entry::new(Kind::Seal, self.tail.mono_ns, self.tail.cycle, json!(seal)))?;
+        self.seal = Some(seal);
+        Ok(())
+    }
+
+    /// The number of the newest seal; 0 if this opening of the journal has none.
+    fn sealed(&self) -> u64 {
+        self.seal.as_ref().map_or(0, |seal| seal.records + 1)
+    }
+
+    /// Writes what the newest seal says beside the journal, or where nothing is signed what the last record does.
+    fn write_anchor(&mut self) -> Result<Anchor, JournalError> {
+        let anchor = match &self.seal {
+            Some(seal) => Anchor::sealed(&self.run, seal),
+            None => Anchor::new(self.tail.seq, self.tail.hash.clone()),
+        };
+        let mut text = canonical_json(&json!(anchor));
+        text.push('\n');
+        artefact::write_file(&self.folder.join(ANCHOR), text.as_bytes())?;
+        self.anchored = self.tail.seq;
+        Ok(anchor)
+    }
+
+    /// Seals and anchors what has become long. The record that made it so stands, whatever becomes of this: where it cannot be
+    /// done, it is done behind one of the next, and at the end at the latest.
+    fn move_along(&mut self) {
+        if self.tail.closed {
+            return;
+        }
+        if self.tail.seq >= self.sealed() + SEALED_EVERY && self.seal().is_err() {
+            return;
+        }
+        if self.tail.seq >= self.anchored + SEALED_EVERY {
+            let _ = self.write_anchor();
+        }
+    }
+
     fn insert(&mut self, entry: Entry) -> Result<Record, JournalError> {
+        let record = self.put(entry)?;
+        self.move_along();
+        Ok(record)
+    }
+
+    fn put(&mut self, entry: Entry) -> Result<Record, JournalError> {
         if let Some(stands) = self.ask_where_it_ends()?.filter(|record| record.is_of(&entry)) {
             return Ok(stands);
         }
-        if self.tail.closed {
+        if self.tail.closed && entry.kind != Kind::Seal {
             return Err(JournalError::Closed { path: self.folder.clone() });
         }
         let record = self.record_of(entry);
@@ -276,7 +367,8 @@ impl Journal {
         }
         self.tail.seq = record.seq;
         self.tail.hash.clone_from(&record.hash);
-        self.tail.closed = record.kind == Kind::End;
+        self.tail.closed |= record.kind == Kind::End;
+        (self.tail.mono_ns, self.tail.cycle) = (record.mono_ns, record.cycle);
         if record.kind == Kind::Intent {
             self.tail.last_command_id = record.command_id;
         }
@@ -337,19 +429,39 @@ impl Journal {
         let Some(record) = &self.doubtful else { return Ok(None) };
         self.tail = read_tail(&self.connection, &self.folder)?;
         let stands = self.tail.hash == record.hash;
-        Ok(self.doubtful.take().filter(|_| stands))
+        let stands = self.doubtful.take().filter(|_| stands);
+        if let Some(record) = stands.as_ref().filter(|record| record.kind == Kind::Seal) {
+            self.seal = serde_json::from_str(&record.payload).ok();
+        }
+        Ok(stands)
     }
 
-    /// A journal that ends before its anchor was cut, and is not gone on with.
+    /// A journal that was cut, or is not what was written since its anchor, is not gone on with: that would sign it.
     fn is_whole(&self) -> Result<(), JournalError> {
-        match read_anchor(&self.folder)? {
-            Some(anchor) if anchor.records > self.tail.seq => Err(JournalError::Broken {
-                path: self.folder.clone(),
-                seq: self.tail.seq + 1,
-                what: format!("{} records were written, and {} are there", anchor.records, self.tail.seq),
-            }),
-            _ => Ok(()),
+        let broken = |seq, what| Err(JournalError::Broken { path: self.folder.clone(), seq, what });
+        let (mut records, mut head) = (0, Tail::of_nothing().hash);
+        if let Some(anchor) = read_anchor(&self.folder)? {
+            if anchor.records > self.tail.seq {
+                let what = format!("{} records were written, and {} are there", anchor.records, self.tail.seq);
+                return broken(self.tail.seq + 1, what);
+            }
+            let last = self.records(anchor.records).next().transpose()?.filter(|r| r.seq == anchor.records);
+            if last.is_none_or(|record| record.hash != anchor.head) {
+                return broken(
+                    anchor.records,
+                    "its hash is not the one of the anchor: the journal was rewritten".into(),
+                );
+            }
+            (records, head) = (anchor.records, anchor.head);
         }
+        for record in self.records(records + 1) {
+            let record = record?;
+            if let Some(flaw) = record.flaw_behind(records, &head) {
+                return broken(records + 1, flaw);
+            }
+            (records, head) = (record.seq, record.hash);
+        }
+        Ok(())
     }
 }
 
@@ -373,14 +485,17 @@ fn boot_id() -> String {
     format!("{:016x}", rand::random::<u64>())
 }
 
-fn first_of(connection: &Connection, folder: &Path) -> Result<(String, u32), JournalError> {
+/// Returns the name of the run, the part and the first command number.
+fn first_of(connection: &Connection, folder: &Path) -> Result<(String, String, u32), JournalError> {
     let broken = |what: &str| JournalError::Broken { path: folder.to_owned(), seq: 1, what: what.to_owned() };
     let first = Records::new(connection, folder, 0).next().ok_or_else(|| broken("there is no record"))??;
     if first.kind != Kind::Begin {
         return Err(broken("it is not the beginning of a run"));
     }
-    let id = first.value()["first_command_id"].as_u64().and_then(|id| u32::try_from(id).ok());
-    Ok((first.part, id.ok_or_else(|| broken("it names no first command number"))?))
+    let value = first.value();
+    let id = value["first_command_id"].as_u64().and_then(|id| u32::try_from(id).ok());
+    let run = value["run"].as_str().ok_or_else(|| broken("it names no run"))?;
+    Ok((run.to_owned(), first.part, id.ok_or_else(|| broken("it names no first command number"))?))
 }
 
 fn artefacts_of(connection: &Connection, folder: &Path) -> Result<BTreeMap<String, String>, JournalError> {
@@ -398,28 +513,36 @@ fn artefacts_of(connection: &Connection, folder: &Path) -> Result<BTreeMap<Strin
 
 fn read_tail(connection: &Connection, folder: &Path) -> Result<Tail, JournalError> {
     let failed = JournalError::database(folder);
-    let last = connection
-        .query_row("SELECT seq, hash, kind FROM record ORDER BY seq DESC LIMIT 1", [], |row| {
-            Ok((whole(row, 0)?, row.get::<_, String>(1)?, row.get::<_, String>(2)?))
-        })
-        .optional()
-        .map_err(&failed)?;
-    let Some((seq, hash, kind)) = last else { return Ok(Tail::of_nothing()) };
+    let sql = "SELECT seq, mono_ns, cycle, hash FROM record ORDER BY seq DESC LIMIT 1";
+    let last = connection.query_row(sql, [], |row| {
+        let (seq, mono_ns, cycle, hash) = (whole(row, 0)?, whole(row, 1)?, row.get(2)?, row.get(3)?);
+        Ok(Tail { seq, mono_ns, cycle, hash, ..Tail::of_nothing() })
+    });
+    let Some(tail) = last.optional().map_err(&failed)? else { return Ok(Tail::of_nothing()) };
+    let ask = |sql| connection.prepare_cached(sql).map_err(&failed);
     let last_command_id =
-        connection.query_row("SELECT max(command_id) FROM record", [], |row| row.get(0)).map_err(&failed)?;
-    Ok(Tail { seq, hash, last_command_id, closed: kind == Kind::End.as_str() })
+        ask("SELECT max(command_id) FROM record NOT INDEXED")?.query_row([], |row| row.get(0)).map_err(&failed)?;
+    // The end is the last record, or the one before its seal.
+    let ended = "SELECT count(*) FROM record WHERE seq >= ?1 AND kind = 'end'";
+    let ends = ask(ended)?.query_row([signed(tail.seq) - 1], |row| row.get::<_, u32>(0)).map_err(&failed)?;
+    Ok(Tail { last_command_id, closed: ends > 0, ..tail })
 }
 
-/// Returns the intents without an outcome, in order.
+/// Returns the intents without an outcome, in order. The records themselves are read, and no index, which nobody proves.
 pub(super) fn open_intents(connection: &Connection, folder: &Path) -> Result<Vec<Record>, JournalError> {
     let failed = JournalError::database(folder);
-    let sql = "SELECT seq FROM record AS intent WHERE kind = 'intent' AND NOT EXISTS
-        (SELECT 1 FROM record WHERE kind = 'outcome' AND command_id = intent.command_id) ORDER BY seq";
+    let sql = "SELECT seq, command_id, kind = 'intent' FROM record NOT INDEXED
+        WHERE kind IN ('intent', 'outcome') AND command_id IS NOT NULL ORDER BY seq";
     let mut statement = connection.prepare(sql).map_err(&failed)?;
-    let numbers = statement.query_map([], |row| whole(row, 0)).map_err(&failed)?;
-    let mut open = Vec::new();
-    for seq in numbers {
-        open.extend(Records::new(connection, folder, seq.map_err(&failed)?).next().transpose()?);
+    let mut rows = statement.query([]).map_err(&failed)?;
+    let mut open = BTreeMap::new();
+    while let Some(row) = rows.next().map_err(&failed)? {
+        let (seq, id) = (whole(row, 0).map_err(&failed)?, row.get::<_, u32>(1).map_err(&failed)?);
+        match row.get(2).map_err(&failed)? {
+            true => drop(open.insert(id, seq)),
+            false => drop(open.remove(&id)),
+        }
     }
-    Ok(open)
+    let first = |seq| Records::new(connection, folder, seq).next().transpose();
+    open.into_values().filter_map(|seq| first(seq).transpose()).collect()
 }

@@ -111,7 +111,7 @@ impl Story {
                 }
                 self.end = Some(record);
             }
-            Kind::Reopen | Kind::Outcome | Kind::Note => {}
+            Kind::Reopen | Kind::Outcome | Kind::Note | Kind::Seal => {}
         }
     }
 
@@ -147,11 +147,13 @@ impl Story {
         html += &self.form(folder)?;
         html += &self.pictures(folder)?;
         html += &self.happenings();
-        let Verified { records, head, closed, .. } = verified;
+        let Verified { records, head, closed, signed, .. } = verified;
         let end = if *closed { "closed" } else { "not closed yet" };
+        let by = verified.keys.iter().map(|key| format!("<br/><code>{key}</code>")).collect::<String>();
+        let by = if by.is_empty() { "Not signed.".into() } else { format!("Signed up to record {signed} with:{by}") };
         let _ = write!(
             html,
-            "<footer><p>Made from {records} records in an unbroken chain ({end}). Hash of the last:<br/><code>{head}</code><br/>\
+            "<footer><p>Made from {records} records in an unbroken chain ({end}). Hash of the last:<br/><code>{head}</code><br/>{by}<br/>\
              To prove it again: <code>regrind audit verify</code></p></footer>\n</body>\n</html>\n"
         );
         Ok(html)

@@ -21,6 +21,7 @@ pub fn words(record: &Record) -> String {
         Kind::Event => serde_json::from_value(value.clone()).ok().map(|event: Event| event_words(&event)),
         Kind::Artefact => artefact_words(&value),
         Kind::End => end_words(&value),
+        Kind::Seal => seal_words(&value),
         Kind::Note => None,
     };
     let mut line = told.unwrap_or_else(|| value.as_str().map_or_else(|| record.payload.clone(), str::to_owned));
@@ -46,6 +47,11 @@ fn artefact_words(value: &Value) -> Option<String> {
     let sha256 = value["sha256"].as_str()?;
     let head = sha256.get(..12).unwrap_or(sha256);
     Some(format!("{}, {} bytes, sha256 {head}...", value["name"].as_str()?, value["bytes"]))
+}
+
+fn seal_words(value: &Value) -> Option<String> {
+    let key = value["key"].as_str()?;
+    Some(format!("sealed up to record {}, key {}...", value["records"], key.get(..12).unwrap_or(key)))
 }
 
 fn end_words(value: &Value) -> Option<String> {

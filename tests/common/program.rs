@@ -51,6 +51,8 @@ pub fn small_recipe(folder: &Path, speed: f64) -> PathBuf {
 pub fn regrind(arguments: &[&str], folder: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_regrind"));
     command.args(arguments).current_dir(folder).stdin(Stdio::null());
+    // Whoever runs the tests may have a key; records are signed here where a test says so.
+    command.env("REGRIND_KEY", "");
     command
 }
 
@@ -59,6 +61,7 @@ pub struct Running {
     child: Child,
     lines: Receiver<String>,
     errors: Option<std::thread::JoinHandle<String>>,
+    folder: Option<PathBuf>,
     pub said: Vec<String>,
     /// What came on the error stream, once it has ended.
     pub told: String,
@@ -66,6 +69,7 @@ pub struct Running {
 
 impl Running {
     pub fn new(mut command: Command) -> Self {
+        let folder = command.get_current_dir().map(Path::to_owned);
         let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         let (to, lines) = channel();
         let out = BufReader::new(child.stdout.take().unwrap());
@@ -77,7 +81,7 @@ impl Running {
             let _ = errors.read_to_string(&mut text);
             text
         });
-        Self { child, lines, errors: Some(errors), said: Vec::new(), told: String::new() }
+        Self { child, lines, errors: Some(errors), folder, said: Vec::new(), told: String::new() }
     }
 
     /// Waits for a line that will do.
@@ -172,12 +176,14 @@ impl Drop for Running {
         // It may have ended long ago.
         let _ = self.child.kill();
         let _ = self.child.wait();
+        self.folder.iter().for_each(|folder| crate::keep::keep(folder));
     }
 }
 
 /// Runs the program to its end.
 pub fn run(arguments: &[&str], folder: &Path) -> (i32, String, String) {
     let Output { status, stdout, stderr } = regrind(arguments, folder).output().unwrap();
+    crate::keep::keep(folder);
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
     (status.code().unwrap_or(-1), text(stdout), text(stderr))
 }

@@ -9,7 +9,7 @@ use regrind::cell::Actor;
 use regrind::config::{CellConfig, Link};
 use regrind::device::{ModbusCmm, ModbusGrinder};
 use regrind::drive::{Notice, Reply, Request, Run, ask};
-use regrind::journal::{Header, Journal};
+use regrind::journal::{AuditKey, Header, Journal};
 use regrind::recipe::Recipe;
 use regrind::setup;
 use regrind_sim::options::MachineOptions;
@@ -93,6 +93,12 @@ pub struct Ready {
     pub folder: PathBuf,
 }
 
+impl Drop for Rig {
+    fn drop(&mut self) {
+        crate::keep::keep(self.home.path());
+    }
+}
+
 impl Rig {
     pub async fn new(recipe: Recipe) -> Self {
         let spec = WorldSpec::deserialize(toml::Value::Table(recipe.simulation.clone().unwrap())).unwrap();
@@ -155,7 +161,7 @@ impl Rig {
             first_command_id: 1,
             content: json!({}),
         };
-        let journal = Journal::create(&folder, header).unwrap();
+        let journal = Journal::create_with(&folder, header, Some(AuditKey::new())).unwrap();
         let (notices, shown) = mpsc::unbounded_channel();
         let link = |link: &Link| setup::modbus(link, true, 7, self.runs).unwrap();
         let cmm = ModbusCmm::new(link(&self.cell.cmm.link)).unwrap();

@@ -3,6 +3,8 @@
 mod contract;
 mod exchange;
 mod interop;
+#[path = "../common/keep.rs"]
+mod keep;
 mod modbus;
 #[path = "../common/program.rs"]
 mod program;

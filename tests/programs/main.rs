@@ -2,6 +2,8 @@
 
 mod compensate;
 mod gcode;
+#[path = "../common/keep.rs"]
+mod keep;
 mod linuxcnc;
 mod path;
 #[path = "../common/program.rs"]

@@ -3,12 +3,12 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::program::run;
+use crate::program::{regrind, root, run, small_recipe};
 use regrind::cell::{
     Actor, Alarm, AlarmId, Command as Order, Device, Ending, Event, Figures, Judgement, Occupation, Role, Verdict,
     table,
 };
-use regrind::journal::{Entry, Header, Journal, Kind, sha256_hex};
+use regrind::journal::{AuditKey, Entry, Header, Journal, Kind, PublicKey, Reader, sha256_hex, verify};
 use regrind::report::state_picture;
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -246,6 +246,183 @@ fn what_is_exported_proves_itself() {
         assert!(serde_json::from_str::<Value>(line).unwrap()["payload"].is_object());
         previous = due;
     }
+}
+
+/// Reads CSV as RFC 4180 says, and nothing that it does not say.
+fn rows_of_csv(text: &str) -> Vec<Vec<String>> {
+    let (mut rows, mut row, mut field) = (Vec::new(), Vec::new(), String::new());
+    let mut letters = text.chars().peekable();
+    while let Some(letter) = letters.next() {
+        match letter {
+            '"' if field.is_empty() => loop {
+                match letters.next().expect("a quote is closed") {
+                    '"' if letters.peek() == Some(&'"') => field.extend(letters.next()),
+                    '"' => break,
+                    other => field.push(other),
+                }
+            },
+            ',' => row.push(std::mem::take(&mut field)),
+            '\r' => {
+                assert_eq!(letters.next(), Some('\n'));
+                row.push(std::mem::take(&mut field));
+                rows.push(std::mem::take(&mut row));
+            }
+            plain => {
+                assert!(plain != '"' && plain != '\n');
+                field.push(plain);
+            }
+        }
+    }
+    assert!(row.is_empty() && field.is_empty(), "the last line has its end");
+    rows
+}
+
+#[test]
+fn a_record_in_csv_is_exact() {
+    let (home, folder) = recorded(false);
+    let rows = rows_of_csv(&printed(home.path(), &["audit", "export", "--format", "csv"], 0));
+    let head = "seq utc boot_id mono_ns actor station kind part cycle command_id reason payload prev_hash hash";
+    assert_eq!(rows[0], head.split(' ').collect::<Vec<_>>());
+    let records: Vec<_> = Reader::open(&folder).unwrap().records(1).map(Result::unwrap).collect();
+    assert_eq!(rows.len(), records.len() + 1);
+    for (row, record) in rows[1..].iter().zip(records) {
+        let id = record.command_id.map_or(String::new(), |id| id.to_string());
+        let numbers = [record.seq.to_string(), record.mono_ns.to_string(), record.cycle.to_string()];
+        assert_eq!([&row[0], &row[3], &row[8]], numbers.each_ref());
+        let texts = [&record.utc, &record.boot_id, &record.actor, &record.station, &record.part, &id, &record.reason];
+        assert_eq!([1, 2, 4, 5, 7, 9, 10].map(|k| &row[k]), texts);
+        assert_eq!([&row[11], &row[12], &row[13]], [&record.payload, &record.prev_hash, &record.hash]);
+        assert_eq!(row[6], record.kind.as_str());
+    }
+    assert!(refused(home.path(), &["audit", "export", "--format", "xml"], 2).contains("jsonl"));
+}
+
+/// What a command prints and says where REGRIND_KEY names a file, and its exit code.
+fn with_key(home: &Path, key: &Path, arguments: &[&str]) -> (i32, String, String) {
+    let done = regrind(arguments, home).env("REGRIND_KEY", key).output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    (done.status.code().unwrap(), text(done.stdout), text(done.stderr))
+}
+
+#[test]
+fn the_key_of_a_computer_is_made_once_and_its_public_half_is_told_again() {
+    let home = tempfile::tempdir().unwrap();
+    let path = home.path().join("settings/audit.key");
+    let (code, said, errors) = with_key(home.path(), &path, &["audit", "key"]);
+    assert_eq!((code, errors.as_str()), (0, ""));
+    let public = PublicKey::from_text(&said).unwrap();
+    assert!(said.contains("made now") && said.contains(&public.fingerprint()) && said.contains("quality"), "{said}");
+    let (_, said, _) = with_key(home.path(), &path, &["audit", "key", "--json"]);
+    let value: Value = serde_json::from_str(&said).unwrap();
+    assert_eq!((&value["public_key"], &value["made"]), (&json!(public), &json!(false)));
+    assert_eq!(AuditKey::read(&path).unwrap().public(), public);
+    // The usual place, and a place that is named.
+    let done = regrind(&["audit", "key", "--json"], home.path())
+        .env_remove("REGRIND_KEY")
+        .env("XDG_CONFIG_HOME", home.path())
+        .output();
+    let value: Value = serde_json::from_slice(&done.unwrap().stdout).unwrap();
+    assert_eq!(value["file"], json!(home.path().join("regrind/audit.key")));
+    let done = regrind(&["audit", "key"], home.path())
+        .env_remove("REGRIND_KEY")
+        .env_remove("XDG_CONFIG_HOME")
+        .env("HOME", home.path())
+        .output();
+    assert!(done.unwrap().status.success() && home.path().join(".config/regrind/audit.key").is_file());
+    printed(home.path(), &["audit", "key", "--key", "here.key"], 0);
+    assert!(refused(home.path(), &["audit", "key"], 2).contains("name the file with --key"), "REGRIND_KEY is empty");
+    fs::write(home.path().join("broken.key"), "x").unwrap();
+    std::os::unix::fs::symlink("/nowhere/at/all", home.path().join("dangling.key")).unwrap();
+    for file in ["broken.key", "dangling.key", "here.key/below.key", "."] {
+        let error = refused(home.path(), &["audit", "key", "--key", file], 2);
+        assert!(error.contains(file), "{error}");
+    }
+}
+
+#[test]
+fn a_run_signs_its_record_and_quality_proves_it_with_the_key_that_it_kept() {
+    let home = tempfile::tempdir().unwrap();
+    let key = home.path().join("audit.key");
+    let kept = with_key(home.path(), &key, &["audit", "key"]).1;
+    fs::write(home.path().join("kept"), &kept).unwrap();
+    let public = PublicKey::from_text(&kept).unwrap();
+    let recipe = small_recipe(home.path(), 1e4);
+    let cell = root().join("config/sim.toml");
+    let arguments = ["run", recipe.to_str().unwrap(), "--cell", cell.to_str().unwrap(), "--runs", "runs"];
+    let (code, said, errors) = with_key(home.path(), &key, &arguments);
+    assert_eq!(code, 0, "{said}{errors}");
+    for given in ["kept".to_owned(), public.to_string()] {
+        let words = printed(home.path(), &["audit", "verify", "--key", &given], 0);
+        assert!(words.contains("signed      to its end") && words.contains("as given"), "{words}");
+        assert!(words.contains(&public.fingerprint()), "{words}");
+    }
+    assert!(printed(home.path(), &["audit", "verify"], 0).contains("only --key can tell"));
+    let value: Value = serde_json::from_str(&printed(home.path(), &["audit", "verify", "--json"], 0)).unwrap();
+    assert_eq!(value["keys"], json!([public]));
+    assert_eq!(value["signed"].as_u64().unwrap() + 1, value["records"].as_u64().unwrap());
+    let other = AuditKey::new().public().to_string();
+    let error = refused(home.path(), &["audit", "verify", "--key", &other], 1);
+    assert!(error.contains("broken at record 1") && error.contains("none of those given"), "{error}");
+    printed(home.path(), &["audit", "verify", "--key", &other, "--key", "kept"], 0);
+    let shown = printed(home.path(), &["audit", "show", "--kind", "seal"], 0);
+    assert!(shown.contains("sealed up to record 1, key "), "{shown}");
+    for wrong in ["", "abc", "absent", "small.toml"] {
+        let error = refused(home.path(), &["audit", "verify", "--key", wrong], 2);
+        assert!(error.contains("regrind audit key"), "{wrong}: {error}");
+    }
+    assert!(fs::read_to_string(report_in(home.path())).unwrap().contains(&public.to_string()));
+}
+
+/// The report of the one run of a folder.
+fn report_in(home: &Path) -> PathBuf {
+    let run = fs::read_dir(home.join("runs")).unwrap().next().unwrap().unwrap().path();
+    run.join("report.html")
+}
+
+#[test]
+fn a_run_does_not_begin_with_a_key_that_cannot_be_used() {
+    use std::os::unix::fs::PermissionsExt;
+    let home = tempfile::tempdir().unwrap();
+    let recipe = small_recipe(home.path(), 1e4);
+    let cell = root().join("config/sim.toml");
+    let key = home.path().join("audit.key");
+    AuditKey::make(&key).unwrap();
+    fs::set_permissions(&key, fs::Permissions::from_mode(0o644)).unwrap();
+    fs::write(home.path().join("broken.key"), "x").unwrap();
+    fs::set_permissions(home.path().join("broken.key"), fs::Permissions::from_mode(0o600)).unwrap();
+    for (file, says) in [("audit.key", "chmod 600"), ("broken.key", "no audit key"), ("absent.key", "absent.key")] {
+        let arguments = ["run", recipe.to_str().unwrap(), "--cell", cell.to_str().unwrap(), "--runs", "runs"];
+        let (code, said, errors) = with_key(home.path(), &home.path().join(file), &arguments);
+        assert_eq!(code, 2, "{file}: {said}");
+        assert!(errors.contains(says), "{file}: {errors}");
+        assert!(!home.path().join("runs").exists(), "{file}: a run was begun");
+    }
+}
+
+#[test]
+fn an_end_that_is_not_signed_ends_with_1_where_the_run_names_a_key() {
+    let home = tempfile::tempdir().unwrap();
+    let folder = home.path().join("runs/r");
+    let header = Header {
+        run: "r".into(),
+        part: "SN 7".into(),
+        actor: "Ada".into(),
+        station: "console".into(),
+        simulation: false,
+        first_command_id: 1,
+        content: Value::Null,
+    };
+    let journal = Journal::create_with(&folder, header, Some(AuditKey::new())).unwrap();
+    assert!(printed(home.path(), &["audit", "verify"], 0).contains("signed      up to record 1 of 2"));
+    journal.close(0, 0, json!("stopped")).unwrap();
+    printed(home.path(), &["audit", "verify"], 0);
+    let database = rusqlite::Connection::open(folder.join("journal.sqlite")).unwrap();
+    database.execute_batch("DROP TRIGGER record_is_not_deleted; DELETE FROM record WHERE seq = 4").unwrap();
+    drop(database);
+    assert!(verify(&folder).unwrap().lacks_last_seal());
+    assert!(refused(home.path(), &["audit", "verify"], 1).contains("its end is not signed"));
+    let (home, _) = recorded(false);
+    assert!(printed(home.path(), &["audit", "verify"], 0).contains("signed      no: who wrote it had no key"));
 }
 
 #[test]

@@ -10,6 +10,8 @@ mod data;
 mod faults;
 mod heartbeats;
 mod height_maps;
+#[path = "../common/keep.rs"]
+mod keep;
 mod killed;
 mod learning;
 mod manual;

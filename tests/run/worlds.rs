@@ -238,6 +238,7 @@ pub fn run(setup: Setup) -> Ran {
 
 async fn go(setup: Setup) -> Ran {
     let home = tempfile::tempdir().unwrap();
+    let _kept = crate::keep::Kept(home.path().to_owned());
     let folder = home.path().join("run");
     let mut recipe = Recipe::read(&root().join(format!("recipes/{}.toml", setup.recipe))).unwrap();
     recipe.measure.temperature_c = setup.temperature_c;

@@ -1,60 +1,18 @@
-//! The journal: what was acknowledged is there, and every change is found.
+//! What was acknowledged is there, and what was not is not.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use regrind_journal::{
-    Anchor, Entry, Header, Journal, JournalError, Kind, Reader, canonical_json, sha256_hex, verify, verify_against,
-};
+use regrind_journal::{Against, AuditKey, Entry, Journal, JournalError, Kind, Reader, verify, verify_against};
 use rusqlite::Connection;
 use serde_json::json;
-use tempfile::TempDir;
 
-fn header() -> Header {
-    Header {
-        run: "run-1".into(),
-        part: "SN 7".into(),
-        actor: "Ada".into(),
-        station: "console".into(),
-        simulation: true,
-        first_command_id: 1,
-        content: json!({ "recipe": "abc" }),
-    }
-}
-
-/// A run of a few records, closed.
-fn written() -> (TempDir, PathBuf, Anchor) {
-    let home = tempfile::tempdir().unwrap();
-    let folder = home.path().join("runs/run-1");
-    let mut journal = Journal::create(&folder, header()).unwrap();
-    for cycle in 1..4 {
-        let id = journal.intend(Entry::new(Kind::Intent, 5, cycle, json!({ "command": "register" }))).unwrap();
-        journal
-            .append(Entry {
-                command_id: Some(id),
-                ..Entry::new(Kind::Outcome, 6, cycle, json!({ "z": 1.5, "a": "ü\n" }))
-            })
-            .unwrap();
-        journal.store(&format!("cycle-{cycle}/measured.csv"), b"1,2,3\n", 7, cycle).unwrap();
-    }
-    let anchor = journal.close(9, 3, json!("accepted")).unwrap();
-    (home, folder, anchor)
-}
-
-/// Changes the database as somebody would who knows SQL.
-fn tamper(folder: &Path, sql: &str) {
-    let database = Connection::open(folder.join("journal.sqlite")).unwrap();
-    let triggers = ["record_is_not_changed", "record_is_not_deleted", "record_follows_the_last"];
-    for trigger in triggers {
-        database.execute_batch(&format!("DROP TRIGGER {trigger}")).unwrap();
-    }
-    database.execute_batch(sql).unwrap();
-}
+use crate::written::{closed, header, home, long, tamper};
 
 #[test]
 fn what_was_written_is_read_and_verified() {
-    let (_home, folder, anchor) = written();
+    let (_home, folder, anchor) = closed();
     let verified = verify(&folder).unwrap();
     assert_eq!((verified.records, verified.artefacts, verified.closed, verified.anchored), (11, 3, true, 11));
     assert_eq!(verified.head, anchor.head);
@@ -65,52 +23,23 @@ fn what_was_written_is_read_and_verified() {
 }
 
 #[test]
-fn every_change_is_found() {
-    let fields = [
-        "utc = 'x'",
-        "boot_id = 'x'",
-        "mono_ns = 1",
-        "actor = 'x'",
-        "station = 'x'",
-        "kind = 'note'",
-        "part = 'x'",
-        "cycle = 9",
-        "command_id = 77",
-        "reason = 'x'",
-        "payload = '{}'",
-        "prev_hash = 'x'",
-        "hash = 'x'",
-        "seq = 99",
-    ];
-    let mut changes: Vec<_> = fields.iter().map(|field| format!("UPDATE record SET {field} WHERE seq = 6")).collect();
-    changes.push("DELETE FROM record WHERE seq = 6".into());
-    changes.push("DELETE FROM record WHERE seq = 1".into());
-    changes.push("DELETE FROM record WHERE seq > 8".into());
-    changes.push("DELETE FROM record".into());
-    changes.push("UPDATE record SET seq = 100 WHERE seq = 5; UPDATE record SET seq = 5 WHERE seq = 6; UPDATE record SET seq = 6 WHERE seq = 100".into());
-    changes.push("INSERT INTO record SELECT 12, utc, boot_id, mono_ns, actor, station, kind, part, cycle, command_id, reason, payload, prev_hash, 'y' FROM record WHERE seq = 6".into());
-    for sql in changes {
-        let (_home, folder, _) = written();
-        tamper(&folder, &sql);
-        assert!(matches!(verify(&folder), Err(JournalError::Broken { .. })), "{sql}: {:?}", verify(&folder));
-    }
-}
-
-#[test]
 fn a_cut_tail_is_found_by_an_anchor_kept_elsewhere_and_a_changed_file_by_its_hash() {
-    let (_home, folder, anchor) = written();
+    let (_home, folder, anchor) = closed();
     std::fs::remove_file(folder.join("journal.anchor")).unwrap();
     tamper(&folder, "DELETE FROM record WHERE seq > 8");
     assert!(!verify(&folder).unwrap().closed);
-    assert!(matches!(verify_against(&folder, &anchor), Err(JournalError::Broken { seq: 9, .. })));
-    let (_home, folder, _) = written();
+    assert!(matches!(
+        verify_against(&folder, &Against { anchor: Some(anchor), keys: Vec::new() }),
+        Err(JournalError::Broken { seq: 9, .. })
+    ));
+    let (_home, folder, _) = closed();
     std::fs::write(folder.join("cycle-2/measured.csv"), "1,2,4\n").unwrap();
     assert!(matches!(verify(&folder), Err(JournalError::Broken { seq: 7, .. })));
 }
 
 #[test]
 fn triggers_stand_in_the_way_of_changes() {
-    let (_home, folder, _) = written();
+    let (_home, folder, _) = closed();
     let database = Connection::open(folder.join("journal.sqlite")).unwrap();
     for sql in ["UPDATE record SET cycle = 1", "DELETE FROM record"] {
         assert!(database.execute_batch(sql).is_err());
@@ -119,7 +48,7 @@ fn triggers_stand_in_the_way_of_changes() {
 
 #[test]
 fn a_writer_that_was_cut_off_keeps_every_acknowledged_record_and_reuses_no_number() {
-    let home = tempfile::tempdir().unwrap();
+    let home = home();
     let folder = home.path().join("run");
     let mut journal = Journal::create(&folder, header()).unwrap();
     let first = journal.intend(Entry::new(Kind::Intent, 1, 1, json!({}))).unwrap();
@@ -137,8 +66,29 @@ fn a_writer_that_was_cut_off_keeps_every_acknowledged_record_and_reuses_no_numbe
 }
 
 #[test]
+fn what_is_not_answered_is_read_from_the_records_and_not_from_an_index() {
+    let home = home();
+    let folder = home.path().join("run");
+    let mut journal = Journal::create(&folder, header()).unwrap();
+    for k in 0..4 {
+        let id = journal.intend(Entry::new(Kind::Intent, k, 1, json!({}))).unwrap();
+        if k % 2 == 0 {
+            let outcome = Entry { command_id: Some(id), ..Entry::new(Kind::Outcome, k, 1, json!({})) };
+            journal.append(outcome.clone()).unwrap();
+            journal.append(Entry { mono_ns: 9, ..outcome }).unwrap();
+        }
+    }
+    drop(journal);
+    tamper(&folder, "DROP INDEX record_command");
+    let mut journal = Journal::open(&folder).unwrap();
+    let open: Vec<_> = journal.open_intents().unwrap().iter().map(|record| record.command_id).collect();
+    assert_eq!(open, [Some(2), Some(4)]);
+    assert_eq!(journal.intend(Entry::new(Kind::Intent, 9, 1, json!({}))).unwrap(), 5);
+}
+
+#[test]
 fn folders_in_use_and_foreign_files_are_refused() {
-    let (home, folder, _) = written();
+    let (home, folder, _) = closed();
     assert!(matches!(Journal::create(&folder, header()).map(|_| ()), Err(JournalError::Exists { .. })));
     assert!(matches!(verify(home.path()), Err(JournalError::Absent { .. })));
     let file = home.path().join("file");
@@ -157,7 +107,7 @@ fn folders_in_use_and_foreign_files_are_refused() {
 
 #[test]
 fn names_do_not_lead_out_of_the_folder_and_nothing_on_record_is_written_over() {
-    let home = tempfile::tempdir().unwrap();
+    let home = home();
     let mut journal = Journal::create(home.path().join("run"), header()).unwrap();
     for name in ["", "../x", "/x", "a/../b", "a/", "journal.sqlite", "journal.sqlite-wal", ".lock"] {
         assert!(matches!(journal.store(name, b"x", 0, 0), Err(JournalError::Name { .. })), "{name}");
@@ -173,7 +123,7 @@ const PLAY: &str = "REGRIND_JOURNAL_PLAY";
 /// This test program again, playing one of its parts in a folder.
 fn child(part: &str, folder: &Path) -> Command {
     let mut child = Command::new(std::env::current_exe().unwrap());
-    child.args([part, "--exact", "--nocapture", "--test-threads=1"]).env(PLAY, folder);
+    child.args([&format!("writing::{part}"), "--exact", "--nocapture", "--test-threads=1"]).env(PLAY, folder);
     child
 }
 
@@ -197,7 +147,7 @@ fn part_of_a_writer() {
 #[test]
 fn a_killed_writer_leaves_every_acknowledged_record_and_a_whole_chain() {
     for least in [1, 40, 300] {
-        let home = tempfile::tempdir().unwrap();
+        let home = home();
         let folder = home.path().join("run");
         let mut writer = child("part_of_a_writer", &folder).stdout(Stdio::piped()).spawn().unwrap();
         let mut lines = BufReader::new(writer.stdout.take().unwrap()).lines();
@@ -231,12 +181,15 @@ fn part_of_a_writer_on_a_small_disk() {
     let ballast = disk.join("ballast");
     std::fs::write(&ballast, vec![0; 128 << 10]).unwrap();
     let folder = disk.join("run");
-    let mut journal = Journal::create(&folder, header()).unwrap();
+    let mut journal = Journal::create_with(&folder, header(), Some(AuditKey::new())).unwrap();
     let event = |k: u64| Entry::new(Kind::Event, k, 1, json!({ "words": "x".repeat(2000) }));
     let full =
         (0..10_000).find_map(|k| journal.append(event(k)).err()).expect("the disk was large enough for everything");
     assert!(full.is_disk_full(), "{full:?}");
     assert!(full.to_string().contains("free space"), "{full}");
+    // Until there is no room for a short record either.
+    let short = |k: u64| Entry::new(Kind::Event, k, 2, json!({}));
+    (0..10_000).find_map(|k| journal.append(short(k)).err()).expect("the disk was large enough for everything");
     let acknowledged = journal.last_seq();
     assert_eq!(verify(&folder).unwrap().records, acknowledged, "read on a full disk");
     let refused = journal.intend(Entry::new(Kind::Intent, 0, 1, json!({}))).unwrap_err();
@@ -248,7 +201,9 @@ fn part_of_a_writer_on_a_small_disk() {
     assert_eq!(journal.append(event(0)).unwrap(), acknowledged + 1, "room again: the run goes on");
     assert_eq!(journal.intend(Entry::new(Kind::Intent, 0, 1, json!({}))).unwrap(), 1, "no number was used up");
     journal.close(0, 1, json!("stopped")).unwrap();
-    assert_eq!(verify(&folder).unwrap().records, acknowledged + 3);
+    let verified = verify(&folder).unwrap();
+    // The event, the command, the end and its seal; the first seal stands behind the beginning.
+    assert_eq!((verified.records, verified.seals), (acknowledged + 4, 2));
     println!("\nplayed to the end, {acknowledged} records");
 }
 
@@ -260,7 +215,7 @@ fn is_named(file: &std::io::Result<std::fs::DirEntry>, part: &str) -> bool {
 #[test]
 #[ignore = "needs a system that gives users a mount namespace"]
 fn a_full_disk_stops_the_run_loses_nothing_and_is_recovered_from() {
-    let home = tempfile::tempdir().unwrap();
+    let home = home();
     let mount = "mount -t tmpfs -o size=512k none \"$0\" || exit 77; exec \"$@\"";
     let player = child("part_of_a_writer_on_a_small_disk", home.path());
     let mut command = Command::new("unshare");
@@ -279,7 +234,7 @@ fn a_full_disk_stops_the_run_loses_nothing_and_is_recovered_from() {
 #[test]
 fn a_full_disk_is_named_by_files_too() {
     // A device on which every write fails for want of room, under the name that a file has before it is whole.
-    let home = tempfile::tempdir().unwrap();
+    let home = home();
     let folder = home.path().join("run");
     let mut journal = Journal::create(&folder, header()).unwrap();
     let before = verify(&folder).unwrap();
@@ -309,7 +264,7 @@ fn make_read_only(folder: &Path, read_only: bool) {
 #[test]
 #[ignore = "needs a user who may not write everywhere: not root"]
 fn a_folder_that_cannot_be_written_is_read_and_refuses_a_writer() {
-    let home = tempfile::tempdir().unwrap();
+    let home = home();
     let folder = home.path().join("run");
     let mut journal = Journal::create(&folder, header()).unwrap();
     journal.append(Entry::new(Kind::Note, 0, 0, json!("x"))).unwrap();
@@ -325,37 +280,10 @@ fn a_folder_that_cannot_be_written_is_read_and_refuses_a_writer() {
     }
 }
 
-/// A journal of so many records, written at once by the rules of its documentation and not by the code under test.
-fn long_journal(records: u64) -> (TempDir, PathBuf) {
-    let home = tempfile::tempdir().unwrap();
-    let folder = home.path().join("run");
-    Journal::create(&folder, header()).unwrap();
-    let first = Reader::open(&folder).unwrap().records(0).next().unwrap().unwrap();
-    let mut database = Connection::open(folder.join("journal.sqlite")).unwrap();
-    let transaction = database.transaction().unwrap();
-    let mut previous = first.hash;
-    for seq in 2..=records {
-        let payload = json!({ "done": seq, "event": "progressed", "total": records, "words": "of the path" });
-        let (utc, boot_id) = ("2026-07-04T12:00:00Z", "0");
-        let text = canonical_json(&json!({
-            "seq": seq, "utc": utc, "boot_id": boot_id, "mono_ns": seq, "actor": "grinder", "station": "wire",
-            "kind": "event", "part": "SN 7", "cycle": 1, "command_id": null, "reason": "", "payload": payload,
-        }));
-        let hash = sha256_hex(format!("regrind journal record 1\n{previous}\n{text}").as_bytes());
-        let sql =
-            "INSERT INTO record VALUES (?1, ?2, ?3, ?1, 'grinder', 'wire', 'event', 'SN 7', 1, NULL, '', ?4, ?5, ?6)";
-        let values = rusqlite::params![seq as i64, utc, boot_id, canonical_json(&payload), previous, hash];
-        transaction.prepare_cached(sql).unwrap().execute(values).unwrap();
-        previous = hash;
-    }
-    transaction.commit().unwrap();
-    (home, folder)
-}
-
 #[test]
 fn a_journal_of_many_pages_is_read_whole_and_a_change_in_any_of_them_is_found() {
     const RECORDS: u64 = 2_100;
-    let (_home, folder) = long_journal(RECORDS);
+    let (_home, folder) = long(RECORDS);
     assert_eq!(verify(&folder).unwrap().records, RECORDS);
     let reader = Reader::open(&folder).unwrap();
     for from in [0, 1, 2, 1_023, 1_024, RECORDS, RECORDS + 1, u64::MAX] {
@@ -364,7 +292,7 @@ fn a_journal_of_many_pages_is_read_whole_and_a_change_in_any_of_them_is_found() 
     }
     // Pages end at 1, 3, 7 ... 511, 1023, 1535.
     for seq in [1, 2, 3, 4, 511, 512, 1_535, 1_536, RECORDS] {
-        let (_home, folder) = long_journal(RECORDS);
+        let (_home, folder) = long(RECORDS);
         tamper(&folder, &format!("UPDATE record SET kind = 'nothing' WHERE seq = {seq}"));
         let found = verify(&folder);
         assert!(matches!(found, Err(JournalError::Broken { seq: at, .. }) if at == seq), "{seq}: {found:?}");
@@ -379,7 +307,7 @@ fn a_journal_of_many_pages_is_read_whole_and_a_change_in_any_of_them_is_found() 
 
 #[test]
 fn what_a_writer_adds_is_found_by_a_reader_that_has_begun() {
-    let home = tempfile::tempdir().unwrap();
+    let home = home();
     let folder = home.path().join("run");
     let mut journal = Journal::create(&folder, header()).unwrap();
     let reader = Reader::open(&folder).unwrap();
@@ -387,22 +315,5 @@ fn what_a_writer_adds_is_found_by_a_reader_that_has_begun() {
     for seq in 1..40 {
         assert_eq!(records.next().unwrap().unwrap().seq, seq);
         assert_eq!(journal.append(Entry::new(Kind::Note, 0, 0, json!(seq))).unwrap(), seq + 1);
-    }
-}
-
-/// Tells how long it takes to verify a long journal: `cargo test --release -p regrind-journal --test journal -- --ignored --nocapture`.
-#[test]
-#[ignore = "a measurement"]
-fn time_of_verifying() {
-    for records in [10_000, 100_000] {
-        let (_home, folder) = long_journal(records);
-        let began = std::time::Instant::now();
-        verify(&folder).unwrap();
-        let took = began.elapsed();
-        println!(
-            "{records} records in {:.3} s, {:.2} us each",
-            took.as_secs_f64(),
-            1e6 * took.as_secs_f64() / records as f64
-        );
     }
 }

@@ -1,0 +1,128 @@
+//! `regrind audit key`: where the key of this computer lies, making it, and the public half on its way to quality.
+
+use std::env;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use regrind::journal::{AuditKey, JournalError, PublicKey};
+use serde_json::json;
+
+use super::Outcome;
+use super::failure::Failure;
+
+/// Names the file of the key; empty, there is to be none.
+const KEY: &str = "REGRIND_KEY";
+
+/// Make the key that signs the records of this computer, once, and print its public half
+#[derive(Args, Debug)]
+#[command(after_help = "\
+The key is made where REGRIND_KEY says, else in $XDG_CONFIG_HOME/regrind/audit.key or ~/.config/regrind/audit.key, readable by
+its owner only. A key that is there is kept, and its public half is printed. Every run of this user signs with it from then on.
+
+Examples:
+  regrind audit key
+  regrind audit key --json > /mnt/quality/grinding-cell-2.key
+  regrind audit verify --key /mnt/quality/grinding-cell-2.key
+
+Exit codes: 0 printed; 2 the file cannot be made or read, others may read it, or it holds no key.")]
+pub(super) struct Arguments {
+    /// File of the key
+    #[arg(long, value_name = "FILE")]
+    key: Option<PathBuf>,
+    /// Print JSON instead of words
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let named = || Place::of_this_user().file().ok_or(Failure::NoPlaceForKey);
+    let path = arguments.key.clone().map_or_else(named, Ok)?;
+    let (key, made) = made_or_read(&path).map_err(Failure::Journal)?;
+    let public = key.public();
+    if arguments.json {
+        let fingerprint = public.fingerprint();
+        super::print_json(&json!({ "public_key": public, "fingerprint": fingerprint, "file": path, "made": made }))?;
+    } else {
+        super::print(&in_words(&public, &path, made))?;
+    }
+    Ok(Outcome::Accepted)
+}
+
+fn made_or_read(path: &Path) -> Result<(AuditKey, bool), JournalError> {
+    if path.exists() {
+        return Ok((AuditKey::read(path)?, false));
+    }
+    match AuditKey::make(path) {
+        Ok(key) => Ok((key, true)),
+        // Another process may have made it at the same moment.
+        Err(JournalError::File { source, .. }) if source.kind() == io::ErrorKind::AlreadyExists => {
+            Ok((AuditKey::read(path)?, false))
+        }
+        Err(error) => Err(error),
+    }
+}
+
+fn in_words(public: &PublicKey, path: &Path, made: bool) -> String {
+    let made = if made { "made now" } else { "was there" };
+    let fingerprint = public.fingerprint();
+    format!(
+        "public key   {public}\nfingerprint  {fingerprint}\nfile         {}, {made}\n\n\
+         Runs of this user sign their records with it from now on. Keep the public key where nobody at this computer can change it:\n\
+         give it to quality, who proves a record with `regrind audit verify --key`. The file itself stays here and goes into no\n\
+         copy that others can read. Without it no record is lost; later ones are signed with another key.\n",
+        path.display()
+    )
+}
+
+/// Where the key of a user is to be.
+enum Place {
+    /// Somebody said so: it must be there.
+    Named(PathBuf),
+    /// Somebody said that there is to be none.
+    Nowhere,
+    /// Where programs keep their settings: there may be none.
+    Usual(Option<PathBuf>),
+}
+
+impl Place {
+    fn of_this_user() -> Self {
+        let folder = |name| env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+        match env::var_os(KEY) {
+            Some(named) if named.is_empty() => Self::Nowhere,
+            Some(named) => Self::Named(named.into()),
+            None => {
+                let settings = folder("XDG_CONFIG_HOME").or_else(|| Some(folder("HOME")?.join(".config")));
+                Self::Usual(settings.map(|settings| settings.join("regrind/audit.key")))
+            }
+        }
+    }
+
+    fn file(self) -> Option<PathBuf> {
+        match self {
+            Self::Named(path) | Self::Usual(Some(path)) => Some(path),
+            Self::Nowhere | Self::Usual(None) => None,
+        }
+    }
+}
+
+/// Returns the key with which a run of this user signs; none if it has none.
+pub(super) fn of_this_user() -> Result<Option<AuditKey>, Failure> {
+    let path = match Place::of_this_user() {
+        Place::Usual(Some(path)) if path.exists() => path,
+        Place::Named(path) => path,
+        Place::Usual(_) | Place::Nowhere => return Ok(None),
+    };
+    AuditKey::read(&path).map(Some).map_err(Failure::Journal)
+}
+
+/// Reads a public key of the command line: its digits, or the file that it was kept in.
+pub(super) fn public(word: &str) -> Result<PublicKey, String> {
+    if let Ok(key) = word.parse() {
+        return Ok(key);
+    }
+    let text = std::fs::read_to_string(word).map_err(|error| {
+        format!("neither 64 small hexadecimal digits nor a file ({error}); give what `regrind audit key` printed")
+    })?;
+    PublicKey::from_text(&text).map_err(|()| "no public key in it; give what `regrind audit key` printed".to_owned())
+}

@@ -1,0 +1,197 @@
+//! The key with which a computer signs the head of its records, and the public half by which others know it.
+
+use std::fmt::{self, Debug, Display, Formatter};
+use std::fs::{self, DirBuilder, OpenOptions};
+use std::io::{self, Write};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
+use std::path::Path;
+use std::str::FromStr;
+
+use ed25519_compact::{KeyPair, Seed, Signature};
+use serde::{Serialize, Serializer};
+use sha2::{Digest, Sha256};
+
+use super::canonical::{hex, unhex};
+use super::error::JournalError;
+use super::open::sync_folder;
+
+/// Said in the first line of the file, for who finds it.
+const FIRST_LINE: &str =
+    "# Audit key of Regrind (Ed25519). Secret: who has this file can sign records in this computer's name.";
+/// More is no key.
+const MOST_BYTES: u64 = 4096;
+
+/// The public half of an audit key: what a record names, and quality keeps. Shown as 64 small hexadecimal digits.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct PublicKey([u8; 32]);
+
+impl PublicKey {
+    /// Returns what two people compare: the first 16 digits of the key's SHA-256, in groups of four.
+    pub fn fingerprint(&self) -> String {
+        let digits = hex(&Sha256::digest(self.0)[..8]);
+        (0..4).map(|k| &digits[4 * k..4 * k + 4]).collect::<Vec<_>>().join(" ")
+    }
+
+    /// Returns whether the owner of this key signed a message: Ed25519 after RFC 8032, the signature in 128 hexadecimal digits.
+    pub(super) fn has_signed(&self, message: &[u8], signature: &str) -> bool {
+        let Some(signature) = unhex::<64>(signature).map(Signature::new) else { return false };
+        ed25519_compact::PublicKey::new(self.0).verify(message, &signature).is_ok()
+    }
+
+    /// Reads a public key from a text: 64 hexadecimal digits, or what `regrind audit key` prints, with `--json` or without.
+    ///
+    /// # Errors
+    /// A text that names none.
+    #[expect(clippy::result_unit_err, reason = "there is one way to be none")]
+    pub fn from_text(text: &str) -> Result<Self, ()> {
+        let text = text.trim();
+        let of_line =
+            |line: &str| line.strip_prefix("public")?.split_whitespace().next_back()?.trim_matches('"').parse().ok();
+        if let Ok(value) = serde_json::from_str::<serde_json::Value>(text) {
+            return value["public_key"].as_str().ok_or(())?.parse();
+        }
+        text.parse().or_else(|()| text.lines().find_map(of_line).ok_or(()))
+    }
+}
+
+impl Display for PublicKey {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        f.write_str(&hex(&self.0))
+    }
+}
+
+impl Debug for PublicKey {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        write!(f, "PublicKey({self})")
+    }
+}
+
+impl FromStr for PublicKey {
+    type Err = ();
+
+    fn from_str(digits: &str) -> Result<Self, ()> {
+        unhex(digits).map(Self).ok_or(())
+    }
+}
+
+impl Serialize for PublicKey {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+/// The key of a computer, both halves.
+#[derive(Clone)]
+pub struct AuditKey {
+    pair: KeyPair,
+}
+
+impl Debug for AuditKey {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        // The secret half is for no log.
+        write!(f, "AuditKey({})", self.public())
+    }
+}
+
+impl AuditKey {
+    /// Returns a new key, by the random numbers of the operating system.
+    pub fn new() -> Self {
+        Self::from_seed(rand::random())
+    }
+
+    fn from_seed(seed: [u8; 32]) -> Self {
+        Self { pair: KeyPair::from_seed(Seed::new(seed)) }
+    }
+
+    /// Returns the public half.
+    pub fn public(&self) -> PublicKey {
+        PublicKey(*self.pair.pk)
+    }
+
+    /// Signs a message; returns 128 hexadecimal digits. The same message always gets the same signature.
+    pub(super) fn sign(&self, message: &[u8]) -> String {
+        hex(self.pair.sk.sign(message, None).as_ref())
+    }
+
+    /// Reads the key of a file.
+    ///
+    /// # Errors
+    /// No such file, one that others may read, one that holds no key.
+    pub fn read(path: &Path) -> Result<Self, JournalError> {
+        let failed = JournalError::file(path, "reading it");
+        let broken = |what| JournalError::Key { path: path.to_owned(), what };
+        let found = fs::metadata(path).map_err(|error| match error.kind() {
+            io::ErrorKind::NotFound => broken("there is no such file"),
+            _ => failed(error),
+        })?;
+        if !found.is_file() || found.len() > MOST_BYTES {
+            return Err(broken("it is no small file"));
+        }
+        let mode = found.mode() & 0o777;
+        if mode & 0o077 != 0 {
+            return Err(JournalError::KeyIsOpen { path: path.to_owned(), mode });
+        }
+        let text = String::from_utf8(fs::read(path).map_err(&failed)?).map_err(|_| broken("it is no text"))?;
+        let value = |name: &str| {
+            let line = text.lines().find_map(|line| line.strip_prefix(name)?.trim_start().strip_prefix('='))?;
+            unhex::<32>(line.trim().trim_matches('"'))
+        };
+        let seed = value("secret").ok_or_else(|| broken("its line `secret = \"...\"` has no 64 hexadecimal digits"))?;
+        let key = Self::from_seed(seed);
+        match value("public") {
+            Some(public) if public == key.public().0 => Ok(key),
+            _ => Err(broken("its line `public` does not belong to its line `secret`")),
+        }
+    }
+
+    /// Makes a key and its file, which nobody else may read. The folder is made if it is not there. A file that is there is never
+    /// written over.
+    ///
+    /// # Errors
+    /// A file of that name, a folder that cannot be written, a full disk.
+    pub fn make(path: &Path) -> Result<Self, JournalError> {
+        let key = Self::new();
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let made = DirBuilder::new().recursive(true).mode(0o700).create(folder);
+        made.map_err(JournalError::file(folder, "creating the folder"))?;
+        let temporary = folder.join(format!(".audit-key-{:016x}.tmp", rand::random::<u64>()));
+        // A link, and no new name for the file: that would take the place of a key that is there.
+        let written = key.write(&temporary).and_then(|()| fs::hard_link(&temporary, path));
+        // The error that brought us here is the one to report.
+        let _ = fs::remove_file(&temporary);
+        written.map_err(JournalError::file(path, "creating it"))?;
+        sync_folder(folder)?;
+        Ok(key)
+    }
+
+    fn write(&self, path: &Path) -> io::Result<()> {
+        let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)?;
+        let secret = hex(self.pair.sk.seed().as_ref());
+        write!(file, "{FIRST_LINE}\nsecret = \"{secret}\"\npublic = \"{}\"\n", self.public())?;
+        file.sync_all()
+    }
+}
+
+impl Default for AuditKey {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn signatures_are_those_of_rfc_8032() {
+        // Test 2 of section 7.1.
+        let seed = unhex("4ccd089b28ff96da9db6c346ec114e0f5b8a319f35aba624da8cf6ed4fb8a6fb").unwrap();
+        let key = AuditKey::from_seed(seed);
+        assert_eq!(key.public().to_string(), "3d4017c3e843895a92b70aa74d1b7ebc9c982ccf2ec4968cc0cd55f12af4660c");
+        let signature = "92a009a9f0d4cab8720e820b5f642540a2b27b5416503f8fb3762223ebdb69da\
+                         085ac1e43e15996e458f3613d0f11d8c387b2eaeb4302aeeb00d291612bb0c00";
+        assert_eq!(key.sign(&[0x72]), signature);
+        assert!(key.public().has_signed(&[0x72], signature));
+        assert!(!key.public().has_signed(&[0x73], signature) && !key.public().has_signed(&[0x72], &signature[2..]));
+    }
+}

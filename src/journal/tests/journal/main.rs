@@ -1,0 +1,9 @@
+//! The journal: what was acknowledged is there, every change is found, and whoever has no key can sign nothing.
+
+#[path = "../../../../tests/common/keep.rs"]
+mod keep;
+mod other_verifier;
+mod seals;
+mod tampering;
+mod writing;
+mod written;
