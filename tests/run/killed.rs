@@ -58,8 +58,13 @@ fn follow(running: &mut Running, folder: &dyn Fn() -> Option<PathBuf>, lines: us
 fn run_with_kills(home: &Path, seed: u64) -> (PathBuf, usize) {
     let mut chance = StdRng::seed_from_u64(seed);
     let runs = format!("runs-{seed}");
-    let command = regrind(&["run", "part.toml", "--cell", "cell.toml", "--runs", &runs, "--json"], home);
-    let mut running = Running::new(command);
+    let signed = |arguments: &[&str]| {
+        let mut command = regrind(arguments, home);
+        command.env("REGRIND_KEY", home.join("audit.key"));
+        Running::new(command)
+    };
+    assert_eq!(signed(&["audit", "key"]).end().0, 0);
+    let mut running = signed(&["run", "part.toml", "--cell", "cell.toml", "--runs", &runs, "--json"]);
     let folder = || fs::read_dir(home.join(&runs)).ok()?.next()?.ok().map(|entry| entry.path());
     let mut kills = 0;
     loop {
@@ -81,7 +86,7 @@ fn run_with_kills(home: &Path, seed: u64) -> (PathBuf, usize) {
                 vec!["run", "part.toml", "--cell", "cell.toml", "--runs", &runs, "--json"]
             }
         };
-        running = Running::new(regrind(&arguments, home));
+        running = signed(&arguments);
     }
 }
 
