@@ -1,9 +1,12 @@
 //! States, commands and answers of docs/modbus.md of its own, for an error in one must not stand at both ends of the wire.
 
+use serde::Serialize;
+
 use crate::words::{Image, WordOrder, bytes_of, crc16};
 
 /// The states of docs/modbus.md.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
 #[allow(missing_docs)]
 pub enum State {
     Idle = 1,
@@ -87,7 +90,8 @@ impl Command {
 }
 
 /// The answers of docs/modbus.md.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
 #[allow(missing_docs)]
 pub enum Answer {
     #[default]
@@ -106,7 +110,7 @@ pub enum Answer {
 }
 
 /// A command as it stands in its 20 registers.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Frame {
     /// Sequence number; 0 is never used.
     pub sequence: u32,

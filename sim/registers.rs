@@ -9,7 +9,7 @@ use crate::body::{Body, Kind};
 use crate::command::{Mode, State};
 use crate::handshake::Handshake;
 use crate::options::{Block, Layout, MachineOptions};
-use crate::seen::{Seen, What};
+use crate::seen::{Seen, What, Witness};
 use crate::transfer::{Inbox, page_image, slots_image};
 use crate::words::{Image, WordOrder};
 
@@ -288,6 +288,11 @@ impl Machine {
         self.handshake.boot_id
     }
 
+    /// Returns the name by which it calls itself.
+    pub fn name(&self) -> String {
+        self.handshake.body.name()
+    }
+
     /// Returns where its blocks are.
     pub fn layout(&self) -> &Layout {
         &self.options.layout
@@ -301,6 +306,11 @@ impl Machine {
     /// Returns the newest things that it saw and did, the oldest of them first.
     pub fn log(&self) -> &[Seen] {
         self.handshake.log.all()
+    }
+
+    /// Has somebody told of everything that it sees and does from now on, while it happens.
+    pub fn witness(&mut self, witness: Witness) {
+        self.handshake.log.witness(witness);
     }
 
     /// Returns how many older things are no longer in the log.

@@ -1,20 +1,26 @@
 //! What a simulated machine saw and did, in order, for a test to hold against the controller's journal.
 
+use std::fmt;
 use std::time::Duration;
+
+use serde::{Serialize, Serializer};
 
 use crate::command::{Answer, Frame, State};
 
 /// One thing that happened.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Seen {
     /// Real time since the machine was made, as its ticks told it.
+    #[serde(rename = "at_s", serialize_with = "seconds")]
     pub at: Duration,
     /// What happened.
+    #[serde(flatten)]
     pub what: What,
 }
 
 /// What can happen at a machine.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(tag = "what", rename_all = "snake_case")]
 pub enum What {
     /// A command was acted upon, or refused with an answer.
     Commanded {
@@ -65,6 +71,7 @@ pub enum What {
         /// Which.
         kind: u16,
         /// Its identity.
+        #[serde(serialize_with = "digits")]
         identity: [u8; 32],
     },
     /// A payload arrived that the machine cannot use.
@@ -87,10 +94,28 @@ pub enum What {
 }
 
 /// The newest things that happened; the older half is forgotten when it is full.
-#[derive(Debug, Default)]
+#[derive(Default)]
 pub(crate) struct Log {
     seen: Vec<Seen>,
     forgotten: u64,
+    witness: Option<Witness>,
+}
+
+/// Who is told of everything as it happens.
+pub type Witness = Box<dyn FnMut(&Seen) + Send>;
+
+impl fmt::Debug for Log {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Log").field("seen", &self.seen).field("forgotten", &self.forgotten).finish_non_exhaustive()
+    }
+}
+
+fn seconds<S: Serializer>(at: &Duration, to: S) -> Result<S::Ok, S::Error> {
+    to.serialize_f64(at.as_secs_f64())
+}
+
+fn digits<S: Serializer>(identity: &[u8; 32], to: S) -> Result<S::Ok, S::Error> {
+    to.collect_str(&identity.iter().map(|byte| format!("{byte:02x}")).collect::<String>())
 }
 
 impl Log {
@@ -101,7 +126,16 @@ impl Log {
             self.seen.drain(..Self::CAPACITY / 2);
             self.forgotten += Self::CAPACITY as u64 / 2;
         }
-        self.seen.push(Seen { at, what });
+        let seen = Seen { at, what };
+        if let Some(witness) = &mut self.witness {
+            witness(&seen);
+        }
+        self.seen.push(seen);
+    }
+
+    /// Has somebody told of everything from now on.
+    pub(crate) fn witness(&mut self, witness: Witness) {
+        self.witness = Some(witness);
     }
 
     pub(crate) fn all(&self) -> &[Seen] {

@@ -152,7 +152,7 @@ impl Cell {
             self.raise(AlarmId::NotIdle, &format!("{device}, {found}"));
         }
         // Held means still: what became of a job that was out of sight is asked before a person is, and what moves is held.
-        if phase.job() == Some((device, JobStep::Reconcile)) {
+        if matches!(self.state, Held(_)) && phase.job() == Some((device, JobStep::Reconcile)) {
             self.go(Holding(phase));
             self.push(Command::Reconcile { device, cycle: self.cycle });
         }

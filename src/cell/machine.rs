@@ -138,10 +138,10 @@ impl Cell {
 
             // Connecting.
             (Starting, Event::Connected { device, boot_id, found, .. }) => self.connected(*device, *boot_id, found),
-            (Held(phase), Event::Connected { device, boot_id, found, .. }) => {
+            (Held(phase) | Holding(phase), Event::Connected { device, boot_id, found, .. }) => {
                 self.reconnected(phase, *device, *boot_id, found);
             }
-            (Starting | Held(_), Event::NotConnected { device, why }) => self.not_connected(*device, why),
+            (Starting | Held(_) | Holding(_), Event::NotConnected { device, why }) => self.not_connected(*device, why),
             (Starting, Event::Refused { device, what: Asked::Clear, why }) => {
                 self.raise(AlarmId::NotIdle, &format!("{device}, {why}"));
                 self.stop(&format!("the {device} could not be cleared: {why}"), false);

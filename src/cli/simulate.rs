@@ -18,7 +18,7 @@ use super::{Outcome, simulated};
 Both machines share one simulated part: its truth is the table [simulation] of the recipe.
 
 Example:
-  regrind simulate --cell config/modbus-tcp.toml
+  regrind simulate --cell config/modbus-tcp.toml --log machines.jsonl
   regrind run recipes/freeform-mirror.toml --cell config/modbus-tcp.toml      # in another terminal
 
 Exit codes: 0 stopped by Ctrl-C; 2 bad files; 3 fault.")]
@@ -32,6 +32,9 @@ pub(super) struct Arguments {
     /// Draw another part and another run from this number
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
+    /// Write what the machines see and do to this file, a line of JSON for each thing as it happens
+    #[arg(long, value_name = "FILE")]
+    log: Option<PathBuf>,
     /// Print where the machines answer as one line of JSON; a port of 0 in the cell file takes any that is free
     #[arg(long)]
     json: bool,
@@ -43,6 +46,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let spec = simulated::world_spec(&recipe, arguments.seed)?;
     super::runtime()?.block_on(async {
         let serving = simulated::serve(spec, &mut cell).await?;
+        arguments.log.as_deref().map_or(Ok(()), |log| serving.log_to(log))?;
         if arguments.json {
             let wires = json!({ "simulation": true, "cmm": wire(&cell.cmm.link), "grinder": wire(&cell.grinder.link) });
             super::print(&format!("{wires}\n"))?;

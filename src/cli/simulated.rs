@@ -1,10 +1,13 @@
 //! A simulated world for the cell: built here only, and handed to its wires alone.
 
+use std::fs::OpenOptions;
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
 
 use regrind::config::{CellConfig, Link};
 use regrind::device::{Line, RegisterMap, Wire, WordOrder};
-use regrind::formats::{place_link, remove_link};
+use regrind::formats::{FormatError, place_link, remove_link};
 use regrind::recipe::Recipe;
 use regrind_sim::options::{Layout, MachineOptions};
 use regrind_sim::registers::Machine;
@@ -92,6 +95,37 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig) -> Result<Simu
 }
 
 impl SimulatedCell {
+    /// Writes all that the machines see and do from now on to a file, a line of JSON for each thing, as it happens.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub(super) fn log_to(&self, path: &Path) -> Result<(), FormatError> {
+        let failed = |source| FormatError::Unwritable { path: path.to_owned(), action: "opening it", source };
+        let file = OpenOptions::new().append(true).create(true).open(path).map_err(failed)?;
+        let file = Arc::new(Mutex::new(file));
+        let machines = self.servings.iter().flat_map(|serving| serving.machines());
+        for (unit, machine) in machines {
+            let (unit, file) = (*unit, Arc::clone(&file));
+            machine.with(|machine| {
+                let name = machine.name();
+                machine.witness(Box::new(move |seen| {
+                    let mut line = serde_json::to_value(seen).unwrap_or_default();
+                    if let Some(line) = line.as_object_mut() {
+                        let utc = jiff::Timestamp::now().to_string();
+                        line.extend([
+                            ("machine".into(), name.clone().into()),
+                            ("unit".into(), unit.into()),
+                            ("utc".into(), utc.into()),
+                        ]);
+                    }
+                    // One write is one line; a disk that is full is no reason for a machine to stand.
+                    let _ = file.lock().map(|mut file| file.write_all(format!("{line}\n").as_bytes()));
+                }));
+            });
+        }
+        Ok(())
+    }
+
     async fn serve(&mut self, line: &Line, units: Vec<(u8, SharedMachine)>) -> Result<u16, String> {
         let names: Vec<String> = units.iter().map(|(unit, _)| format!("unit {unit}")).collect();
         match line {

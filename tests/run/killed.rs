@@ -14,6 +14,7 @@ use regrind::cell::StateName;
 use regrind::drive::{Request, ask};
 use regrind::journal::{Kind, Reader, verify};
 use regrind_sim::seen::What;
+use serde_json::Value;
 
 /// How often a part's program is killed at most.
 const MOST_KILLS: usize = 3;
@@ -155,17 +156,29 @@ fn over_a_serial_line_too() {
     let devices = format!("device = \"{}/", home.path().display());
     let text = changed("config/serial-rtu.toml", &[("device = \"/tmp/regrind-", &devices)]);
     fs::write(home.path().join("cell.toml"), text).unwrap();
-    let mut serving = Running::new(regrind(&["simulate", "part.toml", "--cell", "cell.toml"], home.path()));
+    let mut serving = Running::new(regrind(
+        &["simulate", "part.toml", "--cell", "cell.toml", "--log", "machines.jsonl"],
+        home.path(),
+    ));
     serving.line("its last word", |line| line.starts_with("Ctrl-C"));
     let (folder, kills) = run_with_kills(home.path(), 21);
     println!("{kills} kills");
     is_whole(&folder, 21);
+    let log = fs::read_to_string(home.path().join("machines.jsonl")).unwrap();
+    let seen = log.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
+    let began = seen.filter(|seen| seen["what"] == "began");
+    let mut began: Vec<_> = began.map(|b| format!("{} {} {}", b["machine"], b["job"], b["cycle"])).collect();
+    let all = began.len();
+    began.sort();
+    began.dedup();
+    // Two machines, two passes at least; the first program may have been killed before it had a record of its part.
+    assert!(began.len() == all && all >= 4, "{log}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "takes minutes: for .ci/long"]
 async fn two_hundred_kills() {
-    killed(1000..1080).await;
+    killed(1000..1090).await;
 }
 
 /// Runs a part until the machine of a job moves, and kills the program. Returns the folder of the run.
