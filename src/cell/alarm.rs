@@ -181,9 +181,9 @@ catalogue! {
     }
     /// The program was started again.
     ProgramRestarted {
-        "The program was started again in the middle of the run", "The cell is held; what was under way is found out before anything moves.",
+        "The program was started again in the middle of the run", "The cell is held; the machines are asked what became of their jobs, and what moves is held.",
         Operator,
-        ["Look at both machines.", "Resume: the cell first asks what became of an open job."]
+        ["Look at both machines: the state says what was found out, and what was not.", "Resume: the cell goes on from there."]
     }
     /// Interlock.
     NotClear {

@@ -1,23 +1,21 @@
 //! A simulated world for the cell: built here only, and handed to its wires alone.
 
-use std::fs::OpenOptions;
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex};
 
 use regrind::config::{CellConfig, Link};
 use regrind::device::{Line, RegisterMap, Wire, WordOrder};
-use regrind::formats::{FormatError, place_link, remove_link};
+use regrind::formats::{AddedLines, FormatError, place_link, remove_link};
 use regrind::recipe::Recipe;
 use regrind_sim::options::{Layout, MachineOptions};
 use regrind_sim::registers::Machine;
+use regrind_sim::seen::Seen;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::faults::Faults;
 use regrind_sim::wire::rtu;
 use regrind_sim::wire::{Serving, SharedMachine};
 use regrind_sim::words;
 use regrind_sim::world::World;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::failure::Failure;
 
@@ -31,6 +29,16 @@ pub(super) struct SimulatedCell {
     links: Vec<PathBuf>,
     /// Kept for the life of the machines.
     _world: World,
+}
+
+/// A line of what simulated machines see and do.
+#[derive(Serialize)]
+struct Witnessed<'a> {
+    utc: String,
+    machine: &'a str,
+    unit: u8,
+    #[serde(flatten)]
+    seen: &'a Seen,
 }
 
 impl Drop for SimulatedCell {
@@ -100,26 +108,15 @@ impl SimulatedCell {
     /// # Errors
     /// A file that cannot be written.
     pub(super) fn log_to(&self, path: &Path) -> Result<(), FormatError> {
-        let failed = |source| FormatError::Unwritable { path: path.to_owned(), action: "opening it", source };
-        let file = OpenOptions::new().append(true).create(true).open(path).map_err(failed)?;
-        let file = Arc::new(Mutex::new(file));
+        let lines = AddedLines::open(path)?;
         let machines = self.servings.iter().flat_map(|serving| serving.machines());
         for (unit, machine) in machines {
-            let (unit, file) = (*unit, Arc::clone(&file));
+            let (unit, lines) = (*unit, lines.clone());
             machine.with(|machine| {
                 let name = machine.name();
                 machine.witness(Box::new(move |seen| {
-                    let mut line = serde_json::to_value(seen).unwrap_or_default();
-                    if let Some(line) = line.as_object_mut() {
-                        let utc = jiff::Timestamp::now().to_string();
-                        line.extend([
-                            ("machine".into(), name.clone().into()),
-                            ("unit".into(), unit.into()),
-                            ("utc".into(), utc.into()),
-                        ]);
-                    }
-                    // One write is one line; a disk that is full is no reason for a machine to stand.
-                    let _ = file.lock().map(|mut file| file.write_all(format!("{line}\n").as_bytes()));
+                    let utc = jiff::Timestamp::now().to_string();
+                    lines.add(&Witnessed { utc, machine: &name, unit, seen });
                 }));
             });
         }

@@ -28,7 +28,7 @@ use super::work;
 use super::{Computation, Task, folder_of, made};
 use crate::cell::{Cell, CellPlan, Command, Device, Ending, Event, Gate, Judgement};
 use crate::device::{Coordinates, Identified, digest};
-use crate::formats::{self, FormatError};
+use crate::formats::{self, FormatError, ScratchFolder};
 use crate::journal::{Artefact, JournalError, Kind, Reader, Record, sha256_hex};
 
 /// Where computations are done again, below the run folder; gone when that is over.
@@ -124,14 +124,14 @@ struct Replay<'t> {
     names: BTreeSet<String>,
     /// What the last measurement said that its coordinates are.
     coordinates: Option<Coordinates>,
-    scratch: Scratch,
+    scratch: ScratchFolder,
     last: u64,
 }
 
 impl<'t> Replay<'t> {
     fn new(run: &'t Path, plan: CellPlan, task: &'t Task) -> Result<Self, ReplayError> {
         let found = Interrupted::none(plan);
-        let scratch = Scratch::new(run)?;
+        let scratch = ScratchFolder::at(run.join(SCRATCH))?;
         let (due, files, names) = (VecDeque::new(), BTreeMap::new(), BTreeSet::new());
         Ok(Self { run, task, found, due, files, names, coordinates: None, scratch, last: 0 })
     }
@@ -244,7 +244,9 @@ impl<'t> Replay<'t> {
             self.found.cycles.take(number, Product::Points(points));
             return Ok(());
         }
-        let mut files = self.scratch.files(number)?;
+        let folder = self.scratch.path().join(folder_of(number, 1));
+        made(&folder)?;
+        let mut files = Files::new(folder);
         let (again, product) = match kind {
             Computation::Registration => {
                 work::register_cycle(self.task, &mut files, number, &cycle, self.found.cycles.before(number))
@@ -298,29 +300,15 @@ impl<'t> Replay<'t> {
         for device in Device::BOTH {
             self.check_armed(device)?;
         }
-        self.files_in("");
+        formats::finished_files(self.run);
         for number in 1..=self.found.cell.cycle() + 1 {
             for attempt in 1.. {
                 let folder = folder_of(number, attempt);
-                let Some(names) = self.files_in(&folder) else { break };
+                let Some(names) = formats::finished_files(&self.run.join(&folder)) else { break };
                 names.iter().for_each(|name| self.lies_there(&folder, number, attempt, name));
             }
         }
         Ok(self.found)
-    }
-
-    /// Returns the names of the files in a folder of the run, if it is there. What was being written and never had its name is taken
-    /// away: nothing refers to it.
-    fn files_in(&self, folder: &str) -> Option<Vec<String>> {
-        let folder = self.run.join(folder);
-        let entries = fs::read_dir(&folder).ok()?.flatten().filter(|entry| entry.path().is_file());
-        let mut names: Vec<_> = entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();
-        names.retain(|name| {
-            let unfinished = name.starts_with('.') && name.ends_with(".tmp");
-            // It is in nobody's way where it cannot be taken away.
-            !unfinished || fs::remove_file(folder.join(name)).is_err()
-        });
-        Some(names)
     }
 
     /// Takes in that a file lies in the folder of an attempt: it is not written again, and what is not on record is brought there.
@@ -364,32 +352,5 @@ impl<'t> Replay<'t> {
 
     fn differs(&self, what: String) -> ReplayError {
         ReplayError::Differs { run: self.run.to_owned(), seq: self.last, what }
-    }
-}
-
-/// A folder for what is computed again.
-struct Scratch(PathBuf);
-
-impl Scratch {
-    fn new(run: &Path) -> Result<Self, ReplayError> {
-        let path = run.join(SCRATCH);
-        // A replay that was interrupted itself left it.
-        match fs::remove_dir_all(&path) {
-            Err(source) if source.kind() != io::ErrorKind::NotFound => Err(ReplayError::Scratch { path, source }),
-            _ => Ok(Self(path)),
-        }
-    }
-
-    fn files(&self, number: u32) -> Result<Files, ReplayError> {
-        let folder = self.0.join(folder_of(number, 1));
-        made(&folder)?;
-        Ok(Files::new(folder))
-    }
-}
-
-impl Drop for Scratch {
-    fn drop(&mut self) {
-        // Nothing of it is needed by anybody, and the next replay begins by taking it away.
-        let _ = fs::remove_dir_all(&self.0);
     }
 }

@@ -1,6 +1,7 @@
 //! The folder that results go to.
 
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use super::error::FormatError;
@@ -92,6 +93,54 @@ pub fn remove_link(link: &Path) -> std::io::Result<()> {
         return Err(std::io::Error::from(std::io::ErrorKind::AlreadyExists));
     }
     fs::remove_file(link)
+}
+
+/// A folder for what is only compared, taken away with all in it when this is dropped.
+#[derive(Debug)]
+pub struct ScratchFolder(PathBuf);
+
+impl ScratchFolder {
+    /// Takes a path for it; what an earlier one left there is taken away. The folder is made by who writes into it.
+    ///
+    /// # Errors
+    /// Something there that cannot be taken away.
+    pub fn at(path: PathBuf) -> Result<Self, FormatError> {
+        match fs::remove_dir_all(&path) {
+            Err(source) if source.kind() != io::ErrorKind::NotFound => {
+                Err(FormatError::Unwritable { path, action: "taking it away", source })
+            }
+            _ => Ok(Self(path)),
+        }
+    }
+
+    /// Returns where it is.
+    pub fn path(&self) -> &Path {
+        &self.0
+    }
+}
+
+impl Drop for ScratchFolder {
+    fn drop(&mut self) {
+        // Nobody needs anything of it, and the next one begins by taking it away.
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+/// Returns the names of the files in a folder, sorted, if it is there. What was being written when a program ended, and so never had
+/// its name, is taken away first: nothing refers to it.
+pub fn finished_files(folder: &Path) -> Option<Vec<String>> {
+    let entries = fs::read_dir(folder).ok()?.flatten().filter(|entry| entry.path().is_file());
+    let mut names: Vec<_> = entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();
+    names.retain(|name| {
+        let unfinished = name.starts_with('.') && name.ends_with(".tmp");
+        if unfinished {
+            // It is in nobody's way where it cannot be.
+            let _ = fs::remove_file(folder.join(name));
+        }
+        !unfinished
+    });
+    names.sort();
+    Some(names)
 }
 
 #[cfg(test)]

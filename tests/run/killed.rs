@@ -6,7 +6,7 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 
-use crate::program::{PATIENCE, Running, changed, records_with, regrind, small_recipe};
+use crate::program::{PATIENCE, Running, changed, records_with, regrind};
 use crate::rig::{CMM, GRINDER, Rig, small};
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
@@ -98,7 +98,8 @@ fn is_whole(folder: &Path, seed: u64) {
         verified.closed && verified.unrecorded.iter().all(|name| name == "report.html"),
         "seed {seed}: {verified:?}"
     );
-    let mut started: Vec<_> = records_with(folder, "event").into_iter().filter(|e| e["event"] == "started").collect();
+    let events = records_with(folder, "device").into_iter();
+    let mut started: Vec<_> = events.filter(|event| event["event"] == "started").collect();
     started.iter_mut().for_each(|event| drop(event.as_object_mut().unwrap().remove("detail")));
     let all = started.len();
     started.sort_by_key(ToString::to_string);
@@ -151,8 +152,7 @@ async fn a_killed_program_is_taken_up_again_and_starts_every_pass_once() {
 #[test]
 fn over_a_serial_line_too() {
     let home = tempfile::tempdir().unwrap();
-    let recipe = small_recipe(home.path(), 2000.0);
-    fs::rename(&recipe, home.path().join("part.toml")).unwrap();
+    fs::write(home.path().join("part.toml"), small(12, 8, 2000.0).text()).unwrap();
     let devices = format!("device = \"{}/", home.path().display());
     let text = changed("config/serial-rtu.toml", &[("device = \"/tmp/regrind-", &devices)]);
     fs::write(home.path().join("cell.toml"), text).unwrap();

@@ -1,0 +1,56 @@
+//! Lines that are added to a file as things happen.
+
+use std::fs::{File, OpenOptions};
+use std::io::Write;
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+
+use serde::Serialize;
+
+use super::FormatError;
+
+/// A file to which lines of JSON are added. Clones add to the same file, from any thread.
+#[derive(Clone, Debug)]
+pub struct AddedLines {
+    file: Arc<Mutex<File>>,
+}
+
+impl AddedLines {
+    /// Opens a file, or makes it; what it holds stays.
+    ///
+    /// # Errors
+    /// A file that cannot be written.
+    pub fn open(path: &Path) -> Result<Self, FormatError> {
+        let file = OpenOptions::new().append(true).create(true).open(path);
+        let file =
+            file.map_err(|source| FormatError::Unwritable { path: path.to_owned(), action: "opening it", source })?;
+        Ok(Self { file: Arc::new(Mutex::new(file)) })
+    }
+
+    /// Adds a line in one piece. A disk that is full loses it: who tells what happens is not to stand for that.
+    pub fn add(&self, line: &impl Serialize) {
+        let Ok(mut text) = serde_json::to_string(line) else { return };
+        text.push('\n');
+        if let Ok(mut file) = self.file.lock() {
+            let _ = file.write_all(text.as_bytes());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_are_added_behind_those_that_are_there() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("lines");
+        for line in 1..=2 {
+            let lines = AddedLines::open(&path).unwrap();
+            lines.add(&[line]);
+            lines.clone().add(&"more");
+        }
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), "[1]\n\"more\"\n[2]\n\"more\"\n");
+        assert!(AddedLines::open(folder.path()).unwrap_err().to_string().contains("opening it"));
+    }
+}
