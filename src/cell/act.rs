@@ -165,6 +165,14 @@ impl Cell {
             Mismatch::WordOrder(message) => (AlarmId::WordOrder, message.as_str()),
             Mismatch::Inches => (AlarmId::Inches, "the machine says so of itself"),
             Mismatch::Owned(message) => (AlarmId::Owned, message.as_str()),
+            Mismatch::AtAnotherJob(message) => {
+                let known = self.know(device);
+                (known.met, known.ready) = (false, false);
+                if self.state == Starting {
+                    return self.not_idle(device, message);
+                }
+                (AlarmId::NotIdle, message.as_str())
+            }
         };
         let case = format!("{device}, {message}");
         self.raise(id, &case);

@@ -173,6 +173,8 @@ pub enum Mismatch {
     Inches,
     /// Another client owns it.
     Owned(String),
+    /// It is at the job of another run, which is left alone, also by an abort.
+    AtAnotherJob(String),
 }
 
 /// Something that the cell needs from outside.

@@ -89,7 +89,10 @@ impl Cell {
             (Held(Grind(JobStep::Reconcile)), Event::DeclaredOver { device: Device::Grinder, .. }) => {
                 self.go(Held(Transfer))
             }
-            (Held(Measure(JobStep::Reconcile)), Event::DeclaredOver { device: Device::Cmm, .. }) => self.measure_anew(),
+            // A result that is gone, with the machine's memory or a file, is measured once more too.
+            (Held(Measure(JobStep::Reconcile | JobStep::Collect)), Event::DeclaredOver { device: Device::Cmm, .. }) => {
+                self.measure_anew()
+            }
             (Execute(Load), Event::LoadConfirmed { .. }) => self.first_cycle(),
             (state, Event::ClearConfirmed { device, .. })
                 if state.phase().is_some() && running(state) != Some(*device) =>
@@ -98,7 +101,8 @@ impl Cell {
             }
             (Idle, Event::Restarted { .. }) => {}
             (Stopping, Event::Restarted { .. }) => {
-                self.abort("the program was started again while the run was being stopped")
+                self.reason = "the program was started again while the run was being stopped".to_owned();
+                self.abort_again();
             }
             (_, Event::Restarted { actor }) => self.restarted(&actor.to_string()),
 

@@ -171,7 +171,8 @@ fn of_machine(device: Device, cycle: u32) -> Vec<Event> {
         events.push(Event::Connected { device, boot_id: 1, simulated: true, found });
     }
     let unlike = [Mismatch::Unreachable(text()), Mismatch::WrongDevice(text()), Mismatch::WordOrder(text())];
-    for why in unlike.into_iter().chain([Mismatch::Inches, Mismatch::Owned(text())]) {
+    let more = [Mismatch::Inches, Mismatch::Owned(text()), Mismatch::AtAnotherJob(text())];
+    for why in unlike.into_iter().chain(more) {
         events.push(Event::NotConnected { device, why });
     }
     for result in [JobResult::Complete, JobResult::Stopped, JobResult::Aborted, JobResult::Failed] {

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use regrind::cell::Device;
 use regrind::drive::{CycleRow, Reply, Request, Snapshot, ask, is_live};
+use regrind::journal::{Kind, Reader};
 
 use super::Outcome;
 use super::choice::word_of;
@@ -159,9 +160,14 @@ pub(super) fn folder_of(run: Option<&Path>) -> Result<PathBuf, Failure> {
 
 /// Returns the folder of the run that goes on now; where none does, of the one that was made last.
 pub(super) fn live(runs: &Path) -> Result<PathBuf, Failure> {
+    live_or(runs, newest)
+}
+
+/// The same, with what is meant where none goes on.
+pub(super) fn live_or(runs: &Path, otherwise: fn(&Path) -> Option<PathBuf>) -> Result<PathBuf, Failure> {
     let mut live: Vec<_> = folders(runs).filter(|folder| is_live(folder)).collect();
     match live.len() {
-        0 => newest(runs).ok_or_else(|| Failure::NoRun { path: runs.to_owned() }),
+        0 => otherwise(runs).ok_or_else(|| Failure::NoRun { path: runs.to_owned() }),
         1 => Ok(live.remove(0)),
         _ => {
             live.sort();
@@ -173,6 +179,20 @@ pub(super) fn live(runs: &Path) -> Result<PathBuf, Failure> {
 pub(super) fn folders(runs: &Path) -> impl Iterator<Item = PathBuf> {
     let entries = std::fs::read_dir(runs).into_iter().flatten().filter_map(io::Result::ok);
     entries.map(|entry| entry.path()).filter(|path| path.is_dir())
+}
+
+/// Returns the newest run that has no end on record; where all have, the newest.
+pub(super) fn unfinished(runs: &Path) -> Option<PathBuf> {
+    let is_open = |folder: &PathBuf| {
+        let Ok(reader) = Reader::open(folder) else { return false };
+        let mut records = reader.records(0).filter_map(Result::ok);
+        let is_run = records.next().is_some_and(|first| first.value()["content"]["recover"] != true);
+        is_run && !records.any(|record| record.kind == Kind::End)
+    };
+    let made = |folder: &PathBuf| std::fs::metadata(folder).and_then(|m| m.modified()).ok();
+    let mut all: Vec<_> = folders(runs).collect();
+    all.sort_by_key(made);
+    all.into_iter().rev().find(is_open).or_else(|| newest(runs))
 }
 
 /// Returns the run folder that was made last.

@@ -107,15 +107,11 @@ pub(super) enum Failure {
     EarlierRun { run: PathBuf, program: String, what: String },
     #[error("{}: {what} is not what the run began with; put back the files that the recipe and the cell file name", .run.display())]
     OtherTask { run: PathBuf, what: &'static str },
-    #[error(
-        "{path}: the folder that the run was begun in cannot be entered: {source}; its recipe names files from there"
-    )]
-    WorkingFolder { path: PathBuf, source: io::Error },
     #[error("the port of the {device} cannot be had: {source}")]
     Port { device: regrind::cell::Device, source: io::Error },
     #[error("{device}: {source}")]
     Recover { device: regrind::cell::Device, source: regrind::drive::recover::RecoverError },
-    #[error("a machine was left as it is; begin again when it can be brought home")]
+    #[error("not both machines are known to be idle; begin again, or see to the one that tells nothing over a wire")]
     NotHome,
     #[error(transparent)]
     Learned(regrind::formats::LearnedError),

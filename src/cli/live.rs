@@ -164,7 +164,8 @@ pub(super) fn owner(actor: &Actor, run: &Path) -> u32 {
     let mut hash = crc32fast::Hasher::new();
     hash.update(b"regrind ");
     hash.update(actor.station.as_bytes());
-    let run = std::path::absolute(run).unwrap_or_else(|_| run.to_owned());
+    // However it was typed.
+    let run: std::path::PathBuf = std::path::absolute(run).unwrap_or_else(|_| run.to_owned()).components().collect();
     hash.update(run.as_os_str().as_encoded_bytes());
     hash.finalize().max(1)
 }

@@ -79,6 +79,9 @@ fn told(home: Result<bool, Failure>) -> Result<bool, Failure> {
     }
 }
 
+/// Between two looks at a machine that is on its way.
+const BETWEEN_LOOKS: Duration = Duration::from_secs(1);
+
 /// What is done for the machines of a cell, and where it is recorded.
 struct Recovery {
     actor: Actor,
@@ -99,7 +102,7 @@ impl Recovery {
     ) -> Result<bool, Failure> {
         let Some(settings) = settings else {
             super::print(&format!("{device}: it tells nothing over a wire; bring it home at the machine\n"))?;
-            return Ok(true);
+            return Ok(false);
         };
         let mut machine = machine(settings).map_err(|source| Failure::Port { device, source })?;
         let limit = link.timing.lost_after.max(Duration::from_secs(60));
@@ -108,6 +111,11 @@ impl Recovery {
         loop {
             let seen = look(&mut machine).await.map_err(failed)?;
             super::print(&format!("{mark}{}: {}\n", machine.name(), in_short(&seen)))?;
+            if matches!(seen.state, State::Stopping | State::Aborting) {
+                // It is on its way by itself.
+                tokio::time::sleep(BETWEEN_LOOKS).await;
+                continue;
+            }
             let Some(step) = Step::after(seen.state) else { return Ok(true) };
             if let Some(run) = seen.job.and_then(|job| self.run_of(job.job)) {
                 super::print(&format!(

@@ -7,7 +7,7 @@ use regrind::cell::{CellPlan, TABLE_VERSION};
 use regrind::config::CellConfig;
 use regrind::drive::{Interrupted, Request, Task, is_live};
 use regrind::formats::{FormatError, Learned};
-use regrind::journal::{Journal, JournalError, Kind, Reader, verify};
+use regrind::journal::{Journal, JournalError, Kind, Reader, RunLock, verify};
 use regrind::recipe::Recipe;
 use regrind::setup;
 use serde::Deserialize;
@@ -51,7 +51,7 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let folder = match &arguments.run {
         Some(run) => run.clone(),
-        None => control::live(Path::new("runs"))?,
+        None => control::live_or(Path::new("runs"), control::unfinished)?,
     };
     if is_live(&folder) {
         let request = Request::Resume { reason: arguments.reason.clone(), seen: None };
@@ -62,9 +62,12 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 
 /// Takes up a run that broke off: all of it is looked through before anything is opened.
 fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
-    let (key, begun) = (key::of_this_user()?, Begun::read(folder)?);
-    std::env::set_current_dir(&begun.working_folder)
-        .map_err(|source| Failure::WorkingFolder { path: begun.working_folder.clone(), source })?;
+    let key = key::of_this_user()?;
+    // Whoever else takes the run up, or verifies it, finds it driven from here on.
+    let lock = RunLock::take(folder).map_err(Failure::Journal)?;
+    let begun = Begun::read(folder)?;
+    // Where it is gone, a recipe that names no file from there needs none of it, and any other says which one is missing.
+    let _ = std::env::set_current_dir(&begun.working_folder);
     let recipe = check::or_show(Recipe::parse(&begun.recipe, &text(folder, "recipe.toml")?))?;
     let cell = check::or_show(CellConfig::parse(&begun.cell, &text(folder, "cell.toml")?))?;
     if within(&cell) {
@@ -84,7 +87,7 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
         let (recipe, cell, json) = (&recipe, &cell, arguments.json);
         let live = Live { recipe, cell, part, folder, job: begun.job, actor, json };
         let machines = live.open(epoch(jiff::Timestamp::now()))?;
-        let journal = Journal::open_with(folder, key).map_err(Failure::Journal)?;
+        let journal = Journal::open_locked(lock, key).map_err(Failure::Journal)?;
         let (loaded, interrupted) = (cell.simulated, Some(interrupted));
         outcome(&live.carry_out(machines, Work { task, plan, journal, loaded, interrupted }).await?)
     })
@@ -113,19 +116,19 @@ struct Begun {
 }
 
 impl Begun {
-    /// Verifies the record of a run that nobody drives and that has no end, and reads how it began.
+    /// Verifies the record of a run that has no end, and reads how it began.
     fn read(run: &Path) -> Result<Self, Failure> {
+        let reader = Reader::open(run).map_err(Failure::Journal)?;
+        if reader.records(0).next().is_none() {
+            return Err(Failure::NotBegun { run: run.to_owned() });
+        }
         let verified = verify(run).map_err(|error| match error {
             JournalError::Broken { .. } => Failure::Broken(error),
             error => Failure::Journal(error),
         })?;
-        if verified.under_way {
-            return Err(Failure::Journal(JournalError::Busy { path: run.to_owned() }));
-        }
         if verified.closed {
             return Err(Failure::Over { run: run.to_owned() });
         }
-        let reader = Reader::open(run).map_err(Failure::Journal)?;
         let records = || reader.records(0).filter_map(Result::ok);
         if !records().any(|record| record.kind == Kind::Event) {
             return Err(Failure::NotBegun { run: run.to_owned() });

@@ -202,7 +202,7 @@ fn header(arguments: &Arguments, live: &Live, (task, plan): (&Task, &CellPlan), 
         content: json!({
             "recipe": recipe.path(), "recipe_sha256": hex(recipe.source_sha256()),
             "cell": cell.path(), "cell_sha256": hex(cell.source_sha256()),
-            "working_folder": std::env::current_dir().unwrap_or_default(),
+            "working_folder": std::env::current_dir().unwrap_or_default().to_string_lossy(),
             "nominal_sha256": hex(&task.part_identity), "setting": task.setting,
             "part_name": recipe.part.name, "part_in_files": live.part, "job": live.job, "seed": arguments.seed,
             "plan": plan, "table_version": TABLE_VERSION,

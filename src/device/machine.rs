@@ -28,6 +28,10 @@ pub trait Machine: Send {
     /// What the machine says of itself now. Asking also tells the machine that its client is alive, so ask twice a second or more.
     fn status(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 
+    /// Takes in what an interrupted run had prepared and may have started. For machines that keep no memory of their own: until somebody has
+    /// told what became of it they are taken as ones that may move.
+    fn restore(&mut self, _intended: &Armed) {}
+
     /// Makes this client the owner of the machine.
     fn claim(&mut self) -> impl Future<Output = Result<Status, DeviceError>> + Send;
 

@@ -146,6 +146,9 @@ macro_rules! machine {
             fn notes(&self) -> Vec<String> {
                 match self { $(Self::$wire(machine) => Machine::notes(machine)),+ }
             }
+            fn restore(&mut self, intended: &Armed) {
+                match self { $(Self::$wire(machine) => machine.restore(intended)),+ }
+            }
             async fn connect(&mut self) -> Result<Identity, DeviceError> {
                 match self { $(Self::$wire(machine) => machine.connect().await),+ }
             }

@@ -55,8 +55,7 @@ pub use program::{ProgramError, Programs};
 use record::{Files, Recorder, Ticket, entry};
 pub use replay::{Interrupted, ReplayError};
 use station::{
-    Aborts, Ask, CmmDriver, Fetched, GrinderDriver, Intent, Load, MachineTask, PULSE_EVERY, Pulse, StationDriver,
-    StationReport,
+    Aborts, Ask, CmmDriver, Fetched, GrinderDriver, Load, MachineTask, PULSE_EVERY, Pulse, StationDriver, StationReport,
 };
 use task::Product;
 pub use task::{Probing, Sphere, Task};
@@ -160,13 +159,23 @@ enum Computation {
 }
 
 impl Computation {
-    /// Returns which makes a file of this name.
-    fn of(file: &str) -> Self {
-        match file {
+    /// Returns which makes a file of this name, if one does.
+    fn of(file: &str) -> Option<Self> {
+        Some(match file {
             "measured.csv" | "reference_sphere.csv" => Self::Gate,
             "correction.csv" | "correction.json" | "toolpath.ngc" | "toolpath_z.csv" => Self::Compensation,
-            _ => Self::Registration,
-        }
+            "registration.json"
+            | "deviations.csv"
+            | "deviation_uncertainty.csv"
+            | "deviations.ply"
+            | "figures.json"
+            | "parameters.json"
+            | "error_map.csv"
+            | "error_map.x3p"
+            | "error_map.svg"
+            | "error_map.png" => Self::Registration,
+            _ => return None,
+        })
     }
 }
 
@@ -228,16 +237,15 @@ impl Drive {
         let (reports, reported) = mpsc::channel(64);
         let (orders, ordered) = mpsc::channel(16);
         let (status, seen) = watch::channel(Snapshot::default());
-        let interrupted = run.interrupted.unwrap_or_else(|| Interrupted::none(run.plan));
-        let (ids, open): (Vec<u32>, Vec<Command>) = interrupted.open.into_iter().unzip();
+        let mut interrupted = run.interrupted.unwrap_or_else(|| Interrupted::none(run.plan));
+        let (ids, open): (Vec<u32>, Vec<Command>) = std::mem::take(&mut interrupted.open).into_iter().unzip();
         let recorder = Recorder::new(run.journal, &ids);
         let folder = recorder.folder().to_owned();
         let control = Control::listen(&folder, orders.clone(), seen.clone())?;
         let interrupts = [Interrupt::new(), Interrupt::new()];
         let aborts = [watch::Sender::new(0), watch::Sender::new(0)];
         let pulse = Pulse::new();
-        let armed = interrupted.armed.clone().map(|intent| intent.as_ref().and_then(restored));
-        let [of_cmm, of_grinder] = armed;
+        let [of_cmm, of_grinder] = Device::BOTH.map(|device| interrupted.left_at(device));
         let [poll_cmm, poll_grinder] = run.poll;
         let (cmm, cmm_task) =
             spawn(CmmDriver(cmm), run.job, (&interrupts[0], &aborts[0], &pulse), &reports, of_cmm, poll_cmm);
@@ -596,6 +604,15 @@ impl Drive {
 
     async fn computed(&mut self, computed: Computed) {
         let Computed { cycle: number, event, product, files } = computed;
+        if let (Err(why), Some(Event::Collected { .. } | Event::Registered { .. } | Event::Compensated { .. })) =
+            (&files, &event)
+        {
+            // What is not on record is not made use of: it is computed again once a person has seen to the disk.
+            let event = Event::NotSaved { cycle: number, why: why.clone() };
+            self.notify(Notice::RecordFailed { message: message_of(why) });
+            self.take(event, None).await;
+            return;
+        }
         self.cycles.take(number, product);
         self.adopt(number, files).await;
         if let Some(event) = event {
@@ -934,17 +951,13 @@ fn spawn<D: StationDriver>(
     job: u32,
     (interrupt, aborts, pulse): (&Interrupt, &watch::Sender<u64>, &Pulse),
     reports: &mpsc::Sender<StationReport>,
-    armed: Option<(u32, Armed)>,
+    (armed, may_be_at_work): (Option<(u32, Armed)>, bool),
     poll: Duration,
 ) -> (mpsc::Sender<Ask>, tokio::task::JoinHandle<()>) {
     let (asks, asked) = mpsc::channel(16);
     let station = MachineTask::new(driver, job, interrupt.clone(), reports.clone(), armed);
+    let station = if may_be_at_work { station.may_be_at_work() } else { station };
     (asks, tokio::spawn(station.attend(asked, poll, Aborts::new(aborts.subscribe()), pulse.clone())))
-}
-
-fn restored(intent: &Value) -> Option<(u32, Armed)> {
-    let intent: Intent = serde_json::from_value(intent.clone()).ok()?;
-    Some((u32::from(intent.cycle), intent.armed()))
 }
 
 /// Commands that wait neither for the disk nor for the record of what came before them: they bring machines to rest, only look at

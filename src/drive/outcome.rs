@@ -1,6 +1,6 @@
 //! Which event answers which command, so that the journal shows what became of each.
 
-use crate::cell::{Asked, Command, Device, Event};
+use crate::cell::{Asked, Command, Device, Event, Reconciliation};
 
 /// Whether a command is answered by an event at all; the others are done when they are given.
 pub(super) fn is_answered(command: &Command) -> bool {
@@ -31,6 +31,8 @@ pub(super) fn answers(event: &Event, command: &Command) -> bool {
         (C::AskWhetherClear { device }, E::ClearConfirmed { device: d, .. }) => device == d,
         (C::Prepare { device, .. }, E::Prepared { device: d, .. }) => device == d,
         (C::StartMachine { device, cycle }, E::Started { device: d, cycle: c }) => device == d && cycle == c,
+        // What nobody can tell leaves it open.
+        (C::StartMachine { .. }, E::Reconciled { outcome: Reconciliation::Unknown(_), .. }) => false,
         (C::StartMachine { device, cycle }, E::Reconciled { device: d, cycle: c, .. }) => device == d && cycle == c,
         (C::StartMachine { device, .. }, E::DeclaredOver { device: d, .. }) => device == d,
         (C::HoldMachine { device }, E::MachineHeld { device: d } | E::Ended { device: d, .. }) => device == d,

@@ -156,7 +156,11 @@ impl Scribe {
         loop {
             let error = match self.write(job) {
                 Ok(()) => return Ok(()),
-                Err(error) if !error.may_pass() => return Err(error),
+                Err(error) if !error.may_pass() => {
+                    // A gap among events and commands is the end of the record; a file that cannot come on it is none.
+                    self.broken_off |= !matches!(job, Job::Adopt(..));
+                    return Err(error);
+                }
                 Err(error) if self.given_up.load(Ordering::Acquire) => {
                     // What follows would stand in the record as if nothing were missing before it.
                     self.broken_off = true;

@@ -27,7 +27,7 @@ use super::task::Product;
 use super::work;
 use super::{Computation, Task, folder_of, made};
 use crate::cell::{Cell, CellPlan, Command, Device, Ending, Event, Gate, Judgement};
-use crate::device::{Coordinates, Identified, digest};
+use crate::device::{Armed, Coordinates, Identified, digest};
 use crate::formats::{self, FormatError, ScratchFolder};
 use crate::journal::{Artefact, JournalError, Kind, Reader, Record, sha256_hex};
 
@@ -66,6 +66,8 @@ pub enum ReplayError {
     File(#[from] FormatError),
     #[error("{}: {source}; nothing was commanded: see to the disk and try again", .path.display())]
     Scratch { path: PathBuf, source: io::Error },
+    #[error("{}: what is computed again cannot be written ({what}); nothing was commanded: see to the disk and try again", .run.display())]
+    NotSaved { run: PathBuf, what: String },
     #[error("{}: record {seq} cannot be read back ({what}); this run cannot be gone on with, bring its machines home by `regrind recover`", .run.display())]
     Unreadable { run: PathBuf, seq: u64, what: String },
     #[error(
@@ -106,6 +108,18 @@ impl Interrupted {
         }
     }
 
+    /// Returns what a machine was prepared for last, with its cycle, and whether it may be at it still.
+    pub(super) fn left_at(&self, device: Device) -> (Option<(u32, Armed)>, bool) {
+        let intent = self.armed[device as usize].clone();
+        let Some(intent) = intent.and_then(|value| serde_json::from_value::<Intent>(value).ok()) else {
+            return (None, false);
+        };
+        let cycle = u32::from(intent.cycle);
+        let state = self.cell.state();
+        let at_work = state.phase().map_or(!state.is_end(), |phase| phase.moving() == Some(device));
+        (Some((cycle, intent.armed())), at_work && cycle == self.cell.cycle())
+    }
+
     /// Returns the state in words in which the run broke off.
     pub fn state(&self) -> String {
         format!("{}, cycle {}", self.cell.state(), self.cell.cycle())
@@ -124,16 +138,14 @@ struct Replay<'t> {
     names: BTreeSet<String>,
     /// What the last measurement said that its coordinates are.
     coordinates: Option<Coordinates>,
-    scratch: ScratchFolder,
     last: u64,
 }
 
 impl<'t> Replay<'t> {
     fn new(run: &'t Path, plan: CellPlan, task: &'t Task) -> Result<Self, ReplayError> {
         let found = Interrupted::none(plan);
-        let scratch = ScratchFolder::at(run.join(SCRATCH))?;
         let (due, files, names) = (VecDeque::new(), BTreeMap::new(), BTreeSet::new());
-        Ok(Self { run, task, found, due, files, names, coordinates: None, scratch, last: 0 })
+        Ok(Self { run, task, found, due, files, names, coordinates: None, last: 0 })
     }
 
     fn take(&mut self, record: &Record) -> Result<(), ReplayError> {
@@ -244,7 +256,8 @@ impl<'t> Replay<'t> {
             self.found.cycles.take(number, Product::Points(points));
             return Ok(());
         }
-        let folder = self.scratch.path().join(folder_of(number, 1));
+        let scratch = ScratchFolder::at(self.run.join(SCRATCH))?;
+        let folder = scratch.path().join(folder_of(number, 1));
         made(&folder)?;
         let mut files = Files::new(folder);
         let (again, product) = match kind {
@@ -253,6 +266,10 @@ impl<'t> Replay<'t> {
             }
             _ => work::compensate_cycle(self.task, &mut files, number, &cycle),
         };
+        if let Event::NotSaved { why, .. } = again {
+            let what = super::message_of(&why);
+            return Err(ReplayError::NotSaved { run: self.run.to_owned(), what });
+        }
         let [recorded, again] = [event, &again].map(|event| serde_json::to_value(event).unwrap_or_default());
         if recorded != again {
             return Err(
@@ -316,8 +333,10 @@ impl<'t> Replay<'t> {
         if name == "result.json" || name.starts_with('.') {
             return;
         }
-        let attempts = self.found.attempts.entry((number, Computation::of(name))).or_default();
-        *attempts = attempt.max(*attempts);
+        if let Some(kind) = Computation::of(name) {
+            let attempts = self.found.attempts.entry((number, kind)).or_default();
+            *attempts = attempt.max(*attempts);
+        }
         let path = format!("{folder}/{name}");
         if !self.names.contains(&path) {
             self.found.left.push(path);

@@ -234,6 +234,14 @@ impl<B: StationDriver> MachineTask<B> {
         Self { driver, job, interrupt, reports, loaded: None, armed, cycle, seen, notes }
     }
 
+    /// Takes it that the machine may be at what was prepared for it before this program began.
+    pub(super) fn may_be_at_work(mut self) -> Self {
+        if let Some(armed) = &self.armed {
+            self.driver.machine().restore(armed);
+        }
+        self
+    }
+
     /// Attends until nobody can ask any more. If that panics, which is a fault of this program, it is told as that, and the run goes on
     /// without the machine, to which nobody speaks any more.
     pub(super) async fn attend(self, asks: mpsc::Receiver<Ask>, poll: Duration, aborts: Aborts, pulse: Pulse) {
@@ -328,13 +336,16 @@ impl<B: StationDriver> MachineTask<B> {
             let status = self.driver.machine().status().await?;
             // What is at somebody else's job is not taken from him.
             if self.is_at_another_job(&status) {
-                return Ok((identity, status));
+                return Ok((identity, Err(at_work(&status))));
             }
             let status = self.driver.machine().claim().await?;
-            Ok::<_, DeviceError>((identity, status))
+            Ok::<_, DeviceError>((identity, Ok(status)))
         };
         match connected.await {
-            Ok((identity, status)) => {
+            Ok((_, Err(found))) => {
+                self.tell(Event::NotConnected { device: B::DEVICE, why: Mismatch::AtAnotherJob(found) }).await;
+            }
+            Ok((identity, Ok(status))) => {
                 self.seen.connected = true;
                 self.seen.state = Some(status.state);
                 let found = self.found(&status).await;
@@ -360,10 +371,7 @@ impl<B: StationDriver> MachineTask<B> {
                 Ok(_) => Occupation::Idle,
                 Err(error) => Occupation::Busy(error.to_string()),
             },
-            state => Occupation::Busy(match status.job {
-                Some(job) => format!("{state} with {job}"),
-                None => state.to_string(),
-            }),
+            _ => Occupation::Busy(at_work(status)),
         }
     }
 
@@ -497,9 +505,35 @@ impl<B: StationDriver> MachineTask<B> {
 
     async fn abort(&mut self) {
         self.seen.aborting = true;
+        if !self.seen.connected
+            && let Err(why) = self.meet().await
+        {
+            let device = B::DEVICE;
+            return self.tell(Event::Refused { device, what: Asked::Abort, why }).await;
+        }
         match self.driver.machine().abort().await {
             Ok(status) => self.note(&status).await,
             Err(error) => self.failed(Asked::Abort, error).await,
+        }
+    }
+
+    /// A program that was started again has not met its machine: what is another one, or at another run's job, is not aborted. One that
+    /// cannot be reached now is tried by the abort itself.
+    async fn meet(&mut self) -> Result<(), String> {
+        let met = async {
+            self.driver.machine().connect().await?;
+            self.driver.machine().status().await
+        };
+        match met.await {
+            Ok(status) if self.is_at_another_job(&status) => {
+                Err(format!("it is at another run's job: {}", at_work(&status)))
+            }
+            Ok(_) => {
+                self.seen.connected = true;
+                Ok(())
+            }
+            Err(error) if error.is_link() => Ok(()),
+            Err(error) => Err(error.to_string()),
         }
     }
 
@@ -577,6 +611,12 @@ impl<B: StationDriver> MachineTask<B> {
             }
         };
         match acknowledged.await {
+            // A result that is not there yet is not given back.
+            Ok(status) if status.state.moves() || status.state == State::Held => {
+                let (device, why) =
+                    (B::DEVICE, format!("{} is still {}", self.driver.machine().name(), at_work(&status)));
+                self.tell(Event::Refused { device, what: Asked::Acknowledge, why }).await;
+            }
             Ok(status) => {
                 self.seen.state = Some(status.state);
                 self.seen.running = false;
@@ -813,6 +853,14 @@ impl<B: StationDriver> MachineTask<B> {
             self.seen.running = false;
             self.end(JobResult::Aborted).await;
         }
+    }
+}
+
+/// Says what a machine is at.
+fn at_work(status: &Status) -> String {
+    match status.job {
+        Some(job) => format!("{} with {job}", status.state),
+        None => status.state.to_string(),
     }
 }
 

@@ -37,7 +37,7 @@ pub use open::free_bytes;
 pub use record::{Entry, Kind, Record, Records};
 pub use seal::SEALED_EVERY;
 pub use verify::{Against, Anchor, Verified, verify, verify_against};
-pub use write::{Header, Journal};
+pub use write::{Header, Journal, RunLock};
 
 use std::path::Path;
 

@@ -138,11 +138,15 @@ impl Journal {
     /// # Errors
     /// As [`Journal::open`].
     pub fn open_with(folder: impl AsRef<Path>, key: Option<AuditKey>) -> Result<Self, JournalError> {
-        let folder = folder.as_ref().to_owned();
-        if !folder.join(DATABASE).is_file() {
-            return Err(JournalError::Absent { path: folder });
-        }
-        let lock = lock(&folder)?;
+        Self::open_locked(RunLock::take(folder)?, key)
+    }
+
+    /// As [`Journal::open_with`], for who has looked through the run under its lock before.
+    ///
+    /// # Errors
+    /// Those of [`Journal::open_with`] but those of the lock.
+    pub fn open_locked(lock: RunLock, key: Option<AuditKey>) -> Result<Self, JournalError> {
+        let RunLock { file: lock, folder } = lock;
         let connection = open::read_write(&folder)?;
         let (run, part, first_command_id) = first_of(&connection, &folder)?;
         let mut journal = Self {
@@ -462,6 +466,27 @@ impl Journal {
             (records, head) = (record.seq, record.hash);
         }
         Ok(())
+    }
+}
+
+/// The lock of a run: while it lives no other process can go on with it.
+#[derive(Debug)]
+pub struct RunLock {
+    file: File,
+    folder: PathBuf,
+}
+
+impl RunLock {
+    /// Takes the lock of a run that has a journal.
+    ///
+    /// # Errors
+    /// No journal there, or one that is in use.
+    pub fn take(folder: impl AsRef<Path>) -> Result<Self, JournalError> {
+        let folder = folder.as_ref().to_owned();
+        if !folder.join(DATABASE).is_file() {
+            return Err(JournalError::Absent { path: folder });
+        }
+        Ok(Self { file: lock(&folder)?, folder })
     }
 }
 

@@ -96,10 +96,12 @@ impl Story {
             },
             Kind::Artefact => {
                 let name = value["name"].as_str().unwrap_or_default();
-                if name == format!("cycle-{}/{PICTURE}", record.cycle) {
+                // What was computed again after an interruption stands in a folder of its own; the last counts.
+                let of_cycle = name.starts_with(&format!("cycle-{}/", record.cycle));
+                if of_cycle && name.ends_with(&format!("/{PICTURE}")) {
                     self.cycle(record.cycle).picture = Some(name.to_owned());
                 }
-                if name == format!("cycle-{}/{FIGURES}", record.cycle) {
+                if of_cycle && name.ends_with(&format!("/{FIGURES}")) {
                     self.cycle(record.cycle).form = Some(name.to_owned());
                 }
             }

@@ -170,6 +170,7 @@ fn mismatch_words(why: &Mismatch) -> String {
         Mismatch::WordOrder(words) => format!("another word order: {words}"),
         Mismatch::Inches => "in inches".to_owned(),
         Mismatch::Owned(words) => format!("owned by another client: {words}"),
+        Mismatch::AtAnotherJob(words) => format!("at the job of another run: {words}"),
     }
 }
 

@@ -63,6 +63,8 @@ pub struct ManualMachine {
     work: Option<(Work, u32)>,
     /// The job asked for, and the number of its start.
     job: Option<(Job, u32)>,
+    /// The job of an interrupted run, of which nobody has told what became.
+    untold: Option<(Job, u32)>,
     /// Jobs and cycles that were ever asked for: never twice.
     asked: Vec<(u32, u16)>,
     outcome: Outcome,
@@ -87,6 +89,7 @@ impl ManualMachine {
             state: State::Idle,
             work: None,
             job: None,
+            untold: None,
             asked: Vec::new(),
             outcome: Outcome::None,
             begun: None,
@@ -322,11 +325,18 @@ impl Machine for ManualMachine {
         }
     }
 
+    fn restore(&mut self, intended: &Armed) {
+        self.untold = Some((intended.job, intended.start_sequence));
+        self.asked.push((intended.job.job, intended.job.cycle));
+    }
+
     async fn claim(&mut self) -> Answered<Status> {
         self.status().await
     }
 
     async fn prepare(&mut self, job: Job) -> Answered<Armed> {
+        // The cell goes on only behind a person's word that it is over.
+        self.untold = None;
         let is_loaded = self.work.as_ref().is_some_and(|(_, digest)| *digest == job.digest);
         if self.state != State::Idle || !is_loaded {
             let answer = if is_loaded { Answer::WrongState } else { Answer::PayloadMissing };
@@ -365,6 +375,10 @@ impl Machine for ManualMachine {
     }
 
     async fn stop(&mut self) -> Answered<Status> {
+        if let Some(untold) = self.untold.take() {
+            (self.job, self.state) = (Some(untold), State::Stopping);
+            return Ok(self.told());
+        }
         match self.state {
             State::Prepared => (self.state, self.job) = (State::Idle, None),
             // A person has confirmed that it stands.
@@ -375,7 +389,9 @@ impl Machine for ManualMachine {
     }
 
     async fn abort(&mut self) -> Answered<Status> {
-        let may_move = self.state.moves();
+        let untold = self.untold.take();
+        let may_move = self.state.moves() || untold.is_some();
+        self.job = self.job.or(untold);
         self.state = if may_move { State::Aborting } else { State::Aborted };
         self.outcome = Outcome::Aborted;
         Ok(self.told())
@@ -440,5 +456,39 @@ impl Grinder for ManualMachine {
             }),
             _ => Err(DeviceError::NoResult { machine: Arc::clone(&self.name), job, state: self.state }),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A machine of a run that broke off at a pass.
+    fn taken_up() -> ManualMachine {
+        let settings = ManualSettings {
+            part: "a part".into(),
+            folder: PathBuf::new(),
+            content: Content::default(),
+            free_points: None,
+            probe_tolerance_mm: 0.1,
+        };
+        let mut machine = ManualMachine::new(MachineKind::Grinder, settings);
+        let job = Job { job: 7, cycle: 2, digest: 3 };
+        machine.restore(&Armed { job, start_sequence: 1, token: 0, boot_id: 0 });
+        machine
+    }
+
+    #[tokio::test]
+    async fn what_became_of_the_pass_of_an_interrupted_run_is_nothing_that_this_program_knows() {
+        let job = Job { job: 7, cycle: 2, digest: 3 };
+        let armed = Armed { job, start_sequence: 1, token: 0, boot_id: 0 };
+        assert!(matches!(taken_up().reconcile(&armed).await, Ok(Reconciled::Unknown { .. })));
+        // It may be moving: that it stands takes a person's word, and an abort is confirmed by nobody.
+        let mut machine = taken_up();
+        assert_eq!(machine.stop().await.unwrap().state, State::Stopping);
+        machine.confirm(Word::Still).await.unwrap();
+        let status = machine.status().await.unwrap();
+        assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Stopped));
+        assert_eq!(taken_up().abort().await.unwrap().state, State::Aborting);
     }
 }
