@@ -78,9 +78,7 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
     if !arguments.json {
         let marked = if cell.simulated { "SIMULATION  " } else { "" };
         let state = interrupted.state();
-        super::print(&format!(
-            "{marked}broke off: {state}; the record is whole and was done again without a difference\n"
-        ))?;
+        super::print(&format!("{marked}broke off in {state}\nthe record is whole, and done again nothing differs\n"))?;
     }
     super::runtime()?.block_on(async {
         let (part, actor) = (&begun.part_in_files, operator(arguments.operator.as_deref()));
