@@ -268,7 +268,7 @@ pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<Resul
     let text = without_unit(text, unit_mm);
     let mut points =
         if is_ply { ply::parse_ply(path, &text)?.points } else { parse_points_with(path, &text, decimal)? };
-    let columns = if is_ply { Columns::default() } else { Columns::read(path, &text, points.len())? };
+    let columns = if is_ply { Columns::default() } else { Columns::read(path, &text, points.len(), decimal)? };
     if unit_mm != 1.0 {
         points.iter_mut().for_each(|p| *p *= unit_mm);
     }
@@ -364,11 +364,11 @@ fn beside(names: &[String]) -> [Option<usize>; 5] {
 
 impl Columns {
     /// Goes through the lines again for the columns that the header names; the points have been read from the same lines.
-    fn read(path: &Path, text: &[u8], points: usize) -> Result<Self, FormatError> {
+    fn read(path: &Path, text: &[u8], points: usize, decimal: Option<Decimal>) -> Result<Self, FormatError> {
         let text = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(text);
         let mut preamble = Preamble::new(path);
         let mut lines = text.split(|&b| b == b'\n').map(|l| l.strip_suffix(b"\r").unwrap_or(l)).zip(1..);
-        let (first, layout) = loop {
+        let (first, mut layout) = loop {
             let Some((line, number)) = lines.next() else { return Ok(Self::default()) };
             if let Some(layout) = preamble.take(line, number)? {
                 break ((line, number), layout);
@@ -377,6 +377,13 @@ impl Columns {
         let columns = beside(&preamble.names(layout.separator));
         if columns.iter().all(Option::is_none) {
             return Ok(Self::default());
+        }
+        match decimal {
+            Some(decimal) => layout.decimal = decimal,
+            None => {
+                let data = text.splitn(first.1 as usize, |&b| b == b'\n').last().unwrap_or_default();
+                layout.settle_decimal(path, data)?;
+            }
         }
         let [index, name, enabled, radius, diameter] = columns;
         let mut found = Self {
@@ -474,6 +481,18 @@ mod tests {
         assert_eq!(found.names.unwrap(), ["M1_1", "M1_1"]);
         let two = text.replacen("38.1 ", "12.7 ", 1);
         assert!(matches!(parse(&two, &Content::default()), Err(FormatError::ProbeVaries { line: 3, .. })));
+    }
+
+    #[test]
+    fn a_probe_has_the_decimal_mark_of_its_file() {
+        let text = "# a comment\nname;x;y;z;probe\na;1,5;2,5;3,5;38,1\nb;4;5;6;38,1\n";
+        let comma = Content { decimal: DecimalMark::Comma, ..Content::default() };
+        for content in [Content::default(), comma] {
+            assert_eq!(parse(text, &content).unwrap().probe_radius_mm, Some(19.05));
+        }
+        // Whole coordinates do not tell the mark; the cell does.
+        let whole = "name;x;y;z;probe\na;1;2;3;1.500,5\n";
+        assert_eq!(parse(whole, &comma).unwrap().probe_radius_mm, Some(750.25));
     }
 
     #[test]

@@ -178,6 +178,7 @@ fn what_moves_the_tool_and_is_not_told_is_refused_with_its_line() {
         ("G91\nG53 G0 Z0", "G53"),
         ("G1 X1e3", "not known"),
         ("E5", "not known"),
+        ("G91\nG0 X1000000000\nX1000000000", "farther"),
     ] {
         let bench = Shop::new(error_mm, &format!("G21 G90\nG0 X0 Y0 Z1\nG1 Z0 F100\n{line}\nM2\n"));
         let said = bench.compensate(&[]).expect_err(line);

@@ -11,7 +11,7 @@ use sha2::{Digest, Sha256};
 
 use super::arc::{Arc, Centre, Plane};
 use super::map::{MapBase, identity_in};
-use super::number::{push_fixed, rounded};
+use super::number::{LARGEST_MM, push_fixed, rounded};
 use super::read::{Block, Refusal, Word, block};
 use super::write::UNCORRECTED;
 use super::{GcodeError, hex};
@@ -372,15 +372,23 @@ impl<'a> Rewriter<'a> {
         let mut target = self.base;
         for k in 0..3 {
             let Some(value) = named[k].map(|v| v * self.unit_mm) else { continue };
-            target[k] = if self.relative {
+            let to = if self.relative {
                 let Some(before) = self.base[k] else {
                     let found = format!("{} moves by a distance from a place that is not known", ['X', 'Y', 'Z'][k]);
                     return Err((found, "begin with a G0 in absolute coordinates (G90)"));
                 };
-                Some(before + value)
+                before + value
             } else {
-                Some(value)
+                value
             };
+            if to.abs() > LARGEST_MM {
+                let found = format!(
+                    "{} goes to {to:e} mm, farther than the {LARGEST_MM:e} that are written",
+                    ['X', 'Y', 'Z'][k]
+                );
+                return Err((found, "correct the number, or the unit (G20, G21)"));
+            }
+            target[k] = Some(to);
         }
         Ok(target)
     }
