@@ -1,0 +1,125 @@
+//! What the program is built of, held against deny.toml by the lock file and the manifests of the crates: licences, bans and sources. This is
+//! the part of `cargo deny check licenses bans sources` that can be had without cargo-deny.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use serde_json::Value;
+use toml::Table;
+
+fn table(file: &str) -> Table {
+    fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(file)).unwrap().parse().unwrap()
+}
+
+/// The words of a list of texts, or of tables that name a crate.
+fn words(list: &toml::Value) -> BTreeSet<&str> {
+    list.as_array().unwrap().iter().map(|item| item.get("crate").unwrap_or(item).as_str().unwrap()).collect()
+}
+
+/// The crates that a build for this computer takes, as their manifests have them.
+fn packages() -> Vec<Value> {
+    let platform = format!("{}-unknown-linux-gnu", std::env::consts::ARCH);
+    let output = Command::new(env!("CARGO"))
+        .args(["metadata", "--format-version=1", "--offline", "--locked", "--filter-platform", &platform])
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let found: Value = serde_json::from_slice(&output.stdout).unwrap();
+    found["packages"].as_array().unwrap().clone()
+}
+
+/// Whether an SPDX expression can be fulfilled by these licences. `AND` binds closer than `OR`; an old `/` is `OR`.
+fn is_allowed(expression: &str, may: &BTreeSet<&str>) -> bool {
+    let spaced = expression.replace('(', " ( ").replace(')', " ) ").replace('/', " OR ");
+    let mut words: Vec<&str> = spaced.split_whitespace().rev().collect();
+    let allowed = any_of(&mut words, may);
+    assert!(words.is_empty(), "{expression} is no SPDX expression");
+    allowed
+}
+
+fn any_of(words: &mut Vec<&str>, may: &BTreeSet<&str>) -> bool {
+    let mut allowed = all_of(words, may);
+    while words.pop_if(|word| *word == "OR").is_some() {
+        allowed |= all_of(words, may);
+    }
+    allowed
+}
+
+fn all_of(words: &mut Vec<&str>, may: &BTreeSet<&str>) -> bool {
+    let mut allowed = one(words, may);
+    while words.pop_if(|word| *word == "AND").is_some() {
+        allowed &= one(words, may);
+    }
+    allowed
+}
+
+fn one(words: &mut Vec<&str>, may: &BTreeSet<&str>) -> bool {
+    match words.pop() {
+        Some("(") => {
+            let allowed = any_of(words, may);
+            assert_eq!(words.pop(), Some(")"));
+            allowed
+        }
+        Some(name) => {
+            // A licence with an exception is another licence.
+            let exception = words.pop_if(|word| *word == "WITH").and_then(|_| words.pop());
+            exception.map_or(may.contains(name), |with| may.contains(format!("{name} WITH {with}").as_str()))
+        }
+        None => panic!("a licence is missing"),
+    }
+}
+
+#[test]
+fn expressions_of_licences_are_understood() {
+    let may = BTreeSet::from(["MIT", "Apache-2.0", "Unicode-3.0"]);
+    for (expression, allowed) in [
+        ("MIT", true),
+        ("GPL-3.0-only", false),
+        ("MIT OR GPL-3.0-only", true),
+        ("Unlicense/MIT", true),
+        ("MIT AND GPL-3.0-only OR Zlib", false),
+        ("(MIT OR Apache-2.0) AND Unicode-3.0", true),
+        ("(MIT OR Apache-2.0) AND OpenSSL", false),
+        ("Apache-2.0 WITH LLVM-exception", false),
+        ("Apache-2.0 WITH LLVM-exception OR Apache-2.0 OR MIT", true),
+    ] {
+        assert_eq!(is_allowed(expression, &may), allowed, "{expression}");
+    }
+}
+
+#[test]
+fn every_crate_comes_under_a_licence_that_is_allowed() {
+    let deny = table("deny.toml");
+    let may = words(&deny["licenses"]["allow"]);
+    let exceptions = deny["licenses"]["exceptions"].as_array().unwrap();
+    let (packages, mut used) = (packages(), 0);
+    assert!(packages.len() > 50);
+    for package in &packages {
+        let name = package["name"].as_str().unwrap();
+        let licence = package["license"].as_str().unwrap_or_else(|| panic!("{name} names no licence"));
+        let exception = exceptions.iter().find(|e| e["crate"].as_str() == Some(name));
+        used += usize::from(exception.is_some());
+        let may = exception.map_or_else(|| may.clone(), |e| words(&e["allow"]).union(&may).copied().collect());
+        assert!(is_allowed(licence, &may), "{name} comes under {licence}, which deny.toml does not allow");
+    }
+    assert_eq!(used, exceptions.len(), "an exception that nobody needs");
+}
+
+#[test]
+fn no_crate_is_banned_and_all_come_from_the_registry_that_is_allowed() {
+    let (deny, lock) = (table("deny.toml"), table("Cargo.lock"));
+    let banned = words(&deny["bans"]["deny"]);
+    let registries: Vec<String> =
+        words(&deny["sources"]["allow-registry"]).iter().map(|address| format!("registry+{address}")).collect();
+    for package in lock["package"].as_array().unwrap() {
+        let name = package["name"].as_str().unwrap();
+        assert!(!banned.contains(name), "{name} is banned by deny.toml");
+        match package.get("source").and_then(toml::Value::as_str) {
+            Some(source) => assert!(registries.iter().any(|one| one == source), "{name} comes from {source}"),
+            None => assert!(name.starts_with("regrind"), "{name} comes from a folder"),
+        }
+    }
+}
