@@ -37,6 +37,8 @@ use error::Answered;
 pub use error::DeviceError;
 pub use machine::{Cmm, Grinder, Interrupt, Machine};
 pub use manual::{ManualMachine, ManualSettings, ManualWire};
+#[cfg(fuzzing)]
+pub use modbus::any_registers;
 pub use modbus::{
     Line, Link, LinkFigures, ModbusCmm, ModbusGrinder, ModbusMachine, ModbusSettings, Parity, RegisterMap, RtuWire,
     Signal, SignalTable, SignalType, TcpWire, WordOrder,

@@ -5,6 +5,8 @@
 //! results come down in pages between two readings of their header. The one thing that is never repeated is START: its frame may be written
 //! again, with its number, and if that too does not tell, the outcome is unknown and stays so until the machine is asked.
 
+#[cfg(any(test, fuzzing))]
+mod any_registers;
 mod codec;
 mod link;
 mod settings;
@@ -22,6 +24,8 @@ use super::{
     Machine, MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, Reconciled, SignalValue, Started, State,
     Status, digest,
 };
+#[cfg(fuzzing)]
+pub use any_registers::any_registers;
 use codec::{CommandFrame, Payload, RecordFlaw, Registers, crc32};
 pub use link::{Link, LinkFigures};
 pub use settings::{

@@ -204,7 +204,7 @@ impl Unit {
     }
 
     /// Reads an identity block, or says what it is that answers instead.
-    fn recognise(&self, words: &[u16]) -> Result<Identity, DeviceError> {
+    pub(super) fn recognise(&self, words: &[u16]) -> Result<Identity, DeviceError> {
         let machine = self.name.clone();
         for (at, required) in MAGIC.into_iter().enumerate() {
             if words[at] != required {

@@ -1,0 +1,109 @@
+//! Registers of any content, given to everything that reads them: for tests and for fuzzing only.
+
+use std::sync::{Mutex, OnceLock, PoisonError};
+use std::time::Duration;
+
+use super::codec::{Registers, outcome, pass_figures, point, point_registers};
+use super::{Line, Link, ModbusMachine, ModbusSettings, WordOrder};
+use crate::{Job, MachineKind};
+
+/// A driver whose line leads nowhere and is never asked.
+fn driver() -> ModbusMachine {
+    let settings = ModbusSettings::new(Line::Tcp { host: "nowhere.invalid".into(), port: 502 });
+    let link = Link::new(settings.line.clone(), settings.request_timeout, Duration::ZERO).expect("a thread");
+    ModbusMachine::new(MachineKind::Cmm, link, settings)
+}
+
+/// Reads bytes as the registers of each block; the first byte says which block, and in which order the words are.
+///
+/// # Panics
+/// What must not be: a value that is no number, a result larger than any, a block that makes the driver panic.
+pub fn any_registers(bytes: &[u8]) {
+    static DRIVER: OnceLock<Mutex<ModbusMachine>> = OnceLock::new();
+    let Some((which, bytes)) = bytes.split_first() else { return };
+    let order = if which & 0x80 == 0 { WordOrder::Big } else { WordOrder::Little };
+    let mut machine = DRIVER.get_or_init(|| Mutex::new(driver())).lock().unwrap_or_else(PoisonError::into_inner);
+    machine.unit.map.word_order = order;
+    // The line below has seen to the length of an answer.
+    let sized = |registers: usize| {
+        let mut words: Vec<u16> = bytes.as_chunks::<2>().0.iter().map(|pair| u16::from_be_bytes(*pair)).collect();
+        words.resize(registers, 0);
+        words
+    };
+    match which & 0x7f {
+        0 => drop(machine.unit.recognise(&sized(32))),
+        1 => {
+            if let Ok(block) = machine.understand(&sized(48)) {
+                assert!(block.temperature_c.is_finite());
+            }
+        }
+        2 => assert_header(&machine, &sized(56)),
+        3 => assert_points(&sized(16), order),
+        4 => {
+            if let Ok((.., figures)) = pass_figures(Registers::new(&sized(32), order)) {
+                assert!(figures.into_iter().all(f64::is_finite));
+            }
+        }
+        _ => drop(outcome(sized(1)[0])),
+    }
+}
+
+fn assert_header(machine: &ModbusMachine, words: &[u16]) {
+    let block = machine.unit.registers(words);
+    let job = Job { job: block.u32(6), cycle: words[8], digest: 0 };
+    for kind in [4, 5] {
+        let Ok(header) = machine.header(words, job, kind, block.u32(46)) else { continue };
+        let told = [header.probe_radius_mm, header.scale_mm, header.temperature_c, header.duration_s];
+        assert!(told.into_iter().all(f64::is_finite) && header.bytes <= super::RESULT_BYTES);
+        assert_eq!(header.bytes as usize, 2 * header.registers * header.records as usize);
+    }
+}
+
+fn assert_points(words: &[u16], order: WordOrder) {
+    for (format, scale_mm) in [(1, 1.0), (2, 1e-6), (2, f64::MAX)] {
+        let size = point_registers(format).unwrap_or_default();
+        if let Ok(point) = point(Registers::new(&words[..size], order), format, scale_mm) {
+            assert!(point.at_mm.into_iter().all(f64::is_finite));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// Blocks as a sound machine has them.
+    fn samples() -> Vec<Vec<u8>> {
+        let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../fuzz/corpus/registers");
+        let mut paths: Vec<_> = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+        paths.sort();
+        paths.iter().map(|path| std::fs::read(path).unwrap()).collect()
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
+
+        #[test]
+        fn whatever_a_block_holds_becomes_a_value_or_an_error(
+            which in any::<prop::sample::Index>(),
+            changes in prop::collection::vec((any::<prop::sample::Index>(), prop::sample::select(vec![0, 1, 0x7f, 0x80, 0xf0, 0xff])), 0..5),
+            noise in prop::collection::vec(any::<u8>(), 0..130),
+        ) {
+            let samples = samples();
+            let mut block = samples[which.index(samples.len())].clone();
+            any_registers(&block);
+            for (at, with) in changes {
+                let at = at.index(block.len());
+                block[at] = with;
+            }
+            any_registers(&block);
+            block[0] ^= 0x80;
+            any_registers(&block);
+            for which in 0..6 {
+                any_registers(&[&[which], &noise[..]].concat());
+            }
+        }
+    }
+}
