@@ -26,11 +26,11 @@ pub use regrind_device as device;
 pub use regrind_document as document;
 pub use regrind_formats as formats;
 pub use regrind_journal as journal;
+pub use regrind_report as report;
 
 pub mod config;
 pub mod drive;
 pub mod recipe;
-pub mod report;
 pub mod setup;
 
 /// The example of the README is run as a test.

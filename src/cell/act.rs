@@ -586,7 +586,11 @@ impl Cell {
             None => self.resume_connected(phase),
             Some(_) if self.state == Starting => {}
             Some(device) => {
-                return Err(format!("the {device} is not connected; it is being connected again, resume then"));
+                let what = match self.knows(*device).boot_id {
+                    Some(_) => "is not idle: bring it there at its panel",
+                    None => "is not connected",
+                };
+                return Err(format!("the {device} {what}; it is being connected again, resume then"));
             }
         }
         Ok(())
@@ -831,6 +835,7 @@ impl Cell {
     /// This program was started again: nothing is known of the machines but that they may be at this run's job.
     pub(super) fn restarted(&mut self, actor: &str) {
         if self.state == Completing {
+            self.raise(AlarmId::NotClear, "not both were seen clear before the program ended");
             return self.complete();
         }
         for known in &mut self.known {

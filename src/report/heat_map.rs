@@ -5,9 +5,9 @@ use std::path::Path;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
-use crate::formats::write_atomic;
-use crate::geometry::{Aperture, Grid};
-use crate::registration::{Deviation, PointStatus};
+use regrind_core::geometry::{Aperture, Grid};
+use regrind_core::registration::{Deviation, PointStatus};
+use regrind_formats::write_atomic;
 
 use super::axis::{Ruler, Scale, grouped, three_digits};
 use super::colour::{ColourMap, Tones};

@@ -5,7 +5,7 @@ use std::path::Path;
 use super::ReportError;
 use super::axis::{Ruler, Scale};
 use super::svg::{Anchor, Frame, LARGE, SMALL, Svg};
-use crate::formats::write_atomic;
+use regrind_formats::write_atomic;
 
 /// One axis of a plot.
 #[derive(Clone, Debug, Default)]

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::ReportError;
 use super::colour::Tones;
-use crate::formats::write_atomic;
+use regrind_formats::write_atomic;
 
 /// Returns points, and triangles between them if there are any, as binary PLY with a colour and the deviation at every point.
 ///
@@ -100,7 +100,7 @@ mod tests {
     #[test]
     fn points_and_faces_read_back_and_have_their_colours() {
         let bytes = coloured_ply("part\n7", &ROWS, &[[0, 1, 2]], Some(1.5e-3), &["SIMULATION"]).unwrap();
-        let read = crate::formats::parse_ply(Path::new("p.ply"), &bytes).unwrap();
+        let read = regrind_formats::parse_ply(Path::new("p.ply"), &bytes).unwrap();
         assert_eq!((read.points[1], &read.triangles[..]), ([3.0, 4.0, 5.5].into(), &[[0, 1, 2]][..]));
         let begin = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
         let head = std::str::from_utf8(&bytes[..begin]).unwrap();

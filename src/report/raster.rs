@@ -1,7 +1,7 @@
 //! From scattered samples to pixels.
 
 use super::{ReportError, range};
-use crate::geometry::Grid;
+use regrind_core::geometry::Grid;
 
 /// A picture of values: NaN where nothing is known.
 #[derive(Clone, Debug)]

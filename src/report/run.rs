@@ -16,9 +16,9 @@ use serde_json::Value;
 use super::ReportError;
 use super::axis::three_digits;
 use super::words::{ending_words, words};
-use crate::cell::{Alarm, Command, Ending, Event, Figures, Judgement};
-use crate::formats::{FormatError, escaped, write_atomic};
-use crate::journal::{Kind, Reader, Record, Verified, verify};
+use regrind_cell::{Alarm, Command, Ending, Event, Figures, Judgement};
+use regrind_formats::{FormatError, escaped, write_atomic};
+use regrind_journal::{Kind, Reader, Record, Verified, verify};
 
 /// The report in a run folder.
 pub const RUN_REPORT: &str = "report.html";

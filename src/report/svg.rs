@@ -3,7 +3,7 @@
 use std::fmt::Write;
 
 use super::axis::Tick;
-use crate::formats::escaped;
+use regrind_formats::escaped;
 
 /// Ink of axes and text.
 pub(super) const INK: &str = "#222222";

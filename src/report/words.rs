@@ -4,11 +4,11 @@ use std::fmt::Write;
 
 use serde_json::Value;
 
-use crate::cell::{
+use regrind_cell::{
     Command, CompensationRefusal, Device, Ending, Event, Figures, Gate, GateFailure, Mismatch, Occupation,
     Reconciliation, RecordFailure,
 };
-use crate::journal::{Kind, Record};
+use regrind_journal::{Kind, Record};
 
 /// Returns what a record says, in one line. What this version of the program cannot read stands as it was written.
 pub fn words(record: &Record) -> String {

@@ -28,11 +28,23 @@ fn orders(folder: &Path) -> Vec<(String, String)> {
     orders.map(|event| (text(&event["event"]), text(&event["reason"]))).collect()
 }
 
+/// The program as a terminal starts it, also where who runs the tests ignores SIGHUP.
+fn heeding_hangup(arguments: &[&str], home: &Path) -> Command {
+    let program = regrind(arguments, home);
+    let mut command = Command::new("env");
+    command.arg("--default-signal=HUP").arg(program.get_program()).args(program.get_args());
+    for (name, value) in program.get_envs() {
+        value.map(|value| command.env(name, value));
+    }
+    command.current_dir(home).stdin(Stdio::null());
+    command
+}
+
 #[test]
 fn a_closed_terminal_and_a_stopped_service_end_the_run_in_order() {
     for (signal, reason) in [("TERM", "SIGTERM"), ("HUP", "SIGHUP, the terminal was closed")] {
         let home = tempfile::tempdir().unwrap();
-        let (mut running, folder) = grinding(home.path(), |arguments| regrind(arguments, home.path()));
+        let (mut running, folder) = grinding(home.path(), |arguments| heeding_hangup(arguments, home.path()));
         running.signal(signal);
         let (code, errors) = running.end();
         assert_eq!(code, 3, "{signal}: {errors}");

@@ -252,7 +252,7 @@ impl ManualMachine {
         let read = tokio::task::spawn_blocking(move || {
             let bytes = read_bytes(&file)?;
             let sha256: [u8; 32] = Sha256::digest(&bytes).into();
-            if taken.contains(&sha256) {
+            if taken.contains(&sha256) || lies_there(&settings.folder, &sha256) {
                 return Err(ExchangeError::Offered { path: file });
             }
             let measurement = measured(&settings, &plan, job, done, &file, &bytes)?;
@@ -267,6 +267,15 @@ impl ManualMachine {
         self.measured = Some(measurement);
         Ok(vec![format!("cycle-{}/plan.csv", job.cycle), format!("cycle-{}/{name}", job.cycle)])
     }
+}
+
+/// Whether a file was taken before this program took the run up: what was taken lies in the folder of its cycle.
+fn lies_there(run: &Path, sha256: &[u8; 32]) -> bool {
+    let within = |folder: &Path| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let stem = |path: &Path, wanted: &str| path.file_stem().is_some_and(|stem| stem == wanted);
+    let cycles = within(run).filter(|path| path.is_dir());
+    let mut results = cycles.flat_map(|cycle| within(&cycle).filter(|path| stem(path, "result")).collect::<Vec<_>>());
+    results.any(|path| read_bytes(&path).is_ok_and(|bytes| Sha256::digest(&bytes).as_slice() == sha256))
 }
 
 /// Holds the bytes of a file against the plan.
@@ -476,6 +485,16 @@ mod tests {
         let job = Job { job: 7, cycle: 2, digest: 3 };
         machine.restore(&Armed { job, start_sequence: 1, token: 0, boot_id: 0 });
         machine
+    }
+
+    #[test]
+    fn a_file_that_was_taken_before_the_program_ended_is_known() {
+        let run = tempfile::tempdir().unwrap();
+        std::fs::create_dir(run.path().join("cycle-1")).unwrap();
+        std::fs::write(run.path().join("cycle-1/result.csv"), "1,2,3").unwrap();
+        let sha256 = |text: &str| -> [u8; 32] { Sha256::digest(text).into() };
+        assert!(lies_there(run.path(), &sha256("1,2,3")));
+        assert!(!lies_there(run.path(), &sha256("1,2,4")));
     }
 
     #[tokio::test]

@@ -25,7 +25,7 @@ use std::path::Path;
 
 use thiserror::Error;
 
-use crate::formats::{FormatError, write_atomic};
+use regrind_formats::{FormatError, write_atomic};
 
 pub use axis::Scale;
 pub use colour::ColourMap;
@@ -64,7 +64,7 @@ pub enum ReportError {
     Encoding { figure: String, source: png::EncodingError },
     /// The record of the run cannot be read or believed.
     #[error(transparent)]
-    Record(#[from] crate::journal::JournalError),
+    Record(#[from] regrind_journal::JournalError),
     /// A file could not be read or written.
     #[error(transparent)]
     File(#[from] FormatError),
