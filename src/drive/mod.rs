@@ -615,6 +615,9 @@ impl Drive {
         }
         self.cycles.take(number, product);
         self.adopt(number, files).await;
+        if let Some(Event::RecordFailed { why }) = &event {
+            self.notify(Notice::RecordFailed { message: message_of(why) });
+        }
         if let Some(event) = event {
             self.take(event, None).await;
         }

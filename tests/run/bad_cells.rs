@@ -2,6 +2,7 @@
 //! a bounded time, and a journal that verifies.
 
 use std::fs;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
@@ -121,10 +122,11 @@ impl SmallDisk {
         Self(folder)
     }
 
-    /// Leaves so many bytes of it free.
+    /// Leaves so many bytes of it free, or fewer where somebody else writes meanwhile.
     fn fill_to(&self, left: u64) {
         let free = regrind::journal::free_bytes(&self.0).unwrap();
-        fs::write(self.0.join("filler"), vec![0; free.saturating_sub(left) as usize]).unwrap();
+        let filled = fs::write(self.0.join("filler"), vec![0; free.saturating_sub(left) as usize]);
+        assert!(filled.as_ref().map_or_else(|e| e.kind() == ErrorKind::StorageFull, |()| true), "{filled:?}");
     }
 }
 
