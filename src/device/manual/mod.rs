@@ -504,6 +504,7 @@ mod tests {
         assert!(matches!(taken_up().reconcile(&armed).await, Ok(Reconciled::Unknown { .. })));
         // It may be moving: that it stands takes a person's word, and an abort is confirmed by nobody.
         let mut machine = taken_up();
+        machine.connect().await.unwrap();
         assert_eq!(machine.stop().await.unwrap().state, State::Stopping);
         machine.confirm(Word::Still).await.unwrap();
         let status = machine.status().await.unwrap();
