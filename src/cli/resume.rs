@@ -21,7 +21,7 @@ use super::{Outcome, check, control, key};
 /// Let a held cell go on, or take up a run that broke off
 #[derive(Args, Debug)]
 #[command(after_help = "\
-RUN is the folder of a run; without it, the one under runs/ that goes on now, or else the newest.
+RUN is the folder of a run; without it, the one under runs/ that goes on now, or else the newest that has no end on record.
 
 A run whose program has ended without an end on record (a crash, a cut of the power) is taken up in this terminal: the record is
 verified and done again without commanding anything, the machines are asked what became of their jobs, and the cell comes to

@@ -20,48 +20,7 @@ struct Odd {
 }
 
 impl Machine for Odd {
-    fn name(&self) -> &str {
-        self.cmm.name()
-    }
-    async fn connect(&mut self) -> Result<Identity, DeviceError> {
-        self.cmm.connect().await
-    }
-    async fn status(&mut self) -> Result<Status, DeviceError> {
-        self.cmm.status().await
-    }
-    async fn claim(&mut self) -> Result<Status, DeviceError> {
-        self.cmm.claim().await
-    }
-    async fn prepare(&mut self, job: Job) -> Result<Armed, DeviceError> {
-        self.cmm.prepare(job).await
-    }
-    async fn start(&mut self, armed: Armed) -> Result<Started, DeviceError> {
-        self.cmm.start(armed).await
-    }
-    async fn hold(&mut self) -> Result<Status, DeviceError> {
-        self.cmm.hold().await
-    }
-    async fn resume(&mut self) -> Result<Status, DeviceError> {
-        self.cmm.resume().await
-    }
-    async fn stop(&mut self) -> Result<Status, DeviceError> {
-        self.cmm.stop().await
-    }
-    async fn abort(&mut self) -> Result<Status, DeviceError> {
-        self.cmm.abort().await
-    }
-    async fn clear(&mut self) -> Result<Status, DeviceError> {
-        self.cmm.clear().await
-    }
-    async fn acknowledge(&mut self, done: u32) -> Result<Status, DeviceError> {
-        self.cmm.acknowledge(done).await
-    }
-    async fn release(&mut self) -> Result<Status, DeviceError> {
-        self.cmm.release().await
-    }
-    async fn reconcile(&mut self, intended: &Armed) -> Result<Reconciled, DeviceError> {
-        self.cmm.reconcile(intended).await
-    }
+    crate::through::through!(cmm: name, connect, status, claim, prepare, start, hold, resume, stop, abort, clear, acknowledge, release, reconcile);
 }
 
 impl Cmm for Odd {

@@ -27,6 +27,8 @@ mod replay;
 #[path = "../common/rig.rs"]
 mod rig;
 mod study;
+#[path = "../common/through.rs"]
+mod through;
 #[path = "../common/tries.rs"]
 mod tries;
 mod truth;

@@ -20,48 +20,11 @@ struct Brittle {
 }
 
 impl Machine for Brittle {
-    fn name(&self) -> &str {
-        self.grinder.name()
-    }
-    async fn connect(&mut self) -> Result<Identity, DeviceError> {
-        self.grinder.connect().await
-    }
+    crate::through::through!(grinder: name, connect, claim, prepare, start, hold, resume, stop, abort, clear, acknowledge, release, reconcile);
+
     async fn status(&mut self) -> Result<Status, DeviceError> {
         assert!(!self.breaks.load(Ordering::Acquire), "an index that was out of bounds");
         self.grinder.status().await
-    }
-    async fn claim(&mut self) -> Result<Status, DeviceError> {
-        self.grinder.claim().await
-    }
-    async fn prepare(&mut self, job: Job) -> Result<Armed, DeviceError> {
-        self.grinder.prepare(job).await
-    }
-    async fn start(&mut self, armed: Armed) -> Result<Started, DeviceError> {
-        self.grinder.start(armed).await
-    }
-    async fn hold(&mut self) -> Result<Status, DeviceError> {
-        self.grinder.hold().await
-    }
-    async fn resume(&mut self) -> Result<Status, DeviceError> {
-        self.grinder.resume().await
-    }
-    async fn stop(&mut self) -> Result<Status, DeviceError> {
-        self.grinder.stop().await
-    }
-    async fn abort(&mut self) -> Result<Status, DeviceError> {
-        self.grinder.abort().await
-    }
-    async fn clear(&mut self) -> Result<Status, DeviceError> {
-        self.grinder.clear().await
-    }
-    async fn acknowledge(&mut self, done: u32) -> Result<Status, DeviceError> {
-        self.grinder.acknowledge(done).await
-    }
-    async fn release(&mut self) -> Result<Status, DeviceError> {
-        self.grinder.release().await
-    }
-    async fn reconcile(&mut self, intended: &Armed) -> Result<Reconciled, DeviceError> {
-        self.grinder.reconcile(intended).await
     }
 }
 
