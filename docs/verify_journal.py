@@ -138,14 +138,16 @@ class Chain:
         self.seals, self.signed = self.seals + 1, self.records
 
     def take_anchor(self, a):
-        for is_so, what in [
-            (a.get("run") in (None, self.run), "the anchor is of another run"),
-            (a["head"] == self.head, "its hash is not the one of the anchor"),
-            (not self.key or a.get("key") == self.key and is_hex(a.get("signature"), 128), "the anchor is not signed"),
-            (not self.key or is_signed(self.key, self.run, a["records"], a["head"], a["signature"]), "its anchor's signature is wrong"),
-        ]:
+        def hold(is_so, what):
             if not is_so:
                 raise Broken(self.records, what)
+
+        hold(a.get("run") in (None, self.run), "the anchor is of another run")
+        hold(a["head"] == self.head, "its hash is not the one of the anchor")
+        if self.key:
+            signature = a.get("signature")
+            hold(a.get("key") == self.key and is_hex(signature, 128), "the anchor is not signed with the key that the run names")
+            hold(is_signed(self.key, self.run, a["records"], a["head"], signature), "the signature of the anchor is wrong")
 
 
 def record_of(values):
@@ -217,9 +219,10 @@ def is_driven(folder):
 def read_anchor(path):
     try:
         anchor = parsed(path.read_text())
-        if isinstance(anchor["records"], int) and isinstance(anchor["head"], str):
+        texts = all(isinstance(anchor.get(k), (str, type(None))) for k in ("run", "key", "signature"))
+        if isinstance(anchor["records"], int) and isinstance(anchor["head"], str) and texts:
             return anchor
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         pass
     raise Broken(0, f"{path.name} is no anchor")
 

@@ -152,6 +152,22 @@ fn both_verifiers_find_files_anchors_and_forgeries() {
     broken(&|run| tamper(run, "UPDATE record SET cycle = 5000000000 WHERE seq = 3"));
     broken(&|run| tamper(run, "UPDATE record SET mono_ns = -1 WHERE seq = 3"));
     broken(&|run| tamper(run, "UPDATE record SET seq = -1 WHERE seq = 11"));
+    // An anchor whose signature was taken away, altered, or is another's.
+    for change in [
+        |anchor: &mut Value| *anchor = json!({ "head": anchor["head"], "records": anchor["records"] }),
+        |anchor: &mut Value| anchor["signature"] = json!("0".repeat(128)),
+        |anchor: &mut Value| anchor["signature"] = json!(7),
+        |anchor: &mut Value| anchor["key"] = json!("0".repeat(64)),
+        |anchor: &mut Value| drop(anchor.as_object_mut().unwrap().remove("key")),
+        |anchor: &mut Value| anchor["run"] = json!("another"),
+    ] {
+        let (home, signed) = long_and_whole(300);
+        let mut anchor: Value = serde_json::from_slice(&fs::read(signed.join("journal.anchor")).unwrap()).unwrap();
+        change(&mut anchor);
+        fs::write(signed.join("journal.anchor"), anchor.to_string()).unwrap();
+        runs.push(signed);
+        homes.push(home);
+    }
     runs.iter().zip(told(&[], &runs)).for_each(|(run, told)| assert_same(run, &told));
 }
 
