@@ -3,8 +3,8 @@
 use std::io;
 use std::time::Duration;
 
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::{TcpListener, TcpStream};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::net::TcpListener;
 use tokio::task::JoinSet;
 
 use super::faults::Faults;
@@ -21,7 +21,10 @@ pub async fn serve_tcp(listener: TcpListener, units: Units, faults: Faults) -> i
             accepted = listener.accept() => match accepted {
                 Ok((stream, _)) => {
                     let (units, faults) = (units.clone(), faults.clone());
-                    clients.spawn(async move { serve_client(stream, &units, &faults).await });
+                    clients.spawn(async move {
+                        stream.set_nodelay(true)?;
+                        serve_client(stream, &units, &faults).await
+                    });
                 }
                 // Out of descriptors, or a client that was gone at once: neither concerns the others.
                 Err(_) => tokio::time::sleep(Duration::from_millis(20)).await,
@@ -32,8 +35,13 @@ pub async fn serve_tcp(listener: TcpListener, units: Units, faults: Faults) -> i
 }
 
 /// Answers one client, request after request, until it goes away or sends what is not Modbus.
-async fn serve_client(mut stream: TcpStream, units: &Units, faults: &Faults) -> io::Result<()> {
-    stream.set_nodelay(true)?;
+///
+/// # Errors
+/// The stream cannot be read or written any more.
+pub async fn serve_client<S>(mut stream: S, units: &Units, faults: &Faults) -> io::Result<()>
+where
+    S: AsyncRead + AsyncWrite + Unpin,
+{
     loop {
         let mut header = [0; 7];
         stream.read_exact(&mut header).await?;
@@ -55,7 +63,7 @@ async fn serve_client(mut stream: TcpStream, units: &Units, faults: &Faults) -> 
     }
 }
 
-async fn swallow(mut stream: TcpStream) -> io::Result<()> {
+async fn swallow(mut stream: impl AsyncRead + Unpin) -> io::Result<()> {
     let mut bytes = [0; 256];
     while stream.read(&mut bytes).await? > 0 {}
     Ok(())

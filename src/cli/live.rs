@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use regrind::cell::{Actor, Ending};
 use regrind::config::{CellConfig, Link};
 use regrind::device::{AnyCmm, AnyGrinder, MachineKind};
-use regrind::drive::{Drive, Interrupted, Orders, Request, Run, Task};
+use regrind::drive::{Beside, Drive, Interrupted, Ledger, Orders, Request, Run, Task};
 use regrind::journal::{Journal, MachineLock};
 use regrind::recipe::Recipe;
 use regrind::setup;
@@ -68,7 +68,10 @@ impl Live<'_> {
         let showing = tokio::spawn(Show::new(self.json, cell.simulated, self.recipe, self.folder).follow(shown));
         let poll = [setup::poll(&cell.cmm.link), setup::poll(&cell.grinder.link)];
         let Work { task, plan, journal, loaded, interrupted } = work;
-        let run = Run { plan, task, journal, job: self.job, actor: actor.clone(), loaded, poll, notices, interrupted };
+        let (journal, beside): (Box<dyn Ledger>, _) = (Box::new(journal), Beside::Threads);
+        let actor_of_run = actor.clone();
+        let run =
+            Run { plan, task, journal, job: self.job, actor: actor_of_run, loaded, poll, notices, interrupted, beside };
         let ending = go(run, machines, actor).await?;
         let shown = showing.await.map_err(|e| Failure::Terminal(e.into()));
         // The record is closed; a report that cannot be written must not change how the run ended, nor a terminal that has gone.

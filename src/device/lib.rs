@@ -40,8 +40,8 @@ pub use manual::{ManualMachine, ManualSettings, ManualWire};
 #[cfg(fuzzing)]
 pub use modbus::any_registers;
 pub use modbus::{
-    Line, Link, LinkFigures, ModbusCmm, ModbusGrinder, ModbusMachine, ModbusSettings, Parity, RegisterMap, RtuWire,
-    Signal, SignalTable, SignalType, TcpWire, WordOrder,
+    Dial, Dialled, Line, LineStream, Link, LinkFigures, ModbusCmm, ModbusGrinder, ModbusMachine, ModbusSettings,
+    Parity, RegisterMap, RtuWire, Signal, SignalTable, SignalType, TcpWire, WordOrder,
 };
 pub use payload::{
     Careful, CorrectionMap, Identified, MeasuredPoint, Measurement, Pass, PassRecord, Plan, PointStatus, Target,

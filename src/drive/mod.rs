@@ -11,6 +11,7 @@
 //! The loop never waits for the disk. An event is decided upon at once, and what makes safe goes out at once; everything else that
 //! follows, the answer to who gave an order among it, waits in line until the journal has all that came before it.
 
+mod beside;
 mod control;
 mod cycles;
 mod maps;
@@ -45,13 +46,15 @@ use crate::device::{
     AnyCmm, AnyGrinder, Armed, Cmm, Grinder, Identified, Interrupt, Job, Measurement, PassRecord, Word, hex,
 };
 use crate::formats::{FormatError, LEARNED, ResultFolder, write_json_atomic};
-use crate::journal::{self, Artefact, Entry, Journal, Kind};
+use crate::journal::{self, Artefact, Entry, Kind};
 
+pub use beside::{Beside, Blocking};
 use control::{Control, Ordered};
 pub use control::{Reply, Request, Snapshot, ask, is_live};
 use cycles::Cycles;
 pub use notice::{CycleRow, Notice};
 pub use program::{ProgramError, Programs};
+pub use record::Ledger;
 use record::{Files, Recorder, Ticket, entry};
 pub use replay::{Interrupted, ReplayError};
 use station::{
@@ -66,8 +69,8 @@ pub struct Run {
     pub plan: CellPlan,
     /// What is computed, and from what.
     pub task: Task,
-    /// The journal of the run, just created.
-    pub journal: Journal,
+    /// The journal of the run, just created, or opened to go on with it.
+    pub journal: Box<dyn Ledger>,
     /// The number of the part's run, for the machines.
     pub job: u32,
     /// Who began it.
@@ -80,6 +83,8 @@ pub struct Run {
     pub notices: mpsc::UnboundedSender<Notice>,
     /// A run that was interrupted and is gone on with.
     pub interrupted: Option<Interrupted>,
+    /// Where what blocks is done.
+    pub beside: Beside,
 }
 
 /// Orders from this process itself: Ctrl-C, a prompt.
@@ -94,6 +99,18 @@ impl Orders {
     pub async fn give(&self, request: Request, actor: Actor) {
         // A run that is over needs no orders.
         let _ = self.orders.send(Ordered { request, actor, answer: None }).await;
+    }
+
+    /// Gives an order, and returns what the control socket would answer; none where the run is over.
+    pub async fn ask(&self, request: Request, actor: Actor) -> Option<Reply> {
+        let (answer, answered) = oneshot::channel();
+        self.orders.send(Ordered { request, actor, answer: Some(answer) }).await.ok()?;
+        answered.await.ok()
+    }
+
+    /// Returns what is shown of the run from here on.
+    pub fn status(&self) -> watch::Receiver<Snapshot> {
+        self.status.clone()
     }
 
     /// Whether the cell goes about its work: neither held, nor on its way to a stand or from one.
@@ -120,6 +137,7 @@ pub struct Drive {
     aborts: [watch::Sender<u64>; 2],
     pulse: Pulse,
     reports: mpsc::Receiver<StationReport>,
+    beside: Beside,
     computations: JoinSet<Computed>,
     /// Which of them computes what.
     computing: HashMap<tokio::task::Id, (u32, Computation)>,
@@ -239,7 +257,7 @@ impl Drive {
         let (status, seen) = watch::channel(Snapshot::default());
         let mut interrupted = run.interrupted.unwrap_or_else(|| Interrupted::none(run.plan));
         let (ids, open): (Vec<u32>, Vec<Command>) = std::mem::take(&mut interrupted.open).into_iter().unzip();
-        let recorder = Recorder::new(run.journal, &ids);
+        let recorder = Recorder::new(run.journal, &ids, &run.beside);
         let folder = recorder.folder().to_owned();
         let control = Control::listen(&folder, orders.clone(), seen.clone())?;
         let interrupts = [Interrupt::new(), Interrupt::new()];
@@ -272,6 +290,7 @@ impl Drive {
             aborts,
             pulse,
             reports: reported,
+            beside: run.beside,
             computations: JoinSet::new(),
             computing: HashMap::new(),
             orders: ordered,
@@ -832,7 +851,7 @@ impl Drive {
     /// machine may take its payload meanwhile.
     fn check_space(&mut self, cycle: u32) {
         let (folder, needed) = (self.folder.clone(), self.task.cycle_bytes().max(2 * self.largest_cycle_bytes));
-        self.computations.spawn_blocking(move || {
+        self.beside.compute(&mut self.computations, move || {
             let short = short_of_space(&folder, needed).err();
             let event = short.map(|why| Event::RecordFailed { why });
             Computed { cycle, event, product: Product::Nothing, files: Ok(Vec::new()) }
@@ -895,7 +914,7 @@ impl Drive {
         let attempt = self.attempts.entry((cycle, kind)).or_insert(0);
         *attempt += 1;
         let below = folder_of(cycle, *attempt);
-        let computing = self.computations.spawn_blocking(move || {
+        let computing = self.beside.compute(&mut self.computations, move || {
             let mut files = Files::new(folder.join(&below));
             // What cannot be made is told by the first file that cannot be written into it.
             let _ = made(files.folder());

@@ -11,8 +11,9 @@ use std::time::Duration;
 use serde_json::Value;
 use tokio::sync::{mpsc, oneshot};
 
+use super::beside::{Beside, Blocking};
 use crate::cell::RecordFailure;
-use crate::journal::{Artefact, Entry, Journal, JournalError, Kind};
+use crate::journal::{Anchor, Artefact, Entry, Journal, JournalError, Kind};
 
 /// Resolves once what was given is on the disk, or is known never to come there.
 pub(super) type Ticket = oneshot::Receiver<Result<(), RecordFailure>>;
@@ -21,6 +22,34 @@ pub(super) type Ticket = oneshot::Receiver<Result<(), RecordFailure>>;
 const BETWEEN_TRIES: Duration = Duration::from_millis(100);
 /// How long the end of a run waits for its record.
 pub(super) const PATIENCE: Duration = Duration::from_secs(5);
+
+/// Where a run is recorded. What is acknowledged is on the disk; after an error the same may be given again, and stands once.
+#[expect(missing_docs, reason = "as Journal has them")]
+pub trait Ledger: Send {
+    fn folder(&self) -> &Path;
+    fn append(&mut self, entry: Entry) -> Result<u64, JournalError>;
+    fn intend(&mut self, entry: Entry) -> Result<u32, JournalError>;
+    fn adopt_known(&mut self, found: Artefact, mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError>;
+    fn end(&mut self, mono_ns: u64, cycle: u32, ending: Value) -> Result<Anchor, JournalError>;
+}
+
+impl Ledger for Journal {
+    fn folder(&self) -> &Path {
+        self.folder()
+    }
+    fn append(&mut self, entry: Entry) -> Result<u64, JournalError> {
+        self.append(entry)
+    }
+    fn intend(&mut self, entry: Entry) -> Result<u32, JournalError> {
+        self.intend(entry)
+    }
+    fn adopt_known(&mut self, found: Artefact, mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError> {
+        self.adopt_known(found, mono_ns, cycle)
+    }
+    fn end(&mut self, mono_ns: u64, cycle: u32, ending: Value) -> Result<Anchor, JournalError> {
+        self.end(mono_ns, cycle, ending)
+    }
+}
 
 /// What is to be recorded.
 enum Job {
@@ -49,7 +78,7 @@ pub(super) struct Recorder {
 
 impl Recorder {
     /// Takes a journal, with the numbers of the commands on it that no outcome has named, which are named by 1, 2, 3 from here on.
-    pub(super) fn new(journal: Journal, open: &[u32]) -> Self {
+    pub(super) fn new(journal: Box<dyn Ledger>, open: &[u32], beside: &Beside) -> Self {
         let (given, jobs) = mpsc::unbounded_channel();
         let (failed, failures) = mpsc::unbounded_channel();
         let given_up = Arc::new(AtomicBool::new(false));
@@ -60,9 +89,9 @@ impl Recorder {
             failed,
             given_up: given_up.clone(),
             broken_off: false,
+            beside: beside.clone(),
         };
-        let thread = std::thread::Builder::new().name("journal".into()).spawn(move || scribe.keep(jobs));
-        let thread = Some(thread.expect("a thread can be had"));
+        let thread = beside.attend("journal", scribe.keep(jobs));
         Self { given: Some(given), failures, given_up, thread, folder, intents: open.len() as u64 }
     }
 
@@ -133,27 +162,29 @@ impl Drop for Recorder {
 
 /// Who writes.
 struct Scribe {
-    journal: Option<Journal>,
+    journal: Option<Box<dyn Ledger>>,
     /// The command numbers of the intents that no outcome has named.
     ids: HashMap<u64, u32>,
     failed: mpsc::UnboundedSender<RecordFailure>,
     given_up: Arc<AtomicBool>,
     /// Something was given up, and nothing is written behind it.
     broken_off: bool,
+    beside: Beside,
 }
 
 impl Scribe {
-    fn keep(mut self, mut jobs: mpsc::UnboundedReceiver<Given>) {
-        while let Some((job, answer)) = jobs.blocking_recv() {
+    async fn keep(mut self, mut jobs: mpsc::UnboundedReceiver<Given>) {
+        while let Some((job, answer)) = jobs.recv().await {
             // Who asked may have gone; the record stands all the same.
-            let _ = answer.send(self.until_written(&job).map_err(failure));
+            let _ = answer.send(self.until_written(&job).await.map_err(failure));
         }
     }
 
     /// Writes a job, however often that has to be tried. The loop is told once that it does not go on.
-    fn until_written(&mut self, job: &Job) -> Result<(), JournalError> {
+    async fn until_written(&mut self, job: &Job) -> Result<(), JournalError> {
         let mut told = false;
         loop {
+            self.beside.take_its_time(Blocking::Record).await;
             let error = match self.write(job) {
                 Ok(()) => return Ok(()),
                 Err(error) if !error.may_pass() => {
@@ -171,7 +202,7 @@ impl Scribe {
             if !std::mem::replace(&mut told, true) {
                 let _ = self.failed.send(failure(error));
             }
-            std::thread::sleep(BETWEEN_TRIES);
+            tokio::time::sleep(BETWEEN_TRIES).await;
         }
     }
 

@@ -440,6 +440,9 @@ impl<B: StationDriver> MachineTask<B> {
             let why = "it is not prepared".to_owned();
             return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Start, why }).await;
         };
+        if self.seen.lost {
+            return self.not_sent(Asked::Start).await;
+        }
         let Seen { supplies_missing, manual, signal_out, signals_good_since, .. } = self.seen;
         self.seen = Seen {
             connected: true,
@@ -467,6 +470,12 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
+    /// The link was lost after the cell had asked: nothing moves by its order until the machine has been met again.
+    async fn not_sent(&mut self, what: Asked) {
+        let why = "the link to it is lost, and the command was not sent".to_owned();
+        self.tell(Event::Refused { device: B::DEVICE, what, why }).await;
+    }
+
     async fn hold(&mut self) {
         match self.driver.machine().hold().await {
             Ok(status) => self.note(&status).await,
@@ -485,6 +494,9 @@ impl<B: StationDriver> MachineTask<B> {
     }
 
     async fn resume(&mut self) {
+        if self.seen.lost {
+            return self.not_sent(Asked::Resume).await;
+        }
         match self.driver.machine().resume().await {
             Ok(status) => self.note(&status).await,
             Err(error) => self.failed(Asked::Resume, error).await,

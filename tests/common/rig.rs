@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use regrind::cell::Actor;
 use regrind::config::{CellConfig, Link};
 use regrind::device::{ModbusCmm, ModbusGrinder};
-use regrind::drive::{Notice, Reply, Request, Run, ask};
+use regrind::drive::{Beside, Notice, Reply, Request, Run, ask};
 use regrind::journal::{AuditKey, Header, Journal};
 use regrind::recipe::Recipe;
 use regrind::setup;
@@ -169,13 +169,14 @@ impl Rig {
         let run = Run {
             plan,
             task,
-            journal,
+            journal: Box::new(journal),
             job: self.runs,
             actor: Actor { name: "a test".into(), station: "here".into() },
             loaded,
             poll: [self.cell.cmm.link.timing.poll, self.cell.grinder.link.timing.poll],
             notices,
             interrupted: None,
+            beside: Beside::Threads,
         };
         Ready { run, cmm, grinder, notices: shown, folder }
     }

@@ -12,7 +12,7 @@ use regrind::cell::{Actor, Alarm, AlarmId, Ending, Role, StateName};
 use regrind::config::CellConfig;
 use regrind::device::Wire;
 use regrind::device::{ModbusCmm, ModbusGrinder, ModbusSettings};
-use regrind::drive::{CycleRow, Drive, Notice, Request, Run, ask};
+use regrind::drive::{Beside, CycleRow, Drive, Ledger, Notice, Request, Run, ask};
 use regrind::journal::{Header, Journal};
 use regrind::recipe::Recipe;
 use regrind::setup;
@@ -249,12 +249,22 @@ async fn go(setup: Setup) -> Ran {
     let world = world(&setup, &recipe);
     let taken = Arc::new(Mutex::new(Vec::new()));
     let (servings, [of_cmm, of_grinder]) = serve(&setup, &world, &cell, &folder, &taken).await;
-    let journal = Journal::create(&folder, header("test part")).unwrap();
+    let journal: Box<dyn Ledger> = Box::new(Journal::create(&folder, header("test part")).unwrap());
     let (notices, mut shown) = mpsc::unbounded_channel();
     let poll = [Duration::from_millis(10); 2];
     let actor = Actor { name: "test".into(), station: "here".into() };
-    let run =
-        Run { plan, task, journal, job: JOB, actor: actor.clone(), loaded: true, poll, notices, interrupted: None };
+    let run = Run {
+        plan,
+        task,
+        journal,
+        job: JOB,
+        actor: actor.clone(),
+        loaded: true,
+        poll,
+        notices,
+        interrupted: None,
+        beside: Beside::Threads,
+    };
     let cmm = ModbusCmm::new(of_cmm).unwrap();
     let grinder = ModbusGrinder::new(of_grinder).unwrap();
     let (drive, orders) = Drive::new(run, cmm, grinder).unwrap();

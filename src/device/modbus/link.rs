@@ -12,12 +12,16 @@
 //!
 //! The library below checks lengths and echoes only in debug builds, by panicking. The plain responses are asked for here and checked here.
 
+use std::fmt::Debug;
+use std::future::Future;
 use std::io;
 use std::pin::Pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
+use rand::rngs::StdRng;
+use rand::{RngExt as _, SeedableRng as _};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, ReadBuf};
 use tokio::net::TcpStream;
 use tokio::sync::{Notify, mpsc, oneshot};
@@ -114,6 +118,24 @@ struct Question {
     reply: oneshot::Sender<Answer>,
 }
 
+/// A stream between a line and its machines. Whoever asks can tell whether bytes wait on it to be read.
+pub trait LineStream: AsyncRead + AsyncWrite + Debug + Send + Unpin {
+    /// Returns how many bytes wait, as far as can be told.
+    ///
+    /// # Errors
+    /// The far side has closed.
+    fn waiting(&mut self, cx: &mut Context<'_>) -> io::Result<usize>;
+}
+
+/// How a line is opened where no socket and no port of this computer leads to its machines.
+pub trait Dial: Debug + Send {
+    /// Opens it.
+    fn dial<'a>(&'a mut self, line: &'a Line) -> Dialled<'a>;
+}
+
+/// A line that is being opened.
+pub type Dialled<'a> = Pin<Box<dyn Future<Output = io::Result<Box<dyn LineStream>>> + Send + 'a>>;
+
 /// A handle to one line. Clones share it; the line ends with its last handle.
 #[derive(Debug, Clone)]
 pub struct Link {
@@ -129,15 +151,33 @@ impl Link {
     /// A line that is opened when it is first asked. `quarantine` is how long a machine on it may need for an answer at worst: after an
     /// error the line is left alone for so long.
     pub fn new(line: Line, request_timeout: Duration, quarantine: Duration) -> io::Result<Self> {
-        let (questions, inbox) = mpsc::channel(16);
-        let counters = Counters::default();
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-        let hurried = Arc::new(Notify::new());
-        let connection = Connection::new(line.clone(), request_timeout, quarantine, hurried.clone(), counters.clone());
-        std::thread::Builder::new()
-            .name(format!("line {line}"))
-            .spawn(move || runtime.block_on(connection.run(inbox)))?;
-        Ok(Self { line, request_timeout, questions, hurried, counters })
+        let name = format!("line {line}");
+        let (link, connection, inbox) =
+            Self::ends(line, request_timeout, quarantine, Box::new(OfThisComputer), rand::random());
+        std::thread::Builder::new().name(name).spawn(move || runtime.block_on(connection.run(inbox)))?;
+        Ok(link)
+    }
+
+    /// A line that somebody else opens, as a task of the runtime that this is called in; its dice are those of the seed. For machines that
+    /// stand in the same process, and for time that does not pass by itself.
+    pub fn over(line: Line, request_timeout: Duration, quarantine: Duration, dial: Box<dyn Dial>, seed: u64) -> Self {
+        let (link, connection, inbox) = Self::ends(line, request_timeout, quarantine, dial, seed);
+        tokio::spawn(connection.run(inbox));
+        link
+    }
+
+    fn ends(
+        line: Line,
+        request_timeout: Duration,
+        quarantine: Duration,
+        dial: Box<dyn Dial>,
+        seed: u64,
+    ) -> (Self, Connection, mpsc::Receiver<Question>) {
+        let (questions, inbox) = mpsc::channel(16);
+        let link = Self { line, request_timeout, questions, hurried: Arc::default(), counters: Counters::default() };
+        let connection = Connection::new(&link, quarantine, dial, StdRng::seed_from_u64(seed));
+        (link, connection, inbox)
     }
 
     /// Where it leads.
@@ -183,6 +223,8 @@ struct Connection {
     line: Line,
     request_timeout: Duration,
     quarantine: Duration,
+    dial: Box<dyn Dial>,
+    chance: StdRng,
     hurried: Arc<Notify>,
     counters: Counters,
     connection: Option<tokio_modbus::client::Context>,
@@ -193,20 +235,16 @@ struct Connection {
 }
 
 impl Connection {
-    fn new(
-        line: Line,
-        request_timeout: Duration,
-        quarantine: Duration,
-        hurried: Arc<Notify>,
-        counters: Counters,
-    ) -> Self {
+    fn new(link: &Link, quarantine: Duration, dial: Box<dyn Dial>, chance: StdRng) -> Self {
         let now = Instant::now();
         Self {
-            line,
-            request_timeout,
+            line: link.line.clone(),
+            request_timeout: link.request_timeout,
             quarantine,
-            hurried,
-            counters,
+            dial,
+            chance,
+            hurried: link.hurried.clone(),
+            counters: link.counters.clone(),
             connection: None,
             generation: 0,
             failures: 0,
@@ -270,18 +308,19 @@ impl Connection {
         self.connection = None;
         self.failures = self.failures.saturating_add(1);
         let full = FIRST_BACKOFF.saturating_mul(1 << (self.failures - 1).min(10)).min(LONGEST_BACKOFF);
-        let jittered = full.mul_f64(0.5 + 0.5 * rand::random::<f64>());
+        let jittered = full.mul_f64(0.5 + 0.5 * self.chance.random::<f64>());
         self.not_before = Instant::now() + jittered.max(self.quarantine);
     }
 
     async fn open(&mut self) -> Result<(), LinkFault> {
         tokio::select! {
+            biased;
             () = sleep_until(self.not_before) => {}
             // What the line still carries is drained, and its sync proven, all the same.
             () = self.hurried.notified() => {}
         }
         let limit = self.request_timeout.max(Duration::from_secs(1)) + LONGEST_DRAIN;
-        let opened = timeout(limit, connect(&self.line)).await;
+        let opened = timeout(limit, connect(&self.line, self.dial.as_mut())).await;
         let opened = opened.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()));
         match opened {
             Ok(connection) => {
@@ -397,31 +436,51 @@ impl Line {
     }
 }
 
-async fn connect(wire: &Line) -> io::Result<tokio_modbus::client::Context> {
-    match wire {
-        Line::Tcp { host, port } => {
-            let stream = TcpStream::connect((host.as_str(), *port)).await?;
-            stream.set_nodelay(true)?;
-            // A connection that is given up takes what it has not sent yet with it: no START arrives after it was given up.
-            stream.set_zero_linger()?;
-            Ok(tokio_modbus::client::tcp::attach(Listening::new(stream)))
-        }
-        Line::Rtu { device, baud, parity, stop_bits } => {
-            let parity = match parity {
-                Parity::None => tokio_serial::Parity::None,
-                Parity::Even => tokio_serial::Parity::Even,
-                Parity::Odd => tokio_serial::Parity::Odd,
-            };
-            let stop_bits = if *stop_bits == 2 { tokio_serial::StopBits::Two } else { tokio_serial::StopBits::One };
-            let mut port = tokio_serial::new(device, *baud).parity(parity).stop_bits(stop_bits).open_native_async()?;
-            drain(&mut port, wire.silence().max(Duration::from_millis(5))).await?;
-            Ok(tokio_modbus::client::rtu::attach(Listening::new(port)))
+/// Opens a line, and listens to a serial one until it is silent.
+async fn connect(line: &Line, dial: &mut dyn Dial) -> io::Result<tokio_modbus::client::Context> {
+    let mut stream = dial.dial(line).await?;
+    match line {
+        Line::Tcp { .. } => Ok(tokio_modbus::client::tcp::attach(Listening::new(stream))),
+        Line::Rtu { .. } => {
+            drain(stream.as_mut(), line.silence().max(Duration::from_millis(5))).await?;
+            Ok(tokio_modbus::client::rtu::attach(Listening::new(stream)))
         }
     }
 }
 
+/// Sockets and serial ports of this computer.
+#[derive(Debug)]
+struct OfThisComputer;
+
+impl Dial for OfThisComputer {
+    fn dial<'a>(&'a mut self, line: &'a Line) -> Dialled<'a> {
+        Box::pin(async move {
+            match line {
+                Line::Tcp { host, port } => {
+                    let stream = TcpStream::connect((host.as_str(), *port)).await?;
+                    stream.set_nodelay(true)?;
+                    // A connection that is given up takes what it has not sent yet with it: no START arrives after it was given up.
+                    stream.set_zero_linger()?;
+                    Ok(Box::new(stream) as Box<dyn LineStream>)
+                }
+                Line::Rtu { device, baud, parity, stop_bits } => {
+                    let parity = match parity {
+                        Parity::None => tokio_serial::Parity::None,
+                        Parity::Even => tokio_serial::Parity::Even,
+                        Parity::Odd => tokio_serial::Parity::Odd,
+                    };
+                    let stop_bits =
+                        if *stop_bits == 2 { tokio_serial::StopBits::Two } else { tokio_serial::StopBits::One };
+                    let port = tokio_serial::new(device, *baud).parity(parity).stop_bits(stop_bits);
+                    Ok(Box::new(port.open_native_async()?) as Box<dyn LineStream>)
+                }
+            }
+        })
+    }
+}
+
 /// Reads a serial line empty until it has been silent for a while.
-async fn drain(port: &mut SerialStream, silence: Duration) -> io::Result<()> {
+async fn drain(port: &mut dyn LineStream, silence: Duration) -> io::Result<()> {
     let until = Instant::now() + LONGEST_DRAIN;
     let mut bytes = [0; 256];
     while Instant::now() < until {
@@ -435,14 +494,8 @@ async fn drain(port: &mut SerialStream, silence: Duration) -> io::Result<()> {
     Err(io::ErrorKind::TimedOut.into())
 }
 
-/// A stream that can tell whether bytes wait to be read.
-trait Waiting {
-    /// How many bytes wait, as far as can be told; an error when the far side has closed.
-    fn waiting(&self, cx: &mut Context<'_>) -> io::Result<usize>;
-}
-
-impl Waiting for TcpStream {
-    fn waiting(&self, cx: &mut Context<'_>) -> io::Result<usize> {
+impl LineStream for TcpStream {
+    fn waiting(&mut self, cx: &mut Context<'_>) -> io::Result<usize> {
         let mut byte = [0; 1];
         match self.poll_peek(cx, &mut ReadBuf::new(&mut byte)) {
             Poll::Pending => Ok(0),
@@ -452,33 +505,34 @@ impl Waiting for TcpStream {
     }
 }
 
-impl Waiting for SerialStream {
-    fn waiting(&self, _: &mut Context<'_>) -> io::Result<usize> {
+impl LineStream for SerialStream {
+    fn waiting(&mut self, _: &mut Context<'_>) -> io::Result<usize> {
         Ok(self.bytes_to_read()? as usize)
     }
 }
 
 /// A stream on which nothing may wait when a request is begun: what waits then was sent to nobody's question, and the answer that follows
 /// could not be told from it. Its flush does not wait for a serial port to have sent everything, for that would block the thread.
-struct Listening<T> {
-    inner: T,
+#[derive(Debug)]
+struct Listening {
+    inner: Box<dyn LineStream>,
     asking: bool,
 }
 
-impl<T> Listening<T> {
-    fn new(inner: T) -> Self {
+impl Listening {
+    fn new(inner: Box<dyn LineStream>) -> Self {
         Self { inner, asking: false }
     }
 }
 
-impl<T: AsyncRead + Unpin> AsyncRead for Listening<T> {
+impl AsyncRead for Listening {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         self.asking = false;
         Pin::new(&mut self.inner).poll_read(cx, buffer)
     }
 }
 
-impl<T: AsyncWrite + Waiting + Unpin> AsyncWrite for Listening<T> {
+impl AsyncWrite for Listening {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
         if !self.asking {
             if self.inner.waiting(cx)? > 0 {
@@ -495,12 +549,6 @@ impl<T: AsyncWrite + Waiting + Unpin> AsyncWrite for Listening<T> {
 
     fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
         Pin::new(&mut self.inner).poll_shutdown(cx)
-    }
-}
-
-impl<T: std::fmt::Debug> std::fmt::Debug for Listening<T> {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Listening").field("inner", &self.inner).finish()
     }
 }
 

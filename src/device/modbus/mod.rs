@@ -27,7 +27,7 @@ use super::{
 #[cfg(fuzzing)]
 pub use any_registers::any_registers;
 use codec::{CommandFrame, Payload, RecordFlaw, Registers, crc32};
-pub use link::{Link, LinkFigures};
+pub use link::{Dial, Dialled, LineStream, Link, LinkFigures};
 pub use settings::{
     Line, ModbusSettings, Parity, RegisterMap, RtuWire, Signal, SignalTable, SignalType, TcpWire, WordOrder,
 };

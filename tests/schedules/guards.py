@@ -1,0 +1,102 @@
+#!/usr/bin/env python3
+"""Takes away one guard of the control side after the other, and counts the schedules until one breaks a promise.
+
+    tests/schedules/guards.py [--most N] [NAME ...]
+
+Each guard is a place in the sources and what stands there without it. The change is made in a copy of the tree, below target/guards,
+which is built anew for each: about a minute apiece. What `tests/schedules` does not see within N schedules is told as not seen.
+"""
+import argparse, re, shutil, subprocess, sys
+from pathlib import Path
+
+GUARDS = {
+    "START waits for its record": (
+        "src/drive/mod.rs", "        Command::HoldMachine { .. }\n", "        Command::StartMachine { .. } | Command::HoldMachine { .. }\n"),
+    "what has waited is asked of the cell once more": (
+        "src/drive/mod.rs", "Then::Execute(command) if self.cell.wants(&command) =>", "Then::Execute(command) if true || self.cell.wants(&command) =>"),
+    "an order is answered when it is on record": (
+        "src/drive/mod.rs", "self.backlog.push_back(Waiting { ticket, then: Then::Answer { answer, accepted, message } });",
+        "drop((ticket, answer.send(Reply { accepted, message, status: self.snapshot() })));"),
+    "an abort gives up what the machine is asked": (
+        "src/drive/station.rs", "() = aborts.ordered() => {}", "() = std::future::pending() => {}"),
+    "an abort waits for no record": (
+        "src/drive/mod.rs", "            | Command::AbortMachine { .. }\n            | Command::VerifyClear", "            | Command::VerifyClear"),
+    "a START without an answer is unknown": (
+        "src/drive/station.rs", "self.tell(Event::StartUnknown { device: B::DEVICE, cycle, why: error.to_string() }).await;",
+        "self.seen.running = false; self.failed(Asked::Start, error).await;"),
+    "a START that was not seen is fenced off": (
+        "src/device/modbus/mod.rs", "        self.claim().await?;\n        let second", "        let second"),
+    "a machine that was lost is sent nothing that moves": (
+        "src/drive/station.rs", "        if self.seen.lost {\n            return self.not_sent(Asked::Start).await;\n        }\n", ""),
+    "holding goes on when the link is lost": (
+        "src/cell/act.rs", "        if is_holding {\n", "        if false && is_holding {\n            unreachable!();\n        } else if is_holding {\n            self.go(Held(out_of_sight(phase)));\n        } else if false {\n"),
+    "a job found running while holding is told to hold": (
+        "src/cell/act.rs", "                self.go(self.same(run));\n                self.push(Command::HoldMachine { device });\n", "                self.go(self.same(run));\n"),
+    "a machine that moves while the cell stands is told to hold": (
+        "src/cell/act.rs", "        let told = self.raised.contains(&AlarmId::MovesUnasked);\n", "        return;\n        #[allow(unreachable_code)]\n        let told = false;\n"),
+    "a program that was started again asks what became of the job": (
+        "src/cell/act.rs", "        self.go(Held(out_of_sight(phase)));\n        for device in Device::BOTH {", "        self.go(Held(restart_of(phase)));\n        for device in Device::BOTH {"),
+    "an answer of an older connection is turned away": (
+        "src/device/modbus/link.rs", "        if stale {\n", "        if stale && false {\n"),
+    "nothing may wait when a request begins": (
+        "src/device/modbus/link.rs", "if self.inner.waiting(cx)? > 0 {", "if self.inner.waiting(cx)? > usize::MAX - 1 {"),
+    "an answer has as many registers as were asked": (
+        "src/device/modbus/link.rs", "if words.len() == usize::from(*count) =>", "if !words.is_empty() =>"),
+    "a connection is given up after an error": (
+        "src/device/modbus/link.rs", "        if !matches!(fault, LinkFault::Exception(_)) {\n            self.give_up();", "        if false {\n            self.give_up();"),
+    "payloads in force are compared before a job": (
+        "src/device/modbus/mod.rs", "            self.compare_slot(kind).await?;\n", "            let _ = kind;\n"),
+}  # fmt: skip
+
+
+def main():
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("names", nargs="*", metavar="NAME", help="guards whose name has this in it; all if none is given")
+    options.add_argument("--most", type=int, default=2000, help="schedules to try at most (2000)")
+    options.add_argument("--target", type=Path, help="folder for what is built, if not target/guards/target")
+    given = options.parse_args()
+    root = Path(__file__).resolve().parents[2]
+    tree = root / "target/guards/tree"
+    target = given.target or root / "target/guards/target"
+    unseen = 0
+    for name, change in GUARDS.items():
+        if given.names and not any(wanted in name for wanted in given.names):
+            continue
+        seeds, first = tried(root, tree, target, change, given.most)
+        unseen += first is None
+        found = f"{seeds} | {first}" if first else f"not seen in {seeds} |"
+        print(f"| {name} | {found} |", flush=True)
+    sys.exit(1 if unseen else 0)
+
+
+def tried(root, tree, target, change, most):
+    """Returns how many schedules were tried, and what the first to break a promise says."""
+    file, guard, without = change
+    shutil.rmtree(tree, ignore_errors=True)
+    shutil.copytree(root, tree, ignore=shutil.ignore_patterns("target", ".git"))
+    text = (tree / file).read_text()
+    if guard not in text:
+        sys.exit(f"{file} has no longer {guard!r}: see where that guard is now")
+    # The first place, which is the one that is told of.
+    (tree / file).write_text(text.replace(guard, without, 1))
+    build = ["cargo", "test", "--workspace", "--test", "schedules", "--no-run", "--target-dir", target]
+    built = subprocess.run(build, cwd=tree, capture_output=True, text=True)
+    if built.returncode:
+        sys.exit(f"without this guard it is not built:\n{built.stderr}")
+    program = re.findall(r"\((\S*schedules-\w+)\)", built.stderr)[-1]
+    seeds = min(25, most)
+    while True:
+        environment = {"REGRIND_SCHEDULES": str(seeds), "PATH": "/usr/bin:/bin"}
+        run = ["--exact", "no_schedule_breaks_a_promise"]
+        done = subprocess.run([tree / program, *run], cwd=tree, env=environment, capture_output=True, text=True)
+        broken = re.findall(r"^seed (\d+): (.*)$", done.stdout + done.stderr, re.M)
+        if broken:
+            seed, what = min(broken, key=lambda found: int(found[0]))
+            return int(seed) + 1, f"seed {seed}: {what}"
+        if seeds >= most:
+            return seeds, None
+        seeds = min(4 * seeds, most)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,253 @@
+//! What lies between the program and the machines: bytes that are on their way for a while, stay on their way when the program has hung
+//! up or died, or never arrive.
+
+use std::collections::VecDeque;
+use std::fmt;
+use std::io;
+use std::pin::Pin;
+use std::sync::{Arc, Mutex};
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use rand::rngs::StdRng;
+use rand::{RngExt as _, SeedableRng as _};
+use regrind::device::{Dial, Dialled, Line, LineStream};
+use regrind_sim::wire::Units;
+use regrind_sim::wire::faults::Faults;
+use regrind_sim::wire::rtu::{Line as Pace, serve_rtu};
+use regrind_sim::wire::tcp::serve_client;
+use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, DuplexStream, ReadBuf, duplex, split};
+use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
+use tokio::task::AbortHandle;
+
+use crate::life::Life;
+
+/// How a network carries, as of now.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Weather {
+    /// Share of what is sent that takes long.
+    pub slow_share: f64,
+    /// How long at most.
+    pub slow: Duration,
+    /// Nobody answers a call, and who talks is cut off.
+    pub down: bool,
+    /// What is sent is lost without a word.
+    pub silent: bool,
+}
+
+impl Weather {
+    pub const FAIR: Self = Self { slow_share: 0.0, slow: Duration::ZERO, down: false, silent: false };
+}
+
+/// The network to one machine, or to both on one line.
+#[derive(Clone)]
+pub struct Net(Arc<Shared>);
+
+struct Shared {
+    units: Units,
+    faults: Faults,
+    state: Mutex<State>,
+    /// The machines' end of a serial line; none where each call has a connection of its own.
+    bus: Option<UnboundedSender<Vec<u8>>>,
+}
+
+struct State {
+    weather: Weather,
+    chance: StdRng,
+    /// Who carries answers to a client.
+    carrying: Vec<AbortHandle>,
+    /// Who listens to the serial line.
+    listening: Option<UnboundedSender<Vec<u8>>>,
+}
+
+impl fmt::Debug for Net {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Net")
+    }
+}
+
+impl Net {
+    /// A network of connections, or a serial line of so many bits a second.
+    pub fn new(units: Units, faults: Faults, baud: Option<u32>, seed: u64) -> Self {
+        let chance = StdRng::seed_from_u64(seed);
+        let state = Mutex::new(State { weather: Weather::FAIR, chance, carrying: Vec::new(), listening: None });
+        let Some(baud) = baud else {
+            return Self(Arc::new(Shared { units, faults, state, bus: None }));
+        };
+        let (ours, theirs) = duplex(1 << 16);
+        let (bus, sent) = unbounded_channel();
+        let net = Self(Arc::new(Shared { units: units.clone(), faults: faults.clone(), state, bus: Some(bus) }));
+        tokio::spawn(async move { serve_rtu(theirs, units, Pace::paced(baud), faults).await });
+        let (from_machines, to_machines) = split(ours);
+        tokio::spawn(net.clone().carry_to(sent, to_machines));
+        let back = net.clone();
+        tokio::spawn(back.carry_on_the_line(from_machines));
+        net
+    }
+
+    /// Changes how it carries.
+    pub fn set(&self, weather: Weather) {
+        let mut state = self.state();
+        state.weather = weather;
+        if weather.down {
+            state.carrying.drain(..).for_each(|carrying| carrying.abort());
+            state.listening = None;
+        }
+    }
+
+    fn state(&self) -> std::sync::MutexGuard<'_, State> {
+        self.0.state.lock().unwrap()
+    }
+
+    /// How long the next bytes are on their way; none if they are lost.
+    fn way(&self) -> Option<Duration> {
+        let mut state = self.state();
+        let Weather { slow_share, slow, silent, .. } = state.weather;
+        let usual = Duration::from_micros(state.chance.random_range(50..800));
+        let is_slow = state.chance.random::<f64>() < slow_share;
+        let way = if is_slow { slow.mul_f64(state.chance.random()) } else { usual };
+        (!silent).then_some(way)
+    }
+
+    /// Carries what a client sends. What is on its way arrives, also when who sent it has gone.
+    async fn carry_to(self, mut sent: UnboundedReceiver<Vec<u8>>, mut to: impl AsyncWrite + Unpin) {
+        while let Some(bytes) = sent.recv().await {
+            let Some(way) = self.way() else { continue };
+            tokio::time::sleep(way).await;
+            if to.write_all(&bytes).await.is_err() {
+                return;
+            }
+        }
+    }
+
+    async fn carry_back(self, mut from: impl AsyncRead + Unpin, to: UnboundedSender<Vec<u8>>) {
+        let mut bytes = [0; 512];
+        while let Ok(count @ 1..) = from.read(&mut bytes).await {
+            let Some(way) = self.way() else { continue };
+            tokio::time::sleep(way).await;
+            if to.send(bytes[..count].to_vec()).is_err() {
+                return;
+            }
+        }
+    }
+
+    async fn carry_on_the_line(self, mut from: impl AsyncRead + Unpin) {
+        let mut bytes = [0; 512];
+        while let Ok(count @ 1..) = from.read(&mut bytes).await {
+            let Some(way) = self.way() else { continue };
+            tokio::time::sleep(way).await;
+            if let Some(to) = &self.state().listening {
+                let _ = to.send(bytes[..count].to_vec());
+            }
+        }
+    }
+
+    fn call(&self, life: Arc<Life>) -> Port {
+        let (to_client, from) = unbounded_channel();
+        if let Some(bus) = &self.0.bus {
+            self.state().listening = Some(to_client);
+            return Port { to: bus.clone(), from, ahead: VecDeque::new(), life };
+        }
+        let (ours, theirs): (DuplexStream, DuplexStream) = duplex(1 << 16);
+        let (to, sent) = unbounded_channel();
+        let shared = self.0.clone();
+        tokio::spawn(async move { serve_client(theirs, &shared.units, &shared.faults).await });
+        let (from_machines, to_machines) = split(ours);
+        tokio::spawn(self.clone().carry_to(sent, to_machines));
+        let carrying = tokio::spawn(self.clone().carry_back(from_machines, to_client)).abort_handle();
+        let mut state = self.state();
+        state.carrying.retain(|carrying| !carrying.is_finished());
+        state.carrying.push(carrying);
+        Port { to, from, ahead: VecDeque::new(), life }
+    }
+
+    /// Cuts off whoever listens: the program has died.
+    pub fn hang_up(&self) {
+        let mut state = self.state();
+        state.carrying.drain(..).for_each(|carrying| carrying.abort());
+        state.listening = None;
+    }
+
+    /// Returns how a life of the program reaches the machines.
+    pub fn dial(&self, life: &Arc<Life>) -> Box<dyn Dial> {
+        Box::new(Caller { net: self.clone(), life: life.clone() })
+    }
+}
+
+#[derive(Debug)]
+struct Caller {
+    net: Net,
+    life: Arc<Life>,
+}
+
+impl Dial for Caller {
+    fn dial<'a>(&'a mut self, _: &'a Line) -> Dialled<'a> {
+        Box::pin(async move {
+            let way = self.net.way();
+            tokio::time::sleep(way.unwrap_or(Duration::from_secs(60))).await;
+            if way.is_none() || self.net.state().weather.down || !self.life.passes() {
+                return Err(io::ErrorKind::ConnectionRefused.into());
+            }
+            Ok(Box::new(self.net.call(self.life.clone())) as Box<dyn LineStream>)
+        })
+    }
+}
+
+/// The program's end of a connection.
+struct Port {
+    to: UnboundedSender<Vec<u8>>,
+    from: UnboundedReceiver<Vec<u8>>,
+    ahead: VecDeque<u8>,
+    life: Arc<Life>,
+}
+
+impl fmt::Debug for Port {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Port")
+    }
+}
+
+impl LineStream for Port {
+    fn waiting(&mut self, cx: &mut Context<'_>) -> io::Result<usize> {
+        loop {
+            match self.from.poll_recv(cx) {
+                Poll::Ready(Some(bytes)) => self.ahead.extend(bytes),
+                Poll::Ready(None) => return Err(io::ErrorKind::ConnectionReset.into()),
+                Poll::Pending => return Ok(self.ahead.len()),
+            }
+        }
+    }
+}
+
+impl AsyncRead for Port {
+    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+        if self.ahead.is_empty() {
+            match self.from.poll_recv(cx) {
+                Poll::Ready(Some(bytes)) if self.life.passes() => self.ahead.extend(bytes),
+                Poll::Ready(_) => return Poll::Ready(Ok(())),
+                Poll::Pending => return Poll::Pending,
+            }
+        }
+        let count = buffer.remaining().min(self.ahead.len());
+        let bytes: Vec<u8> = self.ahead.drain(..count).collect();
+        buffer.put_slice(&bytes);
+        Poll::Ready(Ok(()))
+    }
+}
+
+impl AsyncWrite for Port {
+    fn poll_write(self: Pin<&mut Self>, _: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        if !self.life.passes() || self.to.send(bytes.to_vec()).is_err() {
+            return Poll::Ready(Err(io::ErrorKind::BrokenPipe.into()));
+        }
+        Poll::Ready(Ok(bytes.len()))
+    }
+
+    fn poll_flush(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Poll::Ready(Ok(()))
+    }
+
+    fn poll_shutdown(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Poll::Ready(Ok(()))
+    }
+}

@@ -1,0 +1,116 @@
+//! The person at the cell: gives the orders that the schedule draws, and lets the cell go on wherever it waits for one.
+
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use rand::rngs::StdRng;
+use rand::{RngExt as _, SeedableRng as _};
+use regrind::cell::{Actor, Device, StateName};
+use regrind::drive::{Orders, Request};
+use regrind_sim::command::{State, interlock};
+use regrind_sim::wire::SharedMachine;
+use tokio::time::Instant;
+
+use crate::life::Life;
+
+/// After so many resumes the person gives up in order, and after twice as many at once.
+const PATIENCE: u32 = 40;
+
+/// An order, and what the cell said.
+#[derive(Clone, Debug)]
+pub struct Given {
+    pub at: Instant,
+    pub answered: Instant,
+    pub what: &'static str,
+    /// By which it is found on record.
+    pub reason: String,
+    pub accepted: bool,
+    /// Whether the grinder and the CMM moved as it was given.
+    pub moved: [bool; 2],
+}
+
+pub fn actor() -> Actor {
+    Actor { name: "a person".into(), station: "here".into() }
+}
+
+pub struct Person {
+    pub shared: [SharedMachine; 2],
+    pub given: Arc<Mutex<Vec<Given>>>,
+    chance: StdRng,
+    resumes: u32,
+}
+
+impl Person {
+    pub fn new(shared: [SharedMachine; 2], seed: u64) -> Self {
+        Self { shared, given: Arc::default(), chance: StdRng::seed_from_u64(seed), resumes: 0 }
+    }
+
+    /// Looks after the cell in one life of the program; never comes to an end.
+    pub async fn attend(&mut self, orders: &Orders, life: &Life) {
+        let status = orders.status();
+        loop {
+            let pause = Duration::from_millis(self.chance.random_range(50..1500));
+            tokio::time::sleep(pause).await;
+            let (state, number, phase) = {
+                let seen = status.borrow();
+                (seen.state, seen.number, seen.phase)
+            };
+            if state != StateName::Held {
+                continue;
+            }
+            self.resumes += 1;
+            if self.resumes > 2 * PATIENCE {
+                self.give(orders, life, "abort", |reason| Request::Abort { reason }).await;
+            } else if self.resumes > PATIENCE {
+                self.give(orders, life, "stop", |reason| Request::Stop { reason }).await;
+            } else {
+                if let Some(device) = phase.and_then(|phase| phase.moving()) {
+                    self.look_at(orders, life, device).await;
+                }
+                self.give(orders, life, "resume", |reason| Request::Resume { reason, seen: Some(number) }).await;
+            }
+        }
+    }
+
+    /// Where a machine cannot tell what became of its job, a person looks whether it stands, and says so.
+    async fn look_at(&mut self, orders: &Orders, life: &Life, device: Device) {
+        let state = self.shared[device as usize].with(|machine| machine.state());
+        let stands = matches!(state, State::Idle | State::Complete | State::Aborted | State::Faulted);
+        if self.resumes.is_multiple_of(4) && stands {
+            self.give(orders, life, "over", |evidence| Request::Over { device, evidence }).await;
+        }
+    }
+
+    /// Gives an order and keeps what was answered.
+    pub async fn give(
+        &mut self,
+        orders: &Orders,
+        life: &Life,
+        what: &'static str,
+        request: impl FnOnce(String) -> Request,
+    ) {
+        let number = self.given.lock().unwrap().len();
+        give(orders, life, &self.given, (what, format!("order {number}")), &self.shared, request).await;
+    }
+}
+
+/// Gives an order and keeps what was answered, unless the program has died over it.
+pub async fn give(
+    orders: &Orders,
+    life: &Life,
+    given: &Mutex<Vec<Given>>,
+    (what, reason): (&'static str, String),
+    shared: &[SharedMachine; 2],
+    request: impl FnOnce(String) -> Request,
+) {
+    let at = Instant::now();
+    let moved = [0, 1].map(|k: usize| crate::machines::moves(shared[k].with(|machine| machine.state())));
+    let reply = orders.ask(request(reason.clone()), actor()).await;
+    let Some(reply) = reply.filter(|_| !life.is_dead()) else { return };
+    given.lock().unwrap().push(Given { at, answered: Instant::now(), what, reason, accepted: reply.accepted, moved });
+}
+
+/// Opens the interlock of air and coolant of a machine.
+pub fn take_supplies(machine: &SharedMachine, away: bool) {
+    machine.with(|machine| machine.open_interlocks(if away { interlock::SUPPLIES } else { 0 }));
+}
