@@ -271,10 +271,13 @@ impl<B: StationDriver> MachineTask<B> {
                     },
                     None => break,
                 },
-                _ = ticks.tick(), if self.seen.connected && pulse.is_felt() => tokio::select! {
-                    biased;
-                    () = aborts.ordered() => {}
-                    () = self.look() => {}
+                // Asked at each tick anew: a loop that has hung goes on.
+                _ = ticks.tick(), if self.seen.connected => if pulse.is_felt() {
+                    tokio::select! {
+                        biased;
+                        () = aborts.ordered() => {}
+                        () = self.look() => {}
+                    }
                 },
             }
         }

@@ -28,6 +28,8 @@ GUARDS = {
         "src/device/modbus/mod.rs", "        self.claim().await?;\n        let second", "        let second"),
     "a machine that was lost is sent nothing that moves": (
         "src/drive/station.rs", "        if self.seen.lost {\n            return self.not_sent(Asked::Start).await;\n        }\n", ""),
+    "a station looks again after the loop has hung": (
+        "src/drive/station.rs", "if self.seen.connected => if pulse.is_felt() {", "if self.seen.connected && pulse.is_felt() => if true {"),
     "holding goes on when the link is lost": (
         "src/cell/act.rs", "        if is_holding {\n", "        if false && is_holding {\n            unreachable!();\n        } else if is_holding {\n            self.go(Held(out_of_sight(phase)));\n        } else if false {\n"),
     "a job found running while holding is told to hold": (

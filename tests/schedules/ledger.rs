@@ -9,7 +9,7 @@ use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
 use regrind::drive::Ledger;
 use regrind::journal::{Anchor, Artefact, Entry, Journal, JournalError};
-use serde_json::Value;
+use serde_json::{Value, json};
 use tokio::time::Instant;
 
 use crate::life::Life;
@@ -78,13 +78,16 @@ pub struct Recorded {
     pub payload: Value,
 }
 
+/// What came on record in all lives, in order.
+pub type Written = Arc<Mutex<Vec<Recorded>>>;
+
 /// A journal in a life of the program.
 pub struct Kept {
     journal: SharedJournal,
     folder: PathBuf,
     disk: SharedDisk,
     life: Arc<Life>,
-    written: Arc<Mutex<Vec<Recorded>>>,
+    written: Written,
     /// What was written without saying so, by the text of what was given, until it is given again.
     untold: Option<(String, u64)>,
 }
@@ -93,7 +96,7 @@ pub struct Kept {
 pub type SharedJournal = Arc<Mutex<Option<Journal>>>;
 
 impl Kept {
-    pub fn new(journal: Journal, disk: &SharedDisk, life: &Arc<Life>, written: &Arc<Mutex<Vec<Recorded>>>) -> Self {
+    pub fn new(journal: Journal, disk: &SharedDisk, life: &Arc<Life>, written: &Written) -> Self {
         let folder = journal.folder().to_owned();
         let journal = Arc::new(Mutex::new(Some(journal)));
         Self { journal, folder, disk: disk.clone(), life: life.clone(), written: written.clone(), untold: None }
@@ -168,7 +171,7 @@ impl Ledger for Kept {
 
     fn end(&mut self, mono_ns: u64, cycle: u32, ending: Value) -> Result<Anchor, JournalError> {
         let mut anchor = None;
-        let ended = self.write("end".into(), Value::Null, |journal| {
+        let ended = self.write("end".into(), json!("end"), |journal| {
             anchor = Some(journal.end(mono_ns, cycle, ending.clone())?);
             Ok(0)
         });

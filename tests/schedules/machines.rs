@@ -13,7 +13,7 @@ use regrind_sim::world::World;
 use serde::Deserialize;
 use tokio::time::Instant;
 
-use crate::part::setting;
+use crate::part::{Wanted, setting};
 
 /// How often their time passes.
 const TICK: Duration = Duration::from_millis(10);
@@ -38,7 +38,7 @@ pub struct Machines {
 impl Machines {
     /// Switches both on, so many times as fast as real ones.
     pub fn new(seed: u64, speed: f64) -> Self {
-        let truth = setting().recipe.simulation.clone().unwrap();
+        let truth = setting(Wanted::Good).recipe.simulation.clone().unwrap();
         let mut spec = WorldSpec::deserialize(toml::Value::Table(truth)).unwrap();
         spec.seed = 1 + seed % 7;
         let world = World::new(spec).unwrap();

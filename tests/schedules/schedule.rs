@@ -13,20 +13,22 @@ use regrind::device::{Link, Machine as _, ModbusCmm, ModbusGrinder, ModbusSettin
 use regrind::drive::{Beside, Blocking, Drive, Interrupted, Orders, Request, Run};
 use regrind::journal::{AuditKey, Header, Journal, Kind, Reader, RunLock, verify};
 use regrind::setup;
-use regrind_sim::command::Mode;
+use regrind_sim::command::{Frame, Mode};
+use regrind_sim::options::Layout;
 use regrind_sim::wire::SharedMachine;
 use regrind_sim::wire::faults::{Fault, FaultPlan, Faults};
+use regrind_sim::words::WordOrder;
 use serde_json::json;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep, sleep_until};
 
 use crate::checker::{Evidence, Shown, check};
-use crate::ledger::{Disk, Kept, Recorded, SharedDisk};
+use crate::ledger::{Disk, Kept, SharedDisk, Written};
 use crate::life::Life;
 use crate::machines::Machines;
 use crate::net::{Net, Weather};
-use crate::part;
+use crate::part::{self, Wanted};
 use crate::person::{Given, Person, actor, give, take_supplies};
 
 /// Nothing is drawn to go wrong after this.
@@ -39,13 +41,42 @@ const MOST_DEATHS: usize = 3;
 /// What happens to the cell from outside.
 #[derive(Clone, Debug)]
 enum Act {
-    Weather { wire: usize, weather: Weather, lasts: Duration },
-    Disk { disk: Disk, lasts: Duration },
-    Freeze { machine: usize, lasts: Duration },
-    Reboot { machine: usize },
-    Manual { machine: usize, lasts: Duration },
-    Supplies { machine: usize, lasts: Duration },
-    Stranger { machine: usize, aborts: bool },
+    Weather {
+        wire: usize,
+        weather: Weather,
+        lasts: Duration,
+    },
+    Disk {
+        disk: Disk,
+        lasts: Duration,
+    },
+    Freeze {
+        machine: usize,
+        lasts: Duration,
+    },
+    Reboot {
+        machine: usize,
+    },
+    Manual {
+        machine: usize,
+        lasts: Duration,
+    },
+    Supplies {
+        machine: usize,
+        lasts: Duration,
+    },
+    Stranger {
+        machine: usize,
+        aborts: bool,
+    },
+    /// Somebody writes a command under a number near the last that there is.
+    HighNumber {
+        machine: usize,
+    },
+    /// The computer sleeps; the machines do not.
+    Suspend {
+        lasts: Duration,
+    },
     Order(&'static str),
 }
 
@@ -148,6 +179,10 @@ impl Schedule {
         }
     }
 
+    fn wanted(&self) -> Wanted {
+        if self.dies_alone { Wanted::Perfect } else { Wanted::Good }
+    }
+
     /// Runs it and holds what happened against the promises.
     ///
     /// # Errors
@@ -213,7 +248,7 @@ fn act(chance: &mut StdRng) -> Act {
     let machine = chance.random_range(0..2);
     let lasts = if chance.random::<f64>() < 0.3 { up_to(chance, 20.0) } else { up_to(chance, 4.0) };
     let second = Duration::from_secs(1);
-    match chance.random_range(0..14) {
+    match chance.random_range(0..16) {
         0 => Act::Weather { wire: machine, weather: Weather { down: true, ..Weather::FAIR }, lasts },
         1 => Act::Weather { wire: machine, weather: Weather { silent: true, ..Weather::FAIR }, lasts },
         2 | 3 => {
@@ -230,6 +265,8 @@ fn act(chance: &mut StdRng) -> Act {
         10 => Act::Supplies { machine, lasts },
         11 => Act::Stranger { machine, aborts: chance.random::<f64>() < 0.2 },
         12 => Act::Order("hold"),
+        13 => Act::HighNumber { machine },
+        14 => Act::Suspend { lasts },
         _ => Act::Order(["hold", "resume", "stop", "abort"][chance.random_range(0..4)]),
     }
 }
@@ -248,7 +285,7 @@ struct Happening<'s> {
     disk: SharedDisk,
     person: Person,
     shown: Arc<Mutex<Vec<Shown>>>,
-    written: Arc<Mutex<Vec<Recorded>>>,
+    written: Written,
     /// The orders of the life that is under way, for who gives them from outside.
     orders: Office,
     job: u32,
@@ -314,13 +351,13 @@ impl<'s> Happening<'s> {
             let (ended, is_begun) = self.live(&folder, &life).await;
             self.effects += life.effects();
             match ended {
-                Ended::Over(ending) if is_closed(&folder) => break Some(ending),
+                Ended::Over(ending) if self.is_closed() => break Some(ending),
                 // The disk did not take its end: it is gone on with to bring it there.
                 Ended::Over(_) if self.began.elapsed() < CALM_AFTER => sleep(CALM_AFTER).await,
                 Ended::Over(_) | Ended::Never => break None,
                 Ended::Died => sleep(up_to(&mut chance, 8.0)).await,
             }
-            if is_closed(&folder) {
+            if self.is_closed() {
                 break None;
             }
             if !is_begun && !has_events(&folder) {
@@ -334,6 +371,10 @@ impl<'s> Happening<'s> {
         self.evidence(folder, ending)
     }
 
+    fn is_closed(&self) -> bool {
+        self.written.lock().unwrap().iter().any(|recorded| recorded.payload == "end")
+    }
+
     fn folder(&self) -> PathBuf {
         self.home.join(format!("run-{}", self.job))
     }
@@ -341,7 +382,7 @@ impl<'s> Happening<'s> {
     /// Begins or goes on with the run, until it ends or the program dies.
     async fn live(&mut self, folder: &Path, life: &Arc<Life>) -> (Ended, bool) {
         self.lives += 1;
-        let (task, plan) = part::task();
+        let (task, plan) = part::task(self.schedule.wanted());
         let begins = !folder.exists();
         let (journal, interrupted) = if begins {
             (Journal::create_with(folder, self.header(), Some(AuditKey::new())).unwrap(), None)
@@ -412,7 +453,7 @@ impl<'s> Happening<'s> {
     }
 
     fn settings(&self, which: usize) -> ModbusSettings {
-        let cell = &part::setting().cell;
+        let cell = &part::setting(Wanted::Good).cell;
         let link = if which == 0 { &cell.cmm.link } else { &cell.grinder.link };
         setup::modbus(link, true, 7, self.lives as u32).unwrap()
     }
@@ -483,14 +524,21 @@ impl<'s> Happening<'s> {
         let is_steady = self.schedule.baud.is_none()
             && self.schedule.fault_share == 0.0
             && !self.schedule.acts.iter().any(|(_, act)| {
-                matches!(act, Act::Weather { .. } | Act::Freeze { .. } | Act::Reboot { .. } | Act::Stranger { .. })
+                matches!(
+                    act,
+                    Act::Weather { .. }
+                        | Act::Freeze { .. }
+                        | Act::Reboot { .. }
+                        | Act::Stranger { .. }
+                        | Act::HighNumber { .. }
+                        | Act::Suspend { .. }
+                )
             });
         let shown = self.shown.lock().unwrap().clone();
         Evidence {
             began: self.began,
             job: self.job,
             folder,
-            ending,
             log,
             given,
             written,
@@ -500,10 +548,6 @@ impl<'s> Happening<'s> {
             effects: self.effects,
         }
     }
-}
-
-fn is_closed(folder: &Path) -> bool {
-    verify(folder).is_ok_and(|verified| verified.closed)
 }
 
 /// Whether a run has begun, as `regrind resume` asks.
@@ -570,6 +614,13 @@ impl Outside {
             // A second master on a serial line would talk into the answers of the first: there is one master on such a line.
             Act::Stranger { machine, aborts } if !self.is_serial => self.stranger(machine, aborts).await,
             Act::Stranger { .. } => {}
+            Act::HighNumber { machine } => {
+                let frame = Frame { sequence: u32::MAX - 3, command: 1, owner: 99, epoch: 1, ..Frame::default() };
+                let at = Layout::default().command;
+                // It is acknowledged, and refused.
+                let _ = self.shared[machine].with(|machine| machine.write(at, &frame.registers(WordOrder::Big)));
+            }
+            Act::Suspend { lasts } => tokio::time::advance(lasts).await,
             Act::Order(what) => self.order(what).await,
         }
     }
