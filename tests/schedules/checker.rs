@@ -21,6 +21,10 @@ use crate::schedule::Tally;
 const STANDS_WITHIN: Duration = Duration::from_millis(3_600);
 /// An abort is at a machine that moves within this, whatever the disk does.
 const ABORTS_WITHIN: Duration = Duration::from_millis(100);
+/// A command is on a wire that carries for less than this.
+const ON_ITS_WAY: Duration = Duration::from_millis(20);
+/// What a cell shows that stands.
+const STANDS: [StateName; 4] = [StateName::Held, StateName::Stopped, StateName::Aborted, StateName::Complete];
 const NAMES: [&str; 2] = ["cmm", "grinder"];
 
 /// What the cell showed from a moment on; nothing where nobody could see it.
@@ -74,6 +78,7 @@ pub fn check(evidence: &Evidence) -> Result<(), String> {
     map_of_record(evidence, &records)?;
     never_both(evidence)?;
     still_where_shown(evidence)?;
+    begins_nothing_where_it_stands(evidence)?;
     aborted_at_once(evidence)?;
     answered_is_on_record(evidence, &records)?;
     // Once nothing goes wrong any more, the run comes to its end.
@@ -193,8 +198,7 @@ fn still_where_shown(evidence: &Evidence) -> Result<(), String> {
     let last = evidence.log.last().map_or(evidence.began, |moment| moment.at) + Duration::from_secs(60);
     let states = states(evidence);
     for (k, shown) in evidence.shown.iter().enumerate() {
-        let stands = [StateName::Held, StateName::Stopped, StateName::Aborted, StateName::Complete];
-        if !shown.state.is_some_and(|state| stands.contains(&state)) {
+        if !shown.state.is_some_and(|state| STANDS.contains(&state)) {
             continue;
         }
         let until = evidence.shown.get(k + 1).map_or(last, |next| next.at);
@@ -209,6 +213,19 @@ fn still_where_shown(evidence: &Evidence) -> Result<(), String> {
                     evidence.seconds(shown.at)
                 ));
             }
+        }
+    }
+    Ok(())
+}
+
+/// Nothing begins while the cell shows that it stands; where the wire carries, and nobody died over it.
+fn begins_nothing_where_it_stands(evidence: &Evidence) -> Result<(), String> {
+    let began = evidence.log.iter().filter(|moment| matches!(moment.what, What::Began { .. }));
+    for moment in began.filter(|_| evidence.is_steady && evidence.tally.has_one_life()) {
+        let Some(last) = evidence.shown.iter().rev().find(|shown| shown.at + ON_ITS_WAY < moment.at) else { continue };
+        if last.state.is_some_and(|state| STANDS.contains(&state)) {
+            let (machine, at) = (NAMES[moment.machine], evidence.seconds(moment.at));
+            return Err(format!("the {machine} begins at {at:.3} s, and the cell shows {:?}", last.state));
         }
     }
     Ok(())
