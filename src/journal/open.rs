@@ -61,11 +61,19 @@ pub(super) fn read_write(folder: &Path) -> Result<Connection, JournalError> {
     let failed = JournalError::database(&path);
     let connection = Connection::open_with_flags(&path, flags).map_err(&failed)?;
     configure(&connection, &path)?;
+    bring_in_the_log(&connection).map_err(&failed)?;
     if layout < LAYOUT {
         // What is written from here on, an earlier version may not know.
         connection.execute_batch(&format!("PRAGMA user_version = {LAYOUT};")).map_err(&failed)?;
     }
     Ok(connection)
+}
+
+/// Writes all that the log holds into the database, and begins the log anew. Where a sync has failed before, the system may have given up
+/// bringing a part of the log to the disk, and show it all the same; what is written behind such a part is not found again
+/// after a power cut. While somebody reads, the log stays as it is.
+fn bring_in_the_log(connection: &Connection) -> rusqlite::Result<()> {
+    run(connection, "PRAGMA wal_checkpoint(TRUNCATE)")
 }
 
 /// Opens the database of a run for reading, also where the folder cannot be written.
@@ -76,7 +84,7 @@ pub(super) fn read_only(folder: &Path) -> Result<Connection, JournalError> {
     let failed = JournalError::database(&path);
     let tried = Connection::open_with_flags(&path, flags).and_then(|c| reads(&c).map(|()| c));
     let connection = match tried {
-        Err(error) if is_unopenable(&error) && !folder.join(format!("{DATABASE}-wal")).exists() => {
+        Err(error) if is_unopenable(&error) && !has_more_beside(folder) => {
             // A write-ahead database wants to make files beside it. Where it cannot, and there is nothing ahead, it is read as it is.
             let address = address(&path);
             let flags = flags | OpenFlags::SQLITE_OPEN_URI;
@@ -91,6 +99,12 @@ pub(super) fn read_only(folder: &Path) -> Result<Connection, JournalError> {
 
 fn reads(connection: &Connection) -> rusqlite::Result<()> {
     connection.query_row("SELECT count(*) FROM sqlite_schema", [], |_| Ok(()))
+}
+
+/// Whether the file of the database is not all there is: records stand in its log only, or some in it were never committed and are to be
+/// taken back.
+fn has_more_beside(folder: &Path) -> bool {
+    ["wal", "journal"].iter().any(|more| folder.join(format!("{DATABASE}-{more}")).exists())
 }
 
 fn is_unopenable(error: &rusqlite::Error) -> bool {
@@ -112,7 +126,8 @@ fn address(path: &Path) -> String {
     address + "?immutable=1"
 }
 
-/// Looks at the header of the file before SQLite may touch it; returns the layout.
+/// Looks at the header of the file before SQLite may touch it; returns the layout. Whoever closes a file gives back all locks that his process
+/// has on it, so this is for nobody who writes the same journal.
 fn recognise(folder: &Path, path: &Path) -> Result<u32, JournalError> {
     if !path.is_file() {
         return Err(JournalError::Absent { path: folder.to_owned() });
@@ -152,10 +167,18 @@ fn harden(connection: &Connection, path: &Path) -> Result<(), JournalError> {
 
 fn set(connection: &Connection, path: &Path, setting: &'static str, wanted: &'static str) -> Result<(), JournalError> {
     let failed = JournalError::database(path);
-    connection.execute_batch(&format!("PRAGMA {setting} = {wanted};")).map_err(&failed)?;
+    run(connection, &format!("PRAGMA {setting} = {wanted}")).map_err(&failed)?;
     let found =
         connection.query_row(&format!("PRAGMA {setting}"), [], |row| row.get_ref(0).map(text_of)).map_err(&failed)?;
     if found == wanted { Ok(()) } else { Err(JournalError::Setting { path: path.to_owned(), setting, wanted, found }) }
+}
+
+/// Runs a statement to its end, whatever it gives. A setting that is written into the file tells its value first, and fails then.
+fn run(connection: &Connection, sql: &str) -> rusqlite::Result<()> {
+    let mut statement = connection.prepare(sql)?;
+    let mut rows = statement.query([])?;
+    while rows.next()?.is_some() {}
+    Ok(())
 }
 
 fn text_of(value: rusqlite::types::ValueRef<'_>) -> String {
