@@ -144,7 +144,9 @@ impl Recovery {
             let ended = reader.records(0).any(|record| record.is_ok_and(|record| record.kind == Kind::End));
             Some(begin["content"]["job"] == job && !ended)
         };
-        let mut open = control::folders(&self.runs).filter(|folder| is_open(folder) == Some(true));
+        // This one's own record is being written, and to read it beside that would give back the lock on it.
+        let others = control::folders(&self.runs).filter(|folder| *folder != self.folder);
+        let mut open = others.filter(|folder| is_open(folder) == Some(true));
         open.next().map(|folder| folder.display().to_string())
     }
 

@@ -15,7 +15,10 @@
 //!
 //! All of it stands in docs/journal.md, for who wants to prove a record without this program.
 //!
-//! Calls block until the disk has answered; the drive calls from a thread of its own.
+//! Calls block until the disk has answered; the drive calls from a thread of its own. What a call that failed was to write may be given again,
+//! and stands once.
+//!
+//! All this is tried on a disk that fails, beneath SQLite, by tests/failing_disk: docs/reliability.md says what is, and what is not.
 
 mod artefact;
 mod canonical;
@@ -50,7 +53,8 @@ pub const ANCHOR: &str = "journal.anchor";
 /// The lock in a run folder.
 pub const LOCK: &str = ".lock";
 
-/// A journal that is only read. It may be read while it is written.
+/// A journal that is only read. It may be read while another process writes it. Who writes it himself reads it by [`Journal::records`]: a
+/// process that closes a file gives back all locks that it has on it.
 #[derive(Debug)]
 pub struct Reader {
     connection: Connection,
