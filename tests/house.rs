@@ -211,6 +211,21 @@ fn the_crates_depend_on_nothing_above_them() {
 }
 
 #[test]
+fn what_needs_unsafe_is_one_crate_on_which_only_tests_depend() {
+    const APART: &str = "src/journal/tests/disk";
+    let workspace: toml::Table = fs::read_to_string(root().join("Cargo.toml")).unwrap().parse().unwrap();
+    assert_eq!(workspace["workspace"]["lints"]["rust"]["unsafe_code"].as_str(), Some("forbid"));
+    let members = workspace["workspace"]["members"].as_array().unwrap().iter().map(|member| member.as_str().unwrap());
+    for member in members.chain(["."]) {
+        let manifest = format!("{member}/Cargo.toml");
+        let table: toml::Table = fs::read_to_string(root().join(&manifest)).unwrap().parse().unwrap();
+        let inherits = table["lints"].get("workspace").and_then(toml::Value::as_bool) == Some(true);
+        assert_eq!(inherits, member != APART, "{manifest} keeps the lints of the house");
+        assert!(!dependencies(&manifest).iter().any(|name| name == "regrind-disk"), "{manifest}");
+    }
+}
+
+#[test]
 fn only_the_command_line_prints_or_exits() {
     let words =
         ["println!", "print!", "eprint", "io::stdout", "io::stderr", "process::exit", "ExitCode::", "anyhow", "miette"];

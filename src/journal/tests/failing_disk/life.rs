@@ -1,0 +1,288 @@
+//! The life of a journal, and what has to stand when it is over or was cut off.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use regrind_disk::Disk;
+use regrind_journal::{AuditKey, Entry, Header, Journal, JournalError, Kind, Reader, Record, Verified, verify};
+use rusqlite::{Connection, OpenFlags};
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+use crate::keep::Kept;
+
+/// A short life brings its log into the database some times.
+pub const CHECKPOINT_PAGES: u32 = 24;
+
+/// A folder in memory where there is one: what lasts is decided by the disk of the test. The journals in it are kept for the other
+/// verifier, where that is wanted.
+pub struct Home {
+    _kept: Kept,
+    home: TempDir,
+}
+
+impl Home {
+    pub fn new() -> Self {
+        let home = tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap();
+        Self { _kept: Kept(home.path().to_owned()), home }
+    }
+
+    pub fn folder(&self, name: &str) -> PathBuf {
+        self.home.path().join(name)
+    }
+
+    /// A folder with nothing in it.
+    pub fn empty(&self, name: &str) -> PathBuf {
+        let folder = self.folder(name);
+        let _ = fs::remove_dir_all(&folder);
+        fs::create_dir(&folder).unwrap();
+        folder
+    }
+}
+
+/// How much of all there is to try: `None` is a sample, a number is how often chance is asked at each place. Set by .ci/long.
+pub fn draws() -> Option<u64> {
+    std::env::var("REGRIND_DISK_DRAWS").ok().and_then(|number| number.parse().ok())
+}
+
+pub fn header() -> Header {
+    Header {
+        run: "run-1".into(),
+        part: "SN 7".into(),
+        actor: "Ada".into(),
+        station: "console".into(),
+        simulation: true,
+        first_command_id: 1,
+        content: json!({ "recipe": "abc" }),
+    }
+}
+
+/// What is done with a journal.
+#[derive(Clone, Copy)]
+pub enum Step {
+    /// With so many letters.
+    Note(usize),
+    Intend,
+    Outcome,
+    Store(usize),
+    Reopen,
+    End,
+}
+
+/// Some thirty records, of which some need pages of their own.
+pub fn short() -> Vec<Step> {
+    use Step::{End, Intend, Note, Outcome, Reopen, Store};
+    let first = [Store(10), Note(0), Intend, Note(300), Outcome, Note(6000), Intend, Store(9000), Outcome, Note(20)];
+    let second = [Note(700), Intend, Note(3000), Reopen, Note(40), Outcome, Intend, Note(100), Note(13_000), Outcome];
+    let third = [Note(500), Intend, Outcome, Outcome, Store(100), Note(0), Reopen, Reopen, Intend, Note(900)];
+    [&first[..], &second, &third, &[Note(60), Note(4000), Outcome, End]].concat()
+}
+
+/// So many that the head is sealed in the middle of them.
+pub fn long() -> Vec<Step> {
+    use Step::{End, Intend, Note, Outcome};
+    [&[Note(0); 252][..], &[Intend, Note(10), Outcome, Note(10), Intend, Outcome, End]].concat()
+}
+
+/// What the journal has acknowledged: one record.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Told {
+    pub kind: Kind,
+    pub mono_ns: u64,
+    pub command_id: Option<u32>,
+    /// Its content, or the member of it by which it is known.
+    pub payload: Value,
+}
+
+impl Told {
+    pub fn of(record: &Record) -> Self {
+        let value = record.value();
+        let payload = match record.kind {
+            Kind::Artefact => value["name"].clone(),
+            Kind::End => value["ending"].clone(),
+            _ => value,
+        };
+        Self { kind: record.kind, mono_ns: record.mono_ns, command_id: record.command_id, payload }
+    }
+}
+
+/// A life on a disk, and what came of it.
+pub struct Life<'d> {
+    disk: &'d Disk,
+    folder: PathBuf,
+    key: Option<AuditKey>,
+    /// What is tried, for whoever reads of a failure.
+    at: String,
+    /// Every record that was acknowledged, in order.
+    pub told: Vec<Told>,
+    /// What the journal said no for.
+    pub errors: Vec<JournalError>,
+    /// The last command.
+    id: Option<u32>,
+}
+
+/// After so many refusals the disk is well again.
+const PATIENCE: usize = 5;
+
+impl<'d> Life<'d> {
+    /// Leads a life from its beginning to its end. What is refused is tried again, as the drive does. Returns whether it could begin.
+    pub fn led(disk: &'d Disk, folder: &Path, key: Option<AuditKey>, steps: &[Step], at: &str) -> (Self, bool) {
+        let mut life = Self {
+            disk,
+            folder: folder.to_owned(),
+            key: key.clone(),
+            at: at.to_owned(),
+            told: Vec::new(),
+            errors: Vec::new(),
+            id: None,
+        };
+        // Who cannot begin a run begins another, in a folder of its own.
+        let mut journal = match Journal::create_with(folder, header(), key) {
+            Ok(journal) => journal,
+            Err(error) => {
+                life.errors.push(error);
+                return (life, false);
+            }
+        };
+        disk.mark(1);
+        for (number, step) in (1..).zip(steps) {
+            journal = life.take(journal, number, *step);
+        }
+        (life, true)
+    }
+
+    fn take(&mut self, mut journal: Journal, number: u64, step: Step) -> Journal {
+        let entry = |kind, payload: Value| Entry::new(kind, number, 1, payload);
+        let (told, id) = match step {
+            Step::Reopen => {
+                let mode = mode(&self.folder);
+                assert!(mode.as_ref().is_none_or(|mode| mode == "wal"), "{}: no log is written: {mode:?}", self.at);
+                drop(journal);
+                return self.reopened();
+            }
+            Step::Note(letters) => {
+                let payload = json!({ "words": words(number, letters) });
+                self.until_written(|| journal.append(entry(Kind::Note, payload.clone())));
+                (Told { kind: Kind::Note, mono_ns: number, command_id: None, payload }, self.id)
+            }
+            Step::Intend => {
+                let payload = json!({ "command": "register" });
+                let id = self.until_written(|| journal.intend(entry(Kind::Intent, payload.clone())));
+                assert!(Some(id) > self.id, "{}: command {id} after {:?}", self.at, self.id);
+                (Told { kind: Kind::Intent, mono_ns: number, command_id: Some(id), payload }, Some(id))
+            }
+            Step::Outcome => {
+                let (payload, command_id) = (json!({ "event": "registered" }), self.id);
+                let entry = Entry { command_id, ..entry(Kind::Outcome, payload.clone()) };
+                self.until_written(|| journal.append(entry.clone()));
+                (Told { kind: Kind::Outcome, mono_ns: number, command_id, payload }, self.id)
+            }
+            Step::Store(letters) => {
+                let (name, bytes) = (format!("cycle-1/{number}.csv"), words(number, letters));
+                self.until_written(|| journal.store(&name, bytes.as_bytes(), number, 1));
+                (Told { kind: Kind::Artefact, mono_ns: number, command_id: None, payload: json!(name) }, self.id)
+            }
+            Step::End => {
+                self.until_written(|| journal.end(number, 1, json!("accepted")));
+                (Told { kind: Kind::End, mono_ns: number, command_id: None, payload: json!("accepted") }, self.id)
+            }
+        };
+        self.told.push(told);
+        self.id = id;
+        self.disk.mark(1 + self.told.len() as u64);
+        journal
+    }
+
+    /// As the drive's journal thread does it: the same again, while that may help.
+    fn until_written<T>(&mut self, mut write: impl FnMut() -> Result<T, JournalError>) -> T {
+        loop {
+            match write() {
+                Ok(written) => return written,
+                Err(error) => {
+                    assert!(error.may_pass(), "{}: the drive would give up for ever: {error:?}", self.at);
+                    self.refused(error);
+                }
+            }
+        }
+    }
+
+    /// As a person does it who resumes a run.
+    fn reopened(&mut self) -> Journal {
+        loop {
+            match Journal::open_with(&self.folder, self.key.clone()) {
+                Ok(journal) => return journal,
+                Err(error) => {
+                    let accuses = matches!(
+                        error,
+                        JournalError::Broken { .. } | JournalError::Foreign { .. } | JournalError::Closed { .. }
+                    );
+                    assert!(!accuses, "{}: a disk that fails is told as a record that is wrong: {error:?}", self.at);
+                    self.refused(error);
+                }
+            }
+        }
+    }
+
+    fn refused(&mut self, error: JournalError) {
+        let text = error.to_string();
+        assert!(text.contains(&*self.folder.to_string_lossy()), "{}: no place in {text}", self.at);
+        self.errors.push(error);
+        if self.errors.len() >= PATIENCE {
+            self.disk.heal();
+        }
+        assert!(self.errors.len() < 4 * PATIENCE, "{}: refused for ever: {:?}", self.at, self.errors);
+    }
+
+    /// The life came to its end: everything stands once.
+    pub fn is_whole(&self) {
+        let verified = verified(&self.folder, &self.at);
+        assert!(verified.closed && !verified.lacks_last_seal(), "{}: {verified:?}", self.at);
+        assert_eq!(told_in(&self.folder), self.told, "{}", self.at);
+    }
+}
+
+/// Tells how a database is written, as its file says, if the disk lets it be read.
+pub fn mode(folder: &Path) -> Option<String> {
+    let database = Connection::open_with_flags(folder.join("journal.sqlite"), OpenFlags::SQLITE_OPEN_READ_ONLY).ok()?;
+    database.query_row("SELECT count(*) FROM record", [], |_| Ok(())).ok()?;
+    database.query_row("PRAGMA journal_mode", [], |row| row.get(0)).ok()
+}
+
+pub fn words(number: u64, letters: usize) -> String {
+    let letter = char::from(b'a' + (number % 26) as u8);
+    letter.to_string().repeat(letters)
+}
+
+pub fn verified(folder: &Path, at: &str) -> Verified {
+    verify(folder).unwrap_or_else(|error| panic!("{at}: {error}"))
+}
+
+pub fn records(folder: &Path) -> Vec<Record> {
+    Reader::open(folder).unwrap().records(0).map(Result::unwrap).collect()
+}
+
+/// What stands in a journal, without what it writes by itself.
+pub fn told_in(folder: &Path) -> Vec<Told> {
+    let own = [Kind::Begin, Kind::Reopen, Kind::Seal];
+    records(folder).iter().filter(|record| !own.contains(&record.kind)).map(Told::of).collect()
+}
+
+/// The run can be gone on with: no number is used twice, and it comes to its end.
+pub fn is_gone_on_with(folder: &Path, key: Option<&AuditKey>, at: &str) {
+    let before = records(folder);
+    let mut journal = Journal::open_with(folder, key.cloned()).unwrap_or_else(|error| panic!("{at}: {error}"));
+    let open: Vec<_> = journal.open_intents().unwrap().iter().map(|record| record.command_id).collect();
+    let answered = |id| before.iter().any(|record| record.kind == Kind::Outcome && record.command_id == id);
+    let intents: Vec<_> = before.iter().filter(|r| r.kind == Kind::Intent).map(|record| record.command_id).collect();
+    let unanswered: Vec<_> = intents.iter().copied().filter(|id| !answered(*id)).collect();
+    assert_eq!(open, unanswered, "{at}");
+    let id = journal.intend(Entry::new(Kind::Intent, 1000, 2, json!({ "command": "measure" }))).unwrap();
+    assert!(intents.iter().all(|used| *used < Some(id)), "{at}: {id} after {intents:?}");
+    journal.store("gone-on.csv", b"1,2\n", 1001, 2).unwrap();
+    journal.append(Entry::new(Kind::Note, 1002, 2, json!({ "words": words(1002, 5000) }))).unwrap();
+    journal.close(1003, 2, json!("accepted")).unwrap();
+    let verified = verified(folder, at);
+    assert!(verified.closed && !verified.lacks_last_seal(), "{at}: {verified:?}");
+    let after = records(folder);
+    assert_eq!(after[..before.len()], before, "{at}: what stood before is there as it was");
+}
