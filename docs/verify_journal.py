@@ -176,6 +176,9 @@ def opened(folder, scratch, under_way):
         raise Absent("this is no journal of Regrind")
     if int.from_bytes(header[60:64], "big") not in (1, 2):
         raise Absent("the journal has a layout that is not known here")
+    change = folder / "journal.sqlite-journal"
+    if not under_way and change.is_file() and change.open("rb").read(1) not in (b"", b"\0"):
+        raise Absent("its making was cut off, and nothing in it was committed")
     how = "mode=ro" if under_way else "immutable=1"
     if not under_way and log.exists() and log.stat().st_size:
         for file in (database, log):

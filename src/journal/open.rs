@@ -83,8 +83,16 @@ pub(super) fn read_only(folder: &Path) -> Result<Connection, JournalError> {
     let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
     let failed = JournalError::database(&path);
     let tried = Connection::open_with_flags(&path, flags).and_then(|c| reads(&c).map(|()| c));
+    let is_beside = |what: &str| folder.join(format!("{DATABASE}-{what}")).exists();
     let connection = match tried {
-        Err(error) if is_unopenable(&error) && !has_more_beside(folder) => {
+        // Only a writer can take back what the file holds and was never committed.
+        Err(error) if is_unopenable(&error) && is_beside("journal") => {
+            return Err(JournalError::Foreign {
+                path,
+                what: "its making was cut off, and nothing in it was committed",
+            });
+        }
+        Err(error) if is_unopenable(&error) && !is_beside("wal") => {
             // A write-ahead database wants to make files beside it. Where it cannot, and there is nothing ahead, it is read as it is.
             let address = address(&path);
             let flags = flags | OpenFlags::SQLITE_OPEN_URI;
@@ -99,12 +107,6 @@ pub(super) fn read_only(folder: &Path) -> Result<Connection, JournalError> {
 
 fn reads(connection: &Connection) -> rusqlite::Result<()> {
     connection.query_row("SELECT count(*) FROM sqlite_schema", [], |_| Ok(()))
-}
-
-/// Whether the file of the database is not all there is: records stand in its log only, or some in it were never committed and are to be
-/// taken back.
-fn has_more_beside(folder: &Path) -> bool {
-    ["wal", "journal"].iter().any(|more| folder.join(format!("{DATABASE}-{more}")).exists())
 }
 
 fn is_unopenable(error: &rusqlite::Error) -> bool {

@@ -211,7 +211,7 @@ fn a_record_that_was_never_committed_is_not_read_where_it_cannot_be_taken_back()
     cut.restore(&after, Outcome::Lost, &mut Drawn::new(0)).unwrap();
     assert!(after.join("journal.sqlite-journal").exists());
     let refused = Reader::open(&after).map(|_| ());
-    assert!(matches!(refused, Err(JournalError::Database { .. })), "{refused:?}");
+    assert!(matches!(refused, Err(JournalError::Foreign { .. })), "{refused:?}");
     drop(Journal::open(&after).unwrap());
     is_gone_on_with(&after, None, "taken back by a writer");
     assert!(told_in(&after).iter().all(|told| told.mono_ns != 5), "it was never committed");
