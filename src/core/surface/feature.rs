@@ -88,8 +88,10 @@ fn feature(at: Point, around: &[Point], known: Option<Vector>) -> Option<Feature
     let mut residuals: Vec<f64> = around.iter().map(distance).collect();
     let middle = residuals.len() / 2;
     let median = *residuals.select_nth_unstable_by(middle, f64::total_cmp).1;
-    let good = around.iter().filter(|p| distance(p) <= 6.0 * median).copied();
-    let second = fit(at, mean, good);
+    let good = |p: &&Point| distance(p) <= 6.0 * median;
+    // A second fit to the same neighbours would be the first.
+    let second =
+        if around.iter().all(|p| good(&p)) { first } else { fit(at, mean, around.iter().filter(good).copied()) };
     let finite = second.curvatures.iter().all(|k| k.is_finite()) && second.direction.iter().all(|c| c.is_finite());
     finite.then_some(Feature {
         point: at,
