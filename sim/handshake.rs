@@ -12,7 +12,7 @@ use crate::Rng;
 use crate::body::{Body, Kind, Payloads, Progress};
 use crate::command::{Answer, Command, Frame, Mode, State, interlock};
 use crate::options::MachineOptions;
-use crate::seen::{Log, What};
+use crate::seen::{Listening, Log, What};
 use crate::transfer::{Arrived, Origin, Outbox, Slot, slot_of};
 use crate::words::{Image, WordOrder};
 
@@ -69,6 +69,8 @@ pub(crate) struct Handshake {
     owner: u32,
     epoch: u32,
     silent: Duration,
+    /// To the beats of the job that runs.
+    listening: Listening,
     acting_left: Duration,
 }
 
@@ -106,6 +108,7 @@ impl Handshake {
             owner: 0,
             epoch: 0,
             silent: Duration::ZERO,
+            listening: Listening::default(),
             acting_left: Duration::ZERO,
         }
     }
@@ -135,7 +138,13 @@ impl Handshake {
     }
 
     /// The owner's beat has moved.
-    pub(crate) fn hear(&mut self) {
+    pub(crate) fn beat(&mut self) {
+        self.listening.hear(self.now);
+        self.hear();
+    }
+
+    /// The owner has given a sign of life.
+    fn hear(&mut self) {
         self.silent = Duration::ZERO;
     }
 
@@ -261,6 +270,7 @@ impl Handshake {
         self.last_begun = (job, cycle);
         self.begun.insert((job, cycle));
         self.running = true;
+        self.listening = Listening::from(self.now);
         self.note(What::Began { start: frame.sequence, job, cycle });
         self.enter(State::Execute);
         self.body.begin();
@@ -312,7 +322,7 @@ impl Handshake {
             return true;
         }
         (self.done, self.result) = (self.begun_by, result);
-        self.note(What::Ended { start: self.begun_by, result });
+        self.note(What::Ended { start: self.begun_by, result, beats: self.listening.until(self.now) });
         let slot = self.slots[if self.body.kind() == Kind::Cmm { 0 } else { 1 }].as_ref();
         let identity = slot.map_or([0; 32], |slot| slot.payload.identity);
         let origin = Origin { job: self.work.job, cycle: self.work.cycle, done: self.done, identity };

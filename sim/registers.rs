@@ -163,7 +163,7 @@ impl Machine {
         self.beat_block = [count, high, low];
         if self.handshake.is_owned_by(self.options.word_order.to_u32([high, low])) && self.beat != count {
             self.beat = count;
-            self.handshake.hear();
+            self.handshake.beat();
         }
         Ok(())
     }

@@ -65,6 +65,9 @@ pub enum What {
         start: u32,
         /// 1 complete, 2 stopped, 3 aborted, 4 failed.
         result: u16,
+        /// How its client gave signs of life meanwhile.
+        #[serde(flatten)]
+        beats: Beats,
     },
     /// A payload came into force.
     Taken {
@@ -91,6 +94,55 @@ pub enum What {
         /// Its new boot id.
         boot_id: u32,
     },
+}
+
+/// How the owner's beats came while a job ran, from its START to its end.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Beats {
+    /// How many.
+    #[serde(rename = "beats")]
+    pub heard: u32,
+    /// Mean time from one to the next; 0 of fewer than two.
+    #[serde(rename = "mean_beat_s", serialize_with = "seconds")]
+    pub mean: Duration,
+    /// The longest time without one.
+    #[serde(rename = "longest_silence_s", serialize_with = "seconds")]
+    pub longest_silence: Duration,
+}
+
+/// Listens to the owner's beats while a job runs.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Listening {
+    began: Duration,
+    first: Option<Duration>,
+    last: Option<Duration>,
+    heard: u32,
+    longest: Duration,
+}
+
+impl Listening {
+    pub(crate) fn from(began: Duration) -> Self {
+        Self { began, ..Self::default() }
+    }
+
+    /// A beat comes at a time.
+    pub(crate) fn hear(&mut self, now: Duration) {
+        self.longest = self.silence_at(now);
+        self.first = self.first.or(Some(now));
+        self.last = Some(now);
+        self.heard = self.heard.saturating_add(1);
+    }
+
+    /// What came until now.
+    pub(crate) fn until(&self, now: Duration) -> Beats {
+        let between = self.last.zip(self.first).map_or(Duration::ZERO, |(last, first)| last - first);
+        let mean = between.checked_div(self.heard.saturating_sub(1)).unwrap_or_default();
+        Beats { heard: self.heard, mean, longest_silence: self.silence_at(now) }
+    }
+
+    fn silence_at(&self, now: Duration) -> Duration {
+        self.longest.max(now.saturating_sub(self.last.unwrap_or(self.began)))
+    }
 }
 
 /// The newest things that happened; the older half is forgotten when it is full.

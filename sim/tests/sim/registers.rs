@@ -7,7 +7,7 @@ use regrind_sim::body::Kind;
 use regrind_sim::command::{Answer, Command, Frame, Mode, State, interlock};
 use regrind_sim::options::{Layout, MachineOptions};
 use regrind_sim::registers::{Exception, Machine};
-use regrind_sim::seen::What;
+use regrind_sim::seen::{Beats, What};
 use regrind_sim::words::{WordOrder, bytes_of, registers_of, turn_payload};
 
 const MS: Duration = Duration::from_millis(1);
@@ -1011,6 +1011,24 @@ fn the_log_tells_a_job_from_end_to_end() {
     assert!(desk.machine.log().is_sorted_by_key(|seen| seen.at));
     let ended = desk.machine.log().last().unwrap().at;
     assert!((5.0..5.1).contains(&ended.as_secs_f64()), "{ended:?}");
+}
+
+#[test]
+fn a_job_that_ended_tells_how_its_client_beat() {
+    let mut desk = Desk::in_state(State::Execute);
+    desk.wait(S);
+    desk.machine.tick(2100 * MS);
+    // A beat that is repeated is none, and one of somebody else's neither.
+    desk.write_beat(desk.beat, 9);
+    desk.write_beat(1000, 10);
+    desk.wait(3 * S);
+    assert_eq!(desk.machine.state(), State::Complete);
+    let ended = desk.machine.log().iter().find_map(|seen| match seen.what {
+        What::Ended { beats, .. } => Some(beats),
+        _ => None,
+    });
+    // At 0, 0.25, 0.5 and 0.75 s; then eight from 3.1 to 4.85 s; the job takes 5 s.
+    assert_eq!(ended, Some(Beats { heard: 12, mean: 4850 * MS / 11, longest_silence: 2350 * MS }));
 }
 
 #[test]
