@@ -21,6 +21,7 @@ mod orders;
 mod outside;
 mod panics;
 mod prepared;
+mod production;
 #[path = "../common/program.rs"]
 mod program;
 mod replay;
