@@ -23,7 +23,7 @@ use tokio::sync::mpsc;
 
 /// Seconds of the machines in a second.
 const SPEED: f64 = 100.0;
-/// Minutes that production goes on for, unless REGRIND_PRODUCTION_MINUTES says otherwise.
+/// Minutes that production goes on for, with some parts more than the warm-up at least, unless REGRIND_PRODUCTION_MINUTES says otherwise.
 const MINUTES: f64 = 30.0;
 /// Names the folder of the recipe, the cell and the machines' log to the process that makes the parts, and the machines' process.
 const HOME: &str = "REGRIND_PRODUCTION_HOME";
@@ -45,7 +45,7 @@ const LONGEST_SILENCE_S: f64 = 1.5;
 const DRIFT_PERCENT: f64 = 5.0;
 
 #[test]
-#[ignore = "takes half an hour: for .ci/long, or REGRIND_PRODUCTION_MINUTES=3"]
+#[ignore = "takes half an hour: for .ci/long; six minutes with REGRIND_PRODUCTION_MINUTES=0"]
 fn thirty_minutes_of_production_at_a_hundred_times_the_speed() {
     match std::env::var_os(HOME) {
         Some(home) => Production::new(Path::new(&home)).go_on(),
