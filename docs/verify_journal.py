@@ -249,7 +249,7 @@ def walk(path, chain, anchors, under_way):
             if database and any(database.execute("SELECT 1 FROM record WHERE seq < 1 LIMIT 1")):
                 raise Broken(0, "a record stands before the first")
         except sqlite3.DatabaseError as error:
-            raise Broken(chain.records + 1, f"the database cannot be read: {error}")
+            raise Broken(0, f"the database file itself is damaged: {error}")
     return anchored
 
 

@@ -255,7 +255,7 @@ fn act(chance: &mut StdRng) -> Act {
     let machine = chance.random_range(0..2);
     let lasts = if chance.random::<f64>() < 0.3 { up_to(chance, 20.0) } else { up_to(chance, 4.0) };
     let second = Duration::from_secs(1);
-    match chance.random_range(0..16) {
+    match chance.random_range(0..17) {
         0 => Act::Weather { wire: machine, weather: Weather { down: true, ..Weather::FAIR }, lasts },
         1 => Act::Weather { wire: machine, weather: Weather { silent: true, ..Weather::FAIR }, lasts },
         2 | 3 => {
@@ -274,7 +274,7 @@ fn act(chance: &mut StdRng) -> Act {
         12 => Act::Order("hold"),
         13 => Act::HighNumber { machine },
         14 => Act::Suspend { lasts },
-        _ => Act::Order(["hold", "resume", "stop", "abort"][chance.random_range(0..4)]),
+        _ => Act::Order(["abort", "abort", "stop", "resume"][chance.random_range(0..4)]),
     }
 }
 

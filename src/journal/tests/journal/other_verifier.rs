@@ -152,6 +152,11 @@ fn both_verifiers_find_files_anchors_and_forgeries() {
     broken(&|run| tamper(run, "UPDATE record SET cycle = 5000000000 WHERE seq = 3"));
     broken(&|run| tamper(run, "UPDATE record SET mono_ns = -1 WHERE seq = 3"));
     broken(&|run| tamper(run, "UPDATE record SET seq = -1 WHERE seq = 11"));
+    // No database any more: there is no record at which that could be.
+    broken(&|run| {
+        let damage = "PRAGMA writable_schema = ON; UPDATE sqlite_schema SET sql = 'no table at all'; PRAGMA schema_version = 1000";
+        tamper(run, damage);
+    });
     // An anchor whose signature was taken away, altered, or is another's.
     for change in [
         |anchor: &mut Value| *anchor = json!({ "head": anchor["head"], "records": anchor["records"] }),
