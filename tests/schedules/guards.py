@@ -79,6 +79,12 @@ def tried(root, tree, target, change, most):
     text = (tree / file).read_text()
     if guard not in text:
         sys.exit(f"{file} has no longer {guard!r}: see where that guard is now")
+    # What the guard before has changed is as it was, and older than what was built of it.
+    before = target / "changed"
+    if before.is_file():
+        (tree / before.read_text()).touch()
+    target.mkdir(parents=True, exist_ok=True)
+    before.write_text(file)
     # The first place, which is the one that is told of.
     (tree / file).write_text(text.replace(guard, without, 1))
     build = ["cargo", "test", "--workspace", "--test", "schedules", "--no-run", "--target-dir", target]
