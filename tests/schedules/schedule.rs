@@ -211,7 +211,7 @@ impl Schedule {
     fn happen(&self) -> (Evidence, tempfile::TempDir) {
         // In memory, where there is room for what a run asks for: nothing here is to outlast the process.
         let memory = Path::new("/dev/shm");
-        let has_room = free_bytes(memory).is_ok_and(|bytes| bytes > 1 << 30);
+        let has_room = free_bytes(memory).is_ok_and(|bytes| bytes > 48 << 20);
         let home = has_room.then(|| tempfile::tempdir_in(memory).ok()).flatten();
         let home = home.unwrap_or_else(|| tempfile::tempdir().unwrap());
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().start_paused(true).build().unwrap();

@@ -4,10 +4,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use regrind_disk::Drawn;
 use regrind_journal::{AuditKey, Entry, Journal, JournalError, Kind, Reader, verify};
 use serde_json::{Value, json};
 
-use crate::tampering::{Drawn, Tampering, copied, long_and_whole, place, tries};
+use crate::tampering::{Tampering, copied, long_and_whole, place, tries};
 use crate::written::{closed, header, home, tamper};
 
 fn script(name: &str) -> PathBuf {

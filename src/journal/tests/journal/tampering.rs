@@ -3,30 +3,12 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use regrind_disk::Drawn;
 use regrind_journal::{JournalError, Verified, verify};
 use rusqlite::Connection;
 use rusqlite::types::Value;
 
 use crate::written::{Home, closed, long, tamper};
-
-/// Numbers that are the same in every run.
-pub struct Drawn(u64);
-
-impl Drawn {
-    pub fn new(seed: u64) -> Self {
-        Self(seed)
-    }
-
-    /// A number below another one.
-    pub fn below(&mut self, limit: u64) -> u64 {
-        // Splitmix.
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        (z ^ (z >> 31)) % limit
-    }
-}
 
 /// What somebody does to a journal, and the first record that cannot be believed then.
 pub struct Tampering {
