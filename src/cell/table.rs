@@ -1,7 +1,8 @@
 //! The transition table, found by trying: every event in every state that can be reached. So it is what the machine does, and
 //! not what somebody wrote down once.
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
+use std::hash::Hash;
 use std::time::Duration;
 
 use super::command::Command;
@@ -46,30 +47,35 @@ impl Answer {
 
 /// Returns the table, sorted by state and event.
 pub fn table() -> Vec<Row> {
-    let mut rows: BTreeMap<(State, String), BTreeSet<Answer>> = BTreeMap::new();
+    let mut answers: HashMap<State, Vec<BTreeSet<Answer>>> = HashMap::new();
     let mut open: VecDeque<Cell> = [Disposal::Hold, Disposal::Stop].into_iter().map(|d| Cell::new(plan(d))).collect();
-    let (mut seen, mut named) = (BTreeSet::new(), BTreeMap::new());
+    let (mut seen, mut sampled) = (HashSet::new(), HashMap::new());
     while let Some(cell) = open.pop_front() {
-        let events: &Vec<(String, Event)> = named
-            .entry(cell.cycle())
-            .or_insert_with(|| samples(cell.cycle()).into_iter().map(|event| (name_of(&event), event)).collect());
-        for (name, event) in events {
+        let events: &Vec<Event> = sampled.entry(cell.cycle()).or_insert_with(|| samples(cell.cycle()));
+        let answers = answers.entry(cell.state()).or_insert_with(|| vec![BTreeSet::new(); events.len()]);
+        // Late enough for whatever is due.
+        let now = cell.next_deadline().unwrap_or(Duration::ZERO);
+        for (event, answers) in events.iter().zip(answers) {
             let mut next = cell.clone();
-            // Late enough for whatever is due.
-            let now = cell.next_deadline().unwrap_or(Duration::ZERO);
             let commands = next.handle(now, event.clone()).iter().map(Command::name).collect();
-            let answer = Answer { next: next.state(), commands };
-            rows.entry((cell.state(), name.clone())).or_default().insert(answer);
+            answers.insert(Answer { next: next.state(), commands });
             if seen.insert(key(&next)) {
                 open.push_back(next);
             }
         }
     }
-    rows.into_iter().map(|((state, event), answers)| Row { state, event, answers }).collect()
+    let names: Vec<String> = samples(0).iter().map(name_of).collect();
+    let mut rows: BTreeMap<(State, &str), BTreeSet<Answer>> = BTreeMap::new();
+    for (state, answers) in answers {
+        for (name, answers) in names.iter().zip(answers) {
+            rows.entry((state, name)).or_default().extend(answers);
+        }
+    }
+    rows.into_iter().map(|((state, event), answers)| Row { state, event: event.to_owned(), answers }).collect()
 }
 
 /// What decides how a cell answers, without times and counts, and no finer than the table needs.
-fn key(cell: &Cell) -> impl Ord + use<> {
+fn key(cell: &Cell) -> impl Eq + Hash + use<> {
     let known = cell.known.map(|known| (known.ready, known.met && known.stands));
     let clear = cell.known.map(|known| (known.clear, known.said_clear, known.asked_clear));
     let memory = (cell.worse.min(1), cell.repeated, cell.previous.is_some(), cell.passes >= cell.plan.max_cycles);
