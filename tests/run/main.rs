@@ -1,5 +1,6 @@
 //! Whole runs: the program and its drive against simulated machines on real wires, on sunny days and others.
 
+mod apart;
 mod audit;
 mod bad_cells;
 mod careful;
@@ -33,6 +34,5 @@ mod through;
 #[path = "../common/tries.rs"]
 mod tries;
 mod truth;
-mod two_processes;
 mod watching;
 mod worlds;
