@@ -105,6 +105,8 @@ pub struct MachineOptions {
     pub version: u16,
     /// The job and cycle it began before it was switched off.
     pub last_begun: Option<(u32, u16)>,
+    /// It takes its client's word: begins a job that it has begun before, and does not hold what is in force against what is told to be.
+    pub trusting: bool,
 }
 
 impl Default for MachineOptions {
@@ -119,6 +121,7 @@ impl Default for MachineOptions {
             payload_limit_bytes: 64 << 20,
             version: 2,
             last_begun: None,
+            trusting: false,
         }
     }
 }

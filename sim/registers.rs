@@ -221,7 +221,11 @@ impl Machine {
             Block::Beat => self.beat_block.to_vec(),
             Block::Command => self.command.to_vec(),
             Block::Status => self.status_image(),
-            Block::InForce => slots_image(order, &self.handshake.slots),
+            Block::InForce => {
+                let image = slots_image(order, &self.handshake.slots);
+                self.handshake.looked_at();
+                image
+            }
             Block::InboxHeader => self.inbox_header.to_vec(),
             Block::InboxPage => self.inbox_page.to_vec(),
             Block::InboxState => self.inbox.image(order),
@@ -364,6 +368,23 @@ impl Machine {
     pub fn open_interlocks(&mut self, bits: u16) {
         self.handshake.open(bits);
         self.publish();
+    }
+
+    /// Presses the button at the machine's panel that has a held job go on.
+    pub fn press_start(&mut self) {
+        self.handshake.press_start();
+        self.publish();
+    }
+
+    /// Lets a machine that is idle move without an order until it is held; `false` brings it back to where it stood.
+    pub fn stray(&mut self, strays: bool) {
+        self.handshake.stray(strays);
+        self.publish();
+    }
+
+    /// Changes what comes into force next from under the client, once it has been looked at.
+    pub fn spoil(&mut self) {
+        self.handshake.spoil();
     }
 
     /// Stops the machine with a fault of docs/modbus.md.

@@ -89,6 +89,8 @@ pub enum What {
         /// Its number in docs/modbus.md.
         fault: u16,
     },
+    /// It began to move without an order.
+    Strayed,
     /// The machine's application started anew.
     Rebooted {
         /// Its new boot id.

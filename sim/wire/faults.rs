@@ -24,6 +24,8 @@ pub enum Fault {
     DuplicateReply,
     /// Only so many bytes of the answer come.
     Truncate(usize),
+    /// The answer to a read has a register less than was asked for, in a frame without a flaw.
+    Fewer,
     /// The answer is followed by more bytes.
     Extra(Vec<u8>),
     /// Other bytes come before the answer.

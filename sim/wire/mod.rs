@@ -209,6 +209,10 @@ fn deliver(framing: Framing, unit: u8, mut reply: Vec<u8>, met: &[Fault]) -> Del
             Fault::WrongUnit => unit ^= 0x40,
             Fault::WrongFunction => reply[0] ^= 0x01,
             Fault::FlipData => reply.last_mut().into_iter().for_each(|byte| *byte ^= 0x10),
+            Fault::Fewer if reply[0] == 3 && reply[1] >= 2 => {
+                reply[1] -= 2;
+                reply.truncate(reply.len() - 2);
+            }
             Fault::WordSwap if reply[0] == 3 => reply[2..].chunks_exact_mut(4).for_each(|pair| pair.rotate_left(2)),
             _ => {}
         }

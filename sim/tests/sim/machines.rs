@@ -23,7 +23,11 @@ struct Desk {
 
 impl Desk {
     fn new(body: impl Body + 'static, order: WordOrder, payloads: Vec<(u16, Vec<u8>)>) -> Self {
-        let options = MachineOptions { word_order: order, speed: 200.0, ..MachineOptions::default() };
+        Self::with(body, MachineOptions { word_order: order, ..MachineOptions::default() }, payloads)
+    }
+
+    fn with(body: impl Body + 'static, options: MachineOptions, payloads: Vec<(u16, Vec<u8>)>) -> Self {
+        let (order, options) = (options.word_order, MachineOptions { speed: 200.0, ..options });
         let machine = Machine::new(Box::new(body), 5, options);
         let identities: Vec<u8> = payloads.iter().flat_map(|(kind, _)| [*kind as u8; 32]).collect();
         let mut desk = Self { machine, order, digest: crc32fast::hash(&identities), sequence: 0, beat: 0 };
@@ -162,4 +166,71 @@ fn a_part_that_is_held_and_stopped_is_given_free() {
     grinder.command(Command::Acknowledge, Answer::Accepted);
     grinder.command(Command::Prepare, Answer::Accepted);
     grinder.command(Command::Start, Answer::Begun);
+}
+
+/// A grinder with its payloads in force.
+fn grinder(options: MachineOptions) -> Desk {
+    let world = World::new(small_perfect()).unwrap();
+    let map = (2, zero_map(HALF_MM).encode());
+    Desk::with(world.grinder(), options, vec![map, (3, pass(HALF_MM, world.level_mm() - 0.01).encode())])
+}
+
+#[test]
+fn a_machine_moves_without_an_order_until_it_is_held_or_brought_back() {
+    let mut grinder = grinder(MachineOptions::default());
+    for held in [true, false] {
+        grinder.machine.stray(true);
+        grinder.machine.tick(Duration::from_millis(200));
+        assert_eq!(grinder.machine.state(), State::Execute);
+        assert!(grinder.u32(84) > 0, "its progress goes on");
+        if held {
+            grinder.command(Command::Hold, Answer::Accepted);
+            grinder.wait_for(State::Held);
+        }
+        grinder.machine.stray(false);
+        assert_eq!((grinder.machine.state(), grinder.machine.began()), (State::Idle, vec![]));
+    }
+    // What is at a job is left at it.
+    grinder.command(Command::Prepare, Answer::Accepted);
+    grinder.command(Command::Start, Answer::Accepted);
+    grinder.machine.stray(true);
+    grinder.machine.stray(false);
+    assert_eq!(grinder.machine.state(), State::Execute);
+}
+
+#[test]
+fn a_held_machine_goes_on_at_its_panel() {
+    let mut grinder = grinder(MachineOptions::default());
+    grinder.machine.press_start();
+    assert_eq!(grinder.machine.state(), State::Idle, "nothing is held");
+    grinder.command(Command::Prepare, Answer::Accepted);
+    grinder.command(Command::Start, Answer::Accepted);
+    grinder.command(Command::Hold, Answer::Accepted);
+    grinder.wait_for(State::Held);
+    grinder.machine.press_start();
+    assert_eq!(grinder.machine.state(), State::Execute);
+    grinder.wait_for(State::Complete);
+}
+
+#[test]
+fn only_a_trusting_machine_begins_a_job_again_or_with_what_was_not_sent() {
+    for trusting in [false, true] {
+        let mut grinder = grinder(MachineOptions { trusting, ..MachineOptions::default() });
+        grinder.command(Command::Prepare, Answer::Accepted);
+        grinder.command(Command::Start, Answer::Accepted);
+        grinder.wait_for(State::Complete);
+        grinder.command(Command::Acknowledge, Answer::Accepted);
+        grinder.command(Command::Prepare, Answer::Accepted);
+        grinder.command(Command::Start, if trusting { Answer::Accepted } else { Answer::Begun });
+        assert_eq!(grinder.machine.began().len(), if trusting { 2 } else { 1 });
+    }
+    for trusting in [false, true] {
+        let mut grinder = grinder(MachineOptions { trusting, ..MachineOptions::default() });
+        grinder.machine.spoil();
+        grinder.send(3, pass(HALF_MM, 0.0).encode());
+        let in_force = |grinder: &mut Desk| grinder.machine.read(176, 16).unwrap();
+        assert_eq!(in_force(&mut grinder), [0x0303; 16], "as it was sent, when it is looked at first");
+        assert_eq!(in_force(&mut grinder)[0], 0x0203);
+        grinder.command(Command::Prepare, if trusting { Answer::Accepted } else { Answer::Different });
+    }
 }

@@ -284,6 +284,7 @@ async fn each_fault_of_the_wire_breaks_what_it_says() {
     assert_eq!(broken(Fault::DropReply).await, []);
     assert_eq!(broken(Fault::DuplicateReply).await, good(1).repeat(2));
     assert_eq!(broken(Fault::Truncate(4)).await, good(1)[..4]);
+    assert_eq!(broken(Fault::Fewer).await, [0, 1, 0, 0, 0, 3, 1, 3, 0]);
     assert_eq!(broken(Fault::Extra(vec![7, 7])).await, [good(1), vec![7, 7]].concat());
     assert_eq!(broken(Fault::Noise(vec![7, 7])).await, [vec![7, 7], good(1)].concat());
     assert_eq!(broken(Fault::WrongTransaction).await, [&[0x5A, 0x5B], &GOOD[..]].concat());
@@ -516,6 +517,7 @@ async fn a_serial_line_breaks_as_it_is_told() {
         (Fault::Split(Duration::from_micros(10)), good.clone()),
         (Fault::Exception(6), rtu_frame(1, &[0x83, 6])),
         (Fault::Noise(vec![0; 3]), [&[0; 3][..], &good].concat()),
+        (Fault::Fewer, rtu_frame(1, &[3, 0])),
         (Fault::Truncate(3), good[..3].to_vec()),
     ];
     for (fault, mut expected) in cases {
