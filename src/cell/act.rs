@@ -756,10 +756,12 @@ impl Cell {
             Stopping => {}
             Holding(_) if at_job => self.go(Held(run)),
             Suspending(_) if at_job => self.suspended(run),
-            Execute(_) | Unholding(_) | Unsuspending(_) if at_job => {
+            Execute(_) if at_job => {
                 self.raise(AlarmId::MachineHeldItself, &device.to_string());
                 self.go(Held(run));
             }
+            // It was held before it is told to go on, and is seen so once more where its link has just come back.
+            Unholding(_) | Unsuspending(_) if at_job => {}
             Held(_) | Suspended(_) if at_job => {}
             // It had no job, moved, and was told to hold.
             _ if !at_job && self.raised.contains(&AlarmId::MovesUnasked) => {}
