@@ -5,9 +5,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::time::Duration;
 
-use regrind::cell::StateName;
+use regrind::cell::{Phase, StateName};
 use regrind::journal::{Reader, verify};
-use regrind_sim::command::State;
+use regrind_sim::command::{Command, State};
 use regrind_sim::seen::What;
 use serde_json::Value;
 use tokio::time::Instant;
@@ -16,13 +16,18 @@ use crate::ledger::Recorded;
 use crate::machines::Moment;
 use crate::person::Given;
 use crate::schedule::Tally;
+use crate::wire::{Sent, Traffic};
 
 /// A cell that shows that it stands may be wrong for so long: a machine that hears nothing holds by itself after three seconds.
 const STANDS_WITHIN: Duration = Duration::from_millis(3_600);
 /// An abort is at a machine that moves within this, whatever the disk does.
 const ABORTS_WITHIN: Duration = Duration::from_millis(100);
-/// A command is on a wire that carries for less than this.
-const ON_ITS_WAY: Duration = Duration::from_millis(20);
+/// What was in the way of questions to the machines is out of it after this.
+const RECOVERS_WITHIN: Duration = Duration::from_secs(12);
+/// A machine that moves without an order is seen and holds within this.
+const FOUND_WITHIN: Duration = Duration::from_millis(800);
+/// A machine that is found moving is told to hold within this, if it can be reached.
+const HOLDS_WITHIN: Duration = Duration::from_secs(4);
 /// What a cell shows that stands.
 const STANDS: [StateName; 4] = [StateName::Held, StateName::Stopped, StateName::Aborted, StateName::Complete];
 const NAMES: [&str; 2] = ["cmm", "grinder"];
@@ -32,6 +37,7 @@ const NAMES: [&str; 2] = ["cmm", "grinder"];
 pub struct Shown {
     pub at: Instant,
     pub state: Option<StateName>,
+    pub phase: Option<Phase>,
 }
 
 /// What is left of a schedule.
@@ -44,8 +50,13 @@ pub struct Evidence {
     pub written: Vec<Recorded>,
     pub shown: Vec<Shown>,
     pub tally: Tally,
-    /// Whether the wires carried everything at once.
-    pub is_steady: bool,
+    pub wires: Traffic,
+    /// From when to when something was in the way of questions to the machines; none where that may have been so at any time.
+    pub hindered: Option<Vec<(Instant, Instant)>>,
+    /// Whether a machine's application may have stood still.
+    pub freezes: bool,
+    /// Whether it came to the end it should come to where nothing was in its way but deaths of the program.
+    pub ended_well: bool,
     pub effects: u64,
 }
 
@@ -55,7 +66,13 @@ impl Evidence {
         let log = self.log.iter().map(|m| (m.at, format!("{} {:?}", NAMES[m.machine], m.what)));
         let written = self.written.iter().map(|w| (w.at, format!("record {}", w.payload)));
         let given = self.given.iter().map(|g| (g.answered, format!("{} {} {}", g.what, g.reason, g.accepted)));
-        let mut lines: Vec<(Instant, String)> = log.chain(written).chain(given).collect();
+        let shown = self.shown.iter().map(|s| (s.at, format!("shown {:?} {:?}", s.state, s.phase)));
+        let sent = self
+            .wires
+            .sent
+            .iter()
+            .map(|s| (s.at, format!("{} is sent {:?} {}", NAMES[s.machine], s.command, s.frame.sequence)));
+        let mut lines: Vec<(Instant, String)> = log.chain(written).chain(given).chain(shown).chain(sent).collect();
         lines.sort_by_key(|(at, _)| *at);
         let home = self.folder.display().to_string();
         let line = |(at, what): (Instant, String)| format!("{:10.4} {}", self.seconds(at), what.replace(&home, "RUN"));
@@ -64,6 +81,29 @@ impl Evidence {
 
     fn seconds(&self, at: Instant) -> f64 {
         (at - self.began).as_secs_f64()
+    }
+
+    /// What the cell showed last before a moment.
+    fn shown_before(&self, at: Instant) -> Option<&Shown> {
+        let next = self.shown.partition_point(|shown| shown.at < at);
+        self.shown[..next].last()
+    }
+
+    /// What the cell shows from a moment on.
+    fn shown_at(&self, at: Instant) -> Option<&Shown> {
+        let next = self.shown.partition_point(|shown| shown.at <= at);
+        self.shown[..next].last()
+    }
+
+    /// Records of an event of a machine from one moment to another.
+    fn told(&self, event: &str, machine: usize, from: Instant, to: Instant) -> impl Iterator<Item = &Recorded> {
+        let of_it = move |w: &&Recorded| w.payload["event"] == event && w.payload["device"] == NAMES[machine];
+        self.written.iter().filter(move |w| from <= w.at && w.at <= to).filter(of_it)
+    }
+
+    /// The START that is on record last before a record, for the same machine.
+    fn intent_before(&self, number: usize, machine: usize) -> Option<usize> {
+        self.written[..number].iter().rposition(|w| is_intent(w, machine))
     }
 }
 
@@ -76,11 +116,20 @@ pub fn check(evidence: &Evidence) -> Result<(), String> {
     began_once(evidence)?;
     intended_before(evidence)?;
     map_of_record(evidence, &records)?;
+    begun_is_not_intended_again(evidence)?;
+    said_of_starts_is_so(evidence)?;
     never_both(evidence)?;
     still_where_shown(evidence)?;
-    begins_nothing_where_it_stands(evidence)?;
+    held_when_it_holds(evidence)?;
+    moved_by_nothing_that_stands(evidence)?;
+    told_to_hold(evidence)?;
+    strays_are_told_to_hold(evidence)?;
     aborted_at_once(evidence)?;
     answered_is_on_record(evidence, &records)?;
+    asked_as_it_should_be(evidence)?;
+    if !evidence.ended_well {
+        return Err("nothing went wrong but that the program died, and the run does not end as it should".to_owned());
+    }
     // Once nothing goes wrong any more, the run comes to its end.
     let last = evidence.shown.iter().rev().find_map(|shown| shown.state);
     if is_closed { Ok(()) } else { Err(format!("the run comes to no end; last it shows {last:?}")) }
@@ -187,10 +236,23 @@ fn states(evidence: &Evidence) -> Vec<(Instant, [State; 2])> {
     states
 }
 
-/// The two machines never move at the same time.
+/// The two machines never move at the same time by an order of the program.
 fn never_both(evidence: &Evidence) -> Result<(), String> {
-    let both = states(evidence).into_iter().find(|(_, states)| *states == [State::Execute; 2]);
-    both.map_or(Ok(()), |(at, _)| Err(format!("both machines move at {:.3} s", evidence.seconds(at))))
+    let (mut now, mut strays) = ([State::Idle; 2], [false; 2]);
+    for moment in &evidence.log {
+        match moment.what {
+            What::Strayed => strays[moment.machine] = true,
+            What::Changed { to, .. } => {
+                now[moment.machine] = to;
+                strays[moment.machine] &= to == State::Execute;
+            }
+            _ => continue,
+        }
+        if now == [State::Execute; 2] && strays == [false; 2] {
+            return Err(format!("both machines move at {:.3} s", evidence.seconds(moment.at)));
+        }
+    }
+    Ok(())
 }
 
 /// Where the cell shows that it stands, nothing moves.
@@ -218,34 +280,185 @@ fn still_where_shown(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// Nothing begins while the cell shows that it stands; where the wire carries, and nobody died over it.
-fn begins_nothing_where_it_stands(evidence: &Evidence) -> Result<(), String> {
-    let began = evidence.log.iter().filter(|moment| matches!(moment.what, What::Began { .. }));
-    for moment in began.filter(|_| evidence.is_steady && evidence.tally.has_one_life()) {
-        let Some(last) = evidence.shown.iter().rev().find(|shown| shown.at + ON_ITS_WAY < moment.at) else { continue };
-        if last.state.is_some_and(|state| STANDS.contains(&state)) {
-            let (machine, at) = (NAMES[moment.machine], evidence.seconds(moment.at));
-            return Err(format!("the {machine} begins at {at:.3} s, and the cell shows {:?}", last.state));
+/// A cell that holds shows Held only once the machine does that it holds.
+fn held_when_it_holds(evidence: &Evidence) -> Result<(), String> {
+    let states = states(evidence);
+    for pair in evidence.shown.windows(2) {
+        let [before, now] = pair else { continue };
+        if (before.state, now.state) != (Some(StateName::Holding), Some(StateName::Held)) {
+            continue;
+        }
+        let Some(device) = before.phase.and_then(Phase::moving) else { continue };
+        let at = states.partition_point(|(at, _)| *at <= now.at);
+        if states[at - 1].1[device as usize] == State::Execute {
+            return Err(format!("the {device} moves as it is shown to be held at {:.3} s", evidence.seconds(now.at)));
         }
     }
     Ok(())
 }
 
-/// A machine that moves is aborted at once, whatever the disk does; where the wire carries it.
-fn aborted_at_once(evidence: &Evidence) -> Result<(), String> {
-    let states = states(evidence);
-    let aborts = evidence.given.iter().filter(|given| given.what == "abort" && given.accepted);
-    for abort in aborts.filter(|_| evidence.is_steady) {
-        let by = abort.at + ABORTS_WITHIN;
-        let then = states.iter().take_while(|(at, _)| *at <= by).last().map(|(_, states)| *states);
-        let Some(then) = then else { continue };
-        for (k, name) in NAMES.iter().enumerate().filter(|(k, _)| abort.moved[*k]) {
-            if then[k] == State::Execute {
-                return Err(format!("the {name} goes on 0.1 s after the abort at {:.3} s", evidence.seconds(abort.at)));
+/// Nothing that moves a machine leaves the program while the cell shows that it stands.
+fn moved_by_nothing_that_stands(evidence: &Evidence) -> Result<(), String> {
+    let mut numbers = BTreeSet::new();
+    let moves = evidence.wires.sent.iter().filter(|sent| matches!(sent.command, Command::Start | Command::Resume));
+    for sent in moves {
+        // Written again it is the same command, and as it was decided.
+        let is_first = numbers.insert((sent.machine, sent.frame.owner, sent.frame.epoch, sent.frame.sequence));
+        let Some(last) = evidence.shown_before(sent.at).filter(|_| is_first) else { continue };
+        if last.state.is_some_and(|state| state == StateName::Suspended || STANDS.contains(&state)) {
+            let (machine, at) = (NAMES[sent.machine], evidence.seconds(sent.at));
+            return Err(format!(
+                "{:?} {} is sent to the {machine} at {at:.3} s, and the cell shows {:?}",
+                sent.command, sent.frame.sequence, last.state
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// A job that was out of sight and is found to run is told to hold, where the cell holds.
+fn told_to_hold(evidence: &Evidence) -> Result<(), String> {
+    for (k, name) in NAMES.iter().enumerate() {
+        let found = evidence.told("reconciled", k, evidence.began, evidence.began + Duration::from_secs(86_400));
+        for found in found.filter(|found| found.payload["outcome"] == "running") {
+            let by = found.at + HOLDS_WITHIN;
+            let holds = |shown: &Shown| shown.state == Some(StateName::Holding);
+            let from = evidence.shown.partition_point(|shown| shown.at <= found.at);
+            let still = evidence.shown_at(found.at).is_some_and(holds)
+                && evidence.shown[from..].iter().take_while(|shown| shown.at <= by).all(holds);
+            let told = evidence.wires.sent.iter().any(|sent| {
+                let makes_safe = matches!(sent.command, Command::Hold | Command::Stop | Command::Abort);
+                sent.machine == k && makes_safe && found.at <= sent.at && sent.at <= by
+            });
+            if still && !told && evidence.told("link_lost", k, found.at, by).next().is_none() {
+                let at = evidence.seconds(found.at);
+                return Err(format!("the {name} is found to run at {at:.3} s, and is not told to hold"));
             }
         }
     }
     Ok(())
+}
+
+/// A machine that begins to move without an order while the cell stands is told to hold, where it can be reached and seen.
+fn strays_are_told_to_hold(evidence: &Evidence) -> Result<(), String> {
+    let Some(hindered) = evidence.hindered.as_ref().filter(|_| !evidence.freezes) else { return Ok(()) };
+    for (number, moment) in evidence.log.iter().enumerate().filter(|(_, moment)| matches!(moment.what, What::Strayed)) {
+        let (machine, by) = (moment.machine, moment.at + FOUND_WITHIN);
+        let is_hindered = hindered.iter().any(|(from, to)| *from <= by && moment.at <= *to + RECOVERS_WITHIN);
+        let goes_on = !evidence.log[number..].iter().any(|next| {
+            next.machine == machine && next.at <= by && matches!(&next.what, What::Changed { from: State::Execute, .. })
+        });
+        let from = evidence.shown.partition_point(|shown| shown.at <= moment.at).saturating_sub(1);
+        let stands = |shown: &Shown| shown.state == Some(StateName::Held);
+        let stood = evidence.shown[from..].iter().take_while(|shown| shown.at <= by).all(stands);
+        if !is_hindered && goes_on && stood {
+            let (name, at) = (NAMES[machine], evidence.seconds(moment.at));
+            return Err(format!("the {name} moves without an order from {at:.3} s on, and is not told to hold"));
+        }
+    }
+    Ok(())
+}
+
+/// An abort is on its way at once to a machine that moves, whatever the disk does; where nothing is in the way of it.
+fn aborted_at_once(evidence: &Evidence) -> Result<(), String> {
+    let Some(hindered) = &evidence.hindered else { return Ok(()) };
+    for abort in evidence.given.iter().filter(|given| given.what == "abort" && given.done) {
+        let by = abort.at + ABORTS_WITHIN;
+        let is_hindered = hindered.iter().any(|(from, to)| *from <= by && abort.at <= *to + RECOVERS_WITHIN);
+        // A program that was started again has to meet the machines first.
+        let lives = evidence.shown.iter().rposition(|shown| shown.at <= abort.at && shown.state.is_none());
+        let has_met = lives.is_none_or(|end| evidence.shown[end].at + RECOVERS_WITHIN < abort.at);
+        for (k, name) in NAMES.iter().enumerate().filter(|(k, _)| abort.moved[*k] && !is_hindered && has_met) {
+            let began = evidence.log.iter().rfind(|moment| {
+                moment.machine == k
+                    && moment.at <= abort.at
+                    && matches!(moment.what, What::Began { .. } | What::Strayed)
+            });
+            let since = began.map_or(evidence.began, |moment| moment.at);
+            let aborts = |sent: &&Sent| sent.machine == k && sent.command == Command::Abort;
+            if !evidence.wires.sent.iter().filter(aborts).any(|sent| since <= sent.at && sent.at <= by) {
+                return Err(format!(
+                    "no abort leaves for the {name} within 0.1 s of {:.3} s",
+                    evidence.seconds(abort.at)
+                ));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// A pass that a machine has begun is never intended again: that it would refuse it is not relied on.
+fn begun_is_not_intended_again(evidence: &Evidence) -> Result<(), String> {
+    for began in evidence.log.iter().filter(|moment| moment.machine == 1) {
+        let What::Began { start, job, cycle } = began.what else { continue };
+        let again = evidence.written.iter().find(|w| {
+            w.at > began.at
+                && is_intent(w, 1)
+                && w.payload["cycle"] == cycle
+                && w.payload["intent"]["job"] == job
+                && w.payload["intent"]["start_sequence"] != start
+        });
+        if let Some(again) = again {
+            let [begun, at] = [began.at, again.at].map(|at| evidence.seconds(at));
+            return Err(format!("pass {cycle} has begun at {begun:.3} s, and is to be started again at {at:.3} s"));
+        }
+    }
+    Ok(())
+}
+
+/// A START that the record says was not taken has moved nothing, and never will.
+fn said_of_starts_is_so(evidence: &Evidence) -> Result<(), String> {
+    for (number, said) in evidence.written.iter().enumerate() {
+        let event = &said.payload;
+        let refused = event["event"] == "refused" && event["what"] == "start";
+        let not_started = event["event"] == "reconciled" && event["outcome"] == "not_started";
+        if !refused && !not_started {
+            continue;
+        }
+        let machine = usize::from(event["device"] == NAMES[1]);
+        let Some(intent) = evidence.intent_before(number, machine) else { continue };
+        let (intended, rest) = (&evidence.written[intent], &evidence.written[intent + 1..]);
+        if not_started && event["cycle"] != intended.payload["cycle"] {
+            // Of this cycle no START was ever on record.
+            continue;
+        }
+        let meant = &intended.payload["intent"];
+        let moved = evidence.log.iter().filter(|moment| moment.machine == machine && moment.at >= intended.at);
+        for moment in moved {
+            let What::Began { start, job, cycle } = moment.what else { continue };
+            let is_it = meant["start_sequence"] == start && meant["job"] == job && intended.payload["cycle"] == cycle;
+            // A machine that was started anew counts anew: a later START may bear the same number.
+            let is_later = || {
+                rest.iter().any(|w| {
+                    is_intent(w, machine) && w.at <= moment.at && w.payload["intent"]["start_sequence"] == start
+                })
+            };
+            if is_it && !is_later() {
+                let [at, told] = [moment.at, said.at].map(|at| evidence.seconds(at));
+                return Err(format!(
+                    "the {} begins by START {start} at {at:.3} s, of which the record says at {told:.3} s that it was not taken",
+                    NAMES[machine]
+                ));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Whether a record is the intent of a START of a machine.
+fn is_intent(recorded: &Recorded, machine: usize) -> bool {
+    recorded.payload["command"] == "start_machine" && recorded.payload["device"] == NAMES[machine]
+}
+
+/// One question at a time, on a connection on which nothing waits and the machine has been met; and the program never fails.
+fn asked_as_it_should_be(evidence: &Evidence) -> Result<(), String> {
+    if let Some((at, what)) = evidence.wires.wrong.first() {
+        return Err(format!("at {:.3} s {what}", evidence.seconds(*at)));
+    }
+    match evidence.written.iter().find(|w| w.payload["event"] == "station_failed") {
+        Some(failed) => Err(format!("at {:.3} s the program fails: {}", evidence.seconds(failed.at), failed.payload)),
+        None => Ok(()),
+    }
 }
 
 /// An order that was accepted is on record, and was so before it was answered.

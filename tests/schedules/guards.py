@@ -4,7 +4,8 @@
     tests/schedules/guards.py [--most N] [NAME ...]
 
 Each guard is a place in the sources and what stands there without it. The change is made in a copy of the tree, below target/guards,
-which is built anew for each: about a minute apiece. What `tests/schedules` does not see within N schedules is told as not seen.
+which is built anew for each: about a minute apiece. Where another guard stands behind it in a whole run, a test of its room is named
+that sees it. What neither sees within N schedules is told as not seen.
 """
 import argparse, re, shutil, subprocess, sys
 from pathlib import Path
@@ -25,9 +26,12 @@ GUARDS = {
         "src/drive/station.rs", "self.tell(Event::StartUnknown { device: B::DEVICE, cycle, why: error.to_string() }).await;",
         "self.seen.running = false; self.failed(Asked::Start, error).await;"),
     "a START that was not seen is fenced off": (
-        "src/device/modbus/mod.rs", "        self.claim().await?;\n        let second", "        let second"),
-    "a machine that was lost is sent nothing that moves": (
+        "src/device/modbus/mod.rs", "        self.claim().await?;\n        let second", "        let second",
+        "device", "a_start_that_arrives_after_it_was_found_not_started"),
+    "a machine that was lost is sent no START": (
         "src/drive/station.rs", "        if self.seen.lost {\n            return self.not_sent(Asked::Start).await;\n        }\n", ""),
+    "a machine that was lost is sent no RESUME": (
+        "src/drive/station.rs", "        if self.seen.lost {\n            return self.not_sent(Asked::Resume).await;\n        }\n", ""),
     "a station looks again after the loop has hung": (
         "src/drive/station.rs", "if self.seen.connected => if pulse.is_felt() {", "if self.seen.connected && pulse.is_felt() => if true {"),
     "holding goes on when the link is lost": (
@@ -35,7 +39,8 @@ GUARDS = {
     "a job found running while holding is told to hold": (
         "src/cell/act.rs", "                self.go(self.same(run));\n                self.push(Command::HoldMachine { device });\n", "                self.go(self.same(run));\n"),
     "a machine that moves while the cell stands is told to hold": (
-        "src/cell/act.rs", "        let told = self.raised.contains(&AlarmId::MovesUnasked);\n", "        return;\n        #[allow(unreachable_code)]\n        let told = false;\n"),
+        "src/cell/act.rs", "        let told = self.raised.contains(&AlarmId::MovesUnasked);\n", "        return;\n        #[allow(unreachable_code)]\n        let told = false;\n",
+        "cell", "a_machine_that_moves_while_the_cell_is_held_is_told_to_hold"),
     "a program that was started again asks what became of the job": (
         "src/cell/act.rs", "        self.go(Held(out_of_sight(phase)));\n        for device in Device::BOTH {", "        self.go(Held(restart_of(phase)));\n        for device in Device::BOTH {"),
     "an answer of an older connection is turned away": (
@@ -73,7 +78,7 @@ def main():
 
 def tried(root, tree, target, change, most):
     """Returns how many schedules were tried, and what the first to break a promise says."""
-    file, guard, without = change
+    file, guard, without, *by_test = change
     shutil.rmtree(tree, ignore_errors=True)
     shutil.copytree(root, tree, ignore=shutil.ignore_patterns("target", ".git"))
     text = (tree / file).read_text()
@@ -102,8 +107,14 @@ def tried(root, tree, target, change, most):
             seed, what = min(broken, key=lambda found: int(found[0]))
             return int(seed) + 1, f"seed {seed}: {what}"
         if seeds >= most:
-            return seeds, None
+            return seeds, by_test[1] if by_test and fails(tree, target, *by_test) else None
         seeds = min(4 * seeds, most)
+
+
+def fails(tree, target, room, test):
+    """Tells whether a test of a room fails."""
+    run = ["cargo", "test", "--workspace", "--test", room, "--target-dir", target, test]
+    return "FAILED" in subprocess.run(run, cwd=tree, capture_output=True, text=True).stdout
 
 
 if __name__ == "__main__":

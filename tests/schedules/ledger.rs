@@ -12,6 +12,7 @@ use regrind::journal::{Anchor, Artefact, Entry, Journal, JournalError};
 use serde_json::{Value, json};
 use tokio::time::Instant;
 
+use crate::cue::Cues;
 use crate::life::Life;
 
 /// What the disk is like.
@@ -88,6 +89,7 @@ pub struct Kept {
     disk: SharedDisk,
     life: Arc<Life>,
     written: Written,
+    cues: Cues,
     /// What was written without saying so, by the text of what was given, until it is given again.
     untold: Option<(String, u64)>,
 }
@@ -96,10 +98,11 @@ pub struct Kept {
 pub type SharedJournal = Arc<Mutex<Option<Journal>>>;
 
 impl Kept {
-    pub fn new(journal: Journal, disk: &SharedDisk, life: &Arc<Life>, written: &Written) -> Self {
+    pub fn new(journal: Journal, disk: &SharedDisk, life: &Arc<Life>, written: &Written, cues: &Cues) -> Self {
         let folder = journal.folder().to_owned();
         let journal = Arc::new(Mutex::new(Some(journal)));
-        Self { journal, folder, disk: disk.clone(), life: life.clone(), written: written.clone(), untold: None }
+        let (disk, life, written, cues) = (disk.clone(), life.clone(), written.clone(), cues.clone());
+        Self { journal, folder, disk, life, written, cues, untold: None }
     }
 
     /// Returns the journal, to be taken away from a life that is over.
@@ -133,6 +136,7 @@ impl Kept {
             let Some(journal) = journal.as_mut() else { return self.failed(io::ErrorKind::BrokenPipe) };
             write(journal)?
         };
+        self.cues.see_record(&payload);
         self.written.lock().unwrap().push(Recorded { at: Instant::now(), payload });
         if !self.life.passes() {
             return self.failed(io::ErrorKind::BrokenPipe);

@@ -13,6 +13,7 @@ use regrind_sim::world::World;
 use serde::Deserialize;
 use tokio::time::Instant;
 
+use crate::cue::Cues;
 use crate::part::{Wanted, setting};
 
 /// How often their time passes.
@@ -36,21 +37,22 @@ pub struct Machines {
 }
 
 impl Machines {
-    /// Switches both on, so many times as fast as real ones.
-    pub fn new(seed: u64, speed: f64) -> Self {
+    /// Switches both on, so many times as fast as real ones; trusting ones do not see to it themselves that nothing comes twice.
+    pub fn new(seed: u64, speed: f64, trusting: bool, cues: &Cues) -> Self {
         let truth = setting(Wanted::Good).recipe.simulation.clone().unwrap();
         let mut spec = WorldSpec::deserialize(toml::Value::Table(truth)).unwrap();
         spec.seed = 1 + seed % 7;
         let world = World::new(spec).unwrap();
-        let options = |seed| MachineOptions { speed, seed, ..MachineOptions::default() };
+        let options = |seed| MachineOptions { speed, seed, trusting, ..MachineOptions::default() };
         let cmm = Machine::new(Box::new(world.cmm()), 71, options(seed ^ 0xC));
         let grinder = Machine::new(Box::new(world.grinder()), 72, options(seed ^ 0x6));
         let log = Log::default();
         let mut number = 0;
         let shared = [cmm, grinder].map(|mut machine| {
-            let (log, of) = (log.clone(), number);
+            let (log, of, cues) = (log.clone(), number, cues.clone());
             number += 1;
             machine.witness(Box::new(move |seen| {
+                cues.see_machine(&seen.what);
                 log.lock().unwrap().push(Moment { at: Instant::now(), machine: of, what: seen.what.clone() });
             }));
             SharedMachine::from(machine)

@@ -10,29 +10,32 @@
 //! A seed that fails prints the command that repeats it. What failed once stands in [`KEPT`] and is run every time.
 
 mod checker;
+mod cue;
+mod happening;
 #[path = "../common/keep.rs"]
 mod keep;
 mod ledger;
 mod life;
 mod machines;
 mod net;
+mod outside;
 mod part;
 mod person;
 mod schedule;
+mod wire;
 
 use std::panic::AssertUnwindSafe;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use schedule::{Schedule, Tally};
 
-/// Seeds that found something once.
-const KEPT: &[u64] = &[
-    // A station that asked but once whether the loop lives: after a sleep of the computer it never looked at its machine again.
-    306,
-];
+/// Seeds in which it shows that a guard is missing which hardly another one needs: a station asks again whether the loop lives (134); what
+/// waited behind a look that found the link lost is not sent, START (163) and RESUME (181); nothing may wait when a question is asked (264);
+/// an abort does not wait for a machine that stands still (585).
+const KEPT: &[u64] = &[134, 163, 181, 264, 585];
 
 /// How many a merge has time for.
-const SAMPLE: u64 = 60;
+const SAMPLE: u64 = 150;
 
 /// Runs schedules on all processors; says which seed broke which promise.
 fn run_all(schedules: &[Schedule]) -> Tally {
@@ -115,7 +118,7 @@ fn one_schedule() {
 fn a_seed_is_one_schedule() {
     for seed in 0..4 {
         let [first, second] = [(); 2].map(|()| Schedule::drawn(seed).traced());
-        assert!(first.len() > 100, "seed {seed}: {} lines", first.len());
+        assert!(first.len() > 50, "seed {seed}: {} lines", first.len());
         let differs = first.iter().zip(&second).position(|(a, b)| a != b);
         if let Some(k) = differs {
             panic!("seed {seed} differs at line {k}:\n{}\n{}", first[k], second[k]);

@@ -20,7 +20,9 @@ use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, Du
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use tokio::task::AbortHandle;
 
+use crate::cue::Cues;
 use crate::life::Life;
+use crate::wire::{Watched, Wires};
 
 /// How a network carries, as of now.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -53,6 +55,7 @@ struct Shared {
 
 struct State {
     weather: Weather,
+    changes: u64,
     chance: StdRng,
     /// Who carries answers to a client.
     carrying: Vec<AbortHandle>,
@@ -70,7 +73,8 @@ impl Net {
     /// A network of connections, or a serial line of so many bits a second.
     pub fn new(units: Units, faults: Faults, baud: Option<u32>, seed: u64) -> Self {
         let chance = StdRng::seed_from_u64(seed);
-        let state = Mutex::new(State { weather: Weather::FAIR, chance, carrying: Vec::new(), listening: None });
+        let state =
+            Mutex::new(State { weather: Weather::FAIR, changes: 0, chance, carrying: Vec::new(), listening: None });
         let Some(baud) = baud else {
             return Self(Arc::new(Shared { units, faults, state, bus: None }));
         };
@@ -85,14 +89,25 @@ impl Net {
         net
     }
 
-    /// Changes how it carries.
-    pub fn set(&self, weather: Weather) {
+    /// Changes how it carries, for as long as nothing else does or that long.
+    pub async fn weather(&self, weather: Weather, lasts: Duration) {
+        let number = self.set(weather);
+        tokio::time::sleep(lasts).await;
+        if self.state().changes == number {
+            self.set(Weather::FAIR);
+        }
+    }
+
+    /// Changes how it carries; returns the number of the change.
+    pub fn set(&self, weather: Weather) -> u64 {
         let mut state = self.state();
         state.weather = weather;
+        state.changes += 1;
         if weather.down {
             state.carrying.drain(..).for_each(|carrying| carrying.abort());
             state.listening = None;
         }
+        state.changes
     }
 
     fn state(&self) -> std::sync::MutexGuard<'_, State> {
@@ -142,11 +157,12 @@ impl Net {
         }
     }
 
-    fn call(&self, life: Arc<Life>) -> Port {
+    fn call(&self, life: Arc<Life>, wires: Option<&(Wires, Cues)>) -> Port {
         let (to_client, from) = unbounded_channel();
+        let watched = wires.map(|wires| Watched::new(wires, self.0.bus.is_some()));
         if let Some(bus) = &self.0.bus {
             self.state().listening = Some(to_client);
-            return Port { to: bus.clone(), from, ahead: VecDeque::new(), life };
+            return Port { to: bus.clone(), from, ahead: VecDeque::new(), life, watched };
         }
         let (ours, theirs): (DuplexStream, DuplexStream) = duplex(1 << 16);
         let (to, sent) = unbounded_channel();
@@ -158,7 +174,7 @@ impl Net {
         let mut state = self.state();
         state.carrying.retain(|carrying| !carrying.is_finished());
         state.carrying.push(carrying);
-        Port { to, from, ahead: VecDeque::new(), life }
+        Port { to, from, ahead: VecDeque::new(), life, watched }
     }
 
     /// Cuts off whoever listens: the program has died.
@@ -168,9 +184,9 @@ impl Net {
         state.listening = None;
     }
 
-    /// Returns how a life of the program reaches the machines.
-    pub fn dial(&self, life: &Arc<Life>) -> Box<dyn Dial> {
-        Box::new(Caller { net: self.clone(), life: life.clone() })
+    /// Returns how a life of the program reaches the machines, and is watched as it does; anybody else is not.
+    pub fn dial(&self, life: &Arc<Life>, wires: Option<&(Wires, Cues)>) -> Box<dyn Dial> {
+        Box::new(Caller { net: self.clone(), life: life.clone(), wires: wires.cloned() })
     }
 }
 
@@ -178,6 +194,7 @@ impl Net {
 struct Caller {
     net: Net,
     life: Arc<Life>,
+    wires: Option<(Wires, Cues)>,
 }
 
 impl Dial for Caller {
@@ -188,7 +205,7 @@ impl Dial for Caller {
             if way.is_none() || self.net.state().weather.down || !self.life.passes() {
                 return Err(io::ErrorKind::ConnectionRefused.into());
             }
-            Ok(Box::new(self.net.call(self.life.clone())) as Box<dyn LineStream>)
+            Ok(Box::new(self.net.call(self.life.clone(), self.wires.as_ref())) as Box<dyn LineStream>)
         })
     }
 }
@@ -199,6 +216,7 @@ struct Port {
     from: UnboundedReceiver<Vec<u8>>,
     ahead: VecDeque<u8>,
     life: Arc<Life>,
+    watched: Option<Watched>,
 }
 
 impl fmt::Debug for Port {
@@ -230,17 +248,24 @@ impl AsyncRead for Port {
         }
         let count = buffer.remaining().min(self.ahead.len());
         let bytes: Vec<u8> = self.ahead.drain(..count).collect();
+        self.watched.iter_mut().for_each(|watched| watched.reads(&bytes));
         buffer.put_slice(&bytes);
         Poll::Ready(Ok(()))
     }
 }
 
 impl AsyncWrite for Port {
-    fn poll_write(self: Pin<&mut Self>, _: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
-        if !self.life.passes() || self.to.send(bytes.to_vec()).is_err() {
+    fn poll_write(mut self: Pin<&mut Self>, _: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        if !self.life.passes() {
             return Poll::Ready(Err(io::ErrorKind::BrokenPipe.into()));
         }
-        Poll::Ready(Ok(bytes.len()))
+        while let Ok(come) = self.from.try_recv() {
+            self.ahead.extend(come);
+        }
+        let waiting = self.ahead.len();
+        self.watched.iter_mut().for_each(|watched| watched.asks(bytes, waiting));
+        let sent = self.to.send(bytes.to_vec());
+        Poll::Ready(sent.map(|()| bytes.len()).map_err(|_| io::ErrorKind::BrokenPipe.into()))
     }
 
     fn poll_flush(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<io::Result<()>> {

@@ -25,6 +25,8 @@ pub struct Given {
     /// By which it is found on record.
     pub reason: String,
     pub accepted: bool,
+    /// Whether it was carried out, on record or not.
+    pub done: bool,
     /// Whether the grinder and the CMM moved as it was given.
     pub moved: [bool; 2],
 }
@@ -107,7 +109,9 @@ pub async fn give(
     let moved = [0, 1].map(|k: usize| crate::machines::moves(shared[k].with(|machine| machine.state())));
     let reply = orders.ask(request(reason.clone()), actor()).await;
     let Some(reply) = reply.filter(|_| !life.is_dead()) else { return };
-    given.lock().unwrap().push(Given { at, answered: Instant::now(), what, reason, accepted: reply.accepted, moved });
+    let accepted = reply.accepted;
+    let done = accepted || reply.message.contains("what makes safe was carried out");
+    given.lock().unwrap().push(Given { at, answered: Instant::now(), what, reason, accepted, done, moved });
 }
 
 /// Opens the interlock of air and coolant of a machine.

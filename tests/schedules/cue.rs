@@ -1,0 +1,150 @@
+//! Moments that others wait for: what is drawn to happen just as a machine is started, say, happens then.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use rand::RngExt as _;
+use rand::rngs::StdRng;
+use regrind_sim::command::State;
+use regrind_sim::seen::What;
+use serde_json::Value;
+use tokio::sync::watch;
+
+/// A kind of moment at which something can go wrong in a way of its own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Cue {
+    /// A payload is in force.
+    Loaded,
+    Prepared,
+    /// A START is on record.
+    StartOnRecord,
+    /// A START leaves the program.
+    StartSent,
+    /// A machine begins its job.
+    Begins,
+    Holding,
+    Held,
+    Complete,
+    /// An order of a person is on record.
+    Ordered,
+    LinkLost,
+    LinkBack,
+}
+
+impl Cue {
+    pub const ALL: [Self; 11] = [
+        Self::Loaded,
+        Self::Prepared,
+        Self::StartOnRecord,
+        Self::StartSent,
+        Self::Begins,
+        Self::Holding,
+        Self::Held,
+        Self::Complete,
+        Self::Ordered,
+        Self::LinkLost,
+        Self::LinkBack,
+    ];
+
+    /// What of a record is one.
+    fn recorded(payload: &Value) -> Option<Self> {
+        Some(match (payload["event"].as_str(), payload["command"].as_str()) {
+            (Some("pass_loaded" | "plan_loaded"), _) => Self::Loaded,
+            (Some("prepared"), _) => Self::Prepared,
+            (Some("hold" | "resume" | "stop" | "abort"), _) => Self::Ordered,
+            (Some("link_lost"), _) => Self::LinkLost,
+            (Some("link_back"), _) => Self::LinkBack,
+            (_, Some("start_machine")) => Self::StartOnRecord,
+            _ => return None,
+        })
+    }
+
+    /// What of what a machine does is one.
+    fn done(what: &What) -> Option<Self> {
+        Some(match what {
+            What::Began { .. } => Self::Begins,
+            What::Changed { to: State::Holding, .. } => Self::Holding,
+            What::Changed { to: State::Held, .. } => Self::Held,
+            What::Changed { to: State::Complete, .. } => Self::Complete,
+            _ => return None,
+        })
+    }
+}
+
+/// When something happens.
+#[derive(Clone, Copy, Debug)]
+pub enum When {
+    At(Duration),
+    /// So long after a moment comes for that many-th time.
+    After(Cue, u32, Duration),
+}
+
+impl When {
+    /// Draws a time of a run that takes so many seconds, or one of the first moments of a kind.
+    pub fn drawn(chance: &mut StdRng, span_s: f64) -> Self {
+        if chance.random::<f64>() < 0.5 {
+            return Self::At(Duration::from_secs_f64(span_s * chance.random::<f64>()));
+        }
+        let cue = Cue::ALL[chance.random_range(0..Cue::ALL.len())];
+        Self::After(cue, chance.random_range(1..=5), Duration::ZERO).and_soon(chance)
+    }
+
+    /// Draws another time, about as late.
+    pub fn and_soon(self, chance: &mut StdRng) -> Self {
+        let pause = if chance.random::<f64>() < 0.3 { Duration::ZERO } else { any_length(chance, 3.0) };
+        match self {
+            Self::At(at) => Self::At(at + pause),
+            Self::After(cue, nth, _) => Self::After(cue, nth, pause),
+        }
+    }
+}
+
+/// Draws a time up to so many seconds; some milliseconds are as likely as some seconds.
+pub fn any_length(chance: &mut StdRng, most_s: f64) -> Duration {
+    Duration::from_secs_f64(1e-3 * (1e3 * most_s).powf(chance.random::<f64>()))
+}
+
+/// Counts the moments of each kind, for who waits for one.
+#[derive(Clone, Debug)]
+pub struct Cues(Arc<watch::Sender<[u32; Cue::ALL.len()]>>);
+
+impl Cues {
+    pub fn new() -> Self {
+        Self(Arc::new(watch::Sender::new([0; Cue::ALL.len()])))
+    }
+
+    pub fn see_record(&self, payload: &Value) {
+        self.give(Cue::recorded(payload));
+    }
+
+    pub fn see_machine(&self, what: &What) {
+        self.give(Cue::done(what));
+    }
+
+    /// A START leaves the program.
+    pub fn see_start(&self) {
+        self.give(Some(Cue::StartSent));
+    }
+
+    fn give(&self, cue: Option<Cue>) {
+        if let Some(cue) = cue {
+            self.0.send_modify(|counts| counts[cue as usize] += 1);
+        }
+    }
+
+    /// Waits until it is time.
+    pub async fn wait(&self, when: When) {
+        match when {
+            When::At(at) => tokio::time::sleep(at).await,
+            When::After(cue, nth, pause) => {
+                let mut counts = self.0.subscribe();
+                // The counter lives as long as this.
+                let _ = counts.wait_for(|counts| counts[cue as usize] >= nth).await;
+                // At once is before anything else happens.
+                if !pause.is_zero() {
+                    tokio::time::sleep(pause).await;
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,364 @@
+//! A schedule while it happens: the machines live on, and one life of the program follows the other until its run has come to its end.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use rand::rngs::StdRng;
+use rand::{RngExt as _, SeedableRng as _};
+use regrind::cell::Ending;
+use regrind::device::{Link, ModbusCmm, ModbusGrinder, ModbusSettings};
+use regrind::drive::{Beside, Blocking, Drive, Interrupted, Orders, Run};
+use regrind::journal::{AuditKey, Header, Journal, Kind, Reader, RunLock, verify};
+use regrind::setup;
+use regrind_sim::seen::What;
+use regrind_sim::wire::faults::{FaultPlan, Faults};
+use serde_json::json;
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
+use tokio::time::{Instant, sleep, sleep_until};
+
+use crate::checker::{Evidence, Shown};
+use crate::cue::Cues;
+use crate::ledger::{Disk, Kept, SharedDisk, Written};
+use crate::life::Life;
+use crate::machines::Machines;
+use crate::net::{Net, Weather};
+use crate::outside::{Hindered, Office, Outside};
+use crate::part::{self, Wanted};
+use crate::person::{Given, Person, actor};
+use crate::schedule::{Act, Schedule, Tally};
+use crate::wire::Wires;
+
+/// Nothing is drawn to go wrong after this.
+const CALM_AFTER: Duration = Duration::from_secs(90);
+/// What goes wrong is over so long after it began.
+const AT_MOST: Duration = Duration::from_secs(21);
+/// A run has come to its end this long after everything has become calm.
+const ENDS_WITHIN: Duration = Duration::from_secs(1800);
+
+/// A schedule while it happens.
+pub struct Happening<'s> {
+    schedule: &'s Schedule,
+    home: &'s Path,
+    began: Instant,
+    machines: Machines,
+    faults: [Faults; 2],
+    nets: [Net; 2],
+    disk: SharedDisk,
+    person: Person,
+    shown: Arc<Mutex<Vec<Shown>>>,
+    written: Written,
+    wires: Wires,
+    cues: Cues,
+    /// When what is asked of the machines may not have arrived at once.
+    hindered: Hindered,
+    /// The orders of the life that is under way, for who gives them from outside.
+    orders: Office,
+    job: u32,
+    lives: u64,
+    effects: u64,
+    background: JoinSet<()>,
+}
+
+/// How a life of the program ended.
+enum Ended {
+    Died,
+    Over(Ending),
+    /// It came to no end.
+    Never,
+}
+
+impl<'s> Happening<'s> {
+    pub fn new(schedule: &'s Schedule, home: &'s Path) -> Self {
+        let seed = schedule.seed;
+        let cues = Cues::new();
+        let machines = Machines::new(seed, schedule.speed, schedule.trusting, &cues);
+        let faults = [1, 2].map(|k| {
+            let plan = FaultPlan::seeded(seed ^ k, schedule.fault_share, schedule.faults.clone());
+            Faults::from(plan)
+        });
+        let nets = match schedule.baud {
+            // Both are on one line.
+            Some(_) => {
+                let units = [machines.units(0), machines.units(1)].concat();
+                let line = Net::new(units, faults[0].clone(), schedule.baud, seed ^ 0x10);
+                [line.clone(), line]
+            }
+            None => [0, 1].map(|k| Net::new(machines.units(k), faults[k].clone(), None, seed ^ (0x10 + k as u64))),
+        };
+        let person = Person::new(machines.shared.clone(), seed ^ 0x20);
+        let mut background = JoinSet::new();
+        background.spawn(Machines::live(machines.shared.clone()));
+        Self {
+            schedule,
+            home,
+            began: Instant::now(),
+            machines,
+            faults,
+            nets,
+            disk: SharedDisk::new(seed ^ 0x30),
+            person,
+            shown: Arc::default(),
+            written: Arc::default(),
+            wires: Arc::default(),
+            cues,
+            hindered: Arc::default(),
+            orders: Arc::default(),
+            job: 1,
+            lives: 0,
+            effects: 0,
+            background,
+        }
+    }
+
+    pub async fn go(mut self) -> Evidence {
+        self.spawn_acts();
+        let mut deaths = self.schedule.deaths.iter();
+        let mut chance = StdRng::seed_from_u64(self.schedule.seed ^ 0x40);
+        let mut folder = self.folder();
+        let ending = loop {
+            let life = Arc::new(Life::new(deaths.next().copied().unwrap_or(u64::MAX)));
+            let (ended, is_begun) = self.live(&folder, &life).await;
+            self.effects += life.effects();
+            match ended {
+                Ended::Over(ending) if self.is_closed() => break Some(ending),
+                // The disk did not take its end: it is gone on with to bring it there.
+                Ended::Over(_) if self.began.elapsed() < CALM_AFTER => sleep(CALM_AFTER).await,
+                Ended::Over(_) | Ended::Never => break None,
+                Ended::Died => sleep(up_to(&mut chance, 8.0)).await,
+            }
+            if self.is_closed() {
+                break None;
+            }
+            if !is_begun && !has_events(&folder) {
+                fs::remove_dir_all(&folder).unwrap();
+                self.job += 1;
+                folder = self.folder();
+            }
+        };
+        // Whoever has given a machine back has done so by now.
+        sleep(Duration::from_secs(5)).await;
+        self.evidence(folder, ending)
+    }
+
+    fn is_closed(&self) -> bool {
+        self.written.lock().unwrap().iter().any(|recorded| recorded.payload == "end")
+    }
+
+    fn folder(&self) -> PathBuf {
+        self.home.join(format!("run-{}", self.job))
+    }
+
+    /// Begins or goes on with the run, until it ends or the program dies.
+    async fn live(&mut self, folder: &Path, life: &Arc<Life>) -> (Ended, bool) {
+        self.lives += 1;
+        let (task, plan) = part::task(self.schedule.wanted);
+        let begins = !folder.exists();
+        let (journal, interrupted) = if begins {
+            (Journal::create_with(folder, self.header(), Some(AuditKey::new())).unwrap(), None)
+        } else {
+            let lock = RunLock::take(folder).unwrap();
+            verify(folder).unwrap();
+            let interrupted = Interrupted::read(folder, plan.clone(), &task).unwrap_or_else(|error| panic!("{error}"));
+            (Journal::open_locked(lock, None).unwrap(), Some(interrupted))
+        };
+        let kept = Kept::new(journal, &self.disk, life, &self.written, &self.cues);
+        let journal = kept.shared();
+        let (notices, _) = mpsc::unbounded_channel();
+        let disk = self.disk.clone();
+        let mut computing = StdRng::seed_from_u64(self.schedule.seed ^ 0x50 ^ self.lives);
+        let computing = Mutex::new(move || up_to(&mut computing, 0.8));
+        let takes = move |what| match what {
+            Blocking::Record => disk.write_takes(),
+            _ => computing.lock().unwrap()(),
+        };
+        let run = Run {
+            plan,
+            task,
+            journal: Box::new(kept),
+            job: self.job,
+            actor: actor(),
+            loaded: true,
+            poll: part::poll(),
+            notices,
+            interrupted,
+            beside: Beside::InTurn(Arc::new(takes)),
+        };
+        let [of_cmm, of_grinder] = self.links(life);
+        let settings = |which| self.settings(which);
+        let cmm = ModbusCmm::on(of_cmm, settings(0));
+        let grinder = ModbusGrinder::on(of_grinder, settings(1));
+        let (drive, orders) = Drive::new(run, cmm, grinder).unwrap();
+        *self.orders.lock().unwrap() = Some((orders.clone(), life.clone()));
+        let watching = tokio::spawn(watch(orders.clone(), life.clone(), self.shown.clone()));
+        let by = self.began + CALM_AFTER + ENDS_WITHIN;
+        let ended = tokio::select! {
+            biased;
+            () = life.died() => Ended::Died,
+            ending = drive.run() => Ended::Over(ending),
+            () = sleep_until(by) => Ended::Never,
+            () = self.person.attend(&orders, life) => unreachable!("a person does not go"),
+        };
+        watching.abort();
+        // Nobody sees the cell of a program that is not there.
+        self.shown.lock().unwrap().push(Shown { at: Instant::now(), state: None, phase: None });
+        *self.orders.lock().unwrap() = None;
+        life.end();
+        self.nets.iter().for_each(Net::hang_up);
+        // The dead keep no lock.
+        drop(journal.lock().unwrap().take());
+        (ended, !begins)
+    }
+
+    fn header(&self) -> Header {
+        Header {
+            run: format!("run {}", self.job),
+            part: "SN-1".into(),
+            actor: actor().name,
+            station: actor().station,
+            simulation: true,
+            first_command_id: 1,
+            content: json!({ "job": self.job }),
+        }
+    }
+
+    fn settings(&self, which: usize) -> ModbusSettings {
+        let cell = &part::setting(Wanted::Good).cell;
+        let link = if which == 0 { &cell.cmm.link } else { &cell.grinder.link };
+        setup::modbus(link, true, 7, self.lives as u32).unwrap()
+    }
+
+    fn links(&self, life: &Arc<Life>) -> [Link; 2] {
+        let link = |which: usize| {
+            let mut settings = self.settings(which);
+            if let Some(baud) = self.schedule.baud {
+                let parity = regrind::device::Parity::Even;
+                settings.line = regrind::device::Line::Rtu { device: "line".into(), baud, parity, stop_bits: 1 };
+            }
+            let seed = self.schedule.seed ^ (0x60 + which as u64) ^ (self.lives << 8);
+            Link::over(
+                settings.line,
+                settings.request_timeout,
+                settings.quarantine,
+                self.nets[which].dial(life, Some(&(self.wires.clone(), self.cues.clone()))),
+                seed,
+            )
+        };
+        if self.schedule.baud.is_some() {
+            let line = link(0);
+            return [line.clone(), line];
+        }
+        [link(0), link(1)]
+    }
+
+    /// Lets happen what the schedule has.
+    fn spawn_acts(&mut self) {
+        let latest = self.began + CALM_AFTER - AT_MOST;
+        for (number, (when, act)) in self.schedule.acts.iter().cloned().enumerate() {
+            let outside = Outside {
+                shared: self.machines.shared.clone(),
+                nets: self.nets.clone(),
+                disk: self.disk.clone(),
+                orders: self.orders.clone(),
+                given: self.person.given.clone(),
+                settings: [self.settings(0), self.settings(1)],
+                is_serial: self.schedule.baud.is_some(),
+                hindered: self.hindered.clone(),
+                number,
+            };
+            let cues = self.cues.clone();
+            self.background.spawn(async move {
+                cues.wait(when).await;
+                if Instant::now() < latest {
+                    outside.act(act).await;
+                }
+            });
+        }
+        let (faults, nets, disk, shared) =
+            (self.faults.clone(), self.nets.clone(), self.disk.clone(), self.machines.shared.clone());
+        self.background.spawn(async move {
+            sleep(CALM_AFTER).await;
+            faults.iter().for_each(|faults| faults.set(FaultPlan::new(0)));
+            for net in &nets {
+                net.set(Weather::FAIR);
+            }
+            disk.set(Disk::SOUND);
+            shared.iter().for_each(|machine| machine.with(|machine| machine.freeze(false)));
+        });
+    }
+
+    fn evidence(self, folder: PathBuf, ending: Option<Ending>) -> Evidence {
+        let log = self.machines.log.lock().unwrap().clone();
+        let given: Vec<Given> = self.person.given.lock().unwrap().clone();
+        let written = self.written.lock().unwrap().clone();
+        let fired = self.faults.iter().map(|faults| faults.fired().len() as u64).sum();
+        let passes = log.iter().filter(|m| matches!(m.what, What::Began { .. })).count() as u64;
+        let accepted = u64::from(matches!(&ending, Some(Ending::Accepted { .. })));
+        let tally = Tally {
+            runs: 1,
+            accepted,
+            lives: self.lives,
+            passes,
+            records: written.len() as u64,
+            faults: fired,
+            orders: given.len() as u64,
+            simulated: self.began.elapsed(),
+        };
+        let is_plain = self.schedule.baud.is_none() && self.schedule.fault_share == 0.0;
+        let hindered = is_plain.then(|| self.hindered.lock().unwrap().clone());
+        let wires = self.wires.lock().unwrap().clone();
+        // The program may have died with its end on record.
+        let finish = written.iter().rev().find(|recorded| recorded.payload["command"] == "finish");
+        let ended_well = match (finish.and_then(|finish| finish.payload["ending"].as_str()), self.schedule.wanted) {
+            (Some("accepted"), Wanted::Good) | (Some("not_accepted"), Wanted::Perfect) => true,
+            // What went wrong may have ended it.
+            _ => !self.schedule.dies_alone(),
+        };
+        let shown = self.shown.lock().unwrap().clone();
+        Evidence {
+            began: self.began,
+            job: self.job,
+            folder,
+            log,
+            given,
+            written,
+            shown,
+            tally,
+            wires,
+            hindered,
+            freezes: self.schedule.acts.iter().any(|(_, act)| matches!(act, Act::Freeze { .. })),
+            ended_well,
+            effects: self.effects,
+        }
+    }
+}
+
+/// Whether a run has begun, as `regrind resume` asks.
+fn has_events(folder: &Path) -> bool {
+    Reader::open(folder).is_ok_and(|reader| reader.records(0).flatten().any(|record| record.kind == Kind::Event))
+}
+
+/// Keeps what the cell shows of itself.
+async fn watch(orders: Orders, life: Arc<Life>, shown: Arc<Mutex<Vec<Shown>>>) {
+    let mut status = orders.status();
+    loop {
+        let (state, phase) = {
+            let seen = status.borrow_and_update();
+            (seen.state, seen.phase)
+        };
+        if life.is_dead() {
+            return;
+        }
+        shown.lock().unwrap().push(Shown { at: Instant::now(), state: Some(state), phase });
+        if status.changed().await.is_err() {
+            return;
+        }
+    }
+}
+
+/// Draws a time up to so many seconds.
+fn up_to(chance: &mut StdRng, seconds: f64) -> Duration {
+    Duration::from_secs_f64(seconds * chance.random::<f64>())
+}

@@ -1,0 +1,114 @@
+//! What leaves the program, seen where it goes onto the wire: the commands, and whether each question is asked as it should be.
+
+use std::collections::BTreeSet;
+use std::sync::{Arc, Mutex};
+
+use regrind_sim::command::{Command, Frame};
+use regrind_sim::options::Layout;
+use regrind_sim::words::WordOrder;
+use tokio::time::Instant;
+
+use crate::cue::Cues;
+
+/// A command as it left the program.
+#[derive(Clone, Copy, Debug)]
+pub struct Sent {
+    pub at: Instant,
+    /// 0 is the CMM, 1 the grinder.
+    pub machine: usize,
+    pub command: Command,
+    pub frame: Frame,
+}
+
+/// What was seen on the wires.
+#[derive(Clone, Debug, Default)]
+pub struct Traffic {
+    pub sent: Vec<Sent>,
+    /// Questions that should not have been asked as they were.
+    pub wrong: Vec<(Instant, String)>,
+}
+
+pub type Wires = Arc<Mutex<Traffic>>;
+
+/// Watches one connection of the program.
+pub struct Watched {
+    wires: Wires,
+    cues: Cues,
+    is_serial: bool,
+    /// A question has been asked, and so much of its answer has been read.
+    open: Option<Vec<u8>>,
+    /// Units that have answered with what was written to them over this connection.
+    proven: BTreeSet<u8>,
+    /// Units to which such a thing was written.
+    being_proven: BTreeSet<u8>,
+}
+
+impl Watched {
+    pub fn new((wires, cues): &(Wires, Cues), is_serial: bool) -> Self {
+        let (proven, being_proven) = (BTreeSet::new(), BTreeSet::new());
+        Self { wires: wires.clone(), cues: cues.clone(), is_serial, open: None, proven, being_proven }
+    }
+
+    /// A question leaves the program, while so many bytes wait that it has not read.
+    pub fn asks(&mut self, request: &[u8], waiting: usize) {
+        if waiting > 0 {
+            self.wrong(format!("it asks while {waiting} bytes of something else wait"));
+        }
+        if self.open.as_ref().is_some_and(|answer| !self.is_whole(answer)) {
+            self.wrong("it asks anew where an answer is owed".to_owned());
+        }
+        self.open = Some(Vec::new());
+        let Some((unit, pdu)) = self.parts(request) else { return self.wrong(format!("it sends {request:?}")) };
+        let Some(address) = pdu.get(1..3).map(|pair| u16::from_be_bytes([pair[0], pair[1]])) else { return };
+        let layout = Layout::default();
+        match pdu[0] {
+            16 if address == layout.sync => drop(self.being_proven.insert(unit)),
+            3 if address == layout.sync && self.being_proven.contains(&unit) => drop(self.proven.insert(unit)),
+            16 if address == layout.command => self.commands(unit, &pdu[6..]),
+            _ => {}
+        }
+    }
+
+    /// The program reads of an answer.
+    pub fn reads(&mut self, bytes: &[u8]) {
+        self.open.iter_mut().for_each(|answer| answer.extend(bytes));
+    }
+
+    fn commands(&mut self, unit: u8, bytes: &[u8]) {
+        let words: Vec<u16> = bytes.chunks_exact(2).map(|pair| u16::from_be_bytes([pair[0], pair[1]])).collect();
+        let frame = <[u16; 20]>::try_from(words).ok().and_then(|words| Frame::read(WordOrder::Big, &words));
+        let Some((frame, command)) = frame.and_then(|frame| Some((frame, Command::of(frame.command)?))) else {
+            return self.wrong("it commands what is no command".to_owned());
+        };
+        if !self.proven.contains(&unit) {
+            self.wrong(format!("{command:?} goes over a connection on which nobody has been met"));
+        }
+        if command == Command::Start {
+            self.cues.see_start();
+        }
+        let machine = usize::from(unit) - 1;
+        self.wires.lock().unwrap().sent.push(Sent { at: Instant::now(), machine, command, frame });
+    }
+
+    fn parts<'r>(&self, request: &'r [u8]) -> Option<(u8, &'r [u8])> {
+        if self.is_serial {
+            return Some((*request.first()?, request.get(1..request.len().checked_sub(2)?)?));
+        }
+        Some((*request.get(6)?, request.get(7..)?))
+    }
+
+    fn is_whole(&self, answer: &[u8]) -> bool {
+        let length = match answer {
+            [_, _, _, _, high, low, ..] if !self.is_serial => 6 + usize::from(u16::from_be_bytes([*high, *low])),
+            [_, function, ..] if self.is_serial && function & 0x80 != 0 => 5,
+            [_, 3, count, ..] if self.is_serial => 5 + usize::from(*count),
+            [_, _, ..] if self.is_serial => 8,
+            _ => return false,
+        };
+        answer.len() >= length
+    }
+
+    fn wrong(&self, what: String) {
+        self.wires.lock().unwrap().wrong.push((Instant::now(), what));
+    }
+}
