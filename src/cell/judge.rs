@@ -2,7 +2,7 @@
 
 use super::command::Verdict;
 use super::event::{Figures, Response};
-use super::plan::{CellPlan, PvOf};
+use super::plan::{CellPlan, PvOf, Tolerance};
 
 /// A figure that is worse than the one before by more than this share makes a cycle worse.
 const WORSE: f64 = 1.05;
@@ -34,7 +34,7 @@ impl Figures {
 
 /// Where a figure lies beside its limit once its uncertainty is counted (ISO 14253-1).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-enum Conformity {
+pub enum Conformity {
     /// Within, for certain.
     Within,
     /// The uncertainty reaches over the limit: nothing is proven.
@@ -52,6 +52,37 @@ impl Conformity {
         } else {
             Self::Beyond
         }
+    }
+}
+
+/// A figure that is judged, beside its limit.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Compared {
+    /// What the figure is called.
+    pub name: &'static str,
+    /// What was found.
+    pub found_mm: f64,
+    /// Its expanded measuring uncertainty (k = 2), whether it is counted or not.
+    pub expanded_mm: f64,
+    /// The largest that is accepted; infinite where it is not limited.
+    pub limit_mm: f64,
+    /// What follows, with the uncertainty where the tolerance counts it.
+    pub conformity: Conformity,
+}
+
+impl Tolerance {
+    /// Compares the two figures that are judged with their limits: the peak to valley of the points that it is taken of, and the RMS.
+    pub fn compare(&self, figures: &Figures) -> [Compared; 2] {
+        let robust = figures.pv_robust_mm.filter(|_| self.pv_of == PvOf::MostPoints);
+        let pv_name = if robust.is_some() { "PV 99.8 %" } else { "PV" };
+        let compared = |name, found_mm, expanded_mm, limit_mm| {
+            let counted = if self.with_uncertainty { expanded_mm } else { 0.0 };
+            Compared { name, found_mm, expanded_mm, limit_mm, conformity: Conformity::of(found_mm, counted, limit_mm) }
+        };
+        [
+            compared(pv_name, robust.unwrap_or(figures.pv_mm), figures.pv_expanded_mm, self.pv_mm),
+            compared("RMS", figures.rms_mm, figures.rms_expanded_mm, self.rms_mm),
+        ]
     }
 }
 
@@ -119,15 +150,13 @@ fn go_on(plan: &CellPlan, before: Option<&Figures>, now: &Figures, conformity: C
 
 /// The worse of the two figures that are limited.
 fn conformity(plan: &CellPlan, now: &Figures) -> Conformity {
-    let tolerance = &plan.tolerance;
-    let (pv, rms) = if tolerance.with_uncertainty { (now.pv_expanded_mm, now.rms_expanded_mm) } else { (0.0, 0.0) };
-    let of_pv = Conformity::of(judged_pv(plan, now), pv, tolerance.pv_mm);
-    of_pv.max(Conformity::of(now.rms_mm, rms, tolerance.rms_mm))
+    let [pv, rms] = plan.tolerance.compare(now);
+    pv.conformity.max(rms.conformity)
 }
 
 /// The peak to valley that is judged: of all points, or of all but the outermost.
 fn judged_pv(plan: &CellPlan, figures: &Figures) -> f64 {
-    figures.pv_robust_mm.filter(|_| plan.tolerance.pv_of == PvOf::MostPoints).unwrap_or(figures.pv_mm)
+    plan.tolerance.compare(figures)[0].found_mm
 }
 
 fn has_stalled(plan: &CellPlan, before: &Figures, now: &Figures) -> bool {
@@ -148,16 +177,12 @@ fn wrong(response: Response) -> Option<&'static str> {
 }
 
 fn told(plan: &CellPlan, now: &Figures) -> String {
-    let tolerance = &plan.tolerance;
-    let (pv, rms) = (um(judged_pv(plan, now)), um(now.rms_mm));
-    let which = if tolerance.pv_of == PvOf::MostPoints && now.pv_robust_mm.is_some() { "PV 99.8 %" } else { "PV" };
-    let (pv_u, rms_u) = (um(now.pv_expanded_mm), um(now.rms_expanded_mm));
-    let counts = if tolerance.with_uncertainty { "with" } else { "without" };
-    format!(
-        "{which} {pv} ± {pv_u} of {}, RMS {rms} ± {rms_u} of {}, {counts} the uncertainty",
-        um(tolerance.pv_mm),
-        um(tolerance.rms_mm)
-    )
+    let of = |Compared { name, found_mm, expanded_mm, limit_mm, .. }: Compared| {
+        format!("{name} {} ± {} of {}", um(found_mm), um(expanded_mm), um(limit_mm))
+    };
+    let [pv, rms] = plan.tolerance.compare(now).map(of);
+    let counts = if plan.tolerance.with_uncertainty { "with" } else { "without" };
+    format!("{pv}, {rms}, {counts} the uncertainty")
 }
 
 /// Writes a length in micrometres, for people.

@@ -34,6 +34,7 @@ pub use event::{
     Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Forecast, Gate, GateFailure,
     JobResult, Mismatch, Occupation, Reconciliation, RecordFailure, Response,
 };
+pub use judge::{Compared, Conformity};
 pub use memory::Cell;
 pub use plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, PvOf, Tolerance};
 pub use state::{Device, JobStep, Phase, State, StateName};

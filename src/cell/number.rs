@@ -48,6 +48,11 @@ pub(super) mod optional {
     }
 }
 
+/// Reads a limit: where nothing stands there is none, and JSON has no infinity.
+pub(super) fn limit<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+    Option::<Recorded>::deserialize(from)?.map_or(Ok(f64::INFINITY), Recorded::value)
+}
+
 /// The same for pairs of numbers.
 pub(super) mod pairs {
     use super::{Deserialize, Deserializer, Recorded, Serialize, Serializer};

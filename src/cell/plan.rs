@@ -50,9 +50,11 @@ pub enum Beginning {
 /// What is accepted.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Tolerance {
-    /// Peak to valley.
+    /// Peak to valley; infinite where it is not limited.
+    #[serde(deserialize_with = "super::number::limit")]
     pub pv_mm: f64,
-    /// Root mean square.
+    /// Root mean square; infinite where it is not limited.
+    #[serde(deserialize_with = "super::number::limit")]
     pub rms_mm: f64,
     /// Whether the expanded uncertainty is added to the figures first.
     pub with_uncertainty: bool,

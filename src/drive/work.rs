@@ -10,6 +10,7 @@ use std::sync::Arc;
 use crate::cell::{CompensationRefusal, CompensationSummary, Event, Figures, Forecast, Gate, GateFailure, Response};
 use crate::compensation::{self, Correction, ErrorMap, LearningState, NextPassError, Seen, Sense, error_map, response};
 use crate::device::{Coordinates, Identified, Measurement, Plan, PointStatus, TargetKind};
+use crate::form::pv_of_most;
 use crate::formats::{
     FormatError, Learned, NominalInput, RegistrationDocument, ResultFolder, save_registration, write_points,
 };
@@ -252,7 +253,7 @@ fn figures(
     let points = verdict.used.max(1) as f64;
     Figures {
         pv_mm: verdict.pv_mm,
-        pv_robust_mm: pv_of_most(found),
+        pv_robust_mm: pv_of_most(used(found).map(|d| d.deviation_mm)),
         rms_mm: verdict.rms_mm,
         // Of two extreme points, each uncertain by the scatter; k = 2.
         pv_expanded_mm: 2.0 * 2f64.sqrt() * scatter_mm,
@@ -269,14 +270,6 @@ fn figures(
         forecast: forecast.map(|f| Forecast { rms_mm: f.rms_mm, sigma_mm: f.sigma_mm, floor_mm: f.floor_mm }),
         removed_mm: Some(task.limits.allowance_mm - cycle.correction.level_mm),
     }
-}
-
-/// Peak to valley without the outermost 0.2 % of the points, half at each end.
-fn pv_of_most(found: &Registration) -> Option<f64> {
-    let mut values: Vec<f64> = used(found).map(|d| d.deviation_mm).collect();
-    values.sort_unstable_by(f64::total_cmp);
-    let beyond = values.len() / 1000;
-    Some(values.get(values.len().checked_sub(1 + beyond)?)? - values.get(beyond)?)
 }
 
 fn answer(before: &Cycle, cycle: &Cycle, found: &Registration, error: &ErrorMap) -> Option<compensation::Response> {

@@ -297,6 +297,31 @@ fn a_gain_below_what_the_recipe_calls_one_is_none() {
 }
 
 #[test]
+fn a_figure_is_compared_with_its_limit_by_the_rule_of_the_recipe() {
+    let most = Tolerance { pv_of: PvOf::MostPoints, ..plan().tolerance };
+    let found = Figures { pv_robust_mm: Some(0.0069), ..figures(8.0, 0.5) };
+    let [pv, rms] = most.compare(&found);
+    assert_eq!((pv.name, pv.found_mm, pv.limit_mm, pv.conformity), ("PV 99.8 %", 0.0069, 0.007, Conformity::Undecided));
+    assert_eq!((rms.name, rms.expanded_mm, rms.conformity), ("RMS", 0.00005, Conformity::Within));
+    let [alone, _] = Tolerance { with_uncertainty: false, ..most }.compare(&found);
+    assert_eq!((alone.expanded_mm, alone.conformity), (0.0003, Conformity::Within));
+    // Of all points, also where the others are known; and of all points where they are not.
+    for (tolerance, found) in [(plan().tolerance, &found), (most, &figures(8.0, 0.5))] {
+        let [pv, _] = tolerance.compare(found);
+        assert_eq!((pv.name, pv.found_mm, pv.conformity), ("PV", 0.008, Conformity::Beyond));
+    }
+}
+
+#[test]
+fn a_tolerance_without_a_limit_comes_back_from_the_record_without_one() {
+    let open = Tolerance { pv_mm: f64::INFINITY, ..plan().tolerance };
+    let recorded = serde_json::to_string(&open).unwrap();
+    assert!(recorded.contains("\"pv_mm\":null"), "{recorded}");
+    assert_eq!(serde_json::from_str::<Tolerance>(&recorded).unwrap(), open);
+    assert_eq!(open.compare(&figures(1e9, 0.5))[0].conformity, Conformity::Within);
+}
+
+#[test]
 fn a_figure_is_in_tolerance_out_of_it_or_neither() {
     // Limits of 7 and 1 um, uncertainties of 0.3 and 0.05 um: within means the figure and its uncertainty, beyond the figure without it.
     let expecting = |rms_um: f64| Forecast { rms_mm: rms_um / 1e3, sigma_mm: 2e-5, floor_mm: Some(rms_um / 1.2e3) };

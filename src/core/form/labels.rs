@@ -58,7 +58,7 @@ pub fn labelled(figures: &Figures, taken_out: &TakenOut) -> Vec<Labelled> {
     let removed = taken_out.removed(&figures.removed);
     let um = |name, mm: f64, made: &str| row(name, 1e3 * mm, "um", &removed, EVERY_POINT, made);
     let of_fit = format!(
-        "PV of {} {} terms, {:.4} um, and 3 times the rms of the rest, {:.4} um",
+        "robust: PV of {} {} terms fitted to all points, {:.4} um, and 3 times the rms of the rest, {:.4} um",
         pvr.terms,
         pvr.basis,
         1e3 * pvr.fit_pv_mm,
@@ -66,13 +66,16 @@ pub fn labelled(figures: &Figures, taken_out: &TakenOut) -> Vec<Labelled> {
     );
     let cells = format!("cells of {:.3} mm within the aperture that hold a point", coverage.cell_mm);
     vec![
-        um("PV", figures.pv_mm, "largest less least"),
+        um("PV", figures.pv_mm, "of all points: largest less least"),
         um("PVr", pvr.value_mm, &of_fit),
-        um("PV 99.8 %", figures.pv998_mm, "from the quantile 0.1 % to 99.9 %"),
-        um("RMS", figures.rms_mm, "about zero"),
-        um("mean", figures.mean_mm, ""),
-        Labelled { at_mm: Some(highest.at_mm), ..um("highest (stock left)", highest.value_mm, "") },
-        Labelled { at_mm: Some(lowest.at_mm), ..um("lowest (undercut)", lowest.value_mm, "") },
+        um("PV 99.8 %", figures.pv998_mm, "of all points but the outermost 0.1 % at either end: largest less least"),
+        um("RMS", figures.rms_mm, "of all points, about zero"),
+        um("mean", figures.mean_mm, "of all points"),
+        Labelled {
+            at_mm: Some(highest.at_mm),
+            ..um("highest (stock left)", highest.value_mm, "the one highest point")
+        },
+        Labelled { at_mm: Some(lowest.at_mm), ..um("lowest (undercut)", lowest.value_mm, "the one lowest point") },
         row("coverage", 100.0 * coverage.share, "%", "nothing", EVERY_POINT, &cells),
     ]
 }

@@ -21,7 +21,7 @@ mod slope;
 
 pub use basis::Basis;
 pub use error::FormError;
-pub use figures::{Coverage, Extreme, Figures, FormOptions, RobustPv, figures};
+pub use figures::{Coverage, Extreme, Figures, FormOptions, RobustPv, figures, pv_of_most};
 pub use fit::{Fit, fit, fit_most};
 pub use iso::{Iso10110, iso_10110};
 pub use labels::{DIRECTION, EVERY_POINT, Labelled, TakenOut, labelled, labelled_slope};
