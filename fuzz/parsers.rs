@@ -21,7 +21,7 @@ use regrind::formats::gcode::{AlongNormals, Amendment, MapBase, correct_program,
 use regrind::formats::result::{Content, Coordinates, DecimalMark, LengthUnit, check_ended, parse_result};
 use regrind::formats::{
     HeightMap, LIMIT_MM, Learned, X3pFile, parse_metropro, parse_ply, parse_points, parse_sdf, parse_stl, parse_x3p,
-    references::parse_references,
+    read_error_map, references::parse_references,
 };
 use regrind::geometry::{Grid, Point};
 use regrind::journal::{Anchor, Reader, canonical_json, verify};
@@ -246,6 +246,10 @@ pub fn program_map(bytes: &[u8]) -> bool {
     let folder = folder();
     let file = folder.path().join("map.csv");
     fs::write(&file, bytes).expect("a folder for temporary files");
+    // The report draws an error map without its grid.
+    if let Ok(nodes) = read_error_map(&file) {
+        assert!(nodes.iter().flatten().all(|v| v.is_finite()));
+    }
     let Ok(map) = read_program_map(&file) else { return false };
     assert!(map.grid.is_sound() && map.grid.len() == map.values_mm.len());
     assert!(map.values_mm.iter().all(|v| v.is_finite()));

@@ -37,7 +37,7 @@ pub use folder::{ResultFolder, ScratchFolder, finished_files, place_link, remove
 pub use height_map::HeightMap;
 pub use learned::{LEARNED, Learned, LearnedError};
 pub use lines::AddedLines;
-pub use map::{CorrectionIdentities, ErrorMapOrigin, write_correction, write_error_map};
+pub use map::{CorrectionIdentities, ErrorMapOrigin, read_error_map, write_correction, write_error_map};
 pub use measured_map::is_map;
 pub use metropro::{parse_metropro, read_metropro};
 pub use number::LIMIT_MM;

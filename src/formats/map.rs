@@ -7,6 +7,9 @@ use super::gcode::hex;
 use super::registration::write_rows;
 use regrind_core::compensation::{Correction, ErrorMap};
 
+/// The columns of `error_map.csv`.
+const ERROR_MAP_COLUMNS: &str = "x_mm,y_mm,error_mm,sigma_mm,valid";
+
 /// What an error was measured on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ErrorMapOrigin {
@@ -43,11 +46,53 @@ pub fn write_error_map(
     };
     let header = format!(
         "{marked}# part: sha256 {}\n# cycle: {}\n# the pass before was ground {ground}\n# frame: model; positive stands proud, along the outward \
-         normal\nx_mm,y_mm,error_mm,sigma_mm,valid",
+         normal\n{ERROR_MAP_COLUMNS}",
         hex(&origin.part),
         origin.cycle
     );
     write_rows(path, &header, &rows, |(values, valid)| (*values, Some(*valid)))
+}
+
+/// Reads back what [`write_error_map`] wrote: x, y and error of every node where something was measured.
+///
+/// Frame: model. Units: millimetres.
+///
+/// # Errors
+/// A file that cannot be read, other columns, rows that are no finite numbers.
+pub fn read_error_map(path: &Path) -> Result<Vec<[f64; 3]>, FormatError> {
+    let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
+    let text = std::fs::read_to_string(path).map_err(unreadable)?;
+    let mut lines = text.lines().zip(1..).filter(|(line, _)| !line.starts_with('#') && !line.trim().is_empty());
+    let unexpected = |found: &str, line: u64, expected: &str| FormatError::Unexpected {
+        path: path.to_owned(),
+        place: format!("line {line}"),
+        expected: expected.to_owned(),
+        found: found.to_owned(),
+    };
+    match lines.next() {
+        Some((ERROR_MAP_COLUMNS, _)) => {}
+        Some((other, line)) => return Err(unexpected(other, line, ERROR_MAP_COLUMNS)),
+        None => return Err(FormatError::Empty { path: path.to_owned(), expected: "a map" }),
+    }
+    let mut nodes = Vec::new();
+    for (text, line) in lines {
+        let node = node(text).ok_or_else(|| unexpected(text, line, "a node of a map"))?;
+        nodes.extend(node);
+    }
+    Ok(nodes)
+}
+
+/// Reads a row of an error map: nothing of a node where nothing was measured, and none of what is no row.
+fn node(row: &str) -> Option<Option<[f64; 3]>> {
+    let cells: Vec<&str> = row.split(',').map(str::trim).collect();
+    let [x, y, error, sigma, valid] = cells[..] else { return None };
+    let number = |text: &str| text.parse::<f64>().ok().filter(|value| value.is_finite());
+    let (node, _) = ([number(x)?, number(y)?, number(error)?], number(sigma)?);
+    match valid {
+        "1" => Some(Some(node)),
+        "0" => Some(None),
+        _ => None,
+    }
 }
 
 /// What a correction is for, what it is, and what it takes the place of.
@@ -86,4 +131,36 @@ pub fn write_correction(
         hex(&identities.replaces)
     );
     write_rows(path, &header, &rows, |values| (*values, None))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_map_is_read_back_without_the_nodes_where_nothing_was_measured() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("error_map.csv");
+        let read = |text: &str| {
+            std::fs::write(&path, text).unwrap();
+            read_error_map(&path)
+        };
+        let whole = format!(
+            "# SIMULATION\n# cycle: 2\n{ERROR_MAP_COLUMNS}\n-1.5,2,0.001,0.0002,1\n0,2,7,0,0\n1.5,2,-3e-4,0,1\n"
+        );
+        assert_eq!(read(&whole).unwrap(), [[-1.5, 2.0, 0.001], [1.5, 2.0, -3e-4]]);
+        assert_eq!(read(&format!("{ERROR_MAP_COLUMNS}\n")).unwrap(), [[0.0; 3]; 0]);
+        for (from, to, place) in [
+            ("error_mm", "height_mm", "line 3"),
+            ("0.001,", "NaN,", "line 4"),
+            ("0.0002,", "", "line 4"),
+            ("7,0,0", "7,0,2", "line 5"),
+            ("-3e-4", "inf", "line 6"),
+        ] {
+            let message = read(&whole.replacen(from, to, 1)).unwrap_err().to_string();
+            assert!(message.contains(place), "{to}: {message}");
+        }
+        assert!(matches!(read("# nothing\n"), Err(FormatError::Empty { .. })));
+        assert!(matches!(read_error_map(&folder.path().join("none")), Err(FormatError::Unreadable { .. })));
+    }
 }

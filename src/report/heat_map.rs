@@ -28,6 +28,12 @@ pub struct HeatMap {
     pv: f64,
     rms: f64,
     points: usize,
+    /// Lines below the title.
+    lines: Vec<String>,
+    /// What the figures in the last line are of, and what is counted.
+    figures_of: [&'static str; 2],
+    /// The largest map on the page, in pixels of the page.
+    largest: [f64; 2],
 }
 
 impl HeatMap {
@@ -51,6 +57,9 @@ impl HeatMap {
             pv: high - low,
             rms: (squares / samples.len() as f64).sqrt(),
             points: samples.len(),
+            lines: Vec::new(),
+            figures_of: ["", "points"],
+            largest: [WIDTH, HEIGHT],
         };
         Ok(map.with_colours(ColourMap::Diverging))
     }
@@ -106,6 +115,34 @@ impl HeatMap {
         let [low, high] = self.tones.range;
         let tones = Tones::symmetric(low.abs().max(high.abs()), Some(tolerance * self.per_mm));
         Ok(Self { tones, ..self })
+    }
+
+    /// Lets the colours reach from minus to plus a limit, so that maps with the same limit compare; what lies beyond takes the end.
+    ///
+    /// Units: those of the map.
+    ///
+    /// # Errors
+    /// A limit that is negative or not finite.
+    pub fn with_limit(self, limit: f64) -> Result<Self, ReportError> {
+        if !(limit >= 0.0 && limit.is_finite()) {
+            return Err(ReportError::ColourLimit { figure: self.title, limit });
+        }
+        Ok(Self { tones: Tones::symmetric(limit, None), ..self })
+    }
+
+    /// Puts further lines below the title.
+    pub fn with_lines(self, lines: Vec<String>) -> Self {
+        Self { lines, ..self }
+    }
+
+    /// Says that the samples are the nodes of a map: PV and RMS are then those of the map and not of the points that it was made from.
+    pub fn of_nodes(self) -> Self {
+        Self { figures_of: [" of the map", "nodes"], ..self }
+    }
+
+    /// Draws the map no larger than a number of pixels of the page, along x and along y.
+    pub fn at_most(self, largest: [f64; 2]) -> Self {
+        Self { largest, ..self }
     }
 
     /// Leaves open what lies outside of an aperture, even where a gap between samples would be filled.
@@ -185,7 +222,9 @@ impl HeatMap {
         let ([left, top], [width, height]) = (frame.corner, frame.size);
         let mut svg = Svg::new(left + width + 106.0, top + height + 54.0);
         svg.text([left, 24.0], Anchor::Start, LARGE, &self.title);
-        svg.text([left, 44.0], Anchor::Start, SMALL, &self.summary());
+        for (line, y) in self.lines.iter().chain([&self.summary()]).zip((0..).map(|k| 44.0 + LINE * f64::from(k))) {
+            svg.text([left, y], Anchor::Start, SMALL, line);
+        }
         let pixel = width / self.raster.grid.columns as f64;
         // Few samples are shown as the blocks they are; many are smoothed when the figure is scaled.
         let rendering = if pixel > 4.0 { "pixelated" } else { "auto" };
@@ -198,10 +237,10 @@ impl HeatMap {
     fn frame(&self) -> Frame<'static> {
         let Grid { columns, rows, first_mm, spacing_mm: pixel_mm } = self.raster.grid;
         let extent = [columns as f64 * pixel_mm[0], rows as f64 * pixel_mm[1]];
-        let scale = (WIDTH / extent[0]).min(HEIGHT / extent[1]);
+        let scale = (self.largest[0] / extent[0]).min(self.largest[1] / extent[1]);
         // A part like a strip is drawn out of scale rather than as a line.
         let size = extent.map(|e| (e * scale).max(90.0));
-        let corner = [66.0, 58.0];
+        let corner = [66.0, 58.0 + LINE * self.lines.len() as f64];
         let low: [f64; 2] = std::array::from_fn(|k| first_mm[k] - 0.5 * pixel_mm[k]);
         let x = Ruler::new(Scale::Linear, [low[0], low[0] + extent[0]], [corner[0], corner[0] + size[0]]);
         let y = Ruler::new(Scale::Linear, [low[1], low[1] + extent[1]], [corner[1] + size[1], corner[1]]);
@@ -227,18 +266,19 @@ impl HeatMap {
     }
 
     fn summary(&self) -> String {
-        let (unit, points) = (&self.unit, grouped(self.points));
+        let (unit, [of, counted]) = (&self.unit, self.figures_of);
+        let points = format!("{} {counted}", grouped(self.points));
         match self.tones.colours {
             ColourMap::Diverging => {
                 let (pv, rms) = (three_digits(self.pv), three_digits(self.rms));
-                let summary = format!("PV {pv} {unit}, RMS {rms} {unit}, {points} points");
+                let summary = format!("PV{of} {pv} {unit}, RMS{of} {rms} {unit}, {points}");
                 let Some(band) = self.tones.tolerance else { return summary };
                 let share = 100.0 * self.share_within(band);
                 format!("{summary}, {share:.1} % of the area within \u{b1} {} {unit}", three_digits(band))
             }
             ColourMap::Sequential => {
                 let [low, high] = self.tones.range.map(three_digits);
-                format!("{low} to {high} {unit}, {points} points")
+                format!("{low} to {high} {unit}, {points}")
             }
         }
     }
@@ -272,6 +312,9 @@ const LEVELS: u8 = 255;
 /// The largest map on the page, in pixels of the page.
 const WIDTH: f64 = 600.0;
 const HEIGHT: f64 = 460.0;
+
+/// From one line of text below the title to the next.
+const LINE: f64 = 18.0;
 
 #[cfg(test)]
 mod tests {
@@ -321,6 +364,24 @@ mod tests {
         let wide = HeatMap::of_lengths("band", "height", &SMALL_MAP).unwrap().with_tolerance(4e-3).unwrap();
         assert_eq!(wide.limit(), 5.0);
         assert!(wide.to_svg().unwrap().contains("100.0 % of the area"));
+    }
+
+    #[test]
+    fn maps_with_one_limit_have_one_scale_and_say_what_they_are_of() {
+        let map = HeatMap::new("Cycle 1", "deviation", "µm", &SMALL_MAP).unwrap().of_nodes();
+        let map = map.with_limit(8e-3).unwrap().with_lines(vec!["mirror, SN 7".into()]).at_most([200.0, 200.0]);
+        assert_eq!((map.limit(), map.tones.tolerance), (8e-3, None));
+        let svg = map.to_svg().unwrap();
+        let document = roxmltree::Document::parse(&svg).unwrap();
+        let texts: Vec<_> = document.descendants().filter_map(|n| n.text()).collect();
+        for text in
+            ["Cycle 1", "mirror, SN 7", "PV of the map 0.00400 µm, RMS of the map 0.00129 µm, 6 nodes", "x / mm"]
+        {
+            assert!(texts.contains(&text), "{text} is not in {texts:?}");
+        }
+        let size = |name: &str| document.root_element().attribute(name).unwrap().parse::<f64>().unwrap();
+        assert!(size("width") < 400.0, "{}", size("width"));
+        assert!(map.clone().with_limit(f64::NAN).is_err() && map.with_limit(-1.0).is_err());
     }
 
     #[test]
