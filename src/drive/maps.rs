@@ -94,7 +94,7 @@ pub(super) fn save(
 fn save_pictures(task: &Task, files: &mut Files, map: &ErrorMap) -> Result<(), ReportError> {
     let title =
         if task.simulation { "Error of the part, filtered (SIMULATION)" } else { "Error of the part, filtered" };
-    let mut picture = HeatMap::of_lengths(title, "deviation", &map.samples_mm())?;
+    let mut picture = HeatMap::of_lengths(title, "deviation", &map.samples_mm())?.of_nodes();
     if let Some(outline) = task.nominal.outline() {
         picture = picture.within(outline);
     }

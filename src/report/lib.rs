@@ -5,6 +5,9 @@
 //!                                               +-> SVG   the PNG inside axes, with a colour bar
 //!  series of (x, y) --------------> ticks ------+-> SVG
 //!  points with deviations --------> colours --------> PLY
+//!
+//!  records of a run -> told --------> words ---------> a line for each record
+//!                        +----------> story ---------> the report of the run, HTML with its maps
 //! ```
 //!
 //! A figure is a plain value until it is saved, and the same figure gives the same bytes. Frame: maps are drawn over x and y
@@ -13,12 +16,15 @@
 mod axis;
 mod colour;
 mod heat_map;
+mod maps;
 mod plot;
 mod ply;
 mod raster;
 mod run;
 mod states;
+mod story;
 mod svg;
+mod told;
 mod words;
 
 use std::path::Path;

@@ -4,32 +4,43 @@ use std::fmt::Write;
 
 use serde_json::Value;
 
+use super::told::Told;
 use regrind_cell::{
-    Command, CompensationRefusal, Device, Ending, Event, Figures, Gate, GateFailure, Mismatch, Occupation,
-    Reconciliation, RecordFailure,
+    Alarm, Command, CompensationRefusal, Device, Ending, Event, Figures, Gate, GateFailure, Judgement, Mismatch,
+    Occupation, Reconciliation, RecordFailure, Role,
 };
-use regrind_journal::{Kind, Record};
+use regrind_journal::Record;
 
 /// Returns what a record says, in one line. What this version of the program cannot read stands as it was written.
 pub fn words(record: &Record) -> String {
-    let value = record.value();
-    let told = match record.kind {
-        Kind::Begin => begin_words(&value),
-        Kind::Reopen => Some("opened again".to_owned()),
-        Kind::Intent => serde_json::from_value(value.clone()).ok().map(|command: Command| command_words(&command)),
-        Kind::Outcome => value["event"].as_str().map(|event| format!("answered: {}", event.replace('_', " "))),
-        Kind::Event => serde_json::from_value(value.clone()).ok().map(|event: Event| event_words(&event)),
-        Kind::Artefact => artefact_words(&value),
-        Kind::End => end_words(&value),
-        Kind::Seal => seal_words(&value),
-        Kind::Note => None,
-    };
-    let mut line = told.unwrap_or_else(|| value.as_str().map_or_else(|| record.payload.clone(), str::to_owned));
+    let told = told_words(&Told::of(record));
+    let as_written = || record.value().as_str().map_or_else(|| record.payload.clone(), str::to_owned);
+    let mut line = told.unwrap_or_else(as_written);
     if !record.reason.is_empty() {
         let _ = write!(line, " ({})", record.reason);
     }
     // Words may come from a machine; what controls a terminal stays out.
     line.replace(|c: char| c.is_control(), " ")
+}
+
+fn told_words(told: &Told) -> Option<String> {
+    match told {
+        Told::Begun(value) => begin_words(value),
+        Told::OpenedAgain => Some("opened again".to_owned()),
+        Told::Command(command) => Some(command_words(command)),
+        Told::Event(event) => Some(event_words(event)),
+        Told::Answer(answer) => Some(format!("answered: {answer}")),
+        Told::Word(device, value) => person_words(*device, value),
+        Told::Step(device, value) => step_words(*device, value),
+        Told::Remarks(device, remarks) => Some(format!("{device}: {}", remarks.join("; "))),
+        Told::Pass(value) => pass_words(value),
+        Told::Transfer(value) => transfer_words(value),
+        Told::File(value) => artefact_words(value),
+        Told::Seal(value) => seal_words(value),
+        Told::End(ending, _) => Some(ending_words(ending)),
+        Told::Home(home) => Some(home_words(*home)),
+        Told::Unknown => None,
+    }
 }
 
 fn begin_words(value: &Value) -> Option<String> {
@@ -54,11 +65,62 @@ fn seal_words(value: &Value) -> Option<String> {
     Some(format!("sealed up to record {}, key {}...", value["records"], key.get(..12).unwrap_or(key)))
 }
 
-fn end_words(value: &Value) -> Option<String> {
-    let ending = &value["ending"];
-    // The drive puts the ending beside the figures of all cycles.
-    let ending = ending.get("ending").filter(|inner| inner.is_object()).unwrap_or(ending);
-    serde_json::from_value(ending.clone()).ok().map(|ending: Ending| ending_words(&ending))
+/// A person's word about a machine: what is so, with which map, by which file.
+fn person_words(device: Device, value: &Value) -> Option<String> {
+    let mut line = format!("{device}: {}", value["confirmed"].as_str()?);
+    for key in ["map", "file"] {
+        if let Some(text) = value[key].as_str() {
+            let _ = write!(line, ", {key} {text}");
+        }
+    }
+    Some(line)
+}
+
+fn step_words(device: Device, value: &Value) -> Option<String> {
+    let (step, seen) = (value["recover"].as_str()?, value["seen"].as_str().unwrap_or("not told"));
+    Some(format!("{device}: to be brought home by {step}, it was seen {seen}"))
+}
+
+/// Whether each machine is home, CMM and grinder.
+pub(super) fn home_words(home: [bool; 2]) -> String {
+    let of = |(device, home): (Device, bool)| format!("{device} {}", if home { "home" } else { "not home" });
+    Device::BOTH.into_iter().zip(home).map(of).collect::<Vec<_>>().join(", ")
+}
+
+/// What a grinder tells of a pass; what it does not tell is left out.
+fn pass_words(value: &Value) -> Option<String> {
+    let number = |key: &str| value[key].as_f64();
+    let told = [
+        number("path_mm").map(|mm| format!("path {mm:.0$} mm", usize::from(mm < 100.0))),
+        number("removed_mm3").map(|mm3| format!("{mm3:.1} mm3 taken off")),
+        number("deepest_mm").map(|mm| format!("{:.1} um at the deepest", 1e3 * mm)),
+        number("idle_share").map(|share| format!("{:.0} % of the path in air", 1e2 * share)),
+        number("spindle_load").map(|share| format!("spindle load {:.0} %", 1e2 * share)),
+        number("wheel_radius_mm").map(|mm| format!("wheel radius {mm:.4} mm")),
+        number("temperature_c").map(|c| format!("{c:.1} C")),
+        number("duration_s").map(|s| format!("{s:.0} s")),
+    ];
+    let told: Vec<String> = told.into_iter().flatten().collect();
+    if told.is_empty() {
+        Some("pass: nothing is told of it".into())
+    } else {
+        Some(format!("pass: {}", told.join(", ")))
+    }
+}
+
+fn transfer_words(value: &Value) -> Option<String> {
+    let (points, seconds) = (value["points"].as_u64()?, value["seconds"].as_f64()?);
+    let mut line = format!("{points} points fetched in {seconds:.2} s");
+    if let Some(ms) = value["ms_per_point"].as_f64() {
+        let _ = write!(line, ", {ms:.3} ms a point");
+    }
+    match value["coordinates"].as_str() {
+        Some("centres") => line += ", probe centres",
+        Some("contacts") => line += ", contact points",
+        Some(other) => line = format!("{line}, {other}"),
+        None => {}
+    }
+    Some(line)
 }
 
 /// Returns how a run ended, and why.
@@ -91,12 +153,33 @@ fn named(name: &str, device: Option<Device>) -> String {
     device.map_or_else(|| spaced(name), |device| format!("{device}: {}", spaced(name)))
 }
 
+/// How a cycle was judged, and why.
+pub(super) fn judgement_words(judgement: &Judgement) -> String {
+    format!("judged, {}: {}", verdict_words(judgement), judgement.reason)
+}
+
+/// The verdict, by the name that it has in `result.json`.
+pub(super) fn verdict_words(judgement: &Judgement) -> String {
+    spaced(&format!("{:?}", judgement.verdict))
+}
+
+/// What happened, what follows, what to do.
+pub(super) fn alarm_words(alarm: &Alarm) -> String {
+    format!("{} {} {}", alarm.what, alarm.consequence, alarm.remedy.join(" "))
+}
+
+/// Who may clear an alarm.
+pub(super) fn role_words(alarm: &Alarm) -> String {
+    match alarm.clears {
+        Role::Nobody => "itself".to_owned(),
+        role => spaced(&format!("{role:?}")),
+    }
+}
+
 fn command_words(command: &Command) -> String {
     match command {
-        Command::Announce(judgement) => {
-            format!("judged, {}: {}", spaced(&format!("{:?}", judgement.verdict)), judgement.reason)
-        }
-        Command::Raise(alarm) => format!("ALARM {}; {}", alarm.what, alarm.consequence),
+        Command::Announce(judgement) => judgement_words(judgement),
+        Command::Raise(alarm) => format!("ALARM {} {}", alarm.what, alarm.consequence),
         Command::Withdraw { alarm } => format!("alarm over: {}", spaced(&format!("{alarm:?}"))),
         Command::Refuse { event, state, why } => format!("{} refused in {state}: {why}", spaced(event.name())),
         Command::Finish(ending) => format!("finish, {}", ending_words(ending)),
@@ -184,7 +267,8 @@ fn reconciliation_words(outcome: &Reconciliation) -> String {
     }
 }
 
-fn gate_words(gate: &Gate) -> String {
+/// Whether a measurement is usable, and why not.
+pub(super) fn gate_words(gate: &Gate) -> String {
     match gate {
         Gate::Passed => "usable".to_owned(),
         Gate::Failed(GateFailure::NoPart) => "not usable: nothing was touched".to_owned(),

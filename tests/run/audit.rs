@@ -75,6 +75,10 @@ fn orders() -> Vec<Order> {
     ]
 }
 
+/// A map of two by two nodes, one of them without a measurement.
+const MAP: &str =
+    "# cycle: 1\nx_mm,y_mm,error_mm,sigma_mm,valid\n0,0,0.001,0,1\n1,0,-0.002,0,1\n0,1,0.0005,0,1\n1,1,0.5,0,0\n";
+
 /// A folder with one run in `runs/`, as a drive would have recorded it.
 fn recorded(simulation: bool) -> (TempDir, PathBuf) {
     let home = tempfile::tempdir().unwrap();
@@ -94,12 +98,18 @@ fn recorded(simulation: bool) -> (TempDir, PathBuf) {
         let payload = serde_json::to_value(event).unwrap();
         journal.append(Entry::new(Kind::Event, 10 + k as u64, 1, payload)).unwrap();
     }
+    // Only what is answered is an intent; what the cell tells beside it is a note.
     for order in orders() {
-        journal.intend(Entry::new(Kind::Intent, 20, 2, serde_json::to_value(order).unwrap())).unwrap();
+        let payload = serde_json::to_value(&order).unwrap();
+        if matches!(order, Order::StartMachine { .. }) {
+            journal.intend(Entry::new(Kind::Intent, 20, 2, payload)).unwrap();
+        } else {
+            journal.append(Entry::new(Kind::Note, 20, 2, payload)).unwrap();
+        }
     }
     journal.append(Entry::new(Kind::Note, 30, 2, json!({ "pass_record": { "path_mm": 12.5 } }))).unwrap();
     journal.store("cycle-2/measured.csv", b"1,2,3\n", 40, 2).unwrap();
-    journal.store("cycle-1/error_map.png", b"\x89PNG", 40, 1).unwrap();
+    journal.store("cycle-1/error_map.csv", MAP.as_bytes(), 40, 1).unwrap();
     let ending = Ending::Accepted { cycle: 2, reason: "in tolerance".into() };
     journal
         .close(
@@ -211,9 +221,9 @@ fn the_table_says_what_happened_and_is_marked() {
         "grinder: fault, 5, drive [2J too warm",
         "registered, PV 4.20 um, rms 0.812 um, 812 points, 3 outliers; the part is warm",
         "intent        2  grinder: start",
-        "ALARM A machine is in fault: grinder.; The run is aborted.",
+        "ALARM A machine is in fault: grinder. The run is aborted.",
         "judged, accept: in tolerance",
-        "{\"pass_record\":{\"path_mm\":12.5}}",
+        "pass: path 12.5 mm",
         "end           2  ACCEPTED: in tolerance",
     ];
     for words in said {
@@ -223,7 +233,7 @@ fn the_table_says_what_happened_and_is_marked() {
     let rows =
         |arguments: &[&str]| printed(home.path(), &[&["audit", "show"], arguments].concat(), 0).lines().count() - 2;
     assert_eq!(rows(&[]), 14);
-    assert_eq!(rows(&["--kind", "intent"]), 4);
+    assert_eq!(rows(&["--kind", "intent"]), 1);
     assert_eq!(rows(&["--kind", "intent,note", "--cycle", "2"]), 5);
     assert_eq!(rows(&["--cycle", "9"]), 0);
     assert_eq!(printed(home.path(), &["audit", "show", "--kind", "event", "--json"], 0).lines().count(), 4);
@@ -450,15 +460,16 @@ fn the_report_of_a_run_is_one_file_that_needs_nothing_else() {
     for words in said {
         assert!(all.contains(words), "{words}\n{all}");
     }
-    let image = document.descendants().find(|node| node.has_tag_name("img")).unwrap();
-    assert_eq!(image.attribute("src"), Some("data:image/png;base64,iVBORw=="));
+    assert!(all.contains("PV of the map 3.00 \u{b5}m") && all.contains("3 nodes"), "{all}");
+    let image = document.descendants().find(|node| node.has_tag_name("image")).unwrap();
+    assert!(image.attribute("href").unwrap().starts_with("data:image/png;base64,iVBORw"));
     assert!(!html.contains("http"), "nothing is fetched");
     printed(home.path(), &["audit", "verify"], 0);
     let (other, _) = recorded(false);
     printed(other.path(), &["report"], 0);
     assert!(!fs::read_to_string(other.path().join("runs/mirror-1/report.html")).unwrap().contains("SIMULATION"));
-    fs::remove_file(folder.join("cycle-1/error_map.png")).unwrap();
-    assert!(refused(home.path(), &["report"], 1).contains("cycle-1/error_map.png is missing"));
+    fs::remove_file(folder.join("cycle-1/error_map.csv")).unwrap();
+    assert!(refused(home.path(), &["report"], 1).contains("cycle-1/error_map.csv is missing"));
     printed(home.path(), &["report", "."], 2);
 }
 

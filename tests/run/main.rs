@@ -26,6 +26,7 @@ mod production;
 #[path = "../common/program.rs"]
 mod program;
 mod replay;
+mod reports;
 #[path = "../common/rig.rs"]
 mod rig;
 mod study;

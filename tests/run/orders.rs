@@ -270,6 +270,11 @@ async fn what_was_computed_and_cannot_be_written_holds_the_cell_and_is_computed_
     let raised = records(&folder, Kind::Note).into_iter().filter(|note| note["command"] == "raise");
     let alarms: Vec<_> = raised.map(|note| note["id"].clone()).collect();
     assert_eq!(alarms.first(), Some(&Value::from("journal_unwritable")), "{alarms:?}");
+    // The report tells it in words, and that the resumption took it back.
+    regrind::report::write_run_report(&folder).unwrap();
+    let alarms = crate::reports::Page::of(&folder).rows("alarms");
+    assert!(alarms[0][2].starts_with("The record of the run cannot be written"), "{alarms:?}");
+    assert!(alarms[0][1].ends_with("UTC"), "{alarms:?}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -1,0 +1,89 @@
+//! The maps in the report of a run: the first and the last cycle on one scale, and the last on its own.
+
+use std::fmt::Write;
+use std::path::Path;
+
+use serde_json::Value;
+
+use super::heat_map::HeatMap;
+use super::run::when;
+use super::story::Story;
+use super::{ReportError, range};
+use regrind_formats::{escaped, read_error_map};
+
+/// Largest map of a pair, and of one that stands alone, in pixels of the page.
+const OF_A_PAIR: [f64; 2] = [262.0, 262.0];
+const ALONE: [f64; 2] = [600.0, 460.0];
+
+/// What stands beside a map of that width, axes and colour bar, in pixels of the page.
+const BESIDE: f64 = 172.0;
+
+/// The map of a cycle with its heading.
+struct Drawn {
+    cycle: u32,
+    title: String,
+    part: String,
+    samples_um: Vec<[f64; 3]>,
+}
+
+impl Drawn {
+    fn largest_um(&self) -> f64 {
+        let [low, high] = range(self.samples_um.iter().map(|s| s[2]));
+        low.abs().max(high.abs())
+    }
+
+    /// The figure, from minus to plus a limit; in words why there is none.
+    fn figure(&self, limit_um: f64, largest: [f64; 2], caption: &str) -> Result<String, ReportError> {
+        let width = largest[0] + BESIDE;
+        let svg = HeatMap::new(&shortened(&self.title, width, 8.5), "deviation", "\u{b5}m", &self.samples_um)
+            .and_then(|map| map.of_nodes().at_most(largest).with_limit(limit_um))
+            .and_then(|map| map.with_lines(vec![shortened(&self.part, width, 6.8)]).to_svg());
+        let drawn = match svg {
+            // Within HTML it needs no name of its language.
+            Ok(svg) => svg.replacen(" xmlns=\"http://www.w3.org/2000/svg\"", "", 1),
+            Err(ReportError::File(error)) => return Err(error.into()),
+            Err(why) => format!("<p>No map: {}</p>\n", escaped(&why.to_string())),
+        };
+        Ok(format!("<figure>{drawn}<figcaption>Cycle {}, {caption}</figcaption></figure>\n", self.cycle))
+    }
+}
+
+/// Cuts a text where it would be wider than so many pixels.
+fn shortened(text: &str, width: f64, letter: f64) -> String {
+    let most = (width / letter) as usize;
+    if text.chars().count() <= most {
+        return text.to_owned();
+    }
+    text.chars().take(most.saturating_sub(1)).chain(['\u{2026}']).collect()
+}
+
+/// Draws the maps on record.
+pub(super) fn maps(story: &Story, folder: &Path, begin: &Value) -> Result<String, ReportError> {
+    let mapped = || story.cycles.iter().filter_map(|(cycle, told)| Some((*cycle, told.map.as_ref()?)));
+    let Some(last) = mapped().next_back() else { return Ok(String::new()) };
+    let first = mapped().next().filter(|(cycle, _)| *cycle != last.0);
+    let part = begin["content"]["part_name"].as_str().unwrap_or("Part");
+    let serial = story.begin.as_ref().map_or("", |begin| begin.part.as_str());
+    let mark = if begin["simulation"] == true { " (SIMULATION)" } else { "" };
+    let read = |(cycle, (name, utc)): (u32, &(String, String))| -> Result<Drawn, ReportError> {
+        let nodes = read_error_map(&folder.join(name))?;
+        let samples_um = nodes.into_iter().map(|[x, y, error_mm]| [x, y, 1e3 * error_mm]).collect();
+        let title = format!("Cycle {cycle}, {}{mark}", when(utc));
+        Ok(Drawn { cycle, title, part: format!("{part}, {serial}"), samples_um })
+    };
+    let (first, last) = (first.map(read).transpose()?, read(last)?);
+    let mut html = "<h2>Error of the part, filtered</h2>\n".to_owned();
+    if let Some(first) = first {
+        let common = first.largest_um().max(last.largest_um());
+        for drawn in [&first, &last] {
+            html += &drawn.figure(common, OF_A_PAIR, "on one scale")?;
+        }
+    }
+    html += &last.figure(last.largest_um(), ALONE, "on its own scale")?;
+    let _ = writeln!(
+        html,
+        "<p>Red stands proud of the nominal surface, blue lies below it, near white is zero. The maps are filtered; PV and RMS of a map \
+         are not those that are judged.</p>"
+    );
+    Ok(html)
+}

@@ -1,0 +1,198 @@
+//! What the journal tells of a run, as far as a report shows it.
+
+use std::collections::BTreeMap;
+
+use serde_json::Value;
+
+use super::told::Told;
+use super::words::{gate_words, words};
+use regrind_cell::{Alarm, Command, Ending, Event, Figures, Gate, Judgement, Tolerance};
+use regrind_journal::Record;
+
+/// The map of a cycle's error, as text.
+const MAP: &str = "error_map.csv";
+
+/// The figures of a cycle.
+const FIGURES: &str = "figures.json";
+
+#[derive(Default)]
+pub(super) struct Story {
+    pub(super) begin: Option<Record>,
+    pub(super) end: Option<Record>,
+    pub(super) ending: Option<Ending>,
+    /// Whether each machine came home, where this is the record of a recovery.
+    pub(super) home: Option<[bool; 2]>,
+    pub(super) cycles: BTreeMap<u32, CycleStory>,
+    pub(super) alarms: Vec<AlarmStory>,
+    pub(super) orders: Vec<Order>,
+}
+
+#[derive(Default)]
+pub(super) struct CycleStory {
+    pub(super) measurements: Vec<Measurement>,
+    /// Height of the surface that was wanted over the nominal one.
+    pub(super) level_um: Option<f64>,
+    /// Name of the map within the run folder, and when it came on record.
+    pub(super) map: Option<(String, String)>,
+    /// Name of the file of figures within the run folder.
+    pub(super) form: Option<String>,
+}
+
+/// A measurement of a cycle: what was found, or why there is nothing.
+#[derive(Default)]
+pub(super) struct Measurement {
+    pub(super) figures: Option<Figures>,
+    pub(super) unusable: Option<String>,
+    /// A judgement may be amended: the last counts.
+    pub(super) judgements: Vec<Judgement>,
+}
+
+pub(super) struct AlarmStory {
+    pub(super) alarm: Alarm,
+    pub(super) raised: String,
+    pub(super) withdrawn: Option<String>,
+}
+
+/// What a person ordered, or said of a machine.
+pub(super) struct Order {
+    pub(super) record: Record,
+    /// As the cell took it in; none for what goes to a machine past the cell.
+    event: Option<Event>,
+    pub(super) refused: Option<String>,
+}
+
+impl Story {
+    pub(super) fn take(&mut self, record: Record) {
+        match Told::of(&record) {
+            Told::Begun(_) => self.begin = Some(record),
+            Told::Command(command) => self.take_command(record, *command),
+            Told::Event(event) => self.take_event(record, *event),
+            Told::Word(..) | Told::Step(..) => self.orders.push(Order { record, event: None, refused: None }),
+            Told::File(file) => self.take_file(&record, file["name"].as_str().unwrap_or_default()),
+            Told::End(ending, cycles) => {
+                self.take_levels(&cycles);
+                self.ending = Some(ending);
+                self.end = Some(record);
+            }
+            Told::Home(home) => {
+                self.home = Some(home);
+                self.end = Some(record);
+            }
+            Told::Unknown if record.kind == regrind_journal::Kind::End => self.end = Some(record),
+            Told::OpenedAgain
+            | Told::Answer(_)
+            | Told::Remarks(..)
+            | Told::Pass(_)
+            | Told::Transfer(_)
+            | Told::Seal(_)
+            | Told::Unknown => {}
+        }
+    }
+
+    fn take_command(&mut self, record: Record, command: Command) {
+        match command {
+            Command::LoadPass { cycle } | Command::LoadPlan { cycle } => drop(self.cycle(cycle)),
+            Command::Announce(judgement) => self.measurement(judgement.cycle).judgements.push(judgement),
+            Command::Raise(alarm) => {
+                self.alarms.push(AlarmStory { alarm, raised: record.utc, withdrawn: None });
+            }
+            Command::Withdraw { alarm } => {
+                let standing = |a: &&mut AlarmStory| a.alarm.id == alarm && a.withdrawn.is_none();
+                self.alarms.iter_mut().filter(standing).for_each(|a| a.withdrawn = Some(record.utc.clone()));
+            }
+            Command::Refuse { event, why, .. } => {
+                let given = |order: &&mut Order| order.event.as_ref() == Some(&*event) && order.refused.is_none();
+                if let Some(order) = self.orders.iter_mut().rev().find(given) {
+                    order.refused = Some(why);
+                }
+            }
+            Command::Finish(ending) => self.ending = Some(ending),
+            _ => {}
+        }
+    }
+
+    fn take_event(&mut self, record: Record, event: Event) {
+        match event {
+            Event::Collected { cycle, gate, .. } => {
+                let unusable = Some(&gate).filter(|gate| **gate != Gate::Passed).map(gate_words);
+                self.cycle(cycle).measurements.push(Measurement { unusable, ..Measurement::default() });
+            }
+            Event::Registered { cycle, figures } => {
+                // What was judged keeps its figures.
+                if self.measurement(cycle).figures.is_some() {
+                    self.cycle(cycle).measurements.push(Measurement::default());
+                }
+                self.measurement(cycle).figures = Some(figures);
+            }
+            Event::RegistrationFailed { cycle, why } => {
+                self.measurement(cycle).unusable = Some(format!("not registered: {why}"));
+            }
+            event if event.actor().is_some() => {
+                self.orders.push(Order { record, event: Some(event), refused: None });
+            }
+            _ => {}
+        }
+    }
+
+    fn take_file(&mut self, record: &Record, name: &str) {
+        // What was computed again after an interruption stands in a folder of its own; the last counts.
+        if !name.starts_with(&format!("cycle-{}/", record.cycle)) {
+            return;
+        }
+        if name.ends_with(&format!("/{MAP}")) {
+            self.cycle(record.cycle).map = Some((name.to_owned(), record.utc.clone()));
+        } else if name.ends_with(&format!("/{FIGURES}")) {
+            self.cycle(record.cycle).form = Some(name.to_owned());
+        }
+    }
+
+    fn take_levels(&mut self, cycles: &Value) {
+        for row in cycles.as_array().into_iter().flatten() {
+            if let Some(cycle) = row["cycle"].as_u64().and_then(|cycle| u32::try_from(cycle).ok()) {
+                self.cycle(cycle).level_um = row["level_um"].as_f64();
+            }
+        }
+    }
+
+    fn cycle(&mut self, number: u32) -> &mut CycleStory {
+        self.cycles.entry(number).or_default()
+    }
+
+    /// The last measurement of a cycle.
+    fn measurement(&mut self, number: u32) -> &mut Measurement {
+        let measurements = &mut self.cycle(number).measurements;
+        if measurements.is_empty() {
+            measurements.push(Measurement::default());
+        }
+        let last = measurements.len() - 1;
+        &mut measurements[last]
+    }
+
+    /// What the recipe accepts, as the run began with it; none where the record does not tell.
+    pub(super) fn tolerance(&self) -> Option<Tolerance> {
+        let begin = self.begin.as_ref()?.value();
+        serde_json::from_value(begin["content"]["plan"]["tolerance"].clone()).ok()
+    }
+
+    /// The last measurement with figures, and its cycle.
+    pub(super) fn last_found(&self) -> Option<(u32, &Measurement, &Figures)> {
+        let all = self.cycles.iter().flat_map(|(cycle, story)| story.measurements.iter().map(|of| (*cycle, of)));
+        all.rev().find_map(|(cycle, of)| Some((cycle, of, of.figures.as_ref()?)))
+    }
+}
+
+impl Order {
+    pub(super) fn words(&self) -> String {
+        words(&self.record)
+    }
+
+    /// What became of it.
+    pub(super) fn answer(&self) -> String {
+        match (&self.refused, &self.event) {
+            (Some(why), _) => format!("refused: {why}"),
+            (None, Some(_)) => "taken".to_owned(),
+            // It went to the machine, and the record goes on with what came of it.
+            (None, None) => "on record".to_owned(),
+        }
+    }
+}

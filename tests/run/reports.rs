@@ -1,0 +1,436 @@
+//! The report of a run, held against its result and its record: what it says of the end, of the cycles, of alarms and of orders.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::program::{Running, regrind, root, run, small_recipe};
+use regrind::cell::{
+    Actor, AlarmId, Command, Ending, Event, Figures, Gate, GateFailure, Judgement, Phase, State, Tolerance, Verdict,
+    samples,
+};
+use regrind::journal::{Entry, Header, Journal, Kind, Reader};
+use regrind::report::{run_report, write_run_report};
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+/// What a person sees of a report.
+pub struct Page {
+    html: String,
+}
+
+impl Page {
+    /// The report that lies in the folder of a run, which is the one that its record gives.
+    pub fn of(folder: &Path) -> Self {
+        let html = fs::read_to_string(folder.join("report.html")).unwrap();
+        assert_eq!(html, run_report(folder).unwrap());
+        Self { html }
+    }
+
+    /// The text of every element that will do.
+    fn texts(&self, will_do: impl Fn(&roxmltree::Node) -> bool) -> Vec<String> {
+        let document = roxmltree::Document::parse(self.html.strip_prefix("<!DOCTYPE html>\n").unwrap()).unwrap();
+        document.descendants().filter(will_do).map(text_of).collect()
+    }
+
+    /// How the run ended, and whether that is shown as good.
+    pub fn verdict(&self) -> (String, bool) {
+        let [good, bad] = ["good", "bad"].map(|class| {
+            let found = self.texts(|node| node.has_tag_name("p") && node.attribute("class") == Some(class));
+            found.into_iter().next()
+        });
+        let is_good = good.is_some();
+        (good.or(bad).expect("a verdict"), is_good)
+    }
+
+    /// The rows of a table, cell by cell, without its head.
+    pub fn rows(&self, table: &str) -> Vec<Vec<String>> {
+        let document = roxmltree::Document::parse(self.html.strip_prefix("<!DOCTYPE html>\n").unwrap()).unwrap();
+        let table =
+            document.descendants().find(|node| node.has_tag_name("table") && node.attribute("id") == Some(table));
+        let rows = table.into_iter().flat_map(|table| table.descendants().filter(|node| node.has_tag_name("tr")));
+        let cells = |row: roxmltree::Node| row.children().filter(|node| node.has_tag_name("td")).map(text_of).collect();
+        rows.map(cells).filter(|cells: &Vec<String>| !cells.is_empty()).collect()
+    }
+
+    /// The measurements of the cycles: number, verdict and figures, and why.
+    fn cycles(&self) -> Vec<Vec<String>> {
+        self.rows("cycles").chunks(2).map(<[Vec<String>]>::concat).collect()
+    }
+
+    pub fn says(&self, words: &str) -> bool {
+        self.texts(|node| node.has_tag_name("body"))[0].contains(words)
+    }
+}
+
+fn text_of(node: roxmltree::Node) -> String {
+    node.descendants().filter(|node| node.is_text()).filter_map(|node| node.text()).collect()
+}
+
+fn json_in(folder: &Path, name: &str) -> Value {
+    serde_json::from_slice(&fs::read(folder.join(name)).unwrap()).unwrap()
+}
+
+fn the_run(home: &Path) -> PathBuf {
+    fs::read_dir(home.join("runs")).unwrap().next().unwrap().unwrap().path()
+}
+
+fn arguments(recipe: &Path) -> Vec<String> {
+    let cell = root().join("config/sim.toml").display().to_string();
+    let fixed = ["--cell", &cell, "--runs", "runs", "--part", "SN 12", "--operator", "Ada"].map(str::to_owned);
+    ["run".to_owned(), recipe.display().to_string()].into_iter().chain(fixed).collect()
+}
+
+/// A run that grinds, slowly enough that it still does when the test has done with it.
+fn grinding(home: &Path) -> (Running, PathBuf) {
+    let arguments = arguments(&small_recipe(home, 100.0));
+    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    let mut running = Running::new(regrind(&arguments, home));
+    let folder = running.folder(home);
+    running.line("grinding", |line| line.contains("grinding"));
+    (running, folder)
+}
+
+/// The words of each record of a run, as `audit show` prints them, with the kinds.
+fn shown(folder: &Path) -> Vec<(String, String)> {
+    let (code, out, errors) = run(&["audit", "show", folder.to_str().unwrap()], folder);
+    assert_eq!(code, 0, "{errors}");
+    let row = |line: &str| {
+        let kind = line.split_whitespace().find(|word| word.parse::<Kind>().is_ok())?.to_owned();
+        Some((kind, line.to_owned()))
+    };
+    out.lines().skip(2).filter_map(row).collect()
+}
+
+#[test]
+fn the_report_of_an_accepted_run_says_what_its_result_and_its_record_say() {
+    let home = tempfile::tempdir().unwrap();
+    let arguments = arguments(&small_recipe(home.path(), 1e4));
+    let (code, out, errors) = run(&arguments.iter().map(String::as_str).collect::<Vec<_>>(), home.path());
+    assert_eq!(code, 0, "{out}{errors}");
+    let folder = the_run(home.path());
+    let page = Page::of(&folder);
+    let result = json_in(&folder, "result.json");
+    let reason = result["ending"]["reason"].as_str().unwrap();
+    assert_eq!(page.verdict(), (format!("ACCEPTED: {reason}"), true));
+    let (rows, cycles) = (page.cycles(), result["cycles"].as_array().unwrap());
+    assert_eq!(rows.len(), cycles.len(), "{rows:?}");
+    for (row, cycle) in rows.iter().zip(cycles) {
+        let number = &cycle["cycle"];
+        let of_cycle = json_in(&folder, &format!("cycle-{number}/result.json"));
+        let um = |key: &str| format!("{:.2}", 1e3 * of_cycle["figures"][key].as_f64().unwrap());
+        let row = row.join("|");
+        assert!(row.starts_with(&format!("{number}|")), "{row}");
+        let verdict = of_cycle["verdict"].as_str().unwrap().replace('_', " ");
+        for words in [&um("pv_robust_mm"), &um("pv_expanded_mm"), &verdict, of_cycle["reason"].as_str().unwrap()] {
+            assert!(row.contains(words), "{words}: {row}");
+        }
+    }
+    assert!(page.says("No alarm was raised."));
+    let orders = page.rows("orders");
+    assert!(orders[0][1].starts_with("Ada at ") && orders[0][2] == "start", "{orders:?}");
+    let shown = shown(&folder);
+    for (kind, words) in &shown {
+        assert!(!words.contains('{'), "a {kind} is raw: {words}");
+    }
+    assert!(shown.iter().any(|(kind, _)| kind == "note"), "{shown:#?}");
+    maps_are_drawn(&page, cycles.len());
+    let said = |words: &str| shown.iter().any(|(kind, row)| kind == "note" && row.contains(words));
+    for words in ["judged, continue: ", "judged, accept: ", &format!("finish, ACCEPTED: {reason}")] {
+        assert!(said(words), "{words}: {shown:#?}");
+    }
+}
+
+/// The first and the last map on one scale and the last on its own, each with axes, colour bar and a name.
+fn maps_are_drawn(page: &Page, cycles: usize) {
+    let figures = page.texts(|node| node.has_tag_name("figure"));
+    assert_eq!(figures.len(), 3);
+    for (figure, cycle) in figures.iter().zip([1, cycles, cycles]) {
+        for words in [
+            &format!("Cycle {cycle}, 20"),
+            "UTC (SIMULATION)",
+            "free-form mirror, SN 12",
+            "x / mm",
+            "y / mm",
+            "deviation / \u{b5}m",
+            "PV of the map",
+        ] {
+            assert!(figure.contains(words), "{words}: {figure}");
+        }
+    }
+    // The labels behind the upright name of y are those of the colour bar.
+    let bar = |figure: &str| figure.split("y / mm").nth(1).unwrap().split("deviation").next().unwrap().to_owned();
+    assert_eq!(bar(&figures[0]), bar(&figures[1]));
+    assert_ne!(bar(&figures[1]), bar(&figures[2]));
+}
+
+#[test]
+fn the_judged_figure_stands_beside_its_limit_and_every_other_says_what_it_is() {
+    let home = tempfile::tempdir().unwrap();
+    let arguments = arguments(&small_recipe(home.path(), 1e4));
+    let (code, out, errors) = run(&arguments.iter().map(String::as_str).collect::<Vec<_>>(), home.path());
+    assert_eq!(code, 0, "{out}{errors}");
+    let folder = the_run(home.path());
+    let page = Page::of(&folder);
+    let last = json_in(&folder, "result.json")["ending"]["cycle"].clone();
+    let figures = json_in(&folder, &format!("cycle-{last}/result.json"))["figures"].clone();
+    let um = |key: &str| 1e3 * figures[key].as_f64().unwrap();
+    let judged = page.rows("judged");
+    let expected = [("PV 99.8 %", "pv_robust_mm", "pv_expanded_mm", 7.0), ("RMS", "rms_mm", "rms_expanded_mm", 1.0)];
+    assert_eq!(judged.len(), 2, "{judged:?}");
+    for (row, (name, found, expanded, limit)) in judged.iter().zip(expected) {
+        assert!(row[0].starts_with(name), "{row:?}");
+        let numbers = [format!("{:.2}", um(found)), format!("\u{b1} {:.2}", um(expanded)), format!("{limit:.2}")];
+        assert_eq!(row[1..4], numbers, "{row:?}");
+        assert!(row[4].contains("within"), "{row:?}");
+        assert!(row[4].contains(&format!("{:.2}", um(found) + um(expanded))), "{row:?}");
+    }
+    let bold = page.texts(|node| node.has_tag_name("strong"));
+    assert_eq!(
+        bold,
+        [format!("{:.2}", um("pv_robust_mm")), format!("{:.2}", um("rms_mm"))],
+        "one figure of each judges"
+    );
+    assert!(page.says("ISO 14253-1"));
+    // What is called alike is the same number everywhere.
+    let form = json_in(&folder, &format!("cycle-{last}/figures.json"))["figures"].clone();
+    let named = |name: &str| form.as_array().unwrap().iter().find(|row| row["name"] == name).unwrap().clone();
+    for (name, key) in [("PV 99.8 %", "pv_robust_mm"), ("PV", "pv_mm"), ("RMS", "rms_mm")] {
+        let value = named(name)["value"].as_f64().unwrap();
+        assert!((value / um(key) - 1.0).abs() < 1e-9, "{name}: {value} beside {}", um(key));
+    }
+    for name in ["PV", "PVr", "PV 99.8 %", "RMS", "highest (stock left)", "lowest (undercut)"] {
+        assert!(!named(name)["made"].as_str().unwrap().is_empty(), "{name} does not say what it is");
+    }
+}
+
+#[test]
+fn the_report_of_a_stopped_run_says_who_stopped_it_and_that_nothing_was_measured() {
+    let home = tempfile::tempdir().unwrap();
+    let (mut running, folder) = grinding(home.path());
+    running.signal("TERM");
+    assert_eq!(running.end().0, 3);
+    let page = Page::of(&folder);
+    let ending = json_in(&folder, "result.json")["ending"].clone();
+    assert_eq!(ending["ending"], "stopped");
+    assert_eq!(page.verdict(), (format!("STOPPED: {}", ending["reason"].as_str().unwrap()), false));
+    let orders = page.rows("orders");
+    let stop = orders.last().unwrap();
+    assert!(stop[1].starts_with("Ada at ") && stop[2] == "stop, SIGTERM" && stop[3] == "taken", "{orders:?}");
+    let cycles = page.cycles();
+    assert!(cycles.len() == 1 && cycles[0].join("|").contains("not measured"), "{cycles:?}");
+}
+
+#[test]
+fn the_report_of_an_aborted_run_says_so_and_which_order_was_refused() {
+    let home = tempfile::tempdir().unwrap();
+    let (mut running, folder) = grinding(home.path());
+    let path = folder.to_str().unwrap();
+    let (code, out, refused) = run(&["resume", path, "--reason", "too early"], home.path());
+    assert_eq!(code, 3, "{out}{refused}");
+    let (code, out, errors) = run(&["abort", path, "--reason", "smoke"], home.path());
+    assert_eq!(code, 0, "{out}{errors}");
+    assert_eq!(running.end().0, 3);
+    let page = Page::of(&folder);
+    let ending = json_in(&folder, "result.json")["ending"].clone();
+    assert_eq!((&ending["ending"], &ending["confirmed"]), (&json!("aborted"), &json!(true)));
+    assert_eq!(page.verdict(), (format!("ABORTED: {}", ending["reason"].as_str().unwrap()), false));
+    let orders = page.rows("orders");
+    let [.., resume, abort] = orders.as_slice() else { panic!("{orders:?}") };
+    assert!(resume[2] == "resume, too early" && resume[3].starts_with("refused: "), "{orders:?}");
+    assert!(abort[2] == "abort, smoke" && abort[3] == "taken", "{orders:?}");
+}
+
+/// A record that is written here as a drive writes it: events, commands with an answer as intents, all others as notes.
+struct Written {
+    home: TempDir,
+    journal: Journal,
+    at: u64,
+}
+
+impl Written {
+    fn new(content: Value) -> Self {
+        let home = tempfile::tempdir().unwrap();
+        let header = Header {
+            run: "mirror-1".into(),
+            part: "SN 7".into(),
+            actor: "Ada".into(),
+            station: "console".into(),
+            simulation: false,
+            first_command_id: 1,
+            content,
+        };
+        let journal = Journal::create(home.path().join("runs/mirror-1"), header).unwrap();
+        Self { home, journal, at: 0 }
+    }
+
+    fn entry(&mut self, kind: Kind, payload: Value) -> Entry {
+        self.at += 1;
+        Entry::new(kind, self.at, 1, payload)
+    }
+
+    fn event(&mut self, event: Event) {
+        let (actor, station) = event.origin();
+        let entry = self.entry(Kind::Event, serde_json::to_value(event).unwrap());
+        self.journal.append(Entry { actor, station, ..entry }).unwrap();
+    }
+
+    fn told(&mut self, command: Command) {
+        let entry = self.entry(Kind::Note, serde_json::to_value(command).unwrap());
+        self.journal.append(entry).unwrap();
+    }
+
+    fn note(&mut self, payload: Value) {
+        let entry = self.entry(Kind::Note, payload);
+        self.journal.append(entry).unwrap();
+    }
+
+    fn ended(self, ending: &Ending) -> (TempDir, PathBuf) {
+        let Self { home, journal, at } = self;
+        let folder = journal.folder().to_owned();
+        journal.close(at, 1, json!({ "simulation": false, "ending": ending, "cycles": [] })).unwrap();
+        write_run_report(&folder).unwrap();
+        (home, folder)
+    }
+}
+
+fn ada() -> Actor {
+    Actor { name: "Ada".into(), station: "console".into() }
+}
+
+/// An alarm as the cell raises it.
+fn raised(id: &str, what: &str) -> Command {
+    let alarm = json!({ "command": "raise", "id": id, "what": what, "consequence": "The cell is held.",
+        "remedy": ["Look at it.", "Resume."], "clears": "operator" });
+    serde_json::from_value(alarm).unwrap()
+}
+
+fn aborted() -> Ending {
+    Ending::Aborted { cycle: 1, confirmed: false, reason: "smoke".into() }
+}
+
+#[test]
+fn alarms_stand_in_words_with_when_they_were_raised_and_when_withdrawn() {
+    let mut written = Written::new(Value::Null);
+    written.event(Event::Start { actor: ada() });
+    written.told(raised("link_lost", "The link to a machine is lost: grinder."));
+    written.told(Command::Withdraw { alarm: AlarmId::LinkLost });
+    written.told(raised("link_lost", "The link to a machine is lost: CMM."));
+    written.told(raised("machine_fault", "A machine is in fault: grinder."));
+    written.told(Command::Withdraw { alarm: AlarmId::LinkLost });
+    written.told(Command::Finish(aborted()));
+    let (_home, folder) = written.ended(&aborted());
+    let page = Page::of(&folder);
+    let alarms = page.rows("alarms");
+    let [grinder, cmm, fault] = alarms.as_slice() else { panic!("{alarms:?}") };
+    for (row, words) in [(grinder, "lost: grinder."), (cmm, "lost: CMM."), (fault, "in fault: grinder.")] {
+        assert!(row[2].contains(words) && row[2].contains("The cell is held. Look at it. Resume."), "{row:?}");
+    }
+    let times: Vec<String> =
+        Reader::open(&folder).unwrap().records(1).map(|r| r.unwrap().utc[11..19].to_owned()).collect();
+    assert!(grinder[0].contains(&times[2]) && grinder[1].contains(&times[3]), "{grinder:?} {times:?}");
+    assert!(cmm[1].contains(&times[6]), "{cmm:?} {times:?}");
+    assert_eq!(fault[1], "not withdrawn");
+    assert!(page.verdict().0.starts_with("ABORTED, and not every machine has confirmed that it stands: smoke"));
+    let shown = shown(&folder);
+    let said = |words: &str| shown.iter().any(|(_, row)| row.contains(words));
+    assert!(said("ALARM A machine is in fault: grinder. The cell is held."), "{shown:#?}");
+    assert!(said("alarm over: link lost"), "{shown:#?}");
+}
+
+#[test]
+fn a_cycle_without_figures_says_why_and_an_amended_judgement_shows_both() {
+    let mut written = Written::new(Value::Null);
+    written.event(Event::Start { actor: ada() });
+    let failed = |words: &str| Gate::Failed(GateFailure::Coverage(words.into()));
+    written.event(Event::Collected { cycle: 1, targets: 100, found: 12, gate: failed("12 % found, 95 % are needed") });
+    written.event(Event::Collected { cycle: 1, targets: 100, found: 100, gate: Gate::Passed });
+    written.event(Event::Registered { cycle: 1, figures: figures() });
+    let judged = |verdict, reason: &str| Command::Announce(Judgement { cycle: 1, verdict, reason: reason.into() });
+    written.told(judged(Verdict::Continue, "not yet in tolerance"));
+    written.told(judged(Verdict::BudgetSpent, "no material is left"));
+    written.event(Event::Collected { cycle: 2, targets: 100, found: 100, gate: Gate::Passed });
+    written.event(Event::RegistrationFailed { cycle: 2, why: "it did not converge".into() });
+    let (_home, folder) = written.ended(&Ending::NotAccepted { cycle: 2, reason: "no material is left".into() });
+    let page = Page::of(&folder);
+    let rows: Vec<String> = page.cycles().iter().map(|row| row.join("|")).collect();
+    assert_eq!(rows.len(), 3, "{rows:?}");
+    assert!(rows[0].contains("12 % found, 95 % are needed") && rows[2].contains("it did not converge"), "{rows:?}");
+    let last = ["budget spent", "no material is left", "first judged, continue: not yet in tolerance"];
+    assert!(last.iter().all(|words| rows[1].contains(words)), "{rows:?}");
+    // The end is on record also where the command to finish is not.
+    assert_eq!(page.verdict(), ("NOT ACCEPTED: no material is left".into(), false));
+}
+
+fn figures() -> Figures {
+    let found = samples(1).into_iter().find_map(|event| match event {
+        Event::Registered { figures, .. } => Some(figures),
+        _ => None,
+    });
+    found.unwrap()
+}
+
+#[test]
+fn no_record_of_a_run_is_shown_raw_whatever_kind_it_stands_as() {
+    let mut written = Written::new(Value::Null);
+    samples(1).into_iter().for_each(|event| written.event(event));
+    let refused = Event::Resume { actor: ada(), reason: "go".into() };
+    let state = State::Execute(Phase::Load);
+    written.told(Command::Refuse { event: Box::new(refused), state, why: "it is not held".into() });
+    for command in [raised("link_lost", "Lost."), Command::Withdraw { alarm: AlarmId::LinkLost }] {
+        written.told(command);
+    }
+    for payload in [
+        json!({ "pass_record": { "path_mm": 1250.0, "removed_mm3": 12.5, "deepest_mm": 0.02, "idle_share": 0.25,
+            "spindle_load": null, "wheel_radius_mm": 12.5, "temperature_c": 21.0, "duration_s": 75.0 } }),
+        json!({ "transfer": { "points": 812, "seconds": 0.5, "ms_per_point": 0.616, "coordinates": "centres" } }),
+        json!({ "device": "cmm", "notes": ["waits for a file", "left alone: old.csv"] }),
+        json!({ "confirmed": "done", "device": "grinder", "map": "3fa9c210", "file": null }),
+    ] {
+        written.note(payload);
+    }
+    let step = written.entry(Kind::Intent, json!({ "recover": "CLEAR", "device": "grinder", "seen": "FAULTED" }));
+    let command_id = Some(written.journal.intend(step).unwrap());
+    let found = written.entry(Kind::Outcome, json!({ "found": "IDLE" }));
+    written.journal.append(Entry { command_id, ..found }).unwrap();
+    let (_home, folder) = written.ended(&aborted());
+    let shown = shown(&folder);
+    for (kind, words) in &shown {
+        assert!(!words.contains('{') && !words.contains("  null"), "a {kind} is raw: {words}");
+    }
+    let said = |words: &str| assert!(shown.iter().any(|(_, row)| row.contains(words)), "{words}: {shown:#?}");
+    said(
+        "pass: path 1250 mm, 12.5 mm3 taken off, 20.0 um at the deepest, 25 % of the path in air, wheel radius 12.5000 mm, 21.0 C, 75 s",
+    );
+    said("812 points fetched in 0.50 s, 0.616 ms a point, probe centres");
+    said("CMM: waits for a file; left alone: old.csv");
+    said("grinder: done, map 3fa9c210");
+    said("grinder: to be brought home by CLEAR, it was seen FAULTED");
+    said("answered: IDLE");
+    // What a person says of a machine is an order like any other, and one that was refused says why.
+    let orders: Vec<String> = Page::of(&folder).rows("orders").iter().map(|row| row.join("|")).collect();
+    for words in ["grinder: done, map 3fa9c210", "grinder: to be brought home by CLEAR"] {
+        assert!(orders.iter().any(|row| row.contains(words)), "{words}: {orders:#?}");
+    }
+}
+
+#[test]
+fn without_a_limit_or_with_one_of_another_time_nothing_is_invented() {
+    let tolerance = Tolerance { pv_mm: f64::INFINITY, ..tolerance() };
+    let of = |content: Value| {
+        let mut written = Written::new(content);
+        written.event(Event::Registered { cycle: 1, figures: figures() });
+        written.ended(&aborted())
+    };
+    let (_home, folder) = of(json!({ "plan": { "tolerance": tolerance } }));
+    let judged = Page::of(&folder).rows("judged");
+    assert!(judged[0][3] == "no limit" && judged[0][4].is_empty(), "{judged:?}");
+    assert!(judged[1][3] == "1.00" && !judged[1][4].is_empty(), "{judged:?}");
+    let (_home, folder) = of(Value::Null);
+    let page = Page::of(&folder);
+    assert!(page.rows("judged").is_empty() && page.cycles().len() == 1);
+}
+
+fn tolerance() -> Tolerance {
+    use regrind::cell::PvOf;
+    Tolerance { pv_mm: 0.007, rms_mm: 0.001, with_uncertainty: true, pv_of: PvOf::MostPoints }
+}
