@@ -309,9 +309,11 @@ impl<'s> Happening<'s> {
         let is_plain = self.schedule.baud.is_none() && self.schedule.fault_share == 0.0;
         let hindered = is_plain.then(|| self.hindered.lock().unwrap().clone());
         let wires = self.wires.lock().unwrap().clone();
-        // The program may have died with its end on record.
+        // The program may have died with its end on record, before anybody heard of it.
         let finish = written.iter().rev().find(|recorded| recorded.payload["command"] == "finish");
-        let ended_well = match (finish.and_then(|finish| finish.payload["ending"].as_str()), self.schedule.wanted) {
+        let told = ending.as_ref().and_then(|ending| serde_json::to_value(ending).ok());
+        let told = told.as_ref().or(finish.map(|finish| &finish.payload)).and_then(|told| told["ending"].as_str());
+        let ended_well = match (told, self.schedule.wanted) {
             (Some("accepted"), Wanted::Good) | (Some("not_accepted"), Wanted::Perfect) => true,
             // What went wrong may have ended it.
             _ => !self.schedule.dies_alone(),
