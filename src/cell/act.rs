@@ -330,6 +330,18 @@ impl Cell {
         }
     }
 
+    /// A person says that a job is over of which the machine tells nothing. It may stand there with its result, and would refuse
+    /// the next job: it is asked to forget it, now if it can be.
+    pub(super) fn declared_over(&mut self, device: Device) {
+        let discard = Phase::of(device, JobStep::Discard);
+        if self.knows(device).ready && !self.causes.contains(&Cause::Link(device)) {
+            self.go(Holding(discard));
+            self.push(Command::Acknowledge { device });
+        } else {
+            self.go(Held(discard));
+        }
+    }
+
     pub(super) fn acknowledged(&mut self, phase: Phase) {
         match phase {
             Grind(JobStep::Acknowledge) => self.advance(Transfer),
@@ -498,22 +510,24 @@ impl Cell {
 
     /// A machine moves while the cell shows that it stands: it is told to hold, and a person is told.
     pub(super) fn moves_unasked(&mut self, phase: Phase, device: Device) {
-        let told = self.raised.contains(&AlarmId::MovesUnasked);
+        let astray = self.knows(device).astray;
         if phase.moving() == Some(device) {
             // That it goes on is then a person's decision, whatever it was suspended for.
             self.go(Holding(Phase::of(device, JobStep::Run)));
-        } else if told {
+        } else if astray {
             return;
         }
-        self.know(device).clear = false;
+        let known = self.know(device);
+        (known.clear, known.astray) = (false, true);
         self.raise(AlarmId::MovesUnasked, &device.to_string());
         self.push(Command::HoldMachine { device });
     }
 
     /// A machine that no order of the cell has set going moves: it is told to hold, and so is what moves beside it.
     pub(super) fn strays(&mut self, phase: Phase, device: Device) {
-        self.know(device).clear = false;
-        if self.raised.contains(&AlarmId::MovesUnasked) {
+        let known = self.know(device);
+        known.clear = false;
+        if std::mem::replace(&mut known.astray, true) {
             return;
         }
         let what = phase.moving().map_or(String::new(), |moves| format!(", while the {moves} is at its job"));
@@ -597,6 +611,7 @@ impl Cell {
     }
 
     fn resume_connected(&mut self, phase: Phase) {
+        self.known.iter_mut().for_each(|known| known.astray = false);
         let standing: Vec<_> = self.raised.iter().copied().collect();
         for alarm in standing {
             if !matches!(alarm, AlarmId::LinkLost | AlarmId::ConditionLost) || self.causes.is_empty() {
@@ -715,9 +730,12 @@ impl Cell {
     fn machine_restarted(&mut self, device: Device) {
         self.raise(AlarmId::MachineRestarted, &device.to_string());
         let Some(phase) = self.state.phase() else { return };
-        let before_start = matches!(restart_of(phase).job(), Some((_, JobStep::Send)));
-        if phase.job().map(|(job, _)| job) == Some(device) && !before_start {
-            self.go(Held(Phase::of(device, JobStep::Reconcile)));
+        let Some((_, step)) = restart_of(phase).job().filter(|(job, _)| *job == device) else { return };
+        match step {
+            JobStep::Send => {}
+            // That the job is over is known; whether its result is still there is asked again.
+            JobStep::Acknowledge | JobStep::Discard => self.go(Held(phase)),
+            _ => self.go(Held(Phase::of(device, JobStep::Reconcile))),
         }
     }
 
@@ -750,6 +768,7 @@ impl Cell {
     }
 
     pub(super) fn machine_held(&mut self, device: Device) -> Result<(), String> {
+        self.know(device).astray = false;
         let at_job = running(self.state) == Some(device);
         let run = Phase::of(device, JobStep::Run);
         match self.state {
@@ -899,10 +918,8 @@ impl Cell {
     }
 
     fn abort_those_that_move(&mut self) {
-        for device in Device::BOTH {
-            if self.knows(device).met && !self.knows(device).stands {
-                self.push(Command::AbortMachine { device });
-            }
+        for device in self.met_and_not_standing() {
+            self.push(Command::AbortMachine { device });
         }
     }
 
@@ -1023,8 +1040,7 @@ impl Cell {
     }
 
     fn abort_is_due(&mut self) {
-        let unconfirmed: Vec<_> =
-            Device::BOTH.into_iter().filter(|device| self.knows(*device).met && !self.knows(*device).stands).collect();
+        let unconfirmed = self.met_and_not_standing();
         if unconfirmed.is_empty() {
             self.raise(AlarmId::NotClear, "not both were seen clear in time");
             return self.aborted(true);

@@ -9,7 +9,7 @@ use super::event::{Asked, Event, JobResult};
 use super::memory::{Cause, Cell};
 use super::state::{Device, JobStep, Phase, State};
 
-use Phase::{Compensate, Grind, Load, Measure, Register, Transfer};
+use Phase::{Compensate, Grind, Load, Measure, Register};
 use State::{
     Aborting, Completing, Execute, Held, Holding, Idle, Starting, Stopping, Suspended, Suspending, Unholding,
     Unsuspending,
@@ -86,13 +86,12 @@ impl Cell {
             (Suspended(phase), Event::Hold { .. }) => self.hold_suspended(phase),
             (Holding(_) | Held(_), Event::Hold { .. }) => {}
             (Held(phase), Event::Resume { .. }) => self.resume(phase)?,
-            (Held(Grind(JobStep::Reconcile)), Event::DeclaredOver { device: Device::Grinder, .. }) => {
-                self.go(Held(Transfer))
-            }
+            (Held(Grind(JobStep::Reconcile)), Event::DeclaredOver { device: device @ Device::Grinder, .. })
             // A result that is gone, with the machine's memory or a file, is measured once more too.
-            (Held(Measure(JobStep::Reconcile | JobStep::Collect)), Event::DeclaredOver { device: Device::Cmm, .. }) => {
-                self.measure_anew()
-            }
+            | (
+                Held(Measure(JobStep::Reconcile | JobStep::Collect)),
+                Event::DeclaredOver { device: device @ Device::Cmm, .. },
+            ) => self.declared_over(*device),
             (Execute(Load), Event::LoadConfirmed { .. }) => self.first_cycle(),
             (state, Event::ClearConfirmed { device, .. })
                 if state.phase().is_some() && running(state) != Some(*device) =>

@@ -35,6 +35,8 @@ pub(super) struct Known {
     pub(super) stands: bool,
     /// Whether it is in manual mode.
     pub(super) manual: bool,
+    /// Whether it moves without an order, was told to hold, and has not said yet that it stands.
+    pub(super) astray: bool,
 }
 
 /// A cell in the middle of a run.
@@ -105,6 +107,28 @@ impl Cell {
     /// Returns the state.
     pub fn state(&self) -> State {
         self.state
+    }
+
+    /// Returns the state in words for people. Whatever has not confirmed that it stands is named beside a state that says so.
+    pub fn in_words(&self) -> String {
+        match (self.state, &self.unconfirmed()[..]) {
+            (State::Aborted, [device]) => format!("{}: the {device} has not confirmed that it stands", self.state),
+            (State::Aborted, [_, _]) => format!("{}: neither machine has confirmed that it stands", self.state),
+            (state, _) => state.to_string(),
+        }
+    }
+
+    /// Returns the machines that have not confirmed that they stand, in a state that is taken for standing still.
+    pub fn unconfirmed(&self) -> Vec<Device> {
+        match self.state {
+            State::Aborted => self.met_and_not_standing(),
+            state => state.unconfirmed().into_iter().collect(),
+        }
+    }
+
+    pub(super) fn met_and_not_standing(&self) -> Vec<Device> {
+        let known = |device: Device| self.known[device as usize];
+        Device::BOTH.into_iter().filter(|device| known(*device).met && !known(*device).stands).collect()
     }
 
     /// Returns the number of the cycle; 0 before the first.

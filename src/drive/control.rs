@@ -103,6 +103,9 @@ pub struct Snapshot {
     /// The phase in which it is or will go on, and the step of a machine's job in it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub phase: Option<Phase>,
+    /// The machines that have not confirmed that they stand, in a state that is taken for standing still.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub unconfirmed: Vec<Device>,
     /// State and phase, for people.
     #[serde(rename = "words")]
     pub message: String,

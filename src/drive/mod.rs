@@ -483,9 +483,11 @@ impl Drive {
         if let Request::Resume { seen: Some(seen), .. } = request
             && seen != self.states
         {
-            let message = format!("the cell has changed since you saw it; now it is {}", self.cell.state());
+            let message = format!("the cell has changed since you saw it; now it is {}", self.cell.in_words());
             // Who asked may have gone.
-            drop(answer.map(|answer| answer.send(Reply { accepted: false, message, status: self.snapshot() })));
+            if let Some(answer) = answer {
+                drop(answer.send(Reply { accepted: false, message, status: self.snapshot() }));
+            }
             return;
         }
         let event = match request {
@@ -504,7 +506,7 @@ impl Drive {
         let (refusal, ticket) = self.take(event, None).await;
         if let Some(answer) = answer {
             let accepted = refusal.is_none();
-            let message = refusal.unwrap_or_else(|| self.cell.state().to_string());
+            let message = refusal.unwrap_or_else(|| self.cell.in_words());
             self.backlog.push_back(Waiting { ticket, then: Then::Answer { answer, accepted, message } });
             self.answer_without_record();
         }
@@ -533,7 +535,9 @@ impl Drive {
             };
             let message = told.as_ref().err().unwrap_or(&status.message).clone();
             let reply = Reply { accepted: told.is_ok(), message, status };
-            let _ = answer.map(|answer| answer.send(reply));
+            if let Some(answer) = answer {
+                let _ = answer.send(reply);
+            }
         });
     }
 
@@ -943,11 +947,9 @@ impl Drive {
             }
             Event::Registered { cycle, figures } => Notice::Figures { cycle: *cycle, figures: figures.clone() },
             Event::Compensated { cycle, summary } => Notice::Compensated { cycle: *cycle, summary: summary.clone() },
-            event => Notice::State {
-                state: self.cell.state().to_string(),
-                cycle: self.cell.cycle(),
-                event: event.name().to_owned(),
-            },
+            event => {
+                Notice::State { state: self.cell.in_words(), cycle: self.cell.cycle(), event: event.name().to_owned() }
+            }
         };
         self.notify(notice);
     }
@@ -959,7 +961,8 @@ impl Drive {
             simulation: self.task.simulation,
             state: state.name(),
             phase: state.phase(),
-            message: state.to_string(),
+            unconfirmed: self.cell.unconfirmed(),
+            message: self.cell.in_words(),
             number: self.states,
             cycle: self.cell.cycle(),
             seconds: self.now().as_secs_f64(),

@@ -488,7 +488,7 @@ impl<B: StationDriver> MachineTask<B> {
                 Ok(status) if status.state == State::Held => self.tell(Event::MachineHeld { device: B::DEVICE }).await,
                 // On its way there already, by its key or a button: the next looks see it arrive.
                 Ok(status) if status.state == State::Holding => self.note(&status).await,
-                Ok(status) if status.state == State::Complete => self.note(&status).await,
+                Ok(status) if status.state == State::Complete && self.seen.running => self.note(&status).await,
                 Ok(status) if !status.state.moves() => self.tell(Event::MachineHeld { device: B::DEVICE }).await,
                 Ok(_) => self.failed(Asked::Hold, error).await,
                 Err(error) => self.lost(&error).await,

@@ -38,6 +38,8 @@ pub struct Shown {
     pub at: Instant,
     pub state: Option<StateName>,
     pub phase: Option<Phase>,
+    /// Which machines were named as not having confirmed that they stand.
+    pub unconfirmed: [bool; 2],
 }
 
 /// What is left of a schedule.
@@ -255,25 +257,52 @@ fn never_both(evidence: &Evidence) -> Result<(), String> {
     Ok(())
 }
 
-/// Where the cell shows that it stands, nothing moves.
-fn still_where_shown(evidence: &Evidence) -> Result<(), String> {
+/// A machine that moves, from when to when, and whether nobody had ordered it.
+struct Motion {
+    machine: usize,
+    from: Instant,
+    to: Instant,
+    strayed: bool,
+}
+
+fn motions(evidence: &Evidence) -> Vec<Motion> {
     let last = evidence.log.last().map_or(evidence.began, |moment| moment.at) + Duration::from_secs(60);
-    let states = states(evidence);
-    for (k, shown) in evidence.shown.iter().enumerate() {
-        if !shown.state.is_some_and(|state| STANDS.contains(&state)) {
-            continue;
+    let mut motions: Vec<Motion> = Vec::new();
+    let mut strayed = [false; 2];
+    for moment in &evidence.log {
+        let (machine, from) = (moment.machine, moment.at);
+        match moment.what {
+            What::Strayed => strayed[machine] = true,
+            What::Changed { to: State::Execute, .. } => {
+                motions.push(Motion { machine, from, to: last, strayed: std::mem::take(&mut strayed[machine]) });
+            }
+            What::Changed { from: State::Execute, .. } => {
+                let open = motions.iter_mut().rfind(|motion| motion.machine == machine);
+                open.expect("it moved").to = moment.at;
+            }
+            _ => {}
         }
-        let until = evidence.shown.get(k + 1).map_or(last, |next| next.at);
-        let from = shown.at + STANDS_WITHIN;
-        for (j, (at, now)) in states.iter().enumerate() {
-            let to = states.get(j + 1).map_or(last, |next| next.0);
-            if now.contains(&State::Execute) && from.max(*at) < until.min(to) {
-                let at = evidence.seconds(from.max(*at));
-                return Err(format!(
-                    "{now:?} at {at:.3} s, and the cell shows {:?} since {:.3} s",
-                    shown.state,
-                    evidence.seconds(shown.at)
-                ));
+    }
+    motions
+}
+
+/// Where the cell shows that it stands, nothing moves, but what it names as not having confirmed the end of the safe sequence. What
+/// goes astray once the run is over, or in the moment before, nobody watches any more.
+fn still_where_shown(evidence: &Evidence) -> Result<(), String> {
+    let motions = motions(evidence);
+    for (k, shown) in evidence.shown.iter().enumerate() {
+        let Some(state) = shown.state.filter(|state| STANDS.contains(state)) else { continue };
+        let next = evidence.shown.get(k + 1).map(|next| next.at);
+        let over = state != StateName::Held;
+        for motion in &motions {
+            let (from, to) =
+                (motion.from.max(shown.at + STANDS_WITHIN), next.map_or(motion.to, |at| motion.to.min(at)));
+            let is_named = state == StateName::Aborted && shown.unconfirmed[motion.machine];
+            let is_unseen = over && motion.strayed && motion.from + FOUND_WITHIN > shown.at;
+            if from < to && !is_named && !is_unseen {
+                let (name, at) = (NAMES[motion.machine], evidence.seconds(from));
+                let since = evidence.seconds(shown.at);
+                return Err(format!("the {name} moves at {at:.3} s, and the cell shows {state} since {since:.3} s"));
             }
         }
     }

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
-use regrind::cell::Ending;
+use regrind::cell::{Device, Ending};
 use regrind::device::{Link, ModbusCmm, ModbusGrinder, ModbusSettings};
 use regrind::drive::{Beside, Blocking, Drive, Interrupted, Orders, Run};
 use regrind::journal::{AuditKey, Header, Journal, Kind, Reader, RunLock, verify};
@@ -203,7 +203,12 @@ impl<'s> Happening<'s> {
         };
         watching.abort();
         // Nobody sees the cell of a program that is not there.
-        self.shown.lock().unwrap().push(Shown { at: Instant::now(), state: None, phase: None });
+        self.shown.lock().unwrap().push(Shown {
+            at: Instant::now(),
+            state: None,
+            phase: None,
+            unconfirmed: [false; 2],
+        });
         *self.orders.lock().unwrap() = None;
         life.end();
         self.nets.iter().for_each(Net::hang_up);
@@ -346,14 +351,14 @@ fn has_events(folder: &Path) -> bool {
 async fn watch(orders: Orders, life: Arc<Life>, shown: Arc<Mutex<Vec<Shown>>>) {
     let mut status = orders.status();
     loop {
-        let (state, phase) = {
+        let (state, phase, unconfirmed) = {
             let seen = status.borrow_and_update();
-            (seen.state, seen.phase)
+            (seen.state, seen.phase, Device::BOTH.map(|device| seen.unconfirmed.contains(&device)))
         };
         if life.is_dead() {
             return;
         }
-        shown.lock().unwrap().push(Shown { at: Instant::now(), state: Some(state), phase });
+        shown.lock().unwrap().push(Shown { at: Instant::now(), state: Some(state), phase, unconfirmed });
         if status.changed().await.is_err() {
             return;
         }
