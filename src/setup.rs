@@ -93,6 +93,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         check_sphere(recipe, cell, &nominal, sphere)?;
     }
     let task = Task {
+        part: recipe.part.name.clone(),
         pass: pass(recipe, &nominal, part_identity),
         programs: programs(recipe, cell, &nominal, part_identity),
         nominal: Arc::new(nominal),

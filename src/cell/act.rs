@@ -34,12 +34,13 @@ impl Cell {
     }
 
     pub(super) fn raise(&mut self, id: AlarmId, case: &str) {
-        self.raised.insert(id);
-        self.push(Command::Raise(Alarm::of(id, case)));
+        let alarm = Alarm::of(id, case);
+        self.raised.insert(id, alarm.clone());
+        self.push(Command::Raise(alarm));
     }
 
     fn withdraw(&mut self, alarm: AlarmId) {
-        if self.raised.remove(&alarm) {
+        if self.raised.remove(&alarm).is_some() {
             self.push(Command::Withdraw { alarm });
         }
     }
@@ -280,7 +281,7 @@ impl Cell {
     }
 
     /// Whether a person is being asked if the machine that has to be clear is.
-    fn asks_whether_clear(&self, phase: Phase) -> bool {
+    pub(super) fn asks_whether_clear(&self, phase: Phase) -> bool {
         awaits_clear(phase).is_some_and(|device| self.knows(device).asked_clear)
     }
 
@@ -612,7 +613,7 @@ impl Cell {
 
     fn resume_connected(&mut self, phase: Phase) {
         self.known.iter_mut().for_each(|known| known.astray = false);
-        let standing: Vec<_> = self.raised.iter().copied().collect();
+        let standing: Vec<_> = self.raised.keys().copied().collect();
         for alarm in standing {
             if !matches!(alarm, AlarmId::LinkLost | AlarmId::ConditionLost) || self.causes.is_empty() {
                 self.withdraw(alarm);
@@ -783,7 +784,7 @@ impl Cell {
             Unholding(_) | Unsuspending(_) if at_job => {}
             Held(_) | Suspended(_) if at_job => {}
             // It had no job, moved, and was told to hold.
-            _ if !at_job && self.raised.contains(&AlarmId::MovesUnasked) => {}
+            _ if !at_job && self.raised.contains_key(&AlarmId::MovesUnasked) => {}
             state => return Err(format!("the {device} has no job that could be held in the state {state}")),
         }
         Ok(())

@@ -1,9 +1,9 @@
 //! What the cell keeps between two events.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use super::alarm::AlarmId;
+use super::alarm::{Alarm, AlarmId};
 use super::command::Command;
 use super::event::{Condition, Figures};
 use super::plan::CellPlan;
@@ -51,7 +51,7 @@ pub struct Cell {
     pub(super) doubted: bool,
     pub(super) known: [Known; 2],
     pub(super) causes: BTreeSet<Cause>,
-    pub(super) raised: BTreeSet<AlarmId>,
+    pub(super) raised: BTreeMap<AlarmId, Alarm>,
     /// The figures of this cycle, and of the last one that was judged.
     pub(super) figures: Option<Figures>,
     pub(super) previous: Option<Figures>,
@@ -86,7 +86,7 @@ impl Cell {
             doubted: false,
             known: [Known::default(); 2],
             causes: BTreeSet::new(),
-            raised: BTreeSet::new(),
+            raised: BTreeMap::new(),
             figures: None,
             previous: None,
             worse: 0,
@@ -170,8 +170,13 @@ impl Cell {
     }
 
     /// Returns the alarms that stand.
-    pub fn alarms(&self) -> impl Iterator<Item = AlarmId> + '_ {
-        self.raised.iter().copied()
+    pub fn alarms(&self) -> impl Iterator<Item = &Alarm> + '_ {
+        self.raised.values()
+    }
+
+    /// Returns the machine of which a person is being asked whether it is clear of the part.
+    pub fn asks_whether_clear_of(&self) -> Option<Device> {
+        self.state.phase().filter(|phase| self.asks_whether_clear(*phase)).and_then(super::act::awaits_clear)
     }
 
     /// Returns when `Event::Deadline` is due, as time since the run began.

@@ -1,16 +1,19 @@
 //! `regrind hold | stop | abort | confirm | status`: a running cell from another terminal.
 
+use std::fmt::Write as _;
 use std::io;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use regrind::cell::Device;
-use regrind::drive::{CycleRow, Reply, Request, Snapshot, ask, is_live};
+use regrind::drive::{CycleRow, JobProgress, Reply, Request, Snapshot, ask, is_live};
 use regrind::journal::{Kind, Reader};
 
 use super::Outcome;
 use super::choice::word_of;
 use super::failure::Failure;
+use super::show::{how_far, limits, pv_name};
+use super::words::time_left;
 
 /// An order to a running cell.
 #[derive(Args, Debug)]
@@ -134,23 +137,52 @@ pub(super) fn give(run: Option<&Path>, request: &Request, json: bool) -> Result<
         }
         request => asked(request)?,
     };
-    show(&reply, request, json)?;
+    show(&reply, request, &folder, json)?;
     if reply.accepted { Ok(Outcome::Accepted) } else { Err(Failure::OrderRefused { message: reply.message }) }
 }
 
-fn show(reply: &Reply, request: &Request, json: bool) -> Result<(), Failure> {
+fn show(reply: &Reply, request: &Request, folder: &Path, json: bool) -> Result<(), Failure> {
     if json {
         return super::print_json(reply);
     }
     if *request != Request::Status {
         return if reply.accepted { super::print(&format!("{}\n", reply.message)) } else { Ok(()) };
     }
-    let Snapshot { simulation, message, cycle, cycles, .. } = &reply.status;
-    let mut text = format!("{}{message}, cycle {cycle}\n", if *simulation { "SIMULATION  " } else { "" });
-    for CycleRow { cycle, pv_um, rms_um, .. } in cycles {
-        text += &format!("cycle {cycle}: PV {pv_um:.2} um, rms {rms_um:.3} um\n");
+    super::print(&told(&reply.status, folder))
+}
+
+/// Says how a cell is, the most urgent first.
+fn told(status: &Snapshot, folder: &Path) -> String {
+    let mut text = String::new();
+    let marked = if status.simulation { "SIMULATION  " } else { "" };
+    let cycle = match status.cycle {
+        0 => "before the first cycle".to_owned(),
+        cycle => format!("cycle {cycle} of at most {}", status.max_cycles),
+    };
+    let _ = writeln!(text, "{marked}{}, {cycle}", status.message);
+    if let Some(JobProgress { device, done, total, left_s }) = status.progress {
+        let left = left_s.map_or(String::new(), |left_s| format!(", {} left", time_left(left_s)));
+        let _ = writeln!(text, "{}{left}", how_far(device, done, total));
     }
-    super::print(&text)
+    for alarm in &status.alarms {
+        let _ = writeln!(text, "ALARM    {}\n         {}", alarm.what, alarm.consequence);
+        for (k, remedy) in alarm.remedy.iter().enumerate() {
+            let _ = writeln!(text, "         {}. {remedy}", k + 1);
+        }
+    }
+    for waits in status.waits_for.iter().filter(|waits| **waits != status.next) {
+        let _ = writeln!(text, "{waits}");
+    }
+    let _ = writeln!(text, "next     {}", status.next);
+    let _ = writeln!(text, "part     {}, run {}", status.part, folder.display());
+    if let Some(tolerance) = status.tolerance.filter(|_| !status.cycles.is_empty()) {
+        let _ = writeln!(text, "limits   {}", limits(&tolerance));
+        for CycleRow { cycle, pv_um, judged_pv_um, rms_um, .. } in &status.cycles {
+            let (pv, pv_um) = (pv_name(&tolerance), judged_pv_um.unwrap_or(*pv_um));
+            let _ = writeln!(text, "cycle {cycle:<2} {pv} {pv_um:.2} um, RMS {rms_um:.3} um");
+        }
+    }
+    text
 }
 
 /// Returns the folder of a run that was named, or that of the newest run.

@@ -65,7 +65,9 @@ impl Live<'_> {
     pub(super) async fn carry_out(self, machines: Machines, work: Work) -> Result<Ending, Failure> {
         let (cell, actor) = (self.cell, self.actor);
         let (notices, shown) = mpsc::unbounded_channel();
-        let showing = tokio::spawn(Show::new(self.json, cell.simulated, self.recipe, self.folder).follow(shown));
+        let showing = tokio::spawn(
+            Show::new(self.json, cell.simulated, self.recipe, work.plan.tolerance, self.folder).follow(shown),
+        );
         let poll = [setup::poll(&cell.cmm.link), setup::poll(&cell.grinder.link)];
         let Work { task, plan, journal, loaded, interrupted } = work;
         let (journal, beside): (Box<dyn Ledger>, _) = (Box::new(journal), Beside::Threads);

@@ -1,18 +1,19 @@
 //! What a run shows while it runs: a bar on a terminal, plain lines elsewhere, JSON for programs.
 
+use std::collections::HashMap;
 use std::fmt::Write as _;
 use std::io::{self, IsTerminal};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use regrind::cell::{Alarm, Device, Ending, Figures, Judgement};
+use regrind::cell::{Alarm, AlarmId, Device, Ending, Figures, Judgement, PvOf, Tolerance};
 use regrind::drive::{CycleRow, Notice};
-use regrind::recipe::{Recipe, Um};
+use regrind::recipe::Recipe;
 use tokio::sync::mpsc;
 
 use super::failure::Failure;
-use super::words::three_digits;
+use super::words::{judged, three_digits, time_left};
 
 /// How long a line that says nothing new may be left out.
 const QUIET: Duration = Duration::from_secs(2);
@@ -22,30 +23,28 @@ pub(super) struct Show {
     json: bool,
     simulated: bool,
     head: String,
-    tolerance: String,
+    tolerance: Tolerance,
     folder: String,
     bar: Option<ProgressBar>,
     /// When a plain line about progress was printed last.
     said: Option<Instant>,
     job: Option<(Device, u32)>,
-    /// When the job was first seen, and how far it was then.
-    first: Option<(Instant, u32)>,
+    /// What was said of the alarms that stand.
+    alarms: HashMap<AlarmId, String>,
 }
 
 impl Show {
-    pub(super) fn new(json: bool, simulated: bool, recipe: &Recipe, folder: &Path) -> Self {
-        let limit = |name: &str, um: Option<Um>| um.map(|um| format!("{name} {} um", three_digits(um.0)));
-        let limits = [limit("PV", recipe.acceptance.pv_um), limit("rms", recipe.acceptance.rms_um)];
+    pub(super) fn new(json: bool, simulated: bool, recipe: &Recipe, tolerance: Tolerance, folder: &Path) -> Self {
         Self {
             json,
             simulated,
             head: format!("{}, {}", recipe.part.name, recipe.path().display()),
-            tolerance: limits.into_iter().flatten().collect::<Vec<_>>().join(", "),
+            tolerance,
             folder: folder.display().to_string(),
             bar: (!json && io::stderr().is_terminal()).then(bar),
             said: None,
             job: None,
-            first: None,
+            alarms: HashMap::new(),
         }
     }
 
@@ -53,7 +52,7 @@ impl Show {
     pub(super) async fn follow(mut self, mut notices: mpsc::UnboundedReceiver<Notice>) -> Result<(), Failure> {
         if !self.json {
             let marked = if self.simulated { "SIMULATION  " } else { "" };
-            self.line(&format!("{marked}{}; tolerance {}", self.head, self.tolerance))?;
+            self.line(&format!("{marked}{}; tolerance {}", self.head, limits(&self.tolerance)))?;
             self.line(&format!("record in {}", self.folder))?;
         }
         while let Some(notice) = notices.recv().await {
@@ -79,9 +78,15 @@ impl Show {
 
     fn show(&mut self, notice: &Notice) -> Result<(), Failure> {
         match notice {
-            Notice::Progress { device, cycle, done, total } => self.progress(*device, *cycle, *done, *total),
-            Notice::State { state, cycle, event } => {
+            Notice::Progress { device, cycle, done, total, left_s } => {
+                self.progress((*device, *cycle), *done, *total, *left_s)
+            }
+            Notice::State { state, cycle, event, at_job } => {
                 if let Some(bar) = &self.bar {
+                    // The bar of a job goes with it.
+                    if !at_job {
+                        bar.set_style(style("{wide_msg}"));
+                    }
                     bar.set_message(format!("cycle {cycle}  {state}"));
                 }
                 self.order(event)
@@ -114,8 +119,16 @@ impl Show {
                 ))?;
                 summary.warnings.iter().try_for_each(|warning| self.line(&format!("cycle {cycle}: {warning}")))
             }
-            Notice::Alarm(alarm) => self.alarm(alarm),
-            Notice::AlarmGone { .. } => Ok(()),
+            // It is on record each time; a person has seen it.
+            Notice::Alarm(alarm) if self.alarms.get(&alarm.id) == Some(&alarm.what) => Ok(()),
+            Notice::Alarm(alarm) => {
+                self.alarms.insert(alarm.id, alarm.what.clone());
+                self.alarm(alarm)
+            }
+            Notice::AlarmGone { alarm } => {
+                self.alarms.remove(alarm);
+                Ok(())
+            }
             Notice::Refused { why } => self.line(&format!("not done: {why}")),
             Notice::RecordFailed { message } => self.line(&format!("RECORD: {message}")),
             Notice::Finished { ending, cycles } => self.finished(ending, cycles),
@@ -136,55 +149,26 @@ impl Show {
         }
     }
 
-    fn progress(&mut self, device: Device, cycle: u32, done: u32, total: u32) -> Result<(), Failure> {
-        let job = Some((device, cycle));
-        if self.job != job {
-            self.first = Some((Instant::now(), done));
-        }
-        let what = match device {
-            Device::Cmm => "measuring",
-            Device::Grinder => "grinding",
-        };
+    fn progress(&mut self, job: (Device, u32), done: u32, total: u32, left_s: Option<[f64; 2]>) -> Result<(), Failure> {
+        let (device, cycle) = job;
+        let left = left_s.map_or(String::new(), |left_s| format!(", {} left", time_left(left_s)));
+        let is_new = self.job.replace(job) != Some(job);
         if let Some(bar) = &self.bar {
-            if self.job != job {
-                bar.reset();
-            }
+            bar.set_style(style("{wide_msg} [{bar:16}] {percent:>3} %"));
             bar.set_length(u64::from(total));
             bar.set_position(u64::from(done));
-            bar.set_message(format!("cycle {cycle}  {what}"));
-        } else if self.job != job || self.said.is_none_or(|at| at.elapsed() >= QUIET) {
+            bar.set_message(format!("cycle {cycle}  {}{left}", doing(device)));
+        } else if is_new || self.said.is_none_or(|at| at.elapsed() >= QUIET) {
             self.said = Some(Instant::now());
-            let of = match device {
-                Device::Cmm => format!("{done} of {total} points"),
-                Device::Grinder => format!("{:.1} % of the path", 100.0 * f64::from(done) / f64::from(total.max(1))),
-            };
-            self.line(&format!("cycle {cycle}: {what}, {of}{}", self.left(done, total)))?;
+            self.line(&format!("cycle {cycle}: {}{left}", how_far(device, done, total)))?;
         }
-        self.job = job;
         Ok(())
     }
 
-    /// Tells how long the job will still take at the pace so far; nothing before there is a pace.
-    fn left(&self, done: u32, total: u32) -> String {
-        let Some((began, from)) = self.first else { return String::new() };
-        let seconds = began.elapsed().as_secs_f64();
-        if done <= from || seconds < 0.5 {
-            return String::new();
-        }
-        let left_s = seconds / f64::from(done - from) * f64::from(total.saturating_sub(done));
-        if left_s < 90.0 { format!(", {left_s:.0} s left") } else { format!(", {:.0} min left", left_s / 60.0) }
-    }
-
     fn figures(&mut self, cycle: u32, figures: &Figures) -> Result<(), Failure> {
-        let um = |mm: f64| three_digits(1e3 * mm);
-        let mut text = format!(
-            "cycle {cycle}: PV {} um, rms {} um (tolerance {}); {} points, {} outliers",
-            um(figures.pv_mm),
-            um(figures.rms_mm),
-            self.tolerance,
-            figures.points,
-            figures.outliers
-        );
+        let [pv, rms] = self.tolerance.compare(figures).map(|compared| judged(&compared));
+        let (points, outliers) = (figures.points, figures.outliers);
+        let mut text = format!("cycle {cycle}: {pv}, {rms}; {points} points, {outliers} outliers");
         for words in figures.weak_directions.iter().chain(&figures.warnings) {
             let _ = write!(text, "\n         {words}");
         }
@@ -208,11 +192,13 @@ impl Show {
         };
         let mut text = String::new();
         if !cycles.is_empty() {
-            text += "\ncycle    PV um   rms um   points  outliers  level um\n";
+            let pv = format!("{} um", pv_name(&self.tolerance));
+            let _ = writeln!(text, "\ncycle {pv:>13}   RMS um   points  outliers  level um");
         }
         for row in cycles {
-            let CycleRow { cycle, pv_um, rms_um, points, outliers, level_um } = row;
-            let _ = writeln!(text, "{cycle:>5} {pv_um:>8.2} {rms_um:>8.3} {points:>8} {outliers:>9} {level_um:>9.1}");
+            let CycleRow { cycle, pv_um, judged_pv_um, rms_um, points, outliers, level_um } = row;
+            let pv_um = judged_pv_um.unwrap_or(*pv_um);
+            let _ = writeln!(text, "{cycle:>5} {pv_um:>13.2} {rms_um:>8.3} {points:>8} {outliers:>9} {level_um:>9.1}");
         }
         let marked = if self.simulated { "SIMULATION  " } else { "" };
         let _ = write!(text, "\n{marked}{word}: {reason}");
@@ -228,9 +214,44 @@ impl Show {
 }
 
 fn bar() -> ProgressBar {
-    let style = ProgressStyle::with_template("{msg:32} [{bar:40}] {pos}/{len}  {eta} left")
-        .unwrap_or_else(|_| ProgressStyle::default_bar());
-    ProgressBar::new(1).with_style(style)
+    ProgressBar::new(1).with_style(style("{wide_msg}"))
+}
+
+fn style(template: &str) -> ProgressStyle {
+    ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar())
+}
+
+/// Says what a machine does at its job.
+fn doing(device: Device) -> &'static str {
+    match device {
+        Device::Cmm => "measuring",
+        Device::Grinder => "grinding",
+    }
+}
+
+/// Says how far a job is.
+pub(super) fn how_far(device: Device, done: u32, total: u32) -> String {
+    match device {
+        Device::Cmm => format!("measuring, {done} of {total} points"),
+        Device::Grinder => {
+            format!("grinding, {:.1} % of the path", 100.0 * f64::from(done) / f64::from(total.max(1)))
+        }
+    }
+}
+
+/// Names the peak to valley that is judged.
+pub(super) fn pv_name(tolerance: &Tolerance) -> &'static str {
+    match tolerance.pv_of {
+        PvOf::All => "PV",
+        PvOf::MostPoints => "PV 99.8 %",
+    }
+}
+
+/// Says what is accepted.
+pub(super) fn limits(tolerance: &Tolerance) -> String {
+    let limits =
+        [(pv_name(tolerance), tolerance.pv_mm), ("RMS", tolerance.rms_mm)].into_iter().filter(|(_, mm)| mm.is_finite());
+    limits.map(|(name, mm)| format!("{name} {} um", three_digits(1e3 * mm))).collect::<Vec<_>>().join(", ")
 }
 
 /// The shares of the error that are taken back: one, or from the shortest waves to the longest.

@@ -1,5 +1,7 @@
 //! Numbers as people read them.
 
+use regrind::cell::Compared;
+
 /// A count with its thousands apart: 451,401.
 pub(super) fn count(n: usize) -> String {
     let digits = n.to_string();
@@ -31,9 +33,44 @@ pub(super) fn three_digits(value: f64) -> String {
     format!("{value:.*}", (3 - before_point).max(0) as usize)
 }
 
+/// Writes a figure that is judged, beside its limit if it has one.
+pub(super) fn judged(compared: &Compared) -> String {
+    let um = |mm: f64| three_digits(1e3 * mm);
+    let Compared { name, found_mm, limit_mm, .. } = compared;
+    let of = if limit_mm.is_finite() { format!(" of {}", um(*limit_mm)) } else { String::new() };
+    format!("{name} {}{of} um", um(*found_mm))
+}
+
+/// Writes the least and the most time that something will take.
+pub(super) fn time_left([least_s, most_s]: [f64; 2]) -> String {
+    let (unit, name) = match most_s {
+        s if s < 90.0 => (1.0, "s"),
+        s if s < 5400.0 => (60.0, "min"),
+        _ => (3600.0, "h"),
+    };
+    let digits = usize::from(name == "h");
+    let [least, most] = [least_s, most_s].map(|s| format!("{:.digits$}", s / unit));
+    if least == most { format!("{most} {name}") } else { format!("{least} to {most} {name}") }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_time_that_is_left_is_said_as_a_range() {
+        let cases = [
+            ([50.2, 50.4], "50 s"),
+            ([28.0, 81.0], "28 to 81 s"),
+            ([80.0, 100.0], "1 to 2 min"),
+            ([3000.0, 3010.0], "50 min"),
+            ([5000.0, 9000.0], "1.4 to 2.5 h"),
+            ([0.0, 0.0], "0 s"),
+        ];
+        for (left_s, text) in cases {
+            assert_eq!(time_left(left_s), text);
+        }
+    }
 
     #[test]
     fn numbers_read_well() {

@@ -11,8 +11,8 @@ use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::{mpsc, oneshot, watch};
 
-use super::notice::CycleRow;
-use crate::cell::{Actor, Device, Phase, StateName};
+use super::snapshot::Snapshot;
+use crate::cell::{Actor, Device};
 
 /// The socket in a run folder.
 const SOCKET: &str = "control.sock";
@@ -91,33 +91,6 @@ pub struct Reply {
     pub message: String,
     /// How the cell is after it.
     pub status: Snapshot,
-}
-
-/// How a running cell is.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Snapshot {
-    /// Whether any machine of it is simulated.
-    pub simulation: bool,
-    /// The state, by PackML's name.
-    pub state: StateName,
-    /// The phase in which it is or will go on, and the step of a machine's job in it.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub phase: Option<Phase>,
-    /// The machines that have not confirmed that they stand, in a state that is taken for standing still.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub unconfirmed: Vec<Device>,
-    /// State and phase, for people.
-    #[serde(rename = "words")]
-    pub message: String,
-    /// Counts the states since the run began, so that an order can say which one it is meant for.
-    #[serde(default)]
-    pub number: u64,
-    /// The number of the cycle; 0 before the first.
-    pub cycle: u32,
-    /// Time since the run began.
-    pub seconds: f64,
-    /// What is known of each cycle.
-    pub cycles: Vec<CycleRow>,
 }
 
 /// An order on its way to the loop.

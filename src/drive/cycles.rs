@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use super::CycleRow;
 use super::task::{Cycle, Product, Task};
+use crate::cell::Tolerance;
 use crate::device::{CorrectionMap, Pass, Plan};
 
 /// The cycles, by number.
@@ -70,12 +71,13 @@ impl Cycles {
     }
 
     /// What is shown of them.
-    pub(super) fn rows(&self) -> Vec<CycleRow> {
+    pub(super) fn rows(&self, tolerance: &Tolerance) -> Vec<CycleRow> {
         let rows = self.0.iter().filter_map(|(&cycle, c)| {
             let figures = c.figures.as_ref()?;
             Some(CycleRow {
                 cycle,
                 pv_um: 1e3 * figures.pv_mm,
+                judged_pv_um: Some(1e3 * tolerance.compare(figures)[0].found_mm),
                 rms_um: 1e3 * figures.rms_mm,
                 points: figures.points,
                 outliers: figures.outliers,

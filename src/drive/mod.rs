@@ -17,11 +17,13 @@ mod cycles;
 mod maps;
 mod notice;
 mod outcome;
+mod pace;
 mod pass_record;
 mod program;
 mod record;
 pub mod recover;
 mod replay;
+mod snapshot;
 mod station;
 mod task;
 mod work;
@@ -50,15 +52,19 @@ use crate::journal::{self, Artefact, Entry, Kind};
 
 pub use beside::{Beside, Blocking};
 use control::{Control, Ordered};
-pub use control::{Reply, Request, Snapshot, ask, is_live};
+pub use control::{Reply, Request, ask, is_live};
 use cycles::Cycles;
 pub use notice::{CycleRow, Notice};
+pub use pace::JobProgress;
+use pace::Pace;
 pub use program::{ProgramError, Programs};
 pub use record::Ledger;
 use record::{Files, Recorder, Ticket, entry};
 pub use replay::{Interrupted, ReplayError};
+pub use snapshot::Snapshot;
 use station::{
-    Aborts, Ask, CmmDriver, Fetched, GrinderDriver, Load, MachineTask, PULSE_EVERY, Pulse, StationDriver, StationReport,
+    Aborts, Ask, CmmDriver, Fetched, GrinderDriver, Load, MachineTask, Notes, PULSE_EVERY, Pulse, StationDriver,
+    StationReport,
 };
 use task::Product;
 pub use task::{Probing, Sphere, Task};
@@ -145,6 +151,9 @@ pub struct Drive {
     status: watch::Sender<Snapshot>,
     notices: mpsc::UnboundedSender<Notice>,
     cycles: Cycles,
+    pace: Pace,
+    /// What each machine waits for, in words.
+    notes: [Vec<String>; 2],
     /// What the files of each cycle take on the disk, and the most of them.
     cycle_bytes: BTreeMap<u32, u64>,
     largest_cycle_bytes: u64,
@@ -297,6 +306,8 @@ impl Drive {
             status,
             notices: run.notices,
             cycles: interrupted.cycles,
+            pace: Pace::default(),
+            notes: [Vec::new(), Vec::new()],
             cycle_bytes: BTreeMap::new(),
             largest_cycle_bytes: 0,
             states: interrupted.states,
@@ -461,7 +472,7 @@ impl Drive {
                 self.adopt(cycle, files).await;
             }
         }
-        let rows: Vec<CycleRow> = self.cycles.rows();
+        let rows: Vec<CycleRow> = self.cycles.rows(&self.cell.plan().tolerance);
         let result = json!({ "simulation": self.task.simulation, "ending": ending, "cycles": rows });
         let now = self.now();
         self.leave("result.json".into(), self.cell.cycle(), &result).await;
@@ -581,10 +592,14 @@ impl Drive {
 
     async fn reported(&mut self, StationReport { event, detail, fetched, notes, files }: StationReport) {
         self.adopt(self.cell.cycle(), record::describe(&self.folder, &files)).await;
-        if let Some((device, messages)) = notes {
-            let payload = json!({ "device": device, "notes": messages });
-            self.note(Kind::Note, (device.to_string(), "wire".into()), payload);
-            self.notify(Notice::Note { device, messages });
+        if let Some(Notes { device, all, new: messages }) = notes {
+            self.notes[device as usize] = all;
+            self.status.send_replace(self.snapshot());
+            if !messages.is_empty() {
+                let payload = json!({ "device": device, "notes": messages });
+                self.note(Kind::Note, (device.to_string(), "wire".into()), payload);
+                self.notify(Notice::Note { device, messages });
+            }
         }
         if let Some(Fetched::Record(record)) = &fetched {
             let payload = json!({ "pass_record": pass_record::document(record) });
@@ -668,13 +683,13 @@ impl Drive {
     async fn take(&mut self, event: Event, detail: Option<Value>) -> (Option<String>, Ticket) {
         let now = self.now();
         let ticket = self.record_event(now, &event, detail);
-        self.show_event(&event);
         let before = self.cell.state();
-        let commands = self.cell.handle(now, event);
+        let commands = self.cell.handle(now, event.clone());
         self.states += u64::from(self.cell.state() != before);
         for command in commands.iter().filter(|command| waits_for_nothing(command)) {
             self.execute(command.clone()).await;
         }
+        self.show_event(now, &event);
         let mut refusal = None;
         for command in commands {
             if let Command::Refuse { why, .. } = &command {
@@ -940,34 +955,25 @@ impl Drive {
         let _ = self.notices.send(notice);
     }
 
-    fn show_event(&self, event: &Event) {
+    /// Shows an event that the cell has taken in.
+    fn show_event(&mut self, now: Duration, event: &Event) {
+        self.pace.follow(self.cell.state());
         let notice = match event {
             Event::Progressed { device, done, total } => {
-                Notice::Progress { device: *device, cycle: self.cell.cycle(), done: *done, total: *total }
+                let cycle = self.cell.cycle();
+                self.pace.take(now, (*device, cycle), *done, *total);
+                self.pace.follow(self.cell.state());
+                let left_s = self.pace.progress().and_then(|progress| progress.left_s);
+                Notice::Progress { device: *device, cycle, done: *done, total: *total, left_s }
             }
             Event::Registered { cycle, figures } => Notice::Figures { cycle: *cycle, figures: figures.clone() },
             Event::Compensated { cycle, summary } => Notice::Compensated { cycle: *cycle, summary: summary.clone() },
             event => {
-                Notice::State { state: self.cell.in_words(), cycle: self.cell.cycle(), event: event.name().to_owned() }
+                let (state, cycle, at_job) = (self.cell.in_words(), self.cell.cycle(), self.pace.progress().is_some());
+                Notice::State { state, cycle, event: event.name().to_owned(), at_job }
             }
         };
         self.notify(notice);
-    }
-
-    /// How the cell is, as the control socket tells it.
-    fn snapshot(&self) -> Snapshot {
-        let state = self.cell.state();
-        Snapshot {
-            simulation: self.task.simulation,
-            state: state.name(),
-            phase: state.phase(),
-            unconfirmed: self.cell.unconfirmed(),
-            message: self.cell.in_words(),
-            number: self.states,
-            cycle: self.cell.cycle(),
-            seconds: self.now().as_secs_f64(),
-            cycles: self.cycles.rows(),
-        }
     }
 }
 

@@ -10,7 +10,14 @@ use crate::cell::{Alarm, AlarmId, CompensationSummary, Device, Ending, Figures, 
 #[allow(missing_docs)]
 pub enum Notice {
     /// The cell took an event in.
-    State { state: String, cycle: u32, event: String },
+    State {
+        state: String,
+        cycle: u32,
+        event: String,
+        /// Whether a job of a machine is under way, of which progress is told.
+        #[serde(skip)]
+        at_job: bool,
+    },
     /// The right part is to be loaded, and that to be confirmed.
     LoadPart,
     /// A machine cannot tell whether it is clear of the part: a person is to look, and to confirm it.
@@ -21,8 +28,15 @@ pub enum Notice {
         #[serde(rename = "words")]
         messages: Vec<String>,
     },
-    /// A job goes on.
-    Progress { device: Device, cycle: u32, done: u32, total: u32 },
+    /// A job goes on, and will take at least and at most so many seconds more.
+    Progress {
+        device: Device,
+        cycle: u32,
+        done: u32,
+        total: u32,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        left_s: Option<[f64; 2]>,
+    },
     /// The points of a measurement came over the wire, in this time.
     Transferred { cycle: u32, points: usize, seconds: f64, ms_per_point: f64 },
     /// A measurement is registered.
@@ -51,7 +65,11 @@ pub enum Notice {
 #[allow(missing_docs)]
 pub struct CycleRow {
     pub cycle: u32,
+    /// Of all points that were used.
     pub pv_um: f64,
+    /// Of the points that it is judged by.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub judged_pv_um: Option<f64>,
     pub rms_um: f64,
     pub points: u32,
     pub outliers: u32,

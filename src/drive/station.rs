@@ -54,6 +54,14 @@ pub(super) enum Fetched {
     Record(Box<PassRecord>),
 }
 
+/// What a person should know of a machine now.
+pub(super) struct Notes {
+    pub(super) device: Device,
+    pub(super) all: Vec<String>,
+    /// Those of them that were not told before.
+    pub(super) new: Vec<String>,
+}
+
 /// A fact, with what the journal should keep beside it.
 #[derive(Default)]
 pub(super) struct StationReport {
@@ -61,8 +69,8 @@ pub(super) struct StationReport {
     pub(super) event: Option<Event>,
     pub(super) detail: Option<serde_json::Value>,
     pub(super) fetched: Option<Fetched>,
-    /// What a person should know of a machine, where that is new.
-    pub(super) notes: Option<(Device, Vec<String>)>,
+    /// What a person should know of a machine, where that has changed.
+    pub(super) notes: Option<Notes>,
     /// Files of the run folder that came with a person's word, to be brought on record.
     pub(super) files: Vec<String>,
 }
@@ -679,10 +687,11 @@ impl<B: StationDriver> MachineTask<B> {
     async fn pass_on_notes(&mut self) {
         let notes = self.driver.machine().notes();
         let new: Vec<String> = notes.iter().filter(|message| !self.notes.contains(message)).cloned().collect();
+        let changed = self.notes != notes;
         self.notes = notes;
-        if !new.is_empty() {
-            let _ =
-                self.reports.send(StationReport { notes: Some((B::DEVICE, new)), ..StationReport::default() }).await;
+        if changed {
+            let notes = Some(Notes { device: B::DEVICE, all: self.notes.clone(), new });
+            let _ = self.reports.send(StationReport { notes, ..StationReport::default() }).await;
         }
     }
 

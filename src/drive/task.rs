@@ -28,6 +28,8 @@ const NODE_BYTES: u64 = 250;
 /// Everything that does not change during a run.
 #[derive(Debug)]
 pub struct Task {
+    /// What the part is called, for people.
+    pub part: String,
     /// The nominal surface.
     pub nominal: Arc<Nominal>,
     /// Where it came from, for the record.

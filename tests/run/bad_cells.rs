@@ -361,6 +361,22 @@ fn ctrl_c_holds_once_and_aborts_twice() {
     while !held(home.path()) {
         assert!(began.elapsed() < BOUNDED, "it does not come to hold");
     }
+    let (_, said, _) = run(&["status", folder.to_str().unwrap()], home.path());
+    for part in [
+        "SIMULATION  Held (Grind, Run), cycle 1 of at most ",
+        "grinding, ",
+        "next     regrind resume goes on",
+        ", run ",
+    ] {
+        assert!(said.contains(part), "{part:?}: {said}");
+    }
+    let (_, said, _) = run(&["status", folder.to_str().unwrap(), "--json"], home.path());
+    let status = serde_json::from_str::<serde_json::Value>(&said).unwrap()["status"].clone();
+    let progress = &status["progress"];
+    assert_eq!((&progress["device"], status["part"].is_string()), (&serde_json::json!("grinder"), true), "{said}");
+    assert!(progress["done"].as_u64() < progress["total"].as_u64(), "{said}");
+    assert!(progress["left_s"].is_null(), "a job that stands has no pace: {said}");
+    assert!(status["tolerance"].is_object() && status["next"].as_str().unwrap().contains("regrind resume"), "{said}");
     running.interrupt();
     running.line("abort", |line| line.starts_with("ABORT"));
     let (code, errors) = running.end();

@@ -132,7 +132,8 @@ fn hold_and_go_on(person: &Person, program: &mut Running) {
     person.does("hold");
     let still = program.line("prompt to hold", |line| line.contains("then: regrind confirm still"));
     let state = || person.types("status").1;
-    assert!(state().starts_with("Holding"), "{}", state());
+    // What it waits for is said to whoever asks how it is, too.
+    assert!(state().starts_with("Holding") && state().contains("regrind confirm still"), "{}", state());
     person.does(still.split("then: regrind ").nth(1).unwrap());
     let began = Instant::now();
     while !state().starts_with("Held") {

@@ -1,0 +1,158 @@
+//! How far the job under way is, and how long it will still take.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use crate::cell::{Device, JobStep, State};
+
+/// A pace is told once it has been seen for so long.
+const SEEN_FOR: Duration = Duration::from_millis(500);
+/// Marks of the way that are kept: the latest quarter of them tells the present pace.
+const MARKS: usize = 32;
+
+/// How far a job is.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct JobProgress {
+    /// The machine that is at it.
+    pub device: Device,
+    /// Points of a measurement; of a pass, as many parts of the path as the machine counts.
+    pub done: u32,
+    /// How many there are.
+    pub total: u32,
+    /// Least and most time that it will still take, in seconds: at the pace since it began to move, and at that of late. None before
+    /// there is a pace, and while it stands.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub left_s: Option<[f64; 2]>,
+}
+
+/// The pace of the job under way.
+#[derive(Debug, Default)]
+pub(super) struct Pace {
+    job: Option<(Device, u32)>,
+    done: (u32, u32),
+    /// When it was how far, since it last began to move.
+    marks: VecDeque<(Duration, u32)>,
+}
+
+impl Pace {
+    /// Takes a sign of progress.
+    pub(super) fn take(&mut self, now: Duration, job: (Device, u32), done: u32, total: u32) {
+        if self.job.replace(job) != Some(job) || done < self.done.0 {
+            self.marks.clear();
+        }
+        self.done = (done, total);
+        if self.marks.len() == MARKS {
+            // Every other one, but the first and the last: the marks reach back to the beginning, at half the density.
+            let mut index = 0;
+            self.marks.retain(|_| {
+                index += 1;
+                index == 1 || index % 2 == 0
+            });
+        }
+        self.marks.push_back((now, done));
+    }
+
+    /// Takes the state of the cell: a job that stands has no pace, and one that is over no progress.
+    pub(super) fn follow(&mut self, state: State) {
+        let at = state.phase().and_then(|phase| phase.job());
+        let is_at_it = |device| matches!(at, Some((at, JobStep::Run | JobStep::Reconcile)) if at == device);
+        if self.job.is_some_and(|(device, _)| !is_at_it(device)) {
+            self.job = None;
+        }
+        if !matches!(state, State::Execute(_)) {
+            self.marks.clear();
+        }
+    }
+
+    /// Returns how far the job is, if one is under way.
+    pub(super) fn progress(&self) -> Option<JobProgress> {
+        let (device, _) = self.job?;
+        let (done, total) = self.done;
+        Some(JobProgress { device, done, total, left_s: self.left_s() })
+    }
+
+    fn left_s(&self) -> Option<[f64; 2]> {
+        let (now, done) = *self.marks.back()?;
+        let open = f64::from(self.done.1.saturating_sub(done));
+        let since = |(at, from): (Duration, u32)| {
+            let seconds = (now.saturating_sub(at)).as_secs_f64();
+            (done > from && seconds >= SEEN_FOR.as_secs_f64()).then(|| seconds / f64::from(done - from) * open)
+        };
+        let whole = since(*self.marks.front()?)?;
+        let late = since(self.marks[self.marks.len() - self.marks.len().div_ceil(4)]).unwrap_or(whole);
+        Some([whole.min(late), whole.max(late)])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cell::Phase;
+
+    const JOB: (Device, u32) = (Device::Grinder, 1);
+    const RUNS: State = State::Execute(Phase::Grind(JobStep::Run));
+
+    fn ms(ms: u64) -> Duration {
+        Duration::from_millis(ms)
+    }
+
+    #[test]
+    fn a_steady_job_is_left_what_is_left_of_it() {
+        let mut pace = Pace::default();
+        assert_eq!(pace.progress(), None);
+        for k in 0..=500_u32 {
+            pace.take(ms(100 * u64::from(k)), JOB, k, 1000);
+            pace.follow(RUNS);
+        }
+        let told = pace.progress().unwrap();
+        assert_eq!((told.device, told.done, told.total), (Device::Grinder, 500, 1000));
+        let [least, most] = told.left_s.unwrap();
+        assert!((least - 50.0).abs() < 1e-9 && (most - 50.0).abs() < 1e-9, "{least} to {most}");
+        assert!(pace.marks.len() <= MARKS && pace.marks[0] == (ms(0), 0), "{:?}", pace.marks);
+    }
+
+    #[test]
+    fn a_job_that_slows_down_is_left_a_range() {
+        let mut pace = Pace::default();
+        for k in 0..100_u32 {
+            pace.take(ms(100 * u64::from(k)), JOB, k, 200);
+        }
+        for k in 0..20_u32 {
+            pace.take(ms(10_000 + 1_000 * u64::from(k)), JOB, 100 + k, 200);
+        }
+        let [least, most] = pace.progress().unwrap().left_s.unwrap();
+        assert!(least < 30.0 && most > 70.0, "{least} to {most}");
+    }
+
+    #[test]
+    fn what_stands_has_no_pace_and_what_is_over_no_progress() {
+        let mut pace = Pace::default();
+        for k in 0..20_u32 {
+            pace.take(ms(100 * u64::from(k)), JOB, k, 100);
+        }
+        pace.follow(State::Held(Phase::Grind(JobStep::Run)));
+        let held = pace.progress().unwrap();
+        assert_eq!((held.done, held.left_s), (19, None));
+        // The hour that it stood does not count.
+        pace.follow(RUNS);
+        pace.take(ms(3_600_000), JOB, 20, 100);
+        assert_eq!(pace.progress().unwrap().left_s, None, "no pace yet");
+        pace.take(ms(3_601_000), JOB, 30, 100);
+        assert_eq!(pace.progress().unwrap().left_s, Some([7.0, 7.0]));
+        // The same machine at its next job.
+        pace.take(ms(3_602_000), (Device::Grinder, 2), 1, 100);
+        assert_eq!(pace.progress().unwrap().left_s, None);
+        pace.follow(State::Execute(Phase::Transfer));
+        assert_eq!(pace.progress(), None);
+    }
+
+    #[test]
+    fn a_job_without_parts_is_at_its_end() {
+        let mut pace = Pace::default();
+        pace.take(ms(0), JOB, 0, 0);
+        pace.take(ms(1000), JOB, 0, 0);
+        assert_eq!(pace.progress().unwrap().left_s, None);
+    }
+}
