@@ -39,7 +39,7 @@ GUARDS = {
     "a job found running while holding is told to hold": (
         "src/cell/act.rs", "                self.go(self.same(run));\n                self.push(Command::HoldMachine { device });\n", "                self.go(self.same(run));\n"),
     "a machine that moves while the cell stands is told to hold": (
-        "src/cell/act.rs", "        let told = self.raised.contains(&AlarmId::MovesUnasked);\n", "        return;\n        #[allow(unreachable_code)]\n        let told = false;\n",
+        "src/cell/act.rs", "        let astray = self.knows(device).astray;\n", "        return;\n        #[allow(unreachable_code)]\n        let astray = false;\n",
         "cell", "a_machine_that_moves_while_the_cell_is_held_is_told_to_hold"),
     "a program that was started again asks what became of the job": (
         "src/cell/act.rs", "        self.go(Held(out_of_sight(phase)));\n        for device in Device::BOTH {", "        self.go(Held(restart_of(phase)));\n        for device in Device::BOTH {"),
