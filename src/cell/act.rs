@@ -899,8 +899,9 @@ impl Cell {
     pub(super) fn stopped(&mut self) {
         self.go(Stopped);
         let (cycle, reason) = (self.cycle, std::mem::take(&mut self.reason));
-        let judged_out = self.judged_out;
-        let ending = if judged_out { Ending::NotAccepted { cycle, reason } } else { Ending::Stopped { cycle, reason } };
+        let (judged_out, ordered) = (self.judged_out, self.ordered);
+        let ending =
+            if judged_out { Ending::NotAccepted { cycle, reason } } else { Ending::Stopped { cycle, reason, ordered } };
         self.push(Command::Finish(ending));
     }
 

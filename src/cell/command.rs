@@ -105,8 +105,13 @@ pub enum Ending {
     Accepted { cycle: u32, reason: String },
     /// The run came to its end in order and the part is not in tolerance, or was never judged to be.
     NotAccepted { cycle: u32, reason: String },
-    /// The run could not begin, or a person stopped it.
-    Stopped { cycle: u32, reason: String },
+    /// The run could not begin, or was stopped; `ordered` where a person did.
+    Stopped {
+        cycle: u32,
+        reason: String,
+        #[serde(default)]
+        ordered: bool,
+    },
     /// The run was aborted; `confirmed` where both machines said that they stand.
     Aborted { cycle: u32, confirmed: bool, reason: String },
 }

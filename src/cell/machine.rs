@@ -78,6 +78,7 @@ impl Cell {
             // Orders.
             (Idle, Event::Start { .. }) => self.start(),
             (_, Event::Stop { actor, reason }) if !matches!(self.state, Stopping | Completing | Aborting) => {
+                self.ordered = true;
                 self.stop(&format!("{actor} stopped the run{}", because(reason)), false);
             }
             (Starting, Event::Hold { .. }) => self.go(Held(Load)),

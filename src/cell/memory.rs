@@ -60,6 +60,8 @@ pub struct Cell {
     /// How the run ends when the state that leads to the end is over.
     pub(super) reason: String,
     pub(super) judged_out: bool,
+    /// Whether a person ordered it.
+    pub(super) ordered: bool,
     pub(super) repeated: bool,
     /// The machine that is being stopped, while the cell is.
     pub(super) stopping: Option<Device>,
@@ -92,6 +94,7 @@ impl Cell {
             worse: 0,
             reason: String::new(),
             judged_out: false,
+            ordered: false,
             repeated: false,
             stopping: None,
             now: Duration::ZERO,

@@ -15,16 +15,22 @@ use super::failure::Failure;
 use super::show::{how_far, limits, pv_name};
 use super::words::time_left;
 
-/// An order to a running cell.
-#[derive(Args, Debug)]
-#[command(after_help = "\
+/// What stands below the help of each order.
+pub(super) fn help(example: &str) -> String {
+    format!(
+        "\
 RUN is the folder of a run; without it, the one under runs/ that goes on now. Who gave the order is recorded as the operating
 system knows them.
 
 Example:
-  regrind hold runs/freeform-mirror-20260704T120000 --reason \"coolant looks low\"
+  {example}
 
-Exit codes: 0 the order was taken; 2 no such run; 3 the cell refused the order.")]
+Exit codes: 0 the order was taken; 2 no such run; 3 the cell refused the order."
+    )
+}
+
+/// An order to a running cell.
+#[derive(Args, Debug)]
 pub(super) struct Arguments {
     /// Folder of the run
     #[arg(value_name = "RUN")]

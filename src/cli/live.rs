@@ -178,7 +178,8 @@ pub(super) fn owner(actor: &Actor, run: &Path) -> u32 {
 pub(super) fn outcome(ending: &Ending) -> Result<Outcome, Failure> {
     match ending {
         Ending::Accepted { .. } => Ok(Outcome::Accepted),
-        Ending::NotAccepted { .. } => Ok(Outcome::NotInTolerance),
+        // That a person has it end in order is no fault.
+        Ending::NotAccepted { .. } | Ending::Stopped { ordered: true, .. } => Ok(Outcome::NotInTolerance),
         Ending::Stopped { reason, .. } | Ending::Aborted { reason, .. } => {
             Err(Failure::Ended { reason: reason.clone() })
         }

@@ -46,16 +46,20 @@ enum Command {
     Plan(plan::Arguments),
     Simulate(simulate::Arguments),
     /// Hold a running cell at the next safe place
+    #[command(after_help = control::help("regrind hold --reason \"coolant looks low\""))]
     Hold(control::Arguments),
     Resume(resume::Arguments),
     Recover(recover::Arguments),
-    /// End a running cell in order
+    /// End a running cell in order: what moves comes to its safe place, and the run is over
+    #[command(after_help = control::help("regrind stop --reason \"end of the shift\""))]
     Stop(control::Arguments),
     /// End a running cell at once: the safe sequence only
+    #[command(after_help = control::help("regrind abort --reason \"noise at the wheel\""))]
     Abort(control::Arguments),
     /// Tell a running cell what a person has seen
     Confirm(control::Confirmation),
-    /// Tell how a running cell is
+    /// Tell how a running cell is, what it waits for, and what to do next
+    #[command(after_help = control::help("regrind status runs/freeform-mirror-20260704T120000Z --json"))]
     Status(control::Arguments),
     Audit(audit::Arguments),
     Report(report::Arguments),

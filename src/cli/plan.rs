@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::compensation::path::{Summary, ToolPath};
-use regrind::config::CellConfig;
+use regrind::config::{BUILT_IN, CellConfig};
 use regrind::drive::Task;
 use regrind::recipe::Recipe;
 use regrind::setup;
@@ -27,7 +27,7 @@ pub(super) struct Arguments {
     #[arg(value_name = "RECIPE")]
     recipe: PathBuf,
     /// Cell that would make it
-    #[arg(long, value_name = "FILE", default_value = "config/sim.toml")]
+    #[arg(long, value_name = "FILE", default_value = BUILT_IN)]
     cell: PathBuf,
     /// Write the program of the first pass, which has no correction
     #[arg(long, value_name = "FILE")]

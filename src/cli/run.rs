@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use regrind::cell::{Actor, Beginning, CellPlan, Ending, TABLE_VERSION};
-use regrind::config::{CellConfig, Link};
+use regrind::config::{BUILT_IN, CellConfig, Link};
 use regrind::device::Line;
 use regrind::drive::Task;
 use regrind::formats::{LEARNED, Learned, LearnedError};
@@ -31,13 +31,13 @@ Example:
   regrind run recipes/freeform-mirror.toml
   regrind run recipes/freeform-mirror.toml --cell config/modbus-tcp.toml --part SN-0042 --operator \"A. Smith\"
 
-Exit codes: 0 accepted; 1 finished, not in tolerance; 2 bad arguments, recipe or data; 3 fault or abort.")]
+Exit codes: 0 accepted; 1 finished, not in tolerance, or stopped by a person; 2 bad arguments, recipe or data; 3 fault or abort.")]
 pub(super) struct Arguments {
     /// Recipe of the part
     #[arg(value_name = "RECIPE")]
     recipe: PathBuf,
-    /// Cell that makes it
-    #[arg(long, value_name = "FILE", default_value = "config/sim.toml")]
+    /// Cell that makes it; `sim` is the simulated one that comes with the program
+    #[arg(long, value_name = "FILE", default_value = BUILT_IN)]
     cell: PathBuf,
     /// Serial number of the part
     #[arg(long, value_name = "SERIAL")]
@@ -251,8 +251,17 @@ pub(super) fn free_folder(runs: &Path, name: &str, began: jiff::Timestamp, simul
     (0..).map(named).find(|folder| !folder.exists()).expect("some number is free")
 }
 
+/// The name by which the operating system knows who started this program: a service may have none in its environment.
+fn own_name() -> String {
+    use std::os::unix::fs::MetadataExt;
+    let Ok(uid) = std::fs::metadata("/proc/self").map(|own| own.uid().to_string()) else { return "unknown".into() };
+    let users = std::fs::read_to_string("/etc/passwd").unwrap_or_default();
+    let own = users.lines().map(|line| line.split(':').collect::<Vec<_>>()).find(|user| user.get(2) == Some(&&*uid));
+    own.map_or_else(|| format!("uid {uid}"), |user| user[0].to_owned())
+}
+
 pub(super) fn operator(named: Option<&str>) -> Actor {
-    let user = || std::env::var("USER").or_else(|_| std::env::var("USERNAME")).unwrap_or_else(|_| "unknown".into());
+    let user = || std::env::var("USER").or_else(|_| std::env::var("USERNAME")).unwrap_or_else(|_| own_name());
     let host = std::fs::read_to_string("/etc/hostname").unwrap_or_default();
     let host = if host.trim().is_empty() { "this computer".to_owned() } else { host.trim().to_owned() };
     Actor { name: named.map_or_else(user, str::to_owned), station: host }

@@ -13,7 +13,7 @@ use regrind::recipe::Recipe;
 use tokio::sync::mpsc;
 
 use super::failure::Failure;
-use super::words::{judged, three_digits, time_left};
+use super::words::{judged, three_digits, time_left, wrapped};
 
 /// How long a line that says nothing new may be left out.
 const QUIET: Duration = Duration::from_secs(2);
@@ -207,7 +207,10 @@ impl Show {
 
     fn line(&self, text: &str) -> Result<(), Failure> {
         match &self.bar {
-            Some(bar) => bar.suspend(|| super::print(&format!("{text}\n"))),
+            Some(bar) => {
+                let columns = console::Term::stdout().size_checked().map_or(usize::MAX, |(_, columns)| columns.into());
+                bar.suspend(|| super::print(&wrapped(text, columns)))
+            }
             None => super::print(&format!("{text}\n")),
         }
     }

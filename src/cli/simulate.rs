@@ -52,6 +52,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             super::print(&format!("{wires}\n"))?;
             return until_stopped().await;
         }
+        super::print(&format!("SIMULATION: the part of {}\n", recipe.path().display()))?;
         for place in &serving.places {
             super::print(&format!("SIMULATION: {place}\n"))?;
         }

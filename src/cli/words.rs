@@ -53,6 +53,40 @@ pub(super) fn time_left([least_s, most_s]: [f64; 2]) -> String {
     if least == most { format!("{most} {name}") } else { format!("{least} to {most} {name}") }
 }
 
+/// Breaks lines between words where a terminal would break them anywhere. What goes on stands below what it goes on with: below the
+/// text of a line that begins with a label and two spaces. A word that is longer than a line is left to the terminal.
+pub(super) fn wrapped(text: &str, columns: usize) -> String {
+    let mut out = String::new();
+    for line in text.lines() {
+        let indent = " ".repeat(text_begins(line, columns));
+        let (mut left, mut room) = (line, columns);
+        while let Some((end, _)) = left.char_indices().nth(room) {
+            let first_word = left.len() - left.trim_start().len();
+            let space = match left[end..].starts_with(' ') {
+                true => Some(end),
+                false => left[..end].rfind(' ').filter(|at| *at > first_word),
+            };
+            let space = space.or_else(|| left[first_word..].find(' ').map(|at| first_word + at));
+            let Some(at) = space.filter(|at| !left[*at..].trim().is_empty()) else { break };
+            out += left[..at].trim_end();
+            out += "\n";
+            out += &indent;
+            (left, room) = (left[at..].trim_start(), columns.saturating_sub(indent.len()));
+        }
+        out += left;
+        out += "\n";
+    }
+    out
+}
+
+/// Returns the column of the text behind a label, if both have their place in a line.
+fn text_begins(line: &str, columns: usize) -> usize {
+    let begin = line.len() - line.trim_start().len();
+    let label = line[begin..].find("  ").map(|at| begin + at);
+    let text = label.map(|label| line.len() - line[label..].trim_start().len());
+    text.filter(|text| *text < columns / 2).unwrap_or(begin.min(columns / 2))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -69,6 +103,27 @@ mod tests {
         ];
         for (left_s, text) in cases {
             assert_eq!(time_left(left_s), text);
+        }
+    }
+
+    #[test]
+    fn a_long_line_is_broken_between_words_below_its_text() {
+        assert_eq!(wrapped("short\n  also short", 20), "short\n  also short\n");
+        assert_eq!(wrapped("ALARM  one two three four", 16), "ALARM  one two\n       three\n       four\n");
+        assert_eq!(wrapped("   one two three", 10), "   one two\n   three\n");
+        assert_eq!(wrapped("record in /a/very/long/path/indeed", 12), "record in\n/a/very/long/path/indeed\n");
+        assert_eq!(wrapped("\u{b5}m \u{b1} \u{b5}m \u{b1}", 4), "\u{b5}m \u{b1}\n\u{b5}m \u{b1}\n");
+        assert_eq!(wrapped("", 4), "");
+        assert_eq!(wrapped("any length", usize::MAX), "any length\n");
+        for columns in 0..40 {
+            let text = "cycle 1: PV 99.8 % 28.8 of 7.00 um, RMS 5.28 of 1.00 um \u{b1} 0.01  ";
+            let words = |text: &str| text.split_whitespace().map(str::to_owned).collect::<Vec<_>>();
+            let broken = wrapped(text, columns);
+            assert_eq!(words(&broken), words(text), "{columns}");
+            assert!(
+                columns < 8 || broken.lines().all(|line| line.trim_end().chars().count() <= columns),
+                "{columns}: {broken}"
+            );
         }
     }
 

@@ -106,6 +106,9 @@ pub struct GrinderLimits {
     pub travel: Option<Travel>,
 }
 
+/// What the simulated cell is called that comes with the program.
+pub const BUILT_IN: &str = "sim";
+
 static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<written::CellFile>);
 
 /// Returns the JSON schema of a cell file.
@@ -114,11 +117,14 @@ pub fn json_schema() -> &'static serde_json::Value {
 }
 
 impl CellConfig {
-    /// Reads a cell file.
+    /// Reads a cell file; [`BUILT_IN`] is no file but the simulated cell that comes with the program.
     ///
     /// # Errors
     /// A file that cannot be read, and everything that is wrong with its text.
     pub fn read(path: &Path) -> Result<Self, Problems> {
+        if path == Path::new(BUILT_IN) {
+            return Self::parse(path, include_str!("../../config/sim.toml"));
+        }
         let text = read_text(path)?;
         Self::parse(path, &text)
     }

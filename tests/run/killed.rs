@@ -146,7 +146,7 @@ async fn killed(seeds: impl Iterator<Item = u64>) {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_killed_program_is_taken_up_again_and_starts_every_pass_once() {
-    killed(1..=10).await;
+    killed(1..=13).await;
 }
 
 #[test]
@@ -178,7 +178,7 @@ fn over_a_serial_line_too() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "takes minutes: for .ci/long"]
 async fn two_hundred_kills() {
-    killed(1000..1090).await;
+    killed(1000..1105).await;
 }
 
 /// Runs a part until the machine of a job moves, and kills the program. Returns the folder of the run.

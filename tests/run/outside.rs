@@ -41,13 +41,35 @@ fn heeding_hangup(arguments: &[&str], home: &Path) -> Command {
 }
 
 #[test]
+fn the_simulated_cell_comes_with_the_program() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = small_recipe(home.path(), 1e4).display().to_string();
+    let (code, with_none, errors) = run(&["plan", &recipe], home.path());
+    assert_eq!(code, 0, "{errors}");
+    let (code, with_its_name, errors) = run(&["plan", &recipe, "--cell", "sim"], home.path());
+    assert_eq!((code, with_its_name), (0, with_none), "{errors}");
+    let (code, said, errors) = run(&["run", &recipe, "--cell", "sim", "--loaded"], home.path());
+    assert_eq!(code, 0, "{said}{errors}");
+    assert!(said.contains("SIMULATION  ACCEPTED"), "{said}");
+}
+
+#[test]
+fn each_order_shows_how_it_is_given() {
+    for order in ["hold", "stop", "abort", "status"] {
+        let (code, said, _) = run(&[order, "--help"], Path::new("."));
+        let example = said.split("Example:").nth(1).unwrap_or_else(|| panic!("{order} has no example: {said}"));
+        assert!(code == 0 && example.trim_start().starts_with(&format!("regrind {order} ")), "{said}");
+    }
+}
+
+#[test]
 fn a_closed_terminal_and_a_stopped_service_end_the_run_in_order() {
     for (signal, reason) in [("TERM", "SIGTERM"), ("HUP", "SIGHUP, the terminal was closed")] {
         let home = tempfile::tempdir().unwrap();
         let (mut running, folder) = grinding(home.path(), |arguments| heeding_hangup(arguments, home.path()));
         running.signal(signal);
         let (code, errors) = running.end();
-        assert_eq!(code, 3, "{signal}: {errors}");
+        assert!(code == 1 && !errors.contains("error"), "{signal}: {code} {errors}");
         assert_eq!(orders(&folder), [("stop".to_owned(), reason.to_owned())]);
         let verified = verify(&folder).unwrap();
         assert!(verified.closed, "{signal}: {verified:?}");
@@ -67,7 +89,7 @@ fn a_service_that_is_told_twice_aborts() {
     }
     running.signal("TERM");
     let (code, errors) = running.end();
-    assert_eq!(code, 3, "{errors}");
+    assert!(code == 3 || code == 1 && orders(&folder).len() == 1, "{code} {errors}");
     assert!(verify(&folder).unwrap().closed);
     let reasons: Vec<_> = orders(&folder).into_iter().map(|(_, reason)| reason).collect();
     // The machine may have stood before the second one came.
@@ -123,7 +145,7 @@ fn two_runs_that_go_on_are_named_and_none_is_taken() {
     assert!(errors.contains("2 runs go on") && errors.matches("SIMULATION").count() == 2, "{errors}");
     for running in [&mut first, &mut second] {
         running.signal("TERM");
-        assert_eq!(running.end().0, 3);
+        assert_eq!(running.end().0, 1);
     }
 }
 

@@ -208,7 +208,7 @@ fn the_report_of_a_stopped_run_says_who_stopped_it_and_that_nothing_was_measured
     let home = tempfile::tempdir().unwrap();
     let (mut running, folder) = grinding(home.path());
     running.signal("TERM");
-    assert_eq!(running.end().0, 3);
+    assert_eq!(running.end().0, 1);
     let page = Page::of(&folder);
     let ending = json_in(&folder, "result.json")["ending"].clone();
     assert_eq!(ending["ending"], "stopped");

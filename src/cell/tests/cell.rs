@@ -433,6 +433,7 @@ fn stop_at_every_step_ends_in_order() {
         run.go_on();
         let expected = if state == State::Completing { State::Completing } else { State::Stopped };
         assert_eq!(run.cell.state(), expected, "stopped at {state}");
+        assert!(!matches!(run.ending(), Some(Ending::Stopped { ordered: false, .. })), "a person ordered it");
         assert!(!run.all.iter().any(|c| matches!(c, Command::AbortMachine { .. })));
     }
 }
