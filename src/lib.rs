@@ -10,6 +10,8 @@
 //!                                 Event v  | Command
 //!                                      cell            journal   (written before a command is carried out)
 //!
+//!  terminal, page <== control ==> drive     (orders, and how the cell is: one door for all)
+//!
 //!  pure: geometry, surface, measuring, registration, compensation, form, cell: no file, no clock, no randomness, no logging
 //! ```
 //!

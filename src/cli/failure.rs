@@ -1,6 +1,7 @@
 //! Why a command could not do its work, in one sentence with its remedy, and the exit code for it.
 
 use std::io;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use regrind::compensation::NextPassError;
@@ -95,6 +96,15 @@ pub(super) enum Failure {
         .free >> 20, .needed.div_ceil(1 << 20)
     )]
     NoSpace { path: PathBuf, free: u64, needed: u64 },
+    #[error(
+        "the page cannot be shown at {address}: {source}; choose another port with --listen, or 0 for any that is free"
+    )]
+    Page { address: SocketAddr, source: io::Error },
+    #[error(
+        "{address} is open to other computers, and the page has no users and no encryption; show it at 127.0.0.1, and reach it from \
+         elsewhere through a tunnel: ssh -L 7373:127.0.0.1:7373 CELL"
+    )]
+    ForOthers { address: SocketAddr },
     #[error("{}: its program ended before anything was asked of a machine; begin a new run", .run.display())]
     NotBegun { run: PathBuf },
     #[error("{}: its simulated machines ended with the program that ran it; begin a new run", .run.display())]

@@ -18,6 +18,7 @@ mod report;
 mod resume;
 mod run;
 mod schema;
+mod serve;
 mod show;
 mod simulate;
 mod simulated;
@@ -61,6 +62,7 @@ enum Command {
     /// Tell how a running cell is, what it waits for, and what to do next
     #[command(after_help = control::help("regrind status runs/freeform-mirror-20260704T120000Z --json"))]
     Status(control::Arguments),
+    Serve(serve::Arguments),
     Audit(audit::Arguments),
     Report(report::Arguments),
     Register(register::Arguments),
@@ -108,6 +110,7 @@ fn run() -> ExitCode {
         Command::Abort(arguments) => control::order(&arguments, |reason| Request::Abort { reason }),
         Command::Confirm(arguments) => control::confirm(&arguments),
         Command::Status(arguments) => control::order(&arguments, |_| Request::Status),
+        Command::Serve(arguments) => serve::run(&arguments),
         Command::Audit(arguments) => audit::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
         Command::Register(arguments) => register::run(&arguments),

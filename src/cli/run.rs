@@ -1,5 +1,6 @@
 //! `regrind run`: grind, measure, register, judge, compensate, until the part is accepted or the loop must stop.
 
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
@@ -15,7 +16,7 @@ use serde_json::json;
 
 use super::failure::Failure;
 use super::live::{Live, Work, outcome};
-use super::{Outcome, check, key, plan, simulated};
+use super::{Outcome, check, key, plan, serve, simulated};
 
 /// What a run began with of what an earlier one had learned, in its folder.
 pub(super) const LEARNED_FROM: &str = "learned_from.json";
@@ -54,6 +55,9 @@ pub(super) struct Arguments {
     /// Draw another simulated part and run from this number
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
+    /// Show the cell as a page in the browser meanwhile, at this address, as `regrind serve` does
+    #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = serve::ADDRESS)]
+    serve: Option<SocketAddr>,
     /// Print a line of JSON for everything that happens
     #[arg(long)]
     json: bool,
@@ -111,6 +115,8 @@ async fn carry_out(
     if free < needed {
         return Err(Failure::NoSpace { path: arguments.runs.clone(), free, needed });
     }
+    let page = arguments.serve.map(|at| serve::Beside::begin(&arguments.runs, at, arguments.json));
+    let _page = page.transpose()?;
     let live = Live { recipe, cell, part: &part, folder: &folder, job, actor, json: arguments.json };
     let machines = live.open(job)?;
     if let Some(earlier) = earlier.as_ref().filter(|_| !arguments.json) {

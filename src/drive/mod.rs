@@ -12,7 +12,6 @@
 //! follows, the answer to who gave an order among it, waits in line until the journal has all that came before it.
 
 mod beside;
-mod control;
 mod cycles;
 mod maps;
 mod notice;
@@ -51,17 +50,15 @@ use crate::formats::{FormatError, LEARNED, ResultFolder, write_json_atomic};
 use crate::journal::{self, Artefact, Entry, Kind};
 
 pub use beside::{Beside, Blocking};
-use control::{Control, Ordered};
-pub use control::{Reply, Request, ask, is_live};
 use cycles::Cycles;
-pub use notice::{CycleRow, Notice};
-pub use pace::JobProgress;
+pub use notice::Notice;
 use pace::Pace;
 pub use program::{ProgramError, Programs};
 pub use record::Ledger;
 use record::{Files, Recorder, Ticket, entry};
+use regrind_control::{Control, Ordered};
+pub use regrind_control::{CycleRow, JobProgress, Reply, Request, Snapshot, ask, is_live};
 pub use replay::{Interrupted, ReplayError};
-pub use snapshot::Snapshot;
 use station::{
     Aborts, Ask, CmmDriver, Fetched, GrinderDriver, Load, MachineTask, Notes, PULSE_EVERY, Pulse, StationDriver,
     StationReport,
@@ -505,6 +502,7 @@ impl Drive {
             Request::Started { .. } | Request::Done { .. } | Request::Still { .. } => {
                 return self.confirm(&request, &actor, answer);
             }
+            Request::Remark { what } => return self.remark(&what, &actor, answer),
             Request::Clear { device } => Event::ClearConfirmed { actor, device },
             Request::Hold { reason } => Event::Hold { actor, reason },
             Request::Resume { reason, .. } => Event::Resume { actor, reason },
@@ -512,7 +510,7 @@ impl Drive {
             Request::Abort { reason } => Event::Abort { actor, reason },
             Request::Loaded => Event::LoadConfirmed { actor },
             Request::Over { device, evidence } => Event::DeclaredOver { actor, device, evidence },
-            Request::Status => return,
+            Request::Status | Request::Watch => return,
         };
         let (refusal, ticket) = self.take(event, None).await;
         if let Some(answer) = answer {
@@ -520,6 +518,17 @@ impl Drive {
             let message = refusal.unwrap_or_else(|| self.cell.in_words());
             self.backlog.push_back(Waiting { ticket, then: Then::Answer { answer, accepted, message } });
             self.answer_without_record();
+        }
+    }
+
+    /// Puts on record what a program that speaks for people wants to have there.
+    fn remark(&mut self, what: &str, actor: &Actor, answer: Option<oneshot::Sender<Reply>>) {
+        let origin = (actor.name.clone(), actor.station.clone());
+        let payload = json!({ "remark": what });
+        let ticket = self.recorder.append(entry(Kind::Note, self.now(), self.cell.cycle(), origin, payload));
+        if let Some(answer) = answer {
+            let then = Then::Answer { answer, accepted: true, message: "on record".into() };
+            self.backlog.push_back(Waiting { ticket, then });
         }
     }
 

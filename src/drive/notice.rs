@@ -1,6 +1,7 @@
 //! What is shown of a run while it runs.
 
-use serde::{Deserialize, Serialize};
+use regrind_control::CycleRow;
+use serde::Serialize;
 
 use crate::cell::{Alarm, AlarmId, CompensationSummary, Device, Ending, Figures, Judgement};
 
@@ -58,21 +59,4 @@ pub enum Notice {
     },
     /// The run is over.
     Finished { ending: Ending, cycles: Vec<CycleRow> },
-}
-
-/// A cycle in the table at the end of a run.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[allow(missing_docs)]
-pub struct CycleRow {
-    pub cycle: u32,
-    /// Of all points that were used.
-    pub pv_um: f64,
-    /// Of the points that it is judged by.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub judged_pv_um: Option<f64>,
-    pub rms_um: f64,
-    pub points: u32,
-    pub outliers: u32,
-    /// Height of the surface that was wanted over the nominal one.
-    pub level_um: f64,
 }

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use serde::{Deserialize, Serialize};
+use regrind_control::JobProgress;
 
 use crate::cell::{Device, JobStep, State};
 
@@ -11,21 +11,6 @@ use crate::cell::{Device, JobStep, State};
 const SEEN_FOR: Duration = Duration::from_millis(500);
 /// Marks of the way that are kept: the latest quarter of them tells the present pace.
 const MARKS: usize = 32;
-
-/// How far a job is.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct JobProgress {
-    /// The machine that is at it.
-    pub device: Device,
-    /// Points of a measurement; of a pass, as many parts of the path as the machine counts.
-    pub done: u32,
-    /// How many there are.
-    pub total: u32,
-    /// Least and most time that it will still take, in seconds: at the pace since it began to move, and at that of late. None before
-    /// there is a pace, and while it stands.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub left_s: Option<[f64; 2]>,
-}
 
 /// The pace of the job under way.
 #[derive(Debug, Default)]

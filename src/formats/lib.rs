@@ -44,8 +44,8 @@ pub use number::LIMIT_MM;
 pub use ply::{PlyFile, parse_ply, read_ply};
 pub use points::{parse_points, read_points};
 pub use registration::{
-    DeviationRow, sync_folder, try_writing, write_atomic, write_column, write_deviations, write_json_atomic,
-    write_points,
+    DeviationRow, read_deviations, sync_folder, try_writing, write_atomic, write_column, write_deviations,
+    write_json_atomic, write_points,
 };
 pub use sdf::{parse_sdf, read_sdf};
 pub use stl::{StlFile, parse_stl, read_stl};

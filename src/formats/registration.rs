@@ -47,6 +47,44 @@ pub fn write_deviations(path: impl AsRef<Path>, rows: &[DeviationRow]) -> Result
     })
 }
 
+/// Reads back what [`write_deviations`] wrote.
+///
+/// # Errors
+/// A file that cannot be read, other columns, rows that are no finite numbers.
+pub fn read_deviations(path: &Path) -> Result<Vec<DeviationRow>, FormatError> {
+    let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
+    let text = fs::read_to_string(path).map_err(unreadable)?;
+    let mut lines = text.lines().zip(1u64..).filter(|(line, _)| !line.starts_with('#') && !line.trim().is_empty());
+    let unexpected = |(found, line): (&str, u64), expected: &str| FormatError::Unexpected {
+        path: path.to_owned(),
+        place: format!("line {line}"),
+        expected: expected.to_owned(),
+        found: found.chars().take(80).collect(),
+    };
+    match lines.next() {
+        Some((DEVIATIONS_HEADER, _)) => {}
+        Some(other) => return Err(unexpected(other, DEVIATIONS_HEADER)),
+        None => return Err(FormatError::Empty { path: path.to_owned(), expected: "deviations" }),
+    }
+    lines.map(|line| deviation_row(line.0).ok_or_else(|| unexpected(line, "a point and its deviation"))).collect()
+}
+
+fn deviation_row(row: &str) -> Option<DeviationRow> {
+    let (numbers, used) = row.trim().rsplit_once(',')?;
+    let mut values = [0.0; 7];
+    let mut cells = numbers.split(',');
+    for value in &mut values {
+        *value = cells.next()?.parse::<f64>().ok().filter(|value| value.is_finite())?;
+    }
+    let [x, y, z, nx, ny, nz, deviation_mm] = values;
+    let used = match used {
+        "1" => true,
+        "0" => false,
+        _ => return None,
+    };
+    cells.next().is_none().then_some(DeviationRow { point_mm: [x, y, z], normal: [nx, ny, nz], deviation_mm, used })
+}
+
 /// Writes a point cloud as comma separated text under the header given, in millimetres; no header if it is empty.
 ///
 /// # Errors

@@ -23,6 +23,7 @@ mod raster;
 mod run;
 mod states;
 mod story;
+mod summary;
 mod svg;
 mod told;
 mod words;
@@ -40,6 +41,7 @@ pub use plot::{Axis, Plot, Series};
 pub use ply::{coloured_ply, save_coloured_ply};
 pub use run::{RUN_REPORT, run_report, write_run_report};
 pub use states::state_picture;
+pub use summary::{CycleSummary, RunResult, RunSummary, run_summary};
 pub use words::{ending_words, words};
 
 /// Why a figure could not be drawn or saved. A figure goes by its title, a line of it by its name; an index counts from 0.

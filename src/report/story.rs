@@ -12,6 +12,9 @@ use regrind_journal::Record;
 /// The map of a cycle's error, as text.
 const MAP: &str = "error_map.csv";
 
+/// The points of a cycle with their deviations, as text.
+const DEVIATIONS: &str = "deviations.csv";
+
 /// The figures of a cycle.
 const FIGURES: &str = "figures.json";
 
@@ -34,6 +37,8 @@ pub(super) struct CycleStory {
     pub(super) level_um: Option<f64>,
     /// Name of the map within the run folder, and when it came on record.
     pub(super) map: Option<(String, String)>,
+    /// Name of the points with their deviations within the run folder.
+    pub(super) deviations: Option<String>,
     /// Name of the file of figures within the run folder.
     pub(super) form: Option<String>,
 }
@@ -82,6 +87,7 @@ impl Story {
             Told::OpenedAgain
             | Told::Answer(_)
             | Told::Remarks(..)
+            | Told::Remark(_)
             | Told::Pass(_)
             | Told::Transfer(_)
             | Told::Seal(_)
@@ -141,6 +147,8 @@ impl Story {
         }
         if name.ends_with(&format!("/{MAP}")) {
             self.cycle(record.cycle).map = Some((name.to_owned(), record.utc.clone()));
+        } else if name.ends_with(&format!("/{DEVIATIONS}")) {
+            self.cycle(record.cycle).deviations = Some(name.to_owned());
         } else if name.ends_with(&format!("/{FIGURES}")) {
             self.cycle(record.cycle).form = Some(name.to_owned());
         }

@@ -27,6 +27,8 @@ pub(super) enum Told {
     Step(Device, Value),
     /// Words of a machine.
     Remarks(Device, Vec<String>),
+    /// What a program that speaks for people had to have on record.
+    Remark(String),
     /// What a grinder tells of a pass.
     Pass(Value),
     /// How points came over the wire.
@@ -78,6 +80,9 @@ impl Told {
         if let Some(remarks) = value["notes"].as_array() {
             let remarks = remarks.iter().filter_map(Value::as_str).map(str::to_owned).collect();
             return Some(Self::Remarks(device()?, remarks));
+        }
+        if let Some(remark) = value["remark"].as_str() {
+            return Some(Self::Remark(remark.to_owned()));
         }
         let inner = |key: &str| Some(value[key].clone()).filter(Value::is_object);
         inner("pass_record").map(Self::Pass).or_else(|| inner("transfer").map(Self::Transfer))

@@ -33,6 +33,7 @@ fn told_words(told: &Told) -> Option<String> {
         Told::Word(device, value) => person_words(*device, value),
         Told::Step(device, value) => step_words(*device, value),
         Told::Remarks(device, remarks) => Some(format!("{device}: {}", remarks.join("; "))),
+        Told::Remark(remark) => Some(remark.clone()),
         Told::Pass(value) => pass_words(value),
         Told::Transfer(value) => transfer_words(value),
         Told::File(value) => artefact_words(value),

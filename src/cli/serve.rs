@@ -1,0 +1,138 @@
+//! `regrind serve`: the live page of the cell, and of the runs that it made.
+
+use std::io::{self, Read};
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::Mutex;
+use std::time::Duration;
+
+use clap::Args;
+use regrind::config::CellConfig;
+use regrind::journal::Reader;
+use regrind::recipe::Recipe;
+use regrind::setup;
+use regrind_page::Page;
+use tokio::net::TcpListener;
+
+use super::Outcome;
+use super::failure::Failure;
+
+/// Where the page is, if nothing else is said.
+pub(super) const ADDRESS: &str = "127.0.0.1:7373";
+/// How long the page outlives the run that it was begun with, so that every browser hears how it ended.
+const LINGERS: Duration = Duration::from_secs(3);
+
+/// Show the cell, and the runs that it made, as a page in the browser
+#[derive(Args, Debug)]
+#[command(after_help = "\
+The page shows the run that is on, from wherever it was begun, and gives orders to it through the same door as `regrind hold` and
+the like. It opens by the address that is printed, with its key, and on this computer only; from another one, use a tunnel:
+  ssh -L 7373:127.0.0.1:7373 CELL
+
+Example:
+  regrind serve --runs runs
+
+Exit codes: 0 stopped by Ctrl-C; 2 bad arguments.")]
+pub(super) struct Arguments {
+    /// Folder of the runs
+    #[arg(long, value_name = "DIR", default_value = "runs")]
+    runs: PathBuf,
+    /// Address and port of the page; a port of 0 takes any that is free
+    #[arg(long, value_name = "ADDRESS", default_value = ADDRESS)]
+    listen: SocketAddr,
+    /// End when standard input does: with the program that began this one
+    #[arg(long, hide = true)]
+    while_stdin: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let Arguments { runs, listen, while_stdin } = arguments;
+    if !listen.ip().is_loopback() {
+        return Err(Failure::ForOthers { address: *listen });
+    }
+    super::runtime()?.block_on(async {
+        let taken = |source| Failure::Page { address: *listen, source };
+        let listener = TcpListener::bind(listen).await.map_err(taken)?;
+        let address = listener.local_addr().map_err(taken)?;
+        let planned = Planned::default();
+        let page = Page::new(
+            std::path::absolute(runs).unwrap_or_else(|_| runs.clone()),
+            address,
+            Box::new(move |run| planned.of(run)),
+            Box::new(|what| eprintln!("page: refused {what}")),
+        );
+        let page = page.map_err(taken)?;
+        super::print(&format!("page     {}\n", page.url()))?;
+        tokio::select! {
+            () = page.serve(listener) => {}
+            ended = tokio::signal::ctrl_c(), if !while_stdin => ended.map_err(Failure::Terminal)?,
+            () = end_of_input(), if *while_stdin => tokio::time::sleep(LINGERS).await,
+        }
+        Ok(Outcome::Accepted)
+    })
+}
+
+/// Waits until nobody can write to standard input any more.
+async fn end_of_input() {
+    let (ended, end) = tokio::sync::oneshot::channel::<()>();
+    // A thread of its own, which ends with the program: a read of a pipe cannot be called off.
+    std::thread::spawn(move || {
+        let mut some = [0; 64];
+        while io::stdin().read(&mut some).is_ok_and(|read| read > 0) {}
+        drop(ended);
+    });
+    drop(end.await);
+}
+
+/// The page beside a run. It ends, a little later, with the program that holds this.
+pub(super) struct Beside {
+    _page: Child,
+}
+
+impl Beside {
+    /// Begins to show the runs in a folder. In a program of its own: it can neither slow the run down nor take it along.
+    pub(super) fn begin(runs: &Path, listen: SocketAddr, json: bool) -> Result<Self, Failure> {
+        let told = if json { Stdio::null() } else { Stdio::inherit() };
+        let failed = |source| Failure::Page { address: listen, source };
+        let program = std::env::current_exe().map_err(failed)?;
+        let mut command = Command::new(program);
+        command.args(["serve", "--while-stdin", "--listen", &listen.to_string(), "--runs"]).arg(runs);
+        // Ctrl-C is for the run; a page that went with it would leave its browsers without the end.
+        #[cfg(unix)]
+        std::os::unix::process::CommandExt::process_group(&mut command, 0);
+        let page = command.stdin(Stdio::piped()).stdout(told).spawn().map_err(failed)?;
+        Ok(Self { _page: page })
+    }
+}
+
+/// The plan of the run that was asked for last.
+#[derive(Default)]
+struct Planned(Mutex<Option<(PathBuf, Vec<[f64; 2]>)>>);
+
+impl Planned {
+    fn of(&self, run: &Path) -> Option<Vec<[f64; 2]>> {
+        let mut last = self.0.lock().ok()?;
+        if let Some((known, points)) = &*last
+            && known == run
+        {
+            return Some(points.clone());
+        }
+        let points = planned(run)?;
+        *last = Some((run.to_owned(), points.clone()));
+        Some(points)
+    }
+}
+
+/// Lays the points of a run out again, from what it keeps of its recipe and its cell.
+fn planned(run: &Path) -> Option<Vec<[f64; 2]>> {
+    let first = Reader::open(run).ok()?.records(0).next()?.ok()?.value();
+    let content = &first["content"];
+    let from = PathBuf::from(content["working_folder"].as_str()?);
+    let named = |key: &str| Some(from.join(content[key].as_str()?));
+    let text = |name: &str| std::fs::read_to_string(run.join(name)).ok();
+    let recipe = Recipe::parse(&named("recipe")?, &text("recipe.toml")?).ok()?;
+    let cell = CellConfig::parse(&named("cell")?, &text("cell.toml")?).ok()?;
+    let (task, _) = setup::prepare(&recipe, &cell).ok()?;
+    Some(task.targets.iter().map(|target| [target.point.x, target.point.y]).collect())
+}

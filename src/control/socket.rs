@@ -1,0 +1,233 @@
+//! The control socket of a running cell: a person at another terminal holds, resumes, stops or aborts it, or asks how it is.
+//!
+//! One line of JSON in, one line out; for who watches, one line after another. The operating system says who is at the other end;
+//! that is what is recorded, and for whom a program speaks beside it.
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use regrind_cell::Actor;
+use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader, Lines};
+use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
+use tokio::net::{UnixListener, UnixStream};
+use tokio::sync::{mpsc, oneshot, watch};
+
+use super::request::{Line, OnBehalf, Reply, Request};
+use super::snapshot::Snapshot;
+
+/// The socket in a run folder.
+const SOCKET: &str = "control.sock";
+/// Longest line that is read.
+const LONGEST_LINE: u64 = 4096;
+/// A client that says nothing for so long is gone.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+/// Between two tries to let a client in.
+const BETWEEN_TRIES: Duration = Duration::from_millis(50);
+/// Between two lines to who watches: no eye follows more of them, and a cell that says nothing for longer than this is not there.
+const LEAST_BETWEEN_LINES: Duration = Duration::from_millis(100);
+const MOST_BETWEEN_LINES: Duration = Duration::from_secs(1);
+/// Longest time without a line after which who watches takes the cell for gone.
+const SILENCE: Duration = Duration::from_millis(2500);
+
+/// An order on its way to the loop.
+pub struct Ordered {
+    /// What is asked.
+    pub request: Request,
+    /// Who asks.
+    pub actor: Actor,
+    /// Where the answer goes; none for orders of this process itself.
+    pub answer: Option<oneshot::Sender<Reply>>,
+}
+
+/// A socket that goes away with its owner.
+pub struct Control {
+    path: PathBuf,
+    task: tokio::task::JoinHandle<()>,
+}
+
+impl Control {
+    /// Listens in a run folder.
+    ///
+    /// # Errors
+    /// A folder in which no socket can be made, such as one with a name too long for the operating system.
+    pub fn listen(folder: &Path, orders: mpsc::Sender<Ordered>, status: watch::Receiver<Snapshot>) -> io::Result<Self> {
+        let path = folder.join(SOCKET);
+        // One that a killed process left behind; the lock of the journal says that nobody lives there.
+        if path.exists() {
+            regrind_formats::remove_socket(&path)?;
+        }
+        let listener = UnixListener::bind(&path)?;
+        let task = tokio::spawn(async move {
+            loop {
+                let Ok((stream, _)) = listener.accept().await else {
+                    // No descriptor is left, or the client has gone: that passes, and orders must get through when it has.
+                    tokio::time::sleep(BETWEEN_TRIES).await;
+                    continue;
+                };
+                let (orders, status) = (orders.clone(), status.clone());
+                // A client that misbehaves hurts itself only.
+                tokio::spawn(async move { drop(serve(stream, orders, status).await) });
+            }
+        });
+        Ok(Self { path, task })
+    }
+}
+
+impl Drop for Control {
+    fn drop(&mut self) {
+        self.task.abort();
+        // Nobody listens any more; a socket left behind is replaced by the next run.
+        let _ = regrind_formats::remove_socket(&self.path);
+    }
+}
+
+/// Lets a client say what it wants, and gives it that.
+async fn serve(
+    stream: UnixStream,
+    orders: mpsc::Sender<Ordered>,
+    mut status: watch::Receiver<Snapshot>,
+) -> io::Result<()> {
+    let peer = actor_of(&stream)?;
+    let (read, mut write) = stream.into_split();
+    let mut text = String::new();
+    let mut read = BufReader::new(read).take(LONGEST_LINE);
+    tokio::time::timeout(PATIENCE, read.read_line(&mut text)).await??;
+    let reply = match serde_json::from_str(&text) {
+        Ok(Line { request: Request::Watch, .. }) => return told_on(&mut write, &mut status).await,
+        Ok(Line { request, by }) => answer(request, on_behalf(peer, by), &orders, &status).await,
+        Err(error) => refusal(format!("not an order: {error}"), &status),
+    };
+    tell(&mut write, &reply).await
+}
+
+/// Hands an order over, and waits for what the cell says to it.
+async fn answer(
+    request: Request,
+    actor: Actor,
+    orders: &mpsc::Sender<Ordered>,
+    status: &watch::Receiver<Snapshot>,
+) -> Reply {
+    if request == Request::Status {
+        return Reply { accepted: true, message: String::new(), status: status.borrow().clone() };
+    }
+    let over = || refusal("the run is over".into(), status);
+    let (answer, answered) = oneshot::channel();
+    let handed_over = async {
+        orders.send(Ordered { request, actor, answer: Some(answer) }).await.ok()?;
+        answered.await.ok()
+    };
+    match tokio::time::timeout(PATIENCE, handed_over).await {
+        Ok(reply) => reply.unwrap_or_else(over),
+        Err(_) => refusal("the cell has not answered; whether it took the order is not known".into(), status),
+    }
+}
+
+fn refusal(message: String, status: &watch::Receiver<Snapshot>) -> Reply {
+    Reply { accepted: false, message, status: status.borrow().clone() }
+}
+
+/// Tells how the cell is after every change, and at least so often that silence means that nobody is there.
+async fn told_on(write: &mut OwnedWriteHalf, status: &mut watch::Receiver<Snapshot>) -> io::Result<()> {
+    loop {
+        let now = status.borrow_and_update().clone();
+        tell(write, &Reply { accepted: true, message: String::new(), status: now }).await?;
+        tokio::time::sleep(LEAST_BETWEEN_LINES).await;
+        // Silence is as good a reason to tell it again as a change.
+        if let Ok(Err(_)) = tokio::time::timeout(MOST_BETWEEN_LINES, status.changed()).await {
+            return Ok(());
+        }
+    }
+}
+
+async fn tell(write: &mut OwnedWriteHalf, reply: &Reply) -> io::Result<()> {
+    let mut text = serde_json::to_vec(reply)?;
+    text.push(b'\n');
+    tokio::time::timeout(PATIENCE, write.write_all(&text)).await?
+}
+
+/// Names the person by what the operating system vouches for.
+fn actor_of(stream: &UnixStream) -> io::Result<Actor> {
+    let peer = stream.peer_cred()?;
+    let name = match std::env::var("USER") {
+        // The same user as this process: the name is known.
+        Ok(name) if Some(peer.uid()) == own_uid() => format!("{name} (uid {})", peer.uid()),
+        _ => format!("uid {}", peer.uid()),
+    };
+    let station = peer.pid().map_or("local console".to_owned(), |pid| format!("local console, process {pid}"));
+    Ok(Actor { name, station })
+}
+
+/// Names the person for whom a program speaks; what that program says of them is told as its word.
+fn on_behalf(peer: Actor, by: Option<OnBehalf>) -> Actor {
+    let Some(by) = by else { return peer };
+    let name = by.name.map_or(peer.name.clone(), |name| format!("{name}, by a program of {}", peer.name));
+    Actor { name, station: format!("{} ({})", by.station, peer.station) }
+}
+
+fn own_uid() -> Option<u32> {
+    use std::os::unix::fs::MetadataExt;
+    std::fs::metadata("/proc/self").ok().map(|m| m.uid())
+}
+
+/// Whether a run goes on in a folder: somebody listens to its orders.
+pub fn is_live(folder: &Path) -> bool {
+    std::os::unix::net::UnixStream::connect(folder.join(SOCKET)).is_ok()
+}
+
+/// Asks a running cell; blocks for its answer.
+///
+/// # Errors
+/// No cell that runs in that folder, and one that does not answer.
+pub fn ask(folder: &Path, request: &Request) -> io::Result<Reply> {
+    ask_for(folder, request, None)
+}
+
+/// Asks a running cell on behalf of somebody else; blocks for its answer.
+///
+/// # Errors
+/// Those of [`ask`].
+pub fn ask_for(folder: &Path, request: &Request, by: Option<OnBehalf>) -> io::Result<Reply> {
+    use std::io::{BufRead, Write};
+    let mut stream = std::os::unix::net::UnixStream::connect(folder.join(SOCKET))?;
+    stream.set_read_timeout(Some(PATIENCE))?;
+    stream.write_all(&line(request, by)?)?;
+    let mut text = String::new();
+    std::io::BufReader::new(stream).read_line(&mut text)?;
+    Ok(serde_json::from_str(&text)?)
+}
+
+fn line(request: &Request, by: Option<OnBehalf>) -> io::Result<Vec<u8>> {
+    let mut text = serde_json::to_vec(&Line { request: request.clone(), by })?;
+    text.push(b'\n');
+    Ok(text)
+}
+
+/// A running cell that is watched.
+pub struct Watch {
+    lines: Lines<BufReader<OwnedReadHalf>>,
+    /// Held open: a cell that is no longer listened to stops telling.
+    _write: OwnedWriteHalf,
+}
+
+/// Begins to watch a running cell.
+///
+/// # Errors
+/// No cell that runs in that folder.
+pub async fn watch(folder: &Path) -> io::Result<Watch> {
+    let (read, mut write) = UnixStream::connect(folder.join(SOCKET)).await?.into_split();
+    write.write_all(&line(&Request::Watch, None)?).await?;
+    Ok(Watch { lines: BufReader::new(read).lines(), _write: write })
+}
+
+impl Watch {
+    /// Waits for the next thing that the cell tells of itself; none where it has gone.
+    ///
+    /// # Errors
+    /// A cell that says nothing for too long, or what nobody understands.
+    pub async fn next(&mut self) -> io::Result<Option<Snapshot>> {
+        let Some(text) = tokio::time::timeout(SILENCE, self.lines.next_line()).await?? else { return Ok(None) };
+        Ok(Some(serde_json::from_str::<Reply>(&text)?.status))
+    }
+}

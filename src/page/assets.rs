@@ -1,0 +1,23 @@
+//! What a browser needs besides the pages, out of the program itself.
+
+use axum::extract::Path;
+use axum::http::StatusCode;
+use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
+use axum::response::{IntoResponse, Response};
+
+const ASSETS: [(&str, &str, &str); 6] = [
+    ("page.css", "text/css; charset=utf-8", include_str!("assets/page.css")),
+    ("page.js", "text/javascript; charset=utf-8", include_str!("assets/page.js")),
+    ("map.js", "text/javascript; charset=utf-8", include_str!("assets/map.js")),
+    ("relief.js", "text/javascript; charset=utf-8", include_str!("assets/relief.js")),
+    ("theme.js", "text/javascript; charset=utf-8", include_str!("assets/theme.js")),
+    ("icon.svg", "image/svg+xml", include_str!("assets/icon.svg")),
+];
+
+pub(crate) async fn asset(Path(name): Path<String>) -> Response {
+    match ASSETS.iter().find(|(known, ..)| *known == name) {
+        // Another version of the program has other assets at the same address.
+        Some((_, kind, text)) => ([(CONTENT_TYPE, *kind), (CACHE_CONTROL, "no-cache")], *text).into_response(),
+        None => StatusCode::NOT_FOUND.into_response(),
+    }
+}

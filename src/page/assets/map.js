@@ -1,0 +1,220 @@
+// Error maps and points on a canvas: what the server sends in bytes, in the colours of every other picture.
+"use strict";
+const regrindMap = (() => {
+  /** Reads a map: columns, rows, first node, spacing, values in micrometres (NaN where nothing was measured). */
+  function readGrid(buffer) {
+    const head = new DataView(buffer);
+    const [columns, rows] = [head.getUint32(0, true), head.getUint32(4, true)];
+    const [firstX, firstY, stepX, stepY] = [8, 16, 24, 32].map((at) => head.getFloat64(at, true));
+    return { columns, rows, firstX, firstY, stepX, stepY, values: new Float32Array(buffer, 40) };
+  }
+
+  /** The largest size of some values, and how they are spread. */
+  function statistics(values) {
+    let [limit, count, squares, low, high] = [0, 0, 0, Infinity, -Infinity];
+    for (const value of values) {
+      if (Number.isNaN(value)) continue;
+      count += 1;
+      squares += value * value;
+      low = Math.min(low, value);
+      high = Math.max(high, value);
+      limit = Math.max(limit, Math.abs(value));
+    }
+    return { limit: limit || 1, count, rms: Math.sqrt(squares / Math.max(count, 1)), pv: count ? high - low : 0 };
+  }
+
+  /** 255 colours from below to above, out of hexadecimal digits. */
+  function readColours(text) {
+    const colours = new Uint8Array(text.length / 2);
+    for (let k = 0; k < colours.length; k += 1) colours[k] = parseInt(text.slice(2 * k, 2 * k + 2), 16);
+    return colours;
+  }
+
+  const level = (value, limit) => Math.round((Math.min(Math.max(value / limit, -1), 1) + 1) * 127);
+
+  /** The value of a map between its nodes, straight along x and y; nothing where one of the four was not measured. */
+  function valueAt(grid, x, y) {
+    const [u, v] = [(x - grid.firstX) / grid.stepX, (y - grid.firstY) / grid.stepY];
+    // Maps of one part begin and end within a fraction of a step of each other.
+    const [column, row] = [[u, grid.columns], [v, grid.rows]].map(([at, count]) => Math.min(Math.max(Math.floor(at), 0), count - 2));
+    const [s, t] = [u - column, v - row];
+    if (Math.abs(s - 0.5) > 1 || Math.abs(t - 0.5) > 1) return NaN;
+    const node = (c, r) => grid.values[(row + r) * grid.columns + column + c];
+    return (1 - t) * ((1 - s) * node(0, 0) + s * node(1, 0)) + t * ((1 - s) * node(0, 1) + s * node(1, 1));
+  }
+
+  /** What a map has more than another one, at the nodes of the first. */
+  function difference(now, before) {
+    const values = now.values.map((value, k) => {
+      const [column, row] = [k % now.columns, Math.floor(k / now.columns)];
+      return value - valueAt(before, now.firstX + column * now.stepX, now.firstY + row * now.stepY);
+    });
+    return { ...now, values };
+  }
+
+  /** Round steps over a range, some five of them. */
+  function ticks(low, high) {
+    const rough = (high - low) / 5;
+    const decade = 10 ** Math.floor(Math.log10(rough));
+    const step = [1, 2, 5, 10].map((k) => k * decade).find((s) => s >= rough) || decade;
+    const found = [];
+    for (let tick = Math.ceil(low / step) * step; tick <= high + 1e-9 * step; tick += step) found.push(tick);
+    return found.map((tick) => [tick, Number(tick.toPrecision(6)).toString().replace("-", "−")]);
+  }
+
+  /** Makes a canvas as fine as the screen, and returns its context and its size in the pixels of the page. */
+  function prepared(canvas) {
+    const { clientWidth: width, clientHeight: height } = canvas;
+    const fine = window.devicePixelRatio || 1;
+    canvas.width = Math.round(width * fine);
+    canvas.height = Math.round(height * fine);
+    const context = canvas.getContext("2d");
+    context.scale(fine, fine);
+    const style = getComputedStyle(document.documentElement);
+    const [ink, quiet, ground] = ["--ink", "--quiet", "--ground"].map((name) => style.getPropertyValue(name).trim());
+    context.font = "13px Arial, sans-serif";
+    return { context, width, height, ink, quiet, ground };
+  }
+
+  /** The pixels of a map, one a node, y upwards. */
+  function picture(grid, limit, colours) {
+    const canvas = document.createElement("canvas");
+    [canvas.width, canvas.height] = [grid.columns, grid.rows];
+    const image = new ImageData(grid.columns, grid.rows);
+    for (let row = 0; row < grid.rows; row += 1) {
+      for (let column = 0; column < grid.columns; column += 1) {
+        const value = grid.values[row * grid.columns + column];
+        if (Number.isNaN(value)) continue;
+        const at = 4 * ((grid.rows - 1 - row) * grid.columns + column);
+        image.data.set(colours.subarray(3 * level(value, limit), 3 * level(value, limit) + 3), at);
+        image.data[at + 3] = 255;
+      }
+    }
+    canvas.getContext("2d").putImageData(image, 0, 0);
+    return canvas;
+  }
+
+  /** Where the part lies: the bounds of a map, or else of some points. */
+  function bounds(grid, places) {
+    if (grid) {
+      return [grid.firstX - grid.stepX / 2, grid.firstY - grid.stepY / 2,
+        grid.firstX + (grid.columns - 0.5) * grid.stepX, grid.firstY + (grid.rows - 0.5) * grid.stepY];
+    }
+    let [x0, y0, x1, y1] = [Infinity, Infinity, -Infinity, -Infinity];
+    for (const [x, y] of places) [x0, y0, x1, y1] = [Math.min(x0, x), Math.min(y0, y), Math.max(x1, x), Math.max(y1, y)];
+    const margin = 0.03 * Math.max(x1 - x0, y1 - y0, 1e-6);
+    return [x0 - margin, y0 - margin, x1 + margin, y1 + margin];
+  }
+
+  /** Draws a map with its axes and its bar; returns how places on the page and on the part belong together. */
+  function draw(canvas, { grid, limit, colours, dots, mark, key }) {
+    const { context, width, height, ink, quiet, ground } = prepared(canvas);
+    context.fillStyle = ground;
+    context.fillRect(0, 0, width, height);
+    if (!grid && !(dots && dots.length)) return null;
+    const [x0, y0, x1, y1] = bounds(grid, (dots || []).map((dot) => dot.at));
+    const [left, right, top, bottom] = [46, grid ? 84 : 12, 8, 38];
+    const scale = Math.min((width - left - right) / (x1 - x0), (height - top - bottom) / (y1 - y0));
+    const [w, h] = [scale * (x1 - x0), scale * (y1 - y0)];
+    const offset = left + Math.max(0, (width - left - right - w) / 2);
+    const view = {
+      limit,
+      toPage: (x, y) => [offset + (x - x0) * scale, top + h - (y - y0) * scale],
+      toPart: (px, py) => [x0 + (px - offset) / scale, y0 + (top + h - py) / scale],
+    };
+    if (grid) {
+      context.imageSmoothingEnabled = w / grid.columns < 4;
+      context.drawImage(picture(grid, limit, colours), offset, top, w, h);
+    }
+    for (const dot of dots || []) {
+      const [px, py] = view.toPage(...dot.at);
+      context.beginPath();
+      context.arc(px, py, dot.size, 0, 7);
+      [context.fillStyle, context.strokeStyle] = [dot.fill || ground, dot.fill ? ink : quiet];
+      if (dot.fill) context.fill();
+      else context.stroke();
+    }
+    [context.strokeStyle, context.lineWidth] = [ink, 1];
+    context.strokeRect(offset, top, w, h);
+    axes(context, view, { x0, y0, x1, y1, offset, top, w, h, ink });
+    if (grid) bar(context, { limit, colours, x: offset + w + 14, top, h, ink });
+    if (key) {
+      context.fillStyle = quiet;
+      context.fillText(key, offset, height - 4);
+    }
+    if (mark) {
+      const [px, py] = view.toPage(...mark);
+      for (const [colour, thick] of [[ground, 3], [ink, 1]]) {
+        [context.strokeStyle, context.lineWidth] = [colour, thick];
+        context.beginPath();
+        context.moveTo(px - 9, py);
+        context.lineTo(px + 9, py);
+        context.moveTo(px, py - 9);
+        context.lineTo(px, py + 9);
+        context.stroke();
+      }
+    }
+    return view;
+  }
+
+  function axes(context, view, { x0, y0, x1, y1, offset, top, w, h, ink }) {
+    context.fillStyle = ink;
+    context.textAlign = "center";
+    for (const [x, text] of ticks(x0, x1)) {
+      const [px] = view.toPage(x, y0);
+      context.fillRect(px, top + h, 1, 4);
+      context.fillText(text, px, top + h + 16);
+    }
+    context.textAlign = "right";
+    for (const [y, text] of ticks(y0, y1)) {
+      const [, py] = view.toPage(x0, y);
+      context.fillRect(offset - 4, py, 4, 1);
+      context.fillText(text, offset - 7, py + 4);
+    }
+    context.textAlign = "right";
+    context.fillText("mm", offset + w, top + h + 31);
+    context.textAlign = "left";
+  }
+
+  function bar(context, { limit, colours, x, top, h, ink }) {
+    for (let k = 0; k < 255; k += 1) {
+      context.fillStyle = `rgb(${colours[3 * k]},${colours[3 * k + 1]},${colours[3 * k + 2]})`;
+      context.fillRect(x, top + h * (1 - (k + 1) / 255), 14, h / 255 + 1);
+    }
+    context.strokeStyle = ink;
+    context.strokeRect(x, top, 14, h);
+    context.fillStyle = ink;
+    for (const [value, text] of ticks(-limit, limit)) {
+      context.fillText(text, x + 19, top + h * (1 - (value / limit + 1) / 2) + 4);
+    }
+    context.fillText("µm", x, top + h + 16);
+  }
+
+  /** Draws how many nodes have which value. */
+  function histogram(canvas, values, limit, colours) {
+    const { context, width, height, ink } = prepared(canvas);
+    const bins = new Array(51).fill(0);
+    for (const value of values) {
+      if (!Number.isNaN(value)) bins[Math.min(50, Math.floor((Math.min(Math.max(value / limit, -1), 1) + 1) * 25.5))] += 1;
+    }
+    const most = Math.max(...bins, 1);
+    const [left, wide, high] = [46, width - 80, height - 20];
+    bins.forEach((count, k) => {
+      const at = 3 * Math.round(k * 5.08);
+      context.fillStyle = `rgb(${colours[at]},${colours[at + 1]},${colours[at + 2]})`;
+      const bar = (high * count) / most;
+      context.fillRect(left + (wide * k) / 51, high - bar, wide / 51 - 1, bar);
+      context.strokeStyle = ink;
+      context.lineWidth = 0.4;
+      if (count) context.strokeRect(left + (wide * k) / 51, high - bar, wide / 51 - 1, bar);
+    });
+    context.fillStyle = ink;
+    context.fillRect(left, high, wide, 1);
+    context.textAlign = "center";
+    for (const [value, text] of ticks(-limit, limit)) context.fillText(text, left + wide * (value / limit + 1) / 2, height - 5);
+    context.textAlign = "left";
+    context.fillText("µm", left + wide + 8, height - 5);
+  }
+
+  return { readGrid, readColours, statistics, difference, draw, histogram, level };
+})();

@@ -1,0 +1,186 @@
+//! How PV and RMS come down from cycle to cycle, with their limits, their uncertainty, and where the next one would come.
+
+use maud::{Markup, html};
+use regrind_cell::Tolerance;
+use regrind_report::CycleSummary;
+
+use super::texts::{Language, Text};
+
+const WIDTH: f64 = 420.0;
+const HEIGHT: f64 = 190.0;
+const LEFT: f64 = 46.0;
+const RIGHT: f64 = 84.0;
+const TOP: f64 = 10.0;
+const BOTTOM: f64 = 24.0;
+
+/// One of the two figures over the cycles: (cycle, value, expanded uncertainty).
+struct Line {
+    name: &'static str,
+    class: &'static str,
+    points: Vec<(u32, f64, f64)>,
+    limit_um: f64,
+}
+
+impl Line {
+    /// Where the next cycle would come if it took away the same share as the last.
+    fn forecast(&self) -> Option<(u32, f64)> {
+        let [.., (_, before, _), (cycle, last, _)] = self.points[..] else { return None };
+        (last < before).then(|| (cycle + 1, last * last / before))
+    }
+}
+
+/// Draws it; nothing where nothing is measured.
+pub(crate) fn chart(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, ahead: bool, language: Language) -> Markup {
+    let points = |k: usize| {
+        let of = |cycle: &CycleSummary| Some((cycle.cycle, cycle.figures?[k][0], cycle.figures?[k][1]));
+        cycles.iter().filter_map(of).filter(|(_, value, _)| *value > 0.0 && value.is_finite()).collect()
+    };
+    let limit = |of: fn(&Tolerance) -> f64| tolerance.map_or(f64::INFINITY, |tolerance| 1e3 * of(tolerance));
+    let lines = [
+        Line { name: "PV", class: "pv", points: points(0), limit_um: limit(|t| t.pv_mm) },
+        Line { name: "RMS", class: "rms", points: points(1), limit_um: limit(|t| t.rms_mm) },
+    ];
+    let Some(scale) = Scale::of(&lines, ahead) else {
+        return html! { p .quiet { (Text::NotMeasured.to(language)) } };
+    };
+    html! {
+        svg viewBox=(format!("0 0 {WIDTH} {HEIGHT}")) role="img" aria-label=(words(&lines, language)) {
+            @for decade in scale.ticks() {
+                @let y = format!("{:.1}", scale.y(decade));
+                line .grid x1=(LEFT) x2=(WIDTH - RIGHT) y1=(y) y2=(y) {}
+                text .tick x=(LEFT - 6.0) y=(format!("{:.1}", scale.y(decade) + 4.0)) text-anchor="end" { (tick(decade)) }
+            }
+            @for cycle in scale.first..=scale.last {
+                text .tick x=(format!("{:.1}", scale.x(cycle))) y=(HEIGHT - 6.0) text-anchor="middle" { (cycle) }
+            }
+            text .tick x="10" y=(TOP + 4.0) { "µm" }
+            @for line in &lines { (drawn(line, &scale, ahead, language)) }
+        }
+    }
+}
+
+fn drawn(line: &Line, scale: &Scale, ahead: bool, language: Language) -> Markup {
+    let at = |cycle: u32, value: f64| format!("{:.1},{:.1}", scale.x(cycle), scale.y(value));
+    let join = |points: Vec<String>| points.join(" ");
+    let middle = join(line.points.iter().map(|(cycle, value, _)| at(*cycle, *value)).collect());
+    let above = line.points.iter().map(|(cycle, value, u)| at(*cycle, value + u));
+    let below = line.points.iter().rev().map(|(cycle, value, u)| at(*cycle, (value - u).max(scale.low)));
+    let band = join(above.chain(below).collect());
+    let right = WIDTH - RIGHT + 6.0;
+    html! {
+        g class=(line.class) {
+            @if line.limit_um.is_finite() && line.limit_um > 0.0 {
+                @let y = format!("{:.1}", scale.y(line.limit_um));
+                line .limit x1=(LEFT) x2=(WIDTH - RIGHT) y1=(y) y2=(y) {}
+                text .name x=(right) y=(y) dy="4" { (line.name) " " (Text::Limit.to(language)) }
+            }
+            polygon .band points=(band) {}
+            polyline .line points=(middle) {}
+            @for (cycle, value, u) in &line.points {
+                circle cx=(format!("{:.1}", scale.x(*cycle))) cy=(format!("{:.1}", scale.y(*value))) r="4" {
+                    title { (line.name) " " (format!("{value:.2} ± {u:.2} µm")) }
+                }
+            }
+            @if let Some((cycle, value)) = line.forecast().filter(|_| ahead) {
+                @let (from, last) = line.points.last().map(|(cycle, value, _)| (*cycle, *value)).unwrap_or_default();
+                polyline .forecast points=(join(vec![at(from, last), at(cycle, value.max(scale.low))])) {}
+                circle .forecast cx=(format!("{:.1}", scale.x(cycle))) cy=(format!("{:.1}", scale.y(value.max(scale.low)))) r="4" {
+                    title { (line.name) " " (Text::Forecast.to(language)) " " (format!("{value:.2} µm")) }
+                }
+            }
+        }
+    }
+}
+
+/// What somebody hears who does not see it.
+fn words(lines: &[Line], language: Language) -> String {
+    let of = |line: &Line| {
+        let points =
+            line.points.iter().map(|(cycle, value, _)| format!("{} {cycle}: {value:.2} µm", Text::Cycle.to(language)));
+        format!("{}: {}", line.name, points.collect::<Vec<_>>().join(", "))
+    };
+    lines.iter().map(of).collect::<Vec<_>>().join("; ")
+}
+
+/// Cycles along, micrometres upwards by their logarithm.
+struct Scale {
+    first: u32,
+    last: u32,
+    low: f64,
+    high: f64,
+}
+
+impl Scale {
+    /// The scale on which all of some lines can be seen; none where there is nothing to see.
+    fn of(lines: &[Line], ahead: bool) -> Option<Self> {
+        let all = || lines.iter().flat_map(|line| &line.points);
+        let first = all().map(|(cycle, ..)| *cycle).min()?;
+        let forecast = lines.iter().filter_map(Line::forecast).filter(|_| ahead);
+        let last = all().map(|(cycle, ..)| *cycle).chain(forecast.map(|(cycle, _)| cycle)).max()?;
+        let limits = lines.iter().map(|line| line.limit_um).filter(|limit| limit.is_finite() && *limit > 0.0);
+        let values =
+            || all().map(|(_, value, u)| value + u).chain(all().map(|(_, value, _)| *value)).chain(limits.clone());
+        let low = values().fold(f64::INFINITY, f64::min) / 1.6;
+        let high = values().fold(0.0, f64::max) * 1.2;
+        Some(Self { first, last: last.max(first + 1), low, high })
+    }
+
+    fn x(&self, cycle: u32) -> f64 {
+        let share = f64::from(cycle - self.first) / f64::from(self.last - self.first);
+        LEFT + 12.0 + share * (WIDTH - LEFT - RIGHT - 24.0)
+    }
+
+    fn y(&self, value: f64) -> f64 {
+        let share = (value.max(self.low) / self.low).ln() / (self.high / self.low).ln();
+        HEIGHT - BOTTOM - share.clamp(0.0, 1.0) * (HEIGHT - TOP - BOTTOM)
+    }
+
+    /// 1, 2 and 5 of every decade, or the decades alone where those would crowd.
+    fn ticks(&self) -> Vec<f64> {
+        let (from, to) = (self.low.log10().floor() as i32, self.high.log10().ceil() as i32);
+        let steps: &[f64] = if to - from > 3 { &[1.0] } else { &[1.0, 2.0, 5.0] };
+        let all = (from..=to).flat_map(|decade| steps.iter().map(move |step| step * 10f64.powi(decade)));
+        all.filter(|tick| (self.low..=self.high).contains(tick)).collect()
+    }
+}
+
+fn tick(value: f64) -> String {
+    if value >= 1.0 { format!("{value:.0}") } else { format!("{value}").chars().take(6).collect() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn measured(cycle: u32, pv_um: f64, rms_um: f64) -> CycleSummary {
+        CycleSummary {
+            cycle,
+            figures: Some([[pv_um, 0.1 * pv_um], [rms_um, 0.05 * rms_um]]),
+            ..CycleSummary::default()
+        }
+    }
+
+    #[test]
+    fn a_part_that_comes_down_is_expected_to_come_down_by_the_same_share() {
+        let line = Line { name: "PV", class: "pv", points: vec![(1, 20.0, 1.0), (2, 5.0, 1.0)], limit_um: 7.0 };
+        assert_eq!(line.forecast(), Some((3, 1.25)));
+        let worse = Line { points: vec![(1, 5.0, 1.0), (2, 6.0, 1.0)], ..line };
+        assert_eq!(worse.forecast(), None);
+    }
+
+    #[test]
+    fn every_cycle_lies_on_the_chart() {
+        let cycles = [measured(1, 28.79, 5.285), measured(2, 3.6, 0.526)];
+        let svg = chart(&cycles, None, true, Language::En).into_string();
+        assert_eq!(svg.matches("<circle").count(), 6, "{svg}");
+        assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
+    }
+
+    #[test]
+    fn nothing_measured_is_said() {
+        for cycles in [&[][..], &[CycleSummary { cycle: 1, ..CycleSummary::default() }], &[measured(1, f64::NAN, 0.0)]]
+        {
+            assert!(chart(cycles, None, true, Language::De).into_string().contains("gemessen"));
+        }
+    }
+}

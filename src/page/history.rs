@@ -1,0 +1,74 @@
+//! The runs in a folder, as a list shows them. What was read of a run is kept until its record changes.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::SystemTime;
+
+use regrind_control::is_live;
+use regrind_report::{RunSummary, run_summary};
+
+/// The files that change with a record, and when they did last, with their lengths.
+type Stamp = [Option<(SystemTime, u64)>; 2];
+
+pub(crate) struct History {
+    runs: PathBuf,
+    read: Mutex<HashMap<PathBuf, (Stamp, Arc<RunSummary>)>>,
+}
+
+/// A run in the list.
+#[derive(Clone)]
+pub(crate) struct Listed {
+    /// The name of its folder.
+    pub(crate) id: String,
+    pub(crate) is_live: bool,
+    pub(crate) summary: Arc<RunSummary>,
+}
+
+impl History {
+    pub(crate) fn new(runs: PathBuf) -> Self {
+        Self { runs, read: Mutex::default() }
+    }
+
+    /// Returns the folder of a run by its name; none for what is no name of a folder here.
+    pub(crate) fn folder(&self, id: &str) -> Option<PathBuf> {
+        let plain = !id.is_empty() && !id.starts_with('.') && !id.contains(['/', '\\', '\0', ':']);
+        let folder = self.runs.join(id);
+        (plain && folder.join("journal.sqlite").is_file()).then_some(folder)
+    }
+
+    /// Lists the runs, those that are on first, then the newest first. Blocks for the disk.
+    pub(crate) fn list(&self) -> Vec<Listed> {
+        let folders = std::fs::read_dir(&self.runs).into_iter().flatten().filter_map(Result::ok);
+        let ids = folders.filter_map(|entry| entry.file_name().into_string().ok());
+        let listed = |id: String| {
+            let folder = self.folder(&id)?;
+            Some(Listed { is_live: is_live(&folder), summary: self.summary(&folder)?, id })
+        };
+        let mut all: Vec<Listed> = ids.filter_map(listed).collect();
+        all.sort_by(|a, b| (b.is_live, &b.summary.began, &b.id).cmp(&(a.is_live, &a.summary.began, &a.id)));
+        all
+    }
+
+    /// Reads what the record of a run tells; none where it cannot be read. Blocks for the disk.
+    pub(crate) fn summary(&self, folder: &Path) -> Option<Arc<RunSummary>> {
+        let stamp = stamp(folder);
+        let kept = |read: &HashMap<PathBuf, (Stamp, Arc<RunSummary>)>| {
+            read.get(folder).filter(|(at, _)| *at == stamp).map(|(_, summary)| Arc::clone(summary))
+        };
+        if let Some(summary) = kept(&self.read.lock().unwrap_or_else(PoisonError::into_inner)) {
+            return Some(summary);
+        }
+        let summary = Arc::new(run_summary(folder).ok()?);
+        let mut read = self.read.lock().unwrap_or_else(PoisonError::into_inner);
+        read.insert(folder.to_owned(), (stamp, Arc::clone(&summary)));
+        Some(summary)
+    }
+}
+
+fn stamp(folder: &Path) -> Stamp {
+    ["journal.sqlite", "journal.sqlite-wal"].map(|name| {
+        let metadata = std::fs::metadata(folder.join(name)).ok()?;
+        Some((metadata.modified().ok()?, metadata.len()))
+    })
+}

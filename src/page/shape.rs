@@ -1,0 +1,134 @@
+//! Maps and points in the bytes that the canvas draws from: little endian, lengths in millimetres, deviations in micrometres.
+//!
+//! ```text
+//!  map      u32 columns, u32 rows, f64 first x, first y, f64 spacing x, y, then f32 a node, x fastest; NaN where nothing was measured
+//!  points   f32 x, y, deviation a point, in the order measured; the deviation is NaN where the point took no part in the fit
+//!  planned  f32 x, y a point, in the order in which it is to be touched
+//! ```
+
+use std::path::PathBuf;
+
+use axum::extract::{Path, State};
+use axum::http::StatusCode;
+use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
+use axum::response::{IntoResponse, Response};
+use regrind_formats::{DeviationRow, FormatError, read_deviations, read_error_map};
+use regrind_report::CycleSummary;
+use tokio::task::spawn_blocking;
+
+use super::Shared;
+
+/// Most nodes of a map that are drawn.
+const MOST_NODES: usize = 4 << 20;
+
+pub(crate) async fn map(State(page): State<Shared>, Path((run, cycle)): Path<(String, u32)>) -> Response {
+    respond(move || {
+        let path = file(&page, &run, cycle, |of| of.map.as_ref())?;
+        Some(read_error_map(&path).map(|nodes| grid_bytes(&nodes)))
+    })
+    .await
+}
+
+pub(crate) async fn points(State(page): State<Shared>, Path((run, cycle)): Path<(String, u32)>) -> Response {
+    respond(move || {
+        let path = file(&page, &run, cycle, |of| of.deviations.as_ref())?;
+        Some(read_deviations(&path).map(|rows| Some(point_bytes(&rows))))
+    })
+    .await
+}
+
+pub(crate) async fn planned(State(page): State<Shared>, Path(run): Path<String>) -> Response {
+    respond(move || {
+        let points = (page.planned)(&page.history.folder(&run)?)?;
+        Some(Ok(Some(points.iter().flatten().flat_map(|value| (*value as f32).to_le_bytes()).collect())))
+    })
+    .await
+}
+
+/// The file of a cycle that its record names.
+fn file(page: &Shared, run: &str, cycle: u32, named: fn(&CycleSummary) -> Option<&String>) -> Option<PathBuf> {
+    let folder = page.history.folder(run)?;
+    let summary = page.history.summary(&folder)?;
+    let of = summary.cycles.iter().find(|of| of.cycle == cycle)?;
+    Some(folder.join(named(of)?))
+}
+
+/// Answers with bytes that are made where waiting hurts nobody.
+async fn respond(make: impl FnOnce() -> Option<Result<Option<Vec<u8>>, FormatError>> + Send + 'static) -> Response {
+    match spawn_blocking(make).await {
+        Ok(Some(Ok(Some(bytes)))) => {
+            let headers = [(CONTENT_TYPE, "application/octet-stream"), (CACHE_CONTROL, "no-cache")];
+            (headers, bytes).into_response()
+        }
+        Ok(Some(Err(error))) => (StatusCode::UNPROCESSABLE_ENTITY, error.to_string()).into_response(),
+        Ok(_) => StatusCode::NOT_FOUND.into_response(),
+        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+    }
+}
+
+/// Lays nodes on the grid that they came from; none where they lie on no grid.
+fn grid_bytes(nodes: &[[f64; 3]]) -> Option<Vec<u8>> {
+    let [x, y] = [0, 1].map(|k| axis(nodes.iter().map(|node| node[k]).collect()));
+    let ([first_x, step_x, columns], [first_y, step_y, rows]) = (x?, y?);
+    let (columns, rows) = (columns as usize, rows as usize);
+    if columns.checked_mul(rows)? > MOST_NODES {
+        return None;
+    }
+    let mut values = vec![f32::NAN; columns * rows];
+    for [x, y, error_mm] in nodes {
+        let at = |value: &f64, first: f64, step: f64| ((value - first) / step).round() as usize;
+        let (column, row) = (at(x, first_x, step_x), at(y, first_y, step_y));
+        *values.get_mut(row * columns + column)? = (1e3 * error_mm) as f32;
+    }
+    let mut bytes = Vec::with_capacity(40 + 4 * values.len());
+    bytes.extend([columns as u32, rows as u32].iter().flat_map(|count| count.to_le_bytes()));
+    bytes.extend([first_x, first_y, step_x, step_y].iter().flat_map(|length| length.to_le_bytes()));
+    bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+    Some(bytes)
+}
+
+/// The first of some places along an axis, their distance, and how many there are; none where there is no distance.
+fn axis(mut places: Vec<f64>) -> Option<[f64; 3]> {
+    places.sort_by(f64::total_cmp);
+    let (first, last) = (*places.first()?, *places.last()?);
+    // Places of one column are written alike; what is closer than this is rounding.
+    let least = 1e-6 * (last - first);
+    let steps = places.windows(2).map(|pair| pair[1] - pair[0]).filter(|step| *step > least);
+    let step = steps.fold(f64::INFINITY, f64::min);
+    step.is_finite().then(|| [first, step, ((last - first) / step).round() + 1.0])
+}
+
+fn point_bytes(rows: &[DeviationRow]) -> Vec<u8> {
+    let value = |row: &DeviationRow| {
+        let [x, y, _] = row.point_mm;
+        [x, y, if row.used { 1e3 * row.deviation_mm } else { f64::NAN }]
+    };
+    rows.iter().flat_map(value).flat_map(|value| (value as f32).to_le_bytes()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nodes_come_on_the_grid_that_they_were_written_from() {
+        // Three columns and two rows, one node of which was not measured; in any order.
+        let nodes = [[2.0, 5.5, 4e-3], [1.0, 5.0, 1e-3], [1.5, 5.0, 2e-3], [1.0, 5.5, 3e-3], [2.0, 5.0, -1e-3]];
+        let bytes = grid_bytes(&nodes).unwrap();
+        let count = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());
+        let length = |at: usize| f64::from_le_bytes(bytes[at..at + 8].try_into().unwrap());
+        assert_eq!((count(0), count(4)), (3, 2));
+        assert_eq!([8, 16, 24, 32].map(length), [1.0, 5.0, 0.5, 0.5]);
+        let values: Vec<f32> = bytes[40..].chunks(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
+        assert_eq!(values[..4], [1.0, 2.0, -1.0, 3.0]);
+        assert!(values[4].is_nan());
+        assert_eq!(values[5], 4.0);
+    }
+
+    #[test]
+    fn what_lies_on_no_grid_is_not_drawn() {
+        assert!(grid_bytes(&[]).is_none());
+        assert!(grid_bytes(&[[1.0, 1.0, 0.0]]).is_none(), "one node has no spacing");
+        assert!(grid_bytes(&[[0.0, 0.0, 0.0], [1e-3, 1.0, 0.0], [1e6, 1e6, 0.0]]).is_none(), "too many nodes");
+    }
+}

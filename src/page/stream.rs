@@ -1,0 +1,78 @@
+//! What changes on a page while somebody looks at it: pieces of HTML, sent when they are other than those sent last.
+
+use std::convert::Infallible;
+use std::time::Duration;
+
+use axum::Extension;
+use axum::extract::{Path, State};
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::sse::{Event, Sse};
+use axum::response::{IntoResponse, Response};
+use futures_util::stream::unfold;
+use serde_json::{Map, Value, json};
+use tokio::sync::watch::Receiver;
+
+use super::Shared;
+use super::guard::Session;
+use super::live::Seen;
+use super::texts::Language;
+use super::view::{self, Piece};
+
+/// Longest silence of the stream: a browser that hears nothing for longer shows that its figures are old.
+const MOST_BETWEEN: Duration = Duration::from_secs(1);
+
+/// A browser that looks at a run.
+struct Looking {
+    page: Shared,
+    session: Session,
+    language: Language,
+    seen: Receiver<Seen>,
+    /// What it was sent last of each piece.
+    sent: Vec<(Piece, String)>,
+    is_first: bool,
+}
+
+pub(crate) async fn events(
+    State(page): State<Shared>,
+    Extension(session): Extension<Session>,
+    Path(run): Path<String>,
+    headers: HeaderMap,
+) -> Response {
+    let Some(folder) = page.history.folder(&run) else { return StatusCode::NOT_FOUND.into_response() };
+    let seen = page.live.look(&folder);
+    let language = view::language(&headers);
+    let looking = Looking { page, session, language, seen, sent: Vec::new(), is_first: true };
+    let stream = unfold(looking, |mut looking| async {
+        let event = looking.next().await?;
+        Some((Ok::<_, Infallible>(event), looking))
+    });
+    Sse::new(stream).into_response()
+}
+
+impl Looking {
+    /// Waits for what the browser has to know next; none where there will be no more.
+    async fn next(&mut self) -> Option<Event> {
+        if !self.is_first {
+            if let Ok(Err(_)) = tokio::time::timeout(MOST_BETWEEN, self.seen.changed()).await {
+                return None;
+            }
+        } else if self.seen.borrow().summary.run.is_empty() {
+            // Nothing is known yet; the watcher has just begun to look.
+            let _ = tokio::time::timeout(MOST_BETWEEN, self.seen.changed()).await;
+        }
+        self.is_first = false;
+        let seen = self.seen.borrow_and_update().clone();
+        let has_control = self.page.guard.has_control(&self.session.0, false);
+        let mut pieces = Map::new();
+        for (piece, html) in view::pieces(&seen, has_control, self.language) {
+            match self.sent.iter_mut().find(|(sent, _)| *sent == piece) {
+                Some((_, sent)) if *sent == html => continue,
+                Some((_, sent)) => sent.clone_from(&html),
+                None => self.sent.push((piece, html.clone())),
+            }
+            pieces.insert(piece.id().into(), Value::String(html));
+        }
+        let data = json!({ "pieces": pieces, "state": view::state(&seen, has_control) });
+        Event::default().json_data(data).ok()
+    }
+}

@@ -1,0 +1,402 @@
+//! What the page says by itself, in every language that it speaks. What a cell tells of its machines and its alarms comes in the
+//! words of the cell.
+
+use regrind_cell::{Device, JobStep, Phase, StateName};
+use regrind_control::Next;
+use regrind_report::RunResult;
+
+/// A language of the page.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub(crate) enum Language {
+    #[default]
+    En,
+    De,
+    Zh,
+}
+
+impl Language {
+    pub(crate) const ALL: [Self; 3] = [Self::En, Self::De, Self::Zh];
+
+    /// The tag by which HTML and browsers name it.
+    pub(crate) fn tag(self) -> &'static str {
+        ["en", "de", "zh"][self as usize]
+    }
+
+    /// What its speakers call it.
+    pub(crate) fn name(self) -> &'static str {
+        ["English", "Deutsch", "中文"][self as usize]
+    }
+
+    /// Returns the first that a list of tags names, such as that of `Accept-Language`; the order of the list decides, not its weights.
+    pub(crate) fn first_of(tags: &str) -> Option<Self> {
+        tags.split(',').find_map(|tag| {
+            let primary = tag.trim().split(['-', ';', '_']).next()?.to_ascii_lowercase();
+            Self::ALL.into_iter().find(|language| language.tag() == primary)
+        })
+    }
+}
+
+macro_rules! texts {
+    ($($name:ident { $en:literal, $de:literal, $zh:literal })+) => {
+        /// Something that the page says.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+        pub(crate) enum Text {
+            $($name,)+
+        }
+
+        impl Text {
+            #[cfg(test)]
+            const ALL: &[Self] = &[$(Self::$name),+];
+
+            /// Says it.
+            pub(crate) fn to(self, language: Language) -> &'static str {
+                match self {
+                    $(Self::$name => [$en, $de, $zh][language as usize],)+
+                }
+            }
+        }
+    };
+}
+
+texts! {
+    // The frame of the page.
+    Cell { "Cell", "Zelle", "单元" }
+    Runs { "Runs", "Läufe", "运行记录" }
+    Compare { "Compare", "Vergleichen", "比较" }
+    Language { "Language", "Sprache", "语言" }
+    Appearance { "Appearance", "Darstellung", "外观" }
+    AsTheSystem { "as the system", "wie das System", "跟随系统" }
+    Light { "light", "hell", "浅色" }
+    Dark { "dark", "dunkel", "深色" }
+    HighContrast { "high contrast", "hoher Kontrast", "高对比度" }
+    SkipToOrders { "To the orders", "Zu den Befehlen", "跳到指令" }
+    Simulation { "SIMULATION", "SIMULATION", "仿真" }
+    NotConnected { "No data since", "Keine Daten seit", "无数据，自" }
+    ProgramGone {
+        "The program that ran the cell does not answer. What the machines do is not known: look at them. Then: regrind resume",
+        "Das Programm der Zelle antwortet nicht. Was die Maschinen tun, ist nicht bekannt: bitte nachsehen. Dann: regrind resume",
+        "单元程序没有应答。机器的状态未知：请到现场查看。然后执行：regrind resume"
+    }
+    PageGone {
+        "This page has lost its server. What the cell does is not known here: look at it.",
+        "Diese Seite hat ihren Server verloren. Was die Zelle tut, ist hier nicht bekannt: bitte nachsehen.",
+        "页面与服务器断开。此处无法得知单元状态：请到现场查看。"
+    }
+    // What stands about the part.
+    Part { "Part", "Teil", "零件" }
+    Recipe { "Recipe", "Rezept", "配方" }
+    Cycle { "Cycle", "Zyklus", "循环" }
+    OfAtMost { "of at most", "von höchstens", "／最多" }
+    Operator { "Operator", "Bediener", "操作员" }
+    Run { "Run", "Lauf", "运行" }
+    Began { "Began", "Beginn", "开始" }
+    Ended { "Ended", "Ende", "结束" }
+    Result { "Result", "Ergebnis", "结果" }
+    Alarms { "Alarms", "Alarme", "报警" }
+    // The column of the work.
+    NextAction { "Your next action", "Ihr nächster Schritt", "您的下一步" }
+    TimeLeft { "left", "verbleiben", "剩余" }
+    Waits { "Waiting for", "Wartet auf", "等待" }
+    WhatToDo { "What to do", "Was zu tun ist", "处理方法" }
+    ClearedBy { "Cleared by", "Quittiert durch", "复位人" }
+    ByItself { "nobody: it goes by itself", "niemand: er geht von selbst", "无需：自行消失" }
+    ByOperator { "the operator", "den Bediener", "操作员" }
+    ByEngineer { "the process engineer", "den Prozessingenieur", "工艺工程师" }
+    NoAlarm { "No alarm", "Kein Alarm", "无报警" }
+    // Figures.
+    Convergence { "Convergence", "Konvergenz", "收敛" }
+    Figures { "Figures", "Kennwerte", "数值" }
+    Judged { "judged", "beurteilt", "判定" }
+    Limit { "limit", "Grenze", "限值" }
+    Forecast { "forecast", "Prognose", "预测" }
+    NotMeasured { "nothing is measured yet", "noch nichts gemessen", "尚未测量" }
+    Uncertainty { "expanded uncertainty, k = 2", "erweiterte Unsicherheit, k = 2", "扩展不确定度 k = 2" }
+    Report { "Report", "Bericht", "报告" }
+    // The map.
+    Map { "Error map", "Fehlerkarte", "误差图" }
+    Relief { "Relief", "Relief", "立体图" }
+    Difference { "Change", "Änderung", "变化" }
+    Points { "Points", "Punkte", "测点" }
+    Histogram { "Distribution", "Verteilung", "分布" }
+    NoRelief {
+        "This browser draws no relief: the map is shown.",
+        "Dieser Browser zeichnet kein Relief: die Karte wird gezeigt.",
+        "此浏览器无法绘制立体图：显示误差图。"
+    }
+    MapHelp {
+        "Error of the part along the normal, in micrometres. Arrow keys move the mark, or turn the relief.",
+        "Fehler des Teils längs der Normalen, in Mikrometern. Pfeiltasten bewegen die Marke oder drehen das Relief.",
+        "零件沿法向的误差，单位微米。方向键移动标记或旋转立体图。"
+    }
+    Filtered { "Of the map, which is filtered:", "Der gefilterten Karte:", "滤波后的图：" }
+    Planned { "planned", "geplant", "计划" }
+    Touched { "touched", "angetastet", "已测" }
+    // Orders.
+    Hold { "HOLD", "HALTEN", "保持" }
+    Resume { "RESUME", "FORTSETZEN", "继续" }
+    Stop { "END THE RUN", "LAUF BEENDEN", "结束运行" }
+    Abort { "ABORT", "ABBRECHEN", "中止" }
+    Loaded { "THE PART IS LOADED", "TEIL IST GELADEN", "零件已装好" }
+    IsClear { "IS CLEAR OF THE PART", "IST FREI VOM TEIL", "已离开零件" }
+    DeclareOver { "ITS JOB IS OVER", "AUFTRAG IST BEENDET", "作业已结束" }
+    WhatYouSaw { "What you saw at the machine", "Was an der Maschine zu sehen war", "您在机器上看到的情况" }
+    FirstThing { "RESUME does this first:", "FORTSETZEN tut zuerst dies:", "“继续”首先执行：" }
+    TakeControl { "TAKE CONTROL", "BEDIENUNG ÜBERNEHMEN", "接管操作" }
+    ControlElsewhere {
+        "Another screen has control. Hold, end and abort work here all the same.",
+        "Ein anderer Bildschirm bedient. Halten, Beenden und Abbrechen gehen hier trotzdem.",
+        "另一屏幕正在操作。此处仍可保持、结束和中止。"
+    }
+    NoButtonStops {
+        "No button here replaces the emergency stop of the machine.",
+        "Kein Knopf hier ersetzt den Not-Halt der Maschine.",
+        "此处任何按钮都不能代替机器的急停。"
+    }
+    // Next actions.
+    Nothing { "Nothing: the cell works by itself.", "Nichts: die Zelle arbeitet selbst.", "无：单元自动运行。" }
+    Load {
+        "Load the part and clamp it. See that wheel and probe are clear of it. Then press THE PART IS LOADED.",
+        "Teil laden und spannen. Prüfen, dass Scheibe und Taster frei sind. Dann TEIL IST GELADEN drücken.",
+        "装上零件并夹紧。确认砂轮和测头已离开零件。然后按“零件已装好”。"
+    }
+    SeeClear {
+        "See that this machine is clear of the part, and confirm it:",
+        "Prüfen, dass diese Maschine frei vom Teil ist, und bestätigen:",
+        "确认此机器已离开零件："
+    }
+    SeeToAlarm {
+        "Do what the alarm says. The cell goes on by itself when it is gone.",
+        "Tun, was der Alarm sagt. Die Zelle macht selbst weiter, wenn er weg ist.",
+        "按报警提示处理。报警消失后单元自动继续。"
+    }
+    ClearAlarm {
+        "Do what the alarm says. Then press RESUME, or END THE RUN.",
+        "Tun, was der Alarm sagt. Dann FORTSETZEN drücken oder LAUF BEENDEN.",
+        "按报警提示处理。然后按“继续”或“结束运行”。"
+    }
+    ResumeOrStop {
+        "Press RESUME to go on, or END THE RUN.",
+        "FORTSETZEN drücken, oder LAUF BEENDEN.",
+        "按“继续”，或“结束运行”。"
+    }
+    SeeStands {
+        "See whether this machine stands. Then press RESUME, which asks it what became of its job; where it cannot tell, say so below:",
+        "Prüfen, ob diese Maschine steht. Dann FORTSETZEN drücken: sie wird nach ihrem Auftrag gefragt; kann sie es nicht sagen, unten angeben:",
+        "查看此机器是否静止。然后按“继续”，系统会询问其作业结果；若机器无法应答，请在下方说明："
+    }
+    KeepAway {
+        "Keep away from both machines: they run their safe sequence.",
+        "Abstand halten von beiden Maschinen: sie fahren ihre sichere Folge.",
+        "远离两台机器：正在执行安全动作。"
+    }
+    EmergencyCircuit {
+        "Use the emergency stop of each machine that has not confirmed that it stands.",
+        "Not-Halt jeder Maschine betätigen, die ihren Stillstand nicht bestätigt hat.",
+        "对未确认静止的机器使用急停。"
+    }
+    ReadReport { "The run is over: read its report.", "Der Lauf ist zu Ende: Bericht lesen.", "运行已结束：请看报告。" }
+    // States, by PackML's names.
+    Idle { "IDLE", "BEREIT", "待机" }
+    Starting { "STARTING", "STARTET", "启动中" }
+    Execute { "RUNNING", "LÄUFT", "运行中" }
+    Holding { "HOLDING", "HÄLT AN", "保持中" }
+    Held { "HELD", "ANGEHALTEN", "已保持" }
+    Unholding { "RESUMING", "SETZT FORT", "恢复中" }
+    Suspending { "SUSPENDING", "SETZT AUS", "暂停中" }
+    Suspended { "SUSPENDED", "AUSGESETZT", "已暂停" }
+    Unsuspending { "GOING ON", "MACHT WEITER", "恢复中" }
+    Stopping { "STOPPING", "BEENDET", "停止中" }
+    Stopped { "STOPPED", "BEENDET", "已停止" }
+    Aborting { "ABORTING", "BRICHT AB", "中止中" }
+    Aborted { "ABORTED", "ABGEBROCHEN", "已中止" }
+    Completing { "COMPLETING", "SCHLIESST AB", "完成中" }
+    Complete { "COMPLETE", "FERTIG", "完成" }
+    // Phases.
+    AtLoad { "loading", "Laden", "装件" }
+    AtGrind { "grinding", "Schleifen", "磨削" }
+    AtTransfer { "leaving the part to the CMM", "Übergabe an die Messmaschine", "移交测量机" }
+    AtMeasure { "measuring", "Messen", "测量" }
+    AtRegister { "registering", "Einpassen", "配准" }
+    AtJudge { "judging", "Beurteilen", "判定" }
+    AtCompensate { "computing the correction", "Korrektur berechnen", "计算补偿" }
+    // What a resume does first.
+    GoesOn {
+        "the machine goes on with its job from where it stands",
+        "die Maschine setzt ihren Auftrag dort fort, wo sie steht",
+        "机器从当前位置继续作业"
+    }
+    Asks {
+        "the machine is asked what became of its job; nothing moves before it has answered",
+        "die Maschine wird nach ihrem Auftrag gefragt; nichts bewegt sich vor ihrer Antwort",
+        "询问机器作业结果；应答前不会有任何动作"
+    }
+    SendsAnew {
+        "the job is sent to the machine anew and checked; then it starts",
+        "der Auftrag wird der Maschine neu gesendet und geprüft; dann startet sie",
+        "重新发送并检查作业；然后启动"
+    }
+    ReadsResult {
+        "the result is read from the machine again",
+        "das Ergebnis wird noch einmal von der Maschine gelesen",
+        "重新读取机器结果"
+    }
+    GivesBack {
+        "the machine is told that it may forget its result",
+        "der Maschine wird gesagt, dass sie ihr Ergebnis vergessen darf",
+        "告知机器可以清除结果"
+    }
+    AsksToLoad { "the part is asked for", "nach dem Teil wird gefragt", "要求装件" }
+    LeavesPart {
+        "the grinder is seen clear of the part; then the measurement begins",
+        "geprüft wird, dass die Schleifmaschine frei ist; dann beginnt die Messung",
+        "确认磨床已离开零件；然后开始测量"
+    }
+    ComputesAnew { "it is computed again; nothing moves", "es wird neu berechnet; nichts bewegt sich", "重新计算；无动作" }
+    // How runs ended.
+    Open { "no end on record", "kein Ende im Protokoll", "无结束记录" }
+    Live { "on now", "im Gang", "进行中" }
+    Accepted { "ACCEPTED", "ANGENOMMEN", "合格" }
+    NotAccepted { "NOT ACCEPTED", "NICHT ANGENOMMEN", "不合格" }
+    WasStopped { "STOPPED", "BEENDET", "已停止" }
+    WasAborted { "ABORTED", "ABGEBROCHEN", "已中止" }
+    Recovery { "machines brought home", "Maschinen heimgefahren", "机器复位" }
+    All { "all", "alle", "全部" }
+    Show { "Show", "Anzeigen", "显示" }
+    TwoSideBySide {
+        "Choose two runs, then compare them side by side.",
+        "Zwei Läufe wählen, dann nebeneinander vergleichen.",
+        "选择两次运行并排比较。"
+    }
+    KeyNeeded {
+        "This page needs its key. It stands in the address that `regrind serve` has printed.",
+        "Diese Seite braucht ihren Schlüssel. Er steht in der Adresse, die `regrind serve` ausgegeben hat.",
+        "此页面需要密钥，见 `regrind serve` 输出的地址。"
+    }
+    NotHere { "There is nothing at this address.", "Unter dieser Adresse ist nichts.", "此地址没有内容。" }
+}
+
+/// The word for a state.
+pub(crate) fn state(name: StateName) -> Text {
+    match name {
+        StateName::Idle => Text::Idle,
+        StateName::Starting => Text::Starting,
+        StateName::Execute => Text::Execute,
+        StateName::Holding => Text::Holding,
+        StateName::Held => Text::Held,
+        StateName::Unholding => Text::Unholding,
+        StateName::Suspending => Text::Suspending,
+        StateName::Suspended => Text::Suspended,
+        StateName::Unsuspending => Text::Unsuspending,
+        StateName::Stopping => Text::Stopping,
+        StateName::Stopped => Text::Stopped,
+        StateName::Aborting => Text::Aborting,
+        StateName::Aborted => Text::Aborted,
+        StateName::Completing => Text::Completing,
+        StateName::Complete => Text::Complete,
+    }
+}
+
+/// The word for a phase.
+pub(crate) fn phase(phase: Phase) -> Text {
+    match phase {
+        Phase::Load => Text::AtLoad,
+        Phase::Grind(_) => Text::AtGrind,
+        Phase::Transfer => Text::AtTransfer,
+        Phase::Measure(_) => Text::AtMeasure,
+        Phase::Register => Text::AtRegister,
+        Phase::Judge => Text::AtJudge,
+        Phase::Compensate => Text::AtCompensate,
+    }
+}
+
+/// The word for how a run ended.
+pub(crate) fn result(result: RunResult) -> Text {
+    match result {
+        RunResult::Open => Text::Open,
+        RunResult::Accepted => Text::Accepted,
+        RunResult::NotAccepted => Text::NotAccepted,
+        RunResult::Stopped => Text::WasStopped,
+        RunResult::Aborted => Text::WasAborted,
+        RunResult::Recovery => Text::Recovery,
+    }
+}
+
+/// What a person does next, and the machine that it is about.
+pub(crate) fn next(next: &Next, language: Language) -> (String, Option<Device>) {
+    let (text, device) = match next {
+        Next::Load => (Text::Load, None),
+        Next::SeeClear { device } => (Text::SeeClear, Some(*device)),
+        Next::Bring { what } => return (what.clone(), None),
+        Next::SeeToAlarm => (Text::SeeToAlarm, None),
+        Next::ClearAlarm => (Text::ClearAlarm, None),
+        Next::ResumeOrStop => (Text::ResumeOrStop, None),
+        Next::SeeWhetherItStands { device } => (Text::SeeStands, Some(*device)),
+        Next::KeepAway => (Text::KeepAway, None),
+        Next::EmergencyCircuit => (Text::EmergencyCircuit, None),
+        Next::ReadReport => (Text::ReadReport, None),
+        _ => (Text::Nothing, None),
+    };
+    (text.to(language).to_owned(), device)
+}
+
+/// What a resume does first where the cell is held in a phase, and the machine that it is about.
+pub(crate) fn on_resume(phase: Phase) -> (Text, Option<Device>) {
+    let Some((device, step)) = phase.job() else {
+        let text = match phase {
+            Phase::Load => Text::AsksToLoad,
+            Phase::Transfer => Text::LeavesPart,
+            _ => Text::ComputesAnew,
+        };
+        return (text, None);
+    };
+    let text = match step {
+        JobStep::Run => Text::GoesOn,
+        JobStep::Reconcile => Text::Asks,
+        JobStep::Send | JobStep::Clear | JobStep::Prepare | JobStep::Start => Text::SendsAnew,
+        JobStep::Collect | JobStep::Qualify => Text::ReadsResult,
+        JobStep::Acknowledge | JobStep::Discard => Text::GivesBack,
+    };
+    (text, Some(device))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_text_is_there_in_every_language() {
+        for text in Text::ALL {
+            for language in Language::ALL {
+                assert!(!text.to(language).trim().is_empty(), "{text:?} in {language:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_first_language_that_the_page_speaks_is_taken() {
+        for (tags, expected) in [
+            ("de-DE,de;q=0.9,en;q=0.8", Some(Language::De)),
+            ("fr, zh-Hans-CN;q=0.8", Some(Language::Zh)),
+            ("EN_us", Some(Language::En)),
+            ("fr", None),
+            ("", None),
+            (";;,,-", None),
+        ] {
+            assert_eq!(Language::first_of(tags), expected, "{tags}");
+        }
+    }
+
+    #[test]
+    fn no_button_is_called_emergency_stop() {
+        let buttons =
+            [Text::Hold, Text::Resume, Text::Stop, Text::Abort, Text::Loaded, Text::IsClear, Text::DeclareOver];
+        for text in buttons {
+            for language in Language::ALL {
+                let word = text.to(language).to_lowercase();
+                for bad in ["emergency", "not-halt", "notaus", "急停"] {
+                    assert!(!word.contains(bad), "{word}");
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,673 @@
+//! The pages as HTML, in the language of who looks. The pieces of a run's page are made here alone, for the first look and for every
+//! change after it.
+
+use axum::Extension;
+use axum::extract::{Path, Query, State};
+use axum::http::header::{ACCEPT_LANGUAGE, CONTENT_TYPE, COOKIE};
+use axum::http::{HeaderMap, HeaderName, StatusCode};
+use axum::response::{IntoResponse, Redirect, Response};
+use maud::{DOCTYPE, Markup, html};
+use regrind_cell::{Alarm, Device, Role, StateName, Tolerance};
+use regrind_control::{JobProgress, Next, Snapshot};
+use regrind_report::{ColourMap, CycleSummary, RUN_REPORT, RunResult, RunSummary};
+use serde::Deserialize;
+use serde_json::{Value, json};
+use tokio::task::spawn_blocking;
+
+use super::Shared;
+use super::chart::chart;
+use super::guard::{Session, text};
+use super::history::Listed;
+use super::live::{Seen, verdict};
+use super::texts::{self, Language, Text};
+
+/// A piece of the page of a run, which changes by itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Piece {
+    Banner,
+    About,
+    Next,
+    Job,
+    Alarms,
+    Figures,
+    Convergence,
+    Control,
+}
+
+impl Piece {
+    /// The element of the page that holds it.
+    pub(crate) fn id(self) -> &'static str {
+        match self {
+            Self::Banner => "banner",
+            Self::About => "about",
+            Self::Next => "next",
+            Self::Job => "job",
+            Self::Alarms => "alarms",
+            Self::Figures => "figures",
+            Self::Convergence => "convergence",
+            Self::Control => "control",
+        }
+    }
+}
+
+/// Makes every piece of the page of a run.
+pub(crate) fn pieces(seen: &Seen, has_control: bool, language: Language) -> [(Piece, String); 8] {
+    let Seen { snapshot, summary, .. } = seen;
+    let snapshot = snapshot.as_deref();
+    let live = snapshot.filter(|_| seen.answers);
+    let tolerance = summary.tolerance.as_ref();
+    [
+        (Piece::Banner, banner(seen, language)),
+        (Piece::About, about(seen, language)),
+        (Piece::Next, next(seen, language)),
+        (Piece::Job, live.map_or_else(Markup::default, |snapshot| job(snapshot, language))),
+        (Piece::Alarms, alarms(snapshot.map_or(&[], |snapshot| &snapshot.alarms), language)),
+        (Piece::Figures, figures(&summary.cycles, tolerance, language)),
+        (Piece::Convergence, chart(&summary.cycles, tolerance, live.is_some(), language)),
+        (Piece::Control, control(live.is_some() && !has_control, language)),
+    ]
+    .map(|(piece, markup)| (piece, markup.into_string()))
+}
+
+/// What the scripts of the page have to know of a run.
+pub(crate) fn state(seen: &Seen, has_control: bool) -> Value {
+    let live = seen.snapshot.as_deref().filter(|_| seen.answers);
+    let cycles: Vec<_> = seen
+        .summary
+        .cycles
+        .iter()
+        .map(|of| {
+            json!({
+                "cycle": of.cycle, "map": of.map, "points": of.deviations,
+            })
+        })
+        .collect();
+    let progress = live.and_then(|live| live.progress);
+    let measures = progress.filter(|progress| progress.device == Device::Cmm);
+    json!({
+        "answers": seen.answers,
+        "lost": seen.is_lost(),
+        "over": seen.summary.ended.is_some() && !seen.answers,
+        "number": live.map(|live| live.number),
+        "can": live.map_or_else(Vec::new, |live| can(live, has_control)),
+        "cycle": live.map(|live| live.cycle),
+        "cycles": cycles,
+        "touched": measures.map(|progress| [progress.done, progress.total]),
+        "alarms": live.map_or(0, |live| live.alarms.len()),
+        "verdict": verdict(seen),
+    })
+}
+
+/// The orders that make sense now.
+fn can(live: &Snapshot, has_control: bool) -> Vec<&'static str> {
+    let mut can = vec!["hold", "stop", "abort"];
+    if is_over(live.state) {
+        can.clear();
+    }
+    if has_control && live.state == StateName::Held {
+        can.push("resume");
+    }
+    match live.next_step {
+        Next::Load if has_control => can.push("loaded"),
+        Next::SeeClear { .. } if has_control => can.push("clear"),
+        Next::SeeWhetherItStands { .. } if has_control => can.push("over"),
+        _ => {}
+    }
+    can
+}
+
+fn is_over(state: StateName) -> bool {
+    matches!(state, StateName::Stopped | StateName::Aborted | StateName::Complete)
+}
+
+/// The state in one word, a shape and a colour: for who stands two metres away.
+fn banner(seen: &Seen, language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
+    let mark = |class: &str, shape: &str, word: &str, more: &str| {
+        html! {
+            div .banner .(class) {
+                svg .shape viewBox="0 0 24 24" aria-hidden="true" { path d=(shape) {} }
+                div { strong { (word) } @if !more.is_empty() { span .more { (more) } } }
+                @if seen.summary.simulation { span .simulation { (say(Text::Simulation)) } }
+            }
+        }
+    };
+    let live = seen.snapshot.as_deref().filter(|live| seen.answers && !is_over(live.state));
+    if let Some(live) = live {
+        let phase = live.phase.map_or(String::new(), |phase| say(texts::phase(phase)).to_owned());
+        let not_confirmed = live.unconfirmed.iter().map(|device| format!("{device}?")).collect::<Vec<_>>().join(" ");
+        let cycle = match live.cycle {
+            0 => String::new(),
+            cycle => format!("{} {cycle} {} {}", say(Text::Cycle), say(Text::OfAtMost), live.max_cycles),
+        };
+        let more =
+            [phase, cycle, not_confirmed].into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join(" · ");
+        let (class, shape) = look(live);
+        return mark(class, shape, say(texts::state(live.state)), &more);
+    }
+    if seen.is_lost() && !seen.summary.run.is_empty() {
+        return mark("lost", UNKNOWN, "?", say(Text::ProgramGone));
+    }
+    let result = seen.summary.result;
+    let (class, shape) = match result {
+        RunResult::Accepted => ("good", TICK),
+        RunResult::Aborted => ("bad", OCTAGON),
+        RunResult::Open | RunResult::Recovery => ("still", SQUARE),
+        _ => ("bad", CROSS),
+    };
+    // The words of the record begin with the same word.
+    let verdict = &seen.summary.verdict;
+    let reason = verdict.split_once(": ").filter(|(word, _)| word.chars().all(|c| !c.is_lowercase()));
+    mark(class, shape, say(texts::result(result)), reason.map_or(verdict, |(_, reason)| reason))
+}
+
+const PLAY: &str = "M6 3 L21 12 L6 21 Z";
+const PAUSE: &str = "M5 3 H10 V21 H5 Z M14 3 H19 V21 H14 Z";
+const SQUARE: &str = "M4 4 H20 V20 H4 Z";
+const OCTAGON: &str = "M8 2 H16 L22 8 V16 L16 22 H8 L2 16 V8 Z";
+const TICK: &str = "M2 13 L9 20 L22 6 L19 3 L9 14 L5 10 Z";
+const CROSS: &str = "M4 7 L7 4 L12 9 L17 4 L20 7 L15 12 L20 17 L17 20 L12 15 L7 20 L4 17 L9 12 Z";
+const TRIANGLE: &str = "M12 2 L23 21 H1 Z";
+const UNKNOWN: &str = "M12 2 L22 12 L12 22 L2 12 Z";
+
+/// Colour and shape of a state.
+fn look(live: &Snapshot) -> (&'static str, &'static str) {
+    use StateName as S;
+    match live.state {
+        S::Aborting | S::Aborted => ("bad", OCTAGON),
+        _ if !live.alarms.is_empty() || !live.unconfirmed.is_empty() => ("alarm", TRIANGLE),
+        S::Execute if matches!(live.next_step, Next::Load | Next::SeeClear { .. } | Next::Bring { .. }) => {
+            ("asks", TRIANGLE)
+        }
+        S::Execute | S::Starting | S::Unholding | S::Unsuspending | S::Completing => ("runs", PLAY),
+        S::Held | S::Holding | S::Suspending | S::Suspended => ("held", PAUSE),
+        _ => ("still", SQUARE),
+    }
+}
+
+fn about(seen: &Seen, language: Language) -> Markup {
+    let RunSummary { run, part, name, recipe, operator, began, ended, .. } = &*seen.summary;
+    let say = |text: Text| text.to(language);
+    html! {
+        dl {
+            dt { (say(Text::Part)) } dd { strong { (part) } " " (name) }
+            dt { (say(Text::Recipe)) } dd { (recipe) }
+            dt { (say(Text::Operator)) } dd { (operator) }
+            dt { (say(Text::Began)) } dd { (when(began)) }
+            @if let Some(ended) = ended { dt { (say(Text::Ended)) } dd { (when(ended)) } }
+            dt { (say(Text::Run)) } dd .id { (run) }
+        }
+    }
+}
+
+/// A time of the record to the second.
+fn when(utc: &str) -> String {
+    let second: String = utc.chars().take(19).collect();
+    if second.is_empty() { second } else { format!("{} UTC", second.replacen('T', " ", 1)) }
+}
+
+/// What a person does next, with the buttons for it.
+fn next(seen: &Seen, language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
+    let Some(live) = seen.snapshot.as_deref().filter(|_| seen.answers) else {
+        // Of a run that is lost the banner has said what to do.
+        return html! { @if !seen.is_lost() { p .sentence { (say(Text::ReadReport)) } } };
+    };
+    let (sentence, device) = texts::next(&live.next_step, language);
+    let named = device.map(|device| device.to_string().to_lowercase());
+    html! {
+        p .sentence { (sentence) @if let Some(device) = device { " " strong { (device) } } }
+        @match &live.next_step {
+            Next::Load => { button type="button" data-order="loaded" { (say(Text::Loaded)) } }
+            Next::SeeClear { device } => {
+                button type="button" data-order="clear" data-device=(named.unwrap_or_default()) { (device) " " (say(Text::IsClear)) }
+            }
+            Next::SeeWhetherItStands { .. } => {
+                label { (say(Text::WhatYouSaw)) input id="evidence" type="text" maxlength="300" autocomplete="off"; }
+                button type="button" data-order="over" data-device=(named.unwrap_or_default()) { (say(Text::DeclareOver)) }
+            }
+            _ => {}
+        }
+        @if let Some(phase) = live.phase.filter(|_| live.state == StateName::Held) {
+            @let (first, device) = texts::on_resume(phase);
+            p .first { (say(Text::FirstThing)) " " @if let Some(device) = device { (device) ": " } (say(first)) }
+        }
+        @for waits in &live.waits_for { p .quiet { (say(Text::Waits)) ": " (waits) } }
+    }
+}
+
+/// How far the job under way is.
+fn job(live: &Snapshot, language: Language) -> Markup {
+    let Some(JobProgress { device, done, total, left_s }) = live.progress else { return Markup::default() };
+    let percent = 100.0 * f64::from(done.min(total)) / f64::from(total.max(1));
+    let unit = if device == Device::Cmm { format!(" {done}/{total}") } else { String::new() };
+    html! {
+        p .phase {
+            span { (device) " " (live.phase.map_or("", |phase| texts::phase(phase).to(language))) (unit) }
+            strong { (format!("{percent:.0} %")) }
+            @if let Some(left) = left_s { span .left { (range(left)) " " (Text::TimeLeft.to(language)) } }
+        }
+        progress max=(total.max(1)) value=(done) aria-label=(device) {}
+    }
+}
+
+/// A range of seconds, as nobody reads more of it.
+fn range([least, most]: [f64; 2]) -> String {
+    let (unit, per) = match most {
+        most if most < 90.0 => ("s", 1.0),
+        most if most < 5400.0 => ("min", 60.0),
+        _ => ("h", 3600.0),
+    };
+    let digits = usize::from(unit == "h");
+    let [least, most] = [least, most].map(|seconds| format!("{:.digits$}", seconds / per));
+    if least == most { format!("{most} {unit}") } else { format!("{least} – {most} {unit}") }
+}
+
+fn alarms(alarms: &[Alarm], language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
+    html! {
+        @if alarms.is_empty() { p .quiet { (say(Text::NoAlarm)) } }
+        @for alarm in alarms {
+            article .alarm {
+                h3 { (alarm.what) }
+                p { (alarm.consequence) }
+                p .quiet { (say(Text::WhatToDo)) ":" }
+                ol { @for remedy in &alarm.remedy { li { (remedy) } } }
+                p .quiet { (say(Text::ClearedBy)) ": " (say(match alarm.clears {
+                    Role::Nobody => Text::ByItself,
+                    Role::Operator => Text::ByOperator,
+                    _ => Text::ByEngineer,
+                })) }
+            }
+        }
+    }
+}
+
+/// A row a cycle: what was judged, beside its limit.
+fn figures(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
+    let limit = |mm: f64| if mm.is_finite() { format!("{:.2}", 1e3 * mm) } else { "–".to_owned() };
+    html! {
+        table {
+            tr {
+                th .n { (say(Text::Cycle)) }
+                th .n { "PV, µm" } th .n { "± U" } th .n { "RMS, µm" } th .n { "± U" } th { (say(Text::Judged)) }
+            }
+            @for of in cycles {
+                tr {
+                    td .n { (of.cycle) }
+                    @match of.figures {
+                        Some([[pv, pv_u], [rms, rms_u]]) => {
+                            td .n { strong { (format!("{pv:.2}")) } } td .n { (format!("{pv_u:.2}")) }
+                            td .n { strong { (format!("{rms:.3}")) } } td .n { (format!("{rms_u:.3}")) }
+                        }
+                        None => { @for _ in 0..4 { td .n { "–" } } }
+                    }
+                    td title=(of.reason) { (of.verdict.as_deref().unwrap_or(&of.reason)) }
+                }
+            }
+            @if let Some(tolerance) = tolerance {
+                tr .limit {
+                    td .n { (say(Text::Limit)) }
+                    td .n { (limit(tolerance.pv_mm)) } td {} td .n { (limit(tolerance.rms_mm)) } td {} td {}
+                }
+            }
+        }
+        p .quiet { "U: " (say(Text::Uncertainty)) }
+    }
+}
+
+fn control(is_elsewhere: bool, language: Language) -> Markup {
+    html! {
+        @if is_elsewhere {
+            p { (Text::ControlElsewhere.to(language)) }
+            button type="button" data-order="control" { (Text::TakeControl.to(language)) }
+        }
+    }
+}
+
+/// The page of the run that is on; of the last one where none is.
+pub(crate) async fn home(State(page): State<Shared>) -> Response {
+    let history = std::sync::Arc::clone(&page.history);
+    let listed = spawn_blocking(move || history.list()).await.unwrap_or_default();
+    let live = listed.iter().filter(|run| run.is_live).count();
+    match listed.first().filter(|_| live <= 1) {
+        Some(first) => Redirect::to(&format!("/runs/{}", first.id)).into_response(),
+        None => Redirect::to("/runs").into_response(),
+    }
+}
+
+pub(crate) async fn run(
+    State(page): State<Shared>,
+    Extension(session): Extension<Session>,
+    Path(id): Path<String>,
+    headers: HeaderMap,
+) -> Response {
+    let language = language(&headers);
+    let Some(folder) = page.history.folder(&id) else { return not_here(headers).await };
+    let mut looked = page.live.look(&folder);
+    let known = looked.borrow().summary.run.is_empty();
+    if known {
+        // A run that is on tells itself at once; of one that is over the record tells.
+        drop(tokio::time::timeout(std::time::Duration::from_secs(2), looked.changed()).await);
+    }
+    let seen = looked.borrow().clone();
+    let has_control = page.guard.has_control(&session.0, false);
+    let main = cell(&seen, &id, has_control, language);
+    let token = page.guard.token(&session.0);
+    document(
+        &format!("{} {}", seen.summary.part, seen.summary.name),
+        &Frame { language, token: &token, is_cell: true },
+        main,
+    )
+}
+
+/// The page of a run: the cell while it is on, and what it came to afterwards.
+fn cell(seen: &Seen, id: &str, has_control: bool, language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
+    let made = pieces(seen, has_control, language);
+    let piece = |piece: Piece| {
+        let html = made.iter().find(|(made, _)| *made == piece).map_or("", |(_, html)| html);
+        maud::PreEscaped(html.to_owned())
+    };
+    let data =
+        json!({ "run": id, "state": state(seen, has_control), "colours": colours(), "texts": script_texts(language) });
+    html! {
+        a .skip href="#orders" { (say(Text::SkipToOrders)) }
+        div #old role="alert" hidden {}
+        section #banner aria-live="polite" { (piece(Piece::Banner)) }
+        main .cell data-run=(id) {
+            section #next aria-live="polite" aria-label=(say(Text::NextAction)) { (piece(Piece::Next)) }
+            section #job aria-label=(say(Text::TimeLeft)) { (piece(Piece::Job)) }
+            section .map aria-label=(say(Text::Map)) { (map(language)) }
+            section .side {
+                h2 { (say(Text::Alarms)) }
+                div #alarms aria-live="assertive" { (piece(Piece::Alarms)) }
+                h2 { (say(Text::Convergence)) }
+                div #convergence { (piece(Piece::Convergence)) }
+                h2 { (say(Text::Figures)) }
+                div #figures { (piece(Piece::Figures)) }
+                div #about { (piece(Piece::About)) }
+                p { a href=(format!("/runs/{id}/report")) { (say(Text::Report)) } }
+            }
+        }
+        section #orders .orders {
+            button .hold type="button" data-order="hold" disabled { (say(Text::Hold)) }
+            button .resume type="button" data-order="resume" disabled { (say(Text::Resume)) }
+            button .stop type="button" data-order="stop" disabled { (say(Text::Stop)) }
+            div #control { (piece(Piece::Control)) }
+            p #answer role="status" { (say(Text::NoButtonStops)) }
+            button .abort type="button" data-order="abort" disabled { (say(Text::Abort)) }
+        }
+        script #data type="application/json" { (maud::PreEscaped(harmless(&data))) }
+    }
+}
+
+/// JSON that ends no script element before its time.
+fn harmless(data: &Value) -> String {
+    data.to_string().replace('<', "\\u003c")
+}
+
+fn map(language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
+    html! {
+        div .tools role="group" {
+            button type="button" data-view="map" aria-pressed="true" { (say(Text::Map)) }
+            button type="button" data-view="difference" aria-pressed="false" { (say(Text::Difference)) }
+            button type="button" data-view="relief" aria-pressed="false" { (say(Text::Relief)) }
+            button type="button" data-points aria-pressed="false" { (say(Text::Points)) }
+            label { (say(Text::Cycle)) " " select #cycle {} }
+        }
+        canvas #map tabindex="0" role="img" aria-label=(say(Text::MapHelp)) {}
+        canvas #relief tabindex="0" role="img" aria-label=(say(Text::MapHelp)) hidden {}
+        output #reading {}
+        canvas #histogram role="img" aria-label=(say(Text::Histogram)) {}
+    }
+}
+
+/// What the scripts say by themselves.
+fn script_texts(language: Language) -> Value {
+    let say = |text: Text| text.to(language);
+    json!({
+        "noData": say(Text::NotConnected), "pageGone": say(Text::PageGone), "programGone": say(Text::ProgramGone),
+        "noRelief": say(Text::NoRelief), "notMeasured": say(Text::NotMeasured), "planned": say(Text::Planned),
+        "touched": say(Text::Touched), "filtered": say(Text::Filtered), "order": say(Text::NoButtonStops),
+    })
+}
+
+/// The colours of the maps, from below to above, as they are in every picture: three bytes each in hexadecimal digits.
+fn colours() -> String {
+    let colour = |k: u32| ColourMap::Diverging.at(f64::from(k) / 254.0);
+    (0..255).flat_map(colour).map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// What a list of runs is narrowed to; empty is all.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+pub(crate) struct Wanted {
+    part: String,
+    recipe: String,
+    result: String,
+}
+
+impl Wanted {
+    fn fits(&self, run: &Listed) -> bool {
+        let has = |value: &str, wanted: &str| {
+            wanted.is_empty() || value.to_lowercase().contains(&wanted.trim().to_lowercase())
+        };
+        let result = self.result.is_empty() || self.result == format!("{:?}", run.summary.result);
+        has(&run.summary.part, &self.part) && has(&run.summary.recipe, &self.recipe) && result
+    }
+}
+
+/// The list of runs.
+pub(crate) async fn runs(State(page): State<Shared>, Query(wanted): Query<Wanted>, headers: HeaderMap) -> Response {
+    let language = language(&headers);
+    let say = |text: Text| text.to(language);
+    let history = std::sync::Arc::clone(&page.history);
+    let listed = spawn_blocking(move || history.list()).await.unwrap_or_default();
+    const RESULTS: [RunResult; 5] =
+        [RunResult::Open, RunResult::Accepted, RunResult::NotAccepted, RunResult::Stopped, RunResult::Aborted];
+    let main = html! {
+        main .list {
+            h1 { (say(Text::Runs)) }
+            form .filter method="get" action="/runs" {
+                label { (say(Text::Part)) " " input name="part" value=(wanted.part); }
+                label { (say(Text::Recipe)) " " input name="recipe" value=(wanted.recipe); }
+                label { (say(Text::Result)) " "
+                    select name="result" {
+                        option value="" { (say(Text::All)) }
+                        @for result in RESULTS {
+                            @let name = format!("{result:?}");
+                            option value=(name) selected[name == wanted.result] { (say(texts::result(result))) }
+                        }
+                    }
+                }
+                button { (say(Text::Show)) }
+            }
+            form method="get" action="/compare" {
+                (table_of(listed.iter().filter(|run| wanted.fits(run)), language))
+                p { (say(Text::TwoSideBySide)) " " button { (say(Text::Compare)) } }
+            }
+        }
+    };
+    document(say(Text::Runs), &Frame { language, token: "", is_cell: false }, main)
+}
+
+fn table_of<'a>(runs: impl Iterator<Item = &'a Listed>, language: Language) -> Markup {
+    let say = |text: Text| text.to(language);
+    html! {
+        table {
+            tr {
+                th {} th { (say(Text::Run)) } th { (say(Text::Part)) } th { (say(Text::Recipe)) } th { (say(Text::Began)) }
+                th .n { (say(Text::Cycle)) } th .n { "PV, µm" } th .n { "RMS, µm" } th .n { (say(Text::Alarms)) } th { (say(Text::Result)) }
+            }
+            @for Listed { id, is_live, summary } in runs {
+                @let figures = summary.cycles.iter().rev().find_map(|of| of.figures);
+                tr {
+                    td { input type="checkbox" name="run" value=(id) aria-label=(id); }
+                    td { a href=(format!("/runs/{id}")) { (id) } }
+                    td { (summary.part) } td { (summary.recipe) } td { (when(&summary.began)) }
+                    td .n { (summary.cycles.len()) }
+                    @for k in 0..2 {
+                        td .n { @if let Some(figures) = figures { (format!("{:.2}", figures[k][0])) } @else { "–" } }
+                    }
+                    td .n { (summary.alarms) }
+                    td class=(if summary.result == RunResult::Accepted { "good" } else { "" }) {
+                        @if *is_live { strong { (say(Text::Live)) } } @else { (say(texts::result(summary.result))) }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Two runs side by side.
+pub(crate) async fn compare(
+    State(page): State<Shared>,
+    axum::extract::RawQuery(query): axum::extract::RawQuery,
+    headers: HeaderMap,
+) -> Response {
+    let language = language(&headers);
+    let say = |text: Text| text.to(language);
+    let query = query.unwrap_or_default();
+    let ids: Vec<String> = query.split('&').filter_map(|pair| pair.strip_prefix("run=")).map(str::to_owned).collect();
+    let history = std::sync::Arc::clone(&page.history);
+    let found = spawn_blocking(move || {
+        let of = |id: &String| Some((id.clone(), history.summary(&history.folder(id)?)?));
+        ids.iter().filter_map(of).take(2).collect::<Vec<_>>()
+    });
+    let found = found.await.unwrap_or_default();
+    if found.len() < 2 {
+        return Redirect::to("/runs").into_response();
+    }
+    let main = html! {
+        main .compare {
+            @for (id, summary) in &found {
+                @let seen = Seen { summary: std::sync::Arc::clone(summary), ..Seen::default() };
+                @let tolerance = summary.tolerance.as_ref();
+                section data-compared=(id) {
+                    h2 { a href=(format!("/runs/{id}")) { (id) } }
+                    (banner(&seen, language))
+                    canvas role="img" aria-label=(say(Text::Map)) {}
+                    (chart(&summary.cycles, tolerance, false, language))
+                    (figures(&summary.cycles, tolerance, language))
+                    (about(&seen, language))
+                }
+            }
+        }
+        @let maps: Vec<_> = found.iter().map(|(id, summary)| {
+            json!({ "run": id, "cycle": summary.cycles.iter().rev().find(|of| of.map.is_some()).map(|of| of.cycle) })
+        }).collect();
+        script #data type="application/json" {
+            (maud::PreEscaped(harmless(&json!({ "compared": maps, "colours": colours(), "texts": script_texts(language) }))))
+        }
+    };
+    document(say(Text::Compare), &Frame { language, token: "", is_cell: true }, main)
+}
+
+/// The report of a run, as it stands in its folder.
+pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, headers: HeaderMap) -> Response {
+    let Some(folder) = page.history.folder(&id) else { return not_here(headers).await };
+    let read = spawn_blocking(move || {
+        std::fs::read(folder.join(RUN_REPORT)).or_else(|_| regrind_report::run_report(&folder).map(String::into_bytes))
+    });
+    match read.await {
+        Ok(Ok(html)) => {
+            // Its style stands in it; nothing in it may run, and nothing may be fetched.
+            let policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'";
+            let headers = [
+                (CONTENT_TYPE, "text/html; charset=utf-8"),
+                (HeaderName::from_static("content-security-policy"), policy),
+            ];
+            (headers, html).into_response()
+        }
+        Ok(Err(error)) => (StatusCode::UNPROCESSABLE_ENTITY, error.to_string()).into_response(),
+        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+    }
+}
+
+pub(crate) async fn not_here(headers: HeaderMap) -> Response {
+    let language = language(&headers);
+    let main = html! { main .list { h1 { "404" } p { (Text::NotHere.to(language)) } } };
+    (StatusCode::NOT_FOUND, document("404", &Frame { language, token: "", is_cell: false }, main)).into_response()
+}
+
+/// What who has no key is told.
+pub(crate) fn key_needed(status: StatusCode, headers: &HeaderMap) -> Response {
+    let language = language(headers);
+    let main = html! {
+        main .list {
+            h1 { "Regrind" }
+            p { (Text::KeyNeeded.to(language)) }
+            form method="get" action="/" { label { "key " input name="key" type="password" autocomplete="off"; } " " button { "OK" } }
+        }
+    };
+    (status, document("Regrind", &Frame { language, token: "", is_cell: false }, main)).into_response()
+}
+
+/// What stands around every page.
+struct Frame<'a> {
+    language: Language,
+    /// The token of the orders; empty where none are given.
+    token: &'a str,
+    /// Whether maps are drawn on it.
+    is_cell: bool,
+}
+
+fn document(title: &str, frame: &Frame, main: Markup) -> Response {
+    let Frame { language, token, is_cell } = *frame;
+    let say = |text: Text| text.to(language);
+    let markup = html! {
+        (DOCTYPE)
+        html lang=(language.tag()) {
+            head {
+                meta charset="utf-8";
+                meta name="viewport" content="width=device-width, initial-scale=1";
+                meta name="regrind-token" content=(token);
+                title { (title) " · Regrind" }
+                link rel="icon" href="/assets/icon.svg";
+                link rel="stylesheet" href="/assets/page.css";
+                script src="/assets/theme.js" {}
+                @if is_cell {
+                    script src="/assets/map.js" defer {}
+                    script src="/assets/relief.js" defer {}
+                    script src="/assets/page.js" defer {}
+                }
+            }
+            body {
+                nav {
+                    a href="/" { (say(Text::Cell)) } " " a href="/runs" { (say(Text::Runs)) }
+                    span .settings {
+                        label { (say(Text::Language)) " "
+                            select #language {
+                                @for each in Language::ALL {
+                                    option value=(each.tag()) lang=(each.tag()) selected[each == language] { (each.name()) }
+                                }
+                            }
+                        }
+                        " "
+                        label { (say(Text::Appearance)) " "
+                            select #theme {
+                                @for (value, text) in [("", Text::AsTheSystem), ("light", Text::Light), ("dark", Text::Dark), ("contrast", Text::HighContrast)] {
+                                    option value=(value) { (say(text)) }
+                                }
+                            }
+                        }
+                    }
+                }
+                (main)
+            }
+        }
+    };
+    ([(CONTENT_TYPE, "text/html; charset=utf-8")], markup.into_string()).into_response()
+}
+
+/// The language that a browser chose here, or else the first that its owner wants.
+pub(crate) fn language(headers: &HeaderMap) -> Language {
+    let chosen = text(headers, COOKIE).and_then(|cookies| {
+        let pair = cookies.split(';').find_map(|pair| pair.trim().strip_prefix("regrind_language="))?;
+        Language::first_of(pair)
+    });
+    chosen.or_else(|| Language::first_of(text(headers, ACCEPT_LANGUAGE)?)).unwrap_or_default()
+}

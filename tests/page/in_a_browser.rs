@@ -1,0 +1,120 @@
+//! The page as a person has it before them.
+
+use serde_json::json;
+
+use crate::Shown;
+use crate::browser::{Browser, Tab};
+
+const SCREEN: [u32; 2] = [1024, 768];
+
+fn banner(word: &str) -> String {
+    format!("document.querySelector('#banner').innerText.includes('{word}')")
+}
+
+/// How many different colours a canvas shows.
+fn colours(canvas: &str) -> String {
+    format!(
+        "(() => {{ const c = document.querySelector('{canvas}'); const k = document.createElement('canvas'); k.width = c.width; \
+         k.height = c.height; const x = k.getContext('2d'); x.drawImage(c, 0, 0); const d = x.getImageData(0, 0, k.width, k.height).data; \
+         const s = new Set(); for (let i = 0; i < d.length; i += 4) if (d[i + 3]) s.add(d[i] << 16 | d[i + 1] << 8 | d[i + 2]); return s.size; }})()"
+    )
+}
+
+fn is_old(browser: &mut Browser, tab: &Tab) -> bool {
+    tab.read(browser, "document.body.classList.contains('old')") == true
+}
+
+#[test]
+#[ignore = "needs a browser: Debian package chromium"]
+fn a_cell_is_held_gone_on_with_and_aborted_and_every_tab_shows_it() {
+    let home = tempfile::tempdir().unwrap();
+    let mut shown = Shown::begin(home.path(), 20.0);
+    let mut browser = Browser::start(home.path());
+    let tab = browser.open(&shown.url, SCREEN);
+    tab.until(&mut browser, &banner("RUNNING"));
+    // A second tab is harmless.
+    let second = browser.open(&shown.url, [390, 844]);
+    tab.click(&mut browser, "[data-order=hold]");
+    tab.until(&mut browser, &banner("HELD"));
+    assert!(tab.read(&mut browser, "document.querySelector('#next').innerText").as_str().unwrap().contains("RESUME"));
+    second.until(&mut browser, &banner("HELD"));
+    tab.click(&mut browser, "[data-order=resume]");
+    second.until(&mut browser, &banner("RUNNING"));
+    second.click(&mut browser, "[data-order=abort]");
+    tab.until(&mut browser, &banner("ABORTED"));
+    assert!(!is_old(&mut browser, &tab), "a run that is over is not old");
+    for tab in [&tab, &second] {
+        assert_eq!(tab.problems(&browser), Vec::<String>::new());
+    }
+    assert_eq!(shown.run.end().0, 3);
+}
+
+#[test]
+#[ignore = "needs a browser: Debian package chromium"]
+fn a_run_is_watched_to_its_acceptance_and_its_map_and_relief_are_drawn() {
+    let home = tempfile::tempdir().unwrap();
+    let mut shown = Shown::begin(home.path(), 200.0);
+    // So that it waits for the browser, however long that takes to start.
+    let held = crate::program::run(&["hold", &shown.folder.display().to_string()], home.path());
+    assert_eq!(held.0, 0, "{held:?}");
+    let mut browser = Browser::start(home.path());
+    let tab = browser.open(&shown.url, SCREEN);
+    tab.until(&mut browser, &banner("HELD"));
+    tab.click(&mut browser, "[data-order=resume]");
+    tab.until(&mut browser, "document.querySelectorAll('#cycle option').length > 0");
+    tab.until(&mut browser, &format!("{} > 50", colours("#map")));
+    tab.until(&mut browser, &banner("ACCEPTED"));
+    tab.until(&mut browser, "document.querySelectorAll('#convergence circle').length >= 4");
+    tab.click(&mut browser, "[data-view=relief]");
+    tab.until(&mut browser, &format!("!document.querySelector('#relief').hidden && {} > 50", colours("#relief")));
+    let before = tab.read(&mut browser, "document.querySelector('#relief').toDataURL()");
+    tab.send(&mut browser, "Page.bringToFront", json!({}));
+    tab.read(&mut browser, "document.querySelector('#relief').focus()");
+    tab.press(&mut browser, "ArrowRight", 39, "");
+    tab.until(&mut browser, &format!("document.querySelector('#relief').toDataURL() !== {before}"));
+    tab.click(&mut browser, "[data-view=difference]");
+    tab.until(&mut browser, &format!("!document.querySelector('#map').hidden && {} > 50", colours("#map")));
+    assert_eq!(tab.problems(&browser), Vec::<String>::new());
+    assert_eq!(shown.run.end().0, 0);
+}
+
+#[test]
+#[ignore = "needs a browser: Debian package chromium"]
+fn a_page_whose_cell_is_killed_says_so_and_offers_no_order() {
+    let home = tempfile::tempdir().unwrap();
+    let shown = Shown::begin(home.path(), 20.0);
+    let mut browser = Browser::start(home.path());
+    let tab = browser.open(&shown.url, SCREEN);
+    tab.until(&mut browser, &banner("RUNNING"));
+    shown.run.signal("KILL");
+    tab.until(&mut browser, "document.body.classList.contains('old')");
+    let words = tab.read(&mut browser, "document.querySelector('#old').innerText");
+    assert!(words.as_str().unwrap().contains("No data since"), "{words}");
+    tab.until(
+        &mut browser,
+        "[...document.querySelectorAll('.orders [data-order]')].every((button) => button.disabled)",
+    );
+    shown.page.signal("KILL");
+    tab.until(&mut browser, "document.querySelector('#old').innerText.includes('lost its server')");
+}
+
+#[test]
+#[ignore = "needs a browser: Debian package chromium"]
+fn the_keyboard_alone_aborts_a_run() {
+    let home = tempfile::tempdir().unwrap();
+    let mut shown = Shown::begin(home.path(), 20.0);
+    let mut browser = Browser::start(home.path());
+    let tab = browser.open(&shown.url, SCREEN);
+    tab.until(&mut browser, &banner("RUNNING"));
+    tab.send(&mut browser, "Page.bringToFront", json!({}));
+    for _ in 0..40 {
+        tab.press(&mut browser, "Tab", 9, "");
+        if tab.read(&mut browser, "document.activeElement.dataset.order") == "abort" {
+            break;
+        }
+    }
+    assert_eq!(tab.read(&mut browser, "document.activeElement.dataset.order"), "abort");
+    tab.press(&mut browser, "Enter", 13, "\r");
+    tab.until(&mut browser, &banner("ABORTED"));
+    assert_eq!(shown.run.end().0, 3);
+}

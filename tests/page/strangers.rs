@@ -1,0 +1,179 @@
+//! Who is refused, what becomes of it, and that the cell does not notice.
+
+use std::io::Write;
+use std::net::TcpStream;
+use std::path::Path;
+
+use serde_json::{Value, json};
+
+use crate::http::{Visitor, raw};
+use crate::program::{records_with, run};
+use crate::{Shown, serve};
+
+fn remarks(shown: &Shown) -> Vec<String> {
+    let all = records_with(&shown.folder, "remark");
+    all.iter().map(|record| record["remark"].as_str().unwrap_or_default().to_owned()).collect()
+}
+
+fn status(folder: &Path) -> Value {
+    let (code, said, errors) = run(&["status", ".", "--json"], folder);
+    assert_eq!(code, 0, "{errors}");
+    serde_json::from_str::<Value>(&said).unwrap()["status"].clone()
+}
+
+#[test]
+fn orders_that_do_not_come_from_the_page_are_refused_and_on_record_and_the_cell_goes_on() {
+    let home = tempfile::tempdir().unwrap();
+    let mut shown = Shown::begin(home.path(), 20.0);
+    shown.run.line("grinding", |line| line.contains("grinding"));
+    let (visitor, stranger) = (shown.visitor(), Visitor::stranger(&shown.url));
+    let path = format!("/runs/{}/orders", shown.id);
+    let (token, origin) = (visitor.token(&shown.id), format!("http://{}", visitor.place));
+    let stop = br#"{"order":"stop","reason":""}"#;
+    let with = |origin: &'static str, token: &str| {
+        [("Origin", origin), ("X-Regrind-Token", token)].map(|(n, v)| (n, v.to_owned()))
+    };
+    let post = |who: &Visitor, headers: &[(&str, String)], body: &[u8]| {
+        let headers: Vec<_> = headers.iter().map(|(name, value)| (*name, value.as_str())).collect();
+        who.post(&path, &headers, body).status
+    };
+    let own = [("Origin", origin.clone()), ("X-Regrind-Token", token.clone())];
+    // Nobody who lacks the key, the origin or the token; a token is that of one browser.
+    assert_eq!(post(&stranger, &own, stop), 401);
+    assert_eq!(post(&visitor, &[], stop), 403);
+    assert_eq!(post(&visitor, &with("http://evil.example", &token), stop), 403);
+    assert_eq!(post(&visitor, &with("null", &token), stop), 403);
+    assert_eq!(post(&visitor, &[("Origin", origin.clone())], stop), 403);
+    let other = shown.visitor().token(&shown.id);
+    assert_ne!(token, other);
+    assert_eq!(post(&visitor, &[("Origin", origin.clone()), ("X-Regrind-Token", other)], stop), 403);
+    // The address with the key, opened once more in the same browser, leaves its other tabs their token.
+    let again = visitor.get(&shown.url[shown.url.find("/?").unwrap()..]);
+    let same =
+        again.header("set-cookie").iter().all(|cookie| visitor.cookies.contains(cookie.split(';').next().unwrap()));
+    assert!(again.status == 303 && same, "{again:?}");
+    // What is no order of the page: those of programs, one that names no state, one too long, nonsense.
+    for body in
+        [&br#"{"order":"remark","what":"x"}"#[..], br#"{"order":"status"}"#, br#"{"order":"watch"}"#, b"{}", b"\xff\0"]
+    {
+        assert_eq!(post(&visitor, &own, body), 400, "{}", String::from_utf8_lossy(body));
+    }
+    assert_eq!(post(&visitor, &own, br#"{"order":"resume","reason":""}"#), 400, "meant for no state");
+    assert_eq!(post(&visitor, &own, &[b' '; 5000]), 413);
+    let told = remarks(&shown);
+    for words in [
+        "an order from the origin http://evil.example",
+        "an order without the token of the page",
+        "what is no order of the page",
+    ] {
+        assert!(told.iter().any(|remark| remark.contains(words)), "{words}: {told:?}");
+    }
+    let now = status(&shown.folder);
+    assert_eq!((now["state"].as_str(), now["cycle"].as_u64()), (Some("Execute"), Some(1)), "{now}");
+    assert!(now["alarms"].is_null(), "{now}");
+    let taken = visitor.order(&shown.id, &json!({ "order": "stop", "reason": "" }));
+    assert!(taken.1, "{taken:?}");
+    assert_eq!(shown.run.end().0, 1);
+}
+
+#[test]
+fn who_has_no_key_sees_nothing_and_a_thousand_wrong_ones_keep_nobody_out() {
+    let home = tempfile::tempdir().unwrap();
+    let (page, url) = serve(home.path());
+    let stranger = Visitor::stranger(&url);
+    for path in [
+        "/",
+        "/runs",
+        "/runs/some",
+        "/runs/some/events",
+        "/runs/some/cycles/1/map",
+        "/runs/some/report",
+        "/compare",
+        "/nothing",
+    ] {
+        let answer = stranger.get(path);
+        assert_eq!(answer.status, 401, "{path}");
+        assert!(answer.text().contains("needs its key"), "{path}");
+    }
+    let guesses: Vec<u16> = (0..1000).map(|guess| stranger.get(&format!("/?key={guess:032x}")).status).collect();
+    assert!(guesses[..20].iter().all(|status| *status == 401), "{:?}", &guesses[..20]);
+    assert!(guesses[20..].contains(&429) && guesses.iter().all(|status| [401, 429].contains(status)));
+    assert_eq!(Visitor::with_key(&url).get("/runs").status, 200);
+    drop(page);
+}
+
+#[test]
+fn a_request_for_another_host_is_refused_and_what_is_outside_of_the_runs_is_not_there() {
+    let home = tempfile::tempdir().unwrap();
+    std::fs::create_dir(home.path().join("runs")).unwrap();
+    std::fs::write(home.path().join("secret.html"), "secret").unwrap();
+    let (_page, url) = serve(home.path());
+    let visitor = Visitor::with_key(&url);
+    let cookies = &visitor.cookies;
+    for host in ["evil.example", "evil.example:80", "127.0.0.1", ""] {
+        let request = format!("GET /runs HTTP/1.1\r\nHost: {host}\r\nCookie: {cookies}\r\nConnection: close\r\n\r\n");
+        assert_eq!(raw(&visitor.place, request.as_bytes()).status, 421, "{host}");
+    }
+    let port = visitor.place.rsplit(':').next().unwrap();
+    let request =
+        format!("GET /runs HTTP/1.1\r\nHost: LocalHost:{port}\r\nCookie: {cookies}\r\nConnection: close\r\n\r\n");
+    assert_eq!(raw(&visitor.place, request.as_bytes()).status, 200);
+    for path in [
+        "/runs/..",
+        "/runs/../secret.html",
+        "/runs/%2e%2e/report",
+        "/runs/..%2fsecret.html/report",
+        "/runs/%00/report",
+        "/assets/..%2fpage.js",
+        "/assets/Cargo.toml",
+    ] {
+        let answer = visitor.get(path);
+        assert!(answer.status == 404 || answer.status == 400, "{path}: {answer:?}");
+        assert!(!answer.text().contains("secret"), "{path}");
+    }
+}
+
+#[test]
+fn clients_that_never_finish_a_request_do_not_keep_others_waiting() {
+    let home = tempfile::tempdir().unwrap();
+    let (_page, url) = serve(home.path());
+    let visitor = Visitor::with_key(&url);
+    let mut slow: Vec<_> = (0..200).map(|_| TcpStream::connect(&visitor.place).unwrap()).collect();
+    for stream in &mut slow {
+        stream.write_all(b"GET /runs HTTP/1.1\r\nHost: ").unwrap();
+    }
+    assert_eq!(visitor.get("/runs").status, 200);
+    drop(slow);
+}
+
+#[test]
+fn one_screen_has_control_every_screen_makes_safe_and_taking_over_is_on_record() {
+    let home = tempfile::tempdir().unwrap();
+    let mut shown = Shown::begin(home.path(), 20.0);
+    shown.run.line("grinding", |line| line.contains("grinding"));
+    let (one, other) = (shown.visitor(), shown.visitor());
+    let resume = |folder: &Path| json!({ "order": "resume", "reason": "", "seen": status(folder)["number"] });
+    let comes_to = |shown: &mut Shown, state: &str| {
+        let Shown { run, folder, .. } = shown;
+        run.until(state, |_| (status(folder)["state"] == state).then_some(()));
+    };
+    assert!(one.order(&shown.id, &json!({ "order": "hold", "reason": "" })).1);
+    comes_to(&mut shown, "Held");
+    assert!(one.order(&shown.id, &resume(&shown.folder)).1, "nobody had control");
+    comes_to(&mut shown, "Execute");
+    // The other screen makes safe, and lets nothing move.
+    assert!(other.order(&shown.id, &json!({ "order": "hold", "reason": "" })).1);
+    comes_to(&mut shown, "Held");
+    let refused = other.order(&shown.id, &resume(&shown.folder));
+    assert!(refused.0 == 409 && !refused.1 && refused.2.contains("control"), "{refused:?}");
+    assert!(other.take_control(&shown.id).1);
+    assert_eq!(one.order(&shown.id, &resume(&shown.folder)).0, 409);
+    assert!(other.order(&shown.id, &resume(&shown.folder)).1);
+    assert!(one.order(&shown.id, &json!({ "order": "abort", "reason": "" })).1);
+    assert_eq!(shown.run.end().0, 3);
+    let told = remarks(&shown);
+    assert!(told.iter().any(|remark| remark.contains("control was taken over")), "{told:?}");
+    let reader = regrind::journal::Reader::open(&shown.folder).unwrap();
+    let stations: Vec<String> = reader.records(1).map(|record| record.unwrap().station).collect();
+    assert!(stations.iter().any(|station| station.starts_with("page, screen ")), "{stations:?}");
+}

@@ -1,0 +1,69 @@
+//! What the pages hold, without a browser.
+
+use crate::http::Visitor;
+use crate::program::{run, small_recipe};
+use crate::serve;
+
+#[test]
+fn a_run_that_is_over_is_listed_shown_compared_and_reported() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = small_recipe(home.path(), 1e5).display().to_string();
+    for part in ["SN-<1>", "SN-0002"] {
+        let (code, said, errors) = run(&["run", &recipe, "--cell", "sim", "--part", part], home.path());
+        assert_eq!(code, 0, "{said}{errors}");
+    }
+    let mut ids: Vec<String> = std::fs::read_dir(home.path().join("runs"))
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect();
+    ids.sort();
+    let (_page, url) = serve(home.path());
+    let mut visitor = Visitor::with_key(&url);
+
+    let list = visitor.get("/runs").text();
+    assert!(ids.iter().all(|id| list.contains(&format!("/runs/{id}\""))), "{list}");
+    assert!(list.contains("SN-&lt;1&gt;") && !list.contains("SN-<1>"), "{list}");
+    let narrowed = visitor.get("/runs?part=0002&result=Accepted").text();
+    assert!(!narrowed.contains(&ids[0]) && narrowed.contains(&ids[1]), "{narrowed}");
+    assert!(!visitor.get("/runs?result=Aborted").text().contains(&ids[1]));
+
+    let shown = visitor.get(&format!("/runs/{}", ids[0])).text();
+    let result: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(home.path().join("runs").join(&ids[0]).join("result.json")).unwrap())
+            .unwrap();
+    let last = result["cycles"].as_array().unwrap().last().unwrap();
+    assert!(shown.contains(&format!("<strong>{:.3}</strong>", last["rms_um"].as_f64().unwrap())), "{shown}");
+    assert!(shown.contains("ACCEPTED") && shown.contains("SIMULATION") && shown.contains("<polyline"), "{shown}");
+    visitor.language = "de-AT".into();
+    assert!(visitor.get(&format!("/runs/{}", ids[0])).text().contains("ANGENOMMEN"));
+    visitor.cookies += "; regrind_language=zh";
+    assert!(visitor.get(&format!("/runs/{}", ids[0])).text().contains("合格"));
+
+    let both = visitor.get(&format!("/compare?run={}&run={}", ids[0], ids[1]));
+    assert!(
+        both.status == 200 && ids.iter().all(|id| both.text().contains(&format!("data-compared=\"{id}\""))),
+        "{both:?}"
+    );
+    assert_eq!(visitor.get(&format!("/compare?run={}", ids[0])).header("location"), ["/runs"]);
+    let report = visitor.get(&format!("/runs/{}/report", ids[0]));
+    assert_eq!(report.body, std::fs::read(home.path().join("runs").join(&ids[0]).join("report.html")).unwrap());
+    assert!(report.header("content-security-policy")[0].contains("default-src 'none'"));
+
+    let map = visitor.get(&format!("/runs/{}/cycles/1/map", ids[0]));
+    let count = |at: usize| u32::from_le_bytes(map.body[at..at + 4].try_into().unwrap()) as usize;
+    assert_eq!(map.body.len(), 40 + 4 * count(0) * count(4));
+    let points = visitor.get(&format!("/runs/{}/cycles/1/points", ids[0]));
+    assert_eq!(points.body.len(), 300 * 12);
+    assert_eq!(visitor.get(&format!("/runs/{}/planned", ids[0])).body.len(), 300 * 8);
+    assert_eq!(visitor.get(&format!("/runs/{}/cycles/9/map", ids[0])).status, 404);
+}
+
+#[test]
+fn a_page_for_other_computers_and_one_on_a_port_in_use_are_refused() {
+    let home = tempfile::tempdir().unwrap();
+    let (code, _, errors) = run(&["serve", "--listen", "0.0.0.0:0"], home.path());
+    assert!(code == 2 && errors.contains("open to other computers") && errors.contains("ssh -L"), "{errors}");
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let (code, _, errors) = run(&["serve", "--listen", &taken.local_addr().unwrap().to_string()], home.path());
+    assert!(code == 2 && errors.contains("--listen"), "{errors}");
+}
