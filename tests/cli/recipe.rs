@@ -25,7 +25,7 @@ const TELESCOPE: &str = include_str!("../../recipes/telescope-panel.toml");
 const SIM: &str = include_str!("../../config/sim.toml");
 const TCP: &str = include_str!("../../config/modbus-tcp.toml");
 const RTU: &str = include_str!("../../config/serial-rtu.toml");
-const FILES: &str = include_str!("../../config/file-exchange.toml");
+const FILES: &str = include_str!("../../config/laser-tracker.toml");
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))

@@ -122,6 +122,11 @@ impl Running {
         self.child.try_wait().unwrap().is_some()
     }
 
+    /// What it reads from, where it was given a pipe for that.
+    pub fn keys(&mut self) -> std::process::ChildStdin {
+        self.child.stdin.take().expect("a pipe for what it reads")
+    }
+
     /// Presses Ctrl-C.
     pub fn interrupt(&self) {
         self.signal("INT");

@@ -9,6 +9,7 @@ mod cycles;
 #[path = "../common/data.rs"]
 mod data;
 mod faults;
+mod files;
 mod heartbeats;
 mod height_maps;
 #[path = "../common/keep.rs"]

@@ -34,7 +34,7 @@ impl Shop {
         let nominal = data.join("nominal/reference.yaml");
         let inbox = "inbox = \"../exchange/grinder/in\"";
         let cell = changed(
-            "config/file-exchange.toml",
+            "config/laser-tracker.toml",
             &[
                 ("../exchange/cmm/reference.yaml", nominal.to_str().unwrap()),
                 ("stable_for_s = 2.0", "stable_for_s = 0.2"),
