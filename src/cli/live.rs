@@ -11,12 +11,13 @@ use regrind::drive::{Beside, Drive, Interrupted, Ledger, Orders, Request, Run, T
 use regrind::journal::{Journal, MachineLock};
 use regrind::recipe::Recipe;
 use regrind::setup;
+use regrind_control::Next;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::mpsc;
 
 use super::Outcome;
 use super::failure::Failure;
-use super::show::Show;
+use super::show::{Show, reads_keys};
 
 /// What a run is driven by.
 pub(super) struct Live<'a> {
@@ -93,7 +94,11 @@ async fn go(run: Run, machines: Machines, actor: Actor) -> Result<Ending, Failur
     let (drive, orders) =
         Drive::with_cell(run, cmm, grinder).map_err(|source| Failure::ControlSocket { path: folder, source })?;
     let signals = Signals::new().map_err(Failure::Signals)?;
-    let heeding = [tokio::spawn(heed_ctrl_c(orders.clone(), actor.clone())), tokio::spawn(signals.heed(orders, actor))];
+    let heeding = [
+        tokio::spawn(heed_ctrl_c(orders.clone(), actor.clone())),
+        tokio::spawn(heed_enter(orders.clone(), actor.clone())),
+        tokio::spawn(signals.heed(orders, actor)),
+    ];
     let ending = drive.run().await;
     heeding.iter().for_each(tokio::task::JoinHandle::abort);
     Ok(ending)
@@ -111,6 +116,25 @@ async fn heed_ctrl_c(orders: Orders, actor: Actor) {
             Request::Hold { reason: "Ctrl-C".into() }
         };
         orders.give(request, actor.clone()).await;
+    }
+}
+
+/// Enter says that the part is loaded, where a person at this terminal is asked for it. Keys that were pressed ahead confirm nothing.
+async fn heed_enter(orders: Orders, actor: Actor) {
+    let mut status = orders.status();
+    if status.wait_for(|seen| seen.next_step == Next::Load).await.is_err() || !reads_keys() {
+        return;
+    }
+    // What cannot be thrown away is taken for an answer of nobody.
+    if rustix::termios::tcflush(io::stdin(), rustix::termios::QueueSelector::IFlush).is_err() {
+        return;
+    }
+    let (typed, pressed) = tokio::sync::oneshot::channel();
+    // A thread of its own, which ends with the program: a terminal cannot be asked in vain.
+    std::thread::spawn(move || typed.send(io::stdin().read_line(&mut String::new()).is_ok_and(|read| read > 0)));
+    let still_asked = |orders: &Orders| orders.status().borrow().next_step == Next::Load;
+    if pressed.await == Ok(true) && still_asked(&orders) {
+        orders.give(Request::Loaded, actor).await;
     }
 }
 

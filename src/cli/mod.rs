@@ -2,6 +2,7 @@
 
 mod accuracy;
 mod audit;
+mod blocks;
 mod check;
 mod choice;
 mod compensate;
@@ -17,12 +18,14 @@ mod register;
 mod report;
 mod resume;
 mod run;
+mod runs;
 mod schema;
 mod serve;
 mod show;
 mod simulate;
 mod simulated;
 mod states;
+mod watch;
 mod words;
 
 use std::io::{self, Write};
@@ -62,6 +65,8 @@ enum Command {
     /// Tell how a running cell is, what it waits for, and what to do next
     #[command(after_help = control::help("regrind status runs/freeform-mirror-20260704T120000Z --json"))]
     Status(control::Arguments),
+    Watch(watch::Arguments),
+    Runs(runs::Arguments),
     Serve(serve::Arguments),
     Audit(audit::Arguments),
     Report(report::Arguments),
@@ -110,6 +115,8 @@ fn run() -> ExitCode {
         Command::Abort(arguments) => control::order(&arguments, |reason| Request::Abort { reason }),
         Command::Confirm(arguments) => control::confirm(&arguments),
         Command::Status(arguments) => control::order(&arguments, |_| Request::Status),
+        Command::Watch(arguments) => watch::run(&arguments),
+        Command::Runs(arguments) => runs::run(&arguments),
         Command::Serve(arguments) => serve::run(&arguments),
         Command::Audit(arguments) => audit::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),

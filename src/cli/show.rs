@@ -3,15 +3,17 @@
 use std::collections::HashMap;
 use std::fmt::Write as _;
 use std::io::{self, IsTerminal};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use regrind::cell::{Alarm, AlarmId, Device, Ending, Figures, Judgement, PvOf, Tolerance};
 use regrind::drive::{CycleRow, Notice};
+use regrind::formats::read_error_map;
 use regrind::recipe::Recipe;
 use tokio::sync::mpsc;
 
+use super::blocks::{Blocks, sparkline};
 use super::failure::Failure;
 use super::words::{judged, three_digits, time_left, wrapped};
 
@@ -31,6 +33,8 @@ pub(super) struct Show {
     job: Option<(Device, u32)>,
     /// What was said of the alarms that stand.
     alarms: HashMap<AlarmId, String>,
+    /// RMS of each cycle.
+    rms_mm: Vec<f64>,
 }
 
 impl Show {
@@ -45,6 +49,7 @@ impl Show {
             said: None,
             job: None,
             alarms: HashMap::new(),
+            rms_mm: Vec::new(),
         }
     }
 
@@ -95,9 +100,12 @@ impl Show {
                 "cycle {cycle}: {points} points fetched in {seconds:.2} s, {} ms a point",
                 three_digits(*ms_per_point)
             )),
-            Notice::LoadPart => self.line(
-                "load the part, clamp it, see that wheel and probe are clear of it,\nthen: regrind confirm loaded",
-            ),
+            Notice::LoadPart => {
+                let by_key = if reads_keys() { "press Enter here, or: " } else { "" };
+                self.line(&format!(
+                    "load the part, clamp it, see that wheel and probe are clear of it,\nthen: {by_key}regrind confirm loaded"
+                ))
+            }
             Notice::AskWhetherClear { device } => self.line(&format!(
                 "{device}: nothing tells whether it is clear of the part; see that it is,\nthen: regrind confirm clear --machine {}",
                 device.to_string().to_lowercase()
@@ -172,7 +180,20 @@ impl Show {
         for words in figures.weak_directions.iter().chain(&figures.warnings) {
             let _ = write!(text, "\n         {words}");
         }
-        self.line(&text)
+        self.line(&text)?;
+        self.rms_mm.push(figures.rms_mm);
+        self.picture(cycle)
+    }
+
+    /// Shows the error map of a cycle on a terminal with colours, and how the RMS has come down to it.
+    fn picture(&self, cycle: u32) -> Result<(), Failure> {
+        let (Some(bar), true) = (&self.bar, console::colors_enabled()) else { return Ok(()) };
+        let nodes = newest_map(Path::new(&self.folder), cycle).and_then(|path| read_error_map(&path).ok());
+        let columns = console::Term::stdout().size_checked().map_or(60, |(_, columns)| usize::from(columns));
+        let Some(blocks) = nodes.and_then(|nodes| Blocks::of(&nodes, [columns.min(72) - 4, 16])) else { return Ok(()) };
+        let falls = sparkline(self.rms_mm.iter().copied());
+        let below = format!("error, filtered: +- {} um   RMS {falls}\n", three_digits(blocks.limit_um));
+        bar.suspend(|| super::print(&format!("{}{below}", blocks.to_ansi())))
     }
 
     fn alarm(&mut self, alarm: &Alarm) -> Result<(), Failure> {
@@ -180,7 +201,7 @@ impl Show {
         for (k, remedy) in alarm.remedy.iter().enumerate() {
             let _ = write!(text, "\n         {}. {remedy}", k + 1);
         }
-        self.line(&text)
+        self.striking(&text, "ALARM", "31")
     }
 
     fn finished(&mut self, ending: &Ending, cycles: &[CycleRow]) -> Result<(), Failure> {
@@ -202,18 +223,39 @@ impl Show {
         }
         let marked = if self.simulated { "SIMULATION  " } else { "" };
         let _ = write!(text, "\n{marked}{word}: {reason}");
-        self.line(&text)
+        self.striking(&text, word, if word == "ACCEPTED" { "32" } else { "31" })
     }
 
     fn line(&self, text: &str) -> Result<(), Failure> {
-        match &self.bar {
-            Some(bar) => {
-                let columns = console::Term::stdout().size_checked().map_or(usize::MAX, |(_, columns)| columns.into());
-                bar.suspend(|| super::print(&wrapped(text, columns)))
-            }
-            None => super::print(&format!("{text}\n")),
-        }
+        self.striking(text, "", "")
     }
+
+    /// Prints lines of which a terminal shows a word in colour, with its bell.
+    fn striking(&self, text: &str, word: &str, colour: &str) -> Result<(), Failure> {
+        let Some(bar) = &self.bar else { return super::print(&format!("{text}\n")) };
+        let columns = console::Term::stdout().size_checked().map_or(usize::MAX, |(_, columns)| columns.into());
+        let mut text = wrapped(text, columns);
+        if !word.is_empty() && console::colors_enabled() {
+            text = text.replacen(word, &format!("\x1b[1;{colour}m{word}\x1b[0m"), 1);
+        }
+        let bell = if word.is_empty() { "" } else { "\x07" };
+        bar.suspend(|| super::print(&format!("{bell}{text}")))
+    }
+}
+
+/// The error map of a cycle that was made last: what was measured again stands in a folder of its own.
+fn newest_map(run: &Path, cycle: u32) -> Option<PathBuf> {
+    let cycle = run.join(format!("cycle-{cycle}"));
+    let attempts = (2..).map(|attempt| cycle.join(format!("attempt-{attempt}"))).take_while(|folder| folder.is_dir());
+    let maps = std::iter::once(cycle.clone()).chain(attempts).map(|folder| folder.join("error_map.csv"));
+    maps.filter(|map| map.is_file()).last()
+}
+
+/// Whether a person at this terminal can answer: it is one, and not somebody else's at the moment.
+pub(super) fn reads_keys() -> bool {
+    // Who reads from a terminal in the background is stopped by it, machines or not.
+    let has_it = rustix::termios::tcgetpgrp(io::stdin()).is_ok_and(|group| group == rustix::process::getpgrp());
+    has_it && io::stdin().is_terminal() && io::stderr().is_terminal()
 }
 
 fn bar() -> ProgressBar {

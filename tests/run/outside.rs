@@ -54,6 +54,31 @@ fn the_simulated_cell_comes_with_the_program() {
 }
 
 #[test]
+fn a_running_cell_is_watched_line_by_line_in_a_pipe_and_listed_with_what_became_of_it() {
+    let home = tempfile::tempdir().unwrap();
+    let (mut running, folder) = grinding(home.path(), |arguments| regrind(arguments, home.path()));
+    let name = folder.file_name().unwrap().to_string_lossy().into_owned();
+    let mut watch = Running::new(regrind(&["watch"], home.path()));
+    watch.line("the state", |line| line.starts_with("cycle 1: Execute (Grind"));
+    let (code, said, errors) = run(&["runs"], home.path());
+    assert!(code == 0 && said.contains(&name) && said.contains("on now"), "{said}{errors}");
+    assert_eq!(run(&["stop"], home.path()).0, 0);
+    assert_eq!(running.end().0, 1);
+    assert_eq!(watch.end().0, 0, "{:?}", watch.said);
+    assert!(watch.said.last().unwrap().starts_with("STOPPED"), "{:?}", watch.said);
+    let (code, said, _) = run(&["runs", "--json"], home.path());
+    let listed: serde_json::Value = serde_json::from_str(&said).unwrap();
+    assert_eq!(
+        (code, listed[0]["run"].as_str(), listed[0]["result"].as_str()),
+        (0, Some(&*name), Some("Stopped")),
+        "{said}"
+    );
+    assert!(run(&["runs", "--part", "another"], home.path()).1.contains("no run in"));
+    let (code, _, errors) = run(&["runs", "--runs", "elsewhere"], home.path());
+    assert!(code == 2 && errors.contains("elsewhere") && errors.contains("--runs"), "{errors}");
+}
+
+#[test]
 fn each_order_shows_how_it_is_given() {
     for order in ["hold", "stop", "abort", "status"] {
         let (code, said, _) = run(&[order, "--help"], Path::new("."));

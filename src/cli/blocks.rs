@@ -1,0 +1,102 @@
+//! A map in coloured blocks, for a terminal: two pixels a character, the upper half and the lower.
+
+use regrind::report::ColourMap;
+
+/// A pixel; none where nothing was measured.
+type Pixel = Option<[u8; 3]>;
+
+/// The pixels of a map.
+pub(super) struct Blocks {
+    /// The upper and the lower half of each character, row by row from above.
+    pub(super) rows: Vec<Vec<[Pixel; 2]>>,
+    /// What the darkest red stands for, in micrometres.
+    pub(super) limit_um: f64,
+}
+
+impl Blocks {
+    /// Paints a map in at most so many characters along and so many above each other.
+    ///
+    /// Shape: nodes of x, y and error in millimetres. A half of a character is about as wide as it is high.
+    pub(super) fn of(nodes: &[[f64; 3]], most: [usize; 2]) -> Option<Self> {
+        let range = |k: usize| nodes.iter().fold([f64::MAX, f64::MIN], |[a, b], node| [a.min(node[k]), b.max(node[k])]);
+        let ([x0, x1], [y0, y1]) = (range(0), range(1));
+        let (wide, deep) = (x1 - x0, y1 - y0);
+        if !(wide > 0.0 && deep > 0.0) || most.contains(&0) {
+            return None;
+        }
+        let pixel_mm = (wide / most[0] as f64).max(deep / (2 * most[1]) as f64);
+        let [columns, lines] = [wide, deep].map(|size| ((size / pixel_mm).round() as usize).max(1));
+        let mut sums = vec![(0.0, 0_u32); columns * lines];
+        for [x, y, error_mm] in nodes {
+            let column = (((x - x0) / wide * columns as f64) as usize).min(columns - 1);
+            let line = (((y1 - y) / deep * lines as f64) as usize).min(lines - 1);
+            let (sum, count) = &mut sums[line * columns + column];
+            (*sum, *count) = (*sum + error_mm, *count + 1);
+        }
+        let means: Vec<Option<f64>> =
+            sums.iter().map(|(sum, count)| (*count > 0).then(|| sum / f64::from(*count))).collect();
+        let limit_mm = means.iter().flatten().fold(0.0_f64, |limit, mean| limit.max(mean.abs()));
+        let colour =
+            |mean: f64| ColourMap::Diverging.at(if limit_mm > 0.0 { 0.5 + 0.5 * mean / limit_mm } else { 0.5 });
+        let at = |line: usize, column: usize| means.get(line * columns + column).copied().flatten().map(colour);
+        let row = |above: usize| (0..columns).map(|column| [at(above, column), at(above + 1, column)]).collect();
+        Some(Self { rows: (0..lines).step_by(2).map(row).collect(), limit_um: 1e3 * limit_mm })
+    }
+
+    /// Writes them with the codes that terminals of today understand.
+    pub(super) fn to_ansi(&self) -> String {
+        let code = |plane: u8, [r, g, b]: [u8; 3]| format!("\x1b[{plane};2;{r};{g};{b}m");
+        let block = |[above, below]: &[Pixel; 2]| match (above, below) {
+            (Some(above), Some(below)) => format!("{}{}\u{2580}\x1b[0m", code(38, *above), code(48, *below)),
+            (Some(above), None) => format!("{}\u{2580}\x1b[0m", code(38, *above)),
+            (None, Some(below)) => format!("{}\u{2584}\x1b[0m", code(38, *below)),
+            (None, None) => " ".to_owned(),
+        };
+        self.rows.iter().map(|row| row.iter().map(block).chain(["\n".to_owned()]).collect::<String>()).collect()
+    }
+}
+
+/// Draws how a figure came down, a character a cycle: the highest stands for the largest, by the logarithm.
+pub(super) fn sparkline(values: impl Iterator<Item = f64> + Clone) -> String {
+    const STEPS: [char; 8] =
+        ['\u{2581}', '\u{2582}', '\u{2583}', '\u{2584}', '\u{2585}', '\u{2586}', '\u{2587}', '\u{2588}'];
+    let logs = values.map(|value| value.max(1e-9).ln());
+    let (low, high) = logs.clone().fold((f64::MAX, f64::MIN), |(low, high), log| (low.min(log), high.max(log)));
+    let step = |log: f64| if high > low { (7.0 * (log - low) / (high - low)).round() as usize } else { 7 };
+    logs.map(|log| STEPS[step(log).min(7)]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_map_is_painted_as_it_lies_and_no_larger_than_asked() {
+        // Proud above on the right, deep below on the left.
+        let nodes: Vec<[f64; 3]> = (0..40)
+            .flat_map(|i| (0..20).map(move |j| [f64::from(i), f64::from(j), 1e-4 * f64::from(i + j) - 2.9e-3]))
+            .collect();
+        let blocks = Blocks::of(&nodes, [20, 30]).unwrap();
+        assert!(blocks.rows.iter().all(|row| row.len() == 20) && blocks.rows.len() == 5, "{}", blocks.rows.len());
+        let [r, _, b] = blocks.rows[0][19][0].unwrap();
+        assert!(r > b, "proud is red");
+        let [r, _, b] = blocks.rows[4][0][1].unwrap();
+        assert!(b > r, "deep is blue");
+        assert!(Blocks::of(&nodes, [40, 3]).unwrap().rows.len() <= 3);
+    }
+
+    #[test]
+    fn what_has_no_extent_is_not_painted() {
+        for nodes in [&[][..], &[[1.0, 1.0, 0.0]], &[[1.0, 1.0, 0.0], [2.0, 1.0, 0.0]]] {
+            assert!(Blocks::of(nodes, [10, 10]).is_none());
+        }
+        assert!(Blocks::of(&[[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]], [0, 4]).is_none());
+    }
+
+    #[test]
+    fn a_sparkline_goes_down_with_its_figures() {
+        assert_eq!(sparkline([100.0, 10.0, 1.0].into_iter()), "\u{2588}\u{2585}\u{2581}");
+        assert_eq!(sparkline([5.0].into_iter()), "\u{2588}");
+        assert_eq!(sparkline([].into_iter()), "");
+    }
+}

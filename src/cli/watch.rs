@@ -1,0 +1,272 @@
+//! `regrind watch`: a running cell on the whole of a terminal.
+
+use std::io::{self, IsTerminal};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use clap::Args;
+use ratatui::Frame;
+use ratatui::crossterm::event::{self, Event, KeyCode, KeyEventKind};
+use ratatui::layout::{Constraint, Layout, Rect};
+use ratatui::style::{Color, Style, Stylize};
+use ratatui::text::{Line, Span, Text};
+use ratatui::widgets::{Block, Gauge, Paragraph, Wrap};
+use regrind::cell::StateName;
+use regrind::drive::{CycleRow, JobProgress, Request, Snapshot, ask};
+use regrind::formats::read_error_map;
+use regrind::report::run_summary;
+use tokio::sync::mpsc;
+
+use super::Outcome;
+use super::blocks::{Blocks, sparkline};
+use super::control;
+use super::failure::Failure;
+use super::show::{how_far, limits, pv_name};
+use super::words::time_left;
+
+/// Between two looks whether a map is on record.
+const BETWEEN_LOOKS: Duration = Duration::from_secs(1);
+
+/// Watch a running cell: its state, progress, figures and error map, with a key to hold it
+#[derive(Args, Debug)]
+#[command(after_help = "\
+RUN is the folder of a run; without it, the one under runs/ that goes on now. Keys: h holds the cell, q leaves it as it is.
+Where the output is no terminal, each new state is a line.
+
+Example:
+  regrind watch
+
+Exit codes: 0 the run ended, or q was pressed; 2 no such run; 3 its program has gone.")]
+pub(super) struct Arguments {
+    /// Folder of the run
+    #[arg(value_name = "RUN")]
+    run: Option<PathBuf>,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let folder = arguments.run.clone().map_or_else(|| control::live(Path::new("runs")), Ok)?;
+    super::runtime()?.block_on(async {
+        let gone = |source| Failure::NotRunning { path: folder.clone(), source };
+        let mut watch = regrind_control::watch(&folder).await.map_err(gone)?;
+        let Some(first) = watch.next().await.map_err(gone)? else { return Err(gone(io::ErrorKind::BrokenPipe.into())) };
+        if !io::stdout().is_terminal() {
+            return in_lines(first, &mut watch, &folder).await;
+        }
+        let mut view =
+            View { seen: first, folder: folder.clone(), map: None, mapped: 0, looked: None, said: String::new() };
+        let mut terminal = ratatui::init();
+        let ended = view.follow(&mut terminal, &mut watch).await;
+        ratatui::restore();
+        // What was on the whole terminal has gone with it.
+        super::print(&format!("{}\n{}\n", folder.display(), view.seen.message))?;
+        ended
+    })
+}
+
+/// A line for each new state, for a file or a pipe.
+async fn in_lines(first: Snapshot, watch: &mut regrind_control::Watch, folder: &Path) -> Result<Outcome, Failure> {
+    let mut told = String::new();
+    let mut seen = Ok(Some(first));
+    while let Ok(Some(now)) = &seen {
+        let line = format!("cycle {}: {}\n", now.cycle, now.message);
+        if line != told {
+            super::print(&line)?;
+            told = line;
+        }
+        seen = watch.next().await;
+    }
+    super::print(&format!("{}\n", ended(folder, seen)?))?;
+    Ok(Outcome::Accepted)
+}
+
+/// How a run ended whose program tells no more; an error where it has no end on record.
+fn ended(folder: &Path, told: io::Result<Option<Snapshot>>) -> Result<String, Failure> {
+    let summary = run_summary(folder).unwrap_or_default();
+    if summary.ended.is_some() {
+        return Ok(summary.verdict);
+    }
+    let source = told.err().unwrap_or_else(|| io::ErrorKind::BrokenPipe.into());
+    Err(Failure::NotRunning { path: folder.to_owned(), source })
+}
+
+/// What is on the terminal.
+struct View {
+    seen: Snapshot,
+    folder: PathBuf,
+    /// Nodes of the last error map.
+    map: Option<Vec<[f64; 3]>>,
+    /// How many cycles have theirs on record, and when that was looked up.
+    mapped: usize,
+    looked: Option<Instant>,
+    /// What came of the last key.
+    said: String,
+}
+
+impl View {
+    async fn follow(
+        &mut self,
+        terminal: &mut ratatui::DefaultTerminal,
+        watch: &mut regrind_control::Watch,
+    ) -> Result<Outcome, Failure> {
+        let mut keys = keys();
+        loop {
+            self.read_map();
+            terminal.draw(|frame| self.draw(frame)).map_err(Failure::Terminal)?;
+            tokio::select! {
+                seen = watch.next() => match seen {
+                    Ok(Some(seen)) => self.seen = seen,
+                    told => {
+                        self.seen.message = ended(&self.folder, told)?;
+                        return Ok(Outcome::Accepted);
+                    }
+                },
+                key = keys.recv() => match key {
+                    Some(KeyCode::Char('q') | KeyCode::Esc) | None => return Ok(Outcome::Accepted),
+                    Some(KeyCode::Char('h')) => self.hold().await,
+                    Some(_) => {}
+                },
+            }
+        }
+    }
+
+    async fn hold(&mut self) {
+        let folder = self.folder.clone();
+        let asked =
+            tokio::task::spawn_blocking(move || ask(&folder, &Request::Hold { reason: "regrind watch".into() }));
+        self.said = match asked.await {
+            Ok(Ok(reply)) => format!("hold: {}", reply.message),
+            Ok(Err(error)) => format!("hold: {error}"),
+            Err(error) => format!("hold: {error}"),
+        };
+    }
+
+    /// Reads the map of a cycle that was measured, once it is on record.
+    fn read_map(&mut self) {
+        let just_looked = self.looked.is_some_and(|at| at.elapsed() < BETWEEN_LOOKS);
+        if self.mapped >= self.seen.cycles.len() || just_looked {
+            return;
+        }
+        self.looked = Some(Instant::now());
+        let cycles = run_summary(&self.folder).map(|summary| summary.cycles).unwrap_or_default();
+        let names: Vec<String> = cycles.into_iter().filter_map(|of| of.map).collect();
+        if let Some(map) = names.last().and_then(|name| read_error_map(&self.folder.join(name)).ok()) {
+            (self.map, self.mapped) = (Some(map), names.len());
+        }
+    }
+
+    fn draw(&self, frame: &mut Frame) {
+        let alarms = self.alarms();
+        let rows = [
+            Constraint::Length(3),
+            Constraint::Length(2),
+            Constraint::Length(if alarms.lines.is_empty() { 0 } else { (alarms.lines.len() as u16 * 2).min(9) }),
+            Constraint::Min(6),
+            Constraint::Length(1),
+        ];
+        let [head, job, alarm, rest, foot] = Layout::vertical(rows).areas(frame.area());
+        frame.render_widget(self.head(), head);
+        self.job(frame, job);
+        frame.render_widget(Paragraph::new(alarms).wrap(Wrap { trim: true }).red(), alarm);
+        let wide = rest.width >= 70;
+        let [left, right] = match wide {
+            true => Layout::horizontal([Constraint::Percentage(55), Constraint::Percentage(45)]).areas(rest),
+            false => Layout::vertical([Constraint::Length(3 + self.seen.cycles.len() as u16), Constraint::Min(0)])
+                .areas(rest),
+        };
+        let (figures, map) = if wide { (right, left) } else { (left, right) };
+        frame.render_widget(self.figures(), figures);
+        self.map(frame, map);
+        let keys = if self.said.is_empty() { "h hold   q leave" } else { &self.said };
+        frame.render_widget(Paragraph::new(keys).dim(), foot);
+    }
+
+    fn head(&self) -> Paragraph<'_> {
+        let Snapshot { simulation, state, phase, cycle, max_cycles, next, part, .. } = &self.seen;
+        let colour = match state {
+            StateName::Execute | StateName::Starting | StateName::Unholding | StateName::Unsuspending => Color::Green,
+            StateName::Complete => Color::Green,
+            StateName::Aborting | StateName::Aborted | StateName::Stopped => Color::Red,
+            _ => Color::Yellow,
+        };
+        let marked = if *simulation { "  SIMULATION" } else { "" };
+        let phase = phase.map_or(String::new(), |phase| format!("  {}", phase.name()));
+        let first = Line::from(vec![
+            Span::styled(
+                format!(" {} ", state.to_string().to_uppercase()),
+                Style::new().fg(Color::Black).bg(colour).bold(),
+            ),
+            Span::raw(format!("{phase}  cycle {cycle} of at most {max_cycles}  {part}{marked}")),
+        ]);
+        Paragraph::new(vec![first, Line::from(format!("next: {next}"))]).wrap(Wrap { trim: true })
+    }
+
+    fn job(&self, frame: &mut Frame, area: Rect) {
+        let Some(JobProgress { device, done, total, left_s }) = self.seen.progress else { return };
+        let left = left_s.map_or(String::new(), |left_s| format!(", {} left", time_left(left_s)));
+        let ratio = (f64::from(done) / f64::from(total.max(1))).clamp(0.0, 1.0);
+        let gauge = Gauge::default()
+            .ratio(ratio)
+            .gauge_style(Color::Blue)
+            .label(format!("{}{left}", how_far(device, done, total)));
+        frame.render_widget(gauge, Rect { height: 1.min(area.height), ..area });
+    }
+
+    fn alarms(&self) -> Text<'_> {
+        let of = |alarm: &regrind::cell::Alarm| {
+            let remedy = alarm.remedy.iter().zip(1..).map(|(remedy, k)| format!("  {k}. {remedy}")).collect::<String>();
+            [Line::from(format!("ALARM  {}", alarm.what)).bold(), Line::from(format!("{}{remedy}", alarm.consequence))]
+        };
+        Text::from(self.seen.alarms.iter().flat_map(of).collect::<Vec<_>>())
+    }
+
+    fn figures(&self) -> Paragraph<'_> {
+        let Some(tolerance) = self.seen.tolerance else { return Paragraph::default() };
+        let row = |row: &CycleRow| {
+            let CycleRow { cycle, pv_um, judged_pv_um, rms_um, .. } = row;
+            Line::from(format!("{cycle:>5} {:>12.2} {rms_um:>8.3}", judged_pv_um.unwrap_or(*pv_um)))
+        };
+        let falls = sparkline(self.seen.cycles.iter().map(|row| row.rms_um));
+        let head = Line::from(format!("cycle {:>12} {:>8}", pv_name(&tolerance), "RMS um"));
+        let lines = [Line::from(limits(&tolerance)), head.dim()].into_iter().chain(self.seen.cycles.iter().map(row));
+        Paragraph::new(lines.chain([Line::from(falls).cyan()]).collect::<Vec<_>>()).wrap(Wrap { trim: false })
+    }
+
+    fn map(&self, frame: &mut Frame, area: Rect) {
+        let Some(nodes) = &self.map else { return };
+        let room = [area.width.saturating_sub(2), area.height.saturating_sub(2)].map(usize::from);
+        let Some(blocks) = Blocks::of(nodes, room) else { return };
+        let colour = |pixel: Option<[u8; 3]>| pixel.map_or(Color::Reset, |[r, g, b]| Color::Rgb(r, g, b));
+        let cell = |[above, below]: &[Option<[u8; 3]>; 2]| {
+            Span::styled("\u{2580}", Style::new().fg(colour(*above)).bg(colour(*below)))
+        };
+        let lines: Vec<Line> = blocks.rows.iter().map(|row| row.iter().map(cell).collect()).collect();
+        let title = format!("error, filtered: +- {:.2} um", blocks.limit_um);
+        frame.render_widget(Paragraph::new(lines).block(Block::bordered().title(title)), area);
+    }
+}
+
+/// Keys as they are pressed, from a thread that may wait for them.
+fn keys() -> mpsc::Receiver<KeyCode> {
+    let (pressed, keys) = mpsc::channel(16);
+    std::thread::spawn(move || {
+        while !pressed.is_closed() {
+            // Looked at again and again, so that the thread ends with who listens.
+            if !event::poll(Duration::from_millis(200)).unwrap_or(false) {
+                continue;
+            }
+            match event::read() {
+                Ok(Event::Key(key)) if key.kind == KeyEventKind::Press => {
+                    // In raw mode Ctrl-C is a key like any other.
+                    let leaves = key.code == KeyCode::Char('c') && key.modifiers.contains(event::KeyModifiers::CONTROL);
+                    let code = if leaves { KeyCode::Esc } else { key.code };
+                    if pressed.blocking_send(code).is_err() {
+                        return;
+                    }
+                }
+                Ok(_) => {}
+                Err(_) => return,
+            }
+        }
+    });
+    keys
+}
