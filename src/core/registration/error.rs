@@ -12,7 +12,8 @@ pub enum RegistrationError {
     #[error(transparent)]
     Surface(#[from] SurfaceError),
     #[error(
-        "the probe radius is {radius_mm} mm; it must be above 0 and below {limit_mm:.3} mm, half the size of the part"
+        "the probe radius is {radius_mm} mm; it must be above 0 and below {limit_mm:.3} mm, half the size of the part; without a ball \
+         (radius 0) the points are contact points: register with the method `contact`"
     )]
     ProbeRadius { radius_mm: f64, limit_mm: f64 },
     #[error("there are {points} measured points and at least {least} are needed; measure more")]
@@ -39,11 +40,8 @@ pub enum RegistrationError {
         "no minimum within {iterations} iterations; the objective is at {objective_mm2:.3e} mm^2; allow more, or give a start pose"
     )]
     NotConverged { iterations: usize, objective_mm2: f64 },
-    #[error(
-        "the measured points do not fit the nominal surface: rms {rms_mm:.4} mm, limit {limit_mm:.4} mm; check part, units and \
-         probe radius, or raise the limit"
-    )]
-    DoesNotFit { rms_mm: f64, limit_mm: f64 },
+    #[error("the measured points do not fit the nominal surface: rms {rms_mm:.4} mm, limit {limit_mm:.4} mm; {remedy}")]
+    DoesNotFit { rms_mm: f64, limit_mm: f64, remedy: String },
     #[error(
         "the measured cloud is a mirror image of the part: as measured it fits to {rms_mm:.4} mm, mirrored to \
          {mirrored_rms_mm:.4} mm rms; one axis of the CMM file is reversed"

@@ -15,6 +15,7 @@
 
 mod correspond;
 mod deviation;
+mod doubt;
 mod error;
 mod iterate;
 mod lateral;
@@ -45,7 +46,7 @@ use part::Part;
 use refit::{LEAST_SIGMA_MM, trim_and_refit};
 pub use result::Registration;
 pub use robust::Loss;
-use start::{InitialPose, initial_pose, mirrored_rms};
+use start::{InitialPose, initial_pose, mirror_image, mirrored_rms};
 pub use verdict::{Verdict, WeakDirection};
 
 /// Registers measured points to a nominal surface.
@@ -58,10 +59,20 @@ pub use verdict::{Verdict, WeakDirection};
 /// Input that cannot be registered, a cloud that does not fit the surface, and an iteration that does not converge.
 pub fn register(nominal: &Nominal, measured: &[Point], options: &Options) -> Result<Registration, RegistrationError> {
     let part = Part::check(nominal, measured, options)?;
+    let mut registration =
+        fit(&part, measured, options).map_err(|error| or_mirrored(&part, measured, options, error))?;
+    confirm(&part, &registration, measured, options)?;
+    let doubts = doubt::doubts(&part, &registration, measured, options);
+    registration.verdict.warnings.extend(doubts);
+    Ok(registration)
+}
+
+/// Finds the pose, whatever it is worth.
+fn fit(part: &Part, measured: &[Point], options: &Options) -> Result<Registration, RegistrationError> {
     if let Some(side) = options.side.given() {
         part.check_fold(options, side)?;
     }
-    let initial = initial_pose(&part, measured, options)?;
+    let initial = initial_pose(part, measured, options)?;
     if options.side == ProbeSide::Auto {
         part.check_fold(options, initial.side)?;
     }
@@ -69,9 +80,21 @@ pub fn register(nominal: &Nominal, measured: &[Point], options: &Options) -> Res
     let mut trace = Vec::new();
     let mut correspondences: Vec<Correspondence> = measured.par_iter().map(|_| Correspondence::NEW).collect();
     let descent = trim_and_refit(&problem, &initial, options, &mut correspondences, &mut trace)?;
-    let registration = report(&part, &problem, descent, correspondences, trace, &initial, options)?;
-    confirm(&part, &registration, measured, options)?;
-    Ok(registration)
+    report(part, &problem, descent, correspondences, trace, &initial, options)
+}
+
+/// Says that a cloud is a mirror image, if that is why it cannot be registered.
+///
+/// What is wrong with the surface, the radius or the points themselves is found before any pose is tried, and stays as it is.
+fn or_mirrored(part: &Part, measured: &[Point], options: &Options, error: RegistrationError) -> RegistrationError {
+    use RegistrationError::{NotConverged, TooFewUsed, Undetermined, WrongSide};
+    if !matches!(error, TooFewUsed { .. } | NotConverged { .. } | WrongSide { .. } | Undetermined) {
+        return error;
+    }
+    match mirror_image(part, measured, options) {
+        Some((rms_mm, mirrored_rms_mm)) => RegistrationError::Mirrored { rms_mm, mirrored_rms_mm },
+        None => error,
+    }
 }
 
 /// Turns the end of the iteration into what is reported.
@@ -108,7 +131,9 @@ fn confirm(part: &Part, found: &Registration, measured: &[Point], options: &Opti
         return Err(RegistrationError::Mirrored { rms_mm, mirrored_rms_mm });
     }
     if rms_mm > limit_mm {
-        return Err(RegistrationError::DoesNotFit { rms_mm, limit_mm });
+        let remedy = doubt::of_radius(part, found, measured, options)
+            .unwrap_or_else(|| "check part, units and probe radius, or raise the limit".to_owned());
+        return Err(RegistrationError::DoesNotFit { rms_mm, limit_mm, remedy });
     }
     Ok(())
 }

@@ -14,7 +14,43 @@ use nalgebra::Vector6;
 use super::deviation::{Deviation, PointStatus};
 use super::result::Registration;
 
+/// What the points tell of the radius that they were registered with.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ToldRadius {
+    /// How much larger the radius should be, in millimetres.
+    pub(super) more_mm: f64,
+    /// Its standard uncertainty by what scatter would be left, as if every point scattered by itself.
+    pub(super) sigma_mm: f64,
+    /// The share of the rms that would be left.
+    pub(super) rms_left: f64,
+}
+
 impl Registration {
+    /// Returns what the points tell of the radius, taken for a seventh unknown; `None` where there is no scatter.
+    ///
+    /// ```text
+    ///  dr = sum r_i (1 - a_i g) / sum (1 - a_i g)^2
+    /// ```
+    pub(super) fn told_radius(&self) -> Option<ToldRadius> {
+        let variance = self.verdict.residual_sigma_mm.powi(2);
+        let used = || self.deviations.iter().filter(|d| d.status == PointStatus::Used);
+        let sum: Vector6<f64> = used().map(row).sum();
+        let motion = self.verdict.covariance * sum / variance;
+        let (mut cross, mut lever, mut squares, mut points) = (0.0, 0.0, 0.0, 0);
+        for deviation in used() {
+            let left = 1.0 - row(deviation).dot(&motion);
+            cross += deviation.deviation_mm * left;
+            lever += left * left;
+            squares += deviation.deviation_mm.powi(2);
+            points += 1;
+        }
+        let more_mm = cross / lever;
+        let rest = (squares - cross * more_mm).max(0.0);
+        let sigma_mm = (rest / f64::from((points - 7).max(1)) / lever).sqrt();
+        let told = ToldRadius { more_mm, sigma_mm, rms_left: (rest / squares).sqrt() };
+        (more_mm.is_finite() && sigma_mm.is_finite() && told.rms_left.is_finite()).then_some(told)
+    }
+
     /// Adds the standard uncertainty of the probe's radius, in millimetres, to what is stated of pose and deviations.
     ///
     /// (A^T A)^-1 is taken from the covariance, so that directions that are held or locked stay as they are; without any

@@ -82,10 +82,30 @@ pub(crate) fn initial_pose(
 
 /// Returns the rms to which the mirrored cloud fits; `None` if it cannot be registered at all.
 pub(crate) fn mirrored_rms(part: &Part, measured: &[Point], options: &Options, side: Side) -> Option<f64> {
-    // Mirrored in the plane x = 0 of the CMM frame: which plane does not matter to a search over all poses.
-    let mirrored: Vec<Point> = spread(measured, 4 * COMPARED).map(|p| Point::new(-p.x, p.y, p.z)).collect();
+    searched_rms(part, &mirrored(measured), options, side)
+}
+
+/// Returns the rms of the cloud as measured and mirrored, if it fits mirrored and does not as it is.
+pub(crate) fn mirror_image(part: &Part, measured: &[Point], options: &Options) -> Option<(f64, f64)> {
+    let sides = options.side.given().map_or(vec![Side::Normal, Side::Opposite], |side| vec![side]);
+    let best = |points: &[Point]| {
+        sides.iter().filter_map(|side| searched_rms(part, points, options, *side)).min_by(f64::total_cmp)
+    };
+    let mirrored_rms_mm = best(&mirrored(measured)).filter(|rms| *rms <= part.rms_limit_mm(options))?;
+    let some: Vec<Point> = spread(measured, 4 * COMPARED).copied().collect();
+    let rms_mm = best(&some)?;
+    (mirrored_rms_mm < 0.3 * rms_mm).then_some((rms_mm, mirrored_rms_mm))
+}
+
+/// Some points mirrored in the plane x = 0 of the CMM frame: which plane does not matter to a search over all poses.
+fn mirrored(measured: &[Point]) -> Vec<Point> {
+    spread(measured, 4 * COMPARED).map(|p| Point::new(-p.x, p.y, p.z)).collect()
+}
+
+/// Returns the rms to which a search over all poses fits points on one side.
+fn searched_rms(part: &Part, points: &[Point], options: &Options, side: Side) -> Option<f64> {
     let options = Options { side: side.into(), ..*options };
-    let search = Search::new(part, &mirrored, &options);
+    let search = Search::new(part, points, &options);
     search.compared(&search.candidates(side), side).first().map(|c| c.rms_mm)
 }
 

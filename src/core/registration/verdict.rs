@@ -296,7 +296,7 @@ fn weakly_seen(scaled: &Matrix6<f64>, sigma_mm: f64, scaling: &Scaling, some_hel
 }
 
 /// A length with two digits in the unit that suits it.
-fn length(mm: f64) -> String {
+pub(super) fn length(mm: f64) -> String {
     match mm {
         l if l >= 10.0 => format!("{l:.0} mm"),
         l if l >= 1.0 => format!("{l:.1} mm"),

@@ -3,6 +3,7 @@
 mod accuracy;
 mod common;
 mod distance;
+mod doubts;
 mod exact;
 mod form;
 mod learning;

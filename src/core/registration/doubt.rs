@@ -1,0 +1,169 @@
+//! What makes a fit doubtful that was found all the same: a radius that is not the ball's, and points that are not enough.
+
+use crate::geometry::Point;
+
+use super::deviation::PointStatus;
+use super::options::{Method, Options, Start};
+use super::part::Part;
+use super::result::Registration;
+use super::start::spread;
+use super::verdict::length;
+
+/// A radius is doubted only if another one leaves at most this share of the rms. Half the radius on a free-form of 64 mm radius
+/// leaves a quarter beside the form error of a ground part, double the radius less.
+const RMS_LEFT: f64 = 0.65;
+
+/// A radius is doubted only if it is off by this share of itself: a diameter or a mistaken ball are. The form error of a wheel that
+/// wears is of the very shape that a wrong radius makes; it was seen to tell 0.25 mm less than the 1.5 mm of the ball.
+const LEAST_SHARE_OFF: f64 = 0.4;
+
+/// A radius is doubted only if it makes this much rms of the cloud's size: 7 um on a part of 100 x 60 mm. That is more than what a
+/// ground part is bent by, and leaves out the surfaces that can hardly tell a radius.
+const LEAST_RMS_OF_SIZE: f64 = 2e-4;
+
+/// Below this share of the radius given there is no ball: what is left is the form error's.
+const MOST_OF_CONTACT: f64 = 0.25;
+
+/// Below this there is no ball, but a surface that is wanted this much above the nominal one.
+const LEAST_BALL_MM: f64 = 0.1;
+
+/// A radius that so few points more than there are unknowns tell is chance.
+const LEAST_FREEDOM: usize = 20;
+
+/// Points that another radius is tried on.
+const TRIED: usize = 2048;
+
+/// Shares of the points, and of the surface, beyond which they are spoken of.
+const MOST_OUTLIERS: f64 = 0.05;
+const MOST_OFF_PART: f64 = 0.2;
+const LEAST_COVERAGE: f64 = 0.5;
+
+/// Tells in words what a person should know of the points and of the radius.
+pub(super) fn doubts(part: &Part, found: &Registration, measured: &[Point], options: &Options) -> Vec<String> {
+    let mut doubts = of_points(found);
+    doubts.extend(of_radius(part, found, measured, options));
+    doubts
+}
+
+/// Tells that many points were left out, or that they cover little of the surface.
+fn of_points(found: &Registration) -> Vec<String> {
+    let points = found.deviations.len();
+    let count = |status| found.deviations.iter().filter(|d| d.status == status).count();
+    let (outliers, off_part) = (count(PointStatus::Outlier), count(PointStatus::OffPart));
+    let share = |n: usize| n as f64 / points as f64;
+    let mut doubts = Vec::new();
+    if share(outliers) > MOST_OUTLIERS {
+        doubts.push(format!(
+            "{outliers} of {points} points ({:.0} %) are outliers and were left out: look for dirt or coolant on the part, a probe that \
+             slipped or wears, points of a fixture, or steps and edges that the nominal surface does not have",
+            100.0 * share(outliers),
+        ));
+    }
+    if share(off_part) > MOST_OFF_PART {
+        doubts.push(format!(
+            "{off_part} of {points} points ({:.0} %) lie beyond the edge of the nominal surface and were left out: does the nominal \
+             surface reach as far as the part, and does the cloud belong to it?",
+            100.0 * share(off_part),
+        ));
+    }
+    let coverage = found.verdict.coverage;
+    if coverage < LEAST_COVERAGE {
+        doubts.push(format!(
+            "the {} points used lie on {:.0} % of the nominal surface only, and tell nothing of the rest: was the measurement or its \
+             file cut short, or is the nominal surface larger than the part?",
+            points - outliers - off_part,
+            100.0 * coverage,
+        ));
+    }
+    doubts
+}
+
+/// Tells which other radius fits the points much better, if one does.
+pub(super) fn of_radius(part: &Part, found: &Registration, measured: &[Point], options: &Options) -> Option<String> {
+    let given_mm = options.probe_radius_mm;
+    if !can_be_doubted(part, found, options) {
+        return None;
+    }
+    let sample: Vec<Point> = spread(measured, TRIED).copied().collect();
+    let told_mm = settled(given_mm + found.told_radius()?.more_mm, given_mm, &|radius_mm| {
+        refit(part, found, &sample, options, radius_mm)
+    })?;
+    let is_contact = told_mm.abs() < MOST_OF_CONTACT * given_mm;
+    if (told_mm - given_mm).abs() < LEAST_SHARE_OFF * given_mm {
+        return None;
+    }
+    let other = refit(part, found, &sample, options, if is_contact { 0.0 } else { told_mm })?;
+    let (rms_mm, other_rms_mm) = (found.verdict.rms_mm, other.verdict.rms_mm);
+    is_better(part, rms_mm, other_rms_mm).then(|| {
+        let (rms, other_rms) = (length(rms_mm), length(other_rms_mm));
+        if is_contact {
+            format!(
+                "the points look like contact points on the surface, not like centres of a ball of {given_mm} mm: as contact points they \
+                 fit to {other_rms} rms instead of {rms}; if the CMM has taken its radius off already, register with the method `contact`"
+            )
+        } else {
+            let side = if told_mm < 0.0 { " on the other side of the surface" } else { "" };
+            format!(
+                "a probe radius of about {:.2} mm{side} fits the points to {other_rms} rms, the {given_mm} mm given to {rms}: check which \
+                 ball was in the probe, and that the figure is its radius and not its diameter; else the part is bent in just that way, \
+                 as by a wheel whose radius is off",
+                told_mm.abs()
+            )
+        }
+    })
+}
+
+/// Registers some points with another radius; one below zero is that of a ball on the other side, and zero is none.
+fn refit(part: &Part, found: &Registration, sample: &[Point], given: &Options, radius_mm: f64) -> Option<Registration> {
+    let is_ball = radius_mm.abs() >= LEAST_BALL_MM;
+    let options = Options {
+        probe_radius_mm: if is_ball { radius_mm.abs() } else { 0.0 },
+        method: if is_ball { given.method } else { Method::Contact },
+        start: Start::Pose(found.cmm_from_model),
+        side: if is_ball && radius_mm < 0.0 { found.side.other() } else { found.side }.into(),
+        ..*given
+    };
+    let part = Part::check(part.nominal, sample, &options).ok()?;
+    super::fit(&part, sample, &options).ok()
+}
+
+/// Whether another radius fits so much better that it is no form error.
+fn is_better(part: &Part, rms_mm: f64, other_rms_mm: f64) -> bool {
+    let taken2 = rms_mm * rms_mm - other_rms_mm * other_rms_mm;
+    other_rms_mm <= RMS_LEFT * rms_mm && taken2 >= (LEAST_RMS_OF_SIZE * part.size_mm).powi(2)
+}
+
+/// Whether it is worth trying another radius: it takes enough away by the linear model, and the scatter leaves it known.
+fn can_be_doubted(part: &Part, found: &Registration, options: &Options) -> bool {
+    /// The model is linear, and a wrong radius is far off: a little more is let through than is said in the end.
+    const MARGIN: f64 = 1.15;
+    let (given_mm, rms_mm) = (options.probe_radius_mm, found.verdict.rms_mm);
+    // With a coordinate locked the place of the fixture would be taken for the radius.
+    let is_ball = options.method != Method::Contact && given_mm >= LEAST_BALL_MM && !options.locked.contains(&true);
+    if !is_ball || found.verdict.used < 7 + LEAST_FREEDOM || rms_mm < LEAST_RMS_OF_SIZE * part.size_mm {
+        return false;
+    }
+    found.told_radius().is_some_and(|told| {
+        let off_mm = told.more_mm.abs();
+        MARGIN * off_mm >= LEAST_SHARE_OFF * given_mm
+            && off_mm > 5.0 * told.sigma_mm
+            && is_better(part, MARGIN * rms_mm, told.rms_left * rms_mm)
+    })
+}
+
+/// Follows the radius that the points tell until it stands, to the other side of the surface if need be; `None` if nothing fits.
+fn settled(first_mm: f64, given_mm: f64, refit: &impl Fn(f64) -> Option<Registration>) -> Option<f64> {
+    const TURNS: usize = 5;
+    let mut radius_mm = first_mm;
+    for _ in 0..TURNS {
+        if radius_mm.abs() < LEAST_BALL_MM {
+            radius_mm = 0.0;
+        }
+        let more_mm = refit(radius_mm)?.told_radius()?.more_mm * if radius_mm < 0.0 { -1.0 } else { 1.0 };
+        radius_mm += more_mm;
+        if more_mm.abs() < 0.01 * given_mm {
+            break;
+        }
+    }
+    Some(radius_mm)
+}
