@@ -170,6 +170,14 @@ fn finite_above_zero(text: &str) -> Result<f64, String> {
     above_zero(text).and_then(|v| if v.is_finite() { Ok(v) } else { Err("give a finite number above 0".into()) })
 }
 
+/// Reads a finite number, 0 or above.
+fn finite_from_zero(text: &str) -> Result<f64, String> {
+    match text.trim().parse::<f64>() {
+        Ok(value) if value >= 0.0 && value.is_finite() => Ok(value.abs()),
+        _ => Err("give a finite number above 0, or 0 for a probe without a ball, with a decimal point".into()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use clap::CommandFactory;

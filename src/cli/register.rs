@@ -5,9 +5,10 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use regrind::formats::{
-    Alternative, NominalInput, RegistrationDocument, ResultFolder, is_map, read_measured, save_registration,
+    Alternative, NominalInput, NotedPoints, RegistrationDocument, ResultFolder, is_map, read_measured_with_notes,
+    save_registration,
 };
-use regrind::geometry::{Point, Pose};
+use regrind::geometry::Pose;
 use regrind::registration::{Coordinate, Loss, Method, Options, ProbeSide, Start, register};
 use regrind::surface::{Distance, Nominal, NominalKind, Projection};
 
@@ -16,7 +17,7 @@ use super::failure::Failure;
 use super::initial::read_pose;
 use super::nominal::{self, kind_in_words};
 use super::words::{count, counted, three_digits};
-use super::{Outcome, above_zero, finite_above_zero};
+use super::{Outcome, above_zero, finite_above_zero, finite_from_zero};
 
 /// Register measured probe centres to the offset of a nominal surface
 #[derive(Args, Debug)]
@@ -29,8 +30,8 @@ pub(super) struct Arguments {
     /// Measured points as text or PLY, in mm, or an interferometer's or profilometer's map as X3P, SDF or MetroPro
     #[arg(long, value_name = "FILE")]
     measured: PathBuf,
-    /// Radius of the probe in mm; not needed with --method contact
-    #[arg(long, value_name = "MM", allow_negative_numbers = true, value_parser = finite_above_zero)]
+    /// Radius of the probe in mm; 0 for one without a ball, such as an optical one. Not needed with --method contact
+    #[arg(long, value_name = "MM", allow_negative_numbers = true, value_parser = finite_from_zero)]
     probe_radius: Option<f64>,
     /// Folder for the results; created if absent
     #[arg(long, value_name = "DIR")]
@@ -88,8 +89,9 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let options = options(arguments)?;
     let folder = ResultFolder::prepare(&arguments.out)?;
     let (nominal, measured) = read_inputs(arguments)?;
-    let registration = register(&nominal, &measured, &options)
+    let mut registration = register(&nominal, &measured.points, &options)
         .map_err(|e| Failure::of_registration(e, &arguments.nominal, &arguments.measured))?;
+    registration.verdict.warnings.extend(measured.notes.iter().map(ToString::to_string));
     let nominal_file =
         NominalInput { file: &arguments.nominal, points: nominal.len(), kind: kind_in_words(nominal.kind()) };
     let document = RegistrationDocument::new(&registration, &options, nominal_file, &arguments.measured);
@@ -104,14 +106,20 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     Ok(Outcome::Accepted)
 }
 
+/// What the points are: a probe without a ball measures the surface itself.
+fn method(arguments: &Arguments) -> Method {
+    if arguments.probe_radius == Some(0.0) { Method::Contact } else { arguments.method }
+}
+
 fn options(arguments: &Arguments) -> Result<Options, Failure> {
-    let radius_mm = match (arguments.probe_radius, arguments.method) {
+    let method = method(arguments);
+    let radius_mm = match (arguments.probe_radius, method) {
         (Some(radius_mm), _) => radius_mm,
         (None, Method::Contact) => 0.0,
         (None, _) => return Err(Failure::NoProbeRadius),
     };
     Ok(Options {
-        method: arguments.method,
+        method,
         distance: arguments.distance,
         loss: arguments.loss,
         side: arguments.side,
@@ -129,14 +137,14 @@ fn options(arguments: &Arguments) -> Result<Options, Failure> {
 }
 
 /// Reads both files at once; the nominal surface is made while the measured points are still read.
-fn read_inputs(arguments: &Arguments) -> Result<(Nominal, Vec<Point>), Failure> {
+fn read_inputs(arguments: &Arguments) -> Result<(Nominal, NotedPoints), Failure> {
     let (path, projection) = (&arguments.nominal, arguments.projection);
-    if is_map(&arguments.measured)? && !matches!(arguments.method, Method::Contact) {
+    if is_map(&arguments.measured)? && method(arguments) != Method::Contact {
         return Err(Failure::MapOfContacts { path: arguments.measured.clone() });
     }
     std::thread::scope(|scope| {
         let nominal = scope.spawn(move || nominal::surface(path, projection));
-        let measured = read_measured(&arguments.measured);
+        let measured = read_measured_with_notes(&arguments.measured);
         let nominal = nominal.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
         Ok((nominal, measured?))
     })

@@ -15,6 +15,7 @@ mod lines;
 mod map;
 mod measured_map;
 pub mod metropro;
+mod note;
 mod number;
 pub mod ply;
 pub mod points;
@@ -40,9 +41,10 @@ pub use lines::AddedLines;
 pub use map::{CorrectionIdentities, ErrorMapOrigin, read_error_map, write_correction, write_error_map};
 pub use measured_map::is_map;
 pub use metropro::{parse_metropro, read_metropro};
+pub use note::{NotedPoints, PointNote};
 pub use number::LIMIT_MM;
 pub use ply::{PlyFile, parse_ply, read_ply};
-pub use points::{parse_points, read_points};
+pub use points::{parse_points, read_points, read_points_with_notes};
 pub use registration::{
     DeviationRow, read_deviations, sync_folder, try_writing, write_atomic, write_column, write_deviations,
     write_json_atomic, write_points,
@@ -141,17 +143,25 @@ pub fn read_nominal(path: impl AsRef<Path>) -> Result<NominalFile, FormatError> 
 /// # Errors
 /// Those of the format found, and a file that is STL or TOML.
 pub fn read_measured(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> {
+    read_measured_with_notes(path).map(|read| read.points)
+}
+
+/// Reads measured points as [`read_measured`] does, with what the file leaves open.
+///
+/// # Errors
+/// Those of [`read_measured`].
+pub fn read_measured_with_notes(path: impl AsRef<Path>) -> Result<NotedPoints, FormatError> {
     let path = path.as_ref();
     let wrong = |found, remedy| {
         let expected = "measured points as text or PLY, or a map as X3P, SDF or MetroPro";
         Err(FormatError::WrongKind { path: path.to_owned(), expected, found, remedy })
     };
     match kind(path)? {
-        Kind::Text => read_points(path),
-        Kind::Ply => read_ply(path).map(|file| file.points),
+        Kind::Text => read_points_with_notes(path),
+        Kind::Ply => read_ply(path).map(|file| file.points.into()),
         Kind::Stl => wrong("an STL mesh", "export the points, or give the mesh as the nominal"),
         Kind::Toml => wrong("a TOML file", "give the definition as the nominal"),
-        Kind::Map(format) => (format.read)(path).map(|map| map.points),
+        Kind::Map(format) => (format.read)(path).map(|map| map.points.into()),
     }
 }
 

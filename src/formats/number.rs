@@ -73,6 +73,22 @@ pub(super) fn looks_numeric(field: &[u8]) -> bool {
     }
 }
 
+/// Returns whether there is a point and a comma: the one is the decimal mark of a number, and the other stands between its thousands.
+pub(super) fn has_both_marks(text: &[u8]) -> bool {
+    text.contains(&b'.') && text.contains(&b',')
+}
+
+/// Returns how many digits stand behind the decimal mark of a number, and how many in its exponent.
+pub(super) fn digits_after(field: &[u8]) -> [usize; 2] {
+    let begins = |is: fn(&u8) -> bool| field.iter().rposition(is).map(|at| &field[at + 1..]);
+    let digits = |text: Option<&[u8]>| {
+        let text = text.unwrap_or_default();
+        let text = text.strip_prefix(b"-").or(text.strip_prefix(b"+")).unwrap_or(text);
+        text.iter().take_while(|b| b.is_ascii_digit()).count()
+    };
+    [digits(begins(|b| matches!(b, b'.' | b','))), digits(begins(|b| matches!(b, b'e' | b'E')))]
+}
+
 /// Returns what a field tells about the decimal mark.
 pub(super) fn evidence(field: &[u8]) -> Evidence {
     let last = |mark: u8| field.iter().rposition(|&b| b == mark);
@@ -171,6 +187,21 @@ mod tests {
         assert_eq!(point("2,512"), Err(NumberFault::AmbiguousComma));
         assert_eq!(point("2,5"), Err(NumberFault::OtherMark));
         assert_eq!(comma("2.5"), Err(NumberFault::OtherMark));
+    }
+
+    #[test]
+    fn the_digits_behind_the_mark_and_in_the_exponent_are_counted() {
+        let cases = [
+            ("12", [0, 0]),
+            ("-1.25", [2, 0]),
+            ("1.234,5", [1, 0]),
+            ("1.5e-05", [1, 2]),
+            ("1e+0", [0, 1]),
+            ("", [0, 0]),
+        ];
+        for (text, digits) in cases {
+            assert_eq!(digits_after(text.as_bytes()), digits, "{text}");
+        }
     }
 
     #[test]

@@ -11,8 +11,9 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use super::error::{FormatError, excerpt};
-use super::layout::{Layout, Preamble, Separator, is_comment};
-use super::number::{Decimal, NumberFault, coordinate, is_believable};
+use super::layout::{Fields, Layout, Preamble, Separator, is_comment};
+use super::note::{NotedPoints, PointNote};
+use super::number::{Decimal, NumberFault, coordinate, digits_after, has_both_marks, is_believable, looks_numeric};
 use regrind_core::geometry::Point;
 
 /// Largest text file that is read.
@@ -40,6 +41,14 @@ const SHARE: usize = 256 << 10;
 /// finite number of at most 1e7 mm where a coordinate should be; a header that states another unit than mm or whose columns
 /// x, y, z are not clear.
 pub fn read_points(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> {
+    read_points_with_notes(path).map(|read| read.points)
+}
+
+/// Reads a point cloud as [`read_points`] does, with what the file leaves open.
+///
+/// # Errors
+/// Those of [`read_points`].
+pub fn read_points_with_notes(path: impl AsRef<Path>) -> Result<NotedPoints, FormatError> {
     let path = path.as_ref();
     let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
     let file = File::open(path).map_err(unreadable)?;
@@ -52,12 +61,12 @@ pub fn read_points(path: impl AsRef<Path>) -> Result<Vec<Point>, FormatError> {
 /// # Errors
 /// Those of [`read_points`].
 pub fn parse_points(path: impl AsRef<Path>, reader: impl Read + Send) -> Result<Vec<Point>, FormatError> {
-    Cloud::new(path.as_ref(), 0).read(reader)
+    Cloud::new(path.as_ref(), 0).read(reader).map(|read| read.points)
 }
 
 /// Reads a point cloud whose decimal mark is known from elsewhere.
 pub(super) fn parse_points_with(path: &Path, text: &[u8], decimal: Option<Decimal>) -> Result<Vec<Point>, FormatError> {
-    Cloud { decimal, ..Cloud::new(path, 0) }.read(text)
+    Cloud { decimal, ..Cloud::new(path, 0) }.read(text).map(|read| read.points)
 }
 
 /// A cloud while it is being read.
@@ -72,6 +81,37 @@ struct Cloud<'p> {
     /// Lines done.
     lines: u64,
     points: Vec<Point>,
+    grouped: Grouped,
+}
+
+/// Numbers with a mark between their thousands: how many lines were found to have one, up to two, and the first.
+#[derive(Default)]
+struct Grouped {
+    lines: usize,
+    /// Lines before it in what was read, the number and its value.
+    first: Option<(u64, String, f64)>,
+}
+
+impl Grouped {
+    /// Looks at a line that was read as a point, unless enough is known.
+    fn see(&mut self, line: &[u8], layout: &Layout, lines_before: u64) {
+        if self.lines > 1 || !has_both_marks(line) {
+            return;
+        }
+        let (fields, _) = layout.pick(line);
+        let Some(field) = fields.into_iter().find(|field| has_both_marks(field)) else { return };
+        self.lines += 1;
+        if let (None, Ok(value)) = (&self.first, coordinate(field, layout.decimal)) {
+            self.first = Some((lines_before, excerpt(field), value));
+        }
+    }
+
+    /// Takes what was found in a share that follows some lines.
+    fn add(&mut self, share: Self, lines_before: u64) {
+        self.lines += share.lines;
+        let first = share.first.map(|(line, found, value)| (line + lines_before, found, value));
+        self.first = self.first.take().or(first);
+    }
 }
 
 /// A piece of the file in memory.
@@ -100,14 +140,16 @@ struct Share {
     lines: u64,
     /// Where the first bad line begins, if there is one.
     bad: Option<usize>,
+    grouped: Grouped,
 }
 
 impl<'p> Cloud<'p> {
     fn new(path: &'p Path, length: u64) -> Self {
-        Self { path, decimal: None, length, preamble: Preamble::new(path), layout: None, lines: 0, points: Vec::new() }
+        let (preamble, points, grouped) = (Preamble::new(path), Vec::new(), Grouped::default());
+        Self { path, decimal: None, length, preamble, layout: None, lines: 0, points, grouped }
     }
 
-    fn read(mut self, mut reader: impl Read + Send) -> Result<Vec<Point>, FormatError> {
+    fn read(mut self, mut reader: impl Read + Send) -> Result<NotedPoints, FormatError> {
         let path = self.path;
         let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
         self.check_size(self.length)?;
@@ -128,8 +170,41 @@ impl<'p> Cloud<'p> {
             self.check_size(total)?;
             std::mem::swap(&mut batch, &mut next);
         }
-        self.take(&batch.bytes[batch.begin..batch.end], total)?;
-        self.finish()
+        let text = &batch.bytes[batch.begin..batch.end];
+        self.take(text, total)?;
+        let notes = self.notes(text);
+        Ok(NotedPoints { notes, points: self.finish()? })
+    }
+
+    /// Returns what the file leaves open; `text` is the end of it, whole lines but for the last.
+    fn notes(&mut self, text: &[u8]) -> Vec<PointNote> {
+        let mut notes = Vec::new();
+        if let (1, Some((before, found, value_mm))) = (self.grouped.lines, self.grouped.first.take()) {
+            notes.push(PointNote::OneThousandsMark { path: self.path.to_owned(), line: before + 1, found, value_mm });
+        }
+        notes.extend(self.note_of_end(text));
+        notes
+    }
+
+    /// Tells of a last line that breaks off behind a digit, and whether it shows that digits are missing.
+    fn note_of_end(&self, text: &[u8]) -> Option<PointNote> {
+        /// Lines above that its digits are compared with, and how many have to be there.
+        const ABOVE: usize = 1000;
+        const LEAST: usize = 3;
+        let (layout, point) = (self.layout.as_ref()?, *self.points.last()?);
+        let mut lines = text.rsplit(|&b| b == b'\n');
+        let last =
+            lines.next().filter(|line| line.last().is_some_and(|b| !b.is_ascii_whitespace()) && !is_comment(line))?;
+        let number = |line| Fields::of(line, layout.separator).last().unwrap_or_default();
+        let data = lines.filter(|line| !line.trim_ascii().is_empty() && !is_comment(line)).take(ABOVE);
+        let above: Vec<[usize; 2]> =
+            data.filter(|line| looks_numeric(number(line))).map(|line| digits_after(number(line))).collect();
+        let found = number(last);
+        let here = digits_after(found);
+        let fewer = |k: usize| above.iter().map(|digits| digits[k]).min().filter(|least| here[k] < *least);
+        let fewer_digits = (0..2).filter(|_| above.len() >= LEAST).find_map(|k| fewer(k).map(|least| [here[k], least]));
+        let (path, line, found) = (self.path.to_owned(), self.lines, excerpt(found));
+        Some(PointNote::NoLineEnd { path, line, found, point, fewer_digits })
     }
 
     /// Returns the length of the whole lines in a full batch, unless the last one goes on for too long.
@@ -149,13 +224,14 @@ impl<'p> Cloud<'p> {
     fn take(&mut self, text: &[u8], bytes_so_far: u64) -> Result<(), FormatError> {
         let rest = self.take_preamble(text)?;
         let Some(layout) = &self.layout else { return self.check_preamble(bytes_so_far) };
-        let shares: Vec<Share> = if rest.len() <= SHARE {
+        let mut shares: Vec<Share> = if rest.len() <= SHARE {
             vec![read_share(rest, layout)]
         } else {
             split_at_lines(rest).into_par_iter().map(|share| read_share(share, layout)).collect()
         };
         let mut offset = 0;
-        for (share, text) in shares.iter().zip(split_at_lines(rest)) {
+        for (share, text) in shares.iter_mut().zip(split_at_lines(rest)) {
+            self.grouped.add(std::mem::take(&mut share.grouped), self.lines);
             self.lines += share.lines;
             if let Some(bad) = share.bad {
                 let (line, _, ended) = first_line(&rest[offset + bad..]);
@@ -274,7 +350,8 @@ fn first_line(text: &[u8]) -> (&[u8], usize, bool) {
 }
 
 fn read_share(text: &[u8], layout: &Layout) -> Share {
-    let mut share = Share { points: Vec::with_capacity(text.len() / 40), lines: 0, bad: None };
+    let mut share =
+        Share { points: Vec::with_capacity(text.len() / 40), lines: 0, bad: None, grouped: Grouped::default() };
     let quick = layout.decimal == Decimal::Point && layout.columns == [0, 1, 2];
     let mut at = 0;
     while at < text.len() {
@@ -287,7 +364,11 @@ fn read_share(text: &[u8], layout: &Layout) -> Share {
         } else {
             let (line, used, ended) = first_line(rest);
             match careful_line(Path::new(""), 0, line, layout, ended) {
-                Ok(point) => share.points.extend(point),
+                Ok(Some(point)) => {
+                    share.grouped.see(line, layout, share.lines);
+                    share.points.push(point);
+                }
+                Ok(None) => {}
                 Err(_) => {
                     share.bad = Some(at);
                     break;

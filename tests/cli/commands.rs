@@ -434,11 +434,51 @@ fn wrong_units_are_refused() {
 #[test]
 fn wrong_radii_are_refused() {
     let bench = Bench::new();
-    for radius in ["0", "-1.5", "NaN", "inf", "1,5", "1e3"] {
+    for radius in ["-1.5", "NaN", "inf", "1,5", "1e3"] {
         bench.refused("nominal.csv", "measured.csv", &["--probe-radius", radius], &["--probe-radius", "above 0"]);
     }
     let arguments = ["register", "--nominal", "nominal.csv", "--measured", "measured.csv", "--out", "out"];
     bench.assert_refused(&bench.run(&arguments), &["--probe-radius", "--method contact"]);
+}
+
+#[test]
+fn a_probe_without_a_ball_measures_contact_points() {
+    let bench = Bench::new();
+    bench.write("contacts.csv", rows(nominal(), ","));
+    for radius in ["0", "0.0"] {
+        let document = bench.registered("nominal.csv", "contacts.csv", &["--probe-radius", radius]);
+        assert_eq!(document["method"], "contact");
+        assert!(number(&document["rms_mm"]) < 1e-6 && document["probe_radius_mm"].is_null(), "{document}");
+    }
+}
+
+#[test]
+fn what_is_doubtful_is_said_as_a_warning() {
+    let bench = Bench::new();
+    let warned = |measured: &str, more: &[&str]| {
+        let words = text(&bench.register("nominal.csv", measured, more).stdout);
+        let shown: Vec<String> =
+            words.lines().filter_map(|line| line.strip_prefix("warning")).map(|line| line.trim().to_owned()).collect();
+        let document = bench.registered("nominal.csv", measured, more);
+        assert_eq!(document["warnings"], Value::from(shown.clone()), "{words}");
+        shown
+    };
+    assert_eq!(warned("measured.csv", &[]), [""; 0]);
+    let told = warned("measured.csv", &["--probe-radius", "3"]);
+    assert!(
+        told.len() == 1 && told[0].contains("a probe radius of about 1.") && told[0].contains("diameter"),
+        "{told:?}"
+    );
+    let lines: String = measured().iter().map(|p| format!("{:.6},{:.6},{:.6}\n", p[0], p[1], p[2])).collect();
+    bench.write("unended.csv", lines.trim_end());
+    let told = warned("unended.csv", &[]);
+    assert!(
+        told.len() == 1 && told[0].starts_with("unended.csv, line 1500: ") && told[0].contains("see that"),
+        "{told:?}"
+    );
+    bench.write("cut.csv", &lines[..lines.len() - 3]);
+    let told = warned("cut.csv", &[]);
+    assert!(told.len() == 1 && told[0].contains("has 4 digits where the lines above have 6"), "{told:?}");
 }
 
 #[test]

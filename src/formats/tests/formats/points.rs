@@ -538,3 +538,62 @@ proptest! {
         prop_assert_eq!(back, expected);
     }
 }
+
+/// Reads a file and returns how it was noted.
+fn notes(content: &str) -> Vec<String> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("measured.csv");
+    fs::write(&path, content).unwrap();
+    let read = read_measured_with_notes(&path).unwrap();
+    assert_eq!(read.points, read_points(&path).unwrap());
+    let name = path.display().to_string();
+    read.notes.iter().map(|note| note.to_string().strip_prefix(&name).expect("names the file").to_owned()).collect()
+}
+
+#[test]
+fn a_last_line_without_an_end_is_noted_and_a_number_that_lacks_digits_more_so() {
+    let lines = "1.125,2.250,3.375\n4.125,5.250,6.375\n-7.125,8.250,9.375\n";
+    assert_eq!(notes(&format!("{lines}1.500,2.500,3.500\n")), [""; 0]);
+    for whole in ["1.500,2.500,3.500 ", "# end", "   "] {
+        assert_eq!(notes(&format!("{lines}{whole}")), [""; 0], "{whole:?}");
+    }
+    let told = notes(&format!("x,y,z\n{lines}1.500,2.500,-13.500"));
+    assert_eq!(told.len(), 1);
+    for words in [", line 5: ", "no line end", "`-13.500`", "(1.5, 2.5, -13.5) mm", "would not show"] {
+        assert!(told[0].contains(words), "{told:?}");
+    }
+    for (cut, digits) in [("3.50", 2), ("3.5", 1), ("3.", 0), ("13", 0)] {
+        let told = notes(&format!("{lines}1.500,2.500,{cut}"));
+        let words = format!("has {digits} digits where the lines above have 3 or more: the file is cut");
+        assert!(told.len() == 1 && told[0].contains(&words) && told[0].contains("line 4: "), "{told:?}");
+    }
+    let exponents = "1e-05 2e-05 3.5e-05\n".repeat(4);
+    let told = notes(&format!("{exponents}1e-05 2e-05 3.5e-0"));
+    assert!(told[0].contains("`3.5e-0` has 1 digits where the lines above have 2"), "{told:?}");
+    // Numbers that are written as short as they are show nothing.
+    let told = notes("1.125,2,3\n1,2,3.25\n1,2,3.125\n1,2,3");
+    assert!(told.len() == 1 && told[0].contains("would not show"), "{told:?}");
+}
+
+#[test]
+fn the_line_of_a_note_is_right_in_a_large_file() {
+    let mut content = "1.12345678;2.12345678;3.12345678\n".repeat(200_000);
+    content += "1.12345678;2.12345678;3.1234";
+    let told = notes(&content);
+    assert!(told.len() == 1 && told[0].contains(", line 200001: "), "{told:?}");
+}
+
+#[test]
+fn one_number_with_a_mark_between_its_thousands_is_noted() {
+    let rows = "1,5;2,5;3,5\n".repeat(40_000);
+    assert_eq!(notes(&rows), [""; 0]);
+    let told = notes(&format!("{rows}1,5;1.234,5;3,5\n{rows}"));
+    assert!(told.len() == 1, "{told:?}");
+    assert!(
+        told[0].contains(", line 40001: `1.234,5` was read as 1234.5 mm") && told[0].contains("no other"),
+        "{told:?}"
+    );
+    assert_eq!(notes(&format!("{rows}1,5;1.234,5;3,5\n{rows}1,5;1.234,5;3,5\n")), [""; 0]);
+    assert_eq!(notes("1.5;2.5;3.5\n1.5;1,234.5;3.5\n1.5;2.5;3.5\n").len(), 1);
+    assert_eq!(notes("1.5,2.5,3.5\n1.5,2,3.5\n"), [""; 0]);
+}
