@@ -91,7 +91,9 @@ catalogue! {
     /// Link lost.
     LinkLost {
         "The link to a machine is lost", "Nothing new begins. A machine that was moving holds by itself; the cell asks it what became of its job and goes on when the link is back.", Nobody,
-        ["Check the cable, the switch and whether the control is running.", "Wait: the cell goes on by itself.",
+        ["Check the cable, the switch and whether the control is running.",
+         "If the machine answers, but with an exception: compare the register map of the cell file with the machine's.",
+         "Wait: the cell goes on by itself.",
          "If it cannot be mended, stop or abort the run."]
     }
     /// A fault of this program.

@@ -105,7 +105,10 @@ pub enum DeviceError {
     #[error("{machine} refused the {what}: {answer}")]
     PayloadRefused { machine: Arc<str>, what: &'static str, answer: Answer },
     /// A Modbus exception; addresses count from 0.
-    #[error("{machine} answered exception {code} ({}) to {what} at register {address}: compare the register map of the cell file with the machine's", exception_in_words(*.code))]
+    #[error(
+        "{machine} is there and answered exception {code} ({}) to {what} at register {address}: {}",
+        exception_in_words(*.code), exception_remedy(*.code)
+    )]
     Exception { machine: Arc<str>, what: &'static str, address: u16, code: u8 },
     /// Something answers that is not a machine of this kind; the register at this address, counted from 0, gave it away.
     #[error(
@@ -142,7 +145,10 @@ pub enum DeviceError {
     )]
     Restarted { machine: Arc<str>, was: u32, is: u32 },
     /// A number came that is none.
-    #[error("{machine}: {field} is {value}, which is not a finite number; refused")]
+    #[error(
+        "{machine}: {field} is {value}, which is not a finite number; refused. The machine's program has not filled it in, or has put its words \
+         in another order than the one of its sentinels (docs/modbus.md)"
+    )]
     NotFinite { machine: Arc<str>, field: String, value: f64 },
     /// A number came that cannot be.
     #[error(
@@ -213,6 +219,18 @@ fn version_in_words(found: u16, required: u16) -> String {
 
 fn kind_in_words(kind: std::io::ErrorKind) -> String {
     kind.to_string()
+}
+
+/// Says what is to be done about a Modbus exception.
+fn exception_remedy(code: u8) -> &'static str {
+    match code {
+        1..=3 => {
+            "compare the register map of the cell file with the machine's: its base addresses, which count from 0 (40001 is register 0), and \
+             the version that the machine's program follows (docs/modbus.md)"
+        }
+        10 | 11 => "look at the gateway, and compare the unit number in the cell file",
+        _ => "look at the machine",
+    }
 }
 
 fn exception_in_words(code: u8) -> &'static str {

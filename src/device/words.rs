@@ -360,17 +360,20 @@ pub struct SignalValue {
     pub unit: String,
     /// Least and most that it may be.
     pub range: [f64; 2],
+    /// What explains a value that is not there or cannot be, in words.
+    pub cause: Option<String>,
 }
 
 impl SignalValue {
     /// Says what is wrong with it, if anything is.
     pub fn flaw(&self) -> Option<String> {
-        let Self { name, value, unit, range: [least, most] } = self;
-        match value {
-            None => Some(format!("{name}: the machine gives no number")),
-            Some(value) if (least..=most).contains(&value) => None,
-            Some(value) => Some(format!("{name} is {value} {unit}, and {least} to {most} {unit} are wanted")),
-        }
+        let Self { name, value, unit, range: [least, most], cause } = self;
+        let flaw = match value {
+            None => format!("{name}: the machine gives no number"),
+            Some(value) if (least..=most).contains(&value) => return None,
+            Some(value) => format!("{name} is {value} {unit}, and {least} to {most} {unit} are wanted"),
+        };
+        Some(cause.iter().fold(flaw, |flaw, cause| format!("{flaw}: {cause}")))
     }
 }
 

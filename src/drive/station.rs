@@ -665,7 +665,12 @@ impl<B: StationDriver> MachineTask<B> {
 
     async fn lost(&mut self, error: &DeviceError) {
         if !std::mem::replace(&mut self.seen.lost, true) {
-            self.tell(Event::LinkLost { device: B::DEVICE, why: error.to_string() }).await;
+            let answers = if error.is_link() {
+                ""
+            } else {
+                "the machine answers, but not as the cell file and docs/modbus.md have it: "
+            };
+            self.tell(Event::LinkLost { device: B::DEVICE, why: format!("{answers}{error}") }).await;
         }
     }
 

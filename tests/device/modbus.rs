@@ -361,11 +361,20 @@ async fn further_signals_are_read_scaled_and_held_against_their_range() {
     assert_eq!(flaw, "part_temperature is 20.25 C, and 15 to 19 C are wanted");
     assert_eq!((status.state, status.temperature_c), (State::Idle, Some(20.25)));
     // A register that is not there, and one that holds no number.
-    for (address, kind, scale) in [(60_000, SignalType::I16, 0.01), (97, SignalType::I16, f64::NAN)] {
+    let cases = [
+        (
+            60_000,
+            SignalType::I16,
+            0.01,
+            "answered exception 2 (no such register, or not to be written) to signal at register 60000: compare",
+        ),
+        (97, SignalType::I16, f64::NAN, "register 97 reads as NaN: compare address, type, scale and word_order"),
+    ];
+    for (address, kind, scale, words) in cases {
         let absent = Signal { address, kind, scale, ..temperature.clone() };
         let mut cmm = connected(ModbusSettings { signals: vec![absent], ..settings(&serving) }).await;
-        let status = cmm.status().await.unwrap();
-        assert_eq!(status.signals[0].flaw().as_deref(), Some("part_temperature: the machine gives no number"));
+        let flaw = cmm.status().await.unwrap().signals[0].flaw().unwrap();
+        assert!(flaw.starts_with("part_temperature: the machine gives no number: ") && flaw.contains(words), "{flaw}");
     }
 }
 

@@ -10,6 +10,7 @@ mod any_registers;
 mod codec;
 mod link;
 mod settings;
+mod signal;
 mod unit;
 mod wire;
 
@@ -26,7 +27,7 @@ use super::{
 };
 #[cfg(fuzzing)]
 pub use any_registers::any_registers;
-use codec::{CommandFrame, Payload, RecordFlaw, Registers, crc32};
+use codec::{CommandFrame, Payload, RecordFlaw, crc32};
 pub use link::{Dial, Dialled, LineStream, Link, LinkFigures};
 pub use settings::{
     Line, ModbusSettings, Parity, RegisterMap, RtuWire, Signal, SignalTable, SignalType, TcpWire, WordOrder,
@@ -251,29 +252,18 @@ impl ModbusMachine {
         Err(DeviceError::Taken { machine: self.machine(), ours: self.owner, owner: status.owner })
     }
 
+    /// Reads a signal; one that the machine does not have, or that reads as no number, has no value and says why.
     async fn signal(&mut self, k: usize) -> Result<SignalValue, DeviceError> {
-        let Signal { name, unit, range, .. } = self.signals[k].clone();
-        let value = self.signal_value(k).await?.filter(|value| value.is_finite());
-        Ok(SignalValue { name, value, unit, range })
-    }
-
-    /// Returns the value of a signal; none where the machine has no such register now.
-    async fn signal_value(&mut self, k: usize) -> Result<Option<f64>, DeviceError> {
         let signal = self.signals[k].clone();
-        let words = match self.unit.read("signal", signal.address, signal.kind.registers()).await {
-            Err(DeviceError::Exception { .. }) => return Ok(None),
-            words => words?,
+        let (value, cause) = match self.unit.read("signal", signal.address, signal.kind.registers()).await {
+            Err(error @ DeviceError::Exception { .. }) => (None, Some(error.to_string())),
+            words => {
+                let words = words?;
+                (Some(signal.value(&words, signal.word_order)).filter(|value| value.is_finite()), signal.cause(&words))
+            }
         };
-        let block = Registers::new(&words, signal.word_order);
-        let kept = match signal.kind {
-            SignalType::U16 => f64::from(words[0]),
-            SignalType::I16 => f64::from(block.i16(0)),
-            SignalType::U32 => f64::from(block.u32(0)),
-            SignalType::I32 => f64::from(block.i32(0)),
-            SignalType::F32 => f64::from(block.f32(0)),
-            SignalType::F64 => block.f64(0),
-        };
-        Ok(Some(kept * signal.scale))
+        let Signal { name, unit, range, .. } = signal;
+        Ok(SignalValue { name, value, unit, range, cause })
     }
 
     // ---- commands ----------------------------------------------------------------------------------------------------------------

@@ -1,0 +1,71 @@
+//! A signal that a cell file asks for besides the contract's own: what its registers say, and what explains that they say nothing.
+
+use super::codec::Registers;
+use super::settings::{Signal, SignalType, WordOrder};
+
+impl Signal {
+    /// Returns the value that registers have in an order of words, in the signal's unit; it may be no number.
+    pub(super) fn value(&self, words: &[u16], order: WordOrder) -> f64 {
+        let block = Registers::new(words, order);
+        let kept = match self.kind {
+            SignalType::U16 => f64::from(block.u16(0)),
+            SignalType::I16 => f64::from(block.i16(0)),
+            SignalType::U32 => f64::from(block.u32(0)),
+            SignalType::I32 => f64::from(block.i32(0)),
+            SignalType::F32 => f64::from(block.f32(0)),
+            SignalType::F64 => block.f64(0),
+        };
+        kept * self.scale
+    }
+
+    /// Says what explains registers that are no number or out of range: the other order of words, if that one is good.
+    pub(super) fn cause(&self, words: &[u16]) -> Option<String> {
+        let is_good = |value: &f64| (self.range[0]..=self.range[1]).contains(value);
+        let value = self.value(words, self.word_order);
+        let (other, name) = match self.word_order {
+            WordOrder::Big => (WordOrder::Little, "little"),
+            WordOrder::Little => (WordOrder::Big, "big"),
+        };
+        let swapped =
+            Some(self.value(words, other)).filter(|swapped| !is_good(&value) && words.len() > 1 && is_good(swapped));
+        let hint = swapped.map(|swapped| {
+            let unit = &self.unit;
+            format!("it would be {swapped} {unit} with its words in the other order, word_order = \"{name}\" in the cell file")
+        });
+        let reads = || {
+            format!(
+                "register {} reads as {value}: compare address, type, scale and word_order in the cell file with the machine's",
+                self.address
+            )
+        };
+        hint.or_else(|| (!value.is_finite()).then(reads))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn signal(kind: SignalType, word_order: WordOrder) -> Signal {
+        let (name, unit) = ("part_temperature".into(), "C".into());
+        Signal { name, address: 1000, kind, word_order, scale: 1.0, unit, range: [15.0, 25.0] }
+    }
+
+    #[test]
+    fn swapped_words_are_told_where_the_other_order_is_good() {
+        let float = |value: f32| [(value.to_bits() >> 16) as u16, value.to_bits() as u16];
+        let [first, second] = float(20.25);
+        let big = signal(SignalType::F32, WordOrder::Big);
+        assert_eq!(big.cause(&[first, second]), None);
+        let told = big.cause(&[second, first]).unwrap();
+        assert!(told.starts_with("it would be 20.25 C with") && told.contains("word_order = \"little\""), "{told}");
+        let little = signal(SignalType::F32, WordOrder::Little);
+        assert!(little.cause(&[first, second]).unwrap().contains("word_order = \"big\""));
+        // No number either way: only what it reads as is known.
+        let told = big.cause(&[0x7fc0, 0x7fc0]).unwrap();
+        assert!(told.starts_with("register 1000 reads as NaN: "), "{told}");
+        // Out of range in both orders, and of one word.
+        assert_eq!(big.cause(&float(40.0)), None);
+        assert_eq!(signal(SignalType::I16, WordOrder::Big).cause(&[7]), None);
+    }
+}
