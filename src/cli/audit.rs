@@ -259,7 +259,7 @@ fn show(arguments: &ToShow) -> Result<Outcome, Failure> {
     let begin = first(&folder)?;
     let part = begin["content"]["part_name"].as_str().map_or(String::new(), |name| format!("; {name}"));
     let head = format!(
-        "{}{}{part}\n{:>6}  {:<23}  {:<16}  {:<8}  {:>5}  what",
+        "{}{}{part}\n{:>6}  {:<19}  {:<16}  {:<8}  {:>5}  what",
         mark(&begin),
         folder.display(),
         "record",
@@ -273,12 +273,12 @@ fn show(arguments: &ToShow) -> Result<Outcome, Failure> {
 
 /// A record as a row of the table.
 fn row(record: &Record) -> String {
-    // To the millisecond, without the letters of the standard.
-    let utc: String = record.utc.trim_end_matches('Z').replacen('T', " ", 1).chars().take(23).collect();
+    // Whole seconds, without the letters of the standard: within one the numbers tell the order, and --json has the rest.
+    let utc: String = record.utc.trim_end_matches('Z').replacen('T', " ", 1).chars().take(19).collect();
     let who: String = record.actor.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
     let cycle = if record.cycle == 0 { "-".to_owned() } else { record.cycle.to_string() };
     let kind = record.kind.as_str();
-    format!("{:>6}  {utc:<23}  {who:<16}  {kind:<8}  {cycle:>5}  {}", record.seq, words(record))
+    format!("{:>6}  {utc:<19}  {who:<16}  {kind:<8}  {cycle:>5}  {}", record.seq, words(record))
 }
 
 /// Prints a line for each record that is wanted, as they are read; a reader that has gone away ends it.

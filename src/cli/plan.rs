@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use regrind::cell::Beginning;
 use regrind::compensation::path::{Summary, ToolPath};
 use regrind::config::{BUILT_IN, CellConfig};
 use regrind::drive::Task;
@@ -37,6 +38,9 @@ pub(super) struct Arguments {
     json: bool,
 }
 
+/// A shift: longer than this no pass and no measurement is meant to take.
+const MOST_MINUTES: f64 = 480.0;
+
 #[derive(Serialize)]
 struct Document {
     simulation: bool,
@@ -53,6 +57,16 @@ struct Document {
     tracks: u64,
     path_mm: f64,
     grinding_minutes: f64,
+    /// The passes that the recipe allows, and the measurements beside them.
+    most_passes: u32,
+    most_measurements: u32,
+    /// What the search moves of one measurement take by themselves; absent where the operator takes the points.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    least_measuring_minutes: Option<f64>,
+    /// All passes and what is known of all measurements.
+    least_hours_to_last: f64,
+    /// What a person should know before this is run.
+    warnings: Vec<String>,
     /// Of the program of one pass; absent where none can be made.
     #[serde(skip_serializing_if = "Option::is_none")]
     program_points: Option<u64>,
@@ -86,6 +100,11 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let depth_um = 1e3 * task.limits.depth_of_cut_mm;
     let passes = f64::from(plan.max_cycles.max(1) - 1);
     let first_um = 1e3 * task.limits.allowance_mm;
+    let grinding_minutes = path_mm / task.pass.feed_mm_min;
+    let most_measurements = plan.max_cycles + u32::from(plan.begin_with == Beginning::Measure);
+    let least_measuring_minutes = least_measuring_minutes(&task);
+    let least_minutes = f64::from(plan.max_cycles) * grinding_minutes
+        + f64::from(most_measurements) * least_measuring_minutes.unwrap_or(0.0);
     let document = Document {
         simulation: cell.simulated,
         part: recipe.part.name.clone(),
@@ -100,7 +119,12 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         removal_budget_um: 1e3 * task.limits.removal_budget_mm,
         tracks: tracks as u64,
         path_mm,
-        grinding_minutes: path_mm / task.pass.feed_mm_min,
+        grinding_minutes,
+        most_passes: plan.max_cycles,
+        most_measurements,
+        least_measuring_minutes,
+        least_hours_to_last: least_minutes / 60.0,
+        warnings: warnings(&task, path_mm, grinding_minutes, least_measuring_minutes),
         program_points: program.as_ref().map(|(_, summary)| summary.points),
         no_program: task.programs.as_ref().err().map(ToString::to_string),
         learns: recipe.compensation.learn,
@@ -111,6 +135,58 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         super::print(&words(&document))?;
     }
     Ok(Outcome::Accepted)
+}
+
+/// What the probe takes to search every target from the distance of its approach, and nothing else: the moves between targets are
+/// the measuring machine's own.
+fn least_measuring_minutes(task: &Task) -> Option<f64> {
+    let targets = task.targets.len() + task.sphere.map_or(0, |sphere| sphere.points);
+    let seconds = targets as f64 * task.probing.approach_mm / task.probing.speed_mm_s;
+    (!task.targets.is_empty()).then_some(seconds / 60.0)
+}
+
+/// Tells of a pass or a measurement that takes longer than any would be left to run.
+fn warnings(task: &Task, path_mm: f64, grinding_minutes: f64, measuring_minutes: Option<f64>) -> Vec<String> {
+    let n = three_digits;
+    let mut warnings = Vec::new();
+    if grinding_minutes > MOST_MINUTES {
+        warnings.push(format!(
+            "a pass takes {} h, more than a shift of {} h: {} mm of path at {} mm/min; see that grinding.feed_mm_min is not in mm/s and that \
+             grinding.track_mm is not too small",
+            n(grinding_minutes / 60.0),
+            MOST_MINUTES / 60.0,
+            n(path_mm),
+            n(task.pass.feed_mm_min),
+        ));
+    }
+    if let Some(minutes) = measuring_minutes.filter(|minutes| *minutes > MOST_MINUTES) {
+        warnings.push(format!(
+            "a measurement takes {} h at least, more than a shift of {} h: {} searched over {} mm at {} mm/s; see measure.speed_mm_s and how many \
+             points are asked for",
+            n(minutes / 60.0),
+            MOST_MINUTES / 60.0,
+            counted(task.targets.len(), "point"),
+            n(task.probing.approach_mm),
+            n(task.probing.speed_mm_s),
+        ));
+    }
+    warnings
+}
+
+/// Says how long a run may take: as far as recipe and cell tell it.
+fn time_in_words(d: &Document) -> String {
+    let n = three_digits;
+    let measurements = counted(d.most_measurements as usize, "measurement");
+    let measuring = d.least_measuring_minutes.map_or("of a time that is not known".to_owned(), |minutes| {
+        format!("of {} minutes and more by the search moves alone", n(minutes))
+    });
+    format!(
+        "at most {} of {} minutes and {measurements} {measuring}: {} h and more, if all are needed; the moves between points, loading and the wear \
+         of the wheel are not told by recipe and cell",
+        if d.most_passes == 1 { "1 pass".to_owned() } else { format!("{} passes", d.most_passes) },
+        n(d.grinding_minutes),
+        n(d.least_hours_to_last),
+    )
 }
 
 /// Lays the path of the first pass and checks it; none where only the grinder's controller can lay one.
@@ -135,9 +211,10 @@ fn words(d: &Document) -> String {
     } else {
         ""
     };
+    let warnings: String = d.warnings.iter().map(|warning| format!("warning     {warning}\n")).collect();
     format!(
         "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nprogram     {program}\n{learns}\
-         level       {} um over the nominal surface first, at least {} um deeper each pass, so {} um at the last\nbudget      {} um in all\ncycles      at most {}\n",
+         level       {} um over the nominal surface first, at least {} um deeper each pass, so {} um at the last\nbudget      {} um in all\ncycles      at most {}\ntime        {}\n{warnings}",
         d.part,
         counted(d.nominal_points, "point"),
         d.part_identity,
@@ -150,6 +227,7 @@ fn words(d: &Document) -> String {
         n(d.depth_of_cut_um),
         n(d.last_level_um),
         n(d.removal_budget_um),
-        d.most_cycles
+        d.most_cycles,
+        time_in_words(d),
     )
 }

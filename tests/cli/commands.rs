@@ -574,3 +574,23 @@ fn a_run_into_the_same_folder_replaces_the_result() {
     assert!(Path::new(&bench.path("out/here/registration.json")).exists());
     assert_eq!(first, bench.registered("nominal.csv", "measured.csv", &[]), "the same input gives the same bits");
 }
+
+#[test]
+fn a_plan_tells_its_time_and_warns_of_a_pass_without_end() {
+    let bench = Bench::new();
+    let shipped = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/recipes/shallow-wave.toml")).unwrap();
+    let feed = shipped.lines().find(|line| line.starts_with("feed_mm_min")).unwrap();
+    bench.write("good.toml", &shipped);
+    bench.write("slow.toml", shipped.replace(feed, "feed_mm_min = 16.7"));
+    let plan = |recipe: &str| text(&bench.run(&["plan", recipe]).stdout);
+    let good = plan("good.toml");
+    for words in
+        ["time        at most 5 passes of ", " minutes and 5 measurements of 13.5 minutes and more", " h and more"]
+    {
+        assert!(good.contains(words), "`{words}` is missing: {good}");
+    }
+    assert!(!good.contains("warning"), "{good}");
+    let slow = plan("slow.toml");
+    assert!(slow.contains("warning     a pass takes ") && slow.contains("a shift of 8 h"), "{slow}");
+    assert!(slow.contains("at 16.7 mm/min") && slow.contains("grinding.feed_mm_min"), "{slow}");
+}
