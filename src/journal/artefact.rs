@@ -45,14 +45,16 @@ pub(super) fn path_within(folder: &Path, name: &str) -> Result<PathBuf, JournalE
     Ok(folder.join(name))
 }
 
+/// What a file is called until it is whole. One that was cut off by a crash stays, and is written over by the next.
+pub(super) fn temporary_name(name: &str) -> String {
+    format!(".{name}.tmp")
+}
+
 /// Brings bytes to the disk under a temporary name, then gives the file its name, then brings the name to the disk.
 pub(super) fn write_file(path: &Path, bytes: &[u8]) -> Result<(), JournalError> {
     let folder = path.parent().unwrap_or(Path::new("."));
     fs::create_dir_all(folder).map_err(JournalError::file(folder, "creating the folder"))?;
-    let mut hidden = std::ffi::OsString::from(".");
-    hidden.push(path.file_name().unwrap_or_default());
-    hidden.push(".tmp");
-    let temporary = path.with_file_name(hidden);
+    let temporary = path.with_file_name(temporary_name(&path.file_name().unwrap_or_default().to_string_lossy()));
     let written = fill(&temporary, bytes).and_then(|()| fs::rename(&temporary, path));
     if written.is_err() {
         // The error that brought us here is the one to report.

@@ -8,7 +8,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::artefact::{Artefact, describe, path_within};
+use super::artefact::{Artefact, describe, path_within, temporary_name};
 use super::error::JournalError;
 use super::key::PublicKey;
 use super::record::{Kind, Record};
@@ -216,11 +216,16 @@ fn files_below(folder: &Path, below: &str, found: &mut Vec<String>) -> Result<()
         let name = format!("{below}{}", entry.file_name().to_string_lossy());
         match entry.file_type().map_err(JournalError::file(&at, "looking into it"))? {
             kind if kind.is_dir() => files_below(folder, &format!("{name}/"), found)?,
-            kind if kind.is_file() && !name.starts_with(DATABASE) && name != ANCHOR && name != LOCK => found.push(name),
+            kind if kind.is_file() && !is_own(&name) => found.push(name),
             _ => {}
         }
     }
     Ok(())
+}
+
+/// Whether a file of a run folder is the journal's own, or what a crash has left of one.
+fn is_own(name: &str) -> bool {
+    name.starts_with(DATABASE) || [ANCHOR, LOCK, &temporary_name(ANCHOR)].contains(&name)
 }
 
 impl<'a> Seen<'a> {

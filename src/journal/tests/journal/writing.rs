@@ -121,6 +121,14 @@ fn names_do_not_lead_out_of_the_folder_and_nothing_on_record_is_written_over() {
 const PLAY: &str = "REGRIND_JOURNAL_PLAY";
 
 /// This test program again, playing one of its parts in a folder.
+#[test]
+fn an_anchor_that_was_cut_off_as_it_was_written_is_no_file_of_the_run() {
+    let (_home, folder, _) = closed();
+    std::fs::write(folder.join(".journal.anchor.tmp"), b"{\"records\":").unwrap();
+    std::fs::write(folder.join("notes.txt"), b"").unwrap();
+    assert_eq!(verify(&folder).unwrap().unrecorded, ["notes.txt"]);
+}
+
 fn child(part: &str, folder: &Path) -> Command {
     let mut child = Command::new(std::env::current_exe().unwrap());
     child.args([&format!("writing::{part}"), "--exact", "--nocapture", "--test-threads=1"]).env(PLAY, folder);
