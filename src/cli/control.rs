@@ -36,7 +36,7 @@ pub(super) struct Arguments {
     #[arg(value_name = "RUN")]
     run: Option<PathBuf>,
     /// Why, for the record
-    #[arg(long, value_name = "TEXT", default_value = "")]
+    #[arg(long, value_name = "TEXT", default_value = "", value_parser = super::remark)]
     reason: String,
     /// Print the answer as JSON
     #[arg(long)]
@@ -72,7 +72,7 @@ pub(super) struct Confirmation {
     #[arg(long, value_name = "FILE")]
     file: Option<PathBuf>,
     /// What was seen at the machine, for `over`
-    #[arg(long, value_name = "TEXT", default_value = "")]
+    #[arg(long, value_name = "TEXT", default_value = "", value_parser = super::remark)]
     evidence: String,
     /// Print the answer as JSON
     #[arg(long)]

@@ -34,6 +34,7 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 use failure::Failure;
+use regrind::document::{countable, misleading, visible};
 use regrind::drive::Request;
 
 /// Closed-loop grinding: register measured probe centres to the offset of a nominal surface.
@@ -131,7 +132,7 @@ fn run() -> ExitCode {
         Ok(Outcome::Accepted) => ExitCode::SUCCESS,
         Ok(Outcome::NotInTolerance) => ExitCode::from(1),
         Err(failure) => {
-            let _ = writeln!(io::stderr(), "error: {failure}");
+            let _ = writeln!(io::stderr(), "error: {}", countable(&visible(&failure.to_string())));
             ExitCode::from(failure.exit_code())
         }
     }
@@ -155,6 +156,25 @@ fn print_json(value: &impl serde::Serialize) -> Result<(), Failure> {
     let mut text = serde_json::to_string_pretty(value).map_err(|e| Failure::Terminal(e.into()))?;
     text.push('\n');
     print(&text)
+}
+
+/// Reads what a person, a part or a place is called.
+fn name(text: &str) -> Result<String, String> {
+    const LONGEST: usize = 300;
+    match (misleading(text), text.trim()) {
+        (Some(hidden), _) => Err(format!(
+            "it has the character U+{:04X}, which is not seen or turns what is read; type it anew",
+            u32::from(hidden)
+        )),
+        (None, "") => Err("it is empty".into()),
+        (None, name) if name.chars().count() > LONGEST => Err(format!("it is longer than {LONGEST} characters")),
+        (None, name) => Ok(name.to_owned()),
+    }
+}
+
+/// Reads what a person has to say, which may be nothing.
+fn remark(text: &str) -> Result<String, String> {
+    if text.trim().is_empty() { Ok(String::new()) } else { name(text) }
 }
 
 /// Reads a number above 0; `inf` is one.

@@ -41,7 +41,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "TEXT", default_value = "")]
     reason: String,
     /// Who takes the run up
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", value_parser = super::name)]
     operator: Option<String>,
     /// Print the answer, or a line for everything that happens, as JSON
     #[arg(long)]

@@ -41,10 +41,10 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "FILE", default_value = BUILT_IN)]
     cell: PathBuf,
     /// Serial number of the part
-    #[arg(long, value_name = "SERIAL")]
+    #[arg(long, value_name = "SERIAL", value_parser = super::name)]
     part: Option<String>,
     /// Who runs it
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", value_parser = super::name)]
     operator: Option<String>,
     /// Folder that the run's own folder is made in
     #[arg(long, value_name = "DIR", default_value = "runs")]

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use regrind::cell::{Alarm, AlarmId, Device, Ending, Figures, Judgement, PvOf, Tolerance};
+use regrind::document::visible;
 use regrind::drive::{CycleRow, Notice};
 use regrind::formats::read_error_map;
 use regrind::recipe::Recipe;
@@ -232,6 +233,8 @@ impl Show {
 
     /// Prints lines of which a terminal shows a word in colour, with its bell.
     fn striking(&self, text: &str, word: &str, colour: &str) -> Result<(), Failure> {
+        // Some of it came from a machine or a file.
+        let text = &visible(text);
         let Some(bar) = &self.bar else { return super::print(&format!("{text}\n")) };
         let columns = console::Term::stdout().size_checked().map_or(usize::MAX, |(_, columns)| columns.into());
         let mut text = wrapped(text, columns);

@@ -9,6 +9,7 @@
 
 mod read;
 mod schema;
+mod shown;
 
 use std::fmt;
 use std::ops::Range;
@@ -17,6 +18,7 @@ use std::path::{Path, PathBuf};
 pub use read::Document;
 pub use read::{problem_at, read_text, sha256};
 pub use schema::schema_of;
+pub use shown::{countable, misleading, visible};
 
 /// Everything that is wrong with one file.
 #[derive(Clone, Debug, PartialEq)]

@@ -11,6 +11,7 @@ use sha2::{Digest, Sha256};
 use toml::de::{DeTable, DeValue};
 
 use super::schema::choices;
+use super::shown::{countable, misleading};
 use super::{Problem, Problems};
 
 /// Far more than a person writes.
@@ -154,6 +155,7 @@ impl<'t> Document<'t> {
     }
 
     fn push(&mut self, span: Range<usize>, key: String, found: String, allowed: &str, remedy: &str) {
+        let found = countable(&found);
         self.problems.push(Problem { span, key, found, allowed: allowed.to_owned(), remedy: remedy.to_owned() });
     }
 
@@ -454,6 +456,12 @@ impl Shape<'_, '_> {
         let length = text.chars().count();
         if text.chars().any(char::is_control) {
             return self.wrong(value, "text of one line", "remove line breaks and control characters");
+        }
+        if let Some(hidden) = misleading(text) {
+            let found =
+                format!("has the character U+{:04X}, which is not seen or turns what is read", u32::from(hidden));
+            self.tell(found, "it must be text that reads as it is written", "remove it, or type the text anew");
+            return false;
         }
         if (least..=most).contains(&length) {
             return true;

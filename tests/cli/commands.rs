@@ -594,3 +594,31 @@ fn a_plan_tells_its_time_and_warns_of_a_pass_without_end() {
     assert!(slow.contains("warning     a pass takes ") && slow.contains("a shift of 8 h"), "{slow}");
     assert!(slow.contains("at 16.7 mm/min") && slow.contains("grinding.feed_mm_min"), "{slow}");
 }
+
+#[test]
+fn names_that_read_otherwise_than_they_are_and_numbers_that_nobody_counts_are_told() {
+    let home = tempfile::tempdir().unwrap();
+    let shipped =
+        std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/recipes/freeform-mirror.toml")).unwrap();
+    let program = || Command::new(env!("CARGO_BIN_EXE_regrind"));
+    let check = |from: &str, to: &str| {
+        assert!(shipped.contains(from));
+        let path = home.path().join("recipe.toml");
+        std::fs::write(&path, shipped.replace(from, to)).unwrap();
+        let output = program().args(["check", path.to_str().unwrap()]).output().unwrap();
+        assert_eq!(output.status.code(), Some(2));
+        String::from_utf8(output.stdout).unwrap() + &String::from_utf8(output.stderr).unwrap()
+    };
+    for name in ["\"free\u{202e}form\"", "\"free\\u202eform\"", "\"free\u{200b}form\""] {
+        let said = check("\"free-form mirror\"", name);
+        assert!(said.contains("part.name") && said.contains("U+20"), "{said}");
+    }
+    let feed = shipped.lines().find(|line| line.starts_with("feed_mm_min")).unwrap();
+    let said = check(feed, "feed_mm_min = 1e300");
+    assert!(said.contains("is 1e300") && !said.contains("0000000000000000"), "{said}");
+    for option in ["--part", "--operator"] {
+        let output = program().args(["run", "none.toml", option, "A\u{202e}B"]).output().unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.code() == Some(2) && said.contains("U+202E") && said.contains(option), "{said}");
+    }
+}

@@ -1,0 +1,94 @@
+//! What is shown of a person's text and numbers: text that reads as what it is, numbers of a length that a person reads.
+
+use std::fmt::Write;
+
+/// Digits before the point, and zeros behind it, that a person still counts.
+const MOST_DIGITS: usize = 15;
+const MOST_ZEROS: usize = 9;
+
+/// Returns the first character of a text that is not seen, or that makes the rest read otherwise than it is stored: controls, marks of
+/// direction, and what has no width.
+pub fn misleading(text: &str) -> Option<char> {
+    text.chars().find(|c| is_misleading(*c))
+}
+
+fn is_misleading(c: char) -> bool {
+    c.is_control()
+        || matches!(c, '\u{ad}' | '\u{61c}' | '\u{180e}' | '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202e}')
+        || matches!(c, '\u{2060}'..='\u{2069}' | '\u{feff}' | '\u{fff9}'..='\u{fffb}' | '\u{e0000}'..='\u{e007f}')
+}
+
+/// Returns a text with each such character by its number, as `<U+202E>`; line ends stay what they are.
+pub fn visible(text: &str) -> String {
+    text.chars().fold(String::with_capacity(text.len()), |mut shown, c| {
+        if is_misleading(c) && c != '\n' {
+            let _ = write!(shown, "<U+{:04X}>", u32::from(c));
+        } else {
+            shown.push(c);
+        }
+        shown
+    })
+}
+
+/// Returns a text in which numbers with more digits than anybody counts are written with an exponent: `1e300`.
+pub fn countable(text: &str) -> String {
+    let is_of_number = |c: char| c.is_ascii_digit() || c == '.';
+    let mut shown = String::with_capacity(text.len());
+    let mut rest = text;
+    while let Some(begin) = rest.find(|c: char| c.is_ascii_digit()) {
+        let length = rest[begin..].find(|c| !is_of_number(c)).unwrap_or(rest.len() - begin);
+        let (before, number, after) = (&rest[..begin], &rest[begin..begin + length], &rest[begin + length..]);
+        // Digits within a word are no number: a hash, a name.
+        let alone = !before.ends_with(|c: char| c.is_alphanumeric() || c == '_')
+            && !after.starts_with(|c: char| c.is_alphanumeric() || c == '_');
+        shown.push_str(before);
+        match number.parse::<f64>() {
+            Ok(value) if alone && is_long(number) => {
+                let _ = write!(shown, "{value:e}");
+            }
+            _ => shown.push_str(number),
+        }
+        rest = after;
+    }
+    shown + rest
+}
+
+fn is_long(number: &str) -> bool {
+    let (whole, fraction) = number.split_once('.').unwrap_or((number, ""));
+    let zeros = fraction.len() - fraction.trim_start_matches('0').len();
+    whole.len() > MOST_DIGITS || (whole == "0" && zeros > MOST_ZEROS && zeros < fraction.len())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_that_nobody_counts_have_an_exponent() {
+        for (text, expected) in [
+            (format!("is {} mm", 1e300), "is 1e300 mm".to_owned()),
+            (format!("is {} mm, more than {}", -2.5e22, 0.5), "is -2.5e22 mm, more than 0.5".into()),
+            (format!("is {} um", 3e-12), "is 3e-12 um".into()),
+            ("sha256 12345678901234567890123456789012345678901234567890abcdef".into(), String::new()),
+            ("1800 points at 16.7 mm/min, 0.000001 mm, 123456789012345".into(), String::new()),
+            ("run-20261123T004625Z 0.0 ... 1.".into(), String::new()),
+        ] {
+            let expected = if expected.is_empty() { text.clone() } else { expected };
+            assert_eq!(countable(&text), expected);
+        }
+    }
+
+    #[test]
+    fn text_that_reads_otherwise_than_it_is_is_told_and_shown() {
+        for (text, found) in [
+            ("free\u{202e}form", Some('\u{202e}')),
+            ("bell\u{7}", Some('\u{7}')),
+            ("SN\u{200b}1", Some('\u{200b}')),
+            ("Spiegel, groß, 镜子, مرآة, é", None),
+            ("", None),
+        ] {
+            assert_eq!(misleading(text), found, "{text:?}");
+        }
+        assert_eq!(visible("a\u{202e}b\nc\u{7}"), "a<U+202E>b\nc<U+0007>");
+    }
+}
