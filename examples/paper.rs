@@ -4,7 +4,7 @@
 //! cargo run --release --example paper
 //! ```
 //!
-//! The figures go to `target/paper/`. The picture in the README was made by this and
+//! The figures go to `target/paper/`. The picture in docs/figures.md was made by this and
 //! `cp target/paper/fig11b.svg docs/error-map.svg`.
 //!
 //! The surface, its normals, the form errors and the contact of the probe come from `regrind-sim` in closed form, which shares

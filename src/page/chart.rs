@@ -19,28 +19,35 @@ struct Line {
     class: &'static str,
     points: Vec<(u32, f64, f64)>,
     limit_um: f64,
+    /// What the next cycle is expected to come to.
+    forecast: Option<(u32, f64)>,
 }
 
 impl Line {
-    /// Where the next cycle would come if it took away the same share as the last.
-    fn forecast(&self) -> Option<(u32, f64)> {
-        let [.., (_, before, _), (cycle, last, _)] = self.points[..] else { return None };
-        (last < before).then(|| (cycle + 1, last * last / before))
+    fn of(
+        [name, class]: [&'static str; 2],
+        k: usize,
+        cycles: &[CycleSummary],
+        limit_mm: Option<f64>,
+        ahead: bool,
+    ) -> Self {
+        let of = |cycle: &CycleSummary| Some((cycle.cycle, cycle.figures?[k][0], cycle.figures?[k][1]));
+        let can_be_shown = |value: f64| value > 0.0 && value.is_finite();
+        let points: Vec<_> = cycles.iter().filter_map(of).filter(|(_, value, _)| can_be_shown(*value)).collect();
+        let last = points.last().map(|(cycle, ..)| *cycle).filter(|_| ahead);
+        let expected = last.and_then(|last| Some((last + 1, cycles.iter().find(|of| of.cycle == last)?.expected?[k])));
+        let forecast = expected.filter(|(_, value)| can_be_shown(*value));
+        Self { name, class, points, limit_um: limit_mm.map_or(f64::INFINITY, |mm| 1e3 * mm), forecast }
     }
 }
 
 /// Draws it; nothing where nothing is measured.
 pub(crate) fn chart(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, ahead: bool, language: Language) -> Markup {
-    let points = |k: usize| {
-        let of = |cycle: &CycleSummary| Some((cycle.cycle, cycle.figures?[k][0], cycle.figures?[k][1]));
-        cycles.iter().filter_map(of).filter(|(_, value, _)| *value > 0.0 && value.is_finite()).collect()
-    };
-    let limit = |of: fn(&Tolerance) -> f64| tolerance.map_or(f64::INFINITY, |tolerance| 1e3 * of(tolerance));
     let lines = [
-        Line { name: "PV", class: "pv", points: points(0), limit_um: limit(|t| t.pv_mm) },
-        Line { name: "RMS", class: "rms", points: points(1), limit_um: limit(|t| t.rms_mm) },
+        Line::of(["PV", "pv"], 0, cycles, tolerance.map(|tolerance| tolerance.pv_mm), ahead),
+        Line::of(["RMS", "rms"], 1, cycles, tolerance.map(|tolerance| tolerance.rms_mm), ahead),
     ];
-    let Some(scale) = Scale::of(&lines, ahead) else {
+    let Some(scale) = Scale::of(&lines) else {
         return html! { p .quiet { (Text::NotMeasured.to(language)) } };
     };
     html! {
@@ -54,12 +61,12 @@ pub(crate) fn chart(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, ahea
                 text .tick x=(format!("{:.1}", scale.x(cycle))) y=(HEIGHT - 6.0) text-anchor="middle" { (cycle) }
             }
             text .tick x="10" y=(TOP + 4.0) { "µm" }
-            @for line in &lines { (drawn(line, &scale, ahead, language)) }
+            @for line in &lines { (drawn(line, &scale, language)) }
         }
     }
 }
 
-fn drawn(line: &Line, scale: &Scale, ahead: bool, language: Language) -> Markup {
+fn drawn(line: &Line, scale: &Scale, language: Language) -> Markup {
     let at = |cycle: u32, value: f64| format!("{:.1},{:.1}", scale.x(cycle), scale.y(value));
     let join = |points: Vec<String>| points.join(" ");
     let middle = join(line.points.iter().map(|(cycle, value, _)| at(*cycle, *value)).collect());
@@ -81,7 +88,7 @@ fn drawn(line: &Line, scale: &Scale, ahead: bool, language: Language) -> Markup 
                     title { (line.name) " " (format!("{value:.2} ± {u:.2} µm")) }
                 }
             }
-            @if let Some((cycle, value)) = line.forecast().filter(|_| ahead) {
+            @if let Some((cycle, value)) = line.forecast {
                 @let (from, last) = line.points.last().map(|(cycle, value, _)| (*cycle, *value)).unwrap_or_default();
                 polyline .forecast points=(join(vec![at(from, last), at(cycle, value.max(scale.low))])) {}
                 circle .forecast cx=(format!("{:.1}", scale.x(cycle))) cy=(format!("{:.1}", scale.y(value.max(scale.low)))) r="4" {
@@ -112,15 +119,16 @@ struct Scale {
 
 impl Scale {
     /// The scale on which all of some lines can be seen; none where there is nothing to see.
-    fn of(lines: &[Line], ahead: bool) -> Option<Self> {
+    fn of(lines: &[Line]) -> Option<Self> {
         let all = || lines.iter().flat_map(|line| &line.points);
         let first = all().map(|(cycle, ..)| *cycle).min()?;
-        let forecast = lines.iter().filter_map(Line::forecast).filter(|_| ahead);
-        let last = all().map(|(cycle, ..)| *cycle).chain(forecast.map(|(cycle, _)| cycle)).max()?;
+        let forecast = || lines.iter().filter_map(|line| line.forecast);
+        let last = all().map(|(cycle, ..)| *cycle).chain(forecast().map(|(cycle, _)| cycle)).max()?;
         let limits = lines.iter().map(|line| line.limit_um).filter(|limit| limit.is_finite() && *limit > 0.0);
         let values =
             || all().map(|(_, value, u)| value + u).chain(all().map(|(_, value, _)| *value)).chain(limits.clone());
         let low = values().fold(f64::INFINITY, f64::min) / 1.6;
+        let low = forecast().map(|(_, value)| value / 1.6).fold(low, f64::min);
         let high = values().fold(0.0, f64::max) * 1.2;
         Some(Self { first, last: last.max(first + 1), low, high })
     }
@@ -161,18 +169,20 @@ mod tests {
     }
 
     #[test]
-    fn a_part_that_comes_down_is_expected_to_come_down_by_the_same_share() {
-        let line = Line { name: "PV", class: "pv", points: vec![(1, 20.0, 1.0), (2, 5.0, 1.0)], limit_um: 7.0 };
-        assert_eq!(line.forecast(), Some((3, 1.25)));
-        let worse = Line { points: vec![(1, 5.0, 1.0), (2, 6.0, 1.0)], ..line };
-        assert_eq!(worse.forecast(), None);
+    fn what_a_correction_is_expected_to_leave_is_shown_while_the_run_is_on() {
+        let mut cycles = [measured(1, 20.0, 5.0), measured(2, 5.0, 1.0)];
+        cycles[0].expected = Some([4.0, 0.9]);
+        let of = |cycles: &[CycleSummary], ahead| Line::of(["PV", "pv"], 0, cycles, None, ahead).forecast;
+        assert_eq!(of(&cycles, true), None, "it was made before the last measurement");
+        assert_eq!(of(&cycles[..1], true), Some((2, 4.0)));
+        assert_eq!(of(&cycles[..1], false), None);
     }
 
     #[test]
     fn every_cycle_lies_on_the_chart() {
         let cycles = [measured(1, 28.79, 5.285), measured(2, 3.6, 0.526)];
         let svg = chart(&cycles, None, true, Language::En).into_string();
-        assert_eq!(svg.matches("<circle").count(), 6, "{svg}");
+        assert_eq!(svg.matches("<circle").count(), 4, "{svg}");
         assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
     }
 

@@ -76,8 +76,7 @@ fn grid_bytes(nodes: &[[f64; 3]]) -> Option<Vec<u8>> {
     }
     let mut values = vec![f32::NAN; columns * rows];
     for [x, y, error_mm] in nodes {
-        let at = |value: &f64, first: f64, step: f64| ((value - first) / step).round() as usize;
-        let (column, row) = (at(x, first_x, step_x), at(y, first_y, step_y));
+        let (column, row) = (place(*x, first_x, step_x)?, place(*y, first_y, step_y)?);
         *values.get_mut(row * columns + column)? = (1e3 * error_mm) as f32;
     }
     let mut bytes = Vec::with_capacity(40 + 4 * values.len());
@@ -85,6 +84,13 @@ fn grid_bytes(nodes: &[[f64; 3]]) -> Option<Vec<u8>> {
     bytes.extend([first_x, first_y, step_x, step_y].iter().flat_map(|length| length.to_le_bytes()));
     bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
     Some(bytes)
+}
+
+/// Which step of an axis a place is; none where it lies between two.
+fn place(value: f64, first: f64, step: f64) -> Option<usize> {
+    const ROUNDING: f64 = 0.01;
+    let steps = (value - first) / step;
+    ((steps - steps.round()).abs() < ROUNDING).then_some(steps.round() as usize)
 }
 
 /// The first of some places along an axis, their distance, and how many there are; none where there is no distance.
@@ -129,6 +135,7 @@ mod tests {
     fn what_lies_on_no_grid_is_not_drawn() {
         assert!(grid_bytes(&[]).is_none());
         assert!(grid_bytes(&[[1.0, 1.0, 0.0]]).is_none(), "one node has no spacing");
-        assert!(grid_bytes(&[[0.0, 0.0, 0.0], [1e-3, 1.0, 0.0], [1e6, 1e6, 0.0]]).is_none(), "too many nodes");
+        assert!(grid_bytes(&[[0.0, 0.0, 0.0], [2.0, 2.0, 0.0], [1e6, 1e6, 0.0]]).is_none(), "too many nodes");
+        assert!(grid_bytes(&[[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2.4, 2.0, 0.0]]).is_none(), "between two");
     }
 }

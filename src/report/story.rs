@@ -41,6 +41,8 @@ pub(super) struct CycleStory {
     pub(super) deviations: Option<String>,
     /// Name of the file of figures within the run folder.
     pub(super) form: Option<String>,
+    /// PV and RMS that the next pass is expected to leave, in millimetres.
+    pub(super) expected_mm: Option<[f64; 2]>,
 }
 
 /// A measurement of a cycle: what was found, or why there is nothing.
@@ -129,6 +131,9 @@ impl Story {
                     self.cycle(cycle).measurements.push(Measurement::default());
                 }
                 self.measurement(cycle).figures = Some(figures);
+            }
+            Event::Compensated { cycle, summary } => {
+                self.cycle(cycle).expected_mm = Some([summary.predicted_pv_mm, summary.predicted_rms_mm]);
             }
             Event::RegistrationFailed { cycle, why } => {
                 self.measurement(cycle).unusable = Some(format!("not registered: {why}"));

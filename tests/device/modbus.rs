@@ -794,7 +794,7 @@ async fn a_hold_comes_before_the_next_page_of_whatever_is_being_transferred() {
     assert_eq!(pages.load(Ordering::SeqCst), 31, "pages came after the hold was ordered");
 }
 
-/// The figure of the README: run with `--ignored --nocapture`.
+/// The figure of docs/figures.md: run with `--ignored --nocapture`.
 #[tokio::test]
 #[ignore = "takes as long as a line of 115,200 baud takes, half a minute"]
 async fn eighteen_hundred_points_over_a_serial_line() {

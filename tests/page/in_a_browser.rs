@@ -2,8 +2,9 @@
 
 use serde_json::json;
 
-use crate::Shown;
 use crate::browser::{Browser, Tab};
+use crate::program::{changed, root};
+use crate::{SPEED, Shown};
 
 const SCREEN: [u32; 2] = [1024, 768];
 
@@ -117,4 +118,37 @@ fn the_keyboard_alone_aborts_a_run() {
     tab.press(&mut browser, "Enter", 13, "\r");
     tab.until(&mut browser, &banner("ABORTED"));
     assert_eq!(shown.run.end().0, 3);
+}
+
+/// The pictures in the documentation, as the page is now.
+#[test]
+#[ignore = "writes into docs"]
+fn pictures_are_made() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = home.path().join("freeform-mirror.toml");
+    std::fs::write(&recipe, changed("recipes/freeform-mirror.toml", &[(SPEED, &format!("{SPEED}\nspeed = 200.0"))]))
+        .unwrap();
+    let mut shown = Shown::of(home.path(), &recipe);
+    let mut browser = Browser::start(home.path());
+    let tab = browser.open(&shown.url, [1180, 780]);
+    tab.until(&mut browser, "document.querySelectorAll('#cycle option').length > 0");
+    tab.until(&mut browser, "document.querySelector('progress') && document.querySelector('progress').value > 300");
+    let picture = |tab: &Tab, browser: &mut Browser, name: &str| {
+        // A moment for the last bytes to be painted; the picture is looked at before it is kept.
+        std::thread::park_timeout(std::time::Duration::from_secs(1));
+        let shot = tab.send(browser, "Page.captureScreenshot", json!({ "format": "png" }));
+        let decode = format!("base64 -d > '{}'", root().join("docs").join(name).display());
+        let mut shell =
+            std::process::Command::new("sh").args(["-c", &decode]).stdin(std::process::Stdio::piped()).spawn().unwrap();
+        std::io::Write::write_all(&mut shell.stdin.take().unwrap(), shot["data"].as_str().unwrap().as_bytes()).unwrap();
+        assert!(shell.wait().unwrap().success());
+    };
+    picture(&tab, &mut browser, "page.png");
+    let phone = browser.open(&shown.url, [390, 844]);
+    phone.until(&mut browser, &banner("RUNNING"));
+    picture(&phone, &mut browser, "page-phone.png");
+    tab.until(&mut browser, &banner("ACCEPTED"));
+    tab.click(&mut browser, "[data-view=relief]");
+    picture(&tab, &mut browser, "page-relief.png");
+    assert_eq!(shown.run.end().0, 0);
 }

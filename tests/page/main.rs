@@ -19,6 +19,9 @@ use std::path::{Path, PathBuf};
 use http::Visitor;
 use program::{Running, regrind, small_recipe};
 
+/// The line of a recipe behind which the speed of its machines may stand.
+const SPEED: &str = "[simulation]\nseed = 1";
+
 /// A cell that is at work, and its page.
 struct Shown {
     run: Running,
@@ -33,7 +36,11 @@ struct Shown {
 impl Shown {
     /// Begins a run whose machines are so many times as fast as real ones.
     fn begin(home: &Path, speed: f64) -> Self {
-        let recipe = small_recipe(home, speed).display().to_string();
+        Self::of(home, &small_recipe(home, speed))
+    }
+
+    fn of(home: &Path, recipe: &Path) -> Self {
+        let recipe = recipe.display().to_string();
         let arguments = ["run", &recipe, "--cell", "sim", "--part", "SN-0042", "--operator", "A. Smith"];
         let mut run = Running::new(regrind(&arguments, home));
         let folder = run.folder(home);
