@@ -15,8 +15,10 @@
 
 mod axis;
 mod colour;
+mod course;
 mod heat_map;
 mod maps;
+mod means;
 mod plot;
 mod ply;
 mod raster;

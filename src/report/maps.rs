@@ -5,6 +5,7 @@ use std::path::Path;
 
 use serde_json::Value;
 
+use super::course::histogram;
 use super::heat_map::HeatMap;
 use super::run::when;
 use super::story::Story;
@@ -39,13 +40,17 @@ impl Drawn {
             .and_then(|map| map.of_nodes().at_most(largest).with_limit(limit_um))
             .and_then(|map| map.with_lines(vec![shortened(&self.part, width, 6.8)]).to_svg());
         let drawn = match svg {
-            // Within HTML it needs no name of its language.
-            Ok(svg) => svg.replacen(" xmlns=\"http://www.w3.org/2000/svg\"", "", 1),
+            Ok(svg) => within_html(&svg),
             Err(ReportError::File(error)) => return Err(error.into()),
             Err(why) => format!("<p>No map: {}</p>\n", escaped(&why.to_string())),
         };
         Ok(format!("<figure>{drawn}<figcaption>Cycle {}, {caption}</figcaption></figure>\n", self.cycle))
     }
+}
+
+/// Takes a figure into a page: within HTML it needs no name of its language.
+pub(super) fn within_html(svg: &str) -> String {
+    svg.replacen(" xmlns=\"http://www.w3.org/2000/svg\"", "", 1)
 }
 
 /// Cuts a text where it would be wider than so many pixels.
@@ -80,6 +85,9 @@ pub(super) fn maps(story: &Story, folder: &Path, begin: &Value) -> Result<String
         }
     }
     html += &last.figure(last.largest_um(), ALONE, "on its own scale")?;
+    let heading = format!("Cycle {}, {}", last.cycle, last.part);
+    let spread = histogram(&shortened(&heading, 460.0, 8.5), &last.samples_um)?;
+    let _ = writeln!(html, "<figure>{}</figure>", within_html(&spread));
     let _ = writeln!(
         html,
         "<p>Red stands proud of the nominal surface, blue lies below it, near white is zero. The maps are filtered; PV and RMS of a map \

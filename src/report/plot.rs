@@ -58,7 +58,7 @@ impl Plot {
         svg.frame(&Frame {
             corner: CORNER,
             size: SIZE,
-            x_ticks: x.ticks(10),
+            x_ticks: x.ticks(self.most_x_ticks()),
             y_ticks: y.ticks(8),
             x_label: &self.x.label,
             y_label: &self.y.label,
@@ -80,6 +80,14 @@ impl Plot {
     /// As [`Plot::to_svg`], and a file that cannot be written.
     pub fn save_svg(&self, path: &Path) -> Result<(), ReportError> {
         Ok(write_atomic(path, self.to_svg()?.as_bytes())?)
+    }
+
+    /// Things that are counted have no halves.
+    fn most_x_ticks(&self) -> usize {
+        const MOST: usize = 10;
+        let all = || self.series.iter().flat_map(|series| &series.points).map(|point| point[0]);
+        let [low, high] = super::range(all());
+        if all().all(|x| x.fract() == 0.0) { ((high - low) as usize).clamp(1, MOST) } else { MOST }
     }
 
     /// Checks one coordinate of all points and lays their range on the page.

@@ -12,7 +12,9 @@ use serde_json::Value;
 
 use super::ReportError;
 use super::axis::three_digits;
-use super::maps::maps;
+use super::course::convergence;
+use super::maps::{maps, within_html};
+use super::means::{last_registration, means, registered, signatures};
 use super::story::{Measurement, Story};
 use super::words::{alarm_words, ending_words, home_words, judgement_words, role_words, verdict_words};
 use regrind_cell::{Compared, Conformity, Ending, Figures, Tolerance};
@@ -30,7 +32,11 @@ white-space:nowrap;font-variant-numeric:tabular-nums}td.t{white-space:nowrap}\
 .good,.bad{padding:.6em .8em;font-weight:bold}.good{background:#d5ead0}.bad{background:#f7d9d0}\
 #judged td{font-size:1.1em}tr.of td{border-bottom:none;padding-top:.6em}figure{display:inline-block;margin:0 .5em 1em 0;max-width:100%}figure svg{max-width:100%;height:auto}\
 figcaption{color:#555}code{font-size:.85em;word-break:break-all}\
-footer{margin-top:2.5em;border-top:1px solid #ddd;color:#555}";
+footer{margin-top:2.5em;border-top:1px solid #ddd;color:#555}\
+#signatures td{min-width:11em;height:2.6em;border-bottom:1px solid #222}\
+@page{size:auto;margin:14mm}@media print{body{font-size:10.5pt;max-width:none;margin:0;padding:0}\
+h2{break-after:avoid}figure,tr,#signatures,footer{break-inside:avoid}.good,.bad,.mark{print-color-adjust:exact}\
+td,th{padding:.2em .5em}}";
 
 /// Proves the record of a run, writes its report beside it and returns the name of the report.
 ///
@@ -68,12 +74,19 @@ fn html(story: &Story, folder: &Path, verified: &Verified) -> Result<String, Rep
     );
     html += &verdict(story);
     html += &judged(story);
+    let registration = last_registration(story, folder)?;
     html += &facts(story, &begin);
+    html += &means(story, registration.as_ref().map(|(_, found)| found));
     html += &cycles(story);
+    if let Some(plot) = convergence(story) {
+        let _ = writeln!(html, "<figure>{}</figure>", within_html(&plot));
+    }
     html += &maps(story, folder, &begin)?;
+    html += &registration.map_or(String::new(), |(cycle, found)| registered(cycle, &found));
     html += &form(story, folder)?;
     html += &alarms(story);
     html += &orders(story);
+    html += &signatures();
     let Verified { records, head, closed, signed, .. } = verified;
     let end = if *closed { "closed" } else { "not closed yet" };
     let by = verified.keys.iter().map(|key| format!("<br/><code>{key}</code>")).collect::<String>();

@@ -15,6 +15,9 @@ const MAP: &str = "error_map.csv";
 /// The points of a cycle with their deviations, as text.
 const DEVIATIONS: &str = "deviations.csv";
 
+/// How a cycle was registered.
+const REGISTRATION: &str = "registration.json";
+
 /// The figures of a cycle.
 const FIGURES: &str = "figures.json";
 
@@ -26,6 +29,12 @@ pub(super) struct Story {
     /// Whether each machine came home, where this is the record of a recovery.
     pub(super) home: Option<[bool; 2]>,
     pub(super) cycles: BTreeMap<u32, CycleStory>,
+    /// Name and address of each machine, as it answered.
+    pub(super) machines: [Option<[String; 2]>; 2],
+    /// What the grinder told of its wheel last.
+    pub(super) wheel_radius_mm: Option<f64>,
+    /// By how much the probe's radius was off on the reference sphere last, and in which cycle.
+    pub(super) radius_error_mm: Option<(u32, f64)>,
     pub(super) alarms: Vec<AlarmStory>,
     pub(super) orders: Vec<Order>,
 }
@@ -39,6 +48,8 @@ pub(super) struct CycleStory {
     pub(super) map: Option<(String, String)>,
     /// Name of the points with their deviations within the run folder.
     pub(super) deviations: Option<String>,
+    /// Name of the file that tells how it was registered, within the run folder.
+    pub(super) registration: Option<String>,
     /// Name of the file of figures within the run folder.
     pub(super) form: Option<String>,
     /// PV and RMS that the next pass is expected to leave, in millimetres.
@@ -81,6 +92,9 @@ impl Story {
                 self.ending = Some(ending);
                 self.end = Some(record);
             }
+            Told::Pass(pass) => {
+                self.wheel_radius_mm = pass["wheel_radius_mm"].as_f64().or(self.wheel_radius_mm);
+            }
             Told::Home(home) => {
                 self.home = Some(home);
                 self.end = Some(record);
@@ -90,7 +104,6 @@ impl Story {
             | Told::Answer(_)
             | Told::Remarks(..)
             | Told::Remark(_)
-            | Told::Pass(_)
             | Told::Transfer(_)
             | Told::Seal(_)
             | Told::Unknown => {}
@@ -132,6 +145,13 @@ impl Story {
                 }
                 self.measurement(cycle).figures = Some(figures);
             }
+            Event::Connected { device, .. } => {
+                let detail = &record.value()["detail"];
+                let [name, address] =
+                    ["name", "address"].map(|key| detail[key].as_str().unwrap_or("not told").to_owned());
+                self.machines[device as usize] = Some([name, address]);
+            }
+            Event::Qualified { cycle, radius_error_mm } => self.radius_error_mm = Some((cycle, radius_error_mm)),
             Event::Compensated { cycle, summary } => {
                 self.cycle(cycle).expected_mm = Some([summary.predicted_pv_mm, summary.predicted_rms_mm]);
             }
@@ -154,6 +174,8 @@ impl Story {
             self.cycle(record.cycle).map = Some((name.to_owned(), record.utc.clone()));
         } else if name.ends_with(&format!("/{DEVIATIONS}")) {
             self.cycle(record.cycle).deviations = Some(name.to_owned());
+        } else if name.ends_with(&format!("/{REGISTRATION}")) {
+            self.cycle(record.cycle).registration = Some(name.to_owned());
         } else if name.ends_with(&format!("/{FIGURES}")) {
             self.cycle(record.cycle).form = Some(name.to_owned());
         }

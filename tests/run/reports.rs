@@ -126,6 +126,7 @@ fn the_report_of_an_accepted_run_says_what_its_result_and_its_record_say() {
         }
     }
     assert!(page.says("No alarm was raised."));
+    means_registration_and_signatures(&page, &folder, cycles.len());
     let orders = page.rows("orders");
     assert!(orders[0][1].starts_with("Ada at ") && orders[0][2] == "start", "{orders:?}");
     let shown = shown(&folder);
@@ -140,10 +141,34 @@ fn the_report_of_an_accepted_run_says_what_its_result_and_its_record_say() {
     }
 }
 
+/// With what it was made and measured, how well its place is known, and where people sign.
+fn means_registration_and_signatures(page: &Page, folder: &Path, cycles: usize) {
+    let cells = |table: &str| page.rows(table).into_iter().map(|row| row.join("|")).collect::<Vec<_>>();
+    let means = cells("means");
+    assert!(means[0].starts_with("SIMULATED CMM 1, measuring machine at 127.0.0.1:"), "{means:?}");
+    assert!(means[1].starts_with("SIMULATED GRINDER 1, grinder at 127.0.0.1:"), "{means:?}");
+    assert!(means[2].starts_with("radius 12.5000 mm, as the grinder told"), "{means:?}");
+    let found = json_in(folder, &format!("cycle-{cycles}/registration.json"));
+    let radius = format!(
+        "radius {:.5} mm; on the reference sphere in cycle {cycles} off by ",
+        found["probe_radius_mm"].as_f64().unwrap()
+    );
+    assert!(means[3].starts_with(&radius), "{means:?}");
+    let registration = cells("registration");
+    let used = format!("{} of {} points used", found["used"], found["points"]);
+    assert!(registration[0].contains("converged in ") && registration[0].contains(&used), "{registration:?}");
+    let x = 1e3 * found["standard_uncertainty"]["x_mm"].as_f64().unwrap();
+    assert!(registration[1].starts_with(&format!("{x:.2} ")), "{registration:?}");
+    assert_eq!(page.rows("signatures").len(), 4);
+}
+
 /// The first and the last map on one scale and the last on its own, each with axes, colour bar and a name.
 fn maps_are_drawn(page: &Page, cycles: usize) {
-    let figures = page.texts(|node| node.has_tag_name("figure"));
-    assert_eq!(figures.len(), 3);
+    let (others, figures): (Vec<_>, Vec<_>) =
+        page.texts(|node| node.has_tag_name("figure")).into_iter().partition(|figure| !figure.contains("scale"));
+    assert_eq!((others.len(), figures.len()), (2, 3));
+    assert!(others[0].contains("Convergence") && others[0].contains("limit of RMS"), "{others:?}");
+    assert!(others[1].contains("nodes of the filtered map") && others[1].contains("SN 12"), "{others:?}");
     for (figure, cycle) in figures.iter().zip([1, cycles, cycles]) {
         for words in [
             &format!("Cycle {cycle}, 20"),

@@ -1,0 +1,100 @@
+//! What a part was made and measured with, how well its place was known, and where people sign.
+
+use std::fmt::Write;
+use std::fs;
+use std::io;
+use std::path::Path;
+
+use serde_json::Value;
+
+use super::ReportError;
+use super::story::Story;
+use regrind_cell::Device;
+use regrind_formats::{FormatError, escaped};
+
+/// Machines, wheel and probe, as far as the record tells of them.
+pub(super) fn means(story: &Story, registration: Option<&Value>) -> String {
+    let not_told = || "not told".to_owned();
+    let machine = |device: Device| {
+        let [name, address] = story.machines[device as usize].clone()?;
+        Some(format!("{name}, {address}"))
+    };
+    let wheel = story.wheel_radius_mm.map(|mm| format!("radius {mm:.4} mm, as the grinder told of its last pass"));
+    let radius = registration.and_then(|found| found["probe_radius_mm"].as_f64()).filter(|mm| *mm > 0.0);
+    let off = story.radius_error_mm.map(|(cycle, mm)| {
+        format!("; on the reference sphere in cycle {cycle} off by {:.2} \u{b5}m from what the recipe states", 1e3 * mm)
+    });
+    let probe = radius.map(|mm| format!("radius {mm:.5} mm{}", off.unwrap_or_default()));
+    let rows = [
+        ("Measuring machine", machine(Device::Cmm)),
+        ("Grinder", machine(Device::Grinder)),
+        ("Wheel", wheel),
+        ("Probe", probe),
+    ];
+    let row = |(key, value): (&str, Option<String>)| {
+        format!("<tr><th>{key}</th><td>{}</td></tr>\n", escaped(&value.unwrap_or_else(not_told)))
+    };
+    let rows: String = rows.into_iter().map(row).collect();
+    format!("<h2>Machines, wheel and probe</h2>\n<table id=\"means\">\n{rows}</table>\n")
+}
+
+/// Reads how the last measurement was registered; none where none was.
+pub(super) fn last_registration(story: &Story, folder: &Path) -> Result<Option<(u32, Value)>, ReportError> {
+    let last = story.cycles.iter().rev().find_map(|(cycle, of)| Some((*cycle, of.registration.as_ref()?)));
+    let Some((cycle, name)) = last else { return Ok(None) };
+    let path = folder.join(name);
+    let bytes = fs::read(&path).map_err(|source| FormatError::Unreadable { path: path.clone(), source })?;
+    let found = serde_json::from_slice(&bytes)
+        .map_err(|source| FormatError::Unreadable { path, source: io::Error::from(source) })?;
+    Ok(Some((cycle, found)))
+}
+
+/// Where the part lay, and how well that is known.
+pub(super) fn registered(cycle: u32, found: &Value) -> String {
+    let number = |key: &str| found[key].as_f64();
+    let count = |key: &str| found[key].as_array().map_or(0, Vec::len);
+    let um = |mm: f64| format!("{:.2} \u{b5}m", 1e3 * mm);
+    let sigma = |key: &str| found["standard_uncertainty"][key].as_f64();
+    let shift = ["x_mm", "y_mm", "z_mm"].map(|key| sigma(key).map_or("held".to_owned(), um)).join(", ");
+    let turn = ["rx_rad", "ry_rad", "rz_rad"]
+        .map(|key| sigma(key).map_or("held".to_owned(), |rad| format!("{:.2} \u{b5}rad", 1e6 * rad)));
+    let converged = if found["converged"] == true { "converged" } else { "not converged" };
+    let points = |key: &str| number(key).map_or("-".to_owned(), |n| format!("{n:.0}"));
+    let verdict = format!(
+        "{converged} in {} steps; {} of {} points used, {} outliers, {} off the part; {:.1} % of the surface covered; rms {}",
+        points("iterations"),
+        points("used"),
+        points("points"),
+        count("outliers"),
+        count("off_part"),
+        100.0 * number("coverage").unwrap_or(f64::NAN),
+        number("rms_mm").map_or("-".to_owned(), um)
+    );
+    let words = |key: &str, of: fn(&Value) -> Option<&str>| -> Vec<String> {
+        found[key].as_array().into_iter().flatten().filter_map(of).map(str::to_owned).collect()
+    };
+    let mut remarks = words("weak_directions", |weak| weak["words"].as_str());
+    remarks.extend(words("warnings", Value::as_str));
+    if count("alternatives") > 0 {
+        remarks.push(format!("{} other poses fit about as well", count("alternatives")));
+    }
+    let remarks = if remarks.is_empty() { "nothing".to_owned() } else { remarks.join("; ") };
+    let mut html = format!("<h2>Registration, cycle {cycle}</h2>\n<table id=\"registration\">\n");
+    for (key, value) in [
+        ("Fit", verdict),
+        ("Standard uncertainty of the place", format!("{shift} along x, y, z; {} about x, y, z", turn.join(", "))),
+        ("To be known", remarks),
+    ] {
+        let _ = writeln!(html, "<tr><th>{key}</th><td>{}</td></tr>", escaped(&value));
+    }
+    html + "</table>\n"
+}
+
+/// Where those sign who answer for it.
+pub(super) fn signatures() -> String {
+    let row = |role: &str| format!("<tr><th>{role}</th><td></td><td></td><td></td></tr>\n");
+    let rows: String = ["Recipe approved by", "Made by", "Checked by", "Released by"].map(row).concat();
+    format!(
+        "<h2>Signatures</h2>\n<table id=\"signatures\">\n<tr><th></th><th>name</th><th>date</th><th>signature</th></tr>\n{rows}</table>\n"
+    )
+}
