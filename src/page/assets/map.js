@@ -1,6 +1,9 @@
 // Error maps and points on a canvas: what the server sends in bytes, in the colours of every other picture.
 "use strict";
 const regrindMap = (() => {
+  /** More points than these are drawn as blocks. */
+  const MOST_DISCS = 4000;
+
   /** Reads a map: columns, rows, first node, spacing, values in micrometres (NaN where nothing was measured). */
   function readGrid(buffer) {
     const head = new DataView(buffer);
@@ -126,14 +129,8 @@ const regrindMap = (() => {
       context.imageSmoothingEnabled = w / grid.columns < 4;
       context.drawImage(picture(grid, limit, colours), offset, top, w, h);
     }
-    for (const dot of dots || []) {
-      const [px, py] = view.toPage(...dot.at);
-      context.beginPath();
-      context.arc(px, py, dot.size, 0, 7);
-      [context.fillStyle, context.strokeStyle] = [dot.fill || ground, dot.fill ? ink : quiet];
-      if (dot.fill) context.fill();
-      else context.stroke();
-    }
+    if (dots && dots.length > MOST_DISCS) blocks(context, view, dots, [offset, top, w, h]);
+    else discs(context, view, dots || [], { ground, ink, quiet });
     [context.strokeStyle, context.lineWidth] = [ink, 1];
     context.strokeRect(offset, top, w, h);
     axes(context, view, { x0, y0, x1, y1, offset, top, w, h, ink });
@@ -155,6 +152,40 @@ const regrindMap = (() => {
       }
     }
     return view;
+  }
+
+  /** Points as discs; those of no colour are hollow. */
+  function discs(context, view, dots, { ground, ink, quiet }) {
+    for (const { at, size, rgb } of dots) {
+      const [px, py] = view.toPage(...at);
+      context.beginPath();
+      context.arc(px, py, size, 0, 7);
+      [context.fillStyle, context.strokeStyle] = [rgb ? `rgb(${rgb})` : ground, rgb ? ink : quiet];
+      if (rgb) context.fill();
+      else context.stroke();
+    }
+  }
+
+  /** Points as blocks of pixels: tens of thousands are there at once. */
+  function blocks(context, view, dots, [left, top, w, h]) {
+    const fine = window.devicePixelRatio || 1;
+    const [wide, high] = [w, h].map((size) => Math.max(1, Math.round(size * fine)));
+    const image = new ImageData(wide, high);
+    const pixels = new Uint32Array(image.data.buffer);
+    for (const { at, size, rgb } of dots) {
+      const [px, py] = view.toPage(...at);
+      const side = Math.max(1, Math.round((rgb ? 1.2 : 0.6) * size * fine));
+      const [column, row] = [(px - left) * fine, (py - top) * fine].map((middle) => Math.round(middle - side / 2));
+      // Alpha, blue, green, red: as the bytes of a pixel lie on every machine that browsers run on.
+      const colour = rgb ? (0xff000000 | (rgb[2] << 16) | (rgb[1] << 8) | rgb[0]) >>> 0 : 0xff909090;
+      for (let y = Math.max(row, 0); y < Math.min(row + side, high); y += 1) {
+        for (let x = Math.max(column, 0); x < Math.min(column + side, wide); x += 1) pixels[y * wide + x] = colour;
+      }
+    }
+    const canvas = document.createElement("canvas");
+    [canvas.width, canvas.height] = [wide, high];
+    canvas.getContext("2d").putImageData(image, 0, 0);
+    context.drawImage(canvas, left, top, w, h);
   }
 
   function axes(context, view, { x0, y0, x1, y1, offset, top, w, h, ink }) {

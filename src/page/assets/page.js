@@ -199,12 +199,12 @@
     if (state.touched && view !== "relief" && (!grid || withPoints)) {
       planned = planned || await bytes(`${base}/planned`);
       if (planned) {
-        const ink = getComputedStyle(document.documentElement).getPropertyValue("--ink").trim();
+        const ink = getComputedStyle(document.body).color.match(/\d+/g).slice(0, 3).map(Number);
         const places = new Float32Array(planned);
         const [done] = state.touched;
         const dots = [];
         for (let k = 0; 2 * k < places.length; k += 1) {
-          dots.push({ at: [places[2 * k], places[2 * k + 1]], size: k < done ? 2.6 : 1.4, fill: k < done ? ink : null });
+          dots.push({ at: [places[2 * k], places[2 * k + 1]], size: k < done ? 2.6 : 1.4, rgb: k < done ? ink : null });
         }
         return { dots, key: `● ${texts.touched} ${done}   ○ ${texts.planned} ${dots.length - done}` };
       }
@@ -215,8 +215,8 @@
       const dots = [];
       for (let k = 0; k < values.length; k += 3) {
         const at = 3 * regrindMap.level(values[k + 2], limit);
-        const fill = Number.isNaN(values[k + 2]) ? null : `rgb(${colours[at]},${colours[at + 1]},${colours[at + 2]})`;
-        dots.push({ at: [values[k], values[k + 1]], size: 2.2, fill });
+        const rgb = Number.isNaN(values[k + 2]) ? null : [colours[at], colours[at + 1], colours[at + 2]];
+        dots.push({ at: [values[k], values[k + 1]], size: 2.2, rgb });
       }
       return { dots };
     }
