@@ -135,6 +135,8 @@ pub(super) enum Failure {
     ShortMap,
     #[error("`confirm clear` needs --machine: which machine was looked at")]
     NoMachine,
+    #[error("{path} is there already; choose another folder, or move it away")]
+    IsThere { path: PathBuf },
     #[error("{path}: {source}; --runs names the folder of the runs")]
     NoRuns { path: PathBuf, source: std::io::Error },
     #[error("{path} cannot be found: {source}; name the file of the measurement")]

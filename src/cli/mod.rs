@@ -7,7 +7,9 @@ mod check;
 mod choice;
 mod compensate;
 mod control;
+mod doctor;
 mod failure;
+mod init;
 mod initial;
 mod key;
 mod live;
@@ -47,6 +49,7 @@ struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Init(init::Arguments),
     Run(run::Arguments),
     Plan(plan::Arguments),
     Simulate(simulate::Arguments),
@@ -75,6 +78,7 @@ enum Command {
     Accuracy(accuracy::Arguments),
     Compensate(compensate::Arguments),
     Check(check::Arguments),
+    Doctor(doctor::Arguments),
     Schema(schema::Arguments),
     States(states::Arguments),
 }
@@ -106,6 +110,7 @@ fn run() -> ExitCode {
         }
     };
     let ended = match arguments.command {
+        Command::Init(arguments) => init::run(&arguments),
         Command::Run(arguments) => run::run(&arguments),
         Command::Plan(arguments) => plan::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
@@ -125,6 +130,7 @@ fn run() -> ExitCode {
         Command::Accuracy(arguments) => accuracy::run(&arguments),
         Command::Compensate(arguments) => compensate::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
+        Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Schema(arguments) => schema::run(&arguments),
         Command::States(arguments) => states::run(&arguments),
     };

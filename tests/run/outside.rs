@@ -200,3 +200,83 @@ fn a_second_run_does_not_take_the_machines_of_the_first() {
     serving.interrupt();
     serving.end();
 }
+
+#[test]
+fn what_a_new_folder_says_to_type_makes_a_part() {
+    let home = tempfile::tempdir().unwrap();
+    let (code, said, errors) = run(&["init", "shop", "--part", "plano \"X\" \\ 1"], home.path());
+    assert_eq!(code, 0, "{said}{errors}");
+    let shop = home.path().join("shop");
+    let readme = fs::read_to_string(shop.join("README.md")).unwrap();
+    let block = readme.split("```sh\n").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
+    let path = std::env::join_paths(
+        std::iter::once(Path::new(env!("CARGO_BIN_EXE_regrind")).parent().unwrap().to_owned())
+            .chain(std::env::split_paths(&std::env::var_os("PATH").unwrap())),
+    );
+    for line in block.lines() {
+        let mut typed = Command::new("bash");
+        typed.args(["-c", line]).current_dir(&shop).env("PATH", path.as_ref().unwrap()).env("REGRIND_KEY", "");
+        let output = typed.output().unwrap();
+        let told = String::from_utf8_lossy(&output.stderr).into_owned() + &String::from_utf8_lossy(&output.stdout);
+        assert!(output.status.success(), "{line}: {told}");
+    }
+    let (_, listed, _) = run(&["runs"], &shop);
+    assert!(listed.contains("ACCEPTED  SN-0001"), "{listed}");
+    let (code, _, errors) = run(&["init", "shop"], home.path());
+    assert!(code == 2 && errors.contains("is there already"), "{errors}");
+}
+
+#[test]
+fn every_kind_of_new_folder_has_a_good_recipe_and_a_good_cell() {
+    let home = tempfile::tempdir().unwrap();
+    for machines in ["simulated", "modbus-tcp", "modbus-rtu", "files", "manual"] {
+        let (code, said, errors) = run(&["init", machines, "--machines", machines], home.path());
+        assert_eq!(code, 0, "{machines}: {said}{errors}");
+        let shop = home.path().join(machines);
+        let (code, said, errors) = run(&["check", "recipe.toml", "cell.toml"], &shop);
+        assert_eq!(code, 0, "{machines}: {said}{errors}");
+        let texts = ["recipe.toml", "cell.toml"].map(|file| fs::read_to_string(shop.join(file)).unwrap());
+        for elsewhere in ["../", "recipes/", "config/"] {
+            assert!(texts.iter().all(|text| !text.contains(elsewhere)), "{machines} names {elsewhere}");
+        }
+    }
+}
+
+#[test]
+fn a_run_shows_its_page_beside_it_and_ends_as_ever() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = small_recipe(home.path(), 1e5).display().to_string();
+    let (code, said, errors) = run(&["run", &recipe, "--cell", "sim", "--serve", "127.0.0.1:0"], home.path());
+    assert!(code == 0 && said.contains("page     http://127.0.0.1:"), "{said}{errors}");
+}
+
+#[test]
+fn the_doctor_says_what_stands_in_the_way_of_a_run_and_moves_nothing() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = small_recipe(home.path(), 1e4).display().to_string();
+    let (code, said, errors) = run(&["doctor", "--recipe", &recipe], home.path());
+    assert!(code == 0 && said.contains("simulated within the program") && !said.contains("OBSTACLE"), "{said}{errors}");
+    assert!(said.contains("sphere is clear of the part") && said.contains("records are not signed"), "{said}");
+    assert!(!home.path().join("runs").exists(), "it leaves nothing behind");
+
+    let cell = home.path().join("cell.toml");
+    let at = |ports: [String; 2]| {
+        let [cmm, grinder] = ports.map(|port| format!("port = {port}"));
+        fs::write(&cell, changed("config/modbus-tcp.toml", &[("port = 15021", &cmm), ("port = 15022", &grinder)]))
+            .unwrap();
+    };
+    at(["0".into(), "0".into()]);
+    let path = cell.display().to_string();
+    let mut simulated = Running::new(regrind(&["simulate", &recipe, "--cell", &path, "--json"], home.path()));
+    let wires: serde_json::Value =
+        serde_json::from_str(&simulated.line("the wires", |line| line.starts_with('{'))).unwrap();
+    at(["cmm", "grinder"].map(|machine| wires[machine]["port"].to_string()));
+    let cell = path;
+    let (code, said, errors) = run(&["doctor", &cell], home.path());
+    assert!(code == 0 && said.contains("unit 1 stands IDLE") && said.contains("unit 2 stands IDLE"), "{said}{errors}");
+    drop(simulated);
+    let (code, said, _) = run(&["doctor", &cell, "--json"], home.path());
+    let found: serde_json::Value = serde_json::from_str(&said).unwrap();
+    let obstacles = found.as_array().unwrap().iter().filter(|finding| finding["found"] == "obstacle").count();
+    assert_eq!((code, obstacles), (1, 2), "{said}");
+}

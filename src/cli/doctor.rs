@@ -1,0 +1,217 @@
+//! `regrind doctor`: does anything stand in the way of a run? Nothing is moved, and nothing is taken.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use regrind::cell::Device;
+use regrind::config::{BUILT_IN, CellConfig, Link};
+use regrind::device::{Line, Machine, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, Status};
+use regrind::drive::recover::{in_short, look};
+use regrind::formats::{ResultFolder, try_writing};
+use regrind::journal::free_bytes;
+use regrind::recipe::Recipe;
+use regrind::report::run_summary;
+use regrind::setup;
+use serde::Serialize;
+
+use super::failure::Failure;
+use super::live::take;
+use super::run::within;
+use super::{Outcome, check, control, key};
+
+/// Look at the computer, the cell file, the machines and a recipe, and say what stands in the way of a run; nothing is moved
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Of a machine on Modbus it reads who it is and how it stands, and writes nothing but the sign of life of a client. Machines that take files, or
+that a person serves, have nothing to read; their folders are looked at.
+
+Example:
+  regrind doctor config/modbus-tcp.toml --recipe recipes/freeform-mirror.toml
+
+Exit codes: 0 nothing stands in the way; 1 something does; 2 bad cell file.")]
+pub(super) struct Arguments {
+    /// Cell to look at
+    #[arg(value_name = "CELL", default_value = BUILT_IN)]
+    cell: PathBuf,
+    /// Recipe that is to be run on it
+    #[arg(long, value_name = "FILE")]
+    recipe: Option<PathBuf>,
+    /// Folder of the runs
+    #[arg(long, value_name = "DIR", default_value = "runs")]
+    runs: PathBuf,
+    /// Print what was found as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Something that was looked at.
+#[derive(Serialize)]
+struct Finding {
+    what: String,
+    found: Found,
+    words: String,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+enum Found {
+    Good,
+    /// No obstacle, and worth knowing.
+    Notice,
+    /// It stands in the way of a run.
+    Obstacle,
+}
+
+impl Finding {
+    fn new(what: impl Into<String>, found: Found, words: impl Into<String>) -> Self {
+        Self { what: what.into(), found, words: words.into() }
+    }
+
+    fn of<E: std::fmt::Display>(what: &str, looked: Result<String, E>) -> Self {
+        match looked {
+            Ok(words) => Self::new(what, Found::Good, words),
+            Err(why) => Self::new(what, Found::Obstacle, why.to_string()),
+        }
+    }
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let Arguments { cell: path, recipe, runs, json } = arguments;
+    let cell = check::or_show(CellConfig::read(path))?;
+    let mut findings = vec![Finding::new("cell", Found::Good, format!("{} is a good cell file", path.display()))];
+    findings.extend(cell.notes().into_iter().map(|note| Finding::new("cell", Found::Notice, note)));
+    findings.extend([folder(runs), clock(runs), signing()]);
+    findings.extend(recipe.as_ref().map(|recipe| Finding::of("recipe", fits(recipe, &cell))));
+    findings.extend(super::runtime()?.block_on(machines(&cell)));
+    if *json {
+        super::print_json(&findings)?;
+    } else {
+        super::print(&findings.iter().map(in_words).collect::<String>())?;
+    }
+    let obstacle = findings.iter().any(|finding| finding.found == Found::Obstacle);
+    Ok(if obstacle { Outcome::NotInTolerance } else { Outcome::Accepted })
+}
+
+fn in_words(finding: &Finding) -> String {
+    let Finding { what, found, words } = finding;
+    let mark = match found {
+        Found::Good => "ok",
+        Found::Notice => "note",
+        Found::Obstacle => "OBSTACLE",
+    };
+    format!("{mark:<9}{what}: {words}\n")
+}
+
+/// Whether runs can be written, and how much of them.
+fn folder(runs: &Path) -> Finding {
+    const LITTLE_BYTES: u64 = 1 << 30;
+    // One that is not there yet is made, tried, and taken away again.
+    let written = if runs.is_dir() { try_writing(runs) } else { ResultFolder::prepare(runs).map(drop) };
+    let free = free_bytes(runs).unwrap_or(u64::MAX);
+    match written {
+        Err(error) => Finding::new("folder of the runs", Found::Obstacle, error.to_string()),
+        Ok(()) if free < LITTLE_BYTES => {
+            let words = format!("{} has {} MB free; a run of many points takes hundreds", runs.display(), free >> 20);
+            Finding::new("folder of the runs", Found::Notice, words)
+        }
+        Ok(()) => Finding::new(
+            "folder of the runs",
+            Found::Good,
+            format!("{} can be written, {} GB are free", runs.display(), free >> 30),
+        ),
+    }
+}
+
+/// Whether the clock goes on from what was recorded.
+fn clock(runs: &Path) -> Finding {
+    /// When this was written; no clock that is right shows less.
+    const LEAST: &str = "2026-01-01T00:00:00Z";
+    let now = jiff::Timestamp::now().to_string();
+    let last = control::folders(runs)
+        .filter_map(|folder| run_summary(&folder).ok())
+        .map(|run| run.ended.unwrap_or(run.began))
+        .max();
+    let last = last.unwrap_or_default();
+    if now.as_str() < LEAST || now < last {
+        let words = format!(
+            "it shows {now:.19}, and the last record was written at {last:.19}: set it; records are ordered by their numbers all the same"
+        );
+        return Finding::new("clock", Found::Notice, words);
+    }
+    Finding::new("clock", Found::Good, format!("{now:.19} UTC"))
+}
+
+fn signing() -> Finding {
+    match key::of_this_user() {
+        Ok(Some(key)) => {
+            Finding::new("audit key", Found::Good, format!("records are signed with {}", key.public().fingerprint()))
+        }
+        Ok(None) => Finding::new(
+            "audit key",
+            Found::Notice,
+            "there is none, and records are not signed: regrind audit key makes one",
+        ),
+        Err(error) => Finding::new("audit key", Found::Obstacle, error.to_string()),
+    }
+}
+
+/// Whether a recipe can be run on the cell: the reference sphere clear of the part, everything within the limits of the machines.
+fn fits(recipe: &Path, cell: &CellConfig) -> Result<String, Failure> {
+    let recipe = check::or_show(Recipe::read(recipe))?;
+    let (task, _) = setup::prepare(&recipe, cell).map_err(Failure::Setup)?;
+    let sphere = if task.sphere.is_some() { ", and the reference sphere is clear of the part" } else { "" };
+    Ok(format!("{} is within the limits of this cell{sphere}", recipe.path().display()))
+}
+
+async fn machines(cell: &CellConfig) -> Vec<Finding> {
+    if within(cell) {
+        return vec![Finding::new("machines", Found::Good, "simulated within the program: there is nothing to reach")];
+    }
+    let settings = |link| setup::modbus(link, cell.simulated, 1, 1);
+    vec![
+        machine(Device::Cmm, &cell.cmm.link, settings(&cell.cmm.link), ModbusCmm::new).await,
+        machine(Device::Grinder, &cell.grinder.link, settings(&cell.grinder.link), ModbusGrinder::new).await,
+    ]
+}
+
+async fn machine<M: Machine>(
+    device: Device,
+    link: &Link,
+    settings: Option<ModbusSettings>,
+    make: fn(ModbusSettings) -> std::io::Result<M>,
+) -> Finding {
+    let what = device.to_string();
+    let Some(settings) = settings else {
+        return Finding::new(
+            what,
+            Found::Notice,
+            "it tells nothing over a wire: what it needs is said when a run begins",
+        );
+    };
+    let kind = match device {
+        Device::Cmm => MachineKind::Cmm,
+        Device::Grinder => MachineKind::Grinder,
+    };
+    // Whoever has it is at work with it, and a second client would be in the way.
+    let _taken = match take(link, kind, Path::new("regrind doctor")) {
+        Ok(taken) => taken,
+        Err(failure) => return Finding::new(what, Found::Notice, failure.to_string()),
+    };
+    if let Some((Line::Rtu { device: port, .. }, _)) = link.wire.line()
+        && !Path::new(&port).exists()
+    {
+        return Finding::new(
+            what,
+            Found::Obstacle,
+            format!("there is no port {port}: see the cable, and the name in the cell file"),
+        );
+    }
+    match make(settings) {
+        Err(error) => Finding::new(what, Found::Obstacle, format!("its port cannot be opened: {error}")),
+        Ok(mut machine) => {
+            let looked = look(&mut machine).await;
+            let name = machine.name().to_owned();
+            Finding::of(&what, looked.map(|status: Status| format!("{name} stands {}", in_short(&status))))
+        }
+    }
+}

@@ -1,0 +1,166 @@
+//! `regrind init`: a folder in which a shop begins.
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use regrind::formats::{ResultFolder, write_atomic};
+use regrind::{config, recipe};
+
+use super::Outcome;
+use super::failure::Failure;
+
+/// Make a folder to begin in: a recipe, a cell, their schemas for the editor, and a page that says what to type
+#[derive(Args, Debug)]
+#[command(after_help = "\
+What is there already is left alone: a folder that has one of the files is refused. The recipe makes a free-form mirror; change what it says of
+the part, the wheel and the measurement. The cell begins as the one that ships for such machines.
+
+Example:
+  regrind init mirrors --machines modbus-tcp
+  cd mirrors && regrind check recipe.toml cell.toml
+
+Exit codes: 0 made; 2 the folder has such files already, or cannot be written.")]
+pub(super) struct Arguments {
+    /// Folder to make
+    #[arg(value_name = "DIR")]
+    folder: PathBuf,
+    /// How the machines are reached
+    #[arg(long, value_enum, default_value = "simulated")]
+    machines: Machines,
+    /// What the part is called
+    #[arg(long, value_name = "NAME", value_parser = super::name)]
+    part: Option<String>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Machines {
+    /// Both are simulated within the program
+    Simulated,
+    /// Modbus over TCP; simulated by another process until you change it
+    ModbusTcp,
+    /// Modbus over serial lines; simulated by another process until you change it
+    ModbusRtu,
+    /// They take and give files
+    Files,
+    /// A person serves them step by step
+    Manual,
+}
+
+impl Machines {
+    /// The cell that ships for them.
+    fn cell(self) -> &'static str {
+        match self {
+            Self::Simulated => include_str!("../../config/sim.toml"),
+            Self::ModbusTcp => include_str!("../../config/modbus-tcp.toml"),
+            Self::ModbusRtu => include_str!("../../config/serial-rtu.toml"),
+            Self::Files => include_str!("../../config/file-exchange.toml"),
+            Self::Manual => include_str!("../../config/manual.toml"),
+        }
+    }
+
+    /// The recipe that goes with that cell.
+    fn recipe(self) -> (&'static str, &'static str) {
+        match self {
+            // Machines that take files have no pattern of ours.
+            Self::Files => (include_str!("../../recipes/telescope-panel.toml"), "telescope primary mirror"),
+            _ => (include_str!("../../recipes/freeform-mirror.toml"), "free-form mirror"),
+        }
+    }
+
+    /// What is typed to make a part, a line each with what it is for.
+    fn commands(self) -> Vec<(&'static str, &'static str)> {
+        let run = "regrind run recipe.toml --cell cell.toml --part SN-0001 --operator \"Your Name\"";
+        let before = match self {
+            Self::ModbusTcp | Self::ModbusRtu => Some((
+                "regrind simulate recipe.toml --cell cell.toml",
+                "the simulated machines, in a terminal of their own",
+            )),
+            Self::Files => Some((
+                "mkdir -p exchange/cmm/in exchange/cmm/out exchange/grinder/in exchange/grinder/out",
+                "the folders of both machines",
+            )),
+            Self::Simulated | Self::Manual => None,
+        };
+        let always = [
+            (run, "makes a part"),
+            ("regrind runs", "what was made, and how it ended"),
+            ("regrind audit verify", "is the record of the newest run unbroken?"),
+        ];
+        let checked = [
+            ("regrind check recipe.toml cell.toml", "every problem with its line, column and remedy"),
+            ("regrind plan recipe.toml --cell cell.toml", "what would be commanded, and how long it takes"),
+        ];
+        checked.into_iter().chain(before).chain(always).collect()
+    }
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let Arguments { folder, machines, part } = arguments;
+    let (recipe, shipped_name) = machines.recipe();
+    let name = part.as_deref().unwrap_or(shipped_name);
+    let files = [
+        ("recipe.toml", recipe_of(recipe, shipped_name, name)),
+        ("cell.toml", cell_of(machines.cell())),
+        ("README.md", readme(name, *machines)),
+        ("recipe.schema.json", format!("{:#}\n", recipe::json_schema())),
+        ("cell.schema.json", format!("{:#}\n", config::json_schema())),
+    ];
+    if let Some((there, _)) = files.iter().find(|(file, _)| folder.join(file).exists()) {
+        return Err(Failure::IsThere { path: folder.join(there) });
+    }
+    let made = ResultFolder::prepare(folder)?;
+    for (file, text) in &files {
+        write_atomic(&folder.join(file), text.as_bytes())?;
+    }
+    made.keep();
+    super::print(&words(folder, *machines))?;
+    Ok(Outcome::Accepted)
+}
+
+/// The recipe for a folder of its own.
+fn recipe_of(shipped: &str, shipped_name: &str, name: &str) -> String {
+    let named = toml::Value::String(name.to_owned()).to_string();
+    shipped
+        .replacen(&format!("name = \"{shipped_name}\""), &format!("name = {named}"), 1)
+        .replace("../docs/recipe.schema.json", "recipe.schema.json")
+        .replace("docs/recipe.schema.json", "recipe.schema.json")
+        .replace("recipes/freeform-mirror.toml", "recipe.toml")
+        .replace("config/file-exchange.toml", "cell.toml")
+}
+
+/// The cell for a folder of its own: what it names lies in it.
+fn cell_of(shipped: &str) -> String {
+    let text = shipped
+        .replace("../docs/cell.schema.json", "cell.schema.json")
+        .replace("docs/cell.schema.json", "cell.schema.json");
+    let text = text.replace("../exchange/", "exchange/").replace("recipes/freeform-mirror.toml", "recipe.toml");
+    let text =
+        text.replace("recipes/telescope-panel.toml", "recipe.toml").replace("config/serial-rtu.toml", "cell.toml");
+    let text = text.replace("config/modbus-tcp.toml", "cell.toml");
+    // What ships beside it is not here.
+    text.replace(" With several stations: config/laser-tracker.toml.", "")
+}
+
+fn readme(name: &str, machines: Machines) -> String {
+    let mut text = format!(
+        "# {name}\n\n`recipe.toml` says how the part is made, measured and accepted, `cell.toml` which machines make it. An editor that knows TOML completes \
+         both from the schemas beside them. In this folder:\n\n```sh\n"
+    );
+    let commands = machines.commands();
+    let width = commands.iter().map(|(command, _)| command.chars().count()).max().unwrap_or(0);
+    for (command, what) in commands {
+        let _ = writeln!(text, "{command:width$}  # {what}");
+    }
+    text + "```\n\nWhile a run is on, from another terminal: `regrind status`, `regrind hold`, `regrind resume`, `regrind abort`, `regrind serve`. Every order \
+            explains itself with `--help`.\n\nNo part of this program is a safety function: guards and the emergency stop are the machines' own circuits.\n"
+}
+
+fn words(folder: &Path, machines: Machines) -> String {
+    let mut text =
+        format!("made {}: recipe.toml, cell.toml, README.md and two schemas\nnext:\n  cd {0}\n", folder.display());
+    for (command, _) in machines.commands() {
+        let _ = writeln!(text, "  {command}");
+    }
+    text
+}
