@@ -22,8 +22,8 @@ use super::{Outcome, check, control, key};
 /// Look at the computer, the cell file, the machines and a recipe, and say what stands in the way of a run; nothing is moved
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Of a machine on Modbus it reads who it is and how it stands, and writes nothing but the sign of life of a client. Machines that take files, or
-that a person serves, have nothing to read; their folders are looked at.
+Of a machine on Modbus it reads who it is and how it stands, and writes nothing but the sign of life of a client. Of machines that take files, or
+that a person serves, nothing is read.
 
 Example:
   regrind doctor config/modbus-tcp.toml --recipe recipes/freeform-mirror.toml

@@ -12,6 +12,7 @@ use regrind::journal::{Journal, MachineLock};
 use regrind::recipe::Recipe;
 use regrind::setup;
 use regrind_control::Next;
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::mpsc;
 
@@ -129,14 +130,24 @@ async fn heed_enter(orders: Orders, actor: Actor) {
     if rustix::termios::tcflush(io::stdin(), rustix::termios::QueueSelector::IFlush).is_err() {
         return;
     }
-    let (typed, pressed) = tokio::sync::oneshot::channel();
-    // A thread of its own, which ends with the program: a terminal cannot be asked in vain.
-    std::thread::spawn(move || typed.send(io::stdin().read_line(&mut String::new()).is_ok_and(|read| read > 0)));
-    let still_asked = |orders: &Orders| orders.status().borrow().next_step == Next::Load;
-    if pressed.await == Ok(true) && still_asked(&orders) {
+    // A thread of its own, for a terminal is waited for; no longer than somebody is asked, and only while the program has it.
+    let still_asked = move || status.has_changed().is_ok() && status.borrow().next_step == Next::Load;
+    let typed = tokio::task::spawn_blocking(move || {
+        while still_asked() {
+            let mut terminal = [PollFd::from_borrowed_fd(rustix::stdio::stdin(), PollFlags::IN)];
+            if poll(&mut terminal, Some(&BETWEEN_LOOKS)).is_ok_and(|ready| ready > 0) && reads_keys() {
+                return io::stdin().read_line(&mut String::new()).is_ok_and(|read| read > 0) && still_asked();
+            }
+        }
+        false
+    });
+    if typed.await.unwrap_or(false) {
         orders.give(Request::Loaded, actor).await;
     }
 }
+
+/// Between two looks whether a person is still asked.
+const BETWEEN_LOOKS: Timespec = Timespec { tv_sec: 0, tv_nsec: 200_000_000 };
 
 /// What ends a program from outside: a terminal that is closed, a service that is stopped.
 struct Signals {

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use regrind_cell::Device;
+use regrind_document::misleading;
 use serde::{Deserialize, Serialize};
 
 use super::snapshot::Snapshot;
@@ -97,4 +98,21 @@ pub(super) struct Line {
     pub(super) request: Request,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) by: Option<OnBehalf>,
+}
+
+impl Line {
+    /// Whether a text in it reads otherwise than it is: it would be on record so, for years.
+    pub(super) fn misleads(&self) -> bool {
+        let text = match &self.request {
+            Request::Hold { reason }
+            | Request::Resume { reason, .. }
+            | Request::Stop { reason }
+            | Request::Abort { reason } => Some(reason),
+            Request::Over { evidence, .. } => Some(evidence),
+            Request::Remark { what } => Some(what),
+            _ => None,
+        };
+        let by = self.by.iter().flat_map(|by| by.name.iter().chain([&by.station]));
+        text.into_iter().chain(by).any(|text| misleading(text).is_some())
+    }
 }

@@ -5,13 +5,14 @@
 
 use std::io;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use regrind_cell::Actor;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader, Lines};
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::net::{UnixListener, UnixStream};
-use tokio::sync::{mpsc, oneshot, watch};
+use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 
 use super::request::{Line, OnBehalf, Reply, Request};
 use super::snapshot::Snapshot;
@@ -23,6 +24,10 @@ const LONGEST_LINE: u64 = 4096;
 /// A client that says nothing for so long is gone.
 const PATIENCE: Duration = Duration::from_secs(10);
 
+/// An order that has no answer by then gets one that says so, while who gave it still listens.
+const ANSWERS_WITHIN: Duration = Duration::from_secs(8);
+/// Most clients that watch at a time: each has a descriptor for as long as it likes, and orders need theirs.
+const WATCHERS: usize = 16;
 /// Between two tries to let a client in.
 const BETWEEN_TRIES: Duration = Duration::from_millis(50);
 /// Between two lines to who watches: no eye follows more of them, and a cell that says nothing for longer than this is not there.
@@ -59,6 +64,7 @@ impl Control {
             regrind_formats::remove_socket(&path)?;
         }
         let listener = UnixListener::bind(&path)?;
+        let places = Arc::new(Semaphore::new(WATCHERS));
         let task = tokio::spawn(async move {
             loop {
                 let Ok((stream, _)) = listener.accept().await else {
@@ -66,9 +72,9 @@ impl Control {
                     tokio::time::sleep(BETWEEN_TRIES).await;
                     continue;
                 };
-                let (orders, status) = (orders.clone(), status.clone());
+                let (orders, status, places) = (orders.clone(), status.clone(), Arc::clone(&places));
                 // A client that misbehaves hurts itself only.
-                tokio::spawn(async move { drop(serve(stream, orders, status).await) });
+                tokio::spawn(async move { drop(serve(stream, orders, status, &places).await) });
             }
         });
         Ok(Self { path, task })
@@ -88,6 +94,7 @@ async fn serve(
     stream: UnixStream,
     orders: mpsc::Sender<Ordered>,
     mut status: watch::Receiver<Snapshot>,
+    places: &Semaphore,
 ) -> io::Result<()> {
     let peer = actor_of(&stream)?;
     let (read, mut write) = stream.into_split();
@@ -95,7 +102,13 @@ async fn serve(
     let mut read = BufReader::new(read).take(LONGEST_LINE);
     tokio::time::timeout(PATIENCE, read.read_line(&mut text)).await??;
     let reply = match serde_json::from_str(&text) {
-        Ok(Line { request: Request::Watch, .. }) => return told_on(&mut write, &mut status).await,
+        Ok(Line { request: Request::Watch, .. }) => match places.try_acquire() {
+            Ok(_place) => return told_on(&mut write, &mut status).await,
+            Err(_) => refusal(format!("{WATCHERS} others watch already; close one of them"), &status),
+        },
+        Ok(line) if line.misleads() => {
+            refusal("not an order: it has characters that are not seen or turn what is read".into(), &status)
+        }
         Ok(Line { request, by }) => answer(request, on_behalf(peer, by), &orders, &status).await,
         Err(error) => refusal(format!("not an order: {error}"), &status),
     };
@@ -118,7 +131,7 @@ async fn answer(
         orders.send(Ordered { request, actor, answer: Some(answer) }).await.ok()?;
         answered.await.ok()
     };
-    match tokio::time::timeout(PATIENCE, handed_over).await {
+    match tokio::time::timeout(ANSWERS_WITHIN, handed_over).await {
         Ok(reply) => reply.unwrap_or_else(over),
         Err(_) => refusal("the cell has not answered; whether it took the order is not known".into(), status),
     }
@@ -225,9 +238,10 @@ impl Watch {
     /// Waits for the next thing that the cell tells of itself; none where it has gone.
     ///
     /// # Errors
-    /// A cell that says nothing for too long, or what nobody understands.
+    /// A cell that says nothing for too long, what nobody understands, or that it is watched by too many.
     pub async fn next(&mut self) -> io::Result<Option<Snapshot>> {
         let Some(text) = tokio::time::timeout(SILENCE, self.lines.next_line()).await?? else { return Ok(None) };
-        Ok(Some(serde_json::from_str::<Reply>(&text)?.status))
+        let Reply { accepted, message, status } = serde_json::from_str(&text)?;
+        if accepted { Ok(Some(status)) } else { Err(io::Error::other(message)) }
     }
 }

@@ -18,10 +18,10 @@ fn is_misleading(c: char) -> bool {
         || matches!(c, '\u{2060}'..='\u{2069}' | '\u{feff}' | '\u{fff9}'..='\u{fffb}' | '\u{e0000}'..='\u{e007f}')
 }
 
-/// Returns a text with each such character by its number, as `<U+202E>`; line ends stay what they are.
+/// Returns a text with each such character by its number, as `<U+202E>`; line ends and tabs stay what they are.
 pub fn visible(text: &str) -> String {
     text.chars().fold(String::with_capacity(text.len()), |mut shown, c| {
-        if is_misleading(c) && c != '\n' {
+        if is_misleading(c) && !matches!(c, '\n' | '\t') {
             let _ = write!(shown, "<U+{:04X}>", u32::from(c));
         } else {
             shown.push(c);
@@ -89,6 +89,6 @@ mod tests {
         ] {
             assert_eq!(misleading(text), found, "{text:?}");
         }
-        assert_eq!(visible("a\u{202e}b\nc\u{7}"), "a<U+202E>b\nc<U+0007>");
+        assert_eq!(visible("a\u{202e}b\n\tc\u{7}"), "a<U+202E>b\n\tc<U+0007>");
     }
 }

@@ -529,6 +529,7 @@ impl Drive {
         if let Some(answer) = answer {
             let then = Then::Answer { answer, accepted: true, message: "on record".into() };
             self.backlog.push_back(Waiting { ticket, then });
+            self.answer_without_record();
         }
     }
 

@@ -18,6 +18,7 @@ use sha2::{Digest, Sha256};
 
 use super::{Shared, view};
 
+/// The cookies of a page, by its port: a browser keeps one set for all pages of a computer.
 const KEY_COOKIE: &str = "regrind_key";
 const SESSION_COOKIE: &str = "regrind_session";
 /// The header in which an order carries its token.
@@ -77,6 +78,17 @@ impl Guard {
 
     pub(crate) fn url(&self) -> String {
         format!("http://{}/?key={}", self.address, self.key)
+    }
+
+    /// The cookie of that name that is this page's.
+    fn cookie<'h>(&self, headers: &'h HeaderMap, name: &str) -> Option<&'h str> {
+        let name = self.cookie_name(name);
+        let pairs = text(headers, COOKIE)?.split(';').filter_map(|pair| pair.trim().split_once('='));
+        pairs.filter(|(known, _)| *known == name).map(|(_, value)| value).next()
+    }
+
+    fn cookie_name(&self, name: &str) -> String {
+        format!("{name}_{}", self.address.port())
     }
 
     /// Whether a request names this page as its host.
@@ -162,8 +174,8 @@ pub(crate) async fn let_in(State(page): State<Shared>, mut request: Request, nex
             told => shut_out(guard, &request, told),
         };
     }
-    let told = cookie(request.headers(), KEY_COOKIE).map(|key| guard.is_key(key));
-    match (told, cookie(request.headers(), SESSION_COOKIE)) {
+    let told = guard.cookie(request.headers(), KEY_COOKIE).map(|key| guard.is_key(key));
+    match (told, guard.cookie(request.headers(), SESSION_COOKIE)) {
         (Some(Some(true)), Some(session)) => {
             let session = Session(session.to_owned());
             request.extensions_mut().insert(session);
@@ -190,8 +202,8 @@ pub(crate) fn foreign(guard: &Guard, headers: &HeaderMap, session: &Session) -> 
 /// Gives a browser the key to keep, and a name; one that has a name goes by it in all its tabs.
 fn welcome(guard: &Guard, request: &Request) -> Response {
     let headers = request.headers();
-    let is_known = cookie(headers, KEY_COOKIE).is_some_and(|key| same(key, &guard.key));
-    let session = match cookie(headers, SESSION_COOKIE).filter(|_| is_known) {
+    let is_known = guard.cookie(headers, KEY_COOKIE).is_some_and(|key| same(key, &guard.key));
+    let session = match guard.cookie(headers, SESSION_COOKIE).filter(|_| is_known) {
         Some(session) => session.to_owned(),
         None => match random_word() {
             Ok(session) => session,
@@ -201,6 +213,7 @@ fn welcome(guard: &Guard, request: &Request) -> Response {
     let path = request.uri().path().to_owned();
     let mut response = (StatusCode::SEE_OTHER, [(LOCATION, path)]).into_response();
     for (name, value) in [(KEY_COOKIE, &guard.key), (SESSION_COOKIE, &session)] {
+        let name = guard.cookie_name(name);
         let cookie = format!("{name}={value}; HttpOnly; SameSite=Strict; Path=/");
         if let Ok(cookie) = HeaderValue::from_str(&cookie) {
             response.headers_mut().append(SET_COOKIE, cookie);
@@ -210,7 +223,7 @@ fn welcome(guard: &Guard, request: &Request) -> Response {
 }
 
 fn shut_out(guard: &Guard, request: &Request, told: Option<bool>) -> Response {
-    let gave = cookie(request.headers(), KEY_COOKIE).is_some() || key_in(request.uri().query()).is_some();
+    let gave = guard.cookie(request.headers(), KEY_COOKIE).is_some() || key_in(request.uri().query()).is_some();
     if gave || request.method() != "GET" {
         let what = if gave { "a wrong key" } else { "an order without a key" };
         guard.refused(&format!("{what} for {}", printable(request.uri().path())));
@@ -221,11 +234,6 @@ fn shut_out(guard: &Guard, request: &Request, told: Option<bool>) -> Response {
 
 fn key_in(query: Option<&str>) -> Option<&str> {
     query?.split('&').find_map(|pair| pair.strip_prefix("key="))
-}
-
-fn cookie<'h>(headers: &'h HeaderMap, name: &str) -> Option<&'h str> {
-    let pairs = text(headers, COOKIE)?.split(';').filter_map(|pair| pair.trim().split_once('='));
-    pairs.filter(|(known, _)| *known == name).map(|(_, value)| value).next()
 }
 
 pub(crate) fn text(headers: &HeaderMap, name: HeaderName) -> Option<&str> {

@@ -1,7 +1,8 @@
 //! Orders from the page, through the same door as those from the terminal.
 //!
 //! One browser has control. What makes safe (hold, stop, abort) is taken from every one; what lets machines move, or says what a
-//! person has seen, from the one that has control only. Who takes control is on record in the run.
+//! person has seen, from the one that has control only. Who takes control is on record in the run, and so is what did not come from
+//! the page.
 
 use std::path::PathBuf;
 
@@ -46,8 +47,8 @@ pub(crate) async fn order(
             | Request::Over { .. }),
         ) => {
             if !page.guard.has_control(&session.0, true) {
-                let what = "an order from a screen that has not got control".to_owned();
-                return refuse(&page, &run, what, StatusCode::CONFLICT).await;
+                let what = "another screen has control; take it over first".to_owned();
+                return (StatusCode::CONFLICT, Json(Answer { accepted: false, message: what })).into_response();
             }
             request
         }

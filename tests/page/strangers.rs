@@ -103,6 +103,20 @@ fn who_has_no_key_sees_nothing_and_a_thousand_wrong_ones_keep_nobody_out() {
 }
 
 #[test]
+fn the_pages_of_two_cells_on_one_computer_leave_each_other_their_keys() {
+    let [one, other] = [(), ()].map(|()| tempfile::tempdir().unwrap());
+    let ((_one, one), (_other, other)) = (serve(one.path()), serve(other.path()));
+    // A browser keeps its cookies by the name of the computer, whatever the port.
+    let (mut first, second) = (Visitor::with_key(&one), Visitor::with_key(&other));
+    let names = |visitor: &Visitor| -> Vec<String> {
+        visitor.cookies.split("; ").map(|cookie| cookie.split('=').next().unwrap().to_owned()).collect()
+    };
+    assert!(names(&first).iter().all(|name| !names(&second).contains(name)), "{first:?} {second:?}");
+    first.cookies = format!("{}; {}", second.cookies, first.cookies);
+    assert_eq!(first.get("/runs").status, 200);
+}
+
+#[test]
 fn a_request_for_another_host_is_refused_and_what_is_outside_of_the_runs_is_not_there() {
     let home = tempfile::tempdir().unwrap();
     std::fs::create_dir(home.path().join("runs")).unwrap();

@@ -79,6 +79,41 @@ fn a_running_cell_is_watched_line_by_line_in_a_pipe_and_listed_with_what_became_
 }
 
 #[test]
+fn the_door_takes_no_text_that_misleads_and_no_more_watchers_than_it_has_places_for() {
+    use std::io::{BufRead, BufReader, Write};
+    let home = tempfile::tempdir().unwrap();
+    let (mut running, folder) = grinding(home.path(), |arguments| regrind(arguments, home.path()));
+    let says = |line: &str| {
+        let mut stream = UnixStream::connect(folder.join("control.sock")).unwrap();
+        stream.write_all(line.as_bytes()).unwrap();
+        let mut reader = BufReader::new(stream);
+        let mut reply = String::new();
+        reader.read_line(&mut reply).unwrap();
+        (serde_json::from_str::<serde_json::Value>(&reply).unwrap(), reader)
+    };
+    for line in [
+        "{\"order\":\"hold\",\"reason\":\"a\\u202eb\"}\n",
+        "{\"order\":\"remark\",\"what\":\"a\\u0007\"}\n",
+        "{\"order\":\"over\",\"device\":\"cmm\",\"evidence\":\"\u{200b}\"}\n",
+        "{\"order\":\"abort\",\"by\":{\"name\":\"A\\u202e\",\"station\":\"page\"}}\n",
+    ] {
+        let (reply, _) = says(line);
+        assert!(
+            reply["accepted"] == false && reply["words"].as_str().unwrap().contains("not an order"),
+            "{line} {reply}"
+        );
+        assert_eq!(reply["status"]["state"], "Execute", "{line}");
+    }
+    let watchers: Vec<_> = (0..17).map(|_| says("{\"order\":\"watch\"}\n")).collect();
+    let taken = watchers.iter().filter(|(reply, _)| reply["accepted"] == true).count();
+    assert_eq!(taken, 16);
+    assert_eq!(run(&["stop"], home.path()).0, 0);
+    drop(watchers);
+    assert_eq!(running.end().0, 1);
+    assert_eq!(orders(&folder).len(), 1, "nothing else came through the door");
+}
+
+#[test]
 fn each_order_shows_how_it_is_given() {
     for order in ["hold", "stop", "abort", "status"] {
         let (code, said, _) = run(&[order, "--help"], Path::new("."));
