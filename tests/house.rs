@@ -22,7 +22,7 @@ const ARROWS: [(&str, &str, &[&str]); 18] = [
     ("device", "src/device", &["document", "formats", "geometry"]),
     ("config", "src/config", &["device", "document", "geometry"]),
     ("report", "src/report", &["cell", "journal", "formats", "geometry", "registration"]),
-    ("page", "src/page", &["cell", "control", "formats", "report"]),
+    ("page", "src/page", &["cell", "control", "document", "formats", "report"]),
     (
         "drive",
         "src/drive",
@@ -203,7 +203,10 @@ fn the_crates_depend_on_nothing_above_them() {
         ("src/formats/Cargo.toml", &["regrind-core"]),
         ("src/device/Cargo.toml", &["regrind-core", "regrind-document", "regrind-formats"]),
         ("src/control/Cargo.toml", &["regrind-cell", "regrind-document", "regrind-formats"]),
-        ("src/page/Cargo.toml", &["regrind-cell", "regrind-control", "regrind-formats", "regrind-report"]),
+        (
+            "src/page/Cargo.toml",
+            &["regrind-cell", "regrind-control", "regrind-document", "regrind-formats", "regrind-report"],
+        ),
         ("src/report/Cargo.toml", &["regrind-cell", "regrind-core", "regrind-formats", "regrind-journal"]),
         ("sim/Cargo.toml", &[]),
     ] {

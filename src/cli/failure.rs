@@ -101,10 +101,18 @@ pub(super) enum Failure {
     )]
     Page { address: SocketAddr, source: io::Error },
     #[error(
-        "{address} is open to other computers, and the page has no users and no encryption; show it at 127.0.0.1, and reach it from \
-         elsewhere through a tunnel: ssh -L 7373:127.0.0.1:7373 CELL"
+        "{address} is open to other computers; give the page a certificate (--certificate FILE --key FILE) and users (--users FILE), or \
+         show it at 127.0.0.1 and reach it from elsewhere through a tunnel: ssh -L 7373:127.0.0.1:7373 CELL"
     )]
     ForOthers { address: SocketAddr },
+    #[error(transparent)]
+    Tls(#[from] regrind_page::TlsError),
+    #[error(transparent)]
+    Users(#[from] regrind_page::UsersError),
+    #[error("{}: there is no user {name:?}; `regrind users list` tells who is there", .path.display())]
+    NoUser { name: String, path: PathBuf },
+    #[error("the two passwords are not alike; nothing was changed")]
+    NotAlike,
     #[error("{}: its program ended before anything was asked of a machine; begin a new run", .run.display())]
     NotBegun { run: PathBuf },
     #[error("{}: its simulated machines ended with the program that ran it; begin a new run", .run.display())]

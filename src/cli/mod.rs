@@ -23,10 +23,12 @@ mod run;
 mod runs;
 mod schema;
 mod serve;
+mod shell;
 mod show;
 mod simulate;
 mod simulated;
 mod states;
+mod users;
 mod watch;
 mod words;
 
@@ -72,6 +74,7 @@ enum Command {
     Watch(watch::Arguments),
     Runs(runs::Arguments),
     Serve(serve::Arguments),
+    Users(users::Arguments),
     Audit(audit::Arguments),
     Report(report::Arguments),
     Register(register::Arguments),
@@ -81,6 +84,8 @@ enum Command {
     Doctor(doctor::Arguments),
     Schema(schema::Arguments),
     States(states::Arguments),
+    Completions(shell::Completions),
+    Man(shell::Pages),
 }
 
 const EXIT_CODES: &str = "Exit codes: 0 accepted; 1 finished, not in tolerance; 2 bad arguments or data; 3 fault.";
@@ -124,6 +129,7 @@ fn run() -> ExitCode {
         Command::Watch(arguments) => watch::run(&arguments),
         Command::Runs(arguments) => runs::run(&arguments),
         Command::Serve(arguments) => serve::run(&arguments),
+        Command::Users(arguments) => users::run(&arguments),
         Command::Audit(arguments) => audit::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
         Command::Register(arguments) => register::run(&arguments),
@@ -133,6 +139,8 @@ fn run() -> ExitCode {
         Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Schema(arguments) => schema::run(&arguments),
         Command::States(arguments) => states::run(&arguments),
+        Command::Completions(arguments) => shell::completions(&arguments),
+        Command::Man(arguments) => shell::pages(&arguments),
     };
     match ended {
         Ok(Outcome::Accepted) => ExitCode::SUCCESS,

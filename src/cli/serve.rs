@@ -12,7 +12,7 @@ use regrind::config::CellConfig;
 use regrind::journal::Reader;
 use regrind::recipe::Recipe;
 use regrind::setup;
-use regrind_page::Page;
+use regrind_page::{Entrance, Page, Tls, UsersFile};
 use tokio::net::TcpListener;
 
 use super::Outcome;
@@ -27,11 +27,13 @@ const LINGERS: Duration = Duration::from_secs(3);
 #[derive(Args, Debug)]
 #[command(after_help = "\
 The page shows the run that is on, from wherever it was begun, and gives orders to it through the same door as `regrind hold` and
-the like. It opens by the address that is printed, with its key, and on this computer only; from another one, use a tunnel:
-  ssh -L 7373:127.0.0.1:7373 CELL
+the like. It opens by the address that is printed, with its key, and on this computer only. For other computers it needs a certificate,
+by whose names they reach it, and users, who sign in; or they use a tunnel: ssh -L 7373:127.0.0.1:7373 CELL
 
-Example:
+Examples:
   regrind serve --runs runs
+  regrind users add \"A. Smith\" --role operator
+  regrind serve --listen 0.0.0.0:7373 --certificate cell.pem --key cell.key --users users.toml
 
 Exit codes: 0 stopped by Ctrl-C; 2 bad arguments.")]
 pub(super) struct Arguments {
@@ -41,14 +43,26 @@ pub(super) struct Arguments {
     /// Address and port of the page; a port of 0 takes any that is free
     #[arg(long, value_name = "ADDRESS", default_value = ADDRESS)]
     listen: SocketAddr,
+    /// Certificate of the page in PEM, with those of who signed it behind it; for other addresses than this computer's own
+    #[arg(long, value_name = "FILE", requires = "key")]
+    certificate: Option<PathBuf>,
+    /// Private key of the certificate in PEM, which nobody else may read
+    #[arg(long, value_name = "FILE", requires = "certificate")]
+    key: Option<PathBuf>,
+    /// Who may sign in (see `regrind users`); without it, who has the key of the page is let in
+    #[arg(long, value_name = "FILE")]
+    users: Option<PathBuf>,
     /// End when standard input does: with the program that began this one
     #[arg(long, hide = true)]
     while_stdin: bool,
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let Arguments { runs, listen, while_stdin } = arguments;
-    if !listen.ip().is_loopback() {
+    let Arguments { runs, listen, certificate, key, users, while_stdin } = arguments;
+    let tls =
+        certificate.as_ref().zip(key.as_ref()).map(|(certificate, key)| Tls::read(certificate, key)).transpose()?;
+    let users = users.as_ref().map(|path| UsersFile::open(path)).transpose()?;
+    if !listen.ip().is_loopback() && (tls.is_none() || users.is_none()) {
         return Err(Failure::ForOthers { address: *listen });
     }
     super::runtime()?.block_on(async {
@@ -58,7 +72,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         let planned = Planned::default();
         let page = Page::new(
             std::path::absolute(runs).unwrap_or_else(|_| runs.clone()),
-            address,
+            Entrance { address, tls, users },
             Box::new(move |run| planned.of(run)),
             Box::new(|what| eprintln!("page: refused {what}")),
         );

@@ -47,7 +47,7 @@ pub use ply::{PlyFile, parse_ply, read_ply};
 pub use points::{parse_points, read_points, read_points_with_notes};
 pub use registration::{
     DeviationRow, read_deviations, sync_folder, try_writing, write_atomic, write_column, write_deviations,
-    write_json_atomic, write_points,
+    write_json_atomic, write_points, write_private,
 };
 pub use sdf::{parse_sdf, read_sdf};
 pub use stl::{StlFile, parse_stl, read_stl};

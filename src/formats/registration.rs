@@ -125,6 +125,16 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), FormatError> {
     draft.publish()
 }
 
+/// Writes a file that nobody but its owner may read, whole or not at all.
+///
+/// # Errors
+/// Those of [`write_atomic`].
+pub fn write_private(path: &Path, bytes: &[u8]) -> Result<(), FormatError> {
+    let mut draft = Draft::create_private(path)?;
+    draft.write(bytes)?;
+    draft.publish()
+}
+
 /// Tries whether files can be written to a folder.
 ///
 /// # Errors
@@ -188,6 +198,18 @@ pub(super) struct Draft<'p> {
 
 impl<'p> Draft<'p> {
     pub(super) fn create(path: &'p Path) -> Result<Self, FormatError> {
+        Self::create_by(path, OpenOptions::new().write(true).create_new(true))
+    }
+
+    /// One that nobody but its owner may read; where files have no such mode, their folder decides.
+    fn create_private(path: &'p Path) -> Result<Self, FormatError> {
+        let mut options = OpenOptions::new();
+        #[cfg(unix)]
+        std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
+        Self::create_by(path, options.write(true).create_new(true))
+    }
+
+    fn create_by(path: &'p Path, options: &OpenOptions) -> Result<Self, FormatError> {
         static COUNT: AtomicU64 = AtomicU64::new(0);
         let failed = |source| FormatError::Unwritable { path: path.to_owned(), action: "creating it", source };
         if path.is_dir() {
@@ -198,7 +220,7 @@ impl<'p> Draft<'p> {
         hidden.push(name);
         hidden.push(format!(".{}-{}.tmp", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed)));
         let temporary = path.with_file_name(hidden);
-        let file = OpenOptions::new().write(true).create_new(true).open(&temporary).map_err(failed)?;
+        let file = options.open(&temporary).map_err(failed)?;
         Ok(Self { path, temporary, file: BufWriter::new(file), published: false })
     }
 

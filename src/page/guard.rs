@@ -1,28 +1,39 @@
-//! Who is let in: whoever has the key, under the name of this page, and with orders only from the page itself.
+//! Who is let in: whoever has the key, or has signed in where there are users; under a name of this page; and with orders only from
+//! the page itself.
 //!
 //! A page on the loopback address is open to every program of the computer, and to every page in every browser on it. So the address
 //! that opens it carries a key, which becomes a cookie; a request must name this page as its host (a foreign name that leads here is
-//! refused); and an order must come from this page by its `Origin` and carry the token that only this page knows.
+//! refused); and an order must come from this page by its `Origin` and carry a token that was fetched for it and is good once.
 
+use std::collections::VecDeque;
 use std::io;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use axum::Extension;
 use axum::extract::{Request, State};
-use axum::http::header::{COOKIE, HOST, LOCATION, ORIGIN, REFERRER_POLICY, SET_COOKIE, X_CONTENT_TYPE_OPTIONS};
+use axum::http::header::{
+    CACHE_CONTROL, COOKIE, HOST, LOCATION, ORIGIN, REFERRER_POLICY, SET_COOKIE, X_CONTENT_TYPE_OPTIONS,
+};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use sha2::{Digest, Sha256};
 
-use super::{Shared, view};
+use super::sign_in::SignedIn;
+use super::tls::Tls;
+use super::users::{Person, UsersFile};
+use super::{Shared, orders, view};
 
 /// The cookies of a page, by its port: a browser keeps one set for all pages of a computer.
 const KEY_COOKIE: &str = "regrind_key";
 const SESSION_COOKIE: &str = "regrind_session";
 /// The header in which an order carries its token.
 const TOKEN: &str = "x-regrind-token";
+/// How long a token waits for its order, and how many wait at most.
+const TOKEN_LASTS: Duration = Duration::from_secs(30);
+const TOKENS: usize = 1024;
 
 /// Wrong keys within a minute that are answered as such; to more it is said that there are too many.
 const WRONG_KEYS: u32 = 20;
@@ -34,29 +45,75 @@ const MINUTE: Duration = Duration::from_secs(60);
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; \
                       form-action 'self'; frame-ancestors 'none'; base-uri 'none'";
 
+/// Where a page is open, and to whom.
+pub struct Entrance {
+    /// Where it listens.
+    pub address: SocketAddr,
+    /// Its certificate; none on the loopback address alone.
+    pub tls: Option<Tls>,
+    /// Who may sign in; without users, who has the key.
+    pub users: Option<UsersFile>,
+}
+
+impl Entrance {
+    fn scheme(&self) -> &'static str {
+        if self.tls.is_some() { "https" } else { "http" }
+    }
+
+    /// Whether a request names this page as its host.
+    fn is_host(&self, named: &str) -> bool {
+        let port = self.address.port();
+        let (host, at) = match named.rsplit_once(':') {
+            Some((host, at)) if !at.ends_with(']') => (host, at.parse().ok()),
+            // What browsers leave out.
+            _ => (named, Some(if self.tls.is_some() { 443 } else { 80 })),
+        };
+        let is_loopback = ["localhost", "127.0.0.1", "[::1]"].iter().any(|name| name.eq_ignore_ascii_case(host));
+        let is_here = match &self.tls {
+            Some(tls) => tls.is_for(host),
+            None => is_loopback || named == self.address.to_string(),
+        };
+        is_here && at == Some(port)
+    }
+
+    /// The address by which a browser opens the page.
+    fn base(&self) -> String {
+        let name = self.tls.as_ref().and_then(Tls::name);
+        let at = name.map_or(self.address.to_string(), |name| format!("{name}:{}", self.address.port()));
+        format!("{}://{at}/", self.scheme())
+    }
+}
+
 pub(crate) struct Guard {
-    address: SocketAddr,
+    pub(crate) entrance: Entrance,
+    pub(crate) signed_in: SignedIn,
     key: String,
     wrong: Mutex<Rate>,
     refusals: Mutex<Rate>,
+    /// Tokens that no order came with yet: for which browser, and since when.
+    tokens: Mutex<VecDeque<(String, String, Instant)>>,
     /// The browser that has control.
     holder: Mutex<Option<String>>,
     log: Box<dyn Fn(&str) + Send + Sync>,
 }
 
 /// How often something happened within a minute.
-struct Rate {
+pub(crate) struct Rate {
     began: Instant,
     count: u32,
 }
 
 impl Rate {
-    fn new() -> Self {
+    pub(crate) fn new() -> Self {
         Self { began: Instant::now(), count: 0 }
     }
 
-    fn count(&mut self) -> u32 {
-        if self.began.elapsed() > MINUTE {
+    pub(crate) fn is_over(&self) -> bool {
+        self.began.elapsed() > MINUTE
+    }
+
+    pub(crate) fn count(&mut self) -> u32 {
+        if self.is_over() {
             *self = Self::new();
         }
         self.count += 1;
@@ -65,19 +122,22 @@ impl Rate {
 }
 
 impl Guard {
-    pub(crate) fn new(address: SocketAddr, log: Box<dyn Fn(&str) + Send + Sync>) -> io::Result<Self> {
+    pub(crate) fn new(entrance: Entrance, log: Box<dyn Fn(&str) + Send + Sync>) -> io::Result<Self> {
         Ok(Self {
-            address,
+            entrance,
+            signed_in: SignedIn::default(),
             key: random_word()?,
             wrong: Mutex::new(Rate::new()),
             refusals: Mutex::new(Rate::new()),
+            tokens: Mutex::default(),
             holder: Mutex::new(None),
             log,
         })
     }
 
     pub(crate) fn url(&self) -> String {
-        format!("http://{}/?key={}", self.address, self.key)
+        let base = self.entrance.base();
+        if self.entrance.users.is_some() { base } else { format!("{base}?key={}", self.key) }
     }
 
     /// The cookie of that name that is this page's.
@@ -88,19 +148,22 @@ impl Guard {
     }
 
     fn cookie_name(&self, name: &str) -> String {
-        format!("{name}_{}", self.address.port())
+        format!("{name}_{}", self.entrance.address.port())
     }
 
-    /// Whether a request names this page as its host.
-    fn is_host(&self, host: &str) -> bool {
-        let port = self.address.port();
-        let here = [
-            self.address.to_string(),
-            format!("localhost:{port}"),
-            format!("127.0.0.1:{port}"),
-            format!("[::1]:{port}"),
-        ];
-        here.iter().any(|name| name.eq_ignore_ascii_case(host))
+    /// Has a browser keep a cookie, for this page alone.
+    fn set_cookie(&self, headers: &mut HeaderMap, name: &str, value: &str) {
+        let secure = if self.entrance.tls.is_some() { "; Secure" } else { "" };
+        let ends = if value.is_empty() { "; Max-Age=0" } else { "" };
+        let cookie = format!("{}={value}; HttpOnly; SameSite=Strict; Path=/{secure}{ends}", self.cookie_name(name));
+        if let Ok(cookie) = HeaderValue::from_str(&cookie) {
+            headers.append(SET_COOKIE, cookie);
+        }
+    }
+
+    /// Has a browser keep the session in which somebody signed in; an empty one ends it.
+    pub(crate) fn set_session(&self, response: &mut Response, session: &str) {
+        self.set_cookie(response.headers_mut(), SESSION_COOKIE, session);
     }
 
     /// Whether a key is right; none where it is one wrong one of many. The right one is let in however many wrong ones come: nobody
@@ -113,9 +176,31 @@ impl Guard {
         (wrong <= WRONG_KEYS).then_some(false)
     }
 
-    /// The token of the orders of a browser.
-    pub(crate) fn token(&self, session: &str) -> String {
-        hex(&Sha256::digest(format!("regrind order {} {session}", self.key)))
+    /// Makes the token of the next order of a browser.
+    fn give_token(&self, session: &Session) -> io::Result<String> {
+        let token = random_word()?;
+        let mut tokens = self.tokens.lock().unwrap_or_else(PoisonError::into_inner);
+        tokens.push_back((session.id.clone(), token.clone(), Instant::now()));
+        while tokens.len() > TOKENS || tokens.front().is_some_and(|(.., since)| since.elapsed() > TOKEN_LASTS) {
+            tokens.pop_front();
+        }
+        Ok(token)
+    }
+
+    /// Whether a token was given to this browser, not long ago, and no order came with it yet. It is good once: an order that
+    /// somebody else has seen and sends again has none.
+    fn takes_token(&self, session: &Session, token: &str) -> bool {
+        let mut tokens = self.tokens.lock().unwrap_or_else(PoisonError::into_inner);
+        let found = tokens
+            .iter()
+            .position(|(id, known, since)| *id == session.id && same(known, token) && since.elapsed() <= TOKEN_LASTS);
+        found.and_then(|at| tokens.remove(at)).is_some()
+    }
+
+    /// Whether who sits at a browser is still let in.
+    pub(crate) fn lets(&self, session: &Session) -> bool {
+        let person = |users| self.signed_in.person(&session.id, users);
+        self.entrance.users.as_ref().is_none_or(|users| person(users) == session.person)
     }
 
     /// Tells that something was refused, to who keeps it; returns whether it should be on record too.
@@ -130,12 +215,12 @@ impl Guard {
     }
 
     /// Whether a browser has control; one that nobody else has is taken by who asks.
-    pub(crate) fn has_control(&self, session: &str, asks: bool) -> bool {
+    pub(crate) fn has_control(&self, session: &Session, asks: bool) -> bool {
         let mut holder = self.holder.lock().unwrap_or_else(PoisonError::into_inner);
         match &*holder {
-            Some(holder) => holder == session,
+            Some(holder) => *holder == session.id,
             None if asks => {
-                *holder = Some(session.to_owned());
+                *holder = Some(session.id.clone());
                 true
             }
             None => true,
@@ -143,60 +228,107 @@ impl Guard {
     }
 
     /// Gives control to a browser.
-    pub(crate) fn take_control(&self, session: &str) {
-        *self.holder.lock().unwrap_or_else(PoisonError::into_inner) = Some(session.to_owned());
+    pub(crate) fn take_control(&self, session: &Session) {
+        *self.holder.lock().unwrap_or_else(PoisonError::into_inner) = Some(session.id.clone());
+    }
+
+    /// Takes control from a browser that has signed out: the next one that asks has it.
+    pub(crate) fn leave_control(&self, session: &Session) {
+        let mut holder = self.holder.lock().unwrap_or_else(PoisonError::into_inner);
+        holder.take_if(|holder| *holder == session.id);
+    }
+}
+
+/// Where a request came from.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Peer(pub(crate) IpAddr);
+
+/// The browser that a request comes from, and who sits at it where people sign in.
+#[derive(Clone, Debug)]
+pub(crate) struct Session {
+    pub(crate) id: String,
+    pub(crate) person: Option<Person>,
+    pub(crate) from: IpAddr,
+}
+
+impl Session {
+    /// Whether an order of that name is for who sits at it. Who has the key of the page is the user of the operating system that
+    /// serves it.
+    pub(crate) fn may(&self, order: &str) -> bool {
+        self.person.as_ref().is_none_or(|person| person.role.may(order))
     }
 }
 
 /// Refuses a request that names another page than this one, and puts on every answer what a browser may make of it.
 pub(crate) async fn names_this_page(State(page): State<Shared>, request: Request, next: Next) -> Response {
     let host = text(request.headers(), HOST).unwrap_or_default();
-    let mut response = if page.guard.is_host(host) {
+    let mut response = if page.guard.entrance.is_host(host) {
         next.run(request).await
     } else {
-        page.guard.refused(&format!("a request for the host {}", printable(host)));
+        drop(orders::record_refusal(&page, None, format!("a request for the host {}", printable(host))));
         (StatusCode::MISDIRECTED_REQUEST, "this page goes by another name\n").into_response()
     };
     let headers = response.headers_mut();
     let policy = HeaderName::from_static("content-security-policy");
     headers.entry(policy).or_insert(HeaderValue::from_static(POLICY));
     headers.insert(X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
-    headers.insert(REFERRER_POLICY, HeaderValue::from_static("no-referrer"));
+    // Without any, a form would be sent as from nowhere.
+    headers.insert(REFERRER_POLICY, HeaderValue::from_static("same-origin"));
     response
 }
 
-/// Lets in who has the key, and turns a key in the address into a cookie.
-pub(crate) async fn let_in(State(page): State<Shared>, mut request: Request, next: Next) -> Response {
+/// Lets in who has the key or has signed in, and turns a key in the address into a cookie.
+pub(crate) async fn let_in(
+    State(page): State<Shared>,
+    Extension(Peer(from)): Extension<Peer>,
+    mut request: Request,
+    next: Next,
+) -> Response {
     let guard = &page.guard;
-    if let Some(key) = key_in(request.uri().query()) {
-        return match guard.is_key(key) {
-            Some(true) => welcome(guard, &request),
-            told => shut_out(guard, &request, told),
-        };
-    }
-    let told = guard.cookie(request.headers(), KEY_COOKIE).map(|key| guard.is_key(key));
-    match (told, guard.cookie(request.headers(), SESSION_COOKIE)) {
-        (Some(Some(true)), Some(session)) => {
-            let session = Session(session.to_owned());
-            request.extensions_mut().insert(session);
-            next.run(request).await
+    let id = guard.cookie(request.headers(), SESSION_COOKIE).map(str::to_owned);
+    let session = if let Some(users) = &guard.entrance.users {
+        let person = id.as_ref().and_then(|id| guard.signed_in.person(id, users));
+        id.zip(person).map(|(id, person)| Session { id, person: Some(person), from })
+    } else {
+        if let Some(key) = key_in(request.uri().query()) {
+            return match guard.is_key(key) {
+                Some(true) => welcome(guard, &request),
+                told => shut_out(&page, &request, told),
+            };
         }
-        (told, _) => shut_out(guard, &request, told.unwrap_or(Some(false))),
+        let told = guard.cookie(request.headers(), KEY_COOKIE).map(|key| guard.is_key(key));
+        let known = id.filter(|_| told == Some(Some(true)));
+        let Some(id) = known else { return shut_out(&page, &request, told.unwrap_or(Some(false))) };
+        Some(Session { id, person: None, from })
+    };
+    let Some(session) = session else { return not_signed_in(&page, &request) };
+    request.extensions_mut().insert(session);
+    next.run(request).await
+}
+
+/// Gives the page the token of its next order.
+pub(crate) async fn token(State(page): State<Shared>, Extension(session): Extension<Session>) -> Response {
+    match page.guard.give_token(&session) {
+        Ok(token) => ([(CACHE_CONTROL, "no-store")], token).into_response(),
+        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     }
 }
 
-/// The browser that a request comes from.
-#[derive(Clone, Debug)]
-pub(crate) struct Session(pub(crate) String);
-
-/// Why an order is refused before anybody looks at it; none where it comes from this page.
-pub(crate) fn foreign(guard: &Guard, headers: &HeaderMap, session: &Session) -> Option<String> {
+/// Why a request that changes something is refused before anybody looks at it; none where it comes from this page.
+pub(crate) fn foreign_origin(guard: &Guard, headers: &HeaderMap) -> Option<String> {
     let origin = text(headers, ORIGIN).unwrap_or_default();
-    if !origin.strip_prefix("http://").is_some_and(|host| guard.is_host(host)) {
-        return Some(format!("an order from the origin {}", printable(origin)));
-    }
-    let token = text(headers, HeaderName::from_static(TOKEN)).unwrap_or_default();
-    (!same(token, &guard.token(&session.0))).then(|| "an order without the token of the page".to_owned())
+    let host = origin.strip_prefix(guard.entrance.scheme()).and_then(|rest| rest.strip_prefix("://"));
+    (!host.is_some_and(|host| guard.entrance.is_host(host)))
+        .then(|| format!("an order from the origin {}", printable(origin)))
+}
+
+/// Why an order is refused before anybody looks at it; none where it comes from this page, for the first time.
+pub(crate) fn foreign(guard: &Guard, headers: &HeaderMap, session: &Session) -> Option<String> {
+    foreign_origin(guard, headers).or_else(|| {
+        let token = text(headers, HeaderName::from_static(TOKEN)).unwrap_or_default();
+        (!guard.takes_token(session, token))
+            .then(|| "an order without a token of the page, or with one that was used".into())
+    })
 }
 
 /// Gives a browser the key to keep, and a name; one that has a name goes by it in all its tabs.
@@ -212,24 +344,27 @@ fn welcome(guard: &Guard, request: &Request) -> Response {
     };
     let path = request.uri().path().to_owned();
     let mut response = (StatusCode::SEE_OTHER, [(LOCATION, path)]).into_response();
-    for (name, value) in [(KEY_COOKIE, &guard.key), (SESSION_COOKIE, &session)] {
-        let name = guard.cookie_name(name);
-        let cookie = format!("{name}={value}; HttpOnly; SameSite=Strict; Path=/");
-        if let Ok(cookie) = HeaderValue::from_str(&cookie) {
-            response.headers_mut().append(SET_COOKIE, cookie);
-        }
-    }
+    guard.set_cookie(response.headers_mut(), KEY_COOKIE, &guard.key);
+    guard.set_session(&mut response, &session);
     response
 }
 
-fn shut_out(guard: &Guard, request: &Request, told: Option<bool>) -> Response {
-    let gave = guard.cookie(request.headers(), KEY_COOKIE).is_some() || key_in(request.uri().query()).is_some();
+fn shut_out(page: &Shared, request: &Request, told: Option<bool>) -> Response {
+    let gave = page.guard.cookie(request.headers(), KEY_COOKIE).is_some() || key_in(request.uri().query()).is_some();
     if gave || request.method() != "GET" {
         let what = if gave { "a wrong key" } else { "an order without a key" };
-        guard.refused(&format!("{what} for {}", printable(request.uri().path())));
+        drop(orders::record_refusal(page, None, format!("{what} for {}", printable(request.uri().path()))));
     }
     let status = if told.is_none() { StatusCode::TOO_MANY_REQUESTS } else { StatusCode::UNAUTHORIZED };
     view::key_needed(status, request.headers())
+}
+
+fn not_signed_in(page: &Shared, request: &Request) -> Response {
+    if request.method() != "GET" {
+        let path = printable(request.uri().path());
+        drop(orders::record_refusal(page, None, format!("an order of somebody who has not signed in, for {path}")));
+    }
+    view::sign_in(StatusCode::UNAUTHORIZED, request.headers(), None)
 }
 
 fn key_in(query: Option<&str>) -> Option<&str> {
@@ -241,7 +376,7 @@ pub(crate) fn text(headers: &HeaderMap, name: HeaderName) -> Option<&str> {
 }
 
 /// What a stranger sent, for a line of a log.
-fn printable(text: &str) -> String {
+pub(crate) fn printable(text: &str) -> String {
     text.chars().take(80).map(|c| if c.is_ascii_graphic() { c } else { '?' }).collect()
 }
 
@@ -250,7 +385,7 @@ fn same(one: &str, other: &str) -> bool {
     Sha256::digest(one) == Sha256::digest(other)
 }
 
-fn random_word() -> io::Result<String> {
+pub(crate) fn random_word() -> io::Result<String> {
     let mut bytes = [0; 16];
     getrandom::fill(&mut bytes).map_err(|error| io::Error::other(error.to_string()))?;
     Ok(hex(&bytes))

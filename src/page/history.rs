@@ -37,15 +37,23 @@ impl History {
         (plain && folder.join("journal.sqlite").is_file()).then_some(folder)
     }
 
+    /// The folders of the runs that are on. Blocks for the disk.
+    pub(crate) fn live(&self) -> Vec<PathBuf> {
+        self.ids().filter_map(|id| self.folder(&id)).filter(|folder| is_live(folder)).collect()
+    }
+
+    fn ids(&self) -> impl Iterator<Item = String> + use<> {
+        let folders = std::fs::read_dir(&self.runs).into_iter().flatten().filter_map(Result::ok);
+        folders.filter_map(|entry| entry.file_name().into_string().ok())
+    }
+
     /// Lists the runs, those that are on first, then the newest first. Blocks for the disk.
     pub(crate) fn list(&self) -> Vec<Listed> {
-        let folders = std::fs::read_dir(&self.runs).into_iter().flatten().filter_map(Result::ok);
-        let ids = folders.filter_map(|entry| entry.file_name().into_string().ok());
         let listed = |id: String| {
             let folder = self.folder(&id)?;
             Some(Listed { is_live: is_live(&folder), summary: self.summary(&folder)?, id })
         };
-        let mut all: Vec<Listed> = ids.filter_map(listed).collect();
+        let mut all: Vec<Listed> = self.ids().filter_map(listed).collect();
         all.sort_by(|a, b| (b.is_live, &b.summary.began, &b.id).cmp(&(a.is_live, &a.summary.began, &a.id)));
         all
     }

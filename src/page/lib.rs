@@ -4,7 +4,7 @@
 //! ```text
 //!  run folder: control.sock ==watch==> live ---> Seen --> view (HTML in a person's language) --> stream --> every browser
 //!              journal.sqlite --------> history --^        shape (maps and points in bytes) ------------> the canvas
-//!  browser ==POST==> guard (key, Host, Origin, token, control) --> orders ==control.sock==> the drive
+//!  browser ==POST==> guard (key or user, Host, Origin, token, control) --> orders ==control.sock==> the drive
 //! ```
 //!
 //! The page stands beside the run and never within it: it reads what the run tells and what is on record, and it can die without the
@@ -17,12 +17,15 @@ mod history;
 mod live;
 mod orders;
 mod shape;
+mod sign_in;
 mod stream;
 mod texts;
+mod tls;
+mod users;
 mod view;
 
 use std::io;
-use std::net::SocketAddr;
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -31,12 +34,19 @@ use axum::Router;
 use axum::extract::DefaultBodyLimit;
 use axum::middleware::from_fn_with_state;
 use axum::routing::{get, post};
+use hyper::body::Incoming;
+use hyper::service::{Service, service_fn};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 
-use guard::Guard;
+pub use guard::Entrance;
+pub use tls::{Tls, TlsError};
+pub use users::{PageRole, Person, Users, UsersError, UsersFile};
+
+use guard::{Guard, Peer};
 use history::History;
 use live::Live;
 
@@ -61,53 +71,75 @@ pub struct Page {
 type Shared = Arc<Page>;
 
 impl Page {
-    /// Makes ready to show the runs in a folder at an address. `planned` tells where the probe is to touch; `log` takes what nobody
-    /// else would keep.
+    /// Makes ready to show the runs in a folder. `planned` tells where the probe is to touch; `log` takes what nobody else would keep.
     ///
     /// # Errors
     /// No random numbers for the key.
     pub fn new(
         runs: PathBuf,
-        address: SocketAddr,
+        entrance: Entrance,
         planned: Box<PlannedPoints>,
         log: Box<dyn Fn(&str) + Send + Sync>,
     ) -> io::Result<Self> {
         let history = Arc::new(History::new(runs));
         let live = Live::new(Arc::clone(&history));
-        Ok(Self { guard: Guard::new(address, log)?, live, history, planned })
+        Ok(Self { guard: Guard::new(entrance, log)?, live, history, planned })
     }
 
-    /// Returns the address that opens the page, with its key.
+    /// Returns the address that opens the page, with its key where there are no users.
     pub fn url(&self) -> String {
         self.guard.url()
     }
 
     /// Shows the page to whoever comes, for as long as it is polled.
     pub async fn serve(self, listener: TcpListener) {
+        let tls = self.guard.entrance.tls.clone();
         let service = TowerToHyperService::new(router(Arc::new(self)));
         let places = Arc::new(Semaphore::new(CONNECTIONS));
         loop {
             let Ok(place) = Arc::clone(&places).acquire_owned().await else { return };
-            let Ok((stream, _)) = listener.accept().await else {
+            let Ok((stream, peer)) = listener.accept().await else {
                 // No descriptor is left, or the client has gone: that passes.
                 tokio::time::sleep(Duration::from_millis(50)).await;
                 continue;
             };
-            let service = service.clone();
+            let (service, tls) = (service.clone(), tls.clone());
             tokio::spawn(async move {
                 let _place = place;
-                let mut http = hyper::server::conn::http1::Builder::new();
-                let http = http.timer(TokioTimer::new()).header_read_timeout(PATIENCE);
                 // A client that goes away or misbehaves is no concern of anybody else.
-                drop(http.serve_connection(TokioIo::new(stream), service).await);
+                match tls {
+                    None => answer(stream, peer.ip(), service).await,
+                    Some(tls) => {
+                        if let Ok(Ok(stream)) = tokio::time::timeout(PATIENCE, tls.accept(stream)).await {
+                            answer(stream, peer.ip(), service).await;
+                        }
+                    }
+                }
             });
         }
     }
 }
 
+/// Answers what comes over one connection.
+async fn answer(
+    stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    from: IpAddr,
+    service: TowerToHyperService<Router>,
+) {
+    let mut http = hyper::server::conn::http1::Builder::new();
+    let http = http.timer(TokioTimer::new()).header_read_timeout(PATIENCE);
+    let service = service_fn(move |mut request: hyper::Request<Incoming>| {
+        request.extensions_mut().insert(Peer(from));
+        service.call(request)
+    });
+    drop(http.serve_connection(TokioIo::new(stream), service).await);
+}
+
 fn router(page: Shared) -> Router {
     Router::new()
         .route("/", get(view::home))
+        .route("/token", get(guard::token))
+        .route("/sign-out", post(sign_in::sign_out))
         .route("/runs", get(view::runs))
         .route("/compare", get(view::compare))
         .route("/runs/{run}", get(view::run))
@@ -120,6 +152,7 @@ fn router(page: Shared) -> Router {
         .route("/runs/{run}/cycles/{cycle}/points", get(shape::points))
         .fallback(view::not_here)
         .layer(from_fn_with_state(Arc::clone(&page), guard::let_in))
+        .route("/sign-in", post(sign_in::sign_in))
         .route("/assets/{name}", get(assets::asset))
         .layer(from_fn_with_state(Arc::clone(&page), guard::names_this_page))
         .layer(DefaultBodyLimit::max(LONGEST_BODY))

@@ -1,10 +1,11 @@
 //! Orders from the page, through the same door as those from the terminal.
 //!
-//! One browser has control. What makes safe (hold, stop, abort) is taken from every one; what lets machines move, or says what a
-//! person has seen, from the one that has control only. Who takes control is on record in the run, and so is what did not come from
-//! the page.
+//! One browser has control. What makes safe (hold, stop, abort) is taken from every one whose person may give it; what lets machines
+//! move, or says what a person has seen, from the one that has control only. Who takes control is on record in the run, and so is
+//! what was refused.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use axum::Extension;
 use axum::Json;
@@ -12,12 +13,14 @@ use axum::body::Bytes;
 use axum::extract::{Path, State};
 use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
+use regrind_cell::Role;
 use regrind_control::{OnBehalf, Reply, Request, ask_for};
 use serde::Serialize;
-use tokio::task::spawn_blocking;
+use tokio::task::{JoinHandle, spawn_blocking};
 
 use super::Shared;
 use super::guard::{Session, foreign};
+use super::users::PageRole;
 
 /// What the page answers to an order.
 #[derive(Serialize)]
@@ -38,26 +41,56 @@ pub(crate) async fn order(
         return refuse(&page, &run, what, StatusCode::FORBIDDEN).await;
     }
     let Some(folder) = page.history.folder(&run) else { return StatusCode::NOT_FOUND.into_response() };
-    let request = match serde_json::from_slice(&body) {
-        Ok(request @ (Request::Hold { .. } | Request::Stop { .. } | Request::Abort { .. })) => request,
-        Ok(
-            request @ (Request::Resume { seen: Some(_), .. }
-            | Request::Loaded
-            | Request::Clear { .. }
-            | Request::Over { .. }),
-        ) => {
-            if !page.guard.has_control(&session.0, true) {
-                let what = "another screen has control; take it over first".to_owned();
-                return (StatusCode::CONFLICT, Json(Answer { accepted: false, message: what })).into_response();
-            }
-            request
-        }
-        // What else the cell understands is for programs and the terminal.
-        Ok(_) | Err(_) => {
-            return refuse(&page, &run, "what is no order of the page".into(), StatusCode::BAD_REQUEST).await;
-        }
+    let request = serde_json::from_slice::<Request>(&body).ok();
+    // What else the cell understands is for programs and the terminal.
+    let Some((request, name)) = request.and_then(|request| name_of(&request).map(|name| (request, name))) else {
+        return refuse(&page, &run, "what is no order of the page".into(), StatusCode::BAD_REQUEST).await;
     };
+    if let Some(what) = not_for(&session, name) {
+        return refuse(&page, &run, what, StatusCode::FORBIDDEN).await;
+    }
+    if !MAKES_SAFE.contains(&name) && !page.guard.has_control(&session, true) {
+        let message = "another screen has control; take it over first".to_owned();
+        return (StatusCode::CONFLICT, Json(Answer { accepted: false, message })).into_response();
+    }
+    if name == "resume"
+        && let Some(what) = clears_alarm_of_another(&folder, &session).await
+    {
+        return refuse(&page, &run, what, StatusCode::FORBIDDEN).await;
+    }
     answered(give(folder, request, &session).await)
+}
+
+/// What every screen may order, whoever has control.
+const MAKES_SAFE: [&str; 3] = ["hold", "stop", "abort"];
+
+/// The name of an order that the page gives; none for what is for programs and the terminal.
+fn name_of(request: &Request) -> Option<&'static str> {
+    match request {
+        Request::Hold { .. } => Some("hold"),
+        Request::Stop { .. } => Some("stop"),
+        Request::Abort { .. } => Some("abort"),
+        // One that is meant for the state that the person saw.
+        Request::Resume { seen: Some(_), .. } => Some("resume"),
+        Request::Loaded => Some("loaded"),
+        Request::Clear { .. } => Some("clear"),
+        Request::Over { .. } => Some("over"),
+        _ => None,
+    }
+}
+
+/// Why an order is not for who sits at a browser.
+fn not_for(session: &Session, order: &str) -> Option<String> {
+    let person = session.person.as_ref().filter(|_| !session.may(order))?;
+    Some(format!("the order {order} of {person}: it is not for that role"))
+}
+
+/// Why somebody does not go on: an alarm that stands is cleared by a process engineer, and they are none.
+async fn clears_alarm_of_another(folder: &std::path::Path, session: &Session) -> Option<String> {
+    let person = session.person.as_ref().filter(|person| person.role != PageRole::Engineer)?;
+    let Reply { status, .. } = give(folder.to_owned(), Request::Status, session).await.ok()?;
+    let theirs = status.alarms.iter().find(|alarm| alarm.clears == Role::ProcessEngineer)?;
+    Some(format!("the order resume of {person}: an engineer clears the alarm \"{}\"", theirs.what))
 }
 
 /// Gives control to the browser that asks for it.
@@ -67,14 +100,15 @@ pub(crate) async fn take_control(
     Path(run): Path<String>,
     headers: HeaderMap,
 ) -> Response {
-    if let Some(what) = foreign(&page.guard, &headers, &session) {
+    let refused = foreign(&page.guard, &headers, &session).or_else(|| not_for(&session, "control"));
+    if let Some(what) = refused {
         return refuse(&page, &run, what, StatusCode::FORBIDDEN).await;
     }
     let Some(folder) = page.history.folder(&run) else { return StatusCode::NOT_FOUND.into_response() };
     let what = "control was taken over by another screen of the page".to_owned();
     let recorded = give(folder, Request::Remark { what }, &session).await;
     if recorded.is_ok() {
-        page.guard.take_control(&session.0);
+        page.guard.take_control(&session);
     }
     answered(recorded)
 }
@@ -89,21 +123,40 @@ fn answered(reply: std::io::Result<Reply>) -> Response {
     }
 }
 
-/// Refuses, and has it on record in the run that it was meant for.
+/// Refuses, and answers when it is on record.
 async fn refuse(page: &Shared, run: &str, what: String, status: StatusCode) -> Response {
-    if page.guard.refused(&what)
-        && let Some(folder) = page.history.folder(run)
-    {
-        let remark = Request::Remark { what: format!("the page refused {what}") };
-        // A run that is over takes no remark.
-        drop(give(folder, remark, &Session(String::new())).await);
+    if let Some(written) = record_refusal(page, Some(run), what.clone()) {
+        drop(written.await);
     }
     (status, Json(Answer { accepted: false, message: what })).into_response()
 }
 
+/// Has it told and on record that something was refused: in the run that it was meant for, or in every run that is on.
+pub(crate) fn record_refusal(page: &Shared, run: Option<&str>, what: String) -> Option<JoinHandle<()>> {
+    page.guard.refused(&what).then(|| write_down(page, run.map(str::to_owned), format!("the page refused {what}")))
+}
+
+/// Has something on record in every run that is on.
+pub(crate) fn record(page: &Shared, what: String) {
+    drop(write_down(page, None, what));
+}
+
+/// The record takes it in its turn; a run that is over takes no remark.
+fn write_down(page: &Shared, run: Option<String>, what: String) -> JoinHandle<()> {
+    let history = Arc::clone(&page.history);
+    spawn_blocking(move || {
+        let folders = run.map_or_else(|| history.live(), |run| history.folder(&run).into_iter().collect());
+        for folder in folders {
+            let by = OnBehalf { name: None, station: "page".into() };
+            drop(ask_for(&folder, &Request::Remark { what: what.clone() }, Some(by)));
+        }
+    })
+}
+
 /// Asks the cell on a thread that may wait.
 async fn give(folder: PathBuf, request: Request, session: &Session) -> std::io::Result<Reply> {
-    let screen = session.0.get(..6).map_or("page".to_owned(), |short| format!("page, screen {short}"));
-    let by = OnBehalf { name: None, station: screen };
+    let screen = session.id.get(..6).map_or("page".to_owned(), |short| format!("page, screen {short}"));
+    let station = if session.from.is_loopback() { screen } else { format!("{screen}, at {}", session.from) };
+    let by = OnBehalf { name: session.person.as_ref().map(ToString::to_string), station };
     spawn_blocking(move || ask_for(&folder, &request, Some(by))).await.map_err(std::io::Error::other)?
 }

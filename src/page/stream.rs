@@ -61,10 +61,13 @@ impl Looking {
             let _ = tokio::time::timeout(MOST_BETWEEN, self.seen.changed()).await;
         }
         self.is_first = false;
+        if !self.page.guard.lets(&self.session) {
+            return None;
+        }
         let seen = self.seen.borrow_and_update().clone();
-        let has_control = self.page.guard.has_control(&self.session.0, false);
+        let has_control = self.page.guard.has_control(&self.session, false);
         let mut pieces = Map::new();
-        for (piece, html) in view::pieces(&seen, has_control, self.language) {
+        for (piece, html) in view::pieces(&seen, has_control || !self.session.may("control"), self.language) {
             match self.sent.iter_mut().find(|(sent, _)| *sent == piece) {
                 Some((_, sent)) if *sent == html => continue,
                 Some((_, sent)) => sent.clone_from(&html),
@@ -72,7 +75,7 @@ impl Looking {
             }
             pieces.insert(piece.id().into(), Value::String(html));
         }
-        let data = json!({ "pieces": pieces, "state": view::state(&seen, has_control) });
+        let data = json!({ "pieces": pieces, "state": view::state(&seen, &self.session, has_control) });
         Event::default().json_data(data).ok()
     }
 }

@@ -5,6 +5,8 @@ use regrind_cell::{Device, JobStep, Phase, StateName};
 use regrind_control::Next;
 use regrind_report::RunResult;
 
+use super::users::PageRole;
+
 /// A language of the page.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub(crate) enum Language {
@@ -272,6 +274,30 @@ texts! {
         "Diese Seite braucht ihren Schlüssel. Er steht in der Adresse, die `regrind serve` ausgegeben hat.",
         "此页面需要密钥，见 `regrind serve` 输出的地址。"
     }
+    // Signing in.
+    SignIn { "Sign in", "Anmelden", "登录" }
+    SignOut { "Sign out", "Abmelden", "退出" }
+    UserName { "Name", "Name", "用户名" }
+    Password { "Password", "Kennwort", "密码" }
+    SignInRefused {
+        "Name and password do not belong together. Type both again.",
+        "Name und Kennwort gehören nicht zusammen. Beide noch einmal eingeben.",
+        "用户名与密码不符。请重新输入。"
+    }
+    TooManyTries {
+        "Too many tries from here. Wait a minute, then sign in.",
+        "Zu viele Versuche von hier. Eine Minute warten, dann anmelden.",
+        "此处尝试次数过多。请等待一分钟再登录。"
+    }
+    WhoMakesUsers {
+        "Who keeps the computer of the cell adds users: regrind users add",
+        "Wer den Rechner der Zelle betreut, legt Benutzer an: regrind users add",
+        "由单元计算机的管理者添加用户：regrind users add"
+    }
+    Viewer { "viewer", "Betrachter", "查看者" }
+    Quality { "quality", "Qualität", "质量" }
+    OperatorRole { "operator", "Bediener", "操作员" }
+    Engineer { "engineer", "Ingenieur", "工程师" }
     NotHere { "There is nothing at this address.", "Unter dieser Adresse ist nichts.", "此地址没有内容。" }
 }
 
@@ -318,6 +344,16 @@ pub(crate) fn result(result: RunResult) -> Text {
         RunResult::Stopped => Text::WasStopped,
         RunResult::Aborted => Text::WasAborted,
         RunResult::Recovery => Text::Recovery,
+    }
+}
+
+/// The word for what a person may do.
+pub(crate) fn role(role: PageRole) -> Text {
+    match role {
+        PageRole::Viewer => Text::Viewer,
+        PageRole::Quality => Text::Quality,
+        PageRole::Operator => Text::OperatorRole,
+        PageRole::Engineer => Text::Engineer,
     }
 }
 

@@ -20,6 +20,7 @@ use super::guard::{Session, text};
 use super::history::Listed;
 use super::live::{Seen, verdict};
 use super::texts::{self, Language, Text};
+use super::users::Person;
 
 /// A piece of the page of a run, which changes by itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -70,7 +71,7 @@ pub(crate) fn pieces(seen: &Seen, has_control: bool, language: Language) -> [(Pi
 }
 
 /// What the scripts of the page have to know of a run.
-pub(crate) fn state(seen: &Seen, has_control: bool) -> Value {
+pub(crate) fn state(seen: &Seen, session: &Session, has_control: bool) -> Value {
     let live = seen.snapshot.as_deref().filter(|_| seen.answers);
     let cycles: Vec<_> = seen
         .summary
@@ -89,7 +90,7 @@ pub(crate) fn state(seen: &Seen, has_control: bool) -> Value {
         "lost": seen.is_lost(),
         "over": seen.summary.ended.is_some() && !seen.answers,
         "number": live.map(|live| live.number),
-        "can": live.map_or_else(Vec::new, |live| can(live, has_control)),
+        "can": live.map_or_else(Vec::new, |live| can(live, session, has_control)),
         "cycle": live.map(|live| live.cycle),
         "cycles": cycles,
         "touched": measures.map(|progress| [progress.done, progress.total]),
@@ -98,8 +99,8 @@ pub(crate) fn state(seen: &Seen, has_control: bool) -> Value {
     })
 }
 
-/// The orders that make sense now.
-fn can(live: &Snapshot, has_control: bool) -> Vec<&'static str> {
+/// The orders that make sense now, and are for who sits there.
+fn can(live: &Snapshot, session: &Session, has_control: bool) -> Vec<&'static str> {
     let mut can = vec!["hold", "stop", "abort"];
     if is_over(live.state) {
         can.clear();
@@ -113,6 +114,7 @@ fn can(live: &Snapshot, has_control: bool) -> Vec<&'static str> {
         Next::SeeWhetherItStands { .. } if has_control => can.push("over"),
         _ => {}
     }
+    can.retain(|order| session.may(order));
     can
 }
 
@@ -352,26 +354,22 @@ pub(crate) async fn run(
         drop(tokio::time::timeout(std::time::Duration::from_secs(2), looked.changed()).await);
     }
     let seen = looked.borrow().clone();
-    let has_control = page.guard.has_control(&session.0, false);
-    let main = cell(&seen, &id, has_control, language);
-    let token = page.guard.token(&session.0);
-    document(
-        &format!("{} {}", seen.summary.part, seen.summary.name),
-        &Frame { language, token: &token, is_cell: true },
-        main,
-    )
+    let has_control = page.guard.has_control(&session, false);
+    let main = cell(&seen, &id, &session, has_control, language);
+    let title = format!("{} {}", seen.summary.part, seen.summary.name);
+    document(&title, &Frame { language, person: session.person.as_ref(), is_cell: true }, main)
 }
 
 /// The page of a run: the cell while it is on, and what it came to afterwards.
-fn cell(seen: &Seen, id: &str, has_control: bool, language: Language) -> Markup {
+fn cell(seen: &Seen, id: &str, session: &Session, has_control: bool, language: Language) -> Markup {
     let say = |text: Text| text.to(language);
-    let made = pieces(seen, has_control, language);
+    let made = pieces(seen, has_control || !session.may("control"), language);
     let piece = |piece: Piece| {
         let html = made.iter().find(|(made, _)| *made == piece).map_or("", |(_, html)| html);
         maud::PreEscaped(html.to_owned())
     };
-    let data =
-        json!({ "run": id, "state": state(seen, has_control), "colours": colours(), "texts": script_texts(language) });
+    let state = state(seen, session, has_control);
+    let data = json!({ "run": id, "state": state, "colours": colours(), "texts": script_texts(language) });
     html! {
         a .skip href="#orders" { (say(Text::SkipToOrders)) }
         div #old role="alert" hidden {}
@@ -461,7 +459,12 @@ impl Wanted {
 }
 
 /// The list of runs.
-pub(crate) async fn runs(State(page): State<Shared>, Query(wanted): Query<Wanted>, headers: HeaderMap) -> Response {
+pub(crate) async fn runs(
+    State(page): State<Shared>,
+    Extension(session): Extension<Session>,
+    Query(wanted): Query<Wanted>,
+    headers: HeaderMap,
+) -> Response {
     let language = language(&headers);
     let say = |text: Text| text.to(language);
     let history = std::sync::Arc::clone(&page.history);
@@ -491,7 +494,7 @@ pub(crate) async fn runs(State(page): State<Shared>, Query(wanted): Query<Wanted
             }
         }
     };
-    document(say(Text::Runs), &Frame { language, token: "", is_cell: false }, main)
+    document(say(Text::Runs), &Frame { language, person: session.person.as_ref(), is_cell: false }, main)
 }
 
 fn table_of<'a>(runs: impl Iterator<Item = &'a Listed>, language: Language) -> Markup {
@@ -525,6 +528,7 @@ fn table_of<'a>(runs: impl Iterator<Item = &'a Listed>, language: Language) -> M
 /// Two runs side by side.
 pub(crate) async fn compare(
     State(page): State<Shared>,
+    Extension(session): Extension<Session>,
     axum::extract::RawQuery(query): axum::extract::RawQuery,
     headers: HeaderMap,
 ) -> Response {
@@ -563,7 +567,7 @@ pub(crate) async fn compare(
             (maud::PreEscaped(harmless(&json!({ "compared": maps, "colours": colours(), "texts": script_texts(language) }))))
         }
     };
-    document(say(Text::Compare), &Frame { language, token: "", is_cell: true }, main)
+    document(say(Text::Compare), &Frame { language, person: session.person.as_ref(), is_cell: true }, main)
 }
 
 /// The report of a run, as it stands in its folder.
@@ -590,7 +594,7 @@ pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, h
 pub(crate) async fn not_here(headers: HeaderMap) -> Response {
     let language = language(&headers);
     let main = html! { main .list { h1 { "404" } p { (Text::NotHere.to(language)) } } };
-    (StatusCode::NOT_FOUND, document("404", &Frame { language, token: "", is_cell: false }, main)).into_response()
+    (StatusCode::NOT_FOUND, document("404", &Frame { language, person: None, is_cell: false }, main)).into_response()
 }
 
 /// What who has no key is told.
@@ -603,20 +607,39 @@ pub(crate) fn key_needed(status: StatusCode, headers: &HeaderMap) -> Response {
             form method="get" action="/" { label { "key " input name="key" type="password" autocomplete="off"; } " " button { "OK" } }
         }
     };
-    (status, document("Regrind", &Frame { language, token: "", is_cell: false }, main)).into_response()
+    (status, document("Regrind", &Frame { language, person: None, is_cell: false }, main)).into_response()
+}
+
+/// The page at which somebody signs in, and what is said to who could not.
+pub(crate) fn sign_in(status: StatusCode, headers: &HeaderMap, told: Option<Text>) -> Response {
+    let language = language(headers);
+    let say = |text: Text| text.to(language);
+    let main = html! {
+        main .list .sign-in {
+            h1 { (say(Text::SignIn)) }
+            @if let Some(told) = told { p .no role="alert" { (say(told)) } }
+            form method="post" action="/sign-in" {
+                label { (say(Text::UserName)) " " input name="name" autocomplete="username" required maxlength="64" autofocus; }
+                label { (say(Text::Password)) " " input name="password" type="password" autocomplete="current-password" required maxlength="256"; }
+                button { (say(Text::SignIn)) }
+            }
+            p .quiet { (say(Text::WhoMakesUsers)) }
+        }
+    };
+    (status, document(say(Text::SignIn), &Frame { language, person: None, is_cell: false }, main)).into_response()
 }
 
 /// What stands around every page.
 struct Frame<'a> {
     language: Language,
-    /// The token of the orders; empty where none are given.
-    token: &'a str,
+    /// Who has signed in.
+    person: Option<&'a Person>,
     /// Whether maps are drawn on it.
     is_cell: bool,
 }
 
 fn document(title: &str, frame: &Frame, main: Markup) -> Response {
-    let Frame { language, token, is_cell } = *frame;
+    let Frame { language, person, is_cell } = *frame;
     let say = |text: Text| text.to(language);
     let markup = html! {
         (DOCTYPE)
@@ -624,11 +647,11 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
             head {
                 meta charset="utf-8";
                 meta name="viewport" content="width=device-width, initial-scale=1";
-                meta name="regrind-token" content=(token);
                 title { (title) " · Regrind" }
                 link rel="icon" href="/assets/icon.svg";
                 link rel="stylesheet" href="/assets/page.css";
                 script src="/assets/theme.js" {}
+                script src="/assets/post.js" defer {}
                 @if is_cell {
                     script src="/assets/map.js" defer {}
                     script src="/assets/relief.js" defer {}
@@ -639,6 +662,10 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
                 nav {
                     a href="/" { (say(Text::Cell)) } " " a href="/runs" { (say(Text::Runs)) }
                     span .settings {
+                        @if let Some(person) = person {
+                            span .person { (person.name) " · " (say(texts::role(person.role))) } " "
+                            button #sign-out type="button" { (say(Text::SignOut)) } " "
+                        }
                         label { (say(Text::Language)) " "
                             select #language {
                                 @for each in Language::ALL {

@@ -126,12 +126,14 @@ fn channels(colour: u32) -> [u8; 3] {
 mod tests {
     use super::*;
 
+    fn linear(channel: u8) -> f64 {
+        let c = f64::from(channel) / 255.0;
+        if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
+    }
+
     /// CIE L* of an sRGB colour, from 0 to 100.
     fn lightness(colour: [u8; 3]) -> f64 {
-        let [r, g, b] = colour.map(|c| {
-            let c = f64::from(c) / 255.0;
-            if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
-        });
+        let [r, g, b] = colour.map(linear);
         let y = 0.2126 * r + 0.7152 * g + 0.0722 * b;
         if y > 0.008856 { 116.0 * y.cbrt() - 16.0 } else { 903.3 * y }
     }
@@ -143,6 +145,52 @@ mod tests {
             assert!(at(k + 1) < at(k), "red arm at {k}");
             assert!(at(-k - 1) < at(-k), "blue arm at {k}");
             assert!((at(k) - at(-k)).abs() < 5.0, "{k}: {} against {}", at(k), at(-k));
+        }
+    }
+
+    /// How an eye that lacks one kind of cones sees linear sRGB: Machado, Oliveira and Fernandes 2009, table 1, severity 1.
+    const EYES: [(&str, [[f64; 3]; 3]); 3] = [
+        (
+            "protanopia",
+            [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+        ),
+        (
+            "deuteranopia",
+            [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+        ),
+        (
+            "tritanopia",
+            [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+        ),
+    ];
+
+    /// CIE L*a*b* (D65) of a colour as an eye sees it.
+    fn lab(colour: [u8; 3], eye: &[[f64; 3]; 3]) -> [f64; 3] {
+        let times = |m: &[[f64; 3]; 3], v: [f64; 3]| m.map(|row| row[0] * v[0] + row[1] * v[1] + row[2] * v[2]);
+        let seen = times(eye, colour.map(linear)).map(|c| c.clamp(0.0, 1.0));
+        let to_xyz =
+            [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]];
+        let xyz = times(&to_xyz, seen);
+        let f = |v: f64| if v > 216.0 / 24389.0 { v.cbrt() } else { (24389.0 / 27.0 * v + 16.0) / 116.0 };
+        let [x, y, z] = [f(xyz[0] / 0.95047), f(xyz[1]), f(xyz[2] / 1.08883)];
+        [116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)]
+    }
+
+    #[test]
+    fn proud_and_low_material_are_told_apart_by_eyes_that_lack_one_kind_of_cones() {
+        for (name, eye) in &EYES {
+            let at = |arm: f64| lab(ColourMap::Diverging.at(0.5 + 0.5 * arm), eye);
+            for k in 1..=10 {
+                let arm = f64::from(k) / 10.0;
+                let (proud, low) = (at(arm), at(-arm));
+                let apart = (0..3).map(|k| (proud[k] - low[k]).powi(2)).sum::<f64>().sqrt();
+                // 2.3 is just seen; a tenth of the range is told apart by four times that.
+                assert!(apart > 9.2, "{name}, {arm}: {proud:?} against {low:?}, {apart}");
+                for sign in [-1.0, 1.0] {
+                    let (near, far) = (at(sign * (arm - 0.1)), at(sign * arm));
+                    assert!(far[0] < near[0], "{name}: larger is not darker, {near:?} {far:?}");
+                }
+            }
         }
     }
 

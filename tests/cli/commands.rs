@@ -622,3 +622,28 @@ fn names_that_read_otherwise_than_they_are_and_numbers_that_nobody_counts_are_to
         assert!(output.status.code() == Some(2) && said.contains("U+202E") && said.contains(option), "{said}");
     }
 }
+
+#[test]
+fn shells_and_man_know_every_command() {
+    let bench = Bench::new();
+    for (shell, words) in [
+        ("bash", "complete -F _regrind"),
+        ("zsh", "#compdef regrind"),
+        ("fish", "complete -c regrind"),
+        ("powershell", "Register-ArgumentCompleter"),
+    ] {
+        let output = bench.run(&["completions", shell]);
+        let script = text(&output.stdout);
+        assert_eq!(output.status.code(), Some(0));
+        assert!(script.contains(words) && script.contains("register"), "{shell}: {script}");
+    }
+    assert_eq!(bench.run(&["man", "--out", "man"]).status.code(), Some(0));
+    for (page, words) in [
+        ("regrind.1", "Closed\\-loop grinding"),
+        ("regrind-run.1", "\\-\\-part"),
+        ("regrind-audit-verify.1", "Exit codes"),
+    ] {
+        let text = fs::read_to_string(bench.path("man").join(page)).unwrap();
+        assert!(text.contains(words), "{page}: {text}");
+    }
+}

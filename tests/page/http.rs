@@ -2,7 +2,11 @@
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
+use std::sync::Arc;
 use std::time::Duration;
+
+use rustls::pki_types::ServerName;
+use rustls::{ClientConfig, ClientConnection, StreamOwned};
 
 use serde_json::Value;
 
@@ -28,9 +32,24 @@ impl Answer {
 
 /// Sends a request as it stands, and reads the answer to its end.
 pub fn raw(place: &str, request: &[u8]) -> Answer {
-    let mut stream = TcpStream::connect(place).unwrap();
+    asked(connected(place), request)
+}
+
+/// Sends a request over an encrypted line to a host that proves its name.
+pub fn raw_by_tls(place: &str, tls: &Arc<ClientConfig>, name: &str, request: &[u8]) -> Answer {
+    let client = ClientConnection::new(Arc::clone(tls), ServerName::try_from(name.to_owned()).unwrap()).unwrap();
+    asked(StreamOwned::new(client, connected(place)), request)
+}
+
+fn connected(place: &str) -> TcpStream {
+    let stream = TcpStream::connect(place).unwrap();
     stream.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
-    stream.write_all(request).unwrap();
+    stream
+}
+
+fn asked(mut stream: impl Read + Write, request: &[u8]) -> Answer {
+    // A server that does not like the name says so by closing.
+    let _ = stream.write_all(request);
     let mut bytes = Vec::new();
     // A server may close on who says too much.
     let _ = stream.read_to_end(&mut bytes);
@@ -46,13 +65,15 @@ pub struct Visitor {
     pub place: String,
     pub cookies: String,
     pub language: String,
+    /// What it trusts, and the name by which it knows the page, where the line is encrypted.
+    pub tls: Option<(Arc<ClientConfig>, String)>,
 }
 
 impl Visitor {
     /// One that has no key.
     pub fn stranger(url: &str) -> Self {
         let place = url.trim_start_matches("http://").split('/').next().unwrap().to_owned();
-        Self { place, cookies: String::new(), language: "en".into() }
+        Self { place, cookies: String::new(), language: "en".into(), tls: None }
     }
 
     /// One that came by the address with the key.
@@ -66,42 +87,80 @@ impl Visitor {
         visitor
     }
 
+    /// One that signs in with a name and a password; none where that is refused.
+    pub fn signed_in(url: &str, name: &str, password: &str) -> Option<Self> {
+        let visitor = Self::stranger(url);
+        visitor.sign_in(name, password)
+    }
+
+    pub fn sign_in(mut self, name: &str, password: &str) -> Option<Self> {
+        let answer = self.try_to_sign_in(name, password);
+        let cookie = answer.header("set-cookie").first().copied().filter(|_| answer.status == 303)?.to_owned();
+        self.cookies = cookie.split(';').next().unwrap().to_owned();
+        Some(self)
+    }
+
+    pub fn try_to_sign_in(&self, name: &str, password: &str) -> Answer {
+        let escaped = |text: &str| text.bytes().map(|byte| format!("%{byte:02x}")).collect::<String>();
+        let body = format!("name={}&password={}", escaped(name), escaped(password));
+        let form = ("Content-Type", "application/x-www-form-urlencoded");
+        self.post("/sign-in", &[form, ("Origin", &self.origin())], body.as_bytes())
+    }
+
+    /// The name and port by which it asks for the page.
+    pub fn host(&self) -> String {
+        let port = self.place.rsplit(':').next().unwrap();
+        self.tls.as_ref().map_or(self.place.clone(), |(_, name)| format!("{name}:{port}"))
+    }
+
+    pub fn origin(&self) -> String {
+        let scheme = if self.tls.is_some() { "https" } else { "http" };
+        format!("{scheme}://{}", self.host())
+    }
+
+    fn ask(&self, request: &[u8]) -> Answer {
+        match &self.tls {
+            Some((tls, name)) => raw_by_tls(&self.place, tls, name, request),
+            None => raw(&self.place, request),
+        }
+    }
+
     pub fn get(&self, path: &str) -> Answer {
-        let Self { place, cookies, language } = self;
+        let (Self { cookies, language, .. }, host) = (self, self.host());
         let request = format!(
-            "GET {path} HTTP/1.1\r\nHost: {place}\r\nCookie: {cookies}\r\nAccept-Language: {language}\r\nConnection: close\r\n\r\n"
+            "GET {path} HTTP/1.1\r\nHost: {host}\r\nCookie: {cookies}\r\nAccept-Language: {language}\r\nConnection: close\r\n\r\n"
         );
-        raw(place, request.as_bytes())
+        self.ask(request.as_bytes())
     }
 
     pub fn post(&self, path: &str, headers: &[(&str, &str)], body: &[u8]) -> Answer {
-        let Self { place, cookies, .. } = self;
+        let (Self { cookies, .. }, host) = (self, self.host());
         let more: String = headers.iter().map(|(name, value)| format!("{name}: {value}\r\n")).collect();
         let length = body.len();
         let head = format!(
-            "POST {path} HTTP/1.1\r\nHost: {place}\r\nCookie: {cookies}\r\n{more}Content-Length: {length}\r\nConnection: close\r\n\r\n"
+            "POST {path} HTTP/1.1\r\nHost: {host}\r\nCookie: {cookies}\r\n{more}Content-Length: {length}\r\nConnection: close\r\n\r\n"
         );
-        raw(place, &[head.as_bytes(), body].concat())
+        self.ask(&[head.as_bytes(), body].concat())
     }
 
-    /// The token that stands in a page.
-    pub fn token(&self, run: &str) -> String {
-        let page = self.get(&format!("/runs/{run}")).text();
-        let begin = page.split("name=\"regrind-token\" content=\"").nth(1).expect("a page with a token");
-        begin.split('"').next().unwrap().to_owned()
+    /// A token for the next order.
+    pub fn token(&self) -> String {
+        let answer = self.get("/token");
+        assert_eq!(answer.status, 200, "{answer:?}");
+        answer.text()
     }
 
     /// Gives an order as the page does; returns whether it was taken, and what was said to it.
     pub fn order(&self, run: &str, order: &Value) -> (u16, bool, String) {
-        self.give(&format!("/runs/{run}/orders"), run, order.to_string().as_bytes())
+        self.give(&format!("/runs/{run}/orders"), order.to_string().as_bytes())
     }
 
     pub fn take_control(&self, run: &str) -> (u16, bool, String) {
-        self.give(&format!("/runs/{run}/control"), run, b"")
+        self.give(&format!("/runs/{run}/control"), b"")
     }
 
-    fn give(&self, path: &str, run: &str, body: &[u8]) -> (u16, bool, String) {
-        let (origin, token) = (format!("http://{}", self.place), self.token(run));
+    fn give(&self, path: &str, body: &[u8]) -> (u16, bool, String) {
+        let (origin, token) = (self.origin(), self.token());
         let answer = self.post(path, &[("Origin", &origin), ("X-Regrind-Token", &token)], body);
         let said: Value = serde_json::from_slice(&answer.body).unwrap_or_else(|_| panic!("{answer:?}"));
         (answer.status, said["accepted"] == true, said["message"].as_str().unwrap_or_default().to_owned())

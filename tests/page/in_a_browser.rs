@@ -3,8 +3,8 @@
 use serde_json::json;
 
 use crate::browser::{Browser, Tab};
-use crate::program::{changed, root};
-use crate::{SPEED, Shown};
+use crate::program::{Running, changed, regrind, root, small_recipe};
+use crate::{SPEED, Shown, serve_with, users};
 
 const SCREEN: [u32; 2] = [1024, 768];
 
@@ -118,6 +118,80 @@ fn the_keyboard_alone_aborts_a_run() {
     tab.press(&mut browser, "Enter", 13, "\r");
     tab.until(&mut browser, &banner("ABORTED"));
     assert_eq!(shown.run.end().0, 3);
+}
+
+#[test]
+#[ignore = "needs a browser: Debian package chromium"]
+fn somebody_signs_in_over_tls_and_sees_what_their_role_may_order() {
+    let home = tempfile::tempdir().unwrap();
+    for (name, role) in [("V. Guest", "viewer"), ("A. Smith", "operator")] {
+        users::add(home.path(), name, role, users::PASSWORD);
+    }
+    let (certificate, key, _) = users::certificate(home.path());
+    let recipe = small_recipe(home.path(), 20.0).display().to_string();
+    let mut run = Running::new(regrind(&["run", &recipe, "--cell", "sim"], home.path()));
+    run.line("grinding", |line| line.contains("grinding"));
+    let arguments = ["--listen", "127.0.0.1:0", "--certificate", &certificate, "--key", &key, "--users", "users.toml"];
+    let (_page, url) = serve_with(home.path(), &arguments);
+    let url = url.replace("cell-2.example", "127.0.0.1");
+    let mut browser = Browser::start(home.path());
+    let tab = browser.open("about:blank", SCREEN);
+    // The certificate is one of the test's own making.
+    tab.send(&mut browser, "Security.setIgnoreCertificateErrors", json!({ "ignore": true }));
+    tab.send(&mut browser, "Page.navigate", json!({ "url": url }));
+    let sign_in = |browser: &mut Browser, name: &str, password: &str| {
+        tab.until(browser, "document.querySelector('[name=password]')");
+        let fill = |field: &str, value: &str| format!("document.querySelector('[name={field}]').value = '{value}';");
+        tab.read(browser, &(fill("name", name) + &fill("password", password)));
+        tab.click(browser, "main form button");
+    };
+    sign_in(&mut browser, "V. Guest", "not this one");
+    tab.until(&mut browser, "document.querySelector('.no')?.innerText.includes('do not belong together')");
+    sign_in(&mut browser, "V. Guest", users::PASSWORD);
+    tab.until(&mut browser, &banner("RUNNING"));
+    let orders = "[...document.querySelectorAll('.orders [data-order]')]";
+    assert_eq!(tab.read(&mut browser, &format!("{orders}.every((button) => button.disabled)")), true);
+    tab.click(&mut browser, "#sign-out");
+    sign_in(&mut browser, "A. Smith", users::PASSWORD);
+    tab.until(&mut browser, &banner("RUNNING"));
+    assert!(tab.read(&mut browser, "document.querySelector('nav').innerText").as_str().unwrap().contains("A. Smith"));
+    tab.click(&mut browser, "[data-order=abort]");
+    tab.until(&mut browser, &banner("ABORTED"));
+    assert_eq!(run.end().0, 3);
+}
+
+#[test]
+#[ignore = "needs a browser and axe-core: REGRIND_AXE names its axe.min.js"]
+fn axe_finds_nothing_serious_in_any_appearance() {
+    let axe = std::fs::read_to_string(std::env::var("REGRIND_AXE").expect("REGRIND_AXE names axe.min.js")).unwrap();
+    let home = tempfile::tempdir().unwrap();
+    let mut shown = Shown::begin(home.path(), 200.0);
+    assert_eq!(shown.run.end().0, 0);
+    users::add(home.path(), "A. Smith", "operator", users::PASSWORD);
+    let (_page, for_users) = serve_with(home.path(), &["--listen", "127.0.0.1:0", "--users", "users.toml"]);
+    let mut browser = Browser::start(home.path());
+    let place = shown.url.split("/?").next().unwrap().to_owned();
+    let (run, runs) = (shown.url.clone(), format!("{place}/runs"));
+    let compared = format!("{place}/compare?run={0}&run={0}", shown.id);
+    for (url, there) in [
+        (&run, "document.querySelectorAll('#cycle option').length > 0"),
+        (&runs, "document.querySelector('main table')"),
+        (&compared, "document.querySelectorAll('.compare section').length == 2"),
+        (&for_users, "document.querySelector('[name=password]')"),
+    ] {
+        let tab = browser.open(url, SCREEN);
+        tab.until(&mut browser, there);
+        tab.read(&mut browser, &format!("{axe};0"));
+        for theme in ["light", "dark", "contrast"] {
+            tab.read(&mut browser, &format!("document.documentElement.dataset.theme = '{theme}'"));
+            let found = tab.read(
+                &mut browser,
+                "axe.run().then((found) => [found.passes.length, found.violations.filter((of) => ['serious', 'critical'].includes(of.impact))\
+                 .map((of) => `${of.id}: ${of.nodes.map((node) => node.html).join(' ')}`)])",
+            );
+            assert!(found[0].as_u64() > Some(5) && found[1] == json!([]), "{url}, {theme}: {found}");
+        }
+    }
 }
 
 /// The pictures in the documentation, as the page is now.

@@ -12,6 +12,7 @@ mod browser;
 mod http;
 mod in_a_browser;
 mod strangers;
+mod users;
 mod views;
 
 use std::path::{Path, PathBuf};
@@ -57,7 +58,11 @@ impl Shown {
 
 /// Serves the page of the runs below a folder; returns the address that opens it.
 fn serve(home: &Path) -> (Running, String) {
-    let mut page = Running::new(regrind(&["serve", "--runs", "runs", "--listen", "127.0.0.1:0"], home));
+    serve_with(home, &["--listen", "127.0.0.1:0"])
+}
+
+fn serve_with(home: &Path, arguments: &[&str]) -> (Running, String) {
+    let mut page = Running::new(regrind(&[&["serve", "--runs", "runs"], arguments].concat(), home));
     let line = page.line("address of the page", |line| line.starts_with("page "));
     let url = line.trim_start_matches("page").trim().to_owned();
     (page, url)

@@ -91,7 +91,6 @@
 
   // ---- orders ----
 
-  const token = document.querySelector('meta[name="regrind-token"]').content;
   const bodies = {
     hold: () => ({ order: "hold", reason: "" }),
     resume: () => ({ order: "resume", reason: "", seen: state.number }),
@@ -112,9 +111,8 @@
     }
     const url = order === "control" ? `${base}/control` : `${base}/orders`;
     const body = order === "control" ? "" : JSON.stringify(bodies[order](button));
-    const headers = { "X-Regrind-Token": token, "Content-Type": "application/json" };
     try {
-      const answer = await fetch(url, { method: "POST", headers, body });
+      const answer = await regrindPost(url, body);
       const { accepted, message } = await answer.json();
       answered(accepted, `${button.textContent.trim()}: ${message}`);
     } catch (error) {

@@ -1,0 +1,77 @@
+//! `regrind completions` and `regrind man`: what a shell and `man` know of the program, made of the same words as `--help`.
+
+use std::path::PathBuf;
+
+use clap::{Args, Command, CommandFactory};
+use clap_complete::Shell;
+use clap_mangen::Man;
+use regrind::formats::{ResultFolder, write_atomic};
+
+use super::Outcome;
+use super::failure::Failure;
+
+/// Print what completes the commands in a shell
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Examples:
+  regrind completions bash > ~/.local/share/bash-completion/completions/regrind
+  regrind completions zsh > ~/.zfunc/_regrind
+  regrind completions powershell >> $PROFILE
+
+Exit codes: 0 printed; 2 bad arguments.")]
+pub(super) struct Completions {
+    /// The shell
+    #[arg(value_enum)]
+    shell: Shell,
+}
+
+/// Write the pages of the manual, one a command, for `man`
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Example:
+  regrind man --out ~/.local/share/man/man1
+  man regrind-run
+
+Exit codes: 0 written; 2 the folder cannot be written.")]
+pub(super) struct Pages {
+    /// Folder to write to; made if it is not there
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+pub(super) fn completions(arguments: &Completions) -> Result<Outcome, Failure> {
+    let mut script = Vec::new();
+    clap_complete::generate(arguments.shell, &mut super::Arguments::command(), "regrind", &mut script);
+    super::print(&String::from_utf8_lossy(&script))?;
+    Ok(Outcome::Accepted)
+}
+
+pub(super) fn pages(arguments: &Pages) -> Result<Outcome, Failure> {
+    let folder = ResultFolder::prepare(&arguments.out)?;
+    for (name, page) in manual() {
+        write_atomic(&arguments.out.join(name), &page)?;
+    }
+    folder.keep();
+    Ok(Outcome::Accepted)
+}
+
+/// The page of each command that is shown, by its file name.
+fn manual() -> Vec<(String, Vec<u8>)> {
+    let mut program = super::Arguments::command().disable_help_subcommand(true);
+    program.build();
+    let mut pages = Vec::new();
+    gather(&program, "regrind", &mut pages);
+    pages
+}
+
+fn gather(command: &Command, name: &str, pages: &mut Vec<(String, Vec<u8>)>) {
+    let named = command.clone().name(name.to_owned());
+    let mut page = Vec::new();
+    // Into memory: that cannot fail.
+    if Man::new(named).render(&mut page).is_ok() {
+        pages.push((format!("{name}.1"), page));
+    }
+    for below in command.get_subcommands().filter(|below| !below.is_hide_set() && below.get_name() != "help") {
+        gather(below, &format!("{name}-{}", below.get_name()), pages);
+    }
+}

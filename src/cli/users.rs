@@ -1,0 +1,117 @@
+//! `regrind users`: who may sign in to the page from another computer, and as what.
+
+use std::io::{self, BufRead, IsTerminal};
+use std::path::{Path, PathBuf};
+
+use clap::{Args, Subcommand};
+use regrind::formats::write_private;
+use regrind_page::{PageRole, Users, UsersError};
+use serde_json::json;
+
+use super::Outcome;
+use super::failure::Failure;
+
+/// Keep the list of who may sign in to the page of the cell
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Roles: viewer looks; quality looks, and may hold; operator gives every order, but goes on from no alarm that a process engineer clears;
+engineer gives every order. The list has of a password only what proves it. A change counts at once, for a page that is open too.
+
+Example:
+  regrind users add \"A. Smith\" --role operator
+  regrind serve --listen 0.0.0.0:7373 --certificate cell.pem --key cell.key --users users.toml
+
+Exit codes: 0 done; 2 bad arguments, a password that is too short, or a list that cannot be read or written.")]
+pub(super) struct Arguments {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Subcommand, Debug)]
+enum What {
+    /// Add a person, or give one who is there another role and password
+    Add {
+        /// The name by which they sign in, and which is on record with their orders
+        #[arg(value_name = "NAME")]
+        name: String,
+        /// What they may do: viewer, quality, operator or engineer
+        #[arg(long)]
+        role: PageRole,
+        #[command(flatten)]
+        list: Kept,
+    },
+    /// Take a person off the list
+    Remove {
+        /// Their name
+        #[arg(value_name = "NAME")]
+        name: String,
+        #[command(flatten)]
+        list: Kept,
+    },
+    /// Tell who is on the list
+    List {
+        #[command(flatten)]
+        list: Kept,
+        /// Print JSON instead of words
+        #[arg(long)]
+        json: bool,
+    },
+}
+
+#[derive(Args, Debug)]
+struct Kept {
+    /// The list
+    #[arg(long = "users", value_name = "FILE", default_value = "users.toml")]
+    path: PathBuf,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    match &arguments.what {
+        What::Add { name, role, list } => add(name, *role, &list.path)?,
+        What::Remove { name, list } => remove(name, &list.path)?,
+        What::List { list, json } => tell(&Users::read(&list.path)?, *json)?,
+    }
+    Ok(Outcome::Accepted)
+}
+
+fn add(name: &str, role: PageRole, path: &Path) -> Result<(), Failure> {
+    let mut users = match Users::read(path) {
+        Err(UsersError::Unreadable { source, .. }) if source.kind() == io::ErrorKind::NotFound => Users::default(),
+        read => read?,
+    };
+    users.add(name, role, &password(name)?)?;
+    write_private(path, users.to_text().as_bytes())?;
+    super::print(&format!("{} may sign in as {role}; list in {}\n", name.trim(), path.display()))
+}
+
+fn remove(name: &str, path: &Path) -> Result<(), Failure> {
+    let mut users = Users::read(path)?;
+    if !users.remove(name) {
+        return Err(Failure::NoUser { name: name.to_owned(), path: path.to_owned() });
+    }
+    write_private(path, users.to_text().as_bytes())?;
+    super::print(&format!("{name} may sign in no more\n"))
+}
+
+fn tell(users: &Users, as_json: bool) -> Result<(), Failure> {
+    if as_json {
+        let people: Vec<_> = users.people().map(|of| json!({ "name": of.name, "role": of.role })).collect();
+        return super::print_json(&people);
+    }
+    users.people().try_for_each(|of| super::print(&format!("{:9}  {}\n", of.role, of.name)))
+}
+
+/// Asks for a password, twice and unseen; out of a pipe it is the first line.
+fn password(name: &str) -> Result<String, Failure> {
+    if !io::stdin().is_terminal() {
+        let mut line = String::new();
+        io::stdin().lock().read_line(&mut line).map_err(Failure::Terminal)?;
+        return Ok(line.trim_end_matches(['\r', '\n']).to_owned());
+    }
+    let terminal = console::Term::stderr();
+    let asked = |prompt: String| {
+        terminal.write_str(&prompt).and_then(|()| terminal.read_secure_line()).map_err(Failure::Terminal)
+    };
+    let first = asked(format!("password for {name}: "))?;
+    if asked("once more: ".into())? == first { Ok(first) } else { Err(Failure::NotAlike) }
+}

@@ -1,0 +1,91 @@
+//! What lets other computers in: the certificate of the page, and the names that it goes by.
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use thiserror::Error;
+use tokio::net::TcpStream;
+use tokio_rustls::TlsAcceptor;
+use tokio_rustls::rustls::ServerConfig;
+use tokio_rustls::rustls::crypto::ring;
+use tokio_rustls::rustls::pki_types::pem::PemObject;
+use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer, ServerName};
+use tokio_rustls::rustls::version::TLS13;
+use tokio_rustls::server::TlsStream;
+use webpki::EndEntityCert;
+
+/// What is wrong with a certificate or its key.
+#[derive(Debug, Error)]
+#[expect(missing_docs, reason = "the messages tell them")]
+pub enum TlsError {
+    #[error("{}: no certificate in PEM can be read from it: {what}", .path.display())]
+    Certificate { path: PathBuf, what: String },
+    #[error("{}: no private key in PEM can be read from it: {what}", .path.display())]
+    Key { path: PathBuf, what: String },
+    #[error("{}: other users of this computer may read the key (mode {mode:o}); it is for its owner only: chmod 600 {}", .path.display(), .path.display())]
+    KeyIsOpen { path: PathBuf, mode: u32 },
+    #[error("the certificate {} and the key {} cannot be used: {what}", .certificate.display(), .key.display())]
+    Unfit { certificate: PathBuf, key: PathBuf, what: String },
+}
+
+/// The certificate of a page, ready to be shown.
+#[derive(Clone)]
+pub struct Tls {
+    acceptor: TlsAcceptor,
+    /// That of the page itself; those behind it belong to who signed it.
+    certificate: CertificateDer<'static>,
+}
+
+impl Tls {
+    /// Reads a certificate (with those of who signed it behind it) and its private key, both in PEM. TLS 1.3 only: every browser since
+    /// 2018 speaks it.
+    ///
+    /// # Errors
+    /// Files that cannot be read or hold none, a key that others may read, and two that do not belong together.
+    pub fn read(certificate: &Path, key: &Path) -> Result<Self, TlsError> {
+        let unread = |what: String| TlsError::Certificate { path: certificate.to_owned(), what };
+        let chain = CertificateDer::pem_file_iter(certificate).and_then(Iterator::collect);
+        let chain: Vec<CertificateDer<'static>> = chain.map_err(|error| unread(error.to_string()))?;
+        let Some(first) = chain.first().cloned() else { return Err(unread("there is none in it".into())) };
+        let secret = secret(key)?;
+        let unfit = |what: String| TlsError::Unfit { certificate: certificate.to_owned(), key: key.to_owned(), what };
+        EndEntityCert::try_from(&first).map_err(|error| unfit(error.to_string()))?;
+        let config = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
+            .with_protocol_versions(&[&TLS13])
+            .and_then(|config| config.with_no_client_auth().with_single_cert(chain, secret));
+        let mut config = config.map_err(|error| unfit(error.to_string()))?;
+        config.alpn_protocols = vec![b"http/1.1".to_vec()];
+        Ok(Self { acceptor: TlsAcceptor::from(Arc::new(config)), certificate: first })
+    }
+
+    /// Whether the certificate is for a name or an address: no browser shows the page by another.
+    pub(crate) fn is_for(&self, host: &str) -> bool {
+        let host = host.trim_start_matches('[').trim_end_matches(']');
+        let (Ok(name), Ok(certificate)) = (ServerName::try_from(host), EndEntityCert::try_from(&self.certificate))
+        else {
+            return false;
+        };
+        certificate.verify_is_valid_for_subject_name(&name).is_ok()
+    }
+
+    /// The first name that the certificate is for, unless it is for many at once.
+    pub(crate) fn name(&self) -> Option<String> {
+        let certificate = EndEntityCert::try_from(&self.certificate).ok()?;
+        certificate.valid_dns_names().find(|name| !name.contains('*')).map(str::to_owned)
+    }
+
+    pub(crate) async fn accept(&self, stream: TcpStream) -> io::Result<TlsStream<TcpStream>> {
+        self.acceptor.accept(stream).await
+    }
+}
+
+/// Reads a private key that nobody else may read.
+fn secret(path: &Path) -> Result<PrivateKeyDer<'static>, TlsError> {
+    let unread = |what: String| TlsError::Key { path: path.to_owned(), what };
+    let found = std::fs::metadata(path).map_err(|error| unread(error.to_string()))?;
+    if let Some(mode) = super::users::open_to_others(&found) {
+        return Err(TlsError::KeyIsOpen { path: path.to_owned(), mode });
+    }
+    PrivateKeyDer::from_pem_file(path).map_err(|error| unread(error.to_string()))
+}

@@ -1,0 +1,288 @@
+//! Who may sign in to the page, and as what: a file with a line a person, which keeps of a password only what proves it (Argon2id).
+
+use std::fmt::{self, Display, Formatter};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+use std::sync::{Mutex, PoisonError};
+use std::time::SystemTime;
+
+use argon2::Argon2;
+use argon2::password_hash::phc::PasswordHash;
+use argon2::password_hash::{PasswordHasher, PasswordVerifier};
+use regrind_document::misleading;
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// Said in the first lines of the file, for who finds it.
+const FIRST_LINES: &str = "\
+# Who may sign in to the page of this cell. `regrind users` keeps it. Of a password it has only what proves it, which is still for
+# nobody else: who has it may try passwords as fast as a computer can.
+";
+/// Longest name of a person, in characters.
+const LONGEST_NAME: usize = 64;
+/// Lengths of a password, in bytes: a shorter one is guessed, a longer one is no password.
+const SHORTEST_PASSWORD: usize = 10;
+const LONGEST_PASSWORD: usize = 256;
+/// More is no list of the users of a cell.
+const MOST_BYTES: u64 = 1 << 20;
+
+/// What a person may do at the page.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PageRole {
+    /// Looks.
+    Viewer,
+    /// Looks, and holds a cell whose figures are not right.
+    Quality,
+    /// Gives every order, but goes on from no alarm that a process engineer clears.
+    Operator,
+    /// Gives every order.
+    Engineer,
+}
+
+impl PageRole {
+    /// All of them, from who may least.
+    pub const ALL: [Self; 4] = [Self::Viewer, Self::Quality, Self::Operator, Self::Engineer];
+
+    /// The word for it in the file and on the command line.
+    pub fn name(self) -> &'static str {
+        ["viewer", "quality", "operator", "engineer"][self as usize]
+    }
+
+    /// Whether an order of that name is for this role.
+    pub(crate) fn may(self, order: &str) -> bool {
+        match self {
+            Self::Viewer => false,
+            Self::Quality => order == "hold",
+            Self::Operator | Self::Engineer => true,
+        }
+    }
+}
+
+impl Display for PageRole {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+impl FromStr for PageRole {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let found = Self::ALL.into_iter().find(|role| role.name() == text);
+        found.ok_or_else(|| "the roles are viewer, quality, operator and engineer".to_owned())
+    }
+}
+
+/// Somebody who has signed in.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Person {
+    /// The name by which they sign in, and which is on record with their orders.
+    pub name: String,
+    /// What they may do.
+    pub role: PageRole,
+}
+
+impl Display for Person {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        write!(f, "{} ({})", self.name, self.role)
+    }
+}
+
+/// What is wrong with the file of the users, or with what was to become of it.
+#[derive(Debug, Error)]
+#[expect(missing_docs, reason = "the messages tell them")]
+pub enum UsersError {
+    #[error("{}: the list of users cannot be read: {source}; make one: regrind users add NAME --role operator", .path.display())]
+    Unreadable { path: PathBuf, source: io::Error },
+    #[error("{}: other users of this computer may read it (mode {mode:o}); it is for its owner only: chmod 600 {}", .path.display(), .path.display())]
+    Open { path: PathBuf, mode: u32 },
+    #[error("{}: no list of users: {what}", .path.display())]
+    Broken { path: PathBuf, what: String },
+    #[error(
+        "the name of a user has 1 to {LONGEST_NAME} characters, none of them a control character or one that turns what is read"
+    )]
+    Name,
+    #[error("the password has {found} bytes; it needs {SHORTEST_PASSWORD} to {LONGEST_PASSWORD}")]
+    Password { found: usize },
+    #[error("the password cannot be made a proof of: {0}")]
+    Hash(String),
+}
+
+/// The file as it is written.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Written {
+    #[serde(default)]
+    user: Vec<User>,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct User {
+    name: String,
+    role: PageRole,
+    /// What proves the password, as a PHC string.
+    proof: String,
+}
+
+/// The people who may sign in.
+#[derive(Clone, Debug, Default)]
+pub struct Users {
+    users: Vec<User>,
+}
+
+impl Users {
+    /// Reads a list of users.
+    ///
+    /// # Errors
+    /// A file that is not there, that others may read, or that is no such list.
+    pub fn read(path: &Path) -> Result<Self, UsersError> {
+        let failed = |source| UsersError::Unreadable { path: path.to_owned(), source };
+        let found = std::fs::metadata(path).map_err(failed)?;
+        let broken = |what: String| UsersError::Broken { path: path.to_owned(), what };
+        if !found.is_file() || found.len() > MOST_BYTES {
+            return Err(broken("it is no small file".into()));
+        }
+        if let Some(mode) = open_to_others(&found) {
+            return Err(UsersError::Open { path: path.to_owned(), mode });
+        }
+        Self::parse(&std::fs::read_to_string(path).map_err(failed)?).map_err(broken)
+    }
+
+    fn parse(text: &str) -> Result<Self, String> {
+        let Written { user: users } = toml::from_str(text).map_err(|error| error.to_string())?;
+        for (at, user) in users.iter().enumerate() {
+            let wrong = |what: &str| Err(format!("user {} ({:?}): {what}", at + 1, user.name));
+            if named(&user.name).is_err() {
+                return wrong("no name for a user");
+            }
+            if users[..at].iter().any(|other| other.name == user.name) {
+                return wrong("the name is there twice");
+            }
+            if PasswordHash::new(&user.proof).is_err() {
+                return wrong("its proof is none; set the password anew: regrind users add");
+            }
+        }
+        Ok(Self { users })
+    }
+
+    /// The file that says it.
+    pub fn to_text(&self) -> String {
+        let written = Written { user: self.users.clone() };
+        // Strings alone: that is always TOML.
+        format!("{FIRST_LINES}\n{}", toml::to_string(&written).unwrap_or_default())
+    }
+
+    /// Adds a person, or gives one who is there another password and role.
+    ///
+    /// # Errors
+    /// What is no name, and a password that is too short or too long.
+    pub fn add(&mut self, name: &str, role: PageRole, password: &str) -> Result<(), UsersError> {
+        let name = named(name)?;
+        if !(SHORTEST_PASSWORD..=LONGEST_PASSWORD).contains(&password.len()) {
+            return Err(UsersError::Password { found: password.len() });
+        }
+        let proof = Argon2::default().hash_password(password.as_bytes());
+        let proof = proof.map_err(|error| UsersError::Hash(error.to_string()))?.to_string();
+        self.users.retain(|user| user.name != name);
+        self.users.push(User { name, role, proof });
+        self.users.sort_by(|a, b| a.name.cmp(&b.name));
+        Ok(())
+    }
+
+    /// Takes a person off the list; returns whether they were on it.
+    pub fn remove(&mut self, name: &str) -> bool {
+        let before = self.users.len();
+        self.users.retain(|user| user.name != name);
+        self.users.len() < before
+    }
+
+    /// Everybody on the list, by name.
+    pub fn people(&self) -> impl Iterator<Item = Person> + '_ {
+        self.users.iter().map(|User { name, role, .. }| Person { name: name.clone(), role: *role })
+    }
+
+    /// Who signs in with a name and a password; none where they do not belong together. Takes some hundredths of a second, for a name
+    /// that is not there as well: who guesses learns nothing of either.
+    fn signs_in(&self, name: &str, password: &str) -> Option<Proven> {
+        let user = self.users.iter().find(|user| user.name == name);
+        let proof = user.or(self.users.first()).and_then(|user| PasswordHash::new(&user.proof).ok())?;
+        let is_proven = Argon2::default().verify_password(password.as_bytes(), &proof).is_ok();
+        user.filter(|_| is_proven).map(|user| Proven(user.clone()))
+    }
+}
+
+/// A line of the list, whose person gave the password that goes with it.
+#[derive(Clone, Debug)]
+pub(crate) struct Proven(User);
+
+impl Proven {
+    pub(crate) fn person(&self) -> Person {
+        Person { name: self.0.name.clone(), role: self.0.role }
+    }
+}
+
+fn named(name: &str) -> Result<String, UsersError> {
+    let name = name.trim();
+    let fits = (1..=LONGEST_NAME).contains(&name.chars().count());
+    if fits && misleading(name).is_none() { Ok(name.to_owned()) } else { Err(UsersError::Name) }
+}
+
+#[cfg(unix)]
+pub(crate) fn open_to_others(found: &std::fs::Metadata) -> Option<u32> {
+    use std::os::unix::fs::MetadataExt;
+    Some(found.mode() & 0o777).filter(|mode| mode & 0o077 != 0)
+}
+
+/// Elsewhere who may read a file is a matter of its folder: that of the user is theirs.
+#[cfg(not(unix))]
+pub(crate) fn open_to_others(_: &std::fs::Metadata) -> Option<u32> {
+    None
+}
+
+/// When a file changed last, and how long it is; none where it is not there.
+type Stamp = Option<(SystemTime, u64)>;
+
+/// A list of users that is read again when it changes: who is taken off it, or has another role or password, is out at once.
+pub struct UsersFile {
+    path: PathBuf,
+    read: Mutex<(Stamp, Users)>,
+}
+
+impl UsersFile {
+    /// Opens a list.
+    ///
+    /// # Errors
+    /// Those of [`Users::read`].
+    pub fn open(path: &Path) -> Result<Self, UsersError> {
+        let read = (changed(path), Users::read(path)?);
+        Ok(Self { path: path.to_owned(), read: Mutex::new(read) })
+    }
+
+    /// The list as it stands. One that cannot be read has nobody on it.
+    fn now(&self) -> Users {
+        let at = changed(&self.path);
+        let mut read = self.read.lock().unwrap_or_else(PoisonError::into_inner);
+        if at.is_none() || read.0 != at {
+            *read = (at, Users::read(&self.path).unwrap_or_default());
+        }
+        read.1.clone()
+    }
+
+    /// Who signs in with a name and a password. Blocks for some hundredths of a second.
+    pub(crate) fn signs_in(&self, name: &str, password: &str) -> Option<Proven> {
+        self.now().signs_in(name, password)
+    }
+
+    /// Whether a line is still on the list as it was.
+    pub(crate) fn has(&self, Proven(was): &Proven) -> bool {
+        self.now().users.contains(was)
+    }
+}
+
+fn changed(path: &Path) -> Stamp {
+    let found = std::fs::metadata(path).ok()?;
+    Some((found.modified().ok()?, found.len()))
+}
