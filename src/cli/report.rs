@@ -1,38 +1,55 @@
-//! `regrind report`: one HTML file that tells a run.
+//! `regrind report`: one HTML file that tells a run, and its results as other systems take them.
 
 use std::path::PathBuf;
 
 use clap::Args;
-use regrind::report::write_run_report;
+use regrind::report::{ResultsFormat, write_run_report, write_run_results};
 
 use super::Outcome;
 use super::control::folder_of;
 use super::failure::Failure;
 
-/// Write the report of a run: one HTML file that opens without a network
+/// Write the report of a run: one HTML file that opens without a network; its results as QIF or DFQ
 #[derive(Args, Debug)]
 #[command(after_help = "\
 RUN is the folder of a run; without it, the newest under runs/. The record is proven first; the report is RUN/report.html.
+Results for other systems hold each measurement with its figures, limits, uncertainties and verdict.
 
-Example:
+Examples:
   regrind report runs/freeform-mirror-20260704T120000Z
+  regrind report runs/freeform-mirror-20260704T120000Z --qif --dfq=/srv/qdas/part-17.dfq
 
-Exit codes: 0 written; 1 the record is broken; 2 no such run, no record in it, or the folder cannot be written.")]
+Exit codes: 0 written; 1 the record is broken; 2 no such run, no record in it, nothing measured (with --qif or --dfq), or a file
+cannot be written.")]
 pub(super) struct Arguments {
     /// Folder of the run
     #[arg(value_name = "RUN")]
     run: Option<PathBuf>,
+    /// Write the results as QIF 3.0 too, to FILE or to RUN/results.qif
+    #[arg(long, value_name = "FILE", num_args = 0..=1, require_equals = true)]
+    qif: Option<Option<PathBuf>>,
+    /// Write the results as Q-DAS ASCII too, to FILE or to RUN/results.dfq
+    #[arg(long, value_name = "FILE", num_args = 0..=1, require_equals = true)]
+    dfq: Option<Option<PathBuf>>,
     /// Print JSON instead of words
     #[arg(long)]
     json: bool,
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let path = write_run_report(&folder_of(arguments.run.as_deref())?).map_err(Failure::Report)?;
+    let folder = folder_of(arguments.run.as_deref())?;
+    let mut written = vec![("report", write_run_report(&folder).map_err(Failure::Report)?)];
+    let wanted = [("qif", ResultsFormat::Qif, &arguments.qif), ("dfq", ResultsFormat::Dfq, &arguments.dfq)];
+    for (key, format, path) in wanted {
+        if let Some(path) = path {
+            written.push((key, write_run_results(&folder, format, path.as_deref()).map_err(Failure::Report)?));
+        }
+    }
     if arguments.json {
-        super::print_json(&serde_json::json!({ "report": path }))?;
+        let named = written.into_iter().map(|(key, path)| (key.to_owned(), serde_json::json!(path))).collect();
+        super::print_json(&serde_json::Value::Object(named))?;
     } else {
-        super::print(&format!("{}\n", path.display()))?;
+        super::print(&written.iter().map(|(_, path)| format!("{}\n", path.display())).collect::<String>())?;
     }
     Ok(Outcome::Accepted)
 }

@@ -8,6 +8,7 @@
 //!
 //!  records of a run -> told --------> words ---------> a line for each record
 //!                        +----------> story ---------> the report of the run, HTML with its maps
+//!                                       +------------> its results for other systems: QIF, Q-DAS ASCII
 //! ```
 //!
 //! A figure is a plain value until it is saved, and the same figure gives the same bytes. Frame: maps are drawn over x and y
@@ -16,12 +17,15 @@
 mod axis;
 mod colour;
 mod course;
+mod dfq;
 mod heat_map;
 mod maps;
 mod means;
 mod plot;
 mod ply;
+mod qif;
 mod raster;
+mod results;
 mod run;
 mod states;
 mod story;
@@ -29,6 +33,7 @@ mod summary;
 mod svg;
 mod told;
 mod words;
+mod xml;
 
 use std::path::Path;
 
@@ -41,6 +46,7 @@ pub use colour::ColourMap;
 pub use heat_map::HeatMap;
 pub use plot::{Axis, Plot, Series};
 pub use ply::{coloured_ply, save_coloured_ply};
+pub use results::{RUN_DFQ, RUN_QIF, ResultsFormat, run_results, write_run_results};
 pub use run::{RUN_REPORT, run_report, write_run_report};
 pub use states::state_picture;
 pub use summary::{CycleSummary, RunResult, RunSummary, run_summary};
@@ -72,6 +78,11 @@ pub enum ReportError {
     /// The pixels could not be encoded.
     #[error("{figure}: the picture could not be encoded: {source}")]
     Encoding { figure: String, source: png::EncodingError },
+    /// A run of which there are no results.
+    #[error(
+        "run {run}: nothing was measured that could be registered, so there are no results to write; `regrind report` tells why"
+    )]
+    NothingMeasured { run: String },
     /// The record of the run cannot be read or believed.
     #[error(transparent)]
     Record(#[from] regrind_journal::JournalError),

@@ -19,7 +19,7 @@ use super::story::{Measurement, Story};
 use super::words::{alarm_words, ending_words, home_words, judgement_words, role_words, verdict_words};
 use regrind_cell::{Compared, Conformity, Ending, Figures, Tolerance};
 use regrind_formats::{FormatError, escaped, write_atomic};
-use regrind_journal::{Reader, Record, Verified, verify};
+use regrind_journal::{Record, Verified};
 
 /// The report in a run folder.
 pub const RUN_REPORT: &str = "report.html";
@@ -53,11 +53,7 @@ pub fn write_run_report(folder: &Path) -> Result<PathBuf, ReportError> {
 /// # Errors
 /// A record that cannot be believed, a file on it that cannot be read.
 pub fn run_report(folder: &Path) -> Result<String, ReportError> {
-    let verified = verify(folder)?;
-    let mut story = Story::default();
-    for record in Reader::open(folder)?.records(0).take(verified.records as usize) {
-        story.take(record?);
-    }
+    let (story, verified) = Story::proven(folder)?;
     html(&story, folder, &verified)
 }
 

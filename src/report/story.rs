@@ -1,13 +1,15 @@
 //! What the journal tells of a run, as far as a report shows it.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use serde_json::Value;
 
+use super::ReportError;
 use super::told::Told;
 use super::words::{gate_words, words};
 use regrind_cell::{Alarm, Command, Ending, Event, Figures, Gate, Judgement, Tolerance};
-use regrind_journal::Record;
+use regrind_journal::{Reader, Record, Verified, verify};
 
 /// The map of a cycle's error, as text.
 const MAP: &str = "error_map.csv";
@@ -59,6 +61,8 @@ pub(super) struct CycleStory {
 /// A measurement of a cycle: what was found, or why there is nothing.
 #[derive(Default)]
 pub(super) struct Measurement {
+    /// When the last that is told of it came on record.
+    pub(super) utc: String,
     pub(super) figures: Option<Figures>,
     pub(super) unusable: Option<String>,
     /// A judgement may be amended: the last counts.
@@ -80,6 +84,19 @@ pub(super) struct Order {
 }
 
 impl Story {
+    /// Proves the record of a run and reads what it tells, as far as it is proven.
+    ///
+    /// # Errors
+    /// A record that cannot be read or believed.
+    pub(super) fn proven(folder: &Path) -> Result<(Self, Verified), ReportError> {
+        let verified = verify(folder)?;
+        let mut story = Self::default();
+        for record in Reader::open(folder)?.records(0).take(verified.records as usize) {
+            story.take(record?);
+        }
+        Ok((story, verified))
+    }
+
     pub(super) fn take(&mut self, record: Record) {
         match Told::of(&record) {
             Told::Begun(_) => self.begin = Some(record),
@@ -136,14 +153,20 @@ impl Story {
         match event {
             Event::Collected { cycle, gate, .. } => {
                 let unusable = Some(&gate).filter(|gate| **gate != Gate::Passed).map(gate_words);
-                self.cycle(cycle).measurements.push(Measurement { unusable, ..Measurement::default() });
+                self.cycle(cycle).measurements.push(Measurement {
+                    utc: record.utc,
+                    unusable,
+                    ..Measurement::default()
+                });
             }
             Event::Registered { cycle, figures } => {
                 // What was judged keeps its figures.
                 if self.measurement(cycle).figures.is_some() {
                     self.cycle(cycle).measurements.push(Measurement::default());
                 }
-                self.measurement(cycle).figures = Some(figures);
+                let measurement = self.measurement(cycle);
+                measurement.figures = Some(figures);
+                measurement.utc = record.utc;
             }
             Event::Connected { device, .. } => {
                 let detail = &record.value()["detail"];

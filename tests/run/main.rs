@@ -28,6 +28,7 @@ mod production;
 mod program;
 mod replay;
 mod reports;
+mod results;
 #[path = "../common/rig.rs"]
 mod rig;
 mod study;

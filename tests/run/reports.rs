@@ -66,15 +66,15 @@ fn text_of(node: roxmltree::Node) -> String {
     node.descendants().filter(|node| node.is_text()).filter_map(|node| node.text()).collect()
 }
 
-fn json_in(folder: &Path, name: &str) -> Value {
+pub fn json_in(folder: &Path, name: &str) -> Value {
     serde_json::from_slice(&fs::read(folder.join(name)).unwrap()).unwrap()
 }
 
-fn the_run(home: &Path) -> PathBuf {
+pub fn the_run(home: &Path) -> PathBuf {
     fs::read_dir(home.join("runs")).unwrap().next().unwrap().unwrap().path()
 }
 
-fn arguments(recipe: &Path) -> Vec<String> {
+pub fn arguments(recipe: &Path) -> Vec<String> {
     let cell = root().join("config/sim.toml").display().to_string();
     let fixed = ["--cell", &cell, "--runs", "runs", "--part", "SN 12", "--operator", "Ada"].map(str::to_owned);
     ["run".to_owned(), recipe.display().to_string()].into_iter().chain(fixed).collect()
@@ -266,14 +266,14 @@ fn the_report_of_an_aborted_run_says_so_and_which_order_was_refused() {
 }
 
 /// A record that is written here as a drive writes it: events, commands with an answer as intents, all others as notes.
-struct Written {
+pub struct Written {
     home: TempDir,
     journal: Journal,
     at: u64,
 }
 
 impl Written {
-    fn new(content: Value) -> Self {
+    pub fn new(content: Value) -> Self {
         let home = tempfile::tempdir().unwrap();
         let header = Header {
             run: "mirror-1".into(),
@@ -288,28 +288,28 @@ impl Written {
         Self { home, journal, at: 0 }
     }
 
-    fn entry(&mut self, kind: Kind, payload: Value) -> Entry {
+    pub fn entry(&mut self, kind: Kind, payload: Value) -> Entry {
         self.at += 1;
         Entry::new(kind, self.at, 1, payload)
     }
 
-    fn event(&mut self, event: Event) {
+    pub fn event(&mut self, event: Event) {
         let (actor, station) = event.origin();
         let entry = self.entry(Kind::Event, serde_json::to_value(event).unwrap());
         self.journal.append(Entry { actor, station, ..entry }).unwrap();
     }
 
-    fn told(&mut self, command: Command) {
+    pub fn told(&mut self, command: Command) {
         let entry = self.entry(Kind::Note, serde_json::to_value(command).unwrap());
         self.journal.append(entry).unwrap();
     }
 
-    fn note(&mut self, payload: Value) {
+    pub fn note(&mut self, payload: Value) {
         let entry = self.entry(Kind::Note, payload);
         self.journal.append(entry).unwrap();
     }
 
-    fn ended(self, ending: &Ending) -> (TempDir, PathBuf) {
+    pub fn ended(self, ending: &Ending) -> (TempDir, PathBuf) {
         let Self { home, journal, at } = self;
         let folder = journal.folder().to_owned();
         journal.close(at, 1, json!({ "simulation": false, "ending": ending, "cycles": [] })).unwrap();
@@ -318,7 +318,7 @@ impl Written {
     }
 }
 
-fn ada() -> Actor {
+pub fn ada() -> Actor {
     Actor { name: "Ada".into(), station: "console".into() }
 }
 
@@ -329,7 +329,7 @@ fn raised(id: &str, what: &str) -> Command {
     serde_json::from_value(alarm).unwrap()
 }
 
-fn aborted() -> Ending {
+pub fn aborted() -> Ending {
     Ending::Aborted { cycle: 1, confirmed: false, reason: "smoke".into() }
 }
 
@@ -386,7 +386,7 @@ fn a_cycle_without_figures_says_why_and_an_amended_judgement_shows_both() {
     assert_eq!(page.verdict(), ("NOT ACCEPTED: no material is left".into(), false));
 }
 
-fn figures() -> Figures {
+pub fn figures() -> Figures {
     let found = samples(1).into_iter().find_map(|event| match event {
         Event::Registered { figures, .. } => Some(figures),
         _ => None,
@@ -455,7 +455,7 @@ fn without_a_limit_or_with_one_of_another_time_nothing_is_invented() {
     assert!(page.rows("judged").is_empty() && page.cycles().len() == 1);
 }
 
-fn tolerance() -> Tolerance {
+pub fn tolerance() -> Tolerance {
     use regrind::cell::PvOf;
     Tolerance { pv_mm: 0.007, rms_mm: 0.001, with_uncertainty: true, pv_of: PvOf::MostPoints }
 }

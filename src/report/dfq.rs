@@ -1,0 +1,138 @@
+//! Results as Q-DAS ASCII (DFQ): description and values in one file, a line a K-field, values in the order that they were measured.
+//!
+//! ```text
+//! K0100      how many characteristics          K2001/k .. K2402/k   each: number, name, digits, unit, limit, machine
+//! K1001 ..   the part, its machine, remarks    K0001/k ..           each value: value, attribute, time, text, serial
+//! ```
+//!
+//! Units: millimetres, so that a file is ASCII wherever the names in it are. Lines end as on Windows.
+//! A file with other texts is UTF-8 and begins with its mark.
+
+use std::fmt::Write;
+
+use super::results::{Kind, Measured, Results};
+
+/// What attribute a value has: valid, and left out of all statistics.
+const VALID: u32 = 0;
+const LEFT_OUT: u32 = 255;
+
+pub(super) fn text(results: &Results) -> String {
+    let mut file = Fields::default();
+    let kinds: Vec<&Kind> = results.kinds().collect();
+    file.field("K0100", &kinds.len().to_string());
+    part(&mut file, results);
+    for (number, kind) in (1..).zip(&kinds) {
+        characteristic(&mut file, results, number, kind);
+    }
+    for of in results.measured.iter().filter(|of| !of.figures.is_empty()) {
+        values(&mut file, results, of);
+    }
+    if file.text.is_ascii() { file.text } else { format!("\u{feff}{}", file.text) }
+}
+
+fn part(file: &mut Fields, results: &Results) {
+    let mark = if results.simulation { "SIMULATION. " } else { "" };
+    let remark = format!(
+        "{mark}{} Recipe {} (sha256 {}), cell {} (sha256 {}). Hash of the last record: {}",
+        results.verdict, results.recipe[0], results.recipe[1], results.cell[0], results.cell[1], results.head
+    );
+    let station = &results.station;
+    for (key, value) in [
+        ("K1001", &results.name),
+        ("K1002", &results.name),
+        ("K1053", &results.run),
+        ("K1082", station),
+        ("K1203", &"closed-loop grinding".to_owned()),
+        ("K1222", &results.operator),
+        ("K1900", &remark),
+    ] {
+        file.field(key, value);
+    }
+}
+
+fn characteristic(file: &mut Fields, results: &Results, number: u32, kind: &Kind) {
+    let mut field = |key: &str, value: &str| file.field(&format!("{key}/{number}"), value);
+    field("K2001", &number.to_string());
+    field("K2002", kind.name);
+    // A variable with one-sided natural limit: no figure of these is below 0.
+    field("K2004", "0");
+    field("K2022", "6");
+    field("K2101", "0");
+    if let Some(limit_mm) = kind.limit_mm {
+        field("K2110", "0");
+        field("K2111", &mm(limit_mm));
+        field("K2120", "2");
+        field("K2121", "1");
+    }
+    field("K2142", "mm");
+    if let Some([name, address]) = &results.cmm {
+        field("K2401", name);
+        field("K2402", &format!("{name} at {address}"));
+    }
+    field("K2900", kind.what);
+}
+
+fn values(file: &mut Fields, results: &Results, of: &Measured) {
+    for (number, figure) in (1..).zip(&of.figures) {
+        let mut field = |key: &str, value: &str| file.field(&format!("{key}/{number}"), value);
+        field("K0001", &mm(figure.found_mm));
+        let attribute = if figure.found_mm.is_finite() { VALID } else { LEFT_OUT };
+        field("K0002", &attribute.to_string());
+        field("K0004", &when(&of.utc));
+        let judged = if of.verdict.is_empty() { "not judged" } else { &of.verdict };
+        field("K0009", &format!("cycle {}, {judged}; U (k = 2) {} mm", of.cycle, mm(figure.expanded_mm)));
+        field("K0014", &results.part);
+    }
+}
+
+/// A decimal to a picometre, as the other format has it.
+fn mm(value: f64) -> String {
+    format!("{value:.9}")
+}
+
+/// `2026-07-04T12:00:00Z` as `04.07.2026/12:00:00`.
+fn when(utc: &str) -> String {
+    let (date, time) = utc.split_once('T').unwrap_or((utc, ""));
+    let mut date: Vec<&str> = date.split('-').collect();
+    date.reverse();
+    let time: String = time.chars().take(8).collect();
+    format!("{}/{time}", date.join("."))
+}
+
+/// The file, a line a field.
+#[derive(Default)]
+struct Fields {
+    text: String,
+}
+
+impl Fields {
+    /// A field; one without a value is not written. What would end the line, or part a value from its companions, is a space; micrometres are um and ± is +-,
+    /// for the sake of readers that know ASCII alone.
+    fn field(&mut self, key: &str, value: &str) {
+        let value = value
+            .replace(|c: char| c.is_control() || c == '\u{a4}', " ")
+            .replace('\u{b5}', "u")
+            .replace('\u{b1}', "+-");
+        if !value.trim().is_empty() {
+            let _ = write!(self.text, "{key} {}\r\n", value.trim());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_text_ends_no_line() {
+        let mut file = Fields::default();
+        file.field("K1001", "part\r\nK2111/1 9\u{f}\u{14}\u{a4}x");
+        file.field("K1002", "\n");
+        assert_eq!(file.text, "K1001 part  K2111/1 9   x\r\n");
+    }
+
+    #[test]
+    fn a_time_is_written_day_first() {
+        assert_eq!(when("2026-07-04T12:01:02.123456789Z"), "04.07.2026/12:01:02");
+    }
+}

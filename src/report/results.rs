@@ -1,0 +1,249 @@
+//! What other systems for quality take of a run: who measured which part when, each judged figure with its limit and uncertainty,
+//! and the verdict. The two formats are written from this alone, so that they cannot say two things.
+
+use std::path::{Path, PathBuf};
+
+use super::story::{CycleStory, Measurement, Story};
+use super::words::{ending_words, verdict_words};
+use super::{ReportError, dfq, qif};
+use regrind_cell::{Conformity, Ending, Figures, Tolerance};
+use regrind_formats::write_atomic;
+use regrind_journal::Record;
+
+/// The results of a run as QIF 3.0, in its folder.
+pub const RUN_QIF: &str = "results.qif";
+
+/// The results of a run as Q-DAS ASCII, in its folder.
+pub const RUN_DFQ: &str = "results.dfq";
+
+/// What the results of a run can be written as.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ResultsFormat {
+    /// QIF 3.0 results (ANSI/DMSC), XML.
+    Qif,
+    /// Q-DAS ASCII transfer format, description and values in one file.
+    Dfq,
+}
+
+/// Proves the record of a run, writes its results and returns the name of the file: `path`, or the usual one in the folder.
+///
+/// # Errors
+/// A record that is not there or cannot be believed, or in which nothing was measured; a file that cannot be written.
+pub fn write_run_results(folder: &Path, format: ResultsFormat, path: Option<&Path>) -> Result<PathBuf, ReportError> {
+    let usual = match format {
+        ResultsFormat::Qif => RUN_QIF,
+        ResultsFormat::Dfq => RUN_DFQ,
+    };
+    let path = path.map_or_else(|| folder.join(usual), Path::to_path_buf);
+    write_atomic(&path, run_results(folder, format)?.as_bytes())?;
+    Ok(path)
+}
+
+/// Makes the results of a run from its record. The same record gives the same bytes.
+///
+/// # Errors
+/// A record that cannot be believed, or in which nothing was measured.
+pub fn run_results(folder: &Path, format: ResultsFormat) -> Result<String, ReportError> {
+    let (story, verified) = Story::proven(folder)?;
+    let results = Results::of(&story, verified.head.to_string());
+    if results.measured.iter().all(|of| of.figures.is_empty()) {
+        return Err(ReportError::NothingMeasured { run: results.run });
+    }
+    Ok(match format {
+        ResultsFormat::Qif => qif::text(&results),
+        ResultsFormat::Dfq => dfq::text(&results),
+    })
+}
+
+/// Everything that a file of results tells. Texts are as they stand in the record. Times are RFC 3339 in UTC.
+pub(super) struct Results {
+    pub(super) run: String,
+    pub(super) part: String,
+    pub(super) name: String,
+    /// Name of the recipe and the hash of its bytes.
+    pub(super) recipe: [String; 2],
+    /// The same of the cell.
+    pub(super) cell: [String; 2],
+    pub(super) operator: String,
+    pub(super) station: String,
+    pub(super) began: String,
+    pub(super) ended: Option<String>,
+    pub(super) software: String,
+    pub(super) simulation: bool,
+    pub(super) accepted: Option<bool>,
+    pub(super) verdict: String,
+    pub(super) decision_rule: Option<&'static str>,
+    /// Name and address of the measuring machine, as it answered.
+    pub(super) cmm: Option<[String; 2]>,
+    /// Each measurement of each cycle, in its order.
+    pub(super) measured: Vec<Measured>,
+    /// The hash of the last record.
+    pub(super) head: String,
+}
+
+/// A measurement.
+pub(super) struct Measured {
+    pub(super) cycle: u32,
+    pub(super) utc: String,
+    /// Empty where there is nothing that could be believed.
+    pub(super) figures: Vec<Figure>,
+    pub(super) standing: Standing,
+    pub(super) verdict: String,
+    pub(super) reason: String,
+    /// Points used, and points left out as outliers.
+    pub(super) points: Option<[u32; 2]>,
+    pub(super) coverage: Option<f64>,
+}
+
+/// A figure of a measurement. Units: millimetres.
+pub(super) struct Figure {
+    pub(super) kind: Kind,
+    pub(super) found_mm: f64,
+    /// Expanded, k = 2.
+    pub(super) expanded_mm: f64,
+    pub(super) standing: Standing,
+}
+
+/// What a figure is.
+pub(super) struct Kind {
+    pub(super) name: &'static str,
+    pub(super) what: &'static str,
+    /// None where there is none.
+    pub(super) limit_mm: Option<f64>,
+}
+
+/// Where a figure, or a measurement, stands beside what is allowed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Standing {
+    Within,
+    Undecided,
+    Beyond,
+    /// Nothing was judged: there is no limit, or nobody came to it.
+    NotJudged,
+}
+
+impl Results {
+    fn of(story: &Story, head: String) -> Self {
+        let begin = story.begin.as_ref().map(Record::value).unwrap_or_default();
+        let text = |value: &serde_json::Value| value.as_str().unwrap_or_default().to_owned();
+        let content = |key: &str| text(&begin["content"][key]);
+        let of_begin = |field: fn(&Record) -> &String| story.begin.as_ref().map(field).cloned().unwrap_or_default();
+        let tolerance = story.tolerance();
+        let all = |(cycle, of): (&u32, &CycleStory)| {
+            let measured = |one: &Measurement| Measured::of(*cycle, one, tolerance.as_ref());
+            of.measurements.iter().map(measured).collect::<Vec<_>>()
+        };
+        Self {
+            run: text(&begin["run"]),
+            part: of_begin(|begin| &begin.part),
+            name: content("part_name"),
+            recipe: [content("recipe"), content("recipe_sha256")],
+            cell: [content("cell"), content("cell_sha256")],
+            operator: of_begin(|begin| &begin.actor),
+            station: of_begin(|begin| &begin.station),
+            began: of_begin(|begin| &begin.utc),
+            ended: story.end.as_ref().map(|end| end.utc.clone()),
+            software: text(&begin["regrind"]),
+            simulation: begin["simulation"] == true,
+            accepted: story.ending.as_ref().map(|ending| matches!(ending, Ending::Accepted { .. })),
+            verdict: story.ending.as_ref().map_or("The run has not come to its end.".to_owned(), ending_words),
+            decision_rule: tolerance.as_ref().map(decision_rule),
+            cmm: story.machines[regrind_cell::Device::Cmm as usize].clone(),
+            measured: story.cycles.iter().flat_map(all).collect(),
+            head,
+        }
+    }
+
+    /// What is told of each figure, by its place in every measurement that has figures.
+    pub(super) fn kinds(&self) -> impl Iterator<Item = &Kind> {
+        let first = self.measured.iter().find(|of| !of.figures.is_empty());
+        first.into_iter().flat_map(|of| &of.figures).map(|figure| &figure.kind)
+    }
+}
+
+impl Measured {
+    fn of(cycle: u32, of: &Measurement, tolerance: Option<&Tolerance>) -> Self {
+        let judgement = of.judgements.last();
+        let figures = of.figures.as_ref().map(|figures| figures_of(figures, tolerance, judgement.is_some()));
+        let figures = figures.unwrap_or_default();
+        Self {
+            cycle,
+            utc: of.utc.clone(),
+            standing: standing_of_all(&figures),
+            figures,
+            verdict: judgement.map(verdict_words).unwrap_or_default(),
+            reason: judgement.map_or_else(|| of.unusable.clone().unwrap_or_default(), |last| last.reason.clone()),
+            points: of.figures.as_ref().map(|figures| [figures.points, figures.outliers]),
+            coverage: of.figures.as_ref().map(|figures| figures.coverage),
+        }
+    }
+}
+
+fn decision_rule(tolerance: &Tolerance) -> &'static str {
+    if tolerance.with_uncertainty {
+        "ISO 14253-1: within where figure and expanded uncertainty (k = 2) together do not exceed the limit"
+    } else {
+        "the figure by itself is held against its limit"
+    }
+}
+
+/// The figures that are judged first, then the peak to valley of all points where another is judged.
+fn figures_of(figures: &Figures, tolerance: Option<&Tolerance>, judged: bool) -> Vec<Figure> {
+    let compared = tolerance.map(|tolerance| tolerance.compare(figures));
+    let all_points = Figure {
+        kind: Kind { name: "PV", what: PV, limit_mm: None },
+        found_mm: figures.pv_mm,
+        expanded_mm: figures.pv_expanded_mm,
+        standing: Standing::NotJudged,
+    };
+    let Some(compared) = compared else {
+        let kind = Kind { name: "RMS", what: RMS, limit_mm: None };
+        let (found_mm, expanded_mm) = (figures.rms_mm, figures.rms_expanded_mm);
+        return vec![all_points, Figure { kind, found_mm, expanded_mm, standing: Standing::NotJudged }];
+    };
+    let of_all = compared[0].name == "PV";
+    let mut list: Vec<Figure> = compared
+        .into_iter()
+        .map(|compared| {
+            let limit_mm = Some(compared.limit_mm).filter(|limit| limit.is_finite());
+            let standing = match compared.conformity {
+                _ if !judged || limit_mm.is_none() => Standing::NotJudged,
+                Conformity::Within => Standing::Within,
+                Conformity::Undecided => Standing::Undecided,
+                Conformity::Beyond => Standing::Beyond,
+            };
+            Figure {
+                kind: Kind { name: compared.name, what: what_of(compared.name), limit_mm },
+                found_mm: compared.found_mm,
+                expanded_mm: compared.expanded_mm,
+                standing,
+            }
+        })
+        .collect();
+    if !of_all {
+        list.push(all_points);
+    }
+    list
+}
+
+const PV: &str = "largest less least deviation from the nominal surface along its normal, all points";
+const RMS: &str = "root mean square of the deviations from the nominal surface along its normal";
+
+fn what_of(name: &str) -> &'static str {
+    match name {
+        "RMS" => RMS,
+        "PV" => PV,
+        _ => {
+            "largest less least deviation from the nominal surface along its normal, without the outermost 0.1 % at either end"
+        }
+    }
+}
+
+/// Beyond where any figure is; within where each that has a limit is.
+fn standing_of_all(figures: &[Figure]) -> Standing {
+    let any = |standing| figures.iter().any(|figure| figure.standing == standing);
+    [Standing::Beyond, Standing::Undecided, Standing::Within]
+        .into_iter()
+        .find(|one| any(*one))
+        .unwrap_or(Standing::NotJudged)
+}

@@ -1,0 +1,168 @@
+//! The results of a run for other systems, QIF and Q-DAS ASCII: what they say is what the record says, and others can read it.
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use crate::data::data;
+use crate::program::{root, run, small_recipe};
+use crate::reports::{Written, aborted, ada, arguments, figures, json_in, the_run, tolerance};
+use regrind::cell::{Command as CellCommand, Event, Figures, Gate, GateFailure, Judgement, Verdict};
+use regrind::report::{ResultsFormat, run_results};
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+/// What a script in tests/common says of a file.
+fn read_by(script: &str, arguments: &[&Path]) -> Value {
+    let python = std::env::var_os("REGRIND_LXML_PYTHON").unwrap_or_else(|| "python3".into());
+    let said = Command::new(python).arg(root().join("tests/common").join(script)).args(arguments).output().unwrap();
+    assert!(said.status.success(), "{script}: {}", String::from_utf8_lossy(&said.stderr));
+    serde_json::from_slice(&said.stdout).unwrap()
+}
+
+fn read_qif(path: &Path) -> Value {
+    read_by("check_qif.py", &[&data("qif3-schema"), path])
+}
+
+fn read_dfq(path: &Path) -> Value {
+    read_by("read_dfq.py", &[path])
+}
+
+/// A run with five measurements that stand differently, its names such as break files.
+fn hostile() -> (TempDir, std::path::PathBuf) {
+    let plan = json!({ "plan": { "tolerance": tolerance() }, "part_name": "Spiegel \u{201e}\u{c4}\u{201c} <1> & \"2\" ]]>",
+        "recipe": "a\u{a4}b.toml", "recipe_sha256": "00", "cell": "c.toml", "cell_sha256": "11" });
+    let mut written = Written::new(plan);
+    written.event(Event::Start { actor: ada() });
+    let of = |pv_mm: f64, rms_mm: f64| Figures {
+        pv_robust_mm: Some(pv_mm),
+        rms_mm,
+        pv_expanded_mm: 0.0005,
+        rms_expanded_mm: 0.0001,
+        ..figures()
+    };
+    let mut measured = |cycle: u32, figures: Figures, judged: Option<Verdict>| {
+        written.event(Event::Collected { cycle, targets: 100, found: 100, gate: Gate::Passed });
+        written.event(Event::Registered { cycle, figures });
+        if let Some(verdict) = judged {
+            let reason = "as it is\r\nK2111/1 9".into();
+            written.told(CellCommand::Announce(Judgement { cycle, verdict, reason }));
+        }
+    };
+    measured(1, of(0.009, 0.0004), Some(Verdict::Continue));
+    measured(2, of(0.0068, 0.0004), Some(Verdict::Continue));
+    measured(3, of(0.0060, 0.0004), None);
+    measured(4, of(0.0060, 0.0004), Some(Verdict::Accept));
+    let gate = Gate::Failed(GateFailure::Coverage("12 % found".into()));
+    written.event(Event::Collected { cycle: 5, targets: 100, found: 12, gate });
+    written.ended(&aborted())
+}
+
+#[test]
+fn both_formats_tell_what_result_json_tells_and_the_same_twice() {
+    let home = tempfile::tempdir().unwrap();
+    let arguments = arguments(&small_recipe(home.path(), 1e4));
+    let (code, out, errors) = run(&arguments.iter().map(String::as_str).collect::<Vec<_>>(), home.path());
+    assert_eq!(code, 0, "{out}{errors}");
+    let folder = the_run(home.path());
+    let path = folder.to_str().unwrap();
+    let (code, out, errors) = run(&["report", path, "--qif", "--dfq=elsewhere.dfq"], home.path());
+    assert_eq!((code, out.lines().count()), (0, 3), "{out}{errors}");
+    let qif = fs::read_to_string(folder.join("results.qif")).unwrap();
+    let dfq = fs::read_to_string(home.path().join("elsewhere.dfq")).unwrap();
+    assert_eq!(qif, run_results(&folder, ResultsFormat::Qif).unwrap());
+    assert_eq!(dfq, run_results(&folder, ResultsFormat::Dfq).unwrap());
+    assert!(qif.contains("SIMULATION. ") && dfq.contains("K1900 SIMULATION. "));
+    assert!(dfq.is_ascii(), "{dfq}");
+    let document = roxmltree::Document::parse(&qif).unwrap();
+    let values: Vec<&str> =
+        document.descendants().filter(|node| node.has_tag_name("Value")).map(|node| node.text().unwrap()).collect();
+    let cycles = json_in(&folder, "result.json")["cycles"].as_array().unwrap().len();
+    assert_eq!(values.len(), 3 * cycles);
+    for (cycle, told) in (1..).zip(values.chunks(3)) {
+        let figures = json_in(&folder, &format!("cycle-{cycle}/result.json"))["figures"].clone();
+        let expected = ["pv_robust_mm", "rms_mm", "pv_mm"].map(|key| format!("{:.9}", figures[key].as_f64().unwrap()));
+        assert_eq!(told, expected);
+        for (number, value) in (1..).zip(expected) {
+            assert!(dfq.contains(&format!("K0001/{number} {value}\r\n")), "cycle {cycle}: {value}");
+        }
+    }
+}
+
+#[test]
+fn a_run_in_which_nothing_was_measured_has_no_results_and_says_so() {
+    let mut written = Written::new(Value::Null);
+    written.event(Event::Start { actor: ada() });
+    let (home, folder) = written.ended(&aborted());
+    let (code, _, errors) = run(&["report", folder.to_str().unwrap(), "--qif"], home.path());
+    assert_eq!(code, 2);
+    assert!(errors.contains("nothing was measured that could be registered"), "{errors}");
+    assert!(!folder.join("results.qif").exists());
+}
+
+#[test]
+#[ignore = "needs Python with lxml, and real measurements: see REGRIND_LXML_PYTHON and REGRIND_DATA"]
+fn other_readers_qif_follows_the_schema_and_says_what_stands_where() {
+    let (_home, folder) = hostile();
+    let path = folder.join("results.qif");
+    fs::write(&path, run_results(&folder, ResultsFormat::Qif).unwrap()).unwrap();
+    let told = read_qif(&path);
+    assert_eq!((&told["part"], &told["status"]), (&json!("SN 7"), &json!("FAIL")));
+    let measured = told["measured"].as_array().unwrap();
+    let of = |key: &str| measured.iter().map(|one| one[key].clone()).collect::<Vec<_>>();
+    assert_eq!(of("cycle"), [1, 2, 3, 4, 5]);
+    assert_eq!(of("status"), ["FAIL", "UNKNOWN", "UNKNOWN", "PASS", "NOT_CALCULATED"]);
+    assert_eq!(of("operator"), ["Ada"; 5]);
+    let pv = |cycle: usize| &measured[cycle - 1]["figures"][0];
+    let standing = [1, 2, 3, 4].map(|cycle| pv(cycle)["status"].clone());
+    assert_eq!(standing, ["FAIL", "INDETERMINATE", "NOT_ANALYZED", "PASS"]);
+    assert_eq!(
+        *pv(1),
+        json!({ "name": "PV 99.8 %", "found_mm": 0.009, "standard_mm": 0.00025, "limit_mm": 0.007, "status": "FAIL" })
+    );
+    assert_eq!(measured[0]["figures"][2]["limit_mm"], Value::Null);
+    assert_eq!(measured[4]["reason"], "not usable: 12 % found");
+}
+
+#[test]
+#[ignore = "needs Python with lxml, and real measurements: see REGRIND_LXML_PYTHON and REGRIND_DATA"]
+fn other_readers_dfq_reads_by_the_list_of_fields() {
+    let (_home, folder) = hostile();
+    let path = folder.join("results.dfq");
+    fs::write(&path, run_results(&folder, ResultsFormat::Dfq).unwrap()).unwrap();
+    let told = read_dfq(&path);
+    assert_eq!(told["head"]["part_number"], "Spiegel \u{201e}\u{c4}\u{201c} <1> & \"2\" ]]>");
+    assert_eq!(told["head"]["inspector"], "Ada");
+    let characteristics = told["characteristics"].as_array().unwrap();
+    let names: Vec<&Value> = characteristics.iter().map(|one| &one["name"]).collect();
+    assert_eq!(names, ["PV 99.8 %", "RMS", "PV"]);
+    assert_eq!((&characteristics[0]["upper"], &characteristics[0]["unit"]), (&json!(0.007), &json!("mm")));
+    assert!(characteristics[2].get("upper").is_none());
+    let values = characteristics[0]["values"].as_array().unwrap();
+    let found: Vec<&Value> = values.iter().map(|one| &one["value"]).collect();
+    assert_eq!(found, [0.009, 0.0068, 0.006, 0.006]);
+    assert!(values.iter().all(|one| one["part"] == "SN 7" && one["attribute"] == 0), "{values:?}");
+    assert!(
+        values[0]["text"].as_str().unwrap().starts_with("cycle 1, continue; U (k = 2) 0.000500000 mm"),
+        "{values:?}"
+    );
+}
+
+#[test]
+#[ignore = "needs Python with lxml, and real measurements: see REGRIND_LXML_PYTHON and REGRIND_DATA"]
+fn other_readers_read_a_whole_run() {
+    let home = tempfile::tempdir().unwrap();
+    let arguments = arguments(&small_recipe(home.path(), 1e4));
+    let (code, out, errors) = run(&arguments.iter().map(String::as_str).collect::<Vec<_>>(), home.path());
+    assert_eq!(code, 0, "{out}{errors}");
+    let folder = the_run(home.path());
+    let (code, _, errors) = run(&["report", folder.to_str().unwrap(), "--qif", "--dfq"], home.path());
+    assert_eq!(code, 0, "{errors}");
+    let [qif, dfq] = [read_qif(&folder.join("results.qif")), read_dfq(&folder.join("results.dfq"))];
+    assert_eq!((&qif["part"], &qif["status"]), (&json!("SN 12"), &json!("PASS")));
+    let last = qif["measured"].as_array().unwrap().last().unwrap();
+    assert_eq!(last["status"], "PASS");
+    let values = dfq["characteristics"][0]["values"].as_array().unwrap();
+    assert_eq!(values.last().unwrap()["value"], last["figures"][0]["found_mm"]);
+    assert_eq!(values.len(), qif["measured"].as_array().unwrap().len());
+}
