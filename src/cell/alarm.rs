@@ -43,6 +43,16 @@ macro_rules! catalogue {
             /// All alarms, in the order of the catalogue.
             pub const ALL: &[Self] = &[$(Self::$id),+];
 
+            /// What happened in general, with which every alarm of this kind begins.
+            pub fn head(self) -> &'static str {
+                self.entry().0
+            }
+
+            /// What to do, in this order.
+            pub fn remedy(self) -> &'static [&'static str] {
+                self.entry().3
+            }
+
             /// What happened in general, what follows, who clears it, and what to do.
             fn entry(self) -> (&'static str, &'static str, Role, &'static [&'static str]) {
                 match self {

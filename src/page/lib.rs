@@ -10,6 +10,7 @@
 //! The page stands beside the run and never within it: it reads what the run tells and what is on record, and it can die without the
 //! run noticing. Everything that a browser needs is in the program; nothing is fetched from elsewhere.
 
+mod alarms;
 mod assets;
 mod chart;
 mod guard;

@@ -1,5 +1,5 @@
-//! What the page says by itself, in every language that it speaks. What a cell tells of its machines and its alarms comes in the
-//! words of the cell.
+//! What the page says by itself, in every language that it speaks. Alarms have a file of their own; what a cell
+//! tells of its machines comes in the words of the cell.
 
 use regrind_cell::{Device, JobStep, Phase, StateName};
 use regrind_control::Next;

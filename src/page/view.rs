@@ -15,6 +15,7 @@ use serde_json::{Value, json};
 use tokio::task::spawn_blocking;
 
 use super::Shared;
+use super::alarms::said;
 use super::chart::chart;
 use super::guard::{Session, text};
 use super::history::Listed;
@@ -269,12 +270,12 @@ fn alarms(alarms: &[Alarm], language: Language) -> Markup {
     let say = |text: Text| text.to(language);
     html! {
         @if alarms.is_empty() { p .quiet { (say(Text::NoAlarm)) } }
-        @for alarm in alarms {
+        @for (alarm, said) in alarms.iter().map(|alarm| (alarm, said(alarm, language))) {
             article .alarm {
-                h3 { (alarm.what) }
-                p { (alarm.consequence) }
+                h3 { (said.what) }
+                p { (said.consequence) }
                 p .quiet { (say(Text::WhatToDo)) ":" }
-                ol { @for remedy in &alarm.remedy { li { (remedy) } } }
+                ol { @for remedy in &said.remedy { li { (remedy) } } }
                 p .quiet { (say(Text::ClearedBy)) ": " (say(match alarm.clears {
                     Role::Nobody => Text::ByItself,
                     Role::Operator => Text::ByOperator,
