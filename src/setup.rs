@@ -10,7 +10,7 @@ use std::time::Duration;
 use sha2::{Digest, Sha256};
 use thiserror::Error;
 
-use crate::cell::{CellPlan, Deadlines, Disposal, Gates, Tolerance};
+use crate::cell::{CellPlan, Deadlines, Device, Disposal, Gates, Tolerance};
 use crate::compensation::path::{Limits, PathError, PathOptions, TrackSpacing, Wheel as PathWheel};
 use crate::compensation::{CorrectionLimits, MapOptions, contact_width_mm};
 use crate::config::{CellConfig, Link};
@@ -490,6 +490,23 @@ pub fn machines(
 pub fn modbus(link: &Link, simulated: bool, owner: u32, epoch: u32) -> Option<ModbusSettings> {
     let (line, unit) = link.wire.line()?;
     Some(ModbusSettings::of(line, unit, &making(link, simulated, [owner, epoch])))
+}
+
+/// Tells whether what a machine is made of is there, such as the folders that it gives and takes files in. Nothing is asked of the machine.
+///
+/// # Errors
+/// Those of [`machines`].
+pub fn is_there(cell: &CellConfig, device: Device) -> Result<(), MakingError> {
+    let link = match device {
+        Device::Cmm => &cell.cmm.link,
+        Device::Grinder => &cell.grinder.link,
+    };
+    let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
+    let making = Making { cell_folder, ..making(link, cell.simulated, [1, 1]) };
+    match device {
+        Device::Cmm => link.wire.cmm(&making).map(drop),
+        Device::Grinder => link.wire.grinder(&making).map(drop),
+    }
 }
 
 /// What a machine of a cell is made of besides its wire, for no part yet.

@@ -180,7 +180,8 @@ fn told(status: &Snapshot, folder: &Path) -> String {
         let _ = writeln!(text, "{waits}");
     }
     let _ = writeln!(text, "next     {}", status.next);
-    let _ = writeln!(text, "part     {}, run {}", status.part, folder.display());
+    let serial = if status.serial.is_empty() { String::new() } else { format!(", {}", status.serial) };
+    let _ = writeln!(text, "part     {}{serial}, run {}", status.part, folder.display());
     if let Some(tolerance) = status.tolerance.filter(|_| !status.cycles.is_empty()) {
         let _ = writeln!(text, "limits   {}", limits(&tolerance));
         for CycleRow { cycle, pv_um, judged_pv_um, rms_um, .. } in &status.cycles {

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use regrind::cell::Device;
-use regrind::config::{BUILT_IN, CellConfig, Link};
+use regrind::config::{BUILT_IN, CellConfig};
 use regrind::device::{Line, Machine, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, Status};
 use regrind::drive::recover::{in_short, look};
 use regrind::formats::{ResultFolder, try_writing};
@@ -169,28 +169,28 @@ async fn machines(cell: &CellConfig) -> Vec<Finding> {
     }
     let settings = |link| setup::modbus(link, cell.simulated, 1, 1);
     vec![
-        machine(Device::Cmm, &cell.cmm.link, settings(&cell.cmm.link), ModbusCmm::new).await,
-        machine(Device::Grinder, &cell.grinder.link, settings(&cell.grinder.link), ModbusGrinder::new).await,
+        machine(Device::Cmm, cell, settings(&cell.cmm.link), ModbusCmm::new).await,
+        machine(Device::Grinder, cell, settings(&cell.grinder.link), ModbusGrinder::new).await,
     ]
 }
 
 async fn machine<M: Machine>(
     device: Device,
-    link: &Link,
+    cell: &CellConfig,
     settings: Option<ModbusSettings>,
     make: fn(ModbusSettings) -> std::io::Result<M>,
 ) -> Finding {
     let what = device.to_string();
     let Some(settings) = settings else {
-        return Finding::new(
-            what,
-            Found::Notice,
-            "it tells nothing over a wire: what it needs is said when a run begins",
-        );
+        let words = "it tells nothing over a wire; what it is reached by is there";
+        return match setup::is_there(cell, device) {
+            Ok(()) => Finding::new(what, Found::Notice, words),
+            Err(error) => Finding::new(what, Found::Obstacle, error.to_string()),
+        };
     };
-    let kind = match device {
-        Device::Cmm => MachineKind::Cmm,
-        Device::Grinder => MachineKind::Grinder,
+    let (kind, link) = match device {
+        Device::Cmm => (MachineKind::Cmm, &cell.cmm.link),
+        Device::Grinder => (MachineKind::Grinder, &cell.grinder.link),
     };
     // Whoever has it is at work with it, and a second client would be in the way.
     let _taken = match take(link, kind, Path::new("regrind doctor")) {

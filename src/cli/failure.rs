@@ -145,6 +145,8 @@ pub(super) enum Failure {
     NoMachine,
     #[error("{path} is there already; choose another folder, or move it away")]
     IsThere { path: PathBuf },
+    #[error("no folder to make is named; give it as in: regrind init mirrors --machines modbus-tcp")]
+    NoFolder,
     #[error("{path}: {source}; --runs names the folder of the runs")]
     NoRuns { path: PathBuf, source: std::io::Error },
     #[error("{path} cannot be found: {source}; name the file of the measurement")]
@@ -191,7 +193,8 @@ impl Failure {
         use RegistrationError::*;
         let hint = match source {
             DoesNotFit { .. } => " (--max-rms)",
-            NotConverged { .. } | TooFewUsed { .. } => " (--initial)",
+            NotConverged { .. } => " (--initial), or hold the directions that the part does not tell (--lock)",
+            TooFewUsed { .. } => " (--initial)",
             WrongSide { .. } => " (--side)",
             Undetermined => " (--lock)",
             Size { remedy, .. } if !remedy.contains("millimetres") => " (both files must be in millimetres)",

@@ -1,6 +1,7 @@
 //! `regrind init`: a folder in which a shop begins.
 
 use std::fmt::Write as _;
+use std::io::{self, IsTerminal};
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
@@ -11,10 +12,12 @@ use super::Outcome;
 use super::failure::Failure;
 
 /// Make a folder to begin in: a recipe, a cell, their schemas for the editor, and a page that says what to type
-#[derive(Args, Debug)]
+#[derive(Args, Clone, Debug)]
 #[command(after_help = "\
 What is there already is left alone: a folder that has one of the files is refused. The recipe makes a free-form mirror; change what it says of
 the part, the wheel and the measurement. The cell begins as the one that ships for such machines.
+
+On a terminal it asks for what is not given.
 
 Example:
   regrind init mirrors --machines modbus-tcp
@@ -24,10 +27,10 @@ Exit codes: 0 made; 2 the folder has such files already, or cannot be written.")
 pub(super) struct Arguments {
     /// Folder to make
     #[arg(value_name = "DIR")]
-    folder: PathBuf,
-    /// How the machines are reached
-    #[arg(long, value_enum, default_value = "simulated")]
-    machines: Machines,
+    folder: Option<PathBuf>,
+    /// How the machines are reached [default: simulated]
+    #[arg(long, value_enum)]
+    machines: Option<Machines>,
     /// What the part is called
     #[arg(long, value_name = "NAME", value_parser = super::name)]
     part: Option<String>,
@@ -96,13 +99,78 @@ impl Machines {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let Arguments { folder, machines, part } = arguments;
+    let Wanted { folder, machines, part } = wanted(arguments)?;
     let (recipe, shipped_name) = machines.recipe();
     let name = part.as_deref().unwrap_or(shipped_name);
+    make(&folder, machines, recipe_of(recipe, shipped_name, name), name)
+}
+
+/// What is to be made.
+struct Wanted {
+    folder: PathBuf,
+    machines: Machines,
+    part: Option<String>,
+}
+
+/// What was given; what was not, a person at a terminal is asked for. Who gave the folder has said enough.
+fn wanted(arguments: &Arguments) -> Result<Wanted, Failure> {
+    let Arguments { folder, machines, part } = arguments.clone();
+    if let Some(folder) = folder {
+        return Ok(Wanted { folder, machines: machines.unwrap_or(Machines::Simulated), part });
+    }
+    if !(io::stdin().is_terminal() && io::stdout().is_terminal()) {
+        return Err(Failure::NoFolder);
+    }
+    let folder = PathBuf::from(ask("Folder to make", "regrind", |given| Ok(given.to_owned()))?);
+    let machines = match machines {
+        Some(machines) => machines,
+        None => ask_for_machines()?,
+    };
+    let shipped = machines.recipe().1;
+    let part = match part {
+        Some(part) => part,
+        None => ask("What the part is called", shipped, super::name)?,
+    };
+    Ok(Wanted { folder, machines, part: Some(part) })
+}
+
+fn ask_for_machines() -> Result<Machines, Failure> {
+    let mut list = "How the machines are reached:\n".to_owned();
+    for (number, machines) in (1..).zip(Machines::value_variants()) {
+        let named = machines.to_possible_value();
+        let help = named.as_ref().and_then(|value| value.get_help()).map(ToString::to_string).unwrap_or_default();
+        let _ = writeln!(list, "  {number}  {:<12} {help}", named.as_ref().map_or("", |value| value.get_name()));
+    }
+    super::print(&list)?;
+    ask("Number or name", "1", |given| {
+        let by_number =
+            given.parse().ok().and_then(|n: usize| Machines::value_variants().get(n.checked_sub(1)?).copied());
+        by_number.map_or_else(|| Machines::from_str(given, true), Ok)
+    })
+}
+
+/// Asks until the answer will do; Enter alone takes the usual one.
+fn ask<T>(question: &str, usual: &str, read: impl Fn(&str) -> Result<T, String>) -> Result<T, Failure> {
+    loop {
+        super::print(&format!("{question} [{usual}]: "))?;
+        let mut line = String::new();
+        // The end of the input is no answer, and there will be none.
+        if io::stdin().read_line(&mut line).unwrap_or(0) == 0 {
+            return Err(Failure::NoFolder);
+        }
+        let given = line.trim();
+        match read(if given.is_empty() { usual } else { given }) {
+            Ok(answer) => return Ok(answer),
+            Err(why) => super::print(&format!("{given:?}: {why}\n"))?,
+        }
+    }
+}
+
+fn make(folder: &Path, machines: Machines, recipe: String, name: &str) -> Result<Outcome, Failure> {
     let files = [
-        ("recipe.toml", recipe_of(recipe, shipped_name, name)),
+        ("recipe.toml", recipe),
         ("cell.toml", cell_of(machines.cell())),
-        ("README.md", readme(name, *machines)),
+        ("README.md", readme(name, machines)),
         ("recipe.schema.json", format!("{:#}\n", recipe::json_schema())),
         ("cell.schema.json", format!("{:#}\n", config::json_schema())),
     ];
@@ -114,7 +182,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         write_atomic(&folder.join(file), text.as_bytes())?;
     }
     made.keep();
-    super::print(&words(folder, *machines))?;
+    super::print(&words(folder, machines))?;
     Ok(Outcome::Accepted)
 }
 

@@ -159,7 +159,9 @@ fn runtime() -> Result<tokio::runtime::Runtime, Failure> {
 
 /// Writes text to the terminal; a reader that has gone away is no fault.
 fn print(text: &str) -> Result<(), Failure> {
-    match io::stdout().lock().write_all(text.as_bytes()) {
+    let mut out = io::stdout().lock();
+    // A question has no end of a line, and is to be seen.
+    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(Failure::Terminal(error)),
         _ => Ok(()),
     }

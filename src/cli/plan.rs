@@ -57,6 +57,11 @@ struct Document {
     tracks: u64,
     path_mm: f64,
     grinding_minutes: f64,
+    /// What one pass takes off, reckoned as depth of cut times the ground that its tracks cover.
+    removed_mm3_a_pass: f64,
+    /// What the wheel loses by that; absent where the recipe gives no grinding ratio.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    wheel_loss_mm3_a_pass: Option<f64>,
     /// The passes that the recipe allows, and the measurements beside them.
     most_passes: u32,
     most_measurements: u32,
@@ -101,6 +106,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let passes = f64::from(plan.max_cycles.max(1) - 1);
     let first_um = 1e3 * task.limits.allowance_mm;
     let grinding_minutes = path_mm / task.pass.feed_mm_min;
+    let removed_mm3_a_pass = pass_mm * task.pass.track_spacing_mm * task.limits.depth_of_cut_mm;
     let most_measurements = plan.max_cycles + u32::from(plan.begin_with == Beginning::Measure);
     let least_measuring_minutes = least_measuring_minutes(&task);
     let least_minutes = f64::from(plan.max_cycles) * grinding_minutes
@@ -120,6 +126,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         tracks: tracks as u64,
         path_mm,
         grinding_minutes,
+        removed_mm3_a_pass,
+        wheel_loss_mm3_a_pass: recipe.grinding.grinding_ratio.map(|ratio| removed_mm3_a_pass / ratio),
         most_passes: plan.max_cycles,
         most_measurements,
         least_measuring_minutes,
@@ -181,12 +189,27 @@ fn time_in_words(d: &Document) -> String {
         format!("of {} minutes and more by the search moves alone", n(minutes))
     });
     format!(
-        "at most {} of {} minutes and {measurements} {measuring}: {} h and more, if all are needed; the moves between points, loading and the wear \
-         of the wheel are not told by recipe and cell",
+        "at most {} of {} minutes and {measurements} {measuring}: {} h and more, if all are needed; the moves between points, and loading are \
+         not told by recipe and cell",
         if d.most_passes == 1 { "1 pass".to_owned() } else { format!("{} passes", d.most_passes) },
         n(d.grinding_minutes),
         n(d.least_hours_to_last),
     )
+}
+
+/// Says what a pass takes off the part, and off the wheel.
+fn removal_in_words(d: &Document) -> String {
+    let n = three_digits;
+    let most = f64::from(d.most_passes);
+    let wheel = match d.wheel_loss_mm3_a_pass {
+        Some(loss) => format!(
+            "the wheel loses about {} mm3 by it, {} mm3 by all passes that are allowed",
+            n(loss),
+            n(most * loss)
+        ),
+        None => "what the wheel loses by it is told where grinding.grinding_ratio is given".to_owned(),
+    };
+    format!("about {} mm3 a pass; {wheel}", n(d.removed_mm3_a_pass))
 }
 
 /// Lays the path of the first pass and checks it; none where only the grinder's controller can lay one.
@@ -214,7 +237,7 @@ fn words(d: &Document) -> String {
     let warnings: String = d.warnings.iter().map(|warning| format!("warning     {warning}\n")).collect();
     format!(
         "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nprogram     {program}\n{learns}\
-         level       {} um over the nominal surface first, at least {} um deeper each pass, so {} um at the last\nbudget      {} um in all\ncycles      at most {}\ntime        {}\n{warnings}",
+         level       {} um over the nominal surface first, at least {} um deeper each pass, so {} um at the last\nbudget      {} um in all\nremoval     {}\ncycles      at most {}\ntime        {}\n{warnings}",
         d.part,
         counted(d.nominal_points, "point"),
         d.part_identity,
@@ -227,6 +250,7 @@ fn words(d: &Document) -> String {
         n(d.depth_of_cut_um),
         n(d.last_level_um),
         n(d.removal_budget_um),
+        removal_in_words(d),
         d.most_cycles,
         time_in_words(d),
     )

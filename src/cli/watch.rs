@@ -181,7 +181,7 @@ impl View {
     }
 
     fn head(&self) -> Paragraph<'_> {
-        let Snapshot { simulation, state, phase, cycle, max_cycles, next, part, .. } = &self.seen;
+        let Snapshot { simulation, state, phase, cycle, max_cycles, next, part, serial, .. } = &self.seen;
         let colour = match state {
             StateName::Execute | StateName::Starting | StateName::Unholding | StateName::Unsuspending => Color::Green,
             StateName::Complete => Color::Green,
@@ -195,7 +195,7 @@ impl View {
                 format!(" {} ", state.to_string().to_uppercase()),
                 Style::new().fg(Color::Black).bg(colour).bold(),
             ),
-            Span::raw(format!("{phase}  cycle {cycle} of at most {max_cycles}  {part}{marked}")),
+            Span::raw(format!("{phase}  cycle {cycle} of at most {max_cycles}  {part}  {serial}{marked}")),
         ]);
         Paragraph::new(vec![first, Line::from(format!("next: {next}"))]).wrap(Wrap { trim: true })
     }

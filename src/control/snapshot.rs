@@ -13,6 +13,9 @@ pub struct Snapshot {
     /// What the part is called.
     #[serde(default)]
     pub part: String,
+    /// Its serial number; empty where nobody knows.
+    #[serde(default)]
+    pub serial: String,
     /// The state, by PackML's name.
     pub state: StateName,
     /// The phase in which it is or will go on, and the step of a machine's job in it.

@@ -128,6 +128,8 @@ pub struct Drive {
     task: Arc<Task>,
     recorder: Recorder,
     folder: PathBuf,
+    /// The serial number of the part.
+    serial: String,
     job: u32,
     actor: Actor,
     loaded: bool,
@@ -263,6 +265,7 @@ impl Drive {
         let (status, seen) = watch::channel(Snapshot::default());
         let mut interrupted = run.interrupted.unwrap_or_else(|| Interrupted::none(run.plan));
         let (ids, open): (Vec<u32>, Vec<Command>) = std::mem::take(&mut interrupted.open).into_iter().unzip();
+        let serial = run.journal.part().to_owned();
         let recorder = Recorder::new(run.journal, &ids, &run.beside);
         let folder = recorder.folder().to_owned();
         let control = Control::listen(&folder, orders.clone(), seen.clone())?;
@@ -282,6 +285,7 @@ impl Drive {
             poll_grinder,
         );
         let drive = Self {
+            serial,
             cell: interrupted.cell,
             task: Arc::new(run.task),
             recorder,

@@ -27,6 +27,10 @@ pub(super) const PATIENCE: Duration = Duration::from_secs(5);
 #[expect(missing_docs, reason = "as Journal has them")]
 pub trait Ledger: Send {
     fn folder(&self) -> &Path;
+    /// The serial number of the part; empty where nobody knows.
+    fn part(&self) -> &str {
+        ""
+    }
     fn append(&mut self, entry: Entry) -> Result<u64, JournalError>;
     fn intend(&mut self, entry: Entry) -> Result<u32, JournalError>;
     fn adopt_known(&mut self, found: Artefact, mono_ns: u64, cycle: u32) -> Result<Artefact, JournalError>;
@@ -36,6 +40,9 @@ pub trait Ledger: Send {
 impl Ledger for Journal {
     fn folder(&self) -> &Path {
         self.folder()
+    }
+    fn part(&self) -> &str {
+        self.part()
     }
     fn append(&mut self, entry: Entry) -> Result<u64, JournalError> {
         self.append(entry)

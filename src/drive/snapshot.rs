@@ -17,6 +17,7 @@ impl Drive {
         Snapshot {
             simulation: self.task.simulation,
             part: self.task.part.clone(),
+            serial: self.serial.clone(),
             state: state.name(),
             phase: state.phase(),
             unconfirmed: self.cell.unconfirmed(),

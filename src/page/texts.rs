@@ -93,6 +93,8 @@ texts! {
     Run { "Run", "Lauf", "运行" }
     Began { "Began", "Beginn", "开始" }
     Ended { "Ended", "Ende", "结束" }
+    Since { "Since", "Seit", "自" }
+    Until { "Until", "Bis", "至" }
     Result { "Result", "Ergebnis", "结果" }
     Alarms { "Alarms", "Alarme", "报警" }
     // The column of the work.

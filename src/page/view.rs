@@ -447,6 +447,9 @@ pub(crate) struct Wanted {
     part: String,
     recipe: String,
     result: String,
+    /// The first and the last day on which it began, `2026-07-04`, in UTC.
+    since: String,
+    until: String,
 }
 
 impl Wanted {
@@ -455,7 +458,10 @@ impl Wanted {
             wanted.is_empty() || value.to_lowercase().contains(&wanted.trim().to_lowercase())
         };
         let result = self.result.is_empty() || self.result == format!("{:?}", run.summary.result);
-        has(&run.summary.part, &self.part) && has(&run.summary.recipe, &self.recipe) && result
+        let day = run.summary.began.get(..10).unwrap_or_default();
+        let in_time =
+            (self.since.is_empty() || day >= self.since.trim()) && (self.until.is_empty() || day <= self.until.trim());
+        has(&run.summary.part, &self.part) && has(&run.summary.recipe, &self.recipe) && result && in_time
     }
 }
 
@@ -487,6 +493,8 @@ pub(crate) async fn runs(
                         }
                     }
                 }
+                label { (say(Text::Since)) " " input type="date" name="since" value=(wanted.since); }
+                label { (say(Text::Until)) " " input type="date" name="until" value=(wanted.until); }
                 button { (say(Text::Show)) }
             }
             form method="get" action="/compare" {

@@ -309,6 +309,10 @@ pub struct Grinding {
     /// Level of the first pass over the nominal surface; each further pass goes deeper by the depth of cut.
     #[schemars(range(min = 0.0, max = 10000.0))]
     pub allowance_um: Um,
+    /// How many mm3 of the part the wheel takes off for each mm3 that it wears (G): `regrind plan` tells the loss of the wheel by it, and
+    /// nothing else goes by it.
+    #[schemars(range(min = 0.01, max = 1000000.0), example = 200.0)]
+    pub grinding_ratio: Option<f64>,
 }
 
 /// Axis of the model frame that a spindle lies along.
@@ -484,6 +488,7 @@ impl Default for Grinding {
             path_tolerance_um: Um(0.1),
             spark_out_passes: 2,
             allowance_um: Um(0.0),
+            grinding_ratio: None,
         }
     }
 }

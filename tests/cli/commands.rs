@@ -590,6 +590,14 @@ fn a_plan_tells_its_time_and_warns_of_a_pass_without_end() {
         assert!(good.contains(words), "`{words}` is missing: {good}");
     }
     assert!(!good.contains("warning"), "{good}");
+    assert!(
+        good.contains("mm3 a pass; what the wheel loses by it is told where grinding.grinding_ratio is given"),
+        "{good}"
+    );
+    bench.write("worn.toml", shipped.replace(feed, &format!("{feed}\ngrinding_ratio = 200.0")));
+    let told: Value = serde_json::from_slice(&bench.run(&["plan", "worn.toml", "--json"]).stdout).unwrap();
+    let [removed, lost] = ["removed_mm3_a_pass", "wheel_loss_mm3_a_pass"].map(|key| told[key].as_f64().unwrap());
+    assert!(removed > 0.0 && (removed / lost - 200.0).abs() < 1e-9, "{told}");
     let slow = plan("slow.toml");
     assert!(slow.contains("warning     a pass takes ") && slow.contains("a shift of 8 h"), "{slow}");
     assert!(slow.contains("at 16.7 mm/min") && slow.contains("grinding.feed_mm_min"), "{slow}");

@@ -26,6 +26,13 @@ fn a_run_that_is_over_is_listed_shown_compared_and_reported() {
     let narrowed = visitor.get("/runs?part=0002&result=Accepted").text();
     assert!(!narrowed.contains(&ids[0]) && narrowed.contains(&ids[1]), "{narrowed}");
     assert!(!visitor.get("/runs?result=Aborted").text().contains(&ids[1]));
+    let lists = |visitor: &mut Visitor, wanted: &str| {
+        let text = visitor.get(&format!("/runs?{wanted}")).text();
+        ids.iter().filter(|id| text.contains(&format!("/runs/{id}\""))).count()
+    };
+    assert_eq!(lists(&mut visitor, "since=2026-01-01&until=9999-01-01"), 2);
+    assert_eq!(lists(&mut visitor, "since=9999-01-01"), 0);
+    assert_eq!(lists(&mut visitor, "until=2026-01-01"), 0);
 
     let shown = visitor.get(&format!("/runs/{}", ids[0])).text();
     let result: serde_json::Value =

@@ -44,6 +44,8 @@ fn the_commands_of_the_page_begin_a_run_that_hands_over_its_first_plan() {
     let folder = running.folder(home.path()).display().to_string();
     let status = || run(&["status", &folder], home.path()).1;
     running.until("a run that asks for the part", |_| status().contains("confirm loaded").then_some(()));
+    let said = status();
+    assert!(said.contains(", SN-0042, run "), "{said}");
     assert_eq!(run(&["confirm", "loaded"], home.path()).0, 0);
     until_handed_over(&mut running, home.path());
     assert_eq!(run(&["stop"], home.path()).0, 0);

@@ -1,6 +1,7 @@
 //! What comes from outside of a run: a terminal that is closed, a service that is stopped, strangers at the control socket, a second run.
 
 use std::fs;
+use std::io::Write;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -275,6 +276,51 @@ fn every_kind_of_new_folder_has_a_good_recipe_and_a_good_cell() {
             assert!(texts.iter().all(|text| !text.contains(elsewhere)), "{machines} names {elsewhere}");
         }
     }
+}
+
+#[test]
+fn without_a_folder_and_without_a_person_to_ask_nothing_is_made() {
+    let home = tempfile::tempdir().unwrap();
+    let (code, _, errors) = run(&["init"], home.path());
+    assert!(code == 2 && errors.contains("no folder to make is named"), "{errors}");
+    assert_eq!(fs::read_dir(home.path()).unwrap().count(), 0);
+}
+
+#[test]
+fn at_a_terminal_a_new_folder_is_asked_for_until_the_answers_will_do() {
+    let home = tempfile::tempdir().unwrap();
+    // `script` gives it a terminal of its own.
+    let typed = format!("{} init", env!("CARGO_BIN_EXE_regrind"));
+    let mut command = Command::new("script");
+    command.args(["-qec", &typed, "/dev/null"]).current_dir(home.path()).stdin(Stdio::piped());
+    let mut running = Running::new(command);
+    let mut keys = running.keys();
+    keys.write_all(b"shop\nseven\n2\nlens 7\n").unwrap();
+    let code = running.end().0;
+    let said = running.said.join("\n");
+    assert!(code == 0 && said.contains("made shop:"), "{said}");
+    let texts =
+        ["recipe.toml", "cell.toml"].map(|file| fs::read_to_string(home.path().join("shop").join(file)).unwrap());
+    assert!(texts[0].contains("name = \"lens 7\"") && texts[1].contains("modbus-tcp"), "{texts:?}");
+}
+
+#[test]
+fn the_doctor_misses_the_folders_in_which_machines_give_and_take() {
+    let home = tempfile::tempdir().unwrap();
+    let (code, _, errors) = run(&["init", "shop", "--machines", "files"], home.path());
+    assert_eq!(code, 0, "{errors}");
+    let shop = home.path().join("shop");
+    let (code, said, _) = run(&["doctor", "cell.toml"], &shop);
+    assert_eq!(code, 1, "{said}");
+    assert!(
+        said.matches("OBSTACLE").count() == 2 && said.contains("is not there; make it where the CMM finds it"),
+        "{said}"
+    );
+    for folder in ["cmm/in", "cmm/out", "grinder/in", "grinder/out"] {
+        fs::create_dir_all(shop.join("exchange").join(folder)).unwrap();
+    }
+    let (code, said, _) = run(&["doctor", "cell.toml"], &shop);
+    assert!(code == 0 && !said.contains("OBSTACLE"), "{said}");
 }
 
 #[test]
