@@ -225,4 +225,8 @@ fn pictures_are_made() {
     tab.click(&mut browser, "[data-view=relief]");
     picture(&tab, &mut browser, "page-relief.png");
     assert_eq!(shown.run.end().0, 0);
+    let run = std::fs::read_dir(home.path().join("runs")).unwrap().next().unwrap().unwrap().path();
+    let report = browser.open(&format!("file://{}", run.join("report.html").display()), [1000, 1000]);
+    report.until(&mut browser, "document.querySelector('#judged') !== null");
+    picture(&report, &mut browser, "report.png");
 }
