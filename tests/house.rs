@@ -6,12 +6,14 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Every room, its folder or file, and the rooms that it may name. An arrow that stands here in no line is a turned arrow.
-const ARROWS: [(&str, &str, &[&str]); 18] = [
+const ARROWS: [(&str, &str, &[&str]); 20] = [
     ("geometry", "src/core/geometry", &[]),
     ("surface", "src/core/surface", &["geometry"]),
     ("measuring", "src/core/measuring", &["geometry", "surface"]),
     ("registration", "src/core/registration", &["geometry", "surface"]),
-    ("compensation", "src/core/compensation", &["geometry", "surface", "registration"]),
+    ("compensation", "src/core/compensation", &["geometry", "sparse", "surface", "registration"]),
+    ("model", "src/core/model", &["sparse"]),
+    ("sparse", "src/core/sparse.rs", &[]),
     ("form", "src/core/form", &["geometry", "surface"]),
     ("cell", "src/cell", &[]),
     ("document", "src/document", &[]),

@@ -44,5 +44,7 @@ pub mod compensation;
 pub mod form;
 pub mod geometry;
 pub mod measuring;
+pub mod model;
 pub mod registration;
+mod sparse;
 pub mod surface;

@@ -313,7 +313,8 @@ fn the_doctor_misses_the_folders_in_which_machines_give_and_take() {
     let (code, said, _) = run(&["doctor", "cell.toml"], &shop);
     assert_eq!(code, 1, "{said}");
     assert!(
-        said.matches("OBSTACLE").count() == 2 && said.contains("is not there; make it where the measuring machine finds it"),
+        said.matches("OBSTACLE").count() == 2
+            && said.contains("is not there; make it where the measuring machine finds it"),
         "{said}"
     );
     for folder in ["cmm/in", "cmm/out", "grinder/in", "grinder/out"] {

@@ -24,7 +24,6 @@ pub mod path;
 mod response;
 mod robust;
 mod sampling;
-mod selected;
 mod spline;
 
 pub use correction::Correction;

@@ -25,8 +25,8 @@ use thiserror::Error;
 
 use super::filter::Trend;
 use super::kept::Kept;
-use super::selected::{Pattern, SelectedInverse};
 use crate::geometry::Grid;
+use crate::sparse::{Pattern, SelectedInverse};
 
 /// Knots to a cut-off: with five the splines themselves let waves at the cut-off pass to 0.2 %.
 const KNOTS: f64 = 5.0;

@@ -1,0 +1,208 @@
+//! The model by the covariance of every pair of points: exact, and the measure of the sparse way.
+//!
+//! With K = k(x_i, x_j) + s^2, the effects b by generalised least squares, b = (H'K^-1 H)^-1 H'K^-1 d, and what is left told by kriging
+//! (Rasmussen and Williams 2006, 2.7, with a vague prior of b): mean h'b + k'K^-1 (d - H b), variance
+//! k(x, x) - k'K^-1 k + r'(H'K^-1 H)^-1 r with r = h - H'K^-1 k.
+
+use faer::linalg::solvers::{Llt, Solve};
+use faer::{Mat, Side};
+use nalgebra::{DMatrix, DVector};
+
+use super::{Hyper, ModelError, Observed};
+
+/// What the model says of a place.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Predicted {
+    /// The field, the most probable value.
+    pub mean_mm: f64,
+    /// Its standard uncertainty; the scatter of a further point is not in it.
+    pub sigma_mm: f64,
+}
+
+/// A model that knows some points.
+pub struct Dense {
+    hyper: Hyper,
+    places: Vec<[f64; 2]>,
+    factor: Llt<f64>,
+    /// K^-1 (d - H b).
+    weights: Vec<f64>,
+    /// K^-1 H.
+    effects: Mat<f64>,
+    /// The effects, and their covariance.
+    found: DVector<f64>,
+    covariance: DMatrix<f64>,
+    likelihood: f64,
+}
+
+impl Dense {
+    /// Fits the effects and the field to what was measured; takes time as the cube of the number of points.
+    ///
+    /// # Errors
+    /// Rows that do not belong together, numbers that are none, parameters that are not above 0, effects that cannot be told apart.
+    pub fn fit(observed: &Observed, hyper: Hyper) -> Result<Self, ModelError> {
+        observed.check()?;
+        hyper.check()?;
+        let Observed { places, deviations_mm, effects } = observed;
+        let (n, p) = (places.len(), effects.ncols());
+        let scatter2 = hyper.scatter_mm * hyper.scatter_mm;
+        let covariance = Mat::from_fn(n, n, |r, c| {
+            // Only the lower triangle is read.
+            if r < c {
+                0.0
+            } else {
+                hyper.field.covariance_mm2(places[r], places[c]) + if r == c { scatter2 } else { 0.0 }
+            }
+        });
+        let factor = Llt::new(covariance.as_ref(), Side::Lower).map_err(|_| ModelError::NotDefinite)?;
+        let right = Mat::from_fn(n, p + 1, |r, c| if c < p { effects[(r, c)] } else { deviations_mm[r] });
+        let solved = factor.solve(&right);
+        // H'K^-1 H and H'K^-1 d.
+        let gram = DMatrix::from_fn(p, p, |a, b| (0..n).map(|k| effects[(k, a)] * solved[(k, b)]).sum());
+        let towards = DVector::from_fn(p, |a, _| (0..n).map(|k| effects[(k, a)] * solved[(k, p)]).sum());
+        let gram = told_apart(gram)?;
+        let found = gram.solve(&towards);
+        let left = |k: usize| solved[(k, p)] - (0..p).map(|a| solved[(k, a)] * found[a]).sum::<f64>();
+        let weights: Vec<f64> = (0..n).map(left).collect();
+        let squares: f64 = (0..n).map(|k| deviations_mm[k] * weights[k]).sum();
+        let diagonal = factor.L().diagonal();
+        let log_det: f64 = 2.0 * (0..n).map(|k| diagonal[k].ln()).sum::<f64>();
+        let log_gram: f64 = 2.0 * gram.l_dirty().diagonal().iter().map(|v| v.ln()).sum::<f64>();
+        Ok(Self {
+            hyper,
+            places: places.clone(),
+            weights,
+            effects: Mat::from_fn(n, p, |r, c| solved[(r, c)]),
+            found,
+            covariance: gram.inverse(),
+            likelihood: -0.5 * (log_det + log_gram + squares + (n - p) as f64 * std::f64::consts::TAU.ln()),
+            factor,
+        })
+    }
+
+    /// Returns the logarithm of the likelihood of what was measured, whatever the effects are (restricted likelihood, Patterson and
+    /// Thompson 1971): by it parameters are compared.
+    pub fn log_likelihood(&self) -> f64 {
+        self.likelihood
+    }
+
+    /// The squares of the whitened residuals, d'K^-1 (d - H b).
+    pub(super) fn whitened_squares(&self, observed: &Observed) -> f64 {
+        observed.deviations_mm.iter().zip(&self.weights).map(|(d, w)| d * w).sum()
+    }
+
+    /// Returns the effects and their covariance: with the motions of the part as effects, where its nominal frame is, and how well
+    /// that is known beside a field that nobody knows either.
+    pub fn effects(&self) -> (&DVector<f64>, &DMatrix<f64>) {
+        (&self.found, &self.covariance)
+    }
+
+    /// Tells the field at some places, the effects taken off.
+    pub fn predict(&self, places: &[[f64; 2]]) -> Vec<Predicted> {
+        let (n, p) = (self.places.len(), self.found.len());
+        let across = Mat::from_fn(n, places.len(), |r, c| self.hyper.field.covariance_mm2(self.places[r], places[c]));
+        let solved = self.factor.solve(&across);
+        let sigma2 = self.hyper.field.sigma_mm * self.hyper.field.sigma_mm;
+        (0..places.len())
+            .map(|c| {
+                let mean_mm = (0..n).map(|k| across[(k, c)] * self.weights[k]).sum();
+                let known: f64 = (0..n).map(|k| across[(k, c)] * solved[(k, c)]).sum();
+                let moved =
+                    DVector::from_fn(p, |a, _| (0..n).map(|k| self.effects[(k, a)] * across[(k, c)]).sum::<f64>());
+                let by_effects = if p == 0 { 0.0 } else { moved.dot(&(&self.covariance * &moved)) };
+                Predicted { mean_mm, sigma_mm: (sigma2 - known + by_effects).max(0.0).sqrt() }
+            })
+            .collect()
+    }
+}
+
+/// The factor of H'K^-1 H; none where a direction of it is nothing beside the others.
+pub(super) fn told_apart(gram: DMatrix<f64>) -> Result<nalgebra::Cholesky<f64, nalgebra::Dyn>, ModelError> {
+    const LEAST: f64 = 1e-12;
+    if gram.nrows() == 0 {
+        return gram.cholesky().ok_or(ModelError::EffectsAlike);
+    }
+    // Effects have units of their own: what counts is how alike they are.
+    let scales = DVector::from_iterator(gram.nrows(), gram.diagonal().iter().map(|v| v.sqrt()));
+    let alike = DMatrix::from_fn(gram.nrows(), gram.ncols(), |a, b| gram[(a, b)] / (scales[a] * scales[b]));
+    let least = alike.symmetric_eigenvalues().iter().copied().fold(f64::INFINITY, f64::min);
+    if least.is_nan() || least <= LEAST {
+        return Err(ModelError::EffectsAlike);
+    }
+    gram.cholesky().ok_or(ModelError::EffectsAlike)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Field;
+    use super::*;
+
+    const HYPER: Hyper = Hyper { field: Field { sigma_mm: 2.0, range_mm: 20.0 }, scatter_mm: 0.5 };
+
+    #[test]
+    fn of_one_point_it_is_what_is_worked_out_by_hand() {
+        // k = 4, s^2 = 0.25: mean = 4 / 4.25 * 3, variance = 4 - 16 / 4.25.
+        let model = Dense::fit(&Observed::without_effects(vec![[1.0, 2.0]], vec![3.0]), HYPER).unwrap();
+        let [at, far] = model.predict(&[[1.0, 2.0], [1e4, 0.0]])[..] else { panic!() };
+        assert!((at.mean_mm - 12.0 / 4.25).abs() < 1e-14 && (at.sigma_mm.powi(2) - (4.0 - 16.0 / 4.25)).abs() < 1e-14);
+        assert_eq!(far, Predicted { mean_mm: 0.0, sigma_mm: 2.0 });
+        let by_hand = -0.5 * (4.25_f64.ln() + 9.0 / 4.25 + std::f64::consts::TAU.ln());
+        assert!((model.log_likelihood() - by_hand).abs() < 1e-14);
+    }
+
+    fn wave(places: &[[f64; 2]]) -> Vec<f64> {
+        places.iter().map(|[x, y]| (0.1 * x).sin() + 0.5 * (0.13 * y).cos()).collect()
+    }
+
+    fn places(count: u32) -> Vec<[f64; 2]> {
+        (0..count).map(|k| f64::from(k)).map(|k| [(7.31 * k) % 60.0, (13.7 * k) % 40.0]).collect()
+    }
+
+    #[test]
+    fn effects_take_off_what_moves_all_points_and_say_how_well_they_are_known() {
+        let places = places(120);
+        let effects = DMatrix::from_fn(120, 3, |r, c| [1.0, places[r][0], places[r][1]][c]);
+        let planted = DVector::from_column_slice(&[40.0, 0.3, -0.2]);
+        let still = wave(&places);
+        let moved: Vec<f64> = still.iter().zip((&effects * &planted).iter()).map(|(d, m)| d + m).collect();
+        let with = |deviations_mm| Observed { places: places.clone(), deviations_mm, effects: effects.clone() };
+        let [a, b] = [still, moved].map(|d| Dense::fit(&with(d), HYPER).unwrap());
+        // What is planted comes back on top of what the field itself has along it.
+        assert!((b.effects().0 - a.effects().0 - &planted).norm() < 1e-9);
+        let asked = [[30.0, 20.0], [70.0, 10.0]];
+        for (p, q) in a.predict(&asked).into_iter().zip(b.predict(&asked)) {
+            assert!((p.mean_mm - q.mean_mm).abs() < 1e-9 && (p.sigma_mm - q.sigma_mm).abs() < 1e-12);
+        }
+        // The place of a part with a field of 2 mm and a range of a third of it is known to much worse than its points scatter.
+        let height = a.effects().1[(0, 0)].sqrt();
+        assert!(height > 10.0 * 0.5 / 120.0_f64.sqrt(), "{height}");
+    }
+
+    #[test]
+    fn moving_everything_moves_nothing() {
+        let at = places(80);
+        let away: Vec<[f64; 2]> = at.iter().map(|[x, y]| [x + 1e4, y - 3e3]).collect();
+        let fit =
+            |places: &[[f64; 2]]| Dense::fit(&Observed::without_effects(places.to_vec(), wave(&at)), HYPER).unwrap();
+        let (here, there) = (fit(&at).predict(&[[11.0, 12.0]])[0], fit(&away).predict(&[[10_011.0, -2988.0]])[0]);
+        assert!((here.mean_mm - there.mean_mm).abs() < 1e-9 && (here.sigma_mm - there.sigma_mm).abs() < 1e-9);
+    }
+
+    #[test]
+    fn what_is_no_model_is_refused_in_words() {
+        let of = |observed: &Observed, hyper| Dense::fit(observed, hyper).err().unwrap().to_string();
+        let two = Observed::without_effects(vec![[0.0; 2]; 2], vec![1.0, f64::NAN]);
+        assert_eq!(of(&two, HYPER), "point 2 has a number that is none");
+        let none = Observed::without_effects(vec![], vec![]);
+        assert!(of(&none, HYPER).contains("needs 1 points at least, 0"));
+        let odd = Observed::without_effects(vec![[0.0; 2]; 2], vec![1.0]);
+        assert!(of(&odd, HYPER).contains("do not belong together"));
+        let good = Observed::without_effects(vec![[0.0; 2]; 2], vec![1.0; 2]);
+        assert!(of(&good, Hyper { scatter_mm: 0.0, ..HYPER }).contains("the scatter is 0 mm"));
+        let alike = Observed {
+            effects: DMatrix::from_element(9, 2, 1.0),
+            ..Observed::without_effects(places(9), vec![0.0; 9])
+        };
+        assert!(of(&alike, HYPER).contains("cannot be told apart"));
+        assert!(Dense::fit(&good, HYPER).is_ok(), "two points at one place");
+    }
+}

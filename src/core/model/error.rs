@@ -1,0 +1,28 @@
+//! Why a model cannot be had.
+
+use thiserror::Error;
+
+/// Why a model cannot be had. A point counts from 0.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[allow(missing_docs)]
+#[non_exhaustive]
+pub enum ModelError {
+    #[error("{points} places, {deviations} deviations and {rows} rows of effects do not belong together")]
+    Shape { points: usize, deviations: usize, rows: usize },
+    #[error("a model needs {least} points at least, {points} were given")]
+    TooFewPoints { points: usize, least: usize },
+    #[error("point {} has a number that is none", point + 1)]
+    NotFinite { point: usize },
+    #[error("the {what} is {value} mm; it must be finite and above 0")]
+    Hyper { what: &'static str, value: f64 },
+    #[error(
+        "the covariance of the points is not definite: their scatter is too small beside the field, or places coincide"
+    )]
+    NotDefinite,
+    #[error("the effects cannot be told apart by these points; leave out what the surface does not show")]
+    EffectsAlike,
+    #[error(
+        "a grid for the field would have {nodes} nodes, more than {most}; the range of {range_mm} mm is too short for the part"
+    )]
+    TooManyNodes { nodes: usize, most: usize, range_mm: f64 },
+}

@@ -1,0 +1,111 @@
+//! One model of the error of a part: a rigid motion, a smooth random field, and the scatter of the probe.
+//!
+//! ```text
+//!  deviations at points --> likelihood --> Hyper: how strong and how wide the field is, how far a point scatters
+//!          |                                  |
+//!          +------> Dense, or Sparse <--------+
+//!                        |
+//!                        +--> mean and sigma anywhere, the motion with its covariance, samples of all of it
+//! ```
+//!
+//! The deviation of point i is d_i = h_i' b + f(x_i) + e_i. The rows h_i are what the registration could still move (its Jacobian), with
+//! no knowledge of b beforehand; f is a Matern field of smoothness 2; e_i is independent. Motion and field are told together, for a
+//! direction in which the surface does not hold the part looks like form: whoever takes one for known gives the other a lie.
+//!
+//! Two ways to the same answer. [`Dense`] has the covariance of every pair of points: exact, for some 3,000 points. [`Sparse`] has the
+//! precision of the field on a grid (Lindgren, Rue and Lindstrom 2011, alpha = 3), where each node knows its neighbours alone: for any
+//! number of points, and for samples.
+//!
+//! Frame: places lie in the plane of projection of the model {M}. Units: millimetres.
+
+mod dense;
+mod error;
+mod likelihood;
+mod matern;
+mod normals;
+mod sparse;
+
+pub use dense::{Dense, Predicted};
+pub use error::ModelError;
+pub use likelihood::Priors;
+pub use sparse::{Lattice, Sparse};
+
+use matern::correlation;
+use nalgebra::DMatrix;
+
+/// A smooth random field: how strong it is, and how wide.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Field {
+    /// Standard deviation of the field about 0.
+    pub sigma_mm: f64,
+    /// The distance at which it has all but forgotten itself: correlation 0.14.
+    pub range_mm: f64,
+}
+
+impl Field {
+    /// Returns the covariance of the field at two places.
+    pub fn covariance_mm2(&self, a: [f64; 2], b: [f64; 2]) -> f64 {
+        let distance_mm = (a[0] - b[0]).hypot(a[1] - b[1]);
+        self.sigma_mm * self.sigma_mm * correlation(4.0 * distance_mm / self.range_mm)
+    }
+}
+
+/// What the model has to know before it can tell anything.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Hyper {
+    /// The field.
+    pub field: Field,
+    /// Standard deviation by which a point scatters by itself.
+    pub scatter_mm: f64,
+}
+
+/// What was measured. All three have a row a point.
+#[derive(Clone, Debug)]
+pub struct Observed {
+    /// Where.
+    pub places: Vec<[f64; 2]>,
+    /// What.
+    pub deviations_mm: Vec<f64>,
+    /// What a unit of each effect that nobody knows adds to it, such as the motions of the part; may have no column.
+    pub effects: DMatrix<f64>,
+}
+
+impl Observed {
+    /// Deviations of which nothing moves them all.
+    pub fn without_effects(places: Vec<[f64; 2]>, deviations_mm: Vec<f64>) -> Self {
+        let effects = DMatrix::zeros(places.len(), 0);
+        Self { places, deviations_mm, effects }
+    }
+
+    /// Says what makes these no observations.
+    fn check(&self) -> Result<(), ModelError> {
+        let Self { places, deviations_mm, effects } = self;
+        let (points, columns) = (places.len(), effects.ncols());
+        if deviations_mm.len() != points || effects.nrows() != points {
+            return Err(ModelError::Shape { points, deviations: deviations_mm.len(), rows: effects.nrows() });
+        }
+        if points <= columns {
+            return Err(ModelError::TooFewPoints { points, least: columns + 1 });
+        }
+        let finite = |k: usize| {
+            places[k].iter().chain(&deviations_mm[k..=k]).chain(effects.row(k).iter()).all(|value| value.is_finite())
+        };
+        match (0..points).find(|&k| !finite(k)) {
+            Some(point) => Err(ModelError::NotFinite { point }),
+            None => Ok(()),
+        }
+    }
+}
+
+impl Hyper {
+    /// Says what makes these no parameters.
+    fn check(&self) -> Result<(), ModelError> {
+        let Self { field: Field { sigma_mm, range_mm }, scatter_mm } = *self;
+        for (what, value) in [("field", sigma_mm), ("range", range_mm), ("scatter", scatter_mm)] {
+            if !(value.is_finite() && value > 0.0) {
+                return Err(ModelError::Hyper { what, value });
+            }
+        }
+        Ok(())
+    }
+}

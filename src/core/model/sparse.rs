@@ -1,0 +1,418 @@
+//! The model by the precision of the field on a grid: each node knows its neighbours alone, so there may be any number of points.
+//!
+//! A Matern field of smoothness 2 in the plane solves (kappa^2 - Laplace)^(3/2) tau f = white noise (Lindgren, Rue and Lindstrom 2011). On a square grid
+//! with C the area of each node and Q1 that of kappa^2 - Laplace, the precision is Q = tau^2 Q1 C^-1 Q1 C^-1 Q1.
+//!
+//! The usual Q1 errs by the square of kappa h. Here it is kappa^2 m x m + K x m + m x K, with K = [-1 2 -1] and m = [1 10 1] / 12 along each axis: for a
+//! wave of w radians a node that is (kappa^2 + w^2)(1 - w^2/12) in every direction, and so the nodes are those of the true field
+//! raised by (1 - w^2/12)^-3/2 = 1 + w^2/8. The quadratic B-splines by which places read the nodes lower it by 1 - w^2/8: what is
+//! left is of the fourth power. tau is that by which the field without an edge has its variance on this very grid; the edge, which would
+//! add to it, lies further than one range away from every place.
+//!
+//! With B the splines from nodes to points, P = Q + B'B / s^2 is the precision of the nodes beside known effects; the effects come from
+//! H'R^-1 H with R^-1 = (1 - B P^-1 B' / s^2) / s^2.
+
+use faer::Mat;
+use nalgebra::{DMatrix, DVector};
+use rayon::prelude::*;
+
+use super::dense::told_apart;
+use super::normals::Normals;
+use super::{Hyper, ModelError, Observed, Predicted};
+use crate::sparse::{Factor, Pattern, SelectedInverse};
+
+/// How many ranges the grid goes on beyond every place.
+const MARGIN: f64 = 1.25;
+/// Nodes in one range.
+const NODES_A_RANGE: f64 = 14.0;
+/// More would take minutes.
+const MOST_NODES: usize = 120_000;
+/// How far Q reaches, and the nodes around a place from each other: three steps along either axis.
+const REACH: isize = 3;
+/// Samples that are made at a time.
+const BATCH: usize = 50;
+
+/// A square grid over the places of a part, and one range beyond them.
+pub struct Lattice {
+    corner_mm: [f64; 2],
+    spacing_mm: f64,
+    counts: [usize; 2],
+    pattern: Pattern,
+}
+
+/// The nodes by which a place is read, with how much each of them counts.
+type Around = [(usize, f64); 9];
+
+impl Lattice {
+    /// Lays a grid that is fine enough for a field of some range, over all places that will be asked for.
+    ///
+    /// # Errors
+    /// No place, a place that is no number, more nodes than can be worked with.
+    pub fn over(places: &[[f64; 2]], range_mm: f64) -> Result<Self, ModelError> {
+        if !(range_mm.is_finite() && range_mm > 0.0) {
+            return Err(ModelError::Hyper { what: "range", value: range_mm });
+        }
+        if let Some(point) = places.iter().position(|place| !place.iter().all(|value| value.is_finite())) {
+            return Err(ModelError::NotFinite { point });
+        }
+        if places.is_empty() {
+            return Err(ModelError::TooFewPoints { points: 0, least: 1 });
+        }
+        let spacing_mm = range_mm / NODES_A_RANGE;
+        let ends = [0, 1].map(|axis| {
+            let of = places.iter().map(|place| place[axis]);
+            [
+                of.clone().fold(f64::INFINITY, f64::min) - MARGIN * range_mm,
+                of.fold(f64::NEG_INFINITY, f64::max) + MARGIN * range_mm,
+            ]
+        });
+        let counts = ends.map(|[low, high]| ((high - low) / spacing_mm).ceil() + 1.0);
+        let nodes = counts[0] * counts[1];
+        if nodes > MOST_NODES as f64 {
+            return Err(ModelError::TooManyNodes { nodes: nodes as usize, most: MOST_NODES, range_mm });
+        }
+        let counts = counts.map(|count| count as usize);
+        let (begins, rows) = pattern(counts);
+        let pattern = Pattern::new(counts[0] * counts[1], begins, rows).ok_or(ModelError::NotDefinite)?;
+        Ok(Self { corner_mm: ends.map(|[low, _]| low), spacing_mm, counts, pattern })
+    }
+
+    /// Returns the number of nodes.
+    pub fn nodes(&self) -> usize {
+        self.counts[0] * self.counts[1]
+    }
+
+    /// The nodes by which a place is read; for a place beyond the grid those of its edge.
+    fn around(&self, place: [f64; 2]) -> Around {
+        let [(i, u), (j, v)] = [0, 1].map(|axis| {
+            let last = (self.counts[axis] - 1) as f64;
+            let at = ((place[axis] - self.corner_mm[axis]) / self.spacing_mm).clamp(0.5, last - 0.5);
+            let nearest = at.round().clamp(1.0, last - 1.0);
+            (nearest as usize - 1, spline(at - nearest))
+        });
+        std::array::from_fn(|k| ((j + k / 3) * self.counts[0] + i + k % 3, u[k % 3] * v[k / 3]))
+    }
+
+    /// The lower triangle of the precision of the field, in the order of the pattern.
+    fn precision(&self, hyper: &Hyper) -> Vec<f64> {
+        let kappa_h = 4.0 / hyper.field.range_mm * self.spacing_mm;
+        let tau2 = unit_variance(kappa_h) / hyper.field.sigma_mm.powi(2);
+        let [nx, ny] = self.counts.map(|count| count as isize);
+        // Along an axis, in units of the spacing: C, and K and m = C - K / 12 between a node and the one `step` further.
+        let share = |k: isize, count: isize| if k == 0 || k == count - 1 { 0.5 } else { 1.0 };
+        let pull = |k: isize, step: isize, count: isize| match step {
+            0 if k == 0 || k == count - 1 => 1.0,
+            0 => 2.0,
+            _ => -1.0,
+        };
+        let mass = |k: isize, step: isize, count: isize| {
+            let whole = if step == 0 { share(k, count) } else { 0.0 };
+            whole - pull(k, step, count) / 12.0
+        };
+        let inside = |i: isize, j: isize| (0..nx).contains(&i) && (0..ny).contains(&j);
+        const SIDE: usize = 2 * REACH as usize + 3;
+        const MIDDLE: isize = REACH + 1;
+        let column = |of: usize| -> Vec<f64> {
+            let (i0, j0) = (of as isize % nx, of as isize / nx);
+            let mut window = [[0.0_f64; SIDE]; SIDE];
+            window[MIDDLE as usize][MIDDLE as usize] = 1.0;
+            for turn in 1..=REACH {
+                let mut next = [[0.0_f64; SIDE]; SIDE];
+                for (dj, di) in (-turn..=turn).flat_map(|dj| (-turn..=turn).map(move |di| (dj, di))) {
+                    let (i, j) = (i0 + di, j0 + dj);
+                    if !inside(i, j) {
+                        continue;
+                    }
+                    let mut value = 0.0;
+                    for (sj, si) in (-1..=1).flat_map(|sj| (-1..=1).map(move |si| (sj, si))) {
+                        if inside(i + si, j + sj) {
+                            let (mi, mj) = (mass(i, si, nx), mass(j, sj, ny));
+                            let weight = kappa_h * kappa_h * mi * mj + pull(i, si, nx) * mj + mi * pull(j, sj, ny);
+                            value += weight * window[(MIDDLE + dj + sj) as usize][(MIDDLE + di + si) as usize];
+                        }
+                    }
+                    // Between two of the three stands C^-1.
+                    let area = if turn < REACH { share(i, nx) * share(j, ny) } else { 1.0 };
+                    next[(MIDDLE + dj) as usize][(MIDDLE + di) as usize] = value / area;
+                }
+                window = next;
+            }
+            below(of, self.counts)
+                .map(|(di, dj)| tau2 * window[(MIDDLE + dj) as usize][(MIDDLE + di) as usize])
+                .collect()
+        };
+        (0..self.nodes()).into_par_iter().flat_map_iter(column).collect()
+    }
+}
+
+/// How much each of three nodes counts at `t` from the middle one, -1/2 to 1/2: the quadratic B-spline.
+fn spline(t: f64) -> [f64; 3] {
+    [0.5 * (0.5 - t).powi(2), 0.75 - t * t, 0.5 * (0.5 + t).powi(2)]
+}
+
+/// Where, beside a node, the precision has an entry in its column, at or below the diagonal; ascending.
+fn below(of: usize, [nx, ny]: [usize; 2]) -> impl Iterator<Item = (isize, isize)> {
+    let (i0, j0) = ((of % nx) as isize, (of / nx) as isize);
+    let all = (0..=REACH).flat_map(|dj| (-REACH..=REACH).map(move |di| (di, dj)));
+    all.filter(move |&(di, dj)| {
+        let (i, j) = (i0 + di, j0 + dj);
+        (dj > 0 || di >= 0) && (0..nx as isize).contains(&i) && j < ny as isize
+    })
+}
+
+fn pattern(counts: [usize; 2]) -> (Vec<usize>, Vec<usize>) {
+    let (mut begins, mut rows) = (vec![0], Vec::new());
+    for of in 0..counts[0] * counts[1] {
+        rows.extend(below(of, counts).map(|(di, dj)| (of as isize + dj * counts[0] as isize + di) as usize));
+        begins.push(rows.len());
+    }
+    (begins, rows)
+}
+
+/// The variance, with tau = 1, of the field on a grid without an edge: the mean over the waves that the grid has of what the precision
+/// and the spline at a node make of them.
+fn unit_variance(kappa_h: f64) -> f64 {
+    // The function is smooth and returns to itself: equal steps are exact once they are finer than its width.
+    let steps = ((40.0 / kappa_h) as usize).clamp(64, 4096);
+    let wave = |k: usize| (std::f64::consts::TAU * k as f64 / steps as f64).cos();
+    // K, m and the spline along one axis.
+    let axis: Vec<[f64; 3]> = (0..steps).map(wave).map(|c| [2.0 - 2.0 * c, (5.0 + c) / 6.0, (3.0 + c) / 4.0]).collect();
+    let of = |[ka, ma, sa]: [f64; 3], [kb, mb, sb]: [f64; 3]| {
+        (sa * sb).powi(2) * (kappa_h * kappa_h * ma * mb + ka * mb + ma * kb).powi(-3)
+    };
+    let rows: Vec<f64> = axis.par_iter().map(|&a| axis.iter().map(|&b| of(a, b)).sum()).collect();
+    rows.iter().sum::<f64>() / (steps * steps) as f64
+}
+
+/// A model that knows some points.
+pub struct Sparse<'a> {
+    lattice: &'a Lattice,
+    factor: Factor<'a>,
+    inverse: SelectedInverse<'a>,
+    /// The field at the nodes.
+    mean_mm: Vec<f64>,
+    /// By how much the field at the nodes falls with each effect: P^-1 B'H / s^2.
+    follows: Mat<f64>,
+    found: DVector<f64>,
+    covariance: DMatrix<f64>,
+    likelihood: f64,
+}
+
+impl<'a> Sparse<'a> {
+    /// Fits the effects and the field to what was measured.
+    ///
+    /// # Errors
+    /// Those of [`super::Dense::fit`].
+    pub fn fit(lattice: &'a Lattice, observed: &Observed, hyper: Hyper) -> Result<Self, ModelError> {
+        observed.check()?;
+        hyper.check()?;
+        let Observed { places, deviations_mm, effects } = observed;
+        let (n, p) = (places.len(), effects.ncols());
+        let precision2 = hyper.scatter_mm.powi(-2);
+        let around: Vec<Around> = places.iter().map(|&place| lattice.around(place)).collect();
+        let mut values = lattice.precision(&hyper);
+        let before = lattice.pattern.factor(&values).ok_or(ModelError::NotDefinite)?.log_determinant();
+        for nodes in &around {
+            for (a, wa) in nodes {
+                for (b, wb) in nodes.iter().filter(|(b, _)| b >= a) {
+                    let entry = lattice.pattern.place(*b, *a).ok_or(ModelError::NotDefinite)?;
+                    values[entry] += wa * wb * precision2;
+                }
+            }
+        }
+        let factor = lattice.pattern.factor(&values).ok_or(ModelError::NotDefinite)?;
+        // B'H and B'd.
+        let mut right = Mat::<f64>::zeros(lattice.nodes(), p + 1);
+        for (k, nodes) in around.iter().enumerate() {
+            for &(node, weight) in nodes {
+                (0..p).for_each(|a| right[(node, a)] += weight * effects[(k, a)]);
+                right[(node, p)] += weight * deviations_mm[k];
+            }
+        }
+        let solved = factor.solve_all(&right).ok_or(ModelError::NotDefinite)?;
+        let inner = |a: usize, b: usize| (0..lattice.nodes()).map(|k| right[(k, a)] * solved[(k, b)]).sum::<f64>();
+        let plain = |a: usize, b: &dyn Fn(usize) -> f64| (0..n).map(|k| effects[(k, a)] * b(k)).sum::<f64>();
+        let gram =
+            DMatrix::from_fn(p, p, |a, b| (plain(a, &|k| effects[(k, b)]) - inner(a, b) * precision2) * precision2);
+        let towards =
+            DVector::from_fn(p, |a, _| (plain(a, &|k| deviations_mm[k]) - inner(a, p) * precision2) * precision2);
+        let gram = told_apart(gram)?;
+        let found = gram.solve(&towards);
+        let follows = Mat::from_fn(lattice.nodes(), p, |r, c| solved[(r, c)] * precision2);
+        let mean_mm: Vec<f64> = (0..lattice.nodes())
+            .map(|k| solved[(k, p)] * precision2 - (0..p).map(|a| follows[(k, a)] * found[a]).sum::<f64>())
+            .collect();
+        let left = |(k, nodes): (usize, &Around)| {
+            let field: f64 = nodes.iter().map(|&(node, weight)| weight * mean_mm[node]).sum();
+            let moved: f64 = (0..p).map(|a| effects[(k, a)] * found[a]).sum();
+            deviations_mm[k] * (deviations_mm[k] - moved - field)
+        };
+        let squares = precision2 * around.iter().enumerate().map(left).sum::<f64>();
+        let log_gram: f64 = 2.0 * gram.l_dirty().diagonal().iter().map(|v| v.ln()).sum::<f64>();
+        let log_det = factor.log_determinant() - before - n as f64 * precision2.ln();
+        Ok(Self {
+            inverse: factor.selected_inverse().ok_or(ModelError::NotDefinite)?,
+            lattice,
+            factor,
+            mean_mm,
+            follows,
+            found,
+            covariance: gram.inverse(),
+            likelihood: -0.5 * (log_det + log_gram + squares + (n - p) as f64 * std::f64::consts::TAU.ln()),
+        })
+    }
+
+    /// Returns the logarithm of the likelihood, as [`super::Dense::log_likelihood`] does.
+    pub fn log_likelihood(&self) -> f64 {
+        self.likelihood
+    }
+
+    /// Returns the effects and their covariance, as [`super::Dense::effects`] does.
+    pub fn effects(&self) -> (&DVector<f64>, &DMatrix<f64>) {
+        (&self.found, &self.covariance)
+    }
+
+    /// Tells the field at some places, the effects taken off.
+    pub fn predict(&self, places: &[[f64; 2]]) -> Vec<Predicted> {
+        let p = self.found.len();
+        let tell = |&place: &[f64; 2]| {
+            let nodes = self.lattice.around(place);
+            let mean_mm = nodes.iter().map(|&(node, weight)| weight * self.mean_mm[node]).sum();
+            let pairs = nodes.iter().flat_map(|&(a, wa)| nodes.iter().map(move |&(b, wb)| (a, b, wa * wb)));
+            let known: f64 = pairs.map(|(a, b, weight)| weight * self.inverse.entry(a.max(b), a.min(b))).sum();
+            let moved =
+                DVector::from_fn(p, |a, _| nodes.iter().map(|&(node, w)| w * self.follows[(node, a)]).sum::<f64>());
+            let by_effects = if p == 0 { 0.0 } else { moved.dot(&(&self.covariance * &moved)) };
+            Predicted { mean_mm, sigma_mm: (known + by_effects).max(0.0).sqrt() }
+        };
+        places.par_iter().map(tell).collect()
+    }
+
+    /// Draws fields that what was measured leaves possible, each with its own effects: a row a place, a column a sample, in millimetres. The
+    /// same seed gives the same samples.
+    ///
+    /// # Errors
+    /// Memory that does not suffice.
+    pub fn samples(&self, places: &[[f64; 2]], count: usize, seed: u64) -> Result<DMatrix<f64>, ModelError> {
+        let (nodes, p) = (self.lattice.nodes(), self.found.len());
+        let around: Vec<Around> = places.iter().map(|&place| self.lattice.around(place)).collect();
+        let root = self.covariance.clone().cholesky().map(|root| root.l());
+        let batch = |first: usize| -> Option<Vec<f64>> {
+            // Each sample has a stream of its own, and as many are made with it in every case: it is the same whichever others are wanted.
+            let mut normals: Vec<Normals> = (first..first + BATCH).map(|k| Normals::new(seed, k as u64)).collect();
+            let mut white = Mat::zeros(nodes, BATCH);
+            for (c, normals) in normals.iter_mut().enumerate() {
+                (0..nodes).for_each(|r| white[(r, c)] = normals.next());
+            }
+            let field = self.factor.colour(white)?;
+            let mut values = Vec::with_capacity(BATCH * places.len());
+            for (c, normals) in normals.iter_mut().enumerate().take(count - first) {
+                let drawn = DVector::from_fn(p, |_, _| normals.next());
+                let off = root.as_ref().map_or(DVector::zeros(p), |root| root * drawn);
+                values.extend(around.iter().map(|nodes| {
+                    let at = |&(node, weight): &(usize, f64)| {
+                        let moved: f64 = (0..p).map(|a| self.follows[(node, a)] * off[a]).sum();
+                        weight * (self.mean_mm[node] + field[(node, c)] - moved)
+                    };
+                    nodes.iter().map(at).sum::<f64>()
+                }));
+            }
+            Some(values)
+        };
+        let firsts: Vec<usize> = (0..count).step_by(BATCH).collect();
+        let batches: Option<Vec<Vec<f64>>> = firsts.into_par_iter().map(batch).collect();
+        let values = batches.ok_or(ModelError::NotDefinite)?.concat();
+        Ok(DMatrix::from_vec(places.len(), count, values))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Dense, Field};
+    use super::*;
+
+    const HYPER: Hyper = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4 };
+
+    fn places(count: u32) -> Vec<[f64; 2]> {
+        // Steps of two irrational numbers: everywhere, and nowhere twice.
+        (0..count)
+            .map(|k| f64::from(k) + 0.5)
+            .map(|k| [(0.754_877_666 * k).fract() * 102.0, (0.569_840_291 * k).fract() * 62.0])
+            .collect()
+    }
+
+    /// Points of a shape with motions of a part as effects.
+    fn observed(count: u32) -> Observed {
+        let places = places(count);
+        let mut normals = Normals::new(3, 0);
+        let shape = |[x, y]: [f64; 2]| 5e-3 * ((0.08 * x).sin() * (0.11 * y).cos() + 0.4 * (0.17 * x + 0.05 * y).sin());
+        let deviations_mm = places.iter().map(|&place| shape(place) + 3e-4 * normals.next()).collect();
+        let effects = DMatrix::from_fn(places.len(), 3, |r, c| [1.0, places[r][0] - 50.0, places[r][1] - 30.0][c]);
+        Observed { places, deviations_mm, effects }
+    }
+
+    #[test]
+    fn it_tells_what_the_covariances_of_all_points_tell() {
+        let observed = observed(1500);
+        let exact = Dense::fit(&observed, HYPER).unwrap();
+        let lattice = Lattice::over(&observed.places, HYPER.field.range_mm).unwrap();
+        let sparse = Sparse::fit(&lattice, &observed, HYPER).unwrap();
+        let asked: Vec<[f64; 2]> = (0..600).map(|k| [4.1 * f64::from(k % 25), 2.6 * f64::from(k / 25)]).collect();
+        let (mut worst_mean, mut worst_sigma) = (0.0_f64, 0.0_f64);
+        for (a, b) in exact.predict(&asked).into_iter().zip(sparse.predict(&asked)) {
+            worst_mean = worst_mean.max((a.mean_mm - b.mean_mm).abs() / a.sigma_mm);
+            worst_sigma = worst_sigma.max((b.sigma_mm / a.sigma_mm - 1.0).abs());
+        }
+        println!("mean off by {worst_mean:.4} sigma, sigma by {:.3} %", 100.0 * worst_sigma);
+        assert!(worst_mean < 0.05 && worst_sigma < 0.02, "{worst_mean} {worst_sigma}");
+        let sigmas = |found: &DMatrix<f64>| found.diagonal().map(f64::sqrt);
+        let (a, b) = (sigmas(exact.effects().1), sigmas(sparse.effects().1));
+        assert!((0..3).all(|k| (b[k] / a[k] - 1.0).abs() < 0.02), "{a} {b}");
+        let off = exact.effects().0 - sparse.effects().0;
+        assert!((0..3).all(|k| off[k].abs() < 0.05 * a[k]), "{off} {a}");
+        let likelihoods = [exact.log_likelihood(), sparse.log_likelihood()];
+        assert!((likelihoods[0] - likelihoods[1]).abs() < 3.0, "{likelihoods:?}");
+    }
+
+    #[test]
+    fn samples_scatter_as_it_says_and_are_the_same_for_a_seed() {
+        let observed = observed(120);
+        let lattice = Lattice::over(&observed.places, HYPER.field.range_mm).unwrap();
+        let model = Sparse::fit(&lattice, &observed, HYPER).unwrap();
+        let asked = [[10.0, 10.0], [50.0, 30.0], [101.0, 61.0], [0.0, 62.0]];
+        let samples = model.samples(&asked, 4000, 1).unwrap();
+        for (row, told) in samples.row_iter().zip(model.predict(&asked)) {
+            let mean = row.mean();
+            let sigma = (row.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / 4000.0).sqrt();
+            assert!((mean - told.mean_mm).abs() < 0.08 * told.sigma_mm, "{mean} {told:?}");
+            assert!((sigma / told.sigma_mm - 1.0).abs() < 0.06, "{sigma} {told:?}");
+        }
+        let again = model.samples(&asked, 60, 1).unwrap();
+        assert_eq!(again.columns(0, 60), samples.columns(0, 60));
+        assert_ne!(model.samples(&asked, 60, 2).unwrap(), again);
+    }
+
+    #[test]
+    fn before_anything_is_measured_it_is_the_field() {
+        // One point far from all that is asked for.
+        let observed = Observed::without_effects(vec![[300.0, 300.0]], vec![0.0]);
+        let asked = [[0.0, 0.0], [37.3, 11.9], [90.0, 60.0]];
+        let all: Vec<[f64; 2]> = asked.iter().copied().chain(observed.places.clone()).collect();
+        let lattice = Lattice::over(&all, HYPER.field.range_mm).unwrap();
+        let model = Sparse::fit(&lattice, &observed, HYPER).unwrap();
+        for told in model.predict(&asked) {
+            assert!(told.mean_mm.abs() < 1e-12);
+            assert!((told.sigma_mm / HYPER.field.sigma_mm - 1.0).abs() < 0.02, "{told:?}");
+        }
+    }
+
+    #[test]
+    fn a_grid_that_cannot_be_is_refused_in_words() {
+        let of = |places: &[[f64; 2]], range_mm| Lattice::over(places, range_mm).err().unwrap().to_string();
+        assert!(of(&[], 1.0).contains("1 points at least"));
+        assert!(of(&[[0.0, f64::NAN]], 1.0).contains("point 1 "));
+        assert!(of(&[[0.0; 2]], 0.0).contains("the range is 0 mm"));
+        assert!(of(&[[0.0; 2], [1e6, 1e6]], 1.0).contains("more than 120000"));
+        assert!(Lattice::over(&[[5.0, 5.0]], 1.0).is_ok(), "one place is enough");
+    }
+}
