@@ -10,6 +10,7 @@ use serde_json::json;
 
 use super::Outcome;
 use super::failure::Failure;
+use super::outside::settings_folder;
 
 /// Names the file of the key; empty, there is to be none.
 const KEY: &str = "REGRIND_KEY";
@@ -87,14 +88,10 @@ enum Place {
 
 impl Place {
     fn of_this_user() -> Self {
-        let folder = |name| env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
         match env::var_os(KEY) {
             Some(named) if named.is_empty() => Self::Nowhere,
             Some(named) => Self::Named(named.into()),
-            None => {
-                let settings = folder("XDG_CONFIG_HOME").or_else(|| Some(folder("HOME")?.join(".config")));
-                Self::Usual(settings.map(|settings| settings.join("regrind/audit.key")))
-            }
+            None => Self::Usual(settings_folder().map(|settings| settings.join("regrind/audit.key"))),
         }
     }
 
