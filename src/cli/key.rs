@@ -91,7 +91,7 @@ impl Place {
         match env::var_os(KEY) {
             Some(named) if named.is_empty() => Self::Nowhere,
             Some(named) => Self::Named(named.into()),
-            None => Self::Usual(settings_folder().map(|settings| settings.join("regrind/audit.key"))),
+            None => Self::Usual(settings_folder().map(|settings| settings.join("regrind").join("audit.key"))),
         }
     }
 
