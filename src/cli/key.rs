@@ -18,8 +18,9 @@ const KEY: &str = "REGRIND_KEY";
 /// Make the key that signs the records of this computer, once, and print its public half
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The key is made where REGRIND_KEY says, else in $XDG_CONFIG_HOME/regrind/audit.key or ~/.config/regrind/audit.key, readable by
-its owner only. A key that is there is kept, and its public half is printed. Every run of this user signs with it from then on.
+The key is made where REGRIND_KEY says, else in $XDG_CONFIG_HOME/regrind/audit.key or ~/.config/regrind/audit.key (on Windows in
+%LOCALAPPDATA%), readable by its owner only. A key that is there is kept, and its public half is printed. Every run of this user
+signs with it from then on.
 
 Examples:
   regrind audit key

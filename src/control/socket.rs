@@ -53,7 +53,7 @@ impl Control {
     /// Listens in a run folder.
     ///
     /// # Errors
-    /// A folder in which no socket can be made, such as one with a name too long for the operating system.
+    /// A folder in which no socket can be made, such as one with a name too long for the operating system; a pipe that another program has.
     pub fn listen(folder: &Path, orders: mpsc::Sender<Ordered>, status: watch::Receiver<Snapshot>) -> io::Result<Self> {
         let mut door = Door::open(folder)?;
         let places = Arc::new(Semaphore::new(WATCHERS));
