@@ -135,17 +135,25 @@ fn on_a_thread_of_its_own<T: Send + 'static>(
 mod tests {
     use super::*;
 
-    #[tokio::test]
-    async fn a_run_has_one_door_however_its_folder_is_called() {
+    #[test]
+    fn a_run_has_one_name_however_its_folder_is_called() {
         let home = tempfile::tempdir().unwrap();
         let folder = home.path().join("Run");
         std::fs::create_dir(&folder).unwrap();
-        let door = Door::open(&folder).unwrap();
-        for same in [folder.clone(), folder.join("."), home.path().join("run")] {
-            let refused = Door::open(&same).err().expect("a second door").to_string();
-            assert!(refused.contains("another program"), "{refused}");
+        for same in [folder.join("."), home.path().join("run"), folder.join("..").join("RUN")] {
+            assert_eq!(name_of(&same).unwrap(), name_of(&folder).unwrap(), "{same:?}");
         }
+        assert_ne!(name_of(home.path()).unwrap(), name_of(&folder).unwrap());
+        assert!(name_of(&home.path().join("absent")).is_err());
+    }
+
+    #[tokio::test]
+    async fn a_door_that_is_open_is_not_opened_by_another_program() {
+        let home = tempfile::tempdir().unwrap();
+        let door = Door::open(home.path()).unwrap();
+        let refused = Door::open(home.path()).err().expect("a second door").to_string();
+        assert!(refused.contains("another program"), "{refused}");
         drop(door);
-        Door::open(&folder).unwrap();
+        Door::open(home.path()).unwrap();
     }
 }
