@@ -1,11 +1,13 @@
 //! How long the model of the error takes: a batch of touches more, a whole measurement with its map and samples, a scan.
 //!
-//!     cargo bench --bench model
+//! ```text
+//! cargo bench --bench model
+//! ```
 
 use divan::Bencher;
 use divan::counter::ItemsCount;
 use nalgebra::DMatrix;
-use regrind_core::model::{Dense, Field, Hyper, Lattice, Observed, Priors, Sparse};
+use regrind::model::{Dense, Field, Hyper, Lattice, Observed, Priors, Sparse};
 
 fn main() {
     divan::main();

@@ -23,7 +23,7 @@
 //! `cmm_from_model`. A deviation is positive where material stands proud, along the outward normal, the probe's side.
 
 pub use regrind_cell as cell;
-pub use regrind_core::{compensation, form, geometry, measuring, registration, surface};
+pub use regrind_core::{compensation, form, geometry, measuring, model, registration, surface};
 pub use regrind_device as device;
 pub use regrind_document as document;
 pub use regrind_formats as formats;

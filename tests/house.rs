@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Every room, its folder or file, and the rooms that it may name. An arrow that stands here in no line is a turned arrow.
-const ARROWS: [(&str, &str, &[&str]); 20] = [
+const ARROWS: [(&str, &str, &[&str]); 21] = [
     ("geometry", "src/core/geometry", &[]),
     ("surface", "src/core/surface", &["geometry"]),
     ("measuring", "src/core/measuring", &["geometry", "surface"]),
@@ -17,6 +17,7 @@ const ARROWS: [(&str, &str, &[&str]); 20] = [
     ("form", "src/core/form", &["geometry", "surface"]),
     ("cell", "src/cell", &[]),
     ("document", "src/document", &[]),
+    ("windows", "src/windows", &[]),
     ("journal", "src/journal", &[]),
     ("formats", "src/formats", &CORE),
     ("control", "src/control", &["cell", "document", "formats"]),
@@ -42,6 +43,47 @@ const ARROWS: [(&str, &str, &[&str]); 20] = [
 
 /// The rooms of the numerical core.
 const CORE: [&str; 6] = ["geometry", "surface", "measuring", "registration", "compensation", "form"];
+
+/// The files that may say what system it is, and what each system has alone: twins with the same functions, and what chooses between them.
+const SYSTEMS: [&str; 16] = [
+    "sim/wire/mod.rs",
+    "sim/wire/pty.rs",
+    "src/cli/outside/mod.rs",
+    "src/cli/outside/unix.rs",
+    "src/cli/outside/windows.rs",
+    "src/control/door/mod.rs",
+    "src/control/door/unix.rs",
+    "src/control/door/windows.rs",
+    "src/device/modbus/port/mod.rs",
+    "src/formats/system/mod.rs",
+    "src/formats/system/unix.rs",
+    "src/formats/system/windows.rs",
+    "src/journal/system/mod.rs",
+    "src/journal/system/unix.rs",
+    "src/journal/system/windows.rs",
+    "src/windows",
+];
+
+/// What names a system.
+const OF_ONE_SYSTEM: [&str; 17] = [
+    "(unix)",
+    "(windows)",
+    "(not(unix))",
+    "(not(windows))",
+    "target_os",
+    "target_family",
+    "os::unix",
+    "os::linux",
+    "os::windows",
+    "os::fd",
+    "rustix",
+    "regrind_windows",
+    "windows_sys",
+    "signal::unix",
+    "signal::windows",
+    "\"/proc/",
+    "\"/etc/",
+];
 
 /// What the numerical core and the deciding machine have no word for.
 const IMPURE: [&str; 13] = [
@@ -152,8 +194,8 @@ fn no_room_names_one_that_it_must_not_know() {
     let rooms = || ARROWS.iter().map(|(room, ..)| *room).chain(["cli"]);
     for (room, place, may) in ARROWS {
         // The rooms that are crates name files of their own by `crate`.
-        let apart = ["cell", "control", "journal", "formats", "document", "device", "page", "report"].contains(&room);
-        let crates = if apart { &["regrind_core"][..] } else { &["crate", "regrind_core"] };
+        let apart = ["cell", "control", "journal", "formats", "document", "device", "page", "report", "windows"];
+        let crates = if apart.contains(&room) { &["regrind_core"][..] } else { &["crate", "regrind_core"] };
         for source in sources(place) {
             for name in named(&source.code, crates) {
                 let fine = name == room || may.contains(&name) || !rooms().any(|other| other == name);
@@ -188,11 +230,13 @@ fn the_core_and_the_machine_that_decides_have_no_file_no_clock_no_chance_and_no_
     }
 }
 
-/// The crates that the manifest of one of ours names.
+/// The crates that the manifest of one of ours names, for every system or for one.
 fn dependencies(manifest: &str) -> Vec<String> {
     let text = fs::read_to_string(root().join(manifest)).unwrap();
     let table: toml::Table = text.parse().unwrap();
-    table["dependencies"].as_table().unwrap().keys().cloned().collect()
+    let systems = table.get("target").and_then(toml::Value::as_table).into_iter().flat_map(toml::Table::values);
+    let lists = table.get("dependencies").into_iter().chain(systems.filter_map(|system| system.get("dependencies")));
+    lists.flat_map(|list| list.as_table().unwrap().keys().cloned()).collect()
 }
 
 #[test]
@@ -200,11 +244,12 @@ fn the_crates_depend_on_nothing_above_them() {
     for (manifest, may) in [
         ("src/core/Cargo.toml", &[][..]),
         ("src/cell/Cargo.toml", &[]),
-        ("src/journal/Cargo.toml", &[]),
+        ("src/windows/Cargo.toml", &[]),
+        ("src/journal/Cargo.toml", &["regrind-windows"]),
         ("src/document/Cargo.toml", &[]),
-        ("src/formats/Cargo.toml", &["regrind-core"]),
+        ("src/formats/Cargo.toml", &["regrind-core", "regrind-windows"]),
         ("src/device/Cargo.toml", &["regrind-core", "regrind-document", "regrind-formats"]),
-        ("src/control/Cargo.toml", &["regrind-cell", "regrind-document", "regrind-formats"]),
+        ("src/control/Cargo.toml", &["regrind-cell", "regrind-document", "regrind-formats", "regrind-windows"]),
         (
             "src/page/Cargo.toml",
             &["regrind-cell", "regrind-control", "regrind-document", "regrind-formats", "regrind-report"],
@@ -223,8 +268,8 @@ fn the_crates_depend_on_nothing_above_them() {
 }
 
 #[test]
-fn what_needs_unsafe_is_one_crate_on_which_only_tests_depend() {
-    const APART: &str = "src/journal/tests/disk";
+fn what_needs_unsafe_is_a_crate_for_tests_and_one_for_windows() {
+    const APART: [&str; 2] = ["src/journal/tests/disk", "src/windows"];
     let workspace: toml::Table = fs::read_to_string(root().join("Cargo.toml")).unwrap().parse().unwrap();
     assert_eq!(workspace["workspace"]["lints"]["rust"]["unsafe_code"].as_str(), Some("forbid"));
     let members = workspace["workspace"]["members"].as_array().unwrap().iter().map(|member| member.as_str().unwrap());
@@ -232,8 +277,10 @@ fn what_needs_unsafe_is_one_crate_on_which_only_tests_depend() {
         let manifest = format!("{member}/Cargo.toml");
         let table: toml::Table = fs::read_to_string(root().join(&manifest)).unwrap().parse().unwrap();
         let inherits = table["lints"].get("workspace").and_then(toml::Value::as_bool) == Some(true);
-        assert_eq!(inherits, member != APART, "{manifest} keeps the lints of the house");
+        assert_eq!(inherits, !APART.contains(&member), "{manifest} keeps the lints of the house");
         assert!(!dependencies(&manifest).iter().any(|name| name == "regrind-disk"), "{manifest}");
+        let everywhere = table.get("dependencies").is_some_and(|list| list.get("regrind-windows").is_some());
+        assert!(!everywhere, "{manifest} needs regrind-windows on Windows alone");
     }
 }
 
@@ -249,6 +296,18 @@ fn only_formats_report_journal_and_the_file_exchange_write_files() {
     let words = ["File::create", "OpenOptions", "fs::write", "fs::rename", "fs::remove", "fs::create_dir"];
     let may = ["src/formats", "src/report", "src/journal", "src/device/exchange"];
     assert_absent(sources("src").iter().filter(|s| !may.iter().any(|room| is_in(s, room))), &words);
+}
+
+#[test]
+fn which_system_it_is_is_asked_at_few_places() {
+    let found: Vec<_> = sources("src").into_iter().chain(sources("sim")).collect();
+    let (twins, others): (Vec<_>, _) = found.iter().partition(|s| SYSTEMS.iter().any(|place| is_in(s, place)));
+    assert_absent(others, &OF_ONE_SYSTEM);
+    for place in SYSTEMS {
+        let of_it = twins.iter().filter(|source| is_in(source, place));
+        let says = of_it.flat_map(|source| OF_ONE_SYSTEM.map(|word| source.code.contains(word))).any(|says| says);
+        assert!(says, "{place} says nothing of a system: it belongs in no list");
+    }
 }
 
 #[test]

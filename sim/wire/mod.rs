@@ -10,6 +10,9 @@
 //! [`Serving`] is all that most callers need: it binds, serves, lets the machines' time pass, and stops.
 
 pub mod faults;
+#[cfg(not(unix))]
+#[path = "no_pty.rs"]
+pub mod pty;
 #[cfg(unix)]
 pub mod pty;
 pub mod rtu;
@@ -316,7 +319,6 @@ impl Serving {
     ///
     /// # Errors
     /// No pseudo-terminal can be had.
-    #[cfg(unix)]
     pub fn rtu<M: Into<SharedMachine>>(units: Vec<(u8, M)>, line: rtu::Line, faults: Faults) -> io::Result<Self> {
         let port = pty::Pty::open()?;
         let mut serving = Self::of(units, faults);
@@ -329,14 +331,13 @@ impl Serving {
     ///
     /// # Errors
     /// Something that is not a link is there already, or the link cannot be made, or this is not a serial port.
-    #[cfg(unix)]
     pub fn link(&mut self, at: impl AsRef<Path>) -> io::Result<()> {
         let at = at.as_ref();
         let port = self.path.clone().ok_or(io::ErrorKind::Unsupported)?;
         if std::fs::symlink_metadata(at).is_ok_and(|found| found.is_symlink()) {
             std::fs::remove_file(at)?;
         }
-        std::os::unix::fs::symlink(&port, at)?;
+        pty::link(&port, at)?;
         self.linked = Some((at.to_path_buf(), port));
         self.path = Some(at.to_path_buf());
         Ok(())

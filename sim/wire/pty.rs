@@ -50,6 +50,11 @@ impl Pty {
     }
 }
 
+/// Gives a terminal another path.
+pub(super) fn link(terminal: &Path, at: &Path) -> io::Result<()> {
+    std::os::unix::fs::symlink(terminal, at)
+}
+
 impl AsyncRead for Pty {
     fn poll_read(self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         loop {

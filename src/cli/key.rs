@@ -10,6 +10,7 @@ use serde_json::json;
 
 use super::Outcome;
 use super::failure::Failure;
+use super::outside::settings_folder;
 
 /// Names the file of the key; empty, there is to be none.
 const KEY: &str = "REGRIND_KEY";
@@ -17,8 +18,9 @@ const KEY: &str = "REGRIND_KEY";
 /// Make the key that signs the records of this computer, once, and print its public half
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The key is made where REGRIND_KEY says, else in $XDG_CONFIG_HOME/regrind/audit.key or ~/.config/regrind/audit.key, readable by
-its owner only. A key that is there is kept, and its public half is printed. Every run of this user signs with it from then on.
+The key is made where REGRIND_KEY says, else in $XDG_CONFIG_HOME/regrind/audit.key or ~/.config/regrind/audit.key (on Windows in
+%LOCALAPPDATA%), readable by its owner only. A key that is there is kept, and its public half is printed. Every run of this user
+signs with it from then on.
 
 Examples:
   regrind audit key
@@ -87,14 +89,10 @@ enum Place {
 
 impl Place {
     fn of_this_user() -> Self {
-        let folder = |name| env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
         match env::var_os(KEY) {
             Some(named) if named.is_empty() => Self::Nowhere,
             Some(named) => Self::Named(named.into()),
-            None => {
-                let settings = folder("XDG_CONFIG_HOME").or_else(|| Some(folder("HOME")?.join(".config")));
-                Self::Usual(settings.map(|settings| settings.join("regrind/audit.key")))
-            }
+            None => Self::Usual(settings_folder().map(|settings| settings.join("regrind").join("audit.key"))),
         }
     }
 

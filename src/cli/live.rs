@@ -1,6 +1,5 @@
 //! A run in this process: its machines, its terminal, and what is done from outside to end it.
 
-use std::io;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
@@ -12,12 +11,11 @@ use regrind::journal::{Journal, MachineLock};
 use regrind::recipe::Recipe;
 use regrind::setup;
 use regrind_control::Next;
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::mpsc;
 
 use super::Outcome;
 use super::failure::Failure;
+use super::outside::{self, Endings};
 use super::show::{Show, reads_keys};
 
 /// What a run is driven by.
@@ -94,11 +92,11 @@ async fn go(run: Run, machines: Machines, actor: Actor) -> Result<Ending, Failur
     let Machines { cmm, grinder, _taken } = machines;
     let (drive, orders) =
         Drive::with_cell(run, cmm, grinder).map_err(|source| Failure::ControlSocket { path: folder, source })?;
-    let signals = Signals::new().map_err(Failure::Signals)?;
+    let endings = Endings::new().map_err(Failure::Signals)?;
     let heeding = [
         tokio::spawn(heed_ctrl_c(orders.clone(), actor.clone())),
         tokio::spawn(heed_enter(orders.clone(), actor.clone())),
-        tokio::spawn(signals.heed(orders, actor)),
+        tokio::spawn(heed_endings(endings, orders, actor)),
     ];
     let ending = drive.run().await;
     heeding.iter().for_each(tokio::task::JoinHandle::abort);
@@ -127,16 +125,15 @@ async fn heed_enter(orders: Orders, actor: Actor) {
         return;
     }
     // What cannot be thrown away is taken for an answer of nobody.
-    if rustix::termios::tcflush(io::stdin(), rustix::termios::QueueSelector::IFlush).is_err() {
+    if outside::forget_what_was_typed().is_err() {
         return;
     }
     // A thread of its own, for a terminal is waited for; no longer than somebody is asked, and only while the program has it.
     let still_asked = move || status.has_changed().is_ok() && status.borrow().next_step == Next::Load;
     let typed = tokio::task::spawn_blocking(move || {
         while still_asked() {
-            let mut terminal = [PollFd::from_borrowed_fd(rustix::stdio::stdin(), PollFlags::IN)];
-            if poll(&mut terminal, Some(&BETWEEN_LOOKS)).is_ok_and(|ready| ready > 0) && reads_keys() {
-                return io::stdin().read_line(&mut String::new()).is_ok_and(|read| read > 0) && still_asked();
+            if let Some(entered) = outside::enter_within(BETWEEN_LOOKS, reads_keys) {
+                return entered && still_asked();
             }
         }
         false
@@ -147,49 +144,20 @@ async fn heed_enter(orders: Orders, actor: Actor) {
 }
 
 /// Between two looks whether a person is still asked.
-const BETWEEN_LOOKS: Timespec = Timespec { tv_sec: 0, tv_nsec: 200_000_000 };
+const BETWEEN_LOOKS: Duration = Duration::from_millis(200);
 
-/// What ends a program from outside: a terminal that is closed, a service that is stopped.
-struct Signals {
-    /// None where whoever started the program wants it to outlive its terminal (`nohup`).
-    hangup: Option<Signal>,
-    terminate: Signal,
-}
-
-impl Signals {
-    fn new() -> io::Result<Self> {
-        let hangup = if ignores_hangup() { None } else { Some(signal(SignalKind::hangup())?) };
-        Ok(Self { hangup, terminate: signal(SignalKind::terminate())? })
+/// The first ends the run in order, the next one aborts it. A terminal that closes may say so twice.
+async fn heed_endings(mut endings: Endings, orders: Orders, actor: Actor) {
+    let mut first: Option<Instant> = None;
+    while let Some(outside::Ending { by, hung_up }) = endings.next().await {
+        let request = match first {
+            None => Request::Stop { reason: by.to_owned() },
+            Some(at) if hung_up && at.elapsed() < IN_ONE_GO => continue,
+            Some(_) => Request::Abort { reason: format!("{by}, again") },
+        };
+        first = first.or_else(|| Some(Instant::now()));
+        orders.give(request, actor.clone()).await;
     }
-
-    /// The first ends the run in order, the next one aborts it. A terminal that closes may say so twice.
-    async fn heed(mut self, orders: Orders, actor: Actor) {
-        let mut first: Option<Instant> = None;
-        loop {
-            let (name, hung_up) = tokio::select! {
-                Some(()) = self.terminate.recv() => ("SIGTERM", false),
-                Some(()) = async { self.hangup.as_mut()?.recv().await }, if self.hangup.is_some() => {
-                    ("SIGHUP, the terminal was closed", true)
-                }
-                else => return,
-            };
-            let reason = name.to_owned();
-            let request = match first {
-                None => Request::Stop { reason },
-                Some(at) if hung_up && at.elapsed() < IN_ONE_GO => continue,
-                Some(_) => Request::Abort { reason: format!("{reason}, again") },
-            };
-            first = first.or_else(|| Some(Instant::now()));
-            orders.give(request, actor.clone()).await;
-        }
-    }
-}
-
-/// Whether SIGHUP, the first signal, is ignored by who started this program.
-fn ignores_hangup() -> bool {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
-    ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).is_some_and(|mask| mask & 1 == 1)
 }
 
 /// Keeps a machine on a line from every other run on this computer.

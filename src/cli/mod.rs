@@ -14,6 +14,7 @@ mod initial;
 mod key;
 mod live;
 mod nominal;
+mod outside;
 mod plan;
 mod recover;
 mod register;

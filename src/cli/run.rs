@@ -16,7 +16,7 @@ use serde_json::json;
 
 use super::failure::Failure;
 use super::live::{Live, Work, outcome};
-use super::{Outcome, check, key, plan, serve, simulated};
+use super::{Outcome, check, key, outside, plan, serve, simulated};
 
 /// What a run began with of what an earlier one had learned, in its folder.
 pub(super) const LEARNED_FROM: &str = "learned_from.json";
@@ -257,18 +257,8 @@ pub(super) fn free_folder(runs: &Path, name: &str, began: jiff::Timestamp, simul
     (0..).map(named).find(|folder| !folder.exists()).expect("some number is free")
 }
 
-/// The name by which the operating system knows who started this program: a service may have none in its environment.
-fn own_name() -> String {
-    use std::os::unix::fs::MetadataExt;
-    let Ok(uid) = std::fs::metadata("/proc/self").map(|own| own.uid().to_string()) else { return "unknown".into() };
-    let users = std::fs::read_to_string("/etc/passwd").unwrap_or_default();
-    let own = users.lines().map(|line| line.split(':').collect::<Vec<_>>()).find(|user| user.get(2) == Some(&&*uid));
-    own.map_or_else(|| format!("uid {uid}"), |user| user[0].to_owned())
-}
-
 pub(super) fn operator(named: Option<&str>) -> Actor {
-    let user = || std::env::var("USER").or_else(|_| std::env::var("USERNAME")).unwrap_or_else(|_| own_name());
-    let host = std::fs::read_to_string("/etc/hostname").unwrap_or_default();
-    let host = if host.trim().is_empty() { "this computer".to_owned() } else { host.trim().to_owned() };
-    Actor { name: named.map_or_else(user, str::to_owned), station: host }
+    let user = || std::env::var("USER").or_else(|_| std::env::var("USERNAME")).unwrap_or_else(|_| outside::own_name());
+    let station = outside::host().unwrap_or_else(|| "this computer".into());
+    Actor { name: named.map_or_else(user, str::to_owned), station }
 }

@@ -113,8 +113,7 @@ impl Beside {
         let mut command = Command::new(program);
         command.args(["serve", "--while-stdin", "--listen", &listen.to_string(), "--runs"]).arg(runs);
         // Ctrl-C is for the run; a page that went with it would leave its browsers without the end.
-        #[cfg(unix)]
-        std::os::unix::process::CommandExt::process_group(&mut command, 0);
+        super::outside::set_apart(&mut command);
         let page = command.stdin(Stdio::piped()).stdout(told).spawn().map_err(failed)?;
         Ok(Self { _page: page })
     }

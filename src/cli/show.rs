@@ -16,6 +16,7 @@ use tokio::sync::mpsc;
 
 use super::blocks::{Blocks, sparkline};
 use super::failure::Failure;
+use super::outside::is_in_front;
 use super::words::{judged, three_digits, time_left, wrapped};
 
 /// How long a line that says nothing new may be left out.
@@ -256,9 +257,7 @@ fn newest_map(run: &Path, cycle: u32) -> Option<PathBuf> {
 
 /// Whether a person at this terminal can answer: it is one, and not somebody else's at the moment.
 pub(super) fn reads_keys() -> bool {
-    // Who reads from a terminal in the background is stopped by it, machines or not.
-    let has_it = rustix::termios::tcgetpgrp(io::stdin()).is_ok_and(|group| group == rustix::process::getpgrp());
-    has_it && io::stdin().is_terminal() && io::stderr().is_terminal()
+    is_in_front() && io::stdin().is_terminal() && io::stderr().is_terminal()
 }
 
 fn bar() -> ProgressBar {

@@ -8,6 +8,7 @@
 //! Everybody comes through this one door, so an order is recorded alike whoever gave it: the operating system says who is at the
 //! other end, and a program that speaks for others says for whom.
 
+mod door;
 mod request;
 mod snapshot;
 mod socket;

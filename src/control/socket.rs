@@ -10,15 +10,12 @@ use std::time::Duration;
 
 use regrind_cell::Actor;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader, Lines};
-use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
-use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 
+use super::door::{self, Caller, CellSays, Door, TellCaller, TellCell};
 use super::request::{Line, OnBehalf, Reply, Request};
 use super::snapshot::Snapshot;
 
-/// The socket in a run folder.
-const SOCKET: &str = "control.sock";
 /// Longest line that is read.
 const LONGEST_LINE: u64 = 4096;
 /// A client that says nothing for so long is gone.
@@ -48,7 +45,7 @@ pub struct Ordered {
 
 /// A socket that goes away with its owner.
 pub struct Control {
-    path: PathBuf,
+    folder: PathBuf,
     task: tokio::task::JoinHandle<()>,
 }
 
@@ -56,48 +53,42 @@ impl Control {
     /// Listens in a run folder.
     ///
     /// # Errors
-    /// A folder in which no socket can be made, such as one with a name too long for the operating system.
+    /// A folder in which no socket can be made, such as one with a name too long for the operating system; a pipe that another program has.
     pub fn listen(folder: &Path, orders: mpsc::Sender<Ordered>, status: watch::Receiver<Snapshot>) -> io::Result<Self> {
-        let path = folder.join(SOCKET);
-        // One that a killed process left behind; the lock of the journal says that nobody lives there.
-        if path.exists() {
-            regrind_formats::remove_socket(&path)?;
-        }
-        let listener = UnixListener::bind(&path)?;
+        let mut door = Door::open(folder)?;
         let places = Arc::new(Semaphore::new(WATCHERS));
         let task = tokio::spawn(async move {
             loop {
-                let Ok((stream, _)) = listener.accept().await else {
+                let Ok(caller) = door.let_in().await else {
                     // No descriptor is left, or the client has gone: that passes, and orders must get through when it has.
                     tokio::time::sleep(BETWEEN_TRIES).await;
                     continue;
                 };
                 let (orders, status, places) = (orders.clone(), status.clone(), Arc::clone(&places));
                 // A client that misbehaves hurts itself only.
-                tokio::spawn(async move { drop(serve(stream, orders, status, &places).await) });
+                tokio::spawn(async move { drop(serve(caller, orders, status, &places).await) });
             }
         });
-        Ok(Self { path, task })
+        Ok(Self { folder: folder.to_owned(), task })
     }
 }
 
 impl Drop for Control {
     fn drop(&mut self) {
         self.task.abort();
-        // Nobody listens any more; a socket left behind is replaced by the next run.
-        let _ = regrind_formats::remove_socket(&self.path);
+        door::take_away(&self.folder);
     }
 }
 
 /// Lets a client say what it wants, and gives it that.
 async fn serve(
-    stream: UnixStream,
+    caller: Caller,
     orders: mpsc::Sender<Ordered>,
     mut status: watch::Receiver<Snapshot>,
     places: &Semaphore,
 ) -> io::Result<()> {
-    let peer = actor_of(&stream)?;
-    let (read, mut write) = stream.into_split();
+    let peer = caller.actor()?;
+    let (read, mut write) = caller.into_halves();
     let mut text = String::new();
     let mut read = BufReader::new(read).take(LONGEST_LINE);
     tokio::time::timeout(PATIENCE, read.read_line(&mut text)).await??;
@@ -142,7 +133,7 @@ fn refusal(message: String, status: &watch::Receiver<Snapshot>) -> Reply {
 }
 
 /// Tells how the cell is after every change, and at least so often that silence means that nobody is there.
-async fn told_on(write: &mut OwnedWriteHalf, status: &mut watch::Receiver<Snapshot>) -> io::Result<()> {
+async fn told_on(write: &mut TellCaller, status: &mut watch::Receiver<Snapshot>) -> io::Result<()> {
     loop {
         let now = status.borrow_and_update().clone();
         tell(write, &Reply { accepted: true, message: String::new(), status: now }).await?;
@@ -154,22 +145,10 @@ async fn told_on(write: &mut OwnedWriteHalf, status: &mut watch::Receiver<Snapsh
     }
 }
 
-async fn tell(write: &mut OwnedWriteHalf, reply: &Reply) -> io::Result<()> {
+async fn tell(write: &mut TellCaller, reply: &Reply) -> io::Result<()> {
     let mut text = serde_json::to_vec(reply)?;
     text.push(b'\n');
     tokio::time::timeout(PATIENCE, write.write_all(&text)).await?
-}
-
-/// Names the person by what the operating system vouches for.
-fn actor_of(stream: &UnixStream) -> io::Result<Actor> {
-    let peer = stream.peer_cred()?;
-    let name = match std::env::var("USER") {
-        // The same user as this process: the name is known.
-        Ok(name) if Some(peer.uid()) == own_uid() => format!("{name} (uid {})", peer.uid()),
-        _ => format!("uid {}", peer.uid()),
-    };
-    let station = peer.pid().map_or("local console".to_owned(), |pid| format!("local console, process {pid}"));
-    Ok(Actor { name, station })
 }
 
 /// Names the person for whom a program speaks; what that program says of them is told as its word.
@@ -179,14 +158,9 @@ fn on_behalf(peer: Actor, by: Option<OnBehalf>) -> Actor {
     Actor { name, station: format!("{} ({})", by.station, peer.station) }
 }
 
-fn own_uid() -> Option<u32> {
-    use std::os::unix::fs::MetadataExt;
-    std::fs::metadata("/proc/self").ok().map(|m| m.uid())
-}
-
 /// Whether a run goes on in a folder: somebody listens to its orders.
 pub fn is_live(folder: &Path) -> bool {
-    std::os::unix::net::UnixStream::connect(folder.join(SOCKET)).is_ok()
+    door::is_open(folder)
 }
 
 /// Asks a running cell; blocks for its answer.
@@ -202,12 +176,7 @@ pub fn ask(folder: &Path, request: &Request) -> io::Result<Reply> {
 /// # Errors
 /// Those of [`ask`].
 pub fn ask_for(folder: &Path, request: &Request, by: Option<OnBehalf>) -> io::Result<Reply> {
-    use std::io::{BufRead, Write};
-    let mut stream = std::os::unix::net::UnixStream::connect(folder.join(SOCKET))?;
-    stream.set_read_timeout(Some(PATIENCE))?;
-    stream.write_all(&line(request, by)?)?;
-    let mut text = String::new();
-    std::io::BufReader::new(stream).read_line(&mut text)?;
+    let text = door::ask(folder, &line(request, by)?, PATIENCE)?;
     Ok(serde_json::from_str(&text)?)
 }
 
@@ -219,9 +188,9 @@ fn line(request: &Request, by: Option<OnBehalf>) -> io::Result<Vec<u8>> {
 
 /// A running cell that is watched.
 pub struct Watch {
-    lines: Lines<BufReader<OwnedReadHalf>>,
+    lines: Lines<BufReader<CellSays>>,
     /// Held open: a cell that is no longer listened to stops telling.
-    _write: OwnedWriteHalf,
+    _write: TellCell,
 }
 
 /// Begins to watch a running cell.
@@ -229,7 +198,7 @@ pub struct Watch {
 /// # Errors
 /// No cell that runs in that folder.
 pub async fn watch(folder: &Path) -> io::Result<Watch> {
-    let (read, mut write) = UnixStream::connect(folder.join(SOCKET)).await?.into_split();
+    let (read, mut write) = door::knock(folder).await?;
     write.write_all(&line(&Request::Watch, None)?).await?;
     Ok(Watch { lines: BufReader::new(read).lines(), _write: write })
 }

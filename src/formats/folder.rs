@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use super::error::FormatError;
 use super::registration::try_writing;
+use super::system::{is_socket, link_to};
 
 /// A folder that can be written to; what was created for it goes away again unless it is kept.
 #[derive(Debug)]
@@ -60,12 +61,8 @@ impl Drop for ResultFolder {
 /// # Errors
 /// A folder that cannot be written, and a file of that name that is no socket.
 pub fn remove_socket(path: &Path) -> std::io::Result<()> {
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::FileTypeExt;
-        if !fs::symlink_metadata(path)?.file_type().is_socket() {
-            return Err(std::io::Error::from(std::io::ErrorKind::AlreadyExists));
-        }
+    if !is_socket(path)? {
+        return Err(std::io::Error::from(std::io::ErrorKind::AlreadyExists));
     }
     fs::remove_file(path)
 }
@@ -78,10 +75,7 @@ pub fn place_link(device: &Path, link: &Path) -> std::io::Result<()> {
     if fs::symlink_metadata(link).is_ok() {
         remove_link(link)?;
     }
-    #[cfg(unix)]
-    return std::os::unix::fs::symlink(device, link);
-    #[cfg(not(unix))]
-    Err(std::io::Error::from(std::io::ErrorKind::Unsupported))
+    link_to(device, link)
 }
 
 /// Removes a link; anything else of that name is left alone.

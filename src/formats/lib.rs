@@ -24,6 +24,7 @@ pub mod registration;
 pub mod result;
 pub mod sdf;
 pub mod stl;
+mod system;
 mod whole;
 pub mod x3p;
 
@@ -51,6 +52,7 @@ pub use registration::{
 };
 pub use sdf::{parse_sdf, read_sdf};
 pub use stl::{StlFile, parse_stl, read_stl};
+pub use system::{OpenToOthers, readable_by_others};
 pub use whole::read_whole;
 pub use x3p::{MapRecord, X3pFile, escaped, parse_x3p, read_x3p, write_error_map_x3p, write_x3p};
 

@@ -12,6 +12,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::error::FormatError;
+use super::system;
 use regrind_core::geometry::Point;
 
 /// The first line of `deviations.csv`. These names are a contract.
@@ -198,18 +199,15 @@ pub(super) struct Draft<'p> {
 
 impl<'p> Draft<'p> {
     pub(super) fn create(path: &'p Path) -> Result<Self, FormatError> {
-        Self::create_by(path, OpenOptions::new().write(true).create_new(true))
+        Self::create_by(path, |temporary| OpenOptions::new().write(true).create_new(true).open(temporary))
     }
 
-    /// One that nobody but its owner may read; where files have no such mode, their folder decides.
+    /// One that nobody but its owner may read.
     fn create_private(path: &'p Path) -> Result<Self, FormatError> {
-        let mut options = OpenOptions::new();
-        #[cfg(unix)]
-        std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
-        Self::create_by(path, options.write(true).create_new(true))
+        Self::create_by(path, system::create_owners)
     }
 
-    fn create_by(path: &'p Path, options: &OpenOptions) -> Result<Self, FormatError> {
+    fn create_by(path: &'p Path, create: fn(&Path) -> io::Result<File>) -> Result<Self, FormatError> {
         static COUNT: AtomicU64 = AtomicU64::new(0);
         let failed = |source| FormatError::Unwritable { path: path.to_owned(), action: "creating it", source };
         if path.is_dir() {
@@ -220,7 +218,7 @@ impl<'p> Draft<'p> {
         hidden.push(name);
         hidden.push(format!(".{}-{}.tmp", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed)));
         let temporary = path.with_file_name(hidden);
-        let file = options.open(&temporary).map_err(failed)?;
+        let file = create(&temporary).map_err(failed)?;
         Ok(Self { path, temporary, file: BufWriter::new(file), published: false })
     }
 
@@ -254,11 +252,11 @@ impl Drop for Draft<'_> {
     }
 }
 
-/// Makes the rename of a path last; only Unix lets a folder be opened for it.
+/// Makes the rename of a path last.
 ///
 /// # Errors
 /// A folder that cannot be brought to the disk.
 pub fn sync_folder(path: &Path) -> io::Result<()> {
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    if cfg!(unix) { File::open(folder)?.sync_all() } else { Ok(()) }
+    system::sync_folder(folder)
 }

@@ -10,6 +10,7 @@ use sha2::{Digest, Sha256};
 use super::canonical::hex;
 use super::error::JournalError;
 use super::open::sync_folder;
+use super::system;
 use super::{ANCHOR, DATABASE, LOCK};
 
 /// A file of the run folder, as it stands in the journal.
@@ -94,7 +95,6 @@ pub(super) fn describe(path: &Path, name: &str) -> Result<Artefact, JournalError
 
 /// Brings a file that somebody else wrote to the disk.
 pub(super) fn sync_file(path: &Path) -> Result<(), JournalError> {
-    let synced = File::open(path).and_then(|file| file.sync_all());
-    synced.map_err(JournalError::file(path, "bringing it to the disk"))?;
+    system::sync_file(path).map_err(JournalError::file(path, "bringing it to the disk"))?;
     path.parent().map_or(Ok(()), sync_folder)
 }

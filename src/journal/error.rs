@@ -64,10 +64,8 @@ pub enum JournalError {
     )]
     Key { path: PathBuf, what: &'static str },
     /// Others may read the audit key.
-    #[error(
-        "{path}: others may read this audit key (mode {mode:03o}, at most 600): `chmod 600` it, and make another if somebody may have it"
-    )]
-    KeyIsOpen { path: PathBuf, mode: u32 },
+    #[error("{path}: others may read this audit key ({how}): {remedy}, and make another if somebody may have it")]
+    KeyIsOpen { path: PathBuf, how: String, remedy: String },
     /// A name that may lead out of the run folder.
     #[error("`{name}` cannot be the name of a file in a run folder; give a relative path of plain names")]
     Name { name: String },

@@ -1,9 +1,8 @@
 //! The key with which a computer signs the head of its records, and the public half by which others know it.
 
 use std::fmt::{self, Debug, Display, Formatter};
-use std::fs::{self, DirBuilder, OpenOptions};
+use std::fs;
 use std::io::{self, Write};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::path::Path;
 use std::str::FromStr;
 
@@ -14,6 +13,7 @@ use sha2::{Digest, Sha256};
 use super::canonical::{hex, unhex};
 use super::error::JournalError;
 use super::open::sync_folder;
+use super::system;
 
 /// Said in the first line of the file, for who finds it.
 const FIRST_LINE: &str =
@@ -127,9 +127,8 @@ impl AuditKey {
         if !found.is_file() || found.len() > MOST_BYTES {
             return Err(broken("it is no small file"));
         }
-        let mode = found.mode() & 0o777;
-        if mode & 0o077 != 0 {
-            return Err(JournalError::KeyIsOpen { path: path.to_owned(), mode });
+        if let Some(system::OpenToOthers { how, remedy }) = system::readable_by_others(path).map_err(&failed)? {
+            return Err(JournalError::KeyIsOpen { path: path.to_owned(), how, remedy });
         }
         let text = String::from_utf8(fs::read(path).map_err(&failed)?).map_err(|_| broken("it is no text"))?;
         let value = |name: &str| {
@@ -152,8 +151,7 @@ impl AuditKey {
     pub fn make(path: &Path) -> Result<Self, JournalError> {
         let key = Self::new();
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let made = DirBuilder::new().recursive(true).mode(0o700).create(folder);
-        made.map_err(JournalError::file(folder, "creating the folder"))?;
+        system::create_owners_folder(folder).map_err(JournalError::file(folder, "creating the folder"))?;
         let temporary = folder.join(format!(".audit-key-{:016x}.tmp", rand::random::<u64>()));
         // A link, and no new name for the file: that would take the place of a key that is there.
         let written = key.write(&temporary).and_then(|()| fs::hard_link(&temporary, path));
@@ -165,7 +163,7 @@ impl AuditKey {
     }
 
     fn write(&self, path: &Path) -> io::Result<()> {
-        let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)?;
+        let mut file = system::create_owners_file(path)?;
         let secret = hex(self.pair.sk.seed().as_ref());
         write!(file, "{FIRST_LINE}\nsecret = \"{secret}\"\npublic = \"{}\"\n", self.public())?;
         file.sync_all()

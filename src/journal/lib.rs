@@ -28,6 +28,7 @@ mod machine;
 mod open;
 mod record;
 mod seal;
+mod system;
 mod verify;
 mod write;
 

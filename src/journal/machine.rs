@@ -8,20 +8,19 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use super::error::JournalError;
-use super::sha256_hex;
+use super::{sha256_hex, system};
 
 /// A machine that no other run on this computer can take while this lives.
 #[derive(Debug)]
 pub struct MachineLock {
     /// Held, not read.
     _file: File,
-    path: PathBuf,
+    /// Where the holder and the epoch stand.
+    told: PathBuf,
     holder: String,
     last_epoch: u32,
 }
 
-/// Where locks may lie, the best first: a place that is the same for every user and every session of a computer. `TMPDIR` is not.
-const PLACES: [&str; 4] = ["/run/lock", "/var/lock", "/var/tmp", "/tmp"];
 const FOLDER: &str = "regrind-machines";
 /// Begins the line of the lock's file that keeps the epoch.
 const EPOCH: &str = "epoch ";
@@ -32,7 +31,8 @@ impl MachineLock {
     /// # Errors
     /// A machine that another run has, which is named; no folder for locks that can be written.
     pub fn take(address: &str, run: &Path) -> Result<Self, JournalError> {
-        Self::take_in(&place(PLACES.iter().map(Path::new), &std::env::temp_dir()), address, run)
+        // Where no place is for all, the user's own is better than none.
+        Self::take_in(&system::place_of_locks().unwrap_or_else(std::env::temp_dir).join(FOLDER), address, run)
     }
 
     /// Returns an epoch for the client of these machines: higher than every one that a client of this computer had for any of them, and
@@ -47,19 +47,20 @@ impl MachineLock {
     fn take_in(folder: &Path, address: &str, run: &Path) -> Result<Self, JournalError> {
         let path = folder.join(format!("{}.lock", &sha256_hex(address.as_bytes())[..16]));
         let file = opened(folder, &path)?;
+        let told = system::beside_lock(&path);
         match file.try_lock() {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => {
-                let holder = fs::read_to_string(&path).unwrap_or_default();
+                let holder = fs::read_to_string(&told).unwrap_or_default();
                 let holder = holder.lines().next().unwrap_or_default().trim().to_owned();
                 return Err(JournalError::MachineTaken { address: address.to_owned(), holder });
             }
             Err(TryLockError::Error(error)) => return Err(JournalError::file(&path, "locking it")(error)),
         }
-        let kept = fs::read_to_string(&path).unwrap_or_default();
+        let kept = fs::read_to_string(&told).unwrap_or_default();
         let last_epoch = kept.lines().find_map(|line| line.strip_prefix(EPOCH)?.trim().parse().ok()).unwrap_or(0);
         let holder = format!("{}, process {}", run.display(), std::process::id());
-        let lock = Self { _file: file, path, holder, last_epoch };
+        let lock = Self { _file: file, told, holder, last_epoch };
         lock.write(last_epoch);
         Ok(lock)
     }
@@ -69,18 +70,11 @@ impl MachineLock {
     fn write(&self, epoch: u32) {
         let text = format!("{}\n{EPOCH}{epoch}\n", self.holder);
         // Never empty in between: what was kept outlives a program that is killed here.
-        let _ = OpenOptions::new().write(true).open(&self.path).and_then(|mut file| {
+        let _ = OpenOptions::new().write(true).create(true).truncate(false).open(&self.told).and_then(|mut file| {
             file.write_all(text.as_bytes())?;
             file.set_len(text.len() as u64)
         });
     }
-}
-
-/// Returns the folder of the locks: in the first place that is there and every user can write, or else among the temporary files.
-fn place<'a>(places: impl Iterator<Item = &'a Path>, temporary: &Path) -> PathBuf {
-    use std::os::unix::fs::PermissionsExt;
-    let for_all = |place: &Path| fs::metadata(place).is_ok_and(|m| m.is_dir() && m.permissions().mode() & 0o002 != 0);
-    places.into_iter().find(|place| for_all(place)).unwrap_or(temporary).join(FOLDER)
 }
 
 /// Opens the file that is locked; every user of the computer may.
@@ -91,19 +85,13 @@ fn opened(folder: &Path, path: &PathBuf) -> Result<File, JournalError> {
         if !folder.is_dir() {
             made.map_err(JournalError::file(folder, "creating the folder"))?;
         }
-        open_to_all(folder, 0o1777);
+        system::open_folder_to_all(folder);
     }
     if !path.exists() {
         OpenOptions::new().append(true).create(true).open(path).map_err(JournalError::file(path, "creating it"))?;
-        open_to_all(path, 0o666);
+        system::open_file_to_all(path);
     }
     File::open(path).map_err(JournalError::file(path, "opening it"))
-}
-
-fn open_to_all(path: &Path, mode: u32) {
-    use std::os::unix::fs::PermissionsExt;
-    // Where that is not allowed, the locks of one user are still his.
-    let _ = fs::set_permissions(path, fs::Permissions::from_mode(mode));
 }
 
 #[cfg(test)]
@@ -139,20 +127,5 @@ mod tests {
         assert_eq!(epoch(&[], 7), 7);
         drop(take("cmm"));
         assert_eq!(epoch(&["cmm"], 0), 1003, "who only had it has kept it");
-    }
-
-    #[test]
-    fn locks_lie_where_every_user_and_session_finds_them() {
-        use std::os::unix::fs::PermissionsExt;
-        let home = tempfile::tempdir().unwrap();
-        let [shared, own, temporary] = ["shared", "own", "temporary"].map(|name| home.path().join(name));
-        for (folder, mode) in [(&shared, 0o1777), (&own, 0o755)] {
-            fs::create_dir(folder).unwrap();
-            fs::set_permissions(folder, fs::Permissions::from_mode(mode)).unwrap();
-        }
-        let missing = home.path().join("missing");
-        let places = |list: &[&Path]| place(list.iter().copied(), &temporary);
-        assert_eq!(places(&[&missing, &own, &shared]), shared.join(FOLDER));
-        assert_eq!(places(&[&own, &missing]), temporary.join(FOLDER));
     }
 }

@@ -9,6 +9,7 @@ use rusqlite::{Connection, OpenFlags};
 
 use super::DATABASE;
 use super::error::JournalError;
+use super::system;
 
 /// `RGrd`: says in the header of the file whose database this is.
 const APPLICATION_ID: u32 = 0x5247_7264;
@@ -191,13 +192,10 @@ fn text_of(value: rusqlite::types::ValueRef<'_>) -> String {
     }
 }
 
-/// Makes names in a folder last; only Unix lets a folder be opened for it.
+/// Makes names in a folder last.
 pub(super) fn sync_folder(folder: &Path) -> Result<(), JournalError> {
     let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
-    if !cfg!(unix) {
-        return Ok(());
-    }
-    File::open(folder).and_then(|f| f.sync_all()).map_err(JournalError::file(folder, "bringing it to the disk"))
+    system::sync_folder(folder).map_err(JournalError::file(folder, "bringing it to the disk"))
 }
 
 /// Returns whether a folder is absent or empty.
@@ -216,7 +214,5 @@ pub(super) fn is_free(folder: &Path) -> Result<bool, JournalError> {
 pub fn free_bytes(folder: &Path) -> Result<u64, JournalError> {
     let whole = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
     let there = whole.ancestors().find(|folder| folder.is_dir()).unwrap_or(&whole);
-    let room = rustix::fs::statvfs(there)
-        .map_err(|error| JournalError::file(there, "asking for its free space")(error.into()))?;
-    Ok(room.f_bavail.saturating_mul(room.f_frsize))
+    system::free_bytes(there).map_err(JournalError::file(there, "asking for its free space"))
 }

@@ -4,6 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use regrind_formats::{OpenToOthers, readable_by_others};
 use thiserror::Error;
 use tokio::net::TcpStream;
 use tokio_rustls::TlsAcceptor;
@@ -23,8 +24,8 @@ pub enum TlsError {
     Certificate { path: PathBuf, what: String },
     #[error("{}: no private key in PEM can be read from it: {what}", .path.display())]
     Key { path: PathBuf, what: String },
-    #[error("{}: other users of this computer may read the key (mode {mode:o}); it is for its owner only: chmod 600 {}", .path.display(), .path.display())]
-    KeyIsOpen { path: PathBuf, mode: u32 },
+    #[error("{}: other users of this computer may read the key ({}); it is for its owner only: {}", .path.display(), .open.how, .open.remedy)]
+    KeyIsOpen { path: PathBuf, open: OpenToOthers },
     #[error("the certificate {} and the key {} cannot be used: {what}", .certificate.display(), .key.display())]
     Unfit { certificate: PathBuf, key: PathBuf, what: String },
 }
@@ -83,9 +84,8 @@ impl Tls {
 /// Reads a private key that nobody else may read.
 fn secret(path: &Path) -> Result<PrivateKeyDer<'static>, TlsError> {
     let unread = |what: String| TlsError::Key { path: path.to_owned(), what };
-    let found = std::fs::metadata(path).map_err(|error| unread(error.to_string()))?;
-    if let Some(mode) = super::users::open_to_others(&found) {
-        return Err(TlsError::KeyIsOpen { path: path.to_owned(), mode });
+    if let Some(open) = readable_by_others(path).map_err(|error| unread(error.to_string()))? {
+        return Err(TlsError::KeyIsOpen { path: path.to_owned(), open });
     }
     PrivateKeyDer::from_pem_file(path).map_err(|error| unread(error.to_string()))
 }

@@ -11,6 +11,7 @@ use argon2::Argon2;
 use argon2::password_hash::phc::PasswordHash;
 use argon2::password_hash::{PasswordHasher, PasswordVerifier};
 use regrind_document::misleading;
+use regrind_formats::{OpenToOthers, readable_by_others};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -96,8 +97,8 @@ impl Display for Person {
 pub enum UsersError {
     #[error("{}: the list of users cannot be read: {source}; make one: regrind users add NAME --role operator", .path.display())]
     Unreadable { path: PathBuf, source: io::Error },
-    #[error("{}: other users of this computer may read it (mode {mode:o}); it is for its owner only: chmod 600 {}", .path.display(), .path.display())]
-    Open { path: PathBuf, mode: u32 },
+    #[error("{}: other users of this computer may read it ({}); it is for its owner only: {}", .path.display(), .open.how, .open.remedy)]
+    Open { path: PathBuf, open: OpenToOthers },
     #[error("{}: no list of users: {what}", .path.display())]
     Broken { path: PathBuf, what: String },
     #[error(
@@ -145,8 +146,8 @@ impl Users {
         if !found.is_file() || found.len() > MOST_BYTES {
             return Err(broken("it is no small file".into()));
         }
-        if let Some(mode) = open_to_others(&found) {
-            return Err(UsersError::Open { path: path.to_owned(), mode });
+        if let Some(open) = readable_by_others(path).map_err(failed)? {
+            return Err(UsersError::Open { path: path.to_owned(), open });
         }
         Self::parse(&std::fs::read_to_string(path).map_err(failed)?).map_err(broken)
     }
@@ -228,18 +229,6 @@ fn named(name: &str) -> Result<String, UsersError> {
     let name = name.trim();
     let fits = (1..=LONGEST_NAME).contains(&name.chars().count());
     if fits && misleading(name).is_none() { Ok(name.to_owned()) } else { Err(UsersError::Name) }
-}
-
-#[cfg(unix)]
-pub(crate) fn open_to_others(found: &std::fs::Metadata) -> Option<u32> {
-    use std::os::unix::fs::MetadataExt;
-    Some(found.mode() & 0o777).filter(|mode| mode & 0o077 != 0)
-}
-
-/// Elsewhere who may read a file is a matter of its folder: that of the user is theirs.
-#[cfg(not(unix))]
-pub(crate) fn open_to_others(_: &std::fs::Metadata) -> Option<u32> {
-    None
 }
 
 /// When a file changed last, and how long it is; none where it is not there.

@@ -29,9 +29,10 @@ use tokio::time::{Instant, sleep, sleep_until, timeout};
 use tokio_modbus::client::Client as _;
 use tokio_modbus::slave::{Slave, SlaveContext as _};
 use tokio_modbus::{ProtocolError, Request, Response};
-use tokio_serial::{SerialPort as _, SerialPortBuilderExt as _, SerialStream};
+use tokio_serial::{SerialPort as _, SerialStream};
 
-use super::settings::{Line, Parity};
+use super::port;
+use super::settings::Line;
 
 /// The first wait before a line is opened again; it doubles up to [`LONGEST_BACKOFF`].
 const FIRST_BACKOFF: Duration = Duration::from_millis(100);
@@ -464,15 +465,7 @@ impl Dial for OfThisComputer {
                     Ok(Box::new(stream) as Box<dyn LineStream>)
                 }
                 Line::Rtu { device, baud, parity, stop_bits } => {
-                    let parity = match parity {
-                        Parity::None => tokio_serial::Parity::None,
-                        Parity::Even => tokio_serial::Parity::Even,
-                        Parity::Odd => tokio_serial::Parity::Odd,
-                    };
-                    let stop_bits =
-                        if *stop_bits == 2 { tokio_serial::StopBits::Two } else { tokio_serial::StopBits::One };
-                    let port = tokio_serial::new(device, *baud).parity(parity).stop_bits(stop_bits);
-                    Ok(Box::new(port.open_native_async()?) as Box<dyn LineStream>)
+                    Ok(Box::new(port::open(device, *baud, *parity, *stop_bits)?) as Box<dyn LineStream>)
                 }
             }
         })
@@ -554,6 +547,7 @@ impl AsyncWrite for Listening {
 
 #[cfg(test)]
 mod tests {
+    use super::super::settings::Parity;
     use super::*;
 
     #[test]

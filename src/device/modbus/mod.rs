@@ -9,6 +9,7 @@
 mod any_registers;
 mod codec;
 mod link;
+mod port;
 mod settings;
 mod signal;
 mod unit;

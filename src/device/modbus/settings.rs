@@ -1,12 +1,12 @@
 //! What a cell file says of a machine on Modbus, and everything that has to be known to drive it.
 
 use std::net::IpAddr;
-use std::path::Path;
 use std::time::Duration;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::port;
 use crate::place::Place;
 use regrind_document::Document;
 
@@ -194,11 +194,10 @@ impl RtuWire {
 
     /// Says that the port is not on this computer, and which are; nothing where it is there.
     pub(super) fn missing(&self) -> Option<String> {
-        if self.device.is_empty() || Path::new(&self.device).exists() {
+        if self.device.is_empty() || port::is_there(&self.device) {
             return None;
         }
-        let ports = serialport::available_ports().unwrap_or_default();
-        let names: Vec<String> = ports.into_iter().map(|port| port.port_name).collect();
+        let names = port::names();
         let there = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
         Some(format!("{} is not on this computer; the serial ports here: {there}", self.device))
     }

@@ -13,6 +13,7 @@
 //! at sectors of 512 bytes, each by itself and in any order.
 //!
 //! SQLite waits for nothing here: a sleep of its own is over at once, and a sync is done when the memory of the disk has it.
+#![cfg(unix)]
 
 mod drawn;
 mod image;

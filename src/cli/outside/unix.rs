@@ -1,0 +1,87 @@
+//! Signals, terminals and process groups.
+
+use std::io;
+use std::path::PathBuf;
+use std::process::Command;
+use std::time::Duration;
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use tokio::signal::unix::{Signal, SignalKind, signal};
+
+use super::Ending;
+
+/// What ends a program from outside: a terminal that is closed, a service that is stopped.
+pub(crate) struct Endings {
+    /// None where whoever started the program wants it to outlive its terminal (`nohup`).
+    hangup: Option<Signal>,
+    terminate: Signal,
+}
+
+impl Endings {
+    pub(crate) fn new() -> io::Result<Self> {
+        let hangup = if ignores_hangup() { None } else { Some(signal(SignalKind::hangup())?) };
+        Ok(Self { hangup, terminate: signal(SignalKind::terminate())? })
+    }
+
+    /// Waits for the next; none where there will be none.
+    pub(crate) async fn next(&mut self) -> Option<Ending> {
+        tokio::select! {
+            Some(()) = self.terminate.recv() => Some(Ending { by: "SIGTERM", hung_up: false }),
+            Some(()) = async { self.hangup.as_mut()?.recv().await }, if self.hangup.is_some() => {
+                Some(Ending { by: "SIGHUP, the terminal was closed", hung_up: true })
+            }
+            else => None,
+        }
+    }
+}
+
+/// Whether SIGHUP, the first signal, is ignored by who started this program.
+fn ignores_hangup() -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).is_some_and(|mask| mask & 1 == 1)
+}
+
+/// Throws away what was typed before somebody was asked.
+pub(crate) fn forget_what_was_typed() -> io::Result<()> {
+    Ok(rustix::termios::tcflush(io::stdin(), rustix::termios::QueueSelector::IFlush)?)
+}
+
+/// Waits a while for Enter, no longer than it takes to come while this program has the terminal: none where it has not come yet.
+pub(crate) fn enter_within(patience: Duration, has_terminal: impl Fn() -> bool) -> Option<bool> {
+    let mut terminal = [PollFd::from_borrowed_fd(rustix::stdio::stdin(), PollFlags::IN)];
+    let patience = Timespec { tv_sec: 0, tv_nsec: i64::from(patience.subsec_nanos()) };
+    let typed = poll(&mut terminal, Some(&patience)).is_ok_and(|ready| ready > 0) && has_terminal();
+    typed.then(|| io::stdin().read_line(&mut String::new()).is_ok_and(|read| read > 0))
+}
+
+/// Whether the terminal is this program's at the moment: who reads from it in the background is stopped by it, machines or not.
+pub(crate) fn is_in_front() -> bool {
+    rustix::termios::tcgetpgrp(io::stdin()).is_ok_and(|group| group == rustix::process::getpgrp())
+}
+
+/// Keeps Ctrl-C at this program's terminal from a program that it starts.
+pub(crate) fn set_apart(command: &mut Command) {
+    std::os::unix::process::CommandExt::process_group(command, 0);
+}
+
+/// The name by which the operating system knows who started this program: a service may have none in its environment.
+pub(crate) fn own_name() -> String {
+    use std::os::unix::fs::MetadataExt;
+    let Ok(uid) = std::fs::metadata("/proc/self").map(|own| own.uid().to_string()) else { return "unknown".into() };
+    let users = std::fs::read_to_string("/etc/passwd").unwrap_or_default();
+    let own = users.lines().map(|line| line.split(':').collect::<Vec<_>>()).find(|user| user.get(2) == Some(&&*uid));
+    own.map_or_else(|| format!("uid {uid}"), |user| user[0].to_owned())
+}
+
+/// The name of this computer, if it has one.
+pub(crate) fn host() -> Option<String> {
+    let host = std::fs::read_to_string("/etc/hostname").unwrap_or_default();
+    Some(host.trim().to_owned()).filter(|host| !host.is_empty())
+}
+
+/// Where programs keep their settings for this user, if anywhere.
+pub(crate) fn settings_folder() -> Option<PathBuf> {
+    let folder = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    folder("XDG_CONFIG_HOME").or_else(|| Some(folder("HOME")?.join(".config")))
+}

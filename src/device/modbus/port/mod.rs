@@ -1,0 +1,34 @@
+//! Serial ports of this computer.
+
+#[cfg(unix)]
+mod unix;
+#[cfg(windows)]
+mod windows;
+
+use std::io;
+
+use tokio_serial::{SerialPortBuilderExt as _, SerialStream};
+
+use super::settings::Parity;
+
+#[cfg(unix)]
+pub(super) use unix::is_there;
+#[cfg(windows)]
+pub(super) use windows::is_there;
+
+/// Opens a port; while it is open no other program can.
+pub(super) fn open(device: &str, baud: u32, parity: Parity, stop_bits: u8) -> io::Result<SerialStream> {
+    let parity = match parity {
+        Parity::None => tokio_serial::Parity::None,
+        Parity::Even => tokio_serial::Parity::Even,
+        Parity::Odd => tokio_serial::Parity::Odd,
+    };
+    let stop_bits = if stop_bits == 2 { tokio_serial::StopBits::Two } else { tokio_serial::StopBits::One };
+    Ok(tokio_serial::new(device, baud).parity(parity).stop_bits(stop_bits).open_native_async()?)
+}
+
+/// The names of the ports that the system knows.
+pub(super) fn names() -> Vec<String> {
+    let ports = serialport::available_ports().unwrap_or_default();
+    ports.into_iter().map(|port| port.port_name).collect()
+}

@@ -1,0 +1,32 @@
+//! What one system does otherwise than another with files: a module each, with the same functions.
+
+#[cfg(unix)]
+mod unix;
+#[cfg(windows)]
+mod windows;
+
+use std::path::Path;
+
+#[cfg(unix)]
+use unix as here;
+#[cfg(windows)]
+use windows as here;
+
+pub(super) use here::{create_owners, is_socket, link_to, sync_folder};
+
+/// That others than its owner may read a file.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct OpenToOthers {
+    /// What lets them.
+    pub how: String,
+    /// The command that takes it from them.
+    pub remedy: String,
+}
+
+/// Says how others than its owner may read a file, and what to do about it; none where they may not.
+///
+/// # Errors
+/// A file that is not there, or of which the system does not tell it.
+pub fn readable_by_others(path: &Path) -> std::io::Result<Option<OpenToOthers>> {
+    here::readable_by_others(path)
+}

@@ -1,0 +1,34 @@
+//! Files have modes, folders can be brought to the disk, devices have names among the files.
+
+use std::fs::{self, File, OpenOptions};
+use std::io;
+use std::os::unix::fs::{FileTypeExt, MetadataExt, OpenOptionsExt};
+use std::path::Path;
+
+use super::OpenToOthers;
+
+/// Makes a file that nobody but its owner may read, for writing.
+pub(crate) fn create_owners(path: &Path) -> io::Result<File> {
+    OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)
+}
+
+pub(super) fn readable_by_others(path: &Path) -> io::Result<Option<OpenToOthers>> {
+    let mode = fs::metadata(path)?.mode() & 0o777;
+    let open = || OpenToOthers { how: format!("mode {mode:o}"), remedy: format!("chmod 600 {}", path.display()) };
+    Ok((mode & 0o077 != 0).then(open))
+}
+
+/// Whether what is at a path, itself and not what it links to, is a socket.
+pub(crate) fn is_socket(path: &Path) -> io::Result<bool> {
+    Ok(fs::symlink_metadata(path)?.file_type().is_socket())
+}
+
+/// Gives a device another name.
+pub(crate) fn link_to(device: &Path, link: &Path) -> io::Result<()> {
+    std::os::unix::fs::symlink(device, link)
+}
+
+/// Brings the names in a folder to the disk.
+pub(crate) fn sync_folder(folder: &Path) -> io::Result<()> {
+    File::open(folder)?.sync_all()
+}

@@ -1,0 +1,84 @@
+//! Who this process belongs to.
+
+use std::io;
+use std::os::windows::io::{AsRawHandle, FromRawHandle, OwnedHandle};
+use std::ptr;
+
+use windows_sys::Win32::Foundation::{HANDLE, LocalFree};
+use windows_sys::Win32::Security::Authorization::ConvertSidToStringSidW;
+use windows_sys::Win32::Security::{GetTokenInformation, PSID, TOKEN_QUERY, TOKEN_USER, TokenUser};
+use windows_sys::Win32::System::Threading::{GetCurrentProcess, OpenProcessToken};
+use windows_sys::Win32::System::WindowsProgramming::GetUserNameW;
+
+use super::succeeded;
+
+/// Longest name of a user, with the zero behind it (UNLEN).
+const LONGEST_NAME: usize = 257;
+
+/// Returns the name of the user whose process this is, as Windows knows it.
+///
+/// # Errors
+/// Windows does not tell it.
+pub fn own_name() -> io::Result<String> {
+    let mut name = [0; LONGEST_NAME];
+    let mut length = LONGEST_NAME as u32;
+    // SAFETY: `name` has `length` units to write to; both live longer than the call.
+    succeeded(unsafe { GetUserNameW(name.as_mut_ptr(), &mut length) })?;
+    let name = name.split(|unit| *unit == 0).next().unwrap_or_default();
+    Ok(String::from_utf16_lossy(name))
+}
+
+/// The security identifier of the user whose process this is: `S-1-5-21-...`.
+pub(crate) fn own_sid() -> io::Result<String> {
+    let token = own_token()?;
+    let mut length = 0;
+    // SAFETY: with no room to write to the call only tells how much it needs, and fails, which is no news.
+    unsafe { GetTokenInformation(token.as_raw_handle(), TokenUser, ptr::null_mut(), 0, &mut length) };
+    // Words of eight bytes: what is written begins with a pointer.
+    let mut room = vec![0_u64; (length as usize).div_ceil(8).max(1)];
+    // SAFETY: `room` has at least `length` bytes, and is aligned for the `TOKEN_USER` that they begin with.
+    succeeded(unsafe {
+        GetTokenInformation(token.as_raw_handle(), TokenUser, room.as_mut_ptr().cast(), length, &mut length)
+    })?;
+    if (length as usize) < size_of::<TOKEN_USER>() {
+        return Err(io::ErrorKind::UnexpectedEof.into());
+    }
+    // SAFETY: the call has filled in a whole `TOKEN_USER`, whose identifier lies in `room` behind it.
+    let user = unsafe { room.as_ptr().cast::<TOKEN_USER>().read() };
+    text_of(user.User.Sid)
+}
+
+fn own_token() -> io::Result<OwnedHandle> {
+    let mut token: HANDLE = ptr::null_mut();
+    // SAFETY: the handle of the own process is always good, and `token` lives longer than the call.
+    succeeded(unsafe { OpenProcessToken(GetCurrentProcess(), TOKEN_QUERY, &mut token) })?;
+    // SAFETY: the call has opened this handle for us, and nobody else closes it.
+    Ok(unsafe { OwnedHandle::from_raw_handle(token) })
+}
+
+/// A security identifier as text. It must be a whole one, as all are that Windows hands out.
+pub(crate) fn text_of(sid: PSID) -> io::Result<String> {
+    let mut text = ptr::null_mut();
+    // SAFETY: `sid` is one that Windows wrote; where it is none, the call says so.
+    succeeded(unsafe { ConvertSidToStringSidW(sid, &mut text) })?;
+    let mut units = Vec::new();
+    // SAFETY: the text ends with a zero, and is read no further than that.
+    while let unit @ 1.. = unsafe { text.add(units.len()).read() } {
+        units.push(unit);
+    }
+    // SAFETY: the call has allocated the text for us, and nothing points into it any more.
+    unsafe { LocalFree(text.cast()) };
+    Ok(String::from_utf16_lossy(&units))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_user_of_this_process_has_a_name_and_an_identifier() {
+        assert!(!own_name().unwrap().is_empty());
+        let sid = own_sid().unwrap();
+        assert!(sid.starts_with("S-1-") && !sid.contains('\0'), "{sid}");
+    }
+}

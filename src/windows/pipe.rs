@@ -1,0 +1,80 @@
+//! A named pipe that nobody but its owner opens, from this computer only.
+
+use std::io;
+use std::os::windows::io::{AsRawHandle, BorrowedHandle};
+
+use tokio::net::windows::named_pipe::{NamedPipeClient, NamedPipeServer, ServerOptions};
+use windows_sys::Win32::System::Pipes::GetNamedPipeClientProcessId;
+
+use super::access::{OwnersAlone, is_owned_here};
+use super::succeeded;
+
+/// Makes an end of a pipe for one client to come. The first one fails where somebody has a pipe of that name already.
+///
+/// # Errors
+/// A name that is taken or no name of a pipe.
+///
+/// # Panics
+/// Outside a runtime of tokio that does input and output, as all its sockets do.
+pub fn listen(name: &str, is_first: bool) -> io::Result<NamedPipeServer> {
+    let owners_alone = OwnersAlone::new()?;
+    let mut options = ServerOptions::new();
+    options.first_pipe_instance(is_first).reject_remote_clients(true);
+    // SAFETY: the attributes are whole, and what they point to lives longer than the call.
+    unsafe { options.create_with_security_attributes_raw(name, owners_alone.attributes().cast_mut().cast()) }
+}
+
+/// Returns the number of the process at the other end.
+///
+/// # Errors
+/// Nobody is there.
+pub fn client_process(pipe: &NamedPipeServer) -> io::Result<u32> {
+    let mut process = 0;
+    // SAFETY: the pipe is open, and `process` lives longer than the call.
+    succeeded(unsafe { GetNamedPipeClientProcessId(pipe.as_raw_handle(), &mut process) })?;
+    Ok(process)
+}
+
+/// Whether a pipe belongs to the user whose process this is: anybody may have made one of the name that a client looks for.
+///
+/// # Errors
+/// Windows does not tell it.
+pub fn is_of_this_user(pipe: &NamedPipeClient) -> io::Result<bool> {
+    // SAFETY: the pipe stays open for as long as it is borrowed, which is longer than this.
+    is_owned_here(unsafe { BorrowedHandle::borrow_raw(pipe.as_raw_handle()) })
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    use tokio::net::windows::named_pipe::ClientOptions;
+
+    use super::*;
+
+    fn name(of: &str) -> String {
+        format!(r"\\.\pipe\regrind-test-{of}-{}", std::process::id())
+    }
+
+    #[tokio::test]
+    async fn a_pipe_that_is_there_is_not_made_a_first_time_again() {
+        let name = name("first");
+        let first = listen(&name, true).unwrap();
+        assert!(listen(&name, true).is_err(), "somebody has it");
+        drop((listen(&name, false).unwrap(), first));
+        listen(&name, true).unwrap();
+    }
+
+    #[tokio::test]
+    async fn the_ends_of_a_pipe_know_each_other() {
+        let name = name("ends");
+        let mut server = listen(&name, true).unwrap();
+        let mut client = ClientOptions::new().open(&name).unwrap();
+        server.connect().await.unwrap();
+        assert!(is_of_this_user(&client).unwrap());
+        assert_eq!(client_process(&server).unwrap(), std::process::id());
+        client.write_all(b"hold").await.unwrap();
+        let mut said = [0; 4];
+        server.read_exact(&mut said).await.unwrap();
+        assert_eq!(&said, b"hold");
+    }
+}
