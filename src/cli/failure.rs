@@ -145,6 +145,8 @@ pub(super) enum Failure {
     NoMachine,
     #[error("{path} is there already; choose another folder, or move it away")]
     IsThere { path: PathBuf },
+    #[error("no model of the error: {0}")]
+    NoModel(regrind::model::ModelError),
     #[error("no folder to make is named; give it as in: regrind init mirrors --machines modbus-tcp")]
     NoFolder,
     #[error("{path}: {source}; --runs names the folder of the runs")]

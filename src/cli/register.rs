@@ -6,9 +6,10 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use regrind::formats::{
     Alternative, NominalInput, NotedPoints, RegistrationDocument, ResultFolder, is_map, read_measured_with_notes,
-    save_registration,
+    save_form, save_registration,
 };
 use regrind::geometry::Pose;
+use regrind::model::{Form, Interval};
 use regrind::registration::{Coordinate, Loss, Method, Options, ProbeSide, Start, register};
 use regrind::surface::{Distance, Nominal, NominalKind, Projection};
 
@@ -63,6 +64,9 @@ pub(super) struct Arguments {
     /// Leave out points farther off than this many robust standard deviations; `inf` keeps all
     #[arg(long, value_name = "N", default_value_t = 6.0, allow_negative_numbers = true, value_parser = above_zero)]
     outlier_sigmas: f64,
+    /// Tell the form apart from the scatter of the probe, with uncertainties that hold for both: model.json and form.csv
+    #[arg(long)]
+    model: bool,
     /// Print registration.json instead of a summary
     #[arg(long)]
     json: bool,
@@ -77,6 +81,10 @@ Writes into the folder:
   deviations.csv              a row per measured point in the order given: contact point and normal in the
                               model frame, deviation (positive where material stands proud), used (1 or 0)
   deviation_uncertainty.csv   standard uncertainty of each deviation in mm, in the same order
+with --model also
+  model.json                  PV and RMS of the form with 95 % intervals, the scatter of the probe taken off; how
+                              well the place of the nominal frame is known beside a form that nobody knows
+  form.csv                    the form at each measured point, and its standard uncertainty, in mm
 
 `covariance` is 6 x 6 in the order [translation; rotation] of the twist, in mm and rad: of the small motion in
 the model frame that takes the true pose to the one found. Directions that are locked or held have no variance.
@@ -97,10 +105,15 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let document = RegistrationDocument::new(&registration, &options, nominal_file, &arguments.measured);
     document.check().map_err(|what| Failure::NotFinite { what })?;
     save_registration(folder.path(), &document, &registration.deviations).map_err(Failure::NotSaved)?;
+    let form = if arguments.model { Some(Form::of(&registration, None).map_err(Failure::NoModel)?) } else { None };
+    if let Some(form) = &form {
+        save_form(folder.path(), form, &registration).map_err(Failure::NotSaved)?;
+    }
     if arguments.json {
         super::print_json(&document)?;
     } else {
         super::print(&summary(&document, nominal.kind(), folder.path()))?;
+        super::print(&form.as_ref().map_or(String::new(), form_in_words))?;
     }
     folder.keep();
     Ok(Outcome::Accepted)
@@ -192,6 +205,25 @@ fn summary(document: &RegistrationDocument, kind: NominalKind, folder: &Path) ->
     }
     line("files", format!("registration.json, deviations.csv, deviation_uncertainty.csv in {}", folder.display()));
     text
+}
+
+/// What the model says, a line each.
+fn form_in_words(form: &Form) -> String {
+    let um = |mm: f64| three_digits(1e3 * mm);
+    let within =
+        |figure: &Interval| format!("{} um ({} to {})", um(figure.median_mm), um(figure.low_mm), um(figure.high_mm));
+    let Form { hyper, figures, frame_covariance, .. } = form;
+    let sigma = [0, 1, 2].map(|k| um(frame_covariance[(k, k)].sqrt())).join(", ");
+    format!(
+        "form        RMS {}, PV {}, PV 99.8 % {}; with 95 %\nmodel       the form is {} um strong and {} mm wide, a point scatters by {} um\n\
+         frame       known to {sigma} um along x, y, z beside that form\n",
+        within(&figures.rms),
+        within(&figures.pv),
+        within(&figures.pv_most_points),
+        um(hyper.field.sigma_mm),
+        three_digits(hyper.field.range_mm),
+        um(hyper.scatter_mm),
+    )
 }
 
 fn pose_in_words(document: &RegistrationDocument) -> String {

@@ -7,6 +7,7 @@ mod document;
 mod error;
 mod figures;
 mod folder;
+mod form_document;
 pub mod gcode;
 mod height_map;
 mod layout;
@@ -36,6 +37,7 @@ pub use document::{
 pub use error::FormatError;
 pub use figures::write_figures;
 pub use folder::{ResultFolder, ScratchFolder, finished_files, place_link, remove_link, remove_socket};
+pub use form_document::save_form;
 pub use height_map::HeightMap;
 pub use learned::{LEARNED, Learned, LearnedError};
 pub use lines::AddedLines;

@@ -154,7 +154,7 @@ mod tests {
     }
 
     fn places(count: u32) -> Vec<[f64; 2]> {
-        (0..count).map(|k| f64::from(k)).map(|k| [(7.31 * k) % 60.0, (13.7 * k) % 40.0]).collect()
+        (0..count).map(f64::from).map(|k| [(7.31 * k) % 60.0, (13.7 * k) % 40.0]).collect()
     }
 
     #[test]

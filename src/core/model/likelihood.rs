@@ -39,11 +39,22 @@ impl Hyper {
     pub fn of(observed: &Observed, priors: &Priors) -> Result<Self, ModelError> {
         observed.check()?;
         let few = thinned(observed);
-        let at = |[range, ratio]: [f64; 2]| scaled(&few, range.exp(), ratio.exp(), priors);
+        let least_mm = least_range_mm(&few);
+        let at = |[range, ratio]: [f64; 2]| scaled(&few, range.exp().max(least_mm), ratio.exp(), priors);
         let start = [priors.range_mm[0].ln(), priors.scatter_ratio[0].ln()];
         let (best, _) = climb(start, |place| at(place).map_or(f64::NEG_INFINITY, |(_, value)| value));
         at(best).map(|(hyper, _)| hyper)
     }
+}
+
+/// A field that forgets itself between two neighbours is no form: what is narrower than this cannot be told from scatter.
+fn least_range_mm(observed: &Observed) -> f64 {
+    const NEIGHBOURS: f64 = 2.5;
+    let span = |axis: usize| {
+        let of = observed.places.iter().map(|place| place[axis]);
+        of.clone().fold(f64::NEG_INFINITY, f64::max) - of.fold(f64::INFINITY, f64::min)
+    };
+    NEIGHBOURS * (span(0) * span(1) / observed.places.len() as f64).sqrt()
 }
 
 /// The parameters with the scale that suits them best, and the logarithm of their probability.

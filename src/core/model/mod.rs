@@ -20,6 +20,7 @@
 
 mod dense;
 mod error;
+mod form;
 mod likelihood;
 mod matern;
 mod normals;
@@ -27,6 +28,7 @@ mod sparse;
 
 pub use dense::{Dense, Predicted};
 pub use error::ModelError;
+pub use form::{Form, FormFigures, Interval};
 pub use likelihood::Priors;
 pub use sparse::{Lattice, Sparse};
 

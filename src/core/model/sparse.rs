@@ -23,6 +23,10 @@ use crate::sparse::{Factor, Pattern, SelectedInverse};
 
 /// How many ranges the grid goes on beyond every place.
 const MARGIN: f64 = 1.25;
+/// Beyond every place, at most, as a share of the part.
+const MARGIN_OF_PART: f64 = 0.75;
+/// Nodes along a part, at least.
+const NODES_A_PART: f64 = 36.0;
 /// Nodes in one range.
 const NODES_A_RANGE: f64 = 14.0;
 /// More would take minutes.
@@ -58,14 +62,17 @@ impl Lattice {
         if places.is_empty() {
             return Err(ModelError::TooFewPoints { points: 0, least: 1 });
         }
-        let spacing_mm = range_mm / NODES_A_RANGE;
-        let ends = [0, 1].map(|axis| {
+        let spans = [0, 1].map(|axis| {
             let of = places.iter().map(|place| place[axis]);
-            [
-                of.clone().fold(f64::INFINITY, f64::min) - MARGIN * range_mm,
-                of.fold(f64::NEG_INFINITY, f64::max) + MARGIN * range_mm,
-            ]
+            [of.clone().fold(f64::INFINITY, f64::min), of.fold(f64::NEG_INFINITY, f64::max)]
         });
+        let size_mm = spans.iter().map(|[low, high]| high - low).fold(0.0, f64::max);
+        // A field that is wider than the part is told by points much nearer to each other than its range; and its edge, however far, is not
+        // seen once the motions of the part are free.
+        let resolved_mm = if size_mm > 0.0 { size_mm / NODES_A_PART } else { f64::INFINITY };
+        let spacing_mm = (range_mm / NODES_A_RANGE).min(resolved_mm);
+        let beyond_mm = (MARGIN * range_mm).min((MARGIN_OF_PART * size_mm).max(2.0 * spacing_mm));
+        let ends = spans.map(|[low, high]| [low - beyond_mm, high + beyond_mm]);
         let counts = ends.map(|[low, high]| ((high - low) / spacing_mm).ceil() + 1.0);
         let nodes = counts[0] * counts[1];
         if nodes > MOST_NODES as f64 {

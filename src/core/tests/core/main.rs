@@ -8,6 +8,7 @@ mod exact;
 mod form;
 mod learning;
 mod map;
+mod model;
 mod paper;
 mod parameters;
 mod parts;

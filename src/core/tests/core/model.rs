@@ -1,0 +1,103 @@
+//! What the model says of registered parts, held against what was planted: form, figures, and the place of the nominal frame.
+
+use nalgebra::{DMatrix, DVector, Matrix6, Vector6};
+use rand::SeedableRng;
+use rand::rngs::StdRng;
+
+use crate::common::{RADIUS_MM, centres, free_form, normal, placed, points, pose};
+use regrind_core::geometry::Pose;
+use regrind_core::model::{Form, Interval};
+use regrind_core::registration::{Options, Registration, Start, register};
+use regrind_sim::form::FormError;
+use regrind_sim::probe::Placement;
+use regrind_sim::shape::FreeForm;
+
+const SCATTER_MM: f64 = 3e-4;
+const PARTS: u64 = 16;
+
+struct Part {
+    form: FormError,
+    truth: Pose,
+    found: Registration,
+    model: Form,
+}
+
+/// A part with a form of some rms and a length of 30 mm, somewhere near, registered from where it is about.
+fn part(seed: u64, rms_mm: f64) -> Part {
+    let mut rng = StdRng::seed_from_u64(seed);
+    let form = FormError::with_rms(&mut regrind_sim::rng(seed), 30.0, rms_mm);
+    let placement = Placement::new([1.0, -2.0, 0.5], [0.3, -0.2, 0.5]);
+    let mut all = placed(&placement, &centres(&FreeForm::default(), &form, [[-48.0, -28.0], [48.0, 28.0]], [30, 20]));
+    for centre in &mut all {
+        centre.iter_mut().for_each(|v| *v += SCATTER_MM * normal(&mut rng));
+    }
+    let truth = pose(&placement);
+    let options = Options { start: Start::Pose(truth), ..Options::new(RADIUS_MM) };
+    let found = register(&free_form(409, 249), &points(&all), &options).unwrap();
+    let model = Form::of(&found, None).unwrap();
+    Part { form, truth, found, model }
+}
+
+impl Part {
+    /// The true form at the points, after its own best fit.
+    fn form(&self) -> Vec<f64> {
+        let rows = self.found.deviations.iter();
+        let form = DVector::from_iterator(rows.len(), rows.clone().map(|d| self.form.height(d.point.x, d.point.y)));
+        let motions = DMatrix::from_fn(rows.len(), 6, |r, c| {
+            let d = &self.found.deviations[r];
+            let arm = d.point.coords.cross(&d.normal) / 30.0;
+            [d.normal.x, d.normal.y, d.normal.z, arm.x, arm.y, arm.z][c]
+        });
+        let base = motions.qr().q();
+        let left = &form - &base * base.tr_mul(&form);
+        left.iter().copied().collect()
+    }
+
+    /// The square of the error of the pose in units of a covariance, by its degrees of freedom: 1 where the covariance is right.
+    fn pose_error(&self, covariance: &Matrix6<f64>) -> f64 {
+        let twist = (self.truth.inverse() * self.found.cmm_from_model).log();
+        let off = Vector6::from_iterator(twist.iter().copied());
+        (off.transpose() * covariance.try_inverse().unwrap() * off)[0] / 6.0
+    }
+}
+
+fn figures(of: &[f64]) -> [f64; 2] {
+    let (low, high) = of.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)));
+    [(of.iter().map(|v| v * v).sum::<f64>() / of.len() as f64).sqrt(), high - low]
+}
+
+fn holds(interval: Interval, value: f64) -> bool {
+    (interval.low_mm..=interval.high_mm).contains(&value)
+}
+
+#[test]
+fn form_and_frame_are_said_with_intervals_that_hold_the_truth() {
+    let (mut rms, mut pv) = (0, 0);
+    let (mut frame, mut repeated) = (0.0, 0.0);
+    for seed in 0..PARTS {
+        let part = part(seed, 5e-3);
+        let truth = part.form();
+        let [true_rms, true_pv] = figures(&truth);
+        rms += u32::from(holds(part.model.figures.rms, true_rms));
+        pv += u32::from(holds(part.model.figures.pv, true_pv));
+        frame += part.pose_error(&part.model.frame_covariance) / PARTS as f64;
+        repeated += part.pose_error(&part.found.verdict.covariance) / PARTS as f64;
+        assert_eq!(part.model.points.len(), truth.len());
+        assert!((part.model.hyper.scatter_mm / SCATTER_MM - 1.0).abs() < 0.25, "seed {seed}: {:?}", part.model.hyper);
+    }
+    println!(
+        "of {PARTS} parts RMS held in {rms}, PV in {pv}; pose: chi2/6 {frame:.2} by the model, {repeated:.0} by white residuals"
+    );
+    assert!(rms >= PARTS as u32 - 3 && pv >= PARTS as u32 - 3, "{rms} {pv}");
+    assert!((0.4..2.0).contains(&frame), "{frame}");
+    assert!(repeated > 20.0, "{repeated}");
+}
+
+#[test]
+fn the_figures_of_a_part_without_form_are_not_the_scatter_of_its_probe() {
+    let part = part(1, 1e-9);
+    let raw = figures(&part.found.deviations.iter().map(|d| d.deviation_mm).collect::<Vec<_>>());
+    let told = part.model.figures;
+    println!("raw rms {:.2e} pv {:.2e}; {told:?}", raw[0], raw[1]);
+    assert!(told.rms.high_mm < 0.35 * raw[0] && told.pv.high_mm < 0.35 * raw[1], "{told:?} {raw:?}");
+}

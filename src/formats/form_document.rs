@@ -1,0 +1,69 @@
+//! What the model of the error says of a registered measurement, as files.
+
+use std::path::Path;
+
+use serde::Serialize;
+
+use super::document::StandardUncertainty;
+use super::error::FormatError;
+use super::registration::{write_json_atomic, write_rows};
+use regrind_core::model::{Form, Interval};
+use regrind_core::registration::Registration;
+
+/// The columns of `form.csv`.
+const FORM_HEADER: &str = "x_mm,y_mm,form_mm,sigma_mm";
+
+/// `model.json`. Lengths in millimetres.
+#[derive(Serialize)]
+struct FormDocument {
+    /// Standard deviation and range of the form, and scatter of a single point.
+    form_sigma_mm: f64,
+    form_range_mm: f64,
+    scatter_mm: f64,
+    /// Figures of the form after its own best fit: median, and the interval that holds it with 95 %.
+    rms: Interval,
+    pv: Interval,
+    pv_99_8: Interval,
+    /// The same of the deviations as they were measured, the scatter of the probe in them.
+    raw_rms_mm: f64,
+    raw_pv_mm: f64,
+    /// How well the place of the nominal frame is known; `covariance` of registration.json is how well the same pose is found again.
+    frame_standard_uncertainty: StandardUncertainty,
+    frame_covariance: [[f64; 6]; 6],
+}
+
+/// Writes `model.json`, and `form.csv` with a row a measured point in the order given.
+///
+/// # Errors
+/// A folder that cannot be written.
+pub fn save_form(folder: &Path, form: &Form, registration: &Registration) -> Result<(), FormatError> {
+    let covariance = form.frame_covariance;
+    let sigma = |k: usize| covariance[(k, k)].max(0.0).sqrt();
+    let document = FormDocument {
+        form_sigma_mm: form.hyper.field.sigma_mm,
+        form_range_mm: form.hyper.field.range_mm,
+        scatter_mm: form.hyper.scatter_mm,
+        rms: form.figures.rms,
+        pv: form.figures.pv,
+        pv_99_8: form.figures.pv_most_points,
+        raw_rms_mm: registration.verdict.rms_mm,
+        raw_pv_mm: registration.verdict.pv_mm,
+        frame_standard_uncertainty: StandardUncertainty {
+            x_mm: sigma(0),
+            y_mm: sigma(1),
+            z_mm: sigma(2),
+            rx_rad: sigma(3),
+            ry_rad: sigma(4),
+            rz_rad: sigma(5),
+        },
+        frame_covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),
+    };
+    write_json_atomic(folder.join("model.json"), &document)?;
+    let rows: Vec<[f64; 4]> = registration
+        .deviations
+        .iter()
+        .zip(&form.points)
+        .map(|(at, told)| [at.point.x, at.point.y, told.mean_mm, told.sigma_mm])
+        .collect();
+    write_rows(&folder.join("form.csv"), FORM_HEADER, &rows, |row| (*row, None))
+}
