@@ -112,12 +112,12 @@ fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// The sources of a room, tests and benches of its crate left out.
+/// The sources of a room, tests, benches and examples of its crate left out.
 fn sources(room: &str) -> Vec<Source> {
     let mut found = Vec::new();
     let mut open = vec![root().join(room)];
     while let Some(path) = open.pop() {
-        if path.ends_with("tests") || path.ends_with("benches") {
+        if ["tests", "benches", "examples"].iter().any(|beside| path.ends_with(beside)) {
             continue;
         } else if path.is_dir() {
             open.extend(fs::read_dir(&path).unwrap().map(|entry| entry.unwrap().path()));

@@ -1,7 +1,8 @@
 //! The page of a cell: who is let in, what it shows, and what comes of its orders.
 //!
 //! Every run here is the program itself with its simulated machines, every page the program that serves it. What needs a browser asks
-//! for one: Debian package chromium.
+//! for one: Debian package chromium. Signals and modes are Unix's.
+#![cfg(unix)]
 
 #[path = "../common/keep.rs"]
 mod keep;

@@ -1,4 +1,7 @@
 //! Whole runs: the program and its drive against simulated machines on real wires, on sunny days and others.
+//!
+//! Signals, modes and the socket of a run are Unix's; what is tried on Windows is in .ci/windows.
+#![cfg(unix)]
 
 mod apart;
 mod audit;

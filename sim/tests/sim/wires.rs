@@ -11,6 +11,7 @@ use regrind_sim::options::MachineOptions;
 use regrind_sim::registers::Machine;
 use regrind_sim::wire::Serving;
 use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, When};
+#[cfg(unix)]
 use regrind_sim::wire::pty::Pty;
 use regrind_sim::wire::rtu::Line;
 use regrind_sim::words::{WordOrder, bytes_of, crc16, registers_of};
@@ -531,6 +532,7 @@ async fn a_serial_line_breaks_as_it_is_told() {
     }
 }
 
+#[cfg(unix)]
 #[tokio::test]
 async fn a_pseudo_terminal_changes_no_byte_and_outlives_its_client() {
     let mut pty = Pty::open().unwrap();
@@ -545,6 +547,7 @@ async fn a_pseudo_terminal_changes_no_byte_and_outlives_its_client() {
     }
 }
 
+#[cfg(unix)]
 #[tokio::test]
 async fn a_serial_line_can_have_the_name_that_a_cell_file_gives_it() {
     let folder = tempfile::tempdir().unwrap();

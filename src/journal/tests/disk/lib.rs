@@ -13,13 +13,19 @@
 //! at sectors of 512 bytes, each by itself and in any order.
 //!
 //! SQLite waits for nothing here: a sleep of its own is over at once, and a sync is done when the memory of the disk has it.
-#![cfg(unix)]
+//!
+//! It stands in for a disk of Unix; elsewhere there are the drawn numbers alone.
 
 mod drawn;
+#[cfg(unix)]
 mod image;
+#[cfg(unix)]
 mod plan;
+#[cfg(unix)]
 mod vfs;
 
 pub use drawn::Drawn;
+#[cfg(unix)]
 pub use image::{Cut, Outcome};
+#[cfg(unix)]
 pub use plan::{Disk, Fault, Operation, Stall};
