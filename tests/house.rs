@@ -42,7 +42,7 @@ const ARROWS: [(&str, &str, &[&str]); 21] = [
 ];
 
 /// The rooms of the numerical core.
-const CORE: [&str; 6] = ["geometry", "surface", "measuring", "registration", "compensation", "form"];
+const CORE: [&str; 7] = ["geometry", "surface", "measuring", "registration", "compensation", "form", "model"];
 
 /// The files that may say what system it is, and what each system has alone: twins with the same functions, and what chooses between them.
 const SYSTEMS: [&str; 16] = [

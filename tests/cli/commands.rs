@@ -576,6 +576,22 @@ fn a_run_into_the_same_folder_replaces_the_result() {
 }
 
 #[test]
+fn a_model_tells_the_form_with_intervals_for_every_point() {
+    let bench = Bench::new();
+    bench.registered("nominal.csv", "measured.csv", &["--model"]);
+    let model: Value = serde_json::from_slice(&fs::read(bench.path("out/here/model.json")).unwrap()).unwrap();
+    for figure in ["rms", "pv", "pv_99_8"] {
+        let [low, median, high] = ["low_mm", "median_mm", "high_mm"].map(|key| model[figure][key].as_f64().unwrap());
+        assert!(0.0 < low && low <= median && median <= high, "{figure}: {model}");
+    }
+    assert!(model["rms"]["high_mm"].as_f64() < model["raw_rms_mm"].as_f64(), "{model}");
+    let rows = |file: &str| fs::read_to_string(bench.path(file)).unwrap().lines().count();
+    assert_eq!(rows("out/here/form.csv"), rows("out/here/deviations.csv"));
+    let told = text(&bench.register("nominal.csv", "measured.csv", &["--model"]).stdout);
+    assert!(told.contains("form        RMS ") && told.contains("frame       known to "), "{told}");
+}
+
+#[test]
 fn a_plan_tells_its_time_and_warns_of_a_pass_without_end() {
     let bench = Bench::new();
     let shipped = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/recipes/shallow-wave.toml")).unwrap();
