@@ -96,7 +96,7 @@ pub(super) struct NominalTable {
 }
 
 /// Where points are taken.
-#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum PatternWord {
     /// On a grid: spacing_mm, or columns and rows.

@@ -121,15 +121,18 @@ fn limits(value: &Value) -> String {
         Some("boolean") => "`true`, `false`".into(),
         Some("string") => format!("text of {} characters", bounds("minLength", "maxLength")),
         Some("array") => {
-            let of = limits(&value["items"]);
-            let of = if of == "number" { String::new() } else { format!(" of {of}") };
-            match bounds("minItems", "maxItems") {
-                many if many.is_empty() => format!("list{of}"),
-                many if value.get("minItems") == value.get("maxItems") => {
-                    format!("[{} numbers]{of}", many.split(' ').next().unwrap_or_default())
-                }
-                many => format!("list, {many}{of}"),
+            let items = value.get("minItems").and_then(Value::as_u64);
+            if items.is_some() && value.get("minItems") == value.get("maxItems") {
+                let of = value.get("items").map(limits).filter(|of| of != "number");
+                return format!("[{} numbers]{}", items.unwrap_or(0), of.map_or(String::new(), |of| format!(" of {of}")));
             }
+            let of = format!("list of {}", limits(&value["items"]).replace("number", "numbers"));
+            match (items, value.get("maxItems")) {
+                (Some(least), None) => format!("{of}, {least} or more"),
+                (_, Some(most)) => format!("{of}, {most} at most"),
+                _ => of,
+            }
+            .replace("numberss", "numbers")
         }
         Some(kind @ ("number" | "integer")) => {
             let limits = bounds("minimum", "maximum");
@@ -145,11 +148,13 @@ fn limits(value: &Value) -> String {
 }
 
 fn words(value: &Value) -> String {
-    let said = value["description"].as_str().unwrap_or("").replace('\n', " ");
+    let said = value["description"].as_str().unwrap_or("").to_owned();
     let chosen = value.get("oneOf").and_then(Value::as_array).into_iter().flatten();
     let of = |one: &Value| Some(format!("`\"{}\"`: {}", one["const"].as_str()?, one["description"].as_str()?));
     let chosen: Vec<String> = chosen.filter_map(of).map(|words| words.trim_end_matches('.').to_owned()).collect();
-    if chosen.is_empty() { said } else { format!("{said} {}.", chosen.join("; ")) }
+    let all = if chosen.is_empty() { said } else { format!("{said} {}.", chosen.join("; ")) };
+    // A bar would end the cell of the list.
+    all.replace('\n', " ").replace('|', "\\|")
 }
 
 /// The list of the keys of a table, or of each of its forms.
