@@ -45,15 +45,17 @@ fn file_name(block: &str) -> Option<&str> {
     (name.ends_with(".toml") && !name.contains(' ')).then_some(name)
 }
 
-/// Puts the tables of a fragment into the place of those of a file.
+/// Puts the tables of a fragment into the place of those of a file: the keys of a table replace all of its keys.
 fn put(into: &mut toml::Table, from: toml::Table) {
+    if from.contains_key("file") {
+        into.clear();
+    } else if from.values().any(|value| !value.is_table()) {
+        into.retain(|_, value| value.is_table());
+    }
     for (name, value) in from {
-        match value {
-            toml::Value::Table(table) if table.values().all(toml::Value::is_table) => {
-                let there = into.entry(name).or_insert_with(|| toml::Table::new().into());
-                put(there.as_table_mut().unwrap(), table);
-            }
-            value => drop(into.insert(name, value)),
+        match (value, into.get_mut(&name)) {
+            (toml::Value::Table(table), Some(toml::Value::Table(there))) => put(there, table),
+            (value, _) => drop(into.insert(name, value)),
         }
     }
 }
