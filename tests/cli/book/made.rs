@@ -124,7 +124,11 @@ fn limits(value: &Value) -> String {
             let items = value.get("minItems").and_then(Value::as_u64);
             if items.is_some() && value.get("minItems") == value.get("maxItems") {
                 let of = value.get("items").map(limits).filter(|of| of != "number");
-                return format!("[{} numbers]{}", items.unwrap_or(0), of.map_or(String::new(), |of| format!(" of {of}")));
+                return format!(
+                    "[{} numbers]{}",
+                    items.unwrap_or(0),
+                    of.map_or(String::new(), |of| format!(" of {of}"))
+                );
             }
             let of = format!("list of {}", limits(&value["items"]).replace("number", "numbers"));
             match (items, value.get("maxItems")) {

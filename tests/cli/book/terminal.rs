@@ -36,12 +36,12 @@ impl Terminal {
     /// Types a block: each line once the one before has ended. The last one is left to itself.
     pub fn types(&mut self, block: &str) {
         self.shown.clear();
-        for line in block.replace("\\\n", " ").lines().filter(|line| !line.trim().is_empty()) {
+        for line in commands(block) {
             self.until_it_ends();
             self.log.push(format!("$ {line}"));
             match line.trim().strip_prefix("cd ") {
                 Some(folder) => self.folder = self.folder.join(folder.trim()),
-                None => self.begin(line),
+                None => self.begin(&line),
             }
         }
     }
@@ -143,6 +143,22 @@ impl Drop for Terminal {
             let _ = typed.child.wait();
         }
     }
+}
+
+/// The commands of a block: a line each, which goes on behind a backslash and within quotes.
+fn commands(block: &str) -> Vec<String> {
+    let mut found: Vec<String> = Vec::new();
+    let mut open = String::new();
+    for line in block.replace("\\\n", " ").lines() {
+        open.push_str(line);
+        if open.matches('\'').count() % 2 == 1 {
+            open.push('\n');
+        } else if !open.trim().is_empty() {
+            found.push(std::mem::take(&mut open));
+        }
+    }
+    assert!(open.trim().is_empty(), "a quote without its end: {open}");
+    found
 }
 
 /// Whether a line is as a screen of the page has it, where `...` stands for any characters.
