@@ -129,6 +129,7 @@ typed! {
     the_first_part_is_made: "first-part.md"
     recipes_are_written: "recipes.md"
     a_cell_is_commissioned: "commissioning.md"
+    a_person_serves_the_machines: "manual.md"
     alarms_are_met: "alarms.md"
     files_are_read: "formats.md"
     the_method_is_followed: "method.md"
