@@ -64,7 +64,12 @@ fn put(into: &mut toml::Table, from: toml::Table) {
 fn whole(fragment: &str, home: &Path) -> PathBuf {
     let tables: toml::Table = fragment.parse().unwrap_or_else(|e| panic!("{e}\n{fragment}"));
     let is_cell = tables.keys().all(|name| ["cell", "cmm", "grinder"].contains(&name.as_str()));
-    let shipped = home.join(if is_cell { "config/modbus-tcp.toml" } else { "recipes/freeform-mirror.toml" });
+    let wire = tables.get("cmm").and_then(|cmm| cmm.get("wire")?.get("kind")?.as_str());
+    let shipped = home.join(match wire {
+        Some("manual") => "config/manual.toml",
+        _ if is_cell => "config/modbus-tcp.toml",
+        _ => "recipes/freeform-mirror.toml",
+    });
     let mut file: toml::Table = fs::read_to_string(&shipped).unwrap().parse().unwrap();
     put(&mut file, tables);
     let path = shipped.with_file_name("fragment.toml");
