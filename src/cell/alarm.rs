@@ -349,6 +349,13 @@ catalogue! {
     }
 }
 
+impl AlarmId {
+    /// Returns the alarm with no values of a case, as the catalogue has it.
+    pub fn in_general(self) -> Alarm {
+        Alarm::of(self, "")
+    }
+}
+
 impl Alarm {
     /// Fills an entry of the catalogue with the values of a case.
     pub(super) fn of(id: AlarmId, case: impl AsRef<str>) -> Self {

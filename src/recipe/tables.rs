@@ -96,7 +96,7 @@ pub(super) struct NominalTable {
 }
 
 /// Where points are taken.
-#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum PatternWord {
     /// On a grid: spacing_mm, or columns and rows.
@@ -225,7 +225,8 @@ pub struct Acceptance {
 #[derive(Clone, Debug, Deserialize, JsonSchema, PartialEq)]
 #[serde(default, deny_unknown_fields)]
 pub struct Compensation {
-    /// A fixed share of the deviation that every cycle takes back; 0 measures and judges only. Left out, `gain_by` chooses it.
+    /// A fixed share of the deviation that every cycle takes back; 0 takes nothing back, and passes are ground all the same. Left out, `gain_by`
+    /// chooses it.
     #[schemars(range(min = 0.0, max = 1.2))]
     pub(super) gain: Option<f64>,
     /// What the share that a cycle takes back is chosen by, where `gain` does not fix it.
