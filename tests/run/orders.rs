@@ -104,17 +104,11 @@ fn watch_the_disk(rig: &Rig, folder: &Arc<Mutex<PathBuf>>, broken: &Arc<Mutex<Ve
                 counts[number] += usize::from(command != last);
                 last = command;
                 let on_disk = match command {
-                    // Orders that make safe wait for no intent; what led to them is on the disk.
-                    4 | 6 | 7 => {
-                        let causes = records(&folder, Kind::Event).into_iter().map(|e| e["event"].clone());
-                        causes
-                            .filter(|e| ["hold", "abort", "stop", "prepared", "connected"].iter().any(|o| e == o))
-                            .count()
-                    }
-                    10 => usize::MAX,
+                    // Orders that make safe wait for no disk; what led to them comes on record as soon as it can.
+                    4 | 6 | 7 | 10 => usize::MAX,
                     _ => intents(&folder, machine).iter().filter(|(intended, _)| *intended == command).count(),
                 };
-                if on_disk < if matches!(command, 4 | 6 | 7) { 1 } else { counts[number] } {
+                if on_disk < counts[number] {
                     let times = counts[number];
                     broken.lock().unwrap().push(format!("command {command} came the {times}. time, on disk {on_disk}"));
                 }
