@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU16, Ordering};
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use super::terminal::Terminal;
 use super::{blocks, root, text_of};
@@ -15,14 +15,22 @@ use super::{blocks, root, text_of};
 /// The ports of machines and pages in the book, which are some that are free where it is typed.
 const PORTS: [&str; 2] = ["15021", "15022"];
 
-/// Returns a port at which nothing listens, and that the system gives to nobody by itself.
-fn free_port() -> String {
-    static NEXT: AtomicU16 = AtomicU16::new(0);
-    let begin = u16::try_from(std::process::id() % 20_000).unwrap();
-    loop {
-        let port = 10_000 + (begin + NEXT.fetch_add(1, Ordering::Relaxed)) % 20_000;
-        if TcpListener::bind(("127.0.0.1", port)).is_ok() {
-            return port.to_string();
+/// A port at which nothing listens, that the system gives to nobody by itself, and that is kept from other tests meanwhile.
+struct FreePort {
+    port: u16,
+    _kept: fs::File,
+}
+
+impl FreePort {
+    fn find() -> Self {
+        static NEXT: AtomicU32 = AtomicU32::new(0);
+        loop {
+            let k = std::process::id().wrapping_mul(31).wrapping_add(NEXT.fetch_add(1, Ordering::Relaxed));
+            let port = 10_000 + u16::try_from(k % 20_000).unwrap();
+            let kept = fs::File::create(std::env::temp_dir().join(format!("regrind-book-port-{port}"))).unwrap();
+            if kept.try_lock().is_ok() && TcpListener::bind(("127.0.0.1", port)).is_ok() {
+                return Self { port, _kept: kept };
+            }
         }
     }
 }
@@ -80,8 +88,10 @@ fn whole(fragment: &str, home: &Path) -> PathBuf {
 fn type_page(page: &str) {
     let home = shop();
     let mut text = text_of(page);
-    for port in PORTS.into_iter().filter(|port| text_of(page).contains(port)) {
-        text = text.replace(port, &free_port());
+    let free: Vec<(&str, FreePort)> =
+        PORTS.into_iter().filter(|port| text.contains(port)).map(|port| (port, FreePort::find())).collect();
+    for (port, FreePort { port: free, .. }) in &free {
+        text = text.replace(port, &free.to_string());
     }
     let mut terminals: BTreeMap<String, Terminal> = BTreeMap::new();
     let mut last = String::new();

@@ -5,7 +5,7 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use crate::program::PATIENCE;
 
@@ -108,6 +108,11 @@ impl Terminal {
     /// Presses Ctrl-C.
     fn interrupt(&self) {
         let typed = self.typed.as_ref().expect("a command that goes on");
+        let began = Instant::now();
+        // No person is as fast as to come before it listens.
+        while !heeds_interrupts(typed.child.id()) && began.elapsed() < PATIENCE {
+            std::thread::park_timeout(Duration::from_millis(5));
+        }
         let done = Command::new("sh").args(["-c", &format!("kill -INT {}", typed.child.id())]).status().unwrap();
         assert!(done.success());
     }
@@ -143,6 +148,15 @@ impl Drop for Terminal {
             let _ = typed.child.wait();
         }
     }
+}
+
+/// Whether a process would hear Ctrl-C; where the system does not tell, it is taken to.
+fn heeds_interrupts(id: u32) -> bool {
+    let Ok(status) = std::fs::read_to_string(format!("/proc/{id}/status")) else { return true };
+    let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:"));
+    let caught = caught.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
+    // SIGINT is signal 2.
+    caught.is_none_or(|mask| mask & 0b10 != 0)
 }
 
 /// The commands of a block: a line each, which goes on behind a backslash and within quotes.
