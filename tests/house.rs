@@ -30,8 +30,8 @@ const ARROWS: [(&str, &str, &[&str]); 21] = [
         "drive",
         "src/drive",
         &[
-            CORE[0], CORE[1], CORE[2], CORE[3], CORE[4], CORE[5], "cell", "control", "device", "formats", "journal",
-            "report",
+            CORE[0], CORE[1], CORE[2], CORE[3], CORE[4], CORE[5], CORE[6], "cell", "control", "device", "formats",
+            "journal", "report",
         ],
     ),
     (

@@ -420,8 +420,17 @@ impl Cell {
 
     fn judge(&mut self) {
         let Some(figures) = self.figures.take() else { return self.go(Held(Register)) };
-        let Judged { verdict, reason } = judge::judge(&self.plan, self.previous.as_ref(), &figures, self.passes);
+        let Judged { verdict, mut reason } = judge::judge(&self.plan, self.previous.as_ref(), &figures, self.passes);
         let response = figures.response;
+        let distance = |of: &Figures| judge::distance(&self.plan, of);
+        match &self.best {
+            Some((cycle, best)) if distance(best) < distance(&figures) && *cycle != self.cycle => {
+                if !matches!(verdict, Verdict::Accept | Verdict::Continue | Verdict::WrongResponse) {
+                    reason += &judge::best_in_words(&self.plan, *cycle, best);
+                }
+            }
+            _ => self.best = Some((self.cycle, figures.clone())),
+        }
         self.previous = Some(figures);
         self.worse = if verdict == Verdict::Diverging { self.worse + 1 } else { 0 };
         self.push(Command::Announce(Judgement { cycle: self.cycle, verdict, reason: reason.clone() }));

@@ -286,6 +286,10 @@ pub struct Figures {
     /// Root mean square of the deviations.
     #[serde(with = "super::number")]
     pub rms_mm: f64,
+    /// The figures of the part itself, which are judged: the scatter of the probe is taken off them. None in records of earlier versions,
+    /// which judged those of the points.
+    #[serde(default)]
+    pub form: Option<FormFigures>,
     /// Expanded measuring uncertainty (k = 2) of the peak to valley.
     #[serde(with = "super::number")]
     pub pv_expanded_mm: f64,
@@ -317,6 +321,54 @@ pub struct Figures {
     /// The most that was taken off anywhere since the run began; none where nobody knows.
     #[serde(default, with = "super::number::optional")]
     pub removed_mm: Option<f64>,
+}
+
+/// The figures of the form of a part.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FormFigures {
+    /// Peak to valley.
+    pub pv: Interval,
+    /// Peak to valley of all but the outermost 0.2 %.
+    pub pv_robust: Interval,
+    /// Root mean square.
+    pub rms: Interval,
+    /// How far a single point scatters (rms).
+    #[serde(with = "super::number")]
+    pub scatter_mm: f64,
+}
+
+/// What a measurement leaves possible of a figure, on record.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Interval {
+    /// As probably above as below.
+    #[serde(with = "super::number")]
+    pub median_mm: f64,
+    /// Below it with a probability of 2.5 %; 0 where the figure is known from above alone.
+    #[serde(with = "super::number")]
+    pub low_mm: f64,
+    /// Above it with a probability of 2.5 %.
+    #[serde(with = "super::number")]
+    pub high_mm: f64,
+}
+
+impl Interval {
+    /// A figure that is as uncertain to either side.
+    pub fn about(median_mm: f64, expanded_mm: f64) -> Self {
+        Self { median_mm, low_mm: median_mm - expanded_mm, high_mm: median_mm + expanded_mm }
+    }
+
+    /// Returns the expanded uncertainty: half of its width.
+    pub fn expanded_mm(&self) -> f64 {
+        0.5 * (self.high_mm - self.low_mm)
+    }
+
+    pub(super) fn is_sound(&self) -> bool {
+        let Self { median_mm, low_mm, high_mm } = *self;
+        [median_mm, low_mm, high_mm].iter().all(|v| v.is_finite())
+            && low_mm <= median_mm
+            && median_mm <= high_mm
+            && median_mm >= 0.0
+    }
 }
 
 /// What another pass is expected to leave.

@@ -1,7 +1,7 @@
 //! What follows from the figures of a cycle, and why, in words.
 
 use super::command::Verdict;
-use super::event::{Figures, Response};
+use super::event::{Figures, Interval, Response};
 use super::plan::{CellPlan, PvOf, Tolerance};
 
 /// A figure that is worse than the one before by more than this share makes a cycle worse.
@@ -28,7 +28,21 @@ impl Figures {
             self.forecast.map_or(0.0, |f| f.rms_mm + f.sigma_mm + f.floor_mm.unwrap_or(0.0)),
             self.removed_mm.unwrap_or(0.0),
         ];
-        all.iter().all(|figure| figure.is_finite() && *figure >= 0.0)
+        let form = self.form.iter().flat_map(|form| [form.pv, form.pv_robust, form.rms]);
+        all.iter().all(|figure| figure.is_finite() && *figure >= 0.0) && form.into_iter().all(|of| of.is_sound())
+    }
+
+    /// The peak to valley of all points or of most, if that was worked out, and the root mean square, as far as they are known.
+    fn known(&self, pv_of: PvOf) -> ([Interval; 2], bool) {
+        match &self.form {
+            Some(form) if pv_of == PvOf::MostPoints => ([form.pv_robust, form.rms], true),
+            Some(form) => ([form.pv, form.rms], false),
+            None => {
+                let robust = self.pv_robust_mm.filter(|_| pv_of == PvOf::MostPoints);
+                let pv = Interval::about(robust.unwrap_or(self.pv_mm), self.pv_expanded_mm);
+                ([pv, Interval::about(self.rms_mm, self.rms_expanded_mm)], robust.is_some())
+            }
+        }
     }
 }
 
@@ -44,10 +58,10 @@ pub enum Conformity {
 }
 
 impl Conformity {
-    fn of(found: f64, expanded: f64, limit: f64) -> Self {
-        if found + expanded <= limit {
+    fn of([low, high]: [f64; 2], limit: f64) -> Self {
+        if high <= limit {
             Self::Within
-        } else if found - expanded <= limit {
+        } else if low <= limit {
             Self::Undecided
         } else {
             Self::Beyond
@@ -60,10 +74,12 @@ impl Conformity {
 pub struct Compared {
     /// What the figure is called.
     pub name: &'static str,
-    /// What was found.
+    /// What was found: as probably too large as too small.
     pub found_mm: f64,
-    /// Its expanded measuring uncertainty (k = 2), whether it is counted or not.
+    /// Its expanded measuring uncertainty (k = 2), whether it is counted or not: half of what lies between the next two.
     pub expanded_mm: f64,
+    /// The least and the most that it may be, with 95 %; whether they are counted or not.
+    pub between_mm: [f64; 2],
     /// The largest that is accepted; infinite where it is not limited.
     pub limit_mm: f64,
     /// What follows, with the uncertainty where the tolerance counts it.
@@ -73,16 +89,14 @@ pub struct Compared {
 impl Tolerance {
     /// Compares the two figures that are judged with their limits: the peak to valley of the points that it is taken of, and the RMS.
     pub fn compare(&self, figures: &Figures) -> [Compared; 2] {
-        let robust = figures.pv_robust_mm.filter(|_| self.pv_of == PvOf::MostPoints);
-        let pv_name = if robust.is_some() { "PV 99.8 %" } else { "PV" };
-        let compared = |name, found_mm, expanded_mm, limit_mm| {
-            let counted = if self.with_uncertainty { expanded_mm } else { 0.0 };
-            Compared { name, found_mm, expanded_mm, limit_mm, conformity: Conformity::of(found_mm, counted, limit_mm) }
+        let ([pv, rms], is_robust) = figures.known(self.pv_of);
+        let compared = |name, of: Interval, limit_mm| {
+            let between_mm = [of.low_mm, of.high_mm];
+            let counted = if self.with_uncertainty { between_mm } else { [of.median_mm; 2] };
+            let conformity = Conformity::of(counted, limit_mm);
+            Compared { name, found_mm: of.median_mm, expanded_mm: of.expanded_mm(), between_mm, limit_mm, conformity }
         };
-        [
-            compared(pv_name, robust.unwrap_or(figures.pv_mm), figures.pv_expanded_mm, self.pv_mm),
-            compared("RMS", figures.rms_mm, figures.rms_expanded_mm, self.rms_mm),
-        ]
+        [compared(if is_robust { "PV 99.8 %" } else { "PV" }, pv, self.pv_mm), compared("RMS", rms, self.rms_mm)]
     }
 }
 
@@ -113,8 +127,9 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
         return tell(Verdict::WrongResponse, format!("{message}; {figures}"));
     }
     if let Some(before) = before {
-        let was = format!("before: PV {}, RMS {}", um(judged_pv(plan, before)), um(before.rms_mm));
-        if judged_pv(plan, now) > WORSE * judged_pv(plan, before) || now.rms_mm > WORSE * before.rms_mm {
+        let [[pv, rms], [pv_before, rms_before]] = [now, before].map(|of| judged(plan, of));
+        let was = format!("before: PV {}, RMS {}", um(pv_before), um(rms_before));
+        if pv > WORSE * pv_before || rms > WORSE * rms_before {
             return tell(Verdict::Diverging, format!("worse than the cycle before: {figures}; {was}"));
         }
         if has_stalled(plan, before, now) {
@@ -141,7 +156,10 @@ fn go_on(plan: &CellPlan, before: Option<&Figures>, now: &Figures, conformity: C
     let (expected, sigma) = (um(forecast.rms_mm), um(forecast.sigma_mm));
     let floor = forecast.floor_mm.map_or(String::new(), |floor| format!(", no pass can go below {}", um(floor)));
     let expected = format!("RMS {expected} ± {sigma} is expected of another pass{floor}");
-    if now.rms_mm - forecast.rms_mm > plan.stall_mm.max(plan.stall_share * now.rms_mm) {
+    let [_, rms] = plan.tolerance.compare(now);
+    // What the floor is known to as well as what was found is not gone below by another pass.
+    let at_floor = forecast.floor_mm.is_some_and(|floor| rms.found_mm <= floor + rms.expanded_mm);
+    if !at_floor && rms.found_mm - forecast.rms_mm > plan.stall_mm.max(plan.stall_share * rms.found_mm) {
         return tell(Verdict::Continue, format!("{so_far}: {figures}; {expected}"));
     }
     let verdict = if undecided { Verdict::Undecided } else { Verdict::Stalled };
@@ -154,15 +172,33 @@ fn conformity(plan: &CellPlan, now: &Figures) -> Conformity {
     pv.conformity.max(rms.conformity)
 }
 
-/// The peak to valley that is judged: of all points, or of all but the outermost.
-fn judged_pv(plan: &CellPlan, figures: &Figures) -> f64 {
-    plan.tolerance.compare(figures)[0].found_mm
+/// The two figures that are judged.
+fn judged(plan: &CellPlan, figures: &Figures) -> [f64; 2] {
+    plan.tolerance.compare(figures).map(|compared| compared.found_mm)
 }
 
 fn has_stalled(plan: &CellPlan, before: &Figures, now: &Figures) -> bool {
     let still = |was: f64, is: f64, least: f64| was - is < least.max(plan.stall_share * was);
-    still(judged_pv(plan, before), judged_pv(plan, now), now.pv_expanded_mm)
-        && still(before.rms_mm, now.rms_mm, now.rms_expanded_mm.max(plan.stall_mm))
+    let [pv, rms] = plan.tolerance.compare(now);
+    let [pv_before, rms_before] = judged(plan, before);
+    still(pv_before, pv.found_mm, pv.expanded_mm) && still(rms_before, rms.found_mm, rms.expanded_mm.max(plan.stall_mm))
+}
+
+/// How far figures are from what is accepted: the larger of the two as a share of its limit; the RMS where there is none.
+pub(super) fn distance(plan: &CellPlan, figures: &Figures) -> f64 {
+    let compared = plan.tolerance.compare(figures);
+    let shares = compared.iter().filter(|of| of.limit_mm.is_finite() && of.limit_mm > 0.0);
+    shares.map(|of| of.found_mm / of.limit_mm).reduce(f64::max).unwrap_or(compared[1].found_mm)
+}
+
+/// Names a cycle that was better than the last one.
+pub(super) fn best_in_words(plan: &CellPlan, cycle: u32, figures: &Figures) -> String {
+    let [pv, rms] = judged(plan, figures);
+    format!(
+        "; the best was cycle {cycle} with PV {} and RMS {}: its correction and its map are in cycle-{cycle}",
+        um(pv),
+        um(rms)
+    )
 }
 
 /// Says what a wrong response means.

@@ -31,8 +31,8 @@ mod table;
 pub use alarm::{Alarm, AlarmId, Role};
 pub use command::{Command, Ending, Judgement, Verdict};
 pub use event::{
-    Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Forecast, Gate, GateFailure,
-    JobResult, Mismatch, Occupation, Reconciliation, RecordFailure, Response,
+    Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Forecast, FormFigures, Gate,
+    GateFailure, Interval, JobResult, Mismatch, Occupation, Reconciliation, RecordFailure, Response,
 };
 pub use judge::{Compared, Conformity};
 pub use memory::Cell;

@@ -55,6 +55,8 @@ pub struct Cell {
     /// The figures of this cycle, and of the last one that was judged.
     pub(super) figures: Option<Figures>,
     pub(super) previous: Option<Figures>,
+    /// The cycle that came nearest to what is accepted, and its figures.
+    pub(super) best: Option<(u32, Figures)>,
     /// Cycles in a row that were worse than the one before.
     pub(super) worse: u32,
     /// How the run ends when the state that leads to the end is over.
@@ -91,6 +93,7 @@ impl Cell {
             raised: BTreeMap::new(),
             figures: None,
             previous: None,
+            best: None,
             worse: 0,
             reason: String::new(),
             judged_out: false,

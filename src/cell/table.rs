@@ -16,7 +16,7 @@ use super::state::{Device, Phase, State};
 
 /// The version of the table. A run is gone on with by a program of the version that began it only; a change of what follows from
 /// anything is another version.
-pub const TABLE_VERSION: u32 = 3;
+pub const TABLE_VERSION: u32 = 4;
 
 /// What an event does in a state.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -227,6 +227,7 @@ fn sample_figures() -> Vec<Figures> {
         pv_mm: 0.030,
         pv_robust_mm: None,
         rms_mm: 0.006,
+        form: None,
         pv_expanded_mm: 0.0005,
         rms_expanded_mm: 0.0001,
         coverage: 0.99,

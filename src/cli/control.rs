@@ -184,8 +184,8 @@ fn told(status: &Snapshot, folder: &Path) -> String {
     let _ = writeln!(text, "part     {}{serial}, run {}", status.part, folder.display());
     if let Some(tolerance) = status.tolerance.filter(|_| !status.cycles.is_empty()) {
         let _ = writeln!(text, "limits   {}", limits(&tolerance));
-        for CycleRow { cycle, pv_um, judged_pv_um, rms_um, .. } in &status.cycles {
-            let (pv, pv_um) = (pv_name(&tolerance), judged_pv_um.unwrap_or(*pv_um));
+        for row in &status.cycles {
+            let (CycleRow { cycle, .. }, pv, [pv_um, rms_um]) = (row, pv_name(&tolerance), row.judged_um());
             let _ = writeln!(text, "cycle {cycle:<2} {pv} {pv_um:.2} um, RMS {rms_um:.3} um");
         }
     }

@@ -9,7 +9,7 @@ use regrind::formats::{
     save_form, save_registration,
 };
 use regrind::geometry::Pose;
-use regrind::model::{Form, Interval};
+use regrind::model::{Form, Given, Interval};
 use regrind::registration::{Coordinate, Loss, Method, Options, ProbeSide, Start, register};
 use regrind::surface::{Distance, Nominal, NominalKind, Projection};
 
@@ -84,7 +84,7 @@ Writes into the folder:
 with --model also
   model.json                  PV and RMS of the form with 95 % intervals, the scatter of the probe taken off; how
                               well the place of the nominal frame is known beside a form that nobody knows
-  form.csv                    the form at each measured point, and its standard uncertainty, in mm
+  form.csv                    the form at each point that was used, and its standard uncertainty, in mm
 
 `covariance` is 6 x 6 in the order [translation; rotation] of the twist, in mm and rad: of the small motion in
 the model frame that takes the true pose to the one found. Directions that are locked or held have no variance.
@@ -105,9 +105,13 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let document = RegistrationDocument::new(&registration, &options, nominal_file, &arguments.measured);
     document.check().map_err(|what| Failure::NotFinite { what })?;
     save_registration(folder.path(), &document, &registration.deviations).map_err(Failure::NotSaved)?;
-    let form = if arguments.model { Some(Form::of(&registration, None).map_err(Failure::NoModel)?) } else { None };
+    let form = if arguments.model {
+        Some(Form::of(&registration, &Given::default()).map_err(Failure::NoModel)?)
+    } else {
+        None
+    };
     if let Some(form) = &form {
-        save_form(folder.path(), form, &registration).map_err(Failure::NotSaved)?;
+        save_form(folder.path(), form, &registration, None).map_err(Failure::NotSaved)?;
     }
     if arguments.json {
         super::print_json(&document)?;

@@ -176,14 +176,15 @@ impl Show {
     }
 
     fn figures(&mut self, cycle: u32, figures: &Figures) -> Result<(), Failure> {
-        let [pv, rms] = self.tolerance.compare(figures).map(|compared| judged(&compared));
+        let compared = self.tolerance.compare(figures);
+        let [pv, rms] = compared.map(|compared| judged(&compared));
         let (points, outliers) = (figures.points, figures.outliers);
         let mut text = format!("cycle {cycle}: {pv}, {rms}; {points} points, {outliers} outliers");
         for words in figures.weak_directions.iter().chain(&figures.warnings) {
             let _ = write!(text, "\n         {words}");
         }
         self.line(&text)?;
-        self.rms_mm.push(figures.rms_mm);
+        self.rms_mm.push(compared[1].found_mm);
         self.picture(cycle)
     }
 
@@ -219,8 +220,8 @@ impl Show {
             let _ = writeln!(text, "\ncycle {pv:>13}   RMS um   points  outliers  level um");
         }
         for row in cycles {
-            let CycleRow { cycle, pv_um, judged_pv_um, rms_um, points, outliers, level_um } = row;
-            let pv_um = judged_pv_um.unwrap_or(*pv_um);
+            let CycleRow { cycle, points, outliers, level_um, .. } = row;
+            let [pv_um, rms_um] = row.judged_um();
             let _ = writeln!(text, "{cycle:>5} {pv_um:>13.2} {rms_um:>8.3} {points:>8} {outliers:>9} {level_um:>9.1}");
         }
         let marked = if self.simulated { "SIMULATION  " } else { "" };

@@ -222,10 +222,10 @@ impl View {
     fn figures(&self) -> Paragraph<'_> {
         let Some(tolerance) = self.seen.tolerance else { return Paragraph::default() };
         let row = |row: &CycleRow| {
-            let CycleRow { cycle, pv_um, judged_pv_um, rms_um, .. } = row;
-            Line::from(format!("{cycle:>5} {:>12.2} {rms_um:>8.3}", judged_pv_um.unwrap_or(*pv_um)))
+            let (cycle, [pv_um, rms_um]) = (row.cycle, row.judged_um());
+            Line::from(format!("{cycle:>5} {pv_um:>12.2} {rms_um:>8.3}"))
         };
-        let falls = sparkline(self.seen.cycles.iter().map(|row| row.rms_um));
+        let falls = sparkline(self.seen.cycles.iter().map(|row| row.judged_um()[1]));
         let head = Line::from(format!("cycle {:>12} {:>8}", pv_name(&tolerance), "RMS um"));
         let lines = [Line::from(limits(&tolerance)), head.dim()].into_iter().chain(self.seen.cycles.iter().map(row));
         Paragraph::new(lines.chain([Line::from(falls).cyan()]).collect::<Vec<_>>()).wrap(Wrap { trim: false })

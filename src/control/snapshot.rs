@@ -147,12 +147,23 @@ pub struct CycleRow {
     pub cycle: u32,
     /// Of all points that were used.
     pub pv_um: f64,
-    /// Of the points that it is judged by.
+    /// As it is judged.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub judged_pv_um: Option<f64>,
+    /// Of all points that were used.
     pub rms_um: f64,
+    /// As it is judged.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub judged_rms_um: Option<f64>,
     pub points: u32,
     pub outliers: u32,
     /// Height of the surface that was wanted over the nominal one.
     pub level_um: f64,
+}
+
+impl CycleRow {
+    /// Returns PV and RMS as they are judged; those of the points where nobody said which.
+    pub fn judged_um(&self) -> [f64; 2] {
+        [self.judged_pv_um.unwrap_or(self.pv_um), self.judged_rms_um.unwrap_or(self.rms_um)]
+    }
 }

@@ -74,11 +74,13 @@ impl Cycles {
     pub(super) fn rows(&self, tolerance: &Tolerance) -> Vec<CycleRow> {
         let rows = self.0.iter().filter_map(|(&cycle, c)| {
             let figures = c.figures.as_ref()?;
+            let [judged_pv_um, judged_rms_um] = tolerance.compare(figures).map(|of| Some(1e3 * of.found_mm));
             Some(CycleRow {
                 cycle,
                 pv_um: 1e3 * figures.pv_mm,
-                judged_pv_um: Some(1e3 * tolerance.compare(figures)[0].found_mm),
+                judged_pv_um,
                 rms_um: 1e3 * figures.rms_mm,
+                judged_rms_um,
                 points: figures.points,
                 outliers: figures.outliers,
                 level_um: 1e3 * c.correction.level_mm,

@@ -11,6 +11,7 @@ use crate::formats::gcode::GcodeError;
 use crate::formats::{CorrectionIdentities, FormatError, Learned, ResultFolder, write_correction};
 use crate::geometry::{Grid, Point, Pose, Sample};
 use crate::measuring::{self, sphere_targets};
+use crate::model::Form;
 use crate::registration::{
     Deviation, MapLimits, Method, Options, PointStatus, Registration, RegistrationError, Start, register,
 };
@@ -105,6 +106,7 @@ pub(super) struct Cycle {
     pub(super) plan: Option<Arc<Plan>>,
     pub(super) points: Option<Arc<Points>>,
     pub(super) registration: Option<Arc<Registration>>,
+    pub(super) form: Option<Arc<Form>>,
     pub(super) error: Option<Arc<ErrorMap>>,
     /// What is known of the grinder with this cycle taken in.
     pub(super) known: Option<Arc<LearningState>>,
@@ -121,6 +123,7 @@ impl Cycle {
             plan: None,
             points: None,
             registration: None,
+            form: None,
             error: None,
             known: None,
             figures: None,
@@ -137,8 +140,9 @@ impl Cycle {
         match product {
             Product::Points(points) => self.points = Some(Arc::new(points)),
             Product::Registered(found) => {
-                let Registered { registration, error, known, figures } = *found;
+                let Registered { registration, form, error, known, figures } = *found;
                 self.registration = Some(Arc::new(registration));
+                self.form = form.map(Arc::new);
                 self.error = error.map(Arc::new);
                 self.known = known.map(Arc::new);
                 self.figures = Some(figures);
@@ -160,6 +164,8 @@ pub(super) enum Product {
 /// What a registration gives besides its event.
 pub(super) struct Registered {
     pub(super) registration: Registration,
+    /// What the model of the error says of it; none where it can say nothing.
+    pub(super) form: Option<Form>,
     pub(super) error: Option<ErrorMap>,
     pub(super) known: Option<LearningState>,
     pub(super) figures: Figures,

@@ -7,16 +7,20 @@ use std::borrow::Cow;
 use std::path::Path;
 use std::sync::Arc;
 
-use crate::cell::{CompensationRefusal, CompensationSummary, Event, Figures, Forecast, Gate, GateFailure, Response};
+use crate::cell::{
+    CompensationRefusal, CompensationSummary, Event, Figures, Forecast, FormFigures, Gate, GateFailure, Interval,
+    Response,
+};
 use crate::compensation::{self, Correction, ErrorMap, LearningState, NextPassError, Seen, Sense, error_map, response};
 use crate::device::{Coordinates, Identified, Measurement, Plan, PointStatus, TargetKind};
 use crate::form::pv_of_most;
 use crate::formats::{
-    FormatError, Learned, NominalInput, RegistrationDocument, ResultFolder, save_registration, write_points,
+    FormatError, Learned, NominalInput, RegistrationDocument, ResultFolder, save_form, save_registration, write_points,
 };
 use crate::geometry::{Point, Vector};
 use crate::measuring::fit_sphere;
-use crate::registration::{Options, PointStatus as Fate, Registration, weak_for_compensation};
+use crate::model::{self, Form, Given};
+use crate::registration::{Options, PointStatus as Fate, Registration, Verdict, weak_for_compensation};
 
 use super::maps;
 use super::record::{Files, Unfinished, unfinished};
@@ -198,6 +202,13 @@ fn registered(
     let (mut found, options) = task.register(&points.part, probe_radius_mm).map_err(unfinished)?;
     found.allow_for_radius(points.radius_sigma_mm);
     save(task, files, &found, &options).map_err(unfinished)?;
+    let form = Form::of(&found, &Given { priors: None, radius_sigma_mm: points.radius_sigma_mm });
+    if let Ok(form) = &form {
+        for name in ["form.csv", "model.json"] {
+            files.place(name);
+        }
+        save_form(files.folder(), form, &found, Some(task.simulation)).map_err(unfinished)?;
+    }
     let error = error_map(&readings(&found), &task.map).ok();
     maps::save_figures(task, files, error.as_ref(), &found).map_err(unfinished)?;
     let offered = maps::parameters(task, files, &found).map_err(unfinished)?;
@@ -206,9 +217,13 @@ fn registered(
     let answer = error.as_ref().and_then(|error| answer(before?, cycle, &found, error));
     let known = error.as_ref().map(|error| learned_from(task, cycle, before, error, answer));
     let forecast = known.as_ref().zip(error.as_ref()).map(|(known, error)| known.forecast(error));
-    let mut figures = figures(task, cycle, &found, error.as_ref(), answer, forecast);
+    let mut figures = figures(task, cycle, &found, form.as_ref().ok(), error.as_ref(), answer, forecast);
     figures.warnings.extend(error.iter().flat_map(|map| map.advice.iter().cloned()).chain(offered));
-    Ok(Registered { registration: found, error, known, figures })
+    let untold = |error| {
+        format!("form and scatter of the probe could not be told apart, so U is less than it should be: {error}")
+    };
+    figures.warnings.extend(form.as_ref().err().map(untold));
+    Ok(Registered { registration: found, form: form.ok(), error, known, figures })
 }
 
 /// Takes a measured pass into what is known of the grinder.
@@ -241,6 +256,7 @@ fn figures(
     task: &Task,
     cycle: &Cycle,
     found: &Registration,
+    form: Option<&Form>,
     error: Option<&ErrorMap>,
     answer: Option<compensation::Response>,
     forecast: Option<compensation::Forecast>,
@@ -249,16 +265,27 @@ fn figures(
     let moved = task.fixture_cmm_from_model.inverse() * found.cmm_from_model;
     let outliers = found.deviations.iter().filter(|d| d.status == Fate::Outlier).count() as u32;
     // What the filter takes out is what a point scatters by: noise of the probe and the finest texture.
-    let scatter_mm = error.map_or(verdict.residual_sigma_mm, |map| map.point_sigma_mm);
-    let points = verdict.used.max(1) as f64;
+    let filtered_mm = error.map_or(verdict.residual_sigma_mm, |map| map.point_sigma_mm);
+    let scatter_mm = form.map_or(filtered_mm, |form| form.hyper.scatter_mm);
+    let pv_robust_mm = pv_of_most(used(found).map(|d| d.deviation_mm));
+    // Of two extreme points, each uncertain by the scatter; k = 2.
+    let pv_expanded_mm = 2.0 * 2f64.sqrt() * scatter_mm;
+    let by_points = FormFigures {
+        pv: Interval::about(verdict.pv_mm, pv_expanded_mm),
+        pv_robust: Interval::about(pv_robust_mm.unwrap_or(verdict.pv_mm), pv_expanded_mm),
+        rms: rms_without(scatter_mm, verdict),
+        scatter_mm,
+    };
+    let told = form.map_or(by_points, |form| form_figures(&form.figures, scatter_mm));
+    // What is expected is told of the same figure: what the filter leaves has the scatter of the probe in it, and the part has not.
+    let bare = |mm: f64| without(scatter_mm, mm);
     Figures {
         pv_mm: verdict.pv_mm,
-        pv_robust_mm: pv_of_most(used(found).map(|d| d.deviation_mm)),
+        pv_robust_mm,
         rms_mm: verdict.rms_mm,
-        // Of two extreme points, each uncertain by the scatter; k = 2.
-        pv_expanded_mm: 2.0 * 2f64.sqrt() * scatter_mm,
-        // The rms of n values that scatter by s is uncertain by s / sqrt(2 n), whatever their form; k = 2.
-        rms_expanded_mm: 2.0 * scatter_mm / (2.0 * points).sqrt(),
+        form: Some(told),
+        pv_expanded_mm,
+        rms_expanded_mm: by_points.rms.expanded_mm(),
         coverage: verdict.coverage,
         points: verdict.used as u32,
         outliers,
@@ -267,8 +294,38 @@ fn figures(
         weak_directions: verdict.weak_directions.iter().map(|w| w.words.clone()).collect(),
         warnings: verdict.warnings.clone(),
         response: answer.map(|answer| in_words_of_the_cell(answer.sense)),
-        forecast: forecast.map(|f| Forecast { rms_mm: f.rms_mm, sigma_mm: f.sigma_mm, floor_mm: f.floor_mm }),
+        forecast: forecast.map(|f| Forecast {
+            rms_mm: bare(f.rms_mm),
+            sigma_mm: f.sigma_mm,
+            floor_mm: f.floor_mm.map(bare),
+        }),
         removed_mm: Some(task.limits.allowance_mm - cycle.correction.level_mm),
+    }
+}
+
+/// What is left of an rms when that of something independent is taken off.
+fn without(scatter_mm: f64, rms_mm: f64) -> f64 {
+    (rms_mm * rms_mm - scatter_mm * scatter_mm).max(0.0).sqrt()
+}
+
+/// What the model tells, in the words of the cell.
+fn form_figures(of: &model::FormFigures, scatter_mm: f64) -> FormFigures {
+    let interval = |of: model::Interval| Interval { median_mm: of.median_mm, low_mm: of.low_mm, high_mm: of.high_mm };
+    FormFigures { pv: interval(of.pv), pv_robust: interval(of.pv_most_points), rms: interval(of.rms), scatter_mm }
+}
+
+/// The root mean square without the scatter s of n points, of which the registration took p: F^2 = RMS^2 - s^2 (1 - p/n), which is uncertain by
+/// u^2(F^2) = 4 F^2 s^2 / n + 2 s^4 / n; k = 2.
+fn rms_without(scatter_mm: f64, verdict: &Verdict) -> Interval {
+    const MOTIONS: f64 = 6.0;
+    let n = (verdict.used as f64).max(MOTIONS + 1.0);
+    let scatter2 = scatter_mm * scatter_mm;
+    let form2 = (verdict.rms_mm.powi(2) - scatter2 * (1.0 - MOTIONS / n)).max(0.0);
+    let expanded2 = 2.0 * ((4.0 * form2 * scatter2 + 2.0 * scatter2 * scatter2) / n).sqrt();
+    Interval {
+        median_mm: form2.sqrt(),
+        low_mm: (form2 - expanded2).max(0.0).sqrt(),
+        high_mm: (form2 + expanded2).sqrt(),
     }
 }
 
@@ -308,7 +365,8 @@ fn compensated(
     let found =
         cycle.registration.as_ref().ok_or_else(|| failed(&"the measurement of this cycle is not registered"))?;
     // Where the part may slide in its own surface, nobody knows where on the part a map would be ground in.
-    if let Some(why) = weak_for_compensation(found, &task.place) {
+    let covariance = cycle.form.as_ref().map_or(&found.verdict.covariance, |form| &form.frame_covariance);
+    if let Some(why) = weak_for_compensation(found, covariance, &task.place) {
         return Err(Unfinished::For(CompensationRefusal::WeakDirections(vec![why])));
     }
     let map = match &cycle.error {
@@ -333,13 +391,16 @@ fn compensated(
         Unfinished::NotSaved(why) => Unfinished::NotSaved(why),
     })?;
     let largest_mm = step.correction.values_mm.iter().fold(0.0f64, |most, v| most.max(v.abs()));
-    let ratio = found.verdict.pv_mm / found.verdict.rms_mm.max(f64::MIN_POSITIVE);
-    let forecast = known.forecast(&map);
+    let told = cycle.figures.as_ref().and_then(|figures| figures.form);
+    let [pv_mm, rms_mm, scatter_mm] = told.map_or([found.verdict.pv_mm, found.verdict.rms_mm, 0.0], |form| {
+        [form.pv_robust.median_mm, form.rms.median_mm, form.scatter_mm]
+    });
+    let expected_mm = without(scatter_mm, known.forecast(&map).rms_mm);
     let summary = CompensationSummary {
         largest_mm,
         depth_mm: step.depth_mm,
-        predicted_pv_mm: forecast.rms_mm * ratio,
-        predicted_rms_mm: forecast.rms_mm,
+        predicted_pv_mm: expected_mm * pv_mm / rms_mm.max(f64::MIN_POSITIVE),
+        predicted_rms_mm: expected_mm,
         air_share: step.air_share,
         gains: known.gains(),
         response: known.response()[0],

@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::document::StandardUncertainty;
 use super::error::FormatError;
 use super::registration::{write_json_atomic, write_rows};
-use regrind_core::model::{Form, Interval};
+use regrind_core::model::{Form, FormPoint, Interval};
 use regrind_core::registration::Registration;
 
 /// The columns of `form.csv`.
@@ -16,10 +16,15 @@ const FORM_HEADER: &str = "x_mm,y_mm,form_mm,sigma_mm";
 /// `model.json`. Lengths in millimetres.
 #[derive(Serialize)]
 struct FormDocument {
+    /// Whether the part is one of a simulated cell; absent where nobody says.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    simulation: Option<bool>,
     /// Standard deviation and range of the form, and scatter of a single point.
     form_sigma_mm: f64,
     form_range_mm: f64,
     scatter_mm: f64,
+    /// Whether a form shows at all; where it does not, the figures are known from above alone.
+    form_is_seen: bool,
     /// Figures of the form after its own best fit: median, and the interval that holds it with 95 %.
     rms: Interval,
     pv: Interval,
@@ -32,17 +37,24 @@ struct FormDocument {
     frame_covariance: [[f64; 6]; 6],
 }
 
-/// Writes `model.json`, and `form.csv` with a row a measured point in the order given.
+/// Writes `model.json`, and `form.csv` with a row a measured point that was used, in the order given.
 ///
 /// # Errors
 /// A folder that cannot be written.
-pub fn save_form(folder: &Path, form: &Form, registration: &Registration) -> Result<(), FormatError> {
+pub fn save_form(
+    folder: &Path,
+    form: &Form,
+    registration: &Registration,
+    simulation: Option<bool>,
+) -> Result<(), FormatError> {
     let covariance = form.frame_covariance;
     let sigma = |k: usize| covariance[(k, k)].max(0.0).sqrt();
     let document = FormDocument {
+        simulation,
         form_sigma_mm: form.hyper.field.sigma_mm,
         form_range_mm: form.hyper.field.range_mm,
         scatter_mm: form.hyper.scatter_mm,
+        form_is_seen: form.is_seen,
         rms: form.figures.rms,
         pv: form.figures.pv,
         pv_99_8: form.figures.pv_most_points,
@@ -59,11 +71,7 @@ pub fn save_form(folder: &Path, form: &Form, registration: &Registration) -> Res
         frame_covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),
     };
     write_json_atomic(folder.join("model.json"), &document)?;
-    let rows: Vec<[f64; 4]> = registration
-        .deviations
-        .iter()
-        .zip(&form.points)
-        .map(|(at, told)| [at.point.x, at.point.y, told.mean_mm, told.sigma_mm])
-        .collect();
+    let row = |of: &FormPoint| [of.at_mm[0], of.at_mm[1], of.form.mean_mm, of.form.sigma_mm];
+    let rows: Vec<[f64; 4]> = form.points.iter().map(row).collect();
     write_rows(&folder.join("form.csv"), FORM_HEADER, &rows, |row| (*row, None))
 }

@@ -209,15 +209,15 @@ pub struct RegistrationSettings {
 #[derive(Clone, Debug, Deserialize, JsonSchema, PartialEq)]
 #[serde(default, deny_unknown_fields)]
 pub struct Acceptance {
-    /// Largest peak to valley of the deviations.
+    /// Largest peak to valley of the form.
     #[schemars(range(min = 0.001, max = 100000.0))]
     pub pv_um: Option<Um>,
     /// Which points the peak to valley is taken of.
     pub pv_of: PvOf,
-    /// Largest rms of the deviations.
+    /// Largest rms of the form.
     #[schemars(range(min = 0.001, max = 100000.0))]
     pub rms_um: Option<Um>,
-    /// Whether the expanded uncertainty (k = 2) is added before the comparison.
+    /// Whether a figure must be within its limit with a probability of 97.5 %; else the most probable value is held against it.
     pub expanded_uncertainty: bool,
 }
 

@@ -181,7 +181,7 @@ impl Measured {
 
 fn decision_rule(tolerance: &Tolerance) -> &'static str {
     if tolerance.with_uncertainty {
-        "ISO 14253-1: within where figure and expanded uncertainty (k = 2) together do not exceed the limit"
+        "ISO 14253-1, JCGM 106: within where the figure does not exceed the limit with a probability of 97.5 %"
     } else {
         "the figure by itself is held against its limit"
     }
@@ -190,8 +190,10 @@ fn decision_rule(tolerance: &Tolerance) -> &'static str {
 /// The figures that are judged first, then the peak to valley of all points where another is judged.
 fn figures_of(figures: &Figures, tolerance: Option<&Tolerance>, judged: bool) -> Vec<Figure> {
     let compared = tolerance.map(|tolerance| tolerance.compare(figures));
+    // What is judged is the form; that of the points, with the scatter of the probe in it, stands beside it.
+    let of_form = figures.form.is_some();
     let all_points = Figure {
-        kind: Kind { name: "PV", what: PV, limit_mm: None },
+        kind: Kind { name: if of_form { "PV as measured" } else { "PV" }, what: PV, limit_mm: None },
         found_mm: figures.pv_mm,
         expanded_mm: figures.pv_expanded_mm,
         standing: Standing::NotJudged,
@@ -201,7 +203,7 @@ fn figures_of(figures: &Figures, tolerance: Option<&Tolerance>, judged: bool) ->
         let (found_mm, expanded_mm) = (figures.rms_mm, figures.rms_expanded_mm);
         return vec![all_points, Figure { kind, found_mm, expanded_mm, standing: Standing::NotJudged }];
     };
-    let of_all = compared[0].name == "PV";
+    let of_all = !of_form && compared[0].name == "PV";
     let mut list: Vec<Figure> = compared
         .into_iter()
         .map(|compared| {
@@ -213,7 +215,7 @@ fn figures_of(figures: &Figures, tolerance: Option<&Tolerance>, judged: bool) ->
                 Conformity::Beyond => Standing::Beyond,
             };
             Figure {
-                kind: Kind { name: compared.name, what: what_of(compared.name), limit_mm },
+                kind: Kind { name: compared.name, what: what_of(compared.name, of_form), limit_mm },
                 found_mm: compared.found_mm,
                 expanded_mm: compared.expanded_mm,
                 standing,
@@ -229,13 +231,23 @@ fn figures_of(figures: &Figures, tolerance: Option<&Tolerance>, judged: bool) ->
 const PV: &str = "largest less least deviation from the nominal surface along its normal, all points";
 const RMS: &str = "root mean square of the deviations from the nominal surface along its normal";
 
-fn what_of(name: &str) -> &'static str {
-    match name {
-        "RMS" => RMS,
-        "PV" => PV,
-        _ => {
-            "largest less least deviation from the nominal surface along its normal, without the outermost 0.1 % at either end"
-        }
+const FORM_PV: &str = "largest less least deviation of the form from the nominal surface along its normal, after its best fit, the scatter of \
+                       the probe taken off";
+const FORM_MOST: &str = "largest less least deviation of the form from the nominal surface along its normal, after its best fit, the scatter of \
+                         the probe taken off, without the outermost 0.1 % at either end";
+const FORM_RMS: &str = "root mean square of the deviations of the form from the nominal surface along its normal, after its best fit, the scatter \
+                        of the probe taken off";
+const MOST: &str =
+    "largest less least deviation from the nominal surface along its normal, without the outermost 0.1 % at either end";
+
+fn what_of(name: &str, of_form: bool) -> &'static str {
+    match (name, of_form) {
+        ("RMS", false) => RMS,
+        ("RMS", true) => FORM_RMS,
+        ("PV", false) => PV,
+        ("PV", true) => FORM_PV,
+        (_, false) => MOST,
+        (_, true) => FORM_MOST,
     }
 }
 

@@ -115,17 +115,19 @@ fn judged(story: &Story) -> String {
     let judged = if of.judgements.is_empty() { "measured and not judged" } else { "judged" };
     let mut html = format!(
         "<table id=\"judged\">\n<tr><th>{judged}, cycle {cycle}</th><th class=\"n\">found, \u{b5}m</th>\
-         <th class=\"n\">U (k = 2), \u{b5}m</th><th class=\"n\">limit, \u{b5}m</th><th></th></tr>\n"
+         <th class=\"n\">U (k = 2), \u{b5}m</th><th class=\"n\">95 % between, \u{b5}m</th><th class=\"n\">limit, \u{b5}m</th><th></th></tr>\n"
     );
     for compared in tolerance.compare(figures) {
-        let Compared { name, found_mm, expanded_mm, limit_mm, .. } = compared;
+        let Compared { name, found_mm, expanded_mm, between_mm: [low_mm, high_mm], limit_mm, .. } = compared;
         let limit = if limit_mm.is_finite() { um(limit_mm) } else { "no limit".to_owned() };
         let _ = writeln!(
             html,
             "<tr><td>{name}</td><td class=\"n\"><strong>{}</strong></td><td class=\"n\">\u{b1} {}</td>\
-             <td class=\"n\">{limit}</td><td>{}</td></tr>",
+             <td class=\"n\">{} to {}</td><td class=\"n\">{limit}</td><td>{}</td></tr>",
             um(found_mm),
             um(expanded_mm),
+            um(low_mm),
+            um(high_mm),
             comparison(&compared, tolerance.with_uncertainty)
         );
     }
@@ -138,7 +140,7 @@ fn um(mm: f64) -> String {
 
 /// How a figure lies beside its limit, reckoned before the reader's eyes.
 fn comparison(compared: &Compared, with_uncertainty: bool) -> String {
-    let Compared { found_mm, expanded_mm, limit_mm, conformity, .. } = *compared;
+    let Compared { found_mm, between_mm: [low_mm, high_mm], limit_mm, conformity, .. } = *compared;
     if !limit_mm.is_finite() {
         return String::new();
     }
@@ -147,41 +149,35 @@ fn comparison(compared: &Compared, with_uncertainty: bool) -> String {
         Conformity::Undecided => "not decided",
         Conformity::Beyond => "beyond the limit",
     };
-    let reckoned = |sign: &str, value: f64, sum: f64| {
-        let is = if sum <= limit_mm { "\u{2264}" } else { "&gt;" };
+    let beside = |what: &str, value: f64| {
+        let is = if value <= limit_mm { "\u{2264}" } else { "&gt;" };
         // Two numbers that differ are not shown as the same.
-        let alike = um(sum) == um(limit_mm) && sum != limit_mm;
+        let alike = um(value) == um(limit_mm) && value != limit_mm;
         let digits = if alike { 5 } else { 2 };
-        let [found, value, sum, limit] = [found_mm, value, sum, limit_mm].map(|mm| format!("{:.digits$}", 1e3 * mm));
-        if sign.is_empty() {
-            format!("{found} {is} {limit}")
-        } else {
-            format!("{found} {sign} {value} = {sum} {is} {limit}")
-        }
+        let [value, limit] = [value, limit_mm].map(|mm| format!("{:.digits$}", 1e3 * mm));
+        format!("{what}{value} {is} {limit}")
     };
-    let (above, below) = (found_mm + expanded_mm, found_mm - expanded_mm);
     let sums = match (with_uncertainty, conformity) {
-        (false, _) => reckoned("", 0.0, found_mm),
-        (true, Conformity::Within) => reckoned("+", expanded_mm, above),
-        (true, Conformity::Beyond) => reckoned("\u{2212}", expanded_mm, below),
-        (true, Conformity::Undecided) => {
-            format!("{}, {}", reckoned("+", expanded_mm, above), reckoned("\u{2212}", expanded_mm, below))
-        }
+        (false, _) => beside("", found_mm),
+        (true, Conformity::Within) => beside("at most ", high_mm),
+        (true, Conformity::Beyond) => beside("at least ", low_mm),
+        (true, Conformity::Undecided) => format!("{}, {}", beside("at most ", high_mm), beside("at least ", low_mm)),
     };
     format!("{words}: {sums}")
 }
 
 fn decision_rule(tolerance: &Tolerance) -> String {
     let rule = if tolerance.with_uncertainty {
-        "Decision rule, after ISO 14253-1: the part is accepted only where each figure and its expanded uncertainty U together \
-         do not exceed the limit; it is out of tolerance for certain only where the figure less U exceeds it; between the two \
-         nothing is proven."
+        "Decision rule, after ISO 14253-1 and JCGM 106: the part is accepted only where each figure is within its limit with a \
+         probability of 97.5 % at least; it is out of tolerance for certain only where one is beyond it with that probability; between \
+         the two nothing is proven."
     } else {
         "Decision rule: each figure by itself is held against its limit; its uncertainty is told and not counted."
     };
     format!(
-        "{rule} U is of the scatter of the points; that of the pose is not in it. PV is the largest less the least deviation \
-         along the normal{}.",
+        "{rule} The figures are those of the form of the part after its best fit: the scatter of the probe is taken off them, and it and the \
+         pose are in their uncertainty. Where no form shows they are known from above alone. U is half of the interval that holds the \
+         figure with 95 %. PV is the largest less the least deviation along the normal{}.",
         match tolerance.pv_of {
             regrind_cell::PvOf::All => ", of all points",
             regrind_cell::PvOf::MostPoints => ", PV 99.8 % that of all points but the outermost 0.1 % at either end",
@@ -232,7 +228,7 @@ fn cycles(story: &Story) -> String {
         html.extend(measurements.iter().map(|of| measurement(*number, of, tolerance.as_ref(), &level)));
     }
     html + "</table>\n<p>Deviations are along the normal, positive where material stands proud; \u{b1} is the expanded uncertainty \
-            (k = 2) by the scatter of the points. The level is the height of the surface that was wanted over the nominal one.</p>\n"
+            (k = 2). The level is the height of the surface that was wanted over the nominal one.</p>\n"
 }
 
 fn measurement(number: u32, of: &Measurement, tolerance: Option<&Tolerance>, level: &str) -> String {
@@ -253,15 +249,17 @@ fn measurement(number: u32, of: &Measurement, tolerance: Option<&Tolerance>, lev
 
 /// The figures of a measurement: those that are judged where the record tells which, or else those of all points.
 fn figures_row(f: &Figures, tolerance: Option<&Tolerance>, level: &str) -> String {
-    let judged = tolerance.map(|tolerance| tolerance.compare(f)[0]);
-    let (pv_mm, expanded_mm) = judged.map_or((f.pv_mm, f.pv_expanded_mm), |pv| (pv.found_mm, pv.expanded_mm));
+    // The record tells of every run what is accepted; of one that ends before, the points tell.
+    let points = || [[f.pv_mm, f.pv_expanded_mm], [f.rms_mm, f.rms_expanded_mm]];
+    let of = |tolerance: &Tolerance| tolerance.compare(f).map(|compared| [compared.found_mm, compared.expanded_mm]);
+    let [[pv_mm, pv_expanded_mm], [rms_mm, rms_expanded_mm]] = tolerance.map_or_else(points, of);
     format!(
         "<td class=\"n\">{} \u{b1} {}</td><td class=\"n\">{:.3} \u{b1} {:.3}</td><td class=\"n\">{}</td><td class=\"n\">{}</td>\
          <td class=\"n\">{:.1} %</td><td class=\"n\">{level}</td>",
         um(pv_mm),
-        um(expanded_mm),
-        1e3 * f.rms_mm,
-        1e3 * f.rms_expanded_mm,
+        um(pv_expanded_mm),
+        1e3 * rms_mm,
+        1e3 * rms_expanded_mm,
         f.points,
         f.outliers,
         1e2 * f.coverage

@@ -130,11 +130,9 @@ fn cycle_summary(cycle: u32, story: &CycleStory, tolerance: Option<&Tolerance>) 
     let judgement = last.and_then(|of| of.judgements.last());
     let unusable = || last.and_then(|of| of.unusable.clone()).unwrap_or_default();
     let figures = last.and_then(|of| of.figures.as_ref()).map(|figures| {
-        let pv = tolerance.map_or([figures.pv_mm, figures.pv_expanded_mm], |tolerance| {
-            let [pv, ..] = tolerance.compare(figures);
-            [pv.found_mm, pv.expanded_mm]
-        });
-        [pv, [figures.rms_mm, figures.rms_expanded_mm]].map(|figure| figure.map(|mm| 1e3 * mm))
+        let points = [[figures.pv_mm, figures.pv_expanded_mm], [figures.rms_mm, figures.rms_expanded_mm]];
+        let of = |tolerance: &Tolerance| tolerance.compare(figures).map(|of| [of.found_mm, of.expanded_mm]);
+        tolerance.map_or(points, of).map(|figure| figure.map(|mm| 1e3 * mm))
     });
     CycleSummary {
         cycle,

@@ -6,8 +6,8 @@ use serde_json::Value;
 
 use super::told::Told;
 use regrind_cell::{
-    Alarm, Command, CompensationRefusal, Device, Ending, Event, Figures, Gate, GateFailure, Judgement, Mismatch,
-    Occupation, Reconciliation, RecordFailure, Role,
+    Alarm, Command, CompensationRefusal, Device, Ending, Event, Figures, Gate, GateFailure, Interval, Judgement,
+    Mismatch, Occupation, Reconciliation, RecordFailure, Role,
 };
 use regrind_journal::Record;
 
@@ -292,6 +292,12 @@ fn figures_words(figures: &Figures) -> String {
         figures.points,
         figures.outliers
     );
+    if let Some(form) = &figures.form {
+        let um =
+            |of: &Interval| format!("{:.2} ({:.2} to {:.2}) um", 1e3 * of.median_mm, 1e3 * of.low_mm, 1e3 * of.high_mm);
+        let (pv, rms, scatter_um) = (um(&form.pv_robust), um(&form.rms), 1e3 * form.scatter_mm);
+        let _ = write!(line, "; the form without the scatter of {scatter_um:.2} um: PV 99.8 % {pv}, rms {rms}");
+    }
     for words in figures.weak_directions.iter().chain(&figures.warnings) {
         let _ = write!(line, "; {words}");
     }

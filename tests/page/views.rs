@@ -39,7 +39,7 @@ fn a_run_that_is_over_is_listed_shown_compared_and_reported() {
         serde_json::from_slice(&std::fs::read(home.path().join("runs").join(&ids[0]).join("result.json")).unwrap())
             .unwrap();
     let last = result["cycles"].as_array().unwrap().last().unwrap();
-    assert!(shown.contains(&format!("<strong>{:.3}</strong>", last["rms_um"].as_f64().unwrap())), "{shown}");
+    assert!(shown.contains(&format!("<strong>{:.3}</strong>", last["judged_rms_um"].as_f64().unwrap())), "{shown}");
     assert!(shown.contains("ACCEPTED") && shown.contains("SIMULATION") && shown.contains("<polyline"), "{shown}");
     visitor.language = "de-AT".into();
     assert!(visitor.get(&format!("/runs/{}", ids[0])).text().contains("ANGENOMMEN"));

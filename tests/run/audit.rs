@@ -33,6 +33,7 @@ fn figures() -> Figures {
     Figures {
         pv_mm: 0.004_2,
         rms_mm: 0.000_812,
+        form: None,
         pv_expanded_mm: 0.0005,
         rms_expanded_mm: 0.0001,
         coverage: 0.99,

@@ -306,7 +306,10 @@ async fn an_interferometers_maps_close_the_loop() {
     let figures: Value = serde_json::from_slice(&fs::read(cycle.join("figures.json")).unwrap()).unwrap();
     let rows = figures["figures"].as_array().unwrap();
     let named = |name: &str| rows.iter().find(|row| row["name"] == name).unwrap()["value"].as_f64().unwrap();
-    assert!((named("RMS") / last.rms_um - 1.0).abs() < 1e-9 && (named("PV") / last.pv_um - 1.0).abs() < 1e-9);
+    assert!(
+        (named("RMS of the points") / last.rms_um - 1.0).abs() < 1e-9
+            && (named("PV of the points") / last.pv_um - 1.0).abs() < 1e-9
+    );
     assert!(named("PVr") > 0.0 && named("coverage") > 95.0 && named("slope RMS") > 0.0, "{figures}");
     assert!(figures["missing"].as_array().unwrap().is_empty(), "{figures}");
     for name in ["error_map.csv", "error_map.svg", "error_map.png", "deviations.ply"] {

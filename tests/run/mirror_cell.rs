@@ -120,8 +120,8 @@ fn raw_tracker_files_become_a_measurement_and_no_map_while_the_plane_is_free() {
         for k in [0, 1] {
             assert!((v.covariance[(k, k)].sqrt() / in_plane_mm[k] - 1.0).abs() < 0.1, "{session}: axis {k}");
         }
-        let lateral = lateral_error(&free, 2.0);
-        let why = weak_for_compensation(&free, &MapLimits::default());
+        let lateral = lateral_error(&free, &free.verdict.covariance, 2.0);
+        let why = weak_for_compensation(&free, &free.verdict.covariance, &MapLimits::default());
         println!("{lateral:?}\n{}", why.as_deref().unwrap_or("a map may be made"));
         let why = why.expect("refused");
         assert!(
@@ -131,8 +131,12 @@ fn raw_tracker_files_become_a_measurement_and_no_map_while_the_plane_is_free() {
             "{why}"
         );
         let held = registered(&nominal, &cloud, [true, true, false, false, false, true]);
-        println!("held: rms {:.2} um, {:?}", held.verdict.rms_mm * 1e3, lateral_error(&held, 2.0));
-        assert_eq!(weak_for_compensation(&held, &MapLimits::default()), None);
+        println!(
+            "held: rms {:.2} um, {:?}",
+            held.verdict.rms_mm * 1e3,
+            lateral_error(&held, &held.verdict.covariance, 2.0)
+        );
+        assert_eq!(weak_for_compensation(&held, &held.verdict.covariance, &MapLimits::default()), None);
     }
 }
 

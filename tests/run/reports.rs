@@ -117,11 +117,12 @@ fn the_report_of_an_accepted_run_says_what_its_result_and_its_record_say() {
     for (row, cycle) in rows.iter().zip(cycles) {
         let number = &cycle["cycle"];
         let of_cycle = json_in(&folder, &format!("cycle-{number}/result.json"));
-        let um = |key: &str| format!("{:.2}", 1e3 * of_cycle["figures"][key].as_f64().unwrap());
         let row = row.join("|");
         assert!(row.starts_with(&format!("{number}|")), "{row}");
         let verdict = of_cycle["verdict"].as_str().unwrap().replace('_', " ");
-        for words in [&um("pv_robust_mm"), &um("pv_expanded_mm"), &verdict, of_cycle["reason"].as_str().unwrap()] {
+        let form = |key: &str| 1e3 * of_cycle["figures"]["form"]["pv_robust"][key].as_f64().unwrap();
+        let expanded = format!("{:.2}", 0.5 * (form("high_mm") - form("low_mm")));
+        for words in [&format!("{:.2}", form("median_mm")), &expanded, &verdict, of_cycle["reason"].as_str().unwrap()] {
             assert!(row.contains(words), "{words}: {row}");
         }
     }
@@ -200,30 +201,37 @@ fn the_judged_figure_stands_beside_its_limit_and_every_other_says_what_it_is() {
     let figures = json_in(&folder, &format!("cycle-{last}/result.json"))["figures"].clone();
     let um = |key: &str| 1e3 * figures[key].as_f64().unwrap();
     let judged = page.rows("judged");
-    let expected = [("PV 99.8 %", "pv_robust_mm", "pv_expanded_mm", 7.0), ("RMS", "rms_mm", "rms_expanded_mm", 1.0)];
+    let form = |figure: &str| {
+        ["median_mm", "low_mm", "high_mm"].map(|key| 1e3 * figures["form"][figure][key].as_f64().unwrap())
+    };
+    let expected = [("PV 99.8 %", form("pv_robust"), 7.0), ("RMS", form("rms"), 1.0)];
     assert_eq!(judged.len(), 2, "{judged:?}");
-    for (row, (name, found, expanded, limit)) in judged.iter().zip(expected) {
+    for (row, (name, [found, low, high], limit)) in judged.iter().zip(expected) {
         assert!(row[0].starts_with(name), "{row:?}");
-        let numbers = [format!("{:.2}", um(found)), format!("\u{b1} {:.2}", um(expanded)), format!("{limit:.2}")];
-        assert_eq!(row[1..4], numbers, "{row:?}");
-        assert!(row[4].contains("within"), "{row:?}");
-        assert!(row[4].contains(&format!("{:.2}", um(found) + um(expanded))), "{row:?}");
+        let (expanded, between) = (format!("\u{b1} {:.2}", 0.5 * (high - low)), format!("{low:.2} to {high:.2}"));
+        assert_eq!(row[1..5], [format!("{found:.2}"), expanded, between, format!("{limit:.2}")], "{row:?}");
+        assert!(row[5].contains("within") && row[5].contains(&format!("at most {high:.2}")), "{row:?}");
     }
     let bold = page.texts(|node| node.has_tag_name("strong"));
-    assert_eq!(
-        bold,
-        [format!("{:.2}", um("pv_robust_mm")), format!("{:.2}", um("rms_mm"))],
-        "one figure of each judges"
-    );
+    let medians = ["pv_robust", "rms"].map(|figure| format!("{:.2}", form(figure)[0]));
+    assert_eq!(bold, medians, "one figure of each judges");
     assert!(page.says("ISO 14253-1"));
     // What is called alike is the same number everywhere.
-    let form = json_in(&folder, &format!("cycle-{last}/figures.json"))["figures"].clone();
-    let named = |name: &str| form.as_array().unwrap().iter().find(|row| row["name"] == name).unwrap().clone();
+    let points = json_in(&folder, &format!("cycle-{last}/figures.json"))["figures"].clone();
+    let named = |name: &str| points.as_array().unwrap().iter().find(|row| row["name"] == name).unwrap().clone();
     for (name, key) in [("PV 99.8 %", "pv_robust_mm"), ("PV", "pv_mm"), ("RMS", "rms_mm")] {
+        let name = &format!("{name} of the points");
         let value = named(name)["value"].as_f64().unwrap();
         assert!((value / um(key) - 1.0).abs() < 1e-9, "{name}: {value} beside {}", um(key));
     }
-    for name in ["PV", "PVr", "PV 99.8 %", "RMS", "highest (stock left)", "lowest (undercut)"] {
+    for name in [
+        "PV of the points",
+        "PVr",
+        "PV 99.8 % of the points",
+        "RMS of the points",
+        "highest (stock left)",
+        "lowest (undercut)",
+    ] {
         assert!(!named(name)["made"].as_str().unwrap().is_empty(), "{name} does not say what it is");
     }
 }
@@ -448,8 +456,8 @@ fn without_a_limit_or_with_one_of_another_time_nothing_is_invented() {
     };
     let (_home, folder) = of(json!({ "plan": { "tolerance": tolerance } }));
     let judged = Page::of(&folder).rows("judged");
-    assert!(judged[0][3] == "no limit" && judged[0][4].is_empty(), "{judged:?}");
-    assert!(judged[1][3] == "1.00" && !judged[1][4].is_empty(), "{judged:?}");
+    assert!(judged[0][4] == "no limit" && judged[0][5].is_empty(), "{judged:?}");
+    assert!(judged[1][4] == "1.00" && !judged[1][5].is_empty(), "{judged:?}");
     let (_home, folder) = of(Value::Null);
     let page = Page::of(&folder);
     assert!(page.rows("judged").is_empty() && page.cycles().len() == 1);

@@ -37,6 +37,7 @@ fn hostile() -> (TempDir, std::path::PathBuf) {
     let of = |pv_mm: f64, rms_mm: f64| Figures {
         pv_robust_mm: Some(pv_mm),
         rms_mm,
+        form: None,
         pv_expanded_mm: 0.0005,
         rms_expanded_mm: 0.0001,
         ..figures()
@@ -81,7 +82,9 @@ fn both_formats_tell_what_result_json_tells_and_the_same_twice() {
     assert_eq!(values.len(), 3 * cycles);
     for (cycle, told) in (1..).zip(values.chunks(3)) {
         let figures = json_in(&folder, &format!("cycle-{cycle}/result.json"))["figures"].clone();
-        let expected = ["pv_robust_mm", "rms_mm", "pv_mm"].map(|key| format!("{:.9}", figures[key].as_f64().unwrap()));
+        let form = |key: &str| &figures["form"][key]["median_mm"];
+        let expected =
+            [form("pv_robust"), form("rms"), &figures["pv_mm"]].map(|v| format!("{:.9}", v.as_f64().unwrap()));
         assert_eq!(told, expected);
         for (number, value) in (1..).zip(expected) {
             assert!(dfq.contains(&format!("K0001/{number} {value}\r\n")), "cycle {cycle}: {value}");

@@ -66,10 +66,14 @@ pub fn labelled(figures: &Figures, taken_out: &TakenOut) -> Vec<Labelled> {
     );
     let cells = format!("cells of {:.3} mm within the aperture that hold a point", coverage.cell_mm);
     vec![
-        um("PV", figures.pv_mm, "of all points: largest less least"),
+        um("PV of the points", figures.pv_mm, "of all points: largest less least"),
         um("PVr", pvr.value_mm, &of_fit),
-        um("PV 99.8 %", figures.pv998_mm, "of all points but the outermost 0.1 % at either end: largest less least"),
-        um("RMS", figures.rms_mm, "of all points, about zero"),
+        um(
+            "PV 99.8 % of the points",
+            figures.pv998_mm,
+            "of all points but the outermost 0.1 % at either end: largest less least",
+        ),
+        um("RMS of the points", figures.rms_mm, "of all points, about zero"),
         um("mean", figures.mean_mm, "of all points"),
         Labelled {
             at_mm: Some(highest.at_mm),

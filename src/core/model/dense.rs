@@ -4,11 +4,15 @@
 //! (Rasmussen and Williams 2006, 2.7, with a vague prior of b): mean h'b + k'K^-1 (d - H b), variance
 //! k(x, x) - k'K^-1 k + r'(H'K^-1 H)^-1 r with r = h - H'K^-1 k.
 
-use faer::linalg::solvers::{Llt, Solve};
+use faer::linalg::solvers::{DenseSolveCore, Llt, Solve};
 use faer::{Mat, Side};
 use nalgebra::{DMatrix, DVector};
 
+use super::normals::Normals;
 use super::{Hyper, ModelError, Observed};
+
+/// What keeps a covariance definite whose least values are nothing.
+const NEXT_TO_NOTHING: f64 = 1e-9;
 
 /// What the model says of a place.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -94,6 +98,34 @@ impl Dense {
     /// that is known beside a field that nobody knows either.
     pub fn effects(&self) -> (&DVector<f64>, &DMatrix<f64>) {
         (&self.found, &self.covariance)
+    }
+
+    /// Draws what may have been the scatter of each observed point; a column a sample. What is left of the observations without it, and
+    /// without the effects, is the field.
+    ///
+    /// With W = K^-1 - K^-1 H (H'K^-1 H)^-1 H'K^-1 the scatter has the mean s^2 W d and the covariance s^2 - s^4 W.
+    pub(super) fn scatters(&self, count: usize, seed: u64) -> Result<Mat<f64>, ModelError> {
+        let n = self.places.len();
+        let scatter2 = self.hyper.scatter_mm * self.hyper.scatter_mm;
+        let inverse = self.factor.inverse();
+        let p = self.found.len();
+        let by_effects =
+            Mat::from_fn(n, p, |r, c| (0..p).map(|k| self.effects[(r, k)] * self.covariance[(k, c)]).sum::<f64>());
+        let among_effects = &by_effects * self.effects.transpose();
+        let covariance = Mat::from_fn(n, n, |r, c| {
+            let own = if r == c { 1.0 + NEXT_TO_NOTHING } else { 0.0 };
+            own - scatter2 * (inverse[(r, c)] - among_effects[(r, c)])
+        });
+        let root = Llt::new(covariance.as_ref(), Side::Lower).map_err(|_| ModelError::NotDefinite)?;
+        let mut normals = Normals::new(seed, 0);
+        let drawn = Mat::from_fn(n, count, |_, _| normals.next());
+        let mut samples = root.L() * &drawn;
+        for c in 0..count {
+            for r in 0..n {
+                samples[(r, c)] = scatter2 * self.weights[r] + self.hyper.scatter_mm * samples[(r, c)];
+            }
+        }
+        Ok(samples)
     }
 
     /// Tells the field at some places, the effects taken off.

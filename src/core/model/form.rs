@@ -9,7 +9,8 @@ use nalgebra::{DMatrix, Matrix3, Matrix6, SymmetricEigen, Vector6};
 
 use rayon::prelude::*;
 
-use super::{Hyper, Lattice, ModelError, Observed, Predicted, Priors, Sparse};
+use super::normals::Normals;
+use super::{Dense, Hyper, Lattice, ModelError, Observed, Predicted, Priors, Sparse};
 use crate::geometry::{Point, Vector};
 use crate::registration::{PointStatus, Registration};
 
@@ -21,10 +22,22 @@ pub struct Form {
     /// Covariance of the pose as the place of the nominal frame: of the twist [v; omega] in the model frame, as that of the registration,
     /// which is how well the same pose would be found again. Units mm^2, mm rad, rad^2. Directions that were held have no variance.
     pub frame_covariance: Matrix6<f64>,
-    /// The form at every measured point, in the order given.
-    pub points: Vec<Predicted>,
+    /// The form after its own best fit, at every point that was used, in the order given; of a scan with more than 6,000 points at as many of
+    /// them.
+    pub points: Vec<FormPoint>,
     /// The figures of the form.
     pub figures: FormFigures,
+    /// Whether the points show a form at all. Where they do not, the figures are known from above alone, and their intervals begin at 0.
+    pub is_seen: bool,
+}
+
+/// The form at a measured point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FormPoint {
+    /// Where, in the model frame.
+    pub at_mm: [f64; 2],
+    /// The form there and its standard uncertainty.
+    pub form: Predicted,
 }
 
 /// Figures with what the measurement leaves possible of each.
@@ -52,6 +65,12 @@ pub struct Interval {
 /// Fields that are drawn, and places at which they are looked at, at most.
 const SAMPLES: usize = 1000;
 const MOST_PLACES: usize = 6000;
+/// Fewer tell nothing.
+const FEWEST_SAMPLES: usize = 30;
+/// Points whose every pair is worked with, at most; of more the grid is faster.
+const MOST_DENSE: usize = 700;
+/// By how much more a form has to be spoken for than none, in the logarithm of the likelihood: by chance it is so in one part of twenty.
+const EVIDENCE: f64 = 2.6;
 /// Points of which every pair is looked at, at most.
 const MOST_PAIRED: usize = 1500;
 /// A direction whose variance is less than this share of the largest was held.
@@ -62,7 +81,7 @@ impl Form {
     ///
     /// # Errors
     /// Too few points, and points that leave nothing to tell the form by.
-    pub fn of(registration: &Registration, priors: Option<Priors>) -> Result<Self, ModelError> {
+    pub fn of(registration: &Registration, given: &Given) -> Result<Self, ModelError> {
         let used: Vec<_> = registration.deviations.iter().filter(|d| d.status == PointStatus::Used).collect();
         if used.is_empty() {
             return Err(ModelError::TooFewPoints { points: 0, least: 7 });
@@ -74,23 +93,34 @@ impl Form {
             deviations_mm: used.iter().map(|d| d.deviation_mm).collect(),
             effects: motions.rows(used.iter().map(|d| (d.point, d.normal))),
         };
-        let priors = priors.unwrap_or_else(|| Priors::of_size(motions.size_mm));
-        let hyper = Hyper::of(&observed, &priors)?;
-        let all: Vec<[f64; 2]> = registration.deviations.iter().map(|d| place(&d.point)).collect();
-        let lattice = Lattice::over(&all, hyper.field.range_mm)?;
-        let model = Sparse::fit(&lattice, &observed, hyper)?;
-        Ok(Self {
-            hyper,
-            frame_covariance: motions.to_twist(&of_the_fit(&observed, hyper)),
-            points: model.predict(&all),
-            figures: figures(&model, &observed)?,
-        })
+        let priors = given.priors.unwrap_or_else(|| Priors::of_size(motions.size_mm));
+        let mut told = Hyper::told(&observed, &priors)?;
+        let hyper = told.likely[0].0;
+        let is_seen = hyper.evidence(&observed) > EVIDENCE;
+        if !is_seen {
+            // What is spoken for by next to nothing is as good as what is spoken for by a little more.
+            told.likely.push((told.wide, 1.0));
+            told.likely.iter_mut().for_each(|(_, weight)| *weight = 1.0);
+        }
+        let frame_covariance = motions.to_twist(&of_the_fit(&observed, told.wide, given.radius_sigma_mm));
+        let drawn = Drawn::of(&observed, &told.likely)?;
+        let drawn = drawn.with_the_unknown(told.scatter_u, given.radius_sigma_mm).after_best_fit();
+        Ok(Self { hyper, frame_covariance, points: drawn.points(), figures: drawn.figures(is_seen), is_seen })
     }
 }
 
+/// What the points cannot tell of themselves.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Given {
+    /// What is known of form and scatter beforehand; without it what every part of its size is like.
+    pub priors: Option<Priors>,
+    /// Standard uncertainty of the radius of the probe: it moves every point along its normal alike.
+    pub radius_sigma_mm: f64,
+}
+
 /// The covariance of the motions as the registration finds them, by least squares of deviations that a form makes alike: A+ (K + s^2) A+'
-/// with A+ = (H'H)^-1 H' (Aitken 1935). Of many points some tell the part of the form.
-fn of_the_fit(observed: &Observed, hyper: Hyper) -> DMatrix<f64> {
+/// with A+ = (H'H)^-1 H' (Aitken 1935), and of the radius of the probe. Of many points some tell the part of the form.
+fn of_the_fit(observed: &Observed, hyper: Hyper, radius_sigma_mm: f64) -> DMatrix<f64> {
     let Observed { places, effects, .. } = observed;
     let inverse = |rows: &DMatrix<f64>| {
         rows.tr_mul(rows).pseudo_inverse(f64::EPSILON).unwrap_or_else(|_| DMatrix::zeros(rows.ncols(), rows.ncols()))
@@ -114,42 +144,106 @@ fn of_the_fit(observed: &Observed, hyper: Hyper) -> DMatrix<f64> {
         })
         .collect();
     let covered = DMatrix::from_row_slice(chosen.len(), p, &covered);
-    by_scatter + weights.tr_mul(&covered)
+    // What moves all points alike.
+    let of_radius = weights.row_sum().transpose() * radius_sigma_mm;
+    by_scatter + weights.tr_mul(&covered) + &of_radius * of_radius.transpose()
 }
 
-/// The figures of drawn fields, each after its own best fit.
-fn figures(model: &Sparse, observed: &Observed) -> Result<FormFigures, ModelError> {
-    let chosen: Vec<usize> = match observed.places.len() {
-        n if n <= MOST_PLACES => (0..n).collect(),
-        n => (0..MOST_PLACES).map(|k| k * n / MOST_PLACES).collect(),
-    };
-    let places: Vec<[f64; 2]> = chosen.iter().map(|&k| observed.places[k]).collect();
-    let base = observed.effects.select_rows(&chosen).qr().q();
-    let mut samples = model.samples(&places, SAMPLES, 1)?;
-    if base.ncols() > 0 {
-        let fitted: DMatrix<f64> = &base * base.tr_mul(&samples);
-        samples -= fitted;
+/// Forms that may have been, a column each, and what was observed at their places.
+struct Drawn {
+    forms: DMatrix<f64>,
+    observed: Observed,
+}
+
+impl Drawn {
+    /// By each of the likely parameters as many as speaks for them.
+    fn of(observed: &Observed, likely: &[(Hyper, f64)]) -> Result<Self, ModelError> {
+        let n = observed.places.len();
+        let chosen: Vec<usize> = (0..n.min(MOST_PLACES)).map(|k| k * n / n.min(MOST_PLACES)).collect();
+        let seen = observed.only(&chosen);
+        let whole: f64 = likely.iter().map(|(_, weight)| weight).sum();
+        let mut forms = DMatrix::zeros(chosen.len(), 0);
+        for (k, (hyper, weight)) in (1..).zip(likely) {
+            let count = (SAMPLES as f64 * weight / whole).round() as usize;
+            if count < FEWEST_SAMPLES {
+                continue;
+            }
+            let drawn = if n <= MOST_DENSE {
+                // What was observed less scatters that may have been.
+                let scatters = Dense::fit(observed, *hyper)?.scatters(count, k)?;
+                DMatrix::from_fn(n, count, |r, c| observed.deviations_mm[r] - scatters[(r, c)])
+            } else {
+                let lattice = Lattice::over(&observed.places, hyper.field.range_mm)?;
+                Sparse::fit(&lattice, observed, *hyper)?.samples(&seen.places, count, k)?
+            };
+            let (rows, before) = forms.shape();
+            forms = forms.resize(rows, before + count, 0.0);
+            forms.columns_mut(before, count).copy_from(&drawn);
+        }
+        Ok(Self { forms, observed: seen })
     }
-    let mut found: [Vec<f64>; 3] = Default::default();
-    for sample in samples.column_iter() {
-        let mut sorted: Vec<f64> = sample.iter().copied().collect();
-        sorted.sort_unstable_by(f64::total_cmp);
-        let n = sorted.len();
-        let left_out = n / 1000;
-        found[0].push((sorted.iter().map(|v| v * v).sum::<f64>() / n as f64).sqrt());
-        found[1].push(sorted[n - 1] - sorted[0]);
-        found[2].push(sorted[n - 1 - left_out] - sorted[left_out]);
+
+    /// Takes in that the scatter is known to a share of itself only, and the radius of the probe to some length.
+    ///
+    /// What a form leaves of the observations is the scatter, and that may be as much larger or smaller; the motions are taken off afterwards.
+    fn with_the_unknown(mut self, scatter_u: f64, radius_sigma_mm: f64) -> Self {
+        let mut normals = Normals::new(2, 0);
+        for mut form in self.forms.column_iter_mut() {
+            let share = (scatter_u * normals.next()).exp() - 1.0;
+            let radius_mm = radius_sigma_mm * normals.next();
+            for (value, observed) in form.iter_mut().zip(&self.observed.deviations_mm) {
+                *value -= share * (observed - *value) + radius_mm;
+            }
+        }
+        self
     }
-    let [rms, pv, pv_most_points] = found.map(Interval::of);
-    Ok(FormFigures { rms, pv, pv_most_points })
+
+    /// Each form after its own best fit.
+    fn after_best_fit(mut self) -> Self {
+        if self.observed.effects.ncols() > 0 {
+            let base = self.observed.effects.clone().qr().q();
+            let fitted: DMatrix<f64> = &base * base.tr_mul(&self.forms);
+            self.forms -= fitted;
+        }
+        self
+    }
+
+    fn points(&self) -> Vec<FormPoint> {
+        let count = self.forms.ncols() as f64;
+        let of = |(k, at_mm): (usize, &[f64; 2])| {
+            let row = self.forms.row(k);
+            let mean_mm = row.sum() / count;
+            let sigma_mm = (row.iter().map(|v| (v - mean_mm).powi(2)).sum::<f64>() / (count - 1.0)).sqrt();
+            FormPoint { at_mm: *at_mm, form: Predicted { mean_mm, sigma_mm } }
+        };
+        self.observed.places.iter().enumerate().map(of).collect()
+    }
+
+    /// The figures; where no form is seen they are known from above alone.
+    fn figures(&self, is_seen: bool) -> FormFigures {
+        let mut found: [Vec<f64>; 3] = Default::default();
+        let mut sorted = Vec::with_capacity(self.forms.nrows());
+        for form in self.forms.column_iter() {
+            sorted.clear();
+            sorted.extend(form.iter().copied());
+            sorted.sort_unstable_by(f64::total_cmp);
+            let n = sorted.len();
+            let left_out = n / 1000;
+            found[0].push((sorted.iter().map(|v| v * v).sum::<f64>() / n as f64).sqrt());
+            found[1].push(sorted[n - 1] - sorted[0]);
+            found[2].push(sorted[n - 1 - left_out] - sorted[left_out]);
+        }
+        let [rms, pv, pv_most_points] = found.map(|values| Interval::of(values, is_seen));
+        FormFigures { rms, pv, pv_most_points }
+    }
 }
 
 impl Interval {
     /// Of values that are equally probable.
-    fn of(mut values: Vec<f64>) -> Self {
+    fn of(mut values: Vec<f64>, has_low: bool) -> Self {
         values.sort_unstable_by(f64::total_cmp);
         let at = |share: f64| values[((values.len() - 1) as f64 * share).round() as usize];
-        Self { median_mm: at(0.5), low_mm: at(0.025), high_mm: at(0.975) }
+        Self { median_mm: at(0.5), low_mm: if has_low { at(0.025) } else { 0.0 }, high_mm: at(0.975) }
     }
 }
 

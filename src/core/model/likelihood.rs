@@ -4,6 +4,8 @@
 //! range and the share of the scatter, are searched; the scale follows from them at once: sigma^2 is the mean square of the whitened
 //! residuals.
 
+use nalgebra::{DMatrix, DVector};
+
 use super::{Dense, Field, Hyper, ModelError, Observed};
 
 /// What is known of a field before anything is measured: the median of each, and by what factor it may be off (one standard deviation of
@@ -16,8 +18,21 @@ pub struct Priors {
     pub scatter_ratio: [f64; 2],
 }
 
-/// More points tell hardly more of the parameters, and take time by their cube.
-const MOST_POINTS: usize = 400;
+/// Ratios of scatter to field at which the search begins.
+const RATIOS: [f64; 4] = [0.01, 0.1, 0.6, 3.0];
+/// What is spoken for by so much less than the best (in the logarithm) is left out; so is what has all but the same range.
+const NEAR: f64 = 8.0;
+const APART: f64 = 0.2;
+/// Of so many points every pair is looked at.
+const MOST_TOGETHER: usize = 250;
+/// Of more, so many that lie all over the part tell how wide the field is.
+const SPREAD: usize = 150;
+/// How far beside the best parameters the likelihood is looked at, and the most by which a scatter is taken for unknown (of its logarithm).
+const STEP: f64 = 0.1;
+const MOST_UNKNOWN: f64 = 0.5;
+/// Neighbours tell how far a point scatters, and what is narrow: blocks of so many at most, so many blocks at most.
+const POINTS_A_BLOCK: usize = 48;
+const MOST_BLOCKS: usize = 40;
 
 impl Priors {
     /// What every part is like: the range some third of its size, the scatter a twentieth of the field, each by a factor of six.
@@ -34,16 +49,113 @@ impl Priors {
 impl Hyper {
     /// Finds the parameters that what was measured speaks for most.
     ///
+    /// Of many points the likelihood is a composite one (Varin, Reid and Firth 2011): of some that lie all over the part, and of blocks of neighbours,
+    /// each with a plane of its own that nobody knows.
+    ///
     /// # Errors
     /// Those of [`Dense::fit`].
     pub fn of(observed: &Observed, priors: &Priors) -> Result<Self, ModelError> {
+        Self::told(observed, priors).map(|told| told.likely[0].0)
+    }
+
+    /// The same, with what else it might be.
+    pub(super) fn told(observed: &Observed, priors: &Priors) -> Result<Told, ModelError> {
         observed.check()?;
-        let few = thinned(observed);
-        let least_mm = least_range_mm(&few);
-        let at = |[range, ratio]: [f64; 2]| scaled(&few, range.exp().max(least_mm), ratio.exp(), priors);
-        let start = [priors.range_mm[0].ln(), priors.scatter_ratio[0].ln()];
-        let (best, _) = climb(start, |place| at(place).map_or(f64::NEG_INFINITY, |(_, value)| value));
-        at(best).map(|(hyper, _)| hyper)
+        let least_mm = least_range_mm(observed);
+        let all = if observed.places.len() <= MOST_TOGETHER {
+            vec![observed.clone()]
+        } else {
+            std::iter::once(thinned(observed, SPREAD)).chain(blocks(observed)).collect()
+        };
+        let at = |of: &[Observed], [range, ratio]: [f64; 2]| scaled(of, range.exp(), ratio.exp(), priors);
+        // What is narrower than can be told has no height.
+        let height = |of: &[Observed], place: [f64; 2]| match at(of, place) {
+            Ok((_, value)) if place[0] >= least_mm.ln() => value,
+            _ => f64::NEG_INFINITY,
+        };
+        // A hill may have two tops: a wide form and a narrow one.
+        let far = (priors.range_mm[0] / least_mm).max(1.5);
+        let ranges = [0.1, 0.4, 0.7, 1.0, 1.5].map(|power: f64| (least_mm * far.powf(power)).ln());
+        let tops = ranges.map(|range| {
+            let places = RATIOS.map(|ratio| [range, ratio.ln()]).map(|place| (place, height(&all, place)));
+            places.into_iter().fold(([range, 0.0], f64::NEG_INFINITY), |a, b| if b.1 > a.1 { b } else { a })
+        });
+        let start = tops.iter().fold(tops[0], |a, b| if b.1 > a.1 { *b } else { a });
+        let (best, top) = climb(start.0, [0.15 * far.ln(), 0.7], 0.01, |place| height(&all, place));
+        let (hyper, _) = at(&all, best)?;
+        let others = tops.into_iter().filter(|(place, of)| top - of < NEAR && (place[0] - best[0]).abs() > APART);
+        let others =
+            others.map(|(place, _)| climb(place, [0.0, 0.3], 0.05, |[_, ratio]| height(&all, [place[0], ratio])));
+        let mut likely = vec![(hyper, 1.0)];
+        likely.extend(others.filter_map(|(place, of)| Some((at(&all, place).ok()?.0, (of - top).exp()))));
+        // The wide waves by those points alone that see them.
+        let (wide, _) = climb(best, [0.3, 0.3], 0.03, |place| height(&all[..1], place));
+        let wide = at(&all[..1], wide).map_or(hyper, |(wide, _)| Self { scatter_mm: hyper.scatter_mm, ..wide });
+        // By the curvature of the hill along the scatter, whose scale moves with it.
+        let beside = |step: f64| at(&all, [best[0], best[1] + step]).unwrap_or((hyper, top));
+        let (below, above) = (beside(-STEP), beside(STEP));
+        let moved = 0.5 * (above.0.scatter_mm / below.0.scatter_mm).ln();
+        let falls = (2.0 * top - below.1 - above.1).max(f64::MIN_POSITIVE);
+        Ok(Told { likely, wide, scatter_u: (moved / falls.sqrt()).abs().min(MOST_UNKNOWN) })
+    }
+}
+
+/// What speaks for which parameters.
+pub(super) struct Told {
+    /// The most probable first, with how much more it is spoken for than each other.
+    pub(super) likely: Vec<(Hyper, f64)>,
+    /// By points all over the part: how strong and how wide its widest waves are.
+    pub(super) wide: Hyper,
+    /// Standard uncertainty of the logarithm of the scatter.
+    pub(super) scatter_u: f64,
+}
+
+/// Neighbours, block by block, each with a plane as the effect that nobody knows.
+fn blocks(observed: &Observed) -> Vec<Observed> {
+    let mut whole: Vec<Vec<usize>> = vec![(0..observed.places.len()).collect()];
+    let mut done = Vec::new();
+    while let Some(mut block) = whole.pop() {
+        if block.len() <= POINTS_A_BLOCK {
+            done.push(block);
+            continue;
+        }
+        let span = |axis: usize| {
+            let of = block.iter().map(|&k| observed.places[k][axis]);
+            of.clone().fold(f64::NEG_INFINITY, f64::max) - of.fold(f64::INFINITY, f64::min)
+        };
+        let axis = usize::from(span(1) > span(0));
+        block.sort_by(|&a, &b| observed.places[a][axis].total_cmp(&observed.places[b][axis]).then(a.cmp(&b)));
+        let rest = block.split_off(block.len() / 2);
+        whole.extend([block, rest]);
+    }
+    let every = done.len().div_ceil(MOST_BLOCKS);
+    done.iter().step_by(every).map(|block| with_plane(observed, block)).collect()
+}
+
+fn with_plane(observed: &Observed, block: &[usize]) -> Observed {
+    let places: Vec<[f64; 2]> = block.iter().map(|&k| observed.places[k]).collect();
+    let middle = [0, 1].map(|axis| places.iter().map(|place| place[axis]).sum::<f64>() / places.len() as f64);
+    let effects = DMatrix::from_fn(places.len(), 3, |r, c| match c {
+        0 => 1.0,
+        c => places[r][c - 1] - middle[c - 1],
+    });
+    Observed { deviations_mm: block.iter().map(|&k| observed.deviations_mm[k]).collect(), places, effects }
+}
+
+impl Hyper {
+    /// Returns by how much more what was measured speaks for this field than for none, in the logarithm of the restricted likelihood.
+    pub(super) fn evidence(&self, observed: &Observed) -> f64 {
+        let few = thinned(observed, MOST_TOGETHER);
+        let with = Dense::fit(&few, *self).map_or(f64::NEG_INFINITY, |model| model.log_likelihood());
+        let (n, p) = few.effects.shape();
+        let base = few.effects.clone().qr();
+        let deviations = DVector::from_column_slice(&few.deviations_mm);
+        let q = base.q();
+        let left = &deviations - &q * q.tr_mul(&deviations);
+        let free = (n - p) as f64;
+        let variance = left.norm_squared() / free;
+        let log_gram = 2.0 * base.r().diagonal().iter().map(|v| v.abs().ln()).sum::<f64>();
+        with + 0.5 * (free * (std::f64::consts::TAU * variance).ln() + free + log_gram)
     }
 }
 
@@ -57,49 +169,55 @@ fn least_range_mm(observed: &Observed) -> f64 {
     NEIGHBOURS * (span(0) * span(1) / observed.places.len() as f64).sqrt()
 }
 
-/// The parameters with the scale that suits them best, and the logarithm of their probability.
-fn scaled(observed: &Observed, range_mm: f64, ratio: f64, priors: &Priors) -> Result<(Hyper, f64), ModelError> {
+/// The parameters with the scale that suits them best, and the logarithm of their probability. What tells nothing of its plane, such as points
+/// on a line, tells nothing here.
+fn scaled(told: &[Observed], range_mm: f64, ratio: f64, priors: &Priors) -> Result<(Hyper, f64), ModelError> {
     let unit = Hyper { field: Field { sigma_mm: 1.0, range_mm }, scatter_mm: ratio };
-    let model = Dense::fit(observed, unit)?;
-    let free = (observed.places.len() - observed.effects.ncols()) as f64;
+    let (mut value, mut squares, mut free) = (priors.log_density(range_mm, ratio), 0.0, 0.0);
+    for (k, observed) in told.iter().enumerate() {
+        let model = match Dense::fit(observed, unit) {
+            Ok(model) => model,
+            Err(error) if k == 0 => return Err(error),
+            Err(_) => continue,
+        };
+        let of = model.whitened_squares(observed);
+        value += model.log_likelihood() + 0.5 * of;
+        squares += of;
+        free += (observed.places.len() - observed.effects.ncols()) as f64;
+    }
     // No deviation at all is a field of no strength.
-    let sigma_mm = (model.whitened_squares(observed) / free).sqrt().max(f64::MIN_POSITIVE.sqrt());
-    let squares = model.whitened_squares(observed);
-    let value = model.log_likelihood() + 0.5 * squares - 0.5 * free - free * sigma_mm.ln();
+    let sigma_mm = (squares / free).sqrt().max(f64::MIN_POSITIVE.sqrt());
     let hyper = Hyper { field: Field { sigma_mm, range_mm }, scatter_mm: ratio * sigma_mm };
-    Ok((hyper, value + priors.log_density(range_mm, ratio)))
+    Ok((hyper, value - 0.5 * free - free * sigma_mm.ln()))
 }
 
 /// Some of the points, far from each other and near: every k-th in a fixed disorder.
-fn thinned(observed: &Observed) -> Observed {
+fn thinned(observed: &Observed, most: usize) -> Observed {
     let n = observed.places.len();
-    if n <= MOST_POINTS {
+    if n <= most {
         return observed.clone();
     }
     // Steps of the golden section go everywhere and repeat nothing.
     let mut chosen: Vec<usize> =
-        (0..MOST_POINTS).map(|k| (((k as f64 + 0.5) * 0.618_033_988_749_894_9).fract() * n as f64) as usize).collect();
+        (0..most).map(|k| (((k as f64 + 0.5) * 0.618_033_988_749_894_9).fract() * n as f64) as usize).collect();
     chosen.sort_unstable();
     chosen.dedup();
-    Observed {
-        places: chosen.iter().map(|&k| observed.places[k]).collect(),
-        deviations_mm: chosen.iter().map(|&k| observed.deviations_mm[k]).collect(),
-        effects: observed.effects.select_rows(&chosen),
-    }
+    observed.only(&chosen)
 }
 
 /// Climbs to the highest place of two dimensions by a simplex (Nelder and Mead 1965).
-fn climb(start: [f64; 2], height: impl Fn([f64; 2]) -> f64) -> ([f64; 2], f64) {
+///
+/// It begins with a simplex of some steps, and ends with one that is smaller than `near`.
+fn climb(start: [f64; 2], steps: [f64; 2], near: f64, height: impl Fn([f64; 2]) -> f64) -> ([f64; 2], f64) {
     const TURNS: usize = 120;
-    const SMALL: f64 = 1e-4;
     let seen = |place: [f64; 2]| (place, height(place));
-    let mut corners = [seen(start), seen([start[0] + 0.7, start[1]]), seen([start[0], start[1] + 0.9])];
+    let mut corners = [seen(start), seen([start[0] + steps[0], start[1]]), seen([start[0], start[1] + steps[1]])];
     for _ in 0..TURNS {
         corners.sort_by(|a, b| b.1.total_cmp(&a.1));
         let [best, middle, worst] = corners;
         let spread =
             (0..2).map(|k| (best.0[k] - worst.0[k]).abs().max((best.0[k] - middle.0[k]).abs())).fold(0.0, f64::max);
-        if spread < SMALL {
+        if spread < near {
             break;
         }
         let centre = [0, 1].map(|k| 0.5 * (best.0[k] + middle.0[k]));
@@ -129,7 +247,6 @@ fn climb(start: [f64; 2], height: impl Fn([f64; 2]) -> f64) -> ([f64; 2], f64) {
 mod tests {
     use super::super::normals::Normals;
     use super::*;
-    use nalgebra::{DMatrix, DVector};
 
     /// A field of known parameters at 300 places of a part of 102 x 62 mm, moved and tilted by what nobody knows.
     fn drawn(hyper: Hyper, seed: u64) -> Observed {
@@ -179,7 +296,7 @@ mod tests {
     #[test]
     fn a_hill_is_climbed() {
         let hill = |[x, y]: [f64; 2]| -(x - 1.0).powi(2) - 30.0 * (y + 2.0 - 0.3 * x).powi(2);
-        let (top, height) = climb([-3.0, 4.0], hill);
+        let (top, height) = climb([-3.0, 4.0], [0.7, 0.9], 1e-4, hill);
         assert!((top[0] - 1.0).abs() < 1e-3 && (top[1] + 1.7).abs() < 1e-3 && height > -1e-6, "{top:?}");
     }
 }

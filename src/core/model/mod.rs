@@ -28,7 +28,7 @@ mod sparse;
 
 pub use dense::{Dense, Predicted};
 pub use error::ModelError;
-pub use form::{Form, FormFigures, Interval};
+pub use form::{Form, FormFigures, FormPoint, Given, Interval};
 pub use likelihood::Priors;
 pub use sparse::{Lattice, Sparse};
 
@@ -77,6 +77,15 @@ impl Observed {
     pub fn without_effects(places: Vec<[f64; 2]>, deviations_mm: Vec<f64>) -> Self {
         let effects = DMatrix::zeros(places.len(), 0);
         Self { places, deviations_mm, effects }
+    }
+
+    /// Some of them.
+    fn only(&self, chosen: &[usize]) -> Self {
+        Self {
+            places: chosen.iter().map(|&k| self.places[k]).collect(),
+            deviations_mm: chosen.iter().map(|&k| self.deviations_mm[k]).collect(),
+            effects: self.effects.select_rows(chosen),
+        }
     }
 
     /// Says what makes these no observations.

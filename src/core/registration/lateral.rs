@@ -16,7 +16,7 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::Matrix3;
+use nalgebra::{Matrix3, Matrix6};
 
 use super::deviation::{Deviation, PointStatus};
 use super::result::Registration;
@@ -50,13 +50,14 @@ pub struct LateralError {
     pub error_mm: f64,
 }
 
-/// Returns what the lateral uncertainty of a pose does to a map of its deviations.
+/// Returns what the lateral uncertainty of a pose, by a covariance of its twist, does to a map of its deviations: that of the verdict tells
+/// how well the pose is found again, that of [`crate::model::Form`] also what a form does to it.
 ///
 /// Equation: for the twist [v; omega] of covariance C a point moves by v + omega x p; J C J^T with J = [1, -p^], seen in the tangent
 /// plane, is the covariance of that; its largest eigenvalue counts.
-pub fn lateral_error(found: &Registration, coverage_factor: f64) -> LateralError {
+pub fn lateral_error(found: &Registration, covariance: &Matrix6<f64>, coverage_factor: f64) -> LateralError {
     let used: Vec<&Deviation> = found.deviations.iter().filter(|d| d.status == PointStatus::Used).collect();
-    let lateral_mm = used.iter().map(|d| lateral_sigma(found, d)).fold(0.0, f64::max);
+    let lateral_mm = used.iter().map(|d| lateral_sigma(covariance, d)).fold(0.0, f64::max);
     let slope = slope(&used);
     LateralError { lateral_mm, slope, error_mm: coverage_factor * lateral_mm * slope }
 }
@@ -64,8 +65,8 @@ pub fn lateral_error(found: &Registration, coverage_factor: f64) -> LateralError
 /// Tells in words why no map may be made from a registration; nothing if one may.
 ///
 /// See the head of this module for the criterion.
-pub fn weak_for_compensation(found: &Registration, limits: &MapLimits) -> Option<String> {
-    let LateralError { lateral_mm, slope, error_mm } = lateral_error(found, limits.coverage_factor);
+pub fn weak_for_compensation(found: &Registration, covariance: &Matrix6<f64>, limits: &MapLimits) -> Option<String> {
+    let LateralError { lateral_mm, slope, error_mm } = lateral_error(found, covariance, limits.coverage_factor);
     let rms_mm = found.verdict.rms_mm;
     let limit_mm = limits.share * rms_mm;
     let beside_mm = limits.coverage_factor * lateral_mm;
@@ -91,8 +92,7 @@ pub fn weak_for_compensation(found: &Registration, limits: &MapLimits) -> Option
 }
 
 /// Standard uncertainty of a point along the surface, in the direction in which it is largest.
-fn lateral_sigma(found: &Registration, deviation: &Deviation) -> f64 {
-    let c = &found.verdict.covariance;
+fn lateral_sigma(c: &Matrix6<f64>, deviation: &Deviation) -> f64 {
     let hat = deviation.point.coords.cross_matrix();
     let block = |i: usize, j: usize| -> Matrix3<f64> { c.fixed_view::<3, 3>(i, j).into_owned() };
     // (v - p^ omega) has the covariance Cvv - Cvw p^T... with p^T = -p^.
@@ -139,6 +139,14 @@ fn slope(used: &[&Deviation]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn of(found: &Registration, coverage_factor: f64) -> LateralError {
+        lateral_error(found, &found.verdict.covariance, coverage_factor)
+    }
+
+    fn weak(found: &Registration, limits: &MapLimits) -> Option<String> {
+        weak_for_compensation(found, &found.verdict.covariance, limits)
+    }
     use crate::geometry::{Point, Pose};
     use crate::registration::{Verdict, WeakDirection};
     use crate::surface::Side;
@@ -194,21 +202,21 @@ mod tests {
 
     #[test]
     fn the_error_of_a_map_is_lateral_uncertainty_times_slope() {
-        let e = lateral_error(&waved([3.4, 1.0, 9.0, 0.0, 0.0, 0.0], false), 2.0);
+        let e = of(&waved([3.4, 1.0, 9.0, 0.0, 0.0, 0.0], false), 2.0);
         assert!((e.lateral_mm - 3.4).abs() < 1e-12, "{e:?}");
         // The steepest slope of the wave is h / w; patches see a little less of it.
         let steepest = HEIGHT_MM / WAVE_MM;
         assert!(e.slope > 0.85 * steepest && e.slope <= steepest, "{e:?}");
         assert!((e.error_mm - 2.0 * e.lateral_mm * e.slope).abs() < 1e-15);
         // A turn about z moves the corners most; turns about x and y move nothing along a flat part through the origin.
-        let e = lateral_error(&waved([0.0, 0.0, 0.0, 1e-2, 1e-2, 2e-4], false), 2.0);
+        let e = of(&waved([0.0, 0.0, 0.0, 1e-2, 1e-2, 2e-4], false), 2.0);
         assert!((e.lateral_mm - 2e-4 * HALF_MM * 2f64.sqrt()).abs() < 1e-9, "{e:?}");
     }
 
     #[test]
     fn noise_of_points_that_lie_close_together_is_no_slope() {
-        let plain = lateral_error(&waved([1.0; 6], false), 2.0).slope;
-        let twins = lateral_error(&waved([1.0; 6], true), 2.0).slope;
+        let plain = of(&waved([1.0; 6], false), 2.0).slope;
+        let twins = of(&waved([1.0; 6], true), 2.0).slope;
         assert!((twins / plain - 1.0).abs() < 0.25, "{twins} against {plain}");
     }
 
@@ -216,16 +224,16 @@ mod tests {
     fn a_map_is_refused_where_the_error_is_above_its_share_and_not_before() {
         let at = |sigma: f64| waved([sigma, 0.0, 0.0, 0.0, 0.0, 0.0], false);
         let limits = MapLimits { place_mm: 1e3, ..MapLimits::default() };
-        let unit = lateral_error(&at(1.0), limits.coverage_factor).error_mm;
+        let unit = of(&at(1.0), limits.coverage_factor).error_mm;
         let border = limits.share * at(1.0).verdict.rms_mm / unit;
-        assert_eq!(weak_for_compensation(&at(0.999 * border), &limits), None);
-        let why = weak_for_compensation(&at(1.001 * border), &limits).unwrap();
+        assert_eq!(weak(&at(0.999 * border), &limits), None);
+        let why = weak(&at(1.001 * border), &limits).unwrap();
         assert!(why.contains("known to 3.4 mm only") && why.contains("Hold the directions in the recipe"), "{why}");
         let near = MapLimits { share: 1e3, ..MapLimits::default() };
-        assert_eq!(weak_for_compensation(&at(0.499), &near), None);
-        let why = weak_for_compensation(&at(0.501), &near).unwrap();
+        assert_eq!(weak(&at(0.499), &near), None);
+        let why = weak(&at(0.501), &near).unwrap();
         assert!(why.contains("might sit 1.00 mm beside its place, allowed are 1.00 mm"), "{why}");
         // Locked directions have no variance.
-        assert_eq!(weak_for_compensation(&at(0.0), &limits), None);
+        assert_eq!(weak(&at(0.0), &limits), None);
     }
 }

@@ -186,7 +186,7 @@ fn what_is_removed_is_gone_and_recorded() {
     let taken_out = TakenOut { motion: "rigid motion but x (registration)".into(), filter: "waves below 3 mm".into() };
     let rows = labelled(&found, &taken_out);
     assert!(rows.iter().all(|row| !row.removed.is_empty() && !row.direction.is_empty() && !row.cut_off.is_empty()));
-    let pv = rows.iter().find(|row| row.name == "PV").unwrap();
+    let pv = rows.iter().find(|row| row.name == "PV of the points").unwrap();
     assert_eq!((pv.unit, pv.removed.as_str()), ("um", "rigid motion but x (registration), piston, tilt, power"));
     assert!(is_about(pv.value, 1e3 * found.pv_mm, 1e-9));
 }
