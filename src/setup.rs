@@ -18,7 +18,7 @@ use crate::device::{AnyCmm, AnyGrinder, Line, Making, MakingError, ModbusSetting
 use crate::drive::{Probing, Programs, Sphere, Task};
 use crate::formats::{self, FormatError, NominalFile};
 use crate::geometry::{Point, Vector};
-use crate::measuring::{Layout, PatternError, Target, targets};
+use crate::measuring::{Expansion, Layout, PatternError, Target, targets};
 use crate::recipe::{NominalSource, Pattern, Recipe, SpindleAxis, StartAt, Um, Wheel};
 use crate::registration::{Coordinate, MapLimits};
 use crate::surface::{DefinedSurface, DefinitionError, Nominal, Projection, Side, SurfaceError};
@@ -129,6 +129,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         tolerance_mm: recipe.acceptance.pv_um.map(|pv| 0.5 * pv.mm()),
         least_found: recipe.measure.minimum_coverage,
         temperature_c: recipe.measure.temperature_c,
+        expansion: expansion(recipe, cell),
         simulation: cell.simulated,
     };
     let mut plan = plan(recipe, cell);
@@ -415,6 +416,19 @@ fn path_wheel(wheel: &Wheel, nominal: &Nominal) -> PathWheel {
             PathWheel::tilted_cup(radius_mm, minor_radius_mm, tilt_deg.map_or_else(sloped, f64::to_radians))
         }
     }
+}
+
+/// How part and scales grow, where the recipe tells it of the part.
+fn expansion(recipe: &Recipe, cell: &CellConfig) -> Option<Expansion> {
+    const MILLIONTH: f64 = 1e-6;
+    let of_part = recipe.part.expansion_um_m_k?;
+    let uncertainty = recipe.part.expansion_uncertainty_um_m_k.unwrap_or(0.1 * of_part.abs());
+    Some(Expansion {
+        part_per_k: MILLIONTH * of_part,
+        part_sigma_per_k: MILLIONTH * uncertainty,
+        scales_per_k: MILLIONTH * cell.cmm.scale_expansion_um_m_k,
+        temperature_sigma_k: cell.cmm.temperature_uncertainty_k,
+    })
 }
 
 fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {

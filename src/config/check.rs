@@ -84,6 +84,8 @@ pub(super) fn check(written: &CellFile, document: &mut Document) -> Checked {
         cmm: cmm_link.filter(|_| complete).map(|link| Cmm {
             link,
             fixture_cmm_from_model: fixture(&cmm.fixture),
+            scale_expansion_um_m_k: cmm.temperature.scale_expansion_um_m_k,
+            temperature_uncertainty_k: cmm.temperature.uncertainty_k,
             reference_sphere: sphere.flatten(),
             travel: travel.flatten(),
         }),

@@ -39,6 +39,10 @@ pub struct Cmm {
     pub link: Link,
     /// Where the fixture holds the part: takes model coordinates to CMM coordinates.
     pub fixture_cmm_from_model: Pose,
+    /// Expansion of its scales in millionths per kelvin, as far as it does not correct that by itself.
+    pub scale_expansion_um_m_k: f64,
+    /// Standard uncertainty of the temperature of the part that it tells.
+    pub temperature_uncertainty_k: f64,
     /// The sphere on which the probe is checked.
     pub reference_sphere: Option<ReferenceSphere>,
     /// The box that the probe's centre must not leave.

@@ -49,6 +49,8 @@ pub(super) struct CmmTable {
     /// Further values that are read and recorded.
     #[schemars(length(max = 64))]
     pub signals: Vec<SignalTable>,
+    /// What it knows of temperatures; looked at where a recipe tells how its part grows.
+    pub temperature: TemperatureTable,
     /// Where the fixture holds the part.
     pub fixture: FixtureTable,
     /// The sphere on which the probe is checked.
@@ -103,6 +105,24 @@ pub(super) struct TimingTable {
     /// Of silence after a broken answer, so that late bytes die out.
     #[schemars(range(min = 0, max = 60000))]
     pub quarantine_ms: u64,
+}
+
+/// What a measuring machine knows of temperatures.
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct TemperatureTable {
+    /// Expansion of its scales in millionths per kelvin, as far as it does not correct that by itself.
+    #[schemars(range(min = -20.0, max = 100.0))]
+    pub scale_expansion_um_m_k: f64,
+    /// Standard uncertainty of the temperature of the part that it tells.
+    #[schemars(range(min = 0.0, max = 20.0))]
+    pub uncertainty_k: f64,
+}
+
+impl Default for TemperatureTable {
+    fn default() -> Self {
+        Self { scale_expansion_um_m_k: 0.0, uncertainty_k: 0.5 }
+    }
 }
 
 /// Where the fixture holds the part: CMM coordinates are the turned model coordinates plus the translation.

@@ -289,7 +289,16 @@ impl<'t> Replay<'t> {
         };
         let (part, sphere) = (read("measured.csv")?, read("reference_sphere.csv")?);
         let coordinates = self.coordinates.unwrap_or(Coordinates::Centres);
-        work::recorded_points(self.task, part, sphere, coordinates).map_err(|why| {
+        let temperature_c = match self.files.get(&(number, work::CONDITIONS_FILE.to_owned())) {
+            Some(file) => {
+                let path = self.run.join(&file.name);
+                let bytes = fs::read(&path).map_err(|source| ReplayError::Scratch { path, source })?;
+                let told: Result<work::Conditions, _> = serde_json::from_slice(&bytes);
+                Some(told.map_err(|error| self.differs(format!("{}: {error}", file.name)))?.temperature_c)
+            }
+            None => None,
+        };
+        work::recorded_points(self.task, part, sphere, (coordinates, temperature_c)).map_err(|why| {
             self.differs(format!("the points of cycle {number} are not what a gate lets through: {why:?}"))
         })
     }

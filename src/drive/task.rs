@@ -10,7 +10,7 @@ use crate::device::{Careful, Coordinates, CorrectionMap, Identified, Pass, Plan,
 use crate::formats::gcode::GcodeError;
 use crate::formats::{CorrectionIdentities, FormatError, Learned, ResultFolder, write_correction};
 use crate::geometry::{Grid, Point, Pose, Sample};
-use crate::measuring::{self, sphere_targets};
+use crate::measuring::{self, Expansion, sphere_targets};
 use crate::model::Form;
 use crate::registration::{
     Deviation, MapLimits, Method, Options, PointStatus, Registration, RegistrationError, Start, register,
@@ -75,6 +75,8 @@ pub struct Task {
     pub least_found: f64,
     /// Least and largest temperature of a measurement that is used, where the recipe has a window.
     pub temperature_c: Option<[f64; 2]>,
+    /// How part and scales grow with their temperature, where the recipe tells it of the part.
+    pub expansion: Option<Expansion>,
     /// Whether the cell is simulated; everything stored is marked so.
     pub simulation: bool,
 }
@@ -182,6 +184,8 @@ pub(super) struct Points {
     pub(super) coordinates: Coordinates,
     /// Standard uncertainty of that; 0 where the radius is the recipe's, which states none.
     pub(super) radius_sigma_mm: f64,
+    /// Temperature of the part in degrees Celsius, where the machine told it.
+    pub(super) temperature_c: Option<f64>,
 }
 
 impl Task {

@@ -7,6 +7,8 @@ use std::borrow::Cow;
 use std::path::Path;
 use std::sync::Arc;
 
+use serde::{Deserialize, Serialize};
+
 use crate::cell::{
     CompensationRefusal, CompensationSummary, Event, Figures, Forecast, FormFigures, Gate, GateFailure, Interval,
     Response,
@@ -15,7 +17,8 @@ use crate::compensation::{self, Correction, ErrorMap, LearningState, NextPassErr
 use crate::device::{Coordinates, Identified, Measurement, Plan, PointStatus, TargetKind};
 use crate::form::pv_of_most;
 use crate::formats::{
-    FormatError, Learned, NominalInput, RegistrationDocument, ResultFolder, save_form, save_registration, write_points,
+    FormatError, Learned, NominalInput, RegistrationDocument, ResultFolder, save_form, save_registration,
+    write_json_atomic, write_points,
 };
 use crate::geometry::{Point, Vector};
 use crate::measuring::fit_sphere;
@@ -41,12 +44,13 @@ pub(super) fn gate_cycle(
         Some(failure) => (0, Err(failure)),
         None => {
             let [part, sphere] = touched(&plan, planned, measurement);
-            (part.len() as u32, gate(task, planned, part, sphere, measurement.coordinates))
+            let told = (measurement.coordinates, measurement.temperature_c.filter(|told| told.is_finite()));
+            (part.len() as u32, gate(task, planned, part, sphere, told))
         }
     };
     let saved = usable.map_err(Unfinished::For).and_then(|points| {
         let made = ResultFolder::prepare(files.folder()).map(ResultFolder::keep);
-        let saved = made.and_then(|()| save_points(files, &points, task.simulation));
+        let saved = made.and_then(|()| save_points(task, files, &points));
         saved.map(|()| points).map_err(|error| match unfinished(error) {
             Unfinished::NotSaved(why) => Unfinished::NotSaved(why),
             Unfinished::For(message) => Unfinished::For(GateFailure::Broken(message)),
@@ -77,7 +81,7 @@ fn gate(
     planned: u32,
     part: Vec<Point>,
     sphere: Vec<Point>,
-    coordinates: Coordinates,
+    (coordinates, temperature_c): (Coordinates, Option<f64>),
 ) -> Result<Points, GateFailure> {
     if part.is_empty() {
         return Err(GateFailure::NoPart);
@@ -92,7 +96,7 @@ fn gate(
         )));
     }
     let (radius_mm, radius_sigma_mm) = (ball.map(|b| b[0]), ball.map_or(0.0, |b| b[1]));
-    Ok(Points { part, sphere, radius_mm, radius_sigma_mm, coordinates })
+    Ok(Points { part, sphere, radius_mm, radius_sigma_mm, temperature_c, coordinates })
 }
 
 /// Returns the points of a measurement that a gate has let through before, from its files.
@@ -100,9 +104,9 @@ pub(super) fn recorded_points(
     task: &Task,
     part: Vec<Point>,
     sphere: Vec<Point>,
-    coordinates: Coordinates,
+    told: (Coordinates, Option<f64>),
 ) -> Result<Points, GateFailure> {
-    gate(task, 0, part, sphere, coordinates)
+    gate(task, 0, part, sphere, told)
 }
 
 /// Share of its stated radius by which a qualified probe may differ: more is another stylus.
@@ -198,11 +202,19 @@ fn registered(
     // The surface wanted by this pass stands above the nominal one by its level, and the ball rolls on that.
     let radius_mm = points.radius_mm.unwrap_or(task.probing.probe_radius_mm);
     let ball_mm = if points.coordinates == Coordinates::Contacts { 0.0 } else { radius_mm };
+    let grown = task.expansion.as_ref().zip(points.temperature_c);
+    let (ball_mm, part, scale_sigma) = match grown {
+        Some((expansion, told_c)) => {
+            let part = Cow::Owned(expansion.at_reference(&points.part, told_c));
+            (ball_mm / expansion.measured(told_c), part, expansion.sigma(told_c))
+        }
+        None => (ball_mm, Cow::Borrowed(&points.part), 0.0),
+    };
     let probe_radius_mm = (ball_mm + cycle.correction.level_mm).max(0.0);
-    let (mut found, options) = task.register(&points.part, probe_radius_mm).map_err(unfinished)?;
+    let (mut found, options) = task.register(&part, probe_radius_mm).map_err(unfinished)?;
     found.allow_for_radius(points.radius_sigma_mm);
     save(task, files, &found, &options).map_err(unfinished)?;
-    let form = Form::of(&found, &Given { priors: None, radius_sigma_mm: points.radius_sigma_mm });
+    let form = Form::of(&found, &Given { priors: None, radius_sigma_mm: points.radius_sigma_mm, scale_sigma });
     if let Ok(form) = &form {
         for name in ["form.csv", "model.json"] {
             files.place(name);
@@ -219,6 +231,10 @@ fn registered(
     let forecast = known.as_ref().zip(error.as_ref()).map(|(known, error)| known.forecast(error));
     let mut figures = figures(task, cycle, &found, form.as_ref().ok(), error.as_ref(), answer, forecast);
     figures.warnings.extend(error.iter().flat_map(|map| map.advice.iter().cloned()).chain(offered));
+    if task.expansion.is_some() && grown.is_none() {
+        let message = "the measurement does not tell its temperature: the growth of the part is not taken off (part.expansion_um_m_k)";
+        figures.warnings.push(message.to_owned());
+    }
     let untold = |error| {
         format!("form and scatter of the probe could not be told apart, so U is less than it should be: {error}")
     };
@@ -421,9 +437,24 @@ pub(super) fn learned(task: &Task, run: String, cycle: &Cycle) -> Option<Learned
     Some(Learned::new(simulation, setting, run, correction, known.clone()))
 }
 
-/// Writes the points of a measurement, in the CMM frame.
-fn save_points(files: &mut Files, points: &Points, simulation: bool) -> Result<(), FormatError> {
-    let header = if simulation { "# SIMULATION\nx_mm,y_mm,z_mm" } else { "x_mm,y_mm,z_mm" };
+/// Where it stands.
+pub(super) const CONDITIONS_FILE: &str = "measured.json";
+
+/// What a measurement was made in, as far as the registration goes by it.
+#[derive(Serialize, Deserialize)]
+pub(super) struct Conditions {
+    simulation: bool,
+    /// Of the part, in degrees Celsius.
+    pub(super) temperature_c: f64,
+}
+
+/// Writes the points of a measurement, in the CMM frame, and what they were measured in.
+fn save_points(task: &Task, files: &mut Files, points: &Points) -> Result<(), FormatError> {
+    if let Some(temperature_c) = points.temperature_c.filter(|_| task.expansion.is_some()) {
+        let conditions = Conditions { simulation: task.simulation, temperature_c };
+        write_json_atomic(files.place(CONDITIONS_FILE), &conditions)?;
+    }
+    let header = if task.simulation { "# SIMULATION\nx_mm,y_mm,z_mm" } else { "x_mm,y_mm,z_mm" };
     if !points.sphere.is_empty() {
         write_points(files.place("reference_sphere.csv"), header, &points.sphere)?;
     }

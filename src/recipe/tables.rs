@@ -73,6 +73,12 @@ pub struct Part {
     /// Number of its drawing.
     #[schemars(length(min = 1, max = 80))]
     pub drawing: Option<String>,
+    /// Expansion of the part in millionths per kelvin: a measurement that tells its temperature is taken to 20 degrees Celsius by it.
+    #[schemars(range(min = -20.0, max = 100.0), example = 0.55)]
+    pub expansion_um_m_k: Option<f64>,
+    /// Its standard uncertainty; left out, a tenth of it.
+    #[schemars(range(min = 0.0, max = 100.0))]
+    pub expansion_uncertainty_um_m_k: Option<f64>,
 }
 
 /// What the surface shall be: `file`, or the tables surface and aperture.

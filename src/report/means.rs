@@ -38,6 +38,13 @@ pub(super) fn means(story: &Story, registration: Option<&Value>) -> String {
     format!("<h2>Machines, wheel and probe</h2>\n<table id=\"means\">\n{rows}</table>\n")
 }
 
+/// Reads what the model says of the measurement whose registration this is; none where it says nothing.
+pub(super) fn last_model(story: &Story, folder: &Path) -> Option<Value> {
+    let registration = story.cycles.values().rev().find_map(|of| of.registration.as_ref())?;
+    let bytes = fs::read(folder.join(registration).with_file_name("model.json")).ok()?;
+    serde_json::from_slice(&bytes).ok()
+}
+
 /// Reads how the last measurement was registered; none where none was.
 pub(super) fn last_registration(story: &Story, folder: &Path) -> Result<Option<(u32, Value)>, ReportError> {
     let last = story.cycles.iter().rev().find_map(|(cycle, of)| Some((*cycle, of.registration.as_ref()?)));
@@ -50,14 +57,19 @@ pub(super) fn last_registration(story: &Story, folder: &Path) -> Result<Option<(
 }
 
 /// Where the part lay, and how well that is known.
-pub(super) fn registered(cycle: u32, found: &Value) -> String {
+pub(super) fn registered(cycle: u32, found: &Value, model: Option<&Value>) -> String {
     let number = |key: &str| found[key].as_f64();
     let count = |key: &str| found[key].as_array().map_or(0, Vec::len);
     let um = |mm: f64| format!("{:.2} \u{b5}m", 1e3 * mm);
-    let sigma = |key: &str| found["standard_uncertainty"][key].as_f64();
-    let shift = ["x_mm", "y_mm", "z_mm"].map(|key| sigma(key).map_or("held".to_owned(), um)).join(", ");
-    let turn = ["rx_rad", "ry_rad", "rz_rad"]
-        .map(|key| sigma(key).map_or("held".to_owned(), |rad| format!("{:.2} \u{b5}rad", 1e6 * rad)));
+    // A direction that is held has no uncertainty in one file, and 0 in the other.
+    let place = |stated: &Value| {
+        let sigma = |key: &str| stated[key].as_f64().filter(|sigma| *sigma > 0.0);
+        let shift = ["x_mm", "y_mm", "z_mm"].map(|key| sigma(key).map_or("held".to_owned(), um)).join(", ");
+        let turn = ["rx_rad", "ry_rad", "rz_rad"]
+            .map(|key| sigma(key).map_or("held".to_owned(), |rad| format!("{:.2} \u{b5}rad", 1e6 * rad)));
+        format!("{shift} along x, y, z; {} about x, y, z", turn.join(", "))
+    };
+    let frame = model.map_or("not told".to_owned(), |model| place(&model["frame_standard_uncertainty"]));
     let converged = if found["converged"] == true { "converged" } else { "not converged" };
     let points = |key: &str| number(key).map_or("-".to_owned(), |n| format!("{n:.0}"));
     let verdict = format!(
@@ -82,7 +94,8 @@ pub(super) fn registered(cycle: u32, found: &Value) -> String {
     let mut html = format!("<h2>Registration, cycle {cycle}</h2>\n<table id=\"registration\">\n");
     for (key, value) in [
         ("Fit", verdict),
-        ("Standard uncertainty of the place", format!("{shift} along x, y, z; {} about x, y, z", turn.join(", "))),
+        ("The same pose is found again to", place(&found["standard_uncertainty"])),
+        ("The nominal frame is known beside the form to", frame),
         ("To be known", remarks),
     ] {
         let _ = writeln!(html, "<tr><th>{key}</th><td>{}</td></tr>", escaped(&value));

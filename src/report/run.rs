@@ -14,7 +14,7 @@ use super::ReportError;
 use super::axis::three_digits;
 use super::course::convergence;
 use super::maps::{maps, within_html};
-use super::means::{last_registration, means, registered, signatures};
+use super::means::{last_model, last_registration, means, registered, signatures};
 use super::story::{Measurement, Story};
 use super::words::{alarm_words, ending_words, home_words, judgement_words, role_words, verdict_words};
 use regrind_cell::{Compared, Conformity, Ending, Figures, Tolerance};
@@ -78,7 +78,8 @@ fn html(story: &Story, folder: &Path, verified: &Verified) -> Result<String, Rep
         let _ = writeln!(html, "<figure>{}</figure>", within_html(&plot));
     }
     html += &maps(story, folder, &begin)?;
-    html += &registration.map_or(String::new(), |(cycle, found)| registered(cycle, &found));
+    html += &registration
+        .map_or(String::new(), |(cycle, found)| registered(cycle, &found, last_model(story, folder).as_ref()));
     html += &form(story, folder)?;
     html += &alarms(story);
     html += &orders(story);

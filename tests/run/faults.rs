@@ -3,7 +3,7 @@
 
 #![cfg(unix)]
 
-use crate::worlds::{JOB, Ran, Setup, run};
+use crate::worlds::{JOB, Ran, Setup, run, table};
 use regrind::cell::{AlarmId, Ending};
 use regrind_sim::spec::{Faults, Mirrored, Misreported};
 
@@ -134,6 +134,33 @@ fn a_measurement_outside_its_window_of_temperature_is_not_used() {
     caught("a warm part", warm, AlarmId::Temperature, words, 1);
     let words = &["it was 20.00 degrees Celsius, and 20.50 to 21.00 degrees"];
     caught("a window above the part", window(20.5, 21.0), AlarmId::Temperature, words, 1);
+}
+
+#[test]
+fn a_warm_part_is_judged_by_what_it_is_at_20_degrees() {
+    // Ten kelvins at 8e-6 a kelvin: a curved part swells out of its own shape.
+    let at = |temperature_c: f64, expansion_um_m_k: Option<f64>| {
+        let setup = Setup { expansion_um_m_k, ..Setup::new(RECIPE, 1) };
+        let setup = setup.with(move |world| {
+            (world.cmm.part_temperature_c, world.cmm.cte_per_k, world.cmm.noise_um) = (temperature_c, 8e-6, 0.05);
+        });
+        let ran = run(setup);
+        let column = |row: Vec<f64>| row[6];
+        let deviations: Vec<f64> = table(&ran.folder.join("cycle-1/deviations.csv")).into_iter().map(column).collect();
+        let told = ran.folder.join("cycle-1/measured.json");
+        (deviations, std::fs::read_to_string(told).ok())
+    };
+    let (cold, _) = at(20.0, None);
+    let (plain, untold) = at(30.0, None);
+    let (taken_off, told) = at(30.0, Some(8.0));
+    let rms = |of: &[f64]| {
+        let squares: f64 = of.iter().zip(&cold).map(|(a, b)| (a - b).powi(2)).sum();
+        1e3 * (squares / cold.len() as f64).sqrt()
+    };
+    let [plain_um, taken_off_um] = [rms(&plain), rms(&taken_off)];
+    println!("growth leaves {plain_um:.3} um rms, and {taken_off_um:.4} where it is taken off");
+    assert!(plain_um > 0.08 && taken_off_um < 0.005, "{plain_um} {taken_off_um}");
+    assert!(untold.is_none() && told.is_some_and(|told| told.contains("\"temperature_c\": 30.0")));
 }
 
 #[test]

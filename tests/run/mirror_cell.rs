@@ -125,8 +125,8 @@ fn raw_tracker_files_become_a_measurement_and_no_map_while_the_plane_is_free() {
         println!("{lateral:?}\n{}", why.as_deref().unwrap_or("a map may be made"));
         let why = why.expect("refused");
         assert!(
-            why.contains("x and y shift: known to 3.")
-                && why.contains("rotation about z: known to")
+            why.contains("x and y shift: found again to 3.")
+                && why.contains("rotation about z: found again to")
                 && why.contains("Hold the directions in the recipe"),
             "{why}"
         );

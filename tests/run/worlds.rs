@@ -52,13 +52,24 @@ pub struct Setup {
     pub version: u16,
     /// What the recipe says of the temperature of a measurement.
     pub temperature_c: Option<[f64; 2]>,
+    /// What the recipe says of the growth of the part.
+    pub expansion_um_m_k: Option<f64>,
 }
 
 impl Setup {
     /// A recipe as it is, with a seed.
     pub fn new(recipe: &'static str, seed: u64) -> Self {
         let world = Box::new(|_: &mut WorldSpec| {});
-        Self { recipe, seed, world, exchanged: false, other_word_order: false, version: 2, temperature_c: None }
+        Self {
+            recipe,
+            seed,
+            world,
+            exchanged: false,
+            other_word_order: false,
+            version: 2,
+            temperature_c: None,
+            expansion_um_m_k: None,
+        }
     }
 
     /// The same in another world.
@@ -242,6 +253,7 @@ async fn go(setup: Setup) -> Ran {
     let folder = home.path().join("run");
     let mut recipe = Recipe::read(&root().join(format!("recipes/{}.toml", setup.recipe))).unwrap();
     recipe.measure.temperature_c = setup.temperature_c;
+    recipe.part.expansion_um_m_k = setup.expansion_um_m_k;
     let cell = CellConfig::read(&root().join("config/sim.toml")).unwrap();
     let (task, plan) = setup::prepare(&recipe, &cell).unwrap();
     let probe_radius_mm = recipe.measure.probe_radius_mm;

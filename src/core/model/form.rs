@@ -93,6 +93,11 @@ impl Form {
             deviations_mm: used.iter().map(|d| d.deviation_mm).collect(),
             effects: motions.rows(used.iter().map(|d| (d.point, d.normal))),
         };
+        // What a standard uncertainty of each adds to every point.
+        let alike = DMatrix::from_fn(used.len(), 2, |r, c| match c {
+            0 => given.radius_sigma_mm,
+            _ => given.scale_sigma * (used[r].point - motions.centre).dot(&used[r].normal),
+        });
         let priors = given.priors.unwrap_or_else(|| Priors::of_size(motions.size_mm));
         let mut told = Hyper::told(&observed, &priors)?;
         let hyper = told.likely[0].0;
@@ -102,9 +107,9 @@ impl Form {
             told.likely.push((told.wide, 1.0));
             told.likely.iter_mut().for_each(|(_, weight)| *weight = 1.0);
         }
-        let frame_covariance = motions.to_twist(&of_the_fit(&observed, told.wide, given.radius_sigma_mm));
+        let frame_covariance = motions.to_twist(&of_the_fit(&observed, told.wide, &alike));
         let drawn = Drawn::of(&observed, &told.likely)?;
-        let drawn = drawn.with_the_unknown(told.scatter_u, given.radius_sigma_mm).after_best_fit();
+        let drawn = drawn.with_the_unknown(told.scatter_u, &alike).after_best_fit();
         Ok(Self { hyper, frame_covariance, points: drawn.points(), figures: drawn.figures(is_seen), is_seen })
     }
 }
@@ -116,11 +121,13 @@ pub struct Given {
     pub priors: Option<Priors>,
     /// Standard uncertainty of the radius of the probe: it moves every point along its normal alike.
     pub radius_sigma_mm: f64,
+    /// Standard uncertainty of all lengths, as a share of them: that of temperature and expansion.
+    pub scale_sigma: f64,
 }
 
 /// The covariance of the motions as the registration finds them, by least squares of deviations that a form makes alike: A+ (K + s^2) A+'
-/// with A+ = (H'H)^-1 H' (Aitken 1935), and of the radius of the probe. Of many points some tell the part of the form.
-fn of_the_fit(observed: &Observed, hyper: Hyper, radius_sigma_mm: f64) -> DMatrix<f64> {
+/// with A+ = (H'H)^-1 H' (Aitken 1935), and of what adds to all points alike. Of many points some tell the part of the form.
+fn of_the_fit(observed: &Observed, hyper: Hyper, alike: &DMatrix<f64>) -> DMatrix<f64> {
     let Observed { places, effects, .. } = observed;
     let inverse = |rows: &DMatrix<f64>| {
         rows.tr_mul(rows).pseudo_inverse(f64::EPSILON).unwrap_or_else(|_| DMatrix::zeros(rows.ncols(), rows.ncols()))
@@ -144,15 +151,16 @@ fn of_the_fit(observed: &Observed, hyper: Hyper, radius_sigma_mm: f64) -> DMatri
         })
         .collect();
     let covered = DMatrix::from_row_slice(chosen.len(), p, &covered);
-    // What moves all points alike.
-    let of_radius = weights.row_sum().transpose() * radius_sigma_mm;
-    by_scatter + weights.tr_mul(&covered) + &of_radius * of_radius.transpose()
+    let of_alike = weights.tr_mul(&alike.select_rows(&chosen));
+    by_scatter + weights.tr_mul(&covered) + &of_alike * of_alike.transpose()
 }
 
 /// Forms that may have been, a column each, and what was observed at their places.
 struct Drawn {
     forms: DMatrix<f64>,
     observed: Observed,
+    /// Which of the points they are.
+    chosen: Vec<usize>,
 }
 
 impl Drawn {
@@ -180,19 +188,20 @@ impl Drawn {
             forms = forms.resize(rows, before + count, 0.0);
             forms.columns_mut(before, count).copy_from(&drawn);
         }
-        Ok(Self { forms, observed: seen })
+        Ok(Self { forms, observed: seen, chosen })
     }
 
-    /// Takes in that the scatter is known to a share of itself only, and the radius of the probe to some length.
+    /// Takes in that the scatter is known to a share of itself only, and what adds to all points alike: a column a standard uncertainty.
     ///
     /// What a form leaves of the observations is the scatter, and that may be as much larger or smaller; the motions are taken off afterwards.
-    fn with_the_unknown(mut self, scatter_u: f64, radius_sigma_mm: f64) -> Self {
+    fn with_the_unknown(mut self, scatter_u: f64, alike: &DMatrix<f64>) -> Self {
         let mut normals = Normals::new(2, 0);
         for mut form in self.forms.column_iter_mut() {
             let share = (scatter_u * normals.next()).exp() - 1.0;
-            let radius_mm = radius_sigma_mm * normals.next();
-            for (value, observed) in form.iter_mut().zip(&self.observed.deviations_mm) {
-                *value -= share * (observed - *value) + radius_mm;
+            let times: Vec<f64> = (0..alike.ncols()).map(|_| normals.next()).collect();
+            for ((value, observed), &row) in form.iter_mut().zip(&self.observed.deviations_mm).zip(&self.chosen) {
+                let more: f64 = times.iter().zip(alike.row(row).iter()).map(|(times, one)| times * one).sum();
+                *value -= share * (observed - *value) + more;
             }
         }
         self

@@ -2,6 +2,7 @@
 
 use thiserror::Error;
 
+use super::options::Coordinate;
 use crate::surface::SurfaceError;
 
 /// Why a registration cannot be had.
@@ -16,8 +17,17 @@ pub enum RegistrationError {
          (radius 0) the points are contact points: register with the method `contact`"
     )]
     ProbeRadius { radius_mm: f64, limit_mm: f64 },
-    #[error("there are {points} measured points and at least {least} are needed; measure more")]
+    #[error(
+        "there are {points} measured points and at least {least} are needed, one more than the pose has free directions; measure more, or \
+         hold what the fixture knows"
+    )]
     TooFewPoints { points: usize, least: usize },
+    #[error(
+        "the measured points are a line, or next to one: {width_mm:.3} mm wide, with {distance_mm:.3} mm from point to point; they do not \
+         tell how the part is turned about that line, nor where it lies across it; measure a strip of {least_mm:.3} mm at least, or start \
+         at a pose and hold {} and {}", hold[0].name(), hold[1].name()
+    )]
+    Narrow { width_mm: f64, distance_mm: f64, least_mm: f64, hold: [Coordinate; 2] },
     #[error("measured point {} is not finite; remove it or correct it", index + 1)]
     NotFinite { index: usize },
     #[error("all {points} measured points lie on one line; a pose needs points off it")]

@@ -143,7 +143,7 @@ impl Problem<'_> {
     /// Returns the best step of the linear problem within the ball, along the directions that are free and seen; eq. (15).
     fn step_within(&self, ball_radius: f64, at: &Standing) -> Result<BallStep, RegistrationError> {
         let sums = &at.sums;
-        if sums.points < 6 {
+        if sums.points < self.locked.iter().filter(|locked| !**locked).count() {
             return Err(RegistrationError::TooFewUsed { used: sums.points, points: self.measured.len() });
         }
         let free = free_directions(&self.locked, &at.scaling);

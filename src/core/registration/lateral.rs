@@ -181,7 +181,7 @@ mod tests {
         }
         let n = deviations.len() as f64;
         let objective_mm2 = deviations.iter().map(|d| d.deviation_mm * d.deviation_mm).sum::<f64>();
-        let words = "x and y shift: known to 3.4 mm only".to_owned();
+        let words = "x and y shift: found again to 3.4 mm only".to_owned();
         let verdict = Verdict {
             used: deviations.len(),
             objective_mm2,
@@ -228,7 +228,10 @@ mod tests {
         let border = limits.share * at(1.0).verdict.rms_mm / unit;
         assert_eq!(weak(&at(0.999 * border), &limits), None);
         let why = weak(&at(1.001 * border), &limits).unwrap();
-        assert!(why.contains("known to 3.4 mm only") && why.contains("Hold the directions in the recipe"), "{why}");
+        assert!(
+            why.contains("found again to 3.4 mm only") && why.contains("Hold the directions in the recipe"),
+            "{why}"
+        );
         let near = MapLimits { share: 1e3, ..MapLimits::default() };
         assert_eq!(weak(&at(0.499), &near), None);
         let why = weak(&at(0.501), &near).unwrap();

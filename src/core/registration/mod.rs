@@ -20,6 +20,7 @@ mod error;
 mod iterate;
 mod lateral;
 mod linearize;
+mod narrow;
 mod options;
 mod part;
 mod radius;
@@ -51,7 +52,7 @@ pub use verdict::{Verdict, WeakDirection};
 
 /// Registers measured points to a nominal surface.
 ///
-/// Shapes: at least 7 measured points, in any order; the deviations come back in the same order. Frames: the points are in the
+/// Shapes: measured points in any order, at least one more than there are free directions; the deviations come back in the same order. Frames: the points are in the
 /// CMM frame, the surface in the model frame, and the pose takes the latter to the former. Units: millimetres. Equations: (3),
 /// (7) to (15) of the paper.
 ///
@@ -59,6 +60,7 @@ pub use verdict::{Verdict, WeakDirection};
 /// Input that cannot be registered, a cloud that does not fit the surface, and an iteration that does not converge.
 pub fn register(nominal: &Nominal, measured: &[Point], options: &Options) -> Result<Registration, RegistrationError> {
     let part = Part::check(nominal, measured, options)?;
+    narrow::check_thread(measured, options)?;
     let mut registration =
         fit(&part, measured, options).map_err(|error| or_mirrored(&part, measured, options, error))?;
     confirm(&part, &registration, measured, options)?;
@@ -120,6 +122,7 @@ fn report(
 
 /// Refuses a fit that is none: a cloud of another part, or a mirror image.
 fn confirm(part: &Part, found: &Registration, measured: &[Point], options: &Options) -> Result<(), RegistrationError> {
+    narrow::check_strip(&found.deviations, options)?;
     let rms_mm = found.verdict.rms_mm;
     let limit_mm = part.rms_limit_mm(options);
     let doubtful = rms_mm > limit_mm || rms_mm > (0.02 * part.nominal.relief_mm()).max(10.0 * LEAST_SIGMA_MM);

@@ -83,6 +83,11 @@ pub enum Coordinate {
 }
 
 impl Coordinate {
+    /// Returns its name, as recipes and commands have it.
+    pub fn name(self) -> &'static str {
+        ["x", "y", "z", "rx", "ry", "rz"][self as usize]
+    }
+
     /// Returns which of x, y, z, rx, ry, rz are among some coordinates, as [`Options::locked`] has them.
     pub fn locked(coordinates: &[Self]) -> [bool; 6] {
         [Self::X, Self::Y, Self::Z, Self::Rx, Self::Ry, Self::Rz].map(|coordinate| coordinates.contains(&coordinate))

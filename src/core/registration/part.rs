@@ -33,9 +33,13 @@ impl<'a> Part<'a> {
         measured: &[Point],
         options: &Options,
     ) -> Result<Self, RegistrationError> {
-        const LEAST: usize = 7;
-        if measured.len() < LEAST {
-            return Err(RegistrationError::TooFewPoints { points: measured.len(), least: LEAST });
+        if options.locked == [true; 6] {
+            return Err(RegistrationError::Undetermined);
+        }
+        // One more than the free directions, or nothing is left to tell how well it fits.
+        let least = 7 - options.locked.iter().filter(|locked| **locked).count();
+        if measured.len() < least {
+            return Err(RegistrationError::TooFewPoints { points: measured.len(), least });
         }
         if let Some(index) = measured.par_iter().position_first(|p| !(p.x + p.y + p.z).is_finite()) {
             return Err(RegistrationError::NotFinite { index });
@@ -44,9 +48,6 @@ impl<'a> Part<'a> {
             return Err(RegistrationError::Collinear { points: measured.len() });
         }
         check_repeats(measured)?;
-        if options.locked == [true; 6] {
-            return Err(RegistrationError::Undetermined);
-        }
         let (middle, size_mm) = middle_and_size(measured);
         let nominal_mm = nominal.size_mm();
         check_sizes(size_mm, nominal_mm)?;

@@ -1,5 +1,7 @@
 //! How well the pose is known, which way it is not, and what each deviation is worth.
 
+use std::collections::HashMap;
+
 use nalgebra::{DMatrix, Matrix6, Vector6};
 use rayon::prelude::*;
 
@@ -53,7 +55,7 @@ pub struct Verdict {
 /// A direction in which the pose is badly known.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct WeakDirection {
-    /// In words: "x and y shift: known to 3.4 mm only".
+    /// In words: "x and y shift: found again to 3.4 mm only".
     pub words: String,
     /// Whether the direction could not be seen at all and was held where it began.
     pub held: bool,
@@ -279,11 +281,11 @@ fn weakly_seen(scaled: &Matrix6<f64>, sigma_mm: f64, scaling: &Scaling, some_hel
             let names: Vec<&str> = group.iter().map(|k| ["x", "y", "z"][k % 3]).collect();
             let names = names.join(" and ");
             let words = if kind == "shift" {
-                format!("{names} shift: known to {} only", length(at_rim[worst]))
+                format!("{names} shift: found again to {} only", length(at_rim[worst]))
             } else {
                 let angle = at_rim[worst] / scaling.size_mm;
                 format!(
-                    "rotation about {names}: known to {:.2} mrad only, {} at the rim",
+                    "rotation about {names}: found again to {:.2} mrad only, {} at the rim",
                     1e3 * angle,
                     length(at_rim[worst])
                 )
@@ -307,22 +309,48 @@ pub(super) fn length(mm: f64) -> String {
     }
 }
 
-/// Returns the share of the surface's cells that hold a point which was used.
+/// Returns the share of the surface that points which were used lie on.
 ///
-/// A cell is a cube with an edge of a fifteenth of the surface's rms size, or three times the mean distance of the points
-/// where these are sparser: small enough to see a missing corner, large enough that a full pattern leaves no cell empty.
+/// Of many points it is counted in cubes with an edge of a fifteenth of the surface's rms size, small enough to see a missing corner. Of
+/// few a place is covered that has a point within little more than the distance at which as many points would lie all over it: a full
+/// pattern leaves no gap, and a line covers no more than its own strip.
 pub(crate) fn coverage(nominal: &Nominal, deviations: &[Deviation]) -> f64 {
     const MOST: usize = 50_000;
+    // A disc and a rectangle have an area of some 2.5^2 times the square of their rms size.
+    const SIDE: f64 = 2.5;
+    const WITHIN: f64 = 1.1;
     let size = nominal.size_mm();
     let stride = deviations.len().div_ceil(MOST);
     let used: Vec<&Deviation> = deviations.iter().step_by(stride).filter(|d| d.status == PointStatus::Used).collect();
-    let edge = (size / 15.0).max(3.0 * 3.5 * size / (used.len() as f64).sqrt());
+    let edge = size / 15.0;
+    let within = WITHIN * SIDE * size / (used.len() as f64).sqrt();
+    if within > 0.5 * edge {
+        return covered_within(within, &nominal.sample(4_000), &used);
+    }
     let sample = nominal.sample(20_000);
     let mut cells = Cells::around(&sample, edge);
     for deviation in used {
         cells.touch(&deviation.point);
     }
     sample.iter().filter(|p| cells.is_touched(p)).count() as f64 / sample.len() as f64
+}
+
+/// The share of some places that have a point within a distance.
+fn covered_within(within_mm: f64, places: &[Point], used: &[&Deviation]) -> f64 {
+    let cell = |p: &Point| [p.x, p.y, p.z].map(|c| (c / within_mm).floor() as i64);
+    let mut points: HashMap<[i64; 3], Vec<Point>> = HashMap::new();
+    for deviation in used {
+        points.entry(cell(&deviation.point)).or_default().push(deviation.point);
+    }
+    let around = |p: &Point| {
+        let at = cell(p);
+        (0..27).map(move |k: i64| [at[0] + k % 3 - 1, at[1] + k / 3 % 3 - 1, at[2] + k / 9 - 1])
+    };
+    let near = |p: &&Point| {
+        let near = around(p).filter_map(|cell| points.get(&cell)).flatten();
+        near.into_iter().any(|other| (other - **p).norm_squared() <= within_mm * within_mm)
+    };
+    places.iter().filter(near).count() as f64 / places.len().max(1) as f64
 }
 
 /// Cubes around some points, and which of them were touched.

@@ -9,6 +9,7 @@ mod form;
 mod learning;
 mod map;
 mod model;
+mod narrow;
 mod paper;
 mod parameters;
 mod parts;

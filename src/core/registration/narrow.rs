@@ -1,0 +1,135 @@
+//! Clouds that are hardly wider than a line: a scan line, a few rows.
+//!
+//! A line of points fits a curved surface in poses that are centimetres apart, and the scatter says of each that it is exact: what turns the
+//! part about the line moves no point far. So such a cloud is refused, unless what it cannot tell is held: the turn about it, and the
+//! shift across it.
+//!
+//! Two looks. Before any pose is tried: do the points follow each other like beads on a thread? After the fit: how wide is the strip of
+//! the contacts along the surface, in distances from point to point?
+
+use nalgebra::{Matrix3, SymmetricEigen};
+
+use super::deviation::{Deviation, PointStatus};
+use super::error::RegistrationError;
+use super::options::{Coordinate, Options, Start};
+use crate::geometry::{Point, Pose, Vector};
+
+/// A cloud narrower than so many distances from point to point tells nothing across.
+const LEAST_DISTANCES: f64 = 2.5;
+/// From end to end of a thread, point by point, it is no farther than so many times its extent.
+const THREAD: f64 = 2.0;
+/// Points that are looked at, at most.
+const MOST: usize = 600;
+/// A cloud that is wider than this share of its length is not narrow, however few its points are.
+const WIDE: f64 = 0.2;
+
+/// Refuses a thread before a pose is tried.
+pub(super) fn check_thread(measured: &[Point], options: &Options) -> Result<(), RegistrationError> {
+    let few: Vec<Point> = measured.iter().step_by(measured.len().div_ceil(MOST)).copied().collect();
+    let Some(_) = Thread::of(few) else { return Ok(()) };
+    let Some(thread) = Thread::of(measured.to_vec()) else { return Ok(()) };
+    let model_from_cmm = match &options.start {
+        Start::Pose(pose) => pose.inverse(),
+        Start::Search => Pose::identity(),
+    };
+    let needed = untold(model_from_cmm.direction(&thread.axis), Vector::z());
+    if are_held(&needed, options) { Ok(()) } else { Err(refused(thread.width_mm, thread.distance_mm, needed)) }
+}
+
+/// Points that follow each other along a line, which may be bent.
+struct Thread {
+    axis: Vector,
+    width_mm: f64,
+    distance_mm: f64,
+}
+
+impl Thread {
+    /// Taken in the order along the longest axis, the points of a plane go to and fro across it, and those of a line do not.
+    fn of(mut points: Vec<Point>) -> Option<Self> {
+        let (middle, axes) = principal(points.iter().copied());
+        let axis: Vector = axes.column(2).into();
+        let at = |p: &Point| (p - middle).dot(&axis);
+        points.sort_by(|a, b| at(a).total_cmp(&at(b)));
+        let extent_mm = at(points.last()?) - at(points.first()?);
+        let path_mm: f64 = points.windows(2).map(|two| (two[1] - two[0]).norm()).sum();
+        if path_mm > THREAD * extent_mm {
+            return None;
+        }
+        let beside = points.windows(3).map(|beads| {
+            let chord = beads[2] - beads[0];
+            chord.cross(&(beads[1] - beads[0])).norm() / chord.norm().max(f64::MIN_POSITIVE)
+        });
+        let width_mm = 2.0 * median(&mut beside.collect::<Vec<_>>());
+        let distance_mm = path_mm / (points.len() - 1) as f64;
+        (width_mm <= WIDE * extent_mm).then_some(Self { axis, width_mm, distance_mm })
+    }
+}
+
+/// Refuses a strip of contacts that is too narrow for its points.
+pub(super) fn check_strip(deviations: &[Deviation], options: &Options) -> Result<(), RegistrationError> {
+    let used = || deviations.iter().filter(|d| d.status == PointStatus::Used);
+    let normal = used().map(|d| d.normal).sum::<Vector>();
+    if normal.norm() == 0.0 {
+        return Ok(());
+    }
+    let normal = normal.normalize();
+    let flat = |d: &Deviation| d.point - normal * d.point.coords.dot(&normal);
+    let (middle, axes) = principal(used().map(flat));
+    let [across, along]: [Vector; 2] = [1, 2].map(|k| axes.column(k).into());
+    let extent = |axis: &Vector| {
+        // Of a strip that is evenly filled: sqrt(12) times its standard deviation.
+        let (sum, n) = used().fold((0.0, 0.0), |(sum, n), d| (sum + (flat(d) - middle).dot(axis).powi(2), n + 1.0));
+        (12.0 * sum / n).sqrt()
+    };
+    let (width_mm, length_mm) = (extent(&across), extent(&along));
+    if width_mm > WIDE * length_mm {
+        return Ok(());
+    }
+    let contacts: Vec<Point> = used().map(|d| d.point).collect();
+    let mut nearest: Vec<f64> = (0..contacts.len())
+        .step_by(contacts.len().div_ceil(MOST))
+        .map(|k| {
+            let others = contacts.iter().enumerate().filter(|(other, _)| *other != k);
+            others.map(|(_, p)| (p - contacts[k]).norm_squared()).fold(f64::INFINITY, f64::min).sqrt()
+        })
+        .collect();
+    // Rows may lie nearer to each other than their points do.
+    let distance_mm = median(&mut nearest).max((width_mm * length_mm / contacts.len() as f64).sqrt());
+    let needed = untold(along, normal);
+    if width_mm < LEAST_DISTANCES * distance_mm && !are_held(&needed, options) {
+        return Err(refused(width_mm, distance_mm, needed));
+    }
+    Ok(())
+}
+
+/// The turn about a line and the shift across it, as the coordinates nearest to them.
+fn untold(line: Vector, normal: Vector) -> [Coordinate; 2] {
+    const SHIFTS: [Coordinate; 3] = [Coordinate::X, Coordinate::Y, Coordinate::Z];
+    const TURNS: [Coordinate; 3] = [Coordinate::Rx, Coordinate::Ry, Coordinate::Rz];
+    [SHIFTS[normal.cross(&line).iamax()], TURNS[line.iamax()]]
+}
+
+fn are_held(needed: &[Coordinate; 2], options: &Options) -> bool {
+    let held = Coordinate::locked(needed);
+    held.iter().zip(&options.locked).all(|(needed, locked)| !needed || *locked)
+}
+
+fn refused(width_mm: f64, distance_mm: f64, hold: [Coordinate; 2]) -> RegistrationError {
+    RegistrationError::Narrow { width_mm, distance_mm, least_mm: LEAST_DISTANCES * distance_mm, hold }
+}
+
+/// The middle of points, and their principal axes from the shortest to the longest.
+fn principal(points: impl Iterator<Item = Point> + Clone) -> (Point, Matrix3<f64>) {
+    let n = points.clone().count().max(1) as f64;
+    let middle = Point::from(points.clone().map(|p| p.coords).sum::<Vector>() / n);
+    let spread = points.map(|p| (p - middle) * (p - middle).transpose()).sum::<Matrix3<f64>>();
+    let SymmetricEigen { eigenvalues, eigenvectors } = spread.symmetric_eigen();
+    let mut order = [0, 1, 2];
+    order.sort_by(|a, b| eigenvalues[*a].total_cmp(&eigenvalues[*b]));
+    (middle, Matrix3::from_columns(&order.map(|k| eigenvectors.column(k).into_owned())))
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_unstable_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(0.0)
+}
