@@ -27,6 +27,7 @@ mod radius;
 mod refit;
 mod result;
 mod robust;
+mod sampling;
 mod solve;
 mod start;
 mod verdict;
@@ -82,6 +83,9 @@ fn fit(part: &Part, measured: &[Point], options: &Options) -> Result<Registratio
     let mut trace = Vec::new();
     let mut correspondences: Vec<Correspondence> = measured.par_iter().map(|_| Correspondence::NEW).collect();
     let descent = trim_and_refit(&problem, &initial, options, &mut correspondences, &mut trace)?;
+    if let Some(least_share) = sampling::least_share(&problem, &descent, &correspondences) {
+        return fit(&Part { least_share, ..*part }, measured, options);
+    }
     report(part, &problem, descent, correspondences, trace, &initial, options)
 }
 

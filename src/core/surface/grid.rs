@@ -60,6 +60,11 @@ impl GridLattice {
         self.columns as usize
     }
 
+    /// Whether its nodes stand at equal steps of x and y.
+    pub(crate) fn is_regular(&self) -> bool {
+        self.regular.is_some()
+    }
+
     pub(crate) fn rows(&self) -> usize {
         self.rows as usize
     }

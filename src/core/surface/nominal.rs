@@ -265,6 +265,17 @@ impl Nominal {
         if count == 0 { 0.0 } else { (sum / f64::from(count)).sqrt() }
     }
 
+    /// Returns the surface by every second node of its grid; none where it is not one grid, or one of too few nodes.
+    pub(crate) fn every_second(&self) -> Option<Self> {
+        let [patch] = &self.patches[..] else { return None };
+        let Lattice::Grid(grid) = &patch.lattice else { return None };
+        let [columns, rows] = [grid.columns(), grid.rows()].map(|nodes| nodes.div_ceil(2));
+        let node = |k: usize| *patch.point((2 * (k / columns) * grid.columns() + 2 * (k % columns)) as u32);
+        let points: Vec<Point> = (0..columns * rows).map(node).collect();
+        check_grid(columns, rows, points.len()).ok()?;
+        Some(Self::grid(GridLattice::new(columns, rows, &points, grid.is_regular()), &points))
+    }
+
     /// Returns how the surface bends at some places spread over it.
     pub(crate) fn features(&self) -> &[Feature] {
         self.features.get_or_init(|| {

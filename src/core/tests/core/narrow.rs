@@ -3,12 +3,13 @@
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 
-use crate::common::{RADIUS_MM, free_form, normal, placed, points, pose};
+use crate::common::{RADIUS_MM, centres, free_form, normal, placed, points, pose};
 use regrind_core::geometry::{Point, Pose};
 use regrind_core::registration::{Coordinate, Options, Registration, RegistrationError, Start, register};
+use regrind_core::surface::{Nominal, Projection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
-use regrind_sim::shape::{FreeForm, Shape};
+use regrind_sim::shape::{FreeForm, Shape, XyPolynomial};
 
 /// Centres over some places, with scatter and a form of some rms.
 fn measured(places: &[[f64; 2]], form_rms_mm: f64, seed: u64) -> Vec<Point> {
@@ -119,6 +120,33 @@ fn a_line_covers_its_own_strip() {
     println!("a line {single:.2}, a half {half:.2}, full patterns {full:.3?}");
     assert!(single < 0.3 && (0.5..0.62).contains(&half), "{single} {half}");
     assert!(full.iter().all(|share| *share > 0.97), "{full:?}");
+}
+
+/// A cap that any turn about z leaves as it is, sampled on a grid: what the grid adds turns with nothing.
+#[test]
+fn a_turn_that_only_the_sampling_sees_is_held() {
+    for (columns, rows, seed) in [(41, 25, 1), (103, 63, 2), (205, 125, 3), (409, 249, 4)] {
+        let r4 = [(4, 0, 1.5), (2, 2, 3.0), (0, 4, 1.5)];
+        let shape = XyPolynomial {
+            normalisation_radius_mm: 50.0,
+            terms: [(2, 0, 12.0), (0, 2, 12.0)].into_iter().chain(r4).collect(),
+        };
+        let nominal = Nominal::from_points(points(&shape.grid(102.0, 62.0, columns, rows)), Projection::Auto).unwrap();
+        let mut rng = StdRng::seed_from_u64(seed);
+        let mut cloud =
+            placed(&placement(), &centres(&shape, &FormError::none(), [[-48.0, -28.0], [48.0, 28.0]], [47, 31]));
+        cloud.iter_mut().flatten().for_each(|v| *v += 3e-4 * normal(&mut rng));
+        let options = Options { start: Start::Pose(pose(&placement())), ..free() };
+        let found = register(&nominal, &points(&cloud), &options).unwrap();
+        let weak: Vec<&str> = found.verdict.weak_directions.iter().map(|weak| weak.words.as_str()).collect();
+        assert!(
+            found.verdict.weak_directions.iter().any(|weak| weak.held) && weak[0].contains("rotation about z"),
+            "{columns} x {rows}: {weak:?}, condition {:.1e}",
+            found.verdict.condition
+        );
+        let held = found.verdict.weak_directions.iter().filter(|weak| weak.held).count();
+        assert_eq!(held, 1, "{columns} x {rows}: {weak:?}");
+    }
 }
 
 #[test]

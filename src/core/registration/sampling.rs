@@ -1,0 +1,54 @@
+//! Directions that only the sampling of the nominal surface sees.
+//!
+//! A cap about z is the same however it is turned about z, but its points lie on a grid, and what stands between them is not quite the same.
+//! The rank test takes that for something that holds the part: weakly, and wrongly. So a direction that is seen by next to nothing is looked
+//! at once more on every second node of the grid. What the part itself says of it stays; what the sampling says becomes another.
+
+use super::correspond::Correspondence;
+use super::iterate::{Descent, Problem, free_directions};
+use super::solve::Spectrum;
+use crate::surface::{OffsetSurface, Place};
+
+/// Directions that are seen by a larger share than this are not doubted.
+const DOUBTED: f64 = 1e-4;
+/// What changes by more than this share of itself is the sampling's.
+const CHANGED: f64 = 0.5;
+/// Points that are looked at, at most.
+const MOST: usize = 400;
+
+/// Returns the share below which directions are the sampling's; none where all that are seen are the part's.
+pub(super) fn least_share(problem: &Problem, descent: &Descent, correspondences: &[Correspondence]) -> Option<f64> {
+    let free = free_directions(&problem.locked, &descent.scaling);
+    let gram = descent.sums.gram();
+    let spectrum = Spectrum::new(&(free * gram * free));
+    let share = |k: usize| (spectrum.squares[k] / gram.trace()).sqrt();
+    if descent.rank == 0 || share(descent.rank - 1) > DOUBTED {
+        return None;
+    }
+    let half = problem.surface.nominal().every_second()?;
+    let surface = &problem.surface;
+    let coarse = OffsetSurface::new(&half, surface.radius_mm(), surface.side()).ok()?.with_distance(surface.distance());
+    let model_from_cmm = descent.cmm_from_model.inverse();
+    let used: Vec<usize> = (0..correspondences.len()).filter(|&k| correspondences[k].used).collect();
+    let rows: Vec<[[f64; 6]; 2]> = used
+        .iter()
+        .step_by(used.len().div_ceil(MOST).max(1))
+        .map(|&k| {
+            let p = model_from_cmm.point(&problem.measured[k]);
+            [surface, &coarse].map(|on| descent.scaling.row(&p, &on.foot(&p, Place::UNKNOWN).normal))
+        })
+        .collect();
+    let is_of_the_sampling = |k: &usize| {
+        let direction = spectrum.directions.column(*k);
+        let along = |row: &[f64; 6]| row.iter().zip(direction.iter()).map(|(r, d)| r * d).sum::<f64>();
+        let (seen, changed) = rows.iter().fold((0.0, 0.0), |(seen, changed), [fine, coarse]| {
+            (seen + along(fine).powi(2), changed + (along(coarse) - along(fine)).powi(2))
+        });
+        changed > CHANGED * CHANGED * seen
+    };
+    let doubted = (0..descent.rank).rev().take_while(|k| share(*k) <= DOUBTED).filter(is_of_the_sampling);
+    let last = doubted.last()?;
+    // Between the strongest of them and the next that is seen.
+    let next = if last == 0 { 1.0 } else { share(last - 1) };
+    Some((share(last) * next).sqrt())
+}
