@@ -40,7 +40,8 @@ fn shop() -> tempfile::TempDir {
     let home = tempfile::tempdir().unwrap();
     for folder in ["config", "recipes"] {
         fs::create_dir(home.path().join(folder)).unwrap();
-        for entry in fs::read_dir(root().join(folder)).unwrap().map(Result::unwrap) {
+        let files = fs::read_dir(root().join(folder)).unwrap().map(Result::unwrap);
+        for entry in files.filter(|entry| entry.path().is_file()) {
             fs::copy(entry.path(), home.path().join(folder).join(entry.file_name())).unwrap();
         }
     }
