@@ -205,7 +205,8 @@ fn registered(
     error.as_ref().map_or(Ok(()), |map| maps::save(task, files, (number, cycle), map, &found))?;
     let answer = error.as_ref().and_then(|error| answer(before?, cycle, &found, error));
     let known = error.as_ref().map(|error| learned_from(task, cycle, before, error, answer));
-    let forecast = known.as_ref().zip(error.as_ref()).map(|(known, error)| known.forecast(error));
+    let forecast =
+        known.as_ref().zip(error.as_ref()).map(|(known, error)| known.forecast(error, task.scallops_rms_mm()));
     let mut figures = figures(task, cycle, &found, error.as_ref(), answer, forecast);
     figures.warnings.extend(error.iter().flat_map(|map| map.advice.iter().cloned()).chain(offered));
     Ok(Registered { registration: found, error, known, figures })
@@ -334,7 +335,7 @@ fn compensated(
     })?;
     let largest_mm = step.correction.values_mm.iter().fold(0.0f64, |most, v| most.max(v.abs()));
     let ratio = found.verdict.pv_mm / found.verdict.rms_mm.max(f64::MIN_POSITIVE);
-    let forecast = known.forecast(&map);
+    let forecast = known.forecast(&map, task.scallops_rms_mm());
     let summary = CompensationSummary {
         largest_mm,
         depth_mm: step.depth_mm,
