@@ -11,13 +11,15 @@ use sha2::{Digest, Sha256};
 use thiserror::Error;
 
 use crate::cell::{CellPlan, Deadlines, Device, Disposal, Gates, Tolerance};
-use crate::compensation::path::{Limits, PathError, PathOptions, TrackSpacing, Wheel as PathWheel};
-use crate::compensation::{CorrectionLimits, MapOptions, contact_width_mm};
+use crate::compensation::path::{
+    Field, Limits, PathError, PathOptions, Scallops, TrackSpacing, Wanted, Wheel as PathWheel,
+};
+use crate::compensation::{Correction, CorrectionLimits, MapOptions, contact_width_mm};
 use crate::config::{CellConfig, Link};
 use crate::device::{AnyCmm, AnyGrinder, Line, Making, MakingError, ModbusSettings, Pass, hex};
 use crate::drive::{Probing, Programs, Sphere, Task};
 use crate::formats::{self, FormatError, NominalFile};
-use crate::geometry::{Point, Vector};
+use crate::geometry::{Aperture, Grid, Point, Vector};
 use crate::measuring::{Expansion, Layout, PatternError, Target, targets};
 use crate::recipe::{NominalSource, Pattern, Recipe, SpindleAxis, StartAt, Um, Wheel};
 use crate::registration::{Coordinate, MapLimits};
@@ -62,6 +64,11 @@ pub enum SetupError {
         "{recipe}: the measuring pattern is `free`, and {cell} reaches its CMM over a wire that needs a plan; choose grid, spiral or file"
     )]
     NeedsPlan { recipe: PathBuf, cell: PathBuf },
+    #[error(
+        "{recipe}: grinding.track_mm is missing, and cannot be chosen by the scallops between the tracks, because no path is laid over this part: \
+         {source}; add grinding.track_mm"
+    )]
+    Tracks { recipe: PathBuf, source: PathError },
     #[error("{cell}: {source}")]
     Machine { cell: PathBuf, source: MakingError },
 }
@@ -78,6 +85,9 @@ const LARGEST_TARGET: usize = 56;
 const TRANSFER_ROOM: f64 = 3.0;
 /// And is looked at no more often than this.
 const SLOW_POLL: Duration = Duration::from_millis(250);
+/// Share of the tolerances, of RMS and of PV, that scallops take at most where the distance of the tracks is chosen by them, and above which
+/// they are warned of. Of an RMS a fifth in quadrature is 2 %; of a PV it is a fifth.
+pub const SCALLOP_SHARE: f64 = 0.2;
 
 /// Makes what a run computes from, and what its cell decides by.
 ///
@@ -92,10 +102,13 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
     if let Some(sphere) = &sphere {
         check_sphere(recipe, cell, &nominal, sphere)?;
     }
+    let ground = ground(recipe, &nominal);
+    let (track_mm, scallops) = tracks(recipe, &nominal, &ground)?;
     let task = Task {
         part: recipe.part.name.clone(),
-        pass: pass(recipe, &nominal, part_identity),
-        programs: programs(recipe, cell, &nominal, part_identity),
+        pass: pass(recipe, &nominal, part_identity, track_mm),
+        programs: ground.map(|ground| programs(recipe, cell, &nominal, part_identity, (ground, track_mm))),
+        scallops,
         nominal: Arc::new(nominal),
         nominal_file,
         part_identity,
@@ -116,7 +129,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         gain: recipe.compensation.gain(),
         repeatability_mm: recipe.compensation.repeatability_um.map(Um::mm),
         learned: None,
-        setting: setting(recipe, cell, &part_identity, targets.len()),
+        setting: setting(recipe, cell, &part_identity, track_mm, targets.len()),
         targets,
         limits: CorrectionLimits {
             largest_depth_mm: cell.grinder.limits.largest_depth_mm,
@@ -162,17 +175,16 @@ fn map_options(recipe: &Recipe) -> MapOptions {
 }
 
 /// Says what a run has to have in common with another to learn from it: the cell, the part, and how it is ground, looked at and corrected.
-fn setting(recipe: &Recipe, cell: &CellConfig, part: &[u8; 32], targets: usize) -> String {
+fn setting(recipe: &Recipe, cell: &CellConfig, part: &[u8; 32], track_mm: f64, targets: usize) -> String {
     let part = hex(part);
     let (grinding, measure, map) = (&recipe.grinding, &recipe.measure, &recipe.compensation);
     let mut said = format!(
-        "cell {:?}, part {part}, begin with {:?}; {:?}, feed {} mm/min, tracks {} mm, spark-out {}, depth {} mm; {targets} targets, probe {} mm, \
+        "cell {:?}, part {part}, begin with {:?}; {:?}, feed {} mm/min, tracks {track_mm} mm, spark-out {}, depth {} mm; {targets} targets, probe {} mm, \
          held {:?}; cut-off {} mm, {:?}, gain {:?}",
         cell.name,
         recipe.cycle.begin_with,
         grinding.wheel,
         grinding.feed_mm_min,
-        grinding.track_mm,
         grinding.spark_out_passes,
         map.depth_of_cut_um.mm(),
         measure.probe_radius_mm,
@@ -331,7 +343,7 @@ fn check_travel(recipe: &Recipe, cell: &CellConfig, targets: &[Target]) -> Resul
     }
 }
 
-fn pass(recipe: &Recipe, nominal: &Nominal, part_identity: [u8; 32]) -> Pass {
+fn pass(recipe: &Recipe, nominal: &Nominal, part_identity: [u8; 32], track_spacing_mm: f64) -> Pass {
     let [low, high] = match nominal.outline() {
         Some(outline) => outline.bounds(),
         None => nominal.points().fold([[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]], |[low, high], p| {
@@ -342,7 +354,7 @@ fn pass(recipe: &Recipe, nominal: &Nominal, part_identity: [u8; 32]) -> Pass {
         spark_out_passes: recipe.grinding.spark_out_passes,
         wheel_radius_mm: recipe.grinding.wheel.radius_mm(),
         feed_mm_min: recipe.grinding.feed_mm_min,
-        track_spacing_mm: recipe.grinding.track_mm,
+        track_spacing_mm,
         level_mm: recipe.grinding.allowance_um.mm(),
         depth_of_cut_mm: recipe.compensation.depth_of_cut_um.mm(),
         x_mm: [low[0], high[0]],
@@ -351,19 +363,68 @@ fn pass(recipe: &Recipe, nominal: &Nominal, part_identity: [u8; 32]) -> Pass {
     }
 }
 
+/// The surface that paths are laid over, and the outline of the part.
+type Ground = (Field, Aperture);
+
+fn ground(recipe: &Recipe, nominal: &Nominal) -> Result<Ground, PathError> {
+    if recipe.measure.side.given() == Some(Side::Opposite) {
+        return Err(PathError::OtherSide);
+    }
+    Programs::ground(nominal)
+}
+
+/// Returns the distance of the tracks, as the recipe has it or as the scallops allow it, and what they leave between them.
+fn tracks(
+    recipe: &Recipe,
+    nominal: &Nominal,
+    ground: &Result<Ground, PathError>,
+) -> Result<(f64, Option<Scallops>), SetupError> {
+    let grinding = &recipe.grinding;
+    let (field, outline) = match (ground, grinding.track_mm) {
+        (Ok(ground), _) => ground,
+        (Err(_), Some(track_mm)) => return Ok((track_mm, None)),
+        (Err(source), None) => {
+            return Err(SetupError::Tracks { recipe: recipe.path().to_owned(), source: source.clone() });
+        }
+    };
+    let [low, high] = outline.bounds();
+    let size_mm = [high[0] - low[0], high[1] - low[1]];
+    let none = Correction::none(Grid { columns: 2, rows: 2, first_mm: low, spacing_mm: size_mm }, 0.0);
+    let unknown = |source| SetupError::Tracks { recipe: recipe.path().to_owned(), source };
+    let wanted = Wanted::new(field.clone(), &none, 1.0).map_err(unknown)?;
+    let wheel = path_wheel(&grinding.wheel, nominal);
+    let unit = Scallops::between(&wanted, outline, &wheel, grinding.pattern, 1.0);
+    // Tracks overlap, and there is more than one.
+    let widest_mm = grinding.wheel.radius_mm().min(0.5 * size_mm[0].min(size_mm[1]));
+    let track_mm = match (grinding.track_mm, grinding.scallop_nm) {
+        (Some(track_mm), None) => track_mm,
+        (most_mm, Some(nm)) => unit.track_for_mm(1e-6 * nm, f64::INFINITY).min(most_mm.unwrap_or(widest_mm)),
+        (None, None) => track_for_tolerance_mm(recipe, &unit).min(widest_mm),
+    };
+    Ok((track_mm, Some(unit.at_mm(track_mm))))
+}
+
+/// Returns the widest distance of tracks whose scallops take no more than their share of the tolerances of a recipe, cut down to two digits.
+pub fn track_for_tolerance_mm(recipe: &Recipe, scallops: &Scallops) -> f64 {
+    let share = |limit: Option<Um>| limit.map_or(f64::INFINITY, |um| SCALLOP_SHARE * um.mm());
+    let most_mm = scallops.track_for_mm(share(recipe.acceptance.pv_um), share(recipe.acceptance.rms_um));
+    if !most_mm.is_finite() {
+        return most_mm;
+    }
+    let per_mm = 10f64.powf(1.0 - most_mm.log10().floor());
+    (most_mm * per_mm).floor() / per_mm
+}
+
 /// How the programs of a part are made.
 fn programs(
     recipe: &Recipe,
     cell: &CellConfig,
     nominal: &Nominal,
     part_identity: [u8; 32],
-) -> Result<Programs, PathError> {
+    (ground, track_mm): (Ground, f64),
+) -> Programs {
     let (grinding, limits) = (&recipe.grinding, &cell.grinder.limits);
-    if recipe.measure.side.given() == Some(Side::Opposite) {
-        return Err(PathError::OtherSide);
-    }
-    let ground = Programs::ground(nominal)?;
-    let plain = PathOptions::new(path_wheel(&grinding.wheel, nominal), grinding.track_mm, grinding.feed_mm_min);
+    let plain = PathOptions::new(path_wheel(&grinding.wheel, nominal), track_mm, grinding.feed_mm_min);
     // The wheel comes up to its feed before it meets the part.
     let run_up_mm =
         limits.largest_acceleration_mm_s2.map_or(0.0, |a| 1.1 * (grinding.feed_mm_min / 60.0).powi(2) / (2.0 * a));
@@ -371,8 +432,9 @@ fn programs(
         pattern: grinding.pattern,
         one_way: grinding.one_way,
         spacing: match grinding.scallop_nm {
-            Some(nm) => TrackSpacing::Scallop { height_mm: 1e-6 * nm, widest_mm: grinding.track_mm },
-            None => TrackSpacing::Distance(grinding.track_mm),
+            // A correction may bend the surface a little more than the nominal one.
+            Some(nm) => TrackSpacing::Scallop { height_mm: 1e-6 * nm, widest_mm: track_mm },
+            None => TrackSpacing::Distance(track_mm),
         },
         chord_error_mm: grinding.chord_error_um.mm(),
         overrun_mm: grinding.overrun_mm,
@@ -381,7 +443,7 @@ fn programs(
         spiral_acceleration_mm_s2: limits.largest_acceleration_mm_s2,
         ..plain
     };
-    Ok(Programs {
+    Programs {
         part: recipe.part.name.clone(),
         part_identity,
         ground,
@@ -395,7 +457,7 @@ fn programs(
         path_tolerance_mm: grinding.path_tolerance_um.mm(),
         spark_out_passes: grinding.spark_out_passes,
         simulation: cell.simulated,
-    })
+    }
 }
 
 /// The wheel of a recipe as paths have it; a cup is tilted further than the part slopes unless the recipe says by how much.

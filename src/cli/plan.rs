@@ -4,11 +4,11 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::cell::Beginning;
-use regrind::compensation::path::{Summary, ToolPath};
+use regrind::compensation::path::{Scallops, Summary, ToolPath};
 use regrind::config::{BUILT_IN, CellConfig};
 use regrind::drive::Task;
 use regrind::recipe::Recipe;
-use regrind::setup;
+use regrind::setup::{self, SCALLOP_SHARE};
 use serde::Serialize;
 
 use super::Outcome;
@@ -55,6 +55,10 @@ struct Document {
     last_level_um: f64,
     removal_budget_um: f64,
     tracks: u64,
+    track_mm: f64,
+    /// What the tracks leave between them; absent where no path can be laid.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    scallops: Option<ScallopsTold>,
     path_mm: f64,
     grinding_minutes: f64,
     /// What one pass takes off, reckoned as depth of cut times the ground that its tracks cover.
@@ -80,6 +84,58 @@ struct Document {
     no_program: Option<String>,
     /// Whether a run would begin with what an earlier one learned.
     learns: bool,
+}
+
+/// The scallops beside what is allowed of form and scallops together.
+#[derive(Serialize)]
+struct ScallopsTold {
+    pv_um: f64,
+    rms_um: f64,
+    mean_um: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    allowed_pv_um: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    allowed_rms_um: Option<f64>,
+}
+
+impl ScallopsTold {
+    fn of(scallops: &Scallops, recipe: &Recipe) -> Self {
+        let [pv_um, rms_um, mean_um] = [scallops.height_mm, scallops.rms_mm, scallops.mean_mm].map(|mm| 1e3 * mm);
+        let [allowed_pv_um, allowed_rms_um] =
+            [recipe.acceptance.pv_um, recipe.acceptance.rms_um].map(|um| um.map(|um| um.0));
+        Self { pv_um, rms_um, mean_um, allowed_pv_um, allowed_rms_um }
+    }
+
+    /// The tolerances of which they take more than their share, each with what they take.
+    fn beyond(&self) -> Vec<String> {
+        let taken = [
+            ("acceptance.pv_um", self.pv_um, self.allowed_pv_um),
+            ("acceptance.rms_um", self.rms_um, self.allowed_rms_um),
+        ];
+        let of = |(key, found, allowed): (&str, f64, Option<f64>)| {
+            let share = found / allowed?;
+            (share > SCALLOP_SHARE * (1.0 + 1e-9)).then(|| format!("{} % of {key}", three_digits(100.0 * share)))
+        };
+        taken.into_iter().filter_map(of).collect()
+    }
+
+    fn in_words(&self, track_mm: f64) -> String {
+        let n = three_digits;
+        let allowed: Vec<String> = [("PV", self.allowed_pv_um), ("RMS", self.allowed_rms_um)]
+            .into_iter()
+            .filter_map(|(what, um)| um.map(|um| format!("{what} {} um", n(um))))
+            .collect();
+        format!(
+            "PV {} um and RMS {} um between tracks {} mm apart; {} allowed of all errors together",
+            n(self.pv_um),
+            n(self.rms_um),
+            n(track_mm),
+            match &allowed[..] {
+                [one] => format!("{one} is"),
+                all => format!("{} are", all.join(" and ")),
+            }
+        )
+    }
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
@@ -124,6 +180,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         last_level_um: first_um - (passes * depth_um).min(1e3 * task.limits.removal_budget_mm),
         removal_budget_um: 1e3 * task.limits.removal_budget_mm,
         tracks: tracks as u64,
+        track_mm: task.pass.track_spacing_mm,
+        scallops: task.scallops.map(|scallops| ScallopsTold::of(&scallops, &recipe)),
         path_mm,
         grinding_minutes,
         removed_mm3_a_pass,
@@ -132,7 +190,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         most_measurements,
         least_measuring_minutes,
         least_hours_to_last: least_minutes / 60.0,
-        warnings: warnings(&task, path_mm, grinding_minutes, least_measuring_minutes),
+        warnings: warnings(&task, path_mm, grinding_minutes, least_measuring_minutes)
+            .into_iter()
+            .chain(warning_of_scallops(&task, &recipe))
+            .collect(),
         program_points: program.as_ref().map(|(_, summary)| summary.points),
         no_program: task.programs.as_ref().err().map(ToString::to_string),
         learns: recipe.compensation.learn,
@@ -179,6 +240,21 @@ fn warnings(task: &Task, path_mm: f64, grinding_minutes: f64, measuring_minutes:
         ));
     }
     warnings
+}
+
+/// Tells of scallops that leave too little of the tolerances for what a correction can take back.
+fn warning_of_scallops(task: &Task, recipe: &Recipe) -> Option<String> {
+    let scallops = task.scallops?;
+    let beyond = ScallopsTold::of(&scallops, recipe).beyond();
+    (!beyond.is_empty()).then(|| {
+        format!(
+            "the scallops between the tracks take {}, more than {} %, and no correction takes them back; write grinding.track_mm = {} or less, or \
+             take a wheel that is blunter across the tracks",
+            beyond.join(" and "),
+            100.0 * SCALLOP_SHARE,
+            setup::track_for_tolerance_mm(recipe, &scallops),
+        )
+    })
 }
 
 /// Says how long a run may take: as far as recipe and cell tell it.
@@ -236,7 +312,7 @@ fn words(d: &Document) -> String {
     };
     let warnings: String = d.warnings.iter().map(|warning| format!("warning     {warning}\n")).collect();
     format!(
-        "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nprogram     {program}\n{learns}\
+        "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nscallops    {}\nprogram     {program}\n{learns}\
          level       {} um over the nominal surface first, at least {} um deeper each pass, so {} um at the last\nbudget      {} um in all\nremoval     {}\ncycles      at most {}\ntime        {}\n{warnings}",
         d.part,
         counted(d.nominal_points, "point"),
@@ -246,6 +322,7 @@ fn words(d: &Document) -> String {
         d.tracks,
         n(d.path_mm),
         n(d.grinding_minutes),
+        d.scallops.as_ref().map_or("not told where no path is laid".to_owned(), |told| told.in_words(d.track_mm)),
         n(d.first_level_um),
         n(d.depth_of_cut_um),
         n(d.last_level_um),

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::cell::Figures;
-use crate::compensation::path::{PathError, Summary, ToolPath};
+use crate::compensation::path::{PathError, Scallops, Summary, ToolPath};
 use crate::compensation::{Correction, CorrectionLimits, ErrorMap, GainRule, LearningState, MapOptions, NextPassError};
 use crate::device::{Careful, Coordinates, CorrectionMap, Identified, Pass, Plan, Target, TargetKind};
 use crate::formats::gcode::GcodeError;
@@ -71,6 +71,8 @@ pub struct Task {
     pub tolerance_mm: Option<f64>,
     /// How programs are made, or why there are none.
     pub programs: Result<Programs, PathError>,
+    /// What the tracks of a pass leave between them; unknown where no path can be laid.
+    pub scallops: Option<Scallops>,
     /// Least share of the targets that must be touched.
     pub least_found: f64,
     /// Least and largest temperature of a measurement that is used, where the recipe has a window.
@@ -256,6 +258,11 @@ impl Task {
             Err(error) if error.is_ours() => Ok(None),
             Err(error) => Err(error.clone()),
         }
+    }
+
+    /// Returns the rms of the scallops, as far as they are known.
+    pub(super) fn scallops_rms_mm(&self) -> f64 {
+        self.scallops.map_or(0.0, |scallops| scallops.rms_mm)
     }
 
     /// What is known of the grinder before the first pass.

@@ -228,7 +228,8 @@ fn registered(
     error.as_ref().map_or(Ok(()), |map| maps::save(task, files, (number, cycle), map, &found))?;
     let answer = error.as_ref().and_then(|error| answer(before?, cycle, &found, error));
     let known = error.as_ref().map(|error| learned_from(task, cycle, before, error, answer));
-    let forecast = known.as_ref().zip(error.as_ref()).map(|(known, error)| known.forecast(error));
+    let forecast =
+        known.as_ref().zip(error.as_ref()).map(|(known, error)| known.forecast(error, task.scallops_rms_mm()));
     let mut figures = figures(task, cycle, &found, form.as_ref().ok(), error.as_ref(), answer, forecast);
     figures.warnings.extend(error.iter().flat_map(|map| map.advice.iter().cloned()).chain(offered));
     if task.expansion.is_some() && grown.is_none() {
@@ -411,7 +412,7 @@ fn compensated(
     let [pv_mm, rms_mm, scatter_mm] = told.map_or([found.verdict.pv_mm, found.verdict.rms_mm, 0.0], |form| {
         [form.pv_robust.median_mm, form.rms.median_mm, form.scatter_mm]
     });
-    let expected_mm = without(scatter_mm, known.forecast(&map).rms_mm);
+    let expected_mm = without(scatter_mm, known.forecast(&map, task.scallops_rms_mm()).rms_mm);
     let summary = CompensationSummary {
         largest_mm,
         depth_mm: step.depth_mm,

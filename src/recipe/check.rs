@@ -276,10 +276,10 @@ fn grinding(written: &Grinding, document: &mut Document) {
             "leave it out",
         );
     }
-    if written.track_mm > wheel.radius_mm() {
+    if let Some(track_mm) = written.track_mm.filter(|track_mm| *track_mm > wheel.radius_mm()) {
         document.report(
             "grinding.track_mm",
-            format!("is {} mm, more than the wheel's radius, {} mm", written.track_mm, wheel.radius_mm()),
+            format!("is {track_mm} mm, more than the wheel's radius, {} mm", wheel.radius_mm()),
             "tracks must overlap",
             "lower it",
         );
@@ -352,7 +352,7 @@ fn compare_with_size(written: &RecipeFile, size_mm: [f64; 2], document: &mut Doc
         ("measure.probe_radius_mm", measure.probe_radius_mm, 0.5),
         ("compensation.spacing_mm", written.compensation.spacing_mm, 1.0),
         ("compensation.cutoff_mm", written.compensation.cutoff_mm, 2.0),
-        ("grinding.track_mm", written.grinding.track_mm, 1.0),
+        ("grinding.track_mm", written.grinding.track_mm.unwrap_or(0.0), 1.0),
     ];
     for (key, length_mm, share) in lengths {
         let limit_mm = share * smaller_mm;

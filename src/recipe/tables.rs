@@ -286,9 +286,10 @@ pub struct Grinding {
     /// Feed along the track.
     #[schemars(range(min = 0.1, max = 100000.0), example = 600.0)]
     pub feed_mm_min: f64,
-    /// Distance of the tracks; the largest one where scallop_nm is given.
-    #[schemars(range(min = 0.001, max = 1000.0), example = 0.5)]
-    pub track_mm: f64,
+    /// Distance of the tracks; the largest one where scallop_nm is given. Where neither stands it is chosen so that the scallops, the ridges
+    /// between the tracks, take a fifth of acceptance.rms_um and of acceptance.pv_um at most.
+    #[schemars(range(min = 0.001, max = 1000.0))]
+    pub track_mm: Option<f64>,
     /// How the tracks run.
     pub pattern: TrackPattern,
     /// Whether every track of a raster runs towards +x; else they alternate.
@@ -484,7 +485,7 @@ impl Default for Grinding {
         Self {
             wheel: Wheel::Sphere { radius_mm: f64::NAN },
             feed_mm_min: f64::NAN,
-            track_mm: f64::NAN,
+            track_mm: None,
             pattern: TrackPattern::Raster,
             one_way: false,
             scallop_nm: None,

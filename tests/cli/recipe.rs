@@ -496,11 +496,11 @@ fn all_problems_are_told_at_once_and_in_order() {
 #[test]
 fn several_places_of_broken_syntax_are_told() {
     let text = changed(RECIPE, "depth_of_cut_um = 20.0", "depth_of_cut_um 20.0");
-    let text = changed(&text, "track_mm = 0.5", "track_mm = = 0.5");
+    let text = changed(&text, "track_mm = 0.24", "track_mm = = 0.24");
     let problems = recipe(&text).unwrap_err();
     assert!(problems.problems.len() >= 2, "{problems}");
     let lines: Vec<usize> = problems.problems.iter().map(|problem| problems.place(problem).0).collect();
-    for needle in ["depth_of_cut_um 20.0", "track_mm = = 0.5"] {
+    for needle in ["depth_of_cut_um 20.0", "track_mm = = 0.24"] {
         assert!(lines.contains(&place_of(&text, needle).0), "{problems}");
     }
 }

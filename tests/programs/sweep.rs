@@ -125,6 +125,48 @@ fn between_tracks_the_ridges_are_as_high_as_stated_and_nothing_is_cut_deeper() {
 }
 
 #[test]
+fn the_scallops_told_of_a_path_are_those_that_the_wheel_leaves() {
+    for (name, (wheel_name, wheel), pattern) in [
+        ("freeform-mirror", wheels(0.8)[0], Pattern::Raster),
+        ("freeform-mirror", wheels(0.8)[1], Pattern::Raster),
+        ("off-axis-asphere", wheels(0.8)[0], Pattern::Spiral),
+    ] {
+        let mut part = part(name);
+        part.programs.options = PathOptions { pattern, ..with(&part.programs.options, wheel, 1.0) };
+        let (steps, _) = program(&part);
+        let told = part.programs.path(&correction(part.half_mm)).unwrap().0.scallops();
+        // Grooves all over the part, each looked at from its one side to the other: as far as two tracks are apart, wherever that begins.
+        const GROOVES: [usize; 2] = [9, 6];
+        const PLACES: usize = 10;
+        let (mut highest, mut squares, mut sum, mut grooves) = (0.0f64, 0.0, 0.0, 0.0);
+        for k in 0..GROOVES[0] * GROOVES[1] {
+            let share = [(k % GROOVES[0]) as f64 / GROOVES[0] as f64, (k / GROOVES[0]) as f64 / GROOVES[1] as f64];
+            let at: [f64; 2] = [0, 1].map(|i| part.half_mm[i] * (2.0 * share[i] + 1.0 / GROOVES[i] as f64 - 1.0));
+            if !part.programs.ground.1.contains(at[0], at[1]) {
+                continue;
+            }
+            let across = match pattern {
+                Pattern::Raster => [0.0, 1.0],
+                Pattern::Spiral => at.map(|c| c / at[0].hypot(at[1]).max(1e-9)),
+            };
+            let off: Vec<f64> = (0..PLACES)
+                .map(|i| told.track_mm * (i as f64 / PLACES as f64 - 0.5))
+                .map(|t| clearance(&wheel, &steps, truth(&part, 0.02, [0, 1].map(|i| at[i] + t * across[i]))))
+                .collect();
+            let mean = off.iter().sum::<f64>() / PLACES as f64;
+            highest = off.iter().fold(highest, |most, h| most.max(*h));
+            squares += off.iter().map(|h| (h - mean).powi(2)).sum::<f64>() / PLACES as f64;
+            (sum, grooves) = (sum + mean, grooves + 1.0);
+        }
+        let found = [highest, (squares / grooves).sqrt(), sum / grooves];
+        let of = [told.height_mm, told.rms_mm, told.mean_mm];
+        let close = |k: usize, within: f64| (found[k] / of[k] - 1.0).abs() < within;
+        // The highest of all need not be among the places that were looked at.
+        assert!(close(0, 0.1) && close(1, 0.03) && close(2, 0.03), "{name}, {wheel_name}: {found:?} for {told:?}");
+    }
+}
+
+#[test]
 fn a_spiral_leaves_ridges_within_its_distance_everywhere() {
     let mut part = part("off-axis-asphere");
     let wheel = Wheel::Sphere { radius_mm: 12.5 };

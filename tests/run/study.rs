@@ -213,7 +213,7 @@ impl<'a> Line<'a> {
         });
         let answer = answer.filter(|_| self.way != Way::Plain);
         self.known = self.known.after(&Seen { correction: &self.correction, error: &error, answer });
-        let forecast = self.known.forecast(&error);
+        let forecast = self.known.forecast(&error, 0.0);
         self.forecast = Some([1e3 * forecast.rms_mm, 1e3 * forecast.sigma_mm]);
         let next = match self.correction.next(&error, &self.known, &task.limits) {
             Ok(step) => step.correction,

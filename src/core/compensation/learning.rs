@@ -116,7 +116,8 @@ pub struct Forecast {
     pub rms_mm: f64,
     /// Its standard deviation from part to part, in millimetres.
     pub sigma_mm: f64,
-    /// Root mean square that no correction can go below, in millimetres; `None` while only one pass was seen.
+    /// Root mean square that no correction can go below, in millimetres, the scallops between the tracks included; `None` while only one pass was
+    /// seen.
     pub floor_mm: Option<f64>,
 }
 
@@ -220,9 +221,12 @@ impl LearningState {
         known
     }
 
-    /// Returns what the pass after this error is expected to leave.
-    pub fn forecast(&self, error: &ErrorMap) -> Forecast {
-        let rest2 = error.residual_sigma_mm.powi(2);
+    /// Returns what the pass after this error is expected to leave, with scallops of this rms between its tracks.
+    ///
+    /// What is too fine for the map stays: the scatter of the points, and the scallops. A probe that reaches the bottom of the grooves has felt
+    /// them already, so that the greater of what was found and of what is known to be there counts, and not both.
+    pub fn forecast(&self, error: &ErrorMap, scallops_mm: f64) -> Forecast {
+        let rest2 = error.residual_sigma_mm.max(scallops_mm).powi(2);
         let (mut left2, mut scatter2, mut independent) = (0.0, 0.0, 0.0);
         let told = ErrorOnGrid::of(error, error.grid);
         let noise = self.noise_mm2(told.noise_mm2);
@@ -521,7 +525,7 @@ mod tests {
                     assert_eq!(*next, now - share * e, "pass {pass}");
                 }
                 correction = next;
-                let forecast = known.forecast(&error);
+                let forecast = known.forecast(&error, 0.0);
                 assert!(forecast.rms_mm.is_finite() && forecast.sigma_mm.is_finite(), "{forecast:?}");
             }
             assert_eq!(known.gains(), [[CUTOFF_MM, share]]);
@@ -663,13 +667,32 @@ mod tests {
                     let error = map(|_| value);
                     known = after(&known, &none(), &error);
                     assert!(known.is_sound(), "{known:?}");
-                    let forecast = known.forecast(&error);
+                    let forecast = known.forecast(&error, 0.0);
                     assert!(forecast.rms_mm.is_finite() && known.wanted_mm().unwrap().iter().all(|v| v.is_finite()));
                 }
             }
         }
         let all = after(&begin(GainRule::Adaptive, None), &none(), &map(|_| 0.0));
-        assert!(all.wanted_mm().unwrap().iter().all(|v| *v == 0.0) && all.forecast(&map(|_| 0.0)).rms_mm == 0.0);
+        assert!(all.wanted_mm().unwrap().iter().all(|v| *v == 0.0) && all.forecast(&map(|_| 0.0), 0.0).rms_mm == 0.0);
+    }
+
+    #[test]
+    fn no_pass_goes_below_its_scallops_and_they_count_once() {
+        let mut known = begin(GainRule::Adaptive, None);
+        for pass in 1..=3 {
+            known = after(&known, &none(), &of(scatter(pass, 1e-3)));
+        }
+        let found = |rest_mm: f64, scallops_mm: f64| {
+            let error = ErrorMap { residual_sigma_mm: rest_mm, ..of(scatter(4, 1e-3)) };
+            let Forecast { rms_mm, floor_mm, .. } = known.forecast(&error, scallops_mm);
+            [rms_mm, floor_mm.unwrap()]
+        };
+        let [rms_mm, floor_mm] = found(0.0, 0.0);
+        for (k, without) in [rms_mm, floor_mm].into_iter().enumerate() {
+            assert!((found(0.0, 3e-3)[k] - without.hypot(3e-3)).abs() < 1e-15);
+            // What the probe has found in the grooves is the same again.
+            assert_eq!(found(4e-3, 3e-3)[k], found(4e-3, 0.0)[k]);
+        }
     }
 
     #[test]

@@ -2,13 +2,14 @@
 
 use rayon::prelude::*;
 
-use super::options::{PathOptions, Pattern, TrackSpacing};
+use super::options::{PathOptions, TrackSpacing};
+use super::scallop::{from_middle, groove};
 use super::wanted::Bend;
 use super::{PathError, Wanted, Wheel};
 use crate::geometry::{Aperture, Point};
 
 /// Places along each axis at which the wheel is held against the surface.
-const PLACES: usize = 101;
+pub(super) const PLACES: usize = 101;
 /// Places of the wheel, and places of the surface along each axis, at which its body is held against the part.
 const BODIES: usize = 24;
 const GROUND: usize = 48;
@@ -21,7 +22,7 @@ const STEEPEST_RAD: f64 = 1.2;
 /// Holds the wheel against the surface at places all over the part, and returns the distance of the tracks over x and y.
 pub(super) fn track_mm(wanted: &Wanted, outline: &Aperture, options: &PathOptions) -> Result<f64, PathError> {
     let places = places(outline, PLACES);
-    let one = |place: &[f64; 2]| fit_at(&wanted.bend(*place), *place, options);
+    let one = |place: &[f64; 2]| fit_at(&wanted.bend(*place), *place, outline, options);
     let distances: Vec<Result<f64, PathError>> = places.par_iter().map(one).collect();
     let narrowest = distances.into_iter().reduce(narrower).unwrap_or(Err(PathError::Empty))?;
     match options.spacing {
@@ -46,14 +47,21 @@ fn narrower(a: Result<f64, PathError>, b: Result<f64, PathError>) -> Result<f64,
 
 /// Places of a grid over the part, its border included.
 fn places(outline: &Aperture, count: usize) -> Vec<[f64; 2]> {
+    let mut places = on_grid(outline, count);
+    places.extend(outline.outline_mm(4 * count));
+    places
+}
+
+/// Places of a grid over the part.
+pub(super) fn on_grid(outline: &Aperture, count: usize) -> Vec<[f64; 2]> {
     let [low, high] = outline.bounds();
     let at = |k: usize, i: usize| low[k] + (high[k] - low[k]) * i as f64 / (count - 1) as f64;
     let grid = (0..count * count).map(|n| [at(0, n % count), at(1, n / count)]);
-    grid.filter(|[x, y]| outline.contains(*x, *y)).chain(outline.outline_mm(4 * count)).collect()
+    grid.filter(|[x, y]| outline.contains(*x, *y)).collect()
 }
 
 /// Checks slope and hollows at a place; returns the distance over x and y of tracks that leave the scallop wanted.
-fn fit_at(bend: &Bend, place: [f64; 2], options: &PathOptions) -> Result<f64, PathError> {
+fn fit_at(bend: &Bend, place: [f64; 2], outline: &Aperture, options: &PathOptions) -> Result<f64, PathError> {
     let [x_mm, y_mm] = place;
     let normal = &bend.contact.normal;
     let finite = (bend.curvature.iter().sum::<f64>() + bend.contact.point.z).is_finite();
@@ -75,22 +83,12 @@ fn fit_at(bend: &Bend, place: [f64; 2], options: &PathOptions) -> Result<f64, Pa
         return Err(hollow(bend, &wheel, place));
     }
     let TrackSpacing::Scallop { height_mm: height, .. } = options.spacing else { return Ok(f64::INFINITY) };
-    // Across a raster is y, whatever the surface's slant; a spiral crosses everything.
-    let gap = std::array::from_fn::<f64, 3, _>(|k| wheel[k] - bend.curvature[k]);
-    let across = match options.pattern {
-        Pattern::Raster => gap[2],
-        Pattern::Spiral => 0.5 * (gap[0] + gap[2]) + (0.25 * (gap[0] - gap[2]).powi(2) + gap[1] * gap[1]).sqrt(),
-    };
-    // A millimetre along the surface is less over x and y.
-    let shortened = match options.pattern {
-        Pattern::Raster => (1.0 - bend.along[1].z.powi(2)).sqrt(),
-        Pattern::Spiral => normal.z,
-    };
-    Ok((8.0 * height / across).sqrt() * shortened)
+    let groove = groove(bend, from_middle(outline, place), &options.wheel, options.pattern);
+    Ok((8.0 * height / groove.bend).sqrt() / groove.stretch)
 }
 
 /// The wheel's curvature in the directions of a bend: along, mixed, across.
-fn wheel_in(bend: &Bend, wheel: &Wheel) -> [f64; 3] {
+pub(super) fn wheel_in(bend: &Bend, wheel: &Wheel) -> [f64; 3] {
     let ([around, across], direction) = wheel.curvatures(&bend.contact.normal);
     let [c, s] = [0, 1].map(|k| direction.dot(&bend.along[k]));
     [around * c * c + across * s * s, (around - across) * s * c, around * s * s + across * c * c]
@@ -164,7 +162,7 @@ pub(super) mod tests {
     }
 
     /// A surface by its height and slopes over x and y, without a correction.
-    fn surface(height: impl Fn([f64; 2]) -> (f64, [f64; 2])) -> Wanted {
+    pub(in super::super) fn surface(height: impl Fn([f64; 2]) -> (f64, [f64; 2])) -> Wanted {
         let on = Grid { columns: 81, rows: 81, first_mm: [-10.0, -10.0], spacing_mm: [0.25, 0.25] };
         let places = (0..on.len()).map(|k| on.place_mm(k));
         let (z, slopes): (Vec<f64>, Vec<[f64; 2]>) = places.map(height).unzip();
