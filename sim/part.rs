@@ -10,9 +10,18 @@
 //!  r_x = S_x + h_x n + h n_x,    r_y = S_y + h_y n + h n_y
 //! ```
 //!
-//! are exact, with the derivative of n from the second derivatives of the closed form. A ball of radius R travelling along
+//! are exact, with the derivative of n from the second derivatives of the closed form. Where it was ground the wheel has left a groove
+//! around each of its tracks, which stands over h by
+//!
+//! ```text
+//!  b(x, y) (y - y_k)^2 / 2        y_k the nearest track, b how much more the wheel bends across the track than the part
+//! ```
+//!
+//! and where two grooves meet there is a ridge. A ball of radius R travelling along
 //! p + t d touches where r + R m = p + t d, m the unit normal of r: three equations for x, y, t, solved by Newton's method.
-//! The slopes that Newton steps with are differences; what they lead to is the root of the exact equations.
+//! The slopes that Newton steps with are differences; what they lead to is the root of the exact equations. A ball that is sharper than the
+//! wheel touches in one groove, or lies on the ridge between two: where the foot in each of both grooves, were it to go on, lies in the
+//! other. A ball that is as blunt as the wheel or blunter reaches into no groove and rides on the ridges, on the one that it meets first.
 
 use serde::{Deserialize, Serialize};
 
@@ -247,6 +256,47 @@ fn weights(t: f64, first: f64, step: f64, nodes: usize) -> (usize, [f64; 4], [f6
     (cell - 1, w, d.map(|c| c * inside))
 }
 
+/// What the wheel has left around its tracks, which run along x.
+#[derive(Clone, Debug)]
+pub struct Grooves {
+    /// Place of a track, in y.
+    pub first_mm: f64,
+    /// Distance of the tracks.
+    pub spacing_mm: f64,
+    /// Radius of the wheel across them.
+    pub wheel_radius_mm: f64,
+    /// How much more the wheel bends across the track than the part, over y, in 1/mm; 0 where nothing was ground.
+    pub bend: HeightGrid,
+}
+
+impl Grooves {
+    /// Returns how much more a wheel bends across tracks along x than the part at (x, y): the least gap between both along the track, over y.
+    pub fn bend_at(shape: &dyn Shape, wheel_radius_mm: f64, [x, y]: [f64; 2]) -> f64 {
+        let ([p, q], hessian) = (shape.gradient(x, y), shape.hessian(x, y));
+        let w = 1.0 / (1.0 + p * p + q * q).sqrt();
+        let metric = [1.0 + p * p, p * q, 1.0 + q * q];
+        let [along, mixed, across]: [f64; 3] = std::array::from_fn(|k| metric[k] / wheel_radius_mm - w * hessian[k]);
+        let bend = across - mixed * mixed / along;
+        // A hollow that is narrower than the wheel has no groove.
+        if along > 0.0 && bend > 0.0 && bend.is_finite() { bend } else { 0.0 }
+    }
+
+    fn nearest(&self, y: f64) -> f64 {
+        ((y - self.first_mm) / self.spacing_mm).round()
+    }
+
+    fn track_mm(&self, number: f64) -> f64 {
+        self.first_mm + number * self.spacing_mm
+    }
+
+    /// Returns the height of the groove of a track at (x, y), and its gradient.
+    fn at(&self, x: f64, y: f64, track: f64) -> (f64, [f64; 2]) {
+        let (b, [bx, by]) = self.bend.at(x, y);
+        let d = y - self.track_mm(track);
+        (0.5 * b * d * d, [0.5 * bx * d * d, b * d + 0.5 * by * d * d])
+    }
+}
+
 /// What came of moving a ball towards the part.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Contact {
@@ -290,8 +340,10 @@ pub struct Part {
     pub shape: Box<dyn Shape>,
     /// Where it is.
     pub aperture: Aperture,
-    /// How far it stands proud, along the nominal normal.
+    /// How far it stands proud, along the nominal normal; where it is ground, at the bottom of the grooves.
     pub height: HeightGrid,
+    /// The grooves that the last pass left; none on a blank.
+    pub grooves: Option<Grooves>,
 }
 
 impl Part {
@@ -308,13 +360,41 @@ impl Part {
         let mut heights_mm = height.heights_mm.clone();
         height.add(&form, &mut heights_mm);
         height.heights_mm = heights_mm;
-        Self { shape: spec.shape.build(), aperture: spec.aperture, height }
+        Self { shape: spec.shape.build(), aperture: spec.aperture, height, grooves: None }
+    }
+
+    /// Returns how far the real surface stands proud at (x, y), along the nominal normal, in millimetres.
+    pub fn deviation_mm(&self, x: f64, y: f64) -> f64 {
+        self.proud(x, y, self.nearest_track(y)).0
+    }
+
+    /// Returns how far the ridges stand over the bottom of the grooves at (x, y), in millimetres.
+    pub fn ridge_mm(&self, x: f64, y: f64) -> f64 {
+        self.grooves.as_ref().map_or(0.0, |grooves| grooves.bend.at(x, y).0 * grooves.spacing_mm.powi(2) / 8.0)
+    }
+
+    fn nearest_track(&self, y: f64) -> f64 {
+        self.grooves.as_ref().map_or(0.0, |grooves| grooves.nearest(y))
+    }
+
+    /// Height and its gradient, in the groove of a track.
+    fn proud(&self, x: f64, y: f64, track: f64) -> (f64, [f64; 2]) {
+        let (h, slope) = self.height.at(x, y);
+        let Some(grooves) = &self.grooves else { return (h, slope) };
+        let (over, by) = grooves.at(x, y, track);
+        (h + over, [slope[0] + by[0], slope[1] + by[1]])
     }
 
     /// Returns the point of the real surface over (x, y) of the nominal, and the unit normal of the real surface there.
     pub fn surface(&self, x: f64, y: f64) -> (Vec3, Vec3) {
+        let (point, tx, ty) = self.tangents(x, y, self.nearest_track(y));
+        (point, unit_normal(tx, ty))
+    }
+
+    /// The point and its derivatives by x and y, in the groove of a track as if it went on for ever.
+    fn tangents(&self, x: f64, y: f64, track: f64) -> (Vec3, Vec3, Vec3) {
         let ([p, q], [zxx, zxy, zyy]) = (self.shape.gradient(x, y), self.shape.hessian(x, y));
-        let (h, [hx, hy]) = self.height.at(x, y);
+        let (h, [hx, hy]) = self.proud(x, y, track);
         let w = 1.0 / (1.0 + p * p + q * q).sqrt();
         let n = [-p * w, -q * w, w];
         // n = N / |N| with N = (-p, -q, 1), so dn = (dN - n (n . dN)) / |N|.
@@ -325,10 +405,8 @@ impl Part {
         let (nx, ny) = (turn(zxx, zxy), turn(zxy, zyy));
         let tx: Vec3 = std::array::from_fn(|i| [1.0, 0.0, p][i] + hx * n[i] + h * nx[i]);
         let ty: Vec3 = std::array::from_fn(|i| [0.0, 1.0, q][i] + hy * n[i] + h * ny[i]);
-        let m = [tx[1] * ty[2] - tx[2] * ty[1], tx[2] * ty[0] - tx[0] * ty[2], tx[0] * ty[1] - tx[1] * ty[0]];
-        let norm = (m[0] * m[0] + m[1] * m[1] + m[2] * m[2]).sqrt();
         let [sx, sy, sz] = self.shape.point(x, y);
-        ([sx + h * n[0], sy + h * n[1], sz + h * n[2]], m.map(|c| c / norm))
+        ([sx + h * n[0], sy + h * n[1], sz + h * n[2]], tx, ty)
     }
 
     /// Moves a ball along its way until it touches.
@@ -373,16 +451,72 @@ impl Part {
         Some(t)
     }
 
-    /// Solves r + R m = p + t d from a place nearby; none where that does not converge.
+    /// Returns where the ball touches, from a place nearby; none where no place is found.
     fn exact_contact(&self, way: &Approach, t: f64) -> Option<([f64; 2], f64)> {
-        let offset = |x: f64, y: f64| -> Vec3 {
-            let (r, m) = self.surface(x, y);
-            std::array::from_fn(|i| r[i] + way.radius_mm * m[i])
-        };
         let centre = way.centre(t);
         let [p, q] = self.shape.gradient(centre[0], centre[1]);
         let w = way.radius_mm / (1.0 + p * p + q * q).sqrt();
-        let mut at = [centre[0] + p * w, centre[1] + q * w, t];
+        let foot = [centre[0] + p * w, centre[1] + q * w];
+        let Some(grooves) = &self.grooves else { return self.contact_in(way, [foot[0], foot[1], t], 0.0) };
+        let mut track = grooves.nearest(foot[1]);
+        if way.radius_mm >= grooves.wheel_radius_mm {
+            let ridges = (-3..3).map(|k| grooves.track_mm(track + f64::from(k) + 0.5));
+            let touched = ridges.filter_map(|y| self.contact_on_ridge(way, [foot[0], t], y));
+            return touched.max_by(|a, b| a.1.total_cmp(&b.1));
+        }
+        let mut before = f64::NAN;
+        for _ in 0..20 {
+            let (foot, t) = self.contact_in(way, [foot[0], foot[1], t], track)?;
+            let nearest = grooves.nearest(foot[1]);
+            if nearest == track {
+                return Some((foot, t));
+            }
+            let next = track + (nearest - track).signum();
+            if next == before {
+                return self.contact_on_ridge(way, [foot[0], t], grooves.track_mm(0.5 * (track + next)));
+            }
+            (before, track) = (track, next);
+        }
+        None
+    }
+
+    /// Solves |r - c| = R and (r - c) . r_x = 0 along the ridge at y, with c = p + t d, from a place nearby.
+    fn contact_on_ridge(&self, way: &Approach, [mut x, mut t]: [f64; 2], y: f64) -> Option<([f64; 2], f64)> {
+        let track = self.nearest_track(y);
+        let mut last = f64::INFINITY;
+        for _ in 0..40 {
+            let ((r, tx, _), c) = (self.tangents(x, y, track), way.centre(t));
+            let off: Vec3 = std::array::from_fn(|i| r[i] - c[i]);
+            let miss = [dot(off, off).sqrt() - way.radius_mm, dot(off, tx)];
+            let size = miss[0].abs().max(miss[1].abs());
+            if !size.is_finite() || size < 1e-14 || (size < 1e-11 && size >= last) {
+                last = last.min(size);
+                break;
+            }
+            last = size;
+            const STEP_MM: f64 = 1e-4;
+            let [ahead, behind] = [x + STEP_MM, x - STEP_MM].map(|x| self.tangents(x, y, track).1);
+            let bend: Vec3 = std::array::from_fn(|i| (ahead[i] - behind[i]) / (2.0 * STEP_MM));
+            let length = dot(off, off).sqrt();
+            let (a, b) = (miss[1] / length, -dot(off, way.direction) / length);
+            let (c, d) = (dot(tx, tx) + dot(off, bend), -dot(way.direction, tx));
+            let determinant = a * d - b * c;
+            let step = [(d * miss[0] - b * miss[1]) / determinant, (a * miss[1] - c * miss[0]) / determinant];
+            let longest = step[0].abs().max(step[1].abs());
+            let damping = if longest > 2.0 { 2.0 / longest } else { 1.0 };
+            (x, t) = (x - damping * step[0], t - damping * step[1]);
+        }
+        (last < 1e-10).then_some(([x, y], t))
+    }
+
+    /// Solves r + R m = p + t d in the groove of a track from a place nearby; none where that does not converge.
+    fn contact_in(&self, way: &Approach, from: Vec3, track: f64) -> Option<([f64; 2], f64)> {
+        let offset = |x: f64, y: f64| -> Vec3 {
+            let (r, tx, ty) = self.tangents(x, y, track);
+            let m = unit_normal(tx, ty);
+            std::array::from_fn(|i| r[i] + way.radius_mm * m[i])
+        };
+        let mut at = from;
         let mut last = f64::INFINITY;
         for _ in 0..40 {
             let [x, y, t] = at;
@@ -406,6 +540,12 @@ impl Part {
         }
         (last < 1e-10).then_some(([at[0], at[1]], at[2]))
     }
+}
+
+fn unit_normal(tx: Vec3, ty: Vec3) -> Vec3 {
+    let m = cross(tx, ty);
+    let norm = dot(m, m).sqrt();
+    m.map(|c| c / norm)
 }
 
 fn cross(a: Vec3, b: Vec3) -> Vec3 {
@@ -514,6 +654,56 @@ mod tests {
                 assert!(dot(off, off).sqrt() < 1e-12, "the centre left its line");
             }
         }
+    }
+
+    /// A part that a wheel has left its grooves on.
+    fn grooved(wheel_radius_mm: f64, spacing_mm: f64) -> Part {
+        let mut part = rough_part();
+        let mut bend = HeightGrid::over(part.aperture.half_mm(), 0.0);
+        bend.heights_mm = bend.nodes().map(|at| Grooves::bend_at(part.shape.as_ref(), wheel_radius_mm, at)).collect();
+        part.grooves = Some(Grooves { first_mm: -32.6, spacing_mm, wheel_radius_mm, bend });
+        part
+    }
+
+    #[test]
+    fn a_ball_touches_grooves_and_ridges_and_cuts_nothing() {
+        // A ball of 1.5 mm lies in the grooves of a wheel of 12.5 mm, hardly in those of 1.6 mm, and rides on the ridges of one of 1 mm.
+        for (wheel_radius_mm, spacing_mm, rides) in [(12.5, 0.5, false), (1.6, 0.3, false), (1.0, 0.2, true)] {
+            let part = grooved(wheel_radius_mm, spacing_mm);
+            let (mut on_ridges, mut in_grooves) = (0, 0);
+            for k in 0..60 {
+                let (x, y) = (f64::from(k) * 1.37 - 40.0, 20.0 - spacing_mm * 0.1 * f64::from(k % 23));
+                let n = part.shape.normal(x, y);
+                let tilt = [0.0, 0.1, -0.07][k as usize % 3];
+                let way = way(&part, x, y, [n[0] + tilt, n[1] - 0.5 * tilt, n[2]]);
+                let Contact::Touched { centre_mm: c, foot_mm } = part.touch(&way) else {
+                    panic!("no touch at {x} {y}")
+                };
+                // Looked at from everywhere nearby: nothing is nearer than the radius, and the foot is as near.
+                let distance = |[x, y]: [f64; 2]| {
+                    let r = part.surface(x, y).0;
+                    (0..3).map(|i| (r[i] - c[i]).powi(2)).sum::<f64>().sqrt()
+                };
+                assert!((distance(foot_mm) - 1.5).abs() < 1e-9, "{wheel_radius_mm} at {x} {y}: {}", distance(foot_mm));
+                let around = (0..200 * 40).map(|i| (f64::from(i % 200) - 100.0, f64::from(i / 200) - 20.0));
+                let places = around.map(|(i, j)| [foot_mm[0] + 0.01 * j, foot_mm[1] + 0.004 * i]);
+                let nearest = places.map(distance).fold(f64::INFINITY, f64::min);
+                assert!(nearest > 1.5 - 1e-9, "{wheel_radius_mm} at {x} {y}: cuts {} nm deep", 1e6 * (1.5 - nearest));
+                let grooves = part.grooves.as_ref().unwrap();
+                let beside = (foot_mm[1] - grooves.track_mm(grooves.nearest(foot_mm[1]))).abs();
+                if (beside - 0.5 * spacing_mm).abs() < 1e-9 { on_ridges += 1 } else { in_grooves += 1 }
+            }
+            assert!(if rides { in_grooves == 0 } else { in_grooves > 0 && on_ridges > 0 }, "{on_ridges} {in_grooves}");
+        }
+    }
+
+    #[test]
+    fn grooves_are_as_the_wheel_bends_more_than_the_part() {
+        let flat = crate::shape::Wave { height_mm: 1e-9 };
+        assert!((Grooves::bend_at(&flat, 12.5, [3.0, 4.0]) - 0.08).abs() < 1e-9);
+        // At the foot of a bowl and of a dome, and none where the bowl is narrower than the wheel.
+        let bowl = |radius_mm: f64| Grooves::bend_at(&Sphere { radius_mm }, 12.5, [0.0, 0.0]);
+        assert!((bowl(50.0) - 0.06).abs() < 1e-12 && (bowl(-50.0) - 0.1).abs() < 1e-12 && bowl(12.0) == 0.0);
     }
 
     #[test]

@@ -16,6 +16,10 @@
 //! and since machine and part give way, a share mu of what stood proud stays: h becomes mu h + (1 - mu) cmd where h > cmd, and
 //! where h <= cmd the wheel cuts air. Spark-out repeats the stroke.
 //!
+//! **Scallops.** The wheel is a ball, and where it cuts it leaves a groove around each track: h is the bottom of the grooves, and the ridges
+//! between them belong to the part that is measured ([`crate::part`]). Grooves lie where the last pass has its tracks; where a pass that was broken off or cut air has not
+//! come, those of the pass before keep their height.
+//!
 //! **Depth of cut.** What stands higher over cmd than the depth of cut is taken off by roughing strokes first, each by at
 //! most the depth of cut, with ten times the feed and a wheel of their own (no wear, no growth). They leave at most the depth of cut
 //! for the finishing stroke, so a pass ends as one finishing stroke from there. More than [`MOST_STROKES`] are refused.
@@ -29,7 +33,7 @@ use std::sync::{Arc, Mutex};
 
 use crate::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
 use crate::form::FormError;
-use crate::part::Part;
+use crate::part::{Grooves, HeightGrid, Part};
 use crate::payload::{BROKEN, INTERLOCK, Map, Pass, PassRecord, outside};
 use crate::spec::{GrinderSpec, Mirrored, Misreported, WorldSpec};
 use crate::truth::{GrindEntry, Source, State, locked, nothing_done, stream};
@@ -100,6 +104,8 @@ struct Run {
     order: Vec<(f64, u32)>,
     /// What does not change along the path, a value for every node, in millimetres.
     fixed_mm: Vec<f64>,
+    /// The grooves that the wheel leaves where it cuts.
+    grooves: Option<Grooves>,
     strokes: Vec<Stroke>,
     stroke_mm: f64,
     total_s: f64,
@@ -156,6 +162,9 @@ impl Run {
             self.in_air += 1;
         } else {
             *h = spec.error_copying * *h + (1.0 - spec.error_copying) * cmd;
+            if let (Some(left), Some(cut)) = (&mut state.part.grooves, &self.grooves) {
+                left.bend.heights_mm[node] = cut.bend.heights_mm[node];
+            }
         }
     }
 
@@ -229,7 +238,7 @@ fn fixed_mm(state: &State, map: &Map, pass: &Pass) -> Vec<f64> {
     let (spec, part) = (&state.spec.grinder, &state.part);
     let rng = &mut stream(state.spec.seed, Source::Repeatability, state.passes_begun + 1);
     let fresh = smooth(rng, spec.repeatability_correlation_mm, spec.repeatability_um);
-    let true_radius_mm = state.true_wheel_radius_mm.unwrap_or(pass.wheel_radius_mm + 1e-3 * spec.wheel_radius_error_um);
+    let true_radius_mm = true_radius_mm(state, pass);
     let y0 = grown(pass.extent_mm)[2];
     let lag_mm = 1e-3 * spec.following_um * pass.feed_mm_min / 1000.0;
     let nodes = part.height.nodes().zip(&state.systematic_mm);
@@ -246,6 +255,20 @@ fn fixed_mm(state: &State, map: &Map, pass: &Pass) -> Vec<f64> {
     let mut steered: Vec<f64> = steered.collect();
     part.height.add(&fresh, &mut steered);
     steered
+}
+
+/// Returns the true radius of the wheel in a pass.
+fn true_radius_mm(state: &State, pass: &Pass) -> f64 {
+    state.true_wheel_radius_mm.unwrap_or(pass.wheel_radius_mm + 1e-3 * state.spec.grinder.wheel_radius_error_um)
+}
+
+/// Returns the grooves that the wheel leaves all over the part.
+fn grooves(state: &State, pass: &Pass) -> Grooves {
+    let wheel_radius_mm = true_radius_mm(state, pass);
+    let part = &state.part;
+    let mut bend = HeightGrid::over(part.aperture.half_mm(), 0.0);
+    bend.heights_mm = bend.nodes().map(|at| Grooves::bend_at(part.shape.as_ref(), wheel_radius_mm, at)).collect();
+    Grooves { first_mm: grown(pass.extent_mm)[2], spacing_mm: pass.track_spacing_mm, wheel_radius_mm, bend }
 }
 
 /// Returns what this machine makes of the map at (x, y).
@@ -336,6 +359,7 @@ fn strokes(roughing: u32, pass: &Pass, stroke_mm: f64) -> (Vec<Stroke>, f64) {
 /// Makes a pass ready for the part as it stands.
 fn run(state: &State, (job, cycle): (u32, u16), map_payload: &Payload, map: &Map, pass: Pass) -> Result<Run, Refusal> {
     let fixed_mm = fixed_mm(state, map, &pass);
+    let grooves = state.spec.grinder.scallops.then(|| grooves(state, &pass));
     let (order, stroke_mm) = raster(&state.part, &pass);
     let within = |&(_, node): &(f64, u32)| state.part.height.heights_mm[node as usize] - fixed_mm[node as usize];
     let proud_mm = order.iter().map(within).fold(0.0, f64::max);
@@ -354,6 +378,7 @@ fn run(state: &State, (job, cycle): (u32, u16), map_payload: &Payload, map: &Map
         pass,
         order,
         fixed_mm,
+        grooves,
         strokes,
         stroke_mm,
         total_s,
@@ -452,6 +477,11 @@ impl Body for Grinder {
         };
         state.history.push(entry);
         run.before_mm = state.part.height.heights_mm.clone();
+        state.part.grooves = run.grooves.as_ref().map(|cut| {
+            let before = state.part.grooves.take().map(|grooves| grooves.bend);
+            let bend = before.unwrap_or_else(|| HeightGrid::over(state.part.aperture.half_mm(), 0.0));
+            Grooves { bend, ..cut.clone() }
+        });
         self.running = Some(run);
     }
 

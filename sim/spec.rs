@@ -46,6 +46,8 @@ pub struct GrinderSpec {
     pub thermal_tau_s: f64,
     /// Share of what stands proud that stays, mu.
     pub error_copying: f64,
+    /// The wheel is a ball of the radius that the pass states, and leaves grooves around its tracks; else it is straight across them.
+    pub scallops: bool,
     /// RMS of the random part drawn for every pass.
     pub repeatability_um: f64,
     /// Its correlation length.
@@ -77,6 +79,7 @@ impl Default for GrinderSpec {
             thermal_um: 4.0,
             thermal_tau_s: 1200.0,
             error_copying: 0.15,
+            scallops: true,
             repeatability_um: 0.4,
             repeatability_correlation_mm: 14.0,
             travel_mm: [250.0, 250.0],
@@ -87,7 +90,7 @@ impl Default for GrinderSpec {
 }
 
 impl GrinderSpec {
-    /// A grinder without any error, as stiff as can be.
+    /// A grinder without any error, as stiff as can be, whose wheel leaves nothing between its tracks.
     pub fn perfect() -> Self {
         Self {
             wheel_radius_error_um: 0.0,
@@ -101,6 +104,7 @@ impl GrinderSpec {
             break_in_um: 0.0,
             thermal_um: 0.0,
             error_copying: 0.0,
+            scallops: false,
             repeatability_um: 0.0,
             ..Self::default()
         }

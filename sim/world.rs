@@ -66,15 +66,16 @@ impl World {
         locked(&self.state).spec.clone()
     }
 
-    /// Truth: how far the real surface stands over the nominal at (x, y) of the model frame, along the normal, in millimetres.
+    /// Truth: how far the real surface stands over the nominal at (x, y) of the model frame, along the normal, in millimetres, the ridges
+    /// between the grinder's tracks included.
     pub fn deviation_mm(&self, x_mm: f64, y_mm: f64) -> f64 {
-        locked(&self.state).part.height.at(x_mm, y_mm).0
+        locked(&self.state).part.deviation_mm(x_mm, y_mm)
     }
 
     /// Truth: the same at many places, at one moment.
     pub fn deviations_mm(&self, places_mm: &[[f64; 2]]) -> Vec<f64> {
         let state = locked(&self.state);
-        places_mm.iter().map(|&[x, y]| state.part.height.at(x, y).0).collect()
+        places_mm.iter().map(|&[x, y]| state.part.deviation_mm(x, y)).collect()
     }
 
     /// Truth: the point of the nominal surface over (x, y) and its unit normal.
@@ -98,7 +99,8 @@ impl World {
             .nodes()
             .zip(&part.height.heights_mm)
             .filter(|([x, y], _)| part.aperture.contains(*x, *y))
-            .map(|(_, h)| *h)
+            // The mean of a parabola is a third of its height.
+            .map(|([x, y], h)| h + part.ridge_mm(x, y) / 3.0)
             .collect();
         on_part.iter().sum::<f64>() / on_part.len() as f64
     }

@@ -87,7 +87,7 @@ impl Person {
             spark_out: 1,
             wheel_radius_mm: 25.0,
             feed_mm_min: 1000.0,
-            track_spacing_mm: 0.5,
+            track_spacing_mm: 0.24,
             level_mm: level.trim_end_matches("mm").trim().parse().unwrap(),
             depth_of_cut_mm: 0.02,
             extent_mm: [-51.0, 51.0, -31.0, 31.0],

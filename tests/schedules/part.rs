@@ -62,7 +62,7 @@ pub fn setting(wanted: Wanted) -> &'static Setting {
                 ("form_error_um = 20.0", "form_error_um = 0.0"),
                 (
                     "[simulation.part]",
-                    "[simulation.grinder]\nwaviness_um = 0.0\nrepeatability_um = 0.0\n\n[simulation.part]",
+                    "[simulation.grinder]\nscallops = false\nwaviness_um = 0.0\nrepeatability_um = 0.0\n\n[simulation.part]",
                 ),
             ],
         );

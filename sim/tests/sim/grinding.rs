@@ -1,6 +1,6 @@
 //! The grinder against what can be worked out by hand.
 
-use crate::common::{NOMINAL, grind, grinder_payloads, map_of, pass, run, small_perfect, zero_map};
+use crate::common::{NOMINAL, grind, grinder_payloads, map_of, net, pass, run, small_perfect, zero_map};
 use regrind_sim::body::Body;
 use regrind_sim::part::{PartSpec, ShapeSpec};
 use regrind_sim::payload::{Pass, PassRecord};
@@ -164,6 +164,37 @@ fn wear_and_heat_run_along_the_path_and_heat_stays_for_the_next_pass() {
     grind(&mut grinder, 1, 1, &zero_map(HALF_MM), &deep(0.05));
     let second = fall(&warm);
     assert!(first > 2e-3 && second > 0.0 && second < 0.5 * first, "{first} {second}");
+}
+
+#[test]
+fn between_the_tracks_ridges_stand_where_the_wheel_has_cut() {
+    let mut spec = small_perfect();
+    spec.grinder.scallops = true;
+    spec.part.shape = ShapeSpec::Wave { height_mm: 1e-9 };
+    let world = world(spec);
+    let wheel_mm = deep(0.1).wheel_radius_mm;
+    let mut grinder = world.grinder();
+    grinder.prepare(1, 0, &grinder_payloads(&zero_map(HALF_MM), &deep(0.1))).unwrap();
+    grinder.begin();
+    grinder.advance((24.0 * 33.0 + 23.0) / 50.0);
+    grinder.retract();
+    grinder.outcome(3);
+    // Tracks lie 1 mm apart from -11.5 mm; the first half of them has been ground. h = t^2 / (8 r), and a parabola between.
+    let ridge_mm = 1.0 / (8.0 * wheel_mm);
+    let stands = |y: f64, height_mm: f64| {
+        let found = world.deviation_mm(1.3, y);
+        assert!((found - height_mm).abs() < 1e-9, "at {y}: {found}, wanted {height_mm}");
+    };
+    stands(-5.5, 0.1);
+    stands(-5.0, 0.1 + ridge_mm);
+    stands(-5.25, 0.1 + 0.25 * ridge_mm);
+    stands(5.0, 0.2);
+    grind(&mut grinder, 1, 0, &zero_map(HALF_MM), &deep(0.1));
+    stands(5.0, 0.1 + ridge_mm);
+    assert!((world.level_mm() - 0.1 - ridge_mm / 3.0).abs() < 1e-9, "{}", world.level_mm());
+    let fine = net([14.0, 9.0], 0.037);
+    let (pv_um, _) = crate::common::pv_rms_um(&world.deviations_mm(&fine));
+    assert!((pv_um - 1e3 * ridge_mm).abs() < 0.02e3 * ridge_mm, "{pv_um}");
 }
 
 #[test]
