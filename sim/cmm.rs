@@ -85,6 +85,8 @@ struct Run {
     unexpected: u32,
     fault: u16,
     elapsed_s: f64,
+    /// When each target has been touched.
+    due_s: Vec<f64>,
     noise: Rng,
     outliers: Rng,
     not_found: Rng,
@@ -102,6 +104,7 @@ impl Run {
             unexpected: 0,
             fault: 0,
             elapsed_s: 0.0,
+            due_s: Vec::new(),
             noise,
             outliers,
             not_found,
@@ -111,18 +114,30 @@ impl Run {
     fn begin(&mut self, state: &mut State) {
         state.measurements_begun += 1;
         self.placement = state.load_on_table();
+        self.due_s = Self::due_s(&self.plan, &state.spec.cmm);
         let draw = |source| stream(state.spec.seed, source, state.measurements_begun);
         self.noise = draw(Source::Noise);
         self.outliers = draw(Source::Outliers);
         self.not_found = draw(Source::NotFound);
     }
 
-    /// Returns how long so many targets take, those at the beginning slower than the others where the plan says so.
-    fn takes_s(&self, targets: usize, each_s: f64) -> f64 {
-        let (careful, speed_mm_s) = self.plan.careful;
-        let slowly = targets.min(careful as usize);
-        let slower = if slowly == 0 { 1.0 } else { self.plan.speed_mm_s / speed_mm_s };
-        each_s * ((targets - slowly) as f64 + slower * slowly as f64)
+    /// Returns when each target has been touched: those at the beginning take longer where the plan says so, and between two lies the travel.
+    fn due_s(plan: &Plan, spec: &CmmSpec) -> Vec<f64> {
+        let (slowly, speed_mm_s) = plan.careful;
+        let each_s = |k: usize| {
+            let slower = if k < slowly as usize { plan.speed_mm_s / speed_mm_s } else { 1.0 };
+            slower * spec.seconds_per_point
+        };
+        let travel_mm = |k: usize| {
+            let [from, to] = [k.max(1) - 1, k].map(|k| plan.targets[k].point_mm);
+            (0..3).map(|i| (to[i] - from[i]).powi(2)).sum::<f64>().sqrt()
+        };
+        let mut at_s = 0.0;
+        let due = |k: usize| {
+            at_s += each_s(k) + travel_mm(k) / spec.travel_mm_s;
+            at_s
+        };
+        (0..plan.targets.len()).map(due).collect()
     }
 
     fn finished(&self) -> bool {
@@ -203,7 +218,8 @@ fn untouched(target: &Target, status: Status) -> PointRecord {
 fn reported(faults: &Faults, target: &Target, stated_radius_mm: f64, centre_mm: Vec3) -> Vec3 {
     let back = if faults.returns_contact_points { stated_radius_mm } else { 0.0 };
     let unit = if faults.inches { 25.4 } else { 1.0 };
-    std::array::from_fn(|i| (centre_mm[i] - back * target.normal[i]) / unit)
+    let sign = if faults.cmm_mirrored { [1.0, -1.0, 1.0] } else { [1.0; 3] };
+    std::array::from_fn(|i| sign[i] * (centre_mm[i] - back * target.normal[i]) / unit)
 }
 
 /// The measuring machine of a world.
@@ -279,8 +295,8 @@ impl Body for Cmm {
             run.elapsed_s += seconds;
         }
         state.engaged = Some(Kind::Cmm);
-        let (each_s, most) = (state.spec.cmm.seconds_per_point, state.spec.cmm.unexpected_touches_most);
-        while run.fault == 0 && !run.finished() && run.takes_s(run.records.len() + 1, each_s) <= run.elapsed_s {
+        let most = state.spec.cmm.unexpected_touches_most;
+        while run.fault == 0 && run.due_s.get(run.records.len()).is_some_and(|due_s| *due_s <= run.elapsed_s) {
             let target = run.plan.targets[run.records.len()];
             let record = run.measure(&state, &target);
             run.records.push(record);
@@ -304,7 +320,7 @@ impl Body for Cmm {
         let Some(mut run) = self.running.take() else { return nothing_done(state.spec.cmm.part_temperature_c) };
         state.release(Kind::Cmm);
         let (spec, faults) = (&state.spec.cmm, &state.spec.faults);
-        let duration_s = run.elapsed_s.min(run.takes_s(run.plan.targets.len(), spec.seconds_per_point));
+        let duration_s = run.elapsed_s.min(run.due_s.last().copied().unwrap_or(0.0));
         let rest = run.plan.targets[run.records.len()..].iter();
         run.records.extend(rest.map(|target| untouched(target, Status::NotReached)));
         let kept = run.records.len().saturating_sub(faults.missing_records as usize);

@@ -147,6 +147,8 @@ pub struct CmmSpec {
     pub travel_most_mm: Vec3,
     /// Time that a point takes.
     pub seconds_per_point: f64,
+    /// Speed of the travel from one point to the next.
+    pub travel_mm_s: f64,
     /// Touches before the search begins that the machine puts up with in one measurement.
     pub unexpected_touches_most: u32,
     /// Points are sent as 32-bit counts of a nanometre (format 2) in place of floats (format 1).
@@ -172,6 +174,7 @@ impl Default for CmmSpec {
             travel_least_mm: [-500.0, -500.0, -300.0],
             travel_most_mm: [500.0, 500.0, 400.0],
             seconds_per_point: 1.0,
+            travel_mm_s: 100.0,
             unexpected_touches_most: 20,
             scaled_points: false,
         }
@@ -281,6 +284,8 @@ pub struct Faults {
     pub contact_points_declared: bool,
     /// The CMM reports inches, and the header says millimetres.
     pub inches: bool,
+    /// An axis of the CMM counts the other way: what it reports is mirrored in y.
+    pub cmm_mirrored: bool,
     /// The part lies on the CMM turned by half a turn about z.
     pub part_turned_180: bool,
     /// There is no part in either machine.
@@ -379,7 +384,8 @@ impl WorldSpec {
         check_all("cmm.sphere_centre_mm", &c.sphere_centre_mm, -2e3, 2e3, "-2000 to 2000 mm")?;
         check_all("cmm.travel_least_mm", &c.travel_least_mm, -2e3, 2e3, "-2000 to 2000 mm")?;
         check_all("cmm.travel_most_mm", &c.travel_most_mm, -2e3, 2e3, "-2000 to 2000 mm")?;
-        check_all("cmm.seconds_per_point", &[c.seconds_per_point], 1e-3, 1e3, "0.001 to 1000 s")
+        check_all("cmm.seconds_per_point", &[c.seconds_per_point], 1e-3, 1e3, "0.001 to 1000 s")?;
+        check_all("cmm.travel_mm_s", &[c.travel_mm_s], 0.1, 1e6, "0.1 to 1000000 mm/s")
     }
 
     /// The surface must have a height everywhere on the part; domains of these shapes are convex, so the rim tells.

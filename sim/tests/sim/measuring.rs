@@ -300,10 +300,22 @@ fn a_table_that_cannot_be_is_refused_with_its_key() {
 
 #[test]
 fn the_careful_beginning_of_a_plan_is_slow_and_the_rest_is_not() {
-    let world = World::new(small_perfect()).unwrap();
+    let mut spec = small_perfect();
+    spec.cmm.travel_mm_s = 1e6;
+    let world = World::new(spec).unwrap();
     let places: Vec<[f64; 2]> = (0..20).map(|k| [0.1 * f64::from(k) - 1.0, 0.0]).collect();
     let plan = plan(&world, &places);
     let took = |plan: &Plan| measure(&mut world.cmm(), plan).0.duration_s;
     let (usual, careful) = (took(&plan), took(&Plan { careful: (5, 0.2 * plan.speed_mm_s), ..plan.clone() }));
-    assert!((careful / usual - (15.0 + 5.0 * 5.0) / 20.0).abs() < 1e-9, "{usual} s, and {careful} s with care");
+    assert!((careful / usual - (15.0 + 5.0 * 5.0) / 20.0).abs() < 1e-5, "{usual} s, and {careful} s with care");
+}
+
+#[test]
+fn between_two_targets_lies_the_travel() {
+    let world = World::new(small_perfect()).unwrap();
+    let took = |places: &[[f64; 2]]| measure(&mut world.cmm(), &plan(&world, places)).0.duration_s;
+    let [near, far] = [took(&[[0.0, 0.0], [1.0, 0.0]]), took(&[[0.0, 0.0], [10.0, 0.0]])];
+    assert_eq!(took(&[[0.0, 0.0]]), 1.0);
+    // 9 mm more, at 100 mm/s, over a surface that is next to flat.
+    assert!((far - near - 0.09).abs() < 0.01 && near > 2.0, "{near} {far}");
 }
