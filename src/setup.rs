@@ -10,18 +10,18 @@ use std::time::Duration;
 use sha2::{Digest, Sha256};
 use thiserror::Error;
 
-use crate::cell::{CellPlan, Deadlines, Device, Disposal, Gates, Tolerance};
+use crate::cell::{CellPlan, Deadlines, Device, Disposal, Gates, PvOf, Tolerance};
 use crate::compensation::path::{
     Field, Limits, PathError, PathOptions, Scallops, TrackSpacing, Wanted, Wheel as PathWheel,
 };
 use crate::compensation::{Correction, CorrectionLimits, MapOptions, contact_width_mm};
 use crate::config::{CellConfig, Link};
 use crate::device::{AnyCmm, AnyGrinder, Line, Making, MakingError, ModbusSettings, Pass, hex};
-use crate::drive::{Probing, Programs, Sphere, Task};
+use crate::drive::{Adaptive, Probing, Programs, Sphere, Task};
 use crate::formats::{self, FormatError, NominalFile};
 use crate::geometry::{Aperture, Grid, Point, Vector};
 use crate::measuring::{Expansion, Layout, PatternError, Target, targets};
-use crate::recipe::{NominalSource, Pattern, Recipe, SpindleAxis, StartAt, Um, Wheel};
+use crate::recipe::{Mode, NominalSource, Pattern, Recipe, SpindleAxis, StartAt, Um, Wheel};
 use crate::registration::{Coordinate, MapLimits};
 use crate::surface::{DefinedSurface, DefinitionError, Nominal, Projection, Side, SurfaceError};
 
@@ -143,14 +143,32 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         least_found: recipe.measure.minimum_coverage,
         temperature_c: recipe.measure.temperature_c,
         expansion: expansion(recipe, cell),
+        adaptive: adaptive(recipe),
         simulation: cell.simulated,
     };
     let mut plan = plan(recipe, cell);
+    if task.adaptive.is_some() {
+        // One of the first touches may miss; the gate that counts them all is the task's.
+        plan.gates.least_found *= Adaptive::ONE_MAY_MISS;
+    }
     let [map, targets] = [8 * task.first_correction().grid.len(), LARGEST_TARGET * task.targets.len()];
     for (link, bytes) in [(&cell.grinder.link, map), (&cell.cmm.link, targets)] {
         plan.deadlines.transfer = plan.deadlines.transfer.max(transfer_within(link, bytes));
     }
     Ok((task, plan))
+}
+
+/// What a measurement goes by whose touches are chosen.
+fn adaptive(recipe: &Recipe) -> Option<Adaptive> {
+    let accepted_risk = recipe.measuring.accepted_risk.filter(|_| recipe.measuring.mode == Mode::Adaptive)?;
+    let limit = |um: Option<Um>| um.map_or(f64::INFINITY, Um::mm);
+    let pv_mm = limit(recipe.acceptance.pv_um);
+    let (pv_mm, pv_most_points_mm) = match recipe.acceptance.pv_of {
+        PvOf::All => (pv_mm, f64::INFINITY),
+        PvOf::MostPoints => (f64::INFINITY, pv_mm),
+    };
+    let (rms_mm, most_cycles) = (limit(recipe.acceptance.rms_um), u32::from(recipe.cycle.most_cycles));
+    Some(Adaptive { pv_mm, pv_most_points_mm, rms_mm, accepted_risk, most_cycles })
 }
 
 /// Returns how long so many bytes may take over the line of a machine, with room for it to be sent anew.

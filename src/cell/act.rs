@@ -402,7 +402,7 @@ impl Cell {
         let (shift, turn) = (figures.shift_mm, figures.turn_rad.to_degrees());
         if !figures.are_sound() {
             self.useless(AlarmId::RegistrationFailed, "a figure is not a number, or negative");
-        } else if figures.coverage < gates.least_coverage {
+        } else if figures.touch_on.is_none() && figures.coverage < gates.least_coverage {
             let (found, least) = (100.0 * figures.coverage, 100.0 * gates.least_coverage);
             self.useless(
                 AlarmId::Coverage,
@@ -412,6 +412,9 @@ impl Cell {
             let (most, most_turn) = (gates.most_shift_mm, gates.most_turn_rad.to_degrees());
             let case = format!("{shift:.3} mm of at most {most:.3} mm, {turn:.2} of at most {most_turn:.2} degrees");
             self.useless(AlarmId::PartMisplaced, &case);
+        } else if figures.touch_on.is_some() {
+            // Of the same measurement: nothing is judged by a part of it.
+            self.advance(Measure(JobStep::Send));
         } else {
             self.figures = Some(figures.clone());
             self.advance(Judge);

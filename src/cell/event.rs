@@ -321,6 +321,18 @@ pub struct Figures {
     /// The most that was taken off anywhere since the run began; none where nobody knows.
     #[serde(default, with = "super::number::optional")]
     pub removed_mm: Option<f64>,
+    /// What is to be touched before anything is decided; none where enough is known, and where all is touched at once.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub touch_on: Option<Box<TouchOn>>,
+}
+
+/// More that is to be touched.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TouchOn {
+    /// How many targets are next.
+    pub targets: u32,
+    /// Why, in words.
+    pub why: String,
 }
 
 /// The figures of the form of a part.

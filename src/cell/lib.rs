@@ -32,7 +32,7 @@ pub use alarm::{Alarm, AlarmId, Role};
 pub use command::{Command, Ending, Judgement, Verdict};
 pub use event::{
     Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Forecast, FormFigures, Gate,
-    GateFailure, Interval, JobResult, Mismatch, Occupation, Reconciliation, RecordFailure, Response,
+    GateFailure, Interval, JobResult, Mismatch, Occupation, Reconciliation, RecordFailure, Response, TouchOn,
 };
 pub use judge::{Compared, Conformity};
 pub use memory::Cell;

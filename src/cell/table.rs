@@ -8,7 +8,7 @@ use std::time::Duration;
 use super::command::Command;
 use super::event::{
     Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Gate, GateFailure, JobResult,
-    Mismatch, Occupation, Reconciliation, RecordFailure, Response,
+    Mismatch, Occupation, Reconciliation, RecordFailure, Response, TouchOn,
 };
 use super::memory::Cell;
 use super::plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, PvOf, Tolerance};
@@ -16,7 +16,7 @@ use super::state::{Device, Phase, State};
 
 /// The version of the table. A run is gone on with by a program of the version that began it only; a change of what follows from
 /// anything is another version.
-pub const TABLE_VERSION: u32 = 4;
+pub const TABLE_VERSION: u32 = 5;
 
 /// What an event does in a state.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -240,6 +240,7 @@ fn sample_figures() -> Vec<Figures> {
         response: None,
         forecast: None,
         removed_mm: Some(0.1),
+        touch_on: None,
     };
     let mut all = vec![
         plain.clone(),
@@ -250,6 +251,11 @@ fn sample_figures() -> Vec<Figures> {
         Figures { shift_mm: 5.0, ..plain.clone() },
         Figures { turn_rad: 3.0, ..plain.clone() },
         Figures { removed_mm: Some(2.0), ..plain.clone() },
+        Figures {
+            touch_on: Some(Box::new(TouchOn { targets: 20, why: String::new() })),
+            coverage: 0.1,
+            ..plain.clone()
+        },
         Figures { pv_mm: f64::NAN, ..plain.clone() },
     ];
     for response in

@@ -7,11 +7,12 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use regrind::cell::{Alarm, AlarmId, Device, Ending, Figures, Judgement, PvOf, Tolerance};
+use regrind::cell::{Alarm, AlarmId, Device, Ending, Figures, Judgement, PvOf, Tolerance, TouchOn};
 use regrind::document::visible;
 use regrind::drive::{CycleRow, Notice};
 use regrind::formats::read_error_map;
-use regrind::recipe::Recipe;
+use regrind::model::FIRST;
+use regrind::recipe::{Mode, Recipe};
 use tokio::sync::mpsc;
 
 use super::blocks::{Blocks, sparkline};
@@ -29,6 +30,8 @@ pub(super) struct Show {
     head: String,
     tolerance: Tolerance,
     folder: String,
+    /// Whether touches are chosen: their batches are too many to tell of each how fast it came.
+    is_chosen: bool,
     bar: Option<ProgressBar>,
     /// When a plain line about progress was printed last.
     said: Option<Instant>,
@@ -47,6 +50,7 @@ impl Show {
             head: format!("{}, {}", recipe.part.name, recipe.path().display()),
             tolerance,
             folder: folder.display().to_string(),
+            is_chosen: recipe.measuring.mode == Mode::Adaptive,
             bar: (!json && io::stderr().is_terminal()).then(bar),
             said: None,
             job: None,
@@ -98,6 +102,7 @@ impl Show {
                 }
                 self.order(event)
             }
+            Notice::Transferred { .. } if self.is_chosen => Ok(()),
             Notice::Transferred { cycle, points, seconds, ms_per_point } => self.line(&format!(
                 "cycle {cycle}: {points} points fetched in {seconds:.2} s, {} ms a point",
                 three_digits(*ms_per_point)
@@ -141,7 +146,7 @@ impl Show {
             }
             Notice::Refused { why } => self.line(&format!("not done: {why}")),
             Notice::RecordFailed { message } => self.line(&format!("RECORD: {message}")),
-            Notice::Finished { ending, cycles } => self.finished(ending, cycles),
+            Notice::Finished { ending, cycles, touches } => self.finished(ending, cycles, *touches),
         }
     }
 
@@ -179,6 +184,13 @@ impl Show {
         let compared = self.tolerance.compare(figures);
         let [pv, rms] = compared.map(|compared| judged(&compared));
         let (points, outliers) = (figures.points, figures.outliers);
+        if let Some(TouchOn { targets, why }) = figures.touch_on.as_deref() {
+            // Of the first touches nothing is known but that they belong to this part.
+            let known =
+                figures.form.filter(|_| points as usize > FIRST).map_or(String::new(), |_| format!("{pv}, {rms}; "));
+            self.line(&format!("cycle {cycle}: {known}{points} points; {targets} more, for {why}"))?;
+            return self.picture(cycle);
+        }
         let mut text = format!("cycle {cycle}: {pv}, {rms}; {points} points, {outliers} outliers");
         for words in figures.weak_directions.iter().chain(&figures.warnings) {
             let _ = write!(text, "\n         {words}");
@@ -207,7 +219,7 @@ impl Show {
         self.striking(&text, "ALARM", "31")
     }
 
-    fn finished(&mut self, ending: &Ending, cycles: &[CycleRow]) -> Result<(), Failure> {
+    fn finished(&mut self, ending: &Ending, cycles: &[CycleRow], touches: Option<[usize; 2]>) -> Result<(), Failure> {
         let (word, reason) = match ending {
             Ending::Accepted { reason, .. } => ("ACCEPTED", reason),
             Ending::NotAccepted { reason, .. } => ("NOT ACCEPTED", reason),
@@ -223,6 +235,9 @@ impl Show {
             let CycleRow { cycle, points, outliers, level_um, .. } = row;
             let [pv_um, rms_um] = row.judged_um();
             let _ = writeln!(text, "{cycle:>5} {pv_um:>13.2} {rms_um:>8.3} {points:>8} {outliers:>9} {level_um:>9.1}");
+        }
+        if let Some([taken, whole]) = touches {
+            let _ = writeln!(text, "\n{taken} touches of the part; the whole pattern would have taken {whole}");
         }
         let marked = if self.simulated { "SIMULATION  " } else { "" };
         let _ = write!(text, "\n{marked}{word}: {reason}");
@@ -251,9 +266,14 @@ impl Show {
 /// The error map of a cycle that was made last: what was measured again stands in a folder of its own.
 fn newest_map(run: &Path, cycle: u32) -> Option<PathBuf> {
     let cycle = run.join(format!("cycle-{cycle}"));
-    let attempts = (2..).map(|attempt| cycle.join(format!("attempt-{attempt}"))).take_while(|folder| folder.is_dir());
-    let maps = std::iter::once(cycle.clone()).chain(attempts).map(|folder| folder.join("error_map.csv"));
-    maps.filter(|map| map.is_file()).last()
+    let of = |what: &str, first: u32| {
+        let folders = (first..).map(|k| cycle.join(format!("{what}-{k}"))).take_while(|folder| folder.is_dir());
+        folders.collect::<Vec<_>>()
+    };
+    let (batches, attempts) = (of("batch", 1), of("attempt", 2));
+    let all = batches.into_iter().chain([cycle.clone()]).chain(attempts);
+    let maps = all.map(|folder| folder.join("error_map.csv"));
+    maps.rev().find(|map| map.is_file())
 }
 
 /// Whether a person at this terminal can answer: it is one, and not somebody else's at the moment.

@@ -53,6 +53,6 @@ pub use table::{AnyCmm, AnyGrinder, Wire};
 pub use wiring::{Making, MakingError, Timing, Wired};
 pub use words::hex;
 pub use words::{
-    Answer, Armed, Command, Fault, Identity, Job, MachineKind, Outcome, Reconciled, SignalValue, Started, State,
-    Status, Word, digest,
+    Answer, Armed, Command, Fault, Identity, Job, MachineKind, Number, Outcome, Reconciled, SignalValue, Started,
+    State, Status, Word, digest,
 };

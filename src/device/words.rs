@@ -64,9 +64,53 @@ pub struct Job {
     pub digest: u32,
 }
 
+impl Job {
+    /// Returns which batch of touches of which cycle it is.
+    pub fn number(&self) -> Number {
+        Number::of(self.cycle)
+    }
+}
+
 impl fmt::Display for Job {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "job {} cycle {} (digest {:08x})", self.job, self.cycle, self.digest)
+        write!(f, "job {} cycle {} (digest {:08x})", self.job, self.number(), self.digest)
+    }
+}
+
+/// A cycle, and which batch of touches of it where a measurement is taken batch by batch: the batches before it. A machine sees one number of
+/// 16 bits: the cycle, and 1024 for each batch before.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Number {
+    /// The cycle.
+    pub cycle: u32,
+    /// The batches before.
+    pub batch: u32,
+}
+
+impl Number {
+    /// The cycles of a run, and the batches of a measurement, are fewer.
+    pub const CYCLES: u32 = 1024;
+    /// The batches of a measurement.
+    pub const BATCHES: u32 = 64;
+
+    /// Takes apart what a machine sees.
+    pub fn of(seen: u16) -> Self {
+        let seen = u32::from(seen);
+        Self { cycle: seen % Self::CYCLES, batch: seen / Self::CYCLES }
+    }
+
+    /// Returns what a machine sees, which is another for every batch as long as the limits are kept.
+    pub fn seen(self) -> u16 {
+        (self.cycle % Self::CYCLES + Self::CYCLES * (self.batch % Self::BATCHES)) as u16
+    }
+}
+
+impl fmt::Display for Number {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.batch {
+            0 => self.cycle.fmt(f),
+            before => write!(f, "{}, batch {}", self.cycle, before + 1),
+        }
     }
 }
 

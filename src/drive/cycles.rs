@@ -9,6 +9,8 @@ use super::CycleRow;
 use super::task::{Cycle, Product, Task};
 use crate::cell::Tolerance;
 use crate::device::{CorrectionMap, Pass, Plan};
+use crate::geometry::Pose;
+use crate::model::{FIRST, short_way, spread};
 
 /// The cycles, by number.
 #[derive(Default)]
@@ -35,10 +37,27 @@ impl Cycles {
         let judged = last.filter(|cycle| cycle.is_judged()).and_then(|cycle| cycle.registration.as_ref());
         let pose = judged.map_or(task.fixture_cmm_from_model, |found| found.cmm_from_model);
         let seated_anew = last.is_some_and(|cycle| cycle.plan.is_some() && !cycle.is_judged());
-        let plan = Arc::new(task.plan(correction.level_mm, &pose, seated_anew));
         let cycle = self.0.entry(number).or_insert_with(|| Cycle::new((*correction).clone()));
-        cycle.plan = Some(Arc::clone(&plan));
-        plan
+        let plan = match task.adaptive {
+            None => task.plan(correction.level_mm, &pose, seated_anew),
+            Some(_) => batch(task, cycle, &pose, seated_anew),
+        };
+        cycle.plan.insert(Arc::new(plan)).clone()
+    }
+
+    /// Returns which batch of touches the plan of a cycle is.
+    pub(super) fn batch(&self, number: u32) -> u32 {
+        self.get(number).map_or(0, |cycle| cycle.batch)
+    }
+
+    /// Returns how many touches of the part were tried, and how many the whole pattern would have been, in all measurements.
+    pub(super) fn touches(&self, task: &Task) -> [usize; 2] {
+        let measured = self.0.values().filter_map(|cycle| cycle.points.as_ref());
+        let tried = measured.clone().map(|points| match points.tried.is_empty() {
+            true => points.part.len(),
+            false => points.tried.iter().map(Vec::len).sum(),
+        });
+        [tried.sum(), measured.count() * task.targets.len()]
     }
 
     /// Returns the last measurement of an earlier pass that was judged. What a gate refused, and what was measured once more after
@@ -88,4 +107,22 @@ impl Cycles {
         });
         rows.collect()
     }
+}
+
+/// Lays the next batch of touches of a measurement: where nothing was found yet some that lie far apart, slowly where the part may have been
+/// seated anew.
+fn batch(task: &Task, cycle: &mut Cycle, pose: &Pose, seated_anew: bool) -> Plan {
+    cycle.batch = cycle.points.as_ref().map_or(0, |points| points.tried.len() as u32);
+    cycle.asked = match &cycle.next {
+        Some(next) => Arc::clone(next),
+        None => {
+            let places = task.places();
+            Arc::new(short_way(&places, spread(&places, FIRST)))
+        }
+    };
+    let is_first = cycle.batch == 0;
+    let pose = cycle.registration.as_ref().map_or(*pose, |found| found.cmm_from_model);
+    let chosen = cycle.asked.to_vec();
+    let order = if is_first && seated_anew { (chosen, Vec::new()) } else { (Vec::new(), chosen) };
+    task.plan_of(cycle.correction.level_mm, &pose, order, is_first)
 }

@@ -25,6 +25,7 @@ mod replay;
 mod snapshot;
 mod station;
 mod task;
+mod touches;
 mod work;
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
@@ -44,7 +45,7 @@ use crate::cell::{
     Phase, RecordFailure, State, StateName,
 };
 use crate::device::{
-    AnyCmm, AnyGrinder, Armed, Cmm, Grinder, Identified, Interrupt, Job, Measurement, PassRecord, Word, hex,
+    AnyCmm, AnyGrinder, Armed, Cmm, Grinder, Identified, Interrupt, Job, Measurement, Number, PassRecord, Word, hex,
 };
 use crate::formats::{FormatError, LEARNED, ResultFolder, write_json_atomic};
 use crate::journal::{self, Artefact, Entry, Kind};
@@ -64,7 +65,7 @@ use station::{
     StationReport,
 };
 use task::Product;
-pub use task::{Probing, Sphere, Task};
+pub use task::{Adaptive, Probing, Sphere, Task};
 
 /// Everything a run needs besides its machines.
 pub struct Run {
@@ -182,13 +183,15 @@ enum Computation {
     Gate,
     Registration,
     Compensation,
+    /// The registration that the cell decides by, where touches are chosen.
+    Settled,
 }
 
 impl Computation {
     /// Returns which makes a file of this name, if one does.
     fn of(file: &str) -> Option<Self> {
         Some(match file {
-            "measured.csv" | "reference_sphere.csv" => Self::Gate,
+            "measured.csv" | "reference_sphere.csv" | "touches.json" => Self::Gate,
             "correction.csv" | "correction.json" | "toolpath.ngc" | "toolpath_z.csv" => Self::Compensation,
             "registration.json"
             | "deviations.csv"
@@ -211,6 +214,11 @@ fn folder_of(cycle: u32, attempt: u32) -> String {
         0 | 1 => format!("cycle-{cycle}"),
         attempt => format!("cycle-{cycle}/attempt-{attempt}"),
     }
+}
+
+/// The folder of what is known after a batch of touches, where they are chosen.
+fn batch_folder(cycle: u32, batch: u32) -> String {
+    format!("cycle-{cycle}/batch-{batch}")
 }
 
 /// Something that waits to be on record, and what follows then.
@@ -387,7 +395,7 @@ impl Drive {
                 let gate = Gate::Failed(GateFailure::Broken(why));
                 Event::Collected { cycle, targets: 0, found: 0, gate }
             }
-            Computation::Registration => Event::RegistrationFailed { cycle, why },
+            Computation::Registration | Computation::Settled => Event::RegistrationFailed { cycle, why },
             Computation::Compensation => Event::CompensationRefused { cycle, why: CompensationRefusal::Failed(why) },
         };
         self.take(event, None).await;
@@ -474,14 +482,18 @@ impl Drive {
             }
         }
         let rows: Vec<CycleRow> = self.cycles.rows(&self.cell.plan().tolerance);
-        let result = json!({ "simulation": self.task.simulation, "ending": ending, "cycles": rows });
+        let mut result = json!({ "simulation": self.task.simulation, "ending": ending, "cycles": rows });
+        let touches = self.task.adaptive.map(|_| self.cycles.touches(&self.task));
+        if let Some([taken, whole_patterns]) = touches {
+            result["touches"] = json!({ "taken": taken, "whole_patterns": whole_patterns });
+        }
         let now = self.now();
         self.leave("result.json".into(), self.cell.cycle(), &result).await;
         self.keep_what_was_learned(&ending).await;
         if let Err(failure) = self.recorder.close(now, self.cell.cycle(), result).await {
             self.notify(Notice::RecordFailed { message: message_of(&failure) });
         }
-        self.notify(Notice::Finished { ending: ending.clone(), cycles: rows });
+        self.notify(Notice::Finished { ending: ending.clone(), cycles: rows, touches });
         // No more asks: each station gives its machine back and ends.
         self.asks = [mpsc::channel(1).0, mpsc::channel(1).0];
         for station in self.stations.drain(..) {
@@ -647,7 +659,8 @@ impl Drive {
 
     /// Records and shows how fast points came over the wire.
     async fn transferred(&mut self, measurement: &Measurement, taken: Duration) {
-        let (cycle, points, seconds) = (u32::from(measurement.cycle), measurement.points.len(), taken.as_secs_f64());
+        let cycle = Number::of(measurement.cycle).cycle;
+        let (points, seconds) = (measurement.points.len(), taken.as_secs_f64());
         let ms_per_point = 1e3 * seconds / points.max(1) as f64;
         let payload = json!({ "transfer": { "points": points, "seconds": seconds, "ms_per_point": ms_per_point, "coordinates": measurement.coordinates } });
         self.note(Kind::Note, ("cmm".into(), "wire".into()), payload);
@@ -656,6 +669,9 @@ impl Drive {
 
     async fn computed(&mut self, computed: Computed) {
         let Computed { cycle: number, event, product, files } = computed;
+        if matches!(&event, Some(Event::Registered { figures, .. }) if figures.touch_on.is_none()) {
+            *self.attempts.entry((number, Computation::Settled)).or_insert(0) += 1;
+        }
         if let (Err(why), Some(Event::Collected { .. } | Event::Registered { .. } | Event::Compensated { .. })) =
             (&files, &event)
         {
@@ -802,7 +818,10 @@ impl Drive {
             Command::LoadPlan { cycle } => self.load_plan(cycle).await,
             Command::VerifyClear { device } => self.ask(device, Ask::VerifyClear).await,
             Command::AskWhetherClear { device } => self.notify(Notice::AskWhetherClear { device }),
-            Command::Prepare { device, cycle } => self.ask(device, Ask::Prepare { cycle }).await,
+            Command::Prepare { device, cycle } => {
+                let batch = if device == Device::Cmm { self.cycles.batch(cycle) } else { 0 };
+                self.ask(device, Ask::Prepare { number: Number { cycle, batch } }).await;
+            }
             Command::StartMachine { device, cycle } => self.ask(device, Ask::Start { cycle }).await,
             Command::HoldMachine { device } => self.ask_at_once(device, Ask::Hold).await,
             Command::ResumeMachine { device } => self.ask(device, Ask::Resume).await,
@@ -906,10 +925,10 @@ impl Drive {
 
     /// Looks through the points of a measurement and writes them.
     fn gate(&mut self, measurement: Box<Measurement>) {
-        let number = u32::from(measurement.cycle);
-        let plan = self.cycles.get(number).and_then(|cycle| cycle.plan.clone());
+        let number = Number::of(measurement.cycle).cycle;
+        let cycle = self.cycles.get(number).cloned();
         self.compute(Computation::Gate, number, move |task, files| {
-            work::gate_cycle(task, files, number, plan.as_deref(), &measurement)
+            work::gate_cycle(task, files, number, cycle.as_ref(), &measurement)
         });
     }
 
@@ -946,14 +965,17 @@ impl Drive {
         let (task, folder) = (Arc::clone(&self.task), self.folder.clone());
         let attempt = self.attempts.entry((cycle, kind)).or_insert(0);
         *attempt += 1;
-        let below = folder_of(cycle, *attempt);
+        let which = *attempt;
+        let mut files = Files::new(folder.clone(), folder_of(cycle, which));
+        if task.adaptive.is_some() && kind != Computation::Compensation {
+            let settled = self.attempts.get(&(cycle, Computation::Settled)).map_or(1, |before| before + 1);
+            files = Files::new(folder.clone(), batch_folder(cycle, which)).then(folder_of(cycle, settled));
+        }
         let computing = self.beside.compute(&mut self.computations, move || {
-            let mut files = Files::new(folder.join(&below));
             // What cannot be made is told by the first file that cannot be written into it.
-            let _ = made(files.folder());
+            let _ = made(&files.folder());
             let (event, product) = work(&task, &mut files);
-            let names: Vec<String> = files.made().iter().map(|name| format!("{below}/{name}")).collect();
-            Computed { cycle, event: Some(event), product, files: record::describe(&folder, &names) }
+            Computed { cycle, event: Some(event), product, files: record::describe(&folder, &files.made()) }
         });
         self.computing.insert(computing.id(), (cycle, kind));
     }

@@ -58,5 +58,10 @@ pub enum Notice {
         message: String,
     },
     /// The run is over.
-    Finished { ending: Ending, cycles: Vec<CycleRow> },
+    Finished {
+        ending: Ending,
+        cycles: Vec<CycleRow>,
+        /// The touches of the part, and what the whole pattern would have taken; where touches were chosen.
+        touches: Option<[usize; 2]>,
+    },
 }

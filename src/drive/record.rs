@@ -13,6 +13,7 @@ use tokio::sync::{mpsc, oneshot};
 
 use super::beside::{Beside, Blocking};
 use crate::cell::RecordFailure;
+use crate::formats::{FormatError, ResultFolder};
 use crate::journal::{Anchor, Artefact, Entry, Journal, JournalError, Kind};
 
 /// Resolves once what was given is on the disk, or is known never to come there.
@@ -253,36 +254,54 @@ pub(super) fn describe(folder: &Path, names: &[String]) -> Result<Vec<Artefact>,
     names.iter().map(|name| Artefact::of(folder, name).map_err(failure)).collect()
 }
 
-/// The files that a computation makes in one folder. What of them is there when it is over goes on record, however it ended.
+/// The files that a computation makes in one folder below that of the run. What of them is there when it is over goes on record, however it
+/// ended.
 pub(super) struct Files {
-    folder: PathBuf,
-    names: Vec<&'static str>,
+    run: PathBuf,
+    below: String,
+    /// Where what is not decided by yet goes in place of that: a batch of touches.
+    settled: Option<String>,
+    names: Vec<String>,
 }
 
 impl Files {
-    pub(super) fn new(folder: PathBuf) -> Self {
-        Self { folder, names: Vec::new() }
+    pub(super) fn new(run: PathBuf, below: String) -> Self {
+        Self { run, below, settled: None, names: Vec::new() }
     }
 
-    pub(super) fn folder(&self) -> &Path {
-        &self.folder
+    /// The same, with the folder that [`Files::settle`] goes on to.
+    pub(super) fn then(self, settled: String) -> Self {
+        Self { settled: Some(settled), ..self }
+    }
+
+    /// Goes on to the folder of what the cell decides by, and makes it where it is another.
+    pub(super) fn settle(&mut self) -> Result<(), FormatError> {
+        let Some(settled) = self.settled.take() else { return Ok(()) };
+        self.below = settled;
+        ResultFolder::prepare(self.folder()).map(ResultFolder::keep)
+    }
+
+    pub(super) fn folder(&self) -> PathBuf {
+        self.run.join(&self.below)
     }
 
     /// Keeps the name of a file that is about to be written, and returns where it goes.
     pub(super) fn place(&mut self, name: &'static str) -> PathBuf {
+        let name = if self.below.is_empty() { name.to_owned() } else { format!("{}/{name}", self.below) };
+        let path = self.run.join(&name);
         self.names.push(name);
-        self.folder.join(name)
+        path
     }
 
-    /// Returns the names of all that were to be made.
-    pub(super) fn names(&self) -> &[&'static str] {
+    /// Returns the names of all that were to be made, below the folder of the run.
+    pub(super) fn names(&self) -> &[String] {
         &self.names
     }
 
     /// Returns the names of those that were made.
-    pub(super) fn made(self) -> Vec<&'static str> {
-        let Self { folder, mut names } = self;
-        names.retain(|name| folder.join(name).is_file());
+    pub(super) fn made(self) -> Vec<String> {
+        let Self { run, mut names, .. } = self;
+        names.retain(|name| run.join(name).is_file());
         names
     }
 }

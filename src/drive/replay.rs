@@ -16,6 +16,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use serde::de::DeserializeOwned;
 use serde_json::Value;
 use thiserror::Error;
 
@@ -25,9 +26,9 @@ use super::record::Files;
 use super::station::Intent;
 use super::task::Product;
 use super::work;
-use super::{Computation, Task, folder_of, made};
+use super::{Computation, Task, batch_folder, folder_of, made};
 use crate::cell::{Cell, CellPlan, Command, Device, Ending, Event, Gate, Judgement};
-use crate::device::{Armed, Coordinates, Identified, digest};
+use crate::device::{Armed, Coordinates, Identified, Number, digest};
 use crate::formats::{self, FormatError, ScratchFolder};
 use crate::journal::{Artefact, JournalError, Kind, Reader, Record, sha256_hex};
 
@@ -114,7 +115,7 @@ impl Interrupted {
         let Some(intent) = intent.and_then(|value| serde_json::from_value::<Intent>(value).ok()) else {
             return (None, false);
         };
-        let cycle = u32::from(intent.cycle);
+        let cycle = Number::of(intent.cycle).cycle;
         let state = self.cell.state();
         let at_work = state.phase().map_or(!state.is_end(), |phase| phase.moving() == Some(device));
         (Some((cycle, intent.armed())), at_work && cycle == self.cell.cycle())
@@ -257,9 +258,8 @@ impl<'t> Replay<'t> {
             return Ok(());
         }
         let scratch = ScratchFolder::at(self.run.join(SCRATCH))?;
-        let folder = scratch.path().join(folder_of(number, 1));
-        made(&folder)?;
-        let mut files = Files::new(folder);
+        let mut files = Files::new(scratch.path().to_owned(), folder_of(number, 1));
+        made(&files.folder())?;
         let (again, product) = match kind {
             Computation::Registration => {
                 work::register_cycle(self.task, &mut files, number, &cycle, self.found.cycles.before(number))
@@ -276,7 +276,7 @@ impl<'t> Replay<'t> {
                 self.differs(format!("computed again, cycle {number} gives {again}, and the record has {recorded}"))
             );
         }
-        self.compare(number, &files)?;
+        self.compare(number, scratch.path(), &files)?;
         self.found.cycles.take(number, product);
         Ok(())
     }
@@ -289,27 +289,30 @@ impl<'t> Replay<'t> {
         };
         let (part, sphere) = (read("measured.csv")?, read("reference_sphere.csv")?);
         let coordinates = self.coordinates.unwrap_or(Coordinates::Centres);
-        let temperature_c = match self.files.get(&(number, work::CONDITIONS_FILE.to_owned())) {
-            Some(file) => {
-                let path = self.run.join(&file.name);
-                let bytes = fs::read(&path).map_err(|source| ReplayError::Scratch { path, source })?;
-                let told: Result<work::Conditions, _> = serde_json::from_slice(&bytes);
-                Some(told.map_err(|error| self.differs(format!("{}: {error}", file.name)))?.temperature_c)
-            }
-            None => None,
-        };
-        work::recorded_points(self.task, part, sphere, (coordinates, temperature_c)).map_err(|why| {
+        let conditions = self.read_json::<work::Conditions>(number, work::CONDITIONS_FILE)?;
+        let temperature_c = conditions.map(|told| told.temperature_c);
+        let touches = self.read_json::<work::Touches>(number, work::TOUCHES_FILE)?;
+        work::recorded_points(self.task, part, sphere, (coordinates, temperature_c), touches).map_err(|why| {
             self.differs(format!("the points of cycle {number} are not what a gate lets through: {why:?}"))
         })
     }
 
+    /// The newest document of a name that is on record of a cycle.
+    fn read_json<T: DeserializeOwned>(&self, number: u32, name: &str) -> Result<Option<T>, ReplayError> {
+        let Some(file) = self.files.get(&(number, name.to_owned())) else { return Ok(None) };
+        let path = self.run.join(&file.name);
+        let bytes = fs::read(&path).map_err(|source| ReplayError::Scratch { path, source })?;
+        serde_json::from_slice(&bytes).map(Some).map_err(|error| self.differs(format!("{}: {error}", file.name)))
+    }
+
     /// Holds the files that a computation made again against those on record.
-    fn compare(&self, number: u32, files: &Files) -> Result<(), ReplayError> {
+    fn compare(&self, number: u32, scratch: &Path, files: &Files) -> Result<(), ReplayError> {
         // A file of this format carries the time at which it was written.
         let dated = |name: &str| name.ends_with(".x3p");
         for name in files.names().iter().filter(|name| !dated(name)) {
-            let path = files.folder().join(name);
-            let Some(recorded) = self.files.get(&(number, (*name).to_owned())) else { continue };
+            let path = scratch.join(name);
+            let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+            let Some(recorded) = self.files.get(&(number, name.to_owned())) else { continue };
             if !path.is_file() {
                 return Err(self.differs(format!("computed again, there is no {}", recorded.name)));
             }
@@ -333,6 +336,11 @@ impl<'t> Replay<'t> {
                 let Some(names) = formats::finished_files(&self.run.join(&folder)) else { break };
                 names.iter().for_each(|name| self.lies_there(&folder, number, attempt, name));
             }
+            for batch in 1.. {
+                let folder = batch_folder(number, batch);
+                let Some(names) = formats::finished_files(&self.run.join(&folder)) else { break };
+                names.iter().for_each(|name| self.lies_there(&folder, number, batch, name));
+            }
         }
         Ok(self.found)
     }
@@ -342,7 +350,17 @@ impl<'t> Replay<'t> {
         if name == "result.json" || name.starts_with('.') {
             return;
         }
-        if let Some(kind) = Computation::of(name) {
+        let kind = Computation::of(name).and_then(|kind| match kind {
+            // Where touches are chosen what was settled lies in the folders of the cycle, and what it came from in those of its batches.
+            Computation::Gate | Computation::Registration if self.task.adaptive.is_some() => {
+                if folder.contains("/batch-") {
+                    return Some(kind);
+                }
+                (kind == Computation::Registration).then_some(Computation::Settled)
+            }
+            kind => Some(kind),
+        });
+        if let Some(kind) = kind {
             let attempts = self.found.attempts.entry((number, kind)).or_default();
             *attempts = attempt.max(*attempts);
         }
@@ -355,8 +373,12 @@ impl<'t> Replay<'t> {
     fn check_armed(&mut self, device: Device) -> Result<(), ReplayError> {
         let Some(value) = self.found.armed[device as usize].clone() else { return Ok(()) };
         let intent: Intent = serde_json::from_value(value).map_err(|error| self.unreadable(&error))?;
-        let number = u32::from(intent.cycle);
+        let Number { cycle: number, batch } = Number::of(intent.cycle);
         let Some(cycle) = self.found.cycles.get(number) else { return Ok(()) };
+        // What was prepared before the plan of the next batch was laid is over.
+        if device == Device::Cmm && cycle.batch != batch {
+            return Ok(());
+        }
         let due = match (device, &cycle.plan) {
             (Device::Grinder, _) => {
                 let (map, pass) = self.task.payloads(&cycle.correction);

@@ -18,8 +18,8 @@ use crate::cell::{
     Asked, Condition, Device, Event, Gate, GateFailure, JobResult, Mismatch, Occupation, Reconciliation,
 };
 use crate::device::{
-    Armed, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, Measurement, Outcome,
-    Pass, PassRecord, Plan, Reconciled, SignalValue, State, Status, Word, digest,
+    Armed, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, Measurement, Number,
+    Outcome, Pass, PassRecord, Plan, Reconciled, SignalValue, State, Status, Word, digest,
 };
 
 /// What a machine is asked. Answers are the events that [`crate::cell::Command`] names.
@@ -27,7 +27,7 @@ pub(super) enum Ask {
     Connect,
     Load { cycle: u32, load: Load },
     VerifyClear,
-    Prepare { cycle: u32 },
+    Prepare { number: Number },
     Start { cycle: u32 },
     Hold,
     Resume,
@@ -313,7 +313,7 @@ impl<B: StationDriver> MachineTask<B> {
             Ask::Connect => self.connect().await,
             Ask::Load { cycle, load } => self.load(cycle, &load).await,
             Ask::VerifyClear => self.verify_clear().await,
-            Ask::Prepare { cycle } => self.prepare(cycle).await,
+            Ask::Prepare { number } => self.prepare(number).await,
             Ask::Start { cycle } => self.start(cycle).await,
             Ask::Hold => self.hold().await,
             Ask::Resume => self.resume().await,
@@ -421,13 +421,14 @@ impl<B: StationDriver> MachineTask<B> {
         }
     }
 
-    async fn prepare(&mut self, cycle: u32) {
+    async fn prepare(&mut self, number: Number) {
+        let cycle = number.cycle;
         self.armed = None;
         let Some(digest) = self.loaded else {
             let why = "nothing was loaded for it".to_owned();
             return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Prepare, why }).await;
         };
-        let job = Job { job: self.job, cycle: cycle as u16, digest };
+        let job = Job { job: self.job, cycle: number.seen(), digest };
         if self.seen.state == Some(State::Prepared)
             && let Err(error) = self.driver.machine().stop().await
         {
@@ -446,7 +447,7 @@ impl<B: StationDriver> MachineTask<B> {
     }
 
     async fn start(&mut self, cycle: u32) {
-        let armed = self.armed.clone().filter(|armed| u32::from(armed.job.cycle) == cycle);
+        let armed = self.armed.clone().filter(|armed| armed.job.number().cycle == cycle);
         let Some(armed) = armed else {
             let why = "it is not prepared".to_owned();
             return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Start, why }).await;
@@ -569,7 +570,7 @@ impl<B: StationDriver> MachineTask<B> {
     }
 
     async fn reconcile(&mut self, cycle: u32) {
-        let Some(armed) = self.armed.clone().filter(|armed| u32::from(armed.job.cycle) == cycle) else {
+        let Some(armed) = self.armed.clone().filter(|armed| armed.job.number().cycle == cycle) else {
             // Of what nobody here has prepared the machine cannot be asked, and nothing is concluded.
             let why = "this program has no preparation of this cycle to ask it for".to_owned();
             let outcome = Reconciliation::Unknown(why);
@@ -602,7 +603,7 @@ impl<B: StationDriver> MachineTask<B> {
     }
 
     async fn collect(&mut self, cycle: u32) {
-        let armed = self.armed.as_ref().filter(|armed| u32::from(armed.job.cycle) == cycle);
+        let armed = self.armed.as_ref().filter(|armed| armed.job.number().cycle == cycle);
         let Some(job) = armed.map(|armed| armed.job) else {
             let why = "no job of this run is known to it".to_owned();
             return self.tell(Event::Refused { device: B::DEVICE, what: Asked::Collect, why }).await;

@@ -9,9 +9,9 @@ use crate::compensation::{Correction, CorrectionLimits, ErrorMap, GainRule, Lear
 use crate::device::{Careful, Coordinates, CorrectionMap, Identified, Pass, Plan, Target, TargetKind};
 use crate::formats::gcode::GcodeError;
 use crate::formats::{CorrectionIdentities, FormatError, Learned, ResultFolder, write_correction};
-use crate::geometry::{Grid, Point, Pose, Sample};
+use crate::geometry::{Grid, Point, Pose, Sample, Vector};
 use crate::measuring::{self, Expansion, sphere_targets};
-use crate::model::Form;
+use crate::model::{FIRST, Form, Purpose, spread};
 use crate::registration::{
     Deviation, MapLimits, Method, Options, PointStatus, Registration, RegistrationError, Start, register,
 };
@@ -79,8 +79,48 @@ pub struct Task {
     pub temperature_c: Option<[f64; 2]>,
     /// How part and scales grow with their temperature, where the recipe tells it of the part.
     pub expansion: Option<Expansion>,
+    /// How touches are chosen; none where all targets are touched.
+    pub adaptive: Option<Adaptive>,
     /// Whether the cell is simulated; everything stored is marked so.
     pub simulation: bool,
+}
+
+/// What a measurement goes by whose touches are chosen.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Adaptive {
+    /// The largest peak to valley that is accepted, of all points; infinite where it is not limited.
+    pub pv_mm: f64,
+    /// The same of most.
+    pub pv_most_points_mm: f64,
+    /// The largest root mean square that is accepted; infinite where it is not limited.
+    pub rms_mm: f64,
+    /// The probability with which a part that is not in tolerance may be accepted.
+    pub accepted_risk: f64,
+    /// The most passes of the grinder.
+    pub most_cycles: u32,
+}
+
+impl Adaptive {
+    /// Share of the first touches that is left where one of them finds nothing.
+    pub const ONE_MAY_MISS: f64 = 1.0 - 1.0 / FIRST as f64;
+    /// Looks that are taken at a measurement, most often: each may err with its share of the accepted risk.
+    const LOOKS: f64 = 5.0;
+    /// Share of the tolerance of the rms to which a form has to be known to be corrected: beside what a pass adds that is next to nothing.
+    const KNOWN: f64 = 0.17;
+    /// An rms that is as hard to keep as a peak to valley of 1.
+    const RMS_OF_PV: f64 = 0.2;
+
+    /// The probability with which one look may err.
+    pub fn look_risk(&self) -> f64 {
+        self.accepted_risk / Self::LOOKS
+    }
+
+    /// What a measurement after a pass is to tell.
+    pub fn purpose(&self, may_grind: bool) -> Purpose {
+        let Self { pv_mm, pv_most_points_mm, rms_mm, .. } = *self;
+        let correction_mm = Self::KNOWN * rms_mm.min(Self::RMS_OF_PV * pv_mm.min(pv_most_points_mm));
+        Purpose { pv_mm, pv_most_points_mm, rms_mm, correction_mm, may_grind }
+    }
 }
 
 /// How the probe goes about it.
@@ -108,6 +148,11 @@ pub struct Sphere {
 pub(super) struct Cycle {
     pub(super) correction: Arc<Correction>,
     pub(super) plan: Option<Arc<Plan>>,
+    /// Which batch of touches the plan is of, and which targets it has, where they are chosen.
+    pub(super) batch: u32,
+    pub(super) asked: Arc<Vec<usize>>,
+    /// The targets of the batch that comes next.
+    pub(super) next: Option<Arc<Vec<usize>>>,
     pub(super) points: Option<Arc<Points>>,
     pub(super) registration: Option<Arc<Registration>>,
     pub(super) form: Option<Arc<Form>>,
@@ -125,6 +170,9 @@ impl Cycle {
         Self {
             correction: Arc::new(correction),
             plan: None,
+            batch: 0,
+            asked: Arc::default(),
+            next: None,
             points: None,
             registration: None,
             form: None,
@@ -144,7 +192,8 @@ impl Cycle {
         match product {
             Product::Points(points) => self.points = Some(Arc::new(points)),
             Product::Registered(found) => {
-                let Registered { registration, form, error, known, figures } = *found;
+                let Registered { registration, form, error, known, figures, next } = *found;
+                self.next = next.map(Arc::new);
                 self.registration = Some(Arc::new(registration));
                 self.form = form.map(Arc::new);
                 self.error = error.map(Arc::new);
@@ -173,10 +222,12 @@ pub(super) struct Registered {
     pub(super) error: Option<ErrorMap>,
     pub(super) known: Option<LearningState>,
     pub(super) figures: Figures,
+    /// The targets to touch next; none where enough is known.
+    pub(super) next: Option<Vec<usize>>,
 }
 
 /// The points of a measurement that may be used.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct Points {
     pub(super) part: Vec<Point>,
     pub(super) sphere: Vec<Point>,
@@ -186,8 +237,13 @@ pub(super) struct Points {
     pub(super) coordinates: Coordinates,
     /// Standard uncertainty of that; 0 where the radius is the recipe's, which states none.
     pub(super) radius_sigma_mm: f64,
+    /// How far the probe scatters by what it found on the sphere, and to what share of it that is known; 0 where none was touched.
+    pub(super) probe_scatter_mm: [f64; 2],
     /// Temperature of the part in degrees Celsius, where the machine told it.
     pub(super) temperature_c: Option<f64>,
+    /// Which targets were tried, batch by batch, and which each point of the part is of; empty where all are touched at once.
+    pub(super) tried: Vec<Vec<usize>>,
+    pub(super) of: Vec<usize>,
 }
 
 impl Task {
@@ -213,10 +269,10 @@ impl Task {
     ///
     /// # Errors
     /// Those of [`Task::first_path`], and files that cannot be written.
-    pub fn save_first(&self, folder: &Path) -> Result<Vec<&'static str>, ProgramError> {
+    pub fn save_first(&self, folder: &Path) -> Result<Vec<String>, ProgramError> {
         ResultFolder::prepare(folder).map_err(GcodeError::from)?.keep();
         let (first, none) = (self.first_correction(), self.uncorrected());
-        let mut files = Files::new(folder.to_owned());
+        let mut files = Files::new(folder.to_owned(), String::new());
         self.save_correction(&mut files, &first, &none).map_err(GcodeError::from)?;
         self.save_program(&mut files, &first)?;
         Ok(files.made())
@@ -285,13 +341,26 @@ impl Task {
         points: &[Point],
         probe_radius_mm: f64,
     ) -> Result<(Registration, Options), RegistrationError> {
+        self.register_from(points, probe_radius_mm, self.start_at_fixture)
+    }
+
+    /// Does the same, from where the fixture holds the part if that is wanted.
+    ///
+    /// # Errors
+    /// Those of [`register`].
+    pub fn register_from(
+        &self,
+        points: &[Point],
+        probe_radius_mm: f64,
+        start_at_fixture: bool,
+    ) -> Result<(Registration, Options), RegistrationError> {
         let at_fixture = Start::Pose(self.fixture_cmm_from_model);
-        let start = if self.start_at_fixture { at_fixture } else { Start::Search };
+        let start = if start_at_fixture { at_fixture } else { Start::Search };
         // Without a ball and at the nominal surface, or below it by the last in-feed, there is no offset: the points lie on the surface.
         let method = if probe_radius_mm == 0.0 { Method::Contact } else { self.registration.method };
         let options = Options { probe_radius_mm, method, start, ..self.registration };
         let found = register(&self.nominal, points, &options)?;
-        if self.start_at_fixture || !found.verdict.weak_directions.iter().any(|weak| weak.held) {
+        if start_at_fixture || !found.verdict.weak_directions.iter().any(|weak| weak.held) {
             return Ok((found, options));
         }
         let options = Options { start: at_fixture, ..options };
@@ -318,15 +387,33 @@ impl Task {
     /// Where the part may have been seated anew, a few targets as far apart as the part has them come first, and slowly: what lies
     /// otherwise than expected is met at them.
     pub fn plan(&self, level_mm: f64, cmm_from_model: &Pose, seated_anew: bool) -> Plan {
-        let sphere = self.sphere.iter().flat_map(|s| sphere_targets(s.centre, s.radius_mm, s.points));
+        let first = if seated_anew { spread(&self.places(), CAREFUL_TARGETS) } else { Vec::new() };
+        let rest = (0..self.targets.len()).filter(|k| !first.contains(k)).collect();
+        self.plan_of(level_mm, cmm_from_model, (first, rest), true)
+    }
+
+    /// The targets as the model of the error takes them.
+    pub(super) fn places(&self) -> Vec<(Point, Vector)> {
+        self.targets.iter().map(|target| (target.point, target.normal)).collect()
+    }
+
+    /// Lays a plan of some targets, the first of them slowly; the reference sphere, where it is wanted, between them.
+    pub(super) fn plan_of(
+        &self,
+        level_mm: f64,
+        cmm_from_model: &Pose,
+        (first, rest): (Vec<usize>, Vec<usize>),
+        with_sphere: bool,
+    ) -> Plan {
+        let sphere = self.sphere.iter().filter(|_| with_sphere);
+        let sphere = sphere.flat_map(|s| sphere_targets(s.centre, s.radius_mm, s.points));
         let sphere = sphere.map(|t| (TargetKind::ReferenceSphere, t.point, t.normal));
-        let first = if seated_anew { spread(&self.targets, CAREFUL_TARGETS) } else { Vec::new() };
         let on_part = |t: &measuring::Target| {
             let point = cmm_from_model.point(&(t.point + level_mm * t.normal));
             (TargetKind::Part, point, cmm_from_model.direction(&t.normal))
         };
         let begin = first.iter().map(|k| on_part(&self.targets[*k]));
-        let rest = self.targets.iter().enumerate().filter(|(k, _)| !first.contains(k)).map(|(_, t)| on_part(t));
+        let rest = rest.iter().map(|k| on_part(&self.targets[*k]));
         let targets = begin.chain(sphere).chain(rest).enumerate().map(|(index, (what, point, normal))| Target {
             index: index as u32,
             what,
@@ -374,21 +461,6 @@ impl Task {
 const CAREFUL_TARGETS: usize = 9;
 /// At this share of the recipe's speed.
 const CAREFUL_SHARE: f64 = 0.2;
-
-/// Returns so many targets that lie as far apart as they can: each is the one farthest from those before it.
-fn spread(targets: &[measuring::Target], most: usize) -> Vec<usize> {
-    let mut chosen: Vec<usize> = Vec::new();
-    let mut apart_mm = vec![f64::INFINITY; targets.len()];
-    while chosen.len() < most.min(targets.len()) {
-        let next = (0..targets.len()).max_by(|a, b| apart_mm[*a].total_cmp(&apart_mm[*b]).then(b.cmp(a)));
-        let Some(next) = next else { break };
-        chosen.push(next);
-        for (apart, target) in apart_mm.iter_mut().zip(targets) {
-            *apart = apart.min((target.point - targets[next].point).norm());
-        }
-    }
-    chosen
-}
 
 /// The points that took part in a registration.
 pub(super) fn used(found: &Registration) -> impl Iterator<Item = &Deviation> {

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::cell::{
     CompensationRefusal, CompensationSummary, Event, Figures, Forecast, FormFigures, Gate, GateFailure, Interval,
-    Response,
+    Response, TouchOn,
 };
 use crate::compensation::{self, Correction, ErrorMap, LearningState, NextPassError, Seen, Sense, error_map, response};
 use crate::device::{Coordinates, Identified, Measurement, Plan, PointStatus, TargetKind};
@@ -28,24 +28,34 @@ use crate::registration::{Options, PointStatus as Fate, Registration, Verdict, w
 use super::maps;
 use super::record::{Files, Unfinished, unfinished};
 use super::task::{Cycle, Points, Product, Registered, Task, readings, used};
+use super::touches;
 
 /// Looks whether the measurement of a cycle may be used, and writes its points.
 pub(super) fn gate_cycle(
     task: &Task,
     files: &mut Files,
     number: u32,
-    plan: Option<&Plan>,
+    cycle: Option<&Cycle>,
     measurement: &Measurement,
 ) -> (Event, Product) {
     let unplanned = || Plan { targets: Vec::new(), ..task.plan(0.0, &task.fixture_cmm_from_model, false) };
-    let plan = plan.map_or_else(|| Cow::Owned(unplanned()), Cow::Borrowed);
+    let plan = cycle.and_then(|cycle| cycle.plan.as_deref()).map_or_else(|| Cow::Owned(unplanned()), Cow::Borrowed);
+    let before = cycle.filter(|_| task.adaptive.is_some());
+    let so_far = before.and_then(|cycle| cycle.points.as_deref());
     let planned = plan.targets.iter().filter(|t| t.what == TargetKind::Part).count() as u32;
+    let planned = planned + so_far.map_or(0, |points| points.tried.iter().map(Vec::len).sum::<usize>() as u32);
     let (found, usable) = match foreign(task, &plan, measurement).or_else(|| out_of_window(task, measurement)) {
         Some(failure) => (0, Err(failure)),
         None => {
             let [part, sphere] = touched(&plan, planned, measurement);
             let told = (measurement.coordinates, measurement.temperature_c.filter(|told| told.is_finite()));
-            (part.len() as u32, gate(task, planned, part, sphere, told))
+            let asked = before.map(|cycle| &cycle.asked[..]).unwrap_or_default();
+            let touches = Touches::and(so_far, asked, &plan, measurement);
+            let (part, sphere) = match so_far {
+                Some(points) => ([&points.part[..], &part].concat(), points.sphere.clone()),
+                None => (part, sphere),
+            };
+            (part.len() as u32, gate(task, planned, part, sphere, told, touches))
         }
     };
     let saved = usable.map_err(Unfinished::For).and_then(|points| {
@@ -82,13 +92,16 @@ fn gate(
     part: Vec<Point>,
     sphere: Vec<Point>,
     (coordinates, temperature_c): (Coordinates, Option<f64>),
+    Touches { tried, of, .. }: Touches,
 ) -> Result<Points, GateFailure> {
     if part.is_empty() {
         return Err(GateFailure::NoPart);
     }
     let ball = radius(task, &sphere)?;
     let (found, share) = (part.len(), part.len() as f64 / f64::from(planned.max(1)));
-    if planned > 0 && share < task.least_found {
+    // Of a few touches one may miss.
+    let spared = if tried.is_empty() { 0.0 } else { 1.0 / f64::from(planned.max(1)) };
+    if planned > 0 && share + spared < task.least_found {
         let limit = 100.0 * task.least_found;
         return Err(GateFailure::Coverage(format!(
             "{found} of {planned} points were found, {:.1} %, and the recipe asks for {limit:.1} % (minimum_coverage)",
@@ -96,7 +109,39 @@ fn gate(
         )));
     }
     let (radius_mm, radius_sigma_mm) = (ball.map(|b| b[0]), ball.map_or(0.0, |b| b[1]));
-    Ok(Points { part, sphere, radius_mm, radius_sigma_mm, temperature_c, coordinates })
+    let probe_scatter_mm = ball.map_or([0.0; 2], |[.., rms_mm]| scatter(rms_mm, sphere.len()));
+    Ok(Points { part, sphere, radius_mm, radius_sigma_mm, probe_scatter_mm, temperature_c, coordinates, tried, of })
+}
+
+/// How far a probe scatters by what it found on a sphere, of which the fit took four numbers, and to what share of it that is known.
+fn scatter(rms_mm: f64, points: usize) -> [f64; 2] {
+    const FITTED: f64 = 4.0;
+    let free = (points as f64 - FITTED).max(1.0);
+    [rms_mm * (points as f64 / free).sqrt(), 1.0 / (2.0 * free).sqrt()]
+}
+
+/// Which targets were tried and which were found, where they are chosen batch by batch.
+#[derive(Default, Serialize, Deserialize)]
+pub(super) struct Touches {
+    simulation: bool,
+    /// The targets of each batch, by their places in the pattern.
+    tried: Vec<Vec<usize>>,
+    /// The target of each point that was found.
+    of: Vec<usize>,
+}
+
+impl Touches {
+    /// Adds a batch to what was touched before.
+    fn and(so_far: Option<&Points>, asked: &[usize], plan: &Plan, measurement: &Measurement) -> Self {
+        let (mut tried, mut of) = so_far.map(|points| (points.tried.clone(), points.of.clone())).unwrap_or_default();
+        if !asked.is_empty() {
+            let pairs = measurement.points.iter().zip(&plan.targets).filter(|(_, t)| t.what == TargetKind::Part);
+            let found = pairs.zip(asked).filter(|((p, _), _)| p.status == PointStatus::Touched);
+            of.extend(found.map(|(_, target)| *target));
+            tried.push(asked.to_vec());
+        }
+        Self { simulation: false, tried, of }
+    }
 }
 
 /// Returns the points of a measurement that a gate has let through before, from its files.
@@ -105,8 +150,9 @@ pub(super) fn recorded_points(
     part: Vec<Point>,
     sphere: Vec<Point>,
     told: (Coordinates, Option<f64>),
+    touches: Option<Touches>,
 ) -> Result<Points, GateFailure> {
-    gate(task, 0, part, sphere, told)
+    gate(task, 0, part, sphere, told, touches.unwrap_or_default())
 }
 
 /// Share of its stated radius by which a qualified probe may differ: more is another stylus.
@@ -157,8 +203,8 @@ fn out_of_window(task: &Task, measurement: &Measurement) -> Option<GateFailure> 
     }
 }
 
-/// Finds the radius of the probe and its standard uncertainty from the reference sphere: it tells contact points and inches from centres in millimetres.
-fn radius(task: &Task, points: &[Point]) -> Result<Option<[f64; 2]>, GateFailure> {
+/// Finds the radius of the probe, its standard uncertainty and how far the points lie from the reference sphere: it tells contact points and inches from centres in millimetres.
+fn radius(task: &Task, points: &[Point]) -> Result<Option<[f64; 3]>, GateFailure> {
     let Some(sphere) = task.sphere else { return Ok(None) };
     let fit = fit_sphere(points).map_err(|error| GateFailure::Broken(error.to_string()))?;
     let (stated, found) = (task.probing.probe_radius_mm, fit.radius_mm - sphere.radius_mm);
@@ -169,7 +215,7 @@ fn radius(task: &Task, points: &[Point]) -> Result<Option<[f64; 2]>, GateFailure
     if (fit.radius_mm * 25.4 / (sphere.radius_mm + stated) - 1.0).abs() < 0.05 {
         return Err(GateFailure::Inches);
     }
-    Ok(Some([found, fit.radius_sigma_mm]))
+    Ok(Some([found, fit.radius_sigma_mm, fit.rms_mm]))
 }
 
 /// Registers the points of a cycle and writes what was found; `before` is the last measurement of an earlier pass that was judged.
@@ -211,17 +257,39 @@ fn registered(
         None => (ball_mm, Cow::Borrowed(&points.part), 0.0),
     };
     let probe_radius_mm = (ball_mm + cycle.correction.level_mm).max(0.0);
-    let (mut found, options) = task.register(&part, probe_radius_mm).map_err(unfinished)?;
+    // The first few touches say whether it is the right part, where it should be; anything more would be guessed from them.
+    let at_fixture = task.start_at_fixture || points.tried.len() == 1;
+    let (mut found, options) = task.register_from(&part, probe_radius_mm, at_fixture).map_err(unfinished)?;
     found.allow_for_radius(points.radius_sigma_mm);
+    let given = Given {
+        radius_sigma_mm: points.radius_sigma_mm,
+        scale_sigma,
+        probe_scatter_mm: points.probe_scatter_mm,
+        ..Given::default()
+    };
+    let looked = task.adaptive.as_ref().filter(|_| !points.tried.is_empty());
+    let looked_at = looked.is_some();
+    let looked = looked.map(|adaptive| touches::look(task, adaptive, (number, cycle), points, (&found, given)));
+    let (form, next) = match looked {
+        Some(touches::Looked { form, next }) => (form, next),
+        None => (Form::of(&found, &given).map_err(|error| error.to_string()), None),
+    };
+    if looked_at && next.is_none() {
+        files.settle().and_then(|()| save_points(task, files, points)).map_err(unfinished)?;
+    }
     save(task, files, &found, &options).map_err(unfinished)?;
-    let form = Form::of(&found, &Given { priors: None, radius_sigma_mm: points.radius_sigma_mm, scale_sigma });
     if let Ok(form) = &form {
         for name in ["form.csv", "model.json"] {
             files.place(name);
         }
-        save_form(files.folder(), form, &found, Some(task.simulation)).map_err(unfinished)?;
+        save_form(&files.folder(), form, &found, Some(task.simulation)).map_err(unfinished)?;
     }
-    let error = error_map(&readings(&found), &task.map).ok();
+    // Where touches were chosen the form between them is told, and where they were not it is what was found.
+    let error = match &form {
+        Ok(form) if looked_at => touches::map(task, form),
+        Err(_) if looked_at => None,
+        _ => error_map(&readings(&found), &task.map).ok(),
+    };
     maps::save_figures(task, files, error.as_ref(), &found).map_err(unfinished)?;
     let offered = maps::parameters(task, files, &found).map_err(unfinished)?;
     // Every measurement leaves its map, whatever becomes of the correction.
@@ -236,11 +304,16 @@ fn registered(
         let message = "the measurement does not tell its temperature: the growth of the part is not taken off (part.expansion_um_m_k)";
         figures.warnings.push(message.to_owned());
     }
-    let untold = |error| {
+    let untold = |error: &String| {
         format!("form and scatter of the probe could not be told apart, so U is less than it should be: {error}")
     };
-    figures.warnings.extend(form.as_ref().err().map(untold));
-    Ok(Registered { registration: found, form: form.ok(), error, known, figures })
+    if next.is_none() {
+        figures.warnings.extend(form.as_ref().err().map(untold));
+    }
+    figures.touch_on =
+        next.as_ref().map(|(next, why)| Box::new(TouchOn { targets: next.len() as u32, why: (*why).to_owned() }));
+    let next = next.map(|(next, _)| next);
+    Ok(Registered { registration: found, form: form.ok(), error, known, figures, next })
 }
 
 /// Takes a measured pass into what is known of the grinder.
@@ -266,7 +339,7 @@ fn save(task: &Task, files: &mut Files, found: &Registration, options: &Options)
     for name in ["deviations.csv", "deviation_uncertainty.csv", "registration.json"] {
         files.place(name);
     }
-    save_registration(files.folder(), &document, &found.deviations)
+    save_registration(&files.folder(), &document, &found.deviations)
 }
 
 fn figures(
@@ -317,6 +390,7 @@ fn figures(
             floor_mm: f.floor_mm.map(bare),
         }),
         removed_mm: Some(task.limits.allowance_mm - cycle.correction.level_mm),
+        touch_on: None,
     }
 }
 
@@ -438,8 +512,9 @@ pub(super) fn learned(task: &Task, run: String, cycle: &Cycle) -> Option<Learned
     Some(Learned::new(simulation, setting, run, correction, known.clone()))
 }
 
-/// Where it stands.
+/// Where they stand.
 pub(super) const CONDITIONS_FILE: &str = "measured.json";
+pub(super) const TOUCHES_FILE: &str = "touches.json";
 
 /// What a measurement was made in, as far as the registration goes by it.
 #[derive(Serialize, Deserialize)]
@@ -454,6 +529,10 @@ fn save_points(task: &Task, files: &mut Files, points: &Points) -> Result<(), Fo
     if let Some(temperature_c) = points.temperature_c.filter(|_| task.expansion.is_some()) {
         let conditions = Conditions { simulation: task.simulation, temperature_c };
         write_json_atomic(files.place(CONDITIONS_FILE), &conditions)?;
+    }
+    if !points.tried.is_empty() {
+        let (tried, of) = (points.tried.clone(), points.of.clone());
+        write_json_atomic(files.place(TOUCHES_FILE), &Touches { simulation: task.simulation, tried, of })?;
     }
     let header = if task.simulation { "# SIMULATION\nx_mm,y_mm,z_mm" } else { "x_mm,y_mm,z_mm" };
     if !points.sphere.is_empty() {

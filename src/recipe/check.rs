@@ -6,8 +6,8 @@ use serde::Deserialize;
 
 use super::curvature;
 use super::tables::{
-    Acceptance, Compensation, Grinding, Measure, NominalTable, PatternWord, RecipeFile, RegistrationSettings, StartAt,
-    Um, Wheel,
+    Acceptance, Compensation, Grinding, Measure, Mode, NominalTable, PatternWord, RecipeFile, RegistrationSettings,
+    StartAt, Um, Wheel,
 };
 use super::{NominalSource, Pattern};
 use crate::cell::Beginning;
@@ -32,6 +32,7 @@ pub(super) fn check(
     compare_with_part(written, nominal.as_ref(), document);
     compare_tables(written, document);
     measure(&written.measure, document);
+    measuring(written, document);
     registration(&written.registration, document);
     acceptance(&written.acceptance, document);
     compensation(&written.compensation, document);
@@ -121,6 +122,42 @@ fn in_place(key: &str, sentence: &str) -> String {
     match sentence.strip_prefix(&format!("`{key}` ")) {
         Some(rest) => rest.to_owned(),
         None => format!("is refused: {sentence}"),
+    }
+}
+
+fn measuring(written: &RecipeFile, document: &mut Document) {
+    let risk = written.measuring.accepted_risk;
+    if written.measuring.mode == Mode::Fixed {
+        if risk.is_some() {
+            let remedy = "leave it out, or write `mode = \"adaptive\"`";
+            document.report("measuring.accepted_risk", "is for mode adaptive", "all targets are touched", remedy);
+        }
+        return;
+    }
+    if risk.is_none() {
+        document.report(
+            "measuring.accepted_risk",
+            "is missing",
+            "a part of which only some targets are touched may be accepted though it is not in tolerance",
+            "consent to a probability for that: `accepted_risk = 0.025`",
+        );
+    }
+    if written.measure.pattern == PatternWord::Free {
+        let remedy = "lay a pattern, or write `mode = \"fixed\"`";
+        document.report(
+            "measuring.mode",
+            "is adaptive",
+            "targets are chosen from a pattern, and this one is free",
+            remedy,
+        );
+    }
+    if !written.measure.qualify {
+        document.report(
+            "measure.qualify",
+            "is false",
+            "in mode adaptive the reference sphere tells how far the probe scatters: the rest is form between the touches",
+            "let it be touched, or write `mode = \"fixed\"`",
+        );
     }
 }
 

@@ -25,7 +25,8 @@ use crate::surface::{DefinedSurface, Projection};
 
 use tables::RecipeFile;
 pub use tables::{
-    Acceptance, Compensation, Cycle, Grinding, Measure, Part, RegistrationSettings, SpindleAxis, StartAt, Um, Wheel,
+    Acceptance, Compensation, Cycle, Grinding, Measure, Measuring, Mode, Part, RegistrationSettings, SpindleAxis,
+    StartAt, Um, Wheel,
 };
 
 /// A recipe, checked.
@@ -37,6 +38,8 @@ pub struct Recipe {
     pub nominal: NominalSource,
     /// How it is measured.
     pub measure: Measure,
+    /// Which targets are touched.
+    pub measuring: Measuring,
     /// Where points are taken.
     pub pattern: Pattern,
     /// How the measured points are registered.
@@ -117,12 +120,23 @@ impl Recipe {
             let found = "something is missing".into();
             return Err(Problems::whole(path, text, found, "compare it with a shipped recipe"));
         };
-        let RecipeFile { part, measure, registration, acceptance, compensation, grinding, cycle, simulation, .. } =
-            written;
+        let RecipeFile {
+            part,
+            measure,
+            measuring,
+            registration,
+            acceptance,
+            compensation,
+            grinding,
+            cycle,
+            simulation,
+            ..
+        } = written;
         Ok(Self {
             part,
             nominal,
             measure,
+            measuring,
             pattern,
             registration,
             acceptance,

@@ -42,6 +42,8 @@ pub(super) struct RecipeFile {
     /// How it is measured.
     #[schemars(extend("x-required" = true))]
     pub measure: Measure,
+    /// Whether all targets are touched, or those that tell most until enough is known.
+    pub measuring: Measuring,
     /// How the measured points are registered.
     pub registration: RegistrationSettings,
     /// When the part is good. At least one of pv_um and rms_um.
@@ -114,6 +116,29 @@ pub(super) enum PatternWord {
     File,
     /// Where the operator takes them: points is the least number.
     Free,
+}
+
+/// Which targets are touched.
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq)]
+#[serde(default, deny_unknown_fields)]
+pub struct Measuring {
+    /// Which targets are touched.
+    pub mode: Mode,
+    /// The probability with which a part that is not in tolerance may be accepted after touches that were chosen: who writes it consents to
+    /// it. For mode adaptive, which needs it.
+    #[schemars(range(min = 0.01, max = 0.1), example = 0.025)]
+    pub accepted_risk: Option<f64>,
+}
+
+/// Which targets are touched.
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Mode {
+    /// All of the pattern.
+    #[default]
+    Fixed,
+    /// Batch by batch those that tell most, until the part can be accepted or its form is known well enough for a correction.
+    Adaptive,
 }
 
 /// How the part is measured.

@@ -228,7 +228,16 @@ fn cycles(story: &Story) -> String {
         let measurements = if cycle.measurements.is_empty() { &none[..] } else { &cycle.measurements };
         html.extend(measurements.iter().map(|of| measurement(*number, of, tolerance.as_ref(), &level)));
     }
-    html + "</table>\n<p>Deviations are along the normal, positive where material stands proud; \u{b1} is the expanded uncertainty \
+    let touches = story.end.as_ref().map(|end| end.value()["ending"]["touches"].clone()).unwrap_or_default();
+    let touches = match (touches["taken"].as_u64(), touches["whole_patterns"].as_u64()) {
+        (Some(taken), Some(whole)) => {
+            format!("<p>Touches were chosen: {taken} of the part; the whole pattern would have taken {whole}.</p>\n")
+        }
+        _ => String::new(),
+    };
+    html + "</table>\n"
+        + &touches
+        + "<p>Deviations are along the normal, positive where material stands proud; \u{b1} is the expanded uncertainty \
             (k = 2). The level is the height of the surface that was wanted over the nominal one.</p>\n"
 }
 

@@ -153,11 +153,10 @@ impl Story {
         match event {
             Event::Collected { cycle, gate, .. } => {
                 let unusable = Some(&gate).filter(|gate| **gate != Gate::Passed).map(gate_words);
-                self.cycle(cycle).measurements.push(Measurement {
-                    utc: record.utc,
-                    unusable,
-                    ..Measurement::default()
-                });
+                let measurements = &mut self.cycle(cycle).measurements;
+                // What goes on with the touches before is the same measurement.
+                measurements.pop_if(|last| last.figures.as_ref().is_some_and(|figures| figures.touch_on.is_some()));
+                measurements.push(Measurement { utc: record.utc, unusable, ..Measurement::default() });
             }
             Event::Registered { cycle, figures } => {
                 // What was judged keeps its figures.

@@ -47,6 +47,7 @@ fn figures() -> Figures {
         pv_robust_mm: None,
         response: None,
         removed_mm: Some(0.1),
+        touch_on: None,
     }
 }
 

@@ -56,7 +56,7 @@ fn follow(running: &mut Running, folder: &dyn Fn() -> Option<PathBuf>, lines: us
 }
 
 /// Runs a part whose program is killed at drawn moments. Returns its folder and how often it was killed.
-fn run_with_kills(home: &Path, seed: u64) -> (PathBuf, usize) {
+pub fn run_with_kills(home: &Path, seed: u64) -> (PathBuf, usize) {
     let mut chance = StdRng::seed_from_u64(seed);
     let runs = format!("runs-{seed}");
     let signed = |arguments: &[&str]| {

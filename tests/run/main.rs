@@ -37,6 +37,7 @@ mod rig;
 mod study;
 #[path = "../common/through.rs"]
 mod through;
+mod touches;
 #[path = "../common/tries.rs"]
 mod tries;
 mod truth;

@@ -1,8 +1,12 @@
 //! Cycles of one simulated part without wires: ground, touched, registered, compensated as in a run, and held against the truth.
 #![allow(dead_code, reason = "not every program that includes this uses all of it")]
 
+#[path = "made.rs"]
+pub mod made;
+
 use std::path::Path;
 
+use regrind::cell::CellPlan;
 use regrind::compensation::{
     Correction, ErrorMap, GainRule, LearningState, MapOptions, NextPassError, Seen, error_map, response,
 };
@@ -48,6 +52,7 @@ pub struct After {
 pub struct Bench {
     pub name: String,
     task: Task,
+    plan: CellPlan,
     spec: WorldSpec,
     plan_of: Vec<(Point, Vector)>,
 }
@@ -57,12 +62,12 @@ impl Bench {
         let root = Path::new(env!("CARGO_MANIFEST_DIR"));
         let recipe = Recipe::read(&root.join(format!("recipes/{name}.toml"))).unwrap();
         let cell = CellConfig::read(&root.join("config/sim.toml")).unwrap();
-        let (task, _) = setup::prepare(&recipe, &cell).unwrap();
+        let (task, plan) = setup::prepare(&recipe, &cell).unwrap();
         let mut spec: WorldSpec = recipe.simulation.clone().unwrap().try_into().unwrap();
         // No correction takes the ridges between tracks back, nor could it: what is studied is what corrections do.
         spec.grinder.scallops = false;
         let plan_of = task.targets.iter().map(|t| (t.point, t.normal)).collect();
-        Self { name: name.to_owned(), task, spec, plan_of }
+        Self { name: name.to_owned(), task, plan, spec, plan_of }
     }
 
     /// Makes one part after another in a world of its own: for each the truth after every pass.
@@ -174,41 +179,63 @@ impl<'a> Line<'a> {
 
     /// Touches the part where the recipe says, and registers what the probe gave.
     fn register(&self, level_mm: f64) -> Registration {
+        let all: Vec<usize> = (0..self.bench.plan_of.len()).collect();
+        let (touched, _) = self.touch(level_mm, &all);
+        let points: Vec<Point> = touched.into_iter().map(|(_, point)| point).collect();
+        self.registered(&points, level_mm)
+    }
+
+    /// Touches some of the targets, and returns those that were found, with the seconds that it took.
+    fn touch(&self, level_mm: f64, chosen: &[usize]) -> (Vec<(usize, Point)>, f64) {
         let task = &self.bench.task;
-        let target = |(index, (p, n)): (usize, &(Point, Vector))| {
+        let target = |(index, k): (usize, &usize)| {
+            let (p, n) = self.bench.plan_of[*k];
             let at = task.fixture_cmm_from_model.point(&(p + level_mm * n));
-            let normal = task.fixture_cmm_from_model.direction(n);
+            let normal = task.fixture_cmm_from_model.direction(&n);
             Target { index: index as u32, feature: Feature::Part, point_mm: at.into(), normal: normal.into() }
         };
-        let radius_mm = task.probing.probe_radius_mm;
         let plan = Plan {
-            probe_radius_mm: radius_mm,
+            probe_radius_mm: task.probing.probe_radius_mm,
             approach_mm: task.probing.approach_mm,
             search_mm: task.probing.search_mm,
             speed_mm_s: task.probing.speed_mm_s,
             safe_height_mm: task.probing.safe_height_mm,
             careful: (0, 0.0),
-            targets: self.bench.plan_of.iter().enumerate().map(target).collect(),
+            targets: chosen.iter().enumerate().map(target).collect(),
         };
-        let records = touch(self.worlds[0], self.job, &plan);
-        let points: Vec<Point> =
-            records.iter().filter(|r| r.status == Status::Touched).map(|r| Point::from(r.position_mm)).collect();
+        let (records, took_s) = touched_in(self.worlds[0], self.job, &plan);
+        let found = records.iter().filter(|r| r.status == Status::Touched);
+        (found.map(|r| (chosen[r.index as usize], Point::from(r.position_mm))).collect(), took_s)
+    }
+
+    fn registered(&self, points: &[Point], level_mm: f64) -> Registration {
+        let task = &self.bench.task;
         // The true radius, as the reference sphere tells it in a run.
-        let true_radius_mm = radius_mm + 1e-3 * self.bench.spec.cmm.probe_radius_error_um;
-        task.register(&points, true_radius_mm + level_mm).unwrap().0
+        let true_radius_mm = task.probing.probe_radius_mm + 1e-3 * self.bench.spec.cmm.probe_radius_error_um;
+        task.register(points, true_radius_mm + level_mm).unwrap().0
     }
 
     /// Makes the next correction of what was found.
     fn correct(&mut self, found: &Registration) {
+        let error = self.error(found);
+        self.correct_by(found, error);
+    }
+
+    fn error(&self, found: &Registration) -> ErrorMap {
         let task = &self.bench.task;
         let used = || found.deviations.iter().filter(|d| d.status == PointStatus::Used);
         let readings: Vec<Sample> =
             used().map(|d| Sample { at_mm: [d.point.x, d.point.y], deviation_mm: d.deviation_mm }).collect();
-        let error = match self.way {
+        match self.way {
             Way::Regrind(_) => error_map(&readings, &task.map).unwrap(),
             Way::Plain => unfiltered(&readings, &task.map),
-        };
-        let places: Vec<(Point, Vector)> = used().map(|d| (d.point, d.normal)).collect();
+        }
+    }
+
+    fn correct_by(&mut self, found: &Registration, error: ErrorMap) {
+        let task = &self.bench.task;
+        let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
+        let places: Vec<(Point, Vector)> = used.map(|d| (d.point, d.normal)).collect();
         let answer = self.before.as_ref().map(|(correction, earlier)| {
             let scatter_mm = earlier.point_sigma_mm.hypot(error.point_sigma_mm);
             response([earlier, &error], [correction, &self.correction], &places, scatter_mm)
@@ -276,13 +303,19 @@ fn pass_of(task: &Task, level_mm: f64) -> Pass {
 
 /// Measures a part by a plan.
 pub fn touch(world: &World, job: u32, plan: &Plan) -> Vec<PointRecord> {
+    touched_in(world, job, plan).0
+}
+
+/// Measures a part by a plan, and says how many seconds that takes.
+fn touched_in(world: &World, job: u32, plan: &Plan) -> (Vec<PointRecord>, f64) {
     let mut cmm = world.cmm();
     let payload = Payload { bytes: plan.encode(), identity: [1; 32] };
     cmm.prepare(job, 0, &Payloads { plan: Some(payload), ..Payloads::default() }).unwrap();
     cmm.begin();
     while !cmm.advance(1000.0).finished {}
     let outcome = cmm.outcome(1);
-    decode_points(&outcome.bytes, (outcome.format == 2).then_some(outcome.scale_mm)).unwrap()
+    let records = decode_points(&outcome.bytes, (outcome.format == 2).then_some(outcome.scale_mm)).unwrap();
+    (records, outcome.duration_s)
 }
 
 /// Grinds a part once, by a map.

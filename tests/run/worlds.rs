@@ -14,7 +14,7 @@ use regrind::device::Wire;
 use regrind::device::{ModbusCmm, ModbusGrinder, ModbusSettings};
 use regrind::drive::{Beside, CycleRow, Drive, Ledger, Notice, Request, Run, ask};
 use regrind::journal::{Header, Journal};
-use regrind::recipe::Recipe;
+use regrind::recipe::{Measuring, Mode, Recipe};
 use regrind::setup;
 use regrind_sim::Vec3;
 use regrind_sim::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
@@ -54,6 +54,8 @@ pub struct Setup {
     pub temperature_c: Option<[f64; 2]>,
     /// What the recipe says of the growth of the part.
     pub expansion_um_m_k: Option<f64>,
+    /// Whether touches are chosen.
+    pub adaptive: bool,
 }
 
 impl Setup {
@@ -69,6 +71,7 @@ impl Setup {
             version: 2,
             temperature_c: None,
             expansion_um_m_k: None,
+            adaptive: false,
         }
     }
 
@@ -254,6 +257,9 @@ async fn go(setup: Setup) -> Ran {
     let mut recipe = Recipe::read(&root().join(format!("recipes/{}.toml", setup.recipe))).unwrap();
     recipe.measure.temperature_c = setup.temperature_c;
     recipe.part.expansion_um_m_k = setup.expansion_um_m_k;
+    if setup.adaptive {
+        recipe.measuring = Measuring { mode: Mode::Adaptive, accepted_risk: Some(0.025) };
+    }
     let cell = CellConfig::read(&root().join("config/sim.toml")).unwrap();
     let (task, plan) = setup::prepare(&recipe, &cell).unwrap();
     let probe_radius_mm = recipe.measure.probe_radius_mm;

@@ -146,6 +146,20 @@ pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, 
     Ok(ErrorMap { advice, ..map }.advised(options, readings.len(), apart_mm))
 }
 
+/// Lays the form that a model tells at many places on a grid, through the filter of the map.
+///
+/// What is told has no scatter of its own: nothing is left out as an outlier, and what the points beside the form scatter by, and how well
+/// the form is known, is what the model says of them.
+///
+/// # Errors
+/// Those of [`error_map`].
+pub fn told_map(told: &[Sample], options: &MapOptions, scatter_mm: f64, known_mm: f64) -> Result<ErrorMap, MapError> {
+    let map = error_map(told, &MapOptions { outlier_limit: None, ..*options })?;
+    let sigma_mm = vec![known_mm; map.sigma_mm.len()];
+    let residual_sigma_mm = scatter_mm.hypot(map.residual_sigma_mm);
+    Ok(ErrorMap { sigma_mm, residual_sigma_mm, point_sigma_mm: scatter_mm, ..map })
+}
+
 /// The filter that readings are judged by: with a cut-off of four distances between them at least. With a shorter one a reading is
 /// compared with little but itself.
 struct Wide {

@@ -30,7 +30,7 @@ pub use correction::Correction;
 pub use error::MapError;
 pub use filter::Order;
 pub use learning::{Forecast, GainRule, LearningState, Seen};
-pub use map::{ErrorMap, FilteredGrid, MapOptions, Smoothing, error_map, filter_grid};
+pub use map::{ErrorMap, FilteredGrid, MapOptions, Smoothing, error_map, filter_grid, told_map};
 pub use next_pass::{CorrectionLimits, NextPass, NextPassError};
 pub use parameters::{
     Contact, Parameter, ParameterError, ParameterKind, ParameterOptions, Parameters, WheelTerm, parameters,

@@ -9,10 +9,11 @@ use nalgebra::{DMatrix, Matrix3, Matrix6, SymmetricEigen, Vector6};
 
 use rayon::prelude::*;
 
+use super::likelihood::Told;
 use super::normals::Normals;
 use super::{Dense, Hyper, Lattice, ModelError, Observed, Predicted, Priors, Sparse};
 use crate::geometry::{Point, Vector};
-use crate::registration::{PointStatus, Registration};
+use crate::registration::{Deviation, PointStatus, Registration};
 
 /// What a registered measurement says of the form of a part.
 #[derive(Clone, Debug)]
@@ -27,6 +28,8 @@ pub struct Form {
     pub points: Vec<FormPoint>,
     /// The figures of the form.
     pub figures: FormFigures,
+    /// How well the smooth form is known: the RMS of its standard uncertainty over all places.
+    pub known_mm: f64,
     /// Whether the points show a form at all. Where they do not, the figures are known from above alone, and their intervals begin at 0.
     pub is_seen: bool,
 }
@@ -60,6 +63,12 @@ pub struct Interval {
     pub low_mm: f64,
     /// Above it with a probability of 2.5 %.
     pub high_mm: f64,
+    /// Below it with the probability of [`Given::look_risk`]: for who looks more than once.
+    #[serde(skip)]
+    pub least_mm: f64,
+    /// Above it with that probability.
+    #[serde(skip)]
+    pub most_mm: f64,
 }
 
 /// Fields that are drawn, and places at which they are looked at, at most.
@@ -82,40 +91,92 @@ impl Form {
     /// # Errors
     /// Too few points, and points that leave nothing to tell the form by.
     pub fn of(registration: &Registration, given: &Given) -> Result<Self, ModelError> {
+        let seen = Seen::of(registration, given)?;
+        let alike = seen.motions.alike(given, seen.places());
+        let drawn = Drawn::of(&seen.observed, &seen.told.likely)?;
+        let alike = alike.select_rows(&drawn.chosen);
+        let drawn =
+            drawn.with_the_scatter(&seen.observed, &seen.told, given).with_what_is_alike(&alike).after_best_fit();
+        Ok(seen.form(given, &drawn))
+    }
+
+    /// Tells the form at places of the part that need not have been touched: points of the nominal surface with their normals, in the model
+    /// frame. The figures are those of all of them.
+    ///
+    /// What is too narrow for the distance of the points is told from the scatter of the probe by [`Given::probe_scatter_mm`] alone. As
+    /// nothing says how wide it is, every place has one of its own.
+    ///
+    /// # Errors
+    /// Those of [`Form::of`], and places that are too many for the range of the form.
+    pub fn over(registration: &Registration, given: &Given, places: &[(Point, Vector)]) -> Result<Self, ModelError> {
+        let seen = Seen::of(registration, given)?;
+        let places: Vec<_> = thinned(places.len()).map(|k| places[k]).collect();
+        let alike = seen.motions.alike(given, places.iter().copied());
+        let effects = seen.motions.rows(places.iter().copied());
+        let drawn = Drawn::over(&seen.observed, &seen.told.likely, places.iter().map(plane).collect(), effects)?;
+        let drawn = drawn.with_what_is_narrow(&seen.told, given).with_what_is_alike(&alike).after_best_fit();
+        Ok(seen.form(given, &drawn))
+    }
+}
+
+/// A registration as the model sees it, with what speaks for which parameters.
+struct Seen<'a> {
+    used: Vec<&'a Deviation>,
+    motions: Motions,
+    observed: Observed,
+    told: Told,
+    is_seen: bool,
+}
+
+impl<'a> Seen<'a> {
+    fn of(registration: &'a Registration, given: &Given) -> Result<Self, ModelError> {
         let used: Vec<_> = registration.deviations.iter().filter(|d| d.status == PointStatus::Used).collect();
         if used.is_empty() {
             return Err(ModelError::TooFewPoints { points: 0, least: 7 });
         }
         let motions = Motions::of(registration, used.iter().map(|d| d.point));
-        let place = |point: &Point| [point.x, point.y];
-        let observed = Observed {
-            places: used.iter().map(|d| place(&d.point)).collect(),
-            deviations_mm: used.iter().map(|d| d.deviation_mm).collect(),
-            effects: motions.rows(used.iter().map(|d| (d.point, d.normal))),
-        };
-        // What a standard uncertainty of each adds to every point.
-        let alike = DMatrix::from_fn(used.len(), 2, |r, c| match c {
-            0 => given.radius_sigma_mm,
-            _ => given.scale_sigma * (used[r].point - motions.centre).dot(&used[r].normal),
-        });
+        let observed = motions.observed(&used);
         let priors = given.priors.unwrap_or_else(|| Priors::of_size(motions.size_mm));
         let mut told = Hyper::told(&observed, &priors)?;
-        let hyper = told.likely[0].0;
-        let is_seen = hyper.evidence(&observed) > EVIDENCE;
+        let is_seen = told.likely[0].0.evidence(&observed) > EVIDENCE;
         if !is_seen {
             // What is spoken for by next to nothing is as good as what is spoken for by a little more.
             told.likely.push((told.wide, 1.0));
             told.likely.iter_mut().for_each(|(_, weight)| *weight = 1.0);
         }
-        let frame_covariance = motions.to_twist(&of_the_fit(&observed, told.wide, &alike));
-        let drawn = Drawn::of(&observed, &told.likely)?;
-        let drawn = drawn.with_the_unknown(told.scatter_u, &alike).after_best_fit();
-        Ok(Self { hyper, frame_covariance, points: drawn.points(), figures: drawn.figures(is_seen), is_seen })
+        Ok(Self { used, motions, observed, told, is_seen })
+    }
+
+    fn places(&self) -> impl ExactSizeIterator<Item = (Point, Vector)> + Clone + '_ {
+        self.used.iter().map(|d| (d.point, d.normal))
+    }
+
+    fn form(&self, given: &Given, drawn: &Drawn) -> Form {
+        let alike = self.motions.alike(given, self.places());
+        let covariance = of_the_fit(&self.observed, self.told.wide, &alike);
+        Form {
+            hyper: self.told.likely[0].0,
+            frame_covariance: self.motions.to_twist(&covariance),
+            points: drawn.points(),
+            figures: drawn.figures(self.is_seen, given.look_risk),
+            known_mm: drawn.known_mm,
+            is_seen: self.is_seen,
+        }
     }
 }
 
+fn plane((point, _): &(Point, Vector)) -> [f64; 2] {
+    [point.x, point.y]
+}
+
+/// Some of so many, evenly.
+fn thinned(of: usize) -> impl Iterator<Item = usize> {
+    let most = of.min(MOST_PLACES);
+    (0..most).map(move |k| k * of / most)
+}
+
 /// What the points cannot tell of themselves.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug)]
 pub struct Given {
     /// What is known of form and scatter beforehand; without it what every part of its size is like.
     pub priors: Option<Priors>,
@@ -123,6 +184,17 @@ pub struct Given {
     pub radius_sigma_mm: f64,
     /// Standard uncertainty of all lengths, as a share of them: that of temperature and expansion.
     pub scale_sigma: f64,
+    /// How far the probe itself scatters, and to what share of that it is known: what points scatter by more is form, too narrow to be told
+    /// otherwise. 0 where nothing tells; all of the scatter is the probe's then.
+    pub probe_scatter_mm: [f64; 2],
+    /// With what probability a figure may be beyond either of the bounds [`Interval::least_mm`] and [`Interval::most_mm`].
+    pub look_risk: f64,
+}
+
+impl Default for Given {
+    fn default() -> Self {
+        Self { priors: None, radius_sigma_mm: 0.0, scale_sigma: 0.0, probe_scatter_mm: [0.0; 2], look_risk: 0.005 }
+    }
 }
 
 /// The covariance of the motions as the registration finds them, by least squares of deviations that a form makes alike: A+ (K + s^2) A+'
@@ -155,62 +227,97 @@ fn of_the_fit(observed: &Observed, hyper: Hyper, alike: &DMatrix<f64>) -> DMatri
     by_scatter + weights.tr_mul(&covered) + &of_alike * of_alike.transpose()
 }
 
-/// Forms that may have been, a column each, and what was observed at their places.
+/// Forms that may have been, a column each, at some places.
 struct Drawn {
     forms: DMatrix<f64>,
-    observed: Observed,
-    /// Which of the points they are.
+    places: Vec<[f64; 2]>,
+    effects: DMatrix<f64>,
+    /// Which of the points the places are, where they are points.
     chosen: Vec<usize>,
+    /// The RMS of the standard uncertainties of what is told of them, as far as it is smooth.
+    known_mm: f64,
 }
 
 impl Drawn {
-    /// By each of the likely parameters as many as speaks for them.
+    /// At the points, by each of the likely parameters as many as speaks for them.
     fn of(observed: &Observed, likely: &[(Hyper, f64)]) -> Result<Self, ModelError> {
         let n = observed.places.len();
-        let chosen: Vec<usize> = (0..n.min(MOST_PLACES)).map(|k| k * n / n.min(MOST_PLACES)).collect();
+        let chosen: Vec<usize> = thinned(n).collect();
         let seen = observed.only(&chosen);
-        let whole: f64 = likely.iter().map(|(_, weight)| weight).sum();
-        let mut forms = DMatrix::zeros(chosen.len(), 0);
-        for (k, (hyper, weight)) in (1..).zip(likely) {
-            let count = (SAMPLES as f64 * weight / whole).round() as usize;
-            if count < FEWEST_SAMPLES {
-                continue;
-            }
-            let drawn = if n <= MOST_DENSE {
+        let forms = mixed(chosen.len(), likely, |hyper, count, seed| {
+            if n <= MOST_DENSE {
                 // What was observed less scatters that may have been.
-                let scatters = Dense::fit(observed, *hyper)?.scatters(count, k)?;
-                DMatrix::from_fn(n, count, |r, c| observed.deviations_mm[r] - scatters[(r, c)])
-            } else {
-                let lattice = Lattice::over(&observed.places, hyper.field.range_mm)?;
-                Sparse::fit(&lattice, observed, *hyper)?.samples(&seen.places, count, k)?
-            };
-            let (rows, before) = forms.shape();
-            forms = forms.resize(rows, before + count, 0.0);
-            forms.columns_mut(before, count).copy_from(&drawn);
-        }
-        Ok(Self { forms, observed: seen, chosen })
+                let scatters = Dense::fit(observed, hyper)?.scatters(count, seed)?;
+                return Ok(DMatrix::from_fn(n, count, |r, c| observed.deviations_mm[r] - scatters[(r, c)]));
+            }
+            let lattice = Lattice::over(&observed.places, hyper.field.range_mm)?;
+            Sparse::fit(&lattice, observed, hyper)?.samples(&seen.places, count, seed)
+        })?;
+        Ok(Self { known_mm: spread_mm(&forms), forms, places: seen.places, effects: seen.effects, chosen })
     }
 
-    /// Takes in that the scatter is known to a share of itself only, and what adds to all points alike: a column a standard uncertainty.
+    /// The same at other places.
+    fn over(
+        observed: &Observed,
+        likely: &[(Hyper, f64)],
+        places: Vec<[f64; 2]>,
+        effects: DMatrix<f64>,
+    ) -> Result<Self, ModelError> {
+        let everywhere: Vec<[f64; 2]> = observed.places.iter().chain(&places).copied().collect();
+        let forms = mixed(places.len(), likely, |hyper, count, seed| {
+            let lattice = Lattice::over(&everywhere, hyper.field.range_mm)?;
+            Sparse::fit(&lattice, observed, hyper)?.samples(&places, count, seed)
+        })?;
+        let drawn = Self { forms, places, effects, chosen: Vec::new(), known_mm: 0.0 }.after_best_fit();
+        Ok(Self { known_mm: spread_mm(&drawn.forms), ..drawn })
+    }
+
+    /// Takes in what is not known of the scatter, and what of it is too narrow a form to be told from it.
     ///
-    /// What a form leaves of the observations is the scatter, and that may be as much larger or smaller; the motions are taken off afterwards.
-    fn with_the_unknown(mut self, scatter_u: f64, alike: &DMatrix<f64>) -> Self {
+    /// What a smooth form leaves of the observations is the scatter, as far as that is known, and that is the probe's but for a share of its square. That
+    /// share of what is left at a point is form; how much more or less is as uncertain as the scatter of the probe lets it be. Motions are in what is left too;
+    /// they are taken off afterwards.
+    fn with_the_scatter(mut self, observed: &Observed, told: &Told, given: &Given) -> Self {
         let mut normals = Normals::new(2, 0);
         for mut form in self.forms.column_iter_mut() {
-            let share = (scatter_u * normals.next()).exp() - 1.0;
-            let times: Vec<f64> = (0..alike.ncols()).map(|_| normals.next()).collect();
-            for ((value, observed), &row) in form.iter_mut().zip(&self.observed.deviations_mm).zip(&self.chosen) {
-                let more: f64 = times.iter().zip(alike.row(row).iter()).map(|(times, one)| times * one).sum();
-                *value -= share * (observed - *value) + more;
+            let share = (told.scatter_u * normals.next()).exp() - 1.0;
+            let [probe_mm, narrow_mm] = parted(told, given, &mut normals);
+            let is_form = narrow_mm.powi(2) / (probe_mm.powi(2) + narrow_mm.powi(2)).max(f64::MIN_POSITIVE);
+            let moved_mm = is_form.sqrt() * probe_mm;
+            for (value, &row) in form.iter_mut().zip(&self.chosen) {
+                let left = observed.deviations_mm[row] - *value;
+                *value += (is_form - share * (1.0 - is_form)) * left;
+                if moved_mm > 0.0 {
+                    *value += moved_mm * normals.next();
+                }
             }
+        }
+        self
+    }
+
+    /// Adds what is too narrow to be told at places that were not touched: what the scatter is more than that of the probe.
+    fn with_what_is_narrow(mut self, told: &Told, given: &Given) -> Self {
+        for (c, mut form) in self.forms.column_iter_mut().enumerate() {
+            let mut normals = Normals::new(4, c as u64);
+            let [_, narrow_mm] = parted(told, given, &mut normals);
+            form.iter_mut().for_each(|value| *value += narrow_mm * normals.next());
+        }
+        self
+    }
+
+    /// Adds what adds to all places alike: a column a standard uncertainty.
+    fn with_what_is_alike(mut self, alike: &DMatrix<f64>) -> Self {
+        let mut normals = Normals::new(3, 0);
+        for mut form in self.forms.column_iter_mut() {
+            alike.column_iter().for_each(|one| form.axpy(normals.next(), &one, 1.0));
         }
         self
     }
 
     /// Each form after its own best fit.
     fn after_best_fit(mut self) -> Self {
-        if self.observed.effects.ncols() > 0 {
-            let base = self.observed.effects.clone().qr().q();
+        if self.effects.ncols() > 0 {
+            let base = self.effects.clone().qr().q();
             let fitted: DMatrix<f64> = &base * base.tr_mul(&self.forms);
             self.forms -= fitted;
         }
@@ -225,11 +332,11 @@ impl Drawn {
             let sigma_mm = (row.iter().map(|v| (v - mean_mm).powi(2)).sum::<f64>() / (count - 1.0)).sqrt();
             FormPoint { at_mm: *at_mm, form: Predicted { mean_mm, sigma_mm } }
         };
-        self.observed.places.iter().enumerate().map(of).collect()
+        self.places.iter().enumerate().map(of).collect()
     }
 
     /// The figures; where no form is seen they are known from above alone.
-    fn figures(&self, is_seen: bool) -> FormFigures {
+    fn figures(&self, is_seen: bool, look_risk: f64) -> FormFigures {
         let mut found: [Vec<f64>; 3] = Default::default();
         let mut sorted = Vec::with_capacity(self.forms.nrows());
         for form in self.forms.column_iter() {
@@ -242,22 +349,69 @@ impl Drawn {
             found[1].push(sorted[n - 1] - sorted[0]);
             found[2].push(sorted[n - 1 - left_out] - sorted[left_out]);
         }
-        let [rms, pv, pv_most_points] = found.map(|values| Interval::of(values, is_seen));
+        let [rms, pv, pv_most_points] = found.map(|values| Interval::of(values, is_seen, look_risk));
         FormFigures { rms, pv, pv_most_points }
     }
 }
 
+/// The scatter of the probe and what of the scatter is too narrow a form, each as it may be. Where nothing tells how far the probe scatters it is the scatter that was
+/// found.
+fn parted(told: &Told, given: &Given, normals: &mut Normals) -> [f64; 2] {
+    let ([probe_mm, probe_u], scatter_mm) = (given.probe_scatter_mm, told.likely[0].0.scatter_mm);
+    if probe_mm <= 0.0 {
+        return [scatter_mm, 0.0];
+    }
+    let may_be = |mm: f64, share: f64, z: f64| (mm * (share * z).exp()).powi(2);
+    let found = may_be(scatter_mm, told.scatter_u, normals.next());
+    let own = may_be(probe_mm, probe_u, normals.next());
+    [own.min(found).sqrt(), (found - own).max(0.0).sqrt()]
+}
+
+/// The RMS of the standard deviations of all rows.
+fn spread_mm(forms: &DMatrix<f64>) -> f64 {
+    let variances: f64 = forms.row_iter().map(|row| row.variance()).sum();
+    (variances / forms.nrows().max(1) as f64).sqrt()
+}
+
+/// Forms drawn by each of the likely parameters, as many as speaks for them, one beside the other.
+fn mixed(
+    rows: usize,
+    likely: &[(Hyper, f64)],
+    draw: impl Fn(Hyper, usize, u64) -> Result<DMatrix<f64>, ModelError>,
+) -> Result<DMatrix<f64>, ModelError> {
+    let whole: f64 = likely.iter().map(|(_, weight)| weight).sum();
+    let mut forms = DMatrix::zeros(rows, 0);
+    for (seed, (hyper, weight)) in (1..).zip(likely) {
+        let count = (SAMPLES as f64 * weight / whole).round() as usize;
+        if count < FEWEST_SAMPLES {
+            continue;
+        }
+        let drawn = draw(*hyper, count, seed)?;
+        let before = forms.ncols();
+        forms = forms.resize(rows, before + count, 0.0);
+        forms.columns_mut(before, count).copy_from(&drawn);
+    }
+    Ok(forms)
+}
+
 impl Interval {
     /// Of values that are equally probable.
-    fn of(mut values: Vec<f64>, has_low: bool) -> Self {
+    fn of(mut values: Vec<f64>, has_low: bool, risk: f64) -> Self {
         values.sort_unstable_by(f64::total_cmp);
         let at = |share: f64| values[((values.len() - 1) as f64 * share).round() as usize];
-        Self { median_mm: at(0.5), low_mm: if has_low { at(0.025) } else { 0.0 }, high_mm: at(0.975) }
+        let low = |share: f64| if has_low { at(share) } else { 0.0 };
+        Self {
+            median_mm: at(0.5),
+            low_mm: low(0.025),
+            high_mm: at(0.975),
+            least_mm: low(risk),
+            most_mm: at(1.0 - risk),
+        }
     }
 }
 
 /// The motions that the registration was free to make, about the middle of the points and in units of their size.
-struct Motions {
+pub(super) struct Motions {
     centre: Point,
     size_mm: f64,
     /// A column a motion.
@@ -265,7 +419,7 @@ struct Motions {
 }
 
 impl Motions {
-    fn of(registration: &Registration, points: impl Iterator<Item = Point> + Clone) -> Self {
+    pub(super) fn of(registration: &Registration, points: impl Iterator<Item = Point> + Clone) -> Self {
         let n = points.clone().count() as f64;
         let centre = Point::from(points.clone().fold(Vector::zeros(), |sum, p| sum + p.coords) / n);
         let size_mm = (points.map(|p| (p - centre).norm_squared()).sum::<f64>() / n).sqrt().max(f64::MIN_POSITIVE);
@@ -278,8 +432,27 @@ impl Motions {
         Self { centre, size_mm, free }
     }
 
+    /// Deviations of which the motions move them all.
+    pub(super) fn observed(&self, used: &[&Deviation]) -> Observed {
+        Observed {
+            places: used.iter().map(|d| [d.point.x, d.point.y]).collect(),
+            deviations_mm: used.iter().map(|d| d.deviation_mm).collect(),
+            effects: self.rows(used.iter().map(|d| (d.point, d.normal))),
+        }
+    }
+
+    /// What a standard uncertainty of the radius of the probe and of the scale add to every point.
+    fn alike(&self, given: &Given, points: impl ExactSizeIterator<Item = (Point, Vector)>) -> DMatrix<f64> {
+        let mut alike = DMatrix::zeros(points.len(), 2);
+        for (r, (point, normal)) in points.enumerate() {
+            alike[(r, 0)] = given.radius_sigma_mm;
+            alike[(r, 1)] = given.scale_sigma * (point - self.centre).dot(&normal);
+        }
+        alike
+    }
+
     /// What a unit of each motion adds to the distance of each point from the surface.
-    fn rows(&self, points: impl Iterator<Item = (Point, Vector)>) -> DMatrix<f64> {
+    pub(super) fn rows(&self, points: impl Iterator<Item = (Point, Vector)>) -> DMatrix<f64> {
         let rows: Vec<[f64; 6]> = points
             .map(|(point, normal)| {
                 let arm = (point - self.centre).cross(&normal) / self.size_mm;

@@ -21,16 +21,20 @@
 mod dense;
 mod error;
 mod form;
+mod growing;
 mod likelihood;
 mod matern;
 mod normals;
 mod sparse;
+mod touches;
 
 pub use dense::{Dense, Predicted};
 pub use error::ModelError;
 pub use form::{Form, FormFigures, FormPoint, Given, Interval};
+pub use growing::Growing;
 pub use likelihood::Priors;
 pub use sparse::{Lattice, Sparse};
+pub use touches::{FEWEST, FIRST, Look, Purpose, SoFar, Why, look, short_way, spread};
 
 use matern::correlation;
 use nalgebra::DMatrix;

@@ -151,13 +151,13 @@ impl ManualMachine {
     }
 
     fn prompt_to_measure(&self, job: Job, plan: &Plan, confirm: &dyn Fn(&str) -> String) -> Vec<String> {
-        let (part, file) = (&self.settings.part, self.cycle_folder(job.cycle).join("plan.csv"));
+        let (part, file) = (&self.settings.part, self.cycle_folder(job).join(plan_file(job)));
         let points = match self.settings.free_points {
             Some(least) => format!("at least {least} points"),
             None => format!("{} points of {}", plan.targets.len(), file.display()),
         };
         vec![
-            format!("MEASURE {part}, cycle {}: {points}", job.cycle),
+            format!("MEASURE {part}, cycle {}: {points}", job.number()),
             format!("check: right part, clean, clamped; wheel clear of it; probe radius {} mm", plan.probe_radius_mm),
             "when it is measured and the probe is clear of the part,".to_owned(),
             confirm("done --file RESULT"),
@@ -169,7 +169,7 @@ impl ManualMachine {
             let ended = "when the pass has ended and the wheel is clear of the part,".to_owned();
             return vec![ended, confirm("done")];
         }
-        let folder = self.cycle_folder(job.cycle.saturating_sub(1));
+        let folder = self.cycle_folder(Job { cycle: job.cycle.saturating_sub(1), ..job });
         let there = ["toolpath.ngc", "correction.csv"].map(|name| folder.join(name)).into_iter().find(|f| f.is_file());
         let by = there.map_or("your own program".to_owned(), |file| file.display().to_string());
         let map = hex(&map[..4]);
@@ -190,8 +190,8 @@ impl ManualMachine {
         if folder.parent() == Some(Path::new("runs")) { String::new() } else { format!(" {}", folder.display()) }
     }
 
-    fn cycle_folder(&self, cycle: u16) -> PathBuf {
-        self.settings.folder.join(format!("cycle-{cycle}"))
+    fn cycle_folder(&self, job: Job) -> PathBuf {
+        self.settings.folder.join(format!("cycle-{}", job.number().cycle))
     }
 
     // ---- what a person says -------------------------------------------------------------------------------------------------------
@@ -248,7 +248,7 @@ impl ManualMachine {
             return Err(self.not_taken("no measurement is asked for"));
         };
         let (settings, plan, taken) = (self.settings.clone(), Arc::clone(plan), self.taken.clone());
-        let cycle_folder = self.cycle_folder(job.cycle);
+        let cycle_folder = self.cycle_folder(job);
         let read = tokio::task::spawn_blocking(move || {
             let bytes = read_bytes(&file)?;
             let sha256: [u8; 32] = Sha256::digest(&bytes).into();
@@ -258,14 +258,27 @@ impl ManualMachine {
             let measurement = measured(&settings, &plan, job, done, &file, &bytes)?;
             // As it came, under a name that no other file of a cycle has.
             let extension = file.extension().map_or("txt".to_owned(), |e| file_word(&e.to_string_lossy()));
-            let name = format!("result.{extension}");
+            let name = format!("result{}.{extension}", of_batch(job));
             write_atomic(&cycle_folder.join(&name), &bytes)?;
             Ok((measurement, sha256, name))
         });
         let (measurement, sha256, name) = read.await.map_err(|e| self.not_taken(e))?.map_err(|e| self.not_taken(e))?;
         self.taken.push(sha256);
         self.measured = Some(measurement);
-        Ok(vec![format!("cycle-{}/plan.csv", job.cycle), format!("cycle-{}/{name}", job.cycle)])
+        let cycle = job.number().cycle;
+        Ok(vec![format!("cycle-{cycle}/{}", plan_file(job)), format!("cycle-{cycle}/{name}")])
+    }
+}
+
+fn plan_file(job: Job) -> String {
+    format!("plan{}.csv", of_batch(job))
+}
+
+/// What tells the files of a batch from those of the first.
+fn of_batch(job: Job) -> String {
+    match job.number().batch {
+        0 => String::new(),
+        before => format!("-{}", before + 1),
     }
 }
 
@@ -355,7 +368,7 @@ impl Machine for ManualMachine {
             return Err(self.refused(Command::Prepare, Answer::AlreadyBegun));
         }
         if let Some((Work::Measure(plan), _)) = &self.work {
-            let (settings, plan, folder) = (self.settings.clone(), Arc::clone(plan), self.cycle_folder(job.cycle));
+            let (settings, plan, folder) = (self.settings.clone(), Arc::clone(plan), self.cycle_folder(job));
             let written = tokio::task::spawn_blocking(move || write_plan(&settings, &folder, &plan, job));
             written.await.map_err(|e| self.not_taken(e))?.map_err(|e| self.not_taken(e))?;
         }

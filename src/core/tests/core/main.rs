@@ -14,3 +14,4 @@ mod paper;
 mod parameters;
 mod parts;
 mod search;
+mod touches;

@@ -1,0 +1,320 @@
+//! The model as it grows: points come one batch after another, and what is known at a set of places is brought up to date with each.
+//!
+//! The factor L of the covariance of all points told so far is bordered row by row, and with it A = L^-1 k(points, places):
+//!
+//! ```text
+//!  l = L^-1 k(points, x)      d^2 = k(x, x) + s^2 - l'l      a = (k(x, places) - l'A) / d      w = (z - l'v) / d
+//!  mean += w a                variance -= a^2
+//! ```
+//!
+//! A further point costs as much as points are known times places are asked for, and nothing is ever solved anew. Effects that nobody knows are part of the
+//! covariance with a variance beyond all that is measured: what is told of a place is the field and the effects together.
+
+use nalgebra::DMatrix;
+use rayon::prelude::*;
+
+use super::{Hyper, ModelError, Observed, Predicted};
+
+/// Standard deviation of an effect that nobody knows, in units of the field: more would drown the field in rounding.
+const VAGUE: f64 = 1e3;
+/// Places that are worked on at a time: so many, beside some hundred points, stay near the processor.
+const BLOCK: usize = 256;
+
+/// A model that takes points in, and knows at every place of a set what it says there.
+#[derive(Clone)]
+pub struct Growing {
+    hyper: Hyper,
+    places: Vec<[f64; 2]>,
+    effects: DMatrix<f64>,
+    /// Where points were told, what effects move them by, and L row by row.
+    told: Vec<[f64; 2]>,
+    moved: Vec<Vec<f64>>,
+    lower: Vec<Vec<f64>>,
+    /// L^-1 of the deviations.
+    whitened: Vec<f64>,
+    blocks: Vec<Block>,
+}
+
+/// Some of the places.
+#[derive(Clone)]
+struct Block {
+    first: usize,
+    mean_mm: Vec<f64>,
+    variance_mm2: Vec<f64>,
+    /// A, a row a point.
+    across: Vec<Vec<f64>>,
+}
+
+impl Growing {
+    /// Asks for some places before anything is told of them.
+    ///
+    /// `effects` has a row a place: what a unit of each effect adds there.
+    ///
+    /// # Errors
+    /// Rows that do not belong together, numbers that are none, parameters that are not above 0.
+    pub fn over(places: Vec<[f64; 2]>, effects: DMatrix<f64>, hyper: Hyper) -> Result<Self, ModelError> {
+        hyper.check()?;
+        if effects.nrows() != places.len() {
+            return Err(ModelError::Shape { points: places.len(), deviations: places.len(), rows: effects.nrows() });
+        }
+        let finite = |k: usize| places[k].iter().chain(effects.row(k).iter()).all(|value| value.is_finite());
+        if let Some(point) = (0..places.len()).find(|&k| !finite(k)) {
+            return Err(ModelError::NotFinite { point });
+        }
+        let mut growing = Self {
+            hyper,
+            blocks: Vec::new(),
+            told: Vec::new(),
+            moved: Vec::new(),
+            lower: Vec::new(),
+            whitened: Vec::new(),
+            places,
+            effects,
+        };
+        let block = |first: usize| {
+            let until = (first + BLOCK).min(growing.places.len());
+            let variance_mm2 = (first..until)
+                .map(|k| {
+                    let row = growing.row(k);
+                    growing.covariance_mm2((growing.places[k], &row), (growing.places[k], &row))
+                })
+                .collect();
+            Block { first, mean_mm: vec![0.0; until - first], variance_mm2, across: Vec::new() }
+        };
+        growing.blocks = (0..growing.places.len()).step_by(BLOCK).map(block).collect();
+        Ok(growing)
+    }
+
+    /// Takes points in.
+    ///
+    /// # Errors
+    /// Rows that do not belong together, and numbers that are none; nothing is taken in then.
+    pub fn tell(&mut self, observed: &Observed) -> Result<(), ModelError> {
+        let Observed { places, deviations_mm, effects } = observed;
+        let (points, columns) = (places.len(), self.effects.ncols());
+        if deviations_mm.len() != points || effects.shape() != (points, columns) {
+            return Err(ModelError::Shape { points, deviations: deviations_mm.len(), rows: effects.nrows() });
+        }
+        let finite = |k: usize| {
+            places[k].iter().chain(&deviations_mm[k..=k]).chain(effects.row(k).iter()).all(|value| value.is_finite())
+        };
+        if let Some(point) = (0..points).find(|&k| !finite(k)) {
+            return Err(ModelError::NotFinite { point });
+        }
+        let known = self.told.len();
+        for (k, &place) in places.iter().enumerate() {
+            self.border(place, effects.row(k).iter().copied().collect(), deviations_mm[k])?;
+        }
+        self.carry(known);
+        Ok(())
+    }
+
+    /// Takes in that some of the places will be touched: what will be found there is not known, and how well it will be known does not
+    /// depend on it (hallucinated updates, Desautels, Krause and Burdick 2014).
+    ///
+    /// # Errors
+    /// Parameters by which nothing can be told apart.
+    pub fn imagine(&mut self, place: usize) -> Result<(), ModelError> {
+        let known = self.told.len();
+        let row = self.row(place);
+        let expected = self.expected(self.places[place], &row);
+        self.border(self.places[place], row, expected)?;
+        self.carry(known);
+        Ok(())
+    }
+
+    /// Returns what is known at each place, the effects in it.
+    pub fn known(&self) -> impl Iterator<Item = Predicted> + '_ {
+        let of =
+            |(mean_mm, variance): (&f64, &f64)| Predicted { mean_mm: *mean_mm, sigma_mm: variance.max(0.0).sqrt() };
+        self.blocks.iter().flat_map(move |block| block.mean_mm.iter().zip(&block.variance_mm2).map(of))
+    }
+
+    /// Returns where is asked.
+    pub fn places(&self) -> &[[f64; 2]] {
+        &self.places
+    }
+
+    /// Says by how many standard deviations of what was expected each of some points is off, the scatter of the probe among them.
+    pub fn surprise(&self, observed: &Observed) -> Vec<f64> {
+        let Observed { places, deviations_mm, effects } = observed;
+        let of = |k: usize| {
+            let row: Vec<f64> = effects.row(k).iter().copied().collect();
+            let l = self.solved(places[k], &row);
+            let mean: f64 = l.iter().zip(&self.whitened).map(|(l, w)| l * w).sum();
+            let own = self.covariance_mm2((places[k], &row), (places[k], &row));
+            let variance = own + self.hyper.scatter_mm.powi(2) - l.iter().map(|l| l * l).sum::<f64>();
+            (deviations_mm[k] - mean) / variance.max(self.hyper.scatter_mm.powi(2)).sqrt()
+        };
+        (0..places.len()).into_par_iter().map(of).collect()
+    }
+
+    fn row(&self, place: usize) -> Vec<f64> {
+        self.effects.row(place).iter().copied().collect()
+    }
+
+    fn covariance_mm2(&self, (a, moved_a): ([f64; 2], &[f64]), (b, moved_b): ([f64; 2], &[f64])) -> f64 {
+        let effects: f64 = moved_a.iter().zip(moved_b).map(|(a, b)| a * b).sum();
+        self.hyper.field.covariance_mm2(a, b) + (VAGUE * self.hyper.field.sigma_mm).powi(2) * effects
+    }
+
+    /// L^-1 of the covariances of a place with all points.
+    fn solved(&self, place: [f64; 2], row: &[f64]) -> Vec<f64> {
+        let mut l: Vec<f64> = Vec::with_capacity(self.told.len());
+        for (k, lower) in self.lower.iter().enumerate() {
+            let covariance = self.covariance_mm2((place, row), (self.told[k], &self.moved[k]));
+            let before: f64 = lower.iter().zip(&l).map(|(a, b)| a * b).sum();
+            l.push((covariance - before) / lower[k]);
+        }
+        l
+    }
+
+    fn expected(&self, place: [f64; 2], row: &[f64]) -> f64 {
+        self.solved(place, row).iter().zip(&self.whitened).map(|(l, w)| l * w).sum()
+    }
+
+    /// Adds a row to the factor.
+    fn border(&mut self, place: [f64; 2], row: Vec<f64>, deviation_mm: f64) -> Result<(), ModelError> {
+        let mut l = self.solved(place, &row);
+        let own = self.covariance_mm2((place, &row), (place, &row)) + self.hyper.scatter_mm.powi(2);
+        let left = own - l.iter().map(|l| l * l).sum::<f64>();
+        // Less than the scatter itself is rounding.
+        let d = left.max(self.hyper.scatter_mm.powi(2)).sqrt();
+        if !(d.is_finite() && d > 0.0) {
+            return Err(ModelError::NotDefinite);
+        }
+        let before: f64 = l.iter().zip(&self.whitened).map(|(l, w)| l * w).sum();
+        self.whitened.push((deviation_mm - before) / d);
+        l.push(d);
+        self.lower.push(l);
+        self.told.push(place);
+        self.moved.push(row);
+        Ok(())
+    }
+
+    /// Carries the points from one on to all places.
+    fn carry(&mut self, from: usize) {
+        let Self { hyper, places, effects, told, moved, lower, whitened, blocks } = self;
+        let vague = (VAGUE * hyper.field.sigma_mm).powi(2);
+        blocks.par_iter_mut().for_each(|block| {
+            for k in from..told.len() {
+                let mut row: Vec<f64> = (block.first..block.first + block.mean_mm.len())
+                    .map(|at| {
+                        let by_effects: f64 = moved[k].iter().zip(effects.row(at).iter()).map(|(a, b)| a * b).sum();
+                        hyper.field.covariance_mm2(told[k], places[at]) + vague * by_effects
+                    })
+                    .collect();
+                for (l, across) in lower[k].iter().zip(&block.across) {
+                    row.iter_mut().zip(across).for_each(|(value, across)| *value -= l * across);
+                }
+                let d = lower[k][k];
+                for (at, value) in row.iter_mut().enumerate() {
+                    *value /= d;
+                    block.mean_mm[at] += whitened[k] * *value;
+                    block.variance_mm2[at] -= *value * *value;
+                }
+                block.across.push(row);
+            }
+        });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Dense, Field};
+    use super::*;
+
+    const HYPER: Hyper = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4 };
+
+    fn observed(count: u32, effects: usize) -> Observed {
+        let places: Vec<[f64; 2]> = (0..count).map(f64::from).map(|k| [(7.31 * k) % 60.0, (13.7 * k) % 40.0]).collect();
+        let deviations_mm = places.iter().map(|[x, y]| 5e-3 * ((0.1 * x).sin() + 0.5 * (0.13 * y).cos())).collect();
+        let effects =
+            DMatrix::from_fn(places.len(), effects, |r, c| [1.0, places[r][0] / 30.0, places[r][1] / 30.0][c]);
+        Observed { places, deviations_mm, effects }
+    }
+
+    fn asked(effects: usize) -> (Vec<[f64; 2]>, DMatrix<f64>) {
+        let places: Vec<[f64; 2]> = (0..600).map(|k| [2.7 * f64::from(k % 25), 1.9 * f64::from(k / 25)]).collect();
+        let rows = DMatrix::from_fn(places.len(), effects, |r, c| [1.0, places[r][0] / 30.0, places[r][1] / 30.0][c]);
+        (places, rows)
+    }
+
+    fn grown(observed: &Observed, batches: &[usize]) -> Growing {
+        let (places, effects) = asked(observed.effects.ncols());
+        let mut growing = Growing::over(places, effects, HYPER).unwrap();
+        let mut first = 0;
+        for count in batches {
+            let chosen: Vec<usize> = (first..first + count).collect();
+            growing.tell(&observed.only(&chosen)).unwrap();
+            first += count;
+        }
+        assert_eq!(first, observed.places.len());
+        growing
+    }
+
+    #[test]
+    fn in_batches_it_tells_what_all_points_at_once_tell() {
+        let observed = observed(120, 0);
+        let growing = grown(&observed, &[10, 1, 49, 60]);
+        let exact = Dense::fit(&observed, HYPER).unwrap().predict(growing.places());
+        for (a, b) in exact.iter().zip(growing.known()) {
+            assert!((a.mean_mm - b.mean_mm).abs() < 1e-10 && (a.sigma_mm - b.sigma_mm).abs() < 1e-10, "{a:?} {b:?}");
+        }
+    }
+
+    #[test]
+    fn beside_effects_it_tells_field_and_effects_together() {
+        let observed = observed(120, 3);
+        let growing = grown(&observed, &[60, 60]);
+        let dense = Dense::fit(&observed, HYPER).unwrap();
+        let (found, _) = dense.effects();
+        let (places, effects) = asked(3);
+        let moved = effects * found;
+        for (k, (a, b)) in dense.predict(&places).iter().zip(growing.known()).enumerate() {
+            assert!((a.mean_mm + moved[k] - b.mean_mm).abs() < 1e-7, "{k}: {a:?} {b:?}");
+            assert!(b.sigma_mm < HYPER.field.sigma_mm && b.sigma_mm > 0.0, "{k}: {b:?}");
+        }
+    }
+
+    #[test]
+    fn what_will_be_touched_is_known_better_whatever_will_be_found() {
+        let observed = observed(60, 3);
+        let mut growing = grown(&observed, &[60]);
+        let before: Vec<Predicted> = growing.known().collect();
+        let place = growing.places()[77];
+        growing.imagine(77).unwrap();
+        let imagined: Vec<Predicted> = growing.known().collect();
+        assert!(before.iter().zip(&imagined).all(|(a, b)| (a.mean_mm - b.mean_mm).abs() < 1e-12));
+        assert!(imagined[77].sigma_mm < HYPER.scatter_mm && imagined[77].sigma_mm < 0.9 * before[77].sigma_mm);
+        // Touched in truth, and found to be elsewhere.
+        let mut touched = grown(&observed, &[60]);
+        let effects = DMatrix::from_row_slice(1, 3, &[1.0, place[0] / 30.0, place[1] / 30.0]);
+        touched.tell(&Observed { places: vec![place], deviations_mm: vec![0.1], effects }).unwrap();
+        for (a, b) in touched.known().zip(&imagined) {
+            assert!((a.sigma_mm - b.sigma_mm).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn a_point_off_by_ten_scatters_is_a_surprise_and_one_as_expected_is_none() {
+        let observed = observed(121, 3);
+        let first: Vec<usize> = (0..120).collect();
+        let growing = grown(&observed.only(&first), &[120]);
+        let mut last = observed.only(&[120]);
+        assert!(growing.surprise(&last)[0].abs() < 2.0);
+        last.deviations_mm[0] += 10.0 * HYPER.scatter_mm;
+        assert!(growing.surprise(&last)[0] > 5.0);
+    }
+
+    #[test]
+    fn what_does_not_belong_together_is_refused() {
+        let (places, effects) = asked(3);
+        assert!(Growing::over(places.clone(), DMatrix::zeros(7, 3), HYPER).is_err());
+        let mut growing = Growing::over(places, effects, HYPER).unwrap();
+        assert!(growing.tell(&observed(5, 2)).is_err());
+        let mut wrong = observed(5, 3);
+        wrong.deviations_mm[4] = f64::NAN;
+        assert!(growing.tell(&wrong).unwrap_err().to_string().contains("point 5 "));
+    }
+}

@@ -1,0 +1,246 @@
+//! Where to touch next and whether to touch on, held against planted parts.
+
+use rand::SeedableRng;
+use rand::rngs::StdRng;
+
+use crate::common::{RADIUS_MM, free_form, normal, placed, points, pose};
+use regrind_core::geometry::{Point, Vector};
+use regrind_core::model::{FEWEST, FIRST, Form, Given, Interval, Look, Purpose, SoFar, Why, look, short_way, spread};
+use regrind_core::registration::{Options, Registration, Start, register};
+use regrind_sim::form::FormError;
+use regrind_sim::probe::Placement;
+use regrind_sim::shape::{FreeForm, Shape};
+
+const SCATTER_MM: f64 = 3e-4;
+const STRICT: Purpose =
+    Purpose { pv_mm: f64::INFINITY, pv_most_points_mm: 1e-4, rms_mm: 1e-4, correction_mm: 5e-4, may_grind: true };
+const LOOSE: Purpose = Purpose { pv_most_points_mm: 1.0, rms_mm: 1.0, ..STRICT };
+
+/// A part with something on it that is no smooth form, and its pattern of 36 by 22 targets.
+struct Part {
+    form: FormError,
+    extra: Box<dyn Fn(f64, f64) -> f64>,
+    targets: Vec<(Point, Vector)>,
+    seed: u64,
+}
+
+impl Part {
+    fn new(seed: u64, rms_mm: f64, extra: impl Fn(f64, f64) -> f64 + 'static) -> Self {
+        let shape = FreeForm::default();
+        let places = (0..36 * 22).map(|k| [f64::from(k % 36) / 35.0, f64::from(k / 36) / 21.0]);
+        let targets = places.map(|[u, v]| [96.0 * u - 48.0, 56.0 * v - 28.0]).map(|[x, y]| {
+            let [p, q] = shape.gradient(x, y);
+            (Point::new(x, y, shape.height(x, y)), Vector::new(-p, -q, 1.0).normalize())
+        });
+        let form = FormError::with_rms(&mut regrind_sim::rng(seed), 30.0, rms_mm);
+        Self { form, extra: Box::new(extra), targets: targets.collect(), seed }
+    }
+
+    fn smooth(seed: u64, rms_mm: f64) -> Self {
+        Self::new(seed, rms_mm, |_, _| 0.0)
+    }
+
+    fn stands_mm(&self, target: usize) -> f64 {
+        let at = self.targets[target].0;
+        self.form.height(at.x, at.y) + (self.extra)(at.x, at.y)
+    }
+
+    /// Touches some targets; every touch of a target scatters alike, whichever batch it is in.
+    fn measured(&self, touched: &[usize]) -> Registration {
+        let placement = Placement::new([1.0, -2.0, 0.5], [0.3, -0.2, 0.5]);
+        let centre = |&k: &usize| {
+            let mut rng = StdRng::seed_from_u64(self.seed ^ ((k as u64) << 20));
+            let (at, n) = self.targets[k];
+            let c = at + (RADIUS_MM + self.stands_mm(k)) * n;
+            [c.x, c.y, c.z].map(|v| v + SCATTER_MM * normal(&mut rng))
+        };
+        let centres: Vec<[f64; 3]> = touched.iter().map(centre).collect();
+        let options = Options { start: Start::Pose(pose(&placement)), ..Options::new(RADIUS_MM) };
+        register(&free_form(205, 125), &points(&placed(&placement, &centres)), &options).unwrap()
+    }
+
+    /// Touches in two batches, and looks.
+    fn look(&self, first: &[usize], last: &[usize], purpose: &Purpose) -> Look {
+        let touched = [first, last].concat();
+        let mut tried = vec![None; self.targets.len()];
+        first.iter().for_each(|&k| tried[k] = Some(0));
+        last.iter().for_each(|&k| tried[k] = Some(1));
+        let so_far = SoFar { targets: &self.targets, tried: &tried, touched: &touched };
+        look(&self.measured(&touched), &given(), &so_far, purpose, 1).unwrap()
+    }
+
+    fn form(&self, touched: &[usize]) -> Form {
+        Form::over(&self.measured(touched), &given(), &self.targets).unwrap()
+    }
+
+    /// The true form at all targets after its own best fit: RMS and PV.
+    fn truth(&self) -> [f64; 2] {
+        let rows = nalgebra::DMatrix::from_fn(self.targets.len(), 6, |r, c| {
+            let (at, n) = self.targets[r];
+            let arm = at.coords.cross(&n) / 30.0;
+            [n.x, n.y, n.z, arm.x, arm.y, arm.z][c]
+        });
+        let form = nalgebra::DVector::from_fn(self.targets.len(), |r, _| self.stands_mm(r));
+        let base = rows.qr().q();
+        let left = &form - &base * base.tr_mul(&form);
+        [(left.norm_squared() / left.len() as f64).sqrt(), left.max() - left.min()]
+    }
+}
+
+fn given() -> Given {
+    Given { probe_scatter_mm: [SCATTER_MM, 0.15], ..Given::default() }
+}
+
+/// Some targets, far apart, in two batches.
+fn apart(part: &Part, count: usize) -> (Vec<usize>, Vec<usize>) {
+    let mut all = spread(&part.targets, count);
+    let last = all.split_off(count / 2);
+    (all, last)
+}
+
+fn holds(interval: Interval, value: f64) -> bool {
+    (interval.low_mm..=interval.high_mm).contains(&value)
+}
+
+#[test]
+fn between_the_touches_the_form_is_told_with_intervals_that_hold_it() {
+    let parts = std::env::var("REGRIND_PARTS").map_or(14, |parts| parts.parse().unwrap());
+    let touches = std::env::var("REGRIND_TOUCHES").map_or(70, |touches| touches.parse().unwrap());
+    let (mut rms, mut pv, mut width) = (0, 0, [0.0; 2]);
+    for seed in 0..parts {
+        let part = Part::smooth(seed, 5e-3);
+        let (first, last) = apart(&part, touches);
+        let form = part.form(&[first, last].concat());
+        let truth = part.truth();
+        rms += u32::from(holds(form.figures.rms, truth[0]));
+        pv += u32::from(holds(form.figures.pv, truth[1]));
+        width[0] += (form.figures.rms.high_mm - form.figures.rms.low_mm) / truth[0] / parts as f64;
+        width[1] += (form.figures.pv.high_mm - form.figures.pv.low_mm) / truth[1] / parts as f64;
+        assert_eq!(form.points.len(), part.targets.len());
+    }
+    println!(
+        "of {parts} parts with {touches} touches RMS held in {rms}, PV in {pv}; intervals are {width:.2?} of them wide"
+    );
+    assert!(rms + 3 >= parts as u32 && pv + 3 >= parts as u32, "{rms} {pv}");
+    assert!(width[0] < 0.5 && width[1] < 0.6, "{width:?}");
+}
+
+#[test]
+fn what_is_narrower_than_the_touches_are_apart_is_in_the_figures() {
+    // Ridges of 0.5 um that no touch can tell from the scatter of a probe, and a probe that scatters by as much by itself.
+    let rough = Part::new(3, 1e-9, |x, y| 5e-4 * (f64::sin(9.1 * x) * f64::cos(7.7 * y)).signum());
+    let (first, last) = apart(&rough, 120);
+    let told = rough.form(&[first.clone(), last.clone()].concat()).figures;
+    let [rms, _] = rough.truth();
+    assert!(told.rms.high_mm > rms && told.rms.median_mm > 0.7 * rms, "{told:?} {rms}");
+    let smooth = Part::smooth(3, 1e-9);
+    let of_smooth = smooth.form(&[first, last].concat()).figures;
+    assert!(of_smooth.rms.median_mm < 0.4 * told.rms.median_mm, "{of_smooth:?}");
+}
+
+#[test]
+fn it_ends_where_enough_is_known_and_goes_on_where_not() {
+    let part = Part::smooth(5, 5e-3);
+    let (first, last) = apart(&part, 30);
+    let few = part.look(&first, &last, &LOOSE);
+    assert_eq!((few.why, few.next.len()), (Why::Few, FEWEST - 30));
+    let (first, last) = apart(&part, 60);
+    let within = part.look(&first, &last, &LOOSE);
+    assert!(within.why == Why::Within && within.next.is_empty(), "{:?}", within.why);
+    let known = part.look(&first, &last, &Purpose { correction_mm: 0.1, ..STRICT });
+    assert!(known.why == Why::Known && known.next.is_empty(), "{:?}", known.why);
+    let unknown = part.look(&first, &last, &Purpose { correction_mm: 1e-7, ..STRICT });
+    assert_eq!((unknown.why, unknown.next.len()), (Why::Unknown, 30));
+    let between = Purpose { rms_mm: unknown.form.figures.rms.median_mm, pv_most_points_mm: 1.0, ..STRICT };
+    assert_eq!(part.look(&first, &last, &between).why, Why::Undecided);
+    let all: Vec<usize> = (0..part.targets.len()).collect();
+    assert_eq!(part.look(&all[..400], &all[400..], &STRICT).why, Why::All);
+}
+
+#[test]
+fn the_next_touches_are_new_where_least_is_known_and_say_more_than_as_many_anywhere() {
+    let part = Part::smooth(6, 5e-3);
+    // All touches in one half.
+    let half: Vec<usize> = (0..part.targets.len()).filter(|k| part.targets[*k].0.x < 0.0).collect();
+    let left: Vec<(Point, Vector)> = half.iter().map(|&k| part.targets[k]).collect();
+    let touched: Vec<usize> = spread(&left, 60).into_iter().map(|k| half[k]).collect();
+    let look = part.look(&touched[..30], &touched[30..], &STRICT);
+    assert!(look.next.iter().all(|k| !touched.contains(k)), "{:?}", look.next);
+    let right = look.next.iter().filter(|&&k| part.targets[k].0.x > 0.0).count();
+    assert!(5 * right > 4 * look.next.len(), "{right} of {}", look.next.len());
+    let known = |next: &[usize]| part.form(&[&touched, next].concat()).known_mm;
+    let anywhere: Vec<usize> =
+        (0..part.targets.len()).filter(|k| !touched.contains(k)).step_by(25).take(look.next.len()).collect();
+    let [chosen_mm, anywhere_mm] = [known(&look.next), known(&anywhere)];
+    println!("known to {:.2} um, and to {:.2} um by as many anywhere", 1e3 * chosen_mm, 1e3 * anywhere_mm);
+    assert!(chosen_mm < anywhere_mm, "{chosen_mm} {anywhere_mm}");
+    // The same is asked for again.
+    assert_eq!(part.look(&touched[..30], &touched[30..], &STRICT).next, look.next);
+}
+
+#[test]
+fn dust_has_its_neighbours_touched_and_is_left_out_then() {
+    let at = Part::smooth(7, 1e-3).targets[300].0;
+    let part = Part::new(7, 1e-3, move |x, y| if (x - at.x).hypot(y - at.y) < 1.0 { 0.03 } else { 0.0 });
+    let (mut first, last) = apart(&part, 80);
+    first.push(300);
+    let seen = part.look(&first, &last, &LOOSE);
+    assert_eq!(seen.why, Why::Around);
+    let near = |k: &&usize| (part.targets[**k].0 - at).norm() < 6.0;
+    let around: Vec<usize> = seen.next.iter().filter(near).copied().collect();
+    assert!(around.len() >= 4, "{around:?}");
+    let again = part.look(&[&first[..], &last].concat(), &seen.next, &LOOSE);
+    assert_eq!(again.why, Why::Within, "alone among its neighbours it is dust");
+}
+
+#[test]
+fn a_chip_at_the_edge_is_no_dust() {
+    let corner = Part::smooth(8, 1e-3).targets[0].0;
+    let part = Part::new(8, 1e-3, move |x, y| if (x - corner.x).hypot(y - corner.y) < 6.0 { -0.05 } else { 0.0 });
+    // The corner is among those that lie farthest apart; its neighbours come next.
+    let (first, last) = apart(&part, 80);
+    let seen = part.look(&first, &last, &LOOSE);
+    assert_eq!(seen.why, Why::Around);
+    let again = part.look(&[&first[..], &last].concat(), &seen.next, &LOOSE);
+    let told = again.form.figures.pv;
+    println!("{:?}: {told:?}", again.why);
+    // Touches that agree with each other are form, however deep; those that do not are a feature of which nobody knows the edge.
+    assert!(
+        again.why == Why::Feature && again.next.len() + 80 + seen.next.len() == part.targets.len()
+            || told.low_mm > 0.03
+    );
+    let deep = Purpose { pv_most_points_mm: 0.02, rms_mm: 1.0, ..STRICT };
+    assert_ne!(part.look(&[&first[..], &last].concat(), &seen.next, &deep).why, Why::Within);
+}
+
+#[test]
+fn a_batch_that_was_not_expected_is_followed_by_another() {
+    // Smooth where the first touches are, and a wave of 4 um where the last are.
+    let part = Part::new(9, 1e-3, |x, y| if x > 10.0 { 4e-3 * (0.9 * x).sin() * (0.8 * y).cos() } else { 0.0 });
+    let [left, right]: [Vec<usize>; 2] = [false, true]
+        .map(|on_right| (0..part.targets.len()).filter(|&k| (part.targets[k].0.x > 10.0) == on_right).collect());
+    let some = |of: &[usize], count: usize| -> Vec<usize> { of.iter().step_by(of.len() / count).copied().collect() };
+    let look = part.look(&some(&left, 100), &some(&right, 30), &LOOSE);
+    assert!(matches!(look.why, Why::Surprised | Why::Around | Why::Feature), "{:?}", look.why);
+    assert!(!look.next.is_empty());
+}
+
+#[test]
+fn the_first_touches_lie_far_apart_and_the_way_is_short() {
+    let part = Part::smooth(1, 1e-3);
+    let chosen = spread(&part.targets, FIRST);
+    let least = |of: &[usize]| {
+        let pairs = of.iter().flat_map(|a| of.iter().map(move |b| (*a, *b))).filter(|(a, b)| a < b);
+        pairs.map(|(a, b)| (part.targets[a].0 - part.targets[b].0).norm()).fold(f64::INFINITY, f64::min)
+    };
+    assert!(least(&chosen) > 20.0, "{}", least(&chosen));
+    let many = spread(&part.targets, 60);
+    let way = short_way(&part.targets, many.clone());
+    let long = |of: &[usize]| of.windows(2).map(|p| (part.targets[p[0]].0 - part.targets[p[1]].0).norm()).sum::<f64>();
+    let [mut sorted, mut wanted] = [way.clone(), many.clone()];
+    sorted.sort_unstable();
+    wanted.sort_unstable();
+    assert!(sorted == wanted && long(&way) < 0.4 * long(&many), "{} of {}", long(&way), long(&many));
+    assert!(short_way(&part.targets, Vec::new()).is_empty() && spread(&[], 4).is_empty());
+    assert_eq!((short_way(&part.targets, vec![7]), spread(&part.targets[..3], 10).len()), (vec![7], 3));
+}

@@ -1,0 +1,72 @@
+//! A measurement whose touches are chosen: what is known after a batch, and which targets are next.
+
+use super::task::{Adaptive, Cycle, Points, Task};
+use crate::compensation::{ErrorMap, told_map};
+use crate::geometry::Sample;
+use crate::model::{self, FEWEST, Form, Given, SoFar, Why, short_way, spread};
+use crate::registration::Registration;
+
+/// What a look told.
+pub(super) struct Looked {
+    /// The form over the whole pattern; the reason where there is none.
+    pub(super) form: Result<Form, String>,
+    /// The targets that are next, and why; none where enough is known.
+    pub(super) next: Option<(Vec<usize>, &'static str)>,
+}
+
+/// Looks at what was touched so far. After the first batch, which the gates look at, so many more are asked for that a look can say something.
+pub(super) fn look(
+    task: &Task,
+    adaptive: &Adaptive,
+    (number, cycle): (u32, &Cycle),
+    points: &Points,
+    (found, given): (&Registration, Given),
+) -> Looked {
+    let places = task.places();
+    let mut tried = vec![None; places.len()];
+    for (batch, targets) in (0..).zip(&points.tried) {
+        targets.iter().for_each(|&target| tried[target] = Some(batch));
+    }
+    let open = |chosen: Vec<usize>| chosen.into_iter().filter(|&k| tried[k].is_none()).collect();
+    let first: Vec<usize> = open(spread(&places, FEWEST));
+    if points.tried.len() == 1 && !first.is_empty() {
+        let why = "the part is where it should be";
+        return Looked { form: Err(why.to_owned()), next: Some((short_way(&places, first), why)) };
+    }
+    let so_far = SoFar { targets: &places, tried: &tried, touched: &points.of };
+    let purpose = adaptive.purpose(u32::from(cycle.correction.cycle) < adaptive.most_cycles);
+    let given = Given { look_risk: adaptive.look_risk(), ..given };
+    match model::look(found, &given, &so_far, &purpose, u64::from(number)) {
+        Ok(look) => {
+            let next = (!look.next.is_empty()).then(|| (look.next, in_words(look.why)));
+            Looked { form: Ok(look.form), next }
+        }
+        // What no model can be made of is touched everywhere.
+        Err(error) => {
+            let rest: Vec<usize> = open((0..places.len()).collect());
+            let next = (!rest.is_empty()).then_some((rest, "no model can be made of what was found"));
+            Looked { form: Err(error.to_string()), next }
+        }
+    }
+}
+
+fn in_words(why: Why) -> &'static str {
+    match why {
+        Why::Within => "it is in tolerance",
+        Why::Known => "its form is known well enough for a correction",
+        Why::All => "every target was touched",
+        Why::Few => "these are too few to say anything",
+        Why::Surprised => "the last touches are not where they were expected",
+        Why::Around => "a touch stands out, and around it nothing is known",
+        Why::Feature => "something narrow stands on the part, so every target is touched",
+        Why::Undecided => "it may be in tolerance and may not be",
+        Why::Unknown => "its form is not known well enough for a correction",
+    }
+}
+
+/// Lays the form on the grid of the error map.
+pub(super) fn map(task: &Task, form: &Form) -> Option<ErrorMap> {
+    let of = |p: &model::FormPoint| Sample { at_mm: p.at_mm, deviation_mm: p.form.mean_mm };
+    let told: Vec<Sample> = form.points.iter().map(of).collect();
+    told_map(&told, &task.map, form.hyper.scatter_mm, form.known_mm).ok()
+}

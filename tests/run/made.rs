@@ -1,0 +1,191 @@
+//! Whole parts, ground and measured until they are accepted: by the whole pattern, or by touches that are chosen batch by batch.
+
+use regrind::cell::PvOf;
+use regrind::compensation::told_map;
+use regrind::drive::Adaptive;
+use regrind::geometry::{Point, Sample, Vector};
+use regrind::model::{self, FEWEST, FIRST, Form, FormFigures, Given, SoFar, Why};
+use regrind::registration::Registration;
+use regrind_sim::body::Body;
+use regrind_sim::spec::WorldSpec;
+use regrind_sim::world::World;
+
+use super::{Bench, GainRule, Line, Way};
+
+/// How a part is measured.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Measured {
+    /// Everywhere that the recipe says.
+    Whole,
+    /// Where it tells most, until enough is known.
+    Chosen,
+}
+
+/// What became of a part.
+#[derive(Clone, Debug, Default)]
+pub struct Made {
+    pub passes: u32,
+    pub touches: usize,
+    pub touching_s: f64,
+    pub grinding_s: f64,
+    pub accepted: bool,
+    /// RMS and PV of the truth after the last pass, at the targets, in micrometres, after its own best position.
+    pub truth_um: [f64; 2],
+    /// Whether the truth is within the limits.
+    pub conforms: bool,
+    /// Touches after each pass, with why they ended.
+    pub told: Vec<String>,
+}
+
+impl Bench {
+    /// A recipe as it ships, its grinder with scallops.
+    pub fn as_shipped(name: &str) -> Self {
+        let mut bench = Self::new(name);
+        bench.spec.grinder.scallops = true;
+        bench
+    }
+
+    /// The same with other limits: so many times those of the recipe.
+    pub fn with_limits(mut self, times: f64) -> Self {
+        self.plan.tolerance.pv_mm *= times;
+        self.plan.tolerance.rms_mm *= times;
+        self
+    }
+
+    /// Makes a part in a world of its own.
+    pub fn make(&self, seed: u64, measured: Measured) -> Made {
+        let world = World::new(WorldSpec { seed, ..self.spec.clone() }).unwrap();
+        let mut line = Line::new(self, Way::Regrind(GainRule::Adaptive), &world, &world, None, 1);
+        let mut made = Made::default();
+        for cycle in 1..=self.plan.max_cycles {
+            let level_mm = line.correction.level_mm;
+            made.passes = cycle;
+            made.grinding_s += line.ground(cycle as u16);
+            let took = line.measured(level_mm, measured, seed, cycle);
+            made.touches += took.touches;
+            made.touching_s += took.seconds;
+            made.told.push(format!("{} {}", took.touches, took.why));
+            let deviations: Vec<f64> = world.deviations_mm(&line.places).iter().map(|d| d - level_mm).collect();
+            let truth = line.without_motion(&deviations);
+            (made.truth_um, made.conforms) = self.truth(&truth);
+            if self.accepts(&took.figures) {
+                made.accepted = true;
+                break;
+            }
+            line.correct_by(&took.found, took.error);
+        }
+        made
+    }
+
+    /// The limits, with peak to valley of all points, and of most.
+    fn limits_mm(&self) -> [f64; 3] {
+        let tolerance = &self.plan.tolerance;
+        match tolerance.pv_of {
+            PvOf::All => [tolerance.pv_mm, f64::INFINITY, tolerance.rms_mm],
+            PvOf::MostPoints => [f64::INFINITY, tolerance.pv_mm, tolerance.rms_mm],
+        }
+    }
+
+    fn accepts(&self, figures: &FormFigures) -> bool {
+        let [pv, most, rms] = self.limits_mm();
+        figures.pv.high_mm <= pv && figures.pv_most_points.high_mm <= most && figures.rms.high_mm <= rms
+    }
+
+    fn truth(&self, truth_mm: &[f64]) -> ([f64; 2], bool) {
+        let mut sorted = truth_mm.to_vec();
+        sorted.sort_by(f64::total_cmp);
+        let (n, out) = (sorted.len(), sorted.len() / 1000);
+        let rms = (truth_mm.iter().map(|v| v * v).sum::<f64>() / n as f64).sqrt();
+        let [pv, most] = [sorted[n - 1] - sorted[0], sorted[n - 1 - out] - sorted[out]];
+        let [pv_limit, most_limit, rms_limit] = self.limits_mm();
+        let judged = if most_limit.is_finite() { most } else { pv };
+        ([1e3 * rms, 1e3 * judged], pv <= pv_limit && most <= most_limit && rms <= rms_limit)
+    }
+}
+
+/// A measurement of one pass.
+struct Took {
+    touches: usize,
+    seconds: f64,
+    why: String,
+    figures: FormFigures,
+    found: Registration,
+    error: regrind::compensation::ErrorMap,
+}
+
+impl Line<'_> {
+    /// Grinds one pass and returns the seconds that it took.
+    fn ground(&mut self, cycle: u16) -> f64 {
+        let (map, pass) = (self.payload(), super::pass_of(&self.bench.task, self.correction.level_mm));
+        let payload = |bytes: Vec<u8>, kind: u8| Some(super::Payload { bytes, identity: [kind; 32] });
+        let payloads = super::Payloads { plan: None, map: payload(map.encode(), 2), pass: payload(pass.encode(), 3) };
+        let grinder = &mut self.grinders[0];
+        grinder.prepare(self.job, cycle, &payloads).unwrap();
+        grinder.begin();
+        while !grinder.advance(1000.0).finished {}
+        grinder.outcome(1).duration_s
+    }
+
+    fn measured(&self, level_mm: f64, measured: Measured, seed: u64, cycle: u32) -> Took {
+        match measured {
+            Measured::Whole => self.whole(level_mm),
+            Measured::Chosen => self.chosen(level_mm, seed, cycle),
+        }
+    }
+
+    fn whole(&self, level_mm: f64) -> Took {
+        let all: Vec<usize> = (0..self.bench.plan_of.len()).collect();
+        let (touched, seconds) = self.touch(level_mm, &all);
+        let points: Vec<Point> = touched.iter().map(|(_, point)| *point).collect();
+        let found = self.registered(&points, level_mm);
+        let figures = Form::of(&found, &self.given()).unwrap().figures;
+        let error = self.error(&found);
+        Took { touches: all.len(), seconds, why: String::new(), figures, found, error }
+    }
+
+    /// What the reference sphere tells of the probe.
+    fn given(&self) -> Given {
+        Given { probe_scatter_mm: [1e-3 * self.bench.spec.cmm.noise_um, 0.15], ..Given::default() }
+    }
+
+    fn chosen(&self, level_mm: f64, seed: u64, cycle: u32) -> Took {
+        let targets: &[(Point, Vector)] = &self.bench.plan_of;
+        let [pv_mm, pv_most_points_mm, rms_mm] = self.bench.limits_mm();
+        let most_cycles = self.bench.plan.max_cycles;
+        let adaptive = Adaptive { pv_mm, pv_most_points_mm, rms_mm, accepted_risk: 0.025, most_cycles };
+        let purpose = adaptive.purpose(cycle < most_cycles);
+        let given = Given { look_risk: adaptive.look_risk(), ..self.given() };
+        let mut tried = vec![None; targets.len()];
+        let (mut all, mut seconds, mut path) = (Vec::new(), 0.0, Vec::new());
+        let mut next = model::short_way(targets, model::spread(targets, FIRST));
+        for batch in 0.. {
+            let (touched, took_s) = self.touch(level_mm, &next);
+            next.iter().for_each(|&k| tried[k] = Some(batch));
+            seconds += took_s;
+            all.extend(touched);
+            let points: Vec<Point> = all.iter().map(|(_, point)| *point).collect();
+            let of: Vec<usize> = all.iter().map(|(k, _)| *k).collect();
+            if batch == 0 {
+                // The gates look at these; then so many more that a look says something.
+                let more: Vec<usize> =
+                    model::spread(targets, FEWEST).into_iter().filter(|&k| tried[k].is_none()).collect();
+                next = model::short_way(targets, more);
+                continue;
+            }
+            let found = self.registered(&points, level_mm);
+            let so_far = SoFar { targets, tried: &tried, touched: &of };
+            let look = model::look(&found, &given, &so_far, &purpose, seed).unwrap();
+            path.push(format!("{}{:?}", all.len(), look.why));
+            if matches!(look.why, Why::Within | Why::Known | Why::All) {
+                let form = &look.form;
+                let told: Vec<Sample> =
+                    form.points.iter().map(|p| Sample { at_mm: p.at_mm, deviation_mm: p.form.mean_mm }).collect();
+                let error = told_map(&told, &self.bench.task.map, form.hyper.scatter_mm, form.known_mm).unwrap();
+                let why = path.join(" ");
+                return Took { touches: all.len(), seconds, why, figures: form.figures, found, error };
+            }
+            next = look.next;
+        }
+        unreachable!()
+    }
+}
