@@ -7,7 +7,7 @@
 use divan::Bencher;
 use divan::counter::ItemsCount;
 use nalgebra::DMatrix;
-use regrind::model::{Dense, Field, Hyper, Lattice, Observed, Priors, Sparse};
+use regrind::model::{Dense, Field, Growing, Hyper, Lattice, Observed, Priors, Sparse};
 
 fn main() {
     divan::main();
@@ -24,9 +24,21 @@ fn measured(count: u32) -> Observed {
     let shape = |[x, y]: [f64; 2]| 5e-3 * ((0.08 * x).sin() * (0.11 * y).cos() + 0.4 * (0.17 * x + 0.05 * y).sin());
     let scatter = |k: usize| 5e-4 * ((k as f64 * 12.9898).sin() * 43_758.545_3).fract();
     let deviations_mm = places.iter().enumerate().map(|(k, &place)| shape(place) + scatter(k)).collect();
-    let row = |[x, y]: [f64; 2]| [0.02 * x, 0.03 * y, 1.0, y - 31.0, 51.0 - x, 1e-3 * x * y];
-    let effects = DMatrix::from_fn(places.len(), 6, |r, c| row(places[r])[c]);
+    let effects = motions(&places);
     Observed { places, deviations_mm, effects }
+}
+
+/// What the six motions of a part that is bent both ways add at each place.
+fn motions(places: &[[f64; 2]]) -> DMatrix<f64> {
+    let row = |[x, y]: [f64; 2]| {
+        let (x, y) = (x - 51.0, y - 31.0);
+        let z = 0.004 * x * x - 0.005 * y * y + 4e-5 * x * x * x;
+        let n = [-0.008 * x - 1.2e-4 * x * x, 0.01 * y, 1.0];
+        let arm = [x / 50.0, y / 50.0, z / 50.0];
+        let turn = |a: usize, b: usize| arm[a] * n[b] - arm[b] * n[a];
+        [n[0], n[1], n[2], turn(1, 2), turn(2, 0), turn(0, 1)]
+    };
+    DMatrix::from_fn(places.len(), 6, |r, c| row(places[r])[c])
 }
 
 fn nodes(columns: u32, rows: u32) -> Vec<[f64; 2]> {
@@ -41,6 +53,25 @@ fn nodes(columns: u32, rows: u32) -> Vec<[f64; 2]> {
 fn a_batch_after_400_points(bencher: Bencher) {
     let (all, map) = (measured(420), nodes(40, 25));
     bencher.bench(|| Dense::fit(&all, HYPER).unwrap().predict(&map));
+}
+
+/// The same in place, beside 6,000 nodes: what is known of every one is brought up to date.
+#[divan::bench]
+fn a_batch_after_400_points_in_place(bencher: Bencher) {
+    let (all, map) = (measured(420), nodes(100, 60));
+    let only = |from: usize, until: usize| Observed {
+        places: all.places[from..until].to_vec(),
+        deviations_mm: all.deviations_mm[from..until].to_vec(),
+        effects: all.effects.rows(from, until - from).into_owned(),
+    };
+    let effects = motions(&map);
+    let mut before = Growing::over(map, effects, HYPER).unwrap();
+    before.tell(&only(0, 400)).unwrap();
+    let batch = only(400, 420);
+    bencher.with_inputs(|| before.clone()).bench_values(|mut model| {
+        model.tell(&batch).unwrap();
+        model
+    });
 }
 
 #[divan::bench]

@@ -32,6 +32,7 @@ const FAR: ([f64; 3], [f64; 3]) = ([20.0, 10.0, 20.0], [20.0, 20.0, 10.0]);
 
 static NOMINAL: LazyLock<Vec<Point>> = LazyLock::new(|| grid(DENSE));
 static SCAN_NEAR: LazyLock<Vec<Point>> = LazyLock::new(|| measured(SCAN, &placement(NEAR)));
+static SCAN_FAR: LazyLock<Vec<Point>> = LazyLock::new(|| measured(SCAN, &placement(FAR)));
 static DENSE_NEAR: LazyLock<Vec<Point>> = LazyLock::new(|| measured(DENSE, &placement(NEAR)));
 static DENSE_FAR: LazyLock<Vec<Point>> = LazyLock::new(|| measured(DENSE, &placement(FAR)));
 
@@ -113,20 +114,30 @@ mod near {
 mod far {
     use super::*;
 
-    fn time(bencher: Bencher, start: Start) {
-        let measured = &*DENSE_FAR;
+    fn time(bencher: Bencher, measured: &[Point], start: Start) {
         let fresh = || gridded(NOMINAL.clone());
         bencher.with_inputs(fresh).bench_refs(|nominal| found(nominal, measured, start));
     }
 
     #[divan::bench]
     fn from_identity(bencher: Bencher) {
-        time(bencher, AT_IDENTITY());
+        time(bencher, &DENSE_FAR, AT_IDENTITY());
     }
 
     #[divan::bench]
     fn from_a_search(bencher: Bencher) {
-        time(bencher, Start::Search);
+        time(bencher, &DENSE_FAR, Start::Search);
+    }
+
+    /// 28,476 of them.
+    #[divan::bench(sample_count = 20)]
+    fn a_scan_from_identity(bencher: Bencher) {
+        time(bencher, &SCAN_FAR, AT_IDENTITY());
+    }
+
+    #[divan::bench(sample_count = 20)]
+    fn a_scan_from_a_search(bencher: Bencher) {
+        time(bencher, &SCAN_FAR, Start::Search);
     }
 }
 

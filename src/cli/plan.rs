@@ -7,6 +7,7 @@ use regrind::cell::Beginning;
 use regrind::compensation::path::{Scallops, Summary, ToolPath};
 use regrind::config::{BUILT_IN, CellConfig};
 use regrind::drive::Task;
+use regrind::model::FIRST;
 use regrind::recipe::Recipe;
 use regrind::setup::{self, SCALLOP_SHARE};
 use serde::Serialize;
@@ -48,6 +49,8 @@ struct Document {
     part_identity: String,
     nominal_points: usize,
     targets: usize,
+    /// Whether they are touched batch by batch until enough is known.
+    touches_are_chosen: bool,
     sphere_points: usize,
     most_cycles: u32,
     first_level_um: f64,
@@ -173,6 +176,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         part_identity: task.part_identity.iter().map(|b| format!("{b:02x}")).collect(),
         nominal_points: task.nominal.len(),
         targets: task.targets.len(),
+        touches_are_chosen: task.adaptive.is_some(),
         sphere_points: task.sphere.map_or(0, |s| s.points),
         most_cycles: plan.max_cycles,
         first_level_um: first_um,
@@ -317,7 +321,11 @@ fn words(d: &Document) -> String {
         d.part,
         counted(d.nominal_points, "point"),
         d.part_identity,
-        if d.targets == 0 { "where the operator takes the points".to_owned() } else { counted(d.targets, "point") },
+        match (d.targets, d.touches_are_chosen) {
+            (0, _) => "where the operator takes the points".to_owned(),
+            (targets, false) => counted(targets, "point"),
+            (targets, true) => format!("{FIRST} of {}, then batches until enough is known", counted(targets, "point")),
+        },
         d.sphere_points,
         d.tracks,
         n(d.path_mm),

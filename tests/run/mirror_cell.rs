@@ -12,7 +12,10 @@ use regrind::device::exchange::{
 use regrind::device::{Coordinates, Identified, Job, Measurement, Plan, digest};
 use regrind::formats::result::{Content, Coordinates as Said};
 use regrind::geometry::{Point, Pose, Twist, Vector};
-use regrind::registration::{MapLimits, Options, Registration, Start, lateral_error, register, weak_for_compensation};
+use regrind::model::{Form, Given};
+use regrind::registration::{
+    MapLimits, Options, PointStatus, Registration, Start, lateral_error, register, weak_for_compensation,
+};
 use regrind::surface::{DefinedSurface, Nominal, Side};
 
 const REFLECTOR_MM: f64 = 19.05;
@@ -158,4 +161,56 @@ fn another_reflector_than_the_recipes_is_refused() {
     let (found, said) = measured(strict, REFLECTOR_MM);
     let said = said.join("\n");
     assert!(found.is_none() && said.contains("station 1 (ref_1.yaml): reference point primary_"), "{said}");
+}
+
+/// The points of a session, and what they deviate by.
+fn session(data: &Path, nominal: &Nominal, name: &str) -> (Vec<Point>, Registration) {
+    let home = tempfile::tempdir().unwrap();
+    let (found, said) = measured(cell(data, name, home.path()), REFLECTOR_MM);
+    let found = found.unwrap_or_else(|| panic!("{said:#?}"));
+    let cloud: Vec<Point> = found.points.iter().map(|p| Point::from(p.at_mm)).collect();
+    let registration = registered(nominal, &cloud, [false; 6]);
+    (cloud, registration)
+}
+
+/// How what one measurement tells of another's places agrees with what was found there: rms of the difference in micrometres, and the share
+/// within 95 %, the scatter of the tracker among it.
+fn told(by: &Registration, of: &Registration) -> (f64, f64) {
+    let used: Vec<_> = of.deviations.iter().filter(|d| d.status == PointStatus::Used).collect();
+    let places: Vec<(Point, Vector)> = used.iter().map(|d| (d.point, d.normal)).collect();
+    let form = Form::over(by, &Given::default(), &places).unwrap();
+    let off: Vec<[f64; 2]> = used
+        .iter()
+        .zip(&form.points)
+        .map(|(d, p)| [d.deviation_mm - p.form.mean_mm, p.form.sigma_mm.hypot(form.hyper.scatter_mm)])
+        .collect();
+    let n = off.len() as f64;
+    let rms_um = 1e3 * (off.iter().map(|[off, _]| off * off).sum::<f64>() / n).sqrt();
+    (rms_um, off.iter().filter(|[off, sigma]| off.abs() <= 1.96 * sigma).count() as f64 / n)
+}
+
+#[test]
+#[ignore = "needs real measurements: REGRIND_DATA"]
+fn one_session_tells_little_of_another_and_a_fifth_of_it_no_less() {
+    let data = data("lat-freeform-mirror");
+    let nominal = nominal();
+    let sessions = ["20250824_M1_1", "20250825_M1"].map(|name| session(&data, &nominal, name));
+    for [a, b] in [[0, 1], [1, 0]] {
+        let ((cloud, by), (_, of)) = (&sessions[a], &sessions[b]);
+        let few: Vec<Point> = cloud.iter().step_by(5).copied().collect();
+        let whole = told(by, of);
+        let fifth = told(&registered(&nominal, &few, [false; 6]), of);
+        let rms_um = 1e3 * of.verdict.rms_mm;
+        println!(
+            "session {a} tells session {b}, {rms_um:.1} um rms, but for {:.1} um, {:.1} % within 95 %; {} points of it but for {:.1} um, {:.1} %",
+            whole.0,
+            100.0 * whole.1,
+            few.len(),
+            fifth.0,
+            100.0 * fifth.1
+        );
+        // Between the days the tracker stood elsewhere, or the mirror was moved: what no point of one session shows.
+        assert!(whole.0 < rms_um && fifth.0 < rms_um, "{whole:?} {fifth:?} {rms_um}");
+        assert!(whole.1 > 0.7 && fifth.1 > 0.85, "{whole:?} {fifth:?}");
+    }
 }

@@ -29,8 +29,7 @@ pub(super) fn trim_and_refit(
     }
     let counts: &[usize] =
         if problem.surface.fits_normals() { &COARSE_COUNTS_WHERE_NORMALS_COST } else { &COARSE_COUNTS };
-    let enough = 2 * counts.iter().max().expect("there is a count");
-    for few in counts.iter().filter(|_| problem.measured.len() >= enough) {
+    for few in counts.iter().filter(|few| problem.measured.len() >= 2 * **few) {
         pose = descend_coarsely(&problem, pose, *few, if initial.near { Some(options) } else { None }, trace)?;
     }
     prefetch(&problem, correspondences, &pose);
