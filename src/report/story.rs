@@ -69,6 +69,13 @@ pub(super) struct Measurement {
     pub(super) judgements: Vec<Judgement>,
 }
 
+impl Measurement {
+    /// Whether more touches belong to it.
+    fn goes_on(&self) -> bool {
+        self.figures.as_ref().is_some_and(|figures| figures.touch_on.is_some())
+    }
+}
+
 pub(super) struct AlarmStory {
     pub(super) alarm: Alarm,
     pub(super) raised: String,
@@ -154,13 +161,16 @@ impl Story {
             Event::Collected { cycle, gate, .. } => {
                 let unusable = Some(&gate).filter(|gate| **gate != Gate::Passed).map(gate_words);
                 let measurements = &mut self.cycle(cycle).measurements;
-                // What goes on with the touches before is the same measurement.
-                measurements.pop_if(|last| last.figures.as_ref().is_some_and(|figures| figures.touch_on.is_some()));
-                measurements.push(Measurement { utc: record.utc, unusable, ..Measurement::default() });
+                match measurements.last_mut().filter(|last| last.goes_on()) {
+                    // What goes on with the touches before is the same measurement, and is what they showed until more is known.
+                    Some(last) if unusable.is_none() => last.utc = record.utc,
+                    Some(last) => *last = Measurement { utc: record.utc, unusable, ..Measurement::default() },
+                    None => measurements.push(Measurement { utc: record.utc, unusable, ..Measurement::default() }),
+                }
             }
             Event::Registered { cycle, figures } => {
                 // What was judged keeps its figures.
-                if self.measurement(cycle).figures.is_some() {
+                if self.measurement(cycle).figures.is_some() && !self.measurement(cycle).goes_on() {
                     self.cycle(cycle).measurements.push(Measurement::default());
                 }
                 let measurement = self.measurement(cycle);
