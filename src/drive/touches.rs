@@ -2,9 +2,13 @@
 
 use super::task::{Adaptive, Cycle, Points, Task};
 use crate::compensation::{ErrorMap, told_map};
+use crate::device::Number;
 use crate::geometry::Sample;
-use crate::model::{self, FEWEST, Form, Given, SoFar, Why, short_way, spread};
+use crate::model::{self, FEWEST, Form, Given, MOST_BATCHES, SoFar, Why, short_way, spread};
 use crate::registration::Registration;
+
+// Behind the most batches comes one of all that is left, and a machine must not take it for another.
+const _: () = assert!(MOST_BATCHES < Number::BATCHES - 1);
 
 /// What a look told.
 pub(super) struct Looked {
@@ -54,6 +58,7 @@ fn in_words(why: Why) -> &'static str {
     match why {
         Why::Within => "it is in tolerance",
         Why::Known => "its form is known well enough for a correction",
+        Why::Enough => "another pass mends more than more touches would",
         Why::All => "every target was touched",
         Why::Few => "these are too few to say anything",
         Why::Surprised => "the last touches are not where they were expected",
@@ -61,6 +66,8 @@ fn in_words(why: Why) -> &'static str {
         Why::Feature => "something narrow stands on the part, so every target is touched",
         Why::Undecided => "it may be in tolerance and may not be",
         Why::Unknown => "its form is not known well enough for a correction",
+        Why::Beyond => "it is out of tolerance, and no pass is left",
+        Why::Late => "so many batches were touched that the rest is touched at once",
     }
 }
 

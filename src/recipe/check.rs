@@ -134,7 +134,7 @@ fn measuring(written: &RecipeFile, document: &mut Document) {
         }
         return;
     }
-    if risk.is_none() {
+    if risk.is_none() && !document.has_problem("measuring.accepted_risk") {
         document.report(
             "measuring.accepted_risk",
             "is missing",
@@ -149,6 +149,14 @@ fn measuring(written: &RecipeFile, document: &mut Document) {
             "is adaptive",
             "targets are chosen from a pattern, and this one is free",
             remedy,
+        );
+    }
+    if !written.acceptance.expanded_uncertainty {
+        document.report(
+            "acceptance.expanded_uncertainty",
+            "is false",
+            "figures told from some of the targets are no figures without their uncertainty",
+            "make it true, or write `mode = \"fixed\"`",
         );
     }
     if !written.measure.qualify {

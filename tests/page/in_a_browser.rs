@@ -113,7 +113,7 @@ fn the_keyboard_alone_aborts_a_run() {
     tab.send(&mut browser, "Emulation.setFocusEmulationEnabled", json!({ "enabled": true }));
     let is_there = |browser: &mut Browser| tab.read(browser, "document.activeElement.dataset.order") == "abort";
     let mut presses = 0;
-    while !is_there(&mut browser) && presses < 200 {
+    while !is_there(&mut browser) && presses < 40 {
         tab.press(&mut browser, "Tab", 9, "");
         presses += 1;
     }

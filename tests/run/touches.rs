@@ -3,8 +3,8 @@
 use std::fs;
 use std::path::Path;
 
-use crate::killed::run_with_kills;
-use crate::program::{Running, changed, regrind};
+use crate::killed::{began_once, on_serial_lines, run_with_kills};
+use crate::program::changed;
 use crate::worlds::{Ran, Setup, run, table};
 use regrind::cell::AlarmId;
 use regrind::drive::Notice;
@@ -144,8 +144,9 @@ fn people_are_told_after_every_batch_what_is_known_and_why_more_is_touched() {
     assert!(ran.notices.iter().filter(ended).count() > on.len(), "every batch is a job of its own");
 }
 
-/// A recipe whose touches are chosen, fast, beside a cell on serial lines, in a folder.
-fn serial_cell(home: &Path) {
+#[test]
+fn a_killed_program_goes_on_with_the_touches_that_are_on_record_and_repeats_none() {
+    let home = tempfile::tempdir().unwrap();
     let recipe = changed(
         "recipes/freeform-mirror.toml",
         &[
@@ -153,21 +154,7 @@ fn serial_cell(home: &Path) {
             ("seed = 1\n", "seed = 1\nspeed = 3000.0\n"),
         ],
     );
-    fs::write(home.join("part.toml"), recipe).unwrap();
-    let devices = format!("device = \"{}/", home.display());
-    let cell = changed("config/serial-rtu.toml", &[("device = \"/tmp/regrind-", &devices)]);
-    fs::write(home.join("cell.toml"), cell).unwrap();
-}
-
-#[test]
-fn a_killed_program_goes_on_with_the_touches_that_are_on_record_and_repeats_none() {
-    let home = tempfile::tempdir().unwrap();
-    serial_cell(home.path());
-    let mut serving = Running::new(regrind(
-        &["simulate", "part.toml", "--cell", "cell.toml", "--log", "machines.jsonl"],
-        home.path(),
-    ));
-    serving.line("its last word", |line| line.starts_with("Ctrl-C"));
+    let _serving = on_serial_lines(home.path(), &recipe);
     let mut most_kills = 0;
     for seed in [31, 32] {
         let (folder, kills) = run_with_kills(home.path(), seed);
@@ -192,12 +179,5 @@ fn a_killed_program_goes_on_with_the_touches_that_are_on_record_and_repeats_none
         }
     }
     assert!(most_kills > 0);
-    let log = fs::read_to_string(home.path().join("machines.jsonl")).unwrap();
-    let seen = log.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
-    let began = seen.filter(|seen| seen["what"] == "began");
-    let mut began: Vec<_> = began.map(|b| format!("{} {} {}", b["machine"], b["job"], b["cycle"])).collect();
-    let all = began.len();
-    began.sort();
-    began.dedup();
-    assert!(began.len() == all && all >= 8, "{log}");
+    assert!(began_once(home.path()) >= 8);
 }

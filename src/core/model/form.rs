@@ -274,9 +274,10 @@ impl Drawn {
 
     /// Takes in what is not known of the scatter, and what of it is too narrow a form to be told from it.
     ///
-    /// What a smooth form leaves of the observations is the scatter, as far as that is known, and that is the probe's but for a share of its square. That
-    /// share of what is left at a point is form; how much more or less is as uncertain as the scatter of the probe lets it be. Motions are in what is left too;
-    /// they are taken off afterwards.
+    /// What a smooth form leaves of the observations is the scatter, as far as that is known, and that is the
+    /// probe's but for a share of its square. That share of what is left at a point is form; how much more or less
+    /// is as uncertain as the scatter of the probe lets it be. Motions are in what is left too; they are taken off
+    /// afterwards.
     fn with_the_scatter(mut self, observed: &Observed, told: &Told, given: &Given) -> Self {
         let mut normals = Normals::new(2, 0);
         for mut form in self.forms.column_iter_mut() {
@@ -354,8 +355,8 @@ impl Drawn {
     }
 }
 
-/// The scatter of the probe and what of the scatter is too narrow a form, each as it may be. Where nothing tells how far the probe scatters it is the scatter that was
-/// found.
+/// The scatter of the probe and what of the scatter is too narrow a form, each as it may be. Where nothing tells how
+/// far the probe scatters it is the scatter that was found.
 fn parted(told: &Told, given: &Given, normals: &mut Normals) -> [f64; 2] {
     let ([probe_mm, probe_u], scatter_mm) = (given.probe_scatter_mm, told.likely[0].0.scatter_mm);
     if probe_mm <= 0.0 {

@@ -34,7 +34,7 @@ pub use form::{Form, FormFigures, FormPoint, Given, Interval};
 pub use growing::Growing;
 pub use likelihood::Priors;
 pub use sparse::{Lattice, Sparse};
-pub use touches::{FEWEST, FIRST, Look, Purpose, SoFar, Why, look, short_way, spread};
+pub use touches::{FEWEST, FIRST, Look, MOST_BATCHES, Purpose, SoFar, Why, look, short_way, spread};
 
 use matern::correlation;
 use nalgebra::DMatrix;

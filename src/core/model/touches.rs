@@ -60,6 +60,8 @@ pub enum Why {
     Within,
     /// The part has to be corrected, and the form is known well enough for that.
     Known,
+    /// The part has to be corrected, and more touches would cost more than another pass mends.
+    Enough,
     /// Every target was tried.
     All,
     /// Fewer touches say nothing.
@@ -74,12 +76,18 @@ pub enum Why {
     Undecided,
     /// The form is not known well enough for a correction.
     Unknown,
+    /// A figure is beyond its limit for certain, and no pass is left that would be corrected.
+    Beyond,
+    /// So many batches were touched that the others are touched at once.
+    Late,
 }
 
 /// Touches that tell whether it is the right part, and where it is.
 pub const FIRST: usize = 10;
 /// Fewer touches decide nothing.
 pub const FEWEST: usize = 40;
+/// Batches of a measurement, but for a last one of all that is left: who counts them on a wire has few bits for it.
+pub const MOST_BATCHES: u32 = 60;
 /// Touches of a batch, at least and at most.
 const BATCH: [usize; 2] = [20, 100];
 /// One in so many goes anywhere.
@@ -91,7 +99,7 @@ const NEIGHBOURS: usize = 6;
 const SURROUNDED: usize = 4;
 /// By chance the squares of a batch are larger in one of a thousand.
 const BY_CHANCE: f64 = 3.09;
-/// Where a figure may lie on either side and another pass may help, touching on is given up at this share of the pattern, and at no fewer.
+/// Where nothing is accepted and another pass may help, touching on is given up at this share of the pattern, and at no fewer.
 const GIVEN_UP: (f64, usize) = (1.0 / 6.0, 120);
 
 /// Returns so many targets that lie as far apart as they can: each is the one farthest from those before it.
@@ -133,15 +141,19 @@ pub fn look(
         () if !around.is_empty() => Why::Around,
         () => settled(&form, purpose, (count, so_far.targets.len())),
     };
+    let is_over = matches!(why, Why::Within | Why::Known | Why::Enough | Why::Beyond | Why::All);
+    let batches = so_far.tried.iter().flatten().max().map_or(0, |last| last + 1);
+    let why = if batches >= MOST_BATCHES && !is_over { Why::Late } else { why };
     let next = match why {
-        Why::Within | Why::Known | Why::All => Vec::new(),
-        Why::Feature => (0..so_far.tried.len()).filter(|&k| so_far.tried[k].is_none()).collect(),
+        _ if is_over => Vec::new(),
+        Why::Feature | Why::Late => (0..so_far.tried.len()).filter(|&k| so_far.tried[k].is_none()).collect(),
         _ => {
             let wanted = if count < FEWEST { FEWEST - count } else { (count / 2).clamp(BATCH[0], BATCH[1]) };
             growing.next(so_far, &around, wanted.max(around.len()).min(left), seed)?
         }
     };
-    let next = if why == Why::Feature { next } else { short_way(so_far.targets, next) };
+    let is_all = matches!(why, Why::Feature | Why::Late);
+    let next = if is_all { next } else { short_way(so_far.targets, next) };
     Ok(Look { form, next, why })
 }
 
@@ -159,10 +171,12 @@ fn settled(form: &Form, purpose: &Purpose, (count, pattern): (usize, usize)) -> 
     let is_beyond = figures.iter().any(|(figure, limit)| figure.least_mm > *limit);
     let (share, least) = GIVEN_UP;
     let gives_up = count >= least.max((share * pattern as f64) as usize);
+    // Who judges looks once, and may accept what a look among many may not: then more is touched, not ground.
+    let is_accepted = figures.iter().all(|(figure, limit)| figure.high_mm <= *limit);
     match () {
-        () if is_known && purpose.may_grind && (is_beyond || gives_up) => Why::Known,
-        // Nothing is to be corrected, and what is measured further would change nothing.
-        () if is_known && is_beyond => Why::Known,
+        () if is_beyond && !purpose.may_grind => Why::Beyond,
+        () if is_known && (is_beyond || gives_up && purpose.may_grind && !is_accepted) => Why::Known,
+        () if gives_up && purpose.may_grind && !is_accepted => Why::Enough,
         () if is_beyond => Why::Unknown,
         () => Why::Undecided,
     }

@@ -3,7 +3,7 @@
 use crate::common::{RADIUS_MM, centres, free_form, placed, points, pose, pose_error_mm};
 use nalgebra::{Matrix6, Vector6};
 use regrind_core::geometry::{Point, Pose, Vector};
-use regrind_core::registration::{Options, PointStatus, register};
+use regrind_core::registration::{Options, PointStatus, Start, register};
 use regrind_core::surface::{Nominal, Projection};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::{Placement, add_noise, add_outliers};
@@ -197,5 +197,25 @@ fn the_stated_covariance_is_the_observed_scatter() {
         let v = weakest.eigenvectors.column(weakest.eigenvalues.imax()).into_owned();
         let ratio = ((v.transpose() * observed * v)[0] / (v.transpose() * stated * v)[0]).sqrt();
         assert!((ratio - 1.0).abs() < 0.15, "{name}, weakest direction: {ratio:.3}");
+    }
+}
+
+#[test]
+fn from_far_away_a_few_points_go_the_long_way_ahead_of_the_others() {
+    let placement = Placement::new([20.0, 10.0, 20.0], [20.0, 20.0, 10.0]);
+    let shape = FreeForm::default();
+    let form = FormError::with_rms(&mut regrind_sim::rng(5), 30.0, 1e-3);
+    for (columns, rows) in [(226, 126), (75, 40)] {
+        let cloud =
+            points(&placed(&placement, &centres(&shape, &form, [[-49.0, -29.0], [49.0, 29.0]], [columns, rows])));
+        let found = register(
+            &free_form(409, 249),
+            &cloud,
+            &Options { start: Start::Pose(Pose::identity()), ..Options::new(RADIUS_MM) },
+        );
+        let found = found.unwrap();
+        assert!(pose_error_mm(&found.cmm_from_model, &pose(&placement)) < 0.02);
+        let whole = found.trace.iter().filter(|turn| 2 * turn.points > cloud.len()).count();
+        assert!(whole <= 3, "{} points: {whole} of {} turns are of all of them", cloud.len(), found.trace.len());
     }
 }

@@ -5,7 +5,9 @@ use rand::rngs::StdRng;
 
 use crate::common::{RADIUS_MM, free_form, normal, placed, points, pose};
 use regrind_core::geometry::{Point, Vector};
-use regrind_core::model::{FEWEST, FIRST, Form, Given, Interval, Look, Purpose, SoFar, Why, look, short_way, spread};
+use regrind_core::model::{
+    FEWEST, FIRST, Form, Given, Interval, Look, MOST_BATCHES, Purpose, SoFar, Why, look, short_way, spread,
+};
 use regrind_core::registration::{Options, Registration, Start, register};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
@@ -133,6 +135,11 @@ fn what_is_narrower_than_the_touches_are_apart_is_in_the_figures() {
     let told = rough.form(&[first.clone(), last.clone()].concat()).figures;
     let [rms, _] = rough.truth();
     assert!(told.rms.high_mm > rms && told.rms.median_mm > 0.7 * rms, "{told:?} {rms}");
+    // Also where every target is touched, and what is narrow is left of the touches themselves.
+    let all: Vec<usize> = (0..rough.targets.len()).collect();
+    let whole = rough.measured(&all);
+    let of_whole = Form::of(&whole, &given()).unwrap().figures.rms;
+    assert!(holds(of_whole, rms), "{of_whole:?} {rms}");
     let smooth = Part::smooth(3, 1e-9);
     let of_smooth = smooth.form(&[first, last].concat()).figures;
     assert!(of_smooth.rms.median_mm < 0.4 * told.rms.median_mm, "{of_smooth:?}");
@@ -155,6 +162,55 @@ fn it_ends_where_enough_is_known_and_goes_on_where_not() {
     assert_eq!(part.look(&first, &last, &between).why, Why::Undecided);
     let all: Vec<usize> = (0..part.targets.len()).collect();
     assert_eq!(part.look(&all[..400], &all[400..], &STRICT).why, Why::All);
+}
+
+#[test]
+fn what_is_beyond_for_certain_is_not_touched_for_a_correction_that_no_pass_is_left_for() {
+    let part = Part::smooth(5, 5e-3);
+    let (first, last) = apart(&part, 60);
+    let over = part.look(&first, &last, &Purpose { correction_mm: 1e-7, may_grind: false, ..STRICT });
+    assert!(over.why == Why::Beyond && over.next.is_empty(), "{:?}", over.why);
+}
+
+#[test]
+fn touching_is_not_given_up_where_one_look_would_accept_and_the_risk_of_many_does_not_allow_it() {
+    let part = Part::smooth(5, 5e-3);
+    let (first, last) = apart(&part, 150);
+    let rms = part.look(&first, &last, &LOOSE).form.figures.rms;
+    let between = |rms_mm| Purpose { rms_mm, correction_mm: 0.1, ..LOOSE };
+    // Within with 97.5 %, by which a run judges, and not with 99.5 %, by which it looks.
+    assert_eq!(part.look(&first, &last, &between(0.5 * (rms.high_mm + rms.most_mm))).why, Why::Undecided);
+    assert_eq!(part.look(&first, &last, &between(0.5 * (rms.median_mm + rms.high_mm))).why, Why::Known);
+    assert_eq!(part.look(&first, &last, &between(1.001 * rms.most_mm)).why, Why::Within);
+}
+
+#[test]
+fn another_pass_mends_more_than_touches_beyond_a_sixth_of_the_pattern() {
+    let part = Part::smooth(5, 5e-3);
+    let never = Purpose { correction_mm: 1e-7, ..STRICT };
+    let why = |count, purpose: &Purpose| {
+        let (first, last) = apart(&part, count);
+        part.look(&first, &last, purpose).why
+    };
+    assert_eq!(why(part.targets.len() / 6 - 2, &never), Why::Unknown);
+    assert_eq!(why(part.targets.len() / 6, &never), Why::Enough);
+    assert_eq!(why(part.targets.len() / 6, &Purpose { may_grind: false, ..never }), Why::Beyond);
+}
+
+#[test]
+fn batches_have_an_end() {
+    let part = Part::smooth(6, 5e-3);
+    let touched = spread(&part.targets, 60);
+    let looked = |last: u32| {
+        let mut tried = vec![None; part.targets.len()];
+        touched.iter().for_each(|&k| tried[k] = Some(0));
+        tried[touched[0]] = Some(last);
+        let so_far = SoFar { targets: &part.targets, tried: &tried, touched: &touched };
+        look(&part.measured(&touched), &given(), &so_far, &Purpose { correction_mm: 1e-7, ..STRICT }, 1).unwrap()
+    };
+    assert_ne!(looked(MOST_BATCHES - 2).why, Why::Late);
+    let late = looked(MOST_BATCHES - 1);
+    assert_eq!((late.why, late.next.len()), (Why::Late, part.targets.len() - 60));
 }
 
 #[test]
