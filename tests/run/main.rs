@@ -13,6 +13,7 @@ mod cycles;
 mod data;
 mod faults;
 mod files;
+mod first_touches;
 mod heartbeats;
 mod height_maps;
 #[path = "../common/keep.rs"]

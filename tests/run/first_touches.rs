@@ -1,0 +1,153 @@
+//! What is wrong with a measurement whose touches are chosen is found at the first ten, whatever brings them: a serial line, or files.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::killed::on_serial_lines;
+use crate::program::{Running, changed, records_with, regrind, run};
+use crate::study::touch;
+use regrind::recipe::Recipe;
+use regrind_sim::payload::{Feature, Plan, PointRecord, Status, Target};
+use regrind_sim::spec::WorldSpec;
+use regrind_sim::world::World;
+use serde::Deserialize as _;
+use serde_json::Value;
+
+/// What is wrong, by what of the recipe's world is exchanged for it, and the alarm that tells it.
+const WRONG: [(&str, [&str; 2], &str); 4] = [
+    (
+        "mirrored",
+        ["[simulation.part]", "[simulation.faults]\ncmm_mirrored = true\n\n[simulation.part]"],
+        "registration_failed",
+    ),
+    ("inches", ["[simulation.part]", "[simulation.faults]\ninches = true\n\n[simulation.part]"], "inches"),
+    (
+        "wrong radius",
+        ["[simulation.part]", "[simulation.cmm]\nprobe_radius_error_um = 50.0\n\n[simulation.part]"],
+        "probe_radius",
+    ),
+    ("wrong part", ["i = 3, j = 0, value_mm = 2.6", "i = 3, j = 0, value_mm = 3.4"], "registration_failed"),
+];
+
+/// The free-form recipe with touches that are chosen, of a part that is measured first, in such a world.
+fn recipe([from, to]: [&str; 2]) -> String {
+    changed(
+        "recipes/freeform-mirror.toml",
+        &[
+            ("[registration]", "[measuring]\nmode = \"adaptive\"\naccepted_risk = 0.025\n\n[registration]"),
+            ("[cycle]\n", "[cycle]\nbegin_with = \"measure\"\n"),
+            ("seed = 1\n", "seed = 1\nspeed = 3000.0\n"),
+            (from, to),
+        ],
+    )
+}
+
+/// Waits for the alarm of a run, ends it, and returns how many targets of the part it had touched by then.
+fn touched_until(running: &mut Running, folder: &Path, alarm: &str, what: &str) -> u64 {
+    let name = format!("\"{alarm}\"");
+    running.line("alarm", |line| line.contains("\"clears\""));
+    let said = running.said.last().unwrap().clone();
+    assert!(said.contains(&name), "{what}: {said}");
+    let home = folder.parent().unwrap().parent().unwrap();
+    assert_eq!(run(&["stop", &folder.display().to_string()], home).0, 0, "{what}");
+    running.end();
+    let collected = records_with(folder, "targets").into_iter().filter(|event| event["event"] == "collected");
+    collected.map(|event| event["targets"].as_u64().unwrap()).sum()
+}
+
+/// The one run below a home.
+fn only_run(home: &Path, running: &mut Running) -> PathBuf {
+    running.until("a run folder", |_| Some(fs::read_dir(home.join("runs")).ok()?.next()?.unwrap().path()))
+}
+
+#[test]
+fn over_a_serial_line() {
+    for (what, world, alarm) in WRONG {
+        let home = tempfile::tempdir().unwrap();
+        let _machines = on_serial_lines(home.path(), recipe(world));
+        let mut running =
+            Running::new(regrind(&["run", "part.toml", "--cell", "cell.toml", "--loaded", "--json"], home.path()));
+        let folder = only_run(home.path(), &mut running);
+        let touched = touched_until(&mut running, &folder, alarm, what);
+        assert!((1..=10).contains(&touched), "{what}: {touched} touches");
+    }
+}
+
+#[test]
+fn by_files() {
+    for (what, world, alarm) in WRONG {
+        let home = tempfile::tempdir().unwrap();
+        let text = recipe(world);
+        fs::write(home.path().join("part.toml"), &text).unwrap();
+        file_cell(home.path());
+        let table = Recipe::read(&home.path().join("part.toml")).unwrap().simulation.unwrap();
+        let world = World::new(WorldSpec::deserialize(toml::Value::Table(table)).unwrap()).unwrap();
+        let mut running =
+            Running::new(regrind(&["run", "part.toml", "--cell", "cell.toml", "--loaded", "--json"], home.path()));
+        let folder = only_run(home.path(), &mut running);
+        measure_once(&mut running, home.path(), &world);
+        let touched = touched_until(&mut running, &folder, alarm, what);
+        assert!((1..=10).contains(&touched), "{what}: {touched} touches");
+    }
+}
+
+/// A cell by files beside the recipe, its machines where those of the simulation stand.
+fn file_cell(home: &Path) {
+    for folder in ["cmm/in", "cmm/out", "grinder/in", "grinder/out"] {
+        fs::create_dir_all(home.join("exchange").join(folder)).unwrap();
+    }
+    let text = changed(
+        "config/file-exchange.toml",
+        &[
+            ("../exchange", "exchange"),
+            ("stable_for_s = 2.0", "stable_for_s = 0.05"),
+            ("[0.0, 0.0, 3600.0]", "[0.0, 0.0, 0.0]"),
+            ("[-26.56505117707799, 0.0, 0.0]", "[0.0, 0.0, 0.0]"),
+            ("largest_feed_mm_min = 6000.0", "largest_feed_mm_min = 20000.0"),
+            (
+                "[grinder.wire]",
+                "[cmm.reference_sphere]\ncentre_mm = [0.0, 120.0, 20.0]\nradius_mm = 12.5\npoints = 25\n\n[grinder.wire]",
+            ),
+        ],
+    );
+    fs::write(home.join("cell.toml"), text).unwrap();
+}
+
+/// Does what the person at the measuring machine does: takes the plan, touches, and hands in what was found.
+fn measure_once(running: &mut Running, home: &Path, world: &World) {
+    let outbox = home.join("exchange/cmm/out");
+    let handed_over = running.until("a plan in the outbox", |_| {
+        let entries = fs::read_dir(&outbox).unwrap().map(|entry| entry.unwrap().path());
+        entries.into_iter().find(|folder| folder.join("handover.json").is_file())
+    });
+    let told: Value = serde_json::from_slice(&fs::read(handed_over.join("plan.json")).unwrap()).unwrap();
+    let rows = fs::read_to_string(handed_over.join("plan.csv")).unwrap();
+    let number = |key: &str| told[key].as_f64().unwrap_or_else(|| panic!("{key} in {told}"));
+    let plan = Plan {
+        probe_radius_mm: number("probe_radius_mm"),
+        approach_mm: number("approach_mm"),
+        search_mm: number("search_mm"),
+        speed_mm_s: number("speed_mm_s"),
+        safe_height_mm: number("safe_height_mm"),
+        careful: (0, 0.0),
+        targets: rows.lines().filter(|row| !row.starts_with('#')).skip(1).map(target).collect(),
+    };
+    let row = |found: PointRecord| {
+        let [x, y, z] = found.position_mm;
+        format!("{},{x},{y},{z}\n", found.index)
+    };
+    let found = touch(world, 1, &plan).into_iter().filter(|found| found.status == Status::Touched);
+    let text =
+        format!("# plan: {}\nindex,x,y,z\n{}", told["plan"].as_str().unwrap(), found.map(row).collect::<String>());
+    // Named when it is whole.
+    fs::write(home.join("result.csv"), text).unwrap();
+    fs::rename(home.join("result.csv"), home.join("exchange/cmm/in/result.csv")).unwrap();
+}
+
+/// A row of a plan: index, point, normal, what it is on.
+fn target(row: &str) -> Target {
+    let cells: Vec<&str> = row.split(',').collect();
+    let three = |from: usize| std::array::from_fn(|k| cells[from + k].parse().unwrap());
+    let feature = if cells[7] == "2" { Feature::ReferenceSphere } else { Feature::Part };
+    Target { index: cells[0].parse().unwrap(), feature, point_mm: three(1), normal: three(4) }
+}
