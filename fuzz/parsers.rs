@@ -248,7 +248,7 @@ pub fn program_map(bytes: &[u8]) -> bool {
     fs::write(&file, bytes).expect("a folder for temporary files");
     // The report draws an error map without its grid.
     if let Ok(nodes) = read_error_map(&file) {
-        assert!(nodes.iter().flatten().all(|v| v.is_finite()));
+        assert!(nodes.iter().flat_map(|node| [node.error(), node.sigma()]).flatten().all(f64::is_finite));
     }
     let Ok(map) = read_program_map(&file) else { return false };
     assert!(map.grid.is_sound() && map.grid.len() == map.values_mm.len());

@@ -1,5 +1,6 @@
 //! A map in coloured blocks, for a terminal: two pixels a character, the upper half and the lower.
 
+use regrind::formats::MapNode;
 use regrind::report::ColourMap;
 
 /// A pixel; none where nothing was measured.
@@ -9,15 +10,27 @@ type Pixel = Option<[u8; 3]>;
 pub(super) struct Blocks {
     /// The upper and the lower half of each character, row by row from above.
     pub(super) rows: Vec<Vec<[Pixel; 2]>>,
-    /// What the darkest red stands for, in micrometres.
+    /// What the darkest red stands for, or the brightest where nothing is below zero, in micrometres.
     pub(super) limit_um: f64,
 }
 
 impl Blocks {
-    /// Paints a map in at most so many characters along and so many above each other.
+    /// Paints an error map in at most so many characters along and so many above each other.
     ///
     /// Shape: nodes of x, y and error in millimetres. A half of a character is about as wide as it is high.
-    pub(super) fn of(nodes: &[[f64; 3]], most: [usize; 2]) -> Option<Self> {
+    pub(super) fn of(nodes: &[MapNode], most: [usize; 2]) -> Option<Self> {
+        let nodes: Vec<[f64; 3]> = nodes.iter().map(MapNode::error).collect();
+        Self::painted(&nodes, most, |share| ColourMap::Diverging.at(0.5 + 0.5 * share))
+    }
+
+    /// Paints how well the error is known: from dark where it is best to bright.
+    pub(super) fn of_sigma(nodes: &[MapNode], most: [usize; 2]) -> Option<Self> {
+        let nodes: Vec<[f64; 3]> = nodes.iter().map(MapNode::sigma).collect();
+        Self::painted(&nodes, most, |share| ColourMap::Sequential.at(share))
+    }
+
+    /// The colours are those of shares of the largest size.
+    fn painted(nodes: &[[f64; 3]], most: [usize; 2], colour: impl Fn(f64) -> [u8; 3]) -> Option<Self> {
         let range = |k: usize| nodes.iter().fold([f64::MAX, f64::MIN], |[a, b], node| [a.min(node[k]), b.max(node[k])]);
         let ([x0, x1], [y0, y1]) = (range(0), range(1));
         let (wide, deep) = (x1 - x0, y1 - y0);
@@ -27,17 +40,16 @@ impl Blocks {
         let pixel_mm = (wide / most[0] as f64).max(deep / (2 * most[1]) as f64);
         let [columns, lines] = [wide, deep].map(|size| ((size / pixel_mm).round() as usize).max(1));
         let mut sums = vec![(0.0, 0_u32); columns * lines];
-        for [x, y, error_mm] in nodes {
+        for [x, y, value_mm] in nodes {
             let column = (((x - x0) / wide * columns as f64) as usize).min(columns - 1);
             let line = (((y1 - y) / deep * lines as f64) as usize).min(lines - 1);
             let (sum, count) = &mut sums[line * columns + column];
-            (*sum, *count) = (*sum + error_mm, *count + 1);
+            (*sum, *count) = (*sum + value_mm, *count + 1);
         }
         let means: Vec<Option<f64>> =
             sums.iter().map(|(sum, count)| (*count > 0).then(|| sum / f64::from(*count))).collect();
         let limit_mm = means.iter().flatten().fold(0.0_f64, |limit, mean| limit.max(mean.abs()));
-        let colour =
-            |mean: f64| ColourMap::Diverging.at(if limit_mm > 0.0 { 0.5 + 0.5 * mean / limit_mm } else { 0.5 });
+        let colour = |mean: f64| colour(if limit_mm > 0.0 { mean / limit_mm } else { 0.0 });
         let at = |line: usize, column: usize| means.get(line * columns + column).copied().flatten().map(colour);
         let row = |above: usize| (0..columns).map(|column| [at(above, column), at(above + 1, column)]).collect();
         Some(Self { rows: (0..lines).step_by(2).map(row).collect(), limit_um: 1e3 * limit_mm })
@@ -53,6 +65,14 @@ impl Blocks {
             (None, None) => " ".to_owned(),
         };
         self.rows.iter().map(|row| row.iter().map(block).chain(["\n".to_owned()]).collect::<String>()).collect()
+    }
+
+    /// Puts another one of the same size beside it, so far away.
+    pub(super) fn beside(mut self, other: Self, apart: usize) -> Self {
+        for (row, more) in self.rows.iter_mut().zip(other.rows) {
+            row.extend(std::iter::repeat_n([None; 2], apart).chain(more));
+        }
+        self
     }
 }
 
@@ -73,9 +93,8 @@ mod tests {
     #[test]
     fn a_map_is_painted_as_it_lies_and_no_larger_than_asked() {
         // Proud above on the right, deep below on the left.
-        let nodes: Vec<[f64; 3]> = (0..40)
-            .flat_map(|i| (0..20).map(move |j| [f64::from(i), f64::from(j), 1e-4 * f64::from(i + j) - 2.9e-3]))
-            .collect();
+        let node = |i, j| node([f64::from(i), f64::from(j)], 1e-4 * f64::from(i + j) - 2.9e-3);
+        let nodes: Vec<MapNode> = (0..40).flat_map(|i| (0..20).map(move |j| node(i, j))).collect();
         let blocks = Blocks::of(&nodes, [20, 30]).unwrap();
         assert!(blocks.rows.iter().all(|row| row.len() == 20) && blocks.rows.len() == 5, "{}", blocks.rows.len());
         let [r, _, b] = blocks.rows[0][19][0].unwrap();
@@ -83,14 +102,27 @@ mod tests {
         let [r, _, b] = blocks.rows[4][0][1].unwrap();
         assert!(b > r, "deep is blue");
         assert!(Blocks::of(&nodes, [40, 3]).unwrap().rows.len() <= 3);
+        let sigma = Blocks::of_sigma(&nodes, [20, 30]).unwrap();
+        assert_eq!((sigma.rows.len(), sigma.limit_um), (5, 0.1));
+        let both = blocks.beside(sigma, 2);
+        assert!(both.rows.iter().all(|row| row.len() == 42 && row[20..22] == [[None; 2]; 2]));
+        assert_eq!(both.rows[0][30][0].unwrap(), ColourMap::Sequential.at(1.0));
+    }
+
+    /// A node that is known to a tenth of a micrometre.
+    fn node(at_mm: [f64; 2], error_mm: f64) -> MapNode {
+        MapNode { at_mm, error_mm, sigma_mm: 1e-4 }
     }
 
     #[test]
     fn what_has_no_extent_is_not_painted() {
-        for nodes in [&[][..], &[[1.0, 1.0, 0.0]], &[[1.0, 1.0, 0.0], [2.0, 1.0, 0.0]]] {
-            assert!(Blocks::of(nodes, [10, 10]).is_none());
+        let painted = |places: &[[f64; 2]], most| {
+            Blocks::of(&places.iter().map(|at_mm| node(*at_mm, 0.0)).collect::<Vec<_>>(), most)
+        };
+        for places in [&[][..], &[[1.0, 1.0]], &[[1.0, 1.0], [2.0, 1.0]]] {
+            assert!(painted(places, [10, 10]).is_none());
         }
-        assert!(Blocks::of(&[[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]], [0, 4]).is_none());
+        assert!(painted(&[[0.0, 0.0], [1.0, 1.0]], [0, 4]).is_none());
     }
 
     #[test]

@@ -205,9 +205,27 @@ impl Show {
         let (Some(bar), true) = (&self.bar, console::colors_enabled()) else { return Ok(()) };
         let nodes = newest_map(Path::new(&self.folder), cycle).and_then(|path| read_error_map(&path).ok());
         let columns = console::Term::stdout().size_checked().map_or(60, |(_, columns)| usize::from(columns));
-        let Some(blocks) = nodes.and_then(|nodes| Blocks::of(&nodes, [columns.min(72) - 4, 16])) else { return Ok(()) };
-        let falls = sparkline(self.rms_mm.iter().copied());
-        let below = format!("error, filtered: +- {} um   RMS {falls}\n", three_digits(blocks.limit_um));
+        let Some(nodes) = nodes else { return Ok(()) };
+        let falls = match &self.rms_mm[..] {
+            [] => String::new(),
+            rms_mm => format!("RMS {}\n", sparkline(rms_mm.iter().copied())),
+        };
+        let error = |blocks: &Blocks| format!("error, filtered: +- {} um", three_digits(blocks.limit_um));
+        let (blocks, below) = if self.is_chosen {
+            // Where touches are chosen, what is known and how well stand side by side.
+            const APART: usize = 2;
+            let room = [(columns.min(110) - 4 - APART) / 2, 16];
+            let both = Blocks::of(&nodes, room).zip(Blocks::of_sigma(&nodes, room));
+            let Some((blocks, sigma)) = both else { return Ok(()) };
+            let wide = blocks.rows.first().map_or(0, Vec::len) + APART;
+            let known = format!("known to: {} um at worst", three_digits(sigma.limit_um));
+            let below = format!("{:wide$}{known}\n{falls}", error(&blocks));
+            (blocks.beside(sigma, APART), below)
+        } else {
+            let Some(blocks) = Blocks::of(&nodes, [columns.min(72) - 4, 16]) else { return Ok(()) };
+            let below = format!("{}   {falls}", error(&blocks));
+            (blocks, below)
+        };
         bar.suspend(|| super::print(&format!("{}{below}", blocks.to_ansi())))
     }
 

@@ -13,7 +13,7 @@ use ratatui::text::{Line, Span, Text};
 use ratatui::widgets::{Block, Gauge, Paragraph, Wrap};
 use regrind::cell::StateName;
 use regrind::drive::{CycleRow, JobProgress, Request, Snapshot, ask};
-use regrind::formats::read_error_map;
+use regrind::formats::{MapNode, read_error_map};
 use regrind::report::run_summary;
 use tokio::sync::mpsc;
 
@@ -30,7 +30,8 @@ const BETWEEN_LOOKS: Duration = Duration::from_secs(1);
 /// Watch a running cell: its state, progress, figures and error map, with a key to hold it
 #[derive(Args, Debug)]
 #[command(after_help = "\
-RUN is the folder of a run; without it, the one under runs/ that goes on now. Keys: h holds the cell, q leaves it as it is.
+RUN is the folder of a run; without it, the one under runs/ that goes on now. Keys: h holds the cell, u shows how well the map is known, q leaves
+the cell as it is.
 Where the output is no terminal, each new state is a line.
 
 Example:
@@ -53,7 +54,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             return in_lines(first, &mut watch, &folder).await;
         }
         let mut view =
-            View { seen: first, folder: folder.clone(), map: None, mapped: 0, looked: None, said: String::new() };
+            View { seen: first, folder: folder.clone(), map: None, as_sigma: false, looked: None, said: String::new() };
         let mut terminal = ratatui::init();
         let ended = view.follow(&mut terminal, &mut watch).await;
         ratatui::restore();
@@ -93,11 +94,12 @@ fn ended(folder: &Path, told: io::Result<Option<Snapshot>>) -> Result<String, Fa
 struct View {
     seen: Snapshot,
     folder: PathBuf,
-    /// Nodes of the last error map.
-    map: Option<Vec<[f64; 3]>>,
-    /// How many cycles have theirs on record, and when that was looked up.
-    mapped: usize,
-    looked: Option<Instant>,
+    /// Nodes of the last error map, and its name within the run folder.
+    map: Option<(String, Vec<MapNode>)>,
+    /// Whether it is shown how well it is known, in place of the error.
+    as_sigma: bool,
+    /// When the record was looked at for a newer one, and what the cell's state had for a number then.
+    looked: Option<(Instant, u64)>,
     /// What came of the last key.
     said: String,
 }
@@ -123,6 +125,7 @@ impl View {
                 key = keys.recv() => match key {
                     Some(KeyCode::Char('q') | KeyCode::Esc) | None => return Ok(Outcome::Accepted),
                     Some(KeyCode::Char('h')) => self.hold().await,
+                    Some(KeyCode::Char('u')) => self.as_sigma = !self.as_sigma,
                     Some(_) => {}
                 },
             }
@@ -140,17 +143,20 @@ impl View {
         };
     }
 
-    /// Reads the map of a cycle that was measured, once it is on record.
+    /// Reads the newest map on record, once there may be another one.
     fn read_map(&mut self) {
-        let just_looked = self.looked.is_some_and(|at| at.elapsed() < BETWEEN_LOOKS);
-        if self.mapped >= self.seen.cycles.len() || just_looked {
+        let number = self.seen.number;
+        if self.looked.is_some_and(|(at, of)| of == number || at.elapsed() < BETWEEN_LOOKS) {
             return;
         }
-        self.looked = Some(Instant::now());
+        self.looked = Some((Instant::now(), number));
         let cycles = run_summary(&self.folder).map(|summary| summary.cycles).unwrap_or_default();
-        let names: Vec<String> = cycles.into_iter().filter_map(|of| of.map).collect();
-        if let Some(map) = names.last().and_then(|name| read_error_map(&self.folder.join(name)).ok()) {
-            (self.map, self.mapped) = (Some(map), names.len());
+        let Some(name) = cycles.into_iter().rev().find_map(|of| of.map) else { return };
+        if self.map.as_ref().is_some_and(|(known, _)| *known == name) {
+            return;
+        }
+        if let Ok(map) = read_error_map(&self.folder.join(&name)) {
+            self.map = Some((name, map));
         }
     }
 
@@ -176,7 +182,7 @@ impl View {
         let (figures, map) = if wide { (right, left) } else { (left, right) };
         frame.render_widget(self.figures(), figures);
         self.map(frame, map);
-        let keys = if self.said.is_empty() { "h hold   q leave" } else { &self.said };
+        let keys = if self.said.is_empty() { "h hold   u uncertainty   q leave" } else { &self.said };
         frame.render_widget(Paragraph::new(keys).dim(), foot);
     }
 
@@ -232,15 +238,19 @@ impl View {
     }
 
     fn map(&self, frame: &mut Frame, area: Rect) {
-        let Some(nodes) = &self.map else { return };
+        let Some((_, nodes)) = &self.map else { return };
         let room = [area.width.saturating_sub(2), area.height.saturating_sub(2)].map(usize::from);
-        let Some(blocks) = Blocks::of(nodes, room) else { return };
+        let painted = if self.as_sigma { Blocks::of_sigma } else { Blocks::of };
+        let Some(blocks) = painted(nodes, room) else { return };
         let colour = |pixel: Option<[u8; 3]>| pixel.map_or(Color::Reset, |[r, g, b]| Color::Rgb(r, g, b));
         let cell = |[above, below]: &[Option<[u8; 3]>; 2]| {
             Span::styled("\u{2580}", Style::new().fg(colour(*above)).bg(colour(*below)))
         };
         let lines: Vec<Line> = blocks.rows.iter().map(|row| row.iter().map(cell).collect()).collect();
-        let title = format!("error, filtered: +- {:.2} um", blocks.limit_um);
+        let title = match self.as_sigma {
+            true => format!("known to: {:.3} um at worst", blocks.limit_um),
+            false => format!("error, filtered: +- {:.2} um", blocks.limit_um),
+        };
         frame.render_widget(Paragraph::new(lines).block(Block::bordered().title(title)), area);
     }
 }

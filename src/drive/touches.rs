@@ -73,7 +73,7 @@ fn in_words(why: Why) -> &'static str {
 
 /// Lays the form on the grid of the error map.
 pub(super) fn map(task: &Task, form: &Form) -> Option<ErrorMap> {
-    let of = |p: &model::FormPoint| Sample { at_mm: p.at_mm, deviation_mm: p.form.mean_mm };
-    let told: Vec<Sample> = form.points.iter().map(of).collect();
-    told_map(&told, &task.map, form.hyper.scatter_mm, form.known_mm).ok()
+    let of = |p: &model::FormPoint| (Sample { at_mm: p.at_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm);
+    let told: Vec<_> = form.points.iter().map(of).collect();
+    told_map(&told, &task.map, form.hyper.scatter_mm).ok()
 }

@@ -53,13 +53,35 @@ pub fn write_error_map(
     write_rows(path, &header, &rows, |(values, valid)| (*values, Some(*valid)))
 }
 
-/// Reads back what [`write_error_map`] wrote: x, y and error of every node where something was measured.
+/// A node of an error map where something was measured, in the model frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MapNode {
+    /// Where.
+    pub at_mm: [f64; 2],
+    /// The error; positive stands proud.
+    pub error_mm: f64,
+    /// Its standard uncertainty, 0 where that is not known.
+    pub sigma_mm: f64,
+}
+
+impl MapNode {
+    /// Returns x, y and error.
+    pub fn error(&self) -> [f64; 3] {
+        [self.at_mm[0], self.at_mm[1], self.error_mm]
+    }
+
+    /// Returns x, y and how well the error is known.
+    pub fn sigma(&self) -> [f64; 3] {
+        [self.at_mm[0], self.at_mm[1], self.sigma_mm]
+    }
+}
+
+/// Reads back what [`write_error_map`] wrote: every node where something was measured.
 ///
-/// Frame: model. Units: millimetres.
 ///
 /// # Errors
 /// A file that cannot be read, other columns, rows that are no finite numbers.
-pub fn read_error_map(path: &Path) -> Result<Vec<[f64; 3]>, FormatError> {
+pub fn read_error_map(path: &Path) -> Result<Vec<MapNode>, FormatError> {
     let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
     let text = std::fs::read_to_string(path).map_err(unreadable)?;
     let mut lines = text.lines().zip(1..).filter(|(line, _)| !line.starts_with('#') && !line.trim().is_empty());
@@ -83,11 +105,11 @@ pub fn read_error_map(path: &Path) -> Result<Vec<[f64; 3]>, FormatError> {
 }
 
 /// Reads a row of an error map: nothing of a node where nothing was measured, and none of what is no row.
-fn node(row: &str) -> Option<Option<[f64; 3]>> {
+fn node(row: &str) -> Option<Option<MapNode>> {
     let cells: Vec<&str> = row.split(',').map(str::trim).collect();
     let [x, y, error, sigma, valid] = cells[..] else { return None };
     let number = |text: &str| text.parse::<f64>().ok().filter(|value| value.is_finite());
-    let (node, _) = ([number(x)?, number(y)?, number(error)?], number(sigma)?);
+    let node = MapNode { at_mm: [number(x)?, number(y)?], error_mm: number(error)?, sigma_mm: number(sigma)? };
     match valid {
         "1" => Some(Some(node)),
         "0" => Some(None),
@@ -148,8 +170,10 @@ mod tests {
         let whole = format!(
             "# SIMULATION\n# cycle: 2\n{ERROR_MAP_COLUMNS}\n-1.5,2,0.001,0.0002,1\n0,2,7,0,0\n1.5,2,-3e-4,0,1\n"
         );
-        assert_eq!(read(&whole).unwrap(), [[-1.5, 2.0, 0.001], [1.5, 2.0, -3e-4]]);
-        assert_eq!(read(&format!("{ERROR_MAP_COLUMNS}\n")).unwrap(), [[0.0; 3]; 0]);
+        let nodes = read(&whole).unwrap();
+        assert_eq!(nodes.iter().map(MapNode::error).collect::<Vec<_>>(), [[-1.5, 2.0, 0.001], [1.5, 2.0, -3e-4]]);
+        assert_eq!(nodes.iter().map(MapNode::sigma).collect::<Vec<_>>(), [[-1.5, 2.0, 0.0002], [1.5, 2.0, 0.0]]);
+        assert_eq!(read(&format!("{ERROR_MAP_COLUMNS}\n")).unwrap(), []);
         for (from, to, place) in [
             ("error_mm", "height_mm", "line 3"),
             ("0.001,", "NaN,", "line 4"),

@@ -1,7 +1,8 @@
 //! Maps and points in the bytes that the canvas draws from: little endian, lengths in millimetres, deviations in micrometres.
 //!
 //! ```text
-//!  map      u32 columns, u32 rows, f64 first x, first y, f64 spacing x, y, then f32 a node, x fastest; NaN where nothing was measured
+//!  map      u32 columns, u32 rows, f64 first x, first y, f64 spacing x, y, then f32 a node, x fastest; NaN where nothing was measured;
+//!           the errors of all nodes first, then the standard uncertainties of all
 //!  points   f32 x, y, deviation a point, in the order measured; the deviation is NaN where the point took no part in the fit
 //!  planned  f32 x, y a point, in the order in which it is to be touched
 //! ```
@@ -12,7 +13,7 @@ use axum::extract::{Path, State};
 use axum::http::StatusCode;
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::{IntoResponse, Response};
-use regrind_formats::{DeviationRow, FormatError, read_deviations, read_error_map};
+use regrind_formats::{DeviationRow, FormatError, MapNode, read_deviations, read_error_map};
 use regrind_report::CycleSummary;
 use tokio::task::spawn_blocking;
 
@@ -67,17 +68,19 @@ async fn respond(make: impl FnOnce() -> Option<Result<Option<Vec<u8>>, FormatErr
 }
 
 /// Lays nodes on the grid that they came from; none where they lie on no grid.
-fn grid_bytes(nodes: &[[f64; 3]]) -> Option<Vec<u8>> {
-    let [x, y] = [0, 1].map(|k| axis(nodes.iter().map(|node| node[k]).collect()));
+fn grid_bytes(nodes: &[MapNode]) -> Option<Vec<u8>> {
+    let [x, y] = [0, 1].map(|k| axis(nodes.iter().map(|node| node.at_mm[k]).collect()));
     let ([first_x, step_x, columns], [first_y, step_y, rows]) = (x?, y?);
     let (columns, rows) = (columns as usize, rows as usize);
     if columns.checked_mul(rows)? > MOST_NODES {
         return None;
     }
-    let mut values = vec![f32::NAN; columns * rows];
-    for [x, y, error_mm] in nodes {
-        let (column, row) = (place(*x, first_x, step_x)?, place(*y, first_y, step_y)?);
-        *values.get_mut(row * columns + column)? = (1e3 * error_mm) as f32;
+    let mut values = vec![f32::NAN; 2 * columns * rows];
+    let (errors, sigmas) = values.split_at_mut(columns * rows);
+    for MapNode { at_mm: [x, y], error_mm, sigma_mm } in nodes {
+        let at = place(*y, first_y, step_y)? * columns + place(*x, first_x, step_x)?;
+        *errors.get_mut(at)? = (1e3 * error_mm) as f32;
+        *sigmas.get_mut(at)? = (1e3 * sigma_mm) as f32;
     }
     let mut bytes = Vec::with_capacity(40 + 4 * values.len());
     bytes.extend([columns as u32, rows as u32].iter().flat_map(|count| count.to_le_bytes()));
@@ -120,22 +123,28 @@ mod tests {
     fn nodes_come_on_the_grid_that_they_were_written_from() {
         // Three columns and two rows, one node of which was not measured; in any order.
         let nodes = [[2.0, 5.5, 4e-3], [1.0, 5.0, 1e-3], [1.5, 5.0, 2e-3], [1.0, 5.5, 3e-3], [2.0, 5.0, -1e-3]];
-        let bytes = grid_bytes(&nodes).unwrap();
+        let bytes = grid_bytes(&nodes.map(node)).unwrap();
         let count = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());
         let length = |at: usize| f64::from_le_bytes(bytes[at..at + 8].try_into().unwrap());
         assert_eq!((count(0), count(4)), (3, 2));
         assert_eq!([8, 16, 24, 32].map(length), [1.0, 5.0, 0.5, 0.5]);
         let values: Vec<f32> = bytes[40..].chunks(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
         assert_eq!(values[..4], [1.0, 2.0, -1.0, 3.0]);
-        assert!(values[4].is_nan());
-        assert_eq!(values[5], 4.0);
+        assert!(values[4].is_nan() && values[10].is_nan());
+        assert_eq!((values[5], values.len()), (4.0, 12));
+        assert_eq!(values[6..10], [0.1, 0.2, 0.1, 0.3], "how well each is known");
+    }
+
+    fn node([x, y, error_mm]: [f64; 3]) -> MapNode {
+        MapNode { at_mm: [x, y], error_mm, sigma_mm: 0.1 * error_mm.abs() }
     }
 
     #[test]
     fn what_lies_on_no_grid_is_not_drawn() {
         assert!(grid_bytes(&[]).is_none());
-        assert!(grid_bytes(&[[1.0, 1.0, 0.0]]).is_none(), "one node has no spacing");
-        assert!(grid_bytes(&[[0.0, 0.0, 0.0], [2.0, 2.0, 0.0], [1e6, 1e6, 0.0]]).is_none(), "too many nodes");
-        assert!(grid_bytes(&[[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2.4, 2.0, 0.0]]).is_none(), "between two");
+        let of = |places: &[[f64; 2]]| grid_bytes(&places.iter().map(|[x, y]| node([*x, *y, 0.0])).collect::<Vec<_>>());
+        assert!(of(&[[1.0, 1.0]]).is_none(), "one node has no spacing");
+        assert!(of(&[[0.0, 0.0], [2.0, 2.0], [1e6, 1e6]]).is_none(), "too many nodes");
+        assert!(of(&[[0.0, 0.0], [1.0, 1.0], [2.4, 2.0]]).is_none(), "between two");
     }
 }

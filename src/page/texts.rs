@@ -120,6 +120,7 @@ texts! {
     Map { "Error map", "Fehlerkarte", "误差图" }
     Relief { "Relief", "Relief", "立体图" }
     Difference { "Change", "Änderung", "变化" }
+    Sigma { "Uncertainty", "Unsicherheit", "不确定度" }
     Points { "Points", "Punkte", "测点" }
     Histogram { "Distribution", "Verteilung", "分布" }
     NoRelief {
@@ -132,6 +133,7 @@ texts! {
         "Fehler des Teils längs der Normalen, in Mikrometern. Pfeiltasten bewegen die Marke oder drehen das Relief.",
         "零件沿法向的误差，单位微米。方向键移动标记或旋转立体图。"
     }
+    KnownTo { "Standard uncertainty of the map, RMS:", "Standardunsicherheit der Karte, RMS:", "误差图的标准不确定度，RMS：" }
     Filtered { "Of the map, which is filtered:", "Der gefilterten Karte:", "滤波后的图：" }
     Planned { "planned", "geplant", "计划" }
     Touched { "touched", "angetastet", "已测" }

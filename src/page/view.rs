@@ -370,7 +370,7 @@ fn cell(seen: &Seen, id: &str, session: &Session, has_control: bool, language: L
         maud::PreEscaped(html.to_owned())
     };
     let state = state(seen, session, has_control);
-    let data = json!({ "run": id, "state": state, "colours": colours(), "texts": script_texts(language) });
+    let data = json!({ "run": id, "state": state, "colours": colours(ColourMap::Diverging), "unsigned": colours(ColourMap::Sequential), "texts": script_texts(language) });
     html! {
         a .skip href="#orders" { (say(Text::SkipToOrders)) }
         div #old role="alert" hidden {}
@@ -413,6 +413,7 @@ fn map(language: Language) -> Markup {
         div .tools role="group" {
             button type="button" data-view="map" aria-pressed="true" { (say(Text::Map)) }
             button type="button" data-view="difference" aria-pressed="false" { (say(Text::Difference)) }
+            button type="button" data-view="sigma" aria-pressed="false" { (say(Text::Sigma)) }
             button type="button" data-view="relief" aria-pressed="false" { (say(Text::Relief)) }
             button type="button" data-points aria-pressed="false" { (say(Text::Points)) }
             label { (say(Text::Cycle)) " " select #cycle {} }
@@ -430,13 +431,13 @@ fn script_texts(language: Language) -> Value {
     json!({
         "noData": say(Text::NotConnected), "pageGone": say(Text::PageGone), "programGone": say(Text::ProgramGone),
         "noRelief": say(Text::NoRelief), "notMeasured": say(Text::NotMeasured), "planned": say(Text::Planned),
-        "touched": say(Text::Touched), "filtered": say(Text::Filtered), "order": say(Text::NoButtonStops),
+        "touched": say(Text::Touched), "filtered": say(Text::Filtered), "known": say(Text::KnownTo), "order": say(Text::NoButtonStops),
     })
 }
 
 /// The colours of the maps, from below to above, as they are in every picture: three bytes each in hexadecimal digits.
-fn colours() -> String {
-    let colour = |k: u32| ColourMap::Diverging.at(f64::from(k) / 254.0);
+fn colours(of: ColourMap) -> String {
+    let colour = |k: u32| of.at(f64::from(k) / 254.0);
     (0..255).flat_map(colour).map(|byte| format!("{byte:02x}")).collect()
 }
 
@@ -573,7 +574,7 @@ pub(crate) async fn compare(
             json!({ "run": id, "cycle": summary.cycles.iter().rev().find(|of| of.map.is_some()).map(|of| of.cycle) })
         }).collect();
         script #data type="application/json" {
-            (maud::PreEscaped(harmless(&json!({ "compared": maps, "colours": colours(), "texts": script_texts(language) }))))
+            (maud::PreEscaped(harmless(&json!({ "compared": maps, "colours": colours(ColourMap::Diverging), "texts": script_texts(language) }))))
         }
     };
     document(say(Text::Compare), &Frame { language, person: session.person.as_ref(), is_cell: true }, main)

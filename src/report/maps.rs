@@ -10,7 +10,7 @@ use super::heat_map::HeatMap;
 use super::run::when;
 use super::story::Story;
 use super::{ReportError, range};
-use regrind_formats::{escaped, read_error_map};
+use regrind_formats::{MapNode, escaped, read_error_map};
 
 /// Largest map of a pair, and of one that stands alone, in pixels of the page.
 const OF_A_PAIR: [f64; 2] = [262.0, 262.0];
@@ -72,7 +72,7 @@ pub(super) fn maps(story: &Story, folder: &Path, begin: &Value) -> Result<String
     let mark = if begin["simulation"] == true { " (SIMULATION)" } else { "" };
     let read = |(cycle, (name, utc)): (u32, &(String, String))| -> Result<Drawn, ReportError> {
         let nodes = read_error_map(&folder.join(name))?;
-        let samples_um = nodes.into_iter().map(|[x, y, error_mm]| [x, y, 1e3 * error_mm]).collect();
+        let samples_um = nodes.iter().map(MapNode::error).map(|[x, y, error_mm]| [x, y, 1e3 * error_mm]).collect();
         let title = format!("Cycle {cycle}, {}{mark}", when(utc));
         Ok(Drawn { cycle, title, part: format!("{part}, {serial}"), samples_um })
     };

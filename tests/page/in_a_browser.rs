@@ -81,6 +81,40 @@ fn a_run_is_watched_to_its_acceptance_and_its_map_and_relief_are_drawn() {
 
 #[test]
 #[ignore = "needs a browser: Debian package chromium"]
+fn where_touches_are_chosen_the_map_is_shown_as_it_grows_and_how_well_it_is_known() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = small_recipe(home.path(), 200.0);
+    let text = std::fs::read_to_string(&recipe).unwrap();
+    let measuring = "[measuring]\nmode = \"adaptive\"\naccepted_risk = 0.025\n\n[registration]";
+    std::fs::write(&recipe, text.replacen("[registration]", measuring, 1)).unwrap();
+    let mut shown = Shown::of(home.path(), &recipe);
+    let held = crate::program::run(&["hold", &shown.folder.display().to_string()], home.path());
+    assert_eq!(held.0, 0, "{held:?}");
+    let mut browser = Browser::start(home.path());
+    let tab = browser.open(&shown.url, SCREEN);
+    tab.click(&mut browser, "[data-order=resume]");
+    tab.until(&mut browser, "document.querySelectorAll('#cycle option').length > 0");
+    tab.click(&mut browser, "[data-order=hold]");
+    tab.until(&mut browser, &banner("HELD"));
+    tab.click(&mut browser, "[data-view=sigma]");
+    tab.until(&mut browser, "document.querySelector('#reading').innerText.includes('Standard uncertainty')");
+    tab.until(&mut browser, &format!("{} > 50", colours("#map")));
+    let known = |browser: &mut Browser| {
+        let told = tab.read(browser, "document.querySelector('#reading').innerText.match(/[0-9.]+/)[0]");
+        told.as_str().unwrap().parse::<f64>().unwrap()
+    };
+    let before = known(&mut browser);
+    assert!(before > 0.0 && before < 10.0, "{before}");
+    let picture = tab.read(&mut browser, "document.querySelector('#map').toDataURL()");
+    tab.click(&mut browser, "[data-order=resume]");
+    tab.until(&mut browser, &format!("document.querySelector('#map').toDataURL() !== {picture}"));
+    tab.until(&mut browser, &banner("ACCEPTED"));
+    assert_eq!(tab.problems(&browser), Vec::<String>::new());
+    assert_eq!(shown.run.end().0, 0);
+}
+
+#[test]
+#[ignore = "needs a browser: Debian package chromium"]
 fn a_page_whose_cell_is_killed_says_so_and_offers_no_order() {
     let home = tempfile::tempdir().unwrap();
     let shown = Shown::begin(home.path(), 20.0);

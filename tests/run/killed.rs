@@ -150,7 +150,7 @@ async fn a_killed_program_is_taken_up_again_and_starts_every_pass_once() {
 }
 
 /// Machines on serial lines, played by the program itself, beside a cell for them and this recipe.
-pub fn on_serial_lines(home: &Path, recipe: &str) -> Running {
+pub fn on_serial_lines(home: &Path, recipe: impl AsRef<[u8]>) -> Running {
     fs::write(home.join("part.toml"), recipe).unwrap();
     let devices = format!("device = \"{}/", home.display());
     let cell = changed("config/serial-rtu.toml", &[("device = \"/tmp/regrind-", &devices)]);
@@ -177,10 +177,102 @@ pub fn began_once(home: &Path) -> usize {
 #[test]
 fn over_a_serial_line_too() {
     let home = tempfile::tempdir().unwrap();
-    let _serving = on_serial_lines(home.path(), &small(12, 8, 2000.0).text());
+    let _serving = on_serial_lines(home.path(), small(12, 8, 2000.0).text());
     let (folder, kills) = run_with_kills(home.path(), 21);
     println!("{kills} kills");
     is_whole(&folder, 21);
     // Two machines, two passes at least; the first program may have been killed before it had a record of its part.
     assert!(began_once(home.path()) >= 4);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "takes minutes: for .ci/long"]
+async fn two_hundred_kills() {
+    killed(1000..1105).await;
+}
+
+/// Runs a part until the machine of a job moves, and kills the program. Returns the folder of the run.
+fn killed_while(home: &Path, moment: &str) -> PathBuf {
+    let mut running = Running::new(regrind(&["run", "part.toml", "--cell", "cell.toml", "--json"], home));
+    running.line(moment, |line| line.contains(moment));
+    running.signal("KILL");
+    running.end();
+    fs::read_dir(home.join("runs")).unwrap().next().unwrap().unwrap().path()
+}
+
+fn recover(home: &Path, typed: &str) -> (i32, String) {
+    let mut command = regrind(&["recover", "--cell", "cell.toml"], home);
+    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    // It may need none of it.
+    let _ = child.stdin.take().unwrap().write_all(typed.as_bytes());
+    let output = child.wait_with_output().unwrap();
+    let said = [output.stdout, output.stderr].map(|bytes| String::from_utf8(bytes).unwrap()).join("");
+    (output.status.code().unwrap_or(-1), said)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn machines_that_hold_what_no_run_knows_are_brought_home_step_by_step() {
+    let (_rig, home) = cell_that_stays().await;
+    tokio::task::spawn_blocking(move || {
+        let run = killed_while(&home, "\"event\":\"started\"");
+        let name = run.file_name().unwrap().to_str().unwrap().to_owned();
+        fs::rename(&run, home.join("kept")).unwrap();
+        // Nothing is done by a word that is none.
+        let (code, said) = recover(&home, "yes\nyes\n");
+        assert_eq!(code, 3, "{said}");
+        assert!(!said.contains(&name), "{said}");
+        let (code, said) = recover(&home, &"STOP\nACKNOWLEDGE\nCLEAR\n".repeat(4));
+        assert!(code == 0 || code == 3, "{said}");
+        // Whatever the CMM had come to by then: each word given in turn brings it home in the end.
+        for _ in 0..4 {
+            for word in ["STOP\n", "ACKNOWLEDGE\n", "CLEAR\n"] {
+                recover(&home, word);
+            }
+        }
+        let (code, said) = recover(&home, "");
+        assert!(code == 0 && said.matches("IDLE").count() == 2, "{said}");
+        for folder in fs::read_dir(home.join("runs")).unwrap() {
+            let verified = verify(folder.unwrap().path()).unwrap();
+            assert!(verified.closed && verified.open_intents.is_empty(), "{verified:?}");
+        }
+    })
+    .await
+    .unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_cannot_be_taken_up_again_is_refused_before_anything_is_commanded() {
+    let (rig, home) = cell_that_stays().await;
+    let commands =
+        |rig: &Rig| [CMM, GRINDER].map(|k| rig.came[k].lock().unwrap().iter().filter(|c| c.command.is_some()).count());
+    let (run, home) =
+        tokio::task::spawn_blocking(move || (killed_while(&home, "\"event\":\"started\""), home)).await.unwrap();
+    let before = commands(&rig);
+    let resumed = |arguments: &[&str]| {
+        let all: Vec<&str> = ["resume"].iter().chain(arguments).copied().collect();
+        crate::program::run(&all, &home)
+    };
+    let run = run.to_str().unwrap();
+    // Another part than the one that the run began with.
+    let recipe = Path::new(run).join("recipe.toml");
+    let text = fs::read_to_string(&recipe).unwrap();
+    fs::write(&recipe, text.replacen("rows = 8", "rows = 9", 1)).unwrap();
+    let (code, _, said) = resumed(&[run]);
+    assert!(code == 1 && said.contains("recipe.toml is not what was written"), "{said}");
+    fs::write(&recipe, text).unwrap();
+    let (code, _, said) = resumed(&["nowhere"]);
+    assert!(code == 2 && said.contains("nowhere"), "{said}");
+    assert_eq!(commands(&rig), before, "nothing was commanded");
+
+    // A run whose machines lived in the program itself.
+    let own = crate::program::changed("config/sim.toml", &[]);
+    fs::write(home.join("sim.toml"), own).unwrap();
+    let mut running =
+        Running::new(regrind(&["run", "part.toml", "--cell", "sim.toml", "--runs", "own", "--json"], &home));
+    running.line("a pass", |line| line.contains("\"event\":\"started\""));
+    running.signal("KILL");
+    running.end();
+    let own = fs::read_dir(home.join("own")).unwrap().next().unwrap().unwrap().path();
+    let (code, _, said) = resumed(&[own.to_str().unwrap()]);
+    assert!(code == 2 && said.contains("ended with the program"), "{said}");
 }

@@ -4,7 +4,7 @@ use regrind::cell::PvOf;
 use regrind::compensation::told_map;
 use regrind::drive::Adaptive;
 use regrind::geometry::{Point, Sample, Vector};
-use regrind::model::{self, FEWEST, FIRST, Form, FormFigures, Given, SoFar, Why};
+use regrind::model::{self, FEWEST, FIRST, Form, FormFigures, FormPoint, Given, SoFar};
 use regrind::registration::Registration;
 use regrind_sim::body::Body;
 use regrind_sim::spec::WorldSpec;
@@ -176,11 +176,11 @@ impl Line<'_> {
             let so_far = SoFar { targets, tried: &tried, touched: &of };
             let look = model::look(&found, &given, &so_far, &purpose, seed).unwrap();
             path.push(format!("{}{:?}", all.len(), look.why));
-            if matches!(look.why, Why::Within | Why::Known | Why::All) {
+            if look.next.is_empty() {
                 let form = &look.form;
-                let told: Vec<Sample> =
-                    form.points.iter().map(|p| Sample { at_mm: p.at_mm, deviation_mm: p.form.mean_mm }).collect();
-                let error = told_map(&told, &self.bench.task.map, form.hyper.scatter_mm, form.known_mm).unwrap();
+                let of = |p: &FormPoint| (Sample { at_mm: p.at_mm, deviation_mm: p.form.mean_mm }, p.smooth_sigma_mm);
+                let told: Vec<_> = form.points.iter().map(of).collect();
+                let error = told_map(&told, &self.bench.task.map, form.hyper.scatter_mm).unwrap();
                 let why = path.join(" ");
                 return Took { touches: all.len(), seconds, why, figures: form.figures, found, error };
             }

@@ -148,14 +148,19 @@ pub fn error_map(readings: &[Sample], options: &MapOptions) -> Result<ErrorMap, 
 
 /// Lays the form that a model tells at many places on a grid, through the filter of the map.
 ///
-/// What is told has no scatter of its own: nothing is left out as an outlier, and what the points beside the form scatter by, and how well
-/// the form is known, is what the model says of them.
+/// Each place has its standard uncertainty, in millimetres, which goes through the filter as the form does. What is told has no scatter of
+/// its own: nothing is left out as an outlier, and what the points beside the form scatter by is what the model says.
 ///
 /// # Errors
 /// Those of [`error_map`].
-pub fn told_map(told: &[Sample], options: &MapOptions, scatter_mm: f64, known_mm: f64) -> Result<ErrorMap, MapError> {
-    let map = error_map(told, &MapOptions { outlier_limit: None, ..*options })?;
-    let sigma_mm = vec![known_mm; map.sigma_mm.len()];
+pub fn told_map(told: &[(Sample, f64)], options: &MapOptions, scatter_mm: f64) -> Result<ErrorMap, MapError> {
+    let options = MapOptions { outlier_limit: None, ..*options };
+    let form: Vec<Sample> = told.iter().map(|(sample, _)| *sample).collect();
+    let sigma = |(sample, sigma_mm): &(Sample, f64)| Sample { deviation_mm: *sigma_mm, ..*sample };
+    let (map, sigma) = (error_map(&form, &options)?, error_map(&told.iter().map(sigma).collect::<Vec<_>>(), &options)?);
+    // What is fitted to them may go beyond them between two.
+    let [least, most] = told.iter().fold([f64::INFINITY, 0.0], |[a, b], (_, of)| [a.min(*of), b.max(*of)]);
+    let sigma_mm = sigma.values_mm.iter().map(|value| value.clamp(least.min(most), most)).collect();
     let residual_sigma_mm = scatter_mm.hypot(map.residual_sigma_mm);
     Ok(ErrorMap { sigma_mm, residual_sigma_mm, point_sigma_mm: scatter_mm, ..map })
 }

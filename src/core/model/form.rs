@@ -41,6 +41,8 @@ pub struct FormPoint {
     pub at_mm: [f64; 2],
     /// The form there and its standard uncertainty.
     pub form: Predicted,
+    /// Standard uncertainty of what of it is smooth: what a correction can be made by.
+    pub smooth_sigma_mm: f64,
 }
 
 /// Figures with what the measurement leaves possible of each.
@@ -159,7 +161,7 @@ impl<'a> Seen<'a> {
             frame_covariance: self.motions.to_twist(&covariance),
             points: drawn.points(),
             figures: drawn.figures(self.is_seen, given.look_risk),
-            known_mm: drawn.known_mm,
+            known_mm: drawn.known_mm(),
             is_seen: self.is_seen,
         }
     }
@@ -234,8 +236,8 @@ struct Drawn {
     effects: DMatrix<f64>,
     /// Which of the points the places are, where they are points.
     chosen: Vec<usize>,
-    /// The RMS of the standard uncertainties of what is told of them, as far as it is smooth.
-    known_mm: f64,
+    /// Standard uncertainty of what is told of each place, as far as it is smooth.
+    smooth_sigma_mm: Vec<f64>,
 }
 
 impl Drawn {
@@ -253,7 +255,7 @@ impl Drawn {
             let lattice = Lattice::over(&observed.places, hyper.field.range_mm)?;
             Sparse::fit(&lattice, observed, hyper)?.samples(&seen.places, count, seed)
         })?;
-        Ok(Self { known_mm: spread_mm(&forms), forms, places: seen.places, effects: seen.effects, chosen })
+        Ok(Self { smooth_sigma_mm: spread_mm(&forms), forms, places: seen.places, effects: seen.effects, chosen })
     }
 
     /// The same at other places.
@@ -268,8 +270,8 @@ impl Drawn {
             let lattice = Lattice::over(&everywhere, hyper.field.range_mm)?;
             Sparse::fit(&lattice, observed, hyper)?.samples(&places, count, seed)
         })?;
-        let drawn = Self { forms, places, effects, chosen: Vec::new(), known_mm: 0.0 }.after_best_fit();
-        Ok(Self { known_mm: spread_mm(&drawn.forms), ..drawn })
+        let drawn = Self { forms, places, effects, chosen: Vec::new(), smooth_sigma_mm: Vec::new() }.after_best_fit();
+        Ok(Self { smooth_sigma_mm: spread_mm(&drawn.forms), ..drawn })
     }
 
     /// Takes in what is not known of the scatter, and what of it is too narrow a form to be told from it.
@@ -331,9 +333,16 @@ impl Drawn {
             let row = self.forms.row(k);
             let mean_mm = row.sum() / count;
             let sigma_mm = (row.iter().map(|v| (v - mean_mm).powi(2)).sum::<f64>() / (count - 1.0)).sqrt();
-            FormPoint { at_mm: *at_mm, form: Predicted { mean_mm, sigma_mm } }
+            let smooth_sigma_mm = self.smooth_sigma_mm[k];
+            FormPoint { at_mm: *at_mm, form: Predicted { mean_mm, sigma_mm }, smooth_sigma_mm }
         };
         self.places.iter().enumerate().map(of).collect()
+    }
+
+    /// The RMS over all places of how well the smooth form is known.
+    fn known_mm(&self) -> f64 {
+        let squares: f64 = self.smooth_sigma_mm.iter().map(|sigma| sigma * sigma).sum();
+        (squares / self.smooth_sigma_mm.len().max(1) as f64).sqrt()
     }
 
     /// The figures; where no form is seen they are known from above alone.
@@ -368,10 +377,9 @@ fn parted(told: &Told, given: &Given, normals: &mut Normals) -> [f64; 2] {
     [own.min(found).sqrt(), (found - own).max(0.0).sqrt()]
 }
 
-/// The RMS of the standard deviations of all rows.
-fn spread_mm(forms: &DMatrix<f64>) -> f64 {
-    let variances: f64 = forms.row_iter().map(|row| row.variance()).sum();
-    (variances / forms.nrows().max(1) as f64).sqrt()
+/// The standard deviation of each row.
+fn spread_mm(forms: &DMatrix<f64>) -> Vec<f64> {
+    forms.row_iter().map(|row| row.variance().sqrt()).collect()
 }
 
 /// Forms drawn by each of the likely parameters, as many as speaks for them, one beside the other.

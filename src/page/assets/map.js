@@ -4,12 +4,13 @@ const regrindMap = (() => {
   /** More points than these are drawn as blocks. */
   const MOST_DISCS = 4000;
 
-  /** Reads a map: columns, rows, first node, spacing, values in micrometres (NaN where nothing was measured). */
+  /** Reads a map: columns, rows, first node, spacing, values and their sigma in micrometres (NaN where nothing was measured). */
   function readGrid(buffer) {
     const head = new DataView(buffer);
     const [columns, rows] = [head.getUint32(0, true), head.getUint32(4, true)];
     const [firstX, firstY, stepX, stepY] = [8, 16, 24, 32].map((at) => head.getFloat64(at, true));
-    return { columns, rows, firstX, firstY, stepX, stepY, values: new Float32Array(buffer, 40) };
+    const [values, sigma] = [0, 1].map((k) => new Float32Array(buffer, 40 + 4 * k * columns * rows, columns * rows));
+    return { columns, rows, firstX, firstY, stepX, stepY, low: -1, values, sigma };
   }
 
   /** The largest size of some values, and how they are spread. */
@@ -33,7 +34,8 @@ const regrindMap = (() => {
     return colours;
   }
 
-  const level = (value, limit) => Math.round((Math.min(Math.max(value / limit, -1), 1) + 1) * 127);
+  /** Which of the 255 colours a value has: from -limit to limit, or from 0 where nothing is below (low 0). */
+  const level = (value, limit, low = -1) => Math.round((254 * (Math.min(Math.max(value / limit, low), 1) - low)) / (1 - low));
 
   /** The value of a map between its nodes, straight along x and y; nothing where one of the four was not measured. */
   function valueAt(grid, x, y) {
@@ -89,7 +91,7 @@ const regrindMap = (() => {
         const value = grid.values[row * grid.columns + column];
         if (Number.isNaN(value)) continue;
         const at = 4 * ((grid.rows - 1 - row) * grid.columns + column);
-        image.data.set(colours.subarray(3 * level(value, limit), 3 * level(value, limit) + 3), at);
+        image.data.set(colours.subarray(3 * level(value, limit, grid.low), 3 * level(value, limit, grid.low) + 3), at);
         image.data[at + 3] = 255;
       }
     }
@@ -134,7 +136,7 @@ const regrindMap = (() => {
     [context.strokeStyle, context.lineWidth] = [ink, 1];
     context.strokeRect(offset, top, w, h);
     axes(context, view, { x0, y0, x1, y1, offset, top, w, h, ink });
-    if (grid) bar(context, { limit, colours, x: offset + w + 14, top, h, ink });
+    if (grid) bar(context, { limit, low: grid.low, colours, x: offset + w + 14, top, h, ink });
     if (key) {
       context.fillStyle = quiet;
       context.fillText(key, offset, height - 4);
@@ -207,7 +209,7 @@ const regrindMap = (() => {
     context.textAlign = "left";
   }
 
-  function bar(context, { limit, colours, x, top, h, ink }) {
+  function bar(context, { limit, low, colours, x, top, h, ink }) {
     for (let k = 0; k < 255; k += 1) {
       context.fillStyle = `rgb(${colours[3 * k]},${colours[3 * k + 1]},${colours[3 * k + 2]})`;
       context.fillRect(x, top + h * (1 - (k + 1) / 255), 14, h / 255 + 1);
@@ -215,18 +217,18 @@ const regrindMap = (() => {
     context.strokeStyle = ink;
     context.strokeRect(x, top, 14, h);
     context.fillStyle = ink;
-    for (const [value, text] of ticks(-limit, limit)) {
-      context.fillText(text, x + 19, top + h * (1 - (value / limit + 1) / 2) + 4);
+    for (const [value, text] of ticks(low * limit, limit)) {
+      context.fillText(text, x + 19, top + h * (1 - (value / limit - low) / (1 - low)) + 4);
     }
     context.fillText("µm", x, top + h + 16);
   }
 
   /** Draws how many nodes have which value. */
-  function histogram(canvas, values, limit, colours) {
+  function histogram(canvas, { values, low }, limit, colours) {
     const { context, width, height, ink } = prepared(canvas);
     const bins = new Array(51).fill(0);
     for (const value of values) {
-      if (!Number.isNaN(value)) bins[Math.min(50, Math.floor((Math.min(Math.max(value / limit, -1), 1) + 1) * 25.5))] += 1;
+      if (!Number.isNaN(value)) bins[Math.min(50, Math.floor((51 * level(value, limit, low)) / 255))] += 1;
     }
     const most = Math.max(...bins, 1);
     const [left, wide, high] = [46, width - 80, height - 20];
@@ -242,7 +244,9 @@ const regrindMap = (() => {
     context.fillStyle = ink;
     context.fillRect(left, high, wide, 1);
     context.textAlign = "center";
-    for (const [value, text] of ticks(-limit, limit)) context.fillText(text, left + wide * (value / limit + 1) / 2, height - 5);
+    for (const [value, text] of ticks(low * limit, limit)) {
+      context.fillText(text, left + (wide * (value / limit - low)) / (1 - low), height - 5);
+    }
     context.textAlign = "left";
     context.fillText("µm", left + wide + 8, height - 5);
   }

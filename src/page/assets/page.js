@@ -3,7 +3,7 @@
 (() => {
   const element = (id) => document.getElementById(id);
   const data = JSON.parse(element("data").textContent);
-  const colours = regrindMap.readColours(data.colours);
+  const [colours, unsigned] = [data.colours, data.unsigned || ""].map(regrindMap.readColours);
   const texts = data.texts;
 
   /** Fetches bytes once; those of a map never change under one name. */
@@ -188,6 +188,7 @@
       const before = at > 0 ? await mapOf(run, mapped[at - 1].cycle, mapped[at - 1].map) : null;
       grid = before && regrindMap.difference(grid, before);
     }
+    if (grid && view === "sigma") grid = { ...grid, values: grid.sigma, low: 0 };
     const { limit } = grid ? regrindMap.statistics(grid.values) : { limit: 1 };
     return { grid, limit, ...await dotsOver(grid, limit, at < 0 ? null : mapped[at]) };
   }
@@ -196,15 +197,21 @@
   async function dotsOver(grid, limit, of) {
     if (state.touched && view !== "relief" && (!grid || withPoints)) {
       planned = planned || await bytes(`${base}/planned`);
-      if (planned) {
+      const places = planned ? new Float32Array(planned) : [];
+      const [[done, total], count] = [state.touched, places.length / 2];
+      // Where touches are chosen a job is some of the plan, in an order of its own: what they showed is drawn once it is known.
+      const isChosen = total !== count;
+      if (planned && !(isChosen && grid)) {
         const ink = getComputedStyle(document.body).color.match(/\d+/g).slice(0, 3).map(Number);
-        const places = new Float32Array(planned);
-        const [done] = state.touched;
         const dots = [];
-        for (let k = 0; 2 * k < places.length; k += 1) {
-          dots.push({ at: [places[2 * k], places[2 * k + 1]], size: k < done ? 2.6 : 1.4, rgb: k < done ? ink : null });
+        for (let k = 0; k < count; k += 1) {
+          const isTouched = !isChosen && k < done;
+          dots.push({ at: [places[2 * k], places[2 * k + 1]], size: isTouched ? 2.6 : 1.4, rgb: isTouched ? ink : null });
         }
-        return { dots, key: `● ${texts.touched} ${done}   ○ ${texts.planned} ${dots.length - done}` };
+        const key = isChosen
+          ? `○ ${texts.planned} ${count}   ${texts.touched} ${done} / ${total}`
+          : `● ${texts.touched} ${done}   ○ ${texts.planned} ${count - done}`;
+        return { dots, key };
       }
     }
     if (withPoints && of && of.points) {
@@ -213,7 +220,9 @@
       const dots = [];
       for (let k = 0; k < values.length; k += 3) {
         const at = 3 * regrindMap.level(values[k + 2], limit);
-        const rgb = Number.isNaN(values[k + 2]) ? null : [colours[at], colours[at + 1], colours[at + 2]];
+        const hue = [colours[at], colours[at + 1], colours[at + 2]];
+        // Over how well the error is known they say only where it was touched.
+        const rgb = Number.isNaN(values[k + 2]) ? null : view === "sigma" ? [255, 255, 255] : hue;
         dots.push({ at: [values[k], values[k + 1]], size: 2.2, rgb });
       }
       return { dots };
@@ -225,14 +234,15 @@
   function paint() {
     if (!current) return;
     const { grid, limit, dots, key } = current;
+    const hues = grid && grid.low === 0 ? unsigned : colours;
     const asRelief = view === "relief" && grid;
     if (asRelief && solid === undefined) solid = regrindRelief.prepare(relief);
     const drawnSolid = asRelief && solid;
     [canvas.hidden, relief.hidden] = [Boolean(drawnSolid), !drawnSolid];
     if (drawnSolid) solid.show(grid, limit, colours);
-    else seen = regrindMap.draw(canvas, { grid, limit, colours, dots, mark, key });
+    else seen = regrindMap.draw(canvas, { grid, limit, colours: hues, dots, mark, key });
     element("histogram").hidden = !grid;
-    if (grid) regrindMap.histogram(element("histogram"), grid.values, limit, colours);
+    if (grid) regrindMap.histogram(element("histogram"), grid, limit, hues);
     read(asRelief && !solid ? texts.noRelief : null);
   }
 
@@ -244,7 +254,9 @@
       return;
     }
     const { pv, rms, count } = regrindMap.statistics(grid.values);
-    const whole = `${texts.filtered} PV ${pv.toFixed(2)} µm, RMS ${rms.toFixed(3)} µm, n = ${count}`;
+    const whole = grid.low === 0
+      ? `${texts.known} ${rms.toFixed(3)} µm`
+      : `${texts.filtered} PV ${pv.toFixed(2)} µm, RMS ${rms.toFixed(3)} µm, n = ${count}`;
     if (!mark) {
       reading.textContent = whole;
       return;
@@ -252,7 +264,8 @@
     const [column, row] = [(mark[0] - grid.firstX) / grid.stepX, (mark[1] - grid.firstY) / grid.stepY].map(Math.round);
     const inside = column >= 0 && row >= 0 && column < grid.columns && row < grid.rows;
     const value = inside ? grid.values[row * grid.columns + column] : NaN;
-    const words = Number.isNaN(value) ? "–" : `${value >= 0 ? "+" : "−"}${Math.abs(value).toFixed(3)} µm`;
+    const sign = grid.low === 0 ? "" : value >= 0 ? "+" : "−";
+    const words = Number.isNaN(value) ? "–" : `${sign}${Math.abs(value).toFixed(3)} µm`;
     reading.textContent = `x ${mark[0].toFixed(2)} mm, y ${mark[1].toFixed(2)} mm: ${words}   (${whole})`;
   }
 

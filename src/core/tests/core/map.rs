@@ -5,7 +5,9 @@ use std::f64::consts::{PI, TAU};
 use crate::common::normal;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use regrind_core::compensation::{ErrorMap, MapError, MapOptions, Order, Roughness, Smoothing, error_map, filter_grid};
+use regrind_core::compensation::{
+    ErrorMap, MapError, MapOptions, Order, Roughness, Smoothing, error_map, filter_grid, told_map,
+};
 use regrind_core::geometry::{Grid, GridError, Sample};
 
 /// Readings at the nodes of a grid about the origin, of a function of the place.
@@ -427,4 +429,28 @@ fn a_short_cutoff_is_advised_against() {
     assert!(short.advice[0].contains("choose a longer cut-off or measure more densely"), "{:?}", short.advice);
     let wide = MapOptions { contact_width_mm: 4.0, ..MapOptions::new(5.0, 1.0) };
     assert!(made(&readings, &wide).advice[0].contains("smaller wheel"));
+}
+
+#[test]
+fn what_a_model_tells_is_laid_out_with_how_well_each_place_is_known() {
+    let form = |x: f64, y: f64| 1e-3 * (0.05 * x).sin() + 2e-5 * y;
+    let sigma = |x: f64, _: f64| 3e-4 + 4e-6 * x;
+    let told: Vec<(Sample, f64)> =
+        trial(form).into_iter().map(|sample| (sample, sigma(sample.at_mm[0], sample.at_mm[1]))).collect();
+    let options = MapOptions::new(5.0, 1.0);
+    let map = told_map(&told, &options, 2e-4).unwrap();
+    let alone = made(&trial(form), &MapOptions { outlier_limit: None, ..options });
+    assert_eq!((map.values_mm, map.point_sigma_mm), (alone.values_mm, 2e-4));
+    for (k, found) in map.sigma_mm.iter().enumerate().filter(|(k, _)| map.valid[*k]) {
+        let [x, y] = map.grid.place_mm(k);
+        assert!((found - sigma(x, y)).abs() < 1e-6, "{found} at {x}, {y}");
+    }
+    // Known everywhere but at one place: never better than anywhere, never worse than there.
+    let spike: Vec<(Sample, f64)> =
+        told.iter().enumerate().map(|(k, (sample, _))| (*sample, if k == 900 { 1e-3 } else { 1e-4 })).collect();
+    let map = told_map(&spike, &options, 2e-4).unwrap();
+    assert!(map.sigma_mm.iter().all(|sigma| (1e-4..=1e-3).contains(sigma)));
+    assert!(map.sigma_mm.iter().any(|sigma| *sigma > 1.2e-4));
+    let empty = told_map(&[], &options, 2e-4);
+    assert!(empty.is_err());
 }
