@@ -58,7 +58,8 @@ fn a_run_that_is_over_is_listed_shown_compared_and_reported() {
 
     let map = visitor.get(&format!("/runs/{}/cycles/1/map", ids[0]));
     let count = |at: usize| u32::from_le_bytes(map.body[at..at + 4].try_into().unwrap()) as usize;
-    assert_eq!(map.body.len(), 40 + 4 * count(0) * count(4));
+    // An error and its uncertainty a node.
+    assert_eq!(map.body.len(), 40 + 8 * count(0) * count(4));
     let points = visitor.get(&format!("/runs/{}/cycles/1/points", ids[0]));
     assert_eq!(points.body.len(), 300 * 12);
     assert_eq!(visitor.get(&format!("/runs/{}/planned", ids[0])).body.len(), 300 * 8);
