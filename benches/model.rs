@@ -13,7 +13,7 @@ fn main() {
     divan::main();
 }
 
-const HYPER: Hyper = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4 };
+const HYPER: Hyper = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4, drift: 0.0 };
 
 /// Points of a part of 102 x 62 mm with form, scatter, and the six motions of a part as effects.
 fn measured(count: u32) -> Observed {
@@ -25,7 +25,7 @@ fn measured(count: u32) -> Observed {
     let scatter = |k: usize| 5e-4 * ((k as f64 * 12.9898).sin() * 43_758.545_3).fract();
     let deviations_mm = places.iter().enumerate().map(|(k, &place)| shape(place) + scatter(k)).collect();
     let effects = motions(&places);
-    Observed { places, deviations_mm, effects }
+    Observed { places, deviations_mm, effects, path: Vec::new() }
 }
 
 /// What the six motions of a part that is bent both ways add at each place.
@@ -63,6 +63,7 @@ fn a_batch_after_400_points_in_place(bencher: Bencher) {
         places: all.places[from..until].to_vec(),
         deviations_mm: all.deviations_mm[from..until].to_vec(),
         effects: all.effects.rows(from, until - from).into_owned(),
+        path: Vec::new(),
     };
     let effects = motions(&map);
     let mut before = Growing::over(map, effects, HYPER).unwrap();
@@ -106,5 +107,13 @@ fn a_scan_of_28476_points(bencher: Bencher) {
 #[divan::bench(sample_count = 5)]
 fn the_parameters_of_1800_points(bencher: Bencher) {
     let all = measured(1800);
+    bencher.bench(|| Hyper::of(&all, &Priors::of_size(102.0)).unwrap());
+}
+
+/// The same of points that were measured along a path, whose drift is searched too.
+#[divan::bench(sample_count = 5)]
+fn the_parameters_of_1800_points_along_a_path(bencher: Bencher) {
+    let all = measured(1800);
+    let all = Observed { path: (0..1800).map(f64::from).collect(), ..all };
     bencher.bench(|| Hyper::of(&all, &Priors::of_size(102.0)).unwrap());
 }

@@ -217,9 +217,13 @@ fn form_in_words(form: &Form) -> String {
     let within =
         |figure: &Interval| format!("{} um ({} to {})", um(figure.median_mm), um(figure.low_mm), um(figure.high_mm));
     let Form { hyper, figures, frame_covariance, .. } = form;
+    let drift = match hyper.drift {
+        0.0 => String::new(),
+        drift => format!(", of which the next point along the path has {} %", (100.0 * drift).round()),
+    };
     let sigma = [0, 1, 2].map(|k| um(frame_covariance[(k, k)].sqrt())).join(", ");
     format!(
-        "form        RMS {}, PV {}, PV 99.8 % {}; with 95 %\nmodel       the form is {} um strong and {} mm wide, a point scatters by {} um\n\
+        "form        RMS {}, PV {}, PV 99.8 % {}; with 95 %\nmodel       the form is {} um strong and {} mm wide, a point scatters by {} um{drift}\n\
          frame       known to {sigma} um along x, y, z beside that form\n",
         within(&figures.rms),
         within(&figures.pv),

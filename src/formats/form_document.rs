@@ -23,6 +23,8 @@ struct FormDocument {
     form_sigma_mm: f64,
     form_range_mm: f64,
     scatter_mm: f64,
+    /// How much of its scatter the next point along the path has.
+    scatter_drift: f64,
     /// Whether a form shows at all; where it does not, the figures are known from above alone.
     form_is_seen: bool,
     /// Figures of the form after its own best fit: median, and the interval that holds it with 95 %.
@@ -54,6 +56,7 @@ pub fn save_form(
         form_sigma_mm: form.hyper.field.sigma_mm,
         form_range_mm: form.hyper.field.range_mm,
         scatter_mm: form.hyper.scatter_mm,
+        scatter_drift: form.hyper.drift,
         form_is_seen: form.is_seen,
         rms: form.figures.rms,
         pv: form.figures.pv,

@@ -1,6 +1,7 @@
 //! The model by the covariance of every pair of points: exact, and the measure of the sparse way.
 //!
-//! With K = k(x_i, x_j) + s^2, the effects b by generalised least squares, b = (H'K^-1 H)^-1 H'K^-1 d, and what is left told by kriging
+//! With K = k(x_i, x_j) + s^2 R, where R is 1 and, between points of a path on which the probe drifts, the drift to the power of their steps
+//! (an autoregression of the first order), the effects b by generalised least squares, b = (H'K^-1 H)^-1 H'K^-1 d, and what is left told by kriging
 //! (Rasmussen and Williams 2006, 2.7, with a vague prior of b): mean h'b + k'K^-1 (d - H b), variance
 //! k(x, x) - k'K^-1 k + r'(H'K^-1 H)^-1 r with r = h - H'K^-1 k.
 
@@ -27,6 +28,7 @@ pub struct Predicted {
 pub struct Dense {
     hyper: Hyper,
     places: Vec<[f64; 2]>,
+    path: Vec<f64>,
     factor: Llt<f64>,
     /// K^-1 (d - H b).
     weights: Vec<f64>,
@@ -46,7 +48,7 @@ impl Dense {
     pub fn fit(observed: &Observed, hyper: Hyper) -> Result<Self, ModelError> {
         observed.check()?;
         hyper.check()?;
-        let Observed { places, deviations_mm, effects } = observed;
+        let Observed { places, deviations_mm, effects, path } = observed;
         let (n, p) = (places.len(), effects.ncols());
         let scatter2 = hyper.scatter_mm * hyper.scatter_mm;
         let covariance = Mat::from_fn(n, n, |r, c| {
@@ -54,7 +56,7 @@ impl Dense {
             if r < c {
                 0.0
             } else {
-                hyper.field.covariance_mm2(places[r], places[c]) + if r == c { scatter2 } else { 0.0 }
+                hyper.field.covariance_mm2(places[r], places[c]) + scatter2 * shared(&hyper, path, r, c)
             }
         });
         let factor = Llt::new(covariance.as_ref(), Side::Lower).map_err(|_| ModelError::NotDefinite)?;
@@ -74,6 +76,7 @@ impl Dense {
         Ok(Self {
             hyper,
             places: places.clone(),
+            path: path.clone(),
             weights,
             effects: Mat::from_fn(n, p, |r, c| solved[(r, c)]),
             found,
@@ -103,7 +106,7 @@ impl Dense {
     /// Draws what may have been the scatter of each observed point; a column a sample. What is left of the observations without it, and
     /// without the effects, is the field.
     ///
-    /// With W = K^-1 - K^-1 H (H'K^-1 H)^-1 H'K^-1 the scatter has the mean s^2 W d and the covariance s^2 - s^4 W.
+    /// With W = K^-1 - K^-1 H (H'K^-1 H)^-1 H'K^-1 the scatter has the mean s^2 R W d and the covariance s^2 R - s^4 R W R.
     pub(super) fn scatters(&self, count: usize, seed: u64) -> Result<Mat<f64>, ModelError> {
         let n = self.places.len();
         let scatter2 = self.hyper.scatter_mm * self.hyper.scatter_mm;
@@ -111,18 +114,26 @@ impl Dense {
         let p = self.found.len();
         let by_effects =
             Mat::from_fn(n, p, |r, c| (0..p).map(|k| self.effects[(r, k)] * self.covariance[(k, c)]).sum::<f64>());
-        let among_effects = &by_effects * self.effects.transpose();
+        let weights = inverse - &by_effects * self.effects.transpose();
+        let drifts = self.hyper.drift > 0.0 && !self.path.is_empty();
+        let shared = Mat::from_fn(n, n, |r, c| shared(&self.hyper, &self.path, r, c));
+        let told = if drifts { &shared * &weights * &shared } else { weights };
         let covariance = Mat::from_fn(n, n, |r, c| {
-            let own = if r == c { 1.0 + NEXT_TO_NOTHING } else { 0.0 };
-            own - scatter2 * (inverse[(r, c)] - among_effects[(r, c)])
+            let own = if r == c { NEXT_TO_NOTHING } else { 0.0 };
+            shared[(r, c)] + own - scatter2 * told[(r, c)]
         });
+        let mean_of = |r: usize| match drifts {
+            true => (0..n).map(|k| shared[(r, k)] * self.weights[k]).sum(),
+            false => self.weights[r],
+        };
+        let means: Vec<f64> = (0..n).map(mean_of).collect();
         let root = Llt::new(covariance.as_ref(), Side::Lower).map_err(|_| ModelError::NotDefinite)?;
         let mut normals = Normals::new(seed, 0);
         let drawn = Mat::from_fn(n, count, |_, _| normals.next());
         let mut samples = root.L() * &drawn;
         for c in 0..count {
             for r in 0..n {
-                samples[(r, c)] = scatter2 * self.weights[r] + self.hyper.scatter_mm * samples[(r, c)];
+                samples[(r, c)] = scatter2 * means[r] + self.hyper.scatter_mm * samples[(r, c)];
             }
         }
         Ok(samples)
@@ -147,6 +158,15 @@ impl Dense {
     }
 }
 
+/// How much of their scatter two points share.
+fn shared(hyper: &Hyper, path: &[f64], r: usize, c: usize) -> f64 {
+    match path.is_empty() {
+        true if r == c => 1.0,
+        true => 0.0,
+        false => hyper.shared(path[r] - path[c]),
+    }
+}
+
 /// The factor of H'K^-1 H; none where a direction of it is nothing beside the others.
 pub(super) fn told_apart(gram: DMatrix<f64>) -> Result<nalgebra::Cholesky<f64, nalgebra::Dyn>, ModelError> {
     const LEAST: f64 = 1e-12;
@@ -168,7 +188,7 @@ mod tests {
     use super::super::Field;
     use super::*;
 
-    const HYPER: Hyper = Hyper { field: Field { sigma_mm: 2.0, range_mm: 20.0 }, scatter_mm: 0.5 };
+    const HYPER: Hyper = Hyper { field: Field { sigma_mm: 2.0, range_mm: 20.0 }, scatter_mm: 0.5, drift: 0.0 };
 
     #[test]
     fn of_one_point_it_is_what_is_worked_out_by_hand() {
@@ -179,6 +199,40 @@ mod tests {
         assert_eq!(far, Predicted { mean_mm: 0.0, sigma_mm: 2.0 });
         let by_hand = -0.5 * (4.25_f64.ln() + 9.0 / 4.25 + std::f64::consts::TAU.ln());
         assert!((model.log_likelihood() - by_hand).abs() < 1e-14);
+    }
+
+    #[test]
+    fn of_two_points_of_a_path_it_is_what_is_worked_out_by_hand() {
+        // No step of the field between them: K = [4.25 4.125; 4.125 4.25] by a drift of a half, and so the sum has 16.75 for 12 of the field.
+        let drifting = Hyper { drift: 0.5, ..HYPER };
+        let at = |path: [f64; 2]| Observed {
+            path: path.to_vec(),
+            ..Observed::without_effects(vec![[1.0, 2.0]; 2], vec![3.0, 1.0])
+        };
+        let model = Dense::fit(&at([7.0, 8.0]), drifting).unwrap();
+        let told = model.predict(&[[1.0, 2.0]])[0];
+        // mean = 4 (w1 + w2), w1 + w2 = (3 + 1) / (4.25 + 4.125); variance = 4 - 16 * 2 / 8.375.
+        assert!((told.mean_mm - 4.0 * 4.0 / 8.375).abs() < 1e-13, "{told:?}");
+        assert!((told.sigma_mm.powi(2) - (4.0 - 32.0 / 8.375)).abs() < 1e-13, "{told:?}");
+        // Far apart on the path they scatter on their own.
+        let apart = Dense::fit(&at([7.0, 900.0]), drifting).unwrap();
+        let alone = Dense::fit(&at([7.0, 8.0]), HYPER).unwrap();
+        assert!((apart.log_likelihood() - alone.log_likelihood()).abs() < 1e-13);
+        // What may have been their scatter has the mean s^2 R K^-1 d and the covariance s^2 R - s^4 R K^-1 R.
+        let samples = model.scatters(40_000, 3).unwrap();
+        let k = nalgebra::Matrix2::new(4.25, 4.125, 4.125, 4.25).try_inverse().unwrap();
+        let r = nalgebra::Matrix2::new(0.25, 0.125, 0.125, 0.25);
+        let mean = r * k * nalgebra::Vector2::new(3.0, 1.0);
+        let covariance = r - r * k * r;
+        for a in 0..2 {
+            let found = (0..40_000).map(|c| samples[(a, c)]).sum::<f64>() / 4e4;
+            assert!((found - mean[a]).abs() < 0.01, "{found} {}", mean[a]);
+            for b in 0..2 {
+                let of = |c: usize| (samples[(a, c)] - mean[a]) * (samples[(b, c)] - mean[b]);
+                let found = (0..40_000).map(of).sum::<f64>() / 4e4;
+                assert!((found - covariance[(a, b)]).abs() < 0.005, "{found} {}", covariance[(a, b)]);
+            }
+        }
     }
 
     fn wave(places: &[[f64; 2]]) -> Vec<f64> {
@@ -196,7 +250,12 @@ mod tests {
         let planted = DVector::from_column_slice(&[40.0, 0.3, -0.2]);
         let still = wave(&places);
         let moved: Vec<f64> = still.iter().zip((&effects * &planted).iter()).map(|(d, m)| d + m).collect();
-        let with = |deviations_mm| Observed { places: places.clone(), deviations_mm, effects: effects.clone() };
+        let with = |deviations_mm| Observed {
+            places: places.clone(),
+            deviations_mm,
+            effects: effects.clone(),
+            path: Vec::new(),
+        };
         let [a, b] = [still, moved].map(|d| Dense::fit(&with(d), HYPER).unwrap());
         // What is planted comes back on top of what the field itself has along it.
         assert!((b.effects().0 - a.effects().0 - &planted).norm() < 1e-9);
@@ -230,6 +289,12 @@ mod tests {
         assert!(of(&odd, HYPER).contains("do not belong together"));
         let good = Observed::without_effects(vec![[0.0; 2]; 2], vec![1.0; 2]);
         assert!(of(&good, Hyper { scatter_mm: 0.0, ..HYPER }).contains("the scatter is 0 mm"));
+        for drift in [1.0, -0.1, f64::NAN] {
+            assert!(of(&good, Hyper { drift, ..HYPER }).contains("below 1"));
+        }
+        for path in [vec![0.0; good.places.len() + 1], vec![f64::NAN; good.places.len()]] {
+            assert!(of(&Observed { path, ..good.clone() }, HYPER).contains("belong together"));
+        }
         let alike = Observed {
             effects: DMatrix::from_element(9, 2, 1.0),
             ..Observed::without_effects(places(9), vec![0.0; 9])

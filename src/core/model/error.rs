@@ -15,6 +15,8 @@ pub enum ModelError {
     NotFinite { point: usize },
     #[error("the {what} is {value} mm; it must be finite and above 0")]
     Hyper { what: &'static str, value: f64 },
+    #[error("the drift is {value}; it must be 0 at least and below 1")]
+    Drift { value: f64 },
     #[error(
         "the covariance of the points is not definite: their scatter is too small beside the field, or places coincide"
     )]

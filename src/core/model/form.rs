@@ -11,6 +11,7 @@ use rayon::prelude::*;
 
 use super::likelihood::Told;
 use super::normals::Normals;
+use super::spacing_mm;
 use super::{Dense, Hyper, Lattice, ModelError, Observed, Predicted, Priors, Sparse};
 use crate::geometry::{Point, Vector};
 use crate::registration::{Deviation, PointStatus, Registration};
@@ -93,7 +94,7 @@ impl Form {
     /// # Errors
     /// Too few points, and points that leave nothing to tell the form by.
     pub fn of(registration: &Registration, given: &Given) -> Result<Self, ModelError> {
-        let seen = Seen::of(registration, given)?;
+        let seen = Seen::of(registration, given, true)?;
         let alike = seen.motions.alike(given, seen.places());
         let drawn = Drawn::of(&seen.observed, &seen.told.likely)?;
         let alike = alike.select_rows(&drawn.chosen);
@@ -111,7 +112,7 @@ impl Form {
     /// # Errors
     /// Those of [`Form::of`], and places that are too many for the range of the form.
     pub fn over(registration: &Registration, given: &Given, places: &[(Point, Vector)]) -> Result<Self, ModelError> {
-        let seen = Seen::of(registration, given)?;
+        let seen = Seen::of(registration, given, false)?;
         let places: Vec<_> = thinned(places.len()).map(|k| places[k]).collect();
         let alike = seen.motions.alike(given, places.iter().copied());
         let effects = seen.motions.rows(places.iter().copied());
@@ -131,13 +132,16 @@ struct Seen<'a> {
 }
 
 impl<'a> Seen<'a> {
-    fn of(registration: &'a Registration, given: &Given) -> Result<Self, ModelError> {
-        let used: Vec<_> = registration.deviations.iter().filter(|d| d.status == PointStatus::Used).collect();
+    fn of(registration: &'a Registration, given: &Given, in_order: bool) -> Result<Self, ModelError> {
+        let all = registration.deviations.iter().enumerate().filter(|(_, d)| d.status == PointStatus::Used);
+        let (path, used): (Vec<f64>, Vec<&Deviation>) = all.map(|(k, d)| (k as f64, d)).unzip();
         if used.is_empty() {
             return Err(ModelError::TooFewPoints { points: 0, least: 7 });
         }
         let motions = Motions::of(registration, used.iter().map(|d| d.point));
         let observed = motions.observed(&used);
+        let path = if in_order && is_path(&observed.places) { path } else { Vec::new() };
+        let observed = Observed { path, ..observed };
         let priors = given.priors.unwrap_or_else(|| Priors::of_size(motions.size_mm));
         let mut told = Hyper::told(&observed, &priors)?;
         let is_seen = told.likely[0].0.evidence(&observed) > EVIDENCE;
@@ -165,6 +169,19 @@ impl<'a> Seen<'a> {
             is_seen: self.is_seen,
         }
     }
+}
+
+/// Whether points follow each other like those of a path that is gone along: most are near the one before.
+fn is_path(places: &[[f64; 2]]) -> bool {
+    const NEAR: f64 = 3.0;
+    let apart_mm = |pair: &[[f64; 2]]| (pair[1][0] - pair[0][0]).hypot(pair[1][1] - pair[0][1]);
+    let mut steps_mm: Vec<f64> = places.windows(2).map(apart_mm).collect();
+    if steps_mm.is_empty() {
+        return false;
+    }
+    let middle = steps_mm.len() / 2;
+    let median_mm = *steps_mm.select_nth_unstable_by(middle, f64::total_cmp).1;
+    median_mm <= NEAR * spacing_mm(places)
 }
 
 fn plane((point, _): &(Point, Vector)) -> [f64; 2] {
@@ -206,7 +223,7 @@ fn of_the_fit(observed: &Observed, hyper: Hyper, alike: &DMatrix<f64>) -> DMatri
     let inverse = |rows: &DMatrix<f64>| {
         rows.tr_mul(rows).pseudo_inverse(f64::EPSILON).unwrap_or_else(|_| DMatrix::zeros(rows.ncols(), rows.ncols()))
     };
-    let by_scatter = inverse(effects) * hyper.scatter_mm.powi(2);
+    let by_scatter = inverse(effects) * hyper.white_scatter_mm().powi(2);
     let n = places.len();
     let chosen: Vec<usize> = (0..n.min(MOST_PAIRED)).map(|k| k * n / n.min(MOST_PAIRED)).collect();
     let rows = effects.select_rows(&chosen);
@@ -447,6 +464,7 @@ impl Motions {
             places: used.iter().map(|d| [d.point.x, d.point.y]).collect(),
             deviations_mm: used.iter().map(|d| d.deviation_mm).collect(),
             effects: self.rows(used.iter().map(|d| (d.point, d.normal))),
+            path: Vec::new(),
         }
     }
 

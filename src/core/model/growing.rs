@@ -90,7 +90,7 @@ impl Growing {
     /// # Errors
     /// Rows that do not belong together, and numbers that are none; nothing is taken in then.
     pub fn tell(&mut self, observed: &Observed) -> Result<(), ModelError> {
-        let Observed { places, deviations_mm, effects } = observed;
+        let Observed { places, deviations_mm, effects, .. } = observed;
         let (points, columns) = (places.len(), self.effects.ncols());
         if deviations_mm.len() != points || effects.shape() != (points, columns) {
             return Err(ModelError::Shape { points, deviations: deviations_mm.len(), rows: effects.nrows() });
@@ -137,7 +137,7 @@ impl Growing {
 
     /// Says by how many standard deviations of what was expected each of some points is off, the scatter of the probe among them.
     pub fn surprise(&self, observed: &Observed) -> Vec<f64> {
-        let Observed { places, deviations_mm, effects } = observed;
+        let Observed { places, deviations_mm, effects, .. } = observed;
         let of = |k: usize| {
             let row: Vec<f64> = effects.row(k).iter().copied().collect();
             let l = self.solved(places[k], &row);
@@ -224,14 +224,14 @@ mod tests {
     use super::super::{Dense, Field};
     use super::*;
 
-    const HYPER: Hyper = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4 };
+    const HYPER: Hyper = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4, drift: 0.0 };
 
     fn observed(count: u32, effects: usize) -> Observed {
         let places: Vec<[f64; 2]> = (0..count).map(f64::from).map(|k| [(7.31 * k) % 60.0, (13.7 * k) % 40.0]).collect();
         let deviations_mm = places.iter().map(|[x, y]| 5e-3 * ((0.1 * x).sin() + 0.5 * (0.13 * y).cos())).collect();
         let effects =
             DMatrix::from_fn(places.len(), effects, |r, c| [1.0, places[r][0] / 30.0, places[r][1] / 30.0][c]);
-        Observed { places, deviations_mm, effects }
+        Observed { places, deviations_mm, effects, path: Vec::new() }
     }
 
     fn asked(effects: usize) -> (Vec<[f64; 2]>, DMatrix<f64>) {
@@ -290,7 +290,7 @@ mod tests {
         // Touched in truth, and found to be elsewhere.
         let mut touched = grown(&observed, &[60]);
         let effects = DMatrix::from_row_slice(1, 3, &[1.0, place[0] / 30.0, place[1] / 30.0]);
-        touched.tell(&Observed { places: vec![place], deviations_mm: vec![0.1], effects }).unwrap();
+        touched.tell(&Observed { places: vec![place], deviations_mm: vec![0.1], effects, path: Vec::new() }).unwrap();
         for (a, b) in touched.known().zip(&imagined) {
             assert!((a.sigma_mm - b.sigma_mm).abs() < 1e-12);
         }

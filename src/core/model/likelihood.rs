@@ -2,11 +2,11 @@
 //!
 //! The restricted likelihood, whatever the effects are, times what was known beforehand, is made as large as it gets. Its two shapes, the
 //! range and the share of the scatter, are searched; the scale follows from them at once: sigma^2 is the mean square of the whitened
-//! residuals.
+//! residuals. Where the points were measured along a path the drift of the probe is a third one, as far as it is spoken for.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::DMatrix;
 
-use super::{Dense, Field, Hyper, ModelError, Observed};
+use super::{Dense, Field, Hyper, ModelError, Observed, spacing_mm};
 
 /// What is known of a field before anything is measured: the median of each, and by what factor it may be off (one standard deviation of
 /// its logarithm).
@@ -27,9 +27,17 @@ const APART: f64 = 0.2;
 const MOST_TOGETHER: usize = 250;
 /// Of more, so many that lie all over the part tell how wide the field is.
 const SPREAD: usize = 150;
+/// The field, in scatters, that is as good as none.
+const NO_FIELD: f64 = 1e-6;
 /// How far beside the best parameters the likelihood is looked at, and the most by which a scatter is taken for unknown (of its logarithm).
 const STEP: f64 = 0.1;
 const MOST_UNKNOWN: f64 = 0.5;
+/// Drifts at which the search begins, and by how much one has to be spoken for more than none, in the logarithm of the likelihood.
+const DRIFTS: [f64; 3] = [0.3, 0.6, 0.85];
+const DRIFT_EVIDENCE: f64 = 2.0;
+/// How finely a drift is told, and the most that is.
+const DRIFT_STEPS: [f64; 3] = [0.12, 0.06, 0.03];
+const MOST_DRIFT: f64 = 0.97;
 /// Neighbours tell how far a point scatters, and what is narrow: blocks of so many at most, so many blocks at most.
 const POINTS_A_BLOCK: usize = 48;
 const MOST_BLOCKS: usize = 40;
@@ -67,21 +75,41 @@ impl Hyper {
         } else {
             std::iter::once(thinned(observed, SPREAD)).chain(blocks(observed)).collect()
         };
-        let at = |of: &[Observed], [range, ratio]: [f64; 2]| scaled(of, range.exp(), ratio.exp(), priors);
+        let at = |of: &[Observed], [range, ratio]: [f64; 2], drift: f64| {
+            scaled(of, [range.exp(), ratio.exp(), drift], priors)
+        };
         // What is narrower than can be told has no height.
-        let height = |of: &[Observed], place: [f64; 2]| match at(of, place) {
+        let height_of = |of: &[Observed], place: [f64; 2], drift: f64| match at(of, place, drift) {
             Ok((_, value)) if place[0] >= least_mm.ln() => value,
             _ => f64::NEG_INFINITY,
         };
         // A hill may have two tops: a wide form and a narrow one.
         let far = (priors.range_mm[0] / least_mm).max(1.5);
         let ranges = [0.1, 0.4, 0.7, 1.0, 1.5].map(|power: f64| (least_mm * far.powf(power)).ln());
-        let tops = ranges.map(|range| {
-            let places = RATIOS.map(|ratio| [range, ratio.ln()]).map(|place| (place, height(&all, place)));
-            places.into_iter().fold(([range, 0.0], f64::NEG_INFINITY), |a, b| if b.1 > a.1 { b } else { a })
-        });
-        let start = tops.iter().fold(tops[0], |a, b| if b.1 > a.1 { *b } else { a });
-        let (best, top) = climb(start.0, [0.15 * far.ln(), 0.7], 0.01, |place| height(&all, place));
+        let higher = |a: Top, b: Top| if b.1 > a.1 { b } else { a };
+        let tops_of = |drift: f64| {
+            ranges.map(|range| {
+                let places = RATIOS.map(|ratio| [range, ratio.ln()]);
+                let seen = places.map(|place| (place, height_of(&all, place, drift)));
+                seen.into_iter().fold(([range, 0.0], f64::NEG_INFINITY), higher)
+            })
+        };
+        let climbed = |tops: &[Top], drift: f64| {
+            let start = tops.iter().copied().fold(tops[0], higher);
+            climb(start.0, [0.15 * far.ln(), 0.7], 0.01, |place| height_of(&all, place, drift))
+        };
+        let (mut drift, mut tops) = (0.0, tops_of(0.0));
+        let mut found = climbed(&tops, drift);
+        if !observed.path.is_empty() {
+            let drifting =
+                told_drift(found, |drift| climbed(&tops_of(drift), drift), |top, drift| climbed(&[top], drift));
+            if let Some((told, top)) = drifting {
+                (drift, found, tops) = (told, top, tops_of(told));
+            }
+        }
+        let (best, top) = found;
+        let at = |of: &[Observed], place: [f64; 2]| at(of, place, drift);
+        let height = |of: &[Observed], place: [f64; 2]| height_of(of, place, drift);
         let (hyper, _) = at(&all, best)?;
         let others = tops.into_iter().filter(|(place, of)| top - of < NEAR && (place[0] - best[0]).abs() > APART);
         let others =
@@ -98,6 +126,21 @@ impl Hyper {
         let falls = (2.0 * top - below.1 - above.1).max(f64::MIN_POSITIVE);
         Ok(Told { likely, wide, scatter_u: (moved / falls.sqrt()).abs().min(MOST_UNKNOWN) })
     }
+}
+
+/// A place of range and ratio, by their logarithms, and how high the likelihood is there.
+type Top = ([f64; 2], f64);
+
+/// The drift that is spoken for most, with the top of the likelihood by it; none where it is spoken for by too little more than none.
+fn told_drift(without: Top, search: impl Fn(f64) -> Top, climb: impl Fn(Top, f64) -> Top) -> Option<(f64, Top)> {
+    let higher = |a: (f64, Top), b: (f64, Top)| if b.1.1 > a.1.1 { b } else { a };
+    let mut best = DRIFTS.map(|drift| (drift, search(drift))).into_iter().fold((0.0, without), higher);
+    // From there in ever smaller steps: what is near is spoken for by much the same range and ratio.
+    for step in DRIFT_STEPS {
+        let beside = [best.0 - step, best.0 + step].map(|drift| drift.clamp(0.0, MOST_DRIFT));
+        best = beside.map(|drift| (drift, climb(best.1, drift))).into_iter().fold(best, higher);
+    }
+    (best.1.1 > without.1 + DRIFT_EVIDENCE).then_some(best)
 }
 
 /// What speaks for which parameters.
@@ -139,7 +182,8 @@ fn with_plane(observed: &Observed, block: &[usize]) -> Observed {
         0 => 1.0,
         c => places[r][c - 1] - middle[c - 1],
     });
-    Observed { deviations_mm: block.iter().map(|&k| observed.deviations_mm[k]).collect(), places, effects }
+    let deviations_mm = block.iter().map(|&k| observed.deviations_mm[k]).collect();
+    Observed { deviations_mm, places, effects, path: observed.path_of(block) }
 }
 
 impl Hyper {
@@ -147,32 +191,25 @@ impl Hyper {
     pub(super) fn evidence(&self, observed: &Observed) -> f64 {
         let few = thinned(observed, MOST_TOGETHER);
         let with = Dense::fit(&few, *self).map_or(f64::NEG_INFINITY, |model| model.log_likelihood());
-        let (n, p) = few.effects.shape();
-        let base = few.effects.clone().qr();
-        let deviations = DVector::from_column_slice(&few.deviations_mm);
-        let q = base.q();
-        let left = &deviations - &q * q.tr_mul(&deviations);
-        let free = (n - p) as f64;
-        let variance = left.norm_squared() / free;
-        let log_gram = 2.0 * base.r().diagonal().iter().map(|v| v.abs().ln()).sum::<f64>();
-        with + 0.5 * (free * (std::f64::consts::TAU * variance).ln() + free + log_gram)
+        // As good as none, and a scatter that suits it best.
+        let unit = Self { field: Field { sigma_mm: NO_FIELD, ..self.field }, scatter_mm: 1.0, ..*self };
+        let Ok(without) = Dense::fit(&few, unit) else { return f64::INFINITY };
+        let squares = without.whitened_squares(&few);
+        let free = (few.places.len() - few.effects.ncols()) as f64;
+        with - (without.log_likelihood() + 0.5 * squares - 0.5 * free - 0.5 * free * (squares / free).ln())
     }
 }
 
 /// A field that forgets itself between two neighbours is no form: what is narrower than this cannot be told from scatter.
 fn least_range_mm(observed: &Observed) -> f64 {
     const NEIGHBOURS: f64 = 2.5;
-    let span = |axis: usize| {
-        let of = observed.places.iter().map(|place| place[axis]);
-        of.clone().fold(f64::NEG_INFINITY, f64::max) - of.fold(f64::INFINITY, f64::min)
-    };
-    NEIGHBOURS * (span(0) * span(1) / observed.places.len() as f64).sqrt()
+    NEIGHBOURS * spacing_mm(&observed.places)
 }
 
 /// The parameters with the scale that suits them best, and the logarithm of their probability. What tells nothing of its plane, such as points
 /// on a line, tells nothing here.
-fn scaled(told: &[Observed], range_mm: f64, ratio: f64, priors: &Priors) -> Result<(Hyper, f64), ModelError> {
-    let unit = Hyper { field: Field { sigma_mm: 1.0, range_mm }, scatter_mm: ratio };
+fn scaled(told: &[Observed], [range_mm, ratio, drift]: [f64; 3], priors: &Priors) -> Result<(Hyper, f64), ModelError> {
+    let unit = Hyper { field: Field { sigma_mm: 1.0, range_mm }, scatter_mm: ratio, drift };
     let (mut value, mut squares, mut free) = (priors.log_density(range_mm, ratio), 0.0, 0.0);
     for (k, observed) in told.iter().enumerate() {
         let model = match Dense::fit(observed, unit) {
@@ -187,7 +224,7 @@ fn scaled(told: &[Observed], range_mm: f64, ratio: f64, priors: &Priors) -> Resu
     }
     // No deviation at all is a field of no strength.
     let sigma_mm = (squares / free).sqrt().max(f64::MIN_POSITIVE.sqrt());
-    let hyper = Hyper { field: Field { sigma_mm, range_mm }, scatter_mm: ratio * sigma_mm };
+    let hyper = Hyper { field: Field { sigma_mm, range_mm }, scatter_mm: ratio * sigma_mm, drift };
     Ok((hyper, value - 0.5 * free - free * sigma_mm.ln()))
 }
 
@@ -247,6 +284,7 @@ fn climb(start: [f64; 2], steps: [f64; 2], near: f64, height: impl Fn([f64; 2]) 
 mod tests {
     use super::super::normals::Normals;
     use super::*;
+    use nalgebra::DVector;
 
     /// A field of known parameters at 300 places of a part of 102 x 62 mm, moved and tilted by what nobody knows.
     fn drawn(hyper: Hyper, seed: u64) -> Observed {
@@ -263,12 +301,12 @@ mod tests {
         let of = |k: usize, scatter: f64| field[k] + hyper.scatter_mm * scatter + 0.3 - 0.01 * places[k][0];
         let deviations_mm = (0..places.len()).map(|k| of(k, normals.next())).collect();
         let effects = DMatrix::from_fn(places.len(), 3, |r, c| [1.0, places[r][0], places[r][1]][c]);
-        Observed { places, deviations_mm, effects }
+        Observed { places, deviations_mm, effects, path: Vec::new() }
     }
 
     #[test]
     fn planted_parameters_are_found_again() {
-        let planted = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4 };
+        let planted = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4, drift: 0.0 };
         let (mut sigma, mut range, mut scatter) = (0.0, 0.0, 0.0);
         const PARTS: u32 = 6;
         for seed in 0..PARTS {
@@ -282,9 +320,46 @@ mod tests {
         assert!((off[0] - 1.0).abs() < 0.3 && (off[1] - 1.0).abs() < 0.25 && (off[2] - 1.0).abs() < 0.08, "{off:?}");
     }
 
+    /// The same along a path to and fro over a grid of 30 by 18, on which the probe drifts.
+    fn along_a_path(hyper: Hyper, seed: u64) -> Observed {
+        let at = |k: usize| {
+            [if (k / 30).is_multiple_of(2) { k % 30 } else { 29 - k % 30 }, k / 30].map(|at| 3.5 * at as f64)
+        };
+        let places: Vec<[f64; 2]> = (0..540).map(at).collect();
+        let n = places.len();
+        let covariance = DMatrix::from_fn(n, n, |r, c| {
+            hyper.field.covariance_mm2(places[r], places[c]) + if r == c { 1e-14 } else { 0.0 }
+        });
+        let mut normals = Normals::new(seed, 0);
+        let field = covariance.cholesky().unwrap().l() * DVector::from_fn(n, |_, _| normals.next());
+        let mut scatter = normals.next();
+        let mut of = |k: usize| {
+            scatter = hyper.drift * scatter + (1.0 - hyper.drift * hyper.drift).sqrt() * normals.next();
+            field[k] + hyper.scatter_mm * scatter
+        };
+        let deviations_mm = (0..n).map(&mut of).collect();
+        let effects = DMatrix::from_fn(n, 3, |r, c| [1.0, places[r][0], places[r][1]][c]);
+        Observed { places, deviations_mm, effects, path: (0..n).map(|k| k as f64).collect() }
+    }
+
+    #[test]
+    fn a_drift_along_the_path_is_found_again_and_none_is_seen_where_there_is_none() {
+        for drift in [0.0, 0.7, 0.9] {
+            let planted = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4, drift };
+            const PARTS: u64 = 4;
+            let told = |seed| Hyper::of(&along_a_path(planted, seed), &Priors::of_size(102.0)).unwrap();
+            let all: Vec<Hyper> = (1..=PARTS).map(told).collect();
+            let mean = |of: &dyn Fn(&Hyper) -> f64| all.iter().map(of).sum::<f64>() / PARTS as f64;
+            let off = [mean(&|h| h.drift) - drift, mean(&|h| (h.scatter_mm / planted.scatter_mm).ln())];
+            println!("drift {drift}: off by {off:.3?}, {:.3?}", all.iter().map(|h| h.drift).collect::<Vec<_>>());
+            assert!(off[0].abs() < 0.1 && off[1].abs() < 0.3, "{off:?} {all:?}");
+            assert!(drift > 0.0 || all.iter().all(|h| h.drift == 0.0), "{all:?}");
+        }
+    }
+
     #[test]
     fn the_scale_of_everything_is_the_scale_of_what_is_found() {
-        let planted = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4 };
+        let planted = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4, drift: 0.0 };
         let observed = drawn(planted, 1);
         let tenfold =
             Observed { deviations_mm: observed.deviations_mm.iter().map(|d| 10.0 * d).collect(), ..observed.clone() };

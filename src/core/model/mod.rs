@@ -9,7 +9,8 @@
 //! ```
 //!
 //! The deviation of point i is d_i = h_i' b + f(x_i) + e_i. The rows h_i are what the registration could still move (its Jacobian), with
-//! no knowledge of b beforehand; f is a Matern field of smoothness 2; e_i is independent. Motion and field are told together, for a
+//! no knowledge of b beforehand; f is a Matern field of smoothness 2; e_i is independent, or shared
+//! with the points before it along the path where the probe drifts. Motion and field are told together, for a
 //! direction in which the surface does not hold the part looks like form: whoever takes one for known gives the other a lie.
 //!
 //! Two ways to the same answer. [`Dense`] has the covariance of every pair of points: exact, for some 3,000 points. [`Sparse`] has the
@@ -63,6 +64,9 @@ pub struct Hyper {
     pub field: Field,
     /// Standard deviation by which a point scatters by itself.
     pub scatter_mm: f64,
+    /// How much of its scatter the next point along the path has, from 0, where each scatters on its own, to below 1: a scanning
+    /// probe drifts. Points k steps apart share this to the power of k.
+    pub drift: f64,
 }
 
 /// What was measured. All three have a row a point.
@@ -74,13 +78,15 @@ pub struct Observed {
     pub deviations_mm: Vec<f64>,
     /// What a unit of each effect that nobody knows adds to it, such as the motions of the part; may have no column.
     pub effects: DMatrix<f64>,
+    /// Which point of a path each of them is; empty where they were not measured along one.
+    pub path: Vec<f64>,
 }
 
 impl Observed {
     /// Deviations of which nothing moves them all.
     pub fn without_effects(places: Vec<[f64; 2]>, deviations_mm: Vec<f64>) -> Self {
         let effects = DMatrix::zeros(places.len(), 0);
-        Self { places, deviations_mm, effects }
+        Self { places, deviations_mm, effects, path: Vec::new() }
     }
 
     /// Some of them.
@@ -89,14 +95,20 @@ impl Observed {
             places: chosen.iter().map(|&k| self.places[k]).collect(),
             deviations_mm: chosen.iter().map(|&k| self.deviations_mm[k]).collect(),
             effects: self.effects.select_rows(chosen),
+            path: self.path_of(chosen),
         }
+    }
+
+    fn path_of(&self, chosen: &[usize]) -> Vec<f64> {
+        if self.path.is_empty() { Vec::new() } else { chosen.iter().map(|&k| self.path[k]).collect() }
     }
 
     /// Says what makes these no observations.
     fn check(&self) -> Result<(), ModelError> {
-        let Self { places, deviations_mm, effects } = self;
+        let Self { places, deviations_mm, effects, path } = self;
         let (points, columns) = (places.len(), effects.ncols());
-        if deviations_mm.len() != points || effects.nrows() != points {
+        let has_path = path.len() == points && path.iter().all(|value| value.is_finite());
+        if deviations_mm.len() != points || effects.nrows() != points || !(path.is_empty() || has_path) {
             return Err(ModelError::Shape { points, deviations: deviations_mm.len(), rows: effects.nrows() });
         }
         if points <= columns {
@@ -112,14 +124,43 @@ impl Observed {
     }
 }
 
+/// How far apart the points of a part lie, as if each had as much of the rectangle around them.
+fn spacing_mm(places: &[[f64; 2]]) -> f64 {
+    let span = |axis: usize| {
+        let of = places.iter().map(|place| place[axis]);
+        of.clone().fold(f64::NEG_INFINITY, f64::max) - of.fold(f64::INFINITY, f64::min)
+    };
+    (span(0) * span(1) / places.len() as f64).sqrt()
+}
+
 impl Hyper {
+    /// How much of their scatter two points share that are so many steps of the path apart.
+    fn shared(&self, steps: f64) -> f64 {
+        // Further apart nothing is left of it.
+        const FAR: f64 = 36.0;
+        if self.drift == 0.0 {
+            return if steps == 0.0 { 1.0 } else { 0.0 };
+        }
+        let power = steps.abs() * self.drift.ln();
+        if power < -FAR { 0.0 } else { power.exp() }
+    }
+
+    /// The scatter of independent points that would leave as much of a field unknown that is wider than the drift is long: that of their
+    /// sum, s^2 (1 + drift) / (1 - drift).
+    fn white_scatter_mm(&self) -> f64 {
+        self.scatter_mm * ((1.0 + self.drift) / (1.0 - self.drift)).sqrt()
+    }
+
     /// Says what makes these no parameters.
     fn check(&self) -> Result<(), ModelError> {
-        let Self { field: Field { sigma_mm, range_mm }, scatter_mm } = *self;
+        let Self { field: Field { sigma_mm, range_mm }, scatter_mm, drift } = *self;
         for (what, value) in [("field", sigma_mm), ("range", range_mm), ("scatter", scatter_mm)] {
             if !(value.is_finite() && value > 0.0) {
                 return Err(ModelError::Hyper { what, value });
             }
+        }
+        if !(0.0..1.0).contains(&drift) {
+            return Err(ModelError::Drift { value: drift });
         }
         Ok(())
     }

@@ -213,9 +213,9 @@ impl<'a> Sparse<'a> {
     pub fn fit(lattice: &'a Lattice, observed: &Observed, hyper: Hyper) -> Result<Self, ModelError> {
         observed.check()?;
         hyper.check()?;
-        let Observed { places, deviations_mm, effects } = observed;
+        let Observed { places, deviations_mm, effects, .. } = observed;
         let (n, p) = (places.len(), effects.ncols());
-        let precision2 = hyper.scatter_mm.powi(-2);
+        let precision2 = hyper.white_scatter_mm().powi(-2);
         let around: Vec<Around> = places.iter().map(|&place| lattice.around(place)).collect();
         let mut values = lattice.precision(&hyper);
         let before = lattice.pattern.factor(&values).ok_or(ModelError::NotDefinite)?.log_determinant();
@@ -338,7 +338,7 @@ mod tests {
     use super::super::{Dense, Field};
     use super::*;
 
-    const HYPER: Hyper = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4 };
+    const HYPER: Hyper = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4, drift: 0.0 };
 
     fn places(count: u32) -> Vec<[f64; 2]> {
         // Steps of two irrational numbers: everywhere, and nowhere twice.
@@ -355,7 +355,7 @@ mod tests {
         let shape = |[x, y]: [f64; 2]| 5e-3 * ((0.08 * x).sin() * (0.11 * y).cos() + 0.4 * (0.17 * x + 0.05 * y).sin());
         let deviations_mm = places.iter().map(|&place| shape(place) + 3e-4 * normals.next()).collect();
         let effects = DMatrix::from_fn(places.len(), 3, |r, c| [1.0, places[r][0] - 50.0, places[r][1] - 30.0][c]);
-        Observed { places, deviations_mm, effects }
+        Observed { places, deviations_mm, effects, path: Vec::new() }
     }
 
     #[test]
