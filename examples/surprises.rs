@@ -11,7 +11,7 @@ use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 use regrind::drive::Adaptive;
 use regrind::geometry::{Point, Pose, Vector};
-use regrind::model::{FEWEST, FIRST, Given, SoFar, Why, look, short_way, spread};
+use regrind::model::{FEWEST, FIRST, Given, SoFar, Why, look, spread};
 use regrind::registration::{Options, Start, register};
 use regrind::surface::{Nominal, Projection};
 use regrind_sim::Rng;
@@ -152,8 +152,12 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
     let given = Given { look_risk: adaptive.look_risk(), probe_scatter_mm: [SCATTER_MM, 0.15], ..Given::default() };
     let mut tried = vec![None; targets.len()];
     let mut touched: Vec<usize> = Vec::new();
-    let mut next = short_way(&targets, spread(&targets, FIRST.max(FEWEST)));
-    for batch in 0.. {
+    // As in a run: ten for the gates, then so many that a look says something.
+    let fewest = spread(&targets, FEWEST);
+    let mut next = fewest[FIRST..].to_vec();
+    fewest[..FIRST].iter().for_each(|&k| tried[k] = Some(0));
+    touched.extend(&fewest[..FIRST]);
+    for batch in 1.. {
         next.iter().for_each(|&k| tried[k] = Some(batch));
         touched.extend(&next);
         let cloud: Vec<Point> = touched.iter().map(|&k| centres[k]).collect();

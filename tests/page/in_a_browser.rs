@@ -41,6 +41,9 @@ fn a_cell_is_held_gone_on_with_and_aborted_and_every_tab_shows_it() {
     second.until(&mut browser, &banner("HELD"));
     tab.click(&mut browser, "[data-order=resume]");
     second.until(&mut browser, &banner("RUNNING"));
+    // On a telephone too all of it is on the screen.
+    let ends = second.read(&mut browser, "document.querySelector('.simulation').getBoundingClientRect().right");
+    assert!(ends.as_f64().unwrap() <= 390.0, "{ends}");
     second.click(&mut browser, "[data-order=abort]");
     tab.until(&mut browser, &banner("ABORTED"));
     assert!(!is_old(&mut browser, &tab), "a run that is over is not old");
