@@ -63,7 +63,10 @@ fn main() {
         ("steep free form", Box::new(steep())),
     ];
     println!("{repeats} measurements of {points} points each; of 100 the interval of 95 % holds");
-    println!("{:18}{:18}{:>8}{:>8}{:>8}{:>8}    width, in those of who knows the field", "", "", "RMS", "PV", "form", "pose");
+    println!(
+        "{:18}{:18}{:>8}{:>8}{:>8}{:>8}    width, in those of who knows the field",
+        "", "", "RMS", "PV", "form", "pose"
+    );
     for (name, shape) in &shapes {
         let nominal = nominal(shape.as_ref());
         for kind in KINDS {
@@ -76,7 +79,8 @@ fn main() {
             let (form, pose) = (share(&|held| held.points), share(&pose));
             print!("{name:18}{:18}{rms:8.1}{pv:8.1}{form:8.1}{pose:8.1}", kind.name);
             let ratio = |k: usize| share(&|held| held.widths[0][k]) / share(&|held| held.widths[1][k]);
-            let ratios = (0..4).map(|k| if kind.form_rms_mm > 0.0 { format!("{:8.2}", ratio(k)) } else { String::new() });
+            let ratios =
+                (0..4).map(|k| if kind.form_rms_mm > 0.0 { format!("{:8.2}", ratio(k)) } else { String::new() });
             println!("    {}", ratios.collect::<String>());
         }
     }
