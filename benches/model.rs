@@ -13,7 +13,7 @@ fn main() {
     divan::main();
 }
 
-const HYPER: Hyper = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4, drift: 0.0 };
+const HYPER: Hyper = Hyper { field: Field::new(5e-3, 30.0), scatter_mm: 3e-4, drift: 0.0 };
 
 /// Points of a part of 102 x 62 mm with form, scatter, and the six motions of a part as effects.
 fn measured(count: u32) -> Observed {
@@ -78,7 +78,7 @@ fn a_batch_after_400_points_in_place(bencher: Bencher) {
 #[divan::bench]
 fn a_batch_after_400_points_by_the_grid(bencher: Bencher) {
     let (all, map) = (measured(420), nodes(40, 25));
-    let lattice = Lattice::over(&all.places, HYPER.field.range_mm).unwrap();
+    let lattice = Lattice::over(&all.places, &HYPER.field).unwrap();
     bencher.bench(|| Sparse::fit(&lattice, &all, HYPER).unwrap().predict(&map));
 }
 
@@ -87,7 +87,7 @@ fn a_batch_after_400_points_by_the_grid(bencher: Bencher) {
 fn a_measurement_of_1800_points(bencher: Bencher) {
     let (all, map) = (measured(1800), nodes(100, 60));
     bencher.counter(ItemsCount::new(1000_u32)).bench(|| {
-        let lattice = Lattice::over(&map, HYPER.field.range_mm).unwrap();
+        let lattice = Lattice::over(&map, &HYPER.field).unwrap();
         let model = Sparse::fit(&lattice, &all, HYPER).unwrap();
         (model.predict(&map), model.samples(&map, 1000, 1).unwrap())
     });
@@ -97,7 +97,7 @@ fn a_measurement_of_1800_points(bencher: Bencher) {
 fn a_scan_of_28476_points(bencher: Bencher) {
     let (all, map) = (measured(28_476), nodes(100, 60));
     bencher.bench(|| {
-        let lattice = Lattice::over(&map, HYPER.field.range_mm).unwrap();
+        let lattice = Lattice::over(&map, &HYPER.field).unwrap();
         let model = Sparse::fit(&lattice, &all, HYPER).unwrap();
         (model.predict(&map), model.samples(&map, 1000, 1).unwrap())
     });

@@ -221,9 +221,13 @@ fn form_in_words(form: &Form) -> String {
         0.0 => String::new(),
         drift => format!(", of which the next point along the path has {} %", (100.0 * drift).round()),
     };
+    let lay = hyper.field.lay.angle_rad().map_or(String::new(), |angle_rad| {
+        let (times, degrees) = (three_digits(hyper.field.lay.stretch), angle_rad.to_degrees().round());
+        format!(", {times} times as wide along {degrees} degrees from x as across")
+    });
     let sigma = [0, 1, 2].map(|k| um(frame_covariance[(k, k)].sqrt())).join(", ");
     format!(
-        "form        RMS {}, PV {}, PV 99.8 % {}; with 95 %\nmodel       the form is {} um strong and {} mm wide, a point scatters by {} um{drift}\n\
+        "form        RMS {}, PV {}, PV 99.8 % {}; with 95 %\nmodel       the form is {} um strong and {} mm wide{lay}, a point scatters by {} um{drift}\n\
          frame       known to {sigma} um along x, y, z beside that form\n",
         within(&figures.rms),
         within(&figures.pv),

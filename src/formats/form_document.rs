@@ -22,6 +22,12 @@ struct FormDocument {
     /// Standard deviation and range of the form, and scatter of a single point.
     form_sigma_mm: f64,
     form_range_mm: f64,
+    /// How often it can be differentiated: once, thrice, endless.
+    form_smoothness: &'static str,
+    /// Where it is wider along a direction: how many times as wide as across, and the angle of that direction from x.
+    form_lay_stretch: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    form_lay_deg: Option<f64>,
     scatter_mm: f64,
     /// How much of its scatter the next point along the path has.
     scatter_drift: f64,
@@ -55,6 +61,9 @@ pub fn save_form(
         simulation,
         form_sigma_mm: form.hyper.field.sigma_mm,
         form_range_mm: form.hyper.field.range_mm,
+        form_smoothness: form.hyper.field.smoothness.name(),
+        form_lay_stretch: form.hyper.field.lay.stretch,
+        form_lay_deg: form.hyper.field.lay.angle_rad().map(f64::to_degrees),
         scatter_mm: form.hyper.scatter_mm,
         scatter_drift: form.hyper.drift,
         form_is_seen: form.is_seen,

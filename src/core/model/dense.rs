@@ -188,7 +188,7 @@ mod tests {
     use super::super::Field;
     use super::*;
 
-    const HYPER: Hyper = Hyper { field: Field { sigma_mm: 2.0, range_mm: 20.0 }, scatter_mm: 0.5, drift: 0.0 };
+    const HYPER: Hyper = Hyper { field: Field::new(2.0, 20.0), scatter_mm: 0.5, drift: 0.0 };
 
     #[test]
     fn of_one_point_it_is_what_is_worked_out_by_hand() {

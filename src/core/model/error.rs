@@ -15,6 +15,14 @@ pub enum ModelError {
     NotFinite { point: usize },
     #[error("the {what} is {value} mm; it must be finite and above 0")]
     Hyper { what: &'static str, value: f64 },
+    #[error(
+        "the lay of the field goes along {along:?} and stretches it {stretch} times; it must be a unit vector, and 1 time at least"
+    )]
+    Lay { along: [f64; 2], stretch: f64 },
+    #[error("an endlessly smooth field has no precision on a grid; take one that can be differentiated three times")]
+    NoPrecision,
+    #[error("the grid is that of a field with another smoothness or another lay")]
+    OtherGrid,
     #[error("the drift is {value}; it must be 0 at least and below 1")]
     Drift { value: f64 },
     #[error(

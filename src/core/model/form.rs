@@ -9,7 +9,7 @@ use nalgebra::{DMatrix, Matrix3, Matrix6, SymmetricEigen, Vector6};
 
 use rayon::prelude::*;
 
-use super::likelihood::Told;
+use super::likelihood::{ANY, ON_A_GRID, Told};
 use super::normals::Normals;
 use super::spacing_mm;
 use super::{Dense, Hyper, Lattice, ModelError, Observed, Predicted, Priors, Sparse};
@@ -85,6 +85,8 @@ const MOST_DENSE: usize = 700;
 const EVIDENCE: f64 = 2.6;
 /// Points of which every pair is looked at, at most.
 const MOST_PAIRED: usize = 1500;
+/// What is less likely than this counts for nothing.
+const FEW: f64 = 1e-3;
 /// A direction whose variance is less than this share of the largest was held.
 const HELD: f64 = 1e-13;
 
@@ -132,7 +134,7 @@ struct Seen<'a> {
 }
 
 impl<'a> Seen<'a> {
-    fn of(registration: &'a Registration, given: &Given, in_order: bool) -> Result<Self, ModelError> {
+    fn of(registration: &'a Registration, given: &Given, at_points: bool) -> Result<Self, ModelError> {
         let all = registration.deviations.iter().enumerate().filter(|(_, d)| d.status == PointStatus::Used);
         let (path, used): (Vec<f64>, Vec<&Deviation>) = all.map(|(k, d)| (k as f64, d)).unzip();
         if used.is_empty() {
@@ -140,14 +142,16 @@ impl<'a> Seen<'a> {
         }
         let motions = Motions::of(registration, used.iter().map(|d| d.point));
         let observed = motions.observed(&used);
-        let path = if in_order && is_path(&observed.places) { path } else { Vec::new() };
+        let path = if at_points && is_path(&observed.places) { path } else { Vec::new() };
         let observed = Observed { path, ..observed };
         let priors = given.priors.unwrap_or_else(|| Priors::of_size(motions.size_mm));
-        let mut told = Hyper::told(&observed, &priors)?;
+        let is_dense = at_points && observed.places.len() <= MOST_DENSE;
+        let mut told = Hyper::told(&observed, &priors, if is_dense { &ANY } else { &ON_A_GRID })?;
         let is_seen = told.likely[0].0.evidence(&observed) > EVIDENCE;
         if !is_seen {
             // What is spoken for by next to nothing is as good as what is spoken for by a little more.
-            told.likely.push((told.wide, 1.0));
+            let on_a_grid = told.wide.iter().filter(|(wide, _)| ON_A_GRID.contains(&wide.field.smoothness));
+            told.likely.extend(on_a_grid.copied());
             told.likely.iter_mut().for_each(|(_, weight)| *weight = 1.0);
         }
         Ok(Self { used, motions, observed, told, is_seen })
@@ -159,7 +163,7 @@ impl<'a> Seen<'a> {
 
     fn form(&self, given: &Given, drawn: &Drawn) -> Form {
         let alike = self.motions.alike(given, self.places());
-        let covariance = of_the_fit(&self.observed, self.told.wide, &alike);
+        let covariance = of_the_fit(&self.observed, &self.told.wide, &alike);
         Form {
             hyper: self.told.likely[0].0,
             frame_covariance: self.motions.to_twist(&covariance),
@@ -217,25 +221,30 @@ impl Default for Given {
 }
 
 /// The covariance of the motions as the registration finds them, by least squares of deviations that a form makes alike: A+ (K + s^2) A+'
-/// with A+ = (H'H)^-1 H' (Aitken 1935), and of what adds to all points alike. Of many points some tell the part of the form.
-fn of_the_fit(observed: &Observed, hyper: Hyper, alike: &DMatrix<f64>) -> DMatrix<f64> {
+/// with A+ = (H'H)^-1 H' (Aitken 1935), and of what adds to all points alike. K is the mean of those of fields that it may be, each as
+/// likely as it is said. Of many points some tell the part of the form.
+fn of_the_fit(observed: &Observed, likely: &[(Hyper, f64)], alike: &DMatrix<f64>) -> DMatrix<f64> {
     let Observed { places, effects, .. } = observed;
     let inverse = |rows: &DMatrix<f64>| {
         rows.tr_mul(rows).pseudo_inverse(f64::EPSILON).unwrap_or_else(|_| DMatrix::zeros(rows.ncols(), rows.ncols()))
     };
-    let by_scatter = inverse(effects) * hyper.white_scatter_mm().powi(2);
+    let whole: f64 = likely.iter().map(|(_, weight)| weight).sum();
+    let scatter2: f64 = likely.iter().map(|(hyper, weight)| weight / whole * hyper.white_scatter_mm().powi(2)).sum();
     let n = places.len();
     let chosen: Vec<usize> = (0..n.min(MOST_PAIRED)).map(|k| k * n / n.min(MOST_PAIRED)).collect();
     let rows = effects.select_rows(&chosen);
     // A+, a row a point.
     let weights = &rows * inverse(&rows);
     let p = rows.ncols();
+    let fields: Vec<_> = likely.iter().filter(|(_, weight)| *weight > FEW * whole).collect();
     let covered: Vec<f64> = chosen
         .par_iter()
         .flat_map_iter(|&a| {
             let mut sum = vec![0.0; p];
             for (k, &b) in chosen.iter().enumerate() {
-                let covariance = hyper.field.covariance_mm2(places[a], places[b]);
+                let of =
+                    |(hyper, weight): &&(Hyper, f64)| weight / whole * hyper.field.covariance_mm2(places[a], places[b]);
+                let covariance: f64 = fields.iter().map(of).sum();
                 sum.iter_mut().zip(weights.row(k).iter()).for_each(|(sum, weight)| *sum += covariance * weight);
             }
             sum
@@ -243,7 +252,7 @@ fn of_the_fit(observed: &Observed, hyper: Hyper, alike: &DMatrix<f64>) -> DMatri
         .collect();
     let covered = DMatrix::from_row_slice(chosen.len(), p, &covered);
     let of_alike = weights.tr_mul(&alike.select_rows(&chosen));
-    by_scatter + weights.tr_mul(&covered) + &of_alike * of_alike.transpose()
+    inverse(effects) * scatter2 + weights.tr_mul(&covered) + &of_alike * of_alike.transpose()
 }
 
 /// Forms that may have been, a column each, at some places.
@@ -269,7 +278,7 @@ impl Drawn {
                 let scatters = Dense::fit(observed, hyper)?.scatters(count, seed)?;
                 return Ok(DMatrix::from_fn(n, count, |r, c| observed.deviations_mm[r] - scatters[(r, c)]));
             }
-            let lattice = Lattice::over(&observed.places, hyper.field.range_mm)?;
+            let lattice = Lattice::over(&observed.places, &hyper.field)?;
             Sparse::fit(&lattice, observed, hyper)?.samples(&seen.places, count, seed)
         })?;
         Ok(Self { smooth_sigma_mm: spread_mm(&forms), forms, places: seen.places, effects: seen.effects, chosen })
@@ -284,7 +293,7 @@ impl Drawn {
     ) -> Result<Self, ModelError> {
         let everywhere: Vec<[f64; 2]> = observed.places.iter().chain(&places).copied().collect();
         let forms = mixed(places.len(), likely, |hyper, count, seed| {
-            let lattice = Lattice::over(&everywhere, hyper.field.range_mm)?;
+            let lattice = Lattice::over(&everywhere, &hyper.field)?;
             Sparse::fit(&lattice, observed, hyper)?.samples(&places, count, seed)
         })?;
         let drawn = Self { forms, places, effects, chosen: Vec::new(), smooth_sigma_mm: Vec::new() }.after_best_fit();

@@ -224,7 +224,7 @@ mod tests {
     use super::super::{Dense, Field};
     use super::*;
 
-    const HYPER: Hyper = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4, drift: 0.0 };
+    const HYPER: Hyper = Hyper { field: Field::new(5e-3, 30.0), scatter_mm: 3e-4, drift: 0.0 };
 
     fn observed(count: u32, effects: usize) -> Observed {
         let places: Vec<[f64; 2]> = (0..count).map(f64::from).map(|k| [(7.31 * k) % 60.0, (13.7 * k) % 40.0]).collect();

@@ -2,11 +2,14 @@
 //!
 //! The restricted likelihood, whatever the effects are, times what was known beforehand, is made as large as it gets. Its two shapes, the
 //! range and the share of the scatter, are searched; the scale follows from them at once: sigma^2 is the mean square of the whitened
-//! residuals. Where the points were measured along a path the drift of the probe is a third one, as far as it is spoken for.
+//! residuals. Beside them stand the smoothness of the field, the lay along which it is wider, and, where the points were measured along a path, the
+//! drift of the probe, each as far as it is spoken for.
 
 use nalgebra::DMatrix;
+use rayon::prelude::*;
 
-use super::{Dense, Field, Hyper, ModelError, Observed, spacing_mm};
+use super::climb::climb;
+use super::{Dense, Field, Hyper, Lay, ModelError, Observed, Smoothness, spacing_mm};
 
 /// What is known of a field before anything is measured: the median of each, and by what factor it may be off (one standard deviation of
 /// its logarithm).
@@ -35,6 +38,15 @@ const MOST_UNKNOWN: f64 = 0.5;
 /// Drifts at which the search begins, and by how much one has to be spoken for more than none, in the logarithm of the likelihood.
 const DRIFTS: [f64; 3] = [0.3, 0.6, 0.85];
 const DRIFT_EVIDENCE: f64 = 2.0;
+/// Kinds of field: all, and those that have a precision on a grid.
+pub(super) const ANY: [Smoothness; 3] = [Smoothness::Once, Smoothness::Thrice, Smoothness::Endless];
+pub(super) const ON_A_GRID: [Smoothness; 2] = [Smoothness::Once, Smoothness::Thrice];
+/// The logarithm of the stretch of a lay at which the search begins, the most that is told, and by how much it has to be spoken for.
+const FIRST_STRETCH: f64 = 0.6;
+const MOST_STRETCHED: f64 = 10.0;
+const LAY_EVIDENCE: f64 = 4.0;
+/// By how much more each step of smoothness has to be spoken for.
+const DOUBT: f64 = 2.0;
 /// How finely a drift is told, and the most that is.
 const DRIFT_STEPS: [f64; 3] = [0.12, 0.06, 0.03];
 const MOST_DRIFT: f64 = 0.97;
@@ -55,7 +67,7 @@ impl Priors {
 }
 
 impl Hyper {
-    /// Finds the parameters that what was measured speaks for most.
+    /// Finds the parameters that what was measured speaks for most, of fields that both ways of the model can work with.
     ///
     /// Of many points the likelihood is a composite one (Varin, Reid and Firth 2011): of some that lie all over the part, and of blocks of neighbours,
     /// each with a plane of its own that nobody knows.
@@ -63,73 +75,188 @@ impl Hyper {
     /// # Errors
     /// Those of [`Dense::fit`].
     pub fn of(observed: &Observed, priors: &Priors) -> Result<Self, ModelError> {
-        Self::told(observed, priors).map(|told| told.likely[0].0)
+        Self::told(observed, priors, &ON_A_GRID).map(|told| told.likely[0].0)
     }
 
-    /// The same, with what else it might be.
-    pub(super) fn told(observed: &Observed, priors: &Priors) -> Result<Told, ModelError> {
+    /// The same, with what else it might be, of fields of some smoothness.
+    pub(super) fn told(observed: &Observed, priors: &Priors, smoothness: &[Smoothness]) -> Result<Told, ModelError> {
         observed.check()?;
-        let least_mm = least_range_mm(observed);
-        let all = if observed.places.len() <= MOST_TOGETHER {
-            vec![observed.clone()]
-        } else {
-            std::iter::once(thinned(observed, SPREAD)).chain(blocks(observed)).collect()
-        };
-        let at = |of: &[Observed], [range, ratio]: [f64; 2], drift: f64| {
-            scaled(of, [range.exp(), ratio.exp(), drift], priors)
-        };
-        // What is narrower than can be told has no height.
-        let height_of = |of: &[Observed], place: [f64; 2], drift: f64| match at(of, place, drift) {
-            Ok((_, value)) if place[0] >= least_mm.ln() => value,
-            _ => f64::NEG_INFINITY,
-        };
-        // A hill may have two tops: a wide form and a narrow one.
-        let far = (priors.range_mm[0] / least_mm).max(1.5);
-        let ranges = [0.1, 0.4, 0.7, 1.0, 1.5].map(|power: f64| (least_mm * far.powf(power)).ln());
-        let higher = |a: Top, b: Top| if b.1 > a.1 { b } else { a };
-        let tops_of = |drift: f64| {
-            ranges.map(|range| {
-                let places = RATIOS.map(|ratio| [range, ratio.ln()]);
-                let seen = places.map(|place| (place, height_of(&all, place, drift)));
-                seen.into_iter().fold(([range, 0.0], f64::NEG_INFINITY), higher)
-            })
-        };
-        let climbed = |tops: &[Top], drift: f64| {
-            let start = tops.iter().copied().fold(tops[0], higher);
-            climb(start.0, [0.15 * far.ln(), 0.7], 0.01, |place| height_of(&all, place, drift))
-        };
-        let (mut drift, mut tops) = (0.0, tops_of(0.0));
-        let mut found = climbed(&tops, drift);
-        if !observed.path.is_empty() {
-            let drifting =
-                told_drift(found, |drift| climbed(&tops_of(drift), drift), |top, drift| climbed(&[top], drift));
-            if let Some((told, top)) = drifting {
-                (drift, found, tops) = (told, top, tops_of(told));
+        let search = Search::of(observed, priors);
+        let rough = Shape::default();
+        let mut tops = search.tops(rough);
+        let mut best = (rough, search.climbed(&tops, rough));
+        if !observed.path.is_empty()
+            && let Some(drifting) = search.drift(best.1)
+        {
+            best = drifting;
+            tops = search.tops(best.0);
+        }
+        let mut all = vec![best];
+        for &smoothness in smoothness.iter().filter(|of| **of != best.0.smoothness) {
+            let shape = Shape { smoothness, ..best.0 };
+            let seen = search.tops(shape);
+            let top = search.climbed(&seen, shape);
+            if top.1 > all[0].1.1 {
+                tops = seen;
+                all.insert(0, (shape, top));
+            } else {
+                all.push((shape, top));
             }
         }
-        let (best, top) = found;
-        let at = |of: &[Observed], place: [f64; 2]| at(of, place, drift);
-        let height = |of: &[Observed], place: [f64; 2]| height_of(of, place, drift);
-        let (hyper, _) = at(&all, best)?;
-        let others = tops.into_iter().filter(|(place, of)| top - of < NEAR && (place[0] - best[0]).abs() > APART);
-        let others =
-            others.map(|(place, _)| climb(place, [0.0, 0.3], 0.05, |[_, ratio]| height(&all, [place[0], ratio])));
-        let mut likely = vec![(hyper, 1.0)];
-        likely.extend(others.filter_map(|(place, of)| Some((at(&all, place).ok()?.0, (of - top).exp()))));
-        // The wide waves by those points alone that see them.
-        let (wide, _) = climb(best, [0.3, 0.3], 0.03, |place| height(&all[..1], place));
-        let wide = at(&all[..1], wide).map_or(hyper, |(wide, _)| Self { scatter_mm: hyper.scatter_mm, ..wide });
-        // By the curvature of the hill along the scatter, whose scale moves with it.
-        let beside = |step: f64| at(&all, [best[0], best[1] + step]).unwrap_or((hyper, top));
-        let (below, above) = (beside(-STEP), beside(STEP));
-        let moved = 0.5 * (above.0.scatter_mm / below.0.scatter_mm).ln();
-        let falls = (2.0 * top - below.1 - above.1).max(f64::MIN_POSITIVE);
-        Ok(Told { likely, wide, scatter_u: (moved / falls.sqrt()).abs().min(MOST_UNKNOWN) })
+        if let Some(lay) = search.lay(all[0]) {
+            // The others are as much less likely beside it as they were without it.
+            all.iter_mut().for_each(|(shape, _)| shape.lay = lay.0.lay);
+            let higher = lay.1.1 - all[0].1.1;
+            all.iter_mut().for_each(|(_, top)| top.1 += higher);
+            all[0] = lay;
+        }
+        search.told(&all, &tops)
+    }
+}
+
+/// What of the parameters is not climbed to: it is taken one by one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Shape {
+    smoothness: Smoothness,
+    lay: Lay,
+    drift: f64,
+}
+
+impl Default for Shape {
+    fn default() -> Self {
+        Self { smoothness: Smoothness::Once, lay: Lay::NONE, drift: 0.0 }
     }
 }
 
 /// A place of range and ratio, by their logarithms, and how high the likelihood is there.
 type Top = ([f64; 2], f64);
+
+/// The hill of the likelihood.
+struct Search<'a> {
+    /// Points all over the part, and blocks of neighbours.
+    all: Vec<Observed>,
+    priors: &'a Priors,
+    /// The logarithms of the least range that can be told, and of how many of it the range is that is expected.
+    least: f64,
+    far: f64,
+}
+
+impl<'a> Search<'a> {
+    fn of(observed: &Observed, priors: &'a Priors) -> Self {
+        let all = if observed.places.len() <= MOST_TOGETHER {
+            vec![observed.clone()]
+        } else {
+            std::iter::once(thinned(observed, SPREAD)).chain(blocks(observed)).collect()
+        };
+        let least_mm = least_range_mm(observed);
+        Self { all, priors, least: least_mm.ln(), far: (priors.range_mm[0] / least_mm).max(1.5).ln() }
+    }
+
+    fn at(&self, of: &[Observed], [range, ratio]: [f64; 2], shape: Shape) -> Result<(Hyper, f64), ModelError> {
+        scaled(of, [range.exp(), ratio.exp()], shape, self.priors)
+    }
+
+    /// What is narrower than can be told has no height.
+    fn height(&self, of: &[Observed], place: [f64; 2], shape: Shape) -> f64 {
+        match self.at(of, place, shape) {
+            Ok((_, value)) if place[0] >= self.least => value,
+            _ => f64::NEG_INFINITY,
+        }
+    }
+
+    /// A hill may have two tops: a wide form and a narrow one.
+    fn tops(&self, shape: Shape) -> Vec<Top> {
+        let ranges = [0.1, 0.4, 0.7, 1.0, 1.5].map(|power: f64| self.least + power * self.far);
+        let top = |range: &f64| {
+            let places = RATIOS.map(|ratio| [*range, ratio.ln()]);
+            let seen = places.map(|place| (place, self.height(&self.all, place, shape)));
+            seen.into_iter().fold(([*range, 0.0], f64::NEG_INFINITY), higher)
+        };
+        ranges.par_iter().map(top).collect()
+    }
+
+    fn climbed(&self, tops: &[Top], shape: Shape) -> Top {
+        let start = tops.iter().copied().fold(tops[0], higher);
+        climb(start.0, [0.15 * self.far, 0.7], 0.01, |place| self.height(&self.all, place, shape))
+    }
+
+    /// The drift that is spoken for most, with the top of the likelihood by it; none where it is spoken for by too little more than none.
+    fn drift(&self, without: Top) -> Option<(Shape, Top)> {
+        let of = |drift| Shape { drift, ..Shape::default() };
+        let found = told_drift(
+            without,
+            |drift| self.climbed(&self.tops(of(drift)), of(drift)),
+            |top, drift| self.climbed(&[top], of(drift)),
+        );
+        found.map(|(drift, top)| (of(drift), top))
+    }
+
+    /// The lay of the field, where it is spoken for by enough more than none.
+    fn lay(&self, (shape, without): (Shape, Top)) -> Option<(Shape, Top)> {
+        // A lay turns, and none has none: twice its angle and the logarithm of its stretch are the polar coordinates of a plane.
+        let of = |[a, b]: [f64; 2]| {
+            let stretch = a.hypot(b).exp().min(MOST_STRETCHED);
+            Shape { lay: Lay::at(0.5 * b.atan2(a), stretch), ..shape }
+        };
+        let height = |place: [f64; 2]| self.height(&self.all, without.0, of(place));
+        let starts =
+            [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]].map(|along: [f64; 2]| along.map(|v| v * FIRST_STRETCH));
+        let seen = starts.map(|start| (start, height(start)));
+        let start = seen.into_iter().fold(seen[0], higher);
+        if start.1 < without.1 {
+            return None;
+        }
+        let (place, _) = climb(start.0, [0.3, 0.3], 0.03, height);
+        let top = self.climbed(&[without], of(place));
+        (top.1 > without.1 + LAY_EVIDENCE).then(|| (of(place), top))
+    }
+
+    /// The best of some shapes, with what else it might be: `tops` are those of the first.
+    fn told(&self, shapes: &[(Shape, Top)], tops: &[Top]) -> Result<Told, ModelError> {
+        let (shape, (best, top)) = shapes[0];
+        let (hyper, _) = self.at(&self.all, best, shape)?;
+        let mut likely = vec![(hyper, 1.0)];
+        let near = tops.iter().filter(|(place, of)| top - of < NEAR && (place[0] - best[0]).abs() > APART);
+        let climbed = near.map(|(place, _)| {
+            (shape, climb(*place, [0.0, 0.3], 0.05, |[_, ratio]| self.height(&self.all, [place[0], ratio], shape)))
+        });
+        let others: Vec<_> =
+            climbed.chain(shapes[1..].iter().copied()).filter(|(_, (_, of))| top - of < NEAR).collect();
+        likely.extend(
+            others
+                .into_iter()
+                .filter_map(|(shape, (place, of))| Some((self.at(&self.all, place, shape).ok()?.0, (of - top).exp()))),
+        );
+        // By the curvature of the hill along the scatter, whose scale moves with it.
+        let beside = |step: f64| self.at(&self.all, [best[0], best[1] + step], shape).unwrap_or((hyper, top));
+        let (below, above) = (beside(-STEP), beside(STEP));
+        let moved = 0.5 * (above.0.scatter_mm / below.0.scatter_mm).ln();
+        let falls = (2.0 * top - below.1 - above.1).max(f64::MIN_POSITIVE);
+        let scatter_u = (moved / falls.sqrt()).abs().min(MOST_UNKNOWN);
+        Ok(Told { likely, wide: self.wide((shape, best), hyper), scatter_u })
+    }
+
+    /// How strong and how wide the widest waves are, by those points alone that see them, with how much speaks for each smoothness.
+    fn wide(&self, (shape, best): (Shape, [f64; 2]), found: Hyper) -> Vec<(Hyper, f64)> {
+        let spread = &self.all[..1];
+        let of = |smoothness| {
+            let shape = Shape { smoothness, ..shape };
+            let (place, top) = climb(best, [0.3, 0.3], 0.03, |place| self.height(spread, place, shape));
+            let (wide, _) = self.at(spread, place, shape).ok()?;
+            Some((Hyper { scatter_mm: found.scatter_mm, ..wide }, top))
+        };
+        let seen: Vec<(Hyper, f64)> = ANY.into_par_iter().filter_map(of).collect();
+        let top = seen.iter().map(|(_, of)| *of).fold(f64::NEG_INFINITY, f64::max);
+        if !top.is_finite() {
+            return vec![(found, 1.0)];
+        }
+        seen.into_iter().map(|(wide, of)| (wide, (of - top).exp())).collect()
+    }
+}
+
+fn higher(a: Top, b: Top) -> Top {
+    if b.1 > a.1 { b } else { a }
+}
 
 /// The drift that is spoken for most, with the top of the likelihood by it; none where it is spoken for by too little more than none.
 fn told_drift(without: Top, search: impl Fn(f64) -> Top, climb: impl Fn(Top, f64) -> Top) -> Option<(f64, Top)> {
@@ -147,8 +274,8 @@ fn told_drift(without: Top, search: impl Fn(f64) -> Top, climb: impl Fn(Top, f64
 pub(super) struct Told {
     /// The most probable first, with how much more it is spoken for than each other.
     pub(super) likely: Vec<(Hyper, f64)>,
-    /// By points all over the part: how strong and how wide its widest waves are.
-    pub(super) wide: Hyper,
+    /// By points all over the part: how strong and how wide its widest waves are, of each smoothness, with how much speaks for it.
+    pub(super) wide: Vec<(Hyper, f64)>,
     /// Standard uncertainty of the logarithm of the scatter.
     pub(super) scatter_u: f64,
 }
@@ -200,6 +327,15 @@ impl Hyper {
     }
 }
 
+/// What a rough field says of a smooth form is too careful, and what a smooth one says of a rough form is wrong: the smoother has to be spoken for by more.
+fn doubt(smoothness: Smoothness) -> f64 {
+    match smoothness {
+        Smoothness::Once => 0.0,
+        Smoothness::Thrice => -DOUBT,
+        Smoothness::Endless => -2.0 * DOUBT,
+    }
+}
+
 /// A field that forgets itself between two neighbours is no form: what is narrower than this cannot be told from scatter.
 fn least_range_mm(observed: &Observed) -> f64 {
     const NEIGHBOURS: f64 = 2.5;
@@ -208,9 +344,15 @@ fn least_range_mm(observed: &Observed) -> f64 {
 
 /// The parameters with the scale that suits them best, and the logarithm of their probability. What tells nothing of its plane, such as points
 /// on a line, tells nothing here.
-fn scaled(told: &[Observed], [range_mm, ratio, drift]: [f64; 3], priors: &Priors) -> Result<(Hyper, f64), ModelError> {
-    let unit = Hyper { field: Field { sigma_mm: 1.0, range_mm }, scatter_mm: ratio, drift };
-    let (mut value, mut squares, mut free) = (priors.log_density(range_mm, ratio), 0.0, 0.0);
+fn scaled(
+    told: &[Observed],
+    [range_mm, ratio]: [f64; 2],
+    Shape { smoothness, lay, drift }: Shape,
+    priors: &Priors,
+) -> Result<(Hyper, f64), ModelError> {
+    let unit = Hyper { field: Field { sigma_mm: 1.0, range_mm, smoothness, lay }, scatter_mm: ratio, drift };
+    let known = priors.log_density(range_mm, ratio) + doubt(smoothness);
+    let (mut value, mut squares, mut free) = (known, 0.0, 0.0);
     for (k, observed) in told.iter().enumerate() {
         let model = match Dense::fit(observed, unit) {
             Ok(model) => model,
@@ -224,7 +366,7 @@ fn scaled(told: &[Observed], [range_mm, ratio, drift]: [f64; 3], priors: &Priors
     }
     // No deviation at all is a field of no strength.
     let sigma_mm = (squares / free).sqrt().max(f64::MIN_POSITIVE.sqrt());
-    let hyper = Hyper { field: Field { sigma_mm, range_mm }, scatter_mm: ratio * sigma_mm, drift };
+    let hyper = Hyper { field: Field { sigma_mm, ..unit.field }, scatter_mm: ratio * sigma_mm, drift };
     Ok((hyper, value - 0.5 * free - free * sigma_mm.ln()))
 }
 
@@ -240,44 +382,6 @@ fn thinned(observed: &Observed, most: usize) -> Observed {
     chosen.sort_unstable();
     chosen.dedup();
     observed.only(&chosen)
-}
-
-/// Climbs to the highest place of two dimensions by a simplex (Nelder and Mead 1965).
-///
-/// It begins with a simplex of some steps, and ends with one that is smaller than `near`.
-fn climb(start: [f64; 2], steps: [f64; 2], near: f64, height: impl Fn([f64; 2]) -> f64) -> ([f64; 2], f64) {
-    const TURNS: usize = 120;
-    let seen = |place: [f64; 2]| (place, height(place));
-    let mut corners = [seen(start), seen([start[0] + steps[0], start[1]]), seen([start[0], start[1] + steps[1]])];
-    for _ in 0..TURNS {
-        corners.sort_by(|a, b| b.1.total_cmp(&a.1));
-        let [best, middle, worst] = corners;
-        let spread =
-            (0..2).map(|k| (best.0[k] - worst.0[k]).abs().max((best.0[k] - middle.0[k]).abs())).fold(0.0, f64::max);
-        if spread < near {
-            break;
-        }
-        let centre = [0, 1].map(|k| 0.5 * (best.0[k] + middle.0[k]));
-        let along = |factor: f64| [0, 1].map(|k| centre[k] + factor * (centre[k] - worst.0[k]));
-        let reflected = seen(along(1.0));
-        let replaced = if reflected.1 > best.1 {
-            let further = seen(along(2.0));
-            if further.1 > reflected.1 { further } else { reflected }
-        } else if reflected.1 > middle.1 {
-            reflected
-        } else {
-            let nearer = seen(along(if reflected.1 > worst.1 { 0.5 } else { -0.5 }));
-            if nearer.1 <= worst.1.max(reflected.1) {
-                for corner in &mut corners[1..] {
-                    *corner = seen([0, 1].map(|k| 0.5 * (corner.0[k] + best.0[k])));
-                }
-                continue;
-            }
-            nearer
-        };
-        corners[2] = replaced;
-    }
-    corners.into_iter().max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or((start, f64::NEG_INFINITY))
 }
 
 #[cfg(test)]
@@ -306,11 +410,12 @@ mod tests {
 
     #[test]
     fn planted_parameters_are_found_again() {
-        let planted = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4, drift: 0.0 };
+        let planted = Hyper { field: Field::new(5e-3, 30.0), scatter_mm: 3e-4, drift: 0.0 };
         let (mut sigma, mut range, mut scatter) = (0.0, 0.0, 0.0);
         const PARTS: u32 = 6;
         for seed in 0..PARTS {
-            let found = Hyper::of(&drawn(planted, u64::from(seed)), &Priors::of_size(102.0)).unwrap();
+            let told = Hyper::told(&drawn(planted, u64::from(seed)), &Priors::of_size(102.0), &ANY).unwrap();
+            let found = told.likely[0].0;
             sigma += (found.field.sigma_mm / planted.field.sigma_mm).ln() / f64::from(PARTS);
             range += (found.field.range_mm / planted.field.range_mm).ln() / f64::from(PARTS);
             scatter += (found.scatter_mm / planted.scatter_mm).ln() / f64::from(PARTS);
@@ -345,7 +450,7 @@ mod tests {
     #[test]
     fn a_drift_along_the_path_is_found_again_and_none_is_seen_where_there_is_none() {
         for drift in [0.0, 0.7, 0.9] {
-            let planted = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4, drift };
+            let planted = Hyper { field: Field::new(5e-3, 30.0), scatter_mm: 3e-4, drift };
             const PARTS: u64 = 4;
             let told = |seed| Hyper::of(&along_a_path(planted, seed), &Priors::of_size(102.0)).unwrap();
             let all: Vec<Hyper> = (1..=PARTS).map(told).collect();
@@ -359,19 +464,12 @@ mod tests {
 
     #[test]
     fn the_scale_of_everything_is_the_scale_of_what_is_found() {
-        let planted = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4, drift: 0.0 };
+        let planted = Hyper { field: Field::new(5e-3, 30.0), scatter_mm: 3e-4, drift: 0.0 };
         let observed = drawn(planted, 1);
         let tenfold =
             Observed { deviations_mm: observed.deviations_mm.iter().map(|d| 10.0 * d).collect(), ..observed.clone() };
         let [a, b] = [observed, tenfold].map(|observed| Hyper::of(&observed, &Priors::of_size(102.0)).unwrap());
         assert!((b.field.sigma_mm / a.field.sigma_mm - 10.0).abs() < 1e-6);
         assert!((b.field.range_mm / a.field.range_mm - 1.0).abs() < 1e-9);
-    }
-
-    #[test]
-    fn a_hill_is_climbed() {
-        let hill = |[x, y]: [f64; 2]| -(x - 1.0).powi(2) - 30.0 * (y + 2.0 - 0.3 * x).powi(2);
-        let (top, height) = climb([-3.0, 4.0], [0.7, 0.9], 1e-4, hill);
-        assert!((top[0] - 1.0).abs() < 1e-3 && (top[1] + 1.7).abs() < 1e-3 && height > -1e-6, "{top:?}");
     }
 }

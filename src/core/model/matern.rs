@@ -1,19 +1,34 @@
-//! The correlation of a Matern field of smoothness 2.
+//! The correlation of a field at a distance, by its smoothness.
 //!
-//! M(x) = x^2 K_2(x) / 2 with x = kappa r, kappa = 4 / range: at one range the correlation has fallen to about 0.1. K_2 is the modified
-//! Bessel function of the second kind; its integral over exp(-x cosh t) cosh(2 t) is summed once at equal steps of x, and read by cubics
+//! Matern's of smoothness nu is M(x) = 2^(1 - nu) x^nu K_nu(x) / Gamma(nu) with x = kappa r, kappa = sqrt(8 nu) / range: x^2 K_2(x) / 2 and
+//! x^4 K_4(x) / 48. At one range it has fallen to 0.14, and without end of nu it is exp(-2 (r / range)^2). K_nu is the modified
+//! Bessel function of the second kind; its integral over exp(-x cosh t) cosh(nu t) is summed once at equal steps of x, and read by cubics
 //! between them: within 1e-10.
 
 use std::sync::OnceLock;
 
-/// Steps of the table in 1, and where it ends: M(45) is below 1e-16.
+use super::Smoothness;
+
+/// Steps of the table in 1, and where it ends: both are below 1e-14 there.
 const STEPS: usize = 256;
 const LAST: usize = 45;
 
-/// Returns the correlation at a distance of `x` in units of 1 / kappa.
-pub(super) fn correlation(x: f64) -> f64 {
-    static TABLE: OnceLock<Vec<[f64; 2]>> = OnceLock::new();
-    let table = TABLE.get_or_init(|| (0..=LAST * STEPS).map(|k| exact(k as f64 / STEPS as f64)).collect());
+/// A table of the correlation and its slope.
+type Table = OnceLock<Vec<[f64; 2]>>;
+
+/// Returns the correlation at a distance in ranges.
+pub(super) fn correlation(smoothness: Smoothness, ranges: f64) -> f64 {
+    static ONCE: Table = Table::new();
+    static THRICE: Table = Table::new();
+    match smoothness {
+        Smoothness::Once => read(&ONCE, 2, 4.0 * ranges),
+        Smoothness::Thrice => read(&THRICE, 4, 32_f64.sqrt() * ranges),
+        Smoothness::Endless => (-2.0 * ranges * ranges).exp(),
+    }
+}
+
+fn read(table: &Table, nu: i32, x: f64) -> f64 {
+    let table = table.get_or_init(|| (0..=LAST * STEPS).map(|k| exact(nu, k as f64 / STEPS as f64)).collect());
     let at = (x.abs() * STEPS as f64).min((LAST * STEPS) as f64);
     let k = at as usize;
     let (Some([a, da]), Some([b, db])) = (table.get(k), table.get(k + 1)) else { return 0.0 };
@@ -23,13 +38,15 @@ pub(super) fn correlation(x: f64) -> f64 {
     u * u * (1.0 + 2.0 * v) * a + v * v * (1.0 + 2.0 * u) * b + h * u * v * (u * da - v * db)
 }
 
-/// The correlation and its slope: M' = -x^2 K_1(x) / 2.
-fn exact(x: f64) -> [f64; 2] {
+/// The correlation and its slope, M' = -2^(1 - nu) x^nu K_(nu-1)(x) / Gamma(nu).
+fn exact(nu: i32, x: f64) -> [f64; 2] {
     if x == 0.0 {
         return [1.0, 0.0];
     }
-    let half_square = 0.5 * x * x;
-    [half_square * bessel(2.0, x), -half_square * bessel(1.0, x)]
+    // 2^(nu - 1) Gamma(nu)
+    let scale = (1..nu).map(|k| 2.0 * f64::from(k)).product::<f64>();
+    let power = x.powi(nu) / scale;
+    [power * bessel(f64::from(nu), x), -power * bessel(f64::from(nu - 1), x)]
 }
 
 /// K_nu(x) by equal steps: the integrand is analytic and falls doubly exponentially, so the sum is exact to rounding.
@@ -54,36 +71,51 @@ fn bessel(nu: f64, x: f64) -> f64 {
 mod tests {
     use super::*;
 
-    /// K_2 from tables (Abramowitz and Stegun, 9.8; Wolfram): 0.1, 1, 2, 5, 10.
-    const K2: [(f64, f64); 5] = [
-        (0.1, 199.503_964_642_114_1),
-        (1.0, 1.624_838_898_635_177_4),
-        (2.0, 0.253_759_754_566_055_8),
-        (5.0, 5.308_943_712_223_46e-3),
-        (10.0, 2.150_981_700_693_277e-5),
+    /// K_2 and K_4 from tables (Abramowitz and Stegun, 9.8; Wolfram): 0.1, 1, 2, 5, 10.
+    const K: [(f64, f64, f64); 5] = [
+        (0.1, 199.503_964_642_114_1, 479_600.249_792_568_27),
+        (1.0, 1.624_838_898_635_177_4, 44.232_415_847_062_84),
+        (2.0, 0.253_759_754_566_055_8, 2.195_915_927_411_958_6),
+        (5.0, 5.308_943_712_223_46e-3, 1.525_906_581_050_080_5e-2),
+        (10.0, 2.150_981_700_693_277e-5, 3.786_143_716_089_198e-5),
     ];
 
     #[test]
     fn it_is_that_of_the_tables() {
-        for (x, k2) in K2 {
-            let expected = 0.5 * x * x * k2;
-            assert!((correlation(x) / expected - 1.0).abs() < 1e-10, "{x}: {} {expected}", correlation(x));
+        for (x, k2, k4) in K {
+            let of = [
+                (correlation(Smoothness::Once, x / 4.0), 0.5 * x * x * k2),
+                (correlation(Smoothness::Thrice, x / 32_f64.sqrt()), x.powi(4) * k4 / 48.0),
+            ];
+            for (found, expected) in of {
+                assert!((found / expected - 1.0).abs() < 1e-10, "{x}: {found} {expected}");
+            }
         }
-        assert_eq!(correlation(0.0), 1.0);
-        assert_eq!(correlation(1e9), 0.0);
-        assert_eq!(correlation(f64::INFINITY), 0.0);
+        for smoothness in ALL {
+            assert_eq!(correlation(smoothness, 0.0), 1.0);
+            assert_eq!(correlation(smoothness, 1e9), 0.0);
+            assert_eq!(correlation(smoothness, f64::INFINITY), 0.0);
+        }
     }
+
+    const ALL: [Smoothness; 3] = [Smoothness::Once, Smoothness::Thrice, Smoothness::Endless];
 
     #[test]
     fn between_the_steps_it_is_as_exact() {
         for k in 0..4000 {
             let x = 1e-4 + 0.011_37 * f64::from(k);
-            assert!((correlation(x) - exact(x)[0]).abs() < 1e-10, "{x}");
+            for (nu, found) in
+                [(2, correlation(Smoothness::Once, x / 4.0)), (4, correlation(Smoothness::Thrice, x / 32_f64.sqrt()))]
+            {
+                assert!((found - exact(nu, x)[0]).abs() < 1e-10, "{nu} {x}");
+            }
         }
     }
 
     #[test]
-    fn at_one_range_it_has_fallen_to_a_tenth() {
-        assert!((correlation(4.0) - 0.139).abs() < 1e-3, "{}", correlation(4.0));
+    fn at_one_range_each_has_fallen_to_a_seventh() {
+        for smoothness in ALL {
+            assert!((correlation(smoothness, 1.0) - 0.138).abs() < 4e-3, "{}", correlation(smoothness, 1.0));
+        }
     }
 }

@@ -19,8 +19,10 @@
 //!
 //! Frame: places lie in the plane of projection of the model {M}. Units: millimetres.
 
+mod climb;
 mod dense;
 mod error;
+mod field;
 mod form;
 mod growing;
 mod likelihood;
@@ -31,31 +33,14 @@ mod touches;
 
 pub use dense::{Dense, Predicted};
 pub use error::ModelError;
+pub use field::{Field, Lay, Smoothness};
 pub use form::{Form, FormFigures, FormPoint, Given, Interval};
 pub use growing::Growing;
 pub use likelihood::Priors;
 pub use sparse::{Lattice, Sparse};
 pub use touches::{FEWEST, FIRST, Look, MOST_BATCHES, Purpose, SoFar, Why, look, short_way, spread};
 
-use matern::correlation;
 use nalgebra::DMatrix;
-
-/// A smooth random field: how strong it is, and how wide.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Field {
-    /// Standard deviation of the field about 0.
-    pub sigma_mm: f64,
-    /// The distance at which it has all but forgotten itself: correlation 0.14.
-    pub range_mm: f64,
-}
-
-impl Field {
-    /// Returns the covariance of the field at two places.
-    pub fn covariance_mm2(&self, a: [f64; 2], b: [f64; 2]) -> f64 {
-        let distance_mm = (a[0] - b[0]).hypot(a[1] - b[1]);
-        self.sigma_mm * self.sigma_mm * correlation(4.0 * distance_mm / self.range_mm)
-    }
-}
 
 /// What the model has to know before it can tell anything.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -153,11 +138,10 @@ impl Hyper {
 
     /// Says what makes these no parameters.
     fn check(&self) -> Result<(), ModelError> {
-        let Self { field: Field { sigma_mm, range_mm }, scatter_mm, drift } = *self;
-        for (what, value) in [("field", sigma_mm), ("range", range_mm), ("scatter", scatter_mm)] {
-            if !(value.is_finite() && value > 0.0) {
-                return Err(ModelError::Hyper { what, value });
-            }
+        let Self { field, scatter_mm, drift } = *self;
+        field.check()?;
+        if !(scatter_mm.is_finite() && scatter_mm > 0.0) {
+            return Err(ModelError::Hyper { what: "scatter", value: scatter_mm });
         }
         if !(0.0..1.0).contains(&drift) {
             return Err(ModelError::Drift { value: drift });

@@ -1,13 +1,13 @@
 //! The model by the precision of the field on a grid: each node knows its neighbours alone, so there may be any number of points.
 //!
-//! A Matern field of smoothness 2 in the plane solves (kappa^2 - Laplace)^(3/2) tau f = white noise (Lindgren, Rue and Lindstrom 2011). On a square grid
-//! with C the area of each node and Q1 that of kappa^2 - Laplace, the precision is Q = tau^2 Q1 C^-1 Q1 C^-1 Q1.
+//! A Matern field of smoothness nu = alpha - 1 in the plane solves (kappa^2 - Laplace)^(alpha/2) tau f = white noise (Lindgren, Rue and Lindstrom 2011). On a
+//! square grid with C the area of each node and Q1 that of kappa^2 - Laplace, the precision is Q = tau^2 Q1 (C^-1 Q1)^(alpha - 1), with alpha 3 or 5.
 //!
 //! The usual Q1 errs by the square of kappa h. Here it is kappa^2 m x m + K x m + m x K, with K = [-1 2 -1] and m = [1 10 1] / 12 along each axis: for a
 //! wave of w radians a node that is (kappa^2 + w^2)(1 - w^2/12) in every direction, and so the nodes are those of the true field
-//! raised by (1 - w^2/12)^-3/2 = 1 + w^2/8. The quadratic B-splines by which places read the nodes lower it by 1 - w^2/8: what is
+//! raised by (1 - w^2/12)^(-alpha/2) = 1 + alpha w^2/24. The B-splines of degree alpha - 1 by which places read the nodes lower it by the same: what is
 //! left is of the fourth power. tau is that by which the field without an edge has its variance on this very grid; the edge, which would
-//! add to it, lies further than one range away from every place.
+//! add to it, lies further than one range away from every place. A field with a lay is laid on a grid of the plane in which it has none.
 //!
 //! With B the splines from nodes to points, P = Q + B'B / s^2 is the precision of the nodes beside known effects; the effects come from
 //! H'R^-1 H with R^-1 = (1 - B P^-1 B' / s^2) / s^2.
@@ -18,7 +18,7 @@ use rayon::prelude::*;
 
 use super::dense::told_apart;
 use super::normals::Normals;
-use super::{Hyper, ModelError, Observed, Predicted};
+use super::{Field, Hyper, ModelError, Observed, Predicted, Smoothness};
 use crate::sparse::{Factor, Pattern, SelectedInverse};
 
 /// How many ranges the grid goes on beyond every place.
@@ -27,17 +27,17 @@ const MARGIN: f64 = 1.25;
 const MARGIN_OF_PART: f64 = 0.75;
 /// Nodes along a part, at least.
 const NODES_A_PART: f64 = 36.0;
-/// Nodes in one range.
+/// Nodes in one range, at least; and of a smooth field at most: with more the precision drowns in rounding.
 const NODES_A_RANGE: f64 = 14.0;
+const MOST_A_RANGE: f64 = 30.0;
 /// More would take minutes.
 const MOST_NODES: usize = 120_000;
-/// How far Q reaches, and the nodes around a place from each other: three steps along either axis.
-const REACH: isize = 3;
 /// Samples that are made at a time.
 const BATCH: usize = 50;
 
 /// A square grid over the places of a part, and one range beyond them.
 pub struct Lattice {
+    field: Field,
     corner_mm: [f64; 2],
     spacing_mm: f64,
     counts: [usize; 2],
@@ -45,17 +45,25 @@ pub struct Lattice {
 }
 
 /// The nodes by which a place is read, with how much each of them counts.
-type Around = [(usize, f64); 9];
+type Around = Vec<(usize, f64)>;
+
+/// How the precision of a field is made: its alpha, which is how far Q reaches along either axis, and the nodes around a place from each other at most.
+fn reach(smoothness: Smoothness) -> Result<isize, ModelError> {
+    match smoothness {
+        Smoothness::Once => Ok(3),
+        Smoothness::Thrice => Ok(5),
+        Smoothness::Endless => Err(ModelError::NoPrecision),
+    }
+}
 
 impl Lattice {
-    /// Lays a grid that is fine enough for a field of some range, over all places that will be asked for.
+    /// Lays a grid that is fine enough for a field, however strong, over all places that will be asked for.
     ///
     /// # Errors
-    /// No place, a place that is no number, more nodes than can be worked with.
-    pub fn over(places: &[[f64; 2]], range_mm: f64) -> Result<Self, ModelError> {
-        if !(range_mm.is_finite() && range_mm > 0.0) {
-            return Err(ModelError::Hyper { what: "range", value: range_mm });
-        }
+    /// No field, or one that is endlessly smooth; no place, a place that is no number, more nodes than can be worked with.
+    pub fn over(places: &[[f64; 2]], field: &Field) -> Result<Self, ModelError> {
+        field.check()?;
+        let (reach, range_mm) = (reach(field.smoothness)?, field.range_mm);
         if let Some(point) = places.iter().position(|place| !place.iter().all(|value| value.is_finite())) {
             return Err(ModelError::NotFinite { point });
         }
@@ -63,15 +71,18 @@ impl Lattice {
             return Err(ModelError::TooFewPoints { points: 0, least: 1 });
         }
         let spans = [0, 1].map(|axis| {
-            let of = places.iter().map(|place| place[axis]);
+            let of = places.iter().map(|&place| field.straightened(place)[axis]);
             [of.clone().fold(f64::INFINITY, f64::min), of.fold(f64::NEG_INFINITY, f64::max)]
         });
         let size_mm = spans.iter().map(|[low, high]| high - low).fold(0.0, f64::max);
-        // A field that is wider than the part is told by points much nearer to each other than its range; and its edge, however far, is not
-        // seen once the motions of the part are free.
+        // A field that is wider than the part is told by points much nearer to each other than its range; and the edge of a rough one, however far, is
+        // not seen once the motions of the part are free. A smooth one is held by its edge, but has fewer nodes to go there.
         let resolved_mm = if size_mm > 0.0 { size_mm / NODES_A_PART } else { f64::INFINITY };
-        let spacing_mm = (range_mm / NODES_A_RANGE).min(resolved_mm);
-        let beyond_mm = (MARGIN * range_mm).min((MARGIN_OF_PART * size_mm).max(2.0 * spacing_mm));
+        let is_rough = field.smoothness == Smoothness::Once;
+        let finest_mm = if is_rough { 0.0 } else { range_mm / MOST_A_RANGE };
+        let spacing_mm = (range_mm / NODES_A_RANGE).min(resolved_mm).max(finest_mm);
+        let most_mm = if is_rough { (MARGIN_OF_PART * size_mm).max(2.0 * spacing_mm) } else { f64::INFINITY };
+        let beyond_mm = (MARGIN * range_mm).min(most_mm);
         let ends = spans.map(|[low, high]| [low - beyond_mm, high + beyond_mm]);
         let counts = ends.map(|[low, high]| ((high - low) / spacing_mm).ceil() + 1.0);
         let nodes = counts[0] * counts[1];
@@ -79,9 +90,9 @@ impl Lattice {
             return Err(ModelError::TooManyNodes { nodes: nodes as usize, most: MOST_NODES, range_mm });
         }
         let counts = counts.map(|count| count as usize);
-        let (begins, rows) = pattern(counts);
+        let (begins, rows) = pattern(counts, reach);
         let pattern = Pattern::new(counts[0] * counts[1], begins, rows).ok_or(ModelError::NotDefinite)?;
-        Ok(Self { corner_mm: ends.map(|[low, _]| low), spacing_mm, counts, pattern })
+        Ok(Self { field: *field, corner_mm: ends.map(|[low, _]| low), spacing_mm, counts, pattern })
     }
 
     /// Returns the number of nodes.
@@ -91,19 +102,23 @@ impl Lattice {
 
     /// The nodes by which a place is read; for a place beyond the grid those of its edge.
     fn around(&self, place: [f64; 2]) -> Around {
+        let place = self.field.straightened(place);
+        // So many nodes stand on either side of the nearest one.
+        let beside = if self.field.smoothness == Smoothness::Once { 1 } else { 2 };
         let [(i, u), (j, v)] = [0, 1].map(|axis| {
-            let last = (self.counts[axis] - 1) as f64;
-            let at = ((place[axis] - self.corner_mm[axis]) / self.spacing_mm).clamp(0.5, last - 0.5);
-            let nearest = at.round().clamp(1.0, last - 1.0);
-            (nearest as usize - 1, spline(at - nearest))
+            let (first, last) = (beside as f64, (self.counts[axis] - 1 - beside) as f64);
+            let at = ((place[axis] - self.corner_mm[axis]) / self.spacing_mm).clamp(first - 0.5, last + 0.5);
+            let nearest = at.round().clamp(first, last);
+            (nearest as usize - beside, spline(beside, at - nearest))
         });
-        std::array::from_fn(|k| ((j + k / 3) * self.counts[0] + i + k % 3, u[k % 3] * v[k / 3]))
+        let pairs = v.iter().enumerate().flat_map(|(b, v)| u.iter().enumerate().map(move |(a, u)| (a, b, u * v)));
+        pairs.map(|(a, b, weight)| ((j + b) * self.counts[0] + i + a, weight)).collect()
     }
 
     /// The lower triangle of the precision of the field, in the order of the pattern.
-    fn precision(&self, hyper: &Hyper) -> Vec<f64> {
-        let kappa_h = 4.0 / hyper.field.range_mm * self.spacing_mm;
-        let tau2 = unit_variance(kappa_h) / hyper.field.sigma_mm.powi(2);
+    fn precision(&self, hyper: &Hyper, reach: isize) -> Vec<f64> {
+        let kappa_h = (8.0 * (reach - 1) as f64).sqrt() / hyper.field.range_mm * self.spacing_mm;
+        let tau2 = unit_variance(kappa_h, reach) / hyper.field.sigma_mm.powi(2);
         let [nx, ny] = self.counts.map(|count| count as isize);
         // Along an axis, in units of the spacing: C, and K and m = C - K / 12 between a node and the one `step` further.
         let share = |k: isize, count: isize| if k == 0 || k == count - 1 { 0.5 } else { 1.0 };
@@ -117,13 +132,14 @@ impl Lattice {
             whole - pull(k, step, count) / 12.0
         };
         let inside = |i: isize, j: isize| (0..nx).contains(&i) && (0..ny).contains(&j);
-        const SIDE: usize = 2 * REACH as usize + 3;
-        const MIDDLE: isize = REACH + 1;
+        // Of the farthest reach, and what is looked at beside it.
+        const SIDE: usize = 13;
+        const MIDDLE: isize = 6;
         let column = |of: usize| -> Vec<f64> {
             let (i0, j0) = (of as isize % nx, of as isize / nx);
             let mut window = [[0.0_f64; SIDE]; SIDE];
             window[MIDDLE as usize][MIDDLE as usize] = 1.0;
-            for turn in 1..=REACH {
+            for turn in 1..=reach {
                 let mut next = [[0.0_f64; SIDE]; SIDE];
                 for (dj, di) in (-turn..=turn).flat_map(|dj| (-turn..=turn).map(move |di| (dj, di))) {
                     let (i, j) = (i0 + di, j0 + dj);
@@ -138,13 +154,13 @@ impl Lattice {
                             value += weight * window[(MIDDLE + dj + sj) as usize][(MIDDLE + di + si) as usize];
                         }
                     }
-                    // Between two of the three stands C^-1.
-                    let area = if turn < REACH { share(i, nx) * share(j, ny) } else { 1.0 };
+                    // Between two of them stands C^-1.
+                    let area = if turn < reach { share(i, nx) * share(j, ny) } else { 1.0 };
                     next[(MIDDLE + dj) as usize][(MIDDLE + di) as usize] = value / area;
                 }
                 window = next;
             }
-            below(of, self.counts)
+            below(of, self.counts, reach)
                 .map(|(di, dj)| tau2 * window[(MIDDLE + dj) as usize][(MIDDLE + di) as usize])
                 .collect()
         };
@@ -152,25 +168,33 @@ impl Lattice {
     }
 }
 
-/// How much each of three nodes counts at `t` from the middle one, -1/2 to 1/2: the quadratic B-spline.
-fn spline(t: f64) -> [f64; 3] {
-    [0.5 * (0.5 - t).powi(2), 0.75 - t * t, 0.5 * (0.5 + t).powi(2)]
+/// How much each node counts, at `t` from the nearest one (-1/2 to 1/2) of so many on either side: the B-spline of twice that degree.
+fn spline(beside: usize, t: f64) -> Vec<f64> {
+    let quartic = |x: f64| match x.abs() {
+        x if x <= 0.5 => 115.0 / 192.0 - 0.625 * x * x + 0.25 * x.powi(4),
+        x if x <= 1.5 => (55.0 + 20.0 * x - 120.0 * x * x + 80.0 * x.powi(3) - 16.0 * x.powi(4)) / 96.0,
+        x => (5.0 - 2.0 * x).powi(4) / 384.0,
+    };
+    match beside {
+        1 => vec![0.5 * (0.5 - t).powi(2), 0.75 - t * t, 0.5 * (0.5 + t).powi(2)],
+        _ => (-2..=2).map(|k| quartic(t - f64::from(k))).collect(),
+    }
 }
 
 /// Where, beside a node, the precision has an entry in its column, at or below the diagonal; ascending.
-fn below(of: usize, [nx, ny]: [usize; 2]) -> impl Iterator<Item = (isize, isize)> {
+fn below(of: usize, [nx, ny]: [usize; 2], reach: isize) -> impl Iterator<Item = (isize, isize)> {
     let (i0, j0) = ((of % nx) as isize, (of / nx) as isize);
-    let all = (0..=REACH).flat_map(|dj| (-REACH..=REACH).map(move |di| (di, dj)));
+    let all = (0..=reach).flat_map(move |dj| (-reach..=reach).map(move |di| (di, dj)));
     all.filter(move |&(di, dj)| {
         let (i, j) = (i0 + di, j0 + dj);
         (dj > 0 || di >= 0) && (0..nx as isize).contains(&i) && j < ny as isize
     })
 }
 
-fn pattern(counts: [usize; 2]) -> (Vec<usize>, Vec<usize>) {
+fn pattern(counts: [usize; 2], reach: isize) -> (Vec<usize>, Vec<usize>) {
     let (mut begins, mut rows) = (vec![0], Vec::new());
     for of in 0..counts[0] * counts[1] {
-        rows.extend(below(of, counts).map(|(di, dj)| (of as isize + dj * counts[0] as isize + di) as usize));
+        rows.extend(below(of, counts, reach).map(|(di, dj)| (of as isize + dj * counts[0] as isize + di) as usize));
         begins.push(rows.len());
     }
     (begins, rows)
@@ -178,14 +202,18 @@ fn pattern(counts: [usize; 2]) -> (Vec<usize>, Vec<usize>) {
 
 /// The variance, with tau = 1, of the field on a grid without an edge: the mean over the waves that the grid has of what the precision
 /// and the spline at a node make of them.
-fn unit_variance(kappa_h: f64) -> f64 {
+fn unit_variance(kappa_h: f64, reach: isize) -> f64 {
     // The function is smooth and returns to itself: equal steps are exact once they are finer than its width.
     let steps = ((40.0 / kappa_h) as usize).clamp(64, 4096);
     let wave = |k: usize| (std::f64::consts::TAU * k as f64 / steps as f64).cos();
+    let spline = |c: f64| match reach {
+        3 => (3.0 + c) / 4.0,
+        _ => (114.0 + 76.0 * c + 2.0 * c * c) / 192.0,
+    };
     // K, m and the spline along one axis.
-    let axis: Vec<[f64; 3]> = (0..steps).map(wave).map(|c| [2.0 - 2.0 * c, (5.0 + c) / 6.0, (3.0 + c) / 4.0]).collect();
+    let axis: Vec<[f64; 3]> = (0..steps).map(wave).map(|c| [2.0 - 2.0 * c, (5.0 + c) / 6.0, spline(c)]).collect();
     let of = |[ka, ma, sa]: [f64; 3], [kb, mb, sb]: [f64; 3]| {
-        (sa * sb).powi(2) * (kappa_h * kappa_h * ma * mb + ka * mb + ma * kb).powi(-3)
+        (sa * sb).powi(2) * (kappa_h * kappa_h * ma * mb + ka * mb + ma * kb).powi(-reach as i32)
     };
     let rows: Vec<f64> = axis.par_iter().map(|&a| axis.iter().map(|&b| of(a, b)).sum()).collect();
     rows.iter().sum::<f64>() / (steps * steps) as f64
@@ -216,8 +244,11 @@ impl<'a> Sparse<'a> {
         let Observed { places, deviations_mm, effects, .. } = observed;
         let (n, p) = (places.len(), effects.ncols());
         let precision2 = hyper.white_scatter_mm().powi(-2);
+        if (hyper.field.smoothness, hyper.field.lay) != (lattice.field.smoothness, lattice.field.lay) {
+            return Err(ModelError::OtherGrid);
+        }
         let around: Vec<Around> = places.iter().map(|&place| lattice.around(place)).collect();
-        let mut values = lattice.precision(&hyper);
+        let mut values = lattice.precision(&hyper, reach(hyper.field.smoothness)?);
         let before = lattice.pattern.factor(&values).ok_or(ModelError::NotDefinite)?.log_determinant();
         for nodes in &around {
             for (a, wa) in nodes {
@@ -335,10 +366,10 @@ impl<'a> Sparse<'a> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Dense, Field};
+    use super::super::{Dense, Lay};
     use super::*;
 
-    const HYPER: Hyper = Hyper { field: Field { sigma_mm: 5e-3, range_mm: 30.0 }, scatter_mm: 3e-4, drift: 0.0 };
+    const HYPER: Hyper = Hyper { field: Field::new(5e-3, 30.0), scatter_mm: 3e-4, drift: 0.0 };
 
     fn places(count: u32) -> Vec<[f64; 2]> {
         // Steps of two irrational numbers: everywhere, and nowhere twice.
@@ -358,33 +389,51 @@ mod tests {
         Observed { places, deviations_mm, effects, path: Vec::new() }
     }
 
+    /// A field of each smoothness, one with a lay, and one far wider than the part.
+    fn hypers() -> [Hyper; 4] {
+        let smooth = Field { smoothness: Smoothness::Thrice, ..HYPER.field };
+        let fields = [
+            HYPER.field,
+            Field { range_mm: 45.0, ..smooth },
+            Field { lay: Lay::at(0.4, 3.0), range_mm: 40.0, ..HYPER.field },
+            Field { sigma_mm: 0.1, range_mm: 250.0, ..smooth },
+        ];
+        fields.map(|field| Hyper { field, ..HYPER })
+    }
+
     #[test]
     fn it_tells_what_the_covariances_of_all_points_tell() {
         let observed = observed(1500);
-        let exact = Dense::fit(&observed, HYPER).unwrap();
-        let lattice = Lattice::over(&observed.places, HYPER.field.range_mm).unwrap();
-        let sparse = Sparse::fit(&lattice, &observed, HYPER).unwrap();
         let asked: Vec<[f64; 2]> = (0..600).map(|k| [4.1 * f64::from(k % 25), 2.6 * f64::from(k / 25)]).collect();
-        let (mut worst_mean, mut worst_sigma) = (0.0_f64, 0.0_f64);
-        for (a, b) in exact.predict(&asked).into_iter().zip(sparse.predict(&asked)) {
-            worst_mean = worst_mean.max((a.mean_mm - b.mean_mm).abs() / a.sigma_mm);
-            worst_sigma = worst_sigma.max((b.sigma_mm / a.sigma_mm - 1.0).abs());
+        for hyper in hypers() {
+            let exact = Dense::fit(&observed, hyper).unwrap();
+            let lattice = Lattice::over(&observed.places, &hyper.field).unwrap();
+            let sparse = Sparse::fit(&lattice, &observed, hyper).unwrap();
+            let (mut worst_mean, mut worst_sigma) = (0.0_f64, 0.0_f64);
+            for (a, b) in exact.predict(&asked).into_iter().zip(sparse.predict(&asked)) {
+                worst_mean = worst_mean.max((a.mean_mm - b.mean_mm).abs() / a.sigma_mm);
+                worst_sigma = worst_sigma.max((b.sigma_mm / a.sigma_mm - 1.0).abs());
+            }
+            println!(
+                "{} nodes: mean off by {worst_mean:.4} sigma, sigma by {:.3} %",
+                lattice.nodes(),
+                100.0 * worst_sigma
+            );
+            assert!(worst_mean < 0.05 && worst_sigma < 0.02, "{hyper:?} {worst_mean} {worst_sigma}");
+            let sigmas = |found: &DMatrix<f64>| found.diagonal().map(f64::sqrt);
+            let (a, b) = (sigmas(exact.effects().1), sigmas(sparse.effects().1));
+            assert!((0..3).all(|k| (b[k] / a[k] - 1.0).abs() < 0.02), "{hyper:?} {a} {b}");
+            let off = exact.effects().0 - sparse.effects().0;
+            assert!((0..3).all(|k| off[k].abs() < 0.05 * a[k]), "{hyper:?} {off} {a}");
+            let likelihoods = [exact.log_likelihood(), sparse.log_likelihood()];
+            assert!((likelihoods[0] - likelihoods[1]).abs() < 3.0, "{hyper:?} {likelihoods:?}");
         }
-        println!("mean off by {worst_mean:.4} sigma, sigma by {:.3} %", 100.0 * worst_sigma);
-        assert!(worst_mean < 0.05 && worst_sigma < 0.02, "{worst_mean} {worst_sigma}");
-        let sigmas = |found: &DMatrix<f64>| found.diagonal().map(f64::sqrt);
-        let (a, b) = (sigmas(exact.effects().1), sigmas(sparse.effects().1));
-        assert!((0..3).all(|k| (b[k] / a[k] - 1.0).abs() < 0.02), "{a} {b}");
-        let off = exact.effects().0 - sparse.effects().0;
-        assert!((0..3).all(|k| off[k].abs() < 0.05 * a[k]), "{off} {a}");
-        let likelihoods = [exact.log_likelihood(), sparse.log_likelihood()];
-        assert!((likelihoods[0] - likelihoods[1]).abs() < 3.0, "{likelihoods:?}");
     }
 
     #[test]
     fn samples_scatter_as_it_says_and_are_the_same_for_a_seed() {
         let observed = observed(120);
-        let lattice = Lattice::over(&observed.places, HYPER.field.range_mm).unwrap();
+        let lattice = Lattice::over(&observed.places, &HYPER.field).unwrap();
         let model = Sparse::fit(&lattice, &observed, HYPER).unwrap();
         let asked = [[10.0, 10.0], [50.0, 30.0], [101.0, 61.0], [0.0, 62.0]];
         let samples = model.samples(&asked, 4000, 1).unwrap();
@@ -405,21 +454,31 @@ mod tests {
         let observed = Observed::without_effects(vec![[300.0, 300.0]], vec![0.0]);
         let asked = [[0.0, 0.0], [37.3, 11.9], [90.0, 60.0]];
         let all: Vec<[f64; 2]> = asked.iter().copied().chain(observed.places.clone()).collect();
-        let lattice = Lattice::over(&all, HYPER.field.range_mm).unwrap();
-        let model = Sparse::fit(&lattice, &observed, HYPER).unwrap();
-        for told in model.predict(&asked) {
-            assert!(told.mean_mm.abs() < 1e-12);
-            assert!((told.sigma_mm / HYPER.field.sigma_mm - 1.0).abs() < 0.02, "{told:?}");
+        for hyper in &hypers()[..3] {
+            let lattice = Lattice::over(&all, &hyper.field).unwrap();
+            let model = Sparse::fit(&lattice, &observed, *hyper).unwrap();
+            for told in model.predict(&asked) {
+                assert!(told.mean_mm.abs() < 1e-12);
+                assert!((told.sigma_mm / hyper.field.sigma_mm - 1.0).abs() < 0.02, "{hyper:?} {told:?}");
+            }
         }
     }
 
     #[test]
     fn a_grid_that_cannot_be_is_refused_in_words() {
-        let of = |places: &[[f64; 2]], range_mm| Lattice::over(places, range_mm).err().unwrap().to_string();
+        let of = |places: &[[f64; 2]], range_mm| {
+            Lattice::over(places, &Field::new(1.0, range_mm)).err().unwrap().to_string()
+        };
         assert!(of(&[], 1.0).contains("1 points at least"));
         assert!(of(&[[0.0, f64::NAN]], 1.0).contains("point 1 "));
         assert!(of(&[[0.0; 2]], 0.0).contains("the range is 0 mm"));
         assert!(of(&[[0.0; 2], [1e6, 1e6]], 1.0).contains("more than 120000"));
-        assert!(Lattice::over(&[[5.0, 5.0]], 1.0).is_ok(), "one place is enough");
+        let endless = Field { smoothness: Smoothness::Endless, ..Field::new(1.0, 1.0) };
+        assert!(Lattice::over(&[[5.0, 5.0]], &endless).err().unwrap().to_string().contains("no precision"));
+        let observed = Observed::without_effects(vec![[5.0, 5.0]], vec![0.0]);
+        let lattice = Lattice::over(&observed.places, &Field::new(1.0, 1.0)).unwrap();
+        let other = Hyper { field: Field { lay: Lay::at(0.0, 2.0), ..Field::new(1.0, 1.0) }, ..HYPER };
+        assert!(Sparse::fit(&lattice, &observed, other).err().unwrap().to_string().contains("another lay"));
+        assert!(Lattice::over(&[[5.0, 5.0]], &Field::new(1.0, 1.0)).is_ok(), "one place is enough");
     }
 }
