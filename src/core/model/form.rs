@@ -147,7 +147,7 @@ impl<'a> Seen<'a> {
         let priors = given.priors.unwrap_or_else(|| Priors::of_size(motions.size_mm));
         let is_dense = at_points && observed.places.len() <= MOST_DENSE;
         let mut told = Hyper::told(&observed, &priors, if is_dense { &ANY } else { &ON_A_GRID })?;
-        let is_seen = told.likely[0].0.evidence(&observed) > EVIDENCE;
+        let is_seen = told.plain.evidence(&observed) > EVIDENCE;
         if !is_seen {
             // What is spoken for by next to nothing is as good as what is spoken for by a little more.
             let on_a_grid = told.wide.iter().filter(|(wide, _)| ON_A_GRID.contains(&wide.field.smoothness));

@@ -83,18 +83,21 @@ impl Hyper {
         observed.check()?;
         let search = Search::of(observed, priors);
         let rough = Shape::default();
-        let mut tops = search.tops(rough);
+        let mut tops = search.tops(rough, &RATIOS);
         let mut best = (rough, search.climbed(&tops, rough));
         if !observed.path.is_empty()
             && let Some(drifting) = search.drift(best.1)
         {
             best = drifting;
-            tops = search.tops(best.0);
+            tops = search.tops(best.0, &RATIOS);
         }
+        let (plain, _) = search.at(&search.all, best.1.0, best.0)?;
+        let ratio = best.1.0[1].exp();
         let mut all = vec![best];
         for &smoothness in smoothness.iter().filter(|of| **of != best.0.smoothness) {
             let shape = Shape { smoothness, ..best.0 };
-            let seen = search.tops(shape);
+            // What is smoother is narrower, and leaves more to the scatter.
+            let seen = search.tops(shape, &[ratio, 3.0 * ratio]);
             let top = search.climbed(&seen, shape);
             if top.1 > all[0].1.1 {
                 tops = seen;
@@ -110,7 +113,7 @@ impl Hyper {
             all.iter_mut().for_each(|(_, top)| top.1 += higher);
             all[0] = lay;
         }
-        search.told(&all, &tops)
+        search.told(&all, &tops, plain)
     }
 }
 
@@ -165,12 +168,12 @@ impl<'a> Search<'a> {
     }
 
     /// A hill may have two tops: a wide form and a narrow one.
-    fn tops(&self, shape: Shape) -> Vec<Top> {
+    fn tops(&self, shape: Shape, ratios: &[f64]) -> Vec<Top> {
         let ranges = [0.1, 0.4, 0.7, 1.0, 1.5].map(|power: f64| self.least + power * self.far);
         let top = |range: &f64| {
-            let places = RATIOS.map(|ratio| [*range, ratio.ln()]);
+            let places = ratios.iter().map(|ratio| [*range, ratio.ln()]);
             let seen = places.map(|place| (place, self.height(&self.all, place, shape)));
-            seen.into_iter().fold(([*range, 0.0], f64::NEG_INFINITY), higher)
+            seen.fold(([*range, 0.0], f64::NEG_INFINITY), higher)
         };
         ranges.par_iter().map(top).collect()
     }
@@ -185,7 +188,7 @@ impl<'a> Search<'a> {
         let of = |drift| Shape { drift, ..Shape::default() };
         let found = told_drift(
             without,
-            |drift| self.climbed(&self.tops(of(drift)), of(drift)),
+            |drift| self.climbed(&self.tops(of(drift), &RATIOS), of(drift)),
             |top, drift| self.climbed(&[top], of(drift)),
         );
         found.map(|(drift, top)| (of(drift), top))
@@ -212,7 +215,7 @@ impl<'a> Search<'a> {
     }
 
     /// The best of some shapes, with what else it might be: `tops` are those of the first.
-    fn told(&self, shapes: &[(Shape, Top)], tops: &[Top]) -> Result<Told, ModelError> {
+    fn told(&self, shapes: &[(Shape, Top)], tops: &[Top], plain: Hyper) -> Result<Told, ModelError> {
         let (shape, (best, top)) = shapes[0];
         let (hyper, _) = self.at(&self.all, best, shape)?;
         let mut likely = vec![(hyper, 1.0)];
@@ -233,17 +236,22 @@ impl<'a> Search<'a> {
         let moved = 0.5 * (above.0.scatter_mm / below.0.scatter_mm).ln();
         let falls = (2.0 * top - below.1 - above.1).max(f64::MIN_POSITIVE);
         let scatter_u = (moved / falls.sqrt()).abs().min(MOST_UNKNOWN);
-        Ok(Told { likely, wide: self.wide((shape, best), hyper), scatter_u })
+        Ok(Told { likely, plain, wide: self.wide(shapes, hyper), scatter_u })
     }
 
     /// How strong and how wide the widest waves are, by those points alone that see them, with how much speaks for each smoothness.
-    fn wide(&self, (shape, best): (Shape, [f64; 2]), found: Hyper) -> Vec<(Hyper, f64)> {
+    fn wide(&self, shapes: &[(Shape, Top)], found: Hyper) -> Vec<(Hyper, f64)> {
+        let (best, (from, _)) = shapes[0];
         let spread = &self.all[..1];
         let of = |smoothness| {
-            let shape = Shape { smoothness, ..shape };
-            let (place, top) = climb(best, [0.3, 0.3], 0.03, |place| self.height(spread, place, shape));
+            let known = shapes.iter().find(|(shape, _)| shape.smoothness == smoothness && self.all.len() == 1);
+            let (shape, (place, top)) = known.copied().unwrap_or_else(|| {
+                let shape = Shape { smoothness, ..best };
+                (shape, climb(from, [0.3, 0.3], 0.03, |place| self.height(spread, place, shape)))
+            });
             let (wide, _) = self.at(spread, place, shape).ok()?;
-            Some((Hyper { scatter_mm: found.scatter_mm, ..wide }, top))
+            // Each is taken for as likely as it is: what is too careful of the three makes the mean of them careful.
+            Some((Hyper { scatter_mm: found.scatter_mm, ..wide }, top - doubt(smoothness)))
         };
         let seen: Vec<(Hyper, f64)> = ANY.into_par_iter().filter_map(of).collect();
         let top = seen.iter().map(|(_, of)| *of).fold(f64::NEG_INFINITY, f64::max);
@@ -274,6 +282,8 @@ fn told_drift(without: Top, search: impl Fn(f64) -> Top, climb: impl Fn(Top, f64
 pub(super) struct Told {
     /// The most probable first, with how much more it is spoken for than each other.
     pub(super) likely: Vec<(Hyper, f64)>,
+    /// The most probable of the roughest without a lay: how much speaks for a form is known of these.
+    pub(super) plain: Hyper,
     /// By points all over the part: how strong and how wide its widest waves are, of each smoothness, with how much speaks for it.
     pub(super) wide: Vec<(Hyper, f64)>,
     /// Standard uncertainty of the logarithm of the scatter.
