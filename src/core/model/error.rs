@@ -15,6 +15,10 @@ pub enum ModelError {
     NotFinite { point: usize },
     #[error("the {what} is {value} mm; it must be finite and above 0")]
     Hyper { what: &'static str, value: f64 },
+    #[error(
+        "the standard uncertainty of the {what} is {value} (mm, rad or a share); it must be 0 at least and what a measuring machine can have: correct what is stated of the machine"
+    )]
+    Stated { what: &'static str, value: f64 },
     #[error("the drift is {value}; it must be 0 at least and below 1")]
     Drift { value: f64 },
     #[error(
