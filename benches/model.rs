@@ -25,7 +25,7 @@ fn measured(count: u32) -> Observed {
     let scatter = |k: usize| 5e-4 * ((k as f64 * 12.9898).sin() * 43_758.545_3).fract();
     let deviations_mm = places.iter().enumerate().map(|(k, &place)| shape(place) + scatter(k)).collect();
     let effects = motions(&places);
-    Observed { places, deviations_mm, effects, path: Vec::new() }
+    Observed { effects, ..Observed::without_effects(places, deviations_mm) }
 }
 
 /// What the six motions of a part that is bent both ways add at each place.
@@ -63,6 +63,7 @@ fn a_batch_after_400_points_in_place(bencher: Bencher) {
         places: all.places[from..until].to_vec(),
         deviations_mm: all.deviations_mm[from..until].to_vec(),
         effects: all.effects.rows(from, until - from).into_owned(),
+        stated: DMatrix::zeros(until - from, 0),
         path: Vec::new(),
     };
     let effects = motions(&map);

@@ -24,7 +24,7 @@ fn main() {
     let columns = rows.first().map_or(0, Vec::len);
     let (seen, asked) = (places("places"), places("asked"));
     let effects = DMatrix::from_fn(seen.len(), columns, |r, c| rows[r][c]);
-    let observed = Observed { places: seen, deviations_mm: numbers(&told["deviations_mm"]), effects, path: Vec::new() };
+    let observed = Observed { effects, ..Observed::without_effects(seen, numbers(&told["deviations_mm"])) };
     let field = Field::new(number("sigma_mm"), number("range_mm"));
     let hyper = Hyper { field, scatter_mm: number("scatter_mm"), drift: 0.0 };
     let began = std::time::Instant::now();

@@ -9,6 +9,7 @@
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
+use regrind::cell::{PvOf, Tolerance};
 use regrind::drive::Adaptive;
 use regrind::geometry::{Point, Pose, Vector};
 use regrind::model::{FEWEST, FIRST, Given, SoFar, Why, look, spread};
@@ -142,13 +143,14 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
             Point::from(centre[0])
         })
         .collect();
-    let adaptive = Adaptive {
-        pv_mm: f64::INFINITY,
-        pv_most_points_mm: 7e-3 * limits,
+    let tolerance = Tolerance {
+        pv_mm: 7e-3 * limits,
         rms_mm: 1e-3 * limits,
-        accepted_risk: 0.025,
-        most_cycles: 5,
+        with_uncertainty: true,
+        probability: Tolerance::USUAL,
+        pv_of: PvOf::MostPoints,
     };
+    let adaptive = Adaptive { tolerance, accepted_risk: 0.025, most_cycles: 5 };
     let given = Given { look_risk: adaptive.look_risk(), probe_scatter_mm: [SCATTER_MM, 0.15], ..Given::default() };
     let mut tried = vec![None; targets.len()];
     let mut touched: Vec<usize> = Vec::new();
@@ -175,7 +177,7 @@ fn measured(shape: &FreeForm, nominal: &Nominal, planted: Planted, limits: f64, 
             let told = mean(&|k| look.form.points[k].form.mean_mm - without[k]) / mean(&|k| planted[k]);
             let whole = planted + without;
             let (rms_mm, pv_mm) = figures_mm(&whole);
-            let conforms = rms_mm <= adaptive.rms_mm && pv_mm <= adaptive.pv_most_points_mm;
+            let conforms = rms_mm <= adaptive.tolerance.rms_mm && pv_mm <= adaptive.tolerance.pv_mm;
             let is_accepted = look.why == Why::Within;
             return Seen {
                 touches: touched.len(),

@@ -10,7 +10,7 @@ use std::time::Duration;
 use sha2::{Digest, Sha256};
 use thiserror::Error;
 
-use crate::cell::{CellPlan, Deadlines, Device, Disposal, Gates, PvOf, Tolerance};
+use crate::cell::{CellPlan, Deadlines, Device, Disposal, Gates, Tolerance};
 use crate::compensation::path::{
     Field, Limits, PathError, PathOptions, Scallops, TrackSpacing, Wanted, Wheel as PathWheel,
 };
@@ -143,6 +143,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         least_found: recipe.measure.minimum_coverage,
         temperature_c: recipe.measure.temperature_c,
         expansion: expansion(recipe, cell),
+        machine: cell.cmm.uncertainty,
         adaptive: adaptive(recipe),
         simulation: cell.simulated,
     };
@@ -161,14 +162,19 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
 /// What a measurement goes by whose touches are chosen.
 fn adaptive(recipe: &Recipe) -> Option<Adaptive> {
     let accepted_risk = recipe.measuring.accepted_risk.filter(|_| recipe.measuring.mode == Mode::Adaptive)?;
+    Some(Adaptive { tolerance: tolerance(recipe), accepted_risk, most_cycles: u32::from(recipe.cycle.most_cycles) })
+}
+
+/// What is accepted.
+fn tolerance(recipe: &Recipe) -> Tolerance {
     let limit = |um: Option<Um>| um.map_or(f64::INFINITY, Um::mm);
-    let pv_mm = limit(recipe.acceptance.pv_um);
-    let (pv_mm, pv_most_points_mm) = match recipe.acceptance.pv_of {
-        PvOf::All => (pv_mm, f64::INFINITY),
-        PvOf::MostPoints => (f64::INFINITY, pv_mm),
-    };
-    let (rms_mm, most_cycles) = (limit(recipe.acceptance.rms_um), u32::from(recipe.cycle.most_cycles));
-    Some(Adaptive { pv_mm, pv_most_points_mm, rms_mm, accepted_risk, most_cycles })
+    Tolerance {
+        pv_mm: limit(recipe.acceptance.pv_um),
+        rms_mm: limit(recipe.acceptance.rms_um),
+        with_uncertainty: recipe.acceptance.expanded_uncertainty,
+        probability: recipe.probability(),
+        pv_of: recipe.acceptance.pv_of,
+    }
 }
 
 /// Returns how long so many bytes may take over the line of a machine, with room for it to be sent anew.
@@ -524,12 +530,7 @@ fn plan(recipe: &Recipe, cell: &CellConfig) -> CellPlan {
     CellPlan {
         begin_with: recipe.cycle.begin_with,
         max_cycles: u32::from(recipe.cycle.most_cycles),
-        tolerance: Tolerance {
-            pv_mm: recipe.acceptance.pv_um.map_or(f64::INFINITY, Um::mm),
-            rms_mm: recipe.acceptance.rms_um.map_or(f64::INFINITY, Um::mm),
-            with_uncertainty: recipe.acceptance.expanded_uncertainty,
-            pv_of: recipe.acceptance.pv_of,
-        },
+        tolerance: tolerance(recipe),
         stall_share: 0.02,
         stall_mm: recipe.cycle.stall_um.mm(),
         on_stall: recipe.cycle.on_stall,

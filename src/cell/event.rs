@@ -4,6 +4,7 @@
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
+use super::figure::Interval;
 use super::state::Device;
 
 /// A person, and where the order was given.
@@ -347,40 +348,6 @@ pub struct FormFigures {
     /// How far a single point scatters (rms).
     #[serde(with = "super::number")]
     pub scatter_mm: f64,
-}
-
-/// What a measurement leaves possible of a figure, on record.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Interval {
-    /// As probably above as below.
-    #[serde(with = "super::number")]
-    pub median_mm: f64,
-    /// Below it with a probability of 2.5 %; 0 where the figure is known from above alone.
-    #[serde(with = "super::number")]
-    pub low_mm: f64,
-    /// Above it with a probability of 2.5 %.
-    #[serde(with = "super::number")]
-    pub high_mm: f64,
-}
-
-impl Interval {
-    /// A figure that is as uncertain to either side.
-    pub fn about(median_mm: f64, expanded_mm: f64) -> Self {
-        Self { median_mm, low_mm: median_mm - expanded_mm, high_mm: median_mm + expanded_mm }
-    }
-
-    /// Returns the expanded uncertainty: half of its width.
-    pub fn expanded_mm(&self) -> f64 {
-        0.5 * (self.high_mm - self.low_mm)
-    }
-
-    pub(super) fn is_sound(&self) -> bool {
-        let Self { median_mm, low_mm, high_mm } = *self;
-        [median_mm, low_mm, high_mm].iter().all(|v| v.is_finite())
-            && low_mm <= median_mm
-            && median_mm <= high_mm
-            && median_mm >= 0.0
-    }
 }
 
 /// What another pass is expected to leave.

@@ -1,7 +1,8 @@
 //! What follows from the figures of a cycle, and why, in words.
 
 use super::command::Verdict;
-use super::event::{Figures, Interval, Response};
+use super::event::{Figures, Response};
+use super::figure::Interval;
 use super::plan::{CellPlan, PvOf, Tolerance};
 
 /// A figure that is worse than the one before by more than this share makes a cycle worse.
@@ -46,7 +47,8 @@ impl Figures {
     }
 }
 
-/// Where a figure lies beside its limit once its uncertainty is counted (ISO 14253-1).
+/// Where a figure lies beside its limit once its uncertainty is counted (ISO 14253-1, JCGM 106): within with the probability of the
+/// tolerance at least, beyond with the same, or neither.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Conformity {
     /// Within, for certain.
@@ -82,19 +84,44 @@ pub struct Compared {
     pub between_mm: [f64; 2],
     /// The largest that is accepted; infinite where it is not limited.
     pub limit_mm: f64,
+    /// The probability that it is within its limit, 0.001 to 0.999, whether it is counted or not; none where it is not limited.
+    pub within: Option<f64>,
+    /// What is held against the limit: the least and the most that it may be by the probability of the tolerance, or twice what was found.
+    pub held_mm: [f64; 2],
     /// What follows, with the uncertainty where the tolerance counts it.
     pub conformity: Conformity,
+}
+
+impl Compared {
+    /// Returns with what probability the figure is within its limit, for people; none where it is not limited.
+    pub fn within_in_words(&self) -> Option<String> {
+        let [least, most] = [Interval::PROBABILITIES[0], Interval::PROBABILITIES[Interval::COUNT - 1]];
+        self.within.map(|within| match within {
+            _ if within <= least => format!("within it with less than {}", percent(least)),
+            _ if within >= most => format!("within it with more than {}", percent(most)),
+            _ => format!("within it with {}", percent(within)),
+        })
+    }
+}
+
+/// Writes a probability, for people: never more than it is.
+fn percent(probability: f64) -> String {
+    format!("{:.1} %", 0.1 * (1e3 * probability + 1e-6).floor())
 }
 
 impl Tolerance {
     /// Compares the two figures that are judged with their limits: the peak to valley of the points that it is taken of, and the RMS.
     pub fn compare(&self, figures: &Figures) -> [Compared; 2] {
         let ([pv, rms], is_robust) = figures.known(self.pv_of);
-        let compared = |name, of: Interval, limit_mm| {
+        let compared = |name, of: Interval, limit_mm: f64| {
             let between_mm = [of.low_mm, of.high_mm];
-            let counted = if self.with_uncertainty { between_mm } else { [of.median_mm; 2] };
-            let conformity = Conformity::of(counted, limit_mm);
-            Compared { name, found_mm: of.median_mm, expanded_mm: of.expanded_mm(), between_mm, limit_mm, conformity }
+            let held_mm = match self.with_uncertainty {
+                true => [1.0 - self.probability, self.probability].map(|share| of.quantile_mm(share)),
+                false => [of.median_mm; 2],
+            };
+            let within = limit_mm.is_finite().then(|| of.probability_within(limit_mm));
+            let (conformity, expanded_mm) = (Conformity::of(held_mm, limit_mm), of.expanded_mm());
+            Compared { name, found_mm: of.median_mm, expanded_mm, between_mm, limit_mm, within, held_mm, conformity }
         };
         [compared(if is_robust { "PV 99.8 %" } else { "PV" }, pv, self.pv_mm), compared("RMS", rms, self.rms_mm)]
     }
@@ -213,12 +240,19 @@ fn wrong(response: Response) -> Option<&'static str> {
 }
 
 fn told(plan: &CellPlan, now: &Figures) -> String {
-    let of = |Compared { name, found_mm, expanded_mm, limit_mm, .. }: Compared| {
-        format!("{name} {} ± {} of {}", um(found_mm), um(expanded_mm), um(limit_mm))
+    let of = |compared: Compared| {
+        let within = compared.within_in_words().map_or(String::new(), |words| format!(" ({words})"));
+        let Compared { name, found_mm, expanded_mm, limit_mm, .. } = compared;
+        format!("{name} {} ± {} of {}{within}", um(found_mm), um(expanded_mm), um(limit_mm))
     };
     let [pv, rms] = plan.tolerance.compare(now).map(of);
-    let counts = if plan.tolerance.with_uncertainty { "with" } else { "without" };
-    format!("{pv}, {rms}, {counts} the uncertainty")
+    let Tolerance { with_uncertainty, probability, .. } = plan.tolerance;
+    let counts = if with_uncertainty {
+        format!("{} is asked for", percent(probability))
+    } else {
+        "without the uncertainty".into()
+    };
+    format!("{pv}, {rms}; {counts}")
 }
 
 /// Writes a length in micrometres, for people.

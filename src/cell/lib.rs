@@ -20,6 +20,7 @@ mod act;
 mod alarm;
 mod command;
 mod event;
+mod figure;
 mod judge;
 mod machine;
 mod memory;
@@ -32,8 +33,9 @@ pub use alarm::{Alarm, AlarmId, Role};
 pub use command::{Command, Ending, Judgement, Verdict};
 pub use event::{
     Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Forecast, FormFigures, Gate,
-    GateFailure, Interval, JobResult, Mismatch, Occupation, Reconciliation, RecordFailure, Response, TouchOn,
+    GateFailure, JobResult, Mismatch, Occupation, Reconciliation, RecordFailure, Response, TouchOn,
 };
+pub use figure::Interval;
 pub use judge::{Compared, Conformity};
 pub use memory::Cell;
 pub use plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, PvOf, Tolerance};

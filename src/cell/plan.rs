@@ -56,10 +56,30 @@ pub struct Tolerance {
     /// Root mean square; infinite where it is not limited.
     #[serde(deserialize_with = "super::number::limit")]
     pub rms_mm: f64,
-    /// Whether the expanded uncertainty is added to the figures first.
+    /// Whether the uncertainty of the figures is counted; else what is as probably above as below is held against the limit.
     pub with_uncertainty: bool,
+    /// The probability with which a figure must be within its limit to be accepted, and beyond it to be rejected, 0.5 to below 1. Recorded where it is not
+    /// the usual one.
+    #[serde(default = "Tolerance::usual", skip_serializing_if = "Tolerance::is_usual")]
+    pub probability: f64,
     /// Which points the peak to valley is taken of.
     pub pv_of: PvOf,
+}
+
+impl Tolerance {
+    /// The probability that is asked for where nobody asks for another: of a normal figure its guard band is the expanded uncertainty with
+    /// k = 2 (ISO 14253-1).
+    pub const USUAL: f64 = 0.975;
+
+    fn usual() -> f64 {
+        Self::USUAL
+    }
+
+    // What serde asks takes a reference.
+    #[allow(clippy::trivially_copy_pass_by_ref)]
+    fn is_usual(probability: &f64) -> bool {
+        *probability == Self::USUAL
+    }
 }
 
 /// Which points a peak to valley is taken of.

@@ -16,7 +16,7 @@ use super::state::{Device, Phase, State};
 
 /// The version of the table. A run is gone on with by a program of the version that began it only; a change of what follows from
 /// anything is another version.
-pub const TABLE_VERSION: u32 = 5;
+pub const TABLE_VERSION: u32 = 6;
 
 /// What an event does in a state.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -96,7 +96,13 @@ fn plan(disposal: Disposal) -> CellPlan {
     CellPlan {
         begin_with: Beginning::Grind,
         max_cycles: 3,
-        tolerance: Tolerance { pv_mm: 0.010, rms_mm: 0.002, with_uncertainty: false, pv_of: PvOf::All },
+        tolerance: Tolerance {
+            pv_mm: 0.010,
+            rms_mm: 0.002,
+            with_uncertainty: false,
+            probability: Tolerance::USUAL,
+            pv_of: PvOf::All,
+        },
         stall_share: 0.05,
         stall_mm: 0.0,
         on_stall: disposal,

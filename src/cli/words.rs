@@ -38,7 +38,8 @@ pub(super) fn judged(compared: &Compared) -> String {
     let um = |mm: f64| three_digits(1e3 * mm);
     let Compared { name, found_mm, limit_mm, .. } = compared;
     let of = if limit_mm.is_finite() { format!(" of {}", um(*limit_mm)) } else { String::new() };
-    format!("{name} {}{of} um", um(*found_mm))
+    let within = compared.within_in_words().map_or(String::new(), |words| format!(" ({words})"));
+    format!("{name} {}{of} um{within}", um(*found_mm))
 }
 
 /// Writes the least and the most time that something will take.

@@ -3,11 +3,12 @@
 use std::path::Path;
 use std::time::Duration;
 
-use super::written::{CellFile, FixtureTable, GrinderTable, SphereTable, TimingTable, TravelTable};
+use super::written::{CellFile, FixtureTable, GrinderTable, SphereTable, TimingTable, TravelTable, UncertaintyTable};
 use super::{CellConfig, Cmm, Grinder, GrinderLimits, Link, ReferenceSphere, Travel};
 use crate::device::{Place, RegisterMap, Signal, SignalTable, Timing, Wire};
 use crate::document::Document;
 use crate::geometry::{Point, Pose, Twist};
+use crate::model;
 
 /// Everything of a cell but where it came from; `None` where something is missing, which has been told.
 pub(super) struct Checked {
@@ -86,6 +87,7 @@ pub(super) fn check(written: &CellFile, document: &mut Document) -> Checked {
             fixture_cmm_from_model: fixture(&cmm.fixture),
             scale_expansion_um_m_k: cmm.temperature.scale_expansion_um_m_k,
             temperature_uncertainty_k: cmm.temperature.uncertainty_k,
+            uncertainty: uncertainty(&cmm.uncertainty),
             reference_sphere: sphere.flatten(),
             travel: travel.flatten(),
         }),
@@ -168,6 +170,17 @@ fn fixture(written: &FixtureTable) -> Pose {
         Pose::exp(&twist).rotation
     };
     Pose { rotation: turn(2) * turn(1) * turn(0), translation_mm: written.translation_mm.into() }.orthonormalised()
+}
+
+fn uncertainty(written: &UncertaintyTable) -> model::Machine {
+    const MILLIONTH: f64 = 1e-6;
+    const UM: f64 = 1e-3;
+    model::Machine {
+        scale: written.scale_ppm.map(|ppm| MILLIONTH * ppm),
+        squareness_rad: written.squareness_urad.map(|urad| MILLIONTH * urad),
+        probe_mm: UM * written.probe_um,
+        reference_sphere_mm: UM * written.reference_sphere_um,
+    }
 }
 
 fn reference_sphere(

@@ -15,6 +15,7 @@ use std::sync::LazyLock;
 use crate::device::{RegisterMap, Signal, Timing, Wire};
 use crate::document::{Document, Problems, problem_at, read_text, schema_of, sha256};
 use crate::geometry::{Point, Pose};
+use crate::model::Machine;
 
 /// A cell, checked.
 #[derive(Clone, Debug)]
@@ -43,6 +44,8 @@ pub struct Cmm {
     pub scale_expansion_um_m_k: f64,
     /// Standard uncertainty of the temperature of the part that it tells.
     pub temperature_uncertainty_k: f64,
+    /// What it does to all points together, as standard uncertainties.
+    pub uncertainty: Machine,
     /// The sphere on which the probe is checked.
     pub reference_sphere: Option<ReferenceSphere>,
     /// The box that the probe's centre must not leave.

@@ -51,6 +51,8 @@ pub(super) struct CmmTable {
     pub signals: Vec<SignalTable>,
     /// What it knows of temperatures; looked at where a recipe tells how its part grows.
     pub temperature: TemperatureTable,
+    /// What it does to all points together, as standard uncertainties; what is left out is not stated, and taken for 0.
+    pub uncertainty: UncertaintyTable,
     /// Where the fixture holds the part.
     pub fixture: FixtureTable,
     /// The sphere on which the probe is checked.
@@ -123,6 +125,24 @@ impl Default for TemperatureTable {
     fn default() -> Self {
         Self { scale_expansion_um_m_k: 0.0, uncertainty_k: 0.5 }
     }
+}
+
+/// What a measuring machine does to all points together, as standard uncertainties: half of what a certificate states with k = 2. Points cannot show it.
+#[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct UncertaintyTable {
+    /// Of the lengths along its x, y and z axes, in millionths.
+    #[schemars(inner(range(min = 0.0, max = 1000.0)), example = [0.5, 0.5, 0.5])]
+    pub scale_ppm: [f64; 3],
+    /// Of the angles between its axes, xy, xz and yz.
+    #[schemars(inner(range(min = 0.0, max = 10000.0)), example = [1.0, 1.0, 1.0])]
+    pub squareness_urad: [f64; 3],
+    /// Of the error of the probe in any one direction, beside its radius.
+    #[schemars(range(min = 0.0, max = 1000.0), example = 0.2)]
+    pub probe_um: f64,
+    /// Of the radius of the sphere that the probe is qualified on.
+    #[schemars(range(min = 0.0, max = 1000.0), example = 0.05)]
+    pub reference_sphere_um: f64,
 }
 
 /// Where the fixture holds the part: CMM coordinates are the turned model coordinates plus the translation.

@@ -41,8 +41,8 @@ use tokio::task::{JoinError, JoinSet};
 use tokio::time::Instant;
 
 use crate::cell::{
-    Actor, Asked, Cell, CellPlan, Command, CompensationRefusal, Device, Ending, Event, Gate, GateFailure, Judgement,
-    Phase, RecordFailure, State, StateName,
+    Actor, Asked, Cell, CellPlan, Command, Compared, CompensationRefusal, Device, Ending, Event, Gate, GateFailure,
+    Judgement, Phase, RecordFailure, State, StateName,
 };
 use crate::device::{
     AnyCmm, AnyGrinder, Armed, Cmm, Grinder, Identified, Interrupt, Job, Measurement, Number, PassRecord, Word, hex,
@@ -857,12 +857,14 @@ impl Drive {
     async fn leave_judgement(&mut self, which: u32, judgement: &Judgement) {
         let number = judgement.cycle;
         let cycle = self.cycles.get(number);
+        let judged = cycle.and_then(|c| c.figures.as_ref()).map(|figures| self.cell.plan().tolerance.compare(figures));
         let result = json!({
             "simulation": self.task.simulation,
             "cycle": number,
             "verdict": judgement.verdict,
             "reason": judgement.reason,
             "figures": cycle.and_then(|c| c.figures.as_ref()),
+            "judged": judged.map(|judged| judged.map(|of| judged_of(&of))),
             "level_mm": cycle.map(|c| c.correction.level_mm),
         });
         self.leave(format!("{}/result.json", folder_of(number, which)), number, &result).await;
@@ -1076,4 +1078,15 @@ fn message_of(failure: &RecordFailure) -> String {
     match failure {
         RecordFailure::DiskFull(message) | RecordFailure::Unwritable(message) => message.clone(),
     }
+}
+
+/// A figure beside its limit, as the result of a cycle has it.
+fn judged_of(of: &Compared) -> Value {
+    json!({
+        "name": of.name,
+        "found_mm": of.found_mm,
+        "expanded_mm": of.expanded_mm,
+        "limit_mm": Some(of.limit_mm).filter(|limit| limit.is_finite()),
+        "probability_within": of.within,
+    })
 }

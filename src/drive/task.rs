@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::cell::Figures;
+use crate::cell::{Figures, PvOf, Tolerance};
 use crate::compensation::path::{PathError, Scallops, Summary, ToolPath};
 use crate::compensation::{Correction, CorrectionLimits, ErrorMap, GainRule, LearningState, MapOptions, NextPassError};
 use crate::device::{Careful, Coordinates, CorrectionMap, Identified, Pass, Plan, Target, TargetKind};
@@ -11,7 +11,7 @@ use crate::formats::gcode::GcodeError;
 use crate::formats::{CorrectionIdentities, FormatError, Learned, ResultFolder, write_correction};
 use crate::geometry::{Grid, Point, Pose, Sample, Vector};
 use crate::measuring::{self, Expansion, sphere_targets};
-use crate::model::{FIRST, Form, Purpose, spread};
+use crate::model::{FIRST, Form, Machine, Purpose, spread};
 use crate::registration::{
     Deviation, MapLimits, Method, Options, PointStatus, Registration, RegistrationError, Start, register,
 };
@@ -79,6 +79,8 @@ pub struct Task {
     pub temperature_c: Option<[f64; 2]>,
     /// How part and scales grow with their temperature, where the recipe tells it of the part.
     pub expansion: Option<Expansion>,
+    /// What the measuring machine does to all points together, as its cell file states it.
+    pub machine: Machine,
     /// How touches are chosen; none where all targets are touched.
     pub adaptive: Option<Adaptive>,
     /// Whether the cell is simulated; everything stored is marked so.
@@ -88,12 +90,8 @@ pub struct Task {
 /// What a measurement goes by whose touches are chosen.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Adaptive {
-    /// The largest peak to valley that is accepted, of all points; infinite where it is not limited.
-    pub pv_mm: f64,
-    /// The same of most.
-    pub pv_most_points_mm: f64,
-    /// The largest root mean square that is accepted; infinite where it is not limited.
-    pub rms_mm: f64,
+    /// What is accepted, as the plan of the cell has it.
+    pub tolerance: Tolerance,
     /// The probability with which a part that is not in tolerance may be accepted.
     pub accepted_risk: f64,
     /// The most passes of the grinder.
@@ -110,14 +108,19 @@ impl Adaptive {
     /// An rms that is as hard to keep as a peak to valley of 1.
     const RMS_OF_PV: f64 = 0.2;
 
-    /// The probability with which one look may err.
+    /// The probability with which one look may err: a share of the accepted risk, and no more than who judges may, so that what a look takes for within
+    /// is accepted.
     pub fn look_risk(&self) -> f64 {
-        self.accepted_risk / Self::LOOKS
+        (self.accepted_risk / Self::LOOKS).min(1.0 - self.tolerance.probability)
     }
 
     /// What a measurement after a pass is to tell.
     pub fn purpose(&self, may_grind: bool) -> Purpose {
-        let Self { pv_mm, pv_most_points_mm, rms_mm, .. } = *self;
+        let Tolerance { pv_mm, rms_mm, pv_of, .. } = self.tolerance;
+        let (pv_mm, pv_most_points_mm) = match pv_of {
+            PvOf::All => (pv_mm, f64::INFINITY),
+            PvOf::MostPoints => (f64::INFINITY, pv_mm),
+        };
         let correction_mm = Self::KNOWN * rms_mm.min(Self::RMS_OF_PV * pv_mm.min(pv_most_points_mm));
         Purpose { pv_mm, pv_most_points_mm, rms_mm, correction_mm, may_grind }
     }

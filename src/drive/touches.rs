@@ -39,7 +39,7 @@ pub(super) fn look(
     }
     let so_far = SoFar { targets: &places, tried: &tried, touched: &points.of };
     let purpose = adaptive.purpose(u32::from(cycle.correction.cycle) < adaptive.most_cycles);
-    let given = Given { look_risk: adaptive.look_risk(), ..given };
+    let given = Given { look_risk: adaptive.look_risk(), probability: adaptive.tolerance.probability, ..given };
     match model::look(found, &given, &so_far, &purpose, u64::from(number)) {
         Ok(look) => {
             let next = (!look.next.is_empty()).then(|| (look.next, in_words(look.why)));

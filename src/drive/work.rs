@@ -260,8 +260,9 @@ fn registered(
     // The first few touches say whether it is the right part, where it should be; anything more would be guessed from them.
     let at_fixture = task.start_at_fixture || points.tried.len() == 1;
     let (mut found, options) = task.register_from(&part, probe_radius_mm, at_fixture).map_err(unfinished)?;
-    found.allow_for_radius(points.radius_sigma_mm);
+    found.allow_for_radius(points.radius_sigma_mm.hypot(task.machine.reference_sphere_mm));
     let given = Given {
+        machine: task.machine,
         radius_sigma_mm: points.radius_sigma_mm,
         scale_sigma,
         probe_scatter_mm: points.probe_scatter_mm,
@@ -399,9 +400,21 @@ fn without(scatter_mm: f64, rms_mm: f64) -> f64 {
     (rms_mm * rms_mm - scatter_mm * scatter_mm).max(0.0).sqrt()
 }
 
+// What the one tells is what the other records.
+const _: () = {
+    let mut k = 0;
+    while k < Interval::COUNT {
+        assert!(Interval::PROBABILITIES[k] == model::Interval::PROBABILITIES[k]);
+        k += 1;
+    }
+};
+
 /// What the model tells, in the words of the cell.
 fn form_figures(of: &model::FormFigures, scatter_mm: f64) -> FormFigures {
-    let interval = |of: model::Interval| Interval { median_mm: of.median_mm, low_mm: of.low_mm, high_mm: of.high_mm };
+    let interval = |of: model::Interval| {
+        let model::Interval { median_mm, low_mm, high_mm, quantiles_mm, .. } = of;
+        Interval { median_mm, low_mm, high_mm, quantiles_mm: Some(quantiles_mm) }
+    };
     FormFigures { pv: interval(of.pv), pv_robust: interval(of.pv_most_points), rms: interval(of.rms), scatter_mm }
 }
 
@@ -417,6 +430,7 @@ fn rms_without(scatter_mm: f64, verdict: &Verdict) -> Interval {
         median_mm: form2.sqrt(),
         low_mm: (form2 - expanded2).max(0.0).sqrt(),
         high_mm: (form2 + expanded2).sqrt(),
+        quantiles_mm: None,
     }
 }
 

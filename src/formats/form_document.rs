@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::document::StandardUncertainty;
 use super::error::FormatError;
 use super::registration::{write_json_atomic, write_rows};
-use regrind_core::model::{Form, FormPoint, Interval};
+use regrind_core::model::{Form, FormPoint, Interval, Share};
 use regrind_core::registration::Registration;
 
 /// The columns of `form.csv`.
@@ -15,7 +15,7 @@ const FORM_HEADER: &str = "x_mm,y_mm,form_mm,sigma_mm";
 
 /// `model.json`. Lengths in millimetres.
 #[derive(Serialize)]
-struct FormDocument {
+struct FormDocument<'a> {
     /// Whether the part is one of a simulated cell; absent where nobody says.
     #[serde(skip_serializing_if = "Option::is_none")]
     simulation: Option<bool>,
@@ -37,6 +37,8 @@ struct FormDocument {
     rms: Interval,
     pv: Interval,
     pv_99_8: Interval,
+    /// What the standard uncertainties of the figures come from; the squares of all add up.
+    budget: &'a [Share],
     /// The same of the deviations as they were measured, the scatter of the probe in them.
     raw_rms_mm: f64,
     raw_pv_mm: f64,
@@ -70,6 +72,7 @@ pub fn save_form(
         rms: form.figures.rms,
         pv: form.figures.pv,
         pv_99_8: form.figures.pv_most_points,
+        budget: &form.budget,
         raw_rms_mm: registration.verdict.rms_mm,
         raw_pv_mm: registration.verdict.pv_mm,
         frame_standard_uncertainty: StandardUncertainty {

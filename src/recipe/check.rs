@@ -125,6 +125,9 @@ fn in_place(key: &str, sentence: &str) -> String {
     }
 }
 
+/// What two probabilities may differ by that are meant to be the same.
+const ROUNDING: f64 = 1e-9;
+
 fn measuring(written: &RecipeFile, document: &mut Document) {
     let risk = written.measuring.accepted_risk;
     if written.measuring.mode == Mode::Fixed {
@@ -140,6 +143,19 @@ fn measuring(written: &RecipeFile, document: &mut Document) {
             "is missing",
             "a part of which only some targets are touched may be accepted though it is not in tolerance",
             "consent to a probability for that: `accepted_risk = 0.025`",
+        );
+    }
+    if let (Some(risk), Some(probability)) = (risk, written.acceptance.probability)
+        && 1.0 - probability > risk + ROUNDING
+    {
+        document.report(
+            "measuring.accepted_risk",
+            format!(
+                "is {risk}, less than the {:.3} that `acceptance.probability`, {probability}, leaves",
+                1.0 - probability
+            ),
+            "who judges may not err more often than the whole measurement",
+            &format!("raise it to {:.3}, or the probability to {:.3}", 1.0 - probability, 1.0 - risk),
         );
     }
     if written.measure.pattern == PatternWord::Free {
@@ -265,6 +281,14 @@ fn acceptance(written: &Acceptance, document: &mut Document) {
             "raise it, or are the two interchanged?",
         ),
         _ => {}
+    }
+    if let Some(probability) = written.probability.filter(|_| !written.expanded_uncertainty) {
+        document.report(
+            "acceptance.probability",
+            format!("is {probability}, and `expanded_uncertainty` is false"),
+            "without its uncertainty a figure has no probability of being within its limit",
+            "leave one of the two out",
+        );
     }
 }
 

@@ -17,6 +17,7 @@ mod tables;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
+use crate::cell::Tolerance;
 use crate::document::{Document, Problems, problem_at, read_text, schema_of, sha256};
 use crate::geometry::{Aperture, Pose};
 use crate::measuring::Layout;
@@ -171,6 +172,14 @@ impl Recipe {
             rms_limit_mm: settings.max_rms_um.map(Um::mm),
             ..registration::Options::new(self.measure.probe_radius_mm)
         }
+    }
+
+    /// Returns the probability with which a figure must be within its limit: no more may be accepted wrongly by who judges than in the whole
+    /// of a measurement whose touches are chosen.
+    pub fn probability(&self) -> f64 {
+        let risk = self.measuring.accepted_risk.filter(|_| self.measuring.mode == Mode::Adaptive);
+        let usual = risk.filter(|risk| *risk < 1.0 - Tolerance::USUAL).map_or(Tolerance::USUAL, |risk| 1.0 - risk);
+        self.acceptance.probability.unwrap_or(usual)
     }
 
     /// Returns the path that the recipe was read from.

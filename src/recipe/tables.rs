@@ -248,8 +248,12 @@ pub struct Acceptance {
     /// Largest rms of the form.
     #[schemars(range(min = 0.001, max = 100000.0))]
     pub rms_um: Option<Um>,
-    /// Whether a figure must be within its limit with a probability of 97.5 %; else the most probable value is held against it.
+    /// Whether a figure must be within its limit with `probability`; else the most probable value is held against it.
     pub expanded_uncertainty: bool,
+    /// The probability with which a figure must be within its limit to be accepted, and beyond it to be rejected. Left out 0.975, or where
+    /// `measuring.accepted_risk` is less than 0.025, one less that.
+    #[schemars(range(min = 0.5, max = 0.995), example = 0.975)]
+    pub probability: Option<f64>,
 }
 
 /// How what is left is turned into a correction.
@@ -480,7 +484,7 @@ impl Compensation {
 
 impl Default for Acceptance {
     fn default() -> Self {
-        Self { pv_um: None, pv_of: PvOf::default(), rms_um: None, expanded_uncertainty: true }
+        Self { pv_um: None, pv_of: PvOf::default(), rms_um: None, expanded_uncertainty: true, probability: None }
     }
 }
 

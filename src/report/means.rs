@@ -100,7 +100,49 @@ pub(super) fn registered(cycle: u32, found: &Value, model: Option<&Value>) -> St
     ] {
         let _ = writeln!(html, "<tr><th>{key}</th><td>{}</td></tr>", escaped(&value));
     }
-    html + "</table>\n"
+    html + "</table>\n" + &model.map_or(String::new(), budget)
+}
+
+/// What the uncertainty of the figures comes from, source by source; nothing where the record has none.
+fn budget(model: &Value) -> String {
+    let Some(shares) = model["budget"].as_array().filter(|shares| !shares.is_empty()) else { return String::new() };
+    let um = |share: &Value, key: &str| match (share["is_stated"] == true, share[key].as_f64()) {
+        (true, Some(mm)) => format!("{:.3}", 1e3 * mm),
+        _ => "not stated".to_owned(),
+    };
+    let rows = shares.iter().map(|share| {
+        let source = source_words(share["source"].as_str().unwrap_or_default());
+        let [rms, pv] = ["rms_mm", "pv_99_8_mm"].map(|key| um(share, key));
+        format!("<tr><td>{}</td><td class=\"n\">{rms}</td><td class=\"n\">{pv}</td></tr>\n", escaped(source))
+    });
+    let whole = |key: &str| {
+        let squares = shares.iter().filter_map(|share| share[key].as_f64()).map(|mm| mm * mm);
+        format!("{:.3}", 1e3 * squares.sum::<f64>().sqrt())
+    };
+    format!(
+        "<h2>What the uncertainty comes from</h2>\n<table id=\"budget\">\n<tr><th>standard uncertainty by</th>\
+         <th class=\"n\">of the RMS, \u{b5}m</th><th class=\"n\">of the PV 99.8 %, \u{b5}m</th></tr>\n{}\
+         <tr><th>all together</th><td class=\"n\">{}</td><td class=\"n\">{}</td></tr>\n</table>\n\
+         <p>The squares add up. What is not stated by the cell file is taken for 0.</p>\n",
+        rows.collect::<String>(),
+        whole("rms_mm"),
+        whole("pv_99_8_mm")
+    )
+}
+
+/// A source of uncertainty by the name that it has in `model.json`.
+fn source_words(name: &str) -> &str {
+    match name {
+        "scatter" => "scatter of the probe",
+        "form" => "form between the touches",
+        "pose" => "place of the part",
+        "radius" => "radius of the probe and of the reference sphere",
+        "scales" => "scales of the machine",
+        "squareness" => "squareness of the machine",
+        "probe" => "probe by direction",
+        "temperature" => "temperature and expansion",
+        other => other,
+    }
 }
 
 /// Where those sign who answer for it.

@@ -109,7 +109,7 @@ fn product(xml: &mut Xml, results: &Results) {
                         ("recipe_sha256", &results.recipe[1]),
                         ("cell", &results.cell[0]),
                         ("cell_sha256", &results.cell[1]),
-                        ("decision_rule", results.decision_rule.unwrap_or("not recorded")),
+                        ("decision_rule", results.decision_rule.as_deref().unwrap_or("not recorded")),
                     ],
                 );
                 xml.text("ModelNumber", &results.name);

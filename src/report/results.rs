@@ -72,7 +72,7 @@ pub(super) struct Results {
     pub(super) simulation: bool,
     pub(super) accepted: Option<bool>,
     pub(super) verdict: String,
-    pub(super) decision_rule: Option<&'static str>,
+    pub(super) decision_rule: Option<String>,
     /// Name and address of the measuring machine, as it answered.
     pub(super) cmm: Option<[String; 2]>,
     /// Each measurement of each cycle, in its order.
@@ -179,11 +179,14 @@ impl Measured {
     }
 }
 
-fn decision_rule(tolerance: &Tolerance) -> &'static str {
+fn decision_rule(tolerance: &Tolerance) -> String {
     if tolerance.with_uncertainty {
-        "ISO 14253-1, JCGM 106: within where the figure does not exceed the limit with a probability of 97.5 %"
+        format!(
+            "ISO 14253-1, JCGM 106: within where the figure does not exceed the limit with a probability of {:.1} %",
+            1e2 * tolerance.probability
+        )
     } else {
-        "the figure by itself is held against its limit"
+        "the figure by itself is held against its limit".to_owned()
     }
 }
 

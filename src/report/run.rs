@@ -116,15 +116,16 @@ fn judged(story: &Story) -> String {
     let judged = if of.judgements.is_empty() { "measured and not judged" } else { "judged" };
     let mut html = format!(
         "<table id=\"judged\">\n<tr><th>{judged}, cycle {cycle}</th><th class=\"n\">found, \u{b5}m</th>\
-         <th class=\"n\">U (k = 2), \u{b5}m</th><th class=\"n\">95 % between, \u{b5}m</th><th class=\"n\">limit, \u{b5}m</th><th></th></tr>\n"
+         <th class=\"n\">U (k = 2), \u{b5}m</th><th class=\"n\">95 % between, \u{b5}m</th><th class=\"n\">limit, \u{b5}m</th><th></th><th></th></tr>\n"
     );
     for compared in tolerance.compare(figures) {
         let Compared { name, found_mm, expanded_mm, between_mm: [low_mm, high_mm], limit_mm, .. } = compared;
         let limit = if limit_mm.is_finite() { um(limit_mm) } else { "no limit".to_owned() };
+        let within = compared.within_in_words().unwrap_or_default();
         let _ = writeln!(
             html,
             "<tr><td>{name}</td><td class=\"n\"><strong>{}</strong></td><td class=\"n\">\u{b1} {}</td>\
-             <td class=\"n\">{} to {}</td><td class=\"n\">{limit}</td><td>{}</td></tr>",
+             <td class=\"n\">{} to {}</td><td class=\"n\">{limit}</td><td>{within}</td><td>{}</td></tr>",
             um(found_mm),
             um(expanded_mm),
             um(low_mm),
@@ -141,7 +142,7 @@ fn um(mm: f64) -> String {
 
 /// How a figure lies beside its limit, reckoned before the reader's eyes.
 fn comparison(compared: &Compared, with_uncertainty: bool) -> String {
-    let Compared { found_mm, between_mm: [low_mm, high_mm], limit_mm, conformity, .. } = *compared;
+    let Compared { found_mm, held_mm: [low_mm, high_mm], limit_mm, conformity, .. } = *compared;
     if !limit_mm.is_finite() {
         return String::new();
     }
@@ -169,11 +170,15 @@ fn comparison(compared: &Compared, with_uncertainty: bool) -> String {
 
 fn decision_rule(tolerance: &Tolerance) -> String {
     let rule = if tolerance.with_uncertainty {
-        "Decision rule, after ISO 14253-1 and JCGM 106: the part is accepted only where each figure is within its limit with a \
-         probability of 97.5 % at least; it is out of tolerance for certain only where one is beyond it with that probability; between \
-         the two nothing is proven."
+        format!(
+            "Decision rule, after ISO 14253-1 and JCGM 106: the part is accepted only where each figure is within its limit with a \
+             probability of {:.1} % at least; it is out of tolerance for certain only where one is beyond it with that probability; between \
+             the two nothing is proven.",
+            1e2 * tolerance.probability
+        )
     } else {
         "Decision rule: each figure by itself is held against its limit; its uncertainty is told and not counted."
+            .to_owned()
     };
     format!(
         "{rule} The figures are those of the form of the part after its best fit: the scatter of the probe is taken off them, and it and the \

@@ -150,9 +150,8 @@ impl Line<'_> {
 
     fn chosen(&self, level_mm: f64, seed: u64, cycle: u32) -> Took {
         let targets: &[(Point, Vector)] = &self.bench.plan_of;
-        let [pv_mm, pv_most_points_mm, rms_mm] = self.bench.limits_mm();
-        let most_cycles = self.bench.plan.max_cycles;
-        let adaptive = Adaptive { pv_mm, pv_most_points_mm, rms_mm, accepted_risk: 0.025, most_cycles };
+        let (tolerance, most_cycles) = (self.bench.plan.tolerance, self.bench.plan.max_cycles);
+        let adaptive = Adaptive { tolerance, accepted_risk: 0.025, most_cycles };
         let purpose = adaptive.purpose(cycle < most_cycles);
         let given = Given { look_risk: adaptive.look_risk(), ..self.given() };
         let mut tried = vec![None; targets.len()];

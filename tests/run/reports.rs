@@ -465,5 +465,11 @@ fn without_a_limit_or_with_one_of_another_time_nothing_is_invented() {
 
 pub fn tolerance() -> Tolerance {
     use regrind::cell::PvOf;
-    Tolerance { pv_mm: 0.007, rms_mm: 0.001, with_uncertainty: true, pv_of: PvOf::MostPoints }
+    Tolerance {
+        pv_mm: 0.007,
+        rms_mm: 0.001,
+        with_uncertainty: true,
+        probability: Tolerance::USUAL,
+        pv_of: PvOf::MostPoints,
+    }
 }

@@ -3,7 +3,8 @@
 //! With K = k(x_i, x_j) + s^2 R, where R is 1 and, between points of a path on which the probe drifts, the drift to the power of their steps
 //! (an autoregression of the first order), the effects b by generalised least squares, b = (H'K^-1 H)^-1 H'K^-1 d, and what is left told by kriging
 //! (Rasmussen and Williams 2006, 2.7, with a vague prior of b): mean h'b + k'K^-1 (d - H b), variance
-//! k(x, x) - k'K^-1 k + r'(H'K^-1 H)^-1 r with r = h - H'K^-1 k.
+//! k(x, x) - k'K^-1 k + r'(H'K^-1 H)^-1 r with r = h - H'K^-1 k. Effects E that are stated stand beside those of H and have a variance of 1, so their
+//! part of H'K^-1 H has 1 added to its diagonal; that is the same as E E' in K.
 
 use faer::linalg::solvers::{DenseSolveCore, Llt, Solve};
 use faer::{Mat, Side};
@@ -29,6 +30,7 @@ pub struct Dense {
     hyper: Hyper,
     places: Vec<[f64; 2]>,
     path: Vec<f64>,
+    stated: DMatrix<f64>,
     factor: Llt<f64>,
     /// K^-1 (d - H b).
     weights: Vec<f64>,
@@ -46,42 +48,25 @@ impl Dense {
     /// # Errors
     /// Rows that do not belong together, numbers that are none, parameters that are not above 0, effects that cannot be told apart.
     pub fn fit(observed: &Observed, hyper: Hyper) -> Result<Self, ModelError> {
-        observed.check()?;
-        hyper.check()?;
-        let Observed { places, deviations_mm, effects, path } = observed;
-        let (n, p) = (places.len(), effects.ncols());
-        let scatter2 = hyper.scatter_mm * hyper.scatter_mm;
-        let covariance = Mat::from_fn(n, n, |r, c| {
-            // Only the lower triangle is read.
-            if r < c {
-                0.0
-            } else {
-                hyper.field.covariance_mm2(places[r], places[c]) + scatter2 * shared(&hyper, path, r, c)
-            }
-        });
-        let factor = Llt::new(covariance.as_ref(), Side::Lower).map_err(|_| ModelError::NotDefinite)?;
-        let right = Mat::from_fn(n, p + 1, |r, c| if c < p { effects[(r, c)] } else { deviations_mm[r] });
-        let solved = factor.solve(&right);
-        // H'K^-1 H and H'K^-1 d.
-        let gram = DMatrix::from_fn(p, p, |a, b| (0..n).map(|k| effects[(k, a)] * solved[(k, b)]).sum());
-        let towards = DVector::from_fn(p, |a, _| (0..n).map(|k| effects[(k, a)] * solved[(k, p)]).sum());
-        let gram = told_apart(gram)?;
+        let Observed { places, deviations_mm, path, .. } = observed;
+        let Solved { effects, factor, solved, gram, towards, log_det, .. } = Solved::of(observed, &hyper)?;
+        let (n, p, vague) = (places.len(), effects.ncols(), observed.effects.ncols());
+        let gram = told_apart(with_stated(gram, vague))?;
         let found = gram.solve(&towards);
         let left = |k: usize| solved[(k, p)] - (0..p).map(|a| solved[(k, a)] * found[a]).sum::<f64>();
         let weights: Vec<f64> = (0..n).map(left).collect();
         let squares: f64 = (0..n).map(|k| deviations_mm[k] * weights[k]).sum();
-        let diagonal = factor.L().diagonal();
-        let log_det: f64 = 2.0 * (0..n).map(|k| diagonal[k].ln()).sum::<f64>();
         let log_gram: f64 = 2.0 * gram.l_dirty().diagonal().iter().map(|v| v.ln()).sum::<f64>();
         Ok(Self {
             hyper,
             places: places.clone(),
             path: path.clone(),
+            stated: observed.stated.clone(),
             weights,
             effects: Mat::from_fn(n, p, |r, c| solved[(r, c)]),
             found,
             covariance: gram.inverse(),
-            likelihood: -0.5 * (log_det + log_gram + squares + (n - p) as f64 * std::f64::consts::TAU.ln()),
+            likelihood: -0.5 * (log_det + log_gram + squares + (n - vague) as f64 * std::f64::consts::TAU.ln()),
             factor,
         })
     }
@@ -97,16 +82,16 @@ impl Dense {
         observed.deviations_mm.iter().zip(&self.weights).map(|(d, w)| d * w).sum()
     }
 
-    /// Returns the effects and their covariance: with the motions of the part as effects, where its nominal frame is, and how well
+    /// Returns the effects and their covariance, those that are stated behind the others: with the motions of the part as effects, where its nominal frame is, and how well
     /// that is known beside a field that nobody knows either.
     pub fn effects(&self) -> (&DVector<f64>, &DMatrix<f64>) {
         (&self.found, &self.covariance)
     }
 
-    /// Draws what may have been the scatter of each observed point; a column a sample. What is left of the observations without it, and
-    /// without the effects, is the field.
+    /// Draws what may have been the scatter of each observed point and what is stated to move it; a column a sample. What is left of the
+    /// observations without it, and without the effects that nobody knows, is the field.
     ///
-    /// With W = K^-1 - K^-1 H (H'K^-1 H)^-1 H'K^-1 the scatter has the mean s^2 R W d and the covariance s^2 R - s^4 R W R.
+    /// With W = K^-1 - K^-1 H (H'K^-1 H)^-1 H'K^-1 and N = s^2 R + E E' that has the mean N W d and the covariance N - N W N; K has E E' in it.
     pub(super) fn scatters(&self, count: usize, seed: u64) -> Result<Mat<f64>, ModelError> {
         let n = self.places.len();
         let scatter2 = self.hyper.scatter_mm * self.hyper.scatter_mm;
@@ -115,11 +100,17 @@ impl Dense {
         let by_effects =
             Mat::from_fn(n, p, |r, c| (0..p).map(|k| self.effects[(r, k)] * self.covariance[(k, c)]).sum::<f64>());
         let weights = inverse - &by_effects * self.effects.transpose();
-        let drifts = self.hyper.drift > 0.0 && !self.path.is_empty();
-        let shared = Mat::from_fn(n, n, |r, c| shared(&self.hyper, &self.path, r, c));
+        let is_stated = self.stated.ncols() > 0;
+        let drifts = is_stated || self.hyper.drift > 0.0 && !self.path.is_empty();
+        let mut shared = Mat::from_fn(n, n, |r, c| shared(&self.hyper, &self.path, r, c));
+        if is_stated {
+            let stated = Mat::from_fn(n, self.stated.ncols(), |r, c| self.stated[(r, c)] / self.hyper.scatter_mm);
+            shared += &stated * stated.transpose();
+        }
+        let most = (0..n).map(|k| shared[(k, k)]).fold(0.0, f64::max);
         let told = if drifts { &shared * &weights * &shared } else { weights };
         let covariance = Mat::from_fn(n, n, |r, c| {
-            let own = if r == c { NEXT_TO_NOTHING } else { 0.0 };
+            let own = if r == c { NEXT_TO_NOTHING * most } else { 0.0 };
             shared[(r, c)] + own - scatter2 * told[(r, c)]
         });
         let mean_of = |r: usize| match drifts {
@@ -167,6 +158,55 @@ fn shared(hyper: &Hyper, path: &[f64], r: usize, c: usize) -> f64 {
     }
 }
 
+/// What the covariance of points makes of what was measured.
+pub(super) struct Solved {
+    /// H, and behind it E.
+    effects: DMatrix<f64>,
+    factor: Llt<f64>,
+    /// K^-1 of these, and behind them K^-1 d.
+    solved: Mat<f64>,
+    /// H'K^-1 H and H'K^-1 d with E behind H, K without E.
+    pub(super) gram: DMatrix<f64>,
+    pub(super) towards: DVector<f64>,
+    /// d'K^-1 d.
+    pub(super) own: f64,
+    pub(super) log_det: f64,
+}
+
+impl Solved {
+    pub(super) fn of(observed: &Observed, hyper: &Hyper) -> Result<Self, ModelError> {
+        observed.check()?;
+        hyper.check()?;
+        let Observed { places, deviations_mm, path, .. } = observed;
+        let effects = observed.all_effects();
+        let (n, p) = (places.len(), effects.ncols());
+        let scatter2 = hyper.scatter_mm * hyper.scatter_mm;
+        let covariance = Mat::from_fn(n, n, |r, c| {
+            // Only the lower triangle is read.
+            if r < c {
+                0.0
+            } else {
+                hyper.field.covariance_mm2(places[r], places[c]) + scatter2 * shared(hyper, path, r, c)
+            }
+        });
+        let factor = Llt::new(covariance.as_ref(), Side::Lower).map_err(|_| ModelError::NotDefinite)?;
+        let right = Mat::from_fn(n, p + 1, |r, c| if c < p { effects[(r, c)] } else { deviations_mm[r] });
+        let solved = factor.solve(&right);
+        let gram = DMatrix::from_fn(p, p, |a, b| (0..n).map(|k| effects[(k, a)] * solved[(k, b)]).sum());
+        let towards = DVector::from_fn(p, |a, _| (0..n).map(|k| effects[(k, a)] * solved[(k, p)]).sum());
+        let own = (0..n).map(|k| deviations_mm[k] * solved[(k, p)]).sum();
+        let diagonal = factor.L().diagonal();
+        let log_det: f64 = 2.0 * (0..n).map(|k| diagonal[k].ln()).sum::<f64>();
+        Ok(Self { effects, factor, solved, gram, towards, own, log_det })
+    }
+}
+
+/// Takes in that effects behind the first, which nobody knows, have a variance of 1.
+pub(super) fn with_stated(mut gram: DMatrix<f64>, vague: usize) -> DMatrix<f64> {
+    (vague..gram.nrows()).for_each(|k| gram[(k, k)] += 1.0);
+    gram
+}
+
 /// The factor of H'K^-1 H; none where a direction of it is nothing beside the others.
 pub(super) fn told_apart(gram: DMatrix<f64>) -> Result<nalgebra::Cholesky<f64, nalgebra::Dyn>, ModelError> {
     const LEAST: f64 = 1e-12;
@@ -199,6 +239,25 @@ mod tests {
         assert_eq!(far, Predicted { mean_mm: 0.0, sigma_mm: 2.0 });
         let by_hand = -0.5 * (4.25_f64.ln() + 9.0 / 4.25 + std::f64::consts::TAU.ln());
         assert!((model.log_likelihood() - by_hand).abs() < 1e-14);
+    }
+
+    #[test]
+    fn what_is_stated_of_one_point_is_what_is_worked_out_by_hand() {
+        // k = 4, s^2 = 0.25, e^2 = 2.25: of the 3 that were found the field has 4 / 6.5.
+        let stated = DMatrix::from_element(1, 1, 1.5);
+        let model =
+            Dense::fit(&Observed { stated, ..Observed::without_effects(vec![[1.0, 2.0]], vec![3.0]) }, HYPER).unwrap();
+        let told = model.predict(&[[1.0, 2.0]])[0];
+        assert!(
+            (told.mean_mm - 12.0 / 6.5).abs() < 1e-14 && (told.sigma_mm.powi(2) - (4.0 - 16.0 / 6.5)).abs() < 1e-13
+        );
+        let by_hand = -0.5 * (6.5_f64.ln() + 9.0 / 6.5 + std::f64::consts::TAU.ln());
+        assert!((model.log_likelihood() - by_hand).abs() < 1e-14);
+        // Scatter and what is stated together have the rest, N W d = 2.5 / 6.5 * 3, with N - N W N.
+        let samples = model.scatters(40_000, 5).unwrap();
+        let mean = (0..40_000).map(|c| samples[(0, c)]).sum::<f64>() / 4e4;
+        let variance = (0..40_000).map(|c| (samples[(0, c)] - mean).powi(2)).sum::<f64>() / 4e4;
+        assert!((mean - 7.5 / 6.5).abs() < 0.03 && (variance - (2.5 - 6.25 / 6.5)).abs() < 0.05, "{mean} {variance}");
     }
 
     #[test]
@@ -254,7 +313,7 @@ mod tests {
             places: places.clone(),
             deviations_mm,
             effects: effects.clone(),
-            path: Vec::new(),
+            ..Observed::without_effects(places.clone(), Vec::new())
         };
         let [a, b] = [still, moved].map(|d| Dense::fit(&with(d), HYPER).unwrap());
         // What is planted comes back on top of what the field itself has along it.

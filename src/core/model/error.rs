@@ -23,6 +23,10 @@ pub enum ModelError {
     NoPrecision,
     #[error("the grid is that of a field with another smoothness or another lay")]
     OtherGrid,
+    #[error(
+        "the standard uncertainty of the {what} is {value} (mm, rad or a share); it must be 0 at least and what a measuring machine can have: correct what is stated of the machine"
+    )]
+    Stated { what: &'static str, value: f64 },
     #[error("the drift is {value}; it must be 0 at least and below 1")]
     Drift { value: f64 },
     #[error(

@@ -5,11 +5,13 @@
 //! best fit, over fields drawn from what the measurement leaves possible; so the scatter of the probe is taken off them, and the pose is
 //! in their uncertainty.
 
-use nalgebra::{DMatrix, Matrix3, Matrix6, SymmetricEigen, Vector6};
+use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, SymmetricEigen, Vector6};
 
 use rayon::prelude::*;
 
+use super::budget::{self, Share};
 use super::likelihood::{ANY, ON_A_GRID, Told};
+use super::machine::{Effects, Machine, Source, unsound};
 use super::normals::Normals;
 use super::spacing_mm;
 use super::{Dense, Hyper, Lattice, ModelError, Observed, Predicted, Priors, Sparse};
@@ -31,6 +33,8 @@ pub struct Form {
     pub figures: FormFigures,
     /// How well the smooth form is known: the RMS of its standard uncertainty over all places.
     pub known_mm: f64,
+    /// What the standard uncertainties of the figures come from, source by source; empty where they cannot be parted.
+    pub budget: Vec<Share>,
     /// Whether the points show a form at all. Where they do not, the figures are known from above alone, and their intervals begin at 0.
     pub is_seen: bool,
 }
@@ -72,6 +76,12 @@ pub struct Interval {
     /// Above it with that probability.
     #[serde(skip)]
     pub most_mm: f64,
+    /// Below it with the probability of [`Given::probability`]: for who judges.
+    #[serde(skip)]
+    pub accepted_mm: f64,
+    /// Below each of them with one of [`Interval::PROBABILITIES`].
+    #[serde(skip)]
+    pub quantiles_mm: [f64; 15],
 }
 
 /// Fields that are drawn, and places at which they are looked at, at most.
@@ -97,11 +107,8 @@ impl Form {
     /// Too few points, and points that leave nothing to tell the form by.
     pub fn of(registration: &Registration, given: &Given) -> Result<Self, ModelError> {
         let seen = Seen::of(registration, given, true)?;
-        let alike = seen.motions.alike(given, seen.places());
         let drawn = Drawn::of(&seen.observed, &seen.told.likely)?;
-        let alike = alike.select_rows(&drawn.chosen);
-        let drawn =
-            drawn.with_the_scatter(&seen.observed, &seen.told, given).with_what_is_alike(&alike).after_best_fit();
+        let drawn = drawn.with_the_scatter(&seen.observed, &seen.told, given).after_best_fit();
         Ok(seen.form(given, &drawn))
     }
 
@@ -116,32 +123,34 @@ impl Form {
     pub fn over(registration: &Registration, given: &Given, places: &[(Point, Vector)]) -> Result<Self, ModelError> {
         let seen = Seen::of(registration, given, false)?;
         let places: Vec<_> = thinned(places.len()).map(|k| places[k]).collect();
-        let alike = seen.motions.alike(given, places.iter().copied());
         let effects = seen.motions.rows(places.iter().copied());
         let drawn = Drawn::over(&seen.observed, &seen.told.likely, places.iter().map(plane).collect(), effects)?;
-        let drawn = drawn.with_what_is_narrow(&seen.told, given).with_what_is_alike(&alike).after_best_fit();
+        let drawn = drawn.with_what_is_narrow(&seen.told, given).after_best_fit();
         Ok(seen.form(given, &drawn))
     }
 }
 
 /// A registration as the model sees it, with what speaks for which parameters.
-struct Seen<'a> {
-    used: Vec<&'a Deviation>,
+struct Seen {
     motions: Motions,
     observed: Observed,
+    /// Of each of the stated effects.
+    sources: Vec<Source>,
     told: Told,
     is_seen: bool,
 }
 
-impl<'a> Seen<'a> {
-    fn of(registration: &'a Registration, given: &Given, at_points: bool) -> Result<Self, ModelError> {
+impl Seen {
+    fn of(registration: &Registration, given: &Given, at_points: bool) -> Result<Self, ModelError> {
         let all = registration.deviations.iter().enumerate().filter(|(_, d)| d.status == PointStatus::Used);
         let (path, used): (Vec<f64>, Vec<&Deviation>) = all.map(|(k, d)| (k as f64, d)).unzip();
         if used.is_empty() {
             return Err(ModelError::TooFewPoints { points: 0, least: 7 });
         }
         let motions = Motions::of(registration, used.iter().map(|d| d.point));
-        let observed = motions.observed(&used);
+        let stated = motions.stated(registration, given)?;
+        let observed =
+            Observed { stated: stated.columns(used.iter().map(|d| (d.point, d.normal))), ..motions.observed(&used) };
         let path = if at_points && is_path(&observed.places) { path } else { Vec::new() };
         let observed = Observed { path, ..observed };
         let priors = given.priors.unwrap_or_else(|| Priors::of_size(motions.size_mm));
@@ -154,21 +163,21 @@ impl<'a> Seen<'a> {
             told.likely.extend(on_a_grid.copied());
             told.likely.iter_mut().for_each(|(_, weight)| *weight = 1.0);
         }
-        Ok(Self { used, motions, observed, told, is_seen })
-    }
-
-    fn places(&self) -> impl ExactSizeIterator<Item = (Point, Vector)> + Clone + '_ {
-        self.used.iter().map(|d| (d.point, d.normal))
+        Ok(Self { motions, observed, sources: stated.sources(), told, is_seen })
     }
 
     fn form(&self, given: &Given, drawn: &Drawn) -> Form {
-        let alike = self.motions.alike(given, self.places());
-        let covariance = of_the_fit(&self.observed, &self.told.wide, &alike);
+        let covariance = of_the_fit(&self.observed, &self.told.wide, &self.observed.stated);
+        let figures = drawn.figures(self.is_seen, given);
+        let hyper = self.told.likely[0].0;
+        let of_drawn = budget::Drawn { forms: &drawn.forms, places: &drawn.places, effects: &drawn.effects };
+        let uncertainties_mm = [figures.rms, figures.pv_most_points].map(|of| of.standard_mm());
         Form {
-            hyper: self.told.likely[0].0,
+            hyper,
             frame_covariance: self.motions.to_twist(&covariance),
             points: drawn.points(),
-            figures: drawn.figures(self.is_seen, given.look_risk),
+            figures,
+            budget: budget::parted((&self.observed, &self.sources), &hyper, &of_drawn, uncertainties_mm),
             known_mm: drawn.known_mm(),
             is_seen: self.is_seen,
         }
@@ -203,7 +212,9 @@ fn thinned(of: usize) -> impl Iterator<Item = usize> {
 pub struct Given {
     /// What is known of form and scatter beforehand; without it what every part of its size is like.
     pub priors: Option<Priors>,
-    /// Standard uncertainty of the radius of the probe: it moves every point along its normal alike.
+    /// What the machine does to all points together, as its cell file states it.
+    pub machine: Machine,
+    /// Standard uncertainty of the radius of the probe as it was found: it moves every point along its normal alike.
     pub radius_sigma_mm: f64,
     /// Standard uncertainty of all lengths, as a share of them: that of temperature and expansion.
     pub scale_sigma: f64,
@@ -212,11 +223,21 @@ pub struct Given {
     pub probe_scatter_mm: [f64; 2],
     /// With what probability a figure may be beyond either of the bounds [`Interval::least_mm`] and [`Interval::most_mm`].
     pub look_risk: f64,
+    /// With what probability a figure must be within its limit to be accepted.
+    pub probability: f64,
 }
 
 impl Default for Given {
     fn default() -> Self {
-        Self { priors: None, radius_sigma_mm: 0.0, scale_sigma: 0.0, probe_scatter_mm: [0.0; 2], look_risk: 0.005 }
+        Self {
+            priors: None,
+            machine: Machine::default(),
+            radius_sigma_mm: 0.0,
+            scale_sigma: 0.0,
+            probe_scatter_mm: [0.0; 2],
+            look_risk: 0.005,
+            probability: 0.975,
+        }
     }
 }
 
@@ -281,7 +302,12 @@ impl Drawn {
             let lattice = Lattice::over(&observed.places, &hyper.field)?;
             Sparse::fit(&lattice, observed, hyper)?.samples(&seen.places, count, seed)
         })?;
-        Ok(Self { smooth_sigma_mm: spread_mm(&forms), forms, places: seen.places, effects: seen.effects, chosen })
+        // What is stated moves the part too, and that is no form.
+        let smooth_sigma_mm = match observed.stated.ncols() {
+            0 => spread_mm(&forms),
+            _ => spread_mm(&best_fitted(forms.clone(), &seen.effects)),
+        };
+        Ok(Self { smooth_sigma_mm, forms, places: seen.places, effects: seen.effects, chosen })
     }
 
     /// The same at other places.
@@ -308,13 +334,17 @@ impl Drawn {
     /// afterwards.
     fn with_the_scatter(mut self, observed: &Observed, told: &Told, given: &Given) -> Self {
         let mut normals = Normals::new(2, 0);
+        // What is stated is left of the observations as well, and is no scatter.
+        let seen = observed.only(&self.chosen);
+        let stated = (seen.stated.ncols() > 0).then(|| seen.all_effects().qr().q());
         for mut form in self.forms.column_iter_mut() {
             let share = (told.scatter_u * normals.next()).exp() - 1.0;
             let [probe_mm, narrow_mm] = parted(told, given, &mut normals);
             let is_form = narrow_mm.powi(2) / (probe_mm.powi(2) + narrow_mm.powi(2)).max(f64::MIN_POSITIVE);
             let moved_mm = is_form.sqrt() * probe_mm;
-            for (value, &row) in form.iter_mut().zip(&self.chosen) {
-                let left = observed.deviations_mm[row] - *value;
+            let left = DVector::from_fn(form.len(), |k, _| seen.deviations_mm[k] - form[k]);
+            let left = stated.as_ref().map_or_else(|| left.clone(), |base| &left - base * base.tr_mul(&left));
+            for (value, left) in form.iter_mut().zip(&left) {
                 *value += (is_form - share * (1.0 - is_form)) * left;
                 if moved_mm > 0.0 {
                     *value += moved_mm * normals.next();
@@ -334,22 +364,9 @@ impl Drawn {
         self
     }
 
-    /// Adds what adds to all places alike: a column a standard uncertainty.
-    fn with_what_is_alike(mut self, alike: &DMatrix<f64>) -> Self {
-        let mut normals = Normals::new(3, 0);
-        for mut form in self.forms.column_iter_mut() {
-            alike.column_iter().for_each(|one| form.axpy(normals.next(), &one, 1.0));
-        }
-        self
-    }
-
     /// Each form after its own best fit.
     fn after_best_fit(mut self) -> Self {
-        if self.effects.ncols() > 0 {
-            let base = self.effects.clone().qr().q();
-            let fitted: DMatrix<f64> = &base * base.tr_mul(&self.forms);
-            self.forms -= fitted;
-        }
+        self.forms = best_fitted(self.forms, &self.effects);
         self
     }
 
@@ -372,7 +389,7 @@ impl Drawn {
     }
 
     /// The figures; where no form is seen they are known from above alone.
-    fn figures(&self, is_seen: bool, look_risk: f64) -> FormFigures {
+    fn figures(&self, is_seen: bool, given: &Given) -> FormFigures {
         let mut found: [Vec<f64>; 3] = Default::default();
         let mut sorted = Vec::with_capacity(self.forms.nrows());
         for form in self.forms.column_iter() {
@@ -385,7 +402,7 @@ impl Drawn {
             found[1].push(sorted[n - 1] - sorted[0]);
             found[2].push(sorted[n - 1 - left_out] - sorted[left_out]);
         }
-        let [rms, pv, pv_most_points] = found.map(|values| Interval::of(values, is_seen, look_risk));
+        let [rms, pv, pv_most_points] = found.map(|values| Interval::of(values, is_seen, given));
         FormFigures { rms, pv, pv_most_points }
     }
 }
@@ -401,6 +418,16 @@ fn parted(told: &Told, given: &Given, normals: &mut Normals) -> [f64; 2] {
     let found = may_be(scatter_mm, told.scatter_u, normals.next());
     let own = may_be(probe_mm, probe_u, normals.next());
     [own.min(found).sqrt(), (found - own).max(0.0).sqrt()]
+}
+
+/// Each form after its own best fit.
+fn best_fitted(mut forms: DMatrix<f64>, effects: &DMatrix<f64>) -> DMatrix<f64> {
+    if effects.ncols() > 0 {
+        let base = effects.clone().qr().q();
+        let fitted: DMatrix<f64> = &base * base.tr_mul(&forms);
+        forms -= fitted;
+    }
+    forms
 }
 
 /// The standard deviation of each row.
@@ -430,17 +457,30 @@ fn mixed(
 }
 
 impl Interval {
+    /// The probabilities of the quantiles by which a figure is recorded.
+    pub const PROBABILITIES: [f64; 15] =
+        [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.975, 0.99, 0.995, 0.999];
+
+    /// Returns the standard uncertainty: its width over that of a normal figure.
+    pub fn standard_mm(&self) -> f64 {
+        const WIDTH: f64 = 2.0 * 1.96;
+        (self.high_mm - self.low_mm) / WIDTH
+    }
+
     /// Of values that are equally probable.
-    fn of(mut values: Vec<f64>, has_low: bool, risk: f64) -> Self {
+    fn of(mut values: Vec<f64>, has_low: bool, given: &Given) -> Self {
         values.sort_unstable_by(f64::total_cmp);
+        let Given { look_risk, probability, .. } = *given;
         let at = |share: f64| values[((values.len() - 1) as f64 * share).round() as usize];
         let low = |share: f64| if has_low { at(share) } else { 0.0 };
         Self {
             median_mm: at(0.5),
             low_mm: low(0.025),
             high_mm: at(0.975),
-            least_mm: low(risk),
-            most_mm: at(1.0 - risk),
+            least_mm: low(look_risk),
+            most_mm: at(1.0 - look_risk),
+            accepted_mm: at(probability),
+            quantiles_mm: Self::PROBABILITIES.map(|share| if share < 0.5 { low(share) } else { at(share) }),
         }
     }
 }
@@ -473,18 +513,19 @@ impl Motions {
             places: used.iter().map(|d| [d.point.x, d.point.y]).collect(),
             deviations_mm: used.iter().map(|d| d.deviation_mm).collect(),
             effects: self.rows(used.iter().map(|d| (d.point, d.normal))),
+            stated: DMatrix::zeros(used.len(), 0),
             path: Vec::new(),
         }
     }
 
-    /// What a standard uncertainty of the radius of the probe and of the scale add to every point.
-    fn alike(&self, given: &Given, points: impl ExactSizeIterator<Item = (Point, Vector)>) -> DMatrix<f64> {
-        let mut alike = DMatrix::zeros(points.len(), 2);
-        for (r, (point, normal)) in points.enumerate() {
-            alike[(r, 0)] = given.radius_sigma_mm;
-            alike[(r, 1)] = given.scale_sigma * (point - self.centre).dot(&normal);
+    /// What is stated of all points together, about their middle.
+    pub(super) fn stated(&self, registration: &Registration, given: &Given) -> Result<Effects, ModelError> {
+        let of_others = [given.radius_sigma_mm, given.scale_sigma];
+        if let Some((what, value)) = unsound(&given.machine, of_others) {
+            return Err(ModelError::Stated { what, value });
         }
-        alike
+        let model_from_machine = registration.cmm_from_model.rotation.transpose();
+        Ok(Effects::new(given.machine, of_others, self.centre, model_from_machine))
     }
 
     /// What a unit of each motion adds to the distance of each point from the surface.

@@ -35,6 +35,21 @@ pub struct Growing {
     blocks: Vec<Block>,
 }
 
+/// Effects that nobody knows, and beside them those that are stated: all have the same variance, so that these are as much smaller.
+fn joined(effects: &DMatrix<f64>, stated: &DMatrix<f64>, hyper: &Hyper) -> DMatrix<f64> {
+    if stated.ncols() == 0 {
+        return effects.clone();
+    }
+    let (p, smaller) = (effects.ncols(), 1.0 / (VAGUE * hyper.field.sigma_mm));
+    // Rows that do not belong together are told of by who takes them.
+    let rows = if stated.nrows() == effects.nrows() { effects.nrows() } else { 0 };
+    DMatrix::from_fn(
+        rows,
+        p + stated.ncols(),
+        |r, c| if c < p { effects[(r, c)] } else { smaller * stated[(r, c - p)] },
+    )
+}
+
 /// Some of the places.
 #[derive(Clone)]
 struct Block {
@@ -53,7 +68,19 @@ impl Growing {
     /// # Errors
     /// Rows that do not belong together, numbers that are none, parameters that are not above 0.
     pub fn over(places: Vec<[f64; 2]>, effects: DMatrix<f64>, hyper: Hyper) -> Result<Self, ModelError> {
+        let stated = DMatrix::zeros(places.len(), 0);
+        Self::beside(places, effects, &stated, hyper)
+    }
+
+    /// The same with effects that are stated, of variance 1.
+    pub(super) fn beside(
+        places: Vec<[f64; 2]>,
+        effects: DMatrix<f64>,
+        stated: &DMatrix<f64>,
+        hyper: Hyper,
+    ) -> Result<Self, ModelError> {
         hyper.check()?;
+        let effects = joined(&effects, stated, &hyper);
         if effects.nrows() != places.len() {
             return Err(ModelError::Shape { points: places.len(), deviations: places.len(), rows: effects.nrows() });
         }
@@ -90,7 +117,8 @@ impl Growing {
     /// # Errors
     /// Rows that do not belong together, and numbers that are none; nothing is taken in then.
     pub fn tell(&mut self, observed: &Observed) -> Result<(), ModelError> {
-        let Observed { places, deviations_mm, effects, .. } = observed;
+        let Observed { places, deviations_mm, .. } = observed;
+        let effects = joined(&observed.effects, &observed.stated, &self.hyper);
         let (points, columns) = (places.len(), self.effects.ncols());
         if deviations_mm.len() != points || effects.shape() != (points, columns) {
             return Err(ModelError::Shape { points, deviations: deviations_mm.len(), rows: effects.nrows() });
@@ -137,7 +165,8 @@ impl Growing {
 
     /// Says by how many standard deviations of what was expected each of some points is off, the scatter of the probe among them.
     pub fn surprise(&self, observed: &Observed) -> Vec<f64> {
-        let Observed { places, deviations_mm, effects, .. } = observed;
+        let Observed { places, deviations_mm, .. } = observed;
+        let effects = joined(&observed.effects, &observed.stated, &self.hyper);
         let of = |k: usize| {
             let row: Vec<f64> = effects.row(k).iter().copied().collect();
             let l = self.solved(places[k], &row);
@@ -231,7 +260,7 @@ mod tests {
         let deviations_mm = places.iter().map(|[x, y]| 5e-3 * ((0.1 * x).sin() + 0.5 * (0.13 * y).cos())).collect();
         let effects =
             DMatrix::from_fn(places.len(), effects, |r, c| [1.0, places[r][0] / 30.0, places[r][1] / 30.0][c]);
-        Observed { places, deviations_mm, effects, path: Vec::new() }
+        Observed { effects, ..Observed::without_effects(places, deviations_mm) }
     }
 
     fn asked(effects: usize) -> (Vec<[f64; 2]>, DMatrix<f64>) {
@@ -290,7 +319,7 @@ mod tests {
         // Touched in truth, and found to be elsewhere.
         let mut touched = grown(&observed, &[60]);
         let effects = DMatrix::from_row_slice(1, 3, &[1.0, place[0] / 30.0, place[1] / 30.0]);
-        touched.tell(&Observed { places: vec![place], deviations_mm: vec![0.1], effects, path: Vec::new() }).unwrap();
+        touched.tell(&Observed { effects, ..Observed::without_effects(vec![place], vec![0.1]) }).unwrap();
         for (a, b) in touched.known().zip(&imagined) {
             assert!((a.sigma_mm - b.sigma_mm).abs() < 1e-12);
         }
@@ -305,6 +334,18 @@ mod tests {
         assert!(growing.surprise(&last)[0].abs() < 2.0);
         last.deviations_mm[0] += 10.0 * HYPER.scatter_mm;
         assert!(growing.surprise(&last)[0] > 5.0);
+    }
+
+    #[test]
+    fn what_is_stated_of_one_point_is_what_is_worked_out_by_hand() {
+        let hyper = Hyper { field: Field::new(2.0, 20.0), scatter_mm: 0.5, drift: 0.0 };
+        let (place, stated) = (vec![[1.0, 2.0]], DMatrix::from_element(1, 1, 1.5));
+        let mut growing = Growing::beside(place.clone(), DMatrix::zeros(1, 0), &stated, hyper).unwrap();
+        growing.tell(&Observed { stated, ..Observed::without_effects(place, vec![3.0]) }).unwrap();
+        // Field and effect together: 4 + 2.25, of which a point with a scatter of 0.25 was told.
+        let told = growing.known().next().unwrap();
+        assert!((told.mean_mm - 6.25 / 6.5 * 3.0).abs() < 1e-12, "{told:?}");
+        assert!((told.sigma_mm.powi(2) - (6.25 - 6.25 * 6.25 / 6.5)).abs() < 1e-12, "{told:?}");
     }
 
     #[test]

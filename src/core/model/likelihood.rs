@@ -9,6 +9,7 @@ use nalgebra::DMatrix;
 use rayon::prelude::*;
 
 use super::climb::climb;
+use super::profile::{Profile, best_scale};
 use super::{Dense, Field, Hyper, Lay, ModelError, Observed, Smoothness, spacing_mm};
 
 /// What is known of a field before anything is measured: the median of each, and by what factor it may be off (one standard deviation of
@@ -320,7 +321,8 @@ fn with_plane(observed: &Observed, block: &[usize]) -> Observed {
         c => places[r][c - 1] - middle[c - 1],
     });
     let deviations_mm = block.iter().map(|&k| observed.deviations_mm[k]).collect();
-    Observed { deviations_mm, places, effects, path: observed.path_of(block) }
+    let stated = observed.stated.select_rows(block);
+    Observed { deviations_mm, places, effects, stated, path: observed.path_of(block) }
 }
 
 impl Hyper {
@@ -330,6 +332,9 @@ impl Hyper {
         let with = Dense::fit(&few, *self).map_or(f64::NEG_INFINITY, |model| model.log_likelihood());
         // As good as none, and a scatter that suits it best.
         let unit = Self { field: Field { sigma_mm: NO_FIELD, ..self.field }, scatter_mm: 1.0, ..*self };
+        if few.stated.ncols() > 0 {
+            return Profile::of(&few, unit).map_or(f64::INFINITY, |without| with - best_scale(&[without]).1);
+        }
         let Ok(without) = Dense::fit(&few, unit) else { return f64::INFINITY };
         let squares = without.whitened_squares(&few);
         let free = (few.places.len() - few.effects.ncols()) as f64;
@@ -363,6 +368,13 @@ fn scaled(
     let unit = Hyper { field: Field { sigma_mm: 1.0, range_mm, smoothness, lay }, scatter_mm: ratio, drift };
     let known = priors.log_density(range_mm, ratio) + doubt(smoothness);
     let (mut value, mut squares, mut free) = (known, 0.0, 0.0);
+    if told[0].stated.ncols() > 0 {
+        let first = Profile::of(&told[0], unit)?;
+        let others = told[1..].iter().filter_map(|observed| Profile::of(observed, unit).ok());
+        let (sigma_mm, of) = best_scale(&std::iter::once(first).chain(others).collect::<Vec<_>>());
+        let hyper = Hyper { field: Field { sigma_mm, ..unit.field }, scatter_mm: ratio * sigma_mm, drift };
+        return Ok((hyper, value + of));
+    }
     for (k, observed) in told.iter().enumerate() {
         let model = match Dense::fit(observed, unit) {
             Ok(model) => model,
@@ -415,7 +427,7 @@ mod tests {
         let of = |k: usize, scatter: f64| field[k] + hyper.scatter_mm * scatter + 0.3 - 0.01 * places[k][0];
         let deviations_mm = (0..places.len()).map(|k| of(k, normals.next())).collect();
         let effects = DMatrix::from_fn(places.len(), 3, |r, c| [1.0, places[r][0], places[r][1]][c]);
-        Observed { places, deviations_mm, effects, path: Vec::new() }
+        Observed { effects, ..Observed::without_effects(places, deviations_mm) }
     }
 
     #[test]
@@ -454,7 +466,8 @@ mod tests {
         };
         let deviations_mm = (0..n).map(&mut of).collect();
         let effects = DMatrix::from_fn(n, 3, |r, c| [1.0, places[r][0], places[r][1]][c]);
-        Observed { places, deviations_mm, effects, path: (0..n).map(|k| k as f64).collect() }
+        let path = (0..n).map(|k| k as f64).collect();
+        Observed { effects, path, ..Observed::without_effects(places, deviations_mm) }
     }
 
     #[test]

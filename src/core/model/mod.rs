@@ -19,6 +19,7 @@
 //!
 //! Frame: places lie in the plane of projection of the model {M}. Units: millimetres.
 
+mod budget;
 mod climb;
 mod dense;
 mod error;
@@ -26,17 +27,21 @@ mod field;
 mod form;
 mod growing;
 mod likelihood;
+mod machine;
 mod matern;
 mod normals;
+mod profile;
 mod sparse;
 mod touches;
 
+pub use budget::Share;
 pub use dense::{Dense, Predicted};
 pub use error::ModelError;
 pub use field::{Field, Lay, Smoothness};
 pub use form::{Form, FormFigures, FormPoint, Given, Interval};
 pub use growing::Growing;
 pub use likelihood::Priors;
+pub use machine::{Machine, Source};
 pub use sparse::{Lattice, Sparse};
 pub use touches::{FEWEST, FIRST, Look, MOST_BATCHES, Purpose, SoFar, Why, look, short_way, spread};
 
@@ -63,6 +68,8 @@ pub struct Observed {
     pub deviations_mm: Vec<f64>,
     /// What a unit of each effect that nobody knows adds to it, such as the motions of the part; may have no column.
     pub effects: DMatrix<f64>,
+    /// What a standard uncertainty of each effect that somebody states adds to it, such as those of the machine; may have no column.
+    pub stated: DMatrix<f64>,
     /// Which point of a path each of them is; empty where they were not measured along one.
     pub path: Vec<f64>,
 }
@@ -70,8 +77,8 @@ pub struct Observed {
 impl Observed {
     /// Deviations of which nothing moves them all.
     pub fn without_effects(places: Vec<[f64; 2]>, deviations_mm: Vec<f64>) -> Self {
-        let effects = DMatrix::zeros(places.len(), 0);
-        Self { places, deviations_mm, effects, path: Vec::new() }
+        let [effects, stated] = [0, 0].map(|columns| DMatrix::zeros(places.len(), columns));
+        Self { places, deviations_mm, effects, stated, path: Vec::new() }
     }
 
     /// Some of them.
@@ -80,8 +87,21 @@ impl Observed {
             places: chosen.iter().map(|&k| self.places[k]).collect(),
             deviations_mm: chosen.iter().map(|&k| self.deviations_mm[k]).collect(),
             effects: self.effects.select_rows(chosen),
+            stated: self.stated.select_rows(chosen),
             path: self.path_of(chosen),
         }
+    }
+
+    /// The effects that nobody knows, and beside them those that are stated.
+    fn all_effects(&self) -> DMatrix<f64> {
+        let (n, p) = self.effects.shape();
+        DMatrix::from_fn(
+            n,
+            p + self.stated.ncols(),
+            |r, c| {
+                if c < p { self.effects[(r, c)] } else { self.stated[(r, c - p)] }
+            },
+        )
     }
 
     fn path_of(&self, chosen: &[usize]) -> Vec<f64> {
@@ -90,17 +110,22 @@ impl Observed {
 
     /// Says what makes these no observations.
     fn check(&self) -> Result<(), ModelError> {
-        let Self { places, deviations_mm, effects, path } = self;
+        let Self { places, deviations_mm, effects, stated, path } = self;
         let (points, columns) = (places.len(), effects.ncols());
         let has_path = path.len() == points && path.iter().all(|value| value.is_finite());
-        if deviations_mm.len() != points || effects.nrows() != points || !(path.is_empty() || has_path) {
+        if deviations_mm.len() != points
+            || effects.nrows() != points
+            || stated.nrows() != points
+            || !(path.is_empty() || has_path)
+        {
             return Err(ModelError::Shape { points, deviations: deviations_mm.len(), rows: effects.nrows() });
         }
         if points <= columns {
             return Err(ModelError::TooFewPoints { points, least: columns + 1 });
         }
         let finite = |k: usize| {
-            places[k].iter().chain(&deviations_mm[k..=k]).chain(effects.row(k).iter()).all(|value| value.is_finite())
+            let effects = effects.row(k).into_iter().chain(&stated.row(k)).all(|value| value.is_finite());
+            effects && places[k].iter().chain(&deviations_mm[k..=k]).all(|value| value.is_finite())
         };
         match (0..points).find(|&k| !finite(k)) {
             Some(point) => Err(ModelError::NotFinite { point }),

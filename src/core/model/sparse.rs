@@ -10,13 +10,13 @@
 //! add to it, lies further than one range away from every place. A field with a lay is laid on a grid of the plane in which it has none.
 //!
 //! With B the splines from nodes to points, P = Q + B'B / s^2 is the precision of the nodes beside known effects; the effects come from
-//! H'R^-1 H with R^-1 = (1 - B P^-1 B' / s^2) / s^2.
+//! H'R^-1 H with R^-1 = (1 - B P^-1 B' / s^2) / s^2, to which effects that are stated, of variance 1, add 1 on the diagonal.
 
 use faer::Mat;
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
-use super::dense::told_apart;
+use super::dense::{told_apart, with_stated};
 use super::normals::Normals;
 use super::{Field, Hyper, ModelError, Observed, Predicted, Smoothness};
 use crate::sparse::{Factor, Pattern, SelectedInverse};
@@ -219,6 +219,18 @@ fn unit_variance(kappa_h: f64, reach: isize) -> f64 {
     rows.iter().sum::<f64>() / (steps * steps) as f64
 }
 
+/// What a variance comes from.
+pub(super) struct Parted {
+    /// The points by themselves.
+    pub(super) scatter: f64,
+    /// The field between them.
+    pub(super) form: f64,
+    /// The effects that nobody knows.
+    pub(super) pose: f64,
+    /// Each of those that are stated.
+    pub(super) stated: Vec<f64>,
+}
+
 /// A model that knows some points.
 pub struct Sparse<'a> {
     lattice: &'a Lattice,
@@ -241,7 +253,8 @@ impl<'a> Sparse<'a> {
     pub fn fit(lattice: &'a Lattice, observed: &Observed, hyper: Hyper) -> Result<Self, ModelError> {
         observed.check()?;
         hyper.check()?;
-        let Observed { places, deviations_mm, effects, .. } = observed;
+        let Observed { places, deviations_mm, .. } = observed;
+        let (effects, vague) = (observed.all_effects(), observed.effects.ncols());
         let (n, p) = (places.len(), effects.ncols());
         let precision2 = hyper.white_scatter_mm().powi(-2);
         if (hyper.field.smoothness, hyper.field.lay) != (lattice.field.smoothness, lattice.field.lay) {
@@ -274,7 +287,7 @@ impl<'a> Sparse<'a> {
             DMatrix::from_fn(p, p, |a, b| (plain(a, &|k| effects[(k, b)]) - inner(a, b) * precision2) * precision2);
         let towards =
             DVector::from_fn(p, |a, _| (plain(a, &|k| deviations_mm[k]) - inner(a, p) * precision2) * precision2);
-        let gram = told_apart(gram)?;
+        let gram = told_apart(with_stated(gram, vague))?;
         let found = gram.solve(&towards);
         let follows = Mat::from_fn(lattice.nodes(), p, |r, c| solved[(r, c)] * precision2);
         let mean_mm: Vec<f64> = (0..lattice.nodes())
@@ -296,7 +309,7 @@ impl<'a> Sparse<'a> {
             follows,
             found,
             covariance: gram.inverse(),
-            likelihood: -0.5 * (log_det + log_gram + squares + (n - p) as f64 * std::f64::consts::TAU.ln()),
+            likelihood: -0.5 * (log_det + log_gram + squares + (n - vague) as f64 * std::f64::consts::TAU.ln()),
         })
     }
 
@@ -324,6 +337,39 @@ impl<'a> Sparse<'a> {
             Predicted { mean_mm, sigma_mm: (known + by_effects).max(0.0).sqrt() }
         };
         places.par_iter().map(tell).collect()
+    }
+
+    /// Tells what the uncertainty of a sum over places, each with its weight, comes from.
+    ///
+    /// With the motions known the sum is told by a'd, of whose error the scatter makes s^2 a'a, an effect that is stated (e'a)^2, and the field what
+    /// is left; that the motions are not known adds the rest.
+    pub(super) fn parted(&self, observed: &Observed, hyper: &Hyper, sum: (&[[f64; 2]], &[f64])) -> Option<Parted> {
+        let (nodes, vague, stated) = (self.lattice.nodes(), observed.effects.ncols(), observed.stated.ncols());
+        let mut right = Mat::<f64>::zeros(nodes, 1);
+        for (&place, weight) in sum.0.iter().zip(sum.1) {
+            self.lattice.around(place).iter().for_each(|(node, share)| right[(*node, 0)] += weight * share);
+        }
+        let solved = self.factor.solve_all(&right)?;
+        let own: f64 = (0..nodes).map(|k| right[(k, 0)] * solved[(k, 0)]).sum();
+        let follows = |a: usize| (0..nodes).map(|k| self.follows[(k, a)] * right[(k, 0)]).sum::<f64>();
+        let moved = DVector::from_fn(self.found.len(), |a, _| follows(a));
+        let precision = self.covariance.clone().try_inverse()?;
+        let precision = precision.view((vague, vague), (stated, stated)).into_owned();
+        let held = if stated == 0 { DVector::zeros(0) } else { precision.try_inverse()? * moved.rows(vague, stated) };
+        let pose_known = own + moved.rows(vague, stated).dot(&held);
+        let precision2 = hyper.white_scatter_mm().powi(-2);
+        let weight = |k: usize| {
+            let around = self.lattice.around(observed.places[k]);
+            let read = |of: &dyn Fn(usize) -> f64| around.iter().map(|&(node, share)| share * of(node)).sum::<f64>();
+            let left = |c: usize| observed.stated[(k, c)] - read(&|node| self.follows[(node, vague + c)]);
+            precision2 * (read(&|node| solved[(node, 0)]) - (0..stated).map(|c| left(c) * held[c]).sum::<f64>())
+        };
+        let weights = DVector::from_fn(observed.places.len(), |k, _| weight(k));
+        let scatter = weights.norm_squared() / precision2;
+        let stated: Vec<f64> = observed.stated.tr_mul(&weights).iter().map(|of| of * of).collect();
+        let form = (pose_known - scatter - stated.iter().sum::<f64>()).max(0.0);
+        let pose = (own + moved.dot(&(&self.covariance * &moved)) - pose_known).max(0.0);
+        Some(Parted { scatter, form, pose, stated })
     }
 
     /// Draws fields that what was measured leaves possible, each with its own effects: a row a place, a column a sample, in millimetres. The
@@ -386,7 +432,7 @@ mod tests {
         let shape = |[x, y]: [f64; 2]| 5e-3 * ((0.08 * x).sin() * (0.11 * y).cos() + 0.4 * (0.17 * x + 0.05 * y).sin());
         let deviations_mm = places.iter().map(|&place| shape(place) + 3e-4 * normals.next()).collect();
         let effects = DMatrix::from_fn(places.len(), 3, |r, c| [1.0, places[r][0] - 50.0, places[r][1] - 30.0][c]);
-        Observed { places, deviations_mm, effects, path: Vec::new() }
+        Observed { effects, ..Observed::without_effects(places, deviations_mm) }
     }
 
     /// A field of each smoothness, one with a lay, and one far wider than the part.
@@ -427,6 +473,35 @@ mod tests {
             assert!((0..3).all(|k| off[k].abs() < 0.05 * a[k]), "{hyper:?} {off} {a}");
             let likelihoods = [exact.log_likelihood(), sparse.log_likelihood()];
             assert!((likelihoods[0] - likelihoods[1]).abs() < 3.0, "{hyper:?} {likelihoods:?}");
+        }
+    }
+
+    #[test]
+    fn what_is_stated_it_tells_as_the_covariances_of_all_points_do_and_parts_its_variance() {
+        let mut observed = observed(600);
+        let rows: Vec<[f64; 2]> =
+            observed.places.iter().map(|[x, y]| [2e-3, 4e-3 * ((x - 50.0) / 50.0).powi(2) + 1e-5 * y]).collect();
+        observed.stated = DMatrix::from_fn(600, 2, |r, c| rows[r][c]);
+        let exact = Dense::fit(&observed, HYPER).unwrap();
+        let lattice = Lattice::over(&observed.places, &HYPER.field).unwrap();
+        let sparse = Sparse::fit(&lattice, &observed, HYPER).unwrap();
+        let asked: Vec<[f64; 2]> = (0..150).map(|k| [8.1 * f64::from(k % 12), 5.0 * f64::from(k / 12)]).collect();
+        for (a, b) in exact.predict(&asked).into_iter().zip(sparse.predict(&asked)) {
+            assert!((a.mean_mm - b.mean_mm).abs() < 0.06 * a.sigma_mm && (b.sigma_mm / a.sigma_mm - 1.0).abs() < 0.03);
+        }
+        let [a, b] = [exact.log_likelihood(), sparse.log_likelihood()];
+        assert!((a - b).abs() < 3.0, "{a} {b}");
+        // What is stated makes the field less well known, never better.
+        let before = Dense::fit(&Observed { stated: DMatrix::zeros(600, 0), ..observed.clone() }, HYPER).unwrap();
+        let sigma = |model: &Dense| model.predict(&asked[40..41])[0].sigma_mm;
+        assert!(sigma(&exact) > sigma(&before));
+        // The variance of one place is the sum of its parts.
+        for place in &asked {
+            let parts = sparse.parted(&observed, &HYPER, (&[*place], &[1.0])).unwrap();
+            let whole = parts.scatter + parts.form + parts.pose + parts.stated.iter().sum::<f64>();
+            let told = sparse.predict(&[*place])[0].sigma_mm.powi(2);
+            assert!((whole / told - 1.0).abs() < 1e-6, "{whole} {told}");
+            assert!(parts.scatter > 0.0 && parts.form > 0.0 && parts.stated[1] > 0.0);
         }
     }
 

@@ -129,7 +129,7 @@ pub fn look(
     seed: u64,
 ) -> Result<Look, ModelError> {
     let form = Form::over(registration, given, so_far.targets)?;
-    let mut growing = Expected::of(registration, &form, so_far)?;
+    let mut growing = Expected::of(registration, given, &form, so_far)?;
     let count = so_far.touched.len();
     let left = so_far.tried.iter().filter(|tried| tried.is_none()).count();
     let around = growing.around(so_far);
@@ -172,7 +172,7 @@ fn settled(form: &Form, purpose: &Purpose, (count, pattern): (usize, usize)) -> 
     let (share, least) = GIVEN_UP;
     let gives_up = count >= least.max((share * pattern as f64) as usize);
     // Who judges looks once, and may accept what a look among many may not: then more is touched, not ground.
-    let is_accepted = figures.iter().all(|(figure, limit)| figure.high_mm <= *limit);
+    let is_accepted = figures.iter().all(|(figure, limit)| figure.accepted_mm <= *limit);
     match () {
         () if is_beyond && !purpose.may_grind => Why::Beyond,
         () if is_known && (is_beyond || gives_up && purpose.may_grind && !is_accepted) => Why::Known,
@@ -192,20 +192,26 @@ struct Expected {
 
 impl Expected {
     /// Tells the model all that was found before the last batch, looks what it expects of that, and tells it the rest.
-    fn of(registration: &Registration, form: &Form, so_far: &SoFar) -> Result<Self, ModelError> {
+    fn of(registration: &Registration, given: &Given, form: &Form, so_far: &SoFar) -> Result<Self, ModelError> {
         let SoFar { targets, tried, touched } = so_far;
         let all: Vec<_> = registration.deviations.iter().zip(touched.iter().copied()).collect();
         let used = || all.iter().filter(|(d, _)| d.status == PointStatus::Used);
         let motions = Motions::of(registration, used().map(|(d, _)| d.point));
+        let stated = motions.stated(registration, given)?;
         let last = tried.iter().flatten().max().copied().unwrap_or(0);
         let of = |is_last: bool| -> (Observed, Vec<usize>) {
             let chosen: Vec<_> = used().filter(|(_, target)| (tried[*target] == Some(last)) == is_last).collect();
             let rows: Vec<_> = chosen.iter().map(|(d, _)| *d).collect();
-            (motions.observed(&rows), chosen.iter().map(|(_, target)| *target).collect())
+            let columns = stated.columns(rows.iter().map(|d| (d.point, d.normal)));
+            (
+                Observed { stated: columns, ..motions.observed(&rows) },
+                chosen.iter().map(|(_, target)| *target).collect(),
+            )
         };
         let ((before, _), (found, of_targets)) = (of(false), of(true));
         let places = targets.iter().map(|(point, _)| [point.x, point.y]).collect();
-        let mut growing = Growing::over(places, motions.rows(targets.iter().copied()), form.hyper)?;
+        let (rows, columns) = (motions.rows(targets.iter().copied()), stated.columns(targets.iter().copied()));
+        let mut growing = Growing::beside(places, rows, &columns, form.hyper)?;
         growing.tell(&before)?;
         // Before the motions are held nothing is expected.
         let is_held = before.places.len() > before.effects.ncols();

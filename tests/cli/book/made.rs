@@ -68,7 +68,7 @@ fn keys(form: &Value) -> impl Iterator<Item = (&String, &Value)> {
 }
 
 fn unit(key: &str) -> &'static str {
-    const UNITS: [(&str, &str); 11] = [
+    const UNITS: [(&str, &str); 13] = [
         ("_mm_s2", "mm/s²"),
         ("_mm_min", "mm/min"),
         ("_mm_s", "mm/s"),
@@ -76,6 +76,8 @@ fn unit(key: &str) -> &'static str {
         ("_um", "µm"),
         ("_nm", "nm"),
         ("_deg", "degrees"),
+        ("_urad", "µrad"),
+        ("_ppm", "ppm"),
         ("_ms", "ms"),
         ("_for_s", "s"),
         ("_c", "°C"),

@@ -6,7 +6,7 @@ use rand::rngs::StdRng;
 
 use crate::common::{RADIUS_MM, centres, free_form, normal, placed, points, pose};
 use regrind_core::geometry::Pose;
-use regrind_core::model::{Form, Given, Interval};
+use regrind_core::model::{Form, Given, Interval, Machine, Share, Source};
 use regrind_core::registration::{Options, Registration, Start, register};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
@@ -140,6 +140,65 @@ fn a_form_as_small_as_the_scatter_is_told_without_it() {
     assert!(raw[0] > 1.3 && raw[1] > 1.5, "{raw:?}");
 }
 
+/// A part that was measured by a machine with errors of its scales and its angles, in units of what is stated of it, and with a wrong radius.
+fn by_a_machine(seed: u64, machine: &Machine, radius_sigma_mm: f64) -> (FormError, Registration) {
+    let mut rng = StdRng::seed_from_u64(seed);
+    let form = FormError::with_rms(&mut regrind_sim::rng(seed), 30.0, 2e-3);
+    let mut all = centres(&FreeForm::default(), &form, [[-48.0, -28.0], [48.0, 28.0]], [26, 16]);
+    let [sx, sy, sz] = machine.scale.map(|of| of * normal(&mut rng));
+    let [xy, xz, yz] = machine.squareness_rad.map(|of| of * normal(&mut rng));
+    for centre in &mut all {
+        let [x, y, z] = *centre;
+        *centre = [x + sx * x + xy * y + xz * z, y + sy * y + yz * z, z + sz * z];
+        centre.iter_mut().for_each(|v| *v += SCATTER_MM * normal(&mut rng));
+    }
+    let stated_mm = RADIUS_MM + radius_sigma_mm * normal(&mut rng);
+    let options = Options { start: Start::Pose(Pose::identity()), ..Options::new(stated_mm) };
+    (form, register(&free_form(409, 249), &points(&all), &options).unwrap())
+}
+
+#[test]
+fn what_a_machine_does_to_all_points_is_allowed_for_where_it_is_stated() {
+    const MACHINES: u64 = 8;
+    let machine = Machine { scale: [2e-5; 3], squareness_rad: [2e-5; 3], ..Machine::default() };
+    let radius_sigma_mm = 3e-4;
+    let given = Given { machine, radius_sigma_mm, ..Given::default() };
+    let (mut with, mut without, mut wider) = (0, 0, 0.0);
+    for seed in 0..MACHINES {
+        let (form, found) = by_a_machine(seed, &machine, radius_sigma_mm);
+        let model = Form::of(&found, &given).unwrap();
+        let blind = Form::of(&found, &Given::default()).unwrap();
+        let part = Part { form, truth: Pose::identity(), found, model };
+        let [true_rms, _] = figures(&part.form());
+        with += u32::from(holds(part.model.figures.rms, true_rms));
+        without += u32::from(holds(blind.figures.rms, true_rms));
+        let width = |form: &Form| form.figures.rms.high_mm - form.figures.rms.low_mm;
+        wider += width(&part.model) / width(&blind) / MACHINES as f64;
+        let squares = |of: fn(&Share) -> f64| part.model.budget.iter().map(|s| of(s).powi(2)).sum::<f64>().sqrt();
+        assert!((squares(|s| s.rms_mm) / part.model.figures.rms.standard_mm() - 1.0).abs() < 1e-9);
+        let stated = |source| part.model.budget.iter().find(|s| s.source == source).unwrap().is_stated;
+        assert!(stated(Source::Scales) && stated(Source::Radius) && !stated(Source::Probe));
+    }
+    println!(
+        "of {MACHINES} RMS held in {with} where it is stated, in {without} where it is not; {wider:.1} times as wide"
+    );
+    assert!(with >= MACHINES as u32 - 1 && with > without && wider > 1.5, "{with} {without} {wider}");
+}
+
+#[test]
+fn what_no_uncertainty_can_be_is_refused_in_words() {
+    let part = part(3, 5e-3);
+    for wrong in [-1e-3, f64::NAN, 1e9] {
+        for machine in [
+            Machine { probe_mm: wrong, ..Machine::default() },
+            Machine { squareness_rad: [0.0, wrong, 0.0], ..Machine::default() },
+        ] {
+            let error = Form::of(&part.found, &Given { machine, ..Given::default() }).unwrap_err().to_string();
+            assert!(error.contains("standard uncertainty") && error.contains(&wrong.to_string()), "{error}");
+        }
+    }
+}
+
 #[test]
 fn what_is_known_of_the_radius_of_the_probe_is_in_what_is_said() {
     let part = part(3, 1e-9);
@@ -147,7 +206,6 @@ fn what_is_known_of_the_radius_of_the_probe_is_in_what_is_said() {
     let doubted = Form::of(&part.found, &given).unwrap();
     let [z, z_doubted] = [&part.model, &doubted].map(|form| form.frame_covariance[(2, 2)].sqrt());
     assert!((z_doubted / 2e-2 - 1.0).abs() < 0.2 && z < 1e-4, "{z} {z_doubted}");
-    assert!(doubted.figures.rms.high_mm > 2.0 * part.model.figures.rms.high_mm, "{:?}", doubted.figures);
 }
 
 #[test]

@@ -1,0 +1,229 @@
+//! What a measuring machine does to all points together, and no point can show: its scales, its angles, its probe.
+//!
+//! Each is an effect on the deviations whose size nobody knows but whose standard uncertainty somebody states: a column of E, scaled so that its
+//! factor has the variance 1. The covariance of what was measured is K + s^2 R + E E', and the form is the field alone. So an error of the machine is
+//! in the figures once, where it was measured, and is not added to them again.
+
+use nalgebra::{DMatrix, Matrix3};
+
+use crate::geometry::{Point, Vector};
+
+/// Standard uncertainties of what a measuring machine does to all points together; 0 where nothing is stated.
+///
+/// Frame: the axes are those of the machine {W}.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Machine {
+    /// Of the length of each axis, as a share of it.
+    pub scale: [f64; 3],
+    /// Of the angles xy, xz and yz between the axes beside a right one.
+    pub squareness_rad: [f64; 3],
+    /// Of the error of the probe in any one direction, beside its radius.
+    pub probe_mm: f64,
+    /// Of the radius of the sphere that the probe is qualified on.
+    pub reference_sphere_mm: f64,
+}
+
+/// What a part of an uncertainty comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Source {
+    /// Each touch by itself.
+    Scatter,
+    /// The form between the touches, and below their scatter.
+    Form,
+    /// Where the part lies.
+    Pose,
+    /// The radius of the probe as it was found, and that of the sphere on which.
+    Radius,
+    /// The scales of the machine.
+    Scales,
+    /// Its angles.
+    Squareness,
+    /// The probe by direction.
+    Probe,
+    /// Temperature and expansion.
+    Temperature,
+}
+
+impl Source {
+    /// All of them, as they are told.
+    pub const ALL: [Self; 8] = [
+        Self::Scatter,
+        Self::Form,
+        Self::Pose,
+        Self::Radius,
+        Self::Scales,
+        Self::Squareness,
+        Self::Probe,
+        Self::Temperature,
+    ];
+}
+
+/// What is stated of all points together, as far as it is above 0.
+#[derive(Clone, Debug)]
+pub(super) struct Effects {
+    machine: Machine,
+    radius_mm: f64,
+    temperature: f64,
+    centre: Point,
+    model_from_machine: Matrix3<f64>,
+}
+
+impl Effects {
+    /// `radius_mm` is the standard uncertainty of the radius of the probe as it was found, `temperature` that of all lengths as a share of them.
+    pub(super) fn new(
+        machine: Machine,
+        [radius_mm, temperature]: [f64; 2],
+        centre: Point,
+        model_from_machine: Matrix3<f64>,
+    ) -> Self {
+        let radius_mm = radius_mm.hypot(machine.reference_sphere_mm);
+        Self { machine, radius_mm, temperature, centre, model_from_machine }
+    }
+
+    /// Which columns there are.
+    pub(super) fn sources(&self) -> Vec<Source> {
+        self.all().into_iter().map(|(source, _)| source).collect()
+    }
+
+    /// What one standard uncertainty of each adds to the distance of each point from the surface: a row a point.
+    pub(super) fn columns(&self, points: impl Iterator<Item = (Point, Vector)>) -> DMatrix<f64> {
+        let all = self.all();
+        let to_machine = self.model_from_machine.transpose();
+        let placed: Vec<(Vector, Vector)> =
+            points.map(|(point, normal)| (to_machine * (point - self.centre), to_machine * normal)).collect();
+        DMatrix::from_fn(placed.len(), all.len(), |r, c| all[c].1.on(placed[r].0, placed[r].1))
+    }
+
+    fn all(&self) -> Vec<(Source, Effect)> {
+        let Machine { scale, squareness_rad, probe_mm, .. } = self.machine;
+        let scales = scale.into_iter().enumerate().map(|(k, share)| (Source::Scales, Effect::Stretch([k, k], share)));
+        let angles = [[0, 1], [0, 2], [1, 2]].into_iter().zip(squareness_rad);
+        let angles = angles.map(|(axes, angle)| (Source::Squareness, Effect::Stretch(axes, angle)));
+        let probe = (0..5).map(|k| (Source::Probe, Effect::Direction(k, probe_mm)));
+        let alike =
+            [(Source::Radius, Effect::Radius(self.radius_mm)), (Source::Temperature, Effect::Size(self.temperature))];
+        alike.into_iter().chain(scales).chain(angles).chain(probe).filter(|(_, effect)| effect.size() > 0.0).collect()
+    }
+}
+
+/// One effect, with its standard uncertainty.
+#[derive(Clone, Copy, Debug)]
+enum Effect {
+    /// Along the normal, everywhere alike.
+    Radius(f64),
+    /// All lengths by a share.
+    Size(f64),
+    /// The first axis, in proportion to where a point is on the second.
+    Stretch([usize; 2], f64),
+    /// One of the five spherical harmonics of degree 2 of the normal. Those of degree 1 are shifts of the part. Scaled so that the sum of their
+    /// squares is 1 in every direction.
+    Direction(usize, f64),
+}
+
+impl Effect {
+    fn size(&self) -> f64 {
+        match *self {
+            Self::Radius(size) | Self::Size(size) | Self::Stretch(_, size) | Self::Direction(_, size) => size,
+        }
+    }
+
+    /// What it adds at a place, by where that is beside the middle and by the normal, both in the frame of the machine.
+    fn on(&self, arm: Vector, n: Vector) -> f64 {
+        let root = 3.0_f64.sqrt();
+        let of_unit = match *self {
+            Self::Radius(_) => 1.0,
+            Self::Size(_) => arm.dot(&n),
+            Self::Stretch([along, by], _) => arm[by] * n[along],
+            Self::Direction(0, _) => root * n.x * n.y,
+            Self::Direction(1, _) => root * n.y * n.z,
+            Self::Direction(2, _) => root * n.x * n.z,
+            Self::Direction(3, _) => 0.5 * (3.0 * n.z * n.z - 1.0),
+            Self::Direction(..) => 0.5 * root * (n.x * n.x - n.y * n.y),
+        };
+        self.size() * of_unit
+    }
+}
+
+/// Says what no standard uncertainty can be: what is negative, none, or beyond all sense.
+pub(super) fn unsound(machine: &Machine, [radius_mm, temperature]: [f64; 2]) -> Option<(&'static str, f64)> {
+    // More than a tenth of all lengths, than six degrees, than a centimetre, is no measuring machine.
+    let shares = machine.scale.map(|of| ("scale", of, 0.1)).into_iter();
+    let angles = machine.squareness_rad.map(|of| ("squareness", of, 0.1)).into_iter();
+    let others = [
+        ("probe by direction", machine.probe_mm, 10.0),
+        ("reference sphere", machine.reference_sphere_mm, 10.0),
+        ("radius of the probe", radius_mm, 10.0),
+        ("temperature", temperature, 0.1),
+    ];
+    shares.chain(angles).chain(others).find(|(_, of, most)| !(0.0..=*most).contains(of)).map(|(what, of, _)| (what, of))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn effects(machine: Machine, of_others: [f64; 2]) -> Effects {
+        Effects::new(machine, of_others, Point::new(1.0, 2.0, 3.0), Matrix3::identity())
+    }
+
+    #[test]
+    fn of_one_point_they_are_what_is_worked_out_by_hand() {
+        let machine = Machine {
+            scale: [1e-6, 0.0, 3e-6],
+            squareness_rad: [4e-6, 5e-6, 6e-6],
+            probe_mm: 2e-4,
+            reference_sphere_mm: 4e-4,
+        };
+        let of = effects(machine, [3e-4, 1e-5]);
+        // 10, 20, 30 beside the middle, on a normal of 0.6 and 0.8.
+        let row = of.columns(std::iter::once((Point::new(11.0, 22.0, 33.0), Vector::new(0.6, 0.0, 0.8))));
+        let root = 3.0_f64.sqrt();
+        let by_hand = [
+            5e-4,
+            1e-5 * (6.0 + 24.0),
+            6e-6,
+            3e-6 * 24.0,
+            4e-6 * 20.0 * 0.6,
+            5e-6 * 30.0 * 0.6,
+            0.0,
+            0.0,
+            0.0,
+            2e-4 * root * 0.48,
+            2e-4 * 0.5 * (3.0 * 0.64 - 1.0),
+            2e-4 * 0.5 * root * 0.36,
+        ];
+        assert_eq!(row.ncols(), by_hand.len());
+        assert!(row.iter().zip(by_hand).all(|(found, hand)| (found - hand).abs() < 1e-15), "{row}");
+        assert_eq!(of.sources()[..4], [Source::Radius, Source::Temperature, Source::Scales, Source::Scales]);
+    }
+
+    #[test]
+    fn the_error_by_direction_has_the_same_variance_in_every_direction() {
+        let of = effects(Machine { probe_mm: 3e-4, ..Machine::default() }, [0.0; 2]);
+        for k in 0..50_u32 {
+            let (turn, rise) = (0.7 * f64::from(k), -0.98 + 0.04 * f64::from(k));
+            let flat = (1.0 - rise * rise).sqrt();
+            let normal = Vector::new(flat * turn.cos(), flat * turn.sin(), rise);
+            let row = of.columns(std::iter::once((Point::origin(), normal)));
+            assert!((row.norm() / 3e-4 - 1.0).abs() < 1e-12, "{normal}");
+        }
+    }
+
+    #[test]
+    fn the_axes_are_those_of_the_machine() {
+        // Its x axis is the model's y.
+        let turned = Matrix3::new(0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0);
+        let machine = Machine { scale: [1e-6, 0.0, 0.0], ..Machine::default() };
+        let of = Effects::new(machine, [0.0; 2], Point::origin(), turned);
+        let on = |normal| of.columns(std::iter::once((Point::new(10.0, 20.0, 0.0), normal)))[0];
+        assert!((on(Vector::y()) - 2e-5).abs() < 1e-18 && on(Vector::x()).abs() < 1e-18);
+    }
+
+    #[test]
+    fn where_nothing_is_stated_there_is_no_column() {
+        let none = effects(Machine::default(), [0.0; 2]);
+        assert!(none.sources().is_empty());
+        assert_eq!(none.columns(std::iter::once((Point::origin(), Vector::z()))).shape(), (1, 0));
+    }
+}
