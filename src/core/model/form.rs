@@ -12,7 +12,9 @@ use rayon::prelude::*;
 use super::likelihood::Told;
 use super::normals::Normals;
 use super::spacing_mm;
+use super::{AreaOptions, IsoFigures, SlopeFigures};
 use super::{Dense, Hyper, Lattice, ModelError, Observed, Predicted, Priors, Sparse};
+use crate::form::{IsoFits, SlopesAt};
 use crate::geometry::{Point, Vector};
 use crate::registration::{Deviation, PointStatus, Registration};
 
@@ -29,6 +31,10 @@ pub struct Form {
     pub points: Vec<FormPoint>,
     /// The figures of the form.
     pub figures: FormFigures,
+    /// Power, irregularity and their like; none where the points are too few for them.
+    pub iso: Option<IsoFigures>,
+    /// The slopes of the smooth form; none where the points are too few for them.
+    pub slope: Option<SlopeFigures>,
     /// How well the smooth form is known: the RMS of its standard uncertainty over all places.
     pub known_mm: f64,
     /// Whether the points show a form at all. Where they do not, the figures are known from above alone, and their intervals begin at 0.
@@ -98,9 +104,10 @@ impl Form {
         let alike = seen.motions.alike(given, seen.places());
         let drawn = Drawn::of(&seen.observed, &seen.told.likely)?;
         let alike = alike.select_rows(&drawn.chosen);
+        let slope = seen.slope(given, &drawn, &alike);
         let drawn =
             drawn.with_the_scatter(&seen.observed, &seen.told, given).with_what_is_alike(&alike).after_best_fit();
-        Ok(seen.form(given, &drawn))
+        Ok(Self { slope, ..seen.form(given, &drawn) })
     }
 
     /// Tells the form at places of the part that need not have been touched: points of the nominal surface with their normals, in the model
@@ -117,8 +124,9 @@ impl Form {
         let alike = seen.motions.alike(given, places.iter().copied());
         let effects = seen.motions.rows(places.iter().copied());
         let drawn = Drawn::over(&seen.observed, &seen.told.likely, places.iter().map(plane).collect(), effects)?;
+        let slope = seen.slope(given, &drawn, &alike);
         let drawn = drawn.with_what_is_narrow(&seen.told, given).with_what_is_alike(&alike).after_best_fit();
-        Ok(seen.form(given, &drawn))
+        Ok(Self { slope, ..seen.form(given, &drawn) })
     }
 }
 
@@ -157,6 +165,14 @@ impl<'a> Seen<'a> {
         self.used.iter().map(|d| (d.point, d.normal))
     }
 
+    /// The slopes of what is drawn, before anything is added that has none.
+    fn slope(&self, given: &Given, drawn: &Drawn, alike: &DMatrix<f64>) -> Option<SlopeFigures> {
+        let slopes = SlopesAt::over(&drawn.places, given.area.integration_mm)?;
+        let smooth = drawn.clone().with_what_is_alike(alike).after_best_fit();
+        Some(SlopeFigures::of(&slopes, &smooth.forms, self.is_seen))
+    }
+
+    /// The form by what is drawn, without its slopes.
     fn form(&self, given: &Given, drawn: &Drawn) -> Form {
         let alike = self.motions.alike(given, self.places());
         let covariance = of_the_fit(&self.observed, self.told.wide, &alike);
@@ -165,6 +181,9 @@ impl<'a> Seen<'a> {
             frame_covariance: self.motions.to_twist(&covariance),
             points: drawn.points(),
             figures: drawn.figures(self.is_seen, given.look_risk),
+            iso: IsoFits::over(&drawn.places, given.area.middle_mm)
+                .map(|fits| IsoFigures::of(&fits, &drawn.forms, self.is_seen, given.look_risk)),
+            slope: None,
             known_mm: drawn.known_mm(),
             is_seen: self.is_seen,
         }
@@ -208,11 +227,20 @@ pub struct Given {
     pub probe_scatter_mm: [f64; 2],
     /// With what probability a figure may be beyond either of the bounds [`Interval::least_mm`] and [`Interval::most_mm`].
     pub look_risk: f64,
+    /// What the figures of an area go by.
+    pub area: AreaOptions,
 }
 
 impl Default for Given {
     fn default() -> Self {
-        Self { priors: None, radius_sigma_mm: 0.0, scale_sigma: 0.0, probe_scatter_mm: [0.0; 2], look_risk: 0.005 }
+        Self {
+            priors: None,
+            radius_sigma_mm: 0.0,
+            scale_sigma: 0.0,
+            probe_scatter_mm: [0.0; 2],
+            look_risk: 0.005,
+            area: AreaOptions::default(),
+        }
     }
 }
 
@@ -247,6 +275,7 @@ fn of_the_fit(observed: &Observed, hyper: Hyper, alike: &DMatrix<f64>) -> DMatri
 }
 
 /// Forms that may have been, a column each, at some places.
+#[derive(Clone)]
 struct Drawn {
     forms: DMatrix<f64>,
     places: Vec<[f64; 2]>,
@@ -422,7 +451,7 @@ fn mixed(
 
 impl Interval {
     /// Of values that are equally probable.
-    fn of(mut values: Vec<f64>, has_low: bool, risk: f64) -> Self {
+    pub(super) fn of(mut values: Vec<f64>, has_low: bool, risk: f64) -> Self {
         values.sort_unstable_by(f64::total_cmp);
         let at = |share: f64| values[((values.len() - 1) as f64 * share).round() as usize];
         let low = |share: f64| if has_low { at(share) } else { 0.0 };

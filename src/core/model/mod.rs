@@ -21,6 +21,7 @@
 
 mod dense;
 mod error;
+mod figures;
 mod form;
 mod growing;
 mod likelihood;
@@ -31,6 +32,7 @@ mod touches;
 
 pub use dense::{Dense, Predicted};
 pub use error::ModelError;
+pub use figures::{AngleInterval, AreaOptions, IsoFigures, SlopeFigures};
 pub use form::{Form, FormFigures, FormPoint, Given, Interval};
 pub use growing::Growing;
 pub use likelihood::Priors;
