@@ -265,6 +265,7 @@ fn registered(
         radius_sigma_mm: points.radius_sigma_mm,
         scale_sigma,
         probe_scatter_mm: points.probe_scatter_mm,
+        area: maps::area(task),
         ..Given::default()
     };
     let looked = task.adaptive.as_ref().filter(|_| !points.tried.is_empty());
@@ -290,7 +291,7 @@ fn registered(
         Err(_) if looked_at => None,
         _ => error_map(&readings(&found), &task.map).ok(),
     };
-    maps::save_figures(task, files, error.as_ref(), &found).map_err(unfinished)?;
+    maps::save_figures(task, files, error.as_ref(), &found, form.as_ref().ok()).map_err(unfinished)?;
     let offered = maps::parameters(task, files, &found).map_err(unfinished)?;
     // Every measurement leaves its map, whatever becomes of the correction.
     error.as_ref().map_or(Ok(()), |map| maps::save(task, files, (number, cycle), map, &found))?;
