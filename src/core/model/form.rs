@@ -110,6 +110,16 @@ impl Form {
         Ok(Self { slope, ..seen.form(given, &drawn) })
     }
 
+    /// Tells the parameters of the form by the points alone, whatever is expected of it beforehand: what a part teaches of those that
+    /// follow. None where no form is seen. `in_order` says that the points may lie along a path.
+    ///
+    /// # Errors
+    /// Those of [`Form::of`].
+    pub fn alone(registration: &Registration, given: &Given, in_order: bool) -> Result<Option<Hyper>, ModelError> {
+        let seen = Seen::of(registration, &Given { priors: None, ..*given }, in_order)?;
+        Ok(seen.is_seen.then(|| seen.told.likely[0].0))
+    }
+
     /// Tells the form at places of the part that need not have been touched: points of the nominal surface with their normals, in the model
     /// frame. The figures are those of all of them.
     ///

@@ -48,8 +48,12 @@ impl Priors {
         Self { range_mm: [size_mm / 3.0, 6.0], scatter_ratio: [0.05, 20.0] }
     }
 
+    /// Beyond one factor it falls as slowly as it does there (Huber 1964): a part that is like none before is told by its own points.
     fn log_density(&self, range_mm: f64, ratio: f64) -> f64 {
-        let of = |value: f64, [median, factor]: [f64; 2]| -0.5 * ((value / median).ln() / factor.ln()).powi(2);
+        let of = |value: f64, [median, factor]: [f64; 2]| {
+            let off = ((value / median).ln() / factor.ln()).abs();
+            if off <= 1.0 { -0.5 * off * off } else { 0.5 - off }
+        };
         of(range_mm, self.range_mm) + of(ratio, self.scatter_ratio)
     }
 }
@@ -84,7 +88,8 @@ impl Hyper {
             _ => f64::NEG_INFINITY,
         };
         // A hill may have two tops: a wide form and a narrow one.
-        let far = (priors.range_mm[0] / least_mm).max(1.5);
+        let widest_mm = priors.range_mm[0].max(size_mm(&observed.places) / 3.0);
+        let far = (widest_mm / least_mm).max(1.5);
         let ranges = [0.1, 0.4, 0.7, 1.0, 1.5].map(|power: f64| (least_mm * far.powf(power)).ln());
         let higher = |a: Top, b: Top| if b.1 > a.1 { b } else { a };
         let tops_of = |drift: f64| {
@@ -204,6 +209,14 @@ impl Hyper {
 fn least_range_mm(observed: &Observed) -> f64 {
     const NEIGHBOURS: f64 = 2.5;
     NEIGHBOURS * spacing_mm(&observed.places)
+}
+
+/// The root mean square distance of places from their middle.
+fn size_mm(places: &[[f64; 2]]) -> f64 {
+    let n = places.len() as f64;
+    let middle = [0, 1].map(|axis| places.iter().map(|place| place[axis]).sum::<f64>() / n);
+    let squares = places.iter().map(|[x, y]| (x - middle[0]).powi(2) + (y - middle[1]).powi(2));
+    (squares.sum::<f64>() / n).sqrt()
 }
 
 /// The parameters with the scale that suits them best, and the logarithm of their probability. What tells nothing of its plane, such as points

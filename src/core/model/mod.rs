@@ -28,6 +28,7 @@ mod likelihood;
 mod matern;
 mod normals;
 mod sparse;
+mod taught;
 mod touches;
 
 pub use dense::{Dense, Predicted};
@@ -37,6 +38,7 @@ pub use form::{Form, FormFigures, FormPoint, Given, Interval};
 pub use growing::Growing;
 pub use likelihood::Priors;
 pub use sparse::{Lattice, Sparse};
+pub use taught::{Lesson, Taught};
 pub use touches::{FEWEST, FIRST, Look, MOST_BATCHES, Purpose, SoFar, Why, look, short_way, spread};
 
 use matern::correlation;
