@@ -9,7 +9,7 @@ use regrind::formats::{
     save_form, save_registration,
 };
 use regrind::geometry::Pose;
-use regrind::model::{Form, Given, Interval};
+use regrind::model::{AngleInterval, Form, Given, Interval, IsoFigures, SlopeFigures};
 use regrind::registration::{Coordinate, Loss, Method, Options, ProbeSide, Start, register};
 use regrind::surface::{Distance, Nominal, NominalKind, Projection};
 
@@ -226,8 +226,9 @@ fn form_in_words(form: &Form) -> String {
         format!(", {times} times as wide along {degrees} degrees from x as across")
     });
     let sigma = [0, 1, 2].map(|k| um(frame_covariance[(k, k)].sqrt())).join(", ");
+    let areas = area_in_words(form);
     format!(
-        "form        RMS {}, PV {}, PV 99.8 % {}; with 95 %\nmodel       the form is {} um strong and {} mm wide{lay}, a point scatters by {} um{drift}\n\
+        "form        RMS {}, PV {}, PV 99.8 % {}; with 95 %\n{areas}model       the form is {} um strong and {} mm wide{lay}, a point scatters by {} um{drift}\n\
          frame       known to {sigma} um along x, y, z beside that form\n",
         within(&figures.rms),
         within(&figures.pv),
@@ -236,6 +237,27 @@ fn form_in_words(form: &Form) -> String {
         three_digits(hyper.field.range_mm),
         um(hyper.scatter_mm),
     )
+}
+
+/// Slopes and the figures of ISO 10110-5, where the points are enough for them.
+fn area_in_words(form: &Form) -> String {
+    let mut text = String::new();
+    if let Some(SlopeFigures { rms, largest, integration_mm, .. }) = form.slope {
+        let urad = |of: AngleInterval| {
+            let [median, low, high] = [of.median_rad, of.low_rad, of.high_rad].map(|rad| three_digits(1e6 * rad));
+            format!("{median} urad ({low} to {high})")
+        };
+        let length = three_digits(integration_mm);
+        text += &format!("slopes      RMS {}, largest {}; over {length} mm, with 95 %\n", urad(rms), urad(largest));
+    }
+    if let Some(IsoFigures { power, irregularity, symmetric, .. }) = form.iso {
+        let [power, irregularity, symmetric] = [power, irregularity, symmetric].map(|of| {
+            let [median, low, high] = [of.median_mm, of.low_mm, of.high_mm].map(|mm| three_digits(1e6 * mm));
+            format!("{median} nm ({low} to {high})")
+        });
+        text += &format!("ISO 10110-5 power {power}, irregularity {irregularity}, symmetric {symmetric}; with 95 %\n");
+    }
+    text
 }
 
 fn pose_in_words(document: &RegistrationDocument) -> String {

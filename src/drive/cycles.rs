@@ -10,7 +10,7 @@ use super::task::{Cycle, Product, Task};
 use crate::cell::Tolerance;
 use crate::device::{CorrectionMap, Pass, Plan};
 use crate::geometry::Pose;
-use crate::model::{FIRST, short_way, spread};
+use crate::model::{FIRST, Taught, short_way, spread};
 
 /// The cycles, by number.
 #[derive(Default)]
@@ -87,6 +87,18 @@ impl Cycles {
     /// Returns the last cycle that tells something of the grinder.
     pub(super) fn last_known(&self) -> Option<&Cycle> {
         self.0.values().rev().find(|cycle| cycle.is_judged() && cycle.known.is_some())
+    }
+
+    /// Returns what earlier parts taught of the fields of errors, with the last judged pass of either kind of this one.
+    pub(super) fn taught(&self, task: &Task) -> Taught {
+        let mut taught = task.learned.as_ref().map(|learned| learned.fields).unwrap_or_default();
+        for is_corrected in [false, true] {
+            let alike = |cycle: &&Cycle| cycle.is_judged() && cycle.correction.is_none() != is_corrected;
+            if let Some(field) = self.0.values().filter(alike).filter_map(|cycle| cycle.field).next_back() {
+                taught.take(is_corrected, &field);
+            }
+        }
+        taught
     }
 
     /// What is shown of them.

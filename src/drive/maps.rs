@@ -9,6 +9,7 @@ use crate::form::{FormOptions, TakenOut, figures, slope};
 use crate::formats::{
     ErrorMapOrigin, FormatError, write_error_map, write_error_map_x3p, write_figures, write_json_atomic,
 };
+use crate::model::{AreaOptions, Form};
 use crate::registration::{Deviation, Registration};
 use crate::report::{HeatMap, ReportError, save_coloured_ply};
 
@@ -21,13 +22,25 @@ pub(super) fn save_figures(
     files: &mut Files,
     map: Option<&ErrorMap>,
     found: &Registration,
+    form: Option<&Form>,
 ) -> Result<(), FormatError> {
     let options = FormOptions { aperture: task.nominal.outline().cloned(), ..FormOptions::default() };
     let made = figures(&readings(found), &options);
-    let cutoff_mm = task.map.cutoff_mm;
-    let slopes = map.map(|map| slope(&map.grid, &map.values_mm, &map.valid, INTEGRATION * cutoff_mm));
+    // Slopes of the form and of the map are compared: both over the same length, which is what the places allow.
+    let told_mm = form.and_then(|form| form.slope).map(|slope| slope.integration_mm);
+    let integration_mm = told_mm.unwrap_or(INTEGRATION * task.map.cutoff_mm);
+    let slopes = map.map(|map| slope(&map.grid, &map.values_mm, &map.valid, integration_mm));
     let slopes = slopes.as_ref().map(Result::as_ref);
-    write_figures(&files.place("figures.json"), made.as_ref(), slopes, &taken_out(task), task.simulation)
+    write_figures(&files.place("figures.json"), (made.as_ref(), slopes, form), &taken_out(task), task.simulation)
+}
+
+/// What the figures of an area go by: the middle of the aperture, and the length over which slopes are taken.
+pub(super) fn area(task: &Task) -> AreaOptions {
+    let middle = |[low, high]: [[f64; 2]; 2]| std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
+    AreaOptions {
+        middle_mm: task.nominal.outline().map(|outline| middle(outline.bounds())),
+        integration_mm: Some(INTEGRATION * task.map.cutoff_mm),
+    }
 }
 
 /// What registration and filter take out, in words.

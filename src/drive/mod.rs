@@ -877,7 +877,8 @@ impl Drive {
         }
         let run = self.folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         let last = self.cycles.last_known().cloned();
-        let Some(learned) = last.and_then(|cycle| work::learned(&self.task, run, &cycle)) else { return };
+        let fields = self.cycles.taught(&self.task);
+        let Some(learned) = last.and_then(|cycle| work::learned(&self.task, run, (&cycle, fields))) else { return };
         self.leave(LEARNED.into(), self.cell.cycle(), &learned).await;
     }
 

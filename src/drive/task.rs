@@ -11,7 +11,7 @@ use crate::formats::gcode::GcodeError;
 use crate::formats::{CorrectionIdentities, FormatError, Learned, ResultFolder, write_correction};
 use crate::geometry::{Grid, Point, Pose, Sample, Vector};
 use crate::measuring::{self, Expansion, sphere_targets};
-use crate::model::{FIRST, Form, Machine, Purpose, spread};
+use crate::model::{FIRST, Form, Hyper, Machine, Purpose, spread};
 use crate::registration::{
     Deviation, MapLimits, Method, Options, PointStatus, Registration, RegistrationError, Start, register,
 };
@@ -159,6 +159,8 @@ pub(super) struct Cycle {
     pub(super) points: Option<Arc<Points>>,
     pub(super) registration: Option<Arc<Registration>>,
     pub(super) form: Option<Arc<Form>>,
+    /// What its points alone tell of the field of its error; none where they show none.
+    pub(super) field: Option<Hyper>,
     pub(super) error: Option<Arc<ErrorMap>>,
     /// What is known of the grinder with this cycle taken in.
     pub(super) known: Option<Arc<LearningState>>,
@@ -179,6 +181,7 @@ impl Cycle {
             points: None,
             registration: None,
             form: None,
+            field: None,
             error: None,
             known: None,
             figures: None,
@@ -195,10 +198,11 @@ impl Cycle {
         match product {
             Product::Points(points) => self.points = Some(Arc::new(points)),
             Product::Registered(found) => {
-                let Registered { registration, form, error, known, figures, next } = *found;
+                let Registered { registration, form, field, error, known, figures, next } = *found;
                 self.next = next.map(Arc::new);
                 self.registration = Some(Arc::new(registration));
                 self.form = form.map(Arc::new);
+                self.field = field;
                 self.error = error.map(Arc::new);
                 self.known = known.map(Arc::new);
                 self.figures = Some(figures);
@@ -222,6 +226,8 @@ pub(super) struct Registered {
     pub(super) registration: Registration,
     /// What the model of the error says of it; none where it can say nothing.
     pub(super) form: Option<Form>,
+    /// What the points alone tell of the field of the error.
+    pub(super) field: Option<Hyper>,
     pub(super) error: Option<ErrorMap>,
     pub(super) known: Option<LearningState>,
     pub(super) figures: Figures,

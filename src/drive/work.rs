@@ -22,7 +22,7 @@ use crate::formats::{
 };
 use crate::geometry::{Point, Vector};
 use crate::measuring::fit_sphere;
-use crate::model::{self, Form, Given};
+use crate::model::{self, Form, Given, Hyper, Lesson, Priors, Taught};
 use crate::registration::{Options, PointStatus as Fate, Registration, Verdict, weak_for_compensation};
 
 use super::maps;
@@ -263,9 +263,11 @@ fn registered(
     found.allow_for_radius(points.radius_sigma_mm.hypot(task.machine.reference_sphere_mm));
     let given = Given {
         machine: task.machine,
+        priors: priors(task, cycle, before),
         radius_sigma_mm: points.radius_sigma_mm,
         scale_sigma,
         probe_scatter_mm: points.probe_scatter_mm,
+        area: maps::area(task),
         ..Given::default()
     };
     let looked = task.adaptive.as_ref().filter(|_| !points.tried.is_empty());
@@ -291,7 +293,7 @@ fn registered(
         Err(_) if looked_at => None,
         _ => error_map(&readings(&found), &task.map).ok(),
     };
-    maps::save_figures(task, files, error.as_ref(), &found).map_err(unfinished)?;
+    maps::save_figures(task, files, error.as_ref(), &found, form.as_ref().ok()).map_err(unfinished)?;
     let offered = maps::parameters(task, files, &found).map_err(unfinished)?;
     // Every measurement leaves its map, whatever becomes of the correction.
     error.as_ref().map_or(Ok(()), |map| maps::save(task, files, (number, cycle), map, &found))?;
@@ -314,7 +316,26 @@ fn registered(
     figures.touch_on =
         next.as_ref().map(|(next, why)| Box::new(TouchOn { targets: next.len() as u32, why: (*why).to_owned() }));
     let next = next.map(|(next, _)| next);
-    Ok(Registered { registration: found, form: form.ok(), error, known, figures, next })
+    let field = next.is_none().then(|| field_alone(&found, &given, form.as_ref().ok(), !looked_at)).flatten();
+    Ok(Registered { registration: found, form: form.ok(), field, error, known, figures, next })
+}
+
+/// What is expected of the field of the error of a cycle: what earlier parts taught of passes of its kind, or else the pass before it in this run, if it was
+/// of the same kind.
+fn priors(task: &Task, cycle: &Cycle, before: Option<&Cycle>) -> Option<Priors> {
+    let is_corrected = !cycle.correction.is_none();
+    let taught = task.learned.as_ref().and_then(|learned| learned.fields.of(is_corrected));
+    let alike = before.filter(|before| before.correction.is_none() != is_corrected);
+    let of_this_part = || Some(Lesson::after(None, &alike?.field?));
+    taught.or_else(of_this_part).map(|lesson| lesson.priors())
+}
+
+/// What the points alone tell of the field; where nothing was expected of it that is what was found.
+fn field_alone(found: &Registration, given: &Given, form: Option<&Form>, in_order: bool) -> Option<Hyper> {
+    match (form?, given.priors) {
+        (form, None) => form.is_seen.then_some(form.hyper),
+        (_, Some(_)) => Form::alone(found, given, in_order).ok().flatten(),
+    }
 }
 
 /// Takes a measured pass into what is known of the grinder.
@@ -515,7 +536,7 @@ fn compensated(
 }
 
 /// What the next part of this kind can begin with; none where this run did not get so far.
-pub(super) fn learned(task: &Task, run: String, cycle: &Cycle) -> Option<Learned> {
+pub(super) fn learned(task: &Task, run: String, (cycle, fields): (&Cycle, Taught)) -> Option<Learned> {
     let known = cycle.known.as_deref()?;
     let wrong = [Response::SignFlipped, Response::Mirrored, Response::NoEffect, Response::Doubled];
     if cycle.figures.as_ref()?.response.is_some_and(|response| wrong.contains(&response)) {
@@ -523,7 +544,7 @@ pub(super) fn learned(task: &Task, run: String, cycle: &Cycle) -> Option<Learned
     }
     let (setting, simulation) = (task.setting.clone(), task.simulation);
     let correction = cycle.correction.changed(known);
-    Some(Learned::new(simulation, setting, run, correction, known.clone()))
+    Some(Learned::new(simulation, setting, run, correction, known.clone()).with_fields(fields))
 }
 
 /// Where they stand.

@@ -6,10 +6,12 @@ use serde::Serialize;
 
 use super::error::FormatError;
 use super::registration::write_json_atomic;
+use super::told_figures::{Told, notation, told};
 use regrind_core::form::{
-    Basis, DIRECTION, EVERY_POINT, Figures, Fit, FormError, Iso10110, Labelled, Slope, TakenOut, labelled,
+    Basis, DIRECTION, EVERY_POINT, Figures, Fit, FormError, FormOptions, Iso10110, Labelled, Slope, TakenOut, labelled,
     labelled_slope,
 };
+use regrind_core::model::Form;
 
 /// What is written of a cycle's figures.
 #[derive(Serialize)]
@@ -18,6 +20,11 @@ struct FiguresDocument<'a> {
     frame: &'static str,
     /// Points that took part.
     points: Option<usize>,
+    /// The form of the part: each figure with what the measurement leaves possible of it, and the raw one.
+    form: Vec<Told>,
+    /// The indication of ISO 10110-5 that the form meets in each of its values with a probability of 97.5 %.
+    form_iso_10110_5: Option<String>,
+    /// What was measured, the scatter of the probe in it.
     figures: Vec<Labelled>,
     iso_10110_5: Option<OfPoints<&'a Iso10110>>,
     zernike: Option<OfPoints<SeriesDocument>>,
@@ -58,7 +65,10 @@ struct TermDocument {
     orthogonal_nm: f64,
 }
 
-/// Writes `figures.json`: the figures of the points and, where there is a map, its slopes, all with what was taken out before.
+/// What there is to be written of a cycle: the figures of the points, the slopes of the map, and the form; none where there is no map or no form.
+pub type Found<'a> = (Result<&'a Figures, &'a FormError>, Option<Result<&'a Slope, &'a FormError>>, Option<&'a Form>);
+
+/// Writes `figures.json`: the figures of the form and beside them those of the points and the slopes of the map, all with what was taken out before.
 ///
 /// Where there are no figures the file says why.
 ///
@@ -66,8 +76,7 @@ struct TermDocument {
 /// A file that cannot be written.
 pub fn write_figures(
     path: &Path,
-    figures: Result<&Figures, &FormError>,
-    slope: Option<Result<&Slope, &FormError>>,
+    (figures, slope, form): Found<'_>,
     taken_out: &TakenOut,
     simulation: bool,
 ) -> Result<(), FormatError> {
@@ -82,11 +91,19 @@ pub fn write_figures(
         None => missing.push("slopes: there is no map".to_owned()),
     }
     let found = figures.ok();
+    match form {
+        None => missing.push("figures of the form: form and scatter could not be told apart".to_owned()),
+        Some(Form { slope: None, .. }) => missing.push("slopes of the form: the places are too few".to_owned()),
+        Some(_) => {}
+    }
+    let wavelength_nm = found.map_or(FormOptions::default().wavelength_nm, |found| found.iso_10110.wavelength_nm);
     let removed = taken_out.removed(found.map_or(&[], |f| &f.removed));
     let document = FiguresDocument {
         simulation,
         frame: "model",
         points: found.map(|f| f.points),
+        form: form.map(|form| told(form, found, slope.and_then(Result::ok), taken_out)).unwrap_or_default(),
+        form_iso_10110_5: form.and_then(|form| form.iso).map(|iso| notation(&iso, wavelength_nm)),
         figures: rows,
         iso_10110_5: found.map(|f| of_points(&removed, &f.iso_10110)),
         zernike: found.and_then(|f| f.zernike.as_ref()).map(|fit| of_points(&removed, series(fit))),

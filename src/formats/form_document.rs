@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::document::StandardUncertainty;
 use super::error::FormatError;
 use super::registration::{write_json_atomic, write_rows};
-use regrind_core::model::{Form, FormPoint, Interval, Share};
+use regrind_core::model::{Form, FormPoint, Interval, IsoFigures, Share, SlopeFigures};
 use regrind_core::registration::Registration;
 
 /// The columns of `form.csv`.
@@ -39,6 +39,11 @@ struct FormDocument<'a> {
     pv_99_8: Interval,
     /// What the standard uncertainties of the figures come from; the squares of all add up.
     budget: &'a [Share],
+    /// The slopes of the smooth form, and what ISO 10110-5 says of the form; absent where the points are too few.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    slope: Option<SlopeFigures>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    iso_10110_5: Option<IsoFigures>,
     /// The same of the deviations as they were measured, the scatter of the probe in them.
     raw_rms_mm: f64,
     raw_pv_mm: f64,
@@ -73,6 +78,8 @@ pub fn save_form(
         pv: form.figures.pv,
         pv_99_8: form.figures.pv_most_points,
         budget: &form.budget,
+        slope: form.slope,
+        iso_10110_5: form.iso,
         raw_rms_mm: registration.verdict.rms_mm,
         raw_pv_mm: registration.verdict.pv_mm,
         frame_standard_uncertainty: StandardUncertainty {

@@ -8,6 +8,7 @@ use thiserror::Error;
 use super::FormatError;
 use super::whole::read_whole;
 use regrind_core::compensation::{Correction, LearningState};
+use regrind_core::model::Taught;
 
 /// The file in a run folder.
 pub const LEARNED: &str = "learned.json";
@@ -31,6 +32,9 @@ pub struct Learned {
     pub correction: Correction,
     /// How well it is known.
     pub known: LearningState,
+    /// What this part and those before it taught of the fields of their errors; nothing in files of earlier versions.
+    #[serde(default)]
+    pub fields: Taught,
 }
 
 /// What tells whether a file is looked for at all.
@@ -56,7 +60,13 @@ pub enum LearnedError {
 impl Learned {
     /// What a run leaves to the next part.
     pub fn new(simulation: bool, setting: String, run: String, correction: Correction, known: LearningState) -> Self {
-        Self { layout: LAYOUT, simulation, setting, run, correction, known }
+        Self { layout: LAYOUT, simulation, setting, run, correction, known, fields: Taught::default() }
+    }
+
+    /// The same with what was taught of the fields.
+    #[must_use]
+    pub fn with_fields(self, fields: Taught) -> Self {
+        Self { fields, ..self }
     }
 
     /// Reads what a run left, and the file as it is; `None` where it left nothing, or nothing for this setting.
@@ -117,6 +127,9 @@ impl Learned {
         if !values_mm.iter().all(|v| v.is_finite()) || !level_mm.is_finite() {
             return Some("a number of its correction is not finite".into());
         }
+        if !self.fields.is_sound() {
+            return Some("a number of what it knows of the fields of errors cannot be".into());
+        }
         (!self.known.is_sound()).then(|| "a number of what it knows of the grinder cannot be".into())
     }
 
@@ -132,6 +145,7 @@ mod tests {
     use super::*;
     use regrind_core::compensation::{ErrorMap, GainRule, MapOptions, Seen};
     use regrind_core::geometry::Grid;
+    use regrind_core::model::{Field, Hyper};
 
     const GRID: Grid = Grid { columns: 5, rows: 4, first_mm: [-2.0, -1.5], spacing_mm: [1.0, 1.0] };
 
@@ -166,6 +180,21 @@ mod tests {
         let first = back.first_correction(Correction::none(finer, 0.06));
         assert_eq!((first.level_mm, first.cycle, first.values_mm.len()), (0.06, 1, 63));
         assert_eq!(first.values_mm[2], back.correction.values_mm[1]);
+    }
+
+    #[test]
+    fn fields_are_kept_and_a_file_without_them_has_taught_nothing_of_them() {
+        let mut fields = Taught::default();
+        fields.take(true, &Hyper { field: Field { sigma_mm: 1e-3, range_mm: 15.0 }, scatter_mm: 3e-4, drift: 0.0 });
+        let text = serde_json::to_string(&learned().with_fields(fields)).unwrap();
+        assert_eq!(read(&text).unwrap().unwrap().0.fields, fields);
+        // As earlier versions wrote it.
+        let plain = serde_json::to_string(&learned()).unwrap();
+        let old = plain.replace(",\"fields\":{}", "");
+        assert_ne!(plain, old);
+        assert_eq!(serde_json::to_string(&read(&old).unwrap().unwrap().0).unwrap(), plain);
+        let error = read(&text.replace("\"range_mm\":[15.0", "\"range_mm\":[-15.0")).unwrap_err().to_string();
+        assert!(error.contains("fields of errors") && error.contains("archive"), "{error}");
     }
 
     #[test]

@@ -26,6 +26,7 @@ pub mod result;
 pub mod sdf;
 pub mod stl;
 mod system;
+mod told_figures;
 mod whole;
 pub mod x3p;
 

@@ -270,7 +270,8 @@ pub struct Compensation {
     #[schemars(range(min = 0.001, max = 1000.0))]
     pub repeatability_um: Option<Um>,
     /// Begin with what the last finished run found to come back in every pass, if it had this part and cell, this wheel and way of grinding,
-    /// as many targets, and this cut-off, smoothing and gain.
+    /// as many targets, and this cut-off, smoothing and gain. What is measured is then told with the form that earlier parts had after such
+    /// passes, as far as it is like that.
     pub learn: bool,
     /// The least that a pass takes off where it takes off least.
     #[schemars(range(min = 0.0, max = 1000.0))]

@@ -18,6 +18,7 @@ mod axis;
 mod colour;
 mod course;
 mod dfq;
+mod form;
 mod heat_map;
 mod maps;
 mod means;

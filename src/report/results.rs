@@ -3,6 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
+use super::form::read_figures;
 use super::story::{CycleStory, Measurement, Story};
 use super::words::{ending_words, verdict_words};
 use super::{ReportError, dfq, qif};
@@ -45,7 +46,7 @@ pub fn write_run_results(folder: &Path, format: ResultsFormat, path: Option<&Pat
 /// A record that cannot be believed, or in which nothing was measured.
 pub fn run_results(folder: &Path, format: ResultsFormat) -> Result<String, ReportError> {
     let (story, verified) = Story::proven(folder)?;
-    let results = Results::of(&story, verified.head.to_string());
+    let results = Results::of(&story, verified.head.to_string()).with_areas(&story, folder)?;
     if results.measured.iter().all(|of| of.figures.is_empty()) {
         return Err(ReportError::NothingMeasured { run: results.run });
     }
@@ -154,10 +155,23 @@ impl Results {
         }
     }
 
-    /// What is told of each figure, by its place in every measurement that has figures.
+    /// What is told of each figure, by its place in every measurement: those that not all of them have come last.
     pub(super) fn kinds(&self) -> impl Iterator<Item = &Kind> {
-        let first = self.measured.iter().find(|of| !of.figures.is_empty());
-        first.into_iter().flat_map(|of| &of.figures).map(|figure| &figure.kind)
+        let most = self.measured.iter().max_by_key(|of| of.figures.len());
+        most.into_iter().flat_map(|of| &of.figures).map(|figure| &figure.kind)
+    }
+
+    /// The same with the figures of an area, which stand in a file of each cycle: its last measurement has them.
+    fn with_areas(mut self, story: &Story, folder: &Path) -> Result<Self, ReportError> {
+        for (cycle, of) in &story.cycles {
+            let Some(name) = &of.form else { continue };
+            let told = read_figures(&folder.join(name))?;
+            let last = self.measured.iter_mut().rev().find(|one| one.cycle == *cycle && !one.figures.is_empty());
+            if let Some(last) = last {
+                last.figures.extend(areas(&told).unwrap_or_default());
+            }
+        }
+        Ok(self)
     }
 }
 
@@ -252,6 +266,41 @@ fn what_of(name: &str, of_form: bool) -> &'static str {
         (_, false) => MOST,
         (_, true) => FORM_MOST,
     }
+}
+
+/// The lengths of ISO 10110-5, by what `figures.json` calls them.
+const AREAS: [(&str, &str, &str); 6] = [
+    ("power", "ISO 10110-5 A", "peak to valley of the best sphere of the form"),
+    ("irregularity", "ISO 10110-5 B", "peak to valley of what piston, tilt and power leave of the form"),
+    (
+        "symmetric irregularity",
+        "ISO 10110-5 C",
+        "peak to valley of the part of the irregularity that is symmetric about the middle",
+    ),
+    ("RMSt", "ISO 10110-5 RMSt", "root mean square of what piston and tilt leave of the form"),
+    ("RMSi", "ISO 10110-5 RMSi", "root mean square of what piston, tilt and power leave of the form"),
+    (
+        "RMSa",
+        "ISO 10110-5 RMSa",
+        "root mean square of the part of the irregularity that is not symmetric about the middle",
+    ),
+];
+
+/// The figures of an area that a file tells with their intervals; all of them, or none.
+fn areas(told: &serde_json::Value) -> Option<Vec<Figure>> {
+    const MM_OF_NM: f64 = 1e-6;
+    let rows = told["form"].as_array()?;
+    let figure = |(named, name, what): (&str, &'static str, &'static str)| {
+        let row = rows.iter().find(|row| row["name"] == named && row["unit"] == "nm")?;
+        let [median, low, high] = ["median", "low", "high"].map(|key| row[key].as_f64());
+        Some(Figure {
+            kind: Kind { name, what, limit_mm: None },
+            found_mm: MM_OF_NM * median?,
+            expanded_mm: MM_OF_NM * 0.5 * (high? - low?),
+            standing: Standing::NotJudged,
+        })
+    };
+    AREAS.into_iter().map(figure).collect()
 }
 
 /// Beyond where any figure is; within where each that has a limit is.

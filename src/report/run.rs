@@ -4,21 +4,19 @@
 //! report can tell whether a journal is the one that it was made from.
 
 use std::fmt::Write;
-use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
 use super::ReportError;
-use super::axis::three_digits;
 use super::course::convergence;
+use super::form::form;
 use super::maps::{maps, within_html};
 use super::means::{last_model, last_registration, means, registered, signatures};
 use super::story::{Measurement, Story};
 use super::words::{alarm_words, ending_words, home_words, judgement_words, role_words, verdict_words};
 use regrind_cell::{Compared, Conformity, Ending, Figures, Tolerance};
-use regrind_formats::{FormatError, escaped, write_atomic};
+use regrind_formats::{escaped, write_atomic};
 use regrind_journal::{Record, Verified};
 
 /// The report in a run folder.
@@ -290,54 +288,6 @@ fn judgement_of(measurement: &Measurement) -> (String, String) {
     };
     let earlier: String = earlier.iter().map(|earlier| format!("; first {}", judgement_words(earlier))).collect();
     (verdict_words(last), format!("{}{earlier}", last.reason))
-}
-
-/// A row a figure, a column a cycle, and what must be known of each figure.
-fn form(story: &Story, folder: &Path) -> Result<String, ReportError> {
-    let mut cycles = Vec::new();
-    for (number, cycle) in &story.cycles {
-        let Some(name) = &cycle.form else { continue };
-        let path = folder.join(name);
-        let bytes = fs::read(&path).map_err(|source| FormatError::Unreadable { path: path.clone(), source })?;
-        let figures: Value = serde_json::from_slice(&bytes)
-            .map_err(|source| FormatError::Unreadable { path, source: io::Error::from(source) })?;
-        cycles.push((number, figures));
-    }
-    let listed = |figures: &Value| figures["figures"].as_array().cloned().unwrap_or_default();
-    let named = |figures: &Value, name: &Value| listed(figures).into_iter().find(|row| row["name"] == *name);
-    let Some((_, last)) = cycles.last() else { return Ok(String::new()) };
-    let heads: String = cycles.iter().map(|(number, _)| format!("<th class=\"n\">cycle {number}</th>")).collect();
-    let mut html = format!(
-        "<h2>Form of the surface</h2>\n<table id=\"form\">\n<tr><th>figure</th>{heads}<th>unit</th><th>what it is</th>\
-         <th>removed</th><th>waves left out</th></tr>\n"
-    );
-    for row in listed(last) {
-        let text = |key: &str| escaped(row[key].as_str().unwrap_or_default());
-        let cell = |(_, figures): &(&u32, Value)| {
-            let value = named(figures, &row["name"]).and_then(|row| row["value"].as_f64());
-            format!("<td class=\"n\">{}</td>", value.map_or("-".to_owned(), three_digits))
-        };
-        let cells: String = cycles.iter().map(cell).collect();
-        let _ = writeln!(
-            html,
-            "<tr><td>{}</td>{cells}<td>{}</td><td>{}</td><td>{}</td><td>{}</td></tr>",
-            text("name"),
-            text("unit"),
-            text("made"),
-            text("removed"),
-            text("cut_off")
-        );
-    }
-    html += "</table>\n<p>What is told of a figure is that of the last cycle. All along the outward normal, positive where \
-             material stands proud; figures of the surface, not of a wavefront. ISO 10110-5, in nanometres, that the surface \
-             just meets:</p>\n<ul>\n";
-    for (number, figures) in &cycles {
-        let notation = figures["iso_10110_5"]["notation"].as_str().unwrap_or("-");
-        let missing = figures["missing"].as_array().into_iter().flatten().filter_map(Value::as_str);
-        let missing: String = missing.map(|why| format!("; no {}", escaped(why))).collect();
-        let _ = writeln!(html, "<li>cycle {number}: <code>{}</code>{missing}</li>", escaped(notation));
-    }
-    Ok(html + "</ul>\n")
 }
 
 fn alarms(story: &Story) -> String {

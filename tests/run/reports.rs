@@ -216,6 +216,17 @@ fn the_judged_figure_stands_beside_its_limit_and_every_other_says_what_it_is() {
     let medians = ["pv_robust", "rms"].map(|figure| format!("{:.2}", form(figure)[0]));
     assert_eq!(bold, medians, "one figure of each judges");
     assert!(page.says("ISO 14253-1"));
+    // What the form is known to be, every figure beside the raw one.
+    let told = json_in(&folder, &format!("cycle-{last}/figures.json"))["form"].clone();
+    let rows = page.rows("told");
+    assert_eq!(rows.len(), told.as_array().unwrap().len());
+    assert!(rows.len() == 12, "{rows:?}");
+    for (row, told) in rows.iter().zip(told.as_array().unwrap()) {
+        assert_eq!(row[0], told["name"].as_str().unwrap());
+        assert!(row[row.len() - 4].contains(" to "), "{row:?}");
+        let [low, median, high] = ["low", "median", "high"].map(|key| told[key].as_f64().unwrap());
+        assert!(low <= median && median <= high && told["raw"].is_number(), "{told}");
+    }
     // What is called alike is the same number everywhere.
     let points = json_in(&folder, &format!("cycle-{last}/figures.json"))["figures"].clone();
     let named = |name: &str| points.as_array().unwrap().iter().find(|row| row["name"] == name).unwrap().clone();

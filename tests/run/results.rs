@@ -79,13 +79,18 @@ fn both_formats_tell_what_result_json_tells_and_the_same_twice() {
     let values: Vec<&str> =
         document.descendants().filter(|node| node.has_tag_name("Value")).map(|node| node.text().unwrap()).collect();
     let cycles = json_in(&folder, "result.json")["cycles"].as_array().unwrap().len();
-    assert_eq!(values.len(), 3 * cycles);
-    for (cycle, told) in (1..).zip(values.chunks(3)) {
+    assert_eq!(values.len(), 9 * cycles);
+    for (cycle, told) in (1..).zip(values.chunks(9)) {
         let figures = json_in(&folder, &format!("cycle-{cycle}/result.json"))["figures"].clone();
         let form = |key: &str| &figures["form"][key]["median_mm"];
         let expected =
             [form("pv_robust"), form("rms"), &figures["pv_mm"]].map(|v| format!("{:.9}", v.as_f64().unwrap()));
-        assert_eq!(told, expected);
+        assert_eq!(told[..3], expected);
+        let told_nm = json_in(&folder, &format!("cycle-{cycle}/figures.json"))["form"].clone();
+        let named = |name: &str| told_nm.as_array().unwrap().iter().find(|row| row["name"] == name).unwrap().clone();
+        let areas = ["power", "irregularity", "symmetric irregularity", "RMSt", "RMSi", "RMSa"];
+        let areas = areas.map(|name| format!("{:.9}", 1e-6 * named(name)["median"].as_f64().unwrap()));
+        assert_eq!(told[3..], areas);
         for (number, value) in (1..).zip(expected) {
             assert!(dfq.contains(&format!("K0001/{number} {value}\r\n")), "cycle {cycle}: {value}");
         }

@@ -19,7 +19,7 @@ use super::removed::{Removed, pv, without};
 use crate::geometry::{Aperture, Sample};
 
 /// Highest power of r of the symmetric part, halved.
-const SYMMETRIC: usize = 6;
+pub(super) const SYMMETRIC: usize = 6;
 
 /// Power, irregularity and their like, of the surface, in nanometres.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -93,16 +93,7 @@ pub fn iso_10110(samples: &[Sample], aperture: &Aperture, wavelength_nm: f64) ->
 /// Fits P_0 to P_6 of 2 (r/R)^2 - 1, Legendre's polynomials, which are the Zernike terms without azimuth but for a factor; fewer where the
 /// points do not carry them. Returns the values at the samples.
 fn symmetric(samples: &[Sample], square: impl Fn(&Sample) -> f64 + Sync) -> Result<Vec<f64>, FormError> {
-    let values = |s: &Sample| {
-        let t = 2.0 * square(s) - 1.0;
-        let mut row = [1.0; SYMMETRIC + 1];
-        row[1] = t;
-        for n in 1..SYMMETRIC {
-            let k = n as f64;
-            row[n + 1] = ((2.0 * k + 1.0) * t * row[n] - k * row[n - 1]) / (k + 1.0);
-        }
-        row
-    };
+    let values = |s: &Sample| even_terms(square(s));
     let mut terms = (SYMMETRIC + 1).min(samples.len() / 4).max(1);
     loop {
         let solved = solve(terms, samples, |_, s, row| {
@@ -117,22 +108,33 @@ fn symmetric(samples: &[Sample], square: impl Fn(&Sample) -> f64 + Sync) -> Resu
     }
 }
 
+/// The values of the terms where (r/R)^2 is so much.
+pub(super) fn even_terms(square: f64) -> [f64; SYMMETRIC + 1] {
+    let t = 2.0 * square - 1.0;
+    let mut row = [1.0; SYMMETRIC + 1];
+    row[1] = t;
+    for n in 1..SYMMETRIC {
+        let k = n as f64;
+        row[n + 1] = ((2.0 * k + 1.0) * t * row[n] - k * row[n - 1]) / (k + 1.0);
+    }
+    row
+}
+
 fn rms(values: impl ExactSizeIterator<Item = f64>) -> f64 {
     let count = values.len() as f64;
     (values.map(|v| v * v).sum::<f64>() / count).sqrt()
 }
 
 fn notation(found: &Iso10110) -> String {
-    format!(
-        "3/{}({}/{}) RMSt<{}; RMSi<{}; RMSa<{}; lambda={}",
-        up(found.power_nm),
-        up(found.irregularity_nm),
-        up(found.symmetric_nm),
-        up(found.rms_total_nm),
-        up(found.rms_irregularity_nm),
-        up(found.rms_varying_nm),
-        found.wavelength_nm
-    )
+    let Iso10110 { power_nm, irregularity_nm, symmetric_nm, .. } = *found;
+    let rms_nm = [found.rms_total_nm, found.rms_irregularity_nm, found.rms_varying_nm];
+    iso_10110_notation([power_nm, irregularity_nm, symmetric_nm], rms_nm, found.wavelength_nm)
+}
+
+/// Returns the indication of ISO 10110-5 with A, B and C, and with RMSt, RMSi and RMSa, every value rounded up. Units: nanometres.
+pub fn iso_10110_notation([a, b, c]: [f64; 3], [total, irregularity, varying]: [f64; 3], wavelength_nm: f64) -> String {
+    let [a, b, c, total, irregularity, varying] = [a, b, c, total, irregularity, varying].map(up);
+    format!("3/{a}({b}/{c}) RMSt<{total}; RMSi<{irregularity}; RMSa<{varying}; lambda={wavelength_nm}")
 }
 
 /// Writes a value in nanometres rounded up: to whole ones from 10 on, to hundredths below.

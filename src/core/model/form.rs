@@ -14,7 +14,9 @@ use super::likelihood::{ANY, ON_A_GRID, Told};
 use super::machine::{Effects, Machine, Source, unsound};
 use super::normals::Normals;
 use super::spacing_mm;
+use super::{AreaOptions, IsoFigures, SlopeFigures};
 use super::{Dense, Hyper, Lattice, ModelError, Observed, Predicted, Priors, Sparse};
+use crate::form::{IsoFits, SlopesAt};
 use crate::geometry::{Point, Vector};
 use crate::registration::{Deviation, PointStatus, Registration};
 
@@ -31,6 +33,10 @@ pub struct Form {
     pub points: Vec<FormPoint>,
     /// The figures of the form.
     pub figures: FormFigures,
+    /// Power, irregularity and their like; none where the points are too few for them.
+    pub iso: Option<IsoFigures>,
+    /// The slopes of the smooth form; none where the points are too few for them.
+    pub slope: Option<SlopeFigures>,
     /// How well the smooth form is known: the RMS of its standard uncertainty over all places.
     pub known_mm: f64,
     /// What the standard uncertainties of the figures come from, source by source; empty where they cannot be parted.
@@ -108,8 +114,19 @@ impl Form {
     pub fn of(registration: &Registration, given: &Given) -> Result<Self, ModelError> {
         let seen = Seen::of(registration, given, true)?;
         let drawn = Drawn::of(&seen.observed, &seen.told.likely)?;
+        let slope = seen.slope(given, &drawn);
         let drawn = drawn.with_the_scatter(&seen.observed, &seen.told, given).after_best_fit();
-        Ok(seen.form(given, &drawn))
+        Ok(Self { slope, ..seen.form(given, &drawn) })
+    }
+
+    /// Tells the parameters of the form by the points alone, whatever is expected of it beforehand: what a part teaches of those that
+    /// follow. None where no form is seen. `in_order` says that the points may lie along a path.
+    ///
+    /// # Errors
+    /// Those of [`Form::of`].
+    pub fn alone(registration: &Registration, given: &Given, in_order: bool) -> Result<Option<Hyper>, ModelError> {
+        let seen = Seen::of(registration, &Given { priors: None, ..*given }, in_order)?;
+        Ok(seen.is_seen.then(|| seen.told.likely[0].0))
     }
 
     /// Tells the form at places of the part that need not have been touched: points of the nominal surface with their normals, in the model
@@ -125,8 +142,9 @@ impl Form {
         let places: Vec<_> = thinned(places.len()).map(|k| places[k]).collect();
         let effects = seen.motions.rows(places.iter().copied());
         let drawn = Drawn::over(&seen.observed, &seen.told.likely, places.iter().map(plane).collect(), effects)?;
+        let slope = seen.slope(given, &drawn);
         let drawn = drawn.with_what_is_narrow(&seen.told, given).after_best_fit();
-        Ok(seen.form(given, &drawn))
+        Ok(Self { slope, ..seen.form(given, &drawn) })
     }
 }
 
@@ -166,10 +184,19 @@ impl Seen {
         Ok(Self { motions, observed, sources: stated.sources(), told, is_seen })
     }
 
+    /// The slopes of what is drawn, before anything is added that has none.
+    fn slope(&self, given: &Given, drawn: &Drawn) -> Option<SlopeFigures> {
+        let slopes = SlopesAt::over(&drawn.places, given.area.integration_mm)?;
+        let smooth = drawn.clone().after_best_fit();
+        Some(SlopeFigures::of(&slopes, &smooth.forms, (self.is_seen, given)))
+    }
+
+    /// The form by what is drawn, without its slopes.
     fn form(&self, given: &Given, drawn: &Drawn) -> Form {
         let covariance = of_the_fit(&self.observed, &self.told.wide, &self.observed.stated);
         let figures = drawn.figures(self.is_seen, given);
         let hyper = self.told.likely[0].0;
+        let on_a_grid = if ON_A_GRID.contains(&hyper.field.smoothness) { hyper } else { self.told.plain };
         let of_drawn = budget::Drawn { forms: &drawn.forms, places: &drawn.places, effects: &drawn.effects };
         let uncertainties_mm = [figures.rms, figures.pv_most_points].map(|of| of.standard_mm());
         Form {
@@ -177,7 +204,10 @@ impl Seen {
             frame_covariance: self.motions.to_twist(&covariance),
             points: drawn.points(),
             figures,
-            budget: budget::parted((&self.observed, &self.sources), &hyper, &of_drawn, uncertainties_mm),
+            budget: budget::parted((&self.observed, &self.sources), &on_a_grid, &of_drawn, uncertainties_mm),
+            iso: IsoFits::over(&drawn.places, given.area.middle_mm)
+                .map(|fits| IsoFigures::of(&fits, &drawn.forms, self.is_seen, given)),
+            slope: None,
             known_mm: drawn.known_mm(),
             is_seen: self.is_seen,
         }
@@ -225,6 +255,8 @@ pub struct Given {
     pub look_risk: f64,
     /// With what probability a figure must be within its limit to be accepted.
     pub probability: f64,
+    /// What the figures of an area go by.
+    pub area: AreaOptions,
 }
 
 impl Default for Given {
@@ -237,6 +269,7 @@ impl Default for Given {
             probe_scatter_mm: [0.0; 2],
             look_risk: 0.005,
             probability: 0.975,
+            area: AreaOptions::default(),
         }
     }
 }
@@ -277,6 +310,7 @@ fn of_the_fit(observed: &Observed, likely: &[(Hyper, f64)], alike: &DMatrix<f64>
 }
 
 /// Forms that may have been, a column each, at some places.
+#[derive(Clone)]
 struct Drawn {
     forms: DMatrix<f64>,
     places: Vec<[f64; 2]>,
@@ -468,7 +502,7 @@ impl Interval {
     }
 
     /// Of values that are equally probable.
-    fn of(mut values: Vec<f64>, has_low: bool, given: &Given) -> Self {
+    pub(super) fn of(mut values: Vec<f64>, has_low: bool, given: &Given) -> Self {
         values.sort_unstable_by(f64::total_cmp);
         let Given { look_risk, probability, .. } = *given;
         let at = |share: f64| values[((values.len() - 1) as f64 * share).round() as usize];

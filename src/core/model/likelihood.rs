@@ -61,8 +61,12 @@ impl Priors {
         Self { range_mm: [size_mm / 3.0, 6.0], scatter_ratio: [0.05, 20.0] }
     }
 
+    /// Beyond one factor it falls as slowly as it does there (Huber 1964): a part that is like none before is told by its own points.
     fn log_density(&self, range_mm: f64, ratio: f64) -> f64 {
-        let of = |value: f64, [median, factor]: [f64; 2]| -0.5 * ((value / median).ln() / factor.ln()).powi(2);
+        let of = |value: f64, [median, factor]: [f64; 2]| {
+            let off = ((value / median).ln() / factor.ln()).abs();
+            if off <= 1.0 { -0.5 * off * off } else { 0.5 - off }
+        };
         of(range_mm, self.range_mm) + of(ratio, self.scatter_ratio)
     }
 }
@@ -153,7 +157,9 @@ impl<'a> Search<'a> {
             std::iter::once(thinned(observed, SPREAD)).chain(blocks(observed)).collect()
         };
         let least_mm = least_range_mm(observed);
-        Self { all, priors, least: least_mm.ln(), far: (priors.range_mm[0] / least_mm).max(1.5).ln() }
+        // However narrow a form is expected to be, it may be wide.
+        let widest_mm = priors.range_mm[0].max(size_mm(&observed.places) / 3.0);
+        Self { all, priors, least: least_mm.ln(), far: (widest_mm / least_mm).max(1.5).ln() }
     }
 
     fn at(&self, of: &[Observed], [range, ratio]: [f64; 2], shape: Shape) -> Result<(Hyper, f64), ModelError> {
@@ -355,6 +361,14 @@ fn doubt(smoothness: Smoothness) -> f64 {
 fn least_range_mm(observed: &Observed) -> f64 {
     const NEIGHBOURS: f64 = 2.5;
     NEIGHBOURS * spacing_mm(&observed.places)
+}
+
+/// The root mean square distance of places from their middle.
+fn size_mm(places: &[[f64; 2]]) -> f64 {
+    let n = places.len() as f64;
+    let middle = [0, 1].map(|axis| places.iter().map(|place| place[axis]).sum::<f64>() / n);
+    let squares = places.iter().map(|[x, y]| (x - middle[0]).powi(2) + (y - middle[1]).powi(2));
+    (squares.sum::<f64>() / n).sqrt()
 }
 
 /// The parameters with the scale that suits them best, and the logarithm of their probability. What tells nothing of its plane, such as points

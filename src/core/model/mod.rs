@@ -24,6 +24,7 @@ mod climb;
 mod dense;
 mod error;
 mod field;
+mod figures;
 mod form;
 mod growing;
 mod likelihood;
@@ -32,17 +33,20 @@ mod matern;
 mod normals;
 mod profile;
 mod sparse;
+mod taught;
 mod touches;
 
 pub use budget::Share;
 pub use dense::{Dense, Predicted};
 pub use error::ModelError;
 pub use field::{Field, Lay, Smoothness};
+pub use figures::{AngleInterval, AreaOptions, IsoFigures, SlopeFigures};
 pub use form::{Form, FormFigures, FormPoint, Given, Interval};
 pub use growing::Growing;
 pub use likelihood::Priors;
 pub use machine::{Machine, Source};
 pub use sparse::{Lattice, Sparse};
+pub use taught::{Lesson, Taught};
 pub use touches::{FEWEST, FIRST, Look, MOST_BATCHES, Purpose, SoFar, Why, look, short_way, spread};
 
 use nalgebra::DMatrix;

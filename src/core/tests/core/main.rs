@@ -14,4 +14,5 @@ mod paper;
 mod parameters;
 mod parts;
 mod search;
+mod taught;
 mod touches;

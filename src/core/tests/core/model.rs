@@ -5,9 +5,10 @@ use rand::SeedableRng;
 use rand::rngs::StdRng;
 
 use crate::common::{RADIUS_MM, centres, free_form, normal, placed, points, pose};
+use regrind_core::form::{IsoFits, IsoOfForm, SlopesAt};
 use regrind_core::geometry::Pose;
-use regrind_core::model::{Form, Given, Interval, Machine, Share, Source};
-use regrind_core::registration::{Options, Registration, Start, register};
+use regrind_core::model::{AngleInterval, Form, Given, Interval, Machine, Share, Source};
+use regrind_core::registration::{Options, PointStatus, Registration, Start, register};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
 use regrind_sim::shape::FreeForm;
@@ -79,10 +80,11 @@ fn holds(interval: Interval, value: f64) -> bool {
 
 #[test]
 fn form_and_frame_are_said_with_intervals_that_hold_the_truth() {
-    let (mut rms, mut pv) = (0, 0);
+    let (mut rms, mut pv, mut areas) = (0, 0, [0; 9]);
     let (mut frame, mut repeated) = (0.0, 0.0);
     for seed in 0..PARTS {
         let part = part(seed, 5e-3);
+        areas.iter_mut().zip(areas_held(&part)).for_each(|(held, one)| *held += u64::from(one));
         let truth = part.form();
         let [true_rms, true_pv] = figures(&truth);
         rms += u32::from(holds(part.model.figures.rms, true_rms));
@@ -95,7 +97,9 @@ fn form_and_frame_are_said_with_intervals_that_hold_the_truth() {
     println!(
         "of {PARTS} parts RMS held in {rms}, PV in {pv}; pose: chi2/6 {frame:.2} by the model, {repeated:.0} by white residuals"
     );
+    println!("slopes and ISO 10110-5 held in {areas:?}");
     assert!(rms >= PARTS as u32 - 3 && pv >= PARTS as u32 - 3, "{rms} {pv}");
+    assert!(areas.iter().all(|held| held + 4 >= PARTS), "{areas:?}");
     assert!((0.4..2.0).contains(&frame), "{frame}");
     assert!(repeated > 20.0, "{repeated}");
 }
@@ -216,4 +220,77 @@ fn the_figures_of_a_part_without_form_are_not_the_scatter_of_its_probe() {
     println!("raw rms {:.2e} pv {:.2e}; {told:?}", raw[0], raw[1]);
     assert!(told.rms.high_mm < 0.6 * raw[0] && told.pv.high_mm < 0.6 * raw[1], "{told:?} {raw:?}");
     assert!(!part.model.is_seen && told.rms.low_mm == 0.0 && told.pv.low_mm == 0.0, "{told:?}");
+}
+
+/// What is true of the figures of an area: of the planted form at the points.
+fn of_an_area(part: &Part) -> (IsoOfForm, [f64; 2]) {
+    let places: Vec<[f64; 2]> = part.found.deviations.iter().map(|d| [d.point.x, d.point.y]).collect();
+    let slope = part.model.slope.unwrap();
+    let slopes = SlopesAt::over(&places, Some(slope.integration_mm)).unwrap();
+    assert_eq!((slopes.integration_mm, slopes.nodes), (slope.integration_mm, slope.places));
+    (IsoFits::over(&places, None).unwrap().of(&part.form()), slopes.of(&part.form()))
+}
+
+/// Whether each figure of an area is held: ISO 10110-5 from the power on, and the slopes.
+fn areas_held(part: &Part) -> [bool; 9] {
+    let (iso, slopes) = of_an_area(part);
+    let (told, slope) = (part.model.iso.unwrap(), part.model.slope.unwrap());
+    [
+        holds(told.power, iso.power_mm),
+        holds(told.power_rim, iso.power_rim_mm),
+        holds(told.irregularity, iso.irregularity_mm),
+        holds(told.symmetric, iso.symmetric_mm),
+        holds(told.rms_total, iso.rms_total_mm),
+        holds(told.rms_irregularity, iso.rms_irregularity_mm),
+        holds(told.rms_varying, iso.rms_varying_mm),
+        holds_angle(slope.rms, slopes[0]),
+        holds_angle(slope.largest, slopes[1]),
+    ]
+}
+
+fn holds_angle(of: AngleInterval, value: f64) -> bool {
+    (of.low_rad..=of.high_rad).contains(&value)
+}
+
+#[test]
+fn a_part_without_form_has_slopes_and_iso_10110_with_upper_bounds_alone() {
+    let part = part(1, 1e-9);
+    let (told, slope) = (part.model.iso.unwrap(), part.model.slope.unwrap());
+    let (iso, slopes) = of_an_area(&part);
+    for (of, truth_mm) in [
+        (told.power, iso.power_mm),
+        (told.irregularity, iso.irregularity_mm),
+        (told.symmetric, iso.symmetric_mm),
+        (told.rms_total, iso.rms_total_mm),
+        (told.rms_irregularity, iso.rms_irregularity_mm),
+        (told.rms_varying, iso.rms_varying_mm),
+    ] {
+        assert!(of.low_mm == 0.0 && of.high_mm > truth_mm, "{of:?} {truth_mm}");
+    }
+    assert!(slope.rms.low_rad == 0.0 && slope.largest.low_rad == 0.0 && slope.rms.high_rad > slopes[0], "{slope:?}");
+    // The scatter of the probe is off them.
+    let raw: Vec<f64> = part.found.deviations.iter().map(|d| d.deviation_mm).collect();
+    let places: Vec<[f64; 2]> = part.found.deviations.iter().map(|d| [d.point.x, d.point.y]).collect();
+    let raw_iso = IsoFits::over(&places, None).unwrap().of(&raw);
+    let raw_slopes = SlopesAt::over(&places, Some(slope.integration_mm)).unwrap().of(&raw);
+    assert!(told.irregularity.high_mm < 0.6 * raw_iso.irregularity_mm, "{told:?} {raw_iso:?}");
+    assert!(slope.rms.high_rad < 0.8 * raw_slopes[0], "{slope:?} {raw_slopes:?}");
+}
+
+#[test]
+fn of_too_few_points_no_figure_of_an_area_is_invented() {
+    let mut part = part(2, 5e-3);
+    for (k, deviation) in part.found.deviations.iter_mut().enumerate() {
+        if k % 43 != 0 {
+            deviation.status = PointStatus::Outlier;
+        }
+    }
+    let told = Form::of(&part.found, &Given::default()).unwrap();
+    assert_eq!(told.points.len(), 14);
+    assert!(told.slope.is_none() && told.iso.is_some());
+    for (k, deviation) in part.found.deviations.iter_mut().enumerate() {
+        deviation.status = if k % 60 == 7 { PointStatus::Used } else { PointStatus::Outlier };
+    }
+    let told = Form::of(&part.found, &Given::default()).unwrap();
+    assert!(told.slope.is_none() && told.iso.is_none());
 }

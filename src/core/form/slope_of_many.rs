@@ -1,0 +1,181 @@
+//! Slopes of many forms at the same scattered places: what depends on the places alone is made once.
+//!
+//! The slope at a place is that of the least-squares plane through all places within R of it. Such a plane flattens a wave by 1 - (k R)^2 / 12, and a difference
+//! over a length L by 1 - (k L)^2 / 24: R = L / sqrt 2 has the integration length L.
+
+use nalgebra::{Matrix2, SymmetricEigen, Vector2};
+
+use crate::geometry::bounds;
+
+/// Fewer places tell no figure of an area; at fewer a slope is taken for none of the part.
+const FEWEST: usize = 20;
+const FEWEST_NODES: usize = 6;
+/// Places at which a slope is taken, and places that each is taken from, at most.
+const MOST_NODES: usize = 1500;
+const MOST_AROUND: usize = 24;
+/// The shortest radius, in distances from place to place: as far as the corners of a square.
+const SHORTEST: f64 = 1.5;
+/// A longer one is taken where less than this share of the places has a slope; it is no longer than this share of the part.
+const SHARE: f64 = 0.25;
+const LONGEST: f64 = 0.3;
+const LONGER: f64 = 1.25;
+/// Least variance of the places around along any direction, and how far their middle may be off, in shares of the radius: beyond that a
+/// place lies at an edge.
+const LEAST_VARIANCE: f64 = 0.08;
+const MOST_OFF: f64 = 0.25;
+
+/// How slopes are taken from values at some places.
+pub struct SlopesAt {
+    /// Length over which a slope is taken.
+    pub integration_mm: f64,
+    /// At how many places it is taken.
+    pub nodes: usize,
+    /// Where the places of each node begin, and behind the last.
+    begins: Vec<usize>,
+    /// Which place counts how much for the slope along x and along y.
+    weights: Vec<(usize, [f64; 2])>,
+}
+
+impl SlopesAt {
+    /// Makes them over an integration length, or over one that is longer and as short as the places allow. None where the places are too few for
+    /// any.
+    ///
+    /// Frame: model. Units: millimetres.
+    pub fn over(places: &[[f64; 2]], integration_mm: Option<f64>) -> Option<Self> {
+        if places.len() < FEWEST {
+            return None;
+        }
+        let [low, high] = bounds(places.iter().copied());
+        let size_mm = [0, 1].map(|k| high[k] - low[k]);
+        let spacing_mm = (size_mm[0] * size_mm[1] / places.len() as f64).sqrt();
+        let longest_mm = LONGEST * size_mm[0].min(size_mm[1]);
+        let wanted_mm = integration_mm.filter(|mm| mm.is_finite() && *mm > 0.0).unwrap_or(0.0);
+        let mut radius_mm = (wanted_mm / 2f64.sqrt()).max(SHORTEST * spacing_mm);
+        if !(radius_mm.is_finite() && radius_mm > 0.0) {
+            return None;
+        }
+        // Places along x, so that those that are near are a run of them.
+        let mut order: Vec<usize> = (0..places.len()).collect();
+        order.sort_by(|&a, &b| places[a][0].total_cmp(&places[b][0]).then(a.cmp(&b)));
+        while radius_mm <= longest_mm {
+            let made = Self::within(places, &order, radius_mm);
+            let asked = places.len().min(MOST_NODES) as f64;
+            if made.nodes >= FEWEST_NODES && made.nodes as f64 >= SHARE * asked {
+                return Some(made);
+            }
+            radius_mm *= LONGER;
+        }
+        None
+    }
+
+    fn within(places: &[[f64; 2]], order: &[usize], radius_mm: f64) -> Self {
+        let most = places.len().min(MOST_NODES);
+        let (mut begins, mut weights) = (vec![0], Vec::new());
+        for of in (0..most).map(|k| k * places.len() / most) {
+            if let Some(around) = plane(places, order, of, radius_mm) {
+                weights.extend(around);
+                begins.push(weights.len());
+            }
+        }
+        Self { integration_mm: radius_mm * 2f64.sqrt(), nodes: begins.len() - 1, begins, weights }
+    }
+
+    /// Returns the root mean square and the largest of the slopes of a form, in radians: a value a place, in their order.
+    pub fn of(&self, form: &[f64]) -> [f64; 2] {
+        let (mut squares, mut most) = (0.0, 0.0_f64);
+        for ends in self.begins.windows(2) {
+            let mut slope = [0.0; 2];
+            for (place, weight) in &self.weights[ends[0]..ends[1]] {
+                slope[0] += weight[0] * form[*place];
+                slope[1] += weight[1] * form[*place];
+            }
+            let square = slope[0] * slope[0] + slope[1] * slope[1];
+            squares += square;
+            most = most.max(square);
+        }
+        [(squares / self.nodes as f64).sqrt(), most.sqrt()]
+    }
+}
+
+/// How much each place around one counts for the slope of a plane through them; none where they do not lie all around.
+fn plane(places: &[[f64; 2]], order: &[usize], of: usize, radius_mm: f64) -> Option<Vec<(usize, [f64; 2])>> {
+    let [x, y] = places[of];
+    let first = order.partition_point(|&k| places[k][0] < x - radius_mm);
+    let run = order[first..].iter().copied().take_while(|&k| places[k][0] <= x + radius_mm);
+    let near: Vec<usize> = run.filter(|&k| (places[k][0] - x).hypot(places[k][1] - y) <= radius_mm).collect();
+    let count = near.len().min(MOST_AROUND);
+    if count < 4 {
+        return None;
+    }
+    let near: Vec<usize> = (0..count).map(|k| near[k * near.len() / count]).collect();
+    let at = |k: usize| Vector2::new(places[k][0] - x, places[k][1] - y) / radius_mm;
+    let middle = near.iter().map(|&k| at(k)).sum::<Vector2<f64>>() / count as f64;
+    let moment: Matrix2<f64> = near.iter().map(|&k| (at(k) - middle) * (at(k) - middle).transpose()).sum();
+    let least = SymmetricEigen::new(moment).eigenvalues.min() / count as f64;
+    if middle.norm() > MOST_OFF || least < LEAST_VARIANCE {
+        return None;
+    }
+    let inverse = moment.try_inverse()?;
+    let weight = |k: usize| (inverse * (at(k) - middle) / radius_mm).into();
+    Some(near.into_iter().map(|k| (k, weight(k))).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn grid(spacing_mm: f64) -> Vec<[f64; 2]> {
+        let count = [(60.0 / spacing_mm) as i32, (40.0 / spacing_mm) as i32];
+        let all = (0..=count[0]).flat_map(|i| (0..=count[1]).map(move |j| [f64::from(i), f64::from(j)]));
+        all.map(|at| at.map(|v| v * spacing_mm)).collect()
+    }
+
+    fn scattered(count: u32) -> Vec<[f64; 2]> {
+        let of = |k: f64| [(0.754_877_666 * k).fract() * 60.0, (0.569_840_291 * k).fract() * 40.0];
+        (0..count).map(|k| of(f64::from(k) + 0.5)).collect()
+    }
+
+    fn of(at: &SlopesAt, places: &[[f64; 2]], form: impl Fn(f64, f64) -> f64) -> [f64; 2] {
+        at.of(&places.iter().map(|[x, y]| form(*x, *y)).collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn a_plane_has_its_slope_at_every_place() {
+        for (places, wanted) in
+            [(grid(1.0), None), (grid(2.0), Some(9.0)), (scattered(300), None), (scattered(60), None)]
+        {
+            let at = SlopesAt::over(&places, wanted).unwrap();
+            let [rms, most] = of(&at, &places, |x, y| 3e-6 * x - 4e-6 * y + 1.0);
+            assert!((rms - 5e-6).abs() < 1e-14 && (most - 5e-6).abs() < 1e-14, "{rms} {most}");
+            assert_eq!(of(&at, &places, |_, _| 0.0), [0.0; 2]);
+            assert!(wanted.is_none_or(|wanted: f64| (at.integration_mm / wanted - 1.0).abs() < 1e-12));
+        }
+    }
+
+    #[test]
+    fn a_wave_is_flattened_as_a_difference_over_the_length_flattens_it() {
+        // sin(kx) over a length L has the slope k cos(kx) sinc(kL/2).
+        let k = std::f64::consts::TAU / 20.0;
+        for (places, wanted) in [(grid(1.0), 2.0), (grid(1.0), 5.0), (grid(1.0), 8.0), (scattered(2400), 6.0)] {
+            let at = SlopesAt::over(&places, Some(wanted)).unwrap();
+            let length = at.integration_mm;
+            let expected = (0.5 * k * length).sin() / (0.5 * k * length) * k * 1e-6 / 2f64.sqrt();
+            let [rms, most] = of(&at, &places, |x, _| 1e-6 * (k * x).sin());
+            assert!((rms / expected - 1.0).abs() < 0.05, "{length}: {rms} {expected}");
+            assert!((most / (expected * 2f64.sqrt()) - 1.0).abs() < 0.1, "{length}: {most}");
+        }
+    }
+
+    #[test]
+    fn lines_far_apart_have_slopes_over_as_long_as_they_need_and_few_places_have_none() {
+        // A scan: 0.2 mm along, 4 mm across.
+        let scan: Vec<[f64; 2]> =
+            (0..11).flat_map(|j| (0..301).map(move |i| [0.2 * f64::from(i), 4.0 * f64::from(j)])).collect();
+        let at = SlopesAt::over(&scan, None).unwrap();
+        assert!((4.0..16.0).contains(&at.integration_mm) && at.nodes > 300, "{} {}", at.integration_mm, at.nodes);
+        assert!((of(&at, &scan, |x, y| 1e-6 * (x + y))[0] - 2f64.sqrt() * 1e-6).abs() < 1e-14);
+        assert!(SlopesAt::over(&scattered(19), None).is_none());
+        let line: Vec<[f64; 2]> = (0..40).map(|k| [f64::from(k), 0.5 * f64::from(k)]).collect();
+        assert!(SlopesAt::over(&line, None).is_none() && SlopesAt::over(&[[1.0; 2]; 40], None).is_none());
+    }
+}

@@ -1,0 +1,178 @@
+//! What earlier parts taught of the field: how wide it is and how far a point scatters beside it, after passes with and without a correction.
+//!
+//! A pass without a correction leaves what the machine grinds wrong everywhere: wide waves. One with a correction leaves what no correction takes
+//! back: narrow ones. So each kind is taught by itself, whatever the number of the pass: a part that begins with the correction that an
+//! earlier one left has no pass of the first kind.
+//!
+//! A part teaches by what its own points tell, whatever was expected of it. The logarithms of range and ratio of n parts have a mean and a variance
+//! v; what is expected of the next has that mean and the variance
+//!
+//! ```text
+//!  (2 w^2 + (n - 1) v) / (n + 1) * (1 + 1 / n)        and no less than (ln 1.5)^2
+//! ```
+//!
+//! where w = ln 2.5 is how much parts are taken to differ before anything is known of it.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Hyper, Priors};
+
+/// How different parts are before anything is known of them, and for how many parts that counts.
+const DIFFERENT: f64 = 2.5;
+const COUNTS_FOR: f64 = 2.0;
+/// What is expected is never narrower than this factor: a part that differs is still told from its own points.
+const NARROWEST: f64 = 1.5;
+/// Machines change: no more parts than these count.
+const MOST_PARTS: u32 = 20;
+
+/// What earlier parts taught of their fields.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Taught {
+    /// After a pass that was ground without a correction.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub without_correction: Option<Lesson>,
+    /// After a pass that was ground with one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub with_correction: Option<Lesson>,
+}
+
+/// What parts had in common.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Lesson {
+    /// Median of the range, in millimetres, and by what factor parts differ: one standard deviation of its logarithm.
+    pub range_mm: [f64; 2],
+    /// The same of the ratio of the scatter to the field.
+    pub scatter_ratio: [f64; 2],
+    /// How many parts taught it; of more than twenty the last ones count.
+    pub parts: u32,
+}
+
+impl Taught {
+    /// Returns what was taught by passes of this kind.
+    pub fn of(&self, is_corrected: bool) -> Option<Lesson> {
+        if is_corrected { self.with_correction } else { self.without_correction }
+    }
+
+    /// Takes in what a further part told after a pass of this kind.
+    pub fn take(&mut self, is_corrected: bool, hyper: &Hyper) {
+        let lesson = if is_corrected { &mut self.with_correction } else { &mut self.without_correction };
+        *lesson = Some(Lesson::after(*lesson, hyper));
+    }
+
+    /// Whether every number is one that can be, for what was read from a file.
+    pub fn is_sound(&self) -> bool {
+        let number = |of: [f64; 2]| of[0].is_finite() && of[0] > 0.0 && of[1].is_finite() && of[1] >= 1.0;
+        let is_sound = |lesson: Lesson| {
+            number(lesson.range_mm) && number(lesson.scatter_ratio) && (1..=MOST_PARTS).contains(&lesson.parts)
+        };
+        [self.without_correction, self.with_correction].into_iter().flatten().all(is_sound)
+    }
+}
+
+impl Lesson {
+    /// What is known after a further part.
+    pub fn after(before: Option<Self>, hyper: &Hyper) -> Self {
+        let [range_mm, ratio] = [hyper.field.range_mm, hyper.scatter_mm / hyper.field.sigma_mm];
+        let Some(before) = before else {
+            return Self { range_mm: [range_mm, 1.0], scatter_ratio: [ratio, 1.0], parts: 1 };
+        };
+        let n = f64::from((before.parts + 1).min(MOST_PARTS));
+        // Welford 1962.
+        let with = |[median, factor]: [f64; 2], value: f64| {
+            let off = (value / median).ln();
+            let squares = factor.ln().powi(2) * (n - 2.0) + off * off * (n - 1.0) / n;
+            [median * (off / n).exp(), (squares / (n - 1.0)).sqrt().exp()]
+        };
+        Self {
+            range_mm: with(before.range_mm, range_mm),
+            scatter_ratio: with(before.scatter_ratio, ratio),
+            parts: n as u32,
+        }
+    }
+
+    /// What is expected of the next part.
+    pub fn priors(&self) -> Priors {
+        let n = f64::from(self.parts.max(1));
+        let expected = |[median, factor]: [f64; 2]| {
+            let squares = COUNTS_FOR * DIFFERENT.ln().powi(2) + (n - 1.0) * factor.ln().powi(2);
+            let variance = squares / (COUNTS_FOR + n - 1.0) * (1.0 + 1.0 / n);
+            [median, variance.sqrt().exp().max(NARROWEST)]
+        };
+        Priors { range_mm: expected(self.range_mm), scatter_ratio: expected(self.scatter_ratio) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Field;
+    use super::*;
+
+    fn hyper(range_mm: f64, ratio: f64) -> Hyper {
+        Hyper { field: Field::new(2e-3, range_mm), scatter_mm: 2e-3 * ratio, drift: 0.0 }
+    }
+
+    #[test]
+    fn of_two_parts_it_is_what_is_worked_out_by_hand() {
+        let mut taught = Taught::default();
+        assert!(taught.of(true).is_none());
+        taught.take(true, &hyper(10.0, 0.1));
+        let one = taught.of(true).unwrap().priors();
+        // One part: twice the variance of ln 2.5.
+        assert!((one.range_mm[0] - 10.0).abs() < 1e-12, "{one:?}");
+        assert!((one.range_mm[1].ln() - 2f64.sqrt() * 2.5f64.ln()).abs() < 1e-12, "{one:?}");
+        taught.take(true, &hyper(40.0, 0.1));
+        let lesson = taught.of(true).unwrap();
+        // Mean of the logarithms: 20; they are off by ln 2 each, and the sample variance is 2 (ln 2)^2.
+        assert!((lesson.range_mm[0] - 20.0).abs() < 1e-12 && lesson.parts == 2, "{lesson:?}");
+        assert!((lesson.range_mm[1].ln() - 2f64.sqrt() * 2f64.ln()).abs() < 1e-12, "{lesson:?}");
+        assert!((lesson.scatter_ratio[0] - 0.1).abs() < 1e-12 && (lesson.scatter_ratio[1] - 1.0).abs() < 1e-12);
+        let variance = (2.0 * 2.5f64.ln().powi(2) + 2.0 * 2f64.ln().powi(2)) / 3.0 * 1.5;
+        assert!((lesson.priors().range_mm[1].ln() - variance.sqrt()).abs() < 1e-12);
+        assert!(taught.of(false).is_none() && taught.is_sound());
+    }
+
+    #[test]
+    fn many_parts_alike_teach_no_more_than_the_narrowest_factor_and_the_old_ones_fade() {
+        let mut lesson = None;
+        let mut factors = Vec::new();
+        for _ in 0..200 {
+            let next = Lesson::after(lesson, &hyper(15.0, 0.3));
+            factors.push(next.priors().range_mm[1]);
+            lesson = Some(next);
+        }
+        assert!(factors.windows(2).all(|pair| pair[1] <= pair[0] + 1e-12), "{factors:?}");
+        assert_eq!((factors[199], lesson.unwrap().parts), (1.5, 20));
+        // A machine that has changed.
+        for _ in 0..80 {
+            lesson = Some(Lesson::after(lesson, &hyper(60.0, 0.3)));
+        }
+        let lesson = lesson.unwrap();
+        assert!((lesson.range_mm[0] / 60.0 - 1.0).abs() < 0.05, "{lesson:?}");
+    }
+
+    #[test]
+    fn parts_that_differ_widen_what_is_expected() {
+        let lesson = (0..12)
+            .map(|k| hyper(if k % 2 == 0 { 5.0 } else { 80.0 }, 0.3))
+            .fold(None, |lesson, hyper| Some(Lesson::after(lesson, &hyper)));
+        let priors = lesson.unwrap().priors();
+        assert!(priors.range_mm[1] > 3.5 && priors.scatter_ratio[1] < 1.6, "{priors:?}");
+    }
+
+    #[test]
+    fn numbers_that_cannot_be_are_found() {
+        let good = Lesson::after(None, &hyper(15.0, 0.3));
+        let of = |lesson| Taught { with_correction: Some(lesson), without_correction: None }.is_sound();
+        assert!(of(good) && Taught::default().is_sound());
+        for bad in [
+            Lesson { range_mm: [0.0, 2.0], ..good },
+            Lesson { range_mm: [15.0, 0.5], ..good },
+            Lesson { scatter_ratio: [f64::NAN, 2.0], ..good },
+            Lesson { scatter_ratio: [0.1, f64::INFINITY], ..good },
+            Lesson { parts: 0, ..good },
+            Lesson { parts: 21, ..good },
+        ] {
+            assert!(!of(bad), "{bad:?}");
+        }
+    }
+}

@@ -1,0 +1,127 @@
+//! The figures of the form in the report of a run, and those of the points as they were measured.
+
+use std::fmt::Write;
+use std::fs;
+use std::io;
+use std::path::Path;
+
+use serde_json::Value;
+
+use super::ReportError;
+use super::axis::three_digits;
+use super::story::Story;
+use regrind_formats::{FormatError, escaped};
+
+/// The figures of every cycle that has some: a row a figure, a column a cycle, and what must be known of each figure.
+pub(super) fn form(story: &Story, folder: &Path) -> Result<String, ReportError> {
+    let mut cycles = Vec::new();
+    for (number, cycle) in &story.cycles {
+        let Some(name) = &cycle.form else { continue };
+        cycles.push((*number, read_figures(&folder.join(name))?));
+    }
+    let Some((_, last)) = cycles.last() else { return Ok(String::new()) };
+    let html = format!("<h2>Form of the surface</h2>\n{}{}", told(&cycles, last), raw(&cycles, last));
+    Ok(html + &notations(&cycles))
+}
+
+/// Reads the figures of a cycle.
+pub(super) fn read_figures(path: &Path) -> Result<Value, ReportError> {
+    let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
+    let bytes = fs::read(path).map_err(unreadable)?;
+    Ok(serde_json::from_slice(&bytes).map_err(|source| unreadable(io::Error::from(source)))?)
+}
+
+fn listed<'a>(figures: &'a Value, list: &str) -> &'a [Value] {
+    figures[list].as_array().map_or(&[], Vec::as_slice)
+}
+
+fn named<'a>(figures: &'a Value, list: &str, name: &Value) -> Option<&'a Value> {
+    listed(figures, list).iter().find(|row| row["name"] == *name)
+}
+
+fn heads(cycles: &[(u32, Value)]) -> String {
+    cycles.iter().map(|(number, _)| format!("<th class=\"n\">cycle {number}</th>")).collect()
+}
+
+/// What the model tells, with its intervals; nothing in the files of earlier versions.
+fn told(cycles: &[(u32, Value)], last: &Value) -> String {
+    let list = listed(last, "form");
+    if list.is_empty() {
+        return String::new();
+    }
+    let mut html = format!(
+        "<table id=\"told\">\n<tr><th>figure</th>{}<th class=\"n\">raw, last cycle</th><th>unit</th><th>what it is</th></tr>\n",
+        heads(cycles)
+    );
+    for row in list {
+        let text = |key: &str| escaped(row[key].as_str().unwrap_or_default());
+        let cell = |(_, figures): &(u32, Value)| match named(figures, "form", &row["name"]).and_then(interval) {
+            Some([median, low, high]) => format!("<td class=\"n\">{median}<br/><small>{low} to {high}</small></td>"),
+            None => "<td class=\"n\">-</td>".to_owned(),
+        };
+        let cells: String = cycles.iter().map(cell).collect();
+        let _ = writeln!(
+            html,
+            "<tr><td>{}</td>{cells}<td class=\"n\">{}</td><td>{}</td><td>{}</td></tr>",
+            text("name"),
+            row["raw"].as_f64().map_or("-".to_owned(), three_digits),
+            text("unit"),
+            text("made")
+        );
+    }
+    let removed = escaped(list[0]["removed"].as_str().unwrap_or_default());
+    html + &format!(
+        "</table>\n<p>Of the form of the part, the scatter of the probe taken off: the median, and between which the figure lies with 95 %. An interval that \
+         begins at 0 says what is known from above alone. Raw: the same of what was measured, with the scatter of the probe in it. Removed: {removed}.</p>\n"
+    )
+}
+
+/// Median, low and high in digits.
+fn interval(row: &Value) -> Option<[String; 3]> {
+    let number = |key: &str| row[key].as_f64().map(three_digits);
+    Some([number("median")?, number("low")?, number("high")?])
+}
+
+/// The figures of the points and of the map.
+fn raw(cycles: &[(u32, Value)], last: &Value) -> String {
+    let title = if listed(last, "form").is_empty() { "" } else { "<h3>Raw, as measured</h3>\n" };
+    let mut html = format!(
+        "{title}<table id=\"form\">\n<tr><th>figure</th>{}<th>unit</th><th>what it is</th><th>removed</th><th>waves left out</th></tr>\n",
+        heads(cycles)
+    );
+    for row in listed(last, "figures") {
+        let text = |key: &str| escaped(row[key].as_str().unwrap_or_default());
+        let cell = |(_, figures): &(u32, Value)| {
+            let value = named(figures, "figures", &row["name"]).and_then(|row| row["value"].as_f64());
+            format!("<td class=\"n\">{}</td>", value.map_or("-".to_owned(), three_digits))
+        };
+        let cells: String = cycles.iter().map(cell).collect();
+        let _ = writeln!(
+            html,
+            "<tr><td>{}</td>{cells}<td>{}</td><td>{}</td><td>{}</td><td>{}</td></tr>",
+            text("name"),
+            text("unit"),
+            text("made"),
+            text("removed"),
+            text("cut_off")
+        );
+    }
+    html + "</table>\n"
+}
+
+/// The indications of ISO 10110-5 that are met.
+fn notations(cycles: &[(u32, Value)]) -> String {
+    let mut html = "<p>What is told of a figure is that of the last cycle. All along the outward normal, positive where material stands proud; figures of the \
+                    surface, not of a wavefront. ISO 10110-5, in nanometres, that the form meets in each value with 97.5 %, and that what was measured \
+                    just meets:</p>\n<ul>\n"
+        .to_owned();
+    for (number, figures) in cycles {
+        let notation = figures["iso_10110_5"]["notation"].as_str().unwrap_or("-");
+        let of_form = figures["form_iso_10110_5"].as_str();
+        let of_form = of_form.map_or(String::new(), |of| format!("<code>{}</code>; raw ", escaped(of)));
+        let missing = figures["missing"].as_array().into_iter().flatten().filter_map(Value::as_str);
+        let missing: String = missing.map(|why| format!("; no {}", escaped(why))).collect();
+        let _ = writeln!(html, "<li>cycle {number}: {of_form}<code>{}</code>{missing}</li>", escaped(notation));
+    }
+    html + "</ul>\n"
+}
