@@ -107,6 +107,10 @@ pub trait Body: Send {
     fn advance(&mut self, seconds: f64) -> Progress;
     /// Moves clear of the part; the job can go on with `advance` or end with `outcome`.
     fn retract(&mut self);
+    /// Says whether [`Body::so_far`] tells anything.
+    fn tells_so_far(&self) -> bool {
+        false
+    }
     /// Returns what the job that runs has left so far and will not change any more; none where it leaves all at its end.
     fn so_far(&self) -> Option<Outcome> {
         None

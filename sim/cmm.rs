@@ -331,6 +331,10 @@ impl Body for Cmm {
         locked(&self.world).clear(Kind::Cmm);
     }
 
+    fn tells_so_far(&self) -> bool {
+        true
+    }
+
     fn so_far(&self) -> Option<Outcome> {
         let run = self.running.as_ref()?;
         Some(run.told(&locked(&self.world)))

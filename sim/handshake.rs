@@ -348,7 +348,7 @@ impl Handshake {
 
     /// Says whether full pages of a result can be had while its job still runs.
     pub(crate) fn gives_ahead(&self) -> bool {
-        self.gives_ahead && self.body.kind() == Kind::Cmm
+        self.gives_ahead && self.body.tells_so_far()
     }
 
     /// Returns the outbox as it is now, if there is anything in it.

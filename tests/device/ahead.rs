@@ -177,13 +177,13 @@ fn lies() -> Vec<(u16, Fault)> {
         (PAGE, Fault::Fewer),
         (PAGE, Fault::WordSwap),
     ];
-    let lost =
-        |at| [Fault::DropReply, Fault::DropRequest, Fault::Disconnect(5), Fault::FlipCrc].map(|fault| (at, fault));
-    let refused = |at| [1, 2, 3, 4, 6, 11].map(|code| (at, Fault::Exception(code)));
-    for at in [HEADER, SELECT, PAGE] {
-        all.extend(lost(at));
-        all.extend(refused(at));
-    }
+    all.extend([
+        (HEADER, Fault::Disconnect(5)),
+        (SELECT, Fault::DropRequest),
+        (PAGE, Fault::DropReply),
+        (PAGE, Fault::FlipCrc),
+    ]);
+    all.extend([HEADER, SELECT, PAGE].into_iter().flat_map(|at| [2, 6].map(|code| (at, Fault::Exception(code)))));
     all
 }
 

@@ -140,6 +140,9 @@ impl Body for Toy {
         Progress { done: self.done, total, finished: self.done == total, fault: 0 }
     }
     fn retract(&mut self) {}
+    fn tells_so_far(&self) -> bool {
+        self.kind == Kind::Cmm
+    }
     fn so_far(&self) -> Option<body::Outcome> {
         let bytes = self.points().into_iter().take(self.size() * self.done as usize).collect();
         (self.kind == Kind::Cmm).then(|| self.left(bytes))
