@@ -107,6 +107,14 @@ pub trait Body: Send {
     fn advance(&mut self, seconds: f64) -> Progress;
     /// Moves clear of the part; the job can go on with `advance` or end with `outcome`.
     fn retract(&mut self);
+    /// Says whether [`Body::so_far`] tells anything.
+    fn tells_so_far(&self) -> bool {
+        false
+    }
+    /// Returns what the job that runs has left so far and will not change any more; none where it leaves all at its end.
+    fn so_far(&self) -> Option<Outcome> {
+        None
+    }
     /// Ends the job, complete (1), stopped (2), aborted (3) or failed (4), and returns what it leaves.
     fn outcome(&mut self, result: u16) -> Outcome;
     /// Returns the interlock bits of docs/modbus.md; bit 1, clear of the part, too.

@@ -144,6 +144,23 @@ impl Run {
         self.records.len() == self.plan.targets.len()
     }
 
+    /// Returns what the machine says of the records that there are.
+    fn told(&self, state: &State) -> Outcome {
+        let (spec, faults) = (&state.spec.cmm, &state.spec.faults);
+        let scale = spec.scaled_points.then_some(COUNT_MM);
+        Outcome {
+            kind: 4,
+            format: if spec.scaled_points { 2 } else { 1 },
+            bytes: encode_points(&self.records, scale),
+            records: self.records.len() as u32,
+            coordinates: if faults.returns_contact_points && faults.contact_points_declared { 2 } else { 1 },
+            probe_radius_mm: self.plan.probe_radius_mm,
+            scale_mm: scale.unwrap_or(1.0),
+            temperature_c: spec.part_temperature_c,
+            duration_s: self.elapsed_s.min(self.due_s.last().copied().unwrap_or(0.0)),
+        }
+    }
+
     /// Touches one target.
     fn measure(&mut self, state: &State, target: &Target) -> PointRecord {
         let spec = &state.spec.cmm;
@@ -314,33 +331,30 @@ impl Body for Cmm {
         locked(&self.world).clear(Kind::Cmm);
     }
 
+    fn tells_so_far(&self) -> bool {
+        true
+    }
+
+    fn so_far(&self) -> Option<Outcome> {
+        let run = self.running.as_ref()?;
+        Some(run.told(&locked(&self.world)))
+    }
+
     fn outcome(&mut self, _result: u16) -> Outcome {
         let mut state = locked(&self.world);
         self.ready = None;
         let Some(mut run) = self.running.take() else { return nothing_done(state.spec.cmm.part_temperature_c) };
         state.release(Kind::Cmm);
-        let (spec, faults) = (&state.spec.cmm, &state.spec.faults);
-        let duration_s = run.elapsed_s.min(run.due_s.last().copied().unwrap_or(0.0));
+        let faults = &state.spec.faults;
         let rest = run.plan.targets[run.records.len()..].iter();
         run.records.extend(rest.map(|target| untouched(target, Status::NotReached)));
         let kept = run.records.len().saturating_sub(faults.missing_records as usize);
         run.records.truncate(kept);
-        let scale = spec.scaled_points.then_some(COUNT_MM);
         if let (true, Some(record)) = (faults.non_finite_point, run.records.get_mut(kept / 2)) {
             record.position_mm[0] = f64::NAN;
         }
-        let outcome = Outcome {
-            kind: 4,
-            format: if spec.scaled_points { 2 } else { 1 },
-            bytes: encode_points(&run.records, scale),
-            records: kept as u32,
-            coordinates: if faults.returns_contact_points && faults.contact_points_declared { 2 } else { 1 },
-            probe_radius_mm: run.plan.probe_radius_mm,
-            scale_mm: scale.unwrap_or(1.0),
-            temperature_c: spec.part_temperature_c,
-            duration_s,
-        };
-        state.heat *= (-duration_s / state.spec.grinder.thermal_tau_s).exp();
+        let outcome = run.told(&state);
+        state.heat *= (-outcome.duration_s / state.spec.grinder.thermal_tau_s).exp();
         outcome
     }
 

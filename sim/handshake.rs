@@ -3,6 +3,7 @@
 //! Whatever a frame asks, the number and the answer are latched before anything moves, and a (job, cycle) moves once in a
 //! machine's life. Nothing here knows a register's address or a clock.
 
+use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::time::Duration;
 
@@ -63,6 +64,7 @@ pub(crate) struct Handshake {
     begun_by: u32,
     begun: BTreeSet<(u32, u16)>,
     trusting: bool,
+    gives_ahead: bool,
     /// What comes into force next is changed once it has been looked at.
     spoils: bool,
     /// It has come into force, and nobody has looked yet.
@@ -107,6 +109,7 @@ impl Handshake {
             begun_by: 0,
             begun: options.last_begun.into_iter().collect(),
             trusting: options.trusting,
+            gives_ahead: options.gives_ahead,
             spoils: false,
             spoils_soon: false,
             last_begun: options.last_begun.unwrap_or_default(),
@@ -331,11 +334,32 @@ impl Handshake {
         }
         (self.done, self.result) = (self.begun_by, result);
         self.note(What::Ended { start: self.begun_by, result, beats: self.listening.until(self.now) });
-        let slot = self.slots[if self.body.kind() == Kind::Cmm { 0 } else { 1 }].as_ref();
-        let identity = slot.map_or([0; 32], |slot| slot.payload.identity);
-        let origin = Origin { job: self.work.job, cycle: self.work.cycle, done: self.done, identity };
+        let origin = self.origin();
         self.outbox = Outbox::new(self.order, self.body.outcome(result), origin);
         self.outbox.is_some()
+    }
+
+    /// Whose result it is, that of the job that runs or has just ended.
+    fn origin(&self) -> Origin {
+        let slot = self.slots[if self.body.kind() == Kind::Cmm { 0 } else { 1 }].as_ref();
+        let identity = slot.map_or([0; 32], |slot| slot.payload.identity);
+        Origin { job: self.work.job, cycle: self.work.cycle, done: self.done, identity }
+    }
+
+    /// Says whether full pages of a result can be had while its job still runs.
+    pub(crate) fn gives_ahead(&self) -> bool {
+        self.gives_ahead && self.body.tells_so_far()
+    }
+
+    /// Returns the outbox as it is now, if there is anything in it.
+    pub(crate) fn outbox(&self) -> Option<Cow<'_, Outbox>> {
+        match self.state {
+            State::Complete => self.outbox.as_ref().map(Cow::Borrowed),
+            State::Execute | State::Holding | State::Held | State::Stopping if self.running && self.gives_ahead() => {
+                Outbox::so_far(self.order, self.body.so_far()?, self.origin()).map(Cow::Owned)
+            }
+            _ => None,
+        }
     }
 
     fn complete(&mut self, result: u16) {

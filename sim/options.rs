@@ -105,6 +105,8 @@ pub struct MachineOptions {
     pub version: u16,
     /// The job and cycle it began before it was switched off.
     pub last_begun: Option<(u32, u16)>,
+    /// A CMM gives the full pages of a result while its job still runs, and says so.
+    pub gives_ahead: bool,
     /// It takes its client's word: begins a job that it has begun before, and does not hold what is in force against what is told to be.
     pub trusting: bool,
 }
@@ -121,6 +123,7 @@ impl Default for MachineOptions {
             payload_limit_bytes: 64 << 20,
             version: 2,
             last_begun: None,
+            gives_ahead: true,
             trusting: false,
         }
     }

@@ -214,7 +214,6 @@ impl Machine {
 
     fn image(&mut self, block: Block) -> Vec<u16> {
         let order = self.options.word_order;
-        let outbox = self.handshake.outbox.as_ref().filter(|_| self.handshake.state == State::Complete);
         match block {
             Block::Identity => self.identity_image(),
             Block::Sync => vec![self.sync[0], self.sync[1], !self.sync[0], !self.sync[1]],
@@ -229,10 +228,11 @@ impl Machine {
             Block::InboxHeader => self.inbox_header.to_vec(),
             Block::InboxPage => self.inbox_page.to_vec(),
             Block::InboxState => self.inbox.image(order),
-            Block::OutboxHeader => outbox.map_or_else(|| vec![0; 56], |outbox| outbox.header_image()),
+            Block::OutboxHeader => self.handshake.outbox().map_or_else(|| vec![0; 56], |outbox| outbox.header_image()),
             Block::OutboxSelect => self.select.to_vec(),
             Block::OutboxPage => {
                 let page = order.to_u32(self.select);
+                let outbox = self.handshake.outbox();
                 outbox.map_or_else(|| page_image(order, page, &[]), |outbox| outbox.page_image(order, page))
             }
         }
@@ -248,7 +248,7 @@ impl Machine {
             .u32(4, 0x1234_5678)
             .f64(6, -2.5e-7)
             .u32(10, self.handshake.boot_id)
-            .u16(12, 1)
+            .u16(12, 1 | u16::from(self.handshake.gives_ahead()) << 1)
             .u16(13, 1)
             .u16(15, self.options.lost_after_ms)
             .bytes(16, &name)

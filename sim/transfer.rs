@@ -161,7 +161,7 @@ pub(crate) fn slots_image(order: WordOrder, slots: &[Option<Slot>; 3]) -> Vec<u1
 }
 
 /// What a job left, until it is acknowledged.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct Outbox {
     header: Vec<u16>,
     registers: Vec<u16>,
@@ -177,6 +177,15 @@ pub(crate) struct Origin {
 }
 
 impl Outbox {
+    /// Packs what a job that still runs has left so far: without a CRC, without the number of an end, and in full pages alone.
+    pub(crate) fn so_far(order: WordOrder, outcome: Outcome, origin: Origin) -> Option<Self> {
+        let mut outbox = Self::new(order, outcome, Origin { done: 0, ..origin })?;
+        outbox.header[4..6].fill(0);
+        let full = outbox.registers.len() / PAGE_REGISTERS * PAGE_REGISTERS;
+        outbox.registers.truncate(full);
+        Some(outbox)
+    }
+
     /// Packs an outcome; `None` if one of its figures is not a number that may be sent.
     pub(crate) fn new(order: WordOrder, outcome: Outcome, origin: Origin) -> Option<Self> {
         let figures = [outcome.probe_radius_mm, outcome.scale_mm, outcome.temperature_c, outcome.duration_s];

@@ -44,6 +44,8 @@ pub enum Fault {
     FlipCrc,
     /// One bit of the last register of the answer is wrong and every checksum of the wire right.
     FlipData,
+    /// Some registers of the answer to a read, by their places in it, say something else, and every checksum of the wire is right.
+    Lie(Vec<(usize, u16)>),
     /// Every two registers of an answer to a read are exchanged.
     WordSwap,
     /// So many bytes of the answer come, then the connection is closed (TCP; on RTU the rest is lost).

@@ -216,6 +216,12 @@ fn deliver(framing: Framing, unit: u8, mut reply: Vec<u8>, met: &[Fault]) -> Del
                 reply[1] -= 2;
                 reply.truncate(reply.len() - 2);
             }
+            Fault::Lie(instead) if reply[0] == 3 => {
+                for (register, value) in instead {
+                    let at = 2 + 2 * register;
+                    reply.get_mut(at..at + 2).into_iter().for_each(|word| word.copy_from_slice(&value.to_be_bytes()));
+                }
+            }
             Fault::WordSwap if reply[0] == 3 => reply[2..].chunks_exact_mut(4).for_each(|pair| pair.rotate_left(2)),
             _ => {}
         }

@@ -12,7 +12,7 @@ use regrind::journal::{Kind, Reader};
 use super::Outcome;
 use super::choice::word_of;
 use super::failure::Failure;
-use super::show::{how_far, limits, pv_name};
+use super::show::{how_far, limits, pv_name, so_far};
 use super::words::time_left;
 
 /// What stands below the help of each order.
@@ -169,6 +169,9 @@ fn told(status: &Snapshot, folder: &Path) -> String {
     if let Some(JobProgress { device, done, total, left_s }) = status.progress {
         let left = left_s.map_or(String::new(), |left_s| format!(", {} left", time_left(left_s)));
         let _ = writeln!(text, "{}{left}", how_far(device, done, total));
+    }
+    if let Some(told) = &status.so_far {
+        let _ = writeln!(text, "{}", so_far(told));
     }
     for alarm in &status.alarms {
         let _ = writeln!(text, "ALARM    {}\n         {}", alarm.what, alarm.consequence);

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 use regrind::cell::{Alarm, AlarmId, Device, Ending, Figures, Judgement, PvOf, Tolerance, TouchOn};
 use regrind::document::visible;
-use regrind::drive::{CycleRow, Notice};
+use regrind::drive::{CycleRow, Notice, SoFar};
 use regrind::formats::read_error_map;
 use regrind::model::FIRST;
 use regrind::recipe::{Mode, Recipe};
@@ -323,6 +323,13 @@ pub(super) fn how_far(device: Device, done: u32, total: u32) -> String {
             format!("grinding, {:.1} % of the path", 100.0 * f64::from(done) / f64::from(total.max(1)))
         }
     }
+}
+
+/// Says what the touches of a measurement tell that still runs.
+pub(super) fn so_far(SoFar { touched, rms_um, least_um, most_um }: &SoFar) -> String {
+    format!(
+        "preliminary, from where the plan has the part: {touched} touched, RMS {rms_um:.2} um, {least_um:+.2} to {most_um:+.2} um"
+    )
 }
 
 /// Names the peak to valley that is judged.

@@ -21,7 +21,7 @@ use super::Outcome;
 use super::blocks::{Blocks, sparkline};
 use super::control;
 use super::failure::Failure;
-use super::show::{how_far, limits, pv_name};
+use super::show::{how_far, limits, pv_name, so_far};
 use super::words::time_left;
 
 /// Between two looks whether a map is on record.
@@ -214,7 +214,11 @@ impl View {
             .ratio(ratio)
             .gauge_style(Color::Blue)
             .label(format!("{}{left}", how_far(device, done, total)));
-        frame.render_widget(gauge, Rect { height: 1.min(area.height), ..area });
+        let [bar, below] = Layout::vertical([Constraint::Length(1), Constraint::Min(0)]).areas(area);
+        frame.render_widget(gauge, bar);
+        if let Some(told) = &self.seen.so_far {
+            frame.render_widget(Paragraph::new(so_far(told)).dim(), below);
+        }
     }
 
     fn alarms(&self) -> Text<'_> {

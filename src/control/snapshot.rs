@@ -40,6 +40,9 @@ pub struct Snapshot {
     /// How far the job under way is.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub progress: Option<JobProgress>,
+    /// What the touches of the measurement under way say so far, where the CMM gives them before its end.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub so_far: Option<SoFar>,
     /// What the figures of a cycle are judged by.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tolerance: Option<Tolerance>,
@@ -138,6 +141,20 @@ pub struct JobProgress {
     /// there is a pace, and while it stands.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub left_s: Option<[f64; 2]>,
+}
+
+/// What the touches of a measurement say that still runs: preliminary. They are counted from where the plan has the part, so that its place
+/// on the table is in them; no gate has seen them, and nothing is judged by them.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SoFar {
+    /// How many touches of the part have come.
+    pub touched: u32,
+    /// The quadratic mean of their deviations, along the normals; positive where material stands proud.
+    pub rms_um: f64,
+    /// The least deviation.
+    pub least_um: f64,
+    /// The largest.
+    pub most_um: f64,
 }
 
 /// A cycle in the table at the end of a run.

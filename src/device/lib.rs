@@ -44,8 +44,8 @@ pub use modbus::{
     Parity, RegisterMap, RtuWire, Signal, SignalTable, SignalType, TcpWire, WordOrder,
 };
 pub use payload::{
-    Careful, CorrectionMap, Identified, MeasuredPoint, Measurement, Pass, PassRecord, Plan, PointStatus, Target,
-    TargetKind,
+    Careful, CorrectionMap, Identified, MeasuredPoint, Measurement, Pass, PassRecord, Plan, PointStatus, Preliminary,
+    Target, TargetKind,
 };
 pub use place::Place;
 pub use regrind_formats::result::Coordinates;

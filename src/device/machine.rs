@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::error::DeviceError;
-use super::payload::{CorrectionMap, Measurement, Pass, PassRecord, Plan};
+use super::payload::{CorrectionMap, Measurement, Pass, PassRecord, Plan, Preliminary};
 use super::words::{Armed, Identity, Job, Reconciled, Started, Status, Word};
 
 /// What every machine of a cell can be asked, whatever its wire.
@@ -86,6 +86,13 @@ pub trait Cmm: Machine {
     /// Carries the plan to the machine and proves that it is what the machine would use.
     fn load_plan(&mut self, plan: &Plan, interrupt: &Interrupt)
     -> impl Future<Output = Result<(), DeviceError>> + Send;
+
+    /// Reads on a little in what the machine gives of the points of this job while it still runs, where it gives that. Ask after a look at
+    /// the status, when nothing else is to be asked: it takes a moment, at most one step between two looks, and breaks off where the
+    /// flag is raised. Returns the points that are new, if there are any; what goes wrong is seen by the next look.
+    fn read_ahead(&mut self, _job: Job, _interrupt: &Interrupt) -> impl Future<Output = Option<Preliminary>> + Send {
+        std::future::ready(None)
+    }
 
     /// Fetches the points of this job, which has to be complete. Fetching twice gives the same, until it is acknowledged.
     fn collect(

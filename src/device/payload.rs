@@ -142,6 +142,19 @@ pub struct Measurement {
     pub done: u32,
 }
 
+/// Points that a CMM gives while it still measures: to be looked at, and never judged by. What counts is the [`Measurement`] at the end.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Preliminary {
+    /// Whose they are.
+    pub job: super::Job,
+    /// How many points of the job were told before these; 0 where it begins anew, and what was told before is to be forgotten.
+    pub from: usize,
+    /// The points, in the order of the plan.
+    pub points: Vec<MeasuredPoint>,
+    /// What their coordinates are.
+    pub coordinates: Coordinates,
+}
+
 /// What a grinder, or the person who serves it, says of a pass; `None` is what nobody told.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PassRecord {

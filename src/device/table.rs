@@ -10,8 +10,8 @@ use super::modbus::{Line, Link, RtuWire, TcpWire};
 use super::place::Place;
 use super::wiring::{Making, MakingError, Wired};
 use super::{
-    Armed, CorrectionMap, DeviceError, Identity, Job, Measurement, Pass, PassRecord, Plan, Reconciled, Started, Status,
-    Word,
+    Armed, CorrectionMap, DeviceError, Identity, Job, Measurement, Pass, PassRecord, Plan, Preliminary, Reconciled,
+    Started, Status, Word,
 };
 use regrind_document::Document;
 use regrind_formats::result::Coordinates;
@@ -114,6 +114,9 @@ macro_rules! drivers {
         impl Cmm for AnyCmm {
             async fn load_plan(&mut self, plan: &Plan, interrupt: &Interrupt) -> Result<(), DeviceError> {
                 match self { $(Self::$wire(cmm) => cmm.load_plan(plan, interrupt).await),+ }
+            }
+            async fn read_ahead(&mut self, job: Job, interrupt: &Interrupt) -> Option<Preliminary> {
+                match self { $(Self::$wire(cmm) => cmm.read_ahead(job, interrupt).await),+ }
             }
             async fn collect(&mut self, job: Job, interrupt: &Interrupt) -> Result<Measurement, DeviceError> {
                 match self { $(Self::$wire(cmm) => Cmm::collect(cmm, job, interrupt).await),+ }

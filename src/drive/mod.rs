@@ -23,6 +23,7 @@ mod record;
 pub mod recover;
 mod replay;
 mod snapshot;
+mod so_far;
 mod station;
 mod task;
 mod touches;
@@ -45,7 +46,8 @@ use crate::cell::{
     Judgement, Phase, RecordFailure, State, StateName,
 };
 use crate::device::{
-    AnyCmm, AnyGrinder, Armed, Cmm, Grinder, Identified, Interrupt, Job, Measurement, Number, PassRecord, Word, hex,
+    AnyCmm, AnyGrinder, Armed, Cmm, Grinder, Identified, Interrupt, Job, Measurement, Number, PassRecord, Preliminary,
+    Word, hex,
 };
 use crate::formats::{FormatError, LEARNED, ResultFolder, write_json_atomic};
 use crate::journal::{self, Artefact, Entry, Kind};
@@ -58,8 +60,9 @@ pub use program::{ProgramError, Programs};
 pub use record::Ledger;
 use record::{Files, Recorder, Ticket, entry};
 use regrind_control::{Control, Ordered};
-pub use regrind_control::{CycleRow, JobProgress, Reply, Request, Snapshot, ask, is_live};
+pub use regrind_control::{CycleRow, JobProgress, Reply, Request, Snapshot, SoFar, ask, is_live};
 pub use replay::{Interrupted, ReplayError};
+use so_far::Touching;
 use station::{
     Aborts, Ask, CmmDriver, Fetched, GrinderDriver, Load, MachineTask, Notes, PULSE_EVERY, Pulse, StationDriver,
     StationReport,
@@ -152,6 +155,7 @@ pub struct Drive {
     notices: mpsc::UnboundedSender<Notice>,
     cycles: Cycles,
     pace: Pace,
+    touching: Touching,
     /// What each machine waits for, in words.
     notes: [Vec<String>; 2],
     /// What the files of each cycle take on the disk, and the most of them.
@@ -316,6 +320,7 @@ impl Drive {
             notices: run.notices,
             cycles: interrupted.cycles,
             pace: Pace::default(),
+            touching: Touching::default(),
             notes: [Vec::new(), Vec::new()],
             cycle_bytes: BTreeMap::new(),
             largest_cycle_bytes: 0,
@@ -616,7 +621,8 @@ impl Drive {
         Ok(identity)
     }
 
-    async fn reported(&mut self, StationReport { event, detail, fetched, notes, files }: StationReport) {
+    async fn reported(&mut self, report: StationReport) {
+        let StationReport { event, detail, fetched, preliminary, notes, files } = report;
         self.adopt(self.cell.cycle(), record::describe(&self.folder, &files)).await;
         if let Some(Notes { device, all, new: messages }) = notes {
             self.notes[device as usize] = all;
@@ -626,6 +632,9 @@ impl Drive {
                 self.note(Kind::Note, (device.to_string(), "wire".into()), payload);
                 self.notify(Notice::Note { device, messages });
             }
+        }
+        if let Some(preliminary) = preliminary {
+            self.preview(&preliminary);
         }
         if let Some(Fetched::Record(record)) = &fetched {
             let payload = json!({ "pass_record": pass_record::document(record) });
@@ -644,6 +653,18 @@ impl Drive {
             }
             self.take(event, detail).await;
         }
+    }
+
+    /// Shows what a measurement that still runs says so far.
+    fn preview(&mut self, preliminary: &Preliminary) {
+        let number = self.cell.cycle();
+        let asked = Number { cycle: number, batch: self.cycles.batch(number) };
+        let plan = self.cycles.get(number).and_then(|cycle| cycle.plan.clone());
+        match plan.filter(|_| preliminary.job.job == self.job && preliminary.job.number() == asked) {
+            Some(plan) => self.touching.take(&plan, preliminary),
+            None => self.touching.forget(),
+        }
+        self.status.send_replace(self.snapshot());
     }
 
     /// Tells what of a pass record cannot be, beside the pass that was commanded.
@@ -997,6 +1018,9 @@ impl Drive {
     /// Shows an event that the cell has taken in.
     fn show_event(&mut self, now: Duration, event: &Event) {
         self.pace.follow(self.cell.state());
+        if self.pace.progress().is_none_or(|progress| progress.device != Device::Cmm) {
+            self.touching.forget();
+        }
         let notice = match event {
             Event::Progressed { device, done, total } => {
                 let cycle = self.cell.cycle();

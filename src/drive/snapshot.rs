@@ -27,6 +27,7 @@ impl Drive {
             max_cycles: self.cell.plan().max_cycles,
             seconds: self.now().as_secs_f64(),
             progress: self.pace.progress(),
+            so_far: self.touching.so_far(),
             tolerance: Some(self.cell.plan().tolerance),
             cycles: self.cycles.rows(&self.cell.plan().tolerance),
             alarms: self.cell.alarms().cloned().collect(),

@@ -19,7 +19,7 @@ use crate::cell::{
 };
 use crate::device::{
     Armed, Cmm, CorrectionMap, DeviceError, Fault, Grinder, Identified, Interrupt, Job, Machine, Measurement, Number,
-    Outcome, Pass, PassRecord, Plan, Reconciled, SignalValue, State, Status, Word, digest,
+    Outcome, Pass, PassRecord, Plan, Preliminary, Reconciled, SignalValue, State, Status, Word, digest,
 };
 
 /// What a machine is asked. Answers are the events that [`crate::cell::Command`] names.
@@ -69,6 +69,8 @@ pub(super) struct StationReport {
     pub(super) event: Option<Event>,
     pub(super) detail: Option<serde_json::Value>,
     pub(super) fetched: Option<Fetched>,
+    /// Points that a CMM gives while it still measures.
+    pub(super) preliminary: Option<Preliminary>,
     /// What a person should know of a machine, where that has changed.
     pub(super) notes: Option<Notes>,
     /// Files of the run folder that came with a person's word, to be brought on record.
@@ -83,6 +85,10 @@ pub(super) trait StationDriver: Send + 'static {
     /// Carries the payloads and returns the digest of their identities.
     fn load(&mut self, load: &Load, interrupt: &Interrupt) -> impl Future<Output = Result<u32, DeviceError>> + Send;
     fn fetch(&mut self, job: Job, interrupt: &Interrupt) -> impl Future<Output = Result<Fetched, DeviceError>> + Send;
+    /// Reads on in what the machine gives while the job still runs; see [`Cmm::read_ahead`].
+    fn read_ahead(&mut self, _job: Job, _: &Interrupt) -> impl Future<Output = Option<Preliminary>> + Send {
+        std::future::ready(None)
+    }
 }
 
 pub(super) struct CmmDriver<C>(pub(super) C);
@@ -106,6 +112,10 @@ impl<C: Cmm + 'static> StationDriver for CmmDriver<C> {
         let began = Instant::now();
         let measurement = self.0.collect(job, interrupt).await?;
         Ok(Fetched::Points(Box::new(measurement), began.elapsed()))
+    }
+
+    fn read_ahead(&mut self, job: Job, interrupt: &Interrupt) -> impl Future<Output = Option<Preliminary>> + Send {
+        self.0.read_ahead(job, interrupt)
     }
 }
 
@@ -684,8 +694,18 @@ impl<B: StationDriver> MachineTask<B> {
             Ok(status) => {
                 self.pass_on_notes().await;
                 self.note(&status).await;
+                self.read_ahead().await;
             }
             Err(error) => self.lost(&error).await,
+        }
+    }
+
+    /// Has a running job's points come while nothing else is asked: an order raises the flag and comes first.
+    async fn read_ahead(&mut self) {
+        let Some(armed) = self.armed.as_ref().filter(|_| self.seen.running && !self.seen.ended) else { return };
+        let preliminary = self.driver.read_ahead(armed.job, &self.interrupt).await;
+        if preliminary.is_some() {
+            let _ = self.reports.send(StationReport { preliminary, ..StationReport::default() }).await;
         }
     }
 

@@ -100,6 +100,12 @@ texts! {
     // The column of the work.
     NextAction { "Your next action", "Ihr nächster Schritt", "您的下一步" }
     TimeLeft { "left", "verbleiben", "剩余" }
+    Preliminary { "preliminary", "vorläufig", "初步" }
+    PreliminaryMeans {
+        "from where the plan has the part; not registered, not judged",
+        "gegen die Lage des Teils im Plan; nicht eingepasst, nicht beurteilt",
+        "相对于计划中的工件位置；未配准，未判定"
+    }
     Waits { "Waiting for", "Wartet auf", "等待" }
     WhatToDo { "What to do", "Was zu tun ist", "处理方法" }
     ClearedBy { "Cleared by", "Quittiert durch", "复位人" }

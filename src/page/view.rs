@@ -8,7 +8,7 @@ use axum::http::{HeaderMap, HeaderName, StatusCode};
 use axum::response::{IntoResponse, Redirect, Response};
 use maud::{DOCTYPE, Markup, html};
 use regrind_cell::{Alarm, Device, Role, StateName, Tolerance};
-use regrind_control::{JobProgress, Next, Snapshot};
+use regrind_control::{JobProgress, Next, Snapshot, SoFar};
 use regrind_report::{ColourMap, CycleSummary, RUN_REPORT, RunResult, RunSummary};
 use serde::Deserialize;
 use serde_json::{Value, json};
@@ -251,6 +251,12 @@ fn job(live: &Snapshot, language: Language) -> Markup {
             @if let Some(left) = left_s { span .left { (range(left)) " " (Text::TimeLeft.to(language)) } }
         }
         progress max=(total.max(1)) value=(done) aria-label=(device) {}
+        @if let Some(SoFar { touched, rms_um, least_um, most_um }) = live.so_far {
+            p .quiet title=(Text::PreliminaryMeans.to(language)) {
+                (Text::Preliminary.to(language)) ": " (touched) " " (Text::Touched.to(language))
+                (format!(", RMS {rms_um:.2} µm, {least_um:+.2} … {most_um:+.2} µm"))
+            }
+        }
     }
 }
 

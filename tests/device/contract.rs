@@ -173,6 +173,36 @@ async fn measured(order: WordOrder, sim_order: words::WordOrder) -> Vec<Vec<u8>>
     record.lock().unwrap().clone()
 }
 
+/// What goes over the wire while seven of eight points are measured, and read.
+async fn measured_ahead(order: WordOrder, word_order: words::WordOrder) -> Vec<Vec<u8>> {
+    let options = MachineOptions { word_order, ..MachineOptions::default() };
+    let machine = Machine::new(Box::new(Toy::new(Kind::Cmm, 1e9).up_to(7)), BOOT_ID, options);
+    let (settings, record) = record(machine, order).await;
+    let (mut cmm, one, calm) = (ModbusCmm::new(settings).unwrap(), plan(), Interrupt::new());
+    let target = |k: u32| {
+        let [x, y, z] = one.targets[0].point_mm;
+        Target { index: 70_000 + k, point_mm: [x + f64::from(k), y, z], ..one.targets[0] }
+    };
+    let plan = Plan { targets: (0..8).map(target).collect(), ..one.clone() };
+    let job = Job { job: JOB, cycle: CYCLE, digest: digest(&[plan.identity()]) };
+    cmm.connect().await.unwrap();
+    cmm.claim().await.unwrap();
+    cmm.load_plan(&plan, &calm).await.unwrap();
+    let armed = cmm.prepare(job).await.unwrap();
+    cmm.start(armed).await.unwrap();
+    let mut told = Vec::new();
+    for _ in 0..3 {
+        cmm.status().await.unwrap();
+        told.extend(cmm.read_ahead(job, &calm).await);
+    }
+    assert_eq!(told.len(), 1, "one page is full");
+    assert_eq!(
+        (told[0].points.len(), told[0].points[6].index, told[0].points[6].at_mm),
+        (7, 70_006, [1.1 + 6.0, -2.3, 2.7])
+    );
+    record.lock().unwrap().clone()
+}
+
 async fn complete(cmm: &mut ModbusCmm) -> Status {
     for _ in 0..200 {
         let status = cmm.status().await.unwrap();
@@ -193,9 +223,13 @@ async fn handed_over(order: WordOrder, sim_order: words::WordOrder) -> Vec<Vec<u
     record.lock().unwrap().clone()
 }
 
-/// The answer to a look at the status with the snapshot number and the beats of the page, which are as it happens.
+/// The answer to a look at the status with the snapshot number and the beats of the page, and that to a look at an outbox without a duration:
+/// those are as it happens.
 fn as_on_the_page(frame: &[u8]) -> Vec<u8> {
     let mut frame = frame.to_vec();
+    if frame.len() == 9 + 112 && frame[7..9] == [3, 112] {
+        frame[9 + 2 * 24..9 + 2 * 28].fill(0);
+    }
     if frame.len() == 9 + 96 && frame[7..9] == [3, 96] {
         for (register, value) in [(0, 0x0102_u16), (28, 0x0345), (29, 0x0019), (47, 0x0102)] {
             frame[9 + 2 * register..][..2].copy_from_slice(&value.to_be_bytes());
@@ -205,8 +239,10 @@ fn as_on_the_page(frame: &[u8]) -> Vec<u8> {
 }
 
 /// The pieces of the page that stand in one word order, and those that stand in both.
-const TURNED: [&str; 6] = ["claim", "status", "header", "page", "point", "beat"];
-const UNTURNED: [&str; 8] = [
+const TURNED: [&str; 8] = ["claim", "status", "header", "page", "point", "beat", "ahead", "full"];
+const UNTURNED: [&str; 10] = [
+    "ahead.request",
+    "full.request",
     "claim.answer",
     "beat.answer",
     "status.request",
@@ -226,6 +262,7 @@ async fn the_frames_of_the_page_are_those_on_the_wire() {
     {
         let mut sent = measured(order, sim_order).await;
         sent.extend(handed_over(order, sim_order).await);
+        sent.extend(measured_ahead(order, sim_order).await);
         let sent: BTreeSet<_> = sent.iter().map(|frame| as_on_the_page(frame)).collect();
         let names = TURNED.map(|frame| format!("{frame}.{name}")).into_iter().chain(UNTURNED.map(str::to_owned));
         for name in names {

@@ -162,6 +162,28 @@ async fn our_driver_has_a_pymodbus_cmm_measure() {
 
 #[tokio::test]
 #[ignore = "needs Python with venv, and pymodbus: see REGRIND_PYTHON"]
+async fn a_pymodbus_cmm_gives_pages_while_it_measures() {
+    let process = Process::of(python(), "cmm.py", &["--ahead", "--seconds", "3"]);
+    let mut cmm = ModbusCmm::new(process.settings.clone()).unwrap();
+    cmm.connect().await.unwrap();
+    cmm.claim().await.unwrap();
+    let (plan, calm) = (plan(), Interrupt::new());
+    cmm.load_plan(&plan, &calm).await.unwrap();
+    let job = Job { job: 5, cycle: 1, digest: digest(&[plan.identity()]) };
+    let armed = cmm.prepare(job).await.unwrap();
+    cmm.start(armed).await.unwrap();
+    let mut came = Vec::new();
+    while cmm.status().await.unwrap().state != State::Complete {
+        came.extend(cmm.read_ahead(job, &calm).await.into_iter().flat_map(|told| told.points));
+    }
+    let measured = cmm.collect(job, &calm).await.unwrap();
+    println!("{} of {} points came while it measured", came.len(), measured.points.len());
+    assert!(!came.is_empty() && came == measured.points[..came.len()]);
+    assert_eq!(measured.points.len(), 200);
+}
+
+#[tokio::test]
+#[ignore = "needs Python with venv, and pymodbus: see REGRIND_PYTHON"]
 async fn our_driver_has_a_pymodbus_grinder_grind() {
     let python = python();
     // Long enough for a hold to come before its end on any computer.

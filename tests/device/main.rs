@@ -1,5 +1,6 @@
 //! The drivers, each against machines at the far end of its real wire.
 
+mod ahead;
 mod contract;
 mod exchange;
 mod interop;

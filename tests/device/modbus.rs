@@ -38,7 +38,7 @@ async fn serve(kind: Kind, points_a_second: f64, faults: Faults) -> Serving {
     Serving::tcp_with("127.0.0.1:0", vec![(1, machine)], faults).await.unwrap()
 }
 
-fn settings(serving: &Serving) -> ModbusSettings {
+pub fn settings(serving: &Serving) -> ModbusSettings {
     let port = serving.local_addr().unwrap().port();
     ModbusSettings {
         request_timeout: Duration::from_millis(300),
@@ -50,17 +50,17 @@ fn settings(serving: &Serving) -> ModbusSettings {
 }
 
 /// For what must go well at the first try: no stall of the computer is taken for a silent machine.
-fn patient(settings: ModbusSettings) -> ModbusSettings {
+pub fn patient(settings: ModbusSettings) -> ModbusSettings {
     ModbusSettings { request_timeout: Duration::from_secs(30), ..settings }
 }
 
-fn began(serving: &Serving) -> Vec<(u32, u32, u16)> {
+pub fn began(serving: &Serving) -> Vec<(u32, u32, u16)> {
     serving.machine(1).unwrap().with(|machine| machine.began())
 }
 
 // ---- what is sent -------------------------------------------------------------------------------------------------------------------
 
-fn plan(points: u32) -> Plan {
+pub fn plan(points: u32) -> Plan {
     let target = |index: u32| {
         let (x, y) = (f64::from(index % 40) * 0.5, f64::from(index / 40) * 0.5);
         let length = (1.0 + 0.01 * x * x).sqrt();
@@ -91,12 +91,12 @@ fn map_and_pass() -> (CorrectionMap, Pass) {
     (map, pass())
 }
 
-fn job_of(plan: &Plan, cycle: u16) -> Job {
+pub fn job_of(plan: &Plan, cycle: u16) -> Job {
     Job { job: 42, cycle, digest: digest(&[plan.identity()]) }
 }
 
 /// Every coordinate to the last bit: what the toy machine does is known.
-fn assert_exact(plan: &Plan, measured: &Measurement, hint: &str) {
+pub fn assert_exact(plan: &Plan, measured: &Measurement, hint: &str) {
     assert_eq!(measured.points.len(), plan.targets.len(), "{hint}");
     assert_eq!(measured.plan_identity, plan.identity(), "{hint}");
     for (target, point) in plan.targets.iter().zip(&measured.points) {
@@ -108,7 +108,7 @@ fn assert_exact(plan: &Plan, measured: &Measurement, hint: &str) {
 }
 
 /// A measuring machine that is connected, and its own.
-async fn claimed(settings: ModbusSettings) -> ModbusCmm {
+pub async fn claimed(settings: ModbusSettings) -> ModbusCmm {
     let mut cmm = connected(settings).await;
     cmm.claim().await.unwrap();
     cmm
@@ -120,7 +120,7 @@ async fn connected(settings: ModbusSettings) -> ModbusCmm {
     cmm
 }
 
-async fn reaches<M: Machine>(machine: &mut M, state: State) -> Result<(), DeviceError> {
+pub async fn reaches<M: Machine>(machine: &mut M, state: State) -> Result<(), DeviceError> {
     let began = Instant::now();
     loop {
         let status = machine.status().await?;
@@ -703,7 +703,7 @@ async fn a_frozen_application_behind_a_living_wire_is_found() {
 
 // ---- serial lines -------------------------------------------------------------------------------------------------------------------
 
-fn rtu(units: Vec<(u8, registers::Machine)>, line: SerialLine, faults: Faults) -> (Serving, ModbusSettings) {
+pub fn rtu(units: Vec<(u8, registers::Machine)>, line: SerialLine, faults: Faults) -> (Serving, ModbusSettings) {
     let serving = Serving::rtu(units, line, faults).unwrap();
     let device = serving.path().unwrap().to_string_lossy().into_owned();
     let wire = Line::Rtu { device, baud: line.baud, parity: Parity::None, stop_bits: 1 };
@@ -792,32 +792,4 @@ async fn a_hold_comes_before_the_next_page_of_whatever_is_being_transferred() {
     let refused = cmm.hold().await; // it is idle, so it says no, but it says so
     assert!(matches!(refused, Err(DeviceError::Refused { command: Command::Hold, .. })), "{refused:?}");
     assert_eq!(pages.load(Ordering::SeqCst), 31, "pages came after the hold was ordered");
-}
-
-/// The figure of docs/figures.md: run with `--ignored --nocapture`.
-#[tokio::test]
-#[ignore = "takes as long as a line of 115,200 baud takes, half a minute"]
-async fn eighteen_hundred_points_over_a_serial_line() {
-    let machine = toy(Kind::Cmm, AT_ONCE, MachineOptions::default());
-    let (_serving, settings) = rtu(vec![(1, machine)], SerialLine::paced(115_200), Faults::none());
-    let mut cmm = claimed(ModbusSettings { request_timeout: Duration::from_secs(2), ..settings }).await;
-    let (plan, calm) = (plan(1800), Interrupt::new());
-    let began = Instant::now();
-    cmm.load_plan(&plan, &calm).await.unwrap();
-    let loaded = began.elapsed();
-    let job = job_of(&plan, 1);
-    let armed = cmm.prepare(job).await.unwrap();
-    cmm.start(armed).await.unwrap();
-    reaches(&mut cmm, State::Complete).await.unwrap();
-    let began = Instant::now();
-    let measured = cmm.collect(job, &calm).await.unwrap();
-    let collected = began.elapsed();
-    assert_exact(&plan, &measured, "1,800 points");
-    let ms = |time: Duration| time.as_secs_f64() * 1e3 / 1800.0;
-    println!(
-        "plan {loaded:.1?} ({:.2} ms a point), points {collected:.1?} ({:.2} ms a point)",
-        ms(loaded),
-        ms(collected)
-    );
-    println!("{:?}", cmm.link().figures());
 }

@@ -26,17 +26,45 @@ pub struct Toy {
     done: u32,
     points_a_second: f64,
     moved_s: f64,
+    /// Gives its points in counts of a nanometre.
+    in_counts: bool,
+    /// Does not get further than so many.
+    most: u32,
 }
 
 impl Toy {
     /// A machine that measures, or works off thousandths of its path, at a speed.
     pub fn new(kind: Kind, points_a_second: f64) -> Self {
-        Self { kind, payloads: Payloads::default(), work: (0, 0), done: 0, points_a_second, moved_s: 0.0 }
+        Self {
+            kind,
+            payloads: Payloads::default(),
+            work: (0, 0),
+            done: 0,
+            points_a_second,
+            moved_s: 0.0,
+            in_counts: false,
+            most: u32::MAX,
+        }
+    }
+
+    /// The same machine with its points in counts of a nanometre.
+    pub fn in_counts(self) -> Self {
+        Self { in_counts: true, ..self }
+    }
+
+    /// The same machine, which does not get further than so many points.
+    pub fn up_to(self, most: u32) -> Self {
+        Self { most, ..self }
     }
 
     fn total(&self) -> u32 {
         let plan = self.payloads.plan.as_ref();
         plan.map_or(1000, |plan| ((plan.bytes.len() - 64) / 56) as u32)
+    }
+
+    /// Bytes of a point.
+    fn size(&self) -> usize {
+        if self.in_counts { 20 } else { 32 }
     }
 
     fn points(&self) -> Vec<u8> {
@@ -49,10 +77,30 @@ impl Toy {
             records.extend([0, 1, 0, 0]);
             for axis in 0..3 {
                 let centre_mm = real(at + 8 + 8 * axis) + radius_mm * real(at + 32 + 8 * axis);
-                records.extend(centre_mm.to_be_bytes());
+                match self.in_counts {
+                    true => records.extend(((centre_mm * 1e6).round() as i32).to_be_bytes()),
+                    false => records.extend(centre_mm.to_be_bytes()),
+                }
             }
         }
         records
+    }
+
+    /// What is in the outbox, with these records.
+    fn left(&self, bytes: Vec<u8>) -> body::Outcome {
+        let cmm = self.kind == Kind::Cmm;
+        let (format, scale_mm) = if self.in_counts { (2, 1e-6) } else { (1, 1.0) };
+        body::Outcome {
+            kind: if cmm { 4 } else { 5 },
+            format,
+            records: if cmm { (bytes.len() / self.size()) as u32 } else { 1 },
+            bytes,
+            coordinates: u16::from(cmm),
+            probe_radius_mm: if cmm { 2.0 } else { 0.0 },
+            scale_mm,
+            temperature_c: 20.5,
+            duration_s: self.moved_s,
+        }
     }
 
     fn record(&self, result: u16) -> Vec<u8> {
@@ -88,24 +136,21 @@ impl Body for Toy {
     fn advance(&mut self, seconds: f64) -> Progress {
         self.moved_s += seconds;
         let total = self.total();
-        self.done = ((self.moved_s * self.points_a_second) as u32).min(total);
+        self.done = ((self.moved_s * self.points_a_second) as u32).min(total).min(self.most);
         Progress { done: self.done, total, finished: self.done == total, fault: 0 }
     }
     fn retract(&mut self) {}
+    fn tells_so_far(&self) -> bool {
+        self.kind == Kind::Cmm
+    }
+    fn so_far(&self) -> Option<body::Outcome> {
+        let bytes = self.points().into_iter().take(self.size() * self.done as usize).collect();
+        (self.kind == Kind::Cmm).then(|| self.left(bytes))
+    }
     fn outcome(&mut self, result: u16) -> body::Outcome {
         let cmm = self.kind == Kind::Cmm;
         let bytes = if cmm { self.points() } else { self.record(result) };
-        body::Outcome {
-            kind: if cmm { 4 } else { 5 },
-            format: 1,
-            records: if cmm { self.total() } else { 1 },
-            bytes,
-            coordinates: u16::from(cmm),
-            probe_radius_mm: if cmm { 2.0 } else { 0.0 },
-            scale_mm: 1.0,
-            temperature_c: 20.5,
-            duration_s: self.moved_s,
-        }
+        self.left(bytes)
     }
     fn interlocks(&self) -> u16 {
         15

@@ -35,6 +35,7 @@ mod reports;
 mod results;
 #[path = "../common/rig.rs"]
 mod rig;
+mod so_far;
 mod study;
 #[path = "../common/through.rs"]
 mod through;

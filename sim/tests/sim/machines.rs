@@ -168,6 +168,64 @@ fn a_part_that_is_held_and_stopped_is_given_free() {
     grinder.command(Command::Start, Answer::Begun);
 }
 
+impl Desk {
+    fn outbox_page(&mut self, page: u32) -> Vec<u16> {
+        self.machine.write(460, &self.order.from_u32(page)).unwrap();
+        self.machine.read(462, 116).unwrap()
+    }
+}
+
+/// A measuring machine that has measured 15 of 35 points, or a few more.
+fn measuring(gives_ahead: bool, order: WordOrder) -> Desk {
+    let world = World::new(small_perfect()).unwrap();
+    let targets = plan(&world, &net([12.0, 8.0], 4.0));
+    let options = MachineOptions { gives_ahead, word_order: order, ..MachineOptions::default() };
+    let mut cmm = Desk::with(world.cmm(), options, vec![(1, targets.encode())]);
+    cmm.command(Command::Prepare, Answer::Accepted);
+    cmm.command(Command::Start, Answer::Accepted);
+    while cmm.u32(84) < 15 {
+        cmm.machine.tick(Duration::from_millis(5));
+    }
+    assert!(cmm.u32(84) < 21 && cmm.u32(86) == 35, "{}", cmm.u32(84));
+    cmm
+}
+
+#[test]
+fn full_pages_are_given_while_it_measures_and_stay_as_they_are() {
+    for order in [WordOrder::Big, WordOrder::Little] {
+        let mut cmm = measuring(true, order);
+        assert_eq!(cmm.machine.read(12, 1), Ok(vec![3]), "the flag");
+        let header = cmm.machine.read(400, 56).unwrap();
+        let so_far = cmm.u32(84);
+        assert_eq!((header[0], cmm.u32(402), cmm.u32(404), cmm.u32(406)), (4, 32 * so_far, 0, 12), "{order:?}");
+        assert_eq!((cmm.u32(410), cmm.u32(446)), (so_far, 0), "{order:?}");
+        let full = [0, 1].map(|page| cmm.outbox_page(page));
+        assert!(full.iter().all(|page| page[2] == 112), "{order:?}");
+        assert_eq!(cmm.outbox_page(2)[2], 0, "the page that is being filled");
+        cmm.command(Command::Hold, Answer::Accepted);
+        cmm.wait_for(State::Held);
+        assert_eq!([0, 1].map(|page| cmm.outbox_page(page)), full, "held");
+        cmm.command(Command::Stop, Answer::Accepted);
+        cmm.wait_for(State::Complete);
+        assert_eq!([0, 1].map(|page| cmm.outbox_page(page)), full, "stopped");
+        assert_eq!((cmm.u32(410), cmm.outbox_page(4)[2]), (35, 112), "with what was not reached");
+        let later = cmm.machine.read(400, 56).unwrap();
+        assert_eq!((&later[8..10], &later[12..20], &later[28..46]), (&header[8..10], &header[12..20], &header[28..46]));
+    }
+}
+
+#[test]
+fn a_machine_that_gives_all_at_the_end_or_was_aborted_shows_nothing() {
+    let mut old = measuring(false, WordOrder::Big);
+    assert_eq!(old.machine.read(12, 1), Ok(vec![1]));
+    assert_eq!((old.machine.read(400, 56).unwrap(), old.outbox_page(0)[2]), (vec![0; 56], 0));
+    let mut aborted = measuring(true, WordOrder::Big);
+    aborted.command(Command::Abort, Answer::Accepted);
+    assert_eq!((aborted.machine.read(400, 56).unwrap(), aborted.outbox_page(0)[2]), (vec![0; 56], 0));
+    aborted.wait_for(State::Aborted);
+    assert_eq!((aborted.machine.read(400, 56).unwrap(), aborted.outbox_page(0)[2]), (vec![0; 56], 0));
+}
+
 /// A grinder with its payloads in force.
 fn grinder(options: MachineOptions) -> Desk {
     let world = World::new(small_perfect()).unwrap();

@@ -430,9 +430,14 @@ impl Line {
 
     /// How long the longest request and the longest answer are on the line.
     fn transmission_at_most(&self) -> Duration {
+        self.transmission(2 * 256)
+    }
+
+    /// How long so many bytes are on the line; no time on TCP.
+    pub(super) fn transmission(&self, bytes: u32) -> Duration {
         match self {
             Self::Tcp { .. } => Duration::ZERO,
-            Self::Rtu { baud, .. } => Duration::from_secs_f64(2.0 * 256.0 * 11.0 / f64::from((*baud).max(1))),
+            Self::Rtu { baud, .. } => Duration::from_secs_f64(f64::from(bytes) * 11.0 / f64::from((*baud).max(1))),
         }
     }
 }

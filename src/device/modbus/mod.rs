@@ -5,6 +5,7 @@
 //! results come down in pages between two readings of their header. The one thing that is never repeated is START: its frame may be written
 //! again, with its number, and if that too does not tell, the outcome is unknown and stays so until the machine is asked.
 
+mod ahead;
 #[cfg(any(test, fuzzing))]
 mod any_registers;
 mod codec;
@@ -23,9 +24,10 @@ use tokio::time::{Instant, sleep};
 
 use super::{
     Answer, Armed, Cmm, Command, Coordinates, CorrectionMap, DeviceError, Fault, Grinder, Identity, Interrupt, Job,
-    Machine, MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, Reconciled, SignalValue, Started, State,
-    Status, digest,
+    Machine, MachineKind, Measurement, Outcome, Pass, PassRecord, Plan, Preliminary, Reconciled, SignalValue, Started,
+    State, Status, digest,
 };
+use ahead::{Ahead, Misses};
 #[cfg(fuzzing)]
 pub use any_registers::any_registers;
 use codec::{CommandFrame, Payload, RecordFlaw, crc32};
@@ -78,6 +80,11 @@ pub struct ModbusMachine {
     beaten: Option<Instant>,
     seen_beat: Option<(u16, Instant)>,
     loaded: BTreeMap<u16, Slot>,
+    /// The last look, for the one step ahead that may follow it.
+    seen: Option<Block>,
+    /// The pages of a result that were read while its job ran.
+    ahead: Option<Ahead>,
+    misses: Misses,
 }
 
 impl ModbusMachine {
@@ -105,6 +112,9 @@ impl ModbusMachine {
             beaten: None,
             seen_beat: None,
             loaded: BTreeMap::new(),
+            seen: None,
+            ahead: None,
+            misses: Misses::default(),
         }
     }
 
@@ -123,6 +133,7 @@ impl ModbusMachine {
         self.seen_beat = None;
         self.owned = false;
         self.loaded.clear();
+        self.ahead = None;
         let identity = self.unit.meet().await?;
         // Before the first write that means anything to a machine that may be another one.
         self.check_identity(&identity)?;
@@ -234,9 +245,11 @@ impl ModbusMachine {
     }
 
     async fn status(&mut self) -> Result<Status, DeviceError> {
+        self.seen = None;
         let block = self.look().await?;
         self.check_owner(&block)?;
-        let mut status = Status::from(block);
+        let mut status = Status::from(&block);
+        self.seen = Some(block);
         for k in 0..self.signals.len() {
             let reading = self.signal(k).await?;
             status.signals.push(reading);
@@ -398,6 +411,7 @@ impl ModbusMachine {
             return Err(DeviceError::Refused { machine: self.machine(), command, answer, state });
         }
         self.began = Some(start_sequence);
+        self.ahead = None;
         let (owner, epoch) = (self.owner, self.epoch);
         let frame = CommandFrame {
             sequence: start_sequence,
@@ -643,7 +657,9 @@ impl ModbusMachine {
                 return Err(DeviceError::Mismatch { machine: self.machine(), field, sent, held });
             }
             match self.fetch_once(job, kind, status.done, interrupt).await {
-                Ok((header, words)) => return Ok((status, header, words)),
+                Ok(Some((header, words))) => return Ok((status, header, words)),
+                // What was read ahead does not belong to it: now all of it is read.
+                Ok(None) => {}
                 Err(error) if !error.is_link() || tries >= self.retries => return Err(error),
                 Err(_) => tries += 1,
             }
@@ -656,13 +672,15 @@ impl ModbusMachine {
         kind: u16,
         done: u32,
         interrupt: &Interrupt,
-    ) -> Result<(Header, Vec<u16>), DeviceError> {
+    ) -> Result<Option<(Header, Vec<u16>)>, DeviceError> {
         let before = self.header_words().await?;
         let header = self.header(&before, job, kind, done)?;
         let total = (header.bytes / 2) as usize;
         let pages = total.div_ceil(PAGE) as u32;
         let mut words = Vec::with_capacity(total);
-        for page in 0..pages {
+        words.extend(self.kept(job, &header, done).into_iter().flatten());
+        let ahead = (words.len() / PAGE) as u32;
+        for page in ahead..pages {
             self.break_off(interrupt, "result", page, pages)?;
             self.beat().await?;
             let due = (total - words.len()).min(PAGE);
@@ -674,10 +692,14 @@ impl ModbusMachine {
             return Err(self.unit.distrust("header of a result (read twice)", expected, found).await);
         }
         let crc = crc32(&words);
+        if ahead > 0 && (crc != header.crc || self.kept(job, &header, done).is_none()) {
+            self.ahead = None;
+            return Ok(None);
+        }
         if crc != header.crc {
             return Err(self.unit.distrust("check number of a result", header.crc.into(), crc.into()).await);
         }
-        Ok((header, words))
+        Ok(Some((header, words)))
     }
 
     async fn header_words(&mut self) -> Result<Vec<u16>, DeviceError> {
@@ -751,6 +773,17 @@ impl ModbusMachine {
                 return Err(self.unit.distrust("number of a page", page.into(), found.into()).await);
             }
             sleep(Duration::from_millis(2)).await;
+        }
+    }
+
+    fn coordinates(&self, header: &Header) -> Result<Coordinates, DeviceError> {
+        match header.coordinates {
+            1 => Ok(Coordinates::Centres),
+            2 => Ok(Coordinates::Contacts),
+            other => {
+                let (field, found) = ("what its coordinates are", u32::from(other));
+                Err(DeviceError::Unlisted { machine: self.machine(), field, found })
+            }
         }
     }
 
@@ -830,6 +863,7 @@ impl From<Block> for Status {
 }
 
 /// The header of a result.
+#[derive(Debug, Clone)]
 struct Header {
     format: u16,
     bytes: u32,
@@ -1001,6 +1035,10 @@ impl Cmm for ModbusCmm {
         self.0.load(plan, interrupt).await
     }
 
+    async fn read_ahead(&mut self, job: Job, interrupt: &Interrupt) -> Option<Preliminary> {
+        self.0.read_ahead(job, interrupt).await
+    }
+
     async fn collect(&mut self, job: Job, interrupt: &Interrupt) -> Result<Measurement, DeviceError> {
         let machine = &mut self.0;
         let (status, header, words) = machine.fetch(job, 4, interrupt).await?;
@@ -1013,14 +1051,7 @@ impl Cmm for ModbusCmm {
             let targets = (u64::from(slot.bytes) - 64) / 56;
             machine.count("points of the measurement", targets, header.records.into())?;
         }
-        let coordinates = match header.coordinates {
-            1 => Coordinates::Centres,
-            2 => Coordinates::Contacts,
-            other => {
-                let (field, found) = ("what its coordinates are", u32::from(other));
-                return Err(DeviceError::Unlisted { machine: machine.machine(), field, found });
-            }
-        };
+        let coordinates = machine.coordinates(&header)?;
         let points = words.chunks_exact(header.registers).map(|record| {
             let record = machine.unit.registers(record);
             codec::point(record, header.format, header.scale_mm).map_err(|flaw| machine.flawed(flaw))

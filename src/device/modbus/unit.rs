@@ -19,6 +19,9 @@ const MAGIC: [u16; 2] = [0x5247, 0x4431];
 const VERSION: u16 = 2;
 /// Registers of the identity block.
 const IDENTITY_REGISTERS: u16 = 32;
+/// The flags of an identity block.
+const SIMULATION: u16 = 1;
+const GIVES_AHEAD: u16 = 2;
 /// A machine that says it is busy is asked again after this.
 const BUSY_PAUSE: Duration = Duration::from_millis(50);
 /// The sentinels that prove the order of words.
@@ -38,6 +41,8 @@ pub(super) struct Unit {
     /// The generation of the line on which the machine was proved.
     trusted: Option<u64>,
     identity: Option<Identity>,
+    /// The flags of its identity.
+    flags: u16,
 }
 
 /// What a unit is told about its machine.
@@ -52,12 +57,22 @@ impl Unit {
     pub(super) fn new(kind: MachineKind, link: Link, settings: UnitSettings) -> Self {
         let UnitSettings { unit, map, retries, lost_after } = settings;
         let name = format!("{kind} at {}, unit {unit}", link.line()).into();
-        Self { name, link, map, unit, kind, retries, lost_after, trusted: None, identity: None }
+        Self { name, link, map, unit, kind, retries, lost_after, trusted: None, identity: None, flags: 0 }
     }
 
     /// Who was proved to be there.
     pub(super) fn identity(&self) -> Option<&Identity> {
         self.identity.as_ref()
+    }
+
+    /// Whether it says that it gives full pages of a result while its job still runs.
+    pub(super) fn gives_ahead(&self) -> bool {
+        self.identity.is_some() && self.flags & GIVES_AHEAD != 0
+    }
+
+    /// The generation of the line on which the machine was proved, while that line stands as far as is known here.
+    pub(super) fn generation(&self) -> Option<u64> {
+        self.trusted
     }
 
     pub(super) fn registers<'a>(&self, words: &'a [u16]) -> Registers<'a> {
@@ -91,6 +106,15 @@ impl Unit {
     /// Writes registers, on a proved connection only. May be carried out more than once.
     pub(super) async fn write(&mut self, what: &'static str, address: u16, words: &[u16]) -> Result<(), DeviceError> {
         self.exchange(what, address, Ask::Write { address, words: words.into() }).await.map(drop)
+    }
+
+    /// Asks once, on the proved connection that there is: for what may fail, and is then done without.
+    pub(super) async fn once(&mut self, what: &'static str, address: u16, ask: Ask) -> Result<Vec<u16>, DeviceError> {
+        let Some(generation) = self.trusted else {
+            return Err(DeviceError::NotConnected { machine: self.name.clone(), what });
+        };
+        let answer = self.link.ask(self.unit, Some(generation), ask).await;
+        answer.map(|(_, words)| words).map_err(|fault| self.failed(what, address, fault))
     }
 
     /// Gives the connection up because something that came over it does not hold, and says what.
@@ -181,6 +205,7 @@ impl Unit {
             }
             _ => {
                 self.identity = Some(identity);
+                self.flags = words[12];
                 Ok(generation)
             }
         }
@@ -246,7 +271,7 @@ impl Unit {
             kind,
             name: block.text(16, 16),
             boot_id: block.u32(10),
-            simulation: words[12] & 1 == 1,
+            simulation: words[12] & SIMULATION != 0,
             silence_limit_s: Some(f64::from(silence_ms) / 1e3),
         })
     }

@@ -64,6 +64,8 @@ class Machine:
     seconds = 0.2
     # The file that stands for the part, where the machines work on one.
     part = None
+    # Whether full pages of the result can be read while the job runs, and how long a record is.
+    ahead, record_bytes = False, 32
 
     def __init__(self):
         self.boot_id = random.randint(1, 0xFFFFFFFF)
@@ -128,7 +130,7 @@ class Machine:
             registers[at : at + len(words)] = words
 
         identity = struct.pack(">4HId", 0x5247, 0x4431, 2, self.kind, 0x12345678, -2.5e-7)
-        put(0, identity + struct.pack(">I4H", self.boot_id, 1, 1, 0, 0) + self.name.encode("ascii").ljust(32, b"\0"))
+        put(0, identity + struct.pack(">I4H", self.boot_id, 1 | self.ahead << 1, 1, 0, 0) + self.name.encode("ascii").ljust(32, b"\0"))
         registers[34], registers[35] = registers[32] ^ 0xFFFF, registers[33] ^ 0xFFFF
         put(64, self.status(self.beaten))
         put(120, b"".join(self.slot(kind) for kind in (1, 2, 3)))
@@ -140,7 +142,7 @@ class Machine:
         put(462, self.outbox_page(registers[460] << 16 | registers[461]))
 
     def status(self, echo):
-        progress = int(self.total() * min(1.0, self.moved / self.seconds)) if self.job[0] else 0
+        progress = self.progress() if self.job[0] else 0
         beat = int(time.monotonic() * 10) & 0xFFFF
         last_job, last_cycle = self.begun[-1] if self.begun else (0, 0)
         job, cycle, digest = self.job
@@ -186,17 +188,34 @@ class Machine:
                 self.slots[kind] = (self.received, identity)
         return True
 
+    def progress(self):
+        return int(self.total() * min(1.0, self.moved / self.seconds))
+
+    def so_far(self):
+        """Of a job that runs the records that there are, which will not change; none for a machine that gives all at the end."""
+        if not self.ahead or self.state not in (EXECUTE, HELD):
+            return None
+        kind, form, data, *rest = self.work()
+        return kind, form, data[: self.progress() * self.record_bytes], *rest
+
     def outbox_header(self):
-        if self.state != COMPLETE or self.outbox is None:
+        ended = self.state == COMPLETE
+        outbox = self.outbox if ended else self.so_far()
+        if outbox is None:
             return bytes(112)
-        kind, form, data, records, coordinates, radius, identity = self.outbox
+        kind, form, data, records, coordinates, radius, identity = outbox
         job, cycle, _ = self.job
-        head = struct.pack(">HHIIIHHI", kind, form, len(data), binascii.crc32(data), job, cycle, coordinates, records)
+        crc = binascii.crc32(data) if ended else 0
+        records = records if ended else self.progress()
+        head = struct.pack(">HHIIIHHI", kind, form, len(data), crc, job, cycle, coordinates, records)
         head += struct.pack(">ddddHH", radius, 1.0, 20.0, self.duration_s(), 1, 0) + identity
-        return head + struct.pack(">I16x", self.done)
+        return head + struct.pack(">I16x", self.done if ended else 0)
 
     def outbox_page(self, number):
-        data = self.outbox[2][number * PAGE_BYTES : (number + 1) * PAGE_BYTES] if self.state == COMPLETE and self.outbox else b""
+        outbox = self.outbox if self.state == COMPLETE else self.so_far()
+        data = outbox[2][number * PAGE_BYTES : (number + 1) * PAGE_BYTES] if outbox else b""
+        if self.state != COMPLETE and len(data) < PAGE_BYTES:
+            data = b""
         return (struct.pack(">IHH", number, len(data) // 2, 0) + data).ljust(232, b"\0")
 
     # Beats: only those of the owner count.
@@ -299,8 +318,9 @@ def serve(machine):
     arguments.add_argument("--unit", type=int, default=1)
     arguments.add_argument("--part", type=pathlib.Path, help="file that stands for the part (part.py)")
     arguments.add_argument("--seconds", type=float, default=machine.seconds, help="how long a job takes")
+    arguments.add_argument("--ahead", action="store_true", help="gives full pages of the result while the job runs (a CMM)")
     given = arguments.parse_args()
-    machine.part, machine.seconds = given.part, given.seconds
+    machine.part, machine.seconds, machine.ahead = given.part, given.seconds, given.ahead
 
     async def main():
         registers = SimData(0, values=[0] * 578, datatype=DataType.REGISTERS)

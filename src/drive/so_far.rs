@@ -1,0 +1,133 @@
+//! What the points say that a CMM gives while it still measures: for people to look at. No gate has seen them, nothing is registered, and
+//! nothing is judged or recorded by them.
+
+use regrind_control::SoFar;
+
+use crate::device::{Coordinates, Job, MeasuredPoint, Plan, PointStatus, Preliminary, TargetKind};
+
+/// The touches of the part that have come of a job, summed up.
+#[derive(Debug, Default)]
+pub(super) struct Touching {
+    job: Option<Job>,
+    came: usize,
+    /// Deviations of what was touched of the part.
+    touched: u32,
+    square_sum_mm2: f64,
+    range_mm: Option<[f64; 2]>,
+}
+
+impl Touching {
+    /// Takes points that are new. Those that do not follow on what came before, or are not of the plan, make all that came nothing.
+    pub(super) fn take(&mut self, plan: &Plan, preliminary: &Preliminary) {
+        let Preliminary { job, from, points, coordinates } = preliminary;
+        if *from == 0 {
+            *self = Self { job: Some(*job), ..Self::default() };
+        }
+        let due = plan.targets.get(*from..from.saturating_add(points.len())).unwrap_or_default();
+        let fits =
+            points.len() == due.len() && points.iter().zip(due).all(|(point, target)| point.index == target.index);
+        if self.job != Some(*job) || self.came != *from || !fits {
+            return self.forget();
+        }
+        self.came += points.len();
+        let part = points.iter().zip(due).filter(|(_, target)| target.what == TargetKind::Part);
+        for (point, target) in part.filter(|(point, _)| point.status == PointStatus::Touched) {
+            let ball_mm = if *coordinates == Coordinates::Centres { plan.probe_radius_mm } else { 0.0 };
+            self.add(deviation_mm(point, &target.point_mm, &target.normal, ball_mm));
+        }
+    }
+
+    fn add(&mut self, mm: f64) {
+        let [least, most] = self.range_mm.unwrap_or([mm, mm]);
+        self.range_mm = Some([least.min(mm), most.max(mm)]);
+        self.square_sum_mm2 += mm * mm;
+        self.touched += 1;
+    }
+
+    pub(super) fn forget(&mut self) {
+        *self = Self::default();
+    }
+
+    /// Returns what is shown of it; nothing before the part was touched.
+    pub(super) fn so_far(&self) -> Option<SoFar> {
+        let [least, most] = self.range_mm?;
+        let rms_um = 1e3 * (self.square_sum_mm2 / f64::from(self.touched)).sqrt();
+        Some(SoFar { touched: self.touched, rms_um, least_um: 1e3 * least, most_um: 1e3 * most })
+    }
+}
+
+/// How far a touch lies from where the plan has it, along the normal: the part's error and its place in one.
+fn deviation_mm(point: &MeasuredPoint, target_mm: &[f64; 3], normal: &[f64; 3], ball_mm: f64) -> f64 {
+    (0..3).map(|k| (point.at_mm[k] - target_mm[k]) * normal[k]).sum::<f64>() - ball_mm
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::device::Target;
+
+    const JOB: Job = Job { job: 1, cycle: 1, digest: 7 };
+
+    fn plan() -> Plan {
+        let target = |index: u32| Target {
+            index,
+            what: if index == 0 { TargetKind::ReferenceSphere } else { TargetKind::Part },
+            point_mm: [f64::from(index), 0.0, 5.0],
+            normal: [0.6, 0.0, 0.8],
+        };
+        Plan {
+            targets: (0..6).map(target).collect(),
+            probe_radius_mm: 2.0,
+            approach_mm: 1.0,
+            search_mm: 1.0,
+            speed_mm_s: 2.0,
+            safe_height_mm: 20.0,
+            careful: None,
+        }
+    }
+
+    /// Centres that stand proud of the plan by so much, and each a little aside, which is no deviation.
+    fn centres(from: u32, proud_mm: &[f64]) -> Preliminary {
+        let point = |(index, proud): (u32, &f64)| MeasuredPoint {
+            index,
+            status: PointStatus::Touched,
+            quality: 0,
+            at_mm: [f64::from(index) + (2.0 + proud) * 0.6 + 0.8, 0.3, 5.0 + (2.0 + proud) * 0.8 - 0.6],
+        };
+        let points = (from..).zip(proud_mm).map(point).collect();
+        Preliminary { job: JOB, from: from as usize, points, coordinates: Coordinates::Centres }
+    }
+
+    #[test]
+    fn what_came_is_told_along_the_normals_without_the_sphere_and_what_was_not_touched() {
+        let mut touching = Touching::default();
+        assert_eq!(touching.so_far(), None);
+        touching.take(&plan(), &centres(0, &[0.5, 0.003]));
+        let mut rest = centres(2, &[-0.004, 9.0]);
+        rest.points[1].status = PointStatus::NotFound;
+        touching.take(&plan(), &rest);
+        let told = touching.so_far().unwrap();
+        assert_eq!(told.touched, 2);
+        let near = |found: f64, is: f64| (found - is).abs() < 1e-9;
+        assert!(near(told.least_um, -4.0) && near(told.most_um, 3.0) && near(told.rms_um, 12.5_f64.sqrt()), "{told:?}");
+    }
+
+    #[test]
+    fn what_does_not_follow_or_is_of_another_plan_makes_it_nothing() {
+        for wrong in [
+            centres(3, &[0.001]),
+            Preliminary { job: Job { job: 2, ..JOB }, ..centres(2, &[0.001]) },
+            Preliminary { from: 2, ..centres(3, &[0.001]) },
+            Preliminary { from: usize::MAX - 1, ..centres(3, &[0.001]) },
+            centres(2, &[0.001; 9]),
+        ] {
+            let mut touching = Touching::default();
+            touching.take(&plan(), &centres(0, &[0.5, 0.003]));
+            touching.take(&plan(), &wrong);
+            assert_eq!(touching.so_far(), None, "{wrong:?}");
+            // Told from the beginning it is believed again.
+            touching.take(&plan(), &centres(0, &[0.5, 0.003]));
+            assert_eq!(touching.so_far().map(|told| told.touched), Some(1));
+        }
+    }
+}

@@ -1,0 +1,356 @@
+//! Pages of a result that come while its job still runs: a machine that gives them, one that does not, and some that lie. The machine
+//! measures when a test says so, and stands otherwise.
+
+#![cfg(unix)]
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use regrind::device::{
+    Cmm, DeviceError, Interrupt, Machine, MeasuredPoint, Measurement, ModbusCmm, ModbusSettings, Plan, Preliminary,
+    State,
+};
+use regrind_sim::body::Kind;
+use regrind_sim::command::State as At;
+use regrind_sim::options::MachineOptions;
+use regrind_sim::wire::Serving;
+use regrind_sim::wire::faults::{Fault, FaultPlan, Faults, Request, When};
+use regrind_sim::wire::rtu::Line as SerialLine;
+use regrind_sim::{registers, words};
+
+use crate::modbus::{assert_exact, began, claimed, job_of, patient, plan, reaches, rtu, settings};
+use crate::toy::Toy;
+
+const HEADER: u16 = 400;
+const SELECT: u16 = 460;
+const PAGE: u16 = 462;
+/// Points of a full page.
+const FULL: usize = 7;
+const POINTS: u32 = 200;
+/// Pages of the whole result.
+const PAGES: u64 = 29;
+
+fn machine(toy: Toy, gives_ahead: bool) -> registers::Machine {
+    let options = MachineOptions { speed: 0.0, gives_ahead, ..MachineOptions::default() };
+    registers::Machine::new(Box::new(toy), 0xb007, options)
+}
+
+fn toy() -> Toy {
+    Toy::new(Kind::Cmm, 1000.0)
+}
+
+async fn serve(toy: Toy, gives_ahead: bool) -> Serving {
+    Serving::tcp_with("127.0.0.1:0", vec![(1, machine(toy, gives_ahead))], Faults::none()).await.unwrap()
+}
+
+/// Has the machine measure a thousand points a second for so long.
+fn work(serving: &Serving, ms: u64) {
+    serving.machine(1).unwrap().with(|machine| {
+        machine.set_speed(1.0);
+        machine.tick(Duration::from_millis(ms));
+        machine.set_speed(0.0);
+    });
+}
+
+/// Has a job begun.
+async fn begun(settings: ModbusSettings, plan: &Plan) -> ModbusCmm {
+    let mut cmm = claimed(settings).await;
+    cmm.load_plan(plan, &Interrupt::new()).await.unwrap();
+    let armed = cmm.prepare(job_of(plan, 1)).await.unwrap();
+    cmm.start(armed).await.unwrap();
+    cmm
+}
+
+/// Has a job begun, and about half of it measured: more than 14 pages, fewer than 15.
+async fn half_done(serving: &Serving, settings: ModbusSettings, plan: &Plan) -> ModbusCmm {
+    let cmm = begun(settings, plan).await;
+    work(serving, 102);
+    cmm
+}
+
+/// Looks so many times, and takes one step ahead after each.
+async fn look(cmm: &mut ModbusCmm, plan: &Plan, cycle: u16, looks: usize) -> Vec<Preliminary> {
+    let mut told = Vec::new();
+    for _ in 0..looks {
+        cmm.status().await.unwrap();
+        told.extend(cmm.read_ahead(job_of(plan, cycle), &Interrupt::new()).await);
+    }
+    told
+}
+
+async fn finish(serving: &Serving, cmm: &mut ModbusCmm, plan: &Plan) -> Result<Measurement, DeviceError> {
+    work(serving, 200);
+    reaches(cmm, State::Complete).await?;
+    cmm.collect(job_of(plan, 1), &Interrupt::new()).await
+}
+
+/// Requests that read or write at an address first, counted from now on.
+fn counted(serving: &Serving, rules: FaultPlan, at: u16) -> Arc<AtomicU64> {
+    let count = Arc::new(AtomicU64::new(0));
+    let counter = Arc::clone(&count);
+    let look = move |request: &Request| {
+        counter.fetch_add(u64::from(request.address == at), Ordering::SeqCst);
+        false
+    };
+    serving.faults().set(rules.always(When::Matching(Box::new(look)), Fault::DropReply));
+    count
+}
+
+fn of(count: &AtomicU64) -> u64 {
+    count.load(Ordering::SeqCst)
+}
+
+/// Requests at an address while the job runs.
+fn early(at: u16) -> When {
+    When::Matching(Box::new(move |request| request.address == at && request.state == Some(At::Execute)))
+}
+
+fn points(told: &[Preliminary]) -> Vec<MeasuredPoint> {
+    told.iter().flat_map(|told| told.points.clone()).collect()
+}
+
+#[tokio::test]
+async fn what_came_while_it_measured_is_not_read_again_and_the_points_are_those_of_an_old_machine() {
+    let plan = plan(POINTS);
+    let mut both = Vec::new();
+    for (gives_ahead, came) in [(true, 14), (false, 0)] {
+        let serving = serve(toy(), gives_ahead).await;
+        let mut cmm = half_done(&serving, patient(settings(&serving)), &plan).await;
+        let early = counted(&serving, FaultPlan::new(0), PAGE);
+        let told = look(&mut cmm, &plan, 1, 20).await;
+        // A page that is not full is asked for by nobody.
+        assert_eq!(of(&early), came);
+        assert!(told.iter().enumerate().all(|(k, told)| told.from == FULL * k), "{told:?}");
+        let late = counted(&serving, FaultPlan::new(0), PAGE);
+        let measured = finish(&serving, &mut cmm, &plan).await.unwrap();
+        assert_eq!(of(&late), PAGES - came);
+        assert_exact(&plan, &measured, "read ahead");
+        assert_eq!(points(&told), measured.points[..FULL * came as usize]);
+        assert_eq!(cmm.collect(job_of(&plan, 1), &Interrupt::new()).await.unwrap(), measured, "read twice");
+        both.push(measured);
+    }
+    assert_eq!(both[0], both[1]);
+}
+
+#[tokio::test]
+async fn records_that_lie_across_pages_and_low_words_first_come_whole() {
+    let plan = plan(POINTS);
+    let options = MachineOptions { speed: 0.0, word_order: words::WordOrder::Little, ..MachineOptions::default() };
+    let machine = registers::Machine::new(Box::new(toy().in_counts()), 0xb007, options);
+    let serving = Serving::tcp("127.0.0.1:0", vec![(1, machine)]).await.unwrap();
+    let mut settings = patient(settings(&serving));
+    settings.registers.word_order = regrind::device::WordOrder::Little;
+    let mut cmm = half_done(&serving, settings, &plan).await;
+    let told = look(&mut cmm, &plan, 1, 20).await;
+    let measured = finish(&serving, &mut cmm, &plan).await.unwrap();
+    // Nine full pages of 112 registers, ten to a record.
+    assert_eq!(points(&told), measured.points[..100]);
+    assert!(told.iter().map(|told| told.points.len()).all(|new| new == 11 || new == 12), "{told:?}");
+    assert_eq!(measured.points.len(), POINTS as usize);
+}
+
+/// What a machine says ahead that is not so, and what goes wrong on the way: where it is said, and what.
+fn lies() -> Vec<(u16, Fault)> {
+    let lie = |register, value| Fault::Lie(vec![(register, value)]);
+    let mut all = vec![
+        (HEADER, lie(0, 5)),                                                  // another kind
+        (HEADER, lie(1, 3)),                                                  // a format that is none
+        (HEADER, lie(1, 2)),                                                  // a format with other bytes
+        (HEADER, lie(7, 43)),                                                 // another job
+        (HEADER, lie(8, 2)),                                                  // another cycle
+        (HEADER, lie(9, 2)),                                                  // contacts, and centres in the end
+        (HEADER, lie(9, 7)),                                                  // neither
+        (HEADER, Fault::Lie(vec![(2, 0), (3, 64_000), (10, 0), (11, 2000)])), // more than there is
+        (HEADER, lie(12, 0x4010)),                                            // another probe
+        (HEADER, lie(16, 0x7ff8)),                                            // a scale that is no number
+        (HEADER, lie(28, 2)),                                                 // inches
+        (HEADER, lie(30, 0xdead)),                                            // another plan
+        (HEADER, lie(47, 4)),                                                 // the number of an end
+        (PAGE, lie(1, 9)),                                                    // another page
+        (PAGE, lie(2, 5)),                                                    // a page that is not full
+        (PAGE, lie(2, 0)),                                                    // not full yet
+        (PAGE, lie(6, 9)),                                                    // a status that is none
+        (PAGE, lie(8, 0x7ff8)),                                               // a coordinate that is no number
+        (PAGE, lie(8, 0x4044)),                                               // another coordinate
+        (PAGE, Fault::FlipData),
+        (PAGE, Fault::Fewer),
+        (PAGE, Fault::WordSwap),
+    ];
+    all.extend([
+        (HEADER, Fault::Disconnect(5)),
+        (SELECT, Fault::DropRequest),
+        (PAGE, Fault::DropReply),
+        (PAGE, Fault::FlipCrc),
+    ]);
+    all.extend([HEADER, SELECT, PAGE].into_iter().flat_map(|at| [2, 6].map(|code| (at, Fault::Exception(code)))));
+    all
+}
+
+#[tokio::test]
+async fn whatever_is_said_ahead_the_points_are_right_in_the_end() {
+    let plan = plan(POINTS);
+    for (at, fault) in lies() {
+        for always in [false, true] {
+            let hint = format!("{at}: {fault:?}, always: {always}");
+            let serving = serve(toy(), true).await;
+            let settings = ModbusSettings { request_timeout: Duration::from_millis(100), ..settings(&serving) };
+            let mut cmm = half_done(&serving, settings, &plan).await;
+            let rules = FaultPlan::new(1);
+            serving.faults().set(match always {
+                true => rules.always(early(at), fault.clone()),
+                false => rules.times(if at == HEADER { 1 } else { 2 }, 1, early(at), fault.clone()),
+            });
+            // No look fails by it: what goes wrong ahead is given up, and soon.
+            look(&mut cmm, &plan, 1, 8).await;
+            let measured = finish(&serving, &mut cmm, &plan).await;
+            assert_exact(&plan, &measured.unwrap_or_else(|error| panic!("{hint}: {error}")), &hint);
+            assert_eq!(began(&serving).len(), 1, "{hint}");
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_machine_that_refuses_is_asked_once_and_one_that_does_not_answer_three_times() {
+    let plan = plan(POINTS);
+    for (fault, times) in [(Fault::Exception(2), 1), (Fault::Disconnect(0), 3)] {
+        let serving = serve(toy(), true).await;
+        let mut cmm = half_done(&serving, patient(settings(&serving)), &plan).await;
+        serving.faults().set(FaultPlan::new(1).always(early(HEADER), fault.clone()));
+        assert!(look(&mut cmm, &plan, 1, 8).await.is_empty());
+        assert_eq!(serving.faults().fired().len(), times, "{fault:?}");
+        // Another START is another job: it is asked anew.
+        serving.faults().set(FaultPlan::new(1));
+        cmm.stop().await.unwrap();
+        reaches(&mut cmm, State::Complete).await.unwrap();
+        let done = cmm.status().await.unwrap().done;
+        cmm.acknowledge(done).await.unwrap();
+        let armed = cmm.prepare(job_of(&plan, 2)).await.unwrap();
+        cmm.start(armed).await.unwrap();
+        work(&serving, 20);
+        assert_eq!(look(&mut cmm, &plan, 2, 5).await.len(), 2, "{fault:?}");
+    }
+}
+
+#[tokio::test]
+async fn nothing_that_was_kept_outlives_its_line_or_its_job() {
+    let plan = plan(POINTS);
+    for reconnects in [false, true] {
+        let serving = serve(toy(), true).await;
+        let mut cmm = half_done(&serving, settings(&serving), &plan).await;
+        // A page that is kept with a bit turned, which only the line it came on keeps from being used.
+        serving.faults().set(FaultPlan::new(0).once(early(PAGE), Fault::FlipData));
+        assert_eq!(points(&look(&mut cmm, &plan, 1, 9).await).len(), 8 * FULL);
+        serving.faults().set(FaultPlan::new(0).once(When::Reading(64), Fault::Disconnect(3)));
+        match reconnects {
+            true => drop(cmm.connect().await.unwrap()),
+            false => drop(cmm.status().await.unwrap()),
+        }
+        cmm.claim().await.unwrap();
+        let again = look(&mut cmm, &plan, 1, 3).await;
+        assert_eq!(again.iter().map(|told| told.from).collect::<Vec<_>>(), [0, FULL], "it begins anew");
+        let late = counted(&serving, FaultPlan::new(0), PAGE);
+        assert_exact(&plan, &finish(&serving, &mut cmm, &plan).await.unwrap(), "another line");
+        assert_eq!(of(&late), PAGES - 2, "read once");
+    }
+}
+
+#[tokio::test]
+async fn a_page_that_changes_after_all_has_everything_read_anew() {
+    let plan = plan(POINTS);
+    let serving = serve(toy(), true).await;
+    let mut cmm = half_done(&serving, settings(&serving), &plan).await;
+    serving.faults().set(FaultPlan::new(0).once(early(PAGE), Fault::FlipData));
+    look(&mut cmm, &plan, 1, 20).await;
+    let late = counted(&serving, FaultPlan::new(0), PAGE);
+    assert_exact(&plan, &finish(&serving, &mut cmm, &plan).await.unwrap(), "a page that changed");
+    assert_eq!(of(&late), PAGES - 14 + PAGES);
+    // Where the result itself is broken it stays an error, as ever.
+    serving.faults().set(FaultPlan::new(0).always(When::Reading(PAGE), Fault::FlipData));
+    let broken = cmm.collect(job_of(&plan, 1), &Interrupt::new()).await;
+    assert!(matches!(broken, Err(DeviceError::Corrupt { what: "check number of a result", .. })), "{broken:?}");
+}
+
+#[tokio::test]
+async fn one_step_follows_a_look_and_none_an_order() {
+    let plan = plan(POINTS);
+    let serving = serve(toy(), true).await;
+    let mut cmm = half_done(&serving, patient(settings(&serving)), &plan).await;
+    let (job, calm, raised) = (job_of(&plan, 1), Interrupt::new(), Interrupt::new());
+    raised.raise();
+    let requests = |serving: &Serving| serving.faults().requests();
+    cmm.status().await.unwrap();
+    let before = requests(&serving);
+    assert_eq!(cmm.read_ahead(job, &raised).await, None);
+    assert_eq!(cmm.read_ahead(job, &calm).await, None);
+    assert_eq!(requests(&serving), before, "an order was on its way, and the look is used up");
+    // The header, then a page a look.
+    look(&mut cmm, &plan, 1, 2).await;
+    cmm.status().await.unwrap();
+    let before = requests(&serving);
+    assert_eq!(cmm.read_ahead(job, &calm).await.unwrap().from, FULL);
+    assert_eq!(cmm.read_ahead(job, &calm).await, None);
+    assert_eq!(requests(&serving), before + 2);
+    // An order that comes with the select goes before the page.
+    let (raiser, flag) = (calm.clone(), calm.clone());
+    let raise = When::Matching(Box::new(move |request| {
+        if request.address == SELECT {
+            raiser.raise();
+        }
+        false
+    }));
+    let pages = counted(&serving, FaultPlan::new(0).always(raise, Fault::DropReply), PAGE);
+    cmm.status().await.unwrap();
+    assert_eq!(cmm.read_ahead(job, &flag).await, None);
+    assert_eq!(of(&pages), 0);
+    cmm.hold().await.unwrap();
+    reaches(&mut cmm, State::Held).await.unwrap();
+    // What was measured can be read on while it is held, and nothing after an abort.
+    assert_eq!(look(&mut cmm, &plan, 1, 1).await[0].from, 2 * FULL);
+    cmm.abort().await.unwrap();
+    reaches(&mut cmm, State::Aborted).await.unwrap();
+    let none = counted(&serving, FaultPlan::new(0), PAGE);
+    assert!(look(&mut cmm, &plan, 1, 3).await.is_empty());
+    assert_eq!(of(&none), 0);
+}
+
+#[tokio::test]
+async fn on_a_line_on_which_an_order_would_wait_nothing_is_read_ahead() {
+    let plan = plan(40);
+    for (baud, told) in [(19_200, 0), (38_400, 2)] {
+        let (serving, settings) = rtu(vec![(1, machine(toy(), true))], SerialLine::unpaced(baud), Faults::none());
+        let mut cmm = begun(patient(settings), &plan).await;
+        work(&serving, 20);
+        assert_eq!(look(&mut cmm, &plan, 1, 4).await.len(), told, "{baud}");
+    }
+}
+
+/// The figure of docs/figures.md: run with `--ignored --nocapture`.
+#[tokio::test]
+#[ignore = "takes as long as a line of 115,200 baud takes and as 1,800 points at 50 a second, two minutes"]
+async fn eighteen_hundred_points_over_a_serial_line() {
+    let plan = plan(1800);
+    for gives_ahead in [false, true] {
+        let options = MachineOptions { gives_ahead, ..MachineOptions::default() };
+        let machine = registers::Machine::new(Box::new(Toy::new(Kind::Cmm, 50.0)), 0xb007, options);
+        let (_serving, settings) = rtu(vec![(1, machine)], SerialLine::paced(115_200), Faults::none());
+        let settings = ModbusSettings { request_timeout: Duration::from_secs(2), ..settings };
+        let at_first = Instant::now();
+        let mut cmm = begun(settings, &plan).await;
+        let loaded = at_first.elapsed();
+        let mut came = 0;
+        while cmm.status().await.unwrap().state != State::Complete {
+            let told = cmm.read_ahead(job_of(&plan, 1), &Interrupt::new()).await;
+            came += told.map_or(0, |told| told.points.len());
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+        let ended = Instant::now();
+        let measured = cmm.collect(job_of(&plan, 1), &Interrupt::new()).await.unwrap();
+        let collected = ended.elapsed();
+        assert_exact(&plan, &measured, "1,800 points");
+        println!(
+            "gives ahead: {gives_ahead}; plan {loaded:.1?}; {came} points ahead; the whole result {collected:.2?} after the end"
+        );
+        println!("{:?}", cmm.link().figures());
+    }
+}

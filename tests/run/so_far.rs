@@ -1,0 +1,68 @@
+//! What a run shows of a measurement that still goes on: it is to be seen, and nothing hangs on it.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use crate::rig::{CMM, PATIENCE, Ready, Rig, order, small, until};
+use regrind::cell::Ending;
+use regrind::drive::{Drive, Request, Snapshot, SoFar};
+use regrind_sim::registers::Machine;
+
+fn cmm(rig: &Rig, what: impl FnOnce(&mut Machine)) {
+    rig.servings[CMM].machines()[0].1.with(what);
+}
+
+/// Asks until the snapshot will do.
+async fn seen<T>(folder: &Path, what: impl Fn(&Snapshot) -> Option<T>) -> T {
+    let began = Instant::now();
+    loop {
+        let status = order(folder, Request::Status).await.0.status;
+        if let Some(found) = what(&status) {
+            return found;
+        }
+        assert!(began.elapsed() < PATIENCE, "{status:?}");
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn touches_are_shown_while_they_are_measured_and_are_gone_with_the_end() {
+    let mut rig = Rig::new(small(12, 8, 5000.0)).await;
+    // The CMM measures when the test says so.
+    cmm(&rig, |machine| machine.set_speed(0.0));
+    let Ready { run, cmm: driver, grinder, folder, .. } = rig.next(true);
+    let (drive, orders) = Drive::new(run, driver, grinder).unwrap();
+    let running = tokio::spawn(drive.run());
+    until(&folder, |words| words.starts_with("Execute (Measure, Run)")).await;
+    assert_eq!(orders.status().borrow().so_far, None);
+    let half = |machine: &mut Machine| {
+        let progress = |machine: &mut Machine| machine.read(84, 4).unwrap()[1];
+        machine.set_speed(100.0);
+        while progress(machine) < 60 {
+            machine.tick(Duration::from_millis(10));
+        }
+        machine.set_speed(0.0);
+        assert!(progress(machine) < 90, "{}", progress(machine));
+    };
+    cmm(&rig, half);
+    // Eight full pages of seven points, those on the reference sphere among them; the first of them will do.
+    let told = seen(&folder, |status| status.so_far.filter(|told| told.touched >= 14)).await;
+    let SoFar { touched, rms_um, least_um, most_um } = told;
+    assert!(touched <= 90 && rms_um > 0.0 && rms_um <= least_um.abs().max(most_um.abs()), "{told:?}");
+    // Held they stay to be seen; an order is obeyed as ever.
+    let (reply, ..) = order(&folder, Request::Hold { reason: "to look".into() }).await;
+    assert!(reply.accepted, "{reply:?}");
+    until(&folder, |words| words.starts_with("Held (Measure, Run)")).await;
+    assert!(seen(&folder, |status| status.so_far).await.touched >= touched);
+    let (reply, ..) = order(&folder, Request::Resume { reason: String::new(), seen: None }).await;
+    assert!(reply.accepted, "{reply:?}");
+    cmm(&rig, |machine| machine.set_speed(5000.0));
+    let ending = tokio::time::timeout(PATIENCE, running).await.expect("it ends").unwrap();
+    assert!(matches!(ending, Ending::Accepted { .. }), "{ending:?}");
+    assert_eq!(orders.status().borrow().so_far, None);
+    // Nothing of it is on record.
+    let journal = std::fs::read(folder.join("journal.sqlite")).unwrap();
+    for word in ["so_far", "preliminary"] {
+        assert!(!journal.windows(word.len()).any(|bytes| bytes == word.as_bytes()), "{word}");
+    }
+}
