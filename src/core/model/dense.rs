@@ -46,6 +46,15 @@ impl Dense {
     /// # Errors
     /// Rows that do not belong together, numbers that are none, parameters that are not above 0, effects that cannot be told apart.
     pub fn fit(observed: &Observed, hyper: Hyper) -> Result<Self, ModelError> {
+        Self::with(observed, hyper, |_, _| 0.0)
+    }
+
+    /// The same with what else pairs of observed points have in common, which no other place has a part of.
+    pub(super) fn with(
+        observed: &Observed,
+        hyper: Hyper,
+        shared_mm2: impl Fn(usize, usize) -> f64,
+    ) -> Result<Self, ModelError> {
         observed.check()?;
         hyper.check()?;
         let Observed { places, deviations_mm, effects, path } = observed;
@@ -56,7 +65,8 @@ impl Dense {
             if r < c {
                 0.0
             } else {
-                hyper.field.covariance_mm2(places[r], places[c]) + scatter2 * shared(&hyper, path, r, c)
+                let of_field = hyper.field.covariance_mm2(places[r], places[c]);
+                of_field + scatter2 * shared(&hyper, path, r, c) + shared_mm2(r, c)
             }
         });
         let factor = Llt::new(covariance.as_ref(), Side::Lower).map_err(|_| ModelError::NotDefinite)?;
@@ -155,6 +165,20 @@ impl Dense {
                 Predicted { mean_mm, sigma_mm: (sigma2 - known + by_effects).max(0.0).sqrt() }
             })
             .collect()
+    }
+
+    /// The same, with the covariance of every pair of the places.
+    pub(super) fn predict_together(&self, places: &[[f64; 2]]) -> (Vec<f64>, Mat<f64>) {
+        let (n, m, p) = (self.places.len(), places.len(), self.found.len());
+        let field = self.hyper.field;
+        let across = Mat::from_fn(n, m, |r, c| field.covariance_mm2(self.places[r], places[c]));
+        let solved = self.factor.solve(&across);
+        let moved = self.effects.transpose() * &across;
+        let known = Mat::from_fn(p, p, |r, c| self.covariance[(r, c)]);
+        let prior = Mat::from_fn(m, m, |r, c| field.covariance_mm2(places[r], places[c]));
+        let covariance = prior - across.transpose() * &solved + moved.transpose() * &known * &moved;
+        let mean_of = |c: usize| (0..n).map(|k| across[(k, c)] * self.weights[k]).sum();
+        ((0..m).map(mean_of).collect(), covariance)
     }
 }
 

@@ -48,7 +48,7 @@ impl Priors {
         Self { range_mm: [size_mm / 3.0, 6.0], scatter_ratio: [0.05, 20.0] }
     }
 
-    fn log_density(&self, range_mm: f64, ratio: f64) -> f64 {
+    pub(super) fn log_density(&self, range_mm: f64, ratio: f64) -> f64 {
         let of = |value: f64, [median, factor]: [f64; 2]| -0.5 * ((value / median).ln() / factor.ln()).powi(2);
         of(range_mm, self.range_mm) + of(ratio, self.scatter_ratio)
     }
@@ -245,7 +245,7 @@ fn thinned(observed: &Observed, most: usize) -> Observed {
 /// Climbs to the highest place of two dimensions by a simplex (Nelder and Mead 1965).
 ///
 /// It begins with a simplex of some steps, and ends with one that is smaller than `near`.
-fn climb(start: [f64; 2], steps: [f64; 2], near: f64, height: impl Fn([f64; 2]) -> f64) -> ([f64; 2], f64) {
+pub(super) fn climb(start: [f64; 2], steps: [f64; 2], near: f64, height: impl Fn([f64; 2]) -> f64) -> ([f64; 2], f64) {
     const TURNS: usize = 120;
     let seen = |place: [f64; 2]| (place, height(place));
     let mut corners = [seen(start), seen([start[0] + steps[0], start[1]]), seen([start[0], start[1] + steps[1]])];

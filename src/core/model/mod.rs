@@ -17,6 +17,8 @@
 //! precision of the field on a grid (Lindgren, Rue and Lindstrom 2011, alpha = 3), where each node knows its neighbours alone: for any
 //! number of points, and for samples.
 //!
+//! [`Sessions`] tells what comes back in several measurements from what is of each alone.
+//!
 //! Frame: places lie in the plane of projection of the model {M}. Units: millimetres.
 
 mod dense;
@@ -26,6 +28,7 @@ mod growing;
 mod likelihood;
 mod matern;
 mod normals;
+mod sessions;
 mod sparse;
 mod touches;
 
@@ -34,6 +37,7 @@ pub use error::ModelError;
 pub use form::{Form, FormFigures, FormPoint, Given, Interval};
 pub use growing::Growing;
 pub use likelihood::Priors;
+pub use sessions::{Between, Foretold, Sessions};
 pub use sparse::{Lattice, Sparse};
 pub use touches::{FEWEST, FIRST, Look, MOST_BATCHES, Purpose, SoFar, Why, look, short_way, spread};
 
