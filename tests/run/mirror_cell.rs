@@ -12,7 +12,7 @@ use regrind::device::exchange::{
 use regrind::device::{Coordinates, Identified, Job, Measurement, Plan, digest};
 use regrind::formats::result::{Content, Coordinates as Said};
 use regrind::geometry::{Point, Pose, Twist, Vector};
-use regrind::model::{Form, Given};
+use regrind::model::{Form, Given, Interval, ModelError, Priors, Sessions};
 use regrind::registration::{
     MapLimits, Options, PointStatus, Registration, Start, lateral_error, register, weak_for_compensation,
 };
@@ -212,5 +212,92 @@ fn one_session_tells_little_of_another_and_a_fifth_of_it_no_less() {
         // Between the days the tracker stood elsewhere, or the mirror was moved: what no point of one session shows.
         assert!(whole.0 < rms_um && fifth.0 < rms_um, "{whole:?} {fifth:?} {rms_um}");
         assert!(whole.1 > 0.7 && fifth.1 > 0.85, "{whole:?} {fifth:?}");
+    }
+}
+
+/// Which station each point of a session was measured from: its files, one after another.
+fn stations(data: &Path, name: &str) -> Vec<u32> {
+    let rows = |station: u32| {
+        let file = std::fs::read_to_string(data.join(name).join(format!("M1_{station}.txt"))).ok()?;
+        Some(file.lines().filter(|line| line.starts_with("Checked")).count())
+    };
+    (1..).map_while(|station| Some(vec![station; rows(station)?])).flatten().collect()
+}
+
+fn rms_um(of: impl Iterator<Item = f64> + Clone) -> f64 {
+    1e3 * (of.clone().map(|mm| mm * mm).sum::<f64>() / of.count() as f64).sqrt()
+}
+
+fn um(Interval { median_mm, low_mm, high_mm, .. }: Interval) -> String {
+    format!("{:.1} um, {:.1} to {:.1}", 1e3 * median_mm, 1e3 * low_mm, 1e3 * high_mm)
+}
+
+#[test]
+#[ignore = "needs real measurements: REGRIND_DATA"]
+fn a_session_that_was_not_seen_is_foretold_with_what_its_stations_will_differ_by() {
+    let data = data("lat-freeform-mirror");
+    let nominal = nominal();
+    let names = ["20250824_M1_1", "20250825_M1"];
+    let days = names.map(|name| (session(&data, &nominal, name).1, stations(&data, name)));
+    let (mut hits, mut count) = (0, 0);
+    for [a, b] in [[0, 1], [1, 0]] {
+        let known = Sessions::of(&[(&days[a].0, &days[a].1)]).unwrap();
+        let unseen = Sessions::of(&[(&days[b].0, &days[b].1)]).unwrap();
+        let between = known.between(&Priors::of_size(3000.0)).unwrap();
+        let told = between.foretell(&known, &unseen).unwrap();
+        let found = unseen.deviations_mm();
+        let pairs = || told.iter().zip(found);
+        let within = pairs().filter(|(t, d)| (*d - t.mean_mm).abs() <= t.half_width_mm()).count();
+        (hits, count) = (hits + within, count + found.len());
+        let share = within as f64 / found.len() as f64;
+        let degrees = told.iter().map(|t| t.degrees).fold(f64::INFINITY, f64::min);
+        println!("{} left out, by the {} stations of {}: {between:.5?}", names[b], between.sessions, names[a]);
+        println!(
+            "  found {:.1} um rms, foretold {:.1}, off by {:.1}, sigma {:.1}; {:.1} % within 95 %, {degrees:.1} degrees of freedom at least",
+            rms_um(found.iter().copied()),
+            rms_um(told.iter().map(|t| t.mean_mm)),
+            rms_um(pairs().map(|(t, d)| d - t.mean_mm)),
+            rms_um(told.iter().map(|t| t.sigma_mm)),
+            100.0 * share
+        );
+        assert!((0.90..=0.99).contains(&share), "{share}");
+        // One day as one session does not tell what another day brings.
+        let one = vec![1; days[a].1.len()];
+        let alone = Sessions::of(&[(&days[a].0, &one)]).unwrap().between(&Priors::of_size(3000.0));
+        assert_eq!(alone.err(), Some(ModelError::TooFewSessions { sessions: 1, least: 2 }));
+    }
+    println!("{:.1} % of {count} points of both days within 95 %", 100.0 * hits as f64 / count as f64);
+}
+
+#[test]
+#[ignore = "needs real measurements: REGRIND_DATA"]
+fn a_fifth_of_the_points_says_what_all_say_of_a_session() {
+    let data = data("lat-freeform-mirror");
+    let nominal = nominal();
+    for name in ["20250824_M1_1", "20250825_M1"] {
+        let (cloud, whole) = session(&data, &nominal, name);
+        let of_all = Form::of(&whole, &Given::default()).unwrap();
+        println!(
+            "{name}: {} points, {:.1} um rms, {:.1} um PV",
+            cloud.len(),
+            1e3 * whole.verdict.rms_mm,
+            1e3 * whole.verdict.pv_mm
+        );
+        println!("  form of all: RMS {}; PV {}", um(of_all.figures.rms), um(of_all.figures.pv_most_points));
+        for first in 0..5 {
+            let few: Vec<Point> = cloud.iter().skip(first).step_by(5).copied().collect();
+            let fifth = registered(&nominal, &few, [false; 6]);
+            let form = Form::of(&fifth, &Given::default()).unwrap();
+            println!(
+                "  {} of them: {:.1} um rms, {:.1} um PV; form RMS {}; PV {}",
+                few.len(),
+                1e3 * fifth.verdict.rms_mm,
+                1e3 * fifth.verdict.pv_mm,
+                um(form.figures.rms),
+                um(form.figures.pv_most_points)
+            );
+            assert!((fifth.verdict.rms_mm / whole.verdict.rms_mm - 1.0).abs() < 0.15, "{name}: {first}");
+            assert!(fifth.verdict.pv_mm <= 1.02 * whole.verdict.pv_mm, "{name}: {first}");
+        }
     }
 }

@@ -48,8 +48,18 @@ impl Dense {
     /// # Errors
     /// Rows that do not belong together, numbers that are none, parameters that are not above 0, effects that cannot be told apart.
     pub fn fit(observed: &Observed, hyper: Hyper) -> Result<Self, ModelError> {
+        Self::with(observed, hyper, |_, _| 0.0)
+    }
+
+    /// The same with what else pairs of observed points have in common, which no other place has a part of.
+    pub(super) fn with(
+        observed: &Observed,
+        hyper: Hyper,
+        shared_mm2: impl Fn(usize, usize) -> f64,
+    ) -> Result<Self, ModelError> {
         let Observed { places, deviations_mm, path, .. } = observed;
-        let Solved { effects, factor, solved, gram, towards, log_det, .. } = Solved::of(observed, &hyper)?;
+        let Solved { effects, factor, solved, gram, towards, log_det, .. } =
+            Solved::with(observed, &hyper, shared_mm2)?;
         let (n, p, vague) = (places.len(), effects.ncols(), observed.effects.ncols());
         let gram = told_apart(with_stated(gram, vague))?;
         let found = gram.solve(&towards);
@@ -147,6 +157,20 @@ impl Dense {
             })
             .collect()
     }
+
+    /// The same, with the covariance of every pair of the places.
+    pub(super) fn predict_together(&self, places: &[[f64; 2]]) -> (Vec<f64>, Mat<f64>) {
+        let (n, m, p) = (self.places.len(), places.len(), self.found.len());
+        let field = self.hyper.field;
+        let across = Mat::from_fn(n, m, |r, c| field.covariance_mm2(self.places[r], places[c]));
+        let solved = self.factor.solve(&across);
+        let moved = self.effects.transpose() * &across;
+        let known = Mat::from_fn(p, p, |r, c| self.covariance[(r, c)]);
+        let prior = Mat::from_fn(m, m, |r, c| field.covariance_mm2(places[r], places[c]));
+        let covariance = prior - across.transpose() * &solved + moved.transpose() * &known * &moved;
+        let mean_of = |c: usize| (0..n).map(|k| across[(k, c)] * self.weights[k]).sum();
+        ((0..m).map(mean_of).collect(), covariance)
+    }
 }
 
 /// How much of their scatter two points share.
@@ -175,6 +199,10 @@ pub(super) struct Solved {
 
 impl Solved {
     pub(super) fn of(observed: &Observed, hyper: &Hyper) -> Result<Self, ModelError> {
+        Self::with(observed, hyper, |_, _| 0.0)
+    }
+
+    fn with(observed: &Observed, hyper: &Hyper, shared_mm2: impl Fn(usize, usize) -> f64) -> Result<Self, ModelError> {
         observed.check()?;
         hyper.check()?;
         let Observed { places, deviations_mm, path, .. } = observed;
@@ -186,7 +214,8 @@ impl Solved {
             if r < c {
                 0.0
             } else {
-                hyper.field.covariance_mm2(places[r], places[c]) + scatter2 * shared(hyper, path, r, c)
+                let of_field = hyper.field.covariance_mm2(places[r], places[c]);
+                of_field + scatter2 * shared(hyper, path, r, c) + shared_mm2(r, c)
             }
         });
         let factor = Llt::new(covariance.as_ref(), Side::Lower).map_err(|_| ModelError::NotDefinite)?;

@@ -39,4 +39,10 @@ pub enum ModelError {
         "a grid for the field would have {nodes} nodes, more than {most}; the range of {range_mm} mm is too short for the part"
     )]
     TooManyNodes { nodes: usize, most: usize, range_mm: f64 },
+    #[error(
+        "the points are of {sessions} session; what differs between sessions is told by {least} at least: measure once more, or from another station"
+    )]
+    TooFewSessions { sessions: usize, least: usize },
+    #[error("{points} points and {sessions} numbers of their sessions do not belong together")]
+    Sessions { points: usize, sessions: usize },
 }

@@ -62,7 +62,7 @@ impl Priors {
     }
 
     /// Beyond one factor it falls as slowly as it does there (Huber 1964): a part that is like none before is told by its own points.
-    fn log_density(&self, range_mm: f64, ratio: f64) -> f64 {
+    pub(super) fn log_density(&self, range_mm: f64, ratio: f64) -> f64 {
         let of = |value: f64, [median, factor]: [f64; 2]| {
             let off = ((value / median).ln() / factor.ln()).abs();
             if off <= 1.0 { -0.5 * off * off } else { 0.5 - off }

@@ -17,6 +17,8 @@
 //! precision of the field on a grid (Lindgren, Rue and Lindstrom 2011, alpha = 3), where each node knows its neighbours alone: for any
 //! number of points, and for samples.
 //!
+//! [`Sessions`] tells what comes back in several measurements from what is of each alone.
+//!
 //! Frame: places lie in the plane of projection of the model {M}. Units: millimetres.
 
 mod budget;
@@ -32,6 +34,7 @@ mod machine;
 mod matern;
 mod normals;
 mod profile;
+mod sessions;
 mod sparse;
 mod taught;
 mod touches;
@@ -45,6 +48,7 @@ pub use form::{Form, FormFigures, FormPoint, Given, Interval};
 pub use growing::Growing;
 pub use likelihood::Priors;
 pub use machine::{Machine, Source};
+pub use sessions::{Between, Foretold, Sessions};
 pub use sparse::{Lattice, Sparse};
 pub use taught::{Lesson, Taught};
 pub use touches::{FEWEST, FIRST, Look, MOST_BATCHES, Purpose, SoFar, Why, look, short_way, spread};

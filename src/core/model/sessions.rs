@@ -1,0 +1,314 @@
+//! Measurements in several sessions: what comes back in each, and what another one would find.
+//!
+//! A session is whatever is set up anew: a day, a station of a tracker, a clamping. The deviation of a point is
+//!
+//! ```text
+//!  d_i = h_i' b + f(x_i) + g_s(x_i) + e_i
+//! ```
+//!
+//! with the motions and the field f of the part as in the model of one measurement, and g_s a field of the session s alone, independent of that of any
+//! other: how the frame was told, how the part hung, what the air did to the beam. g has a strength and a range of its own; one that is wider than
+//! the part shifts and tilts it. No point of one session tells f from g: it takes two.
+//!
+//! Frame: places lie in the plane of projection of the model {M}. Units: millimetres.
+
+use faer::Mat;
+use nalgebra::DMatrix;
+
+use super::climb::climb;
+use super::form::Motions;
+use super::{Dense, Field, Hyper, ModelError, Observed, Priors};
+use crate::registration::{Deviation, PointStatus, Registration};
+
+/// Points, and the session of each.
+#[derive(Clone, Debug)]
+pub struct Sessions {
+    observed: Observed,
+    of: Vec<u32>,
+}
+
+/// What comes back in every session, and what is of each alone.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Between {
+    /// The field that comes back, and the scatter of a point.
+    pub hyper: Hyper,
+    /// The field of a session.
+    pub own: Field,
+    /// Standard uncertainty of the logarithm of its strength.
+    pub own_u: f64,
+    /// In how many sessions it was seen.
+    pub sessions: usize,
+}
+
+/// What a session that was not seen will find at a point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Foretold {
+    /// The most probable deviation, after the best fit of that session.
+    pub mean_mm: f64,
+    /// Standard uncertainty of the deviation that will be found, its field and its scatter in it.
+    pub sigma_mm: f64,
+    /// How many degrees of freedom that uncertainty is known by.
+    pub degrees: f64,
+}
+
+/// Of so many points every pair is looked at while parameters are searched, and at the end.
+const MOST_SEARCHED: usize = 300;
+const MOST_KNOWN: usize = 1500;
+/// Fewer sessions tell nothing of what differs between them.
+const FEWEST_SESSIONS: usize = 2;
+/// Where the search begins: shares of the strength of the session's field in that of the part, and its range in that of the part.
+const SHARES: [f64; 3] = [0.1, 0.5, 2.0];
+const RANGES: [f64; 3] = [0.3, 1.0, 3.0];
+/// How often the parameters of either field are searched while those of the other stand still.
+const ROUNDS: usize = 4;
+/// What is known of the field of a session beforehand, the median and the factor of one standard deviation: its share in that of the part, and its range in the
+/// most probable one of that.
+const OWN_SHARE: [f64; 2] = [0.5, 6.0];
+const OWN_RANGE: [f64; 2] = [3.0, 6.0];
+/// How far beside the best strength the likelihood is looked at.
+const STEP: f64 = 0.1;
+/// Fewer degrees of freedom are not told apart.
+const LEAST_DEGREES: f64 = 2.0;
+
+impl Sessions {
+    /// Takes points and the number of the session of each.
+    ///
+    /// # Errors
+    /// Rows that do not belong together, and numbers that are none.
+    pub fn new(observed: Observed, of: Vec<u32>) -> Result<Self, ModelError> {
+        observed.check()?;
+        if of.len() != observed.places.len() {
+            return Err(ModelError::Sessions { points: observed.places.len(), sessions: of.len() });
+        }
+        Ok(Self { observed, of })
+    }
+
+    /// Takes registrations, each with the number of the session of every point that was measured. The motions that each was free to make
+    /// are unknown for itself. What lies apart was left out before.
+    ///
+    /// # Errors
+    /// Those of [`Sessions::new`].
+    pub fn of(registrations: &[(&Registration, &[u32])]) -> Result<Self, ModelError> {
+        let (mut parts, mut of) = (Vec::new(), Vec::new());
+        for (registration, sessions) in registrations {
+            let deviations = &registration.deviations;
+            if deviations.len() != sessions.len() {
+                return Err(ModelError::Sessions { points: deviations.len(), sessions: sessions.len() });
+            }
+            let used = deviations.iter().zip(*sessions).filter(|(d, _)| d.status == PointStatus::Used);
+            let (used, numbers): (Vec<&Deviation>, Vec<u32>) = used.unzip();
+            if used.is_empty() {
+                return Err(ModelError::TooFewPoints { points: 0, least: 7 });
+            }
+            parts.push(Motions::of(registration, used.iter().map(|d| d.point)).observed(&used));
+            of.extend(numbers);
+        }
+        Self::new(joined(&parts), of)
+    }
+
+    /// Returns what was found at each point that was used, the registrations one after another.
+    pub fn deviations_mm(&self) -> &[f64] {
+        &self.observed.deviations_mm
+    }
+
+    /// Tells what comes back from what does not, by restricted likelihood.
+    ///
+    /// # Errors
+    /// Fewer than two sessions, and those of [`Dense::fit`].
+    pub fn between(&self, priors: &Priors) -> Result<Between, ModelError> {
+        let mut numbers = self.of.clone();
+        numbers.sort_unstable();
+        numbers.dedup();
+        if numbers.len() < FEWEST_SESSIONS {
+            return Err(ModelError::TooFewSessions { sessions: numbers.len(), least: FEWEST_SESSIONS });
+        }
+        let few = self.thinned(MOST_SEARCHED);
+        let (found, top) = few.searched(priors);
+        let (hyper, own, _) = few.scaled(found, priors)?;
+        // By the curvature of the hill along the strength, whose scale moves with it.
+        let beside = |step: f64| {
+            let [common, [share, range]] = found;
+            few.scaled([common, [share + step, range]], priors).map(|(_, own, value)| (own.sigma_mm.ln(), value))
+        };
+        let (below, above) = (beside(-STEP)?, beside(STEP)?);
+        let falls = (2.0 * top - below.1 - above.1).max(f64::MIN_POSITIVE);
+        let own_u = (0.5 * (above.0 - below.0) / falls.sqrt()).abs().min(1.0);
+        Ok(Between { hyper, own, own_u, sessions: numbers.len() })
+    }
+
+    /// Climbs from the best of some beginnings: the common field, then that of the session, and again.
+    fn searched(&self, priors: &Priors) -> ([[f64; 2]; 2], f64) {
+        let height = |at| self.scaled(at, priors).map_or(f64::NEG_INFINITY, |(_, _, value)| value);
+        let [median_mm, _] = priors.range_mm;
+        let mut best = ([[median_mm.ln(), 0.5_f64.ln()]; 2], f64::NEG_INFINITY);
+        for range in RANGES {
+            for share in SHARES {
+                for own in RANGES {
+                    let ranges_mm = [range * median_mm, own * OWN_RANGE[0] * median_mm];
+                    let at = [[ranges_mm[0].ln(), 0.5_f64.ln()], [share.ln(), ranges_mm[1].ln()]];
+                    let value = height(at);
+                    if value > best.1 {
+                        best = (at, value);
+                    }
+                }
+            }
+        }
+        for _ in 0..ROUNDS {
+            let own = best.0[1];
+            let (common, _) = climb(best.0[0], [0.4, 0.4], 0.02, |common| height([common, own]));
+            let (own, value) = climb(own, [0.4, 0.4], 0.02, |own| height([common, own]));
+            best = ([common, own], value);
+        }
+        best
+    }
+
+    /// The parameters with the scale that suits them best, and the logarithm of their probability: range and scatter of the common field, share and range of
+    /// the session's, by their logarithms, scatter and share in units of the common field.
+    fn scaled(
+        &self,
+        [[range, ratio], [share, own_range]]: [[f64; 2]; 2],
+        priors: &Priors,
+    ) -> Result<(Hyper, Field, f64), ModelError> {
+        let [range_mm, ratio, share, own_mm] = [range, ratio, share, own_range].map(f64::exp);
+        let unit = Hyper { field: Field::new(1.0, range_mm), scatter_mm: ratio, drift: 0.0 };
+        let own = Field::new(share, own_mm);
+        let model = self.fit(unit, own)?;
+        let squares = model.whitened_squares(&self.observed);
+        let free = (self.of.len() - self.observed.effects.ncols()) as f64;
+        // No deviation at all is a field of no strength.
+        let scale = (squares / free).sqrt().max(f64::MIN_POSITIVE.sqrt());
+        let log_of = |value: f64, [median, factor]: [f64; 2]| -0.5 * ((value / median).ln() / factor.ln()).powi(2);
+        let value = model.log_likelihood() + 0.5 * squares - 0.5 * free - free * scale.ln()
+            + priors.log_density(range_mm, ratio)
+            + log_of(share, OWN_SHARE)
+            + log_of(own_mm / priors.range_mm[0], OWN_RANGE);
+        let scaled = |field: Field| Field { sigma_mm: field.sigma_mm * scale, ..field };
+        Ok((Hyper { field: scaled(unit.field), scatter_mm: ratio * scale, drift: 0.0 }, scaled(own), value))
+    }
+
+    fn fit(&self, hyper: Hyper, own: Field) -> Result<Dense, ModelError> {
+        let places = &self.observed.places;
+        Dense::with(&self.observed, hyper, |a, b| match self.of[a] == self.of[b] {
+            true => own.covariance_mm2(places[a], places[b]),
+            false => 0.0,
+        })
+    }
+
+    /// Some of them, evenly in the order they were measured.
+    fn thinned(&self, most: usize) -> Self {
+        let n = self.of.len();
+        let chosen: Vec<usize> = (0..n.min(most)).map(|k| k * n / n.min(most)).collect();
+        Self { observed: self.observed.only(&chosen), of: chosen.iter().map(|&k| self.of[k]).collect() }
+    }
+}
+
+/// Points one after another, each part with effects of its own.
+fn joined(parts: &[Observed]) -> Observed {
+    let rows = parts.iter().map(|part| part.places.len()).sum();
+    let mut effects = DMatrix::zeros(rows, parts.iter().map(|part| part.effects.ncols()).sum());
+    let (mut places, mut deviations_mm, mut column) = (Vec::new(), Vec::new(), 0);
+    for part in parts {
+        effects.view_mut((places.len(), column), part.effects.shape()).copy_from(&part.effects);
+        column += part.effects.ncols();
+        places.extend(&part.places);
+        deviations_mm.extend(&part.deviations_mm);
+    }
+    Observed { effects, ..Observed::without_effects(places, deviations_mm) }
+}
+
+impl Between {
+    /// Tells what sessions that were not seen will find: at the places of `unseen`, in its sessions, after its own best fit. What was found there, and
+    /// whether its numbers are those of known sessions, does not matter.
+    ///
+    /// Takes time as the cube of the number of points; of more than 1,500 known ones as many are taken.
+    ///
+    /// # Errors
+    /// Those of [`Dense::fit`].
+    pub fn foretell(&self, known: &Sessions, unseen: &Sessions) -> Result<Vec<Foretold>, ModelError> {
+        let model = known.thinned(MOST_KNOWN).fit(self.hyper, self.own)?;
+        let Observed { places, effects, .. } = &unseen.observed;
+        let (means_mm, common) = model.predict_together(places);
+        let own = Mat::from_fn(places.len(), places.len(), |r, c| match unseen.of[r] == unseen.of[c] {
+            true => self.own.covariance_mm2(places[r], places[c]),
+            false => 0.0,
+        });
+        let base = Base::of(effects);
+        let fitted_mm = base.after_best_fit(&means_mm);
+        let [common, own] = [common, own].map(|covariance| base.variances_after(&covariance));
+        let scatter_mm2 = self.hyper.scatter_mm.powi(2);
+        let of = |k: usize| {
+            let steady_mm2 = common[k] + scatter_mm2 * base.free(k);
+            let variance_mm2 = (steady_mm2 + own[k]).max(f64::MIN_POSITIVE);
+            // Of a variance whose logarithm is uncertain by 2 u, and a part of the whole (Satterthwaite 1946).
+            let relative = 2.0 * self.own_u * own[k] / variance_mm2;
+            let degrees = (2.0 / relative.powi(2).max(f64::MIN_POSITIVE)).max(LEAST_DEGREES);
+            Foretold { mean_mm: fitted_mm[k], sigma_mm: variance_mm2.sqrt(), degrees }
+        };
+        Ok((0..places.len()).map(of).collect())
+    }
+}
+
+impl Foretold {
+    /// Returns by how much what will be found lies off the mean at most, with a probability of 95 %: Student's t, for an uncertainty that few
+    /// sessions tell is uncertain itself.
+    pub fn half_width_mm(&self) -> f64 {
+        self.sigma_mm * student(self.degrees)
+    }
+}
+
+/// The quantile 97.5 % of Student's t (Fisher and Cornish 1960): within 2 % of 2 degrees of freedom, 0.4 % of 3, exact of many.
+fn student(degrees: f64) -> f64 {
+    const Z: f64 = 1.959_963_984_540_054;
+    // Terms of 1 / degrees, each z times a polynomial of z^2, the highest power first.
+    const TERMS: [(f64, [f64; 5]); 4] = [
+        (4.0, [0.0, 0.0, 0.0, 1.0, 1.0]),
+        (96.0, [0.0, 0.0, 5.0, 16.0, 3.0]),
+        (384.0, [0.0, 3.0, 19.0, 17.0, -15.0]),
+        (92_160.0, [79.0, 776.0, 1482.0, -1920.0, -945.0]),
+    ];
+    let mut power = 1.0;
+    TERMS.iter().fold(Z, |sum, (under, factors)| {
+        power /= degrees.max(LEAST_DEGREES);
+        sum + power * Z * factors.iter().fold(0.0, |value, factor| value * Z * Z + factor) / under
+    })
+}
+
+/// An orthonormal base Q of what a best fit takes off.
+struct Base {
+    q: DMatrix<f64>,
+}
+
+impl Base {
+    fn of(effects: &DMatrix<f64>) -> Self {
+        let q = if effects.ncols() > 0 { effects.clone().qr().q() } else { effects.clone() };
+        Self { q }
+    }
+
+    fn after_best_fit(&self, values: &[f64]) -> Vec<f64> {
+        let taken = self.q.tr_mul(&nalgebra::DVector::from_column_slice(values));
+        let fitted = &self.q * taken;
+        values.iter().zip(fitted.iter()).map(|(value, fitted)| value - fitted).collect()
+    }
+
+    /// How much of the variance of independent points the fit leaves at one of them.
+    fn free(&self, point: usize) -> f64 {
+        1.0 - self.q.row(point).norm_squared()
+    }
+
+    /// The diagonal of P V P with P = 1 - Q Q'.
+    fn variances_after(&self, covariance: &Mat<f64>) -> Vec<f64> {
+        let (n, p) = self.q.shape();
+        let q = Mat::from_fn(n, p, |r, c| self.q[(r, c)]);
+        let taken = covariance * &q;
+        let both = q.transpose() * &taken;
+        let back = &q * &both;
+        let of = |r: usize| {
+            let off = |c: usize| q[(r, c)] * (back[(r, c)] - 2.0 * taken[(r, c)]);
+            (covariance[(r, r)] + (0..p).map(off).sum::<f64>()).max(0.0)
+        };
+        (0..n).map(of).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests;
