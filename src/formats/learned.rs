@@ -185,7 +185,7 @@ mod tests {
     #[test]
     fn fields_are_kept_and_a_file_without_them_has_taught_nothing_of_them() {
         let mut fields = Taught::default();
-        fields.take(true, &Hyper { field: Field { sigma_mm: 1e-3, range_mm: 15.0 }, scatter_mm: 3e-4, drift: 0.0 });
+        fields.take(true, &Hyper { field: Field::new(1e-3, 15.0), scatter_mm: 3e-4, drift: 0.0 });
         let text = serde_json::to_string(&learned().with_fields(fields)).unwrap();
         assert_eq!(read(&text).unwrap().unwrap().0.fields, fields);
         // As earlier versions wrote it.
