@@ -24,6 +24,7 @@ pub struct Actor {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[expect(missing_docs, reason = "the fields are told above")]
 #[serde(tag = "event", rename_all = "snake_case")]
+#[expect(clippy::large_enum_variant, reason = "events are few, and never kept in numbers")]
 pub enum Event {
     // Orders of people.
     /// Begin the run.

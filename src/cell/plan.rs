@@ -75,8 +75,6 @@ impl Tolerance {
         Self::USUAL
     }
 
-    // What serde asks takes a reference.
-    #[allow(clippy::trivially_copy_pass_by_ref)]
     fn is_usual(probability: &f64) -> bool {
         *probability == Self::USUAL
     }

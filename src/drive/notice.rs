@@ -9,6 +9,7 @@ use crate::cell::{Alarm, AlarmId, CompensationSummary, Device, Ending, Figures, 
 #[derive(Clone, Debug, Serialize)]
 #[serde(tag = "notice", rename_all = "snake_case")]
 #[allow(missing_docs)]
+#[expect(clippy::large_enum_variant, reason = "notices are few, and never kept in numbers")]
 pub enum Notice {
     /// The cell took an event in.
     State {
