@@ -12,7 +12,7 @@ const ARROWS: [(&str, &str, &[&str]); 21] = [
     ("measuring", "src/core/measuring", &["geometry", "surface"]),
     ("registration", "src/core/registration", &["geometry", "surface"]),
     ("compensation", "src/core/compensation", &["geometry", "sparse", "surface", "registration"]),
-    ("model", "src/core/model", &["geometry", "registration", "sparse"]),
+    ("model", "src/core/model", &["form", "geometry", "registration", "sparse"]),
     ("sparse", "src/core/sparse.rs", &[]),
     ("form", "src/core/form", &["geometry", "surface"]),
     ("cell", "src/cell", &[]),

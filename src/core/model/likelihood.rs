@@ -8,7 +8,7 @@
 use nalgebra::DMatrix;
 use rayon::prelude::*;
 
-use super::climb::climb;
+use super::hill::climb;
 use super::profile::{Profile, best_scale};
 use super::{Dense, Field, Hyper, Lay, ModelError, Observed, Smoothness, spacing_mm};
 

@@ -22,13 +22,13 @@
 //! Frame: places lie in the plane of projection of the model {M}. Units: millimetres.
 
 mod budget;
-mod climb;
 mod dense;
 mod error;
 mod field;
 mod figures;
 mod form;
 mod growing;
+mod hill;
 mod likelihood;
 mod machine;
 mod matern;

@@ -15,7 +15,7 @@
 use faer::Mat;
 use nalgebra::DMatrix;
 
-use super::climb::climb;
+use super::hill::climb;
 use super::form::Motions;
 use super::{Dense, Field, Hyper, ModelError, Observed, Priors};
 use crate::registration::{Deviation, PointStatus, Registration};

@@ -60,7 +60,6 @@ fn what_differs_between_sessions_is_found_again_and_an_unseen_one_is_covered() {
         scatter += (between.hyper.scatter_mm / COMMON.scatter_mm).ln() / f64::from(PARTS);
         covered += within(&between, &sessions) / f64::from(PARTS);
     }
-    println!("strength {:.3}, scatter {:.3}, {:.2} % within", strength.exp(), scatter.exp(), 100.0 * covered);
     assert!(strength.abs() < 0.4 && scatter.abs() < 0.2, "{strength} {scatter}");
     assert!((0.93..=0.97).contains(&covered), "{covered}");
 }
@@ -69,7 +68,6 @@ fn what_differs_between_sessions_is_found_again_and_an_unseen_one_is_covered() {
 fn sessions_that_differ_by_nothing_are_told_so() {
     let sessions = planted(1e-12, 5, 1, 3);
     let between = sessions[0].between(&Priors::of_size(102.0)).unwrap();
-    println!("{between:?}");
     let own = between.foretell(&sessions[0], &sessions[1]).unwrap();
     let sure = Between { own: Field { sigma_mm: 1e-12, ..between.own }, ..between };
     let none = sure.foretell(&sessions[0], &sessions[1]).unwrap();
