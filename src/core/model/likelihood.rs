@@ -46,6 +46,8 @@ pub(super) const ON_A_GRID: [Smoothness; 2] = [Smoothness::Once, Smoothness::Thr
 const FIRST_STRETCH: f64 = 0.6;
 const MOST_STRETCHED: f64 = 10.0;
 const LAY_EVIDENCE: f64 = 4.0;
+/// By what factor a field may be stronger than what is seen of it (one standard deviation of its logarithm).
+const STRONGER: f64 = 2.0;
 /// By how much more each step of smoothness has to be spoken for.
 const DOUBT: f64 = 2.0;
 /// How finely a drift is told, and the most that is.
@@ -144,6 +146,8 @@ struct Search<'a> {
     /// Points all over the part, and blocks of neighbours.
     all: Vec<Observed>,
     priors: &'a Priors,
+    /// The root mean square of what was measured.
+    rms_mm: f64,
     /// The logarithms of the least range that can be told, and of how many of it the range is that is expected.
     least: f64,
     far: f64,
@@ -159,11 +163,16 @@ impl<'a> Search<'a> {
         let least_mm = least_range_mm(observed);
         // However narrow a form is expected to be, it may be wide.
         let widest_mm = priors.range_mm[0].max(size_mm(&observed.places) / 3.0);
-        Self { all, priors, least: least_mm.ln(), far: (widest_mm / least_mm).max(1.5).ln() }
+        let squares: f64 = observed.deviations_mm.iter().map(|d| d * d).sum();
+        let rms_mm = (squares / observed.places.len() as f64).sqrt();
+        Self { all, priors, rms_mm, least: least_mm.ln(), far: (widest_mm / least_mm).max(1.5).ln() }
     }
 
     fn at(&self, of: &[Observed], [range, ratio]: [f64; 2], shape: Shape) -> Result<(Hyper, f64), ModelError> {
-        scaled(of, [range.exp(), ratio.exp()], shape, self.priors)
+        let (hyper, value) = scaled(of, [range.exp(), ratio.exp()], shape, self.priors)?;
+        // What a fit takes off a form is about as much as what it leaves: a field that was far stronger would be one of which the points show next to nothing.
+        let beyond = (hyper.field.sigma_mm / self.rms_mm.max(f64::MIN_POSITIVE)).ln().max(0.0) / STRONGER.ln();
+        Ok((hyper, value - 0.5 * beyond * beyond))
     }
 
     /// What is narrower than can be told has no height.

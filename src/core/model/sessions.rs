@@ -15,8 +15,8 @@
 use faer::Mat;
 use nalgebra::DMatrix;
 
-use super::hill::climb;
 use super::form::Motions;
+use super::hill::climb;
 use super::{Dense, Field, Hyper, ModelError, Observed, Priors};
 use crate::registration::{Deviation, PointStatus, Registration};
 
