@@ -442,7 +442,7 @@ mod tests {
             HYPER.field,
             Field { range_mm: 45.0, ..smooth },
             Field { lay: Lay::at(0.4, 3.0), range_mm: 40.0, ..HYPER.field },
-            Field { sigma_mm: 0.1, range_mm: 250.0, ..smooth },
+            Field { sigma_mm: 0.03, range_mm: 150.0, ..smooth },
         ];
         fields.map(|field| Hyper { field, ..HYPER })
     }

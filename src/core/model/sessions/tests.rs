@@ -5,7 +5,7 @@ use super::*;
 
 const COMMON: Hyper = Hyper { field: Field::new(5e-3, 40.0), scatter_mm: 1e-3, drift: 0.0 };
 const OWN: Field = Field::new(4e-3, 150.0);
-const A_SESSION: usize = 30;
+const A_SESSION: usize = 40;
 
 /// Points of a part of 102 x 62 mm that was measured so often, each time moved by what nobody knows: known first, then unseen, of one part.
 fn planted(own_mm: f64, known: u32, unseen: u32, seed: u64) -> [Sessions; 2] {
