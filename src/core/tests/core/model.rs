@@ -205,11 +205,17 @@ fn what_no_uncertainty_can_be_is_refused_in_words() {
 
 #[test]
 fn what_is_known_of_the_radius_of_the_probe_is_in_what_is_said() {
-    let part = part(3, 1e-9);
+    let (part, with_form) = (part(3, 1e-9), part(3, 5e-3));
     let given = Given { radius_sigma_mm: 2e-2, ..Given::default() };
     let doubted = Form::of(&part.found, &given).unwrap();
     let [z, z_doubted] = [&part.model, &doubted].map(|form| form.frame_covariance[(2, 2)].sqrt());
     assert!((z_doubted / 2e-2 - 1.0).abs() < 0.2 && z < 1e-4, "{z} {z_doubted}");
+    // A wrong radius would show in points that have no form; in a form it may hide.
+    let [sure, doubted] =
+        [Given::default(), given].map(|given| Form::of(&with_form.found, &given).unwrap().figures.rms);
+    let width = |of: Interval| of.high_mm - of.low_mm;
+    println!("RMS {:.2} times as wide beside an unknown radius", width(doubted) / width(sure));
+    assert!(width(doubted) > 2.0 * width(sure), "{sure:?} {doubted:?}");
 }
 
 #[test]
