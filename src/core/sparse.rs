@@ -129,19 +129,18 @@ impl<'a> Factor<'a> {
     pub fn colour(&self, mut white: Mat<f64>) -> Option<Mat<f64>> {
         let symbolic = self.pattern.blocks()?;
         let factor = SupernodalLltRef::new(symbolic, &self.values);
-        let columns = white.ncols();
         for s in (0..symbolic.n_supernodes()).rev() {
             let node = factor.supernode(s);
             let (begin, width) = (node.start(), node.val().ncols());
             let (l11, l21) = node.val().split_at_row(width);
-            let below = Mat::from_fn(l21.nrows(), columns, |r, c| white[(node.pattern()[r], c)]);
+            let below = gathered(&white, node.pattern());
             let mut own = white.as_mut().subrows_mut(begin, width);
             matmul(own.as_mut(), Accum::Add, l21.transpose(), &below, -1.0, Par::Seq);
             solve_upper_triangular_in_place(l11.transpose(), own, Par::Seq);
         }
         // From the order of the factor back to that of the matrix.
-        let at = |k: usize| self.pattern.symbolic.perm().map_or(k, |perm| perm.arrays().1[k]);
-        Some(Mat::from_fn(white.nrows(), columns, |r, c| white[(at(r), c)]))
+        let Some(order) = self.pattern.symbolic.perm() else { return Some(white) };
+        Some(gathered(&white, order.arrays().1))
     }
 
     /// Works out the entries of the inverse within the factor's pattern.
@@ -202,7 +201,7 @@ impl SelectedInverse<'_> {
             symbolic.supernode(t).pattern().iter().enumerate().for_each(|(k, &row)| local[row] = end - begin + k);
             let last = first + rows[first..].partition_point(|&row| row < end);
             for c in first..last {
-                let column = self.blocks[t].col(rows[c] - begin);
+                let column = self.blocks[t].col_as_slice(rows[c] - begin);
                 for (r, &row) in rows.iter().enumerate().skip(c) {
                     let place = if row < end { row - begin } else { local[row] };
                     let value = column[place];
@@ -214,6 +213,16 @@ impl SelectedInverse<'_> {
         }
         dense
     }
+}
+
+/// Some rows of a matrix, in the order in which they are named.
+fn gathered(of: &Mat<f64>, rows: &[usize]) -> Mat<f64> {
+    let mut chosen = Mat::zeros(rows.len(), of.ncols());
+    for c in 0..of.ncols() {
+        let from = of.col_as_slice(c);
+        chosen.col_as_slice_mut(c).iter_mut().zip(rows).for_each(|(to, &row)| *to = from[row]);
+    }
+    chosen
 }
 
 #[cfg(test)]

@@ -63,9 +63,11 @@ impl Dense {
         let (n, p, vague) = (places.len(), effects.ncols(), observed.effects.ncols());
         let gram = told_apart(with_stated(gram, vague))?;
         let found = gram.solve(&towards);
-        let left = |k: usize| solved[(k, p)] - (0..p).map(|a| solved[(k, a)] * found[a]).sum::<f64>();
-        let weights: Vec<f64> = (0..n).map(left).collect();
-        let squares: f64 = (0..n).map(|k| deviations_mm[k] * weights[k]).sum();
+        let mut weights = solved.col_as_slice(p).to_vec();
+        for a in 0..p {
+            weights.iter_mut().zip(solved.col_as_slice(a)).for_each(|(weight, of)| *weight -= of * found[a]);
+        }
+        let squares = dot(deviations_mm, &weights);
         let log_gram: f64 = 2.0 * gram.l_dirty().diagonal().iter().map(|v| v.ln()).sum::<f64>();
         Ok(Self {
             hyper,
@@ -73,7 +75,7 @@ impl Dense {
             path: path.clone(),
             stated: observed.stated.clone(),
             weights,
-            effects: Mat::from_fn(n, p, |r, c| solved[(r, c)]),
+            effects: solved.subcols(0, p).to_owned(),
             found,
             covariance: gram.inverse(),
             likelihood: -0.5 * (log_det + log_gram + squares + (n - vague) as f64 * std::f64::consts::TAU.ln()),
@@ -142,16 +144,16 @@ impl Dense {
 
     /// Tells the field at some places, the effects taken off.
     pub fn predict(&self, places: &[[f64; 2]]) -> Vec<Predicted> {
-        let (n, p) = (self.places.len(), self.found.len());
-        let across = Mat::from_fn(n, places.len(), |r, c| self.hyper.field.covariance_mm2(self.places[r], places[c]));
+        let p = self.found.len();
+        let across = self.hyper.field.pairs().across(&self.places, places);
         let solved = self.factor.solve(&across);
         let sigma2 = self.hyper.field.sigma_mm * self.hyper.field.sigma_mm;
         (0..places.len())
             .map(|c| {
-                let mean_mm = (0..n).map(|k| across[(k, c)] * self.weights[k]).sum();
-                let known: f64 = (0..n).map(|k| across[(k, c)] * solved[(k, c)]).sum();
-                let moved =
-                    DVector::from_fn(p, |a, _| (0..n).map(|k| self.effects[(k, a)] * across[(k, c)]).sum::<f64>());
+                let column = across.col_as_slice(c);
+                let mean_mm = dot(column, &self.weights);
+                let known = dot(column, solved.col_as_slice(c));
+                let moved = DVector::from_fn(p, |a, _| dot(self.effects.col_as_slice(a), column));
                 let by_effects = if p == 0 { 0.0 } else { moved.dot(&(&self.covariance * &moved)) };
                 Predicted { mean_mm, sigma_mm: (sigma2 - known + by_effects).max(0.0).sqrt() }
             })
@@ -160,16 +162,16 @@ impl Dense {
 
     /// The same, with the covariance of every pair of the places.
     pub(super) fn predict_together(&self, places: &[[f64; 2]]) -> (Vec<f64>, Mat<f64>) {
-        let (n, m, p) = (self.places.len(), places.len(), self.found.len());
-        let field = self.hyper.field;
-        let across = Mat::from_fn(n, m, |r, c| field.covariance_mm2(self.places[r], places[c]));
+        let p = self.found.len();
+        let pairs = self.hyper.field.pairs();
+        let across = pairs.across(&self.places, places);
         let solved = self.factor.solve(&across);
         let moved = self.effects.transpose() * &across;
         let known = Mat::from_fn(p, p, |r, c| self.covariance[(r, c)]);
-        let prior = Mat::from_fn(m, m, |r, c| field.covariance_mm2(places[r], places[c]));
+        let prior = pairs.across(places, places);
         let covariance = prior - across.transpose() * &solved + moved.transpose() * &known * &moved;
-        let mean_of = |c: usize| (0..n).map(|k| across[(k, c)] * self.weights[k]).sum();
-        ((0..m).map(mean_of).collect(), covariance)
+        let mean_of = |c: usize| dot(across.col_as_slice(c), &self.weights);
+        ((0..places.len()).map(mean_of).collect(), covariance)
     }
 }
 
@@ -209,25 +211,36 @@ impl Solved {
         let effects = observed.all_effects();
         let (n, p) = (places.len(), effects.ncols());
         let scatter2 = hyper.scatter_mm * hyper.scatter_mm;
-        let covariance = Mat::from_fn(n, n, |r, c| {
+        let pairs = hyper.field.pairs();
+        let mut covariance = Mat::zeros(n, n);
+        for c in 0..n {
             // Only the lower triangle is read.
-            if r < c {
-                0.0
-            } else {
-                let of_field = hyper.field.covariance_mm2(places[r], places[c]);
-                of_field + scatter2 * shared(hyper, path, r, c) + shared_mm2(r, c)
+            let column = &mut covariance.col_as_slice_mut(c)[c..];
+            pairs.column(places[c], &places[c..], column);
+            column.iter_mut().zip(c..).for_each(|(v, r)| *v += shared_mm2(r, c));
+            match path.is_empty() {
+                true => column[0] += scatter2,
+                false => {
+                    column.iter_mut().zip(&path[c..]).for_each(|(v, at)| *v += scatter2 * hyper.shared(at - path[c]))
+                }
             }
-        });
+        }
         let factor = Llt::new(covariance.as_ref(), Side::Lower).map_err(|_| ModelError::NotDefinite)?;
-        let right = Mat::from_fn(n, p + 1, |r, c| if c < p { effects[(r, c)] } else { deviations_mm[r] });
+        let mut right = Mat::zeros(n, p + 1);
+        (0..p).for_each(|c| right.col_as_slice_mut(c).copy_from_slice(effects.column(c).as_slice()));
+        right.col_as_slice_mut(p).copy_from_slice(deviations_mm);
         let solved = factor.solve(&right);
-        let gram = DMatrix::from_fn(p, p, |a, b| (0..n).map(|k| effects[(k, a)] * solved[(k, b)]).sum());
-        let towards = DVector::from_fn(p, |a, _| (0..n).map(|k| effects[(k, a)] * solved[(k, p)]).sum());
-        let own = (0..n).map(|k| deviations_mm[k] * solved[(k, p)]).sum();
+        let gram = DMatrix::from_fn(p, p, |a, b| dot(right.col_as_slice(a), solved.col_as_slice(b)));
+        let towards = DVector::from_fn(p, |a, _| dot(right.col_as_slice(a), solved.col_as_slice(p)));
+        let own = dot(deviations_mm, solved.col_as_slice(p));
         let diagonal = factor.L().diagonal();
         let log_det: f64 = 2.0 * (0..n).map(|k| diagonal[k].ln()).sum::<f64>();
         Ok(Self { effects, factor, solved, gram, towards, own, log_det })
     }
+}
+
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
 /// Takes in that effects behind the first, which nobody knows, have a variance of 1.

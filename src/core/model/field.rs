@@ -1,7 +1,9 @@
 //! A random field in the plane: how strong it is, how wide, how smooth, and along what lay.
 
+use faer::Mat;
+
 use super::ModelError;
-use super::matern::correlation;
+use super::matern::Curve;
 
 /// A random field whose mean is 0.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -72,8 +74,13 @@ impl Field {
 
     /// Returns the covariance of the field at two places.
     pub fn covariance_mm2(&self, a: [f64; 2], b: [f64; 2]) -> f64 {
-        let [u, v] = self.straightened([a[0] - b[0], a[1] - b[1]]);
-        self.sigma_mm * self.sigma_mm * correlation(self.smoothness, u.hypot(v) / self.range_mm)
+        self.pairs().covariance_mm2(a, b)
+    }
+
+    /// What the covariance of every pair of places is told by: for who asks for many.
+    pub(super) fn pairs(&self) -> Pairs {
+        let [x, y] = [[1.0, 0.0], [0.0, 1.0]].map(|axis| self.straightened(axis).map(|v| v / self.range_mm));
+        Pairs { x, y, variance_mm2: self.sigma_mm * self.sigma_mm, curve: Curve::of(self.smoothness) }
     }
 
     /// Takes the plane to one in which the field is alike in all directions; an area stays as large as it is.
@@ -96,6 +103,37 @@ impl Field {
         let Lay { along: [c, s], stretch } = self.lay;
         let is_lay = stretch.is_finite() && stretch >= 1.0 && (c.hypot(s) - 1.0).abs() < 1e-9;
         if is_lay { Ok(()) } else { Err(ModelError::Lay { along: [c, s], stretch }) }
+    }
+}
+
+/// A field, as it is asked for pairs of places.
+#[derive(Clone, Copy)]
+pub(super) struct Pairs {
+    /// Where the axes go in the plane in which the field is alike in all directions and has a range of 1.
+    x: [f64; 2],
+    y: [f64; 2],
+    variance_mm2: f64,
+    curve: Curve,
+}
+
+impl Pairs {
+    #[inline]
+    pub(super) fn covariance_mm2(&self, a: [f64; 2], b: [f64; 2]) -> f64 {
+        let (dx, dy) = (a[0] - b[0], a[1] - b[1]);
+        let (u, v) = (self.x[0] * dx + self.y[0] * dy, self.x[1] * dx + self.y[1] * dy);
+        self.variance_mm2 * self.curve.at(u * u + v * v)
+    }
+
+    /// Writes the covariances of a place with others.
+    pub(super) fn column(&self, at: [f64; 2], places: &[[f64; 2]], into: &mut [f64]) {
+        into.iter_mut().zip(places).for_each(|(into, place)| *into = self.covariance_mm2(at, *place));
+    }
+
+    /// The covariances of some places, a row each, with others, a column each.
+    pub(super) fn across(&self, rows: &[[f64; 2]], columns: &[[f64; 2]]) -> Mat<f64> {
+        let mut across = Mat::zeros(rows.len(), columns.len());
+        columns.iter().enumerate().for_each(|(c, at)| self.column(*at, rows, across.col_as_slice_mut(c)));
+        across
     }
 }
 

@@ -10,6 +10,7 @@ use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, SymmetricEigen, Vector6};
 use rayon::prelude::*;
 
 use super::budget::{self, Share};
+use super::field::Pairs;
 use super::likelihood::{ANY, ON_A_GRID, Told};
 use super::machine::{Effects, Machine, Source, unsound};
 use super::normals::Normals;
@@ -290,14 +291,14 @@ fn of_the_fit(observed: &Observed, likely: &[(Hyper, f64)], alike: &DMatrix<f64>
     // A+, a row a point.
     let weights = &rows * inverse(&rows);
     let p = rows.ncols();
-    let fields: Vec<_> = likely.iter().filter(|(_, weight)| *weight > FEW * whole).collect();
+    let counting = likely.iter().filter(|(_, weight)| *weight > FEW * whole);
+    let fields: Vec<_> = counting.map(|(hyper, weight)| (hyper.field.pairs(), weight / whole)).collect();
     let covered: Vec<f64> = chosen
         .par_iter()
         .flat_map_iter(|&a| {
             let mut sum = vec![0.0; p];
             for (k, &b) in chosen.iter().enumerate() {
-                let of =
-                    |(hyper, weight): &&(Hyper, f64)| weight / whole * hyper.field.covariance_mm2(places[a], places[b]);
+                let of = |(pairs, weight): &(Pairs, f64)| weight * pairs.covariance_mm2(places[a], places[b]);
                 let covariance: f64 = fields.iter().map(of).sum();
                 sum.iter_mut().zip(weights.row(k).iter()).for_each(|(sum, weight)| *sum += covariance * weight);
             }

@@ -190,8 +190,11 @@ impl Growing {
     /// L^-1 of the covariances of a place with all points.
     fn solved(&self, place: [f64; 2], row: &[f64]) -> Vec<f64> {
         let mut l: Vec<f64> = Vec::with_capacity(self.told.len());
+        let pairs = self.hyper.field.pairs();
+        let vague = (VAGUE * self.hyper.field.sigma_mm).powi(2);
         for (k, lower) in self.lower.iter().enumerate() {
-            let covariance = self.covariance_mm2((place, row), (self.told[k], &self.moved[k]));
+            let by_effects: f64 = row.iter().zip(&self.moved[k]).map(|(a, b)| a * b).sum();
+            let covariance = pairs.covariance_mm2(place, self.told[k]) + vague * by_effects;
             let before: f64 = lower.iter().zip(&l).map(|(a, b)| a * b).sum();
             l.push((covariance - before) / lower[k]);
         }
@@ -225,12 +228,13 @@ impl Growing {
     fn carry(&mut self, from: usize) {
         let Self { hyper, places, effects, told, moved, lower, whitened, blocks } = self;
         let vague = (VAGUE * hyper.field.sigma_mm).powi(2);
+        let pairs = hyper.field.pairs();
         blocks.par_iter_mut().for_each(|block| {
             for k in from..told.len() {
                 let mut row: Vec<f64> = (block.first..block.first + block.mean_mm.len())
                     .map(|at| {
                         let by_effects: f64 = moved[k].iter().zip(effects.row(at).iter()).map(|(a, b)| a * b).sum();
-                        hyper.field.covariance_mm2(told[k], places[at]) + vague * by_effects
+                        pairs.covariance_mm2(told[k], places[at]) + vague * by_effects
                     })
                     .collect();
                 for (l, across) in lower[k].iter().zip(&block.across) {

@@ -22,6 +22,9 @@ pub struct Priors {
     pub scatter_ratio: [f64; 2],
 }
 
+/// By what factors the range and the ratio of a part are off of which nothing is known, and how many parts are like none before.
+const EVERY: [f64; 2] = [6.0, 20.0];
+const LIKE_NONE: f64 = 0.2;
 /// Ratios of scatter to field at which the search begins.
 const RATIOS: [f64; 4] = [0.01, 0.1, 0.6, 3.0];
 /// What is spoken for by so much less than the best (in the logarithm) is left out; so is what has all but the same range.
@@ -58,18 +61,26 @@ const POINTS_A_BLOCK: usize = 48;
 const MOST_BLOCKS: usize = 40;
 
 impl Priors {
-    /// What every part is like: the range some third of its size, the scatter a twentieth of the field, each by a factor of six.
+    /// What every part is like: the range some third of its size, the scatter a twentieth of the field, each by a factor of its own.
     pub fn of_size(size_mm: f64) -> Self {
-        Self { range_mm: [size_mm / 3.0, 6.0], scatter_ratio: [0.05, 20.0] }
+        Self { range_mm: [size_mm / 3.0, EVERY[0]], scatter_ratio: [0.05, EVERY[1]] }
     }
 
-    /// Beyond one factor it falls as slowly as it does there (Huber 1964): a part that is like none before is told by its own points.
+    /// One part of a few is like none before, and differs from what is expected as much as parts of which nothing is known (Schmidli and others
+    /// 2014). Beyond one factor either falls as slowly as it does there (Huber 1964).
     pub(super) fn log_density(&self, range_mm: f64, ratio: f64) -> f64 {
-        let of = |value: f64, [median, factor]: [f64; 2]| {
+        let of = |value: f64, median: f64, factor: f64| {
             let off = ((value / median).ln() / factor.ln()).abs();
-            if off <= 1.0 { -0.5 * off * off } else { 0.5 - off }
+            (if off <= 1.0 { -0.5 * off * off } else { 0.5 - off }) - factor.ln().ln()
         };
-        of(range_mm, self.range_mm) + of(ratio, self.scatter_ratio)
+        let by = |[of_range, of_ratio]: [f64; 2]| {
+            of(range_mm, self.range_mm[0], of_range) + of(ratio, self.scatter_ratio[0], of_ratio)
+        };
+        let factors = [self.range_mm[1], self.scatter_ratio[1]];
+        let like = by(factors) + (1.0 - LIKE_NONE).ln();
+        let unlike = by([factors[0].max(EVERY[0]), factors[1].max(EVERY[1])]) + LIKE_NONE.ln();
+        let higher = like.max(unlike);
+        higher + ((like - higher).exp() + (unlike - higher).exp()).ln()
     }
 }
 
@@ -101,11 +112,15 @@ impl Hyper {
         let (plain, _) = search.at(&search.all, best.1.0, best.0)?;
         let ratio = best.1.0[1].exp();
         let mut all = vec![best];
-        for &smoothness in smoothness.iter().filter(|of| **of != best.0.smoothness) {
-            let shape = Shape { smoothness, ..best.0 };
+        let others: Vec<_> = smoothness.iter().filter(|of| **of != best.0.smoothness).collect();
+        let climb = |smoothness: &&Smoothness| {
+            let shape = Shape { smoothness: **smoothness, ..best.0 };
             // What is smoother is narrower, and leaves more to the scatter.
             let seen = search.tops(shape, &[ratio, 3.0 * ratio]);
             let top = search.climbed(&seen, shape);
+            (shape, seen, top)
+        };
+        for (shape, seen, top) in others.par_iter().map(climb).collect::<Vec<_>>() {
             if top.1 > all[0].1.1 {
                 tops = seen;
                 all.insert(0, (shape, top));
@@ -196,7 +211,7 @@ impl<'a> Search<'a> {
 
     fn climbed(&self, tops: &[Top], shape: Shape) -> Top {
         let start = tops.iter().copied().fold(tops[0], higher);
-        climb(start.0, [0.15 * self.far, 0.7], 0.01, |place| self.height(&self.all, place, shape))
+        climb(start.0, [0.15 * self.far, 0.7], 0.02, |place| self.height(&self.all, place, shape))
     }
 
     /// The drift that is spoken for most, with the top of the likelihood by it; none where it is spoken for by too little more than none.
@@ -283,13 +298,19 @@ fn higher(a: Top, b: Top) -> Top {
 }
 
 /// The drift that is spoken for most, with the top of the likelihood by it; none where it is spoken for by too little more than none.
-fn told_drift(without: Top, search: impl Fn(f64) -> Top, climb: impl Fn(Top, f64) -> Top) -> Option<(f64, Top)> {
+fn told_drift(
+    without: Top,
+    search: impl Fn(f64) -> Top + Sync,
+    climb: impl Fn(Top, f64) -> Top + Sync,
+) -> Option<(f64, Top)> {
     let higher = |a: (f64, Top), b: (f64, Top)| if b.1.1 > a.1.1 { b } else { a };
-    let mut best = DRIFTS.map(|drift| (drift, search(drift))).into_iter().fold((0.0, without), higher);
+    let seen: Vec<_> = DRIFTS.par_iter().map(|&drift| (drift, search(drift))).collect();
+    let mut best = seen.into_iter().fold((0.0, without), higher);
     // From there in ever smaller steps: what is near is spoken for by much the same range and ratio.
     for step in DRIFT_STEPS {
         let beside = [best.0 - step, best.0 + step].map(|drift| drift.clamp(0.0, MOST_DRIFT));
-        best = beside.map(|drift| (drift, climb(best.1, drift))).into_iter().fold(best, higher);
+        let seen: Vec<_> = beside.par_iter().map(|&drift| (drift, climb(best.1, drift))).collect();
+        best = seen.into_iter().fold(best, higher);
     }
     (best.1.1 > without.1 + DRIFT_EVIDENCE).then_some(best)
 }
@@ -393,19 +414,22 @@ fn scaled(
     let (mut value, mut squares, mut free) = (known, 0.0, 0.0);
     if told[0].stated.ncols() > 0 {
         let first = Profile::of(&told[0], unit)?;
-        let others = told[1..].iter().filter_map(|observed| Profile::of(observed, unit).ok());
+        let others: Vec<_> = told[1..].par_iter().filter_map(|observed| Profile::of(observed, unit).ok()).collect();
         let (sigma_mm, of) = best_scale(&std::iter::once(first).chain(others).collect::<Vec<_>>());
         let hyper = Hyper { field: Field { sigma_mm, ..unit.field }, scatter_mm: ratio * sigma_mm, drift };
         return Ok((hyper, value + of));
     }
-    for (k, observed) in told.iter().enumerate() {
-        let model = match Dense::fit(observed, unit) {
-            Ok(model) => model,
+    let fit = |observed: &Observed| {
+        Dense::fit(observed, unit).map(|model| (model.log_likelihood(), model.whitened_squares(observed)))
+    };
+    let fitted: Vec<_> = told.par_iter().map(fit).collect();
+    for (k, (observed, fitted)) in told.iter().zip(fitted).enumerate() {
+        let (likelihood, of) = match fitted {
+            Ok(fitted) => fitted,
             Err(error) if k == 0 => return Err(error),
             Err(_) => continue,
         };
-        let of = model.whitened_squares(observed);
-        value += model.log_likelihood() + 0.5 * of;
+        value += likelihood + 0.5 * of;
         squares += of;
         free += (observed.places.len() - observed.effects.ncols()) as f64;
     }
@@ -506,6 +530,17 @@ mod tests {
             assert!(off[0].abs() < 0.1 && off[1].abs() < 0.3, "{off:?} {all:?}");
             assert!(drift > 0.0 || all.iter().all(|h| h.drift == 0.0), "{all:?}");
         }
+    }
+
+    #[test]
+    fn what_was_taught_counts_for_no_more_than_that_one_part_of_five_is_like_none_before() {
+        let taught = Priors { range_mm: [8.0, 2.0], scatter_ratio: [0.1, 2.0] };
+        let [at, off] = [8.0, 8.0 * 25.0].map(|range_mm| taught.log_density(range_mm, 0.1));
+        // By hand: ln(0.8 / ln^2 2 + 0.2 / (ln 6 ln 20)), and of what is 25 times as wide all but nothing but the second, (0.5 - ln 25 / ln 6) lower.
+        let (like, unlike) = (0.8 / 2f64.ln().powi(2), 0.2 / (6f64.ln() * 20f64.ln()));
+        let [near, far] = [0.5 - 25f64.ln() / 2f64.ln(), 0.5 - 25f64.ln() / 6f64.ln()];
+        assert!((at - (like + unlike).ln()).abs() < 1e-12, "{at}");
+        assert!((off - (like * near.exp() + unlike * far.exp()).ln()).abs() < 1e-12, "{off}");
     }
 
     #[test]

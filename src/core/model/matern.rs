@@ -16,26 +16,42 @@ const LAST: usize = 45;
 /// A table of the correlation and its slope.
 type Table = OnceLock<Vec<[f64; 2]>>;
 
-/// Returns the correlation at a distance in ranges.
-pub(super) fn correlation(smoothness: Smoothness, ranges: f64) -> f64 {
-    static ONCE: Table = Table::new();
-    static THRICE: Table = Table::new();
-    match smoothness {
-        Smoothness::Once => read(&ONCE, 2, 4.0 * ranges),
-        Smoothness::Thrice => read(&THRICE, 4, 32_f64.sqrt() * ranges),
-        Smoothness::Endless => (-2.0 * ranges * ranges).exp(),
+/// The correlation over the distance: of one smoothness, the same for every pair of places.
+#[derive(Clone, Copy)]
+pub(super) struct Curve {
+    /// The steps in which the correlation is read; none where it is an exponential.
+    table: Option<&'static [[f64; 2]]>,
+    /// Steps of the table in one range.
+    steps: f64,
+}
+
+impl Curve {
+    pub(super) fn of(smoothness: Smoothness) -> Self {
+        static ONCE: Table = Table::new();
+        static THRICE: Table = Table::new();
+        match smoothness {
+            Smoothness::Once => Self { table: Some(read(&ONCE, 2)), steps: 4.0 * STEPS as f64 },
+            Smoothness::Thrice => Self { table: Some(read(&THRICE, 4)), steps: 32_f64.sqrt() * STEPS as f64 },
+            Smoothness::Endless => Self { table: None, steps: 0.0 },
+        }
+    }
+
+    /// Returns the correlation at a distance in ranges, by its square.
+    #[inline]
+    pub(super) fn at(&self, ranges2: f64) -> f64 {
+        let Some(table) = self.table else { return (-2.0 * ranges2).exp() };
+        let at = (self.steps * ranges2.sqrt()).min((LAST * STEPS) as f64);
+        let k = at as usize;
+        let Some([[a, da], [b, db]]) = table.get(k..k + 2).and_then(|pair| pair.first_chunk::<2>()) else { return 0.0 };
+        let t = at - k as f64;
+        let (u, v) = (1.0 - t, t);
+        const H: f64 = 1.0 / STEPS as f64;
+        u * u * (1.0 + 2.0 * v) * a + v * v * (1.0 + 2.0 * u) * b + H * u * v * (u * da - v * db)
     }
 }
 
-fn read(table: &Table, nu: i32, x: f64) -> f64 {
-    let table = table.get_or_init(|| (0..=LAST * STEPS).map(|k| exact(nu, k as f64 / STEPS as f64)).collect());
-    let at = (x.abs() * STEPS as f64).min((LAST * STEPS) as f64);
-    let k = at as usize;
-    let (Some([a, da]), Some([b, db])) = (table.get(k), table.get(k + 1)) else { return 0.0 };
-    let t = at - k as f64;
-    let h = 1.0 / STEPS as f64;
-    let (u, v) = (1.0 - t, t);
-    u * u * (1.0 + 2.0 * v) * a + v * v * (1.0 + 2.0 * u) * b + h * u * v * (u * da - v * db)
+fn read(table: &'static Table, nu: i32) -> &'static [[f64; 2]] {
+    table.get_or_init(|| (0..=LAST * STEPS).map(|k| exact(nu, k as f64 / STEPS as f64)).collect())
 }
 
 /// The correlation and its slope, M' = -2^(1 - nu) x^nu K_(nu-1)(x) / Gamma(nu).
@@ -70,6 +86,10 @@ fn bessel(nu: f64, x: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn correlation(smoothness: Smoothness, ranges: f64) -> f64 {
+        Curve::of(smoothness).at(ranges * ranges)
+    }
 
     /// K_2 and K_4 from tables (Abramowitz and Stegun, 9.8; Wolfram): 0.1, 1, 2, 5, 10.
     const K: [(f64, f64, f64); 5] = [

@@ -188,6 +188,7 @@ impl Sessions {
 
     fn fit(&self, hyper: Hyper, own: Field) -> Result<Dense, ModelError> {
         let places = &self.observed.places;
+        let own = own.pairs();
         Dense::with(&self.observed, hyper, |a, b| match self.of[a] == self.of[b] {
             true => own.covariance_mm2(places[a], places[b]),
             false => 0.0,
@@ -228,8 +229,9 @@ impl Between {
         let model = known.thinned(MOST_KNOWN).fit(self.hyper, self.own)?;
         let Observed { places, effects, .. } = &unseen.observed;
         let (means_mm, common) = model.predict_together(places);
+        let pairs = self.own.pairs();
         let own = Mat::from_fn(places.len(), places.len(), |r, c| match unseen.of[r] == unseen.of[c] {
-            true => self.own.covariance_mm2(places[r], places[c]),
+            true => pairs.covariance_mm2(places[r], places[c]),
             false => 0.0,
         });
         let base = Base::of(effects);

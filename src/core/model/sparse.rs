@@ -204,18 +204,23 @@ fn pattern(counts: [usize; 2], reach: isize) -> (Vec<usize>, Vec<usize>) {
 /// and the spline at a node make of them.
 fn unit_variance(kappa_h: f64, reach: isize) -> f64 {
     // The function is smooth and returns to itself: equal steps are exact once they are finer than its width.
-    let steps = ((40.0 / kappa_h) as usize).clamp(64, 4096);
+    let steps = ((20.0 / kappa_h) as usize).clamp(32, 2048) * 2;
     let wave = |k: usize| (std::f64::consts::TAU * k as f64 / steps as f64).cos();
     let spline = |c: f64| match reach {
         3 => (3.0 + c) / 4.0,
         _ => (114.0 + 76.0 * c + 2.0 * c * c) / 192.0,
     };
-    // K, m and the spline along one axis.
-    let axis: Vec<[f64; 3]> = (0..steps).map(wave).map(|c| [2.0 - 2.0 * c, (5.0 + c) / 6.0, spline(c)]).collect();
+    // K, m and the spline along one axis. A wave and the one that runs the other way tell the same, and so do the two axes.
+    let axis: Vec<[f64; 3]> = (0..=steps / 2).map(wave).map(|c| [2.0 - 2.0 * c, (5.0 + c) / 6.0, spline(c)]).collect();
+    let weight = |k: usize| if k == 0 || 2 * k == steps { 1.0 } else { 2.0 };
     let of = |[ka, ma, sa]: [f64; 3], [kb, mb, sb]: [f64; 3]| {
         (sa * sb).powi(2) * (kappa_h * kappa_h * ma * mb + ka * mb + ma * kb).powi(-reach as i32)
     };
-    let rows: Vec<f64> = axis.par_iter().map(|&a| axis.iter().map(|&b| of(a, b)).sum()).collect();
+    let row = |a: usize| {
+        let beside: f64 = (0..a).map(|b| weight(b) * of(axis[a], axis[b])).sum();
+        weight(a) * (2.0 * beside + weight(a) * of(axis[a], axis[a]))
+    };
+    let rows: Vec<f64> = (0..axis.len()).into_par_iter().map(row).collect();
     rows.iter().sum::<f64>() / (steps * steps) as f64
 }
 
@@ -386,20 +391,20 @@ impl<'a> Sparse<'a> {
             let mut normals: Vec<Normals> = (first..first + BATCH).map(|k| Normals::new(seed, k as u64)).collect();
             let mut white = Mat::zeros(nodes, BATCH);
             for (c, normals) in normals.iter_mut().enumerate() {
-                (0..nodes).for_each(|r| white[(r, c)] = normals.next());
+                white.col_as_slice_mut(c).fill_with(|| normals.next());
             }
-            let field = self.factor.colour(white)?;
+            let mut field = self.factor.colour(white)?;
             let mut values = Vec::with_capacity(BATCH * places.len());
             for (c, normals) in normals.iter_mut().enumerate().take(count - first) {
                 let drawn = DVector::from_fn(p, |_, _| normals.next());
                 let off = root.as_ref().map_or(DVector::zeros(p), |root| root * drawn);
-                values.extend(around.iter().map(|nodes| {
-                    let at = |&(node, weight): &(usize, f64)| {
-                        let moved: f64 = (0..p).map(|a| self.follows[(node, a)] * off[a]).sum();
-                        weight * (self.mean_mm[node] + field[(node, c)] - moved)
-                    };
-                    nodes.iter().map(at).sum::<f64>()
-                }));
+                let field = field.col_as_slice_mut(c);
+                field.iter_mut().zip(&self.mean_mm).for_each(|(field, mean)| *field += mean);
+                for (a, off) in off.iter().enumerate() {
+                    field.iter_mut().zip(self.follows.col_as_slice(a)).for_each(|(field, of)| *field -= of * off);
+                }
+                let at = |nodes: &Around| nodes.iter().map(|&(node, weight)| weight * field[node]).sum::<f64>();
+                values.extend(around.iter().map(at));
             }
             Some(values)
         };

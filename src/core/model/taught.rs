@@ -8,7 +8,7 @@
 //! v; what is expected of the next has that mean and the variance
 //!
 //! ```text
-//!  (2 w^2 + (n - 1) v) / (n + 1) * (1 + 1 / n)        and no less than (ln 1.5)^2
+//!  (2 w^2 + (n - 1) v) / (n + 1) * (1 + 1 / n)        and no less than (ln 2)^2
 //! ```
 //!
 //! where w = ln 2.5 is how much parts are taken to differ before anything is known of it.
@@ -21,7 +21,7 @@ use super::{Hyper, Priors};
 const DIFFERENT: f64 = 2.5;
 const COUNTS_FOR: f64 = 2.0;
 /// What is expected is never narrower than this factor: a part that differs is still told from its own points.
-const NARROWEST: f64 = 1.5;
+const NARROWEST: f64 = 2.0;
 /// Machines change: no more parts than these count.
 const MOST_PARTS: u32 = 20;
 
@@ -141,7 +141,7 @@ mod tests {
             lesson = Some(next);
         }
         assert!(factors.windows(2).all(|pair| pair[1] <= pair[0] + 1e-12), "{factors:?}");
-        assert_eq!((factors[199], lesson.unwrap().parts), (1.5, 20));
+        assert_eq!((factors[199], lesson.unwrap().parts), (2.0, 20));
         // A machine that has changed.
         for _ in 0..80 {
             lesson = Some(Lesson::after(lesson, &hyper(60.0, 0.3)));
@@ -156,7 +156,7 @@ mod tests {
             .map(|k| hyper(if k % 2 == 0 { 5.0 } else { 80.0 }, 0.3))
             .fold(None, |lesson, hyper| Some(Lesson::after(lesson, &hyper)));
         let priors = lesson.unwrap().priors();
-        assert!(priors.range_mm[1] > 3.5 && priors.scatter_ratio[1] < 1.6, "{priors:?}");
+        assert!(priors.range_mm[1] > 3.5 && priors.scatter_ratio[1] < 2.1, "{priors:?}");
     }
 
     #[test]
