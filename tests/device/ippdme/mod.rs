@@ -1,0 +1,3 @@
+//! The driver of I++ DME against servers at the far end of its wire.
+
+mod vectors;
