@@ -605,6 +605,16 @@ pub fn is_there(cell: &CellConfig, device: Device) -> Result<(), MakingError> {
     }
 }
 
+/// Makes the driver of the measuring machine for no part yet: to look at it. Nothing is asked of the machine.
+///
+/// # Errors
+/// Those of [`machines`].
+pub fn cmm(cell: &CellConfig) -> Result<AnyCmm, MakingError> {
+    let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
+    let link = &cell.cmm.link;
+    link.wire.cmm(&Making { cell_folder, volume_mm: volume_mm(cell), ..making(link, cell.simulated, [1, 1]) })
+}
+
 /// The box that the probe's centre must not leave.
 fn volume_mm(cell: &CellConfig) -> Option<[[f64; 3]; 2]> {
     cell.cmm.travel.as_ref().map(|travel| [travel.least_mm, travel.most_mm])

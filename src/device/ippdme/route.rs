@@ -9,8 +9,6 @@ use crate::payload::{Plan, Target};
 
 /// More targets than this are touched in the order of the plan: their order would take longer to find than it saves.
 const MOST_ORDERED: usize = 6000;
-/// More targets than this are not improved beyond the nearest neighbour.
-const MOST_IMPROVED: usize = 2500;
 /// A normal that points further down than this cannot be come at from above.
 const LEAST_UP: f64 = -0.2;
 
@@ -145,67 +143,153 @@ fn nearest(places: &[[f64; 2]], begin: Option<[f64; 2]>) -> Vec<usize> {
     order
 }
 
-/// Two-opt and Or-opt, until neither shortens the way.
-fn improve(places: &[[f64; 2]], order: &mut Vec<usize>) {
+/// Two-opt and Or-opt over the near neighbours of each stop, until neither shortens the way.
+fn improve(places: &[[f64; 2]], order: &mut [usize]) {
     const PASSES: usize = 30;
-    if places.len() > MOST_IMPROVED {
+    if order.len() < 4 {
         return;
     }
+    let mut tour = Tour::new(places, order);
     for _ in 0..PASSES {
-        let turned = turn_stretches(places, order);
-        if !move_stretches(places, order) && !turned {
+        let mut better = false;
+        for stop in 0..places.len() {
+            better |= tour.turn_behind(stop) || tour.turn_before(stop) || tour.carry(stop);
+        }
+        if !better {
             break;
         }
     }
 }
 
-/// The way between two stops of an order; none before the first and behind the last.
-fn leg(places: &[[f64; 2]], order: &[usize], a: Option<usize>, b: Option<usize>) -> f64 {
-    match (a.and_then(|a| order.get(a)), b.and_then(|b| order.get(b))) {
-        (Some(a), Some(b)) => apart(places[*a], places[*b]),
-        _ => 0.0,
-    }
+/// A way that is being made shorter. Its first stop stays, for the way to it is not known here.
+struct Tour<'a> {
+    places: &'a [[f64; 2]],
+    order: &'a mut [usize],
+    /// Where in the order each stop is.
+    at: Vec<usize>,
+    /// The nearest other stops of each, the nearest first.
+    near: Vec<Vec<usize>>,
 }
 
-fn turn_stretches(places: &[[f64; 2]], order: &mut [usize]) -> bool {
-    let mut better = false;
-    // The first stop stays, for the way to it is not known here.
-    for i in 1..order.len() {
-        for j in i + 1..order.len() {
-            let before = leg(places, order, Some(i - 1), Some(i)) + leg(places, order, Some(j), Some(j + 1));
-            let after = leg(places, order, Some(i - 1), Some(j)) + leg(places, order, Some(i), Some(j + 1));
-            if after < before - 1e-9 {
-                order[i..=j].reverse();
-                better = true;
+impl<'a> Tour<'a> {
+    fn new(places: &'a [[f64; 2]], order: &'a mut [usize]) -> Self {
+        let near = (0..places.len()).map(|k| neighbours(places, k)).collect();
+        let mut tour = Self { places, at: vec![0; order.len()], order, near };
+        tour.note(0..tour.order.len());
+        tour
+    }
+
+    fn note(&mut self, stretch: Range<usize>) {
+        for k in stretch {
+            self.at[self.order[k]] = k;
+        }
+    }
+
+    fn apart(&self, a: usize, b: usize) -> f64 {
+        apart(self.places[a], self.places[b])
+    }
+
+    /// The way between two stops; none where there is no second one.
+    fn to(&self, a: usize, b: Option<&usize>) -> f64 {
+        b.map_or(0.0, |b| self.apart(a, *b))
+    }
+
+    fn turn(&mut self, stretch: Range<usize>) {
+        self.order[stretch.clone()].reverse();
+        self.note(stretch);
+    }
+
+    /// Turns round what lies behind a stop so that one of its neighbours comes next.
+    fn turn_behind(&mut self, stop: usize) -> bool {
+        let i = self.at[stop];
+        let Some(&next) = self.order.get(i + 1) else { return false };
+        let now = self.apart(stop, next);
+        for k in 0..self.near[stop].len() {
+            let other = self.near[stop][k];
+            let (j, saved) = (self.at[other], now - self.apart(stop, other));
+            if saved <= 1e-9 {
+                break;
+            }
+            let behind = self.order.get(j + 1);
+            if j > i && saved + self.to(other, behind) - self.to(next, behind) > 1e-9 {
+                self.turn(i + 1..j + 1);
+                return true;
             }
         }
+        false
     }
-    better
+
+    /// Turns round what lies before a stop so that one of its neighbours comes just before.
+    fn turn_before(&mut self, stop: usize) -> bool {
+        let i = self.at[stop];
+        if i < 2 {
+            return false;
+        }
+        let last = self.order[i - 1];
+        let now = self.apart(last, stop);
+        for k in 0..self.near[stop].len() {
+            let other = self.near[stop][k];
+            let (j, saved) = (self.at[other], now - self.apart(stop, other));
+            if saved <= 1e-9 {
+                break;
+            }
+            if (1..i).contains(&j) {
+                let before = self.order[j - 1];
+                if saved + self.apart(before, other) - self.apart(before, last) > 1e-9 {
+                    self.turn(j..i);
+                    return true;
+                }
+            }
+        }
+        false
+    }
+
+    /// Carries a stretch of one to three stops, which begins with this one, behind a neighbour of it.
+    fn carry(&mut self, stop: usize) -> bool {
+        let i = self.at[stop];
+        for size in 1..=3 {
+            if i == 0 || i + size > self.order.len() {
+                return false;
+            }
+            let (before, last, behind) = (self.order[i - 1], self.order[i + size - 1], self.order.get(i + size));
+            let saved = self.apart(before, stop) + self.to(last, behind) - self.to(before, behind);
+            for k in 0..self.near[stop].len() {
+                let other = self.near[stop][k];
+                let j = self.at[other];
+                if self.apart(other, stop) >= saved - 1e-9 {
+                    break;
+                }
+                if (i - 1..i + size).contains(&j) {
+                    continue;
+                }
+                let next = self.order.get(j + 1);
+                if self.apart(other, stop) + self.to(last, next) - self.to(other, next) < saved - 1e-9 {
+                    if j < i {
+                        self.order[j + 1..i + size].rotate_right(size);
+                        self.note(j + 1..i + size);
+                    } else {
+                        self.order[i..=j].rotate_left(size);
+                        self.note(i..j + 1);
+                    }
+                    return true;
+                }
+            }
+        }
+        false
+    }
 }
 
-fn move_stretches(places: &[[f64; 2]], order: &mut Vec<usize>) -> bool {
-    let mut better = false;
-    for size in 1..=3 {
-        let mut i = 1;
-        while i + size < order.len() {
-            let cut = leg(places, order, Some(i - 1), Some(i)) + leg(places, order, Some(i + size - 1), Some(i + size));
-            let saved = cut - leg(places, order, Some(i - 1), Some(i + size));
-            let stretch: Vec<usize> = order.drain(i..i + size).collect();
-            let (first, last) = (places[stretch[0]], places[stretch[size - 1]]);
-            let costs = |k: usize| {
-                let [a, b] = [order.get(k - 1), order.get(k)].map(|stop| stop.map(|stop| places[*stop]));
-                let to = a.map_or(0.0, |a| apart(a, first));
-                let from = b.map_or(0.0, |b| apart(last, b));
-                to + from - a.zip(b).map_or(0.0, |(a, b)| apart(a, b))
-            };
-            let best = (1..=order.len()).min_by(|a, b| costs(*a).total_cmp(&costs(*b))).unwrap_or(i);
-            let to = if costs(best) < saved - 1e-9 { best } else { i };
-            better |= to != i;
-            order.splice(to..to, stretch);
-            i += 1;
-        }
+/// The nearest other places, the nearest first.
+fn neighbours(places: &[[f64; 2]], of: usize) -> Vec<usize> {
+    const NEAR: usize = 10;
+    let mut others: Vec<usize> = (0..places.len()).filter(|k| *k != of).collect();
+    let nearer = |a: &usize, b: &usize| apart(places[*a], places[of]).total_cmp(&apart(places[*b], places[of]));
+    if others.len() > NEAR {
+        others.select_nth_unstable_by(NEAR, nearer);
+        others.truncate(NEAR);
     }
-    better
+    others.sort_unstable_by(nearer);
+    others
 }
 
 fn place(plan: &Plan, k: usize) -> [f64; 2] {

@@ -161,8 +161,8 @@ impl Session {
         if self.is_abort_ordered() {
             return Err(self.abort().await);
         }
-        self.last = self.last % 99_999 + 1;
-        let (command, tag) = (Command::new(name, arguments), Tag::Command(self.last));
+        let command = Command::new(name, arguments);
+        let tag = if command.is_event() { self.next_event() } else { self.next_command() };
         self.write(&command, tag).await.map_err(Failure::Link)?;
         let mut pending =
             Pending { tag, command: &command, acknowledged: false, answer: Answer::default(), error: None };
@@ -254,6 +254,11 @@ impl Session {
     fn was_given(&self, number: u32) -> bool {
         // Tags begin anew after 99999; those before are long over.
         number != 0 && (number <= self.last || number > 99_999 - 1_000 && self.last < 1_000)
+    }
+
+    fn next_command(&mut self) -> Tag {
+        self.last = self.last % 99_999 + 1;
+        Tag::Command(self.last)
     }
 
     fn next_event(&mut self) -> Tag {

@@ -139,6 +139,8 @@ impl Worker {
 
     async fn carry_out(&mut self, order: Order) -> Result<(), Failure> {
         match order {
+            // One that an abort has overtaken is not begun.
+            Order::Run(_) if !locked(&self.shared).state.moves() || self.session.is_abort_ordered() => Ok(()),
             Order::Run(work) => {
                 let began = Instant::now();
                 let ran = self.run(&work).await;
@@ -221,6 +223,9 @@ impl Worker {
         }
         self.rise(work).await?;
         let mut shared = locked(&self.shared);
+        if shared.state == State::Aborting {
+            return Ok(()); // The abort is next.
+        }
         shared.clear = Some(true);
         (shared.state, shared.outcome) = match *self.wish.borrow() {
             _ if shared.points.iter().all(Option::is_some) => (State::Complete, Outcome::Complete),
