@@ -6,6 +6,7 @@
 use std::sync::{Arc, Mutex};
 
 use tokio::sync::{mpsc, oneshot, watch};
+use tokio::time::Instant;
 
 use super::response::values;
 use super::route::Route;
@@ -34,6 +35,7 @@ pub struct IppdmeCmm {
     wish: watch::Sender<Wish>,
     /// The task that owns the session; none where there is no session.
     orders: Option<mpsc::Sender<Order>>,
+    identity: Option<Identity>,
     loaded: Option<(Arc<Work>, u32)>,
     /// What the running or prepared job is about.
     work: Option<(Arc<Work>, [u8; 32])>,
@@ -53,6 +55,7 @@ impl IppdmeCmm {
             aborts: watch::Sender::new(0),
             wish: watch::Sender::new(Wish::GoOn),
             orders: None,
+            identity: None,
             loaded: None,
             work: None,
             begun: 0,
@@ -84,7 +87,7 @@ impl IppdmeCmm {
             shared.notes = worker.session.notes();
         }
         tokio::spawn(worker.attend());
-        self.orders = Some(orders);
+        (self.orders, self.identity) = (Some(orders), Some(identity.clone()));
         Ok(identity)
     }
 
@@ -121,7 +124,7 @@ impl IppdmeCmm {
             name: format!("{class}, {version}"),
             boot_id: 0,
             simulation,
-            silence_limit_s: None,
+            silence_limit_s: Some(self.settings.silence_limit.as_secs_f64()),
         })
     }
 
@@ -198,8 +201,12 @@ impl IppdmeCmm {
         orders.send(order).await.map_err(|_| locked(&self.shared).lost.clone().unwrap_or(gone))
     }
 
-    /// Proves that the server answers.
+    /// Proves that the server answers. While something moves the task that moves it sees to that.
     async fn look(&self) -> Answered<()> {
+        self.told()?;
+        if locked(&self.shared).state.moves() {
+            return Ok(());
+        }
         let (answer, looked) = oneshot::channel();
         self.order(Order::Look(answer)).await?;
         // An answer that does not come has made the session lost.
@@ -232,11 +239,19 @@ impl Machine for IppdmeCmm {
     }
 
     async fn connect(&mut self) -> Answered<Identity> {
+        // A server has one client: a session that is whole stays.
+        let whole = self.identity.clone().filter(|_| self.orders.is_some());
+        if let Some(identity) = whole
+            && self.look().await.is_ok()
+        {
+            return Ok(identity);
+        }
         self.orders = None;
         self.open().await
     }
 
     async fn status(&mut self) -> Answered<Status> {
+        locked(&self.shared).looked_at = Instant::now();
         self.told()
     }
 
@@ -283,6 +298,7 @@ impl Machine for IppdmeCmm {
             return Err(self.refused(Command::Start, Answer::OtherJob));
         };
         self.wish.send_replace(Wish::GoOn);
+        locked(&self.shared).looked_at = Instant::now();
         let status = self.go(Command::Start, &[State::Prepared], State::Execute)?;
         self.begun = start_sequence;
         if let Err(error) = self.order(Order::Run(work)).await {
@@ -304,7 +320,9 @@ impl Machine for IppdmeCmm {
             return Err(self.refused(Command::Resume, Answer::WrongState));
         };
         self.wish.send_replace(Wish::GoOn);
+        locked(&self.shared).looked_at = Instant::now();
         let status = self.go(Command::Resume, &[State::Held], State::Execute)?;
+        locked(&self.shared).why = None;
         self.order(Order::Run(work)).await?;
         Ok(status)
     }

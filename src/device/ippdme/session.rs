@@ -183,7 +183,7 @@ impl Session {
             };
             let Some(line) = next else {
                 if Instant::now() >= due || asked_alive.is_some_and(|(_, limit)| Instant::now() >= limit) {
-                    return Err(Failure::Link(self.timed_out(pending.command)));
+                    return Err(Failure::Link(self.timed_out(pending.command, began.elapsed())));
                 }
                 // Its answer is awaited beside that of the command.
                 let (tag, limit) = (self.next_event(), Instant::now() + self.limits.answer);
@@ -316,7 +316,7 @@ impl Session {
             let line = tokio::select! {
                 biased;
                 line = read_line(&mut self.stream, &mut self.unread) => line,
-                () = sleep_until(over) => return Err(Failure::Link(self.timed_out(&command))),
+                () = sleep_until(over) => return Err(Failure::Link(self.timed_out(&command, self.limits.abort))),
             };
             let response = self.understood(line)?;
             match response.said {
@@ -349,7 +349,9 @@ impl Session {
     pub(super) fn note(&mut self, note: String) {
         if !self.notes.contains(&note) {
             self.notes.push_back(note);
-            self.notes.truncate(NOTES);
+            if self.notes.len() > NOTES {
+                self.notes.pop_front();
+            }
         }
     }
 
@@ -357,9 +359,9 @@ impl Session {
         self.notes.iter().cloned().collect()
     }
 
-    fn timed_out(&self, command: &Command) -> DeviceError {
+    fn timed_out(&self, command: &Command, limit: Duration) -> DeviceError {
         let what = super::known(&command.name);
-        DeviceError::TimedOut { machine: Arc::clone(&self.machine), what, limit: self.limits.answer }
+        DeviceError::TimedOut { machine: Arc::clone(&self.machine), what, limit }
     }
 
     fn disconnected(&self, what: &'static str) -> DeviceError {

@@ -95,6 +95,8 @@ pub struct IppdmeSettings {
     pub volume_mm: [[f64; 3]; 2],
     /// How long to wait for what.
     pub limits: Limits,
+    /// Without a look at the status, after which a job holds by itself.
+    pub silence_limit: Duration,
     /// What the machine must call itself.
     pub expected_name: Option<String>,
     /// Whether it has to be a simulation, or must not be one.
@@ -154,6 +156,7 @@ impl Wired for IppdmeWire {
                 after_abort: ms(self.delay_after_abort_ms),
                 alive: ms(self.alive_every_ms),
             },
+            silence_limit: making.timing.lost_after,
             expected_name: making.expected_name.map(str::to_owned),
             simulated: making.simulated,
         }))

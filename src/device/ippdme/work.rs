@@ -61,6 +61,8 @@ pub(super) struct Shared {
     pub(super) points: Vec<Option<MeasuredPoint>>,
     pub(super) radius_mm: Option<f64>,
     pub(super) worked: Duration,
+    /// When somebody looked at it last.
+    pub(super) looked_at: Instant,
     /// Why the session is over.
     pub(super) lost: Option<DeviceError>,
     /// Why the machine stands, and what the server had to say.
@@ -79,6 +81,7 @@ impl Shared {
             points: Vec::new(),
             radius_mm: None,
             worked: Duration::ZERO,
+            looked_at: Instant::now(),
             lost: None,
             why: None,
             notes: Vec::new(),
@@ -205,7 +208,7 @@ impl Worker {
         self.set_up(work).await?;
         let mut unreached = 0;
         for &k in &work.route.order {
-            if *self.wish.borrow() != Wish::GoOn {
+            if self.wished() != Wish::GoOn {
                 break;
             }
             if locked(&self.shared).points[k].is_some() {
@@ -222,18 +225,30 @@ impl Worker {
             }
         }
         self.rise(work).await?;
+        let wish = *self.wish.borrow();
         let mut shared = locked(&self.shared);
         if shared.state == State::Aborting {
             return Ok(()); // The abort is next.
         }
         shared.clear = Some(true);
-        (shared.state, shared.outcome) = match *self.wish.borrow() {
+        (shared.state, shared.outcome) = match wish {
             _ if shared.points.iter().all(Option::is_some) => (State::Complete, Outcome::Complete),
             Wish::Stop => (State::Complete, Outcome::Stopped),
             // Held, or told to go on again at the last moment.
             Wish::Hold | Wish::GoOn => (State::Held, Outcome::None),
         };
         Ok(())
+    }
+
+    /// What is to become of the job. Where nobody has looked for long it holds by itself, as a machine does that misses its client.
+    fn wished(&self) -> Wish {
+        let mut shared = locked(&self.shared);
+        if shared.state == State::Execute && shared.looked_at.elapsed() > self.settings.silence_limit {
+            shared.state = State::Holding;
+            shared.why = Some("nobody looked at it for too long, and it held by itself".to_owned());
+            return Wish::Hold;
+        }
+        *self.wish.borrow()
     }
 
     /// Sees to it that everything is as the plan needs it, whoever was at the machine before.

@@ -55,6 +55,7 @@ pub fn settings(port: u16, limits: Limits) -> IppdmeSettings {
         retries: 1,
         volume_mm: [[-500.0, -500.0, -300.0], [500.0, 500.0, 400.0]],
         limits,
+        silence_limit: Duration::from_secs(20),
         expected_name: None,
         simulated: true,
     }

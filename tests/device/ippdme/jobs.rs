@@ -213,3 +213,16 @@ async fn a_second_client_waits_until_the_first_has_gone() {
     assert!(first.is_ok() && second.is_ok(), "{first:?}, {second:?}");
     let _: &ServingDme = &bench.serving;
 }
+
+#[tokio::test]
+async fn a_job_that_nobody_looks_at_holds_by_itself() {
+    let mut bench = Bench::new(SLOW, patient()).await;
+    let mut settings = settings(bench.serving.local_addr().port(), patient());
+    settings.silence_limit = std::time::Duration::ZERO;
+    bench.cmm = IppdmeCmm::new(settings);
+    let plan = bench.plan(10);
+    bench.begin(&plan).await.unwrap();
+    let held = until(&mut bench.cmm, |status| is(status, State::Held)).await.unwrap();
+    assert!(held.progress.is_some_and(|(done, _)| done < 10));
+    assert!(bench.cmm.notes()[0].contains("nobody looked"), "{:?}", bench.cmm.notes());
+}

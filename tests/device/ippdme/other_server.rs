@@ -29,6 +29,7 @@ fn serve() -> (Python, u16) {
 }
 
 #[tokio::test]
+#[ignore = "needs a Python"]
 async fn a_cap_of_a_sphere_is_measured() {
     let (_python, port) = serve();
     let mut cmm = IppdmeCmm::new(settings(port, patient()));
