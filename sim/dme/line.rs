@@ -206,7 +206,8 @@ mod tests {
             ("012345 GoTo(X(1))", 2),
             ("00001 AbortE()", 1),
             ("00001 GoTo(X(12345678901234567))", 509),
-            ("00001 GoTo(X(1)", 507),
+            ("00001 GoTo(X(1)", 502),
+            ("00001 GoTo(X(1))2", 507),
             ("00001 GoTo(X(1)\t)", 7),
         ] {
             assert_eq!(read(line).unwrap_err().1.number, number, "{line}");

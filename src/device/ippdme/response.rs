@@ -160,6 +160,24 @@ mod tests {
     }
 
     #[test]
+    fn a_line_of_nothing_but_parentheses_is_refused() {
+        assert!(Response::read(&format!("00001 # {}", "A(".repeat(30_000))).is_err());
+    }
+
+    proptest::proptest! {
+        /// Whatever a server sends, no reader falls over it, and what is read as a command is written as one.
+        #[test]
+        fn any_line_is_read_or_refused(line in "([0-9E]{5} [&#!%]? ?)?[A-Za-z0-9().,+\\-\" E]{0,60}|\\PC{0,40}") {
+            let _ = Response::read(&line);
+            if let Ok((tag, command)) = crate::ippdme::Command::read(&line) {
+                let written = command.line(tag);
+                let again = crate::ippdme::Command::read(written.trim_end());
+                proptest::prop_assert_eq!(again, Ok((tag, command)));
+            }
+        }
+    }
+
+    #[test]
     fn errors_are_read_however_they_are_quoted() {
         let read = |line: &str| match said(line) {
             Said::Error(error) => (error.severity, error.number, error.cause, error.text),

@@ -4,6 +4,8 @@ use std::fmt::{self, Write as _};
 
 /// The most digits that a number may have.
 const MOST_DIGITS: usize = 16;
+/// Parentheses in parentheses: the standard has two.
+const DEEPEST: u32 = 8;
 
 /// What holds an answer to its question.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -140,11 +142,12 @@ pub(super) enum Strictness {
 pub(super) struct Reader<'a> {
     rest: &'a str,
     strictness: Strictness,
+    depth: u32,
 }
 
 impl<'a> Reader<'a> {
     pub(super) fn new(rest: &'a str, strictness: Strictness) -> Self {
-        Self { rest, strictness }
+        Self { rest, strictness, depth: 0 }
     }
 
     pub(super) fn rest(&self) -> &'a str {
@@ -253,7 +256,13 @@ impl<'a> Reader<'a> {
         if !self.eat('(') {
             return Ok(Item::Name(name.to_owned()));
         }
-        Ok(Item::Call(name.to_owned(), self.in_parentheses()?))
+        self.depth += 1;
+        if self.depth > DEEPEST {
+            return Err(arguments("parentheses within too many others"));
+        }
+        let items = self.in_parentheses()?;
+        self.depth -= 1;
+        Ok(Item::Call(name.to_owned(), items))
     }
 }
 
