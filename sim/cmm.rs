@@ -252,6 +252,102 @@ impl Cmm {
     }
 }
 
+/// What a touch that the probe is led to comes to.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Touch {
+    /// Where the ball's centre was.
+    Centre(Vec3),
+    /// Nothing was there.
+    Missed,
+    /// Something was there before the search began, or the part is not.
+    Unexpected,
+}
+
+/// The probe of the measuring machine, led touch by touch by a server that knows no plan.
+pub struct Led {
+    world: Arc<Mutex<State>>,
+    run: Option<Run>,
+}
+
+impl Led {
+    pub(crate) fn new(world: Arc<Mutex<State>>) -> Self {
+        Self { world, run: None }
+    }
+
+    /// The least and the largest corner of the travel.
+    pub fn volume_mm(&self) -> [Vec3; 2] {
+        let spec = &locked(&self.world).spec.cmm;
+        [spec.travel_least_mm, spec.travel_most_mm]
+    }
+
+    /// The speed of travel.
+    pub fn travel_mm_s(&self) -> f64 {
+        locked(&self.world).spec.cmm.travel_mm_s
+    }
+
+    /// How long a touch takes.
+    pub fn seconds_per_point(&self) -> f64 {
+        locked(&self.world).spec.cmm.seconds_per_point
+    }
+
+    /// Touches at a point along its normal, with radius, approach and search. The first touch after the part was away is another
+    /// measurement.
+    pub fn touch(
+        &mut self,
+        point_mm: Vec3,
+        normal: Vec3,
+        [probe_radius_mm, approach_mm, search_mm]: [f64; 3],
+    ) -> Touch {
+        let mut state = locked(&self.world);
+        if !state.take(Kind::Cmm) {
+            return Touch::Unexpected;
+        }
+        let feature = feature(&state.spec.cmm, point_mm);
+        let target = Target { index: 0, feature, point_mm, normal };
+        let (speed_mm_s, safe_height_mm, careful) = (1.0, 0.0, (0, 0.0));
+        let plan = Plan {
+            probe_radius_mm,
+            approach_mm,
+            search_mm,
+            speed_mm_s,
+            safe_height_mm,
+            careful,
+            targets: vec![target],
+        };
+        let goes_on = state.on_table;
+        let mut run = match self.run.take() {
+            Some(run) if goes_on => Run { plan, ..run },
+            _ => {
+                let mut run = Run::new(plan);
+                run.begin(&mut state);
+                run
+            }
+        };
+        let record = run.measure(&state, &target);
+        self.run = Some(run);
+        match record.status {
+            Status::Touched => Touch::Centre(record.position_mm),
+            Status::NotFound => Touch::Missed,
+            Status::NotReached => Touch::Unexpected,
+        }
+    }
+
+    /// The probe is clear of the part, and others may have it.
+    pub fn let_go(&mut self) {
+        locked(&self.world).release(Kind::Cmm);
+    }
+}
+
+/// Whether a point is one of the reference sphere: what the probe meets there is that.
+fn feature(spec: &CmmSpec, point_mm: Vec3) -> Feature {
+    let away_mm = (0..3).map(|k| (point_mm[k] - spec.sphere_centre_mm[k]).powi(2)).sum::<f64>().sqrt();
+    if (away_mm - spec.sphere_radius_mm).abs() < 0.5 * spec.sphere_radius_mm {
+        Feature::ReferenceSphere
+    } else {
+        Feature::Part
+    }
+}
+
 fn progress(run: &Run) -> Progress {
     Progress {
         done: run.records.len() as u32,

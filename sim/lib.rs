@@ -24,8 +24,9 @@
 //!  options    how a machine is set up: where its registers are
 //!  handshake  one machine's side of the handshake: states, interlocks, silence
 //!  registers  a whole machine: what a Modbus client reads and writes
+//!  dme        a server of I++ DME, which is told touch by touch what to do
 //!  seen       what the machine saw and did
-//!  wire       Modbus TCP and RTU servers, a serial line without hardware, and everything that goes wrong on them
+//!  wire       Modbus TCP and RTU and I++ DME servers, a serial line without hardware, and everything that goes wrong on them
 //! ```
 //!
 //! Units: millimetres and radians throughout. Frames: `shape` and `form` live in the model frame, the points a probe reports
@@ -34,6 +35,7 @@
 pub mod body;
 pub mod cmm;
 pub mod command;
+pub mod dme;
 pub mod form;
 mod handshake;
 pub mod options;

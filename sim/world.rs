@@ -10,7 +10,7 @@
 use std::fmt;
 use std::sync::{Arc, Mutex};
 
-use crate::cmm::Cmm;
+use crate::cmm::{Cmm, Led};
 use crate::probe::Placement;
 use crate::process::{Grinder, systematic_mm};
 use crate::spec::{Faults, SpecError, WorldSpec};
@@ -47,6 +47,11 @@ impl World {
     /// Returns the measuring machine; there is one, so hand it to one wire.
     pub fn cmm(&self) -> Cmm {
         Cmm::new(self.state.clone())
+    }
+
+    /// Returns the probe of the measuring machine, to be led touch by touch; there is one, so hand it to one wire.
+    pub fn led(&self) -> Led {
+        Led::new(self.state.clone())
     }
 
     /// Puts a new blank in, as an operator would.

@@ -571,6 +571,7 @@ pub fn machines(
             Pattern::Free { least_points } => Some(usize::try_from(*least_points).unwrap_or(usize::MAX)),
             _ => None,
         },
+        volume_mm: volume_mm(cell),
         ..making(link, cell.simulated, [owner, epoch])
     };
     let cmm = cell.cmm.link.wire.cmm(&making(&cell.cmm.link)).map_err(failed)?;
@@ -597,11 +598,26 @@ pub fn is_there(cell: &CellConfig, device: Device) -> Result<(), MakingError> {
         Device::Grinder => &cell.grinder.link,
     };
     let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
-    let making = Making { cell_folder, ..making(link, cell.simulated, [1, 1]) };
+    let making = Making { cell_folder, volume_mm: volume_mm(cell), ..making(link, cell.simulated, [1, 1]) };
     match device {
         Device::Cmm => link.wire.cmm(&making).map(drop),
         Device::Grinder => link.wire.grinder(&making).map(drop),
     }
+}
+
+/// Makes the driver of the measuring machine for no part yet: to look at it. Nothing is asked of the machine.
+///
+/// # Errors
+/// Those of [`machines`].
+pub fn cmm(cell: &CellConfig) -> Result<AnyCmm, MakingError> {
+    let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
+    let link = &cell.cmm.link;
+    link.wire.cmm(&Making { cell_folder, volume_mm: volume_mm(cell), ..making(link, cell.simulated, [1, 1]) })
+}
+
+/// The box that the probe's centre must not leave.
+fn volume_mm(cell: &CellConfig) -> Option<[[f64; 3]; 2]> {
+    cell.cmm.travel.as_ref().map(|travel| [travel.least_mm, travel.most_mm])
 }
 
 /// What a machine of a cell is made of besides its wire, for no part yet.
@@ -618,6 +634,7 @@ fn making(link: &Link, simulated: bool, [owner, epoch]: [u32; 2]) -> Making<'_> 
         registers: &link.registers,
         signals: &link.signals,
         expected_name: link.expected_name.as_deref(),
+        volume_mm: None,
         beside: None,
     }
 }

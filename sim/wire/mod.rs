@@ -1,14 +1,16 @@
-//! The machines' end of a Modbus wire.
+//! The machines' end of a wire.
 //!
 //! ```text
 //!  tcp      any number of clients, several units behind one port
 //!  rtu      a serial line, real or not, that takes as long as its baud rate says
 //!  pty      a serial line without hardware, opened by its path
-//!  faults   what goes wrong, when
+//!  faults   what goes wrong on Modbus, when
+//!  dme      I++ DME over TCP, one client at a time
 //! ```
 //!
 //! [`Serving`] is all that most callers need: it binds, serves, lets the machines' time pass, and stops.
 
+pub mod dme;
 pub mod faults;
 #[cfg(not(unix))]
 #[path = "no_pty.rs"]

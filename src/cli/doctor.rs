@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use regrind::cell::Device;
 use regrind::config::{BUILT_IN, CellConfig};
-use regrind::device::{Line, Machine, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, Status};
+use regrind::device::{DeviceError, Line, Machine, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, Status};
 use regrind::drive::recover::{in_short, look};
 use regrind::formats::{ResultFolder, try_writing};
 use regrind::journal::free_bytes;
@@ -22,7 +22,8 @@ use super::{Outcome, check, control, key};
 /// Look at the computer, the cell file, the machines and a recipe, and say what stands in the way of a run; nothing is moved
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Of a machine on Modbus it reads who it is and how it stands, and writes nothing but the sign of life of a client. Of machines that take files, or
+Of a machine on Modbus it reads who it is and how it stands, and writes nothing but the sign of life of a client. At a server of I++ DME
+it opens a session, asks the same, and ends it. Of machines that take files, or
 that a person serves, nothing is read.
 
 Example:
@@ -168,10 +169,33 @@ async fn machines(cell: &CellConfig) -> Vec<Finding> {
         return vec![Finding::new("machines", Found::Good, "simulated within the program: there is nothing to reach")];
     }
     let settings = |link| setup::modbus(link, cell.simulated, 1, 1);
-    vec![
-        machine(Device::Cmm, cell, settings(&cell.cmm.link), ModbusCmm::new).await,
-        machine(Device::Grinder, cell, settings(&cell.grinder.link), ModbusGrinder::new).await,
-    ]
+    let cmm = match cell.cmm.link.wire.dme() {
+        Some(_) => server(cell).await,
+        None => machine(Device::Cmm, cell, settings(&cell.cmm.link), ModbusCmm::new).await,
+    };
+    vec![cmm, machine(Device::Grinder, cell, settings(&cell.grinder.link), ModbusGrinder::new).await]
+}
+
+/// A server of I++ DME: a session is opened, it is asked who it is and how it stands, and the session is ended.
+async fn server(cell: &CellConfig) -> Finding {
+    let what = Device::Cmm.to_string();
+    let _taken = match take(&cell.cmm.link, MachineKind::Cmm, Path::new("regrind doctor")) {
+        Ok(taken) => taken,
+        Err(failure) => return Finding::new(what, Found::Notice, failure.to_string()),
+    };
+    let mut machine = match setup::cmm(cell) {
+        Ok(machine) => machine,
+        Err(error) => return Finding::new(what, Found::Obstacle, error.to_string()),
+    };
+    let looked = async {
+        let identity = machine.connect().await?;
+        let status = machine.status().await?;
+        let words = format!("{}: {} stands {}", machine.name(), identity.name, in_short(&status));
+        let told = machine.notes().iter().fold(words, |words, note| format!("{words}; {note}"));
+        machine.release().await?;
+        Ok::<_, DeviceError>(told)
+    };
+    Finding::of(&what, looked.await)
 }
 
 async fn machine<M: Machine>(

@@ -163,7 +163,9 @@ async fn heed_endings(mut endings: Endings, orders: Orders, actor: Actor) {
 /// Keeps a machine on a line from every other run on this computer.
 pub(super) fn take(link: &Link, kind: MachineKind, run: &Path) -> Result<Option<MachineLock>, Failure> {
     let run = std::path::absolute(run).unwrap_or_else(|_| run.to_owned());
-    let taken = link.wire.line().map(|(line, unit)| MachineLock::take(&format!("{kind} at {line}, unit {unit}"), &run));
+    let on_line = link.wire.line().map(|(line, unit)| format!("{kind} at {line}, unit {unit}"));
+    let served = link.wire.dme().map(|(host, port)| format!("{kind} at {host}:{port}"));
+    let taken = on_line.or(served).map(|machine| MachineLock::take(&machine, &run));
     taken.transpose().map_err(Failure::Machine)
 }
 

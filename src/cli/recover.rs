@@ -101,7 +101,13 @@ impl Recovery {
         machine: fn(ModbusSettings) -> io::Result<M>,
     ) -> Result<bool, Failure> {
         let Some(settings) = settings else {
-            super::print(&format!("{device}: it tells nothing over a wire; bring it home at the machine\n"))?;
+            let words = match link.wire.dme() {
+                Some(_) => {
+                    "its server keeps no job, so there is none to end; see at the machine that the probe is clear"
+                }
+                None => "it tells nothing over a wire; bring it home at the machine",
+            };
+            super::print(&format!("{device}: {words}\n"))?;
             return Ok(false);
         };
         let mut machine = machine(settings).map_err(|source| Failure::Port { device, source })?;

@@ -87,7 +87,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     super::runtime()?.block_on(async {
         let mut cell = cell;
         let _world = match spec {
-            Some(spec) => Some(simulated::serve(spec, &mut cell).await?),
+            Some(spec) => Some(simulated::serve(spec, &mut cell, recipe.measure.probe_radius_mm).await?),
             None => None,
         };
         let ending = carry_out(arguments, &recipe, &cell, task, plan, earlier, key).await?;
@@ -188,7 +188,9 @@ impl Earlier {
 
 /// Whether the machines of a cell are simulated in this process: only there a port may be left open.
 pub(super) fn within(cell: &CellConfig) -> bool {
-    let open = |link: &Link| matches!(link.wire.line(), Some((Line::Tcp { port: 0, .. }, _)));
+    let open = |link: &Link| {
+        matches!(link.wire.line(), Some((Line::Tcp { port: 0, .. }, _))) || matches!(link.wire.dme(), Some((_, 0)))
+    };
     cell.simulated && (open(&cell.cmm.link) || open(&cell.grinder.link))
 }
 

@@ -3,13 +3,16 @@
 use std::path::{Path, PathBuf};
 
 use regrind::config::{CellConfig, Link};
-use regrind::device::{Line, RegisterMap, Wire, WordOrder};
+use regrind::device::{IppdmeWire, Line, RegisterMap, Wire, WordOrder};
 use regrind::formats::{AddedLines, FormatError, place_link, remove_link};
 use regrind::recipe::Recipe;
+use regrind_sim::cmm::Led;
+use regrind_sim::dme;
 use regrind_sim::options::{Layout, MachineOptions};
 use regrind_sim::registers::Machine;
 use regrind_sim::seen::Seen;
 use regrind_sim::spec::WorldSpec;
+use regrind_sim::wire::dme::ServingDme;
 use regrind_sim::wire::faults::Faults;
 use regrind_sim::wire::rtu;
 use regrind_sim::wire::{Serving, SharedMachine};
@@ -25,6 +28,8 @@ pub(super) struct SimulatedCell {
     pub(super) servings: Vec<Serving>,
     /// In words, where each machine answers.
     pub(super) places: Vec<String>,
+    /// A measuring machine that is reached by I++ DME.
+    dme: Option<ServingDme>,
     /// Links that were placed at the devices of serial lines.
     links: Vec<PathBuf>,
     /// Kept for the life of the machines.
@@ -70,25 +75,39 @@ pub(super) fn world_spec(recipe: &Recipe, seed: Option<u64>) -> Result<WorldSpec
     Ok(spec)
 }
 
-/// Serves both machines of a cell on their wires. A port of 0 is replaced in the cell by the one that was free.
+/// Serves both machines of a cell on their wires. A port of 0 is replaced in the cell by the one that was free. A server of I++ DME has a
+/// probe of its own, whose radius is the one that the recipe has.
 ///
 /// # Errors
 /// A wire that cannot be had.
-pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig) -> Result<SimulatedCell, Failure> {
+pub(super) async fn serve(
+    spec: WorldSpec,
+    cell: &mut CellConfig,
+    probe_radius_mm: f64,
+) -> Result<SimulatedCell, Failure> {
     let path = cell.path().to_owned();
     let failed = |reason: String| Failure::Simulation { path: path.clone(), reason };
     let speed = spec.speed;
     let seed = spec.seed;
     let world = World::new(spec).map_err(|e| failed(e.to_string()))?;
-    let cmm = Machine::new(Box::new(world.cmm()), boot_id(), options(&cell.cmm.link, speed, seed));
-    let grinder = Machine::new(Box::new(world.grinder()), boot_id(), options(&cell.grinder.link, speed, seed + 1));
-    let mut simulated = SimulatedCell { servings: Vec::new(), places: Vec::new(), links: Vec::new(), _world: world };
+    let (servings, places, links) = (Vec::new(), Vec::new(), Vec::new());
+    let mut simulated = SimulatedCell { servings, places, dme: None, links, _world: world.clone() };
     let line = |link: &Link| {
         let none = "a machine that a person serves cannot be simulated; its part is yours to play";
         link.wire.line().ok_or_else(|| failed(none.into()))
     };
-    let [(of_cmm, cmm_unit), (of_grinder, grinder_unit)] = [line(&cell.cmm.link)?, line(&cell.grinder.link)?];
-    let (cmm, grinder) = ((cmm_unit, cmm.into()), (grinder_unit, grinder.into()));
+    let grinder = Machine::new(Box::new(world.grinder()), boot_id(), options(&cell.grinder.link, speed, seed + 1));
+    let (of_grinder, unit) = line(&cell.grinder.link)?;
+    let grinder = (unit, grinder.into());
+    if let Wire::Ippdme(wire) = &mut cell.cmm.link.wire {
+        simulated.serve_dme(wire, world.led(), speed, probe_radius_mm).await.map_err(&failed)?;
+        let port = simulated.serve(&of_grinder, vec![grinder]).await.map_err(&failed)?;
+        set_port(&mut cell.grinder.link.wire, port);
+        return Ok(simulated);
+    }
+    let cmm = Machine::new(Box::new(world.cmm()), boot_id(), options(&cell.cmm.link, speed, seed));
+    let (of_cmm, unit) = line(&cell.cmm.link)?;
+    let cmm = (unit, cmm.into());
     if of_cmm == of_grinder {
         let port = simulated.serve(&of_cmm, vec![cmm, grinder]).await.map_err(failed)?;
         set_port(&mut cell.cmm.link.wire, port);
@@ -120,6 +139,21 @@ impl SimulatedCell {
                 }));
             });
         }
+        Ok(())
+    }
+
+    /// Serves a measuring machine by I++ DME, and writes the port that it got into its wire.
+    async fn serve_dme(&mut self, wire: &mut IppdmeWire, probe: Led, speed: f64, radius_mm: f64) -> Result<(), String> {
+        let tools = vec![("NoTool".to_owned(), 0.0), (wire.tool.clone(), radius_mm)];
+        let machine = dme::machine::Machine::new(probe, dme::machine::Options { tools, ..Default::default() });
+        let server = dme::Server::new(machine, speed, dme::faults::Faults::none());
+        let (host, port) = (wire.host.clone(), wire.port);
+        let serving = ServingDme::tcp((host.as_str(), port), server)
+            .await
+            .map_err(|e| format!("{host}:{port} cannot be served: {e}; choose another port, or end what holds it"))?;
+        wire.port = serving.local_addr().port();
+        self.places.push(format!("I++ DME {host}:{}", wire.port));
+        self.dme = Some(serving);
         Ok(())
     }
 

@@ -90,6 +90,13 @@ pub enum DeviceError {
     #[error("{machine}: {why}")]
     NotTaken { machine: Arc<str>, why: String },
 
+    /// A line came that means nothing, or belongs to nothing.
+    #[error(
+        "{machine} sent a line that cannot be used ({why}): {line:?}; nothing of it was used and the connection was given up. If it happens \
+         again compare the server's version of I++ DME with docs/ippdme.md"
+    )]
+    Unreadable { machine: Arc<str>, line: String, why: &'static str },
+
     /// The folders that stand for the machine cannot be read or written, or hold something that must not be touched.
     #[error("{machine}: {why}")]
     Folder { machine: Arc<str>, why: String },
@@ -173,6 +180,40 @@ pub enum DeviceError {
         "{machine} is in {state} and has no finished result of {job}: a result stands from COMPLETE until it is acknowledged"
     )]
     NoResult { machine: Arc<str>, job: Job, state: State },
+    /// A server of I++ DME refused a method by its number.
+    #[error("{machine} refused {method} with {error}; look at the machine's own panel, then clear")]
+    MethodRefused { machine: Arc<str>, method: &'static str, error: crate::ippdme::ServerError },
+    /// A server of I++ DME did not tell what it was asked.
+    #[error("{machine} was asked {method} and did not tell {missing}: nothing is taken in its place")]
+    Untold { machine: Arc<str>, method: &'static str, missing: &'static str },
+    /// A server of I++ DME does not know the tool of the cell file.
+    #[error("{machine} has no tool {tool:?}; it has {known}: correct cmm.wire.tool")]
+    NoTool { machine: Arc<str>, tool: String, known: String },
+    /// The machine's probe is another than the plan's.
+    #[error(
+        "{machine} says that the tool {tool:?} has a radius of {told_mm} mm, the plan is made for {plan_mm} mm; they may differ by {limit_mm} mm: \
+         qualify the probe, or correct the tool in the cell file or the radius in the recipe"
+    )]
+    ProbeRadius { machine: Arc<str>, tool: String, told_mm: f64, plan_mm: f64, limit_mm: f64 },
+    /// A property was set, and another value is in force.
+    #[error(
+        "{machine} was told to keep {property} at {wanted} and says that it is {told}: correct the recipe or the cell file"
+    )]
+    NotSet { machine: Arc<str>, property: String, wanted: f64, told: f64 },
+    /// A plan leads the probe out of the machine's volume; told before anything moves.
+    #[error(
+        "{machine}: the {what} target {target} leads the probe's centre to {axis} = {value_mm} mm, and [cmm.travel] allows {least_mm} to {most_mm} \
+         mm; nothing was moved. Move the part in [cmm.fixture], lower measure.safe_height_mm, or correct [cmm.travel]"
+    )]
+    OutOfVolume {
+        machine: Arc<str>,
+        what: &'static str,
+        target: u32,
+        axis: char,
+        value_mm: f64,
+        least_mm: f64,
+        most_mm: f64,
+    },
     /// A payload was given to the driver that no machine could take.
     #[error("{machine}: the {what} cannot be sent: {field} is {value}, allowed is {limit}")]
     BadPayload { machine: Arc<str>, what: &'static str, field: String, value: f64, limit: &'static str },
@@ -194,6 +235,7 @@ impl DeviceError {
                 // Busy, a gateway that finds nobody, a memory error: asked again it may go well.
                 | Self::Exception { code: 4 | 5 | 6 | 8 | 10 | 11, .. }
                 | Self::Folder { .. }
+                | Self::Unreadable { .. }
         )
     }
 }

@@ -24,6 +24,7 @@
 
 mod error;
 pub mod exchange;
+pub mod ippdme;
 mod machine;
 mod manual;
 mod modbus;
@@ -35,6 +36,7 @@ mod words;
 
 use error::Answered;
 pub use error::DeviceError;
+pub use ippdme::{IppdmeCmm, IppdmeSettings, IppdmeWire, NoGrinder};
 pub use machine::{Cmm, Grinder, Interrupt, Machine};
 pub use manual::{ManualMachine, ManualSettings, ManualWire};
 #[cfg(fuzzing)]

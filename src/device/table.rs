@@ -4,6 +4,7 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use super::exchange::ExchangeWire;
+use super::ippdme::IppdmeWire;
 use super::machine::{Cmm, Grinder, Interrupt, Machine};
 use super::manual::ManualWire;
 use super::modbus::{Line, Link, RtuWire, TcpWire};
@@ -82,6 +83,11 @@ macro_rules! drivers {
             /// The Modbus line and the unit on it, where it is one.
             pub fn line(&self) -> Option<(Line, u8)> {
                 match self { $(Self::$wire(wire) => Wired::line(wire)),+ }
+            }
+
+            /// Host and port of a server of I++ DME, where it is one.
+            pub fn dme(&self) -> Option<(String, u16)> {
+                match self { $(Self::$wire(wire) => Wired::dme(wire)),+ }
             }
 
             /// Makes the driver of a measuring machine; nothing is asked of the machine yet.
@@ -207,4 +213,6 @@ drivers! {
     FileExchange(ExchangeWire),
     /// A person, step by step.
     Manual(ManualWire),
+    /// I++ DME over TCP, for a measuring machine.
+    Ippdme(IppdmeWire),
 }

@@ -55,6 +55,8 @@ pub struct Making<'a> {
     pub signals: &'a [Signal],
     /// The name that it must give of itself.
     pub expected_name: Option<&'a str>,
+    /// The box that a probe's centre must not leave, its least and its largest corner.
+    pub volume_mm: Option<[[f64; 3]; 2]>,
     /// The line of the other machine, which may be its own too.
     pub beside: Option<&'a Link>,
 }
@@ -106,6 +108,11 @@ pub trait Wired {
         None
     }
 
+    /// Host and port of a server of I++ DME, where it is one.
+    fn dme(&self) -> Option<(String, u16)> {
+        None
+    }
+
     /// The Modbus line and the unit on it, where it is one: what a simulated machine is served on.
     fn line(&self) -> Option<(Line, u8)> {
         None
@@ -128,6 +135,14 @@ pub enum MakingError {
     /// A serial port that is not there.
     #[error("{missing}; connect it, or name one of these in the cell file")]
     NoPort { missing: String },
+    /// A machine whose positions are to be held against its volume, and nobody says what that is.
+    #[error(
+        "cmm.travel is missing: every position is held against it before {machine} moves; add the box that its probe must not leave"
+    )]
+    NoVolume { machine: String },
+    /// A machine that this wire has no driver for.
+    #[error("{table}.wire: kind = {kind:?} is for a measuring machine; name another wire")]
+    NoDriver { table: &'static str, kind: &'static str },
     /// A line that cannot be opened.
     #[error("{line} cannot be opened: {source}; check the cell file and the machine")]
     Line { line: String, source: std::io::Error },

@@ -4,6 +4,7 @@ mod ahead;
 mod contract;
 mod exchange;
 mod interop;
+mod ippdme;
 #[path = "../common/keep.rs"]
 mod keep;
 mod modbus;

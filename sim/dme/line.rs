@@ -1,0 +1,216 @@
+//! Commands as they come over the wire, by a reader of its own: an error in one reader must not stand at both ends.
+
+use std::fmt;
+
+use super::faults::Fault;
+
+/// A tag.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Tag {
+    event: bool,
+    number: u32,
+}
+
+impl Tag {
+    /// What nobody asked for.
+    pub const UNASKED: Self = Self { event: true, number: 0 };
+
+    /// Whether it is that of a command that is carried out at once.
+    pub fn is_event(self) -> bool {
+        self.event
+    }
+}
+
+impl fmt::Display for Tag {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.event { write!(f, "E{:04}", self.number) } else { write!(f, "{:05}", self.number) }
+    }
+}
+
+/// An error as it is told.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Error {
+    /// 1 warns, 2 and 3 stop, 9 ends.
+    pub severity: u8,
+    /// Its number.
+    pub number: u16,
+    /// What it came of.
+    pub cause: String,
+}
+
+impl Error {
+    /// An error of the standard, with its severity.
+    pub fn new(number: u16, cause: &str) -> Self {
+        let severity = match number {
+            504 => 1,
+            1 | 2 | 6 | 514 | 1001 | 1003 | 1006 | 1010 => 2,
+            _ => 3,
+        };
+        Self { severity, number, cause: cause.to_owned() }
+    }
+}
+
+impl fmt::Display for Error {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let text = match self.number {
+            1 => "Illegal tag",
+            2 => "No space at pos. 6",
+            6 => "Transaction aborted (Use ClearAllErrors To Continue)",
+            7 => "Illegal character",
+            8 => "Protocol error",
+            500 => "Emergency stop",
+            501 => "Unsupported command",
+            502 => "Incorrect arguments",
+            504 => "Argument out of range",
+            507 => "Illegal command",
+            508 => "Bad context",
+            509 => "Bad argument",
+            510 => "Bad property",
+            514 => "Use ClearAllErrors to continue",
+            1001 => "Illegal touch",
+            1005 => "Error during home",
+            1006 => "Surface not found",
+            1008 => "Target position out of machine volume",
+            1010 => "Vector has no norm",
+            1502 => "Tool not found",
+            _ => "Error",
+        };
+        write!(f, "Error({}, {:04}, \"{}\", \"{text}\")", self.severity, self.number, self.cause.replace('"', "#"))
+    }
+}
+
+/// What stands between two commas of a command.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Argument {
+    /// A number.
+    Number(f64),
+    /// A string.
+    Text(String),
+    /// A name, and the numbers in its parentheses where it has any.
+    Name(String, Option<Vec<f64>>),
+}
+
+/// A command.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Command {
+    /// Its name.
+    pub name: String,
+    /// What stands in its parentheses.
+    pub arguments: Vec<Argument>,
+    /// What goes wrong with it.
+    pub fault: Option<Fault>,
+}
+
+impl Command {
+    pub(super) fn with(self, fault: Option<Fault>) -> Self {
+        Self { fault, ..self }
+    }
+}
+
+type Refused = (Option<Tag>, Error);
+
+/// Reads a line without its end.
+///
+/// # Errors
+/// The tag, where it could be read, and the error to be told.
+pub fn read(line: &str) -> Result<(Tag, Command), Refused> {
+    let bytes = line.as_bytes();
+    if let Some(bad) = bytes.iter().find(|b| !(32..127).contains(*b)) {
+        return Err((None, Error::new(7, &format!("byte {bad}"))));
+    }
+    let tag = tag(bytes).ok_or((None, Error::new(1, line)))?;
+    if bytes.get(5) != Some(&b' ') {
+        return Err((Some(tag), Error::new(2, line)));
+    }
+    let command = command(&line[6..]).map_err(|number| (Some(tag), Error::new(number, line)))?;
+    if command.name.ends_with('E') != tag.event {
+        return Err((Some(tag), Error::new(1, line)));
+    }
+    Ok((tag, command))
+}
+
+fn tag(bytes: &[u8]) -> Option<Tag> {
+    let head = bytes.get(..5)?;
+    let event = head[0] == b'E';
+    let digits = std::str::from_utf8(&head[usize::from(event)..]).ok()?;
+    let number = digits.bytes().all(|b| b.is_ascii_digit()).then(|| digits.parse().ok()).flatten()?;
+    (number > 0).then_some(Tag { event, number })
+}
+
+fn command(text: &str) -> Result<Command, u16> {
+    let (name, rest) = text.split_once('(').ok_or(502u16)?;
+    let name = name.trim_end();
+    if name.is_empty() || !name.bytes().all(|b| b.is_ascii_alphanumeric()) {
+        return Err(507);
+    }
+    let inside = rest.trim_end().strip_suffix(')').ok_or(507u16)?;
+    let arguments = if inside.trim().is_empty() { Vec::new() } else { arguments(inside)? };
+    Ok(Command { name: name.to_owned(), arguments, fault: None })
+}
+
+/// Parts what stands between commas that are in no string and in no parentheses.
+fn arguments(inside: &str) -> Result<Vec<Argument>, u16> {
+    let (mut depth, mut quoted, mut from, mut parts) = (0i32, false, 0, Vec::new());
+    for (at, c) in inside.char_indices() {
+        match c {
+            '"' => quoted = !quoted,
+            '(' if !quoted => depth += 1,
+            ')' if !quoted => depth -= 1,
+            ',' if !quoted && depth == 0 => {
+                parts.push(&inside[from..at]);
+                from = at + 1;
+            }
+            _ => {}
+        }
+    }
+    parts.push(&inside[from..]);
+    if depth != 0 || quoted { Err(502) } else { parts.into_iter().map(argument).collect() }
+}
+
+fn argument(text: &str) -> Result<Argument, u16> {
+    let text = text.trim();
+    if let Some(body) = text.strip_prefix('"') {
+        return body.strip_suffix('"').filter(|body| !body.is_empty()).map(|b| Argument::Text(b.to_owned())).ok_or(509);
+    }
+    if text.starts_with(|c: char| c.is_ascii_digit() || "+-.".contains(c)) {
+        return number(text).map(Argument::Number);
+    }
+    let Some((name, rest)) = text.split_once('(') else { return Ok(Argument::Name(text.to_owned(), None)) };
+    let inside = rest.strip_suffix(')').ok_or(502u16)?;
+    let numbers = inside.split(',').filter(|_| !inside.trim().is_empty()).map(|n| number(n.trim()));
+    Ok(Argument::Name(name.trim_end().to_owned(), Some(numbers.collect::<Result<_, _>>()?)))
+}
+
+fn number(text: &str) -> Result<f64, u16> {
+    let mantissa = text.split(['E', 'e']).next().unwrap_or(text);
+    let digits = mantissa.bytes().filter(u8::is_ascii_digit).count();
+    let plain = text.bytes().all(|b| b.is_ascii_digit() || b"+-.Ee".contains(&b));
+    if !plain || digits > 16 {
+        return Err(509);
+    }
+    text.parse().ok().filter(|n: &f64| n.is_finite()).ok_or(509)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_are_read_and_refused_by_number() {
+        let (tag, command) = read("00014 PtMeas(X(10), Y(20.5) ,IJK(0,0,1))").unwrap();
+        assert_eq!(tag.to_string(), "00014");
+        let point = Argument::Name("X".into(), Some(vec![10.0]));
+        assert_eq!((command.name.as_str(), &command.arguments[0]), ("PtMeas", &point));
+        for (line, number) in [
+            ("A2345 GoTo(X(1))", 1),
+            ("012345 GoTo(X(1))", 2),
+            ("00001 AbortE()", 1),
+            ("00001 GoTo(X(12345678901234567))", 509),
+            ("00001 GoTo(X(1)", 502),
+            ("00001 GoTo(X(1))2", 507),
+            ("00001 GoTo(X(1)\t)", 7),
+        ] {
+            assert_eq!(read(line).unwrap_err().1.number, number, "{line}");
+        }
+    }
+}

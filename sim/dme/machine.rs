@@ -1,0 +1,392 @@
+//! The machine behind the server: tools, frames, parameters within their limits, motion within the volume, and touches of the true part.
+
+use super::line::{Argument, Command, Error};
+use crate::Vec3;
+use crate::cmm::{Led, Touch};
+
+/// How the server and its machine are set up.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// Tools by name, and what the machine takes their radius to be; `NoTool` has none.
+    pub tools: Vec<(String, f64)>,
+    /// What it calls its class.
+    pub class: String,
+    /// The version of the standard that it says it keeps.
+    pub version: String,
+    /// Whether it has been homed before the client comes.
+    pub homed: bool,
+    /// Fastest travel and fastest touch, in millimetres per second.
+    pub fastest_mm_s: [f64; 2],
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            tools: vec![("NoTool".into(), 0.0), ("Probe1".into(), 1.5)],
+            class: "CartCMM_Simulated".into(),
+            version: "1.4".into(),
+            homed: false,
+            fastest_mm_s: [1000.0, 50.0],
+        }
+    }
+}
+
+/// What a command brings, and how long it takes.
+#[derive(Clone, Debug, Default)]
+pub struct Done {
+    /// Seconds of the machine's time.
+    pub seconds: f64,
+    /// Lines of data, each by its fields.
+    pub data: Vec<Vec<String>>,
+    /// What stops nothing.
+    pub warnings: Vec<Error>,
+}
+
+impl Done {
+    fn told(fields: Vec<String>) -> Self {
+        Self { data: vec![fields], ..Self::default() }
+    }
+}
+
+/// Parameters of a tool: speed of travel, then speed, approach, search and retract of a touch.
+const PARAMETERS: [&str; 5] =
+    ["GoToPar.Speed", "PtMeasPar.Speed", "PtMeasPar.Approach", "PtMeasPar.Search", "PtMeasPar.Retract"];
+
+/// A frame: rows of the rotation that takes the machine's frame to it, and where the machine's origin is in it.
+#[derive(Clone, Copy, Debug)]
+struct Frame {
+    rows: [Vec3; 3],
+    origin: Vec3,
+    written: [f64; 6],
+}
+
+impl Frame {
+    const MACHINE: Self =
+        Self { rows: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], origin: [0.0; 3], written: [0.0; 6] };
+
+    /// Origin, then theta about x' between psi about z and phi about z''.
+    fn new(written: [f64; 6]) -> Self {
+        let [x, y, z, theta, psi, phi] = written;
+        let about_z = |deg: f64| {
+            let (s, c) = deg.to_radians().sin_cos();
+            [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
+        };
+        let (s, c) = theta.to_radians().sin_cos();
+        let about_x = [[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]];
+        let rows = times(times(about_z(phi), about_x), about_z(psi));
+        Self { rows, origin: [x, y, z], written }
+    }
+
+    fn turned(&self, v: Vec3) -> Vec3 {
+        self.rows.map(|row| (0..3).map(|k| row[k] * v[k]).sum())
+    }
+
+    fn turned_back(&self, v: Vec3) -> Vec3 {
+        std::array::from_fn(|k| (0..3).map(|i| self.rows[i][k] * v[i]).sum())
+    }
+
+    fn of_machine(&self, at: Vec3) -> Vec3 {
+        let turned = self.turned(at);
+        std::array::from_fn(|k| turned[k] + self.origin[k])
+    }
+
+    fn to_machine(self, at: Vec3) -> Vec3 {
+        self.turned_back(std::array::from_fn(|k| at[k] - self.origin[k]))
+    }
+}
+
+fn times(a: [Vec3; 3], b: [Vec3; 3]) -> [Vec3; 3] {
+    a.map(|row| std::array::from_fn(|k| (0..3).map(|i| row[i] * b[i][k]).sum()))
+}
+
+/// The machine.
+pub struct Machine {
+    options: Options,
+    probe: Led,
+    homed: bool,
+    tool: String,
+    parameters: [f64; 5],
+    part_frame: Frame,
+    in_part_frame: bool,
+    report: Vec<String>,
+    /// Where the probe's centre is, in the machine's frame, and where it goes.
+    at_mm: Vec3,
+    to_mm: Vec3,
+    joystick: bool,
+    touched_mm: Option<f64>,
+}
+
+impl Machine {
+    /// A machine with its probe high over its table.
+    pub fn new(probe: Led, options: Options) -> Self {
+        let [least, most] = probe.volume_mm();
+        let at_mm = [0.5 * (least[0] + most[0]), 0.5 * (least[1] + most[1]), most[2]];
+        Self {
+            homed: options.homed,
+            options,
+            probe,
+            tool: "NoTool".into(),
+            parameters: [50.0, 5.0, 5.0, 5.0, 5.0],
+            part_frame: Frame::MACHINE,
+            in_part_frame: false,
+            report: Vec::new(),
+            at_mm,
+            to_mm: at_mm,
+            joystick: true,
+            touched_mm: None,
+        }
+    }
+
+    /// Where the probe's centre is, in the machine's frame.
+    pub fn at_mm(&self) -> Vec3 {
+        self.at_mm
+    }
+
+    pub(super) fn begin_session(&mut self) {
+        self.report = ["X", "Y", "Z"].map(str::to_owned).to_vec();
+    }
+
+    /// Errors are forgotten: the probe may touch again.
+    pub(super) fn arm(&mut self) {}
+
+    /// The motion of the command has come to its end.
+    pub(super) fn arrive(&mut self) {
+        self.stop_short(1.0);
+    }
+
+    /// The motion ends after this share of its way.
+    pub(super) fn stop_short(&mut self, share: f64) {
+        self.at_mm = std::array::from_fn(|k| self.at_mm[k] + share * (self.to_mm[k] - self.at_mm[k]));
+        self.to_mm = self.at_mm;
+        // Well above what it touched, the probe lets the part go.
+        if self.touched_mm.is_none_or(|height| self.at_mm[2] > height + 2.0 * self.parameters[2]) {
+            self.touched_mm = None;
+            self.probe.let_go();
+        }
+    }
+
+    /// Begins a command and says what it will have brought when its time is over.
+    pub(super) fn carry_out(&mut self, command: &Command) -> Result<Done, Error> {
+        let no = |number| Error::new(number, &command.name);
+        let arguments = &command.arguments[..];
+        let text = |text: String| Ok(Done::told(vec![text]));
+        let moves = matches!(command.name.as_str(), "GoTo" | "PtMeas" | "ChangeTool" | "Home");
+        self.joystick &= !moves;
+        match (command.name.as_str(), arguments) {
+            ("GetDMEVersion", []) => text(format!("DMEVersion(\"{}\")", self.options.version)),
+            ("GetMachineClass", []) => text(format!("GetMachineClass(\"{}\")", self.options.class)),
+            ("IsHomed", []) => text(format!("IsHomed({})", u8::from(self.homed))),
+            ("IsUserEnabled", []) => text(format!("IsUserEnabled({})", u8::from(self.joystick))),
+            ("EnableUser" | "DisableUser", []) => {
+                self.joystick = command.name == "EnableUser";
+                Ok(Done::default())
+            }
+            ("GetXtdErrStatus", []) => text(format!("IsHomed({})", u8::from(self.homed))),
+            ("EnumTools", []) => {
+                let data = self.options.tools.iter().map(|(name, _)| vec![format!("\"{name}\"")]).collect();
+                Ok(Done { data, ..Done::default() })
+            }
+            ("Home", []) => {
+                let [least, most] = self.probe.volume_mm();
+                let corner = [least[0], most[1], most[2]];
+                self.homed = true;
+                Ok(self.moves_to(corner))
+            }
+            ("GoTo" | "PtMeas" | "ChangeTool", _) if !self.homed => Err(no(508)),
+            ("ChangeTool", [Argument::Text(name)]) => {
+                let known = self.options.tools.iter().any(|(tool, _)| tool == name);
+                if !known {
+                    return Err(no(1502));
+                }
+                self.tool.clone_from(name);
+                Ok(Done { seconds: 10.0, ..Done::default() })
+            }
+            ("SetCoordSystem", [Argument::Name(name, None)]) => {
+                self.in_part_frame = match name.as_str() {
+                    "PartCsy" => true,
+                    "MachineCsy" => false,
+                    _ => return Err(no(509)),
+                };
+                Ok(Done::default())
+            }
+            ("GetCoordSystem", []) => {
+                text(format!("CoordSystem({})", if self.in_part_frame { "PartCsy" } else { "MachineCsy" }))
+            }
+            ("SetCsyTransformation", [Argument::Name(name, None), rest @ ..]) if name == "PartCsy" => {
+                let numbers: Vec<f64> =
+                    rest.iter().filter_map(|a| if let Argument::Number(n) = a { Some(*n) } else { None }).collect();
+                let written: [f64; 6] = numbers.try_into().map_err(|_| no(502))?;
+                if !(0.0..=180.0).contains(&written[3]) {
+                    return Err(no(1007));
+                }
+                self.part_frame = Frame::new(written);
+                Ok(Done::default())
+            }
+            ("GetCsyTransformation", [Argument::Name(name, None)]) if name == "PartCsy" => {
+                let numbers = self.part_frame.written.map(|n| n.to_string()).join(", ");
+                text(format!("GetCsyTransformation({numbers})"))
+            }
+            ("GetProp", properties) => self.get(properties).map_err(no),
+            ("SetProp", properties) => self.set(properties, &command.name).map_err(no),
+            ("OnPtMeasReport", fields) => {
+                let names: Option<Vec<String>> = fields.iter().map(asked).collect();
+                let known = ["X", "Y", "Z", "IJK", "ER", "Q"];
+                let names = names.filter(|names| names.iter().all(|name| known.contains(&name.as_str())));
+                self.report = names.ok_or_else(|| no(502))?;
+                Ok(Done::default())
+            }
+            ("Get", fields) => {
+                let at = self.frame().of_machine(self.at_mm);
+                let told = fields.iter().map(|field| {
+                    let name = asked(field)?;
+                    let k = ["X", "Y", "Z"].iter().position(|axis| *axis == name)?;
+                    Some(format!("{name}({})", at[k]))
+                });
+                told.collect::<Option<_>>().map(Done::told).ok_or_else(|| no(502))
+            }
+            ("GoTo", axes) => {
+                let to = self.place(axes).ok_or_else(|| no(502))?;
+                self.is_within(to).map_err(no)?;
+                Ok(self.moves_to(to))
+            }
+            ("PtMeas", axes) => self.touch(axes).map_err(no),
+            _ => Err(no(501)),
+        }
+    }
+
+    fn frame(&self) -> Frame {
+        if self.in_part_frame { self.part_frame } else { Frame::MACHINE }
+    }
+
+    /// A place in the machine's frame; axes that are not named stay.
+    fn place(&self, axes: &[Argument]) -> Option<Vec3> {
+        let mut at = self.frame().of_machine(self.at_mm);
+        for axis in axes {
+            let Argument::Name(name, Some(numbers)) = axis else { return None };
+            match (name.as_str(), &numbers[..]) {
+                ("X", [x]) => at[0] = *x,
+                ("Y", [y]) => at[1] = *y,
+                ("Z", [z]) => at[2] = *z,
+                ("IJK", [_, _, _]) => {}
+                _ => return None,
+            }
+        }
+        Some(self.frame().to_machine(at))
+    }
+
+    fn is_within(&self, at: Vec3) -> Result<(), u16> {
+        let [least, most] = self.probe.volume_mm();
+        let within = (0..3).all(|k| (least[k] - 1e-9..=most[k] + 1e-9).contains(&at[k]));
+        if within { Ok(()) } else { Err(1008) }
+    }
+
+    fn moves_to(&mut self, to_mm: Vec3) -> Done {
+        let way_mm = (0..3).map(|k| (to_mm[k] - self.at_mm[k]).powi(2)).sum::<f64>().sqrt();
+        self.to_mm = to_mm;
+        let speed = self.parameters[0].min(self.probe.travel_mm_s());
+        Done { seconds: way_mm / speed, ..Done::default() }
+    }
+
+    /// Touches the part as it really is.
+    fn touch(&mut self, axes: &[Argument]) -> Result<Done, u16> {
+        let point_mm = self.place(axes).ok_or(502u16)?;
+        let direction = axes.iter().find_map(|axis| match axis {
+            Argument::Name(name, Some(numbers)) if name == "IJK" => <Vec3>::try_from(numbers.clone()).ok(),
+            _ => None,
+        });
+        let direction = self.frame().turned_back(direction.ok_or(502u16)?);
+        let length = direction.iter().map(|c| c * c).sum::<f64>().sqrt();
+        if length == 0.0 {
+            return Err(1010);
+        }
+        let normal = direction.map(|c| c / length);
+        let radius_mm = self.radius().ok_or(508u16)?;
+        let [_, _, approach_mm, search_mm, retract_mm] = self.parameters;
+        let on_way = |mm: f64| -> Vec3 { std::array::from_fn(|k| point_mm[k] + mm * normal[k]) };
+        self.is_within(on_way(approach_mm + radius_mm))?;
+        self.is_within(on_way(radius_mm - search_mm))?;
+        let moved = self.moves_to(on_way(approach_mm + radius_mm)).seconds;
+        self.touched_mm = Some(point_mm[2]);
+        let seconds = moved + self.probe.seconds_per_point();
+        match self.probe.touch(point_mm, normal, [radius_mm, approach_mm, search_mm]) {
+            Touch::Centre(centre) => {
+                let back = if retract_mm < 0.0 {
+                    on_way(approach_mm + radius_mm)
+                } else {
+                    std::array::from_fn(|k| centre[k] + retract_mm * normal[k])
+                };
+                self.to_mm = back;
+                let fields = self.reported(centre, normal, radius_mm);
+                Ok(Done { seconds, ..Done::told(fields) })
+            }
+            Touch::Missed => {
+                self.arrive();
+                Err(1006)
+            }
+            Touch::Unexpected => {
+                self.arrive();
+                Err(1001)
+            }
+        }
+    }
+
+    fn reported(&self, centre: Vec3, normal: Vec3, radius_mm: f64) -> Vec<String> {
+        let frame = self.frame();
+        let (at, inward) = (frame.of_machine(centre), frame.turned(normal));
+        let field = |name: &String| match name.as_str() {
+            "X" => format!("X({})", at[0]),
+            "Y" => format!("Y({})", at[1]),
+            "Z" => format!("Z({})", at[2]),
+            "IJK" => format!("IJK({},{},{})", inward[0], inward[1], inward[2]),
+            "ER" => format!("ER({radius_mm})"),
+            _ => "Q(0)".to_owned(),
+        };
+        self.report.iter().map(field).collect()
+    }
+
+    fn radius(&self) -> Option<f64> {
+        let tool = self.options.tools.iter().find(|(name, _)| *name == self.tool);
+        tool.map(|(_, radius)| *radius).filter(|radius| *radius > 0.0)
+    }
+
+    fn get(&self, properties: &[Argument]) -> Result<Done, u16> {
+        let told = properties.iter().map(|property| {
+            let name = asked(property).ok_or(502u16)?;
+            match name.as_str() {
+                "Tool.Name" => Ok(format!("Tool.Name(\"{}\")", self.tool)),
+                "Tool.AvrRadius" => self.radius().map(|radius| format!("Tool.AvrRadius({radius})")).ok_or(510),
+                other => {
+                    let k = PARAMETERS.iter().position(|known| other.strip_prefix("Tool.") == Some(*known));
+                    k.map(|k| format!("{other}({})", self.parameters[k])).ok_or(510)
+                }
+            }
+        });
+        told.collect::<Result<_, _>>().map(Done::told)
+    }
+
+    /// Sets parameters; what is beyond the machine's limits is kept within, and warned of.
+    fn set(&mut self, properties: &[Argument], cause: &str) -> Result<Done, u16> {
+        let mut warnings = Vec::new();
+        for property in properties {
+            let Argument::Name(name, Some(numbers)) = property else { return Err(502) };
+            let k = PARAMETERS.iter().position(|known| name.strip_prefix("Tool.") == Some(*known)).ok_or(510u16)?;
+            let [value] = numbers[..] else { return Err(502) };
+            let most = self.options.fastest_mm_s.get(k).copied().unwrap_or(100.0);
+            let least = if k == 4 { -1.0 } else { 1e-3 };
+            let kept = value.clamp(least, most);
+            if kept != value {
+                warnings.push(Error::new(504, cause));
+            }
+            self.parameters[k] = kept;
+        }
+        Ok(Done { warnings, ..Done::default() })
+    }
+}
+
+/// The name of a property that is asked for.
+fn asked(argument: &Argument) -> Option<String> {
+    match argument {
+        Argument::Name(name, Some(numbers)) if numbers.is_empty() => Some(name.clone()),
+        _ => None,
+    }
+}

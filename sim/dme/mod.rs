@@ -1,0 +1,267 @@
+//! A server of I++ DME before a simulated measuring machine: what it answers to each line, and when. No wire is in here; `wire/dme` has one.
+//!
+//! ```text
+//!  line     commands as they come, by a reader of its own
+//!  machine  what the machine is and does: tools, frames, motion, touches
+//!  faults   what goes wrong, at which command
+//! ```
+//!
+//! Commands are acknowledged as they come and carried out one after another; those that end in E at once. After an error nothing but
+//! ClearAllErrors is taken. What an abort meets is told so, each with error 0006.
+
+pub mod faults;
+pub mod line;
+pub mod machine;
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use faults::{Fault, Faults};
+use line::{Command, Error, Tag};
+use machine::{Done, Machine};
+
+/// A line that is to go out, or the end of the connection.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Outgoing {
+    /// When, in the time of the caller.
+    pub at: Duration,
+    /// The line, its end too.
+    pub text: String,
+    /// It comes byte for byte.
+    pub split: bool,
+    /// The connection is closed behind it.
+    pub closes: bool,
+}
+
+/// A command that is being carried out.
+struct Running {
+    tag: Tag,
+    command: Command,
+    began: Duration,
+    ends: Duration,
+    done: Result<Done, Error>,
+}
+
+/// A server, between its client and its machine.
+pub struct Server {
+    machine: Machine,
+    faults: Faults,
+    /// Seconds of the machine's time in a real second.
+    speed: f64,
+    waiting: VecDeque<(Tag, Command)>,
+    running: Option<Running>,
+    latched: bool,
+    in_session: bool,
+    out: VecDeque<Outgoing>,
+}
+
+impl Server {
+    /// A server before a machine.
+    pub fn new(machine: Machine, speed: f64, faults: Faults) -> Self {
+        Self {
+            machine,
+            faults,
+            speed,
+            waiting: VecDeque::new(),
+            running: None,
+            latched: false,
+            in_session: false,
+            out: VecDeque::new(),
+        }
+    }
+
+    /// Looks at the machine, or changes it.
+    pub fn machine(&mut self) -> &mut Machine {
+        &mut self.machine
+    }
+
+    /// The client is gone: what runs comes to its end, and nothing else is begun.
+    pub fn hung_up(&mut self) {
+        self.waiting.clear();
+        self.out.clear();
+        self.running = None;
+        self.machine.stop_short(1.0);
+        (self.in_session, self.latched) = (false, false);
+    }
+
+    /// When something is to be done next without a line having come.
+    pub fn due(&self) -> Option<Duration> {
+        let running = self.running.as_ref().map(|running| running.ends);
+        running.into_iter().chain(self.out.front().map(|out| out.at)).min()
+    }
+
+    /// The stop circuit opens.
+    pub fn emergency_stop(&mut self, now: Duration) {
+        self.abandon(now, &Error::new(500, "emergency"));
+        self.latched = true;
+        self.say(now, format!("E0000 ! {}", Error::new(500, "emergency")));
+    }
+
+    /// Lets time pass and returns what is to be sent now.
+    pub fn tick(&mut self, now: Duration) -> Vec<Outgoing> {
+        while self.running.as_ref().is_some_and(|running| running.ends <= now) {
+            self.finish();
+            self.begin_next(now);
+        }
+        let mut due = Vec::new();
+        while self.out.front().is_some_and(|out| out.at <= now) {
+            due.extend(self.out.pop_front());
+        }
+        due
+    }
+
+    /// Takes a line, without its end.
+    pub fn receive(&mut self, text: &str, now: Duration) {
+        match line::read(text) {
+            Err((tag, error)) => {
+                let tag = tag.unwrap_or(Tag::UNASKED);
+                self.say(now, format!("{tag} &"));
+                self.fail(tag, &error, now);
+                self.say(now, format!("{tag} %"));
+            }
+            Ok((tag, command)) if tag.is_event() => self.at_once(tag, &command, now),
+            Ok((tag, command)) => {
+                let fault = self.faults.at(&command.name);
+                if fault == Some(Fault::EmergencyStop) {
+                    return self.emergency_stop(now);
+                }
+                let late = if let Some(Fault::LateAcknowledgement(late)) = fault { late } else { Duration::ZERO };
+                let ack = Outgoing { at: now + late, text: format!("{tag} &\r\n"), split: false, closes: false };
+                self.out.push_back(ack);
+                self.waiting.push_back((tag, command.with(fault)));
+                if self.running.is_none() {
+                    self.begin_next(now + late);
+                }
+            }
+        }
+    }
+
+    fn at_once(&mut self, tag: Tag, command: &Command, now: Duration) {
+        let fault = self.faults.at(&command.name);
+        self.say(now, format!("{tag} &"));
+        match command.name.as_str() {
+            "AbortE" if fault == Some(Fault::AbortIgnored) => return,
+            "AbortE" => {
+                if self.abandon(now, &Error::new(6, "")) {
+                    self.latched = true;
+                }
+            }
+            "GetErrStatusE" => self.say(now, format!("{tag} # ErrStatus({})", u8::from(self.latched))),
+            _ => self.fail(tag, &Error::new(501, &command.name), now),
+        }
+        self.say(now, format!("{tag} %"));
+    }
+
+    /// Gives up what runs and what waits, and says whether there was anything.
+    fn abandon(&mut self, now: Duration, error: &Error) -> bool {
+        let running = self.running.take();
+        if let Some(running) = &running {
+            let whole = running.ends.saturating_sub(running.began).as_secs_f64();
+            let so_far = now.saturating_sub(running.began).as_secs_f64();
+            self.machine.stop_short(if whole > 0.0 { (so_far / whole).min(1.0) } else { 1.0 });
+        }
+        let running = running.map(|running| (running.tag, running.command));
+        let victims: Vec<(Tag, Command)> = running.into_iter().chain(self.waiting.drain(..)).collect();
+        for (tag, command) in &victims {
+            self.fail(*tag, &Error { cause: command.name.clone(), ..error.clone() }, now);
+            self.say(now, format!("{tag} %"));
+        }
+        !victims.is_empty()
+    }
+
+    fn begin_next(&mut self, now: Duration) {
+        let Some((tag, command)) = self.waiting.pop_front() else { return };
+        let done = self.carry_out(&command);
+        let lasts = done.as_ref().map_or(0.0, |done| done.seconds) / self.speed;
+        let ends = now + Duration::try_from_secs_f64(lasts).unwrap_or_default();
+        self.running = Some(Running { tag, command, began: now, ends, done });
+    }
+
+    /// What a command does; gates come first.
+    fn carry_out(&mut self, command: &Command) -> Result<Done, Error> {
+        let name = command.name.as_str();
+        let no = |number| Err(Error::new(number, name));
+        if self.latched && !matches!(name, "ClearAllErrors" | "GetXtdErrStatus") {
+            return no(514);
+        }
+        match name {
+            "ClearAllErrors" => {
+                self.latched = false;
+                self.machine.arm();
+            }
+            "StartSession" if self.in_session => return no(8),
+            "StartSession" => {
+                self.in_session = true;
+                self.machine.begin_session();
+            }
+            "EndSession" => self.in_session = false,
+            _ if !self.in_session => return no(508),
+            _ => return self.machine.carry_out(command),
+        }
+        Ok(Done::default())
+    }
+
+    fn finish(&mut self) {
+        let Some(Running { tag, command, ends, done, .. }) = self.running.take() else { return };
+        let fault = command.fault.clone();
+        match done {
+            Ok(done) => {
+                self.machine.arrive();
+                for warning in &done.warnings {
+                    self.say(ends, format!("{tag} ! {warning}"));
+                }
+                for data in &done.data {
+                    self.say_data(tag, data, fault.as_ref(), ends);
+                }
+            }
+            Err(mut error) => {
+                if let Some(Fault::Severity(severity)) = fault {
+                    error.severity = severity;
+                }
+                self.fail(tag, &error, ends);
+            }
+        }
+        match fault {
+            Some(Fault::NoCompletion) => {}
+            Some(Fault::Disconnect) => {
+                self.say(ends, String::new());
+                self.out.back_mut().into_iter().for_each(|out| out.closes = true);
+            }
+            _ => self.say(ends, format!("{tag} %")),
+        }
+    }
+
+    /// Says data of a command, with what goes wrong with it.
+    fn say_data(&mut self, tag: Tag, data: &[String], fault: Option<&Fault>, at: Duration) {
+        let mut fields = data.to_vec();
+        match fault {
+            Some(Fault::Reordered) => fields.reverse(),
+            Some(Fault::UnaskedQuality) => fields.insert(0, "Q(0)".to_owned()),
+            _ => {}
+        }
+        let text = format!("{tag} # {}", fields.join(", "));
+        self.say(at, text.clone());
+        match fault {
+            Some(Fault::Twice) => self.say(at, text),
+            Some(Fault::Split) => self.out.back_mut().into_iter().for_each(|out| out.split = true),
+            Some(Fault::Garbled) => {
+                self.out.pop_back();
+                self.say(at, text.replace(')', ""));
+            }
+            Some(Fault::Stranger) => self.say(at, format!("77777 # {}", fields.join(", "))),
+            _ => {}
+        }
+    }
+
+    fn fail(&mut self, tag: Tag, error: &Error, at: Duration) {
+        self.latched |= error.severity >= 2;
+        self.say(at, format!("{tag} ! {error}"));
+    }
+
+    fn say(&mut self, at: Duration, text: String) {
+        // Lines go out in the order in which they were said.
+        let at = self.out.back().map_or(at, |last| last.at.max(at));
+        let text = if text.is_empty() { text } else { text + "\r\n" };
+        self.out.push_back(Outgoing { at, text, split: false, closes: false });
+    }
+}

@@ -1,0 +1,94 @@
+//! Commands: written by the client strictly, and read as a server reads them.
+
+use std::fmt;
+
+use super::grammar;
+use super::text::{Flaw, Item, Reader, Strictness, Tag, arguments, has_stray_blank, list};
+
+/// The most characters of a line, its end left out.
+pub const LONGEST_LINE: usize = 65_536;
+
+/// A command without its tag.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Command {
+    /// Its name, such as `PtMeas`.
+    pub name: String,
+    /// What stands in its parentheses.
+    pub arguments: Vec<Item>,
+}
+
+impl Command {
+    /// A command.
+    pub fn new(name: &str, arguments: Vec<Item>) -> Self {
+        Self { name: name.to_owned(), arguments }
+    }
+
+    /// Whether it is carried out while others run: its name ends in a capital E.
+    pub fn is_event(&self) -> bool {
+        self.name.ends_with('E')
+    }
+
+    /// Reads a line without its end, as strictly as a server must.
+    ///
+    /// # Errors
+    /// The number with which a server refuses it.
+    pub fn read(line: &str) -> Result<(Tag, Self), Flaw> {
+        if line.len() > LONGEST_LINE {
+            return Err(Flaw { number: 8, why: "a line of more than 65536 characters" });
+        }
+        if !line.bytes().all(|b| (32..=126).contains(&b)) {
+            return Err(Flaw { number: 7, why: "a character that is not ASCII 32 to 126" });
+        }
+        let (tag, rest) = tagged(line)?;
+        if has_stray_blank(rest) {
+            return Err(arguments("a blank where none may stand"));
+        }
+        let mut reader = Reader::new(rest, Strictness::Strict);
+        let command = Self::untagged(&mut reader)?;
+        if !reader.is_at_end() {
+            return Err(Flaw { number: 507, why: "something stands behind the command" });
+        }
+        if command.is_event() != matches!(tag, Tag::Event(_)) {
+            return Err(Flaw { number: 1, why: "commands that end in E have event tags, and no others" });
+        }
+        grammar::check(&command)?;
+        Ok((tag, command))
+    }
+
+    fn untagged(reader: &mut Reader<'_>) -> Result<Self, Flaw> {
+        let illegal = |why| Flaw { number: 507, why };
+        let text = reader.rest();
+        let end = text.bytes().position(|b| !b.is_ascii_alphanumeric()).unwrap_or(text.len());
+        let name = &text[..end];
+        if !grammar::is_known(name) {
+            return Err(illegal("a command that nobody knows"));
+        }
+        *reader = Reader::new(&text[end..], Strictness::Strict);
+        if !reader.eat('(') {
+            return Err(arguments("a command without parentheses"));
+        }
+        Ok(Self::new(name, reader.in_parentheses()?))
+    }
+
+    /// Writes the line, its end too.
+    pub fn line(&self, tag: Tag) -> String {
+        format!("{tag} {self}\r\n")
+    }
+}
+
+impl fmt::Display for Command {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}({})", self.name, list(&self.arguments))
+    }
+}
+
+/// Parts the tag from what it is the tag of.
+fn tagged(line: &str) -> Result<(Tag, &str), Flaw> {
+    let illegal = Flaw { number: 1, why: "a tag that is none" };
+    let tag = line.get(..5).and_then(Tag::read).ok_or(illegal)?;
+    if matches!(tag, Tag::Command(0) | Tag::Event(0)) {
+        return Err(Flaw { number: 1, why: "tags count from 1" });
+    }
+    let rest = line[5..].strip_prefix(' ').ok_or(Flaw { number: 2, why: "no blank behind the tag" })?;
+    Ok((tag, rest))
+}

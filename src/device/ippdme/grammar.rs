@@ -1,0 +1,323 @@
+//! What each command may be asked with. A server refuses the rest by number; a client that keeps to it is refused by none.
+
+use super::command::Command;
+use super::text::{Flaw, Item, Tag, arguments, bad};
+
+const PART_AXES: &[&str] = &["X", "Y", "Z", "R", "Tool.A", "Tool.B", "Tool.C"];
+const CSYS: &[&str] = &["JogDisplayCsy", "JogMoveCsy", "MoveableMachineCsy", "MultipleArmCsy", "PartCsy", "SensorCsy"];
+const COORDINATES: &[&str] = &["MachineCsy", "MoveableMachineCsy", "MultipleArmCsy", "PartCsy"];
+const PARAMETERS: &[&str] = &["Accel", "Speed", "Approach", "Search", "Retract"];
+
+/// What the parentheses of a command hold.
+enum Shape {
+    Nothing,
+    /// So many numbers, or one of two counts, and which of them must be positive or whole besides.
+    Numbers(&'static [usize], &'static [Wanted]),
+    /// One string.
+    Text,
+    /// One positive number.
+    Positive,
+    /// One whole number.
+    Whole,
+    /// The tag of an event command.
+    Daemon,
+    /// One of these names.
+    OneOf(&'static [&'static str]),
+    /// The frame and six numbers.
+    Transformation,
+    /// Properties asked for, each once.
+    Asked(&'static [&'static str]),
+    /// The same, with a time and a distance.
+    Daemonised,
+    /// Axes with values.
+    Axes,
+    /// A point to be touched.
+    Touch,
+    /// Properties of tools: one to be told of its parts, several to be told or set.
+    Enumerated,
+    Told,
+    Set,
+}
+
+/// What one of the numbers must be.
+enum Wanted {
+    Positive(usize),
+    Through(usize),
+}
+
+use Shape::{
+    Asked, Axes, Daemon, Daemonised, Enumerated, Nothing, Numbers, OneOf, Positive, Set, Text, Told, Touch,
+    Transformation, Whole,
+};
+use Wanted::{Positive as P, Through as T};
+
+const COMMANDS: &[(&str, Shape)] = &[
+    ("AbortE", Nothing),
+    ("AlignPart", Numbers(&[7, 14], &[])),
+    ("AlignTool", Numbers(&[4, 8], &[])),
+    ("CenterPart", Numbers(&[4], &[])),
+    ("ChangeTool", Text),
+    ("ClearAllErrors", Nothing),
+    ("DisableUser", Nothing),
+    ("EnableUser", Nothing),
+    ("EndSession", Nothing),
+    ("EnumAllProp", Enumerated),
+    ("EnumProp", Enumerated),
+    ("EnumTools", Nothing),
+    ("FindTool", Text),
+    ("Get", Asked(PART_AXES)),
+    ("GetChangeToolAction", Text),
+    ("GetCoordSystem", Nothing),
+    ("GetCsyTransformation", OneOf(CSYS)),
+    ("GetDMEVersion", Nothing),
+    ("GetErrStatusE", Nothing),
+    ("GetErrorInfo", Whole),
+    ("GetMachineClass", Nothing),
+    ("GetProp", Told),
+    ("GetPropE", Told),
+    ("GetXtdErrStatus", Nothing),
+    ("GoTo", Axes),
+    ("Home", Nothing),
+    ("IsHomed", Nothing),
+    ("IsUserEnabled", Nothing),
+    ("LockAxis", Asked(&["X", "Y", "Z", "R", "C", "Phi", "A", "B"])),
+    ("OnMoveReportE", Daemonised),
+    // A quality came with a later version than this grammar's, 1.4.
+    ("OnPtMeasReport", Asked(&["X", "Y", "Z", "R", "Tool.A", "Tool.B", "Tool.C", "ER", "IJK"])),
+    ("OnScanReport", Asked(&["X", "Y", "Z", "R", "Tool.A", "Tool.B", "Tool.C", "ER", "IJK", "Q"])),
+    ("PtMeas", Touch),
+    ("ReQualify", Nothing),
+    ("ScanInCylEndIsPlane", Numbers(&[26], &[P(15), T(22)])),
+    ("ScanInCylEndIsSphere", Numbers(&[23], &[P(15), P(19)])),
+    ("ScanInPlaneEndIsCyl", Numbers(&[21], &[P(9), P(16), T(17)])),
+    ("ScanInPlaneEndIsPlane", Numbers(&[20], &[P(9), T(16)])),
+    ("ScanInPlaneEndIsSphere", Numbers(&[17], &[P(9), P(13)])),
+    ("ScanOnCircle", Numbers(&[12], &[])),
+    ("ScanOnCircleHint", Numbers(&[2], &[])),
+    ("ScanOnLine", Numbers(&[10], &[P(9)])),
+    ("ScanOnLineHint", Numbers(&[2], &[])),
+    ("ScanUnknownHint", Positive),
+    ("SetCoordSystem", OneOf(COORDINATES)),
+    ("SetCsyTransformation", Transformation),
+    ("SetProp", Set),
+    ("SetTool", Text),
+    ("StartSession", Nothing),
+    ("StopAllDaemons", Nothing),
+    ("StopDaemon", Daemon),
+    ("TiltCenterPart", Numbers(&[7], &[])),
+    ("TiltPart", Numbers(&[4], &[])),
+];
+
+/// The names of all commands.
+pub(super) fn names() -> impl Iterator<Item = &'static str> {
+    COMMANDS.iter().map(|(name, _)| *name)
+}
+
+/// Whether there is such a command.
+pub(super) fn is_known(name: &str) -> bool {
+    names().any(|known| known == name)
+}
+
+/// Refuses what a command may not be asked with.
+pub(super) fn check(command: &Command) -> Result<(), Flaw> {
+    let Some((_, shape)) = COMMANDS.iter().find(|(name, _)| *name == command.name) else {
+        return Err(Flaw { number: 507, why: "a command that nobody knows" });
+    };
+    let items = &command.arguments[..];
+    let values_are_numbers = |item: &Item| match item {
+        Item::Call(_, values) => values.iter().all(|value| value.number().is_some()),
+        _ => true,
+    };
+    if !items.iter().all(values_are_numbers) {
+        return Err(arguments("in the parentheses of a property stand numbers"));
+    }
+    let one = || match items {
+        [] | [Item::Nothing] => Err(arguments("it has one argument")),
+        [one] => Ok(one),
+        _ => Err(arguments("it has one argument")),
+    };
+    match shape {
+        Nothing if items.is_empty() => Ok(()),
+        Nothing => Err(arguments("it has no arguments")),
+        Text => matches!(one()?, Item::Text(_)).then_some(()).ok_or(bad("the argument is a string")),
+        Daemon => matches!(one()?, Item::Tag(Tag::Event(_))).then_some(()).ok_or(bad("the argument is an event tag")),
+        Positive => one()?.number().filter(|n| *n > 0.0).map(drop).ok_or(bad("the argument is a positive number")),
+        Whole => one()?.number().filter(|n| n.fract() == 0.0).map(drop).ok_or(bad("the argument is a whole number")),
+        OneOf(names) => match one()? {
+            Item::Name(name) if names.contains(&name.as_str()) => Ok(()),
+            _ => Err(arguments("the argument is not one of the names")),
+        },
+        Numbers(counts, wanted) => numbers(items, counts, wanted),
+        Transformation => transformation(items),
+        Asked(names) => properties(items, &|name, values| names.contains(&name) && values.is_empty()),
+        Daemonised => daemonised(items),
+        Axes => properties(items, &|name, values| match name {
+            "IJK" => values.len() == 3,
+            _ => PART_AXES.contains(&name) && values.len() == 1,
+        }),
+        Touch => touch(items),
+        Enumerated => one().and_then(|item| enumerated(item, items)).or_else(|flaw| trailing(items, flaw)),
+        Told => each_property(items, told),
+        Set => each_property(items, set),
+    }
+}
+
+fn numbers(items: &[Item], counts: &[usize], wanted: &[Wanted]) -> Result<(), Flaw> {
+    let numbers: Option<Vec<f64>> = items.iter().map(Item::number).collect();
+    let numbers = numbers.filter(|numbers| counts.contains(&numbers.len()));
+    let numbers = numbers.ok_or(arguments("it has another number of numbers"))?;
+    for wanted in wanted {
+        let (P(k) | T(k)) = wanted;
+        if numbers[*k] <= 0.0 {
+            return Err(bad("a step, a diameter and a number of crossings are positive"));
+        }
+        if matches!(wanted, T(_)) && numbers[*k].fract() != 0.0 {
+            return Err(bad("the number of crossings is whole"));
+        }
+    }
+    Ok(())
+}
+
+fn transformation(items: &[Item]) -> Result<(), Flaw> {
+    let [Item::Name(csy), rest @ ..] = items else { return Err(arguments("it has a name and six numbers")) };
+    if rest.len() != 6 || rest.iter().any(|item| item.number().is_none()) {
+        return Err(arguments("it has a name and six numbers"));
+    }
+    if !CSYS.contains(&csy.as_str()) {
+        return Err(bad("the name is not that of a coordinate system"));
+    }
+    match rest[3].number() {
+        Some(theta) if (0.0..=180.0).contains(&theta) => Ok(()),
+        _ => Err(Flaw { number: 1007, why: "theta is 0 to 180 degrees" }),
+    }
+}
+
+/// Holds properties to be of the right kind, and each to stand there once.
+fn properties(items: &[Item], fits: &dyn Fn(&str, &[Item]) -> bool) -> Result<(), Flaw> {
+    if items.is_empty() {
+        return Err(arguments("it has at least one argument"));
+    }
+    for (k, item) in items.iter().enumerate() {
+        let Item::Call(name, values) = item else { return Err(arguments("an argument is no property")) };
+        if !fits(name, values) {
+            return Err(arguments("an argument is not one of its properties"));
+        }
+        once(&items[..k], name)?;
+    }
+    Ok(())
+}
+
+fn once(before: &[Item], name: &str) -> Result<(), Flaw> {
+    let twice = before.iter().any(|item| matches!(item, Item::Call(other, _) if other == name));
+    if twice { Err(arguments("a property stands there twice")) } else { Ok(()) }
+}
+
+fn daemonised(items: &[Item]) -> Result<(), Flaw> {
+    if items.is_empty() {
+        return Ok(());
+    }
+    for item in items {
+        if matches!(item, Item::Call(name, values) if matches!(name.as_str(), "Time" | "Dis") && values.len() != 1) {
+            return Err(bad("time and distance have a number"));
+        }
+    }
+    properties(items, &|name, values| match name {
+        "Time" | "Dis" => true,
+        _ => PART_AXES.contains(&name) && values.is_empty(),
+    })
+}
+
+fn touch(items: &[Item]) -> Result<(), Flaw> {
+    for item in items {
+        if matches!(item, Item::Call(name, values) if matches!(name.as_str(), "X" | "Y" | "Z") && values.is_empty()) {
+            return Err(bad("a coordinate has a number"));
+        }
+    }
+    properties(items, &|name, values| match name {
+        "IJK" => values.len() == 3,
+        _ => PART_AXES.contains(&name) && values.len() == 1,
+    })?;
+    let is_place = |item: &Item| matches!(item, Item::Call(name, _) if matches!(name.as_str(), "X" | "Y" | "Z"));
+    if items.iter().any(is_place) { Ok(()) } else { Err(arguments("one of X, Y and Z must be there")) }
+}
+
+// ---- properties of tools --------------------------------------------------------------------------------------------------------
+
+/// A name with a comma and nothing behind it is refused as a property without its parentheses.
+fn trailing(items: &[Item], otherwise: Flaw) -> Result<(), Flaw> {
+    match items {
+        [.., Item::Name(_), Item::Nothing] => Err(bad("a property ends with its parentheses")),
+        _ => Err(otherwise),
+    }
+}
+
+fn each_property(items: &[Item], check: fn(&[&str], &[Item]) -> Result<(), Flaw>) -> Result<(), Flaw> {
+    let all_calls = !items.is_empty() && items.iter().all(|item| matches!(item, Item::Call(..)));
+    if !all_calls {
+        return trailing(items, arguments("an argument is no property"));
+    }
+    for item in items {
+        let Item::Call(name, values) = item else { continue };
+        let parts: Vec<&str> = name.split('.').collect();
+        check(&parts, values)?;
+    }
+    Ok(())
+}
+
+fn enumerated(item: &Item, items: &[Item]) -> Result<(), Flaw> {
+    let Item::Call(name, values) = item else { return trailing(items, arguments("the argument is no property")) };
+    let parts: Vec<&str> = name.split('.').collect();
+    if !values.is_empty() {
+        return Err(arguments("a property is asked for with empty parentheses"));
+    }
+    tool(&parts)?;
+    if parts.len() > 1 && !matches!(parts[1], "GoToPar" | "PtMeasPar" | "ScanPar") {
+        return Err(bad("the second part is GoToPar, PtMeasPar or ScanPar"));
+    }
+    third_and_fourth(&parts, &["Act", "Def", "Max", "Min"])
+}
+
+fn tool(parts: &[&str]) -> Result<(), Flaw> {
+    if matches!(parts[0], "Tool" | "FoundTool") { Ok(()) } else { Err(bad("the first part is Tool or FoundTool")) }
+}
+
+fn third_and_fourth(parts: &[&str], fourth: &[&str]) -> Result<(), Flaw> {
+    if parts.get(2).is_some_and(|part| !PARAMETERS.contains(part)) {
+        return Err(bad("the third part is no parameter"));
+    }
+    if parts.get(3).is_some_and(|part| !fourth.contains(part)) {
+        return Err(bad("the fourth part is no side of a parameter"));
+    }
+    if parts.len() > 4 { Err(arguments("a property has four parts at most")) } else { Ok(()) }
+}
+
+fn told(parts: &[&str], values: &[Item]) -> Result<(), Flaw> {
+    if !values.is_empty() {
+        return Err(arguments("a property is asked for with empty parentheses"));
+    }
+    tool(parts)?;
+    match parts {
+        [_] => Err(arguments("a tool alone is no property")),
+        ["FoundTool", "Alignment"] => Err(arguments("only the active tool has an alignment")),
+        [
+            _,
+            "Alignment" | "CollisionVolume" | "Id" | "Name" | "AvrRadius" | "AvrOffsets" | "QualSigma" | "QualTime",
+        ] => Ok(()),
+        [_, "GoToPar" | "PtMeasPar" | "ScanPar", _, ..] => third_and_fourth(parts, &["Act", "Def", "Max", "Min"]),
+        _ => Err(bad("the second part is no property of a tool")),
+    }
+}
+
+fn set(parts: &[&str], values: &[Item]) -> Result<(), Flaw> {
+    tool(parts)?;
+    match parts {
+        [_] | [_, _] => Err(arguments("a property that is set has three parts or four")),
+        [_, "GoToPar" | "PtMeasPar" | "ScanPar", _, ..] => third_and_fourth(parts, &["Act"]),
+        _ => Err(bad("the second part is GoToPar, PtMeasPar or ScanPar")),
+    }?;
+    match (values.len(), parts.len()) {
+        (1, _) => Ok(()),
+        (_, 4) => Err(bad("a property is set by one number")),
+        _ => Err(arguments("a property is set by one number")),
+    }
+}

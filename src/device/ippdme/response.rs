@@ -1,0 +1,194 @@
+//! Answers: read by their meaning, for servers differ in everything that the standard shows by example only.
+
+use std::fmt;
+
+use super::text::{Flaw, Item, Reader, Strictness, Tag};
+
+/// A line of a server.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Response {
+    /// Whose answer it is.
+    pub tag: Tag,
+    /// What it says.
+    pub said: Said,
+}
+
+/// What a line of a server says.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Said {
+    /// The command is in the queue.
+    Acknowledged,
+    /// Data of the command.
+    Data(Vec<Item>),
+    /// Something went wrong.
+    Error(ServerError),
+    /// The command is over.
+    Complete,
+}
+
+/// An error as the server gives it. Its number is what counts; severity and text differ between servers.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ServerError {
+    /// 0 information, 1 warning, 2 the client can go on, 3 an operator is needed, 9 the server is done.
+    pub severity: u8,
+    /// Its number.
+    pub number: u16,
+    /// What caused it.
+    pub cause: String,
+    /// In the server's words.
+    pub text: String,
+}
+
+impl ServerError {
+    /// Whether it stops nothing.
+    pub fn is_warning(&self) -> bool {
+        self.severity < 2
+    }
+}
+
+impl fmt::Display for ServerError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "error {:04}, severity {}: {}", self.number, self.severity, self.text)?;
+        if self.cause.is_empty() { Ok(()) } else { write!(f, " ({})", self.cause) }
+    }
+}
+
+impl Response {
+    /// Reads a line without its end.
+    ///
+    /// # Errors
+    /// A line that means nothing.
+    pub fn read(line: &str) -> Result<Self, Flaw> {
+        let none = |why| Flaw { number: 8, why };
+        let tag = line.get(..5).and_then(Tag::read).ok_or(none("no tag"))?;
+        let rest = line[5..].trim_start_matches(' ');
+        let mut characters = rest.chars();
+        let said = match characters.next() {
+            Some('&') if characters.as_str().trim().is_empty() => Said::Acknowledged,
+            Some('%') if characters.as_str().trim().is_empty() => Said::Complete,
+            Some('#') => Said::Data(data(characters.as_str())?),
+            Some('!') => Said::Error(error(characters.as_str()).ok_or(none("an error without its numbers"))?),
+            _ => return Err(none("none of & # ! %")),
+        };
+        Ok(Self { tag, said })
+    }
+}
+
+fn data(text: &str) -> Result<Vec<Item>, Flaw> {
+    let mut reader = Reader::new(text, Strictness::Lenient);
+    // A list in parentheses without a name is a list.
+    if reader.eat('(') {
+        let items = reader.in_parentheses()?;
+        return ended(reader, items);
+    }
+    let items = reader.items()?;
+    ended(reader, items)
+}
+
+fn ended(mut reader: Reader<'_>, items: Vec<Item>) -> Result<Vec<Item>, Flaw> {
+    let whole = reader.is_at_end() && !items.contains(&Item::Nothing);
+    if whole { Ok(items) } else { Err(Flaw { number: 8, why: "something stands between the data" }) }
+}
+
+/// Reads `Error(severity, number, cause, text)`; cause and text with their quotes or without, and with anything in them.
+fn error(text: &str) -> Option<ServerError> {
+    let inside = text.trim().strip_prefix("Error")?.trim_start().strip_prefix('(')?;
+    let inside = inside.trim_end().strip_suffix(')').unwrap_or(inside);
+    let mut parts = inside.splitn(3, ',').map(str::trim);
+    let severity = parts.next()?.parse().ok().filter(|severity| *severity < 10)?;
+    let number = parts.next()?.parse().ok().filter(|number| *number < 10_000)?;
+    let rest = parts.next().unwrap_or_default();
+    // The text is the last string, or what stands behind the last comma.
+    let (cause, text) = match rest.strip_suffix('"').and_then(|rest| rest.rsplit_once('"')) {
+        Some((cause, text)) => (cause.trim_end().trim_end_matches(','), text),
+        None => rest.rsplit_once(',').unwrap_or(("", rest)),
+    };
+    let bare = |text: &str| text.trim().trim_matches('"').to_owned();
+    Some(ServerError { severity, number, cause: bare(cause), text: bare(text) })
+}
+
+/// The number of a property among data, whatever its place; none where it is not there, or there twice.
+pub fn value(data: &[Item], name: &str) -> Option<f64> {
+    match &values(data, name)?[..] {
+        [Item::Number(value)] => Some(*value),
+        _ => None,
+    }
+}
+
+/// What stands in the parentheses of a property among data.
+pub fn values(data: &[Item], name: &str) -> Option<Vec<Item>> {
+    let mut found = data.iter().filter_map(|item| match item {
+        Item::Call(called, values) if called == name => Some(values),
+        _ => None,
+    });
+    let first = found.next()?;
+    found.next().is_none().then(|| first.clone())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn said(line: &str) -> Said {
+        Response::read(line).unwrap().said
+    }
+
+    #[test]
+    fn the_four_kinds_are_told_apart() {
+        assert_eq!(said("00001 &"), Said::Acknowledged);
+        assert_eq!(said("00001 % "), Said::Complete);
+        assert_eq!(Response::read("E0000 # KeyPress(\"Done\")").unwrap().tag, Tag::UNASKED);
+        for nothing in ["", "00001", "00001 ?", "0001 &", "00001 & more", "00001 # X(1) Y(2)", "00001 ! Error(x)"] {
+            assert!(Response::read(nothing).is_err(), "{nothing}");
+        }
+    }
+
+    #[test]
+    fn properties_are_found_by_their_names() {
+        let Said::Data(data) = said("00014 # Q(0), Z(5.12) ,X( 1.5E1),IJK(0,0,1), Tool.AvrRadius(1.5)") else {
+            panic!()
+        };
+        assert_eq!((value(&data, "X"), value(&data, "Z"), value(&data, "Y")), (Some(15.0), Some(5.12), None));
+        assert_eq!(value(&data, "Tool.AvrRadius"), Some(1.5));
+        assert_eq!(values(&data, "IJK").map(|v| v.len()), Some(3));
+    }
+
+    #[test]
+    fn a_property_that_comes_twice_is_none() {
+        let Said::Data(data) = said("00014 # X(1), X(2)") else { panic!() };
+        assert_eq!(value(&data, "X"), None);
+    }
+
+    #[test]
+    fn a_line_of_nothing_but_parentheses_is_refused() {
+        assert!(Response::read(&format!("00001 # {}", "A(".repeat(30_000))).is_err());
+    }
+
+    proptest::proptest! {
+        /// Whatever a server sends, no reader falls over it, and what is read as a command is written as one.
+        #[test]
+        fn any_line_is_read_or_refused(line in "([0-9E]{5} [&#!%]? ?)?[A-Za-z0-9().,+\\-\" E]{0,60}|\\PC{0,40}") {
+            let _ = Response::read(&line);
+            if let Ok((tag, command)) = crate::ippdme::Command::read(&line) {
+                let written = command.line(tag);
+                let again = crate::ippdme::Command::read(written.trim_end());
+                proptest::prop_assert_eq!(again, Ok((tag, command)));
+            }
+        }
+    }
+
+    #[test]
+    fn errors_are_read_however_they_are_quoted() {
+        let read = |line: &str| match said(line) {
+            Said::Error(error) => (error.severity, error.number, error.cause, error.text),
+            other => panic!("{other:?}"),
+        };
+        let (cause, text) = ("00070 GoTo(X(2), Y(3))".to_owned(), "Transaction aborted".to_owned());
+        assert_eq!(
+            read("00070 ! Error(2, 0006, \"00070 GoTo(X(2), Y(3))\", \"Transaction aborted\")"),
+            (2, 6, cause, text)
+        );
+        assert_eq!(read("00003 ! Error(3,500,GoTo,E stop)"), (3, 500, "GoTo".into(), "E stop".into()));
+        assert_eq!(read("00003 ! Error(1,0504)"), (1, 504, String::new(), String::new()));
+    }
+}

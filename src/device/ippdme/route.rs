@@ -1,0 +1,372 @@
+//! The way over the targets: from touch to touch over a plane above them all, in an order that makes the way short, and every position
+//! held against the volume of the machine before the first motion.
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use crate::error::DeviceError;
+use crate::payload::{Plan, Target};
+
+/// More targets than this are touched in the order of the plan: their order would take longer to find than it saves.
+const MOST_ORDERED: usize = 6000;
+/// A normal that points further down than this cannot be come at from above.
+const LEAST_UP: f64 = -0.2;
+
+/// The way over the targets of a plan.
+#[derive(Clone, Debug)]
+pub(super) struct Route {
+    /// Which target is touched when: places in the plan.
+    pub(super) order: Vec<usize>,
+    /// The height at which the probe's centre travels.
+    pub(super) clearance_mm: f64,
+    /// How long the way is across, in this order and in that of the plan.
+    pub(super) travel_m: f64,
+    pub(super) plain_m: f64,
+}
+
+impl Route {
+    /// Finds the way.
+    ///
+    /// # Errors
+    /// A target that cannot be come at from above, or a position outside of the volume.
+    pub(super) fn over(plan: &Plan, volume_mm: &[[f64; 3]; 2], machine: &Arc<str>) -> Result<Self, DeviceError> {
+        let highest = plan.targets.iter().map(|target| target.point_mm[2]).fold(f64::NEG_INFINITY, f64::max);
+        let clearance_mm = highest + plan.safe_height_mm + plan.probe_radius_mm;
+        for target in &plan.targets {
+            check(target, plan, clearance_mm, volume_mm, machine)?;
+        }
+        let order = order(plan);
+        let plain: Vec<usize> = (0..plan.targets.len()).collect();
+        let [travel_m, plain_m] = [&order, &plain].map(|order| 1e-3 * length(&order_places(plan, order)));
+        Ok(Self { order, clearance_mm, travel_m, plain_m })
+    }
+}
+
+/// Where the probe's centre turns into the normal.
+pub(super) fn approach(target: &Target, plan: &Plan) -> [f64; 3] {
+    along(target, plan.approach_mm + plan.probe_radius_mm)
+}
+
+/// A place on the normal of a target.
+pub(super) fn along(target: &Target, mm: f64) -> [f64; 3] {
+    std::array::from_fn(|k| target.point_mm[k] + mm * target.normal[k])
+}
+
+fn check(
+    target: &Target,
+    plan: &Plan,
+    clearance_mm: f64,
+    volume_mm: &[[f64; 3]; 2],
+    machine: &Arc<str>,
+) -> Result<(), DeviceError> {
+    if target.normal[2] < LEAST_UP {
+        return Err(DeviceError::BadPayload {
+            machine: Arc::clone(machine),
+            what: "plan",
+            field: format!("the height of the normal of target {}", target.index),
+            value: target.normal[2],
+            limit: "-0.2 or more: the probe comes from above; turn the part, or leave the target out",
+        });
+    }
+    let start = approach(target, plan);
+    let over = [start[0], start[1], clearance_mm];
+    let end = along(target, plan.probe_radius_mm - plan.search_mm);
+    for (what, at) in [("travel over", over), ("approach to", start), ("search at", end)] {
+        for axis in 0..3 {
+            let [least, most] = volume_mm.map(|corner| corner[axis]);
+            if !(least..=most).contains(&at[axis]) {
+                return Err(DeviceError::OutOfVolume {
+                    machine: Arc::clone(machine),
+                    what,
+                    target: target.index,
+                    axis: ['x', 'y', 'z'][axis],
+                    value_mm: at[axis],
+                    least_mm: least,
+                    most_mm: most,
+                });
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The order of the touches. A careful beginning stays one, and the reference sphere is not mixed with the part.
+fn order(plan: &Plan) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..plan.targets.len()).collect();
+    if plan.targets.len() > MOST_ORDERED {
+        return order;
+    }
+    let careful = plan.careful.map_or(0, |careful| careful.targets as usize).min(order.len());
+    let mut from = careful;
+    while from < order.len() {
+        let what = plan.targets[from].what;
+        let alike = plan.targets[from..].iter().take_while(|target| target.what == what).count();
+        shorten(plan, &mut order, from..from + alike);
+        from += alike;
+    }
+    order
+}
+
+/// Orders a stretch of the way: to the nearest neighbour, then improved by turning stretches round and by moving short ones. The plan's own
+/// order stays where that is the shorter way.
+fn shorten(plan: &Plan, order: &mut [usize], stretch: Range<usize>) {
+    let begin = stretch.start.checked_sub(1).map(|k| place(plan, order[k]));
+    let targets = &mut order[stretch];
+    let places: Vec<[f64; 2]> = targets.iter().map(|k| place(plan, *k)).collect();
+    let mut found = nearest(&places, begin);
+    improve(&places, &mut found);
+    let way = |order: &[usize]| {
+        let all: Vec<[f64; 2]> = begin.into_iter().chain(order.iter().map(|k| places[*k])).collect();
+        length(&all)
+    };
+    let plain: Vec<usize> = (0..places.len()).collect();
+    let mut plain_improved = plain.clone();
+    improve(&places, &mut plain_improved);
+    let best = [plain, found, plain_improved].into_iter().min_by(|a, b| way(a).total_cmp(&way(b)));
+    let before = targets.to_vec();
+    for (k, at) in best.unwrap_or_default().into_iter().enumerate() {
+        targets[k] = before[at];
+    }
+}
+
+fn nearest(places: &[[f64; 2]], begin: Option<[f64; 2]>) -> Vec<usize> {
+    let mut left: Vec<usize> = (0..places.len()).collect();
+    let mut at = begin.unwrap_or_else(|| places.first().copied().unwrap_or_default());
+    let mut order = Vec::with_capacity(left.len());
+    while let Some((k, _)) =
+        left.iter().enumerate().min_by(|a, b| apart(places[*a.1], at).total_cmp(&apart(places[*b.1], at)))
+    {
+        let next = left.swap_remove(k);
+        at = places[next];
+        order.push(next);
+    }
+    order
+}
+
+/// Two-opt and Or-opt over the near neighbours of each stop, until neither shortens the way.
+fn improve(places: &[[f64; 2]], order: &mut [usize]) {
+    const PASSES: usize = 30;
+    if order.len() < 4 {
+        return;
+    }
+    let mut tour = Tour::new(places, order);
+    for _ in 0..PASSES {
+        let mut better = false;
+        for stop in 0..places.len() {
+            better |= tour.turn_behind(stop) || tour.turn_before(stop) || tour.carry(stop);
+        }
+        if !better {
+            break;
+        }
+    }
+}
+
+/// A way that is being made shorter. Its first stop stays, for the way to it is not known here.
+struct Tour<'a> {
+    places: &'a [[f64; 2]],
+    order: &'a mut [usize],
+    /// Where in the order each stop is.
+    at: Vec<usize>,
+    /// The nearest other stops of each, the nearest first.
+    near: Vec<Vec<usize>>,
+}
+
+impl<'a> Tour<'a> {
+    fn new(places: &'a [[f64; 2]], order: &'a mut [usize]) -> Self {
+        let near = (0..places.len()).map(|k| neighbours(places, k)).collect();
+        let mut tour = Self { places, at: vec![0; order.len()], order, near };
+        tour.note(0..tour.order.len());
+        tour
+    }
+
+    fn note(&mut self, stretch: Range<usize>) {
+        for k in stretch {
+            self.at[self.order[k]] = k;
+        }
+    }
+
+    fn apart(&self, a: usize, b: usize) -> f64 {
+        apart(self.places[a], self.places[b])
+    }
+
+    /// The way between two stops; none where there is no second one.
+    fn to(&self, a: usize, b: Option<&usize>) -> f64 {
+        b.map_or(0.0, |b| self.apart(a, *b))
+    }
+
+    fn turn(&mut self, stretch: Range<usize>) {
+        self.order[stretch.clone()].reverse();
+        self.note(stretch);
+    }
+
+    /// Turns round what lies behind a stop so that one of its neighbours comes next.
+    fn turn_behind(&mut self, stop: usize) -> bool {
+        let i = self.at[stop];
+        let Some(&next) = self.order.get(i + 1) else { return false };
+        let now = self.apart(stop, next);
+        for k in 0..self.near[stop].len() {
+            let other = self.near[stop][k];
+            let (j, saved) = (self.at[other], now - self.apart(stop, other));
+            if saved <= 1e-9 {
+                break;
+            }
+            let behind = self.order.get(j + 1);
+            if j > i && saved + self.to(other, behind) - self.to(next, behind) > 1e-9 {
+                self.turn(i + 1..j + 1);
+                return true;
+            }
+        }
+        false
+    }
+
+    /// Turns round what lies before a stop so that one of its neighbours comes just before.
+    fn turn_before(&mut self, stop: usize) -> bool {
+        let i = self.at[stop];
+        if i < 2 {
+            return false;
+        }
+        let last = self.order[i - 1];
+        let now = self.apart(last, stop);
+        for k in 0..self.near[stop].len() {
+            let other = self.near[stop][k];
+            let (j, saved) = (self.at[other], now - self.apart(stop, other));
+            if saved <= 1e-9 {
+                break;
+            }
+            if (1..i).contains(&j) {
+                let before = self.order[j - 1];
+                if saved + self.apart(before, other) - self.apart(before, last) > 1e-9 {
+                    self.turn(j..i);
+                    return true;
+                }
+            }
+        }
+        false
+    }
+
+    /// Carries a stretch of one to three stops, which begins with this one, behind a neighbour of it.
+    fn carry(&mut self, stop: usize) -> bool {
+        let i = self.at[stop];
+        for size in 1..=3 {
+            if i == 0 || i + size > self.order.len() {
+                return false;
+            }
+            let (before, last, behind) = (self.order[i - 1], self.order[i + size - 1], self.order.get(i + size));
+            let saved = self.apart(before, stop) + self.to(last, behind) - self.to(before, behind);
+            for k in 0..self.near[stop].len() {
+                let other = self.near[stop][k];
+                let j = self.at[other];
+                if self.apart(other, stop) >= saved - 1e-9 {
+                    break;
+                }
+                if (i - 1..i + size).contains(&j) {
+                    continue;
+                }
+                let next = self.order.get(j + 1);
+                if self.apart(other, stop) + self.to(last, next) - self.to(other, next) < saved - 1e-9 {
+                    if j < i {
+                        self.order[j + 1..i + size].rotate_right(size);
+                        self.note(j + 1..i + size);
+                    } else {
+                        self.order[i..=j].rotate_left(size);
+                        self.note(i..j + 1);
+                    }
+                    return true;
+                }
+            }
+        }
+        false
+    }
+}
+
+/// The nearest other places, the nearest first.
+fn neighbours(places: &[[f64; 2]], of: usize) -> Vec<usize> {
+    const NEAR: usize = 10;
+    let mut others: Vec<usize> = (0..places.len()).filter(|k| *k != of).collect();
+    let nearer = |a: &usize, b: &usize| apart(places[*a], places[of]).total_cmp(&apart(places[*b], places[of]));
+    if others.len() > NEAR {
+        others.select_nth_unstable_by(NEAR, nearer);
+        others.truncate(NEAR);
+    }
+    others.sort_unstable_by(nearer);
+    others
+}
+
+fn place(plan: &Plan, k: usize) -> [f64; 2] {
+    let [x, y, _] = approach(&plan.targets[k], plan);
+    [x, y]
+}
+
+fn order_places(plan: &Plan, order: &[usize]) -> Vec<[f64; 2]> {
+    order.iter().map(|k| place(plan, *k)).collect()
+}
+
+fn apart(a: [f64; 2], b: [f64; 2]) -> f64 {
+    (a[0] - b[0]).hypot(a[1] - b[1])
+}
+
+fn length(places: &[[f64; 2]]) -> f64 {
+    places.windows(2).map(|pair| apart(pair[0], pair[1])).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::payload::{Careful, TargetKind};
+
+    fn plan(points: impl Iterator<Item = [f64; 3]>) -> Plan {
+        let target = |(index, point_mm)| Target {
+            index: index as u32,
+            what: TargetKind::Part,
+            point_mm,
+            normal: [0.0, 0.0, 1.0],
+        };
+        Plan {
+            targets: points.enumerate().map(target).collect(),
+            probe_radius_mm: 1.5,
+            approach_mm: 2.0,
+            search_mm: 2.0,
+            speed_mm_s: 3.0,
+            safe_height_mm: 20.0,
+            careful: None,
+        }
+    }
+
+    const VOLUME: [[f64; 3]; 2] = [[-100.0; 3], [100.0; 3]];
+
+    fn machine() -> Arc<str> {
+        Arc::from("cmm")
+    }
+
+    /// A grid whose points come shuffled.
+    fn shuffled() -> Plan {
+        plan((0..100).map(|k| (k * 37) % 100).map(|k| [f64::from(k % 10), f64::from(k / 10), 0.0]))
+    }
+
+    #[test]
+    fn a_shuffled_grid_is_walked_almost_without_a_step_too_many() {
+        let route = Route::over(&shuffled(), &VOLUME, &machine()).unwrap();
+        assert!(route.travel_m < 0.107 && route.plain_m > 0.3, "{} and {}", route.travel_m, route.plain_m);
+        let mut all = route.order.clone();
+        all.sort_unstable();
+        assert_eq!(all, (0..100).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn a_careful_beginning_stays_the_beginning() {
+        let careful = Careful { targets: 5, speed_mm_s: 0.5 };
+        let route = Route::over(&Plan { careful: Some(careful), ..shuffled() }, &VOLUME, &machine()).unwrap();
+        assert_eq!(route.order[..5], [0, 1, 2, 3, 4]);
+    }
+
+    #[test]
+    fn a_position_outside_of_the_volume_is_named_before_anything_moves() {
+        let outside = plan([[0.0, 0.0, 0.0], [99.0, 0.0, 77.0]].into_iter());
+        let Err(DeviceError::OutOfVolume { axis, target, value_mm, .. }) =
+            Route::over(&Plan { safe_height_mm: 30.0, ..outside }, &VOLUME, &machine())
+        else {
+            panic!()
+        };
+        assert_eq!((axis, target, value_mm), ('z', 0, 108.5));
+    }
+}

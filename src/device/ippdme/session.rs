@@ -1,0 +1,403 @@
+//! A session with a server: one command after another, each to its end, and an abort that waits for none.
+//!
+//! The next command goes out when the last one is over. Lines are held to their tags: what belongs to a command that is over, or to none
+//! that was given, becomes no value. The standard has no time-outs and no sign of life, so both are made here.
+
+use std::collections::VecDeque;
+use std::fmt::Debug;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::net::TcpStream;
+use tokio::sync::watch;
+use tokio::time::{Instant, sleep, sleep_until, timeout};
+
+use super::command::{Command, LONGEST_LINE};
+use super::response::{Response, Said, ServerError, value};
+use super::text::{Item, Tag};
+use crate::error::DeviceError;
+
+/// How long to wait for what.
+#[derive(Clone, Copy, Debug)]
+pub struct Limits {
+    /// For the connection, and for the acknowledgement of a command.
+    pub answer: Duration,
+    /// For the end of a command, over the time that its motion takes.
+    pub completion: Duration,
+    /// For the end of an abort.
+    pub abort: Duration,
+    /// Between two tries to go on after an abort that the server has acknowledged and not digested.
+    pub after_abort: Duration,
+    /// Of silence while something moves, after which the server is asked whether it is alive.
+    pub alive: Duration,
+}
+
+/// So often is a server asked to forget its errors after an abort.
+const CLEARING_TRIES: u32 = 20;
+/// Messages are for a person: the last ones.
+const NOTES: usize = 8;
+
+/// Why a command came to nothing.
+#[derive(Debug)]
+pub(super) enum Failure {
+    /// The wire failed, or what came over it; the session is not to be used any more.
+    Link(DeviceError),
+    /// The server said no.
+    No(ServerError),
+    /// It was aborted, and the server has forgotten its errors.
+    Aborted,
+    /// What it said cannot be.
+    Wrong(DeviceError),
+}
+
+/// A wire to a server.
+pub(super) trait Stream: AsyncRead + AsyncWrite + Debug + Send + Unpin {}
+impl<S: AsyncRead + AsyncWrite + Debug + Send + Unpin> Stream for S {}
+
+/// A session with a server.
+#[derive(Debug)]
+pub(super) struct Session {
+    pub(super) machine: Arc<str>,
+    stream: Box<dyn Stream>,
+    unread: Vec<u8>,
+    limits: Limits,
+    last: u32,
+    last_event: u16,
+    /// Aborts that were ordered and those that were carried out.
+    aborts: watch::Receiver<u64>,
+    aborted: u64,
+    notes: VecDeque<String>,
+}
+
+/// What came of a command.
+#[derive(Debug, Default)]
+pub(super) struct Answer {
+    /// The data, a list for each line.
+    pub(super) data: Vec<Vec<Item>>,
+    /// What the server had to say besides.
+    pub(super) warnings: Vec<ServerError>,
+}
+
+impl Answer {
+    /// The number of a property in the one line of data there is.
+    pub(super) fn value(&self, name: &str) -> Option<f64> {
+        value(self.line()?, name)
+    }
+
+    /// The one line of data there is; one that came twice alike is one.
+    pub(super) fn line(&self) -> Option<&[Item]> {
+        let (first, rest) = self.data.split_first()?;
+        rest.iter().all(|other| other == first).then_some(first)
+    }
+}
+
+/// How far a command is.
+struct Pending<'a> {
+    tag: Tag,
+    command: &'a Command,
+    acknowledged: bool,
+    answer: Answer,
+    error: Option<ServerError>,
+}
+
+impl Session {
+    /// Opens the connection; nothing is said yet.
+    pub(super) async fn dial(
+        machine: Arc<str>,
+        (host, port): (&str, u16),
+        limits: Limits,
+        aborts: watch::Receiver<u64>,
+    ) -> Result<Self, DeviceError> {
+        let unreachable = |why| DeviceError::Unreachable { machine: Arc::clone(&machine), why, limit: limits.answer };
+        let dialled = timeout(limits.answer, TcpStream::connect((host, port))).await;
+        let stream = dialled.unwrap_or(Err(std::io::ErrorKind::TimedOut.into())).map_err(|e| unreachable(e.kind()))?;
+        // What is given up takes what it has not sent along: no command arrives after that.
+        stream.set_nodelay(true).and_then(|()| stream.set_zero_linger()).map_err(|e| unreachable(e.kind()))?;
+        Ok(Self::on(Arc::clone(&machine), Box::new(stream), limits, aborts))
+    }
+
+    pub(super) fn on(machine: Arc<str>, stream: Box<dyn Stream>, limits: Limits, aborts: watch::Receiver<u64>) -> Self {
+        let aborted = *aborts.borrow();
+        let (unread, notes) = (Vec::new(), VecDeque::new());
+        Self { machine, stream, unread, limits, last: 0, last_event: 0, aborts, aborted, notes }
+    }
+
+    /// Begins a session anew, whatever the server was at: it ends the one that may be left over, and that waits for its motion. A server in
+    /// an error, or in a session that it did not end for one, is tried again when it has forgotten that.
+    pub(super) async fn open(&mut self) -> Result<(), Failure> {
+        const LEFT_OVER: [u16; 4] = [8, 507, 508, 514];
+        for again in [true, false] {
+            match self.ask("EndSession", Vec::new()).await {
+                Ok(_) | Err(Failure::No(_)) => {}
+                Err(other) => return Err(other),
+            }
+            match self.ask("StartSession", Vec::new()).await {
+                Err(Failure::No(error)) if again && LEFT_OVER.contains(&error.number) => {
+                    if let Err(failure @ (Failure::Link(_) | Failure::Wrong(_) | Failure::Aborted)) =
+                        self.ask("ClearAllErrors", Vec::new()).await
+                    {
+                        return Err(failure);
+                    }
+                }
+                other => return other.map(drop),
+            }
+        }
+        Ok(())
+    }
+
+    /// Asks without any motion.
+    pub(super) async fn ask(&mut self, name: &str, arguments: Vec<Item>) -> Result<Answer, Failure> {
+        self.move_by(name, arguments, Duration::ZERO).await
+    }
+
+    /// Asks for what takes so long by its motion, and waits for its end.
+    pub(super) async fn move_by(
+        &mut self,
+        name: &str,
+        arguments: Vec<Item>,
+        motion: Duration,
+    ) -> Result<Answer, Failure> {
+        if self.is_abort_ordered() {
+            return Err(self.abort().await);
+        }
+        let command = Command::new(name, arguments);
+        let tag = if command.is_event() { self.next_event() } else { self.next_command() };
+        self.write(&command, tag).await.map_err(Failure::Link)?;
+        let mut pending =
+            Pending { tag, command: &command, acknowledged: false, answer: Answer::default(), error: None };
+        self.await_end(&mut pending, motion).await
+    }
+
+    async fn await_end(&mut self, pending: &mut Pending<'_>, motion: Duration) -> Result<Answer, Failure> {
+        let began = Instant::now();
+        let mut alive_at = began + self.limits.alive;
+        let mut asked_alive: Option<(Tag, Instant)> = None;
+        let mut due = began + self.limits.answer;
+        loop {
+            let next = tokio::select! {
+                biased;
+                () = self.abort_ordered() => return Err(self.abort().await),
+                line = read_line(&mut self.stream, &mut self.unread) => Some(line),
+                () = sleep_until(due.min(alive_at)) => None,
+            };
+            let Some(line) = next else {
+                if Instant::now() >= due || asked_alive.is_some_and(|(_, limit)| Instant::now() >= limit) {
+                    return Err(Failure::Link(self.timed_out(pending.command, began.elapsed())));
+                }
+                // Its answer is awaited beside that of the command.
+                let (tag, limit) = (self.next_event(), Instant::now() + self.limits.answer);
+                self.write(&Command::new("GetErrStatusE", Vec::new()), tag).await.map_err(Failure::Link)?;
+                (asked_alive, alive_at) = (Some((tag, limit)), limit);
+                continue;
+            };
+            let response = self.understood(line)?;
+            alive_at = Instant::now() + self.limits.alive;
+            if response.tag == pending.tag {
+                if let Some(answer) = self.take(pending, response.said)? {
+                    return Ok(answer);
+                }
+                due = match (&pending.error, pending.acknowledged) {
+                    // A command that failed moves no more.
+                    (Some(_), _) | (None, false) => Instant::now() + self.limits.answer,
+                    (None, true) => began + self.limits.answer + motion + self.limits.completion,
+                };
+            } else if asked_alive.is_some_and(|(tag, _)| tag == response.tag) {
+                asked_alive = asked_alive.filter(|_| response.said != Said::Complete);
+            } else {
+                self.beside(response)?;
+            }
+        }
+    }
+
+    /// Takes a line of the command itself; an answer where it is over.
+    fn take(&mut self, pending: &mut Pending<'_>, said: Said) -> Result<Option<Answer>, Failure> {
+        match said {
+            Said::Acknowledged => pending.acknowledged = true,
+            Said::Data(data) => pending.answer.data.push(data),
+            Said::Error(error) if is_passing(&error) => {
+                self.note(format!("{}: {error}", pending.command.name));
+                pending.answer.warnings.push(error);
+            }
+            Said::Error(error) => {
+                pending.error.get_or_insert(error);
+            }
+            Said::Complete => {
+                return match pending.error.take() {
+                    Some(error) => Err(Failure::No(error)),
+                    None => Ok(Some(std::mem::take(&mut pending.answer))),
+                };
+            }
+        }
+        Ok(None)
+    }
+
+    /// Takes a line that is not of the command: the server's own, or late ones of commands that are over.
+    fn beside(&mut self, response: Response) -> Result<(), Failure> {
+        match (response.tag, response.said) {
+            (Tag::UNASKED, Said::Error(error)) if !is_passing(&error) => Err(Failure::No(error)),
+            (Tag::UNASKED, Said::Error(error)) => {
+                self.note(format!("unasked: {error}"));
+                Ok(())
+            }
+            (Tag::UNASKED, Said::Data(data)) => {
+                self.note(format!("somebody at the machine: {}", super::text::list(&data)));
+                Ok(())
+            }
+            (Tag::UNASKED, _) => Ok(()),
+            (Tag::Command(number), _) if self.was_given(number) => Ok(()),
+            (Tag::Event(number), _) if number <= self.last_event => Ok(()),
+            (tag, _) => Err(Failure::Link(self.unreadable(tag.to_string(), "it answers what was not asked"))),
+        }
+    }
+
+    fn was_given(&self, number: u32) -> bool {
+        // Tags begin anew after 99999; those before are long over.
+        number != 0 && (number <= self.last || number > 99_999 - 1_000 && self.last < 1_000)
+    }
+
+    fn next_command(&mut self) -> Tag {
+        self.last = self.last % 99_999 + 1;
+        Tag::Command(self.last)
+    }
+
+    fn next_event(&mut self) -> Tag {
+        self.last_event = self.last_event % 9_999 + 1;
+        Tag::Event(self.last_event)
+    }
+
+    async fn write(&mut self, command: &Command, tag: Tag) -> Result<(), DeviceError> {
+        let line = command.line(tag);
+        let written = timeout(self.limits.answer, self.stream.write_all(line.as_bytes())).await;
+        written.unwrap_or(Err(std::io::ErrorKind::TimedOut.into())).map_err(|_| self.disconnected("writing"))
+    }
+
+    fn understood(&mut self, line: std::io::Result<String>) -> Result<Response, Failure> {
+        let line = line.map_err(|e| match e.kind() {
+            std::io::ErrorKind::InvalidData => {
+                Failure::Link(self.unreadable(String::new(), "a line that does not end, or is not ASCII"))
+            }
+            _ => Failure::Link(self.disconnected("reading")),
+        })?;
+        Response::read(&line).map_err(|flaw| Failure::Link(self.unreadable(line, flaw.why)))
+    }
+
+    // ---- the end of everything ------------------------------------------------------------------------------------------------------
+
+    pub(super) fn is_abort_ordered(&self) -> bool {
+        *self.aborts.borrow() > self.aborted
+    }
+
+    /// Waits until an abort is ordered, or nobody is left to order one.
+    pub(super) fn abort_ordered(&self) -> impl Future<Output = ()> + Send + use<> {
+        let (mut aborts, aborted) = (self.aborts.clone(), self.aborted);
+        async move {
+            if aborts.wait_for(|ordered| *ordered > aborted).await.is_err() {
+                std::future::pending::<()>().await;
+            }
+        }
+    }
+
+    /// Aborts what runs and waits, and makes the server ready again. [`Failure::Aborted`] where it did so.
+    pub(super) async fn abort(&mut self) -> Failure {
+        self.aborted = *self.aborts.borrow();
+        match self.aborts_now().await {
+            Ok(()) => Failure::Aborted,
+            Err(failure) => failure,
+        }
+    }
+
+    async fn aborts_now(&mut self) -> Result<(), Failure> {
+        let (command, tag) = (Command::new("AbortE", Vec::new()), self.next_event());
+        self.write(&command, tag).await.map_err(Failure::Link)?;
+        let over = Instant::now() + self.limits.abort;
+        // Nothing else may be said before it is over; what its victims still say is theirs.
+        loop {
+            let line = tokio::select! {
+                biased;
+                line = read_line(&mut self.stream, &mut self.unread) => line,
+                () = sleep_until(over) => return Err(Failure::Link(self.timed_out(&command, self.limits.abort))),
+            };
+            let response = self.understood(line)?;
+            match response.said {
+                Said::Complete if response.tag == tag => break,
+                Said::Error(error) if response.tag == tag && !is_passing(&error) => {
+                    let why = "it does not carry out AbortE";
+                    self.note(format!("AbortE: {error}"));
+                    return Err(Failure::Link(self.unreadable(error.to_string(), why)));
+                }
+                _ => {}
+            }
+        }
+        self.clear_errors(CLEARING_TRIES).await
+    }
+
+    /// Has the server forget its errors. One that has acknowledged an abort may need a while until it does.
+    pub(super) async fn clear_errors(&mut self, tries: u32) -> Result<(), Failure> {
+        for left in (0..tries).rev() {
+            match Box::pin(self.ask("ClearAllErrors", Vec::new())).await {
+                Ok(_) => return Ok(()),
+                Err(Failure::No(_)) if left > 0 => sleep(self.limits.after_abort).await,
+                Err(other) => return Err(other),
+            }
+        }
+        Ok(())
+    }
+
+    // ---- words ------------------------------------------------------------------------------------------------------------------------
+
+    pub(super) fn note(&mut self, note: String) {
+        if !self.notes.contains(&note) {
+            self.notes.push_back(note);
+            if self.notes.len() > NOTES {
+                self.notes.pop_front();
+            }
+        }
+    }
+
+    pub(super) fn notes(&self) -> Vec<String> {
+        self.notes.iter().cloned().collect()
+    }
+
+    fn timed_out(&self, command: &Command, limit: Duration) -> DeviceError {
+        let what = super::known(&command.name);
+        DeviceError::TimedOut { machine: Arc::clone(&self.machine), what, limit }
+    }
+
+    fn disconnected(&self, what: &'static str) -> DeviceError {
+        DeviceError::Disconnected { machine: Arc::clone(&self.machine), what }
+    }
+
+    fn unreadable(&self, line: String, why: &'static str) -> DeviceError {
+        let line = line.chars().take(120).collect();
+        DeviceError::Unreadable { machine: Arc::clone(&self.machine), line, why }
+    }
+}
+
+/// Whether an error stops nothing. Servers may change the severity of an error; those that stop a machine are known by their numbers.
+fn is_passing(error: &ServerError) -> bool {
+    error.is_warning() && !matches!(error.number, 6 | 500 | 503 | 1000..=1009 | 1500..=1503 | 2500..=2506)
+}
+
+/// Reads a line; what was read of it is kept where this is given up.
+async fn read_line(stream: &mut Box<dyn Stream>, unread: &mut Vec<u8>) -> std::io::Result<String> {
+    loop {
+        if let Some(end) = unread.iter().position(|b| *b == b'\n') {
+            let line: Vec<u8> = unread.drain(..=end).collect();
+            let text = line.strip_suffix(b"\n").unwrap_or(&line);
+            let text = text.strip_suffix(b"\r").unwrap_or(text);
+            // Texts of errors come in the server's own language.
+            let text: String = text.iter().map(|b| if (32..=126).contains(b) { char::from(*b) } else { '?' }).collect();
+            if text.is_empty() {
+                continue;
+            }
+            return Ok(text);
+        }
+        if unread.len() > LONGEST_LINE {
+            return Err(std::io::ErrorKind::InvalidData.into());
+        }
+        if stream.read_buf(unread).await? == 0 {
+            return Err(std::io::ErrorKind::UnexpectedEof.into());
+        }
+    }
+}

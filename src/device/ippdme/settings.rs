@@ -1,0 +1,202 @@
+//! What a cell file says of a server of I++ DME, and the machine that is made of it.
+
+use std::net::IpAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use schemars::JsonSchema;
+use serde::Deserialize;
+
+use super::session::Limits;
+use super::{IppdmeCmm, NoGrinder};
+use crate::place::Place;
+use crate::wiring::{Making, MakingError, Wired};
+use regrind_document::Document;
+
+/// I++ DME over TCP, for a measuring machine.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct IppdmeWire {
+    /// Name or address of the server.
+    #[schemars(length(min = 1, max = 253), extend("x-required" = true), example = "192.168.0.20")]
+    pub host: String,
+    /// Port; 0, in a simulated cell only, for one that is free at the start.
+    #[schemars(range(min = 0, max = 65535))]
+    pub port: u16,
+    /// Tool, as the server calls it.
+    #[schemars(length(min = 1, max = 80), extend("x-required" = true), example = &"Probe1")]
+    pub tool: String,
+    /// By how much the radius that the server tells of its tool, or of a touch, may differ from the recipe's.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub probe_tolerance_mm: f64,
+    /// Speed of travel between targets; the server may keep it lower.
+    #[schemars(range(min = 0.1, max = 2000.0))]
+    pub travel_speed_mm_s: f64,
+    /// The part's frame, in which the probe is sent: origin of the machine in it, then theta, psi and phi in degrees; left out, the machine's own.
+    #[schemars(inner(range(min = -100000.0, max = 100000.0)), example = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0])]
+    pub part_frame: Option<[f64; 6]>,
+    /// How often a target is tried again that was missed.
+    #[schemars(range(min = 0, max = 10))]
+    pub tries_again: u8,
+    /// For the connection, and for the acknowledgement of a command.
+    #[schemars(range(min = 10, max = 600000))]
+    pub answer_timeout_ms: u32,
+    /// For the end of a command, over twice the time that its way takes.
+    #[schemars(range(min = 10, max = 3600000))]
+    pub completion_timeout_ms: u32,
+    /// For the end of an abort.
+    #[schemars(range(min = 10, max = 600000))]
+    pub abort_timeout_ms: u32,
+    /// Between two tries to have errors forgotten behind an abort; some servers are not ready at once.
+    #[schemars(range(min = 1, max = 60000))]
+    pub delay_after_abort_ms: u32,
+    /// Of silence, after which the server is asked whether it is alive.
+    #[schemars(range(min = 10, max = 600000))]
+    pub alive_every_ms: u32,
+}
+
+impl Default for IppdmeWire {
+    fn default() -> Self {
+        Self {
+            host: String::new(),
+            port: 1294,
+            tool: String::new(),
+            probe_tolerance_mm: 0.01,
+            travel_speed_mm_s: 100.0,
+            part_frame: None,
+            tries_again: 1,
+            answer_timeout_ms: 5000,
+            completion_timeout_ms: 10_000,
+            abort_timeout_ms: 5000,
+            delay_after_abort_ms: 250,
+            alive_every_ms: 1000,
+        }
+    }
+}
+
+/// Everything that has to be known to drive a server of I++ DME.
+#[derive(Clone, Debug)]
+pub struct IppdmeSettings {
+    /// Name or address of the server.
+    pub host: String,
+    /// Its port.
+    pub port: u16,
+    /// The tool, as the server calls it.
+    pub tool: String,
+    /// By how much its radius may differ from the plan's.
+    pub probe_tolerance_mm: f64,
+    /// Speed of travel between targets.
+    pub travel_speed_mm_s: f64,
+    /// The part's frame; none for the machine's own.
+    pub part_frame: Option<[f64; 6]>,
+    /// How often a target is tried again that was missed.
+    pub retries: u8,
+    /// The least and the largest corner of the box that the probe's centre must not leave.
+    pub volume_mm: [[f64; 3]; 2],
+    /// How long to wait for what.
+    pub limits: Limits,
+    /// Without a look at the status, after which a job holds by itself.
+    pub silence_limit: Duration,
+    /// What the machine must call itself.
+    pub expected_name: Option<String>,
+    /// Whether it has to be a simulation, or must not be one.
+    pub simulated: bool,
+}
+
+impl IppdmeSettings {
+    pub(super) fn diagonal_mm(&self) -> f64 {
+        let [least, most] = self.volume_mm;
+        (0..3).map(|k| (most[k] - least[k]).powi(2)).sum::<f64>().sqrt()
+    }
+}
+
+impl Wired for IppdmeWire {
+    type Cmm = IppdmeCmm;
+    type Grinder = NoGrinder;
+
+    fn check(&self, place: &Place<'_>, document: &mut Document) {
+        if place.table == "grinder" {
+            let allowed = "I++ DME is for measuring machines";
+            return document.report("grinder.wire.kind", "is \"ippdme\"", allowed, "name another wire");
+        }
+        self.check_address(place, document);
+        if !document.is_there("cmm.travel") {
+            let allowed = "every position is held against the machine's volume before it moves";
+            document.report("cmm.wire.kind", "is \"ippdme\" without [cmm.travel]", allowed, "add least_mm and most_mm");
+        }
+        if self.tool.contains(['"', '\r', '\n']) || !self.tool.is_ascii() {
+            let allowed = "names of tools are plain ASCII without quotes";
+            document.report("cmm.wire.tool", format!("is {:?}", self.tool), allowed, "correct it");
+        }
+        if let Some([_, _, _, theta, ..]) = self.part_frame
+            && !(0.0..=180.0).contains(&theta)
+        {
+            let found = format!("has a theta of {theta} degrees");
+            document.report("cmm.wire.part_frame", found, "theta is 0 to 180 degrees", "correct its fourth number");
+        }
+    }
+
+    fn cmm(&self, making: &Making<'_>) -> Result<IppdmeCmm, MakingError> {
+        let machine = format!("cmm at {}:{}", self.host, self.port);
+        let volume_mm = making.volume_mm.ok_or(MakingError::NoVolume { machine })?;
+        let ms = |ms: u32| Duration::from_millis(ms.into());
+        Ok(IppdmeCmm::new(IppdmeSettings {
+            host: self.host.clone(),
+            port: self.port,
+            tool: self.tool.clone(),
+            probe_tolerance_mm: self.probe_tolerance_mm,
+            travel_speed_mm_s: self.travel_speed_mm_s,
+            part_frame: self.part_frame,
+            retries: self.tries_again,
+            volume_mm,
+            limits: Limits {
+                answer: ms(self.answer_timeout_ms),
+                completion: ms(self.completion_timeout_ms),
+                abort: ms(self.abort_timeout_ms),
+                after_abort: ms(self.delay_after_abort_ms),
+                alive: ms(self.alive_every_ms),
+            },
+            silence_limit: making.timing.lost_after,
+            expected_name: making.expected_name.map(str::to_owned),
+            simulated: making.simulated,
+        }))
+    }
+
+    fn grinder(&self, _: &Making<'_>) -> Result<NoGrinder, MakingError> {
+        Err(MakingError::NoDriver { table: "grinder", kind: "ippdme" })
+    }
+
+    fn dme(&self) -> Option<(String, u16)> {
+        Some((self.host.clone(), self.port))
+    }
+}
+
+impl IppdmeWire {
+    fn check_address(&self, place: &Place<'_>, document: &mut Document) {
+        let host = &self.host;
+        let is_here = host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback());
+        if host.is_empty() {
+            // Told by the schema.
+        } else if host.chars().any(|c| c.is_whitespace() || c == '/' || c == '@') {
+            let allowed = "it must be a name or an address alone, such as \"192.168.0.20\"";
+            document.report(&place.key("wire.host"), format!("is {host:?}"), allowed, "the port has a key of its own");
+        } else if place.simulated == Some(true) && !is_here {
+            document.report(
+                &place.key("wire.host"),
+                format!("is {host:?} in a simulated cell"),
+                "simulated machines are on this computer: 127.0.0.1, ::1 or localhost",
+                "is the machine real? then write `simulated = false`",
+            );
+        }
+        if self.port == 0 && place.simulated == Some(false) {
+            let found = "is 0 in a cell that is not simulated";
+            let allowed = "it must be a whole number from 1 to 65535";
+            document.report(&place.key("wire.port"), found, allowed, "1294 is usual for I++ DME");
+        }
+    }
+}
+
+/// The name by which messages call a machine.
+pub(super) fn name(settings: &IppdmeSettings) -> Arc<str> {
+    format!("cmm at {}:{} (I++ DME)", settings.host, settings.port).into()
+}

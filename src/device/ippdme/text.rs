@@ -1,0 +1,321 @@
+//! What lines of I++ DME are made of: tags, numbers, strings, names, and what stands in parentheses.
+
+use std::fmt::{self, Write as _};
+
+/// The most digits that a number may have.
+const MOST_DIGITS: usize = 16;
+/// Parentheses in parentheses: the standard has two.
+const DEEPEST: u32 = 8;
+
+/// What holds an answer to its question.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Tag {
+    /// Of a command that waits its turn: 1 to 99999.
+    Command(u32),
+    /// Of a command that is carried out while others run: 1 to 9999; 0 is the server's own.
+    Event(u16),
+}
+
+impl Tag {
+    /// What the server says without being asked.
+    pub const UNASKED: Self = Self::Event(0);
+
+    /// Reads the five characters of a tag.
+    pub fn read(text: &str) -> Option<Self> {
+        let digits = |text: &str| text.bytes().all(|b| b.is_ascii_digit()).then(|| text.parse().ok()).flatten();
+        match text.strip_prefix('E') {
+            _ if text.len() != 5 => None,
+            Some(number) => digits(number).map(|n: u32| Self::Event(n as u16)),
+            None => digits(text).map(Self::Command),
+        }
+    }
+}
+
+impl fmt::Display for Tag {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Command(number) => write!(f, "{number:05}"),
+            Self::Event(number) => write!(f, "E{number:04}"),
+        }
+    }
+}
+
+/// Why a line is refused: the number of the standard that a server answers, and what is wrong.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Flaw {
+    /// The number.
+    pub number: u16,
+    /// In words.
+    pub why: &'static str,
+}
+
+/// Incorrect arguments.
+pub(super) const fn arguments(why: &'static str) -> Flaw {
+    Flaw { number: 502, why }
+}
+
+/// A bad argument.
+pub(super) const fn bad(why: &'static str) -> Flaw {
+    Flaw { number: 509, why }
+}
+
+/// What stands between two commas.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Item {
+    /// A finite number.
+    Number(f64),
+    /// A string, without its quotes.
+    Text(String),
+    /// The tag of an event command, which names a daemon.
+    Tag(Tag),
+    /// A name alone, such as `PartCsy`.
+    Name(String),
+    /// A name, dots in it or not, and what stands in its parentheses: `Tool.PtMeasPar.Speed(4)`.
+    Call(String, Vec<Item>),
+    /// Nothing: a comma with nothing behind it.
+    Nothing,
+}
+
+impl Item {
+    /// A property with one number, such as `X(1.5)`.
+    pub fn with(name: &str, value: f64) -> Self {
+        Self::Call(name.to_owned(), vec![Self::Number(value)])
+    }
+
+    /// A property that is asked for, such as `X()`.
+    pub fn asked(name: &str) -> Self {
+        Self::Call(name.to_owned(), Vec::new())
+    }
+
+    /// The number that it is.
+    pub fn number(&self) -> Option<f64> {
+        if let Self::Number(value) = self { Some(*value) } else { None }
+    }
+}
+
+impl fmt::Display for Item {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Number(value) => f.write_str(&number(*value)),
+            Self::Text(text) => write!(f, "\"{text}\""),
+            Self::Tag(tag) => tag.fmt(f),
+            Self::Name(name) => f.write_str(name),
+            Self::Call(name, items) => write!(f, "{name}({})", list(items)),
+            Self::Nothing => Ok(()),
+        }
+    }
+}
+
+/// Items as they stand in parentheses.
+pub(super) fn list(items: &[Item]) -> String {
+    let mut text = String::new();
+    for (k, item) in items.iter().enumerate() {
+        // Writing to a string cannot fail.
+        let _ = write!(text, "{}{item}", if k > 0 { ", " } else { "" });
+    }
+    text
+}
+
+/// Writes a number with 16 digits at most, leading zeros counted: a strict server counts them.
+pub fn number(value: f64) -> String {
+    let value = if value == 0.0 { 0.0 } else { value };
+    let digits = |text: &str| text.bytes().filter(u8::is_ascii_digit).count();
+    let short = format!("{value:e}");
+    let mantissa = |text: &str| digits(text.split('e').next().unwrap_or(text));
+    let short = if mantissa(&short) > MOST_DIGITS { format!("{value:.15e}") } else { short };
+    // What was rounded to sixteen digits is written out from these.
+    let plain = short.parse::<f64>().map_or(String::new(), |rounded| rounded.to_string());
+    let is_plain = !plain.is_empty() && digits(&plain) <= MOST_DIGITS;
+    if is_plain { plain } else { short.replace('e', "E") }
+}
+
+/// How exactly a line is held to the grammar.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum Strictness {
+    /// As a server must.
+    Strict,
+    /// Where only the meaning counts: blanks anywhere between two things, numbers of any length.
+    Lenient,
+}
+
+/// Reads items, one character after another.
+pub(super) struct Reader<'a> {
+    rest: &'a str,
+    strictness: Strictness,
+    depth: u32,
+}
+
+impl<'a> Reader<'a> {
+    pub(super) fn new(rest: &'a str, strictness: Strictness) -> Self {
+        Self { rest, strictness, depth: 0 }
+    }
+
+    pub(super) fn rest(&self) -> &'a str {
+        self.rest
+    }
+
+    pub(super) fn is_at_end(&mut self) -> bool {
+        self.skip_blanks();
+        self.rest.is_empty()
+    }
+
+    fn skip_blanks(&mut self) {
+        self.rest = self.rest.trim_start_matches(' ');
+    }
+
+    pub(super) fn eat(&mut self, wanted: char) -> bool {
+        self.skip_blanks();
+        let after = self.rest.strip_prefix(wanted);
+        self.rest = after.unwrap_or(self.rest);
+        after.is_some()
+    }
+
+    /// Reads what stands in parentheses, behind the opening one.
+    pub(super) fn in_parentheses(&mut self) -> Result<Vec<Item>, Flaw> {
+        if self.eat(')') {
+            return Ok(Vec::new());
+        }
+        let items = self.items()?;
+        if self.eat(')') { Ok(items) } else { Err(arguments("something stands where a comma or ) should")) }
+    }
+
+    /// Reads items with commas between them.
+    pub(super) fn items(&mut self) -> Result<Vec<Item>, Flaw> {
+        let mut items = vec![self.item()?];
+        while self.eat(',') {
+            items.push(self.item()?);
+        }
+        Ok(items)
+    }
+
+    fn item(&mut self) -> Result<Item, Flaw> {
+        self.skip_blanks();
+        match self.rest.chars().next() {
+            None | Some(',' | ')') => Ok(Item::Nothing),
+            Some('"') => self.text(),
+            Some('0'..='9' | '+' | '-' | '.') => self.number().map(Item::Number),
+            Some('A'..='Z' | 'a'..='z') => self.named(),
+            Some(_) => Err(arguments("a character that begins nothing")),
+        }
+    }
+
+    fn text(&mut self) -> Result<Item, Flaw> {
+        let body = &self.rest[1..];
+        let end = body.find('"').ok_or(bad("a string that does not end"))?;
+        if end == 0 && self.strictness == Strictness::Strict {
+            return Err(bad("an empty string"));
+        }
+        self.rest = &body[end + 1..];
+        Ok(Item::Text(body[..end].to_owned()))
+    }
+
+    fn take(&mut self, of: impl Fn(u8) -> bool) -> &'a str {
+        let end = self.rest.bytes().position(|b| !of(b)).unwrap_or(self.rest.len());
+        let (taken, rest) = self.rest.split_at(end);
+        self.rest = rest;
+        taken
+    }
+
+    fn number(&mut self) -> Result<f64, Flaw> {
+        let all = self.rest;
+        if self.rest.starts_with(['+', '-']) {
+            self.rest = &self.rest[1..];
+        }
+        let mantissa = self.take(|b| b.is_ascii_digit() || b == b'.');
+        let digits = mantissa.bytes().filter(u8::is_ascii_digit).count();
+        if mantissa.len() - digits > 1 {
+            return Err(bad("a number with two decimal points"));
+        }
+        if digits == 0 {
+            return Err(bad("a number without a digit"));
+        }
+        if digits > MOST_DIGITS && self.strictness == Strictness::Strict {
+            return Err(bad("a number with more than 16 digits"));
+        }
+        if self.rest.starts_with(['E', 'e']) {
+            self.rest = &self.rest[1..];
+            if self.rest.starts_with(['+', '-']) {
+                self.rest = &self.rest[1..];
+            }
+            if !(1..=3).contains(&self.take(|b| b.is_ascii_digit()).len()) {
+                return Err(bad("an exponent that has not one, two or three digits"));
+            }
+        }
+        let value = all[..all.len() - self.rest.len()].parse().ok().filter(|value: &f64| value.is_finite());
+        value.ok_or(bad("a number that is too large"))
+    }
+
+    fn named(&mut self) -> Result<Item, Flaw> {
+        let name = self.take(|b| b.is_ascii_alphanumeric() || b == b'.' || b == b'_');
+        if name.ends_with('.') || name.contains("..") {
+            return Err(arguments("a dot without a name"));
+        }
+        if let Some(tag @ Tag::Event(_)) = Tag::read(name) {
+            return Ok(Item::Tag(tag));
+        }
+        if !self.eat('(') {
+            return Ok(Item::Name(name.to_owned()));
+        }
+        self.depth += 1;
+        if self.depth > DEEPEST {
+            return Err(arguments("parentheses within too many others"));
+        }
+        let items = self.in_parentheses()?;
+        self.depth -= 1;
+        Ok(Item::Call(name.to_owned(), items))
+    }
+}
+
+/// Tells where a blank stands that the grammar does not have: within a name or a number, or between two things without a comma.
+pub(super) fn has_stray_blank(text: &str) -> bool {
+    let (mut before, mut quoted, mut blank) = ('(', false, false);
+    for c in text.chars() {
+        let ends_gap = blank && c != ' ' && !quoted;
+        if ends_gap && !matches!(before, ',' | '(' | ')') && !matches!(c, ',' | '(' | ')') {
+            return true;
+        }
+        (quoted, blank) = (quoted ^ (c == '"'), c == ' ' && !quoted);
+        before = if c == ' ' { before } else { c };
+    }
+    false
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_have_sixteen_digits_at_most_and_come_back() {
+        for (value, text) in [
+            (0.0, "0"),
+            (-0.0, "0"),
+            (5.1, "5.1"),
+            (-123.0, "-123"),
+            (1_234_567_890_123_456.0, "1234567890123456"),
+            (1e20, "1E20"),
+            (1.234_567_890_123_456e-123, "1.234567890123456E-123"),
+            (0.1 + 0.2, "0.3"),
+            (1.0 / 3.0, "3.333333333333333E-1"),
+        ] {
+            assert_eq!(number(value), text);
+        }
+        for k in 1..2000 {
+            let value = f64::from(k).sqrt() * 10f64.powi(k % 30 - 15);
+            let text = number(value);
+            let mantissa = text.split('E').next().unwrap();
+            assert!(mantissa.bytes().filter(u8::is_ascii_digit).count() <= 16, "{text}");
+            let back = Reader::new(&text, Strictness::Strict).number().unwrap();
+            assert!((back - value).abs() <= 1e-15 * value, "{text} for {value}");
+        }
+    }
+
+    #[test]
+    fn tags_have_five_characters() {
+        assert_eq!(Tag::read("00007"), Some(Tag::Command(7)));
+        assert_eq!(Tag::read("E0000"), Some(Tag::UNASKED));
+        assert_eq!(Tag::Event(12).to_string(), "E0012");
+        for none in ["0007", "000007", "E00", "A2345", "+1234", "E+123"] {
+            assert_eq!(Tag::read(none), None, "{none}");
+        }
+    }
+}

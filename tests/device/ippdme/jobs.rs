@@ -1,0 +1,228 @@
+//! Jobs from their beginning to their end, and what people and crashes do to them.
+
+use regrind::device::{
+    Careful, Cmm, DeviceError, Interrupt, IppdmeCmm, Machine, Outcome, Plan, PointStatus, Reconciled, State,
+};
+use regrind_sim::dme::machine::Options;
+use regrind_sim::spec::CmmSpec;
+use regrind_sim::wire::dme::ServingDme;
+
+use super::bench::{Bench, begin, is, job, patient, settings, until, until_points, until_still};
+
+/// So fast that a touch takes about a millisecond.
+const FAST: f64 = 5000.0;
+/// So slow that a job of twenty touches is still running when it is told something.
+const SLOW: f64 = 50.0;
+
+#[tokio::test]
+async fn a_plan_is_measured_and_its_points_are_those_of_the_part() {
+    let mut bench = Bench::new(FAST, patient()).await;
+    let plan = Plan { careful: Some(Careful { targets: 2, speed_mm_s: 0.5 }), ..bench.plan(20) };
+    let armed = bench.begin(&plan).await.unwrap();
+    let status = until_still(&mut bench.cmm).await.unwrap();
+    assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete), "{:?}", bench.cmm.notes());
+    assert_eq!((status.done, status.clear_of_part), (armed.start_sequence, Some(true)));
+    let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
+    bench.are_true(&plan, &measurement);
+    assert!(measurement.points.iter().all(|point| point.status == PointStatus::Touched));
+    assert_eq!(measurement.probe_radius_mm, Some(1.5));
+    assert_eq!(bench.cmm.acknowledge(status.done).await.unwrap().state, State::Idle);
+    assert_eq!(bench.world.measurements_begun(), 1);
+}
+
+#[tokio::test]
+async fn the_part_in_a_frame_of_its_own_gives_the_same_points() {
+    let bench = Bench::new(FAST, patient()).await;
+    let plan = bench.plan(10);
+    // The part's frame is that of the machine here, once by numbers that do nothing and once turned all the way round.
+    for part_frame in [Some([0.0; 6]), Some([0.0, 0.0, 0.0, 0.0, 200.0, 160.0])] {
+        let port = bench.serving.local_addr().port();
+        let mut cmm = IppdmeCmm::new(regrind::device::IppdmeSettings { part_frame, ..settings(port, patient()) });
+        cmm.connect().await.unwrap();
+        begin(&mut cmm, &plan).await.unwrap();
+        until_still(&mut cmm).await.unwrap();
+        bench.are_true(&plan, &cmm.collect(job(&plan), &Interrupt::new()).await.unwrap());
+        cmm.release().await.unwrap();
+    }
+}
+
+#[tokio::test]
+async fn points_come_ahead_each_once_and_in_the_order_of_the_plan() {
+    let mut bench = Bench::new(500.0, patient()).await;
+    let plan = bench.plan(15);
+    bench.begin(&plan).await.unwrap();
+    let mut ahead = Vec::new();
+    loop {
+        let over = is(&bench.cmm.status().await.unwrap(), State::Complete);
+        if let Some(more) = bench.cmm.read_ahead(job(&plan), &Interrupt::new()).await {
+            assert_eq!(more.from, ahead.len());
+            ahead.extend(more.points);
+        }
+        if over {
+            break;
+        }
+        tokio::task::yield_now().await;
+    }
+    assert_eq!(ahead, bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap().points);
+}
+
+#[tokio::test]
+async fn a_hold_retracts_and_a_resume_touches_what_is_left() {
+    let mut bench = Bench::new(SLOW, patient()).await;
+    let plan = bench.plan(10);
+    bench.begin(&plan).await.unwrap();
+    until_points(&mut bench.cmm, 2).await;
+    assert_eq!(bench.cmm.hold().await.unwrap().state, State::Holding);
+    let held = until(&mut bench.cmm, |status| is(status, State::Held)).await.unwrap();
+    assert!(held.progress.is_some_and(|(done, _)| done < 10) && held.clear_of_part == Some(true));
+    let highest = plan.targets.iter().map(|t| t.point_mm[2]).fold(f64::MIN, f64::max);
+    let height = bench.serving.with(|server| server.machine().at_mm()[2]);
+    assert!(height >= highest + plan.safe_height_mm, "{height}");
+    bench.cmm.resume().await.unwrap();
+    let status = until_still(&mut bench.cmm).await.unwrap();
+    assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete), "{:?}", bench.cmm.notes());
+    let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
+    bench.are_true(&plan, &measurement);
+}
+
+#[tokio::test]
+async fn a_stop_ends_it_in_order_and_gives_no_measurement() {
+    let mut bench = Bench::new(SLOW, patient()).await;
+    let plan = bench.plan(20);
+    bench.begin(&plan).await.unwrap();
+    until_points(&mut bench.cmm, 1).await;
+    bench.cmm.stop().await.unwrap();
+    let status = until_still(&mut bench.cmm).await.unwrap();
+    assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Stopped));
+    let none = bench.cmm.collect(job(&plan), &Interrupt::new()).await;
+    assert!(matches!(none, Err(DeviceError::NoResult { .. })));
+}
+
+#[tokio::test]
+async fn an_abort_ends_it_where_it_is_and_the_machine_can_be_used_again() {
+    let mut bench = Bench::new(1.0, patient()).await;
+    let plan = bench.plan(20);
+    bench.begin(&plan).await.unwrap();
+    assert_eq!(bench.cmm.abort().await.unwrap().state, State::Aborting);
+    let status = until_still(&mut bench.cmm).await.unwrap();
+    assert_eq!((status.state, status.outcome, status.clear_of_part), (State::Aborted, Outcome::Aborted, None));
+    // Nothing of it is left at the server.
+    assert_eq!(bench.serving.with(|server| server.due()), None);
+    assert_eq!(bench.cmm.clear().await.unwrap().state, State::Idle);
+    bench.cmm.prepare(job(&plan)).await.unwrap();
+}
+
+#[tokio::test]
+async fn a_start_is_taken_once() {
+    let mut bench = Bench::new(1.0, patient()).await;
+    let plan = bench.plan(5);
+    let armed = bench.begin(&plan).await.unwrap();
+    let again = bench.cmm.start(armed).await;
+    assert!(matches!(again, Err(DeviceError::Refused { .. })), "{again:?}");
+}
+
+#[tokio::test]
+async fn a_program_that_is_started_again_says_that_the_points_are_gone() {
+    let mut bench = Bench::new(SLOW, patient()).await;
+    let plan = bench.plan(20);
+    let armed = bench.begin(&plan).await.unwrap();
+    until_points(&mut bench.cmm, 1).await;
+    let mut another = bench.another();
+    another.restore(&armed);
+    drop(std::mem::replace(&mut bench.cmm, another));
+    bench.cmm.connect().await.unwrap();
+    let Reconciled::Finished(status) = bench.cmm.reconcile(&armed).await.unwrap() else { panic!() };
+    assert_eq!((status.state, status.outcome, status.clear_of_part), (State::Complete, Outcome::Failed, None));
+    assert!(bench.cmm.notes().iter().any(|note| note.contains("is gone")));
+    assert!(bench.cmm.collect(job(&plan), &Interrupt::new()).await.is_err());
+    bench.cmm.acknowledge(status.done).await.unwrap();
+    let armed = begin(&mut bench.cmm, &plan).await.unwrap();
+    assert!(armed.start_sequence > status.done);
+    until_points(&mut bench.cmm, 1).await;
+}
+
+#[tokio::test]
+async fn a_plan_that_leads_out_of_the_volume_is_refused_before_anything_moves() {
+    let mut bench = Bench::new(FAST, patient()).await;
+    let plan = Plan { safe_height_mm: 450.0, ..bench.plan(5) };
+    bench.cmm.connect().await.unwrap();
+    let error = bench.cmm.load_plan(&plan, &Interrupt::new()).await.unwrap_err();
+    let text = error.to_string();
+    assert!(text.contains("target 10") && text.contains("400") && text.contains("safe_height_mm"), "{text}");
+    assert_eq!(bench.world.measurements_begun(), 0);
+}
+
+#[tokio::test]
+async fn a_probe_of_another_radius_touches_nothing() {
+    let tools = vec![("NoTool".to_owned(), 0.0), ("Probe1".to_owned(), 1.52)];
+    let mut bench = Bench::with(FAST, patient(), Options { tools, ..Options::default() }).await;
+    let plan = bench.plan(5);
+    bench.begin(&plan).await.unwrap();
+    assert_eq!(until_still(&mut bench.cmm).await.unwrap().state, State::Faulted);
+    assert!(bench.cmm.notes()[0].contains("1.52 mm"), "{:?}", bench.cmm.notes());
+    assert_eq!(bench.world.measurements_begun(), 0);
+}
+
+#[tokio::test]
+async fn a_tool_that_the_server_has_not_is_named_with_those_it_has() {
+    let tools = vec![("Star".to_owned(), 1.5)];
+    let mut bench = Bench::with(FAST, patient(), Options { tools, ..Options::default() }).await;
+    let error = bench.cmm.connect().await.unwrap_err().to_string();
+    assert!(error.contains("\"Probe1\"") && error.contains("Star"), "{error}");
+}
+
+#[tokio::test]
+async fn a_real_machine_is_not_taken_for_a_simulation() {
+    let class = "CartCMM".to_owned();
+    let mut bench = Bench::with(FAST, patient(), Options { class, ..Options::default() }).await;
+    let error = bench.cmm.connect().await.unwrap_err();
+    assert!(matches!(error, DeviceError::WrongReality { simulation: false, .. }), "{error}");
+}
+
+#[tokio::test]
+async fn speeds_that_the_machine_keeps_lower_are_told_and_used() {
+    let mut bench = Bench::with(FAST, patient(), Options { fastest_mm_s: [50.0, 2.0], ..Options::default() }).await;
+    let plan = bench.plan(5);
+    bench.begin(&plan).await.unwrap();
+    let status = until_still(&mut bench.cmm).await.unwrap();
+    assert_eq!(status.outcome, Outcome::Complete, "{:?}", bench.cmm.notes());
+    assert!(bench.cmm.notes().iter().any(|note| note.contains("Speed is 50")), "{:?}", bench.cmm.notes());
+}
+
+#[tokio::test]
+async fn targets_that_are_missed_are_tried_again_and_then_told() {
+    let spec = CmmSpec { not_found_share: 0.5, ..CmmSpec::perfect() };
+    let mut bench = Bench::measuring(spec, FAST, patient(), Options::default()).await;
+    let plan = bench.plan(20);
+    bench.begin(&plan).await.unwrap();
+    let status = until_still(&mut bench.cmm).await.unwrap();
+    assert_eq!(status.outcome, Outcome::Complete, "{:?}", bench.cmm.notes());
+    let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
+    bench.are_true(&plan, &measurement);
+    let missed = measurement.points.iter().filter(|point| point.status == PointStatus::NotFound).count();
+    // Half of the first tries, and a quarter of both.
+    assert!((1..15).contains(&missed), "{missed}");
+}
+
+#[tokio::test]
+async fn a_second_client_waits_until_the_first_has_gone() {
+    let mut bench = Bench::new(FAST, patient()).await;
+    bench.cmm.connect().await.unwrap();
+    let mut other = bench.another();
+    let (first, second) = tokio::join!(bench.cmm.release(), other.connect());
+    assert!(first.is_ok() && second.is_ok(), "{first:?}, {second:?}");
+    let _: &ServingDme = &bench.serving;
+}
+
+#[tokio::test]
+async fn a_job_that_nobody_looks_at_holds_by_itself() {
+    let mut bench = Bench::new(SLOW, patient()).await;
+    let mut settings = settings(bench.serving.local_addr().port(), patient());
+    settings.silence_limit = std::time::Duration::ZERO;
+    bench.cmm = IppdmeCmm::new(settings);
+    let plan = bench.plan(10);
+    bench.begin(&plan).await.unwrap();
+    let held = until(&mut bench.cmm, |status| is(status, State::Held)).await.unwrap();
+    assert!(held.progress.is_some_and(|(done, _)| done < 10));
+    assert!(bench.cmm.notes()[0].contains("nobody looked"), "{:?}", bench.cmm.notes());
+}

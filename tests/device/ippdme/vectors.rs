@@ -1,0 +1,110 @@
+//! The lines of the NIST test suite: the good ones come back, the bad ones are refused by the number that stands beside them.
+
+use std::path::PathBuf;
+
+use regrind::device::ippdme::{Command, Response};
+
+#[path = "../../common/data.rs"]
+mod data;
+
+fn files(extension: &str) -> Vec<(String, String)> {
+    let folder = data::data("nist-ippdme-testsuite").join("test_files");
+    let mut paths: Vec<PathBuf> = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+    paths.retain(|path| path.extension().is_some_and(|found| found == extension));
+    paths.sort();
+    let read = |path: PathBuf| {
+        (
+            path.file_stem().unwrap().to_string_lossy().into_owned(),
+            String::from_utf8_lossy(&std::fs::read(path).unwrap()).into_owned(),
+        )
+    };
+    paths.into_iter().map(read).collect()
+}
+
+/// The strings of a file: a line of two backslashes stands for the end of a line on the wire, a colon for the end of the file.
+fn lines(text: &str) -> impl Iterator<Item = &str> {
+    text.lines().map(|line| line.trim_end_matches('\r')).filter(|line| !matches!(*line, "\\\\" | ":" | ""))
+}
+
+/// A refused line, and the number that stands two lines below it.
+fn refused(text: &str) -> Vec<(&str, u16)> {
+    let lines: Vec<&str> = text.lines().map(|line| line.trim_end_matches('\r')).collect();
+    let number = |line: &str| (line.trim().len() == 4).then(|| line.trim().parse().ok()).flatten();
+    (2..lines.len()).filter_map(|k| number(lines[k]).map(|number| (lines[k - 2], number))).collect()
+}
+
+#[test]
+#[ignore = "needs the real measurements that REGRIND_DATA names"]
+fn every_good_command_comes_back_in_one_form() {
+    let texts = files("txt");
+    let (mut good, mut wrong) = (0, Vec::new());
+    for (name, program) in files("prg") {
+        let text = &texts.iter().find(|(other, _)| *other == name).map(|(_, text)| text.as_str()).unwrap_or_default();
+        let bad =
+            if matches!(name.as_str(), "parserCmdErrors" | "numbersErrorCmd") { refused(text) } else { Vec::new() };
+        for line in lines(&program).filter(|line| !bad.iter().any(|(bad, _)| bad == line)) {
+            match Command::read(line) {
+                Ok((tag, command)) => {
+                    let again = command.line(tag);
+                    let whole = again.strip_suffix("\r\n").unwrap();
+                    assert_eq!(Command::read(whole), Ok((tag, command)), "{line}");
+                    good += 1;
+                }
+                // The angle is read already where it stands for the checker, which comes later.
+                Err(flaw) if flaw.number == 1007 && name == "checkerCmdErrors" => {}
+                Err(flaw) => wrong.push(format!("{name}: {line}: {flaw:?}")),
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    assert!(good > 1000, "{good}");
+}
+
+#[test]
+#[ignore = "needs the real measurements that REGRIND_DATA names"]
+fn every_bad_command_is_refused_by_its_number() {
+    let (mut seen, mut wrong) = (0, Vec::new());
+    for (name, text) in
+        files("txt").iter().filter(|(name, _)| matches!(name.as_str(), "parserCmdErrors" | "numbersErrorCmd"))
+    {
+        for (line, number) in refused(text) {
+            seen += 1;
+            let found = Command::read(line).map_err(|flaw| flaw.number);
+            if found.as_ref().err() != Some(&number) {
+                wrong.push(format!("{name}: {line}: {number}, and not {found:?}"));
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    assert!(seen > 200, "{seen}");
+}
+
+#[test]
+#[ignore = "needs the real measurements that REGRIND_DATA names"]
+fn every_answer_is_read() {
+    let (mut good, mut wrong) = (0, Vec::new());
+    for (name, answers) in
+        files("res").iter().filter(|(name, _)| !matches!(name.as_str(), "parserResErrors" | "numbersErrorRes"))
+    {
+        for line in lines(answers) {
+            match Response::read(line) {
+                Ok(_) => good += 1,
+                Err(flaw) => wrong.push(format!("{name}: {line}: {flaw:?}")),
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    assert!(good > 1000, "{good}");
+}
+
+#[test]
+#[ignore = "needs the real measurements that REGRIND_DATA names"]
+fn no_broken_number_becomes_a_value() {
+    for (_, answers) in files("res").iter().filter(|(name, _)| name == "numbersErrorRes") {
+        // A number of more digits than the standard has is a number all the same.
+        let broken = lines(answers).filter(|line| !line.contains("12345678901234567"));
+        for line in broken {
+            assert!(Response::read(line).is_err(), "{line}");
+        }
+    }
+}
