@@ -164,7 +164,28 @@ impl Lattice {
                 .map(|(di, dj)| tau2 * window[(MIDDLE + dj) as usize][(MIDDLE + di) as usize])
                 .collect()
         };
-        (0..self.nodes()).into_par_iter().flat_map_iter(column).collect()
+        // What stands far enough from every edge has the same column, and so has what stands alike beside one.
+        let [along, across] =
+            self.counts.map(|count| (0..count).map(|k| like(k, count, reach as usize)).collect::<Vec<_>>());
+        let mut known: Vec<Option<Vec<f64>>> = vec![None; (2 * reach as usize + 3).pow(2)];
+        let mut values = Vec::new();
+        for (j, &row) in across.iter().enumerate() {
+            for (i, &of) in along.iter().enumerate() {
+                let seen = &mut known[row * (2 * reach as usize + 3) + of];
+                values.extend_from_slice(seen.get_or_insert_with(|| column(j * self.counts[0] + i)));
+            }
+        }
+        values
+    }
+}
+
+/// Which of the nodes along an axis this one is like: each within reach of an end is like none but itself.
+fn like(k: usize, count: usize, reach: usize) -> usize {
+    let (before, behind) = (k, count - 1 - k);
+    match () {
+        () if before <= reach || count <= 2 * reach + 3 => before,
+        () if behind <= reach => 2 * reach + 2 - behind,
+        () => reach + 1,
     }
 }
 
@@ -421,6 +442,14 @@ mod tests {
     use super::*;
 
     const HYPER: Hyper = Hyper { field: Field::new(5e-3, 30.0), scatter_mm: 3e-4, drift: 0.0 };
+
+    #[test]
+    fn within_reach_of_an_end_a_node_is_like_none_but_itself() {
+        let of = |count: usize| (0..count).map(|k| like(k, count, 3)).collect::<Vec<_>>();
+        assert_eq!(of(11), [0, 1, 2, 3, 4, 4, 4, 5, 6, 7, 8]);
+        assert_eq!(of(9), [0, 1, 2, 3, 4, 5, 6, 7, 8]);
+        assert_eq!(of(4), [0, 1, 2, 3]);
+    }
 
     fn places(count: u32) -> Vec<[f64; 2]> {
         // Steps of two irrational numbers: everywhere, and nowhere twice.
