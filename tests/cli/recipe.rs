@@ -101,6 +101,22 @@ fn the_default_recipe_is_what_it_says() {
     assert_ne!(recipe.source_sha256(), again.source_sha256());
 }
 
+/// Nobody who consents to a small risk for chosen touches is judged by more than that; what is written of the probability is what counts.
+#[test]
+fn the_probability_of_a_decision_is_no_less_than_the_accepted_risk_leaves() {
+    let with = |measuring: &str| recipe(&changed(RECIPE, "[registration]", &format!("{measuring}\n\n[registration]")));
+    let adaptive = |risk: f64| format!("[measuring]\nmode = \"adaptive\"\naccepted_risk = {risk}");
+    assert_eq!(recipe(RECIPE).unwrap().probability(), 0.975);
+    assert_eq!(with("[measuring]\nmode = \"fixed\"").unwrap().probability(), 0.975);
+    for (risk, probability) in [(0.025, 0.975), (0.05, 0.975), (0.01, 0.99), (0.001, 0.999)] {
+        let found = with(&adaptive(risk)).unwrap().probability();
+        assert!((found - probability).abs() < 1e-12, "{risk}: {found}");
+    }
+    let both = changed(RECIPE, "[registration]", &format!("{}\n\n[registration]", adaptive(0.05)));
+    let both = changed(&both, "expanded_uncertainty = true", "probability = 0.96");
+    assert_eq!(recipe(&both).unwrap().probability(), 0.96);
+}
+
 #[test]
 fn the_filter_and_the_gate_of_coverage_are_chosen_by_the_recipe() {
     let told = |recipe: &Recipe| {
@@ -408,6 +424,54 @@ const BAD_RECIPES: &[BadText] = &[
 ];
 
 const BAD_CELLS: &[BadText] = &[
+    (
+        TCP,
+        "# [cmm.uncertainty]",
+        "[cmm.uncertainty]\nscale_ppm = [0.5, -0.5, 0.5]\n#",
+        "cmm.uncertainty.scale_ppm",
+        "[0.5, -0.5, 0.5]",
+        "0 to 1000",
+    ),
+    (
+        TCP,
+        "# [cmm.uncertainty]",
+        "[cmm.uncertainty]\nscale_ppm = [0.5, 0.5]\n#",
+        "cmm.uncertainty.scale_ppm",
+        "[0.5, 0.5]",
+        "3",
+    ),
+    (
+        TCP,
+        "# [cmm.uncertainty]",
+        "[cmm.uncertainty]\nsquareness_urad = [1.0, nan, 1.0]\n#",
+        "cmm.uncertainty.squareness_urad",
+        "[1.0, nan, 1.0]",
+        "0 to 10000",
+    ),
+    (
+        TCP,
+        "# [cmm.uncertainty]",
+        "[cmm.uncertainty]\nprobe_um = 2000.0\n#",
+        "cmm.uncertainty.probe_um",
+        "2000.0",
+        "0 to 1000",
+    ),
+    (
+        TCP,
+        "# [cmm.uncertainty]",
+        "[cmm.uncertainty]\nreference_sphere_um = -0.05\n#",
+        "cmm.uncertainty.reference_sphere_um",
+        "-0.05",
+        "0 to 1000",
+    ),
+    (
+        TCP,
+        "# [cmm.uncertainty]",
+        "[cmm.uncertainty]\nreference_sphere_mm = 0.05\n#",
+        "cmm.uncertainty.reference_sphere_mm",
+        "reference_sphere_mm",
+        "did you mean",
+    ),
     (SIM, "simulated = true ", "simulated = false ", "cmm.wire.port", "0                    #", "1 to 65535"),
     (SIM, "name = \"simulated cell\"\n", "", "cell.name", "cell]", "add `name"),
     (TCP, "port = 15021", "prot = 15021\nport = 1", "cmm.wire.prot", "prot", "did you mean `port`"),
