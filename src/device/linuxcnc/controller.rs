@@ -244,6 +244,9 @@ impl Controller {
         self.errors().await?;
         self.order(Set::Open(path.to_owned()), command).await?;
         let opened = self.until("the program", |seen| seen.program.as_deref() == Some(path) && seen.line == 0).await;
+        if !self.is_connected() {
+            return opened.map(drop);
+        }
         let errors = self.errors().await?;
         match opened {
             Ok(_) if errors.is_empty() => Ok(()),

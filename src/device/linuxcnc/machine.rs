@@ -31,6 +31,8 @@ use crate::words::{
 
 /// Between two looks where a start or a record is waited for.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
+/// A program that runs moves; one that does not for so long is told of.
+const STANDS_AFTER: Duration = Duration::from_secs(5);
 /// The span over which a start has to be seen not taken.
 const SEEN_TWICE_OVER: Duration = Duration::from_millis(1050);
 /// A folder, perhaps on another computer, answers within this.
@@ -56,6 +58,8 @@ pub struct LinuxcncGrinder {
     fault: Fault,
     /// Where a program that had ended left the machine, clear of the part.
     clear_at: Option<String>,
+    /// The line and the place that were seen last, and since when.
+    moved: Option<(u32, String, Instant)>,
     /// What the last look showed.
     last: Option<State>,
     notes: Vec<String>,
@@ -82,6 +86,7 @@ impl LinuxcncGrinder {
             duration_s: None,
             fault: Fault::None,
             clear_at: None,
+            moved: None,
             last: None,
             notes: Vec::new(),
         }
@@ -135,10 +140,23 @@ impl LinuxcncGrinder {
         }
         let is_idle = seen.interpreter == Interpreter::Idle;
         self.idle_since = is_idle.then(|| self.idle_since.unwrap_or_else(Instant::now));
+        self.see_it_move(&seen);
         self.judge(&seen).await?;
         let status = self.told(&seen);
         self.last = Some(status.state);
         Ok((seen, status))
+    }
+
+    /// A controller whose task has died goes on telling what it told last. It has no beat by which that could be known for sure.
+    fn see_it_move(&mut self, seen: &Seen) {
+        match &self.moved {
+            Some((line, at, since)) if (*line, at) == (seen.line, &seen.at) => {
+                if seen.interpreter == Interpreter::Running && since.elapsed() > STANDS_AFTER {
+                    self.note("it says that it runs, and has not moved for 5 s: look at the machine".to_owned());
+                }
+            }
+            _ => self.moved = Some((seen.line, seen.at.clone(), Instant::now())),
+        }
     }
 
     fn note(&mut self, note: String) {
@@ -364,6 +382,15 @@ impl LinuxcncGrinder {
         Ok(())
     }
 
+    /// A job that was taken in before anything was connected is looked for at once, so that what runs is known for it.
+    async fn find_what_was_restored(&mut self) {
+        let Some(work) = self.work.as_ref().filter(|work| work.program.is_none()) else { return };
+        let intended = Armed { job: work.job, start_sequence: work.sequence, token: work.token, boot_id: 0 };
+        if let Err(error) = self.find_again(&intended).await {
+            self.note(error.to_string());
+        }
+    }
+
     /// What became of a job, if that can be told now.
     async fn what_became(&mut self) -> Answered<Option<Reconciled>> {
         let (seen, status) = self.look().await?;
@@ -480,6 +507,7 @@ impl Machine for LinuxcncGrinder {
 
     async fn connect(&mut self) -> Answered<Identity> {
         let name = self.controller.meet().await?;
+        self.find_what_was_restored().await;
         // It has no number that changes when it is restarted, and does not say whether a machine is behind it.
         Ok(Identity { kind: MachineKind::Grinder, name, boot_id: 0, simulation: false, silence_limit_s: None })
     }
@@ -581,7 +609,14 @@ impl Machine for LinuxcncGrinder {
         if !self.controller.is_connected() {
             self.controller.meet().await?;
         }
-        self.controller.abort().await?;
+        match self.controller.abort().await {
+            // What is switched off takes no order. Where nothing runs there is nothing to end.
+            Err(refused @ DeviceError::Refused { .. }) => match self.controller.look(false).await?.interpreter {
+                Interpreter::Idle => {}
+                _ => return Err(refused),
+            },
+            answer => answer?,
+        }
         self.taken = false;
         match self.work.as_mut().map(|work| &mut work.stage) {
             Some(Stage::Begun) => {}
