@@ -609,7 +609,15 @@ impl Machine for LinuxcncGrinder {
         if !self.controller.is_connected() {
             self.controller.meet().await?;
         }
-        match self.controller.abort().await {
+        let aborted = match self.controller.abort().await {
+            // The connection was lost and nobody had noticed.
+            Err(DeviceError::Disconnected { .. }) => {
+                self.controller.meet().await?;
+                self.controller.abort().await
+            }
+            answer => answer,
+        };
+        match aborted {
             // What is switched off takes no order. Where nothing runs there is nothing to end.
             Err(refused @ DeviceError::Refused { .. }) => match self.controller.look(false).await?.interpreter {
                 Interpreter::Idle => {}

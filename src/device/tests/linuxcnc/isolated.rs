@@ -79,6 +79,12 @@ impl Controller {
         }
     }
 
+    /// Has the place of every joint written into a file at every servo cycle: x, y, z in millimetres behind the number of the sample.
+    pub fn sample(&self) -> (Child, PathBuf) {
+        let file = self.folder.join("path.txt");
+        (as_account("halsampler").arg("-t").arg(&file).spawn().unwrap(), file)
+    }
+
     /// Ends every process of the controller at once, as a power cut does.
     pub fn kill(&mut self) {
         for name in ["linuxcnc", "linuxcncrsh", "milltask", "io", "linuxcncsvr", "rtapi_app"] {

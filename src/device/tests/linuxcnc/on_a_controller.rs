@@ -17,6 +17,32 @@ fn bench(text: &str) -> Bench {
     bench
 }
 
+/// A program over a dome of 150 mm, and where its moves end, from where the machine stands.
+fn raster(tracks: u32, points: u32) -> (String, Vec<[f64; 3]>) {
+    let mut ends = vec![[0.0; 3]];
+    for track in 0..tracks {
+        for k in 0..=points {
+            let k = if track % 2 == 0 { k } else { points - k };
+            let (x, y) = (f64::from(k) - 0.5 * f64::from(points), f64::from(track));
+            // As it is written: to the nanometre.
+            let z = ((150.0_f64.powi(2) - x * x - y * y).sqrt() - 150.0) * 1e6;
+            ends.push([x, y, z.round() / 1e6]);
+        }
+    }
+    let lines = ends.iter().skip(1).map(|[x, y, z]| format!("G1 X{x:.6} Y{y:.6} Z{z:.6}\n"));
+    (program(&("F6000\n".to_owned() + &lines.collect::<String>())), ends)
+}
+
+/// How far a place is from a straight line between two others.
+fn distance_mm(place: [f64; 3], from: [f64; 3], to: [f64; 3]) -> f64 {
+    let minus = |a: [f64; 3], b: [f64; 3]| [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+    let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    let (along, off) = (minus(to, from), minus(place, from));
+    let share = (dot(off, along) / dot(along, along).max(1e-30)).clamp(0.0, 1.0);
+    let foot = minus(off, along.map(|part| share * part));
+    dot(foot, foot).sqrt()
+}
+
 macro_rules! on_a_controller {
     ($($(#[$doc:meta])* $name:ident($controller:ident) $body:block)+) => {$(
         $(#[$doc])*
@@ -237,7 +263,7 @@ on_a_controller! {
         server.wait().unwrap();
         refuses!(grinder.status().await, DeviceError::Disconnected { .. });
         refuses!(grinder.connect().await, DeviceError::Unreachable { .. });
-        let mut server = controller.second_server(PORT + 1);
+        let mut again = controller.second_server(PORT + 1);
         drop(Operator::connect(PORT + 1).await);
         grinder.connect().await.unwrap();
         grinder.claim().await.unwrap();
@@ -247,7 +273,8 @@ on_a_controller! {
         grinder.resume().await.unwrap();
         assert_eq!(until(&mut grinder, State::Complete).await.outcome, Outcome::Complete);
         assert_eq!((bench.wrote("begin"), bench.wrote("end")), (1, 1));
-        server.kill().unwrap();
+        again.kill().unwrap();
+        again.wait().unwrap();
     }
 
     a_controller_that_is_killed_has_not_ended_the_pass(controller) {
@@ -275,6 +302,37 @@ on_a_controller! {
         assert_eq!(grinder.status().await.unwrap().state, State::Execute);
         let error = grinder.abort().await.unwrap_err();
         assert!(matches!(error, DeviceError::TimedOut { .. }), "{error:?}");
+    }
+
+    the_path_that_is_run_is_that_of_the_program(controller) {
+        let (text, ends) = raster(12, 24);
+        let bench = bench(&text);
+        let (mut grinder, armed) = bench.prepared().await;
+        let (mut sampler, file) = controller.sample();
+        grinder.start(armed).await.unwrap();
+        until(&mut grinder, State::Complete).await;
+        tokio::time::sleep(Duration::from_millis(300)).await;
+        sampler.kill().unwrap();
+        sampler.wait().unwrap();
+        let told = fs::read_to_string(file).unwrap();
+        let places = told.lines().filter_map(|line| {
+            let mut numbers = line.split_whitespace().skip(1).map(|n| n.parse::<f64>().ok());
+            Some([numbers.next()??, numbers.next()??, numbers.next()??])
+        });
+        let mut off: Vec<f64> = Vec::new();
+        let (mut at, mut furthest) = (0, 0);
+        for place in places.filter(|place| *place != [0.0; 3]) {
+            // The nearest piece of the way, from where it was on.
+            let near = (at..(at + 4).min(ends.len() - 1)).map(|k| (k, distance_mm(place, ends[k], ends[k + 1])));
+            let (k, mm) = near.min_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
+            (at, furthest) = (k, furthest.max(k));
+            off.push(mm);
+        }
+        assert!(off.len() > 1000 && furthest == ends.len() - 2, "{} samples, {furthest} of {}", off.len(), ends.len());
+        let largest = off.iter().fold(0.0, |a: f64, b| a.max(*b));
+        let rms = (off.iter().map(|mm| mm * mm).sum::<f64>() / off.len() as f64).sqrt();
+        println!("{} samples, off by {:.0} nm at most, {:.0} nm rms", off.len(), 1e6 * largest, 1e6 * rms);
+        assert!(largest < 0.5e-3 && rms < 0.1e-3, "{largest} mm, {rms} mm rms");
     }
 
     who_is_not_ready_is_not_made_ready(controller) {

@@ -224,6 +224,20 @@ async fn an_abort_is_on_the_wire_while_an_answer_is_awaited() {
 }
 
 #[tokio::test]
+async fn an_abort_connects_by_itself() {
+    let (fake, bench) = bench().await;
+    let (mut grinder, _) = bench.started().await;
+    // Before anything was known of it, and after.
+    fake.plant().faults.push(("set abort", Fault::Close));
+    grinder.abort().await.unwrap();
+    assert_eq!(until(&mut grinder, State::Aborted).await.outcome, Outcome::Aborted);
+    fake.plant().faults.push(("get enable", Fault::Close));
+    refuses!(grinder.status().await, DeviceError::Disconnected { .. });
+    grinder.abort().await.unwrap();
+    assert_eq!(fake.plant().heard.iter().filter(|line| *line == "set abort").count(), 3);
+}
+
+#[tokio::test]
 async fn a_pause_that_comes_when_the_program_has_ended_is_taken_back() {
     let (fake, bench) = bench().await;
     let (mut grinder, _) = bench.started().await;
@@ -382,7 +396,7 @@ async fn a_wire_that_is_lost_at_any_line_begins_nothing_twice() {
     // Every line once, in one of two ways; what is about the start in both.
     let ways = |at: usize| match at.abs_diff(run) < 8 {
         true => vec![Fault::Close, Fault::DoAndClose],
-        false if at % 2 == 0 => vec![Fault::Close],
+        false if at.is_multiple_of(2) => vec![Fault::Close],
         false => vec![Fault::DoAndClose],
     };
     let mut tries = tokio::task::JoinSet::new();
