@@ -615,6 +615,16 @@ pub fn cmm(cell: &CellConfig) -> Result<AnyCmm, MakingError> {
     link.wire.cmm(&Making { cell_folder, volume_mm: volume_mm(cell), ..making(link, cell.simulated, [1, 1]) })
 }
 
+/// Makes the driver of the grinder for no part yet: to look at it. Nothing is asked of the machine.
+///
+/// # Errors
+/// Those of [`machines`].
+pub fn grinder(cell: &CellConfig) -> Result<AnyGrinder, MakingError> {
+    let cell_folder = cell.path().parent().unwrap_or(Path::new(""));
+    let link = &cell.grinder.link;
+    link.wire.grinder(&Making { cell_folder, ..making(link, cell.simulated, [1, 1]) })
+}
+
 /// The box that the probe's centre must not leave.
 fn volume_mm(cell: &CellConfig) -> Option<[[f64; 3]; 2]> {
     cell.cmm.travel.as_ref().map(|travel| [travel.least_mm, travel.most_mm])

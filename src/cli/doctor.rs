@@ -4,8 +4,10 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use regrind::cell::Device;
-use regrind::config::{BUILT_IN, CellConfig};
-use regrind::device::{DeviceError, Line, Machine, MachineKind, ModbusCmm, ModbusGrinder, ModbusSettings, Status};
+use regrind::config::{BUILT_IN, CellConfig, Link};
+use regrind::device::{
+    DeviceError, Line, Machine, MachineKind, MakingError, ModbusCmm, ModbusGrinder, ModbusSettings, Status,
+};
 use regrind::drive::recover::{in_short, look};
 use regrind::formats::{ResultFolder, try_writing};
 use regrind::journal::free_bytes;
@@ -23,7 +25,7 @@ use super::{Outcome, check, control, key};
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Of a machine on Modbus it reads who it is and how it stands, and writes nothing but the sign of life of a client. At a server of I++ DME
-it opens a session, asks the same, and ends it. Of machines that take files, or
+it opens a session, asks the same, and ends it; of a LinuxCNC it asks without taking control. Of machines that take files, or
 that a person serves, nothing is read.
 
 Example:
@@ -169,21 +171,31 @@ async fn machines(cell: &CellConfig) -> Vec<Finding> {
         return vec![Finding::new("machines", Found::Good, "simulated within the program: there is nothing to reach")];
     }
     let settings = |link| setup::modbus(link, cell.simulated, 1, 1);
-    let cmm = match cell.cmm.link.wire.dme() {
-        Some(_) => server(cell).await,
-        None => machine(Device::Cmm, cell, settings(&cell.cmm.link), ModbusCmm::new).await,
-    };
-    vec![cmm, machine(Device::Grinder, cell, settings(&cell.grinder.link), ModbusGrinder::new).await]
+    let [cmm, grinder] = [&cell.cmm.link, &cell.grinder.link];
+    vec![
+        match cmm.wire.dme() {
+            Some(_) => server(MachineKind::Cmm, cmm, setup::cmm(cell)).await,
+            None => machine(Device::Cmm, cell, settings(cmm), ModbusCmm::new).await,
+        },
+        match grinder.wire.rsh() {
+            Some(_) => server(MachineKind::Grinder, grinder, setup::grinder(cell)).await,
+            None => machine(Device::Grinder, cell, settings(grinder), ModbusGrinder::new).await,
+        },
+    ]
 }
 
-/// A server of I++ DME: a session is opened, it is asked who it is and how it stands, and the session is ended.
-async fn server(cell: &CellConfig) -> Finding {
-    let what = Device::Cmm.to_string();
-    let _taken = match take(&cell.cmm.link, MachineKind::Cmm, Path::new("regrind doctor")) {
+/// A server that keeps no job: a session is opened, it is asked who it is and how it stands, and the session is ended.
+async fn server<M: Machine>(kind: MachineKind, link: &Link, made: Result<M, MakingError>) -> Finding {
+    let what = match kind {
+        MachineKind::Cmm => Device::Cmm,
+        MachineKind::Grinder => Device::Grinder,
+    };
+    let what = what.to_string();
+    let _taken = match take(link, kind, Path::new("regrind doctor")) {
         Ok(taken) => taken,
         Err(failure) => return Finding::new(what, Found::Notice, failure.to_string()),
     };
-    let mut machine = match setup::cmm(cell) {
+    let mut machine = match made {
         Ok(machine) => machine,
         Err(error) => return Finding::new(what, Found::Obstacle, error.to_string()),
     };

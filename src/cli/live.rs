@@ -164,7 +164,7 @@ async fn heed_endings(mut endings: Endings, orders: Orders, actor: Actor) {
 pub(super) fn take(link: &Link, kind: MachineKind, run: &Path) -> Result<Option<MachineLock>, Failure> {
     let run = std::path::absolute(run).unwrap_or_else(|_| run.to_owned());
     let on_line = link.wire.line().map(|(line, unit)| format!("{kind} at {line}, unit {unit}"));
-    let served = link.wire.dme().map(|(host, port)| format!("{kind} at {host}:{port}"));
+    let served = link.wire.dme().or(link.wire.rsh()).map(|(host, port)| format!("{kind} at {host}:{port}"));
     let taken = on_line.or(served).map(|machine| MachineLock::take(&machine, &run));
     taken.transpose().map_err(Failure::Machine)
 }

@@ -101,11 +101,12 @@ impl Recovery {
         machine: fn(ModbusSettings) -> io::Result<M>,
     ) -> Result<bool, Failure> {
         let Some(settings) = settings else {
-            let words = match link.wire.dme() {
-                Some(_) => {
+            let words = match (link.wire.dme(), link.wire.rsh()) {
+                (Some(_), _) => {
                     "its server keeps no job, so there is none to end; see at the machine that the probe is clear"
                 }
-                None => "it tells nothing over a wire; bring it home at the machine",
+                (_, Some(_)) => "its controller keeps no job; end a program that runs or is paused at the machine",
+                _ => "it tells nothing over a wire; bring it home at the machine",
             };
             super::print(&format!("{device}: {words}\n"))?;
             return Ok(false);

@@ -97,6 +97,15 @@ pub enum DeviceError {
     )]
     Unreadable { machine: Arc<str>, line: String, why: &'static str },
 
+    /// A line would not be one plain line of the machine's protocol.
+    #[error("{machine}: {what} would hold what is no plain character, and was not sent: correct the cell file")]
+    Unsendable { machine: Arc<str>, what: &'static str },
+    /// Another client has taken control; the machine does not tell which.
+    #[error(
+        "{machine} is controlled by another client now: find out who commands it, and have that one let it go. It is not taken back but by an          abort, or by a run that is taken up again"
+    )]
+    ControlTaken { machine: Arc<str> },
+
     /// The folders that stand for the machine cannot be read or written, or hold something that must not be touched.
     #[error("{machine}: {why}")]
     Folder { machine: Arc<str>, why: String },
@@ -214,6 +223,20 @@ pub enum DeviceError {
         least_mm: f64,
         most_mm: f64,
     },
+    /// A controller does not answer as linuxcncrsh does.
+    #[error(
+        "{machine} does not answer as linuxcncrsh does: {told:?} to {asked}; nothing but questions was sent. Check host and port in the cell file"
+    )]
+    NotLinuxcnc { machine: Arc<str>, asked: &'static str, told: String },
+    /// A controller refused a password.
+    #[error("{machine} refused the password: correct grinder.wire.{key}, or the options of linuxcncrsh (-w, -e)")]
+    Password { machine: Arc<str>, key: &'static str },
+    /// A machine that is not ready for a job, and that only a person can make ready.
+    #[error("{machine} is not ready: {why}")]
+    Unready { machine: Arc<str>, why: &'static str },
+    /// A controller reported errors.
+    #[error("{machine} reports, when {what}: {errors}")]
+    Reports { machine: Arc<str>, what: &'static str, errors: String },
     /// A payload was given to the driver that no machine could take.
     #[error("{machine}: the {what} cannot be sent: {field} is {value}, allowed is {limit}")]
     BadPayload { machine: Arc<str>, what: &'static str, field: String, value: f64, limit: &'static str },
@@ -236,6 +259,7 @@ impl DeviceError {
                 | Self::Exception { code: 4 | 5 | 6 | 8 | 10 | 11, .. }
                 | Self::Folder { .. }
                 | Self::Unreadable { .. }
+                | Self::ControlTaken { .. }
         )
     }
 }

@@ -25,6 +25,7 @@
 mod error;
 pub mod exchange;
 pub mod ippdme;
+pub mod linuxcnc;
 mod machine;
 mod manual;
 mod modbus;
@@ -37,6 +38,7 @@ mod words;
 use error::Answered;
 pub use error::DeviceError;
 pub use ippdme::{IppdmeCmm, IppdmeSettings, IppdmeWire, NoGrinder};
+pub use linuxcnc::{LinuxcncGrinder, LinuxcncSettings, LinuxcncWire, NoCmm};
 pub use machine::{Cmm, Grinder, Interrupt, Machine};
 pub use manual::{ManualMachine, ManualSettings, ManualWire};
 #[cfg(fuzzing)]

@@ -5,6 +5,7 @@ use serde::Deserialize;
 
 use super::exchange::ExchangeWire;
 use super::ippdme::IppdmeWire;
+use super::linuxcnc::LinuxcncWire;
 use super::machine::{Cmm, Grinder, Interrupt, Machine};
 use super::manual::ManualWire;
 use super::modbus::{Line, Link, RtuWire, TcpWire};
@@ -88,6 +89,11 @@ macro_rules! drivers {
             /// Host and port of a server of I++ DME, where it is one.
             pub fn dme(&self) -> Option<(String, u16)> {
                 match self { $(Self::$wire(wire) => Wired::dme(wire)),+ }
+            }
+
+            /// Host and port of linuxcncrsh, where it is one.
+            pub fn rsh(&self) -> Option<(String, u16)> {
+                match self { $(Self::$wire(wire) => Wired::rsh(wire)),+ }
             }
 
             /// Makes the driver of a measuring machine; nothing is asked of the machine yet.
@@ -215,4 +221,6 @@ drivers! {
     Manual(ManualWire),
     /// I++ DME over TCP, for a measuring machine.
     Ippdme(IppdmeWire),
+    /// LinuxCNC by linuxcncrsh over TCP, for a grinder.
+    Linuxcnc(LinuxcncWire),
 }

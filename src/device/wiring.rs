@@ -113,6 +113,11 @@ pub trait Wired {
         None
     }
 
+    /// Host and port of linuxcncrsh, where it is one.
+    fn rsh(&self) -> Option<(String, u16)> {
+        None
+    }
+
     /// The Modbus line and the unit on it, where it is one: what a simulated machine is served on.
     fn line(&self) -> Option<(Line, u8)> {
         None
@@ -141,7 +146,7 @@ pub enum MakingError {
     )]
     NoVolume { machine: String },
     /// A machine that this wire has no driver for.
-    #[error("{table}.wire: kind = {kind:?} is for a measuring machine; name another wire")]
+    #[error("{table}.wire: kind = {kind:?} is for the other machine of a cell; name another wire")]
     NoDriver { table: &'static str, kind: &'static str },
     /// A line that cannot be opened.
     #[error("{line} cannot be opened: {source}; check the cell file and the machine")]

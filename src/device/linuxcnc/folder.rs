@@ -1,0 +1,99 @@
+//! The folders: where the program of a pass comes from, and the one that this computer and the controller both see.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use regrind_formats::result::read_bytes;
+use regrind_formats::write_atomic;
+
+use super::program::{Order, PROGRAM, Program, RECORD, Record, name_begins};
+
+/// The program that a run leaves with every correction.
+const OF_THE_PASS: &str = "toolpath.ngc";
+/// A record of a few lines; one that is longer is none.
+const LONGEST_RECORD: u64 = 1 << 16;
+
+/// Where programs come from and go to.
+#[derive(Clone, Debug)]
+pub(super) struct Folders {
+    /// The folder of the run.
+    pub(super) run: PathBuf,
+    /// The folder of programs, as this computer sees it.
+    pub(super) here: PathBuf,
+    /// The same, as the controller sees it.
+    pub(super) there: String,
+}
+
+impl Folders {
+    /// Puts the newest program of the run into its frame, if it is of this map.
+    pub(super) fn newest(&self, map: &[u8; 32], rounds: u32) -> Result<Program, String> {
+        let cycles = std::fs::read_dir(&self.run).map_err(|error| at(&self.run, &error))?;
+        let cycles = cycles.flatten().filter_map(|entry| Some((cycle(&entry.path())?, entry.path().join(OF_THE_PASS))));
+        let newest = cycles.filter(|(_, file)| file.is_file()).max_by_key(|(cycle, _)| *cycle);
+        let (cycle, file) = newest.ok_or_else(|| {
+            format!("{} holds no {OF_THE_PASS}: the journal says why none was written", self.run.display())
+        })?;
+        self.framed(cycle, &file, map, rounds)
+    }
+
+    fn framed(&self, cycle: u32, file: &Path, map: &[u8; 32], rounds: u32) -> Result<Program, String> {
+        let pass = read_bytes(file).map_err(|error| error.to_string())?;
+        let run = self.run.file_name().unwrap_or_default().to_string_lossy();
+        let order = Order { run: &run, cycle, pass: &pass, map, rounds, folder: &self.there };
+        Program::frame(order).map_err(|why| format!("{}: {why}", file.display()))
+    }
+
+    /// Puts a program where the controller finds it, and reads it back.
+    pub(super) fn put(&self, program: &Program) -> Result<(), String> {
+        let file = self.here.join(&program.name).with_extension(PROGRAM);
+        let lies_there = |file: &Path| std::fs::read(file).is_ok_and(|text| text == program.text);
+        if lies_there(&file) {
+            return Ok(());
+        }
+        write_atomic(&file, &program.text).map_err(|error| error.to_string())?;
+        match lies_there(&file) {
+            true => Ok(()),
+            false => Err(format!("{} does not hold what was written into it", file.display())),
+        }
+    }
+
+    /// What a program wrote of itself; none where there is no such file.
+    pub(super) fn record(&self, name: &str) -> Result<Option<Record>, String> {
+        let file = self.here.join(name).with_extension(RECORD);
+        let read = std::fs::metadata(&file).and_then(|about| match about.len() <= LONGEST_RECORD {
+            true => std::fs::read(&file),
+            false => Err(io::ErrorKind::FileTooLarge.into()),
+        });
+        match read {
+            Ok(bytes) => Ok(Some(Record::read(&String::from_utf8_lossy(&bytes)))),
+            Err(error) if error.kind() == io::ErrorKind::NotFound && self.here.is_dir() => Ok(None),
+            Err(error) => Err(at(&file, &error)),
+        }
+    }
+
+    /// The program of this run that was prepared by this word, before this program began.
+    pub(super) fn prepared(&self, cycle: u32, token: u32) -> Result<Option<Program>, String> {
+        let run = self.run.file_name().unwrap_or_default().to_string_lossy();
+        let begins = name_begins(&run, cycle);
+        for entry in std::fs::read_dir(&self.here).map_err(|error| at(&self.here, &error))?.flatten() {
+            let file = entry.path();
+            let name = file.file_stem().and_then(|name| name.to_str()).filter(|name| name.starts_with(&begins));
+            let Some(name) = name.filter(|_| file.extension().is_some_and(|e| e == RECORD)) else { continue };
+            if self.record(name)?.is_some_and(|record| record.prepared == Some(token)) {
+                let file = file.with_extension(PROGRAM);
+                let text = std::fs::read(&file).map_err(|error| at(&file, &error))?;
+                return Ok(Program::read(name, cycle, text));
+            }
+        }
+        Ok(None)
+    }
+}
+
+/// The cycle of a folder of a run.
+fn cycle(folder: &Path) -> Option<u32> {
+    folder.file_name()?.to_str()?.strip_prefix("cycle-")?.parse().ok()
+}
+
+fn at(path: &Path, error: &io::Error) -> String {
+    format!("{}: {error}", path.display())
+}

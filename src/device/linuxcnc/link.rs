@@ -1,0 +1,158 @@
+//! The connection to linuxcncrsh. A task owns it: it writes every request at once, whoever still waits for an answer, so that an order to
+//! hold or abort waits for nothing; and whoever has stopped waiting for an answer does not disturb the next.
+
+use std::io;
+use std::time::Duration;
+
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+use tokio::sync::{mpsc, oneshot};
+use tokio::time::{Instant, sleep_until, timeout};
+
+use super::protocol::{Lines, Place, Reply, Request, Waiting};
+
+/// Why there is no answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum LinkFault {
+    /// No connection could be made.
+    Unreachable(io::ErrorKind),
+    /// No answer in time; the connection was given up, so that a late one is nobody's.
+    TimedOut,
+    /// The other end closed it, or it broke.
+    Disconnected,
+    /// What comes is no conversation.
+    Nonsense,
+    /// It would not be one plain line, and was not sent.
+    Unsendable,
+}
+
+/// A connection. Dropping it closes it, and takes what was not sent yet with it.
+#[derive(Debug)]
+pub(super) struct Link {
+    questions: mpsc::UnboundedSender<Question>,
+}
+
+#[derive(Debug)]
+struct Question {
+    request: Request,
+    line: String,
+    within: Duration,
+    reply: oneshot::Sender<Result<Reply, LinkFault>>,
+}
+
+/// An answer that is on its way.
+#[derive(Debug)]
+pub(super) struct Asked(Result<oneshot::Receiver<Result<Reply, LinkFault>>, LinkFault>);
+
+impl Asked {
+    /// Waits for it.
+    pub(super) async fn answer(self) -> Result<Reply, LinkFault> {
+        // Dropped without a word: the task has ended.
+        self.0?.await.unwrap_or(Err(LinkFault::Disconnected))
+    }
+}
+
+impl Link {
+    /// Connects; nothing is said yet.
+    pub(super) async fn open(host: &str, port: u16, within: Duration) -> Result<Self, LinkFault> {
+        let stream = match timeout(within, TcpStream::connect((host, port))).await {
+            Ok(Ok(stream)) => stream,
+            Ok(Err(error)) => return Err(LinkFault::Unreachable(error.kind())),
+            Err(_) => return Err(LinkFault::Unreachable(io::ErrorKind::TimedOut)),
+        };
+        let set = stream.set_nodelay(true).and_then(|()| stream.set_zero_linger());
+        set.map_err(|error| LinkFault::Unreachable(error.kind()))?;
+        let (questions, asked) = mpsc::unbounded_channel();
+        tokio::spawn(Conversation::new(stream).run(asked));
+        Ok(Self { questions })
+    }
+
+    /// Sends a request behind those before it, whether or not they have been answered.
+    pub(super) fn ask(&self, request: Request, within: Duration) -> Asked {
+        let Some(line) = request.line() else { return Asked(Err(LinkFault::Unsendable)) };
+        let (reply, answer) = oneshot::channel();
+        match self.questions.send(Question { request, line, within, reply }) {
+            Ok(()) => Asked(Ok(answer)),
+            Err(_) => Asked(Err(LinkFault::Disconnected)),
+        }
+    }
+
+    /// Sends a request that has no answer.
+    pub(super) fn say(&self, request: Request) {
+        drop(self.ask(request, Duration::ZERO));
+    }
+}
+
+/// Who waits for an answer, and until when.
+type Waiter = (oneshot::Sender<Result<Reply, LinkFault>>, Instant);
+
+struct Conversation {
+    stream: TcpStream,
+    lines: Lines,
+    waiting: Waiting<Waiter>,
+}
+
+impl Conversation {
+    fn new(stream: TcpStream) -> Self {
+        Self { stream, lines: Lines::default(), waiting: Waiting::default() }
+    }
+
+    /// Ends when nobody can ask any more or the connection is of no use any more, and tells all who wait.
+    async fn run(mut self, mut asked: mpsc::UnboundedReceiver<Question>) {
+        let fault = self.converse(&mut asked).await;
+        asked.close();
+        let left = std::iter::from_fn(|| asked.try_recv().ok()).map(|question| question.reply);
+        for reply in self.waiting.drain().map(|(reply, _)| reply).chain(left) {
+            let _ = reply.send(Err(fault));
+        }
+    }
+
+    async fn converse(&mut self, asked: &mut mpsc::UnboundedReceiver<Question>) -> LinkFault {
+        let mut bytes = [0; 4096];
+        loop {
+            let due = self.waiting.first().map(|(_, due)| *due);
+            let result = tokio::select! {
+                biased;
+                question = asked.recv() => match question {
+                    Some(question) => self.send(question).await,
+                    None => Err(LinkFault::Disconnected),
+                },
+                read = self.stream.read(&mut bytes) => match read {
+                    Ok(count) if count > 0 => self.take(&bytes[..count]),
+                    _ => Err(LinkFault::Disconnected),
+                },
+                () = sleep_until(due.unwrap_or_else(Instant::now)), if due.is_some() => Err(LinkFault::TimedOut),
+            };
+            if let Err(fault) = result {
+                return fault;
+            }
+        }
+    }
+
+    async fn send(&mut self, question: Question) -> Result<(), LinkFault> {
+        let Question { request, line, within, reply } = question;
+        let echo = request == Request::EchoOff;
+        if reply.is_closed() && !echo {
+            return Ok(()); // whoever asked has gone; what was never sent need not be
+        }
+        let due = Instant::now() + within;
+        let written = async { self.stream.write_all(line.as_bytes()).await };
+        let limit = within.max(Duration::from_secs(1));
+        let written = timeout(limit, written).await.unwrap_or(Err(io::ErrorKind::TimedOut.into()));
+        if !echo {
+            self.waiting.push(request, (reply, due));
+        }
+        written.map_err(|_| LinkFault::Disconnected)
+    }
+
+    fn take(&mut self, bytes: &[u8]) -> Result<(), LinkFault> {
+        for line in self.lines.take(bytes).ok_or(LinkFault::Nonsense)? {
+            match self.waiting.place(&line) {
+                Place::Answer((reply, _), said) => drop(reply.send(Ok(said))),
+                Place::Aside => {}
+                Place::Nonsense => return Err(LinkFault::Nonsense),
+            }
+        }
+        Ok(())
+    }
+}

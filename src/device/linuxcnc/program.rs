@@ -1,0 +1,291 @@
+//! The program as the controller runs it: that of the pass, in a frame by which it writes itself down.
+//!
+//! linuxcncrsh knows no jobs: it tells that a program runs, and whether one ran to its end it does not tell. So the program says so itself. It
+//! appends a line to a file of its own, its record, when it begins and when its last motion has ended, and its name is that of its content.
+//! Before that the driver has the controller open the record with a word of this very preparation. Who reads that word back knows that both
+//! see one folder, and that no line of the record is of another time.
+
+use sha2::{Digest, Sha256};
+
+use crate::hex;
+
+/// LinuxCNC reads lines of 255 characters.
+const LONGEST_PATH: usize = 220;
+/// The part of a name that tells the run.
+const LONGEST_RUN: usize = 60;
+
+/// A program in its frame.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Program {
+    /// Tells run, cycle and content; without an extension.
+    pub name: String,
+    /// The correction that it grinds is that of this cycle: it is the pass of the next.
+    pub cycle: u32,
+    /// What stands in the file.
+    pub text: Vec<u8>,
+    /// The first line of the pass in the file, counted from 1, and how many lines it has.
+    pub lines: (u32, u32),
+    /// How often the pass is run.
+    pub rounds: u32,
+    /// The identity of the map that it grinds.
+    pub map: [u8; 32],
+}
+
+/// What a program is made of.
+#[derive(Clone, Copy, Debug)]
+pub struct Order<'a> {
+    /// The run, as files call it.
+    pub run: &'a str,
+    /// The cycle whose correction it is.
+    pub cycle: u32,
+    /// The program of the pass.
+    pub pass: &'a [u8],
+    /// The identity of the map that it has to be of.
+    pub map: &'a [u8; 32],
+    /// How often it is run: once, and once more for each spark-out.
+    pub rounds: u32,
+    /// The folder of programs, as the controller sees it.
+    pub folder: &'a str,
+}
+
+impl Program {
+    /// Puts the program of a pass into its frame.
+    ///
+    /// # Errors
+    /// What makes it one that must not be run, in words.
+    pub fn frame(order: Order<'_>) -> Result<Self, String> {
+        let body = body(order.pass, order.map)?;
+        let mut content = Sha256::new();
+        content.update(order.pass);
+        content.update(order.rounds.to_be_bytes());
+        let name = name_begins(order.run, order.cycle) + &hex(&content.finalize()[..8]);
+        let record = path(order.folder, &name, RECORD);
+        if record.len() > LONGEST_PATH {
+            return Err(format!("its path at the controller is longer than {LONGEST_PATH} characters: {record}"));
+        }
+        let says = |word: &str| format!("(LOGAPPEND,{record})\n(LOG,{word})\n(LOGCLOSE)\n");
+        let (repeat, again) = match order.rounds {
+            0 | 1 => (String::new(), ""),
+            rounds => (format!("{REPEAT}{rounds}]\n"), "o<regrind> endrepeat\n"),
+        };
+        let head = format!("({name})\n{}{repeat}", says(BEGIN));
+        // The interpreter reads ahead of the motion. Asking for an input makes it wait for all that is before; then comes the end.
+        let tail = format!("{again}M66 P0 L0\n{}M2\n", says(END));
+        let count = |text: &str| text.bytes().filter(|byte| *byte == b'\n').count() as u32;
+        let lines = (count(&head) + 1, count(body).max(1));
+        let text = [head.as_bytes(), body.as_bytes(), tail.as_bytes()].concat();
+        Ok(Self { name, cycle: order.cycle, text, lines, rounds: order.rounds.max(1), map: *order.map })
+    }
+
+    /// Reads a program that was put into its frame before this program began.
+    pub(super) fn read(name: &str, cycle: u32, text: Vec<u8>) -> Option<Self> {
+        let whole = std::str::from_utf8(&text).ok()?;
+        let repeat = whole.lines().nth(4).and_then(|line| line.strip_prefix(REPEAT)?.strip_suffix(']')?.parse().ok());
+        let map = whole.lines().find_map(|line| line.strip_prefix(OF_MAP)?.strip_suffix(')'))?;
+        let digits = |k: usize| u8::from_str_radix(map.get(2 * k..2 * k + 2)?, 16).ok();
+        let mut identity = [0; 32];
+        for (k, byte) in identity.iter_mut().enumerate() {
+            *byte = digits(k)?;
+        }
+        let repeats = u32::from(repeat.is_some());
+        let (head, tail) = (4 + repeats, 5 + repeats);
+        let count = (whole.lines().count() as u32).checked_sub(head + tail)?;
+        let (lines, rounds) = ((head + 1, count), repeat.unwrap_or(1));
+        Some(Self { name: name.to_owned(), cycle, lines, rounds, map: identity, text })
+    }
+
+    /// How far a line of the file is, in thousandths of the pass.
+    pub(super) fn thousandths(&self, line: u32) -> u32 {
+        let (first, count) = self.lines;
+        let done = line.saturating_sub(first).min(count);
+        u32::try_from(u64::from(done) * 1000 / u64::from(count.max(1))).unwrap_or(1000)
+    }
+}
+
+/// How the name of every program of a cycle begins.
+pub(super) fn name_begins(run: &str, cycle: u32) -> String {
+    let run: String = run.chars().map(plain).take(LONGEST_RUN).collect();
+    format!("{run}-c{cycle}-")
+}
+
+/// The extensions of a program and of its record.
+pub(super) const PROGRAM: &str = "ngc";
+pub(super) const RECORD: &str = "log";
+const PREPARED: &str = "prepared";
+const BEGIN: &str = "begin";
+const END: &str = "end";
+const REPEAT: &str = "o<regrind> repeat [";
+const OF_MAP: &str = "(map: sha256 ";
+
+/// A file of the folder as the controller sees it, which is a Unix system always.
+pub(super) fn path(folder: &str, name: &str, extension: &str) -> String {
+    format!("{}/{name}.{extension}", folder.trim_end_matches('/'))
+}
+
+/// The lines by which a controller opens a record anew.
+pub(super) fn opening(record: &str, token: u32) -> [String; 3] {
+    [format!("(LOGOPEN,{record})"), format!("(LOG,{PREPARED} {token:08x})"), "(LOGCLOSE)".to_owned()]
+}
+
+fn plain(c: char) -> char {
+    if c.is_ascii_alphanumeric() || matches!(c, '-' | '_') { c } else { '_' }
+}
+
+/// Returns the program without its end, if it is of this map, says how exactly it is to be followed, and ends.
+fn body<'a>(pass: &'a [u8], map: &[u8; 32]) -> Result<&'a str, String> {
+    let text = std::str::from_utf8(pass).ok().filter(|text| text.is_ascii()).ok_or("it is not plain text")?;
+    let of_map = format!("{OF_MAP}{})", hex(map));
+    if !text.lines().any(|line| line.trim() == of_map) {
+        return Err(format!("it is not the program of the map {}", hex(&map[..4])));
+    }
+    let code = text.lines().map(code).filter(|words| !words.is_empty());
+    let code: Vec<Vec<&str>> = code.collect();
+    check_mode(&code)?;
+    let body = text.trim_end().strip_suffix("M2").ok_or("it does not end with M2")?;
+    match body.ends_with('\n')
+        && !code[..code.len() - 1].iter().flatten().any(|word| matches!(*word, "M2" | "M30" | "%"))
+    {
+        true => Ok(body),
+        false => Err("it ends before its last line".to_owned()),
+    }
+}
+
+/// The words of a line, without comments.
+fn code(line: &str) -> Vec<&str> {
+    let line = line.split([';', '(']).next().unwrap_or_default();
+    line.split_whitespace().collect()
+}
+
+/// LinuxCNC follows a program at power-on by G64 without a tolerance, which cuts corners by a tenth of a millimetre: it has to say how exactly.
+fn check_mode(code: &[Vec<&str>]) -> Result<(), String> {
+    let mut says = false;
+    for words in code {
+        let has = |word: &str| words.iter().any(|w| w.eq_ignore_ascii_case(word));
+        if has("G64") && !words.iter().any(|w| w.starts_with(['P', 'p'])) {
+            return Err("it sets G64 without a tolerance, which rounds corners off as it likes".to_owned());
+        }
+        says |= has("G61") || has("G61.1") || has("G64");
+        let moves = words.iter().any(|w| w.starts_with(['X', 'Y', 'Z', 'x', 'y', 'z']));
+        if moves && !says {
+            return Err(
+                "it moves before it says how exactly it is to be followed (G61, G61.1, or G64 with P)".to_owned()
+            );
+        }
+    }
+    match says {
+        true => Ok(()),
+        false => Err("it does not say how exactly it is to be followed (G61, G61.1, or G64 with P)".to_owned()),
+    }
+}
+
+/// What a program wrote of itself.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Record {
+    /// The word of the preparation that opened it.
+    pub prepared: Option<u32>,
+    /// How often it has begun.
+    pub begun: u32,
+    /// How often its last motion has ended.
+    pub ended: u32,
+}
+
+impl Record {
+    /// Reads a record; a line that is not whole yet is none.
+    pub fn read(text: &str) -> Self {
+        let mut record = Self::default();
+        let whole = text.rfind('\n').map_or("", |end| &text[..end]);
+        for line in whole.lines().map(str::trim) {
+            match line.split_once(' ') {
+                Some((PREPARED, token)) => record.prepared = u32::from_str_radix(token, 16).ok(),
+                None if line == BEGIN => record.begun += 1,
+                None if line == END => record.ended += 1,
+                _ => {}
+            }
+        }
+        record
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MAP: [u8; 32] = [7; 32];
+
+    fn pass(mode: &str, end: &str) -> String {
+        format!("(part: x)\n(map: sha256 {})\nG21 G90\n{mode}\nG0 Z5\nG1 X1 Y2 F600\n{end}", hex(&MAP))
+    }
+
+    fn frame(pass: &str, rounds: u32) -> Result<Program, String> {
+        let order = Order { run: "A part/1", cycle: 2, pass: pass.as_bytes(), map: &MAP, rounds, folder: "/srv/nc/" };
+        Program::frame(order)
+    }
+
+    #[test]
+    fn a_program_writes_down_that_it_begins_and_ends() {
+        let pass = pass("G64 P0.0001 Q0", "M2\n");
+        let framed = frame(&pass, 1).unwrap();
+        let text = String::from_utf8(framed.text.clone()).unwrap();
+        let name = &framed.name;
+        assert!(name.starts_with("A_part_1-c2-") && name.len() == "A_part_1-c2-".len() + 16, "{name}");
+        let says = |word: &str| format!("(LOGAPPEND,/srv/nc/{name}.log)\n(LOG,{word})\n(LOGCLOSE)\n");
+        let body = pass.strip_suffix("M2\n").unwrap();
+        assert_eq!(text, format!("({name})\n{}{body}M66 P0 L0\n{}M2\n", says("begin"), says("end")));
+        let (first, count) = framed.lines;
+        let lines: Vec<_> = text.lines().collect();
+        assert_eq!(lines[first as usize - 1], "(part: x)");
+        assert_eq!(lines[(first + count) as usize - 2], "G1 X1 Y2 F600");
+        assert_eq!([first, first + 3, first + count + 4].map(|line| framed.thousandths(line)), [0, 500, 1000]);
+    }
+
+    #[test]
+    fn a_program_that_was_framed_before_is_read_as_it_was() {
+        for rounds in [1, 2, 30] {
+            let framed = frame(&pass("G61", "M2\n"), rounds).unwrap();
+            assert_eq!(Program::read(&framed.name, 2, framed.text.clone()), Some(framed));
+        }
+        assert_eq!(Program::read("x", 1, b"M2\n".to_vec()), None);
+    }
+
+    #[test]
+    fn spark_out_is_the_same_program_once_more_and_another_file() {
+        let pass = pass("G61", "M2\n");
+        let (once, thrice) = (frame(&pass, 1).unwrap(), frame(&pass, 3).unwrap());
+        assert_ne!(once.name, thrice.name);
+        let text = String::from_utf8(thrice.text).unwrap();
+        assert!(text.contains("(LOGCLOSE)\no<regrind> repeat [3]\n(part: x)\n"), "{text}");
+        assert!(text.contains("F600\no<regrind> endrepeat\nM66 P0 L0\n"), "{text}");
+    }
+
+    #[test]
+    fn a_program_that_is_followed_as_the_controller_likes_is_none() {
+        for (mode, end) in [
+            ("", "M2\n"),
+            ("G64", "M2\n"),
+            ("(G61)", "M2\n"),
+            ("G1 X3\nG61", "M2\n"),
+            ("G61\nG64", "M2\n"),
+            ("G61", ""),
+            ("G61", "M2\nG1 X4\n"),
+            ("G61\nM2", "M2\n"),
+            ("G61", "M2 X\n"),
+        ] {
+            assert!(frame(&pass(mode, end), 1).is_err(), "{mode:?} {end:?}");
+        }
+        for mode in ["G61", "G61.1", "G64 P0.001", "G64 P0.0001 Q0"] {
+            assert!(frame(&pass(mode, "M2\n"), 1).is_ok(), "{mode}");
+        }
+        let other = pass("G61", "M2\n").replace("0707", "0708");
+        assert!(frame(&other, 1).is_err());
+    }
+
+    #[test]
+    fn what_is_not_whole_in_a_record_is_not_there() {
+        let read = Record::read;
+        assert_eq!(read(""), Record::default());
+        assert_eq!(read("prepared 0000002a\nbegin"), Record { prepared: Some(42), begun: 0, ended: 0 });
+        assert_eq!(read("prepared 0000002a\nbegin\nen"), Record { prepared: Some(42), begun: 1, ended: 0 });
+        assert_eq!(read("prepared 0000002a\r\nbegin\nend\n"), Record { prepared: Some(42), begun: 1, ended: 1 });
+        assert_eq!(read("prepared x\nbeginning\nthe end\n"), Record::default());
+    }
+}

@@ -1,0 +1,418 @@
+//! What is said to linuxcncrsh and what it says: sent strictly, read leniently, without any wire.
+//!
+//! A request is one line. Once `echo` is off and `verbose` is on each has one line for an answer, in the order of the requests; nothing else
+//! ties the two together. So an answer has to name what was asked, and a line that names something else is nobody's.
+
+use std::collections::VecDeque;
+use std::fmt;
+
+/// No line of either side is longer.
+const LONGEST_LINE: usize = 4096;
+/// More lines in a row that answer nothing than that are no conversation.
+const MOST_ASIDE: u32 = 100;
+
+/// What a controller can be asked without ownership, and without anything being changed by it but that an error is told once.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[expect(missing_docs, reason = "the words of the protocol")]
+pub enum Get {
+    Enable,
+    Inifile,
+    Estop,
+    Machine,
+    Mode,
+    JointHomed,
+    Program,
+    ProgramStatus,
+    ProgramLine,
+    AbsActPos,
+    Error,
+}
+
+impl Get {
+    fn word(self) -> &'static str {
+        match self {
+            Self::Enable => "enable",
+            Self::Inifile => "inifile",
+            Self::Estop => "estop",
+            Self::Machine => "machine",
+            Self::Mode => "mode",
+            Self::JointHomed => "joint_homed",
+            Self::Program => "program",
+            Self::ProgramStatus => "program_status",
+            Self::ProgramLine => "program_line",
+            Self::AbsActPos => "abs_act_pos",
+            Self::Error => "error",
+        }
+    }
+}
+
+/// A way of working of the controller.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[expect(missing_docs, reason = "the words of the protocol")]
+pub enum Mode {
+    Manual,
+    Auto,
+    Mdi,
+}
+
+impl Mode {
+    fn word(self) -> &'static str {
+        match self {
+            Self::Manual => "manual",
+            Self::Auto => "auto",
+            Self::Mdi => "mdi",
+        }
+    }
+
+    /// The mode of this name, in whatever case.
+    pub fn of(word: &str) -> Option<Self> {
+        [Self::Manual, Self::Auto, Self::Mdi].into_iter().find(|mode| mode.word().eq_ignore_ascii_case(word))
+    }
+}
+
+/// What a controller can be told. Nothing else is ever sent: no jog, no emergency stop, no override, no home.
+#[derive(Clone, PartialEq, Eq)]
+#[expect(missing_docs, reason = "the words of the protocol")]
+pub enum Set {
+    Verbose,
+    /// Takes control from whoever has it.
+    Enable {
+        password: String,
+    },
+    /// Gives control up.
+    Disable,
+    Mode(Mode),
+    Mdi(String),
+    Open(String),
+    Run,
+    Pause,
+    Resume,
+    Abort,
+}
+
+impl Set {
+    fn words(&self) -> (&'static str, &str) {
+        match self {
+            Self::Verbose => ("verbose", "on"),
+            Self::Enable { password } => ("enable", password),
+            Self::Disable => ("enable", "off"),
+            Self::Mode(mode) => ("mode", mode.word()),
+            Self::Mdi(line) => ("mdi", line),
+            Self::Open(path) => ("open", path),
+            Self::Run => ("run", ""),
+            Self::Pause => ("pause", ""),
+            Self::Resume => ("resume", ""),
+            Self::Abort => ("abort", ""),
+        }
+    }
+}
+
+impl fmt::Debug for Set {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.words() {
+            ("enable", password) if password != "off" => f.write_str("set enable ..."),
+            (word, rest) => write!(f, "set {word} {rest}"),
+        }
+    }
+}
+
+/// One line to the controller.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[expect(missing_docs, reason = "the words of the protocol")]
+pub enum Request {
+    Hello { password: String },
+    EchoOff,
+    Get(Get),
+    Set(Set),
+}
+
+/// What an answer says.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Reply {
+    /// What was asked for.
+    Value(String),
+    /// Taken in. It does not say that it succeeded.
+    Acknowledged,
+    /// Not taken in.
+    Refused,
+}
+
+impl Request {
+    /// Returns the line, with its end; none where it would not be one line, or not a plain one.
+    pub fn line(&self) -> Option<String> {
+        let line = match self {
+            Self::Hello { password } => format!("hello {password} regrind 1.1"),
+            Self::EchoOff => "set echo off".to_owned(),
+            Self::Get(get) => format!("get {}", get.word()),
+            Self::Set(set) => {
+                let (word, rest) = set.words();
+                format!("set {word} {rest}").trim_end().to_owned()
+            }
+        };
+        let plain = line.chars().all(|c| c == ' ' || c.is_ascii_graphic());
+        (plain && line.len() < LONGEST_LINE).then(|| line + "\r\n")
+    }
+
+    /// Whether a line answers it, and what it says then.
+    pub fn answer(&self, line: &str) -> Option<Reply> {
+        match self {
+            Self::Hello { .. } => said(line, "hello"),
+            // What comes back is its own echo.
+            Self::EchoOff => None,
+            Self::Get(get) => match (after(line, get.word()), after(line, "get")) {
+                (Some(value), _) => Some(Reply::Value(value.to_owned())),
+                (_, Some(rest)) => refused(rest, get.word()),
+                _ => None,
+            },
+            Self::Set(set) => {
+                let rest = after(line, "set")?;
+                let (word, _) = set.words();
+                match after(rest, word) {
+                    Some(rest) if rest.eq_ignore_ascii_case("ack") => Some(Reply::Acknowledged),
+                    _ => refused(rest, word),
+                }
+            }
+        }
+    }
+}
+
+/// What follows a word at the beginning of a line.
+fn after<'a>(line: &'a str, word: &str) -> Option<&'a str> {
+    let (head, rest) = line.split_at_checked(word.len())?;
+    let ends = rest.is_empty() || rest.starts_with([' ', '\t']);
+    (ends && head.eq_ignore_ascii_case(word)).then(|| rest.trim())
+}
+
+/// `HELLO ACK name version`, `HELLO NAK`.
+fn said(line: &str, word: &str) -> Option<Reply> {
+    let rest = after(line, word)?;
+    match after(rest, "ack") {
+        Some(value) => Some(Reply::Value(value.to_owned())),
+        None => rest.eq_ignore_ascii_case("nak").then_some(Reply::Refused),
+    }
+}
+
+/// `X NAK`, and `NAK` alone: what a server says that does not get so far as to look at the word.
+fn refused(rest: &str, word: &str) -> Option<Reply> {
+    let rest = after(rest, word).unwrap_or(rest);
+    rest.eq_ignore_ascii_case("nak").then_some(Reply::Refused)
+}
+
+/// Lines out of bytes as they come: half ones wait for their other half. Either of CR and LF ends a line, and empty ones are none.
+#[derive(Debug, Default)]
+pub struct Lines {
+    bytes: Vec<u8>,
+}
+
+impl Lines {
+    /// Takes bytes in, and returns the lines that are whole now; none where what came is no line of this protocol.
+    pub fn take(&mut self, bytes: &[u8]) -> Option<Vec<String>> {
+        self.bytes.extend_from_slice(bytes);
+        let mut lines = Vec::new();
+        while let Some(end) = self.bytes.iter().position(|byte| matches!(byte, b'\r' | b'\n')) {
+            if end > LONGEST_LINE {
+                return None;
+            }
+            let line: Vec<u8> = self.bytes.drain(..=end).take(end).collect();
+            // Every byte is a character: some answers hold garbage.
+            let line: String = line.into_iter().map(char::from).collect();
+            lines.extend(Some(line.trim().to_owned()).filter(|line| !line.is_empty()));
+        }
+        (self.bytes.len() <= LONGEST_LINE).then_some(lines)
+    }
+}
+
+/// Requests that are on their way, in their order, each with what it is kept with.
+#[derive(Debug)]
+pub struct Waiting<T> {
+    requests: VecDeque<(Request, T)>,
+    aside: u32,
+}
+
+/// What a line is.
+#[derive(Debug, PartialEq)]
+pub enum Place<T> {
+    /// The answer to the request that has waited longest.
+    Answer(T, Reply),
+    /// Nobody's.
+    Aside,
+    /// Nobody's, like so many before it that this is no conversation.
+    Nonsense,
+}
+
+impl<T> Default for Waiting<T> {
+    fn default() -> Self {
+        Self { requests: VecDeque::new(), aside: 0 }
+    }
+}
+
+impl<T> Waiting<T> {
+    /// Keeps a request that was sent.
+    pub fn push(&mut self, request: Request, kept: T) {
+        self.requests.push_back((request, kept));
+    }
+
+    /// What is kept with the request that has waited longest.
+    pub fn first(&self) -> Option<&T> {
+        self.requests.front().map(|(_, kept)| kept)
+    }
+
+    /// All that wait, which wait no more.
+    pub fn drain(&mut self) -> impl Iterator<Item = T> + '_ {
+        self.requests.drain(..).map(|(_, kept)| kept)
+    }
+
+    /// Says what a line is.
+    pub fn place(&mut self, line: &str) -> Place<T> {
+        match self.requests.front().and_then(|(request, _)| request.answer(line)) {
+            Some(reply) => {
+                self.aside = 0;
+                match self.requests.pop_front() {
+                    Some((_, kept)) => Place::Answer(kept, reply),
+                    None => Place::Aside,
+                }
+            }
+            None => {
+                self.aside += 1;
+                if self.aside > MOST_ASIDE { Place::Nonsense } else { Place::Aside }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What went over the wire to and from LinuxCNC 2.9, byte by byte.
+    const SESSION: [(&str, &str); 17] = [
+        ("hello EMC regrind 1.1\r\n", "HELLO ACK EMCNETSVR 1.1\r\n"),
+        ("set echo off\r\n", "set echo off\r\n"),
+        ("set verbose on\r\n", "SET VERBOSE ACK\n\r"),
+        ("get inifile\r\n", "INIFILE /home/cnc/Grinder A/grinder.ini\r\n"),
+        ("set run\r\n", "SET RUN NAK\n\r"),
+        ("set enable EMCTOO\r\n", "SET ENABLE ACK\n\r"),
+        ("get enable\r\n", "ENABLE ON\r\n"),
+        ("set mode auto\r\n", "SET MODE ACK\n\r"),
+        ("get mode\r\n", "MODE AUTO\r\n"),
+        ("set open /srv/regrind/Part-c1.ngc\r\n", "SET OPEN ACK\n\r"),
+        ("get program\r\n", "PROGRAM /srv/regrind/Part-c1.ngc\r\n"),
+        ("get error\r\n", "ERROR Linear move on line 3 would exceed X's positive limit\r\n"),
+        ("get error\r\n", "ERROR OK\r\n"),
+        ("get program_status\r\n", "PROGRAM_STATUS RUNNING\r\n"),
+        ("get program_line\r\n", "PROGRAM_LINE 528\r\n"),
+        ("get joint_homed\r\n", "JOINT_HOMED YES YES YES NO NO NO\r\n"),
+        ("set abort\r\n", "SET ABORT ACK\n\r"),
+    ];
+
+    fn requests() -> Vec<Request> {
+        let password = String::from;
+        let path = "/srv/regrind/Part-c1.ngc".to_owned();
+        vec![
+            Request::Hello { password: password("EMC") },
+            Request::EchoOff,
+            Request::Set(Set::Verbose),
+            Request::Get(Get::Inifile),
+            Request::Set(Set::Run),
+            Request::Set(Set::Enable { password: password("EMCTOO") }),
+            Request::Get(Get::Enable),
+            Request::Set(Set::Mode(Mode::Auto)),
+            Request::Get(Get::Mode),
+            Request::Set(Set::Open(path)),
+            Request::Get(Get::Program),
+            Request::Get(Get::Error),
+            Request::Get(Get::Error),
+            Request::Get(Get::ProgramStatus),
+            Request::Get(Get::ProgramLine),
+            Request::Get(Get::JointHomed),
+            Request::Set(Set::Abort),
+        ]
+    }
+
+    fn told() -> Vec<Reply> {
+        let value = |text: &str| Reply::Value(text.to_owned());
+        vec![
+            value("EMCNETSVR 1.1"),
+            Reply::Acknowledged,
+            value("/home/cnc/Grinder A/grinder.ini"),
+            Reply::Refused,
+            Reply::Acknowledged,
+            value("ON"),
+            Reply::Acknowledged,
+            value("AUTO"),
+            Reply::Acknowledged,
+            value("/srv/regrind/Part-c1.ngc"),
+            value("Linear move on line 3 would exceed X's positive limit"),
+            value("OK"),
+            value("RUNNING"),
+            value("528"),
+            value("YES YES YES NO NO NO"),
+            Reply::Acknowledged,
+        ]
+    }
+
+    #[test]
+    fn what_is_sent_is_what_the_server_was_seen_to_take() {
+        let sent: Vec<_> = requests().iter().map(|request| request.line().unwrap()).collect();
+        assert_eq!(sent, SESSION.map(|(asked, _)| asked));
+    }
+
+    #[test]
+    fn answers_are_the_same_in_halves_merged_and_byte_by_byte() {
+        let all: String = SESSION.map(|(_, answer)| answer).concat();
+        for size in [1, 2, 3, 7, 16, 1000] {
+            let (mut lines, mut waiting, mut found) = (Lines::default(), Waiting::default(), Vec::new());
+            for request in requests().into_iter().filter(|request| *request != Request::EchoOff) {
+                waiting.push(request, ());
+            }
+            for bytes in all.as_bytes().chunks(size) {
+                for line in lines.take(bytes).unwrap() {
+                    match waiting.place(&line) {
+                        Place::Answer((), reply) => found.push(reply),
+                        Place::Aside => assert_eq!(line, "set echo off"),
+                        Place::Nonsense => panic!("{line}"),
+                    }
+                }
+            }
+            assert_eq!(found, told(), "in pieces of {size}");
+            assert!(waiting.first().is_none());
+        }
+    }
+
+    #[test]
+    fn a_line_that_names_something_else_answers_nothing() {
+        let run = Request::Set(Set::Run);
+        assert_eq!(run.answer("SET NAK"), Some(Reply::Refused));
+        assert_eq!(run.answer("set run ack"), Some(Reply::Acknowledged));
+        for line in
+            ["SET OPEN ACK", "SET RUNNING ACK", "SET RUN", "SET ACK", "RUN ACK", "\u{fffd}", "", "SET RUN ACK ACK"]
+        {
+            assert_eq!(run.answer(line), None, "{line}");
+        }
+        let line = Request::Get(Get::Program);
+        assert_eq!(line.answer("GET PROGRAM NAK"), Some(Reply::Refused));
+        assert_eq!(line.answer("GET NAK"), Some(Reply::Refused));
+        // One word begins the other.
+        assert_eq!(line.answer("PROGRAM_LINE 3"), None);
+        assert_eq!(line.answer("GET PROGRAM_LINE NAK"), None);
+        assert_eq!(Request::Hello { password: "x".into() }.answer("HELLO NAK"), Some(Reply::Refused));
+    }
+
+    #[test]
+    fn nothing_is_sent_that_would_be_two_lines_or_not_plain() {
+        for path in ["/a\r\nset run", "/a\nb", "/\u{e4}", &"x".repeat(5000)] {
+            assert_eq!(Request::Set(Set::Open(path.to_owned())).line(), None, "{path}");
+        }
+        assert!(!format!("{:?}", Set::Enable { password: "SECRET".into() }).contains("SECRET"));
+    }
+
+    #[test]
+    fn a_flood_of_lines_is_no_conversation() {
+        let mut waiting = Waiting::default();
+        waiting.push(Request::Get(Get::Mode), ());
+        let told: Vec<_> = (0..102).map(|_| waiting.place("ERROR what")).collect();
+        assert_eq!((&told[0], &told[101]), (&Place::Aside, &Place::Nonsense));
+        assert!(Lines::default().take(&[b'x'; 5000]).is_none());
+        assert!(Lines::default().take(&[0xff, b'\n']).is_some());
+    }
+}

@@ -1,0 +1,188 @@
+//! What a cell file says of a grinder by LinuxCNC, and the machine that is made of it.
+
+use std::net::IpAddr;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use schemars::JsonSchema;
+use serde::Deserialize;
+
+use super::{LinuxcncGrinder, NoCmm};
+use crate::MachineKind;
+use crate::place::Place;
+use crate::wiring::{Making, MakingError, Wired};
+use regrind_document::Document;
+
+/// LinuxCNC by linuxcncrsh over TCP, for a grinder.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct LinuxcncWire {
+    /// Name or address of the controller.
+    #[schemars(length(min = 1, max = 253), extend("x-required" = true), example = "192.168.0.30")]
+    pub host: String,
+    /// Port of linuxcncrsh.
+    #[schemars(range(min = 1, max = 65535))]
+    pub port: u16,
+    /// Password of `hello` (option -w of linuxcncrsh).
+    #[schemars(length(min = 1, max = 80))]
+    pub connect_password: String,
+    /// Password of `set enable` (option -e of linuxcncrsh), by which a client takes control.
+    #[schemars(length(min = 1, max = 80))]
+    pub control_password: String,
+    /// Folder of programs that the controller sees too; relative to this file.
+    #[schemars(length(min = 1, max = 400), extend("x-required" = true), example = "/mnt/grinder/nc_files/regrind")]
+    pub programs: String,
+    /// The same folder as the controller sees it; left out, as this computer does.
+    #[schemars(length(min = 1, max = 200), example = "/home/cnc/linuxcnc/nc_files/regrind")]
+    pub programs_at_controller: Option<String>,
+    /// Joints that must be homed.
+    #[schemars(range(min = 1, max = 6))]
+    pub joints: u8,
+    /// For the connection, and for the answer to a line; the controller takes 100 ms for an order.
+    #[schemars(range(min = 500, max = 60000))]
+    pub answer_timeout_ms: u32,
+    /// For a mode, a program or a start to show after the order for it was heard.
+    #[schemars(range(min = 100, max = 600000))]
+    pub settle_timeout_ms: u32,
+    /// For what a program wrote of itself to be seen in the folder after it has stopped running.
+    #[schemars(range(min = 10, max = 600000))]
+    pub record_timeout_ms: u32,
+}
+
+impl Default for LinuxcncWire {
+    fn default() -> Self {
+        Self {
+            host: String::new(),
+            port: 5007,
+            connect_password: "EMC".to_owned(),
+            control_password: "EMCTOO".to_owned(),
+            programs: String::new(),
+            programs_at_controller: None,
+            joints: 3,
+            answer_timeout_ms: 2000,
+            settle_timeout_ms: 5000,
+            record_timeout_ms: 2000,
+        }
+    }
+}
+
+/// Everything that has to be known to drive a controller.
+#[derive(Clone, Debug)]
+pub struct LinuxcncSettings {
+    /// Name or address.
+    pub host: String,
+    /// Port of linuxcncrsh.
+    pub port: u16,
+    /// Password of `hello`.
+    pub connect_password: String,
+    /// Password of `set enable`.
+    pub control_password: String,
+    /// The folder of the run, from which programs come.
+    pub run_folder: PathBuf,
+    /// The folder of programs, as this computer sees it.
+    pub programs: PathBuf,
+    /// The folder of programs, as the controller sees it.
+    pub programs_at_controller: String,
+    /// Joints that must be homed.
+    pub joints: usize,
+    /// For an answer.
+    pub answer_within: Duration,
+    /// For what an order leads to.
+    pub settle_within: Duration,
+    /// For a record to be seen after its program has stopped running.
+    pub record_within: Duration,
+    /// What the machine must call itself: its ini file, or the name of its server.
+    pub expected_name: Option<String>,
+}
+
+impl Wired for LinuxcncWire {
+    type Cmm = NoCmm;
+    type Grinder = LinuxcncGrinder;
+    const WORKS_FROM_RUN: bool = true;
+
+    fn check(&self, place: &Place<'_>, document: &mut Document) {
+        if place.table == "cmm" {
+            let allowed = "LinuxCNC is for grinders";
+            return document.report("cmm.wire.kind", "is \"linuxcnc\"", allowed, "name another wire");
+        }
+        if place.simulated == Some(true) {
+            let allowed = "nothing here simulates LinuxCNC";
+            let remedy = "write `simulated = false`, even where the controller has no machine behind it";
+            document.report(&place.key("wire.kind"), "is \"linuxcnc\" in a simulated cell", allowed, remedy);
+        }
+        let host = &self.host;
+        if host.chars().any(|c| c.is_whitespace() || c == '/' || c == '@') {
+            let allowed = "it must be a name or an address alone, such as \"192.168.0.30\"";
+            document.report(&place.key("wire.host"), format!("is {host:?}"), allowed, "the port has a key of its own");
+        }
+        for (key, password) in
+            [("connect_password", &self.connect_password), ("control_password", &self.control_password)]
+        {
+            let plain = password.chars().all(|c| c.is_ascii_graphic()) && !password.eq_ignore_ascii_case("off");
+            if !plain {
+                let allowed = "it is one word of plain ASCII, and not \"off\"";
+                document.report(&place.key(&format!("wire.{key}")), "is no password", allowed, "correct it");
+            }
+        }
+        self.check_folder(place, document);
+    }
+
+    fn notes(&self) -> Vec<String> {
+        let default = Self::default();
+        let here = self.host == "localhost" || self.host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback());
+        let known = self.control_password == default.control_password;
+        let note = "linuxcncrsh has the password that everybody knows, and listens on every address: let only this computer reach its port";
+        (known && !here).then(|| note.to_owned()).into_iter().collect()
+    }
+
+    fn cmm(&self, _: &Making<'_>) -> Result<NoCmm, MakingError> {
+        Err(MakingError::NoDriver { table: "cmm", kind: "linuxcnc" })
+    }
+
+    fn grinder(&self, making: &Making<'_>) -> Result<LinuxcncGrinder, MakingError> {
+        let programs = making.cell_folder.join(&self.programs);
+        let programs = std::path::absolute(&programs).unwrap_or(programs);
+        if !programs.is_dir() {
+            let (key, machine) = ("grinder.wire.programs".to_owned(), MachineKind::Grinder);
+            return Err(MakingError::Folder { key, path: programs, machine });
+        }
+        let ms = |ms: u32| Duration::from_millis(ms.into());
+        let at_controller = self.programs_at_controller.clone();
+        Ok(LinuxcncGrinder::new(LinuxcncSettings {
+            host: self.host.clone(),
+            port: self.port,
+            connect_password: self.connect_password.clone(),
+            control_password: self.control_password.clone(),
+            run_folder: making.run_folder.to_owned(),
+            programs_at_controller: at_controller.unwrap_or_else(|| programs.display().to_string()),
+            programs,
+            joints: self.joints.into(),
+            answer_within: ms(self.answer_timeout_ms),
+            settle_within: ms(self.settle_timeout_ms),
+            record_within: ms(self.record_timeout_ms),
+            expected_name: making.expected_name.map(str::to_owned),
+        }))
+    }
+
+    fn rsh(&self) -> Option<(String, u16)> {
+        Some((self.host.clone(), self.port))
+    }
+}
+
+impl LinuxcncWire {
+    /// The path stands in a line of the protocol and in a comment of the program.
+    fn check_folder(&self, place: &Place<'_>, document: &mut Document) {
+        let (key, folder) = match &self.programs_at_controller {
+            Some(folder) => ("wire.programs_at_controller", folder),
+            None => ("wire.programs", &self.programs),
+        };
+        let plain = |c: char| c.is_ascii_graphic() && !matches!(c, '(' | ')' | ';' | ',' | '%' | '#');
+        if !folder.chars().all(plain) {
+            let allowed = "the controller takes paths of plain ASCII, without blanks, brackets, commas and semicolons";
+            document.report(&place.key(key), format!("is {folder:?}"), allowed, "name another folder");
+        } else if self.programs_at_controller.is_some() && !folder.starts_with('/') {
+            let allowed = "the controller is asked for it by its whole path";
+            document.report(&place.key(key), format!("is {folder:?}"), allowed, "begin it with /");
+        }
+    }
+}

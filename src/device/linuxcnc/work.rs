@@ -1,0 +1,227 @@
+//! Where a job stands, by what is seen of the controller and what its program wrote down. Pure.
+//!
+//! What runs is told by the controller; whether it ran to its end it does not tell, and silence is no proof. The record of the program is.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::controller::{Interpreter, Seen};
+use super::program::{Program, Record};
+use crate::words::{Fault, Job, Outcome, State};
+
+/// A job that was prepared, and all that is known of it.
+#[derive(Clone, Debug)]
+pub(super) struct Work {
+    pub(super) job: Job,
+    /// The number of its start.
+    pub(super) sequence: u32,
+    /// The word by which its record was opened.
+    pub(super) token: u32,
+    /// Its program; none where what was prepared before is not found any more.
+    pub(super) program: Option<Arc<Program>>,
+    /// Its path at the controller.
+    pub(super) path: String,
+    pub(super) stage: Stage,
+    /// How a person would have it end.
+    pub(super) wanted: Option<Outcome>,
+    /// What went wrong since it began, in the controller's words.
+    pub(super) errors: Vec<String>,
+    /// How often the pass has been run through, and the line seen last.
+    pub(super) round: (u32, u32),
+}
+
+/// How far a job is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Stage {
+    /// Checked; START would begin it.
+    Prepared,
+    /// START was given, or may have been.
+    Begun,
+    /// It is over.
+    Ended(State, Outcome),
+}
+
+/// What is to be made of a moment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Verdict {
+    /// It is at this, and may go on.
+    At(State),
+    /// It is over.
+    Ended(State, Outcome, Fault),
+    /// The controller runs something that is none of ours.
+    Foreign(State),
+    /// The controller stands, and nobody has said how it ended.
+    Untold,
+}
+
+impl Work {
+    /// Whether the record is that of this very preparation.
+    pub(super) fn owns(&self, record: Option<Record>) -> Option<Record> {
+        record.filter(|record| record.prepared == Some(self.token))
+    }
+
+    /// Says what a moment means for a job that was begun. `still` is how long the controller has been seen idle; what the program wrote may
+    /// take as long as `settles` to be seen.
+    pub(super) fn judge(&self, seen: &Seen, record: Option<Record>, still: Duration, settles: Duration) -> Verdict {
+        let record = self.owns(record).unwrap_or_default();
+        let is_ours = seen.program.as_deref() == Some(&self.path);
+        let aborts = self.wanted == Some(Outcome::Aborted);
+        match seen.interpreter {
+            // A pause that came when the program had ended holds nothing.
+            Interpreter::Running | Interpreter::Paused if is_ours && record.ended == 0 => match seen.interpreter {
+                _ if aborts => Verdict::At(State::Aborting),
+                _ if self.wanted == Some(Outcome::Stopped) => Verdict::At(State::Stopping),
+                Interpreter::Paused => Verdict::At(State::Held),
+                _ => Verdict::At(State::Execute),
+            },
+            Interpreter::Running if is_ours => Verdict::At(State::Execute),
+            Interpreter::Running => Verdict::Foreign(State::Execute),
+            Interpreter::Paused if !is_ours => Verdict::Foreign(State::Held),
+            _ if record.ended > 0 && aborts => Verdict::Ended(State::Aborted, Outcome::Complete, Fault::None),
+            _ if record.ended > 0 => Verdict::Ended(State::Complete, Outcome::Complete, Fault::None),
+            _ if still < settles && self.wanted.is_none() => Verdict::At(State::Execute),
+            _ if aborts => Verdict::Ended(State::Aborted, Outcome::Aborted, Fault::None),
+            _ if self.wanted.is_some() => Verdict::Ended(State::Complete, Outcome::Stopped, Fault::None),
+            _ if record.begun == 0 => Verdict::Untold,
+            _ if seen.stopped => Verdict::Ended(State::Faulted, Outcome::Failed, Fault::StopCircuit),
+            _ if !seen.on => Verdict::Ended(State::Faulted, Outcome::Failed, Fault::Supplies),
+            _ if !self.errors.is_empty() => Verdict::Ended(State::Faulted, Outcome::Failed, self.fault()),
+            // Somebody has broken it off at the machine.
+            _ => Verdict::Ended(State::Aborted, Outcome::Aborted, Fault::None),
+        }
+    }
+
+    /// Takes in the line that is seen, and says how many thousandths of all rounds are done.
+    pub(super) fn progress(&mut self, line: u32) -> Option<(u32, u32)> {
+        let program = self.program.as_ref()?;
+        let (round, before) = self.round;
+        // A pause may take it a little back; the beginning of the next round is far back.
+        let again = line + program.lines.1 / 2 < before && round + 1 < program.rounds;
+        self.round = (round + u32::from(again), line);
+        Some((1000 * self.round.0 + program.thousandths(line), 1000 * program.rounds))
+    }
+
+    /// What an error says, as far as its words are known.
+    pub(super) fn fault(&self) -> Fault {
+        let words = self.errors.join("\n").to_lowercase();
+        match () {
+            () if words.contains("limit") => Fault::TravelLimit,
+            () if words.contains("following error") || words.contains("amplifier") => Fault::Drive,
+            () => Fault::Other(0),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::protocol::Mode;
+    use super::*;
+
+    fn work() -> Work {
+        Work {
+            job: Job { job: 7, cycle: 2, digest: 3 },
+            sequence: 2,
+            token: 42,
+            program: None,
+            path: "/nc/p.ngc".into(),
+            stage: Stage::Begun,
+            wanted: None,
+            errors: Vec::new(),
+            round: (0, 0),
+        }
+    }
+
+    fn seen(interpreter: Interpreter, program: &str) -> Seen {
+        Seen {
+            ours: true,
+            stopped: false,
+            on: true,
+            mode: Mode::Auto,
+            homed: true,
+            interpreter,
+            program: Some(program.into()),
+            line: 1,
+            at: String::new(),
+            errors: Vec::new(),
+        }
+    }
+
+    fn record(begun: u32, ended: u32) -> Option<Record> {
+        Some(Record { prepared: Some(42), begun, ended })
+    }
+
+    const SETTLES: Duration = Duration::from_secs(2);
+
+    fn judged(work: &Work, seen: &Seen, record: Option<Record>) -> Verdict {
+        work.judge(seen, record, SETTLES, SETTLES)
+    }
+
+    #[test]
+    fn only_what_the_program_wrote_says_that_it_ran_to_its_end() {
+        let (work, idle) = (work(), seen(Interpreter::Idle, "/nc/p.ngc"));
+        let complete = Verdict::Ended(State::Complete, Outcome::Complete, Fault::None);
+        let aborted = Verdict::Ended(State::Aborted, Outcome::Aborted, Fault::None);
+        assert_eq!(judged(&work, &idle, record(1, 1)), complete);
+        assert_eq!(judged(&work, &idle, record(1, 0)), aborted);
+        assert_eq!(judged(&work, &idle, record(0, 0)), Verdict::Untold);
+        assert_eq!(judged(&work, &idle, None), Verdict::Untold);
+        // Another preparation's.
+        assert_eq!(judged(&work, &idle, Some(Record { prepared: Some(41), begun: 1, ended: 1 })), Verdict::Untold);
+        // What it wrote may be seen late.
+        assert_eq!(work.judge(&idle, record(1, 0), SETTLES / 2, SETTLES), Verdict::At(State::Execute));
+    }
+
+    #[test]
+    fn what_broke_a_program_off_is_told() {
+        let mut work = work();
+        let idle = seen(Interpreter::Idle, "/nc/p.ngc");
+        let failed = |fault| Verdict::Ended(State::Faulted, Outcome::Failed, fault);
+        assert_eq!(
+            judged(&work, &Seen { stopped: true, on: false, ..idle.clone() }, record(1, 0)),
+            failed(Fault::StopCircuit)
+        );
+        assert_eq!(judged(&work, &Seen { on: false, ..idle.clone() }, record(1, 0)), failed(Fault::Supplies));
+        for (error, fault) in [
+            ("Linear move on line 7 would exceed X's positive limit", Fault::TravelLimit),
+            ("joint 0 following error", Fault::Drive),
+            ("Unclosed comment found", Fault::Other(0)),
+        ] {
+            work.errors = vec![error.into()];
+            assert_eq!(judged(&work, &idle, record(1, 0)), failed(fault), "{error}");
+        }
+    }
+
+    #[test]
+    fn what_is_asked_for_ends_as_it_was_asked() {
+        let (running, idle) = (seen(Interpreter::Running, "/nc/p.ngc"), seen(Interpreter::Idle, "/nc/p.ngc"));
+        for (wanted, on_the_way, state) in
+            [(Outcome::Aborted, State::Aborting, State::Aborted), (Outcome::Stopped, State::Stopping, State::Complete)]
+        {
+            let work = Work { wanted: Some(wanted), ..work() };
+            assert_eq!(judged(&work, &running, record(1, 0)), Verdict::At(on_the_way));
+            assert_eq!(judged(&work, &idle, record(1, 0)), Verdict::Ended(state, wanted, Fault::None));
+            // It was quicker.
+            assert_eq!(judged(&work, &idle, record(1, 1)), Verdict::Ended(state, Outcome::Complete, Fault::None));
+        }
+    }
+
+    #[test]
+    fn a_program_of_somebody_else_is_none_of_ours() {
+        let work = work();
+        let of = |interpreter| judged(&work, &seen(interpreter, "/nc/other.ngc"), record(0, 0));
+        assert_eq!(of(Interpreter::Running), Verdict::Foreign(State::Execute));
+        assert_eq!(of(Interpreter::Paused), Verdict::Foreign(State::Held));
+        let paused = seen(Interpreter::Paused, "/nc/p.ngc");
+        assert_eq!(judged(&work, &paused, record(1, 0)), Verdict::At(State::Held));
+    }
+
+    #[test]
+    fn rounds_are_counted_by_the_line_that_falls_back() {
+        let mut work = work();
+        let (name, text) = ("p".to_owned(), Vec::new());
+        let program = Program { name, cycle: 1, text, lines: (6, 100), rounds: 2, map: [0; 32] };
+        work.program = Some(Arc::new(program));
+        let told: Vec<_> = [0, 6, 56, 50, 106, 6, 56, 106, 20].map(|line| work.progress(line).unwrap().0).into();
+        assert_eq!(told, [0, 0, 500, 440, 1000, 1000, 1500, 2000, 1140]);
+    }
+}
