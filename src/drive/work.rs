@@ -315,6 +315,10 @@ fn registered(
     }
     figures.touch_on =
         next.as_ref().map(|(next, why)| Box::new(TouchOn { targets: next.len() as u32, why: (*why).to_owned() }));
+    if next.is_some() && form.is_err() {
+        // The first few touches have six motions taken off: what is left says nothing of a form, however it is called.
+        figures.form = None;
+    }
     let next = next.map(|(next, _)| next);
     let field = next.is_none().then(|| field_alone(&found, &given, form.as_ref().ok(), !looked_at)).flatten();
     Ok(Registered { registration: found, form: form.ok(), field, error, known, figures, next })
