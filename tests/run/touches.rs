@@ -131,8 +131,7 @@ fn people_are_told_after_every_batch_what_is_known_and_why_more_is_touched() {
     });
     let figures: Vec<_> = figures.collect();
     // Of ten touches with six motions taken off nothing is said of a form.
-    let forms: Vec<_> =
-        figures.iter().map(|figures| (figures.points, figures.form.clone().map(|form| form.rms))).collect();
+    let forms: Vec<_> = figures.iter().map(|figures| (figures.points, figures.form.map(|form| form.rms))).collect();
     assert!(forms.iter().all(|(points, form)| form.is_some() == (*points > 10)), "{forms:?}");
     let on: Vec<_> =
         figures.iter().map(|figures| (figures.points, figures.touch_on.clone().map(|on| on.targets))).collect();
