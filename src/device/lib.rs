@@ -29,6 +29,7 @@ pub mod linuxcnc;
 mod machine;
 mod manual;
 mod modbus;
+mod no_machine;
 mod payload;
 mod place;
 mod table;
@@ -37,8 +38,8 @@ mod words;
 
 use error::Answered;
 pub use error::DeviceError;
-pub use ippdme::{IppdmeCmm, IppdmeSettings, IppdmeWire, NoGrinder};
-pub use linuxcnc::{LinuxcncGrinder, LinuxcncSettings, LinuxcncWire, NoCmm};
+pub use ippdme::{IppdmeCmm, IppdmeSettings, IppdmeWire};
+pub use linuxcnc::{LinuxcncGrinder, LinuxcncSettings, LinuxcncWire};
 pub use machine::{Cmm, Grinder, Interrupt, Machine};
 pub use manual::{ManualMachine, ManualSettings, ManualWire};
 #[cfg(fuzzing)]

@@ -386,9 +386,14 @@ fn figures(
     let pv_robust_mm = pv_of_most(used(found).map(|d| d.deviation_mm));
     // Of two extreme points, each uncertain by the scatter; k = 2.
     let pv_expanded_mm = 2.0 * 2f64.sqrt() * scatter_mm;
+    // No peak is below its valley.
+    let pv_about = |mm| {
+        let of = Interval::about(mm, pv_expanded_mm);
+        Interval { low_mm: of.low_mm.max(0.0), ..of }
+    };
     let by_points = FormFigures {
-        pv: Interval::about(verdict.pv_mm, pv_expanded_mm),
-        pv_robust: Interval::about(pv_robust_mm.unwrap_or(verdict.pv_mm), pv_expanded_mm),
+        pv: pv_about(verdict.pv_mm),
+        pv_robust: pv_about(pv_robust_mm.unwrap_or(verdict.pv_mm)),
         rms: rms_without(scatter_mm, verdict),
         scatter_mm,
     };

@@ -27,6 +27,10 @@ pub enum ModelError {
         "the standard uncertainty of the {what} is {value} (mm, rad or a share); it must be 0 at least and what a measuring machine can have: correct what is stated of the machine"
     )]
     Stated { what: &'static str, value: f64 },
+    #[error(
+        "the {what} is expected to be {median} by a factor of {factor}; the one must be finite and above 0, the other finite and above 1: nothing is known for certain beforehand"
+    )]
+    Expected { what: &'static str, median: f64, factor: f64 },
     #[error("the drift is {value}; it must be 0 at least and below 1")]
     Drift { value: f64 },
     #[error(

@@ -66,6 +66,16 @@ impl Priors {
         Self { range_mm: [size_mm / 3.0, EVERY[0]], scatter_ratio: [0.05, EVERY[1]] }
     }
 
+    /// Says what makes these no expectations.
+    pub(super) fn check(&self) -> Result<(), ModelError> {
+        for (what, [median, factor]) in [("range", self.range_mm), ("ratio of scatter to field", self.scatter_ratio)] {
+            if !(median.is_finite() && median > 0.0 && factor.is_finite() && factor > 1.0) {
+                return Err(ModelError::Expected { what, median, factor });
+            }
+        }
+        Ok(())
+    }
+
     /// One part of a few is like none before, and differs from what is expected as much as parts of which nothing is known (Schmidli and others
     /// 2014). Beyond one factor either falls as slowly as it does there (Huber 1964).
     pub(super) fn log_density(&self, range_mm: f64, ratio: f64) -> f64 {
@@ -99,6 +109,7 @@ impl Hyper {
     /// The same, with what else it might be, of fields of some smoothness.
     pub(super) fn told(observed: &Observed, priors: &Priors, smoothness: &[Smoothness]) -> Result<Told, ModelError> {
         observed.check()?;
+        priors.check()?;
         let search = Search::of(observed, priors);
         let rough = Shape::default();
         let mut tops = search.tops(rough, &RATIOS);
@@ -541,6 +552,21 @@ mod tests {
         let [near, far] = [0.5 - 25f64.ln() / 2f64.ln(), 0.5 - 25f64.ln() / 6f64.ln()];
         assert!((at - (like + unlike).ln()).abs() < 1e-12, "{at}");
         assert!((off - (like * near.exp() + unlike * far.exp()).ln()).abs() < 1e-12, "{off}");
+    }
+
+    #[test]
+    fn what_cannot_be_expected_is_refused_in_words() {
+        let good = Priors::of_size(102.0);
+        let observed = drawn(Hyper { field: Field::new(5e-3, 30.0), scatter_mm: 3e-4, drift: 0.0 }, 1);
+        for (bad, words) in [
+            (Priors { range_mm: [8.0, 1.0], ..good }, "the range is expected to be 8 by a factor of 1;"),
+            (Priors { range_mm: [0.0, 2.0], ..good }, "the range is expected to be 0 by a factor of 2;"),
+            (Priors { scatter_ratio: [f64::NAN, 2.0], ..good }, "the ratio of scatter to field is expected to be NaN"),
+            (Priors { scatter_ratio: [0.1, f64::INFINITY], ..good }, "by a factor of inf;"),
+        ] {
+            let error = Hyper::of(&observed, &bad).unwrap_err().to_string();
+            assert!(error.contains(words), "{error}");
+        }
     }
 
     #[test]

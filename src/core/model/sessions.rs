@@ -116,6 +116,7 @@ impl Sessions {
     /// # Errors
     /// Fewer than two sessions, and those of [`Dense::fit`].
     pub fn between(&self, priors: &Priors) -> Result<Between, ModelError> {
+        priors.check()?;
         let mut numbers = self.of.clone();
         numbers.sort_unstable();
         numbers.dedup();

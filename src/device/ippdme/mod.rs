@@ -5,7 +5,7 @@
 //!  session                            one command after another, and the abort that waits for none
 //!  route                              the way over the targets, held against the volume before the first motion
 //!  work                               a job, carried out by the task that owns the session
-//!  machine, settings, no_grinder      what the cell sees of it, and what its file says
+//!  machine, settings                  what the cell sees of it, and what its file says
 //! ```
 //!
 //! docs/ippdme.md is the page for the shop.
@@ -13,7 +13,6 @@
 mod command;
 mod grammar;
 mod machine;
-mod no_grinder;
 mod response;
 mod route;
 mod session;
@@ -23,7 +22,6 @@ mod work;
 
 pub use command::{Command, LONGEST_LINE};
 pub use machine::IppdmeCmm;
-pub use no_grinder::NoGrinder;
 pub use response::{Response, Said, ServerError, value, values};
 pub use session::Limits;
 pub use settings::{IppdmeSettings, IppdmeWire};

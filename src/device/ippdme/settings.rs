@@ -7,8 +7,9 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
+use super::IppdmeCmm;
 use super::session::Limits;
-use super::{IppdmeCmm, NoGrinder};
+use crate::no_machine::NoMachine;
 use crate::place::Place;
 use crate::wiring::{Making, MakingError, Wired};
 use regrind_document::Document;
@@ -112,7 +113,7 @@ impl IppdmeSettings {
 
 impl Wired for IppdmeWire {
     type Cmm = IppdmeCmm;
-    type Grinder = NoGrinder;
+    type Grinder = NoMachine;
 
     fn check(&self, place: &Place<'_>, document: &mut Document) {
         if place.table == "grinder" {
@@ -162,7 +163,7 @@ impl Wired for IppdmeWire {
         }))
     }
 
-    fn grinder(&self, _: &Making<'_>) -> Result<NoGrinder, MakingError> {
+    fn grinder(&self, _: &Making<'_>) -> Result<NoMachine, MakingError> {
         Err(MakingError::NoDriver { table: "grinder", kind: "ippdme" })
     }
 

@@ -6,7 +6,7 @@
 //!  link, controller  the connection, and the conversation over it
 //!  folder            the folder that both see
 //!  work              where the job stands, by what is seen and what is written down
-//!  machine, settings, no_cmm   what the cell sees of it, and what its file says
+//!  machine, settings           what the cell sees of it, and what its file says
 //! ```
 //!
 //! The driver moves nothing but by a program: it neither homes nor jogs, switches no drive on and takes no stop back. docs/linuxcnc.md is
@@ -16,14 +16,12 @@ mod controller;
 mod folder;
 mod link;
 mod machine;
-mod no_cmm;
 mod program;
 mod protocol;
 mod settings;
 mod work;
 
 pub use machine::LinuxcncGrinder;
-pub use no_cmm::NoCmm;
 pub use program::{Order, Program, Record};
 pub use protocol::{Get, Lines, Mode, Place, Reply, Request, Set, Waiting};
 pub use settings::{LinuxcncSettings, LinuxcncWire};

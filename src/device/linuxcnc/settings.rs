@@ -7,8 +7,9 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use super::{LinuxcncGrinder, NoCmm};
+use super::LinuxcncGrinder;
 use crate::MachineKind;
+use crate::no_machine::NoMachine;
 use crate::place::Place;
 use crate::wiring::{Making, MakingError, Wired};
 use regrind_document::Document;
@@ -96,7 +97,7 @@ pub struct LinuxcncSettings {
 }
 
 impl Wired for LinuxcncWire {
-    type Cmm = NoCmm;
+    type Cmm = NoMachine;
     type Grinder = LinuxcncGrinder;
     const WORKS_FROM_RUN: bool = true;
 
@@ -135,7 +136,7 @@ impl Wired for LinuxcncWire {
         (known && !here).then(|| note.to_owned()).into_iter().collect()
     }
 
-    fn cmm(&self, _: &Making<'_>) -> Result<NoCmm, MakingError> {
+    fn cmm(&self, _: &Making<'_>) -> Result<NoMachine, MakingError> {
         Err(MakingError::NoDriver { table: "cmm", kind: "linuxcnc" })
     }
 

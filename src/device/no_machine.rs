@@ -1,15 +1,15 @@
-//! The measuring machine that there is none of: LinuxCNC is for grinders.
+//! The machine that there is none of: some wires are for measuring machines only, others for grinders only.
 
-use crate::error::Answered;
-use crate::machine::{Cmm, Interrupt, Machine};
-use crate::payload::{Measurement, Plan};
-use crate::words::{Armed, Identity, Job, Reconciled, Started, Status};
+use super::error::Answered;
+use super::machine::{Cmm, Grinder, Interrupt, Machine};
+use super::payload::{CorrectionMap, Measurement, Pass, PassRecord, Plan};
+use super::words::{Armed, Identity, Job, Reconciled, Started, Status};
 
-/// No measuring machine can be had by LinuxCNC; this is the type of what cannot be.
+/// The type of a machine that cannot be had by a wire: there is no value of it.
 #[derive(Debug)]
-pub enum NoCmm {}
+pub enum NoMachine {}
 
-impl Machine for NoCmm {
+impl Machine for NoMachine {
     fn name(&self) -> &str {
         match *self {}
     }
@@ -54,7 +54,16 @@ impl Machine for NoCmm {
     }
 }
 
-impl Cmm for NoCmm {
+impl Grinder for NoMachine {
+    async fn load_pass(&mut self, _: &CorrectionMap, _: &Pass, _: &Interrupt) -> Answered<()> {
+        match *self {}
+    }
+    async fn collect(&mut self, _: Job, _: &Interrupt) -> Answered<PassRecord> {
+        match *self {}
+    }
+}
+
+impl Cmm for NoMachine {
     async fn load_plan(&mut self, _: &Plan, _: &Interrupt) -> Answered<()> {
         match *self {}
     }
