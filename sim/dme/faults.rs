@@ -30,6 +30,12 @@ pub enum Fault {
     Severity(u8),
     /// The stop circuit opens when it comes.
     EmergencyStop,
+    /// The connection ends in the middle of a scan.
+    CutInScan,
+    /// A point of a scan is not said.
+    PointLost,
+    /// A point of a scan is said in the place of the one before it, and none is said for its last target.
+    PointsShifted,
 }
 
 #[derive(Debug)]

@@ -88,6 +88,8 @@ pub enum Argument {
     Text(String),
     /// A name, and the numbers in its parentheses where it has any.
     Name(String, Option<Vec<f64>>),
+    /// A name with other names in its parentheses, such as the format of a curve.
+    Names(String, Vec<String>),
 }
 
 /// A command.
@@ -177,6 +179,10 @@ fn argument(text: &str) -> Result<Argument, u16> {
     }
     let Some((name, rest)) = text.split_once('(') else { return Ok(Argument::Name(text.to_owned(), None)) };
     let inside = rest.strip_suffix(')').ok_or(502u16)?;
+    if inside.starts_with(|c: char| c.is_ascii_alphabetic()) {
+        let names = inside.split(',').map(|name| name.trim().to_owned()).collect();
+        return Ok(Argument::Names(name.trim_end().to_owned(), names));
+    }
     let numbers = inside.split(',').filter(|_| !inside.trim().is_empty()).map(|n| number(n.trim()));
     Ok(Argument::Name(name.trim_end().to_owned(), Some(numbers.collect::<Result<_, _>>()?)))
 }

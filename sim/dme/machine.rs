@@ -1,5 +1,7 @@
 //! The machine behind the server: tools, frames, parameters within their limits, motion within the volume, and touches of the true part.
 
+use std::collections::VecDeque;
+
 use super::line::{Argument, Command, Error};
 use crate::Vec3;
 use crate::cmm::{Led, Touch};
@@ -40,21 +42,30 @@ pub struct Done {
     pub data: Vec<Vec<String>>,
     /// What stops nothing.
     pub warnings: Vec<Error>,
+    /// Lines that are said while it moves.
+    pub(super) scanned: VecDeque<super::scan::Scanned>,
 }
 
 impl Done {
-    fn told(fields: Vec<String>) -> Self {
+    pub(super) fn told(fields: Vec<String>) -> Self {
         Self { data: vec![fields], ..Self::default() }
     }
 }
 
-/// Parameters of a tool: speed of travel, then speed, approach, search and retract of a touch.
-const PARAMETERS: [&str; 5] =
-    ["GoToPar.Speed", "PtMeasPar.Speed", "PtMeasPar.Approach", "PtMeasPar.Search", "PtMeasPar.Retract"];
+/// Parameters of a tool: speed of travel, then speed, approach, search and retract of a touch, then speed and retract of a scan.
+const PARAMETERS: [&str; 7] = [
+    "GoToPar.Speed",
+    "PtMeasPar.Speed",
+    "PtMeasPar.Approach",
+    "PtMeasPar.Search",
+    "PtMeasPar.Retract",
+    "ScanPar.Speed",
+    "ScanPar.Retract",
+];
 
 /// A frame: rows of the rotation that takes the machine's frame to it, and where the machine's origin is in it.
 #[derive(Clone, Copy, Debug)]
-struct Frame {
+pub(super) struct Frame {
     rows: [Vec3; 3],
     origin: Vec3,
     written: [f64; 6],
@@ -81,16 +92,16 @@ impl Frame {
         self.rows.map(|row| (0..3).map(|k| row[k] * v[k]).sum())
     }
 
-    fn turned_back(&self, v: Vec3) -> Vec3 {
+    pub(super) fn turned_back(&self, v: Vec3) -> Vec3 {
         std::array::from_fn(|k| (0..3).map(|i| self.rows[i][k] * v[i]).sum())
     }
 
-    fn of_machine(&self, at: Vec3) -> Vec3 {
+    pub(super) fn of_machine(&self, at: Vec3) -> Vec3 {
         let turned = self.turned(at);
         std::array::from_fn(|k| turned[k] + self.origin[k])
     }
 
-    fn to_machine(self, at: Vec3) -> Vec3 {
+    pub(super) fn to_machine(self, at: Vec3) -> Vec3 {
         self.turned_back(std::array::from_fn(|k| at[k] - self.origin[k]))
     }
 }
@@ -102,18 +113,22 @@ fn times(a: [Vec3; 3], b: [Vec3; 3]) -> [Vec3; 3] {
 /// The machine.
 pub struct Machine {
     options: Options,
-    probe: Led,
+    pub(super) probe: Led,
     homed: bool,
     tool: String,
-    parameters: [f64; 5],
+    pub(super) parameters: [f64; 7],
     part_frame: Frame,
     in_part_frame: bool,
     report: Vec<String>,
+    pub(super) scan_report: Vec<String>,
+    pub(super) at_nominals: bool,
+    pub(super) scans: bool,
+    pub(super) contacts: u32,
+    pub(super) touched_mm: Option<f64>,
     /// Where the probe's centre is, in the machine's frame, and where it goes.
     at_mm: Vec3,
     to_mm: Vec3,
     joystick: bool,
-    touched_mm: Option<f64>,
 }
 
 impl Machine {
@@ -126,14 +141,18 @@ impl Machine {
             options,
             probe,
             tool: "NoTool".into(),
-            parameters: [50.0, 5.0, 5.0, 5.0, 5.0],
+            parameters: [50.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0],
             part_frame: Frame::MACHINE,
             in_part_frame: false,
             report: Vec::new(),
+            scan_report: Vec::new(),
+            at_nominals: false,
+            scans: true,
+            contacts: 0,
+            touched_mm: None,
             at_mm,
             to_mm: at_mm,
             joystick: true,
-            touched_mm: None,
         }
     }
 
@@ -142,8 +161,20 @@ impl Machine {
         self.at_mm
     }
 
+    /// Its probe can touch, and not scan.
+    pub fn touches_only(&mut self) {
+        self.scans = false;
+    }
+
+    /// How often the probe came to the part: touches and scans.
+    pub fn contacts(&self) -> u32 {
+        self.contacts
+    }
+
     pub(super) fn begin_session(&mut self) {
         self.report = ["X", "Y", "Z"].map(str::to_owned).to_vec();
+        self.scan_report = ["X", "Y", "Z", "Q"].map(str::to_owned).to_vec();
+        self.at_nominals = false;
     }
 
     /// Errors are forgotten: the probe may touch again.
@@ -152,6 +183,11 @@ impl Machine {
     /// The motion of the command has come to its end.
     pub(super) fn arrive(&mut self) {
         self.stop_short(1.0);
+    }
+
+    /// The probe has come so far in contact.
+    pub(super) fn is_at(&mut self, at_mm: Vec3) {
+        self.at_mm = at_mm;
     }
 
     /// The motion ends after this share of its way.
@@ -170,7 +206,7 @@ impl Machine {
         let no = |number| Error::new(number, &command.name);
         let arguments = &command.arguments[..];
         let text = |text: String| Ok(Done::told(vec![text]));
-        let moves = matches!(command.name.as_str(), "GoTo" | "PtMeas" | "ChangeTool" | "Home");
+        let moves = matches!(command.name.as_str(), "GoTo" | "PtMeas" | "ScanOnCurve" | "ChangeTool" | "Home");
         self.joystick &= !moves;
         match (command.name.as_str(), arguments) {
             ("GetDMEVersion", []) => text(format!("DMEVersion(\"{}\")", self.options.version)),
@@ -192,7 +228,7 @@ impl Machine {
                 self.homed = true;
                 Ok(self.moves_to(corner))
             }
-            ("GoTo" | "PtMeas" | "ChangeTool", _) if !self.homed => Err(no(508)),
+            ("GoTo" | "PtMeas" | "ScanOnCurve" | "ChangeTool", _) if !self.homed => Err(no(508)),
             ("ChangeTool", [Argument::Text(name)]) => {
                 let known = self.options.tools.iter().any(|(tool, _)| tool == name);
                 if !known {
@@ -235,6 +271,20 @@ impl Machine {
                 self.report = names.ok_or_else(|| no(502))?;
                 Ok(Done::default())
             }
+            ("OnScanReport", fields) => {
+                let names: Option<Vec<String>> = fields.iter().map(asked).collect();
+                let known = ["X", "Y", "Z", "Q"];
+                let names = names.filter(|names| names.iter().all(|name| known.contains(&name.as_str())));
+                self.scan_report = names.ok_or_else(|| no(502))?;
+                Ok(Done::default())
+            }
+            ("ScanOnCurveHint", [Argument::Number(_), Argument::Number(_)]) => Ok(Done::default()),
+            ("ScanOnCurveDensity", fields) => {
+                let nominals = Argument::Name("AtNominals".into(), Some(vec![1.0]));
+                self.at_nominals = fields.contains(&nominals);
+                Ok(Done::default())
+            }
+            ("ScanOnCurve", [closed, format, data]) => self.scan(closed, format, data).map_err(no),
             ("Get", fields) => {
                 let at = self.frame().of_machine(self.at_mm);
                 let told = fields.iter().map(|field| {
@@ -254,7 +304,7 @@ impl Machine {
         }
     }
 
-    fn frame(&self) -> Frame {
+    pub(super) fn frame(&self) -> Frame {
         if self.in_part_frame { self.part_frame } else { Frame::MACHINE }
     }
 
@@ -274,13 +324,13 @@ impl Machine {
         Some(self.frame().to_machine(at))
     }
 
-    fn is_within(&self, at: Vec3) -> Result<(), u16> {
+    pub(super) fn is_within(&self, at: Vec3) -> Result<(), u16> {
         let [least, most] = self.probe.volume_mm();
         let within = (0..3).all(|k| (least[k] - 1e-9..=most[k] + 1e-9).contains(&at[k]));
         if within { Ok(()) } else { Err(1008) }
     }
 
-    fn moves_to(&mut self, to_mm: Vec3) -> Done {
+    pub(super) fn moves_to(&mut self, to_mm: Vec3) -> Done {
         let way_mm = (0..3).map(|k| (to_mm[k] - self.at_mm[k]).powi(2)).sum::<f64>().sqrt();
         self.to_mm = to_mm;
         let speed = self.parameters[0].min(self.probe.travel_mm_s());
@@ -301,11 +351,12 @@ impl Machine {
         }
         let normal = direction.map(|c| c / length);
         let radius_mm = self.radius().ok_or(508u16)?;
-        let [_, _, approach_mm, search_mm, retract_mm] = self.parameters;
+        let [_, _, approach_mm, search_mm, retract_mm, ..] = self.parameters;
         let on_way = |mm: f64| -> Vec3 { std::array::from_fn(|k| point_mm[k] + mm * normal[k]) };
         self.is_within(on_way(approach_mm + radius_mm))?;
         self.is_within(on_way(radius_mm - search_mm))?;
         let moved = self.moves_to(on_way(approach_mm + radius_mm)).seconds;
+        self.contacts += 1;
         self.touched_mm = Some(point_mm[2]);
         let seconds = moved + self.probe.seconds_per_point();
         match self.probe.touch(point_mm, normal, [radius_mm, approach_mm, search_mm]) {
@@ -344,7 +395,7 @@ impl Machine {
         self.report.iter().map(field).collect()
     }
 
-    fn radius(&self) -> Option<f64> {
+    pub(super) fn radius(&self) -> Option<f64> {
         let tool = self.options.tools.iter().find(|(name, _)| *name == self.tool);
         tool.map(|(_, radius)| *radius).filter(|radius| *radius > 0.0)
     }
@@ -372,7 +423,7 @@ impl Machine {
             let k = PARAMETERS.iter().position(|known| name.strip_prefix("Tool.") == Some(*known)).ok_or(510u16)?;
             let [value] = numbers[..] else { return Err(502) };
             let most = self.options.fastest_mm_s.get(k).copied().unwrap_or(100.0);
-            let least = if k == 4 { -1.0 } else { 1e-3 };
+            let least = if k == 4 || k == 6 { -1.0 } else { 1e-3 };
             let kept = value.clamp(least, most);
             if kept != value {
                 warnings.push(Error::new(504, cause));

@@ -3,6 +3,7 @@
 //! ```text
 //!  line     commands as they come, by a reader of its own
 //!  machine  what the machine is and does: tools, frames, motion, touches
+//!  scan     curves that are passed over in contact
 //!  faults   what goes wrong, at which command
 //! ```
 //!
@@ -12,6 +13,7 @@
 pub mod faults;
 pub mod line;
 pub mod machine;
+mod scan;
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -42,6 +44,16 @@ struct Running {
     done: Result<Done, Error>,
 }
 
+impl Running {
+    /// When something comes of it next: a line of a scan, or its end.
+    fn next(&self, speed: f64) -> Duration {
+        let line = self.done.as_ref().ok().and_then(|done| done.scanned.front());
+        line.map_or(self.ends, |line| {
+            self.began + Duration::try_from_secs_f64(line.seconds / speed).unwrap_or_default()
+        })
+    }
+}
+
 /// A server, between its client and its machine.
 pub struct Server {
     machine: Machine,
@@ -70,6 +82,11 @@ impl Server {
         }
     }
 
+    /// So many seconds of the machine's time pass in a real one from the next command on.
+    pub fn set_speed(&mut self, speed: f64) {
+        self.speed = speed;
+    }
+
     /// Looks at the machine, or changes it.
     pub fn machine(&mut self) -> &mut Machine {
         &mut self.machine
@@ -86,7 +103,7 @@ impl Server {
 
     /// When something is to be done next without a line having come.
     pub fn due(&self) -> Option<Duration> {
-        let running = self.running.as_ref().map(|running| running.ends);
+        let running = self.running.as_ref().map(|running| running.next(self.speed));
         running.into_iter().chain(self.out.front().map(|out| out.at)).min()
     }
 
@@ -99,7 +116,10 @@ impl Server {
 
     /// Lets time pass and returns what is to be sent now.
     pub fn tick(&mut self, now: Duration) -> Vec<Outgoing> {
-        while self.running.as_ref().is_some_and(|running| running.ends <= now) {
+        while self.running.as_ref().is_some_and(|running| running.next(self.speed) <= now) {
+            if self.say_scanned() {
+                continue;
+            }
             self.finish();
             self.begin_next(now);
         }
@@ -201,6 +221,22 @@ impl Server {
         Ok(Done::default())
     }
 
+    /// Says the next line of a scan; false where there is none.
+    fn say_scanned(&mut self) -> bool {
+        let Some(running) = &mut self.running else { return false };
+        let at = running.next(self.speed);
+        let Some(line) = running.done.as_mut().ok().and_then(|done| done.scanned.pop_front()) else { return false };
+        let (tag, fault) = (running.tag, running.command.fault.clone());
+        let cut = fault == Some(Fault::CutInScan);
+        if cut {
+            running.command.fault = None;
+        }
+        self.machine.is_at(line.at_mm);
+        self.say_data(tag, &scan::spoilt(line, fault.as_ref()), fault.as_ref(), at);
+        self.out.back_mut().into_iter().for_each(|out| out.closes = cut);
+        true
+    }
+
     fn finish(&mut self) {
         let Some(Running { tag, command, ends, done, .. }) = self.running.take() else { return };
         let fault = command.fault.clone();
@@ -236,7 +272,7 @@ impl Server {
         let mut fields = data.to_vec();
         match fault {
             Some(Fault::Reordered) => fields.reverse(),
-            Some(Fault::UnaskedQuality) => fields.insert(0, "Q(0)".to_owned()),
+            Some(Fault::UnaskedQuality) if data[0].contains('(') => fields.insert(0, "Q(0)".to_owned()),
             _ => {}
         }
         let text = format!("{tag} # {}", fields.join(", "));

@@ -38,7 +38,7 @@ mod words;
 
 use error::Answered;
 pub use error::DeviceError;
-pub use ippdme::{IppdmeCmm, IppdmeSettings, IppdmeWire};
+pub use ippdme::{IppdmeCmm, IppdmeSettings, IppdmeWire, Scanning};
 pub use linuxcnc::{LinuxcncGrinder, LinuxcncSettings, LinuxcncWire};
 pub use machine::{Cmm, Grinder, Interrupt, Machine};
 pub use manual::{ManualMachine, ManualSettings, ManualWire};

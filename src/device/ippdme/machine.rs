@@ -78,7 +78,7 @@ impl IppdmeCmm {
             wish: self.wish.subscribe(),
             settings: Arc::clone(&self.settings),
             at_mm: None,
-            speeds_mm_s: [0.0; 2],
+            speeds_mm_s: [0.0; 3],
         };
         {
             let mut shared = locked(&self.shared);
@@ -426,9 +426,10 @@ impl Cmm for IppdmeCmm {
     async fn load_plan(&mut self, plan: &Plan, _: &Interrupt) -> Answered<()> {
         self.loaded = None;
         let (owned, volume_mm, machine) = (plan.clone(), self.settings.volume_mm, Arc::clone(&self.name));
+        let scan = self.settings.scan;
         // The order of many targets takes its while.
         let found = tokio::task::spawn_blocking(move || {
-            Route::over(&owned, &volume_mm, &machine).map(|route| Work { plan: owned, route })
+            Route::over(&owned, scan, &volume_mm, &machine).map(|route| Work { plan: owned, route })
         });
         let work = found.await.unwrap_or_else(|panicked| std::panic::resume_unwind(panicked.into_panic()))?;
         self.loaded = Some((Arc::new(work), digest(&[plan.identity()])));

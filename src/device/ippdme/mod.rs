@@ -4,7 +4,7 @@
 //!  text, command, grammar, response   the lines, without any wire
 //!  session                            one command after another, and the abort that waits for none
 //!  route                              the way over the targets, held against the volume before the first motion
-//!  work                               a job, carried out by the task that owns the session
+//!  work, scan                         a job, carried out by the task that owns the session: touches, and rows that are scanned
 //!  machine, settings                  what the cell sees of it, and what its file says
 //! ```
 //!
@@ -15,6 +15,7 @@ mod grammar;
 mod machine;
 mod response;
 mod route;
+mod scan;
 mod session;
 mod settings;
 mod text;
@@ -24,7 +25,7 @@ pub use command::{Command, LONGEST_LINE};
 pub use machine::IppdmeCmm;
 pub use response::{Response, Said, ServerError, value, values};
 pub use session::Limits;
-pub use settings::{IppdmeSettings, IppdmeWire};
+pub use settings::{IppdmeSettings, IppdmeWire, Scanning};
 pub use text::{Flaw, Item, Tag, number};
 
 /// The name of a command, for messages that keep no strings.

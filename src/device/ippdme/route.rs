@@ -4,19 +4,35 @@
 use std::ops::Range;
 use std::sync::Arc;
 
+use super::settings::Scanning;
 use crate::error::DeviceError;
-use crate::payload::{Plan, Target};
+use crate::payload::{Plan, Target, TargetKind};
 
 /// More targets than this are touched in the order of the plan: their order would take longer to find than it saves.
 const MOST_ORDERED: usize = 6000;
 /// A normal that points further down than this cannot be come at from above.
 const LEAST_UP: f64 = -0.2;
+/// Targets of one scan: its line stays within what servers read.
+const MOST_SCANNED: usize = 400;
+/// A scan is carried out whole, so a hold waits for it.
+const LONGEST_SCAN_S: f64 = 30.0;
+/// Fewer targets than this in a row are touched.
+const LEAST_SCANNED: usize = 4;
+/// A curve that turns by more than this from step to step is two; the cosine of 45 degrees.
+const LEAST_AHEAD: f64 = 0.707;
+
+/// What is done between two rises to the clearance: places in the plan.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Leg {
+    Touch(usize),
+    Scan(Range<usize>),
+}
 
 /// The way over the targets of a plan.
 #[derive(Clone, Debug)]
 pub(super) struct Route {
-    /// Which target is touched when: places in the plan.
-    pub(super) order: Vec<usize>,
+    /// What is touched and scanned, one after another.
+    pub(super) legs: Vec<Leg>,
     /// The height at which the probe's centre travels.
     pub(super) clearance_mm: f64,
     /// How long the way is across, in this order and in that of the plan.
@@ -25,21 +41,77 @@ pub(super) struct Route {
 }
 
 impl Route {
-    /// Finds the way.
+    /// Finds the way; with a step, rows of targets that lie no farther apart are scanned.
     ///
     /// # Errors
     /// A target that cannot be come at from above, or a position outside of the volume.
-    pub(super) fn over(plan: &Plan, volume_mm: &[[f64; 3]; 2], machine: &Arc<str>) -> Result<Self, DeviceError> {
+    pub(super) fn over(
+        plan: &Plan,
+        scan: Option<Scanning>,
+        volume_mm: &[[f64; 3]; 2],
+        machine: &Arc<str>,
+    ) -> Result<Self, DeviceError> {
         let highest = plan.targets.iter().map(|target| target.point_mm[2]).fold(f64::NEG_INFINITY, f64::max);
         let clearance_mm = highest + plan.safe_height_mm + plan.probe_radius_mm;
         for target in &plan.targets {
             check(target, plan, clearance_mm, volume_mm, machine)?;
         }
-        let order = order(plan);
+        let legs = match scan {
+            Some(scan) => legs(plan, scan),
+            None => order(plan).into_iter().map(Leg::Touch).collect(),
+        };
+        let order: Vec<usize> = legs.iter().flat_map(Leg::targets).collect();
         let plain: Vec<usize> = (0..plan.targets.len()).collect();
         let [travel_m, plain_m] = [&order, &plain].map(|order| 1e-3 * length(&order_places(plan, order)));
-        Ok(Self { order, clearance_mm, travel_m, plain_m })
+        Ok(Self { legs, clearance_mm, travel_m, plain_m })
     }
+}
+
+impl Leg {
+    /// The targets that it brings.
+    pub(super) fn targets(&self) -> Range<usize> {
+        match self {
+            Self::Touch(k) => *k..k + 1,
+            Self::Scan(targets) => targets.clone(),
+        }
+    }
+}
+
+/// Parts a plan, in its own order, into rows that are scanned and targets that are touched: a careful beginning, the reference sphere, and what
+/// lies in no row.
+fn legs(plan: &Plan, scan: Scanning) -> Vec<Leg> {
+    let careful = plan.careful.map_or(0, |careful| careful.targets as usize).min(plan.targets.len());
+    let mut legs: Vec<Leg> = (0..careful).map(Leg::Touch).collect();
+    let mut from = careful;
+    while from < plan.targets.len() {
+        let row = from..row_end(plan, from, scan);
+        from = row.end;
+        if row.len() >= LEAST_SCANNED {
+            legs.push(Leg::Scan(row));
+        } else {
+            legs.extend(row.map(Leg::Touch));
+        }
+    }
+    legs
+}
+
+/// Where the row ends that begins here.
+fn row_end(plan: &Plan, from: usize, scan: Scanning) -> usize {
+    let targets = &plan.targets[from..plan.targets.len().min(from + MOST_SCANNED)];
+    let step = |k: usize| -> [f64; 3] {
+        std::array::from_fn(|axis| targets[k].point_mm[axis] - targets[k - 1].point_mm[axis])
+    };
+    let dot = |a: [f64; 3], b: [f64; 3]| (0..3).map(|axis| a[axis] * b[axis]).sum::<f64>();
+    let mut left_mm = LONGEST_SCAN_S * scan.speed_mm_s;
+    let mut goes_on = |k: &usize| {
+        let (k, here) = (*k, step(*k));
+        let far = dot(here, here).sqrt();
+        left_mm -= far;
+        let near = far > 0.0 && far <= scan.step_mm && left_mm >= 0.0;
+        let ahead = k == 1 || dot(here, step(k - 1)) >= LEAST_AHEAD * far * dot(step(k - 1), step(k - 1)).sqrt();
+        near && ahead && [0, k].iter().all(|k| targets[*k].what == TargetKind::Part)
+    };
+    from + 1 + (1..targets.len()).take_while(|k| goes_on(k)).count()
 }
 
 /// Where the probe's centre turns into the normal.
@@ -312,7 +384,7 @@ fn length(places: &[[f64; 2]]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::payload::{Careful, TargetKind};
+    use crate::payload::Careful;
 
     fn plan(points: impl Iterator<Item = [f64; 3]>) -> Plan {
         let target = |(index, point_mm)| Target {
@@ -334,6 +406,10 @@ mod tests {
 
     const VOLUME: [[f64; 3]; 2] = [[-100.0; 3], [100.0; 3]];
 
+    fn scanning(step_mm: f64) -> Option<Scanning> {
+        Some(Scanning { speed_mm_s: 1.0, step_mm })
+    }
+
     fn machine() -> Arc<str> {
         Arc::from("cmm")
     }
@@ -345,9 +421,9 @@ mod tests {
 
     #[test]
     fn a_shuffled_grid_is_walked_almost_without_a_step_too_many() {
-        let route = Route::over(&shuffled(), &VOLUME, &machine()).unwrap();
+        let route = Route::over(&shuffled(), None, &VOLUME, &machine()).unwrap();
         assert!(route.travel_m < 0.107 && route.plain_m > 0.3, "{} and {}", route.travel_m, route.plain_m);
-        let mut all = route.order.clone();
+        let mut all: Vec<usize> = route.legs.iter().flat_map(Leg::targets).collect();
         all.sort_unstable();
         assert_eq!(all, (0..100).collect::<Vec<_>>());
     }
@@ -355,18 +431,47 @@ mod tests {
     #[test]
     fn a_careful_beginning_stays_the_beginning() {
         let careful = Careful { targets: 5, speed_mm_s: 0.5 };
-        let route = Route::over(&Plan { careful: Some(careful), ..shuffled() }, &VOLUME, &machine()).unwrap();
-        assert_eq!(route.order[..5], [0, 1, 2, 3, 4]);
+        let route = Route::over(&Plan { careful: Some(careful), ..shuffled() }, None, &VOLUME, &machine()).unwrap();
+        assert_eq!(route.legs[..5], [0, 1, 2, 3, 4].map(Leg::Touch));
     }
 
     #[test]
     fn a_position_outside_of_the_volume_is_named_before_anything_moves() {
         let outside = plan([[0.0, 0.0, 0.0], [99.0, 0.0, 77.0]].into_iter());
         let Err(DeviceError::OutOfVolume { axis, target, value_mm, .. }) =
-            Route::over(&Plan { safe_height_mm: 30.0, ..outside }, &VOLUME, &machine())
+            Route::over(&Plan { safe_height_mm: 30.0, ..outside }, None, &VOLUME, &machine())
         else {
             panic!()
         };
         assert_eq!((axis, target, value_mm), ('z', 0, 108.5));
+    }
+
+    #[test]
+    fn rows_are_scanned_and_the_rest_is_touched() {
+        // Two careful ones, a row of eight there and one back, a lonely target, and three of a sphere.
+        let row = |y: f64, there: bool| (0..8).map(move |k| [f64::from(if there { k } else { 7 - k }), y, 0.0]);
+        let spread = [[30.0, 0.0, 0.0], [40.0, 9.0, 0.0]].into_iter();
+        let points = spread.chain(row(0.0, true)).chain(row(2.0, false)).chain([[60.0, 0.0, 0.0]]);
+        let mut plan = plan(points.chain([[70.0, 0.0, 5.0], [70.5, 0.0, 5.0], [71.0, 0.0, 5.0]]));
+        plan.targets[19..].iter_mut().for_each(|target| target.what = TargetKind::ReferenceSphere);
+        plan.careful = Some(Careful { targets: 2, speed_mm_s: 0.5 });
+        let route = Route::over(&plan, scanning(1.5), &VOLUME, &machine()).unwrap();
+        let touched = |targets: Range<usize>| targets.map(Leg::Touch);
+        let rows = [Leg::Scan(2..10), Leg::Scan(10..18)];
+        assert_eq!(route.legs, touched(0..2).chain(rows).chain(touched(18..22)).collect::<Vec<_>>());
+        // A step that is shorter than that of the rows scans nothing.
+        let touched_all = Route::over(&plan, scanning(0.9), &VOLUME, &machine()).unwrap();
+        assert_eq!(touched_all.legs, touched(0..22).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn a_long_row_is_several_scans() {
+        let plan = plan((0..1000).map(|k| [0.01 * f64::from(k), 0.0, 0.0]));
+        let route = Route::over(&plan, scanning(1.0), &VOLUME, &machine()).unwrap();
+        assert_eq!(route.legs, [Leg::Scan(0..400), Leg::Scan(400..800), Leg::Scan(800..1000)]);
+        // At 1 mm/s none may be longer than 30 mm.
+        let plan = super::tests::plan((0..80).map(|k| [f64::from(k), 0.0, 0.0]));
+        let route = Route::over(&plan, scanning(1.0), &VOLUME, &machine()).unwrap();
+        assert_eq!(route.legs, [Leg::Scan(0..31), Leg::Scan(31..62), Leg::Scan(62..80)]);
     }
 }

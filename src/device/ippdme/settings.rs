@@ -33,6 +33,12 @@ pub struct IppdmeWire {
     /// Speed of travel between targets; the server may keep it lower.
     #[schemars(range(min = 0.1, max = 2000.0))]
     pub travel_speed_mm_s: f64,
+    /// Speed of scanning, for a probe that can: rows of targets are passed over in contact, and reported at the targets; left out, every one is touched.
+    #[schemars(range(min = 0.1, max = 500.0), example = 10.0)]
+    pub scan_speed_mm_s: Option<f64>,
+    /// The farthest from one target to the next within a scan; what lies farther apart is touched.
+    #[schemars(range(min = 0.001, max = 100.0))]
+    pub scan_step_mm: f64,
     /// The part's frame, in which the probe is sent: origin of the machine in it, then theta, psi and phi in degrees; left out, the machine's own.
     #[schemars(inner(range(min = -100000.0, max = 100000.0)), example = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0])]
     pub part_frame: Option<[f64; 6]>,
@@ -64,6 +70,8 @@ impl Default for IppdmeWire {
             tool: String::new(),
             probe_tolerance_mm: 0.01,
             travel_speed_mm_s: 100.0,
+            scan_speed_mm_s: None,
+            scan_step_mm: 5.0,
             part_frame: None,
             tries_again: 1,
             answer_timeout_ms: 5000,
@@ -88,6 +96,8 @@ pub struct IppdmeSettings {
     pub probe_tolerance_mm: f64,
     /// Speed of travel between targets.
     pub travel_speed_mm_s: f64,
+    /// Speed of scanning, and the farthest from target to target within a scan; none where every target is touched.
+    pub scan: Option<Scanning>,
     /// The part's frame; none for the machine's own.
     pub part_frame: Option<[f64; 6]>,
     /// How often a target is tried again that was missed.
@@ -102,6 +112,15 @@ pub struct IppdmeSettings {
     pub expected_name: Option<String>,
     /// Whether it has to be a simulation, or must not be one.
     pub simulated: bool,
+}
+
+/// How rows of targets are scanned.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Scanning {
+    /// Speed along the surface.
+    pub speed_mm_s: f64,
+    /// The farthest from one target to the next.
+    pub step_mm: f64,
 }
 
 impl IppdmeSettings {
@@ -147,6 +166,7 @@ impl Wired for IppdmeWire {
             tool: self.tool.clone(),
             probe_tolerance_mm: self.probe_tolerance_mm,
             travel_speed_mm_s: self.travel_speed_mm_s,
+            scan: self.scan_speed_mm_s.map(|speed_mm_s| Scanning { speed_mm_s, step_mm: self.scan_step_mm }),
             part_frame: self.part_frame,
             retries: self.tries_again,
             volume_mm,

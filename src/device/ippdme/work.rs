@@ -1,6 +1,7 @@
 //! A job, carried out: this program is what other machines have within. One task owns the session; hold, stop and abort are seen between
 //! two commands, and an abort within one.
 
+use std::ops::Range;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -8,7 +9,7 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, sleep};
 
 use super::response::{ServerError, values};
-use super::route::{Route, along, approach};
+use super::route::{Leg, Route, along, approach};
 use super::session::{Answer, Failure, Session};
 use super::settings::IppdmeSettings;
 use super::text::Item;
@@ -17,7 +18,7 @@ use crate::payload::{MeasuredPoint, Plan, PointStatus, Target};
 use crate::words::{Fault, Job, Outcome, State};
 
 /// Errors of a touch after which the next may be well: no touch, an illegal one, no surface.
-const MISSES: [u16; 3] = [1001, 1003, 1006];
+pub(super) const MISSES: [u16; 3] = [1001, 1003, 1006];
 /// So many targets that cannot be reached mean that the part lies elsewhere.
 const UNREACHED_MOST: u32 = 3;
 /// What a server that lacks a method or a property answers.
@@ -113,8 +114,8 @@ pub(super) struct Worker {
     pub(super) settings: Arc<IppdmeSettings>,
     /// Where the probe's centre is, as far as that is known.
     pub(super) at_mm: Option<[f64; 3]>,
-    /// Speeds in force: of travel and of touching.
-    pub(super) speeds_mm_s: [f64; 2],
+    /// Speeds in force: of travel, of touching and of scanning.
+    pub(super) speeds_mm_s: [f64; 3],
 }
 
 impl Worker {
@@ -207,17 +208,19 @@ impl Worker {
     async fn run(&mut self, work: &Work) -> Result<(), Failure> {
         self.set_up(work).await?;
         let mut unreached = 0;
-        for &k in &work.route.order {
+        for leg in &work.route.legs {
             if self.wished() != Wish::GoOn {
                 break;
             }
-            if locked(&self.shared).points[k].is_some() {
+            if locked(&self.shared).points[leg.targets()].iter().all(Option::is_some) {
                 continue;
             }
-            self.keep_speeds(work, k).await?;
-            let point = self.touch(work, &work.plan.targets[k]).await?;
-            locked(&self.shared).points[k] = Some(point);
-            unreached += u32::from(point.status == PointStatus::NotReached);
+            if let Leg::Scan(row) = leg
+                && self.scan(work, row.clone()).await?
+            {
+                continue;
+            }
+            unreached += self.touch_all(work, leg.targets()).await?;
             if unreached >= UNREACHED_MOST {
                 self.rise(work).await?;
                 let text = format!("{unreached} targets could not be reached: see how the part lies");
@@ -238,6 +241,24 @@ impl Worker {
             Wish::Hold | Wish::GoOn => (State::Held, Outcome::None),
         };
         Ok(())
+    }
+
+    /// Touches what is left of these targets; returns how many could not be reached.
+    async fn touch_all(&mut self, work: &Work, targets: Range<usize>) -> Result<u32, Failure> {
+        let mut unreached = 0;
+        for k in targets {
+            if unreached >= UNREACHED_MOST || *self.wish.borrow() != Wish::GoOn {
+                break;
+            }
+            if locked(&self.shared).points[k].is_some() {
+                continue;
+            }
+            self.keep_speeds(work, k).await?;
+            let point = self.touch(work, &work.plan.targets[k]).await?;
+            locked(&self.shared).points[k] = Some(point);
+            unreached += u32::from(point.status == PointStatus::NotReached);
+        }
+        Ok(unreached)
     }
 
     /// What is to become of the job. Where nobody has looked for long it holds by itself, as a machine does that misses its client.
@@ -264,7 +285,7 @@ impl Worker {
         self.session.move_by("ChangeTool", tool, CHANGE).await?;
         self.find_place().await?;
         self.check_radius(work).await?;
-        self.speeds_mm_s = [0.0; 2];
+        self.speeds_mm_s = [0.0; 3];
         let Plan { approach_mm, search_mm, .. } = work.plan;
         self.set(&[
             ("PtMeasPar.Approach", approach_mm),
@@ -272,6 +293,9 @@ impl Worker {
             ("PtMeasPar.Retract", approach_mm),
         ])
         .await?;
+        if work.route.legs.iter().any(|leg| matches!(leg, Leg::Scan(_))) {
+            self.set_up_scans(work).await?;
+        }
         let report = |names: &[&str]| names.iter().map(|name| Item::asked(name)).collect::<Vec<_>>();
         // A quality, and the radius of a touch, are not in every version.
         for names in [&["X", "Y", "Z", "IJK", "ER", "Q"][..], &["X", "Y", "Z", "IJK", "ER"], &["X", "Y", "Z"]] {
@@ -315,7 +339,7 @@ impl Worker {
         Ok(())
     }
 
-    fn hold_radius(&self, told_mm: f64, work: &Work) -> Result<(), Failure> {
+    pub(super) fn hold_radius(&self, told_mm: f64, work: &Work) -> Result<(), Failure> {
         let (plan_mm, limit_mm) = (work.plan.probe_radius_mm, self.settings.probe_tolerance_mm);
         if (told_mm - plan_mm).abs() <= limit_mm {
             return Ok(());
@@ -325,7 +349,7 @@ impl Worker {
     }
 
     /// Sets parameters of the tool, and takes what is in force from the machine: it may keep them within its own limits.
-    async fn set(&mut self, parameters: &[(&str, f64)]) -> Result<Vec<f64>, Failure> {
+    pub(super) async fn set(&mut self, parameters: &[(&str, f64)]) -> Result<Vec<f64>, Failure> {
         let named = |name: &str| format!("Tool.{name}");
         let wanted = parameters.iter().map(|(name, value)| Item::with(&named(name), *value)).collect();
         self.session.ask("SetProp", wanted).await?;
@@ -349,15 +373,15 @@ impl Worker {
     }
 
     /// Sets the speeds where they change: the first targets of a careful plan are touched slowly.
-    async fn keep_speeds(&mut self, work: &Work, k: usize) -> Result<(), Failure> {
+    pub(super) async fn keep_speeds(&mut self, work: &Work, k: usize) -> Result<(), Failure> {
         let careful = work.plan.careful.filter(|careful| k < careful.targets as usize);
         let touching = careful.map_or(work.plan.speed_mm_s, |careful| careful.speed_mm_s);
         let travel = careful.map_or(self.settings.travel_speed_mm_s, |careful| careful.speed_mm_s);
-        if self.speeds_mm_s == [travel, touching] {
+        if self.speeds_mm_s[..2] == [travel, touching] {
             return Ok(());
         }
         self.set(&[("GoToPar.Speed", travel), ("PtMeasPar.Speed", touching)]).await?;
-        self.speeds_mm_s = [travel, touching];
+        self.speeds_mm_s = [travel, touching, self.speeds_mm_s[2]];
         Ok(())
     }
 
@@ -402,23 +426,27 @@ impl Worker {
         if let Some(radius_mm) = answer.value("ER") {
             self.hold_radius(radius_mm, work)?;
         }
-        let plan = &work.plan;
-        let centre = along(target, plan.probe_radius_mm);
-        let off_mm = distance(centre, at_mm);
-        let most = plan.approach_mm + plan.search_mm + self.settings.probe_tolerance_mm;
-        if off_mm > most {
-            let field = format!("the distance of the touch of target {} from where it was sent", target.index);
-            let (machine, unit) = (Arc::clone(&self.session.machine), "mm".to_owned());
-            let error = DeviceError::OutOfRange { machine, field, value: off_mm, least: 0.0, most, unit };
-            return Err(Failure::Wrong(error));
-        }
+        self.hold_place(work, target, at_mm)?;
         let quality = answer.value("Q").map_or(0, |quality| quality.clamp(0.0, 100.0) as u16);
-        self.at_mm = Some(approach(target, plan));
+        self.at_mm = Some(approach(target, &work.plan));
         Ok(MeasuredPoint { index: target.index, status: PointStatus::Touched, quality, at_mm })
     }
 
+    /// Holds where a point lies against where the probe was sent.
+    pub(super) fn hold_place(&self, work: &Work, target: &Target, at_mm: [f64; 3]) -> Result<(), Failure> {
+        let plan = &work.plan;
+        let off_mm = distance(along(target, plan.probe_radius_mm), at_mm);
+        let most = plan.approach_mm + plan.search_mm + self.settings.probe_tolerance_mm;
+        if off_mm <= most {
+            return Ok(());
+        }
+        let field = format!("the distance of the touch of target {} from where it was sent", target.index);
+        let (machine, unit) = (Arc::clone(&self.session.machine), "mm".to_owned());
+        Err(Failure::Wrong(DeviceError::OutOfRange { machine, field, value: off_mm, least: 0.0, most, unit }))
+    }
+
     /// Travels over a target at the height of the clearance, and down to where the probe turns into the normal.
-    async fn go_over(&mut self, work: &Work, target: &Target) -> Result<(), Failure> {
+    pub(super) async fn go_over(&mut self, work: &Work, target: &Target) -> Result<(), Failure> {
         self.rise(work).await?;
         let [x, y, z] = approach(target, &work.plan);
         self.go_to([x, y, work.route.clearance_mm]).await?;
@@ -426,7 +454,7 @@ impl Worker {
     }
 
     /// Goes straight up to the height of the clearance, if it is not there.
-    async fn rise(&mut self, work: &Work) -> Result<(), Failure> {
+    pub(super) async fn rise(&mut self, work: &Work) -> Result<(), Failure> {
         let Some([x, y, z]) = self.at_mm else { return Ok(()) };
         let clearance_mm = work.route.clearance_mm;
         if z >= clearance_mm {
@@ -446,7 +474,7 @@ impl Worker {
     }
 
     /// How long a way lasts at most, by a speed in force; one that was not set yet is the machine's own and may be slow.
-    fn lasts(&self, way_mm: f64, speed: usize) -> Duration {
+    pub(super) fn lasts(&self, way_mm: f64, speed: usize) -> Duration {
         const SLOWEST_MM_S: f64 = 1.0;
         let speed = self.speeds_mm_s[speed];
         let speed = if speed > 0.0 { speed } else { SLOWEST_MM_S };
@@ -454,7 +482,7 @@ impl Worker {
         Duration::try_from_secs_f64(2.0 * way_mm / speed).unwrap_or(Duration::from_secs(3600))
     }
 
-    async fn find_place(&mut self) -> Result<(), Failure> {
+    pub(super) async fn find_place(&mut self) -> Result<(), Failure> {
         let told = self.session.ask("Get", ["X", "Y", "Z"].map(Item::asked).to_vec()).await?;
         let at = ["X", "Y", "Z"].map(|axis| told.value(axis));
         let [Some(x), Some(y), Some(z)] = at else {
@@ -465,11 +493,11 @@ impl Worker {
     }
 
     /// Asks for what not every server has; none where this one has it not.
-    async fn ask_if_there(&mut self, name: &str, arguments: Vec<Item>) -> Result<Option<Answer>, Failure> {
+    pub(super) async fn ask_if_there(&mut self, name: &str, arguments: Vec<Item>) -> Result<Option<Answer>, Failure> {
         ask_if_there(&mut self.session, name, arguments).await
     }
 
-    fn untold(&self, method: &'static str, missing: &'static str) -> DeviceError {
+    pub(super) fn untold(&self, method: &'static str, missing: &'static str) -> DeviceError {
         DeviceError::Untold { machine: Arc::clone(&self.session.machine), method, missing }
     }
 }
@@ -501,7 +529,7 @@ fn status_of(number: u16) -> PointStatus {
     if number == 1001 { PointStatus::NotReached } else { PointStatus::NotFound }
 }
 
-fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
+pub(super) fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
     (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt()
 }
 

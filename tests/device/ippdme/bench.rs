@@ -51,6 +51,7 @@ pub fn settings(port: u16, limits: Limits) -> IppdmeSettings {
         tool: "Probe1".into(),
         probe_tolerance_mm: 0.01,
         travel_speed_mm_s: 100.0,
+        scan: None,
         part_frame: None,
         retries: 1,
         volume_mm: [[-500.0, -500.0, -300.0], [500.0, 500.0, 400.0]],

@@ -4,5 +4,6 @@ mod bench;
 mod faults;
 mod jobs;
 mod other_server;
+mod scans;
 mod transcript;
 mod vectors;

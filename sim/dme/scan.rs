@@ -1,0 +1,100 @@
+//! Curves that are passed over in contact: the probe is pressed on the true part, and says where it is at each target while it goes on.
+
+use super::faults::Fault;
+use super::line::Argument;
+use super::machine::{Done, Machine};
+use crate::Vec3;
+use crate::cmm::Touch;
+
+/// Points in a line.
+const IN_A_LINE: usize = 7;
+
+/// A line of a scan.
+#[derive(Clone, Debug)]
+pub(super) struct Scanned {
+    /// When it is said, in the machine's time from the beginning on.
+    pub(super) seconds: f64,
+    /// Where the probe is then.
+    pub(super) at_mm: Vec3,
+    /// Its points, each by its fields.
+    pub(super) points: Vec<Vec<String>>,
+}
+
+impl Machine {
+    /// Scans a curve as it is written; it ends where the surface is lost.
+    pub(super) fn scan(&mut self, closed: &Argument, format: &Argument, data: &Argument) -> Result<Done, u16> {
+        let open = Argument::Name("Closed".into(), Some(vec![0.0]));
+        let written =
+            Argument::Names("Format".into(), ["X()", "Y()", "Z()", "IJK()", "tag"].map(str::to_owned).to_vec());
+        let Argument::Name(name, Some(numbers)) = data else { return Err(502) };
+        let whole = name == "Data" && numbers.len() >= 14 && numbers.len().is_multiple_of(7);
+        if !self.scans {
+            return Err(2002);
+        }
+        // Curves that close, leave the surface, or are written otherwise: no client of this machine asks for them.
+        if *closed != open || *format != written || !whole || !self.at_nominals {
+            return Err(506);
+        }
+        let [_, _, approach_mm, search_mm, _, speed_mm_s, retract_mm] = self.parameters;
+        let (radius_mm, frame) = (self.radius().ok_or(508u16)?, self.frame());
+        let mut done = Done::default();
+        self.contacts += 1;
+        let mut last: Option<Vec3> = None;
+        let mut normal = [0.0, 0.0, 1.0];
+        for (k, row) in numbers.chunks_exact(7).enumerate() {
+            let point = frame.to_machine([row[0], row[1], row[2]]);
+            let direction = frame.turned_back([row[3], row[4], row[5]]);
+            let length = direction.iter().map(|c| c * c).sum::<f64>().sqrt();
+            if length == 0.0 || row[6] != 1.0 {
+                return Err(if length == 0.0 { 1010 } else { 506 });
+            }
+            normal = direction.map(|c| c / length);
+            let over: Vec3 = std::array::from_fn(|k| point[k] + (approach_mm + radius_mm) * normal[k]);
+            self.is_within(over)?;
+            let Touch::Centre(centre) = self.probe.touch(point, normal, [radius_mm, approach_mm, search_mm]) else {
+                return Err(1006);
+            };
+            done.seconds += match last {
+                Some(last) => distance(last, centre) / speed_mm_s,
+                None => self.moves_to(over).seconds + self.probe.seconds_per_point(),
+            };
+            if k.is_multiple_of(IN_A_LINE) {
+                done.scanned.push_back(Scanned { seconds: 0.0, at_mm: centre, points: Vec::new() });
+            }
+            let told = frame.of_machine(centre);
+            let fields = self.scan_report.iter().map(|name| match name.as_str() {
+                "X" => told[0].to_string(),
+                "Y" => told[1].to_string(),
+                "Z" => told[2].to_string(),
+                _ => "0".to_owned(),
+            });
+            let line = done.scanned.back_mut().ok_or(511u16)?;
+            line.points.push(fields.collect());
+            (line.seconds, line.at_mm) = (done.seconds, centre);
+            last = Some(centre);
+            self.touched_mm = Some(centre[2]);
+        }
+        let end = last.ok_or(502u16)?;
+        self.moves_to(std::array::from_fn(|k| end[k] + retract_mm.max(0.0) * normal[k]));
+        Ok(done)
+    }
+}
+
+fn distance(a: Vec3, b: Vec3) -> f64 {
+    (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt()
+}
+
+/// The numbers of a line, with what goes wrong with them.
+pub(super) fn spoilt(mut line: Scanned, fault: Option<&Fault>) -> Vec<String> {
+    match fault {
+        Some(Fault::UnaskedQuality) => line.points.iter_mut().for_each(|point| point.insert(0, "0".to_owned())),
+        Some(Fault::PointLost) if line.points.len() == IN_A_LINE => drop(line.points.remove(3)),
+        Some(Fault::PointsShifted) if line.points.len() > 1 => {
+            let first = line.points[0].clone();
+            line.points.insert(0, first);
+            line.points.pop();
+        }
+        _ => {}
+    }
+    line.points.concat()
+}

@@ -1,0 +1,142 @@
+//! Rows of targets that are passed over in contact: one command a row, and a point at each target.
+//!
+//! A server says the points of a scan as bare numbers, in lines of any length, while the probe goes on. They are taken when it has said that the
+//! scan is over, all or none: as many as there are targets, each at its own target. Some servers say a quality that nobody asked for; where
+//! it stands is found by where the points lie.
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use super::response::ServerError;
+use super::route::{Leg, along};
+use super::session::Failure;
+use super::text::Item;
+use super::work::{MISSES, Work, Worker, distance, locked};
+use crate::error::DeviceError;
+use crate::payload::{MeasuredPoint, Plan, PointStatus, Target};
+
+/// A curve that is straight is told as one of this radius.
+const STRAIGHT_MM: f64 = 1e4;
+
+impl Worker {
+    /// Has the server scan as the plan needs it: speed, retract, and points at the targets.
+    pub(super) async fn set_up_scans(&mut self, work: &Work) -> Result<(), Failure> {
+        let Some(scan) = self.settings.scan else { return Ok(()) };
+        let wanted = [("ScanPar.Speed", scan.speed_mm_s), ("ScanPar.Retract", work.plan.approach_mm)];
+        self.speeds_mm_s[2] = self.set(&wanted).await?[0];
+        self.session.ask("OnScanReport", ["X", "Y", "Z"].map(Item::asked).to_vec()).await?;
+        let hint = [work.plan.search_mm, smallest_radius_mm(work)].map(Item::Number).to_vec();
+        // What only makes it faster is not in every server.
+        self.ask_if_there("ScanOnCurveHint", hint).await?;
+        self.session.ask("ScanOnCurveDensity", vec![Item::with("AtNominals", 1.0)]).await?;
+        Ok(())
+    }
+
+    /// Scans a row; false where the probe lost the surface or met it elsewhere, so that its targets have to be touched one by one.
+    pub(super) async fn scan(&mut self, work: &Work, row: Range<usize>) -> Result<bool, Failure> {
+        let targets = &work.plan.targets[row.clone()];
+        self.keep_speeds(work, row.start).await?;
+        self.go_over(work, &targets[0]).await?;
+        let way_mm: f64 = targets.windows(2).map(|pair| distance(pair[0].point_mm, pair[1].point_mm)).sum();
+        let touch = self.lasts(2.0 * (work.plan.approach_mm + work.plan.search_mm), 1);
+        let scanned = self.session.move_by("ScanOnCurve", curve(targets), touch + self.lasts(way_mm, 2)).await;
+        let points = match scanned {
+            Ok(answer) if answer.data.is_empty() && answer.warnings.iter().any(is_missed) => None,
+            Ok(answer) => Some(self.scanned(work, targets, &answer.data)?),
+            Err(Failure::No(error)) if is_missed(&error) && error.severity <= 2 => {
+                self.session.note(format!("the row from target {} on is touched: {error}", targets[0].index));
+                self.session.clear_errors(1).await?;
+                None
+            }
+            Err(other) => return Err(other),
+        };
+        self.find_place().await?;
+        self.rise(work).await?;
+        let is_there = points.is_some();
+        let mut shared = locked(&self.shared);
+        for (slot, point) in shared.points[row].iter_mut().zip(points.into_iter().flatten()) {
+            *slot = Some(point);
+        }
+        Ok(is_there)
+    }
+
+    /// Takes the numbers of a scan as its points, if they can be that.
+    fn scanned(&self, work: &Work, targets: &[Target], data: &[Vec<Item>]) -> Result<Vec<MeasuredPoint>, Failure> {
+        let mut lines: Vec<&Vec<Item>> = data.iter().collect();
+        // A line that comes twice is one: the probe is nowhere twice.
+        lines.dedup();
+        let numbers: Option<Vec<f64>> = lines.iter().flat_map(|line| line.iter()).map(Item::number).collect();
+        let width = numbers.as_ref().map_or(0, |numbers| numbers.len() / targets.len());
+        let numbers = numbers
+            .filter(|numbers| matches!(width, 3 | 4) && numbers.len() == width * targets.len())
+            .filter(|_| lines.iter().all(|line| line.len().is_multiple_of(width)))
+            .ok_or_else(|| Failure::Wrong(self.untold("ScanOnCurve", "one point at each target of the scan")))?;
+        let places = |first: usize| -> Vec<[f64; 3]> {
+            numbers.chunks_exact(width).map(|point| std::array::from_fn(|k| point[first + k])).collect()
+        };
+        let mut found = self.hold_row(work, targets, &places(0)).map(|()| 0);
+        if width == 4 && found.is_err() && self.hold_row(work, targets, &places(1)).is_ok() {
+            found = Ok(1);
+        }
+        let first = found?;
+        let quality = |point: &[f64]| if width == 4 { point[3 - 3 * first].clamp(0.0, 100.0) as u16 } else { 0 };
+        let points = targets.iter().zip(places(first)).zip(numbers.chunks_exact(width));
+        Ok(points
+            .map(|((target, at_mm), said)| {
+                let (index, status) = (target.index, PointStatus::Touched);
+                MeasuredPoint { index, status, quality: quality(said), at_mm }
+            })
+            .collect())
+    }
+
+    /// Holds every point of a row against its target: no farther than the probe may search, and aside by no more than half of the way to the next.
+    fn hold_row(&self, work: &Work, targets: &[Target], places: &[[f64; 3]]) -> Result<(), Failure> {
+        for (k, (target, at_mm)) in targets.iter().zip(places).enumerate() {
+            self.hold_place(work, target, *at_mm)?;
+            let near = [k.checked_sub(1), Some(k + 1)].into_iter().flatten().filter_map(|k| targets.get(k));
+            let steps = near.map(|other| distance(other.point_mm, target.point_mm));
+            let most = 0.5 * steps.fold(f64::INFINITY, f64::min);
+            let aside_mm = aside(target, &work.plan, *at_mm);
+            if aside_mm > most {
+                let field = format!("how far beside target {} its point of the scan lies", target.index);
+                let (machine, unit) = (Arc::clone(&self.session.machine), "mm".to_owned());
+                let error = DeviceError::OutOfRange { machine, field, value: aside_mm, least: 0.0, most, unit };
+                return Err(Failure::Wrong(error));
+            }
+        }
+        Ok(())
+    }
+}
+
+fn is_missed(error: &ServerError) -> bool {
+    MISSES.contains(&error.number)
+}
+
+/// The curve through these targets: open, with the normal of each, all of them on the surface.
+fn curve(targets: &[Target]) -> Vec<Item> {
+    let call = |name: &str, items: Vec<Item>| Item::Call(name.to_owned(), items);
+    let mut format = ["X", "Y", "Z", "IJK"].map(Item::asked).to_vec();
+    format.push(Item::Name("tag".to_owned()));
+    let numbers = targets.iter().flat_map(|target| target.point_mm.into_iter().chain(target.normal).chain([1.0]));
+    let data = numbers.map(Item::Number).collect();
+    vec![Item::with("Closed", 0.0), call("Format", format), call("Data", data)]
+}
+
+/// How far a place lies from the normal of a target.
+fn aside(target: &Target, plan: &Plan, at_mm: [f64; 3]) -> f64 {
+    let centre = along(target, plan.probe_radius_mm);
+    let off: [f64; 3] = std::array::from_fn(|k| at_mm[k] - centre[k]);
+    let along_mm: f64 = (0..3).map(|k| off[k] * target.normal[k]).sum();
+    (0..3).map(|k| (off[k] - along_mm * target.normal[k]).powi(2)).sum::<f64>().sqrt()
+}
+
+/// The smallest radius of curvature along the rows, by how much the normal turns from target to target.
+fn smallest_radius_mm(work: &Work) -> f64 {
+    let rows = work.route.legs.iter().filter_map(|leg| if let Leg::Scan(row) = leg { Some(row.clone()) } else { None });
+    let pairs = rows.flat_map(|row| work.plan.targets[row].windows(2));
+    let radii = pairs.map(|pair| {
+        let turn = distance(pair[0].normal, pair[1].normal);
+        distance(pair[0].point_mm, pair[1].point_mm) / turn.max(1e-9)
+    });
+    radii.fold(STRAIGHT_MM, f64::min)
+}

@@ -1,0 +1,149 @@
+//! Rows that are scanned: their points are those of the part, each at its target, and whatever goes wrong brings no wrong one.
+
+use regrind::device::{
+    Cmm, DeviceError, Fault as MachineFault, Interrupt, IppdmeCmm, Machine, Outcome, Plan, PointStatus, Scanning,
+    State, Status, Target, TargetKind,
+};
+use regrind_sim::dme::faults::Fault;
+use regrind_sim::dme::machine::Options;
+use regrind_sim::spec::CmmSpec;
+
+use super::bench::{Bench, job, patient, settings, until, until_points, until_still};
+
+const FAST: f64 = 5000.0;
+
+async fn scanning(speed: f64, cmm: CmmSpec) -> Bench {
+    let mut bench = Bench::measuring(cmm, speed, patient(), Options::default()).await;
+    let mut settings = settings(bench.serving.local_addr().port(), patient());
+    settings.scan = Some(Scanning { speed_mm_s: 10.0, step_mm: 1.5 });
+    bench.cmm = IppdmeCmm::new(settings);
+    bench
+}
+
+/// Three rows of twelve targets, there and back, and one target by itself.
+fn rows(bench: &Bench) -> Plan {
+    let row = |k: u32| (0..12).map(move |i| (f64::from(if k % 2 == 0 { i } else { 11 - i }) - 5.5, 3.0 * f64::from(k)));
+    let places = (0..3).flat_map(row).chain([(-12.0, -6.0)]);
+    let targets = places.enumerate().map(|(index, (x, y))| {
+        let (point_mm, normal) = bench.world.nominal(x, y);
+        Target { index: 10 + index as u32, what: TargetKind::Part, point_mm, normal }
+    });
+    Plan { targets: targets.collect(), ..bench.plan(1) }
+}
+
+async fn going_wrong(fault: Option<Fault>) -> (Bench, Result<Status, DeviceError>) {
+    let mut bench = scanning(FAST, CmmSpec::perfect()).await;
+    if let Some(fault) = fault {
+        bench.faults.add("ScanOnCurve", 1, fault);
+    }
+    let plan = rows(&bench);
+    bench.begin(&plan).await.unwrap();
+    let ended = until_still(&mut bench.cmm).await;
+    (bench, ended)
+}
+
+async fn is_measured(bench: &mut Bench, ended: Result<Status, DeviceError>) {
+    let status = ended.unwrap();
+    assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete), "{:?}", bench.cmm.notes());
+    let plan = rows(bench);
+    let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
+    bench.are_true(&plan, &measurement);
+    assert!(measurement.points.iter().all(|point| point.status == PointStatus::Touched));
+}
+
+#[tokio::test]
+async fn rows_are_scanned_and_each_point_lies_at_its_target() {
+    let (mut bench, ended) = going_wrong(None).await;
+    is_measured(&mut bench, ended).await;
+    // One begins, however many points it brings: three rows and a touch, where touches alone are 37.
+    assert_eq!(bench.serving.with(|server| server.machine().contacts()), 4);
+}
+
+#[tokio::test]
+async fn a_quality_that_nobody_asked_for_is_no_coordinate() {
+    let (mut bench, ended) = going_wrong(Some(Fault::UnaskedQuality)).await;
+    is_measured(&mut bench, ended).await;
+}
+
+#[tokio::test]
+async fn lines_that_come_twice_or_byte_for_byte_are_one() {
+    for fault in [Fault::Twice, Fault::Split] {
+        let (mut bench, ended) = going_wrong(Some(fault)).await;
+        is_measured(&mut bench, ended).await;
+    }
+}
+
+/// A scan that is not what was asked for: nothing of it is taken, and the machine stands.
+async fn is_refused(fault: Fault, says: &str) {
+    let (bench, ended) = going_wrong(Some(fault)).await;
+    let status = ended.unwrap();
+    assert_eq!((status.state, status.outcome), (State::Faulted, Outcome::Failed));
+    assert_eq!(status.progress, Some((12, 37)), "the first row alone");
+    assert!(bench.cmm.notes()[0].contains(says), "{:?}", bench.cmm.notes());
+}
+
+#[tokio::test]
+async fn a_point_that_is_missing_makes_no_other_one_wrong() {
+    is_refused(Fault::PointLost, "one point at each target").await;
+}
+
+#[tokio::test]
+async fn points_that_stand_for_their_neighbours_are_refused() {
+    is_refused(Fault::PointsShifted, "beside target").await;
+}
+
+#[tokio::test]
+async fn a_connection_that_ends_in_a_scan_takes_nothing_of_it_and_the_row_is_scanned_again() {
+    let (mut bench, ended) = going_wrong(Some(Fault::CutInScan)).await;
+    let error = ended.unwrap_err();
+    assert!(error.is_link(), "{error}");
+    bench.cmm.connect().await.unwrap();
+    let held = until_still(&mut bench.cmm).await.unwrap();
+    assert_eq!((held.state, held.progress, held.clear_of_part), (State::Held, Some((12, 37)), None));
+    bench.cmm.resume().await.unwrap();
+    let ended = until_still(&mut bench.cmm).await;
+    is_measured(&mut bench, ended).await;
+}
+
+#[tokio::test]
+async fn a_row_that_loses_the_surface_is_touched() {
+    let mut bench = scanning(FAST, CmmSpec { not_found_share: 0.1, ..CmmSpec::perfect() }).await;
+    let plan = rows(&bench);
+    bench.begin(&plan).await.unwrap();
+    let ended = until_still(&mut bench.cmm).await;
+    assert!(bench.cmm.notes().iter().any(|note| note.contains("is touched")), "{:?}", bench.cmm.notes());
+    let status = ended.unwrap();
+    assert_eq!(status.outcome, Outcome::Complete, "{:?}", bench.cmm.notes());
+    let measurement = bench.cmm.collect(job(&plan), &Interrupt::new()).await.unwrap();
+    bench.are_true(&plan, &measurement);
+}
+
+#[tokio::test]
+async fn an_abort_in_a_scan_ends_it_there() {
+    let mut bench = scanning(1.0, CmmSpec::perfect()).await;
+    // Acknowledged, and carried out for longer than any test waits.
+    let mut settings = settings(bench.serving.local_addr().port(), patient());
+    settings.scan = Some(Scanning { speed_mm_s: 0.5, step_mm: 1.5 });
+    settings.travel_speed_mm_s = 1000.0;
+    bench.cmm = IppdmeCmm::new(settings);
+    let plan = rows(&bench);
+    bench.serving.with(|server| server.set_speed(FAST));
+    bench.begin(&plan).await.unwrap();
+    until_points(&mut bench.cmm, 1).await;
+    bench.serving.with(|server| server.set_speed(1.0));
+    bench.cmm.abort().await.unwrap();
+    let status = until(&mut bench.cmm, |status| !status.state.moves()).await.unwrap();
+    assert_eq!((status.state, status.outcome, status.clear_of_part), (State::Aborted, Outcome::Aborted, None));
+    assert_eq!(bench.serving.with(|server| server.due()), None);
+}
+
+#[tokio::test]
+async fn a_probe_that_cannot_scan_is_told_as_a_matter_of_the_tool() {
+    let mut bench = scanning(FAST, CmmSpec::perfect()).await;
+    bench.serving.with(|server| server.machine().touches_only());
+    let plan = rows(&bench);
+    bench.begin(&plan).await.unwrap();
+    let status = until_still(&mut bench.cmm).await.unwrap();
+    assert_eq!((status.state, status.fault), (State::Faulted, Some(MachineFault::Tool)));
+    assert!(bench.cmm.notes()[0].contains("2002"), "{:?}", bench.cmm.notes());
+}
