@@ -5,7 +5,7 @@
 
 import sys
 
-WIDTH, BAR, GAP, LEFT, RIGHT = 820, 20, 26, 300, 80
+WIDTH, BAR, GAP, LEFT, RIGHT = 860, 20, 26, 340, 80
 INK, QUIET, TOUCHING, GRINDING = "#1b1b1b", "#5a5a5a", "#0072b2", "#c9c9c9"
 
 
