@@ -22,7 +22,9 @@ async fn scanning(speed: f64, cmm: CmmSpec) -> Bench {
 
 /// Three rows of twelve targets, there and back, and one target by itself.
 fn rows(bench: &Bench) -> Plan {
-    let row = |k: u32| (0..12).map(move |i| (f64::from(if k % 2 == 0 { i } else { 11 - i }) - 5.5, 3.0 * f64::from(k)));
+    let row = |k: u32| {
+        (0..12).map(move |i| (f64::from(if k.is_multiple_of(2) { i } else { 11 - i }) - 5.5, 3.0 * f64::from(k)))
+    };
     let places = (0..3).flat_map(row).chain([(-12.0, -6.0)]);
     let targets = places.enumerate().map(|(index, (x, y))| {
         let (point_mm, normal) = bench.world.nominal(x, y);
