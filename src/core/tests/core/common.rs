@@ -68,8 +68,3 @@ pub fn pose_error_mm(found: &Pose, truth: &Pose) -> f64 {
         .map(|p| (found.point(&p) - truth.point(&p)).norm())
         .fold(0.0, f64::max)
 }
-
-/// How many parts a statement is tried on: so many as REGRIND_PARTS says, or a sample.
-pub fn parts(sample: u64) -> u64 {
-    std::env::var("REGRIND_PARTS").map_or(sample, |parts| parts.parse().unwrap())
-}

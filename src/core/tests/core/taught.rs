@@ -4,7 +4,7 @@ use nalgebra::{DMatrix, DVector};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 
-use crate::common::{RADIUS_MM, free_form, normal, parts, placed, points, pose};
+use crate::common::{RADIUS_MM, free_form, normal, placed, points, pose};
 use regrind_core::geometry::{Point, Vector};
 use regrind_core::model::{Field, Form, Given, Hyper, Interval, Lesson, Observed, Priors, Taught, spread};
 use regrind_core::registration::{Options, Registration, Start, register};
@@ -71,10 +71,14 @@ fn given(lesson: Option<Lesson>) -> Given {
     Given { priors, probe_scatter_mm: [SCATTER_MM, 0.15], ..Given::default() }
 }
 
+fn parts() -> u64 {
+    std::env::var("REGRIND_PARTS").map_or(5, |parts| parts.parse().unwrap())
+}
+
 /// Of some parts: how many RMS and PV were held, and the mean width of both in the true ones.
 fn told(length_mm: f64, rms_mm: f64, lesson: Option<Lesson>) -> ([u64; 2], [f64; 2]) {
     let (mut held, mut wide) = ([0; 2], [0.0; 2]);
-    for seed in 0..parts(5) {
+    for seed in 0..parts() {
         let part = Part::new(1000 + seed, length_mm, rms_mm);
         let figures = part.told(lesson).figures;
         let of = |interval: Interval, truth: f64| {
@@ -86,7 +90,7 @@ fn told(length_mm: f64, rms_mm: f64, lesson: Option<Lesson>) -> ([u64; 2], [f64;
         for (k, (interval, truth)) in [figures.rms, figures.pv].into_iter().zip(part.truth()).enumerate() {
             let (is_held, width) = of(interval, truth);
             held[k] += is_held;
-            wide[k] += width / parts(5) as f64;
+            wide[k] += width / parts() as f64;
         }
     }
     (held, wide)
@@ -148,8 +152,8 @@ fn what_parts_taught_is_believed_as_far_as_it_is_true() {
     }
     let lesson = taught.of(true);
     let ((plain, wide), (held, narrow)) = (told(15.0, 2e-3, None), told(15.0, 2e-3, lesson));
-    println!("{lesson:?}: held {held:?} of {}, {narrow:.3?} wide; untaught {plain:?}, {wide:.3?}", parts(5));
-    assert!(held.iter().zip(plain).all(|(held, plain)| held + 1 >= plain.min(parts(5) - 1)), "{held:?} {plain:?}");
+    println!("{lesson:?}: held {held:?} of {}, {narrow:.3?} wide; untaught {plain:?}, {wide:.3?}", parts());
+    assert!(held.iter().zip(plain).all(|(held, plain)| held + 1 >= plain.min(parts() - 1)), "{held:?} {plain:?}");
     assert!((0..2).all(|k| narrow[k] < 1.05 * wide[k]), "{narrow:?} {wide:?}");
 }
 
@@ -161,7 +165,7 @@ fn a_part_that_is_like_none_before_is_told_by_its_own_points() {
     };
     for (length_mm, rms_mm, lesson) in [(30.0, 5e-3, many(8.0, 1.0)), (15.0, 1e-3, many(200.0, 0.01))] {
         let ((plain, wide), (held, narrow)) = (told(length_mm, rms_mm, None), told(length_mm, rms_mm, lesson));
-        println!("{lesson:?}: held {held:?} of {}, {narrow:.3?} wide; untaught {plain:?}, {wide:.3?}", parts(5));
-        assert!(held.iter().zip(plain).all(|(held, plain)| held + 1 >= plain.min(parts(5) - 1)), "{held:?} {plain:?}");
+        println!("{lesson:?}: held {held:?} of {}, {narrow:.3?} wide; untaught {plain:?}, {wide:.3?}", parts());
+        assert!(held.iter().zip(plain).all(|(held, plain)| held + 1 >= plain.min(parts() - 1)), "{held:?} {plain:?}");
     }
 }

@@ -3,7 +3,7 @@
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 
-use crate::common::{RADIUS_MM, free_form, normal, parts, placed, points, pose};
+use crate::common::{RADIUS_MM, free_form, normal, placed, points, pose};
 use regrind_core::geometry::{Point, Vector};
 use regrind_core::model::{
     FEWEST, FIRST, Form, Given, Interval, Look, MOST_BATCHES, Purpose, SoFar, Why, look, short_way, spread,
@@ -106,7 +106,7 @@ fn holds(interval: Interval, value: f64) -> bool {
 
 #[test]
 fn between_the_touches_the_form_is_told_with_intervals_that_hold_it() {
-    let parts = parts(9);
+    let parts = std::env::var("REGRIND_PARTS").map_or(14, |parts| parts.parse().unwrap());
     let touches = std::env::var("REGRIND_TOUCHES").map_or(70, |touches| touches.parse().unwrap());
     let (mut rms, mut pv, mut width) = (0, 0, [0.0; 2]);
     for seed in 0..parts {
