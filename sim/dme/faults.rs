@@ -30,6 +30,8 @@ pub enum Fault {
     Severity(u8),
     /// The stop circuit opens when it comes.
     EmergencyStop,
+    /// It and all that follows take as long as at a real machine.
+    InRealTime,
     /// The connection ends in the middle of a scan.
     CutInScan,
     /// A point of a scan is not said.

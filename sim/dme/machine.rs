@@ -123,6 +123,7 @@ pub struct Machine {
     pub(super) scan_report: Vec<String>,
     pub(super) at_nominals: bool,
     pub(super) scans: bool,
+    tells_radius: bool,
     pub(super) contacts: u32,
     pub(super) touched_mm: Option<f64>,
     /// Where the probe's centre is, in the machine's frame, and where it goes.
@@ -148,6 +149,7 @@ impl Machine {
             scan_report: Vec::new(),
             at_nominals: false,
             scans: true,
+            tells_radius: true,
             contacts: 0,
             touched_mm: None,
             at_mm,
@@ -164,6 +166,11 @@ impl Machine {
     /// Its probe can touch, and not scan.
     pub fn touches_only(&mut self) {
         self.scans = false;
+    }
+
+    /// Its server does not tell the radius of its tool.
+    pub fn tells_no_radius(&mut self) {
+        self.tells_radius = false;
     }
 
     /// How often the probe came to the part: touches and scans.
@@ -405,6 +412,7 @@ impl Machine {
             let name = asked(property).ok_or(502u16)?;
             match name.as_str() {
                 "Tool.Name" => Ok(format!("Tool.Name(\"{}\")", self.tool)),
+                "Tool.AvrRadius" if !self.tells_radius => Err(510),
                 "Tool.AvrRadius" => self.radius().map(|radius| format!("Tool.AvrRadius({radius})")).ok_or(510),
                 other => {
                     let k = PARAMETERS.iter().position(|known| other.strip_prefix("Tool.") == Some(*known));

@@ -82,11 +82,6 @@ impl Server {
         }
     }
 
-    /// So many seconds of the machine's time pass in a real one from the next command on.
-    pub fn set_speed(&mut self, speed: f64) {
-        self.speed = speed;
-    }
-
     /// Looks at the machine, or changes it.
     pub fn machine(&mut self) -> &mut Machine {
         &mut self.machine
@@ -191,6 +186,9 @@ impl Server {
 
     fn begin_next(&mut self, now: Duration) {
         let Some((tag, command)) = self.waiting.pop_front() else { return };
+        if command.fault == Some(Fault::InRealTime) {
+            self.speed = 1.0;
+        }
         let done = self.carry_out(&command);
         let lasts = done.as_ref().map_or(0.0, |done| done.seconds) / self.speed;
         let ends = now + Duration::try_from_secs_f64(lasts).unwrap_or_default();

@@ -51,8 +51,13 @@ impl Machine {
             normal = direction.map(|c| c / length);
             let over: Vec3 = std::array::from_fn(|k| point[k] + (approach_mm + radius_mm) * normal[k]);
             self.is_within(over)?;
-            let Touch::Centre(centre) = self.probe.touch(point, normal, [radius_mm, approach_mm, search_mm]) else {
-                return Err(1006);
+            let centre = match self.probe.touch(point, normal, [radius_mm, approach_mm, search_mm]) {
+                Touch::Centre(centre) => centre,
+                lost => {
+                    self.moves_to(over);
+                    self.arrive();
+                    return Err(if matches!(lost, Touch::Missed) { 1006 } else { 1001 });
+                }
             };
             done.seconds += match last {
                 Some(last) => distance(last, centre) / speed_mm_s,

@@ -22,6 +22,12 @@ impl Worker {
     /// Has the server scan as the plan needs it: speed, retract, and points at the targets.
     pub(super) async fn set_up_scans(&mut self, work: &Work) -> Result<(), Failure> {
         let Some(scan) = self.settings.scan else { return Ok(()) };
+        if locked(&self.shared).radius_mm.is_none() {
+            // A point of a scan does not tell it either.
+            self.session
+                .note("it does not tell the radius of its tool, so rows are touched and not scanned".to_owned());
+            return Ok(());
+        }
         let wanted = [("ScanPar.Speed", scan.speed_mm_s), ("ScanPar.Retract", work.plan.approach_mm)];
         self.speeds_mm_s[2] = self.set(&wanted).await?[0];
         self.session.ask("OnScanReport", ["X", "Y", "Z"].map(Item::asked).to_vec()).await?;
@@ -32,8 +38,12 @@ impl Worker {
         Ok(())
     }
 
-    /// Scans a row; false where the probe lost the surface or met it elsewhere, so that its targets have to be touched one by one.
+    /// Scans a row; false where the probe lost the surface or met it elsewhere, or nobody knows its radius: the targets have to be touched one by
+    /// one.
     pub(super) async fn scan(&mut self, work: &Work, row: Range<usize>) -> Result<bool, Failure> {
+        if locked(&self.shared).radius_mm.is_none() {
+            return Ok(false);
+        }
         let targets = &work.plan.targets[row.clone()];
         self.keep_speeds(work, row.start).await?;
         self.go_over(work, &targets[0]).await?;

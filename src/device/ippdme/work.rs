@@ -1,7 +1,6 @@
 //! A job, carried out: this program is what other machines have within. One task owns the session; hold, stop and abort are seen between
 //! two commands, and an abort within one.
 
-use std::ops::Range;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -208,23 +207,31 @@ impl Worker {
     async fn run(&mut self, work: &Work) -> Result<(), Failure> {
         self.set_up(work).await?;
         let mut unreached = 0;
-        for leg in &work.route.legs {
-            if self.wished() != Wish::GoOn {
-                break;
-            }
-            if locked(&self.shared).points[leg.targets()].iter().all(Option::is_some) {
-                continue;
-            }
+        'job: for leg in &work.route.legs {
             if let Leg::Scan(row) = leg
-                && self.scan(work, row.clone()).await?
+                && locked(&self.shared).points[row.clone()].iter().any(Option::is_none)
             {
-                continue;
+                if self.wished() != Wish::GoOn {
+                    break;
+                }
+                if self.scan(work, row.clone()).await? {
+                    continue;
+                }
             }
-            unreached += self.touch_all(work, leg.targets()).await?;
-            if unreached >= UNREACHED_MOST {
-                self.rise(work).await?;
-                let text = format!("{unreached} targets could not be reached: see how the part lies");
-                return Err(Failure::No(ServerError { severity: 3, number: 2504, cause: String::new(), text }));
+            for k in leg.targets() {
+                if self.wished() != Wish::GoOn {
+                    break 'job;
+                }
+                if locked(&self.shared).points[k].is_some() {
+                    continue;
+                }
+                self.keep_speeds(work, k).await?;
+                let point = self.touch(work, &work.plan.targets[k]).await?;
+                locked(&self.shared).points[k] = Some(point);
+                unreached += u32::from(point.status == PointStatus::NotReached);
+                if unreached >= UNREACHED_MOST {
+                    return self.lies_elsewhere(work, unreached).await;
+                }
             }
         }
         self.rise(work).await?;
@@ -243,22 +250,11 @@ impl Worker {
         Ok(())
     }
 
-    /// Touches what is left of these targets; returns how many could not be reached.
-    async fn touch_all(&mut self, work: &Work, targets: Range<usize>) -> Result<u32, Failure> {
-        let mut unreached = 0;
-        for k in targets {
-            if unreached >= UNREACHED_MOST || *self.wish.borrow() != Wish::GoOn {
-                break;
-            }
-            if locked(&self.shared).points[k].is_some() {
-                continue;
-            }
-            self.keep_speeds(work, k).await?;
-            let point = self.touch(work, &work.plan.targets[k]).await?;
-            locked(&self.shared).points[k] = Some(point);
-            unreached += u32::from(point.status == PointStatus::NotReached);
-        }
-        Ok(unreached)
+    /// Gives a job up whose targets are not where the plan has them.
+    async fn lies_elsewhere(&mut self, work: &Work, unreached: u32) -> Result<(), Failure> {
+        self.rise(work).await?;
+        let text = format!("{unreached} targets could not be reached: see how the part lies");
+        Err(Failure::No(ServerError { severity: 3, number: 2504, cause: String::new(), text }))
     }
 
     /// What is to become of the job. Where nobody has looked for long it holds by itself, as a machine does that misses its client.

@@ -8,7 +8,7 @@ use regrind_sim::dme::faults::Fault;
 use regrind_sim::dme::machine::Options;
 use regrind_sim::spec::CmmSpec;
 
-use super::bench::{Bench, job, patient, settings, until, until_points, until_still};
+use super::bench::{Bench, job, patient, settings, until, until_still};
 
 const FAST: f64 = 5000.0;
 
@@ -122,21 +122,39 @@ async fn a_row_that_loses_the_surface_is_touched() {
 
 #[tokio::test]
 async fn an_abort_in_a_scan_ends_it_there() {
-    let mut bench = scanning(1.0, CmmSpec::perfect()).await;
-    // Acknowledged, and carried out for longer than any test waits.
+    let mut bench = scanning(FAST, CmmSpec::perfect()).await;
     let mut settings = settings(bench.serving.local_addr().port(), patient());
-    settings.scan = Some(Scanning { speed_mm_s: 0.5, step_mm: 1.5 });
-    settings.travel_speed_mm_s = 1000.0;
+    // The second row takes half a minute, and nobody waits for it.
+    settings.scan = Some(Scanning { speed_mm_s: 0.4, step_mm: 1.5 });
     bench.cmm = IppdmeCmm::new(settings);
+    bench.faults.add("ScanOnCurve", 1, Fault::InRealTime);
     let plan = rows(&bench);
-    bench.serving.with(|server| server.set_speed(FAST));
     bench.begin(&plan).await.unwrap();
-    until_points(&mut bench.cmm, 1).await;
-    bench.serving.with(|server| server.set_speed(1.0));
+    let serving = &bench.serving;
+    until(&mut bench.cmm, |_| serving.with(|server| server.machine().contacts()) == 2).await.unwrap();
     bench.cmm.abort().await.unwrap();
-    let status = until(&mut bench.cmm, |status| !status.state.moves()).await.unwrap();
+    let status = until_still(&mut bench.cmm).await.unwrap();
     assert_eq!((status.state, status.outcome, status.clear_of_part), (State::Aborted, Outcome::Aborted, None));
-    assert_eq!(bench.serving.with(|server| server.due()), None);
+    // The row that was over before is there, and nothing of this one; nothing of it is left at the server.
+    assert_eq!(status.progress, Some((12, 37)));
+    let left = bench.serving.with(|server| (server.due(), server.machine().contacts()));
+    assert_eq!(left, (None, 2));
+}
+
+#[tokio::test]
+async fn numbers_that_come_in_another_order_are_no_points() {
+    is_refused(Fault::Reordered, "from where it was sent").await;
+}
+
+#[tokio::test]
+async fn where_nobody_knows_the_radius_of_the_tool_rows_are_touched() {
+    let mut bench = scanning(FAST, CmmSpec::perfect()).await;
+    bench.serving.with(|server| server.machine().tells_no_radius());
+    let plan = rows(&bench);
+    bench.begin(&plan).await.unwrap();
+    let ended = until_still(&mut bench.cmm).await;
+    is_measured(&mut bench, ended).await;
+    assert_eq!(bench.serving.with(|server| server.machine().contacts()), 37);
 }
 
 #[tokio::test]
