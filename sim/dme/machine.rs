@@ -1,5 +1,6 @@
 //! The machine behind the server: tools, frames, parameters within their limits, motion within the volume, and touches of the true part.
 
+use super::deed::Deed;
 use super::line::{Argument, Command, Error};
 use crate::Vec3;
 use crate::cmm::{Led, Touch};
@@ -40,6 +41,8 @@ pub struct Done {
     pub data: Vec<Vec<String>>,
     /// What stops nothing.
     pub warnings: Vec<Error>,
+    /// The touch that it was.
+    pub(super) touched: Option<Deed>,
 }
 
 impl Done {
@@ -51,6 +54,8 @@ impl Done {
 /// Parameters of a tool: speed of travel, then speed, approach, search and retract of a touch.
 const PARAMETERS: [&str; 5] =
     ["GoToPar.Speed", "PtMeasPar.Speed", "PtMeasPar.Approach", "PtMeasPar.Search", "PtMeasPar.Retract"];
+
+const FIRST_PARAMETERS: [f64; 5] = [50.0, 5.0, 5.0, 5.0, 5.0];
 
 /// A frame: rows of the rotation that takes the machine's frame to it, and where the machine's origin is in it.
 #[derive(Clone, Copy, Debug)]
@@ -114,6 +119,14 @@ pub struct Machine {
     to_mm: Vec3,
     joystick: bool,
     touched_mm: Option<f64>,
+    /// The command that is being carried out, and what it has set going.
+    at: String,
+    pub(super) deeds: Vec<Deed>,
+}
+
+/// Whether a command moves the machine.
+pub(super) fn moves(command: &str) -> bool {
+    matches!(command, "GoTo" | "PtMeas" | "ChangeTool" | "Home")
 }
 
 impl Machine {
@@ -126,7 +139,7 @@ impl Machine {
             options,
             probe,
             tool: "NoTool".into(),
-            parameters: [50.0, 5.0, 5.0, 5.0, 5.0],
+            parameters: FIRST_PARAMETERS,
             part_frame: Frame::MACHINE,
             in_part_frame: false,
             report: Vec::new(),
@@ -134,6 +147,8 @@ impl Machine {
             to_mm: at_mm,
             joystick: true,
             touched_mm: None,
+            at: String::new(),
+            deeds: Vec::new(),
         }
     }
 
@@ -142,12 +157,27 @@ impl Machine {
         self.at_mm
     }
 
+    /// Somebody leads the probe up, as high as it goes.
+    pub fn lift(&mut self) {
+        self.at_mm[2] = self.probe.volume_mm()[1][2];
+        self.to_mm = self.at_mm;
+        self.stop_short(1.0);
+    }
+
     pub(super) fn begin_session(&mut self) {
         self.report = ["X", "Y", "Z"].map(str::to_owned).to_vec();
     }
 
     /// Errors are forgotten: the probe may touch again.
     pub(super) fn arm(&mut self) {}
+
+    /// It is switched on anew: it has to be homed, and knows neither tool nor parameters nor frame.
+    pub(super) fn restart(&mut self) {
+        self.homed = false;
+        self.tool = "NoTool".into();
+        self.parameters = FIRST_PARAMETERS;
+        (self.part_frame, self.in_part_frame, self.joystick) = (Frame::MACHINE, false, true);
+    }
 
     /// The motion of the command has come to its end.
     pub(super) fn arrive(&mut self) {
@@ -170,8 +200,8 @@ impl Machine {
         let no = |number| Error::new(number, &command.name);
         let arguments = &command.arguments[..];
         let text = |text: String| Ok(Done::told(vec![text]));
-        let moves = matches!(command.name.as_str(), "GoTo" | "PtMeas" | "ChangeTool" | "Home");
-        self.joystick &= !moves;
+        self.joystick &= !moves(&command.name);
+        self.at.clone_from(&command.name);
         match (command.name.as_str(), arguments) {
             ("GetDMEVersion", []) => text(format!("DMEVersion(\"{}\")", self.options.version)),
             ("GetMachineClass", []) => text(format!("GetMachineClass(\"{}\")", self.options.class)),
@@ -199,6 +229,7 @@ impl Machine {
                     return Err(no(1502));
                 }
                 self.tool.clone_from(name);
+                self.moves_to(self.at_mm);
                 Ok(Done { seconds: 10.0, ..Done::default() })
             }
             ("SetCoordSystem", [Argument::Name(name, None)]) => {
@@ -283,6 +314,7 @@ impl Machine {
     fn moves_to(&mut self, to_mm: Vec3) -> Done {
         let way_mm = (0..3).map(|k| (to_mm[k] - self.at_mm[k]).powi(2)).sum::<f64>().sqrt();
         self.to_mm = to_mm;
+        self.deeds.push(Deed::Moves { command: self.at.clone(), from_mm: self.at_mm, to_mm });
         let speed = self.parameters[0].min(self.probe.travel_mm_s());
         Done { seconds: way_mm / speed, ..Done::default() }
     }
@@ -317,7 +349,8 @@ impl Machine {
                 };
                 self.to_mm = back;
                 let fields = self.reported(centre, normal, radius_mm);
-                Ok(Done { seconds, ..Done::told(fields) })
+                let touched = Some(Deed::Touched { point_mm, normal, centre_mm: centre });
+                Ok(Done { seconds, touched, ..Done::told(fields) })
             }
             Touch::Missed => {
                 self.arrive();
