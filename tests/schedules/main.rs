@@ -36,12 +36,13 @@ use schedule::{OTHER_WIRES, Schedule, Tally};
 /// an abort does not wait for a machine that stands still (585).
 const KEPT: &[u64] = &[134, 163, 181, 264, 585];
 
-/// The same where the machines are reached by other wires than Modbus.
-const KEPT_BY_OTHER_WIRES: &[u64] = &[];
+/// The same where the machines are reached by other wires than Modbus: a linuxcncrsh that is lost while it is asked what became of a START was
+/// told as one that had never been met (1,000,075).
+const KEPT_BY_OTHER_WIRES: &[u64] = &[1_000_075];
 
 /// How many a merge has time for.
 const SAMPLE: u64 = 150;
-const SAMPLE_BY_OTHER_WIRES: u64 = 60;
+const SAMPLE_BY_OTHER_WIRES: u64 = 30;
 
 /// Runs schedules on all processors; says which seed broke which promise.
 fn run_all(schedules: &[Schedule]) -> Tally {
