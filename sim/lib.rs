@@ -25,6 +25,8 @@
 //!  handshake  one machine's side of the handshake: states, interlocks, silence
 //!  registers  a whole machine: what a Modbus client reads and writes
 //!  dme        a server of I++ DME, which is told touch by touch what to do
+//!  rsh        a controller by LinuxCNC, which is told which program to run
+//!  wheel      what a wheel leaves that is led by a program
 //!  seen       what the machine saw and did
 //!  wire       Modbus TCP and RTU and I++ DME servers, a serial line without hardware, and everything that goes wrong on them
 //! ```
@@ -44,11 +46,13 @@ pub mod payload;
 pub mod probe;
 pub mod process;
 pub mod registers;
+pub mod rsh;
 pub mod seen;
 pub mod shape;
 pub mod spec;
 pub mod transfer;
 pub mod truth;
+pub mod wheel;
 pub mod wire;
 pub mod words;
 pub mod world;

@@ -15,6 +15,7 @@ use crate::probe::Placement;
 use crate::process::{Grinder, systematic_mm};
 use crate::spec::{Faults, SpecError, WorldSpec};
 use crate::truth::{GrindEntry, State, locked};
+use crate::wheel::Wheel;
 
 /// A simulated cell. Clones share one truth.
 #[derive(Clone)]
@@ -52,6 +53,12 @@ impl World {
     /// Returns the probe of the measuring machine, to be led touch by touch; there is one, so hand it to one wire.
     pub fn led(&self) -> Led {
         Led::new(self.state.clone())
+    }
+
+    /// Returns the wheel of the grinder, which is stated to have this radius, to be led from place to place; there is one, so hand it to one
+    /// controller.
+    pub fn wheel(&self, stated_mm: f64) -> Wheel {
+        Wheel::new(self.state.clone(), stated_mm)
     }
 
     /// Puts a new blank in, as an operator would.

@@ -63,6 +63,11 @@ impl Faults {
         self.rules().push(Rule { method: method.to_owned(), skip, fault });
     }
 
+    /// Forgets those that are still to come.
+    pub fn clear(&self) {
+        self.rules().clear();
+    }
+
     pub(super) fn at(&self, method: &str) -> Option<Fault> {
         let mut rules = self.rules();
         let mut met = None;

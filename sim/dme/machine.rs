@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 
+use super::deed::Deed;
 use super::line::{Argument, Command, Error};
 use crate::Vec3;
 use crate::cmm::{Led, Touch};
@@ -44,6 +45,8 @@ pub struct Done {
     pub warnings: Vec<Error>,
     /// Lines that are said while it moves.
     pub(super) scanned: VecDeque<super::scan::Scanned>,
+    /// The touch that it was.
+    pub(super) touched: Option<Deed>,
 }
 
 impl Done {
@@ -62,6 +65,8 @@ const PARAMETERS: [&str; 7] = [
     "ScanPar.Speed",
     "ScanPar.Retract",
 ];
+
+const FIRST_PARAMETERS: [f64; 7] = [50.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0];
 
 /// A frame: rows of the rotation that takes the machine's frame to it, and where the machine's origin is in it.
 #[derive(Clone, Copy, Debug)]
@@ -130,6 +135,14 @@ pub struct Machine {
     at_mm: Vec3,
     to_mm: Vec3,
     joystick: bool,
+    /// The command that is being carried out, and what it has set going.
+    at: String,
+    pub(super) deeds: Vec<Deed>,
+}
+
+/// Whether a command moves the machine.
+pub(super) fn moves(command: &str) -> bool {
+    matches!(command, "GoTo" | "PtMeas" | "ScanOnCurve" | "ChangeTool" | "Home")
 }
 
 impl Machine {
@@ -142,7 +155,7 @@ impl Machine {
             options,
             probe,
             tool: "NoTool".into(),
-            parameters: [50.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0],
+            parameters: FIRST_PARAMETERS,
             part_frame: Frame::MACHINE,
             in_part_frame: false,
             report: Vec::new(),
@@ -155,6 +168,8 @@ impl Machine {
             at_mm,
             to_mm: at_mm,
             joystick: true,
+            at: String::new(),
+            deeds: Vec::new(),
         }
     }
 
@@ -178,6 +193,13 @@ impl Machine {
         self.contacts
     }
 
+    /// Somebody leads the probe up, as high as it goes.
+    pub fn lift(&mut self) {
+        self.at_mm[2] = self.probe.volume_mm()[1][2];
+        self.to_mm = self.at_mm;
+        self.stop_short(1.0);
+    }
+
     pub(super) fn begin_session(&mut self) {
         self.report = ["X", "Y", "Z"].map(str::to_owned).to_vec();
         self.scan_report = ["X", "Y", "Z", "Q"].map(str::to_owned).to_vec();
@@ -186,6 +208,14 @@ impl Machine {
 
     /// Errors are forgotten: the probe may touch again.
     pub(super) fn arm(&mut self) {}
+
+    /// It is switched on anew: it has to be homed, and knows neither tool nor parameters nor frame.
+    pub(super) fn restart(&mut self) {
+        self.homed = false;
+        self.tool = "NoTool".into();
+        self.parameters = FIRST_PARAMETERS;
+        (self.part_frame, self.in_part_frame, self.joystick) = (Frame::MACHINE, false, true);
+    }
 
     /// The motion of the command has come to its end.
     pub(super) fn arrive(&mut self) {
@@ -213,8 +243,8 @@ impl Machine {
         let no = |number| Error::new(number, &command.name);
         let arguments = &command.arguments[..];
         let text = |text: String| Ok(Done::told(vec![text]));
-        let moves = matches!(command.name.as_str(), "GoTo" | "PtMeas" | "ScanOnCurve" | "ChangeTool" | "Home");
-        self.joystick &= !moves;
+        self.joystick &= !moves(&command.name);
+        self.at.clone_from(&command.name);
         match (command.name.as_str(), arguments) {
             ("GetDMEVersion", []) => text(format!("DMEVersion(\"{}\")", self.options.version)),
             ("GetMachineClass", []) => text(format!("GetMachineClass(\"{}\")", self.options.class)),
@@ -242,6 +272,7 @@ impl Machine {
                     return Err(no(1502));
                 }
                 self.tool.clone_from(name);
+                self.moves_to(self.at_mm);
                 Ok(Done { seconds: 10.0, ..Done::default() })
             }
             ("SetCoordSystem", [Argument::Name(name, None)]) => {
@@ -340,6 +371,7 @@ impl Machine {
     pub(super) fn moves_to(&mut self, to_mm: Vec3) -> Done {
         let way_mm = (0..3).map(|k| (to_mm[k] - self.at_mm[k]).powi(2)).sum::<f64>().sqrt();
         self.to_mm = to_mm;
+        self.deeds.push(Deed::Moves { command: self.at.clone(), from_mm: self.at_mm, to_mm });
         let speed = self.parameters[0].min(self.probe.travel_mm_s());
         Done { seconds: way_mm / speed, ..Done::default() }
     }
@@ -375,7 +407,8 @@ impl Machine {
                 };
                 self.to_mm = back;
                 let fields = self.reported(centre, normal, radius_mm);
-                Ok(Done { seconds, ..Done::told(fields) })
+                let touched = Some(Deed::Touched { point_mm, normal, centre_mm: centre });
+                Ok(Done { seconds, touched, ..Done::told(fields) })
             }
             Touch::Missed => {
                 self.arrive();

@@ -5,11 +5,13 @@
 //!  machine  what the machine is and does: tools, frames, motion, touches
 //!  scan     curves that are passed over in contact
 //!  faults   what goes wrong, at which command
+//!  deed     what the machine did
 //! ```
 //!
 //! Commands are acknowledged as they come and carried out one after another; those that end in E at once. After an error nothing but
 //! ClearAllErrors is taken. What an abort meets is told so, each with error 0006.
 
+pub mod deed;
 pub mod faults;
 pub mod line;
 pub mod machine;
@@ -18,6 +20,7 @@ mod scan;
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use deed::{Deed, Witness};
 use faults::{Fault, Faults};
 use line::{Command, Error, Tag};
 use machine::{Done, Machine};
@@ -42,6 +45,8 @@ struct Running {
     began: Duration,
     ends: Duration,
     done: Result<Done, Error>,
+    /// Its client has gone: nobody is told how it ends.
+    unheard: bool,
 }
 
 impl Running {
@@ -65,6 +70,7 @@ pub struct Server {
     latched: bool,
     in_session: bool,
     out: VecDeque<Outgoing>,
+    witness: Option<Witness>,
 }
 
 impl Server {
@@ -79,6 +85,7 @@ impl Server {
             latched: false,
             in_session: false,
             out: VecDeque::new(),
+            witness: None,
         }
     }
 
@@ -88,12 +95,42 @@ impl Server {
     }
 
     /// The client is gone: what runs comes to its end, and nothing else is begun.
-    pub fn hung_up(&mut self) {
+    pub fn hung_up(&mut self, now: Duration) {
         self.waiting.clear();
         self.out.clear();
-        self.running = None;
-        self.machine.stop_short(1.0);
+        // What is acknowledged late is begun late, or not at all.
+        if self.running.as_ref().is_some_and(|running| running.began > now) {
+            self.abandon(now, &Error::new(6, ""));
+            self.out.clear();
+        }
+        self.running.iter_mut().for_each(|running| running.unheard = true);
         (self.in_session, self.latched) = (false, false);
+    }
+
+    /// The server is started anew: what runs is broken off where it is, and the machine has to be homed.
+    pub fn restart(&mut self, now: Duration) {
+        self.hung_up(now);
+        self.abandon(now, &Error::new(500, "restart"));
+        self.out.clear();
+        self.latched = false;
+        self.machine.restart();
+        self.tell(&[Deed::Restarted]);
+    }
+
+    /// Has somebody told of everything that the machine does from now on, while it happens.
+    pub fn witness(&mut self, witness: Witness) {
+        self.witness = Some(witness);
+    }
+
+    fn tell(&mut self, deeds: &[Deed]) {
+        if let Some(witness) = &mut self.witness {
+            deeds.iter().for_each(witness);
+        }
+    }
+
+    /// Whether the machine moves.
+    pub fn moves(&self) -> bool {
+        self.running.as_ref().is_some_and(|running| machine::moves(&running.command.name))
     }
 
     /// When something is to be done next without a line having come.
@@ -105,12 +142,23 @@ impl Server {
     /// The stop circuit opens.
     pub fn emergency_stop(&mut self, now: Duration) {
         self.abandon(now, &Error::new(500, "emergency"));
+        self.tell(&[Deed::Stopped]);
         self.latched = true;
         self.say(now, format!("E0000 ! {}", Error::new(500, "emergency")));
     }
 
     /// Lets time pass and returns what is to be sent now.
     pub fn tick(&mut self, now: Duration) -> Vec<Outgoing> {
+        self.pass(now);
+        let mut due = Vec::new();
+        while self.out.front().is_some_and(|out| out.at <= now) {
+            due.extend(self.out.pop_front());
+        }
+        due
+    }
+
+    /// Lets time pass while nobody is there who could be sent anything.
+    pub fn pass(&mut self, now: Duration) {
         while self.running.as_ref().is_some_and(|running| running.next(self.speed) <= now) {
             if self.say_scanned() {
                 continue;
@@ -118,11 +166,6 @@ impl Server {
             self.finish();
             self.begin_next(now);
         }
-        let mut due = Vec::new();
-        while self.out.front().is_some_and(|out| out.at <= now) {
-            due.extend(self.out.pop_front());
-        }
-        due
     }
 
     /// Takes a line, without its end.
@@ -157,6 +200,7 @@ impl Server {
         match command.name.as_str() {
             "AbortE" if fault == Some(Fault::AbortIgnored) => return,
             "AbortE" => {
+                self.tell(&[Deed::Aborted]);
                 if self.abandon(now, &Error::new(6, "")) {
                     self.latched = true;
                 }
@@ -170,12 +214,13 @@ impl Server {
     /// Gives up what runs and what waits, and says whether there was anything.
     fn abandon(&mut self, now: Duration, error: &Error) -> bool {
         let running = self.running.take();
-        if let Some(running) = &running {
+        if let Some(running) = running.as_ref().filter(|running| machine::moves(&running.command.name)) {
             let whole = running.ends.saturating_sub(running.began).as_secs_f64();
             let so_far = now.saturating_sub(running.began).as_secs_f64();
             self.machine.stop_short(if whole > 0.0 { (so_far / whole).min(1.0) } else { 1.0 });
+            self.tell(&[Deed::Stands { at_mm: self.machine.at_mm() }]);
         }
-        let running = running.map(|running| (running.tag, running.command));
+        let running = running.filter(|running| !running.unheard).map(|running| (running.tag, running.command));
         let victims: Vec<(Tag, Command)> = running.into_iter().chain(self.waiting.drain(..)).collect();
         for (tag, command) in &victims {
             self.fail(*tag, &Error { cause: command.name.clone(), ..error.clone() }, now);
@@ -192,7 +237,8 @@ impl Server {
         let done = self.carry_out(&command);
         let lasts = done.as_ref().map_or(0.0, |done| done.seconds) / self.speed;
         let ends = now + Duration::try_from_secs_f64(lasts).unwrap_or_default();
-        self.running = Some(Running { tag, command, began: now, ends, done });
+        self.tell_of_machine();
+        self.running = Some(Running { tag, command, began: now, ends, done, unheard: false });
     }
 
     /// What a command does; gates come first.
@@ -224,23 +270,41 @@ impl Server {
         let Some(running) = &mut self.running else { return false };
         let at = running.next(self.speed);
         let Some(line) = running.done.as_mut().ok().and_then(|done| done.scanned.pop_front()) else { return false };
-        let (tag, fault) = (running.tag, running.command.fault.clone());
+        let (tag, fault, unheard) = (running.tag, running.command.fault.clone(), running.unheard);
         let cut = fault == Some(Fault::CutInScan);
         if cut {
             running.command.fault = None;
         }
         self.machine.is_at(line.at_mm);
+        if unheard {
+            return true;
+        }
         self.say_data(tag, &scan::spoilt(line, fault.as_ref()), fault.as_ref(), at);
         self.out.back_mut().into_iter().for_each(|out| out.closes = cut);
         true
     }
 
+    fn tell_of_machine(&mut self) {
+        let deeds = std::mem::take(&mut self.machine.deeds);
+        self.tell(&deeds);
+    }
+
     fn finish(&mut self) {
-        let Some(Running { tag, command, ends, done, .. }) = self.running.take() else { return };
+        let Some(Running { tag, command, ends, done, unheard, .. }) = self.running.take() else { return };
+        if done.is_ok() {
+            self.machine.arrive();
+            let touched = done.as_ref().ok().and_then(|done| done.touched.clone());
+            self.tell(touched.as_slice());
+        }
+        if machine::moves(&command.name) {
+            self.tell(&[Deed::Stands { at_mm: self.machine.at_mm() }]);
+        }
+        if unheard {
+            return;
+        }
         let fault = command.fault.clone();
         match done {
             Ok(done) => {
-                self.machine.arrive();
                 for warning in &done.warnings {
                     self.say(ends, format!("{tag} ! {warning}"));
                 }

@@ -5,8 +5,9 @@ use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::{TcpListener, TcpStream, ToSocketAddrs};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::net::{TcpListener, ToSocketAddrs};
+use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until};
 
@@ -15,17 +16,78 @@ use crate::dme::{Outgoing, Server};
 /// The longest line, its end left out.
 const LONGEST_LINE: usize = 65_536;
 
+/// A server that its wire, its client and a test share.
+#[derive(Clone)]
+pub struct SharedServer(Arc<Inner>);
+
+struct Inner {
+    server: Mutex<Server>,
+    /// The server was changed from outside: it may have something to say.
+    changed: Notify,
+    began: Instant,
+}
+
+impl From<Server> for SharedServer {
+    fn from(server: Server) -> Self {
+        Self(Arc::new(Inner { server: Mutex::new(server), changed: Notify::new(), began: Instant::now() }))
+    }
+}
+
+impl SharedServer {
+    /// Looks at the server, or changes it, while nobody else does.
+    pub fn with<T>(&self, look: impl FnOnce(&mut Server) -> T) -> T {
+        let looked = look(&mut self.locked());
+        self.0.changed.notify_one();
+        looked
+    }
+
+    /// The time of the server.
+    pub fn now(&self) -> Duration {
+        self.0.began.elapsed()
+    }
+
+    fn locked(&self) -> MutexGuard<'_, Server> {
+        self.0.server.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Serves a client until it goes away or is sent away, which is the end of its session.
+    pub async fn serve_client(&self, stream: impl AsyncRead + AsyncWrite + Unpin) {
+        // What goes wrong with a client is no other's concern.
+        let _ = self.converse(stream).await;
+        let now = self.now();
+        self.locked().hung_up(now);
+    }
+
+    async fn converse(&self, mut stream: impl AsyncRead + AsyncWrite + Unpin) -> io::Result<()> {
+        let mut unread = Vec::new();
+        loop {
+            let due = self.locked().due().map(|due| self.0.began + due);
+            tokio::select! {
+                read = stream.read_buf(&mut unread) => if read? == 0 { return Ok(()) },
+                () = sleep_until(due.unwrap_or_else(Instant::now)), if due.is_some() => {}
+                () = self.0.changed.notified() => {}
+            }
+            while let Some(end) = unread.iter().position(|b| *b == b'\n') {
+                let line: Vec<u8> = unread.drain(..=end).collect();
+                let line = String::from_utf8_lossy(&line);
+                self.locked().receive(line.trim_end_matches(['\r', '\n']), self.now());
+            }
+            if unread.len() > LONGEST_LINE {
+                return Ok(());
+            }
+            let outgoing = self.locked().tick(self.now());
+            if send(&mut stream, &outgoing).await? {
+                return stream.shutdown().await;
+            }
+        }
+    }
+}
+
 /// A server that is being served, until this is dropped.
 pub struct ServingDme {
     local_addr: SocketAddr,
-    server: Shared,
+    server: SharedServer,
     _tasks: JoinSet<()>,
-}
-
-type Shared = Arc<Mutex<Server>>;
-
-fn locked(server: &Shared) -> MutexGuard<'_, Server> {
-    server.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl ServingDme {
@@ -36,9 +98,9 @@ impl ServingDme {
     pub async fn tcp(addr: impl ToSocketAddrs, server: Server) -> io::Result<Self> {
         let listener = TcpListener::bind(addr).await?;
         let local_addr = listener.local_addr()?;
-        let server = Arc::new(Mutex::new(server));
+        let server = SharedServer::from(server);
         let mut tasks = JoinSet::new();
-        tasks.spawn(serve(listener, Arc::clone(&server)));
+        tasks.spawn(serve(listener, server.clone()));
         Ok(Self { local_addr, server, _tasks: tasks })
     }
 
@@ -49,51 +111,26 @@ impl ServingDme {
 
     /// Looks at the server, or changes it, while nobody else does.
     pub fn with<T>(&self, look: impl FnOnce(&mut Server) -> T) -> T {
-        look(&mut locked(&self.server))
+        self.server.with(look)
     }
 }
 
 /// Serves one client after another.
-async fn serve(listener: TcpListener, server: Shared) {
-    let began = Instant::now();
+async fn serve(listener: TcpListener, server: SharedServer) {
     loop {
         match listener.accept().await {
             Ok((stream, _)) => {
-                // A client that goes away is the end of its session, and no other's concern.
-                let _ = serve_client(stream, &server, began).await;
-                locked(&server).hung_up();
+                if stream.set_nodelay(true).is_ok() {
+                    server.serve_client(stream).await;
+                }
             }
             Err(_) => tokio::time::sleep(Duration::from_millis(20)).await,
         }
     }
 }
 
-async fn serve_client(mut stream: TcpStream, server: &Shared, began: Instant) -> io::Result<()> {
-    stream.set_nodelay(true)?;
-    let mut unread = Vec::new();
-    loop {
-        let due = locked(server).due().map(|due| began + due);
-        tokio::select! {
-            read = stream.read_buf(&mut unread) => if read? == 0 { return Ok(()) },
-            () = sleep_until(due.unwrap_or_else(Instant::now)), if due.is_some() => {}
-        }
-        while let Some(end) = unread.iter().position(|b| *b == b'\n') {
-            let line: Vec<u8> = unread.drain(..=end).collect();
-            let line = String::from_utf8_lossy(&line);
-            locked(server).receive(line.trim_end_matches(['\r', '\n']), began.elapsed());
-        }
-        if unread.len() > LONGEST_LINE {
-            return Ok(());
-        }
-        let outgoing = locked(server).tick(began.elapsed());
-        if send(&mut stream, &outgoing).await? {
-            return stream.shutdown().await;
-        }
-    }
-}
-
 /// Sends lines, several of them in one segment where nothing splits them, and says whether the connection is to be closed.
-async fn send(stream: &mut TcpStream, outgoing: &[Outgoing]) -> io::Result<bool> {
+async fn send(stream: &mut (impl AsyncWrite + Unpin), outgoing: &[Outgoing]) -> io::Result<bool> {
     let mut together = Vec::new();
     for line in outgoing {
         if line.split {

@@ -6,6 +6,7 @@
 //!  pty      a serial line without hardware, opened by its path
 //!  faults   what goes wrong on Modbus, when
 //!  dme      I++ DME over TCP, one client at a time
+//!  rsh      the lines of linuxcncrsh, any number of clients
 //! ```
 //!
 //! [`Serving`] is all that most callers need: it binds, serves, lets the machines' time pass, and stops.
@@ -17,6 +18,7 @@ pub mod faults;
 pub mod pty;
 #[cfg(unix)]
 pub mod pty;
+pub mod rsh;
 pub mod rtu;
 pub mod tcp;
 

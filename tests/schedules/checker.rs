@@ -8,6 +8,8 @@ use std::time::Duration;
 use regrind::cell::{Phase, StateName};
 use regrind::journal::{Reader, verify};
 use regrind_sim::command::{Command, State};
+use regrind_sim::dme::deed::Deed;
+use regrind_sim::rsh::deed::Deed as OfRsh;
 use regrind_sim::seen::What;
 use serde_json::Value;
 use tokio::time::Instant;
@@ -17,6 +19,7 @@ use crate::machines::Moment;
 use crate::person::Given;
 use crate::schedule::Tally;
 use crate::wire::{Sent, Traffic};
+use crate::{programs, touches};
 
 /// A cell that shows that it stands may be wrong for so long: a machine that hears nothing holds by itself after three seconds.
 const STANDS_WITHIN: Duration = Duration::from_millis(3_600);
@@ -48,6 +51,10 @@ pub struct Evidence {
     pub job: u32,
     pub folder: PathBuf,
     pub log: Vec<Moment>,
+    /// What the CMM did, where it is one by I++ DME.
+    pub deeds: Vec<(Instant, Deed)>,
+    /// What the grinder did, where it is one by LinuxCNC.
+    pub rsh_deeds: Vec<(Instant, OfRsh)>,
     pub given: Vec<Given>,
     pub written: Vec<Recorded>,
     pub shown: Vec<Shown>,
@@ -55,6 +62,8 @@ pub struct Evidence {
     pub wires: Traffic,
     /// From when to when something was in the way of questions to the machines; none where that may have been so at any time.
     pub hindered: Option<Vec<(Instant, Instant)>>,
+    /// How far over the highest target the probe's centre travels.
+    pub clearance_mm: f64,
     /// Whether a machine's application may have stood still.
     pub freezes: bool,
     /// Whether it came to the end it should come to where nothing was in its way but deaths of the program.
@@ -74,19 +83,30 @@ impl Evidence {
             .sent
             .iter()
             .map(|s| (s.at, format!("{} is sent {:?} {}", NAMES[s.machine], s.command, s.frame.sequence)));
-        let mut lines: Vec<(Instant, String)> = log.chain(written).chain(given).chain(shown).chain(sent).collect();
+        let deeds = self.deeds.iter().map(|(at, deed)| (*at, format!("cmm {deed:?}")));
+        let rsh_deeds = self.rsh_deeds.iter().map(|(at, deed)| (*at, format!("grinder {:.180}", format!("{deed:?}"))));
+        let spoken = self.wires.lines.iter().map(|s| (s.at, format!("{} is told {}", NAMES[s.machine], s.line)));
+        let mut lines: Vec<(Instant, String)> = log
+            .chain(written)
+            .chain(given)
+            .chain(shown)
+            .chain(sent)
+            .chain(deeds)
+            .chain(rsh_deeds)
+            .chain(spoken)
+            .collect();
         lines.sort_by_key(|(at, _)| *at);
         let home = self.folder.display().to_string();
         let line = |(at, what): (Instant, String)| format!("{:10.4} {}", self.seconds(at), what.replace(&home, "RUN"));
         lines.into_iter().map(line).collect()
     }
 
-    fn seconds(&self, at: Instant) -> f64 {
+    pub fn seconds(&self, at: Instant) -> f64 {
         (at - self.began).as_secs_f64()
     }
 
     /// What the cell showed last before a moment.
-    fn shown_before(&self, at: Instant) -> Option<&Shown> {
+    pub fn shown_before(&self, at: Instant) -> Option<&Shown> {
         let next = self.shown.partition_point(|shown| shown.at < at);
         self.shown[..next].last()
     }
@@ -129,6 +149,8 @@ pub fn check(evidence: &Evidence) -> Result<(), String> {
     aborted_at_once(evidence)?;
     answered_is_on_record(evidence, &records)?;
     asked_as_it_should_be(evidence)?;
+    touches::check(evidence)?;
+    programs::check(evidence)?;
     if !evidence.ended_well {
         return Err("nothing went wrong but that the program died, and the run does not end as it should".to_owned());
     }
@@ -391,17 +413,24 @@ fn strays_are_told_to_hold(evidence: &Evidence) -> Result<(), String> {
 /// An abort is on its way at once to a machine that moves, whatever the disk does; where nothing is in the way of it.
 fn aborted_at_once(evidence: &Evidence) -> Result<(), String> {
     let Some(hindered) = &evidence.hindered else { return Ok(()) };
+    let by_lines = [!evidence.deeds.is_empty(), !evidence.rsh_deeds.is_empty()];
     for abort in evidence.given.iter().filter(|given| given.what == "abort" && given.done) {
         let by = abort.at + ABORTS_WITHIN;
         let is_hindered = hindered.iter().any(|(from, to)| *from <= by && abort.at <= *to + RECOVERS_WITHIN);
         // A program that was started again has to meet the machines first.
         let lives = evidence.shown.iter().rposition(|shown| shown.at <= abort.at && shown.state.is_none());
         let has_met = lives.is_none_or(|end| evidence.shown[end].at + RECOVERS_WITHIN < abort.at);
-        for (k, name) in NAMES.iter().enumerate().filter(|(k, _)| abort.moved[*k] && !is_hindered && has_met) {
+        let met = |k: usize| has_met || by_lines[k];
+        for (k, name) in NAMES.iter().enumerate().filter(|(k, _)| abort.moved[*k] && !is_hindered && met(*k)) {
             let began = evidence.log.iter().rfind(|moment| {
                 moment.machine == k
                     && moment.at <= abort.at
-                    && matches!(moment.what, What::Began { .. } | What::Strayed)
+                    && match &moment.what {
+                        What::Began { .. } | What::Strayed => true,
+                        // Who knows no jobs is seen to move.
+                        What::Changed { to, .. } => by_lines[k] && *to == State::Execute,
+                        _ => false,
+                    }
             });
             let since = began.map_or(evidence.began, |moment| moment.at);
             let aborts = |sent: &&Sent| sent.machine == k && sent.command == Command::Abort;
@@ -475,7 +504,7 @@ fn said_of_starts_is_so(evidence: &Evidence) -> Result<(), String> {
 }
 
 /// Whether a record is the intent of a START of a machine.
-fn is_intent(recorded: &Recorded, machine: usize) -> bool {
+pub fn is_intent(recorded: &Recorded, machine: usize) -> bool {
     recorded.payload["command"] == "start_machine" && recorded.payload["device"] == NAMES[machine]
 }
 
@@ -493,7 +522,10 @@ fn asked_as_it_should_be(evidence: &Evidence) -> Result<(), String> {
 /// An order that was accepted is on record, and was so before it was answered.
 fn answered_is_on_record(evidence: &Evidence, records: &[Value]) -> Result<(), String> {
     for given in evidence.given.iter().filter(|given| given.accepted) {
-        let names = |payload: &Value| payload["reason"] == given.reason || payload["evidence"] == given.reason;
+        let names = |payload: &Value| match given.what {
+            "clear" => payload["event"] == "clear_confirmed",
+            _ => payload["reason"] == given.reason || payload["evidence"] == given.reason,
+        };
         let in_time = evidence.written.iter().any(|w| names(&w.payload) && w.at <= given.answered);
         let stands = records.iter().any(names) || evidence.job > 1;
         if !in_time || !stands {

@@ -126,6 +126,11 @@ impl Cues {
         self.give(Some(Cue::StartSent));
     }
 
+    /// A machine that knows no jobs begins one.
+    pub fn begin(&self) {
+        self.give(Some(Cue::Begins));
+    }
+
     fn give(&self, cue: Option<Cue>) {
         if let Some(cue) = cue {
             self.0.send_modify(|counts| counts[cue as usize] += 1);

@@ -4,17 +4,27 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use regrind_sim::command::State;
+use regrind_sim::dme::deed::Deed;
+use regrind_sim::dme::faults::Faults as DmeFaults;
+use regrind_sim::dme::{Server, machine as probe};
 use regrind_sim::options::MachineOptions;
 use regrind_sim::registers::Machine;
+use regrind_sim::rsh::Controller;
+use regrind_sim::rsh::deed::Deed as OfRsh;
+use regrind_sim::rsh::faults::Faults as RshFaults;
 use regrind_sim::seen::What;
 use regrind_sim::spec::WorldSpec;
-use regrind_sim::wire::{SharedMachine, Units};
+use regrind_sim::wire::SharedMachine;
+use regrind_sim::wire::dme::SharedServer;
+use regrind_sim::wire::rsh::SharedController;
 use regrind_sim::world::World;
 use serde::Deserialize;
 use tokio::time::Instant;
 
 use crate::cue::Cues;
+use crate::net::Far;
 use crate::part::{Wanted, setting};
+use crate::schedule::Schedule;
 
 /// How often their time passes.
 const TICK: Duration = Duration::from_millis(10);
@@ -31,48 +41,194 @@ pub struct Moment {
 /// What both did, in order.
 pub type Log = Arc<Mutex<Vec<Moment>>>;
 
+/// What a measuring machine by I++ DME did, in order.
+pub type Deeds = Arc<Mutex<Vec<(Instant, Deed)>>>;
+
+/// What a grinder by LinuxCNC did, in order.
+pub type RshDeeds = Arc<Mutex<Vec<(Instant, OfRsh)>>>;
+
+/// How much slower a program is run than a pass of a machine of registers, which does its strokes in it.
+const OF_PROGRAMS: f64 = 0.25;
+
+/// A machine, behind whichever wire.
+#[derive(Clone)]
+pub enum Plant {
+    Registers(SharedMachine),
+    Dme(SharedServer),
+    Rsh(SharedController),
+}
+
+impl Plant {
+    /// Whether it may be moving.
+    pub fn moves(&self) -> bool {
+        match self {
+            Self::Registers(machine) => moves(machine.with(|machine| machine.state())),
+            Self::Dme(server) => server.with(|server| server.moves()),
+            Self::Rsh(controller) => controller.with(|controller| controller.moves()),
+        }
+    }
+
+    /// Whether a person who looks at it says that it is at no job.
+    pub fn is_over(&self) -> bool {
+        match self {
+            Self::Registers(machine) => {
+                let state = machine.with(|machine| machine.state());
+                matches!(state, State::Idle | State::Complete | State::Aborted | State::Faulted)
+            }
+            Self::Dme(server) => !server.with(|server| server.moves()),
+            Self::Rsh(controller) => !controller.with(|controller| controller.is_busy()),
+        }
+    }
+
+    /// Somebody has led it away from the part by hand.
+    pub fn moved_away(&self) {
+        match self {
+            Self::Registers(_) => {}
+            Self::Dme(server) => server.with(|server| server.machine().lift()),
+            Self::Rsh(controller) => controller.with(Controller::lead_away),
+        }
+    }
+
+    /// The machine of registers that it is.
+    pub fn registers(&self) -> Option<&SharedMachine> {
+        if let Self::Registers(machine) = self { Some(machine) } else { None }
+    }
+
+    fn live(&self) {
+        match self {
+            Self::Registers(machine) => machine.with(|machine| machine.tick(TICK)),
+            Self::Dme(server) => {
+                let now = server.now();
+                server.with(|server| server.pass(now));
+            }
+            Self::Rsh(controller) => controller.live(),
+        }
+    }
+}
+
 pub struct Machines {
-    pub shared: [SharedMachine; 2],
+    pub plants: [Plant; 2],
     pub log: Log,
+    pub deeds: Deeds,
+    /// What is still to go wrong at the server of I++ DME.
+    pub dme_faults: DmeFaults,
+    pub rsh_deeds: RshDeeds,
+    pub rsh_faults: RshFaults,
 }
 
 impl Machines {
     /// Switches both on, so many times as fast as real ones; trusting ones do not see to it themselves that nothing comes twice.
-    pub fn new(seed: u64, speed: f64, trusting: bool, cues: &Cues) -> Self {
+    pub fn new(schedule: &Schedule, cues: &Cues) -> Self {
+        let Schedule { seed, speed, trusting, .. } = *schedule;
         let truth = setting(Wanted::Good).recipe.simulation.clone().unwrap();
         let mut spec = WorldSpec::deserialize(toml::Value::Table(truth)).unwrap();
         spec.seed = 1 + seed % 7;
+        if schedule.dme.is_some() {
+            spec.cmm.not_found_share = 0.01;
+        }
         let world = World::new(spec).unwrap();
+        let (log, deeds, dme_faults) = (Log::default(), Deeds::default(), DmeFaults::none());
         let options = |seed| MachineOptions { speed, seed, trusting, ..MachineOptions::default() };
-        let cmm = Machine::new(Box::new(world.cmm()), 71, options(seed ^ 0xC));
-        let grinder = Machine::new(Box::new(world.grinder()), 72, options(seed ^ 0x6));
-        let log = Log::default();
-        let mut number = 0;
-        let shared = [cmm, grinder].map(|mut machine| {
-            let (log, of, cues) = (log.clone(), number, cues.clone());
-            number += 1;
+        let by_registers = |number: usize, mut machine: Machine| {
+            let (log, cues) = (log.clone(), cues.clone());
             machine.witness(Box::new(move |seen| {
                 cues.see_machine(&seen.what);
-                log.lock().unwrap().push(Moment { at: Instant::now(), machine: of, what: seen.what.clone() });
+                log.lock().unwrap().push(Moment { at: Instant::now(), machine: number, what: seen.what.clone() });
             }));
-            SharedMachine::from(machine)
-        });
-        Self { shared, log }
+            Plant::Registers(SharedMachine::from(machine))
+        };
+        let cmm = match &schedule.dme {
+            None => by_registers(0, Machine::new(Box::new(world.cmm()), 71, options(seed ^ 0xC))),
+            Some(faults) => {
+                for (method, skip, fault) in faults {
+                    dme_faults.add(method, *skip, fault.clone());
+                }
+                Plant::Dme(by_lines(&world, speed, dme_faults.clone(), (&log, &deeds, cues)))
+            }
+        };
+        let (rsh_deeds, rsh_faults) = (RshDeeds::default(), RshFaults::none());
+        let grinder = match &schedule.rsh {
+            None => by_registers(1, Machine::new(Box::new(world.grinder()), 72, options(seed ^ 0x6))),
+            Some(faults) => {
+                for (begins, skip, fault) in faults {
+                    rsh_faults.add(begins, *skip, fault.clone());
+                }
+                let speed = OF_PROGRAMS * speed;
+                Plant::Rsh(by_programs(&world, speed, rsh_faults.clone(), (&log, &rsh_deeds, cues)))
+            }
+        };
+        Self { plants: [cmm, grinder], log, deeds, dme_faults, rsh_deeds, rsh_faults }
     }
 
-    /// Returns the units behind the wire of a machine.
-    pub fn units(&self, which: usize) -> Units {
-        vec![(which as u8 + 1, self.shared[which].clone())]
+    /// Returns what is at the far end of the wire of a machine.
+    pub fn far(&self, which: usize) -> Far {
+        match &self.plants[which] {
+            Plant::Registers(machine) => Far::Registers(vec![(which as u8 + 1, machine.clone())]),
+            Plant::Dme(server) => Far::Dme(server.clone()),
+            Plant::Rsh(controller) => Far::Rsh(controller.clone()),
+        }
+    }
+
+    /// Returns both, as they are on one line.
+    pub fn both(&self) -> Far {
+        let units = self.plants.iter().enumerate();
+        Far::Registers(units.filter_map(|(k, plant)| Some((k as u8 + 1, plant.registers()?.clone()))).collect())
     }
 
     /// Lets their time pass.
-    pub async fn live(shared: [SharedMachine; 2]) {
+    pub async fn live(plants: [Plant; 2]) {
         let mut ticks = tokio::time::interval(TICK);
         loop {
             ticks.tick().await;
-            shared.iter().for_each(|machine| machine.with(|machine| machine.tick(TICK)));
+            plants.iter().for_each(Plant::live);
         }
     }
+}
+
+/// A measuring machine behind a server of I++ DME.
+fn by_lines(world: &World, speed: f64, faults: DmeFaults, (log, deeds, cues): (&Log, &Deeds, &Cues)) -> SharedServer {
+    let mut server = Server::new(probe::Machine::new(world.led(), probe::Options::default()), speed, faults);
+    let (log, deeds, cues) = (log.clone(), deeds.clone(), cues.clone());
+    server.witness(Box::new(move |deed| {
+        let at = Instant::now();
+        deeds.lock().unwrap().push((at, deed.clone()));
+        let (from, to) = match deed {
+            Deed::Moves { command, .. } => {
+                if command == "ChangeTool" {
+                    cues.begin();
+                }
+                (State::Idle, State::Execute)
+            }
+            Deed::Stands { .. } => (State::Execute, State::Idle),
+            _ => return,
+        };
+        log.lock().unwrap().push(Moment { at, machine: 0, what: What::Changed { from, to } });
+    }));
+    SharedServer::from(server)
+}
+
+/// A grinder behind linuxcncrsh.
+fn by_programs(
+    world: &World,
+    speed: f64,
+    faults: RshFaults,
+    (log, deeds, cues): (&Log, &RshDeeds, &Cues),
+) -> SharedController {
+    let radius_mm = setting(Wanted::Good).recipe.grinding.wheel.radius_mm();
+    let mut controller = Controller::new(world.wheel(radius_mm), speed, faults);
+    let (log, deeds, cues) = (log.clone(), deeds.clone(), cues.clone());
+    controller.witness(Box::new(move |deed| {
+        let at = Instant::now();
+        deeds.lock().unwrap().push((at, deed.clone()));
+        let (from, to) = match deed {
+            OfRsh::Began { .. } => return cues.begin(),
+            OfRsh::Moves => (State::Idle, State::Execute),
+            OfRsh::Stands => (State::Execute, State::Idle),
+            _ => return,
+        };
+        log.lock().unwrap().push(Moment { at, machine: 1, what: What::Changed { from, to } });
+    }));
+    SharedController::from(controller)
 }
 
 /// Whether a machine may be moving in a state.

@@ -13,7 +13,9 @@ use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
 use regrind::device::{Dial, Dialled, Line, LineStream};
 use regrind_sim::wire::Units;
+use regrind_sim::wire::dme::SharedServer;
 use regrind_sim::wire::faults::Faults;
+use regrind_sim::wire::rsh::SharedController;
 use regrind_sim::wire::rtu::{Line as Pace, serve_rtu};
 use regrind_sim::wire::tcp::serve_client;
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, DuplexStream, ReadBuf, duplex, split};
@@ -22,7 +24,7 @@ use tokio::task::AbortHandle;
 
 use crate::cue::Cues;
 use crate::life::Life;
-use crate::wire::{Watched, Wires};
+use crate::wire::{Listening, Watched, Wires};
 
 /// How a network carries, as of now.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -41,13 +43,26 @@ impl Weather {
     pub const FAIR: Self = Self { slow_share: 0.0, slow: Duration::ZERO, down: false, silent: false };
 }
 
+/// Between two looks whether a network carries again.
+const AGAIN: Duration = Duration::from_millis(20);
+
+/// Who is at the far end of a wire.
+#[derive(Clone)]
+pub enum Far {
+    Registers(Units),
+    Dme(SharedServer),
+    Rsh(SharedController),
+}
+
 /// The network to one machine, or to both on one line.
 #[derive(Clone)]
 pub struct Net(Arc<Shared>);
 
 struct Shared {
-    units: Units,
+    far: Far,
     faults: Faults,
+    /// A server of lines has one client at a time.
+    turn: Arc<tokio::sync::Mutex<()>>,
     state: Mutex<State>,
     /// The machines' end of a serial line; none where each call has a connection of its own.
     bus: Option<UnboundedSender<Vec<u8>>>,
@@ -71,16 +86,18 @@ impl fmt::Debug for Net {
 
 impl Net {
     /// A network of connections, or a serial line of so many bits a second.
-    pub fn new(units: Units, faults: Faults, baud: Option<u32>, seed: u64) -> Self {
+    pub fn new(far: Far, faults: Faults, baud: Option<u32>, seed: u64) -> Self {
+        let turn = Arc::default();
         let chance = StdRng::seed_from_u64(seed);
         let state =
             Mutex::new(State { weather: Weather::FAIR, changes: 0, chance, carrying: Vec::new(), listening: None });
-        let Some(baud) = baud else {
-            return Self(Arc::new(Shared { units, faults, state, bus: None }));
+        let (Some(baud), Far::Registers(units)) = (baud, &far) else {
+            return Self(Arc::new(Shared { far, faults, turn, state, bus: None }));
         };
+        let units = units.clone();
         let (ours, theirs) = duplex(1 << 16);
         let (bus, sent) = unbounded_channel();
-        let net = Self(Arc::new(Shared { units: units.clone(), faults: faults.clone(), state, bus: Some(bus) }));
+        let net = Self(Arc::new(Shared { far, faults: faults.clone(), turn, state, bus: Some(bus) }));
         tokio::spawn(async move { serve_rtu(theirs, units, Pace::paced(baud), faults).await });
         let (from_machines, to_machines) = split(ours);
         tokio::spawn(net.clone().carry_to(sent, to_machines));
@@ -146,6 +163,39 @@ impl Net {
         }
     }
 
+    /// Carries lines to a machine. What a network loses TCP sends again, as long as who has sent it is there; and it tells that he has gone.
+    async fn carry_lines_to(self, mut sent: UnboundedReceiver<Vec<u8>>, mut to: impl AsyncWrite + Unpin) {
+        while let Some(bytes) = sent.recv().await {
+            while self.is_silent() && !sent.is_closed() {
+                tokio::time::sleep(AGAIN).await;
+            }
+            let Some(way) = self.way() else { break };
+            tokio::time::sleep(way).await;
+            if to.write_all(&bytes).await.is_err() {
+                return;
+            }
+        }
+        let _ = to.shutdown().await;
+    }
+
+    async fn carry_lines_back(self, mut from: impl AsyncRead + Unpin, to: UnboundedSender<Vec<u8>>) {
+        let mut bytes = [0; 512];
+        while let Ok(count @ 1..) = from.read(&mut bytes).await {
+            while self.is_silent() && !to.is_closed() {
+                tokio::time::sleep(AGAIN).await;
+            }
+            let Some(way) = self.way() else { return };
+            tokio::time::sleep(way).await;
+            if to.send(bytes[..count].to_vec()).is_err() {
+                return;
+            }
+        }
+    }
+
+    fn is_silent(&self) -> bool {
+        self.state().weather.silent
+    }
+
     async fn carry_on_the_line(self, mut from: impl AsyncRead + Unpin) {
         let mut bytes = [0; 512];
         while let Ok(count @ 1..) = from.read(&mut bytes).await {
@@ -159,7 +209,7 @@ impl Net {
 
     fn call(&self, life: Arc<Life>, wires: Option<&(Wires, Cues)>) -> Port {
         let (to_client, from) = unbounded_channel();
-        let watched = wires.map(|wires| Watched::new(wires, self.0.bus.is_some()));
+        let watched = wires.map(|wires| self.watched(wires));
         if let Some(bus) = &self.0.bus {
             self.state().listening = Some(to_client);
             return Port { to: bus.clone(), from, ahead: VecDeque::new(), life, watched };
@@ -167,14 +217,37 @@ impl Net {
         let (ours, theirs): (DuplexStream, DuplexStream) = duplex(1 << 16);
         let (to, sent) = unbounded_channel();
         let shared = self.0.clone();
-        tokio::spawn(async move { serve_client(theirs, &shared.units, &shared.faults).await });
+        tokio::spawn(async move {
+            match &shared.far {
+                Far::Registers(units) => drop(serve_client(theirs, units, &shared.faults).await),
+                Far::Rsh(controller) => controller.serve_client(theirs).await,
+                Far::Dme(server) => {
+                    let _turn = shared.turn.lock().await;
+                    server.serve_client(theirs).await;
+                }
+            }
+        });
         let (from_machines, to_machines) = split(ours);
-        tokio::spawn(self.clone().carry_to(sent, to_machines));
-        let carrying = tokio::spawn(self.clone().carry_back(from_machines, to_client)).abort_handle();
+        let carrying = if let Far::Registers(_) = self.0.far {
+            tokio::spawn(self.clone().carry_to(sent, to_machines));
+            tokio::spawn(self.clone().carry_back(from_machines, to_client))
+        } else {
+            tokio::spawn(self.clone().carry_lines_to(sent, to_machines));
+            tokio::spawn(self.clone().carry_lines_back(from_machines, to_client))
+        };
+        let carrying = carrying.abort_handle();
         let mut state = self.state();
         state.carrying.retain(|carrying| !carrying.is_finished());
         state.carrying.push(carrying);
         Port { to, from, ahead: VecDeque::new(), life, watched }
+    }
+
+    fn watched(&self, wires: &(Wires, Cues)) -> Watch {
+        match self.0.far {
+            Far::Registers(_) => Watch::Frames(Watched::new(wires, self.0.bus.is_some())),
+            Far::Dme(_) => Watch::Lines(Listening::new(wires, 0)),
+            Far::Rsh(_) => Watch::Lines(Listening::new(wires, 1)),
+        }
     }
 
     /// Cuts off whoever listens: the program has died.
@@ -210,13 +283,34 @@ impl Dial for Caller {
     }
 }
 
+/// Who watches a connection.
+enum Watch {
+    Frames(Watched),
+    Lines(Listening),
+}
+
+impl Watch {
+    fn asks(&mut self, bytes: &[u8], waiting: usize) {
+        match self {
+            Self::Frames(watched) => watched.asks(bytes, waiting),
+            Self::Lines(listening) => listening.hears(bytes),
+        }
+    }
+
+    fn reads(&mut self, bytes: &[u8]) {
+        if let Self::Frames(watched) = self {
+            watched.reads(bytes);
+        }
+    }
+}
+
 /// The program's end of a connection.
 struct Port {
     to: UnboundedSender<Vec<u8>>,
     from: UnboundedReceiver<Vec<u8>>,
     ahead: VecDeque<u8>,
     life: Arc<Life>,
-    watched: Option<Watched>,
+    watched: Option<Watch>,
 }
 
 impl fmt::Debug for Port {

@@ -84,3 +84,9 @@ pub fn poll() -> [Duration; 2] {
     let cell = &setting(Wanted::Good).cell;
     [cell.cmm.link.timing.poll, cell.grinder.link.timing.poll]
 }
+
+/// How far over the highest target of a plan the centre of a probe travels that is led by lines.
+pub fn clearance_mm() -> f64 {
+    let measure = &setting(Wanted::Good).recipe.measure;
+    measure.safe_height_mm + measure.probe_radius_mm
+}

@@ -7,11 +7,13 @@ use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
 use regrind::cell::{Actor, Device, StateName};
 use regrind::drive::{Orders, Request};
-use regrind_sim::command::{State, interlock};
+use regrind_control::Next;
+use regrind_sim::command::interlock;
 use regrind_sim::wire::SharedMachine;
 use tokio::time::Instant;
 
 use crate::life::Life;
+use crate::machines::Plant;
 
 /// After so many resumes the person gives up in order, and after twice as many at once.
 const PATIENCE: u32 = 40;
@@ -36,15 +38,15 @@ pub fn actor() -> Actor {
 }
 
 pub struct Person {
-    pub shared: [SharedMachine; 2],
+    pub plants: [Plant; 2],
     pub given: Arc<Mutex<Vec<Given>>>,
     chance: StdRng,
     resumes: u32,
 }
 
 impl Person {
-    pub fn new(shared: [SharedMachine; 2], seed: u64) -> Self {
-        Self { shared, given: Arc::default(), chance: StdRng::seed_from_u64(seed), resumes: 0 }
+    pub fn new(plants: [Plant; 2], seed: u64) -> Self {
+        Self { plants, given: Arc::default(), chance: StdRng::seed_from_u64(seed), resumes: 0 }
     }
 
     /// Looks after the cell in one life of the program; never comes to an end.
@@ -53,10 +55,13 @@ impl Person {
         loop {
             let pause = Duration::from_millis(self.chance.random_range(50..1500));
             tokio::time::sleep(pause).await;
-            let (state, number, phase) = {
+            let (state, number, phase, next) = {
                 let seen = status.borrow();
-                (seen.state, seen.number, seen.phase)
+                (seen.state, seen.number, seen.phase, seen.next_step.clone())
             };
+            if let Next::SeeClear { device } = next {
+                self.see_clear(orders, life, device).await;
+            }
             if state != StateName::Held {
                 continue;
             }
@@ -74,11 +79,18 @@ impl Person {
         }
     }
 
+    /// Where a machine cannot tell whether it is clear of the part, a person looks, moves it away, and says so.
+    async fn see_clear(&mut self, orders: &Orders, life: &Life, device: Device) {
+        let plant = &self.plants[device as usize];
+        if !plant.moves() {
+            plant.moved_away();
+            self.give(orders, life, "clear", |_| Request::Clear { device }).await;
+        }
+    }
+
     /// Where a machine cannot tell what became of its job, a person looks whether it stands, and says so.
     async fn look_at(&mut self, orders: &Orders, life: &Life, device: Device) {
-        let state = self.shared[device as usize].with(|machine| machine.state());
-        let stands = matches!(state, State::Idle | State::Complete | State::Aborted | State::Faulted);
-        if self.resumes.is_multiple_of(4) && stands {
+        if self.resumes.is_multiple_of(4) && self.plants[device as usize].is_over() {
             self.give(orders, life, "over", |evidence| Request::Over { device, evidence }).await;
         }
     }
@@ -92,7 +104,7 @@ impl Person {
         request: impl FnOnce(String) -> Request,
     ) {
         let number = self.given.lock().unwrap().len();
-        give(orders, life, &self.given, (what, format!("order {number}")), &self.shared, request).await;
+        give(orders, life, &self.given, (what, format!("order {number}")), &self.plants, request).await;
     }
 }
 
@@ -102,11 +114,11 @@ pub async fn give(
     life: &Life,
     given: &Mutex<Vec<Given>>,
     (what, reason): (&'static str, String),
-    shared: &[SharedMachine; 2],
+    plants: &[Plant; 2],
     request: impl FnOnce(String) -> Request,
 ) {
     let at = Instant::now();
-    let moved = [0, 1].map(|k: usize| crate::machines::moves(shared[k].with(|machine| machine.state())));
+    let moved = [0, 1].map(|k: usize| plants[k].moves());
     let reply = orders.ask(request(reason.clone()), actor()).await;
     let Some(reply) = reply.filter(|_| !life.is_dead()) else { return };
     let accepted = reply.accepted;

@@ -7,6 +7,8 @@ use std::time::Duration;
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
 use regrind::journal::free_bytes;
+use regrind_sim::dme::faults::Fault as OfDme;
+use regrind_sim::rsh::faults::Fault as OfRsh;
 use regrind_sim::wire::faults::Fault;
 
 use crate::checker::{Evidence, check};
@@ -18,6 +20,15 @@ use crate::part::Wanted;
 
 /// The most lives of the program that are cut short.
 const MOST_DEATHS: usize = 3;
+
+/// From this seed on the machines are reached by other wires than Modbus.
+pub const OTHER_WIRES: u64 = 1_000_000;
+
+/// What goes wrong at a server of I++ DME: at which command, after how many of them, what.
+pub type DmeFault = (&'static str, u32, OfDme);
+
+/// What goes wrong at linuxcncrsh: at which line, after how many of them, what.
+pub type RshFault = (&'static str, u32, OfRsh);
 
 /// The schedule of a seed.
 #[derive(Clone, Debug)]
@@ -32,6 +43,10 @@ pub struct Schedule {
     /// Share of the requests to the machines with which something goes wrong.
     pub fault_share: f64,
     pub faults: Vec<Fault>,
+    /// What goes wrong at the CMM's server of I++ DME; none where the CMM is reached by Modbus.
+    pub dme: Option<Vec<DmeFault>>,
+    /// What goes wrong at the grinder's LinuxCNC; none where the grinder is reached by Modbus.
+    pub rsh: Option<Vec<RshFault>>,
     pub acts: Vec<(When, Act)>,
     /// Before which of its effects each life of the program ends.
     pub deaths: Vec<u64>,
@@ -90,14 +105,20 @@ pub enum Act {
     Suspend {
         lasts: Duration,
     },
+    /// The stop circuit of a machine opens for a moment.
+    EmergencyStop {
+        machine: usize,
+    },
     Order(&'static str),
 }
 
 impl Act {
     /// Whether what is asked of the machines may not arrive at once.
-    pub fn hinders(&self) -> Option<Duration> {
+    pub fn hinders(&self, by_lines: bool) -> Option<Duration> {
         match self {
             Self::Weather { lasts, .. } | Self::Suspend { lasts } => Some(*lasts),
+            Self::Freeze { lasts, .. } if by_lines => Some(*lasts),
+            Self::Reboot { .. } if by_lines => Some(Duration::from_secs(1)),
             _ => None,
         }
     }
@@ -106,6 +127,24 @@ impl Act {
 impl Schedule {
     /// Draws the schedule of a seed. Every kind of fault is in some schedules and not in others, so that none hides another.
     pub fn drawn(seed: u64) -> Self {
+        if seed >= OTHER_WIRES { Self::by_other_wires(seed) } else { Self::by_modbus(seed) }
+    }
+
+    /// What happens is drawn as for Modbus; the wires, and what goes wrong at their servers, by dice of their own.
+    fn by_other_wires(seed: u64) -> Self {
+        let mut chance = StdRng::seed_from_u64(seed ^ 0xD3E0_0000);
+        let mut drawn = Self { baud: None, ..Self::by_modbus(seed) };
+        let by_lines = [[true, false], [false, true], [true, true]][chance.random_range(0..3)];
+        drawn.dme = by_lines[0].then(|| dme_faults(&mut chance));
+        drawn.rsh = by_lines[1].then(|| rsh_faults(&mut chance));
+        if chance.random::<f64>() < 0.2 {
+            let when = When::drawn(&mut chance, 12.0);
+            drawn.acts.push((when, Act::EmergencyStop { machine: usize::from(by_lines[1]) }));
+        }
+        drawn
+    }
+
+    fn by_modbus(seed: u64) -> Self {
         let mut chance = StdRng::seed_from_u64(seed);
         let speed = [2000.0, 400.0, 60.0, 10.0][chance.random_range(0..4)];
         let trusting = chance.random::<f64>() < 0.5;
@@ -145,6 +184,8 @@ impl Schedule {
             baud: None,
             fault_share: 0.0,
             faults: Vec::new(),
+            dme: None,
+            rsh: None,
             acts: Vec::new(),
             deaths,
             wanted: Wanted::Perfect,
@@ -153,7 +194,12 @@ impl Schedule {
 
     /// Whether nothing goes wrong but that the program dies.
     pub fn dies_alone(&self) -> bool {
-        self.acts.is_empty() && self.fault_share == 0.0
+        self.acts.is_empty() && self.fault_share == 0.0 && self.servers_go_well()
+    }
+
+    /// Whether nothing goes wrong at the servers of lines.
+    pub fn servers_go_well(&self) -> bool {
+        self.dme.as_ref().is_none_or(Vec::is_empty) && self.rsh.as_ref().is_none_or(Vec::is_empty)
     }
 
     /// Runs it and holds what happened against the promises.
@@ -229,6 +275,63 @@ fn faults(chance: &mut StdRng, is_serial: bool) -> Vec<Fault> {
         drawn.push(Fault::Silence);
     }
     drawn
+}
+
+/// Draws what goes wrong at a server of I++ DME.
+fn dme_faults(chance: &mut StdRng) -> Vec<DmeFault> {
+    let late = |s: f64| OfDme::LateAcknowledgement(Duration::from_secs_f64(s));
+    let anywhere = [late(0.3), late(2.0), late(6.0), OfDme::NoCompletion, OfDme::Disconnect, OfDme::EmergencyStop];
+    let with_data =
+        [OfDme::Twice, OfDme::Split, OfDme::Reordered, OfDme::UnaskedQuality, OfDme::Garbled, OfDme::Stranger];
+    let at_all = ["GoTo", "GoTo", "PtMeas", "PtMeas", "SetProp", "Get", "ChangeTool", "StartSession", "ClearAllErrors"];
+    let mut faults = Vec::new();
+    for _ in 0..[0, 0, 1, 2, 4, 8][chance.random_range(0..6)] {
+        let skip = chance.random_range(0..120);
+        faults.push(match chance.random_range(0..10) {
+            0..4 => (at_all[chance.random_range(0..at_all.len())], skip, anywhere[chance.random_range(0..6)].clone()),
+            4..8 => (
+                ["PtMeas", "PtMeas", "Get"][chance.random_range(0..3)],
+                skip,
+                with_data[chance.random_range(0..6)].clone(),
+            ),
+            8 => ("AbortE", 0, OfDme::AbortIgnored),
+            _ => ("PtMeas", skip, OfDme::Severity([0, 1, 3, 9][chance.random_range(0..4)])),
+        });
+    }
+    faults
+}
+
+/// Draws what goes wrong at linuxcncrsh.
+fn rsh_faults(chance: &mut StdRng) -> Vec<RshFault> {
+    const SETS: [&str; 9] =
+        ["set run", "set run", "set open", "set open", "set mode", "set mdi", "set enable", "set pause", "set abort"];
+    let late = |s: f64| OfRsh::Late(Duration::from_secs_f64(s));
+    let all = [
+        OfRsh::Lost,
+        OfRsh::Unanswered,
+        late(0.5),
+        late(4.0),
+        OfRsh::Refused,
+        OfRsh::DoneAndRefused,
+        OfRsh::Ignored,
+        OfRsh::Fails,
+        OfRsh::CutBefore,
+        OfRsh::CutBehind,
+        OfRsh::Aside,
+    ];
+    let mut faults = Vec::new();
+    for _ in 0..[0, 0, 1, 2, 4, 8][chance.random_range(0..6)] {
+        faults.push(match chance.random_range(0..10) {
+            0..7 => {
+                let line = SETS[chance.random_range(0..SETS.len())];
+                (line, chance.random_range(0..4), all[chance.random_range(0..all.len())].clone())
+            }
+            7 => ("set run", chance.random_range(0..3), OfRsh::Limit(chance.random_range(0..1000))),
+            8 => ("hello", chance.random_range(0..2), all[chance.random_range(0..all.len())].clone()),
+            _ => ("get", chance.random_range(0..600), all[chance.random_range(0..all.len())].clone()),
+        });
+    }
+    faults
 }
 
 /// Draws what happens, and when. A misfortune seldom comes alone.

@@ -20,15 +20,57 @@ pub struct Sent {
     pub frame: Frame,
 }
 
+/// A line as it left the program, without its end.
+#[derive(Clone, Debug)]
+pub struct Spoken {
+    pub at: Instant,
+    /// 0 is the CMM, 1 the grinder.
+    pub machine: usize,
+    pub line: String,
+}
+
 /// What was seen on the wires.
 #[derive(Clone, Debug, Default)]
 pub struct Traffic {
     pub sent: Vec<Sent>,
+    pub lines: Vec<Spoken>,
     /// Questions that should not have been asked as they were.
     pub wrong: Vec<(Instant, String)>,
 }
 
 pub type Wires = Arc<Mutex<Traffic>>;
+
+/// Watches a connection of the program over which lines go.
+pub struct Listening {
+    wires: Wires,
+    cues: Cues,
+    machine: usize,
+    half: Vec<u8>,
+}
+
+impl Listening {
+    pub fn new((wires, cues): &(Wires, Cues), machine: usize) -> Self {
+        Self { wires: wires.clone(), cues: cues.clone(), machine, half: Vec::new() }
+    }
+
+    /// Bytes leave the program.
+    pub fn hears(&mut self, bytes: &[u8]) {
+        self.half.extend(bytes);
+        while let Some(end) = self.half.iter().position(|byte| *byte == b'\n') {
+            let line: Vec<u8> = self.half.drain(..=end).collect();
+            let line = String::from_utf8_lossy(&line).trim().to_owned();
+            let (at, machine) = (Instant::now(), self.machine);
+            let mut wires = self.wires.lock().unwrap();
+            if line == "set run" {
+                self.cues.see_start();
+            }
+            if line.ends_with(" AbortE()") || line == "set abort" {
+                wires.sent.push(Sent { at, machine, command: Command::Abort, frame: Frame::default() });
+            }
+            wires.lines.push(Spoken { at, machine, line });
+        }
+    }
+}
 
 /// Watches one connection of the program.
 pub struct Watched {

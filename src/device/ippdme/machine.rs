@@ -16,10 +16,12 @@ use super::text::Item;
 use super::work::{Order, Shared, Wish, Work, Worker, ask_if_there, locked};
 use crate::error::{Answered, DeviceError};
 use crate::machine::{Cmm, Interrupt, Machine};
+use crate::modbus::OfThisComputer;
 use crate::payload::{Identified, MeasuredPoint, Measurement, Plan, Preliminary};
 use crate::words::{
     Answer, Armed, Command, Fault, Identity, Job, MachineKind, Outcome, Reconciled, Started, State, Status, digest,
 };
+use crate::{Dial, Line};
 use regrind_formats::result::Coordinates;
 
 /// What a server calls its class that is simulated.
@@ -43,11 +45,24 @@ pub struct IppdmeCmm {
     /// The job of an interrupted run, whose points are gone.
     untold: Option<(Job, u32)>,
     told_ahead: usize,
+    dial: Box<dyn Dial>,
+    /// Whether what takes its while to compute is done in turn with everything else.
+    in_turn: bool,
 }
 
 impl IppdmeCmm {
     /// A machine; nothing is asked of it yet.
     pub fn new(settings: IppdmeSettings) -> Self {
+        Self::by(settings, Box::new(OfThisComputer), false)
+    }
+
+    /// A machine whose connections somebody else opens, and beside which no thread computes: for servers that stand in the same process, and
+    /// for time that does not pass by itself.
+    pub fn over(settings: IppdmeSettings, dial: Box<dyn Dial>) -> Self {
+        Self::by(settings, dial, true)
+    }
+
+    fn by(settings: IppdmeSettings, dial: Box<dyn Dial>, in_turn: bool) -> Self {
         Self {
             name: name(&settings),
             settings: Arc::new(settings),
@@ -61,15 +76,23 @@ impl IppdmeCmm {
             begun: 0,
             untold: None,
             told_ahead: 0,
+            dial,
+            in_turn,
         }
     }
 
-    /// Opens a session and proves whose it is. When it is open nothing moves: a server ends what it is at first.
+    /// Opens a session and proves whose it is. When it is open nothing moves: a server ends what it is at first, or aborts it where an abort
+    /// was ordered that no session has taken. What a job of ours has left may move for as long as one that nobody looks at.
     async fn open(&mut self) -> Answered<Identity> {
-        let (host, port) = (self.settings.host.as_str(), self.settings.port);
+        let state = locked(&self.shared).state;
+        let moved = state.moves() || self.untold.is_some();
+        // One that nobody has confirmed is given anew.
+        let aborted = self.aborts.borrow().saturating_sub(u64::from(state == State::Aborting));
+        let line = Line::Tcp { host: self.settings.host.clone(), port: self.settings.port };
         let (machine, aborts) = (Arc::clone(&self.name), self.aborts.subscribe());
-        let mut session = Session::dial(machine, (host, port), self.settings.limits, aborts).await?;
-        let identity = self.meet(&mut session).await.map_err(|failure| self.in_words("the session", failure))?;
+        let mut session =
+            Session::dial(machine, (&line, self.dial.as_mut()), self.settings.limits, (aborts, aborted)).await?;
+        let identity = self.meet(&mut session, moved).await.map_err(|failure| self.in_words("the session", failure))?;
         let (orders, inbox) = mpsc::channel(4);
         let worker = Worker {
             session,
@@ -91,8 +114,8 @@ impl IppdmeCmm {
         Ok(identity)
     }
 
-    async fn meet(&self, session: &mut Session) -> Result<Identity, Failure> {
-        session.open().await?;
+    async fn meet(&self, session: &mut Session, moved: bool) -> Result<Identity, Failure> {
+        session.open(moved.then_some(self.settings.silence_limit)).await?;
         let version = ask_if_there(session, "GetDMEVersion", Vec::new()).await?;
         let class = ask_if_there(session, "GetMachineClass", Vec::new()).await?;
         let said = |answer: &Option<super::session::Answer>, name: &str| match answer
@@ -427,11 +450,15 @@ impl Cmm for IppdmeCmm {
         self.loaded = None;
         let (owned, volume_mm, machine) = (plan.clone(), self.settings.volume_mm, Arc::clone(&self.name));
         let scan = self.settings.scan;
+        let find = move || Route::over(&owned, scan, &volume_mm, &machine).map(|route| Work { plan: owned, route });
         // The order of many targets takes its while.
-        let found = tokio::task::spawn_blocking(move || {
-            Route::over(&owned, scan, &volume_mm, &machine).map(|route| Work { plan: owned, route })
-        });
-        let work = found.await.unwrap_or_else(|panicked| std::panic::resume_unwind(panicked.into_panic()))?;
+        let work = match self.in_turn {
+            true => find(),
+            false => {
+                let found = tokio::task::spawn_blocking(find).await;
+                found.unwrap_or_else(|panicked| std::panic::resume_unwind(panicked.into_panic()))
+            }
+        }?;
         self.loaded = Some((Arc::new(work), digest(&[plan.identity()])));
         Ok(())
     }

@@ -9,7 +9,6 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
-use tokio::net::TcpStream;
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
@@ -17,6 +16,7 @@ use super::command::{Command, LONGEST_LINE};
 use super::response::{Response, Said, ServerError, value};
 use super::text::{Item, Tag};
 use crate::error::DeviceError;
+use crate::{Dial, Line};
 
 /// How long to wait for what.
 #[derive(Clone, Copy, Debug)]
@@ -105,32 +105,47 @@ impl Session {
     /// Opens the connection; nothing is said yet.
     pub(super) async fn dial(
         machine: Arc<str>,
-        (host, port): (&str, u16),
+        (line, dial): (&Line, &mut dyn Dial),
         limits: Limits,
-        aborts: watch::Receiver<u64>,
+        (aborts, aborted): (watch::Receiver<u64>, u64),
     ) -> Result<Self, DeviceError> {
         let unreachable = |why| DeviceError::Unreachable { machine: Arc::clone(&machine), why, limit: limits.answer };
-        let dialled = timeout(limits.answer, TcpStream::connect((host, port))).await;
+        let dialled = timeout(limits.answer, dial.dial(line)).await;
         let stream = dialled.unwrap_or(Err(std::io::ErrorKind::TimedOut.into())).map_err(|e| unreachable(e.kind()))?;
-        // What is given up takes what it has not sent along: no command arrives after that.
-        stream.set_nodelay(true).and_then(|()| stream.set_zero_linger()).map_err(|e| unreachable(e.kind()))?;
-        Ok(Self::on(Arc::clone(&machine), Box::new(stream), limits, aborts))
+        Ok(Self::on(aborted, Arc::clone(&machine), Box::new(stream), limits, aborts))
     }
 
-    pub(super) fn on(machine: Arc<str>, stream: Box<dyn Stream>, limits: Limits, aborts: watch::Receiver<u64>) -> Self {
-        let aborted = *aborts.borrow();
+    /// A session that has so many aborts behind it; one that was ordered since goes out first.
+    fn on(
+        aborted: u64,
+        machine: Arc<str>,
+        stream: Box<dyn Stream>,
+        limits: Limits,
+        aborts: watch::Receiver<u64>,
+    ) -> Self {
         let (unread, notes) = (Vec::new(), VecDeque::new());
         Self { machine, stream, unread, limits, last: 0, last_event: 0, aborts, aborted, notes }
     }
 
     /// Begins a session anew, whatever the server was at: it ends the one that may be left over, and that waits for its motion. A server in
     /// an error, or in a session that it did not end for one, is tried again when it has forgotten that.
-    pub(super) async fn open(&mut self) -> Result<(), Failure> {
+    ///
+    /// What a job of ours has left that moves comes to its end, unless an abort was ordered or it moves for longer than `ours_within`.
+    pub(super) async fn open(&mut self, ours_within: Option<Duration>) -> Result<(), Failure> {
         const LEFT_OVER: [u16; 4] = [8, 507, 508, 514];
+        if self.is_abort_ordered() {
+            self.aborted = *self.aborts.borrow();
+            self.send_abort(true).await?;
+        }
         for again in [true, false] {
-            match self.ask("EndSession", Vec::new()).await {
-                Ok(_) | Err(Failure::No(_)) => {}
-                Err(other) => return Err(other),
+            let ended = match ours_within.filter(|_| again) {
+                Some(limit) => timeout(limit, self.ask("EndSession", Vec::new())).await.ok(),
+                None => Some(self.ask("EndSession", Vec::new()).await),
+            };
+            match ended {
+                Some(Ok(_) | Err(Failure::No(_))) => {}
+                Some(Err(other)) => return Err(other),
+                None => self.send_abort(true).await?,
             }
             match self.ask("StartSession", Vec::new()).await {
                 Err(Failure::No(error)) if again && LEFT_OVER.contains(&error.number) => {
@@ -308,6 +323,12 @@ impl Session {
     }
 
     async fn aborts_now(&mut self) -> Result<(), Failure> {
+        self.send_abort(false).await?;
+        self.clear_errors(CLEARING_TRIES).await
+    }
+
+    /// Sends the abort and waits for its end. A server without a session may have nothing to abort.
+    async fn send_abort(&mut self, may_refuse: bool) -> Result<(), Failure> {
         let (command, tag) = (Command::new("AbortE", Vec::new()), self.next_event());
         self.write(&command, tag).await.map_err(Failure::Link)?;
         let over = Instant::now() + self.limits.abort;
@@ -320,8 +341,8 @@ impl Session {
             };
             let response = self.understood(line)?;
             match response.said {
-                Said::Complete if response.tag == tag => break,
-                Said::Error(error) if response.tag == tag && !is_passing(&error) => {
+                Said::Complete if response.tag == tag => return Ok(()),
+                Said::Error(error) if response.tag == tag && !is_passing(&error) && !may_refuse => {
                     let why = "it does not carry out AbortE";
                     self.note(format!("AbortE: {error}"));
                     return Err(Failure::Link(self.unreadable(error.to_string(), why)));
@@ -329,7 +350,6 @@ impl Session {
                 _ => {}
             }
         }
-        self.clear_errors(CLEARING_TRIES).await
     }
 
     /// Has the server forget its errors. One that has acknowledged an abort may need a while until it does.

@@ -10,6 +10,7 @@ use super::protocol::{Get, Mode, Reply, Request, Set};
 use super::settings::LinuxcncSettings;
 use crate::error::{Answered, DeviceError};
 use crate::words::{Answer, Command, State};
+use crate::{Dial, Line};
 
 /// Between two questions where something is waited for.
 const ASKED_EVERY: Duration = Duration::from_millis(20);
@@ -50,7 +51,10 @@ pub(super) struct Seen {
 pub(super) struct Controller {
     pub(super) name: Arc<str>,
     settings: LinuxcncSettings,
+    dial: Box<dyn Dial>,
     link: Option<Link>,
+    /// Why there is none, where there was one: who asks then is told that, and not that it was never met.
+    lost: Option<DeviceError>,
     /// Whether this client has taken control, by this connection.
     pub(super) owned: bool,
     /// The machine's configuration, which is what it calls itself by.
@@ -58,16 +62,18 @@ pub(super) struct Controller {
 }
 
 impl Controller {
-    pub(super) fn new(settings: LinuxcncSettings) -> Self {
+    pub(super) fn new(settings: LinuxcncSettings, dial: Box<dyn Dial>) -> Self {
         let name = format!("grinder at {}:{} (LinuxCNC)", settings.host, settings.port).into();
-        Self { name, settings, link: None, owned: false, configuration: None }
+        Self { name, settings, dial, link: None, lost: None, owned: false, configuration: None }
     }
 
     /// Connects anew and proves who is there; only what concerns this connection is set. Returns what the machine calls itself.
     pub(super) async fn meet(&mut self) -> Answered<String> {
         (self.link, self.owned) = (None, false);
         let LinuxcncSettings { host, port, answer_within, connect_password, .. } = &self.settings;
-        let link = Link::open(host, *port, *answer_within).await.map_err(|fault| self.fault(fault, "a connection"))?;
+        let line = Line::Tcp { host: host.clone(), port: *port };
+        let link = Link::open(&line, self.dial.as_mut(), *answer_within).await;
+        let link = link.map_err(|fault| self.fault(fault, "a connection"))?;
         let hello = Request::Hello { password: connect_password.clone() };
         let server = match link.ask(hello, *answer_within).answer().await {
             Ok(Reply::Value(server)) => server,
@@ -81,7 +87,7 @@ impl Controller {
             Reply::Acknowledged => {}
             other => return Err(self.foreign("set verbose", &format!("{other:?}"))),
         }
-        self.link = Some(link);
+        (self.link, self.lost) = (Some(link), None);
         let configuration = self.get(Get::Inifile).await?;
         self.check_name(&server, &configuration)?;
         self.look(false).await?;
@@ -302,7 +308,8 @@ impl Controller {
     }
 
     fn link(&self, what: &'static str) -> Answered<&Link> {
-        self.link.as_ref().ok_or_else(|| DeviceError::NotConnected { machine: self.machine(), what })
+        let never = || DeviceError::NotConnected { machine: self.machine(), what };
+        self.link.as_ref().ok_or_else(|| self.lost.clone().unwrap_or_else(never))
     }
 
     fn foreign(&self, asked: &'static str, told: &str) -> DeviceError {
@@ -311,10 +318,11 @@ impl Controller {
 
     /// What came of a question that was not answered; a connection that is of no use any more is closed.
     fn broken(&mut self, fault: LinkFault, what: &'static str) -> DeviceError {
+        let error = self.fault(fault, what);
         if fault != LinkFault::Unsendable {
-            (self.link, self.owned) = (None, false);
+            (self.link, self.owned, self.lost) = (None, false, Some(error.clone()));
         }
-        self.fault(fault, what)
+        error
     }
 
     fn fault(&self, fault: LinkFault, what: &'static str) -> DeviceError {

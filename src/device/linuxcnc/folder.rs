@@ -22,6 +22,8 @@ pub(super) struct Folders {
     pub(super) here: PathBuf,
     /// The same, as the controller sees it.
     pub(super) there: String,
+    /// Whether what is done with them is done in turn with everything else.
+    pub(super) in_turn: bool,
 }
 
 impl Folders {

@@ -5,11 +5,11 @@ use std::io;
 use std::time::Duration;
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpStream;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::{Instant, sleep_until, timeout};
 
 use super::protocol::{Lines, Place, Reply, Request, Waiting};
+use crate::{Dial, Line, LineStream};
 
 /// Why there is no answer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,14 +54,12 @@ impl Asked {
 
 impl Link {
     /// Connects; nothing is said yet.
-    pub(super) async fn open(host: &str, port: u16, within: Duration) -> Result<Self, LinkFault> {
-        let stream = match timeout(within, TcpStream::connect((host, port))).await {
+    pub(super) async fn open(line: &Line, dial: &mut dyn Dial, within: Duration) -> Result<Self, LinkFault> {
+        let stream = match timeout(within, dial.dial(line)).await {
             Ok(Ok(stream)) => stream,
             Ok(Err(error)) => return Err(LinkFault::Unreachable(error.kind())),
             Err(_) => return Err(LinkFault::Unreachable(io::ErrorKind::TimedOut)),
         };
-        let set = stream.set_nodelay(true).and_then(|()| stream.set_zero_linger());
-        set.map_err(|error| LinkFault::Unreachable(error.kind()))?;
         let (questions, asked) = mpsc::unbounded_channel();
         tokio::spawn(Conversation::new(stream).run(asked));
         Ok(Self { questions })
@@ -87,13 +85,13 @@ impl Link {
 type Waiter = (oneshot::Sender<Result<Reply, LinkFault>>, Instant);
 
 struct Conversation {
-    stream: TcpStream,
+    stream: Box<dyn LineStream>,
     lines: Lines,
     waiting: Waiting<Waiter>,
 }
 
 impl Conversation {
-    fn new(stream: TcpStream) -> Self {
+    fn new(stream: Box<dyn LineStream>) -> Self {
         Self { stream, lines: Lines::default(), waiting: Waiting::default() }
     }
 

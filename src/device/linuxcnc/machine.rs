@@ -12,7 +12,8 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use rand::random;
+use rand::rngs::StdRng;
+use rand::{RngExt as _, SeedableRng as _, random};
 use tokio::time::{Instant, sleep, timeout};
 
 use super::controller::{Controller, Interpreter, Seen};
@@ -21,8 +22,10 @@ use super::program::{PROGRAM, Program, RECORD, Record, opening, path};
 use super::protocol::{Mode, Set};
 use super::settings::LinuxcncSettings;
 use super::work::{Stage, Verdict, Work};
+use crate::Dial;
 use crate::error::{Answered, DeviceError};
 use crate::machine::{Grinder, Interrupt, Machine};
+use crate::modbus::OfThisComputer;
 use crate::payload::{CorrectionMap, Identified, Pass, PassRecord};
 use crate::words::{
     Answer, Armed, Command, Fault, Identity, Job, MachineKind, Outcome, Reconciled, Started, State, Status, Word,
@@ -63,18 +66,31 @@ pub struct LinuxcncGrinder {
     /// What the last look showed.
     last: Option<State>,
     notes: Vec<String>,
+    /// Where the words of preparations come from.
+    chance: StdRng,
 }
 
 impl LinuxcncGrinder {
     /// A grinder; nothing is asked of it yet.
     pub fn new(settings: LinuxcncSettings) -> Self {
+        Self::by(settings, Box::new(OfThisComputer), (false, random()))
+    }
+
+    /// A grinder whose connections somebody else opens, beside which no thread works, and whose dice are those of the seed: for controllers
+    /// that stand in the same process, and for time that does not pass by itself.
+    pub fn over(settings: LinuxcncSettings, dial: Box<dyn Dial>, seed: u64) -> Self {
+        Self::by(settings, dial, (true, seed))
+    }
+
+    fn by(settings: LinuxcncSettings, dial: Box<dyn Dial>, (in_turn, seed): (bool, u64)) -> Self {
         let folders = Folders {
             run: settings.run_folder.clone(),
             here: settings.programs.clone(),
             there: settings.programs_at_controller.clone(),
+            in_turn,
         };
         Self {
-            controller: Controller::new(settings.clone()),
+            controller: Controller::new(settings.clone(), dial),
             settings,
             folders,
             taken: false,
@@ -89,6 +105,7 @@ impl LinuxcncGrinder {
             moved: None,
             last: None,
             notes: Vec::new(),
+            chance: StdRng::seed_from_u64(seed),
         }
     }
 
@@ -111,7 +128,10 @@ impl LinuxcncGrinder {
         work: impl FnOnce(&Folders) -> Result<T, String> + Send + 'static,
     ) -> Answered<T> {
         let folders = self.folders.clone();
-        let done = timeout(FOLDER_WITHIN, tokio::task::spawn_blocking(move || work(&folders))).await;
+        let done = match self.folders.in_turn {
+            true => Ok(Ok(work(&folders))),
+            false => timeout(FOLDER_WITHIN, tokio::task::spawn_blocking(move || work(&folders))).await,
+        };
         let done = match done {
             Ok(done) => done.unwrap_or_else(|error| Err(error.to_string())),
             Err(_) => Err(format!("{} did not answer within 30 s", self.folders.here.display())),
@@ -314,7 +334,7 @@ impl LinuxcncGrinder {
         if before.begun > 0 {
             return Err(self.refused(Command::Prepare, Answer::AlreadyBegun));
         }
-        let token = random::<u32>().max(1);
+        let token = self.chance.random::<u32>().max(1);
         self.controller.errors().await?;
         self.open_record(&program, token).await?;
         self.controller.enter(Mode::Auto, Command::Prepare).await?;

@@ -129,7 +129,7 @@ pub trait LineStream: AsyncRead + AsyncWrite + Debug + Send + Unpin {
 }
 
 /// How a line is opened where no socket and no port of this computer leads to its machines.
-pub trait Dial: Debug + Send {
+pub trait Dial: Debug + Send + Sync {
     /// Opens it.
     fn dial<'a>(&'a mut self, line: &'a Line) -> Dialled<'a>;
 }
@@ -456,7 +456,7 @@ async fn connect(line: &Line, dial: &mut dyn Dial) -> io::Result<tokio_modbus::c
 
 /// Sockets and serial ports of this computer.
 #[derive(Debug)]
-struct OfThisComputer;
+pub(crate) struct OfThisComputer;
 
 impl Dial for OfThisComputer {
     fn dial<'a>(&'a mut self, line: &'a Line) -> Dialled<'a> {

@@ -31,6 +31,7 @@ use ahead::{Ahead, Misses};
 #[cfg(fuzzing)]
 pub use any_registers::any_registers;
 use codec::{CommandFrame, Payload, RecordFlaw, crc32};
+pub(crate) use link::OfThisComputer;
 pub use link::{Dial, Dialled, LineStream, Link, LinkFigures};
 pub use settings::{
     Line, ModbusSettings, Parity, RegisterMap, RtuWire, Signal, SignalTable, SignalType, TcpWire, WordOrder,

@@ -1,0 +1,528 @@
+//! A controller by LinuxCNC behind linuxcncrsh: what it answers to each line, and what it runs. No wire is in here; `wire/rsh` has one.
+//!
+//! ```text
+//!  program  a program as the interpreter reads it: ahead of the motion
+//!  faults   what goes wrong, at which line
+//!  deed     what the controller did
+//! ```
+//!
+//! A `set` that is acknowledged was heard, and nothing more: whether it succeeded is told by the errors that are read once, and by what is
+//! asked afterwards. One client has control, whoever took it last; a set takes a tenth of a second. A program that cannot be opened
+//! leaves the one before.
+
+pub mod deed;
+pub mod faults;
+mod program;
+
+use std::collections::{BTreeMap, VecDeque};
+use std::fs::OpenOptions;
+use std::io::Write;
+use std::time::Duration;
+
+use crate::Vec3;
+use crate::wheel::Wheel;
+use deed::{Deed, Witness};
+use faults::{Fault, Faults};
+use program::{Program, Said, Step, says};
+
+/// A set takes so long, whatever it does.
+const SET_TAKES: Duration = Duration::from_millis(100);
+/// The wheel is looked at at least this often along its way.
+const STEP_MM: f64 = 0.5;
+/// Where the wheel's centre is when it is away from everything.
+const AWAY_MM: Vec3 = [0.0, 0.0, 100.0];
+
+/// A line that is to go out to a client.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Outgoing {
+    /// When, in the time of the caller.
+    pub at: Duration,
+    /// The line, its end too.
+    pub text: String,
+    /// The connection is closed behind it.
+    pub closes: bool,
+}
+
+#[derive(Default)]
+struct Client {
+    greeted: bool,
+    verbose: bool,
+    quiet: bool,
+    lines: VecDeque<String>,
+    /// Its next line is looked at then.
+    free_at: Duration,
+    out: VecDeque<Outgoing>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Interpreter {
+    Idle,
+    Running,
+    Paused,
+}
+
+/// The controller, and the machine that it moves.
+pub struct Controller {
+    wheel: Wheel,
+    faults: Faults,
+    /// Seconds of the machine's time in a real second.
+    speed: f64,
+    clients: BTreeMap<u64, Client>,
+    owner: Option<u64>,
+    stopped: bool,
+    on: bool,
+    homed: bool,
+    mode: &'static str,
+    interpreter: Interpreter,
+    program: Option<Program>,
+    steps: VecDeque<Step>,
+    /// The line that is carried out.
+    line: u32,
+    /// The line at which a limit is met.
+    limit_at: Option<u32>,
+    at_mm: Vec3,
+    errors: VecDeque<String>,
+    log: Option<String>,
+    passed: Duration,
+    moving: bool,
+    witness: Option<Witness>,
+}
+
+impl Controller {
+    /// A controller that is switched on and homed, with no program.
+    pub fn new(wheel: Wheel, speed: f64, faults: Faults) -> Self {
+        Self {
+            wheel,
+            faults,
+            speed,
+            clients: BTreeMap::new(),
+            owner: None,
+            stopped: false,
+            on: true,
+            homed: true,
+            mode: "MANUAL",
+            interpreter: Interpreter::Idle,
+            program: None,
+            steps: VecDeque::new(),
+            line: 0,
+            limit_at: None,
+            at_mm: AWAY_MM,
+            errors: VecDeque::new(),
+            log: None,
+            passed: Duration::ZERO,
+            moving: false,
+            witness: None,
+        }
+    }
+
+    /// Has somebody told of everything that it does from now on, while it happens.
+    pub fn witness(&mut self, witness: Witness) {
+        self.witness = Some(witness);
+    }
+
+    fn tell(&mut self, deed: Deed) {
+        if let Some(witness) = &mut self.witness {
+            witness(&deed);
+        }
+    }
+
+    /// Whether the machine moves.
+    pub fn moves(&self) -> bool {
+        self.moving
+    }
+
+    /// Whether a program is under way, paused or not.
+    pub fn is_busy(&self) -> bool {
+        self.interpreter != Interpreter::Idle
+    }
+
+    // ---- people at the machine ----------------------------------------------------------------------------------------------------
+
+    /// The stop circuit opens.
+    pub fn emergency_stop(&mut self) {
+        (self.stopped, self.on) = (true, false);
+        self.break_off();
+        self.tell(Deed::Stopped);
+    }
+
+    /// The drives go off.
+    pub fn switch_off(&mut self) {
+        self.on = false;
+        self.break_off();
+        self.tell(Deed::Stopped);
+    }
+
+    /// Somebody makes it ready again.
+    pub fn make_ready(&mut self) {
+        (self.stopped, self.on, self.homed) = (false, true, true);
+    }
+
+    /// Somebody turns it to another mode, or back; what runs goes on.
+    pub fn turn_to(&mut self, mode: &'static str) {
+        if !self.is_busy() {
+            self.mode = mode;
+        }
+    }
+
+    /// Somebody presses the button that has a paused program go on.
+    pub fn press_resume(&mut self) {
+        if self.interpreter == Interpreter::Paused && self.program.is_some() {
+            self.interpreter = Interpreter::Running;
+        }
+    }
+
+    /// Somebody has led it away from the part.
+    pub fn lead_away(&mut self) {
+        if !self.is_busy() {
+            self.at_mm = AWAY_MM;
+            self.wheel.let_go();
+        }
+    }
+
+    /// Another client takes control, opens a program of its own where nothing runs, or ends what runs.
+    pub fn steal(&mut self, program: Option<&str>, aborts: bool) {
+        self.owner = Some(u64::MAX);
+        if aborts {
+            self.abort();
+        }
+        if let Some(path) = program.filter(|_| !self.is_busy()) {
+            self.open(path);
+        }
+    }
+
+    /// It ends, with all that it has, and begins anew.
+    pub fn kill(&mut self) {
+        self.break_off();
+        (self.clients, self.owner, self.program, self.log) = (BTreeMap::new(), None, None, None);
+        (self.stopped, self.on, self.homed, self.mode) = (true, false, false, "MANUAL");
+        (self.line, self.interpreter) = (0, Interpreter::Idle);
+        self.errors.clear();
+        self.tell(Deed::Killed);
+    }
+
+    // ---- lines --------------------------------------------------------------------------------------------------------------------
+
+    /// A client has connected.
+    pub fn connected(&mut self, client: u64) {
+        self.clients.insert(client, Client::default());
+    }
+
+    /// A client is gone. What runs goes on.
+    pub fn hung_up(&mut self, client: u64) {
+        self.clients.remove(&client);
+    }
+
+    /// Whether a client is still served.
+    pub fn serves(&self, client: u64) -> bool {
+        self.clients.contains_key(&client)
+    }
+
+    /// When something is to be done for a client next without a line having come.
+    pub fn due(&self, client: u64) -> Option<Duration> {
+        let client = self.clients.get(&client)?;
+        let next = client.lines.front().map(|_| client.free_at);
+        next.into_iter().chain(client.out.front().map(|out| out.at)).min()
+    }
+
+    /// Takes a line of a client, without its end.
+    pub fn receive(&mut self, client: u64, line: &str, now: Duration) {
+        if let Some(client) = self.clients.get_mut(&client) {
+            client.lines.push_back(line.trim().to_owned());
+        }
+        self.attend(client, now);
+    }
+
+    /// Lets time pass and returns what is to be sent to a client now.
+    pub fn tick(&mut self, client: u64, now: Duration) -> Vec<Outgoing> {
+        self.attend(client, now);
+        let Some(client) = self.clients.get_mut(&client) else { return Vec::new() };
+        let mut due = Vec::new();
+        while client.out.front().is_some_and(|out| out.at <= now) {
+            due.extend(client.out.pop_front());
+        }
+        due
+    }
+
+    /// Looks at the lines of a client whose time has come.
+    fn attend(&mut self, number: u64, now: Duration) {
+        self.pass(now);
+        loop {
+            let Some(client) = self.clients.get_mut(&number).filter(|client| client.free_at <= now) else { return };
+            let Some(line) = client.lines.pop_front() else { return };
+            let begins = now.max(client.free_at);
+            self.carry_out(number, &line, begins);
+        }
+    }
+
+    fn carry_out(&mut self, number: u64, line: &str, now: Duration) {
+        let fault = self.faults.at(line);
+        let word = |k: usize| line.split_whitespace().nth(k).unwrap_or_default().to_ascii_lowercase();
+        let is_set = word(0) == "set";
+        let nak = || if is_set { format!("SET {} NAK\n\r", word(1).to_uppercase()) } else { "GET NAK\r\n".to_owned() };
+        let ack = || format!("SET {} ACK\n\r", word(1).to_uppercase());
+        let mut late = if is_set { SET_TAKES } else { Duration::ZERO };
+        if let Some(Fault::Limit(thousandths)) = fault
+            && let Some(program) = &self.program
+        {
+            self.limit_at = Some((program.len() as u32 * thousandths / 1000).max(6));
+        }
+        let answer = match fault {
+            Some(Fault::Lost | Fault::CutBefore) => None,
+            Some(Fault::Refused) => Some(nak()),
+            Some(Fault::Ignored) => Some(ack()),
+            Some(Fault::Fails) => {
+                self.errors.push_back(format!("can't do that ({line})"));
+                Some(ack())
+            }
+            _ => self.obey(number, line),
+        };
+        let answer = match fault {
+            Some(Fault::Unanswered | Fault::CutBehind) => None,
+            Some(Fault::DoneAndRefused) => Some(nak()),
+            Some(Fault::Aside) => answer.map(|answer| format!("AXIS 7\r\n\u{e9}\r\n{answer}")),
+            _ => answer,
+        };
+        if let Some(Fault::Late(by)) = fault {
+            late += by;
+        }
+        let closes = matches!(fault, Some(Fault::CutBefore | Fault::CutBehind));
+        let Some(client) = self.clients.get_mut(&number) else { return };
+        client.free_at = now + late;
+        if answer.is_some() || closes {
+            let text = answer.unwrap_or_default();
+            client.out.push_back(Outgoing { at: now + late, text, closes });
+        }
+    }
+
+    /// Does what a line says, and returns the answer; none where there is none.
+    fn obey(&mut self, number: u64, line: &str) -> Option<String> {
+        let mut words = line.split_whitespace();
+        let first = words.next().unwrap_or_default().to_ascii_lowercase();
+        let second = words.next().unwrap_or_default().to_ascii_lowercase();
+        let rest = line.splitn(3, ' ').nth(2).unwrap_or_default().trim();
+        let upper = second.to_uppercase();
+        match first.as_str() {
+            "hello" => {
+                let client = self.clients.get_mut(&number)?;
+                client.greeted = second == "emc";
+                Some(if client.greeted { "HELLO ACK EMCNETSVR 1.1\r\n" } else { "HELLO NAK\r\n" }.to_owned())
+            }
+            "get" => Some(match self.told(number, &second) {
+                Some(told) => format!("{upper} {told}\r\n"),
+                None => format!("GET {upper} NAK\r\n"),
+            }),
+            "set" => {
+                let client = self.clients.get_mut(&number)?;
+                let (greeted, verbose) = (client.greeted, client.verbose);
+                let echo = if client.quiet { String::new() } else { format!("{line}\r\n") };
+                let done = if greeted { self.set(number, &second, rest) } else { None };
+                let said = match done {
+                    None => "SET NAK\n\r".to_owned(),
+                    Some(true) if verbose || second == "verbose" => format!("SET {upper} ACK\n\r"),
+                    Some(true) => String::new(),
+                    Some(false) => format!("SET {upper} NAK\n\r"),
+                };
+                Some(echo + &said).filter(|answer| !answer.is_empty())
+            }
+            "quit" => {
+                self.clients.remove(&number);
+                None
+            }
+            _ => None,
+        }
+    }
+
+    fn told(&mut self, number: u64, what: &str) -> Option<String> {
+        let switch = |on: bool| if on { "ON" } else { "OFF" }.to_owned();
+        Some(match what {
+            "enable" => switch(self.owner == Some(number)),
+            "inifile" => "/home/cnc/grinder/grinder.ini".to_owned(),
+            "estop" => switch(self.stopped),
+            "machine" => switch(self.on),
+            "mode" => self.mode.to_owned(),
+            "joint_homed" => if self.homed { "YES YES YES NO NO NO" } else { "NO NO NO NO NO NO" }.to_owned(),
+            "program" => self.program.as_ref().map_or("NONE".to_owned(), |program| program.path.clone()),
+            "program_status" => format!("{:?}", self.interpreter).to_uppercase(),
+            "program_line" => self.line.to_string(),
+            "abs_act_pos" => {
+                let [x, y, z] = self.at_mm;
+                format!("{x:.6} {y:.6} {z:.6} 0.000000 0.000000 0.000000")
+            }
+            "error" => self.errors.pop_front().unwrap_or("OK".to_owned()),
+            _ => return None,
+        })
+    }
+
+    /// Whether a set is acknowledged; none where its client has no control.
+    fn set(&mut self, number: u64, what: &str, rest: &str) -> Option<bool> {
+        let client = self.clients.get_mut(&number)?;
+        match (what, rest.to_ascii_lowercase().as_str()) {
+            ("echo", off) => client.quiet = off == "off",
+            ("verbose", on) => client.verbose = on == "on",
+            ("enable", "off") => self.owner = self.owner.filter(|owner| *owner != number),
+            ("enable", _) if rest != "EMCTOO" => return Some(false),
+            ("enable", _) => self.owner = Some(number),
+            _ if self.owner != Some(number) => return None,
+            _ if self.stopped || !self.on => return Some(false),
+            ("mode", mode) => self.change_mode(mode),
+            ("mdi", _) if self.mode == "MDI" && !self.is_busy() => {
+                let said = says(rest);
+                said.into_iter().for_each(|said| self.say(said));
+            }
+            ("open", _) if !self.is_busy() => self.open(rest),
+            ("run", _) if self.mode == "AUTO" && !self.is_busy() && self.program.is_some() => self.run(),
+            ("pause", _) => self.interpreter = Interpreter::Paused,
+            ("resume", _) if self.program.is_some() && self.interpreter == Interpreter::Paused => {
+                self.interpreter = Interpreter::Running;
+            }
+            ("abort", _) => self.abort(),
+            _ => self.errors.push_back(format!("can't do that ({what}) in {} mode", self.mode.to_lowercase())),
+        }
+        self.see_whether_it_moves();
+        Some(true)
+    }
+
+    fn change_mode(&mut self, mode: &str) {
+        match mode {
+            _ if self.is_busy() => self.errors.push_back("can't change mode while a program runs".to_owned()),
+            "auto" => self.mode = "AUTO",
+            "mdi" => self.mode = "MDI",
+            _ => self.mode = "MANUAL",
+        }
+    }
+
+    fn open(&mut self, path: &str) {
+        match std::fs::read_to_string(path) {
+            Ok(text) => {
+                (self.program, self.line) = (Some(Program::new(path, text)), 0);
+                self.tell(Deed::Opened { path: path.to_owned() });
+            }
+            Err(_) => self.errors.push_back(format!("can't open {path}")),
+        }
+    }
+
+    // ---- the program ----------------------------------------------------------------------------------------------------------------
+
+    fn run(&mut self) {
+        let at_mm = self.at_mm;
+        let Some(program) = &mut self.program else { return };
+        program.rewind(at_mm);
+        let (path, text) = (program.path.clone(), program.text.clone());
+        (self.interpreter, self.line) = (Interpreter::Running, 1);
+        self.steps.clear();
+        if !self.wheel.take() {
+            self.errors.push_back("the clamp is empty".to_owned());
+        }
+        self.tell(Deed::Began { path, text });
+        self.read_on();
+    }
+
+    fn read_on(&mut self) {
+        let Some(program) = &mut self.program else { return };
+        for said in program.read_on(&mut self.steps) {
+            self.say(said);
+        }
+    }
+
+    fn say(&mut self, said: Said) {
+        let log = |path: &str, anew: bool| {
+            OpenOptions::new().create(true).write(true).append(!anew).truncate(anew).open(path)
+        };
+        let done = match said {
+            Said::Open { path, anew } => {
+                let opened = log(&path, anew).map(drop);
+                self.log = Some(path);
+                opened
+            }
+            Said::Log(text) => match &self.log {
+                Some(path) => log(path, false).and_then(|mut file| writeln!(file, "{text}")),
+                None => Ok(()),
+            },
+            Said::Close => {
+                self.log = None;
+                Ok(())
+            }
+        };
+        if let Err(error) = done {
+            self.errors.push_back(error.to_string());
+        }
+    }
+
+    fn abort(&mut self) {
+        self.break_off();
+        self.tell(Deed::Aborted);
+    }
+
+    /// What runs is over where it is.
+    fn break_off(&mut self) {
+        self.interpreter = Interpreter::Idle;
+        self.steps.clear();
+        (self.limit_at, self.log) = (None, None);
+        self.see_whether_it_moves();
+    }
+
+    fn see_whether_it_moves(&mut self) {
+        let moves = self.interpreter == Interpreter::Running;
+        if std::mem::replace(&mut self.moving, moves) != moves {
+            self.tell(if moves { Deed::Moves } else { Deed::Stands });
+        }
+    }
+
+    /// Lets time pass: the machine goes along its program.
+    pub fn pass(&mut self, now: Duration) {
+        let mut left_s = now.saturating_sub(self.passed).as_secs_f64() * self.speed;
+        self.passed = now;
+        self.see_whether_it_moves();
+        while self.interpreter == Interpreter::Running {
+            self.read_on();
+            let Some(step) = self.steps.front().cloned() else {
+                return self.end();
+            };
+            match step {
+                Step::Move { to_mm, mm_s, line } => {
+                    self.line = line;
+                    if self.limit_at.is_some_and(|limit| limit <= line) {
+                        self.errors.push_back(format!("Linear move on line {line} would exceed X's positive limit"));
+                        return self.break_off();
+                    }
+                    let way_mm = (0..3).map(|k| (to_mm[k] - self.at_mm[k]).powi(2)).sum::<f64>().sqrt();
+                    let goes_mm = (left_s * mm_s).min(way_mm);
+                    self.go(to_mm, way_mm, goes_mm);
+                    if goes_mm < way_mm {
+                        return;
+                    }
+                    left_s -= way_mm / mm_s;
+                }
+                Step::Wait { line } => {
+                    self.line = line;
+                    self.wheel.been_all_over();
+                    self.program.iter_mut().for_each(Program::go_on);
+                }
+                Step::End { line } => {
+                    self.line = line;
+                    return self.end();
+                }
+            }
+            self.steps.pop_front();
+        }
+    }
+
+    fn go(&mut self, to_mm: Vec3, way_mm: f64, goes_mm: f64) {
+        let from = self.at_mm;
+        let place = |mm: f64| -> Vec3 {
+            std::array::from_fn(|k| if mm >= way_mm { to_mm[k] } else { from[k] + (to_mm[k] - from[k]) * mm / way_mm })
+        };
+        let pieces = (goes_mm / STEP_MM).ceil().max(1.0) as u32;
+        for piece in 1..=pieces {
+            self.wheel.come(place(goes_mm * f64::from(piece) / f64::from(pieces)));
+        }
+        self.at_mm = place(goes_mm);
+    }
+
+    fn end(&mut self) {
+        let path = self.program.as_ref().map(|program| program.path.clone()).unwrap_or_default();
+        self.wheel.let_go();
+        self.tell(Deed::Ended { path });
+        self.break_off();
+    }
+}

@@ -1,0 +1,150 @@
+//! A wheel that is led from place to place by a controller that knows neither part nor pass, and what it leaves.
+//!
+//! The wheel is a ball. Where its centre C is, it stands over the nominal surface by the distance of C from the surface less its radius, at
+//! the foot of C; what a stiff machine would leave between two tracks is what the wheel left on either, by the way between them. Machine and part give
+//! way as in [`crate::process`], which says what `S` and `mu` are: h becomes mu h + (1 - mu) cmd where h > cmd. The grooves of the single
+//! tracks, wear and growth are not in here.
+
+use std::sync::{Arc, Mutex};
+
+use crate::Vec3;
+use crate::body::Kind;
+use crate::truth::{State, locked};
+
+/// Higher than this over the nominal surface nothing is there to be ground.
+const AIR_MM: f64 = 1.0;
+/// Tracks are further apart than this.
+const SAME_TRACK_MM: f64 = 0.2;
+
+/// What the wheel stood at along a track: x, and the height over the nominal surface.
+#[derive(Clone, Debug, Default)]
+struct Track {
+    y_mm: f64,
+    places: Vec<[f64; 2]>,
+}
+
+impl Track {
+    /// The height at a place along the track; at its ends where it does not reach so far.
+    fn at(&self, x: f64) -> Option<f64> {
+        let near = |a: &&[f64; 2], b: &&[f64; 2]| (a[0] - x).abs().total_cmp(&(b[0] - x).abs());
+        let below = self.places.iter().filter(|place| place[0] <= x).min_by(near);
+        let above = self.places.iter().filter(|place| place[0] > x).min_by(near);
+        match (below, above) {
+            (Some([x0, u0]), Some([x1, u1])) => Some(u0 + (u1 - u0) * (x - x0) / (x1 - x0)),
+            (one, other) => one.or(other).map(|place| place[1]),
+        }
+    }
+}
+
+/// The wheel of a world's grinder.
+pub struct Wheel {
+    world: Arc<Mutex<State>>,
+    radius_mm: f64,
+    first: Option<Track>,
+    before: Option<Track>,
+    now: Option<Track>,
+}
+
+impl Wheel {
+    /// A wheel that its controller takes to have this radius.
+    pub(crate) fn new(world: Arc<Mutex<State>>, stated_mm: f64) -> Self {
+        let radius_mm = stated_mm + 1e-3 * locked(&world).spec.grinder.wheel_radius_error_um;
+        Self { world, radius_mm, first: None, before: None, now: None }
+    }
+
+    /// The part is clamped for a program. Whether it is there.
+    pub fn take(&mut self) -> bool {
+        let mut state = locked(&self.world);
+        (self.first, self.before, self.now) = (None, None, None);
+        state.on_table = false;
+        state.take(Kind::Grinder)
+    }
+
+    /// The wheel is away from the part, and others may have it.
+    pub fn let_go(&mut self) {
+        locked(&self.world).release(Kind::Grinder);
+    }
+
+    /// Its centre comes to a place of the model frame.
+    pub fn come(&mut self, centre_mm: Vec3) {
+        let world = Arc::clone(&self.world);
+        let mut state = locked(&world);
+        let Some(([x, y], height_mm)) = foot(&state, centre_mm) else { return };
+        let over_mm = height_mm - self.radius_mm;
+        if over_mm > AIR_MM {
+            return self.next_track();
+        }
+        if self.now.as_ref().is_some_and(|track| (track.y_mm - y).abs() > SAME_TRACK_MM) {
+            self.next_track();
+        }
+        let track = self.now.get_or_insert_with(|| Track { y_mm: y, places: Vec::new() });
+        let last = track.places.last().map_or(x, |place| place[0]);
+        track.places.push([x, over_mm]);
+        if let (Some(before), Some(now)) = (&self.before, &self.now) {
+            let along = [last.min(x), last.max(x)];
+            let across = [before.y_mm.min(now.y_mm), before.y_mm.max(now.y_mm)];
+            grind(&mut state, (along, across), |[x, y]| {
+                let [from, to] = [before.at(x)?, now.at(x)?];
+                Some(from + (to - from) * (y - before.y_mm) / (now.y_mm - before.y_mm))
+            });
+        }
+    }
+
+    fn next_track(&mut self) {
+        if let Some(track) = self.now.take() {
+            self.first.get_or_insert_with(|| track.clone());
+            self.before = Some(track);
+        }
+    }
+
+    /// It has been all over the part: the strips beyond the outermost tracks are as those.
+    pub fn been_all_over(&mut self) {
+        self.next_track();
+        let world = Arc::clone(&self.world);
+        let mut state = locked(&world);
+        let (first, last) = (self.first.take(), self.before.take());
+        let Some((first, last)) = first.zip(last) else { return };
+        let (low, high) = if first.y_mm <= last.y_mm { (&first, &last) } else { (&last, &first) };
+        let all = [f64::NEG_INFINITY, f64::INFINITY];
+        grind(&mut state, (all, [f64::NEG_INFINITY, low.y_mm]), |[x, _]| low.at(x));
+        grind(&mut state, (all, [high.y_mm, f64::INFINITY]), |[x, _]| high.at(x));
+    }
+}
+
+/// The foot of a place on the nominal surface, and how high the place is over it.
+fn foot(state: &State, centre_mm: Vec3) -> Option<([f64; 2], f64)> {
+    let shape = &state.part.shape;
+    let (mut x, mut y) = (centre_mm[0], centre_mm[1]);
+    for _ in 0..60 {
+        let (point, normal) = (shape.point(x, y), shape.normal(x, y));
+        let over: f64 = (0..3).map(|k| (centre_mm[k] - point[k]) * normal[k]).sum();
+        let next = [centre_mm[0] - over * normal[0], centre_mm[1] - over * normal[1]];
+        let moved = (next[0] - x).hypot(next[1] - y);
+        [x, y] = next;
+        if !moved.is_finite() {
+            return None;
+        }
+        if moved < 1e-9 {
+            return Some(([x, y], over));
+        }
+    }
+    None
+}
+
+/// Grinds what lies between these bounds to a height over the nominal surface.
+fn grind(state: &mut State, (along, across): ([f64; 2], [f64; 2]), wanted: impl Fn([f64; 2]) -> Option<f64>) {
+    let mu = state.spec.grinder.error_copying;
+    let within = |[least, most]: [f64; 2], value: f64| (least..=most).contains(&value);
+    let nodes: Vec<(usize, [f64; 2])> = state.part.height.nodes().enumerate().collect();
+    for (k, [x, y]) in nodes {
+        if !within(along, x) || !within(across, y) {
+            continue;
+        }
+        let Some(over_mm) = wanted([x, y]) else { continue };
+        let cmd = over_mm + state.systematic_mm[k];
+        let h = &mut state.part.height.heights_mm[k];
+        if *h > cmd {
+            *h = mu * *h + (1.0 - mu) * cmd;
+        }
+    }
+}

@@ -1,0 +1,99 @@
+//! The lines of linuxcncrsh over a stream: any number of clients.
+
+use std::io;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::sync::watch;
+use tokio::time::{Instant, sleep_until};
+
+use crate::rsh::Controller;
+
+/// The longest line, its end left out.
+const LONGEST_LINE: usize = 4096;
+
+/// A controller that its wires, its clients and a test share.
+#[derive(Clone)]
+pub struct SharedController(Arc<Inner>);
+
+struct Inner {
+    controller: Mutex<Controller>,
+    /// The controller was changed from outside, so often: it may have something to say. The number of the last client.
+    changed: watch::Sender<u64>,
+    clients: Mutex<u64>,
+    began: Instant,
+}
+
+impl From<Controller> for SharedController {
+    fn from(controller: Controller) -> Self {
+        let (changed, clients) = (watch::Sender::new(0), Mutex::new(0));
+        Self(Arc::new(Inner { controller: Mutex::new(controller), changed, clients, began: Instant::now() }))
+    }
+}
+
+impl SharedController {
+    /// Looks at the controller, or changes it, while nobody else does.
+    pub fn with<T>(&self, look: impl FnOnce(&mut Controller) -> T) -> T {
+        let looked = look(&mut self.locked());
+        self.0.changed.send_modify(|times| *times += 1);
+        looked
+    }
+
+    /// Lets the machine's time pass.
+    pub fn live(&self) {
+        self.locked().pass(self.now());
+    }
+
+    /// The time of the controller.
+    pub fn now(&self) -> Duration {
+        self.0.began.elapsed()
+    }
+
+    fn locked(&self) -> MutexGuard<'_, Controller> {
+        self.0.controller.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Serves a client until it goes away or is sent away. What runs goes on.
+    pub async fn serve_client(&self, stream: impl AsyncRead + AsyncWrite + Unpin) {
+        let client = {
+            let mut clients = self.0.clients.lock().unwrap_or_else(PoisonError::into_inner);
+            *clients += 1;
+            *clients
+        };
+        self.locked().connected(client);
+        // What goes wrong with a client is no other's concern.
+        let _ = self.converse(client, stream).await;
+        self.locked().hung_up(client);
+    }
+
+    async fn converse(&self, client: u64, mut stream: impl AsyncRead + AsyncWrite + Unpin) -> io::Result<()> {
+        let mut unread = Vec::new();
+        let mut changed = self.0.changed.subscribe();
+        loop {
+            let due = self.locked().due(client).map(|due| self.0.began + due);
+            tokio::select! {
+                read = stream.read_buf(&mut unread) => if read? == 0 { return Ok(()) },
+                () = sleep_until(due.unwrap_or_else(Instant::now)), if due.is_some() => {}
+                _ = changed.changed() => {}
+            }
+            while let Some(end) = unread.iter().position(|b| matches!(b, b'\r' | b'\n')) {
+                let line: Vec<u8> = unread.drain(..=end).collect();
+                let line = String::from_utf8_lossy(&line).trim().to_owned();
+                if !line.is_empty() {
+                    self.locked().receive(client, &line, self.now());
+                }
+            }
+            if unread.len() > LONGEST_LINE || !self.locked().serves(client) {
+                return stream.shutdown().await;
+            }
+            let outgoing = self.locked().tick(client, self.now());
+            for line in outgoing {
+                stream.write_all(line.text.as_bytes()).await?;
+                if line.closes {
+                    return stream.shutdown().await;
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,210 @@
+//! Holds what a measuring machine by I++ DME did against what is on record: its server knows no jobs, so nothing but the program sees to it
+//! that what moves is meant, and that what is measured was touched.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::time::Duration;
+
+use regrind::cell::StateName;
+use regrind_sim::dme::deed::Deed;
+use tokio::time::Instant;
+
+use crate::checker::{Evidence, is_intent};
+use crate::ledger::Recorded;
+
+/// A hold is seen by what carries out the job within this.
+const HOLDS_WITHIN: Duration = Duration::from_millis(100);
+/// A place that is the same.
+const SAME_MM: f64 = 1e-6;
+/// A touch comes back from where it truly touched, which is as far from its target as the part is from what it should be.
+const STRAIGHT_MM: f64 = 0.1;
+/// What moves the machine.
+const MOTIONS: [&str; 4] = ["GoTo(", "PtMeas(", "Home(", "ChangeTool("];
+
+/// Holds a measuring machine by I++ DME against every promise.
+///
+/// # Errors
+/// The first that was broken.
+pub fn check(evidence: &Evidence) -> Result<(), String> {
+    if evidence.deeds.is_empty() {
+        return Ok(());
+    }
+    moves_by_an_intent(evidence)?;
+    nothing_after_an_abort(evidence)?;
+    travels_at_the_clearance(evidence)?;
+    measured_is_touched(evidence)?;
+    told_nothing_while_it_stands(evidence)?;
+    holds_at_the_next_target(evidence)
+}
+
+/// Every motion that began, by which command, from where to where.
+fn motions(evidence: &Evidence) -> impl Iterator<Item = (Instant, &str, [[f64; 3]; 2])> {
+    evidence.deeds.iter().filter_map(|(at, deed)| match deed {
+        Deed::Moves { command, from_mm, to_mm } => Some((*at, command.as_str(), [*from_mm, *to_mm])),
+        _ => None,
+    })
+}
+
+/// Whether a record says that the job of the CMM is over.
+fn is_over(payload: &serde_json::Value) -> bool {
+    let of_cmm = payload["device"] == "cmm";
+    let ended = matches!(payload["event"].as_str(), Some("ended" | "abort_confirmed" | "fault"));
+    let reconciled = payload["event"] == "reconciled"
+        && (payload["outcome"]["ended"].is_string() || payload["outcome"] == "not_started");
+    of_cmm && (ended || reconciled)
+}
+
+/// Nothing moves but for a START that is on record and is not over.
+fn moves_by_an_intent(evidence: &Evidence) -> Result<(), String> {
+    for (at, command, _) in motions(evidence) {
+        let intent = evidence.written.iter().rfind(|w| w.at <= at && is_intent(w, 0));
+        let what = match intent {
+            None => "no START is on record",
+            Some(intent) if evidence.written.iter().any(|w| intent.at < w.at && w.at < at && is_over(&w.payload)) => {
+                "its job is over by the record"
+            }
+            Some(_) => continue,
+        };
+        return Err(format!("the cmm moves by {command} at {:.3} s, and {what}", evidence.seconds(at)));
+    }
+    Ok(())
+}
+
+/// Behind an abort nothing moves before a person has the job go on, or the next START is on record.
+fn nothing_after_an_abort(evidence: &Evidence) -> Result<(), String> {
+    let mut aborted = None;
+    for (at, deed) in &evidence.deeds {
+        match (deed, aborted) {
+            (Deed::Aborted, _) => aborted = Some(*at),
+            (Deed::Moves { command, .. }, Some(since)) => {
+                let goes_on = |w: &Recorded| {
+                    is_intent(w, 0) || w.payload["command"] == "resume_machine" && w.payload["device"] == "cmm"
+                };
+                if !evidence.written.iter().any(|w| since <= w.at && w.at <= *at && goes_on(w)) {
+                    let [since, at] = [since, *at].map(|at| evidence.seconds(at));
+                    return Err(format!("the cmm was aborted at {since:.3} s, and moves by {command} at {at:.3} s"));
+                }
+                aborted = None;
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+/// Below the clearance the probe goes straight up or down, and to a target that is right there. How it is homed is the machine's own.
+fn travels_at_the_clearance(evidence: &Evidence) -> Result<(), String> {
+    let touched = evidence.deeds.iter().filter_map(|(_, deed)| match deed {
+        Deed::Touched { point_mm, .. } => Some(point_mm[2]),
+        _ => None,
+    });
+    let clearance_mm = touched.fold(f64::NEG_INFINITY, f64::max) + evidence.clearance_mm;
+    for (at, command, [from, to]) in motions(evidence) {
+        let across = (to[0] - from[0]).hypot(to[1] - from[1]);
+        let lowest = from[2].min(to[2]);
+        let is_low = match command {
+            "GoTo" => across > STRAIGHT_MM && lowest < clearance_mm - SAME_MM,
+            "PtMeas" => across > STRAIGHT_MM,
+            _ => false,
+        };
+        if is_low {
+            let at = evidence.seconds(at);
+            return Err(format!("{command} goes {across:.3} mm across at {at:.3} s, from {from:?} to {to:?}"));
+        }
+    }
+    Ok(())
+}
+
+/// Every point of a measurement is where the machine touched last at one of its targets, in this very job.
+fn measured_is_touched(evidence: &Evidence) -> Result<(), String> {
+    for cycle in 1.. {
+        let folder = evidence.folder.join(format!("cycle-{cycle}"));
+        if !folder.is_dir() {
+            return Ok(());
+        }
+        let intents = || evidence.written.iter().filter(|w| is_intent(w, 0));
+        let of_cycle = |w: &&Recorded| w.payload["cycle"] == cycle && w.payload["intent"]["job"] == evidence.job;
+        let Some(intent) = intents().rfind(of_cycle) else { continue };
+        let next = intents().find(|w| w.at > intent.at).map(|w| w.at);
+        let mut last = BTreeMap::new();
+        for (at, deed) in &evidence.deeds {
+            if let Deed::Touched { point_mm, centre_mm, .. } = deed
+                && intent.at <= *at
+                && next.is_none_or(|next| *at < next)
+            {
+                last.insert(point_mm.map(f64::to_bits), *centre_mm);
+            }
+        }
+        let mut left: Vec<[f64; 3]> = last.into_values().collect();
+        for name in ["reference_sphere.csv", "measured.csv"] {
+            for row in rows(&folder.join(name)) {
+                let same = |centre: &[f64; 3]| (0..3).all(|k| (centre[k] - row[k]).abs() < SAME_MM);
+                match left.iter().position(same) {
+                    Some(k) => drop(left.swap_remove(k)),
+                    None => {
+                        return Err(format!(
+                            "cycle {cycle} has a point at {row:?} in {name}, where nothing was touched"
+                        ));
+                    }
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+fn rows(file: &Path) -> Vec<[f64; 3]> {
+    let text = std::fs::read_to_string(file).unwrap_or_default();
+    let numbers = |line: &str| line.split(',').map(|n| n.trim().parse().ok()).collect::<Option<Vec<f64>>>();
+    text.lines().filter_map(|line| numbers(line)?.try_into().ok()).collect()
+}
+
+/// Whether a line moves the machine.
+fn is_motion(line: &str) -> bool {
+    line.split_once(' ').is_some_and(|(_, command)| MOTIONS.iter().any(|motion| command.starts_with(motion)))
+}
+
+/// Nothing that moves the machine leaves the program while the cell shows that it stands.
+fn told_nothing_while_it_stands(evidence: &Evidence) -> Result<(), String> {
+    for spoken in evidence.wires.lines.iter().filter(|spoken| spoken.machine == 0 && is_motion(&spoken.line)) {
+        let stands = [StateName::Held, StateName::Stopped, StateName::Aborted, StateName::Complete];
+        let shown = evidence.shown_before(spoken.at).and_then(|shown| shown.state);
+        if shown.is_some_and(|state| stands.contains(&state)) {
+            let at = evidence.seconds(spoken.at);
+            return Err(format!("the cmm is told {:?} at {at:.3} s, and the cell shows {shown:?}", spoken.line));
+        }
+    }
+    Ok(())
+}
+
+/// Behind a hold or a stop no target is begun but the one that was on its way.
+fn holds_at_the_next_target(evidence: &Evidence) -> Result<(), String> {
+    for given in
+        evidence.given.iter().filter(|given| matches!(given.what, "hold" | "stop") && given.done && given.moved[0])
+    {
+        let from = given.at + HOLDS_WITHIN;
+        let goes_on = |at: &Instant| *at > given.at;
+        let resumed = evidence.given.iter().filter(|other| other.what == "resume").map(|other| other.at).find(goes_on);
+        let died = evidence.shown.iter().filter(|shown| shown.state.is_none()).map(|shown| shown.at).find(goes_on);
+        let to = resumed.into_iter().chain(died).min();
+        let touches = evidence.wires.lines.iter().filter(|spoken| {
+            spoken.machine == 0
+                && spoken.at > from
+                && to.is_none_or(|to| spoken.at < to)
+                && spoken.line.contains(" PtMeas(")
+        });
+        // Missed, a target is tried again.
+        let mut targets: Vec<&str> =
+            touches.filter_map(|spoken| spoken.line.split_once(' ').map(|(_, of)| of)).collect();
+        targets.dedup();
+        if targets.len() > 1 {
+            let at = evidence.seconds(given.at);
+            return Err(format!(
+                "{} is given at {at:.3} s, and {} targets are begun behind it",
+                given.what,
+                targets.len()
+            ));
+        }
+    }
+    Ok(())
+}
