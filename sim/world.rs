@@ -11,10 +11,11 @@ use std::fmt;
 use std::sync::{Arc, Mutex};
 
 use crate::cmm::{Cmm, Led};
+use crate::executed::Wheel;
 use crate::probe::Placement;
 use crate::process::{Grinder, systematic_mm};
 use crate::spec::{Faults, SpecError, WorldSpec};
-use crate::truth::{GrindEntry, State, locked};
+use crate::truth::{GrindEntry, State, Sweep, locked};
 
 /// A simulated cell. Clones share one truth.
 #[derive(Clone)]
@@ -52,6 +53,15 @@ impl World {
     /// Returns the probe of the measuring machine, to be led touch by touch; there is one, so hand it to one wire.
     pub fn led(&self) -> Led {
         Led::new(self.state.clone())
+    }
+
+    /// Returns the wheel of a grinder whose controller is none of this world, to be moved along the path that that executes; there is one
+    /// grinder, so take either this or [`World::grinder`].
+    ///
+    /// # Errors
+    /// A radius that no wheel has.
+    pub fn wheel(&self, stated_radius_mm: f64) -> Result<Wheel, SpecError> {
+        Wheel::new(self.state.clone(), stated_radius_mm)
     }
 
     /// Puts a new blank in, as an operator would.
@@ -118,6 +128,11 @@ impl World {
     /// Truth: every pass that was begun, in order.
     pub fn history(&self) -> Vec<GrindEntry> {
         locked(&self.state).history.clone()
+    }
+
+    /// Truth: every pass along an executed path, in order.
+    pub fn sweeps(&self) -> Vec<Sweep> {
+        locked(&self.state).sweeps.clone()
     }
 
     /// Truth: how often a pass was begun for a job and cycle.

@@ -10,6 +10,7 @@ use tokio::net::{TcpListener, TcpStream, ToSocketAddrs};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until};
 
+use super::executed::ExecutedPath;
 use crate::dme::{Outgoing, Server};
 
 /// The longest line, its end left out.
@@ -34,11 +35,23 @@ impl ServingDme {
     /// # Errors
     /// The address cannot be bound.
     pub async fn tcp(addr: impl ToSocketAddrs, server: Server) -> io::Result<Self> {
+        Self::tcp_after(addr, server, None).await
+    }
+
+    /// Serves over TCP a machine that gets its parts from a grinder outside: whatever it is told to do, it does after what that has done.
+    ///
+    /// # Errors
+    /// The address cannot be bound.
+    pub async fn tcp_after(
+        addr: impl ToSocketAddrs,
+        server: Server,
+        grinder: Option<ExecutedPath>,
+    ) -> io::Result<Self> {
         let listener = TcpListener::bind(addr).await?;
         let local_addr = listener.local_addr()?;
         let server = Arc::new(Mutex::new(server));
         let mut tasks = JoinSet::new();
-        tasks.spawn(serve(listener, Arc::clone(&server)));
+        tasks.spawn(serve(listener, Arc::clone(&server), grinder));
         Ok(Self { local_addr, server, _tasks: tasks })
     }
 
@@ -54,13 +67,13 @@ impl ServingDme {
 }
 
 /// Serves one client after another.
-async fn serve(listener: TcpListener, server: Shared) {
+async fn serve(listener: TcpListener, server: Shared, grinder: Option<ExecutedPath>) {
     let began = Instant::now();
     loop {
         match listener.accept().await {
             Ok((stream, _)) => {
                 // A client that goes away is the end of its session, and no other's concern.
-                let _ = serve_client(stream, &server, began).await;
+                let _ = serve_client(stream, &server, grinder.as_ref(), began).await;
                 locked(&server).hung_up();
             }
             Err(_) => tokio::time::sleep(Duration::from_millis(20)).await,
@@ -68,7 +81,12 @@ async fn serve(listener: TcpListener, server: Shared) {
     }
 }
 
-async fn serve_client(mut stream: TcpStream, server: &Shared, began: Instant) -> io::Result<()> {
+async fn serve_client(
+    mut stream: TcpStream,
+    server: &Shared,
+    grinder: Option<&ExecutedPath>,
+    began: Instant,
+) -> io::Result<()> {
     stream.set_nodelay(true)?;
     let mut unread = Vec::new();
     loop {
@@ -80,6 +98,10 @@ async fn serve_client(mut stream: TcpStream, server: &Shared, began: Instant) ->
         while let Some(end) = unread.iter().position(|b| *b == b'\n') {
             let line: Vec<u8> = unread.drain(..=end).collect();
             let line = String::from_utf8_lossy(&line);
+            // Nothing delays an abort.
+            if let Some(grinder) = grinder.filter(|_| !line.starts_with('E')) {
+                grinder.caught_up().await;
+            }
             locked(server).receive(line.trim_end_matches(['\r', '\n']), began.elapsed());
         }
         if unread.len() > LONGEST_LINE {

@@ -6,11 +6,13 @@
 //!  pty      a serial line without hardware, opened by its path
 //!  faults   what goes wrong on Modbus, when
 //!  dme      I++ DME over TCP, one client at a time
+//!  executed the path that a controller outside executes, a line for each servo cycle
 //! ```
 //!
 //! [`Serving`] is all that most callers need: it binds, serves, lets the machines' time pass, and stops.
 
 pub mod dme;
+pub mod executed;
 pub mod faults;
 #[cfg(not(unix))]
 #[path = "no_pty.rs"]
