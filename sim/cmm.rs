@@ -299,7 +299,7 @@ impl Led {
         [probe_radius_mm, approach_mm, search_mm]: [f64; 3],
     ) -> Touch {
         let mut state = locked(&self.world);
-        if !state.take(Kind::Cmm) {
+        if state.unknown || !state.take(Kind::Cmm) {
             return Touch::Unexpected;
         }
         let feature = feature(&state.spec.cmm, point_mm);

@@ -14,6 +14,7 @@
 //!  world      the two machines, and queries for tests
 //!  part       the part as it really is, and exact contact with it
 //!  process    the grinder: what a pass leaves, node by node along its path
+//!  executed   the grinder once more: what the wheel leaves along a path that a controller outside really executes
 //!  cmm        the measuring machine: what it reports of a plan
 //!  payload    the bytes of docs/modbus.md
 //!
@@ -28,7 +29,8 @@
 //!  rsh        a controller by LinuxCNC, which is told which program to run
 //!  wheel      what a wheel leaves that is led by a program
 //!  seen       what the machine saw and did
-//!  wire       Modbus TCP and RTU and I++ DME servers, a serial line without hardware, and everything that goes wrong on them
+//!  wire       Modbus TCP and RTU and I++ DME servers, a serial line without hardware, the path of a controller outside, and everything that
+//!             goes wrong on them
 //! ```
 //!
 //! Units: millimetres and radians throughout. Frames: `shape` and `form` live in the model frame, the points a probe reports
@@ -38,6 +40,7 @@ pub mod body;
 pub mod cmm;
 pub mod command;
 pub mod dme;
+pub mod executed;
 pub mod form;
 mod handshake;
 pub mod options;

@@ -203,6 +203,16 @@ impl HeightGrid {
         (0..self.rows).flat_map(move |j| (0..self.columns).map(move |i| self.node(i, j)))
     }
 
+    /// Returns the nodes from x0 up to x1 and from y0 up to y1, in whichever order those are given, each with its number: a border belongs to
+    /// what lies above it, so that of rectangles side by side no node is in two or in none.
+    pub(crate) fn within(&self, x_mm: [f64; 2], y_mm: [f64; 2]) -> impl Iterator<Item = (usize, [f64; 2])> + '_ {
+        let from = |k: usize, place: f64| ((place - self.first_mm[k]) / self.step_mm[k]).ceil().max(0.0) as usize;
+        let range =
+            |k: usize, [a, b]: [f64; 2], count: usize| from(k, a.min(b)).min(count)..from(k, a.max(b)).min(count);
+        let (columns, rows) = (range(0, x_mm, self.columns), range(1, y_mm, self.rows));
+        rows.flat_map(move |j| columns.clone().map(move |i| (j * self.columns + i, self.node(i, j))))
+    }
+
     fn node(&self, i: usize, j: usize) -> [f64; 2] {
         [self.first_mm[0] + i as f64 * self.step_mm[0], self.first_mm[1] + j as f64 * self.step_mm[1]]
     }

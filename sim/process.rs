@@ -60,14 +60,14 @@ impl GrinderSpec {
     }
 
     /// Returns the wear of the wheel after so many finishing strokes since it was dressed, in micrometres.
-    fn wear_at_um(&self, strokes: f64) -> f64 {
+    pub(crate) fn wear_at_um(&self, strokes: f64) -> f64 {
         let fast = if self.break_in_share > 0.0 { 1.0 - (-strokes / self.break_in_share).exp() } else { 0.0 };
         self.wear_um * strokes + self.break_in_um * fast
     }
 }
 
 /// Corners of a round part's grid may lie where its formula has no value.
-fn finite_or_zero(value: f64) -> f64 {
+pub(crate) fn finite_or_zero(value: f64) -> f64 {
     if value.is_finite() { value } else { 0.0 }
 }
 
@@ -80,7 +80,7 @@ pub(crate) fn systematic_mm(spec: &WorldSpec, part: &Part) -> Vec<f64> {
     error_mm
 }
 
-fn smooth(rng: &mut crate::Rng, correlation_mm: f64, rms_um: f64) -> FormError {
+pub(crate) fn smooth(rng: &mut crate::Rng, correlation_mm: f64, rms_um: f64) -> FormError {
     if rms_um > 0.0 { FormError::with_rms(rng, correlation_mm, rms_um * 1e-3) } else { FormError::none() }
 }
 
@@ -155,16 +155,10 @@ impl Run {
             let grown = self.heat_at(spec, moment) - self.heat_at(spec, self.finishing_s);
             1e-3 * (worn - spec.thermal_um * grown)
         });
-        let cmd = self.fixed_mm[node] + drift_mm;
-        let h = &mut state.part.height.heights_mm[node];
+        let bend = self.grooves.as_ref().map(|cut| cut.bend.heights_mm[node]);
         self.visits += 1;
-        if state.spec.faults.no_part || *h <= cmd {
+        if !cut(state, node, self.fixed_mm[node] + drift_mm, bend) {
             self.in_air += 1;
-        } else {
-            *h = spec.error_copying * *h + (1.0 - spec.error_copying) * cmd;
-            if let (Some(left), Some(cut)) = (&mut state.part.grooves, &self.grooves) {
-                left.bend.heights_mm[node] = cut.bend.heights_mm[node];
-            }
         }
     }
 
@@ -198,6 +192,21 @@ impl Run {
             wheel_radius_mm: self.pass.wheel_radius_mm,
         }
     }
+}
+
+/// Lets the wheel come over a node where a stiff machine would leave `cmd_mm`, and says whether it cut anything. `bend` is that of the groove
+/// which it leaves, if it leaves any.
+pub(crate) fn cut(state: &mut State, node: usize, cmd_mm: f64, bend: Option<f64>) -> bool {
+    let h = &mut state.part.height.heights_mm[node];
+    if state.spec.faults.no_part || *h <= cmd_mm {
+        return false;
+    }
+    let mu = state.spec.grinder.error_copying;
+    *h = mu * *h + (1.0 - mu) * cmd_mm;
+    if let (Some(left), Some(bend)) = (&mut state.part.grooves, bend) {
+        left.bend.heights_mm[node] = bend;
+    }
+    true
 }
 
 /// Puts what is not so into a record.

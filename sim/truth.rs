@@ -34,6 +34,21 @@ pub struct GrindEntry {
     pub volume_mm3: f64,
 }
 
+/// A pass along a path that a controller executed: from when the wheel came to the part until the part was taken away.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Sweep {
+    /// How often the wheel came over the whole part: 1, and 1 for every spark-out, where nothing was left out and nothing done twice.
+    pub strokes: f64,
+    /// Of that, in the air.
+    pub strokes_in_air: f64,
+    /// Tracks.
+    pub tracks: u32,
+    /// Distance of the tracks, in millimetres; 0 before there were two.
+    pub spacing_mm: f64,
+    /// Seconds from its first track to the end of its last.
+    pub seconds: f64,
+}
+
 /// What a stream of random numbers is for.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Source {
@@ -82,6 +97,10 @@ pub(crate) struct State {
     /// The machine whose wheel or probe is at the part.
     pub engaged: Option<Kind>,
     pub history: Vec<GrindEntry>,
+    /// The passes along executed paths, in order.
+    pub sweeps: Vec<Sweep>,
+    /// Some of an executed path was lost, or the wheel ran into a probe: nobody knows how the part is.
+    pub unknown: bool,
 }
 
 impl State {
@@ -108,6 +127,8 @@ impl State {
             busy: None,
             engaged: None,
             history: Vec::new(),
+            sweeps: Vec::new(),
+            unknown: false,
         }
     }
 

@@ -37,7 +37,7 @@ impl Track {
 }
 
 /// The wheel of a world's grinder.
-pub struct Wheel {
+pub struct PlainWheel {
     world: Arc<Mutex<State>>,
     radius_mm: f64,
     first: Option<Track>,
@@ -45,7 +45,7 @@ pub struct Wheel {
     now: Option<Track>,
 }
 
-impl Wheel {
+impl PlainWheel {
     /// A wheel that its controller takes to have this radius.
     pub(crate) fn new(world: Arc<Mutex<State>>, stated_mm: f64) -> Self {
         let radius_mm = stated_mm + 1e-3 * locked(&world).spec.grinder.wheel_radius_error_um;

@@ -11,11 +11,12 @@ use std::fmt;
 use std::sync::{Arc, Mutex};
 
 use crate::cmm::{Cmm, Led};
+use crate::executed::Wheel;
 use crate::probe::Placement;
 use crate::process::{Grinder, systematic_mm};
 use crate::spec::{Faults, SpecError, WorldSpec};
-use crate::truth::{GrindEntry, State, locked};
-use crate::wheel::Wheel;
+use crate::truth::{GrindEntry, State, Sweep, locked};
+use crate::wheel::PlainWheel;
 
 /// A simulated cell. Clones share one truth.
 #[derive(Clone)]
@@ -55,10 +56,19 @@ impl World {
         Led::new(self.state.clone())
     }
 
-    /// Returns the wheel of the grinder, which is stated to have this radius, to be led from place to place; there is one, so hand it to one
-    /// controller.
-    pub fn wheel(&self, stated_mm: f64) -> Wheel {
-        Wheel::new(self.state.clone(), stated_mm)
+    /// Returns a wheel of the grinder that is led from place to place on tracks far apart, stated to have this radius; see [`crate::wheel`]. There is
+    /// one grinder, so take this, [`World::wheel`] or [`World::grinder`].
+    pub fn plain_wheel(&self, stated_mm: f64) -> PlainWheel {
+        PlainWheel::new(self.state.clone(), stated_mm)
+    }
+
+    /// Returns the wheel of a grinder whose controller is none of this world, to be moved along the path that that executes; there is one
+    /// grinder, so take either this or [`World::grinder`].
+    ///
+    /// # Errors
+    /// A radius that no wheel has.
+    pub fn wheel(&self, stated_radius_mm: f64) -> Result<Wheel, SpecError> {
+        Wheel::new(self.state.clone(), stated_radius_mm)
     }
 
     /// Puts a new blank in, as an operator would.
@@ -125,6 +135,11 @@ impl World {
     /// Truth: every pass that was begun, in order.
     pub fn history(&self) -> Vec<GrindEntry> {
         locked(&self.state).history.clone()
+    }
+
+    /// Truth: every pass along an executed path, in order.
+    pub fn sweeps(&self) -> Vec<Sweep> {
+        locked(&self.state).sweeps.clone()
     }
 
     /// Truth: how often a pass was begun for a job and cycle.

@@ -20,7 +20,7 @@ use std::io::Write;
 use std::time::Duration;
 
 use crate::Vec3;
-use crate::wheel::Wheel;
+use crate::wheel::PlainWheel;
 use deed::{Deed, Witness};
 use faults::{Fault, Faults};
 use program::{Program, Said, Step, says};
@@ -63,7 +63,7 @@ enum Interpreter {
 
 /// The controller, and the machine that it moves.
 pub struct Controller {
-    wheel: Wheel,
+    wheel: PlainWheel,
     faults: Faults,
     /// Seconds of the machine's time in a real second.
     speed: f64,
@@ -90,7 +90,7 @@ pub struct Controller {
 
 impl Controller {
     /// A controller that is switched on and homed, with no program.
-    pub fn new(wheel: Wheel, speed: f64, faults: Faults) -> Self {
+    pub fn new(wheel: PlainWheel, speed: f64, faults: Faults) -> Self {
         Self {
             wheel,
             faults,

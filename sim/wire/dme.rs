@@ -11,6 +11,7 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until};
 
+use super::executed::ExecutedPath;
 use crate::dme::{Outgoing, Server};
 
 /// The longest line, its end left out.
@@ -52,13 +53,21 @@ impl SharedServer {
 
     /// Serves a client until it goes away or is sent away, which is the end of its session.
     pub async fn serve_client(&self, stream: impl AsyncRead + AsyncWrite + Unpin) {
+        self.serve_after(stream, None).await;
+    }
+
+    async fn serve_after(&self, stream: impl AsyncRead + AsyncWrite + Unpin, grinder: Option<&ExecutedPath>) {
         // What goes wrong with a client is no other's concern.
-        let _ = self.converse(stream).await;
+        let _ = self.converse(stream, grinder).await;
         let now = self.now();
         self.locked().hung_up(now);
     }
 
-    async fn converse(&self, mut stream: impl AsyncRead + AsyncWrite + Unpin) -> io::Result<()> {
+    async fn converse(
+        &self,
+        mut stream: impl AsyncRead + AsyncWrite + Unpin,
+        grinder: Option<&ExecutedPath>,
+    ) -> io::Result<()> {
         let mut unread = Vec::new();
         loop {
             let due = self.locked().due().map(|due| self.0.began + due);
@@ -70,6 +79,10 @@ impl SharedServer {
             while let Some(end) = unread.iter().position(|b| *b == b'\n') {
                 let line: Vec<u8> = unread.drain(..=end).collect();
                 let line = String::from_utf8_lossy(&line);
+                // Nothing delays an abort.
+                if let Some(grinder) = grinder.filter(|_| !line.starts_with('E')) {
+                    grinder.caught_up().await;
+                }
                 self.locked().receive(line.trim_end_matches(['\r', '\n']), self.now());
             }
             if unread.len() > LONGEST_LINE {
@@ -96,11 +109,23 @@ impl ServingDme {
     /// # Errors
     /// The address cannot be bound.
     pub async fn tcp(addr: impl ToSocketAddrs, server: Server) -> io::Result<Self> {
+        Self::tcp_after(addr, server, None).await
+    }
+
+    /// Serves over TCP a machine that gets its parts from a grinder outside: whatever it is told to do, it does after what that has done.
+    ///
+    /// # Errors
+    /// The address cannot be bound.
+    pub async fn tcp_after(
+        addr: impl ToSocketAddrs,
+        server: Server,
+        grinder: Option<ExecutedPath>,
+    ) -> io::Result<Self> {
         let listener = TcpListener::bind(addr).await?;
         let local_addr = listener.local_addr()?;
         let server = SharedServer::from(server);
         let mut tasks = JoinSet::new();
-        tasks.spawn(serve(listener, server.clone()));
+        tasks.spawn(serve(listener, server.clone(), grinder));
         Ok(Self { local_addr, server, _tasks: tasks })
     }
 
@@ -116,12 +141,12 @@ impl ServingDme {
 }
 
 /// Serves one client after another.
-async fn serve(listener: TcpListener, server: SharedServer) {
+async fn serve(listener: TcpListener, server: SharedServer, grinder: Option<ExecutedPath>) {
     loop {
         match listener.accept().await {
             Ok((stream, _)) => {
                 if stream.set_nodelay(true).is_ok() {
-                    server.serve_client(stream).await;
+                    server.serve_after(stream, grinder.as_ref()).await;
                 }
             }
             Err(_) => tokio::time::sleep(Duration::from_millis(20)).await,

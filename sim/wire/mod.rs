@@ -7,11 +7,13 @@
 //!  faults   what goes wrong on Modbus, when
 //!  dme      I++ DME over TCP, one client at a time
 //!  rsh      the lines of linuxcncrsh, any number of clients
+//!  executed the path that a controller outside executes, a line for each servo cycle
 //! ```
 //!
 //! [`Serving`] is all that most callers need: it binds, serves, lets the machines' time pass, and stops.
 
 pub mod dme;
+pub mod executed;
 pub mod faults;
 #[cfg(not(unix))]
 #[path = "no_pty.rs"]

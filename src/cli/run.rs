@@ -87,7 +87,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     super::runtime()?.block_on(async {
         let mut cell = cell;
         let _world = match spec {
-            Some(spec) => Some(simulated::serve(spec, &mut cell, recipe.measure.probe_radius_mm).await?),
+            Some(spec) => Some(simulated::serve(spec, &mut cell, &recipe).await?),
             None => None,
         };
         let ending = carry_out(arguments, &recipe, &cell, task, plan, earlier, key).await?;

@@ -45,7 +45,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let mut cell = or_show(CellConfig::read(&arguments.cell))?;
     let spec = simulated::world_spec(&recipe, arguments.seed)?;
     super::runtime()?.block_on(async {
-        let serving = simulated::serve(spec, &mut cell, recipe.measure.probe_radius_mm).await?;
+        let serving = simulated::serve(spec, &mut cell, &recipe).await?;
         arguments.log.as_deref().map_or(Ok(()), |log| serving.log_to(log))?;
         if arguments.json {
             let wires = json!({ "simulation": true, "cmm": wire(&cell.cmm.link), "grinder": wire(&cell.grinder.link) });
@@ -71,8 +71,10 @@ fn wire(link: &Link) -> Value {
     match link.wire.line() {
         Some((Line::Tcp { host, port }, unit)) => json!({ "host": host, "port": port, "unit": unit }),
         Some((Line::Rtu { device, baud, .. }, unit)) => json!({ "device": device, "baud": baud, "unit": unit }),
-        None => {
-            link.wire.dme().map_or(Value::Null, |(host, port)| json!({ "host": host, "port": port, "kind": "ippdme" }))
-        }
+        None => match (link.wire.dme(), link.wire.rsh()) {
+            (Some((host, port)), _) => json!({ "host": host, "port": port, "kind": "ippdme" }),
+            (None, Some((host, port))) => json!({ "host": host, "port": port, "kind": "linuxcnc" }),
+            (None, None) => Value::Null,
+        },
     }
 }

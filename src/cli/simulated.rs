@@ -1,11 +1,13 @@
 //! A simulated world for the cell: built here only, and handed to its wires alone.
 
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
+use regrind::compensation::path::Pattern;
 use regrind::config::{CellConfig, Link};
 use regrind::device::{IppdmeWire, Line, RegisterMap, Wire, WordOrder};
 use regrind::formats::{AddedLines, FormatError, place_link, remove_link};
-use regrind::recipe::Recipe;
+use regrind::recipe::{Recipe, Wheel};
 use regrind_sim::cmm::Led;
 use regrind_sim::dme;
 use regrind_sim::options::{Layout, MachineOptions};
@@ -13,6 +15,7 @@ use regrind_sim::registers::Machine;
 use regrind_sim::seen::Seen;
 use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::dme::ServingDme;
+use regrind_sim::wire::executed::ExecutedPath;
 use regrind_sim::wire::faults::Faults;
 use regrind_sim::wire::rtu;
 use regrind_sim::wire::{Serving, SharedMachine};
@@ -76,15 +79,12 @@ pub(super) fn world_spec(recipe: &Recipe, seed: Option<u64>) -> Result<WorldSpec
 }
 
 /// Serves both machines of a cell on their wires. A port of 0 is replaced in the cell by the one that was free. A server of I++ DME has a
-/// probe of its own, whose radius is the one that the recipe has.
+/// probe of its own, whose radius is the one that the recipe has; and so has a grinder behind LinuxCNC its wheel.
 ///
 /// # Errors
 /// A wire that cannot be had.
-pub(super) async fn serve(
-    spec: WorldSpec,
-    cell: &mut CellConfig,
-    probe_radius_mm: f64,
-) -> Result<SimulatedCell, Failure> {
+pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recipe) -> Result<SimulatedCell, Failure> {
+    let probe_radius_mm = recipe.measure.probe_radius_mm;
     let path = cell.path().to_owned();
     let failed = |reason: String| Failure::Simulation { path: path.clone(), reason };
     let speed = spec.speed;
@@ -92,6 +92,16 @@ pub(super) async fn serve(
     let world = World::new(spec).map_err(|e| failed(e.to_string()))?;
     let (servings, places, links) = (Vec::new(), Vec::new(), Vec::new());
     let mut simulated = SimulatedCell { servings, places, dme: None, links, _world: world.clone() };
+    if let Wire::Linuxcnc(grinder) = &cell.grinder.link.wire {
+        let folder = path.parent().unwrap_or(Path::new(""));
+        let path = grinder.executed_path(folder).map(|command| executed(command, &world, recipe));
+        let path = path.transpose().map_err(&failed)?;
+        let Wire::Ippdme(wire) = &mut cell.cmm.link.wire else {
+            return Err(failed("beside LinuxCNC only a measuring machine behind I++ DME is simulated".into()));
+        };
+        simulated.serve_dme(wire, world.led(), speed, probe_radius_mm, path).await.map_err(&failed)?;
+        return Ok(simulated);
+    }
     let line = |link: &Link| {
         let none = "a machine that a person serves cannot be simulated; its part is yours to play";
         link.wire.line().ok_or_else(|| failed(none.into()))
@@ -100,7 +110,7 @@ pub(super) async fn serve(
     let (of_grinder, unit) = line(&cell.grinder.link)?;
     let grinder = (unit, grinder.into());
     if let Wire::Ippdme(wire) = &mut cell.cmm.link.wire {
-        simulated.serve_dme(wire, world.led(), speed, probe_radius_mm).await.map_err(&failed)?;
+        simulated.serve_dme(wire, world.led(), speed, probe_radius_mm, None).await.map_err(&failed)?;
         let port = simulated.serve(&of_grinder, vec![grinder]).await.map_err(&failed)?;
         set_port(&mut cell.grinder.link.wire, port);
         return Ok(simulated);
@@ -119,6 +129,21 @@ pub(super) async fn serve(
         set_port(&mut cell.grinder.link.wire, port);
     }
     Ok(simulated)
+}
+
+/// The wheel of the recipe, along what a controller outside executes.
+fn executed(command: Command, world: &World, recipe: &Recipe) -> Result<ExecutedPath, String> {
+    let grinding = &recipe.grinding;
+    let (Wheel::Sphere { radius_mm }, Pattern::Raster) = (grinding.wheel, grinding.pattern) else {
+        return Err(
+            "the simulated wheel is a ball on tracks along x; take another recipe, or leave the simulation out".into(),
+        );
+    };
+    let wheel = world.wheel(radius_mm).map_err(|error| error.to_string())?;
+    let program = command.get_program().to_string_lossy().into_owned();
+    ExecutedPath::follow(command, wheel).map_err(|error| {
+        format!("grinder.wire.executed_path: {program} cannot be begun: {error}; correct the cell file")
+    })
 }
 
 impl SimulatedCell {
@@ -143,12 +168,19 @@ impl SimulatedCell {
     }
 
     /// Serves a measuring machine by I++ DME, and writes the port that it got into its wire.
-    async fn serve_dme(&mut self, wire: &mut IppdmeWire, probe: Led, speed: f64, radius_mm: f64) -> Result<(), String> {
+    async fn serve_dme(
+        &mut self,
+        wire: &mut IppdmeWire,
+        probe: Led,
+        speed: f64,
+        radius_mm: f64,
+        grinder: Option<ExecutedPath>,
+    ) -> Result<(), String> {
         let tools = vec![("NoTool".to_owned(), 0.0), (wire.tool.clone(), radius_mm)];
         let machine = dme::machine::Machine::new(probe, dme::machine::Options { tools, ..Default::default() });
         let server = dme::Server::new(machine, speed, dme::faults::Faults::none());
         let (host, port) = (wire.host.clone(), wire.port);
-        let serving = ServingDme::tcp((host.as_str(), port), server)
+        let serving = ServingDme::tcp_after((host.as_str(), port), server, grinder)
             .await
             .map_err(|e| format!("{host}:{port} cannot be served: {e}; choose another port, or end what holds it"))?;
         wire.port = serving.local_addr().port();

@@ -21,6 +21,7 @@ mod ippdme;
 mod keep;
 mod killed;
 mod learning;
+mod linuxcnc;
 mod manual;
 mod mirror_cell;
 mod mirror_run;

@@ -269,6 +269,7 @@ impl<'s> Happening<'s> {
             settle_within: ms(wire.settle_timeout_ms),
             record_within: ms(wire.record_timeout_ms),
             expected_name: None,
+            simulated: true,
         }
     }
 

@@ -215,7 +215,7 @@ fn by_programs(
     (log, deeds, cues): (&Log, &RshDeeds, &Cues),
 ) -> SharedController {
     let radius_mm = setting(Wanted::Good).recipe.grinding.wheel.radius_mm();
-    let mut controller = Controller::new(world.wheel(radius_mm), speed, faults);
+    let mut controller = Controller::new(world.plain_wheel(radius_mm), speed, faults);
     let (log, deeds, cues) = (log.clone(), deeds.clone(), cues.clone());
     controller.witness(Box::new(move |deed| {
         let at = Instant::now();

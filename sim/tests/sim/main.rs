@@ -3,6 +3,7 @@
 mod closing_the_loop;
 mod common;
 mod counter;
+mod executed;
 mod grinding;
 mod machines;
 mod measuring;

@@ -528,8 +528,9 @@ impl Machine for LinuxcncGrinder {
     async fn connect(&mut self) -> Answered<Identity> {
         let name = self.controller.meet().await?;
         self.find_what_was_restored().await;
-        // It has no number that changes when it is restarted, and does not say whether a machine is behind it.
-        Ok(Identity { kind: MachineKind::Grinder, name, boot_id: 0, simulation: false, silence_limit_s: None })
+        // It has no number that changes when it is restarted, and does not know whether a machine is behind it.
+        let simulation = self.settings.simulated;
+        Ok(Identity { kind: MachineKind::Grinder, name, boot_id: 0, simulation, silence_limit_s: None })
     }
 
     async fn status(&mut self) -> Answered<Status> {

@@ -1,7 +1,8 @@
 //! What a cell file says of a grinder by LinuxCNC, and the machine that is made of it.
 
 use std::net::IpAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::time::Duration;
 
 use schemars::JsonSchema;
@@ -36,6 +37,10 @@ pub struct LinuxcncWire {
     /// The same folder as the controller sees it; left out, as this computer does.
     #[schemars(length(min = 1, max = 200), example = "/home/cnc/linuxcnc/nc_files/regrind")]
     pub programs_at_controller: Option<String>,
+    /// For a simulated cell: the program, with its arguments, that prints the path which the controller executes and which the simulated wheel
+    /// follows; relative to this file where it has a slash in it.
+    #[schemars(length(min = 1, max = 20), example = ["linuxcnc/executed-path"])]
+    pub executed_path: Option<Vec<String>>,
     /// Joints that must be homed.
     #[schemars(range(min = 1, max = 6))]
     pub joints: u8,
@@ -59,6 +64,7 @@ impl Default for LinuxcncWire {
             control_password: "EMCTOO".to_owned(),
             programs: String::new(),
             programs_at_controller: None,
+            executed_path: None,
             joints: 3,
             answer_timeout_ms: 2000,
             settle_timeout_ms: 5000,
@@ -84,6 +90,8 @@ pub struct LinuxcncSettings {
     pub programs: PathBuf,
     /// The folder of programs, as the controller sees it.
     pub programs_at_controller: String,
+    /// Whether a simulation is behind the controller, which does not know it itself.
+    pub simulated: bool,
     /// Joints that must be homed.
     pub joints: usize,
     /// For an answer.
@@ -106,11 +114,7 @@ impl Wired for LinuxcncWire {
             let allowed = "LinuxCNC is for grinders";
             return document.report("cmm.wire.kind", "is \"linuxcnc\"", allowed, "name another wire");
         }
-        if place.simulated == Some(true) {
-            let allowed = "nothing here simulates LinuxCNC";
-            let remedy = "write `simulated = false`, even where the controller has no machine behind it";
-            document.report(&place.key("wire.kind"), "is \"linuxcnc\" in a simulated cell", allowed, remedy);
-        }
+        self.check_path(place, document);
         let host = &self.host;
         if host.chars().any(|c| c.is_whitespace() || c == '/' || c == '@') {
             let allowed = "it must be a name or an address alone, such as \"192.168.0.30\"";
@@ -157,6 +161,7 @@ impl Wired for LinuxcncWire {
             run_folder: making.run_folder.to_owned(),
             programs_at_controller: at_controller.unwrap_or_else(|| programs.display().to_string()),
             programs,
+            simulated: making.simulated,
             joints: self.joints.into(),
             answer_within: ms(self.answer_timeout_ms),
             settle_within: ms(self.settle_timeout_ms),
@@ -171,6 +176,38 @@ impl Wired for LinuxcncWire {
 }
 
 impl LinuxcncWire {
+    /// The program that prints the path which the controller executes, where the cell is simulated.
+    pub fn executed_path(&self, cell_folder: &Path) -> Option<Command> {
+        let (program, arguments) = self.executed_path.as_deref()?.split_first()?;
+        let at = Path::new(program);
+        let mut command = match at.components().count() {
+            0 | 1 => Command::new(program),
+            _ => Command::new(cell_folder.join(at)),
+        };
+        command.args(arguments);
+        Some(command)
+    }
+
+    /// The controller is real and the machine behind it is not: then its path is told.
+    fn check_path(&self, place: &Place<'_>, document: &mut Document) {
+        let key = place.key("wire.executed_path");
+        match (place.simulated, &self.executed_path) {
+            (Some(true), None) => {
+                let allowed = "a simulated wheel follows the path that LinuxCNC executes";
+                let remedy = "name the program that prints it (docs/linuxcnc.md), or write `simulated = false`";
+                document.report(&place.key("wire.kind"), "is \"linuxcnc\" in a simulated cell", allowed, remedy);
+            }
+            (Some(false), Some(_)) => {
+                let allowed = "the wheel of a real machine needs nobody to tell it where it is";
+                document.report(&key, "stands in a cell that is not simulated", allowed, "leave it out");
+            }
+            (_, Some(words)) if words.iter().any(String::is_empty) => {
+                document.report(&key, "has an empty word", "it is a program and its arguments", "take it out");
+            }
+            _ => {}
+        }
+    }
+
     /// The path stands in a line of the protocol and in a comment of the program.
     fn check_folder(&self, place: &Place<'_>, document: &mut Document) {
         let (key, folder) = match &self.programs_at_controller {

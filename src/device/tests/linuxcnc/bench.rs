@@ -67,6 +67,7 @@ impl Bench {
             run_folder: run,
             programs_at_controller: programs.display().to_string(),
             programs,
+            simulated: false,
             joints: 3,
             answer_within: Duration::from_secs(30),
             settle_within: Duration::from_secs(30),

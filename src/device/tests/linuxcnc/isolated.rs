@@ -196,7 +196,7 @@ fn configuration() -> String {
         format!("MIN_LIMIT = -{reach}\nMAX_LIMIT = {reach}\nMAX_VELOCITY = 500\nMAX_ACCELERATION = 5000\n")
     };
     let mut text = "[EMC]\nVERSION = 1.1\nMACHINE = bench\n[DISPLAY]\nDISPLAY = linuxcncrsh\n[TASK]\nTASK = milltask\nCYCLE_TIME = 0.001\n\
-         [RS274NGC]\nPARAMETER_FILE = grinder.var\n[EMCMOT]\nEMCMOT = motmod\nCOMM_TIMEOUT = 1.0\nSERVO_PERIOD = 1000000\n\
+         [RS274NGC]\nPARAMETER_FILE = grinder.var\n[EMCMOT]\nEMCMOT = motmod\nCOMM_TIMEOUT = 30.0\nSERVO_PERIOD = 1000000\n\
          [EMCIO]\nEMCIO = io\nCYCLE_TIME = 0.010\nTOOL_TABLE = grinder.tbl\n[HAL]\nHALFILE = grinder.hal\n\
          [TRAJ]\nCOORDINATES = X Y Z\nLINEAR_UNITS = mm\nANGULAR_UNITS = degree\nMAX_LINEAR_VELOCITY = 500\nMAX_LINEAR_ACCELERATION = 5000\n\
          [KINS]\nKINEMATICS = trivkins coordinates=XYZ\nJOINTS = 3\n"

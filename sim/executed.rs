@@ -1,0 +1,349 @@
+//! The grinder once more: what the wheel leaves along the path that a controller outside really executes, servo cycle by servo cycle.
+//!
+//! The pass is no list of registers here, and no map comes with it: all that is known is where the controller had the wheel's centre. From
+//! each place c of it, in the frame of the part, follow the foot on the nominal surface and the height of what a stiff machine would leave there,
+//!
+//! ```text
+//!  h = (c' - foot) . n - R        R the true radius of the wheel
+//!  c' = c + (R - stated) z - lag  touched off at its lowest place; the axes lag behind along the path
+//! ```
+//!
+//! and with that come the systematic errors, wear, growth, and what is drawn afresh, as in [`crate::process`].
+//!
+//! **Tracks.** The wheel is on a track from when it comes near the part until it lifts off, or turns back in x. A track grinds the strip half
+//! way to its neighbours, as deep as at its own y: the ridges between are the [`Grooves`] of the part. So it waits for the next one, or for
+//! [`Wheel::settle`]. Beyond the outermost the wheel leaves what its own curve does. Tracks must run along x.
+//!
+//! **Passes.** Everything from when the wheel comes to the part until the part is taken away is one pass: the wheel is dressed before.
+
+use std::sync::{Arc, Mutex};
+
+use crate::Vec3;
+use crate::body::Kind;
+use crate::part::{Grooves, HeightGrid, NODE_SPACING_MM, Part};
+use crate::process::{cut, smooth};
+use crate::shape::Shape;
+use crate::spec::{SpecError, WorldSpec};
+use crate::truth::{Source, State, Sweep, locked, stream};
+
+/// The wheel is at the part where it is no higher over it.
+const NEAR_MM: f64 = 1.0;
+/// No pass goes so deep at once: whoever is there has run into the part.
+const TOO_DEEP_MM: f64 = 2.0;
+/// How far a strip reaches beyond a border that is nobody else's, as a share of its half width.
+const ON_BORDER: f64 = 0.05;
+/// How far beyond its outermost track the wheel grinds.
+const BESIDE_MM: f64 = 1.5;
+
+/// Where the wheel is over the part.
+#[derive(Clone, Copy, Debug)]
+struct Foot {
+    at_mm: [f64; 2],
+    /// What it would leave over the nominal surface.
+    height_mm: f64,
+    seconds: f64,
+}
+
+/// A way over the part.
+struct Track {
+    feet: Vec<Foot>,
+    y_mm: f64,
+}
+
+/// What is fixed from the beginning of a pass.
+struct Pass {
+    /// Systematic error and what was drawn, a value for every node.
+    fixed_mm: Vec<f64>,
+    /// How the grooves bend, if there are any.
+    bend: Option<HeightGrid>,
+    began_s: f64,
+    heat_at_begin: f64,
+    /// Nodes on the part, and how many the wheel has come over.
+    nodes: f64,
+    visits: u64,
+    in_air: u64,
+    /// y of its first track.
+    first_mm: Option<f64>,
+}
+
+/// The wheel of a grinder whose controller is none of this world.
+pub struct Wheel {
+    world: Arc<Mutex<State>>,
+    stated_radius_mm: f64,
+    last: Option<(Vec3, f64)>,
+    guess_mm: [f64; 2],
+    pass: Option<Pass>,
+    feet: Vec<Foot>,
+    /// The track that waits for the next one.
+    waiting: Option<Track>,
+    /// Half the distance of tracks, once there were two, and to which side they follow each other.
+    half_mm: Option<f64>,
+    side: f64,
+    /// How far the strips have come.
+    reached_mm: Option<f64>,
+}
+
+impl Wheel {
+    pub(crate) fn new(world: Arc<Mutex<State>>, stated_radius_mm: f64) -> Result<Self, SpecError> {
+        if !(0.1..=1000.0).contains(&stated_radius_mm) {
+            return Err(SpecError { key: "radius of the wheel", value: stated_radius_mm, limit: "0.1 to 1000 mm" });
+        }
+        let (last, guess_mm, pass, feet, waiting) = (None, [0.0; 2], None, Vec::new(), None);
+        let (half_mm, side, reached_mm) = (None, 1.0, None);
+        Ok(Self { world, stated_radius_mm, last, guess_mm, pass, feet, waiting, half_mm, side, reached_mm })
+    }
+
+    /// Moves it on: where its centre is in the frame of the part, and when by the controller's clock.
+    pub fn at(&mut self, place_mm: Vec3, seconds: f64) {
+        let Some((from_mm, then)) = self.last.replace((place_mm, seconds)) else { return };
+        if from_mm == place_mm {
+            return;
+        }
+        let world = Arc::clone(&self.world);
+        let state = &mut *locked(&world);
+        match self.foot(state, [from_mm, place_mm], [then, seconds]) {
+            Some(foot) => self.come_over(state, foot),
+            None => self.leave(state),
+        }
+    }
+
+    /// Nobody knows where it is any more, as before the machine is homed or after it was switched off: it does not touch the part.
+    pub fn away(&mut self) {
+        self.last = None;
+        let world = Arc::clone(&self.world);
+        self.leave(&mut locked(&world));
+    }
+
+    /// Some of its path was lost: how the part is nobody knows.
+    pub fn lost(&mut self) {
+        self.away();
+        locked(&self.world).unknown = true;
+    }
+
+    /// What was ground is ground, if no neighbour comes any more; where the wheel is at the part, its track goes on.
+    pub fn settle(&mut self) {
+        let world = Arc::clone(&self.world);
+        let state = &mut *locked(&world);
+        if self.feet.is_empty() {
+            self.grind_waiting(state, None);
+        }
+    }
+
+    /// Where the wheel is over the part, if it is near it.
+    fn foot(&mut self, state: &mut State, [from_mm, place_mm]: [Vec3; 2], [then, seconds]: [f64; 2]) -> Option<Foot> {
+        let error_mm = 1e-3 * state.spec.grinder.wheel_radius_error_um;
+        let stated_mm = self.stated_radius_mm;
+        let radius_mm = *state.true_wheel_radius_mm.get_or_insert(stated_mm + error_mm);
+        // The lag is stated at 1000 mm/min.
+        let lag_s = 1e-3 * state.spec.grinder.following_um * 60.0 / 1000.0;
+        let mut centre: Vec3 = std::array::from_fn(|k| {
+            let speed = (place_mm[k] - from_mm[k]) / (seconds - then).max(1e-6);
+            place_mm[k] - lag_s * speed
+        });
+        centre[2] += radius_mm - stated_mm;
+        let near = [place_mm[0], place_mm[1]];
+        let (at_mm, distance_mm) =
+            [self.guess_mm, near].into_iter().find_map(|from| foot(state.part.shape.as_ref(), centre, from))?;
+        self.guess_mm = at_mm;
+        let height_mm = distance_mm - radius_mm;
+        let over_mm = height_mm - state.part.height.at(at_mm[0], at_mm[1]).0;
+        state.unknown |= over_mm < -TOO_DEEP_MM && state.part.aperture.contains(at_mm[0], at_mm[1]);
+        (over_mm < NEAR_MM).then_some(Foot { at_mm, height_mm, seconds })
+    }
+
+    fn come_over(&mut self, state: &mut State, foot: Foot) {
+        if !state.take(Kind::Grinder) {
+            // The probe is there.
+            state.unknown = true;
+            return;
+        }
+        if self.pass.is_none() || state.on_table {
+            self.begin(state, foot.seconds);
+        }
+        if let [first, .., last] = &self.feet[..] {
+            let forth = last.at_mm[0] - first.at_mm[0];
+            if forth * (foot.at_mm[0] - last.at_mm[0]) < 0.0 {
+                self.end_track(state);
+            }
+        }
+        self.feet.push(foot);
+    }
+
+    fn leave(&mut self, state: &mut State) {
+        self.end_track(state);
+        state.release(Kind::Grinder);
+    }
+
+    fn begin(&mut self, state: &mut State, seconds: f64) {
+        (self.waiting, self.half_mm, self.reached_mm) = (None, None, None);
+        state.on_table = false;
+        state.passes_begun += 1;
+        let spec = &state.spec.grinder;
+        if spec.dressed_each_pass {
+            state.worn_strokes = 0.0;
+        }
+        let rng = &mut stream(state.spec.seed, Source::Repeatability, state.passes_begun);
+        let fresh = smooth(rng, spec.repeatability_correlation_mm, spec.repeatability_um);
+        let mut fixed_mm = state.systematic_mm.clone();
+        state.part.height.add(&fresh, &mut fixed_mm);
+        let radius_mm = state.true_wheel_radius_mm.unwrap_or(self.stated_radius_mm);
+        let nodes = state.part.height.nodes().filter(|[x, y]| state.part.aperture.contains(*x, *y)).count() as f64;
+        self.pass = Some(Pass {
+            fixed_mm,
+            bend: bend(&state.spec, &state.part, radius_mm),
+            began_s: seconds,
+            heat_at_begin: state.heat,
+            nodes,
+            visits: 0,
+            in_air: 0,
+            first_mm: None,
+        });
+        state.sweeps.push(Sweep::default());
+    }
+
+    /// The wheel has lifted off, or turned back.
+    fn end_track(&mut self, state: &mut State) {
+        let feet = std::mem::take(&mut self.feet);
+        let [half_x, half_y] = state.part.aperture.half_mm();
+        let on_part = |foot: &&Foot| foot.at_mm[0].abs() <= half_x && foot.at_mm[1].abs() <= half_y + BESIDE_MM;
+        let (sum, count) =
+            feet.iter().filter(on_part).fold((0.0, 0.0), |(sum, n), foot| (sum + foot.at_mm[1], n + 1.0));
+        if count > 0.0 && feet.len() > 1 {
+            let track = Track { y_mm: sum / count, feet };
+            self.grind_waiting(state, Some(track.y_mm));
+            self.waiting = Some(track);
+        }
+    }
+
+    /// Grinds the track that waits, half way to where the next one is.
+    fn grind_waiting(&mut self, state: &mut State, next_mm: Option<f64>) {
+        let Some(track) = self.waiting.take() else { return };
+        let Some(mut pass) = self.pass.take() else { return };
+        let step = next_mm.map(|next| next - track.y_mm).filter(|step| self.is_neighbour(*step));
+        if let Some(step) = step {
+            (self.half_mm, self.side) = (Some(0.5 * step.abs()), step.signum());
+        }
+        pass.first_mm.get_or_insert(track.y_mm);
+        leave_grooves(state, &pass, &track, self.half_mm);
+        let half = self.half_mm.unwrap_or(0.5 * NODE_SPACING_MM);
+        let (far, near) = (track.y_mm + self.side * half, track.y_mm - self.side * half);
+        let joined = self.reached_mm.filter(|reached| (reached - near).abs() < 0.2 * half);
+        // A border that is nobody else's takes in the row of nodes that is on it.
+        let outwards = [-self.side, self.side].map(|side| ON_BORDER * half * side);
+        let strip = [joined.unwrap_or(near + outwards[0]), if step.is_some() { far } else { far + outwards[1] }];
+        let beside = [(joined.is_none(), -self.side), (step.is_none(), self.side)];
+        let beside = beside.map(|(is_open, side)| is_open.then_some(side));
+        self.reached_mm = Some(far);
+        grind(state, &mut pass, &track, strip, beside.into_iter().flatten());
+        self.pass = Some(pass);
+    }
+
+    fn is_neighbour(&self, step: f64) -> bool {
+        match self.half_mm {
+            Some(half) => (0.4 * half..=6.0 * half).contains(&step.abs()),
+            None => (1e-3..=5.0).contains(&step.abs()),
+        }
+    }
+}
+
+/// Returns how the grooves bend that a wheel leaves all over the part, if it leaves any.
+fn bend(spec: &WorldSpec, part: &Part, radius_mm: f64) -> Option<HeightGrid> {
+    spec.grinder.scallops.then(|| {
+        let mut bend = HeightGrid::over(part.aperture.half_mm(), 0.0);
+        bend.heights_mm = bend.nodes().map(|at| Grooves::bend_at(part.shape.as_ref(), radius_mm, at)).collect();
+        bend
+    })
+}
+
+/// The grooves lie where the tracks of this pass do; where it has not come, those of the pass before keep their height.
+fn leave_grooves(state: &mut State, pass: &Pass, track: &Track, half_mm: Option<f64>) {
+    let (Some(half), Some(first_mm)) = (half_mm, pass.first_mm) else { return };
+    let number = ((track.y_mm - first_mm) / (2.0 * half)).round();
+    let spacing_mm = if number == 0.0 { 2.0 * half } else { (track.y_mm - first_mm) / number };
+    if let Some(sweep) = state.sweeps.last_mut() {
+        sweep.spacing_mm = spacing_mm;
+    }
+    if pass.bend.is_none() {
+        state.part.grooves = None;
+        return;
+    }
+    let before = state.part.grooves.take().map(|grooves| grooves.bend);
+    let bend = before.unwrap_or_else(|| HeightGrid::over(state.part.aperture.half_mm(), 0.0));
+    let wheel_radius_mm = state.true_wheel_radius_mm.unwrap_or_default();
+    state.part.grooves = Some(Grooves { first_mm, spacing_mm, wheel_radius_mm, bend });
+}
+
+/// Lets a track grind the nodes of its strip, and beside it, where no other track is, what its own curve reaches.
+fn grind(state: &mut State, pass: &mut Pass, track: &Track, strip: [f64; 2], beside: impl Iterator<Item = f64>) {
+    let spec = &state.spec.grinder;
+    let strokes = |visits: u64| visits as f64 / pass.nodes.max(1.0);
+    let worn = state.worn_strokes;
+    let wear_um = spec.wear_at_um(worn + strokes(pass.visits)) - spec.wear_at_um(worn);
+    let seconds = track.feet.last().map_or(0.0, |foot| foot.seconds) - pass.began_s;
+    let heat = 1.0 - (1.0 - pass.heat_at_begin) * (-seconds / spec.thermal_tau_s).exp();
+    let drift_mm = 1e-3 * (wear_um - spec.thermal_um * (heat - pass.heat_at_begin));
+    for (node, [x, y], height_mm) in crossed(&state.part.height, track, strip) {
+        let bend = pass.bend.as_ref().map(|bend| bend.heights_mm[node]);
+        let has_cut = cut(state, node, height_mm + pass.fixed_mm[node] + drift_mm, bend);
+        if state.part.aperture.contains(x, y) {
+            pass.visits += 1;
+            pass.in_air += u64::from(!has_cut);
+        }
+    }
+    for side in beside {
+        let edge = if (strip[1] - strip[0]) * side > 0.0 { strip[1] } else { strip[0] };
+        for (node, [x, y], height_mm) in crossed(&state.part.height, track, [edge, edge + side * BESIDE_MM]) {
+            let radius_mm = state.true_wheel_radius_mm.unwrap_or(f64::INFINITY);
+            // A wheel without grooves is straight across its tracks.
+            let across = pass.bend.as_ref().map(|_| Grooves::bend_at(state.part.shape.as_ref(), radius_mm, [x, y]));
+            let rise_mm = 0.5 * across.unwrap_or(0.0) * (y - track.y_mm).powi(2);
+            cut(state, node, height_mm + rise_mm + pass.fixed_mm[node] + drift_mm, None);
+        }
+    }
+    state.heat = heat;
+    if let Some(sweep) = state.sweeps.last_mut() {
+        let [strokes, strokes_in_air] = [pass.visits, pass.in_air].map(|n| n as f64 / pass.nodes.max(1.0));
+        *sweep = Sweep { strokes, strokes_in_air, tracks: sweep.tracks + 1, seconds, ..*sweep };
+    }
+}
+
+/// Returns the nodes that a track crosses within a strip of y, and what the wheel would leave at each: as at its own y.
+fn crossed(grid: &HeightGrid, track: &Track, strip: [f64; 2]) -> Vec<(usize, [f64; 2], f64)> {
+    let mut nodes = Vec::new();
+    for pair in track.feet.windows(2) {
+        let [a, b] = [pair[0], pair[1]];
+        let (from, to) = (a.at_mm[0], b.at_mm[0]);
+        nodes.extend(grid.within([from, to], strip).map(|(node, [x, y])| {
+            let share = (x - from) / (to - from);
+            (node, [x, y], a.height_mm + share * (b.height_mm - a.height_mm))
+        }));
+    }
+    nodes
+}
+
+/// Returns the foot of a point on a surface, from a place nearby, and how far along the normal the point is; none where that does not
+/// converge.
+///
+/// Solves (c - S) . S_x = 0 and (c - S) . S_y = 0 by Newton's method.
+fn foot(shape: &dyn Shape, centre: Vec3, [mut x, mut y]: [f64; 2]) -> Option<([f64; 2], f64)> {
+    for _ in 0..40 {
+        let ([p, q], [r, s, t]) = (shape.gradient(x, y), shape.hessian(x, y));
+        let off = [centre[0] - x, centre[1] - y, centre[2] - shape.height(x, y)];
+        let miss = [off[0] + p * off[2], off[1] + q * off[2]];
+        let [a, b, d] = [1.0 + p * p - r * off[2], p * q - s * off[2], 1.0 + q * q - t * off[2]];
+        let determinant = a * d - b * b;
+        let step = [(d * miss[0] - b * miss[1]) / determinant, (a * miss[1] - b * miss[0]) / determinant];
+        let longest = step[0].abs().max(step[1].abs());
+        if !longest.is_finite() || determinant <= 0.0 {
+            return None;
+        }
+        let damping = if longest > 2.0 { 2.0 / longest } else { 1.0 };
+        (x, y) = (x + damping * step[0], y + damping * step[1]);
+        if longest < 1e-10 {
+            let n = shape.normal(x, y);
+            let point = shape.point(x, y);
+            return Some(([x, y], (0..3).map(|k| (centre[k] - point[k]) * n[k]).sum()));
+        }
+    }
+    None
+}

@@ -1,0 +1,216 @@
+//! The path that a controller outside executes, as a program beside it tells it.
+//!
+//! The program prints a line for every servo cycle, oldest first, and none is left out:
+//!
+//! ```text
+//!  number  x  y  z  homed  mark        number of the cycle, place in millimetres in the frame of the part, 1 or 0, a whole number
+//! ```
+//!
+//! and takes lines with a number each, which it sees to come back as the mark of a cycle to come. Who has seen the mark of his question has
+//! seen everything that the controller had executed before. That is how a measuring machine knows that the part has come out of the grinder,
+//! however long lines lie in a pipe: [`ExecutedPath::caught_up`].
+
+use std::io::{self, BufRead, BufReader, Write};
+use std::process::{Child, ChildStdin, Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use tokio::sync::watch;
+use tokio::time::timeout;
+
+use crate::executed::Wheel;
+
+/// A servo cycle.
+const CYCLE_S: f64 = 1e-3;
+/// What was asked so lately is not asked again: no pass is loaded, begun and ended within it.
+const FRESH: Duration = Duration::from_millis(500);
+/// A program that does not bring a mark back within this is taken for gone.
+const LOST_AFTER: Duration = Duration::from_secs(30);
+/// Between two attempts to begin the program.
+const AGAIN_AFTER: Duration = Duration::from_millis(200);
+
+/// A wheel that follows what a controller executes, until this is dropped.
+pub struct ExecutedPath {
+    shared: Arc<Shared>,
+    asked: Mutex<(u32, Option<Instant>)>,
+}
+
+struct Shared {
+    ended: AtomicBool,
+    /// The program, while it runs.
+    child: Mutex<Option<Child>>,
+    input: Mutex<Option<ChildStdin>>,
+    /// The mark that came last; none while nothing comes.
+    mark: watch::Sender<Option<u32>>,
+}
+
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl ExecutedPath {
+    /// Begins the program, again whenever it ends, and moves the wheel as it tells.
+    ///
+    /// # Errors
+    /// A program that cannot be begun at all.
+    pub fn follow(command: Command, wheel: Wheel) -> io::Result<Self> {
+        let mut command = command;
+        command.stdin(Stdio::piped()).stdout(Stdio::piped());
+        let first = command.spawn()?;
+        let (ended, mark) = (AtomicBool::new(false), watch::Sender::new(None));
+        let shared = Arc::new(Shared { ended, child: Mutex::default(), input: Mutex::default(), mark });
+        let following = Arc::clone(&shared);
+        thread::spawn(move || follow(&following, &mut command, first, wheel));
+        Ok(Self { shared, asked: Mutex::new((rand::random(), None)) })
+    }
+
+    /// Waits until the wheel has been moved along everything that the controller has executed before now. Where no program tells of it any
+    /// more, what it told is all there is.
+    pub async fn caught_up(&self) {
+        let question = {
+            let (question, when) = &mut *locked(&self.asked);
+            if when.is_some_and(|when| when.elapsed() < FRESH) {
+                return;
+            }
+            *question = question.wrapping_add(1).max(1);
+            *when = Some(Instant::now());
+            *question
+        };
+        let mut marks = self.shared.mark.subscribe();
+        let asked = locked(&self.shared.input).as_mut().is_some_and(|input| writeln!(input, "{question}").is_ok());
+        if asked {
+            let seen = marks.wait_for(|mark| mark.is_none_or(|mark| mark == question));
+            // Who has no answer by then has none.
+            let _ = timeout(LOST_AFTER, seen).await;
+        }
+    }
+
+    /// Whether anything of a controller comes.
+    pub fn is_told(&self) -> bool {
+        self.shared.mark.borrow().is_some()
+    }
+}
+
+impl Drop for ExecutedPath {
+    fn drop(&mut self) {
+        self.shared.ended.store(true, Ordering::SeqCst);
+        // The program ends when nobody can ask it any more, and is ended if it does not.
+        *locked(&self.shared.input) = None;
+        if let Some(child) = &mut *locked(&self.shared.child) {
+            let _ = child.kill();
+        }
+    }
+}
+
+/// Follows one program after another.
+fn follow(shared: &Shared, command: &mut Command, first: Child, mut wheel: Wheel) {
+    let mut next = Ok(first);
+    while !shared.ended.load(Ordering::SeqCst) {
+        if let Ok(mut child) = next {
+            *locked(&shared.input) = child.stdin.take();
+            let lines = child.stdout.take();
+            *locked(&shared.child) = Some(child);
+            if let Some(lines) = lines {
+                read(shared, BufReader::new(lines), &mut wheel);
+            }
+            *locked(&shared.input) = None;
+            wheel.away();
+            shared.mark.send_replace(None);
+            if let Some(mut child) = locked(&shared.child).take() {
+                let _ = child.kill();
+                let _ = child.wait();
+            }
+        }
+        thread::sleep(AGAIN_AFTER);
+        next = command.spawn();
+    }
+    if let Ok(mut child) = next {
+        let _ = child.kill();
+        let _ = child.wait();
+    }
+}
+
+/// Moves the wheel line by line, until no more come.
+fn read(shared: &Shared, lines: impl BufRead, wheel: &mut Wheel) {
+    let mut expected = None;
+    for line in lines.lines().map_while(Result::ok) {
+        let Some(Cycle { number, place_mm, homed, mark }) = Cycle::of(&line) else {
+            wheel.lost();
+            continue;
+        };
+        if expected.is_some_and(|expected| expected != number) {
+            wheel.lost();
+        }
+        expected = Some(number + 1);
+        match homed {
+            true => wheel.at(place_mm, number as f64 * CYCLE_S),
+            false => wheel.away(),
+        }
+        if *shared.mark.borrow() != Some(mark) {
+            wheel.settle();
+            shared.mark.send_replace(Some(mark));
+        }
+    }
+}
+
+/// What a line tells.
+#[derive(Debug, PartialEq)]
+struct Cycle {
+    number: u64,
+    place_mm: [f64; 3],
+    homed: bool,
+    mark: u32,
+}
+
+impl Cycle {
+    fn of(line: &str) -> Option<Self> {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        let [number, x, y, z, homed, mark] = words[..] else { return None };
+        let place = |word: &str| word.parse().ok().filter(|mm: &f64| mm.is_finite());
+        let homed = match homed {
+            "1" => true,
+            "0" => false,
+            _ => return None,
+        };
+        let (number, mark) = (number.parse().ok()?, mark.parse().ok()?);
+        Some(Self { number, place_mm: [place(x)?, place(y)?, place(z)?], homed, mark })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::spec::WorldSpec;
+    use crate::world::World;
+
+    #[test]
+    fn a_line_is_whole_or_none() {
+        let cycle = Cycle { number: 7, place_mm: [1.5, -2.0, 30.000001], homed: true, mark: 3 };
+        assert_eq!(Cycle::of("7 1.500000 -2.000000 30.000001 1 3 "), Some(cycle));
+        for broken in ["", "overrun", "7 1 2 3 1", "7 1 2 nan 1 0", "7 1 2 3 2 0", "-7 1 2 3 1 0", "7 1 2 3 1 0 0"] {
+            assert_eq!(Cycle::of(broken), None, "{broken:?}");
+        }
+    }
+
+    #[cfg(unix)]
+    #[tokio::test]
+    async fn who_has_caught_up_has_seen_what_was_before() {
+        // A controller whose lines come only when it is asked: then comes a motion, and behind it the mark.
+        let told = "n=0; while read mark; do for z in 90 80 70; do n=$((n+1)); echo $n 0 0 $z 1 0; done; n=$((n+1)); echo $n 0 0 60 1 $mark; done";
+        let mut command = Command::new("sh");
+        command.args(["-c", told]);
+        let world = World::new(WorldSpec::default()).unwrap();
+        let path = ExecutedPath::follow(command, world.wheel(12.5).unwrap()).unwrap();
+        while locked(&path.shared.input).is_none() {
+            tokio::task::yield_now().await;
+        }
+        path.caught_up().await;
+        let question = locked(&path.asked).0;
+        assert_eq!(*path.shared.mark.borrow(), Some(question));
+        // What was asked so lately is not asked again.
+        path.caught_up().await;
+        assert_eq!((locked(&path.asked).0, path.is_told()), (question, true));
+    }
+}
