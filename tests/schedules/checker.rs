@@ -96,8 +96,9 @@ impl Evidence {
             .chain(spoken)
             .collect();
         lines.sort_by_key(|(at, _)| *at);
-        let home = self.folder.display().to_string();
-        let line = |(at, what): (Instant, String)| format!("{:10.4} {}", self.seconds(at), what.replace(&home, "RUN"));
+        // Journals and programs lie beside each other.
+        let home = self.folder.parent().unwrap_or(&self.folder).display().to_string();
+        let line = |(at, what): (Instant, String)| format!("{:10.4} {}", self.seconds(at), what.replace(&home, "HOME"));
         lines.into_iter().map(line).collect()
     }
 
