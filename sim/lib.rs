@@ -25,8 +25,9 @@
 //!  handshake  one machine's side of the handshake: states, interlocks, silence
 //!  registers  a whole machine: what a Modbus client reads and writes
 //!  dme        a server of I++ DME, which is told touch by touch what to do
+//!  hits       a machine that prints a line for each touch, and hears nothing
 //!  seen       what the machine saw and did
-//!  wire       Modbus TCP and RTU and I++ DME servers, a serial line without hardware, and everything that goes wrong on them
+//!  wire       Modbus TCP and RTU and I++ DME servers, lines of hits, a serial line without hardware, and everything that goes wrong on them
 //! ```
 //!
 //! Units: millimetres and radians throughout. Frames: `shape` and `form` live in the model frame, the points a probe reports
@@ -38,6 +39,7 @@ pub mod command;
 pub mod dme;
 pub mod form;
 mod handshake;
+pub mod hits;
 pub mod options;
 pub mod part;
 pub mod payload;

@@ -6,12 +6,14 @@
 //!  pty      a serial line without hardware, opened by its path
 //!  faults   what goes wrong on Modbus, when
 //!  dme      I++ DME over TCP, one client at a time
+//!  hits     a line for each touch, on a serial line or over TCP
 //! ```
 //!
 //! [`Serving`] is all that most callers need: it binds, serves, lets the machines' time pass, and stops.
 
 pub mod dme;
 pub mod faults;
+pub mod hits;
 #[cfg(not(unix))]
 #[path = "no_pty.rs"]
 pub mod pty;

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::config::{CellConfig, Link};
-use regrind::device::Line;
+use regrind::device::{HitLine, Line};
 use regrind::recipe::Recipe;
 use serde_json::{Value, json};
 
@@ -71,8 +71,11 @@ fn wire(link: &Link) -> Value {
     match link.wire.line() {
         Some((Line::Tcp { host, port }, unit)) => json!({ "host": host, "port": port, "unit": unit }),
         Some((Line::Rtu { device, baud, .. }, unit)) => json!({ "device": device, "baud": baud, "unit": unit }),
-        None => {
-            link.wire.dme().map_or(Value::Null, |(host, port)| json!({ "host": host, "port": port, "kind": "ippdme" }))
-        }
+        None => match (link.wire.dme(), link.wire.hit_line()) {
+            (Some((host, port)), _) => json!({ "host": host, "port": port, "kind": "ippdme" }),
+            (None, Some(HitLine::Tcp { host, port })) => json!({ "host": host, "port": port, "kind": "hit-lines" }),
+            (None, Some(HitLine::Serial { device, .. })) => json!({ "device": device, "kind": "hit-lines" }),
+            (None, None) => Value::Null,
+        },
     }
 }
