@@ -28,9 +28,10 @@
 //!  dme        a server of I++ DME, which is told touch by touch what to do
 //!  rsh        a controller by LinuxCNC, which is told which program to run
 //!  wheel      what a wheel leaves that is led by a program
+//!  hits       a machine that prints a line for each touch, and hears nothing
 //!  seen       what the machine saw and did
-//!  wire       Modbus TCP and RTU and I++ DME servers, a serial line without hardware, the path of a controller outside, and everything that
-//!             goes wrong on them
+//!  wire       Modbus TCP and RTU and I++ DME servers, lines of hits, a serial line without hardware, the path of a controller outside, and
+//!             everything that goes wrong on them
 //! ```
 //!
 //! Units: millimetres and radians throughout. Frames: `shape` and `form` live in the model frame, the points a probe reports
@@ -43,6 +44,7 @@ pub mod dme;
 pub mod executed;
 pub mod form;
 mod handshake;
+pub mod hits;
 pub mod options;
 pub mod part;
 pub mod payload;

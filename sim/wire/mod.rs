@@ -8,6 +8,7 @@
 //!  dme      I++ DME over TCP, one client at a time
 //!  rsh      the lines of linuxcncrsh, any number of clients
 //!  executed the path that a controller outside executes, a line for each servo cycle
+//!  hits     a line for each touch, on a serial line or over TCP
 //! ```
 //!
 //! [`Serving`] is all that most callers need: it binds, serves, lets the machines' time pass, and stops.
@@ -15,6 +16,7 @@
 pub mod dme;
 pub mod executed;
 pub mod faults;
+pub mod hits;
 #[cfg(not(unix))]
 #[path = "no_pty.rs"]
 pub mod pty;

@@ -1,6 +1,7 @@
 //! `regrind doctor`: does anything stand in the way of a run? Nothing is moved, and nothing is taken.
 
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use clap::Args;
 use regrind::cell::Device;
@@ -25,8 +26,8 @@ use super::{Outcome, check, control, key};
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Of a machine on Modbus it reads who it is and how it stands, and writes nothing but the sign of life of a client. At a server of I++ DME
-it opens a session, asks the same, and ends it; of a LinuxCNC it asks without taking control. Of machines that take files, or
-that a person serves, nothing is read.
+it opens a session, asks the same, and ends it; of a LinuxCNC it asks without taking control. To a machine that prints its
+hits it listens for 5 s. Of machines that take files, or that a person serves, nothing is read.
 
 Example:
   regrind doctor config/modbus-tcp.toml --recipe recipes/freeform-mirror.toml
@@ -175,6 +176,7 @@ async fn machines(cell: &CellConfig) -> Vec<Finding> {
     vec![
         match cmm.wire.dme() {
             Some(_) => server(MachineKind::Cmm, cmm, setup::cmm(cell)).await,
+            None if cmm.wire.hit_line().is_some() => heard(cmm, setup::cmm(cell)).await,
             None => machine(Device::Cmm, cell, settings(cmm), ModbusCmm::new).await,
         },
         match grinder.wire.rsh() {
@@ -208,6 +210,40 @@ async fn server<M: Machine>(kind: MachineKind, link: &Link, made: Result<M, Maki
         Ok::<_, DeviceError>(told)
     };
     Finding::of(&what, looked.await)
+}
+
+/// How long lines are waited for.
+const LISTENS: Duration = Duration::from_secs(5);
+
+/// A machine that only prints: its line is opened, and what it prints meanwhile is told, with the formats that it fits.
+async fn heard(link: &Link, made: Result<impl Machine, MakingError>) -> Finding {
+    let what = Device::Cmm.to_string();
+    let _taken = match take(link, MachineKind::Cmm, Path::new("regrind doctor")) {
+        Ok(taken) => taken,
+        Err(failure) => return Finding::new(what, Found::Notice, failure.to_string()),
+    };
+    let mut machine = match made {
+        Ok(machine) => machine,
+        Err(error) => return Finding::new(what, Found::Obstacle, error.to_string()),
+    };
+    let name = machine.name().to_owned();
+    if let Err(error) = machine.connect().await {
+        return Finding::new(what, Found::Obstacle, error.to_string());
+    }
+    let until = tokio::time::Instant::now() + LISTENS;
+    while machine.notes().is_empty() && tokio::time::Instant::now() < until {
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+    match machine.notes().pop() {
+        Some(note) => Finding::new(what, Found::Notice, format!("{name}: {note}")),
+        None => {
+            let listened = LISTENS.as_secs();
+            let words = format!(
+                "{name} is open, and no line came in {listened} s: touch something within them, and the formats are told that it fits"
+            );
+            Finding::new(what, Found::Notice, words)
+        }
+    }
 }
 
 async fn machine<M: Machine>(

@@ -165,7 +165,8 @@ pub(super) fn take(link: &Link, kind: MachineKind, run: &Path) -> Result<Option<
     let run = std::path::absolute(run).unwrap_or_else(|_| run.to_owned());
     let on_line = link.wire.line().map(|(line, unit)| format!("{kind} at {line}, unit {unit}"));
     let served = link.wire.dme().or(link.wire.rsh()).map(|(host, port)| format!("{kind} at {host}:{port}"));
-    let taken = on_line.or(served).map(|machine| MachineLock::take(&machine, &run));
+    let heard = link.wire.hit_line().map(|line| format!("{kind} at {line}"));
+    let taken = on_line.or(served).or(heard).map(|machine| MachineLock::take(&machine, &run));
     taken.transpose().map_err(Failure::Machine)
 }
 

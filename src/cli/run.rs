@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use regrind::cell::{Actor, Beginning, CellPlan, Ending, TABLE_VERSION};
 use regrind::config::{BUILT_IN, CellConfig, Link};
-use regrind::device::Line;
+use regrind::device::{Line, Wire};
 use regrind::drive::Task;
 use regrind::formats::{LEARNED, Learned, LearnedError};
 use regrind::journal::{AuditKey, Header, Journal, free_bytes};
@@ -189,7 +189,9 @@ impl Earlier {
 /// Whether the machines of a cell are simulated in this process: only there a port may be left open.
 pub(super) fn within(cell: &CellConfig) -> bool {
     let open = |link: &Link| {
-        matches!(link.wire.line(), Some((Line::Tcp { port: 0, .. }, _))) || matches!(link.wire.dme(), Some((_, 0)))
+        matches!(link.wire.line(), Some((Line::Tcp { port: 0, .. }, _)))
+            || matches!(link.wire.dme(), Some((_, 0)))
+            || matches!(&link.wire, Wire::HitLines(wire) if wire.is_open())
     };
     cell.simulated && (open(&cell.cmm.link) || open(&cell.grinder.link))
 }

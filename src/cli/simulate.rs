@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::config::{CellConfig, Link};
-use regrind::device::Line;
+use regrind::device::{HitLine, Line};
 use regrind::recipe::Recipe;
 use serde_json::{Value, json};
 
@@ -71,10 +71,12 @@ fn wire(link: &Link) -> Value {
     match link.wire.line() {
         Some((Line::Tcp { host, port }, unit)) => json!({ "host": host, "port": port, "unit": unit }),
         Some((Line::Rtu { device, baud, .. }, unit)) => json!({ "device": device, "baud": baud, "unit": unit }),
-        None => match (link.wire.dme(), link.wire.rsh()) {
-            (Some((host, port)), _) => json!({ "host": host, "port": port, "kind": "ippdme" }),
-            (None, Some((host, port))) => json!({ "host": host, "port": port, "kind": "linuxcnc" }),
-            (None, None) => Value::Null,
+        None => match (link.wire.dme(), link.wire.hit_line(), link.wire.rsh()) {
+            (Some((host, port)), ..) => json!({ "host": host, "port": port, "kind": "ippdme" }),
+            (None, Some(HitLine::Tcp { host, port }), _) => json!({ "host": host, "port": port, "kind": "hit-lines" }),
+            (None, Some(HitLine::Serial { device, .. }), _) => json!({ "device": device, "kind": "hit-lines" }),
+            (None, None, Some((host, port))) => json!({ "host": host, "port": port, "kind": "linuxcnc" }),
+            (None, None, None) => Value::Null,
         },
     }
 }

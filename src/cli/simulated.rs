@@ -5,11 +5,10 @@ use std::process::Command;
 
 use regrind::compensation::path::Pattern;
 use regrind::config::{CellConfig, Link};
-use regrind::device::{IppdmeWire, Line, RegisterMap, Wire, WordOrder};
-use regrind::formats::{AddedLines, FormatError, place_link, remove_link};
+use regrind::device::{Coordinates, HitLine, HitLinesWire, IppdmeWire, Line, RegisterMap, Wire, WordOrder};
+use regrind::formats::{AddedLines, FormatError, ResultFolder, ScratchFolder, place_link, remove_link};
 use regrind::recipe::{Recipe, Wheel};
 use regrind_sim::cmm::Led;
-use regrind_sim::dme;
 use regrind_sim::options::{Layout, MachineOptions};
 use regrind_sim::registers::Machine;
 use regrind_sim::seen::Seen;
@@ -17,10 +16,12 @@ use regrind_sim::spec::WorldSpec;
 use regrind_sim::wire::dme::ServingDme;
 use regrind_sim::wire::executed::ExecutedPath;
 use regrind_sim::wire::faults::Faults;
+use regrind_sim::wire::hits::ServingHits;
 use regrind_sim::wire::rtu;
 use regrind_sim::wire::{Serving, SharedMachine};
 use regrind_sim::words;
 use regrind_sim::world::World;
+use regrind_sim::{dme, hits};
 use serde::{Deserialize, Serialize};
 
 use super::failure::Failure;
@@ -33,6 +34,8 @@ pub(super) struct SimulatedCell {
     pub(super) places: Vec<String>,
     /// A measuring machine that is reached by I++ DME.
     dme: Option<ServingDme>,
+    /// A measuring machine that prints its hits, and the folder where its list is put if the cell file names none.
+    hits: Option<(ServingHits, Option<ScratchFolder>)>,
     /// Links that were placed at the devices of serial lines.
     links: Vec<PathBuf>,
     /// Kept for the life of the machines.
@@ -91,7 +94,7 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
     let seed = spec.seed;
     let world = World::new(spec).map_err(|e| failed(e.to_string()))?;
     let (servings, places, links) = (Vec::new(), Vec::new(), Vec::new());
-    let mut simulated = SimulatedCell { servings, places, dme: None, links, _world: world.clone() };
+    let mut simulated = SimulatedCell { servings, places, dme: None, hits: None, links, _world: world.clone() };
     if let Wire::Linuxcnc(grinder) = &cell.grinder.link.wire {
         let folder = path.parent().unwrap_or(Path::new(""));
         let path = grinder.executed_path(folder).map(|command| executed(command, &world, recipe));
@@ -111,6 +114,13 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
     let grinder = (unit, grinder.into());
     if let Wire::Ippdme(wire) = &mut cell.cmm.link.wire {
         simulated.serve_dme(wire, world.led(), speed, probe_radius_mm, None).await.map_err(&failed)?;
+        let port = simulated.serve(&of_grinder, vec![grinder]).await.map_err(&failed)?;
+        set_port(&mut cell.grinder.link.wire, port);
+        return Ok(simulated);
+    }
+    if let Wire::HitLines(wire) = &mut cell.cmm.link.wire {
+        let folder = path.parent().unwrap_or(Path::new(""));
+        simulated.serve_hits(wire, folder, world.led(), [speed, probe_radius_mm]).await.map_err(&failed)?;
         let port = simulated.serve(&of_grinder, vec![grinder]).await.map_err(&failed)?;
         set_port(&mut cell.grinder.link.wire, port);
         return Ok(simulated);
@@ -189,6 +199,67 @@ impl SimulatedCell {
         Ok(())
     }
 
+    /// Serves a measuring machine that prints its hits: its part program measures whatever list Regrind puts into its folder.
+    async fn serve_hits(
+        &mut self,
+        wire: &mut HitLinesWire,
+        cell_folder: &Path,
+        probe: Led,
+        [speed, radius_mm]: [f64; 2],
+    ) -> Result<(), String> {
+        let own = match &wire.plan_folder {
+            Some(_) => None,
+            None => Some(list_folder().map_err(|e| e.to_string())?),
+        };
+        let folder = match (&own, &wire.plan_folder) {
+            (None, Some(folder)) => cell_folder.join(folder),
+            (own, _) => own.as_ref().map(|own| own.path().to_owned()).unwrap_or_default(),
+        };
+        wire.plan_folder = Some(folder.display().to_string());
+        let mut serving = match wire.line() {
+            HitLine::Tcp { host, port } => {
+                let serving = ServingHits::tcp((host.as_str(), port)).await.map_err(|e| {
+                    format!("{host}:{port} cannot be served: {e}; choose another port, or end what holds it")
+                })?;
+                wire.port = serving.local_addr().map_or(port, |address| address.port());
+                self.places.push(format!("hit lines {host}:{}", wire.port));
+                serving
+            }
+            HitLine::Serial { device, .. } => {
+                let serving = ServingHits::serial().map_err(|e| format!("no pseudo-terminal can be had: {e}"))?;
+                let terminal = serving.path().map(Path::to_owned).unwrap_or_default();
+                if wire.is_open() {
+                    wire.device = Some(terminal.display().to_string());
+                } else {
+                    self.link(&terminal, &device)?;
+                }
+                self.places.push(format!("hit lines {}", wire.device.as_deref().unwrap_or_default()));
+                serving
+            }
+        };
+        let options = hits::Options {
+            style: style(wire),
+            radius_mm,
+            contacts: wire.what == Some(Coordinates::Contacts),
+            search_mm: [2.0, 2.0],
+        };
+        serving.run(hits::Program::new(probe, options, hits::faults::Faults::none()), &folder, speed);
+        self.hits = Some((serving, own));
+        Ok(())
+    }
+
+    /// Places a link to a terminal at the device of a serial line.
+    fn link(&mut self, terminal: &Path, device: &str) -> Result<(), String> {
+        place_link(terminal, Path::new(device)).map_err(|e| {
+            format!(
+                "{device} cannot be made a link to {}: {e}; remove what is there, or name another device",
+                terminal.display()
+            )
+        })?;
+        self.links.push(device.into());
+        Ok(())
+    }
+
     async fn serve(&mut self, line: &Line, units: Vec<(u8, SharedMachine)>) -> Result<u16, String> {
         let names: Vec<String> = units.iter().map(|(unit, _)| format!("unit {unit}")).collect();
         match line {
@@ -205,18 +276,41 @@ impl SimulatedCell {
                 let serving = Serving::rtu(units, rtu::Line::paced(*baud), Faults::none())
                     .map_err(|e| format!("no pseudo-terminal can be had for {device}: {e}"))?;
                 let terminal = serving.path().map(Path::to_owned).unwrap_or_default();
-                place_link(&terminal, Path::new(device)).map_err(|e| {
-                    format!(
-                        "{device} cannot be made a link to {}: {e}; remove what is there, or name another device",
-                        terminal.display()
-                    )
-                })?;
-                self.links.push(device.into());
+                self.link(&terminal, device)?;
                 self.places.push(format!("Modbus RTU {device} at {baud} baud, {}", names.join(" and ")));
                 self.servings.push(serving);
                 Ok(0)
             }
         }
+    }
+}
+
+/// A folder for the list, where the cell file names none.
+fn list_folder() -> Result<ScratchFolder, FormatError> {
+    let path = std::env::temp_dir().join(format!("regrind-list-{:016x}", rand::random::<u64>()));
+    let folder = ScratchFolder::at(path)?;
+    ResultFolder::prepare(folder.path())?.keep();
+    Ok(folder)
+}
+
+/// How the machine prints, as the cell file has it.
+fn style(wire: &HitLinesWire) -> hits::print::Style {
+    use regrind::device::hit_lines::Separator;
+    let reading = wire.reading();
+    hits::print::Style {
+        letters: reading.format.is_lettered(),
+        whole: reading.format.is_integer(),
+        rotary_deg: reading.format.has_rotary().then_some(wire.rotary_deg),
+        decimals: reading.decimals,
+        mark: reading.mark,
+        separator: match reading.separator {
+            Separator::Comma => ',',
+            Separator::Semicolon => ';',
+            Separator::Tab => '\t',
+            Separator::Blank => ' ',
+        },
+        unit_mm: reading.unit_mm,
+        axes: reading.axes,
     }
 }
 

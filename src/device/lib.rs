@@ -24,6 +24,7 @@
 
 mod error;
 pub mod exchange;
+pub mod hit_lines;
 pub mod ippdme;
 pub mod linuxcnc;
 mod machine;
@@ -38,6 +39,7 @@ mod words;
 
 use error::Answered;
 pub use error::DeviceError;
+pub use hit_lines::{HitLine, HitLinesCmm, HitLinesSettings, HitLinesWire};
 pub use ippdme::{IppdmeCmm, IppdmeSettings, IppdmeWire, Scanning};
 pub use linuxcnc::{LinuxcncGrinder, LinuxcncSettings, LinuxcncWire};
 pub use machine::{Cmm, Grinder, Interrupt, Machine};

@@ -4,6 +4,7 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use super::exchange::ExchangeWire;
+use super::hit_lines::{HitLine, HitLinesWire};
 use super::ippdme::IppdmeWire;
 use super::linuxcnc::LinuxcncWire;
 use super::machine::{Cmm, Grinder, Interrupt, Machine};
@@ -89,6 +90,11 @@ macro_rules! drivers {
             /// Host and port of a server of I++ DME, where it is one.
             pub fn dme(&self) -> Option<(String, u16)> {
                 match self { $(Self::$wire(wire) => Wired::dme(wire)),+ }
+            }
+
+            /// Where lines of hits are heard, where it is such a wire.
+            pub fn hit_line(&self) -> Option<HitLine> {
+                match self { $(Self::$wire(wire) => Wired::hit_line(wire)),+ }
             }
 
             /// Host and port of linuxcncrsh, where it is one.
@@ -223,4 +229,6 @@ drivers! {
     Ippdme(IppdmeWire),
     /// LinuxCNC by linuxcncrsh over TCP, for a grinder.
     Linuxcnc(LinuxcncWire),
+    /// A line for each hit, from a measuring machine that hears nothing.
+    HitLines(HitLinesWire),
 }

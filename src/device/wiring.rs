@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use thiserror::Error;
 
+use super::hit_lines::HitLine;
 use super::machine::{Cmm, Grinder};
 use super::modbus::{Line, Link, RegisterMap, Signal};
 use super::place::Place;
@@ -110,6 +111,11 @@ pub trait Wired {
 
     /// Host and port of a server of I++ DME, where it is one.
     fn dme(&self) -> Option<(String, u16)> {
+        None
+    }
+
+    /// Where lines of hits are heard, where it is such a wire.
+    fn hit_line(&self) -> Option<HitLine> {
         None
     }
 

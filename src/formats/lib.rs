@@ -3,6 +3,7 @@
 //! No file is trusted. Whatever is wrong with one comes back as a [`FormatError`] that names the file, the place, what was
 //! found, what was expected and what to do; nothing here panics, and time and memory are bounded by the size of the file.
 
+mod dmis;
 mod document;
 mod error;
 mod figures;
@@ -20,6 +21,7 @@ mod note;
 mod number;
 pub mod ply;
 pub mod points;
+mod qif;
 pub mod references;
 pub mod registration;
 pub mod result;

@@ -10,6 +10,8 @@
 //! and in columns with a header: `index` (the number of the plan's target), `enabled` (rows that say unchecked are left out, as laser
 //! trackers export them), `probe` (the *diameter* of a tracker's reflector in mm) or `probe_radius_mm`, and `name` or `feature`.
 //!
+//! Points may come as QIF (`QIFDocument`) or as DMIS output too; what these say of themselves, and how, stands in their files here.
+//!
 //! A map of an interferometer or profilometer (X3P, SDF, MetroPro) says nothing of itself; its measured samples are points of contact,
 //! in millimetres whatever the unit of other files.
 
@@ -25,7 +27,7 @@ use super::layout::{Fields, Layout, Preamble, is_comment};
 use super::measured_map::map_format;
 use super::number::{Decimal, coordinate};
 use super::points::parse_points_with;
-use super::{FormatError, ply, whole};
+use super::{FormatError, dmis, ply, qif, whole};
 use regrind_core::geometry::Point;
 
 /// Largest result file that is read.
@@ -149,7 +151,9 @@ pub struct ResultFile {
 /// # Errors
 /// The line that was cut.
 pub fn check_ended(path: &Path, text: &[u8]) -> Result<(), FormatError> {
-    if ply::is_ply(text) || map_format(text).is_some() || text.ends_with(b"\n") {
+    // A document has an end of its own.
+    let is_document = ply::is_ply(text) || map_format(text).is_some() || qif::is_xml(text) || dmis::is_dmis(text);
+    if is_document || text.ends_with(b"\n") {
         return Ok(());
     }
     let line = text.split(|&b| b == b'\n').count() as u64;
@@ -172,6 +176,12 @@ pub fn read_bytes(path: &Path) -> Result<Vec<u8>, FormatError> {
 pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatError> {
     if map_format(text).is_some() {
         return Ok(Statements { coordinates: Some(Coordinates::Contacts), ..Statements::default() });
+    }
+    if qif::is_xml(text) {
+        return qif::read_statements(path, text);
+    }
+    if dmis::is_dmis(text) {
+        return dmis::read_statements(path, text);
     }
     let head = &text[..text.len().min(PREAMBLE_BYTES)];
     let head = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(head);
@@ -196,7 +206,7 @@ pub fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatErr
 
 impl Statements {
     /// Takes one statement; what is none of ours is only a comment.
-    fn take(&mut self, path: &Path, line: u64, key: &str, value: &str) -> Result<(), FormatError> {
+    pub(super) fn take(&mut self, path: &Path, line: u64, key: &str, value: &str) -> Result<(), FormatError> {
         let wrong = |key, expected| FormatError::Statement {
             path: path.to_owned(),
             line,
@@ -257,6 +267,13 @@ pub fn parse_result(path: &Path, text: &[u8], content: &Content) -> Result<Resul
     if let Some(format) = map_format(text) {
         let MapPoints { points, notes } = (format.parse)(path, text)?;
         return Ok(ResultFile { points, coordinates, notes, statements, ..ResultFile::default() });
+    }
+    // Both say their unit themselves.
+    if qif::is_xml(text) {
+        return qif::parse(path, text, content);
+    }
+    if dmis::is_dmis(text) {
+        return dmis::parse(path, text, content);
     }
     let unit_mm = agreed_unit(path, &statements, content)?;
     let is_ply = ply::is_ply(text);

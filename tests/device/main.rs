@@ -3,6 +3,7 @@
 mod ahead;
 mod contract;
 mod exchange;
+mod hit_lines;
 mod interop;
 mod ippdme;
 #[path = "../common/keep.rs"]

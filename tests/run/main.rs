@@ -16,6 +16,7 @@ mod files;
 mod first_touches;
 mod heartbeats;
 mod height_maps;
+mod hit_lines;
 mod ippdme;
 #[path = "../common/keep.rs"]
 mod keep;

@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use sha2::{Digest, Sha256};
 
+use super::dmis;
 use super::measured::{Wanted, foreign, measurement};
 use super::outbox::{Outbox, StoredHandover, Taken, Ticket, json_lines, unhex};
 use super::stations::{PlacedStation, place_station};
@@ -45,6 +46,8 @@ pub struct CmmExchange {
     pub least_points: usize,
     /// By how much the probe radius in a file may differ from the plan's.
     pub probe_tolerance_mm: f64,
+    /// The sensor of a DMIS program, where the plan is written as one too.
+    pub dmis_sensor: Option<String>,
 }
 
 impl CmmExchange {
@@ -62,6 +65,7 @@ impl CmmExchange {
             least_points: 1,
             take_earlier: false,
             probe_tolerance_mm: 1e-3,
+            dmis_sensor: None,
         }
     }
 }
@@ -430,10 +434,15 @@ impl Exchange for CmmFolders {
         let CmmExchange { part, inbox, .. } = &self.settings;
         let ticket = Ticket::new(part, job, sequence, &order.plan_identity, order.plan.probe_radius_mm, inbox)?;
         let expects = self.settings.result.filled(&ticket.part, ticket.job, ticket.cycle);
-        let files = [
+        let mut files = vec![
             ("plan.csv", plan_csv(&ticket.part, job, &ticket.identity, &order.plan).into_bytes()),
             ("plan.json", plan_json(&ticket, order, &self.settings, expects.as_str())),
         ];
+        if let (Some(sensor), Some(coordinates)) = (&self.settings.dmis_sensor, self.settings.content.coordinates) {
+            let (part, identity) = (&*ticket.part, &*ticket.identity);
+            let about = dmis::About { part, cycle: ticket.cycle, identity, sensor, coordinates };
+            files.push(("plan.dmi", dmis::program(&order.plan, &about).into_bytes()));
+        }
         self.outbox.publish(&ticket, &files, permit)?;
         (self.expected, self.judged) = (None, None);
         Ok(())

@@ -20,6 +20,7 @@
 //! and written behind [`Exchange`].
 
 mod cmm;
+mod dmis;
 mod error;
 mod grinder;
 mod hand_over;

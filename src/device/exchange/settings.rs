@@ -59,6 +59,9 @@ pub struct ExchangeWire {
     /// By how much the probe radius that a file states may differ from the recipe's.
     #[schemars(range(min = 0.0, max = 10.0))]
     pub probe_tolerance_mm: f64,
+    /// Sensor of the machine, by its name in DMIS: the plan is then written as a DMIS program too, `plan.dmi`, which recalls and selects it.
+    #[schemars(length(min = 1, max = 40), example = &"PROBE6")]
+    pub dmis_sensor: Option<String>,
     /// Whether the machine stands apart and cannot reach the part where the other one works: then nobody is asked whether it is clear.
     pub apart: bool,
 }
@@ -79,6 +82,7 @@ impl Default for ExchangeWire {
             result: "{part}_c{cycle}.*".to_owned(),
             take_earlier: false,
             probe_tolerance_mm: 0.001,
+            dmis_sensor: None,
             apart: false,
         }
     }
@@ -108,6 +112,7 @@ impl Wired for ExchangeWire {
         }
         self.check_result(place, document);
         self.check_stations(place, document);
+        self.check_dmis(place, document);
     }
 
     fn check_beside(&self, grinder: &Self, document: &mut Document) {
@@ -132,6 +137,7 @@ impl Wired for ExchangeWire {
             least_points: making.free_points.unwrap_or(1),
             take_earlier: self.take_earlier,
             probe_tolerance_mm: self.probe_tolerance_mm,
+            dmis_sensor: self.dmis_sensor.clone(),
             ..CmmExchange::new(making.part, outbox, &inbox)
         };
         Ok(self.machine(MachineKind::Cmm, &inbox, CmmFolders::new(settings)))
@@ -190,6 +196,23 @@ impl ExchangeWire {
                 "it must be the name of a file in the inbox, with `{part}`, `{job}`, `{cycle}` and one `*` at most";
             let remedy = "\"{part}_c{cycle}.*\" is usual";
             document.report(&place.key("wire.result"), format!("is {name:?}"), allowed, remedy);
+        }
+    }
+
+    fn check_dmis(&self, place: &Place<'_>, document: &mut Document) {
+        let Some(sensor) = &self.dmis_sensor else { return };
+        let key = place.key("wire.dmis_sensor");
+        if place.table == "grinder" {
+            let allowed = "a grinder has no measuring program";
+            return document.report(&key, "is given for a grinder", allowed, "leave it out");
+        }
+        if !sensor.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '_' | '-')) {
+            let allowed = "it must be a label of DMIS: letters, digits, _ and -";
+            document.report(&key, format!("is {sensor:?}"), allowed, "write it as S(...) has it");
+        }
+        if self.what.is_none() {
+            let allowed = "a DMIS program says whether the radius of the probe is taken off";
+            document.report(&place.key("wire.what"), "is missing beside `dmis_sensor`", allowed, "centres or contacts");
         }
     }
 

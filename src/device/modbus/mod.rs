@@ -10,7 +10,7 @@ mod ahead;
 mod any_registers;
 mod codec;
 mod link;
-mod port;
+pub(crate) mod port;
 mod settings;
 mod signal;
 mod unit;

@@ -194,12 +194,7 @@ impl RtuWire {
 
     /// Says that the port is not on this computer, and which are; nothing where it is there.
     pub(super) fn missing(&self) -> Option<String> {
-        if self.device.is_empty() || port::is_there(&self.device) {
-            return None;
-        }
-        let names = port::names();
-        let there = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
-        Some(format!("{} is not on this computer; the serial ports here: {there}", self.device))
+        port::missing(&self.device)
     }
 }
 

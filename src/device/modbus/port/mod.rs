@@ -12,9 +12,9 @@ use tokio_serial::{SerialPortBuilderExt as _, SerialStream};
 use super::settings::Parity;
 
 #[cfg(unix)]
-pub(super) use unix::is_there;
+use unix::is_there;
 #[cfg(windows)]
-pub(super) use windows::is_there;
+use windows::is_there;
 
 /// Opens a port; while it is open no other program can.
 pub(super) fn open(device: &str, baud: u32, parity: Parity, stop_bits: u8) -> io::Result<SerialStream> {
@@ -27,8 +27,18 @@ pub(super) fn open(device: &str, baud: u32, parity: Parity, stop_bits: u8) -> io
     Ok(tokio_serial::new(device, baud).parity(parity).stop_bits(stop_bits).open_native_async()?)
 }
 
+/// Says that a port is not on this computer, and which are; nothing where it is there.
+pub(crate) fn missing(device: &str) -> Option<String> {
+    if device.is_empty() || is_there(device) {
+        return None;
+    }
+    let names = names();
+    let there = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
+    Some(format!("{device} is not on this computer; the serial ports here: {there}"))
+}
+
 /// The names of the ports that the system knows.
-pub(super) fn names() -> Vec<String> {
+fn names() -> Vec<String> {
     let ports = serialport::available_ports().unwrap_or_default();
     ports.into_iter().map(|port| port.port_name).collect()
 }

@@ -1,0 +1,79 @@
+//! How a machine writes a touch.
+
+use crate::Vec3;
+
+/// The shape of a line.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Style {
+    /// The letters of the axes stand before the numbers.
+    pub letters: bool,
+    /// Whole micrometres, and tenths of a degree.
+    pub whole: bool,
+    /// The angle of the rotary table, where it is written.
+    pub rotary_deg: Option<f64>,
+    /// Digits behind the mark.
+    pub decimals: usize,
+    /// The decimal mark.
+    pub mark: char,
+    /// What stands between two values.
+    pub separator: char,
+    /// Millimetres of the unit.
+    pub unit_mm: f64,
+    /// Which axis each value is.
+    pub axes: [usize; 3],
+}
+
+impl Default for Style {
+    fn default() -> Self {
+        let (decimals, mark, separator, unit_mm, axes) = (3, '.', ',', 1.0, [0, 1, 2]);
+        Self { letters: false, whole: false, rotary_deg: None, decimals, mark, separator, unit_mm, axes }
+    }
+}
+
+impl Style {
+    /// Returns the line of a touch, its end too.
+    pub fn line(&self, at_mm: Vec3) -> Vec<u8> {
+        let value = |k: usize| match self.whole {
+            true => format!("{}", (at_mm[self.axes[k]] * 1e3).round() as i64),
+            false => {
+                let text = format!("{:.*}", self.decimals, at_mm[self.axes[k]] / self.unit_mm);
+                text.replace('.', &self.mark.to_string())
+            }
+        };
+        let angle = self.rotary_deg.map(|angle| match self.whole {
+            true => format!("{}", (angle * 10.0).round() as i64),
+            false => format!("{angle:.1}").replace('.', &self.mark.to_string()),
+        });
+        let values: Vec<String> = (0..3).map(value).chain(angle).collect();
+        let lettered = values.iter().zip("XYZW".chars()).map(|(value, letter)| match self.letters {
+            true => format!("{letter}{value}"),
+            false => value.clone(),
+        });
+        let line = lettered.collect::<Vec<_>>().join(&self.separator.to_string());
+        (line + "\r\n").into_bytes()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_eight_formats_are_written_as_their_page_has_them() {
+        for (letters, whole, rotary_deg, line) in [
+            (false, false, None, "100.000,200.000,300.000\r\n"),
+            (false, true, None, "100000,200000,300000\r\n"),
+            (true, false, None, "X100.000,Y200.000,Z300.000\r\n"),
+            (true, true, None, "X100000,Y200000,Z300000\r\n"),
+            (false, false, Some(245.5), "100.000,200.000,300.000,245.5\r\n"),
+            (false, true, Some(245.5), "100000,200000,300000,2455\r\n"),
+            (true, false, Some(245.5), "X100.000,Y200.000,Z300.000,W245.5\r\n"),
+            (true, true, Some(245.5), "X100000,Y200000,Z300000,W2455\r\n"),
+        ] {
+            let style = Style { letters, whole, rotary_deg, ..Style::default() };
+            assert_eq!(String::from_utf8(style.line([100.0, 200.0, 300.0])).unwrap(), line);
+        }
+        let style = Style { mark: ',', separator: ';', axes: [2, 0, 1], ..Style::default() };
+        assert_eq!(style.line([-1.5, 0.0004, 3.0]), b"3,000;-1,500;0,000\r\n");
+    }
+}

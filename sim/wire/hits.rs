@@ -1,0 +1,142 @@
+//! Lines of hits on a serial line without hardware, or over TCP as a terminal server carries them.
+
+use std::io;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::net::{TcpListener, ToSocketAddrs};
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinSet;
+use tokio::time::sleep;
+
+use super::pty::Pty;
+use crate::hits::Program;
+
+/// How often a part program looks whether there is another list.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// Shorter times are slept together.
+const SHORTEST: Duration = Duration::from_millis(5);
+
+/// What is put on the line next.
+enum Put {
+    Bytes(Vec<u8>, Option<oneshot::Sender<()>>),
+    HangUp,
+}
+
+/// A printer of hits at the far end of a line, until this is dropped.
+pub struct ServingHits {
+    path: Option<PathBuf>,
+    local_addr: Option<SocketAddr>,
+    lines: mpsc::Sender<Put>,
+    tasks: JoinSet<()>,
+}
+
+impl ServingHits {
+    /// Prints on a serial line without hardware.
+    ///
+    /// # Errors
+    /// The system has none left.
+    pub fn serial() -> io::Result<Self> {
+        let pty = Pty::open()?;
+        let path = Some(pty.path().to_owned());
+        let (lines, mut inbox) = mpsc::channel(64);
+        let mut tasks = JoinSet::new();
+        tasks.spawn(async move {
+            // A line that hangs up is pulled out.
+            let _ = print(pty, &mut inbox).await;
+        });
+        Ok(Self { path, local_addr: None, lines, tasks })
+    }
+
+    /// Prints to one client after another over TCP; port 0 takes any that is free.
+    ///
+    /// # Errors
+    /// The address cannot be bound.
+    pub async fn tcp(addr: impl ToSocketAddrs) -> io::Result<Self> {
+        let listener = TcpListener::bind(addr).await?;
+        let local_addr = Some(listener.local_addr()?);
+        let (lines, mut inbox) = mpsc::channel(64);
+        let mut tasks = JoinSet::new();
+        tasks.spawn(async move {
+            loop {
+                match listener.accept().await {
+                    Ok((stream, _)) => drop(print(stream, &mut inbox).await),
+                    Err(_) => sleep(LOOK).await,
+                }
+            }
+        });
+        Ok(Self { path: None, local_addr, lines, tasks })
+    }
+
+    /// The path of the serial line.
+    pub fn path(&self) -> Option<&Path> {
+        self.path.as_deref()
+    }
+
+    /// Where it is served over TCP.
+    pub fn local_addr(&self) -> Option<SocketAddr> {
+        self.local_addr
+    }
+
+    /// Puts bytes on the line, and returns when they are on it, or nobody is there to hear them.
+    pub async fn send(&self, bytes: &[u8]) {
+        let (written, are_written) = oneshot::channel();
+        if self.lines.send(Put::Bytes(bytes.to_vec(), Some(written))).await.is_ok() {
+            let _ = are_written.await;
+        }
+    }
+
+    /// Ends the connection.
+    pub async fn hang_up(&self) {
+        let _ = self.lines.send(Put::HangUp).await;
+    }
+
+    /// Has a part program measure whatever list appears as `plan.csv` in a folder, so many times faster than it would.
+    pub fn run(&mut self, mut program: Program, folder: &Path, speed: f64) {
+        let (list, lines) = (folder.join("plan.csv"), self.lines.clone());
+        self.tasks.spawn(async move {
+            loop {
+                if let Ok(text) = std::fs::read_to_string(&list) {
+                    program.begin(&text);
+                }
+                // A timer is coarser than the touches of a fast machine.
+                let mut owed = Duration::ZERO;
+                while let Some(out) = program.touch_next() {
+                    owed += program.per_touch().div_f64(speed);
+                    if owed > SHORTEST {
+                        sleep(std::mem::take(&mut owed)).await;
+                    }
+                    if !out.bytes.is_empty() && lines.send(Put::Bytes(out.bytes, None)).await.is_err() {
+                        return;
+                    }
+                    if out.hangs_up && lines.send(Put::HangUp).await.is_err() {
+                        return;
+                    }
+                }
+                sleep(LOOK).await;
+            }
+        });
+    }
+}
+
+/// Prints what is put on the line until the far side is gone or it is hung up.
+async fn print(mut stream: impl AsyncRead + AsyncWrite + Unpin, inbox: &mut mpsc::Receiver<Put>) -> io::Result<()> {
+    let mut heard = [0; 256];
+    loop {
+        tokio::select! {
+            put = inbox.recv() => match put {
+                Some(Put::Bytes(bytes, written)) => {
+                    stream.write_all(&bytes).await?;
+                    stream.flush().await?;
+                    written.map(|written| written.send(()));
+                }
+                Some(Put::HangUp) | None => return stream.shutdown().await,
+            },
+            // It hears nothing; what is said to it is read away.
+            read = stream.read(&mut heard) => if read? == 0 { return Ok(()) },
+        }
+    }
+}

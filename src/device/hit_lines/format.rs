@@ -1,0 +1,381 @@
+//! What a line of a hit says: three coordinates, and the angle of a rotary table where there is one.
+//!
+//! The eight formats are those by which generic machines are read ("Support for Generic CMM" of PC-DMIS): numbers with a decimal mark, or
+//! whole ones in micrometres and tenths of a degree; with the letters of the axes before them, or without. Nothing in a line proves that it is
+//! whole, so everything in it is required: the number of values, the letters, and the number of decimals.
+
+use std::fmt;
+
+use schemars::JsonSchema;
+use serde::Deserialize;
+
+/// The letters of the axes in their order.
+const LETTERS: [char; 4] = ['X', 'Y', 'Z', 'W'];
+/// Largest coordinate and angle that are believed.
+const LARGEST_MM: f64 = 1e5;
+const LARGEST_DEG: f64 = 36_000.0;
+/// Most digits before the mark, and most behind it.
+const MOST_DIGITS: usize = 9;
+
+/// How a machine writes a hit.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum LineFormat {
+    /// `100.000,200.000,300.000`
+    Decimal,
+    /// `100000,200000,300000`, in micrometres
+    Integer,
+    /// `X100.000,Y200.000,Z300.000`
+    LetteredDecimal,
+    /// `X100000,Y200000,Z300000`, in micrometres
+    LetteredInteger,
+    /// `100.000,200.000,300.000,245.5`
+    DecimalRotary,
+    /// `100000,200000,300000,2455`, in micrometres and tenths of a degree
+    IntegerRotary,
+    /// `X100.000,Y200.000,Z300.000,W245.5`
+    LetteredDecimalRotary,
+    /// `X100000,Y200000,Z300000,W2455`, in micrometres and tenths of a degree
+    LetteredIntegerRotary,
+}
+
+impl LineFormat {
+    /// All of them, with the words of a cell file.
+    pub const ALL: [(Self, &'static str); 8] = [
+        (Self::Decimal, "decimal"),
+        (Self::Integer, "integer"),
+        (Self::LetteredDecimal, "lettered-decimal"),
+        (Self::LetteredInteger, "lettered-integer"),
+        (Self::DecimalRotary, "decimal-rotary"),
+        (Self::IntegerRotary, "integer-rotary"),
+        (Self::LetteredDecimalRotary, "lettered-decimal-rotary"),
+        (Self::LetteredIntegerRotary, "lettered-integer-rotary"),
+    ];
+
+    /// Whether the numbers are whole: micrometres and tenths of a degree.
+    pub fn is_integer(self) -> bool {
+        use LineFormat::*;
+        matches!(self, Integer | LetteredInteger | IntegerRotary | LetteredIntegerRotary)
+    }
+
+    /// Whether the letters of the axes stand before the numbers.
+    pub fn is_lettered(self) -> bool {
+        use LineFormat::*;
+        matches!(self, LetteredDecimal | LetteredInteger | LetteredDecimalRotary | LetteredIntegerRotary)
+    }
+
+    /// Whether a fourth value tells the angle of a rotary table.
+    pub fn has_rotary(self) -> bool {
+        use LineFormat::*;
+        matches!(self, DecimalRotary | IntegerRotary | LetteredDecimalRotary | LetteredIntegerRotary)
+    }
+
+    /// Returns its name in a cell file.
+    pub fn name(self) -> &'static str {
+        Self::ALL.iter().find(|(format, _)| *format == self).map_or("", |(_, name)| name)
+    }
+}
+
+/// What stands between two values.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+#[expect(missing_docs, reason = "the names say it")]
+pub enum Separator {
+    #[default]
+    Comma,
+    Semicolon,
+    Tab,
+    Blank,
+}
+
+/// How lines are read.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Reading {
+    /// The format.
+    pub format: LineFormat,
+    /// What stands between two values.
+    pub separator: Separator,
+    /// The decimal mark.
+    pub mark: char,
+    /// How many digits stand behind it in a coordinate.
+    pub decimals: usize,
+    /// Millimetres of the unit of a coordinate with a mark.
+    pub unit_mm: f64,
+    /// Which axis each value is: 0 for x.
+    pub axes: [usize; 3],
+}
+
+impl Default for Reading {
+    fn default() -> Self {
+        Self {
+            format: LineFormat::Decimal,
+            separator: Separator::Comma,
+            mark: '.',
+            decimals: 3,
+            unit_mm: 1.0,
+            axes: [0, 1, 2],
+        }
+    }
+}
+
+/// What a line says.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Hit {
+    /// Where the touch was, in the machine's frame, in millimetres.
+    pub at_mm: [f64; 3],
+    /// Where the rotary table stood.
+    pub rotary_deg: Option<f64>,
+}
+
+/// Why a line is refused.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LineFlaw {
+    /// The value, from 1; 0 for the whole line.
+    pub value: usize,
+    /// In words.
+    pub why: String,
+}
+
+impl LineFlaw {
+    pub(super) fn of_line(why: impl Into<String>) -> Self {
+        Self { value: 0, why: why.into() }
+    }
+}
+
+impl fmt::Display for LineFlaw {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.value {
+            0 => f.write_str(&self.why),
+            value => write!(f, "its value {value} {}", self.why),
+        }
+    }
+}
+
+impl Reading {
+    /// Reads a line without its end.
+    ///
+    /// # Errors
+    /// What is not exactly a line of the format.
+    pub fn read(&self, line: &str) -> Result<Hit, LineFlaw> {
+        if let Some((at, c)) = line.chars().enumerate().find(|(_, c)| !matches!(c, '\t' | ' '..='~')) {
+            let why = format!("its character {} is {c:?}, which is no plain text", at + 1);
+            return Err(LineFlaw::of_line(why));
+        }
+        let fields = self.fields(line)?;
+        let mut at_mm = [0.0; 3];
+        for (k, field) in fields.iter().take(3).enumerate() {
+            at_mm[self.axes[k]] = self.coordinate(k, field)?;
+        }
+        let rotary_deg = fields.get(3).map(|field| self.angle(field)).transpose()?;
+        Ok(Hit { at_mm, rotary_deg })
+    }
+
+    fn fields<'l>(&self, line: &'l str) -> Result<Vec<&'l str>, LineFlaw> {
+        let line = line.trim_matches(' ');
+        let fields: Vec<&str> = match self.separator {
+            Separator::Comma => line.split(',').collect(),
+            Separator::Semicolon => line.split(';').collect(),
+            Separator::Tab => line.split('\t').collect(),
+            Separator::Blank => line.split(' ').filter(|field| !field.is_empty()).collect(),
+        };
+        let expected = if self.format.has_rotary() { 4 } else { 3 };
+        let why = match fields.len() {
+            found if found < expected => "it is cut short, or in another format",
+            found if found > expected => "two lines have run together, or it is in another format",
+            _ => return Ok(fields),
+        };
+        Err(LineFlaw::of_line(format!("it has {} values where {expected} belong: {why}", fields.len())))
+    }
+
+    /// Takes the letter off a value, where there has to be one.
+    fn number<'f>(&self, k: usize, field: &'f str) -> Result<&'f str, LineFlaw> {
+        let field = field.trim_matches(' ');
+        if !self.format.is_lettered() {
+            return Ok(field);
+        }
+        let letter = LETTERS[k];
+        let number = field.strip_prefix(letter).or(field.strip_prefix(letter.to_ascii_lowercase()));
+        number.ok_or_else(|| LineFlaw { value: k + 1, why: format!("is {field:?}, and begins with no {letter}") })
+    }
+
+    fn coordinate(&self, k: usize, field: &str) -> Result<f64, LineFlaw> {
+        let number = self.number(k, field)?;
+        let flaw = |why: String| LineFlaw { value: k + 1, why: format!("is {field:?}, {why}") };
+        let (digits, scale_mm) = match self.format.is_integer() {
+            true => (0, 1e-3),
+            false => (self.decimals, self.unit_mm),
+        };
+        let value = exact(number, self.mark, digits, digits).ok_or_else(|| match digits {
+            0 => flaw("and not a whole number".to_owned()),
+            _ => flaw(format!("and not a number with {digits} digits behind a {:?}", self.mark)),
+        })?;
+        let value_mm = if scale_mm == 1e-3 { value / 1e3 } else { value * scale_mm };
+        if value_mm.abs() > LARGEST_MM {
+            return Err(flaw(format!("and {LARGEST_MM} mm is the most")));
+        }
+        Ok(value_mm)
+    }
+
+    fn angle(&self, field: &str) -> Result<f64, LineFlaw> {
+        let number = self.number(3, field)?;
+        let flaw = |why: &str| LineFlaw { value: 4, why: format!("is {field:?}, {why}") };
+        let angle = match self.format.is_integer() {
+            true => exact(number, self.mark, 0, 0).map(|tenths| tenths / 10.0),
+            false => exact(number, self.mark, 1, MOST_DIGITS),
+        };
+        let angle = angle.ok_or_else(|| flaw("and not an angle"))?;
+        if angle.abs() > LARGEST_DEG {
+            return Err(flaw("and 36000 degrees are the most"));
+        }
+        Ok(angle)
+    }
+
+    /// Returns which of the eight formats a line is in, and with how many decimals: what a person needs who writes a cell file.
+    pub fn fitting(line: &str) -> Vec<Self> {
+        let marks = [('.', Separator::Comma), ('.', Separator::Semicolon), ('.', Separator::Tab)];
+        let commas = [(',', Separator::Semicolon), (',', Separator::Tab), (',', Separator::Blank)];
+        let marks = marks.into_iter().chain([('.', Separator::Blank)]).chain(commas);
+        let all = marks.flat_map(|(mark, separator)| {
+            LineFormat::ALL.into_iter().flat_map(move |(format, _)| {
+                // Of whole numbers the mark says nothing.
+                let decimals = if format.is_integer() { 0..=if mark == '.' { 0 } else { -1 } } else { 1..=9 };
+                decimals.map(move |decimals: i32| Self {
+                    format,
+                    separator,
+                    mark,
+                    decimals: decimals as usize,
+                    ..Self::default()
+                })
+            })
+        });
+        all.filter(|reading| reading.read(line).is_ok()).collect()
+    }
+}
+
+impl fmt::Display for Reading {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "format = {:?}", self.format.name())?;
+        if !self.format.is_integer() {
+            write!(f, ", decimals = {}", self.decimals)?;
+        }
+        if self.mark == ',' {
+            f.write_str(", decimal = \"comma\"")?;
+        }
+        match self.separator {
+            Separator::Comma => Ok(()),
+            Separator::Semicolon => f.write_str(", separator = \"semicolon\""),
+            Separator::Tab => f.write_str(", separator = \"tab\""),
+            Separator::Blank => f.write_str(", separator = \"blank\""),
+        }
+    }
+}
+
+/// Reads a sign, digits, and from so many to so many digits behind a mark; none of them, no mark.
+fn exact(text: &str, mark: char, least: usize, most: usize) -> Option<f64> {
+    let digits = text.strip_prefix(['+', '-']).unwrap_or(text);
+    let (whole, behind) = match digits.split_once(mark) {
+        Some((whole, behind)) if most > 0 => (whole, behind),
+        None if least == 0 => (digits, ""),
+        _ => return None,
+    };
+    let are_digits = |text: &str| text.bytes().all(|b| b.is_ascii_digit());
+    let fits = (1..=MOST_DIGITS).contains(&whole.len()) && (least..=most).contains(&behind.len());
+    if !fits || !are_digits(whole) || !are_digits(behind) {
+        return None;
+    }
+    let value: f64 = format!("{whole}.{behind}0").parse().ok()?;
+    Some(if text.starts_with('-') { -value } else { value })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The examples of the page that the formats come from.
+    const EXAMPLES: [(LineFormat, &str); 8] = [
+        (LineFormat::Decimal, "100.000,200.000,300.000"),
+        (LineFormat::Integer, "100000,200000,300000"),
+        (LineFormat::LetteredDecimal, "X100.000,Y200.000,Z300.000"),
+        (LineFormat::LetteredInteger, "X100000,Y200000,Z300000"),
+        (LineFormat::DecimalRotary, "100.000,200.000,300.000,245.5"),
+        (LineFormat::IntegerRotary, "100000,200000,300000,2455"),
+        (LineFormat::LetteredDecimalRotary, "X100.000,Y200.000,Z300.000,W245.5"),
+        (LineFormat::LetteredIntegerRotary, "X100000,Y200000,Z300000,W2455"),
+    ];
+
+    #[test]
+    fn each_example_is_read_by_its_own_format_and_by_no_other() {
+        for (format, line) in EXAMPLES {
+            for (other, _) in EXAMPLES {
+                let read = Reading { format: other, ..Reading::default() }.read(line);
+                if other == format {
+                    let rotary_deg = format.has_rotary().then_some(245.5);
+                    assert_eq!(read, Ok(Hit { at_mm: [100.0, 200.0, 300.0], rotary_deg }), "{line}");
+                } else {
+                    assert!(read.is_err(), "{line} as {other:?}: {read:?}");
+                }
+            }
+            let fitting = Reading::fitting(line);
+            assert_eq!(fitting.len(), 1, "{line}: {fitting:?}");
+            assert_eq!(fitting[0].format, format);
+        }
+        assert_eq!(Reading::fitting(EXAMPLES[0].1)[0].to_string(), "format = \"decimal\", decimals = 3");
+    }
+
+    #[test]
+    fn a_line_that_lost_or_gained_anything_is_refused_with_the_place() {
+        let reading = Reading::default();
+        for (line, why) in [
+            ("100.000,200.000", "it has 2 values where 3 belong: it is cut short"),
+            ("100.000,200.000,300.00", "its value 3 is \"300.00\", and not a number with 3 digits"),
+            ("100.000,200.000,300.000100.000,200.000,300.000", "it has 5 values where 3 belong: two lines"),
+            ("100.000,200.000,300.0001", "its value 3"),
+            ("100.000,,300.000", "its value 2 is \"\""),
+            ("1OO.000,200.000,300.000", "its value 1"),
+            (".000,200.000,300.000", "its value 1"),
+            ("100.000,200.000,3e2", "its value 3"),
+            ("100.000,200.000,NaN", "its value 3"),
+            ("100.000,2\u{0}0.000,300.000", "its character 10"),
+            ("100.000,200 .000,300.000", "its value 2"),
+            ("--1.000,200.000,300.000", "its value 1"),
+            ("999999.000,200.000,300.000", "100000 mm is the most"),
+            ("PROBE 1 QUALIFIED", "it has 1 values"),
+            ("", "it has 1 values"),
+        ] {
+            let flaw = reading.read(line).unwrap_err().to_string();
+            assert!(flaw.contains(why), "{line:?}: {flaw}");
+        }
+        let lettered = Reading { format: LineFormat::LetteredDecimal, ..reading };
+        for line in ["X1.000,Z2.000,Y3.000", "1.000,2.000,3.000", "X1.000,Y2.000,Z3.000,W1.0"] {
+            assert!(lettered.read(line).is_err(), "{line}");
+        }
+        assert_eq!(lettered.read(" x-1.000, y+2.000,  z0.500").unwrap().at_mm, [-1.0, 2.0, 0.5]);
+    }
+
+    #[test]
+    fn no_character_of_a_line_can_be_lost_behind_the_mark_and_be_another_number() {
+        let reading = Reading::default();
+        let line = "-12.345,0.007,123.400";
+        let whole = reading.read(line).unwrap().at_mm;
+        for lost in 0..line.len() {
+            let short: String = line.chars().enumerate().filter(|(k, _)| *k != lost).map(|(_, c)| c).collect();
+            if let Ok(hit) = reading.read(&short) {
+                // A sign, or a digit before a mark: then the point is somewhere else by millimetres.
+                let away = (0..3).map(|k| (hit.at_mm[k] - whole[k]).abs()).fold(0.0, f64::max);
+                assert!(away >= 1.0, "{short}: {away}");
+            }
+        }
+    }
+
+    #[test]
+    fn marks_separators_units_and_axes_are_those_of_the_cell_file() {
+        let german = Reading { mark: ',', separator: Separator::Semicolon, ..Reading::default() };
+        assert_eq!(german.read("1,500;-2,250;0,125").unwrap().at_mm, [1.5, -2.25, 0.125]);
+        assert!(german.read("1.500;-2.250;0.125").is_err());
+        let blanks = Reading { separator: Separator::Blank, decimals: 4, unit_mm: 25.4, ..Reading::default() };
+        assert_eq!(blanks.read("  1.0000   2.0000 -0.5000 ").unwrap().at_mm, [25.4, 50.8, -12.7]);
+        let turned = Reading { axes: [1, 2, 0], ..Reading::default() };
+        assert_eq!(turned.read("1.000,2.000,3.000").unwrap().at_mm, [3.0, 1.0, 2.0]);
+        assert_eq!(Reading::fitting("1,500;-2,250;0,125")[0], german);
+    }
+}

@@ -1,0 +1,366 @@
+//! A measurement as far as lines have brought it: what each line, and what each word of a person, does to it.
+//!
+//! A line that is refused leads to HOLDING, for the touch that it told of may be lost: a person stops the machine, says that it stands, and
+//! goes on with the targets that are left. Good lines count until it stands: whoever leads the probe hears of a hold late.
+
+use std::collections::VecDeque;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use serde::Serialize;
+use tokio::time::Instant;
+
+use super::format::{LineFlaw, Reading};
+use super::lines::Gathered;
+use super::list::{List, Touch};
+use crate::error::DeviceError;
+use crate::words::{Job, Outcome, State, hex};
+use regrind_formats::AddedLines;
+
+/// Refused lines are for a person: the last ones.
+const SHOWN: usize = 4;
+
+/// How lines are judged.
+#[derive(Clone, Debug)]
+pub(super) struct Judging {
+    pub(super) reading: Reading,
+    /// Where the rotary table has to stand, and within what.
+    pub(super) rotary_deg: [f64; 2],
+    /// Beginnings of lines that mean nothing.
+    pub(super) passed_over: Vec<String>,
+}
+
+/// A measurement that is asked for, or was.
+#[derive(Debug)]
+pub(super) struct Asked {
+    pub(super) job: Job,
+    pub(super) sequence: u32,
+    pub(super) plan_identity: [u8; 32],
+    pub(super) list: List,
+    /// Where each line is kept as it came.
+    pub(super) kept: Option<AddedLines>,
+    pub(super) begun: Instant,
+    pub(super) last_line: Instant,
+    /// Lines since it began.
+    lines: u32,
+    doubles: u32,
+    refused: VecDeque<String>,
+}
+
+/// What the driver and the thread that listens share.
+#[derive(Debug)]
+pub(super) struct Hearing {
+    judging: Judging,
+    pub(super) state: State,
+    pub(super) outcome: Outcome,
+    pub(super) asked: Option<Asked>,
+    /// Whether the probe is clear of the part, by a person's word or by what the cell file says.
+    pub(super) clear: Option<bool>,
+    pub(super) worked: Duration,
+    /// Why nothing is heard any more.
+    pub(super) lost: Option<DeviceError>,
+    /// Lines that came when nothing was asked, and the last of them.
+    unasked: (u32, String),
+}
+
+/// A line as it is kept.
+#[derive(Serialize)]
+struct Kept<'a> {
+    /// Seconds since the measurement began.
+    at_s: f64,
+    line: &'a str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    target: Option<u32>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    passed_over: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    refused: Option<&'a str>,
+}
+
+/// A panic elsewhere leaves what still holds.
+pub(super) fn locked(hearing: &Mutex<Hearing>) -> MutexGuard<'_, Hearing> {
+    hearing.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Asked {
+    pub(super) fn new(
+        (job, sequence): (Job, u32),
+        plan_identity: [u8; 32],
+        list: List,
+        kept: Option<AddedLines>,
+    ) -> Self {
+        let (now, refused) = (Instant::now(), VecDeque::new());
+        Self { job, sequence, plan_identity, list, kept, begun: now, last_line: now, lines: 0, doubles: 0, refused }
+    }
+
+    fn keep(&self, line: &str, target: Option<u32>, passed_over: Option<&str>, refused: Option<&str>) {
+        let at_s = self.begun.elapsed().as_secs_f64();
+        if let Some(kept) = &self.kept {
+            kept.add(&Kept { at_s, line, target, passed_over, refused });
+        }
+    }
+
+    fn refuse(&mut self, line: &str, why: &str) {
+        self.keep(line, None, None, Some(why));
+        let shown: String = line.chars().take(80).collect();
+        self.refused.push_back(format!("REFUSED line {} of the measurement, {shown:?}: {why}", self.lines));
+        if self.refused.len() > SHOWN {
+            self.refused.pop_front();
+        }
+    }
+}
+
+impl Hearing {
+    pub(super) fn new(judging: Judging) -> Self {
+        Self {
+            judging,
+            state: State::Idle,
+            outcome: Outcome::None,
+            asked: None,
+            clear: None,
+            worked: Duration::ZERO,
+            lost: None,
+            unasked: (0, String::new()),
+        }
+    }
+
+    /// Takes what came over the line.
+    pub(super) fn take(&mut self, gathered: Gathered) {
+        match gathered {
+            Gathered::Line(line) => self.line(&line),
+            Gathered::Endless(text) => self.flawed(&text, "it does not end: see baud rate, parity and the cable"),
+        }
+    }
+
+    /// A line has begun, and its rest does not come.
+    pub(super) fn cut_short(&mut self, text: &str) {
+        self.flawed(text, "its end did not come: it is cut short; touch that point again");
+    }
+
+    fn line(&mut self, line: &str) {
+        let begins = self.judging.passed_over.iter().any(|beginning| line.trim_start().starts_with(beginning.as_str()));
+        if begins {
+            if let Some(asked) = self.asked.as_mut().filter(|_| self.state.moves()) {
+                asked.lines += 1;
+                asked.keep(line, None, Some("it begins as the cell file says"), None);
+            }
+            return;
+        }
+        let judging = &self.judging;
+        let read = judging.reading.read(line).map_err(|flaw| format!("{flaw}; touch that point again"));
+        let hit = match read {
+            Ok(hit) => hit,
+            Err(why) => return self.flawed(line, &why),
+        };
+        if let Some(stands_deg) = hit.rotary_deg
+            && !(stands_deg - judging.rotary_deg[0]).abs().le(&judging.rotary_deg[1])
+        {
+            let [wanted_deg, within_deg] = judging.rotary_deg;
+            let why = format!(
+                "the rotary table stands at {stands_deg} degrees, and {wanted_deg} within {within_deg} are wanted: turn it back, and touch the \
+                 point again"
+            );
+            return self.flawed(line, &why);
+        }
+        let Some(asked) = self.asked.as_mut().filter(|_| self.state.moves()) else { return self.flawed(line, "") };
+        asked.lines += 1;
+        asked.last_line = Instant::now();
+        match asked.list.take(line, hit.at_mm, asked.begun.elapsed()) {
+            Ok(Touch::Of(index) | Touch::Again(index)) => asked.keep(line, Some(index), None, None),
+            Ok(Touch::Double) => {
+                asked.doubles += 1;
+                asked.keep(line, None, Some("it is the line before, sent twice"), None);
+            }
+            Err(why) => self.refuse(line, &why),
+        }
+    }
+
+    /// A line that is no touch; where nothing is asked it is only told of.
+    fn flawed(&mut self, line: &str, why: &str) {
+        match (&mut self.asked, self.state) {
+            (Some(asked), state) if state.moves() => {
+                asked.lines += 1;
+                asked.last_line = Instant::now();
+                self.refuse(line, why);
+            }
+            (Some(asked), State::Held) => {
+                asked.lines += 1;
+                let held = "it came while the machine was confirmed to stand; go on, then touch that point again";
+                asked.refuse(line, held);
+            }
+            _ => self.unasked = (self.unasked.0 + 1, line.chars().take(80).collect()),
+        }
+    }
+
+    fn refuse(&mut self, line: &str, why: &str) {
+        if let Some(asked) = &mut self.asked {
+            asked.refuse(line, why);
+        }
+        if self.state == State::Execute {
+            self.state = State::Holding;
+        }
+    }
+
+    /// The line is lost, and what is touched from now on is not heard.
+    pub(super) fn is_lost(&mut self, error: DeviceError, begun: Option<String>) {
+        if let Some(text) = begun {
+            self.cut_short(&text);
+        }
+        if let Some(asked) = self.asked.as_mut().filter(|_| self.state.moves()) {
+            asked.refuse(
+                "",
+                "the connection was lost; what was touched meanwhile did not come, see the targets that are left",
+            );
+            self.state = if self.state == State::Execute { State::Holding } else { self.state };
+        }
+        self.lost = Some(error);
+    }
+
+    /// Ends a measurement to which nothing is missing, so long after its last line as the cell file says that the probe needs to come clear.
+    pub(super) fn let_time_pass(&mut self, clear_after: Option<Duration>) {
+        let (Some(asked), Some(clear_after), State::Execute) = (&self.asked, clear_after, self.state) else { return };
+        if asked.list.is_whole() && asked.last_line.elapsed() >= clear_after {
+            self.finish(Outcome::Complete);
+            self.clear = Some(true);
+        }
+    }
+
+    pub(super) fn finish(&mut self, outcome: Outcome) {
+        (self.state, self.outcome) = (State::Complete, outcome);
+        self.worked = self.asked.as_ref().map_or(Duration::ZERO, |asked| asked.begun.elapsed());
+    }
+
+    pub(super) fn forget(&mut self) {
+        (self.asked, self.outcome) = (None, Outcome::None);
+    }
+
+    // ---- words ------------------------------------------------------------------------------------------------------------------------
+
+    /// The last lines that were refused, and what else should be known of lines.
+    pub(super) fn refusals(&self) -> Vec<String> {
+        let asked = self.asked.as_ref();
+        let refused = asked.into_iter().flat_map(|asked| asked.refused.iter().cloned());
+        let doubles = asked.filter(|asked| asked.doubles > 0 && asked.list.is_whole());
+        let doubles = doubles.map(|asked| format!("{} lines came twice and were taken once", asked.doubles));
+        let (count, last) = &self.unasked;
+        let unasked = (*count > 0).then(|| {
+            let fitting = Reading::fitting(last);
+            let fits = match &fitting[..] {
+                [] => "it is in none of the eight formats".to_owned(),
+                several => format!("it fits {}", several.iter().map(ToString::to_string).collect::<Vec<_>>().join("; or ")),
+            };
+            let ours = &self.judging.reading;
+            let (last, read) = (LineFlaw::of_line(format!("{last:?}")), ours.read(last).err());
+            let read = read.map_or("and is read".to_owned(), |flaw| format!("and is refused, for {flaw}"));
+            format!("lines came while nothing was asked for, and were not taken; the last one is {last}: {fits}; the cell file says {ours}, {read}")
+        });
+        refused.chain(doubles).chain(unasked).collect()
+    }
+
+    /// The targets that are left, in short.
+    pub(super) fn left(&self) -> String {
+        const SOME: usize = 12;
+        let Some(asked) = &self.asked else { return String::new() };
+        let left: Vec<u32> = asked.list.left().collect();
+        let first: Vec<String> = left.iter().take(SOME).map(ToString::to_string).collect();
+        let more = if left.len() > SOME { ", ..." } else { "" };
+        match left.len() {
+            0 => "no target is left".to_owned(),
+            count => format!("{count} targets are left: {}{more}", first.join(", ")),
+        }
+    }
+
+    pub(super) fn plan_digits(&self) -> String {
+        self.asked.as_ref().map_or(String::new(), |asked| hex(&asked.plan_identity[..4]))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::list::tests::{TELLING, plan};
+    use super::*;
+    use regrind_formats::result::Coordinates;
+
+    fn hearing(targets: u32) -> Hearing {
+        let judging =
+            Judging { reading: Reading::default(), rotary_deg: [0.0, 0.05], passed_over: vec!["PROBE".to_owned()] };
+        let mut hearing = Hearing::new(judging);
+        let list = List::new(&plan(targets), Coordinates::Centres, false, TELLING);
+        let job = Job { job: 7, cycle: 1, digest: 1 };
+        hearing.asked = Some(Asked::new((job, 1), [0; 32], list, None));
+        hearing.state = State::Execute;
+        hearing
+    }
+
+    fn hear(hearing: &mut Hearing, line: &str) {
+        hearing.take(Gathered::Line(line.to_owned()));
+    }
+
+    fn touched(hearing: &Hearing) -> usize {
+        hearing.asked.as_ref().unwrap().list.progress().0
+    }
+
+    #[test]
+    fn a_refused_line_holds_and_takes_no_good_one_along() {
+        let mut heard = hearing(4);
+        hear(&mut heard, "0.000,0.000,1.500");
+        hear(&mut heard, "PROBE 1");
+        assert_eq!((heard.state, touched(&heard)), (State::Execute, 1));
+        hear(&mut heard, "5.000,0.000,1.50010.000,0.000,1.500");
+        assert_eq!((heard.state, touched(&heard)), (State::Holding, 1));
+        let refusals = heard.refusals();
+        assert!(refusals[0].starts_with("REFUSED line 3 of the measurement") && refusals[0].contains("run together"));
+        // Whoever leads the probe has not heard of it yet.
+        hear(&mut heard, "15.000,0.000,1.500");
+        assert_eq!((heard.state, touched(&heard)), (State::Holding, 2));
+        assert_eq!(heard.left(), "2 targets are left: 101, 102");
+        // What stands touches nothing.
+        heard.state = State::Held;
+        hear(&mut heard, "5.000,0.000,1.500");
+        assert_eq!((heard.state, touched(&heard)), (State::Held, 2));
+        assert!(heard.refusals()[1].contains("confirmed to stand"));
+    }
+
+    #[test]
+    fn a_whole_list_is_over_when_the_cell_file_says_that_the_probe_is_clear() {
+        let mut heard = hearing(1);
+        heard.let_time_pass(Some(Duration::ZERO));
+        assert_eq!(heard.state, State::Execute);
+        hear(&mut heard, "0.000,0.000,1.500");
+        heard.let_time_pass(None);
+        heard.let_time_pass(Some(Duration::from_secs(3600)));
+        assert_eq!((heard.state, heard.clear), (State::Execute, None));
+        heard.let_time_pass(Some(Duration::ZERO));
+        assert_eq!((heard.state, heard.outcome, heard.clear), (State::Complete, Outcome::Complete, Some(true)));
+    }
+
+    #[test]
+    fn a_table_that_was_turned_and_a_line_that_was_not_asked_for_are_told() {
+        let mut heard = hearing(2);
+        heard.judging.reading.format = super::super::LineFormat::DecimalRotary;
+        hear(&mut heard, "0.000,0.000,1.500,0.0");
+        assert_eq!((heard.state, touched(&heard)), (State::Execute, 1));
+        hear(&mut heard, "5.000,0.000,1.500,245.5");
+        assert_eq!((heard.state, touched(&heard)), (State::Holding, 1));
+        assert!(heard.refusals()[0].contains("stands at 245.5 degrees"));
+        let mut heard = hearing(2);
+        heard.state = State::Idle;
+        heard.asked = None;
+        hear(&mut heard, "X1.0,Y2.0,Z3.0");
+        let told = heard.refusals().pop().unwrap();
+        assert!(
+            told.contains("format = \"lettered-decimal\", decimals = 1; the cell file says format = \"decimal\""),
+            "{told}"
+        );
+    }
+
+    #[test]
+    fn a_lost_line_loses_no_point_that_there_is() {
+        let mut heard = hearing(3);
+        hear(&mut heard, "0.000,0.000,1.500");
+        let gone = DeviceError::Disconnected { machine: "x".into(), what: "reading" };
+        heard.is_lost(gone, Some("5.000,0.0".to_owned()));
+        assert_eq!((heard.state, touched(&heard)), (State::Holding, 1));
+        assert!(heard.refusals()[0].contains("cut short") && heard.refusals()[1].contains("did not come"));
+    }
+}

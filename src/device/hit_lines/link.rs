@@ -1,0 +1,168 @@
+//! The port, and the thread that listens to it.
+//!
+//! A serial port can block where it should not, so it has a thread of its own, with a little runtime of its own. What had gathered before it
+//! was opened is read away: it was sent before anybody asked.
+
+use std::io;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use tokio::io::{AsyncRead, AsyncReadExt};
+use tokio::net::TcpStream;
+use tokio::sync::oneshot;
+use tokio::time::{Instant, sleep_until, timeout};
+use tokio_serial::{SerialPort as _, SerialPortBuilderExt as _};
+
+use super::hearing::{Hearing, locked};
+use super::lines::Lines;
+use crate::error::DeviceError;
+use crate::modbus::Parity;
+
+/// A line that is not silent for so long is not going to be.
+const LONGEST_DRAIN: Duration = Duration::from_secs(2);
+
+/// Where lines are heard.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[expect(missing_docs, reason = "the fields are told above them")]
+pub enum HitLine {
+    /// A serial port: its name, bits a second, 7 or 8 data bits, parity, 1 or 2 stop bits.
+    Serial { device: String, baud: u32, data_bits: u8, parity: Parity, stop_bits: u8 },
+    /// A terminal server.
+    Tcp { host: String, port: u16 },
+}
+
+impl std::fmt::Display for HitLine {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Serial { device, baud, .. } => write!(f, "{device} ({baud} baud)"),
+            Self::Tcp { host, port } => write!(f, "{host}:{port}"),
+        }
+    }
+}
+
+trait Source: AsyncRead + Send + Unpin {}
+impl<S: AsyncRead + Send + Unpin> Source for S {}
+
+/// How long to wait for what.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Waits {
+    /// For the connection.
+    pub(super) connect: Duration,
+    /// Of silence, after which what had gathered is read away.
+    pub(super) silence: Duration,
+    /// For the rest of a line.
+    pub(super) rest: Duration,
+}
+
+/// A thread that listens until this is dropped or the line is lost.
+#[derive(Debug)]
+pub(super) struct Listener {
+    _until: oneshot::Sender<()>,
+}
+
+impl Listener {
+    /// Opens the line, reads away what has gathered, and listens from then on.
+    pub(super) async fn open(
+        machine: &Arc<str>,
+        line: HitLine,
+        waits: Waits,
+        hearing: Arc<Mutex<Hearing>>,
+    ) -> Result<Self, DeviceError> {
+        let unreachable = |why| DeviceError::Unreachable { machine: Arc::clone(machine), why, limit: waits.connect };
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+        let runtime = runtime.map_err(|error| unreachable(error.kind()))?;
+        let (until, ended) = oneshot::channel();
+        let (opened, is_open) = oneshot::channel();
+        let name = Arc::clone(machine);
+        let listen = move || runtime.block_on(listen(name, line, waits, hearing, opened, ended));
+        let spawned = std::thread::Builder::new().name("hit lines".into()).spawn(listen);
+        spawned.map_err(|error| unreachable(error.kind()))?;
+        match is_open.await {
+            Ok(Ok(())) => Ok(Self { _until: until }),
+            Ok(Err(error)) => Err(unreachable(error.kind())),
+            Err(_) => Err(unreachable(io::ErrorKind::Other)),
+        }
+    }
+}
+
+async fn listen(
+    machine: Arc<str>,
+    line: HitLine,
+    waits: Waits,
+    hearing: Arc<Mutex<Hearing>>,
+    opened: oneshot::Sender<io::Result<()>>,
+    mut ended: oneshot::Receiver<()>,
+) {
+    let open = async {
+        let mut source = timeout(waits.connect, dial(&line)).await.unwrap_or(Err(io::ErrorKind::TimedOut.into()))?;
+        drain(source.as_mut(), waits.silence).await?;
+        Ok(source)
+    };
+    let mut source = match open.await {
+        Ok(source) => source,
+        Err(error) => return drop(opened.send(Err(error))),
+    };
+    locked(&hearing).lost = None;
+    if opened.send(Ok(())).is_err() {
+        return; // Nobody waits for it any more.
+    }
+    let (mut lines, mut bytes, mut due) = (Lines::default(), [0; 512], None);
+    loop {
+        let read = tokio::select! {
+            biased;
+            _ = &mut ended => return,
+            read = source.read(&mut bytes) => Some(read),
+            () = sleep_until(due.unwrap_or_else(Instant::now)), if due.is_some() => None,
+        };
+        match read {
+            None => {
+                due = None;
+                if let Some(text) = lines.give_up() {
+                    locked(&hearing).cut_short(&text);
+                }
+            }
+            Some(Ok(count)) if count > 0 => {
+                lines.take(&bytes[..count]).into_iter().for_each(|gathered| locked(&hearing).take(gathered));
+                due = lines.has_begun().then(|| Instant::now() + waits.rest);
+            }
+            Some(_) => {
+                let lost = DeviceError::Disconnected { machine, what: "listening" };
+                return locked(&hearing).is_lost(lost, lines.give_up());
+            }
+        }
+    }
+}
+
+async fn dial(line: &HitLine) -> io::Result<Box<dyn Source>> {
+    match line {
+        HitLine::Tcp { host, port } => Ok(Box::new(TcpStream::connect((host.as_str(), *port)).await?)),
+        HitLine::Serial { device, baud, data_bits, parity, stop_bits } => {
+            let port = tokio_serial::new(device, *baud)
+                .data_bits(if *data_bits == 7 { tokio_serial::DataBits::Seven } else { tokio_serial::DataBits::Eight })
+                .parity(match parity {
+                    Parity::None => tokio_serial::Parity::None,
+                    Parity::Even => tokio_serial::Parity::Even,
+                    Parity::Odd => tokio_serial::Parity::Odd,
+                })
+                .stop_bits(if *stop_bits == 2 { tokio_serial::StopBits::Two } else { tokio_serial::StopBits::One })
+                .open_native_async()?;
+            port.clear(tokio_serial::ClearBuffer::Input)?;
+            Ok(Box::new(port))
+        }
+    }
+}
+
+/// Reads a line empty until it has been silent for a while.
+async fn drain(source: &mut dyn Source, silence: Duration) -> io::Result<()> {
+    let until = Instant::now() + LONGEST_DRAIN;
+    let mut bytes = [0; 512];
+    while Instant::now() < until {
+        match timeout(silence, source.read(&mut bytes)).await {
+            Err(_) => return Ok(()),
+            Ok(Ok(0)) => return Err(io::ErrorKind::UnexpectedEof.into()),
+            Ok(Ok(_)) => {}
+            Ok(Err(error)) => return Err(error),
+        }
+    }
+    Err(io::ErrorKind::TimedOut.into())
+}

@@ -1,0 +1,233 @@
+//! What is to be touched, what was, and which touch a point is: that of the target to which it is nearest.
+
+use std::time::Duration;
+
+use schemars::JsonSchema;
+use serde::Deserialize;
+
+use crate::payload::{MeasuredPoint, Plan, PointStatus};
+use regrind_formats::result::Coordinates;
+
+/// What becomes of a touch where there was one before.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Repeated {
+    /// It is refused, and the measurement is held.
+    #[default]
+    Refuse,
+    /// It takes the place of the one before.
+    Replace,
+}
+
+/// How touches are told from one another.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Telling {
+    /// A point farther than this from every target is no touch of any.
+    pub(super) limit_mm: f64,
+    /// The same line within this is the same touch.
+    pub(super) double_within: Duration,
+    pub(super) repeated: Repeated,
+}
+
+/// What is to be touched, and what was.
+#[derive(Clone, Debug)]
+pub(super) struct List {
+    /// Where a line is expected for each target; none where any points will do.
+    expected_mm: Vec<[f64; 3]>,
+    /// The numbers of the targets.
+    indices: Vec<u32>,
+    points: Vec<Option<MeasuredPoint>>,
+    telling: Telling,
+    /// The line before and when it came.
+    last: Option<(String, Duration)>,
+}
+
+/// What a good line is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Touch {
+    /// The first of this target.
+    Of(u32),
+    /// Another of this target, in the place of the one before.
+    Again(u32),
+    /// The line before, sent twice.
+    Double,
+}
+
+impl List {
+    /// A list of the targets of a plan; of none where any points will do.
+    pub(super) fn new(plan: &Plan, what: Coordinates, is_free: bool, telling: Telling) -> Self {
+        let reach_mm = if what == Coordinates::Centres { plan.probe_radius_mm } else { 0.0 };
+        let targets = if is_free { &[][..] } else { &plan.targets[..] };
+        let expected = |k: usize| std::array::from_fn(|i| targets[k].point_mm[i] + reach_mm * targets[k].normal[i]);
+        Self {
+            expected_mm: (0..targets.len()).map(expected).collect(),
+            indices: targets.iter().map(|target| target.index).collect(),
+            points: vec![None; targets.len()],
+            telling,
+            last: None,
+        }
+    }
+
+    fn is_free(&self) -> bool {
+        self.expected_mm.is_empty()
+    }
+
+    /// Takes a point whose line came so long after the measurement began.
+    ///
+    /// # Errors
+    /// What it is not, in words.
+    pub(super) fn take(&mut self, line: &str, at_mm: [f64; 3], came: Duration) -> Result<Touch, String> {
+        let before = self.last.replace((line.to_owned(), came));
+        let within = |at: Duration| came.saturating_sub(at) < self.telling.double_within;
+        if before.is_some_and(|(text, at)| text == line && within(at)) {
+            return Ok(Touch::Double);
+        }
+        let point = |index| MeasuredPoint { index, status: PointStatus::Touched, quality: 0, at_mm };
+        if self.is_free() {
+            let index = self.points.len() as u32;
+            self.points.push(Some(point(index)));
+            return Ok(Touch::Of(index));
+        }
+        let (k, away_mm) = self.nearest(at_mm);
+        let (index, limit_mm) = (self.indices[k], self.telling.limit_mm);
+        if away_mm > limit_mm {
+            return Err(format!(
+                "it is {away_mm:.3} mm from target {index}, the nearest one, and limit_mm is {limit_mm}: see that the right part lies where the \
+                 cell file has it, and touch the target again"
+            ));
+        }
+        match (self.points[k].replace(point(index)), self.telling.repeated) {
+            (None, _) => Ok(Touch::Of(index)),
+            (Some(_), Repeated::Replace) => Ok(Touch::Again(index)),
+            (Some(first), Repeated::Refuse) => {
+                self.points[k] = Some(first);
+                let apart_mm = distance(first.at_mm, at_mm);
+                Err(format!(
+                    "target {index} was touched before, {apart_mm:.4} mm from here, and that touch stands: go on with the targets that are left, \
+                     or say repeated = \"replace\" in the cell file"
+                ))
+            }
+        }
+    }
+
+    fn nearest(&self, at_mm: [f64; 3]) -> (usize, f64) {
+        let away = self.expected_mm.iter().map(|expected| distance(*expected, at_mm)).enumerate();
+        away.min_by(|(_, a), (_, b)| a.total_cmp(b)).unwrap_or((0, f64::INFINITY))
+    }
+
+    /// How many there are, and of how many; none of how many where any will do.
+    pub(super) fn progress(&self) -> (usize, Option<usize>) {
+        (self.points.iter().flatten().count(), (!self.is_free()).then_some(self.points.len()))
+    }
+
+    /// Whether every target was touched.
+    pub(super) fn is_whole(&self) -> bool {
+        !self.is_free() && self.points.iter().all(Option::is_some)
+    }
+
+    /// The numbers of the targets that are left.
+    pub(super) fn left(&self) -> impl Iterator<Item = u32> + '_ {
+        self.indices.iter().zip(&self.points).filter(|(_, point)| point.is_none()).map(|(index, _)| *index)
+    }
+
+    /// The points in the order of the plan; what was not touched was not found.
+    pub(super) fn points(&self) -> Vec<MeasuredPoint> {
+        let missed = |k: usize| MeasuredPoint {
+            index: self.indices.get(k).copied().unwrap_or_default(),
+            status: PointStatus::NotFound,
+            quality: 100,
+            at_mm: [0.0; 3],
+        };
+        self.points.iter().enumerate().map(|(k, point)| point.unwrap_or_else(|| missed(k))).collect()
+    }
+
+    /// The points from one on, up to the first that is missing.
+    pub(super) fn ready(&self, from: usize) -> Vec<MeasuredPoint> {
+        self.points.iter().skip(from).map_while(|point| *point).collect()
+    }
+}
+
+fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
+    (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>().sqrt()
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use crate::payload::{Target, TargetKind};
+
+    /// Targets on a line along x, 5 mm apart, on a plane that looks up.
+    pub(in super::super) fn plan(targets: u32) -> Plan {
+        let target = |k: u32| Target {
+            index: 100 + k,
+            what: TargetKind::Part,
+            point_mm: [5.0 * f64::from(k), 0.0, 0.0],
+            normal: [0.0, 0.0, 1.0],
+        };
+        Plan {
+            targets: (0..targets).map(target).collect(),
+            probe_radius_mm: 1.5,
+            approach_mm: 2.0,
+            search_mm: 2.0,
+            speed_mm_s: 5.0,
+            safe_height_mm: 50.0,
+            careful: None,
+        }
+    }
+
+    pub(in super::super) const TELLING: Telling =
+        Telling { limit_mm: 1.0, double_within: Duration::from_millis(200), repeated: Repeated::Refuse };
+
+    fn at(ms: u64) -> Duration {
+        Duration::from_millis(ms)
+    }
+
+    #[test]
+    fn a_point_belongs_to_the_nearest_target_and_to_none_beyond_the_limit() {
+        let mut list = List::new(&plan(3), Coordinates::Centres, false, TELLING);
+        // The centre of a ball of 1.5 mm.
+        assert_eq!(list.take("a", [5.2, 0.1, 1.6], at(0)), Ok(Touch::Of(101)));
+        assert!(list.take("b", [5.2, 0.1, 0.0], at(10)).unwrap_err().contains("target 101"));
+        assert!(list.take("c", [12.5, 0.0, 1.5], at(20)).unwrap_err().contains("2.500 mm from target"));
+        assert_eq!(list.take("d", [10.0, 0.0, 1.5], at(30)), Ok(Touch::Of(102)));
+        assert_eq!((list.progress(), list.is_whole()), ((2, Some(3)), false));
+        assert_eq!(list.left().collect::<Vec<_>>(), [100]);
+        let points = list.points();
+        assert_eq!(points.iter().map(|p| p.index).collect::<Vec<_>>(), [100, 101, 102]);
+        assert_eq!((points[0].status, points[1].at_mm), (PointStatus::NotFound, [5.2, 0.1, 1.6]));
+        assert_eq!(list.take("e", [0.0, 0.0, 1.5], at(40)), Ok(Touch::Of(100)));
+        assert!(list.is_whole());
+        // Of contacts the radius is no part.
+        let mut contacts = List::new(&plan(3), Coordinates::Contacts, false, TELLING);
+        assert_eq!(contacts.take("a", [5.0, 0.0, 0.1], at(0)), Ok(Touch::Of(101)));
+        assert!(contacts.take("b", [10.0, 0.0, 1.5], at(10)).is_err());
+    }
+
+    #[test]
+    fn the_same_line_at_once_is_one_touch_and_later_another_one() {
+        let mut list = List::new(&plan(2), Coordinates::Centres, false, TELLING);
+        let centre = [0.0, 0.0, 1.5];
+        assert_eq!(list.take("a", centre, at(0)), Ok(Touch::Of(100)));
+        assert_eq!(list.take("a", centre, at(150)), Ok(Touch::Double));
+        // A line that comes again and again does not become a touch by its age.
+        assert_eq!(list.take("a", centre, at(300)), Ok(Touch::Double));
+        let repeated = list.take("a", centre, at(600)).unwrap_err();
+        assert!(repeated.contains("target 100 was touched before, 0.0000 mm"), "{repeated}");
+        assert!(list.take("b", [0.01, 0.0, 1.5], at(601)).unwrap_err().contains("that touch stands"));
+        assert_eq!(list.points()[0].at_mm, centre);
+        let telling = Telling { repeated: Repeated::Replace, ..TELLING };
+        let mut list = List::new(&plan(2), Coordinates::Centres, false, telling);
+        assert_eq!(list.take("a", centre, at(0)), Ok(Touch::Of(100)));
+        assert_eq!(list.take("b", [0.01, 0.0, 1.5], at(1)), Ok(Touch::Again(100)));
+        assert_eq!(list.points()[0].at_mm, [0.01, 0.0, 1.5]);
+    }
+
+    #[test]
+    fn where_any_points_will_do_each_touch_is_one() {
+        let mut list = List::new(&plan(2), Coordinates::Centres, true, TELLING);
+        assert_eq!(list.take("a", [900.0, 0.0, 0.0], at(0)), Ok(Touch::Of(0)));
+        assert_eq!(list.take("a", [900.0, 0.0, 0.0], at(1)), Ok(Touch::Double));
+        assert_eq!(list.take("b", [901.0, 0.0, 0.0], at(2)), Ok(Touch::Of(1)));
+        assert_eq!((list.progress(), list.is_whole(), list.points().len()), ((2, None), false, 2));
+    }
+}

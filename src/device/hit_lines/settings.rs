@@ -1,0 +1,369 @@
+//! What a cell file says of a machine that prints hits, and the machine that is made of it.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use schemars::JsonSchema;
+use serde::Deserialize;
+
+use super::HitLinesCmm;
+use super::format::{LineFormat, Reading, Separator};
+use super::hearing::Judging;
+use super::link::{HitLine, Waits};
+use super::list::{Repeated, Telling};
+use crate::modbus::{Parity, port};
+use crate::no_machine::NoMachine;
+use crate::place::Place;
+use crate::wiring::{Making, MakingError, Wired};
+use regrind_document::Document;
+use regrind_formats::result::{Coordinates, LengthUnit};
+
+/// The device of a simulated cell that stands for a pseudo-terminal, which is made at the start.
+const AUTO: &str = "auto";
+
+/// A line for each hit, from a measuring machine or an arm that hears nothing.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct HitLinesWire {
+    /// Serial port, as the operating system calls it; left out where a terminal server is named. In a simulated cell "auto" makes one.
+    #[schemars(length(min = 1, max = 400), example = &"/dev/ttyUSB0")]
+    pub device: Option<String>,
+    /// Bits a second.
+    #[schemars(range(min = 300, max = 4000000))]
+    pub baud: u32,
+    /// Data bits.
+    pub data_bits: DataBits,
+    /// Parity.
+    pub parity: Parity,
+    /// Stop bits.
+    #[schemars(range(min = 1, max = 2))]
+    pub stop_bits: u8,
+    /// Name or address of a terminal server; left out where a serial port is named.
+    #[schemars(length(min = 1, max = 253), example = &"192.168.0.30")]
+    pub host: Option<String>,
+    /// Its port.
+    #[schemars(range(min = 0, max = 65535))]
+    pub port: u16,
+    /// How a hit is written.
+    #[schemars(extend("x-required" = true), example = &"decimal")]
+    pub format: Option<LineFormat>,
+    /// What the coordinates are: centres of the probe, or contacts.
+    #[schemars(extend("x-required" = true), example = &"centres")]
+    pub what: Option<Coordinates>,
+    /// How many digits stand behind the decimal mark of a coordinate, in each of them; a line with another number is refused.
+    #[schemars(range(min = 1, max = 9))]
+    pub decimals: u8,
+    /// Decimal mark.
+    pub decimal: Mark,
+    /// What stands between two values.
+    pub separator: Separator,
+    /// Unit of coordinates with a decimal mark; whole numbers are micrometres.
+    pub unit: LengthUnit,
+    /// Which axis of the machine the first, second and third value are.
+    pub axes: Axes,
+    /// Where a rotary table has to stand, by its angle in the line.
+    #[schemars(range(min = -36000.0, max = 36000.0))]
+    pub rotary_deg: f64,
+    /// By how much it may be off.
+    #[schemars(range(min = 0.0, max = 10.0))]
+    pub rotary_tolerance_deg: f64,
+    /// A point farther than this from every target is refused; a nearer one belongs to the nearest.
+    #[schemars(range(min = 0.001, max = 100.0))]
+    pub limit_mm: f64,
+    /// The same line, to the last digit, within this is the same touch, sent twice.
+    #[schemars(range(min = 0, max = 10000))]
+    pub double_within_ms: u32,
+    /// What becomes of a second touch of a target.
+    pub repeated: Repeated,
+    /// For the rest of a line that has begun.
+    #[schemars(range(min = 10, max = 60000))]
+    pub line_within_ms: u32,
+    /// Beginnings of lines that mean nothing, such as headers.
+    #[schemars(length(max = 32), inner(length(min = 1, max = 80)))]
+    pub passed_over: Vec<String>,
+    /// Where the machine's own part program leads the probe clear of the part behind its last point: so long after it, it is. Left out, a person
+    /// is asked.
+    #[schemars(range(min = 0.1, max = 3600.0))]
+    pub clear_after_s: Option<f64>,
+    /// Folder in which the list of what is to be touched is put as `plan.csv` when it begins, for a part program; relative to this file.
+    #[schemars(length(min = 1, max = 400))]
+    pub plan_folder: Option<String>,
+}
+
+/// Data bits of a serial line.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+#[expect(missing_docs, reason = "the names say it")]
+pub enum DataBits {
+    Seven,
+    #[default]
+    Eight,
+}
+
+/// A decimal mark.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+#[expect(missing_docs, reason = "the names say it")]
+pub enum Mark {
+    #[default]
+    Point,
+    Comma,
+}
+
+/// Which axes the three values are.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+#[expect(missing_docs, reason = "the names say it")]
+pub enum Axes {
+    #[default]
+    Xyz,
+    Xzy,
+    Yxz,
+    Yzx,
+    Zxy,
+    Zyx,
+}
+
+impl Axes {
+    fn order(self) -> [usize; 3] {
+        match self {
+            Self::Xyz => [0, 1, 2],
+            Self::Xzy => [0, 2, 1],
+            Self::Yxz => [1, 0, 2],
+            Self::Yzx => [1, 2, 0],
+            Self::Zxy => [2, 0, 1],
+            Self::Zyx => [2, 1, 0],
+        }
+    }
+}
+
+impl Default for HitLinesWire {
+    fn default() -> Self {
+        Self {
+            device: None,
+            baud: 9600,
+            data_bits: DataBits::Eight,
+            parity: Parity::Even,
+            stop_bits: 1,
+            host: None,
+            port: 0,
+            format: None,
+            what: None,
+            decimals: 3,
+            decimal: Mark::Point,
+            separator: Separator::Comma,
+            unit: LengthUnit::Mm,
+            axes: Axes::Xyz,
+            rotary_deg: 0.0,
+            rotary_tolerance_deg: 0.05,
+            limit_mm: 1.0,
+            double_within_ms: 200,
+            repeated: Repeated::Refuse,
+            line_within_ms: 1000,
+            passed_over: Vec::new(),
+            clear_after_s: None,
+            plan_folder: None,
+        }
+    }
+}
+
+/// Everything that has to be known to hear a machine that prints hits.
+#[derive(Clone, Debug)]
+pub struct HitLinesSettings {
+    /// The part, as prompts call it.
+    pub part: String,
+    /// The folder of the run.
+    pub run_folder: PathBuf,
+    /// Where a part program looks for the list.
+    pub plan_folder: Option<PathBuf>,
+    /// Where lines are heard.
+    pub line: HitLine,
+    /// How lines are read.
+    pub reading: Reading,
+    /// What the coordinates are.
+    pub what: Coordinates,
+    /// Where the rotary table has to stand, and within what.
+    pub rotary_deg: [f64; 2],
+    /// A point farther than this from every target is none.
+    pub limit_mm: f64,
+    /// The same line within this is the same touch.
+    pub double_within: Duration,
+    /// What becomes of a second touch of a target.
+    pub repeated: Repeated,
+    /// For the rest of a line.
+    pub line_within: Duration,
+    /// Beginnings of lines that mean nothing.
+    pub passed_over: Vec<String>,
+    /// So long after the last point the probe is clear of the part; none where a person says so.
+    pub clear_after: Option<Duration>,
+    /// Where any number of points will do: the least of them.
+    pub free_points: Option<usize>,
+    /// For the connection.
+    pub connect_within: Duration,
+    /// Of silence, after which what had gathered is read away.
+    pub silence: Duration,
+    /// Whether the cell is a simulation.
+    pub simulated: bool,
+}
+
+impl HitLinesSettings {
+    pub(super) fn judging(&self) -> Judging {
+        let passed_over = self.passed_over.clone();
+        Judging { reading: self.reading, rotary_deg: self.rotary_deg, passed_over }
+    }
+
+    pub(super) fn telling(&self) -> Telling {
+        let Self { limit_mm, double_within, repeated, .. } = *self;
+        Telling { limit_mm, double_within, repeated }
+    }
+
+    pub(super) fn waits(&self) -> Waits {
+        Waits { connect: self.connect_within, silence: self.silence, rest: self.line_within }
+    }
+}
+
+impl Wired for HitLinesWire {
+    type Cmm = HitLinesCmm;
+    type Grinder = NoMachine;
+    const BY_PERSON: bool = true;
+
+    fn check(&self, place: &Place<'_>, document: &mut Document) {
+        if place.table == "grinder" {
+            let allowed = "hit lines are those of measuring machines";
+            return document.report("grinder.wire.kind", "is \"hit-lines\"", allowed, "name another wire");
+        }
+        self.check_line(place, document);
+        self.check_format(document);
+    }
+
+    fn notes(&self) -> Vec<String> {
+        self.missing().into_iter().collect()
+    }
+
+    fn coordinates(&self) -> Option<Coordinates> {
+        self.what
+    }
+
+    fn cmm(&self, making: &Making<'_>) -> Result<HitLinesCmm, MakingError> {
+        if let Some(missing) = self.missing() {
+            return Err(MakingError::NoPort { missing });
+        }
+        let plan_folder = self.plan_folder.as_ref().map(|folder| making.cell_folder.join(folder));
+        if let Some(path) = plan_folder.as_ref().filter(|path| !path.is_dir()) {
+            let machine = crate::MachineKind::Cmm;
+            return Err(MakingError::Folder { key: "cmm.wire.plan_folder".to_owned(), path: path.clone(), machine });
+        }
+        let ms = |ms: u32| Duration::from_millis(ms.into());
+        Ok(HitLinesCmm::new(HitLinesSettings {
+            part: making.part.to_owned(),
+            run_folder: making.run_folder.to_owned(),
+            plan_folder,
+            line: self.line(),
+            reading: self.reading(),
+            // A cell file that does not say it is refused.
+            what: self.what.unwrap_or(Coordinates::Centres),
+            rotary_deg: [self.rotary_deg, self.rotary_tolerance_deg],
+            limit_mm: self.limit_mm,
+            double_within: ms(self.double_within_ms),
+            repeated: self.repeated,
+            line_within: ms(self.line_within_ms),
+            passed_over: self.passed_over.clone(),
+            clear_after: self.clear_after_s.map(Duration::from_secs_f64),
+            free_points: making.free_points,
+            connect_within: making.timing.lost_after,
+            silence: making.timing.quarantine,
+            simulated: making.simulated,
+        }))
+    }
+
+    fn grinder(&self, _: &Making<'_>) -> Result<NoMachine, MakingError> {
+        Err(MakingError::NoDriver { table: "grinder", kind: "hit-lines" })
+    }
+
+    fn hit_line(&self) -> Option<HitLine> {
+        Some(self.line())
+    }
+}
+
+impl HitLinesWire {
+    /// Where lines are heard.
+    pub fn line(&self) -> HitLine {
+        let Self { device, host, port, .. } = self.clone();
+        match (device, host) {
+            (Some(device), _) => HitLine::Serial {
+                device,
+                baud: self.baud,
+                data_bits: if self.data_bits == DataBits::Seven { 7 } else { 8 },
+                parity: self.parity,
+                stop_bits: self.stop_bits,
+            },
+            (None, host) => HitLine::Tcp { host: host.unwrap_or_default(), port },
+        }
+    }
+
+    /// Whether its far end has no name before it is simulated in this process.
+    pub fn is_open(&self) -> bool {
+        match self.line() {
+            HitLine::Serial { device, .. } => device == AUTO,
+            HitLine::Tcp { port, .. } => port == 0,
+        }
+    }
+
+    /// How lines are read.
+    pub fn reading(&self) -> Reading {
+        Reading {
+            // A cell file that does not say it is refused.
+            format: self.format.unwrap_or(LineFormat::Decimal),
+            separator: self.separator,
+            mark: if self.decimal == Mark::Comma { ',' } else { '.' },
+            decimals: usize::from(self.decimals),
+            unit_mm: self.unit.mm(),
+            axes: self.axes.order(),
+        }
+    }
+
+    fn missing(&self) -> Option<String> {
+        let device = self.device.as_ref().filter(|device| *device != AUTO)?;
+        port::missing(device)
+    }
+
+    fn check_line(&self, place: &Place<'_>, document: &mut Document) {
+        let one = "it is heard on a serial port or through a terminal server";
+        match (&self.device, &self.host) {
+            (None, None) => {
+                document.report(&place.key("wire.device"), "is missing, and `host` too", one, "name one of them");
+            }
+            (Some(_), Some(_)) => {
+                document.report(&place.key("wire.host"), "is there beside `device`", one, "leave one of them out");
+            }
+            (Some(device), None) if device == AUTO && place.simulated == Some(false) => {
+                let allowed = "only a simulated cell makes its own port";
+                document.report(&place.key("wire.device"), "is \"auto\" in a real cell", allowed, "name the port");
+            }
+            (None, Some(_)) if self.port == 0 && place.simulated == Some(false) => {
+                let found = "is 0 in a cell that is not simulated";
+                let allowed = "it must be a whole number from 1 to 65535";
+                document.report(&place.key("wire.port"), found, allowed, "see the settings of the terminal server");
+            }
+            _ => {}
+        }
+    }
+
+    fn check_format(&self, document: &mut Document) {
+        let Some(format) = self.format else { return };
+        if format.is_integer() && self.unit == LengthUnit::Inch {
+            let found = "is inch, and the format has whole numbers";
+            let allowed = "whole numbers are micrometres";
+            document.report("cmm.wire.unit", found, allowed, "leave it out, or have the machine print decimals");
+        }
+        if self.decimal == Mark::Comma && self.separator == Separator::Comma && !format.is_integer() {
+            let found = "is \"comma\", as the separator is";
+            let allowed = "one mark cannot be both";
+            document.report("cmm.wire.decimal", found, allowed, "say what stands between two values: separator");
+        }
+        if format.is_lettered() && self.axes != Axes::Xyz {
+            let found = "is given, and the lines have letters";
+            document.report("cmm.wire.axes", found, "the letters tell the axes", "leave it out");
+        }
+    }
+}

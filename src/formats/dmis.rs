@@ -1,0 +1,273 @@
+//! Results as DMIS output (ISO 22093): the actual points of features, `FA(P17) = FEAT/POINT,CART,x,y,z,i,j,k`.
+//!
+//! A statement ends with its line unless `$` stands at its end; `$$` begins a comment. The unit is that of `UNITS`, which has to stand above
+//! the first point. What a program has written by `TEXT/OUTFIL` says what the file is about, such as `'plan: 5f3c...'`. `PRCOMP/ON` says that the
+//! machine has taken the radius of the probe off, `PRCOMP/OFF` that it has not.
+
+use std::path::Path;
+
+use super::error::{FormatError, excerpt};
+use super::number::is_believable;
+use super::result::{Content, ResultFile, Statements};
+use regrind_core::geometry::Point;
+
+/// Most points that are read.
+const MOST_POINTS: usize = 5_000_000;
+/// Millimetres per inch.
+const INCH_MM: f64 = 25.4;
+/// Words with which a DMIS file begins.
+const BEGINNINGS: [&[u8]; 5] = [b"DMISMN/", b"DMISMD/", b"FILNAM/", b"UNITS/", b"$$"];
+
+/// Whether a file is one of DMIS, by its first line that is not blank.
+pub(super) fn is_dmis(head: &[u8]) -> bool {
+    let head = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(head).trim_ascii_start();
+    BEGINNINGS.iter().any(|word| head.get(..word.len()).is_some_and(|begins| begins.eq_ignore_ascii_case(word)))
+}
+
+/// A statement, in one line, and the line on which it began.
+struct Statement {
+    text: String,
+    line: u64,
+}
+
+/// What has been read so far.
+#[derive(Default)]
+struct Reading {
+    unit_mm: Option<f64>,
+    points: Vec<Point>,
+    names: Vec<String>,
+    statements: Statements,
+    is_ended: bool,
+}
+
+/// Reads what a file says of itself.
+///
+/// # Errors
+/// A statement that says something impossible.
+pub(super) fn read_statements(path: &Path, text: &[u8]) -> Result<Statements, FormatError> {
+    read(path, text).map(|reading| reading.statements)
+}
+
+/// Reads the points of a file.
+///
+/// # Errors
+/// A file without its end, its unit or its points, and numbers that are none, with their lines.
+pub(super) fn parse(path: &Path, text: &[u8], content: &Content) -> Result<ResultFile, FormatError> {
+    let Reading { points, names, statements, .. } = read(path, text)?;
+    if points.is_empty() {
+        return Err(FormatError::NoData { path: path.to_owned(), expected: "actual points, FA(...) = FEAT/POINT" });
+    }
+    let indices: Option<Vec<u32>> = names.iter().map(|name| index_of(name)).collect();
+    Ok(ResultFile {
+        points,
+        indices,
+        names: Some(names),
+        coordinates: statements.coordinates.or(content.coordinates),
+        probe_radius_mm: statements.probe_radius_mm,
+        statements,
+        ..ResultFile::default()
+    })
+}
+
+/// The number of a target in the name of its feature: `P17`.
+pub(super) fn index_of(name: &str) -> Option<u32> {
+    let digits = name.trim().strip_prefix(['P', 'p'])?;
+    digits.bytes().all(|b| b.is_ascii_digit()).then(|| digits.parse().ok()).flatten()
+}
+
+fn read(path: &Path, text: &[u8]) -> Result<Reading, FormatError> {
+    if let Some(at) = text.iter().position(|b| *b == 0) {
+        let line = text[..at].iter().filter(|b| **b == b'\n').count() as u64 + 1;
+        return Err(FormatError::NotText { path: path.to_owned(), line, value: 0 });
+    }
+    let mut reading = Reading::default();
+    for statement in statements(&String::from_utf8_lossy(text)) {
+        reading.take(path, &statement)?;
+    }
+    if !reading.is_ended {
+        let place = format!("line {}", text.split(|b| *b == b'\n').count());
+        return Err(FormatError::Cut { path: path.to_owned(), place, expected: "ENDFIL at the end".to_owned() });
+    }
+    Ok(reading)
+}
+
+/// Puts lines together to statements.
+fn statements(text: &str) -> Vec<Statement> {
+    let (mut all, mut begun): (Vec<Statement>, Option<Statement>) = (Vec::new(), None);
+    for (line, number) in text.lines().zip(1..) {
+        let line = line.trim_start_matches('\u{feff}').trim();
+        if line.starts_with("$$") || line.is_empty() {
+            continue;
+        }
+        let (part, goes_on) = match line.strip_suffix('$') {
+            Some(part) => (part.trim_end(), true),
+            None => (line, false),
+        };
+        let statement = begun.get_or_insert_with(|| Statement { text: String::new(), line: number });
+        statement.text.push_str(part);
+        if !goes_on {
+            all.extend(begun.take());
+        }
+    }
+    all.extend(begun);
+    all
+}
+
+impl Reading {
+    fn take(&mut self, path: &Path, statement: &Statement) -> Result<(), FormatError> {
+        let text = statement.text.as_str();
+        let (before, after) = text.split_once('/').unwrap_or((text, ""));
+        let keyword = before.trim().to_ascii_uppercase();
+        match keyword.as_str() {
+            "UNITS" => self.unit(path, statement, after),
+            "PRCOMP" => {
+                let is_on = after.trim().eq_ignore_ascii_case("ON");
+                self.say(path, statement, "coordinates", if is_on { "contacts" } else { "centres" })
+            }
+            "TEXT" => self.written(path, statement, after),
+            "ENDFIL" => {
+                self.is_ended = true;
+                Ok(())
+            }
+            _ if keyword.starts_with("FA(") && keyword.contains('=') => self.actual(path, statement, before, after),
+            _ => Ok(()),
+        }
+    }
+
+    fn unit(&mut self, path: &Path, statement: &Statement, after: &str) -> Result<(), FormatError> {
+        let unit = after.split(',').next().unwrap_or_default().trim().to_ascii_uppercase();
+        let unit_mm = match unit.as_str() {
+            "MM" => 1.0,
+            "CM" => 10.0,
+            "M" => 1000.0,
+            "INCH" => INCH_MM,
+            "FEET" => 12.0 * INCH_MM,
+            _ => return Err(unexpected(path, statement, "a unit of length: MM, CM, M, INCH or FEET", &unit)),
+        };
+        if self.unit_mm.is_some_and(|before| before != unit_mm) && !self.points.is_empty() {
+            return Err(unexpected(path, statement, "one unit for all points", &unit));
+        }
+        self.unit_mm = Some(unit_mm);
+        Ok(())
+    }
+
+    /// Takes what a program has written: `OUTFIL,'plan: 5f3c...'`.
+    fn written(&mut self, path: &Path, statement: &Statement, after: &str) -> Result<(), FormatError> {
+        let quoted = after.split_once('\'').and_then(|(_, rest)| rest.rsplit_once('\''));
+        match quoted.and_then(|(text, _)| text.split_once(':')) {
+            Some((key, value)) => self.say(path, statement, key, value.trim()),
+            None => Ok(()),
+        }
+    }
+
+    fn say(&mut self, path: &Path, statement: &Statement, key: &str, value: &str) -> Result<(), FormatError> {
+        let before = self.statements.coordinates;
+        self.statements.take(path, statement.line, key, value)?;
+        if before.is_some() && before != self.statements.coordinates {
+            return Err(unexpected(path, statement, "one kind of coordinates in a file, centres or contacts", value));
+        }
+        Ok(())
+    }
+
+    fn actual(&mut self, path: &Path, statement: &Statement, before: &str, after: &str) -> Result<(), FormatError> {
+        let kind = before.rsplit_once('=').map_or("", |(_, kind)| kind).trim();
+        let mut fields = after.split(',').map(str::trim);
+        let is_point =
+            kind.eq_ignore_ascii_case("FEAT") && fields.next().is_some_and(|f| f.eq_ignore_ascii_case("POINT"));
+        if !is_point {
+            return Ok(()); // An actual of another feature, or none of its coordinates.
+        }
+        let coordinates = fields.next().unwrap_or_default();
+        if !coordinates.eq_ignore_ascii_case("CART") {
+            return Err(unexpected(path, statement, "cartesian coordinates (CART)", coordinates));
+        }
+        let unit_mm =
+            self.unit_mm.ok_or_else(|| unexpected(path, statement, "UNITS above the first point", &statement.text))?;
+        let fields: Vec<&str> = fields.collect();
+        // The three of a direction stand behind; one that is missing must not be taken from them.
+        if !matches!(fields.len(), 3 | 6) {
+            let found = format!("{} numbers", fields.len());
+            return Err(unexpected(path, statement, "3 numbers behind CART, or 6 with a direction", &found));
+        }
+        let mut at_mm = [0.0; 3];
+        for (value, field) in at_mm.iter_mut().zip(&fields) {
+            let number =
+                field.parse::<f64>().ok().map(|number| number * unit_mm).filter(|number| is_believable(*number));
+            *value = number.ok_or_else(|| unexpected(path, statement, "a coordinate", field))?;
+        }
+        if self.points.len() == MOST_POINTS {
+            let (found, limit) = (MOST_POINTS as u64 + 1, MOST_POINTS as u64);
+            return Err(FormatError::TooLarge { path: path.to_owned(), found, limit, unit: "points" });
+        }
+        let name = before.split_once('(').and_then(|(_, rest)| rest.split_once(')')).map_or("", |(name, _)| name);
+        self.points.push(Point::from(at_mm));
+        self.names.push(name.trim().to_owned());
+        Ok(())
+    }
+}
+
+fn unexpected(path: &Path, statement: &Statement, expected: &str, found: &str) -> FormatError {
+    FormatError::Unexpected {
+        path: path.to_owned(),
+        place: format!("line {}", statement.line),
+        expected: expected.to_owned(),
+        found: excerpt(found.as_bytes()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::result::{Coordinates, parse_result};
+    use super::*;
+
+    const PLAN: &str = "00112233445566778899aabbccddeeff00112233445566778899aabbccddeeff";
+
+    fn parsed(text: &str) -> Result<ResultFile, FormatError> {
+        parse_result(Path::new("SN-7_c2.res"), text.as_bytes(), &Content::default())
+    }
+
+    fn file() -> String {
+        format!(
+            "FILNAM/'SN-7'\n$$ a comment\nUNITS/MM, ANGDEC\nTEXT/OUTFIL,'part: SN-7'\nTEXT/OUTFIL,'cycle: 2'\n\
+             TEXT/OUTFIL,'plan: {PLAN}'\nPRCOMP/OFF\nOUTPUT/FA(P7)\nFA(P7) = FEAT/POINT, CART,  $\n  1.50000, -2.25000, 3.00000, 0.0, 0.0, 1.0\n\
+             FA(A_CIRCLE) = FEAT/CIRCLE,INNER,CART,50.0,50.0,40.0,0.0,0.0,1.0,50.0\nFA(P9)=FEAT/POINT,CART,4,5,6,0,0,1\nENDFIL\n"
+        )
+    }
+
+    #[test]
+    fn the_actual_points_come_with_their_targets_and_what_the_file_is_about() {
+        let found = parsed(&file()).unwrap();
+        assert_eq!(found.points, [Point::new(1.5, -2.25, 3.0), Point::new(4.0, 5.0, 6.0)]);
+        assert_eq!((found.indices.as_deref(), found.coordinates), (Some(&[7, 9][..]), Some(Coordinates::Centres)));
+        let says = &found.statements;
+        assert_eq!((says.part.as_deref(), says.cycle, says.plan.as_deref()), (Some("SN-7"), Some(2), Some(PLAN)));
+        let inches = parsed(&file().replace("UNITS/MM", "UNITS/INCH")).unwrap();
+        assert_eq!(inches.points[1], Point::new(4.0 * 25.4, 5.0 * 25.4, 6.0 * 25.4));
+        assert_eq!(
+            parsed(&file().replace("PRCOMP/OFF", "PRCOMP/ON")).unwrap().coordinates,
+            Some(Coordinates::Contacts)
+        );
+        // A name that is no target's leaves the order to tell.
+        assert_eq!(parsed(&file().replace("FA(P9)", "FA(TOP)")).unwrap().indices, None);
+    }
+
+    #[test]
+    fn what_is_missing_or_no_number_is_told_with_its_line() {
+        for (of, with, why) in [
+            ("ENDFIL\n", "", "expected ENDFIL at the end"),
+            ("UNITS/MM, ANGDEC\n", "", "line 8: expected UNITS above the first point"),
+            ("UNITS/MM", "UNITS/FURLONG", "line 3: expected a unit of length"),
+            ("4,5,6", "4,5", "line 12: expected 3 numbers behind CART, or 6 with a direction, found `5 numbers`"),
+            ("4,5,6", "4,NaN,6", "line 12: expected a coordinate, found `NaN`"),
+            ("4,5,6", "4,1e9,6", "found `1e9`"),
+            ("POINT,CART,4", "POINT,POL,4", "line 12: expected cartesian"),
+            ("cycle: 2", "cycle: two", "`cycle` says `two`"),
+            ("OUTPUT/FA(P7)", "PRCOMP/ON", "one kind of coordinates"),
+        ] {
+            let text = file().replace(of, with);
+            assert_ne!(text, file());
+            let error = parsed(&text).unwrap_err().to_string();
+            assert!(error.contains(why), "{with:?}: {error}");
+        }
+    }
+}

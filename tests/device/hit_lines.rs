@@ -1,0 +1,299 @@
+//! The driver of a machine that prints its hits, at the near end of a real serial line (a pseudo-terminal) or of a TCP connection.
+//!
+//! Nothing here goes by the clock: what is waited for is a point, a refusal or a state, and however long that takes.
+#![cfg(unix)]
+
+use std::path::Path;
+use std::time::Duration;
+
+use regrind::device::hit_lines::{HitLine, HitLinesCmm, HitLinesSettings, LineFormat, Reading, Repeated};
+use regrind::device::{
+    Cmm as _, Coordinates, Identified, Interrupt, Job, Machine, Measurement, Outcome, Parity, Plan, PointStatus, State,
+    Target, TargetKind, Word, digest,
+};
+use regrind_sim::hits::faults::Fault;
+use regrind_sim::hits::print::Style;
+use regrind_sim::wire::hits::ServingHits;
+
+/// Longer than any test takes.
+const LONG: Duration = Duration::from_secs(600);
+
+/// Targets in a row, 50 mm apart, on a plane that looks up.
+fn plan(targets: u32) -> Plan {
+    let point_mm = |k: u32| [100.0 + 50.0 * f64::from(k), 200.0, 298.5];
+    let what = TargetKind::Part;
+    let target = |k| Target { index: 7 + k, what, point_mm: point_mm(k), normal: [0.0, 0.0, 1.0] };
+    Plan {
+        targets: (0..targets).map(target).collect(),
+        probe_radius_mm: 1.5,
+        approach_mm: 2.0,
+        search_mm: 2.0,
+        speed_mm_s: 5.0,
+        safe_height_mm: 50.0,
+        careful: None,
+    }
+}
+
+fn settings(folder: &Path, line: HitLine) -> HitLinesSettings {
+    HitLinesSettings {
+        part: "SN-7".into(),
+        run_folder: folder.to_owned(),
+        plan_folder: None,
+        line,
+        reading: Reading::default(),
+        what: Coordinates::Centres,
+        rotary_deg: [245.5, 0.05],
+        limit_mm: 1.0,
+        double_within: LONG,
+        repeated: Repeated::Refuse,
+        line_within: LONG,
+        passed_over: vec!["PROBE".into()],
+        clear_after: None,
+        free_points: None,
+        connect_within: LONG,
+        silence: Duration::from_millis(1),
+        simulated: true,
+    }
+}
+
+fn serial(serving: &ServingHits) -> HitLine {
+    let device = serving.path().unwrap().display().to_string();
+    HitLine::Serial { device, baud: 9600, data_bits: 8, parity: Parity::None, stop_bits: 1 }
+}
+
+struct Bench {
+    cmm: HitLinesCmm,
+    serving: ServingHits,
+    job: Job,
+    folder: tempfile::TempDir,
+}
+
+impl Bench {
+    /// A measurement that has been asked for.
+    async fn new(
+        targets: u32,
+        serving: ServingHits,
+        line: HitLine,
+        change: impl FnOnce(&mut HitLinesSettings),
+    ) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let mut settings = settings(folder.path(), line);
+        change(&mut settings);
+        let (mut cmm, plan) = (HitLinesCmm::new(settings), plan(targets));
+        let job = Job { job: 3, cycle: 1, digest: digest(&[plan.identity()]) };
+        assert!(cmm.connect().await.unwrap().simulation);
+        cmm.claim().await.unwrap();
+        cmm.load_plan(&plan, &Interrupt::new()).await.unwrap();
+        let armed = cmm.prepare(job).await.unwrap();
+        let started = cmm.start(armed).await.unwrap();
+        assert_eq!((started.status.state, started.status.clear_of_part), (State::Execute, None));
+        Self { cmm, serving, job, folder }
+    }
+
+    async fn on_serial(targets: u32, change: impl FnOnce(&mut HitLinesSettings)) -> Self {
+        let serving = ServingHits::serial().unwrap();
+        let line = serial(&serving);
+        Self::new(targets, serving, line, change).await
+    }
+
+    /// Waits until so many targets are touched, and returns the state.
+    async fn until(&mut self, touched: u32, state: State) {
+        loop {
+            let status = self.cmm.status().await.unwrap();
+            if status.state == state && status.progress.unwrap().0 == touched {
+                return;
+            }
+            assert!(status.progress.unwrap().0 <= touched, "{status:?}\n{}", self.notes());
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    }
+
+    fn notes(&self) -> String {
+        self.cmm.notes().join("\n")
+    }
+
+    async fn done(&mut self) -> Measurement {
+        let kept = self.cmm.confirm(Word::Done { map_identity: None, file: None }).await.unwrap();
+        assert_eq!(kept, ["cycle-1/plan.csv", "cycle-1/hits.jsonl"]);
+        assert!(kept.iter().all(|file| self.folder.path().join(file).is_file()));
+        let status = self.cmm.status().await.unwrap();
+        assert_eq!((status.state, status.outcome), (State::Complete, Outcome::Complete));
+        assert_eq!(status.clear_of_part, Some(true));
+        self.cmm.collect(self.job, &Interrupt::new()).await.unwrap()
+    }
+}
+
+/// The lines of the page that the formats come from, byte for byte.
+const GOLDEN: [(LineFormat, &[u8]); 8] = [
+    (LineFormat::Decimal, b"100.000,200.000,300.000\r\n"),
+    (LineFormat::Integer, b"100000,200000,300000\r\n"),
+    (LineFormat::LetteredDecimal, b"X100.000,Y200.000,Z300.000\r\n"),
+    (LineFormat::LetteredInteger, b"X100000,Y200000,Z300000\r\n"),
+    (LineFormat::DecimalRotary, b"100.000,200.000,300.000,245.5\r\n"),
+    (LineFormat::IntegerRotary, b"100000,200000,300000,2455\r\n"),
+    (LineFormat::LetteredDecimalRotary, b"X100.000,Y200.000,Z300.000,W245.5\r\n"),
+    (LineFormat::LetteredIntegerRotary, b"X100000,Y200000,Z300000,W2455\r\n"),
+];
+
+#[tokio::test]
+async fn the_eight_formats_come_over_a_serial_line_byte_for_byte() {
+    for (format, line) in GOLDEN {
+        let style = Style {
+            letters: format.is_lettered(),
+            whole: format.is_integer(),
+            rotary_deg: format.has_rotary().then_some(245.5),
+            ..Style::default()
+        };
+        assert_eq!(style.line([100.0, 200.0, 300.0]), line, "the simulated machine prints it alike");
+        let mut bench = Bench::on_serial(1, |settings| settings.reading.format = format).await;
+        // However it comes.
+        let (begin, rest) = line.split_at(line.len() / 2);
+        bench.serving.send(begin).await;
+        bench.serving.send(rest).await;
+        bench.until(1, State::Execute).await;
+        let measured = bench.done().await;
+        assert_eq!(measured.points[0].at_mm, [100.0, 200.0, 300.0], "{format:?}");
+        assert_eq!((measured.points[0].index, measured.points[0].status), (7, PointStatus::Touched));
+        assert_eq!((measured.coordinates, measured.probe_radius_mm), (Coordinates::Centres, None));
+        bench.cmm.acknowledge(measured.done).await.unwrap();
+        assert_eq!(bench.cmm.status().await.unwrap().state, State::Idle);
+    }
+}
+
+/// Lines of a printer whose first line but one has a fault, up to so many targets.
+fn with_fault(fault: &Fault) -> Vec<u8> {
+    let line = |k: usize| Style::default().line([100.0 + 50.0 * k as f64, 200.0, 300.0]);
+    (0..4).flat_map(|k| if k == 1 { fault.spoil(line(k)) } else { line(k) }).collect()
+}
+
+#[tokio::test]
+async fn a_line_that_is_not_whole_becomes_no_point_and_what_it_told_is_touched_again() {
+    // Each with how many of the four are touched all the same, and the words.
+    for (fault, touched, why) in [
+        (Fault::Lost(4), 3, "not a number with 3 digits"),
+        (Fault::Lost(0), 3, "50.000 mm from target 7, the nearest"),
+        (Fault::Garbled(1), 3, "REFUSED line 2 of the measurement, \"1u0.000,200.000,300.000\": its value 1"),
+        (Fault::Merged, 2, "two lines have run together"),
+        (Fault::Stranger("SN 00412".into()), 4, "it has 1 values where 3 belong"),
+    ] {
+        let mut bench = Bench::on_serial(4, |_| {}).await;
+        let lines = with_fault(&fault);
+        bench.serving.send(&lines).await;
+        bench.until(touched, State::Holding).await;
+        let notes = bench.notes();
+        assert!(
+            notes.contains(why) && notes.contains("then: regrind confirm still --machine cmm"),
+            "{fault:?}: {notes}"
+        );
+        bench.cmm.confirm(Word::Still).await.unwrap();
+        bench.until(touched, State::Held).await;
+        bench.cmm.resume().await.unwrap();
+        // The person looks at what is left, and touches it.
+        for k in [1, 2] {
+            if bench.cmm.status().await.unwrap().progress.unwrap().0 < 4 && (k == 1 || touched == 2) {
+                bench.serving.send(&Style::default().line([100.0 + 50.0 * f64::from(k), 200.0, 300.0])).await;
+                bench.until(if touched == 2 { 2 + k } else { 4 }, State::Execute).await;
+            }
+        }
+        let measured = bench.done().await;
+        for (k, point) in measured.points.iter().enumerate() {
+            assert_eq!(point.at_mm, [100.0 + 50.0 * k as f64, 200.0, 300.0], "{fault:?}");
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_line_sent_twice_is_one_touch_and_a_header_is_passed_over() {
+    let mut bench = Bench::on_serial(4, |_| {}).await;
+    bench.serving.send(b"PROBE 1\r\n").await;
+    bench.serving.send(&with_fault(&Fault::Twice)).await;
+    bench.until(4, State::Execute).await;
+    assert!(bench.notes().contains("1 lines came twice and were taken once"), "{}", bench.notes());
+    bench.done().await;
+}
+
+#[tokio::test]
+async fn a_line_that_was_lost_leaves_its_target_open_and_a_person_may_end_without_it() {
+    let mut bench = Bench::on_serial(4, |_| {}).await;
+    bench.serving.send(&with_fault(&Fault::Dropped)).await;
+    bench.until(3, State::Execute).await;
+    let named = Word::Done { map_identity: None, file: Some("x.csv".into()) };
+    assert!(bench.cmm.confirm(named).await.unwrap_err().to_string().contains("leave --file out"));
+    let measured = bench.done().await;
+    let status: Vec<PointStatus> = measured.points.iter().map(|point| point.status).collect();
+    assert_eq!((status[0], status[1]), (PointStatus::Touched, PointStatus::NotFound));
+}
+
+#[tokio::test]
+async fn another_touch_of_a_target_takes_the_place_of_the_first_only_where_the_cell_file_says_so() {
+    for (repeated, first) in [(Repeated::Refuse, true), (Repeated::Replace, false)] {
+        let mut bench = Bench::on_serial(2, |settings| settings.repeated = repeated).await;
+        bench.serving.send(b"100.000,200.000,300.000\r\n100.010,200.000,300.000\r\n150.000,200.000,300.000\r\n").await;
+        bench.until(2, if first { State::Holding } else { State::Execute }).await;
+        let measured = bench.done().await;
+        assert_eq!(measured.points[0].at_mm[0], if first { 100.0 } else { 100.01 });
+    }
+}
+
+#[tokio::test]
+async fn a_line_of_a_terminal_server_that_breaks_off_loses_no_point_that_there_is() {
+    let serving = ServingHits::tcp("127.0.0.1:0").await.unwrap();
+    let port = serving.local_addr().unwrap().port();
+    let mut bench = Bench::new(3, serving, HitLine::Tcp { host: "127.0.0.1".into(), port }, |_| {}).await;
+    bench.serving.send(b"100.000,200.000,300.000\r\n150.000,200.0").await;
+    bench.until(1, State::Execute).await;
+    bench.serving.hang_up().await;
+    let lost = loop {
+        if let Err(lost) = bench.cmm.status().await {
+            break lost;
+        }
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    };
+    assert!(lost.is_link(), "{lost}");
+    bench.cmm.connect().await.unwrap();
+    // What was touched meanwhile did not come, and nobody knows whether it stands.
+    bench.until(1, State::Holding).await;
+    let notes = bench.notes();
+    assert!(
+        notes.contains("cut short")
+            && notes.contains("the connection was lost")
+            && notes.contains("2 targets are left"),
+        "{notes}"
+    );
+    bench.cmm.confirm(Word::Still).await.unwrap();
+    bench.cmm.resume().await.unwrap();
+    bench.serving.send(b"150.000,200.000,300.000\r\n200.000,200.000,300.000\r\n").await;
+    bench.until(3, State::Execute).await;
+    assert_eq!(bench.done().await.points.len(), 3);
+}
+
+#[tokio::test]
+async fn a_port_that_is_pulled_out_is_lost_and_what_gathered_before_it_is_opened_is_read_away() {
+    let serving = ServingHits::serial().unwrap();
+    // Of another part, perhaps.
+    serving.send(b"100.000,200.000,300.000\r\n").await;
+    let line = serial(&serving);
+    let mut bench = Bench::new(2, serving, line, |_| {}).await;
+    bench.serving.send(b"150.000,200.000,300.000\r\n").await;
+    bench.until(1, State::Execute).await;
+    assert_eq!(bench.cmm.read_ahead(bench.job, &Interrupt::new()).await, None, "the first target is not touched");
+    bench.serving = ServingHits::serial().unwrap();
+    while bench.cmm.status().await.is_ok() {
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    assert!(bench.cmm.connect().await.is_err());
+}
+
+#[tokio::test]
+async fn hold_stop_and_abort_are_asked_of_the_person() {
+    let mut bench = Bench::on_serial(2, |_| {}).await;
+    assert_eq!(bench.cmm.hold().await.unwrap().state, State::Holding);
+    bench.serving.send(b"100.000,200.000,300.000\r\n").await;
+    bench.until(1, State::Holding).await;
+    assert!(bench.notes().contains("HOLD it at its own panel; 1 targets are left: 8"), "{}", bench.notes());
+    bench.cmm.confirm(Word::Still).await.unwrap();
+    assert_eq!(bench.cmm.stop().await.unwrap().outcome, Outcome::Stopped);
+    let mut bench = Bench::on_serial(2, |_| {}).await;
+    assert_eq!(bench.cmm.abort().await.unwrap().state, State::Aborting);
+    assert!(bench.notes().contains("NOW"));
+}

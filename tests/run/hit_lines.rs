@@ -1,0 +1,32 @@
+//! A whole run with a measuring machine that prints its hits on a serial line without hardware.
+#![cfg(unix)]
+
+use std::fs;
+
+use crate::program::{Running, changed, regrind, root, run};
+
+#[test]
+fn a_part_is_made_by_the_lines_of_a_machine_that_hears_nothing() {
+    let home = tempfile::tempdir().unwrap();
+    let recipe = home.path().join("wave.toml");
+    fs::write(
+        &recipe,
+        changed("recipes/shallow-wave.toml", &[("[simulation]\nseed = 1", "[simulation]\nseed = 1\nspeed = 2000.0")]),
+    )
+    .unwrap();
+    let cell = root().join("config/hit-lines.toml");
+    let typed = ["run", recipe.to_str().unwrap(), "--cell", cell.to_str().unwrap(), "--runs", "runs"];
+    let mut program = Running::new(regrind(&typed, home.path()));
+    let folder = program.folder(home.path());
+    program.line("the end", |line| line.starts_with("ACCEPTED"));
+    let (code, errors) = program.end();
+    assert_eq!(code, 0, "{}\n{errors}", program.said.join("\n"));
+    assert!(program.said.iter().any(|line| line.contains("cycle-1/plan.csv")), "{}", program.said.join("\n"));
+    // Each line is kept as it came, with the target that it was taken for.
+    let lines = fs::read_to_string(folder.join("cycle-1/hits.jsonl")).unwrap();
+    let targets = fs::read_to_string(folder.join("cycle-1/plan.csv")).unwrap();
+    let targets = targets.lines().filter(|line| line.starts_with(|c: char| c.is_ascii_digit())).count();
+    assert_eq!(lines.lines().filter(|line| line.contains("\"target\":")).count(), targets);
+    let (code, told, _) = run(&["audit", "verify"], home.path());
+    assert_eq!(code, 0, "{told}");
+}
