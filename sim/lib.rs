@@ -14,6 +14,8 @@
 //!  world      the two machines, and queries for tests
 //!  part       the part as it really is, and exact contact with it
 //!  process    the grinder: what a pass leaves, node by node along its path
+//!  program    what a control reads in a program
+//!  follow     what a wheel leaves that follows it
 //!  cmm        the measuring machine: what it reports of a plan
 //!  payload    the bytes of docs/modbus.md
 //!
@@ -36,6 +38,7 @@ pub mod body;
 pub mod cmm;
 pub mod command;
 pub mod dme;
+mod follow;
 pub mod form;
 mod handshake;
 pub mod options;
@@ -43,6 +46,7 @@ pub mod part;
 pub mod payload;
 pub mod probe;
 pub mod process;
+pub mod program;
 pub mod registers;
 pub mod seen;
 pub mod shape;
