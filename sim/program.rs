@@ -10,9 +10,10 @@
 use std::collections::BTreeMap;
 
 /// Whose control it is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Control {
     /// LinuxCNC.
+    #[default]
     Linuxcnc,
     /// Fanuc with increment system IS-C.
     Fanuc,
@@ -67,12 +68,6 @@ impl Control {
             reader.line(line.trim_end_matches('\r')).map_err(|why| format!("line {}: {why}: {line:?}", k + 1))?;
         }
         reader.finish()
-    }
-}
-
-impl Default for Control {
-    fn default() -> Self {
-        Self::Linuxcnc
     }
 }
 
