@@ -187,15 +187,15 @@ impl<'a> Lines<'a> {
         let feed = feed_mm_min.map_or(Ok(self.feed), |feed| self.rounded_feed(feed))?;
         let nothing_new = to == self.last && feed == self.feed;
         let mut first = true;
-        for k in 0..3 {
-            if to[k] != self.last[k] || (nothing_new && to[k] != NOTHING) {
+        for (k, &value) in to.iter().enumerate() {
+            if value != self.last[k] || (nothing_new && value != NOTHING) {
                 self.between(&mut first);
                 self.text.extend_from_slice(words.axes[k].as_bytes());
                 let numbers = &self.dialect.numbers;
-                if numbers.plus && to[k] >= 0 {
+                if numbers.plus && value >= 0 {
                     self.text.push(b'+');
                 }
-                push_decimals(&mut self.text, to[k], numbers.decimals);
+                push_decimals(&mut self.text, value, numbers.decimals);
             }
         }
         if feed != self.feed {
