@@ -9,7 +9,8 @@ use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
 use regrind::compensation::path::{Field, Move, PathMode, PathOptions, Summary, ToolPath, Wanted, Wheel};
 use regrind::compensation::{Correction, CorrectionLimits, GainRule, LearningState, MapOptions, Seen, error_map};
-use regrind::formats::gcode::{ProgramHeader, write_program};
+use regrind::config::read_dialect;
+use regrind::formats::gcode::{Exactness, ProgramHeader, write_program};
 use regrind::geometry::{Aperture, Grid, Sample};
 
 fn main() {
@@ -103,10 +104,10 @@ fn write(path: &ToolPath, summary: &Summary, file: &Path) {
         tracks: String::new(),
         spark_out_passes: 0,
         simulation: true,
-        mode: PathMode::Blend,
-        path_tolerance_mm: 1e-4,
+        exactness: Exactness { mode: PathMode::Blend, tolerance_mm: 1e-4, controller_mm: None, chord_error_mm: 1e-4 },
     };
-    write_program(file, &header, summary, path).expect("a program");
+    let (dialect, _) = read_dialect(Path::new("config/dialects/linuxcnc.toml")).expect("a dialect that ships");
+    write_program(file, &header, &dialect, summary, path).expect("a program");
 }
 
 /// All together: 28,476 deviations, their map, what they tell, the correction, the path and its program of a million points.

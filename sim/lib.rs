@@ -15,6 +15,8 @@
 //!  part       the part as it really is, and exact contact with it
 //!  process    the grinder: what a pass leaves, node by node along its path
 //!  executed   the grinder once more: what the wheel leaves along a path that a controller outside really executes
+//!  program    what a control reads in a program
+//!  follow     what a wheel leaves that follows it
 //!  cmm        the measuring machine: what it reports of a plan
 //!  payload    the bytes of docs/modbus.md
 //!
@@ -42,6 +44,7 @@ pub mod cmm;
 pub mod command;
 pub mod dme;
 pub mod executed;
+mod follow;
 pub mod form;
 mod handshake;
 pub mod hits;
@@ -50,6 +53,7 @@ pub mod part;
 pub mod payload;
 pub mod probe;
 pub mod process;
+pub mod program;
 pub mod registers;
 pub mod rsh;
 pub mod seen;

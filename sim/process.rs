@@ -29,12 +29,15 @@
 //! broken off leaves a half-ground part. The wheel is dressed and touches off before it finishes: wear and growth count from
 //! there. The heat stays in the spindle from pass to pass and cools while the part is measured.
 
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
 use crate::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
+use crate::follow;
 use crate::form::FormError;
 use crate::part::{Grooves, HeightGrid, Part};
 use crate::payload::{BROKEN, INTERLOCK, Map, Pass, PassRecord, outside};
+use crate::program::{Control, Program};
 use crate::spec::{GrinderSpec, Mirrored, Misreported, WorldSpec};
 use crate::truth::{GrindEntry, Source, State, locked, nothing_done, stream};
 
@@ -243,22 +246,27 @@ fn grown([x0, x1, y0, y1]: [f64; 4]) -> [f64; 4] {
 }
 
 /// Returns what the machine steers to at every node but for wear and growth, in millimetres.
-fn fixed_mm(state: &State, map: &Map, pass: &Pass) -> Vec<f64> {
+fn fixed_mm(state: &State, map: &Map, pass: &Pass, program: Option<&Program>) -> Vec<f64> {
     let (spec, part) = (&state.spec.grinder, &state.part);
     let rng = &mut stream(state.spec.seed, Source::Repeatability, state.passes_begun + 1);
     let fresh = smooth(rng, spec.repeatability_correlation_mm, spec.repeatability_um);
     let true_radius_mm = true_radius_mm(state, pass);
     let y0 = grown(pass.extent_mm)[2];
     let lag_mm = 1e-3 * spec.following_um * pass.feed_mm_min / 1000.0;
-    let nodes = part.height.nodes().zip(&state.systematic_mm);
-    let steered = nodes.map(|([x, y], systematic)| {
+    let followed =
+        program.map(|program| follow::heights_mm(part, program, pass.wheel_radius_mm, pass.track_spacing_mm));
+    let nodes = part.height.nodes().zip(&state.systematic_mm).enumerate();
+    let steered = nodes.map(|(node, ([x, y], systematic))| {
         let [p, q] = part.shape.gradient(x, y);
         let slope2 = 1.0 + p * p + q * q;
         // A wheel larger than stated cuts deeper on slopes: what it leaves is lower by dR (1/nz - 1).
         let wheel = (pass.wheel_radius_mm - true_radius_mm) * (slope2.sqrt() - 1.0);
         let forth = if ((y - y0) / pass.track_spacing_mm).round() as i64 % 2 == 0 { 1.0 } else { -1.0 };
         let following = forth * lag_mm * p / slope2.sqrt();
-        let wanted = pass.level_mm + displaced(state, map, x, y);
+        let wanted = match &followed {
+            Some(followed) => followed[node],
+            None => pass.level_mm + displaced(state, map, x, y),
+        };
         wanted + systematic + finite_or_zero(wheel + following)
     });
     let mut steered: Vec<f64> = steered.collect();
@@ -295,16 +303,50 @@ fn displaced(state: &State, map: &Map, x: f64, y: f64) -> f64 {
     if faults.map_sign_flipped { -u } else { u }
 }
 
+/// Where a control finds its programs, and whose control it is.
+#[derive(Clone, Debug)]
+pub struct Programs {
+    /// The folder.
+    pub folder: PathBuf,
+    /// Who reads them.
+    pub control: Control,
+}
+
+impl Programs {
+    /// Finds the program that names a map, and reads it.
+    fn of_map(&self, identity: &[u8; 32]) -> Result<Program, String> {
+        let map: String = identity.iter().map(|byte| format!("{byte:02x}")).collect();
+        let files = std::fs::read_dir(&self.folder).map_err(|error| format!("{}: {error}", self.folder.display()))?;
+        let is_of_map = |text: &String| {
+            let words: Vec<String> = text.lines().map(str::to_ascii_lowercase).collect();
+            // Long comments may be divided.
+            words.iter().any(|line| line.contains("map: sha256")) && words.iter().any(|line| line.contains(&map))
+        };
+        let texts = files.flatten().filter_map(|file| std::fs::read_to_string(file.path()).ok());
+        let text = texts.filter(is_of_map).max_by_key(String::len);
+        let text = text.ok_or_else(|| format!("{} holds no program of the map {map}", self.folder.display()))?;
+        self.control.read(&text)
+    }
+}
+
 /// The grinder of a world.
 pub struct Grinder {
     world: Arc<Mutex<State>>,
+    programs: Option<Programs>,
     ready: Option<Run>,
     running: Option<Run>,
 }
 
 impl Grinder {
     pub(crate) fn new(world: Arc<Mutex<State>>) -> Self {
-        Self { world, ready: None, running: None }
+        Self { world, programs: None, ready: None, running: None }
+    }
+
+    /// Has it grind by programs in a folder, and not by the map alone.
+    #[must_use]
+    pub fn by_programs(mut self, programs: Programs) -> Self {
+        self.programs = Some(programs);
+        self
     }
 
     /// Refuses what this machine cannot reach or move.
@@ -366,10 +408,18 @@ fn strokes(roughing: u32, pass: &Pass, stroke_mm: f64) -> (Vec<Stroke>, f64) {
 }
 
 /// Makes a pass ready for the part as it stands.
-fn run(state: &State, (job, cycle): (u32, u16), map_payload: &Payload, map: &Map, pass: Pass) -> Result<Run, Refusal> {
-    let fixed_mm = fixed_mm(state, map, &pass);
+fn run(
+    state: &State,
+    (job, cycle): (u32, u16),
+    map_payload: &Payload,
+    map: &Map,
+    (pass, program): (Pass, Option<&Program>),
+) -> Result<Run, Refusal> {
+    let fixed_mm = fixed_mm(state, map, &pass, program);
     let grooves = state.spec.grinder.scallops.then(|| grooves(state, &pass));
-    let (order, stroke_mm) = raster(&state.part, &pass);
+    let (mut order, stroke_mm) = raster(&state.part, &pass);
+    // Where the program does not come nothing is ground.
+    order.retain(|&(_, node)| fixed_mm[node as usize].is_finite());
     let within = |&(_, node): &(f64, u32)| state.part.height.heights_mm[node as usize] - fixed_mm[node as usize];
     let proud_mm = order.iter().map(within).fold(0.0, f64::max);
     let needed = (proud_mm / pass.depth_of_cut_mm).ceil().max(1.0);
@@ -454,7 +504,14 @@ impl Body for Grinder {
             return Err(Refusal { answer: INTERLOCK, reason: "the part is on the measuring machine".to_owned() });
         }
         state.blank_for(job);
-        let run = run(&state, (job, cycle), map_payload, &map, pass)?;
+        let program = match &self.programs {
+            None => None,
+            Some(programs) => {
+                let refused = |reason| Refusal { answer: BROKEN, reason };
+                Some(programs.of_map(&map_payload.identity).map_err(refused)?)
+            }
+        };
+        let run = run(&state, (job, cycle), map_payload, &map, (pass, program.as_ref()))?;
         let first = progress(&run);
         self.ready = Some(run);
         Ok(first)

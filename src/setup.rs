@@ -18,6 +18,7 @@ use crate::compensation::{Correction, CorrectionLimits, MapOptions, contact_widt
 use crate::config::{CellConfig, Link};
 use crate::device::{AnyCmm, AnyGrinder, Line, Making, MakingError, ModbusSettings, Pass, hex};
 use crate::drive::{Adaptive, Probing, Programs, Sphere, Task};
+use crate::formats::gcode::DialectError;
 use crate::formats::{self, FormatError, NominalFile};
 use crate::geometry::{Aperture, Grid, Point, Vector};
 use crate::measuring::{Expansion, Layout, PatternError, Target, targets};
@@ -69,6 +70,8 @@ pub enum SetupError {
          {source}; add grinding.track_mm"
     )]
     Tracks { recipe: PathBuf, source: PathError },
+    #[error("{}: {source} (cell file {})", .recipe.display(), .cell.display())]
+    Dialect { recipe: PathBuf, cell: PathBuf, source: DialectError },
     #[error("{cell}: {source}")]
     Machine { cell: PathBuf, source: MakingError },
 }
@@ -104,10 +107,15 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
     }
     let ground = ground(recipe, &nominal);
     let (track_mm, scallops) = tracks(recipe, &nominal, &ground)?;
+    let programs = ground.map(|ground| programs(recipe, cell, &nominal, part_identity, (ground, track_mm)));
+    if let Ok(programs) = &programs {
+        let said = |source| SetupError::Dialect { recipe: recipe.path().into(), cell: cell.path().into(), source };
+        programs.check_dialect().map_err(said)?;
+    }
     let task = Task {
         part: recipe.part.name.clone(),
         pass: pass(recipe, &nominal, part_identity, track_mm),
-        programs: ground.map(|ground| programs(recipe, cell, &nominal, part_identity, (ground, track_mm))),
+        programs,
         scallops,
         nominal: Arc::new(nominal),
         nominal_file,
@@ -479,6 +487,9 @@ fn programs(
         },
         mode: grinding.path_mode,
         path_tolerance_mm: grinding.path_tolerance_um.mm(),
+        controller_tolerance_mm: cell.grinder.program.controller_tolerance_mm,
+        dialect: cell.grinder.program.dialect.clone(),
+        folder: cell.grinder.program.folder.clone(),
         spark_out_passes: grinding.spark_out_passes,
         simulation: cell.simulated,
     }

@@ -23,7 +23,7 @@ const ARROWS: [(&str, &str, &[&str]); 21] = [
     ("control", "src/control", &["cell", "document", "formats"]),
     ("recipe", "src/recipe", &["document", "cell", "measuring", "geometry", "surface", "registration", "compensation"]),
     ("device", "src/device", &["document", "formats", "geometry"]),
-    ("config", "src/config", &["device", "document", "geometry", "model"]),
+    ("config", "src/config", &["device", "document", "formats", "geometry", "model"]),
     ("report", "src/report", &["cell", "journal", "formats", "geometry", "registration"]),
     ("page", "src/page", &["cell", "control", "document", "formats", "report"]),
     (

@@ -8,7 +8,7 @@ use annotate_snippets::renderer::DecorStyle;
 use annotate_snippets::{AnnotationKind, Level, Origin, Renderer, Snippet};
 use clap::Args;
 use console::Term;
-use regrind::config::CellConfig;
+use regrind::config::{CellConfig, read_dialect};
 use regrind::document::{Problem, Problems};
 use regrind::recipe::{NominalSource, Pattern, Recipe};
 use regrind::surface::Projection;
@@ -19,10 +19,11 @@ use super::Outcome;
 use super::failure::Failure;
 use super::nominal;
 
-/// Check recipes and cell files: every problem with line, column and remedy
+/// Check recipes, cell files and dialects: every problem with line, column and remedy
 #[derive(Args, Debug)]
 #[command(after_help = "\
-A file with a table [cell] is a cell file, any other a recipe. Of a recipe the files that it
+A file with a table [cell] is a cell file, one with a table [dialect] a dialect of programs, any other
+a recipe. Of a recipe the files that it
 names and the truth of a simulated cell are read too.
 
 Example:
@@ -30,7 +31,7 @@ Example:
 
 Exit codes: 0 all are good; 2 one is not; 3 fault.")]
 pub(super) struct Arguments {
-    /// Recipes and cell files
+    /// Recipes, cell files and dialects
     #[arg(value_name = "FILE", required = true)]
     files: Vec<PathBuf>,
     /// Print JSON instead of words
@@ -102,7 +103,11 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 
 /// Checks one file; returns its kind and what is to be said of a good one.
 fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
-    if is_cell_file(path) {
+    if has_table(path, &["[dialect]"]) {
+        let good = |(_, sha256): (_, [u8; 32])| Good { sha256: hex(&sha256), notes: Vec::new() };
+        return ("dialect", read_dialect(path).map(good));
+    }
+    if has_table(path, &["[cell]", "[cmm", "[[cmm", "[grinder]", "[grinder.", "[[grinder"]) {
         let good = |cell: CellConfig| Good { sha256: hex(cell.source_sha256()), notes: cell.notes() };
         return ("cell file", CellConfig::read(path).map(good));
     }
@@ -114,12 +119,11 @@ fn check(path: &Path) -> (&'static str, Result<Good, Problems>) {
     ("recipe", checked)
 }
 
-/// Tells a cell file by what only it has, even if the rest is broken.
-fn is_cell_file(path: &Path) -> bool {
+/// Tells a kind of file by what only it has, even if the rest is broken.
+fn has_table(path: &Path, heads: &[&str]) -> bool {
     const ENOUGH_BYTES: u64 = 1 << 20;
     let mut bytes = Vec::new();
     let read = File::open(path).and_then(|file| file.take(ENOUGH_BYTES).read_to_end(&mut bytes));
-    let heads = ["[cell]", "[cmm", "[[cmm", "[grinder]", "[grinder.", "[[grinder"];
     let text = String::from_utf8_lossy(&bytes);
     read.is_ok() && text.lines().any(|line| heads.iter().any(|head| line.trim_start().starts_with(head)))
 }

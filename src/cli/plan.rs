@@ -82,6 +82,8 @@ struct Document {
     /// Of the program of one pass; absent where none can be made.
     #[serde(skip_serializing_if = "Option::is_none")]
     program_points: Option<u64>,
+    /// The dialect that it is written in.
+    dialect: String,
     /// Why none can be made.
     #[serde(skip_serializing_if = "Option::is_none")]
     no_program: Option<String>,
@@ -199,6 +201,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             .chain(warning_of_scallops(&task, &recipe))
             .collect(),
         program_points: program.as_ref().map(|(_, summary)| summary.points),
+        dialect: cell.grinder.program.dialect.dialect.name.clone(),
         no_program: task.programs.as_ref().err().map(ToString::to_string),
         learns: recipe.compensation.learn,
     };
@@ -306,7 +309,7 @@ fn words(d: &Document) -> String {
     let n = three_digits;
     let marked = if d.simulation { "SIMULATION  " } else { "" };
     let program = match (d.program_points, &d.no_program) {
-        (Some(points), _) => format!("{} a pass", counted(points as usize, "point")),
+        (Some(points), _) => format!("{} a pass, for {}", counted(points as usize, "point"), d.dialect),
         (None, why) => format!("none: {}", why.as_deref().unwrap_or_default()),
     };
     let learns = if d.learns {

@@ -124,7 +124,8 @@ async fn carry_out(
     }
     let header = header(arguments, &live, (&task, &plan), earlier.as_ref());
     let mut journal = begin(header, &live, earlier.and_then(|earlier| earlier.learned), key)?;
-    if task.learned.is_some() || cell.grinder.link.wire.works_from_run() {
+    let works_by_program = cell.grinder.link.wire.works_from_run() || cell.grinder.program.folder.is_some();
+    if task.learned.is_some() || works_by_program {
         record_first_correction(&task, &mut journal)?;
     }
     let loaded = arguments.loaded || cell.simulated;

@@ -1,4 +1,4 @@
-//! `regrind schema`: the JSON schemas of recipes and cell files, for editors.
+//! `regrind schema`: the JSON schemas of recipes, cell files and dialects, for editors.
 
 use clap::{Args, ValueEnum};
 use regrind::{config, recipe};
@@ -6,7 +6,7 @@ use regrind::{config, recipe};
 use super::Outcome;
 use super::failure::Failure;
 
-/// Print the JSON schema of recipes or of cell files, for completion in an editor
+/// Print the JSON schema of recipes, cell files or dialects, for completion in an editor
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Example:
@@ -25,12 +25,15 @@ enum Kind {
     Recipe,
     /// Of cell files
     Cell,
+    /// Of dialects of programs
+    Dialect,
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     super::print_json(match arguments.of {
         Kind::Recipe => recipe::json_schema(),
         Kind::Cell => config::json_schema(),
+        Kind::Dialect => config::dialect_schema(),
     })?;
     Ok(Outcome::Accepted)
 }

@@ -10,6 +10,8 @@ use regrind::formats::{AddedLines, FormatError, ResultFolder, ScratchFolder, pla
 use regrind::recipe::{Recipe, Wheel};
 use regrind_sim::cmm::Led;
 use regrind_sim::options::{Layout, MachineOptions};
+use regrind_sim::process::Programs;
+use regrind_sim::program::Control;
 use regrind_sim::registers::Machine;
 use regrind_sim::seen::Seen;
 use regrind_sim::spec::WorldSpec;
@@ -109,7 +111,11 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
         let none = "a machine that a person serves cannot be simulated; its part is yours to play";
         link.wire.line().ok_or_else(|| failed(none.into()))
     };
-    let grinder = Machine::new(Box::new(world.grinder()), boot_id(), options(&cell.grinder.link, speed, seed + 1));
+    let grinder = match by_programs(cell).map_err(&failed)? {
+        Some(programs) => world.grinder().by_programs(programs),
+        None => world.grinder(),
+    };
+    let grinder = Machine::new(Box::new(grinder), boot_id(), options(&cell.grinder.link, speed, seed + 1));
     let (of_grinder, unit) = line(&cell.grinder.link)?;
     let grinder = (unit, grinder.into());
     if let Wire::Ippdme(wire) = &mut cell.cmm.link.wire {
@@ -154,6 +160,17 @@ fn executed(command: Command, world: &World, recipe: &Recipe) -> Result<Executed
     ExecutedPath::follow(command, wheel).map_err(|error| {
         format!("grinder.wire.executed_path: {program} cannot be begun: {error}; correct the cell file")
     })
+}
+
+/// Where the simulated control finds its programs: where the cell puts them.
+fn by_programs(cell: &CellConfig) -> Result<Option<Programs>, String> {
+    let program = &cell.grinder.program;
+    let Some(folder) = program.folder.clone() else { return Ok(None) };
+    let name = &program.dialect.dialect.name;
+    let control = Control::named(name).ok_or_else(|| {
+        format!("no control is simulated that reads the dialect `{name}`; leave grinder.program.folder out of a simulated cell")
+    })?;
+    Ok(Some(Programs { folder, control }))
 }
 
 impl SimulatedCell {

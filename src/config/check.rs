@@ -4,9 +4,10 @@ use std::path::Path;
 use std::time::Duration;
 
 use super::written::{CellFile, FixtureTable, GrinderTable, SphereTable, TimingTable, TravelTable, UncertaintyTable};
-use super::{CellConfig, Cmm, Grinder, GrinderLimits, Link, ReferenceSphere, Travel};
+use super::{CellConfig, Cmm, Grinder, GrinderLimits, Link, Programming, ReferenceSphere, Travel, dialect};
 use crate::device::{Place, RegisterMap, Signal, SignalTable, Timing, Wire};
 use crate::document::Document;
+use crate::formats::gcode::LINUXCNC;
 use crate::geometry::{Point, Pose, Twist};
 use crate::model;
 
@@ -44,7 +45,7 @@ struct Machine<'w> {
 }
 
 /// Checks a cell file as written; what is wrong is told to the document.
-pub(super) fn check(written: &CellFile, document: &mut Document) -> Checked {
+pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) -> Checked {
     let (cmm, grinder) = (&written.cmm, &written.grinder);
     let machines = [
         Machine {
@@ -77,6 +78,7 @@ pub(super) fn check(written: &CellFile, document: &mut Document) -> Checked {
     let sphere = cmm.reference_sphere.as_ref().map(|sphere| reference_sphere(sphere, cmm.travel.as_ref(), document));
     let travel = cmm.travel.as_ref().map(|travel| self::travel(travel, "cmm", document));
     let limits = limits(grinder, document);
+    let program = programming(grinder, path, document);
     // A table that is there and incomplete has been told of.
     let complete = !matches!(sphere, Some(None)) && !matches!(travel, Some(None));
     Checked {
@@ -91,7 +93,11 @@ pub(super) fn check(written: &CellFile, document: &mut Document) -> Checked {
             reference_sphere: sphere.flatten(),
             travel: travel.flatten(),
         }),
-        grinder: grinder_link.zip(limits).map(|(link, limits)| Grinder { link, limits }),
+        grinder: (grinder_link.zip(limits).zip(program)).map(|((link, limits), program)| Grinder {
+            link,
+            limits,
+            program,
+        }),
     }
 }
 
@@ -170,6 +176,39 @@ fn fixture(written: &FixtureTable) -> Pose {
         Pose::exp(&twist).rotation
     };
     Pose { rotation: turn(2) * turn(1) * turn(0), translation_mm: written.translation_mm.into() }.orthonormalised()
+}
+
+fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> Option<Programming> {
+    let written = &grinder.program;
+    // LinuxCNC takes what is put into a frame for it.
+    if matches!(grinder.wire, Some(Wire::Linuxcnc(_))) {
+        if written.dialect != LINUXCNC {
+            let found = format!("is {:?} beside LinuxCNC", written.dialect);
+            document.report("grinder.program.dialect", found, "it reads its own alone", "leave it out");
+        }
+        if written.folder.is_some() {
+            let found = "stands beside a wire that brings the program";
+            document.report("grinder.program.folder", found, "the wire has a folder of its own", "leave it out");
+        }
+    }
+    let dialect = match dialect::read(&written.dialect, path) {
+        Ok(dialect) => dialect,
+        Err(problems) => {
+            let known = dialect::dialects().collect::<Vec<_>>().join(", ");
+            let file = dialect::file_of(&written.dialect, path).unwrap_or_default();
+            let found =
+                format!("is {:?}: {}", written.dialect, problems.to_string().lines().next().unwrap_or_default());
+            let remedy = format!("name one of these, or correct it: regrind check {}", file.display());
+            let allowed = format!("it must be {known} or a good file");
+            document.report("grinder.program.dialect", found, &allowed, &remedy);
+            return None;
+        }
+    };
+    Some(Programming {
+        dialect,
+        controller_tolerance_mm: written.controller_tolerance_um.map(|um| 1e-3 * um),
+        folder: written.folder.as_ref().map(|folder| path.parent().unwrap_or(Path::new("")).join(folder)),
+    })
 }
 
 fn uncertainty(written: &UncertaintyTable) -> model::Machine {

@@ -7,6 +7,7 @@
 //! Everything that is wrong with a file is told at once ([`crate::document::Problems`]), each thing at its line and column.
 
 mod check;
+mod dialect;
 mod written;
 
 use std::path::{Path, PathBuf};
@@ -14,8 +15,11 @@ use std::sync::LazyLock;
 
 use crate::device::{RegisterMap, Signal, Timing, Wire};
 use crate::document::{Document, Problems, problem_at, read_text, schema_of, sha256};
+use crate::formats::gcode::Dialect;
 use crate::geometry::{Point, Pose};
 use crate::model::Machine;
+
+pub use dialect::{dialect_schema, dialects, parse_dialect, read_dialect};
 
 /// A cell, checked.
 #[derive(Clone, Debug)]
@@ -59,6 +63,19 @@ pub struct Grinder {
     pub link: Link,
     /// What it can do.
     pub limits: GrinderLimits,
+    /// How its programs are written.
+    pub program: Programming,
+}
+
+/// How the programs of a grinder are written.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Programming {
+    /// The dialect of its control.
+    pub dialect: Dialect,
+    /// How far the control rounds corners off by a setting of its own, where that is known.
+    pub controller_tolerance_mm: Option<f64>,
+    /// The folder in which the control finds the program of each pass.
+    pub folder: Option<PathBuf>,
 }
 
 /// How to talk to a machine.
@@ -143,7 +160,7 @@ impl CellConfig {
     pub fn parse(path: &Path, text: &str) -> Result<Self, Problems> {
         let mut document = Document::parse(path, text)?;
         document.hold_against(&SCHEMA);
-        let checked = document.as_written().map(|written| check::check(&written, &mut document));
+        let checked = document.as_written().map(|written| check::check(&written, path, &mut document));
         document.finish()?;
         let cell = checked.and_then(|checked| checked.into_cell(path, text, sha256(text)));
         cell.ok_or_else(|| {

@@ -78,11 +78,34 @@ pub(super) struct GrinderTable {
     /// Further values that are read and recorded.
     #[schemars(length(max = 64))]
     pub signals: Vec<SignalTable>,
+    /// How its programs are written.
+    pub program: ProgramTable,
     /// What it can do.
     #[schemars(extend("x-required" = true))]
     pub limits: LimitsTable,
     /// The box that the wheel's centre must not leave, in the frame of its programs, which is the model's.
     pub travel: Option<TravelTable>,
+}
+
+/// How the programs of a grinder are written.
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct ProgramTable {
+    /// The dialect of its control: `linuxcnc`, `fanuc`, `sinumerik`, `heidenhain`, or a file of your own, relative to this file.
+    #[schemars(length(min = 1, max = 400))]
+    pub dialect: String,
+    /// How far the control rounds corners off by a setting of its own, for dialects that cannot say it.
+    #[schemars(range(min = 0.0, max = 1000.0), example = 0.1)]
+    pub controller_tolerance_um: Option<f64>,
+    /// Folder in which the control finds the program of each pass, for machines that are not given it by their wire; relative to this file.
+    #[schemars(length(min = 1, max = 400), example = &"/mnt/grinder/programs")]
+    pub folder: Option<String>,
+}
+
+impl Default for ProgramTable {
+    fn default() -> Self {
+        Self { dialect: "linuxcnc".to_owned(), controller_tolerance_um: None, folder: None }
+    }
 }
 
 /// How long to wait for what.

@@ -56,6 +56,7 @@ pub use beside::{Beside, Blocking};
 use cycles::Cycles;
 pub use notice::Notice;
 use pace::Pace;
+use program::PROGRAM_FILE;
 pub use program::{ProgramError, Programs};
 pub use record::Ledger;
 use record::{Files, Recorder, Ticket, entry};
@@ -196,7 +197,8 @@ impl Computation {
     fn of(file: &str) -> Option<Self> {
         Some(match file {
             "measured.csv" | "reference_sphere.csv" | "touches.json" => Self::Gate,
-            "correction.csv" | "correction.json" | "toolpath.ngc" | "toolpath_z.csv" => Self::Compensation,
+            "correction.csv" | "correction.json" | "toolpath_z.csv" => Self::Compensation,
+            program if program.strip_prefix(PROGRAM_FILE).is_some_and(|end| end.starts_with('.')) => Self::Compensation,
             "registration.json"
             | "deviations.csv"
             | "deviation_uncertainty.csv"

@@ -1,6 +1,6 @@
 //! The program of a pass: from the correction to the file that a controller runs.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
@@ -9,14 +9,19 @@ use crate::compensation::path::{
     Field, Limits, PathError, PathMode, PathOptions, Pattern, Summary, ToolPath, TrackSpacing, Wanted, axis_offsets,
     height_of,
 };
-use crate::formats::gcode::{GcodeError, ProgramHeader, write_axis_table, write_program};
+use crate::formats::gcode::{
+    Dialect, DialectError, Exactness, GcodeError, ProgramHeader, write_axis_table, write_program,
+};
+use crate::formats::result::read_bytes;
+use crate::formats::write_atomic;
 use crate::geometry::Aperture;
 use crate::surface::Nominal;
 
 use super::record::Files;
 
-/// What a pass leaves beside its correction: the program, and the table for controllers that compensate by one.
-pub(super) const PROGRAM_FILE: &str = "toolpath.ngc";
+/// What a pass leaves beside its correction: the program, with the extension of its dialect, and the table for controllers that compensate
+/// by one.
+pub(super) const PROGRAM_FILE: &str = "toolpath";
 const TABLE_FILE: &str = "toolpath_z.csv";
 /// More points than that are not written beside every correction of a run.
 const MOST_POINTS: u64 = 3_000_000;
@@ -38,6 +43,12 @@ pub struct Programs {
     pub mode: PathMode,
     /// How far it may round corners off with [`PathMode::Blend`], in millimetres.
     pub path_tolerance_mm: f64,
+    /// How far it does by a setting of its own, where that is known, in millimetres.
+    pub controller_tolerance_mm: Option<f64>,
+    /// How its programs are written.
+    pub dialect: Dialect,
+    /// Where else the program of each pass is put, for the controller to find it.
+    pub folder: Option<PathBuf>,
     /// Passes without in-feed.
     pub spark_out_passes: u16,
     /// Whether the cell is simulated.
@@ -58,6 +69,10 @@ pub enum ProgramError {
          write it by `regrind plan --program`"
     )]
     TooLong { points: u64 },
+    #[error(
+        "{path} does not hold what was written into it; look after the folder of programs (grinder.program.folder)"
+    )]
+    NotThere { path: PathBuf },
 }
 
 impl Programs {
@@ -67,6 +82,28 @@ impl Programs {
     /// A surface that is no height over x and y.
     pub fn ground(nominal: &Nominal) -> Result<(Field, Aperture), PathError> {
         height_of(nominal)
+    }
+
+    /// Returns what the program of a pass is called in the folder of a cycle.
+    pub(super) fn file_name(&self) -> String {
+        format!("{PROGRAM_FILE}.{}", self.dialect.dialect.extension)
+    }
+
+    /// Tells whether the dialect can say how exactly a program is to be followed.
+    ///
+    /// # Errors
+    /// What it cannot say.
+    pub fn check_dialect(&self) -> Result<(), DialectError> {
+        self.dialect.post(&self.exactness()).map(drop)
+    }
+
+    fn exactness(&self) -> Exactness {
+        Exactness {
+            mode: self.mode,
+            tolerance_mm: self.path_tolerance_mm,
+            controller_mm: self.controller_tolerance_mm,
+            chord_error_mm: self.options.chord_error_mm,
+        }
     }
 
     /// Lays the path of a pass and checks it against what the grinder can do.
@@ -93,8 +130,8 @@ impl Programs {
         Ok(summary)
     }
 
-    /// Writes `toolpath.ngc` and `toolpath_z.csv` of a pass into a folder; returns why not both: a program that is too long to be kept,
-    /// a table that reaches where the wheel cannot.
+    /// Writes the program and `toolpath_z.csv` of a pass into a folder; returns why not both: a program that is too long to be kept,
+    /// a table that reaches where the wheel cannot. Where the controller looks for programs, this one is put too.
     pub(super) fn keep(
         &self,
         files: &mut Files,
@@ -104,13 +141,31 @@ impl Programs {
         let (path, summary) = self.path(correction)?;
         if summary.points > MOST_POINTS {
             let error = ProgramError::TooLong { points: summary.points };
-            return Ok(Some(format!("there is no {PROGRAM_FILE}: {error}")));
+            if self.folder.is_some() {
+                return Err(error);
+            }
+            return Ok(Some(format!("there is no {}: {error}", self.file_name())));
         }
-        self.write_program(&files.place(PROGRAM_FILE), correction, map_identity, &path, &summary)?;
+        let file = files.place(&self.file_name());
+        self.write_program(&file, correction, map_identity, &path, &summary)?;
+        self.hand_over(&file, correction.cycle)?;
         match self.keep_table(&files.place(TABLE_FILE), correction, map_identity, &path) {
             Ok(()) => Ok(None),
             Err(ProgramError::Path(error)) => Ok(Some(format!("there is no {TABLE_FILE}: {error}"))),
             Err(error) => Err(error),
+        }
+    }
+
+    /// Puts a program where the controller looks for it, under its own name, and reads it back.
+    fn hand_over(&self, program: &Path, cycle: u16) -> Result<(), ProgramError> {
+        let Some(folder) = &self.folder else { return Ok(()) };
+        let bytes = read_bytes(program).map_err(GcodeError::from)?;
+        let extension = &self.dialect.dialect.extension;
+        let path = folder.join(self.dialect.name(&self.part, cycle)).with_extension(extension);
+        write_atomic(&path, &bytes).map_err(GcodeError::from)?;
+        match read_bytes(&path).is_ok_and(|there| there == bytes) {
+            true => Ok(()),
+            false => Err(ProgramError::NotThere { path }),
         }
     }
 
@@ -148,10 +203,9 @@ impl Programs {
             tracks: tracks_in_words(path),
             spark_out_passes: self.spark_out_passes,
             simulation: self.simulation,
-            mode: self.mode,
-            path_tolerance_mm: self.path_tolerance_mm,
+            exactness: self.exactness(),
         };
-        Ok(write_program(file, &header, summary, path)?)
+        Ok(write_program(file, &header, &self.dialect, summary, path)?)
     }
 }
 

@@ -286,7 +286,7 @@ impl Files {
     }
 
     /// Keeps the name of a file that is about to be written, and returns where it goes.
-    pub(super) fn place(&mut self, name: &'static str) -> PathBuf {
+    pub(super) fn place(&mut self, name: &str) -> PathBuf {
         let name = if self.below.is_empty() { name.to_owned() } else { format!("{}/{name}", self.below) };
         let path = self.run.join(&name);
         self.names.push(name);

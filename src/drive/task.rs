@@ -17,7 +17,7 @@ use crate::registration::{
 };
 use crate::surface::Nominal;
 
-use super::program::{PROGRAM_FILE, ProgramError, Programs};
+use super::program::{ProgramError, Programs};
 use super::record::Files;
 
 /// What stays free for the journal and the program of a pass.
@@ -460,7 +460,7 @@ impl Task {
     ) -> Result<Option<String>, ProgramError> {
         match &self.programs {
             Ok(programs) => programs.keep(files, correction, self.map_identity(correction)),
-            Err(error) if error.is_ours() => Ok(Some(format!("there is no {PROGRAM_FILE}: {error}"))),
+            Err(error) if error.is_ours() => Ok(Some(format!("there is no program: {error}"))),
             Err(error) => Err(error.clone().into()),
         }
     }

@@ -723,7 +723,11 @@ fn the_truth_of_a_simulated_cell_is_checked_too() {
 
 #[test]
 fn the_committed_schemas_are_the_ones_in_force() {
-    for (name, schema) in [("recipe", regrind::recipe::json_schema()), ("cell", regrind::config::json_schema())] {
+    for (name, schema) in [
+        ("recipe", regrind::recipe::json_schema()),
+        ("cell", regrind::config::json_schema()),
+        ("dialect", regrind::config::dialect_schema()),
+    ] {
         let committed = fs::read_to_string(root().join(format!("docs/{name}.schema.json"))).unwrap();
         let committed: Value = serde_json::from_str(&committed).unwrap();
         assert_eq!(&committed, schema, "write it anew: regrind schema {name} > docs/{name}.schema.json");
@@ -777,7 +781,11 @@ fn accepts(schema: &Value, value: &Value) -> bool {
 
 #[test]
 fn the_schemas_accept_what_ships_and_refuse_what_is_wrong() {
-    for (folder, schema) in [("recipes", regrind::recipe::json_schema()), ("config", regrind::config::json_schema())] {
+    for (folder, schema) in [
+        ("recipes", regrind::recipe::json_schema()),
+        ("config", regrind::config::json_schema()),
+        ("config/dialects", regrind::config::dialect_schema()),
+    ] {
         for path in shipped(folder) {
             let text = fs::read_to_string(&path).unwrap();
             let value = serde_json::to_value(toml::from_str::<toml::Table>(&text).unwrap()).unwrap();

@@ -1,6 +1,7 @@
 //! Programs for the grinder: read back by an interpreter that none of us wrote, swept by wheels, corrected by maps.
 
 mod compensate;
+mod dialects;
 mod gcode;
 #[path = "../common/keep.rs"]
 mod keep;

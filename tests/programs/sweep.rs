@@ -26,7 +26,7 @@ fn distance(wheel: &Wheel, d: [f64; 3]) -> f64 {
 }
 
 /// How far a point stays from a wheel that goes through a program, rapid moves included.
-fn clearance(wheel: &Wheel, steps: &[ProgramStep], q: [f64; 3]) -> f64 {
+pub fn clearance(wheel: &Wheel, steps: &[ProgramStep], q: [f64; 3]) -> f64 {
     let reach = wheel.reach_mm() + 0.1;
     let mut nearest = f64::INFINITY;
     for pair in steps.windows(2) {
@@ -66,7 +66,7 @@ fn program(part: &Part) -> (Vec<ProgramStep>, f64) {
 }
 
 /// Places on some tracks of a raster, and beside them by a share of their distance.
-fn places(part: &Part, track_mm: f64, beside: f64) -> Vec<[f64; 2]> {
+pub fn places(part: &Part, track_mm: f64, beside: f64) -> Vec<[f64; 2]> {
     let [a, b] = part.half_mm;
     let rows = (2.0 * b / track_mm).round() as usize;
     (0..80)

@@ -11,6 +11,7 @@ mod convergence;
 mod cycles;
 #[path = "../common/data.rs"]
 mod data;
+mod dialects;
 mod faults;
 mod files;
 mod first_touches;

@@ -170,7 +170,7 @@ impl ManualMachine {
             return vec![ended, confirm("done")];
         }
         let folder = self.cycle_folder(Job { cycle: job.cycle.saturating_sub(1), ..job });
-        let there = ["toolpath.ngc", "correction.csv"].map(|name| folder.join(name)).into_iter().find(|f| f.is_file());
+        let there = program_in(&folder).or_else(|| Some(folder.join("correction.csv")).filter(|file| file.is_file()));
         let by = there.map_or("your own program".to_owned(), |file| file.display().to_string());
         let map = hex(&map[..4]);
         vec![
@@ -479,6 +479,15 @@ impl Grinder for ManualMachine {
             _ => Err(DeviceError::NoResult { machine: Arc::clone(&self.name), job, state: self.state }),
         }
     }
+}
+
+/// The program of a pass in the folder of a cycle, in whatever dialect it is.
+fn program_in(folder: &Path) -> Option<PathBuf> {
+    let files = std::fs::read_dir(folder).ok()?.flatten().map(|entry| entry.path());
+    let mut programs: Vec<PathBuf> =
+        files.filter(|file| file.is_file() && file.file_stem() == Some("toolpath".as_ref())).collect();
+    programs.sort();
+    programs.into_iter().next()
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
+use super::dialect::DialectError;
 use crate::FormatError;
 
 /// Why a program could not be written, read or corrected. Lines count from 1.
@@ -17,6 +18,16 @@ pub enum GcodeError {
         "{axis} of move {number} is {value_mm} mm; the path must not be used: please report it with the files that led to it"
     )]
     NotFinite { axis: char, value_mm: f64, number: u64 },
+    #[error(transparent)]
+    Dialect(#[from] DialectError),
+    #[error(
+        "{axis} of move {number} is {value_mm} mm, and the dialect takes {largest_mm} mm at most (numbers.largest_mm); move the work offset"
+    )]
+    Large { axis: char, value_mm: f64, number: u64, largest_mm: f64 },
+    #[error(
+        "of the feed of {feed_mm_min} mm/min of move {number} nothing is left with {decimals} decimals (numbers.feed_decimals); raise          grinding.feed_mm_min"
+    )]
+    Slow { feed_mm_min: f64, decimals: u8, number: u64 },
     #[error("{found} moves came where {expected} were announced; please report it with the files that led to it")]
     Count { found: u64, expected: u64 },
     #[error("{path}, line {line}: {what}; {remedy}")]
@@ -30,6 +41,12 @@ impl GcodeError {
     pub(super) fn after(self, moves: u64) -> Self {
         match self {
             Self::NotFinite { axis, value_mm, number } => Self::NotFinite { axis, value_mm, number: number + moves },
+            Self::Large { axis, value_mm, number, largest_mm } => {
+                Self::Large { axis, value_mm, number: number + moves, largest_mm }
+            }
+            Self::Slow { feed_mm_min, decimals, number } => {
+                Self::Slow { feed_mm_min, decimals, number: number + moves }
+            }
             error => error,
         }
     }

@@ -1,12 +1,13 @@
-//! Programs for numerically controlled machines, in the dialect of LinuxCNC: writing them, reading them, correcting them.
+//! Programs for numerically controlled machines: writing them in the dialect of a control, reading and correcting those of LinuxCNC.
 //!
 //! ```text
-//!  ToolPath --write_program--> part.ngc
+//!  ToolPath + Dialect --write_program--> part.ngc, part.nc, part.mpf, part.h
 //!  base.ngc --Program::read--> lines and moves --correct--> corrected.ngc     (with a map over x and y)
 //! ```
 
 mod amend;
 mod arc;
+mod dialect;
 mod error;
 mod map;
 mod number;
@@ -15,6 +16,7 @@ mod table;
 mod write;
 
 pub use amend::{AlongNormals, Amended, Amendment, correct_program};
+pub use dialect::{Dialect, DialectError, Exactness, Fault, LINUXCNC};
 pub use error::GcodeError;
 pub use map::{MapBase, MapKind, ProgramMap, read_program_map};
 pub use table::write_axis_table;

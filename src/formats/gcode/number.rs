@@ -41,6 +41,32 @@ pub(super) fn push_fixed(text: &mut Vec<u8>, millionths: i64) {
     text.extend_from_slice(&digits[at..]);
 }
 
+/// Appends a number of so many decimals, counted in the last of them.
+#[inline]
+pub(super) fn push_decimals(text: &mut Vec<u8>, count: i64, decimals: u8) {
+    if decimals == 6 {
+        return push_fixed(text, count);
+    }
+    let mut digits = [0u8; 32];
+    let (mut at, mut rest, mut written) = (digits.len(), count.unsigned_abs(), 0);
+    // At least one digit before the point.
+    while written <= decimals || rest > 0 {
+        if written == decimals && decimals > 0 {
+            at -= 1;
+            digits[at] = b'.';
+        }
+        at -= 1;
+        digits[at] = b'0' + (rest % 10) as u8;
+        rest /= 10;
+        written += 1;
+    }
+    if count < 0 {
+        at -= 1;
+        digits[at] = b'-';
+    }
+    text.extend_from_slice(&digits[at..]);
+}
+
 const PAIRS: [[u8; 2]; 100] = {
     let mut pairs = [[0; 2]; 100];
     let mut k = 0;
@@ -87,6 +113,18 @@ mod tests {
         for k in 0..20_000 {
             let value = f64::from(k) * 0.013_577_1 - 131.0;
             assert!((text(value).parse::<f64>().unwrap() - value).abs() <= 0.5e-6 + 1e-12);
+        }
+    }
+
+    #[test]
+    fn every_number_of_decimals_is_written_alike() {
+        for decimals in 0..=6 {
+            for count in [0, 1, -1, 9, 10, -10, 123_456_789, -1_000_000, 999_999] {
+                let mut text = Vec::new();
+                push_decimals(&mut text, count, decimals);
+                let expected = format!("{:.1$}", count as f64 / 10f64.powi(i32::from(decimals)), usize::from(decimals));
+                assert_eq!(String::from_utf8(text).unwrap(), expected);
+            }
         }
     }
 

@@ -1,14 +1,14 @@
-//! Writing a program for LinuxCNC and its kin, a move a line, as fast as a file takes it.
+//! Writing a program in the dialect of a control, a move a block, as fast as a file takes it.
 
-use std::fmt::Write as _;
 use std::path::Path;
 
 use rayon::prelude::*;
 
-use super::number::{LARGEST_MM, push_fixed, rounded, short};
+use super::dialect::{Dialect, Exactness, LineEnd, NAME, NUMBER, Post};
+use super::number::{push_decimals, short};
 use super::{GcodeError, hex};
 use crate::registration::Draft;
-use regrind_core::compensation::path::{Move, PathMode, Summary, ToolPath};
+use regrind_core::compensation::path::{Move, Summary, ToolPath};
 
 /// Bytes that are gathered before they go to the file.
 const CHUNK: usize = 1 << 16;
@@ -41,41 +41,50 @@ pub struct ProgramHeader {
     pub spark_out_passes: u16,
     /// Whether the cell is simulated.
     pub simulation: bool,
-    /// How exactly the controller keeps to the path.
-    pub mode: PathMode,
-    /// How far it may round corners off with [`PathMode::Blend`], in millimetres.
-    pub path_tolerance_mm: f64,
+    /// How exactly it is to be followed.
+    pub exactness: Exactness,
 }
 
 /// Writes a program: the header, the moves track by track, the end.
 ///
-/// Frame: the model frame, which G54 must have its zero in. Units: mm, mm/min. A coordinate that does not change within a track is left
-/// out; every track says all of its beginning anew, so that a program can be gone on with at any of them, and many are written at the same
-/// time. The file appears whole or not at all.
+/// Frame: the model frame, which the work offset must have its zero in. Units: mm, mm/min. A coordinate that does not change within a track
+/// is left out; every track says all of its beginning anew, so that a program can be gone on with at any of them, and many are written at the
+/// same time where blocks have no numbers. The file appears whole or not at all.
 ///
 /// # Errors
-/// A coordinate that is not finite or beyond a kilometre; a number of moves other than the summary has; a file that cannot be written.
+/// What the dialect cannot say; a coordinate that is not finite or larger than it takes, a feed of which nothing is left; a number of moves
+/// other than the summary has; a file that cannot be written.
 pub fn write_program(
     file: &Path,
     header: &ProgramHeader,
+    dialect: &Dialect,
     summary: &Summary,
     path: &ToolPath,
 ) -> Result<(), GcodeError> {
-    write_tracks(file, header, summary, &path.moves_by_track())
+    write_tracks(file, header, dialect, summary, &path.moves_by_track())
 }
 
-fn write_tracks<T>(path: &Path, header: &ProgramHeader, summary: &Summary, tracks: &[T]) -> Result<(), GcodeError>
+fn write_tracks<T>(
+    path: &Path,
+    header: &ProgramHeader,
+    dialect: &Dialect,
+    summary: &Summary,
+    tracks: &[T],
+) -> Result<(), GcodeError>
 where
     T: Iterator<Item = Move> + Clone + Sync,
 {
+    let post = dialect.post(&header.exactness)?;
+    let frame = Frame::new(&post, header)?;
+    let (head, numbered) = frame.head(header, summary);
     let mut draft = Draft::create(path)?;
-    draft.write(header_text(header, summary).as_bytes())?;
-    let mut count = 0;
+    draft.write(head.as_bytes())?;
+    let mut lines = Lines::new(dialect, 0, numbered);
     let at_once = (AT_ONCE * tracks.len() as u64 / summary.points.max(1)) as usize;
-    if at_once < 2 {
-        // Long tracks go to the file as they come.
+    if at_once < 2 || dialect.blocks.is_some() {
+        // Long tracks, and those whose blocks are counted, go to the file as they come.
         for track in tracks {
-            let mut lines = Lines::new(count);
+            lines.begin();
             for one in track.clone() {
                 lines.push(&one)?;
                 if lines.text.len() >= CHUNK {
@@ -83,116 +92,274 @@ where
                     lines.text.clear();
                 }
             }
-            draft.write(&lines.text)?;
-            count = lines.count;
         }
+        draft.write(&lines.text)?;
     } else {
         for some in tracks.chunks(at_once) {
-            let texts: Vec<Result<Lines, GcodeError>> = some.par_iter().map(Lines::of).collect();
-            for lines in texts {
-                let lines = lines.map_err(|error| error.after(count))?;
-                draft.write(&lines.text)?;
-                count += lines.count;
+            let texts: Vec<Result<Lines, GcodeError>> =
+                some.par_iter().map(|track| Lines::of(dialect, track)).collect();
+            for text in texts {
+                let text = text.map_err(|error| error.after(lines.count))?;
+                draft.write(&text.text)?;
+                lines.count += text.count;
             }
         }
     }
-    if count != summary.moves {
-        return Err(GcodeError::Count { found: count, expected: summary.moves });
+    if lines.count != summary.moves {
+        return Err(GcodeError::Count { found: lines.count, expected: summary.moves });
     }
-    draft.write(b"M2\n")?;
+    draft.write(frame.tail(lines.numbered).as_bytes())?;
     draft.publish()?;
     Ok(())
 }
 
 /// The lines of the moves, and what is in force after them.
-struct Lines {
+struct Lines<'a> {
+    dialect: &'a Dialect,
     text: Vec<u8>,
+    /// In the last digit that is written; the largest number where nothing is in force.
     last: [i64; 3],
-    mode: Option<u8>,
-    /// In millionths.
+    rapid: Option<bool>,
     feed: i64,
     count: u64,
+    /// Blocks with a number so far.
+    numbered: u64,
+    per_mm: f64,
+    feed_per: f64,
 }
 
-impl Lines {
-    /// Nothing is in force, after so many moves.
-    fn new(count: u64) -> Self {
-        Self { text: Vec::new(), last: [i64::MAX; 3], mode: None, feed: 0, count }
+/// What a place or a feed is that is not in force.
+const NOTHING: i64 = i64::MAX;
+
+impl<'a> Lines<'a> {
+    /// Nothing is in force, after so many moves and so many numbered blocks.
+    fn new(dialect: &'a Dialect, count: u64, numbered: u64) -> Self {
+        let power = |decimals: u8| 10f64.powi(i32::from(decimals));
+        let (per_mm, feed_per) = (power(dialect.numbers.decimals), power(dialect.numbers.feed_decimals));
+        let (text, last) = (Vec::new(), [NOTHING; 3]);
+        Self { dialect, text, last, rapid: None, feed: NOTHING, count, numbered, per_mm, feed_per }
     }
 
     /// The lines of a whole track.
-    fn of<T: Iterator<Item = Move> + Clone>(track: &T) -> Result<Self, GcodeError> {
-        let mut lines = Self::new(0);
+    fn of<T: Iterator<Item = Move> + Clone>(dialect: &'a Dialect, track: &T) -> Result<Self, GcodeError> {
+        let mut lines = Self::new(dialect, 0, 0);
         track.clone().try_for_each(|one| lines.push(&one))?;
         Ok(lines)
+    }
+
+    /// Nothing is in force any more.
+    fn begin(&mut self) {
+        (self.last, self.rapid, self.feed) = ([NOTHING; 3], None, NOTHING);
     }
 
     #[inline]
     fn push(&mut self, one: &Move) -> Result<(), GcodeError> {
         self.count += 1;
+        let words = &self.dialect.words;
+        number(&mut self.text, self.dialect, self.numbered);
+        self.numbered += 1;
         match one {
-            Move::RapidZ(z) => {
-                self.mode(b'0');
-                self.word(2, *z)?;
-            }
-            Move::RapidXy([x, y]) => {
-                self.mode(b'0');
-                self.word(0, *x)?;
-                self.word(1, *y)?;
-            }
+            Move::RapidZ(z) => self.block(true, [None, None, Some(*z)], None)?,
+            Move::RapidXy([x, y]) => self.block(true, [Some(*x), Some(*y), None], None)?,
             Move::Feed { at, feed_mm_min } => {
-                self.mode(b'1');
-                for k in 0..3 {
-                    self.word(k, at[k])?;
-                }
-                let feed = rounded(*feed_mm_min);
-                if feed != self.feed {
-                    self.feed = feed;
-                    self.text.push(b'F');
-                    self.text.extend_from_slice(short(*feed_mm_min).as_bytes());
-                }
+                self.block(false, [Some(at.x), Some(at.y), Some(at.z)], Some(*feed_mm_min))?;
             }
         }
-        self.text.push(b'\n');
+        if matches!(one, Move::RapidZ(_) | Move::RapidXy(_)) {
+            self.text.extend_from_slice(words.rapid_ends.as_bytes());
+        }
+        end_line(&mut self.text, self.dialect);
+        Ok(())
+    }
+
+    /// The words of a move: those that say something new, or all that are known where none does.
+    #[inline]
+    fn block(&mut self, rapid: bool, to_mm: [Option<f64>; 3], feed_mm_min: Option<f64>) -> Result<(), GcodeError> {
+        let words = &self.dialect.words;
+        if words.each_block || self.rapid != Some(rapid) {
+            self.rapid = Some(rapid);
+            self.text.extend_from_slice(if rapid { &words.rapid } else { &words.line }.as_bytes());
+        }
+        let mut to = self.last;
+        for (k, value_mm) in to_mm.iter().enumerate().filter_map(|(k, value)| Some((k, (*value)?))) {
+            to[k] = self.rounded(k, value_mm)?;
+        }
+        let feed = feed_mm_min.map_or(Ok(self.feed), |feed| self.rounded_feed(feed))?;
+        let nothing_new = to == self.last && feed == self.feed;
+        let mut first = true;
+        for (k, &value) in to.iter().enumerate() {
+            if value != self.last[k] || (nothing_new && value != NOTHING) {
+                self.between(&mut first);
+                self.text.extend_from_slice(words.axes[k].as_bytes());
+                let numbers = &self.dialect.numbers;
+                if numbers.plus && value >= 0 {
+                    self.text.push(b'+');
+                }
+                push_decimals(&mut self.text, value, numbers.decimals);
+            }
+        }
+        if feed != self.feed {
+            self.between(&mut first);
+            self.text.extend_from_slice(words.feed.as_bytes());
+            push_feed(&mut self.text, feed, self.dialect);
+        }
+        (self.last, self.feed) = (to, feed);
         Ok(())
     }
 
     #[inline]
-    fn mode(&mut self, mode: u8) {
-        if self.mode != Some(mode) {
-            self.mode = Some(mode);
-            self.text.extend_from_slice(&[b'G', mode, b' ']);
+    fn between(&mut self, first: &mut bool) {
+        if !std::mem::replace(first, false) {
+            self.text.extend_from_slice(self.dialect.words.between.as_bytes());
         }
     }
 
+    /// A coordinate in the last digit that is written.
     #[inline]
-    fn word(&mut self, axis: usize, value_mm: f64) -> Result<(), GcodeError> {
-        if value_mm.is_nan() || value_mm.abs() > LARGEST_MM {
-            return Err(GcodeError::NotFinite { axis: ['X', 'Y', 'Z'][axis], value_mm, number: self.count });
+    fn rounded(&self, axis: usize, value_mm: f64) -> Result<i64, GcodeError> {
+        let largest_mm = self.dialect.numbers.largest_mm;
+        if value_mm.is_nan() || value_mm.abs() > largest_mm {
+            let axis = ['X', 'Y', 'Z'][axis];
+            return Err(match value_mm.is_finite() {
+                true => GcodeError::Large { axis, value_mm, number: self.count, largest_mm },
+                false => GcodeError::NotFinite { axis, value_mm, number: self.count },
+            });
         }
-        let value = rounded(value_mm);
-        if value != self.last[axis] {
-            self.last[axis] = value;
-            self.text.push([b'X', b'Y', b'Z'][axis]);
-            push_fixed(&mut self.text, value);
+        Ok((value_mm * self.per_mm).round() as i64)
+    }
+
+    /// A feed in the last digit that is written.
+    fn rounded_feed(&self, feed_mm_min: f64) -> Result<i64, GcodeError> {
+        match (feed_mm_min * self.feed_per).round() as i64 {
+            0 => {
+                Err(GcodeError::Slow { feed_mm_min, decimals: self.dialect.numbers.feed_decimals, number: self.count })
+            }
+            feed => Ok(feed),
         }
-        Ok(())
     }
 }
 
-/// The header, with the number of its own lines counted in.
-fn header_text(header: &ProgramHeader, summary: &Summary) -> String {
-    let without = header_lines(header, summary, 0);
-    let lines = without.lines().count() as u64 + summary.moves + 1;
-    header_lines(header, summary, lines)
+/// A feed without zeros at its end.
+fn push_feed(text: &mut Vec<u8>, feed: i64, dialect: &Dialect) {
+    let before = text.len();
+    push_decimals(text, feed, dialect.numbers.feed_decimals);
+    if text[before..].contains(&b'.') {
+        while text.last() == Some(&b'0') {
+            text.pop();
+        }
+    }
+    match (text.last(), dialect.numbers.feed_point) {
+        (Some(b'.'), false) => drop(text.pop()),
+        (Some(b'.'), true) => {}
+        (_, true) if !text[before..].contains(&b'.') => text.push(b'.'),
+        _ => {}
+    }
 }
 
-fn header_lines(h: &ProgramHeader, s: &Summary, lines: u64) -> String {
-    let mut text = String::new();
-    let mut say = |words: std::fmt::Arguments| {
-        // Writing to a string does not fail.
-        let _ = writeln!(text, "({})", comment(&words.to_string()));
-    };
+/// The number of a block, where blocks have one.
+#[inline]
+fn number(text: &mut Vec<u8>, dialect: &Dialect, numbered: u64) {
+    let Some(blocks) = &dialect.blocks else { return };
+    // After the last comes the first again.
+    let round = u64::from(blocks.last.saturating_sub(blocks.first) / blocks.step.max(1)) + 1;
+    let number = u64::from(blocks.first) + u64::from(blocks.step) * (numbered % round);
+    text.extend_from_slice(format!("{}{number} ", blocks.letter).as_bytes());
+}
+
+#[inline]
+fn end_line(text: &mut Vec<u8>, dialect: &Dialect) {
+    text.extend_from_slice(match dialect.text.line_end {
+        LineEnd::Lf => b"\n",
+        LineEnd::Crlf => b"\r\n",
+    });
+}
+
+/// What stands before and after the moves.
+struct Frame<'a> {
+    dialect: &'a Dialect,
+    begin: Vec<String>,
+    setup: Vec<String>,
+    end: Vec<String>,
+}
+
+impl<'a> Frame<'a> {
+    fn new(post: &Post<'a>, header: &ProgramHeader) -> Result<Self, GcodeError> {
+        let dialect = post.dialect;
+        let name = dialect.name(&header.part, header.cycle);
+        let number = dialect.number(header.cycle)?.map_or(String::new(), |number| number.to_string());
+        let of = |line: &String| line.replace(NAME, &name).replace(NUMBER, &number);
+        let [mode, mode_ends] = &post.mode;
+        Ok(Self {
+            dialect,
+            begin: dialect.program.begin.iter().map(of).collect(),
+            setup: dialect.program.setup.iter().chain(mode).cloned().collect(),
+            end: mode_ends.iter().cloned().chain(dialect.program.end.iter().map(of)).collect(),
+        })
+    }
+
+    /// Appends a line; returns whether it has a number.
+    fn line(&self, text: &mut Vec<u8>, line: &str, has_number: bool, numbered: &mut u64) {
+        // A percent sign is none of a control's blocks.
+        if has_number && line != "%" {
+            number(text, self.dialect, *numbered);
+            *numbered += 1;
+        }
+        text.extend_from_slice(line.as_bytes());
+        end_line(text, self.dialect);
+    }
+
+    /// The lines before the moves, with the number of all lines counted in, and how many blocks of them have a number.
+    fn head(&self, header: &ProgramHeader, summary: &Summary) -> (String, u64) {
+        let lines = |count: u64| {
+            let (mut text, mut numbered) = (Vec::new(), 0);
+            let all = self.dialect.blocks.as_ref().is_some_and(|blocks| blocks.all);
+            self.begin.iter().for_each(|line| self.line(&mut text, line, all, &mut numbered));
+            for words in header_words(header, summary, count) {
+                for line in self.comments(&words) {
+                    self.line(&mut text, &line, all, &mut numbered);
+                }
+            }
+            self.setup.iter().for_each(|line| self.line(&mut text, line, true, &mut numbered));
+            (String::from_utf8_lossy(&text).into_owned(), numbered)
+        };
+        let count = lines(0).0.lines().count() as u64 + summary.moves + self.end.len() as u64;
+        lines(count)
+    }
+
+    /// The lines after the moves.
+    fn tail(&self, mut numbered: u64) -> String {
+        let mut text = Vec::new();
+        self.end.iter().for_each(|line| self.line(&mut text, line, true, &mut numbered));
+        String::from_utf8_lossy(&text).into_owned()
+    }
+
+    /// Comments that say something: as many as its length asks for.
+    fn comments(&self, words: &str) -> Vec<String> {
+        let text = &self.dialect.text;
+        // A number before them takes its place too.
+        let marks = text.comment_begins.len() + text.comment_ends.len() + 12;
+        let room = text.longest_line.saturating_sub(marks).max(20);
+        let words = comment(words);
+        let words = if text.upper_case { words.to_ascii_uppercase() } else { words };
+        let mut lines = vec![String::new()];
+        for word in words.split(' ') {
+            let last = lines.len() - 1;
+            let line = &mut lines[last];
+            if line.is_empty() || line.len() + 1 + word.len() <= room {
+                line.push_str(if line.is_empty() { "" } else { " " });
+                line.push_str(word);
+            } else {
+                lines.push(word.to_owned());
+            }
+        }
+        lines.iter().map(|line| format!("{}{line}{}", text.comment_begins, text.comment_ends)).collect()
+    }
+}
+
+/// What the header tells, a comment each.
+fn header_words(h: &ProgramHeader, s: &Summary, lines: u64) -> Vec<String> {
+    let mut said = Vec::new();
+    let mut say = |words: std::fmt::Arguments| said.push(words.to_string());
     if h.simulation {
         say(format_args!("SIMULATION"));
     }
@@ -219,14 +386,7 @@ fn header_lines(h: &ProgramHeader, s: &Summary, lines: u64) -> String {
     say(format_args!("points: {}", s.points));
     say(format_args!("lines: {lines}"));
     say(format_args!("spindle and coolant are the machine's own; start them before"));
-    // LinuxCNC's default at power-on is G64 without a tolerance, which cuts corners by a tenth of a millimetre and more: a program must say.
-    let mode = match h.mode {
-        PathMode::Blend => format!("G64 P{} Q0", short(h.path_tolerance_mm)),
-        PathMode::ExactPath => "G61".into(),
-        PathMode::ExactStop => "G61.1".into(),
-    };
-    let _ = writeln!(text, "G21 G90 G94 G17 G40 G49 G80 G54\n{mode}");
-    text
+    said
 }
 
 /// Returns words that may stand in a comment: no brackets, which would end it or begin another, and plain characters.
@@ -243,7 +403,8 @@ pub(super) fn comment(words: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use regrind_core::compensation::path::Peak;
+    use crate::gcode::dialect::{Blocks, tests::shipped};
+    use regrind_core::compensation::path::{PathMode, Peak};
     use regrind_core::geometry::Point;
 
     /// Along x there and back, one track after the other.
@@ -258,6 +419,11 @@ mod tests {
     }
 
     fn write(tracks: &[std::vec::IntoIter<Move>], points: u64) -> Result<String, GcodeError> {
+        let text = write_in(&shipped("linuxcnc"), tracks, points)?;
+        Ok(text[text.find("G54").unwrap()..].to_owned())
+    }
+
+    fn write_in(dialect: &Dialect, tracks: &[std::vec::IntoIter<Move>], points: u64) -> Result<String, GcodeError> {
         let header = ProgramHeader {
             part: "part".into(),
             cycle: 1,
@@ -269,8 +435,12 @@ mod tests {
             tracks: "raster".into(),
             spark_out_passes: 0,
             simulation: true,
-            mode: PathMode::Blend,
-            path_tolerance_mm: 1e-4,
+            exactness: Exactness {
+                mode: PathMode::Blend,
+                tolerance_mm: 1e-4,
+                controller_mm: Some(1e-4),
+                chord_error_mm: 1e-4,
+            },
         };
         let summary = Summary {
             moves: 5 * tracks.len() as u64,
@@ -287,9 +457,8 @@ mod tests {
         };
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("part.ngc");
-        write_tracks(&file, &header, &summary, tracks)?;
-        let text = std::fs::read_to_string(file).unwrap();
-        Ok(text[text.find("G54").unwrap()..].to_owned())
+        write_tracks(&file, &header, dialect, &summary, tracks)?;
+        Ok(std::fs::read_to_string(file).unwrap())
     }
 
     #[test]
@@ -299,6 +468,114 @@ mod tests {
         let first = ["G0 X-1.000000Y0.000000", "Z1.000000", "G1 Z0.000000F600", "X1.000000", "G0 Z5.000000"];
         let second = ["G0 X1.000000Y1.000000", "Z1.000000", "G1 Z0.100000F600", "X-1.000000", "G0 Z5.000000"];
         assert_eq!(lines, [&first[..], &second, &["M2"]].concat());
+    }
+
+    /// The blocks of a program: what is no comment.
+    fn blocks(name: &str) -> Vec<String> {
+        let dialect = shipped(name);
+        let text = write_in(&dialect, &tracks(1), 2).unwrap();
+        let ends = if dialect.text.line_end == LineEnd::Crlf { "\r\n" } else { "\n" };
+        assert!(text.ends_with(ends) && text.matches('\n').count() == text.matches(ends).count());
+        let is_comment = |line: &&str| line.contains(&dialect.text.comment_begins) && !line.starts_with('O');
+        text.lines().filter(|line| !is_comment(line)).map(str::to_owned).collect()
+    }
+
+    #[test]
+    fn every_dialect_has_its_own_words_numbers_and_frame() {
+        let fanuc = [
+            "%",
+            "O7001 (PART_C1)",
+            "G21 G90 G94 G17",
+            "G40 G49 G80 G54",
+            "G05.1 Q1",
+            "G00 X-1.0000 Y0.0000",
+            "Z1.0000",
+            "G01 Z0.0000 F600.",
+            "X1.0000",
+            "G00 Z5.0000",
+            "G05.1 Q0",
+            "M30",
+            "%",
+        ];
+        assert_eq!(blocks("fanuc"), fanuc);
+        let sinumerik = [
+            "N10 G710 G90 G94 G17 G40 G54",
+            "N20 G642 CTOL=0.0001",
+            "N30 FFWON SOFT",
+            "N40 G0 X-1.000000 Y0.000000",
+            "N50 Z1.000000",
+            "N60 G1 Z0.000000 F600",
+            "N70 X1.000000",
+            "N80 G0 Z5.000000",
+            "N90 FFWOF BRISK",
+            "N100 M30",
+        ];
+        assert_eq!(blocks("sinumerik"), sinumerik);
+        let heidenhain = [
+            "0 BEGIN PGM PART_C1 MM",
+            "CYCL DEF 32.0 TOLERANCE",
+            "CYCL DEF 32.1 T0.0001",
+            "L X-1.0000 Y+0.0000 R0 FMAX",
+            "L Z+1.0000 R0 FMAX",
+            "L Z+0.0000 F600",
+            "L X+1.0000",
+            "L Z+5.0000 R0 FMAX",
+            "CYCL DEF 32.0 TOLERANCE",
+            "CYCL DEF 32.1",
+            "M30",
+            "END PGM PART_C1 MM",
+        ];
+        let found = blocks("heidenhain");
+        assert_eq!(found[0], heidenhain[0]);
+        let first: usize = found[1].split_once(' ').unwrap().0.parse().unwrap();
+        let expected = heidenhain[1..].iter().enumerate().map(|(k, words)| format!("{} {words}", first + k));
+        assert_eq!(found[1..], expected.collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn no_line_is_longer_than_a_control_reads_and_its_header_counts_right() {
+        for name in ["linuxcnc", "fanuc", "sinumerik", "heidenhain"] {
+            let dialect = shipped(name);
+            let text = write_in(&dialect, &tracks(3), 6).unwrap();
+            assert!(text.is_ascii() && text.lines().all(|line| line.len() <= dialect.text.longest_line), "{name}");
+            let counted = format!("LINES: {}", text.lines().count());
+            assert!(text.to_ascii_uppercase().contains(&counted), "{name}: {text}");
+            assert!(!dialect.text.upper_case || text == text.to_ascii_uppercase(), "{name}");
+        }
+    }
+
+    #[test]
+    fn a_move_that_says_nothing_new_is_no_empty_block_and_numbers_begin_anew() {
+        let feed = |x: f64| Move::Feed { at: Point::new(x, 0.0, 0.0), feed_mm_min: 600.0 };
+        let still = vec![vec![Move::RapidZ(5.0), Move::RapidXy([0.0; 2]), feed(1.0), feed(1.0), feed(2.0)].into_iter()];
+        let mut dialect = shipped("sinumerik");
+        dialect.blocks = Some(Blocks { last: 50, ..dialect.blocks.clone().unwrap() });
+        let text = write_in(&dialect, &still, 3).unwrap();
+        let lines: Vec<&str> = text.lines().filter(|line| line.starts_with('N')).collect();
+        assert_eq!(lines[4..6], ["N50 X0.000000 Y0.000000", "N10 G1 X1.000000 Z0.000000 F600"]);
+        assert_eq!(lines[6..8], ["N20 X1.000000 Y0.000000 Z0.000000", "N30 X2.000000"]);
+    }
+
+    #[test]
+    fn what_a_dialect_cannot_write_is_refused() {
+        let one = |at: Point, feed_mm_min: f64| {
+            let moves = [Move::RapidZ(5.0), Move::RapidXy([0.0; 2]), Move::RapidZ(1.0)];
+            vec![
+                moves
+                    .into_iter()
+                    .chain([Move::Feed { at, feed_mm_min }, Move::RapidZ(5.0)])
+                    .collect::<Vec<_>>()
+                    .into_iter(),
+            ]
+        };
+        let fanuc = shipped("fanuc");
+        let written = |at, feed| write_in(&fanuc, &one(at, feed), 1);
+        assert!(written(Point::new(9999.9, 0.0, 0.0), 0.4).is_ok());
+        assert!(matches!(
+            written(Point::new(10_000.1, 0.0, 0.0), 1.0),
+            Err(GcodeError::Large { axis: 'X', number: 4, .. })
+        ));
+        assert!(matches!(written(Point::origin(), 0.0004), Err(GcodeError::Slow { number: 4, .. })));
     }
 
     #[test]

@@ -18,6 +18,7 @@ fn schema(kind: &str) -> &'static Value {
     match kind {
         "recipe" => regrind::recipe::json_schema(),
         "cell" => regrind::config::json_schema(),
+        "dialect" => regrind::config::dialect_schema(),
         _ => panic!("no schema of a {kind}"),
     }
 }
@@ -265,7 +266,7 @@ fn what_is_made_stands_in_the_book() {
 
 #[test]
 fn the_lists_that_are_made_are_all_that_there_are() {
-    for (page, kind) in [("recipes.md", "recipe"), ("commissioning.md", "cell")] {
+    for (page, kind) in [("recipes.md", "recipe"), ("commissioning.md", "cell"), ("dialects.md", "dialect")] {
         let (_, found) = made_anew(&text_of(page));
         let listed: BTreeSet<String> = found
             .iter()

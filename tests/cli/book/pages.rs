@@ -148,6 +148,7 @@ typed! {
     a_person_serves_the_machines: "manual.md"
     alarms_are_met: "alarms.md"
     files_are_read: "formats.md"
+    other_controls_are_written_for: "dialects.md"
     results_are_written_for_others: "results.md"
     the_method_is_followed: "method.md"
 }

@@ -1,0 +1,173 @@
+//! What a ball leaves that follows a program: how far its centre is from the nominal surface, all along the chords between its stops.
+
+use crate::part::Part;
+use crate::program::Program;
+
+/// Places along a chord are no farther apart than this, in millimetres.
+const APART_MM: f64 = 0.15;
+/// Steps of Newton's method down to a foot.
+const STEPS: usize = 12;
+/// A ball that is farther than this from where it should touch grinds nothing.
+const NEAR_MM: f64 = 1.0;
+
+/// A place where the ball touches or would, and how high over the nominal surface, in millimetres.
+#[derive(Clone, Copy, Debug)]
+struct Touch {
+    at_mm: [f64; 2],
+    height_mm: f64,
+}
+
+/// Returns, at every node of a part, how far over the nominal surface a ball of this radius leaves it; not a number where it does not come.
+pub(crate) fn heights_mm(part: &Part, program: &Program, radius_mm: f64, track_mm: f64) -> Vec<f64> {
+    let reach_mm = (1.6 * track_mm).max(2.0 * APART_MM);
+    let cells = Cells::of(touches(part, program, radius_mm), reach_mm);
+    part.height.nodes().map(|at| cells.level_mm(on_part(part, at))).collect()
+}
+
+/// Returns a place, or for one beside the part the last that is on it on the way to its middle: beside it the wheel has lifted off, and what it
+/// would leave there is what it leaves at the edge.
+fn on_part(part: &Part, at_mm: [f64; 2]) -> [f64; 2] {
+    let at = |share: f64| at_mm.map(|v| share * v);
+    let is_on = |share: f64| part.aperture.contains(at(share)[0], at(share)[1]);
+    if is_on(1.0) || !is_on(0.0) {
+        return at_mm;
+    }
+    let (mut on, mut off) = (0.0, 1.0);
+    for _ in 0..40 {
+        let middle = 0.5 * (on + off);
+        *(if is_on(middle) { &mut on } else { &mut off }) = middle;
+    }
+    at(on)
+}
+
+fn touches(part: &Part, program: &Program, radius_mm: f64) -> Vec<Touch> {
+    let mut found = Vec::new();
+    for pair in program.stops.windows(2).filter(|pair| pair[1].feed_mm_min.is_some()) {
+        let (from, to) = (pair[0].at_mm, pair[1].at_mm);
+        let by: [f64; 3] = std::array::from_fn(|k| to[k] - from[k]);
+        let count = (by.iter().map(|b| b * b).sum::<f64>().sqrt() / APART_MM).ceil().max(1.0);
+        for k in 1..=count as usize {
+            let centre = std::array::from_fn(|i| from[i] + by[i] * k as f64 / count);
+            found.extend(touch(part, centre, radius_mm));
+        }
+    }
+    found
+}
+
+/// The foot of the ball's centre on the nominal surface.
+fn touch(part: &Part, centre: [f64; 3], radius_mm: f64) -> Option<Touch> {
+    let shape = part.shape.as_ref();
+    let mut at_mm = [centre[0], centre[1]];
+    for _ in 0..STEPS {
+        // The way from the foot to the centre has no share along the surface: (x - cx) + z_x (z - cz) = 0, and the like for y.
+        let ([p, q], [r, s, t]) = (shape.gradient(at_mm[0], at_mm[1]), shape.hessian(at_mm[0], at_mm[1]));
+        let z = shape.height(at_mm[0], at_mm[1]) - centre[2];
+        let (f, g) = (at_mm[0] - centre[0] + p * z, at_mm[1] - centre[1] + q * z);
+        let (a, b, d) = (1.0 + p * p + r * z, p * q + s * z, 1.0 + q * q + t * z);
+        let determinant = a * d - b * b;
+        let step = [(d * f - b * g) / determinant, (a * g - b * f) / determinant];
+        at_mm = [at_mm[0] - step[0], at_mm[1] - step[1]];
+        if step[0].abs() + step[1].abs() < 1e-10 {
+            break;
+        }
+    }
+    let (point, normal) = (shape.point(at_mm[0], at_mm[1]), shape.normal(at_mm[0], at_mm[1]));
+    let height_mm = (0..3).map(|k| (centre[k] - point[k]) * normal[k]).sum::<f64>() - radius_mm;
+    (height_mm.abs() < NEAR_MM).then_some(Touch { at_mm, height_mm })
+}
+
+/// Touches, found by where they are.
+struct Cells {
+    reach_mm: f64,
+    of: std::collections::HashMap<[i64; 2], Vec<Touch>>,
+}
+
+impl Cells {
+    fn of(touches: Vec<Touch>, reach_mm: f64) -> Self {
+        let mut cells = Self { reach_mm, of: Default::default() };
+        for touch in touches {
+            cells.of.entry(cells.cell(touch.at_mm)).or_default().push(touch);
+        }
+        cells
+    }
+
+    fn cell(&self, at_mm: [f64; 2]) -> [i64; 2] {
+        at_mm.map(|v| (v / self.reach_mm).floor() as i64)
+    }
+
+    /// The height at a place by a plane through the touches around it; their weight falls to 0 at the reach.
+    fn level_mm(&self, at_mm: [f64; 2]) -> f64 {
+        let [i, j] = self.cell(at_mm);
+        // Normal equations of h = c0 + c1 u + c2 v.
+        let (mut m, mut b) = ([[0.0; 3]; 3], [0.0; 3]);
+        let around = (i - 1..=i + 1).flat_map(|i| (j - 1..=j + 1).map(move |j| [i, j]));
+        for touch in around.filter_map(|cell| self.of.get(&cell)).flatten() {
+            let [u, v] = [0, 1].map(|k| (touch.at_mm[k] - at_mm[k]) / self.reach_mm);
+            let weight = (1.0 - u * u - v * v).max(0.0).powi(2);
+            let row = [1.0, u, v];
+            for k in 0..3 {
+                b[k] += weight * row[k] * touch.height_mm;
+                (0..3).for_each(|l| m[k][l] += weight * row[k] * row[l]);
+            }
+        }
+        // Touches along one line tell no slope across it: a little stiffness against it keeps the plane level.
+        m[1][1] += 1e-6 * m[0][0];
+        m[2][2] += 1e-6 * m[0][0];
+        first_of(m, b)
+    }
+}
+
+/// The first unknown of three equations by Cramer's rule; not a number where there are none.
+fn first_of(m: [[f64; 3]; 3], b: [f64; 3]) -> f64 {
+    let of = |c: [f64; 3]| {
+        c[0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (c[1] * m[2][2] - m[1][2] * c[2])
+            + m[0][2] * (c[1] * m[2][1] - m[1][1] * c[2])
+    };
+    of(b) / of([m[0][0], m[1][0], m[2][0]])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::program::Stop;
+    use crate::spec::WorldSpec;
+
+    /// A part as its world has it, with a raster of a ball's centre over it that leaves a height over x and y.
+    fn followed(apart_mm: f64, left_mm: impl Fn(f64, f64) -> f64) -> (Part, Vec<f64>) {
+        let part = Part::blank(&WorldSpec::default().part, 1);
+        let [a, b] = part.aperture.half_mm();
+        let (rows, columns) = ((2.0 * b / apart_mm).ceil() as usize, 200);
+        let mut program = Program::default();
+        for j in 0..=rows {
+            for i in 0..=columns {
+                let at = |k: usize, n: usize, half: f64| half * (2.0 * k as f64 / n as f64 - 1.0);
+                let (x, y) = (at(i, columns, a), at(j, rows, b));
+                let (point, normal) = (part.shape.point(x, y), part.shape.normal(x, y));
+                let at_mm = std::array::from_fn(|k| point[k] + (10.0 + left_mm(x, y)) * normal[k]);
+                program.stops.push(Stop { at_mm, feed_mm_min: (i > 0).then_some(600.0) });
+            }
+        }
+        let heights = heights_mm(&part, &program, 10.0, apart_mm);
+        (part, heights)
+    }
+
+    #[test]
+    fn a_ball_leaves_what_its_centre_says_at_the_edge_too() {
+        let left = |x: f64, y: f64| 0.02 + 0.005 * (0.1 * x).sin() * (0.1 * y).cos();
+        let (part, heights) = followed(0.5, left);
+        for ([x, y], found) in part.height.nodes().zip(heights) {
+            if part.aperture.contains(x, y) {
+                // The chords between the stops are below the curve by 1 um at most.
+                assert!((found - left(x, y)).abs() < 1.5e-3, "{found} at {x} {y}");
+            } else {
+                assert!((found - 0.02).abs() < 0.007, "{found} at {x} {y}");
+            }
+        }
+    }
+
+    #[test]
+    fn where_it_does_not_come_it_leaves_nothing_that_is_a_number() {
+        let part = Part::blank(&WorldSpec::default().part, 1);
+        assert!(heights_mm(&part, &Program::default(), 10.0, 0.5).iter().all(|h| h.is_nan()));
+    }
+}

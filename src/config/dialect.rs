@@ -1,0 +1,105 @@
+//! The dialect that a cell's programs are written in: one that comes with the program, or a file of the shop's own.
+
+use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
+
+use crate::document::{Document, Problems, read_text, schema_of, sha256};
+use crate::formats::gcode::Dialect;
+
+static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<Dialect>);
+
+/// The dialects that come with the program, by name.
+const BUILT_IN: [(&str, &str); 4] = [
+    ("linuxcnc", include_str!("../../config/dialects/linuxcnc.toml")),
+    ("fanuc", include_str!("../../config/dialects/fanuc.toml")),
+    ("sinumerik", include_str!("../../config/dialects/sinumerik.toml")),
+    ("heidenhain", include_str!("../../config/dialects/heidenhain.toml")),
+];
+
+/// Returns the JSON schema of a dialect.
+pub fn dialect_schema() -> &'static serde_json::Value {
+    &SCHEMA
+}
+
+/// Returns the names of the dialects that come with the program.
+pub fn dialects() -> impl Iterator<Item = &'static str> {
+    BUILT_IN.iter().map(|(name, _)| *name)
+}
+
+/// Returns the file that a cell file at this path means by a dialect; none for one that comes with the program.
+pub(super) fn file_of(dialect: &str, cell: &Path) -> Option<PathBuf> {
+    let is_built_in = dialects().any(|name| name == dialect);
+    (!is_built_in).then(|| cell.parent().unwrap_or(Path::new("")).join(dialect))
+}
+
+/// Reads a dialect that comes with the program, or a file.
+///
+/// # Errors
+/// A file that cannot be read, and everything that is wrong with its text.
+pub(super) fn read(dialect: &str, cell: &Path) -> Result<Dialect, Problems> {
+    match BUILT_IN.iter().find(|(name, _)| *name == dialect) {
+        Some((name, text)) => parse_dialect(Path::new(name), text).map(|(dialect, _)| dialect),
+        None => read_dialect(&file_of(dialect, cell).unwrap_or_default()).map(|(dialect, _)| dialect),
+    }
+}
+
+/// Reads a file of a dialect, and the SHA-256 of its text.
+///
+/// # Errors
+/// A file that cannot be read, and everything that is wrong with its text.
+pub fn read_dialect(path: &Path) -> Result<(Dialect, [u8; 32]), Problems> {
+    let text = read_text(path)?;
+    parse_dialect(path, &text)
+}
+
+/// Reads a dialect from its text; the path is for messages.
+///
+/// # Errors
+/// Everything that is wrong with the text.
+pub fn parse_dialect(path: &Path, text: &str) -> Result<(Dialect, [u8; 32]), Problems> {
+    let mut document = Document::parse(path, text)?;
+    document.hold_against(&SCHEMA);
+    let written: Option<Dialect> = document.as_written();
+    for fault in written.iter().flat_map(Dialect::faults) {
+        // What is missing altogether has been told.
+        if !document.has_problem(&fault.key) {
+            document.report(&fault.key, fault.found, fault.allowed, fault.remedy);
+        }
+    }
+    document.finish()?;
+    let missing = || Problems::whole(path, text, "something is missing".into(), "compare it with a shipped dialect");
+    Ok((written.ok_or_else(missing)?, sha256(text)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_ships_is_read_by_its_name() {
+        for name in dialects() {
+            let dialect = read(name, Path::new("cell.toml")).unwrap_or_else(|problems| panic!("{problems}"));
+            assert_eq!(dialect.dialect.name, name);
+        }
+    }
+
+    #[test]
+    fn everything_wrong_is_told_at_its_place_with_a_remedy() {
+        let text = BUILT_IN[1]
+            .1
+            .replace("decimals = 4 ", "decimals = 9 ")
+            .replace("line = ", "lines = ")
+            .replace("G21 G90", "G20 G90");
+        let problems = parse_dialect(Path::new("ours.toml"), &text).unwrap_err();
+        let told = problems.to_string();
+        let at = |what: &str| 1 + text.lines().position(|line| line.contains(what)).unwrap();
+        for (key, what) in
+            [("numbers.decimals", "decimals = 9"), ("words.lines", "lines = "), ("program.setup[0]", "G20")]
+        {
+            let begins = format!("ours.toml:{}:", at(what));
+            assert!(told.lines().any(|line| line.starts_with(&begins) && line.contains(key)), "{key}: {told}");
+        }
+        assert!(told.contains("did you mean `line`?"), "{told}");
+        assert_eq!(told.lines().count(), 3, "{told}");
+    }
+}

@@ -1,0 +1,571 @@
+//! How a kind of control wants its programs written: words, numbers, comments, path modes, first and last lines, as data.
+//!
+//! A dialect is a file. What it cannot say of a pass is not left out but refused ([`Dialect::post`]): a program that rounds corners off by
+//! more than the recipe allows is worse than none.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+use regrind_core::compensation::path::PathMode;
+
+/// The dialect of LinuxCNC, which a cell has that says nothing.
+pub const LINUXCNC: &str = "linuxcnc";
+
+/// How a kind of control wants its programs written.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Dialect {
+    /// What it is called.
+    #[schemars(extend("x-required" = true))]
+    pub dialect: Naming,
+    /// Lines and comments.
+    #[schemars(extend("x-required" = true))]
+    pub text: Text,
+    /// Numbers of blocks; left out, blocks have none.
+    pub blocks: Option<Blocks>,
+    /// How numbers are written.
+    #[schemars(extend("x-required" = true))]
+    pub numbers: Numbers,
+    /// The words of a move.
+    #[schemars(extend("x-required" = true))]
+    pub words: Words,
+    /// How a control is told how exactly to keep to the path; a mode that is left out is refused.
+    pub path: Modes,
+    /// What stands before and after the moves.
+    #[schemars(extend("x-required" = true))]
+    pub program: Frame,
+}
+
+/// What a dialect is called.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Naming {
+    /// Its name.
+    #[schemars(length(min = 1, max = 40), extend("x-required" = true), example = &"fanuc")]
+    pub name: String,
+    /// The extension of its files, without the point.
+    #[schemars(length(min = 1, max = 8), extend("x-required" = true), example = &"nc")]
+    pub extension: String,
+}
+
+/// How a line ends.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum LineEnd {
+    /// A line feed.
+    #[default]
+    Lf,
+    /// A carriage return and a line feed.
+    Crlf,
+}
+
+/// Lines and comments.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Text {
+    /// How lines end.
+    pub line_end: LineEnd,
+    /// Longest line, in characters; longer comments are divided.
+    #[schemars(range(min = 40, max = 10000))]
+    pub longest_line: usize,
+    /// What begins a comment.
+    #[schemars(length(min = 1, max = 8), extend("x-required" = true), example = &"(")]
+    pub comment_begins: String,
+    /// What ends it, if not the end of its line.
+    #[schemars(length(max = 8), example = &")")]
+    pub comment_ends: String,
+    /// Whether there are capital letters only.
+    pub upper_case: bool,
+}
+
+impl Default for Text {
+    fn default() -> Self {
+        let (comment_begins, comment_ends) = (String::new(), String::new());
+        Self { line_end: LineEnd::Lf, longest_line: 255, comment_begins, comment_ends, upper_case: false }
+    }
+}
+
+/// Numbers of blocks.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Blocks {
+    /// What stands before the number.
+    #[schemars(length(max = 4), example = &"N")]
+    pub letter: String,
+    /// Of the first block.
+    #[schemars(range(max = 100000))]
+    pub first: u32,
+    /// From each to the next.
+    #[schemars(range(min = 1, max = 1000))]
+    pub step: u32,
+    /// Largest; after it comes the first again.
+    #[schemars(range(min = 1, max = 999999999))]
+    pub last: u32,
+    /// Whether comments and the lines before them have numbers too.
+    pub all: bool,
+}
+
+impl Default for Blocks {
+    fn default() -> Self {
+        Self { letter: "N".into(), first: 10, step: 10, last: 99_999, all: false }
+    }
+}
+
+/// How numbers are written.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Numbers {
+    /// Decimals of a coordinate, all of which are written.
+    #[schemars(range(min = 2, max = 6), extend("x-required" = true), example = 4)]
+    pub decimals: u8,
+    /// Whether a coordinate from 0 on has a plus sign.
+    pub plus: bool,
+    /// Largest coordinate.
+    #[schemars(range(min = 1.0, max = 1e6))]
+    pub largest_mm: f64,
+    /// Decimals of a feed at most; zeros at the end are left out.
+    #[schemars(range(max = 6))]
+    pub feed_decimals: u8,
+    /// Whether a whole feed has a point behind it: where a number without one counts increments.
+    pub feed_point: bool,
+}
+
+impl Default for Numbers {
+    fn default() -> Self {
+        Self { decimals: 0, plus: false, largest_mm: 1e6, feed_decimals: 6, feed_point: false }
+    }
+}
+
+/// The words of a move.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Words {
+    /// What begins a rapid move.
+    #[schemars(length(min = 1, max = 20), extend("x-required" = true), example = &"G0 ")]
+    pub rapid: String,
+    /// What ends one.
+    #[schemars(length(max = 20), example = &" R0 FMAX")]
+    pub rapid_ends: String,
+    /// What begins a straight move at feed.
+    #[schemars(length(min = 1, max = 20), extend("x-required" = true), example = &"G1 ")]
+    pub line: String,
+    /// Whether these begin every block; else they stay in force.
+    pub each_block: bool,
+    /// The three axes.
+    #[schemars(inner(length(min = 1, max = 4)))]
+    pub axes: [String; 3],
+    /// What stands between the words of a block.
+    #[schemars(length(max = 2))]
+    pub between: String,
+    /// What stands before a feed, in mm/min.
+    #[schemars(length(min = 1, max = 4))]
+    pub feed: String,
+}
+
+impl Default for Words {
+    fn default() -> Self {
+        Self {
+            rapid: String::new(),
+            rapid_ends: String::new(),
+            line: String::new(),
+            each_block: false,
+            axes: ["X", "Y", "Z"].map(str::to_owned),
+            between: " ".into(),
+            feed: "F".into(),
+        }
+    }
+}
+
+/// How a control is told how exactly to keep to the path.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Modes {
+    /// For `path_mode = "blend"`; `{tolerance_mm}` stands for how far corners may be rounded off.
+    pub blend: Option<Mode>,
+    /// For `path_mode = "exact-path"`.
+    pub exact_path: Option<Mode>,
+    /// For `path_mode = "exact-stop"`.
+    pub exact_stop: Option<Mode>,
+}
+
+/// What a path mode is called by.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Mode {
+    /// Lines before the moves.
+    #[schemars(length(min = 1, max = 16), inner(length(min = 1, max = 200)), extend("x-required" = true))]
+    pub begin: Vec<String>,
+    /// Lines after them.
+    #[schemars(length(max = 16), inner(length(min = 1, max = 200)))]
+    pub end: Vec<String>,
+}
+
+/// What stands before and after the moves.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Frame {
+    /// Longest name of a program.
+    #[schemars(range(min = 4, max = 80))]
+    pub longest_name: usize,
+    /// First and last number of programs: each cycle has the next one.
+    pub numbers: Option<[u32; 2]>,
+    /// Lines before the comments; `{name}` and `{number}` are the program's.
+    #[schemars(length(max = 32), inner(length(min = 1, max = 200)))]
+    pub begin: Vec<String>,
+    /// Lines after the comments: units of mm and mm/min, absolute places, the plane, the work offset, no compensations.
+    #[schemars(length(max = 32), inner(length(min = 1, max = 200)))]
+    pub setup: Vec<String>,
+    /// Lines at the end.
+    #[schemars(length(min = 1, max = 32), inner(length(min = 1, max = 200)), extend("x-required" = true))]
+    pub end: Vec<String>,
+}
+
+impl Default for Frame {
+    fn default() -> Self {
+        Self { longest_name: 24, numbers: None, begin: Vec::new(), setup: Vec::new(), end: Vec::new() }
+    }
+}
+
+/// What is wrong with a key of a dialect: which, what was found, what is allowed, what to do.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Fault {
+    /// The key as a path.
+    pub key: String,
+    /// What was found.
+    pub found: String,
+    /// What is allowed.
+    pub allowed: &'static str,
+    /// What to do.
+    pub remedy: &'static str,
+}
+
+/// What a program asks for that a dialect cannot say.
+#[derive(Clone, Debug, Error, PartialEq)]
+#[allow(missing_docs)]
+#[non_exhaustive]
+pub enum DialectError {
+    #[error(
+        "the dialect `{dialect}` has no words for grinding.path_mode = \"{mode}\"; choose another path mode, or write [path.{key}] into a \
+         dialect of your own"
+    )]
+    Mode { dialect: String, mode: &'static str, key: &'static str },
+    #[error(
+        "the dialect `{dialect}` cannot say how far corners may be rounded off: a setting of the control does; write \
+         grinder.program.controller_tolerance_um, as it is set, into the cell file"
+    )]
+    ToleranceUnknown { dialect: String },
+    #[error(
+        "the control rounds corners off by {found_um} um (grinder.program.controller_tolerance_um), and grinding.path_tolerance_um allows \
+         {limit_um} um; set the control tighter, or allow more"
+    )]
+    ToleranceWide { found_um: f64, limit_um: f64 },
+    #[error(
+        "grinding.path_tolerance_um = {found_um} cannot be written with the {decimals} decimals of a length in the dialect `{dialect}`; write a \
+         multiple of {step_um} um"
+    )]
+    ToleranceFine { dialect: String, found_um: f64, decimals: u8, step_um: f64 },
+    #[error(
+        "the dialect `{dialect}` writes {decimals} decimals, which moves points by up to {found_um:.3} um, and grinding.chord_error_um allows \
+         {limit_um} um; allow more, or have the control read more decimals and write them into a dialect of your own"
+    )]
+    Rounding { dialect: String, decimals: u8, found_um: f64, limit_um: f64 },
+    #[error(
+        "programs of the dialect `{dialect}` have the numbers {least} to {most} (program.numbers), and cycle {cycle} is beyond; give it more"
+    )]
+    Number { dialect: String, least: u32, most: u32, cycle: u16 },
+}
+
+/// A dialect that can say what a program asks for, and how it says how exactly to keep to the path.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Post<'a> {
+    /// The dialect.
+    pub dialect: &'a Dialect,
+    /// Lines before the moves and after them, which tell the path mode.
+    pub mode: [Vec<String>; 2],
+}
+
+/// How exactly a program is to be followed.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Exactness {
+    /// The path mode.
+    pub mode: PathMode,
+    /// How far corners may be rounded off with [`PathMode::Blend`], in millimetres.
+    pub tolerance_mm: f64,
+    /// How far the control rounds them off by a setting of its own, where that is known, in millimetres.
+    pub controller_mm: Option<f64>,
+    /// How far points may be from where they should be, in millimetres.
+    pub chord_error_mm: f64,
+}
+
+impl Dialect {
+    /// Returns what is written for a program that is to be followed so exactly.
+    ///
+    /// # Errors
+    /// A path mode without words, a tolerance that cannot be said and is not known to be kept, too few decimals.
+    pub fn post(&self, exactness: &Exactness) -> Result<Post<'_>, DialectError> {
+        let dialect = || self.dialect.name.clone();
+        let (mode, word, key) = match exactness.mode {
+            PathMode::Blend => (&self.path.blend, "blend", "blend"),
+            PathMode::ExactPath => (&self.path.exact_path, "exact-path", "exact_path"),
+            PathMode::ExactStop => (&self.path.exact_stop, "exact-stop", "exact_stop"),
+        };
+        let mode = mode.as_ref().ok_or_else(|| DialectError::Mode { dialect: dialect(), mode: word, key })?;
+        let decimals = self.numbers.decimals;
+        let step_mm = 10f64.powi(-i32::from(decimals));
+        if exactness.mode == PathMode::Blend {
+            self.check_tolerance(mode, exactness, step_mm)?;
+        }
+        // Each of three coordinates is off by half a step at most.
+        let (found_um, limit_um) = (1e3 * 0.5 * step_mm * 3f64.sqrt(), 1e3 * exactness.chord_error_mm);
+        if found_um > limit_um * (1.0 + 1e-9) {
+            return Err(DialectError::Rounding { dialect: dialect(), decimals, found_um, limit_um });
+        }
+        let tolerance = super::number::short(exactness.tolerance_mm);
+        let lines = |lines: &[String]| lines.iter().map(|line| line.replace(TOLERANCE, &tolerance)).collect();
+        Ok(Post { dialect: self, mode: [lines(&mode.begin), lines(&mode.end)] })
+    }
+
+    fn check_tolerance(&self, mode: &Mode, exactness: &Exactness, step_mm: f64) -> Result<(), DialectError> {
+        let says = mode.begin.iter().any(|line| line.contains(TOLERANCE));
+        let (dialect, limit_um) = (self.dialect.name.clone(), 1e3 * exactness.tolerance_mm);
+        match exactness.controller_mm {
+            None if !says => Err(DialectError::ToleranceUnknown { dialect }),
+            Some(mm) if !says && mm > exactness.tolerance_mm * (1.0 + 1e-9) => {
+                Err(DialectError::ToleranceWide { found_um: 1e3 * mm, limit_um })
+            }
+            _ => {
+                let steps = exactness.tolerance_mm / step_mm;
+                if says && ((steps - steps.round()).abs() > 1e-6 || steps < 0.5) {
+                    let (decimals, step_um) = (self.numbers.decimals, 1e3 * step_mm);
+                    return Err(DialectError::ToleranceFine { dialect, found_um: limit_um, decimals, step_um });
+                }
+                Ok(())
+            }
+        }
+    }
+
+    /// Returns the number of the program of a cycle, where programs have numbers.
+    ///
+    /// # Errors
+    /// A cycle beyond the last number.
+    pub fn number(&self, cycle: u16) -> Result<Option<u32>, DialectError> {
+        let Some([least, most]) = self.program.numbers else { return Ok(None) };
+        let number = least.saturating_add(u32::from(cycle.max(1)) - 1);
+        if number > most {
+            return Err(DialectError::Number { dialect: self.dialect.name.clone(), least, most, cycle });
+        }
+        Ok(Some(number))
+    }
+
+    /// Returns the name of the program of a part and a cycle: capital letters, digits and `_`, a letter first.
+    pub fn name(&self, part: &str, cycle: u16) -> String {
+        let plain = |c: char| if c.is_ascii_alphanumeric() { c.to_ascii_uppercase() } else { '_' };
+        let cycle = format!("_C{cycle}");
+        let room = self.program.longest_name.saturating_sub(cycle.len()).max(1);
+        let begins_plainly = part.starts_with(|c: char| c.is_ascii_alphabetic());
+        let part = if begins_plainly { part.to_owned() } else { format!("P{part}") };
+        part.chars().map(plain).take(room).collect::<String>() + &cycle
+    }
+
+    /// Returns what is wrong with it beyond what its schema holds it to.
+    pub fn faults(&self) -> Vec<Fault> {
+        let mut faults = Vec::new();
+        let mut fault = |key: &str, found: String, allowed, remedy| {
+            faults.push(Fault { key: key.to_owned(), found, allowed, remedy });
+        };
+        if let Some(blocks) =
+            self.blocks.as_ref().filter(|blocks| blocks.first.saturating_add(blocks.step) > blocks.last)
+        {
+            let found = format!("is {}, less than `first` and one `step`", blocks.last);
+            fault("blocks.last", found, "blocks must be told apart", "raise it");
+        }
+        if !self.dialect.extension.chars().all(|c| c.is_ascii_alphanumeric()) {
+            let found = format!("is {:?}", self.dialect.extension);
+            fault("dialect.extension", found, "letters and digits make an extension", "leave the point out");
+        }
+        let [x, y, z] = &self.words.axes;
+        if x == y || y == z || z == x {
+            fault("words.axes", format!("are {x}, {y} and {z}"), "each axis has a word of its own", "name three axes");
+        }
+        if (&self.words.rapid, &self.words.rapid_ends) == (&self.words.line, &String::new()) {
+            let found = format!("is {:?}, as `line` is", self.words.rapid);
+            fault("words.rapid", found, "a control must tell rapid moves from feeds", "correct one of them");
+        }
+        if let Some([least, most]) = self.program.numbers.filter(|[least, most]| least > most || *least == 0) {
+            fault(
+                "program.numbers",
+                format!("are {least} to {most}"),
+                "the first is the least, from 1 on",
+                "correct them",
+            );
+        }
+        let longest = self.longest_move();
+        if longest > self.text.longest_line {
+            let found = format!("is {}, and a move has up to {longest} characters", self.text.longest_line);
+            fault("text.longest_line", found, "a move is never divided", "raise it, or lower `numbers.largest_mm`");
+        }
+        for (key, line) in self.lines() {
+            if let Some((found, allowed, remedy)) = self.fault_of(&key, line) {
+                fault(&key, found, allowed, remedy);
+            }
+        }
+        faults
+    }
+
+    /// All fixed words and lines with their keys.
+    fn lines(&self) -> impl Iterator<Item = (String, &String)> {
+        let of = |key: &'static str, lines: &'static str| move |(k, line)| (format!("{key}{lines}[{k}]"), line);
+        let frame = &self.program;
+        let lists = [("program.begin", &frame.begin), ("program.setup", &frame.setup), ("program.end", &frame.end)];
+        let modes = [
+            ("path.blend", &self.path.blend),
+            ("path.exact_path", &self.path.exact_path),
+            ("path.exact_stop", &self.path.exact_stop),
+        ];
+        let words = [
+            ("text.comment_begins", &self.text.comment_begins),
+            ("text.comment_ends", &self.text.comment_ends),
+            ("words.rapid", &self.words.rapid),
+            ("words.rapid_ends", &self.words.rapid_ends),
+            ("words.line", &self.words.line),
+            ("words.between", &self.words.between),
+            ("words.feed", &self.words.feed),
+        ];
+        let of_modes =
+            modes.into_iter().filter_map(|(key, mode)| Some((key, mode.as_ref()?))).flat_map(move |(key, mode)| {
+                let begin = mode.begin.iter().enumerate().map(of(key, ".begin"));
+                begin.chain(mode.end.iter().enumerate().map(of(key, ".end")))
+            });
+        let of_lists = lists.into_iter().flat_map(move |(key, lines)| lines.iter().enumerate().map(of(key, "")));
+        words.into_iter().map(|(key, word)| (key.to_owned(), word)).chain(of_modes).chain(of_lists)
+    }
+
+    /// What is wrong with a fixed line.
+    fn fault_of(&self, key: &str, line: &str) -> Option<(String, &'static str, &'static str)> {
+        if !line.chars().all(|c| matches!(c, ' '..='~')) {
+            return Some((
+                format!("is {line:?}"),
+                "controls read plain characters on one line",
+                "write each line by itself",
+            ));
+        }
+        if line.len() > self.text.longest_line {
+            let found = format!("has {} characters", line.len());
+            return Some((found, "it must be no longer than text.longest_line", "shorten it"));
+        }
+        let bare = match key.starts_with("path.blend.begin") {
+            true => line.replace(TOLERANCE, ""),
+            false if key.starts_with("program.begin") || key.starts_with("program.end") => {
+                let numbered = self.program.numbers.is_some();
+                let line = line.replace(NAME, "");
+                if numbered { line.replace(NUMBER, "") } else { line }
+            }
+            false => line.to_owned(),
+        };
+        if bare.contains(['{', '}']) {
+            let allowed = "{name} and, beside program.numbers, {number} may stand in program.begin and program.end, {tolerance_mm} in path.blend.begin";
+            return Some((format!("is {line:?}"), allowed, "remove it"));
+        }
+        let other = line.to_ascii_uppercase().split_whitespace().find(|word| OTHER.contains(word)).map(str::to_owned);
+        other.map(|word| {
+            let allowed = "programs are written in mm, in mm/min and in absolute places";
+            (format!("has the word {word}"), allowed, "remove it")
+        })
+    }
+
+    /// The longest block that a move can be, in characters.
+    fn longest_move(&self) -> usize {
+        let words = &self.words;
+        let digits = |largest: f64| largest.log10().floor().max(0.0) as usize + 1;
+        let coordinate = digits(self.numbers.largest_mm) + 2 + usize::from(self.numbers.decimals);
+        let axes: usize = words.axes.iter().map(|axis| axis.len() + coordinate + words.between.len()).sum();
+        let feed = words.feed.len() + digits(1e6) + 1 + usize::from(self.numbers.feed_decimals);
+        let begins = words.rapid.len().max(words.line.len()) + words.rapid_ends.len();
+        let number = self.blocks.as_ref().map_or(0, |b| b.letter.len() + digits(f64::from(b.last)) + 1);
+        number + begins + axes + feed
+    }
+}
+
+/// What stands for something else in the lines of a dialect.
+pub(super) const NAME: &str = "{name}";
+pub(super) const NUMBER: &str = "{number}";
+const TOLERANCE: &str = "{tolerance_mm}";
+/// Words of inches, of places from the last one, of feeds by time or turn.
+const OTHER: [&str; 9] = ["G20", "G70", "G700", "G91", "G93", "G95", "G96", "G961", "INCH"];
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+
+    /// A dialect as it ships.
+    pub(in super::super) fn shipped(name: &str) -> Dialect {
+        let file = format!("{}/../../config/dialects/{name}.toml", env!("CARGO_MANIFEST_DIR"));
+        toml::from_str(&std::fs::read_to_string(file).unwrap()).unwrap()
+    }
+
+    fn exactly(mode: PathMode, tolerance_um: f64, controller_um: Option<f64>, chord_um: f64) -> Exactness {
+        let controller_mm = controller_um.map(|um| 1e-3 * um);
+        Exactness { mode, tolerance_mm: 1e-3 * tolerance_um, controller_mm, chord_error_mm: 1e-3 * chord_um }
+    }
+
+    #[test]
+    fn what_ships_is_without_faults() {
+        for name in ["linuxcnc", "fanuc", "sinumerik", "heidenhain"] {
+            let dialect = shipped(name);
+            assert_eq!((dialect.dialect.name.as_str(), dialect.faults()), (name, Vec::new()));
+        }
+    }
+
+    #[test]
+    fn faults_are_told_with_their_keys() {
+        let keys = |change: &dyn Fn(&mut Dialect)| {
+            let mut dialect = shipped("fanuc");
+            change(&mut dialect);
+            dialect.faults().into_iter().map(|fault| fault.key).collect::<Vec<_>>()
+        };
+        assert_eq!(keys(&|d| d.program.setup.push("G20 G90".into())), ["program.setup[2]"]);
+        assert_eq!(keys(&|d| d.program.setup.push("G54 {name}".into())), ["program.setup[2]"]);
+        assert_eq!(keys(&|d| d.program.begin.push("{tolerance_mm}".into())), ["program.begin[2]"]);
+        assert_eq!(keys(&|d| d.program.numbers = None), ["program.begin[1]"]);
+        assert_eq!(keys(&|d| d.program.numbers = Some([8, 7])), ["program.numbers"]);
+        assert_eq!(keys(&|d| d.words.rapid = d.words.line.clone()), ["words.rapid"]);
+        assert_eq!(keys(&|d| d.words.axes[1] = "X".into()), ["words.axes"]);
+        assert_eq!(keys(&|d| d.text.longest_line = 40), ["text.longest_line"]);
+        assert_eq!(keys(&|d| d.dialect.extension = ".nc".into()), ["dialect.extension"]);
+        assert_eq!(keys(&|d| d.path.blend.as_mut().unwrap().begin.push("G5\n".into())), ["path.blend.begin[1]"]);
+        assert_eq!(keys(&|d| d.blocks = Some(Blocks { last: 15, ..Blocks::default() })), ["blocks.last"]);
+    }
+
+    #[test]
+    fn what_cannot_be_said_is_refused() {
+        let [linuxcnc, fanuc, heidenhain] = ["linuxcnc", "fanuc", "heidenhain"].map(shipped);
+        let blend = PathMode::Blend;
+        assert_eq!(linuxcnc.post(&exactly(blend, 0.1, None, 0.1)).unwrap().mode[0], ["G64 P0.0001 Q0"]);
+        assert!(matches!(fanuc.post(&exactly(blend, 0.1, None, 0.1)), Err(DialectError::ToleranceUnknown { .. })));
+        assert!(matches!(fanuc.post(&exactly(blend, 0.1, Some(1.0), 0.1)), Err(DialectError::ToleranceWide { .. })));
+        assert!(fanuc.post(&exactly(blend, 1.0, Some(1.0), 0.1)).is_ok());
+        assert!(matches!(
+            fanuc.post(&exactly(PathMode::ExactPath, 0.1, None, 0.1)),
+            Err(DialectError::Mode { mode: "exact-path", .. })
+        ));
+        assert!(fanuc.post(&exactly(PathMode::ExactStop, 0.1, None, 0.1)).is_ok());
+        let fine = heidenhain.post(&exactly(blend, 0.25, None, 0.1));
+        assert!(matches!(fine, Err(DialectError::ToleranceFine { step_um, .. }) if (step_um - 0.1).abs() < 1e-12));
+        let coarse = heidenhain.post(&exactly(blend, 0.1, None, 0.05));
+        assert!(matches!(coarse, Err(DialectError::Rounding { decimals: 4, .. })));
+    }
+
+    #[test]
+    fn names_and_numbers_are_those_that_a_control_takes() {
+        let fanuc = shipped("fanuc");
+        assert_eq!(fanuc.name("free-form mirror", 2), "FREE_FORM_MIR_C2");
+        assert_eq!(fanuc.name("7 \u{e9}", 65_535), "P7___C65535");
+        assert_eq!(
+            [fanuc.number(0), fanuc.number(1), fanuc.number(999)],
+            [Ok(Some(7001)), Ok(Some(7001)), Ok(Some(7999))]
+        );
+        assert!(matches!(fanuc.number(1000), Err(DialectError::Number { cycle: 1000, .. })));
+        assert_eq!(shipped("sinumerik").number(1), Ok(None));
+    }
+}

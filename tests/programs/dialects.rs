@@ -1,0 +1,117 @@
+//! Programs in every dialect, read back by controls that share nothing with who wrote them: the simulator's, from what their makers say.
+
+use std::path::Path;
+
+use crate::path::{Part, ProgramStep, correction, part, truth, with};
+use crate::sweep::{clearance, places};
+use regrind::compensation::path::{Move, PathMode, Wheel};
+use regrind::config::read_dialect;
+use regrind::formats::gcode::Dialect;
+use regrind_sim::program::{Control, Program};
+
+const DIALECTS: [&str; 4] = ["linuxcnc", "fanuc", "sinumerik", "heidenhain"];
+/// What a touching place may be off in a program whose points are whole, in millimetres.
+const WITHIN_MM: f64 = 2e-4;
+
+fn dialect(name: &str) -> Dialect {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("config/dialects/{name}.toml"));
+    read_dialect(&file).unwrap_or_else(|problems| panic!("{problems}")).0
+}
+
+/// Writes the program of a part in a dialect, and has its control read it.
+fn read_back(part: &mut Part, name: &str) -> (Program, String) {
+    part.programs.dialect = dialect(name);
+    part.programs.controller_tolerance_mm = Some(part.programs.path_tolerance_mm);
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("part");
+    part.programs.write(&file, &correction(part.half_mm), [0xa5; 32]).unwrap();
+    let text = std::fs::read_to_string(file).unwrap();
+    let program = Control::named(name).unwrap().read(&text).unwrap_or_else(|why| panic!("{name}: {why}"));
+    (program, text)
+}
+
+/// Half of the last digit that a dialect writes.
+fn half_a_step_mm(name: &str) -> f64 {
+    0.5 * 10f64.powi(-i32::from(dialect(name).numbers.decimals))
+}
+
+#[test]
+fn every_control_reads_the_path_of_the_plan_to_half_of_the_last_digit() {
+    for name in DIALECTS {
+        let mut part = part("freeform-mirror");
+        part.programs.options = with(&part.programs.options, Wheel::Sphere { radius_mm: 12.5 }, 4.0);
+        let (program, text) = read_back(&mut part, name);
+        let (path, summary) = part.programs.path(&correction(part.half_mm)).unwrap();
+        assert_eq!(program.stops.len() as u64, summary.moves, "{name}");
+        let mut at = [f64::NAN; 3];
+        for (planned, stop) in path.moves().zip(&program.stops) {
+            let feed = match planned {
+                Move::RapidZ(z) => {
+                    at[2] = z;
+                    None
+                }
+                Move::RapidXy([x, y]) => {
+                    (at[0], at[1]) = (x, y);
+                    None
+                }
+                Move::Feed { at: to, feed_mm_min } => {
+                    at = to.into();
+                    Some(feed_mm_min)
+                }
+            };
+            let off = (0..3).filter(|k| !at[*k].is_nan()).map(|k| (at[k] - stop.at_mm[k]).abs()).fold(0.0, f64::max);
+            assert!(off < half_a_step_mm(name) * (1.0 + 1e-6) && stop.feed_mm_min == feed, "{name}: {at:?} {stop:?}");
+        }
+        assert_eq!(program.tolerance_mm, (name != "fanuc").then_some(part.programs.path_tolerance_mm), "{name}");
+        let says = |words: &str| program.comments.iter().any(|comment| comment.to_ascii_lowercase() == words);
+        assert!(says(&format!("map: sha256 {}", "a5".repeat(32))) && says("simulation"), "{name}");
+        assert!(text.lines().all(|line| line.len() <= dialect(name).text.longest_line), "{name}");
+    }
+}
+
+#[test]
+fn the_wheel_that_follows_what_a_control_has_read_leaves_the_corrected_surface() {
+    for name in DIALECTS {
+        let mut part = part("freeform-mirror");
+        let wheel = Wheel::Sphere { radius_mm: 12.5 };
+        part.programs.options = with(&part.programs.options, wheel, 4.0);
+        let (program, _) = read_back(&mut part, name);
+        let steps: Vec<ProgramStep> =
+            program.stops.iter().map(|s| ProgramStep { at: s.at_mm, feed: s.feed_mm_min.is_some() }).collect();
+        let track_mm = part.programs.path(&correction(part.half_mm)).unwrap().0.track_mm();
+        for place in places(&part, track_mm, 0.0) {
+            let off = clearance(&wheel, &steps, truth(&part, 0.02, place));
+            assert!(off.abs() < WITHIN_MM + 2.0 * half_a_step_mm(name), "{name}, {place:?}: {:.3} um", 1e3 * off);
+        }
+    }
+}
+
+#[test]
+fn every_path_mode_of_every_dialect_is_one_that_its_control_keeps_to_the_path_in() {
+    for name in DIALECTS {
+        let mut part = part("shallow-wave");
+        part.programs.options = with(&part.programs.options, part.programs.options.wheel, 20.0);
+        for mode in [PathMode::Blend, PathMode::ExactPath, PathMode::ExactStop] {
+            part.programs.mode = mode;
+            part.programs.dialect = dialect(name);
+            part.programs.controller_tolerance_mm = Some(part.programs.path_tolerance_mm);
+            if part.programs.check_dialect().is_ok() {
+                assert!(!read_back(&mut part, name).0.stops.is_empty());
+            } else {
+                assert!(mode == PathMode::ExactPath && name != "linuxcnc" || name == "heidenhain", "{name} {mode:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_control_does_not_read_what_is_written_for_another() {
+    let mut part = part("shallow-wave");
+    part.programs.options = with(&part.programs.options, part.programs.options.wheel, 20.0);
+    for name in DIALECTS {
+        let (_, text) = read_back(&mut part, name);
+        for other in DIALECTS.into_iter().filter(|other| *other != name) {
+            assert!(Control::named(other).unwrap().read(&text).is_err(), "{other} reads {name}");
+        }
+    }
+}

@@ -1,0 +1,43 @@
+//! Whole parts whose grinder works by programs in a folder, each in the dialect of another control.
+
+use std::fs;
+
+use crate::program::{changed, run, small_recipe};
+
+/// Makes the small mirror in a simulated cell whose control finds its programs in a folder.
+fn made(dialect: &str, more: &str) -> (tempfile::TempDir, i32, String, String) {
+    let home = tempfile::tempdir().unwrap();
+    fs::create_dir(home.path().join("programs")).unwrap();
+    let program =
+        format!("[grinder.program]\ndialect = \"{dialect}\"\nfolder = \"programs\"\n{more}\n[grinder.limits]");
+    fs::write(home.path().join("cell.toml"), changed("config/sim.toml", &[("[grinder.limits]", &program)])).unwrap();
+    let recipe = small_recipe(home.path(), 1e4).display().to_string();
+    let (code, said, errors) = run(&["run", &recipe, "--cell", "cell.toml", "--runs", "runs", "--loaded"], home.path());
+    (home, code, said, errors)
+}
+
+#[test]
+fn a_part_is_ground_by_the_programs_of_every_dialect_until_it_is_accepted() {
+    for (dialect, extension, more) in
+        [("fanuc", "nc", "controller_tolerance_um = 0.1"), ("sinumerik", "mpf", ""), ("heidenhain", "h", "")]
+    {
+        let (home, code, said, errors) = made(dialect, more);
+        assert_eq!(code, 0, "{dialect}: {said}{errors}");
+        assert!(said.contains("SIMULATION  ACCEPTED"), "{dialect}: {said}");
+        let there = fs::read_dir(home.path().join("programs")).unwrap().map(|entry| entry.unwrap().path());
+        let programs: Vec<_> = there.filter(|file| file.extension().is_some_and(|e| e == extension)).collect();
+        // One for each pass.
+        assert!(programs.len() >= 2, "{dialect}: {programs:?}");
+        let kept = fs::read_dir(home.path().join("runs")).unwrap().next().unwrap().unwrap().path();
+        let of_first = fs::read(kept.join(format!("cycle-0/toolpath.{extension}"))).unwrap();
+        assert!(programs.iter().any(|file| fs::read(file).unwrap() == of_first), "{dialect}");
+    }
+}
+
+#[test]
+fn what_a_dialect_cannot_say_is_refused_before_anything_moves() {
+    let (home, code, said, errors) = made("fanuc", "");
+    assert_eq!(code, 2, "{said}{errors}");
+    assert!(errors.contains("grinder.program.controller_tolerance_um"), "{errors}");
+    assert!(!home.path().join("runs").exists() && fs::read_dir(home.path().join("programs")).unwrap().next().is_none());
+}
