@@ -410,6 +410,12 @@ pub struct CompensationSummary {
     pub response: f64,
     /// What else a person should know.
     pub warnings: Vec<String>,
+    /// Parameters of the machine that are taken back beside the map, in words.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub parameters: Vec<String>,
+    /// What of them a person is to agree to first, in words: more than the recipe's tolerance.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub asks: Vec<String>,
 }
 
 /// Why there is no next map.

@@ -132,7 +132,8 @@ impl Show {
                     three_digits(1e3 * summary.predicted_pv_mm),
                     three_digits(1e3 * summary.predicted_rms_mm)
                 ))?;
-                summary.warnings.iter().try_for_each(|warning| self.line(&format!("cycle {cycle}: {warning}")))
+                let said = summary.parameters.iter().chain(&summary.warnings);
+                said.into_iter().try_for_each(|said| self.line(&format!("cycle {cycle}: {said}")))
             }
             // It is on record each time; a person has seen it.
             Notice::Alarm(alarm) if self.alarms.get(&alarm.id) == Some(&alarm.what) => Ok(()),

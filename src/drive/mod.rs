@@ -68,7 +68,8 @@ use station::{
     StationReport,
 };
 use task::Product;
-pub use task::{Adaptive, Probing, Sphere, Task};
+pub(crate) use task::correction_grid;
+pub use task::{Adaptive, Probing, Sphere, TakenBack, Task};
 
 /// Everything a run needs besides its machines.
 pub struct Run {
