@@ -32,7 +32,7 @@ mod table;
 pub use alarm::{Alarm, AlarmId, Role};
 pub use command::{Command, Ending, Judgement, Verdict};
 pub use event::{
-    Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Forecast, FormFigures, Gate,
+    Actor, Asked, CompensationRefusal, CompensationSummary, ParameterTold, Condition, Event, Figures, Forecast, FormFigures, Gate,
     GateFailure, JobResult, Mismatch, Occupation, Reconciliation, RecordFailure, Response, TouchOn,
 };
 pub use figure::Interval;

@@ -132,8 +132,13 @@ impl Show {
                     three_digits(1e3 * summary.predicted_pv_mm),
                     three_digits(1e3 * summary.predicted_rms_mm)
                 ))?;
-                let said = summary.parameters.iter().chain(&summary.warnings);
-                said.into_iter().try_for_each(|said| self.line(&format!("cycle {cycle}: {said}")))
+                for told in &summary.parameters {
+                    self.line(&format!("cycle {cycle}: {}", told.in_words()))?;
+                }
+                if let Some(mm) = summary.map_rms_mm {
+                    self.line(&format!("cycle {cycle}: left for the map: {} um rms", three_digits(1e3 * mm)))?;
+                }
+                summary.warnings.iter().try_for_each(|warning| self.line(&format!("cycle {cycle}: {warning}")))
             }
             // It is on record each time; a person has seen it.
             Notice::Alarm(alarm) if self.alarms.get(&alarm.id) == Some(&alarm.what) => Ok(()),

@@ -880,7 +880,7 @@ impl Drive {
         let number = judgement.cycle;
         let cycle = self.cycles.get(number);
         let judged = cycle.and_then(|c| c.figures.as_ref()).map(|figures| self.cell.plan().tolerance.compare(figures));
-        let result = json!({
+        let mut result = json!({
             "simulation": self.task.simulation,
             "cycle": number,
             "verdict": judgement.verdict,
@@ -889,6 +889,9 @@ impl Drive {
             "judged": judged.map(|judged| judged.map(|of| judged_of(&of))),
             "level_mm": cycle.map(|c| c.correction.level_mm),
         });
+        if self.task.parameters.is_some() {
+            result["parameters"] = json!(cycle.map(|cycle| work::parameters_told(&self.task, cycle)));
+        }
         self.leave(format!("{}/result.json", folder_of(number, which)), number, &result).await;
     }
 

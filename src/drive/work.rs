@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::cell::{
     CompensationRefusal, CompensationSummary, Event, Figures, Forecast, FormFigures, Gate, GateFailure, Interval,
-    Response, TouchOn,
+    ParameterTold, Response, TouchOn,
 };
 use crate::compensation::{self, Correction, ErrorMap, LearningState, NextPassError, Seen, Sense, error_map, response};
 use crate::device::{Coordinates, Identified, Measurement, Plan, PointStatus, TargetKind};
@@ -26,7 +26,6 @@ use crate::model::{self, Form, Given, Hyper, Lesson, Priors, Taught};
 use crate::registration::{Options, PointStatus as Fate, Registration, Verdict, weak_for_compensation};
 
 use super::maps;
-use super::program::set_in_words;
 use super::record::{Files, Unfinished, unfinished};
 use super::task::{Cycle, Points, Product, Registered, Task, readings, used};
 use super::touches;
@@ -557,10 +556,35 @@ fn compensated(
         gains: known.gains(),
         response: known.response()[0],
         warnings: warning.into_iter().collect(),
-        parameters: set_in_words(&step.correction, task.pass.wheel_radius_mm),
+        map_rms_mm: task.parameters.as_ref().map(|_| rms(&step.correction.values_mm)),
+        parameters: parameters_told(task, cycle),
         asks: asks(cycle),
     };
     Ok((summary, step.correction))
+}
+
+/// What was told of the parameters that the recipe has taken back; nothing after the first pass, when they stand.
+pub(super) fn parameters_told(task: &Task, cycle: &Cycle) -> Vec<ParameterTold> {
+    let Some(taken) = &task.parameters else { return Vec::new() };
+    let told = cycle.parameters.iter().flat_map(|told| told.found.iter().enumerate());
+    let wanted = told.filter(|(k, p)| taken.tolerances[*k].is_some() && p.alike.is_empty());
+    let told = |(k, p): (usize, &compensation::Parameter)| {
+        let units = p.kind.units();
+        ParameterTold {
+            name: p.kind.name().to_owned(),
+            unit: p.kind.unit().to_owned(),
+            off: units * p.value,
+            expanded: 2.0 * units * p.sigma,
+            taken: units * p.taken,
+            told: units * cycle.set.as_ref().map_or(0.0, |set| set.values[k]),
+            removes_rms_um: 1e3 * p.removes_rms_mm,
+        }
+    };
+    wanted.map(told).collect()
+}
+
+fn rms(values: &[f64]) -> f64 {
+    (values.iter().map(|v| v * v).sum::<f64>() / values.len().max(1) as f64).sqrt()
 }
 
 /// What a person is to agree to before the next pass: parameters that are further off than the recipe's tolerance of them.

@@ -136,7 +136,7 @@ pub struct Seen<'a> {
 }
 
 /// Tells what of values at the nodes of the correction is that of parameters and slides of the machine.
-pub type Smoother<'a> = &'a dyn Fn(&[f64]) -> Vec<f64>;
+pub type Smoother<'a> = &'a (dyn Fn(&[f64]) -> Vec<f64> + Sync);
 
 impl LearningState {
     /// Knows nothing yet. `repeatability_mm` is the rms of what a pass adds by itself, where that is known from elsewhere; it is shared out
