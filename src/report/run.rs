@@ -15,7 +15,7 @@ use super::maps::{maps, within_html};
 use super::means::{last_model, last_registration, means, registered, signatures};
 use super::story::{Measurement, Story};
 use super::words::{alarm_words, ending_words, home_words, judgement_words, role_words, verdict_words};
-use regrind_cell::{ParameterTold, Compared, Conformity, Ending, Figures, Tolerance};
+use regrind_cell::{Compared, Conformity, Ending, Figures, ParameterTold, Tolerance};
 use regrind_formats::{escaped, write_atomic};
 use regrind_journal::{Record, Verified};
 
@@ -262,8 +262,9 @@ fn parameters(story: &Story) -> String {
     }
     let told = story.cycles.iter().filter(|(_, cycle)| !cycle.parameters.is_empty());
     let left = told.filter_map(|(number, cycle)| Some((number, cycle.map_rms_mm?)));
-    let left: String =
-        left.map(|(number, mm)| format!("<p>Left for the map after cycle {number}: {} um rms.</p>\n", um(mm))).collect();
+    let left: String = left
+        .map(|(number, mm)| format!("<p>Left for the map after cycle {number}: {} um rms.</p>\n", um(mm)))
+        .collect();
     format!(
         "<h3>Parameters of the machine</h3>\n<table id=\"parameters\">\n<tr><th class=\"n\">cycle</th><th>parameter</th>\
          <th class=\"n\">off by</th><th class=\"n\">taken back</th><th class=\"n\">told to the next pass</th>\

@@ -8,7 +8,7 @@ use serde_json::Value;
 use super::ReportError;
 use super::told::Told;
 use super::words::{gate_words, words};
-use regrind_cell::{ParameterTold, Alarm, Command, Ending, Event, Figures, Gate, Judgement, Tolerance};
+use regrind_cell::{Alarm, Command, Ending, Event, Figures, Gate, Judgement, ParameterTold, Tolerance};
 use regrind_journal::{Reader, Record, Verified, verify};
 
 /// The map of a cycle's error, as text.

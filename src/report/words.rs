@@ -226,7 +226,11 @@ fn event_words(event: &Event) -> String {
             1e3 * summary.depth_mm,
             100.0 * summary.air_share,
             1e3 * summary.predicted_pv_mm,
-            parameters_words(summary).iter().chain(&summary.warnings).map(|said| format!("; {said}")).collect::<String>()
+            parameters_words(summary)
+                .iter()
+                .chain(&summary.warnings)
+                .map(|said| format!("; {said}"))
+                .collect::<String>()
         ),
         Event::CompensationRefused { why, .. } => match why {
             CompensationRefusal::BudgetSpent(words) | CompensationRefusal::Failed(words) => words.clone(),

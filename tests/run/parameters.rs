@@ -4,9 +4,12 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use rayon::prelude::*;
 use serde_json::Value;
 
 use crate::program::{changed, root, run};
+use crate::study::told_apart::Compared;
+use crate::study::{After, Bench};
 
 /// A good machine with a wheel that is larger by 0.4 mm, and a part of which no more than 1.6 touches lie on the square centimetre.
 const GRINDER: &str = "[simulation.grinder]\nwheel_radius_error_um = 400.0\nstraightness_x_um = [0.2, -0.2]\nstraightness_y_um = [-0.2, 0.1]\n\
@@ -67,4 +70,19 @@ fn a_wheel_that_is_larger_is_taken_back_as_such_in_a_whole_run() {
     });
     let [alone, with] = told;
     assert!(with.len() < alone.len() || with[1] < 0.7 * alone[1], "{with:?} beside {alone:?}");
+}
+
+/// A few worlds; `cargo run --release --example parameters` draws two hundred.
+#[test]
+fn what_is_told_of_a_few_worlds_holds_and_saves() {
+    let bench = Bench::new("freeform-mirror").held([false; 6]);
+    let made: Vec<Compared> = (1..=6).into_par_iter().map(|seed| bench.told_apart(seed, 2)).collect();
+    let within = made.iter().flat_map(|world| &world.told).filter(|told| told.off.abs() <= 1.0).count();
+    let over = |of: fn(&Compared) -> &Vec<After>| {
+        let sum = |f: fn(&After) -> f64| made.iter().map(|world| f(&of(world)[1]).powi(2)).sum::<f64>();
+        (sum(|a| a.rms_um) / sum(|a| a.floor_um)).sqrt()
+    };
+    let [with, alone] = [over(|world| &world.with), over(|world| &world.alone)];
+    println!("within U: {within} of 6; over the floor {with:.2}, by the map alone {alone:.2}");
+    assert!(within >= 5 && with < 1.2 && with < 0.95 * alone, "{within} of 6, {with} and {alone}");
 }

