@@ -107,7 +107,7 @@ fn correction(bencher: Bencher, spacing_mm: f64) {
     let error = error_map(&READINGS, &options).expect("a map");
     let now = Correction::none(error.grid, 0.06);
     let begin = LearningState::new(GainRule::Wavelength, &options, [FreeForm::WIDTH_MM, FreeForm::DEPTH_MM], None);
-    let seen = Seen { correction: &now, error: &error, answer: None };
+    let seen = Seen { correction: &now, error: &error, answer: None, smooth: None };
     let known = begin.after(&seen);
     let limits = CorrectionLimits {
         depth_of_cut_mm: 0.01,
@@ -117,7 +117,7 @@ fn correction(bencher: Bencher, spacing_mm: f64) {
         removal_budget_mm: 1.0,
         largest_depth_mm: 1.0,
     };
-    bencher.bench(|| now.next(&error, &black_box(&known).after(&seen), &limits).expect("a correction"));
+    bencher.bench(|| now.next(&error, &black_box(&known).after(&seen), None, &limits).expect("a correction"));
 }
 
 /// Wheel, setting and wear told from form.

@@ -30,7 +30,7 @@ fn sizes() -> Vec<u64> {
 fn path(points: u64) -> ToolPath {
     let grid = Grid { columns: 101, rows: 61, first_mm: [-50.0, -30.0], spacing_mm: [1.0, 1.0] };
     let values_mm = (0..grid.len()).map(|k| error_mm(grid.place_mm(k))).collect();
-    path_of(nominal(), &Correction { grid, values_mm, cycle: 2, level_mm: 0.02 }, points)
+    path_of(nominal(), &Correction { grid, values_mm, cycle: 2, level_mm: 0.02, set: None }, points)
 }
 
 /// What the grinder left, in millimetres.
@@ -101,6 +101,7 @@ fn write(path: &ToolPath, summary: &Summary, file: &Path) {
         uncorrected: false,
         level_mm: 0.02,
         wheel: path.options().wheel.description(),
+        parameters: Vec::new(),
         tracks: String::new(),
         spark_out_passes: 0,
         simulation: true,
@@ -132,8 +133,8 @@ fn from_deviations_to_a_program(bencher: Bencher) {
     bencher.bench(|| {
         let error = error_map(black_box(&readings), &options).expect("a map");
         let now = Correction::none(error.grid, 0.06);
-        let known = begin.after(&Seen { correction: &now, error: &error, answer: None });
-        let step = now.next(&error, &known, &limits).expect("a correction");
+        let known = begin.after(&Seen { correction: &now, error: &error, answer: None, smooth: None });
+        let step = now.next(&error, &known, None, &limits).expect("a correction");
         let path = path_of(nominal(), &step.correction, 1_000_000);
         write(&path, &path.summary().expect("a path"), &file);
     });

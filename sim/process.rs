@@ -54,12 +54,17 @@ impl GrinderSpec {
         let [half_x, half_y] = part.aperture.half_mm();
         let [p, q] = part.shape.gradient(x, y);
         let nz = 1.0 / (1.0 + p * p + q * q).sqrt();
-        let setting = nz * (p * self.setting_error_um[0] + q * self.setting_error_um[1]);
+        let [ex, ey] = self.setting_error_um;
+        let setting = nz * (p * ex + q * ey + self.setting_error_z_um);
+        // What is ground into a part that is tilted by a about a point of its frame is turned back by it: -a . (r x n), n = nz (-p, -q, 1).
+        let z = part.shape.height(x, y);
+        let [about_x, about_y] = self.part_tilt_urad.map(|tilt| 1e-3 * tilt);
+        let tilt = -nz * (about_x * (y + q * z) - about_y * (x + p * z));
         let straight =
             |t: f64, [second, third]: [f64; 2]| second * (1.5 * t * t - 0.5) + third * (2.5 * t * t * t - 1.5 * t);
         let straightness = straight(x / half_x, self.straightness_x_um) + straight(y / half_y, self.straightness_y_um);
         let screw = self.periodic_um * (std::f64::consts::TAU * x / self.periodic_pitch_mm + 0.7).sin();
-        finite_or_zero(setting + straightness + screw)
+        finite_or_zero(setting + tilt + straightness + screw)
     }
 
     /// Returns the wear of the wheel after so many finishing strokes since it was dressed, in micrometres.

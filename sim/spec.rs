@@ -18,6 +18,10 @@ pub struct GrinderSpec {
     pub wheel_radius_error_um: f64,
     /// Offset of the wheel in x and y.
     pub setting_error_um: [f64; 2],
+    /// By how much the wheel is set too high.
+    pub setting_error_z_um: f64,
+    /// By how much the part is tilted in the grinder about x and y of its own frame.
+    pub part_tilt_urad: [f64; 2],
     /// Straightness along x: amplitudes of the second and third Legendre polynomial over the part.
     pub straightness_x_um: [f64; 2],
     /// The same along y.
@@ -65,6 +69,8 @@ impl Default for GrinderSpec {
         Self {
             wheel_radius_error_um: 90.0,
             setting_error_um: [12.0, -9.0],
+            setting_error_z_um: 0.0,
+            part_tilt_urad: [0.0; 2],
             straightness_x_um: [-6.0, -4.5],
             straightness_y_um: [-4.5, -3.0],
             periodic_um: 0.4,
@@ -95,6 +101,8 @@ impl GrinderSpec {
         Self {
             wheel_radius_error_um: 0.0,
             setting_error_um: [0.0; 2],
+            setting_error_z_um: 0.0,
+            part_tilt_urad: [0.0; 2],
             straightness_x_um: [0.0; 2],
             straightness_y_um: [0.0; 2],
             periodic_um: 0.0,
@@ -345,6 +353,8 @@ impl WorldSpec {
         let signed = [
             ("grinder.wheel_radius_error_um", &[g.wheel_radius_error_um][..]),
             ("grinder.setting_error_um", &g.setting_error_um),
+            ("grinder.setting_error_z_um", &[g.setting_error_z_um]),
+            ("grinder.part_tilt_urad", &g.part_tilt_urad),
             ("grinder.straightness_x_um", &g.straightness_x_um),
             ("grinder.straightness_y_um", &g.straightness_y_um),
             ("grinder.periodic_um", &[g.periodic_um]),

@@ -14,10 +14,10 @@ use crate::cell::{CellPlan, Deadlines, Device, Disposal, Gates, Tolerance};
 use crate::compensation::path::{
     Field, Limits, PathError, PathOptions, Scallops, TrackSpacing, Wanted, Wheel as PathWheel,
 };
-use crate::compensation::{Correction, CorrectionLimits, MapOptions, contact_width_mm};
+use crate::compensation::{Contact, Correction, CorrectionLimits, MapOptions, WheelTerm, contact_width_mm};
 use crate::config::{CellConfig, Link};
 use crate::device::{AnyCmm, AnyGrinder, Line, Making, MakingError, ModbusSettings, Pass, hex};
-use crate::drive::{Adaptive, Probing, Programs, Sphere, Task};
+use crate::drive::{Adaptive, Probing, Programs, Sphere, TakenBack, Task, correction_grid};
 use crate::formats::gcode::DialectError;
 use crate::formats::{self, FormatError, NominalFile};
 use crate::geometry::{Aperture, Grid, Point, Vector};
@@ -107,6 +107,8 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
     }
     let ground = ground(recipe, &nominal);
     let (track_mm, scallops) = tracks(recipe, &nominal, &ground)?;
+    let parameters = taken_back(recipe, cell, &ground, &nominal)?;
+    let datum = datum(recipe, &nominal);
     let programs = ground.map(|ground| programs(recipe, cell, &nominal, part_identity, (ground, track_mm)));
     if let Ok(programs) = &programs {
         let said = |source| SetupError::Dialect { recipe: recipe.path().into(), cell: cell.path().into(), source };
@@ -132,6 +134,8 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         registration: recipe.registration_options(cell.cmm.fixture_cmm_from_model),
         start_at_fixture: recipe.registration.start == StartAt::Fixture,
         coordinates: cell.cmm.link.wire.coordinates(),
+        parameters,
+        datum,
         place: MapLimits { place_mm: recipe.compensation.largest_displacement_mm, ..MapLimits::default() },
         map: map_options(recipe),
         gain: recipe.compensation.gain(),
@@ -165,6 +169,33 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         plan.deadlines.transfer = plan.deadlines.transfer.max(transfer_within(link, bytes));
     }
     Ok((task, plan))
+}
+
+/// Which parameters of the machine are taken back, with the surface under the nodes of a correction.
+fn taken_back(
+    recipe: &Recipe,
+    cell: &CellConfig,
+    ground: &Result<Ground, PathError>,
+    nominal: &Nominal,
+) -> Result<Option<TakenBack>, SetupError> {
+    let Some(parameters) = &recipe.compensation.parameters else { return Ok(None) };
+    let (field, _) = ground
+        .as_ref()
+        .map_err(|source| SetupError::Tracks { recipe: recipe.path().to_owned(), source: source.clone() })?;
+    let Pass { x_mm, y_mm, .. } = pass(recipe, nominal, [0; 32], 1.0);
+    let grid = correction_grid([x_mm, y_mm], recipe.compensation.spacing_mm);
+    // A program moves the centre of the wheel along the normals; a grinder with a path of its own is guided in height.
+    let is_program = cell.grinder.link.wire.works_from_run();
+    let wheel_term = if is_program { WheelTerm::AlongNormal } else { WheelTerm::InHeight };
+    Ok(Some(TakenBack { tolerances: parameters.tolerances(), wheel_term, nodes: Contact::under(field, &grid) }))
+}
+
+/// Standard uncertainty of where the fixture holds the part, and of how it is turned: as much at its edge.
+fn datum(recipe: &Recipe, nominal: &Nominal) -> Option<[f64; 2]> {
+    let Pass { x_mm, y_mm, .. } = pass(recipe, nominal, [0; 32], 1.0);
+    let half_mm = [x_mm, y_mm].map(|[low, high]| 0.5 * (high - low));
+    let shift_mm = 0.5 * recipe.registration.hold_uncertainty_um?.mm();
+    Some([shift_mm, shift_mm / half_mm[0].max(half_mm[1])])
 }
 
 /// What a measurement goes by whose touches are chosen.

@@ -302,6 +302,6 @@ fn what_was_learned() -> Learned {
     let correction = Correction::none(grid, 0.05);
     let error = ErrorMap::known(grid, (0..grid.len()).map(|k| 1e-3 * k as f64).collect(), vec![true; grid.len()]);
     let begin = LearningState::new(GainRule::Wavelength, &MapOptions::new(1.0, 1.0), [4.0, 3.0], None);
-    let known = begin.after(&Seen { correction: &correction, error: &error, answer: None });
-    Learned::new(true, "a part".into(), "run-1".into(), correction.changed(&known), known)
+    let known = begin.after(&Seen { correction: &correction, error: &error, answer: None, smooth: None });
+    Learned::new(true, "a part".into(), "run-1".into(), correction.changed(&known, None), known)
 }

@@ -269,6 +269,14 @@ catalogue! {
         "There is no map for the next pass", "No further pass is ground.", ProcessEngineer,
         ["Read the reason and the figures of this cycle.", "Resume to compute again, or stop the run."]
     }
+    /// A parameter of the machine.
+    ParameterBeyond {
+        "A parameter of the machine is further off than the recipe's tolerance of it",
+        "The next pass is not begun before somebody agrees: it would be ground with that parameter corrected.", ProcessEngineer,
+        ["Measure it by other means: the radius of the wheel by its profile or a touch on a reference, the setting and the part by an indicator.",
+         "Is it so, resume: the next pass is ground with it, and the map is what is left.",
+         "Is it not, stop the run, correct the recipe or the machine, and begin a new run; without the key in compensation.parameters all goes into the map."]
+    }
     /// Sign.
     SignFlipped {
         "The part answered to the map the other way round", "Another pass would make it worse; the cell is held.", ProcessEngineer,

@@ -410,6 +410,46 @@ pub struct CompensationSummary {
     pub response: f64,
     /// What else a person should know.
     pub warnings: Vec<String>,
+    /// Parameters of the machine that the recipe has taken back beside the map, as far as they are told.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub parameters: Vec<ParameterTold>,
+    /// Root mean square of what is left for the map, where parameters are taken back beside it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub map_rms_mm: Option<f64>,
+    /// What of them a person is to agree to first, in words: more than the recipe's tolerance.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub asks: Vec<String>,
+}
+
+/// What a measurement told of a parameter of the machine, and what of it is taken back.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ParameterTold {
+    /// What it is called.
+    pub name: String,
+    /// The unit of all its values.
+    pub unit: String,
+    /// How far it is off, beside what the pass was told of it already.
+    pub off: f64,
+    /// The expanded uncertainty of that (k = 2).
+    pub expanded: f64,
+    /// What of it is taken back.
+    pub taken: f64,
+    /// How far the next pass is told that it is off what the recipe states, in all.
+    pub told: f64,
+    /// By how much the root mean square falls by it, in micrometres.
+    pub removes_rms_um: f64,
+}
+
+impl ParameterTold {
+    /// For people.
+    pub fn in_words(&self) -> String {
+        let Self { name, unit, off, expanded, taken, told, removes_rms_um } = self;
+        let found = format!("{name}: off by {off:.2} \u{b1} {expanded:.2} {unit}");
+        if *taken == 0.0 && *told == 0.0 {
+            return format!("{found}, no clear error: left to the map");
+        }
+        format!("{found}, {taken:.2} {unit} taken back ({told:.2} in all), which removes {removes_rms_um:.2} um rms")
+    }
 }
 
 /// Why there is no next map.

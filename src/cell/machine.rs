@@ -270,9 +270,14 @@ impl Cell {
                 self.raise_record_failed(why);
                 self.go(Held(p));
             }
-            (Execute(Compensate) | Holding(Compensate), Event::Compensated { .. }) => {
+            (Execute(Compensate) | Holding(Compensate), Event::Compensated { summary, .. }) => {
                 self.cycle += 1;
-                self.advance(Grind(JobStep::Send));
+                if summary.asks.is_empty() {
+                    self.advance(Grind(JobStep::Send));
+                } else {
+                    self.raise(AlarmId::ParameterBeyond, &summary.asks.join("; "));
+                    self.go(Held(Grind(JobStep::Send)));
+                }
             }
             (Execute(Compensate) | Holding(Compensate), Event::CompensationRefused { why, .. }) => self.no_map(why),
 

@@ -16,7 +16,7 @@ use super::state::{Device, Phase, State};
 
 /// The version of the table. A run is gone on with by a program of the version that began it only; a change of what follows from
 /// anything is another version.
-pub const TABLE_VERSION: u32 = 6;
+pub const TABLE_VERSION: u32 = 7;
 
 /// What an event does in a state.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -220,7 +220,9 @@ fn of_computations(cycle: u32) -> Vec<Event> {
     events.push(Event::NotSaved { cycle, why: RecordFailure::DiskFull(text()) });
     let (largest_mm, depth_mm, predicted_pv_mm) = (0.02, 0.03, 0.005);
     let summary = CompensationSummary { largest_mm, depth_mm, predicted_pv_mm, ..CompensationSummary::default() };
-    events.push(Event::Compensated { cycle, summary });
+    events.push(Event::Compensated { cycle, summary: summary.clone() });
+    let asking = CompensationSummary { asks: vec![text()], ..summary };
+    events.push(Event::Compensated { cycle, summary: asking });
     let refusals = [CompensationRefusal::BudgetSpent(text()), CompensationRefusal::WeakDirections(Vec::new())];
     for why in refusals.into_iter().chain([CompensationRefusal::Failed(text())]) {
         events.push(Event::CompensationRefused { cycle, why });

@@ -82,7 +82,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let values_mm = map.values_mm.iter().map(|v| sign * v).collect();
     let tip_mm = arguments.tip_of_radius.unwrap_or(0.0);
     let level_off_mm = LEVEL_OFF_NODES * map.grid.spacing_mm[0].max(map.grid.spacing_mm[1]);
-    let shift = spline_of(&Correction { grid: map.grid, values_mm, cycle: 1, level_mm: 0.0 }, level_off_mm);
+    let shift = spline_of(&Correction { grid: map.grid, values_mm, cycle: 1, level_mm: 0.0, set: None }, level_off_mm);
     let ground = arguments.nominal.as_ref().map(|file| ground(file)).transpose()?;
     let amendment = Amendment {
         shift: &shift,

@@ -132,6 +132,12 @@ impl Show {
                     three_digits(1e3 * summary.predicted_pv_mm),
                     three_digits(1e3 * summary.predicted_rms_mm)
                 ))?;
+                for told in &summary.parameters {
+                    self.line(&format!("cycle {cycle}: {}", told.in_words()))?;
+                }
+                if let Some(mm) = summary.map_rms_mm {
+                    self.line(&format!("cycle {cycle}: left for the map: {} um rms", three_digits(1e3 * mm)))?;
+                }
                 summary.warnings.iter().try_for_each(|warning| self.line(&format!("cycle {cycle}: {warning}")))
             }
             // It is on record each time; a person has seen it.

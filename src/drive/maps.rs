@@ -1,10 +1,10 @@
 //! What a cycle leaves behind of the part's error: figures, the map as text, X3P and picture, and the points in colours.
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::record::{Files, Unfinished, unfinished};
 use super::task::{Cycle, Task, readings, used};
-use crate::compensation::{self, Contact, ErrorMap, ParameterOptions, Smoothing};
+use crate::compensation::{self, Contact, ErrorMap, Parameter, ParameterKind, Parameters, Set, Smoothing};
 use crate::form::{FormOptions, TakenOut, figures, slope};
 use crate::formats::{
     ErrorMapOrigin, FormatError, write_error_map, write_error_map_x3p, write_figures, write_json_atomic,
@@ -60,31 +60,69 @@ fn taken_out(task: &Task) -> TakenOut {
     TakenOut { motion, filter: format!("waves below {} mm ({smoothing})", task.map.cutoff_mm) }
 }
 
-/// Says what of the deviations the machine's parameters explain: the wheel's radius and setting, its wear. What is offered is better
+/// Says what of the deviations the machine's parameters explain: the wheel's radius and setting, the tilt of the part, wear. What is offered is better
 /// corrected there than ground in with every map.
-pub(super) fn parameters(task: &Task, files: &mut Files, found: &Registration) -> Result<Vec<String>, FormatError> {
-    let contact = |d: &Deviation| Contact { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
-    let contacts: Vec<Contact> = used(found).map(contact).collect();
-    let options = ParameterOptions {
-        free_motions: task.registration.locked.map(|locked| !locked),
-        ..ParameterOptions::new(task.pass.wheel_radius_mm)
-    };
+pub(super) fn parameters(
+    task: &Task,
+    files: &mut Files,
+    cycle: &Cycle,
+    contacts: &[Contact],
+) -> Result<Option<Parameters>, FormatError> {
     let path = files.place("parameters.json");
-    match compensation::parameters(&contacts, None, &options) {
-        Ok(told) => {
-            let um = |mm: f64| 1e3 * mm;
-            let document = json!({
-                "simulation": task.simulation, "rms_um": um(told.rms_mm), "rest_rms_um": um(told.rest_rms_mm),
-                "parameters": told.found,
-            });
-            write_json_atomic(path, &document)?;
-            Ok(told.found.into_iter().filter(|p| p.offered).map(|p| p.message).collect())
-        }
+    let options = task.parameter_options(cycle.correction.set.as_ref());
+    match compensation::parameters(contacts, None, &options) {
+        Ok(told) => write_json_atomic(path, &document(task, &told)).map(|()| Some(told)),
         Err(error) => {
             let document = json!({ "simulation": task.simulation, "why_not": error.to_string() });
-            write_json_atomic(path, &document).map(|()| Vec::new())
+            write_json_atomic(path, &document).map(|()| None)
         }
     }
+}
+
+/// The points that took part in a registration, as parameters are told by them.
+pub(super) fn contacts(found: &Registration) -> Vec<Contact> {
+    let contact = |d: &Deviation| Contact { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
+    used(found).map(contact).collect()
+}
+
+fn document(task: &Task, told: &Parameters) -> Value {
+    let um = |mm: f64| 1e3 * mm;
+    let parameter = |p: &Parameter| {
+        let units = p.kind.units();
+        json!({
+            "kind": p.kind, "unit": p.kind.unit(), "value": units * p.value, "expanded": 2.0 * units * p.sigma,
+            "own_share": p.own_share, "alike": p.alike, "offered": p.offered, "taken": units * p.taken, "beyond": p.beyond,
+            "removes_rms_um": um(p.removes_rms_mm), "words": p.message,
+        })
+    };
+    json!({
+        "simulation": task.simulation, "rms_um": um(told.rms_mm), "rest_rms_um": um(told.rest_rms_mm),
+        "parameters": told.found.iter().map(parameter).collect::<Vec<_>>(),
+    })
+}
+
+/// The parameters that the next pass is told: those of this one, and what was found of them beside.
+pub(super) fn set(task: &Task, cycle: &Cycle, contacts: &[Contact], told: &Parameters) -> Option<Set> {
+    let taken = task.parameters.as_ref()?;
+    let before = cycle.correction.set.as_ref();
+    let mut values = before.map_or([0.0; ParameterKind::COUNT], |set| set.values);
+    values.iter_mut().zip(&told.found).for_each(|(value, of)| *value += of.taken);
+    if before.is_some_and(|before| before.values == values) {
+        return before.cloned();
+    }
+    Set::of(values, cycle.correction.cycle + 1, [contacts, &taken.nodes], &task.parameter_options(before))
+}
+
+/// What of values at the nodes of the correction parameters and slides make; none where no parameter is taken back.
+pub(super) fn smoother<'t>(
+    task: &'t Task,
+    cycle: &'t Cycle,
+    contacts: &'t [Contact],
+) -> Option<impl Fn(&[f64]) -> Vec<f64> + use<'t>> {
+    let taken = task.parameters.as_ref()?;
+    let options = task.parameter_options(cycle.correction.set.as_ref());
+    let grid = cycle.correction.grid;
+    Some(move |values_mm: &[f64]| compensation::smooth_of(values_mm, &grid, [contacts, &taken.nodes], &options))
 }
 
 /// Writes the map of a cycle's error and the points that it was made from.

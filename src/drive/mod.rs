@@ -69,7 +69,8 @@ use station::{
     StationReport,
 };
 use task::Product;
-pub use task::{Adaptive, Probing, Sphere, Task};
+pub(crate) use task::correction_grid;
+pub use task::{Adaptive, Probing, Sphere, TakenBack, Task};
 
 /// Everything a run needs besides its machines.
 pub struct Run {
@@ -881,7 +882,7 @@ impl Drive {
         let number = judgement.cycle;
         let cycle = self.cycles.get(number);
         let judged = cycle.and_then(|c| c.figures.as_ref()).map(|figures| self.cell.plan().tolerance.compare(figures));
-        let result = json!({
+        let mut result = json!({
             "simulation": self.task.simulation,
             "cycle": number,
             "verdict": judgement.verdict,
@@ -890,6 +891,9 @@ impl Drive {
             "judged": judged.map(|judged| judged.map(|of| judged_of(&of))),
             "level_mm": cycle.map(|c| c.correction.level_mm),
         });
+        if self.task.parameters.is_some() {
+            result["parameters"] = json!(cycle.map(|cycle| work::parameters_told(&self.task, cycle)));
+        }
         self.leave(format!("{}/result.json", folder_of(number, which)), number, &result).await;
     }
 

@@ -1,14 +1,15 @@
 //! The program of a pass: from the correction to the file that a controller runs.
 
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-use crate::compensation::Correction;
 use crate::compensation::path::{
-    Field, Limits, PathError, PathMode, PathOptions, Pattern, Summary, ToolPath, TrackSpacing, Wanted, axis_offsets,
-    height_of,
+    Field, Limits, PathError, PathMode, PathOptions, Pattern, Summary, ToolPath, TrackSpacing, Wanted, Wheel,
+    axis_offsets, height_of,
 };
+use crate::compensation::{Correction, ParameterKind};
 use crate::formats::gcode::{
     Dialect, DialectError, Exactness, GcodeError, ProgramHeader, write_axis_table, write_program,
 };
@@ -111,13 +112,29 @@ impl Programs {
     /// # Errors
     /// A wheel that does not fit the corrected surface, and limits of the grinder that the path goes beyond.
     pub fn path(&self, correction: &Correction) -> Result<(ToolPath, Summary), PathError> {
-        let (nominal, outline) = &self.ground;
-        let level_off_mm = self.options.wheel.reach_mm();
-        let wanted = Wanted::new(nominal.clone(), correction, level_off_mm)?;
-        let path = ToolPath::new(wanted, outline.clone(), self.options)?;
+        let (nominal, outline) = (self.nominal(correction), &self.ground.1);
+        let wheel = self.wheel(correction);
+        let wanted = Wanted::new(nominal, &handed(correction), wheel.reach_mm())?;
+        let path = ToolPath::new(wanted, outline.clone(), PathOptions { wheel, ..self.options })?;
         let summary = path.summary()?;
         summary.check(&self.limits)?;
         Ok((path, summary))
+    }
+
+    /// The wheel as measurements have made it out.
+    fn wheel(&self, correction: &Correction) -> Wheel {
+        self.options.wheel.larger_by(self.off_mm(correction))
+    }
+
+    /// The nominal surface as the zero of the machine has it. It was touched off with the lowest place of the wheel, by the radius of the recipe: the
+    /// centre of a wheel that is larger by dR stands higher by that already.
+    fn nominal(&self, correction: &Correction) -> Field {
+        self.ground.0.clone().lowered(self.off_mm(correction))
+    }
+
+    /// By how much the wheel is larger than the recipe has it.
+    fn off_mm(&self, correction: &Correction) -> f64 {
+        correction.set.as_ref().map_or(0.0, |set| set.value(ParameterKind::WheelRadius))
     }
 
     /// Writes the program of a pass.
@@ -178,8 +195,8 @@ impl Programs {
         path: &ToolPath,
     ) -> Result<(), ProgramError> {
         let none = Correction { values_mm: vec![0.0; correction.grid.len()], ..correction.clone() };
-        let before = Wanted::new(self.ground.0.clone(), &none, 1.0)?;
-        let offsets = axis_offsets(&before, path.wanted(), &self.options.wheel, &correction.grid)?;
+        let before = Wanted::new(self.nominal(correction), &none, 1.0)?;
+        let offsets = axis_offsets(&before, path.wanted(), &path.options().wheel, &correction.grid)?;
         write_axis_table(file, &correction.grid, &offsets, &map_identity, self.simulation).map_err(GcodeError::from)?;
         Ok(())
     }
@@ -199,7 +216,8 @@ impl Programs {
             map_identity,
             uncorrected: correction.is_none(),
             level_mm: correction.level_mm,
-            wheel: self.options.wheel.description(),
+            wheel: self.wheel(correction).description(),
+            parameters: set_in_words(correction, self.options.wheel.reach_mm()),
             tracks: tracks_in_words(path),
             spark_out_passes: self.spark_out_passes,
             simulation: self.simulation,
@@ -207,6 +225,34 @@ impl Programs {
         };
         Ok(write_program(file, &header, &self.dialect, summary, path)?)
     }
+}
+
+/// The correction as a path takes it: what is left for the map, and with it what setting and tilt take back.
+fn handed(correction: &Correction) -> Cow<'_, Correction> {
+    match &correction.set {
+        None => Cow::Borrowed(correction),
+        Some(_) => Cow::Owned(Correction { values_mm: correction.map_mm().into_owned(), ..correction.clone() }),
+    }
+}
+
+/// Says which parameters a correction takes back, a line each; nothing where it takes none.
+pub(super) fn set_in_words(correction: &Correction, wheel_radius_mm: f64) -> Vec<String> {
+    let Some(set) = &correction.set else { return Vec::new() };
+    let taken = ParameterKind::ALL.into_iter().zip(set.values).filter(|(_, value)| *value != 0.0);
+    let line = |(kind, value): (ParameterKind, f64)| {
+        let said = format!("{}: off by {:.3} {}", kind.name(), kind.units() * value, kind.unit());
+        let since = set.since_cycle;
+        match kind {
+            ParameterKind::WheelRadius => {
+                let true_mm = wheel_radius_mm + value;
+                format!(
+                    "{said}, {true_mm:.6} mm in place of {wheel_radius_mm} mm, since pass {since}; it is not in the map"
+                )
+            }
+            _ => format!("{said}, since pass {since}; what takes it back is in the map that is ground with"),
+        }
+    };
+    taken.map(line).collect()
 }
 
 fn tracks_in_words(path: &ToolPath) -> String {

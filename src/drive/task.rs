@@ -5,7 +5,10 @@ use std::sync::Arc;
 
 use crate::cell::{Figures, PvOf, Tolerance};
 use crate::compensation::path::{PathError, Scallops, Summary, ToolPath};
-use crate::compensation::{Correction, CorrectionLimits, ErrorMap, GainRule, LearningState, MapOptions, NextPassError};
+use crate::compensation::{
+    Contact, Correction, CorrectionLimits, ErrorMap, GainRule, LearningState, MapOptions, NextPassError, ParameterKind,
+    ParameterOptions, Parameters, Set, WheelTerm,
+};
 use crate::device::{Careful, Coordinates, CorrectionMap, Identified, Pass, Plan, Target, TargetKind};
 use crate::formats::gcode::GcodeError;
 use crate::formats::{CorrectionIdentities, FormatError, Learned, ResultFolder, write_correction};
@@ -17,7 +20,7 @@ use crate::registration::{
 };
 use crate::surface::Nominal;
 
-use super::program::{ProgramError, Programs};
+use super::program::{ProgramError, Programs, set_in_words};
 use super::record::Files;
 
 /// What stays free for the journal and the program of a pass.
@@ -63,6 +66,10 @@ pub struct Task {
     pub setting: String,
     /// What a correction must keep to.
     pub limits: CorrectionLimits,
+    /// Which parameters of the machine are taken back; none where all is left to the map.
+    pub parameters: Option<TakenBack>,
+    /// Standard uncertainty of where the datum holds the part, in millimetres, and of how it is turned, in radians, where the recipe states it.
+    pub datum: Option<[f64; 2]>,
     /// What uncertainty of the place of a correction on the part is put up with.
     pub place: MapLimits,
     /// How a pass is ground; level and identity are set for each cycle.
@@ -85,6 +92,17 @@ pub struct Task {
     pub adaptive: Option<Adaptive>,
     /// Whether the cell is simulated; everything stored is marked so.
     pub simulation: bool,
+}
+
+/// Which parameters of the machine are taken back.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TakenBack {
+    /// The tolerance of each that is, in its unit, in the order of [`ParameterKind::ALL`].
+    pub tolerances: [Option<f64>; ParameterKind::COUNT],
+    /// How another radius of the wheel comes out on this grinder.
+    pub wheel_term: WheelTerm,
+    /// The surface under the nodes of a correction.
+    pub nodes: Vec<Contact>,
 }
 
 /// What a measurement goes by whose touches are chosen.
@@ -164,6 +182,10 @@ pub(super) struct Cycle {
     pub(super) error: Option<Arc<ErrorMap>>,
     /// What is known of the grinder with this cycle taken in.
     pub(super) known: Option<Arc<LearningState>>,
+    /// What parameters of the machine make of the error.
+    pub(super) parameters: Option<Arc<Parameters>>,
+    /// What of it is taken back by telling them to the next pass.
+    pub(super) set: Option<Arc<Set>>,
     pub(super) figures: Option<Figures>,
     /// How often it was judged; a measurement that a gate refused never was, and tells nothing of the grinder.
     pub(super) judgements: u32,
@@ -184,6 +206,8 @@ impl Cycle {
             field: None,
             error: None,
             known: None,
+            parameters: None,
+            set: None,
             figures: None,
             judgements: 0,
         }
@@ -198,13 +222,15 @@ impl Cycle {
         match product {
             Product::Points(points) => self.points = Some(Arc::new(points)),
             Product::Registered(found) => {
-                let Registered { registration, form, field, error, known, figures, next } = *found;
+                let Registered { registration, form, field, error, known, parameters, set, figures, next } = *found;
                 self.next = next.map(Arc::new);
                 self.registration = Some(Arc::new(registration));
                 self.form = form.map(Arc::new);
                 self.field = field;
                 self.error = error.map(Arc::new);
                 self.known = known.map(Arc::new);
+                self.parameters = parameters.map(Arc::new);
+                self.set = set.map(Arc::new);
                 self.figures = Some(figures);
             }
             Product::Correction(_) | Product::Nothing => {}
@@ -230,6 +256,8 @@ pub(super) struct Registered {
     pub(super) field: Option<Hyper>,
     pub(super) error: Option<ErrorMap>,
     pub(super) known: Option<LearningState>,
+    pub(super) parameters: Option<Parameters>,
+    pub(super) set: Option<Set>,
     pub(super) figures: Figures,
     /// The targets to touch next; none where enough is known.
     pub(super) next: Option<Vec<usize>>,
@@ -297,13 +325,7 @@ impl Task {
     }
 
     fn uncorrected(&self) -> Correction {
-        let corners = [[self.pass.x_mm[0], self.pass.y_mm[0]], [self.pass.x_mm[1], self.pass.y_mm[1]]];
-        let grid = Grid::over(corners.into_iter(), self.map.spacing_mm).unwrap_or(Grid {
-            columns: 2,
-            rows: 2,
-            first_mm: corners[0],
-            spacing_mm: [corners[1][0] - corners[0][0], corners[1][1] - corners[0][1]],
-        });
+        let grid = correction_grid([self.pass.x_mm, self.pass.y_mm], self.map.spacing_mm);
         Correction::none(grid, self.limits.allowance_mm)
     }
 
@@ -376,6 +398,22 @@ impl Task {
         Ok((register(&self.nominal, points, &options)?, options))
     }
 
+    /// What is asked of the separation of parameters, for a pass that was told these.
+    pub fn parameter_options(&self, told: Option<&Set>) -> ParameterOptions {
+        ParameterOptions {
+            free_motions: self.registration.locked.map(|locked| !locked),
+            datum: self.datum,
+            tolerances: self.parameters.as_ref().map_or([None; ParameterKind::COUNT], |taken| taken.tolerances),
+            wheel_term: self.parameters.as_ref().map_or(WheelTerm::default(), |taken| taken.wheel_term),
+            ..ParameterOptions::new(self.wheel_radius_mm(told))
+        }
+    }
+
+    /// Returns the radius of the wheel that a pass is told: that of the recipe, or what measurements made of it.
+    pub fn wheel_radius_mm(&self, told: Option<&Set>) -> f64 {
+        self.pass.wheel_radius_mm + told.map_or(0.0, |set| set.value(ParameterKind::WheelRadius))
+    }
+
     /// Returns the identity of the map that a pass is given.
     pub fn map_identity(&self, correction: &Correction) -> [u8; 32] {
         self.payloads(correction).0.identity()
@@ -385,10 +423,12 @@ impl Task {
     pub(super) fn payloads(&self, correction: &Correction) -> (CorrectionMap, Pass) {
         let map = CorrectionMap {
             grid: correction.grid,
-            values_mm: correction.values_mm.clone(),
+            values_mm: correction.map_mm().into_owned(),
             part_identity: self.part_identity,
         };
-        (map, Pass { level_mm: correction.level_mm, part_identity: self.part_identity, ..self.pass })
+        let wheel_radius_mm = self.wheel_radius_mm(correction.set.as_ref());
+        let pass = Pass { level_mm: correction.level_mm, part_identity: self.part_identity, ..self.pass };
+        (map, Pass { wheel_radius_mm, ..pass })
     }
 
     /// Lays the plan: the reference sphere first, then the part where it was found last, at the level it was ground to.
@@ -445,7 +485,8 @@ impl Task {
     ) -> Result<(), FormatError> {
         let [identity, replaces] = [correction, base].map(|correction| self.map_identity(correction));
         let identities = CorrectionIdentities { part: self.part_identity, map: identity, replaces };
-        write_correction(&files.place("correction.csv"), correction, &identities, self.simulation)
+        let set = set_in_words(correction, self.pass.wheel_radius_mm);
+        write_correction(&files.place("correction.csv"), correction, (&identities, &set), self.simulation)
     }
 
     /// Writes the program of the next pass, if there is one, and returns why not all of it is there: a pass without it can be ground all the
@@ -464,6 +505,17 @@ impl Task {
             Err(error) => Err(error.clone().into()),
         }
     }
+}
+
+/// The grid of the corrections of a part with these least and most x and y.
+pub(crate) fn correction_grid([x_mm, y_mm]: [[f64; 2]; 2], spacing_mm: f64) -> Grid {
+    let corners = [[x_mm[0], y_mm[0]], [x_mm[1], y_mm[1]]];
+    Grid::over(corners.into_iter(), spacing_mm).unwrap_or(Grid {
+        columns: 2,
+        rows: 2,
+        first_mm: corners[0],
+        spacing_mm: [corners[1][0] - corners[0][0], corners[1][1] - corners[0][1]],
+    })
 }
 
 /// With so many targets a plan begins where the part may have been seated anew.

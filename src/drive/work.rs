@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::cell::{
     CompensationRefusal, CompensationSummary, Event, Figures, Forecast, FormFigures, Gate, GateFailure, Interval,
-    Response, TouchOn,
+    ParameterTold, Response, TouchOn,
 };
 use crate::compensation::{self, Correction, ErrorMap, LearningState, NextPassError, Seen, Sense, error_map, response};
 use crate::device::{Coordinates, Identified, Measurement, Plan, PointStatus, TargetKind};
@@ -294,11 +294,19 @@ fn registered(
         _ => error_map(&readings(&found), &task.map).ok(),
     };
     maps::save_figures(task, files, error.as_ref(), &found, form.as_ref().ok()).map_err(unfinished)?;
-    let offered = maps::parameters(task, files, &found).map_err(unfinished)?;
+    let contacts = maps::contacts(&found);
+    let told = maps::parameters(task, files, cycle, &contacts).map_err(unfinished)?;
     // Every measurement leaves its map, whatever becomes of the correction.
     error.as_ref().map_or(Ok(()), |map| maps::save(task, files, (number, cycle), map, &found))?;
     let answer = error.as_ref().and_then(|error| answer(before?, cycle, &found, error));
-    let known = error.as_ref().map(|error| learned_from(task, cycle, before, error, answer));
+    // What the first pass of a run leaves tells the machine's parameters; what a later one leaves beside is wear and drift, and goes by the learning.
+    let parameters = told.filter(|_| before.is_none());
+    let offered: Vec<String> = parameters.iter().flat_map(offered).collect();
+    let set = match &parameters {
+        Some(told) => maps::set(task, cycle, &contacts, told),
+        None => cycle.correction.set.clone(),
+    };
+    let known = error.as_ref().map(|error| learned_from(task, cycle, before, error, (answer, &contacts)));
     let forecast =
         known.as_ref().zip(error.as_ref()).map(|(known, error)| known.forecast(error, task.scallops_rms_mm()));
     let mut figures = figures(task, cycle, &found, form.as_ref().ok(), error.as_ref(), answer, forecast);
@@ -321,7 +329,12 @@ fn registered(
     }
     let next = next.map(|(next, _)| next);
     let field = next.is_none().then(|| field_alone(&found, &given, form.as_ref().ok(), !looked_at)).flatten();
-    Ok(Registered { registration: found, form: form.ok(), field, error, known, figures, next })
+    Ok(Registered { registration: found, form: form.ok(), field, error, known, parameters, set, figures, next })
+}
+
+/// What is said of the parameters that are clear.
+fn offered(told: &compensation::Parameters) -> impl Iterator<Item = String> {
+    told.found.iter().filter(|p| p.offered).map(|p| p.message.clone())
 }
 
 /// What is expected of the field of the error of a cycle: what earlier parts taught of passes of its kind, or else the pass before it in this run, if it was
@@ -348,10 +361,12 @@ fn learned_from(
     cycle: &Cycle,
     before: Option<&Cycle>,
     error: &ErrorMap,
-    answer: Option<compensation::Response>,
+    (answer, contacts): (Option<compensation::Response>, &[compensation::Contact]),
 ) -> LearningState {
     let earlier = before.and_then(|before| before.known.as_deref().cloned()).unwrap_or_else(|| task.beginning());
-    earlier.after(&Seen { correction: &cycle.correction, error, answer })
+    let smoother = maps::smoother(task, cycle, contacts);
+    let smooth = smoother.as_ref().map(|smoother| smoother as compensation::Smoother<'_>);
+    earlier.after(&Seen { correction: &cycle.correction, error, answer, smooth })
 }
 
 fn save(task: &Task, files: &mut Files, found: &Registration, options: &Options) -> Result<(), FormatError> {
@@ -510,12 +525,13 @@ fn compensated(
     };
     let known = match &cycle.known {
         Some(known) => Arc::clone(known),
-        None => Arc::new(learned_from(task, cycle, None, &map, None)),
+        None => Arc::new(learned_from(task, cycle, None, &map, (None, &maps::contacts(found)))),
     };
-    let step = cycle.correction.next(&map, &known, &task.limits).map_err(|error| match error {
-        NextPassError::BudgetSpent { .. } => Unfinished::For(CompensationRefusal::BudgetSpent(error.to_string())),
-        error => failed(&error),
-    })?;
+    let step =
+        cycle.correction.next(&map, &known, cycle.set.as_deref(), &task.limits).map_err(|error| match error {
+            NextPassError::BudgetSpent { .. } => Unfinished::For(CompensationRefusal::BudgetSpent(error.to_string())),
+            error => failed(&error),
+        })?;
     // A pass that cannot be ground leaves no correction that somebody might take for one.
     let warning = task.save_program(files, &step.correction).map_err(|error| match unfinished(error) {
         Unfinished::For(why) => failed(&format_args!("the next pass cannot be ground: {why}")),
@@ -540,8 +556,52 @@ fn compensated(
         gains: known.gains(),
         response: known.response()[0],
         warnings: warning.into_iter().collect(),
+        map_rms_mm: task.parameters.as_ref().map(|_| rms(&step.correction.values_mm)),
+        parameters: parameters_told(task, cycle),
+        asks: asks(cycle),
     };
     Ok((summary, step.correction))
+}
+
+/// What was told of the parameters that the recipe has taken back; nothing after the first pass, when they stand.
+pub(super) fn parameters_told(task: &Task, cycle: &Cycle) -> Vec<ParameterTold> {
+    let Some(taken) = &task.parameters else { return Vec::new() };
+    let told = cycle.parameters.iter().flat_map(|told| told.found.iter().enumerate());
+    let wanted = told.filter(|(k, p)| taken.tolerances[*k].is_some() && p.alike.is_empty());
+    let told = |(k, p): (usize, &compensation::Parameter)| {
+        let units = p.kind.units();
+        ParameterTold {
+            name: p.kind.name().to_owned(),
+            unit: p.kind.unit().to_owned(),
+            off: units * p.value,
+            expanded: 2.0 * units * p.sigma,
+            taken: units * p.taken,
+            told: units * cycle.set.as_ref().map_or(0.0, |set| set.values[k]),
+            removes_rms_um: 1e3 * p.removes_rms_mm,
+        }
+    };
+    wanted.map(told).collect()
+}
+
+fn rms(values: &[f64]) -> f64 {
+    (values.iter().map(|v| v * v).sum::<f64>() / values.len().max(1) as f64).sqrt()
+}
+
+/// What a person is to agree to before the next pass: parameters that are further off than the recipe's tolerance of them.
+fn asks(cycle: &Cycle) -> Vec<String> {
+    let beyond = cycle.parameters.iter().flat_map(|told| &told.found).filter(|p| p.beyond);
+    let question = |p: &compensation::Parameter| {
+        let (units, unit) = (p.kind.units(), p.kind.unit());
+        let key = p.kind.key().unwrap_or_default();
+        format!(
+            "{} is off by {:.2} \u{b1} {:.2} {unit}, and {:.2} {unit} of it would be taken back, more than compensation.parameters.{key}",
+            p.kind.name(),
+            units * p.value,
+            2.0 * units * p.sigma,
+            units * p.taken
+        )
+    };
+    beyond.map(question).collect()
 }
 
 /// What the next part of this kind can begin with; none where this run did not get so far.
@@ -552,7 +612,7 @@ pub(super) fn learned(task: &Task, run: String, (cycle, fields): (&Cycle, Taught
         return None;
     }
     let (setting, simulation) = (task.setting.clone(), task.simulation);
-    let correction = cycle.correction.changed(known);
+    let correction = cycle.correction.changed(known, cycle.set.as_deref());
     Some(Learned::new(simulation, setting, run, correction, known.clone()).with_fields(fields))
 }
 

@@ -7,7 +7,7 @@ use thiserror::Error;
 
 use super::FormatError;
 use super::whole::read_whole;
-use regrind_core::compensation::{Correction, LearningState};
+use regrind_core::compensation::{Correction, LearningState, Set};
 use regrind_core::model::Taught;
 
 /// The file in a run folder.
@@ -127,6 +127,9 @@ impl Learned {
         if !values_mm.iter().all(|v| v.is_finite()) || !level_mm.is_finite() {
             return Some("a number of its correction is not finite".into());
         }
+        if self.correction.set.as_ref().is_some_and(|set| !set.is_sound(grid.len())) {
+            return Some("a parameter of its correction cannot be, or is of another grid".into());
+        }
         if !self.fields.is_sound() {
             return Some("a number of what it knows of the fields of errors cannot be".into());
         }
@@ -135,8 +138,15 @@ impl Learned {
 
     /// Returns the correction of the first pass of another part: what came back in every pass of this one, on the grid of `none`.
     pub fn first_correction(&self, none: Correction) -> Correction {
-        let values_mm = self.correction.grid.resample(&self.correction.values_mm, &none.grid);
-        Correction { values_mm, ..none }
+        let on_grid = |values: &Vec<f64>| self.correction.grid.resample(values, &none.grid);
+        let set = self.correction.set.as_ref().map(|set| Set {
+            displaced_mm: on_grid(&set.displaced_mm),
+            setting_mm: on_grid(&set.setting_mm),
+            seen_mm: on_grid(&set.seen_mm),
+            since_cycle: none.cycle,
+            ..*set
+        });
+        Correction { values_mm: on_grid(&self.correction.values_mm), set, ..none }
     }
 }
 
@@ -154,8 +164,8 @@ mod tests {
         let values = (0..GRID.len()).map(|k| 1e-3 * k as f64).collect();
         let error = ErrorMap::known(GRID, values, vec![true; GRID.len()]);
         let begin = LearningState::new(GainRule::Wavelength, &MapOptions::new(1.0, 1.0), [4.0, 3.0], None);
-        let known = begin.after(&Seen { correction: &correction, error: &error, answer: None });
-        Learned::new(true, "a part".into(), "run-1".into(), correction.changed(&known), known)
+        let known = begin.after(&Seen { correction: &correction, error: &error, answer: None, smooth: None });
+        Learned::new(true, "a part".into(), "run-1".into(), correction.changed(&known, None), known)
     }
 
     fn read(text: &str) -> Result<Option<(Learned, Vec<u8>)>, LearnedError> {

@@ -128,24 +128,27 @@ pub struct CorrectionIdentities {
     pub replaces: [u8; 32],
 }
 
-/// Writes `correction.csv`: `x_mm,y_mm,correction_mm`, with part, cycle, level and identities in comments.
+/// Writes `correction.csv`: `x_mm,y_mm,correction_mm`, the map as the grinder gets it, with part, cycle, level, identities and the parameters that
+/// are taken back beside it in comments.
 ///
 /// # Errors
 /// Those of [`super::write_deviations`].
 pub fn write_correction(
     path: &Path,
     correction: &Correction,
-    identities: &CorrectionIdentities,
+    (identities, parameters): (&CorrectionIdentities, &[String]),
     simulation: bool,
 ) -> Result<(), FormatError> {
+    let map_mm = correction.map_mm();
     let rows: Vec<[f64; 3]> = (0..correction.grid.len())
-        .map(|k| (correction.grid.place_mm(k), correction.values_mm[k]))
+        .map(|k| (correction.grid.place_mm(k), map_mm[k]))
         .map(|([x, y], value)| [x, y, value])
         .collect();
+    let taken: String = parameters.iter().map(|taken| format!("# parameter: {taken}\n")).collect();
     let marked = if simulation { "# SIMULATION\n" } else { "" };
     let header = format!(
         "{marked}# for pass {}; absolute: it replaces the one before\n# frame: model; positive leaves material, along the outward normal\n# level over the \
-         nominal surface: {} mm\n# part: sha256 {}\n# map: sha256 {}\n# replaces: sha256 {}\nx_mm,y_mm,correction_mm",
+         nominal surface: {} mm\n# part: sha256 {}\n# map: sha256 {}\n# replaces: sha256 {}\n{taken}x_mm,y_mm,correction_mm",
         correction.cycle,
         correction.level_mm,
         hex(&identities.part),

@@ -214,6 +214,13 @@ catalogue! { german:
         "Es gibt keine Karte für den nächsten Durchgang", "Es wird kein weiterer Durchgang geschliffen.",
         ["Den Grund und die Werte dieses Zyklus lesen.", "RESUME rechnet noch einmal; oder den Lauf beenden."]
     }
+    ParameterBeyond {
+        "Ein Parameter der Maschine weicht weiter ab, als das Rezept zulässt",
+        "Der nächste Durchgang beginnt nicht, bevor jemand zustimmt: er würde mit dem korrigierten Parameter geschliffen.",
+        ["Auf anderem Weg messen: den Radius der Scheibe über ihr Profil oder durch Antasten einer Referenz, Zustellung und Lage des Teils mit der Messuhr.",
+         "Stimmt er, RESUME: der nächste Durchgang wird damit geschliffen, die Karte ist, was übrig bleibt.",
+         "Stimmt er nicht, den Lauf beenden, Rezept oder Maschine berichtigen und einen neuen Lauf beginnen; ohne den Schlüssel in compensation.parameters geht alles in die Karte."]
+    }
     SignFlipped {
         "Das Teil hat auf die Karte umgekehrt geantwortet", "Ein weiterer Durchgang würde es schlechter machen; die Zelle ist angehalten.",
         ["Das Vorzeichen der Karte an der Schleifmaschine prüfen: positiv lässt Material stehen.", "Kein RESUME, bevor ein Durchgang an einem Ausschussteil das richtige Vorzeichen gezeigt hat.",
@@ -317,6 +324,7 @@ catalogue! { chinese:
     ComputationLate { "计算超时", "单元在其之前保持。", ["查看计算机是否过载。", "按 RESUME 重新计算。"] }
     WeakDirections { "该面无法确定修正会磨在工件的何处", "不作修正。本循环的误差图在运行文件夹中。", ["如果夹具或基准点足以固定所列方向，请在配方中固定它们 (registration.hold)。", "或测量能固定它们的特征：边缘、基准标记、更大的孔径。", "开始以测量为起点的新运行。"] }
     CompensationFailed { "没有用于下一次磨削的误差图", "不再磨削。", ["阅读原因和本循环的数值。", "按 RESUME 重新计算，或结束运行。"] }
+    ParameterBeyond { "设备的一个参数偏差超出配方给定的公差", "在有人同意之前不会开始下一遍：将按修正后的参数磨削。", ["用其他方法测量：用轮廓或触碰基准测砂轮半径，用千分表测砂轮位置和工件姿态。", "若属实，按 RESUME：下一遍按该参数磨削，补偿图只含剩余部分。", "若不属实，停止运行，改正配方或设备后开始新的运行；compensation.parameters 中没有该键时，全部进入补偿图。"] }
     SignFlipped { "工件对误差图的响应方向相反", "再磨一次会更差；单元保持。", ["检查磨床上误差图的符号：正值留下材料。", "在废件上试磨证明符号正确之前不要按 RESUME。", "结束运行。"] }
     Mirrored { "工件的响应如同误差图被镜像或旋转", "再磨一次会更差；单元保持。", ["检查磨床上 x 和 y 的方向，以及工件在夹具中的转向。", "在废件上试磨证明方向正确之前不要按 RESUME。", "结束运行。"] }
     Doubled { "工件的响应如同误差图被应用了两次", "再磨一次会偏向另一侧；单元保持。", ["查看误差图是否既在程序中又在控制器的表中，或被加到了上一个上：它是绝对值。", "在只有一处应用之前不要按 RESUME。", "结束运行。"] }

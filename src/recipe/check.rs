@@ -36,6 +36,7 @@ pub(super) fn check(
     registration(&written.registration, document);
     acceptance(&written.acceptance, document);
     compensation(&written.compensation, document);
+    parameters(written, document);
     grinding(&written.grinding, document);
     (nominal, pattern(&written.measure, folder, document))
 }
@@ -322,6 +323,60 @@ fn compensation(written: &Compensation, document: &mut Document) {
             "the share is fixed or chosen, not both",
             "leave one of the two out",
         );
+    }
+}
+
+/// What has to stand for parameters of the machine to be told.
+fn parameters(written: &RecipeFile, document: &mut Document) {
+    const KEY: &str = "compensation.parameters";
+    let Some(parameters) = written.compensation.parameters else { return };
+    let tolerances = parameters.tolerances();
+    if tolerances.iter().all(Option::is_none) && !document.has_problem(KEY) {
+        let remedy =
+            "add `wheel_radius_um = 100.0`, the uncertainty with which the wheel is known, or leave the table out";
+        document.report(KEY, "has no parameter", "one that is to be taken back must stand", remedy);
+    }
+    if written.cycle.begin_with == Beginning::Measure {
+        document.report(
+            KEY,
+            "stands in a recipe that begins with a measurement",
+            "parameters are told by what the first pass leaves, and this part was not left by a pass of ours",
+            "write `begin_with = \"grind\"`, or leave the table out",
+        );
+    }
+    if parameters.wheel_radius_um.is_some() && !matches!(written.grinding.wheel, Wheel::Sphere { .. }) {
+        document.report(
+            "compensation.parameters.wheel_radius_um",
+            "stands beside a wheel that is no ball",
+            "only of a ball it is known what another radius leaves",
+            "leave it out: the map takes it back",
+        );
+    }
+    let registration = &written.registration;
+    let held = Coordinate::locked(&registration.hold);
+    let names = [
+        ("wheel_x_um", "x"),
+        ("wheel_y_um", "y"),
+        ("wheel_z_um", "z"),
+        ("part_tilt_x_urad", "rx"),
+        ("part_tilt_y_urad", "ry"),
+    ];
+    for (k, (key, coordinate)) in names.into_iter().enumerate().filter(|(k, _)| tolerances[k + 1].is_some()) {
+        if !held[k] {
+            document.report(
+                &format!("{KEY}.{key}"),
+                format!("stands while `registration.hold` does not hold {coordinate}"),
+                "what moves with the registration looks the same as a part that lies elsewhere",
+                &format!("leave it out, or hold \"{coordinate}\" where the fixture does"),
+            );
+        } else if registration.hold_uncertainty_um.is_none() {
+            document.report(
+                &format!("{KEY}.{key}"),
+                "stands without `registration.hold_uncertainty_um`",
+                "it is told no better than the fixture holds the part",
+                "add it: `hold_uncertainty_um = 0.5` in [registration]",
+            );
+        }
     }
 }
 

@@ -220,6 +220,10 @@ pub struct RegistrationSettings {
     /// Coordinates of the model frame that stay as the fixture has them.
     #[schemars(length(max = 6))]
     pub hold: Vec<Coordinate>,
+    /// The expanded uncertainty (k = 2) of where the fixture holds the part along what is held; of its turns as much at the edge of the
+    /// part. Without it nothing is told of setting and tilt, which look like a part that is held elsewhere.
+    #[schemars(range(min = 0.0, max = 10000.0), example = 0.5)]
+    pub hold_uncertainty_um: Option<Um>,
     /// Where to begin: anywhere, or where the cell's fixture holds the part.
     pub start: StartAt,
     /// The farthest that the part may lie from where the fixture holds it.
@@ -297,6 +301,9 @@ pub struct Compensation {
     /// of the cell.
     #[schemars(range(min = 0.01, max = 10000.0), example = 60.0)]
     pub depth_of_cut_um: Um,
+    /// Parameters of the machine that are taken back as such after the first pass, each with its tolerance; the map is what is left. Left out,
+    /// all is left to the map.
+    pub parameters: Option<MachineParameters>,
     /// Distance of the nodes of the map.
     #[schemars(range(min = 0.01, max = 10000.0))]
     pub spacing_mm: f64,
@@ -304,6 +311,41 @@ pub struct Compensation {
     /// tell the part's place any better.
     #[schemars(range(min = 0.001, max = 1000.0))]
     pub largest_displacement_mm: f64,
+}
+
+/// Tolerances of parameters of the machine: the expanded uncertainty (k = 2) with which each is set. One that stands is taken back where it is told
+/// beyond its uncertainty; for more than its tolerance a person is asked.
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq)]
+#[serde(default, deny_unknown_fields)]
+pub struct MachineParameters {
+    /// Of the radius of the wheel, a ball.
+    #[schemars(range(min = 0.1, max = 10000.0), example = 100.0)]
+    pub wheel_radius_um: Option<Um>,
+    /// Of where the wheel is set along x; told where the part is held along x.
+    #[schemars(range(min = 0.1, max = 10000.0), example = 15.0)]
+    pub wheel_x_um: Option<Um>,
+    /// The same along y.
+    #[schemars(range(min = 0.1, max = 10000.0), example = 15.0)]
+    pub wheel_y_um: Option<Um>,
+    /// How high the wheel is set; told where the part is held along z.
+    #[schemars(range(min = 0.1, max = 10000.0), example = 15.0)]
+    pub wheel_z_um: Option<Um>,
+    /// Tilt of the part in the grinder about x; told where the part is held about x.
+    #[schemars(range(min = 0.1, max = 10000.0), example = 60.0)]
+    pub part_tilt_x_urad: Option<f64>,
+    /// The same about y.
+    #[schemars(range(min = 0.1, max = 10000.0), example = 60.0)]
+    pub part_tilt_y_urad: Option<f64>,
+}
+
+impl MachineParameters {
+    /// The tolerances in millimetres and radians, in the order of [`crate::compensation::ParameterKind::ALL`].
+    pub fn tolerances(&self) -> [Option<f64>; crate::compensation::ParameterKind::COUNT] {
+        let [radius, x, y, z] =
+            [self.wheel_radius_um, self.wheel_x_um, self.wheel_y_um, self.wheel_z_um].map(|um| um.map(Um::mm));
+        let [tilt_x, tilt_y] = [self.part_tilt_x_urad, self.part_tilt_y_urad].map(|urad| urad.map(|urad| 1e-6 * urad));
+        [radius, x, y, z, tilt_x, tilt_y, None]
+    }
 }
 
 /// How the part is ground.
@@ -467,6 +509,7 @@ impl Default for RegistrationSettings {
             loss: Loss::None,
             outlier_sigmas: 6.0,
             hold: Vec::new(),
+            hold_uncertainty_um: None,
             start: StartAt::Search,
             largest_shift_mm: 5.0,
             largest_turn_deg: 5.0,
@@ -494,6 +537,7 @@ impl Default for Compensation {
         Self {
             gain: None,
             gain_by: None,
+            parameters: None,
             repeatability_um: None,
             learn: false,
             smoothing: Smoothing::default(),

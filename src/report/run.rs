@@ -15,7 +15,7 @@ use super::maps::{maps, within_html};
 use super::means::{last_model, last_registration, means, registered, signatures};
 use super::story::{Measurement, Story};
 use super::words::{alarm_words, ending_words, home_words, judgement_words, role_words, verdict_words};
-use regrind_cell::{Compared, Conformity, Ending, Figures, Tolerance};
+use regrind_cell::{Compared, Conformity, Ending, Figures, ParameterTold, Tolerance};
 use regrind_formats::{escaped, write_atomic};
 use regrind_journal::{Record, Verified};
 
@@ -240,8 +240,36 @@ fn cycles(story: &Story) -> String {
     };
     html + "</table>\n"
         + &touches
+        + &parameters(story)
         + "<p>Deviations are along the normal, positive where material stands proud; \u{b1} is the expanded uncertainty \
             (k = 2). The level is the height of the surface that was wanted over the nominal one.</p>\n"
+}
+
+/// Which part of a correction went into parameters of the machine, and what was left for the map; nothing where the recipe takes none back.
+fn parameters(story: &Story) -> String {
+    let row = |number: u32, of: &ParameterTold| {
+        let ParameterTold { name, unit, off, expanded, taken, told, removes_rms_um } = of;
+        format!(
+            "<tr><td class=\"n\">{number}</td><td>{}</td><td class=\"n\">{off:.2} \u{b1} {expanded:.2} {unit}</td>\
+             <td class=\"n\">{taken:.2} {unit}</td><td class=\"n\">{told:.2} {unit}</td><td class=\"n\">{removes_rms_um:.2}</td></tr>\n",
+            escaped(name)
+        )
+    };
+    let rows: String =
+        story.cycles.iter().flat_map(|(number, cycle)| cycle.parameters.iter().map(|of| row(*number, of))).collect();
+    if rows.is_empty() {
+        return String::new();
+    }
+    let told = story.cycles.iter().filter(|(_, cycle)| !cycle.parameters.is_empty());
+    let left = told.filter_map(|(number, cycle)| Some((number, cycle.map_rms_mm?)));
+    let left: String = left
+        .map(|(number, mm)| format!("<p>Left for the map after cycle {number}: {} um rms.</p>\n", um(mm)))
+        .collect();
+    format!(
+        "<h3>Parameters of the machine</h3>\n<table id=\"parameters\">\n<tr><th class=\"n\">cycle</th><th>parameter</th>\
+         <th class=\"n\">off by</th><th class=\"n\">taken back</th><th class=\"n\">told to the next pass</th>\
+         <th class=\"n\">removes, \u{b5}m rms</th></tr>\n{rows}</table>\n{left}"
+    )
 }
 
 fn measurement(number: u32, of: &Measurement, tolerance: Option<&Tolerance>, level: &str) -> String {

@@ -8,7 +8,7 @@ use serde_json::Value;
 use super::ReportError;
 use super::told::Told;
 use super::words::{gate_words, words};
-use regrind_cell::{Alarm, Command, Ending, Event, Figures, Gate, Judgement, Tolerance};
+use regrind_cell::{Alarm, Command, Ending, Event, Figures, Gate, Judgement, ParameterTold, Tolerance};
 use regrind_journal::{Reader, Record, Verified, verify};
 
 /// The map of a cycle's error, as text.
@@ -56,6 +56,10 @@ pub(super) struct CycleStory {
     pub(super) form: Option<String>,
     /// PV and RMS that the next pass is expected to leave, in millimetres.
     pub(super) expected_mm: Option<[f64; 2]>,
+    /// What was told of parameters of the machine.
+    pub(super) parameters: Vec<ParameterTold>,
+    /// Root mean square of what was left for the map beside them, in millimetres.
+    pub(super) map_rms_mm: Option<f64>,
 }
 
 /// A measurement of a cycle: what was found, or why there is nothing.
@@ -185,7 +189,9 @@ impl Story {
             }
             Event::Qualified { cycle, radius_error_mm } => self.radius_error_mm = Some((cycle, radius_error_mm)),
             Event::Compensated { cycle, summary } => {
-                self.cycle(cycle).expected_mm = Some([summary.predicted_pv_mm, summary.predicted_rms_mm]);
+                let story = self.cycle(cycle);
+                story.expected_mm = Some([summary.predicted_pv_mm, summary.predicted_rms_mm]);
+                (story.parameters, story.map_rms_mm) = (summary.parameters, summary.map_rms_mm);
             }
             Event::RegistrationFailed { cycle, why } => {
                 self.measurement(cycle).unusable = Some(format!("not registered: {why}"));

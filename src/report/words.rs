@@ -226,7 +226,11 @@ fn event_words(event: &Event) -> String {
             1e3 * summary.depth_mm,
             100.0 * summary.air_share,
             1e3 * summary.predicted_pv_mm,
-            summary.warnings.iter().map(|warning| format!("; {warning}")).collect::<String>()
+            parameters_words(summary)
+                .iter()
+                .chain(&summary.warnings)
+                .map(|said| format!("; {said}"))
+                .collect::<String>()
         ),
         Event::CompensationRefused { why, .. } => match why {
             CompensationRefusal::BudgetSpent(words) | CompensationRefusal::Failed(words) => words.clone(),
@@ -302,4 +306,11 @@ fn figures_words(figures: &Figures) -> String {
         let _ = write!(line, "; {words}");
     }
     line
+}
+
+/// What was told of parameters of the machine, and what of it went where.
+pub(super) fn parameters_words(summary: &regrind_cell::CompensationSummary) -> Vec<String> {
+    let told = summary.parameters.iter().map(regrind_cell::ParameterTold::in_words);
+    let left = summary.map_rms_mm.filter(|_| !summary.parameters.is_empty());
+    told.chain(left.map(|mm| format!("left for the map: {:.2} um rms", 1e3 * mm))).collect()
 }

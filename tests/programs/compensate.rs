@@ -36,7 +36,7 @@ impl Shop {
     /// Writes a correction as a run does it, which has this map's identity.
     fn save_correction(&self, map: [u8; 32]) {
         let identities = CorrectionIdentities { part: PART, map, replaces: [1; 32] };
-        write_correction(&self.path("map.csv"), &Correction::none(GRID, 0.02), &identities, true).unwrap();
+        write_correction(&self.path("map.csv"), &Correction::none(GRID, 0.02), (&identities, &[]), true).unwrap();
     }
 
     pub fn path(&self, name: &str) -> PathBuf {

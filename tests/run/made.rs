@@ -115,7 +115,7 @@ struct Took {
 
 impl Line<'_> {
     /// Grinds one pass and returns the seconds that it took.
-    fn ground(&mut self, cycle: u16) -> f64 {
+    pub(super) fn ground(&mut self, cycle: u16) -> f64 {
         let (map, pass) = (self.payload(), super::pass_of(&self.bench.task, self.correction.level_mm));
         let payload = |bytes: Vec<u8>, kind: u8| Some(super::Payload { bytes, identity: [kind; 32] });
         let payloads = super::Payloads { plan: None, map: payload(map.encode(), 2), pass: payload(pass.encode(), 3) };

@@ -30,6 +30,7 @@ mod mirror_run;
 mod orders;
 mod outside;
 mod panics;
+mod parameters;
 mod prepared;
 mod production;
 #[path = "../common/program.rs"]

@@ -3,18 +3,21 @@
 
 #[path = "made.rs"]
 pub mod made;
+#[path = "told_apart.rs"]
+pub mod told_apart;
 
 use std::path::Path;
 
 use regrind::cell::CellPlan;
 use regrind::compensation::{
-    Correction, ErrorMap, GainRule, LearningState, MapOptions, NextPassError, Seen, error_map, response,
+    Contact, Correction, ErrorMap, GainRule, LearningState, MapOptions, NextPassError, ParameterKind, Parameters, Seen,
+    Set, Smoother, error_map, parameters, response, smooth_of,
 };
 use regrind::config::CellConfig;
 use regrind::drive::Task;
 use regrind::geometry::{Grid, Point, Sample, Vector};
 use regrind::recipe::Recipe;
-use regrind::registration::{PointStatus, Registration};
+use regrind::registration::{Deviation, PointStatus, Registration};
 use regrind::setup;
 use regrind_sim::body::{Body, Payload, Payloads};
 use regrind_sim::payload::{Feature, Map, Pass, Plan, PointRecord, Status, Target, decode_points};
@@ -108,6 +111,8 @@ struct Line<'a> {
     known: LearningState,
     before: Option<(Correction, ErrorMap)>,
     forecast: Option<[f64; 2]>,
+    /// What was told of the parameters after the first pass.
+    told: Option<Parameters>,
 }
 
 impl<'a> Line<'a> {
@@ -129,7 +134,7 @@ impl<'a> Line<'a> {
             Some((correction, known)) => {
                 (Correction { values_mm: correction.values_mm, ..none }, known.for_next_part())
             }
-            None => (none, LearningState::new(rule, &task.map, size_mm, None)),
+            None => (none, LearningState::new(rule, &task.map, size_mm, task.repeatability_mm)),
         };
         if job > 1 {
             world.load_blank();
@@ -137,7 +142,7 @@ impl<'a> Line<'a> {
         }
         let places = bench.plan_of.iter().map(|(p, _)| [p.x, p.y]).collect();
         let (worlds, grinders) = ([world, twin], [world.grinder(), twin.grinder()]);
-        Self { bench, way, worlds, grinders, job, places, correction, known, before: None, forecast: None }
+        Self { bench, way, worlds, grinders, job, places, correction, known, before: None, forecast: None, told: None }
     }
 
     /// Grinds and measures once, and makes the correction of the next pass.
@@ -146,7 +151,10 @@ impl<'a> Line<'a> {
         let map = self.payload();
         let flat = Map { values_mm: vec![0.0; map.values_mm.len()], ..map.clone() };
         let [real, twin] = &mut self.grinders;
-        grind(real, self.job, cycle, &map, &pass_of(&self.bench.task, level_mm));
+        let set = self.correction.set.as_ref();
+        let wheel_radius_mm = self.bench.task.wheel_radius_mm(set);
+        let told = Pass { wheel_radius_mm, ..pass_of(&self.bench.task, level_mm) };
+        grind(real, self.job, cycle, &map, &told);
         grind(twin, self.job, cycle, &flat, &pass_of(&self.bench.task, level_mm));
         let [whole, alone] = self.worlds.map(|world| {
             let deviations: Vec<f64> = world.deviations_mm(&self.places).iter().map(|d| d - level_mm).collect();
@@ -173,7 +181,7 @@ impl<'a> Line<'a> {
             first_mm,
             spacing_mm,
             nominal: [7; 32],
-            values_mm: self.correction.values_mm.clone(),
+            values_mm: self.correction.map_mm().into_owned(),
         }
     }
 
@@ -241,14 +249,23 @@ impl<'a> Line<'a> {
             response([earlier, &error], [correction, &self.correction], &places, scatter_mm)
         });
         let answer = answer.filter(|_| self.way != Way::Plain);
-        self.known = self.known.after(&Seen { correction: &self.correction, error: &error, answer });
+        let (contacts, set) = self.tell(found);
+        let options = task.parameter_options(self.correction.set.as_ref());
+        let grid = self.correction.grid;
+        let smoother = task
+            .parameters
+            .as_ref()
+            .map(|taken| move |values: &[f64]| smooth_of(values, &grid, [&contacts, &taken.nodes], &options));
+        let smooth = smoother.as_ref().map(|smoother| smoother as Smoother<'_>);
+        let seen = Seen { correction: &self.correction, error: &error, answer, smooth };
+        self.known = self.known.after(&seen);
         let forecast = self.known.forecast(&error, 0.0);
         self.forecast = Some([1e3 * forecast.rms_mm, 1e3 * forecast.sigma_mm]);
-        let next = match self.correction.next(&error, &self.known, &task.limits) {
+        let next = match self.correction.next(&error, &self.known, set.as_ref(), &task.limits) {
             Ok(step) => step.correction,
             // The study goes on where a recipe would have no material left: what counts here is the form.
             Err(NextPassError::BudgetSpent { .. }) => {
-                let changed = self.correction.changed(&self.known);
+                let changed = self.correction.changed(&self.known, set.as_ref());
                 Correction {
                     level_mm: changed.level_mm - task.limits.depth_of_cut_mm,
                     cycle: changed.cycle + 1,
@@ -258,6 +275,23 @@ impl<'a> Line<'a> {
             Err(error) => panic!("{}: {error}", self.bench.name),
         };
         self.before = Some((std::mem::replace(&mut self.correction, next), error));
+    }
+
+    /// Tells the parameters after the first pass, as a run does: where that is, and what of it the next pass is told.
+    fn tell(&mut self, found: &Registration) -> (Vec<Contact>, Option<Set>) {
+        let task = &self.bench.task;
+        let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
+        let contact = |d: &Deviation| Contact { point: d.point, normal: d.normal, deviation_mm: d.deviation_mm };
+        let contacts: Vec<Contact> = used.map(contact).collect();
+        let before = self.correction.set.clone();
+        let Some(taken) = task.parameters.as_ref().filter(|_| self.before.is_none()) else { return (contacts, before) };
+        let options = task.parameter_options(before.as_ref());
+        let told = parameters(&contacts, None, &options).unwrap();
+        let mut values = before.map_or([0.0; ParameterKind::COUNT], |set| set.values);
+        values.iter_mut().zip(&told.found).for_each(|(value, of)| *value += of.taken);
+        let set = Set::of(values, self.correction.cycle + 1, [&contacts, &taken.nodes], &options);
+        self.told = Some(told);
+        (contacts, set)
     }
 
     /// What a next part would begin with.
@@ -270,7 +304,8 @@ impl<'a> Line<'a> {
         let size = 50.0;
         let row = |(p, n): &(Point, Vector)| {
             let turn = p.coords.cross(n) / size;
-            nalgebra::Vector6::new(n.x, n.y, n.z, turn.x, turn.y, turn.z)
+            let row = nalgebra::Vector6::new(n.x, n.y, n.z, turn.x, turn.y, turn.z);
+            row.map_with_location(|k, _, v| if self.bench.task.registration.locked[k] { 0.0 } else { v })
         };
         let rows: Vec<_> = self.bench.plan_of.iter().map(row).collect();
         let gram: nalgebra::Matrix6<f64> = rows.iter().map(|row| row * row.transpose()).sum();

@@ -122,7 +122,7 @@ pub struct Forecast {
 }
 
 /// One measured pass.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy)]
 pub struct Seen<'a> {
     /// What it was ground with.
     pub correction: &'a Correction,
@@ -130,7 +130,13 @@ pub struct Seen<'a> {
     pub error: &'a ErrorMap,
     /// How the part answered to the change of the correction, after the first pass.
     pub answer: Option<Response>,
+    /// What of something that comes back in every pass, given on the grid of the correction in millimetres, parameters and slides of the machine
+    /// make; none where it is not looked for.
+    pub smooth: Option<Smoother<'a>>,
 }
+
+/// Tells what of values at the nodes of the correction is that of parameters and slides of the machine.
+pub type Smoother<'a> = &'a (dyn Fn(&[f64]) -> Vec<f64> + Sync);
 
 impl LearningState {
     /// Knows nothing yet. `repeatability_mm` is the rms of what a pass adds by itself, where that is known from elsewhere; it is shared out
@@ -166,7 +172,7 @@ impl LearningState {
     pub fn after(&self, seen: &Seen) -> Self {
         let mut known = self.clone();
         if seen.answer.is_some_and(|answer| !matches!(answer.sense, Sense::AsCommanded | Sense::Unclear)) {
-            known.wanted_mm = Some(seen.correction.values_mm.clone());
+            known.wanted_mm = Some(seen.correction.seen_mm().into_owned());
             return known;
         }
         let told = ErrorOnGrid::of(seen.error, seen.correction.grid);
@@ -175,25 +181,25 @@ impl LearningState {
         }
         let response = known.response[0];
         let mut mean = Mean::on(self.mean.as_ref(), told.grid, response / self.response[0]);
-        let u = &seen.correction.values_mm;
+        let u = seen.correction.seen_mm();
         let news: Vec<f64> =
-            told.error_mm.iter().zip(u).zip(&mean.values_mm).map(|((e, u), m)| e - response * u - m).collect();
+            told.error_mm.iter().zip(u.iter()).zip(&mean.values_mm).map(|((e, u), m)| e - response * u - m).collect();
         known.whole.take_in(told.mean_square(&news), known.whole.independent(&told));
         for (band, news) in known.bands.iter_mut().zip(self.split(&told, news)) {
             band.take_in(told.mean_square(&news), band.independent(&told));
             add(&mut mean.values_mm, band.gain, &news);
         }
-        let mut believed = vec![0.0; told.grid.len()];
+        // All points together tell it: it is believed as it is, and bands shrink what is left beside it.
+        let mut believed = seen.smooth.map_or_else(|| vec![0.0; told.grid.len()], |smooth| smooth(&mean.values_mm));
+        let rest: Vec<f64> = mean.values_mm.iter().zip(&believed).map(|(mean, smooth)| mean - smooth).collect();
         let noise = known.noise_mm2(told.noise_mm2);
-        for ((band, mean), noise_mm2) in
-            known.bands.iter_mut().zip(self.split(&told, mean.values_mm.clone())).zip(noise)
-        {
+        for ((band, mean), noise_mm2) in known.bands.iter_mut().zip(self.split(&told, rest)).zip(noise) {
             band.shrink(told.mean_square(&mean), noise_mm2);
             add(&mut believed, band.share, &mean);
         }
         known.wanted_mm = Some(match self.rule {
             GainRule::Fixed(share) => {
-                let last = seen.correction.values_mm.iter().zip(&told.error_mm);
+                let last = u.iter().zip(&told.error_mm);
                 last.map(|(u, e)| u - share / response * e).collect()
             }
             GainRule::Adaptive | GainRule::Wavelength => believed.iter().map(|r| -r / response).collect(),
@@ -448,7 +454,7 @@ mod tests {
     }
 
     fn after(known: &LearningState, correction: &Correction, error: &ErrorMap) -> LearningState {
-        known.after(&Seen { correction, error, answer: None })
+        known.after(&Seen { correction, error, answer: None, smooth: None })
     }
 
     fn rms(values: &[f64]) -> f64 {
@@ -520,7 +526,7 @@ mod tests {
             for pass in 0..3 {
                 let error = map(|[x, _]| 1e-3 + correction.at([x, 0.0]));
                 known = after(&known, &correction, &error);
-                let next = correction.changed(&known);
+                let next = correction.changed(&known, None);
                 for ((now, next), e) in correction.values_mm.iter().zip(&next.values_mm).zip(&error.values_mm) {
                     assert_eq!(*next, now - share * e, "pass {pass}");
                 }
@@ -537,15 +543,19 @@ mod tests {
         let (known, form) = (begin(GainRule::Adaptive, None), map(|[x, y]| 1e-3 * (0.1 * x).sin() + 2e-5 * y));
         let answer =
             Response { slope: 0.9, correlation: 1.0, asked_mm: 1e-3, unexplained_mm: 0.0, sense: Sense::AsCommanded };
-        let known = known.after(&Seen { correction: &none(), error: &form, answer: Some(answer) });
+        let known = known.after(&Seen { correction: &none(), error: &form, answer: Some(answer), smooth: None });
         assert!((known.response()[0] - 0.9).abs() < 1e-3, "{:?}", known.response());
         for (u, e) in known.wanted_mm().unwrap().iter().zip(&form.values_mm) {
             assert!((u + e / known.response()[0]).abs() < 1e-15);
         }
         // Four times what was asked for is no answer to it.
         let wild = Response { slope: 4.0, ..answer };
-        let known =
-            begin(GainRule::Adaptive, None).after(&Seen { correction: &none(), error: &form, answer: Some(wild) });
+        let known = begin(GainRule::Adaptive, None).after(&Seen {
+            correction: &none(),
+            error: &form,
+            answer: Some(wild),
+            smooth: None,
+        });
         assert_eq!(known.response(), [1.0, RESPONSE_SIGMA]);
     }
 
@@ -553,12 +563,12 @@ mod tests {
     fn what_was_not_ground_as_it_was_commanded_teaches_nothing() {
         let form = map(|[x, y]| 1e-3 * (0.2 * x + 0.1 * y).sin());
         let first = after(&begin(GainRule::Wavelength, None), &none(), &form);
-        let asked = none().changed(&first);
+        let asked = none().changed(&first, None);
         for sense in
             [Sense::NoEffect, Sense::Flipped, Sense::MirroredX, Sense::MirroredY, Sense::Turned, Sense::Doubled]
         {
             let answer = Response { slope: 0.0, correlation: 0.0, asked_mm: 1e-3, unexplained_mm: 1e-3, sense };
-            let twice = first.after(&Seen { correction: &asked, error: &form, answer: Some(answer) });
+            let twice = first.after(&Seen { correction: &asked, error: &form, answer: Some(answer), smooth: None });
             assert_eq!((twice.wanted_mm(), twice.passes()), (Some(&asked.values_mm[..]), 1), "{sense:?}");
             assert_eq!(twice.scatter_mm(), None);
         }
@@ -591,8 +601,8 @@ mod tests {
                 unexplained_mm: 0.0,
                 sense: Sense::AsCommanded,
             });
-            known = known.after(&Seen { correction: &correction, error: &error, answer });
-            correction = correction.changed(&known);
+            known = known.after(&Seen { correction: &correction, error: &error, answer, smooth: None });
+            correction = correction.changed(&known, None);
         }
         for (left_mm, expected) in left.windows(2).map(|w| w[1] / w[0]).zip([0.2, 0.5525, 0.634]) {
             assert!((left_mm - expected).abs() < 0.01, "{left:?}");

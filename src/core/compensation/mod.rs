@@ -4,7 +4,7 @@
 //!  deviations --error_map--> ErrorMap --Correction::next--> Correction --(ground, measured)--> Response
 //!  (scattered)               (filtered, on a grid)           (absolute, versioned)              (did it answer as commanded?)
 //!      |
-//!      +--parameters--> Parameters (wheel radius, setting, wear: corrected as such, not baked into the map)
+//!      +--parameters--> Parameters --Set--> (wheel radius, setting, tilt: corrected as such, not baked into the map)
 //! ```
 //!
 //! Pure: no file, no clock, no randomness. Frames: everything is over x and y of the model frame {M}. Units: millimetres. Signs:
@@ -29,11 +29,12 @@ mod spline;
 pub use correction::Correction;
 pub use error::MapError;
 pub use filter::Order;
-pub use learning::{Forecast, GainRule, LearningState, Seen};
+pub use learning::{Forecast, GainRule, LearningState, Seen, Smoother};
 pub use map::{ErrorMap, FilteredGrid, MapOptions, Smoothing, error_map, filter_grid, told_map};
 pub use next_pass::{CorrectionLimits, NextPass, NextPassError};
 pub use parameters::{
-    Contact, Parameter, ParameterError, ParameterKind, ParameterOptions, Parameters, WheelTerm, parameters,
+    Contact, Parameter, ParameterError, ParameterKind, ParameterOptions, Parameters, Set, Smooth, WheelTerm,
+    parameters, smooth_of,
 };
 pub use response::{Response, Sense, response};
 pub use sampling::{contact_width_mm, point_spacing_mm};

@@ -5,6 +5,7 @@ use thiserror::Error;
 use super::correction::Correction;
 use super::learning::LearningState;
 use super::map::ErrorMap;
+use super::parameters::Set;
 
 /// What a correction must keep to.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -68,10 +69,15 @@ pub enum NextPassError {
 }
 
 impl Correction {
-    /// Returns the correction that takes back what is worth it, whatever any limit says of it; for the same pass and level.
-    pub fn changed(&self, known: &LearningState) -> Self {
-        let values_mm = known.wanted_mm().unwrap_or(&self.values_mm).to_vec();
-        Self { values_mm, ..self.clone() }
+    /// Returns the correction that takes back what is worth it, whatever any limit says of it; for the same pass and level. What parameters
+    /// take back is not the map's.
+    pub fn changed(&self, known: &LearningState, set: Option<&Set>) -> Self {
+        let seen_mm = self.seen_mm();
+        let mut values_mm = known.wanted_mm().unwrap_or(&seen_mm).to_vec();
+        if let Some(set) = set {
+            values_mm.iter_mut().zip(&set.seen_mm).for_each(|(value, seen)| *value -= seen);
+        }
+        Self { values_mm, set: set.cloned(), ..self.clone() }
     }
 
     /// Returns what the part has lost in all where it loses most, below the surface of a first pass without a correction, in millimetres.
@@ -84,8 +90,8 @@ impl Correction {
             let ([x_mm, y_mm], limit_mm) = (self.grid.place_mm(k), limits.largest_correction_mm);
             return Err(NextPassError::TooLarge { found_mm: self.values_mm[k], x_mm, y_mm, limit_mm });
         }
-        // The correction itself adds where it is negative.
-        let deepest_mm = self.values_mm.iter().copied().fold(0.0, f64::min);
+        // The correction itself adds where it is negative, and so do parameters.
+        let deepest_mm = self.displaced_mm().iter().copied().fold(0.0, f64::min);
         let removed_mm = limits.allowance_mm - self.level_mm - deepest_mm;
         // A picometre is rounding, not removal.
         if removed_mm > limits.removal_budget_mm + 1e-9 {
@@ -94,7 +100,8 @@ impl Correction {
         Ok(removed_mm)
     }
 
-    /// Takes back of the error that the last pass left what is worth taking back, and goes deep enough to cut everywhere.
+    /// Takes back of the error that the last pass left what is worth taking back, and goes deep enough to cut everywhere. `set` is what
+    /// parameters of the machine take back of it, and the map what is left.
     ///
     /// Only removal is possible: the new surface must lie below the present one everywhere. A rise of the correction by d raises the
     /// surface by s d, s being the part's response, and every pass adds its own scatter; so the depth is at least the largest rise, two
@@ -108,10 +115,12 @@ impl Correction {
         &self,
         error: &ErrorMap,
         known: &LearningState,
+        set: Option<&Set>,
         limits: &CorrectionLimits,
     ) -> Result<NextPass, NextPassError> {
-        let values_mm = self.changed(known).values_mm;
-        let on_grid: Vec<f64> = values_mm.iter().zip(&self.values_mm).map(|(next, now)| next - now).collect();
+        let changed = self.changed(known, set);
+        let on_grid: Vec<f64> =
+            changed.displaced_mm().iter().zip(self.displaced_mm().iter()).map(|(next, now)| next - now).collect();
         // Where it was measured: there it is known how much the wheel will cut.
         let changes_mm = self.grid.resample(&on_grid, &error.grid);
         let (response, scatter_mm) = (known.response()[0], known.scatter_mm().unwrap_or(0.0));
@@ -122,7 +131,7 @@ impl Correction {
         if found_mm > limit_mm {
             return Err(NextPassError::TooDeep { found_mm, limit_mm });
         }
-        let correction = Self { grid: self.grid, values_mm, cycle: self.cycle + 1, level_mm: self.level_mm - depth_mm };
+        let correction = Self { cycle: self.cycle + 1, level_mm: self.level_mm - depth_mm, ..changed };
         let removed_mm = correction.removed_mm(limits)?;
         let depths_mm =
             || changes_mm.iter().zip(&error.valid).filter(|(_, valid)| **valid).map(|(c, _)| depth_mm - response * c);
@@ -172,7 +181,7 @@ mod tests {
     fn next(correction: &Correction, error: &ErrorMap, gain: f64) -> Result<NextPass, NextPassError> {
         let options = MapOptions::new(1.0, 1.0);
         let known = LearningState::new(GainRule::Fixed(gain), &options, [1.0; 2], None);
-        correction.next(error, &known.after(&Seen { correction, error, answer: None }), &LIMITS)
+        correction.next(error, &known.after(&Seen { correction, error, answer: None, smooth: None }), None, &LIMITS)
     }
 
     #[test]

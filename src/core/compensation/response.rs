@@ -74,7 +74,10 @@ pub fn response(
     let unseen = Motions::new(places);
     let over =
         |value: &dyn Fn([f64; 2]) -> f64| unseen.without(places.iter().map(|(p, _)| value([p.x, p.y])).collect());
-    let changed = |place: [f64; 2]| corrections[1].at(place) - corrections[0].at(place);
+    // Parameters move the part as a map does, and are answered alike.
+    let asked = corrections.map(|correction| (correction.grid, correction.seen_mm()));
+    let [earlier, later] = asked.each_ref().map(|(grid, values)| move |place| grid.interpolate(values, place));
+    let changed = |place: [f64; 2]| later(place) - earlier(place);
     let answer = over(&|place| after.at(place) - before.at(place));
     let [cx, cy] = [0, 1].map(|k| {
         let nodes = grid.counts()[k];

@@ -23,6 +23,7 @@
 
 mod budget;
 mod dense;
+mod effects;
 mod error;
 mod field;
 mod figures;
@@ -41,6 +42,7 @@ mod touches;
 
 pub use budget::Share;
 pub use dense::{Dense, Predicted};
+pub use effects::Effects;
 pub use error::ModelError;
 pub use field::{Field, Lay, Smoothness};
 pub use figures::{AngleInterval, AreaOptions, IsoFigures, SlopeFigures};

@@ -35,6 +35,8 @@ pub struct ProgramHeader {
     pub level_mm: f64,
     /// The wheel in words.
     pub wheel: String,
+    /// Which parameters of the machine are taken back in the path, a line each.
+    pub parameters: Vec<String>,
     /// The tracks in words.
     pub tracks: String,
     /// How often the program is run again without going deeper.
@@ -376,6 +378,9 @@ fn header_words(h: &ProgramHeader, s: &Summary, lines: u64) -> Vec<String> {
     say(format_args!("units: mm, mm/min; a correction is positive where it leaves material, along the outward normal"));
     say(format_args!("level over the nominal surface: {} mm", short(h.level_mm)));
     say(format_args!("wheel: {}", h.wheel));
+    for taken in &h.parameters {
+        say(format_args!("parameter: {taken}"));
+    }
     say(format_args!("tracks: {}", h.tracks));
     say(format_args!("feed: {} mm/min", short(s.feed_mm_min)));
     say(format_args!("spark-out: the program is run {} times more", h.spark_out_passes));
@@ -432,6 +437,7 @@ mod tests {
             uncorrected: false,
             level_mm: 0.0,
             wheel: "ball".into(),
+            parameters: Vec::new(),
             tracks: "raster".into(),
             spark_out_passes: 0,
             simulation: true,

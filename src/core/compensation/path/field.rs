@@ -61,6 +61,13 @@ impl Field {
         Self { on, per_mm: on.spacing_mm.map(|h| 1.0 / h), nodes }
     }
 
+    /// The same, lower everywhere.
+    #[must_use]
+    pub fn lowered(mut self, by: f64) -> Self {
+        self.nodes.iter_mut().for_each(|node| node[0] -= by);
+        self
+    }
+
     /// Returns the distance of the nodes along x and y, in millimetres.
     pub fn spacing_mm(&self) -> [f64; 2] {
         self.per_mm.map(|p| 1.0 / p)

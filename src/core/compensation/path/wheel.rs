@@ -102,6 +102,15 @@ impl Wheel {
         }
     }
 
+    /// The same wheel with a larger radius; of a ball.
+    #[must_use]
+    pub fn larger_by(self, mm: f64) -> Self {
+        match self {
+            Self::Sphere { radius_mm } => Self::Sphere { radius_mm: radius_mm + mm },
+            other => other,
+        }
+    }
+
     /// Returns how far the wheel reaches from its centre, in millimetres.
     pub fn reach_mm(&self) -> f64 {
         match self {

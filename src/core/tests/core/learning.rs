@@ -41,8 +41,8 @@ fn what_comes_back_is_found_to_the_scatter_of_the_mean() {
                 let scatter = drawn(&mut random, SCATTER_MM);
                 let sum = |k: usize| form[k] + correction.values_mm[k] + scatter[k];
                 let error = ErrorMap::known(GRID, (0..GRID.len()).map(sum).collect(), vec![true; GRID.len()]);
-                known = known.after(&Seen { correction: &correction, error: &error, answer: None });
-                correction = correction.changed(&known);
+                known = known.after(&Seen { correction: &correction, error: &error, answer: None, smooth: None });
+                correction = correction.changed(&known, None);
                 let rest: Vec<f64> = form.iter().zip(&correction.values_mm).map(|(r, u)| r + u).collect();
                 *left += rms(&rest).powi(2) / WORLDS as f64;
             }

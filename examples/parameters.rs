@@ -1,0 +1,73 @@
+//! Parameters of the machine in many worlds: how often they are told within their uncertainty, and what it saves to take them back.
+//!
+//! ```text
+//! cargo run --release --example parameters [WORLDS [FIRST [RECIPE]]]
+//! ```
+//! WORLDS (200) worlds from seed FIRST (1) on, of RECIPE (freeform-mirror), whose wheel, setting and part are off as `tests/run/told_apart.rs` states: by free
+//! registration, by a datum that holds x, y and z, and by one that holds the tilts. Every part is made twice from the same blank on the same machines, with parameters and by the
+//! map alone.
+
+#[path = "../tests/run/study.rs"]
+mod study;
+
+use rayon::prelude::*;
+use study::told_apart::{Compared, Told, corrections};
+use study::{After, Bench};
+
+const PASSES: u16 = 4;
+
+fn main() {
+    let number = |k: usize, otherwise: u64| std::env::args().nth(k).map_or(otherwise, |n| n.parse().expect("a number"));
+    let (worlds, first) = (number(1, 200), number(2, 1));
+    let name = std::env::args().nth(3).unwrap_or_else(|| "freeform-mirror".to_owned());
+    let held = |held: [usize; 3]| std::array::from_fn(|k| held.contains(&k));
+    for (what, held) in [("free", [false; 6]), ("x, y and z held", held([0, 1, 2])), ("tilts held", held([3, 4, 4]))] {
+        let bench = Bench::new(&name).held(held);
+        let seeds = (first..first + worlds).into_par_iter();
+        let made: Vec<Compared> = seeds.map(|seed| bench.told_apart(seed, PASSES)).collect();
+        println!("\n{name}, {what}, {worlds} worlds\n");
+        tell_parameters(&made);
+        tell_corrections(&made);
+    }
+}
+
+fn tell_parameters(made: &[Compared]) {
+    println!("| parameter | within U | U | off by, rms | taken back | asked for |\n|---|---|---|---|---|---|");
+    for kind in made[0].told.iter().map(|told| told.kind) {
+        let told: Vec<&Told> = made.iter().flat_map(|world| &world.told).filter(|told| told.kind == kind).collect();
+        let count = |of: &dyn Fn(&Told) -> bool| told.iter().filter(|told| of(told)).count();
+        let mean = |of: &dyn Fn(&Told) -> f64| told.iter().map(|told| of(told)).sum::<f64>() / told.len() as f64;
+        println!(
+            "| {} | {:.1} % | {:.1} {} | {:.1} | {} | {} |",
+            kind.name(),
+            100.0 * count(&|told| told.off.abs() <= 1.0) as f64 / told.len() as f64,
+            mean(&|told| told.expanded),
+            kind.unit(),
+            mean(&|told| told.truth * told.truth).sqrt(),
+            count(&|told| told.taken != 0.0),
+            count(&|told| told.is_beyond),
+        );
+    }
+}
+
+fn tell_corrections(made: &[Compared]) {
+    println!("\n| | pass 1 | pass 2 | pass 3 | pass 4 | corrections to the floor |\n|---|---|---|---|---|---|");
+    let ways: [(&str, fn(&Compared) -> &Vec<After>); 2] =
+        [("with parameters", |world| &world.with), ("by the map alone", |world| &world.alone)];
+    for (what, of) in ways {
+        let sum = |pass: usize, f: fn(&After) -> f64| made.iter().map(|world| f(&of(world)[pass]).powi(2)).sum::<f64>();
+        let ratio = |pass: usize| (sum(pass, |a| a.rms_um) / sum(pass, |a| a.floor_um)).sqrt();
+        let ratios: String = (0..usize::from(PASSES)).map(|pass| format!(" {:.2} |", ratio(pass))).collect();
+        let mean = made.iter().map(|world| corrections(of(world)) as f64).sum::<f64>() / made.len() as f64;
+        println!("| {what} |{ratios} {mean:.2} |");
+    }
+    let count = |of: &dyn Fn(&Compared) -> bool| made.iter().filter(|world| of(world)).count();
+    let both = |world: &Compared| [corrections(&world.with), corrections(&world.alone)];
+    println!(
+        "\nfewer corrections in {}, more in {}; after the first correction better in {}, worse by more than a twentieth in {}",
+        count(&|world| both(world)[0] < both(world)[1]),
+        count(&|world| both(world)[0] > both(world)[1]),
+        count(&|world| world.with[1].rms_um < world.alone[1].rms_um),
+        count(&|world| world.with[1].rms_um > 1.05 * world.alone[1].rms_um),
+    );
+}

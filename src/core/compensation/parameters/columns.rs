@@ -1,0 +1,154 @@
+//! What a unit of each parameter, of each motion and of the machine's slides adds to the deviations.
+
+use super::{Contact, ParameterKind, WheelTerm};
+use crate::geometry::bounds;
+
+/// A column that is left with less than this share of itself is made by those before it.
+const NOTHING_OWN: f64 = 1e-7;
+
+/// The effect of one unit of something at every point.
+pub(super) struct Column<K> {
+    pub(super) kind: K,
+    pub(super) values: Vec<f64>,
+}
+
+pub(super) const MOTIONS: [&str; 6] = [
+    "a shift of the part along x",
+    "a shift of the part along y",
+    "a shift of the part along z",
+    "a tilt of the part about x",
+    "a tilt of the part about y",
+    "a turn of the part about z",
+];
+const SLIDES: [&str; 4] = [
+    "a slide that is bent along x",
+    "a slide that is bent to and fro along x",
+    "a slide that is bent along y",
+    "a slide that is bent to and fro along y",
+];
+
+/// Where the part is, in x and y: its middle and half its size.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Extent {
+    middle_mm: [f64; 2],
+    half_mm: [f64; 2],
+}
+
+impl Extent {
+    /// The extent of some places.
+    pub fn of(places_mm: impl Iterator<Item = [f64; 2]>) -> Self {
+        let [low, high] = bounds(places_mm);
+        let of = |sign: f64| std::array::from_fn(|k| 0.5 * (high[k] + sign * low[k]));
+        Self { middle_mm: of(1.0), half_mm: of(-1.0) }
+    }
+
+    /// The larger of its sides, in millimetres.
+    pub(super) fn size_mm(&self) -> f64 {
+        2.0 * self.half_mm[0].max(self.half_mm[1])
+    }
+
+    /// -1 to 1 along x and along y.
+    fn share(&self, contact: &Contact) -> [f64; 2] {
+        [0, 1].map(|k| (contact.point[k] - self.middle_mm[k]) / self.half_mm[k].max(f64::MIN_POSITIVE))
+    }
+}
+
+/// What a unit of a motion of the part adds: a shift along x, y, z, a turn about x, y, z through the middle of the model frame.
+pub(super) fn of_motion(contact: &Contact, motion: usize) -> f64 {
+    match motion {
+        0..3 => contact.normal[motion],
+        _ => contact.point.coords.cross(&contact.normal)[motion - 3],
+    }
+}
+
+pub(super) fn motions(contacts: &[Contact], free: [bool; 6]) -> Vec<Column<&'static str>> {
+    let of = |k: usize| Column { kind: MOTIONS[k], values: contacts.iter().map(|c| of_motion(c, k)).collect() };
+    (0..6).filter(|&k| free[k]).map(of).collect()
+}
+
+/// What slides that are not straight add: the second and the third Legendre polynomial along either axis, guided in z.
+pub(super) fn slides(contacts: &[Contact], extent: &Extent) -> Vec<Column<&'static str>> {
+    let of = |k: usize| Column { kind: SLIDES[k], values: contacts.iter().map(|c| of_slide(c, extent, k)).collect() };
+    (0..SLIDES.len()).map(of).collect()
+}
+
+pub(super) fn of_slide(contact: &Contact, extent: &Extent, k: usize) -> f64 {
+    let t = extent.share(contact)[k / 2];
+    contact.normal.z * if k.is_multiple_of(2) { 1.5 * t * t - 0.5 } else { 2.5 * t * t * t - 1.5 * t }
+}
+
+impl ParameterKind {
+    /// What a unit of it adds to the deviation at a contact; wear is no function of the place.
+    pub(super) fn effect(self, contact: &Contact, term: WheelTerm) -> f64 {
+        let n = contact.normal;
+        match self {
+            Self::WheelRadius => match term {
+                WheelTerm::InHeight => 1.0 - 1.0 / n.z,
+                WheelTerm::AlongNormal => n.z - 1.0,
+            },
+            // p nz = -nx
+            Self::SettingX => -n.x,
+            Self::SettingY => -n.y,
+            Self::SettingZ => n.z,
+            Self::TiltX => -of_motion(contact, 3),
+            Self::TiltY => -of_motion(contact, 4),
+            Self::Wear => 0.0,
+        }
+    }
+}
+
+pub(super) fn candidates(
+    contacts: &[Contact],
+    progress: Option<&[f64]>,
+    term: WheelTerm,
+    extent: &Extent,
+) -> Vec<Column<ParameterKind>> {
+    let along_y = || contacts.iter().map(|c| 0.5 * (1.0 + extent.share(c)[1])).collect();
+    let of = |kind: ParameterKind| match kind {
+        ParameterKind::Wear => progress.map_or_else(along_y, <[f64]>::to_vec),
+        _ => contacts.iter().map(|c| kind.effect(c, term)).collect(),
+    };
+    ParameterKind::ALL.into_iter().map(|kind| Column { kind, values: of(kind) }).collect()
+}
+
+/// Orthonormal columns.
+pub(super) struct Basis {
+    pub(super) columns: Vec<Vec<f64>>,
+}
+
+pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(x, y)| x * y).sum()
+}
+
+pub(super) fn rms(values: &[f64]) -> f64 {
+    (dot(values, values) / values.len() as f64).sqrt()
+}
+
+impl Basis {
+    /// Gram-Schmidt, twice over; columns that add nothing are left out.
+    pub(super) fn of<'a>(columns: impl Iterator<Item = &'a Vec<f64>>) -> Self {
+        let mut basis = Self { columns: Vec::new() };
+        for column in columns {
+            let size = dot(column, column).sqrt();
+            let mut own = basis.without(column);
+            let left = dot(&own, &own).sqrt();
+            if left > NOTHING_OWN * size {
+                own.iter_mut().for_each(|v| *v /= left);
+                basis.columns.push(own);
+            }
+        }
+        basis
+    }
+
+    /// Returns what of a column none of these makes.
+    pub(super) fn without(&self, column: &[f64]) -> Vec<f64> {
+        let mut own = column.to_vec();
+        for _ in 0..2 {
+            for unit in &self.columns {
+                let share = dot(unit, &own);
+                own.iter_mut().zip(unit).for_each(|(v, u)| *v -= share * u);
+            }
+        }
+        own
+    }
+}

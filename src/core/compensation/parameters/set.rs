@@ -1,0 +1,163 @@
+//! What of the deviations is taken back by parameters, as the next pass is told it, and what of it the map sees.
+
+use nalgebra::{Matrix6, Vector6};
+use serde::{Deserialize, Serialize};
+
+use super::columns::{Extent, of_motion, of_slide};
+use super::{Contact, Fitted, LEAST_NZ, ParameterKind, ParameterOptions, WheelTerm, parameters};
+use crate::compensation::path::{Field, Jet};
+use crate::geometry::{Grid, Point, Vector};
+
+/// A direction of the motions whose size is less than this share of the largest is none.
+const NO_DIRECTION: f64 = 1e-9;
+
+/// What parameters and slides make of the deviations together, as a function of the place.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Smooth {
+    extent: Extent,
+    term: WheelTerm,
+    slides: Vec<f64>,
+    parameters: Vec<f64>,
+    motion: Motion,
+    share: f64,
+}
+
+impl Smooth {
+    pub(super) fn of(contacts: &[Contact], extent: &Extent, options: &ParameterOptions, fitted: &Fitted) -> Self {
+        let (slides, parameters) = fitted.values.as_slice().split_at(fitted.slides);
+        let none = Motion([0.0; 6]);
+        let (slides, parameters) = (slides.to_vec(), parameters.to_vec());
+        let whole =
+            Self { extent: *extent, term: options.wheel_term, slides, parameters, motion: none, share: fitted.share() };
+        let motion = Motion::of(contacts, options.free_motions, |c| whole.with_motion(c));
+        Self { motion, ..whole }
+    }
+
+    fn with_motion(&self, contact: &Contact) -> f64 {
+        let slides = self.slides.iter().enumerate().map(|(k, value)| value * of_slide(contact, &self.extent, k));
+        let parameters = ParameterKind::ALL.into_iter().zip(&self.parameters);
+        slides.sum::<f64>() + parameters.map(|(kind, value)| value * kind.effect(contact, self.term)).sum::<f64>()
+    }
+
+    /// Returns what they make of the deviation at a contact, as far as it is believed, in millimetres; what a motion of the part makes is taken out.
+    pub fn at(&self, contact: &Contact) -> f64 {
+        self.share * (self.with_motion(contact) - self.motion.at(contact))
+    }
+}
+
+/// Tells what of values at the nodes of a correction parameters and slides make: by the places where the part was measured; nothing where that
+/// cannot be told.
+///
+/// Shapes: `values_mm` at the nodes of `grid`, `nodes` the places of the surface under them; returned at the same nodes.
+pub fn smooth_of(
+    values_mm: &[f64],
+    grid: &Grid,
+    [contacts, nodes]: [&[Contact]; 2],
+    options: &ParameterOptions,
+) -> Vec<f64> {
+    let on_part = |c: &Contact| Contact { deviation_mm: grid.interpolate(values_mm, [c.point.x, c.point.y]), ..*c };
+    let told = parameters(&contacts.iter().map(on_part).collect::<Vec<_>>(), None, options);
+    told.map_or_else(|_| vec![0.0; nodes.len()], |told| nodes.iter().map(|node| told.smooth.at(node)).collect())
+}
+
+/// The motion of the part that registration makes of something.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Motion([f64; 6]);
+
+impl Motion {
+    fn of(contacts: &[Contact], free: [bool; 6], of: impl Fn(&Contact) -> f64) -> Self {
+        let row = |c: &Contact| Vector6::from_fn(|k, _| if free[k] { of_motion(c, k) } else { 0.0 });
+        let gram: Matrix6<f64> = contacts.iter().map(|c| row(c) * row(c).transpose()).sum();
+        let towards: Vector6<f64> = contacts.iter().map(|c| row(c) * of(c)).sum();
+        // Turns and shifts have units of their own.
+        let sizes = gram.diagonal().map(|v| if v > 0.0 { v.sqrt().recip() } else { 0.0 });
+        let parts = Matrix6::from_fn(|r, c| gram[(r, c)] * sizes[r] * sizes[c]).symmetric_eigen();
+        let towards = towards.component_mul(&sizes);
+        let least = NO_DIRECTION * parts.eigenvalues.max();
+        let mut motion = Vector6::zeros();
+        for (value, vector) in parts.eigenvalues.iter().zip(parts.eigenvectors.column_iter()) {
+            if *value > least {
+                motion += vector * (vector.dot(&towards) / value);
+            }
+        }
+        Self(motion.component_mul(&sizes).into())
+    }
+
+    fn at(&self, contact: &Contact) -> f64 {
+        self.0.iter().enumerate().map(|(k, value)| value * of_motion(contact, k)).sum()
+    }
+}
+
+/// Parameters as a pass is told them: absolute, they replace those of the pass before.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Set {
+    /// How far each is off what the recipe states, in its unit, in the order of [`ParameterKind::ALL`].
+    pub values: [f64; ParameterKind::COUNT],
+    /// The first pass that is ground with them.
+    pub since_cycle: u16,
+    /// By how much the surface is displaced along its normal at every node of the correction by telling them, in millimetres.
+    pub displaced_mm: Vec<f64>,
+    /// What of that setting and tilt make: a grinder has a word for the radius of its wheel, and for these none but its map.
+    pub setting_mm: Vec<f64>,
+    /// What of all of it is left once the part is registered anew: what a map would have to do in their place.
+    pub seen_mm: Vec<f64>,
+}
+
+impl Set {
+    /// The set that takes parameters back by these values, from the next pass on; `None` of nothing.
+    ///
+    /// Shapes: `contacts` where the part was measured, `nodes` the places of the surface under the nodes of the correction. Units: millimetres,
+    /// radians.
+    pub fn of(
+        values: [f64; ParameterKind::COUNT],
+        since_cycle: u16,
+        [contacts, nodes]: [&[Contact]; 2],
+        options: &ParameterOptions,
+    ) -> Option<Self> {
+        if values.iter().all(|value| *value == 0.0) {
+            return None;
+        }
+        let of = |c: &Contact, but: Option<ParameterKind>| {
+            let each = ParameterKind::ALL.into_iter().zip(values).filter(|(kind, _)| Some(*kind) != but);
+            -each.map(|(kind, value)| value * kind.effect(c, options.wheel_term)).sum::<f64>()
+        };
+        let motion = Motion::of(contacts, options.free_motions, |c| of(c, None));
+        let displaced_mm: Vec<f64> = nodes.iter().map(|node| of(node, None)).collect();
+        let setting_mm = nodes.iter().map(|node| of(node, Some(ParameterKind::WheelRadius))).collect();
+        let seen_mm = nodes.iter().zip(&displaced_mm).map(|(node, of)| of - motion.at(node)).collect();
+        Some(Self { values, since_cycle, displaced_mm, setting_mm, seen_mm })
+    }
+
+    /// Returns by how much a parameter is off what the recipe states.
+    pub fn value(&self, kind: ParameterKind) -> f64 {
+        ParameterKind::ALL.iter().position(|of| *of == kind).map_or(0.0, |k| self.values[k])
+    }
+
+    /// Whether every number is one that can be, for so many nodes.
+    pub fn is_sound(&self, nodes: usize) -> bool {
+        let each = [&self.displaced_mm, &self.setting_mm, &self.seen_mm];
+        self.values.iter().all(|v| v.is_finite())
+            && each.iter().all(|of| of.len() == nodes && of.iter().all(|v| v.is_finite()))
+    }
+}
+
+impl Contact {
+    /// The places of a surface under the nodes of a grid; beyond where the surface is known, the nearest of those that are.
+    pub fn under(surface: &Field, grid: &Grid) -> Vec<Self> {
+        let at = |k: usize| {
+            let [x, y] = grid.place_mm(k);
+            let Jet { value, slope: [p, q], .. } = surface.at([x, y]);
+            let normal = Vector::new(-p, -q, 1.0).normalize();
+            let is_known = value.is_finite() && normal.z >= LEAST_NZ;
+            is_known.then_some(Self { point: Point::new(x, y, value), normal, deviation_mm: 0.0 })
+        };
+        let known: Vec<Option<Self>> = (0..grid.len()).map(at).collect();
+        let nearest = |k: usize| {
+            let [x, y] = grid.place_mm(k);
+            let far = |c: &&Self| (c.point.x - x).hypot(c.point.y - y);
+            known.iter().flatten().min_by(|a, b| far(a).total_cmp(&far(b))).copied()
+        };
+        let level = Self { point: Point::origin(), normal: Vector::z(), deviation_mm: 0.0 };
+        (0..grid.len()).map(|k| known[k].or_else(|| nearest(k)).unwrap_or(level)).collect()
+    }
+}

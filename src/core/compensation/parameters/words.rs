@@ -1,0 +1,109 @@
+//! What is said of parameters, in the words of a process engineer.
+
+use nalgebra::{DMatrix, DVector};
+
+use super::columns::dot;
+use super::{EXPANDED, NOTHING, Parameter, ParameterKind, ParameterOptions};
+
+/// Another column is named where it makes up so much of one that cannot be told apart.
+const NAMED: f64 = 0.2;
+pub(super) const NO_DATUM: &str =
+    "how well the datum holds the part, which nobody states (registration.hold_uncertainty_um)";
+
+/// What a parameter is called.
+pub fn name(kind: ParameterKind) -> &'static str {
+    match kind {
+        ParameterKind::WheelRadius => "wheel radius",
+        ParameterKind::SettingX => "wheel setting along x",
+        ParameterKind::SettingY => "wheel setting along y",
+        ParameterKind::SettingZ => "wheel setting along z",
+        ParameterKind::TiltX => "tilt of the part about x",
+        ParameterKind::TiltY => "tilt of the part about y",
+        ParameterKind::Wear => "wear along the path",
+    }
+}
+
+impl ParameterKind {
+    /// What it is called, for people.
+    pub fn name(self) -> &'static str {
+        name(self)
+    }
+
+    /// The unit that it is told in, for people: a millionth of that of its value, or a thousandth of a millimetre.
+    pub fn unit(self) -> &'static str {
+        if self.is_angle() { "urad" } else { "um" }
+    }
+
+    /// So many of its units are one of its value.
+    pub fn units(self) -> f64 {
+        if self.is_angle() { 1e6 } else { 1e3 }
+    }
+
+    /// The key of a recipe that takes it back; none where it is never taken.
+    pub fn key(self) -> Option<&'static str> {
+        match self {
+            Self::WheelRadius => Some("wheel_radius_um"),
+            Self::SettingX => Some("wheel_x_um"),
+            Self::SettingY => Some("wheel_y_um"),
+            Self::SettingZ => Some("wheel_z_um"),
+            Self::TiltX => Some("part_tilt_x_urad"),
+            Self::TiltY => Some("part_tilt_y_urad"),
+            Self::Wear => None,
+        }
+    }
+}
+
+/// Returns what makes up most of a column, by name.
+pub(super) fn alike(target: &[f64], others: &[(String, &Vec<f64>)]) -> Vec<String> {
+    let size = dot(target, target).sqrt();
+    if size * size <= NOTHING * target.len() as f64 {
+        return vec!["nothing at all, for it has no effect on a level surface".to_owned()];
+    }
+    let others: Vec<_> = others.iter().filter(|(_, c)| dot(c, c) > NOTHING * c.len() as f64).collect();
+    // Unit columns; the least-squares solution of least size shares out what several could make alike.
+    let sizes: Vec<f64> = others.iter().map(|(_, c)| dot(c, c).sqrt()).collect();
+    let count = others.len();
+    let gram = DMatrix::from_fn(count, count, |r, c| dot(others[r].1, others[c].1) / (sizes[r] * sizes[c]));
+    let right = DVector::from_fn(count, |r, _| dot(others[r].1, target) / (sizes[r] * size));
+    let parts = gram.symmetric_eigen();
+    let mut shares = DVector::zeros(count);
+    for (value, vector) in parts.eigenvalues.iter().zip(parts.eigenvectors.column_iter()) {
+        if *value > 1e-6 {
+            shares += vector * (vector.dot(&right) / value);
+        }
+    }
+    let mut named: Vec<(f64, &String)> =
+        others.iter().zip(shares.iter()).map(|((name, _), share)| (share.abs(), name)).collect();
+    named.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let most = named.first().map_or(0.0, |(share, _)| *share);
+    named.into_iter().take(3).filter(|(share, _)| *share > NAMED * most).map(|(_, name)| name.clone()).collect()
+}
+
+pub(super) fn message(parameter: &Parameter, rest_rms_mm: f64, options: &ParameterOptions) -> String {
+    let Parameter { kind, value, sigma, taken, .. } = *parameter;
+    let (name, unit, units) = (name(kind), kind.unit(), kind.units());
+    if !parameter.alike.is_empty() {
+        let alike = parameter.alike.join(" and ");
+        return format!("{name}: cannot be told apart from {alike}; it is left to the map");
+    }
+    let found = format!("{:.2} \u{b1} {:.2} {unit}", units * value, EXPANDED * units * sigma);
+    if !parameter.offered {
+        return format!("{name}: off by {found} is no clear error; it is left to the map");
+    }
+    let with_um = 1e3 * (rest_rms_mm + parameter.removes_rms_mm);
+    let gain = format!("{:.2} of {with_um:.2} um rms", 1e3 * parameter.removes_rms_mm);
+    let stated = match kind {
+        ParameterKind::WheelRadius => {
+            let (true_mm, stated_mm) = (options.wheel_radius_mm + value, options.wheel_radius_mm);
+            format!("{true_mm:.4} mm instead of {stated_mm:.4} mm, ")
+        }
+        _ => String::new(),
+    };
+    let off = format!("{name}: {stated}off by {found}, which makes {gain}");
+    let key = kind.key().map(|key| format!("compensation.parameters.{key}"));
+    match (key, taken) {
+        (Some(key), 0.0) => format!("{off}; {key} = its tolerance would take it back, now the map does"),
+        (Some(_), taken) => format!("{off}; {:.2} {unit} of it are taken back", units * taken),
+        (None, _) => format!("{off}; it is left to the map, for the wheel wears anew in the next pass"),
+    }
+}

@@ -1,0 +1,191 @@
+//! Parameters of the machine in many worlds: told, taken back, and what comes of it beside the map alone, by the truth.
+
+use regrind::compensation::path::height_of;
+use regrind::compensation::{Contact, GainRule, ParameterKind, WheelTerm};
+use regrind::drive::TakenBack;
+use regrind::geometry::Grid;
+use regrind_sim::spec::WorldSpec;
+use regrind_sim::world::World;
+
+use super::{After, Bench, GrinderSpec, Line, Way};
+
+/// Expanded uncertainties of the radius of a wheel as it is trued, of where it is set and of a part as it is clamped, and of the datum of the CMM.
+pub const RADIUS_UM: f64 = 100.0;
+pub const SETTING_UM: f64 = 15.0;
+pub const TILT_URAD: f64 = 60.0;
+pub const DATUM_UM: f64 = 0.5;
+/// By how much slides are bent, to either side.
+const STRAIGHT_UM: f64 = 0.6;
+/// What a pass may leave over what it adds by itself, to be at the floor.
+pub const AT_FLOOR: f64 = 1.2;
+
+/// What became of one world.
+#[derive(Clone, Debug)]
+pub struct Compared {
+    /// Of each parameter that was told: its kind, by how much it was off in expanded uncertainties, these, whether it was offered, taken and beyond.
+    pub told: Vec<Told>,
+    /// The truth after every pass with parameters, and by the map alone.
+    pub with: Vec<After>,
+    pub alone: Vec<After>,
+}
+
+/// What was told of a parameter.
+#[derive(Clone, Copy, Debug)]
+pub struct Told {
+    pub kind: ParameterKind,
+    pub off: f64,
+    pub expanded: f64,
+    pub truth: f64,
+    pub taken: f64,
+    pub is_beyond: bool,
+}
+
+impl Bench {
+    /// The same in worlds whose grinder is held by a datum in all that a part may be off by in it, or not at all.
+    pub fn held(mut self, held: [bool; 6]) -> Self {
+        self.task.registration.locked = held;
+        if held.contains(&true) {
+            self.task.start_at_fixture = true;
+            self.task.datum = Some(self.datum());
+        }
+        self
+    }
+
+    fn datum(&self) -> [f64; 2] {
+        let [x, y] = [self.task.pass.x_mm, self.task.pass.y_mm].map(|[low, high]| high - low);
+        let shift_mm = 0.5e-3 * DATUM_UM;
+        [shift_mm, shift_mm / (0.5 * x.max(y))]
+    }
+
+    /// A world whose wheel and part are off by what their tolerances allow; the rest as the recipe ships it.
+    fn off(&self, seed: u64) -> WorldSpec {
+        let mut drawn = regrind_sim::rng(seed ^ 0x5eed_0ff5);
+        let mut draw = |expanded: f64| 0.5 * expanded * normal(&mut drawn);
+        let mut spec = WorldSpec { seed, ..self.spec.clone() };
+        let grinder = &mut spec.grinder;
+        // The machine itself is a good one: slides on air or oil, within 0.1 um over 25 mm, a spindle that is cooled.
+        grinder.straightness_x_um = [draw(STRAIGHT_UM), draw(STRAIGHT_UM)];
+        grinder.straightness_y_um = [draw(STRAIGHT_UM), draw(STRAIGHT_UM)];
+        (grinder.waviness_um, grinder.periodic_um, grinder.following_um) = (0.15, 0.05, 0.05);
+        (grinder.wear_um, grinder.break_in_um, grinder.thermal_um) = (0.6, 0.2, 0.8);
+        grinder.wheel_radius_error_um = draw(RADIUS_UM);
+        grinder.setting_error_um = [draw(SETTING_UM), draw(SETTING_UM)];
+        grinder.setting_error_z_um = draw(SETTING_UM);
+        grinder.part_tilt_urad = [draw(TILT_URAD), draw(TILT_URAD)];
+        if self.task.datum.is_some() {
+            let [shift_mm, turn_rad] = self.datum();
+            spec.cmm.translation_mm = [0.0; 3];
+            spec.cmm.rotation_deg = [0.0; 3];
+            spec.cmm.loading_shift_um = 1e3 * shift_mm;
+            spec.cmm.loading_turn_deg = turn_rad.to_degrees();
+        }
+        spec
+    }
+
+    /// Makes one part in a world whose machine is off, with parameters and by the map alone.
+    pub fn told_apart(&self, seed: u64, passes: u16) -> Compared {
+        let spec = self.off(seed);
+        let (told, with) = self.with_parameters().line_of(&spec, passes);
+        let (_, alone) = self.without_parameters().line_of(&spec, passes);
+        Compared { told, with, alone }
+    }
+
+    fn line_of(&self, spec: &WorldSpec, passes: u16) -> (Vec<Told>, Vec<After>) {
+        let of = &spec.grinder;
+        let alone = GrinderSpec {
+            repeatability_um: of.repeatability_um,
+            repeatability_correlation_mm: of.repeatability_correlation_mm,
+            error_copying: of.error_copying,
+            ..GrinderSpec::perfect()
+        };
+        let twin = WorldSpec { grinder: alone, ..spec.clone() };
+        let (world, twin) = (World::new(spec.clone()).unwrap(), World::new(twin).unwrap());
+        let mut line = Line::new(self, Way::Regrind(GainRule::Wavelength), &world, &twin, None, 1);
+        let after = (1..=passes).map(|cycle| line.pass(cycle)).collect();
+        let told = line.told.iter().flat_map(|told| &told.found);
+        let told = told.filter(|p| p.alike.is_empty() && p.kind != ParameterKind::Wear).map(|p| {
+            let drift_um = if p.kind == ParameterKind::SettingZ { self.drift_um(spec) } else { 0.0 };
+            let truth = (truth(of, p.kind) + drift_um) / p.kind.units();
+            let units = p.kind.units();
+            Told {
+                kind: p.kind,
+                off: (p.value - truth) / (2.0 * p.sigma),
+                expanded: 2.0 * units * p.sigma,
+                truth: units * truth,
+                taken: units * p.taken,
+                is_beyond: p.beyond,
+            }
+        });
+        (told.collect(), after)
+    }
+
+    /// What wear and the growth of the spindle add to the height on average, in every pass alike: nothing tells it from how high the wheel is set.
+    fn drift_um(&self, spec: &WorldSpec) -> f64 {
+        let of = &spec.grinder;
+        let alone = GrinderSpec {
+            wear_um: of.wear_um,
+            break_in_um: of.break_in_um,
+            thermal_um: of.thermal_um,
+            error_copying: of.error_copying,
+            ..GrinderSpec::perfect()
+        };
+        let world = World::new(WorldSpec { grinder: alone, ..spec.clone() }).unwrap();
+        let mut line = Line::new(self, Way::Regrind(GainRule::Wavelength), &world, &world, None, 1);
+        let level_mm = line.correction.level_mm;
+        line.ground(1);
+        let off = world.deviations_mm(&line.places);
+        1e3 * off.iter().map(|d| d - level_mm).sum::<f64>() / off.len() as f64
+    }
+
+    fn without_parameters(&self) -> Self {
+        let mut bench = self.again();
+        bench.task.repeatability_mm = Some(1e-3 * self.spec.grinder.repeatability_um);
+        bench
+    }
+
+    fn with_parameters(&self) -> Self {
+        let mut bench = self.without_parameters();
+        let task = &mut bench.task;
+        let corners = [[task.pass.x_mm[0], task.pass.y_mm[0]], [task.pass.x_mm[1], task.pass.y_mm[1]]];
+        let grid = Grid::over(corners.into_iter(), task.map.spacing_mm).unwrap();
+        let nodes = Contact::under(&height_of(&task.nominal).unwrap().0, &grid);
+        let [mm, rad] = [1e-3, 1e-6];
+        let [radius, setting, tilt] = [mm * RADIUS_UM, mm * SETTING_UM, rad * TILT_URAD].map(Some);
+        task.parameters = Some(TakenBack {
+            tolerances: [radius, setting, setting, setting, tilt, tilt, None],
+            wheel_term: WheelTerm::InHeight,
+            nodes,
+        });
+        bench
+    }
+
+    fn again(&self) -> Self {
+        let mut bench = Self::new(&self.name).held(self.task.registration.locked);
+        bench.spec = self.spec.clone();
+        bench
+    }
+}
+
+/// How far a grinder is off, in the unit that a parameter is told in.
+fn truth(of: &GrinderSpec, kind: ParameterKind) -> f64 {
+    match kind {
+        ParameterKind::WheelRadius => of.wheel_radius_error_um,
+        ParameterKind::SettingX => of.setting_error_um[0],
+        ParameterKind::SettingY => of.setting_error_um[1],
+        ParameterKind::SettingZ => of.setting_error_z_um,
+        ParameterKind::TiltX => of.part_tilt_urad[0],
+        ParameterKind::TiltY => of.part_tilt_urad[1],
+        _ => 0.0,
+    }
+}
+
+/// The correction after which the truth is at the floor and stays there, 0 being none; beyond the passes where it never is.
+pub fn corrections(after: &[After]) -> usize {
+    after.iter().position(|a| a.rms_um <= AT_FLOOR * a.floor_um).unwrap_or(after.len())
+}
+
+fn normal(rng: &mut regrind_sim::Rng) -> f64 {
+    use rand::RngExt as _;
+    let [a, b]: [f64; 2] = [rng.random(), rng.random()];
+    (-2.0 * (1.0 - a).ln()).sqrt() * (std::f64::consts::TAU * b).cos()
+}
