@@ -28,7 +28,10 @@ fn beside_linuxcnc(name: &str, test: impl FnOnce(&Path)) {
         let _controller = controller();
         return test(home.path());
     }
-    let prepare = "mount -t tmpfs tmpfs /tmp; chmod 1777 /tmp; ip link set lo up; exec \"$@\"";
+    // Locks of machines are kept outside /tmp too, and every controller here has the same address.
+    let prepare = "for folder in /tmp /run/lock /var/lock /var/tmp; do
+        [ ! -d $folder ] || { mount -t tmpfs tmpfs $folder; chmod 1777 $folder; }
+    done; ip link set lo up; exec \"$@\"";
     let mut command = Command::new("unshare");
     command.args(["--ipc", "--net", "--pid", "--mount", "--fork", "--mount-proc", "--kill-child"]);
     command.args(["sh", "-euc", prepare, "sh"]).arg(std::env::current_exe().unwrap());
