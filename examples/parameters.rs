@@ -52,8 +52,8 @@ fn tell_parameters(made: &[Compared]) {
 
 fn tell_corrections(made: &[Compared]) {
     println!("\n| | pass 1 | pass 2 | pass 3 | pass 4 | corrections to the floor |\n|---|---|---|---|---|---|");
-    let ways: [(&str, fn(&Compared) -> &Vec<After>); 2] =
-        [("with parameters", |world| &world.with), ("by the map alone", |world| &world.alone)];
+    type Way = fn(&Compared) -> &[After];
+    let ways: [(&str, Way); 2] = [("with parameters", |world| &world.with), ("by the map alone", |world| &world.alone)];
     for (what, of) in ways {
         let sum = |pass: usize, f: fn(&After) -> f64| made.iter().map(|world| f(&of(world)[pass]).powi(2)).sum::<f64>();
         let ratio = |pass: usize| (sum(pass, |a| a.rms_um) / sum(pass, |a| a.floor_um)).sqrt();

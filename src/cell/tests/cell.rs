@@ -294,7 +294,7 @@ fn a_parameter_beyond_its_tolerance_is_asked_for_and_confirmed_by_resuming() {
     run.send(Event::Compensated { cycle: 1, summary });
     assert_eq!(run.cell.state(), State::Held(Phase::Grind(JobStep::Send)));
     let alarms = run.alarms();
-    assert!(alarms.iter().any(|id| *id == AlarmId::ParameterBeyond), "{alarms:?}");
+    assert!(alarms.contains(&AlarmId::ParameterBeyond), "{alarms:?}");
     run.send(resume());
     run.until(State::Execute(Phase::Grind(JobStep::Run)));
     assert_eq!(run.starts().iter().filter(|(device, _)| *device == Device::Grinder).count(), 2);
