@@ -11,7 +11,7 @@ const ARROWS: [(&str, &str, &[&str]); 21] = [
     ("surface", "src/core/surface", &["geometry"]),
     ("measuring", "src/core/measuring", &["geometry", "surface"]),
     ("registration", "src/core/registration", &["geometry", "surface"]),
-    ("compensation", "src/core/compensation", &["geometry", "sparse", "surface", "registration"]),
+    ("compensation", "src/core/compensation", &["geometry", "sparse", "surface", "registration", "model"]),
     ("model", "src/core/model", &["form", "geometry", "registration", "sparse"]),
     ("sparse", "src/core/sparse.rs", &[]),
     ("form", "src/core/form", &["geometry", "surface"]),

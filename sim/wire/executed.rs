@@ -42,8 +42,18 @@ struct Shared {
     /// The program, while it runs.
     child: Mutex<Option<Child>>,
     input: Mutex<Option<ChildStdin>>,
-    /// The mark that came last; none while nothing comes.
-    mark: watch::Sender<Option<u32>>,
+    told: watch::Sender<Told>,
+}
+
+/// What the program has told last.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Told {
+    /// There is no program.
+    Gone,
+    /// It has begun, and nothing has come.
+    Nothing,
+    /// A mark.
+    Mark(u32),
 }
 
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -58,9 +68,11 @@ impl ExecutedPath {
     pub fn follow(command: Command, wheel: Wheel) -> io::Result<Self> {
         let mut command = command;
         command.stdin(Stdio::piped()).stdout(Stdio::piped());
-        let first = command.spawn()?;
-        let (ended, mark) = (AtomicBool::new(false), watch::Sender::new(None));
-        let shared = Arc::new(Shared { ended, child: Mutex::default(), input: Mutex::default(), mark });
+        let mut first = command.spawn()?;
+        let (ended, input) = (AtomicBool::new(false), Mutex::new(first.stdin.take()));
+        // Whoever asks from here on waits for an answer.
+        let told = watch::Sender::new(Told::Nothing);
+        let shared = Arc::new(Shared { ended, child: Mutex::default(), input, told });
         let following = Arc::clone(&shared);
         thread::spawn(move || follow(&following, &mut command, first, wheel));
         Ok(Self { shared, asked: Mutex::new((rand::random(), None)) })
@@ -78,18 +90,13 @@ impl ExecutedPath {
             *when = Some(Instant::now());
             *question
         };
-        let mut marks = self.shared.mark.subscribe();
+        let mut told = self.shared.told.subscribe();
         let asked = locked(&self.shared.input).as_mut().is_some_and(|input| writeln!(input, "{question}").is_ok());
         if asked {
-            let seen = marks.wait_for(|mark| mark.is_none_or(|mark| mark == question));
+            let seen = told.wait_for(|told| matches!(*told, Told::Gone) || *told == Told::Mark(question));
             // Who has no answer by then has none.
             let _ = timeout(LOST_AFTER, seen).await;
         }
-    }
-
-    /// Whether anything of a controller comes.
-    pub fn is_told(&self) -> bool {
-        self.shared.mark.borrow().is_some()
     }
 }
 
@@ -109,7 +116,10 @@ fn follow(shared: &Shared, command: &mut Command, first: Child, mut wheel: Wheel
     let mut next = Ok(first);
     while !shared.ended.load(Ordering::SeqCst) {
         if let Ok(mut child) = next {
-            *locked(&shared.input) = child.stdin.take();
+            if let Some(input) = child.stdin.take() {
+                *locked(&shared.input) = Some(input);
+                shared.told.send_replace(Told::Nothing);
+            }
             let lines = child.stdout.take();
             *locked(&shared.child) = Some(child);
             if let Some(lines) = lines {
@@ -117,7 +127,7 @@ fn follow(shared: &Shared, command: &mut Command, first: Child, mut wheel: Wheel
             }
             *locked(&shared.input) = None;
             wheel.away();
-            shared.mark.send_replace(None);
+            shared.told.send_replace(Told::Gone);
             if let Some(mut child) = locked(&shared.child).take() {
                 let _ = child.kill();
                 let _ = child.wait();
@@ -148,9 +158,9 @@ fn read(shared: &Shared, lines: impl BufRead, wheel: &mut Wheel) {
             true => wheel.at(place_mm, number as f64 * CYCLE_S),
             false => wheel.away(),
         }
-        if *shared.mark.borrow() != Some(mark) {
+        if *shared.told.borrow() != Told::Mark(mark) {
             wheel.settle();
-            shared.mark.send_replace(Some(mark));
+            shared.told.send_replace(Told::Mark(mark));
         }
     }
 }
@@ -203,14 +213,11 @@ mod tests {
         command.args(["-c", told]);
         let world = World::new(WorldSpec::default()).unwrap();
         let path = ExecutedPath::follow(command, world.wheel(12.5).unwrap()).unwrap();
-        while locked(&path.shared.input).is_none() {
-            tokio::task::yield_now().await;
-        }
         path.caught_up().await;
         let question = locked(&path.asked).0;
-        assert_eq!(*path.shared.mark.borrow(), Some(question));
+        assert_eq!(*path.shared.told.borrow(), Told::Mark(question));
         // What was asked so lately is not asked again.
         path.caught_up().await;
-        assert_eq!((locked(&path.asked).0, path.is_told()), (question, true));
+        assert_eq!(locked(&path.asked).0, question);
     }
 }

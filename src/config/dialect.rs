@@ -88,7 +88,7 @@ mod tests {
         let text = BUILT_IN[1]
             .1
             .replace("decimals = 4 ", "decimals = 9 ")
-            .replace("line = ", "lines = ")
+            .replace("\nline = ", "\nlines = ")
             .replace("G21 G90", "G20 G90");
         let problems = parse_dialect(Path::new("ours.toml"), &text).unwrap_err();
         let told = problems.to_string();

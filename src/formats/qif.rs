@@ -322,7 +322,7 @@ mod tests {
             ),
             (">false<", ">perhaps<", "expected true or false"),
             ("<FileUnits>", "<FileUnits><!-- ", "no readable XML"),
-            ("SIUnitName>meter", "SIUnitName>feet", "no readable XML"),
+            ("SIUnitName>meter", "SIUnitName>feet", "expected the meter as SIUnitName, found `feet`"),
             ("0.001", "0", "expected the unit in metres, found `0`"),
             (
                 "QIFDocument xmlns=\"http://qifstandards.org/xsd/qif3",

@@ -52,7 +52,7 @@ fn rms_um(folder: &Path, cycle: usize) -> Option<f64> {
 fn a_wheel_that_is_larger_is_taken_back_as_such_in_a_whole_run() {
     let told = ["", TAKEN].map(|parameters| {
         let home = tempfile::tempdir().unwrap();
-        let (folder, said) = ran(home.path(), &recipe(parameters, 0.9));
+        let (folder, said) = ran(home.path(), &recipe(parameters, 0.7));
         let passes: Vec<f64> = (1..).map_while(|cycle| rms_um(&folder, cycle)).collect();
         println!("{passes:.3?}\n{said}");
         if !parameters.is_empty() {
@@ -69,7 +69,7 @@ fn a_wheel_that_is_larger_is_taken_back_as_such_in_a_whole_run() {
         passes
     });
     let [alone, with] = told;
-    assert!(with.len() < alone.len() || with[1] < 0.7 * alone[1], "{with:?} beside {alone:?}");
+    assert!(with.len() < alone.len() && with[1] < alone[1], "{with:?} beside {alone:?}");
 }
 
 /// A few worlds; `cargo run --release --example parameters` draws two hundred.
