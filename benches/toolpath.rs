@@ -100,6 +100,7 @@ fn write(path: &ToolPath, summary: &Summary, file: &Path) {
         map_identity: [2; 32],
         uncorrected: false,
         level_mm: 0.02,
+        from_below: false,
         wheel: path.options().wheel.description(),
         parameters: Vec::new(),
         tracks: String::new(),

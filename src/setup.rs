@@ -430,10 +430,14 @@ fn pass(recipe: &Recipe, nominal: &Nominal, part_identity: [u8; 32], track_spaci
 type Ground = (Field, Aperture);
 
 fn ground(recipe: &Recipe, nominal: &Nominal) -> Result<Ground, PathError> {
-    if recipe.measure.side.given() == Some(Side::Opposite) {
-        return Err(PathError::OtherSide);
-    }
-    Programs::ground(nominal)
+    let (field, outline) = Programs::ground(nominal)?;
+    // Seen from where the wheel comes from.
+    Ok((if from_below(recipe) { field.mirrored() } else { field }, outline))
+}
+
+/// Whether the part is worked on from the side of -z: it is measured there.
+fn from_below(recipe: &Recipe) -> bool {
+    recipe.measure.side.given() == Some(Side::Opposite)
 }
 
 /// Returns the distance of the tracks, as the recipe has it or as the scallops allow it, and what they leave between them.
@@ -489,9 +493,15 @@ fn programs(
     let (grinding, limits) = (&recipe.grinding, &cell.grinder.limits);
     let plain = PathOptions::new(path_wheel(&grinding.wheel, nominal), track_mm, grinding.feed_mm_min);
     // The wheel comes up to its feed before it meets the part.
-    let run_up_mm =
-        limits.largest_acceleration_mm_s2.map_or(0.0, |a| 1.1 * (grinding.feed_mm_min / 60.0).powi(2) / (2.0 * a));
+    let machine = Limits {
+        travel_mm: limits.travel.map(|travel| [travel.least_mm, travel.most_mm]),
+        speed_mm_s: limits.largest_speed_mm_s,
+        acceleration_mm_s2: limits.largest_acceleration_mm_s2,
+        jerk_mm_s3: limits.largest_jerk_mm_s3,
+    };
+    let run_up_mm = 1.1 * machine.run_up_mm(grinding.feed_mm_min);
     let options = PathOptions {
+        from_below: from_below(recipe),
         pattern: grinding.pattern,
         one_way: grinding.one_way,
         spacing: match grinding.scallop_nm {
@@ -511,11 +521,7 @@ fn programs(
         part_identity,
         ground,
         options,
-        limits: Limits {
-            travel_mm: limits.travel.map(|travel| [travel.least_mm, travel.most_mm]),
-            speed_mm_s: limits.largest_speed_mm_s,
-            acceleration_mm_s2: limits.largest_acceleration_mm_s2,
-        },
+        limits: machine,
         mode: grinding.path_mode,
         path_tolerance_mm: grinding.path_tolerance_um.mm(),
         controller_tolerance_mm: cell.grinder.program.controller_tolerance_mm,

@@ -277,6 +277,7 @@ fn limits(grinder: &GrinderTable, document: &mut Document) -> Option<GrinderLimi
         largest_depth_mm: written.largest_depth_mm?,
         largest_speed_mm_s: written.largest_speed_mm_s,
         largest_acceleration_mm_s2: written.largest_acceleration_mm_s2,
+        largest_jerk_mm_s3: written.largest_jerk_mm_s3,
         travel: grinder.travel.as_ref().and_then(|travel| self::travel(travel, "grinder", document)),
     })
 }

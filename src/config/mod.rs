@@ -126,6 +126,8 @@ pub struct GrinderLimits {
     pub largest_speed_mm_s: Option<f64>,
     /// Largest acceleration of an axis, where it is known.
     pub largest_acceleration_mm_s2: Option<f64>,
+    /// Largest change of the acceleration of an axis in time, where it is known.
+    pub largest_jerk_mm_s3: Option<f64>,
     /// Where the wheel's centre may be, in the model frame, where it is known.
     pub travel: Option<Travel>,
 }

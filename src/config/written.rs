@@ -229,6 +229,9 @@ pub(super) struct LimitsTable {
     /// Largest acceleration of an axis.
     #[schemars(range(min = 0.1, max = 10000000.0))]
     pub largest_acceleration_mm_s2: Option<f64>,
+    /// Largest change of the acceleration of an axis in time, its jerk.
+    #[schemars(range(min = 0.1, max = 1000000000.0))]
+    pub largest_jerk_mm_s3: Option<f64>,
 }
 
 impl Default for TimingTable {

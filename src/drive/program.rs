@@ -196,7 +196,10 @@ impl Programs {
     ) -> Result<(), ProgramError> {
         let none = Correction { values_mm: vec![0.0; correction.grid.len()], ..correction.clone() };
         let before = Wanted::new(self.nominal(correction), &none, 1.0)?;
-        let offsets = axis_offsets(&before, path.wanted(), &path.options().wheel, &correction.grid)?;
+        let mut offsets = axis_offsets(&before, path.wanted(), &path.options().wheel, &correction.grid)?;
+        if self.options.from_below {
+            offsets.iter_mut().for_each(|offset| *offset = -*offset);
+        }
         write_axis_table(file, &correction.grid, &offsets, &map_identity, self.simulation).map_err(GcodeError::from)?;
         Ok(())
     }
@@ -216,7 +219,9 @@ impl Programs {
             map_identity,
             uncorrected: correction.is_none(),
             level_mm: correction.level_mm,
-            wheel: self.wheel(correction).description(),
+            wheel: if self.options.from_below { self.wheel(correction).mirrored() } else { self.wheel(correction) }
+                .description(),
+            from_below: self.options.from_below,
             parameters: set_in_words(correction, self.options.wheel.reach_mm()),
             tracks: tracks_in_words(path),
             spark_out_passes: self.spark_out_passes,

@@ -344,6 +344,14 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
             "write `begin_with = \"grind\"`, or leave the table out",
         );
     }
+    if written.measure.side == ProbeSide::Below {
+        document.report(
+            KEY,
+            "stands in a recipe whose part is worked on from below",
+            "parameters are told of a wheel that comes from +z",
+            "leave the table out: the map takes them back",
+        );
+    }
     if parameters.wheel_radius_um.is_some() && !matches!(written.grinding.wheel, Wheel::Sphere { .. }) {
         document.report(
             "compensation.parameters.wheel_radius_um",

@@ -1,21 +1,16 @@
 //! What stands in a program, and which parts have none.
 
+use crate::path::{correction, part, part_from_below, read};
 use std::fs;
-use std::path::Path;
-
-use crate::path::{correction, part, read};
-use regrind::compensation::path::PathError;
-use regrind::config::CellConfig;
-use regrind::recipe::Recipe;
-use regrind::setup;
 
 #[test]
-fn a_part_that_is_worked_on_from_below_has_no_program() {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let recipe = Recipe::read(&root.join("recipes/telescope-panel.toml")).unwrap();
-    let cell = CellConfig::read(&root.join("config/file-exchange.toml")).unwrap();
-    let (task, _) = setup::prepare(&recipe, &cell).unwrap();
-    assert_eq!(task.programs.err(), Some(PathError::OtherSide));
+fn a_program_from_below_says_so() {
+    let part = part_from_below("shallow-wave");
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("part.ngc");
+    part.programs.write(&file, &correction(part.half_mm), [9; 32]).unwrap();
+    let text = fs::read_to_string(&file).unwrap();
+    assert!(text.contains("(frame: model, z into the part, the wheel comes from -z; G54"), "{text:.2000}");
 }
 
 #[test]

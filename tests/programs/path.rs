@@ -23,10 +23,26 @@ pub struct Part {
 /// Prepares a shipped recipe in the simulated cell.
 pub fn part(name: &str) -> Part {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let recipe = Recipe::read(&root.join(format!("recipes/{name}.toml"))).unwrap();
+    prepared(&Recipe::read(&root.join(format!("recipes/{name}.toml"))).unwrap())
+}
+
+/// The same part, measured and worked on from below.
+pub fn part_from_below(name: &str) -> Part {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let recipes = root.join("recipes");
+    let text = std::fs::read_to_string(recipes.join(format!("{name}.toml"))).unwrap();
+    let text = text.replace("file = \"", &format!("file = \"{}/", recipes.display()));
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("below.toml");
+    std::fs::write(&file, text.replace("side = \"above\"", "side = \"below\"")).unwrap();
+    prepared(&Recipe::read(&file).unwrap())
+}
+
+fn prepared(recipe: &Recipe) -> Part {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let cell = CellConfig::read(&root.join("config/sim.toml")).unwrap();
     let spec: WorldSpec = recipe.simulation.clone().unwrap().try_into().unwrap();
-    let (task, _) = setup::prepare(&recipe, &cell).unwrap();
+    let (task, _) = setup::prepare(recipe, &cell).unwrap();
     Part { programs: task.programs.unwrap(), shape: spec.part.shape.build(), half_mm: spec.part.aperture.half_mm() }
 }
 
@@ -58,6 +74,13 @@ pub fn truth(part: &Part, level_mm: f64, [x, y]: [f64; 2]) -> [f64; 3] {
     let (p, n) = (part.shape.point(x, y), part.shape.normal(x, y));
     let d = level_mm + error_mm(x, y);
     std::array::from_fn(|k| p[k] + d * n[k])
+}
+
+/// The same of the lower side, which is moved the other way.
+pub fn truth_below(part: &Part, level_mm: f64, [x, y]: [f64; 2]) -> [f64; 3] {
+    let (p, n) = (part.shape.point(x, y), part.shape.normal(x, y));
+    let d = level_mm + error_mm(x, y);
+    std::array::from_fn(|k| p[k] - d * n[k])
 }
 
 /// Options with another wheel and other tracks.

@@ -2,7 +2,7 @@
 //!
 //! The surface is that of the simulator's shapes, the wheel a distance of its own, the program is read back from its text.
 
-use crate::path::{Part, ProgramStep, correction, part, read, truth, wheels, with};
+use crate::path::{Part, ProgramStep, correction, part, part_from_below, read, truth, truth_below, wheels, with};
 use regrind::compensation::path::{PathOptions, Pattern, TrackSpacing, Wheel};
 
 const PARTS: [&str; 4] = ["freeform-mirror", "off-axis-asphere", "shallow-wave", "biconic"];
@@ -92,6 +92,31 @@ fn every_wheel_leaves_the_corrected_surface_on_its_tracks() {
                 let off = clearance(&wheel, &steps, truth(&part, 0.02, place));
                 assert!(off.abs() < WITHIN_MM, "{name}, {wheel_name}, {place:?}: {:.3} um", 1e3 * off);
             }
+        }
+    }
+}
+
+#[test]
+fn from_below_every_wheel_leaves_the_corrected_lower_side() {
+    for name in PARTS {
+        let mut part = part_from_below(name);
+        let plain = part.programs.options;
+        for (wheel_name, wheel) in wheels(0.8) {
+            part.programs.options = with(&plain, wheel, 4.0);
+            let (steps, track_mm) = program(&part);
+            // As it stands in the model frame: its spindle points the other way.
+            let stands = wheel.mirrored();
+            for place in places(&part, track_mm, 0.0) {
+                let off = clearance(&stands, &steps, truth_below(&part, 0.02, place));
+                assert!(off.abs() < WITHIN_MM, "{name}, {wheel_name}, {place:?}: {:.3} um", 1e3 * off);
+            }
+            for place in places(&part, track_mm, 0.4) {
+                let off = clearance(&stands, &steps, truth_below(&part, 0.02, place));
+                assert!(off > -WITHIN_MM, "{name}, {wheel_name}: {:.3} um too deep at {place:?}", -1e3 * off);
+            }
+            // It travels under everything that it grinds.
+            let least = |feed: bool| steps.iter().filter(|s| s.feed == feed).fold(f64::INFINITY, |z, s| z.min(s.at[2]));
+            assert!(least(false) < least(true), "{name}, {wheel_name}");
         }
     }
 }

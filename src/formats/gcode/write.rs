@@ -33,6 +33,8 @@ pub struct ProgramHeader {
     pub uncorrected: bool,
     /// Height of the surface wanted over the nominal one, in millimetres.
     pub level_mm: f64,
+    /// Whether the wheel comes from -z.
+    pub from_below: bool,
     /// The wheel in words.
     pub wheel: String,
     /// Which parameters of the machine are taken back in the path, a line each.
@@ -374,7 +376,8 @@ fn header_words(h: &ProgramHeader, s: &Summary, lines: u64) -> Vec<String> {
     if h.uncorrected {
         say(format_args!("{UNCORRECTED}"));
     }
-    say(format_args!("frame: model, z away from the part; G54 has its zero in the origin of the model"));
+    let side = if h.from_below { "z into the part, the wheel comes from -z" } else { "z away from the part" };
+    say(format_args!("frame: model, {side}; G54 has its zero in the origin of the model"));
     say(format_args!("units: mm, mm/min; a correction is positive where it leaves material, along the outward normal"));
     say(format_args!("level over the nominal surface: {} mm", short(h.level_mm)));
     say(format_args!("wheel: {}", h.wheel));
@@ -436,6 +439,7 @@ mod tests {
             map_identity: [2; 32],
             uncorrected: false,
             level_mm: 0.0,
+            from_below: false,
             wheel: "ball".into(),
             parameters: Vec::new(),
             tracks: "raster".into(),
@@ -458,6 +462,7 @@ mod tests {
             seconds: 0.0,
             speed_mm_s: [Peak::default(); 3],
             acceleration_mm_s2: Peak::default(),
+            jerk_mm_s3: Peak::default(),
             feed_mm_min: 600.0,
             run_up_mm: 0.0,
         };

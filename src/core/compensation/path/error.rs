@@ -14,11 +14,6 @@ pub enum PathError {
          the model frame so that z looks away from the part"
     )]
     NotAHeight { x_mm: f64, y_mm: f64 },
-    #[error(
-        "the part is worked on from the side of -z (measure.side), and paths are laid on the side of +z; turn the model frame so that z looks away \
-         from the part"
-    )]
-    OtherSide,
     #[error("the correction is not a finite number at x {x_mm:.3}, y {y_mm:.3} mm; make it anew")]
     Correction { x_mm: f64, y_mm: f64 },
     #[error("{key} is {found}; it must be {allowed}")]
@@ -62,6 +57,11 @@ pub enum PathError {
     )]
     Acceleration { x_mm: f64, y_mm: f64, found_mm_s2: f64, limit_mm_s2: f64, feed_mm_min: f64 },
     #[error(
+        "the path bends anew at x {x_mm:.3}, y {y_mm:.3} mm so fast that its acceleration changes by {found_mm_s3:.0} mm/s3, more than the machine's \
+         {limit_mm_s3} mm/s3; lower the feed to {feed_mm_min:.0} mm/min"
+    )]
+    Jerk { x_mm: f64, y_mm: f64, found_mm_s3: f64, limit_mm_s3: f64, feed_mm_min: f64 },
+    #[error(
         "the wheel needs {found_mm:.2} mm to come up to the feed, and has {limit_mm:.2} mm before the part; lengthen the overrun, or lower the \
          feed to {feed_mm_min:.0} mm/min"
     )]
@@ -73,6 +73,6 @@ pub enum PathError {
 impl PathError {
     /// Returns whether only we cannot lay the path: a controller that makes its own from the map may well grind the part.
     pub fn is_ours(&self) -> bool {
-        matches!(self, Self::OtherSide | Self::NotAHeight { .. })
+        matches!(self, Self::NotAHeight { .. })
     }
 }

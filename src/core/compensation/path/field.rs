@@ -68,6 +68,13 @@ impl Field {
         self
     }
 
+    /// Returns the field of the same heights downwards.
+    #[must_use]
+    pub fn mirrored(mut self) -> Self {
+        self.nodes.par_iter_mut().for_each(|node| *node = node.map(|value| -value));
+        self
+    }
+
     /// Returns the distance of the nodes along x and y, in millimetres.
     pub fn spacing_mm(&self) -> [f64; 2] {
         self.per_mm.map(|p| 1.0 / p)

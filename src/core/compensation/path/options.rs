@@ -50,6 +50,9 @@ pub enum PathMode {
 pub struct PathOptions {
     /// The wheel.
     pub wheel: Wheel,
+    /// Whether the wheel comes from -z. The surface is then given as it is seen from there, with z turned round, and so is the wheel: its
+    /// spindle, its heights. The moves of the path are in the model frame.
+    pub from_below: bool,
     /// How the tracks run.
     pub pattern: Pattern,
     /// Whether every track of a raster runs towards +x; else they alternate.
@@ -79,6 +82,7 @@ impl PathOptions {
     pub fn new(wheel: Wheel, track_mm: f64, feed_mm_min: f64) -> Self {
         Self {
             wheel,
+            from_below: false,
             pattern: Pattern::Raster,
             one_way: false,
             spacing: TrackSpacing::Distance(track_mm),

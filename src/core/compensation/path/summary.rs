@@ -17,6 +17,35 @@ pub struct Limits {
     pub speed_mm_s: Option<f64>,
     /// Largest acceleration.
     pub acceleration_mm_s2: Option<f64>,
+    /// Largest change of the acceleration in time.
+    pub jerk_mm_s3: Option<f64>,
+}
+
+impl Limits {
+    /// Returns the way from standstill to a feed with an acceleration that rises and falls within the jerk, in millimetres: v / 2 (v / a + a / j), and
+    /// v (v / j)^(1/2) where a is not reached; v^2 / (2 a) where no jerk is known.
+    pub fn run_up_mm(&self, feed_mm_min: f64) -> f64 {
+        let speed = feed_mm_min / 60.0;
+        match (self.acceleration_mm_s2, self.jerk_mm_s3) {
+            (Some(a), Some(j)) if speed * j >= a * a => 0.5 * speed * (speed / a + a / j),
+            (_, Some(j)) => speed * (speed / j).sqrt(),
+            (Some(a), None) => speed * speed / (2.0 * a),
+            (None, None) => 0.0,
+        }
+    }
+
+    /// Returns the feed whose run-up takes this way, in mm/min.
+    fn feed_of_run_up(&self, way_mm: f64) -> f64 {
+        let (mut low, mut high) = (0.0, 1.0);
+        while self.run_up_mm(high) < way_mm && high < 1e9 {
+            high *= 2.0;
+        }
+        for _ in 0..60 {
+            let middle = 0.5 * (low + high);
+            if self.run_up_mm(middle) <= way_mm { low = middle } else { high = middle }
+        }
+        low
+    }
 }
 
 /// A largest value and where it is.
@@ -51,6 +80,9 @@ pub struct Summary {
     pub speed_mm_s: [Peak; 3],
     /// Largest acceleration across the path, v^2 times its curvature, in mm/s2.
     pub acceleration_mm_s2: Peak,
+    /// Largest change of that acceleration in time while the wheel is on the part or its overrun, in mm/s3: v^3 (k'^2 + k^4)^(1/2) for a curvature k
+    /// that changes by k' along the path. Where it comes down or lifts off a controller may go slower and no harm is done.
+    pub jerk_mm_s3: Peak,
     /// Feed with which tracks begin.
     pub feed_mm_min: f64,
     /// Length from standstill to the part.
@@ -74,6 +106,7 @@ impl ToolPath {
             seconds: 0.0,
             speed_mm_s: [Peak::default(); 3],
             acceleration_mm_s2: Peak::default(),
+            jerk_mm_s3: Peak::default(),
             feed_mm_min: options.feed_mm_min,
             run_up_mm: options.overrun_mm + options.lead_mm,
         };
@@ -98,6 +131,7 @@ impl Summary {
     /// Takes in the moves of one track.
     fn take(&mut self, mut moves: Moves, safe_z_mm: f64) {
         let mut last: Option<Point> = None;
+        let mut before: Option<Bend> = None;
         let mut height = safe_z_mm;
         while let Some(one) = moves.next() {
             self.moves += 1;
@@ -116,6 +150,11 @@ impl Summary {
                     }
                     if let Some(from) = last {
                         self.step(&(at - from), &at, feed_mm_min, moves.bend);
+                        let now = moves.on_span.then(|| Bend { bend: moves.bend, chord_mm: (at - from).norm() });
+                        if let Some((before, now)) = before.zip(now) {
+                            self.bends_anew(before, now, from, feed_mm_min);
+                        }
+                        before = now;
                     }
                     last = Some(at);
                 }
@@ -140,6 +179,17 @@ impl Summary {
         }
     }
 
+    /// From one chord to the next, at the place between them.
+    #[inline]
+    fn bends_anew(&mut self, before: Bend, now: Bend, at: Point, feed_mm_min: f64) {
+        let speed = feed_mm_min / 60.0;
+        let changes = (now.bend - before.bend) / (0.5 * (now.chord_mm + before.chord_mm)).max(f64::MIN_POSITIVE);
+        let value = speed.powi(3) * changes.hypot(now.bend.max(before.bend).powi(2));
+        if value > self.jerk_mm_s3.value {
+            self.jerk_mm_s3 = Peak { value, at_mm: [at.x, at.y], feed_mm_min };
+        }
+    }
+
     fn and(self, other: Self) -> Self {
         let larger = |a: Peak, b: Peak| if b.value > a.value { b } else { a };
         Self {
@@ -152,14 +202,15 @@ impl Summary {
             seconds: self.seconds + other.seconds,
             speed_mm_s: std::array::from_fn(|k| larger(self.speed_mm_s[k], other.speed_mm_s[k])),
             acceleration_mm_s2: larger(self.acceleration_mm_s2, other.acceleration_mm_s2),
+            jerk_mm_s3: larger(self.jerk_mm_s3, other.jerk_mm_s3),
             ..self
         }
     }
 
-    /// Compares a path with what a machine can do. Jerk is left to the controller's planner.
+    /// Compares a path with what a machine can do.
     ///
     /// # Errors
-    /// Travel, speed of an axis, acceleration across the path, and a run-up v^2 / (2 a) longer than the way to the part.
+    /// Travel, speed of an axis, acceleration across the path, its change in time on the part, and a run-up longer than the way to the part.
     pub fn check(&self, limits: &Limits) -> Result<(), PathError> {
         if let Some([least, most]) = limits.travel_mm {
             for (k, axis) in ['X', 'Y', 'Z'].into_iter().enumerate() {
@@ -180,27 +231,36 @@ impl Summary {
                 }
             }
         }
-        limits.acceleration_mm_s2.map_or(Ok(()), |limit| self.check_acceleration(limit))
-    }
-
-    fn check_acceleration(&self, limit_mm_s2: f64) -> Result<(), PathError> {
         let Peak { value: found_mm_s2, at_mm: [x_mm, y_mm], feed_mm_min } = self.acceleration_mm_s2;
-        if found_mm_s2 > limit_mm_s2 {
+        if let Some(limit_mm_s2) = limits.acceleration_mm_s2.filter(|limit| found_mm_s2 > *limit) {
             let feed_mm_min = (feed_mm_min * (limit_mm_s2 / found_mm_s2).sqrt()).floor();
             return Err(PathError::Acceleration { x_mm, y_mm, found_mm_s2, limit_mm_s2, feed_mm_min });
         }
-        let found_mm = (self.feed_mm_min / 60.0).powi(2) / (2.0 * limit_mm_s2);
+        let Peak { value: found_mm_s3, at_mm: [x_mm, y_mm], feed_mm_min } = self.jerk_mm_s3;
+        if let Some(limit_mm_s3) = limits.jerk_mm_s3.filter(|limit| found_mm_s3 > *limit) {
+            let feed_mm_min = (feed_mm_min * (limit_mm_s3 / found_mm_s3).cbrt()).floor();
+            return Err(PathError::Jerk { x_mm, y_mm, found_mm_s3, limit_mm_s3, feed_mm_min });
+        }
+        let found_mm = limits.run_up_mm(self.feed_mm_min);
         if found_mm > self.run_up_mm {
-            let feed_mm_min = (60.0 * (2.0 * limit_mm_s2 * self.run_up_mm).sqrt()).floor();
+            let feed_mm_min = limits.feed_of_run_up(self.run_up_mm).floor();
             return Err(PathError::RunUp { found_mm, limit_mm: self.run_up_mm, feed_mm_min });
         }
         Ok(())
     }
 }
 
+/// How a path bends along a chord.
+#[derive(Clone, Copy)]
+struct Bend {
+    bend: f64,
+    chord_mm: f64,
+}
+
 #[cfg(test)]
 mod tests {
-    use super::super::fit::tests::{PART, ball, path, quadric};
+    use super::super::PathOptions;
+    use super::super::fit::tests::{PART, ball, path, quadric, surface};
     use super::*;
 
     #[test]
@@ -229,6 +289,45 @@ mod tests {
         let straight = Summary { acceleration_mm_s2: Peak::default(), ..summary };
         let slow = Limits { acceleration_mm_s2: Some(1.0), ..Limits::default() };
         assert!(matches!(straight.check(&slow), Err(PathError::RunUp { .. })));
+    }
+
+    #[test]
+    fn jerk_is_that_of_the_curve() {
+        // z = h sin(k x) along the tracks, where a ball of little more than nothing has the surface itself for its path: the third derivative is h k^3.
+        let (h, k) = (0.02, 0.4);
+        let wave = surface(move |[x, _]| (h * (k * x).sin(), [h * k * (k * x).cos(), 0.0]));
+        let options = PathOptions { chord_error_mm: 1e-6, ..ball(0.05) };
+        let summary = path(wave, options).unwrap().summary().unwrap();
+        let of = 10.0_f64.powi(3) * h * k.powi(3);
+        assert!((summary.jerk_mm_s3.value / of - 1.0).abs() < 0.02, "{} for {of}", summary.jerk_mm_s3.value);
+        let limited = |j: f64| summary.check(&Limits { jerk_mm_s3: Some(j), ..Limits::default() });
+        let Err(PathError::Jerk { feed_mm_min, .. }) = limited(0.5 * of) else { panic!("{:?}", limited(0.5 * of)) };
+        assert!((feed_mm_min - 600.0 * 0.5f64.cbrt()).abs() < 6.0, "{feed_mm_min}");
+        let slower = path(
+            surface(move |[x, _]| (h * (k * x).sin(), [h * k * (k * x).cos(), 0.0])),
+            PathOptions { feed_mm_min, lead_mm: 50.0, ..options },
+        );
+        let limits = Limits { jerk_mm_s3: Some(0.5 * of), ..Limits::default() };
+        assert_eq!(slower.unwrap().summary().unwrap().check(&limits), Ok(()));
+    }
+
+    #[test]
+    fn a_run_up_takes_what_acceleration_and_jerk_leave() {
+        let limits =
+            |a: Option<f64>, j: Option<f64>| Limits { acceleration_mm_s2: a, jerk_mm_s3: j, ..Limits::default() };
+        // 10 mm/s with 100 mm/s2: 0.1 s, 0.5 mm; with 1000 mm/s3 0.1 s up and 0.1 s down again, and the acceleration is just reached.
+        assert!((limits(Some(100.0), None).run_up_mm(600.0) - 0.5).abs() < 1e-12);
+        assert!((limits(Some(100.0), Some(1000.0)).run_up_mm(600.0) - 1.0).abs() < 1e-12);
+        assert!((limits(Some(1e9), Some(1000.0)).run_up_mm(600.0) - 1.0).abs() < 1e-12);
+        assert!((limits(None, Some(1000.0)).run_up_mm(600.0) - 1.0).abs() < 1e-12);
+        // 20 mm/s: 0.1 s up, 0.1 s at 100 mm/s2, 0.1 s down; half of 20 mm/s on average.
+        assert!((limits(Some(100.0), Some(1000.0)).run_up_mm(1200.0) - 3.0).abs() < 1e-12);
+        for feed in [1.0, 600.0, 1e5] {
+            for limits in [limits(Some(100.0), None), limits(Some(100.0), Some(1000.0)), limits(None, Some(50.0))] {
+                assert!((limits.feed_of_run_up(limits.run_up_mm(feed)) / feed - 1.0).abs() < 1e-9);
+            }
+        }
+        assert_eq!(Limits::default().run_up_mm(600.0), 0.0);
     }
 
     #[test]

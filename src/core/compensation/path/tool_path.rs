@@ -50,9 +50,20 @@ impl ToolPath {
         self.tracks.spans.len()
     }
 
-    /// Returns the height at which the wheel travels, in millimetres.
+    /// Returns the height at which the wheel travels, in millimetres, in the model frame.
     pub fn safe_z_mm(&self) -> f64 {
+        self.upright(self.safe_z_mm)
+    }
+
+    /// Returns that height as it is seen from where the wheel comes from.
+    pub(super) fn travel_mm(&self) -> f64 {
         self.safe_z_mm
+    }
+
+    /// A height in the model frame that is seen from where the wheel comes from, or the other way round.
+    #[inline]
+    pub(super) fn upright(&self, z_mm: f64) -> f64 {
+        if self.options.from_below { -z_mm } else { z_mm }
     }
 
     /// Nothing of the surface is finer than this, in millimetres.
@@ -108,5 +119,75 @@ impl ToolPath {
             .into_iter()
             .try_fold(f64::NEG_INFINITY, |most, one| one.map(|z| most.max(z)))
             .map_err(|[x_mm, y_mm]| PathError::CannotTouch { x_mm, y_mm })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::fit::tests::{PART, surface};
+    use super::super::{Move, Pattern, Wheel};
+    use super::*;
+
+    /// A surface without any symmetry, seen from +z (1) or from -z (-1).
+    fn seen(from: f64) -> Wanted {
+        surface(move |[x, y]| {
+            let z = 0.01 * x * x - 0.004 * y * y + 0.05 * x + 0.03 * (0.3 * y).sin();
+            (from * z, [from * (0.02 * x + 0.05), from * (-0.008 * y + 0.009 * (0.3 * y).cos())])
+        })
+    }
+
+    #[test]
+    fn the_mirrored_world_has_the_mirrored_path() {
+        let cup = Wheel::tilted_cup(6.0, 1.0, 0.5);
+        for (wheel, pattern) in [
+            (Wheel::Sphere { radius_mm: 10.0 }, Pattern::Raster),
+            (Wheel::Sphere { radius_mm: 10.0 }, Pattern::Spiral),
+            (cup, Pattern::Raster),
+        ] {
+            let options = PathOptions { pattern, ..PathOptions::new(wheel, 1.5, 600.0) };
+            let above = ToolPath::new(seen(1.0), PART, options).unwrap();
+            // A part that hangs, whose lower side is the mirror image of the upper side of the other.
+            let below = ToolPath::new(seen(1.0), PART, PathOptions { from_below: true, ..options }).unwrap();
+            assert_eq!(above.tracks(), below.tracks());
+            for (up, down) in above.moves().zip(below.moves()) {
+                let mirrored = match up {
+                    Move::RapidZ(z) => Move::RapidZ(-z),
+                    Move::RapidXy(_) => up,
+                    Move::Feed { at, feed_mm_min } => Move::Feed { at: Point::new(at.x, at.y, -at.z), feed_mm_min },
+                };
+                assert_eq!(mirrored, down);
+            }
+            let (up, down) = (above.summary().unwrap(), below.summary().unwrap());
+            assert_eq!([up.least_mm[2], up.most_mm[2]], [-down.most_mm[2], -down.least_mm[2]]);
+            assert_eq!((up.points, up.length_mm, up.rapid_mm), (down.points, down.length_mm, down.rapid_mm));
+            assert!(below.safe_z_mm() == -above.safe_z_mm() && below.safe_z_mm() == down.least_mm[2]);
+        }
+    }
+
+    #[test]
+    fn from_below_a_ball_stands_under_the_surface_itself() {
+        // The surface of the model, its wheel under it.
+        let options =
+            PathOptions { from_below: true, ..PathOptions::new(Wheel::Sphere { radius_mm: 10.0 }, 1.5, 600.0) };
+        let below = ToolPath::new(seen(-1.0), PART, options).unwrap();
+        let model = seen(1.0);
+        let mut touching = 0;
+        for one in below.moves() {
+            let Move::Feed { at, .. } = one else { continue };
+            let mut place = [at.x, at.y];
+            for _ in 0..50 {
+                let contact = model.at(place);
+                let off = at - contact.point;
+                let aside = off - contact.normal * off.dot(&contact.normal);
+                place = [place[0] + 0.7 * aside.x, place[1] + 0.7 * aside.y];
+            }
+            if PART.contains(place[0], place[1]) {
+                let contact = model.at(place);
+                let beside = (at - contact.point).dot(&contact.normal) + 10.0;
+                assert!(beside.abs() < 1e-6, "{beside} at {place:?}");
+                touching += 1;
+            }
+        }
+        assert!(touching > 100);
     }
 }

@@ -39,6 +39,8 @@ pub struct Moves<'a> {
     state: State,
     /// How the path bends and where its x and y are, at the last point given.
     pub(super) bend: f64,
+    /// Whether the last point given is on the part or its overrun, and so not where the wheel comes down or lifts off.
+    pub(super) on_span: bool,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -76,7 +78,7 @@ impl ToolPath {
 impl<'a> Moves<'a> {
     /// The moves of some of the spans, which begin and end at the safe height.
     pub(super) fn of(path: &'a ToolPath, from: usize, to: usize) -> Self {
-        Self { path, next: from, end: to, state: State::Above, bend: 0.0 }
+        Self { path, next: from, end: to, state: State::Above, bend: 0.0, on_span: false }
     }
 
     fn walk(&self, span: Span) -> Walk {
@@ -84,6 +86,17 @@ impl<'a> Moves<'a> {
         let longest = self.path.options().longest_step_mm;
         let step = 0.25 * longest / span.speed_mm(from);
         Walk { span, to, t: from, step, at: self.path.centre(&span, from) }
+    }
+
+    /// A move in the model frame.
+    #[inline]
+    fn upright(&self, given: Move) -> Move {
+        let upright = |z| self.path.upright(z);
+        match given {
+            Move::RapidZ(z) => Move::RapidZ(upright(z)),
+            Move::Feed { at, feed_mm_min } => Move::Feed { at: Point::new(at.x, at.y, upright(at.z)), feed_mm_min },
+            Move::RapidXy(_) => given,
+        }
     }
 
     /// Goes on by as much as the chord error allows.
@@ -115,6 +128,8 @@ impl<'a> Moves<'a> {
             }
             self.bend = 8.0 * sag / (chord * chord).max(f64::MIN_POSITIVE);
             let next = taken * (0.95 / share.max(1e-6).sqrt()).clamp(0.5, 2.0);
+            let (low, high) = (span.from.min(span.to), span.from.max(span.to));
+            self.on_span = low <= walk.t.min(t) && walk.t.max(t) <= high;
             walk = Walk { t, at, step: next, ..walk };
             return walk;
         }
@@ -140,7 +155,7 @@ impl Iterator for Moves<'_> {
 
     #[inline]
     fn next(&mut self) -> Option<Move> {
-        let safe = self.path.safe_z_mm();
+        let safe = self.path.travel_mm();
         let (state, given) = match self.state {
             State::Along(walk) if walk.t != walk.to => {
                 let walk = self.along(walk);
@@ -158,7 +173,7 @@ impl Iterator for Moves<'_> {
             State::Over(walk) => (State::Down(walk), xy(&walk)),
             State::Down(walk) => (State::Begin(walk), Move::RapidZ((walk.at.z + APPROACH_MM).min(safe))),
             State::Begin(walk) => {
-                self.bend = 0.0;
+                (self.bend, self.on_span) = (0.0, false);
                 (State::Along(walk), Move::Feed { at: walk.at, feed_mm_min: self.feed_mm_min() })
             }
             State::Ended => return None,
@@ -166,7 +181,7 @@ impl Iterator for Moves<'_> {
         let ended = matches!(state, State::Ended);
         self.state = state;
         // The last retreat has been given with the last track.
-        if ended { None } else { Some(given) }
+        if ended { None } else { Some(self.upright(given)) }
     }
 }
 

@@ -119,6 +119,15 @@ impl Wheel {
         }
     }
 
+    /// Returns the wheel with z turned round.
+    #[must_use]
+    pub fn mirrored(mut self) -> Self {
+        if let Self::Torus { spindle, .. } | Self::Cup { spindle, .. } = &mut self {
+            spindle.z = -spindle.z;
+        }
+        self
+    }
+
     /// Returns what the wheel is, for the header of a program.
     pub fn description(&self) -> String {
         let of = |v: &Vector| format!("{:.4} {:.4} {:.4}", v.x, v.y, v.z);
