@@ -243,7 +243,8 @@ fn told(plan: &CellPlan, now: &Figures) -> String {
     let of = |compared: Compared| {
         let within = compared.within_in_words().map_or(String::new(), |words| format!(" ({words})"));
         let Compared { name, found_mm, expanded_mm, limit_mm, .. } = compared;
-        format!("{name} {} ± {} of {}{within}", um(found_mm), um(expanded_mm), um(limit_mm))
+        let limit = if limit_mm.is_finite() { format!(" of {}", um(limit_mm)) } else { String::new() };
+        format!("{name} {} ± {}{limit}{within}", um(found_mm), um(expanded_mm))
     };
     let [pv, rms] = plan.tolerance.compare(now).map(of);
     let Tolerance { with_uncertainty, probability, .. } = plan.tolerance;

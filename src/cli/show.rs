@@ -306,7 +306,10 @@ pub(super) fn reads_keys() -> bool {
 }
 
 fn bar() -> ProgressBar {
-    ProgressBar::new(1).with_style(style("{wide_msg}"))
+    let bar = ProgressBar::new(1).with_style(style("{wide_msg}"));
+    // Of words that change faster than a terminal is drawn the last would never be seen, and a cell that is held looked as if it went on.
+    bar.enable_steady_tick(Duration::from_millis(200));
+    bar
 }
 
 fn style(template: &str) -> ProgressStyle {

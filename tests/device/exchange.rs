@@ -190,6 +190,88 @@ fn a_result_is_taken_when_it_has_settled_and_ended_and_not_before() {
     assert_eq!(bench.look().answer.unwrap(), found);
 }
 
+/// What a machine that runs DMIS writes for a program: every statement of its text, and every point touched where it was asked for by a ball of 1.5 mm.
+fn ran(program: &str) -> String {
+    // A `$` at the end of a line goes on in the next.
+    let whole = program.replace("$\n", "");
+    let mut output = String::from("UNITS/MM,ANGDEC\n");
+    let mut points = std::collections::BTreeMap::new();
+    for line in whole.lines() {
+        if line.starts_with("TEXT/OUTFIL") || line.starts_with("PRCOMP") {
+            output += &format!("{line}\n");
+        }
+        let nominal = line.strip_prefix("F(").and_then(|rest| rest.split_once(")=FEAT/POINT,CART,"));
+        if let Some((name, numbers)) = nominal {
+            let [x, y, z, i, j, k]: [f64; 6] =
+                numbers.split(',').map(|n| n.parse().unwrap()).collect::<Vec<_>>().try_into().unwrap();
+            points.insert(name.to_owned(), ([x + 1.5 * i, y + 1.5 * j, z + 1.5 * k], [i, j, k]));
+        }
+        if let Some(name) = line.strip_prefix("OUTPUT/FA(").and_then(|rest| rest.strip_suffix(')')) {
+            let ([x, y, z], [i, j, k]) = points[name];
+            output += &format!("FA({name})=FEAT/POINT,CART,{x:.6},{y:.6},{z:.6},$\n{i:.6},{j:.6},{k:.6}\n");
+        }
+    }
+    output + "ENDFIL\n"
+}
+
+#[test]
+fn a_dmis_program_is_handed_over_and_what_a_machine_makes_of_it_is_taken() {
+    use regrind::formats::result::{Content, Coordinates as Said};
+    let shop = Shop::new();
+    let content = Content { coordinates: Some(Said::Centres), ..Content::default() };
+    let settings = CmmExchange { dmis_sensor: Some("PROBE6".into()), content, ..shop.cmm() };
+    let mut bench = Bench::new(settings);
+    let program = fs::read_to_string(shop.outbox.join("SN_7_j3_c2/plan.dmi")).unwrap();
+    let output = ran(&program);
+    // That of another plan, cycle or part is none of this one, whatever its name.
+    for (from, to, expected) in [
+        ("'cycle: 2'", "'cycle: 1'", "is of cycle 1, not 2; left alone"),
+        ("'part: SN 7'", "'part: SN 8'", "is of part SN 8, not SN 7; left alone"),
+        ("PRCOMP/OFF", "PRCOMP/ON", "contacts"),
+        ("ENDFIL", "", "ENDFIL"),
+    ] {
+        assert!(output.contains(from), "{output}");
+        shop.put("SN_7_c2.res", &output.replace(from, to));
+        bench.refused(expected);
+    }
+    shop.put("SN_7_c2.res", &output);
+    let found = bench.settled().answer.unwrap();
+    assert_eq!(found.points.iter().map(|p| p.index).collect::<Vec<_>>(), [10, 11, 12]);
+    assert_eq!((found.coordinates, found.plan_identity), (Coordinates::Centres, plan(3).identity()));
+    for (point, target) in found.points.iter().zip(plan(3).targets) {
+        for k in 0..3 {
+            assert!((point.at_mm[k] - target.point_mm[k] - 1.5 * target.normal[k]).abs() < 1e-6, "{point:?}");
+        }
+    }
+}
+
+#[test]
+fn a_qif_result_is_taken_by_what_it_says_of_itself() {
+    let shop = Shop::new();
+    let mut bench = Bench::new(shop.cmm());
+    let identity: String = plan(3).identity().iter().map(|b| format!("{b:02x}")).collect();
+    let document = |cycle: u32, factor: &str| {
+        format!(
+            "<?xml version=\"1.0\"?>\n<QIFDocument xmlns=\"http://qifstandards.org/xsd/qif3\" versionQIF=\"3.0.0\" idMax=\"9\">\n\
+             <Attributes n=\"3\"><AttributeStr name=\"regrind part\" value=\"SN 7\"/>\
+             <AttributeStr name=\"regrind cycle\" value=\"{cycle}\"/><AttributeStr name=\"regrind plan\" value=\"{identity}\"/></Attributes>\n\
+             <FileUnits><PrimaryUnits><LinearUnit><SIUnitName>meter</SIUnitName><UnitName>mm</UnitName>\
+             <UnitConversion><Factor>{factor}</Factor></UnitConversion></LinearUnit></PrimaryUnits></FileUnits>\n\
+             <MeasuredPointSet count=\"3\" id=\"5\"><Points>1 2 3\n4 5 6\n7 8 9.125</Points>\
+             <Compensated>false</Compensated></MeasuredPointSet>\n</QIFDocument>\n"
+        )
+    };
+    shop.put("export.qif", &document(1, "0.001"));
+    bench.refused("export.qif");
+    // The unit is the one that it states.
+    shop.put("export.qif", &document(2, "0.0254"));
+    let found = bench.settled().answer.unwrap();
+    assert_eq!(found.points.iter().map(|p| p.index).collect::<Vec<_>>(), [10, 11, 12]);
+    let expected = [7.0, 8.0, 9.125].map(|inches| 25.4 * inches);
+    assert!((0..3).all(|k| (found.points[2].at_mm[k] - expected[k]).abs() < 1e-9), "{:?}", found.points[2]);
+    assert_eq!(found.coordinates, Coordinates::Centres);
+}
+
 #[test]
 fn what_is_not_for_this_part_and_cycle_is_left_alone_and_said() {
     let shop = Shop::new();

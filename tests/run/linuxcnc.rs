@@ -5,11 +5,13 @@
 //! LinuxCNC goes by its own clock: nothing here is judged by time.
 
 use std::fs;
+use std::io::Write;
+use std::net::TcpStream;
 use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
-use regrind::cell::StateName;
+use regrind::cell::{AlarmId, StateName};
 use regrind::drive::{Request, ask};
 use serde_json::Value;
 
@@ -28,13 +30,23 @@ fn beside_linuxcnc(name: &str, test: impl FnOnce(&Path)) {
         let _controller = controller();
         return test(home.path());
     }
-    // Locks of machines are kept outside /tmp too, and every controller here has the same address.
-    let prepare = "for folder in /tmp /run/lock /var/lock /var/tmp; do
-        [ ! -d $folder ] || { mount -t tmpfs tmpfs $folder; chmod 1777 $folder; }
-    done; ip link set lo up; exec \"$@\"";
+    // Locks of machines are kept outside /tmp too, and every controller here has the same address. What is tried may itself lie in one of these folders.
+    let prepare = "needed=\"$1 $2\"; shift 2
+    for folder in /tmp /run/lock /var/lock /var/tmp; do
+        [ -d $folder ] || continue
+        mount --bind $folder /mnt
+        mount -t tmpfs tmpfs $folder; chmod 1777 $folder
+        for path in $needed; do
+            case $path in $folder/*) mkdir -p $path; mount --bind /mnt/${path#$folder/} $path ;; esac
+        done
+        umount /mnt
+    done
+    ip link set lo up; exec \"$@\"";
+    let program = std::env::current_exe().unwrap();
+    let built = program.parent().and_then(Path::parent).unwrap();
     let mut command = Command::new("unshare");
     command.args(["--ipc", "--net", "--pid", "--mount", "--fork", "--mount-proc", "--kill-child"]);
-    command.args(["sh", "-euc", prepare, "sh"]).arg(std::env::current_exe().unwrap());
+    command.args(["sh", "-euc", prepare, "sh"]).arg(root()).arg(built).arg(&program);
     command.args(["--exact", name, "--include-ignored", "--nocapture"]);
     command.env(WITHIN, "1").env_remove("TMPDIR").env_remove("DISPLAY");
     let output = command.output().expect("unshare starts");
@@ -184,5 +196,103 @@ fn a_run_that_is_killed_while_linuxcnc_grinds_goes_on_with_the_same_pass() {
         assert!(told.contains("ACCEPTED"), "{told}");
         let records = records();
         assert!(records.len() == 1 && ran_once(&records[0]), "{records:?}");
+    });
+}
+
+/// Begins a run, has something go wrong while LinuxCNC grinds, and returns what the cell shows once it stands: its state and the alarms.
+fn stands_after(home: &Path, go_wrong: impl FnOnce()) -> (StateName, Vec<AlarmId>) {
+    let (recipe, cell) = (recipe(home, [60.0, 12.0]), cell(home));
+    let mut running = Running::new(regrind(&["run", &recipe, "--cell", &cell, "--runs", "runs"], home));
+    running.line("grinding", |line| line.starts_with("cycle 1: grinding"));
+    // It is begun when its program has written so.
+    while !records().iter().any(|record| record.contains("begin")) {
+        std::thread::park_timeout(Duration::from_millis(20));
+    }
+    go_wrong();
+    let folder = fs::read_dir(home.join("runs")).unwrap().next().unwrap().unwrap().path();
+    let mut seen = (StateName::Execute, Vec::new());
+    let stands =
+        |state| matches!(state, StateName::Held | StateName::Suspended | StateName::Aborted | StateName::Stopped);
+    while !running.is_over() {
+        if let Ok(status) = ask(&folder, &Request::Status) {
+            seen = (status.status.state, status.status.alarms.iter().map(|alarm| alarm.id).collect());
+            if stands(seen.0) && !seen.1.is_empty() {
+                break;
+            }
+        }
+        std::thread::park_timeout(Duration::from_millis(20));
+    }
+    let (_, told, error) = run(&["abort", folder.to_str().unwrap(), "--reason", "seen"], home);
+    let (code, errors) = running.end();
+    println!("{seen:?}\n{}\n{errors}\n{code} {told}{error}\n{:?}", running.said.join("\n"), records());
+    seen
+}
+
+fn begun(record: &str) -> usize {
+    record.lines().filter(|line| *line == "begin").count()
+}
+
+#[test]
+#[ignore = "needs LinuxCNC: Debian package linuxcnc-uspace, and root for namespaces"]
+fn a_controller_that_is_killed_while_linuxcnc_grinds_is_told_and_never_started_again() {
+    let name = "linuxcnc::a_controller_that_is_killed_while_linuxcnc_grinds_is_told_and_never_started_again";
+    beside_linuxcnc(name, |home| {
+        let (state, alarms) = stands_after(home, || {
+            for name in ["linuxcncrsh", "milltask", "io", "linuxcncsvr", "rtapi_app"] {
+                let _ = Command::new("pkill").args(["-KILL", "-x", name]).status();
+            }
+        });
+        assert!(alarms.contains(&AlarmId::LinkLost), "{state:?} {alarms:?}");
+        assert!(matches!(state, StateName::Suspended | StateName::Held), "{state:?} {alarms:?}");
+        assert_eq!(records().iter().map(|record| begun(record)).sum::<usize>(), 1);
+    });
+}
+
+#[test]
+#[ignore = "needs LinuxCNC: Debian package linuxcnc-uspace, and root for namespaces"]
+fn a_stop_circuit_that_opens_while_linuxcnc_grinds_is_a_fault_of_the_machine() {
+    let name = "linuxcnc::a_stop_circuit_that_opens_while_linuxcnc_grinds_is_a_fault_of_the_machine";
+    beside_linuxcnc(name, |home| {
+        let (state, alarms) = stands_after(home, || {
+            for words in [&["unlinkp", "iocontrol.0.emc-enable-in"][..], &["setp", "iocontrol.0.emc-enable-in", "0"]] {
+                let mut command = Command::new(ACCOUNT[0]);
+                command.args(&ACCOUNT[1..]).arg("halcmd").args(words);
+                assert!(command.status().unwrap().success(), "{words:?}");
+            }
+        });
+        assert!(alarms.contains(&AlarmId::MachineFault), "{state:?} {alarms:?}");
+        assert_eq!(records().iter().map(|record| begun(record)).sum::<usize>(), 1);
+    });
+}
+
+#[test]
+#[ignore = "needs LinuxCNC: Debian package linuxcnc-uspace, and root for namespaces"]
+fn another_client_that_takes_control_while_linuxcnc_grinds_is_told() {
+    let name = "linuxcnc::another_client_that_takes_control_while_linuxcnc_grinds_is_told";
+    beside_linuxcnc(name, |home| {
+        let mut other = None;
+        let (state, alarms) = stands_after(home, || {
+            let mut stream = TcpStream::connect(("127.0.0.1", 5007)).unwrap();
+            stream.write_all(b"hello EMC other 1.0\r\nset verbose on\r\nset enable EMCTOO\r\nset abort\r\n").unwrap();
+            other = Some(stream);
+        });
+        assert!(!alarms.is_empty(), "{state:?}");
+        assert_eq!(records().iter().map(|record| begun(record)).sum::<usize>(), 1);
+    });
+}
+
+#[test]
+#[ignore = "needs LinuxCNC: Debian package linuxcnc-uspace, and root for namespaces"]
+fn a_program_that_the_controller_cannot_open_is_never_begun() {
+    let name = "linuxcnc::a_program_that_the_controller_cannot_open_is_never_begun";
+    beside_linuxcnc(name, |home| {
+        let (recipe, cell) = (recipe(home, [60.0, 12.0]), cell(home));
+        let text = fs::read_to_string(&cell).unwrap();
+        let named = "programs_at_controller = \"/tmp/nowhere\"\nexecuted_path";
+        fs::write(&cell, replaced(&text, "executed_path", named)).unwrap();
+        let (code, told, errors) = run(&["run", &recipe, "--cell", &cell, "--runs", "runs"], home);
+        println!("{code} {told}\n{errors}");
+        assert!(code != 0 && (told + &errors).contains("/tmp/nowhere"));
+        assert_eq!(records().iter().map(|record| begun(record)).sum::<usize>(), 0);
     });
 }

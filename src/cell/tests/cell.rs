@@ -410,6 +410,15 @@ fn the_form_is_judged_where_it_is_known_and_the_points_are_not() {
 }
 
 #[test]
+fn a_figure_without_a_limit_is_told_without_one() {
+    let open = CellPlan { tolerance: Tolerance { pv_mm: f64::INFINITY, ..plan().tolerance }, ..plan() };
+    let mut run = Run::new(open, |_| with_form([6.0, 6.4, 7.0], [0.4, 0.5, 0.6]));
+    run.start().go_on();
+    let told = run.judgements().last().unwrap().reason.clone();
+    assert!(told.contains("PV 6.40 um ± ") && told.contains(" um, RMS 0.50 um ± ") && !told.contains("inf"), "{told}");
+}
+
+#[test]
 fn at_the_floor_no_further_pass_is_ground() {
     // 1.2 um are found, give or take 0.15; another pass is expected to leave 1.05, and none can leave less than the floor.
     let with_floor = |floor_um: f64| {
