@@ -289,6 +289,7 @@ fn a_program_that_the_controller_cannot_open_is_never_begun() {
         let (recipe, cell) = (recipe(home, [60.0, 12.0]), cell(home));
         let text = fs::read_to_string(&cell).unwrap();
         let named = "programs_at_controller = \"/tmp/nowhere\"\nexecuted_path";
+        let text = replaced(&text, "settle_timeout_ms = 60000", "settle_timeout_ms = 2000");
         fs::write(&cell, replaced(&text, "executed_path", named)).unwrap();
         let (code, told, errors) = run(&["run", &recipe, "--cell", &cell, "--runs", "runs"], home);
         println!("{code} {told}\n{errors}");
