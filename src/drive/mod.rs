@@ -1021,6 +1021,11 @@ impl Drive {
         let _ = self.notices.send(notice);
     }
 
+    fn state_after(&self, event: &Event) -> Notice {
+        let (state, cycle, at_job) = (self.cell.in_words(), self.cell.cycle(), self.pace.progress().is_some());
+        Notice::State { state, cycle, event: event.name().to_owned(), at_job }
+    }
+
     /// Shows an event that the cell has taken in.
     fn show_event(&mut self, now: Duration, event: &Event) {
         self.pace.follow(self.cell.state());
@@ -1035,12 +1040,16 @@ impl Drive {
                 let left_s = self.pace.progress().and_then(|progress| progress.left_s);
                 Notice::Progress { device: *device, cycle, done: *done, total: *total, left_s }
             }
-            Event::Registered { cycle, figures } => Notice::Figures { cycle: *cycle, figures: figures.clone() },
-            Event::Compensated { cycle, summary } => Notice::Compensated { cycle: *cycle, summary: summary.clone() },
-            event => {
-                let (state, cycle, at_job) = (self.cell.in_words(), self.cell.cycle(), self.pace.progress().is_some());
-                Notice::State { state, cycle, event: event.name().to_owned(), at_job }
+            Event::Registered { cycle, figures } => {
+                self.notify(Notice::Figures { cycle: *cycle, figures: figures.clone() });
+                // Nothing else may come that tells of the state: the cell may be held by what was computed.
+                self.state_after(event)
             }
+            Event::Compensated { cycle, summary } => {
+                self.notify(Notice::Compensated { cycle: *cycle, summary: summary.clone() });
+                self.state_after(event)
+            }
+            event => self.state_after(event),
         };
         self.notify(notice);
     }

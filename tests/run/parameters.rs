@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 use serde_json::Value;
 
-use crate::program::{changed, root, run};
+use crate::program::{Running, changed, regrind, root, run};
 use crate::study::told_apart::Compared;
 use crate::study::{After, Bench};
 
@@ -70,6 +70,26 @@ fn a_wheel_that_is_larger_is_taken_back_as_such_in_a_whole_run() {
     });
     let [alone, with] = told;
     assert!(with.len() < alone.len() && with[1] < alone[1], "{with:?} beside {alone:?}");
+}
+
+#[test]
+fn what_is_beyond_its_tolerance_is_asked_for_and_the_cell_is_shown_as_held() {
+    let home = tempfile::tempdir().unwrap();
+    let parameters = TAKEN.replace("600.0", "300.0");
+    fs::write(home.path().join("mirror.toml"), recipe(&parameters, 0.7)).unwrap();
+    let cell = root().join("config/sim.toml");
+    let typed = ["run", "mirror.toml", "--cell", cell.to_str().unwrap(), "--runs", "runs", "--json"];
+    let mut program = Running::new(regrind(&typed, home.path()));
+    program.until("the question, and that it is held", |said| {
+        let notices: Vec<Value> = said.iter().map(|line| serde_json::from_str(line).unwrap()).collect();
+        let asked = notices.iter().any(|n| n["notice"] == "alarm" && n["id"] == "parameter_beyond");
+        let shown = notices.iter().rfind(|n| n["notice"] == "state").map(|n| n["state"].to_string());
+        (asked && shown.is_some_and(|state| state.starts_with("\"Held"))).then_some(())
+    });
+    let folder = fs::read_dir(home.path().join("runs")).unwrap().next().unwrap().unwrap().path();
+    assert_eq!(run(&["resume", folder.to_str().unwrap(), "--reason", "measured"], home.path()).0, 0);
+    let (code, errors) = program.end();
+    assert_eq!(code, 0, "{errors}\n{}", program.said.join("\n"));
 }
 
 /// A few worlds; `cargo run --release --example parameters` draws two hundred.
