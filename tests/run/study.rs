@@ -57,6 +57,7 @@ pub struct Bench {
     task: Task,
     plan: CellPlan,
     spec: WorldSpec,
+    machine: told_apart::Machine,
     plan_of: Vec<(Point, Vector)>,
 }
 
@@ -70,7 +71,7 @@ impl Bench {
         // No correction takes the ridges between tracks back, nor could it: what is studied is what corrections do.
         spec.grinder.scallops = false;
         let plan_of = task.targets.iter().map(|t| (t.point, t.normal)).collect();
-        Self { name: name.to_owned(), task, plan, spec, plan_of }
+        Self { name: name.to_owned(), task, plan, spec, machine: told_apart::Machine::default(), plan_of }
     }
 
     /// Makes one part after another in a world of its own: for each the truth after every pass.
@@ -105,6 +106,8 @@ struct Line<'a> {
     way: Way,
     worlds: [&'a World; 2],
     grinders: [Grinder; 2],
+    /// The twin's own twin without the random part: what the other leaves beyond it is random and nothing else, where a datum shows the height as well.
+    still: Option<(&'a World, Grinder)>,
     job: u32,
     places: Vec<[f64; 2]>,
     correction: Correction,
@@ -142,7 +145,8 @@ impl<'a> Line<'a> {
         }
         let places = bench.plan_of.iter().map(|(p, _)| [p.x, p.y]).collect();
         let (worlds, grinders) = ([world, twin], [world.grinder(), twin.grinder()]);
-        Self { bench, way, worlds, grinders, job, places, correction, known, before: None, forecast: None, told: None }
+        let (still, before, forecast, told) = (None, None, None, None);
+        Self { bench, way, worlds, grinders, still, job, places, correction, known, before, forecast, told }
     }
 
     /// Grinds and measures once, and makes the correction of the next pass.
@@ -156,10 +160,17 @@ impl<'a> Line<'a> {
         let told = Pass { wheel_radius_mm, ..pass_of(&self.bench.task, level_mm) };
         grind(real, self.job, cycle, &map, &told);
         grind(twin, self.job, cycle, &flat, &pass_of(&self.bench.task, level_mm));
-        let [whole, alone] = self.worlds.map(|world| {
+        if let Some((_, still)) = &mut self.still {
+            grind(still, self.job, cycle, &flat, &pass_of(&self.bench.task, level_mm));
+        }
+        let left = |world: &World| {
             let deviations: Vec<f64> = world.deviations_mm(&self.places).iter().map(|d| d - level_mm).collect();
             self.without_motion(&deviations)
-        });
+        };
+        let [whole, mut alone] = self.worlds.map(left);
+        if let Some((still, _)) = &self.still {
+            alone.iter_mut().zip(left(still)).for_each(|(of, still)| *of -= still);
+        }
         let difference: Vec<f64> = whole.iter().zip(&alone).map(|(a, b)| a - b).collect();
         let found = self.register(level_mm);
         let seen_um = 1e3 * found.verdict.rms_mm;

@@ -17,7 +17,8 @@
 //! error of s would otherwise be ground in times all of R, where now it only counts for what is still seen of it.
 //! Then Wiener's share of the mean m is believed, 1 - p' |N|^2 / |m|^2: where nothing stands out of the scatter, nothing is taken back. What
 //! passes differ by tells |N|^2; before that, unless it is stated, only the noise of the points is known, and its share of each band
-//! follows from the filter.
+//! follows from the filter. Of a scatter that was stated as a whole each band is given as much, until passes tell; as that is only its mean, the share is that
+//! of all scatters with this mean (the exponential distribution says least beside it): with c = |m|^2 / (p' |N|^2), 1 - (1 - exp(-c)) / c.
 
 use serde::{Deserialize, Serialize};
 
@@ -149,12 +150,17 @@ impl LearningState {
             edges = std::iter::successors(Some(map.cutoff_mm), octave).collect();
         }
         let count = edges.len() as f64;
-        let band = |from_mm: f64, share: f64| {
-            let scatter = repeatability_mm.map_or([0.0; 2], |rms| [rms * rms * share, 1.0]);
+        let band = |from_mm: f64, share: f64, passes: f64| {
+            let scatter = repeatability_mm.map_or([0.0; 2], |rms| [passes * rms * rms * share, passes]);
             Band { from_mm, belief: None, scatter, gain: 1.0, share: 1.0, changed: false }
         };
-        let whole = band(map.cutoff_mm, 1.0);
-        let bands = edges.into_iter().map(|from_mm| band(from_mm, 1.0 / count));
+        let whole = band(map.cutoff_mm, 1.0, 1.0);
+        // How it is shared out over several nobody stated: in each that counts for one of the values of which a pass has many.
+        let stated = |from_mm: f64| match rule {
+            GainRule::Wavelength => (CORRELATED * independent_values(size_mm[0] * size_mm[1], from_mm)).recip(),
+            GainRule::Fixed(_) | GainRule::Adaptive => 1.0,
+        };
+        let bands = edges.into_iter().map(|from_mm| band(from_mm, 1.0 / count, stated(from_mm)));
         Self {
             rule,
             response: [1.0, RESPONSE_SIGMA],
@@ -372,6 +378,11 @@ impl Band {
         (count > 0.0).then(|| sum / count)
     }
 
+    /// Whether no pass has told how much of the scatter is in this band: only how much it is in all of them was stated.
+    fn is_guessed(&self) -> bool {
+        self.scatter[1] > 0.0 && self.scatter[1] < 1.0
+    }
+
     /// Takes in the mean square of what a pass told beside what was believed.
     fn take_in(&mut self, news_mm2: f64, independent: f64) {
         let expected = self.belief.zip(self.scatter_mm2()).map(|(belief, n2)| (1.0 + belief) * n2);
@@ -398,17 +409,23 @@ impl Band {
     /// Chooses the share of the mean, given by its mean square, that is believed; `noise_mm2` is what the points alone scatter by.
     fn shrink(&mut self, mean_mm2: f64, noise_mm2: f64) {
         let of_mean_mm2 = self.scatter_mm2().unwrap_or(noise_mm2) * self.belief.unwrap_or(1.0);
-        let share = 1.0 - of_mean_mm2 / mean_mm2;
+        let over = mean_mm2 / of_mean_mm2;
+        let share = if self.is_guessed() { 1.0 + (-over).exp_m1() / over } else { 1.0 - over.recip() };
         // Of nothing all may be believed.
         self.share = if share.is_nan() { 1.0 } else { share.max(0.0) };
     }
 
-    /// Number of independent values that a map has in this band: [`CORRELATED`] squares of twice its shortest waves make one.
+    /// Number of independent values that a map has in this band.
     fn independent(&self, told: &ErrorOnGrid) -> f64 {
         let [dx, dy] = told.grid.spacing_mm;
         let area_mm2 = dx * dy * told.valid.iter().filter(|valid| **valid).count() as f64;
-        (area_mm2 / (2.0 * self.from_mm).powi(2) / CORRELATED).max(1.0)
+        independent_values(area_mm2, self.from_mm)
     }
+}
+
+/// Number of independent values on an area, of waves longer than this: [`CORRELATED`] squares of twice the shortest make one.
+fn independent_values(area_mm2: f64, from_mm: f64) -> f64 {
+    (area_mm2 / (2.0 * from_mm).powi(2) / CORRELATED).max(1.0)
 }
 
 /// What is believed of the response with an answer taken in, each by its certainty.
@@ -501,6 +518,25 @@ mod tests {
         let long = noisy(map(|[x, _]| 5e-3 * (x * std::f64::consts::TAU / 30.0).cos()));
         let known = after(&begin(GainRule::Wavelength, None), &none(), &long);
         assert!(known.gains().last().unwrap()[1] > 0.98, "{:?}", known.gains());
+    }
+
+    #[test]
+    fn a_scatter_that_was_stated_as_a_whole_is_a_guess_in_each_band_until_passes_tell() {
+        // Three bands, a third of the stated 1 um^2 in each: of a mean of the same square 1 - (1 - 1 / e) is believed, of one far above all.
+        let known = begin(GainRule::Wavelength, Some(1e-3));
+        let share = |mean_um: f64| {
+            let mut band = Band { belief: Some(1.0), ..known.bands[0] };
+            band.shrink(1e-6 * mean_um * mean_um, 0.0);
+            band.share
+        };
+        assert!((share((1.0f64 / 3.0).sqrt()) - (-1f64).exp()).abs() < 1e-12, "{}", share((1.0f64 / 3.0).sqrt()));
+        assert!((share(10.0) - (1.0 - 1.0 / 300.0)).abs() < 1e-12, "{}", share(10.0));
+        assert!(share(1e-3) < 1e-5, "{}", share(1e-3));
+        // What passes tell soon counts for more: 1,200 mm^2 are 48 squares of 5 mm, and the guess is worth one of these.
+        let mut band = Band { belief: Some(1.0), ..known.bands[0] };
+        band.take_in(0.0, 3.0);
+        assert!((band.scatter_mm2().unwrap() - 1e-6 / 3.0 / 49.0).abs() < 1e-12, "{:?}", band.scatter);
+        assert!(!band.is_guessed());
     }
 
     #[test]

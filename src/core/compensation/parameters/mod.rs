@@ -52,6 +52,9 @@ const LEAST_OWN: f64 = 0.02;
 const EXPANDED: f64 = 2.0;
 /// A mean square effect below this is rounding.
 const NOTHING: f64 = 1e-18;
+/// How strong slides may be, over all that is seen: so many strengths from as much of it down to this.
+const STRENGTHS: i32 = 25;
+const LEAST_STRENGTH: f64 = 1e-3;
 
 /// A point of the surface and how far it is off.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -310,6 +313,9 @@ struct Fitted {
     /// Of each slide and of each candidate behind them: its value; 0 where it was not fitted.
     values: DVector<f64>,
     covariance: DMatrix<f64>,
+    /// Root mean square of a unit of each.
+    sizes: Vec<f64>,
+    rms_mm: f64,
     slides: usize,
 }
 
@@ -372,7 +378,8 @@ impl Columns {
                 covariance[(slides + k, slides + k)] += if motion < 3 { shift * shift } else { turn * turn };
             }
         }
-        Ok(Fitted { values, covariance, slides })
+        let sizes = all.iter().map(|column| rms(column)).collect();
+        Ok(Fitted { values, covariance, sizes, rms_mm, slides })
     }
 
     /// The effects of motions and of chosen columns, in units of these.
@@ -456,14 +463,41 @@ impl Fitted {
         solved.map_or_else(|| DVector::zeros(n), |solved| DVector::from_fn(n, |k, _| chosen[k].1 * solved[k]))
     }
 
-    /// The share of all of them together that is believed: what scatter alone makes of so many is taken off.
-    fn share(&self) -> f64 {
+    /// Returns what is expected of all of them together: of a parameter with a tolerance by that, of what nobody states anything of by how strong all of
+    /// these are, which their values tell.
+    ///
+    /// Equation: T (T + S)^-1 b, the mean over strengths from next to nothing up to all that is seen, each as likely as it makes b (empirical Bayes,
+    /// Morris 1983).
+    fn believed(&self, options: &ParameterOptions) -> DVector<f64> {
         let chosen: Vec<usize> = (0..self.values.len()).filter(|&k| self.covariance[(k, k)] > 0.0).collect();
-        let values = DVector::from_fn(chosen.len(), |k, _| self.values[chosen[k]]);
-        let covariance = DMatrix::from_fn(chosen.len(), chosen.len(), |r, c| self.covariance[(chosen[r], chosen[c])]);
-        let Some(factor) = covariance.cholesky() else { return 0.0 };
-        let squares = values.dot(&factor.solve(&values));
-        if squares > 0.0 { (1.0 - chosen.len() as f64 / squares).max(0.0) } else { 0.0 }
+        let told = DVector::from_fn(chosen.len(), |k, _| self.values[chosen[k]]);
+        let stated = |k: usize| k.checked_sub(self.slides).and_then(|k| options.tolerances[k]);
+        let variance = |k: usize, strength_mm: f64| match stated(k) {
+            Some(tolerance) => (tolerance / EXPANDED).powi(2),
+            None => (strength_mm / self.sizes[k]).powi(2),
+        };
+        let by = |strength_mm: f64| {
+            let prior = DVector::from_fn(chosen.len(), |k, _| variance(chosen[k], strength_mm));
+            let both = DMatrix::from_fn(chosen.len(), chosen.len(), |r, c| {
+                self.covariance[(chosen[r], chosen[c])] + if r == c { prior[r] } else { 0.0 }
+            });
+            let factor = both.cholesky()?;
+            let solved = factor.solve(&told);
+            Some((prior.component_mul(&solved), -0.5 * told.dot(&solved) - 0.5 * factor.ln_determinant()))
+        };
+        let strengths =
+            (0..STRENGTHS).map(|k| self.rms_mm * LEAST_STRENGTH.powf(f64::from(k) / f64::from(STRENGTHS - 1)));
+        let seen: Vec<_> = strengths.filter_map(by).collect();
+        let top = seen.iter().map(|(_, likely)| *likely).fold(f64::NEG_INFINITY, f64::max);
+        let weight = |likely: f64| (likely - top).exp();
+        let whole: f64 = seen.iter().map(|(_, likely)| weight(*likely)).sum();
+        let mut believed = DVector::zeros(self.values.len());
+        for (values, likely) in &seen {
+            for (k, value) in chosen.iter().zip(values.iter()) {
+                believed[*k] += weight(*likely) / whole * value;
+            }
+        }
+        believed
     }
 }
 
@@ -472,4 +506,42 @@ fn own_share(column: &[f64], others: &Basis) -> f64 {
     let size = dot(column, column);
     // A level surface shows nothing of the wheel's radius but rounding.
     if size > NOTHING * column.len() as f64 { (dot(&own, &own) / size).sqrt() } else { 0.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A slide of 2 mm rms a unit, a radius of 1 mm and a setting that was not fitted, each known to 1 um.
+    fn fitted(values_um: [f64; 2]) -> Fitted {
+        let [slide, radius] = values_um.map(|value| 1e-3 * value);
+        Fitted {
+            values: DVector::from_column_slice(&[slide, radius, 0.0]),
+            covariance: DMatrix::from_diagonal(&DVector::from_column_slice(&[1e-6, 1e-6, 0.0])),
+            sizes: vec![2.0, 1.0, 1.0],
+            rms_mm: 1.0,
+            slides: 1,
+        }
+    }
+
+    #[test]
+    fn a_tolerance_and_what_is_seen_say_how_much_is_believed() {
+        let mut options = ParameterOptions::new(12.5);
+        options.tolerances[0] = Some(2e-3);
+        let believed = |values_um: [f64; 2]| {
+            let of = fitted(values_um).believed(&options);
+            assert_eq!(of[2], 0.0, "what was not fitted");
+            [1e3 * of[0], 1e3 * of[1]]
+        };
+        // A tolerance of 2 um expands a standard uncertainty of 1 um, as large as that of what was told: half of it, however much.
+        for radius_um in [0.0, 3.0, -40.0] {
+            let [slide, radius] = believed([0.0, radius_um]);
+            assert!((radius - 0.5 * radius_um).abs() < 1e-12 && slide == 0.0, "{slide} {radius}");
+        }
+        // Of a slide nobody states anything: far above its uncertainty it is believed, within it less than two thirds.
+        assert!((believed([100.0, 0.0])[0] - 100.0).abs() < 0.1, "{:?}", believed([100.0, 0.0]));
+        assert!(believed([0.5, 0.0])[0].abs() < 0.33, "{:?}", believed([0.5, 0.0]));
+        // The same by the other sign, and in another unit.
+        assert_eq!(believed([-0.5, 1.0])[0], -believed([0.5, -1.0])[0]);
+    }
 }

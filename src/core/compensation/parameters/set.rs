@@ -19,16 +19,15 @@ pub struct Smooth {
     slides: Vec<f64>,
     parameters: Vec<f64>,
     motion: Motion,
-    share: f64,
 }
 
 impl Smooth {
     pub(super) fn of(contacts: &[Contact], extent: &Extent, options: &ParameterOptions, fitted: &Fitted) -> Self {
-        let (slides, parameters) = fitted.values.as_slice().split_at(fitted.slides);
+        let believed = fitted.believed(options);
+        let (slides, parameters) = believed.as_slice().split_at(fitted.slides);
         let none = Motion([0.0; 6]);
         let (slides, parameters) = (slides.to_vec(), parameters.to_vec());
-        let whole =
-            Self { extent: *extent, term: options.wheel_term, slides, parameters, motion: none, share: fitted.share() };
+        let whole = Self { extent: *extent, term: options.wheel_term, slides, parameters, motion: none };
         let motion = Motion::of(contacts, options.free_motions, |c| whole.with_motion(c));
         Self { motion, ..whole }
     }
@@ -41,7 +40,7 @@ impl Smooth {
 
     /// Returns what they make of the deviation at a contact, as far as it is believed, in millimetres; what a motion of the part makes is taken out.
     pub fn at(&self, contact: &Contact) -> f64 {
-        self.share * (self.with_motion(contact) - self.motion.at(contact))
+        self.with_motion(contact) - self.motion.at(contact)
     }
 }
 
