@@ -565,6 +565,15 @@ mod tests {
     }
 
     fn write_in(dialect: &Dialect, tracks: &[std::vec::IntoIter<Move>], points: u64) -> Result<String, GcodeError> {
+        write_with(dialect, tracks, points, None)
+    }
+
+    fn write_with<B: Into<Block> + Clone + Send + Sync>(
+        dialect: &Dialect,
+        tracks: &[std::vec::IntoIter<B>],
+        points: u64,
+        arcs: Option<&ArcSummary>,
+    ) -> Result<String, GcodeError> {
         let header = ProgramHeader {
             part: "part".into(),
             cycle: 1,
@@ -583,7 +592,7 @@ mod tests {
                 tolerance_mm: 1e-4,
                 controller_mm: Some(1e-4),
                 chord_error_mm: 1e-4,
-                arcs_within_mm: None,
+                arcs_within_mm: arcs.map(|_| 1e-4),
             },
         };
         let summary = Summary {
@@ -602,7 +611,7 @@ mod tests {
         };
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("part.ngc");
-        write_tracks(&file, &header, &dialect.post(&header.exactness)?, (&summary, None), tracks)?;
+        write_tracks(&file, &header, &dialect.post(&header.exactness)?, (&summary, arcs), tracks)?;
         Ok(std::fs::read_to_string(file).unwrap())
     }
 
@@ -675,6 +684,72 @@ mod tests {
         let first: usize = found[1].split_once(' ').unwrap().0.parse().unwrap();
         let expected = heidenhain[1..].iter().enumerate().map(|(k, words)| format!("{} {words}", first + k));
         assert_eq!(found[1..], expected.collect::<Vec<_>>());
+    }
+
+    /// A track with a quarter of a turn about the origin in the plane of z and x, y along with it or not, a line, and the same turn backwards.
+    fn turning(y_mm: f64) -> Vec<std::vec::IntoIter<Block>> {
+        let arc = |clockwise: bool, to: Point| {
+            let (plane, centre_mm) = (Plane::ZX, [0.0, 0.0]);
+            Block::Arc(Arc { plane, clockwise, to, centre_mm, feed_mm_min: 600.0, deviation_mm: 0.0 })
+        };
+        let feed = |x: f64, y: f64, z: f64| Move::Feed { at: Point::new(x, y, z), feed_mm_min: 600.0 };
+        let straight = [Move::RapidXy([0.0, 0.0]), Move::RapidZ(3.0), feed(0.0, 0.0, 2.0)].map(Block::Straight);
+        let (there, back) = (arc(false, Point::new(2.0, y_mm, 0.0)), arc(true, Point::new(0.0, y_mm, 2.0)));
+        let over = [feed(3.0, y_mm, 0.0), feed(2.0, y_mm, 0.0)].map(Block::Straight);
+        let blocks = straight.into_iter().chain([there]).chain(over).chain([back, Block::Straight(Move::RapidZ(5.0))]);
+        vec![blocks.collect::<Vec<_>>().into_iter()]
+    }
+
+    fn turned(name: &str, y_mm: f64) -> Vec<String> {
+        let dialect = shipped(name);
+        let summary = ArcSummary { moves: 8, arcs: 2, lines: 3, ..ArcSummary::default() };
+        let text = write_with(&dialect, &turning(y_mm), 0, Some(&summary)).unwrap();
+        let counted = format!("LINES: {}", text.lines().count());
+        assert!(text.to_ascii_uppercase().contains(&counted), "{name}: {text}");
+        let is_comment = |line: &&str| line.contains(&dialect.text.comment_begins) && !line.starts_with('O');
+        text.lines().filter(|line| !is_comment(line)).map(str::to_owned).collect()
+    }
+
+    #[test]
+    fn every_dialect_has_its_own_words_of_arcs() {
+        let linuxcnc = [
+            "G21 G90 G94 G17 G40 G49 G80 G54",
+            "G91.1",
+            "G64 P0.0001 Q0",
+            "G0 X0.000000Y0.000000",
+            "Z3.000000",
+            "G1 Z2.000000F600",
+            "G18 G3 X2.000000Y0.100000Z0.000000I0.000000K-2.000000",
+            "G1 X3.000000",
+            "X2.000000",
+            "G2 X0.000000Z2.000000I-2.000000K0.000000",
+            "G0 Z5.000000",
+            "G17",
+            "M2",
+        ];
+        assert_eq!(turned("linuxcnc", 0.1), linuxcnc);
+        let fanuc = turned("fanuc", 0.1);
+        assert_eq!(fanuc[8..10], ["G18 G03 X2.0000 Y0.1000 Z0.0000 I0.0000 K-2.0000", "G01 X3.0000"]);
+        assert_eq!(fanuc[fanuc.len() - 4..], ["G05.1 Q0", "G17", "M30", "%"]);
+        let sinumerik = turned("sinumerik", 0.0);
+        assert_eq!(sinumerik[6..8], ["N70 G18 G3 X2.000000 Z0.000000 I0.000000 K-2.000000", "N80 G1 X3.000000"]);
+        let heidenhain = turned("heidenhain", 0.0);
+        let words: Vec<&str> = heidenhain[6..13].iter().map(|line| line.split_once(' ').unwrap().1).collect();
+        let expected = [
+            "CC X+0.0000 Z+0.0000",
+            "C X+2.0000 Z+0.0000 DR+",
+            "L X+3.0000",
+            "L X+2.0000",
+            "CC X+0.0000 Z+0.0000",
+            "C X+0.0000 Z+2.0000 DR-",
+            "L Z+5.0000 R0 FMAX",
+        ];
+        assert_eq!(words, expected);
+        // Places in place of ways from the beginning.
+        let mut places = shipped("linuxcnc");
+        places.arcs.as_mut().unwrap().centre = CentreWords::Absolute;
+        let text = write_with(&places, &turning(0.0), 0, Some(&ArcSummary { moves: 8, ..ArcSummary::default() }));
+        assert!(text.unwrap().contains("G2 X0.000000Z2.000000I0.000000K0.000000"));
     }
 
     #[test]

@@ -18,8 +18,8 @@ use crate::geometry::{Point, Vector};
 const WINDOW: usize = 1024;
 /// Largest half chord as a share of the centre's distance from it: a quarter of a turn, so that no control can take the longer way round.
 const WIDEST: f64 = 1.0;
-/// Largest way of the third axis as a share of the chord. Some controls have the feed in the plane, some along the whole way: less than 0.05 % apart.
-const STEEPEST: f64 = 0.03;
+/// Largest way of the third axis as a share of the chord. Some controls have the feed in the plane, some along the whole way: 0.5 % apart at most.
+const STEEPEST: f64 = 0.1;
 
 /// The plane of arcs: its first and second axis, and the one across; turning from the first to the second is counter-clockwise.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
