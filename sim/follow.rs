@@ -1,9 +1,9 @@
-//! What a ball leaves that follows a program: how far its centre is from the nominal surface, all along the chords between its stops.
+//! What a ball leaves that follows a program: how far its centre is from the nominal surface, all along the lines and arcs between its stops.
 
 use crate::part::Part;
 use crate::program::Program;
 
-/// Places along a chord are no farther apart than this, in millimetres.
+/// Places along a move are no farther apart than this, in millimetres.
 const APART_MM: f64 = 0.15;
 /// Steps of Newton's method down to a foot.
 const STEPS: usize = 12;
@@ -43,11 +43,10 @@ fn on_part(part: &Part, at_mm: [f64; 2]) -> [f64; 2] {
 fn touches(part: &Part, program: &Program, radius_mm: f64) -> Vec<Touch> {
     let mut found = Vec::new();
     for pair in program.stops.windows(2).filter(|pair| pair[1].feed_mm_min.is_some()) {
-        let (from, to) = (pair[0].at_mm, pair[1].at_mm);
-        let by: [f64; 3] = std::array::from_fn(|k| to[k] - from[k]);
-        let count = (by.iter().map(|b| b * b).sum::<f64>().sqrt() / APART_MM).ceil().max(1.0);
+        let (from, to) = (pair[0].at_mm, &pair[1]);
+        let count = (to.way_mm(from) / APART_MM).ceil().max(1.0);
         for k in 1..=count as usize {
-            let centre = std::array::from_fn(|i| from[i] + by[i] * k as f64 / count);
+            let centre = to.on_the_way(from, k as f64 / count);
             found.extend(touch(part, centre, radius_mm));
         }
     }
@@ -144,7 +143,7 @@ mod tests {
                 let (x, y) = (at(i, columns, a), at(j, rows, b));
                 let (point, normal) = (part.shape.point(x, y), part.shape.normal(x, y));
                 let at_mm = std::array::from_fn(|k| point[k] + (10.0 + left_mm(x, y)) * normal[k]);
-                program.stops.push(Stop { at_mm, feed_mm_min: (i > 0).then_some(600.0) });
+                program.stops.push(Stop { at_mm, feed_mm_min: (i > 0).then_some(600.0), turn: None });
             }
         }
         let heights = heights_mm(&part, &program, 10.0, apart_mm);

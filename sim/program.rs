@@ -1,7 +1,7 @@
 //! What a control reads in a program: by its own means, written from what its makers say of it, so that no error of a writer hides here.
 //!
 //! ```text
-//!  text -> block by block -> where the wheel's centre stops, and how fast it came there
+//!  text -> block by block -> where the wheel's centre stops, how fast and by which way it came there
 //! ```
 //!
 //! A real control would do something with almost anything. This one refuses what would move a real machine elsewhere than its text says at
@@ -26,6 +26,66 @@ pub enum Control {
 /// Millimetres that a number without a point counts in with IS-C.
 const INCREMENT_MM: f64 = 1e-4;
 
+/// An arc as every control has it: about a centre in a plane of two axes, while the third goes along evenly with the angle.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Turn {
+    /// The two axes of the plane, and the one across.
+    axes: [usize; 3],
+    centre_mm: [f64; 2],
+    /// Counter-clockwise, from the first axis to the second, is positive.
+    sweep_rad: f64,
+}
+
+impl Turn {
+    /// Turns from a place to another one.
+    ///
+    /// # Errors
+    /// Radii at the beginning and at the end that differ by more than a control takes, and no way at all.
+    pub fn new(
+        axes: [usize; 3],
+        [from, to]: [[f64; 3]; 2],
+        centre_mm: [f64; 2],
+        clockwise: bool,
+        takes_mm: f64,
+    ) -> Result<Self, String> {
+        let arm = |at: [f64; 3]| [0, 1].map(|k| at[axes[k]] - centre_mm[k]);
+        let (begin, end) = (arm(from), arm(to));
+        let [r, q] = [begin, end].map(|[u, v]| u.hypot(v));
+        // What is not a number is refused with the rest.
+        if !((r - q).abs() <= takes_mm && r > 0.0) {
+            return Err(format!("the radius is {r} mm where the arc begins and {q} mm where it ends"));
+        }
+        let counter = (end[1].atan2(end[0]) - begin[1].atan2(begin[0])).rem_euclid(std::f64::consts::TAU);
+        let sweep_rad = if clockwise { counter - std::f64::consts::TAU } else { counter };
+        if counter == 0.0 {
+            return Err("the arc ends where it begins".into());
+        }
+        Ok(Self { axes, centre_mm, sweep_rad })
+    }
+
+    /// Returns the place at a share of the turn that began here.
+    fn at(&self, from: [f64; 3], to: [f64; 3], share: f64) -> [f64; 3] {
+        let [a, b, c] = self.axes;
+        let (u, v) = (from[a] - self.centre_mm[0], from[b] - self.centre_mm[1]);
+        let (sine, cosine) = (share * self.sweep_rad).sin_cos();
+        let mut at = from;
+        at[a] = self.centre_mm[0] + u * cosine - v * sine;
+        at[b] = self.centre_mm[1] + u * sine + v * cosine;
+        at[c] = from[c] + share * (to[c] - from[c]);
+        at
+    }
+
+    fn radius_mm(&self, from: [f64; 3]) -> f64 {
+        (from[self.axes[0]] - self.centre_mm[0]).hypot(from[self.axes[1]] - self.centre_mm[1])
+    }
+
+    /// Returns how many chords are no farther than this from the turn.
+    fn chords(&self, from: [f64; 3], within_mm: f64) -> usize {
+        let each = (8.0 * within_mm / self.radius_mm(from)).sqrt();
+        (self.sweep_rad.abs() / each).ceil().clamp(1.0, 1e6) as usize
+    }
+}
+
 /// Where a move ends.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Stop {
@@ -33,6 +93,34 @@ pub struct Stop {
     pub at_mm: [f64; 3],
     /// In mm/min; none where it comes rapidly.
     pub feed_mm_min: Option<f64>,
+    /// How it comes there, where it does not come straight.
+    pub turn: Option<Turn>,
+}
+
+impl Stop {
+    /// Returns the place at a share of the way from the stop before it.
+    pub fn on_the_way(&self, from_mm: [f64; 3], share: f64) -> [f64; 3] {
+        match &self.turn {
+            Some(turn) => turn.at(from_mm, self.at_mm, share),
+            None => std::array::from_fn(|k| from_mm[k] + share * (self.at_mm[k] - from_mm[k])),
+        }
+    }
+
+    /// Returns how long that way is, in millimetres.
+    pub fn way_mm(&self, from_mm: [f64; 3]) -> f64 {
+        let along = |k: usize| self.at_mm[k] - from_mm[k];
+        match &self.turn {
+            Some(turn) => (turn.radius_mm(from_mm) * turn.sweep_rad).hypot(along(turn.axes[2])),
+            None => (0..3).map(|k| along(k).powi(2)).sum::<f64>().sqrt(),
+        }
+    }
+
+    /// Returns the ends of straight moves that are no farther than this from the way.
+    pub fn in_chords(&self, from_mm: [f64; 3], within_mm: f64) -> Vec<[f64; 3]> {
+        let count = self.turn.as_ref().map_or(1, |turn| turn.chords(from_mm, within_mm));
+        let inner = (1..count).map(|k| self.on_the_way(from_mm, k as f64 / count as f64));
+        inner.chain([self.at_mm]).collect()
+    }
 }
 
 /// A program as a control has read it.
@@ -76,8 +164,13 @@ struct Reader {
     control: Control,
     program: Program,
     at_mm: Option<[f64; 3]>,
-    /// 0 rapid, 1 at feed.
+    /// 0 rapid, 1 at feed, 2 and 3 along an arc: clockwise and counter-clockwise.
     motion: Option<u8>,
+    /// The plane that was selected last, and where Klartext has its centre, axis by axis.
+    plane: Option<[usize; 3]>,
+    centre: BTreeMap<char, f64>,
+    /// Whether LinuxCNC was told that centres are from the beginning of an arc, or that they are places.
+    from_start: Option<bool>,
     feed_mm_min: Option<f64>,
     metric: bool,
     absolute: bool,
@@ -157,6 +250,10 @@ impl Reader {
                     let scale = if self.control == Control::Fanuc && !has_point { INCREMENT_MM } else { 1.0 };
                     to.insert(name.chars().next().unwrap_or('X'), scale * n);
                 }
+                (Control::Linuxcnc | Control::Sinumerik | Control::Fanuc, "I" | "J" | "K", Some(n)) => {
+                    let scale = if self.control == Control::Fanuc && !has_point { INCREMENT_MM } else { 1.0 };
+                    to.insert(name.chars().next().unwrap_or('I'), scale * n);
+                }
                 (_, "F", Some(n)) if n > 0.0 => self.feed_mm_min = Some(n),
                 (Control::Linuxcnc, "P", Some(n)) => self.program.tolerance_mm = Some(n),
                 (Control::Linuxcnc, "Q", Some(_)) => {}
@@ -179,8 +276,12 @@ impl Reader {
     /// A word G, in tenths; returns one of how exactly the path is kept to.
     fn preparatory(&mut self, tenths: i64) -> Result<Option<i64>, String> {
         match (self.control, tenths) {
-            (_, 0 | 10) => self.motion = Some(u8::from(tenths == 10)),
-            (_, 170 | 400 | 540 | 490 | 800) => {}
+            (_, 0 | 10 | 20 | 30) => self.motion = Some((tenths / 10) as u8),
+            (_, 170) => self.plane = Some([0, 1, 2]),
+            (_, 180) => self.plane = Some([2, 0, 1]),
+            (_, 190) => self.plane = Some([1, 2, 0]),
+            (Control::Linuxcnc, 901 | 911) => self.from_start = Some(tenths == 911),
+            (_, 400 | 540 | 490 | 800) => {}
             (Control::Linuxcnc | Control::Fanuc, 210) | (Control::Sinumerik, 7100) => self.metric = true,
             (_, 900) => self.absolute = true,
             (_, 940) => self.by_minute = true,
@@ -220,16 +321,54 @@ impl Reader {
             Some(_) => Some(self.feed_mm_min.ok_or("it moves at a feed that nobody told")?),
             None => return Err("it moves nobody knows how".into()),
         };
-        let mut at_mm = self.at_mm.unwrap_or([f64::NAN; 3]);
+        let before = self.at_mm.unwrap_or([f64::NAN; 3]);
+        let mut at_mm = before;
         for (axis, value) in to {
-            at_mm["XYZ".find(*axis).unwrap_or(0)] = *value;
+            if let Some(k) = "XYZ".find(*axis) {
+                at_mm[k] = *value;
+            }
         }
         if feed_mm_min.is_some() && at_mm.iter().any(|v| v.is_nan()) {
             return Err("it feeds from a place that it did not tell".into());
         }
+        let turn = match self.motion {
+            Some(motion @ (2 | 3)) => Some(self.turn([before, at_mm], to, motion == 2)?),
+            _ if to.keys().any(|letter| "IJK".contains(*letter)) => return Err("a centre stands with no arc".into()),
+            _ => None,
+        };
         self.at_mm = Some(at_mm);
-        self.program.stops.push(Stop { at_mm, feed_mm_min });
+        self.program.stops.push(Stop { at_mm, feed_mm_min, turn });
         Ok(())
+    }
+
+    /// The arc of a block: its centre is told along the axes of the plane, and both of its ends there.
+    fn turn(&self, ends: [[f64; 3]; 2], told: &BTreeMap<char, f64>, clockwise: bool) -> Result<Turn, String> {
+        let axes = self.plane.ok_or("the plane of its arc was not told")?;
+        let [a, b, c] = axes;
+        let letter = |of: &str, k: usize| of.chars().nth(k).unwrap_or('?');
+        if ![a, b].iter().all(|k| told.contains_key(&letter("XYZ", *k))) {
+            return Err("it does not tell where in the plane its arc ends".into());
+        }
+        // How far the radii of an arc may differ, as its maker has it at first.
+        let (of, from_start, takes_mm) = match self.control {
+            Control::Linuxcnc => (told, self.from_start.ok_or("it does not say where centres are told from")?, 0.005),
+            Control::Fanuc => (told, true, 0.005),
+            Control::Sinumerik => (told, true, 0.01),
+            Control::Heidenhain => (&self.centre, false, 0.016),
+        };
+        let letters = if self.control == Control::Heidenhain { "XYZ" } else { "IJK" };
+        if of.contains_key(&letter(letters, c)) {
+            return Err("the centre of its arc is out of the plane".into());
+        }
+        if self.control == Control::Heidenhain && told.contains_key(&letter("XYZ", c)) {
+            return Err("a C stays in its plane".into());
+        }
+        let mut centre_mm = [0.0; 2];
+        for (k, axis) in [a, b].into_iter().enumerate() {
+            let told = of.get(&letter(letters, axis)).ok_or("the centre of its arc is not told")?;
+            centre_mm[k] = if from_start { ends[0][axis] + told } else { *told };
+        }
+        Turn::new(axes, ends, centre_mm, clockwise, takes_mm)
     }
 
     /// A line of Klartext, with its number.
@@ -265,17 +404,44 @@ impl Reader {
                 self.program.tolerance_mm = self.program.tolerance_mm.or(tolerance);
                 Ok(())
             }
-            _ => self.straight(rest.strip_prefix("L ").ok_or("it is no line of a pass")?),
+            _ => match rest.split_once(' ') {
+                Some(("L", rest)) => self.straight(rest, Some(1)),
+                Some(("CC", rest)) => self.told_centre(rest),
+                Some(("C", rest)) => self.straight(rest, None),
+                _ => Err("it is no line of a pass".into()),
+            },
         }
     }
 
-    /// What comes after an L.
-    fn straight(&mut self, rest: &str) -> Result<(), String> {
+    /// What comes after a CC: two axes, which are the plane of the circles about it.
+    fn told_centre(&mut self, rest: &str) -> Result<(), String> {
+        self.centre.clear();
+        for word in rest.split_whitespace() {
+            let (axis, value) = word.split_at(1);
+            if !(matches!(axis, "X" | "Y" | "Z") && value.starts_with(['+', '-'])) {
+                return Err(format!("{word} is no word of a CC"));
+            }
+            let value = value.parse().map_err(|_| format!("{word} is no place"))?;
+            self.centre.insert(axis.chars().next().unwrap_or('X'), value);
+        }
+        let named: String = self.centre.keys().collect();
+        self.plane = Some(match named.as_str() {
+            "XY" => [0, 1, 2],
+            "XZ" => [2, 0, 1],
+            "YZ" => [1, 2, 0],
+            _ => return Err("a centre is told by two axes".into()),
+        });
+        Ok(())
+    }
+
+    /// What comes after an L or, where nothing says how it moves but a DR, after a C.
+    fn straight(&mut self, rest: &str, motion: Option<u8>) -> Result<(), String> {
         let mut to = BTreeMap::new();
-        self.motion = Some(1);
+        self.motion = motion;
         for word in rest.split_whitespace() {
             match (word.split_at(1), word) {
-                (_, "FMAX") => self.motion = Some(0),
+                (_, "FMAX") if motion.is_some() => self.motion = Some(0),
+                (_, "DR-" | "DR+") if motion.is_none() => self.motion = Some(if word == "DR-" { 2 } else { 3 }),
                 (_, "R0") => {}
                 (("F", feed), _) => self.feed_mm_min = Some(feed.parse().map_err(|_| format!("{word} is no feed"))?),
                 ((axis @ ("X" | "Y" | "Z"), value), _) if value.starts_with(['+', '-']) => {
@@ -346,6 +512,72 @@ mod tests {
             assert_eq!(control.read(text).unwrap().tolerance_mm, (control != Control::Fanuc).then_some(0.001));
             let cut = text.trim_end().rsplit_once('\n').unwrap().0;
             assert!(control.read(cut).is_err(), "{control:?} without an end");
+        }
+    }
+
+    /// Half a turn about (3, 7) in the plane of z and x, from the larger z to the smaller by way of the larger x, y along with it; then a line.
+    const ARCS: [(Control, &str); 4] = [
+        (Control::Linuxcnc, "G21 G90 G94 G17\nG91.1 G61\nG0 X3 Y1 Z9\nG18 G3 X3Z5I0K-2Y1.5F600\nG1 X0\nM2\n"),
+        (
+            Control::Fanuc,
+            "%\nO1\nG21 G90 G94 G17 G61\nG00 X3. Y1. Z9.\nG18 G03 X3. Y1.5 Z5. I0. K-20000 F600.\nG01 X0.\nM30\n%\n",
+        ),
+        (
+            Control::Sinumerik,
+            "N10 G710 G90 G94 G17 G60 G601\nN20 G0 X3 Y1 Z9\nN30 G18 G3 X3 Y1.5 Z5 I0 K-2 F600\nN40 G1 X0\nN50 M30\n",
+        ),
+        (
+            Control::Heidenhain,
+            "0 BEGIN PGM A MM\n1 CYCL DEF 32.0 TOLERANCE\n2 CYCL DEF 32.1 T0.001\n3 L X+3 Y+1 Z+9 R0 FMAX\n4 CC X+3 Z+7\n5 C X+3 Z+5 DR+ F600\n6 L X+0\n7 END PGM A MM\n",
+        ),
+    ];
+
+    #[test]
+    fn every_control_turns_where_the_standard_has_it() {
+        for (control, text) in ARCS {
+            let program = control.read(text).unwrap_or_else(|why| panic!("{control:?}: {why}"));
+            let rises = if control == Control::Heidenhain { 0.0 } else { 0.5 };
+            let [from, arc, line] = program.stops[..] else { panic!("{control:?}: {program:?}") };
+            assert_eq!((from.at_mm, arc.at_mm), ([3.0, 1.0, 9.0], [3.0, 1.0 + rises, 5.0]));
+            assert!(line.turn.is_none() && line.at_mm == [0.0, 1.0 + rises, 5.0]);
+            let off = |at: [f64; 3], of: [f64; 3]| (0..3).all(|k| (at[k] - of[k]).abs() < 1e-12);
+            assert!(off(arc.on_the_way(from.at_mm, 0.5), [5.0, 1.0 + 0.5 * rises, 7.0]), "{control:?}");
+            assert!(off(arc.on_the_way(from.at_mm, 1.0), arc.at_mm), "{control:?}");
+            assert!((arc.way_mm(from.at_mm) - (2.0 * std::f64::consts::PI).hypot(rises)).abs() < 1e-12);
+            let chords = arc.in_chords(from.at_mm, 1e-4);
+            let sagging = |pair: &[[f64; 3]]| {
+                let middle: [f64; 2] = [0, 2].map(|k| 0.5 * (pair[0][k] + pair[1][k]));
+                2.0 - (middle[0] - 3.0).hypot(middle[1] - 7.0)
+            };
+            assert!(chords.windows(2).map(sagging).all(|sag| sag > 0.5e-4 && sag < 1.001e-4));
+            // The other way round it goes by the smaller x.
+            let round = text.replace("G3 ", "G2 ").replace("G03 ", "G02 ").replace("DR+", "DR-");
+            let round = control.read(&round).unwrap().stops[1];
+            assert!(off(round.on_the_way(from.at_mm, 0.5), [1.0, 1.0 + 0.5 * rises, 7.0]), "{control:?}");
+        }
+    }
+
+    #[test]
+    fn arcs_that_a_control_does_not_take_are_refused() {
+        for (control, from, to) in [
+            (Control::Linuxcnc, "G91.1 ", ""),
+            (Control::Linuxcnc, "G91.1", "G90.1"),
+            (Control::Linuxcnc, "G18 ", ""),
+            (Control::Linuxcnc, "K-2", "K-2.1"),
+            (Control::Linuxcnc, "I0K-2", "I0J-2"),
+            (Control::Linuxcnc, "G3 X3Z5", "G3 X3"),
+            (Control::Linuxcnc, "G1 X0", "G1 X0 I1"),
+            (Control::Fanuc, "K-20000", "K-2"),
+            (Control::Sinumerik, "K-2", "K7"),
+            (Control::Heidenhain, "Z+5 DR+", "Y+2 Z+5 DR+"),
+            (Control::Heidenhain, "DR+ ", ""),
+            (Control::Heidenhain, "CC X+3 Z+7", "CC X+3"),
+            (Control::Heidenhain, "Z+7", "Z+7.1"),
+            (Control::Heidenhain, "C X+3 Z+5 DR+", "L X+3 Z+5 DR+"),
+        ] {
+            let (_, text) = ARCS.into_iter().find(|(of, _)| *of == control).unwrap();
+            assert!(text.contains(from), "{from}");
+            assert!(control.read(&text.replacen(from, to, 1)).is_err(), "{control:?}: {to} in place of {from}");
         }
     }
 

@@ -525,6 +525,7 @@ fn programs(
         mode: grinding.path_mode,
         path_tolerance_mm: grinding.path_tolerance_um.mm(),
         controller_tolerance_mm: cell.grinder.program.controller_tolerance_mm,
+        arcs_within_mm: cell.grinder.program.arcs_within_mm,
         dialect: cell.grinder.program.dialect.clone(),
         folder: cell.grinder.program.folder.clone(),
         spark_out_passes: grinding.spark_out_passes,

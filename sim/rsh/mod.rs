@@ -493,6 +493,11 @@ impl Controller {
                     }
                     left_s -= way_mm / mm_s;
                 }
+                Step::Refused { why, line } => {
+                    self.line = line;
+                    self.errors.push_back(why);
+                    return self.break_off();
+                }
                 Step::Wait { line } => {
                     self.line = line;
                     self.wheel.been_all_over();

@@ -3,17 +3,24 @@
 use std::collections::VecDeque;
 
 use crate::Vec3;
+use crate::program::{Stop, Turn};
 
 /// So many motions are read ahead at most.
 const AHEAD: usize = 200;
 /// Rapid travel.
 const RAPID_MM_S: f64 = 100.0;
+/// Chords that stand for an arc are no farther from it than this, in millimetres.
+const CHORDS_MM: f64 = 1e-5;
+/// How far the radii at both ends of an arc may differ, in millimetres.
+const RADII_MM: f64 = 0.005;
 
 /// What is carried out in its turn.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Step {
     /// Straight to a place.
     Move { to_mm: Vec3, mm_s: f64, line: u32 },
+    /// An arc that cannot be gone along.
+    Refused { why: String, line: u32 },
     /// What is behind it is not read before the motion has come here.
     Wait { line: u32 },
     /// The end.
@@ -42,7 +49,11 @@ pub(super) struct Program {
     /// Where a loop began, and how often it is still to be gone through.
     repeats: Option<(usize, u32)>,
     at_mm: Vec3,
-    feeds: bool,
+    /// 0 rapid, 1 at feed, 2 and 3 along an arc: clockwise and counter-clockwise.
+    motion: u8,
+    plane: [usize; 3],
+    /// Whether centres are places (G90.1) and not from the beginning of an arc (G91.1).
+    centres_are_places: bool,
     mm_s: f64,
     /// Nothing is read until this has been carried out.
     waits: bool,
@@ -52,7 +63,21 @@ impl Program {
     pub(super) fn new(path: &str, text: String) -> Self {
         let lines = text.lines().map(str::to_owned).collect();
         let (next, repeats, waits) = (0, None, false);
-        Self { path: path.to_owned(), text, lines, next, repeats, at_mm: [0.0; 3], feeds: false, mm_s: 0.0, waits }
+        let (at_mm, plane) = ([0.0; 3], [0, 1, 2]);
+        let (motion, centres_are_places, mm_s) = (0, false, 0.0);
+        Self {
+            path: path.to_owned(),
+            text,
+            lines,
+            next,
+            repeats,
+            at_mm,
+            motion,
+            plane,
+            centres_are_places,
+            mm_s,
+            waits,
+        }
     }
 
     /// How many lines it has.
@@ -63,7 +88,8 @@ impl Program {
     /// Goes back to the beginning, from a place.
     pub(super) fn rewind(&mut self, at_mm: Vec3) {
         (self.next, self.repeats, self.waits) = (0, None, false);
-        (self.at_mm, self.feeds, self.mm_s) = (at_mm, false, 0.0);
+        (self.at_mm, self.motion, self.mm_s) = (at_mm, 0, 0.0);
+        (self.plane, self.centres_are_places) = ([0, 1, 2], false);
     }
 
     /// What was waited for has been carried out.
@@ -104,10 +130,15 @@ impl Program {
 
     fn code(&mut self, text: &str, line: u32, steps: &mut VecDeque<Step>) {
         let (mut to_mm, mut moves) = (self.at_mm, false);
+        let mut centre = [None; 3];
         for (letter, value) in words(text) {
             match (letter, value) {
-                ('G', 0.0) => self.feeds = false,
-                ('G', 1.0) => self.feeds = true,
+                ('G', 0.0 | 1.0 | 2.0 | 3.0) => self.motion = value as u8,
+                ('G', 17.0) => self.plane = [0, 1, 2],
+                ('G', 18.0) => self.plane = [2, 0, 1],
+                ('G', 19.0) => self.plane = [1, 2, 0],
+                ('G', 90.1 | 91.1) => self.centres_are_places = value == 90.1,
+                ('I' | 'J' | 'K', mm) => centre[letter as usize - 'I' as usize] = Some(mm),
                 ('F', feed) => self.mm_s = feed / 60.0,
                 ('X' | 'Y' | 'Z', mm) => {
                     to_mm[letter as usize - 'X' as usize] = mm;
@@ -125,10 +156,30 @@ impl Program {
             }
         }
         if moves {
-            let mm_s = if self.feeds { self.mm_s.max(1e-3) } else { RAPID_MM_S };
-            steps.push_back(Step::Move { to_mm, mm_s, line });
+            let mm_s = if self.motion > 0 { self.mm_s.max(1e-3) } else { RAPID_MM_S };
+            match self.way(to_mm, centre) {
+                Ok(stop) => {
+                    let chords = stop.in_chords(self.at_mm, CHORDS_MM);
+                    steps.extend(chords.into_iter().map(|to_mm| Step::Move { to_mm, mm_s, line }));
+                }
+                Err(why) => steps.push_back(Step::Refused { why, line }),
+            }
             self.at_mm = to_mm;
         }
+    }
+
+    /// The way to a place: straight, or about a centre of which what is not told is 0.
+    fn way(&self, to_mm: Vec3, centre: [Option<f64>; 3]) -> Result<Stop, String> {
+        let turn = match self.motion {
+            motion @ (2 | 3) => {
+                let begin = |axis: usize| if self.centres_are_places { 0.0 } else { self.at_mm[axis] };
+                let [a, b, _] = self.plane;
+                let about = [a, b].map(|axis| begin(axis) + centre[axis].unwrap_or(0.0));
+                Some(Turn::new(self.plane, [self.at_mm, to_mm], about, motion == 2, RADII_MM)?)
+            }
+            _ => None,
+        };
+        Ok(Stop { at_mm: to_mm, feed_mm_min: None, turn })
     }
 }
 
@@ -177,6 +228,35 @@ mod tests {
         (steps, program.waits) = (VecDeque::new(), false);
         assert_eq!(program.read_on(&mut steps), [log("c")]);
         assert_eq!(steps, [Step::End { line: 9 }]);
+    }
+
+    #[test]
+    fn arcs_are_gone_along_in_their_plane_and_refused_where_they_do_not_close() {
+        let text = "G91.1\nG0 X3Y1Z9\nG18 G3 X3Z5I0K-2F600\nG90.1 G2 X3Z9I3K7\nG91.1 X4Z5K-2\nM2\n";
+        let (mut program, mut steps) = (Program::new("p", text.to_owned()), VecDeque::new());
+        let mut ahead = VecDeque::new();
+        // It reads on when what it has read is gone along.
+        while steps.back() != Some(&Step::End { line: 6 }) {
+            program.read_on(&mut ahead);
+            steps.append(&mut ahead);
+        }
+        let along = |of: u32| -> Vec<Vec3> {
+            let ends = |step: &Step| match step {
+                Step::Move { to_mm, line, .. } if *line == of => Some(*to_mm),
+                _ => None,
+            };
+            steps.iter().filter_map(ends).collect()
+        };
+        for (line, ends) in [(3, [3.0, 1.0, 5.0]), (4, [3.0, 1.0, 9.0])] {
+            let arc = along(line);
+            assert_eq!(arc.last(), Some(&ends));
+            // There by the larger x, and the other way round back again.
+            assert!(
+                arc.iter().all(|[x, y, z]| *x >= 3.0 && *y == 1.0 && ((x - 3.0).hypot(z - 7.0) - 2.0).abs() < 1e-12)
+            );
+            assert!(arc.iter().any(|[x, _, _]| *x > 4.99) && arc.len() > 100, "{}", arc.len());
+        }
+        assert!(matches!(steps.iter().rev().nth(1), Some(Step::Refused { line: 5, .. })));
     }
 
     #[test]

@@ -4,9 +4,10 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::cell::Beginning;
-use regrind::compensation::path::{Scallops, Summary, ToolPath};
+use regrind::compensation::path::{ArcSummary, Scallops, Summary, ToolPath};
 use regrind::config::{BUILT_IN, CellConfig};
 use regrind::drive::Task;
+use regrind::formats::gcode::GcodeError;
 use regrind::model::FIRST;
 use regrind::recipe::Recipe;
 use regrind::setup::{self, SCALLOP_SHARE};
@@ -82,6 +83,9 @@ struct Document {
     /// Of the program of one pass; absent where none can be made.
     #[serde(skip_serializing_if = "Option::is_none")]
     program_points: Option<u64>,
+    /// What becomes of these points in arcs; absent where the cell asks for none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    arcs: Option<ArcsTold>,
     /// The dialect that it is written in.
     dialect: String,
     /// Why none can be made.
@@ -89,6 +93,55 @@ struct Document {
     no_program: Option<String>,
     /// Whether a run would begin with what an earlier one learned.
     learns: bool,
+}
+
+/// A pass in arcs, beside the same pass in lines.
+#[derive(Serialize)]
+struct ArcsTold {
+    arcs: u64,
+    /// Lines at feed that are left.
+    lines: u64,
+    /// Arcs and lines for each second at feed; the same of lines alone.
+    moves_per_second: f64,
+    lines_alone_per_second: f64,
+    /// How far an arc is from the path at most.
+    largest_deviation_um: f64,
+    within_um: f64,
+    /// Largest angle between the end of one move and the beginning of the next; the same of lines alone.
+    largest_corner_mrad: f64,
+    lines_alone_corner_mrad: f64,
+}
+
+impl ArcsTold {
+    fn of(arcs: &ArcSummary, summary: &Summary, within_mm: f64) -> Self {
+        let [largest_corner_mrad, lines_alone_corner_mrad] = arcs.corner_rad.map(|rad| 1e3 * rad);
+        Self {
+            arcs: arcs.arcs,
+            lines: arcs.lines,
+            moves_per_second: (arcs.arcs + arcs.lines) as f64 / summary.seconds,
+            lines_alone_per_second: summary.points as f64 / summary.seconds,
+            largest_deviation_um: 1e3 * arcs.deviation_mm,
+            within_um: 1e3 * within_mm,
+            largest_corner_mrad,
+            lines_alone_corner_mrad,
+        }
+    }
+
+    fn in_words(&self, points: u64) -> String {
+        let n = three_digits;
+        format!(
+            "{} and {} in place of {}, {} a second in place of {}; within {} um of the path ({} um allowed), corners of {} mrad at most in place of {}",
+            counted(self.arcs as usize, "arc"),
+            counted(self.lines as usize, "line"),
+            counted(points as usize, "line"),
+            n(self.moves_per_second),
+            n(self.lines_alone_per_second),
+            n(self.largest_deviation_um),
+            n(self.within_um),
+            n(self.largest_corner_mrad),
+            n(self.lines_alone_corner_mrad),
+        )
+    }
 }
 
 /// The scallops beside what is allowed of form and scallops together.
@@ -148,6 +201,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let cell = or_show(CellConfig::read(&arguments.cell))?;
     let (task, plan) = setup::prepare(&recipe, &cell).map_err(Failure::Setup)?;
     let program = first_path(&task, &recipe, &cell)?;
+    let arcs = arcs_of(&task, program.as_ref())?;
     if let Some(file) = &arguments.program {
         let first = task.first_correction();
         let programs = task.programs.as_ref().map_err(|error| Failure::Programs(error.clone().into()))?;
@@ -201,6 +255,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             .chain(warning_of_scallops(&task, &recipe))
             .collect(),
         program_points: program.as_ref().map(|(_, summary)| summary.points),
+        arcs,
         dialect: cell.grinder.program.dialect.dialect.name.clone(),
         no_program: task.programs.as_ref().err().map(ToString::to_string),
         learns: recipe.compensation.learn,
@@ -211,6 +266,13 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         super::print(&words(&document))?;
     }
     Ok(Outcome::Accepted)
+}
+
+/// What the program of the first pass has in arcs, where the cell asks for them.
+fn arcs_of(task: &Task, program: Option<&(ToolPath, Summary)>) -> Result<Option<ArcsTold>, Failure> {
+    let (Some((path, summary)), Ok(programs)) = (program, &task.programs) else { return Ok(None) };
+    let arcs = programs.arcs(path).map_err(|error| Failure::Programs(GcodeError::from(error).into()))?;
+    Ok(arcs.zip(programs.arcs_within_mm).map(|(arcs, within_mm)| ArcsTold::of(&arcs, summary, within_mm)))
 }
 
 /// What the probe takes to search every target from the distance of its approach, and nothing else: the moves between targets are
@@ -312,6 +374,8 @@ fn words(d: &Document) -> String {
         (Some(points), _) => format!("{} a pass, for {}", counted(points as usize, "point"), d.dialect),
         (None, why) => format!("none: {}", why.as_deref().unwrap_or_default()),
     };
+    let arcs = d.arcs.as_ref().zip(d.program_points);
+    let arcs = arcs.map_or(String::new(), |(arcs, points)| format!("arcs        {}\n", arcs.in_words(points)));
     let learns = if d.learns {
         "learn       a run begins with the correction that the last one like it left; what is told and written here is without it\n"
     } else {
@@ -319,7 +383,7 @@ fn words(d: &Document) -> String {
     };
     let warnings: String = d.warnings.iter().map(|warning| format!("warning     {warning}\n")).collect();
     format!(
-        "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nscallops    {}\nprogram     {program}\n{learns}\
+        "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nscallops    {}\nprogram     {program}\n{arcs}{learns}\
          level       {} um over the nominal surface first, at least {} um deeper each pass, so {} um at the last\nbudget      {} um in all\nremoval     {}\ncycles      at most {}\ntime        {}\n{warnings}",
         d.part,
         counted(d.nominal_points, "point"),

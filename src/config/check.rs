@@ -7,7 +7,7 @@ use super::written::{CellFile, FixtureTable, GrinderTable, SphereTable, TimingTa
 use super::{CellConfig, Cmm, Grinder, GrinderLimits, Link, Programming, ReferenceSphere, Travel, dialect};
 use crate::device::{Place, RegisterMap, Signal, SignalTable, Timing, Wire};
 use crate::document::Document;
-use crate::formats::gcode::LINUXCNC;
+use crate::formats::gcode::{DialectError, LINUXCNC};
 use crate::geometry::{Point, Pose, Twist};
 use crate::model;
 
@@ -204,8 +204,25 @@ fn programming(grinder: &GrinderTable, path: &Path, document: &mut Document) -> 
             return None;
         }
     };
+    let arcs_within_mm = written.arcs_within_um.map(|um| 1e-3 * um);
+    match arcs_within_mm.map(|mm| dialect.arcs(mm)) {
+        Some(Err(DialectError::NoArcs { dialect })) => document.report(
+            "grinder.program.arcs_within_um",
+            format!("stands beside the dialect `{dialect}`, which has no words for arcs"),
+            "arcs are written by the words of [arcs] in a dialect",
+            "leave it out, or write [arcs] into a dialect of your own",
+        ),
+        Some(Err(DialectError::ArcsFine { dialect, found_um, decimals, least_um })) => document.report(
+            "grinder.program.arcs_within_um",
+            format!("is {found_um}"),
+            &format!("the {decimals} decimals of the dialect `{dialect}` move points by up to {least_um:.4} um"),
+            "allow more, or have the control read more decimals and write them into a dialect of your own",
+        ),
+        _ => {}
+    }
     Some(Programming {
         dialect,
+        arcs_within_mm,
         controller_tolerance_mm: written.controller_tolerance_um.map(|um| 1e-3 * um),
         folder: written.folder.as_ref().map(|folder| path.parent().unwrap_or(Path::new("")).join(folder)),
     })

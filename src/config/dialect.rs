@@ -102,4 +102,20 @@ mod tests {
         assert!(told.contains("did you mean `line`?"), "{told}");
         assert_eq!(told.lines().count(), 3, "{told}");
     }
+
+    #[test]
+    fn arcs_without_the_words_of_their_centre_are_told_at_their_place() {
+        for (k, missing) in [(1, "centre_words"), (3, "centre_block")] {
+            let lines = BUILT_IN[k].1.lines().filter(|line| !line.starts_with(missing));
+            let text = lines.collect::<Vec<_>>().join("\n");
+            let problems = parse_dialect(Path::new("ours.toml"), &text).unwrap_err().to_string();
+            let at = 1 + text.lines().position(|line| line.starts_with("[arcs]")).unwrap();
+            assert!(problems.starts_with(&format!("ours.toml:{at}:")), "{problems}");
+            let key = format!("arcs.{missing}");
+            assert!(
+                problems.contains(&key) && problems.contains("write ") && problems.lines().count() == 1,
+                "{problems}"
+            );
+        }
+    }
 }

@@ -74,6 +74,8 @@ pub struct Programming {
     pub dialect: Dialect,
     /// How far the control rounds corners off by a setting of its own, where that is known.
     pub controller_tolerance_mm: Option<f64>,
+    /// How far arcs may be from the path; none for lines alone.
+    pub arcs_within_mm: Option<f64>,
     /// The folder in which the control finds the program of each pass.
     pub folder: Option<PathBuf>,
 }

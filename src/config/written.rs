@@ -97,6 +97,10 @@ pub(super) struct ProgramTable {
     /// How far the control rounds corners off by a setting of its own, for dialects that cannot say it.
     #[schemars(range(min = 0.0, max = 1000.0), example = 0.1)]
     pub controller_tolerance_um: Option<f64>,
+    /// How far arcs may be from the path of the wheel; left out, programs have straight lines only. No more than
+    /// `grinding.chord_error_um`.
+    #[schemars(range(min = 0.0001, max = 1000.0), example = 0.05)]
+    pub arcs_within_um: Option<f64>,
     /// Folder in which the control finds the program of each pass, for machines that are not given it by their wire; relative to this file.
     #[schemars(length(min = 1, max = 400), example = &"/mnt/grinder/programs")]
     pub folder: Option<String>,
@@ -104,7 +108,7 @@ pub(super) struct ProgramTable {
 
 impl Default for ProgramTable {
     fn default() -> Self {
-        Self { dialect: "linuxcnc".to_owned(), controller_tolerance_um: None, folder: None }
+        Self { dialect: "linuxcnc".to_owned(), controller_tolerance_um: None, arcs_within_um: None, folder: None }
     }
 }
 

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 use crate::compensation::path::{
-    Field, Limits, PathError, PathMode, PathOptions, Pattern, Summary, ToolPath, TrackSpacing, Wanted, Wheel,
-    axis_offsets, height_of,
+    ArcSummary, Field, Limits, PathError, PathMode, PathOptions, Pattern, Summary, ToolPath, TrackSpacing, Wanted,
+    Wheel, axis_offsets, height_of,
 };
 use crate::compensation::{Correction, ParameterKind};
 use crate::formats::gcode::{
@@ -46,6 +46,8 @@ pub struct Programs {
     pub path_tolerance_mm: f64,
     /// How far it does by a setting of its own, where that is known, in millimetres.
     pub controller_tolerance_mm: Option<f64>,
+    /// How far arcs may be from the path, in millimetres; none for lines alone.
+    pub arcs_within_mm: Option<f64>,
     /// How its programs are written.
     pub dialect: Dialect,
     /// Where else the program of each pass is put, for the controller to find it.
@@ -104,6 +106,7 @@ impl Programs {
             tolerance_mm: self.path_tolerance_mm,
             controller_mm: self.controller_tolerance_mm,
             chord_error_mm: self.options.chord_error_mm,
+            arcs_within_mm: self.arcs_within_mm,
         }
     }
 
@@ -119,6 +122,15 @@ impl Programs {
         let summary = path.summary()?;
         summary.check(&self.limits)?;
         Ok((path, summary))
+    }
+
+    /// Tells what becomes of a path in arcs; none where its program has lines alone.
+    ///
+    /// # Errors
+    /// What the dialect cannot say.
+    pub fn arcs(&self, path: &ToolPath) -> Result<Option<ArcSummary>, DialectError> {
+        let post = self.dialect.post(&self.exactness())?;
+        Ok(post.arcs.map(|(_, options)| path.arc_summary(&options)))
     }
 
     /// The wheel as measurements have made it out.

@@ -2,16 +2,19 @@
 
 use std::path::Path;
 
-use crate::path::{Part, ProgramStep, correction, part, truth, with};
+use crate::path::{Part, ProgramStep, correction, part, truth, wheels, with};
 use crate::sweep::{clearance, places};
 use regrind::compensation::path::{Move, PathMode, Wheel};
 use regrind::config::read_dialect;
 use regrind::formats::gcode::Dialect;
-use regrind_sim::program::{Control, Program};
+use regrind_sim::program::{Control, Program, Stop};
 
 const DIALECTS: [&str; 4] = ["linuxcnc", "fanuc", "sinumerik", "heidenhain"];
 /// What a touching place may be off in a program whose points are whole, in millimetres.
 const WITHIN_MM: f64 = 2e-4;
+
+/// How far arcs may be from the path, in millimetres: as far as lines are in these recipes.
+const ARCS_WITHIN_MM: f64 = 1e-4;
 
 fn dialect(name: &str) -> Dialect {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("config/dialects/{name}.toml"));
@@ -66,6 +69,98 @@ fn every_control_reads_the_path_of_the_plan_to_half_of_the_last_digit() {
         let says = |words: &str| program.comments.iter().any(|comment| comment.to_ascii_lowercase() == words);
         assert!(says(&format!("map: sha256 {}", "a5".repeat(32))) && says("simulation"), "{name}");
         assert!(text.lines().all(|line| line.len() <= dialect(name).text.longest_line), "{name}");
+    }
+}
+
+/// How far a place is from the way between two stops.
+fn off_the_way(stop: &Stop, from: [f64; 3], place: [f64; 3]) -> f64 {
+    let off = |share: f64| {
+        let at = stop.on_the_way(from, share);
+        (0..3).map(|k| (at[k] - place[k]).powi(2)).sum::<f64>().sqrt()
+    };
+    // Along so short a way there is one nearest place.
+    let (mut low, mut high) = (0.0, 1.0);
+    for _ in 0..60 {
+        let (u, v) = (low + (high - low) / 3.0, high - (high - low) / 3.0);
+        if off(u) < off(v) { high = v } else { low = u }
+    }
+    off(low)
+}
+
+#[test]
+fn along_its_arcs_every_control_passes_all_points_of_the_plan_within_the_tolerance() {
+    for (name, recipe, fewer) in [
+        ("linuxcnc", "shallow-wave", 5),
+        ("fanuc", "freeform-mirror", 2),
+        ("sinumerik", "off-axis-asphere", 2),
+        ("sinumerik", "biconic", 2),
+        ("heidenhain", "shallow-wave", 1),
+    ] {
+        let mut part = part(recipe);
+        part.programs.options = with(&part.programs.options, part.programs.options.wheel, 4.0);
+        part.programs.arcs_within_mm = Some(ARCS_WITHIN_MM);
+        let (program, text) = read_back(&mut part, name);
+        let (path, summary) = part.programs.path(&correction(part.half_mm)).unwrap();
+        let told = part.programs.arcs(&path).unwrap().unwrap();
+        assert_eq!(program.stops.len() as u64, told.moves, "{name}");
+        assert_eq!(program.stops.iter().filter(|stop| stop.turn.is_some()).count() as u64, told.arcs, "{name}");
+        assert!(told.arcs > 50 && fewer * (told.arcs + told.lines) < summary.points, "{name}: {told:?}");
+        let counted = format!("lines: {}", text.lines().count());
+        assert!(program.comments.iter().any(|comment| comment.to_ascii_lowercase() == counted), "{name}");
+        let step_mm = half_a_step_mm(name) * 2.0;
+        // The points in their order: each block passes some of them and ends at the last.
+        let mut points = path
+            .moves()
+            .filter_map(|one| if let Move::Feed { at, feed_mm_min } = one { Some((at, feed_mm_min)) } else { None });
+        let mut last = [f64::NAN; 3];
+        for stop in &program.stops {
+            let mut ended = stop.feed_mm_min.is_none();
+            while !ended {
+                let (at, feed) = points.next().unwrap_or_else(|| panic!("{name}: {stop:?} is no point"));
+                assert_eq!(stop.feed_mm_min, Some(feed), "{name}");
+                ended = (0..3).all(|k| (at[k] - stop.at_mm[k]).abs() <= 0.51 * step_mm);
+                if stop.turn.is_some() {
+                    let off = off_the_way(stop, last, at.into());
+                    // What controls do between two radii that differ is theirs.
+                    assert!(off < ARCS_WITHIN_MM + 2.0 * step_mm, "{name}: {off} at {at}");
+                } else {
+                    assert!(ended, "{name}: {at} {stop:?}");
+                }
+            }
+            last = stop.at_mm;
+        }
+        assert!(points.next().is_none(), "{name}");
+    }
+}
+
+#[test]
+fn the_wheel_that_goes_along_arcs_leaves_the_corrected_surface() {
+    for (name, recipe) in [
+        ("linuxcnc", "freeform-mirror"),
+        ("fanuc", "biconic"),
+        ("sinumerik", "off-axis-asphere"),
+        ("sinumerik", "shallow-wave"),
+        ("heidenhain", "shallow-wave"),
+    ] {
+        for (wheel_name, wheel) in wheels(0.8) {
+            let mut part = part(recipe);
+            part.programs.options = with(&part.programs.options, wheel, 4.0);
+            part.programs.arcs_within_mm = Some(ARCS_WITHIN_MM);
+            let (program, _) = read_back(&mut part, name);
+            assert!(program.stops.iter().any(|stop| stop.turn.is_some()), "{name}, {wheel_name}");
+            let mut steps: Vec<ProgramStep> = Vec::new();
+            for stop in &program.stops {
+                let from = steps.last().map_or(stop.at_mm, |step| step.at);
+                let feed = stop.feed_mm_min.is_some();
+                steps.extend(stop.in_chords(from, 1e-6).into_iter().map(|at| ProgramStep { at, feed }));
+            }
+            let track_mm = part.programs.path(&correction(part.half_mm)).unwrap().0.track_mm();
+            for place in places(&part, track_mm, 0.0) {
+                let off = clearance(&wheel, &steps, truth(&part, 0.02, place));
+                let within = WITHIN_MM + 2.0 * half_a_step_mm(name);
+                assert!(off.abs() < within, "{name}, {wheel_name}, {place:?}: {:.3} um", 1e3 * off);
+            }
+        }
     }
 }
 

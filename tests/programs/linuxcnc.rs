@@ -7,6 +7,7 @@ use std::process::{Command, Stdio};
 use crate::compensate::Shop;
 use crate::path::{correction, error_mm, part, read, wheels, with};
 use regrind::compensation::path::{PathMode, Pattern};
+use regrind_sim::program::Control;
 
 /// Lets the interpreter read a program; returns what it would have the machine do, or what it said against it. It writes files into the
 /// program's folder.
@@ -64,6 +65,59 @@ fn every_program_of_every_recipe_is_read_point_by_point() {
                     assert!(off < 0.6e-4 && theirs.1 == step.feed, "{name}, {wheel_name}: {theirs:?} {step:?}");
                 }
             }
+        }
+    }
+}
+
+/// The arcs of the interpreter in order: the numbers of its call, which has them plane by plane.
+fn arcs(said: &str) -> Vec<([usize; 3], Vec<f64>)> {
+    let mut axes = [0, 1, 2];
+    let mut found = Vec::new();
+    for line in said.lines() {
+        if let Some((_, plane)) = line.split_once("SELECT_PLANE(CANON_PLANE_") {
+            axes = match &plane[..2] {
+                "XY" => [0, 1, 2],
+                "XZ" => [2, 0, 1],
+                _ => [1, 2, 0],
+            };
+        } else if let Some((_, numbers)) = line.split_once("ARC_FEED(") {
+            found.push((axes, numbers.trim_end_matches(')').split(',').map(|n| n.trim().parse().unwrap()).collect()));
+        }
+    }
+    found
+}
+
+#[test]
+#[ignore = "needs the interpreter of LinuxCNC: Debian package linuxcnc-uspace"]
+fn the_interpreter_turns_where_the_simulated_control_does() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("part.ngc");
+    for (name, pattern) in [
+        ("freeform-mirror", Pattern::Raster),
+        ("biconic", Pattern::Raster),
+        ("shallow-wave", Pattern::Raster),
+        ("off-axis-asphere", Pattern::Spiral),
+    ] {
+        let mut part = part(name);
+        let options = with(&part.programs.options, part.programs.options.wheel, 4.0);
+        part.programs.options = regrind::compensation::path::PathOptions { pattern, ..options };
+        part.programs.arcs_within_mm = Some(1e-4);
+        part.programs.write(&file, &correction(part.half_mm), [9; 32]).unwrap();
+        let ours = Control::Linuxcnc.read(&fs::read_to_string(&file).unwrap()).unwrap();
+        let said = interpret(&file).unwrap_or_else(|said| panic!("{name}: {said}"));
+        let theirs = arcs(&said);
+        let turns: Vec<_> = ours.stops.windows(2).filter(|pair| pair[1].turn.is_some()).collect();
+        assert!(turns.len() == theirs.len() && turns.len() > 100, "{name}: {} {}", turns.len(), theirs.len());
+        for (pair, ([a, b, c], arc)) in turns.iter().zip(&theirs) {
+            let (from, to) = (pair[0].at_mm, pair[1].at_mm);
+            // It prints four decimals: ends first, then the centre, the turns (counter-clockwise is positive) and the third axis.
+            let near = |x: f64, y: f64| (x - y).abs() < 0.6e-4;
+            assert!(near(arc[0], to[*a]) && near(arc[1], to[*b]) && near(arc[5], to[*c]), "{name}: {arc:?} {to:?}");
+            let middle = pair[1].on_the_way(from, 0.5);
+            let arm = |at: [f64; 3]| [at[*a] - arc[2], at[*b] - arc[3]];
+            let [[x, y], [u, v]] = [arm(from), arm(middle)];
+            assert!((x.hypot(y) - u.hypot(v)).abs() < 1e-4, "{name}: {arc:?}");
+            assert!(arc[4].abs() == 1.0 && (x * v - y * u).signum() == arc[4], "{name}: {arc:?}");
         }
     }
 }

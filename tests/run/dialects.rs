@@ -35,6 +35,37 @@ fn a_part_is_ground_by_the_programs_of_every_dialect_until_it_is_accepted() {
 }
 
 #[test]
+fn a_part_is_ground_along_arcs_until_it_is_accepted() {
+    for (dialect, extension, word) in
+        [("fanuc", "nc", "G03 "), ("sinumerik", "mpf", "G3 "), ("heidenhain", "h", " DR+")]
+    {
+        let (home, code, said, errors) = made(dialect, "controller_tolerance_um = 0.1\narcs_within_um = 0.1");
+        assert_eq!(code, 0, "{dialect}: {said}{errors}");
+        assert!(said.contains("SIMULATION  ACCEPTED"), "{dialect}: {said}");
+        let there = fs::read_dir(home.path().join("programs")).unwrap().map(|entry| entry.unwrap().path());
+        let programs: Vec<_> = there.filter(|file| file.extension().is_some_and(|e| e == extension)).collect();
+        assert!(programs.len() >= 2, "{dialect}: {programs:?}");
+        for program in programs {
+            let text = fs::read_to_string(program).unwrap();
+            assert!(text.lines().filter(|line| line.contains(word)).count() > 20, "{dialect}");
+        }
+    }
+}
+
+#[test]
+fn arcs_that_cannot_be_written_so_exactly_are_refused_before_anything_moves() {
+    // Four decimals move points by 0.087 um; and the lines of the recipe are within 0.1 um.
+    for (dialect, um, told) in
+        [("heidenhain", "0.05", "grinder.program.arcs_within_um"), ("sinumerik", "0.2", "grinding.chord_error_um")]
+    {
+        let (home, code, said, errors) = made(dialect, &format!("arcs_within_um = {um}"));
+        assert_eq!(code, 2, "{said}{errors}");
+        assert!(errors.contains(told) && errors.contains(um), "{errors}");
+        assert!(!home.path().join("runs").exists());
+    }
+}
+
+#[test]
 fn what_a_dialect_cannot_say_is_refused_before_anything_moves() {
     let (home, code, said, errors) = made("fanuc", "");
     assert_eq!(code, 2, "{said}{errors}");

@@ -1,19 +1,10 @@
-//! Arcs and helices of a program: where they run, and how many chords stand for them.
+//! Arcs and helices of a program that was read: where they run, and how many chords stand for them. Those that are written come from the path.
 
 use std::f64::consts::TAU;
 
 use super::read::Refusal;
+pub(super) use regrind_core::compensation::path::Plane;
 use regrind_core::geometry::Point;
-
-/// The plane of arcs: its first and second axis, and the one across; turning from the first to the second is counter-clockwise.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Plane(pub(super) [usize; 3]);
-
-impl Plane {
-    pub(super) const XY: Self = Self([0, 1, 2]);
-    pub(super) const ZX: Self = Self([2, 0, 1]);
-    pub(super) const YZ: Self = Self([1, 2, 0]);
-}
 
 /// An arc or a helix, in millimetres.
 #[derive(Clone, Copy, Debug, PartialEq)]

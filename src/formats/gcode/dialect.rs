@@ -7,7 +7,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use regrind_core::compensation::path::PathMode;
+use regrind_core::compensation::path::{ArcOptions, PathMode};
 
 /// The dialect of LinuxCNC, which a cell has that says nothing.
 pub const LINUXCNC: &str = "linuxcnc";
@@ -30,6 +30,8 @@ pub struct Dialect {
     /// The words of a move.
     #[schemars(extend("x-required" = true))]
     pub words: Words,
+    /// How arcs are written; left out, there are lines only.
+    pub arcs: Option<ArcWords>,
     /// How a control is told how exactly to keep to the path; a mode that is left out is refused.
     pub path: Modes,
     /// What stands before and after the moves.
@@ -177,6 +179,80 @@ impl Default for Words {
     }
 }
 
+/// How the centre of an arc is told.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum CentreWords {
+    /// By `centre_words`, from the beginning of the arc.
+    #[default]
+    FromStart,
+    /// By `centre_words`, as a place.
+    Absolute,
+    /// By `centre_block`, a block of its own before the arc that names the place by the words of the axes.
+    BlockBefore,
+}
+
+/// How arcs are written.
+#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct ArcWords {
+    /// What begins an arc that turns clockwise, seen against the axis across its plane.
+    #[schemars(length(min = 1, max = 20), extend("x-required" = true), example = &"G2 ")]
+    pub clockwise: String,
+    /// What stands behind its places.
+    #[schemars(length(max = 20), example = &" DR-")]
+    pub clockwise_ends: String,
+    /// What begins one that turns counter-clockwise.
+    #[schemars(length(min = 1, max = 20), extend("x-required" = true), example = &"G3 ")]
+    pub counter_clockwise: String,
+    /// What stands behind its places.
+    #[schemars(length(max = 20), example = &" DR+")]
+    pub counter_clockwise_ends: String,
+    /// What selects the planes of x and y, of z and x, of y and z, before an arc in another plane than the last one; left out where the axes named
+    /// tell it.
+    #[schemars(inner(length(min = 1, max = 20)))]
+    pub planes: Option<[String; 3]>,
+    /// How the centre is told.
+    pub centre: CentreWords,
+    /// The words of the centre along the three axes.
+    #[schemars(inner(length(min = 1, max = 4)))]
+    pub centre_words: Option<[String; 3]>,
+    /// What begins the block of the centre.
+    #[schemars(length(min = 1, max = 20), example = &"CC ")]
+    pub centre_block: Option<String>,
+    /// Whether the third axis may move along with an arc.
+    pub third_axis: bool,
+    /// How much the radius at the end may differ from that at the beginning, as the control takes it.
+    #[schemars(range(min = 0.0, max = 1000.0), extend("x-required" = true), example = 2.0)]
+    pub radius_error_um: f64,
+    /// Lines behind `program.setup` of a program with arcs.
+    #[schemars(length(max = 16), inner(length(min = 1, max = 200)))]
+    pub begin: Vec<String>,
+    /// Lines before `program.end` of one.
+    #[schemars(length(max = 16), inner(length(min = 1, max = 200)))]
+    pub end: Vec<String>,
+}
+
+impl Default for ArcWords {
+    fn default() -> Self {
+        let none = String::new;
+        Self {
+            clockwise: none(),
+            clockwise_ends: none(),
+            counter_clockwise: none(),
+            counter_clockwise_ends: none(),
+            planes: None,
+            centre: CentreWords::FromStart,
+            centre_words: None,
+            centre_block: None,
+            third_axis: false,
+            radius_error_um: 0.0,
+            begin: Vec::new(),
+            end: Vec::new(),
+        }
+    }
+}
+
 /// How a control is told how exactly to keep to the path.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
@@ -271,6 +347,20 @@ pub enum DialectError {
     )]
     Rounding { dialect: String, decimals: u8, found_um: f64, limit_um: f64 },
     #[error(
+        "the dialect `{dialect}` has no words for arcs; leave grinder.program.arcs_within_um out, or write [arcs] into a dialect of your own"
+    )]
+    NoArcs { dialect: String },
+    #[error(
+        "grinder.program.arcs_within_um = {found_um} is less than the {least_um:.4} um that the {decimals} decimals of the dialect `{dialect}` move \
+         points by; allow more, or have the control read more decimals and write them into a dialect of your own"
+    )]
+    ArcsFine { dialect: String, found_um: f64, decimals: u8, least_um: f64 },
+    #[error(
+        "grinder.program.arcs_within_um = {found_um} lets arcs be farther from the path than the {limit_um} um of grinding.chord_error_um; write \
+         {limit_um} or less"
+    )]
+    ArcsWide { found_um: f64, limit_um: f64 },
+    #[error(
         "programs of the dialect `{dialect}` have the numbers {least} to {most} (program.numbers), and cycle {cycle} is beyond; give it more"
     )]
     Number { dialect: String, least: u32, most: u32, cycle: u16 },
@@ -283,6 +373,8 @@ pub struct Post<'a> {
     pub dialect: &'a Dialect,
     /// Lines before the moves and after them, which tell the path mode.
     pub mode: [Vec<String>; 2],
+    /// Where arcs are written: their words, and what they keep to.
+    pub arcs: Option<(&'a ArcWords, ArcOptions)>,
 }
 
 /// How exactly a program is to be followed.
@@ -296,6 +388,8 @@ pub struct Exactness {
     pub controller_mm: Option<f64>,
     /// How far points may be from where they should be, in millimetres.
     pub chord_error_mm: f64,
+    /// How far arcs in place of lines may be from the path, in millimetres; none for lines alone.
+    pub arcs_within_mm: Option<f64>,
 }
 
 impl Dialect {
@@ -316,14 +410,45 @@ impl Dialect {
         if exactness.mode == PathMode::Blend {
             self.check_tolerance(mode, exactness, step_mm)?;
         }
-        // Each of three coordinates is off by half a step at most.
-        let (found_um, limit_um) = (1e3 * 0.5 * step_mm * 3f64.sqrt(), 1e3 * exactness.chord_error_mm);
+        let (found_um, limit_um) = (self.rounding_um(), 1e3 * exactness.chord_error_mm);
         if found_um > limit_um * (1.0 + 1e-9) {
             return Err(DialectError::Rounding { dialect: dialect(), decimals, found_um, limit_um });
         }
         let tolerance = super::number::short(exactness.tolerance_mm);
         let lines = |lines: &[String]| lines.iter().map(|line| line.replace(TOLERANCE, &tolerance)).collect();
-        Ok(Post { dialect: self, mode: [lines(&mode.begin), lines(&mode.end)] })
+        let arcs = exactness.arcs_within_mm.map(|within_mm| self.arcs(within_mm)).transpose()?;
+        if let Some(found_um) = exactness.arcs_within_mm.map(|mm| 1e3 * mm).filter(|um| *um > limit_um * (1.0 + 1e-9)) {
+            return Err(DialectError::ArcsWide { found_um, limit_um });
+        }
+        Ok(Post { dialect: self, mode: [lines(&mode.begin), lines(&mode.end)], arcs })
+    }
+
+    /// Returns the words of arcs that are to be within so many millimetres of the path, and what else they keep to.
+    ///
+    /// # Errors
+    /// A dialect without such words, and a tolerance that its decimals do not hold.
+    pub fn arcs(&self, within_mm: f64) -> Result<(&ArcWords, ArcOptions), DialectError> {
+        let dialect = || self.dialect.name.clone();
+        let words = self.arcs.as_ref().ok_or_else(|| DialectError::NoArcs { dialect: dialect() })?;
+        let (found_um, least_um, decimals) = (1e3 * within_mm, self.rounding_um(), self.numbers.decimals);
+        if found_um < least_um {
+            return Err(DialectError::ArcsFine { dialect: dialect(), found_um, decimals, least_um });
+        }
+        let options = ArcOptions {
+            within_mm,
+            per_mm: 10f64.powi(i32::from(decimals)),
+            radius_error_mm: 1e-3 * words.radius_error_um,
+            largest_mm: self.numbers.largest_mm,
+            helix: words.third_axis,
+            // No arc in more blocks than the lines that it stands for.
+            least_lines: if words.centre == CentreWords::BlockBefore { 3 } else { 2 },
+        };
+        Ok((words, options))
+    }
+
+    /// How far points are off by their decimals: each of three coordinates by half a step at most.
+    fn rounding_um(&self) -> f64 {
+        1e3 * 0.5 * 10f64.powi(-i32::from(self.numbers.decimals)) * 3f64.sqrt()
     }
 
     fn check_tolerance(&self, mode: &Mode, exactness: &Exactness, step_mm: f64) -> Result<(), DialectError> {
@@ -400,6 +525,11 @@ impl Dialect {
                 "correct them",
             );
         }
+        if let Some(arcs) = &self.arcs {
+            for (key, found, allowed, remedy) in arcs.faults() {
+                fault(key, found, allowed, remedy);
+            }
+        }
         let longest = self.longest_move();
         if longest > self.text.longest_line {
             let found = format!("is {}, and a move has up to {longest} characters", self.text.longest_line);
@@ -438,7 +568,12 @@ impl Dialect {
                 begin.chain(mode.end.iter().enumerate().map(of(key, ".end")))
             });
         let of_lists = lists.into_iter().flat_map(move |(key, lines)| lines.iter().enumerate().map(of(key, "")));
-        words.into_iter().map(|(key, word)| (key.to_owned(), word)).chain(of_modes).chain(of_lists)
+        let of_arcs = self.arcs.iter().flat_map(move |arcs| {
+            let lines = arcs.begin.iter().enumerate().map(of("arcs", ".begin"));
+            let lines = lines.chain(arcs.end.iter().enumerate().map(of("arcs", ".end")));
+            arcs.words().map(|(key, word)| (key.to_owned(), word)).chain(lines)
+        });
+        words.into_iter().map(|(key, word)| (key.to_owned(), word)).chain(of_modes).chain(of_lists).chain(of_arcs)
     }
 
     /// What is wrong with a fixed line.
@@ -482,8 +617,72 @@ impl Dialect {
         let axes: usize = words.axes.iter().map(|axis| axis.len() + coordinate + words.between.len()).sum();
         let feed = words.feed.len() + digits(1e6) + 1 + usize::from(self.numbers.feed_decimals);
         let begins = words.rapid.len().max(words.line.len()) + words.rapid_ends.len();
+        let arcs = self.arcs.as_ref().map_or(0, |arcs| arcs.longest() + 2 * (coordinate + words.between.len()));
         let number = self.blocks.as_ref().map_or(0, |b| b.letter.len() + digits(f64::from(b.last)) + 1);
-        number + begins + axes + feed
+        number + begins + axes + feed + arcs
+    }
+}
+
+impl ArcWords {
+    /// What is wrong with them: key, found, allowed, remedy.
+    fn faults(&self) -> impl Iterator<Item = (&'static str, String, &'static str, &'static str)> {
+        let missing = || "is missing".to_owned();
+        let allowed = "an arc is told by its end and its centre";
+        let by_words = self.centre != CentreWords::BlockBefore;
+        let same = self.clockwise == self.counter_clockwise && self.clockwise_ends == self.counter_clockwise_ends;
+        let twice = |words: &[String; 3]| words[0] == words[1] || words[1] == words[2] || words[2] == words[0];
+        [
+            (by_words && self.centre_words.is_none()).then(|| {
+                (
+                    "arcs.centre_words",
+                    missing(),
+                    allowed,
+                    "write the words of its centre, such as [\"I\", \"J\", \"K\"]",
+                )
+            }),
+            (!by_words && self.centre_block.is_none()).then(|| {
+                ("arcs.centre_block", missing(), allowed, "write what begins the block of its centre, such as \"CC \"")
+            }),
+            self.centre_words.as_ref().filter(|words| twice(words)).map(|words| {
+                let found = format!("are {}", words.join(", "));
+                ("arcs.centre_words", found, "each axis has a word of its own", "name three words")
+            }),
+            same.then(|| {
+                let found = format!("is {:?}, as `clockwise` is", self.counter_clockwise);
+                (
+                    "arcs.counter_clockwise",
+                    found,
+                    "a control must tell both turns apart",
+                    "correct one of them, or what ends them",
+                )
+            }),
+        ]
+        .into_iter()
+        .flatten()
+    }
+
+    /// All fixed words with their keys.
+    fn words(&self) -> impl Iterator<Item = (&'static str, &String)> {
+        [
+            ("arcs.clockwise", &self.clockwise),
+            ("arcs.clockwise_ends", &self.clockwise_ends),
+            ("arcs.counter_clockwise", &self.counter_clockwise),
+            ("arcs.counter_clockwise_ends", &self.counter_clockwise_ends),
+        ]
+        .into_iter()
+        .chain(self.planes.iter().flatten().map(|word| ("arcs.planes", word)))
+        .chain(self.centre_words.iter().flatten().map(|word| ("arcs.centre_words", word)))
+        .chain(self.centre_block.iter().map(|word| ("arcs.centre_block", word)))
+    }
+
+    /// The most characters that an arc has beyond the places of a line.
+    fn longest(&self) -> usize {
+        let longest = |words: &Option<[String; 3]>| words.iter().flatten().map(String::len).max().unwrap_or(0);
+        self.clockwise.len().max(self.counter_clockwise.len())
+            + self.clockwise_ends.len().max(self.counter_clockwise_ends.len())
+            + longest(&self.planes)
+            + 2 * longest(&self.centre_words)
+            + 2
     }
 }
 
@@ -506,7 +705,8 @@ pub(super) mod tests {
 
     fn exactly(mode: PathMode, tolerance_um: f64, controller_um: Option<f64>, chord_um: f64) -> Exactness {
         let controller_mm = controller_um.map(|um| 1e-3 * um);
-        Exactness { mode, tolerance_mm: 1e-3 * tolerance_um, controller_mm, chord_error_mm: 1e-3 * chord_um }
+        let (tolerance_mm, chord_error_mm) = (1e-3 * tolerance_um, 1e-3 * chord_um);
+        Exactness { mode, tolerance_mm, controller_mm, chord_error_mm, arcs_within_mm: None }
     }
 
     #[test]
@@ -554,6 +754,32 @@ pub(super) mod tests {
         assert!(matches!(fine, Err(DialectError::ToleranceFine { step_um, .. }) if (step_um - 0.1).abs() < 1e-12));
         let coarse = heidenhain.post(&exactly(blend, 0.1, None, 0.05));
         assert!(matches!(coarse, Err(DialectError::Rounding { decimals: 4, .. })));
+    }
+
+    #[test]
+    fn arcs_are_refused_without_words_beyond_the_decimals_and_beyond_the_path() {
+        let within = |dialect: &Dialect, um: f64| {
+            let exactness = exactly(PathMode::Blend, 0.1, Some(0.1), 0.1);
+            dialect.post(&Exactness { arcs_within_mm: Some(1e-3 * um), ..exactness }).map(|post| post.arcs.unwrap().1)
+        };
+        let [linuxcnc, heidenhain] = ["linuxcnc", "heidenhain"].map(shipped);
+        assert_eq!(within(&linuxcnc, 0.1).unwrap().per_mm, 1e6);
+        assert!(within(&linuxcnc, 0.001).is_ok() && within(&heidenhain, 0.09).is_ok());
+        assert!(matches!(within(&linuxcnc, 0.0008), Err(DialectError::ArcsFine { decimals: 6, .. })));
+        assert!(matches!(within(&heidenhain, 0.08), Err(DialectError::ArcsFine { decimals: 4, .. })));
+        assert!(matches!(within(&linuxcnc, 0.11), Err(DialectError::ArcsWide { .. })));
+        let plain = Dialect { arcs: None, ..linuxcnc };
+        assert!(matches!(within(&plain, 0.1), Err(DialectError::NoArcs { .. })));
+        let keys = |name: &str, change: &dyn Fn(&mut ArcWords)| {
+            let mut dialect = shipped(name);
+            change(dialect.arcs.as_mut().unwrap());
+            dialect.faults().into_iter().map(|fault| fault.key).collect::<Vec<_>>()
+        };
+        assert_eq!(keys("fanuc", &|arcs| arcs.centre_words = None), ["arcs.centre_words"]);
+        assert_eq!(keys("fanuc", &|arcs| arcs.centre_words.as_mut().unwrap()[1] = "I".into()), ["arcs.centre_words"]);
+        assert_eq!(keys("heidenhain", &|arcs| arcs.centre_block = None), ["arcs.centre_block"]);
+        assert_eq!(keys("heidenhain", &|arcs| arcs.clockwise_ends = " DR+".into()), ["arcs.counter_clockwise"]);
+        assert_eq!(keys("linuxcnc", &|arcs| arcs.begin.push("G91".into())), ["arcs.begin[1]"]);
     }
 
     #[test]

@@ -4,11 +4,11 @@ use std::path::Path;
 
 use rayon::prelude::*;
 
-use super::dialect::{Dialect, Exactness, LineEnd, NAME, NUMBER, Post};
+use super::dialect::{ArcWords, CentreWords, Dialect, Exactness, LineEnd, NAME, NUMBER, Post};
 use super::number::{push_decimals, short};
 use super::{GcodeError, hex};
 use crate::registration::Draft;
-use regrind_core::compensation::path::{Move, Summary, ToolPath};
+use regrind_core::compensation::path::{Arc, ArcSummary, Block, Move, Plane, Summary, ToolPath};
 
 /// Bytes that are gathered before they go to the file.
 const CHUNK: usize = 1 << 16;
@@ -65,22 +65,29 @@ pub fn write_program(
     summary: &Summary,
     path: &ToolPath,
 ) -> Result<(), GcodeError> {
-    write_tracks(file, header, dialect, summary, &path.moves_by_track())
+    let post = dialect.post(&header.exactness)?;
+    match &post.arcs {
+        None => write_tracks(file, header, &post, (summary, None), &path.moves_by_track()),
+        Some((_, options)) => {
+            let arcs = path.arc_summary(options);
+            write_tracks(file, header, &post, (summary, Some(&arcs)), &path.arcs_by_track(options))
+        }
+    }
 }
 
 fn write_tracks<T>(
     path: &Path,
     header: &ProgramHeader,
-    dialect: &Dialect,
-    summary: &Summary,
+    post: &Post,
+    (summary, arcs): (&Summary, Option<&ArcSummary>),
     tracks: &[T],
 ) -> Result<(), GcodeError>
 where
-    T: Iterator<Item = Move> + Clone + Sync,
+    T: Iterator<Item: Into<Block>> + Clone + Sync,
 {
-    let post = dialect.post(&header.exactness)?;
-    let frame = Frame::new(&post, header)?;
-    let (head, numbered) = frame.head(header, summary);
+    let dialect = post.dialect;
+    let frame = Frame::new(post, header)?;
+    let (head, numbered) = frame.head(header, summary, arcs);
     let mut draft = Draft::create(path)?;
     draft.write(head.as_bytes())?;
     let mut lines = Lines::new(dialect, 0, numbered);
@@ -90,7 +97,7 @@ where
         for track in tracks {
             lines.begin();
             for one in track.clone() {
-                lines.push(&one)?;
+                lines.push(&one.into())?;
                 if lines.text.len() >= CHUNK {
                     draft.write(&lines.text)?;
                     lines.text.clear();
@@ -109,8 +116,9 @@ where
             }
         }
     }
-    if lines.count != summary.moves {
-        return Err(GcodeError::Count { found: lines.count, expected: summary.moves });
+    let expected = arcs.map_or(summary.moves, |arcs| arcs.moves);
+    if lines.count != expected {
+        return Err(GcodeError::Count { found: lines.count, expected });
     }
     draft.write(frame.tail(lines.numbered).as_bytes())?;
     draft.publish()?;
@@ -123,13 +131,23 @@ struct Lines<'a> {
     text: Vec<u8>,
     /// In the last digit that is written; the largest number where nothing is in force.
     last: [i64; 3],
-    rapid: Option<bool>,
+    motion: Option<Motion>,
+    plane: Option<Plane>,
     feed: i64,
     count: u64,
     /// Blocks with a number so far.
     numbered: u64,
     per_mm: f64,
     feed_per: f64,
+}
+
+/// How a block moves.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Motion {
+    Rapid,
+    Line,
+    Clockwise,
+    CounterClockwise,
 }
 
 /// What a place or a feed is that is not in force.
@@ -141,27 +159,41 @@ impl<'a> Lines<'a> {
         let power = |decimals: u8| 10f64.powi(i32::from(decimals));
         let (per_mm, feed_per) = (power(dialect.numbers.decimals), power(dialect.numbers.feed_decimals));
         let (text, last) = (Vec::new(), [NOTHING; 3]);
-        Self { dialect, text, last, rapid: None, feed: NOTHING, count, numbered, per_mm, feed_per }
+        Self { dialect, text, last, motion: None, plane: None, feed: NOTHING, count, numbered, per_mm, feed_per }
     }
 
     /// The lines of a whole track.
-    fn of<T: Iterator<Item = Move> + Clone>(dialect: &'a Dialect, track: &T) -> Result<Self, GcodeError> {
+    fn of<T: Iterator<Item: Into<Block>> + Clone>(dialect: &'a Dialect, track: &T) -> Result<Self, GcodeError> {
         let mut lines = Self::new(dialect, 0, 0);
-        track.clone().try_for_each(|one| lines.push(&one))?;
+        track.clone().try_for_each(|one| lines.push(&one.into()))?;
         Ok(lines)
     }
 
     /// Nothing is in force any more.
     fn begin(&mut self) {
-        (self.last, self.rapid, self.feed) = ([NOTHING; 3], None, NOTHING);
+        (self.last, self.motion, self.plane, self.feed) = ([NOTHING; 3], None, None, NOTHING);
     }
 
     #[inline]
-    fn push(&mut self, one: &Move) -> Result<(), GcodeError> {
+    fn push(&mut self, block: &Block) -> Result<(), GcodeError> {
         self.count += 1;
-        let words = &self.dialect.words;
+        match block {
+            Block::Straight(one) => self.straight(one),
+            Block::Arc(arc) => self.arc(arc),
+        }
+    }
+
+    /// The number of a block, where it has one.
+    #[inline]
+    fn number(&mut self) {
         number(&mut self.text, self.dialect, self.numbered);
         self.numbered += 1;
+    }
+
+    #[inline]
+    fn straight(&mut self, one: &Move) -> Result<(), GcodeError> {
+        let words = &self.dialect.words;
+        self.number();
         match one {
             Move::RapidZ(z) => self.block(true, [None, None, Some(*z)], None)?,
             Move::RapidXy([x, y]) => self.block(true, [Some(*x), Some(*y), None], None)?,
@@ -180,10 +212,8 @@ impl<'a> Lines<'a> {
     #[inline]
     fn block(&mut self, rapid: bool, to_mm: [Option<f64>; 3], feed_mm_min: Option<f64>) -> Result<(), GcodeError> {
         let words = &self.dialect.words;
-        if words.each_block || self.rapid != Some(rapid) {
-            self.rapid = Some(rapid);
-            self.text.extend_from_slice(if rapid { &words.rapid } else { &words.line }.as_bytes());
-        }
+        let (motion, begins) = if rapid { (Motion::Rapid, &words.rapid) } else { (Motion::Line, &words.line) };
+        self.begins(motion, begins);
         let mut to = self.last;
         for (k, value_mm) in to_mm.iter().enumerate().filter_map(|(k, value)| Some((k, (*value)?))) {
             to[k] = self.rounded(k, value_mm)?;
@@ -193,22 +223,103 @@ impl<'a> Lines<'a> {
         let mut first = true;
         for (k, &value) in to.iter().enumerate() {
             if value != self.last[k] || (nothing_new && value != NOTHING) {
-                self.between(&mut first);
-                self.text.extend_from_slice(words.axes[k].as_bytes());
-                let numbers = &self.dialect.numbers;
-                if numbers.plus && value >= 0 {
-                    self.text.push(b'+');
-                }
-                push_decimals(&mut self.text, value, numbers.decimals);
+                self.place(&words.axes[k], value, &mut first);
             }
         }
-        if feed != self.feed {
-            self.between(&mut first);
-            self.text.extend_from_slice(words.feed.as_bytes());
-            push_feed(&mut self.text, feed, self.dialect);
-        }
-        (self.last, self.feed) = (to, feed);
+        self.feed(feed, &mut first);
+        self.last = to;
         Ok(())
+    }
+
+    /// The block of an arc, or two of them where the centre has one of its own; both ends and the centre are always told.
+    fn arc(&mut self, arc: &Arc) -> Result<(), GcodeError> {
+        let dialect = self.dialect;
+        let (words, Some(arcs)) = (&dialect.words, &dialect.arcs) else { return Ok(()) };
+        let [a, b, c] = arc.plane.0;
+        let mut to = self.last;
+        for k in [a, b, c] {
+            to[k] = self.rounded(k, arc.to[k])?;
+        }
+        let centre = [self.rounded(a, arc.centre_mm[0])?, self.rounded(b, arc.centre_mm[1])?];
+        let feed = self.rounded_feed(arc.feed_mm_min)?;
+        let mut first = true;
+        if let (CentreWords::BlockBefore, Some(begins)) = (arcs.centre, &arcs.centre_block) {
+            self.number();
+            self.text.extend_from_slice(begins.as_bytes());
+            self.centre(&words.axes, arc.plane, centre, &mut first);
+            end_line(&mut self.text, dialect);
+        }
+        self.number();
+        self.turn(arc, arcs);
+        first = true;
+        let last = self.last;
+        for k in (0..3).filter(|k| *k != c || to[c] != last[c]) {
+            self.place(&words.axes[k], to[k], &mut first);
+        }
+        if let Some(letters) = &arcs.centre_words {
+            let from = if arcs.centre == CentreWords::FromStart { [last[a], last[b]] } else { [0; 2] };
+            self.centre(letters, arc.plane, [centre[0] - from[0], centre[1] - from[1]], &mut first);
+        }
+        let ends = if arc.clockwise { &arcs.clockwise_ends } else { &arcs.counter_clockwise_ends };
+        self.text.extend_from_slice(ends.as_bytes());
+        self.feed(feed, &mut first);
+        end_line(&mut self.text, dialect);
+        self.last = to;
+        Ok(())
+    }
+
+    /// What begins an arc: its plane where that is another one, and which way it turns.
+    fn turn(&mut self, arc: &Arc, arcs: &ArcWords) {
+        if let Some(planes) = arcs.planes.as_ref().filter(|_| self.plane != Some(arc.plane)) {
+            let known = [Plane::XY, Plane::ZX, Plane::YZ].iter().position(|plane| *plane == arc.plane);
+            self.text.extend_from_slice(planes[known.unwrap_or(0)].as_bytes());
+        }
+        self.plane = Some(arc.plane);
+        match arc.clockwise {
+            true => self.begins(Motion::Clockwise, &arcs.clockwise),
+            false => self.begins(Motion::CounterClockwise, &arcs.counter_clockwise),
+        }
+    }
+
+    /// The centre along the axes of a plane, in the order of the axes.
+    fn centre(&mut self, letters: &[String; 3], plane: Plane, centre: [i64; 2], first: &mut bool) {
+        for k in 0..3 {
+            if let Some(at) = plane.0[..2].iter().position(|axis| *axis == k) {
+                self.place(&letters[k], centre[at], first);
+            }
+        }
+    }
+
+    /// What begins a block, where it is not in force.
+    #[inline]
+    fn begins(&mut self, motion: Motion, words: &str) {
+        if self.dialect.words.each_block || self.motion != Some(motion) {
+            self.motion = Some(motion);
+            self.text.extend_from_slice(words.as_bytes());
+        }
+    }
+
+    /// A word and a place.
+    #[inline]
+    fn place(&mut self, word: &str, value: i64, first: &mut bool) {
+        self.between(first);
+        self.text.extend_from_slice(word.as_bytes());
+        let numbers = &self.dialect.numbers;
+        if numbers.plus && value >= 0 {
+            self.text.push(b'+');
+        }
+        push_decimals(&mut self.text, value, numbers.decimals);
+    }
+
+    /// A feed that is not in force.
+    #[inline]
+    fn feed(&mut self, feed: i64, first: &mut bool) {
+        if feed != self.feed {
+            self.between(first);
+            self.text.extend_from_slice(self.dialect.words.feed.as_bytes());
+            push_feed(&mut self.text, feed, self.dialect);
+            self.feed = feed;
+        }
     }
 
     #[inline]
@@ -293,11 +404,24 @@ impl<'a> Frame<'a> {
         let number = dialect.number(header.cycle)?.map_or(String::new(), |number| number.to_string());
         let of = |line: &String| line.replace(NAME, &name).replace(NUMBER, &number);
         let [mode, mode_ends] = &post.mode;
+        let of_arcs = post.arcs.iter().map(|(words, _)| *words);
         Ok(Self {
             dialect,
             begin: dialect.program.begin.iter().map(of).collect(),
-            setup: dialect.program.setup.iter().chain(mode).cloned().collect(),
-            end: mode_ends.iter().cloned().chain(dialect.program.end.iter().map(of)).collect(),
+            setup: dialect
+                .program
+                .setup
+                .iter()
+                .chain(of_arcs.clone().flat_map(|arcs| &arcs.begin))
+                .chain(mode)
+                .cloned()
+                .collect(),
+            end: mode_ends
+                .iter()
+                .chain(of_arcs.flat_map(|arcs| &arcs.end))
+                .cloned()
+                .chain(dialect.program.end.iter().map(of))
+                .collect(),
         })
     }
 
@@ -313,12 +437,12 @@ impl<'a> Frame<'a> {
     }
 
     /// The lines before the moves, with the number of all lines counted in, and how many blocks of them have a number.
-    fn head(&self, header: &ProgramHeader, summary: &Summary) -> (String, u64) {
+    fn head(&self, header: &ProgramHeader, summary: &Summary, arcs: Option<&ArcSummary>) -> (String, u64) {
         let lines = |count: u64| {
             let (mut text, mut numbered) = (Vec::new(), 0);
             let all = self.dialect.blocks.as_ref().is_some_and(|blocks| blocks.all);
             self.begin.iter().for_each(|line| self.line(&mut text, line, all, &mut numbered));
-            for words in header_words(header, summary, count) {
+            for words in header_words(header, summary, arcs, count) {
                 for line in self.comments(&words) {
                     self.line(&mut text, &line, all, &mut numbered);
                 }
@@ -326,7 +450,12 @@ impl<'a> Frame<'a> {
             self.setup.iter().for_each(|line| self.line(&mut text, line, true, &mut numbered));
             (String::from_utf8_lossy(&text).into_owned(), numbered)
         };
-        let count = lines(0).0.lines().count() as u64 + summary.moves + self.end.len() as u64;
+        let blocks_of_arc = match self.dialect.arcs.as_ref().map(|arcs| arcs.centre) {
+            Some(CentreWords::BlockBefore) => 2,
+            _ => 1,
+        };
+        let moves = arcs.map_or(summary.moves, |arcs| arcs.moves + (blocks_of_arc - 1) * arcs.arcs);
+        let count = lines(0).0.lines().count() as u64 + moves + self.end.len() as u64;
         lines(count)
     }
 
@@ -361,7 +490,7 @@ impl<'a> Frame<'a> {
 }
 
 /// What the header tells, a comment each.
-fn header_words(h: &ProgramHeader, s: &Summary, lines: u64) -> Vec<String> {
+fn header_words(h: &ProgramHeader, s: &Summary, arcs: Option<&ArcSummary>, lines: u64) -> Vec<String> {
     let mut said = Vec::new();
     let mut say = |words: std::fmt::Arguments| said.push(words.to_string());
     if h.simulation {
@@ -392,6 +521,10 @@ fn header_words(h: &ProgramHeader, s: &Summary, lines: u64) -> Vec<String> {
     }
     say(format_args!("length: {} mm at feed, {:.1} minutes", short(s.length_mm.round()), s.seconds / 60.0));
     say(format_args!("points: {}", s.points));
+    if let Some(of) = arcs {
+        let (arcs, left, off_um) = (of.arcs, of.lines, 1e3 * of.deviation_mm);
+        say(format_args!("arcs: {arcs} and {left} lines stand for the points, within {off_um:.4} um of the path"));
+    }
     say(format_args!("lines: {lines}"));
     say(format_args!("spindle and coolant are the machine's own; start them before"));
     said
@@ -432,6 +565,15 @@ mod tests {
     }
 
     fn write_in(dialect: &Dialect, tracks: &[std::vec::IntoIter<Move>], points: u64) -> Result<String, GcodeError> {
+        write_with(dialect, tracks, points, None)
+    }
+
+    fn write_with<B: Into<Block> + Clone + Send + Sync>(
+        dialect: &Dialect,
+        tracks: &[std::vec::IntoIter<B>],
+        points: u64,
+        arcs: Option<&ArcSummary>,
+    ) -> Result<String, GcodeError> {
         let header = ProgramHeader {
             part: "part".into(),
             cycle: 1,
@@ -450,6 +592,7 @@ mod tests {
                 tolerance_mm: 1e-4,
                 controller_mm: Some(1e-4),
                 chord_error_mm: 1e-4,
+                arcs_within_mm: arcs.map(|_| 1e-4),
             },
         };
         let summary = Summary {
@@ -468,7 +611,7 @@ mod tests {
         };
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("part.ngc");
-        write_tracks(&file, &header, dialect, &summary, tracks)?;
+        write_tracks(&file, &header, &dialect.post(&header.exactness)?, (&summary, arcs), tracks)?;
         Ok(std::fs::read_to_string(file).unwrap())
     }
 
@@ -541,6 +684,72 @@ mod tests {
         let first: usize = found[1].split_once(' ').unwrap().0.parse().unwrap();
         let expected = heidenhain[1..].iter().enumerate().map(|(k, words)| format!("{} {words}", first + k));
         assert_eq!(found[1..], expected.collect::<Vec<_>>());
+    }
+
+    /// A track with a quarter of a turn about the origin in the plane of z and x, y along with it or not, a line, and the same turn backwards.
+    fn turning(y_mm: f64) -> Vec<std::vec::IntoIter<Block>> {
+        let arc = |clockwise: bool, to: Point| {
+            let (plane, centre_mm) = (Plane::ZX, [0.0, 0.0]);
+            Block::Arc(Arc { plane, clockwise, to, centre_mm, feed_mm_min: 600.0, deviation_mm: 0.0 })
+        };
+        let feed = |x: f64, y: f64, z: f64| Move::Feed { at: Point::new(x, y, z), feed_mm_min: 600.0 };
+        let straight = [Move::RapidXy([0.0, 0.0]), Move::RapidZ(3.0), feed(0.0, 0.0, 2.0)].map(Block::Straight);
+        let (there, back) = (arc(false, Point::new(2.0, y_mm, 0.0)), arc(true, Point::new(0.0, y_mm, 2.0)));
+        let over = [feed(3.0, y_mm, 0.0), feed(2.0, y_mm, 0.0)].map(Block::Straight);
+        let blocks = straight.into_iter().chain([there]).chain(over).chain([back, Block::Straight(Move::RapidZ(5.0))]);
+        vec![blocks.collect::<Vec<_>>().into_iter()]
+    }
+
+    fn turned(name: &str, y_mm: f64) -> Vec<String> {
+        let dialect = shipped(name);
+        let summary = ArcSummary { moves: 8, arcs: 2, lines: 3, ..ArcSummary::default() };
+        let text = write_with(&dialect, &turning(y_mm), 0, Some(&summary)).unwrap();
+        let counted = format!("LINES: {}", text.lines().count());
+        assert!(text.to_ascii_uppercase().contains(&counted), "{name}: {text}");
+        let is_comment = |line: &&str| line.contains(&dialect.text.comment_begins) && !line.starts_with('O');
+        text.lines().filter(|line| !is_comment(line)).map(str::to_owned).collect()
+    }
+
+    #[test]
+    fn every_dialect_has_its_own_words_of_arcs() {
+        let linuxcnc = [
+            "G21 G90 G94 G17 G40 G49 G80 G54",
+            "G91.1",
+            "G64 P0.0001 Q0",
+            "G0 X0.000000Y0.000000",
+            "Z3.000000",
+            "G1 Z2.000000F600",
+            "G18 G3 X2.000000Y0.100000Z0.000000I0.000000K-2.000000",
+            "G1 X3.000000",
+            "X2.000000",
+            "G2 X0.000000Z2.000000I-2.000000K0.000000",
+            "G0 Z5.000000",
+            "G17",
+            "M2",
+        ];
+        assert_eq!(turned("linuxcnc", 0.1), linuxcnc);
+        let fanuc = turned("fanuc", 0.1);
+        assert_eq!(fanuc[8..10], ["G18 G03 X2.0000 Y0.1000 Z0.0000 I0.0000 K-2.0000", "G01 X3.0000"]);
+        assert_eq!(fanuc[fanuc.len() - 4..], ["G05.1 Q0", "G17", "M30", "%"]);
+        let sinumerik = turned("sinumerik", 0.0);
+        assert_eq!(sinumerik[6..8], ["N70 G18 G3 X2.000000 Z0.000000 I0.000000 K-2.000000", "N80 G1 X3.000000"]);
+        let heidenhain = turned("heidenhain", 0.0);
+        let words: Vec<&str> = heidenhain[6..13].iter().map(|line| line.split_once(' ').unwrap().1).collect();
+        let expected = [
+            "CC X+0.0000 Z+0.0000",
+            "C X+2.0000 Z+0.0000 DR+",
+            "L X+3.0000",
+            "L X+2.0000",
+            "CC X+0.0000 Z+0.0000",
+            "C X+0.0000 Z+2.0000 DR-",
+            "L Z+5.0000 R0 FMAX",
+        ];
+        assert_eq!(words, expected);
+        // Places in place of ways from the beginning.
+        let mut places = shipped("linuxcnc");
+        places.arcs.as_mut().unwrap().centre = CentreWords::Absolute;
+        let text = write_with(&places, &turning(0.0), 0, Some(&ArcSummary { moves: 8, ..ArcSummary::default() }));
+        assert!(text.unwrap().contains("G2 X0.000000Z2.000000I0.000000K0.000000"));
     }
 
     #[test]

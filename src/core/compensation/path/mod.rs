@@ -10,6 +10,7 @@
 //! Pure. Frame: everything is in the model frame {M}, z away from the part. Units: mm, s, rad; feeds are mm/min. A path is never
 //! held in memory: it is a list of tracks and an iterator over their points.
 
+mod arcs;
 mod axis_table;
 mod error;
 mod field;
@@ -24,6 +25,7 @@ mod walk;
 mod wanted;
 mod wheel;
 
+pub use arcs::{Arc, ArcOptions, ArcSummary, Arcs, Block, Plane, Sampled};
 pub use axis_table::axis_offsets;
 pub use error::PathError;
 pub use field::{Field, Jet};

@@ -41,6 +41,8 @@ pub struct Moves<'a> {
     pub(super) bend: f64,
     /// Whether the last point given is on the part or its overrun, and so not where the wheel comes down or lifts off.
     pub(super) on_span: bool,
+    /// The middle of the step that led to the last point, on the path; none where that began a track.
+    pub(super) middle: Option<Point>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -78,7 +80,7 @@ impl ToolPath {
 impl<'a> Moves<'a> {
     /// The moves of some of the spans, which begin and end at the safe height.
     pub(super) fn of(path: &'a ToolPath, from: usize, to: usize) -> Self {
-        Self { path, next: from, end: to, state: State::Above, bend: 0.0, on_span: false }
+        Self { path, next: from, end: to, state: State::Above, bend: 0.0, on_span: false, middle: None }
     }
 
     fn walk(&self, span: Span) -> Walk {
@@ -129,6 +131,7 @@ impl<'a> Moves<'a> {
             self.bend = 8.0 * sag / (chord * chord).max(f64::MIN_POSITIVE);
             let next = taken * (0.95 / share.max(1e-6).sqrt()).clamp(0.5, 2.0);
             let (low, high) = (span.from.min(span.to), span.from.max(span.to));
+            self.middle = Some(Point::new(middle.x, middle.y, path.upright(middle.z)));
             self.on_span = low <= walk.t.min(t) && walk.t.max(t) <= high;
             walk = Walk { t, at, step: next, ..walk };
             return walk;
@@ -173,7 +176,7 @@ impl Iterator for Moves<'_> {
             State::Over(walk) => (State::Down(walk), xy(&walk)),
             State::Down(walk) => (State::Begin(walk), Move::RapidZ((walk.at.z + APPROACH_MM).min(safe))),
             State::Begin(walk) => {
-                (self.bend, self.on_span) = (0.0, false);
+                (self.bend, self.on_span, self.middle) = (0.0, false, None);
                 (State::Along(walk), Move::Feed { at: walk.at, feed_mm_min: self.feed_mm_min() })
             }
             State::Ended => return None,
