@@ -43,12 +43,12 @@ fn on_part(part: &Part, at_mm: [f64; 2]) -> [f64; 2] {
 fn touches(part: &Part, program: &Program, radius_mm: f64) -> Vec<Touch> {
     let mut found = Vec::new();
     for pair in program.stops.windows(2).filter(|pair| pair[1].feed_mm_min.is_some()) {
-        let (from, to) = (pair[0].at_mm, pair[1].at_mm);
+        let at = |share: f64| program.centre_mm(&pair[0], &pair[1], share);
+        let (from, to) = (at(0.0), at(1.0));
         let by: [f64; 3] = std::array::from_fn(|k| to[k] - from[k]);
         let count = (by.iter().map(|b| b * b).sum::<f64>().sqrt() / APART_MM).ceil().max(1.0);
         for k in 1..=count as usize {
-            let centre = std::array::from_fn(|i| from[i] + by[i] * k as f64 / count);
-            found.extend(touch(part, centre, radius_mm));
+            found.extend(touch(part, at(k as f64 / count), radius_mm));
         }
     }
     found
@@ -144,7 +144,8 @@ mod tests {
                 let (x, y) = (at(i, columns, a), at(j, rows, b));
                 let (point, normal) = (part.shape.point(x, y), part.shape.normal(x, y));
                 let at_mm = std::array::from_fn(|k| point[k] + (10.0 + left_mm(x, y)) * normal[k]);
-                program.stops.push(Stop { at_mm, feed_mm_min: (i > 0).then_some(600.0) });
+                let feed_mm_min = (i > 0).then_some(600.0);
+                program.stops.push(Stop { at_mm, turn_deg: None, feed_mm_min, minutes: None });
             }
         }
         let heights = heights_mm(&part, &program, 10.0, apart_mm);

@@ -1,13 +1,15 @@
 //! What a control reads in a program: by its own means, written from what its makers say of it, so that no error of a writer hides here.
 //!
 //! ```text
-//!  text -> block by block -> where the wheel's centre stops, and how fast it came there
+//!  text -> block by block -> where the wheel's centre stops, or the slides and the head that carry it, and how fast it came there
 //! ```
 //!
 //! A real control would do something with almost anything. This one refuses what would move a real machine elsewhere than its text says at
 //! first sight: a coordinate in increments, inches, places from the last one, a move before the path mode is told, a program without an end.
 
 use std::collections::BTreeMap;
+
+use crate::head::Head;
 
 /// Whose control it is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -31,8 +33,12 @@ const INCREMENT_MM: f64 = 1e-4;
 pub struct Stop {
     /// In millimetres; not a number along an axis that has not been told yet.
     pub at_mm: [f64; 3],
-    /// In mm/min; none where it comes rapidly.
+    /// In degrees, on the scale of the rotary axis; none where none has been told yet.
+    pub turn_deg: Option<f64>,
+    /// In mm/min; none where it comes rapidly. Of a move that is told its time it is how fast the slides are.
     pub feed_mm_min: Option<f64>,
+    /// The time of the move in minutes, where that is told.
+    pub minutes: Option<f64>,
 }
 
 /// A program as a control has read it.
@@ -40,10 +46,42 @@ pub struct Stop {
 pub struct Program {
     /// Where the moves end, in order.
     pub stops: Vec<Stop>,
+    /// The rotary axis that it turns.
+    pub axis: Option<char>,
+    /// Whether it has the control keep the wheel's centre while the head turns.
+    pub keeps_centre: bool,
+    /// Whether the control's own kinematics keep it, of which no program speaks.
+    pub(crate) by_kinematics: bool,
+    /// The head that it turns, once it is known.
+    pub(crate) head: Option<Head>,
     /// How far corners may be rounded off, where the program says it.
     pub tolerance_mm: Option<f64>,
     /// The comments.
     pub comments: Vec<String>,
+}
+
+impl Program {
+    /// Gives it to a machine with this head, if it has one.
+    ///
+    /// # Errors
+    /// What the machine cannot do.
+    pub fn on(mut self, head: Option<Head>) -> Result<Self, String> {
+        let why = match (self.axis, head) {
+            (Some(letter), None) => Some(format!("the program turns {letter}, and this machine has no rotary axis")),
+            (_, Some(head)) => head.refuses(&self),
+            (None, None) => None,
+        };
+        self.head = head;
+        why.map_or(Ok(self), Err)
+    }
+
+    /// Returns where the wheel's centre is at a share of the way from a stop to the next.
+    pub fn centre_mm(&self, from: &Stop, to: &Stop, share: f64) -> [f64; 3] {
+        match &self.head {
+            Some(head) => head.along_mm(from, to, share),
+            None => std::array::from_fn(|k| from.at_mm[k] + share * (to.at_mm[k] - from.at_mm[k])),
+        }
+    }
 }
 
 impl Control {
@@ -64,6 +102,7 @@ impl Control {
     /// What the control would stop at, or what would not do what it seems to, with its line.
     pub fn read(self, text: &str) -> Result<Program, String> {
         let mut reader = Reader { control: self, ..Reader::default() };
+        reader.program.by_kinematics = self == Self::Linuxcnc;
         for (k, line) in text.lines().enumerate() {
             reader.line(line.trim_end_matches('\r')).map_err(|why| format!("line {}: {why}: {line:?}", k + 1))?;
         }
@@ -78,7 +117,14 @@ struct Reader {
     at_mm: Option<[f64; 3]>,
     /// 0 rapid, 1 at feed.
     motion: Option<u8>,
-    feed_mm_min: Option<f64>,
+    turn_deg: Option<f64>,
+    /// Of the last block that told one; in 1/min where feeds are by time, and then of no other block.
+    feed: Option<f64>,
+    by_time: bool,
+    keeps_centre: bool,
+    /// Whether a Sinumerik has its work offset, and turns axes in proportion between points.
+    no_offset: bool,
+    in_proportion: bool,
     metric: bool,
     absolute: bool,
     by_minute: bool,
@@ -146,18 +192,23 @@ impl Reader {
             return Err("it stands outside of the percent signs".into());
         }
         let mut to: BTreeMap<char, f64> = BTreeMap::new();
-        let (mut smooth, mut level) = (None, None);
+        let (mut smooth, mut level, mut length, kept) = (None, None, false, self.keeps_centre);
         for word in words(line)? {
             let Word { name, number, has_point } = word;
             let whole = format!("{name}{}", number.map_or(String::new(), |n| n.to_string()));
             match (self.control, name.as_str(), number) {
                 (Control::Linuxcnc | Control::Sinumerik | Control::Fanuc, "N", Some(_)) => {}
                 (Control::Fanuc, "O", Some(n)) if !self.numbered && (1.0..=9999.0).contains(&n) => self.numbered = true,
-                (_, "X" | "Y" | "Z", Some(n)) => {
+                (_, "X" | "Y" | "Z" | "A" | "B", Some(n)) => {
                     let scale = if self.control == Control::Fanuc && !has_point { INCREMENT_MM } else { 1.0 };
                     to.insert(name.chars().next().unwrap_or('X'), scale * n);
                 }
-                (_, "F", Some(n)) if n > 0.0 => self.feed_mm_min = Some(n),
+                (_, "F", Some(n)) if n > 0.0 => self.feed = Some(n),
+                (Control::Fanuc, "H", Some(_)) => length = true,
+                (Control::Sinumerik, "TRAORI", None) => (self.keeps_centre, self.no_offset) = (true, true),
+                (Control::Sinumerik, "TRAFOOF", None) => self.keeps_centre = false,
+                (Control::Sinumerik, "ORIMKS", None) => {}
+                (Control::Sinumerik, "ORIAXES", None) => self.in_proportion = true,
                 (Control::Linuxcnc, "P", Some(n)) => self.program.tolerance_mm = Some(n),
                 (Control::Linuxcnc, "Q", Some(_)) => {}
                 (Control::Fanuc, "Q", Some(n)) => level = Some(n),
@@ -172,6 +223,10 @@ impl Reader {
                 _ => return Err(format!("{whole} is no word of this control")),
             }
         }
+        let begins = self.keeps_centre && !kept;
+        if self.control == Control::Fanuc && begins != length {
+            return Err("tool centre point control and the length of the tool go together".into());
+        }
         self.exactness(smooth, level)?;
         if to.is_empty() { Ok(()) } else { self.go(&to) }
     }
@@ -180,10 +235,14 @@ impl Reader {
     fn preparatory(&mut self, tenths: i64) -> Result<Option<i64>, String> {
         match (self.control, tenths) {
             (_, 0 | 10) => self.motion = Some(u8::from(tenths == 10)),
-            (_, 170 | 400 | 540 | 490 | 800) => {}
+            (_, 540) => self.no_offset = false,
+            (_, 490) => self.keeps_centre = false,
+            (Control::Fanuc, 434) => self.keeps_centre = true,
+            (_, 170 | 400 | 800) => {}
             (Control::Linuxcnc | Control::Fanuc, 210) | (Control::Sinumerik, 7100) => self.metric = true,
             (_, 900) => self.absolute = true,
-            (_, 940) => self.by_minute = true,
+            (_, 940) => (self.by_minute, self.by_time) = (true, false),
+            (_, 930) => (self.by_minute, self.by_time, self.feed) = (false, true, None),
             (Control::Linuxcnc, 610 | 611 | 640)
             | (Control::Fanuc, 51 | 610 | 640)
             | (Control::Sinumerik, 600 | 6010 | 6420 | 640) => return Ok(Some(tenths)),
@@ -209,26 +268,57 @@ impl Reader {
         let told = [
             (self.metric, "it does not say that it is in mm"),
             (self.absolute, "it does not say that its places are absolute"),
-            (self.by_minute, "it does not say that its feeds are in mm/min"),
+            (self.by_minute || self.by_time, "it does not say that its feeds are in mm/min"),
+            (!self.no_offset, "its work offset was taken back"),
             (self.exact, "it moves before it says how exactly, or in a mode that rounds corners off as it likes"),
         ];
         if let Some((_, why)) = told.iter().find(|(is_so, _)| !is_so) {
             return Err((*why).to_owned());
         }
-        let feed_mm_min = match self.motion {
+        let feed = match self.motion {
             Some(0) => None,
-            Some(_) => Some(self.feed_mm_min.ok_or("it moves at a feed that nobody told")?),
+            Some(_) => Some(self.feed.ok_or("it moves at a feed that nobody told")?),
             None => return Err("it moves nobody knows how".into()),
         };
-        let mut at_mm = self.at_mm.unwrap_or([f64::NAN; 3]);
+        let from_mm = self.at_mm.unwrap_or([f64::NAN; 3]);
+        let mut at_mm = from_mm;
         for (axis, value) in to {
-            at_mm["XYZ".find(*axis).unwrap_or(0)] = *value;
+            match "XYZ".find(*axis) {
+                Some(k) => at_mm[k] = *value,
+                None => self.turn(*axis, *value)?,
+            }
+        }
+        let minutes = feed.filter(|_| self.by_time).map(|inverse| 1.0 / inverse);
+        let feed_mm_min = minutes.map_or(feed, |minutes| {
+            Some((0..3).map(|k| (at_mm[k] - from_mm[k]).powi(2)).sum::<f64>().sqrt() / minutes)
+        });
+        if self.by_time {
+            self.feed = None;
         }
         if feed_mm_min.is_some() && at_mm.iter().any(|v| v.is_nan()) {
             return Err("it feeds from a place that it did not tell".into());
         }
         self.at_mm = Some(at_mm);
-        self.program.stops.push(Stop { at_mm, feed_mm_min });
+        self.program.stops.push(Stop { at_mm, turn_deg: self.turn_deg, feed_mm_min, minutes });
+        Ok(())
+    }
+
+    /// Turns a rotary axis: one in a program, and in one way from beginning to end.
+    fn turn(&mut self, axis: char, to_deg: f64) -> Result<(), String> {
+        let first = self.program.axis.is_none();
+        if *self.program.axis.get_or_insert(axis) != axis {
+            return Err("it turns two axes".into());
+        }
+        if first {
+            self.program.keeps_centre = self.keeps_centre;
+        }
+        if self.program.keeps_centre != self.keeps_centre {
+            return Err("it turns with and without the wheel's centre kept".into());
+        }
+        if self.control == Control::Sinumerik && self.keeps_centre && !self.in_proportion {
+            return Err("it does not say how it turns between points".into());
+        }
+        self.turn_deg = Some(to_deg);
         Ok(())
     }
 
@@ -258,6 +348,14 @@ impl Reader {
                 self.cycle = true;
                 Ok(())
             }
+            "FUNCTION TCPM F TCP AXIS POS PATHCTRL AXIS" => {
+                self.keeps_centre = true;
+                Ok(())
+            }
+            "FUNCTION RESET TCPM" => {
+                self.keeps_centre = false;
+                Ok(())
+            }
             _ if rest.starts_with("CYCL DEF 32.1") && self.cycle => {
                 let tolerance = rest.strip_prefix("CYCL DEF 32.1 T").map(str::parse::<f64>).transpose();
                 let tolerance = tolerance.map_err(|e| e.to_string())?.filter(|mm| *mm > 0.0);
@@ -277,8 +375,8 @@ impl Reader {
             match (word.split_at(1), word) {
                 (_, "FMAX") => self.motion = Some(0),
                 (_, "R0") => {}
-                (("F", feed), _) => self.feed_mm_min = Some(feed.parse().map_err(|_| format!("{word} is no feed"))?),
-                ((axis @ ("X" | "Y" | "Z"), value), _) if value.starts_with(['+', '-']) => {
+                (("F", feed), _) => self.feed = Some(feed.parse().map_err(|_| format!("{word} is no feed"))?),
+                ((axis @ ("X" | "Y" | "Z" | "A" | "B"), value), _) if value.starts_with(['+', '-']) => {
                     let value = value.parse().map_err(|_| format!("{word} is no place"))?;
                     to.insert(axis.chars().next().unwrap_or('X'), value);
                 }

@@ -160,9 +160,9 @@ impl PathOptions {
         wheel
     }
 
-    /// The axis, if the wheel leans.
+    /// Returns the axis by which the wheel leans, if it does.
     #[inline]
-    pub(super) fn leaning(&self) -> Option<&Rotary> {
+    pub fn leaning(&self) -> Option<&Rotary> {
         self.lean.and(self.rotary.as_ref())
     }
 
