@@ -212,7 +212,11 @@ fn a_tilt_of_nothing_writes_the_upright_program_and_the_words_of_the_axis() {
         };
         // Numbers of blocks count the lines of the axis too.
         let is_move = |line: &&str| {
-            line.contains(['X', 'Z']) && !line.contains("PGM") && !line.starts_with(['(', ';']) && !line.contains("; ")
+            line.contains(['X', 'Z'])
+                && !line.contains("PGM")
+                && !line.contains("ORI")
+                && !line.starts_with(['(', ';'])
+                && !line.contains("; ")
         };
         let bare = |line: &str| {
             let numbered = name == "sinumerik" || name == "heidenhain";
@@ -220,7 +224,8 @@ fn a_tilt_of_nothing_writes_the_upright_program_and_the_words_of_the_axis() {
             line.replace(&format!(" {word}"), "").replace(&word, "")
         };
         let moves = |text: &str| text.lines().filter(is_move).map(bare).collect::<Vec<_>>();
-        assert_eq!(moves(&upright), moves(&tilted), "{name}");
+        let [without, with] = [&upright, &tilted].map(|text| moves(text));
+        assert!(without.len() > 1000 && without == with, "{name}");
         assert!(tilted.contains(&word) && !upright.contains(&word), "{name}");
     }
 }

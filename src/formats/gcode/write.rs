@@ -450,7 +450,9 @@ fn header_words(h: &ProgramHeader, s: &Summary, lines: u64) -> Vec<String> {
     say(format_args!("level over the nominal surface: {} mm", short(h.level_mm)));
     say(format_args!("wheel: {}", h.wheel));
     if let Some(rotary) = &h.rotary {
-        say(format_args!("tilt: {}", tilt_in_words(rotary, h, s)));
+        let [tilt, places] = tilt_in_words(rotary, h, s);
+        say(format_args!("tilt: {tilt}"));
+        say(format_args!("places: {places}"));
     }
     for taken in &h.parameters {
         say(format_args!("parameter: {taken}"));
@@ -468,8 +470,8 @@ fn header_words(h: &ProgramHeader, s: &Summary, lines: u64) -> Vec<String> {
     said
 }
 
-/// What the header says of a wheel that leans.
-fn tilt_in_words(rotary: &Rotary, h: &ProgramHeader, s: &Summary) -> String {
+/// What the header says of a wheel that leans, and of what X, Y and Z are then.
+fn tilt_in_words(rotary: &Rotary, h: &ProgramHeader, s: &Summary) -> [String; 2] {
     let about = if rotary.about == TurnAxis::X { "x" } else { "y" };
     let sense = if rotary.reversed { "left-handed" } else { "right-handed" };
     let reached = s.turned.map_or(String::new(), |turned| {
@@ -479,13 +481,13 @@ fn tilt_in_words(rotary: &Rotary, h: &ProgramHeader, s: &Summary) -> String {
     let of = match rotary.pivot_mm {
         None => "XYZ is the wheel's centre, which the control keeps".to_owned(),
         Some(v) => format!(
-            "XYZ is the wheel's centre with the head upright, its pivot {} {} {} mm from there; feeds are inverse times",
+            "the slides', XYZ is the wheel's centre with the head upright; the pivot is {} {} {} mm from it, feeds are inverse times",
             short(v.x),
             short(v.y),
             short(v.z)
         ),
     };
-    format!("{}, {} turns about {about} {sense}{reached}; {of}", h.lean, rotary.letter)
+    [format!("{}, {} turns about {about} {sense}{reached}", h.lean, rotary.letter), of]
 }
 
 /// Returns words that may stand in a comment: no brackets, which would end it or begin another, and plain characters.
