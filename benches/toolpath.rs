@@ -101,6 +101,8 @@ fn write(path: &ToolPath, summary: &Summary, file: &Path) {
         uncorrected: false,
         level_mm: 0.02,
         from_below: false,
+        rotary: None,
+        lean: String::new(),
         wheel: path.options().wheel.description(),
         parameters: Vec::new(),
         tracks: String::new(),

@@ -43,11 +43,10 @@ fn on_part(part: &Part, at_mm: [f64; 2]) -> [f64; 2] {
 fn touches(part: &Part, program: &Program, radius_mm: f64) -> Vec<Touch> {
     let mut found = Vec::new();
     for pair in program.stops.windows(2).filter(|pair| pair[1].feed_mm_min.is_some()) {
-        let (from, to) = (pair[0].at_mm, &pair[1]);
-        let count = (to.way_mm(from) / APART_MM).ceil().max(1.0);
+        let (from, to) = (&pair[0], &pair[1]);
+        let count = (program.way_mm(from, to) / APART_MM).ceil().max(1.0);
         for k in 1..=count as usize {
-            let centre = to.on_the_way(from, k as f64 / count);
-            found.extend(touch(part, centre, radius_mm));
+            found.extend(touch(part, program.centre_mm(from, to, k as f64 / count), radius_mm));
         }
     }
     found
@@ -143,7 +142,8 @@ mod tests {
                 let (x, y) = (at(i, columns, a), at(j, rows, b));
                 let (point, normal) = (part.shape.point(x, y), part.shape.normal(x, y));
                 let at_mm = std::array::from_fn(|k| point[k] + (10.0 + left_mm(x, y)) * normal[k]);
-                program.stops.push(Stop { at_mm, feed_mm_min: (i > 0).then_some(600.0), turn: None });
+                let feed_mm_min = (i > 0).then_some(600.0);
+                program.stops.push(Stop { at_mm, turn_deg: None, feed_mm_min, minutes: None, turn: None });
             }
         }
         let heights = heights_mm(&part, &program, 10.0, apart_mm);

@@ -47,6 +47,7 @@ pub mod executed;
 mod follow;
 pub mod form;
 mod handshake;
+pub mod head;
 pub mod hits;
 pub mod options;
 pub mod part;

@@ -35,6 +35,7 @@ use std::sync::{Arc, Mutex};
 use crate::body::{Body, Kind, Outcome, Payload, Payloads, Progress, Refusal};
 use crate::follow;
 use crate::form::FormError;
+use crate::head::Head;
 use crate::part::{Grooves, HeightGrid, Part};
 use crate::payload::{BROKEN, INTERLOCK, Map, Pass, PassRecord, outside};
 use crate::program::{Control, Program};
@@ -315,6 +316,8 @@ pub struct Programs {
     pub folder: PathBuf,
     /// Who reads them.
     pub control: Control,
+    /// The head that they may turn.
+    pub head: Option<Head>,
 }
 
 impl Programs {
@@ -330,7 +333,7 @@ impl Programs {
         let texts = files.flatten().filter_map(|file| std::fs::read_to_string(file.path()).ok());
         let text = texts.filter(is_of_map).max_by_key(String::len);
         let text = text.ok_or_else(|| format!("{} holds no program of the map {map}", self.folder.display()))?;
-        self.control.read(&text)
+        self.control.read(&text)?.on(self.head)
     }
 }
 

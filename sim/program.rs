@@ -1,13 +1,15 @@
 //! What a control reads in a program: by its own means, written from what its makers say of it, so that no error of a writer hides here.
 //!
 //! ```text
-//!  text -> block by block -> where the wheel's centre stops, how fast and by which way it came there
+//!  text -> block by block -> where the wheel's centre stops, or the slides and the head that carry it, how fast and by which way it came there
 //! ```
 //!
 //! A real control would do something with almost anything. This one refuses what would move a real machine elsewhere than its text says at
 //! first sight: a coordinate in increments, inches, places from the last one, a move before the path mode is told, a program without an end.
 
 use std::collections::BTreeMap;
+
+use crate::head::Head;
 
 /// Whose control it is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -91,8 +93,12 @@ impl Turn {
 pub struct Stop {
     /// In millimetres; not a number along an axis that has not been told yet.
     pub at_mm: [f64; 3],
-    /// In mm/min; none where it comes rapidly.
+    /// In degrees, on the scale of the rotary axis; none where none has been told yet.
+    pub turn_deg: Option<f64>,
+    /// In mm/min; none where it comes rapidly. Of a move that is told its time it is how fast the slides are.
     pub feed_mm_min: Option<f64>,
+    /// The time of the move in minutes, where that is told.
+    pub minutes: Option<f64>,
     /// How it comes there, where it does not come straight.
     pub turn: Option<Turn>,
 }
@@ -128,10 +134,53 @@ impl Stop {
 pub struct Program {
     /// Where the moves end, in order.
     pub stops: Vec<Stop>,
+    /// The rotary axis that it turns.
+    pub axis: Option<char>,
+    /// Whether it has the control keep the wheel's centre while the head turns.
+    pub keeps_centre: bool,
+    /// Whether the control's own kinematics keep it, of which no program speaks.
+    pub(crate) by_kinematics: bool,
+    /// The head that it turns, once it is known.
+    pub(crate) head: Option<Head>,
     /// How far corners may be rounded off, where the program says it.
     pub tolerance_mm: Option<f64>,
     /// The comments.
     pub comments: Vec<String>,
+}
+
+impl Program {
+    /// Gives it to a machine with this head, if it has one.
+    ///
+    /// # Errors
+    /// What the machine cannot do.
+    pub fn on(mut self, head: Option<Head>) -> Result<Self, String> {
+        let why = match (self.axis, head) {
+            (Some(letter), None) => Some(format!("the program turns {letter}, and this machine has no rotary axis")),
+            (_, Some(head)) => head.refuses(&self),
+            (None, None) => None,
+        };
+        self.head = head;
+        why.map_or(Ok(self), Err)
+    }
+
+    /// Returns where the wheel's centre is at a share of the way from a stop to the next.
+    pub fn centre_mm(&self, from: &Stop, to: &Stop, share: f64) -> [f64; 3] {
+        match &self.head {
+            Some(head) => head.along_mm(from, to, share),
+            None => to.on_the_way(from.at_mm, share),
+        }
+    }
+
+    /// Returns how long that way is, in millimetres; of a head that turns, how far its ends are apart.
+    pub fn way_mm(&self, from: &Stop, to: &Stop) -> f64 {
+        match &self.head {
+            Some(_) => {
+                let [a, b] = [0.0, 1.0].map(|share| self.centre_mm(from, to, share));
+                (0..3).map(|k| (b[k] - a[k]).powi(2)).sum::<f64>().sqrt()
+            }
+            None => to.way_mm(from.at_mm),
+        }
+    }
 }
 
 impl Control {
@@ -152,6 +201,7 @@ impl Control {
     /// What the control would stop at, or what would not do what it seems to, with its line.
     pub fn read(self, text: &str) -> Result<Program, String> {
         let mut reader = Reader { control: self, ..Reader::default() };
+        reader.program.by_kinematics = self == Self::Linuxcnc;
         for (k, line) in text.lines().enumerate() {
             reader.line(line.trim_end_matches('\r')).map_err(|why| format!("line {}: {why}: {line:?}", k + 1))?;
         }
@@ -171,7 +221,14 @@ struct Reader {
     centre: BTreeMap<char, f64>,
     /// Whether LinuxCNC was told that centres are from the beginning of an arc, or that they are places.
     from_start: Option<bool>,
-    feed_mm_min: Option<f64>,
+    turn_deg: Option<f64>,
+    /// Of the last block that told one; in 1/min where feeds are by time, and then of no other block.
+    feed: Option<f64>,
+    by_time: bool,
+    keeps_centre: bool,
+    /// Whether a Sinumerik has its work offset, and turns axes in proportion between points.
+    no_offset: bool,
+    in_proportion: bool,
     metric: bool,
     absolute: bool,
     by_minute: bool,
@@ -239,14 +296,14 @@ impl Reader {
             return Err("it stands outside of the percent signs".into());
         }
         let mut to: BTreeMap<char, f64> = BTreeMap::new();
-        let (mut smooth, mut level) = (None, None);
+        let (mut smooth, mut level, mut length, kept) = (None, None, false, self.keeps_centre);
         for word in words(line)? {
             let Word { name, number, has_point } = word;
             let whole = format!("{name}{}", number.map_or(String::new(), |n| n.to_string()));
             match (self.control, name.as_str(), number) {
                 (Control::Linuxcnc | Control::Sinumerik | Control::Fanuc, "N", Some(_)) => {}
                 (Control::Fanuc, "O", Some(n)) if !self.numbered && (1.0..=9999.0).contains(&n) => self.numbered = true,
-                (_, "X" | "Y" | "Z", Some(n)) => {
+                (_, "X" | "Y" | "Z" | "A" | "B", Some(n)) => {
                     let scale = if self.control == Control::Fanuc && !has_point { INCREMENT_MM } else { 1.0 };
                     to.insert(name.chars().next().unwrap_or('X'), scale * n);
                 }
@@ -254,7 +311,12 @@ impl Reader {
                     let scale = if self.control == Control::Fanuc && !has_point { INCREMENT_MM } else { 1.0 };
                     to.insert(name.chars().next().unwrap_or('I'), scale * n);
                 }
-                (_, "F", Some(n)) if n > 0.0 => self.feed_mm_min = Some(n),
+                (_, "F", Some(n)) if n > 0.0 => self.feed = Some(n),
+                (Control::Fanuc, "H", Some(_)) => length = true,
+                (Control::Sinumerik, "TRAORI", None) => (self.keeps_centre, self.no_offset) = (true, true),
+                (Control::Sinumerik, "TRAFOOF", None) => self.keeps_centre = false,
+                (Control::Sinumerik, "ORIMKS", None) => {}
+                (Control::Sinumerik, "ORIAXES", None) => self.in_proportion = true,
                 (Control::Linuxcnc, "P", Some(n)) => self.program.tolerance_mm = Some(n),
                 (Control::Linuxcnc, "Q", Some(_)) => {}
                 (Control::Fanuc, "Q", Some(n)) => level = Some(n),
@@ -269,6 +331,10 @@ impl Reader {
                 _ => return Err(format!("{whole} is no word of this control")),
             }
         }
+        let begins = self.keeps_centre && !kept;
+        if self.control == Control::Fanuc && begins != length {
+            return Err("tool centre point control and the length of the tool go together".into());
+        }
         self.exactness(smooth, level)?;
         if to.is_empty() { Ok(()) } else { self.go(&to) }
     }
@@ -281,10 +347,14 @@ impl Reader {
             (_, 180) => self.plane = Some([2, 0, 1]),
             (_, 190) => self.plane = Some([1, 2, 0]),
             (Control::Linuxcnc, 901 | 911) => self.from_start = Some(tenths == 911),
-            (_, 400 | 540 | 490 | 800) => {}
+            (_, 540) => self.no_offset = false,
+            (_, 490) => self.keeps_centre = false,
+            (Control::Fanuc, 434) => self.keeps_centre = true,
+            (_, 400 | 800) => {}
             (Control::Linuxcnc | Control::Fanuc, 210) | (Control::Sinumerik, 7100) => self.metric = true,
             (_, 900) => self.absolute = true,
-            (_, 940) => self.by_minute = true,
+            (_, 940) => (self.by_minute, self.by_time) = (true, false),
+            (_, 930) => (self.by_minute, self.by_time, self.feed) = (false, true, None),
             (Control::Linuxcnc, 610 | 611 | 640)
             | (Control::Fanuc, 51 | 610 | 640)
             | (Control::Sinumerik, 600 | 6010 | 6420 | 640) => return Ok(Some(tenths)),
@@ -310,23 +380,32 @@ impl Reader {
         let told = [
             (self.metric, "it does not say that it is in mm"),
             (self.absolute, "it does not say that its places are absolute"),
-            (self.by_minute, "it does not say that its feeds are in mm/min"),
+            (self.by_minute || self.by_time, "it does not say that its feeds are in mm/min"),
+            (!self.no_offset, "its work offset was taken back"),
             (self.exact, "it moves before it says how exactly, or in a mode that rounds corners off as it likes"),
         ];
         if let Some((_, why)) = told.iter().find(|(is_so, _)| !is_so) {
             return Err((*why).to_owned());
         }
-        let feed_mm_min = match self.motion {
+        let feed = match self.motion {
             Some(0) => None,
-            Some(_) => Some(self.feed_mm_min.ok_or("it moves at a feed that nobody told")?),
+            Some(_) => Some(self.feed.ok_or("it moves at a feed that nobody told")?),
             None => return Err("it moves nobody knows how".into()),
         };
         let before = self.at_mm.unwrap_or([f64::NAN; 3]);
         let mut at_mm = before;
         for (axis, value) in to {
-            if let Some(k) = "XYZ".find(*axis) {
-                at_mm[k] = *value;
+            match "XYZ".find(*axis) {
+                Some(k) => at_mm[k] = *value,
+                None if "IJK".contains(*axis) => {}
+                None => self.tilt(*axis, *value)?,
             }
+        }
+        let minutes = feed.filter(|_| self.by_time).map(|inverse| 1.0 / inverse);
+        let feed_mm_min = minutes
+            .map_or(feed, |minutes| Some((0..3).map(|k| (at_mm[k] - before[k]).powi(2)).sum::<f64>().sqrt() / minutes));
+        if self.by_time {
+            self.feed = None;
         }
         if feed_mm_min.is_some() && at_mm.iter().any(|v| v.is_nan()) {
             return Err("it feeds from a place that it did not tell".into());
@@ -337,7 +416,26 @@ impl Reader {
             _ => None,
         };
         self.at_mm = Some(at_mm);
-        self.program.stops.push(Stop { at_mm, feed_mm_min, turn });
+        self.program.stops.push(Stop { at_mm, turn_deg: self.turn_deg, feed_mm_min, minutes, turn });
+        Ok(())
+    }
+
+    /// Turns a rotary axis: one in a program, and in one way from beginning to end.
+    fn tilt(&mut self, axis: char, to_deg: f64) -> Result<(), String> {
+        let first = self.program.axis.is_none();
+        if *self.program.axis.get_or_insert(axis) != axis {
+            return Err("it turns two axes".into());
+        }
+        if first {
+            self.program.keeps_centre = self.keeps_centre;
+        }
+        if self.program.keeps_centre != self.keeps_centre {
+            return Err("it turns with and without the wheel's centre kept".into());
+        }
+        if self.control == Control::Sinumerik && self.keeps_centre && !self.in_proportion {
+            return Err("it does not say how it turns between points".into());
+        }
+        self.turn_deg = Some(to_deg);
         Ok(())
     }
 
@@ -397,6 +495,14 @@ impl Reader {
                 self.cycle = true;
                 Ok(())
             }
+            "FUNCTION TCPM F TCP AXIS POS PATHCTRL AXIS" => {
+                self.keeps_centre = true;
+                Ok(())
+            }
+            "FUNCTION RESET TCPM" => {
+                self.keeps_centre = false;
+                Ok(())
+            }
             _ if rest.starts_with("CYCL DEF 32.1") && self.cycle => {
                 let tolerance = rest.strip_prefix("CYCL DEF 32.1 T").map(str::parse::<f64>).transpose();
                 let tolerance = tolerance.map_err(|e| e.to_string())?.filter(|mm| *mm > 0.0);
@@ -443,8 +549,8 @@ impl Reader {
                 (_, "FMAX") if motion.is_some() => self.motion = Some(0),
                 (_, "DR-" | "DR+") if motion.is_none() => self.motion = Some(if word == "DR-" { 2 } else { 3 }),
                 (_, "R0") => {}
-                (("F", feed), _) => self.feed_mm_min = Some(feed.parse().map_err(|_| format!("{word} is no feed"))?),
-                ((axis @ ("X" | "Y" | "Z"), value), _) if value.starts_with(['+', '-']) => {
+                (("F", feed), _) => self.feed = Some(feed.parse().map_err(|_| format!("{word} is no feed"))?),
+                ((axis @ ("X" | "Y" | "Z" | "A" | "B"), value), _) if value.starts_with(['+', '-']) => {
                     let value = value.parse().map_err(|_| format!("{word} is no place"))?;
                     to.insert(axis.chars().next().unwrap_or('X'), value);
                 }

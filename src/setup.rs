@@ -12,17 +12,18 @@ use thiserror::Error;
 
 use crate::cell::{CellPlan, Deadlines, Device, Disposal, Gates, Tolerance};
 use crate::compensation::path::{
-    Field, Limits, PathError, PathOptions, Scallops, TrackSpacing, Wanted, Wheel as PathWheel,
+    Contact as PathContact, Field, Lean, Limits, PathError, PathOptions, Rotary, Scallops, TrackSpacing, TurnAxis,
+    Wanted, Wheel as PathWheel,
 };
 use crate::compensation::{Contact, Correction, CorrectionLimits, MapOptions, WheelTerm, contact_width_mm};
-use crate::config::{CellConfig, Link};
+use crate::config::{CellConfig, Link, RotaryLetter};
 use crate::device::{AnyCmm, AnyGrinder, Line, Making, MakingError, ModbusSettings, Pass, hex};
 use crate::drive::{Adaptive, Probing, Programs, Sphere, TakenBack, Task, correction_grid};
 use crate::formats::gcode::DialectError;
 use crate::formats::{self, FormatError, NominalFile};
 use crate::geometry::{Aperture, Grid, Point, Vector};
 use crate::measuring::{Expansion, Layout, PatternError, Target, targets};
-use crate::recipe::{Mode, NominalSource, Pattern, Recipe, SpindleAxis, StartAt, Um, Wheel};
+use crate::recipe::{Leaning, Mode, NominalSource, Pattern, Recipe, SpindleAxis, StartAt, Tilt, Um, Wheel};
 use crate::registration::{Coordinate, MapLimits};
 use crate::surface::{DefinedSurface, DefinitionError, Nominal, Projection, Side, SurfaceError};
 
@@ -106,7 +107,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         check_sphere(recipe, cell, &nominal, sphere)?;
     }
     let ground = ground(recipe, &nominal);
-    let (track_mm, scallops) = tracks(recipe, &nominal, &ground)?;
+    let (track_mm, scallops) = tracks(recipe, cell, &nominal, &ground)?;
     let parameters = taken_back(recipe, cell, &ground, &nominal)?;
     let datum = datum(recipe, &nominal);
     let programs = ground.map(|ground| programs(recipe, cell, &nominal, part_identity, (ground, track_mm)));
@@ -256,6 +257,9 @@ fn setting(recipe: &Recipe, cell: &CellConfig, part: &[u8; 32], track_mm: f64, t
         map.smoothing,
         map.gain()
     );
+    if let Some(Tilt { lean, angle_deg }) = grinding.tilt {
+        let _ = write!(said, "; tilt {lean:?} by {angle_deg} degrees");
+    }
     // What stands as it always did is not said, so that what was learned before still counts.
     if (map.filter_order, map.roughness) != Default::default() {
         let _ = write!(said, "; order {:?}, {:?}", map.filter_order, map.roughness);
@@ -443,6 +447,7 @@ fn from_below(recipe: &Recipe) -> bool {
 /// Returns the distance of the tracks, as the recipe has it or as the scallops allow it, and what they leave between them.
 fn tracks(
     recipe: &Recipe,
+    cell: &CellConfig,
     nominal: &Nominal,
     ground: &Result<Ground, PathError>,
 ) -> Result<(f64, Option<Scallops>), SetupError> {
@@ -459,8 +464,10 @@ fn tracks(
     let none = Correction::none(Grid { columns: 2, rows: 2, first_mm: low, spacing_mm: size_mm }, 0.0);
     let unknown = |source| SetupError::Tracks { recipe: recipe.path().to_owned(), source };
     let wanted = Wanted::new(field.clone(), &none, 1.0).map_err(unknown)?;
-    let wheel = path_wheel(&grinding.wheel, nominal);
-    let unit = Scallops::between(&wanted, outline, &wheel, grinding.pattern, 1.0);
+    let options =
+        tilted(recipe, cell, PathOptions::new(path_wheel(&grinding.wheel, nominal), 1.0, grinding.feed_mm_min));
+    let wheel_at = |contact: &PathContact| options.wheel_at(contact);
+    let unit = Scallops::between(&wanted, outline, wheel_at, grinding.pattern, 1.0);
     // Tracks overlap, and there is more than one.
     let widest_mm = grinding.wheel.radius_mm().min(0.5 * size_mm[0].min(size_mm[1]));
     let track_mm = match (grinding.track_mm, grinding.scallop_nm) {
@@ -492,6 +499,7 @@ fn programs(
 ) -> Programs {
     let (grinding, limits) = (&recipe.grinding, &cell.grinder.limits);
     let plain = PathOptions::new(path_wheel(&grinding.wheel, nominal), track_mm, grinding.feed_mm_min);
+    let plain = tilted(recipe, cell, plain);
     // The wheel comes up to its feed before it meets the part.
     let machine = Limits {
         travel_mm: limits.travel.map(|travel| [travel.least_mm, travel.most_mm]),
@@ -531,6 +539,31 @@ fn programs(
         spark_out_passes: grinding.spark_out_passes,
         simulation: cell.simulated,
     }
+}
+
+/// The same path with the head of the cell's grinder, and the wheel tilted by it as the recipe has it.
+fn tilted(recipe: &Recipe, cell: &CellConfig, plain: PathOptions) -> PathOptions {
+    let step_rad = 10f64.powi(-i32::from(cell.grinder.program.dialect.numbers.angle_decimals)).to_radians();
+    let rotary = cell.grinder.rotary.map(|head| {
+        let (letter, about) = match head.letter {
+            RotaryLetter::A => ('A', TurnAxis::X),
+            RotaryLetter::B => ('B', TurnAxis::Y),
+        };
+        Rotary {
+            letter,
+            about,
+            reversed: head.reversed,
+            range_rad: head.range_deg.map(f64::to_radians),
+            rate_rad_s: head.largest_rate_deg_min.to_radians() / 60.0,
+            step_rad,
+            pivot_mm: head.pivot_mm.map(Vector::from),
+        }
+    });
+    let lean = recipe.grinding.tilt.map(|Tilt { lean, angle_deg }| match (lean, angle_deg.to_radians()) {
+        (Leaning::Constant, angle_rad) => Lean::Constant { angle_rad },
+        (Leaning::Following, lead_rad) => Lean::Following { lead_rad },
+    });
+    PathOptions { rotary, lean, ..plain }
 }
 
 /// The wheel of a recipe as paths have it; a cup is tilted further than the part slopes unless the recipe says by how much.

@@ -179,7 +179,7 @@ impl Program {
             }
             _ => None,
         };
-        Ok(Stop { at_mm: to_mm, feed_mm_min: None, turn })
+        Ok(Stop { at_mm: to_mm, turn_deg: None, feed_mm_min: None, minutes: None, turn })
     }
 }
 

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use regrind::cell::Beginning;
-use regrind::compensation::path::{ArcSummary, Scallops, Summary, ToolPath};
+use regrind::compensation::path::{ArcSummary, Peak, Scallops, Summary, ToolPath};
 use regrind::config::{BUILT_IN, CellConfig};
 use regrind::drive::Task;
 use regrind::formats::gcode::GcodeError;
@@ -88,6 +88,9 @@ struct Document {
     arcs: Option<ArcsTold>,
     /// The dialect that it is written in.
     dialect: String,
+    /// How the head tilts the wheel; absent where it does not.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    tilt: Option<TiltTold>,
     /// Why none can be made.
     #[serde(skip_serializing_if = "Option::is_none")]
     no_program: Option<String>,
@@ -140,6 +143,44 @@ impl ArcsTold {
             n(self.within_um),
             n(self.largest_corner_mrad),
             n(self.lines_alone_corner_mrad),
+        )
+    }
+}
+
+/// How the head tilts the wheel, on the scale of its axis.
+#[derive(Serialize)]
+struct TiltTold {
+    axis: char,
+    least_deg: f64,
+    most_deg: f64,
+    largest_rate_deg_min: f64,
+    /// Between the upright direction of the head and the normals of the part, at least: at 0 the pole of a ball stands still where it touches.
+    least_lean_deg: f64,
+}
+
+impl TiltTold {
+    fn of(path: &ToolPath, summary: &Summary) -> Option<Self> {
+        let turned = summary.turned?;
+        let on_scale = |peak: Peak| turned.rotary.on_scale_rad(peak.value).to_degrees();
+        let [a, b] = [on_scale(turned.least_rad), on_scale(turned.most_rad)];
+        Some(Self {
+            axis: turned.rotary.letter,
+            least_deg: a.min(b),
+            most_deg: a.max(b),
+            largest_rate_deg_min: 60.0 * turned.rate_rad_s.value.to_degrees(),
+            least_lean_deg: path.least_lean_rad().to_degrees(),
+        })
+    }
+
+    fn in_words(&self) -> String {
+        let n = three_digits;
+        format!(
+            "tilt        {} from {} to {} degrees, {} degrees a minute at most; the normal is {} degrees and more from upright in the head\n",
+            self.axis,
+            n(self.least_deg),
+            n(self.most_deg),
+            n(self.largest_rate_deg_min),
+            n(self.least_lean_deg),
         )
     }
 }
@@ -257,6 +298,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         program_points: program.as_ref().map(|(_, summary)| summary.points),
         arcs,
         dialect: cell.grinder.program.dialect.dialect.name.clone(),
+        tilt: program.as_ref().and_then(|(path, summary)| TiltTold::of(path, summary)),
         no_program: task.programs.as_ref().err().map(ToString::to_string),
         learns: recipe.compensation.learn,
     };
@@ -381,9 +423,10 @@ fn words(d: &Document) -> String {
     } else {
         ""
     };
+    let tilt = d.tilt.as_ref().map_or(String::new(), TiltTold::in_words);
     let warnings: String = d.warnings.iter().map(|warning| format!("warning     {warning}\n")).collect();
     format!(
-        "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nscallops    {}\nprogram     {program}\n{arcs}{learns}\
+        "{marked}{}\nnominal     {}, sha256 {}\nmeasure     {}, and {} on the reference sphere\ngrind       {} tracks, {} mm of path, {} minutes a pass\nscallops    {}\nprogram     {program}\n{arcs}{tilt}{learns}\
          level       {} um over the nominal surface first, at least {} um deeper each pass, so {} um at the last\nbudget      {} um in all\nremoval     {}\ncycles      at most {}\ntime        {}\n{warnings}",
         d.part,
         counted(d.nominal_points, "point"),

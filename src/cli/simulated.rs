@@ -4,11 +4,12 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use regrind::compensation::path::Pattern;
-use regrind::config::{CellConfig, Link};
+use regrind::config::{CellConfig, Link, RotaryLetter};
 use regrind::device::{Coordinates, HitLine, HitLinesWire, IppdmeWire, Line, RegisterMap, Wire, WordOrder};
 use regrind::formats::{AddedLines, FormatError, ResultFolder, ScratchFolder, place_link, remove_link};
 use regrind::recipe::{Recipe, Wheel};
 use regrind_sim::cmm::Led;
+use regrind_sim::head::Head;
 use regrind_sim::options::{Layout, MachineOptions};
 use regrind_sim::process::Programs;
 use regrind_sim::program::Control;
@@ -111,6 +112,10 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
         let none = "a machine that a person serves cannot be simulated; its part is yours to play";
         link.wire.line().ok_or_else(|| failed(none.into()))
     };
+    if recipe.grinding.tilt.is_some() && cell.grinder.program.folder.is_none() {
+        let why = "without programs the simulated grinder grinds upright, and grinding.tilt tilts the wheel; write grinder.program.folder";
+        return Err(failed(why.into()));
+    }
     let grinder = match by_programs(cell).map_err(&failed)? {
         Some(programs) => world.grinder().by_programs(programs),
         None => world.grinder(),
@@ -150,6 +155,11 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
 /// The wheel of the recipe, along what a controller outside executes.
 fn executed(command: Command, world: &World, recipe: &Recipe) -> Result<ExecutedPath, String> {
     let grinding = &recipe.grinding;
+    if grinding.tilt.is_some() {
+        return Err(
+            "the simulated wheel beside LinuxCNC stays upright; leave grinding.tilt or the simulation out".into()
+        );
+    }
     let (Wheel::Sphere { radius_mm }, Pattern::Raster) = (grinding.wheel, grinding.pattern) else {
         return Err(
             "the simulated wheel is a ball on tracks along x; take another recipe, or leave the simulation out".into(),
@@ -170,7 +180,13 @@ fn by_programs(cell: &CellConfig) -> Result<Option<Programs>, String> {
     let control = Control::named(name).ok_or_else(|| {
         format!("no control is simulated that reads the dialect `{name}`; leave grinder.program.folder out of a simulated cell")
     })?;
-    Ok(Some(Programs { folder, control }))
+    let head = cell.grinder.rotary.map(|axis| Head {
+        letter: if axis.letter == RotaryLetter::A { 'A' } else { 'B' },
+        left_handed: axis.reversed,
+        range_deg: axis.range_deg,
+        pivot_mm: axis.pivot_mm,
+    });
+    Ok(Some(Programs { folder, control, head }))
 }
 
 impl SimulatedCell {

@@ -3,8 +3,10 @@
 use std::path::Path;
 use std::time::Duration;
 
-use super::written::{CellFile, FixtureTable, GrinderTable, SphereTable, TimingTable, TravelTable, UncertaintyTable};
-use super::{CellConfig, Cmm, Grinder, GrinderLimits, Link, Programming, ReferenceSphere, Travel, dialect};
+use super::written::{
+    CellFile, FixtureTable, GrinderTable, RotaryTable, SphereTable, TimingTable, TravelTable, Turns, UncertaintyTable,
+};
+use super::{CellConfig, Cmm, Grinder, GrinderLimits, Link, Programming, ReferenceSphere, Rotary, Travel, dialect};
 use crate::device::{Place, RegisterMap, Signal, SignalTable, Timing, Wire};
 use crate::document::Document;
 use crate::formats::gcode::{DialectError, LINUXCNC};
@@ -80,6 +82,7 @@ pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) ->
     let limits = limits(grinder, document);
     let program = programming(grinder, path, document);
     // A table that is there and incomplete has been told of.
+    let rotary = grinder.rotary.as_ref().map(|rotary| self::rotary(rotary, document));
     let complete = !matches!(sphere, Some(None)) && !matches!(travel, Some(None));
     Checked {
         name: written.cell.name.clone(),
@@ -93,11 +96,9 @@ pub(super) fn check(written: &CellFile, path: &Path, document: &mut Document) ->
             reference_sphere: sphere.flatten(),
             travel: travel.flatten(),
         }),
-        grinder: (grinder_link.zip(limits).zip(program)).map(|((link, limits), program)| Grinder {
-            link,
-            limits,
-            program,
-        }),
+        grinder: (grinder_link.zip(limits).zip(program))
+            .filter(|_| !matches!(rotary, Some(None)))
+            .map(|((link, limits), program)| Grinder { link, limits, program, rotary: rotary.flatten() }),
     }
 }
 
@@ -275,6 +276,28 @@ fn travel(written: &TravelTable, machine: &str, document: &mut Document) -> Opti
         }
     }
     Some(Travel { least_mm, most_mm })
+}
+
+fn rotary(written: &RotaryTable, document: &mut Document) -> Option<Rotary> {
+    if written.turns == Turns::Table {
+        document.report(
+            "grinder.rotary.turns",
+            "is \"table\"",
+            "programs tilt the wheel by its head, and no part by its table",
+            "leave the table [grinder.rotary] out: the wheel then stays upright",
+        );
+    }
+    let (letter, range_deg) = (written.axis?, [written.least_deg?, written.most_deg?]);
+    if range_deg[0] >= range_deg[1] {
+        document.report(
+            "grinder.rotary.least_deg",
+            format!("is {}, `most_deg` is {}", range_deg[0], range_deg[1]),
+            "it must be less",
+            "are the two interchanged?",
+        );
+    }
+    let largest_rate_deg_min = written.largest_rate_deg_min?;
+    Some(Rotary { letter, reversed: written.reversed, range_deg, largest_rate_deg_min, pivot_mm: written.pivot_mm })
 }
 
 fn limits(grinder: &GrinderTable, document: &mut Document) -> Option<GrinderLimits> {

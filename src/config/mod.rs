@@ -20,6 +20,7 @@ use crate::geometry::{Point, Pose};
 use crate::model::Machine;
 
 pub use dialect::{dialect_schema, dialects, parse_dialect, read_dialect};
+pub use written::RotaryLetter;
 
 /// A cell, checked.
 #[derive(Clone, Debug)]
@@ -65,6 +66,23 @@ pub struct Grinder {
     pub limits: GrinderLimits,
     /// How its programs are written.
     pub program: Programming,
+    /// The rotary axis of its head, if it has one.
+    pub rotary: Option<Rotary>,
+}
+
+/// The rotary axis of a head that tilts the wheel, in the terms of its scale; [`crate::compensation::path::Rotary`] is the same as paths have it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rotary {
+    /// What programs call it: an A turns about x, a B about y.
+    pub letter: RotaryLetter,
+    /// Whether its scale counts left-handed.
+    pub reversed: bool,
+    /// Least and largest angle on its scale.
+    pub range_deg: [f64; 2],
+    /// Largest rate.
+    pub largest_rate_deg_min: f64,
+    /// From the wheel's centre to the pivot with the head upright; `None` where the control keeps the centre by itself.
+    pub pivot_mm: Option<[f64; 3]>,
 }
 
 /// How the programs of a grinder are written.

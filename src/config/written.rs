@@ -80,6 +80,8 @@ pub(super) struct GrinderTable {
     pub signals: Vec<SignalTable>,
     /// How its programs are written.
     pub program: ProgramTable,
+    /// The rotary axis of a head that tilts the wheel, if it has one.
+    pub rotary: Option<RotaryTable>,
     /// What it can do.
     #[schemars(extend("x-required" = true))]
     pub limits: LimitsTable,
@@ -110,6 +112,51 @@ impl Default for ProgramTable {
     fn default() -> Self {
         Self { dialect: "linuxcnc".to_owned(), controller_tolerance_um: None, arcs_within_um: None, folder: None }
     }
+}
+
+/// What programs call a rotary axis.
+#[derive(Clone, Copy, Debug, Deserialize, JsonSchema, PartialEq, Eq)]
+#[allow(missing_docs, reason = "each is told where the key is")]
+pub enum RotaryLetter {
+    A,
+    B,
+}
+
+/// What a rotary axis turns.
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq, Eq)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum Turns {
+    /// The head with the wheel.
+    #[default]
+    Head,
+    /// The table with the part: no programs are made for it.
+    Table,
+}
+
+/// The rotary axis of a head that tilts the wheel; one alone.
+#[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct RotaryTable {
+    /// Its letter: an A turns about x, a B about y of the model frame.
+    #[schemars(extend("x-required" = true), example = &"B")]
+    pub axis: Option<RotaryLetter>,
+    /// What it turns.
+    pub turns: Turns,
+    /// Whether its scale counts left-handed.
+    pub reversed: bool,
+    /// Least angle on its scale.
+    #[schemars(range(min = -360.0, max = 360.0), extend("x-required" = true), example = -60.0)]
+    pub least_deg: Option<f64>,
+    /// Largest angle on its scale.
+    #[schemars(range(min = -360.0, max = 360.0), extend("x-required" = true), example = 60.0)]
+    pub most_deg: Option<f64>,
+    /// Largest rate, in degrees a minute.
+    #[schemars(range(min = 0.01, max = 10000000.0), extend("x-required" = true), example = 3600.0)]
+    pub largest_rate_deg_min: Option<f64>,
+    /// From the wheel's centre to the pivot with the head upright, in the model frame: programs then have the places of the slides. Left out, the
+    /// control keeps the wheel's centre by itself, and programs have its places.
+    #[schemars(inner(range(min = -10000.0, max = 10000.0)), example = [0.0, 0.0, 180.0])]
+    pub pivot_mm: Option<[f64; 3]>,
 }
 
 /// How long to wait for what.

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 use crate::compensation::path::{
-    ArcSummary, Field, Limits, PathError, PathMode, PathOptions, Pattern, Summary, ToolPath, TrackSpacing, Wanted,
-    Wheel, axis_offsets, height_of,
+    ArcSummary, Field, Lean, Limits, PathError, PathMode, PathOptions, Pattern, Summary, ToolPath, TrackSpacing,
+    Wanted, Wheel, axis_offsets, height_of,
 };
 use crate::compensation::{Correction, ParameterKind};
 use crate::formats::gcode::{
@@ -97,6 +97,12 @@ impl Programs {
     /// # Errors
     /// What it cannot say.
     pub fn check_dialect(&self) -> Result<(), DialectError> {
+        if let Some(rotary) = self.options.leaning() {
+            self.dialect.turning(rotary)?;
+            if self.arcs_within_mm.is_some() {
+                return Err(DialectError::ArcsTilted);
+            }
+        }
         self.dialect.post(&self.exactness()).map(drop)
     }
 
@@ -206,6 +212,9 @@ impl Programs {
         map_identity: [u8; 32],
         path: &ToolPath,
     ) -> Result<(), ProgramError> {
+        if self.options.lean.is_some() {
+            return Err(PathError::TableOfTilted.into());
+        }
         let none = Correction { values_mm: vec![0.0; correction.grid.len()], ..correction.clone() };
         let before = Wanted::new(self.nominal(correction), &none, 1.0)?;
         let mut offsets = axis_offsets(&before, path.wanted(), &path.options().wheel, &correction.grid)?;
@@ -234,6 +243,8 @@ impl Programs {
             wheel: if self.options.from_below { self.wheel(correction).mirrored() } else { self.wheel(correction) }
                 .description(),
             from_below: self.options.from_below,
+            rotary: self.options.leaning().copied(),
+            lean: lean_in_words(self.options.lean),
             parameters: set_in_words(correction, self.options.wheel.reach_mm()),
             tracks: tracks_in_words(path),
             spark_out_passes: self.spark_out_passes,
@@ -270,6 +281,14 @@ pub(super) fn set_in_words(correction: &Correction, wheel_radius_mm: f64) -> Vec
         }
     };
     taken.map(line).collect()
+}
+
+fn lean_in_words(lean: Option<Lean>) -> String {
+    match lean {
+        None => String::new(),
+        Some(Lean::Constant { angle_rad }) => format!("constant by {:.4} degrees", angle_rad.to_degrees()),
+        Some(Lean::Following { lead_rad }) => format!("{:.4} degrees from the normal", lead_rad.to_degrees()),
+    }
 }
 
 fn tracks_in_words(path: &ToolPath) -> String {

@@ -6,8 +6,8 @@ use serde::Deserialize;
 
 use super::curvature;
 use super::tables::{
-    Acceptance, Compensation, Grinding, Measure, Mode, NominalTable, PatternWord, RecipeFile, RegistrationSettings,
-    StartAt, Um, Wheel,
+    Acceptance, Compensation, Grinding, Leaning, Measure, Mode, NominalTable, PatternWord, RecipeFile,
+    RegistrationSettings, StartAt, Um, Wheel,
 };
 use super::{NominalSource, Pattern};
 use crate::cell::Beginning;
@@ -352,6 +352,14 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
             "leave the table out: the map takes them back",
         );
     }
+    if written.grinding.tilt.is_some() {
+        document.report(
+            KEY,
+            "stands beside grinding.tilt",
+            "parameters are told of a wheel that stays upright",
+            "leave one of the two out: the map takes them back",
+        );
+    }
     if parameters.wheel_radius_um.is_some() && !matches!(written.grinding.wheel, Wheel::Sphere { .. }) {
         document.report(
             "compensation.parameters.wheel_radius_um",
@@ -388,6 +396,9 @@ fn parameters(written: &RecipeFile, document: &mut Document) {
     }
 }
 
+/// How near to the normal the pole of a ball may come that follows the surface: within 2 degrees it hardly moves.
+const LEAST_LEAD_DEG: f64 = 2.01;
+
 fn grinding(written: &Grinding, document: &mut Document) {
     let wheel = written.wheel;
     if let Wheel::Torus { radius_mm, minor_radius_mm, .. } | Wheel::Cup { radius_mm, minor_radius_mm, .. } = wheel
@@ -406,6 +417,18 @@ fn grinding(written: &Grinding, document: &mut Document) {
             "is set for a spiral",
             "only a raster has tracks that could alternate",
             "leave it out",
+        );
+    }
+    if let Some(tilt) = written.tilt
+        && tilt.lean == Leaning::Following
+        && tilt.angle_deg.abs() < LEAST_LEAD_DEG
+        && matches!(wheel, Wheel::Sphere { .. })
+    {
+        document.report(
+            "grinding.tilt.angle_deg",
+            format!("is {} for a ball that follows the surface", tilt.angle_deg),
+            "its pole would touch, which stands still",
+            "lean it by 2 degrees or more, 15 to 45 as a rule, to either side",
         );
     }
     if let Some(track_mm) = written.track_mm.filter(|track_mm| *track_mm > wheel.radius_mm()) {

@@ -26,8 +26,8 @@ use crate::surface::{DefinedSurface, Projection};
 
 use tables::RecipeFile;
 pub use tables::{
-    Acceptance, Compensation, Cycle, Grinding, MachineParameters, Measure, Measuring, Mode, Part, RegistrationSettings,
-    SpindleAxis, StartAt, Um, Wheel,
+    Acceptance, Compensation, Cycle, Grinding, Leaning, MachineParameters, Measure, Measuring, Mode, Part,
+    RegistrationSettings, SpindleAxis, StartAt, Tilt, Um, Wheel,
 };
 
 /// A recipe, checked.

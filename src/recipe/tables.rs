@@ -355,6 +355,8 @@ pub struct Grinding {
     /// The wheel.
     #[schemars(extend("x-required" = true))]
     pub wheel: Wheel,
+    /// How a head tilts the wheel, on a grinder that has one; left out, the wheel stays upright.
+    pub tilt: Option<Tilt>,
     /// Feed along the track.
     #[schemars(range(min = 0.1, max = 100000.0), example = 600.0)]
     pub feed_mm_min: f64,
@@ -393,6 +395,35 @@ pub struct Grinding {
     /// nothing else goes by it.
     #[schemars(range(min = 0.01, max = 1000000.0), example = 200.0)]
     pub grinding_ratio: Option<f64>,
+}
+
+/// How a wheel leans.
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq, Eq)]
+#[serde(rename_all = "kebab-case")]
+pub enum Leaning {
+    /// By the same angle everywhere.
+    #[default]
+    Constant,
+    /// After the normal of the surface, seen along the axis of the head: the angle is kept between the normal and the upright direction of the head.
+    Following,
+}
+
+/// How a head tilts the wheel.
+#[derive(Clone, Copy, Debug, Deserialize, JsonSchema, PartialEq)]
+#[serde(default, deny_unknown_fields)]
+pub struct Tilt {
+    /// Whether it follows the surface.
+    pub lean: Leaning,
+    /// How far the head is turned, right-handed about its axis: from upright, or from the normal where it follows. A positive B leans to +x, a
+    /// positive A to -y.
+    #[schemars(range(min = -90.0, max = 90.0), extend("x-required" = true), example = 20.0)]
+    pub angle_deg: f64,
+}
+
+impl Default for Tilt {
+    fn default() -> Self {
+        Self { lean: Leaning::Constant, angle_deg: f64::NAN }
+    }
 }
 
 /// Axis of the model frame that a spindle lies along.
@@ -558,6 +589,7 @@ impl Default for Grinding {
     fn default() -> Self {
         Self {
             wheel: Wheel::Sphere { radius_mm: f64::NAN },
+            tilt: None,
             feed_mm_min: f64::NAN,
             track_mm: None,
             pattern: TrackPattern::Raster,

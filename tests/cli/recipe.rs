@@ -23,6 +23,7 @@ const BICONIC: &str = include_str!("../../recipes/biconic.toml");
 const SPIRAL: &str = include_str!("../../recipes/off-axis-asphere.toml");
 const TELESCOPE: &str = include_str!("../../recipes/telescope-panel.toml");
 const SIM: &str = include_str!("../../config/sim.toml");
+const TILTING: &str = include_str!("../../config/tilting.toml");
 const TCP: &str = include_str!("../../config/modbus-tcp.toml");
 const RTU: &str = include_str!("../../config/serial-rtu.toml");
 const FILES: &str = include_str!("../../config/laser-tracker.toml");
@@ -472,6 +473,17 @@ const BAD_CELLS: &[BadText] = &[
         "reference_sphere_mm",
         "did you mean",
     ),
+    (TILTING, "least_deg = -60.0", "least_deg = 70.0", "grinder.rotary.least_deg", "70.0", "interchanged"),
+    (TILTING, "axis = \"B\"", "axis = \"C\"", "grinder.rotary.axis", "\"C\"", "one of"),
+    (TILTING, "reversed = false", "turns = \"table\"", "grinder.rotary.turns", "\"table\"", "stays upright"),
+    (
+        TILTING,
+        "largest_rate_deg_min = 3600.0\n",
+        "",
+        "grinder.rotary.largest_rate_deg_min",
+        "grinder.rotary]",
+        "add `largest",
+    ),
     (SIM, "simulated = true ", "simulated = false ", "cmm.wire.port", "0                    #", "1 to 65535"),
     (SIM, "name = \"simulated cell\"\n", "", "cell.name", "cell]", "add `name"),
     (TCP, "port = 15021", "prot = 15021\nport = 1", "cmm.wire.prot", "prot", "did you mean `port`"),
@@ -594,6 +606,17 @@ fn every_bad_recipe_is_told_at_its_place() {
 #[test]
 fn every_bad_cell_is_told_at_its_place() {
     assert_told(BAD_CELL_VALUES, BAD_CELLS, cell);
+}
+
+#[test]
+fn a_head_with_two_axes_and_a_ball_on_its_pole_are_refused() {
+    let two = TILTING.replace("[grinder.rotary]", "[[grinder.rotary]]");
+    let told = cell(&two).unwrap_err().to_string();
+    assert!(told.contains("grinder.rotary") && told.contains("table"), "{told}");
+    let pole = format!("{}\n[grinding.tilt]\nlean = \"following\"\nangle_deg = 1.0\n", RECIPE);
+    let told = recipe(&pole).unwrap_err().to_string();
+    assert!(told.contains("grinding.tilt.angle_deg") && told.contains("pole"), "{told}");
+    assert!(recipe(&pole.replace("angle_deg = 1.0", "angle_deg = 20.0")).is_ok());
 }
 
 #[test]

@@ -57,6 +57,7 @@ fn every_control_reads_the_path_of_the_plan_to_half_of_the_last_digit() {
                     (at[0], at[1]) = (x, y);
                     None
                 }
+                Move::RapidTilted { .. } | Move::FeedTilted { .. } => unreachable!("the wheel stays upright"),
                 Move::Feed { at: to, feed_mm_min } => {
                     at = to.into();
                     Some(feed_mm_min)

@@ -6,7 +6,8 @@ use std::process::{Command, Stdio};
 
 use crate::compensate::Shop;
 use crate::path::{correction, error_mm, part, read, wheels, with};
-use regrind::compensation::path::{PathMode, Pattern};
+use regrind::compensation::path::{Lean, PathMode, PathOptions, Pattern, Rotary, TurnAxis};
+use regrind::geometry::Vector;
 use regrind_sim::program::Control;
 
 /// Lets the interpreter read a program; returns what it would have the machine do, or what it said against it. It writes files into the
@@ -118,6 +119,51 @@ fn the_interpreter_turns_where_the_simulated_control_does() {
             let [[x, y], [u, v]] = [arm(from), arm(middle)];
             assert!((x.hypot(y) - u.hypot(v)).abs() < 1e-4, "{name}: {arc:?}");
             assert!(arc[4].abs() == 1.0 && (x * v - y * u).signum() == arc[4], "{name}: {arc:?}");
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs the interpreter of LinuxCNC: Debian package linuxcnc-uspace"]
+fn programs_of_a_wheel_that_tilts_are_read_point_by_point_with_their_angles() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut part = part("freeform-mirror");
+    let plain = part.programs.options;
+    for (about, pivot_mm, lead_rad) in [
+        (TurnAxis::Y, None, 0.35),
+        (TurnAxis::Y, Some(Vector::new(0.0, 0.0, 180.0)), 0.35),
+        (TurnAxis::X, Some(Vector::new(5.0, 0.0, 180.0)), -0.5),
+    ] {
+        let letter = if about == TurnAxis::X { 'A' } else { 'B' };
+        let rotary = Rotary {
+            letter,
+            about,
+            reversed: false,
+            range_rad: [-2.0, 2.0],
+            rate_rad_s: 1e3,
+            step_rad: 1e-6f64.to_radians(),
+            pivot_mm,
+        };
+        let lean = Some(Lean::Following { lead_rad });
+        part.programs.options = PathOptions { rotary: Some(rotary), lean, ..with(&plain, wheels(0.8)[0].1, 6.0) };
+        let file = folder.path().join("part.ngc");
+        part.programs.write(&file, &correction(part.half_mm), [9; 32]).unwrap();
+        let calls = interpret(&file).unwrap_or_else(|said| panic!("{letter}: {said}"));
+        assert_eq!(fs::read_to_string(&file).unwrap().contains("\nG93\n"), pivot_mm.is_some(), "{letter}");
+        let theirs: Vec<[f64; 4]> = calls
+            .lines()
+            .filter_map(|line| line.split_once("STRAIGHT_")?.1.split_once('('))
+            .map(|(_, rest)| rest.trim_end_matches(')').split(',').map(|n| n.trim().parse::<f64>().unwrap()).collect())
+            .map(|numbers: Vec<f64>| [numbers[0], numbers[1], numbers[2], numbers[if letter == 'A' { 3 } else { 4 }]])
+            .collect();
+        let ours = Control::Linuxcnc.read(&fs::read_to_string(&file).unwrap()).unwrap().stops;
+        assert_eq!(theirs.len(), ours.len(), "{letter}");
+        for (theirs, stop) in theirs.iter().zip(&ours).filter(|(_, stop)| stop.turn_deg.is_some()) {
+            // It prints four decimals.
+            let [x, y, z] = stop.at_mm;
+            let off =
+                [x, y, z, stop.turn_deg.unwrap()].iter().zip(theirs).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+            assert!(off < 0.6e-4, "{letter}: {theirs:?} {stop:?}");
         }
     }
 }

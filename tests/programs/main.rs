@@ -10,3 +10,4 @@ mod path;
 #[path = "../common/program.rs"]
 mod program;
 mod sweep;
+mod tilt;

@@ -10,7 +10,7 @@ const PARTS: [&str; 4] = ["freeform-mirror", "off-axis-asphere", "shallow-wave",
 const WITHIN_MM: f64 = 2e-4;
 
 /// How far a point is from a wheel, from its centre.
-fn distance(wheel: &Wheel, d: [f64; 3]) -> f64 {
+pub fn distance(wheel: &Wheel, d: [f64; 3]) -> f64 {
     let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
     match *wheel {
         Wheel::Sphere { radius_mm } => dot(d, d).sqrt() - radius_mm,

@@ -34,6 +34,57 @@ fn a_part_is_ground_by_the_programs_of_every_dialect_until_it_is_accepted() {
     }
 }
 
+/// Makes the small mirror with a wheel that leans, in a simulated cell with this head.
+fn tilted(tilt: &str, dialect: &str, rotary: &str) -> (tempfile::TempDir, i32, String, String) {
+    let home = tempfile::tempdir().unwrap();
+    fs::create_dir(home.path().join("programs")).unwrap();
+    let program = format!("{dialect}\n{rotary}\n[grinder.limits]");
+    fs::write(home.path().join("cell.toml"), changed("config/sim.toml", &[("[grinder.limits]", &program)])).unwrap();
+    let recipe = small_recipe(home.path(), 1e4);
+    let text = fs::read_to_string(&recipe).unwrap();
+    fs::write(&recipe, text.replace("[grinding.wheel]", &format!("{tilt}\n[grinding.wheel]"))).unwrap();
+    let recipe = recipe.display().to_string();
+    let (code, said, errors) = run(&["run", &recipe, "--cell", "cell.toml", "--runs", "runs", "--loaded"], home.path());
+    (home, code, said, errors)
+}
+
+const FOLLOWING: &str = "[grinding.tilt]\nlean = \"following\"\nangle_deg = 25.0";
+const HEAD: &str = "[grinder.rotary]\naxis = \"B\"\nreversed = true\nleast_deg = -80.0\nmost_deg = 80.0\nlargest_rate_deg_min = 36000.0";
+
+#[test]
+fn a_part_is_ground_by_a_ball_that_leans_until_it_is_accepted() {
+    for (dialect, head) in [
+        ("[grinder.program]\nfolder = \"programs\"", format!("{HEAD}\npivot_mm = [3.0, 0.0, 180.0]")),
+        ("[grinder.program]\ndialect = \"sinumerik\"\nfolder = \"programs\"", HEAD.to_owned()),
+    ] {
+        let (home, code, said, errors) = tilted(FOLLOWING, dialect, &head);
+        assert_eq!(code, 0, "{dialect}: {said}{errors}");
+        assert!(said.contains("SIMULATION  ACCEPTED"), "{dialect}: {said}");
+        let program = fs::read_dir(home.path().join("programs")).unwrap().next().unwrap().unwrap().path();
+        let text = fs::read_to_string(program).unwrap();
+        assert!(text.lines().filter(|line| line.contains("B-")).count() > 1000, "{dialect}");
+        // A table of Z knows of no tilt.
+        let kept = fs::read_dir(home.path().join("runs")).unwrap().next().unwrap().unwrap().path();
+        assert!(!kept.join("cycle-0/toolpath_z.csv").exists());
+    }
+}
+
+#[test]
+fn a_wheel_is_not_tilted_by_a_machine_that_cannot_or_does_not_know() {
+    let folder = "[grinder.program]\nfolder = \"programs\"";
+    let narrow = HEAD.replace("-80.0", "-20.0");
+    for (dialect, head, why) in [
+        (folder, "", "[grinder.rotary]"),
+        (folder, narrow.as_str(), "grinding.tilt.angle_deg by"),
+        ("", HEAD, "grinder.program.folder"),
+    ] {
+        let (home, code, said, errors) = tilted(FOLLOWING, dialect, head);
+        assert_ne!(code, 0, "{said}");
+        assert!(errors.contains(why), "{why}: {errors}{said}");
+        assert!(fs::read_dir(home.path().join("programs")).unwrap().next().is_none());
+    }
+}
+
 #[test]
 fn a_part_is_ground_along_arcs_until_it_is_accepted() {
     for (dialect, extension, word) in

@@ -7,7 +7,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use regrind_core::compensation::path::{ArcOptions, PathMode};
+use regrind_core::compensation::path::{ArcOptions, PathMode, Rotary};
 
 /// The dialect of LinuxCNC, which a cell has that says nothing.
 pub const LINUXCNC: &str = "linuxcnc";
@@ -34,6 +34,8 @@ pub struct Dialect {
     pub arcs: Option<ArcWords>,
     /// How a control is told how exactly to keep to the path; a mode that is left out is refused.
     pub path: Modes,
+    /// How a control is told of a head that tilts the wheel; where it is left out, or what is left out of it, is refused.
+    pub rotary: Tilting,
     /// What stands before and after the moves.
     #[schemars(extend("x-required" = true))]
     pub program: Frame,
@@ -126,6 +128,9 @@ pub struct Numbers {
     /// Largest coordinate.
     #[schemars(range(min = 1.0, max = 1e6))]
     pub largest_mm: f64,
+    /// Decimals of an angle in degrees, all of which are written.
+    #[schemars(range(min = 2, max = 6))]
+    pub angle_decimals: u8,
     /// Decimals of a feed at most; zeros at the end are left out.
     #[schemars(range(max = 6))]
     pub feed_decimals: u8,
@@ -135,7 +140,7 @@ pub struct Numbers {
 
 impl Default for Numbers {
     fn default() -> Self {
-        Self { decimals: 0, plus: false, largest_mm: 1e6, feed_decimals: 6, feed_point: false }
+        Self { decimals: 0, plus: false, largest_mm: 1e6, angle_decimals: 4, feed_decimals: 6, feed_point: false }
     }
 }
 
@@ -277,6 +282,29 @@ pub struct Mode {
     pub end: Vec<String>,
 }
 
+/// How a control is told of a head that tilts the wheel.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Tilting {
+    /// Where the control keeps the wheel's centre while the head turns: the program has the centre's places, and its feeds are the centre's.
+    pub tool_centre: Option<Turning>,
+    /// Where the program has the places of the slides: the turn of the pivot is in them, and a feed is the inverse of the time of a block, in 1/min,
+    /// since a slide may go far where the wheel hardly moves.
+    pub slides: Option<Turning>,
+}
+
+/// What a way of tilting is called by.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Turning {
+    /// Lines before the moves, after those of the path mode; none where the control does so anyway.
+    #[schemars(length(max = 16), inner(length(min = 1, max = 200)))]
+    pub begin: Vec<String>,
+    /// Lines after them.
+    #[schemars(length(max = 16), inner(length(min = 1, max = 200)))]
+    pub end: Vec<String>,
+}
+
 /// What stands before and after the moves.
 #[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
@@ -360,6 +388,15 @@ pub enum DialectError {
          {limit_um} or less"
     )]
     ArcsWide { found_um: f64, limit_um: f64 },
+    #[error(
+        "grinder.program.arcs_within_um is for a wheel that stands upright, and grinding.tilt leans it; leave one of them out"
+    )]
+    ArcsTilted,
+    #[error(
+        "the dialect `{dialect}` has no words for a head that tilts the wheel where {where_so}; {remedy}, or write [rotary.{key}] into a dialect of \
+         your own"
+    )]
+    Rotary { dialect: String, where_so: &'static str, remedy: &'static str, key: &'static str },
     #[error(
         "programs of the dialect `{dialect}` have the numbers {least} to {most} (program.numbers), and cycle {cycle} is beyond; give it more"
     )]
@@ -449,6 +486,29 @@ impl Dialect {
     /// How far points are off by their decimals: each of three coordinates by half a step at most.
     fn rounding_um(&self) -> f64 {
         1e3 * 0.5 * 10f64.powi(-i32::from(self.numbers.decimals)) * 3f64.sqrt()
+    }
+
+    /// Returns what a control is told of a head that tilts the wheel.
+    ///
+    /// # Errors
+    /// A way of tilting without words.
+    pub fn turning(&self, rotary: &Rotary) -> Result<&Turning, DialectError> {
+        let (turning, where_so, remedy, key) = match rotary.pivot_mm {
+            None => (
+                &self.rotary.tool_centre,
+                "the control keeps the wheel's centre",
+                "say where the pivot is, grinder.rotary.pivot_mm",
+                "tool_centre",
+            ),
+            Some(_) => (
+                &self.rotary.slides,
+                "the program has the places of the slides",
+                "leave grinder.rotary.pivot_mm out, if the control keeps the wheel's centre",
+                "slides",
+            ),
+        };
+        let dialect = || self.dialect.name.clone();
+        turning.as_ref().ok_or_else(|| DialectError::Rotary { dialect: dialect(), where_so, remedy, key })
     }
 
     fn check_tolerance(&self, mode: &Mode, exactness: &Exactness, step_mm: f64) -> Result<(), DialectError> {
@@ -567,13 +627,26 @@ impl Dialect {
                 let begin = mode.begin.iter().enumerate().map(of(key, ".begin"));
                 begin.chain(mode.end.iter().enumerate().map(of(key, ".end")))
             });
+        let turnings = [("rotary.tool_centre", &self.rotary.tool_centre), ("rotary.slides", &self.rotary.slides)];
+        let of_turnings = turnings.into_iter().filter_map(|(key, turning)| Some((key, turning.as_ref()?))).flat_map(
+            move |(key, turning)| {
+                let begin = turning.begin.iter().enumerate().map(of(key, ".begin"));
+                begin.chain(turning.end.iter().enumerate().map(of(key, ".end")))
+            },
+        );
         let of_lists = lists.into_iter().flat_map(move |(key, lines)| lines.iter().enumerate().map(of(key, "")));
         let of_arcs = self.arcs.iter().flat_map(move |arcs| {
             let lines = arcs.begin.iter().enumerate().map(of("arcs", ".begin"));
             let lines = lines.chain(arcs.end.iter().enumerate().map(of("arcs", ".end")));
             arcs.words().map(|(key, word)| (key.to_owned(), word)).chain(lines)
         });
-        words.into_iter().map(|(key, word)| (key.to_owned(), word)).chain(of_modes).chain(of_lists).chain(of_arcs)
+        words
+            .into_iter()
+            .map(|(key, word)| (key.to_owned(), word))
+            .chain(of_modes)
+            .chain(of_turnings)
+            .chain(of_lists)
+            .chain(of_arcs)
     }
 
     /// What is wrong with a fixed line.
@@ -602,7 +675,10 @@ impl Dialect {
             let allowed = "{name} and, beside program.numbers, {number} may stand in program.begin and program.end, {tolerance_mm} in path.blend.begin";
             return Some((format!("is {line:?}"), allowed, "remove it"));
         }
-        let other = line.to_ascii_uppercase().split_whitespace().find(|word| OTHER.contains(word)).map(str::to_owned);
+        // Slides that turn with a head are the one place where a feed is by time.
+        let allowed = if key.starts_with("rotary.slides.begin") { "G93" } else { "" };
+        let is_other = |word: &&str| *word != allowed && OTHER.contains(word);
+        let other = line.to_ascii_uppercase().split_whitespace().find(is_other).map(str::to_owned);
         other.map(|word| {
             let allowed = "programs are written in mm, in mm/min and in absolute places";
             (format!("has the word {word}"), allowed, "remove it")
@@ -615,11 +691,16 @@ impl Dialect {
         let digits = |largest: f64| largest.log10().floor().max(0.0) as usize + 1;
         let coordinate = digits(self.numbers.largest_mm) + 2 + usize::from(self.numbers.decimals);
         let axes: usize = words.axes.iter().map(|axis| axis.len() + coordinate + words.between.len()).sum();
+        let angle = if self.rotary == Tilting::default() {
+            0
+        } else {
+            1 + words.between.len() + 5 + usize::from(self.numbers.angle_decimals)
+        };
         let feed = words.feed.len() + digits(1e6) + 1 + usize::from(self.numbers.feed_decimals);
         let begins = words.rapid.len().max(words.line.len()) + words.rapid_ends.len();
         let arcs = self.arcs.as_ref().map_or(0, |arcs| arcs.longest() + 2 * (coordinate + words.between.len()));
         let number = self.blocks.as_ref().map_or(0, |b| b.letter.len() + digits(f64::from(b.last)) + 1);
-        number + begins + axes + feed + arcs
+        number + begins + axes + angle + feed + arcs
     }
 }
 

@@ -8,7 +8,7 @@ use super::dialect::{ArcWords, CentreWords, Dialect, Exactness, LineEnd, NAME, N
 use super::number::{push_decimals, short};
 use super::{GcodeError, hex};
 use crate::registration::Draft;
-use regrind_core::compensation::path::{Arc, ArcSummary, Block, Move, Plane, Summary, ToolPath};
+use regrind_core::compensation::path::{Arc, ArcSummary, Block, Move, Plane, Rotary, Summary, ToolPath, TurnAxis};
 
 /// Bytes that are gathered before they go to the file.
 const CHUNK: usize = 1 << 16;
@@ -35,6 +35,10 @@ pub struct ProgramHeader {
     pub level_mm: f64,
     /// Whether the wheel comes from -z.
     pub from_below: bool,
+    /// The rotary axis by which the wheel leans, if it does.
+    pub rotary: Option<Rotary>,
+    /// How it leans, in words.
+    pub lean: String,
     /// The wheel in words.
     pub wheel: String,
     /// Which parameters of the machine are taken back in the path, a line each.
@@ -90,7 +94,8 @@ where
     let (head, numbered) = frame.head(header, summary, arcs);
     let mut draft = Draft::create(path)?;
     draft.write(head.as_bytes())?;
-    let mut lines = Lines::new(dialect, 0, numbered);
+    let rotary = header.rotary.as_ref();
+    let mut lines = Lines::new(dialect, rotary, 0, numbered);
     let at_once = (AT_ONCE * tracks.len() as u64 / summary.points.max(1)) as usize;
     if at_once < 2 || dialect.blocks.is_some() {
         // Long tracks, and those whose blocks are counted, go to the file as they come.
@@ -108,7 +113,7 @@ where
     } else {
         for some in tracks.chunks(at_once) {
             let texts: Vec<Result<Lines, GcodeError>> =
-                some.par_iter().map(|track| Lines::of(dialect, track)).collect();
+                some.par_iter().map(|track| Lines::of(dialect, rotary, track)).collect();
             for text in texts {
                 let text = text.map_err(|error| error.after(lines.count))?;
                 draft.write(&text.text)?;
@@ -128,9 +133,11 @@ where
 /// The lines of the moves, and what is in force after them.
 struct Lines<'a> {
     dialect: &'a Dialect,
+    rotary: Option<&'a Rotary>,
     text: Vec<u8>,
     /// In the last digit that is written; the largest number where nothing is in force.
     last: [i64; 3],
+    turned: i64,
     motion: Option<Motion>,
     plane: Option<Plane>,
     feed: i64,
@@ -138,6 +145,7 @@ struct Lines<'a> {
     /// Blocks with a number so far.
     numbered: u64,
     per_mm: f64,
+    per_deg: f64,
     feed_per: f64,
 }
 
@@ -150,28 +158,37 @@ enum Motion {
     CounterClockwise,
 }
 
+/// No time is told of a shorter way.
+const LEAST_MM: f64 = 1e-6;
 /// What a place or a feed is that is not in force.
 const NOTHING: i64 = i64::MAX;
 
 impl<'a> Lines<'a> {
     /// Nothing is in force, after so many moves and so many numbered blocks.
-    fn new(dialect: &'a Dialect, count: u64, numbered: u64) -> Self {
+    fn new(dialect: &'a Dialect, rotary: Option<&'a Rotary>, count: u64, numbered: u64) -> Self {
         let power = |decimals: u8| 10f64.powi(i32::from(decimals));
-        let (per_mm, feed_per) = (power(dialect.numbers.decimals), power(dialect.numbers.feed_decimals));
-        let (text, last) = (Vec::new(), [NOTHING; 3]);
-        Self { dialect, text, last, motion: None, plane: None, feed: NOTHING, count, numbered, per_mm, feed_per }
+        let numbers = &dialect.numbers;
+        let [per_mm, per_deg, feed_per] = [numbers.decimals, numbers.angle_decimals, numbers.feed_decimals].map(power);
+        let (text, last, turned, feed) = (Vec::new(), [NOTHING; 3], NOTHING, NOTHING);
+        let (motion, plane) = (None, None);
+        Self { dialect, rotary, text, last, turned, motion, plane, feed, count, numbered, per_mm, per_deg, feed_per }
     }
 
     /// The lines of a whole track.
-    fn of<T: Iterator<Item: Into<Block>> + Clone>(dialect: &'a Dialect, track: &T) -> Result<Self, GcodeError> {
-        let mut lines = Self::new(dialect, 0, 0);
+    fn of<T: Iterator<Item: Into<Block>> + Clone>(
+        dialect: &'a Dialect,
+        rotary: Option<&'a Rotary>,
+        track: &T,
+    ) -> Result<Self, GcodeError> {
+        let mut lines = Self::new(dialect, rotary, 0, 0);
         track.clone().try_for_each(|one| lines.push(&one.into()))?;
         Ok(lines)
     }
 
     /// Nothing is in force any more.
     fn begin(&mut self) {
-        (self.last, self.motion, self.plane, self.feed) = ([NOTHING; 3], None, None, NOTHING);
+        (self.last, self.turned, self.feed) = ([NOTHING; 3], NOTHING, NOTHING);
+        (self.motion, self.plane) = (None, None);
     }
 
     #[inline]
@@ -195,22 +212,49 @@ impl<'a> Lines<'a> {
         let words = &self.dialect.words;
         self.number();
         match one {
-            Move::RapidZ(z) => self.block(true, [None, None, Some(*z)], None)?,
-            Move::RapidXy([x, y]) => self.block(true, [Some(*x), Some(*y), None], None)?,
+            Move::RapidZ(z) => self.block(true, [None, None, Some(*z)], None, None)?,
+            Move::RapidXy([x, y]) => self.block(true, [Some(*x), Some(*y), None], None, None)?,
             Move::Feed { at, feed_mm_min } => {
-                self.block(false, [Some(at.x), Some(at.y), Some(at.z)], Some(*feed_mm_min))?;
+                self.block(false, [Some(at.x), Some(at.y), Some(at.z)], None, Some(*feed_mm_min))?;
+            }
+            Move::RapidTilted { to_mm: [x, y], tilt_rad } => {
+                self.block(true, [Some(*x), Some(*y), None], Some(*tilt_rad), None)?;
+            }
+            Move::FeedTilted { at, tilt_rad, feed_mm_min, centre_mm } => {
+                let feed = self.feed_of(*feed_mm_min, *centre_mm);
+                self.block(false, [Some(at.x), Some(at.y), Some(at.z)], Some(*tilt_rad), Some(feed))?;
             }
         }
-        if matches!(one, Move::RapidZ(_) | Move::RapidXy(_)) {
+        if matches!(one, Move::RapidZ(_) | Move::RapidXy(_) | Move::RapidTilted { .. }) {
             self.text.extend_from_slice(words.rapid_ends.as_bytes());
         }
         end_line(&mut self.text, self.dialect);
         Ok(())
     }
 
+    /// The feed as the control takes it: of the wheel's centre, which it keeps, or the inverse of the time in minutes where the program moves the
+    /// slides, which is of its own block and no other.
+    fn feed_of(&mut self, feed_mm_min: f64, centre_mm: f64) -> f64 {
+        if !self.moves_slides() {
+            return feed_mm_min;
+        }
+        self.feed = NOTHING;
+        feed_mm_min / centre_mm.max(LEAST_MM)
+    }
+
+    fn moves_slides(&self) -> bool {
+        self.rotary.is_some_and(|rotary| rotary.pivot_mm.is_some())
+    }
+
     /// The words of a move: those that say something new, or all that are known where none does.
     #[inline]
-    fn block(&mut self, rapid: bool, to_mm: [Option<f64>; 3], feed_mm_min: Option<f64>) -> Result<(), GcodeError> {
+    fn block(
+        &mut self,
+        rapid: bool,
+        to_mm: [Option<f64>; 3],
+        tilt_rad: Option<f64>,
+        feed_mm_min: Option<f64>,
+    ) -> Result<(), GcodeError> {
         let words = &self.dialect.words;
         let (motion, begins) = if rapid { (Motion::Rapid, &words.rapid) } else { (Motion::Line, &words.line) };
         self.begins(motion, begins);
@@ -219,15 +263,22 @@ impl<'a> Lines<'a> {
             to[k] = self.rounded(k, value_mm)?;
         }
         let feed = feed_mm_min.map_or(Ok(self.feed), |feed| self.rounded_feed(feed))?;
-        let nothing_new = to == self.last && feed == self.feed;
+        let turned = tilt_rad.map_or(Ok(self.turned), |tilt| self.rounded_turn(tilt))?;
+        let still = to == self.last && turned == self.turned;
+        // An inverse time alone would be no move.
+        let nothing_new = still && (feed == self.feed || self.moves_slides());
         let mut first = true;
         for (k, &value) in to.iter().enumerate() {
             if value != self.last[k] || (nothing_new && value != NOTHING) {
                 self.place(&words.axes[k], value, &mut first);
             }
         }
+        if let Some(rotary) = self.rotary.filter(|_| turned != self.turned) {
+            self.between(&mut first);
+            self.push_turn(rotary.letter, turned);
+        }
         self.feed(feed, &mut first);
-        self.last = to;
+        (self.last, self.turned) = (to, turned);
         Ok(())
     }
 
@@ -343,6 +394,23 @@ impl<'a> Lines<'a> {
         Ok((value_mm * self.per_mm).round() as i64)
     }
 
+    fn push_turn(&mut self, letter: char, turned: i64) {
+        let numbers = &self.dialect.numbers;
+        self.text.push(letter as u8);
+        if numbers.plus && turned >= 0 {
+            self.text.push(b'+');
+        }
+        push_decimals(&mut self.text, turned, numbers.angle_decimals);
+    }
+
+    /// An angle on the scale of the axis, in the last digit that is written.
+    fn rounded_turn(&self, tilt_rad: f64) -> Result<i64, GcodeError> {
+        let Some(rotary) = self.rotary.filter(|_| tilt_rad.is_finite()) else {
+            return Err(GcodeError::NotFinite { axis: 'A', value_mm: tilt_rad, number: self.count });
+        };
+        Ok((rotary.on_scale_rad(tilt_rad).to_degrees() * self.per_deg).round() as i64)
+    }
+
     /// A feed in the last digit that is written.
     fn rounded_feed(&self, feed_mm_min: f64) -> Result<i64, GcodeError> {
         match (feed_mm_min * self.feed_per).round() as i64 {
@@ -405,20 +473,18 @@ impl<'a> Frame<'a> {
         let of = |line: &String| line.replace(NAME, &name).replace(NUMBER, &number);
         let [mode, mode_ends] = &post.mode;
         let of_arcs = post.arcs.iter().map(|(words, _)| *words);
+        let turning = header.rotary.as_ref().map(|rotary| dialect.turning(rotary)).transpose()?;
+        let [turn, turn_ends] = turning.map_or([&[][..]; 2], |turning| [&turning.begin[..], &turning.end[..]]);
+        let arcs_begin = of_arcs.clone().flat_map(|arcs| &arcs.begin);
+        let arcs_end = of_arcs.flat_map(|arcs| &arcs.end);
         Ok(Self {
             dialect,
             begin: dialect.program.begin.iter().map(of).collect(),
-            setup: dialect
-                .program
-                .setup
+            setup: dialect.program.setup.iter().chain(arcs_begin).chain(mode).chain(turn).cloned().collect(),
+            end: turn_ends
                 .iter()
-                .chain(of_arcs.clone().flat_map(|arcs| &arcs.begin))
-                .chain(mode)
-                .cloned()
-                .collect(),
-            end: mode_ends
-                .iter()
-                .chain(of_arcs.flat_map(|arcs| &arcs.end))
+                .chain(mode_ends)
+                .chain(arcs_end)
                 .cloned()
                 .chain(dialect.program.end.iter().map(of))
                 .collect(),
@@ -510,6 +576,11 @@ fn header_words(h: &ProgramHeader, s: &Summary, arcs: Option<&ArcSummary>, lines
     say(format_args!("units: mm, mm/min; a correction is positive where it leaves material, along the outward normal"));
     say(format_args!("level over the nominal surface: {} mm", short(h.level_mm)));
     say(format_args!("wheel: {}", h.wheel));
+    if let Some(rotary) = &h.rotary {
+        let [tilt, places] = tilt_in_words(rotary, h, s);
+        say(format_args!("tilt: {tilt}"));
+        say(format_args!("places: {places}"));
+    }
     for taken in &h.parameters {
         say(format_args!("parameter: {taken}"));
     }
@@ -528,6 +599,26 @@ fn header_words(h: &ProgramHeader, s: &Summary, arcs: Option<&ArcSummary>, lines
     say(format_args!("lines: {lines}"));
     say(format_args!("spindle and coolant are the machine's own; start them before"));
     said
+}
+
+/// What the header says of a wheel that leans, and of what X, Y and Z are then.
+fn tilt_in_words(rotary: &Rotary, h: &ProgramHeader, s: &Summary) -> [String; 2] {
+    let about = if rotary.about == TurnAxis::X { "x" } else { "y" };
+    let sense = if rotary.reversed { "left-handed" } else { "right-handed" };
+    let reached = s.turned.map_or(String::new(), |turned| {
+        let [a, b] = [turned.least_rad, turned.most_rad].map(|peak| rotary.on_scale_rad(peak.value).to_degrees());
+        format!(", {:.4} to {:.4} degrees", a.min(b), a.max(b))
+    });
+    let of = match rotary.pivot_mm {
+        None => "XYZ is the wheel's centre, which the control keeps".to_owned(),
+        Some(v) => format!(
+            "the slides', XYZ is the wheel's centre with the head upright; the pivot is {} {} {} mm from it, feeds are inverse times",
+            short(v.x),
+            short(v.y),
+            short(v.z)
+        ),
+    };
+    [format!("{}, {} turns about {about} {sense}{reached}", h.lean, rotary.letter), of]
 }
 
 /// Returns words that may stand in a comment: no brackets, which would end it or begin another, and plain characters.
@@ -582,6 +673,8 @@ mod tests {
             uncorrected: false,
             level_mm: 0.0,
             from_below: false,
+            rotary: None,
+            lean: String::new(),
             wheel: "ball".into(),
             parameters: Vec::new(),
             tracks: "raster".into(),
@@ -608,6 +701,7 @@ mod tests {
             jerk_mm_s3: Peak::default(),
             feed_mm_min: 600.0,
             run_up_mm: 0.0,
+            turned: None,
         };
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("part.ngc");

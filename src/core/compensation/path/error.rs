@@ -42,6 +42,32 @@ pub enum PathError {
     )]
     Body { x_mm: f64, y_mm: f64, at_x_mm: f64, at_y_mm: f64, depth_mm: f64, limit_mm: f64 },
     #[error(
+        "{refused}; tilted by {angle_deg} degrees, right-handed about what {letter} turns about, this wheel reaches everywhere: write [grinding.tilt] with \
+         angle_deg = {angle_deg:?}"
+    )]
+    Upright { refused: Box<PathError>, letter: char, angle_deg: f64 },
+    #[error(
+        "grinding.tilt is to tilt the wheel, and the grinder has no rotary axis; leave it out, or describe the axis: [grinder.rotary] in the \
+         cell file"
+    )]
+    NoRotary,
+    #[error(
+        "a wheel that comes from below is not tilted by grinding.tilt; leave it out, or turn the model so that the part is ground from above"
+    )]
+    TiltBelow,
+    #[error("a table of Z over X and Y knows nothing of a wheel that is tilted; grind by the program")]
+    TableOfTilted,
+    #[error(
+        "the wheel would be tilted to {letter} {found_deg:.3} degrees at x {x_mm:.3}, y {y_mm:.3} mm, beyond the {least_deg} to {most_deg} degrees of the \
+         axis (grinder.rotary); change grinding.tilt.angle_deg by {by_deg:.1} degrees or more towards the range, or turn the part"
+    )]
+    Tilt { letter: char, found_deg: f64, x_mm: f64, y_mm: f64, least_deg: f64, most_deg: f64, by_deg: f64 },
+    #[error(
+        "the path turns {letter} at {found_deg_min:.1} degrees a minute at x {x_mm:.3}, y {y_mm:.3} mm, faster than the axis' {limit_deg_min} \
+         (grinder.rotary.largest_rate_deg_min); lower the feed to {feed_mm_min:.1} mm/min, or tilt the wheel by a constant angle"
+    )]
+    Rate { letter: char, found_deg_min: f64, x_mm: f64, y_mm: f64, limit_deg_min: f64, feed_mm_min: f64 },
+    #[error(
         "the path reaches {axis} {found_mm:.3} mm, beyond the travel of {least_mm} to {most_mm} mm; move the part or its work offset, or \
          shorten the overrun"
     )]

@@ -31,6 +31,12 @@ pub(super) fn track_mm(wanted: &Wanted, outline: &Aperture, options: &PathOption
     }
 }
 
+/// Whether the wheel reaches a few places: most of what does not fit fails there.
+pub(super) fn may_fit(wanted: &Wanted, outline: &Aperture, options: &PathOptions) -> bool {
+    const FEW: usize = 21;
+    places(outline, FEW).iter().all(|place| fit_at(&wanted.bend(*place), *place, outline, options).is_ok())
+}
+
 /// The lesser distance or, where the wheel is refused, the refusal that says most: the narrowest hollow, which tells the wheel that fits
 /// everywhere, and else the first, so that the same path is refused with the same words each time.
 fn narrower(a: Result<f64, PathError>, b: Result<f64, PathError>) -> Result<f64, PathError> {
@@ -68,22 +74,23 @@ fn fit_at(bend: &Bend, place: [f64; 2], outline: &Aperture, options: &PathOption
     if !finite {
         return Err(PathError::NotAHeight { x_mm, y_mm });
     }
-    let slope = normal.z.clamp(-1.0, 1.0).acos();
+    let slope = normal.dot(&options.head_at(&bend.contact)).clamp(-1.0, 1.0).acos();
     if slope > STEEPEST_RAD {
         let (slope_deg, limit_deg) = (slope.to_degrees(), STEEPEST_RAD.to_degrees());
         return Err(PathError::Steep { x_mm, y_mm, slope_deg, limit_deg });
     }
-    if options.wheel.centre(&bend.contact).is_none() {
+    let wheel = options.wheel_at(&bend.contact);
+    if wheel.centre(&bend.contact).is_none() {
         return Err(PathError::CannotTouch { x_mm, y_mm });
     }
-    let wheel = wheel_in(bend, &options.wheel);
-    let [a, b, c] = std::array::from_fn(|k| wheel[k] - MARGIN * bend.curvature[k]);
+    let curved = wheel_in(bend, &wheel);
+    let [a, b, c] = std::array::from_fn(|k| curved[k] - MARGIN * bend.curvature[k]);
     // The gap opens in every direction where both the trace and the determinant of this are positive.
     if !(a + c > 0.0 && a * c - b * b > 0.0) {
-        return Err(hollow(bend, &wheel, place));
+        return Err(hollow(bend, &curved, place));
     }
     let TrackSpacing::Scallop { height_mm: height, .. } = options.spacing else { return Ok(f64::INFINITY) };
-    let groove = groove(bend, from_middle(outline, place), &options.wheel, options.pattern);
+    let groove = groove(bend, from_middle(outline, place), &wheel, options.pattern);
     Ok((8.0 * height / groove.bend).sqrt() / groove.stretch)
 }
 
@@ -118,13 +125,15 @@ fn hollow(bend: &Bend, wheel: &[f64; 3], [x_mm, y_mm]: [f64; 2]) -> PathError {
 ///
 /// Curvature tells that a wheel fits where it touches; this tells that it does not touch elsewhere: the far side of a cup, the flank of a
 /// disc, the opposite wall of a valley.
-pub(super) fn check_body(wanted: &Wanted, outline: &Aperture, wheel: &Wheel) -> Result<(), PathError> {
+pub(super) fn check_body(wanted: &Wanted, outline: &Aperture, options: &PathOptions) -> Result<(), PathError> {
     let ground: Vec<([f64; 2], Point)> =
         places(outline, GROUND).into_par_iter().map(|at| (at, wanted.at(at).point)).collect();
-    let reach = wheel.reach_mm() + DEEPEST_MM;
+    let reach = options.wheel.reach_mm() + DEEPEST_MM;
     let one = |place: &[f64; 2]| {
         let [x_mm, y_mm] = *place;
-        let centre = wheel.centre(&wanted.at(*place)).ok_or(PathError::CannotTouch { x_mm, y_mm })?;
+        let contact = wanted.at(*place);
+        let wheel = options.wheel_at(&contact);
+        let centre = wheel.centre(&contact).ok_or(PathError::CannotTouch { x_mm, y_mm })?;
         let (mut depth_mm, mut deepest_at) = (DEEPEST_MM, None);
         for (at, point) in &ground {
             let from = point - centre;

@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{PathError, Wheel};
+use super::wheel::LEAST_LEAN;
+use super::{Lean, PathError, Rotary, Wheel};
 
 /// How tracks run.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -50,6 +51,10 @@ pub enum PathMode {
 pub struct PathOptions {
     /// The wheel.
     pub wheel: Wheel,
+    /// The rotary axis of the machine's head, if it has one.
+    pub rotary: Option<Rotary>,
+    /// How the wheel leans by it; `None` leaves the axis alone, and programs do not name it.
+    pub lean: Option<Lean>,
     /// Whether the wheel comes from -z. The surface is then given as it is seen from there, with z turned round, and so is the wheel: its
     /// spindle, its heights. The moves of the path are in the model frame.
     pub from_below: bool,
@@ -82,6 +87,8 @@ impl PathOptions {
     pub fn new(wheel: Wheel, track_mm: f64, feed_mm_min: f64) -> Self {
         Self {
             wheel,
+            rotary: None,
+            lean: None,
             from_below: false,
             pattern: Pattern::Raster,
             one_way: false,
@@ -129,6 +136,27 @@ impl PathOptions {
             if !(found >= 0.0 && found.is_finite()) {
                 return Err(PathError::Option { key, found, allowed: "a finite number, 0 or above" });
             }
+        }
+        self.check_lean()
+    }
+
+    /// Refuses a wheel that leans by what the machine has not.
+    fn check_lean(&self) -> Result<(), PathError> {
+        let Some(lean) = self.lean else { return Ok(()) };
+        if self.rotary.is_none() {
+            return Err(PathError::NoRotary);
+        }
+        if self.from_below {
+            return Err(PathError::TiltBelow);
+        }
+        let (Lean::Constant { angle_rad: found } | Lean::Following { lead_rad: found }) = lean;
+        if !found.is_finite() {
+            return Err(PathError::Option { key: "tilt (rad)", found, allowed: "a finite number" });
+        }
+        let is_ball = matches!(self.wheel, Wheel::Sphere { .. });
+        if is_ball && matches!(lean, Lean::Following { .. }) && found.abs() < LEAST_LEAN {
+            let allowed = "2 degrees or more to either side: the pole of a ball stands still";
+            return Err(PathError::Option { key: "lead of a ball (rad)", found, allowed });
         }
         Ok(())
     }

@@ -14,8 +14,8 @@
 use rayon::prelude::*;
 
 use super::fit::{PLACES, on_grid, wheel_in};
-use super::wanted::Bend;
-use super::{PathOptions, Pattern, ToolPath, Wanted, Wheel};
+use super::wanted::{Bend, Contact};
+use super::{Pattern, ToolPath, Wanted, Wheel};
 use crate::geometry::{Aperture, Vector};
 
 /// The rms of a parabola about its mean, over its height.
@@ -36,10 +36,19 @@ pub struct Scallops {
 }
 
 impl Scallops {
-    /// Returns what tracks leave on a wanted surface. Where the wheel does not fit the surface there are none, and no path either.
-    pub fn between(wanted: &Wanted, outline: &Aperture, wheel: &Wheel, pattern: Pattern, track_mm: f64) -> Self {
+    /// Returns what tracks leave on a wanted surface, by the wheel as it stands where it touches. Where the wheel does not fit the surface there are
+    /// none, and no path either.
+    pub fn between(
+        wanted: &Wanted,
+        outline: &Aperture,
+        wheel_at: impl Fn(&Contact) -> Wheel + Sync,
+        pattern: Pattern,
+        track_mm: f64,
+    ) -> Self {
         let height = |place: &[f64; 2]| {
-            let Groove { bend, stretch } = groove(&wanted.bend(*place), from_middle(outline, *place), wheel, pattern);
+            let bend = wanted.bend(*place);
+            let wheel = wheel_at(&bend.contact);
+            let Groove { bend, stretch } = groove(&bend, from_middle(outline, *place), &wheel, pattern);
             let height = (track_mm * stretch).powi(2) * bend / 8.0;
             if height.is_finite() { height } else { 0.0 }
         };
@@ -72,8 +81,9 @@ impl Scallops {
 impl ToolPath {
     /// Returns what this path leaves between its tracks.
     pub fn scallops(&self) -> Scallops {
-        let PathOptions { wheel, pattern, .. } = self.options();
-        Scallops::between(self.wanted(), self.outline(), wheel, *pattern, self.track_mm())
+        let options = self.options();
+        let wheel_at = |contact: &Contact| options.wheel_at(contact);
+        Scallops::between(self.wanted(), self.outline(), wheel_at, options.pattern, self.track_mm())
     }
 }
 
@@ -118,11 +128,12 @@ pub(super) fn groove(bend: &Bend, [x, y]: [f64; 2], wheel: &Wheel, pattern: Patt
 
 #[cfg(test)]
 mod tests {
+    use super::super::PathOptions;
     use super::super::fit::tests::{PART, ball, path, quadric};
     use super::*;
 
     fn between(wanted: &Wanted, wheel: Wheel, track_mm: f64) -> Scallops {
-        Scallops::between(wanted, &PART, &wheel, Pattern::Raster, track_mm)
+        Scallops::between(wanted, &PART, |_| wheel, Pattern::Raster, track_mm)
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::{Move, Moves, PathError, ToolPath};
+use super::{Move, Moves, PathError, Rotary, ToolPath};
 use crate::geometry::{Point, Vector};
 
 /// Most points of a path.
@@ -59,6 +59,19 @@ pub struct Peak {
     pub feed_mm_min: f64,
 }
 
+/// How the head turns along a path; angles right-handed, in rad.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Turned {
+    /// By which axis.
+    pub rotary: Rotary,
+    /// Least tilt.
+    pub least_rad: Peak,
+    /// Largest tilt.
+    pub most_rad: Peak,
+    /// Largest rate at feed.
+    pub rate_rad_s: Peak,
+}
+
 /// A path as a whole.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Summary {
@@ -70,7 +83,7 @@ pub struct Summary {
     pub least_mm: [f64; 3],
     /// Largest x, y, z.
     pub most_mm: [f64; 3],
-    /// Length of the moves at feed.
+    /// Length of the wheel's way at feed.
     pub length_mm: f64,
     /// Length of the rapid moves.
     pub rapid_mm: f64,
@@ -78,7 +91,7 @@ pub struct Summary {
     pub seconds: f64,
     /// Largest speed of each axis, in mm/s.
     pub speed_mm_s: [Peak; 3],
-    /// Largest acceleration across the path, v^2 times its curvature, in mm/s2.
+    /// Largest acceleration across the wheel's path, v^2 times its curvature, in mm/s2.
     pub acceleration_mm_s2: Peak,
     /// Largest change of that acceleration in time while the wheel is on the part or its overrun, in mm/s3: v^3 (k'^2 + k^4)^(1/2) for a curvature k
     /// that changes by k' along the path. Where it comes down or lifts off a controller may go slower and no harm is done.
@@ -87,6 +100,8 @@ pub struct Summary {
     pub feed_mm_min: f64,
     /// Length from standstill to the part.
     pub run_up_mm: f64,
+    /// How the head turns, where the wheel leans.
+    pub turned: Option<Turned>,
 }
 
 impl ToolPath {
@@ -109,6 +124,7 @@ impl ToolPath {
             jerk_mm_s3: Peak::default(),
             feed_mm_min: options.feed_mm_min,
             run_up_mm: options.overrun_mm + options.lead_mm,
+            turned: options.leaning().map(Turned::not_yet),
         };
         let tracks: Vec<Summary> = (0..self.tracks())
             .into_par_iter()
@@ -132,7 +148,7 @@ impl Summary {
     fn take(&mut self, mut moves: Moves, safe_z_mm: f64) {
         let mut last: Option<Point> = None;
         let mut before: Option<Bend> = None;
-        let mut height = safe_z_mm;
+        let (mut height, mut tilted) = (safe_z_mm, None);
         while let Some(one) = moves.next() {
             self.moves += 1;
             match one {
@@ -143,28 +159,49 @@ impl Summary {
                     height = z;
                 }
                 Move::RapidXy(_) => {}
-                Move::Feed { at, feed_mm_min } => {
-                    self.points += 1;
-                    for k in 0..3 {
-                        (self.least_mm[k], self.most_mm[k]) = (self.least_mm[k].min(at[k]), self.most_mm[k].max(at[k]));
-                    }
-                    if let Some(from) = last {
-                        self.step(&(at - from), &at, feed_mm_min, moves.bend);
-                        let now = moves.on_span.then(|| Bend { bend: moves.bend, chord_mm: (at - from).norm() });
-                        if let Some((before, now)) = before.zip(now) {
-                            self.bends_anew(before, now, from, feed_mm_min);
-                        }
-                        before = now;
-                    }
-                    last = Some(at);
+                Move::RapidTilted { to_mm, tilt_rad } => {
+                    tilted = Some(tilt_rad);
+                    self.turned.iter_mut().for_each(|turned| turned.to(tilt_rad, to_mm));
                 }
+                Move::FeedTilted { at, tilt_rad, feed_mm_min, centre_mm } => {
+                    let seconds = 60.0 * centre_mm / feed_mm_min;
+                    let by_rad = tilted.replace(tilt_rad).map_or(0.0, |from| tilt_rad - from);
+                    self.turned.iter_mut().for_each(|turned| turned.by(by_rad, tilt_rad, seconds, &at, feed_mm_min));
+                    self.feed(&mut last, &mut before, &moves, (at, feed_mm_min, Some(centre_mm)));
+                }
+                Move::Feed { at, feed_mm_min } => self.feed(&mut last, &mut before, &moves, (at, feed_mm_min, None)),
             }
         }
     }
 
+    /// Takes in a move at feed; the wheel's centre goes as far as the slides do, unless it is told how far.
     #[inline]
-    fn step(&mut self, by: &Vector, at: &Point, feed_mm_min: f64, bend: f64) {
-        let (length, speed) = (by.norm(), feed_mm_min / 60.0);
+    fn feed(
+        &mut self,
+        last: &mut Option<Point>,
+        before: &mut Option<Bend>,
+        moves: &Moves,
+        (at, feed_mm_min, centre_mm): (Point, f64, Option<f64>),
+    ) {
+        self.points += 1;
+        for k in 0..3 {
+            (self.least_mm[k], self.most_mm[k]) = (self.least_mm[k].min(at[k]), self.most_mm[k].max(at[k]));
+        }
+        if let Some(from) = *last {
+            let chord_mm = centre_mm.unwrap_or_else(|| (at - from).norm());
+            self.step(&(at - from), chord_mm, &at, feed_mm_min, moves.bend);
+            let now = moves.on_span.then_some(Bend { bend: moves.bend, chord_mm });
+            if let Some((before, now)) = before.zip(now) {
+                self.bends_anew(before, now, from, feed_mm_min);
+            }
+            *before = now;
+        }
+        *last = Some(at);
+    }
+
+    #[inline]
+    fn step(&mut self, by: &Vector, length: f64, at: &Point, feed_mm_min: f64, bend: f64) {
+        let speed = feed_mm_min / 60.0;
         self.length_mm += length;
         self.seconds += length / speed;
         let share = if length > 0.0 { speed / length } else { 0.0 };
@@ -203,6 +240,7 @@ impl Summary {
             speed_mm_s: std::array::from_fn(|k| larger(self.speed_mm_s[k], other.speed_mm_s[k])),
             acceleration_mm_s2: larger(self.acceleration_mm_s2, other.acceleration_mm_s2),
             jerk_mm_s3: larger(self.jerk_mm_s3, other.jerk_mm_s3),
+            turned: self.turned.zip(other.turned).map(|(a, b)| a.and(b)),
             ..self
         }
     }
@@ -210,7 +248,7 @@ impl Summary {
     /// Compares a path with what a machine can do.
     ///
     /// # Errors
-    /// Travel, speed of an axis, acceleration across the path, its change in time on the part, and a run-up longer than the way to the part.
+    /// Travel and range of the head, speed of an axis and rate of the head, acceleration across the path, its change in time on the part, and a run-up longer than the way to the part.
     pub fn check(&self, limits: &Limits) -> Result<(), PathError> {
         if let Some([least, most]) = limits.travel_mm {
             for (k, axis) in ['X', 'Y', 'Z'].into_iter().enumerate() {
@@ -231,6 +269,7 @@ impl Summary {
                 }
             }
         }
+        self.turned.map_or(Ok(()), |turned| turned.check())?;
         let Peak { value: found_mm_s2, at_mm: [x_mm, y_mm], feed_mm_min } = self.acceleration_mm_s2;
         if let Some(limit_mm_s2) = limits.acceleration_mm_s2.filter(|limit| found_mm_s2 > *limit) {
             let feed_mm_min = (feed_mm_min * (limit_mm_s2 / found_mm_s2).sqrt()).floor();
@@ -245,6 +284,64 @@ impl Summary {
         if found_mm > self.run_up_mm {
             let feed_mm_min = limits.feed_of_run_up(self.run_up_mm).floor();
             return Err(PathError::RunUp { found_mm, limit_mm: self.run_up_mm, feed_mm_min });
+        }
+        Ok(())
+    }
+}
+
+impl Turned {
+    fn not_yet(rotary: &Rotary) -> Self {
+        let [least, most] = [f64::INFINITY, f64::NEG_INFINITY].map(|value| Peak { value, ..Peak::default() });
+        Self { rotary: *rotary, least_rad: least, most_rad: most, rate_rad_s: Peak::default() }
+    }
+
+    fn to(&mut self, tilt_rad: f64, at_mm: [f64; 2]) {
+        let here = Peak { value: tilt_rad, at_mm, feed_mm_min: 0.0 };
+        if tilt_rad < self.least_rad.value {
+            self.least_rad = here;
+        }
+        if tilt_rad > self.most_rad.value {
+            self.most_rad = here;
+        }
+    }
+
+    fn by(&mut self, by_rad: f64, tilt_rad: f64, seconds: f64, at: &Point, feed_mm_min: f64) {
+        let at_mm = [at.x, at.y];
+        self.to(tilt_rad, at_mm);
+        let value = if by_rad == 0.0 { 0.0 } else { by_rad.abs() / seconds.max(f64::MIN_POSITIVE) };
+        if value > self.rate_rad_s.value {
+            self.rate_rad_s = Peak { value, at_mm, feed_mm_min };
+        }
+    }
+
+    fn and(self, other: Self) -> Self {
+        let larger = |a: Peak, b: Peak| if b.value > a.value { b } else { a };
+        let less = |a: Peak, b: Peak| if b.value < a.value { b } else { a };
+        Self {
+            least_rad: less(self.least_rad, other.least_rad),
+            most_rad: larger(self.most_rad, other.most_rad),
+            rate_rad_s: larger(self.rate_rad_s, other.rate_rad_s),
+            ..self
+        }
+    }
+
+    fn check(&self) -> Result<(), PathError> {
+        let Rotary { letter, range_rad, rate_rad_s, .. } = self.rotary;
+        let [least_deg, most_deg] = range_rad.map(f64::to_degrees);
+        for Peak { value, at_mm: [x_mm, y_mm], .. } in [self.least_rad, self.most_rad] {
+            let found_deg = self.rotary.on_scale_rad(value).to_degrees();
+            // Rounding is no excess.
+            let by_deg = (least_deg - found_deg).max(found_deg - most_deg);
+            if by_deg > 1e-9 {
+                return Err(PathError::Tilt { letter, found_deg, x_mm, y_mm, least_deg, most_deg, by_deg });
+            }
+        }
+        let Peak { value, at_mm: [x_mm, y_mm], feed_mm_min } = self.rate_rad_s;
+        if value > rate_rad_s * (1.0 + 1e-9) {
+            let [found_deg_min, limit_deg_min] = [value, rate_rad_s].map(|rate| 60.0 * rate.to_degrees());
+            // A slower spiral has its own feed at this place.
+            let feed_mm_min = feed_mm_min * rate_rad_s / value;
+            return Err(PathError::Rate { letter, found_deg_min, x_mm, y_mm, limit_deg_min, feed_mm_min });
         }
         Ok(())
     }

@@ -3,6 +3,7 @@
 use rayon::prelude::*;
 
 use super::options::PathOptions;
+use super::tilt::{Stand, or_tilted};
 use super::tracks::{Span, Tracks};
 use super::{PathError, Wanted, fit};
 use crate::geometry::{Aperture, Point};
@@ -31,13 +32,33 @@ impl ToolPath {
     /// Options that make no path, and a wheel that does not fit, each with place, value, limit and remedy.
     pub fn new(wanted: Wanted, outline: Aperture, options: PathOptions) -> Result<Self, PathError> {
         options.check()?;
-        let track_mm = fit::track_mm(&wanted, &outline, &options)?;
-        let tracks = Tracks::lay(&outline, &options, track_mm)?;
         let grain_mm = wanted.grain_mm();
+        let tracks = Tracks { spans: Vec::new(), track_mm: f64::NAN };
         let mut path = Self { wanted, outline, options, tracks, safe_z_mm: f64::INFINITY, grain_mm };
-        path.safe_z_mm = path.highest_mm()? + options.safe_height_mm;
-        fit::check_body(&path.wanted, &path.outline, &options.wheel)?;
-        Ok(path)
+        match path.lay() {
+            Ok(()) => Ok(path),
+            Err(refused) => Err(or_tilted(refused, &options, |tilted| {
+                path.options = tilted;
+                fit::may_fit(&path.wanted, &path.outline, &tilted) && path.lay().is_ok()
+            })),
+        }
+    }
+
+    fn lay(&mut self) -> Result<(), PathError> {
+        let track_mm = fit::track_mm(&self.wanted, &self.outline, &self.options)?;
+        self.tracks = Tracks::lay(&self.outline, &self.options, track_mm)?;
+        self.safe_z_mm = self.highest_mm()? + self.options.safe_height_mm + self.options.lift_mm();
+        fit::check_body(&self.wanted, &self.outline, &self.options)
+    }
+
+    /// Returns the least angle between the upright direction of the head and a normal of the part, in rad: at 0 the pole of a ball touches, which
+    /// stands still.
+    pub fn least_lean_rad(&self) -> f64 {
+        let lean = |place: [f64; 2]| {
+            let contact = self.wanted.at(place);
+            contact.normal.angle(&self.options.head_at(&contact))
+        };
+        fit::on_grid(&self.outline, fit::PLACES).into_iter().map(lean).fold(f64::INFINITY, f64::min)
     }
 
     /// Returns the distance of the tracks over x and y, in millimetres.
@@ -86,16 +107,21 @@ impl ToolPath {
         &self.outline
     }
 
-    /// Returns where the wheel's centre is at a place of a track; NaN where a rim cannot touch, which [`ToolPath::new`] has refused.
+    /// Returns where the wheel stands at a place of a track; NaN where a rim cannot touch, which [`ToolPath::new`] has refused.
     #[inline]
-    pub(super) fn centre(&self, span: &Span, t: f64) -> Point {
+    pub(super) fn stand(&self, span: &Span, t: f64) -> Stand {
         let contact = self.wanted.at(span.place(t));
         let lifted = self.tracks.lift_mm(span, t, &self.options);
-        match self.options.wheel.centre(&contact) {
-            Some(centre) if lifted > 0.0 => centre + contact.normal * lifted,
-            Some(centre) => centre,
-            None => Point::new(f64::NAN, f64::NAN, f64::NAN),
-        }
+        let nowhere = Point::new(f64::NAN, f64::NAN, f64::NAN);
+        let none = Stand { centre: nowhere, tilt_rad: f64::NAN, at: nowhere, written_rad: f64::NAN };
+        self.options.stand(&contact, lifted).unwrap_or(none)
+    }
+
+    /// The height that has to be travelled over at a place of a track.
+    fn height_mm(&self, span: &Span, t: f64) -> f64 {
+        let contact = self.wanted.at(span.place(t));
+        let lifted = self.tracks.lift_mm(span, t, &self.options);
+        self.options.stand(&contact, lifted).map_or(f64::NAN, |stand| self.options.height_mm(&contact, lifted, &stand))
     }
 
     /// The highest place of the centre, looked for a millimetre apart on some of the tracks: the height of travel has room above it.
@@ -105,7 +131,7 @@ impl ToolPath {
             let count = (span.length_mm(from, to).ceil() as usize).clamp(8, 20_000);
             (0..=count)
                 .map(|k| from + (to - from) * k as f64 / count as f64)
-                .map(|t| (self.centre(span, t).z, t))
+                .map(|t| (self.height_mm(span, t), t))
                 .try_fold(
                     f64::NEG_INFINITY,
                     |most, (z, t)| if z.is_finite() { Ok(most.max(z)) } else { Err(span.place(t)) },
@@ -152,7 +178,7 @@ mod tests {
             for (up, down) in above.moves().zip(below.moves()) {
                 let mirrored = match up {
                     Move::RapidZ(z) => Move::RapidZ(-z),
-                    Move::RapidXy(_) => up,
+                    Move::RapidXy(_) | Move::RapidTilted { .. } | Move::FeedTilted { .. } => up,
                     Move::Feed { at, feed_mm_min } => Move::Feed { at: Point::new(at.x, at.y, -at.z), feed_mm_min },
                 };
                 assert_eq!(mirrored, down);

@@ -1,8 +1,9 @@
 //! Along the tracks, point by point: as far from each to the next as the chord error allows.
 
+use super::tilt::{Sag, Stand};
 use super::tracks::Span;
 use super::{Pattern, ToolPath};
-use crate::geometry::{Point, Vector};
+use crate::geometry::Point;
 
 /// Share of the chord error that a step aims at: the deviation is looked at in the middle of a step, and the largest is near it.
 const AIM: f64 = 0.8;
@@ -27,6 +28,24 @@ pub enum Move {
         /// How fast.
         feed_mm_min: f64,
     },
+    /// Rapidly in x and y, at the safe height, while the head turns.
+    RapidTilted {
+        /// Where to.
+        to_mm: [f64; 2],
+        /// How far the head is turned there, right-handed.
+        tilt_rad: f64,
+    },
+    /// Straight at a feed while the head turns in proportion.
+    FeedTilted {
+        /// Where to, in millimetres; the slides', where the control does not keep the wheel's centre.
+        at: Point,
+        /// How far the head is turned there, right-handed.
+        tilt_rad: f64,
+        /// How fast the wheel's centre moves.
+        feed_mm_min: f64,
+        /// How far it goes, which is not how far the slides go.
+        centre_mm: f64,
+    },
 }
 
 /// The moves of a path. Each point costs two places of the surface; nothing is stored.
@@ -43,6 +62,8 @@ pub struct Moves<'a> {
     pub(super) on_span: bool,
     /// The middle of the step that led to the last point, on the path; none where that began a track.
     pub(super) middle: Option<Point>,
+    /// How far the wheel's centre has gone to the last point given.
+    centre_mm: f64,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -62,7 +83,7 @@ struct Walk {
     to: f64,
     t: f64,
     step: f64,
-    at: Point,
+    at: Stand,
 }
 
 impl ToolPath {
@@ -80,14 +101,15 @@ impl ToolPath {
 impl<'a> Moves<'a> {
     /// The moves of some of the spans, which begin and end at the safe height.
     pub(super) fn of(path: &'a ToolPath, from: usize, to: usize) -> Self {
-        Self { path, next: from, end: to, state: State::Above, bend: 0.0, on_span: false, middle: None }
+        let (state, bend, on_span, middle, centre_mm) = (State::Above, 0.0, false, None, 0.0);
+        Self { path, next: from, end: to, state, bend, on_span, middle, centre_mm }
     }
 
     fn walk(&self, span: Span) -> Walk {
         let (from, to) = span.with_leads(self.path.options());
         let longest = self.path.options().longest_step_mm;
         let step = 0.25 * longest / span.speed_mm(from);
-        Walk { span, to, t: from, step, at: self.path.centre(&span, from) }
+        Walk { span, to, t: from, step, at: self.path.stand(&span, from) }
     }
 
     /// A move in the model frame.
@@ -97,7 +119,7 @@ impl<'a> Moves<'a> {
         match given {
             Move::RapidZ(z) => Move::RapidZ(upright(z)),
             Move::Feed { at, feed_mm_min } => Move::Feed { at: Point::new(at.x, at.y, upright(at.z)), feed_mm_min },
-            Move::RapidXy(_) => given,
+            Move::RapidXy(_) | Move::RapidTilted { .. } | Move::FeedTilted { .. } => given,
         }
     }
 
@@ -120,21 +142,41 @@ impl<'a> Moves<'a> {
                 walk.t + step * left.signum()
             };
             let taken = (t - walk.t).abs();
-            let at = path.centre(&span, t);
-            let middle = path.centre(&span, 0.5 * (walk.t + t));
-            let (sag, chord) = sag_mm(&walk.at, &middle, &at);
+            let at = path.stand(&span, t);
+            let middle = path.stand(&span, 0.5 * (walk.t + t));
+            let Sag { sag, chord, bent } = options.sag_mm(&walk.at, &middle, &at);
             let share = sag / (AIM * options.chord_error_mm);
             if share > 1.0 && taken > SHORTEST * longest {
                 step = taken * (0.95 / share.sqrt()).max(0.2);
                 continue;
             }
-            self.bend = 8.0 * sag / (chord * chord).max(f64::MIN_POSITIVE);
+            self.bend = 8.0 * bent / (chord * chord).max(f64::MIN_POSITIVE);
+            self.centre_mm = chord;
             let next = taken * (0.95 / share.max(1e-6).sqrt()).clamp(0.5, 2.0);
             let (low, high) = (span.from.min(span.to), span.from.max(span.to));
-            self.middle = Some(Point::new(middle.x, middle.y, path.upright(middle.z)));
+            self.middle = Some(Point::new(middle.at.x, middle.at.y, path.upright(middle.at.z)));
             self.on_span = low <= walk.t.min(t) && walk.t.max(t) <= high;
             walk = Walk { t, at, step: next, ..walk };
             return walk;
+        }
+    }
+
+    /// The move to a point.
+    #[inline]
+    fn feed(&self, stand: &Stand) -> Move {
+        let (at, feed_mm_min) = (stand.at, self.feed_mm_min());
+        match self.path.options().lean {
+            None => Move::Feed { at, feed_mm_min },
+            Some(_) => Move::FeedTilted { at, tilt_rad: stand.written_rad, feed_mm_min, centre_mm: self.centre_mm },
+        }
+    }
+
+    /// The rapid move over the first point of a track.
+    fn over(&self, walk: &Walk) -> Move {
+        let to_mm = [walk.at.at.x, walk.at.at.y];
+        match self.path.options().lean {
+            None => Move::RapidXy(to_mm),
+            Some(_) => Move::RapidTilted { to_mm, tilt_rad: walk.at.written_rad },
         }
     }
 
@@ -162,7 +204,7 @@ impl Iterator for Moves<'_> {
         let (state, given) = match self.state {
             State::Along(walk) if walk.t != walk.to => {
                 let walk = self.along(walk);
-                (State::Along(walk), Move::Feed { at: walk.at, feed_mm_min: self.feed_mm_min() })
+                (State::Along(walk), self.feed(&walk.at))
             }
             State::Along(_) => (State::Above, Move::RapidZ(safe)),
             State::Above if self.next < self.end => {
@@ -170,14 +212,15 @@ impl Iterator for Moves<'_> {
                 let first = self.next == 0;
                 self.next += 1;
                 // The wheel may be anywhere before the first move of all.
-                if first { (State::Over(walk), Move::RapidZ(safe)) } else { (State::Down(walk), xy(&walk)) }
+                if first { (State::Over(walk), Move::RapidZ(safe)) } else { (State::Down(walk), self.over(&walk)) }
             }
             State::Above => (State::Ended, Move::RapidZ(safe)),
-            State::Over(walk) => (State::Down(walk), xy(&walk)),
-            State::Down(walk) => (State::Begin(walk), Move::RapidZ((walk.at.z + APPROACH_MM).min(safe))),
+            State::Over(walk) => (State::Down(walk), self.over(&walk)),
+            State::Down(walk) => (State::Begin(walk), Move::RapidZ((walk.at.at.z + APPROACH_MM).min(safe))),
             State::Begin(walk) => {
                 (self.bend, self.on_span, self.middle) = (0.0, false, None);
-                (State::Along(walk), Move::Feed { at: walk.at, feed_mm_min: self.feed_mm_min() })
+                self.centre_mm = APPROACH_MM.min(safe - walk.at.at.z);
+                (State::Along(walk), self.feed(&walk.at))
             }
             State::Ended => return None,
         };
@@ -186,17 +229,4 @@ impl Iterator for Moves<'_> {
         // The last retreat has been given with the last track.
         if ended { None } else { Some(self.upright(given)) }
     }
-}
-
-fn xy(walk: &Walk) -> Move {
-    Move::RapidXy([walk.at.x, walk.at.y])
-}
-
-/// How far the middle of a step is from its chord, and how long the chord is.
-#[inline]
-fn sag_mm(from: &Point, middle: &Point, to: &Point) -> (f64, f64) {
-    let (chord, half): (Vector, Vector) = (to - from, middle - from);
-    let length2 = chord.norm_squared();
-    let along = if length2 > 0.0 { half.dot(&chord) / length2 } else { 0.0 };
-    ((half - chord * along).norm(), length2.sqrt())
 }

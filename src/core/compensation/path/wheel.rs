@@ -1,6 +1,6 @@
 //! The wheel: where its centre must be for it to touch a place, how it bends there, and what space it fills.
 //!
-//! **Axes.** The spindle's direction is a unit vector in the model frame, fixed during the program (three axes move). The point
+//! **Axes.** The spindle's direction is a unit vector in the model frame, fixed during the program unless a head tilts it. The point
 //! that a program moves is the centre of the ball, or the middle of the circle that the rim's own curve is swept around.
 //!
 //! ```text
@@ -21,7 +21,7 @@ use crate::geometry::{Point, Vector};
 use super::wanted::Contact;
 
 /// The least angle between the normal and the spindle of a rim or a ring, sine: nearer, the place of contact runs around the wheel.
-const LEAST_LEAN: f64 = 0.035;
+pub(super) const LEAST_LEAN: f64 = 0.035;
 
 /// A wheel.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -1,0 +1,83 @@
+//! A head that turns the wheel about one axis: where the wheel's centre is by what the slides and the scale of the axis show.
+//!
+//! ```text
+//!  pivot = slides + v          v: from the wheel's centre to the pivot with the head upright
+//!  centre = pivot - R v        R: the turn, about x for an A, about y for a B
+//! ```
+//!
+//! A control that keeps the wheel's centre does the same with its own figures: then the centre is where programs say.
+
+use crate::Vec3;
+use crate::program::{Program, Stop};
+
+/// A head.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Head {
+    /// What programs call its axis.
+    pub letter: char,
+    /// Whether its scale counts left-handed.
+    pub left_handed: bool,
+    /// Least and largest angle on its scale.
+    pub range_deg: [f64; 2],
+    /// From the wheel's centre to the pivot with the head upright, where the control leads the slides alone.
+    pub pivot_mm: Option<Vec3>,
+}
+
+impl Head {
+    /// Returns the centre of the wheel where slides and scale are.
+    pub fn centre_mm(&self, slides_mm: Vec3, scale_deg: f64) -> Vec3 {
+        let Some([u, v, w]) = self.pivot_mm else { return slides_mm };
+        let angle = if self.left_handed { -scale_deg } else { scale_deg }.to_radians();
+        let (s, c) = (angle.sin(), angle.cos());
+        let arm =
+            if self.letter == 'A' { [u, c * v - s * w, s * v + c * w] } else { [c * u + s * w, v, c * w - s * u] };
+        let pivot = [slides_mm[0] + u, slides_mm[1] + v, slides_mm[2] + w];
+        std::array::from_fn(|k| pivot[k] - arm[k])
+    }
+
+    /// Returns the centre of the wheel at a share of the way from a stop to the next; slides and head move in proportion.
+    pub fn along_mm(&self, from: &Stop, to: &Stop, share: f64) -> Vec3 {
+        let slides = std::array::from_fn(|k| from.at_mm[k] + share * (to.at_mm[k] - from.at_mm[k]));
+        let ends = from.turn_deg.or(to.turn_deg).zip(to.turn_deg);
+        ends.map_or(slides, |(a, b)| self.centre_mm(slides, a + share * (b - a)))
+    }
+
+    /// Tells why this head cannot do a program.
+    pub(crate) fn refuses(&self, program: &Program) -> Option<String> {
+        let letter = program.axis?;
+        if letter != self.letter {
+            return Some(format!("the program turns {letter}, and this machine has {}", self.letter));
+        }
+        if self.pivot_mm.is_some() && program.keeps_centre {
+            return Some("the program has the wheel's centre kept, and this control leads its slides alone".into());
+        }
+        if self.pivot_mm.is_none() && !(program.keeps_centre || program.by_kinematics) {
+            return Some("the program leads the slides, and this control keeps the wheel's centre".into());
+        }
+        let [least, most] = self.range_deg;
+        let turns = program.stops.iter().filter_map(|stop| stop.turn_deg);
+        let beyond = turns.into_iter().find(|turn| !(least - 1e-6..=most + 1e-6).contains(turn));
+        beyond.map(|turn| format!("{letter} {turn} is beyond {least} to {most} degrees"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn by_hand() {
+        let head = |letter, left_handed| Head {
+            letter,
+            left_handed,
+            range_deg: [-90.0, 90.0],
+            pivot_mm: Some([0.0, 0.0, 200.0]),
+        };
+        let close = |a: Vec3, b: Vec3| assert!((0..3).all(|k| (a[k] - b[k]).abs() < 1e-9), "{a:?} {b:?}");
+        // The pivot stays; the wheel below it swings to -x when B turns right-handed, to +y when A does.
+        close(head('B', false).centre_mm([0.0; 3], 90.0), [-200.0, 0.0, 200.0]);
+        close(head('A', false).centre_mm([0.0; 3], 90.0), [0.0, 200.0, 200.0]);
+        close(head('B', true).centre_mm([1.0, 2.0, 3.0], -90.0), [-199.0, 2.0, 203.0]);
+        close(head('B', false).centre_mm([1.0, 2.0, 3.0], 0.0), [1.0, 2.0, 3.0]);
+    }
+}
