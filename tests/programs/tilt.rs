@@ -211,12 +211,11 @@ fn a_tilt_of_nothing_writes_the_upright_program_and_the_words_of_the_axis() {
             format!("B{:.decimals$}", 0.0, decimals = decimals as usize)
         };
         // Numbers of blocks count the lines of the axis too.
+        // No comments, no names, and no words that only tell of the head.
         let is_move = |line: &&str| {
-            line.contains(['X', 'Z'])
-                && !line.contains("PGM")
-                && !line.contains("ORI")
-                && !line.starts_with(['(', ';'])
-                && !line.contains("; ")
+            let is_told =
+                ["PGM", "ORI", "TCPM", "; "].iter().any(|word| line.contains(word)) || line.starts_with(['(', ';']);
+            line.contains(['X', 'Z']) && !is_told
         };
         let bare = |line: &str| {
             let numbered = name == "sinumerik" || name == "heidenhain";

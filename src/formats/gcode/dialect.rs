@@ -393,10 +393,15 @@ pub enum DialectError {
     )]
     ArcsTilted,
     #[error(
-        "the dialect `{dialect}` has no words for a head that tilts the wheel where {where_so}; {remedy}, or write [rotary.{key}] into a dialect of \
-         your own"
+        "the dialect `{dialect}` has no words for a control that keeps the wheel's centre while the head tilts; say where the pivot is, \
+         grinder.rotary.pivot_mm, or write [rotary.tool_centre] into a dialect of your own"
     )]
-    Rotary { dialect: String, where_so: &'static str, remedy: &'static str, key: &'static str },
+    ToolCentre { dialect: String },
+    #[error(
+        "the dialect `{dialect}` has no words for slides that go with a head that tilts; leave grinder.rotary.pivot_mm out, if the control keeps the \
+         wheel's centre, or write [rotary.slides] into a dialect of your own"
+    )]
+    Slides { dialect: String },
     #[error(
         "programs of the dialect `{dialect}` have the numbers {least} to {most} (program.numbers), and cycle {cycle} is beyond; give it more"
     )]
@@ -493,22 +498,11 @@ impl Dialect {
     /// # Errors
     /// A way of tilting without words.
     pub fn turning(&self, rotary: &Rotary) -> Result<&Turning, DialectError> {
-        let (turning, where_so, remedy, key) = match rotary.pivot_mm {
-            None => (
-                &self.rotary.tool_centre,
-                "the control keeps the wheel's centre",
-                "say where the pivot is, grinder.rotary.pivot_mm",
-                "tool_centre",
-            ),
-            Some(_) => (
-                &self.rotary.slides,
-                "the program has the places of the slides",
-                "leave grinder.rotary.pivot_mm out, if the control keeps the wheel's centre",
-                "slides",
-            ),
-        };
         let dialect = || self.dialect.name.clone();
-        turning.as_ref().ok_or_else(|| DialectError::Rotary { dialect: dialect(), where_so, remedy, key })
+        match rotary.pivot_mm {
+            None => self.rotary.tool_centre.as_ref().ok_or_else(|| DialectError::ToolCentre { dialect: dialect() }),
+            Some(_) => self.rotary.slides.as_ref().ok_or_else(|| DialectError::Slides { dialect: dialect() }),
+        }
     }
 
     fn check_tolerance(&self, mode: &Mode, exactness: &Exactness, step_mm: f64) -> Result<(), DialectError> {
@@ -815,6 +809,13 @@ pub(super) mod tests {
         assert_eq!(keys(&|d| d.text.longest_line = 40), ["text.longest_line"]);
         assert_eq!(keys(&|d| d.dialect.extension = ".nc".into()), ["dialect.extension"]);
         assert_eq!(keys(&|d| d.path.blend.as_mut().unwrap().begin.push("G5\n".into())), ["path.blend.begin[1]"]);
+        let slides = |d: &mut Dialect, line: &str| d.rotary.slides.as_mut().unwrap().begin.push(line.into());
+        assert_eq!(keys(&|d| slides(d, "G93")), Vec::<String>::new());
+        assert_eq!(keys(&|d| slides(d, "G91")), ["rotary.slides.begin[1]"]);
+        assert_eq!(
+            keys(&|d| d.rotary.tool_centre.as_mut().unwrap().begin.push("G93".into())),
+            ["rotary.tool_centre.begin[1]"]
+        );
         assert_eq!(keys(&|d| d.blocks = Some(Blocks { last: 15, ..Blocks::default() })), ["blocks.last"]);
     }
 

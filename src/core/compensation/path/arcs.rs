@@ -611,7 +611,7 @@ mod tests {
                 let span = path.tracks.spans[k];
                 let (first, last) = span.with_leads(path.options());
                 let centre = |t: f64| {
-                    let p = path.centre(&span, t);
+                    let p = path.stand(&span, t).at;
                     Point::new(p.x, p.y, path.upright(p.z))
                 };
                 let (mut from, mut t) = (Point::origin(), first);
