@@ -108,7 +108,13 @@ fn write(path: &ToolPath, summary: &Summary, file: &Path) {
         tracks: String::new(),
         spark_out_passes: 0,
         simulation: true,
-        exactness: Exactness { mode: PathMode::Blend, tolerance_mm: 1e-4, controller_mm: None, chord_error_mm: 1e-4 },
+        exactness: Exactness {
+            mode: PathMode::Blend,
+            tolerance_mm: 1e-4,
+            controller_mm: None,
+            chord_error_mm: 1e-4,
+            arcs_within_mm: None,
+        },
     };
     let (dialect, _) = read_dialect(Path::new("config/dialects/linuxcnc.toml")).expect("a dialect that ships");
     write_program(file, &header, &dialect, summary, path).expect("a program");

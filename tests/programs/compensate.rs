@@ -3,11 +3,12 @@
 use std::fs;
 use std::path::PathBuf;
 
-use crate::path::{ProgramStep, error_mm, read};
+use crate::path::{ProgramStep, correction, error_mm, part, read, with};
 use crate::program::run;
 use regrind::compensation::{Correction, ErrorMap};
 use regrind::formats::{CorrectionIdentities, ErrorMapOrigin, write_correction, write_error_map};
 use regrind::geometry::Grid;
+use regrind_sim::program::Control;
 
 const GRID: Grid = Grid { columns: 121, rows: 81, first_mm: [-30.0, -20.0], spacing_mm: [0.5, 0.5] };
 const PART: [u8; 32] = [0xab; 32];
@@ -307,4 +308,29 @@ fn along_the_normals_the_ball_leaves_the_corrected_surface() {
             assert!(off.abs() < 2e-4, "{:.3} um at {x}, {y}", 1e3 * off);
         }
     }
+}
+
+#[test]
+fn a_program_that_was_written_in_arcs_keeps_them_where_the_correction_is_the_same() {
+    let mut part = part("biconic");
+    part.programs.options = with(&part.programs.options, part.programs.options.wheel, 6.0);
+    (part.programs.arcs_within_mm, part.programs.part_identity) = (Some(1e-4), PART);
+    let bench = Shop::new(|_, _| 0.0, "M2\n");
+    part.programs.write(&bench.path("base.ngc"), &correction(part.half_mm), [9; 32]).unwrap();
+    bench.save_error(|_, _| 0.004, Some([9; 32]));
+    let corrected = Control::Linuxcnc.read(&bench.compensate(&[]).unwrap()).unwrap();
+    let base = Control::Linuxcnc.read(&fs::read_to_string(bench.path("base.ngc")).unwrap()).unwrap();
+    assert_eq!(base.stops.len(), corrected.stops.len());
+    let mut turns = 0;
+    for (pair, same) in base.stops.windows(2).zip(corrected.stops.windows(2)) {
+        let Some(feed) = pair[1].feed_mm_min.filter(|_| pair[1].turn.is_some()) else { continue };
+        assert_eq!(same[1].feed_mm_min, Some(feed));
+        for share in [0.3, 1.0] {
+            let [was, is] = [pair, same].map(|pair| pair[1].on_the_way(pair[0].at_mm, share));
+            let off = [is[0] - was[0], is[1] - was[1], is[2] - was[2] + 0.004];
+            assert!(off.iter().all(|v| v.abs() < 3e-6), "{off:?}");
+        }
+        turns += 1;
+    }
+    assert!(turns > 100, "{turns}");
 }

@@ -334,9 +334,9 @@ impl<'a> Lines<'a> {
 
     /// The centre along the axes of a plane, in the order of the axes.
     fn centre(&mut self, letters: &[String; 3], plane: Plane, centre: [i64; 2], first: &mut bool) {
-        for k in 0..3 {
+        for (k, letter) in letters.iter().enumerate() {
             if let Some(at) = plane.0[..2].iter().position(|axis| *axis == k) {
-                self.place(&letters[k], centre[at], first);
+                self.place(letter, centre[at], first);
             }
         }
     }
