@@ -22,7 +22,7 @@ use crate::Vec3;
 use crate::body::Kind;
 use crate::part::{Grooves, HeightGrid, NODE_SPACING_MM, Part};
 use crate::process::{cut, smooth};
-use crate::shape::Shape;
+use crate::shape::foot;
 use crate::spec::{SpecError, WorldSpec};
 use crate::truth::{Source, State, Sweep, locked, stream};
 
@@ -319,31 +319,4 @@ fn crossed(grid: &HeightGrid, track: &Track, strip: [f64; 2]) -> Vec<(usize, [f6
         }));
     }
     nodes
-}
-
-/// Returns the foot of a point on a surface, from a place nearby, and how far along the normal the point is; none where that does not
-/// converge.
-///
-/// Solves (c - S) . S_x = 0 and (c - S) . S_y = 0 by Newton's method.
-fn foot(shape: &dyn Shape, centre: Vec3, [mut x, mut y]: [f64; 2]) -> Option<([f64; 2], f64)> {
-    for _ in 0..40 {
-        let ([p, q], [r, s, t]) = (shape.gradient(x, y), shape.hessian(x, y));
-        let off = [centre[0] - x, centre[1] - y, centre[2] - shape.height(x, y)];
-        let miss = [off[0] + p * off[2], off[1] + q * off[2]];
-        let [a, b, d] = [1.0 + p * p - r * off[2], p * q - s * off[2], 1.0 + q * q - t * off[2]];
-        let determinant = a * d - b * b;
-        let step = [(d * miss[0] - b * miss[1]) / determinant, (a * miss[1] - b * miss[0]) / determinant];
-        let longest = step[0].abs().max(step[1].abs());
-        if !longest.is_finite() || determinant <= 0.0 {
-            return None;
-        }
-        let damping = if longest > 2.0 { 2.0 / longest } else { 1.0 };
-        (x, y) = (x + damping * step[0], y + damping * step[1]);
-        if longest < 1e-10 {
-            let n = shape.normal(x, y);
-            let point = shape.point(x, y);
-            return Some(([x, y], (0..3).map(|k| (centre[k] - point[k]) * n[k]).sum()));
-        }
-    }
-    None
 }

@@ -2,11 +2,10 @@
 
 use crate::part::Part;
 use crate::program::Program;
+use crate::shape::foot;
 
 /// Places along a move are no farther apart than this, in millimetres.
 const APART_MM: f64 = 0.15;
-/// Steps of Newton's method down to a foot.
-const STEPS: usize = 12;
 /// A ball that is farther than this from where it should touch grinds nothing.
 const NEAR_MM: f64 = 1.0;
 
@@ -54,23 +53,8 @@ fn touches(part: &Part, program: &Program, radius_mm: f64) -> Vec<Touch> {
 
 /// The foot of the ball's centre on the nominal surface.
 fn touch(part: &Part, centre: [f64; 3], radius_mm: f64) -> Option<Touch> {
-    let shape = part.shape.as_ref();
-    let mut at_mm = [centre[0], centre[1]];
-    for _ in 0..STEPS {
-        // The way from the foot to the centre has no share along the surface: (x - cx) + z_x (z - cz) = 0, and the like for y.
-        let ([p, q], [r, s, t]) = (shape.gradient(at_mm[0], at_mm[1]), shape.hessian(at_mm[0], at_mm[1]));
-        let z = shape.height(at_mm[0], at_mm[1]) - centre[2];
-        let (f, g) = (at_mm[0] - centre[0] + p * z, at_mm[1] - centre[1] + q * z);
-        let (a, b, d) = (1.0 + p * p + r * z, p * q + s * z, 1.0 + q * q + t * z);
-        let determinant = a * d - b * b;
-        let step = [(d * f - b * g) / determinant, (a * g - b * f) / determinant];
-        at_mm = [at_mm[0] - step[0], at_mm[1] - step[1]];
-        if step[0].abs() + step[1].abs() < 1e-10 {
-            break;
-        }
-    }
-    let (point, normal) = (shape.point(at_mm[0], at_mm[1]), shape.normal(at_mm[0], at_mm[1]));
-    let height_mm = (0..3).map(|k| (centre[k] - point[k]) * normal[k]).sum::<f64>() - radius_mm;
+    let (at_mm, over_mm) = foot(part.shape.as_ref(), centre, [centre[0], centre[1]])?;
+    let height_mm = over_mm - radius_mm;
     (height_mm.abs() < NEAR_MM).then_some(Touch { at_mm, height_mm })
 }
 

@@ -30,6 +30,7 @@
 //!  dme        a server of I++ DME, which is told touch by touch what to do
 //!  rsh        a controller by LinuxCNC, which is told which program to run
 //!  wheel      what a wheel leaves that is led by a program
+//!  faults     what is to go wrong at one of these three
 //!  hits       a machine that prints a line for each touch, and hears nothing
 //!  seen       what the machine saw and did
 //!  wire       Modbus TCP and RTU and I++ DME servers, lines of hits, a serial line without hardware, the path of a controller outside, and
@@ -44,6 +45,7 @@ pub mod cmm;
 pub mod command;
 pub mod dme;
 pub mod executed;
+pub mod faults;
 mod follow;
 pub mod form;
 mod handshake;

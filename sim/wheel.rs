@@ -9,6 +9,7 @@ use std::sync::{Arc, Mutex};
 
 use crate::Vec3;
 use crate::body::Kind;
+use crate::shape::foot;
 use crate::truth::{State, locked};
 
 /// Higher than this over the nominal surface nothing is there to be ground.
@@ -69,7 +70,8 @@ impl PlainWheel {
     pub fn come(&mut self, centre_mm: Vec3) {
         let world = Arc::clone(&self.world);
         let mut state = locked(&world);
-        let Some(([x, y], height_mm)) = foot(&state, centre_mm) else { return };
+        let near = [centre_mm[0], centre_mm[1]];
+        let Some(([x, y], height_mm)) = foot(state.part.shape.as_ref(), centre_mm, near) else { return };
         let over_mm = height_mm - self.radius_mm;
         if over_mm > AIR_MM {
             return self.next_track();
@@ -109,26 +111,6 @@ impl PlainWheel {
         grind(&mut state, (all, [f64::NEG_INFINITY, low.y_mm]), |[x, _]| low.at(x));
         grind(&mut state, (all, [high.y_mm, f64::INFINITY]), |[x, _]| high.at(x));
     }
-}
-
-/// The foot of a place on the nominal surface, and how high the place is over it.
-fn foot(state: &State, centre_mm: Vec3) -> Option<([f64; 2], f64)> {
-    let shape = &state.part.shape;
-    let (mut x, mut y) = (centre_mm[0], centre_mm[1]);
-    for _ in 0..60 {
-        let (point, normal) = (shape.point(x, y), shape.normal(x, y));
-        let over: f64 = (0..3).map(|k| (centre_mm[k] - point[k]) * normal[k]).sum();
-        let next = [centre_mm[0] - over * normal[0], centre_mm[1] - over * normal[1]];
-        let moved = (next[0] - x).hypot(next[1] - y);
-        [x, y] = next;
-        if !moved.is_finite() {
-            return None;
-        }
-        if moved < 1e-9 {
-            return Some(([x, y], over));
-        }
-    }
-    None
 }
 
 /// Grinds what lies between these bounds to a height over the nominal surface.

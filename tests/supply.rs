@@ -1,5 +1,5 @@
 //! What the program is built of, held against deny.toml by the lock file and the manifests of the crates: licences, bans and sources. This is
-//! the part of `cargo deny check licenses bans sources` that can be had without cargo-deny.
+//! the part of `cargo deny check licenses bans sources` that can be had without cargo-deny. And what it is handed out with: the list of the package.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -135,4 +135,35 @@ fn no_crate_is_banned_and_all_come_from_one_registry() {
         }
     }
     assert_eq!(registries.len(), 1, "{registries:?}");
+}
+
+/// Whether a path is meant by a pattern with at most one `*`, which stands for anything but a slash.
+fn is_meant(path: &str, pattern: &str) -> bool {
+    let Some((head, tail)) = pattern.split_once('*') else { return path == pattern };
+    let middle = path.strip_prefix(head).and_then(|rest| rest.strip_suffix(tail));
+    middle.is_some_and(|middle| !middle.contains('/'))
+}
+
+/// The files below a folder of the sources, by their paths from there.
+fn files_below(folder: &str) -> Vec<String> {
+    let entries = fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join(folder)).unwrap().map(|entry| entry.unwrap());
+    let below = entries.flat_map(|entry| {
+        let path = format!("{folder}/{}", entry.file_name().into_string().unwrap());
+        if entry.path().is_dir() { files_below(&path) } else { vec![path] }
+    });
+    below.collect()
+}
+
+#[test]
+fn the_package_has_every_cell_file_dialect_and_recipe_and_may_run_what_is_run() {
+    let manifest = table("Cargo.toml");
+    let assets = manifest["package"]["metadata"]["deb"]["assets"].as_array().unwrap();
+    let assets: Vec<[&str; 2]> = assets.iter().map(|asset| [0, 2].map(|k| asset[k].as_str().unwrap())).collect();
+    for file in files_below("config").into_iter().chain(files_below("recipes")) {
+        let found = assets.iter().find(|[pattern, _]| is_meant(&file, pattern));
+        let Some([_, mode]) = found else { panic!("{file} is not in the package: add it to the assets in Cargo.toml") };
+        let text = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(&file)).unwrap();
+        assert_eq!(*mode == "755", text.starts_with("#!"), "{file} has the mode {mode} in the package");
+    }
+    assert!(is_meant("a/b.toml", "a/*.toml") && !is_meant("a/c/b.toml", "a/*.toml") && !is_meant("a/b", "a/*.toml"));
 }

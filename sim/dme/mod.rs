@@ -179,7 +179,7 @@ impl Server {
             }
             Ok((tag, command)) if tag.is_event() => self.at_once(tag, &command, now),
             Ok((tag, command)) => {
-                let fault = self.faults.at(&command.name);
+                let fault = self.faults.at(|name| *name == command.name);
                 if fault == Some(Fault::EmergencyStop) {
                     return self.emergency_stop(now);
                 }
@@ -195,7 +195,7 @@ impl Server {
     }
 
     fn at_once(&mut self, tag: Tag, command: &Command, now: Duration) {
-        let fault = self.faults.at(&command.name);
+        let fault = self.faults.at(|name| *name == command.name);
         self.say(now, format!("{tag} &"));
         match command.name.as_str() {
             "AbortE" if fault == Some(Fault::AbortIgnored) => return,

@@ -1,7 +1,5 @@
 //! What goes wrong with the lines of a machine that prints its hits.
 
-use std::sync::{Arc, Mutex, PoisonError};
-
 /// Something that goes wrong with a line.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Fault {
@@ -40,24 +38,5 @@ impl Fault {
     }
 }
 
-/// Faults that are still to come, by the number of the line, from 1. Clones share them.
-#[derive(Clone, Debug, Default)]
-pub struct Faults(Arc<Mutex<Vec<(u64, Fault)>>>);
-
-impl Faults {
-    /// None.
-    pub fn none() -> Self {
-        Self::default()
-    }
-
-    /// Has a fault happen to a line.
-    pub fn add(&self, line: u64, fault: Fault) {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).push((line, fault));
-    }
-
-    pub(super) fn at(&self, line: u64) -> Option<Fault> {
-        let mut faults = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let met = faults.iter().position(|(number, _)| *number == line)?;
-        Some(faults.swap_remove(met).1)
-    }
-}
+/// Faults of lines, by their numbers, from 1.
+pub type Faults = crate::faults::Faults<u64, Fault>;

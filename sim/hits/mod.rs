@@ -91,7 +91,7 @@ impl Program {
         let at_mm = std::array::from_fn(|k| centre_mm[k] - back_mm * target.normal[k]);
         self.printed += 1;
         let line = self.options.style.line(at_mm);
-        match self.faults.at(self.printed) {
+        match self.faults.at(|number| *number == self.printed) {
             Some(Fault::HangUp) => Outgoing { bytes: line, hangs_up: true },
             Some(fault) => Outgoing { bytes: fault.spoil(line), hangs_up: false },
             None => Outgoing { bytes: line, hangs_up: false },

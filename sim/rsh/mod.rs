@@ -255,7 +255,7 @@ impl Controller {
     }
 
     fn carry_out(&mut self, number: u64, line: &str, now: Duration) {
-        let fault = self.faults.at(line);
+        let fault = self.faults.at(|begins| line.starts_with(begins));
         let word = |k: usize| line.split_whitespace().nth(k).unwrap_or_default().to_ascii_lowercase();
         let is_set = word(0) == "set";
         let nak = || if is_set { format!("SET {} NAK\n\r", word(1).to_uppercase()) } else { "GET NAK\r\n".to_owned() };

@@ -28,8 +28,10 @@ const CYCLE_S: f64 = 1e-3;
 const FRESH: Duration = Duration::from_millis(500);
 /// A program that does not bring a mark back within this is taken for gone.
 const LOST_AFTER: Duration = Duration::from_secs(30);
-/// Between two attempts to begin the program.
+/// Between two attempts to begin the program: at first, and at most where one after the other told nothing. A controller that is started again
+/// is followed before anybody has brought it to grind.
 const AGAIN_AFTER: Duration = Duration::from_millis(200);
+const AGAIN_AFTER_MOST: Duration = Duration::from_secs(2);
 
 /// A wheel that follows what a controller executes, until this is dropped.
 pub struct ExecutedPath {
@@ -114,7 +116,10 @@ impl Drop for ExecutedPath {
 /// Follows one program after another.
 fn follow(shared: &Shared, command: &mut Command, first: Child, mut wheel: Wheel) {
     let mut next = Ok(first);
+    // Programs in a row that told nothing.
+    let mut silent = 0;
     while !shared.ended.load(Ordering::SeqCst) {
+        let mut has_told = false;
         if let Ok(mut child) = next {
             if let Some(input) = child.stdin.take() {
                 *locked(&shared.input) = Some(input);
@@ -123,7 +128,7 @@ fn follow(shared: &Shared, command: &mut Command, first: Child, mut wheel: Wheel
             let lines = child.stdout.take();
             *locked(&shared.child) = Some(child);
             if let Some(lines) = lines {
-                read(shared, BufReader::new(lines), &mut wheel);
+                has_told = read(shared, BufReader::new(lines), &mut wheel);
             }
             *locked(&shared.input) = None;
             wheel.away();
@@ -133,7 +138,10 @@ fn follow(shared: &Shared, command: &mut Command, first: Child, mut wheel: Wheel
                 let _ = child.wait();
             }
         }
-        thread::sleep(AGAIN_AFTER);
+        silent = if has_told { 0 } else { silent + 1 };
+        // Why there is nothing to tell the first of them has said already.
+        command.stderr(if silent > 0 { Stdio::null() } else { Stdio::inherit() });
+        thread::sleep(pause_after(silent));
         next = command.spawn();
     }
     if let Ok(mut child) = next {
@@ -142,8 +150,13 @@ fn follow(shared: &Shared, command: &mut Command, first: Child, mut wheel: Wheel
     }
 }
 
-/// Moves the wheel line by line, until no more come.
-fn read(shared: &Shared, lines: impl BufRead, wheel: &mut Wheel) {
+/// How long to wait after so many programs in a row that told nothing.
+fn pause_after(silent: u32) -> Duration {
+    (AGAIN_AFTER * 2u32.pow(silent.min(8))).min(AGAIN_AFTER_MOST)
+}
+
+/// Moves the wheel line by line, until no more come. Returns whether any came.
+fn read(shared: &Shared, lines: impl BufRead, wheel: &mut Wheel) -> bool {
     let mut expected = None;
     for line in lines.lines().map_while(Result::ok) {
         let Some(Cycle { number, place_mm, homed, mark }) = Cycle::of(&line) else {
@@ -163,6 +176,7 @@ fn read(shared: &Shared, lines: impl BufRead, wheel: &mut Wheel) {
             shared.told.send_replace(Told::Mark(mark));
         }
     }
+    expected.is_some()
 }
 
 /// What a line tells.
@@ -202,6 +216,29 @@ mod tests {
         for broken in ["", "overrun", "7 1 2 3 1", "7 1 2 nan 1 0", "7 1 2 3 2 0", "-7 1 2 3 1 0", "7 1 2 3 1 0 0"] {
             assert_eq!(Cycle::of(broken), None, "{broken:?}");
         }
+    }
+
+    #[test]
+    fn a_controller_that_is_away_is_asked_for_less_and_less() {
+        assert_eq!([0, 1, 2, 3, 4, u32::MAX].map(|n| pause_after(n).as_millis()), [200, 400, 800, 1600, 2000, 2000]);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_program_that_has_nothing_to_tell_says_so_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let [begun, said] = ["begun", "said"].map(|name| folder.path().join(name));
+        assert!(Command::new("mkfifo").arg(&begun).status().unwrap().success());
+        let mut command = Command::new("sh");
+        command.args(["-c", "echo no controller >&2; echo >\"$0\""]).arg(&begun);
+        command.stderr(std::fs::File::create(&said).unwrap());
+        let world = World::new(WorldSpec::default()).unwrap();
+        let _path = ExecutedPath::follow(command, world.wheel(12.5).unwrap()).unwrap();
+        // Each that begins writes a line here, and waits until it is read.
+        for _ in 0..3 {
+            assert_eq!(std::fs::read_to_string(&begun).unwrap(), "\n");
+        }
+        assert_eq!(std::fs::read_to_string(&said).unwrap(), "no controller\n");
     }
 
     #[cfg(unix)]

@@ -1,5 +1,6 @@
 //! What the arms of the table do.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use super::alarm::{Alarm, AlarmId};
@@ -35,7 +36,7 @@ impl Cell {
 
     pub(super) fn raise(&mut self, id: AlarmId, case: &str) {
         let alarm = Alarm::of(id, case);
-        self.raised.insert(id, alarm.clone());
+        self.raised.insert(id, Arc::new(alarm.clone()));
         self.push(Command::Raise(alarm));
     }
 
@@ -416,14 +417,14 @@ impl Cell {
             // Of the same measurement: nothing is judged by a part of it.
             self.advance(Measure(JobStep::Send));
         } else {
-            self.figures = Some(figures.clone());
+            self.figures = Some(Arc::new(figures.clone()));
             self.advance(Judge);
         }
     }
 
     fn judge(&mut self) {
         let Some(figures) = self.figures.take() else { return self.go(Held(Register)) };
-        let Judged { verdict, mut reason } = judge::judge(&self.plan, self.previous.as_ref(), &figures, self.passes);
+        let Judged { verdict, mut reason } = judge::judge(&self.plan, self.previous.as_deref(), &figures, self.passes);
         let response = figures.response;
         let distance = |of: &Figures| judge::distance(&self.plan, of);
         match &self.best {
@@ -432,7 +433,7 @@ impl Cell {
                     reason += &judge::best_in_words(&self.plan, *cycle, best);
                 }
             }
-            _ => self.best = Some((self.cycle, figures.clone())),
+            _ => self.best = Some((self.cycle, Arc::clone(&figures))),
         }
         self.previous = Some(figures);
         self.worse = if verdict == Verdict::Diverging { self.worse + 1 } else { 0 };

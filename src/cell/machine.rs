@@ -18,24 +18,28 @@ use State::{
 impl Cell {
     /// Takes an event in and returns what is to be done, in this order. After an end state that is nothing.
     ///
-    /// An event that does not fit is answered by [`Command::Refuse`] and changes nothing.
+    /// An event that does not fit is answered by [`Command::Refuse`] and leaves the state as it is.
     pub fn handle(&mut self, now: Duration, event: Event) -> Vec<Command> {
+        if let Err(why) = self.answer(now, &event) {
+            let (event, state) = (Box::new(event), self.state);
+            let why = why.unwrap_or_else(|| format!("{} does not fit the state {state}", event.in_words()));
+            self.commands.push(Command::Refuse { event, state, why });
+        }
+        std::mem::take(&mut self.commands)
+    }
+
+    /// Takes an event in, and leaves what is to be done in `commands`. An event is refused for a reason, or for none where nothing of it fits
+    /// the state: then nothing has changed, and only who reads it needs the words.
+    pub(super) fn answer(&mut self, now: Duration, event: &Event) -> Result<(), Option<String>> {
         if self.state.is_end() {
-            return Vec::new();
+            return Ok(());
         }
         self.now = now;
-        let refused = match self.foreign(&event) {
-            Some(why) => Err(why),
-            None => self.take(&event),
-        };
-        if let Err(why) = refused {
-            let state = self.state;
-            self.commands.push(Command::Refuse { event: Box::new(event), state, why });
-        }
+        let answered = self.foreign(event).map_or_else(|| self.take(event), |why| Err(Some(why)));
         if self.state.is_end() {
             self.deadline = None;
         }
-        std::mem::take(&mut self.commands)
+        answered
     }
 
     /// Tells why an event cannot belong to what the cell is doing, whatever its state.
@@ -45,7 +49,7 @@ impl Cell {
     }
 
     /// The table. Abort and fault come first, then orders, then what interrupts, then the way of a run, then time.
-    fn take(&mut self, event: &Event) -> Result<(), String> {
+    fn take(&mut self, event: &Event) -> Result<(), Option<String>> {
         match (self.state, event) {
             // The safe sequence.
             (Aborting, Event::Abort { .. } | Event::Fault { .. }) => {}
@@ -284,7 +288,7 @@ impl Cell {
             // The end, and time.
             (Completing, Event::Cleared { device }) => self.seen(*device, true, ""),
             (_, Event::Deadline) => self.due(),
-            (state, event) => return Err(format!("{} does not fit the state {state}", event.in_words())),
+            _ => return Err(None),
         }
         Ok(())
     }

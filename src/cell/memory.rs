@@ -1,6 +1,7 @@
 //! What the cell keeps between two events.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 use std::time::Duration;
 
 use super::alarm::{Alarm, AlarmId};
@@ -39,10 +40,10 @@ pub(super) struct Known {
     pub(super) astray: bool,
 }
 
-/// A cell in the middle of a run.
+/// A cell in the middle of a run. What is large is shared by its copies, of which [`super::table()`] makes millions.
 #[derive(Clone, Debug)]
 pub struct Cell {
-    pub(super) plan: CellPlan,
+    pub(super) plan: Arc<CellPlan>,
     pub(super) state: State,
     pub(super) cycle: u32,
     /// Passes of the grinder begun.
@@ -51,12 +52,12 @@ pub struct Cell {
     pub(super) doubted: bool,
     pub(super) known: [Known; 2],
     pub(super) causes: BTreeSet<Cause>,
-    pub(super) raised: BTreeMap<AlarmId, Alarm>,
+    pub(super) raised: BTreeMap<AlarmId, Arc<Alarm>>,
     /// The figures of this cycle, and of the last one that was judged.
-    pub(super) figures: Option<Figures>,
-    pub(super) previous: Option<Figures>,
+    pub(super) figures: Option<Arc<Figures>>,
+    pub(super) previous: Option<Arc<Figures>>,
     /// The cycle that came nearest to what is accepted, and its figures.
-    pub(super) best: Option<(u32, Figures)>,
+    pub(super) best: Option<(u32, Arc<Figures>)>,
     /// Cycles in a row that were worse than the one before.
     pub(super) worse: u32,
     /// How the run ends when the state that leads to the end is over.
@@ -83,7 +84,7 @@ impl Cell {
     /// Returns a cell that waits for `Event::Start`.
     pub fn new(plan: CellPlan) -> Self {
         Self {
-            plan,
+            plan: Arc::new(plan),
             state: State::Idle,
             cycle: 0,
             passes: 0,
@@ -149,7 +150,7 @@ impl Cell {
 
     /// Returns the figures of the last measurement that was registered.
     pub fn figures(&self) -> Option<&Figures> {
-        self.figures.as_ref().or(self.previous.as_ref())
+        self.figures.as_deref().or(self.previous.as_deref())
     }
 
     /// Returns whether a command that was given earlier, and has waited, is still to be carried out. What sets something in motion is
@@ -177,7 +178,7 @@ impl Cell {
 
     /// Returns the alarms that stand.
     pub fn alarms(&self) -> impl Iterator<Item = &Alarm> + '_ {
-        self.raised.values()
+        self.raised.values().map(AsRef::as_ref)
     }
 
     /// Returns the machine of which a person is being asked whether it is clear of the part.

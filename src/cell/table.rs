@@ -5,7 +5,6 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::hash::Hash;
 use std::time::Duration;
 
-use super::command::Command;
 use super::event::{
     Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Gate, GateFailure, JobResult,
     Mismatch, Occupation, Reconciliation, RecordFailure, Response, TouchOn,
@@ -29,6 +28,9 @@ pub struct Row {
     pub answers: BTreeSet<Answer>,
 }
 
+/// The name of the command that follows from an event which does not fit.
+const REFUSE: &str = "refuse";
+
 /// One thing that can follow.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Answer {
@@ -41,7 +43,7 @@ pub struct Answer {
 impl Answer {
     /// Returns whether the event did not fit.
     pub fn is_refusal(&self) -> bool {
-        self.commands.iter().any(|command| command == "refuse")
+        self.commands.iter().any(|command| command == REFUSE)
     }
 }
 
@@ -55,12 +57,18 @@ pub fn table() -> Vec<Row> {
         let answers = answers.entry(cell.state()).or_insert_with(|| vec![BTreeSet::new(); events.len()]);
         // Late enough for whatever is due.
         let now = cell.next_deadline().unwrap_or(Duration::ZERO);
+        let mut next = cell.clone();
         for (event, answers) in events.iter().zip(answers) {
-            let mut next = cell.clone();
-            let commands = next.handle(now, event.clone()).iter().map(Command::name).collect();
+            let answered = next.answer(now, event);
+            let refused = answered.is_err().then(|| REFUSE.to_owned());
+            let commands = next.commands.drain(..).map(|command| command.name()).chain(refused).collect();
             answers.insert(Answer { next: next.state(), commands });
-            if seen.insert(key(&next)) {
-                open.push_back(next);
+            // What does not fit at all has changed nothing: the next event finds the cell as it was.
+            if answered != Err(None) {
+                if seen.insert(key(&next)) {
+                    open.push_back(next);
+                }
+                next = cell.clone();
             }
         }
     }

@@ -13,6 +13,7 @@ use regrind::drive::{CycleRow, Notice, SoFar};
 use regrind::formats::read_error_map;
 use regrind::model::FIRST;
 use regrind::recipe::{Mode, Recipe};
+use regrind::report::in_air;
 use tokio::sync::mpsc;
 
 use super::blocks::{Blocks, sparkline};
@@ -124,10 +125,10 @@ impl Show {
             Notice::Judged(Judgement { cycle, reason, .. }) => self.line(&format!("cycle {cycle}: {reason}")),
             Notice::Compensated { cycle, summary } => {
                 self.line(&format!(
-                    "cycle {cycle}: next pass corrects up to {} um, {} um deep, {} % in air, gain {}; PV {}, RMS {} um expected",
+                    "cycle {cycle}: next pass corrects up to {} um, {} um deep, {}, gain {}; PV {}, RMS {} um expected",
                     three_digits(1e3 * summary.largest_mm),
                     three_digits(1e3 * summary.depth_mm),
-                    three_digits(100.0 * summary.air_share),
+                    in_air(summary.air_share),
                     gains(&summary.gains),
                     three_digits(1e3 * summary.predicted_pv_mm),
                     three_digits(1e3 * summary.predicted_rms_mm)

@@ -26,6 +26,7 @@ mod error;
 pub mod exchange;
 pub mod hit_lines;
 pub mod ippdme;
+mod kept;
 pub mod linuxcnc;
 mod machine;
 mod manual;

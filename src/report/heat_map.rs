@@ -218,11 +218,12 @@ impl HeatMap {
     /// # Errors
     /// What the encoder says.
     pub fn to_svg(&self) -> Result<String, ReportError> {
-        let frame = self.frame();
+        let lines = self.lines_within(self.size()[0] + BESIDE);
+        let frame = self.frame(lines.len());
         let ([left, top], [width, height]) = (frame.corner, frame.size);
-        let mut svg = Svg::new(left + width + 106.0, top + height + 54.0);
+        let mut svg = Svg::new(left + width + BESIDE, top + height + 54.0);
         svg.text([left, 24.0], Anchor::Start, LARGE, &self.title);
-        for (line, y) in self.lines.iter().chain([&self.summary()]).zip((0..).map(|k| 44.0 + LINE * f64::from(k))) {
+        for (line, y) in lines.iter().zip((0..).map(|k| 44.0 + LINE * f64::from(k))) {
             svg.text([left, y], Anchor::Start, SMALL, line);
         }
         let pixel = width / self.raster.grid.columns as f64;
@@ -234,13 +235,29 @@ impl HeatMap {
         Ok(svg.finish())
     }
 
-    fn frame(&self) -> Frame<'static> {
-        let Grid { columns, rows, first_mm, spacing_mm: pixel_mm } = self.raster.grid;
-        let extent = [columns as f64 * pixel_mm[0], rows as f64 * pixel_mm[1]];
-        let scale = (self.largest[0] / extent[0]).min(self.largest[1] / extent[1]);
+    /// The lines below the title, the summary last, broken where they would end beyond the picture.
+    fn lines_within(&self, width: f64) -> Vec<String> {
+        let summary = self.summary();
+        self.lines.iter().chain([&summary]).flat_map(|line| broken(line, (width / LETTER) as usize)).collect()
+    }
+
+    fn extent_mm(&self) -> [f64; 2] {
+        let Grid { columns, rows, spacing_mm, .. } = self.raster.grid;
+        [columns as f64 * spacing_mm[0], rows as f64 * spacing_mm[1]]
+    }
+
+    /// The map in pixels of the page.
+    fn size(&self) -> [f64; 2] {
+        let extent_mm = self.extent_mm();
+        let scale = (self.largest[0] / extent_mm[0]).min(self.largest[1] / extent_mm[1]);
         // A part like a strip is drawn out of scale rather than as a line.
-        let size = extent.map(|e| (e * scale).max(90.0));
-        let corner = [66.0, 58.0 + LINE * self.lines.len() as f64];
+        extent_mm.map(|e| (e * scale).max(90.0))
+    }
+
+    fn frame(&self, lines: usize) -> Frame<'static> {
+        let Grid { first_mm, spacing_mm: pixel_mm, .. } = self.raster.grid;
+        let (extent, size) = (self.extent_mm(), self.size());
+        let corner = [66.0, 40.0 + LINE * lines as f64];
         let low: [f64; 2] = std::array::from_fn(|k| first_mm[k] - 0.5 * pixel_mm[k]);
         let x = Ruler::new(Scale::Linear, [low[0], low[0] + extent[0]], [corner[0], corner[0] + size[0]]);
         let y = Ruler::new(Scale::Linear, [low[1], low[1] + extent[1]], [corner[1] + size[1], corner[1]]);
@@ -313,8 +330,27 @@ const LEVELS: u8 = 255;
 const WIDTH: f64 = 600.0;
 const HEIGHT: f64 = 460.0;
 
+/// What stands on the right of a map, its colour bar, in pixels of the page.
+const BESIDE: f64 = 106.0;
+
 /// From one line of text below the title to the next.
 const LINE: f64 = 18.0;
+
+/// A letter of such a line, in most texts.
+const LETTER: f64 = 6.3;
+
+/// Breaks a line into some of at most so many letters: behind a comma if there is one, else behind a word.
+fn broken(line: &str, most: usize) -> Vec<String> {
+    let (mut lines, mut rest) = (Vec::new(), line);
+    while let Some((end, _)) = rest.char_indices().nth(most) {
+        let fits = &rest[..end];
+        let Some(at) = fits.rfind(", ").map(|at| at + 1).or_else(|| fits.rfind(' ')) else { break };
+        lines.push(rest[..at].to_owned());
+        rest = rest[at..].trim_start();
+    }
+    lines.push(rest.to_owned());
+    lines
+}
 
 #[cfg(test)]
 mod tests {
@@ -375,13 +411,35 @@ mod tests {
         let document = roxmltree::Document::parse(&svg).unwrap();
         let texts: Vec<_> = document.descendants().filter_map(|n| n.text()).collect();
         for text in
-            ["Cycle 1", "mirror, SN 7", "PV of the map 0.00400 µm, RMS of the map 0.00129 µm, 6 nodes", "x / mm"]
+            ["Cycle 1", "mirror, SN 7", "PV of the map 0.00400 µm,", "RMS of the map 0.00129 µm, 6 nodes", "x / mm"]
         {
             assert!(texts.contains(&text), "{text} is not in {texts:?}");
         }
         let size = |name: &str| document.root_element().attribute(name).unwrap().parse::<f64>().unwrap();
         assert!(size("width") < 400.0, "{}", size("width"));
         assert!(map.clone().with_limit(f64::NAN).is_err() && map.with_limit(-1.0).is_err());
+    }
+
+    #[test]
+    fn lines_are_broken_where_the_picture_ends() {
+        let line = "PV 4.00 µm, RMS 1.29 µm, 6 points";
+        assert_eq!(broken(line, 33), [line]);
+        assert_eq!(broken(line, 32), ["PV 4.00 µm, RMS 1.29 µm,", "6 points"]);
+        assert_eq!(broken(line, 12), ["PV 4.00 µm,", "RMS 1.29", "µm, 6 points"]);
+        // What has no place to be broken at stays whole.
+        assert_eq!((broken("unbroken", 3), broken("", 5)), (vec!["unbroken".to_owned()], vec![String::new()]));
+        let narrow = HeatMap::of_lengths("strip", "height", &SMALL_MAP).unwrap().at_most([10.0, 90.0]);
+        let narrow = narrow.with_tolerance(1e-3).unwrap();
+        let svg = narrow.to_svg().unwrap();
+        let document = roxmltree::Document::parse(&svg).unwrap();
+        let number = |node: roxmltree::Node, name: &str| node.attribute(name).unwrap().parse::<f64>().unwrap();
+        let width = number(document.root_element(), "width");
+        let level = document.descendants().filter(|n| n.has_tag_name("text") && n.attribute("transform").is_none());
+        for text in level.filter(|n| n.attribute("text-anchor") == Some("start")) {
+            let length = text.text().unwrap().chars().count() as f64;
+            assert!(number(text, "x") + LETTER * length <= width, "{text:?}");
+        }
+        assert!(svg.contains("% of the area"), "{svg}");
     }
 
     #[test]

@@ -51,7 +51,7 @@ pub use results::{RUN_DFQ, RUN_QIF, ResultsFormat, run_results, write_run_result
 pub use run::{RUN_REPORT, run_report, write_run_report};
 pub use states::state_picture;
 pub use summary::{CycleSummary, RunResult, RunSummary, run_summary};
-pub use words::{ending_words, words};
+pub use words::{ending_words, in_air, words};
 
 /// Why a figure could not be drawn or saved. A figure goes by its title, a line of it by its name; an index counts from 0.
 #[derive(Debug, Error)]

@@ -88,6 +88,15 @@ pub(super) fn home_words(home: [bool; 2]) -> String {
     Device::BOTH.into_iter().zip(home).map(of).collect::<Vec<_>>().join(", ")
 }
 
+/// Returns how much of the part the wheel passes over without reaching it, in words. Units: a share from 0 to 1.
+pub fn in_air(share: f64) -> String {
+    match 100.0 * share {
+        0.0 => "none in air".to_owned(),
+        percent if percent < 0.1 => "< 0.1 % in air".to_owned(),
+        percent => format!("{percent:.1} % in air"),
+    }
+}
+
 /// What a grinder tells of a pass; what it does not tell is left out.
 fn pass_words(value: &Value) -> Option<String> {
     let number = |key: &str| value[key].as_f64();
@@ -221,10 +230,10 @@ fn event_words(event: &Event) -> String {
         }
         Event::Registered { figures, .. } => figures_words(figures),
         Event::Compensated { summary, .. } => format!(
-            "up to {:.2} um, {:.2} um deep, {:.1} % in air, PV {:.2} um expected{}",
+            "up to {:.2} um, {:.2} um deep, {}, PV {:.2} um expected{}",
             1e3 * summary.largest_mm,
             1e3 * summary.depth_mm,
-            100.0 * summary.air_share,
+            in_air(summary.air_share),
             1e3 * summary.predicted_pv_mm,
             parameters_words(summary)
                 .iter()
@@ -313,4 +322,16 @@ pub(super) fn parameters_words(summary: &regrind_cell::CompensationSummary) -> V
     let told = summary.parameters.iter().map(regrind_cell::ParameterTold::in_words);
     let left = summary.map_rms_mm.filter(|_| !summary.parameters.is_empty());
     told.chain(left.map(|mm| format!("left for the map: {:.2} um rms", 1e3 * mm))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn little_air_is_said_to_be_little() {
+        let said =
+            ["none in air", "< 0.1 % in air", "< 0.1 % in air", "0.1 % in air", "62.5 % in air", "100.0 % in air"];
+        assert_eq!([0.0, 8.05e-11, 9.9e-4, 1e-3, 0.625, 1.0].map(in_air), said);
+    }
 }

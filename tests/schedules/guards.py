@@ -67,7 +67,7 @@ GUARDS = {
     "the probe travels at the clearance": (
         "src/device/ippdme/work.rs", "        self.rise(work).await?;\n        let [x, y, z]", "        let [x, y, z]"),
     "a program that has begun is not prepared again": (
-        "src/device/linuxcnc/machine.rs", "if before.begun > 0 {", "if false && before.begun > 0 {"),
+        "src/device/linuxcnc/machine/beginning.rs", "if before.begun > 0 {", "if false && before.begun > 0 {"),
     "the controller has the program that it was told to open": (
         "src/device/linuxcnc/controller.rs", "|seen| seen.program.as_deref() == Some(path) && seen.line == 0)", "|_| true)"),
     "a lost linuxcncrsh is told as lost": (
@@ -75,7 +75,7 @@ GUARDS = {
     "a program writes its end behind its motion": (
         "src/device/linuxcnc/program.rs", "{again}M66 P0 L0\\n{}M2", "{again}M67\\n{}M2"),
     "a START of LinuxCNC that was not seen is fenced off": (
-        "src/device/linuxcnc/machine.rs", "        self.claim_again().await?;\n        let fenced", "        let fenced"),
+        "src/device/linuxcnc/machine/reconciling.rs", "        self.claim_again().await?;\n        let fenced", "        let fenced"),
     "what is prepared is looked at before a START": (
         "src/device/linuxcnc/machine.rs", "if !is_prepared || status.state != State::Prepared || seen.mode", "if seen.mode"),
 }  # fmt: skip

@@ -141,7 +141,7 @@ impl Machines {
             None => by_registers(0, Machine::new(Box::new(world.cmm()), 71, options(seed ^ 0xC))),
             Some(faults) => {
                 for (method, skip, fault) in faults {
-                    dme_faults.add(method, *skip, fault.clone());
+                    dme_faults.add(*method, *skip, fault.clone());
                 }
                 Plant::Dme(by_lines(&world, speed, dme_faults.clone(), (&log, &deeds, cues)))
             }
@@ -151,7 +151,7 @@ impl Machines {
             None => by_registers(1, Machine::new(Box::new(world.grinder()), 72, options(seed ^ 0x6))),
             Some(faults) => {
                 for (begins, skip, fault) in faults {
-                    rsh_faults.add(begins, *skip, fault.clone());
+                    rsh_faults.add(*begins, *skip, fault.clone());
                 }
                 let speed = OF_PROGRAMS * speed;
                 Plant::Rsh(by_programs(&world, speed, rsh_faults.clone(), (&log, &rsh_deeds, cues)))

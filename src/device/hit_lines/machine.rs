@@ -17,6 +17,7 @@ use super::list::List;
 use super::settings::HitLinesSettings;
 use crate::error::{Answered, DeviceError};
 use crate::exchange::plan_csv;
+use crate::kept::Kept;
 use crate::machine::{Cmm, Interrupt, Machine};
 use crate::payload::{Identified, Measurement, Plan, Preliminary};
 use crate::words::{
@@ -31,12 +32,7 @@ pub struct HitLinesCmm {
     settings: HitLinesSettings,
     hearing: Arc<Mutex<Hearing>>,
     listener: Option<Listener>,
-    /// What would be asked, and its digest.
-    loaded: Option<(Arc<Plan>, u32)>,
-    /// The job of an interrupted run, of which nobody has told what became.
-    untold: Option<(Job, u32)>,
-    begun: u32,
-    told_ahead: usize,
+    kept: Kept<Plan>,
 }
 
 impl HitLinesCmm {
@@ -44,7 +40,7 @@ impl HitLinesCmm {
     pub fn new(settings: HitLinesSettings) -> Self {
         let hearing = Arc::new(Mutex::new(Hearing::new(settings.judging())));
         let name = format!("cmm by hit lines, {}", settings.line).into();
-        Self { name, settings, hearing, listener: None, loaded: None, untold: None, begun: 0, told_ahead: 0 }
+        Self { name, settings, hearing, listener: None, kept: Kept::none() }
     }
 
     fn told(&self) -> Answered<Status> {
@@ -235,8 +231,7 @@ impl Machine for HitLinesCmm {
     }
 
     fn restore(&mut self, intended: &Armed) {
-        self.untold = Some((intended.job, intended.start_sequence));
-        self.begun = self.begun.max(intended.start_sequence);
+        self.kept.restore(intended);
     }
 
     async fn claim(&mut self) -> Answered<Status> {
@@ -244,9 +239,7 @@ impl Machine for HitLinesCmm {
     }
 
     async fn prepare(&mut self, job: Job) -> Answered<Armed> {
-        self.untold = None;
-        let loaded = self.loaded.as_ref().filter(|(_, digest)| *digest == job.digest);
-        let Some((plan, _)) = loaded.cloned() else {
+        let Some(plan) = self.kept.ready_for(job) else {
             return Err(self.refused(Command::Prepare, Answer::PayloadMissing));
         };
         self.told()?;
@@ -256,20 +249,19 @@ impl Machine for HitLinesCmm {
         let (settings, owned) = (self.settings.clone(), Arc::clone(&plan));
         let written = tokio::task::spawn_blocking(move || write_list(&settings, &owned, job));
         let kept = written.await.map_err(|e| self.not_taken(e))?.map_err(|e| self.not_taken(e))?;
-        let sequence = self.begun + 1;
         let is_free = self.settings.free_points.is_some();
         let list = List::new(&plan, self.settings.what, is_free, self.settings.telling());
         let mut hearing = locked(&self.hearing);
-        hearing.asked = Some(Asked::new((job, sequence), plan.identity(), list, Some(kept)));
+        let armed = self.kept.prepared(job);
+        hearing.asked = Some(Asked::new((job, armed.start_sequence), plan.identity(), list, Some(kept)));
         (hearing.state, hearing.outcome) = (State::Prepared, Outcome::None);
-        self.told_ahead = 0;
-        Ok(Armed { job, start_sequence: sequence, token: 0, boot_id: 0 })
+        Ok(armed)
     }
 
     async fn start(&mut self, armed: Armed) -> Answered<Started> {
         let Armed { job, start_sequence, .. } = armed;
         self.told()?;
-        let plan = self.loaded.as_ref().map(|(plan, _)| Arc::clone(plan));
+        let plan = self.kept.loaded.as_ref().map(|(plan, _)| Arc::clone(plan));
         let status = {
             let mut hearing = locked(&self.hearing);
             let is_prepared = hearing.state == State::Prepared;
@@ -284,7 +276,7 @@ impl Machine for HitLinesCmm {
             (hearing.state, hearing.clear) = (State::Execute, None);
             status_of(&hearing)
         };
-        self.begun = start_sequence;
+        self.kept.begun = start_sequence;
         if let Some(plan) = plan {
             let settings = self.settings.clone();
             let shown = tokio::task::spawn_blocking(move || show_list(&settings, &plan, job));
@@ -311,7 +303,7 @@ impl Machine for HitLinesCmm {
 
     async fn stop(&mut self) -> Answered<Status> {
         self.told()?;
-        if let Some((job, sequence)) = self.untold.take() {
+        if let Some((job, sequence)) = self.kept.untold.take() {
             let mut hearing = locked(&self.hearing);
             let list = List::new(&no_plan(), self.settings.what, false, self.settings.telling());
             hearing.asked = Some(Asked::new((job, sequence), [0; 32], list, None));
@@ -335,7 +327,7 @@ impl Machine for HitLinesCmm {
     }
 
     async fn abort(&mut self) -> Answered<Status> {
-        let untold = self.untold.take();
+        let untold = self.kept.untold.take();
         let mut hearing = locked(&self.hearing);
         let may_move = hearing.state.moves() || untold.is_some();
         hearing.state = if may_move { State::Aborting } else { State::Aborted };
@@ -399,16 +391,16 @@ fn no_plan() -> Plan {
 
 impl Cmm for HitLinesCmm {
     async fn load_plan(&mut self, plan: &Plan, _: &Interrupt) -> Answered<()> {
-        self.loaded = Some((Arc::new(plan.clone()), digest(&[plan.identity()])));
+        self.kept.loaded = Some((Arc::new(plan.clone()), digest(&[plan.identity()])));
         Ok(())
     }
 
     async fn read_ahead(&mut self, job: Job, _: &Interrupt) -> Option<Preliminary> {
         let hearing = locked(&self.hearing);
         let asked = hearing.asked.as_ref().filter(|asked| asked.job == job)?;
-        let (from, points) = (self.told_ahead, asked.list.ready(self.told_ahead));
+        let (from, points) = (self.kept.told_ahead, asked.list.ready(self.kept.told_ahead));
         drop(hearing);
-        self.told_ahead += points.len();
+        self.kept.told_ahead += points.len();
         let there = !points.is_empty();
         there.then_some(Preliminary { job, from, points, coordinates: self.settings.what })
     }

@@ -15,6 +15,7 @@ use super::settings::{IppdmeSettings, name};
 use super::text::Item;
 use super::work::{Order, Shared, Wish, Work, Worker, ask_if_there, locked};
 use crate::error::{Answered, DeviceError};
+use crate::kept::Kept;
 use crate::machine::{Cmm, Interrupt, Machine};
 use crate::modbus::OfThisComputer;
 use crate::payload::{Identified, MeasuredPoint, Measurement, Plan, Preliminary};
@@ -38,13 +39,9 @@ pub struct IppdmeCmm {
     /// The task that owns the session; none where there is no session.
     orders: Option<mpsc::Sender<Order>>,
     identity: Option<Identity>,
-    loaded: Option<(Arc<Work>, u32)>,
+    kept: Kept<Work>,
     /// What the running or prepared job is about.
     work: Option<(Arc<Work>, [u8; 32])>,
-    begun: u32,
-    /// The job of an interrupted run, whose points are gone.
-    untold: Option<(Job, u32)>,
-    told_ahead: usize,
     dial: Box<dyn Dial>,
     /// Whether what takes its while to compute is done in turn with everything else.
     in_turn: bool,
@@ -71,11 +68,8 @@ impl IppdmeCmm {
             wish: watch::Sender::new(Wish::GoOn),
             orders: None,
             identity: None,
-            loaded: None,
+            kept: Kept::none(),
             work: None,
-            begun: 0,
-            untold: None,
-            told_ahead: 0,
             dial,
             in_turn,
         }
@@ -85,7 +79,7 @@ impl IppdmeCmm {
     /// was ordered that no session has taken. What a job of ours has left may move for as long as one that nobody looks at.
     async fn open(&mut self) -> Answered<Identity> {
         let state = locked(&self.shared).state;
-        let moved = state.moves() || self.untold.is_some();
+        let moved = state.moves() || self.kept.untold.is_some();
         // One that nobody has confirmed is given anew.
         let aborted = self.aborts.borrow().saturating_sub(u64::from(state == State::Aborting));
         let line = Line::Tcp { host: self.settings.host.clone(), port: self.settings.port };
@@ -253,7 +247,7 @@ impl Machine for IppdmeCmm {
 
     fn notes(&self) -> Vec<String> {
         let shared = locked(&self.shared);
-        let way = self.loaded.as_ref().map(|(work, _)| {
+        let way = self.kept.loaded.as_ref().map(|(work, _)| {
             let Route { travel_m, plain_m, .. } = work.route;
             format!("the way across is {travel_m:.2} m, {plain_m:.2} m in the plan's order")
         });
@@ -279,8 +273,7 @@ impl Machine for IppdmeCmm {
     }
 
     fn restore(&mut self, intended: &Armed) {
-        self.untold = Some((intended.job, intended.start_sequence));
-        self.begun = self.begun.max(intended.start_sequence);
+        self.kept.restore(intended);
     }
 
     async fn claim(&mut self) -> Answered<Status> {
@@ -289,19 +282,17 @@ impl Machine for IppdmeCmm {
     }
 
     async fn prepare(&mut self, job: Job) -> Answered<Armed> {
-        self.untold = None;
-        let loaded = self.loaded.as_ref().filter(|(_, digest)| *digest == job.digest);
-        let Some((work, _)) = loaded.cloned() else {
+        let Some(work) = self.kept.ready_for(job) else {
             return Err(self.refused(Command::Prepare, Answer::PayloadMissing));
         };
         self.look().await?;
         self.go(Command::Prepare, &[State::Idle], State::Prepared)?;
-        let sequence = self.begun + 1;
+        let armed = self.kept.prepared(job);
         let mut shared = locked(&self.shared);
         let points = vec![None; work.plan.targets.len()];
         *shared = Shared {
             state: State::Prepared,
-            job: Some((job, sequence)),
+            job: Some((job, armed.start_sequence)),
             clear: shared.clear,
             notes: std::mem::take(&mut shared.notes),
             points,
@@ -309,8 +300,8 @@ impl Machine for IppdmeCmm {
         };
         drop(shared);
         let identity = work.plan.identity();
-        (self.work, self.told_ahead) = (Some((work, identity)), 0);
-        Ok(Armed { job, start_sequence: sequence, token: 0, boot_id: 0 })
+        self.work = Some((work, identity));
+        Ok(armed)
     }
 
     async fn start(&mut self, armed: Armed) -> Answered<Started> {
@@ -323,7 +314,7 @@ impl Machine for IppdmeCmm {
         self.wish.send_replace(Wish::GoOn);
         locked(&self.shared).looked_at = Instant::now();
         let status = self.go(Command::Start, &[State::Prepared], State::Execute)?;
-        self.begun = start_sequence;
+        self.kept.begun = start_sequence;
         if let Err(error) = self.order(Order::Run(work)).await {
             // Nobody took it: nothing was sent.
             locked(&self.shared).state = State::Prepared;
@@ -351,7 +342,7 @@ impl Machine for IppdmeCmm {
     }
 
     async fn stop(&mut self) -> Answered<Status> {
-        if let Some(untold) = self.untold.take() {
+        if let Some(untold) = self.kept.untold.take() {
             // The session is open, so it stands.
             self.told()?;
             let mut shared = locked(&self.shared);
@@ -377,7 +368,7 @@ impl Machine for IppdmeCmm {
     }
 
     async fn abort(&mut self) -> Answered<Status> {
-        let untold = self.untold.take();
+        let untold = self.kept.untold.take();
         {
             let mut shared = locked(&self.shared);
             shared.job = shared.job.or(untold);
@@ -433,7 +424,7 @@ impl Machine for IppdmeCmm {
                 _ => Reconciled::Running(self.status_of(&shared)),
             });
         }
-        if self.untold.take_if(|untold| Some(*untold) == key).is_some() && shared.state == State::Idle {
+        if self.kept.untold.take_if(|untold| Some(*untold) == key).is_some() && shared.state == State::Idle {
             let gone =
                 "the server keeps no job: the machine stands, and what it had touched for the interrupted run is gone";
             (shared.job, shared.state, shared.outcome) = (key, State::Complete, Outcome::Failed);
@@ -447,7 +438,7 @@ impl Machine for IppdmeCmm {
 
 impl Cmm for IppdmeCmm {
     async fn load_plan(&mut self, plan: &Plan, _: &Interrupt) -> Answered<()> {
-        self.loaded = None;
+        self.kept.loaded = None;
         let (owned, volume_mm, machine) = (plan.clone(), self.settings.volume_mm, Arc::clone(&self.name));
         let scan = self.settings.scan;
         let find = move || Route::over(&owned, scan, &volume_mm, &machine).map(|route| Work { plan: owned, route });
@@ -459,18 +450,18 @@ impl Cmm for IppdmeCmm {
                 found.unwrap_or_else(|panicked| std::panic::resume_unwind(panicked.into_panic()))
             }
         }?;
-        self.loaded = Some((Arc::new(work), digest(&[plan.identity()])));
+        self.kept.loaded = Some((Arc::new(work), digest(&[plan.identity()])));
         Ok(())
     }
 
     async fn read_ahead(&mut self, job: Job, _: &Interrupt) -> Option<Preliminary> {
         let shared = locked(&self.shared);
         let ours = shared.job.is_some_and(|(own, _)| own == job);
-        let from = self.told_ahead;
+        let from = self.kept.told_ahead;
         let ready = shared.points.iter().skip(from).map_while(|point| *point);
         let points: Vec<MeasuredPoint> = if ours { ready.collect() } else { Vec::new() };
         drop(shared);
-        self.told_ahead += points.len();
+        self.kept.told_ahead += points.len();
         let there = !points.is_empty();
         there.then_some(Preliminary { job, from, points, coordinates: Coordinates::Centres })
     }

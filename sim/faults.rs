@@ -1,0 +1,74 @@
+//! What is to go wrong at a machine that is told line by line, each once. What goes wrong with the requests of a wire differs, see
+//! [`crate::wire::faults`]: there it is drawn and comes again, and several may meet in one request.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+struct Rule<Place, Fault> {
+    place: Place,
+    /// So many at such a place go well before.
+    skip: u32,
+    fault: Fault,
+}
+
+/// Faults that are still to come, each at a place as the machine names it. Clones share them.
+pub struct Faults<Place, Fault>(Arc<Mutex<Vec<Rule<Place, Fault>>>>);
+
+impl<Place, Fault> Faults<Place, Fault> {
+    /// None.
+    pub fn none() -> Self {
+        Self(Arc::default())
+    }
+
+    /// Has a fault happen at such a place, after so many others like it.
+    pub fn add(&self, place: impl Into<Place>, skip: u32, fault: Fault) {
+        self.rules().push(Rule { place: place.into(), skip, fault });
+    }
+
+    /// Forgets those that are still to come.
+    pub fn clear(&self) {
+        self.rules().clear();
+    }
+
+    /// Returns what happens now, where the places that are meant are these. The first of several is taken, the others wait.
+    pub(crate) fn at(&self, is_meant: impl Fn(&Place) -> bool) -> Option<Fault> {
+        let mut rules = self.rules();
+        let mut met = None;
+        for (k, rule) in rules.iter_mut().enumerate().filter(|(_, rule)| is_meant(&rule.place)) {
+            match rule.skip.checked_sub(1) {
+                Some(left) => rule.skip = left,
+                None => met = met.or(Some(k)),
+            }
+        }
+        met.map(|k| rules.remove(k).fault)
+    }
+
+    fn rules(&self) -> MutexGuard<'_, Vec<Rule<Place, Fault>>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl<Place, Fault> Clone for Faults<Place, Fault> {
+    fn clone(&self) -> Self {
+        Self(Arc::clone(&self.0))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_comes_once_at_its_place_after_those_that_go_well() {
+        let faults = Faults::<String, u8>::none();
+        faults.add("a", 1, 1);
+        faults.add("a", 1, 2);
+        faults.add("b", 0, 3);
+        let shared = faults.clone();
+        let at = |name: &str| shared.at(|place| place == name);
+        assert_eq!([at("c"), at("a"), at("a"), at("a"), at("a")], [None, None, Some(1), Some(2), None]);
+        assert_eq!([at("b"), at("b")], [Some(3), None]);
+        faults.add("b", 0, 4);
+        faults.clear();
+        assert_eq!(at("b"), None);
+    }
+}

@@ -1,0 +1,124 @@
+//! From a program to one that runs: what must hold before, the record that is opened for it, and the one line that starts it.
+
+use std::sync::Arc;
+
+use rand::RngExt as _;
+use tokio::time::{Instant, sleep};
+
+use super::looking::standing_fault;
+use super::{LOOK_EVERY, LinuxcncGrinder, SEEN_TWICE_OVER};
+use crate::error::{Answered, DeviceError};
+use crate::linuxcnc::controller::{Interpreter, Seen};
+use crate::linuxcnc::program::{Program, RECORD, Record, opening, path};
+use crate::linuxcnc::protocol::{Mode, Set};
+use crate::linuxcnc::work::{Stage, Work};
+use crate::words::{Answer, Armed, Command, Fault, Job, State, Status};
+
+impl LinuxcncGrinder {
+    pub(super) async fn prepared(&mut self, job: Job, program: Arc<Program>) -> Answered<Armed> {
+        let (seen, _) = self.look().await?;
+        self.check_ready(&seen)?;
+        if !self.controller.owned {
+            return Err(self.refused(Command::Prepare, Answer::NotOwner));
+        }
+        let name = program.name.clone();
+        let before = self.in_folders(move |folders| folders.record(&name)).await?.unwrap_or_default();
+        if before.begun > 0 {
+            return Err(self.refused(Command::Prepare, Answer::AlreadyBegun));
+        }
+        let token = self.chance.random::<u32>().max(1);
+        self.controller.errors().await?;
+        self.open_record(&program, token).await?;
+        self.controller.enter(Mode::Auto, Command::Prepare).await?;
+        let path = self.path(&program);
+        self.controller.open(&path, Command::Prepare).await?;
+        let sequence = u32::from(job.cycle).max(1);
+        let (stage, wanted, errors, round) = (Stage::Prepared, None, Vec::new(), (0, 0));
+        self.work = Some(Work { job, sequence, token, program: Some(program), path, stage, wanted, errors, round });
+        (self.began, self.duration_s, self.fault, self.clear_at) = (None, None, Fault::None, None);
+        self.notes.clear();
+        self.last = Some(State::Prepared);
+        Ok(Armed { job, start_sequence: sequence, token, boot_id: 0 })
+    }
+
+    /// Refuses what must not be begun with: nothing here makes the machine ready but a person at it.
+    pub(super) fn check_ready(&self, seen: &Seen) -> Answered<()> {
+        match () {
+            () if seen.stopped || !seen.on => {
+                let (state, fault) = (State::Faulted, standing_fault(seen).unwrap_or(Fault::None));
+                Err(DeviceError::Faulted { machine: self.machine(), state, fault })
+            }
+            () if seen.interpreter == Interpreter::Running => Err(self.unready("it runs a program")),
+            () if seen.interpreter == Interpreter::Paused => {
+                Err(self.unready("a program is paused at it: end it at the machine"))
+            }
+            () if !seen.homed => Err(self.unready("it is not homed: home it at the machine")),
+            () => Ok(()),
+        }
+    }
+
+    fn unready(&self, why: &'static str) -> DeviceError {
+        DeviceError::Unready { machine: self.machine(), why }
+    }
+
+    /// Has the controller open the record, and reads there what it was told to write: so both see one folder, the controller can write
+    /// in it, and what is found in the record later is of this preparation.
+    async fn open_record(&mut self, program: &Program, token: u32) -> Answered<()> {
+        let record = path(&self.folders.there, &program.name, RECORD);
+        self.controller.enter(Mode::Mdi, Command::Prepare).await?;
+        for line in opening(&record, token) {
+            self.controller.order(Set::Mdi(line), Command::Prepare).await?;
+        }
+        let began = Instant::now();
+        loop {
+            let name = program.name.clone();
+            let found = self.in_folders(move |folders| folders.record(&name)).await?;
+            if found == Some(Record { prepared: Some(token), begun: 0, ended: 0 }) {
+                return Ok(());
+            }
+            if began.elapsed() > self.settings.settle_within {
+                let (here, there) = (self.folders.here.display(), &self.folders.there);
+                let errors = self.controller.errors().await?.join("; ");
+                let why = format!(
+                    "what the controller writes to {record} is not seen in {here}: is {there} the same folder, and may the account that \
+                     LinuxCNC runs by write there? {errors}"
+                );
+                return Err(DeviceError::Folder { machine: self.machine(), why });
+            }
+            sleep(LOOK_EVERY).await;
+        }
+    }
+
+    /// Sends the one line that begins it, and waits until that shows.
+    pub(super) async fn run(&mut self) -> Answered<Status> {
+        let heard = self.controller.order(Set::Run, Command::Start).await;
+        let refused = match heard {
+            Ok(()) => None,
+            Err(refused @ (DeviceError::Refused { .. } | DeviceError::ControlTaken { .. })) => Some(refused),
+            Err(error) => return Err(error),
+        };
+        let sent = Instant::now();
+        let limit = if refused.is_some() { SEEN_TWICE_OVER } else { self.settings.settle_within };
+        loop {
+            match self.has_begun().await {
+                Ok(Some(status)) => return Ok(status),
+                Ok(None) if sent.elapsed() < limit => sleep(LOOK_EVERY).await,
+                Ok(None) => {
+                    let machine = self.machine();
+                    return Err(refused.unwrap_or(DeviceError::TimedOut { machine, what: "a start", limit }));
+                }
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
+    /// Whether the program of the job is seen to run, or has written that it began.
+    async fn has_begun(&mut self) -> Answered<Option<Status>> {
+        let (seen, status) = self.look().await?;
+        let Some(work) = self.work.clone() else { return Ok(None) };
+        let is_ours = seen.program.as_deref() == Some(&work.path);
+        let runs = is_ours && seen.interpreter != Interpreter::Idle;
+        let wrote = self.record(&work).await?.is_some_and(|record| record.begun > 0);
+        Ok((runs || wrote).then_some(status))
+    }
+}
