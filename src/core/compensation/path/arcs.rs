@@ -144,7 +144,7 @@ impl ArcSummary {
     }
 }
 
-/// The moves of a path, each with the middle of its step: none where the wheel comes down to the beginning of a track.
+/// The moves of a path, each with the middle of its step; one that has none stays a line.
 #[derive(Clone, Debug)]
 pub struct Sampled<'a>(Moves<'a>);
 
@@ -629,7 +629,10 @@ mod tests {
                             }
                             let off = (at - centre(t)).norm();
                             // By rounding of its ends, which the path has none of.
-                            assert!(off <= arc.deviation_mm + 1.0 / per_mm + 1e-9, "{off} {arc:?}");
+                            assert!(
+                                off <= arc.deviation_mm + 1.0 / per_mm + 1e-9,
+                                "{off} {arc:?} {t} {span:?} {share}"
+                            );
                         }
                         from = written(arc.to);
                     } else if let Block::Straight(Move::Feed { at, .. }) = block {
