@@ -60,7 +60,7 @@ pub struct Moves<'a> {
     pub(super) bend: f64,
     /// Whether the last point given is on the part or its overrun, and so not where the wheel comes down or lifts off.
     pub(super) on_span: bool,
-    /// The middle of the step that led to the last point, on the path; none where that began a track.
+    /// The middle of the step that led to the last point, on the path; none where that began a track, and over the place where a lead begins or ends.
     pub(super) middle: Option<Point>,
     /// How far the wheel's centre has gone to the last point given.
     centre_mm: f64,
@@ -154,8 +154,10 @@ impl<'a> Moves<'a> {
             self.centre_mm = chord;
             let next = taken * (0.95 / share.max(1e-6).sqrt()).clamp(0.5, 2.0);
             let (low, high) = (span.from.min(span.to), span.from.max(span.to));
-            self.middle = Some(Point::new(middle.at.x, middle.at.y, path.upright(middle.at.z)));
             self.on_span = low <= walk.t.min(t) && walk.t.max(t) <= high;
+            // Where the lead meets the span the path bends anew, and its middle says little of such a step.
+            let over_an_end = [low, high].iter().any(|end| walk.t.min(t) < *end && *end < walk.t.max(t));
+            self.middle = (!over_an_end).then(|| Point::new(middle.at.x, middle.at.y, path.upright(middle.at.z)));
             walk = Walk { t, at, step: next, ..walk };
             return walk;
         }
