@@ -87,14 +87,14 @@ mod tests {
     fn everything_wrong_is_told_at_its_place_with_a_remedy() {
         let text = BUILT_IN[1]
             .1
-            .replace("decimals = 4 ", "decimals = 9 ")
+            .replace("\ndecimals = 4 ", "\ndecimals = 9 ")
             .replace("\nline = ", "\nlines = ")
             .replace("G21 G90", "G20 G90");
         let problems = parse_dialect(Path::new("ours.toml"), &text).unwrap_err();
         let told = problems.to_string();
         let at = |what: &str| 1 + text.lines().position(|line| line.contains(what)).unwrap();
         for (key, what) in
-            [("numbers.decimals", "decimals = 9"), ("words.lines", "lines = "), ("program.setup[0]", "G20")]
+            [("numbers.decimals", "decimals = 9 "), ("words.lines", "lines = "), ("program.setup[0]", "G20")]
         {
             let begins = format!("ours.toml:{}:", at(what));
             assert!(told.lines().any(|line| line.starts_with(&begins) && line.contains(key)), "{key}: {told}");

@@ -247,6 +247,12 @@ fn a_program_that_turns_is_no_program_for_a_machine_that_does_not() {
     ] {
         assert!(program.clone().on(Some(head)).unwrap_err().contains(what));
     }
+    // Arcs are for wheels that stand upright.
+    assert!(part.programs.check_dialect().is_ok());
+    part.programs.arcs_within_mm = Some(1e-4);
+    let refused = part.programs.check_dialect().unwrap_err().to_string();
+    assert!(refused.contains("grinder.program.arcs_within_um") && refused.contains("grinding.tilt"), "{refused}");
+    part.programs.arcs_within_mm = None;
     // A control that has no words for it.
     part.programs.dialect =
         read_dialect(&Path::new(env!("CARGO_MANIFEST_DIR")).join("config/dialects/heidenhain.toml")).unwrap().0;
