@@ -57,27 +57,34 @@ GUARDS = {
     "payloads in force are compared before a job": (
         "src/device/modbus/mod.rs", "            self.compare_slot(kind).await?;\n", "            let _ = kind;\n"),
     "an abort of a lost I++ connection is given anew": (
-        "src/device/ippdme/machine.rs", "saturating_sub(u64::from(state == State::Aborting))", "saturating_sub(u64::from(state == State::Aborting && false))"),
+        "src/device/ippdme/machine.rs", "saturating_sub(u64::from(state == State::Aborting))", "saturating_sub(u64::from(state == State::Aborting && false))",
+        "device", "an_abort_behind_a_lost_connection"),
     "what an interrupted I++ job has left moving is aborted": (
         "src/device/ippdme/machine.rs", "moved.then_some(self.settings.silence_limit)", "moved.then_some(self.settings.silence_limit).filter(|_| false)"),
     "a line of another I++ command is none of this one": (
-        "src/device/ippdme/session.rs", "if response.tag == pending.tag {", "if response.tag == pending.tag || matches!(response.tag, Tag::Command(_)) {"),
+        "src/device/ippdme/session.rs", "if response.tag == pending.tag {", "if response.tag == pending.tag || matches!(response.tag, Tag::Command(_)) {",
+        "device", "data_of_a_command_that_was_never_given"),
     "an I++ job is held between two targets": (
-        "src/device/ippdme/work.rs", "if self.wished() != Wish::GoOn {", "if false && self.wished() != Wish::GoOn {"),
+        "src/device/ippdme/work.rs", "if self.wished() != Wish::GoOn {", "if false && self.wished() != Wish::GoOn {",
+        "device", "a_hold_retracts_and_a_resume"),
     "the probe travels at the clearance": (
         "src/device/ippdme/work.rs", "        self.rise(work).await?;\n        let [x, y, z]", "        let [x, y, z]"),
     "a program that has begun is not prepared again": (
-        "src/device/linuxcnc/machine/beginning.rs", "if before.begun > 0 {", "if false && before.begun > 0 {"),
+        "src/device/linuxcnc/machine/beginning.rs", "if before.begun > 0 {", "if false && before.begun > 0 {",
+        "linuxcnc", "a_program_that_has_begun_is_not_prepared_again"),
     "the controller has the program that it was told to open": (
-        "src/device/linuxcnc/controller.rs", "|seen| seen.program.as_deref() == Some(path) && seen.line == 0)", "|_| true)"),
+        "src/device/linuxcnc/controller.rs", "|seen| seen.program.as_deref() == Some(path) && seen.line == 0)", "|_| true)",
+        "linuxcnc", "an_open_that_is_acknowledged_and_not_done"),
     "a lost linuxcncrsh is told as lost": (
         "src/device/linuxcnc/controller.rs", "self.lost.clone().unwrap_or_else(never)", "self.lost.clone().filter(|_| false).unwrap_or_else(never)"),
     "a program writes its end behind its motion": (
         "src/device/linuxcnc/program.rs", "{again}M66 P0 L0\\n{}M2", "{again}M67\\n{}M2"),
     "a START of LinuxCNC that was not seen is fenced off": (
-        "src/device/linuxcnc/machine/reconciling.rs", "        self.claim_again().await?;\n        let fenced", "        let fenced"),
+        "src/device/linuxcnc/machine/reconciling.rs", "        self.claim_again().await?;\n        let fenced", "        let fenced",
+        "linuxcnc", "a_start_that_is_acknowledged_and_does_not_show"),
     "what is prepared is looked at before a START": (
-        "src/device/linuxcnc/machine.rs", "if !is_prepared || status.state != State::Prepared || seen.mode", "if seen.mode"),
+        "src/device/linuxcnc/machine.rs", "if !is_prepared || status.state != State::Prepared || seen.mode", "if seen.mode",
+        "linuxcnc", "a_program_that_is_changed_behind_our_back"),
 }  # fmt: skip
 
 

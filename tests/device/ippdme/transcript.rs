@@ -4,40 +4,51 @@ use std::sync::{Arc, Mutex};
 
 use regrind::device::{Cmm, Interrupt, IppdmeCmm, Machine, Plan, State, Target, TargetKind};
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpStream};
 
 use super::bench::{begin, job, patient, settings, until, until_still};
 
 /// The lines of a client.
 type Heard = Arc<Mutex<Vec<String>>>;
 
-/// Answers each command by what stands for its beginning; nothing at all where that is `None`.
+/// Instead of an answer: the connection ends.
+const HANGS_UP: &str = "hangs up";
+
+/// Answers each command by what stands for its beginning; nothing at all where that is `None`. Its clients come one after the other.
 async fn canned(answers: fn(&str) -> Option<&'static str>) -> (u16, Heard) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let port = listener.local_addr().unwrap().port();
     let heard = Heard::default();
     let kept = Arc::clone(&heard);
     tokio::spawn(async move {
-        let (stream, _) = listener.accept().await.unwrap();
-        let (reading, mut writing) = stream.into_split();
-        let mut lines = BufReader::new(reading).lines();
-        while let Ok(Some(line)) = lines.next_line().await {
-            let (tag, said) = line.split_once(' ').unwrap();
-            // A look at an idle machine comes when it comes.
-            let is_look = said == "GetErrStatusE()";
-            if !is_look {
-                kept.lock().unwrap().push(line.clone());
-            }
-            let answer = if is_look { Some("# ErrStatus(0)") } else { answers(said) };
-            let Some(answer) = answer else {
-                writing.write_all(format!("{tag} &\r\n").as_bytes()).await.unwrap();
-                continue;
-            };
-            let data: String = answer.split('|').filter(|a| !a.is_empty()).map(|a| format!("{tag} {a}\r\n")).collect();
-            writing.write_all(format!("{tag} &\r\n{data}{tag} %\r\n").as_bytes()).await.unwrap();
+        while let Ok((stream, _)) = listener.accept().await {
+            attend(stream, answers, &kept).await;
         }
     });
     (port, heard)
+}
+
+async fn attend(stream: TcpStream, answers: fn(&str) -> Option<&'static str>, heard: &Heard) {
+    let (reading, mut writing) = stream.into_split();
+    let mut lines = BufReader::new(reading).lines();
+    while let Ok(Some(line)) = lines.next_line().await {
+        let (tag, said) = line.split_once(' ').unwrap();
+        // A look at an idle machine comes when it comes.
+        let is_look = said == "GetErrStatusE()";
+        if !is_look {
+            heard.lock().unwrap().push(line.clone());
+        }
+        let answer = if is_look { Some("# ErrStatus(0)") } else { answers(said) };
+        let Some(answer) = answer else {
+            writing.write_all(format!("{tag} &\r\n").as_bytes()).await.unwrap();
+            continue;
+        };
+        if answer == HANGS_UP {
+            return;
+        }
+        let data: String = answer.split('|').filter(|a| !a.is_empty()).map(|a| format!("{tag} {a}\r\n")).collect();
+        writing.write_all(format!("{tag} &\r\n{data}{tag} %\r\n").as_bytes()).await.unwrap();
+    }
 }
 
 fn answers(said: &str) -> Option<&'static str> {
@@ -127,6 +138,21 @@ async fn an_abort_goes_out_while_a_motion_is_not_over() {
     let lines = heard.lock().unwrap().clone();
     let [.., before, abort, after] = &lines[..] else { panic!("{lines:?}") };
     assert!(before.contains("GoTo(") && abort.contains("AbortE()") && after.contains("ClearAllErrors()"), "{lines:?}");
+}
+
+#[tokio::test]
+async fn an_abort_behind_a_lost_connection_is_the_first_thing_over_the_next() {
+    let (port, heard) = canned(|said| if said.starts_with("GoTo") { Some(HANGS_UP) } else { answers(said) }).await;
+    let mut cmm = IppdmeCmm::new(settings(port, patient()));
+    cmm.connect().await.unwrap();
+    begin(&mut cmm, &plan()).await.unwrap();
+    let error = until_still(&mut cmm).await.unwrap_err();
+    assert!(error.is_link(), "{error}");
+    let before = heard.lock().unwrap().len();
+    cmm.abort().await.unwrap();
+    let lines = heard.lock().unwrap().clone();
+    assert!(lines[before].contains("AbortE()") && lines[before + 1].contains("EndSession()"), "{lines:?}");
+    assert_eq!(until_still(&mut cmm).await.unwrap().state, State::Aborted);
 }
 
 #[tokio::test]

@@ -193,8 +193,24 @@ async fn a_start_that_is_acknowledged_and_does_not_show_is_unknown_until_it_is_k
     assert!(is_unknown(&grinder.start(armed.clone()).await));
     refuses!(grinder.start(armed.clone()).await, DeviceError::Refused { .. });
     assert!(matches!(grinder.reconcile(&armed).await.unwrap(), Reconciled::NotStarted(_)));
+    // Not before a claim, behind which no older line begins anything.
+    let heard = fake.plant().heard.clone();
+    let mut behind = heard.iter().rev().take_while(|line| *line != "set run");
+    assert!(behind.any(|line| line == "set enable EMCTOO"), "{heard:?}");
     let armed = grinder.prepare(job()).await.unwrap();
     grinder.start(armed).await.unwrap();
+    assert_eq!(fake.plant().runs, 1);
+}
+
+#[tokio::test]
+async fn a_program_that_has_begun_is_not_prepared_again() {
+    let (fake, bench) = bench().await;
+    let (mut grinder, _) = bench.started().await;
+    fake.plant().end();
+    let status = until(&mut grinder, State::Complete).await;
+    grinder.acknowledge(status.done).await.unwrap();
+    grinder.load_pass(&map(), &pass(), &Interrupt::new()).await.unwrap();
+    refuses!(grinder.prepare(job()).await, DeviceError::Refused { answer: Answer::AlreadyBegun, .. });
     assert_eq!(fake.plant().runs, 1);
 }
 
