@@ -35,9 +35,9 @@ impl Head {
         std::array::from_fn(|k| pivot[k] - arm[k])
     }
 
-    /// Returns the centre of the wheel at a share of the way from a stop to the next; slides and head move in proportion.
+    /// Returns the centre of the wheel at a share of the way from a stop to the next; the head turns in proportion to what the slides have gone.
     pub fn along_mm(&self, from: &Stop, to: &Stop, share: f64) -> Vec3 {
-        let slides = std::array::from_fn(|k| from.at_mm[k] + share * (to.at_mm[k] - from.at_mm[k]));
+        let slides = to.on_the_way(from.at_mm, share);
         let ends = from.turn_deg.or(to.turn_deg).zip(to.turn_deg);
         ends.map_or(slides, |(a, b)| self.centre_mm(slides, a + share * (b - a)))
     }

@@ -171,9 +171,9 @@ impl Program {
         }
     }
 
-    /// Returns how long that way is, in millimetres; of a head that turns, how far its ends are apart.
+    /// Returns how long that way is, in millimetres; where a head turns, how far its ends are apart.
     pub fn way_mm(&self, from: &Stop, to: &Stop) -> f64 {
-        match &self.head {
+        match self.axis {
             Some(_) => {
                 let [a, b] = [0.0, 1.0].map(|share| self.centre_mm(from, to, share));
                 (0..3).map(|k| (b[k] - a[k]).powi(2)).sum::<f64>().sqrt()
@@ -618,6 +618,21 @@ mod tests {
             assert_eq!(control.read(text).unwrap().tolerance_mm, (control != Control::Fanuc).then_some(0.001));
             let cut = text.trim_end().rsplit_once('\n').unwrap().0;
             assert!(control.read(cut).is_err(), "{control:?} without an end");
+        }
+    }
+
+    #[test]
+    fn a_head_that_stays_upright_changes_nothing_of_an_arc() {
+        let head =
+            Head { letter: 'B', left_handed: false, range_deg: [-60.0, 60.0], pivot_mm: Some([0.0, 0.0, 180.0]) };
+        for (control, text) in ARCS {
+            let plain = control.read(text).unwrap();
+            let beside = plain.clone().on(Some(head)).unwrap();
+            for pair in plain.stops.windows(2).filter(|pair| pair[1].turn.is_some()) {
+                let half_way = |program: &Program| program.centre_mm(&pair[0], &pair[1], 0.5);
+                assert_eq!(half_way(&beside), half_way(&plain), "{control:?}");
+                assert_eq!(beside.way_mm(&pair[0], &pair[1]), plain.way_mm(&pair[0], &pair[1]), "{control:?}");
+            }
         }
     }
 
