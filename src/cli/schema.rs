@@ -27,6 +27,9 @@ enum Kind {
     Cell,
     /// Of dialects of programs
     Dialect,
+    /// Of plant files
+    #[cfg(feature = "plant")]
+    Plant,
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
@@ -34,6 +37,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         Kind::Recipe => recipe::json_schema(),
         Kind::Cell => config::json_schema(),
         Kind::Dialect => config::dialect_schema(),
+        #[cfg(feature = "plant")]
+        Kind::Plant => config::plant_schema(),
     })?;
     Ok(Outcome::Accepted)
 }

@@ -8,6 +8,8 @@
 
 mod check;
 mod dialect;
+#[cfg(feature = "plant")]
+mod plant;
 mod written;
 
 use std::path::{Path, PathBuf};
@@ -20,6 +22,8 @@ use crate::geometry::{Point, Pose};
 use crate::model::Machine;
 
 pub use dialect::{dialect_schema, dialects, parse_dialect, read_dialect};
+#[cfg(feature = "plant")]
+pub use plant::{PlantConfig, plant_schema};
 pub use written::RotaryLetter;
 
 /// A cell, checked.

@@ -1,0 +1,125 @@
+//! A plant file: what a computer of a plant calls itself, and where the plant is. A cell runs without one.
+
+use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
+
+use regrind_live::{OpcUaSettings, SparkplugSettings};
+use regrind_plant::{ArtefactSettings, DatabaseSettings};
+use schemars::JsonSchema;
+use serde::Deserialize;
+
+use crate::document::{Document, Problems, problem_at, read_text, schema_of, sha256};
+
+static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<PlantFile>);
+
+/// A plant of Regrind: its database, and where live values go.
+#[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+struct PlantFile {
+    /// The plant, and this computer in it.
+    #[schemars(extend("x-required" = true))]
+    plant: PlantTable,
+    /// The database of the plant.
+    database: Option<DatabaseSettings>,
+    /// Where large files of runs are kept, if not in the database.
+    artefacts: Option<ArtefactSettings>,
+    /// A broker that is told how the cell is; nobody is told where it is left out.
+    sparkplug: Option<SparkplugSettings>,
+    /// A server that shows how the cell is; there is none where it is left out.
+    opcua: Option<OpcUaSettings>,
+}
+
+/// The plant, and this computer in it.
+#[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+struct PlantTable {
+    /// What this cell is called in the plant; left out on a computer that is no cell's.
+    #[schemars(length(min = 1, max = 80), example = &"cell-1")]
+    cell: Option<String>,
+}
+
+/// A plant file, checked.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PlantConfig {
+    /// What this cell is called in the plant; none on a computer that is no cell's.
+    pub cell: Option<String>,
+    /// The database of the plant, its files found from here.
+    pub database: Option<DatabaseSettings>,
+    /// Where large files of runs are kept.
+    pub artefacts: Option<ArtefactSettings>,
+    /// A broker that is told how the cell is.
+    pub sparkplug: Option<SparkplugSettings>,
+    /// A server that shows how the cell is.
+    pub opcua: Option<OpcUaSettings>,
+    path: PathBuf,
+    text: String,
+    source_sha256: [u8; 32],
+}
+
+/// Returns the JSON schema of a plant file.
+pub fn plant_schema() -> &'static serde_json::Value {
+    &SCHEMA
+}
+
+impl PlantConfig {
+    /// Reads a plant file.
+    ///
+    /// # Errors
+    /// A file that cannot be read, and everything that is wrong with its text.
+    pub fn read(path: &Path) -> Result<Self, Problems> {
+        Self::parse(path, &read_text(path)?)
+    }
+
+    /// Reads a plant file from its text; the path is for messages, and relative files are relative to its folder.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the text.
+    pub fn parse(path: &Path, text: &str) -> Result<Self, Problems> {
+        let mut document = Document::parse(path, text)?;
+        document.hold_against(&SCHEMA);
+        let written: Option<PlantFile> = document.as_written();
+        let at = path.parent().unwrap_or(Path::new(""));
+        let found = written.map(|PlantFile { plant, database, artefacts, sparkplug, opcua }| Self {
+            cell: plant.cell,
+            database: database.map(|database| DatabaseSettings {
+                password_file: beside(at, database.password_file),
+                certificates: beside(at, database.certificates),
+                ..database
+            }),
+            artefacts: artefacts.map(|kept| ArtefactSettings { folder: at.join(kept.folder), ..kept }),
+            sparkplug: sparkplug.map(|broker| SparkplugSettings {
+                password_file: beside(at, broker.password_file),
+                certificates: beside(at, broker.certificates),
+                ..broker
+            }),
+            opcua,
+            path: path.to_owned(),
+            text: text.to_owned(),
+            source_sha256: sha256(text),
+        });
+        document.finish()?;
+        found.ok_or_else(|| {
+            Problems::whole(path, text, "something is missing".into(), "compare it with config/plant/plant.toml")
+        })
+    }
+
+    /// Returns a problem with a key of this file that somebody else has found, at its place in the text.
+    pub fn problem(&self, key: &str, found: &str, allowed: &str, remedy: &str) -> Problems {
+        problem_at(&self.path, &self.text, key, [found, allowed, remedy])
+    }
+
+    /// Returns the path that the plant file was read from.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Returns the SHA-256 of the text.
+    pub fn source_sha256(&self) -> &[u8; 32] {
+        &self.source_sha256
+    }
+}
+
+/// A file that is named relative to the folder of the plant file.
+fn beside(at: &Path, file: Option<PathBuf>) -> Option<PathBuf> {
+    file.map(|file| at.join(file))
+}
