@@ -1,0 +1,91 @@
+//! Why the plant could not be reached, or said no, with the remedy.
+
+use std::io;
+use std::path::PathBuf;
+
+use regrind_formats::{FormatError, OpenToOthers};
+use regrind_journal::JournalError;
+use regrind_report::ReportError;
+use thiserror::Error;
+
+/// Why the plant could not be reached, or said no.
+#[derive(Debug, Error)]
+#[expect(missing_docs, reason = "the messages tell them")]
+#[non_exhaustive]
+pub enum PlantError {
+    #[error("{}: the password cannot be read: {source}; `regrind plant enrol` writes it for a cell", .path.display())]
+    Password { path: PathBuf, source: io::Error },
+    #[error("{}: other users of this computer may read the password ({}); it is for its owner only: {}", .path.display(), .open.how, .open.remedy)]
+    PasswordIsOpen { path: PathBuf, open: OpenToOthers },
+    #[error("{}: no certificates in PEM can be read from it: {what}", .path.display())]
+    Certificates { path: PathBuf, what: String },
+    #[error(
+        "{host} is another computer, and nothing says by which certificates it proves itself; name them by `certificates` of [database]"
+    )]
+    Unproven { host: String },
+    /// It may be there again later.
+    #[error("the database at {place} cannot be reached: {what}; check that it runs and that the network is up")]
+    Unreachable { place: String, what: String },
+    #[error("the database refused {what}: {why}{hint}")]
+    Refused { what: &'static str, why: String, hint: String },
+    #[error("the database has the layout of Regrind {found}, and this program knows {known}; {remedy}")]
+    Layout { found: i32, known: i32, remedy: &'static str },
+    #[error(
+        "the layout of the database is not what was put there: migration {version} has another text; bring the database back from its backup"
+    )]
+    ForeignLayout { version: i32 },
+    /// What the plant holds and what the cell holds are two stories.
+    #[error("{run}: {what}; keep both as they are, and compare: regrind audit verify --plant")]
+    Differs { run: String, what: String },
+    #[error("the plant has no run {name:?} of {cell:?}; `regrind plant runs` lists them")]
+    NoRun { cell: String, name: String },
+    #[error("{0}")]
+    Recipe(String),
+    #[error("part {work}: {why}; take another: regrind work")]
+    Work { work: i64, why: String },
+    #[error("{}: the folder for large files cannot be used: {source}; check that it is there, and yours to write", .path.display())]
+    Folder { path: PathBuf, source: io::Error },
+    #[error(transparent)]
+    Journal(#[from] JournalError),
+    #[error(transparent)]
+    Report(#[from] ReportError),
+    #[error(transparent)]
+    File(#[from] FormatError),
+}
+
+impl PlantError {
+    /// Whether it may pass by itself: a network that is down, a database that is being started.
+    pub fn may_pass(&self) -> bool {
+        matches!(self, Self::Unreachable { .. })
+    }
+}
+
+/// What the database was asked for when it failed.
+pub(crate) fn refused(what: &'static str) -> impl Fn(tokio_postgres::Error) -> PlantError {
+    move |error| {
+        let Some(said) = error.as_db_error() else {
+            return PlantError::Unreachable { place: "the other end".into(), what: in_words(&error) };
+        };
+        // Classes 57 (it is being shut down or started) and 53 (no room, too many), and a lost race, pass.
+        let passes = ["57", "53", "40", "08"].iter().any(|class| said.code().code().starts_with(class));
+        if passes {
+            return PlantError::Unreachable { place: "the other end".into(), what: said.message().to_owned() };
+        }
+        let hint = said.hint().map_or(String::new(), |hint| format!("; {hint}"));
+        PlantError::Refused { what, why: said.message().to_owned(), hint }
+    }
+}
+
+/// An error of the client with what is behind it.
+pub(crate) fn in_words(error: &tokio_postgres::Error) -> String {
+    let mut words = error.to_string();
+    let mut behind = std::error::Error::source(error);
+    while let Some(source) = behind {
+        let more = source.to_string();
+        if !words.contains(&more) {
+            words = format!("{words}: {more}");
+        }
+        behind = source.source();
+    }
+    words
+}

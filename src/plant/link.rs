@@ -1,0 +1,148 @@
+//! The way to the database: who signs in, by what both ends prove themselves, and how long anything may take.
+
+use std::fs;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use regrind_formats::readable_by_others;
+use rustls::crypto::ring;
+use rustls::pki_types::CertificateDer;
+use rustls::pki_types::pem::PemObject;
+use rustls::{ClientConfig, RootCertStore};
+use tokio_postgres::config::SslMode;
+use tokio_postgres::{Client, Config, NoTls};
+use tokio_postgres_rustls::MakeRustlsConnect;
+
+use super::error::{PlantError, in_words};
+use super::settings::DatabaseSettings;
+
+/// How long the database may take to be reached, and to answer.
+const PATIENCE: Duration = Duration::from_secs(10);
+const ANSWER: Duration = Duration::from_secs(120);
+/// How soon a connection is given up whose other end is gone.
+const SILENCE: Duration = Duration::from_secs(30);
+
+/// A connection to the database of a plant. It ends with the last of those who hold it.
+pub struct Link {
+    client: Client,
+    /// Where it goes, for messages.
+    place: String,
+}
+
+impl Link {
+    /// Signs in to the database as the settings say.
+    ///
+    /// # Errors
+    /// A password or certificates that cannot be read, a database on another computer without certificates, one that cannot be reached.
+    pub async fn open(settings: &DatabaseSettings) -> Result<Self, PlantError> {
+        let place = format!("{}:{}/{}", settings.host, settings.port, settings.name);
+        let config = config(settings)?;
+        let unreached = |what: String| PlantError::Unreachable { place: place.clone(), what };
+        let late = |_| unreached(format!("nothing came within {} s", PATIENCE.as_secs()));
+        let client = match &settings.certificates {
+            Some(path) => {
+                let tls = MakeRustlsConnect::new(tls(path)?);
+                let opened = tokio::time::timeout(PATIENCE, config.connect(tls)).await.map_err(late)?;
+                let (client, connection) = opened.map_err(|error| unopened(&place, &error))?;
+                tokio::spawn(connection);
+                client
+            }
+            None => {
+                let opened = tokio::time::timeout(PATIENCE, config.connect(NoTls)).await.map_err(late)?;
+                let (client, connection) = opened.map_err(|error| unopened(&place, &error))?;
+                tokio::spawn(connection);
+                client
+            }
+        };
+        Ok(Self { client, place })
+    }
+
+    /// What is asked goes through here.
+    pub fn client(&self) -> &Client {
+        &self.client
+    }
+
+    /// The same, for what takes a transaction.
+    pub fn client_mut(&mut self) -> &mut Client {
+        &mut self.client
+    }
+
+    /// Whether nothing can be asked any more.
+    pub fn is_closed(&self) -> bool {
+        self.client.is_closed()
+    }
+
+    /// Where it goes, for messages.
+    pub fn place(&self) -> &str {
+        &self.place
+    }
+}
+
+/// Who could not sign in is told so; everything else is a database that is not there.
+fn unopened(place: &str, error: &tokio_postgres::Error) -> PlantError {
+    match error.as_db_error() {
+        // Invalid authorisation, and no such database or role.
+        Some(said) if ["28", "3D", "42"].iter().any(|class| said.code().code().starts_with(class)) => {
+            PlantError::Refused {
+                what: "to let this computer in",
+                why: said.message().to_owned(),
+                hint: "; check name, user and password of [database]".into(),
+            }
+        }
+        _ => PlantError::Unreachable { place: place.to_owned(), what: in_words(error) },
+    }
+}
+
+fn config(settings: &DatabaseSettings) -> Result<Config, PlantError> {
+    let DatabaseSettings { host, port, name, user, password_file, certificates } = settings;
+    let is_here =
+        host.starts_with('/') || host == "localhost" || host.parse().is_ok_and(|ip: std::net::IpAddr| ip.is_loopback());
+    if certificates.is_none() && !is_here {
+        return Err(PlantError::Unproven { host: host.clone() });
+    }
+    let mut config = Config::new();
+    config.host(host).port(*port).dbname(name).user(user).application_name("regrind");
+    config.ssl_mode(if certificates.is_some() { SslMode::Require } else { SslMode::Disable });
+    config
+        .connect_timeout(PATIENCE)
+        .tcp_user_timeout(SILENCE)
+        .keepalives_idle(SILENCE / 2)
+        .keepalives_interval(SILENCE / 6);
+    config.options(format!(
+        "-c search_path=regrind,pg_temp -c statement_timeout={} -c idle_in_transaction_session_timeout={} -c timezone=UTC",
+        ANSWER.as_millis(),
+        ANSWER.as_millis()
+    ));
+    if let Some(path) = password_file {
+        config.password(password(path)?);
+    }
+    Ok(config)
+}
+
+/// Reads a password that nobody else may read; the end of its line is none of it.
+fn password(path: &Path) -> Result<String, PlantError> {
+    let unread = |source| PlantError::Password { path: path.to_owned(), source };
+    if let Some(open) = readable_by_others(path).map_err(unread)? {
+        return Err(PlantError::PasswordIsOpen { path: path.to_owned(), open });
+    }
+    let text = fs::read_to_string(path).map_err(unread)?;
+    Ok(text.trim_end_matches(['\r', '\n']).to_owned())
+}
+
+fn tls(path: &Path) -> Result<ClientConfig, PlantError> {
+    let unread = |what: String| PlantError::Certificates { path: path.to_owned(), what };
+    let mut roots = RootCertStore::empty();
+    let all = CertificateDer::pem_file_iter(path).map_err(|error| unread(error.to_string()))?;
+    for certificate in all {
+        let certificate = certificate.map_err(|error| unread(error.to_string()))?;
+        roots.add(certificate).map_err(|error| unread(error.to_string()))?;
+    }
+    if roots.is_empty() {
+        return Err(unread("there is none in it".into()));
+    }
+    let config = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
+        .with_safe_default_protocol_versions()
+        .map_err(|error| unread(error.to_string()))?;
+    Ok(config.with_root_certificates(roots).with_no_client_auth())
+}

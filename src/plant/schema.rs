@@ -1,0 +1,194 @@
+//! The layout of the database, version by version, and who may do what in it.
+
+use tokio_postgres::Client;
+
+use super::error::{PlantError, refused};
+use super::link::Link;
+
+/// Every version of the layout: what is put on top of the one before. A text that was handed out is never changed.
+const MIGRATIONS: [(i32, &str); 3] = [
+    (1, include_str!("migrations/0001_records.sql")),
+    (2, include_str!("migrations/0002_work.sql")),
+    (3, include_str!("migrations/0003_views.sql")),
+];
+
+/// The groups of roles: what signs in is a member of one.
+const GROUPS: [&str; 3] = ["regrind_cell", "regrind_reader", "regrind_planner"];
+
+/// Keeps two programs from changing the layout at once: a number that nobody else uses.
+const LOCK: i64 = 0x5267_7264_506c_616e;
+
+/// Brings the layout of a database up to this program's, as its owner. Returns the version that was there, and the one that is.
+///
+/// # Errors
+/// A role that may not, a database that a later program has laid out, one whose layout was changed by hand.
+pub async fn migrate(link: &mut Link) -> Result<[i32; 2], PlantError> {
+    let failed = refused("to be laid out");
+    let client = link.client_mut();
+    let step = client.transaction().await.map_err(&failed)?;
+    step.execute("SELECT pg_advisory_xact_lock($1)", &[&LOCK]).await.map_err(&failed)?;
+    for group in GROUPS {
+        // Groups are of all databases together: another plant may have made them.
+        let make =
+            format!("DO $$ BEGIN CREATE ROLE {group} NOLOGIN; EXCEPTION WHEN duplicate_object THEN NULL; END $$");
+        step.batch_execute(&make).await.map_err(&failed)?;
+    }
+    step.batch_execute(
+        "CREATE SCHEMA IF NOT EXISTS regrind;
+         CREATE TABLE IF NOT EXISTS regrind.migration (version integer PRIMARY KEY, sha256 text NOT NULL,
+            applied_at timestamptz NOT NULL DEFAULT now());
+         GRANT USAGE ON SCHEMA regrind TO regrind_cell, regrind_reader, regrind_planner;
+         GRANT SELECT ON regrind.migration TO regrind_cell, regrind_reader;
+         GRANT regrind_reader TO regrind_planner;",
+    )
+    .await
+    .map_err(&failed)?;
+    let rows =
+        step.query("SELECT version, sha256 FROM regrind.migration ORDER BY version", &[]).await.map_err(&failed)?;
+    let applied: Vec<(i32, String)> = rows.iter().map(|row| (row.get(0), row.get(1))).collect();
+    let before = held_against_ours(&applied)?;
+    for (version, text) in &MIGRATIONS[applied.len()..] {
+        step.batch_execute(text).await.map_err(&failed)?;
+        let sha256 = regrind_journal::sha256_hex(text.as_bytes());
+        let put = "INSERT INTO regrind.migration (version, sha256) VALUES ($1, $2)";
+        step.execute(put, &[version, &sha256]).await.map_err(&failed)?;
+    }
+    step.commit().await.map_err(&failed)?;
+    Ok([before, known()])
+}
+
+/// Holds the layout of a database against the one that this program knows.
+///
+/// # Errors
+/// A layout that is older, later or another one.
+pub async fn is_known(client: &Client) -> Result<(), PlantError> {
+    let layout = |found, remedy| PlantError::Layout { found, known: known(), remedy };
+    let older = "bring it up as its owner: regrind plant init";
+    let rows = match client.query("SELECT version, sha256 FROM regrind.migration ORDER BY version", &[]).await {
+        Ok(rows) => rows,
+        // There is no such table, or no such schema.
+        Err(error) if error.code().is_some_and(|code| ["42P01", "3F000"].contains(&code.code())) => {
+            return Err(layout(0, older));
+        }
+        Err(error) => return Err(refused("to tell its layout")(error)),
+    };
+    let applied: Vec<(i32, String)> = rows.iter().map(|row| (row.get(0), row.get(1))).collect();
+    match held_against_ours(&applied)? {
+        found if found < known() => Err(layout(found, older)),
+        _ => Ok(()),
+    }
+}
+
+fn known() -> i32 {
+    MIGRATIONS.last().map_or(0, |(version, _)| *version)
+}
+
+/// Returns the newest version that was put there, where all of them are ours.
+fn held_against_ours(applied: &[(i32, String)]) -> Result<i32, PlantError> {
+    for (k, (version, sha256)) in applied.iter().enumerate() {
+        match MIGRATIONS.get(k) {
+            None => {
+                let remedy = "use the version of Regrind that laid it out, or a later one";
+                return Err(PlantError::Layout { found: applied[applied.len() - 1].0, known: known(), remedy });
+            }
+            Some((ours, text)) if ours == version && regrind_journal::sha256_hex(text.as_bytes()) == *sha256 => {}
+            Some(_) => return Err(PlantError::ForeignLayout { version: *version }),
+        }
+    }
+    Ok(applied.last().map_or(0, |(version, _)| *version))
+}
+
+/// What a role of a person or a program is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PlantRole {
+    /// Looks at everything and changes nothing: the page, Grafana.
+    Reader,
+    /// Puts parts into the queue and brings recipes, besides looking.
+    Planner,
+}
+
+impl PlantRole {
+    fn group(self) -> &'static str {
+        match self {
+            Self::Reader => "regrind_reader",
+            Self::Planner => "regrind_planner",
+        }
+    }
+}
+
+/// Makes a cell known, with the role by which it signs in, and the keys that may have signed its records. Who is known gets the new password
+/// and the further keys.
+///
+/// # Errors
+/// A role that may not make roles, a name that another cell's role has.
+pub async fn enrol_cell(
+    link: &mut Link,
+    name: &str,
+    role: &str,
+    password: &str,
+    keys: &[String],
+) -> Result<(), PlantError> {
+    let failed = refused("to enrol the cell");
+    let step = link.client_mut().transaction().await.map_err(&failed)?;
+    make_role(&step, role, password, "regrind_cell").await?;
+    step.execute(
+        "INSERT INTO regrind.cell (name, role) VALUES ($1, $2::text::name) ON CONFLICT (name) DO UPDATE SET role = excluded.role, retired_at = NULL",
+        &[&name, &role],
+    )
+    .await
+    .map_err(&failed)?;
+    for key in keys {
+        step.execute(
+            "INSERT INTO regrind.cell_key (cell, key) SELECT id, $2 FROM regrind.cell WHERE name = $1 ON CONFLICT DO NOTHING",
+            &[&name, key],
+        )
+        .await
+        .map_err(&failed)?;
+    }
+    step.commit().await.map_err(&failed)
+}
+
+/// Makes a role for a person or a program, or gives it a new password.
+///
+/// # Errors
+/// A role that may not make roles.
+pub async fn enrol(link: &mut Link, role: &str, password: &str, of: PlantRole) -> Result<(), PlantError> {
+    let failed = refused("to enrol the role");
+    let step = link.client_mut().transaction().await.map_err(&failed)?;
+    make_role(&step, role, password, of.group()).await?;
+    step.commit().await.map_err(&failed)
+}
+
+/// Names and passwords cannot be given apart from the text of a command: the server itself puts them into it.
+async fn make_role(
+    step: &tokio_postgres::Transaction<'_>,
+    role: &str,
+    password: &str,
+    group: &str,
+) -> Result<(), PlantError> {
+    let failed = refused("to make the role");
+    let known =
+        step.query_opt("SELECT 1 FROM pg_roles WHERE rolname = $1::text::name", &[&role]).await.map_err(&failed)?;
+    let verb = if known.is_some() { "ALTER" } else { "CREATE" };
+    let text = "SELECT format('%s ROLE %I LOGIN NOSUPERUSER NOCREATEDB NOCREATEROLE NOREPLICATION NOBYPASSRLS PASSWORD %L', $1::text, $2::text, $3::text),
+        format('GRANT %I TO %I', $4::text, $2::text)";
+    let made = step.query_one(text, &[&verb, &role, &password, &group]).await.map_err(&failed)?;
+    for command in [made.get::<_, &str>(0), made.get::<_, &str>(1)] {
+        step.batch_execute(command).await.map_err(&failed)?;
+    }
+    Ok(())
+}
+
+/// Takes a cell out of the plant: its role may not sign in any more, its records stay.
+///
+/// # Errors
+/// No such cell, a role that may not.
+pub async fn retire_cell(link: &mut Link, name: &str) -> Result<bool, PlantError> {
+    let failed = refused("to retire the cell");
+    let step = link.client_mut().transaction().await.map_err(&failed)?;
+    let text = "UPDATE regrind.cell SET retired_at = now() WHERE name = $1 AND retired_at IS NULL RETURNING format('ALTER ROLE %I NOLOGIN', role)";
+    let Some(row) = step.query_opt(text, &[&name]).await.map_err(&failed)? else { return Ok(false) };
+    step.batch_execute(row.get(0)).await.map_err(&failed)?;
+    step.commit().await.map_err(&failed)?;
+    Ok(true)
+}
