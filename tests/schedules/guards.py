@@ -65,8 +65,11 @@ GUARDS = {
         "src/device/ippdme/session.rs", "if response.tag == pending.tag {", "if response.tag == pending.tag || matches!(response.tag, Tag::Command(_)) {",
         "device", "data_of_a_command_that_was_never_given"),
     "an I++ job is held between two targets": (
-        "src/device/ippdme/work.rs", "if self.wished() != Wish::GoOn {", "if false && self.wished() != Wish::GoOn {",
+        "src/device/ippdme/work.rs", "if self.wished() != Wish::GoOn {\n                    break 'job;", "if false && self.wished() != Wish::GoOn {\n                    break 'job;",
         "device", "a_hold_retracts_and_a_resume"),
+    "an I++ job is held between two rows": (
+        "src/device/ippdme/work.rs", "if self.wished() != Wish::GoOn {\n                    break;", "if false && self.wished() != Wish::GoOn {\n                    break;",
+        "device", "a_hold_in_a_scan"),
     "the probe travels at the clearance": (
         "src/device/ippdme/work.rs", "        self.rise(work).await?;\n        let [x, y, z]", "        let [x, y, z]"),
     "a program that has begun is not prepared again": (

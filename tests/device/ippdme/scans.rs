@@ -120,18 +120,37 @@ async fn a_row_that_loses_the_surface_is_touched() {
     bench.are_true(&plan, &measurement);
 }
 
-#[tokio::test]
-async fn an_abort_in_a_scan_ends_it_there() {
+/// A job in its second row, which takes as long as a real one.
+async fn in_the_second_row(speed_mm_s: f64) -> Bench {
     let mut bench = scanning(FAST, CmmSpec::perfect()).await;
     let mut settings = settings(bench.serving.local_addr().port(), patient());
-    // The second row takes half a minute, and nobody waits for it.
-    settings.scan = Some(Scanning { speed_mm_s: 0.4, step_mm: 1.5 });
+    settings.scan = Some(Scanning { speed_mm_s, step_mm: 1.5 });
     bench.cmm = IppdmeCmm::new(settings);
     bench.faults.add("ScanOnCurve", 1, Fault::InRealTime);
     let plan = rows(&bench);
     bench.begin(&plan).await.unwrap();
     let serving = &bench.serving;
     until(&mut bench.cmm, |_| serving.with(|server| server.machine().contacts()) == 2).await.unwrap();
+    bench
+}
+
+#[tokio::test]
+async fn a_hold_in_a_scan_begins_no_other_row_until_it_is_resumed() {
+    // The row goes to its end in some five seconds.
+    let mut bench = in_the_second_row(10.0).await;
+    assert_eq!(bench.cmm.hold().await.unwrap().state, State::Holding);
+    let held = until_still(&mut bench.cmm).await.unwrap();
+    assert_eq!((held.state, held.progress, held.clear_of_part), (State::Held, Some((24, 37)), Some(true)));
+    assert_eq!(bench.serving.with(|server| (server.due(), server.machine().contacts())), (None, 2));
+    bench.cmm.resume().await.unwrap();
+    let ended = until_still(&mut bench.cmm).await;
+    is_measured(&mut bench, ended).await;
+}
+
+#[tokio::test]
+async fn an_abort_in_a_scan_ends_it_there() {
+    // The row takes half a minute, and nobody waits for it.
+    let mut bench = in_the_second_row(0.4).await;
     bench.cmm.abort().await.unwrap();
     let status = until_still(&mut bench.cmm).await.unwrap();
     assert_eq!((status.state, status.outcome, status.clear_of_part), (State::Aborted, Outcome::Aborted, None));
