@@ -32,7 +32,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "FILE")]
     measured: PathBuf,
     /// Radius of the probe in mm; 0 for one without a ball, such as an optical one. Not needed with --method contact
-    #[arg(long, value_name = "MM", allow_negative_numbers = true, value_parser = finite_from_zero)]
+    #[arg(long, alias = "probe-radius-mm", value_name = "MM", allow_negative_numbers = true, value_parser = finite_from_zero)]
     probe_radius: Option<f64>,
     /// Folder for the results; created if absent
     #[arg(long, value_name = "DIR")]

@@ -84,7 +84,7 @@ impl Bench {
 
     fn register(&self, nominal: &str, measured: &str, more: &[&str]) -> Output {
         let mut arguments = vec!["register", "--nominal", nominal, "--measured", measured, "--out", "out/here"];
-        if !more.contains(&"--probe-radius") && !more.contains(&"contact") {
+        if !more.iter().any(|more| more.starts_with("--probe-radius")) && !more.contains(&"contact") {
             arguments.extend(["--probe-radius", "1.5"]);
         }
         arguments.extend(more);
@@ -445,8 +445,8 @@ fn wrong_radii_are_refused() {
 fn a_probe_without_a_ball_measures_contact_points() {
     let bench = Bench::new();
     bench.write("contacts.csv", rows(nominal(), ","));
-    for radius in ["0", "0.0"] {
-        let document = bench.registered("nominal.csv", "contacts.csv", &["--probe-radius", radius]);
+    for (name, radius) in [("--probe-radius", "0"), ("--probe-radius-mm", "0.0")] {
+        let document = bench.registered("nominal.csv", "contacts.csv", &[name, radius]);
         assert_eq!(document["method"], "contact");
         assert!(number(&document["rms_mm"]) < 1e-6 && document["probe_radius_mm"].is_null(), "{document}");
     }
