@@ -12,6 +12,8 @@ use super::Outcome;
 use super::control::folder_of;
 use super::failure::Failure;
 use super::key;
+#[cfg(feature = "plant")]
+use super::plant::audit as plant;
 
 /// Verify, show or export the record of a run; make the key that signs it
 #[derive(Args, Debug)]
@@ -58,6 +60,10 @@ struct ToVerify {
     /// Public key that may have signed, or the file that it was kept in; again for a run that was gone on with by another computer
     #[arg(long, value_name = "PUBLIC|FILE", value_parser = key::public)]
     key: Vec<PublicKey>,
+    /// Prove the copy of the plant of this file too, and hold the journal against it: RUN may then be the name of a run that is not here
+    #[cfg(feature = "plant")]
+    #[arg(long, value_name = "FILE", conflicts_with = "anchor")]
+    plant: Option<PathBuf>,
     /// Print JSON instead of words
     #[arg(long)]
     json: bool,
@@ -149,6 +155,13 @@ fn failure(error: JournalError) -> Failure {
 }
 
 fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
+    #[cfg(feature = "plant")]
+    if let Some(plant) = &arguments.plant {
+        let copy = plant::prove(plant, arguments.run.as_deref(), &arguments.key, arguments.json)?;
+        if copy == plant::Here::No {
+            return Ok(Outcome::Accepted);
+        }
+    }
     let folder = folder_of(arguments.run.as_deref())?;
     let anchor = arguments.anchor.as_deref().map(read_anchor).transpose()?;
     let found = verify_against(&folder, &Against { anchor, keys: arguments.key.clone() });

@@ -218,6 +218,12 @@ pub(super) fn live_or(runs: &Path, otherwise: fn(&Path) -> Option<PathBuf>) -> R
     }
 }
 
+/// The folders of the runs that are on.
+#[cfg(feature = "plant")]
+pub(super) fn live_runs(runs: &Path) -> impl Iterator<Item = PathBuf> {
+    folders(runs).filter(|folder| is_live(folder))
+}
+
 pub(super) fn folders(runs: &Path) -> impl Iterator<Item = PathBuf> {
     let entries = std::fs::read_dir(runs).into_iter().flatten().filter_map(io::Result::ok);
     entries.map(|entry| entry.path()).filter(|path| path.is_dir())

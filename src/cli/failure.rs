@@ -12,6 +12,8 @@ use regrind::registration::RegistrationError;
 use regrind::report::ReportError;
 use regrind::setup::SetupError;
 use regrind::surface::{DefinitionError, SurfaceError};
+#[cfg(feature = "plant")]
+use regrind_plant::PlantError;
 use thiserror::Error;
 
 /// What was looked at is not as it should be.
@@ -109,6 +111,9 @@ pub(super) enum Failure {
     Tls(#[from] regrind_page::TlsError),
     #[error(transparent)]
     Users(#[from] regrind_page::UsersError),
+    #[cfg(feature = "plant")]
+    #[error(transparent)]
+    Plant(#[from] regrind_plant::PlantError),
     #[error("{}: there is no user {name:?}; `regrind users list` tells who is there", .path.display())]
     NoUser { name: String, path: PathBuf },
     #[error("the two passwords are not alike; nothing was changed")]
@@ -186,6 +191,12 @@ impl Failure {
             Self::Broken(_)
             | Self::NotWhole { .. }
             | Self::Report(ReportError::Record(JournalError::Broken { .. })) => NOT_AS_IT_SHOULD_BE,
+            #[cfg(feature = "plant")]
+            Self::Plant(error) if error.may_pass() => FAULT,
+            #[cfg(feature = "plant")]
+            Self::Plant(PlantError::Differs { .. } | PlantError::Journal(JournalError::Broken { .. })) => {
+                NOT_AS_IT_SHOULD_BE
+            }
             _ => BAD_INPUT,
         }
     }

@@ -16,6 +16,8 @@ mod live;
 mod nominal;
 mod outside;
 mod plan;
+#[cfg(feature = "plant")]
+mod plant;
 mod recover;
 mod register;
 mod report;
@@ -25,6 +27,8 @@ mod runs;
 mod schema;
 mod serve;
 mod shell;
+#[cfg(feature = "plant")]
+mod ship;
 mod show;
 mod simulate;
 mod simulated;
@@ -76,6 +80,10 @@ enum Command {
     Runs(runs::Arguments),
     Serve(serve::Arguments),
     Users(users::Arguments),
+    #[cfg(feature = "plant")]
+    Ship(ship::Arguments),
+    #[cfg(feature = "plant")]
+    Plant(plant::Arguments),
     Audit(audit::Arguments),
     Report(report::Arguments),
     Register(register::Arguments),
@@ -131,6 +139,10 @@ fn run() -> ExitCode {
         Command::Runs(arguments) => runs::run(&arguments),
         Command::Serve(arguments) => serve::run(&arguments),
         Command::Users(arguments) => users::run(&arguments),
+        #[cfg(feature = "plant")]
+        Command::Ship(arguments) => ship::run(&arguments),
+        #[cfg(feature = "plant")]
+        Command::Plant(arguments) => plant::run(&arguments),
         Command::Audit(arguments) => audit::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
         Command::Register(arguments) => register::run(&arguments),

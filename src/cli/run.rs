@@ -58,6 +58,10 @@ pub(super) struct Arguments {
     /// Show the cell as a page in the browser meanwhile, at this address, as `regrind serve` does
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = serve::ADDRESS)]
     serve: Option<SocketAddr>,
+    /// Ship the record to the plant of this file meanwhile, as `regrind ship` does
+    #[cfg(feature = "plant")]
+    #[arg(long, value_name = "FILE")]
+    plant: Option<PathBuf>,
     /// Print a line of JSON for everything that happens
     #[arg(long)]
     json: bool,
@@ -117,6 +121,9 @@ async fn carry_out(
     }
     let page = arguments.serve.map(|at| serve::Beside::begin(&arguments.runs, at, arguments.json));
     let _page = page.transpose()?;
+    #[cfg(feature = "plant")]
+    let _plant =
+        arguments.plant.as_ref().map(|plant| super::plant::Beside::begin(&arguments.runs, plant)).transpose()?;
     let live = Live { recipe, cell, part: &part, folder: &folder, job, actor, json: arguments.json };
     let machines = live.open(job)?;
     if let Some(earlier) = earlier.as_ref().filter(|_| !arguments.json) {

@@ -22,6 +22,7 @@
 
 mod artefact;
 mod canonical;
+mod copy;
 mod error;
 mod key;
 mod machine;
@@ -34,6 +35,7 @@ mod write;
 
 pub use artefact::Artefact;
 pub use canonical::{canonical_json, sha256_hex};
+pub use copy::{restore, restore_file};
 pub use error::JournalError;
 pub use key::{AuditKey, PublicKey};
 pub use machine::MachineLock;
@@ -80,6 +82,19 @@ impl Reader {
     /// Returns the records from a number on, in order.
     pub fn records(&self, from: u64) -> Records<'_> {
         Records::new(&self.connection, &self.folder, from)
+    }
+
+    /// Returns the last record; none where there is no record.
+    ///
+    /// # Errors
+    /// A record that cannot be read.
+    pub fn last(&self) -> Result<Option<Record>, JournalError> {
+        let failed = JournalError::database(&self.folder);
+        let number = self.connection.query_row("SELECT max(seq) FROM record", [], |row| row.get::<_, Option<i64>>(0));
+        match number.map_err(failed)?.and_then(|number| u64::try_from(number).ok()) {
+            None => Ok(None),
+            Some(number) => self.records(number).next().transpose(),
+        }
     }
 
     /// Returns the least number of a record that stands before the first; none in a journal that was left as it is.

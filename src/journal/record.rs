@@ -151,7 +151,7 @@ impl Record {
     }
 
     /// Returns the text that is hashed: all fields but the hashes, as JSON with sorted keys.
-    pub(super) fn text(&self) -> String {
+    pub fn text(&self) -> String {
         let mut text = String::with_capacity(self.payload.len() + 256);
         let string = |text: &mut String, key: &str, value: &str| {
             text.push_str(key);

@@ -502,7 +502,7 @@ fn lock(folder: &Path) -> Result<File, JournalError> {
 }
 
 /// The database counts with a sign; 292 years of nanoseconds fit.
-fn signed(number: u64) -> i64 {
+pub(super) fn signed(number: u64) -> i64 {
     i64::try_from(number).unwrap_or(i64::MAX)
 }
 

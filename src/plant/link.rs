@@ -10,11 +10,13 @@ use rustls::crypto::ring;
 use rustls::pki_types::CertificateDer;
 use rustls::pki_types::pem::PemObject;
 use rustls::{ClientConfig, RootCertStore};
+use serde_json::Value;
 use tokio_postgres::config::SslMode;
-use tokio_postgres::{Client, Config, NoTls};
+use tokio_postgres::types::ToSql;
+use tokio_postgres::{Client, Config, NoTls, Row};
 use tokio_postgres_rustls::MakeRustlsConnect;
 
-use super::error::{PlantError, in_words};
+use super::error::{PlantError, in_words, refused};
 use super::settings::DatabaseSettings;
 
 /// How long the database may take to be reached, and to answer.
@@ -66,6 +68,23 @@ impl Link {
     /// The same, for what takes a transaction.
     pub fn client_mut(&mut self) -> &mut Client {
         &mut self.client
+    }
+
+    /// Asks a question; returns its rows.
+    ///
+    /// # Errors
+    /// A database that cannot be reached, or refuses it.
+    pub async fn ask(&self, text: &str, values: &[&(dyn ToSql + Sync)]) -> Result<Vec<Row>, PlantError> {
+        self.client.query(text, values).await.map_err(refused("what it was asked"))
+    }
+
+    /// Tells how the cell is, in the run of this name.
+    ///
+    /// # Errors
+    /// A database that cannot be reached, or refuses it.
+    pub async fn tell_state(&self, run: Option<&str>, snapshot: &Value) -> Result<(), PlantError> {
+        let told = self.client.execute("SELECT tell_state($1, $2::text::jsonb)", &[&run, &snapshot.to_string()]).await;
+        told.map(drop).map_err(refused("how the cell is"))
     }
 
     /// Whether nothing can be asked any more.

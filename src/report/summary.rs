@@ -37,6 +37,12 @@ pub struct RunSummary {
     pub cycles: Vec<CycleSummary>,
     /// How many alarms were raised.
     pub alarms: usize,
+    /// What each machine called itself: the measuring machine, the grinder; none where it has not answered.
+    pub machines: [Option<String>; 2],
+    /// The radius of the wheel as the grinder told it last, in millimetres.
+    pub wheel_radius_mm: Option<f64>,
+    /// By how much the probe's radius was off on the reference sphere last, in micrometres.
+    pub probe_off_um: Option<f64>,
 }
 
 /// How a run ended.
@@ -113,6 +119,9 @@ fn summary(story: &Story) -> RunSummary {
         cycles: story.cycles.iter().map(|(number, cycle)| cycle_summary(*number, cycle, tolerance.as_ref())).collect(),
         tolerance,
         alarms: story.alarms.len(),
+        machines: story.machines.clone().map(|machine| machine.map(|[name, _]| name)),
+        wheel_radius_mm: story.wheel_radius_mm,
+        probe_off_um: story.radius_error_mm.map(|(_, mm)| 1e3 * mm),
     }
 }
 

@@ -60,6 +60,13 @@ pub(crate) fn is_in_front() -> bool {
     rustix::termios::tcgetpgrp(io::stdin()).is_ok_and(|group| group == rustix::process::getpgrp())
 }
 
+/// Lets other programs of this computer go first.
+#[cfg(feature = "plant")]
+pub(crate) fn give_way() {
+    // Who may not does its work all the same.
+    let _ = rustix::process::nice(10);
+}
+
 /// Keeps Ctrl-C at this program's terminal from a program that it starts.
 pub(crate) fn set_apart(command: &mut Command) {
     std::os::unix::process::CommandExt::process_group(command, 0);

@@ -67,6 +67,10 @@ pub(crate) fn is_in_front() -> bool {
     true
 }
 
+/// Other programs go first where the system says so; here it is left to it.
+#[cfg(feature = "plant")]
+pub(crate) fn give_way() {}
+
 /// Keeps Ctrl-C at this program's terminal from a program that it starts.
 pub(crate) fn set_apart(command: &mut Command) {
     std::os::windows::process::CommandExt::creation_flags(command, NEW_GROUP);

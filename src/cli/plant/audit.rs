@@ -1,0 +1,66 @@
+//! `regrind audit verify --plant`: the copy of the plant, proven by itself, and the journal here held against it.
+
+use std::path::Path;
+
+use regrind::formats::ScratchFolder;
+use regrind::journal::PublicKey;
+use regrind_plant::PlantRun;
+use serde_json::json;
+
+use super::super::control::folder_of;
+use super::super::failure::Failure;
+use super::{open, read};
+
+/// Whether the run lies here too.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in super::super) enum Here {
+    Yes,
+    No,
+}
+
+/// Proves the plant's copy of a run, and that what had arrived stands in the journal here, if there is one.
+pub(in super::super) fn prove(
+    plant: &Path,
+    run: Option<&Path>,
+    keys: &[PublicKey],
+    json: bool,
+) -> Result<Here, Failure> {
+    let config = read(plant)?;
+    let folder = match run {
+        Some(run) if !run.is_dir() => None,
+        run => Some(folder_of(run)?),
+    };
+    let named = folder.as_deref().or(run).and_then(Path::file_name).unwrap_or_default().to_string_lossy().into_owned();
+    super::super::runtime()?.block_on(async {
+        let link = open(&config).await?;
+        let found = PlantRun::find(&link, config.cell.as_deref(), &named).await?;
+        let place = std::env::temp_dir().join(format!("regrind-{:032x}", rand::random::<u128>()));
+        let scratch = ScratchFolder::at(place)?;
+        let copy = scratch.path().join(&found.name);
+        found.fetch(&link, config.artefacts.as_ref(), &copy).await?;
+        let proven = found.prove(&copy, keys)?;
+        if let Some(folder) = &folder {
+            found.stands_in(folder)?;
+        }
+        if json && folder.is_none() {
+            super::super::print_json(&json!({
+                "run": found.name, "cell": found.cell, "sound": true, "records": proven.records, "head": proven.head,
+                "closed": proven.closed, "artefacts": proven.artefacts, "keys": proven.keys, "seals": proven.seals, "signed": proven.signed,
+            }))?;
+        } else if !json {
+            let signed = match proven.signed {
+                0 => "not signed".to_owned(),
+                signed => format!("signed up to record {signed} by a key that the plant knows of {}", found.cell),
+            };
+            let signed = if found.keys.is_empty() && proven.signed > 0 { "signed, by a key that the plant was not told".to_owned() } else { signed };
+            super::super::print(&format!(
+                "plant       {} records and {} files of {}, {signed}{}\n",
+                proven.records,
+                proven.artefacts,
+                found.cell,
+                if folder.is_some() { "; they stand in the journal here" } else { "" }
+            ))?;
+        }
+        Ok(if folder.is_some() { Here::Yes } else { Here::No })
+    })
+}

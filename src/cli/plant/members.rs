@@ -1,0 +1,171 @@
+//! `regrind plant init|enrol|retire|cells`: the layout of the database, and who may sign in to it.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+use regrind::formats::write_private;
+use regrind::journal::PublicKey;
+use regrind_plant::{PlantRole, enrol_cell, migrate, retire_cell};
+use serde_json::json;
+
+use super::super::failure::Failure;
+use super::super::{Outcome, key, name};
+use super::{Where, open, open_any, rows};
+
+/// Lay the database out, or bring it up to this program's layout, as its owner
+#[derive(Args, Debug)]
+#[command(after_help = "\
+The owner of the database signs in, with the right to make roles. What is there stays; it may be said again at any time.
+
+Example:
+  createdb regrind && regrind plant init --plant owner.toml
+
+Exit codes: 0 laid out; 2 the database refuses it; 3 it cannot be reached.")]
+pub(super) struct ToInit {
+    #[command(flatten)]
+    plant: Where,
+}
+
+/// Let a cell, a planner or a reader sign in, with a new password
+#[derive(Args, Debug)]
+#[command(after_help = "\
+A cell reads what is its own, ships its records and takes work; a planner reads everything, brings recipes and queues parts; a reader (the
+page, Grafana) reads everything. The password is written to a file that nobody else may read: carry it to the computer that signs in.
+
+Examples:
+  regrind plant enrol cell-1 --plant owner.toml --password-file cell-1.password --key cell-1.key
+  regrind plant enrol page --as reader --plant owner.toml --password-file page.password
+
+Exit codes: 0 enrolled; 2 the database refuses it; 3 it cannot be reached.")]
+pub(super) struct ToEnrol {
+    /// What it is called in the plant; its role is called so too, in small letters, digits and `_`
+    #[arg(value_name = "NAME", value_parser = name)]
+    name: String,
+    /// What it does
+    #[arg(long = "as", value_enum, default_value = "cell")]
+    role: Kind,
+    /// File for the password; made, or written over
+    #[arg(long, value_name = "FILE")]
+    password_file: PathBuf,
+    /// Public key that may sign the records of the cell, or the file that `regrind audit key --json` was kept in; again for another
+    #[arg(long, value_name = "PUBLIC|FILE", value_parser = key::public)]
+    key: Vec<PublicKey>,
+    #[command(flatten)]
+    plant: Where,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Kind {
+    /// A cell
+    Cell,
+    /// Who queues parts and brings recipes
+    Planner,
+    /// Who looks
+    Reader,
+}
+
+/// Take a cell out of the plant: it cannot sign in any more, and its records stay
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Example:
+  regrind plant retire cell-1 --plant owner.toml
+
+Exit codes: 0 retired; 1 there is no such cell; 2 the database refuses it; 3 it cannot be reached.")]
+pub(super) struct ToRetire {
+    /// What it is called in the plant
+    #[arg(value_name = "NAME")]
+    name: String,
+    #[command(flatten)]
+    plant: Where,
+}
+
+/// Tell which cells there are, and when each was heard of last
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Example:
+  regrind plant cells --plant planner.toml
+
+Exit codes: 0 told; 2 the database refuses it; 3 it cannot be reached.")]
+pub(super) struct ToList {
+    #[command(flatten)]
+    plant: Where,
+    /// Print JSON instead of words
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn init(arguments: &ToInit) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    super::super::runtime()?.block_on(async {
+        let mut link = open_any(&config).await?;
+        let [before, now] = migrate(&mut link).await?;
+        super::super::print(&match before == now {
+            true => format!("{}: layout {now}, as it was\n", link.place()),
+            false => format!("{}: layout {now} (it had {before})\n", link.place()),
+        })?;
+        Ok(Outcome::Accepted)
+    })
+}
+
+pub(super) fn enrol(arguments: &ToEnrol) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    let role = role_of(&arguments.name);
+    let password = format!("{:032x}{:032x}", rand::random::<u128>(), rand::random::<u128>());
+    super::super::runtime()?.block_on(async {
+        let mut link = open(&config).await?;
+        let keys: Vec<String> = arguments.key.iter().map(ToString::to_string).collect();
+        // First the file: a password that nobody has is no use, and another can be made.
+        write_private(&arguments.password_file, format!("{password}\n").as_bytes())?;
+        match arguments.role {
+            Kind::Cell => enrol_cell(&mut link, &arguments.name, &role, &password, &keys).await?,
+            Kind::Planner => regrind_plant::enrol(&mut link, &role, &password, PlantRole::Planner).await?,
+            Kind::Reader => regrind_plant::enrol(&mut link, &role, &password, PlantRole::Reader).await?,
+        }
+        let path = arguments.password_file.display();
+        super::super::print(&format!("{} signs in as {role}, with the password in {path}\n", arguments.name))?;
+        Ok(Outcome::Accepted)
+    })
+}
+
+/// The role of a name: what needs no quotes anywhere.
+fn role_of(name: &str) -> String {
+    let plain = |c: char| if c.is_ascii_alphanumeric() { c.to_ascii_lowercase() } else { '_' };
+    let role: String = name.chars().map(plain).take(48).collect();
+    match role.starts_with(|c: char| c.is_ascii_digit()) {
+        true => format!("_{role}"),
+        false => role,
+    }
+}
+
+pub(super) fn retire(arguments: &ToRetire) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    super::super::runtime()?.block_on(async {
+        let mut link = open(&config).await?;
+        let name = &arguments.name;
+        if retire_cell(&mut link, name).await? {
+            super::super::print(&format!("{name} signs in no more; its records stay\n"))?;
+            return Ok(Outcome::Accepted);
+        }
+        super::super::print(&format!("there is no cell {name}; `regrind plant cells` lists them\n"))?;
+        Ok(Outcome::NotInTolerance)
+    })
+}
+
+pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    super::super::runtime()?.block_on(async {
+        let link = open(&config).await?;
+        let text = "SELECT cell, coalesce(words, 'never heard of'), coalesce(to_char(told_at, 'YYYY-MM-DD HH24:MI:SS'), ''), coalesce(run, '')
+            FROM cell_now ORDER BY cell";
+        let found = rows(&link, text, &[]).await?;
+        let cells: Vec<[String; 4]> = found.iter().map(|row| [0, 1, 2, 3].map(|k| row.get(k))).collect();
+        if arguments.json {
+            let told = cells.iter().map(|[cell, words, at, run]| json!({ "cell": cell, "words": words, "told_at": at, "run": run }));
+            super::super::print_json(&told.collect::<Vec<_>>())?;
+        } else {
+            let line = |[cell, words, at, run]: &[String; 4]| format!("{cell:<20}  {at:<19}  {words}  {run}\n");
+            super::super::print(&cells.iter().map(line).collect::<String>())?;
+        }
+        Ok(Outcome::Accepted)
+    })
+}

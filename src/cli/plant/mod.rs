@@ -1,0 +1,112 @@
+//! `regrind plant`: the database of many cells: who is in it, and what stands there.
+
+pub(super) mod audit;
+mod members;
+mod runs;
+
+use std::path::{Path, PathBuf};
+
+use clap::{Args, Subcommand};
+use regrind::config::PlantConfig;
+use regrind_plant::{Link, PlantError};
+
+use super::failure::Failure;
+use super::{Outcome, check};
+
+/// Keep the database of a plant of many cells
+#[derive(Args, Debug)]
+#[command(after_help = "\
+A cell runs, holds and accepts without a plant; the plant never commands a motion. The database is PostgreSQL 15 or later; who signs in, and
+where it is, stands in a plant file (config/plant/plant.toml). docs/plant.md goes from one cell to four.
+
+Examples:
+  regrind plant init --plant owner.toml
+  regrind plant enrol cell-1 --plant owner.toml --password-file cell-1.password --key cell-1.key
+  regrind plant cells --plant planner.toml
+
+Exit codes: 0 done; 1 what was looked at is not as it should be; 2 bad arguments, or the database refuses it; 3 it cannot be reached.")]
+pub(super) struct Arguments {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, Subcommand)]
+enum What {
+    Init(members::ToInit),
+    Enrol(members::ToEnrol),
+    Retire(members::ToRetire),
+    Cells(members::ToList),
+    Runs(runs::ToList),
+    Fetch(runs::ToFetch),
+    Incidents(runs::ToTell),
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    match &arguments.what {
+        What::Init(of) => members::init(of),
+        What::Enrol(of) => members::enrol(of),
+        What::Retire(of) => members::retire(of),
+        What::Cells(of) => members::list(of),
+        What::Runs(of) => runs::list(of),
+        What::Fetch(of) => runs::fetch(of),
+        What::Incidents(of) => runs::incidents(of),
+    }
+}
+
+/// Which plant is meant.
+#[derive(Args, Clone, Debug)]
+pub(super) struct Where {
+    /// Plant file: where the database is, and who signs in
+    #[arg(long = "plant", value_name = "FILE")]
+    file: PathBuf,
+}
+
+impl Where {
+    pub(super) fn read(&self) -> Result<PlantConfig, Failure> {
+        read(&self.file)
+    }
+}
+
+/// Reads a plant file, or shows what is wrong with it.
+pub(super) fn read(file: &Path) -> Result<PlantConfig, Failure> {
+    check::or_show(PlantConfig::read(file))
+}
+
+/// Signs in to the database of a plant file, whose layout may be any.
+pub(super) async fn open_any(config: &PlantConfig) -> Result<Link, Failure> {
+    let Some(settings) = &config.database else {
+        let missing = config.problem("database", "is missing", "", "say where the database is, and who signs in");
+        return check::or_show(Err(missing));
+    };
+    Ok(Link::open(settings).await?)
+}
+
+/// Signs in to the database of a plant file, which must be laid out as this program knows it.
+pub(super) async fn open(config: &PlantConfig) -> Result<Link, Failure> {
+    let link = open_any(config).await?;
+    regrind_plant::is_known(link.client()).await?;
+    Ok(link)
+}
+
+/// What goes on beside a run for the plant. It ends a little after the program that holds this.
+pub(super) struct Beside {
+    _shipping: super::ship::Beside,
+}
+
+impl Beside {
+    /// Begins to ship the runs in a folder, where the plant file names a database.
+    pub(super) fn begin(runs: &Path, plant: &Path) -> Result<Self, Failure> {
+        // What is wrong with the file is said here, before anything opens.
+        read(plant)?;
+        Ok(Self { _shipping: super::ship::Beside::begin(runs, plant)? })
+    }
+}
+
+/// A question to the database, with what it failed at.
+pub(super) async fn rows(
+    link: &Link,
+    text: &str,
+    values: &[&(dyn regrind_plant::ToSql + Sync)],
+) -> Result<Vec<regrind_plant::Row>, PlantError> {
+    link.ask(text, values).await
+}

@@ -1,0 +1,137 @@
+//! `regrind plant runs|fetch|incidents`: what the plant has of the runs of its cells.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use regrind_plant::PlantRun;
+use serde_json::json;
+
+use super::super::Outcome;
+use super::super::failure::Failure;
+use super::{Where, open, rows};
+
+/// List the newest runs of all cells, or those of one part
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Examples:
+  regrind plant runs --plant planner.toml
+  regrind plant runs --part SN-00 --plant planner.toml
+
+Exit codes: 0 told; 2 the database refuses it; 3 it cannot be reached.")]
+pub(super) struct ToList {
+    /// Serial number of the part, or how it begins
+    #[arg(long, value_name = "SERIAL")]
+    part: Option<String>,
+    /// How many at most
+    #[arg(long, value_name = "N", default_value_t = 40)]
+    most: u32,
+    #[command(flatten)]
+    plant: Where,
+    /// Print JSON instead of words
+    #[arg(long)]
+    json: bool,
+}
+
+/// Bring a run back from the plant as a run folder, and prove it
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Records and files are written as they were at the cell; `regrind report`, `regrind audit` and whatever else reads a run reads it.
+
+Example:
+  regrind plant fetch freeform-mirror-20260704T120000Z --plant planner.toml --out runs
+
+Exit codes: 0 brought back and proven; 1 it cannot be believed, or is not whole; 2 no such run; 3 the plant cannot be reached.")]
+pub(super) struct ToFetch {
+    /// What the run is called
+    #[arg(value_name = "RUN")]
+    run: String,
+    /// The cell that made it, where several have a run of that name
+    #[arg(long, value_name = "NAME")]
+    cell: Option<String>,
+    /// Folder that the run's own folder is made in
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    #[command(flatten)]
+    plant: Where,
+}
+
+/// Tell what should not have been: journals that were cut, refused work, broken chains
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Example:
+  regrind plant incidents --plant planner.toml
+
+Exit codes: 0 told; 2 the database refuses it; 3 it cannot be reached.")]
+pub(super) struct ToTell {
+    /// How many at most
+    #[arg(long, value_name = "N", default_value_t = 40)]
+    most: u32,
+    #[command(flatten)]
+    plant: Where,
+    /// Print JSON instead of words
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    super::super::runtime()?.block_on(async {
+        let link = open(&config).await?;
+        let text = "SELECT cell, run, serial, coalesce(result, 'open'), coalesce(to_char(began, 'YYYY-MM-DD HH24:MI:SS'), ''), records
+            FROM part_run WHERE $1::text IS NULL OR starts_with(serial, $1) ORDER BY began DESC LIMIT $2";
+        let found = rows(&link, text, &[&arguments.part, &i64::from(arguments.most)]).await?;
+        let told = found.iter().map(|row| ([0, 1, 2, 3, 4].map(|k| row.get::<_, String>(k)), row.get::<_, i32>(5)));
+        if arguments.json {
+            let told = told.map(|([cell, run, serial, result, began], records)| {
+                json!({ "cell": cell, "run": run, "part": serial, "result": result, "began": began, "records": records })
+            });
+            super::super::print_json(&told.collect::<Vec<_>>())?;
+        } else {
+            let line = |([cell, run, serial, result, began], records): ([String; 5], i32)| {
+                format!("{began}  {cell:<16}  {serial:<16}  {result:<12}  {records:>6} records  {run}\n")
+            };
+            super::super::print(&told.map(line).collect::<String>())?;
+        }
+        Ok(Outcome::Accepted)
+    })
+}
+
+pub(super) fn fetch(arguments: &ToFetch) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    super::super::runtime()?.block_on(async {
+        let link = open(&config).await?;
+        let run = PlantRun::find(&link, arguments.cell.as_deref(), &arguments.run).await?;
+        let folder = arguments.out.join(&run.name);
+        run.fetch(&link, config.artefacts.as_ref(), &folder).await?;
+        let proven = run.prove(&folder, &[])?;
+        let files = super::super::words::counted(proven.artefacts as usize, "file");
+        super::super::print(&format!(
+            "{}: {} records of {}, {files}; proven\n",
+            folder.display(),
+            run.records,
+            run.cell
+        ))?;
+        Ok(Outcome::Accepted)
+    })
+}
+
+pub(super) fn incidents(arguments: &ToTell) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    super::super::runtime()?.block_on(async {
+        let link = open(&config).await?;
+        let text = "SELECT to_char(i.at, 'YYYY-MM-DD HH24:MI:SS'), coalesce(c.name, i.role), coalesce(i.run, ''), i.what, i.words
+            FROM incident i LEFT JOIN cell c ON c.id = i.cell ORDER BY i.id DESC LIMIT $1";
+        let found = rows(&link, text, &[&i64::from(arguments.most)]).await?;
+        let told = found.iter().map(|row| [0, 1, 2, 3, 4].map(|k| row.get::<_, String>(k)));
+        if arguments.json {
+            let told = told.map(|[at, by, run, what, words]| {
+                json!({ "at": at, "by": by, "run": run, "what": what, "words": words })
+            });
+            super::super::print_json(&told.collect::<Vec<_>>())?;
+        } else {
+            let line = |[at, by, run, what, words]: [String; 5]| format!("{at}  {by:<16}  {what}: {words}  {run}\n");
+            super::super::print(&regrind::document::visible(&told.map(line).collect::<String>()))?;
+        }
+        Ok(Outcome::Accepted)
+    })
+}

@@ -1,0 +1,221 @@
+//! `regrind ship`: the records of this cell go to the plant, beside whatever the cell does.
+
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use clap::Args;
+use regrind::config::PlantConfig;
+use regrind::drive::Request;
+use regrind_plant::{Link, PlantError, Shipped, Shipper};
+use serde_json::json;
+
+use super::failure::Failure;
+use super::{Outcome, outside, plant};
+
+/// From one round to the next, and the longest wait for a plant that is not there.
+const ROUND: Duration = Duration::from_secs(1);
+const LONGEST_WAIT: Duration = Duration::from_secs(60);
+/// How long shipping goes on behind a run that has ended, for what it left.
+const LINGERS: Duration = Duration::from_secs(30);
+
+/// Ship the records and files of finished and running runs to the plant
+#[derive(Args, Debug)]
+#[command(after_help = "\
+It goes on until it is stopped, whether the plant can be reached or not: what could not go, goes later. The plant proves the chain of every
+record as it arrives, and a journal that was cut or rewritten after it was shipped is told here and there. No order of the cell waits for it.
+
+Examples:
+  regrind ship --plant plant.toml
+  regrind ship --plant plant.toml --runs /srv/runs --once
+
+Exit codes: 0 stopped by Ctrl-C, or everything has arrived; 1 a run differs from what the plant has of it; 2 bad arguments; 3 with --once, the
+plant cannot be reached.")]
+pub(super) struct Arguments {
+    /// Plant file: where the database is, and who signs in
+    #[arg(long, value_name = "FILE")]
+    plant: PathBuf,
+    /// Folder of the runs
+    #[arg(long, value_name = "DIR", default_value = "runs")]
+    runs: PathBuf,
+    /// End when everything that is there has arrived
+    #[arg(long)]
+    once: bool,
+    /// Print a line of JSON for everything that happens
+    #[arg(long)]
+    json: bool,
+    /// End a little after standard input does: with the program that began this one
+    #[arg(long, hide = true)]
+    while_stdin: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let config = plant::read(&arguments.plant)?;
+    // Whatever else this computer does goes first.
+    outside::give_way();
+    let mut shipping = Shipping {
+        shipper: Shipper::new(arguments.runs.clone(), config.artefacts.clone()),
+        config,
+        link: None,
+        arguments,
+        waits: false,
+    };
+    super::runtime()?.block_on(async {
+        if arguments.once {
+            return shipping.once().await;
+        }
+        tokio::select! {
+            ended = shipping.go_on() => ended.map(|()| Outcome::Accepted),
+            stopped = tokio::signal::ctrl_c(), if !arguments.while_stdin => {
+                stopped.map_err(Failure::Terminal)?;
+                shipping.ended()
+            }
+        }
+    })
+}
+
+struct Shipping<'a> {
+    config: PlantConfig,
+    shipper: Shipper,
+    link: Option<Link>,
+    arguments: &'a Arguments,
+    /// Whether it was told that the plant is not there.
+    waits: bool,
+}
+
+impl Shipping<'_> {
+    async fn once(&mut self) -> Result<Outcome, Failure> {
+        self.round().await?;
+        self.ended()
+    }
+
+    /// What the exit code says: whether something differs.
+    fn ended(&self) -> Result<Outcome, Failure> {
+        Ok(if self.shipper.left_alone().next().is_some() { Outcome::NotInTolerance } else { Outcome::Accepted })
+    }
+
+    /// Round after round; ends a little after standard input does, where it is to.
+    async fn go_on(&mut self) -> Result<(), Failure> {
+        let mut over = self.arguments.while_stdin.then(end_of_input);
+        let mut last = None;
+        let mut wait = ROUND;
+        loop {
+            let shipped = match self.round().await {
+                Ok(shipped) => {
+                    wait = ROUND;
+                    Some(shipped)
+                }
+                Err(Failure::Plant(error)) if error.may_pass() => {
+                    self.waits_for(&error)?;
+                    wait = (2 * wait).min(LONGEST_WAIT);
+                    None
+                }
+                Err(error) => return Err(error),
+            };
+            let is_empty = shipped.is_some_and(|shipped| shipped == Shipped::default());
+            match last {
+                // One round more than the last that had something: the end of a record is written last.
+                Some(until) if is_empty || Instant::now() > until => return Ok(()),
+                _ => {}
+            }
+            match &mut over {
+                Some(over) if last.is_none() => tokio::select! {
+                    () = tokio::time::sleep(wait) => {}
+                    _ = over => last = Some(Instant::now() + LINGERS),
+                },
+                _ => tokio::time::sleep(if last.is_some() { ROUND } else { wait }).await,
+            }
+        }
+    }
+
+    /// Ships what is there, and tells how the cell is.
+    async fn round(&mut self) -> Result<Shipped, Failure> {
+        if self.link.as_ref().is_none_or(Link::is_closed) {
+            self.link = Some(plant::open(&self.config).await?);
+        }
+        let Some(link) = &self.link else { return Ok(Shipped::default()) };
+        let shipped = self.shipper.round(link).await;
+        let told = match &shipped {
+            Ok(_) => tell_state(link, &self.arguments.runs).await,
+            Err(_) => Ok(()),
+        };
+        let shipped = shipped.and_then(|shipped| told.map(|()| shipped)).inspect_err(|_| self.link = None)?;
+        self.tell(&shipped)?;
+        Ok(shipped)
+    }
+
+    fn tell(&mut self, shipped: &Shipped) -> Result<(), Failure> {
+        self.waits = false;
+        for (run, what) in &shipped.differ {
+            let words = format!("{run}: {what}");
+            eprintln!("ship: {}", regrind::document::visible(&words));
+        }
+        if shipped.records == 0 && shipped.files == 0 {
+            return Ok(());
+        }
+        let Shipped { records, files, runs, .. } = shipped;
+        if self.arguments.json {
+            return super::print(&format!("{}\n", json!({ "records": records, "files": files, "runs": runs })));
+        }
+        if self.arguments.while_stdin {
+            return Ok(());
+        }
+        super::print(&format!("shipped {records} records and {files} files of {runs} runs\n"))
+    }
+
+    /// A plant that is not there is told once.
+    fn waits_for(&mut self, error: &PlantError) -> Result<(), Failure> {
+        if !std::mem::replace(&mut self.waits, true) {
+            eprintln!("ship: {error}; the cell goes on, and its records wait for it here");
+        }
+        Ok(())
+    }
+}
+
+/// Tells the plant how the cell is: as the run that is on says it, or that there is none.
+async fn tell_state(link: &Link, runs: &Path) -> Result<(), PlantError> {
+    let runs = runs.to_owned();
+    // A run that does not answer holds up nothing else meanwhile.
+    let asked = tokio::task::spawn_blocking(move || {
+        let run = super::control::live_runs(&runs).next()?;
+        let reply = regrind_control::ask(&run, &Request::Status).ok()?;
+        Some((run, reply.status))
+    });
+    match asked.await.ok().flatten() {
+        Some((run, status)) => {
+            let name = run.file_name().map(|name| name.to_string_lossy().into_owned());
+            link.tell_state(name.as_deref(), &serde_json::to_value(&status).unwrap_or_default()).await
+        }
+        None => link.tell_state(None, &json!({ "state": "Idle", "words": "no run is on" })).await,
+    }
+}
+
+/// Waits until nobody can write to standard input any more.
+fn end_of_input() -> tokio::sync::oneshot::Receiver<()> {
+    let (ended, end) = tokio::sync::oneshot::channel::<()>();
+    // A thread of its own, which ends with the program: a read of a pipe cannot be called off.
+    std::thread::spawn(move || {
+        let mut some = [0; 64];
+        while io::stdin().read(&mut some).is_ok_and(|read| read > 0) {}
+        drop(ended);
+    });
+    end
+}
+
+/// The shipping beside a run. It ends a little after the program that holds this.
+pub(super) struct Beside {
+    _shipping: Child,
+}
+
+impl Beside {
+    /// Begins to ship the runs in a folder. In a program of its own: it can neither slow the run down nor take it along.
+    pub(super) fn begin(runs: &Path, plant: &Path) -> Result<Self, Failure> {
+        let failed = Failure::Terminal;
+        let mut command = Command::new(std::env::current_exe().map_err(failed)?);
+        command.args(["ship", "--while-stdin", "--plant"]).arg(plant).arg("--runs").arg(runs);
+        outside::set_apart(&mut command);
+        let shipping = command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn().map_err(failed)?;
+        Ok(Self { _shipping: shipping })
+    }
+}

@@ -1,0 +1,167 @@
+//! A record that was kept elsewhere, on its way back into a run folder, where it is read and proven as every other.
+
+use std::fs;
+use std::path::Path;
+
+use rusqlite::params;
+use serde_json::Value;
+
+use super::artefact::{path_within, write_file};
+use super::canonical::canonical_json;
+use super::error::JournalError;
+use super::record::{COLUMNS, Record};
+use super::verify::Anchor;
+use super::write::signed;
+use super::{ANCHOR, open};
+
+impl Record {
+    /// Reads a record from the text that was hashed and the hashes around it; nothing where the text is not one that the journal writes, to
+    /// the byte. Whether the hash is that of the text is not asked: `verify` does.
+    pub fn of_text(text: &str, prev_hash: &str, hash: &str) -> Option<Self> {
+        let value: Value = serde_json::from_str(text).ok()?;
+        let word = |key: &str| value[key].as_str().map(str::to_owned);
+        let number = |key: &str| value[key].as_u64();
+        let record = Self {
+            seq: number("seq")?,
+            utc: word("utc")?,
+            boot_id: word("boot_id")?,
+            mono_ns: number("mono_ns")?,
+            actor: word("actor")?,
+            station: word("station")?,
+            kind: value["kind"].as_str()?.parse().ok()?,
+            part: word("part")?,
+            cycle: u32::try_from(number("cycle")?).ok()?,
+            command_id: match &value["command_id"] {
+                Value::Null => None,
+                id => Some(u32::try_from(id.as_u64()?).ok()?),
+            },
+            reason: word("reason")?,
+            payload: canonical_json(&value["payload"]),
+            prev_hash: prev_hash.to_owned(),
+            hash: hash.to_owned(),
+        };
+        (record.text() == text).then_some(record)
+    }
+}
+
+/// Puts the records of a run into a folder, which is made, with what is kept as their anchor. They stand there as they were given: `verify`
+/// tells whether they can be believed. Files on record are put beside them by [`restore_file`].
+///
+/// # Errors
+/// A folder that is in use or cannot be written; two records of one number, or a gap between two.
+pub fn restore(
+    folder: &Path,
+    records: impl IntoIterator<Item = Record>,
+    anchor: Option<&Anchor>,
+) -> Result<(), JournalError> {
+    if !open::is_free(folder)? {
+        return Err(JournalError::Exists { path: folder.to_owned() });
+    }
+    fs::create_dir_all(folder).map_err(JournalError::file(folder, "creating the folder"))?;
+    let mut connection = open::create(folder)?;
+    let failed = JournalError::database(folder);
+    let all = connection.transaction().map_err(&failed)?;
+    let sql =
+        format!("INSERT INTO record ({COLUMNS}) VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8, ?9, ?10, ?11, ?12, ?13, ?14)");
+    for r in records {
+        let mut statement = all.prepare_cached(&sql).map_err(&failed)?;
+        let values = params![
+            signed(r.seq),
+            r.utc,
+            r.boot_id,
+            signed(r.mono_ns),
+            r.actor,
+            r.station,
+            r.kind.as_str(),
+            r.part,
+            r.cycle,
+            r.command_id,
+            r.reason,
+            r.payload,
+            r.prev_hash,
+            r.hash
+        ];
+        statement.execute(values).map_err(&failed)?;
+    }
+    all.commit().map_err(&failed)?;
+    match anchor {
+        None => Ok(()),
+        Some(anchor) => {
+            let text = serde_json::to_value(anchor).map(|value| canonical_json(&value)).unwrap_or_default();
+            write_file(&folder.join(ANCHOR), text.as_bytes())
+        }
+    }
+}
+
+/// Puts a file on record back into a run folder.
+///
+/// # Errors
+/// A name that leads out of the folder, a folder that cannot be written.
+pub fn restore_file(folder: &Path, name: &str, content: &[u8]) -> Result<(), JournalError> {
+    write_file(&path_within(folder, name)?, content)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Against, AuditKey, Entry, Header, Journal, Kind, Reader, verify_against};
+    use super::*;
+    use serde_json::json;
+
+    fn header(run: &str) -> Header {
+        Header {
+            run: run.into(),
+            part: "SN \"7\"\n".into(),
+            actor: "Ada".into(),
+            station: "console".into(),
+            simulation: true,
+            first_command_id: 1,
+            content: json!({ "a": 0.1, "b": [1e-7, -0.0, 1e300, u64::MAX], "c": "\u{b5}\\\u{1}" }),
+        }
+    }
+
+    #[test]
+    fn a_run_that_comes_back_is_proven_as_it_was() {
+        let home = tempfile::tempdir().unwrap();
+        let [from, to] = ["there", "here"].map(|name| home.path().join(name));
+        let key = AuditKey::new();
+        let mut journal = Journal::create_with(&from, header("run"), Some(key.clone())).unwrap();
+        journal.store("cycle-1/points.csv", b"1,2\n", 1, 1).unwrap();
+        for k in 0..300 {
+            let id = journal.intend(Entry::new(Kind::Intent, k, 1, json!({ "k": k as f64 / 7.0 }))).unwrap();
+            journal.append(Entry { command_id: Some(id), ..Entry::new(Kind::Outcome, k, 1, json!({})) }).unwrap();
+        }
+        let anchor = journal.close(400, 1, json!("accepted")).unwrap();
+        let records: Vec<Record> = Reader::open(&from).unwrap().records(1).map(Result::unwrap).collect();
+        assert_eq!(Reader::open(&from).unwrap().last().unwrap().as_ref(), records.last());
+        let told = records.iter().map(|r| Record::of_text(&r.text(), &r.prev_hash, &r.hash).unwrap());
+        restore(&to, told, Some(&anchor)).unwrap();
+        restore_file(&to, "cycle-1/points.csv", b"1,2\n").unwrap();
+        let against = Against { anchor: Some(anchor), keys: vec![key.public()] };
+        let mut there = verify_against(&from, &against).unwrap();
+        there.under_way = false;
+        assert_eq!(verify_against(&to, &against).unwrap(), there);
+        assert!(restore(&to, [], None).is_err(), "a folder in use");
+        assert!(restore_file(&to, "../points.csv", b"").is_err() && restore_file(&to, "journal.sqlite", b"").is_err());
+    }
+
+    #[test]
+    fn a_text_that_the_journal_does_not_write_is_no_record() {
+        let home = tempfile::tempdir().unwrap();
+        drop(Journal::create(home.path().join("run"), header("run")).unwrap());
+        let record = Reader::open(home.path().join("run")).unwrap().records(1).next().unwrap().unwrap();
+        let text = record.text();
+        let of = |text: &str| Record::of_text(text, &record.prev_hash, &record.hash);
+        assert_eq!(of(&text).as_ref(), Some(&record));
+        for other in [
+            text.replace("\"seq\":1", "\"seq\": 1"),
+            text.replace("\"seq\":1", "\"seq\":1,\"seq\":1"),
+            text.replace("\"seq\":1", "\"seq\":-1"),
+            text.replace("\"kind\":\"begin\"", "\"kind\":\"began\""),
+            text.replace("\"cycle\":0", "\"cycle\":4294967296"),
+            text.replace("}", ""),
+            String::new(),
+        ] {
+            assert!(other != text && of(&other).is_none(), "{other}");
+        }
+    }
+}

@@ -1,0 +1,28 @@
+//! Hashes as the database has them, bytes, and as people and journals have them, small hexadecimal digits.
+
+/// Returns the digits of bytes.
+pub(crate) fn digits(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// Returns the bytes of digits; none for what are not pairs of small digits.
+pub(crate) fn unhex(digits: &str) -> Option<Vec<u8>> {
+    let nibble = |digit: u8| match digit {
+        b'0'..=b'9' => Some(digit - b'0'),
+        b'a'..=b'f' => Some(digit - b'a' + 10),
+        _ => None,
+    };
+    let pairs = digits.as_bytes().chunks(2);
+    pairs.map(|pair| Some(nibble(pair[0])? << 4 | nibble(*pair.get(1)?)?)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn digits_come_back_as_bytes_and_what_are_none_do_not() {
+        assert_eq!(unhex(&digits(&[0, 9, 10, 255])), Some(vec![0, 9, 10, 255]));
+        assert!(["0", "0A", "0g", "\u{b5}"].iter().all(|bad| unhex(bad).is_none()) && unhex("") == Some(vec![]));
+    }
+}

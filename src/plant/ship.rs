@@ -1,0 +1,341 @@
+//! Shipping: what stands in the journals of a cell goes to the plant, at least once on the wire and exactly once in the table.
+//!
+//! ```text
+//!  runs/<id>/journal.sqlite --records--> ship() --+--> record      held against the chain as it arrives
+//!                  files on record --by hash----> +--> artefact    each content once
+//!                  what a glance shows ---------> +--> run, cycle
+//! ```
+//!
+//! How far a run has come is asked of the plant, and nowhere else kept: whatever was lost on the way, a round begins from what stands
+//! there. A journal that is shorter than what the plant has of it, or another one, was cut or rewritten, and is told and left alone.
+
+use std::collections::{HashMap, HashSet};
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use regrind_formats::{ResultFolder, write_atomic};
+use regrind_journal::{DATABASE, Kind, Reader, Record, sha256_hex};
+use regrind_report::{RunResult, RunSummary, run_summary};
+use serde_json::{Value, json};
+use tokio_postgres::types::ToSql;
+
+use super::copy::PlantRun;
+use super::error::{PlantError, refused};
+use super::hex::{digits, unhex};
+use super::link::Link;
+use super::settings::ArtefactSettings;
+
+/// Records and bytes of text that go at once.
+const MOST_RECORDS: usize = 1000;
+const MOST_BYTES: usize = 1 << 20;
+/// Largest content that the database takes.
+const LARGEST_BYTES: u64 = 256 << 20;
+
+/// Ships the runs of a folder.
+pub struct Shipper {
+    runs: PathBuf,
+    artefacts: Option<ArtefactSettings>,
+    /// The runs that are over and have arrived whole, as they were then.
+    settled: HashMap<String, Stamp>,
+    /// The runs that cannot be shipped, and why.
+    left_alone: HashMap<String, String>,
+    /// The files that cannot be, by run and name, once they were told.
+    told: HashSet<(String, String)>,
+}
+
+/// When the files that hold a record were changed last, and how long they are.
+type Stamp = [Option<(SystemTime, u64)>; 2];
+
+/// What went in one round.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Shipped {
+    /// Records that the plant did not have.
+    pub records: u64,
+    /// Contents of files that it did not have.
+    pub files: u64,
+    /// Runs of which something went.
+    pub runs: u64,
+    /// Runs that were found to differ from what the plant has of them, or a file of which cannot go, and why. Each is told once.
+    pub differ: Vec<(String, String)>,
+}
+
+/// A run as the plant has it.
+struct There {
+    id: i32,
+    records: i32,
+    head: Vec<u8>,
+}
+
+impl Shipper {
+    /// Ships from a folder of runs.
+    pub fn new(runs: PathBuf, artefacts: Option<ArtefactSettings>) -> Self {
+        Self { runs, artefacts, settled: HashMap::new(), left_alone: HashMap::new(), told: HashSet::new() }
+    }
+
+    /// Runs that differ from what the plant has of them, and why.
+    pub fn left_alone(&self) -> impl Iterator<Item = (&str, &str)> {
+        self.left_alone.iter().map(|(run, why)| (run.as_str(), why.as_str()))
+    }
+
+    /// Ships what is there and has not arrived, the newest run first.
+    ///
+    /// # Errors
+    /// A plant that cannot be reached or refuses everything. What is wrong with one run is told in the answer, and the others go.
+    pub async fn round(&mut self, link: &Link) -> Result<Shipped, PlantError> {
+        let mut shipped = Shipped::default();
+        for (name, stamp) in self.unsettled() {
+            match self.ship_run(link, &name, &mut shipped).await {
+                Ok(true) => drop(self.settled.insert(name, stamp)),
+                Ok(false) => {}
+                Err(PlantError::Differs { run, what }) => {
+                    self.left_alone.insert(run.clone(), what.clone());
+                    shipped.differ.push((run, what));
+                }
+                // A journal that is being made, or that cannot be read now: another round will tell.
+                Err(PlantError::Journal(_) | PlantError::Report(_)) => {}
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(shipped)
+    }
+
+    /// The runs that may have something new.
+    fn unsettled(&self) -> Vec<(String, Stamp)> {
+        let entries = fs::read_dir(&self.runs).into_iter().flatten().filter_map(Result::ok);
+        let named = entries.filter_map(|entry| entry.file_name().into_string().ok());
+        let mut open: Vec<(String, Stamp)> = named
+            .filter(|name| !name.starts_with('.') && self.runs.join(name).join(DATABASE).is_file())
+            .map(|name| (stamp(&self.runs.join(&name)), name))
+            .filter(|(at, name)| self.settled.get(name) != Some(at) && !self.left_alone.contains_key(name))
+            .map(|(stamp, name)| (name, stamp))
+            .collect();
+        open.sort_by_key(|(_, stamp)| std::cmp::Reverse(stamp.iter().flatten().map(|(at, _)| *at).max()));
+        open
+    }
+
+    /// Ships one run; returns whether it is over and all of it has arrived.
+    async fn ship_run(&mut self, link: &Link, name: &str, shipped: &mut Shipped) -> Result<bool, PlantError> {
+        let folder = self.runs.join(name);
+        let Some(last) = Reader::open(&folder)?.last()? else { return Ok(false) };
+        let mut there = open_run(link, name).await?;
+        let began_with = there.records;
+        held_against(link, &folder, name, &there).await?;
+        while i64::from(there.records) < last.seq as i64 {
+            let batch = batch(&folder, there.records)?;
+            if batch.is_empty() {
+                break;
+            }
+            there = give(link, name, there, &batch).await?;
+        }
+        let [given, missing] = self.give_files(link, &folder, name, there.id, shipped).await?;
+        let is_over = matches!(last.kind, Kind::End | Kind::Seal) && has_end(&folder, &last)?;
+        if there.records > began_with || is_over {
+            tell_run(link, there.id, &told_of(&folder)?).await?;
+        }
+        shipped.records += u64::try_from(there.records - began_with).unwrap_or(0);
+        shipped.files += given;
+        shipped.runs += u64::from(there.records > began_with || given > 0);
+        Ok(is_over && missing == 0)
+    }
+
+    /// Gives the contents of the files on record that the plant does not have. Returns how many went and how many could not.
+    async fn give_files(
+        &mut self,
+        link: &Link,
+        folder: &Path,
+        run: &str,
+        id: i32,
+        shipped: &mut Shipped,
+    ) -> Result<[u64; 2], PlantError> {
+        let failed = refused("to tell which files it lacks");
+        let rows = link.client().query("SELECT name, sha256, bytes FROM missing_artefacts($1)", &[&id]).await;
+        let mut files = [0; 2];
+        for row in rows.map_err(failed)? {
+            let (name, sha256, bytes): (&str, &[u8], i64) = (row.get(0), row.get(1), row.get(2));
+            let Some(what) = self.give_file(link, &folder.join(name), sha256, bytes as u64).await? else {
+                files[0] += 1;
+                continue;
+            };
+            files[1] += 1;
+            if self.told.insert((run.to_owned(), name.to_owned())) {
+                let what = format!("the file {name} {what}");
+                complain(link, run, "a file that cannot be shipped", &what).await?;
+                shipped.differ.push((run.to_owned(), what));
+            }
+        }
+        Ok(files)
+    }
+
+    /// Gives the content of one file; returns why it cannot be.
+    async fn give_file(
+        &self,
+        link: &Link,
+        path: &Path,
+        sha256: &[u8],
+        bytes: u64,
+    ) -> Result<Option<String>, PlantError> {
+        let read = match fs::metadata(path) {
+            Ok(found) if found.len() == bytes => fs::read(path),
+            Ok(_) => return Ok(Some("is not what was written".into())),
+            Err(error) => Err(error),
+        };
+        let content = match read {
+            Ok(content) => content,
+            Err(error) => return Ok(Some(format!("cannot be read: {error}"))),
+        };
+        if sha256_hex(&content) != digits(sha256) {
+            return Ok(Some("is not what was written".into()));
+        }
+        let failed = refused("the content of a file");
+        if let Some(kept) = self.artefacts.as_ref().filter(|kept| bytes as f64 >= kept.from_mb * 1e6) {
+            put_aside(&kept.folder, sha256, &content)?;
+            link.client()
+                .query_one("SELECT place_artefact($1, $2)", &[&sha256, &(bytes as i64)])
+                .await
+                .map_err(failed)?;
+        } else if bytes > LARGEST_BYTES {
+            let most = LARGEST_BYTES >> 20;
+            return Ok(Some(format!(
+                "has {} MB, and the database takes {most}: name a folder by [artefacts]",
+                bytes >> 20
+            )));
+        } else {
+            link.client().query_one("SELECT give_artefact($1, $2)", &[&sha256, &content]).await.map_err(failed)?;
+        }
+        Ok(None)
+    }
+}
+
+fn stamp(folder: &Path) -> Stamp {
+    [DATABASE.to_owned(), format!("{DATABASE}-wal")].map(|name| {
+        let metadata = fs::metadata(folder.join(name)).ok()?;
+        Some((metadata.modified().ok()?, metadata.len()))
+    })
+}
+
+/// Puts a content into the folder of the plant, under its hash. What is there already is the same.
+fn put_aside(folder: &Path, sha256: &[u8], content: &[u8]) -> Result<(), PlantError> {
+    let name = digits(sha256);
+    let path = folder.join(&name[..2]).join(&name);
+    if fs::metadata(&path).is_ok_and(|found| found.len() == content.len() as u64) {
+        return Ok(());
+    }
+    let parent = folder.join(&name[..2]);
+    ResultFolder::prepare(&parent)?.keep();
+    Ok(write_atomic(&path, content)?)
+}
+
+async fn open_run(link: &Link, name: &str) -> Result<There, PlantError> {
+    let row = link.client().query_one("SELECT id, records, head FROM open_run($1)", &[&name]).await;
+    let row = row.map_err(refused("to open a run"))?;
+    Ok(There { id: row.get(0), records: row.get(1), head: row.get(2) })
+}
+
+/// Holds a journal against what the plant has of it, and tells the plant where they differ.
+async fn held_against(link: &Link, folder: &Path, run: &str, there: &There) -> Result<(), PlantError> {
+    let copy = PlantRun {
+        id: there.id,
+        cell: String::new(),
+        name: run.to_owned(),
+        records: u64::try_from(there.records).unwrap_or(0),
+        head: digits(&there.head),
+        keys: Vec::new(),
+    };
+    match copy.stands_in(folder) {
+        Err(PlantError::Differs { run, what }) => {
+            complain(link, &run, "a journal that differs", &what).await?;
+            Err(PlantError::Differs { run, what })
+        }
+        other => other,
+    }
+}
+
+/// Reads the next records that go at once.
+fn batch(folder: &Path, records: i32) -> Result<Vec<Record>, PlantError> {
+    let mut batch = Vec::new();
+    let mut bytes = 0;
+    let reader = Reader::open(folder)?;
+    for record in reader.records(u64::try_from(records).unwrap_or(0) + 1) {
+        let record = record?;
+        bytes += record.payload.len() + 300;
+        batch.push(record);
+        if batch.len() == MOST_RECORDS || bytes > MOST_BYTES {
+            break;
+        }
+    }
+    Ok(batch)
+}
+
+/// Gives records; returns where the run stands then. An answer that was lost leaves it to the next round to ask.
+async fn give(link: &Link, run: &str, there: There, batch: &[Record]) -> Result<There, PlantError> {
+    let hashes: Vec<Vec<u8>> = batch.iter().map(|record| unhex(&record.hash).unwrap_or_default()).collect();
+    let texts: Vec<String> = batch.iter().map(Record::text).collect();
+    let from = there.records + 1;
+    let values: [&(dyn ToSql + Sync); 4] = [&there.id, &from, &hashes, &texts];
+    let row = link.client().query_one("SELECT records, head, refused FROM ship($1, $2, $3, $4)", &values).await;
+    let row = row.map_err(refused("records"))?;
+    match row.get::<_, Option<String>>(2) {
+        Some(what) => Err(PlantError::Differs { run: run.to_owned(), what: format!("the plant refuses it: {what}") }),
+        None => Ok(There { records: row.get(0), head: row.get(1), ..there }),
+    }
+}
+
+/// Whether a run whose last record is this one has its end.
+fn has_end(folder: &Path, last: &Record) -> Result<bool, PlantError> {
+    if last.kind == Kind::End {
+        return Ok(true);
+    }
+    let before = Reader::open(folder)?.records(last.seq - 1).next().transpose()?;
+    Ok(before.is_some_and(|before| before.kind == Kind::End))
+}
+
+async fn complain(link: &Link, run: &str, what: &str, words: &str) -> Result<(), PlantError> {
+    let told = link.client().query_one("SELECT complain($1, $2, $3)", &[&run, &what, &words]).await;
+    told.map(drop).map_err(refused("to be told what is wrong"))
+}
+
+async fn tell_run(link: &Link, id: i32, told: &Value) -> Result<(), PlantError> {
+    let text = told.to_string();
+    let asked = link.client().execute("SELECT tell_run($1, $2::text::jsonb)", &[&id, &text]).await;
+    asked.map(drop).map_err(refused("what a glance shows of a run"))
+}
+
+/// What a glance shows of a run, as its record tells it.
+pub(crate) fn told_of(folder: &Path) -> Result<Value, PlantError> {
+    let RunSummary { result, verdict, tolerance, cycles, alarms, machines, wheel_radius_mm, .. } = run_summary(folder)?;
+    // A limit that is none is infinite, which no number in JSON is.
+    let limit = |mm: f64| mm.is_finite().then_some(1e3 * mm);
+    let cycles = cycles.iter().map(|of| {
+        let [[pv, pv_u], [rms, rms_u]] = of.figures.map_or([[None; 2]; 2], |figures| figures.map(|of| of.map(Some)));
+        let [expected_pv, expected_rms] = of.expected.map_or([None; 2], |of| of.map(Some));
+        json!({
+            "cycle": of.cycle, "verdict": of.verdict, "reason": of.reason, "pv_um": pv, "pv_u_um": pv_u, "rms_um": rms, "rms_u_um": rms_u,
+            "expected_pv_um": expected_pv, "expected_rms_um": expected_rms, "map": of.map,
+        })
+    });
+    let [cmm, grinder] = machines;
+    Ok(json!({
+        "result": result_word(result), "verdict": verdict, "alarms": alarms, "cmm": cmm, "grinder": grinder,
+        "wheel": wheel_radius_mm.map(|mm| format!("R {mm:.3} mm")), "probe": probe_of(folder).map(|mm| format!("R {mm:.3} mm")),
+        "pv_limit_um": tolerance.and_then(|of| limit(of.pv_mm)), "rms_limit_um": tolerance.and_then(|of| limit(of.rms_mm)),
+        "cycles": cycles.collect::<Vec<_>>(),
+    }))
+}
+
+/// The radius of the probe, as the recipe of the run has it.
+fn probe_of(folder: &Path) -> Option<f64> {
+    let recipe: toml::Table = fs::read_to_string(folder.join("recipe.toml")).ok()?.parse().ok()?;
+    recipe.get("measure")?.get("probe_radius_mm")?.as_float()
+}
+
+fn result_word(result: RunResult) -> &'static str {
+    match result {
+        RunResult::Open => "open",
+        RunResult::Accepted => "accepted",
+        RunResult::NotAccepted => "not accepted",
+        RunResult::Stopped => "stopped",
+        RunResult::Aborted => "aborted",
+        RunResult::Recovery => "recovery",
+    }
+}

@@ -1,0 +1,114 @@
+//! Many cells and one database: a real PostgreSQL beside the program itself, with its simulated machines, and whoever would do harm.
+//!
+//! Each test asks for PostgreSQL: Debian package postgresql. Sockets in the file system and modes are Unix's.
+#![cfg(unix)]
+
+#[path = "../common/keep.rs"]
+mod keep;
+#[path = "../common/program.rs"]
+mod program;
+
+mod on_postgres;
+mod postgres;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use postgres::{OWNER, Postgres};
+use program::run;
+use serde_json::Value;
+use tempfile::TempDir;
+
+/// A plant that is laid out, and a folder for whoever is in it.
+struct Plant {
+    postgres: Postgres,
+    home: TempDir,
+}
+
+impl Plant {
+    fn new() -> Self {
+        let plant = Self { postgres: Postgres::start(), home: TempDir::new().unwrap() };
+        plant.postgres.write_owner_password(&plant.path("owner.password"));
+        plant.write_file("owner", OWNER, "");
+        let said = plant.does(&["plant", "init", "--plant", "owner.toml"]);
+        assert!(said.contains("layout") && said.contains("it had 0"), "{said}");
+        plant
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.home.path().join(name)
+    }
+
+    /// Writes the plant file of somebody, whose password lies beside it.
+    fn write_file(&self, name: &str, role: &str, more: &str) {
+        let cell = if more.is_empty() { String::new() } else { format!("cell = \"{more}\"\n") };
+        let socket = self.postgres.socket();
+        let text = format!(
+            "[plant]\n{cell}\n[database]\nhost = \"{}\"\nuser = \"{role}\"\npassword_file = \"{name}.password\"\n",
+            socket.display()
+        );
+        fs::write(self.path(&format!("{name}.toml")), text).unwrap();
+    }
+
+    /// Enrols a cell; its plant file is called as it is.
+    fn cell(&self, name: &str, more: &[&str]) {
+        self.enrol(name, "cell", more);
+        self.write_file(name, &name.replace('-', "_"), name);
+    }
+
+    /// Enrols somebody, whose plant file is called so.
+    fn somebody(&self, name: &str, what: &str) {
+        self.enrol(name, what, &[]);
+        self.write_file(name, &name.replace('-', "_"), "");
+    }
+
+    fn enrol(&self, name: &str, what: &str, more: &[&str]) {
+        let password = format!("{name}.password");
+        let arguments = ["plant", "enrol", name, "--as", what, "--plant", "owner.toml", "--password-file", &password];
+        self.does(&[&arguments, more].concat());
+    }
+
+    fn password(&self, name: &str) -> String {
+        fs::read_to_string(self.path(&format!("{name}.password"))).unwrap().trim_end().to_owned()
+    }
+
+    /// What the program says when it does what it is asked to.
+    fn does(&self, arguments: &[&str]) -> String {
+        self.ends(arguments, 0).0
+    }
+
+    /// What it says, and what on the error stream, when it ends with a code.
+    fn ends(&self, arguments: &[&str], code: i32) -> (String, String) {
+        let (found, out, errors) = run(arguments, self.home.path());
+        assert_eq!(found, code, "{arguments:?}: {out}{errors}");
+        (out, errors)
+    }
+
+    /// The answer to a question of the owner.
+    fn sql(&self, text: &str) -> String {
+        self.postgres.sql("regrind", &format!("SET search_path = regrind; {text}"))
+    }
+
+    /// The answer to a question that a cell or somebody asks by its own means.
+    fn asked_by(&self, name: &str, text: &str) -> Result<String, String> {
+        let role = name.replace('-', "_");
+        self.postgres.ask_as(&role, &self.password(name), "regrind", &format!("SET search_path = regrind; {text}"))
+    }
+
+    /// What should not have been, the newest last.
+    fn incidents(&self) -> Vec<Value> {
+        let told = self.does(&["plant", "incidents", "--json", "--plant", "owner.toml"]);
+        let mut told: Vec<Value> = serde_json::from_str(&told).unwrap();
+        told.reverse();
+        told
+    }
+}
+
+/// The only run below a folder.
+fn only_run(runs: &Path) -> (PathBuf, String) {
+    let mut runs = fs::read_dir(runs).unwrap().map(|entry| entry.unwrap().path());
+    let run = runs.next().expect("a run");
+    assert!(runs.next().is_none(), "one run");
+    let name = run.file_name().unwrap().to_string_lossy().into_owned();
+    (run, name)
+}

@@ -1,0 +1,66 @@
+//! The layout of the database, and the way to it.
+
+use crate::Plant;
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn a_layout_that_is_not_ours_is_refused() {
+    let plant = Plant::new();
+    let init = ["plant", "init", "--plant", "owner.toml"];
+    assert!(plant.does(&init).contains("as it was"));
+    plant.cell("cell-1", &[]);
+    let ship = ["ship", "--once", "--plant", "cell-1.toml"];
+    plant.sql("INSERT INTO migration (version, sha256) VALUES (99, 'x')");
+    for arguments in [&init, &ship] {
+        let (_, told) = plant.ends(arguments, 2);
+        assert!(
+            told.contains("the layout of Regrind 99") && told.contains("use the version of Regrind that laid it out"),
+            "{told}"
+        );
+    }
+    plant.sql("DELETE FROM migration WHERE version = 99");
+    plant.sql("UPDATE migration SET sha256 = 'x' WHERE version = 2");
+    let (_, told) = plant.ends(&ship, 2);
+    assert!(told.contains("migration 2 has another text"), "{told}");
+    plant.sql("DELETE FROM migration");
+    let (_, told) = plant.ends(&ship, 2);
+    assert!(told.contains("regrind plant init"), "{told}");
+    plant.sql("DROP SCHEMA regrind CASCADE");
+    let (_, told) = plant.ends(&ship, 2);
+    assert!(told.contains("regrind plant init"), "{told}");
+    assert!(plant.does(&init).contains("it had 0"));
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn what_cannot_be_reached_or_read_is_told_with_the_remedy() {
+    let mut plant = Plant::new();
+    plant.cell("cell-1", &[]);
+    let ship = ["ship", "--once", "--plant", "cell-1.toml"];
+    let file = std::fs::read_to_string(plant.path("cell-1.toml")).unwrap();
+    let wrong = |change: (&str, &str), code: i32, words: &str| {
+        std::fs::write(plant.path("cell-1.toml"), file.replace(change.0, change.1)).unwrap();
+        let (_, told) = plant.ends(&ship, code);
+        assert!(told.contains(words), "{change:?}: {told}");
+    };
+    wrong(("user = \"cell_1\"", "user = \"cell_9\""), 2, "check name, user and password");
+    wrong(("cell-1.password", "none.password"), 2, "the password cannot be read");
+    wrong(("user = ", "usher = "), 2, "usher");
+    wrong(("[database]", "[database]\nname = \"other\""), 2, "check name, user and password");
+    let socket = format!("host = \"{}\"", plant.postgres.socket().display());
+    wrong((&socket, "host = \"plant.example\""), 2, "nothing says by which certificates it proves itself");
+    wrong((&socket, "host = \"/nowhere\""), 3, "cannot be reached");
+    std::fs::write(plant.path("cell-1.toml"), &file).unwrap();
+    std::fs::set_permissions(plant.path("cell-1.password"), std::os::unix::fs::PermissionsExt::from_mode(0o644))
+        .unwrap();
+    let (_, told) = plant.ends(&ship, 2);
+    assert!(told.contains("other users of this computer may read the password"), "{told}");
+    std::fs::set_permissions(plant.path("cell-1.password"), std::os::unix::fs::PermissionsExt::from_mode(0o600))
+        .unwrap();
+    plant.does(&ship);
+    plant.postgres.kill();
+    let (_, told) = plant.ends(&ship, 3);
+    assert!(told.contains("cannot be reached") && told.contains("check that it runs"), "{told}");
+    plant.postgres.go_on();
+    plant.does(&ship);
+}

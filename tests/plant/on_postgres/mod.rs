@@ -1,0 +1,5 @@
+//! Ignored unless PostgreSQL is asked for.
+
+mod layout;
+mod records;
+mod rights;

@@ -1,0 +1,150 @@
+//! The records of a cell on their way to the plant, as evidence there, and back.
+
+use std::fs;
+use std::path::Path;
+
+use regrind::journal::{Reader, Record, verify};
+use rusqlite::Connection;
+use serde_json::Value;
+
+use crate::program::{Running, regrind, small_recipe};
+use crate::{Plant, only_run};
+
+/// A part of the small recipe made by cell-1, signed, and shipped meanwhile.
+fn made(plant: &Plant) -> (std::path::PathBuf, String) {
+    let key = plant.path("audit.key").display().to_string();
+    let told: Value = serde_json::from_str(&plant.does(&["audit", "key", "--key", &key, "--json"])).unwrap();
+    plant.cell("cell-1", &["--key", told["public_key"].as_str().unwrap()]);
+    let recipe = small_recipe(plant.home.path(), 1000.0).display().to_string();
+    let arguments =
+        ["run", &recipe, "--cell", "sim", "--part", "SN-0042", "--operator", "Ada", "--plant", "cell-1.toml"];
+    let mut command = regrind(&arguments, plant.home.path());
+    command.env("REGRIND_KEY", &key);
+    let mut run = Running::new(command);
+    let (code, errors) = run.end();
+    assert_eq!(code, 0, "{errors}");
+    only_run(&plant.path("runs"))
+}
+
+fn records(folder: &Path) -> Vec<Record> {
+    Reader::open(folder).unwrap().records(1).map(Result::unwrap).collect()
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn a_run_is_shipped_once_proven_there_and_brought_back() {
+    let plant = Plant::new();
+    let (folder, name) = made(&plant);
+    let before = records(&folder);
+    for _ in 0..2 {
+        plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
+        assert_eq!(plant.sql("SELECT count(*), min(seq), max(seq) FROM record"), format!("{0}|1|{0}", before.len()));
+        assert_eq!(plant.sql("SELECT count(*) FROM missing_artefacts(1)"), "0", "as the owner, who is no cell");
+        let files = "SELECT count(*) > 8, count(*) FILTER (WHERE o.sha256 IS NULL) FROM run_artefact a LEFT JOIN artefact_of o USING (sha256)";
+        assert_eq!(plant.sql(files), "t|0");
+    }
+    assert_eq!(plant.sql("SELECT encode(head, 'hex') FROM run"), before.last().unwrap().hash);
+
+    // What a glance shows is what the record tells.
+    let shown = regrind::report::run_summary(&folder).unwrap();
+    let [[pv, pv_u], [rms, rms_u]] = shown.cycles.last().unwrap().figures.unwrap();
+    let row = plant.sql(
+        "SELECT cell, serial, operator, simulation, result, cycles, pv_um, pv_u_um, rms_um, rms_u_um FROM part_run",
+    );
+    let count = shown.cycles.len();
+    assert_eq!(row, format!("cell-1|SN-0042|Ada|t|accepted|{count}|{pv}|{pv_u}|{rms}|{rms_u}"));
+    let named = plant.sql("SELECT recipe, part_name, cmm IS NOT NULL, grinder IS NOT NULL, wheel, probe FROM part_run");
+    assert!(named.starts_with("small|") && named.contains("|t|t|R ") && named.ends_with("|R 1.500 mm"), "{named}");
+    let ended = plant.sql("SELECT ended AT TIME ZONE 'UTC' FROM part_run").replace(' ', "T");
+    assert!(shown.ended.unwrap().starts_with(&ended), "{ended}");
+
+    // The copy is evidence by itself, and with the journal of the cell beside it.
+    let both = plant.does(&["audit", "verify", "--plant", "cell-1.toml"]);
+    assert!(both.contains("they stand in the journal here") && both.contains("sound       "), "{both}");
+    let copy = ["audit", "verify", &name, "--plant", "owner.toml"];
+    fs::rename(plant.path("runs"), plant.path("elsewhere")).unwrap();
+    let alone = plant.does(&copy);
+    assert!(
+        alone.contains(&format!("{} records", before.len()))
+            && alone.contains("by a key that the plant knows of cell-1"),
+        "{alone}"
+    );
+
+    plant.does(&["plant", "fetch", &name, "--plant", "owner.toml", "--out", "back"]);
+    let back = plant.path("back").join(&name);
+    assert_eq!(records(&back), before);
+    let there = verify(&plant.path("elsewhere").join(&name)).unwrap();
+    let here = verify(&back).unwrap();
+    assert_eq!((here.artefacts, here.closed, here.signed), (there.artefacts, true, there.signed));
+    plant.does(&["report", &back.display().to_string()]);
+}
+
+/// Cuts the end off a journal as somebody does who knows how: the anchor goes along.
+fn cut(folder: &Path, keeps: usize) {
+    let journal = Connection::open(folder.join("journal.sqlite")).unwrap();
+    for trigger in ["record_is_not_changed", "record_is_not_deleted"] {
+        journal.execute_batch(&format!("DROP TRIGGER {trigger}")).unwrap();
+    }
+    journal.execute("DELETE FROM record WHERE seq > ?1", [keeps as i64]).unwrap();
+    fs::remove_file(folder.join("journal.anchor")).unwrap();
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn a_journal_that_is_cut_after_it_was_shipped_is_found() {
+    let plant = Plant::new();
+    let (folder, name) = made(&plant);
+    plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
+    let all = records(&folder).len();
+    cut(&folder, all / 2);
+
+    let (_, told) = plant.ends(&["ship", "--once", "--plant", "cell-1.toml"], 1);
+    let words = format!("the plant has {all} records, and the journal has {}: its end was cut off", all / 2);
+    assert!(told.contains(&words), "{told}");
+    let (_, told) = plant.ends(&["audit", "verify", "--plant", "cell-1.toml"], 1);
+    assert!(told.contains(&words), "{told}");
+    let incidents = plant.incidents();
+    let last = incidents.last().unwrap();
+    assert_eq!((last["by"].as_str(), last["run"].as_str()), (Some("cell-1"), Some(&*name)), "{last}");
+    assert!(last["what"] == "a journal that differs" && last["words"].as_str().unwrap().contains(&words), "{last}");
+    // The copy of the plant is as it was, and proves itself.
+    plant.does(&["plant", "fetch", &name, "--plant", "owner.toml", "--out", "back"]);
+    assert_eq!(records(&plant.path("back").join(&name)).len(), all);
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn a_plant_that_was_changed_is_found() {
+    let plant = Plant::new();
+    let (_, name) = made(&plant);
+    plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
+    let verify = ["audit", "verify", &name, "--plant", "owner.toml"];
+    fs::rename(plant.path("runs"), plant.path("elsewhere")).unwrap();
+    let all: usize = plant.sql("SELECT count(*) FROM record").parse().unwrap();
+    // Somebody with all rights, and what is undone behind each.
+    let harm = [
+        (
+            "SET text = replace(text, 'Ada', 'Eve') WHERE seq = 1",
+            "SET text = replace(text, 'Eve', 'Ada') WHERE seq = 1",
+            1,
+        ),
+        ("SET text = text || ' ' WHERE seq = 3", "SET text = rtrim(text) WHERE seq = 3", 3),
+        ("SET seq = -seq WHERE seq = 5", "SET seq = -seq WHERE seq = -5", 6),
+    ];
+    for (does, undoes, at) in harm {
+        plant.sql(&format!("UPDATE record {does}"));
+        let (_, told) = plant.ends(&verify, 1);
+        assert!(told.contains(&format!("record {at}")), "{does}: {told}");
+        plant.sql(&format!("UPDATE record {undoes}"));
+    }
+    plant.sql("DELETE FROM record");
+    plant.sql("UPDATE run SET records = 0, head = decode(repeat('00', 32), 'hex'), ended = NULL");
+    fs::rename(plant.path("elsewhere"), plant.path("runs")).unwrap();
+    plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
+    assert_eq!(plant.sql("SELECT count(*) FROM record").parse(), Ok(all), "shipped anew");
+    fs::rename(plant.path("runs"), plant.path("elsewhere")).unwrap();
+    plant.does(&verify);
+    plant.sql("UPDATE artefact SET content = 'other' WHERE sha256 = (SELECT sha256 FROM run_artefact WHERE name = 'recipe.toml')");
+    let (_, told) = plant.ends(&verify, 1);
+    assert!(told.contains("recipe.toml"), "{told}");
+}

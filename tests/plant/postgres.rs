@@ -1,0 +1,185 @@
+//! A PostgreSQL of its own for each test, in a folder that goes with it. It is reached by its socket alone, and by who has a password.
+
+use std::fs;
+use std::os::unix::fs::{PermissionsExt, chown};
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use tempfile::TempDir;
+
+use crate::program::PATIENCE;
+
+/// The owner of the cluster, and the password by which it signs in.
+pub const OWNER: &str = "owner";
+const PASSWORD: &str = "of-the-owner";
+/// Nothing listens on it: it is a part of the name of the socket.
+const PORT: u16 = 5432;
+
+pub struct Postgres {
+    home: TempDir,
+    bin: PathBuf,
+    server: Option<Child>,
+    /// User and group that it runs as, where this is root, which it does not run as.
+    runs_as: Option<(u32, u32)>,
+}
+
+impl Postgres {
+    /// Starts one with an empty database.
+    pub fn start() -> Self {
+        let home = TempDir::new().unwrap();
+        fs::set_permissions(home.path(), fs::Permissions::from_mode(0o755)).unwrap();
+        let mut postgres = Self { home, bin: bin(), server: None, runs_as: user() };
+        for folder in ["data", "socket"] {
+            let folder = postgres.home.path().join(folder);
+            fs::create_dir(&folder).unwrap();
+            postgres.give(&folder);
+        }
+        let password = postgres.home.path().join("owner.password");
+        fs::write(&password, PASSWORD).unwrap();
+        fs::set_permissions(&password, fs::Permissions::from_mode(0o600)).unwrap();
+        postgres.give(&password);
+        let mut initdb = postgres.program("initdb");
+        initdb.args(["--no-sync", "--auth=scram-sha-256", "--encoding=UTF8", "--locale=C", "--username", OWNER]);
+        initdb.arg("--pwfile").arg(&password).arg("--pgdata").arg(postgres.data());
+        let made = initdb.output().unwrap();
+        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+        postgres.go_on();
+        postgres.sql("postgres", "CREATE DATABASE regrind");
+        postgres
+    }
+
+    /// Starts the server again that was stopped or killed.
+    pub fn go_on(&mut self) {
+        assert!(self.server.is_none(), "it runs");
+        let mut postgres = self.program("postgres");
+        postgres.arg("-D").arg(self.data()).arg("-k").arg(self.socket()).args(["-p", &PORT.to_string(), "-h", ""]);
+        postgres.args(["-c", "fsync=off", "-c", "max_connections=60", "-c", "shared_buffers=32MB"]);
+        let log = fs::File::options().create(true).append(true).open(self.home.path().join("log")).unwrap();
+        let server = postgres.stdin(Stdio::null()).stdout(log.try_clone().unwrap()).stderr(log).spawn().unwrap();
+        self.server = Some(server);
+        let began = Instant::now();
+        while !self.answers() {
+            let ended = self.server.as_mut().unwrap().try_wait().unwrap();
+            assert!(ended.is_none() && began.elapsed() < PATIENCE, "it does not start:\n{}", self.log());
+            std::thread::park_timeout(Duration::from_millis(20));
+        }
+    }
+
+    /// Kills the server as a computer does that loses its power, with all that belongs to it.
+    pub fn kill(&mut self) {
+        let Some(mut server) = self.server.take() else { return };
+        // Of itself it ends what it began: an immediate shutdown writes nothing more.
+        let ended = Command::new("sh").args(["-c", &format!("kill -QUIT {}", server.id())]).status().unwrap();
+        assert!(ended.success());
+        server.wait().unwrap();
+    }
+
+    /// The answer to a question of the owner, a line a row.
+    pub fn sql(&self, database: &str, text: &str) -> String {
+        self.ask_as(OWNER, PASSWORD, database, text).unwrap_or_else(|error| panic!("{text}: {error}"))
+    }
+
+    /// The answer to a question that somebody asks, or why there is none.
+    pub fn ask_as(&self, role: &str, password: &str, database: &str, text: &str) -> Result<String, String> {
+        let mut psql = Command::new(self.bin.join("psql"));
+        psql.args([
+            "-X",
+            "-A",
+            "-t",
+            "-q",
+            "-v",
+            "ON_ERROR_STOP=1",
+            "-U",
+            role,
+            "-d",
+            database,
+            "-p",
+            &PORT.to_string(),
+        ]);
+        psql.arg("-h").arg(self.socket()).args(["-c", text]).env("PGPASSWORD", password).stdin(Stdio::null());
+        let asked = psql.output().unwrap();
+        let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap().trim_end().to_owned();
+        if asked.status.success() { Ok(text(asked.stdout)) } else { Err(text(asked.stderr)) }
+    }
+
+    /// A program of PostgreSQL, signed in as the owner.
+    pub fn tool(&self, name: &str) -> Command {
+        let mut tool = Command::new(self.bin.join(name));
+        tool.args(["-U", OWNER, "-p", &PORT.to_string()]).arg("-h").arg(self.socket());
+        tool.env("PGPASSWORD", PASSWORD).stdin(Stdio::null());
+        tool
+    }
+
+    /// The folder of the socket, which is its host.
+    pub fn socket(&self) -> PathBuf {
+        self.home.path().join("socket")
+    }
+
+    /// The socket itself.
+    pub fn socket_file(&self) -> PathBuf {
+        self.socket().join(format!(".s.PGSQL.{PORT}"))
+    }
+
+    /// Where the password of the owner stands.
+    pub fn write_owner_password(&self, file: &Path) {
+        fs::write(file, PASSWORD).unwrap();
+        fs::set_permissions(file, fs::Permissions::from_mode(0o600)).unwrap();
+    }
+
+    pub fn log(&self) -> String {
+        fs::read_to_string(self.home.path().join("log")).unwrap_or_default()
+    }
+
+    fn data(&self) -> PathBuf {
+        self.home.path().join("data")
+    }
+
+    /// Whether it lets somebody in: its socket is there before it does.
+    fn answers(&self) -> bool {
+        UnixStream::connect(self.socket_file()).is_ok() && self.ask_as(OWNER, PASSWORD, "postgres", "SELECT 1").is_ok()
+    }
+
+    fn give(&self, path: &Path) {
+        if let Some((user, group)) = self.runs_as {
+            chown(path, Some(user), Some(group)).unwrap();
+        }
+    }
+
+    /// A program of the server, as who may run it.
+    fn program(&self, name: &str) -> Command {
+        let path = self.bin.join(name);
+        let Some((user, group)) = self.runs_as else { return Command::new(path) };
+        let mut command = Command::new("setpriv");
+        command.args([format!("--reuid={user}"), format!("--regid={group}"), "--clear-groups".into(), "--".into()]);
+        command.arg(path).current_dir("/");
+        command
+    }
+}
+
+impl Drop for Postgres {
+    fn drop(&mut self) {
+        self.kill();
+        if std::thread::panicking() {
+            eprintln!("{}", self.log());
+        }
+    }
+}
+
+/// The folder of the newest server, where Debian has it; else the one whose programs are found.
+fn bin() -> PathBuf {
+    let versions = fs::read_dir("/usr/lib/postgresql").into_iter().flatten().flatten();
+    let newest =
+        versions.filter_map(|entry| Some((entry.file_name().to_str()?.parse::<u32>().ok()?, entry.path()))).max();
+    newest.map(|(_, path)| path.join("bin")).expect("Debian package postgresql")
+}
+
+/// The user `postgres`, where this one is root.
+fn user() -> Option<(u32, u32)> {
+    let id = |of: &str, who: &[&str]| {
+        let said = Command::new("id").arg(of).args(who).output().unwrap();
+        String::from_utf8(said.stdout).unwrap().trim().parse().unwrap()
+    };
+    (id("-u", &[]) == 0u32).then(|| (id("-u", &["postgres"]), id("-g", &["postgres"])))
+}
