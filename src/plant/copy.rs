@@ -113,12 +113,13 @@ impl PlantRun {
             for row in &rows {
                 let (seq, hash, text): (i32, &[u8], &str) = (row.get(0), row.get(1), row.get(2));
                 let hash = digits(hash);
-                let broken = || JournalError::Broken {
-                    path: folder.to_owned(),
-                    seq: u64::try_from(seq).unwrap_or(0),
-                    what: "the plant has a text of it that no journal writes".into(),
-                };
-                records.push(Record::of_text(text, &head, &hash).ok_or_else(broken)?);
+                let seq = u64::try_from(seq).unwrap_or(0);
+                let broken = |what: &str| JournalError::Broken { path: folder.to_owned(), seq, what: what.into() };
+                if seq != records.len() as u64 + 1 {
+                    return Err(broken("it does not follow the one before it: the plant lacks some").into());
+                }
+                let record = Record::of_text(text, &head, &hash);
+                records.push(record.ok_or_else(|| broken("the plant has a text of it that no journal writes"))?);
                 head = hash;
             }
             if rows.len() < PAGE as usize {
