@@ -226,7 +226,17 @@ pub(super) fn live_runs(runs: &Path) -> impl Iterator<Item = PathBuf> {
 
 pub(super) fn folders(runs: &Path) -> impl Iterator<Item = PathBuf> {
     let entries = std::fs::read_dir(runs).into_iter().flatten().filter_map(io::Result::ok);
-    entries.map(|entry| entry.path()).filter(|path| path.is_dir())
+    // What begins with a dot is kept beside the runs, and is none.
+    let is_hidden = |entry: &std::fs::DirEntry| entry.file_name().to_string_lossy().starts_with('.');
+    entries.filter(move |entry| !is_hidden(entry)).map(|entry| entry.path()).filter(|path| path.is_dir())
+}
+
+/// Whether a run has its end on record; none where there is no record of one.
+#[cfg(feature = "plant")]
+pub(super) fn is_over(folder: &Path) -> Option<bool> {
+    // To look makes no journal where there is none.
+    let reader = Reader::open(folder).ok()?;
+    Some(reader.records(0).any(|record| record.is_ok_and(|record| record.kind == Kind::End)))
 }
 
 /// Returns the newest run that has no end on record; where all have, the newest.

@@ -112,6 +112,12 @@ pub(super) enum Failure {
     #[error(transparent)]
     Users(#[from] regrind_page::UsersError),
     #[cfg(feature = "plant")]
+    #[error("{why}")]
+    OpenWork { why: String },
+    #[cfg(feature = "plant")]
+    #[error("{}: it cannot be read: {source}; check that it is there, and yours to read", .path.display())]
+    Unreadable { path: PathBuf, source: io::Error },
+    #[cfg(feature = "plant")]
     #[error(transparent)]
     Plant(#[from] regrind_plant::PlantError),
     #[error("{}: there is no user {name:?}; `regrind users list` tells who is there", .path.display())]
@@ -191,6 +197,8 @@ impl Failure {
             Self::Broken(_)
             | Self::NotWhole { .. }
             | Self::Report(ReportError::Record(JournalError::Broken { .. })) => NOT_AS_IT_SHOULD_BE,
+            #[cfg(feature = "plant")]
+            Self::OpenWork { .. } => NOT_AS_IT_SHOULD_BE,
             #[cfg(feature = "plant")]
             Self::Plant(error) if error.may_pass() => FAULT,
             #[cfg(feature = "plant")]

@@ -36,6 +36,8 @@ mod states;
 mod users;
 mod watch;
 mod words;
+#[cfg(feature = "plant")]
+mod work;
 
 use std::io::{self, Write};
 use std::process::ExitCode;
@@ -82,6 +84,8 @@ enum Command {
     Users(users::Arguments),
     #[cfg(feature = "plant")]
     Ship(ship::Arguments),
+    #[cfg(feature = "plant")]
+    Work(work::Arguments),
     #[cfg(feature = "plant")]
     Plant(plant::Arguments),
     Audit(audit::Arguments),
@@ -141,6 +145,8 @@ fn run() -> ExitCode {
         Command::Users(arguments) => users::run(&arguments),
         #[cfg(feature = "plant")]
         Command::Ship(arguments) => ship::run(&arguments),
+        #[cfg(feature = "plant")]
+        Command::Work(arguments) => work::run(&arguments),
         #[cfg(feature = "plant")]
         Command::Plant(arguments) => plant::run(&arguments),
         Command::Audit(arguments) => audit::run(&arguments),

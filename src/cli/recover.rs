@@ -166,7 +166,7 @@ impl Recovery {
 }
 
 /// Reads what a person types; the end of the input is no word.
-fn answer() -> Result<String, Failure> {
+pub(super) fn answer() -> Result<String, Failure> {
     let mut line = String::new();
     io::stdin().lock().read_line(&mut line).map_err(Failure::Terminal)?;
     Ok(line.trim().to_owned())

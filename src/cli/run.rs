@@ -36,35 +36,39 @@ Exit codes: 0 accepted; 1 finished, not in tolerance, or stopped by a person; 2 
 pub(super) struct Arguments {
     /// Recipe of the part
     #[arg(value_name = "RECIPE")]
-    recipe: PathBuf,
+    pub(super) recipe: PathBuf,
     /// Cell that makes it; `sim` is the simulated one that comes with the program
     #[arg(long, value_name = "FILE", default_value = BUILT_IN)]
-    cell: PathBuf,
+    pub(super) cell: PathBuf,
     /// Serial number of the part
     #[arg(long, value_name = "SERIAL", value_parser = super::name)]
-    part: Option<String>,
+    pub(super) part: Option<String>,
     /// Who runs it
     #[arg(long, value_name = "NAME", value_parser = super::name)]
-    operator: Option<String>,
+    pub(super) operator: Option<String>,
     /// Folder that the run's own folder is made in
     #[arg(long, value_name = "DIR", default_value = "runs")]
-    runs: PathBuf,
+    pub(super) runs: PathBuf,
     /// The right part is loaded and clamped already, wheel and probe are clear of it: do not ask
     #[arg(long)]
-    loaded: bool,
+    pub(super) loaded: bool,
     /// Draw another simulated part and run from this number
     #[arg(long, value_name = "N")]
-    seed: Option<u64>,
+    pub(super) seed: Option<u64>,
     /// Show the cell as a page in the browser meanwhile, at this address, as `regrind serve` does
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = serve::ADDRESS)]
-    serve: Option<SocketAddr>,
+    pub(super) serve: Option<SocketAddr>,
     /// Ship the record to the plant of this file meanwhile, as `regrind ship` does
     #[cfg(feature = "plant")]
     #[arg(long, value_name = "FILE")]
-    plant: Option<PathBuf>,
+    pub(super) plant: Option<PathBuf>,
+    /// The part of a plant's queue that it makes
+    #[cfg(feature = "plant")]
+    #[arg(skip)]
+    pub(super) work: Option<super::work::Taken>,
     /// Print a line of JSON for everything that happens
     #[arg(long)]
-    json: bool,
+    pub(super) json: bool,
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
@@ -128,6 +132,11 @@ async fn carry_out(
     let machines = live.open(job)?;
     if let Some(earlier) = earlier.as_ref().filter(|_| !arguments.json) {
         super::print(&earlier.in_words(&arguments.runs))?;
+    }
+    // The machines are taken, and nothing has been asked of them: from here on the part is this run's.
+    #[cfg(feature = "plant")]
+    if let Some(work) = &arguments.work {
+        work.begin(&folder).await?;
     }
     let header = header(arguments, &live, (&task, &plan), earlier.as_ref());
     let mut journal = begin(header, &live, earlier.and_then(|earlier| earlier.learned), key)?;

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
 use regrind_live::{OpcUaSettings, SparkplugSettings};
-use regrind_plant::{ArtefactSettings, DatabaseSettings};
+use regrind_plant::{Approver, ArtefactSettings, DatabaseSettings};
 use schemars::JsonSchema;
 use serde::Deserialize;
 
@@ -21,6 +21,9 @@ struct PlantFile {
     plant: PlantTable,
     /// The database of the plant.
     database: Option<DatabaseSettings>,
+    /// Who may approve recipes: two of them must have signed one before this cell makes a part by it.
+    #[schemars(length(max = 100))]
+    approver: Vec<Approver>,
     /// Where large files of runs are kept, if not in the database.
     artefacts: Option<ArtefactSettings>,
     /// A broker that is told how the cell is; nobody is told where it is left out.
@@ -45,6 +48,8 @@ pub struct PlantConfig {
     pub cell: Option<String>,
     /// The database of the plant, its files found from here.
     pub database: Option<DatabaseSettings>,
+    /// Who may approve recipes.
+    pub approvers: Vec<Approver>,
     /// Where large files of runs are kept.
     pub artefacts: Option<ArtefactSettings>,
     /// A broker that is told how the cell is.
@@ -79,13 +84,14 @@ impl PlantConfig {
         document.hold_against(&SCHEMA);
         let written: Option<PlantFile> = document.as_written();
         let at = path.parent().unwrap_or(Path::new(""));
-        let found = written.map(|PlantFile { plant, database, artefacts, sparkplug, opcua }| Self {
+        let found = written.map(|PlantFile { plant, database, approver, artefacts, sparkplug, opcua }| Self {
             cell: plant.cell,
             database: database.map(|database| DatabaseSettings {
                 password_file: beside(at, database.password_file),
                 certificates: beside(at, database.certificates),
                 ..database
             }),
+            approvers: approver,
             artefacts: artefacts.map(|kept| ArtefactSettings { folder: at.join(kept.folder), ..kept }),
             sparkplug: sparkplug.map(|broker| SparkplugSettings {
                 password_file: beside(at, broker.password_file),

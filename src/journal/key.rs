@@ -33,7 +33,7 @@ impl PublicKey {
     }
 
     /// Returns whether the owner of this key signed a message: Ed25519 after RFC 8032, the signature in 128 hexadecimal digits.
-    pub(super) fn has_signed(&self, message: &[u8], signature: &str) -> bool {
+    pub fn has_signed(&self, message: &[u8], signature: &str) -> bool {
         let Some(signature) = unhex::<64>(signature).map(Signature::new) else { return false };
         ed25519_compact::PublicKey::new(self.0).verify(message, &signature).is_ok()
     }
@@ -108,8 +108,9 @@ impl AuditKey {
         PublicKey(*self.pair.pk)
     }
 
-    /// Signs a message; returns 128 hexadecimal digits. The same message always gets the same signature.
-    pub(super) fn sign(&self, message: &[u8]) -> String {
+    /// Signs a message; returns 128 hexadecimal digits. The same message always gets the same signature. What it is for stands in its first
+    /// line, so that a signature of one thing is never taken for that of another.
+    pub fn sign(&self, message: &[u8]) -> String {
         hex(self.pair.sk.sign(message, None).as_ref())
     }
 

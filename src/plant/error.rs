@@ -41,7 +41,7 @@ pub enum PlantError {
     NoRun { cell: String, name: String },
     #[error("{0}")]
     Recipe(String),
-    #[error("part {work}: {why}; take another: regrind work")]
+    #[error("part {work} of the queue: {why}; take another: regrind work")]
     Work { work: i64, why: String },
     #[error("{}: the folder for large files cannot be used: {source}; check that it is there, and yours to write", .path.display())]
     Folder { path: PathBuf, source: io::Error },

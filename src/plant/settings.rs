@@ -52,3 +52,15 @@ pub struct ArtefactSettings {
 fn from_mb() -> f64 {
     8.0
 }
+
+/// Somebody whose signature under a recipe counts.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Approver {
+    /// What the person is called, as the signature has it.
+    #[schemars(length(min = 1, max = 80), example = &"A. Smith")]
+    pub name: String,
+    /// The public half of the person's key, as `regrind audit key --key FILE` prints it.
+    #[schemars(regex(pattern = "^[0-9a-f]{64}$"))]
+    pub key: String,
+}

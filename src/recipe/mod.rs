@@ -107,6 +107,19 @@ impl Recipe {
         Self::parse(path, &text)
     }
 
+    /// Returns the files that it names beside itself.
+    pub fn files(&self) -> Vec<&Path> {
+        let nominal = match &self.nominal {
+            NominalSource::File { path, .. } => Some(path.as_path()),
+            NominalSource::Surface(_) => None,
+        };
+        let pattern = match &self.pattern {
+            Pattern::File(path) => Some(path.as_path()),
+            Pattern::Laid(_) | Pattern::Free { .. } => None,
+        };
+        nominal.into_iter().chain(pattern).collect()
+    }
+
     /// Reads a recipe from its text; the path is for messages, and relative paths are relative to its folder.
     ///
     /// # Errors

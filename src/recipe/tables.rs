@@ -507,6 +507,8 @@ pub struct Cycle {
     /// A cycle whose rms falls by less than this, or is expected to, brings next to nothing; so does one whose rms falls by less than 2 %.
     #[schemars(range(min = 0.0, max = 10000.0))]
     pub stall_um: Um,
+    /// Whether a part that comes from the queue of a plant is confirmed by a person at the cell before its run begins.
+    pub confirm_work: bool,
 }
 
 impl Default for Measure {
@@ -615,6 +617,7 @@ impl Default for Cycle {
             on_stall: Disposal::Stop,
             on_divergence: Disposal::Hold,
             stall_um: Um(0.0),
+            confirm_work: true,
         }
     }
 }

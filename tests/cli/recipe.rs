@@ -739,11 +739,14 @@ fn the_truth_of_a_simulated_cell_is_checked_too() {
 
 #[test]
 fn the_committed_schemas_are_the_ones_in_force() {
-    for (name, schema) in [
+    let schemas = [
         ("recipe", regrind::recipe::json_schema()),
         ("cell", regrind::config::json_schema()),
         ("dialect", regrind::config::dialect_schema()),
-    ] {
+        #[cfg(feature = "plant")]
+        ("plant", regrind::config::plant_schema()),
+    ];
+    for (name, schema) in schemas {
         let committed = fs::read_to_string(root().join(format!("docs/{name}.schema.json"))).unwrap();
         let committed: Value = serde_json::from_str(&committed).unwrap();
         assert_eq!(&committed, schema, "write it anew: regrind schema {name} > docs/{name}.schema.json");

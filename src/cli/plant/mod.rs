@@ -2,6 +2,8 @@
 
 pub(super) mod audit;
 mod members;
+mod queue;
+mod recipes;
 mod runs;
 
 use std::path::{Path, PathBuf};
@@ -12,6 +14,7 @@ use regrind_plant::{Link, PlantError};
 
 use super::failure::Failure;
 use super::{Outcome, check};
+pub(super) use recipes::is_below;
 
 /// Keep the database of a plant of many cells
 #[derive(Args, Debug)]
@@ -39,6 +42,13 @@ enum What {
     Runs(runs::ToList),
     Fetch(runs::ToFetch),
     Incidents(runs::ToTell),
+    Propose(recipes::ToPropose),
+    Approve(recipes::ToApprove),
+    Withdraw(recipes::ToWithdraw),
+    Recipes(recipes::ToList),
+    Queue(queue::ToQueue),
+    Unqueue(queue::ToUnqueue),
+    Work(queue::ToList),
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
@@ -50,6 +60,13 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         What::Runs(of) => runs::list(of),
         What::Fetch(of) => runs::fetch(of),
         What::Incidents(of) => runs::incidents(of),
+        What::Propose(of) => recipes::propose(of),
+        What::Approve(of) => recipes::approve(of),
+        What::Withdraw(of) => recipes::withdraw(of),
+        What::Recipes(of) => recipes::list(of),
+        What::Queue(of) => queue::queue(of),
+        What::Unqueue(of) => queue::unqueue(of),
+        What::Work(of) => queue::list(of),
     }
 }
 

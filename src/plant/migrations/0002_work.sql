@@ -1,28 +1,45 @@
 -- Work and what it is made by: recipes that two people have signed, and parts that cells take, each once.
 
--- A recipe as it is: name, version and text belong together, by the hash of the text.
+-- The hash by which a recipe is known and signed: of its name, its version, its text and the files that it names, line by line.
+CREATE FUNCTION recipe_sha256(of_name text, of_version integer, of_text text, of_files jsonb) RETURNS bytea
+LANGUAGE sql IMMUTABLE SET search_path = regrind, pg_temp AS $$
+    SELECT sha256(convert_to('regrind recipe 1' || chr(10) || of_name || chr(10) || of_version || chr(10)
+        || encode(sha256(convert_to(of_text, 'UTF8')), 'hex') || chr(10)
+        || (SELECT coalesce(string_agg(f.value || ' ' || f.key || chr(10), '' ORDER BY f.key COLLATE "C"), '') FROM jsonb_each_text(of_files) f),
+        'UTF8'))
+$$;
+
+-- A recipe as it is: name, version, text and files belong together.
 CREATE TABLE recipe (
     sha256 bytea PRIMARY KEY,
-    name text NOT NULL CHECK (length(name) BETWEEN 1 AND 80),
+    name text NOT NULL CHECK (length(name) BETWEEN 1 AND 80 AND name !~ '[[:cntrl:]]'),
     version integer NOT NULL CHECK (version > 0),
     text text NOT NULL,
-    -- Other files that it names, such as points of a nominal surface: by name, their contents among the artefacts.
+    -- Other files that it names, such as points of a nominal surface: the hash of each by its name.
     files jsonb NOT NULL DEFAULT '{}',
     proposed_at timestamptz NOT NULL DEFAULT now(),
     proposed_by name NOT NULL DEFAULT session_user,
     withdrawn_at timestamptz,
+    withdrawn_by name,
     withdrawn_why text,
     UNIQUE (name, version),
-    CHECK (sha256 = sha256(convert_to(text, 'UTF8')))
+    CHECK (sha256 = recipe_sha256(name, version, text, files))
+);
+CREATE TABLE recipe_file (
+    recipe bytea NOT NULL REFERENCES recipe,
+    name text NOT NULL CHECK (length(name) BETWEEN 1 AND 200 AND name !~ '[[:cntrl:]]'),
+    content bytea NOT NULL,
+    PRIMARY KEY (recipe, name)
 );
 
--- Who has signed it: Ed25519 over the words of `regrind plant approve`, by a key that cells know.
+-- Who has signed it: Ed25519 over the words that docs/plant.md gives, by a key that cells know. The cell proves it; here it is counted.
 CREATE TABLE approval (
     recipe bytea NOT NULL REFERENCES recipe,
-    person text NOT NULL CHECK (length(person) BETWEEN 1 AND 80),
+    person text NOT NULL CHECK (length(person) BETWEEN 1 AND 80 AND person !~ '[[:cntrl:]]'),
     key text NOT NULL CHECK (key ~ '^[0-9a-f]{64}$'),
     signature text NOT NULL CHECK (signature ~ '^[0-9a-f]{128}$'),
     at timestamptz NOT NULL DEFAULT now(),
+    by name NOT NULL DEFAULT session_user,
     PRIMARY KEY (recipe, key),
     UNIQUE (recipe, person)
 );
@@ -150,21 +167,80 @@ BEGIN
     RETURN NULL;
 END $$;
 
+-- Gives a part back whose run never came to be, for the cell looked. One of which a record has arrived is its run's.
+CREATE FUNCTION give_back_work(of_work bigint, of_run text, why text) RETURNS text
+LANGUAGE plpgsql SECURITY DEFINER SET search_path = regrind, pg_temp AS $$
+DECLARE
+    mine integer := must_be_a_cell();
+BEGIN
+    UPDATE work SET state = 'open', cell = NULL, leased_until = NULL, run = NULL, begun_at = NULL
+        WHERE id = of_work AND state = 'begun' AND cell = mine AND run = of_run
+            AND NOT EXISTS (SELECT FROM run r WHERE r.cell = mine AND r.name = of_run AND r.records > 0);
+    IF NOT FOUND THEN
+        RETURN refuse_work(of_work, NULL, 'give back', 'it was not begun by this cell in run ' || of_run || ', or that run has records');
+    END IF;
+    INSERT INTO work_step (work, step, words) VALUES (of_work, 'given back', left(why, 300));
+    RETURN NULL;
+END $$;
+
 CREATE FUNCTION refuse_work(of_work bigint, of_lease integer, step text, why text) RETURNS text
 LANGUAGE sql SECURITY DEFINER SET search_path = regrind, pg_temp AS $$
     SELECT complain(NULL, 'work refused', format('%s of part %s with lease %s: %s', step, of_work, of_lease, why))
 $$;
 
--- A recipe that work of this cell names, whole, with who has signed it.
-CREATE FUNCTION pull_recipe(of_sha256 bytea) RETURNS TABLE (name text, version integer, text text, files jsonb, approvals jsonb)
+-- A recipe that is approved, whole, with who has signed it.
+CREATE FUNCTION pull_recipe(of_sha256 bytea)
+RETURNS TABLE (name text, version integer, text text, names text[], contents bytea[], persons text[], keys text[], signatures text[])
 LANGUAGE plpgsql STABLE SECURITY DEFINER SET search_path = regrind, pg_temp AS $$
 #variable_conflict use_column
 BEGIN
     PERFORM must_be_a_cell();
-    RETURN QUERY SELECT r.name, r.version, r.text, r.files, (
-            SELECT coalesce(jsonb_agg(jsonb_build_object('person', a.person, 'key', a.key, 'signature', a.signature) ORDER BY a.at), '[]')
-            FROM approval a WHERE a.recipe = r.sha256)
+    RETURN QUERY SELECT r.name, r.version, r.text,
+        array(SELECT f.name FROM recipe_file f WHERE f.recipe = r.sha256 ORDER BY f.name),
+        array(SELECT f.content FROM recipe_file f WHERE f.recipe = r.sha256 ORDER BY f.name),
+        array(SELECT a.person FROM approval a WHERE a.recipe = r.sha256 ORDER BY a.key),
+        array(SELECT a.key FROM approval a WHERE a.recipe = r.sha256 ORDER BY a.key),
+        array(SELECT a.signature FROM approval a WHERE a.recipe = r.sha256 ORDER BY a.key)
         FROM recipe r WHERE r.sha256 = of_sha256 AND r.withdrawn_at IS NULL;
+END $$;
+
+-- Brings the next version of a recipe. What is there under another name or version is refused, and that is put down.
+CREATE FUNCTION propose_recipe(of_name text, of_version integer, of_text text, names text[], contents bytea[])
+RETURNS TABLE (sha256 bytea, refused text) LANGUAGE plpgsql SECURITY DEFINER SET search_path = regrind, pg_temp AS $$
+#variable_conflict use_column
+DECLARE
+    of_files jsonb;
+    known recipe%ROWTYPE;
+    newest integer;
+    made bytea;
+BEGIN
+    -- One at a time, so that a version is given once.
+    LOCK TABLE recipe IN SHARE ROW EXCLUSIVE MODE;
+    SELECT coalesce(jsonb_object_agg(n, encode(pg_catalog.sha256(c), 'hex')), '{}') INTO of_files FROM unnest(names, contents) AS u (n, c);
+    SELECT * INTO known FROM recipe r WHERE r.text = of_text AND r.files = of_files;
+    IF FOUND THEN
+        RETURN QUERY SELECT known.sha256, complain(NULL, 'recipe refused', format('%s is version %s of %s%s', of_name, known.version, known.name,
+            coalesce(', which was withdrawn: ' || known.withdrawn_why, '')));
+        RETURN;
+    END IF;
+    newest := (SELECT coalesce(max(r.version), 0) FROM recipe r WHERE r.name = of_name);
+    IF of_version <> newest + 1 THEN
+        RETURN QUERY SELECT NULL::bytea, format('the newest version of %s is %s', of_name, newest);
+        RETURN;
+    END IF;
+    made := recipe_sha256(of_name, of_version, of_text, of_files);
+    INSERT INTO recipe (sha256, name, version, text, files) VALUES (made, of_name, of_version, of_text, of_files);
+    INSERT INTO recipe_file (recipe, name, content) SELECT made, n, c FROM unnest(names, contents) AS u (n, c);
+    RETURN QUERY SELECT made, NULL::text;
+END $$;
+
+-- Takes a recipe back: nobody begins a part by it any more.
+CREATE FUNCTION withdraw_recipe(of_name text, of_version integer, why text) RETURNS boolean
+LANGUAGE plpgsql SECURITY DEFINER SET search_path = regrind, pg_temp AS $$
+BEGIN
+    UPDATE recipe SET withdrawn_at = now(), withdrawn_by = session_user, withdrawn_why = left(why, 300)
+        WHERE name = of_name AND version = of_version AND withdrawn_at IS NULL;
+    RETURN FOUND;
 END $$;
 
 -- Puts a part into the queue.
@@ -215,24 +291,23 @@ END $$;
 CREATE TRIGGER work_ended AFTER UPDATE OF ended ON run FOR EACH ROW WHEN (old.ended IS NULL AND new.ended IS NOT NULL) EXECUTE FUNCTION work_ended();
 
 ALTER TABLE recipe ENABLE ROW LEVEL SECURITY;
+ALTER TABLE recipe_file ENABLE ROW LEVEL SECURITY;
 ALTER TABLE approval ENABLE ROW LEVEL SECURITY;
 ALTER TABLE work ENABLE ROW LEVEL SECURITY;
 ALTER TABLE work_step ENABLE ROW LEVEL SECURITY;
 CREATE POLICY own ON work FOR SELECT TO regrind_cell USING (cell = (SELECT own_cell()));
 CREATE POLICY everything ON recipe FOR SELECT TO regrind_reader USING (true);
+CREATE POLICY everything ON recipe_file FOR SELECT TO regrind_reader USING (true);
 CREATE POLICY everything ON approval FOR SELECT TO regrind_reader USING (true);
 CREATE POLICY everything ON work FOR SELECT TO regrind_reader USING (true);
 CREATE POLICY everything ON work_step FOR SELECT TO regrind_reader USING (true);
-CREATE POLICY proposes ON recipe FOR INSERT TO regrind_planner WITH CHECK (proposed_by = session_user AND withdrawn_at IS NULL);
-CREATE POLICY withdraws ON recipe FOR UPDATE TO regrind_planner USING (withdrawn_at IS NULL) WITH CHECK (withdrawn_at IS NOT NULL);
 CREATE POLICY signs ON approval FOR INSERT TO regrind_planner WITH CHECK (true);
 
 GRANT SELECT ON work TO regrind_cell;
-GRANT SELECT ON recipe, approval, work, work_step TO regrind_reader;
-GRANT INSERT (sha256, name, version, text, files) ON recipe TO regrind_planner;
-GRANT UPDATE (withdrawn_at, withdrawn_why) ON recipe TO regrind_planner;
+GRANT SELECT ON recipe, recipe_file, approval, work, work_step TO regrind_reader;
 GRANT INSERT (recipe, person, key, signature) ON approval TO regrind_planner;
 REVOKE EXECUTE ON ALL FUNCTIONS IN SCHEMA regrind FROM PUBLIC;
 GRANT EXECUTE ON FUNCTION take_work(integer), renew_work(bigint, integer, integer), begin_work(bigint, integer, text),
-    return_work(bigint, integer, text), pull_recipe(bytea) TO regrind_cell;
-GRANT EXECUTE ON FUNCTION queue_work(text, bytea, text, date), withdraw_work(bigint, text) TO regrind_planner;
+    return_work(bigint, integer, text), give_back_work(bigint, text, text), pull_recipe(bytea) TO regrind_cell;
+GRANT EXECUTE ON FUNCTION queue_work(text, bytea, text, date), withdraw_work(bigint, text), withdraw_recipe(text, integer, text),
+    propose_recipe(text, integer, text, text[], bytea[]) TO regrind_planner;

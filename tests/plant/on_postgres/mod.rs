@@ -3,3 +3,4 @@
 mod layout;
 mod records;
 mod rights;
+mod work;

@@ -1,0 +1,130 @@
+//! `regrind plant queue|unqueue|work`: the parts that are to be made.
+
+use clap::Args;
+use regrind_plant::PlantRecipe;
+use serde_json::json;
+
+use super::super::failure::Failure;
+use super::super::{Outcome, name};
+use super::{Where, open, rows};
+
+/// Queue parts that are to be made by a recipe
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Cells take them by `regrind work`, the one that is due first before the others. Nothing begins by itself: a person at the cell confirms each,
+unless the recipe says otherwise (cycle.confirm_work).
+
+Example:
+  regrind plant queue SN-0042 SN-0043 --recipe freeform-mirror --due 2027-03-01 --plant planner.toml
+
+Exit codes: 0 queued; 2 no such recipe, one that two people have not signed, a part that is queued already; 3 the database cannot be reached.")]
+pub(super) struct ToQueue {
+    /// Serial numbers of the parts
+    #[arg(value_name = "SERIAL", required = true, value_parser = name)]
+    serials: Vec<String>,
+    /// What the recipe is called in the plant
+    #[arg(long, value_name = "NAME")]
+    recipe: String,
+    /// Its version; without it, the newest
+    #[arg(long, value_name = "N")]
+    version: Option<i32>,
+    /// The cell that is to make them; without it, whichever asks first
+    #[arg(long, value_name = "NAME")]
+    cell: Option<String>,
+    /// The day by which they are due
+    #[arg(long, value_name = "YYYY-MM-DD")]
+    due: Option<jiff::civil::Date>,
+    #[command(flatten)]
+    plant: Where,
+}
+
+/// Take a part out of the queue that nobody has begun
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Example:
+  regrind plant unqueue 17 --why \"the blank is broken\" --plant planner.toml
+
+Exit codes: 0 taken out; 1 it is begun, or there is no such part; 2 the database refuses it; 3 it cannot be reached.")]
+pub(super) struct ToUnqueue {
+    /// Its number in the queue (`regrind plant work`)
+    #[arg(value_name = "N")]
+    work: i64,
+    /// Why, for who reads it later
+    #[arg(long, value_name = "WORDS", value_parser = name)]
+    why: String,
+    #[command(flatten)]
+    plant: Where,
+}
+
+/// List the parts that are to be made, and those that are being made
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Example:
+  regrind plant work --plant planner.toml
+
+Exit codes: 0 told; 2 the database refuses it; 3 it cannot be reached.")]
+pub(super) struct ToList {
+    #[command(flatten)]
+    plant: Where,
+    /// Print JSON instead of words
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn queue(arguments: &ToQueue) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    super::super::runtime()?.block_on(async {
+        let link = open(&config).await?;
+        let recipe = PlantRecipe::find(&link, &arguments.recipe, arguments.version).await?;
+        let (sha256, due) = (recipe.sha256(), arguments.due.map(|due| due.to_string()));
+        let text = "SELECT queue_work(s, decode($2, 'hex'), $3, $4::text::date) FROM unnest($1::text[]) AS s";
+        // All of them, or none.
+        let made = rows(&link, text, &[&arguments.serials, &sha256, &arguments.cell, &due]).await?;
+        let numbers: Vec<i64> = made.iter().map(|row| row.get(0)).collect();
+        let lines = numbers.iter().zip(&arguments.serials).map(|(number, serial)| {
+            format!("{number:>6}  {serial}  by version {} of {}\n", recipe.version, recipe.name)
+        });
+        super::super::print(&lines.collect::<String>())?;
+        Ok(Outcome::Accepted)
+    })
+}
+
+pub(super) fn unqueue(arguments: &ToUnqueue) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    let ToUnqueue { work, why, .. } = arguments;
+    super::super::runtime()?.block_on(async {
+        let link = open(&config).await?;
+        let done = rows(&link, "SELECT withdraw_work($1, $2)", &[work, why]).await?;
+        if done.first().is_some_and(|row| row.get(0)) {
+            super::super::print(&format!("part {work} is taken out of the queue\n"))?;
+            return Ok(Outcome::Accepted);
+        }
+        super::super::print(&format!("part {work} is begun or over, or there is none of that number\n"))?;
+        Ok(Outcome::NotInTolerance)
+    })
+}
+
+pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    super::super::runtime()?.block_on(async {
+        let link = open(&config).await?;
+        let text = "SELECT id, serial, recipe, version, coalesce(due::text, ''), state, coalesce(cell, for_cell, ''), coalesce(run, '')
+            FROM work_now ORDER BY due NULLS LAST, id";
+        let found = rows(&link, text, &[]).await?;
+        let mut told = Vec::new();
+        let mut lines = String::new();
+        for row in &found {
+            let (id, version): (i64, i32) = (row.get(0), row.get(3));
+            let [serial, recipe, due, state, cell, run]: [&str; 6] = [1, 2, 4, 5, 6, 7].map(|k| row.get(k));
+            told.push(json!({
+                "work": id, "serial": serial, "recipe": recipe, "version": version, "due": due, "state": state, "cell": cell, "run": run,
+            }));
+            lines += &format!("{id:>6}  {serial:<16}  {recipe} {version}  {due:<10}  {state:<6}  {cell}  {run}\n");
+        }
+        match arguments.json {
+            true => super::super::print_json(&told)?,
+            false => super::super::print(&regrind::document::visible(&lines))?,
+        }
+        Ok(Outcome::Accepted)
+    })
+}

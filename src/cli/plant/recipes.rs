@@ -1,0 +1,219 @@
+//! `regrind plant propose|approve|withdraw|recipes`: what parts are made by, in versions that two people have signed.
+
+use std::collections::BTreeMap;
+use std::path::{Component, Path, PathBuf};
+
+use clap::Args;
+use regrind::journal::AuditKey;
+use regrind::recipe::Recipe;
+use regrind_plant::{PlantError, PlantRecipe};
+use serde_json::json;
+
+use super::super::failure::Failure;
+use super::super::{Outcome, check, name};
+use super::{Where, open, rows};
+
+/// Bring a recipe to the plant, as the next version of its name
+#[derive(Args, Debug)]
+#[command(after_help = "\
+The recipe is checked as `regrind check` does, and goes with the files that it names, which lie beside it or below. No part is made by it before
+two people have signed it.
+
+Example:
+  regrind plant propose recipes/freeform-mirror.toml --plant planner.toml
+
+Exit codes: 0 brought; 2 the recipe is not as it should be, is there already, or the database refuses it; 3 it cannot be reached.")]
+pub(super) struct ToPropose {
+    /// Recipe of the part
+    #[arg(value_name = "RECIPE")]
+    recipe: PathBuf,
+    /// What it is called in the plant; without it, as its file
+    #[arg(long, value_name = "NAME", value_parser = name)]
+    name: Option<String>,
+    #[command(flatten)]
+    plant: Where,
+}
+
+/// Sign a recipe, so that parts are made by it when two people have
+#[derive(Args, Debug)]
+#[command(after_help = "\
+The key is a person's own (`regrind audit key --key FILE` makes one). Its public half stands in the plant file of each cell, by which the cell
+proves the signature itself: `[[approver]]`, name and key. What is signed is the hash of name, version, text and files together.
+
+Example:
+  regrind plant approve freeform-mirror --person \"A. Smith\" --key smith.key --plant planner.toml
+
+Exit codes: 0 signed; 2 no such recipe, one that the person has signed already, or the database refuses it; 3 it cannot be reached.")]
+pub(super) struct ToApprove {
+    /// What it is called in the plant
+    #[arg(value_name = "NAME")]
+    name: String,
+    /// Its version; without it, the newest
+    #[arg(long, value_name = "N")]
+    version: Option<i32>,
+    /// Who signs, as plant files have the name
+    #[arg(long, value_name = "NAME", value_parser = name)]
+    person: String,
+    /// File of the person's key
+    #[arg(long, value_name = "FILE")]
+    key: PathBuf,
+    /// Print the recipe first, and sign nothing
+    #[arg(long)]
+    look: bool,
+    #[command(flatten)]
+    plant: Where,
+}
+
+/// Take a recipe back: no part is begun by it any more
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Example:
+  regrind plant withdraw freeform-mirror --version 3 --why \"wrong radius of the wheel\" --plant planner.toml
+
+Exit codes: 0 withdrawn; 1 there is no such recipe, or it was withdrawn before; 2 the database refuses it; 3 it cannot be reached.")]
+pub(super) struct ToWithdraw {
+    /// What it is called in the plant
+    #[arg(value_name = "NAME")]
+    name: String,
+    /// Its version
+    #[arg(long, value_name = "N")]
+    version: i32,
+    /// Why, for who reads it later
+    #[arg(long, value_name = "WORDS", value_parser = name)]
+    why: String,
+    #[command(flatten)]
+    plant: Where,
+}
+
+/// List the recipes, and who has signed each
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Example:
+  regrind plant recipes --plant planner.toml
+
+Exit codes: 0 told; 2 the database refuses it; 3 it cannot be reached.")]
+pub(super) struct ToList {
+    #[command(flatten)]
+    plant: Where,
+    /// Print JSON instead of words
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn propose(arguments: &ToPropose) -> Result<Outcome, Failure> {
+    let recipe = check::or_show(Recipe::read(&arguments.recipe))?;
+    let config = arguments.plant.read()?;
+    let named = || arguments.recipe.file_stem().map_or("recipe".into(), |stem| stem.to_string_lossy().into_owned());
+    let mut brought = PlantRecipe {
+        name: arguments.name.clone().unwrap_or_else(named),
+        version: 1,
+        text: recipe.text().to_owned(),
+        files: files_of(&recipe)?,
+    };
+    super::super::runtime()?.block_on(async {
+        let link = open(&config).await?;
+        let sha256 = brought.propose(&link).await?;
+        let PlantRecipe { name, version, files, .. } = &brought;
+        let files = match files.len() {
+            0 => String::new(),
+            n => format!(" with {}", super::super::words::counted(n, "file")),
+        };
+        super::super::print(&format!(
+            "{name} version {version}{files}, sha256 {sha256}\nto be signed by two people: regrind plant approve {name}\n"
+        ))?;
+        Ok(Outcome::Accepted)
+    })
+}
+
+/// The files that a recipe names, by the path in it.
+fn files_of(recipe: &Recipe) -> Result<BTreeMap<String, Vec<u8>>, Failure> {
+    let folder = recipe.path().parent().unwrap_or(Path::new(""));
+    let mut files = BTreeMap::new();
+    for path in recipe.files() {
+        let inside = path.strip_prefix(folder).ok().filter(|inside| is_below(inside)).and_then(Path::to_str);
+        let Some(inside) = inside else {
+            let what = format!(
+                "{} names {}, which does not lie beside it or below: put it there, for the recipe goes to other computers with its files",
+                recipe.path().display(),
+                path.display()
+            );
+            return Err(PlantError::Recipe(what).into());
+        };
+        let content = std::fs::read(path).map_err(|source| Failure::Unreadable { path: path.to_owned(), source })?;
+        files.insert(inside.replace('\\', "/"), content);
+    }
+    Ok(files)
+}
+
+/// Whether a relative path leads nowhere but down.
+pub(in super::super) fn is_below(path: &Path) -> bool {
+    path.components().next().is_some() && path.components().all(|part| matches!(part, Component::Normal(_)))
+}
+
+pub(super) fn approve(arguments: &ToApprove) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    let key = AuditKey::read(&arguments.key).map_err(Failure::Journal)?;
+    super::super::runtime()?.block_on(async {
+        let link = open(&config).await?;
+        let recipe = PlantRecipe::find(&link, &arguments.name, arguments.version).await?;
+        if arguments.look {
+            super::super::print(&regrind::document::visible(&recipe.text))?;
+            return Ok(Outcome::Accepted);
+        }
+        recipe.approve(&link, &arguments.person, &key).await?;
+        let (name, version) = (&recipe.name, recipe.version);
+        super::super::print(&format!(
+            "{} has signed version {version} of {name}, sha256 {}\n",
+            arguments.person,
+            recipe.sha256()
+        ))?;
+        Ok(Outcome::Accepted)
+    })
+}
+
+pub(super) fn withdraw(arguments: &ToWithdraw) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    let ToWithdraw { name, version, why, .. } = arguments;
+    super::super::runtime()?.block_on(async {
+        let link = open(&config).await?;
+        let done = rows(&link, "SELECT withdraw_recipe($1, $2, $3)", &[name, version, why]).await?;
+        if done.first().is_some_and(|row| row.get(0)) {
+            super::super::print(&format!("version {version} of {name} is withdrawn\n"))?;
+            return Ok(Outcome::Accepted);
+        }
+        super::super::print(&format!("there is no version {version} of {name}, or it was withdrawn before\n"))?;
+        Ok(Outcome::NotInTolerance)
+    })
+}
+
+pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    super::super::runtime()?.block_on(async {
+        let link = open(&config).await?;
+        let text = "SELECT name, version, encode(sha256, 'hex'), to_char(proposed_at, 'YYYY-MM-DD HH24:MI:SS'), proposed_by::text,
+                array(SELECT person FROM approval a WHERE a.recipe = r.sha256 ORDER BY at), withdrawn_why
+            FROM recipe r ORDER BY name, version DESC";
+        let found = rows(&link, text, &[]).await?;
+        let mut told = Vec::new();
+        let mut lines = String::new();
+        for row in &found {
+            let [name, sha256, at, by]: [&str; 4] = [row.get(0), row.get(2), row.get(3), row.get(4)];
+            let (version, signed, withdrawn): (i32, Vec<&str>, Option<&str>) = (row.get(1), row.get(5), row.get(6));
+            told.push(json!({
+                "name": name, "version": version, "sha256": sha256, "proposed_at": at, "proposed_by": by, "signed_by": signed,
+                "withdrawn": withdrawn,
+            }));
+            let state = match (withdrawn, signed.len()) {
+                (Some(why), _) => format!("withdrawn: {why}"),
+                (None, 0) => "signed by nobody yet".to_owned(),
+                (None, _) => format!("signed by {}", signed.join(", ")),
+            };
+            lines += &format!("{name:<24}  {version:>3}  {at}  {}  {state}\n", &sha256[..12]);
+        }
+        match arguments.json {
+            true => super::super::print_json(&told)?,
+            false => super::super::print(&regrind::document::visible(&lines))?,
+        }
+        Ok(Outcome::Accepted)
+    })
+}

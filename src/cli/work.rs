@@ -1,0 +1,252 @@
+//! `regrind work`: the parts that a plant has queued, taken one after the other, each confirmed by a person at the cell.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::Args;
+use regrind::config::{BUILT_IN, PlantConfig};
+use regrind::formats::{ResultFolder, write_atomic};
+use regrind::recipe::Recipe;
+use regrind_plant::{Begun, LEASE, Lease, Link, PlantError, PlantRecipe};
+
+use super::failure::Failure;
+use super::{Outcome, check, control, plant, recover, run as making};
+
+/// How often the queue is asked where `--wait` is given.
+const ROUND: Duration = Duration::from_secs(5);
+/// Where pulled recipes are kept, below the folder of the runs.
+const RECIPES: &str = ".recipes";
+
+/// Make the parts that the plant has queued for this cell, one after the other
+#[derive(Args, Debug)]
+#[command(after_help = "\
+The part that is due first is leased to this cell, its recipe is pulled by its hash, and proven: two of the approvers in the plant file must have
+signed it. Who stands at the cell confirms the part by its serial number, typed or scanned; anything else gives it back. From the moment it is
+begun it belongs to its run, and no other cell gets it, whatever becomes of this one. It ends when no part is left, or when one did not turn out.
+
+Examples:
+  regrind work --plant cell-1.toml --cell config/modbus-tcp.toml --operator \"A. Smith\"
+  regrind work --plant cell-1.toml --part SN-0042 --once
+  regrind work --plant cell-1.toml --give-back SN-0042
+
+Exit codes: 0 all parts that were there are accepted; 1 one was not, or one that was begun here is not over; 2 bad arguments, or a recipe that is not
+approved; 3 a fault or abort, or the plant cannot be reached.")]
+pub(super) struct Arguments {
+    /// Plant file: where the database is, who signs in, and whose approval counts
+    #[arg(long, value_name = "FILE")]
+    plant: PathBuf,
+    /// Cell that makes them; `sim` is the simulated one that comes with the program
+    #[arg(long, value_name = "FILE", default_value = BUILT_IN)]
+    cell: PathBuf,
+    /// Who stands at the cell
+    #[arg(long, value_name = "NAME", value_parser = super::name)]
+    operator: Option<String>,
+    /// Folder that the runs' own folders are made in
+    #[arg(long, value_name = "DIR", default_value = "runs")]
+    runs: PathBuf,
+    /// Confirm the part of this serial number, if it is the next; any other is given back
+    #[arg(long, value_name = "SERIAL", value_parser = super::name)]
+    part: Option<String>,
+    /// Make one part at most
+    #[arg(long)]
+    once: bool,
+    /// Wait for further parts when there is none, until Ctrl-C
+    #[arg(long, conflicts_with = "once")]
+    wait: bool,
+    /// Give a part back that was begun here and of which no run came: somebody has looked that nothing was ground
+    #[arg(long, value_name = "SERIAL", value_parser = super::name, conflicts_with_all = ["part", "once", "wait"])]
+    give_back: Option<String>,
+    /// Draw other simulated parts and runs from this number
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Print a line of JSON for everything that happens in a run
+    #[arg(long)]
+    json: bool,
+}
+
+/// A part that was confirmed, on its way into its run.
+#[derive(Clone, Debug)]
+pub(super) struct Taken {
+    config: PlantConfig,
+    lease: Lease,
+}
+
+impl Taken {
+    /// Begins the part in a run: from here on it is that run's. Until the plant has said so nothing begins.
+    pub(super) async fn begin(&self, run: &Path) -> Result<(), Failure> {
+        let name = run.file_name().unwrap_or_default().to_string_lossy();
+        let link = plant::open(&self.config).await?;
+        match self.lease.begin(&link, &name).await {
+            // Whether it was begun is not known: the same question has the same answer.
+            Err(error) if error.may_pass() => {
+                let link = plant::open(&self.config).await?;
+                Ok(self.lease.begin(&link, &name).await?)
+            }
+            other => Ok(other?),
+        }
+    }
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let config = plant::read(&arguments.plant)?;
+    if let Some(serial) = &arguments.give_back {
+        return super::runtime()?.block_on(give_back(&config, &arguments.runs, serial));
+    }
+    loop {
+        let next = super::runtime()?.block_on(next(&config, arguments))?;
+        let Some((recipe, taken)) = next else {
+            if !arguments.wait {
+                super::print("no part is waiting for this cell\n")?;
+                return Ok(Outcome::Accepted);
+            }
+            std::thread::sleep(ROUND);
+            continue;
+        };
+        let outcome = making::run(&making::Arguments {
+            recipe,
+            cell: arguments.cell.clone(),
+            part: Some(taken.lease.serial.clone()),
+            operator: arguments.operator.clone(),
+            runs: arguments.runs.clone(),
+            loaded: false,
+            seed: arguments.seed,
+            serve: None,
+            plant: Some(arguments.plant.clone()),
+            work: Some(taken),
+            json: arguments.json,
+        })?;
+        // What did not turn out wants a person before the next blank is ground.
+        if outcome != Outcome::Accepted || arguments.once {
+            return Ok(outcome);
+        }
+    }
+}
+
+/// Takes the next part and has it confirmed; returns its recipe, and what its run begins with.
+async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Option<(PathBuf, Taken)>, Failure> {
+    let link = plant::open(config).await?;
+    nothing_is_open(&link, &arguments.runs).await?;
+    loop {
+        let Some(lease) = Lease::take(&link).await? else { return Ok(None) };
+        let (recipe, signed) = match PlantRecipe::pull(&link, &lease.recipe_sha256, &config.approvers).await {
+            Ok(pulled) => pulled,
+            Err(error) => {
+                // The next cell may know who has signed it.
+                lease.hand_back(&link, &error.to_string()).await?;
+                return Err(error.into());
+            }
+        };
+        let path = keep(&arguments.runs, &lease.recipe_sha256, &recipe)?;
+        let read = match check::or_show(Recipe::read(&path)) {
+            Ok(read) => read,
+            Err(error) => {
+                lease.hand_back(&link, "its recipe is not as it should be for this cell's program").await?;
+                return Err(error);
+            }
+        };
+        let PlantRecipe { name, version, .. } = &recipe;
+        let due = lease.due.as_ref().map_or(String::new(), |due| format!(", due {due}"));
+        let told =
+            format!("{}  by version {version} of {name}, signed by {}{due}\n", lease.serial, signed.join(" and "));
+        super::print(&regrind::document::visible(&told))?;
+        match confirmed(&link, &lease, &read, arguments).await? {
+            true => return Ok(Some((path, Taken { config: config.clone(), lease }))),
+            false => {
+                lease.hand_back(&link, "nobody at the cell confirmed it").await?;
+                super::print("it is given back\n")?;
+                return Ok(None);
+            }
+        }
+    }
+}
+
+/// Whether somebody at the cell wants it made, or the recipe asks for nobody. The lease is kept meanwhile.
+async fn confirmed(link: &Link, lease: &Lease, recipe: &Recipe, arguments: &Arguments) -> Result<bool, Failure> {
+    if let Some(serial) = &arguments.part {
+        return Ok(*serial == lease.serial);
+    }
+    if !recipe.cycle.confirm_work {
+        return Ok(true);
+    }
+    super::print("  type or scan its serial number to begin it, anything else gives it back: ")?;
+    let mut answer = tokio::task::spawn_blocking(recover::answer);
+    loop {
+        tokio::select! {
+            typed = &mut answer => return Ok(typed.map_err(|error| Failure::Terminal(error.into()))?? == lease.serial),
+            () = tokio::time::sleep(LEASE / 3) => lease.renew(link).await?,
+        }
+    }
+}
+
+/// Refuses to take a part while one that was begun here is not over.
+async fn nothing_is_open(link: &Link, runs: &Path) -> Result<(), Failure> {
+    for begun in Begun::all(link).await? {
+        let folder = runs.join(&begun.run);
+        let why = match control::is_over(&folder) {
+            // Its end is on its way to the plant.
+            Some(true) => continue,
+            Some(false) => {
+                format!("run {} of {} is not over: regrind resume {}", begun.run, begun.lease.serial, folder.display())
+            }
+            None => format!(
+                "{} was begun in run {}, of which there is no record in {}; look whether anything was ground: if not, regrind work --give-back {0}",
+                begun.lease.serial,
+                begun.run,
+                runs.display()
+            ),
+        };
+        return Err(Failure::OpenWork { why });
+    }
+    Ok(())
+}
+
+/// Gives a part back of which no run came.
+async fn give_back(config: &PlantConfig, runs: &Path, serial: &str) -> Result<Outcome, Failure> {
+    let link = plant::open(config).await?;
+    let begun = Begun::all(&link).await?.into_iter().find(|begun| begun.lease.serial == serial);
+    let Some(begun) = begun else {
+        super::print(&format!("{serial} is not begun by this cell\n"))?;
+        return Ok(Outcome::NotInTolerance);
+    };
+    if control::is_over(&runs.join(&begun.run)).is_some() {
+        let why = format!(
+            "run {} of {serial} is here: it is gone on with by regrind resume, or ended by regrind stop",
+            begun.run
+        );
+        return Err(PlantError::Work { work: begun.lease.work, why }.into());
+    }
+    begun.give_back(&link, "no run came of it").await?;
+    super::print(&format!("{serial} is given back to the queue\n"))?;
+    Ok(Outcome::Accepted)
+}
+
+/// Keeps a pulled recipe and its files in a folder of its hash; returns where the recipe is.
+fn keep(runs: &Path, sha256: &str, recipe: &PlantRecipe) -> Result<PathBuf, Failure> {
+    let folder = runs.join(RECIPES).join(sha256);
+    let plain = |c: char| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '_' };
+    let name: String = recipe.name.chars().map(plain).collect();
+    let path = folder.join(format!("{}.toml", name.trim_start_matches('.')));
+    write(&path, recipe.text.as_bytes())?;
+    for (name, content) in &recipe.files {
+        let inside = Path::new(name);
+        if !plant::is_below(inside) {
+            let what = format!(
+                "{} names the file {name:?}, which would lie outside of its folder; bring it anew",
+                recipe.name
+            );
+            return Err(PlantError::Recipe(what).into());
+        }
+        write(&folder.join(inside), content)?;
+    }
+    Ok(path)
+}
+
+fn write(path: &Path, content: &[u8]) -> Result<(), Failure> {
+    // What is there is what has been proven before, or is put right.
+    if fs::read(path).is_ok_and(|there| there == content) {
+        return Ok(());
+    }
+    ResultFolder::prepare(path.parent().unwrap_or(Path::new("")))?.keep();
+    Ok(write_atomic(path, content)?)
+}

@@ -1,0 +1,273 @@
+//! Recipes in the plant: brought in versions, signed by two people, and pulled by the hash that was signed.
+//!
+//! What is signed is the hash of name, version, text and files together, so that an old recipe under a new name is another one, which nobody
+//! has signed. The cell proves hash and signatures by the keys of its own plant file: a database that was changed gives it nothing to grind.
+
+use std::collections::BTreeMap;
+
+use regrind_journal::{AuditKey, PublicKey, sha256_hex};
+use tokio_postgres::types::ToSql;
+
+use super::error::{PlantError, refused};
+use super::hex::{digits, unhex};
+use super::link::Link;
+use super::settings::Approver;
+
+/// How many people sign a recipe.
+pub const SIGNERS: usize = 2;
+
+/// A recipe as the plant has it: its text, and the files that it names.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PlantRecipe {
+    /// What it is called.
+    pub name: String,
+    /// Its version, from 1.
+    pub version: i32,
+    /// The text of the recipe.
+    pub text: String,
+    /// What it names beside itself, by the path in it.
+    pub files: BTreeMap<String, Vec<u8>>,
+}
+
+/// Who has signed a recipe.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Approval {
+    /// What the person is called.
+    pub person: String,
+    /// The public half of the person's key.
+    pub key: String,
+    /// The signature, in hexadecimal digits.
+    pub signature: String,
+}
+
+impl PlantRecipe {
+    /// Returns the hash by which it is known and signed, in hexadecimal digits: SHA-256 of a first line that says what it is, then name, version,
+    /// hash of the text, and a line for each file.
+    pub fn sha256(&self) -> String {
+        let mut lines =
+            format!("regrind recipe 1\n{}\n{}\n{}\n", self.name, self.version, sha256_hex(self.text.as_bytes()));
+        for (name, content) in &self.files {
+            lines += &format!("{} {name}\n", sha256_hex(content));
+        }
+        sha256_hex(lines.as_bytes())
+    }
+
+    /// Brings it as the next version of its name; returns its hash.
+    ///
+    /// # Errors
+    /// A recipe that is there under this or another name, a role that may not bring any, a plant that cannot be reached.
+    pub async fn propose(&mut self, link: &Link) -> Result<String, PlantError> {
+        let failed = refused("the recipe");
+        let newest = "SELECT coalesce(max(version), 0) FROM recipe WHERE name = $1";
+        let row = link.client().query_one(newest, &[&self.name]).await.map_err(&failed)?;
+        self.version = row.get::<_, i32>(0) + 1;
+        let names: Vec<&str> = self.files.keys().map(String::as_str).collect();
+        let contents: Vec<&[u8]> = self.files.values().map(Vec::as_slice).collect();
+        let values: [&(dyn ToSql + Sync); 5] = [&self.name, &self.version, &self.text, &names, &contents];
+        let text = "SELECT sha256, refused FROM propose_recipe($1, $2, $3, $4, $5)";
+        let row = link.client().query_one(text, &values).await.map_err(&failed)?;
+        if let Some(why) = row.get::<_, Option<String>>(1) {
+            return Err(PlantError::Recipe(format!("{why}; nothing was brought")));
+        }
+        Ok(digits(row.get(0)))
+    }
+
+    /// Finds a version of a recipe, or the newest that nobody has withdrawn, as a planner or reader.
+    ///
+    /// # Errors
+    /// No such recipe, a plant that cannot be reached.
+    pub async fn find(link: &Link, name: &str, version: Option<i32>) -> Result<Self, PlantError> {
+        let text = "SELECT name, version, text, array(SELECT f.name FROM recipe_file f WHERE f.recipe = r.sha256 ORDER BY 1),
+                array(SELECT f.content FROM recipe_file f WHERE f.recipe = r.sha256 ORDER BY f.name)
+            FROM recipe r WHERE name = $1 AND (version = $2 OR $2 IS NULL AND withdrawn_at IS NULL) ORDER BY version DESC LIMIT 1";
+        let row = link.client().query_opt(text, &[&name, &version]).await.map_err(refused("a recipe"))?;
+        let none = || {
+            let of = version.map_or(String::new(), |version| format!(" of version {version}"));
+            PlantError::Recipe(format!("there is no recipe {name:?}{of}; `regrind plant recipes` lists them"))
+        };
+        let row = row.ok_or_else(none)?;
+        let (names, contents): (Vec<String>, Vec<Vec<u8>>) = (row.get(3), row.get(4));
+        Ok(Self {
+            name: row.get(0),
+            version: row.get(1),
+            text: row.get(2),
+            files: names.into_iter().zip(contents).collect(),
+        })
+    }
+
+    /// Puts a person's signature beside it.
+    ///
+    /// # Errors
+    /// A person or a key that has signed it already, a role that may not, a plant that cannot be reached.
+    pub async fn approve(&self, link: &Link, person: &str, key: &AuditKey) -> Result<(), PlantError> {
+        let sha256 = self.sha256();
+        let signature = key.sign(words(&sha256, person).as_bytes());
+        let (bytes, key) = (unhex(&sha256).unwrap_or_default(), key.public().to_string());
+        let text = "INSERT INTO approval (recipe, person, key, signature) VALUES ($1, $2, $3, $4)";
+        let put = link.client().execute(text, &[&bytes, &person, &key, &signature]).await;
+        match put {
+            Err(error) if error.code() == Some(&tokio_postgres::error::SqlState::UNIQUE_VIOLATION) => {
+                let Self { name, version, .. } = self;
+                let what = format!(
+                    "version {version} of {name} is signed by {person} or by this key already; another person signs it"
+                );
+                Err(PlantError::Recipe(what))
+            }
+            other => other.map(drop).map_err(refused("the signature")),
+        }
+    }
+
+    /// Pulls the recipe of a hash to a cell, and proves it: that it is what has this hash, and that two different people have signed it whom the
+    /// plant file of the cell knows. Returns who they are.
+    ///
+    /// # Errors
+    /// A recipe that is not what its hash says, that too few people have signed, that was withdrawn; the plant is told. A plant that cannot be
+    /// reached.
+    pub async fn pull(link: &Link, sha256: &str, approvers: &[Approver]) -> Result<(Self, Vec<String>), PlantError> {
+        let bytes = unhex(sha256).unwrap_or_default();
+        let text = "SELECT name, version, text, names, contents, persons, keys, signatures FROM pull_recipe($1)";
+        let row = link.client().query_opt(text, &[&bytes]).await.map_err(refused("a recipe"))?;
+        let found = match &row {
+            None => Err(format!("there is no recipe {sha256}, or it was withdrawn")),
+            Some(row) => {
+                let (names, contents): (Vec<String>, Vec<Vec<u8>>) = (row.get(3), row.get(4));
+                let recipe = Self {
+                    name: row.get(0),
+                    version: row.get(1),
+                    text: row.get(2),
+                    files: names.into_iter().zip(contents).collect(),
+                };
+                let [persons, keys, signatures]: [Vec<String>; 3] = [row.get(5), row.get(6), row.get(7)];
+                let of = persons.into_iter().zip(keys).zip(signatures);
+                let approvals: Vec<Approval> =
+                    of.map(|((person, key), signature)| Approval { person, key, signature }).collect();
+                proven(recipe, sha256, &approvals, approvers)
+            }
+        };
+        match found {
+            Ok(found) => Ok(found),
+            Err(what) => {
+                let values: [&(dyn ToSql + Sync); 2] = [&"recipe refused", &what];
+                let told = link.client().query_one("SELECT complain(NULL, $1, $2)", &values).await;
+                told.map_err(refused("to be told what is wrong"))?;
+                Err(PlantError::Recipe(what))
+            }
+        }
+    }
+}
+
+/// What a person signs.
+fn words(sha256: &str, person: &str) -> String {
+    format!("regrind recipe approval 1\n{sha256}\n{person}\n")
+}
+
+/// Proves a recipe that came over the wire; returns who has signed it, or what is wrong.
+fn proven(
+    recipe: PlantRecipe,
+    sha256: &str,
+    approvals: &[Approval],
+    approvers: &[Approver],
+) -> Result<(PlantRecipe, Vec<String>), String> {
+    let PlantRecipe { name, version, .. } = &recipe;
+    if recipe.sha256() != sha256 {
+        return Err(format!(
+            "what the plant gives as version {version} of {name} is not what has the hash {sha256}: name, version, text or a file was changed"
+        ));
+    }
+    let has_signed = |approver: &&Approver| {
+        let key: Option<PublicKey> = approver.key.parse().ok();
+        approvals.iter().any(|of| {
+            of.person == approver.name
+                && of.key == approver.key
+                && key.is_some_and(|key| key.has_signed(words(sha256, &of.person).as_bytes(), &of.signature))
+        })
+    };
+    let mut signed: Vec<&Approver> = approvers.iter().filter(has_signed).collect();
+    // Two names with one key are one person, and so is one name with two.
+    signed.sort_by(|a, b| a.key.cmp(&b.key));
+    signed.dedup_by(|a, b| a.key == b.key);
+    signed.sort_by(|a, b| a.name.cmp(&b.name));
+    signed.dedup_by(|a, b| a.name == b.name);
+    if signed.len() < SIGNERS {
+        let by = signed.iter().map(|of| of.name.as_str()).collect::<Vec<_>>().join(", ");
+        let by = if by.is_empty() { "nobody".to_owned() } else { by };
+        return Err(format!(
+            "version {version} of {name} is signed by {by} of those in this cell's plant file, and two must have signed it: regrind plant approve"
+        ));
+    }
+    let signed = signed.into_iter().map(|of| of.name.clone()).collect();
+    Ok((recipe, signed))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn recipe() -> PlantRecipe {
+        let files = BTreeMap::from([("a.csv".to_owned(), b"1,2\n".to_vec())]);
+        PlantRecipe { name: "mirror".into(), version: 3, text: "[part]\n".into(), files }
+    }
+
+    fn signed(recipe: &PlantRecipe, people: &[(&str, &AuditKey)]) -> Vec<Approval> {
+        let sha256 = recipe.sha256();
+        let of = |(person, key): &(&str, &AuditKey)| Approval {
+            person: (*person).into(),
+            key: key.public().to_string(),
+            signature: key.sign(words(&sha256, person).as_bytes()),
+        };
+        people.iter().map(of).collect()
+    }
+
+    fn approver(name: &str, key: &AuditKey) -> Approver {
+        Approver { name: name.into(), key: key.public().to_string() }
+    }
+
+    #[test]
+    fn the_hash_is_that_of_the_lines() {
+        let text = sha256_hex(b"[part]\n");
+        let lines = format!("regrind recipe 1\nmirror\n3\n{text}\n{} a.csv\n", sha256_hex(b"1,2\n"));
+        assert_eq!(recipe().sha256(), sha256_hex(lines.as_bytes()));
+    }
+
+    #[test]
+    fn two_people_whom_the_cell_knows_must_have_signed_what_came() {
+        let [ada, bob, eve] = [AuditKey::new(), AuditKey::new(), AuditKey::new()];
+        let known = [approver("Ada", &ada), approver("Bob", &bob)];
+        let good = recipe();
+        let both = signed(&good, &[("Ada", &ada), ("Bob", &bob)]);
+        let of = |recipe: &PlantRecipe, approvals: &[Approval], approvers: &[Approver]| {
+            proven(recipe.clone(), &good.sha256(), approvals, approvers).map(|(_, signed)| signed)
+        };
+        assert_eq!(of(&good, &both, &known), Ok(vec!["Ada".to_owned(), "Bob".to_owned()]));
+        // The old text under a new name, or with another file, is not what was signed.
+        for other in [
+            PlantRecipe { name: "panel".into(), ..good.clone() },
+            PlantRecipe { version: 4, ..good.clone() },
+            PlantRecipe { text: "[part]\n\n".into(), ..good.clone() },
+            PlantRecipe { files: BTreeMap::new(), ..good.clone() },
+        ] {
+            assert!(of(&other, &both, &known).unwrap_err().contains("was changed"));
+            // With its own hash it is whole, and nobody has signed it.
+            let own = proven(other.clone(), &other.sha256(), &both, &known).unwrap_err();
+            assert!(own.contains("signed by nobody"), "{own}");
+        }
+        let too_few = [
+            (signed(&good, &[("Ada", &ada)]), known.to_vec()),
+            (signed(&good, &[("Ada", &ada), ("Eve", &eve)]), known.to_vec()),
+            // In another's name.
+            (signed(&good, &[("Ada", &ada), ("Bob", &eve)]), known.to_vec()),
+            // One person with two keys, and two names with one.
+            (signed(&good, &[("Ada", &ada), ("Ada", &bob)]), vec![approver("Ada", &ada), approver("Ada", &bob)]),
+            (signed(&good, &[("Ada", &ada), ("Bob", &ada)]), vec![approver("Ada", &ada), approver("Bob", &ada)]),
+            // A signature of the one under the name of the other.
+            (
+                vec![both[0].clone(), Approval { signature: both[0].signature.clone(), ..both[1].clone() }],
+                known.to_vec(),
+            ),
+            (both.clone(), Vec::new()),
+        ];
+        for (approvals, approvers) in too_few {
+            assert!(of(&good, &approvals, &approvers).unwrap_err().contains("two must have signed"), "{approvals:?}");
+        }
+    }
+}

@@ -1,0 +1,201 @@
+//! Work and what it is made by, between planners, approvers, cells, and whoever would have a part made by something else.
+
+use std::fs;
+use std::process::Stdio;
+
+use serde_json::Value;
+
+use crate::Plant;
+use crate::program::{Running, regrind, small_recipe};
+
+/// A plant with two approvers, a planner and a recipe that both have signed; returns the table of approvers for plant files.
+fn approved(plant: &Plant) -> String {
+    plant.somebody("planner", "planner");
+    let recipe = small_recipe(plant.home.path(), 1000.0).display().to_string();
+    plant.does(&["plant", "propose", &recipe, "--plant", "planner.toml"]);
+    ["Ada", "Bob"].map(|person| approves(plant, person, "small")).concat()
+}
+
+/// A person signs a recipe; returns what a plant file says of the person.
+fn approves(plant: &Plant, person: &str, recipe: &str) -> String {
+    let file = format!("{person}.key");
+    let told: Value = serde_json::from_str(&plant.does(&["audit", "key", "--key", &file, "--json"])).unwrap();
+    plant.does(&["plant", "approve", recipe, "--person", person, "--key", &file, "--plant", "planner.toml"]);
+    format!("\n[[approver]]\nname = \"{person}\"\nkey = {}\n", told["public_key"])
+}
+
+/// A cell that knows approvers.
+fn cell(plant: &Plant, name: &str, approvers: &str) {
+    plant.cell(name, &[]);
+    let file = plant.path(&format!("{name}.toml"));
+    let text = fs::read_to_string(&file).unwrap();
+    fs::write(file, text + approvers).unwrap();
+}
+
+fn queue(plant: &Plant, serial: &str, more: &[&str]) {
+    plant.does(&[&["plant", "queue", serial, "--recipe", "small", "--plant", "planner.toml"], more].concat());
+}
+
+fn work(plant: &Plant) -> Vec<Value> {
+    serde_json::from_str(&plant.does(&["plant", "work", "--json", "--plant", "planner.toml"])).unwrap()
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn parts_are_made_in_the_order_in_which_they_are_due() {
+    let plant = Plant::new();
+    let approvers = approved(&plant);
+    cell(&plant, "cell-1", &approvers);
+    queue(&plant, "SN-3", &[]);
+    queue(&plant, "SN-2", &["--due", "2027-02-01"]);
+    queue(&plant, "SN-1", &["--due", "2027-01-01"]);
+    queue(&plant, "SN-0", &["--cell", "cell-1", "--due", "2026-12-01"]);
+    let (_, told) = plant.ends(&["plant", "queue", "SN-1", "--recipe", "small", "--plant", "planner.toml"], 2);
+    assert!(told.contains("SN-1 is in the queue by this recipe"), "{told}");
+    let (_, told) =
+        plant.ends(&["plant", "queue", "SN-9", "--recipe", "small", "--cell", "cell-9", "--plant", "planner.toml"], 2);
+    assert!(told.contains("there is no cell cell-9"), "{told}");
+
+    // By serial number on the command line, by what is typed, and by what is typed wrong.
+    let said = plant.does(&["work", "--plant", "cell-1.toml", "--part", "SN-0", "--once"]);
+    assert!(said.contains("by version 1 of small, signed by Ada and Bob, due 2026-12-01"), "{said}");
+    for (typed, does) in [("SN-2", "it is given back"), ("", "it is given back"), ("SN-1", "record in")] {
+        let mut command = regrind(&["work", "--plant", "cell-1.toml", "--once"], plant.home.path());
+        command.stdin(Stdio::piped());
+        let mut at_cell = Running::new(command);
+        at_cell.line("part", |line| line.starts_with("SN-1  by version 1"));
+        std::io::Write::write_all(&mut at_cell.keys(), format!("{typed}\n").as_bytes()).unwrap();
+        let (code, told) = at_cell.end();
+        assert!(code == 0 && at_cell.said.iter().any(|line| line.contains(does)), "{typed}: {told} {:?}", at_cell.said);
+    }
+    plant.does(&["plant", "unqueue", "2", "--why", "broken", "--plant", "planner.toml"]);
+    plant.ends(&["plant", "unqueue", "3", "--why", "broken", "--plant", "planner.toml"], 1);
+    let left: Vec<_> = work(&plant).into_iter().filter(|part| part["state"] == "open").collect();
+    assert!(left.len() == 1 && left[0]["serial"] == "SN-3", "{left:?}");
+    plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
+    assert_eq!(
+        plant.sql("SELECT string_agg(serial || ' ' || state, ', ' ORDER BY serial) FROM work"),
+        "SN-0 ended, SN-1 ended, SN-2 withdrawn, SN-3 open"
+    );
+    assert_eq!(
+        plant.sql(
+            "SELECT count(*) FROM work w JOIN run r ON r.name = w.run WHERE r.part = w.serial AND r.result = 'accepted'"
+        ),
+        "2"
+    );
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn a_recipe_that_asks_for_nobody_is_made_by_itself() {
+    let plant = Plant::new();
+    plant.somebody("planner", "planner");
+    let recipe = small_recipe(plant.home.path(), 1000.0);
+    let text = fs::read_to_string(&recipe).unwrap();
+    assert!(text.contains("\n[cycle]\n"));
+    fs::write(&recipe, text.replace("\n[cycle]\n", "\n[cycle]\nconfirm_work = false\n")).unwrap();
+    plant.does(&["plant", "propose", "small.toml", "--plant", "planner.toml"]);
+    let approvers = ["Ada", "Bob"].map(|person| approves(&plant, person, "small")).concat();
+    cell(&plant, "cell-1", &approvers);
+    ["SN-1", "SN-2"].iter().for_each(|serial| queue(&plant, serial, &[]));
+    let said = plant.does(&["work", "--plant", "cell-1.toml"]);
+    assert!(said.ends_with("no part is waiting for this cell\n"), "{said}");
+    assert_eq!(plant.sql("SELECT count(*) FROM work WHERE state IN ('begun', 'ended')"), "2");
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn a_recipe_that_is_not_what_two_people_signed_is_refused_and_put_down() {
+    let plant = Plant::new();
+    let approvers = approved(&plant);
+    cell(&plant, "cell-1", &approvers);
+    let make = ["work", "--plant", "cell-1.toml", "--part", "SN-1", "--once"];
+    let refused = |words: &str| {
+        let before = plant.incidents().len();
+        let (_, told) = plant.ends(&make, 2);
+        assert!(told.contains(words), "{told}");
+        let incidents = plant.incidents();
+        let last = incidents.last().unwrap();
+        assert!(incidents.len() > before && last["what"] == "recipe refused" && last["by"] == "cell-1", "{last}");
+    };
+    // Nobody can have an old recipe under a new name, or sign twice.
+    let again = ["plant", "propose", "small.toml", "--name", "panel", "--plant", "planner.toml"];
+    let (_, told) = plant.ends(&again, 2);
+    assert!(told.contains("panel is version 1 of small"), "{told}");
+    assert_eq!(plant.incidents().last().unwrap()["what"], "recipe refused");
+    let (_, told) =
+        plant.ends(&["plant", "approve", "small", "--person", "Ada", "--key", "Bob.key", "--plant", "planner.toml"], 2);
+    assert!(told.contains("another person signs it"), "{told}");
+
+    // Somebody with all rights in the database gives an old recipe a new name, changes a text, and forges a signature.
+    queue(&plant, "SN-1", &[]);
+    plant.sql("CREATE TABLE kept AS SELECT * FROM recipe; ALTER TABLE recipe DROP CONSTRAINT recipe_check");
+    for harm in ["name = 'panel'", "version = 7", "text = replace(text, 'columns = 20', 'columns = 21')"] {
+        plant.sql(&format!("UPDATE recipe SET {harm}"));
+        refused("name, version, text or a file was changed");
+        plant.sql("UPDATE recipe r SET (name, version, text) = (SELECT k.name, k.version, k.text FROM kept k)");
+    }
+    plant.sql("UPDATE approval SET signature = repeat('ab', 64) WHERE person = 'Bob'");
+    refused("is signed by Ada of those in this cell's plant file");
+    // A cell that knows only one of the two.
+    let one = approvers.split("\n[[approver]]").nth(1).unwrap();
+    cell(&plant, "cell-2", &format!("\n[[approver]]{one}"));
+    plant.ends(&["work", "--plant", "cell-2.toml", "--once", "--part", "SN-1"], 2);
+    // It is still there for a cell that may make it, and nobody has begun it.
+    assert_eq!(work(&plant)[0]["state"], "open");
+    plant.does(&["plant", "withdraw", "small", "--version", "1", "--why", "wrong wheel", "--plant", "planner.toml"]);
+    let said = plant.does(&make);
+    assert!(said.contains("no part is waiting"), "{said}");
+    let (_, told) = plant.ends(&["plant", "propose", "small.toml", "--name", "panel", "--plant", "planner.toml"], 2);
+    assert!(told.contains("which was withdrawn: wrong wheel"), "{told}");
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn a_lease_that_is_over_opens_nothing_and_what_was_begun_is_its_runs() {
+    let plant = Plant::new();
+    let approvers = approved(&plant);
+    ["cell-1", "cell-2"].iter().for_each(|name| cell(&plant, name, &approvers));
+    queue(&plant, "SN-1", &[]);
+    let by = |cell: &str, text: &str| plant.asked_by(cell, text).unwrap();
+    assert_eq!(by("cell-1", "SELECT id, lease FROM take_work(60)"), "1|1");
+    assert_eq!(by("cell-2", "SELECT id FROM take_work(60)"), "", "it is leased");
+    plant.sql("UPDATE work SET leased_until = now() - interval '1 second'");
+    assert!(by("cell-1", "SELECT begin_work(1, 1, 'run-1')").contains("its lease ended at"));
+    assert_eq!(by("cell-2", "SELECT id, lease FROM take_work(60)"), "1|2");
+    // The old lease, and that of the other cell, played again.
+    for (cell, lease) in [("cell-1", 1), ("cell-1", 2), ("cell-2", 1)] {
+        for step in ["begin_work(1, {}, 'run-1')", "renew_work(1, {}, 60)", "return_work(1, {}, 'why')"] {
+            let before = plant.incidents().len();
+            let said = by(cell, &format!("SELECT {}", step.replace("{}", &lease.to_string())));
+            assert!(said.contains("its lease is over"), "{cell} {step}: {said}");
+            let incidents = plant.incidents();
+            assert!(
+                incidents.len() == before + 1
+                    && incidents[before]["what"] == "work refused"
+                    && incidents[before]["by"] == *cell
+            );
+        }
+    }
+    for _ in 0..2 {
+        assert_eq!(by("cell-2", "SELECT begin_work(1, 2, 'run-1')"), "", "the same again has the same answer");
+    }
+    assert!(by("cell-2", "SELECT begin_work(1, 2, 'run-2')").contains("it has been begun, by run run-1"));
+    assert!(by("cell-1", "SELECT begin_work(99, 1, 'run-1')").contains("there is no such part"));
+    plant.sql("UPDATE work SET leased_until = now() - interval '1 day'");
+    assert_eq!(by("cell-1", "SELECT id FROM take_work(60)"), "", "what was begun belongs to its run");
+
+    // The cell died before the run began: it takes nothing more until somebody has looked.
+    let make = ["work", "--plant", "cell-2.toml", "--part", "SN-1", "--once"];
+    let (_, told) = plant.ends(&make, 1);
+    assert!(told.contains("SN-1 was begun in run run-1, of which there is no record in runs"), "{told}");
+    plant.ends(&["work", "--plant", "cell-1.toml", "--give-back", "SN-1"], 1);
+    plant.does(&["work", "--plant", "cell-2.toml", "--give-back", "SN-1"]);
+    plant.does(&make);
+    let run = plant.sql("SELECT run FROM work");
+    // Its run has begun: nobody gives it back.
+    plant.does(&["ship", "--once", "--plant", "cell-2.toml"]);
+    plant.sql("UPDATE work SET state = 'begun'");
+    let said = by("cell-2", &format!("SELECT give_back_work(1, '{run}', 'why')"));
+    assert!(said.contains("that run has records"), "{said}");
+}
