@@ -8,7 +8,10 @@ mod keep;
 #[path = "../common/program.rs"]
 mod program;
 
+mod network;
 mod on_postgres;
+#[path = "../common/outlived.rs"]
+mod outlived;
 mod postgres;
 
 use std::fs;

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::killed::on_serial_lines;
+use crate::outlived::on_serial_lines;
 use crate::program::{Running, changed, records_with, regrind, run};
 use crate::study::touch;
 use regrind::recipe::Recipe;

@@ -6,15 +6,13 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 
-use crate::program::{PATIENCE, Running, changed, records_with, regrind};
+use crate::outlived::{began_once, follow, on_serial_lines};
+use crate::program::{Running, changed, records_with, regrind};
 use crate::rig::{CMM, GRINDER, Rig, small};
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
-use regrind::cell::StateName;
-use regrind::drive::{Request, ask};
 use regrind::journal::{Kind, Reader, verify};
 use regrind_sim::seen::What;
-use serde_json::Value;
 
 /// How often a part's program is killed at most.
 const MOST_KILLS: usize = 3;
@@ -28,31 +26,6 @@ async fn cell_that_stays() -> (Rig, PathBuf) {
     fs::write(home.join("cell.toml"), cell).unwrap();
     fs::write(home.join("part.toml"), rig.recipe.text()).unwrap();
     (rig, home)
-}
-
-/// Follows a program until it has said so much, and kills it then, or to its end; a person lets the cell go on wherever it holds.
-/// Returns its exit code, if it came to its end.
-fn follow(running: &mut Running, folder: &dyn Fn() -> Option<PathBuf>, lines: usize) -> Option<i32> {
-    let began = std::time::Instant::now();
-    loop {
-        if running.has_said() >= lines {
-            running.signal("KILL");
-            running.end();
-            return None;
-        }
-        if running.is_over() {
-            return Some(running.end().0);
-        }
-        if let Some(status) = folder().and_then(|folder| ask(&folder, &Request::Status).ok())
-            && status.status.state == StateName::Held
-        {
-            let resume = Request::Resume { reason: "seen".into(), seen: Some(status.status.number) };
-            // It may have been killed meanwhile, or wait for a machine still.
-            let _ = ask(&folder().unwrap(), &resume);
-        }
-        assert!(began.elapsed() < PATIENCE, "it comes to no end: {:#?}", running.said);
-        std::thread::park_timeout(std::time::Duration::from_millis(5));
-    }
 }
 
 /// Runs a part whose program is killed at drawn moments. Returns its folder and how often it was killed.
@@ -147,31 +120,6 @@ async fn killed(seeds: impl Iterator<Item = u64>) {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_killed_program_is_taken_up_again_and_starts_every_pass_once() {
     killed(1..=13).await;
-}
-
-/// Machines on serial lines, played by the program itself, beside a cell for them and this recipe.
-pub fn on_serial_lines(home: &Path, recipe: impl AsRef<[u8]>) -> Running {
-    fs::write(home.join("part.toml"), recipe).unwrap();
-    let devices = format!("device = \"{}/", home.display());
-    let cell = changed("config/serial-rtu.toml", &[("device = \"/tmp/regrind-", &devices)]);
-    fs::write(home.join("cell.toml"), cell).unwrap();
-    let mut serving =
-        Running::new(regrind(&["simulate", "part.toml", "--cell", "cell.toml", "--log", "machines.jsonl"], home));
-    serving.line("its last word", |line| line.starts_with("Ctrl-C"));
-    serving
-}
-
-/// By the log of those machines, each pass and each measurement began once. Returns how many there were.
-pub fn began_once(home: &Path) -> usize {
-    let log = fs::read_to_string(home.join("machines.jsonl")).unwrap();
-    let seen = log.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
-    let began = seen.filter(|seen| seen["what"] == "began");
-    let mut began: Vec<_> = began.map(|b| format!("{} {} {}", b["machine"], b["job"], b["cycle"])).collect();
-    let all = began.len();
-    began.sort();
-    began.dedup();
-    assert_eq!(began.len(), all, "{log}");
-    all
 }
 
 #[test]

@@ -28,6 +28,8 @@ mod manual;
 mod mirror_cell;
 mod mirror_run;
 mod orders;
+#[path = "../common/outlived.rs"]
+mod outlived;
 mod outside;
 mod panics;
 mod parameters;

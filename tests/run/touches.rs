@@ -3,7 +3,8 @@
 use std::fs;
 use std::path::Path;
 
-use crate::killed::{began_once, on_serial_lines, run_with_kills};
+use crate::killed::run_with_kills;
+use crate::outlived::{began_once, on_serial_lines};
 use crate::program::changed;
 use crate::worlds::{Ran, Setup, run, table};
 use regrind::cell::AlarmId;

@@ -3,4 +3,5 @@
 mod layout;
 mod records;
 mod rights;
+mod weather;
 mod work;

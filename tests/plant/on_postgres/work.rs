@@ -17,7 +17,7 @@ fn approved(plant: &Plant) -> String {
 }
 
 /// A person signs a recipe; returns what a plant file says of the person.
-fn approves(plant: &Plant, person: &str, recipe: &str) -> String {
+pub fn approves(plant: &Plant, person: &str, recipe: &str) -> String {
     let file = format!("{person}.key");
     let told: Value = serde_json::from_str(&plant.does(&["audit", "key", "--key", &file, "--json"])).unwrap();
     plant.does(&["plant", "approve", recipe, "--person", person, "--key", &file, "--plant", "planner.toml"]);

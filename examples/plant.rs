@@ -1,0 +1,197 @@
+//! How a plant of many cells holds up: how fast records are shipped, what a thousand cells leave, and how long its page asks.
+//!
+//! ```text
+//! cargo run --release --features plant --example plant -- ship OWNER.toml RUN [CELLS [RUNS]]
+//! cargo run --release --features plant --example plant -- fill OWNER.toml RUN [CELLS [RUNS [WITH_RECORDS]]]
+//! ```
+//! OWNER.toml is the plant file of the owner of a database that `regrind plant init` has laid out; it is for this alone, and stays full.
+//! RUN is the folder of a finished run, whose records every run here repeats: chained anew, under another name, for another part and day.
+//! `ship` lays RUNS runs (20) into the folders of CELLS cells (8), and ships all of them at once by the roles of these cells. `fill` puts
+//! RUNS runs (518,000: 10^8 records of the shipped free-form mirror) of CELLS cells (1,000) into the tables of runs and cycles, and the
+//! records of the first WITH_RECORDS (50,000) of them into theirs.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use rand::rngs::StdRng;
+use rand::{RngExt, SeedableRng};
+use regrind::config::PlantConfig;
+use regrind::journal::{Kind, Reader, Record, restore, restore_file, sha256_hex};
+use regrind_plant::{DatabaseSettings, Link, Shipper, enrol_cell};
+
+const PASSWORD: &str = "for-measuring";
+
+#[tokio::main]
+async fn main() {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let number = |k: usize, otherwise: usize| arguments.get(k).map_or(otherwise, |n| n.parse().expect("a number"));
+    let [what, owner, run] = [0, 1, 2].map(|k| arguments.get(k).expect("what to do, plant file, and run").as_str());
+    let plant = PlantConfig::read(Path::new(owner)).unwrap_or_else(|problems| panic!("{owner}: {problems:?}"));
+    let database = plant.database.expect("[database]");
+    let like = Like::read(Path::new(run));
+    match what {
+        "ship" => ship(&database, &like, number(3, 8), number(4, 20)).await,
+        "fill" => fill(&database, &like, number(3, 1000), number(4, 518_000), number(5, 50_000)).await,
+        _ => panic!("ship or fill, not {what}"),
+    }
+}
+
+/// A finished run, which others are made like.
+struct Like {
+    folder: PathBuf,
+    records: Vec<Record>,
+}
+
+impl Like {
+    fn read(folder: &Path) -> Self {
+        let reader = Reader::open(folder).expect("a run");
+        Self { folder: folder.to_owned(), records: reader.records(1).map(Result::unwrap).collect() }
+    }
+
+    /// The same records of a run of another name, part and day, in a chain of their own; nobody has signed it.
+    fn again(&self, name: &str, part: &str, days: usize) -> Vec<Record> {
+        let mut head = "0".repeat(64);
+        let day = |utc: &str| {
+            let at: jiff::Timestamp = utc.parse().unwrap();
+            (at - jiff::SignedDuration::from_hours(24 * days as i64)).to_string()
+        };
+        let unsigned = self.records.iter().filter(|record| record.kind != Kind::Seal);
+        let again = unsigned.enumerate().map(|(k, of)| {
+            let mut record = Record { seq: k as u64 + 1, part: part.into(), utc: day(&of.utc), ..of.clone() };
+            if of.kind == Kind::Begin {
+                let mut content = of.value();
+                content["run"] = name.into();
+                content["key"] = serde_json::Value::Null;
+                record.payload = regrind::journal::canonical_json(&content);
+            }
+            if of.kind == Kind::End {
+                let mut content = of.value();
+                content["records"] = (k as u64).into();
+                record.payload = regrind::journal::canonical_json(&content);
+            }
+            record.prev_hash = head.clone();
+            record.hash = sha256_hex(format!("regrind journal record 1\n{head}\n{}", record.text()).as_bytes());
+            head = record.hash.clone();
+            record
+        });
+        again.collect()
+    }
+
+    /// Lays such a run into a folder of runs, with its files.
+    fn lay(&self, runs: &Path, name: &str, part: &str) -> usize {
+        let records = self.again(name, part, 0);
+        let folder = runs.join(name);
+        let (count, files) = (records.len(), records.iter().filter(|record| record.kind == Kind::Artefact));
+        let files: Vec<String> = files.map(|record| record.value()["name"].as_str().unwrap().to_owned()).collect();
+        restore(&folder, records, None).unwrap();
+        for name in files {
+            restore_file(&folder, &name, &std::fs::read(self.folder.join(&name)).unwrap()).unwrap();
+        }
+        count
+    }
+}
+
+async fn ship(database: &DatabaseSettings, like: &Like, cells: usize, runs: usize) {
+    let home = tempfile::tempdir().unwrap();
+    let mut records = 0;
+    let stamp = jiff::Timestamp::now().as_second();
+    let mut owner = Link::open(database).await.unwrap();
+    let mut shippers = Vec::new();
+    for cell in 1..=cells {
+        let (name, folder) = (format!("measured-{cell}"), home.path().join(cell.to_string()));
+        let role = format!("measured_{cell}");
+        enrol_cell(&mut owner, &name, &role, PASSWORD, &[]).await.unwrap();
+        for run in 1..=runs {
+            records += like.lay(&folder, &format!("run-{stamp}-{run}"), &format!("SN-{cell}-{run}"));
+        }
+        let password = home.path().join(format!("{cell}.password"));
+        regrind::formats::write_private(&password, PASSWORD.as_bytes()).unwrap();
+        let settings = DatabaseSettings { user: role, password_file: Some(password), ..database.clone() };
+        shippers.push((Shipper::new(folder, None), settings));
+    }
+    println!("{cells} cells, {runs} runs each, {records} records, and {} files of each run", files_of(like));
+    let began = Instant::now();
+    let shipping = shippers.into_iter().map(|(mut shipper, settings)| {
+        tokio::spawn(async move {
+            let link = Link::open(&settings).await.unwrap();
+            shipper.round(&link).await.unwrap()
+        })
+    });
+    let mut shipped = 0;
+    for one in shipping.collect::<Vec<_>>() {
+        shipped += one.await.unwrap().records;
+    }
+    let seconds = began.elapsed().as_secs_f64();
+    println!("{shipped} records in {seconds:.2} s: {:.0} a second", shipped as f64 / seconds);
+    assert_eq!(shipped as usize, records);
+}
+
+fn files_of(like: &Like) -> usize {
+    like.records.iter().filter(|record| record.kind == Kind::Artefact).count()
+}
+
+async fn fill(database: &DatabaseSettings, like: &Like, cells: usize, runs: usize, with_records: usize) {
+    let link = Link::open(database).await.unwrap();
+    let began = Instant::now();
+    let text = "INSERT INTO cell (name, role) SELECT 'cell-' || n, 'cell_' || n FROM generate_series(1, $1) n ON CONFLICT DO NOTHING";
+    link.ask(text, &[&(cells as i32)]).await.unwrap();
+    let first = link.ask("SELECT coalesce(max(id), 0) FROM run", &[]).await.unwrap()[0].get::<_, i32>(0);
+    // Some 500 parts of a thousand cells in an hour; a fifth of the recipes is made much more often than the others.
+    let text = "WITH made AS (
+            INSERT INTO run (cell, name, part, part_name, recipe, recipe_sha256, operator, simulation, began, ended, result, verdict, pv_limit_um,
+                rms_limit_um, grinder, cmm, wheel, probe, alarms, cycles, pv_um, pv_u_um, rms_um, rms_u_um, records)
+            SELECT c.id, 'run-' || n, 'SN-' || n, 'mirror', 'recipe-' || floor(40 * random() ^ 2), '00', 'operator-' || n % 70, false, t,
+                t + interval '20 minutes', CASE WHEN random() < 0.93 THEN 'accepted' ELSE 'not accepted' END, 'in tolerance', 0.5, 0.1,
+                'grinder-' || c.id % 9, 'cmm-' || c.id % 5, 'R ' || 18 + c.id % 4 || '.000 mm', 'R 1.500 mm', (random() < 0.05)::int, k,
+                0.3 + 0.1 * random(), 0.05, 0.06, 0.01, 0
+            FROM generate_series($1::int, $2::int) n
+                CROSS JOIN LATERAL (SELECT id FROM cell WHERE name = 'cell-' || 1 + n % $3::int) c
+                CROSS JOIN LATERAL (SELECT now() - make_interval(secs => 7.2 * (($4::int - n)::float8)) AS t, 1 + floor(3 * random())::int AS k) x
+            RETURNING id, cycles, pv_um)
+        INSERT INTO cycle (run, cycle, verdict, reason, pv_um, pv_u_um, rms_um, rms_u_um)
+            SELECT id, k, CASE WHEN k = cycles THEN 'accept' ELSE 'grind again' END, '', pv_um * (1 + cycles - k), 0.05, 0.06, 0.01
+            FROM made CROSS JOIN LATERAL generate_series(1, cycles) k";
+    for from in (1..=runs).step_by(10_000) {
+        let [from, to] = [from, (from + 9_999).min(runs)].map(|n| first + n as i32);
+        link.ask(text, &[&from, &to, &(cells as i32), &(first + runs as i32)]).await.unwrap();
+    }
+    let mut random = StdRng::seed_from_u64(1);
+    let mut records = 0;
+    for run in 1..=with_records.min(runs) {
+        let name = format!("run-{}", first as usize + run);
+        let again = like.again(&name, &format!("SN-{run}"), random.random_range(0..40));
+        let hashes: Vec<Vec<u8>> = again.iter().map(|record| bytes_of(&record.hash)).collect();
+        let texts: Vec<String> = again.iter().map(Record::text).collect();
+        let text = "INSERT INTO record (run, seq, hash, text)
+            SELECT r.id, n, hash, text FROM run r, unnest($2::bytea[], $3::text[]) WITH ORDINALITY AS u (hash, text, n) WHERE r.name = $1";
+        link.ask(text, &[&name, &hashes, &texts]).await.unwrap();
+        records += again.len();
+    }
+    link.ask("ANALYZE", &[]).await.unwrap();
+    let bytes = |table: &str| {
+        let text = format!("SELECT pg_total_relation_size('{table}'), pg_relation_size('{table}')");
+        let link = &link;
+        async move {
+            let row = &link.ask(&text, &[]).await.unwrap()[0];
+            [row.get::<_, i64>(0), row.get(1)].map(|bytes| bytes as f64)
+        }
+    };
+    println!(
+        "{runs} runs of {cells} cells, {records} records of {with_records}, in {:.0} s",
+        began.elapsed().as_secs_f64()
+    );
+    for (table, rows) in [("record", records), ("run", runs), ("cycle", 2 * runs)] {
+        let [total, heap] = bytes(table).await;
+        let rows = rows.max(1) as f64;
+        println!(
+            "{table:<8} {:>9.1} MB, {:.0} bytes a row, of which {:.0} are indexes",
+            total / 1e6,
+            total / rows,
+            (total - heap) / rows
+        );
+    }
+}
+
+fn bytes_of(digits: &str) -> Vec<u8> {
+    (0..digits.len() / 2).map(|k| u8::from_str_radix(&digits[2 * k..2 * k + 2], 16).unwrap()).collect()
+}
