@@ -2,8 +2,10 @@
 //!
 //! ```text
 //! cargo bench --bench orders [TRIES]
+//! cargo bench --features plant --bench orders -- TRIES PLANT.toml
 //! ```
-//! The time runs from before the order is written to the control socket to the command at the simulated machine.
+//! The time runs from before the order is written to the control socket to the command at the simulated machine. With the plant file of a cell
+//! every second round is made while `regrind ship` ships the record, and what the others took stands beside it.
 
 #[path = "../tests/common/keep.rs"]
 mod keep;
@@ -13,6 +15,8 @@ mod rig;
 mod tries;
 
 use std::collections::BTreeMap;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 use rig::Rig;
@@ -22,35 +26,64 @@ fn main() {
     // Cargo adds options of its own.
     let tries = std::env::args().skip(1).find_map(|argument| argument.parse().ok()).unwrap_or(200);
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
-    runtime.block_on(measure(tries));
+    let plant = std::env::args().skip(1).find(|argument| argument.ends_with(".toml"));
+    runtime.block_on(measure(tries, plant.as_deref()));
 }
 
-async fn measure(tries: usize) {
+/// Shipping beside the runs below a folder; it ends with this.
+struct Shipping(Child);
+
+impl Shipping {
+    fn begin(plant: &str, runs: &Path) -> Self {
+        let mut ship = Command::new(env!("CARGO_BIN_EXE_regrind"));
+        ship.args(["ship", "--plant", plant, "--runs"]).arg(runs).stdin(Stdio::null()).stdout(Stdio::null());
+        Self(ship.spawn().expect("a program with the feature `plant`"))
+    }
+}
+
+impl Drop for Shipping {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+async fn measure(tries: usize, plant: Option<&str>) {
     let mut rig = Rig::new(rig::small(12, 8, 5000.0)).await;
-    let mut times: BTreeMap<&str, Vec<Duration>> = BTreeMap::new();
+    let mut times: BTreeMap<String, Vec<Duration>> = BTreeMap::new();
     let mut states: BTreeMap<String, usize> = BTreeMap::new();
     let mut slowest: Vec<(Duration, &str, &str)> = Vec::new();
+    let mut shipping = None;
     for k in 0..tries {
         let moment = &MOMENTS[k % MOMENTS.len()];
+        let ships = plant.filter(|_| !(k / MOMENTS.len()).is_multiple_of(2));
+        if k % MOMENTS.len() == 0 {
+            shipping = ships.map(|plant| Shipping::begin(plant, rig.home.path()));
+        }
         let (tried, _) = attempt(&mut rig, moment, (k / MOMENTS.len()).is_multiple_of(2)).await;
         let aborts = tried.abort.iter().zip(["abort, CMM", "abort, grinder"]);
         slowest.extend(aborts.map(|(time, what)| (*time, what, moment.name)));
         slowest.extend(tried.hold.map(|time| (time, "hold", moment.name)));
         assert!(tried.after_abort.is_empty(), "{tried:?}");
         *states.entry(tried.state).or_default() += 1;
-        times.entry("abort, on the wire").or_default().extend(&tried.abort);
-        times.entry("abort, answered").or_default().push(tried.abort_answered);
-        times.entry("hold, on the wire").or_default().extend(tried.hold);
-        times.entry("hold, answered").or_default().extend(tried.hold_answered);
-        times.entry("resume, on the wire").or_default().extend(tried.resume);
-        times.entry("resume, answered").or_default().extend(tried.resume_answered);
+        let mut take = |what: &str, took: &mut dyn Iterator<Item = Duration>| {
+            let beside = if ships.is_some() { ", shipped" } else { "" };
+            times.entry(format!("{what}{beside}")).or_default().extend(took);
+        };
+        take("abort, on the wire", &mut tried.abort.iter().copied());
+        take("abort, answered", &mut std::iter::once(tried.abort_answered));
+        take("hold, on the wire", &mut tried.hold.into_iter());
+        take("hold, answered", &mut tried.hold_answered.into_iter());
+        take("resume, on the wire", &mut tried.resume.into_iter());
+        take("resume, answered", &mut tried.resume_answered.into_iter());
     }
-    println!("{tries} tries\n\n{:22}{:>6}{:>10}{:>10}{:>10}  ms", "", "n", "p50", "p99", "max");
+    drop(shipping);
+    println!("{tries} tries\n\n{:32}{:>6}{:>10}{:>10}{:>10}  ms", "", "n", "p50", "p99", "max");
     for (what, mut times) in times {
         times.sort_unstable();
         let at = |share: f64| times.get(((times.len() as f64 * share).ceil() as usize).saturating_sub(1));
         let ms = |share: f64| at(share).map_or(f64::NAN, |time| 1e3 * time.as_secs_f64());
-        println!("{what:22}{:>6}{:>10.2}{:>10.2}{:>10.2}", times.len(), ms(0.5), ms(0.99), ms(1.0));
+        println!("{what:32}{:>6}{:>10.2}{:>10.2}{:>10.2}", times.len(), ms(0.5), ms(0.99), ms(1.0));
     }
     slowest.sort_unstable_by(|a, b| b.cmp(a));
     println!("\nslowest on the wire");

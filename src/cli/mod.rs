@@ -87,6 +87,8 @@ enum Command {
     #[cfg(feature = "plant")]
     Work(work::Arguments),
     #[cfg(feature = "plant")]
+    Study(plant::studies::Arguments),
+    #[cfg(feature = "plant")]
     Plant(plant::Arguments),
     Audit(audit::Arguments),
     Report(report::Arguments),
@@ -147,6 +149,8 @@ fn run() -> ExitCode {
         Command::Ship(arguments) => ship::run(&arguments),
         #[cfg(feature = "plant")]
         Command::Work(arguments) => work::run(&arguments),
+        #[cfg(feature = "plant")]
+        Command::Study(arguments) => plant::studies::run(&arguments),
         #[cfg(feature = "plant")]
         Command::Plant(arguments) => plant::run(&arguments),
         Command::Audit(arguments) => audit::run(&arguments),

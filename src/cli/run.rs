@@ -66,6 +66,10 @@ pub(super) struct Arguments {
     #[cfg(feature = "plant")]
     #[arg(skip)]
     pub(super) work: Option<super::work::Taken>,
+    /// File for what the simulated world knows of the part in the end
+    #[cfg(feature = "plant")]
+    #[arg(long, hide = true)]
+    pub(super) truth: Option<PathBuf>,
     /// Print a line of JSON for everything that happens
     #[arg(long)]
     pub(super) json: bool,
@@ -94,11 +98,16 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     };
     super::runtime()?.block_on(async {
         let mut cell = cell;
-        let _world = match spec {
+        let world = match spec {
             Some(spec) => Some(simulated::serve(spec, &mut cell, &recipe).await?),
             None => None,
         };
         let ending = carry_out(arguments, &recipe, &cell, task, plan, earlier, key).await?;
+        #[cfg(feature = "plant")]
+        if let (Some(world), Some(path)) = (&world, &arguments.truth) {
+            world.tell_truth(&recipe, &cell, path)?;
+        }
+        drop(world);
         outcome(&ending)
     })
 }

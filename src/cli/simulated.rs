@@ -42,7 +42,7 @@ pub(super) struct SimulatedCell {
     /// Links that were placed at the devices of serial lines.
     links: Vec<PathBuf>,
     /// Kept for the life of the machines.
-    _world: World,
+    world: World,
 }
 
 /// A line of what simulated machines see and do.
@@ -97,7 +97,7 @@ pub(super) async fn serve(spec: WorldSpec, cell: &mut CellConfig, recipe: &Recip
     let seed = spec.seed;
     let world = World::new(spec).map_err(|e| failed(e.to_string()))?;
     let (servings, places, links) = (Vec::new(), Vec::new(), Vec::new());
-    let mut simulated = SimulatedCell { servings, places, dme: None, hits: None, links, _world: world.clone() };
+    let mut simulated = SimulatedCell { servings, places, dme: None, hits: None, links, world: world.clone() };
     if let Wire::Linuxcnc(grinder) = &cell.grinder.link.wire {
         let folder = path.parent().unwrap_or(Path::new(""));
         let path = grinder.executed_path(folder).map(|command| executed(command, &world, recipe));
@@ -190,6 +190,23 @@ fn by_programs(cell: &CellConfig) -> Result<Option<Programs>, String> {
 }
 
 impl SimulatedCell {
+    /// Writes what the world knows of the part: PV and RMS at the targets, in micrometres, in the position that fits best.
+    #[cfg(feature = "plant")]
+    pub(super) fn tell_truth(&self, recipe: &Recipe, cell: &CellConfig, path: &Path) -> Result<(), Failure> {
+        let (task, _) = regrind::setup::prepare(recipe, cell).map_err(Failure::Setup)?;
+        let places: Vec<[f64; 2]> = task.targets.iter().map(|target| [target.point.x, target.point.y]).collect();
+        let stands_mm = self.world.deviations_mm(&places);
+        let level_mm = stands_mm.iter().sum::<f64>() / stands_mm.len().max(1) as f64;
+        let points: Vec<_> = (task.targets.iter().zip(&stands_mm))
+            .map(|(target, mm)| task.fixture_cmm_from_model.point(&(target.point + *mm * target.normal)))
+            .collect();
+        let failed = |source| Failure::of_registration(source, recipe.path(), recipe.path());
+        let (found, _) = task.register(&points, level_mm).map_err(failed)?;
+        let [pv_um, rms_um] = [found.verdict.pv_mm, found.verdict.rms_mm].map(|mm| 1e3 * mm);
+        let truth = serde_json::json!({ "pv_um": pv_um, "rms_um": rms_um });
+        Ok(regrind::formats::write_json_atomic(path.to_owned(), &truth)?)
+    }
+
     /// Writes all that the machines see and do from now on to a file, a line of JSON for each thing, as it happens.
     ///
     /// # Errors

@@ -114,6 +114,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
             serve: None,
             plant: Some(arguments.plant.clone()),
             work: Some(taken),
+            truth: None,
             json: arguments.json,
         })?;
         // What did not turn out wants a person before the next blank is ground.

@@ -11,6 +11,7 @@ mod recipes;
 mod schema;
 mod settings;
 mod ship;
+mod studies;
 mod work;
 
 pub use copy::{PlantRun, content};
@@ -19,7 +20,8 @@ pub use link::Link;
 pub use recipes::{Approval, PlantRecipe};
 pub use schema::{PlantRole, enrol, enrol_cell, is_known, migrate, retire_cell};
 pub use settings::{Approver, ArtefactSettings, DatabaseSettings};
-pub use ship::{Shipped, Shipper};
+pub use ship::{Shipped, Shipper, glance};
+pub use studies::{Job, Study};
 pub use tokio_postgres::Row;
 pub use tokio_postgres::types::ToSql;
 pub use work::{Begun, LEASE, Lease};

@@ -6,14 +6,15 @@ use super::error::{PlantError, refused};
 use super::link::Link;
 
 /// Every version of the layout: what is put on top of the one before. A text that was handed out is never changed.
-const MIGRATIONS: [(i32, &str); 3] = [
+const MIGRATIONS: [(i32, &str); 4] = [
     (1, include_str!("migrations/0001_records.sql")),
     (2, include_str!("migrations/0002_work.sql")),
     (3, include_str!("migrations/0003_views.sql")),
+    (4, include_str!("migrations/0004_studies.sql")),
 ];
 
 /// The groups of roles: what signs in is a member of one.
-const GROUPS: [&str; 3] = ["regrind_cell", "regrind_reader", "regrind_planner"];
+const GROUPS: [&str; 4] = ["regrind_cell", "regrind_reader", "regrind_planner", "regrind_worker"];
 
 /// Keeps two programs from changing the layout at once: a number that nobody else uses.
 const LOCK: i64 = 0x5267_7264_506c_616e;
@@ -37,8 +38,8 @@ pub async fn migrate(link: &mut Link) -> Result<[i32; 2], PlantError> {
         "CREATE SCHEMA IF NOT EXISTS regrind;
          CREATE TABLE IF NOT EXISTS regrind.migration (version integer PRIMARY KEY, sha256 text NOT NULL,
             applied_at timestamptz NOT NULL DEFAULT now());
-         GRANT USAGE ON SCHEMA regrind TO regrind_cell, regrind_reader, regrind_planner;
-         GRANT SELECT ON regrind.migration TO regrind_cell, regrind_reader;
+         GRANT USAGE ON SCHEMA regrind TO regrind_cell, regrind_reader, regrind_planner, regrind_worker;
+         GRANT SELECT ON regrind.migration TO regrind_cell, regrind_reader, regrind_worker;
          GRANT regrind_reader TO regrind_planner;",
     )
     .await
@@ -105,6 +106,8 @@ pub enum PlantRole {
     Reader,
     /// Puts parts into the queue and brings recipes, besides looking.
     Planner,
+    /// Makes the simulated runs of studies.
+    Worker,
 }
 
 impl PlantRole {
@@ -112,6 +115,7 @@ impl PlantRole {
         match self {
             Self::Reader => "regrind_reader",
             Self::Planner => "regrind_planner",
+            Self::Worker => "regrind_worker",
         }
     }
 }

@@ -131,7 +131,7 @@ impl Shipper {
         let [given, missing] = self.give_files(link, &folder, name, there.id, shipped).await?;
         let is_over = matches!(last.kind, Kind::End | Kind::Seal) && has_end(&folder, &last)?;
         if there.records > began_with || is_over {
-            tell_run(link, there.id, &told_of(&folder)?).await?;
+            tell_run(link, there.id, &glance(&folder)?).await?;
         }
         shipped.records += u64::try_from(there.records - began_with).unwrap_or(0);
         shipped.files += given;
@@ -301,8 +301,11 @@ async fn tell_run(link: &Link, id: i32, told: &Value) -> Result<(), PlantError> 
     asked.map(drop).map_err(refused("what a glance shows of a run"))
 }
 
-/// What a glance shows of a run, as its record tells it.
-pub(crate) fn told_of(folder: &Path) -> Result<Value, PlantError> {
+/// Returns what a glance shows of a run, as its record tells it: result, limits, machines, figures of each cycle in micrometres.
+///
+/// # Errors
+/// A record that cannot be read.
+pub fn glance(folder: &Path) -> Result<Value, PlantError> {
     let RunSummary { result, verdict, tolerance, cycles, alarms, machines, wheel_radius_mm, .. } = run_summary(folder)?;
     // A limit that is none is infinite, which no number in JSON is.
     let limit = |mm: f64| mm.is_finite().then_some(1e3 * mm);

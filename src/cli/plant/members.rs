@@ -62,6 +62,8 @@ enum Kind {
     Planner,
     /// Who looks
     Reader,
+    /// Who makes the simulated runs of studies
+    Worker,
 }
 
 /// Take a cell out of the plant: it cannot sign in any more, and its records stay
@@ -120,6 +122,7 @@ pub(super) fn enrol(arguments: &ToEnrol) -> Result<Outcome, Failure> {
             Kind::Cell => enrol_cell(&mut link, &arguments.name, &role, &password, &keys).await?,
             Kind::Planner => regrind_plant::enrol(&mut link, &role, &password, PlantRole::Planner).await?,
             Kind::Reader => regrind_plant::enrol(&mut link, &role, &password, PlantRole::Reader).await?,
+            Kind::Worker => regrind_plant::enrol(&mut link, &role, &password, PlantRole::Worker).await?,
         }
         let path = arguments.password_file.display();
         super::super::print(&format!("{} signs in as {role}, with the password in {path}\n", arguments.name))?;

@@ -5,6 +5,7 @@ mod members;
 mod queue;
 mod recipes;
 mod runs;
+pub(super) mod studies;
 
 use std::path::{Path, PathBuf};
 

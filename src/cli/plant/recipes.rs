@@ -126,7 +126,7 @@ pub(super) fn propose(arguments: &ToPropose) -> Result<Outcome, Failure> {
 }
 
 /// The files that a recipe names, by the path in it.
-fn files_of(recipe: &Recipe) -> Result<BTreeMap<String, Vec<u8>>, Failure> {
+pub(super) fn files_of(recipe: &Recipe) -> Result<BTreeMap<String, Vec<u8>>, Failure> {
     let folder = recipe.path().parent().unwrap_or(Path::new(""));
     let mut files = BTreeMap::new();
     for path in recipe.files() {

@@ -1,7 +1,9 @@
 //! Ignored unless PostgreSQL is asked for.
 
+mod backup;
 mod layout;
 mod records;
 mod rights;
+mod studies;
 mod weather;
 mod work;

@@ -1,0 +1,445 @@
+//! `regrind study`: a recipe made many times in simulation, by as many workers as there are, and what came of it.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use clap::{Args, Subcommand};
+use regrind::formats::{ResultFolder, ScratchFolder, write_atomic};
+use regrind::recipe::Recipe;
+use regrind_plant::{Job, PlantError, Study, glance};
+use serde_json::{Map, Value, json};
+
+use super::super::failure::Failure;
+use super::super::words::three_digits;
+use super::super::{Outcome, check, name, outside};
+use super::recipes::files_of;
+use super::{Where, is_below, open, rows};
+
+/// How often a worker asks for a job where there is none.
+const ROUND: Duration = Duration::from_secs(5);
+/// Most jobs of one study.
+const MOST_JOBS: usize = 1_000_000;
+/// The quantile of the normal distribution for an interval of 95 %.
+const Z: f64 = 1.96;
+
+/// Make a recipe many times in simulation, on as many computers as there are, and tell what came of it
+#[derive(Args, Debug)]
+#[command(after_help = "\
+For commissioning: how often a recipe is accepted, in how many cycles, by which gain or tolerance, and how often an accepted part is truly out of
+tolerance. Each run is a job of the plant's database; a worker that dies loses nothing, for its job is given to another.
+
+Examples:
+  regrind study begin recipes/freeform-mirror.toml --name gains --seeds 1..200 --vary compensation.gain=0.6,0.8,1.0 --plant planner.toml
+  regrind study work --plant worker.toml --workers 2
+  regrind study show gains --plant planner.toml
+
+Exit codes: 0 done; 1 there is no such study; 2 bad arguments, or the database refuses it; 3 it cannot be reached.")]
+pub(in super::super) struct Arguments {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, Subcommand)]
+enum What {
+    Begin(ToBegin),
+    Work(ToWork),
+    Show(ToShow),
+    Stop(ToStop),
+}
+
+/// Begin a study: a job for each seed and each set of values
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Example:
+  regrind study begin mirror.toml --name limits --seeds 1..50 --vary acceptance.pv_um=2.5,3.0 --vary cycle.most_cycles=3,5 --plant planner.toml
+
+Exit codes: 0 begun; 2 the recipe is not as it should be with one of the values, or there is a study of that name; 3 the database cannot be reached.")]
+struct ToBegin {
+    /// Recipe, with a table [simulation]
+    #[arg(value_name = "RECIPE")]
+    recipe: PathBuf,
+    /// What the study is called
+    #[arg(long, value_name = "NAME", value_parser = name)]
+    name: String,
+    /// What the simulated parts and runs are drawn from
+    #[arg(long, value_name = "FIRST..LAST", value_parser = seeds)]
+    seeds: (u64, u64),
+    /// A key of the recipe and the values that it has, apart by commas; again for another key: every value with every other
+    #[arg(long, value_name = "KEY=VALUE,VALUE", value_parser = variation)]
+    vary: Vec<(String, Vec<Value>)>,
+    #[command(flatten)]
+    plant: Where,
+}
+
+/// Make the runs of studies until none is left
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Example:
+  regrind study work --plant worker.toml --workers 2 --wait
+
+Exit codes: 0 none is left; 2 bad arguments, or the database refuses it; 3 it cannot be reached.")]
+struct ToWork {
+    /// How many runs at a time
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=64))]
+    workers: u8,
+    /// Wait for further jobs when there is none, until Ctrl-C
+    #[arg(long)]
+    wait: bool,
+    #[command(flatten)]
+    plant: Where,
+}
+
+/// Tell what came of a study, for each set of values
+#[derive(Args, Debug)]
+#[command(after_help = "\
+`accepted` has its interval of 95 % (Wilson 1927). `false accepts` are accepted parts that are truly out of tolerance, as the simulated world knows.
+
+Example:
+  regrind study show gains --plant planner.toml
+
+Exit codes: 0 told; 1 there is no such study; 2 the database refuses it; 3 it cannot be reached.")]
+struct ToShow {
+    /// What the study is called
+    #[arg(value_name = "NAME")]
+    name: String,
+    #[command(flatten)]
+    plant: Where,
+    /// Print each run as a line of JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Give out no more jobs of a study
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Example:
+  regrind study stop gains --plant planner.toml
+
+Exit codes: 0 stopped; 1 there is no such study, or it was stopped before; 2 the database refuses it; 3 it cannot be reached.")]
+struct ToStop {
+    /// What the study is called
+    #[arg(value_name = "NAME")]
+    name: String,
+    #[command(flatten)]
+    plant: Where,
+}
+
+pub(in super::super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    match &arguments.what {
+        What::Begin(of) => begin(of),
+        What::Work(of) => work(of),
+        What::Show(of) => show(of),
+        What::Stop(of) => stop(of),
+    }
+}
+
+fn seeds(text: &str) -> Result<(u64, u64), String> {
+    let words = || "give the first and the last, such as 1..200".to_owned();
+    let (first, last) = text.split_once("..").ok_or_else(words)?;
+    let number = |of: &str| of.trim().parse::<u64>().map_err(|_| words());
+    match (number(first)?, number(last)?) {
+        (first, last) if first <= last && last - first < MOST_JOBS as u64 => Ok((first, last)),
+        _ => Err(format!("the last is at or behind the first, and there are no more than {MOST_JOBS}")),
+    }
+}
+
+/// A dotted key, and values as TOML has them.
+fn variation(text: &str) -> Result<(String, Vec<Value>), String> {
+    let (key, values) = text.split_once('=').ok_or("give a key and its values, such as compensation.gain=0.8,1.0")?;
+    let key = key.trim();
+    let is_key =
+        |part: &str| !part.is_empty() && part.chars().all(|c| c.is_ascii_alphanumeric() || c == '_' || c == '-');
+    if !key.split('.').all(is_key) {
+        return Err(format!("{key:?} is no key of a recipe"));
+    }
+    let table: toml::Table =
+        format!("values = [{values}]").parse().map_err(|_| format!("{values:?} are no values as TOML has them"))?;
+    let values = serde_json::to_value(&table["values"]).map_err(|error| error.to_string())?;
+    match values {
+        Value::Array(values) if !values.is_empty() => Ok((key.to_owned(), values)),
+        _ => Err("there is no value".into()),
+    }
+}
+
+/// Every value of every key with every other.
+fn every_one(vary: &[(String, Vec<Value>)]) -> Vec<Map<String, Value>> {
+    vary.iter().fold(vec![Map::new()], |all, (key, values)| {
+        let mut every = Vec::with_capacity(all.len() * values.len());
+        for of in &all {
+            for value in values {
+                let mut of = of.clone();
+                of.insert(key.clone(), value.clone());
+                every.push(of);
+            }
+        }
+        every
+    })
+}
+
+/// The text of a recipe with other values.
+fn varied(text: &str, values: &Map<String, Value>) -> Result<String, String> {
+    let mut recipe: toml::Table = text.parse().map_err(|error| format!("the recipe is no TOML: {error}"))?;
+    for (key, value) in values {
+        let mut table = &mut recipe;
+        let (tables, last) = key.rsplit_once('.').unwrap_or(("", key));
+        for part in tables.split('.').filter(|part| !part.is_empty()) {
+            let inner = table.entry(part).or_insert_with(|| toml::Value::Table(toml::Table::new()));
+            table = inner.as_table_mut().ok_or_else(|| format!("{key}: {part} is no table"))?;
+        }
+        let value: toml::Value = serde_json::from_value(value.clone()).map_err(|error| format!("{key}: {error}"))?;
+        table.insert(last.to_owned(), value);
+    }
+    Ok(recipe.to_string())
+}
+
+fn begin(arguments: &ToBegin) -> Result<Outcome, Failure> {
+    let recipe = check::or_show(Recipe::read(&arguments.recipe))?;
+    let sets = every_one(&arguments.vary);
+    for values in &sets {
+        let text = varied(recipe.text(), values).map_err(PlantError::Recipe)?;
+        // What a worker would be refused later is said now.
+        check::or_show(Recipe::parse(recipe.path(), &text))?;
+    }
+    let (first, last) = arguments.seeds;
+    let seeds: Vec<u64> = (first..=last).collect();
+    if seeds.len() * sets.len() > MOST_JOBS {
+        let what =
+            format!("{} jobs are more than the {MOST_JOBS} of one study; take fewer seeds", seeds.len() * sets.len());
+        return Err(PlantError::Recipe(what).into());
+    }
+    let study = Study {
+        name: arguments.name.clone(),
+        recipe: recipe.path().file_stem().unwrap_or_default().to_string_lossy().into_owned(),
+        text: recipe.text().to_owned(),
+        files: files_of(&recipe)?,
+    };
+    let config = arguments.plant.read()?;
+    super::super::runtime()?.block_on(async {
+        let link = open(&config).await?;
+        let sets: Vec<Value> = sets.into_iter().map(Value::Object).collect();
+        let jobs = study.begin(&link, &sets, &seeds).await?;
+        super::super::print(&format!(
+            "{}: {}; regrind study work makes them\n",
+            study.name,
+            super::super::words::counted(jobs, "job")
+        ))?;
+        Ok(Outcome::Accepted)
+    })
+}
+
+fn work(arguments: &ToWork) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    // Whoever works at this computer goes first.
+    outside::give_way();
+    super::super::runtime()?.block_on(async {
+        let mut workers = tokio::task::JoinSet::new();
+        for _ in 0..arguments.workers {
+            let (config, wait) = (config.clone(), arguments.wait);
+            workers.spawn(async move {
+                let mut made = 0_usize;
+                loop {
+                    let link = open(&config).await?;
+                    let Some(job) = Job::take(&link).await? else {
+                        if !wait {
+                            return Ok::<_, Failure>(made);
+                        }
+                        tokio::time::sleep(ROUND).await;
+                        continue;
+                    };
+                    let study = Study::of(&link, &job).await?;
+                    // A run takes longer than a line should stand idle.
+                    drop(link);
+                    let of = job.clone();
+                    let result = tokio::task::spawn_blocking(move || made_of(&study, &of)).await;
+                    let result = result.unwrap_or_else(|error| Err(error.to_string()));
+                    let link = open(&config).await?;
+                    made += usize::from(job.finish(&link, &result).await?);
+                }
+            });
+        }
+        let mut made = 0;
+        while let Some(worker) = workers.join_next().await {
+            made += worker.map_err(|error| Failure::Terminal(error.into()))??;
+        }
+        super::super::print(&format!("{} made\n", super::super::words::counted(made, "run")))?;
+        Ok(Outcome::Accepted)
+    })
+}
+
+/// Makes the run of a job, by a program of its own, and returns what a glance shows of it beside the truth.
+fn made_of(study: &Study, job: &Job) -> Result<Value, String> {
+    let words = |error: &dyn std::fmt::Display| error.to_string();
+    let place = std::env::temp_dir().join(format!("regrind-study-{:032x}", rand::random::<u128>()));
+    let scratch = ScratchFolder::at(place).map_err(|error| words(&error))?;
+    let empty = Map::new();
+    let text = varied(&study.text, job.varied.as_object().unwrap_or(&empty))?;
+    let recipe = scratch.path().join(format!("{}.toml", study.recipe));
+    write(&recipe, text.as_bytes())?;
+    for (name, content) in &study.files {
+        let inside = Path::new(name);
+        if !is_below(inside) {
+            return Err(format!("the file {name:?} would lie outside of its folder"));
+        }
+        write(&scratch.path().join(inside), content)?;
+    }
+    let [runs, truth] = ["runs", "truth.json"].map(|name| scratch.path().join(name));
+    let mut command = Command::new(std::env::current_exe().map_err(|error| words(&error))?);
+    command.arg("run").arg(&recipe).args(["--cell", "sim", "--json", "--seed", &job.seed.to_string(), "--runs"]);
+    command.arg(&runs).arg("--truth").arg(&truth).env("REGRIND_KEY", "");
+    let done = command.stdin(Stdio::null()).stdout(Stdio::null()).output().map_err(|error| words(&error))?;
+    let run = std::fs::read_dir(&runs).ok().and_then(|mut runs| Some(runs.next()?.ok()?.path()));
+    let Some(run) = run else { return Err(String::from_utf8_lossy(&done.stderr).trim_end().to_owned()) };
+    let mut told = glance(&run).map_err(|error| words(&error))?;
+    told["truth"] = std::fs::read(&truth).ok().and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default();
+    Ok(told)
+}
+
+fn write(path: &Path, content: &[u8]) -> Result<(), String> {
+    let made = ResultFolder::prepare(path.parent().unwrap_or(Path::new(""))).map_err(|error| error.to_string())?;
+    made.keep();
+    write_atomic(path, content).map_err(|error| error.to_string())
+}
+
+fn show(arguments: &ToShow) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    super::super::runtime()?.block_on(async {
+        let link = open(&config).await?;
+        let text = "SELECT j.job, j.varied::text, j.seed, j.state, j.result::text FROM study s JOIN study_job j ON j.study = s.id
+            WHERE s.name = $1 ORDER BY j.job";
+        let found = rows(&link, text, &[&arguments.name]).await?;
+        if found.is_empty() {
+            super::super::print(&format!("there is no study {:?}\n", arguments.name))?;
+            return Ok(Outcome::NotInTolerance);
+        }
+        let value = |text: Option<&str>| text.and_then(|text| serde_json::from_str(text).ok()).unwrap_or(Value::Null);
+        let jobs = found.iter().map(|row| {
+            let varied = value(row.get(1));
+            json!({ "job": row.get::<_, i32>(0), "varied": varied, "seed": row.get::<_, i64>(2), "state": row.get::<_, &str>(3), "result": value(row.get(4)) })
+        });
+        let jobs: Vec<Value> = jobs.collect();
+        match arguments.json {
+            true => super::super::print(&jobs.iter().map(|job| format!("{job}\n")).collect::<String>())?,
+            false => super::super::print(&in_words(&jobs))?,
+        }
+        Ok(Outcome::Accepted)
+    })
+}
+
+/// A line for each set of values, in the order in which they were given.
+fn in_words(jobs: &[Value]) -> String {
+    let mut sets: BTreeMap<String, (i64, Vec<&Value>)> = BTreeMap::new();
+    for job in jobs {
+        let first = job["job"].as_i64().unwrap_or(0);
+        sets.entry(job["varied"].to_string()).or_insert_with(|| (first, Vec::new())).1.push(job);
+    }
+    let mut sets: Vec<(String, (i64, Vec<&Value>))> = sets.into_iter().collect();
+    sets.sort_by_key(|(_, (first, _))| *first);
+    let mut text = format!(
+        "{:>5} {:>5} {:>7} {:>24} {:>7} {:>9} {:>9} {:>9}  values\n",
+        "runs", "open", "failed", "accepted", "cycles", "PV um", "RMS um", "false"
+    );
+    for (_, (_, jobs)) in &sets {
+        text += &line_of(jobs);
+    }
+    text
+}
+
+fn line_of(jobs: &[&Value]) -> String {
+    let count = |state: &str| jobs.iter().filter(|job| job["state"] == state).count();
+    let done: Vec<&Value> = jobs.iter().filter(|job| job["state"] == "done").map(|job| &job["result"]).collect();
+    let accepted: Vec<&&Value> = done.iter().filter(|run| run["result"] == "accepted").collect();
+    let last = |run: &Value, key: &str| run["cycles"].as_array()?.iter().rev().find_map(|cycle| cycle[key].as_f64());
+    let cycles = accepted.iter().filter_map(|run| Some(run["cycles"].as_array()?.len() as f64));
+    let is_out = |run: &&&&Value| {
+        let beyond = |of: &str, limit: &str| {
+            run["truth"][of].as_f64().zip(run[limit].as_f64()).is_some_and(|(is, most)| is > most)
+        };
+        beyond("pv_um", "pv_limit_um") || beyond("rms_um", "rms_limit_um")
+    };
+    let known = accepted.iter().filter(|run| run["truth"].is_object()).count();
+    let wrong = accepted.iter().filter(is_out).count();
+    let [low, high] = wilson(accepted.len(), done.len());
+    let share = match done.len() {
+        0 => "-".to_owned(),
+        n => format!("{:.1} % ({low:.1} to {high:.1})", 100.0 * accepted.len() as f64 / n as f64),
+    };
+    let shown = |value: Option<f64>| value.map_or("-".to_owned(), three_digits);
+    let values = jobs[0]["varied"].as_object().into_iter().flatten().map(|(key, value)| format!("{key} = {value}"));
+    format!(
+        "{:>5} {:>5} {:>7} {share:>24} {:>7} {:>9} {:>9} {:>9}  {}\n",
+        done.len(),
+        count("open") + count("leased"),
+        count("failed"),
+        shown(mean(cycles)),
+        shown(median(done.iter().filter_map(|run| last(run, "pv_um")).collect())),
+        shown(median(done.iter().filter_map(|run| last(run, "rms_um")).collect())),
+        if known == 0 { "-".to_owned() } else { format!("{wrong} of {known}") },
+        values.collect::<Vec<_>>().join(", ")
+    )
+}
+
+fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let (sum, count) = values.fold((0.0, 0_u32), |(sum, count), value| (sum + value, count + 1));
+    (count > 0).then(|| sum / f64::from(count))
+}
+
+fn median(mut values: Vec<f64>) -> Option<f64> {
+    values.sort_by(f64::total_cmp);
+    let middle = values.len() / 2;
+    let low = values.get(middle.saturating_sub(usize::from(values.len().is_multiple_of(2))))?;
+    Some((low + values.get(middle)?) / 2.0)
+}
+
+/// The interval of 95 % of a share, in per cent (Wilson 1927).
+fn wilson(of: usize, all: usize) -> [f64; 2] {
+    let (n, p) = (all as f64, of as f64 / all as f64);
+    let middle = p + Z * Z / (2.0 * n);
+    let half = Z * (p * (1.0 - p) / n + Z * Z / (4.0 * n * n)).sqrt();
+    [middle - half, middle + half].map(|bound| 100.0 * bound / (1.0 + Z * Z / n))
+}
+
+fn stop(arguments: &ToStop) -> Result<Outcome, Failure> {
+    let config = arguments.plant.read()?;
+    super::super::runtime()?.block_on(async {
+        let link = open(&config).await?;
+        let done = rows(&link, "SELECT stop_study($1)", &[&arguments.name]).await?;
+        if done.first().is_some_and(|row| row.get(0)) {
+            super::super::print(&format!("{} gives out no more jobs\n", arguments.name))?;
+            return Ok(Outcome::Accepted);
+        }
+        super::super::print(&format!("there is no study {:?}, or it was stopped before\n", arguments.name))?;
+        Ok(Outcome::NotInTolerance)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_value_goes_with_every_other_into_the_recipe() {
+        let vary = ["a.b=1,2", "c=\"x\",true,0.5"].map(|text| variation(text).unwrap());
+        let sets = every_one(&vary);
+        assert_eq!(sets.len(), 6);
+        let text = varied("c = 1\n[a]\nd = 3\n", &sets[5]).unwrap();
+        let back: toml::Table = text.parse().unwrap();
+        assert_eq!(back, "c = 0.5\n[a]\nb = 2\nd = 3\n".parse().unwrap());
+        assert!(varied("a = 1", &sets[0]).unwrap_err().contains("a is no table"));
+        for bad in ["", "a", "=1", "a b=1", "a=", "a=[", "a..b=1"] {
+            assert!(variation(bad).is_err(), "{bad}");
+        }
+        assert_eq!(seeds("3..3"), Ok((3, 3)));
+        assert!(["", "1", "2..1", "-1..2", "0..1000000"].iter().all(|bad| seeds(bad).is_err()));
+    }
+
+    #[test]
+    fn shares_have_the_interval_of_the_book() {
+        // 81 of 263: 0.2553 to 0.3662 (Newcombe 1998, table I, method 3).
+        let [low, high] = wilson(81, 263);
+        assert!((low - 25.53).abs() < 0.01 && (high - 36.62).abs() < 0.01, "{low} {high}");
+        assert_eq!(wilson(0, 20)[0], 0.0);
+        assert_eq!((median(vec![]), median(vec![3.0, 1.0]), median(vec![5.0, 1.0, 2.0])), (None, Some(2.0), Some(2.0)));
+    }
+}

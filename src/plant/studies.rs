@@ -1,0 +1,113 @@
+//! Studies: simulated runs of a recipe, spread over workers by leases as the parts of the queue are.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use serde_json::Value;
+use tokio_postgres::types::ToSql;
+
+use super::error::{PlantError, refused};
+use super::link::Link;
+
+/// How long a job is kept for a worker: a run takes seconds, of a large part minutes.
+const LEASE: Duration = Duration::from_secs(1800);
+
+/// A recipe, and the runs that are to be made of it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Study {
+    /// What the study is called.
+    pub name: String,
+    /// What the recipe is called.
+    pub recipe: String,
+    /// The text of the recipe.
+    pub text: String,
+    /// What it names beside itself, by the path in it.
+    pub files: BTreeMap<String, Vec<u8>>,
+}
+
+/// A run that a worker has taken.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Job {
+    /// The study.
+    pub study: i32,
+    /// Its number in the study, from 1.
+    pub number: i32,
+    /// Keys of the recipe and the values that they have here.
+    pub varied: Value,
+    /// What the simulated part and run are drawn from.
+    pub seed: u64,
+    lease: i32,
+}
+
+impl Study {
+    /// Begins it: each set of values with each seed. Returns how many jobs there are.
+    ///
+    /// # Errors
+    /// A study of that name, a role that may not, a plant that cannot be reached.
+    pub async fn begin(&self, link: &Link, variations: &[Value], seeds: &[u64]) -> Result<usize, PlantError> {
+        let seeds: Vec<i64> = seeds.iter().map(|seed| seed.cast_signed()).collect();
+        let names: Vec<&str> = self.files.keys().map(String::as_str).collect();
+        let contents: Vec<&[u8]> = self.files.values().map(Vec::as_slice).collect();
+        let varied: Vec<String> = variations.iter().map(Value::to_string).collect();
+        let Self { name, recipe, text, .. } = self;
+        let values: [&(dyn ToSql + Sync); 7] = [name, recipe, text, &names, &contents, &varied, &seeds];
+        let asked = "SELECT new_study($1, $2, $3, $4, $5, $6::text[]::jsonb[], $7)";
+        match link.client().query_one(asked, &values).await {
+            Err(error) if error.code() == Some(&tokio_postgres::error::SqlState::UNIQUE_VIOLATION) => {
+                let what = format!("there is a study {name:?}; give this one another name");
+                Err(PlantError::Recipe(what))
+            }
+            other => other.map(|_| seeds.len() * variations.len()).map_err(refused("the study")),
+        }
+    }
+
+    /// Reads the recipe of a job.
+    ///
+    /// # Errors
+    /// A role that is no worker's, a plant that cannot be reached.
+    pub async fn of(link: &Link, job: &Job) -> Result<Self, PlantError> {
+        let text = "SELECT recipe, text, names, contents FROM study_recipe($1)";
+        let row = link.client().query_one(text, &[&job.study]).await.map_err(refused("the recipe of a study"))?;
+        let (names, contents): (Vec<String>, Vec<Vec<u8>>) = (row.get(2), row.get(3));
+        Ok(Self {
+            name: job.study.to_string(),
+            recipe: row.get(0),
+            text: row.get(1),
+            files: names.into_iter().zip(contents).collect(),
+        })
+    }
+}
+
+impl Job {
+    /// Takes the next job; none where there is none.
+    ///
+    /// # Errors
+    /// A role that is no worker's, a plant that cannot be reached.
+    pub async fn take(link: &Link) -> Result<Option<Self>, PlantError> {
+        let seconds = i32::try_from(LEASE.as_secs()).unwrap_or(i32::MAX);
+        let text = "SELECT study, job, lease, varied::text, seed FROM take_job($1)";
+        let row = link.client().query_opt(text, &[&seconds]).await.map_err(refused("a job"))?;
+        Ok(row.map(|row| Self {
+            study: row.get(0),
+            number: row.get(1),
+            lease: row.get(2),
+            varied: serde_json::from_str(row.get(3)).unwrap_or_default(),
+            seed: row.get::<_, i64>(4).cast_unsigned(),
+        }))
+    }
+
+    /// Brings the result, or why there is none. Returns whether it was taken: another worker has the job where this one's time was over.
+    ///
+    /// # Errors
+    /// A plant that cannot be reached.
+    pub async fn finish(&self, link: &Link, result: &Result<Value, String>) -> Result<bool, PlantError> {
+        let told = match result {
+            Ok(told) => told.to_string(),
+            Err(why) => serde_json::json!({ "error": why }).to_string(),
+        };
+        let values: [&(dyn ToSql + Sync); 5] = [&self.study, &self.number, &self.lease, &result.is_err(), &told];
+        let text = "SELECT finish_job($1, $2, $3, $4, $5::text::jsonb)";
+        let row = link.client().query_one(text, &values).await.map_err(refused("the result of a job"))?;
+        Ok(row.get(0))
+    }
+}

@@ -1,0 +1,92 @@
+//! A study: what its workers bring is what a run by hand gives, whatever becomes of one of them.
+
+use serde_json::Value;
+
+use crate::Plant;
+use crate::program::{Running, regrind, run, small_recipe};
+
+fn jobs(plant: &Plant) -> Vec<Value> {
+    let told = plant.does(&["study", "show", "limits", "--json", "--plant", "planner.toml"]);
+    told.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn a_study_is_made_by_whoever_works_and_each_run_is_that_of_its_seed() {
+    let plant = Plant::new();
+    plant.somebody("planner", "planner");
+    ["farm-1", "farm-2"].iter().for_each(|name| plant.somebody(name, "worker"));
+    let recipe = small_recipe(plant.home.path(), 1000.0).display().to_string();
+    let begin = |vary: &str| {
+        let arguments = [
+            "study",
+            "begin",
+            &recipe,
+            "--name",
+            "limits",
+            "--seeds",
+            "7..8",
+            "--vary",
+            vary,
+            "--vary",
+            "cycle.most_cycles=3",
+            "--plant",
+            "planner.toml",
+        ];
+        run(&arguments, plant.home.path())
+    };
+    let (code, _, told) = begin("acceptance.rms_um=1.0,-1.0");
+    assert!(code == 2 && told.contains("rms_um"), "{told}");
+    let (code, told, errors) = begin("acceptance.rms_um=0.002,1.0");
+    assert!(code == 0 && told.starts_with("limits: 4 jobs"), "{told}{errors}");
+    let (code, _, told) = begin("acceptance.rms_um=1.0");
+    assert!(code == 2 && told.contains("there is a study \"limits\""), "{told}");
+
+    // One worker dies with a job, whose time passes faster here.
+    let mut dies = Running::new(regrind(&["study", "work", "--plant", "farm-1.toml"], plant.home.path()));
+    dies.until("a job", |_| (plant.sql("SELECT count(*) FROM study_job WHERE state = 'leased'") == "1").then_some(()));
+    dies.signal("KILL");
+    dies.end();
+    plant.sql("UPDATE study_job SET leased_until = now() - interval '1 second' WHERE state = 'leased'");
+    let told = plant.does(&["study", "work", "--plant", "farm-2.toml", "--workers", "2"]);
+    assert_eq!(told, "4 runs made\n");
+    assert_eq!(plant.asked_by("farm-1", "SELECT finish_job(1, 1, 1, false, '{}')").unwrap(), "f", "its lease is over");
+    assert!(
+        plant.asked_by("farm-1", "SELECT * FROM study").is_err()
+            && plant.asked_by("farm-1", "SELECT stop_study('limits')").is_err()
+    );
+
+    let jobs = jobs(&plant);
+    let of = |seed: u64, rms_um: f64| {
+        jobs.iter().find(|job| job["seed"] == seed && job["varied"]["acceptance.rms_um"] == rms_um).unwrap()
+    };
+    assert!(jobs.iter().all(|job| job["state"] == "done"), "{jobs:?}");
+    for seed in [7, 8] {
+        assert_eq!(of(seed, 1.0)["result"]["result"], "accepted");
+        assert_eq!(of(seed, 0.002)["result"]["result"], "not accepted");
+        // The same truth from the same seed, and it is what the measurement says within its uncertainty.
+        let run = &of(seed, 1.0)["result"];
+        let last = run["cycles"].as_array().unwrap().last().unwrap();
+        let [is, seen, u] = [&run["truth"]["rms_um"], &last["rms_um"], &last["rms_u_um"]].map(|v| v.as_f64().unwrap());
+        assert!((is - seen).abs() < 3.0 * u, "{is} {seen} {u}");
+    }
+    let by_hand = ["run", &recipe, "--seed", "7", "--json", "--truth", "truth.json"];
+    plant.ends(&by_hand, 0);
+    let truth: Value = serde_json::from_str(&std::fs::read_to_string(plant.path("truth.json")).unwrap()).unwrap();
+    let summary = regrind::report::run_summary(&crate::only_run(&plant.path("runs")).0).unwrap();
+    let first = |seed: u64| of(seed, 0.002)["result"]["cycles"][0]["pv_um"].as_f64().unwrap();
+    assert_eq!(Some(first(7)), summary.cycles[0].figures.map(|[[pv, _], _]| pv));
+    assert_ne!(first(7), first(8));
+    assert!(truth["pv_um"].as_f64().unwrap() > 0.0);
+
+    let told = plant.does(&["study", "show", "limits", "--plant", "planner.toml"]);
+    let lines: Vec<&str> = told.lines().collect();
+    assert!(
+        lines.len() == 3 && lines[1].contains("0.0 % (0.0 to 65.8)") && lines[1].ends_with("acceptance.rms_um = 0.002"),
+        "{told}"
+    );
+    assert!(lines[2].contains("100.0 % (34.2 to 100.0)") && lines[2].contains("0 of 2"), "{told}");
+    assert!(plant.does(&["study", "stop", "limits", "--plant", "planner.toml"]).contains("no more jobs"));
+    plant.ends(&["study", "stop", "limits", "--plant", "planner.toml"], 1);
+    plant.ends(&["study", "show", "none", "--plant", "planner.toml"], 1);
+}
