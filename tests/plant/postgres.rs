@@ -1,6 +1,7 @@
 //! A PostgreSQL of its own for each test, in a folder that goes with it. It is reached by its socket alone, and by who has a password.
 
 use std::fs;
+use std::net::TcpListener;
 use std::os::unix::fs::{PermissionsExt, chown};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
@@ -14,13 +15,14 @@ use crate::program::PATIENCE;
 /// The owner of the cluster, and the password by which it signs in.
 pub const OWNER: &str = "owner";
 const PASSWORD: &str = "of-the-owner";
-/// Nothing listens on it: it is a part of the name of the socket.
+/// Nothing listens on it unless somebody asks for TLS: it is a part of the name of the socket.
 const PORT: u16 = 5432;
 
 pub struct Postgres {
     home: TempDir,
     bin: PathBuf,
     server: Option<Child>,
+    port: u16,
     /// User and group that it runs as, where this is root, which it does not run as.
     runs_as: Option<(u32, u32)>,
 }
@@ -30,7 +32,7 @@ impl Postgres {
     pub fn start() -> Self {
         let home = TempDir::new().unwrap();
         fs::set_permissions(home.path(), fs::Permissions::from_mode(0o755)).unwrap();
-        let mut postgres = Self { home, bin: bin(), server: None, runs_as: user() };
+        let mut postgres = Self { home, bin: bin(), server: None, port: PORT, runs_as: user() };
         for folder in ["data", "socket"] {
             let folder = postgres.home.path().join(folder);
             fs::create_dir(&folder).unwrap();
@@ -52,19 +54,54 @@ impl Postgres {
 
     /// Starts the server again that was stopped or killed.
     pub fn go_on(&mut self) {
+        self.go_on_with(&[]);
+        let began = Instant::now();
+        while !self.answers() {
+            assert!(self.runs() && began.elapsed() < PATIENCE, "it does not start:\n{}", self.log());
+            std::thread::park_timeout(Duration::from_millis(20));
+        }
+    }
+
+    /// Starts the server anew so that it is reached from elsewhere by TLS as well, by a certificate and its key. Returns the port.
+    pub fn go_on_by_tls(&mut self, certificate: &Path, key: &Path) -> u16 {
+        let kept = ["server.pem", "server.key"].map(|name| self.home.path().join(name));
+        for (from, to) in [certificate, key].into_iter().zip(&kept) {
+            fs::copy(from, to).unwrap();
+            fs::set_permissions(to, fs::Permissions::from_mode(0o600)).unwrap();
+            self.give(to);
+        }
+        let [certificate, key] = kept.map(|path| path.display().to_string());
+        for _ in 0..50 {
+            self.kill();
+            // Somebody else may have it by the time that the server asks for it: then another is tried.
+            let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+            let tls = format!("ssl_cert_file={certificate}");
+            let key = format!("ssl_key_file={key}");
+            self.go_on_with(&["-h", "127.0.0.1", "-c", "ssl=on", "-c", &tls, "-c", &key, "-p", &port.to_string()]);
+            self.port = port;
+            while self.runs() && !self.answers() {
+                std::thread::park_timeout(Duration::from_millis(20));
+            }
+            if self.runs() {
+                return port;
+            }
+            self.server = None;
+        }
+        panic!("no port is free:\n{}", self.log());
+    }
+
+    fn runs(&mut self) -> bool {
+        self.server.as_mut().is_some_and(|server| server.try_wait().unwrap().is_none())
+    }
+
+    fn go_on_with(&mut self, more: &[&str]) {
         assert!(self.server.is_none(), "it runs");
         let mut postgres = self.program("postgres");
-        postgres.arg("-D").arg(self.data()).arg("-k").arg(self.socket()).args(["-p", &PORT.to_string(), "-h", ""]);
-        postgres.args(["-c", "fsync=off", "-c", "max_connections=60", "-c", "shared_buffers=32MB"]);
+        postgres.arg("-D").arg(self.data()).arg("-k").arg(self.socket()).args(["-p", &self.port.to_string(), "-h", ""]);
+        postgres.args(["-c", "fsync=off", "-c", "max_connections=60", "-c", "shared_buffers=32MB"]).args(more);
         let log = fs::File::options().create(true).append(true).open(self.home.path().join("log")).unwrap();
         let server = postgres.stdin(Stdio::null()).stdout(log.try_clone().unwrap()).stderr(log).spawn().unwrap();
         self.server = Some(server);
-        let began = Instant::now();
-        while !self.answers() {
-            let ended = self.server.as_mut().unwrap().try_wait().unwrap();
-            assert!(ended.is_none() && began.elapsed() < PATIENCE, "it does not start:\n{}", self.log());
-            std::thread::park_timeout(Duration::from_millis(20));
-        }
     }
 
     /// Kills the server as a computer does that loses its power, with all that belongs to it.
@@ -96,7 +133,7 @@ impl Postgres {
             "-d",
             database,
             "-p",
-            &PORT.to_string(),
+            &self.port.to_string(),
         ]);
         psql.arg("-h").arg(self.socket()).args(["-c", text]).env("PGPASSWORD", password).stdin(Stdio::null());
         let asked = psql.output().unwrap();
@@ -107,7 +144,7 @@ impl Postgres {
     /// A program of PostgreSQL, signed in as the owner.
     pub fn tool(&self, name: &str) -> Command {
         let mut tool = Command::new(self.bin.join(name));
-        tool.args(["-U", OWNER, "-p", &PORT.to_string()]).arg("-h").arg(self.socket());
+        tool.args(["-U", OWNER, "-p", &self.port.to_string()]).arg("-h").arg(self.socket());
         tool.env("PGPASSWORD", PASSWORD).stdin(Stdio::null());
         tool
     }
@@ -119,7 +156,7 @@ impl Postgres {
 
     /// The socket itself.
     pub fn socket_file(&self) -> PathBuf {
-        self.socket().join(format!(".s.PGSQL.{PORT}"))
+        self.socket().join(format!(".s.PGSQL.{}", self.port))
     }
 
     /// Where the password of the owner stands.

@@ -1,6 +1,7 @@
 //! Ignored unless PostgreSQL is asked for.
 
 mod backup;
+mod book;
 mod layout;
 mod records;
 mod rights;
