@@ -30,7 +30,7 @@ Examples:
   regrind work --plant cell-1.toml --part SN-0042 --once
   regrind work --plant cell-1.toml --give-back SN-0042
 
-Exit codes: 0 all parts that were there are accepted; 1 one was not, or one that was begun here is not over; 2 bad arguments, or a recipe that is not
+Exit codes: 0 all parts that were there are accepted; 1 one was not, was given back, or was begun here and is not over; 2 bad arguments, or a recipe that is not
 approved; 3 a fault or abort, or the plant cannot be reached.")]
 pub(super) struct Arguments {
     /// Plant file: where the database is, who signs in, and whose approval counts
@@ -94,14 +94,17 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         return super::runtime()?.block_on(give_back(&config, &arguments.runs, serial));
     }
     loop {
-        let next = super::runtime()?.block_on(next(&config, arguments))?;
-        let Some((recipe, taken)) = next else {
-            if !arguments.wait {
+        let (recipe, taken) = match super::runtime()?.block_on(next(&config, arguments))? {
+            Next::Part(recipe, taken) => (recipe, taken),
+            Next::None if arguments.wait => {
+                std::thread::sleep(ROUND);
+                continue;
+            }
+            Next::None => {
                 super::print("no part is waiting for this cell\n")?;
                 return Ok(Outcome::Accepted);
             }
-            std::thread::sleep(ROUND);
-            continue;
+            Next::GivenBack => return Ok(Outcome::NotInTolerance),
         };
         let outcome = making::run(&making::Arguments {
             recipe,
@@ -124,40 +127,46 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     }
 }
 
-/// Takes the next part and has it confirmed; returns its recipe, and what its run begins with.
-async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Option<(PathBuf, Taken)>, Failure> {
+/// What the queue has for the cell.
+enum Next {
+    /// A part that was confirmed, and its recipe.
+    Part(PathBuf, Taken),
+    /// A part that nobody at the cell confirmed.
+    GivenBack,
+    None,
+}
+
+/// Takes the next part and has it confirmed.
+async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failure> {
     let link = plant::open(config).await?;
     nothing_is_open(&link, &arguments.runs).await?;
-    loop {
-        let Some(lease) = Lease::take(&link).await? else { return Ok(None) };
-        let (recipe, signed) = match PlantRecipe::pull(&link, &lease.recipe_sha256, &config.approvers).await {
-            Ok(pulled) => pulled,
-            Err(error) => {
-                // The next cell may know who has signed it.
-                lease.hand_back(&link, &error.to_string()).await?;
-                return Err(error.into());
-            }
-        };
-        let path = keep(&arguments.runs, &lease.recipe_sha256, &recipe)?;
-        let read = match check::or_show(Recipe::read(&path)) {
-            Ok(read) => read,
-            Err(error) => {
-                lease.hand_back(&link, "its recipe is not as it should be for this cell's program").await?;
-                return Err(error);
-            }
-        };
-        let PlantRecipe { name, version, .. } = &recipe;
-        let due = lease.due.as_ref().map_or(String::new(), |due| format!(", due {due}"));
-        let told =
-            format!("{}  by version {version} of {name}, signed by {}{due}\n", lease.serial, signed.join(" and "));
-        super::print(&regrind::document::visible(&told))?;
-        match confirmed(&link, &lease, &read, arguments).await? {
-            true => return Ok(Some((path, Taken { config: config.clone(), lease }))),
-            false => {
-                lease.hand_back(&link, "nobody at the cell confirmed it").await?;
-                super::print("it is given back\n")?;
-                return Ok(None);
-            }
+    let Some(lease) = Lease::take(&link).await? else { return Ok(Next::None) };
+    let (recipe, signed) = match PlantRecipe::pull(&link, &lease.recipe_sha256, &config.approvers).await {
+        Ok(pulled) => pulled,
+        Err(error) => {
+            // The next cell may know who has signed it.
+            lease.hand_back(&link, &error.to_string()).await?;
+            return Err(error.into());
+        }
+    };
+    let path = keep(&arguments.runs, &lease.recipe_sha256, &recipe)?;
+    let read = match check::or_show(Recipe::read(&path)) {
+        Ok(read) => read,
+        Err(error) => {
+            lease.hand_back(&link, "its recipe is not as it should be for this cell's program").await?;
+            return Err(error);
+        }
+    };
+    let PlantRecipe { name, version, .. } = &recipe;
+    let due = lease.due.as_ref().map_or(String::new(), |due| format!(", due {due}"));
+    let told = format!("{}  by version {version} of {name}, signed by {}{due}\n", lease.serial, signed.join(" and "));
+    super::print(&regrind::document::visible(&told))?;
+    match confirmed(&link, &lease, &read, arguments).await? {
+        true => Ok(Next::Part(path, Taken { config: config.clone(), lease })),
+        false => {
+            lease.hand_back(&link, "nobody at the cell confirmed it").await?;
+            super::print("it is given back\n")?;
+            Ok(Next::GivenBack)
         }
     }
 }
@@ -175,7 +184,11 @@ async fn confirmed(link: &Link, lease: &Lease, recipe: &Recipe, arguments: &Argu
     loop {
         tokio::select! {
             typed = &mut answer => return Ok(typed.map_err(|error| Failure::Terminal(error.into()))?? == lease.serial),
-            () = tokio::time::sleep(LEASE / 3) => lease.renew(link).await?,
+            () = tokio::time::sleep(LEASE / 3) => match lease.renew(link).await {
+                // The plant decides when the part is begun; a network that is down meanwhile is nobody's answer.
+                Err(error) if error.may_pass() => {}
+                renewed => renewed?,
+            },
         }
     }
 }

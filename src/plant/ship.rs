@@ -36,7 +36,7 @@ const LARGEST_BYTES: u64 = 256 << 20;
 pub struct Shipper {
     runs: PathBuf,
     artefacts: Option<ArtefactSettings>,
-    /// The runs that are over and have arrived whole, as they were then.
+    /// The runs of which everything has arrived, as they were then.
     settled: HashMap<String, Stamp>,
     /// The runs that cannot be shipped, and why.
     left_alone: HashMap<String, String>,
@@ -114,7 +114,7 @@ impl Shipper {
         open
     }
 
-    /// Ships one run; returns whether it is over and all of it has arrived.
+    /// Ships one run; returns whether all of it has arrived.
     async fn ship_run(&mut self, link: &Link, name: &str, shipped: &mut Shipped) -> Result<bool, PlantError> {
         let folder = self.runs.join(name);
         let Some(last) = Reader::open(&folder)?.last()? else { return Ok(false) };
@@ -129,14 +129,14 @@ impl Shipper {
             there = give(link, name, there, &batch).await?;
         }
         let [given, missing] = self.give_files(link, &folder, name, there.id, shipped).await?;
-        let is_over = matches!(last.kind, Kind::End | Kind::Seal) && has_end(&folder, &last)?;
-        if there.records > began_with || is_over {
+        let is_over = || Ok::<_, PlantError>(matches!(last.kind, Kind::End | Kind::Seal) && has_end(&folder, &last)?);
+        if there.records > began_with || is_over()? {
             tell_run(link, there.id, &glance(&folder)?).await?;
         }
         shipped.records += u64::try_from(there.records - began_with).unwrap_or(0);
         shipped.files += given;
         shipped.runs += u64::from(there.records > began_with || given > 0);
-        Ok(is_over && missing == 0)
+        Ok(missing == 0 && i64::from(there.records) >= last.seq as i64)
     }
 
     /// Gives the contents of the files on record that the plant does not have. Returns how many went and how many could not.
@@ -190,11 +190,12 @@ impl Shipper {
         let failed = refused("the content of a file");
         if let Some(kept) = self.artefacts.as_ref().filter(|kept| bytes as f64 >= kept.from_mb * 1e6) {
             put_aside(&kept.folder, sha256, &content)?;
-            link.client()
-                .query_one("SELECT place_artefact($1, $2)", &[&sha256, &(bytes as i64)])
-                .await
-                .map_err(failed)?;
-        } else if bytes > LARGEST_BYTES {
+            let placed = link.client().query_one("SELECT place_artefact($1, $2)", &[&sha256, &(bytes as i64)]).await;
+            if placed.map_err(&failed)?.get(0) {
+                return Ok(None);
+            }
+        }
+        if bytes > LARGEST_BYTES {
             let most = LARGEST_BYTES >> 20;
             return Ok(Some(format!(
                 "has {} MB, and the database takes {most}: name a folder by [artefacts]",
@@ -214,11 +215,11 @@ fn stamp(folder: &Path) -> Stamp {
     })
 }
 
-/// Puts a content into the folder of the plant, under its hash. What is there already is the same.
+/// Puts a content into the folder of the plant, under its hash. What is there already should be the same, and is put right where it is not.
 fn put_aside(folder: &Path, sha256: &[u8], content: &[u8]) -> Result<(), PlantError> {
     let name = digits(sha256);
     let path = folder.join(&name[..2]).join(&name);
-    if fs::metadata(&path).is_ok_and(|found| found.len() == content.len() as u64) {
+    if fs::read(&path).is_ok_and(|found| found == content) {
         return Ok(());
     }
     let parent = folder.join(&name[..2]);

@@ -317,7 +317,8 @@ BEGIN
     RETURN true;
 END $$;
 
--- Takes down that the content of a file lies in the folder of the plant, by the name that its hash gives it there.
+-- Takes down that the content of a file lies in the folder of the plant, by the name that its hash gives it there. Answers whether it is read
+-- there: what the database has from another cell is given here too, for to know a hash is not to have the content.
 CREATE FUNCTION place_artefact(of_sha256 bytea, of_bytes bigint) RETURNS boolean
 LANGUAGE plpgsql SECURITY DEFINER SET search_path = regrind, pg_temp AS $$
 DECLARE
@@ -328,6 +329,9 @@ BEGIN
         RETURN false;
     END IF;
     INSERT INTO artefact (sha256, bytes, place) VALUES (of_sha256, of_bytes, left(digits, 2) || '/' || digits) ON CONFLICT DO NOTHING;
+    IF NOT EXISTS (SELECT FROM artefact WHERE sha256 = of_sha256 AND place IS NOT NULL) THEN
+        RETURN false;
+    END IF;
     INSERT INTO artefact_of (cell, sha256) VALUES (mine, of_sha256) ON CONFLICT DO NOTHING;
     RETURN true;
 END $$;

@@ -79,6 +79,35 @@ fn a_run_is_shipped_once_proven_there_and_brought_back() {
     plant.does(&["report", &back.display().to_string()]);
 }
 
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn large_files_lie_in_a_folder_and_are_put_right_there() {
+    let plant = Plant::new();
+    let (folder, name) = made(&plant);
+    let files = plant.path("files");
+    fs::create_dir(&files).unwrap();
+    for who in ["cell-1", "owner"] {
+        let file = plant.path(&format!("{who}.toml"));
+        let text = fs::read_to_string(&file).unwrap();
+        fs::write(file, format!("{text}\n[artefacts]\nfolder = \"files\"\nfrom_mb = 0.001\n")).unwrap();
+    }
+    // What was given by the run itself is in the database; it is taken out, as if nothing of it had been shipped.
+    plant.sql("TRUNCATE artefact_of, artefact, record; UPDATE run SET records = 0, head = decode(repeat('00', 32), 'hex'), ended = NULL");
+    plant.sql("TRUNCATE run_artefact");
+    // Somebody who writes into the folder too has put another content there.
+    let recipe = regrind::journal::sha256_hex(&fs::read(folder.join("recipe.toml")).unwrap());
+    fs::create_dir(files.join(&recipe[..2])).unwrap();
+    fs::write(files.join(&recipe[..2]).join(&recipe), "another").unwrap();
+    plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
+    let where_they_are = "SELECT count(*) FILTER (WHERE place IS NOT NULL) > 4, bool_and((place IS NOT NULL) = (bytes >= 1000)) FROM artefact";
+    assert_eq!(plant.sql(where_they_are), "t|t");
+    plant.does(&["plant", "fetch", &name, "--plant", "owner.toml", "--out", "back"]);
+    assert!(verify(&plant.path("back").join(&name)).unwrap().artefacts > 8);
+    fs::write(files.join(&recipe[..2]).join(&recipe), "another").unwrap();
+    let (_, told) = plant.ends(&["audit", "verify", "--plant", "owner.toml"], 1);
+    assert!(told.contains("recipe.toml"), "{told}");
+}
+
 /// Cuts the end off a journal as somebody does who knows how: the anchor goes along.
 fn cut(folder: &Path, keeps: usize) {
     let journal = Connection::open(folder.join("journal.sqlite")).unwrap();

@@ -177,6 +177,10 @@ fn forged_records_are_refused_and_put_down() {
     assert_eq!(said, format!("{stands}|"));
     let said = plant.asked_by("cell-1", &ship(&run, 3, &other[2..])).unwrap();
     assert_eq!(said, format!("{}|", other.len()));
+    // To know the hash of another's file is not to have its content.
+    let known = plant.sql("SELECT encode(sha256, 'hex') FROM artefact LIMIT 1");
+    assert_eq!(plant.asked_by("cell-2", &format!("SELECT place_artefact(decode('{known}', 'hex'), 1)")).unwrap(), "f");
+    assert_eq!(plant.asked_by("cell-2", "SELECT count(*) FROM artefact").unwrap(), "0");
     // A content under a hash that it has not.
     let given = plant.asked_by("cell-1", "SELECT give_artefact(decode(repeat('00', 32), 'hex'), 'x')").unwrap();
     assert_eq!(given, "f");
