@@ -73,7 +73,7 @@ fn a_run_is_shipped_once_proven_there_and_brought_back() {
     plant.does(&["plant", "fetch", &name, "--plant", "owner.toml", "--out", "back"]);
     let back = plant.path("back").join(&name);
     assert_eq!(records(&back), before);
-    let there = verify(&plant.path("elsewhere").join(&name)).unwrap();
+    let there = verify(plant.path("elsewhere").join(&name)).unwrap();
     let here = verify(&back).unwrap();
     assert_eq!((here.artefacts, here.closed, here.signed), (there.artefacts, true, there.signed));
     plant.does(&["report", &back.display().to_string()]);
@@ -102,7 +102,7 @@ fn large_files_lie_in_a_folder_and_are_put_right_there() {
     let where_they_are = "SELECT count(*) FILTER (WHERE place IS NOT NULL) > 4, bool_and((place IS NOT NULL) = (bytes >= 1000)) FROM artefact";
     assert_eq!(plant.sql(where_they_are), "t|t");
     plant.does(&["plant", "fetch", &name, "--plant", "owner.toml", "--out", "back"]);
-    assert!(verify(&plant.path("back").join(&name)).unwrap().artefacts > 8);
+    assert!(verify(plant.path("back").join(&name)).unwrap().artefacts > 8);
     fs::write(files.join(&recipe[..2]).join(&recipe), "another").unwrap();
     let (_, told) = plant.ends(&["audit", "verify", "--plant", "owner.toml"], 1);
     assert!(told.contains("recipe.toml"), "{told}");
