@@ -119,7 +119,7 @@ pub(super) enum Failure {
     Unreadable { path: PathBuf, source: io::Error },
     #[cfg(feature = "plant")]
     #[error(transparent)]
-    Plant(#[from] regrind_plant::PlantError),
+    Plant(Box<PlantError>),
     #[error("{}: there is no user {name:?}; `regrind users list` tells who is there", .path.display())]
     NoUser { name: String, path: PathBuf },
     #[error("the two passwords are not alike; nothing was changed")]
@@ -177,6 +177,14 @@ pub(super) enum Failure {
     Terminal(io::Error),
 }
 
+#[cfg(feature = "plant")]
+impl From<PlantError> for Failure {
+    fn from(error: PlantError) -> Self {
+        // Large, and rare.
+        Self::Plant(Box::new(error))
+    }
+}
+
 impl Failure {
     /// Returns the exit code of the program.
     pub(super) fn exit_code(&self) -> u8 {
@@ -202,7 +210,9 @@ impl Failure {
             #[cfg(feature = "plant")]
             Self::Plant(error) if error.may_pass() => FAULT,
             #[cfg(feature = "plant")]
-            Self::Plant(PlantError::Differs { .. } | PlantError::Journal(JournalError::Broken { .. })) => {
+            Self::Plant(error)
+                if matches!(**error, PlantError::Differs { .. } | PlantError::Journal(JournalError::Broken { .. })) =>
+            {
                 NOT_AS_IT_SHOULD_BE
             }
             _ => BAD_INPUT,

@@ -65,7 +65,7 @@ pub(super) struct Arguments {
     /// The part of a plant's queue that it makes
     #[cfg(feature = "plant")]
     #[arg(skip)]
-    pub(super) work: Option<super::work::Taken>,
+    pub(super) work: Option<Box<super::work::Taken>>,
     /// File for what the simulated world knows of the part in the end
     #[cfg(feature = "plant")]
     #[arg(long, hide = true)]

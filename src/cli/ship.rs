@@ -140,7 +140,13 @@ impl Shipping<'_> {
             Ok(_) => tell_state(link, &self.arguments.runs).await,
             Err(_) => Ok(()),
         };
-        let shipped = shipped.and_then(|shipped| told.map(|()| shipped)).inspect_err(|_| self.link = None)?;
+        let shipped = match (shipped, told) {
+            (Ok(shipped), Ok(())) => shipped,
+            (Err(error), _) | (_, Err(error)) => {
+                self.link = None;
+                return Err(error.into());
+            }
+        };
         self.tell(&shipped)?;
         Ok(shipped)
     }

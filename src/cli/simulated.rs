@@ -204,7 +204,7 @@ impl SimulatedCell {
         let (found, _) = task.register(&points, level_mm).map_err(failed)?;
         let [pv_um, rms_um] = [found.verdict.pv_mm, found.verdict.rms_mm].map(|mm| 1e3 * mm);
         let truth = serde_json::json!({ "pv_um": pv_um, "rms_um": rms_um });
-        Ok(regrind::formats::write_json_atomic(path.to_owned(), &truth)?)
+        Ok(regrind::formats::write_json_atomic(path, &truth)?)
     }
 
     /// Writes all that the machines see and do from now on to a file, a line of JSON for each thing, as it happens.

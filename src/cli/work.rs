@@ -130,7 +130,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
 /// What the queue has for the cell.
 enum Next {
     /// A part that was confirmed, and its recipe.
-    Part(PathBuf, Taken),
+    Part(PathBuf, Box<Taken>),
     /// A part that nobody at the cell confirmed.
     GivenBack,
     None,
@@ -162,7 +162,7 @@ async fn next(config: &PlantConfig, arguments: &Arguments) -> Result<Next, Failu
     let told = format!("{}  by version {version} of {name}, signed by {}{due}\n", lease.serial, signed.join(" and "));
     super::print(&regrind::document::visible(&told))?;
     match confirmed(&link, &lease, &read, arguments).await? {
-        true => Ok(Next::Part(path, Taken { config: config.clone(), lease })),
+        true => Ok(Next::Part(path, Box::new(Taken { config: config.clone(), lease }))),
         false => {
             lease.hand_back(&link, "nobody at the cell confirmed it").await?;
             super::print("it is given back\n")?;
