@@ -156,12 +156,15 @@ fn failure(error: JournalError) -> Failure {
 
 fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
     #[cfg(feature = "plant")]
-    if let Some(plant) = &arguments.plant {
-        let copy = plant::prove(plant, arguments.run.as_deref(), &arguments.key, arguments.json)?;
-        if copy == plant::Here::No {
-            return Ok(Outcome::Accepted);
-        }
-    }
+    let copy = match &arguments.plant {
+        None => None,
+        Some(plant) => match plant::prove(plant, arguments.run.as_deref(), &arguments.key, arguments.json)? {
+            copy if !copy.is_here => return Ok(Outcome::Accepted),
+            copy => Some(copy.told),
+        },
+    };
+    #[cfg(not(feature = "plant"))]
+    let copy: Option<Value> = None;
     let folder = folder_of(arguments.run.as_deref())?;
     let anchor = arguments.anchor.as_deref().map(read_anchor).transpose()?;
     let found = verify_against(&folder, &Against { anchor, keys: arguments.key.clone() });
@@ -171,12 +174,16 @@ fn prove(arguments: &ToVerify) -> Result<Outcome, Failure> {
     let verified = found.map_err(failure)?;
     let begin = first(&folder)?;
     if arguments.json {
-        super::print_json(&json!({
+        let mut told = json!({
             "run": folder, "simulation": begin["simulation"], "sound": true, "records": verified.records,
             "head": verified.head, "anchored": verified.anchored, "closed": verified.closed,
             "under_way": verified.under_way, "artefacts": verified.artefacts, "unrecorded": verified.unrecorded,
             "keys": verified.keys, "seals": verified.seals, "signed": verified.signed,
-        }))?;
+        });
+        if let Some(copy) = copy {
+            told["plant"] = copy;
+        }
+        super::print_json(&told)?;
     } else {
         super::print(&sound(&folder, &begin, &verified, !arguments.key.is_empty()))?;
     }

@@ -231,14 +231,6 @@ pub(super) fn folders(runs: &Path) -> impl Iterator<Item = PathBuf> {
     entries.filter(move |entry| !is_hidden(entry)).map(|entry| entry.path()).filter(|path| path.is_dir())
 }
 
-/// Whether a run has its end on record; none where there is no record of one.
-#[cfg(feature = "plant")]
-pub(super) fn is_over(folder: &Path) -> Option<bool> {
-    // To look makes no journal where there is none.
-    let reader = Reader::open(folder).ok()?;
-    Some(reader.records(0).any(|record| record.is_ok_and(|record| record.kind == Kind::End)))
-}
-
 /// Returns the newest run that has no end on record; where all have, the newest.
 pub(super) fn unfinished(runs: &Path) -> Option<PathBuf> {
     let is_open = |folder: &PathBuf| {

@@ -42,6 +42,8 @@ pub(super) struct SimulatedCell {
     /// Links that were placed at the devices of serial lines.
     links: Vec<PathBuf>,
     /// Kept for the life of the machines.
+    /// What is true of the part; held, and not read where nobody asks for it.
+    #[cfg_attr(not(feature = "plant"), expect(dead_code))]
     world: World,
 }
 

@@ -6,12 +6,14 @@ use std::time::Duration;
 
 use clap::Args;
 use regrind::config::{BUILT_IN, PlantConfig};
+use regrind::drive::is_live;
 use regrind::formats::{ResultFolder, write_atomic};
+use regrind::journal::{DATABASE, Kind, Reader};
 use regrind::recipe::Recipe;
 use regrind_plant::{Begun, LEASE, Lease, Link, PlantError, PlantRecipe};
 
 use super::failure::Failure;
-use super::{Outcome, check, control, plant, recover, run as making};
+use super::{Outcome, check, plant, recover, run as making};
 
 /// How often the queue is asked where `--wait` is given.
 const ROUND: Duration = Duration::from_secs(5);
@@ -29,6 +31,7 @@ Examples:
   regrind work --plant cell-1.toml --cell config/modbus-tcp.toml --operator \"A. Smith\"
   regrind work --plant cell-1.toml --part SN-0042 --once
   regrind work --plant cell-1.toml --give-back SN-0042
+  regrind work --plant cell-1.toml --give-up SN-0042 --why \"the blank broke\"
 
 Exit codes: 0 all parts that were there are accepted; 1 one was not, was given back, or was begun here and is not over; 2 bad arguments, or a recipe that is not
 approved; 3 a fault or abort, or the plant cannot be reached.")]
@@ -54,9 +57,15 @@ pub(super) struct Arguments {
     /// Wait for further parts when there is none, until Ctrl-C
     #[arg(long, conflicts_with = "once")]
     wait: bool,
-    /// Give a part back that was begun here and of which no run came: somebody has looked that nothing was ground
+    /// Give a part back that was begun here and of whose run nothing came: somebody has looked that nothing was ground
     #[arg(long, value_name = "SERIAL", value_parser = super::name, conflicts_with_all = ["part", "once", "wait"])]
     give_back: Option<String>,
+    /// Give a part up whose run broke off and will not be gone on with: a planner says whether it is made again
+    #[arg(long, value_name = "SERIAL", value_parser = super::name, requires = "why", conflicts_with_all = ["part", "once", "wait", "give_back"])]
+    give_up: Option<String>,
+    /// Why it is given up, for who reads it later
+    #[arg(long, value_name = "WORDS", value_parser = super::name, requires = "give_up")]
+    why: Option<String>,
     /// Draw other simulated parts and runs from this number
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
@@ -90,8 +99,8 @@ impl Taken {
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let config = plant::read(&arguments.plant)?;
-    if let Some(serial) = &arguments.give_back {
-        return super::runtime()?.block_on(give_back(&config, &arguments.runs, serial));
+    if let Some(serial) = arguments.give_back.as_ref().or(arguments.give_up.as_ref()) {
+        return super::runtime()?.block_on(give(&config, &arguments.runs, serial, arguments.why.as_deref()));
     }
     loop {
         let (recipe, taken) = match super::runtime()?.block_on(next(&config, arguments))? {
@@ -196,43 +205,85 @@ async fn confirmed(link: &Link, lease: &Lease, recipe: &Recipe, arguments: &Argu
 /// Refuses to take a part while one that was begun here is not over.
 async fn nothing_is_open(link: &Link, runs: &Path) -> Result<(), Failure> {
     for begun in Begun::all(link).await? {
-        let folder = runs.join(&begun.run);
-        let why = match control::is_over(&folder) {
+        let (run, serial, folder) = (&begun.run, &begun.lease.serial, runs.join(&begun.run));
+        let nothing = match how_far(&folder) {
             // Its end is on its way to the plant.
-            Some(true) => continue,
-            Some(false) => {
-                format!("run {} of {} is not over: regrind resume {}", begun.run, begun.lease.serial, folder.display())
+            HowFar::Over => continue,
+            HowFar::UnderWay => {
+                let why = format!(
+                    "run {run} of {serial} is not over: regrind resume {}; where that is refused: regrind work --give-up {serial} --why \"...\"",
+                    folder.display()
+                );
+                return Err(Failure::OpenWork { why });
             }
-            None => format!(
-                "{} was begun in run {}, of which there is no record in {}; look whether anything was ground: if not, regrind work --give-back {0}",
-                begun.lease.serial,
-                begun.run,
-                runs.display()
-            ),
+            HowFar::Nowhere => {
+                format!("of which there is no record in {}; look whether anything was ground: if not", runs.display())
+            }
+            HowFar::Begun => "in which nothing was asked of a machine".to_owned(),
         };
+        let why = format!("{serial} was begun in run {run}, {nothing}: regrind work --give-back {serial}");
         return Err(Failure::OpenWork { why });
     }
     Ok(())
 }
 
-/// Gives a part back of which no run came.
-async fn give_back(config: &PlantConfig, runs: &Path, serial: &str) -> Result<Outcome, Failure> {
+/// Gives a part back of whose run nothing came, or up, for a reason.
+async fn give(config: &PlantConfig, runs: &Path, serial: &str, up: Option<&str>) -> Result<Outcome, Failure> {
     let link = plant::open(config).await?;
     let begun = Begun::all(&link).await?.into_iter().find(|begun| begun.lease.serial == serial);
     let Some(begun) = begun else {
         super::print(&format!("{serial} is not begun by this cell\n"))?;
         return Ok(Outcome::NotInTolerance);
     };
-    if control::is_over(&runs.join(&begun.run)).is_some() {
-        let why = format!(
-            "run {} of {serial} is here: it is gone on with by regrind resume, or ended by regrind stop",
-            begun.run
-        );
-        return Err(PlantError::Work { work: begun.lease.work, why }.into());
+    let (run, folder) = (&begun.run, runs.join(&begun.run));
+    let refused = |why: String| Err(Failure::OpenWork { why });
+    if is_live(&folder) {
+        return refused(format!("run {run} of {serial} is on; regrind stop ends it"));
     }
-    begun.give_back(&link, "no run came of it").await?;
+    if let Some(why) = up {
+        begun.give_up(&link, why).await?;
+        super::print(&format!("{serial} is given up; it is made again where a planner queues it\n"))?;
+        return Ok(Outcome::Accepted);
+    }
+    if matches!(how_far(&folder), HowFar::UnderWay | HowFar::Over) {
+        return refused(format!(
+            "run {run} of {serial} is here: regrind resume goes on with it, regrind work --give-up ends it"
+        ));
+    }
+    begun.give_back(&link, "nothing came of its run").await?;
     super::print(&format!("{serial} is given back to the queue\n"))?;
     Ok(Outcome::Accepted)
+}
+
+/// How far a run came, by its record.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum HowFar {
+    /// There is no record of it.
+    Nowhere,
+    /// It was begun, and nothing was asked of a machine.
+    Begun,
+    /// Something was.
+    UnderWay,
+    /// It has its end.
+    Over,
+}
+
+/// Looks how far a run came. What cannot be read counts as if something had been asked of a machine.
+fn how_far(folder: &Path) -> HowFar {
+    // To look makes no journal where there is none.
+    let Ok(reader) = Reader::open(folder) else {
+        return if folder.join(DATABASE).exists() { HowFar::UnderWay } else { HowFar::Nowhere };
+    };
+    let mut far = HowFar::Nowhere;
+    for record in reader.records(0) {
+        far = match record.map(|record| record.kind) {
+            Ok(Kind::End) => return HowFar::Over,
+            Ok(Kind::Intent | Kind::Event) | Err(_) => HowFar::UnderWay,
+            Ok(_) if far == HowFar::Nowhere => HowFar::Begun,
+            Ok(_) => far,
+        };
+    }
+    far
 }
 
 /// Keeps a pulled recipe and its files in a folder of its hash; returns where the recipe is.

@@ -3,15 +3,13 @@
 use std::fs;
 use std::path::Path;
 
-use rusqlite::params;
 use serde_json::Value;
 
 use super::artefact::{path_within, write_file};
 use super::canonical::canonical_json;
 use super::error::JournalError;
-use super::record::{COLUMNS, Record};
+use super::record::Record;
 use super::verify::Anchor;
-use super::write::signed;
 use super::{ANCHOR, open};
 
 impl Record {
@@ -61,27 +59,8 @@ pub fn restore(
     let mut connection = open::create(folder)?;
     let failed = JournalError::database(folder);
     let all = connection.transaction().map_err(&failed)?;
-    let sql =
-        format!("INSERT INTO record ({COLUMNS}) VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8, ?9, ?10, ?11, ?12, ?13, ?14)");
-    for r in records {
-        let mut statement = all.prepare_cached(&sql).map_err(&failed)?;
-        let values = params![
-            signed(r.seq),
-            r.utc,
-            r.boot_id,
-            signed(r.mono_ns),
-            r.actor,
-            r.station,
-            r.kind.as_str(),
-            r.part,
-            r.cycle,
-            r.command_id,
-            r.reason,
-            r.payload,
-            r.prev_hash,
-            r.hash
-        ];
-        statement.execute(values).map_err(&failed)?;
+    for record in records {
+        record.put_into(&all).map_err(&failed)?;
     }
     all.commit().map_err(&failed)?;
     match anchor {

@@ -150,6 +150,31 @@ impl Record {
         serde_json::from_str(&self.payload).unwrap_or(Value::Null)
     }
 
+    /// Puts it behind those of a database that holds it against them.
+    pub(super) fn put_into(&self, connection: &Connection) -> rusqlite::Result<()> {
+        let sql = format!(
+            "INSERT INTO record ({COLUMNS}) VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8, ?9, ?10, ?11, ?12, ?13, ?14)"
+        );
+        let mut statement = connection.prepare_cached(&sql)?;
+        let values = params![
+            signed(self.seq),
+            self.utc,
+            self.boot_id,
+            signed(self.mono_ns),
+            self.actor,
+            self.station,
+            self.kind.as_str(),
+            self.part,
+            self.cycle,
+            self.command_id,
+            self.reason,
+            self.payload,
+            self.prev_hash,
+            self.hash
+        ];
+        statement.execute(values).map(drop)
+    }
+
     /// Returns the text that is hashed: all fields but the hashes, as JSON with sorted keys.
     pub fn text(&self) -> String {
         let mut text = String::with_capacity(self.payload.len() + 256);
@@ -343,4 +368,9 @@ impl Iterator for Records<'_> {
         }
         self.page.pop_front()
     }
+}
+
+/// The database counts with a sign; 292 years of nanoseconds fit.
+pub(super) fn signed(number: u64) -> i64 {
+    i64::try_from(number).unwrap_or(i64::MAX)
 }

@@ -4,14 +4,14 @@ use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
 
-use rusqlite::{Connection, OptionalExtension, params};
+use rusqlite::{Connection, OptionalExtension};
 use serde_json::{Value, json};
 
 use super::artefact::{self, Artefact};
 use super::canonical::canonical_json;
 use super::error::JournalError;
 use super::key::AuditKey;
-use super::record::{COLUMNS, Entry, Kind, Record, Records, whole};
+use super::record::{Entry, Kind, Record, Records, signed, whole};
 use super::seal::{SEALED_EVERY, Seal};
 use super::verify::{Anchor, read_anchor};
 use super::{ANCHOR, DATABASE, LOCK, open};
@@ -403,29 +403,7 @@ impl Journal {
 
     /// One statement is one transaction: when it returns, it is committed and synced.
     fn write(&self, r: &Record) -> Result<(), JournalError> {
-        let failed = JournalError::database(&self.folder);
-        let sql = format!(
-            "INSERT INTO record ({COLUMNS}) VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8, ?9, ?10, ?11, ?12, ?13, ?14)"
-        );
-        let mut statement = self.connection.prepare_cached(&sql).map_err(&failed)?;
-        let kind = r.kind.as_str();
-        let values = params![
-            signed(r.seq),
-            r.utc,
-            r.boot_id,
-            signed(r.mono_ns),
-            r.actor,
-            r.station,
-            kind,
-            r.part,
-            r.cycle,
-            r.command_id,
-            r.reason,
-            r.payload,
-            r.prev_hash,
-            r.hash
-        ];
-        statement.execute(values).map(|_| ()).map_err(failed)
+        r.put_into(&self.connection).map_err(JournalError::database(&self.folder))
     }
 
     /// After a failed write the record may stand or not; the database is asked. Returns it if it does.
@@ -499,11 +477,6 @@ fn lock(folder: &Path) -> Result<File, JournalError> {
         Err(TryLockError::WouldBlock) => Err(JournalError::Busy { path: folder.to_owned() }),
         Err(TryLockError::Error(error)) => Err(JournalError::file(&path, "locking it")(error)),
     }
-}
-
-/// The database counts with a sign; 292 years of nanoseconds fit.
-pub(super) fn signed(number: u64) -> i64 {
-    i64::try_from(number).unwrap_or(i64::MAX)
 }
 
 fn boot_id() -> String {

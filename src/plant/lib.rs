@@ -1,7 +1,7 @@
-//! Many cells: their records, work and knowledge in one PostgreSQL.
+//! Many cells: their records and their work in one PostgreSQL.
 //!
 //! A cell never needs the plant to run, hold or accept, and the plant never commands a motion. What leaves the cell is its record; what
-//! comes in is work and knowledge, both asked for.
+//! comes in is work, and is asked for.
 
 mod copy;
 mod error;

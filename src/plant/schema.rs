@@ -102,7 +102,7 @@ fn held_against_ours(applied: &[(i32, String)]) -> Result<i32, PlantError> {
 /// What a role of a person or a program is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PlantRole {
-    /// Looks at everything and changes nothing: the page, Grafana.
+    /// Looks at everything and changes nothing: who counts parts, or draws them by Grafana.
     Reader,
     /// Puts parts into the queue and brings recipes, besides looking.
     Planner,

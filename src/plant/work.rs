@@ -5,7 +5,7 @@
 //!    ^               |                 |
 //!    +--return, or --+                 |     a lease that ran out opens nothing: the next has another number
 //!    |  its time is over               |
-//!    +--give back, where no run came of it
+//!    +--give back, where nothing came of its run           ended <--give up, where its run is not gone on with
 //! ```
 
 use std::time::Duration;
@@ -111,12 +111,20 @@ impl Begun {
         Ok(begun.collect())
     }
 
-    /// Gives the part back, of which no run came: the cell has looked.
+    /// Gives the part back, of whose run nothing came: the cell has looked.
     ///
     /// # Errors
-    /// A run of which records have arrived, a plant that cannot be reached.
+    /// A run in which something was asked of a machine, a plant that cannot be reached.
     pub async fn give_back(&self, link: &Link, why: &str) -> Result<(), PlantError> {
         answered(link, self.lease.work, "SELECT give_back_work($1, $2, $3)", &[&self.lease.work, &self.run, &why]).await
+    }
+
+    /// Gives the part up: its run is not gone on with, and no other takes its place unless a planner says so.
+    ///
+    /// # Errors
+    /// A part that this cell has not begun in that run, a plant that cannot be reached.
+    pub async fn give_up(&self, link: &Link, why: &str) -> Result<(), PlantError> {
+        answered(link, self.lease.work, "SELECT give_up_work($1, $2, $3)", &[&self.lease.work, &self.run, &why]).await
     }
 }
 

@@ -5,17 +5,17 @@ use std::path::Path;
 use regrind::formats::ScratchFolder;
 use regrind::journal::PublicKey;
 use regrind_plant::PlantRun;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::super::control::folder_of;
 use super::super::failure::Failure;
 use super::{open, read};
 
-/// Whether the run lies here too.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(in super::super) enum Here {
-    Yes,
-    No,
+/// What the plant's copy of a run is.
+pub(in super::super) struct Copy {
+    /// Whether the run lies here too.
+    pub(in super::super) is_here: bool,
+    pub(in super::super) told: Value,
 }
 
 /// Proves the plant's copy of a run, and that what had arrived stands in the journal here, if there is one.
@@ -24,7 +24,7 @@ pub(in super::super) fn prove(
     run: Option<&Path>,
     keys: &[PublicKey],
     json: bool,
-) -> Result<Here, Failure> {
+) -> Result<Copy, Failure> {
     let config = read(plant)?;
     let folder = match run {
         Some(run) if !run.is_dir() => None,
@@ -42,11 +42,12 @@ pub(in super::super) fn prove(
         if let Some(folder) = &folder {
             found.stands_in(folder)?;
         }
+        let told = json!({
+            "run": found.name, "cell": found.cell, "sound": true, "records": proven.records, "head": proven.head,
+            "closed": proven.closed, "artefacts": proven.artefacts, "keys": proven.keys, "seals": proven.seals, "signed": proven.signed,
+        });
         if json && folder.is_none() {
-            super::super::print_json(&json!({
-                "run": found.name, "cell": found.cell, "sound": true, "records": proven.records, "head": proven.head,
-                "closed": proven.closed, "artefacts": proven.artefacts, "keys": proven.keys, "seals": proven.seals, "signed": proven.signed,
-            }))?;
+            super::super::print_json(&told)?;
         } else if !json {
             let signed = match proven.signed {
                 0 => "not signed".to_owned(),
@@ -61,6 +62,6 @@ pub(in super::super) fn prove(
                 if folder.is_some() { "; they stand in the journal here" } else { "" }
             ))?;
         }
-        Ok(if folder.is_some() { Here::Yes } else { Here::No })
+        Ok(Copy { is_here: folder.is_some(), told })
     })
 }

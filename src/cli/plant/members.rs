@@ -10,7 +10,7 @@ use serde_json::json;
 
 use super::super::failure::Failure;
 use super::super::{Outcome, key, name};
-use super::{Where, open, open_any, rows};
+use super::{Where, open, open_any};
 
 /// Lay the database out, or bring it up to this program's layout, as its owner
 #[derive(Args, Debug)]
@@ -29,12 +29,12 @@ pub(super) struct ToInit {
 /// Let a cell, a planner or a reader sign in, with a new password
 #[derive(Args, Debug)]
 #[command(after_help = "\
-A cell reads what is its own, ships its records and takes work; a planner reads everything, brings recipes and queues parts; a reader (the
-page, Grafana) reads everything. The password is written to a file that nobody else may read: carry it to the computer that signs in.
+A cell reads what is its own, ships its records and takes work; a planner reads everything, brings recipes and queues parts; a reader
+(Grafana, say) reads everything; a worker makes the runs of studies. The password is written to a file that nobody else may read: carry it to the computer that signs in.
 
 Examples:
   regrind plant enrol cell-1 --plant owner.toml --password-file cell-1.password --key cell-1.key
-  regrind plant enrol page --as reader --plant owner.toml --password-file page.password
+  regrind plant enrol office --as reader --plant owner.toml --password-file office.password
 
 Exit codes: 0 enrolled; 2 the database refuses it; 3 it cannot be reached.")]
 pub(super) struct ToEnrol {
@@ -160,7 +160,7 @@ pub(super) fn list(arguments: &ToList) -> Result<Outcome, Failure> {
         let link = open(&config).await?;
         let text = "SELECT cell, coalesce(words, 'never heard of'), coalesce(to_char(told_at, 'YYYY-MM-DD HH24:MI:SS'), ''), coalesce(run, '')
             FROM cell_now ORDER BY cell";
-        let found = rows(&link, text, &[]).await?;
+        let found = link.ask(text, &[]).await?;
         let cells: Vec<[String; 4]> = found.iter().map(|row| [0, 1, 2, 3].map(|k| row.get(k))).collect();
         if arguments.json {
             let told = cells.iter().map(|[cell, words, at, run]| json!({ "cell": cell, "words": words, "told_at": at, "run": run }));

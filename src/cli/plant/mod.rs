@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
 use regrind::config::PlantConfig;
-use regrind_plant::{Link, PlantError};
+use regrind_plant::Link;
 
 use super::failure::Failure;
 use super::{Outcome, check};
@@ -118,13 +118,4 @@ impl Beside {
         read(plant)?;
         Ok(Self { _shipping: super::ship::Beside::begin(runs, plant)? })
     }
-}
-
-/// A question to the database, with what it failed at.
-pub(super) async fn rows(
-    link: &Link,
-    text: &str,
-    values: &[&(dyn regrind_plant::ToSql + Sync)],
-) -> Result<Vec<regrind_plant::Row>, PlantError> {
-    link.ask(text, values).await
 }

@@ -15,7 +15,7 @@ use super::super::failure::Failure;
 use super::super::words::three_digits;
 use super::super::{Outcome, check, name, outside};
 use super::recipes::files_of;
-use super::{Where, is_below, open, rows};
+use super::{Where, is_below, open};
 
 /// How often a worker asks for a job where there is none.
 const ROUND: Duration = Duration::from_secs(5);
@@ -308,7 +308,7 @@ fn show(arguments: &ToShow) -> Result<Outcome, Failure> {
         let link = open(&config).await?;
         let text = "SELECT j.job, j.varied::text, j.seed, j.state, j.result::text FROM study s JOIN study_job j ON j.study = s.id
             WHERE s.name = $1 ORDER BY j.job";
-        let found = rows(&link, text, &[&arguments.name]).await?;
+        let found = link.ask(text, &[&arguments.name]).await?;
         if found.is_empty() {
             super::super::print(&format!("there is no study {:?}\n", arguments.name))?;
             return Ok(Outcome::NotInTolerance);
@@ -397,14 +397,15 @@ fn wilson(of: usize, all: usize) -> [f64; 2] {
     let (n, p) = (all as f64, of as f64 / all as f64);
     let middle = p + Z * Z / (2.0 * n);
     let half = Z * (p * (1.0 - p) / n + Z * Z / (4.0 * n * n)).sqrt();
-    [middle - half, middle + half].map(|bound| 100.0 * bound / (1.0 + Z * Z / n))
+    // Rounding leads no share below nothing or above all.
+    [middle - half, middle + half].map(|bound| (100.0 * bound / (1.0 + Z * Z / n)).clamp(0.0, 100.0))
 }
 
 fn stop(arguments: &ToStop) -> Result<Outcome, Failure> {
     let config = arguments.plant.read()?;
     super::super::runtime()?.block_on(async {
         let link = open(&config).await?;
-        let done = rows(&link, "SELECT stop_study($1)", &[&arguments.name]).await?;
+        let done = link.ask("SELECT stop_study($1)", &[&arguments.name]).await?;
         if done.first().is_some_and(|row| row.get(0)) {
             super::super::print(&format!("{} gives out no more jobs\n", arguments.name))?;
             return Ok(Outcome::Accepted);
@@ -439,7 +440,8 @@ mod tests {
         // 81 of 263: 0.2553 to 0.3662 (Newcombe 1998, table I, method 3).
         let [low, high] = wilson(81, 263);
         assert!((low - 25.53).abs() < 0.01 && (high - 36.62).abs() < 0.01, "{low} {high}");
-        assert_eq!(wilson(0, 20)[0], 0.0);
+        let [[none, _], [_, all]] = [wilson(0, 20), wilson(20, 20)];
+        assert!((0.0..1e-12).contains(&none) && (100.0 - 1e-12..=100.0).contains(&all), "{none} {all}");
         assert_eq!((median(vec![]), median(vec![3.0, 1.0]), median(vec![5.0, 1.0, 2.0])), (None, Some(2.0), Some(2.0)));
     }
 }

@@ -167,7 +167,7 @@ BEGIN
     RETURN NULL;
 END $$;
 
--- Gives a part back whose run never came to be, for the cell looked. One of which a record has arrived is its run's.
+-- Gives a part back whose run never came to anything, for the cell looked. One of whose run a command or an event has arrived is that run's.
 CREATE FUNCTION give_back_work(of_work bigint, of_run text, why text) RETURNS text
 LANGUAGE plpgsql SECURITY DEFINER SET search_path = regrind, pg_temp AS $$
 DECLARE
@@ -175,11 +175,26 @@ DECLARE
 BEGIN
     UPDATE work SET state = 'open', cell = NULL, leased_until = NULL, run = NULL, begun_at = NULL
         WHERE id = of_work AND state = 'begun' AND cell = mine AND run = of_run
-            AND NOT EXISTS (SELECT FROM run r WHERE r.cell = mine AND r.name = of_run AND r.records > 0);
+            AND NOT EXISTS (SELECT FROM run r JOIN record e ON e.run = r.id
+                WHERE r.cell = mine AND r.name = of_run AND e.text ~ '"kind":"(intent|event|end)","mono_ns":');
     IF NOT FOUND THEN
-        RETURN refuse_work(of_work, NULL, 'give back', 'it was not begun by this cell in run ' || of_run || ', or that run has records');
+        RETURN refuse_work(of_work, NULL, 'give back', 'it was not begun by this cell in run ' || of_run || ', or something was asked of a machine there');
     END IF;
     INSERT INTO work_step (work, step, words) VALUES (of_work, 'given back', left(why, 300));
+    RETURN NULL;
+END $$;
+
+-- Gives a part up whose run will not be gone on with. It stays that run's, and whether another is made in its place is for a planner to say.
+CREATE FUNCTION give_up_work(of_work bigint, of_run text, why text) RETURNS text
+LANGUAGE plpgsql SECURITY DEFINER SET search_path = regrind, pg_temp AS $$
+DECLARE
+    mine integer := must_be_a_cell();
+BEGIN
+    UPDATE work SET state = 'ended' WHERE id = of_work AND state = 'begun' AND cell = mine AND run = of_run;
+    IF NOT FOUND THEN
+        RETURN refuse_work(of_work, NULL, 'give up', 'it was not begun by this cell in run ' || of_run);
+    END IF;
+    INSERT INTO work_step (work, step, words) VALUES (of_work, 'given up', left(why, 300));
     RETURN NULL;
 END $$;
 
@@ -308,6 +323,6 @@ GRANT SELECT ON recipe, recipe_file, approval, work, work_step TO regrind_reader
 GRANT INSERT (recipe, person, key, signature) ON approval TO regrind_planner;
 REVOKE EXECUTE ON ALL FUNCTIONS IN SCHEMA regrind FROM PUBLIC;
 GRANT EXECUTE ON FUNCTION take_work(integer), renew_work(bigint, integer, integer), begin_work(bigint, integer, text),
-    return_work(bigint, integer, text), give_back_work(bigint, text, text), pull_recipe(bytea) TO regrind_cell;
+    return_work(bigint, integer, text), give_back_work(bigint, text, text), give_up_work(bigint, text, text), pull_recipe(bytea) TO regrind_cell;
 GRANT EXECUTE ON FUNCTION queue_work(text, bytea, text, date), withdraw_work(bigint, text), withdraw_recipe(text, integer, text),
     propose_recipe(text, integer, text, text[], bytea[]) TO regrind_planner;

@@ -1,4 +1,4 @@
--- What people ask: each view is read with the rights of who reads it. The page and Grafana read the same.
+-- What people ask: each view is read with the rights of who reads it, by a program of the shop or by Grafana.
 
 -- Every cell at a glance. Times left are of the job under way, in seconds.
 CREATE VIEW cell_now WITH (security_invoker = true) AS

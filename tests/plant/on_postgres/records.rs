@@ -61,6 +61,12 @@ fn a_run_is_shipped_once_proven_there_and_brought_back() {
     // The copy is evidence by itself, and with the journal of the cell beside it.
     let both = plant.does(&["audit", "verify", "--plant", "cell-1.toml"]);
     assert!(both.contains("they stand in the journal here") && both.contains("sound       "), "{both}");
+    let told: Value =
+        serde_json::from_str(&plant.does(&["audit", "verify", "--plant", "cell-1.toml", "--json"])).unwrap();
+    assert!(
+        told["head"] == told["plant"]["head"] && told["plant"]["cell"] == "cell-1" && told["plant"]["sound"] == true,
+        "{told}"
+    );
     let copy = ["audit", "verify", &name, "--plant", "owner.toml"];
     fs::rename(plant.path("runs"), plant.path("elsewhere")).unwrap();
     let alone = plant.does(&copy);

@@ -3,7 +3,8 @@
 use std::fs;
 use std::process::Stdio;
 
-use serde_json::Value;
+use regrind::journal::{Entry, Header, Journal, Kind};
+use serde_json::{Value, json};
 
 use crate::Plant;
 use crate::program::{Running, regrind, small_recipe};
@@ -202,5 +203,66 @@ fn a_lease_that_is_over_opens_nothing_and_what_was_begun_is_its_runs() {
     plant.does(&["ship", "--once", "--plant", "cell-2.toml"]);
     plant.sql("UPDATE work SET state = 'begun'");
     let said = by("cell-2", &format!("SELECT give_back_work(1, '{run}', 'why')"));
-    assert!(said.contains("that run has records"), "{said}");
+    assert!(said.contains("something was asked of a machine"), "{said}");
+}
+
+/// A part that cell-1 has begun in a run whose program died; what it had on record by then.
+fn begun_and_died(plant: &Plant, run: &str, events: usize) {
+    assert_eq!(
+        plant
+            .asked_by("cell-1", "SELECT begin_work(id, lease, '{}') FROM take_work(60)".replace("{}", run).as_str())
+            .unwrap(),
+        ""
+    );
+    let header = Header {
+        run: run.into(),
+        part: "SN-1".into(),
+        actor: "Ada".into(),
+        station: "console".into(),
+        simulation: true,
+        first_command_id: 1,
+        content: json!({}),
+    };
+    let mut journal = Journal::create(plant.path("runs").join(run), header).unwrap();
+    for k in 0..events {
+        journal.append(Entry::new(Kind::Event, k as u64, 1, json!({ "event": "start" }))).unwrap();
+    }
+    drop(journal);
+    plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn a_run_that_cannot_be_gone_on_with_does_not_hold_up_its_cell() {
+    let plant = Plant::new();
+    let approvers = approved(&plant);
+    cell(&plant, "cell-1", &approvers);
+    queue(&plant, "SN-1", &[]);
+    let make = ["work", "--plant", "cell-1.toml", "--part", "SN-1", "--once"];
+    let back = ["work", "--plant", "cell-1.toml", "--give-back", "SN-1"];
+    let up = ["work", "--plant", "cell-1.toml", "--give-up", "SN-1", "--why", "its program is gone"];
+    // Nothing was asked of a machine: the part is as it was.
+    begun_and_died(&plant, "run-1", 0);
+    let (_, told) = plant.ends(&make, 1);
+    assert!(told.contains("nothing was asked of a machine") && told.contains("--give-back SN-1"), "{told}");
+    plant.does(&back);
+    assert_eq!(work(&plant)[0]["state"], "open");
+    // Something was: the part is this run's for good, and whether it is made anew is for a planner to say.
+    begun_and_died(&plant, "run-2", 3);
+    let (_, told) = plant.ends(&make, 1);
+    assert!(
+        told.contains("run run-2 of SN-1 is not over: regrind resume") && told.contains("--give-up SN-1"),
+        "{told}"
+    );
+    let (_, told) = plant.ends(&back, 1);
+    assert!(told.contains("run run-2 of SN-1 is here"), "{told}");
+    let said = plant.asked_by("cell-1", "SELECT give_back_work(1, 'run-2', 'why')").unwrap();
+    assert!(said.contains("something was asked of a machine"), "{said}");
+    plant.does(&up);
+    assert_eq!(plant.sql("SELECT state || ' ' || run FROM work"), "ended run-2");
+    assert_eq!(plant.sql("SELECT words FROM work_step WHERE step = 'given up'"), "its program is gone");
+    assert!(plant.does(&make).contains("no part is waiting"));
+    plant.ends(&up, 1);
+    queue(&plant, "SN-1", &[]);
+    plant.does(&make);
 }
