@@ -6,10 +6,11 @@ use super::error::{PlantError, refused};
 use super::link::Link;
 
 /// Every version of the layout: what is put on top of the one before. A text that was handed out is never changed.
-const MIGRATIONS: [(i32, &str); 3] = [
+const MIGRATIONS: [(i32, &str); 4] = [
     (1, include_str!("migrations/0001_records.sql")),
     (2, include_str!("migrations/0002_work.sql")),
     (3, include_str!("migrations/0003_views.sql")),
+    (4, include_str!("migrations/0004_page.sql")),
 ];
 
 /// The groups of roles: what signs in is a member of one.

@@ -3,12 +3,13 @@
 pub(super) mod audit;
 mod members;
 mod runs;
+mod serve;
 
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
 use regrind::config::PlantConfig;
-use regrind_plant::{Link, PlantError};
+use regrind_plant::{DatabaseSettings, Link, PlantError};
 
 use super::failure::Failure;
 use super::{Outcome, check};
@@ -39,6 +40,7 @@ enum What {
     Runs(runs::ToList),
     Fetch(runs::ToFetch),
     Incidents(runs::ToTell),
+    Serve(serve::Arguments),
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
@@ -50,6 +52,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         What::Runs(of) => runs::list(of),
         What::Fetch(of) => runs::fetch(of),
         What::Incidents(of) => runs::incidents(of),
+        What::Serve(of) => serve::serve(of),
     }
 }
 
@@ -72,13 +75,15 @@ pub(super) fn read(file: &Path) -> Result<PlantConfig, Failure> {
     check::or_show(PlantConfig::read(file))
 }
 
+/// The database that a plant file names, or what is wrong with it.
+fn database(config: &PlantConfig) -> Result<&DatabaseSettings, Failure> {
+    let missing = || config.problem("database", "is missing", "", "say where the database is, and who signs in");
+    check::or_show(config.database.as_ref().ok_or_else(missing))
+}
+
 /// Signs in to the database of a plant file, whose layout may be any.
 pub(super) async fn open_any(config: &PlantConfig) -> Result<Link, Failure> {
-    let Some(settings) = &config.database else {
-        let missing = config.problem("database", "is missing", "", "say where the database is, and who signs in");
-        return check::or_show(Err(missing));
-    };
-    Ok(Link::open(settings).await?)
+    Ok(Link::open(database(config)?).await?)
 }
 
 /// Signs in to the database of a plant file, which must be laid out as this program knows it.
