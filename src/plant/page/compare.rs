@@ -59,7 +59,7 @@ async fn made(plant: &Shared, asked: &Asked, after: usize) -> Result<Made, Unmad
             @if selection.recipe().is_empty() {
                 p .no { "Parts of several recipes are compared: a cell may differ by what it was given to make. Choose a recipe." }
             }
-            @if cells.is_empty() { p { "No cell has made such a part." } } @else { (table(&cells, &chances, &selection)) }
+            @if cells.is_empty() { p { "No cell has made such a part." } } @else { div .wide { (table(&cells, &chances, &selection)) } }
             @if more { p { a href=(format!("/cells?{}&after={}", selection.query(), after + CELLS)) { "Further cells" } } }
             p .quiet {
                 "Whether a cell differs: its PV against those of all other cells that are shown, by the rank sum of Mann and Whitney (two-sided, " (ENOUGH) " parts at least \
@@ -130,19 +130,20 @@ fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
 }
 
 fn table(cells: &[Cell], chances: &[Option<f64>], selection: &Selection) -> Markup {
-    let most = cells.iter().filter_map(|cell| cell.pv_um.last()).fold(0.0_f64, |most, value| most.max(*value));
+    let all = || cells.iter().flat_map(|cell| cell.pv_um.iter().copied());
+    let scale = [all().fold(f64::INFINITY, f64::min), all().fold(0.0, f64::max)];
     let mean = |cycles: &[i32]| cycles.iter().map(|n| f64::from(*n)).sum::<f64>() / cycles.len() as f64;
     html! {
         table .compared {
             tr {
-                th { "Cell" } th .n { "n" } th .n { "median PV, µm" } th { "PV, 0 to " (um(Some(most), 2)) " µm" } th .n { "yield" } th .n { "first pass" }
+                th { "Cell" } th .n { "n" } th .n { "median PV, µm" } th { "PV, " (um(Some(scale[0]), 2)) " to " (um(Some(scale[1]), 2)) " µm" } th .n { "yield" } th .n { "first pass" }
                 th .n { "95 %" } th .n { "cycles a part" } th { "differs from the others" }
             }
             @for (cell, chance) in cells.iter().zip(chances) {
                 tr data-cell=(cell.name) {
                     td { a href=(format!("/trend?{}&cell={}", selection.query(), encoded(&cell.name))) { (shown(&cell.name)) } }
                     td .n { (cell.ended) } td .n { strong { (um(quantile(&cell.pv_um, 0.5), 3)) } }
-                    td .box { (drawn(&cell.pv_um, most)) }
+                    td .box { (drawn(&cell.pv_um, scale)) }
                     td .n { (share(cell.accepted, cell.ended)) } td .n { (share(cell.at_once, cell.ended)) } td .n .quiet { (interval(cell.at_once, cell.ended)) }
                     td .n { @if cell.cycles.is_empty() { "–" } @else { (format!("{:.2}", mean(&cell.cycles))) } }
                     td { (told(*chance)) }
@@ -166,15 +167,16 @@ fn probability(p: f64) -> String {
     if p < 0.0001 { "p < 0.0001".to_owned() } else { format!("p = {p:.4}") }
 }
 
-/// The box of sorted values.
-fn drawn(sorted: &[f64], most: f64) -> Markup {
+/// The box of sorted values, on a scale of what all cells have.
+fn drawn(sorted: &[f64], [from, to]: [f64; 2]) -> Markup {
     let [Some(least), Some(low), Some(median), Some(high), Some(largest)] =
         [0.0, 0.25, 0.5, 0.75, 1.0].map(|share| quantile(sorted, share))
     else {
         return Markup::default();
     };
-    let x = |value: f64| format!("{:.1}", 4.0 + 232.0 * if most > 0.0 { value / most } else { 0.0 });
-    let width = |from: f64, to: f64| format!("{:.1}", (232.0 * (to - from) / most.max(f64::MIN_POSITIVE)).max(1.0));
+    let per_um = 232.0 / (to - from).max(1e-9);
+    let x = |value: f64| format!("{:.1}", 4.0 + per_um * (value - from));
+    let width = |from: f64, to: f64| format!("{:.1}", (per_um * (to - from)).max(1.0));
     html! {
         svg viewBox="0 0 240 22" role="img" aria-label=(format!("{least:.2}, {low:.2}, {median:.2}, {high:.2}, {largest:.2} µm")) {
             line .whisker x1=(x(least)) x2=(x(largest)) y1="11" y2="11" {}

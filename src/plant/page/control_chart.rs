@@ -94,6 +94,9 @@ pub(super) fn individuals(name: &str, class: &str, values: &[Value], limits: &Li
     let shows = tolerance > 0.0 && tolerance < 4.0 * most;
     let scale = Scale { most: if shows { most.max(tolerance) } else { most }, count: values.len(), height: 280.0 };
     let steps = if shows { tolerance_line(values, &scale) } else { Vec::new() };
+    // Its name stands beside its end; the line itself steps.
+    let last = values.last().and_then(|value| value.limit_um).filter(|_| shows);
+    lines.extend(last.map(|at| Across { class: "allowed", name: "allowed", at }));
     drawn(&format!("{name}, µm"), class, values, &all, &lines, &scale, |value| limits.is_out(value), &steps)
 }
 

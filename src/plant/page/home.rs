@@ -133,8 +133,8 @@ fn yields(what: &str, kind: &str, counts: &[(String, Count)]) -> Markup {
     };
     html! {
         @if counts.is_empty() { p .quiet { "Nothing ended." } }
-        @else if counts.len() > OPEN { details { summary { "By " (kind) ": " (counts.len()) } (table) } }
-        @else { (table) }
+        @else if counts.len() > OPEN { details { summary { "By " (kind) ": " (counts.len()) } div .wide { (table) } } }
+        @else { div .wide { (table) } }
     }
 }
 
@@ -163,10 +163,10 @@ async fn queue(link: &Link) -> Result<Markup, PlantError> {
     };
     Ok(html! {
         @if rows.is_empty() { p .quiet { "Nothing waits to be made." } } @else {
-            table {
+            div .wide { table {
                 tr { th { "Part" } th { "Recipe" } th { "For" } th { "Due" } th { "State" } }
                 @for row in &rows { (line(row)) }
-            }
+            } }
             @if rows.len() as i64 == QUEUED { p .quiet { "The first " (QUEUED) "." } }
         }
     })
@@ -178,13 +178,13 @@ async fn incidents(link: &Link) -> Result<Markup, PlantError> {
     let rows = link.ask(text, &[&INCIDENTS]).await?;
     Ok(html! {
         @if rows.is_empty() { p .quiet { "Nothing: no broken chain, no refusal." } } @else {
-            table {
+            div .wide { table {
                 tr { th { "When" } th { "By" } th { "Run" } th { "What" } th { "In words" } }
                 @for row in &rows {
                     @let [at, by, run, what, words] = [0, 1, 2, 3, 4].map(|k| row.get::<_, &str>(k));
                     tr { td { (at) } td { (shown(by)) } td .id { (shown(run)) } td { strong { (shown(what)) } } td { (shown(words)) } }
                 }
-            }
+            } }
         }
     })
 }

@@ -92,8 +92,7 @@ async fn read(plant: &Shared, link: &Link, asked: Asked) -> Result<Map, Unmade> 
     let text = "SELECT cycle, serial, cell, recipe, simulation, pv_um, rms_um, map FROM cycle_figure
         WHERE run_id = $1 AND map IS NOT NULL AND ($2::integer IS NULL OR cycle = $2) ORDER BY cycle DESC LIMIT 1";
     let rows = link.ask(text, &[&asked.run, &asked.cycle]).await?;
-    let missing = || Unmade::NotHere(format!("the plant knows of no map of run {}", asked.run));
-    let row = rows.first().ok_or_else(missing)?;
+    let Some(row) = rows.first() else { return without(link, asked).await };
     let words = |k: usize| row.get::<_, Option<String>>(k).unwrap_or_default();
     let name = words(7);
     Ok(Map {
@@ -106,6 +105,26 @@ async fn read(plant: &Shared, link: &Link, asked: Asked) -> Result<Map, Unmade> 
         pv_um: row.get(5),
         rms_um: row.get(6),
         samples: samples(plant, link, asked.run, &name).await?,
+    })
+}
+
+/// A run that has none, beside others that have.
+async fn without(link: &Link, asked: Asked) -> Result<Map, Unmade> {
+    let text = "SELECT serial, cell, recipe, simulation, pv_um, rms_um FROM part_run WHERE id = $1";
+    let rows = link.ask(text, &[&asked.run]).await?;
+    let missing = || Unmade::NotHere(format!("the plant has no run {} that made a part", asked.run));
+    let row = rows.first().ok_or_else(missing)?;
+    let words = |k: usize| row.get::<_, Option<String>>(k).unwrap_or_default();
+    Ok(Map {
+        run: asked.run,
+        cycle: asked.cycle.unwrap_or(0),
+        serial: words(0),
+        cell: words(1),
+        recipe: words(2),
+        simulation: row.get::<_, Option<bool>>(3) == Some(true),
+        pv_um: row.get(4),
+        rms_um: row.get(5),
+        samples: Err("the plant knows of none".into()),
     })
 }
 
@@ -139,7 +158,7 @@ fn side_by_side(maps: &[Map]) -> Markup {
                 figure data-run=(map.run) {
                     (drawn(map, limit))
                     figcaption {
-                        a href=(format!("/runs/{}", map.run)) { (shown(&map.serial)) } ", cycle " (map.cycle) ", " (shown(&map.cell)) ", " (shown(&map.recipe)) " " (mark(map.simulation))
+                        a href=(format!("/runs/{}", map.run)) { (shown(&map.serial)) } @if map.cycle > 0 { ", cycle " (map.cycle) } ", " (shown(&map.cell)) ", " (shown(&map.recipe)) " " (mark(map.simulation))
                         br; "judged: PV " (um(map.pv_um, 2)) " µm, RMS " (um(map.rms_um, 3)) " µm"
                     }
                 }

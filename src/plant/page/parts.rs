@@ -47,7 +47,7 @@ async fn made(plant: &Shared, asked: &Asked) -> Result<Made, Unmade> {
             }
             @if rows.is_empty() { p { "No part's serial number begins so. Capital and small letters are told apart." } } @else {
                 form method="get" action="/maps" {
-                    (table(&rows[..rows.len().min(MOST)]))
+                    div .wide { (table(&rows[..rows.len().min(MOST)])) }
                     p { "Tick two to four: " button { "Maps side by side" } }
                 }
             }

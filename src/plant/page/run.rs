@@ -123,9 +123,13 @@ async fn made(plant: &Shared, id: i32) -> Result<Made, Unmade> {
 
 fn about(run: &Run) -> Markup {
     let result = run.text(12);
+    // The words of the record begin with the same word.
+    let verdict = run.text(13);
+    let reason = verdict.split_once(": ").filter(|(word, _)| word.chars().all(|c| !c.is_lowercase()));
+    let verdict = reason.map_or(verdict, |(_, reason)| reason);
     let row = |what: &str, text: &str| html! { @if !text.is_empty() { dt { (what) } dd { (shown(text)) } } };
     html! {
-        p .verdict.good[result == "accepted"] { strong { (shown(if result.is_empty() { "open" } else { result })) } " " (shown(run.text(13))) }
+        p .verdict.good[result == "accepted"] { strong { (shown(if result.is_empty() { "open" } else { result })) } @if !verdict.is_empty() { ": " (shown(verdict)) } }
         dl .about {
             (row("Part", run.text(5)))
             dt { "Cell" } dd { (shown(&run.cell)) }
@@ -185,7 +189,7 @@ async fn cycles(link: &Link, id: i32) -> Result<Markup, PlantError> {
     let limits = rows.last().map(|row| [row.get::<_, Option<f64>>(8), row.get(9)]);
     Ok(html! {
         @if rows.is_empty() { p .quiet { "No cycle was told of yet." } } @else {
-            table {
+            div .wide { table {
                 tr { th .n { "Cycle" } th .n { "PV, µm" } th .n { "± U" } th .n { "RMS, µm" } th .n { "± U" } th .n { "expected PV" } th { "Judged" } }
                 @for row in &rows {
                     @let [verdict, reason] = [5, 6].map(|k| row.get::<_, Option<&str>>(k).unwrap_or_default());
@@ -200,7 +204,7 @@ async fn cycles(link: &Link, id: i32) -> Result<Markup, PlantError> {
                 @if let Some([pv, rms]) = limits {
                     tr .limit { td .n { "allowed" } td .n { (um(pv, 2)) } td {} td .n { (um(rms, 3)) } td {} td {} td {} }
                 }
-            }
+            } }
             p .quiet { "U: expanded uncertainty, k = 2. Expected: what the correction made from the cycle was expected to leave." }
         }
     })

@@ -115,8 +115,8 @@ fn figure(name: &str, class: &str, values: &[Value]) -> Markup {
             div .wide { (individuals(name, class, values, &limits)) }
             div .wide { (moving_ranges(name, class, values, &limits)) }
             p {
-                (out.len()) " of " (values.len()) " out of limits; " (over) " above what is allowed"
-                @if !out.is_empty() { ": the newest out of limits" }
+                (over) " of " (values.len()) " above what is allowed; " (out.len()) " out of limits"
+                @if !out.is_empty() { ", the newest first:" } @else { "." }
             }
             @if !out.is_empty() {
                 ul .out {

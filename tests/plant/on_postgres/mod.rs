@@ -1,5 +1,6 @@
 //! Ignored unless PostgreSQL is asked for.
 
 mod layout;
+mod page;
 mod records;
 mod rights;

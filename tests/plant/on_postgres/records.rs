@@ -11,7 +11,7 @@ use crate::program::{Running, regrind, small_recipe};
 use crate::{Plant, only_run};
 
 /// A part of the small recipe made by cell-1, signed, and shipped meanwhile.
-fn made(plant: &Plant) -> (std::path::PathBuf, String) {
+pub(super) fn made(plant: &Plant) -> (std::path::PathBuf, String) {
     let key = plant.path("audit.key").display().to_string();
     let told: Value = serde_json::from_str(&plant.does(&["audit", "key", "--key", &key, "--json"])).unwrap();
     plant.cell("cell-1", &["--key", told["public_key"].as_str().unwrap()]);
