@@ -149,7 +149,7 @@ pub(super) fn cards(cells: &[CellNow]) -> Markup {
 fn card(cell: &CellNow) -> Markup {
     let look = cell.look();
     html! {
-        article .cell .(look.class()) data-cell=(cell.name) {
+        article .cell .(look.class()) data-cell=(shown(&cell.name)) {
             h3 {
                 svg .shape viewBox="0 0 24 24" aria-hidden="true" { path d=(look.shape()) {} }
                 span .name { (shown(&cell.name)) }

@@ -155,7 +155,7 @@ fn drawn(
             @for tick in scale.ticks() {
                 @let y = format!("{:.1}", scale.y(tick));
                 line .grid x1=(LEFT) x2=(right) y1=(y) y2=(y) {}
-                text .tick x=(LEFT - 6.0) y=(y) dy="4" text-anchor="end" { (format!("{tick}").chars().take(6).collect::<String>()) }
+                text .tick x=(LEFT - 6.0) y=(y) dy="4" text-anchor="end" { (tick) }
             }
             @for k in scale.marked().into_iter().filter(|k| *k >= offset) {
                 text .tick x=(format!("{:.1}", scale.x(k))) y=(scale.height - 6.0) text-anchor="middle" { (values[k - offset].when.get(..10).unwrap_or_default()) }
@@ -220,11 +220,10 @@ impl Scale {
     /// Round values, four or so.
     fn ticks(&self) -> Vec<f64> {
         let step = round_step(self.most / 4.0);
-        (0..20)
-            .map(|k| f64::from(k) * step)
-            .take_while(|tick| *tick <= 1.04 * self.most)
-            .map(|tick| (tick / step).round() * step)
-            .collect()
+        // So that 0.6 is not 0.6000000000000001.
+        let per_step = 10f64.powf(-step.log10().floor());
+        let round = |tick: f64| (tick * per_step).round() / per_step;
+        (0..20).map(|k| f64::from(k) * step).take_while(|tick| *tick <= 1.04 * self.most).map(round).collect()
     }
 
     /// The values whose day is written.

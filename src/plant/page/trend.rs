@@ -40,7 +40,7 @@ async fn made(plant: &Shared, asked: &Asked) -> Result<Made, Unmade> {
         main .list .plant {
             h1 { "Trend " (mark(selection.simulated)) }
             (form)
-            p .quiet { (selection.words()) ": " (parts.len()) @if parts.len() as i64 == MOST { " parts, the newest" } @else { " parts" } "." }
+            p .quiet { (selection.words()) ": " (parts.len()) @if parts.len() == 1 { " part" } @else { " parts" } @if parts.len() as i64 == MOST { ", the newest" } "." }
             @if selection.recipe().is_empty() {
                 p .no { "Parts of several recipes are in one chart: limits of such a chart tell nothing. Choose a recipe." }
             }
