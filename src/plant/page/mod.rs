@@ -102,7 +102,7 @@ struct Made {
 /// Why a page is not made.
 enum Unmade {
     /// The database is not there, or says no.
-    Plant(PlantError),
+    Plant(Box<PlantError>),
     /// There is nothing of that name.
     NotHere(String),
     /// What was asked makes no sense.
@@ -111,7 +111,7 @@ enum Unmade {
 
 impl From<PlantError> for Unmade {
     fn from(error: PlantError) -> Self {
-        Self::Plant(error)
+        Self::Plant(Box::new(error))
     }
 }
 
@@ -127,7 +127,7 @@ async fn page(session: &Session, making: impl Future<Output = Result<Made, Unmad
 async fn within<T>(making: impl Future<Output = Result<T, Unmade>>) -> Result<T, Unmade> {
     let late = || {
         let what = format!("nothing came within {} s", PATIENCE.as_secs());
-        Unmade::Plant(PlantError::Unreachable { place: "the other end".into(), what })
+        Unmade::from(PlantError::Unreachable { place: "the other end".into(), what })
     };
     tokio::time::timeout(PATIENCE, making).await.unwrap_or_else(|_| Err(late()))
 }

@@ -9,6 +9,7 @@ use serde_json::Value;
 
 use super::records::made;
 use crate::Plant;
+use crate::browser::Browser;
 use crate::http::{Answer, Visitor};
 use crate::program::{PATIENCE, Running, regrind, root};
 
@@ -576,4 +577,30 @@ fn every_question_of_the_dashboard_for_grafana_has_an_answer() {
             .unwrap_or_else(|error| panic!("{asked}: {error}"));
         assert!(!rows.is_empty(), "no row: {asked}");
     }
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql) and a browser (Debian package chromium)"]
+fn in_a_browser_every_page_fits_a_telephone_and_fetches_nothing_from_elsewhere() {
+    let plant = Plant::new();
+    let one = cell(&plant, "cell-1");
+    tell(&plant, one, "1 second", Some("run"), &grinding("SN-0042"));
+    let runs: Vec<Planted> =
+        (2..60).map(|hours| Planted { cell: one, hours, cycles: 2, ..Planted::default() }).collect();
+    let first = plant_runs(&plant, &runs);
+    let shown = Shown::of(&plant);
+    let mut browser = Browser::start(plant.home.path());
+    let tab = browser.open(&shown.url, [390, 844]);
+    tab.until(&mut browser, "document.querySelector('.cell .left')");
+    let base = shown.url.split("?key=").next().unwrap().to_owned();
+    for path in ["", "trend", "cells", "parts?serial=SN", &format!("maps?run={first}"), &format!("runs/{first}")] {
+        tab.send(&mut browser, "Page.navigate", serde_json::json!({ "url": format!("{base}{path}") }));
+        tab.until(&mut browser, &format!("document.readyState == 'complete' && location.href == '{base}{path}'"));
+        let wide = tab.read(
+            &mut browser,
+            "(() => { const m = document.querySelector('main'); return m.scrollWidth - m.clientWidth; })()",
+        );
+        assert_eq!(wide, 0, "{path} is wider than the screen");
+    }
+    assert_eq!(tab.problems(&browser), Vec::<String>::new());
 }
