@@ -54,6 +54,11 @@ impl Run {
     }
 }
 
+/// The number of a run in an address.
+fn number(id: &str) -> Result<i32, Unmade> {
+    id.parse().map_err(|_| Unmade::NotHere("runs go by their numbers here, as in /runs/17".into()))
+}
+
 /// A run by the names that a cell knows it by.
 #[derive(Debug, Deserialize)]
 pub(super) struct Named {
@@ -82,9 +87,9 @@ pub(super) async fn by_name(
 pub(super) async fn run(
     State(plant): State<Shared>,
     Extension(session): Extension<Session>,
-    Path(id): Path<i32>,
+    Path(id): Path<String>,
 ) -> Response {
-    page(&session, made(&plant, id)).await
+    page(&session, async { made(&plant, number(&id)?).await }).await
 }
 
 async fn made(plant: &Shared, id: i32) -> Result<Made, Unmade> {
@@ -219,21 +224,21 @@ async fn maps_of(link: &Link, id: i32) -> Result<Vec<i32>, PlantError> {
 }
 
 /// The proof of a run, however long it takes.
-async fn proof_of(plant: &PlantPage, id: i32) -> Result<(Run, Arc<Proof>), Unmade> {
+async fn proof_of(plant: &PlantPage, id: &str) -> Result<(Run, Arc<Proof>), Unmade> {
     let run = {
         let link = plant.lease().await?;
-        Run::read(&link, id).await?
+        Run::read(&link, number(id)?).await?
     };
-    let proof = proven(plant, id, &run.cell, &run.name, &run.head).await?;
+    let proof = proven(plant, run.id, &run.cell, &run.name, &run.head).await?;
     Ok((run, proof))
 }
 
 pub(super) async fn report(
     State(plant): State<Shared>,
     Extension(session): Extension<Session>,
-    Path(id): Path<i32>,
+    Path(id): Path<String>,
 ) -> Response {
-    match proof_of(&plant, id).await {
+    match proof_of(&plant, &id).await {
         Ok((_, proof)) => match &proof.report {
             Ok(html) => {
                 // Its style stands in it; nothing in it may run, and nothing may be fetched.
@@ -253,30 +258,30 @@ pub(super) async fn report(
 pub(super) async fn qif(
     State(plant): State<Shared>,
     Extension(session): Extension<Session>,
-    Path(id): Path<i32>,
+    Path(id): Path<String>,
 ) -> Response {
-    results(&plant, &session, id, "qif", "application/xml", |proof| &proof.qif).await
+    results(&plant, &session, &id, "qif", "application/xml", |proof| &proof.qif).await
 }
 
 pub(super) async fn dfq(
     State(plant): State<Shared>,
     Extension(session): Extension<Session>,
-    Path(id): Path<i32>,
+    Path(id): Path<String>,
 ) -> Response {
-    results(&plant, &session, id, "dfq", "text/plain; charset=utf-8", |proof| &proof.dfq).await
+    results(&plant, &session, &id, "dfq", "text/plain; charset=utf-8", |proof| &proof.dfq).await
 }
 
 async fn results(
     plant: &PlantPage,
     session: &Session,
-    id: i32,
+    id: &str,
     ending: &str,
     kind: &'static str,
     of: fn(&Proof) -> &Result<String, String>,
 ) -> Response {
     match proof_of(plant, id).await {
-        Ok((_, proof)) => match of(&proof) {
-            Ok(text) => file(&format!("run-{id}.{ending}"), kind, text.clone()),
+        Ok((run, proof)) => match of(&proof) {
+            Ok(text) => file(&format!("run-{}.{ending}", run.id), kind, text.clone()),
             Err(why) => not_made(session, why),
         },
         Err(why) => unmade(session, &why),
