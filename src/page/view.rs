@@ -723,7 +723,7 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
                     @match kind.of() {
                         PageOf::Cell => { a href="/" { (say(Text::Cell)) } " " a href="/runs" { (say(Text::Runs)) } }
                         PageOf::Plant => {
-                            @for (path, name) in [("/", "Plant"), ("/trend", "Trend"), ("/cells", "Cells compared"), ("/parts", "Parts")] { a href=(path) { (name) } " " }
+                            @for (path, name) in [("/", "Plant"), ("/trend", "Trend"), ("/cells", "Compare"), ("/parts", "Parts")] { a href=(path) { (name) } " " }
                         }
                     }
                     span .settings {

@@ -1,6 +1,7 @@
 //! The plant's copy of a run, brought back into a folder that nobody keeps, proven there, and what is made of it.
 
 use std::collections::HashMap;
+use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -103,12 +104,12 @@ async fn prove(plant: &PlantPage, cell: &str, name: &str) -> Result<Proof, Plant
     match run.fetch(&link, plant.artefacts.as_ref(), &folder).await {
         Ok(()) => {}
         Err(error) if error.may_pass() => return Err(error),
-        Err(error) => return Ok(Proof::failed(&run, &error.to_string())),
+        Err(error) => return Ok(Proof::failed(&run, &without(&folder, &error.to_string()))),
     }
     let made = spawn_blocking(move || {
         let _kept_until_here = Arc::clone(&scratch);
-        let found = run.prove(&folder, &[]).map_err(|error| error.to_string());
-        let words = |error: ReportError| error.to_string();
+        let found = run.prove(&folder, &[]).map_err(|error| without(&folder, &error.to_string()));
+        let words = |error: ReportError| without(&folder, &error.to_string());
         Proof {
             at: now(),
             keys: run.keys.len(),
@@ -128,6 +129,11 @@ impl Proof {
         let none = || Err(why.clone());
         Self { at: now(), found: Err(why.clone()), keys: run.keys.len(), report: none(), qif: none(), dfq: none() }
     }
+}
+
+/// What is wrong, without the name of a folder that nobody can look into.
+fn without(folder: &Path, words: &str) -> String {
+    words.replace(&folder.display().to_string(), "the copy")
 }
 
 fn now() -> String {

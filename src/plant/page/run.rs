@@ -112,7 +112,7 @@ async fn made(plant: &Shared, id: i32) -> Result<Made, Unmade> {
             (about(&run))
             h2 { "The copy of the plant" }
             (told(proof.as_deref()))
-            @if let Some(proof) = &proof { (made_of_it(&run, proof)) }
+            @if let Some(proof) = proof.as_ref().filter(|proof| proof.found.is_ok()) { (made_of_it(&run, proof)) }
             h2 { "Cycles" }
             (cycles)
             @if let Some(first) = maps.first() {
