@@ -1,7 +1,7 @@
 //! The page of a plant: all its cells, what they made, and how it came out. It looks and orders nothing.
 //!
 //! ```text
-//!  browser --GET--> door of regrind-page --> a question each page --> pool --> views (0003, 0004), as a reader
+//!  browser --GET--> door of regrind-page --> a question each page --> pool --> views of migrations/, as a reader
 //!                                        --> proofs: a run brought back, proven, and its report made of it
 //! ```
 //!
