@@ -43,6 +43,16 @@ pub(super) struct Arguments {
     /// Address and port of the page; a port of 0 takes any that is free
     #[arg(long, value_name = "ADDRESS", default_value = ADDRESS)]
     listen: SocketAddr,
+    #[command(flatten)]
+    door: Door,
+    /// End when standard input does: with the program that began this one
+    #[arg(long, hide = true)]
+    while_stdin: bool,
+}
+
+/// By what a page proves itself, and who is let in.
+#[derive(Args, Debug)]
+pub(super) struct Door {
     /// Certificate of the page in PEM, with those of who signed it behind it; for other addresses than this computer's own
     #[arg(long, value_name = "FILE", requires = "key")]
     certificate: Option<PathBuf>,
@@ -52,27 +62,34 @@ pub(super) struct Arguments {
     /// Who may sign in (see `regrind users`); without it, who has the key of the page is let in
     #[arg(long, value_name = "FILE")]
     users: Option<PathBuf>,
-    /// End when standard input does: with the program that began this one
-    #[arg(long, hide = true)]
-    while_stdin: bool,
+}
+
+impl Door {
+    /// Listens at an address, where a page may be open there.
+    pub(super) async fn open(&self, listen: SocketAddr) -> Result<(TcpListener, Entrance), Failure> {
+        let Self { certificate, key, users } = self;
+        let tls =
+            certificate.as_ref().zip(key.as_ref()).map(|(certificate, key)| Tls::read(certificate, key)).transpose()?;
+        let users = users.as_ref().map(|path| UsersFile::open(path)).transpose()?;
+        if !listen.ip().is_loopback() && (tls.is_none() || users.is_none()) {
+            return Err(Failure::ForOthers { address: listen });
+        }
+        let taken = |source| Failure::Page { address: listen, source };
+        let listener = TcpListener::bind(listen).await.map_err(taken)?;
+        let address = listener.local_addr().map_err(taken)?;
+        Ok((listener, Entrance { address, tls, users }))
+    }
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
-    let Arguments { runs, listen, certificate, key, users, while_stdin } = arguments;
-    let tls =
-        certificate.as_ref().zip(key.as_ref()).map(|(certificate, key)| Tls::read(certificate, key)).transpose()?;
-    let users = users.as_ref().map(|path| UsersFile::open(path)).transpose()?;
-    if !listen.ip().is_loopback() && (tls.is_none() || users.is_none()) {
-        return Err(Failure::ForOthers { address: *listen });
-    }
+    let Arguments { runs, listen, door, while_stdin } = arguments;
     super::runtime()?.block_on(async {
+        let (listener, entrance) = door.open(*listen).await?;
         let taken = |source| Failure::Page { address: *listen, source };
-        let listener = TcpListener::bind(listen).await.map_err(taken)?;
-        let address = listener.local_addr().map_err(taken)?;
         let planned = Planned::default();
         let page = Page::new(
             std::path::absolute(runs).unwrap_or_else(|_| runs.clone()),
-            Entrance { address, tls, users },
+            entrance,
             Box::new(move |run| planned.of(run)),
             Box::new(|what| eprintln!("page: refused {what}")),
         );

@@ -44,7 +44,9 @@ pub use form_document::save_form;
 pub use height_map::HeightMap;
 pub use learned::{LEARNED, Learned, LearnedError};
 pub use lines::AddedLines;
-pub use map::{CorrectionIdentities, ErrorMapOrigin, MapNode, read_error_map, write_correction, write_error_map};
+pub use map::{
+    CorrectionIdentities, ErrorMapOrigin, MapNode, parse_error_map, read_error_map, write_correction, write_error_map,
+};
 pub use measured_map::is_map;
 pub use metropro::{parse_metropro, read_metropro};
 pub use note::{NotedPoints, PointNote};

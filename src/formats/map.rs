@@ -78,12 +78,18 @@ impl MapNode {
 
 /// Reads back what [`write_error_map`] wrote: every node where something was measured.
 ///
-///
 /// # Errors
 /// A file that cannot be read, other columns, rows that are no finite numbers.
 pub fn read_error_map(path: &Path) -> Result<Vec<MapNode>, FormatError> {
     let unreadable = |source| FormatError::Unreadable { path: path.to_owned(), source };
-    let text = std::fs::read_to_string(path).map_err(unreadable)?;
+    parse_error_map(path, &std::fs::read_to_string(path).map_err(unreadable)?)
+}
+
+/// Reads an error map from its text; the path is for messages.
+///
+/// # Errors
+/// Other columns, rows that are no finite numbers.
+pub fn parse_error_map(path: &Path, text: &str) -> Result<Vec<MapNode>, FormatError> {
     let mut lines = text.lines().zip(1..).filter(|(line, _)| !line.starts_with('#') && !line.trim().is_empty());
     let unexpected = |found: &str, line: u64, expected: &str| FormatError::Unexpected {
         path: path.to_owned(),

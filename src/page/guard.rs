@@ -8,7 +8,7 @@
 use std::collections::VecDeque;
 use std::io;
 use std::net::{IpAddr, SocketAddr};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use axum::Extension;
@@ -24,7 +24,7 @@ use sha2::{Digest, Sha256};
 use super::sign_in::SignedIn;
 use super::tls::Tls;
 use super::users::{Person, UsersFile};
-use super::{Shared, orders, view};
+use super::view::{self, PageOf};
 
 /// The cookies of a page, by its port: a browser keeps one set for all pages of a computer.
 const KEY_COOKIE: &str = "regrind_key";
@@ -86,6 +86,7 @@ impl Entrance {
 
 pub(crate) struct Guard {
     pub(crate) entrance: Entrance,
+    pub(crate) of: PageOf,
     pub(crate) signed_in: SignedIn,
     key: String,
     wrong: Mutex<Rate>,
@@ -94,8 +95,13 @@ pub(crate) struct Guard {
     tokens: Mutex<VecDeque<(String, String, Instant)>>,
     /// The browser that has control.
     holder: Mutex<Option<String>>,
-    log: Box<dyn Fn(&str) + Send + Sync>,
+    log: Box<Told>,
+    /// Has something on record wherever it belongs.
+    on_record: Box<dyn Fn(String) + Send + Sync>,
 }
+
+/// Takes what nobody else would keep.
+pub(crate) type Told = dyn Fn(&str) + Send + Sync;
 
 /// How often something happened within a minute.
 pub(crate) struct Rate {
@@ -122,9 +128,15 @@ impl Rate {
 }
 
 impl Guard {
-    pub(crate) fn new(entrance: Entrance, log: Box<dyn Fn(&str) + Send + Sync>) -> io::Result<Self> {
+    pub(crate) fn new(
+        entrance: Entrance,
+        of: PageOf,
+        log: Box<Told>,
+        on_record: Box<dyn Fn(String) + Send + Sync>,
+    ) -> io::Result<Self> {
         Ok(Self {
             entrance,
+            of,
             signed_in: SignedIn::default(),
             key: random_word()?,
             wrong: Mutex::new(Rate::new()),
@@ -132,6 +144,7 @@ impl Guard {
             tokens: Mutex::default(),
             holder: Mutex::new(None),
             log,
+            on_record,
         })
     }
 
@@ -214,6 +227,18 @@ impl Guard {
         told <= TOLD
     }
 
+    /// Has it told and on record that something was refused.
+    pub(crate) fn record_refusal(&self, what: &str) {
+        if self.refused(what) {
+            self.record(format!("the page refused {what}"));
+        }
+    }
+
+    /// Has something on record.
+    pub(crate) fn record(&self, what: String) {
+        (self.on_record)(what);
+    }
+
     /// Whether a browser has control; one that nobody else has is taken by who asks.
     pub(crate) fn has_control(&self, session: &Session, asks: bool) -> bool {
         let mut holder = self.holder.lock().unwrap_or_else(PoisonError::into_inner);
@@ -243,9 +268,9 @@ impl Guard {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Peer(pub(crate) IpAddr);
 
-/// The browser that a request comes from, and who sits at it where people sign in.
+/// The browser that a request comes from, and who sits at it where people sign in. Whatever is let in has one.
 #[derive(Clone, Debug)]
-pub(crate) struct Session {
+pub struct Session {
     pub(crate) id: String,
     pub(crate) person: Option<Person>,
     pub(crate) from: IpAddr,
@@ -260,12 +285,12 @@ impl Session {
 }
 
 /// Refuses a request that names another page than this one, and puts on every answer what a browser may make of it.
-pub(crate) async fn names_this_page(State(page): State<Shared>, request: Request, next: Next) -> Response {
+pub(crate) async fn names_this_page(State(guard): State<Arc<Guard>>, request: Request, next: Next) -> Response {
     let host = text(request.headers(), HOST).unwrap_or_default();
-    let mut response = if page.guard.entrance.is_host(host) {
+    let mut response = if guard.entrance.is_host(host) {
         next.run(request).await
     } else {
-        drop(orders::record_refusal(&page, None, format!("a request for the host {}", printable(host))));
+        guard.record_refusal(&format!("a request for the host {}", printable(host)));
         (StatusCode::MISDIRECTED_REQUEST, "this page goes by another name\n").into_response()
     };
     let headers = response.headers_mut();
@@ -279,12 +304,11 @@ pub(crate) async fn names_this_page(State(page): State<Shared>, request: Request
 
 /// Lets in who has the key or has signed in, and turns a key in the address into a cookie.
 pub(crate) async fn let_in(
-    State(page): State<Shared>,
+    State(guard): State<Arc<Guard>>,
     Extension(Peer(from)): Extension<Peer>,
     mut request: Request,
     next: Next,
 ) -> Response {
-    let guard = &page.guard;
     let id = guard.cookie(request.headers(), SESSION_COOKIE).map(str::to_owned);
     let session = if let Some(users) = &guard.entrance.users {
         let person = id.as_ref().and_then(|id| guard.signed_in.person(id, users));
@@ -292,23 +316,23 @@ pub(crate) async fn let_in(
     } else {
         if let Some(key) = key_in(request.uri().query()) {
             return match guard.is_key(key) {
-                Some(true) => welcome(guard, &request),
-                told => shut_out(&page, &request, told),
+                Some(true) => welcome(&guard, &request),
+                told => shut_out(&guard, &request, told),
             };
         }
         let told = guard.cookie(request.headers(), KEY_COOKIE).map(|key| guard.is_key(key));
         let known = id.filter(|_| told == Some(Some(true)));
-        let Some(id) = known else { return shut_out(&page, &request, told.unwrap_or(Some(false))) };
+        let Some(id) = known else { return shut_out(&guard, &request, told.unwrap_or(Some(false))) };
         Some(Session { id, person: None, from })
     };
-    let Some(session) = session else { return not_signed_in(&page, &request) };
+    let Some(session) = session else { return not_signed_in(&guard, &request) };
     request.extensions_mut().insert(session);
     next.run(request).await
 }
 
 /// Gives the page the token of its next order.
-pub(crate) async fn token(State(page): State<Shared>, Extension(session): Extension<Session>) -> Response {
-    match page.guard.give_token(&session) {
+pub(crate) async fn token(State(guard): State<Arc<Guard>>, Extension(session): Extension<Session>) -> Response {
+    match guard.give_token(&session) {
         Ok(token) => ([(CACHE_CONTROL, "no-store")], token).into_response(),
         Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     }
@@ -349,22 +373,22 @@ fn welcome(guard: &Guard, request: &Request) -> Response {
     response
 }
 
-fn shut_out(page: &Shared, request: &Request, told: Option<bool>) -> Response {
-    let gave = page.guard.cookie(request.headers(), KEY_COOKIE).is_some() || key_in(request.uri().query()).is_some();
+fn shut_out(guard: &Guard, request: &Request, told: Option<bool>) -> Response {
+    let gave = guard.cookie(request.headers(), KEY_COOKIE).is_some() || key_in(request.uri().query()).is_some();
     if gave || request.method() != "GET" {
         let what = if gave { "a wrong key" } else { "an order without a key" };
-        drop(orders::record_refusal(page, None, format!("{what} for {}", printable(request.uri().path()))));
+        guard.record_refusal(&format!("{what} for {}", printable(request.uri().path())));
     }
     let status = if told.is_none() { StatusCode::TOO_MANY_REQUESTS } else { StatusCode::UNAUTHORIZED };
-    view::key_needed(status, request.headers())
+    view::key_needed(status, guard.of, request.headers())
 }
 
-fn not_signed_in(page: &Shared, request: &Request) -> Response {
+fn not_signed_in(guard: &Guard, request: &Request) -> Response {
     if request.method() != "GET" {
         let path = printable(request.uri().path());
-        drop(orders::record_refusal(page, None, format!("an order of somebody who has not signed in, for {path}")));
+        guard.record_refusal(&format!("an order of somebody who has not signed in, for {path}"));
     }
-    view::sign_in(StatusCode::UNAUTHORIZED, request.headers(), None)
+    view::sign_in(StatusCode::UNAUTHORIZED, guard.of, request.headers(), None)
 }
 
 fn key_in(query: Option<&str>) -> Option<&str> {

@@ -20,6 +20,7 @@ use tokio::task::{JoinHandle, spawn_blocking};
 
 use super::Shared;
 use super::guard::{Session, foreign};
+use super::history::History;
 use super::users::PageRole;
 
 /// What the page answers to an order.
@@ -125,25 +126,15 @@ fn answered(reply: std::io::Result<Reply>) -> Response {
 
 /// Refuses, and answers when it is on record.
 async fn refuse(page: &Shared, run: &str, what: String, status: StatusCode) -> Response {
-    if let Some(written) = record_refusal(page, Some(run), what.clone()) {
-        drop(written.await);
+    if page.guard.refused(&what) {
+        drop(write_down(&page.history, Some(run.to_owned()), format!("the page refused {what}")).await);
     }
     (status, Json(Answer { accepted: false, message: what })).into_response()
 }
 
-/// Has it told and on record that something was refused: in the run that it was meant for, or in every run that is on.
-pub(crate) fn record_refusal(page: &Shared, run: Option<&str>, what: String) -> Option<JoinHandle<()>> {
-    page.guard.refused(&what).then(|| write_down(page, run.map(str::to_owned), format!("the page refused {what}")))
-}
-
-/// Has something on record in every run that is on.
-pub(crate) fn record(page: &Shared, what: String) {
-    drop(write_down(page, None, what));
-}
-
-/// The record takes it in its turn; a run that is over takes no remark.
-fn write_down(page: &Shared, run: Option<String>, what: String) -> JoinHandle<()> {
-    let history = Arc::clone(&page.history);
+/// Has something on record: in a run, or in every run that is on. The record takes it in its turn; a run that is over takes no remark.
+pub(crate) fn write_down(history: &Arc<History>, run: Option<String>, what: String) -> JoinHandle<()> {
+    let history = Arc::clone(history);
     spawn_blocking(move || {
         let folders = run.map_or_else(|| history.live(), |run| history.folder(&run).into_iter().collect());
         for folder in folders {

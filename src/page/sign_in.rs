@@ -14,10 +14,10 @@ use serde::Deserialize;
 use tokio::sync::Semaphore;
 use tokio::task::spawn_blocking;
 
-use super::guard::{Peer, Rate, Session, foreign, foreign_origin, printable, random_word};
+use super::guard::{Guard, Peer, Rate, Session, foreign, foreign_origin, printable, random_word};
 use super::texts::Text;
 use super::users::{Person, Proven, UsersFile};
-use super::{Shared, orders, view};
+use super::view;
 
 /// How long somebody stays signed in: a shift and its handover.
 const LASTS: Duration = Duration::from_secs(12 * 3600);
@@ -98,64 +98,64 @@ pub(crate) struct Credentials {
 }
 
 pub(crate) async fn sign_in(
-    State(page): State<Shared>,
+    State(guard): State<Arc<Guard>>,
     Extension(Peer(from)): Extension<Peer>,
     headers: HeaderMap,
     Form(given): Form<Credentials>,
 ) -> Response {
-    if page.guard.entrance.users.is_none() {
-        return view::not_here(headers).await;
+    if guard.entrance.users.is_none() {
+        return view::not_here(guard.of, &headers);
     }
     let refuse = |status, what: String, told: Text| {
-        drop(orders::record_refusal(&page, None, what));
-        view::sign_in(status, &headers, Some(told))
+        guard.record_refusal(&what);
+        view::sign_in(status, guard.of, &headers, Some(told))
     };
-    if let Some(what) = foreign_origin(&page.guard, &headers) {
+    if let Some(what) = foreign_origin(&guard, &headers) {
         return refuse(StatusCode::FORBIDDEN, what, Text::SignInRefused);
     }
     let who = printable(&given.name);
-    if !page.guard.signed_in.may_try(from) {
+    if !guard.signed_in.may_try(from) {
         let what = format!("one of too many tries to sign in within a minute, as {who}, from {from}");
         return refuse(StatusCode::TOO_MANY_REQUESTS, what, Text::TooManyTries);
     }
-    let Some(proven) = prove(&page, given).await else {
+    let Some(proven) = prove(&guard, given).await else {
         let what = format!("a wrong name or password, {who}, from {from}");
         return refuse(StatusCode::UNAUTHORIZED, what, Text::SignInRefused);
     };
-    page.guard.signed_in.forget_tries(from);
-    orders::record(&page, format!("{} signed in at the page, from {from}", proven.person()));
+    guard.signed_in.forget_tries(from);
+    guard.record(format!("{} signed in at the page, from {from}", proven.person()));
     // A name of this sign-in alone: nobody can have known it before.
     let Ok(session) = random_word() else { return StatusCode::INTERNAL_SERVER_ERROR.into_response() };
-    page.guard.signed_in.add(&session, proven);
+    guard.signed_in.add(&session, proven);
     let mut response = (StatusCode::SEE_OTHER, [(LOCATION, "/")]).into_response();
-    page.guard.set_session(&mut response, &session);
+    guard.set_session(&mut response, &session);
     response
 }
 
 /// Sees whether a name and a password belong together, in its turn.
-async fn prove(page: &Shared, given: Credentials) -> Option<Proven> {
-    let turn = Arc::clone(&page.guard.signed_in.proving).acquire_owned();
+async fn prove(guard: &Arc<Guard>, given: Credentials) -> Option<Proven> {
+    let turn = Arc::clone(&guard.signed_in.proving).acquire_owned();
     let turn = tokio::time::timeout(WAITS, turn).await.ok()?.ok()?;
-    let page = Arc::clone(page);
+    let guard = Arc::clone(guard);
     let proven = spawn_blocking(move || {
         let _turn = turn;
-        page.guard.entrance.users.as_ref()?.signs_in(given.name.trim(), &given.password)
+        guard.entrance.users.as_ref()?.signs_in(given.name.trim(), &given.password)
     });
     proven.await.ok()?
 }
 
 pub(crate) async fn sign_out(
-    State(page): State<Shared>,
+    State(guard): State<Arc<Guard>>,
     Extension(session): Extension<Session>,
     headers: HeaderMap,
 ) -> Response {
-    if let Some(what) = foreign(&page.guard, &headers, &session) {
-        drop(orders::record_refusal(&page, None, what));
+    if let Some(what) = foreign(&guard, &headers, &session) {
+        guard.record_refusal(&what);
         return StatusCode::FORBIDDEN.into_response();
     }
-    page.guard.signed_in.remove(&session.id);
-    page.guard.leave_control(&session);
+    guard.signed_in.remove(&session.id);
+    guard.leave_control(&session);
     let mut response = StatusCode::NO_CONTENT.into_response();
-    page.guard.set_session(&mut response, "");
+    guard.set_session(&mut response, "");
     response
 }

@@ -353,7 +353,7 @@ pub(crate) async fn run(
     headers: HeaderMap,
 ) -> Response {
     let language = language(&headers);
-    let Some(folder) = page.history.folder(&id) else { return not_here(headers).await };
+    let Some(folder) = page.history.folder(&id) else { return not_here(PageOf::Cell, &headers) };
     let mut looked = page.live.look(&folder);
     let known = looked.borrow().summary.run.is_empty();
     if known {
@@ -364,7 +364,7 @@ pub(crate) async fn run(
     let has_control = page.guard.has_control(&session, false);
     let main = cell(&seen, &id, &session, has_control, language);
     let title = format!("{} {}", seen.summary.part, seen.summary.name);
-    document(&title, &Frame { language, person: session.person.as_ref(), is_cell: true }, main)
+    document(&title, &Frame { language, person: session.person.as_ref(), kind: Kind::WithMaps }, main)
 }
 
 /// The page of a run: the cell while it is on, and what it came to afterwards.
@@ -510,7 +510,7 @@ pub(crate) async fn runs(
             }
         }
     };
-    document(say(Text::Runs), &Frame { language, person: session.person.as_ref(), is_cell: false }, main)
+    document(say(Text::Runs), &Frame { language, person: session.person.as_ref(), kind: Kind::Of(PageOf::Cell) }, main)
 }
 
 fn table_of<'a>(runs: impl Iterator<Item = &'a Listed>, language: Language) -> Markup {
@@ -583,12 +583,12 @@ pub(crate) async fn compare(
             (maud::PreEscaped(harmless(&json!({ "compared": maps, "colours": colours(ColourMap::Diverging), "texts": script_texts(language) }))))
         }
     };
-    document(say(Text::Compare), &Frame { language, person: session.person.as_ref(), is_cell: true }, main)
+    document(say(Text::Compare), &Frame { language, person: session.person.as_ref(), kind: Kind::WithMaps }, main)
 }
 
 /// The report of a run, as it stands in its folder.
 pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, headers: HeaderMap) -> Response {
-    let Some(folder) = page.history.folder(&id) else { return not_here(headers).await };
+    let Some(folder) = page.history.folder(&id) else { return not_here(PageOf::Cell, &headers) };
     let read = spawn_blocking(move || {
         std::fs::read(folder.join(RUN_REPORT)).or_else(|_| regrind_report::run_report(&folder).map(String::into_bytes))
     });
@@ -607,14 +607,16 @@ pub(crate) async fn report(State(page): State<Shared>, Path(id): Path<String>, h
     }
 }
 
-pub(crate) async fn not_here(headers: HeaderMap) -> Response {
-    let language = language(&headers);
+/// What is said where nothing is.
+pub(crate) fn not_here(of: PageOf, headers: &HeaderMap) -> Response {
+    let language = language(headers);
     let main = html! { main .list { h1 { "404" } p { (Text::NotHere.to(language)) } } };
-    (StatusCode::NOT_FOUND, document("404", &Frame { language, person: None, is_cell: false }, main)).into_response()
+    (StatusCode::NOT_FOUND, document("404", &Frame { language, person: None, kind: Kind::Of(of) }, main))
+        .into_response()
 }
 
 /// What who has no key is told.
-pub(crate) fn key_needed(status: StatusCode, headers: &HeaderMap) -> Response {
+pub(crate) fn key_needed(status: StatusCode, of: PageOf, headers: &HeaderMap) -> Response {
     let language = language(headers);
     let main = html! {
         main .list {
@@ -623,11 +625,11 @@ pub(crate) fn key_needed(status: StatusCode, headers: &HeaderMap) -> Response {
             form method="get" action="/" { label { "key " input name="key" type="password" autocomplete="off"; } " " button { "OK" } }
         }
     };
-    (status, document("Regrind", &Frame { language, person: None, is_cell: false }, main)).into_response()
+    (status, document("Regrind", &Frame { language, person: None, kind: Kind::Of(of) }, main)).into_response()
 }
 
 /// The page at which somebody signs in, and what is said to who could not.
-pub(crate) fn sign_in(status: StatusCode, headers: &HeaderMap, told: Option<Text>) -> Response {
+pub(crate) fn sign_in(status: StatusCode, of: PageOf, headers: &HeaderMap, told: Option<Text>) -> Response {
     let language = language(headers);
     let say = |text: Text| text.to(language);
     let main = html! {
@@ -642,7 +644,7 @@ pub(crate) fn sign_in(status: StatusCode, headers: &HeaderMap, told: Option<Text
             p .quiet { (say(Text::WhoMakesUsers)) }
         }
     };
-    (status, document(say(Text::SignIn), &Frame { language, person: None, is_cell: false }, main)).into_response()
+    (status, document(say(Text::SignIn), &Frame { language, person: None, kind: Kind::Of(of) }, main)).into_response()
 }
 
 /// What stands around every page.
@@ -650,12 +652,50 @@ struct Frame<'a> {
     language: Language,
     /// Who has signed in.
     person: Option<&'a Person>,
-    /// Whether maps are drawn on it.
-    is_cell: bool,
+    kind: Kind<'a>,
+}
+
+/// What a page is of, which decides what stands at its head.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PageOf {
+    /// One cell and its runs.
+    Cell,
+    /// All cells of a plant. It speaks English.
+    Plant,
+}
+
+/// What a page needs besides its words.
+#[derive(Clone, Copy)]
+enum Kind<'a> {
+    Of(PageOf),
+    /// A page of the cell on which maps are drawn.
+    WithMaps,
+    /// A page of the plant, which is asked for again after some seconds where it changes.
+    Plant {
+        again_s: Option<u32>,
+        style: &'a str,
+    },
+}
+
+impl Kind<'_> {
+    fn of(self) -> PageOf {
+        match self {
+            Self::Of(of) => of,
+            Self::WithMaps => PageOf::Cell,
+            Self::Plant { .. } => PageOf::Plant,
+        }
+    }
+}
+
+/// A page of the plant within the frame of every page. It is asked for again after `again_s` seconds; `style` is the address of what is its
+/// look beside that of the cell's page.
+pub fn plant_document(title: &str, session: &Session, again_s: Option<u32>, style: &str, main: Markup) -> Response {
+    let kind = Kind::Plant { again_s, style };
+    document(title, &Frame { language: Language::En, person: session.person.as_ref(), kind }, main)
 }
 
 fn document(title: &str, frame: &Frame, main: Markup) -> Response {
-    let Frame { language, person, is_cell } = *frame;
+    let Frame { language, person, kind } = *frame;
     let say = |text: Text| text.to(language);
     let markup = html! {
         (DOCTYPE)
@@ -666,9 +706,13 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
                 title { (title) " · Regrind" }
                 link rel="icon" href="/assets/icon.svg";
                 link rel="stylesheet" href="/assets/page.css";
+                @if let Kind::Plant { again_s, style } = kind {
+                    link rel="stylesheet" href=(style);
+                    @if let Some(again_s) = again_s { meta http-equiv="refresh" content=(again_s); }
+                }
                 script src="/assets/theme.js" {}
                 script src="/assets/post.js" defer {}
-                @if is_cell {
+                @if matches!(kind, Kind::WithMaps) {
                     script src="/assets/map.js" defer {}
                     script src="/assets/relief.js" defer {}
                     script src="/assets/page.js" defer {}
@@ -676,20 +720,27 @@ fn document(title: &str, frame: &Frame, main: Markup) -> Response {
             }
             body {
                 nav {
-                    a href="/" { (say(Text::Cell)) } " " a href="/runs" { (say(Text::Runs)) }
+                    @match kind.of() {
+                        PageOf::Cell => { a href="/" { (say(Text::Cell)) } " " a href="/runs" { (say(Text::Runs)) } }
+                        PageOf::Plant => {
+                            @for (path, name) in [("/", "Plant"), ("/trend", "Trend"), ("/cells", "Compare"), ("/parts", "Parts")] { a href=(path) { (name) } " " }
+                        }
+                    }
                     span .settings {
                         @if let Some(person) = person {
                             span .person { (person.name) " · " (say(texts::role(person.role))) } " "
                             button #sign-out type="button" { (say(Text::SignOut)) } " "
                         }
-                        label { (say(Text::Language)) " "
-                            select #language {
-                                @for each in Language::ALL {
-                                    option value=(each.tag()) lang=(each.tag()) selected[each == language] { (each.name()) }
+                        @if !matches!(kind, Kind::Plant { .. }) {
+                            label { (say(Text::Language)) " "
+                                select #language {
+                                    @for each in Language::ALL {
+                                        option value=(each.tag()) lang=(each.tag()) selected[each == language] { (each.name()) }
+                                    }
                                 }
                             }
+                            " "
                         }
-                        " "
                         label { (say(Text::Appearance)) " "
                             select #theme {
                                 @for (value, text) in [("", Text::AsTheSystem), ("light", Text::Light), ("dark", Text::Dark), ("contrast", Text::HighContrast)] {

@@ -1,4 +1,4 @@
-//! Many cells: their records and their work in one PostgreSQL.
+//! Many cells: their records and their work in one PostgreSQL, and a page that shows them.
 //!
 //! A cell never needs the plant to run, hold or accept, and the plant never commands a motion. What leaves the cell is its record; what
 //! comes in is work, and is asked for.
@@ -7,6 +7,7 @@ mod copy;
 mod error;
 mod hex;
 mod link;
+mod page;
 mod recipes;
 mod schema;
 mod settings;
@@ -17,6 +18,7 @@ mod work;
 pub use copy::{PlantRun, content};
 pub use error::PlantError;
 pub use link::Link;
+pub use page::PlantPage;
 pub use recipes::{Approval, PlantRecipe};
 pub use schema::{PlantRole, enrol, enrol_cell, is_known, migrate, retire_cell};
 pub use settings::{Approver, ArtefactSettings, DatabaseSettings};

@@ -6,11 +6,12 @@ use super::error::{PlantError, refused};
 use super::link::Link;
 
 /// Every version of the layout: what is put on top of the one before. A text that was handed out is never changed.
-const MIGRATIONS: [(i32, &str); 4] = [
+const MIGRATIONS: [(i32, &str); 5] = [
     (1, include_str!("migrations/0001_records.sql")),
     (2, include_str!("migrations/0002_work.sql")),
     (3, include_str!("migrations/0003_views.sql")),
     (4, include_str!("migrations/0004_studies.sql")),
+    (5, include_str!("migrations/0005_page.sql")),
 ];
 
 /// The groups of roles: what signs in is a member of one.
@@ -102,7 +103,7 @@ fn held_against_ours(applied: &[(i32, String)]) -> Result<i32, PlantError> {
 /// What a role of a person or a program is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PlantRole {
-    /// Looks at everything and changes nothing: who counts parts, or draws them by Grafana.
+    /// Looks at everything and changes nothing: the page of the plant, Grafana, who counts parts.
     Reader,
     /// Puts parts into the queue and brings recipes, besides looking.
     Planner,

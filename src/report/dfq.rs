@@ -27,7 +27,58 @@ pub(super) fn text(results: &Results) -> String {
     for of in results.measured.iter().filter(|of| !of.figures.is_empty()) {
         values(&mut file, results, of);
     }
-    if file.text.is_ascii() { file.text } else { format!("\u{feff}{}", file.text) }
+    file.whole()
+}
+
+/// A part of several, as it was judged last. Units: millimetres.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DfqPart {
+    /// Its serial number.
+    pub serial: String,
+    /// When it was begun, RFC 3339 in UTC.
+    pub utc: String,
+    /// What stands beside its values.
+    pub words: String,
+    /// PV and RMS, each with its expanded uncertainty; none where nothing was measured.
+    pub figures: [Option<[f64; 2]>; 2],
+    /// What is allowed of each.
+    pub limits_mm: [Option<f64>; 2],
+}
+
+/// Makes the file of several parts of one kind: PV and RMS, a value a part, in the order given. What is allowed stands in it where it is
+/// one and the same for all of them.
+pub fn dfq_of_parts(name: &str, remark: &str, parts: &[DfqPart]) -> String {
+    let mut file = Fields::default();
+    file.field("K0100", "2");
+    for (key, value) in [("K1001", name), ("K1002", name), ("K1203", "closed-loop grinding"), ("K1900", remark)] {
+        file.field(key, value);
+    }
+    for (k, (number, name)) in [("1", "PV"), ("2", "RMS")].into_iter().enumerate() {
+        let mut field = |key: &str, value: &str| file.field(&format!("{key}/{number}"), value);
+        for (key, value) in [("K2001", number), ("K2002", name), ("K2004", "0"), ("K2022", "6"), ("K2101", "0")] {
+            field(key, value);
+        }
+        let mut limits = parts.iter().map(|part| part.limits_mm[k]);
+        let first = limits.next().flatten();
+        if let Some(limit) = first.filter(|first| limits.all(|limit| limit == Some(*first))) {
+            for (key, value) in [("K2110", "0"), ("K2111", &mm(limit)), ("K2120", "2"), ("K2121", "1")] {
+                field(key, value);
+            }
+        }
+        field("K2142", "mm");
+    }
+    for part in parts {
+        for (number, figure) in (1..).zip(&part.figures) {
+            let mut field = |key: &str, value: &str| file.field(&format!("{key}/{number}"), value);
+            let Some([found, expanded]) = figure.filter(|[found, _]| found.is_finite()) else { continue };
+            field("K0001", &mm(found));
+            field("K0002", &VALID.to_string());
+            field("K0004", &when(&part.utc));
+            field("K0009", &format!("{}; U (k = 2) {} mm", part.words, mm(expanded)));
+            field("K0014", &part.serial);
+        }
+    }
+    file.whole()
 }
 
 fn part(file: &mut Fields, results: &Results) {
@@ -106,6 +157,11 @@ struct Fields {
 }
 
 impl Fields {
+    /// The text, with the mark of UTF-8 where it is more than ASCII.
+    fn whole(self) -> String {
+        if self.text.is_ascii() { self.text } else { format!("\u{feff}{}", self.text) }
+    }
+
     /// A field; one without a value is not written. What would end the line, or part a value from its companions, is a space; micrometres are um and ± is +-,
     /// for the sake of readers that know ASCII alone.
     fn field(&mut self, key: &str, value: &str) {

@@ -44,6 +44,7 @@ use regrind_formats::{FormatError, write_atomic};
 
 pub use axis::Scale;
 pub use colour::ColourMap;
+pub use dfq::{DfqPart, dfq_of_parts};
 pub use heat_map::HeatMap;
 pub use plot::{Axis, Plot, Series};
 pub use ply::{coloured_ply, save_coloured_ply};

@@ -8,6 +8,12 @@ mod keep;
 #[path = "../common/program.rs"]
 mod program;
 
+#[path = "../page/browser.rs"]
+#[allow(dead_code, reason = "not every key is pressed here")]
+mod browser;
+#[path = "../page/http.rs"]
+#[allow(dead_code, reason = "users and orders of a cell's page are in its own tests")]
+mod http;
 mod network;
 mod on_postgres;
 #[path = "../common/outlived.rs"]

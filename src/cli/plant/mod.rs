@@ -5,13 +5,14 @@ mod members;
 mod queue;
 mod recipes;
 mod runs;
+mod serve;
 pub(super) mod studies;
 
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
 use regrind::config::PlantConfig;
-use regrind_plant::Link;
+use regrind_plant::{DatabaseSettings, Link, PlantError};
 
 use super::failure::Failure;
 use super::{Outcome, check};
@@ -50,6 +51,7 @@ enum What {
     Queue(queue::ToQueue),
     Unqueue(queue::ToUnqueue),
     Work(queue::ToList),
+    Serve(serve::Arguments),
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
@@ -68,6 +70,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         What::Queue(of) => queue::queue(of),
         What::Unqueue(of) => queue::unqueue(of),
         What::Work(of) => queue::list(of),
+        What::Serve(of) => serve::serve(of),
     }
 }
 
@@ -90,13 +93,15 @@ pub(super) fn read(file: &Path) -> Result<PlantConfig, Failure> {
     check::or_show(PlantConfig::read(file))
 }
 
+/// The database that a plant file names, or what is wrong with it.
+fn database(config: &PlantConfig) -> Result<&DatabaseSettings, Failure> {
+    let missing = || config.problem("database", "is missing", "", "say where the database is, and who signs in");
+    check::or_show(config.database.as_ref().ok_or_else(missing))
+}
+
 /// Signs in to the database of a plant file, whose layout may be any.
 pub(super) async fn open_any(config: &PlantConfig) -> Result<Link, Failure> {
-    let Some(settings) = &config.database else {
-        let missing = config.problem("database", "is missing", "", "say where the database is, and who signs in");
-        return check::or_show(Err(missing));
-    };
-    Ok(Link::open(settings).await?)
+    Ok(Link::open(database(config)?).await?)
 }
 
 /// Signs in to the database of a plant file, which must be laid out as this program knows it.

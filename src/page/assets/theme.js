@@ -12,7 +12,7 @@
       else delete document.documentElement.dataset.theme;
       document.dispatchEvent(new Event("regrind-theme"));
     });
-    languages.addEventListener("change", () => {
+    if (languages) languages.addEventListener("change", () => {
       document.cookie = `regrind_language=${languages.value}; SameSite=Strict; Path=/; Max-Age=31536000`;
       location.reload();
     });

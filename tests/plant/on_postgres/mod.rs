@@ -3,6 +3,7 @@
 mod backup;
 mod book;
 mod layout;
+mod page;
 mod records;
 mod rights;
 mod studies;

@@ -1,0 +1,60 @@
+//! `regrind plant serve`: the page of all cells of a plant.
+
+use std::net::SocketAddr;
+
+use clap::Args;
+use regrind_page::{Door as PageDoor, PageOf};
+use regrind_plant::PlantPage;
+
+use super::super::Outcome;
+use super::super::failure::Failure;
+use super::super::serve::Door;
+use super::Where;
+
+/// Where the page is, if nothing else is said: beside that of a cell.
+const ADDRESS: &str = "127.0.0.1:7374";
+
+/// Show all cells, their parts and their trends as a page in the browser
+#[derive(Args, Debug)]
+#[command(after_help = "\
+The page looks and orders nothing: it signs in as a reader of the plant. It opens by the address that is printed, with its key, and on this
+computer only. For other computers it needs a certificate, by whose names they reach it, and users, who sign in (regrind users).
+
+Examples:
+  regrind plant enrol page --as reader --plant owner.toml --password-file page.password
+  regrind plant serve --plant page.toml
+  regrind plant serve --plant page.toml --listen 0.0.0.0:7374 --certificate plant.pem --key plant.key --users users.toml
+
+Exit codes: 0 stopped by Ctrl-C; 2 bad arguments, or the database refuses it. A database that cannot be reached is waited for.")]
+pub(super) struct Arguments {
+    /// Address and port of the page; a port of 0 takes any that is free
+    #[arg(long, value_name = "ADDRESS", default_value = ADDRESS)]
+    listen: SocketAddr,
+    #[command(flatten)]
+    door: Door,
+    #[command(flatten)]
+    plant: Where,
+}
+
+pub(super) fn serve(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let Arguments { listen, door, plant } = arguments;
+    let config = plant.read()?;
+    let settings = super::database(&config)?.clone();
+    super::super::runtime()?.block_on(async {
+        match super::open(&config).await {
+            Ok(_) => {}
+            Err(Failure::Plant(error)) if error.may_pass() => eprintln!("page: {error}; the page waits for it"),
+            Err(error) => return Err(error),
+        }
+        let (listener, entrance) = door.open(*listen).await?;
+        let log = Box::new(|what: &str| eprintln!("page: refused {what}"));
+        let door =
+            PageDoor::new(entrance, PageOf::Plant, log).map_err(|source| Failure::Page { address: *listen, source })?;
+        super::super::print(&format!("page     {}\n", door.url()))?;
+        tokio::select! {
+            () = door.serve(listener, PlantPage::new(settings, config.artefacts.clone()).routes()) => {}
+            ended = tokio::signal::ctrl_c() => ended.map_err(Failure::Terminal)?,
+        }
+        Ok(Outcome::Accepted)
+    })
+}

@@ -1,0 +1,238 @@
+//! Every cell as it told itself last, and when that was. What was told long ago is not how the cell is.
+
+use maud::{Markup, html};
+
+use super::super::error::PlantError;
+use super::super::link::Link;
+use super::super::{Row, ToSql};
+use super::words::{ago, encoded, range, shown};
+
+/// A cell tells every second; one that is silent for so long may do anything.
+const SILENCE_S: f64 = 60.0;
+/// Most cells on the page.
+const MOST: i64 = 2000;
+
+/// A cell, as the plant knows it.
+pub(super) struct CellNow {
+    name: String,
+    /// Seconds since it told; none where it never has.
+    heard_s: Option<f64>,
+    run: Option<String>,
+    state: String,
+    words: String,
+    simulation: bool,
+    part: String,
+    serial: String,
+    cycle: Option<[i32; 2]>,
+    done: Option<[i32; 2]>,
+    left_s: Option<[f64; 2]>,
+    alarms: i32,
+    next: String,
+}
+
+/// How a cell looks from two metres.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Look {
+    Runs,
+    Held,
+    Alarm,
+    Still,
+    /// Nobody knows.
+    Silent,
+}
+
+impl Look {
+    const ALL: [Self; 5] = [Self::Alarm, Self::Silent, Self::Held, Self::Runs, Self::Still];
+
+    fn class(self) -> &'static str {
+        match self {
+            Self::Runs => "runs",
+            Self::Held => "held",
+            Self::Alarm => "alarm",
+            Self::Still => "still",
+            Self::Silent => "lost",
+        }
+    }
+
+    fn words(self) -> &'static str {
+        match self {
+            Self::Runs => "at work",
+            Self::Held => "held",
+            Self::Alarm => "with an alarm or aborted",
+            Self::Still => "without a run",
+            Self::Silent => "not heard of",
+        }
+    }
+
+    /// A shape besides the colour.
+    fn shape(self) -> &'static str {
+        match self {
+            Self::Runs => "M6 3 L21 12 L6 21 Z",
+            Self::Held => "M5 3 H10 V21 H5 Z M14 3 H19 V21 H14 Z",
+            Self::Alarm => "M12 2 L23 21 H1 Z",
+            Self::Still => "M4 4 H20 V20 H4 Z",
+            Self::Silent => "M12 2 L22 12 L12 22 L2 12 Z",
+        }
+    }
+}
+
+/// Reads how the cells are, those that need somebody first.
+pub(super) async fn read(link: &Link) -> Result<Vec<CellNow>, PlantError> {
+    let text = "SELECT cell, extract(epoch FROM now() - told_at)::double precision, run, coalesce(state, ''), coalesce(words, ''),
+            coalesce(simulation, false), coalesce(part_name, ''), coalesce(serial, ''), cycle, most_cycles, done, total, left_least_s,
+            left_most_s, alarms, coalesce(next, '')
+        FROM cell_now ORDER BY cell LIMIT $1";
+    let mut cells: Vec<CellNow> =
+        link.ask(text, &[&MOST as &(dyn ToSql + Sync)]).await?.iter().map(CellNow::of).collect();
+    cells.sort_by_key(|cell| Look::ALL.iter().position(|look| *look == cell.look()));
+    Ok(cells)
+}
+
+impl CellNow {
+    fn of(row: &Row) -> Self {
+        let pair = |k: usize| Some([row.get::<_, Option<i32>>(k)?, row.get::<_, Option<i32>>(k + 1)?]);
+        let left = |k: usize| Some([row.get::<_, Option<f64>>(k)?, row.get::<_, Option<f64>>(k + 1)?]);
+        Self {
+            name: row.get(0),
+            heard_s: row.get(1),
+            run: row.get(2),
+            state: row.get(3),
+            words: row.get(4),
+            simulation: row.get(5),
+            part: row.get(6),
+            serial: row.get(7),
+            cycle: pair(8),
+            done: pair(10),
+            left_s: left(12),
+            alarms: row.get(14),
+            next: row.get(15),
+        }
+    }
+
+    fn is_silent(&self) -> bool {
+        self.heard_s.is_none_or(|seconds| seconds > SILENCE_S)
+    }
+
+    fn look(&self) -> Look {
+        match self.state.as_str() {
+            _ if self.is_silent() => Look::Silent,
+            "Aborting" | "Aborted" => Look::Alarm,
+            _ if self.alarms > 0 => Look::Alarm,
+            "Execute" | "Starting" | "Unholding" | "Unsuspending" | "Completing" => Look::Runs,
+            "Held" | "Holding" | "Suspending" | "Suspended" => Look::Held,
+            _ => Look::Still,
+        }
+    }
+
+    fn heard(&self) -> String {
+        match self.heard_s {
+            None => "never heard of".to_owned(),
+            Some(seconds) if self.is_silent() => format!("not heard of for {}", ago(seconds)),
+            Some(seconds) => format!("heard {} ago", ago(seconds)),
+        }
+    }
+}
+
+/// How many cells there are of each kind, in words.
+pub(super) fn tally(cells: &[CellNow]) -> String {
+    let of = |look: Look| (cells.iter().filter(|cell| cell.look() == look).count(), look);
+    let told = Look::ALL.map(of).into_iter().filter(|(count, _)| *count > 0);
+    let told: Vec<String> = told.map(|(count, look)| format!("{count} {}", look.words())).collect();
+    if told.is_empty() { "no cell is enrolled yet: regrind plant enrol".to_owned() } else { told.join(" · ") }
+}
+
+/// A card for each.
+pub(super) fn cards(cells: &[CellNow]) -> Markup {
+    html! { div .cells { @for cell in cells { (card(cell)) } } }
+}
+
+fn card(cell: &CellNow) -> Markup {
+    let look = cell.look();
+    html! {
+        article .cell .(look.class()) data-cell=(shown(&cell.name)) {
+            h3 {
+                svg .shape viewBox="0 0 24 24" aria-hidden="true" { path d=(look.shape()) {} }
+                span .name { (shown(&cell.name)) }
+                @if cell.simulation { span .simulation { "SIMULATION" } }
+            }
+            @if look == Look::Silent {
+                p .state { strong { (cell.heard()) } }
+                p { "What it does now is not known." @if !cell.words.is_empty() { " Then it said: " (shown(&cell.words)) } }
+                (of_part(cell))
+            } @else {
+                p .state { strong { (shown(if cell.words.is_empty() { &cell.state } else { &cell.words })) } }
+                (of_part(cell))
+                @if let Some([done, total]) = cell.done {
+                    progress max=(total.max(1)) value=(done.clamp(0, total.max(1))) aria-label="of the job under way" {}
+                    p .left { (done) " of " (total) @if let Some(left) = cell.left_s { ", " strong { (range(left)) } " left" } }
+                }
+                @if cell.alarms > 0 { p .alarms { strong { (cell.alarms) @if cell.alarms == 1 { " alarm" } @else { " alarms" } } } }
+                @if !cell.next.is_empty() && matches!(look, Look::Held | Look::Alarm) { p { "Next: " (shown(&cell.next)) } }
+                p .quiet { (cell.heard()) }
+            }
+        }
+    }
+}
+
+fn of_part(cell: &CellNow) -> Markup {
+    let Some(run) = &cell.run else { return Markup::default() };
+    html! {
+        p {
+            a href=(format!("/run?cell={}&name={}", encoded(&cell.name), encoded(run))) {
+                (shown(if cell.serial.is_empty() { run } else { &cell.serial }))
+            }
+            " " (shown(&cell.part))
+            @if let Some([cycle, most]) = cell.cycle.filter(|[cycle, _]| *cycle > 0) { ", cycle " (cycle) " of at most " (most) }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cell(state: &str, heard_s: Option<f64>, alarms: i32) -> CellNow {
+        CellNow {
+            name: "<script>".into(),
+            heard_s,
+            run: Some("r&s".into()),
+            state: state.into(),
+            words: String::new(),
+            simulation: true,
+            part: "<i>".into(),
+            serial: "\u{202e}42".into(),
+            cycle: Some([2, 6]),
+            done: Some([30, 300]),
+            left_s: Some([80.0, 130.0]),
+            alarms,
+            next: String::new(),
+        }
+    }
+
+    #[test]
+    fn a_cell_that_is_silent_is_never_shown_at_work() {
+        for heard in [None, Some(61.0), Some(1e9), Some(f64::NAN)] {
+            let silent = cell("Execute", heard.filter(|heard| !heard.is_nan()), 0);
+            assert_eq!(silent.look(), Look::Silent);
+            let card = card(&silent).into_string();
+            assert!(card.contains("is not known") && !card.contains("left") && !card.contains("runs"), "{card}");
+        }
+        let looks = [
+            ("Execute", 0, Look::Runs),
+            ("Execute", 1, Look::Alarm),
+            ("Held", 0, Look::Held),
+            ("Idle", 0, Look::Still),
+        ];
+        for (state, alarms, look) in looks {
+            assert_eq!(cell(state, Some(1.0), alarms).look(), look);
+        }
+    }
+
+    #[test]
+    fn what_a_cell_tells_is_words() {
+        let card = card(&cell("Execute", Some(1.0), 0)).into_string();
+        assert!(!card.contains("<script>") && !card.contains("<i>") && !card.contains('\u{202e}'), "{card}");
+        assert!(card.contains("name=r%26s") && card.contains("1 – 2 min") && card.contains("SIMULATION"), "{card}");
+        assert!(tally(&[cell("Held", Some(1.0), 0)]).contains("1 held"));
+    }
+}

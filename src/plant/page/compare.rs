@@ -1,0 +1,212 @@
+//! `/cells`: the cells beside each other, of one recipe: how their parts came out, and whether a difference is more than chance.
+
+use axum::Extension;
+use axum::extract::{Query, RawQuery, State};
+use axum::response::Response;
+use maud::{Markup, html};
+use regrind_page::Session;
+
+use super::super::ToSql;
+use super::super::error::PlantError;
+use super::super::link::Link;
+use super::rank::{ENOUGH, holm, rank_sum};
+use super::selection::{Asked, Selection, mark};
+use super::words::{encoded, interval, share, shown, um};
+use super::{Made, Shared, Unmade, page};
+
+/// Most cells that are compared at once, and most parts of each, the newest.
+const CELLS: usize = 40;
+const PARTS: i64 = 200;
+/// By how rare a chance something is told to be none.
+const CHANCE: f64 = 0.05;
+
+/// The parts of a cell.
+#[derive(Default)]
+struct Cell {
+    name: String,
+    /// In order of size.
+    pv_um: Vec<f64>,
+    cycles: Vec<i32>,
+    ended: i64,
+    accepted: i64,
+    at_once: i64,
+}
+
+pub(super) async fn cells(
+    State(plant): State<Shared>,
+    Extension(session): Extension<Session>,
+    Query(asked): Query<Asked>,
+    RawQuery(query): RawQuery,
+) -> Response {
+    let after = query.as_deref().unwrap_or_default().split('&').find_map(|pair| pair.strip_prefix("after="));
+    page(&session, made(&plant, &asked, after.and_then(|after| after.parse().ok()).unwrap_or(0))).await
+}
+
+async fn made(plant: &Shared, asked: &Asked, after: usize) -> Result<Made, Unmade> {
+    let link = plant.lease().await?;
+    let selection = Selection::of(&link, asked).await?;
+    let form = selection.form(&link, "/cells", &["recipe", "grinder", "cmm", "wheel", "probe"]).await?;
+    let mut cells = read(&link, &selection, after).await?;
+    let more = cells.len() > CELLS;
+    cells.truncate(CELLS);
+    cells.retain(|cell| cell.ended > 0 || !cell.pv_um.is_empty());
+    let chances = chances(&cells);
+    let main = html! {
+        main .list .plant {
+            h1 { "Cells compared " (mark(selection.simulated)) }
+            (form)
+            p .quiet { (selection.words()) ", of each cell the newest " (PARTS) " at most." }
+            @if selection.recipe().is_empty() {
+                p .no { "Parts of several recipes are compared: a cell may differ by what it was given to make. Choose a recipe." }
+            }
+            @if cells.is_empty() { p { "No cell has made such a part." } } @else { div .wide { (table(&cells, &chances, &selection)) } }
+            @if more { p { a href=(format!("/cells?{}&after={}", selection.query(), after + CELLS)) { "Further cells" } } }
+            p .quiet {
+                "Whether a cell differs: its PV against those of all other cells that are shown, by the rank sum of Mann and Whitney (two-sided, " (ENOUGH) " parts at least \
+                 on either side), corrected by Holm for how many cells are looked at; below " (format!("{:.0} %", 100.0 * CHANCE)) " it is told to be more than chance. \
+                 That takes each part for one draw: what drifts within a cell looks like a difference too. The box holds the middle half, its line is the median, \
+                 the whiskers reach to the least and the largest."
+            }
+        }
+    };
+    Ok(Made { title: "Cells".into(), again_s: None, main })
+}
+
+/// Reads the parts of one more cell than are shown.
+async fn read(link: &Link, selection: &Selection, after: usize) -> Result<Vec<Cell>, PlantError> {
+    let (condition, values) = selection.condition();
+    let n = values.len();
+    // A cell at a time, each from the end of its own index.
+    let text = format!(
+        "SELECT c.name, p.pv_um, p.cycles, p.result FROM (SELECT name FROM cell WHERE retired_at IS NULL ORDER BY name LIMIT ${} OFFSET ${}) c
+            LEFT JOIN LATERAL (SELECT pv_um, cycles, result FROM part_run WHERE cell = c.name AND ended IS NOT NULL AND {condition}
+                ORDER BY began DESC LIMIT {PARTS}) p ON true ORDER BY c.name",
+        n + 1,
+        n + 2
+    );
+    let (most, after) = (CELLS as i64 + 1, after as i64);
+    let mut given: Vec<&(dyn ToSql + Sync)> = values.iter().map(|value| value as &(dyn ToSql + Sync)).collect();
+    given.extend([&most as &(dyn ToSql + Sync), &after]);
+    let mut cells: Vec<Cell> = Vec::new();
+    for row in link.ask(&text, &given).await? {
+        let name: String = row.get(0);
+        if cells.last().is_none_or(|last| last.name != name) {
+            cells.push(Cell { name, ..Cell::default() });
+        }
+        let Some(cell) = cells.last_mut() else { continue };
+        let (cycles, result): (Option<i32>, Option<&str>) = (row.get(2), row.get(3));
+        let Some(result) = result.filter(|result| *result != "open") else { continue };
+        cell.ended += 1;
+        cell.accepted += i64::from(result == "accepted");
+        cell.at_once += i64::from(result == "accepted" && cycles == Some(1));
+        cell.cycles.extend(cycles);
+        cell.pv_um.extend(row.get::<_, Option<f64>>(1).filter(|um| um.is_finite()));
+    }
+    for cell in &mut cells {
+        cell.pv_um.sort_by(f64::total_cmp);
+    }
+    Ok(cells)
+}
+
+/// By what chance each cell would differ so from the others, corrected for all of them.
+fn chances(cells: &[Cell]) -> Vec<Option<f64>> {
+    let others = |k: usize| -> Vec<f64> {
+        cells
+            .iter()
+            .enumerate()
+            .filter(|(other, _)| *other != k)
+            .flat_map(|(_, cell)| cell.pv_um.iter().copied())
+            .collect()
+    };
+    let found: Vec<_> = (0..cells.len()).map(|k| rank_sum(&cells[k].pv_um, &others(k))).collect();
+    holm(&found)
+}
+
+/// A value below which a share of sorted values lies, between the two next to it.
+fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
+    let at = share * (sorted.len().checked_sub(1)?) as f64;
+    let (below, above) = (at.floor() as usize, at.ceil() as usize);
+    Some(sorted[below] + (at - at.floor()) * (sorted[above] - sorted[below]))
+}
+
+fn table(cells: &[Cell], chances: &[Option<f64>], selection: &Selection) -> Markup {
+    let all = || cells.iter().flat_map(|cell| cell.pv_um.iter().copied());
+    let scale = [all().fold(f64::INFINITY, f64::min), all().fold(0.0, f64::max)];
+    let mean = |cycles: &[i32]| cycles.iter().map(|n| f64::from(*n)).sum::<f64>() / cycles.len() as f64;
+    html! {
+        table .compared {
+            tr {
+                th { "Cell" } th .n { "n" } th .n { "median PV, µm" } th { "PV, " (um(Some(scale[0]), 2)) " to " (um(Some(scale[1]), 2)) " µm" } th .n { "yield" } th .n { "first pass" }
+                th .n { "95 %" } th .n { "cycles a part" } th { "differs from the others" }
+            }
+            @for (cell, chance) in cells.iter().zip(chances) {
+                tr data-cell=(cell.name) {
+                    td { a href=(format!("/trend?{}&cell={}", selection.query(), encoded(&cell.name))) { (shown(&cell.name)) } }
+                    td .n { (cell.ended) } td .n { strong { (um(quantile(&cell.pv_um, 0.5), 3)) } }
+                    td .box { (drawn(&cell.pv_um, scale)) }
+                    td .n { (share(cell.accepted, cell.ended)) } td .n { (share(cell.at_once, cell.ended)) } td .n .quiet { (interval(cell.at_once, cell.ended)) }
+                    td .n { @if cell.cycles.is_empty() { "–" } @else { (format!("{:.2}", mean(&cell.cycles))) } }
+                    td { (told(*chance)) }
+                }
+            }
+        }
+    }
+}
+
+fn told(chance: Option<f64>) -> Markup {
+    html! {
+        @match chance {
+            None => { span .quiet { "too few to tell" } }
+            Some(chance) if chance < CHANCE => { strong { "more than chance" } " (" (probability(chance)) ")" }
+            Some(chance) => { "no more than chance (" (probability(chance)) ")" }
+        }
+    }
+}
+
+fn probability(p: f64) -> String {
+    if p < 0.0001 { "p < 0.0001".to_owned() } else { format!("p = {p:.4}") }
+}
+
+/// The box of sorted values, on a scale of what all cells have.
+fn drawn(sorted: &[f64], [from, to]: [f64; 2]) -> Markup {
+    let [Some(least), Some(low), Some(median), Some(high), Some(largest)] =
+        [0.0, 0.25, 0.5, 0.75, 1.0].map(|share| quantile(sorted, share))
+    else {
+        return Markup::default();
+    };
+    let per_um = 232.0 / (to - from).max(1e-9);
+    let x = |value: f64| format!("{:.1}", 4.0 + per_um * (value - from));
+    let width = |from: f64, to: f64| format!("{:.1}", (per_um * (to - from)).max(1.0));
+    html! {
+        svg viewBox="0 0 240 22" role="img" aria-label=(format!("{least:.2}, {low:.2}, {median:.2}, {high:.2}, {largest:.2} µm")) {
+            line .whisker x1=(x(least)) x2=(x(largest)) y1="11" y2="11" {}
+            rect .middle x=(x(low)) width=(width(low, high)) y="4" height="14" {}
+            line .median x1=(x(median)) x2=(x(median)) y1="2" y2="20" {}
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quantiles_lie_between_values() {
+        let sorted = [1.0, 2.0, 4.0];
+        assert_eq!(
+            [0.0, 0.25, 0.5, 1.0].map(|share| quantile(&sorted, share)),
+            [Some(1.0), Some(1.5), Some(2.0), Some(4.0)]
+        );
+        assert_eq!(quantile(&[], 0.5), None);
+    }
+
+    #[test]
+    fn a_cell_that_is_worse_is_told_and_its_like_are_not() {
+        let cell = |shift: f64| Cell {
+            pv_um: (0..30).map(|k| 3.0 + shift + 0.05 * f64::from(k)).collect(),
+            ..Cell::default()
+        };
+        let told = chances(&[cell(0.0), cell(0.01), cell(1.5), cell(0.02)]);
+        assert!(told[2].unwrap() < 1e-4 && told[1].unwrap() > 0.01, "{told:?}");
+    }
+}

@@ -1,0 +1,161 @@
+//! What other programs take: the parts of a selection as CSV, and as DFQ.
+
+use std::fmt::Write;
+
+use axum::Extension;
+use axum::extract::{Query, State};
+use axum::response::Response;
+use regrind_page::Session;
+use regrind_report::{DfqPart, dfq_of_parts};
+
+use super::super::{Row, ToSql};
+use super::control_chart::Value;
+use super::run::file;
+use super::selection::{Asked, Selection};
+use super::trend::parts;
+use super::{PlantPage, Shared, Unmade, unmade, within};
+
+/// Most parts in a file.
+const MOST: i64 = 20_000;
+
+/// The columns of the file, in their order: those of the view `part_run`.
+const COLUMNS: [&str; 26] = [
+    "id",
+    "cell",
+    "run",
+    "serial",
+    "part_name",
+    "recipe",
+    "recipe_sha256",
+    "operator",
+    "simulation",
+    "began",
+    "ended",
+    "result",
+    "verdict",
+    "cycles",
+    "pv_um",
+    "pv_u_um",
+    "pv_limit_um",
+    "rms_um",
+    "rms_u_um",
+    "rms_limit_um",
+    "grinder",
+    "cmm",
+    "wheel",
+    "probe",
+    "alarms",
+    "head",
+];
+/// What of them is a number or a word of the program's own; everything else may be any text.
+const NUMBERS: [&str; 11] = [
+    "id",
+    "simulation",
+    "cycles",
+    "pv_um",
+    "pv_u_um",
+    "pv_limit_um",
+    "rms_um",
+    "rms_u_um",
+    "rms_limit_um",
+    "alarms",
+    "head",
+];
+
+pub(super) async fn csv(
+    State(plant): State<Shared>,
+    Extension(session): Extension<Session>,
+    Query(asked): Query<Asked>,
+) -> Response {
+    match within(csv_of(&plant, &asked)).await {
+        Ok(text) => file("parts.csv", "text/csv; charset=utf-8", text),
+        Err(why) => unmade(&session, &why),
+    }
+}
+
+async fn csv_of(plant: &PlantPage, asked: &Asked) -> Result<String, Unmade> {
+    let link = plant.lease().await?;
+    let selection = Selection::of(&link, asked).await?;
+    let (condition, values) = selection.condition();
+    let column = |name: &&str| match *name {
+        time @ ("began" | "ended") => format!("to_char({time}, 'YYYY-MM-DD\"T\"HH24:MI:SS\"Z\"')"),
+        other => format!("{other}::text"),
+    };
+    let columns = COLUMNS.iter().map(column).collect::<Vec<_>>().join(", ");
+    let text = format!("SELECT {columns} FROM part_run WHERE {condition} ORDER BY began DESC LIMIT {MOST}");
+    let values: Vec<_> = values.iter().map(|value| value as &(dyn ToSql + Sync)).collect();
+    let rows = link.ask(&text, &values).await?;
+    let mut file = format!("{}\r\n", COLUMNS.join(","));
+    for row in &rows {
+        line(&mut file, row);
+    }
+    Ok(file)
+}
+
+fn line(file: &mut String, row: &Row) {
+    for (k, name) in COLUMNS.iter().enumerate() {
+        let text = row.get::<_, Option<&str>>(k).unwrap_or_default();
+        let comma = if k == 0 { "" } else { "," };
+        let _ = match NUMBERS.contains(name) {
+            true => write!(file, "{comma}{text}"),
+            false => write!(file, "{comma}{}", quoted(text)),
+        };
+    }
+    file.push_str("\r\n");
+}
+
+/// A text as a field (RFC 4180). One that a spreadsheet would take for a formula has an apostrophe before it, which makes it a text there.
+fn quoted(text: &str) -> String {
+    let formula = text.starts_with(['=', '+', '-', '@', '\t', '\r']);
+    format!("\"{}{}\"", if formula { "'" } else { "" }, text.replace('"', "\"\""))
+}
+
+pub(super) async fn dfq(
+    State(plant): State<Shared>,
+    Extension(session): Extension<Session>,
+    Query(asked): Query<Asked>,
+) -> Response {
+    match within(dfq_of(&plant, &asked)).await {
+        Ok(text) => file("parts.dfq", "text/plain; charset=utf-8", text),
+        Err(why) => unmade(&session, &why),
+    }
+}
+
+async fn dfq_of(plant: &PlantPage, asked: &Asked) -> Result<String, Unmade> {
+    let link = plant.lease().await?;
+    let selection = Selection::of(&link, asked).await?;
+    let parts = parts(&link, &selection, MOST).await?;
+    if parts.is_empty() {
+        return Err(Unmade::NotHere(
+            "nothing was measured of such parts; choose others on the page of the trend".into(),
+        ));
+    }
+    let figure = |value: &Value| [1e-3 * value.um, 1e-3 * value.u_um.unwrap_or(f64::NAN)];
+    let rows: Vec<DfqPart> = parts
+        .iter()
+        .map(|part| DfqPart {
+            serial: part.pv.serial.clone(),
+            utc: part.pv.when.replacen(' ', "T", 1),
+            words: format!("cell {}", part.pv.cell),
+            figures: [Some(figure(&part.pv)), part.rms.as_ref().map(figure)],
+            limits_mm: [Some(&part.pv), part.rms.as_ref()]
+                .map(|value| value.and_then(|value| value.limit_um).map(|um| 1e-3 * um)),
+        })
+        .collect();
+    let mark = if selection.simulated { "SIMULATION. " } else { "" };
+    let when = if selection.first { "measured before any correction" } else { "as judged last" };
+    let name = if selection.recipe().is_empty() { "several recipes" } else { selection.recipe() };
+    Ok(dfq_of_parts(name, &format!("{mark}{}, {when}", selection.words()), &rows))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_field_is_one_field_and_no_formula() {
+        assert_eq!(quoted("a \"b\",\r\nc"), "\"a \"\"b\"\",\r\nc\"");
+        assert_eq!(quoted("=1+1"), "\"'=1+1\"");
+        assert!(NUMBERS.iter().all(|name| COLUMNS.contains(name)));
+    }
+}

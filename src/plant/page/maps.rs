@@ -1,0 +1,227 @@
+//! `/maps`: error maps of runs side by side, on one scale of colours.
+
+use std::path::Path;
+
+use axum::Extension;
+use axum::extract::{RawQuery, State};
+use axum::response::Response;
+use maud::{Markup, PreEscaped, html};
+use regrind_formats::{MapNode, parse_error_map};
+use regrind_page::Session;
+use regrind_report::HeatMap;
+use tokio::task::spawn_blocking;
+
+use super::super::copy::content;
+use super::super::link::Link;
+use super::selection::mark;
+use super::words::{shown, um};
+use super::{Made, Shared, Unmade, page};
+
+/// Most maps at once.
+const MOST: usize = 4;
+/// Largest map, in pixels of the page.
+const LARGEST: [f64; 2] = [400.0, 400.0];
+/// A title is cut where it would be wider than the picture.
+const TITLE: usize = 52;
+
+/// A map that is asked for: of a run, and of its last cycle where none is named.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Asked {
+    run: i32,
+    cycle: Option<i32>,
+}
+
+/// A map, with what it is of.
+struct Map {
+    run: i32,
+    cycle: i32,
+    serial: String,
+    cell: String,
+    recipe: String,
+    simulation: bool,
+    pv_um: Option<f64>,
+    rms_um: Option<f64>,
+    /// Samples (x, y, error), millimetres and micrometres; in words why there are none.
+    samples: Result<Vec<[f64; 3]>, String>,
+}
+
+pub(super) async fn maps(
+    State(plant): State<Shared>,
+    Extension(session): Extension<Session>,
+    RawQuery(query): RawQuery,
+) -> Response {
+    let asked = asked(query.as_deref().unwrap_or_default());
+    page(&session, made(&plant, &asked)).await
+}
+
+/// `run=17&run=18:2`: runs by their numbers, and cycles behind a colon.
+fn asked(query: &str) -> Vec<Asked> {
+    let named = query.split('&').filter_map(|pair| pair.strip_prefix("run="));
+    let one = |text: &str| {
+        let text = text.replace("%3A", ":").replace("%3a", ":");
+        let (run, cycle) = text.split_once(':').map_or((text.as_str(), None), |(run, cycle)| (run, Some(cycle)));
+        Some(Asked { run: run.parse().ok()?, cycle: cycle.map(str::parse).transpose().ok()? })
+    };
+    named.filter_map(one).take(MOST).collect()
+}
+
+async fn made(plant: &Shared, asked: &[Asked]) -> Result<Made, Unmade> {
+    if asked.is_empty() {
+        return Err(Unmade::Nonsense(
+            "name the runs, as in /maps?run=17&run=18, or tick them in the list of parts".into(),
+        ));
+    }
+    let mut maps = Vec::new();
+    {
+        let link = plant.lease().await?;
+        for one in asked {
+            maps.push(read(plant, &link, *one).await?);
+        }
+    }
+    let drawn = spawn_blocking(move || side_by_side(&maps)).await;
+    let main = html! {
+        main .list .plant {
+            h1 { "Maps" }
+            (drawn.unwrap_or_default())
+        }
+    };
+    Ok(Made { title: "Maps".into(), again_s: None, main })
+}
+
+async fn read(plant: &Shared, link: &Link, asked: Asked) -> Result<Map, Unmade> {
+    let text = "SELECT cycle, serial, cell, recipe, simulation, pv_um, rms_um, map FROM cycle_figure
+        WHERE run_id = $1 AND map IS NOT NULL AND ($2::integer IS NULL OR cycle = $2) ORDER BY cycle DESC LIMIT 1";
+    let rows = link.ask(text, &[&asked.run, &asked.cycle]).await?;
+    let Some(row) = rows.first() else { return without(link, asked).await };
+    let words = |k: usize| row.get::<_, Option<String>>(k).unwrap_or_default();
+    let name = words(7);
+    Ok(Map {
+        run: asked.run,
+        cycle: row.get(0),
+        serial: words(1),
+        cell: words(2),
+        recipe: words(3),
+        simulation: row.get::<_, Option<bool>>(4) == Some(true),
+        pv_um: row.get(5),
+        rms_um: row.get(6),
+        samples: samples(plant, link, asked.run, &name).await?,
+    })
+}
+
+/// A run that has none, beside others that have.
+async fn without(link: &Link, asked: Asked) -> Result<Map, Unmade> {
+    let text = "SELECT serial, cell, recipe, simulation, pv_um, rms_um FROM part_run WHERE id = $1";
+    let rows = link.ask(text, &[&asked.run]).await?;
+    let missing = || Unmade::NotHere(format!("the plant has no run {} that made a part", asked.run));
+    let row = rows.first().ok_or_else(missing)?;
+    let words = |k: usize| row.get::<_, Option<String>>(k).unwrap_or_default();
+    Ok(Map {
+        run: asked.run,
+        cycle: asked.cycle.unwrap_or(0),
+        serial: words(0),
+        cell: words(1),
+        recipe: words(2),
+        simulation: row.get::<_, Option<bool>>(3) == Some(true),
+        pv_um: row.get(4),
+        rms_um: row.get(5),
+        samples: Err("the plant knows of none".into()),
+    })
+}
+
+/// Reads a map from among the files of a run; in words why there is none.
+async fn samples(plant: &Shared, link: &Link, run: i32, name: &str) -> Result<Result<Vec<[f64; 3]>, String>, Unmade> {
+    let rows = link.ask("SELECT sha256 FROM run_artefact WHERE run = $1 AND name = $2", &[&run, &name]).await?;
+    let [row] = &rows[..] else { return Ok(Err("its file is not on record, or more than one is by that name".into())) };
+    let sha256: Vec<u8> = row.get(0);
+    let Some(content) = content(link, plant.artefacts.as_ref(), &sha256).await? else {
+        return Ok(Err("its file has not arrived yet".into()));
+    };
+    if regrind_journal::sha256_hex(&content) != super::super::hex::digits(&sha256) {
+        return Ok(Err("the plant's copy of its file is not what was written".into()));
+    }
+    let name = name.to_owned();
+    let parsed = spawn_blocking(move || {
+        let text = String::from_utf8(content).map_err(|_| "its file is no text".to_owned())?;
+        let nodes = parse_error_map(Path::new(&name), &text).map_err(|error| error.to_string())?;
+        Ok(nodes.iter().map(MapNode::error).map(|[x, y, error_mm]| [x, y, 1e3 * error_mm]).collect())
+    });
+    Ok(parsed.await.unwrap_or_else(|_| Err("it could not be read".into())))
+}
+
+/// Draws maps from minus to plus the largest error of all of them.
+fn side_by_side(maps: &[Map]) -> Markup {
+    let all = maps.iter().filter_map(|map| map.samples.as_ref().ok()).flatten();
+    let limit = all.fold(0.0_f64, |most, sample| most.max(sample[2].abs()));
+    html! {
+        div .maps {
+            @for map in maps {
+                figure data-run=(map.run) {
+                    (drawn(map, limit))
+                    figcaption {
+                        a href=(format!("/runs/{}", map.run)) { (shown(&map.serial)) } @if map.cycle > 0 { ", cycle " (map.cycle) } ", " (shown(&map.cell)) ", " (shown(&map.recipe)) " " (mark(map.simulation))
+                        br; "judged: PV " (um(map.pv_um, 2)) " µm, RMS " (um(map.rms_um, 3)) " µm"
+                    }
+                }
+            }
+        }
+        p .quiet {
+            "One scale for all: " (format!("± {limit:.2}")) " µm. Red stands proud of the nominal surface, blue lies below it, near white is zero. The maps are filtered: PV and RMS of a map are not \
+             those that are judged. Each file is what its hash on record says."
+        }
+    }
+}
+
+fn drawn(map: &Map, limit_um: f64) -> Markup {
+    let title =
+        format!("{}, cycle {}{}", shown(&map.serial), map.cycle, if map.simulation { " (SIMULATION)" } else { "" });
+    let title: String = title.chars().take(TITLE).collect();
+    let svg = map.samples.as_ref().map_err(Clone::clone).and_then(|samples| {
+        let heat = HeatMap::new(&title, "deviation", "\u{b5}m", samples)
+            .and_then(|heat| heat.of_nodes().at_most(LARGEST).with_limit(limit_um));
+        heat.and_then(|heat| heat.to_svg()).map_err(|error| error.to_string())
+    });
+    match svg {
+        // The page takes no style from within itself; the same is said without one.
+        Ok(svg) => PreEscaped(
+            svg.replace(" style=\"image-rendering:pixelated\"", " image-rendering=\"pixelated\"")
+                .replace(" style=\"image-rendering:auto\"", ""),
+        ),
+        Err(why) => html! { p .no { "No map: " (shown(&why)) } },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn runs_are_named_by_numbers_alone() {
+        let of = |run, cycle| Asked { run, cycle };
+        assert_eq!(asked("run=17&run=18:2&run=9%3A1&x=3"), [of(17, None), of(18, Some(2)), of(9, Some(1))]);
+        assert_eq!(asked("run=1;DROP&run=&run=%3A&run=1:x"), []);
+        assert_eq!(asked(&"run=1&".repeat(9)).len(), MOST);
+    }
+
+    #[test]
+    fn maps_share_one_scale_and_what_is_none_is_said() {
+        let map = |um: f64, samples: bool| Map {
+            run: 1,
+            cycle: 2,
+            serial: "<b>".into(),
+            cell: "c".into(),
+            recipe: "r".into(),
+            simulation: true,
+            pv_um: Some(3.0),
+            rms_um: None,
+            samples: if samples {
+                Ok((0..25).map(|k| [f64::from(k % 5), f64::from(k / 5), um * f64::from(k) / 24.0]).collect())
+            } else {
+                Err("<i>gone".into())
+            },
+        };
+        let html = side_by_side(&[map(1.0, true), map(-4.0, true), map(0.0, false)]).into_string();
+        assert!(html.contains("± 4.00 µm") && html.contains("&lt;i&gt;gone") && !html.contains("<b>"), "{html}");
+        assert_eq!(html.matches("<svg").count(), 2);
+        assert!(!html.contains("style="), "the page takes none");
+    }
+}

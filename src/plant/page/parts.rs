@@ -1,0 +1,116 @@
+//! `/parts`: parts by how their serial numbers begin; without one, the newest.
+
+use axum::Extension;
+use axum::extract::{Query, State};
+use axum::response::Response;
+use maud::{Markup, html};
+use regrind_page::Session;
+use serde::Deserialize;
+
+use super::super::error::PlantError;
+use super::super::link::Link;
+use super::super::{Row, ToSql};
+use super::words::{encoded, shown, um};
+use super::{Made, Shared, Unmade, page};
+
+/// Most parts on a page.
+const MOST: usize = 100;
+/// What comes behind every text that begins with another: the last character there is.
+const LAST: char = char::MAX;
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+pub(super) struct Asked {
+    serial: String,
+    /// Goes on behind this run.
+    after: Option<i32>,
+}
+
+pub(super) async fn parts(
+    State(plant): State<Shared>,
+    Extension(session): Extension<Session>,
+    Query(asked): Query<Asked>,
+) -> Response {
+    page(&session, made(&plant, &asked)).await
+}
+
+async fn made(plant: &Shared, asked: &Asked) -> Result<Made, Unmade> {
+    let serial = asked.serial.trim().replace('\0', "");
+    let link = plant.lease().await?;
+    let rows = read(&link, &serial, asked.after).await?;
+    let next = (rows.len() > MOST).then(|| rows[MOST - 1].get::<_, i32>(0));
+    let main = html! {
+        main .list .plant {
+            h1 { "Parts" }
+            form .filter method="get" action="/parts" {
+                label { "Serial number begins with " input name="serial" value=(serial) autofocus; } button { "Search" }
+            }
+            @if rows.is_empty() { p { "No part's serial number begins so. Capital and small letters are told apart." } } @else {
+                form method="get" action="/maps" {
+                    div .wide { (table(&rows[..rows.len().min(MOST)])) }
+                    p { "Tick two to four: " button { "Maps side by side" } }
+                }
+            }
+            @if let Some(next) = next { p { a href=(format!("/parts?serial={}&after={next}", encoded(&serial))) { "More" } } }
+            p .quiet { @if serial.is_empty() { "The newest first." } @else { "By serial number, of each the newest first." } }
+        }
+    };
+    Ok(Made { title: "Parts".into(), again_s: None, main })
+}
+
+const COLUMNS: &str = "id, serial, part_name, recipe, cell, run, to_char(began, 'YYYY-MM-DD HH24:MI:SS'), cycles, pv_um, rms_um, result, simulation";
+
+/// Reads one more than are shown, in the order of an index: nothing is sorted, however many begin so.
+async fn read(link: &Link, serial: &str, after: Option<i32>) -> Result<Vec<Row>, PlantError> {
+    let most = MOST as i64 + 1;
+    let (place, mut values): (_, Vec<&(dyn ToSql + Sync)>) = (after, vec![&most]);
+    let last = format!("{serial}{LAST}");
+    let mut text = format!("SELECT {COLUMNS} FROM part_run WHERE true");
+    if !serial.is_empty() {
+        values.extend([&serial as &(dyn ToSql + Sync), &last]);
+        text += " AND serial ~>=~ $2::text AND serial ~<~ $3::text";
+    }
+    if let Some(after) = &place {
+        values.push(after);
+        let n = values.len();
+        text += &match serial.is_empty() {
+            true => format!(" AND (began, id) < (SELECT began, id FROM part_run WHERE id = ${n})"),
+            // The rest of the same part, or a later serial number.
+            false => format!(
+                " AND serial ~>=~ (SELECT serial FROM part_run WHERE id = ${n}) AND (serial <> (SELECT serial FROM part_run WHERE id = ${n})
+                    OR (began, id) < (SELECT began, id FROM part_run WHERE id = ${n}))"
+            ),
+        };
+    }
+    text += match serial.is_empty() {
+        true => " ORDER BY began DESC, id DESC LIMIT $1",
+        false => " ORDER BY serial USING ~<~, began DESC, id DESC LIMIT $1",
+    };
+    link.ask(&text, &values).await
+}
+
+fn table(rows: &[Row]) -> Markup {
+    html! {
+        table .parts {
+            tr {
+                th {} th { "Serial number" } th { "Part" } th { "Recipe" } th { "Cell" } th { "Began, UTC" } th .n { "Cycles" } th .n { "PV, µm" } th .n { "RMS, µm" } th { "Result" }
+            }
+            @for row in rows {
+                @let id = row.get::<_, i32>(0);
+                @let [serial, part, recipe, cell, run] = [1, 2, 3, 4, 5].map(|k| row.get::<_, Option<&str>>(k).unwrap_or_default());
+                @let result = row.get::<_, Option<&str>>(10).unwrap_or("open");
+                tr {
+                    td { input type="checkbox" name="run" value=(id) aria-label=(run); }
+                    td { a href=(format!("/runs/{id}")) { @if serial.is_empty() { (shown(run)) } @else { (shown(serial)) } } }
+                    td { (shown(part)) } td { (shown(recipe)) } td { (shown(cell)) }
+                    td { (row.get::<_, Option<&str>>(6).unwrap_or_default()) }
+                    td .n { (row.get::<_, Option<i32>>(7).map_or("–".to_owned(), |cycles| cycles.to_string())) }
+                    td .n { (um(row.get(8), 2)) } td .n { (um(row.get(9), 3)) }
+                    td class=(if result == "accepted" { "good" } else { "" }) {
+                        (shown(result)) @if row.get::<_, Option<bool>>(11) == Some(true) { " " span .quiet { "(simulated)" } }
+                    }
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,88 @@
+//! A few connections to the database, kept between questions. They read only, and no question of theirs takes long.
+
+use std::ops::Deref;
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+
+use tokio::sync::{Semaphore, SemaphorePermit};
+
+use super::super::error::{PlantError, refused};
+use super::super::link::Link;
+use super::super::schema::is_known;
+use super::super::settings::DatabaseSettings;
+
+/// How many there are at most.
+const LINKS: usize = 4;
+/// How long somebody waits for one that another has, and for a sign of life of one that was kept.
+const TURN: Duration = Duration::from_secs(5);
+const SIGN_OF_LIFE: Duration = Duration::from_secs(2);
+/// What the server keeps to for each of them. Compiling a question would take longer than answering it.
+const RULES: &str = "SET statement_timeout = '5s'; SET default_transaction_read_only = on; SET jit = off";
+
+pub(super) struct Pool {
+    database: DatabaseSettings,
+    places: Semaphore,
+    idle: Mutex<Vec<Link>>,
+}
+
+/// A connection that goes back when nobody needs it any more, if it can still be asked something.
+pub(super) struct Lease<'p> {
+    link: Option<Link>,
+    pool: &'p Pool,
+    _place: SemaphorePermit<'p>,
+}
+
+impl Pool {
+    pub(super) fn new(database: DatabaseSettings) -> Self {
+        Self { database, places: Semaphore::new(LINKS), idle: Mutex::default() }
+    }
+
+    /// Takes a connection that answers: one that was kept, or a new one.
+    pub(super) async fn lease(&self) -> Result<Lease<'_>, PlantError> {
+        let busy = || PlantError::Unreachable {
+            place: "the other end".into(),
+            what: format!("all {LINKS} connections of the page are busy"),
+        };
+        let place = tokio::time::timeout(TURN, self.places.acquire()).await;
+        let place = place.ok().and_then(Result::ok).ok_or_else(busy)?;
+        let lease = |link| Lease { link: Some(link), pool: self, _place: place };
+        while let Some(link) = self.kept() {
+            let answer = tokio::time::timeout(SIGN_OF_LIFE, link.client().simple_query("")).await;
+            if matches!(answer, Ok(Ok(_))) {
+                return Ok(lease(link));
+            }
+        }
+        Ok(lease(self.open().await?))
+    }
+
+    fn kept(&self) -> Option<Link> {
+        self.idle.lock().unwrap_or_else(PoisonError::into_inner).pop()
+    }
+
+    /// Opens one more, to a database that is laid out as this program knows it.
+    pub(super) async fn open(&self) -> Result<Link, PlantError> {
+        let link = Link::open(&self.database).await?;
+        is_known(link.client()).await?;
+        link.client().batch_execute(RULES).await.map_err(refused("to keep to reading"))?;
+        Ok(link)
+    }
+}
+
+impl Deref for Lease<'_> {
+    type Target = Link;
+
+    fn deref(&self) -> &Link {
+        match &self.link {
+            Some(link) => link,
+            None => unreachable!("it is given back when this is dropped, and not before"),
+        }
+    }
+}
+
+impl Drop for Lease<'_> {
+    fn drop(&mut self) {
+        if let Some(link) = self.link.take().filter(|link| !link.is_closed()) {
+            self.pool.idle.lock().unwrap_or_else(PoisonError::into_inner).push(link);
+        }
+    }
+}

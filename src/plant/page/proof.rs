@@ -1,0 +1,153 @@
+//! The plant's copy of a run, brought back into a folder that nobody keeps, proven there, and what is made of it.
+
+use std::collections::HashMap;
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use jiff::Timestamp;
+use regrind_formats::{FormatError, ScratchFolder};
+use regrind_journal::Verified;
+use regrind_report::{ReportError, ResultsFormat, run_report, run_results};
+use tokio::sync::Semaphore;
+use tokio::task::spawn_blocking;
+
+use super::super::copy::PlantRun;
+use super::super::error::{PlantError, refused};
+use super::PlantPage;
+
+/// How long a proof is taken for one: the copy may be changed at any time.
+const LASTS: Duration = Duration::from_secs(60);
+/// How many are kept.
+const KEPT: usize = 16;
+/// Whole runs are brought back one at a time, and a question for one may take so long.
+const ANSWER: &str = "SET statement_timeout = '60s'";
+
+/// What came of a proof.
+pub(super) struct Proof {
+    /// When it was made, UTC.
+    pub(super) at: String,
+    /// What was proven, and by what; in words why it cannot be believed.
+    pub(super) found: Result<Verified, String>,
+    /// The keys that the plant knows of the cell.
+    pub(super) keys: usize,
+    /// The report of the run and its results, or why there are none.
+    pub(super) report: Result<String, String>,
+    pub(super) qif: Result<String, String>,
+    pub(super) dfq: Result<String, String>,
+}
+
+type Known = HashMap<i32, (Instant, String, Arc<Proof>)>;
+
+/// Proofs that were made not long ago.
+pub(super) struct Proofs {
+    known: Mutex<Known>,
+    turn: Semaphore,
+}
+
+impl Default for Proofs {
+    fn default() -> Self {
+        Self { known: Mutex::default(), turn: Semaphore::new(1) }
+    }
+}
+
+impl Proofs {
+    /// A proof of what the plant had of a run up to this head, if it was made not long ago.
+    pub(super) fn known(&self, id: i32, head: &str) -> Option<Arc<Proof>> {
+        let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
+        known.retain(|_, (since, ..)| since.elapsed() < LASTS);
+        known.get(&id).filter(|(_, at, _)| at == head).map(|(.., proof)| Arc::clone(proof))
+    }
+
+    fn keep(&self, id: i32, head: &str, proof: &Arc<Proof>) {
+        let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
+        if known.len() >= KEPT {
+            let oldest = known.iter().min_by_key(|(_, (since, ..))| *since).map(|(id, _)| *id);
+            oldest.map(|id| known.remove(&id));
+        }
+        known.insert(id, (Instant::now(), head.to_owned(), Arc::clone(proof)));
+    }
+}
+
+/// Proves the plant's copy of a run, unless that was just done.
+///
+/// # Errors
+/// A plant that cannot be reached, or has no such run. What is wrong with the copy is told in the proof.
+pub(super) async fn proven(
+    plant: &PlantPage,
+    id: i32,
+    cell: &str,
+    name: &str,
+    head: &str,
+) -> Result<Arc<Proof>, PlantError> {
+    if let Some(known) = plant.proofs.known(id, head) {
+        return Ok(known);
+    }
+    let gone = || PlantError::Unreachable { place: "the other end".into(), what: "the page is being ended".into() };
+    let _turn = plant.proofs.turn.acquire().await.map_err(|_| gone())?;
+    // Somebody else may have waited for the same.
+    if let Some(known) = plant.proofs.known(id, head) {
+        return Ok(known);
+    }
+    let proof = Arc::new(prove(plant, cell, name).await?);
+    plant.proofs.keep(id, head, &proof);
+    Ok(proof)
+}
+
+async fn prove(plant: &PlantPage, cell: &str, name: &str) -> Result<Proof, PlantError> {
+    let link = plant.pool.open().await?;
+    link.client().batch_execute(ANSWER).await.map_err(refused("to wait longer"))?;
+    let run = PlantRun::find(&link, Some(cell), name).await?;
+    let scratch = Arc::new(ScratchFolder::at(std::env::temp_dir().join(format!("regrind-page-{}", random_word()?)))?);
+    // What a run is called is a cell's word: no folder is called so.
+    let folder = scratch.path().join("run");
+    match run.fetch(&link, plant.artefacts.as_ref(), &folder).await {
+        Ok(()) => {}
+        Err(error) if error.may_pass() => return Err(error),
+        Err(error) => return Ok(Proof::failed(&run, &without(&folder, &error.to_string()))),
+    }
+    let made = spawn_blocking(move || {
+        let _kept_until_here = Arc::clone(&scratch);
+        let found = run.prove(&folder, &[]).map_err(|error| without(&folder, &error.to_string()));
+        let words = |error: ReportError| without(&folder, &error.to_string());
+        Proof {
+            at: now(),
+            keys: run.keys.len(),
+            report: run_report(&folder).map_err(words),
+            qif: run_results(&folder, ResultsFormat::Qif).map_err(words),
+            dfq: run_results(&folder, ResultsFormat::Dfq).map_err(words),
+            found,
+        }
+    });
+    let failed = |_| PlantError::Unreachable { place: "this computer".into(), what: "the proof was broken off".into() };
+    made.await.map_err(failed)
+}
+
+impl Proof {
+    fn failed(run: &PlantRun, why: &str) -> Self {
+        let why = why.to_owned();
+        let none = || Err(why.clone());
+        Self { at: now(), found: Err(why.clone()), keys: run.keys.len(), report: none(), qif: none(), dfq: none() }
+    }
+}
+
+/// What is wrong, without the name of a folder that nobody can look into.
+fn without(folder: &Path, words: &str) -> String {
+    words.replace(&folder.display().to_string(), "the copy")
+}
+
+fn now() -> String {
+    Timestamp::now().strftime("%Y-%m-%d %H:%M:%S").to_string()
+}
+
+/// A word that nobody guesses: a folder of that name is nobody else's.
+fn random_word() -> Result<String, PlantError> {
+    let mut bytes = [0; 16];
+    let failed = |error: getrandom::Error| FormatError::Unwritable {
+        path: std::env::temp_dir(),
+        action: "naming a folder in it",
+        source: std::io::Error::other(error.to_string()),
+    };
+    getrandom::fill(&mut bytes).map_err(failed)?;
+    Ok(super::super::hex::digits(&bytes))
+}

@@ -1,0 +1,302 @@
+//! `/runs/{id}`: a run with the figures of each cycle, whether the plant's copy of it is proven, and what is made of that copy.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::Extension;
+use axum::extract::{Path, Query, State};
+use axum::http::header::{CONTENT_DISPOSITION, CONTENT_TYPE};
+use axum::http::{HeaderName, StatusCode};
+use axum::response::{IntoResponse, Redirect, Response};
+use maud::{Markup, html};
+use regrind_page::Session;
+use serde::Deserialize;
+
+use super::super::Row;
+use super::super::error::PlantError;
+use super::super::link::Link;
+use super::proof::{Proof, proven};
+use super::selection::mark;
+use super::words::{encoded, shown, um};
+use super::{Made, PlantPage, Shared, Unmade, page, unmade};
+
+/// How long the page of a run waits for its proof before it is shown without, and how soon it is asked for again then.
+const WAITS: Duration = Duration::from_secs(3);
+const AGAIN_S: u32 = 3;
+
+/// What the plant has of a run at a glance.
+struct Run {
+    id: i32,
+    cell: String,
+    name: String,
+    head: String,
+    row: Row,
+}
+
+impl Run {
+    const COLUMNS: &str = "id, cell, run, head, serial, part_name, recipe, recipe_sha256, operator, simulation, to_char(began, 'YYYY-MM-DD HH24:MI:SS'),
+        to_char(ended, 'YYYY-MM-DD HH24:MI:SS'), result, verdict, grinder, cmm, wheel, probe, alarms, records, pv_limit_um, rms_limit_um";
+
+    async fn read(link: &Link, id: i32) -> Result<Self, Unmade> {
+        let text = format!("SELECT {} FROM part_run WHERE id = $1", Self::COLUMNS);
+        let mut rows = link.ask(&text, &[&id]).await?;
+        let row = rows.pop().ok_or_else(|| Unmade::NotHere(format!("the plant has no run {id} that made a part")))?;
+        Ok(Self { id: row.get(0), cell: row.get(1), name: row.get(2), head: row.get(3), row })
+    }
+
+    /// A text of it by its place among the columns.
+    fn text(&self, k: usize) -> &str {
+        self.row.get::<_, Option<&str>>(k).unwrap_or_default()
+    }
+
+    fn is_simulated(&self) -> bool {
+        self.row.get::<_, Option<bool>>(9) == Some(true)
+    }
+}
+
+/// The number of a run in an address.
+fn number(id: &str) -> Result<i32, Unmade> {
+    id.parse().map_err(|_| Unmade::NotHere("runs go by their numbers here, as in /runs/17".into()))
+}
+
+/// A run by the names that a cell knows it by.
+#[derive(Debug, Deserialize)]
+pub(super) struct Named {
+    cell: String,
+    name: String,
+}
+
+pub(super) async fn by_name(
+    State(plant): State<Shared>,
+    Extension(session): Extension<Session>,
+    Query(Named { cell, name }): Query<Named>,
+) -> Response {
+    let found = async {
+        let link = plant.lease().await?;
+        let [cell, name] = [cell, name].map(|text| text.replace('\0', ""));
+        let rows = link.ask("SELECT id FROM part_run WHERE cell = $1 AND run = $2", &[&cell, &name]).await?;
+        let missing = || Unmade::NotHere(format!("the plant has nothing of the run {name} of {cell} yet"));
+        rows.first().map(|row| row.get::<_, i32>(0)).ok_or_else(missing)
+    };
+    match super::within(found).await {
+        Ok(id) => Redirect::to(&format!("/runs/{id}")).into_response(),
+        Err(why) => unmade(&session, &why),
+    }
+}
+
+pub(super) async fn run(
+    State(plant): State<Shared>,
+    Extension(session): Extension<Session>,
+    Path(id): Path<String>,
+) -> Response {
+    page(&session, async { made(&plant, number(&id)?).await }).await
+}
+
+async fn made(plant: &Shared, id: i32) -> Result<Made, Unmade> {
+    let (run, cycles, maps) = {
+        let link = plant.lease().await?;
+        let run = Run::read(&link, id).await?;
+        (run, cycles(&link, id).await?, maps_of(&link, id).await?)
+    };
+    // It goes on when this page has been shown without it.
+    let (shared, cell, name, head) = (Arc::clone(plant), run.cell.clone(), run.name.clone(), run.head.clone());
+    let proving = tokio::spawn(async move { proven(&shared, id, &cell, &name, &head).await });
+    let proof = match tokio::time::timeout(WAITS, proving).await {
+        Ok(Ok(proof)) => Some(proof?),
+        _ => None,
+    };
+    let title = if run.text(4).is_empty() { run.name.clone() } else { run.text(4).to_owned() };
+    let main = html! {
+        main .list .plant {
+            h1 { (shown(&title)) " " (mark(run.is_simulated())) }
+            (about(&run))
+            h2 { "The copy of the plant" }
+            (told(proof.as_deref()))
+            @if let Some(proof) = proof.as_ref().filter(|proof| proof.found.is_ok()) { (made_of_it(&run, proof)) }
+            h2 { "Cycles" }
+            (cycles)
+            @if let Some(first) = maps.first() {
+                p {
+                    "Maps: " a href=(format!("/maps?run={id}")) { "the last" }
+                    @if maps.len() > 1 { " · " a href=(format!("/maps?run={id}:{first}&run={id}:{}", maps[maps.len() - 1])) { "the first and the last on one scale" } }
+                }
+            }
+        }
+    };
+    Ok(Made { title: shown(&title), again_s: proof.is_none().then_some(AGAIN_S), main })
+}
+
+fn about(run: &Run) -> Markup {
+    let result = run.text(12);
+    // The words of the record begin with the same word.
+    let verdict = run.text(13);
+    let reason = verdict.split_once(": ").filter(|(word, _)| word.chars().all(|c| !c.is_lowercase()));
+    let verdict = reason.map_or(verdict, |(_, reason)| reason);
+    let row = |what: &str, text: &str| html! { @if !text.is_empty() { dt { (what) } dd { (shown(text)) } } };
+    html! {
+        p .verdict.good[result == "accepted"] { strong { (shown(if result.is_empty() { "open" } else { result })) } @if !verdict.is_empty() { ": " (shown(verdict)) } }
+        dl .about {
+            (row("Part", run.text(5)))
+            dt { "Cell" } dd { (shown(&run.cell)) }
+            dt { "Recipe" } dd { a href=(format!("/trend?recipe={}", encoded(run.text(6)))) { (shown(run.text(6))) } " " span .id { (shown(run.text(7))) } }
+            (row("Operator", run.text(8)))
+            (row("Began, UTC", run.text(10))) (row("Ended, UTC", run.text(11)))
+            (row("Grinder", run.text(14))) (row("CMM", run.text(15))) (row("Wheel", run.text(16))) (row("Probe", run.text(17)))
+            dt { "Alarms" } dd { (run.row.get::<_, Option<i32>>(18).map_or("not told".to_owned(), |n| n.to_string())) }
+            dt { "Run" } dd .id { (shown(&run.name)) }
+        }
+        p .quiet { "As the cell told it; what its record says stands in the report." }
+    }
+}
+
+/// What the proof says, in words.
+fn told(proof: Option<&Proof>) -> Markup {
+    let Some(proof) = proof else {
+        return html! { p role="status" { "It is being brought together and proven; this page shows what comes of it by itself." } };
+    };
+    html! {
+        @match &proof.found {
+            Ok(found) => {
+                p .proven { strong { "Proven" } " at " (proof.at) " UTC: " (found.records) " records in an unbroken chain and " (found.artefacts) " files that are what was written"
+                    @if found.signed == 0 { "; not signed" }
+                    @else if proof.keys == 0 { "; signed up to record " (found.signed) ", by a key that the plant was not told" }
+                    @else { "; signed up to record " (found.signed) " by a key that the plant knows of the cell" }
+                    @if found.closed { "." } @else { ". The run has no end on record: it goes on, or it was cut before that arrived." }
+                }
+            }
+            Err(why) => {
+                p .no role="alert" { strong { "NOT PROVEN" } " at " (proof.at) " UTC: " (shown(why)) }
+                p { "Keep the plant and the cell as they are, and compare: regrind audit verify --plant" }
+            }
+        }
+    }
+}
+
+fn made_of_it(run: &Run, proof: &Proof) -> Markup {
+    let id = run.id;
+    let one = |path: &str, name: &str, made: &Result<String, String>| {
+        html! {
+            @match made {
+                Ok(_) => { li { a href=(format!("/runs/{id}/{path}")) { (name) } } }
+                Err(why) => { li .quiet { (name) ": " (shown(why)) } }
+            }
+        }
+    };
+    html! {
+        ul .made { (one("report", "Report", &proof.report)) (one("qif", "Results as QIF 3.0", &proof.qif)) (one("dfq", "Results as DFQ (Q-DAS)", &proof.dfq)) }
+    }
+}
+
+async fn cycles(link: &Link, id: i32) -> Result<Markup, PlantError> {
+    let text = "SELECT cycle, pv_um, pv_u_um, rms_um, rms_u_um, verdict, reason, expected_pv_um, pv_limit_um, rms_limit_um FROM cycle_figure
+        WHERE run_id = $1 ORDER BY cycle LIMIT 1000";
+    let rows = link.ask(text, &[&id]).await?;
+    let limits = rows.last().map(|row| [row.get::<_, Option<f64>>(8), row.get(9)]);
+    Ok(html! {
+        @if rows.is_empty() { p .quiet { "No cycle was told of yet." } } @else {
+            div .wide { table {
+                tr { th .n { "Cycle" } th .n { "PV, µm" } th .n { "± U" } th .n { "RMS, µm" } th .n { "± U" } th .n { "expected PV" } th { "Judged" } }
+                @for row in &rows {
+                    @let [verdict, reason] = [5, 6].map(|k| row.get::<_, Option<&str>>(k).unwrap_or_default());
+                    tr {
+                        td .n { (row.get::<_, i32>(0)) }
+                        td .n { strong { (um(row.get(1), 2)) } } td .n { (um(row.get(2), 2)) }
+                        td .n { strong { (um(row.get(3), 3)) } } td .n { (um(row.get(4), 3)) }
+                        td .n { (um(row.get(7), 2)) }
+                        td { @if verdict.is_empty() { (shown(reason)) } @else { strong { (shown(verdict)) } @if !reason.is_empty() { ": " (shown(reason)) } } }
+                    }
+                }
+                @if let Some([pv, rms]) = limits {
+                    tr .limit { td .n { "allowed" } td .n { (um(pv, 2)) } td {} td .n { (um(rms, 3)) } td {} td {} td {} }
+                }
+            } }
+            p .quiet { "U: expanded uncertainty, k = 2. Expected: what the correction made from the cycle was expected to leave." }
+        }
+    })
+}
+
+/// The cycles of which there is a map.
+async fn maps_of(link: &Link, id: i32) -> Result<Vec<i32>, PlantError> {
+    let rows = link
+        .ask("SELECT cycle FROM cycle_figure WHERE run_id = $1 AND map IS NOT NULL ORDER BY cycle LIMIT 1000", &[&id])
+        .await?;
+    Ok(rows.iter().map(|row| row.get(0)).collect())
+}
+
+/// The proof of a run, however long it takes.
+async fn proof_of(plant: &PlantPage, id: &str) -> Result<(Run, Arc<Proof>), Unmade> {
+    let run = {
+        let link = plant.lease().await?;
+        Run::read(&link, number(id)?).await?
+    };
+    let proof = proven(plant, run.id, &run.cell, &run.name, &run.head).await?;
+    Ok((run, proof))
+}
+
+pub(super) async fn report(
+    State(plant): State<Shared>,
+    Extension(session): Extension<Session>,
+    Path(id): Path<String>,
+) -> Response {
+    match proof_of(&plant, &id).await {
+        Ok((_, proof)) => match &proof.report {
+            Ok(html) => {
+                // Its style stands in it; nothing in it may run, and nothing may be fetched.
+                let policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'";
+                let headers = [
+                    (CONTENT_TYPE, "text/html; charset=utf-8"),
+                    (HeaderName::from_static("content-security-policy"), policy),
+                ];
+                (headers, html.clone()).into_response()
+            }
+            Err(why) => not_made(&session, why),
+        },
+        Err(why) => unmade(&session, &why),
+    }
+}
+
+pub(super) async fn qif(
+    State(plant): State<Shared>,
+    Extension(session): Extension<Session>,
+    Path(id): Path<String>,
+) -> Response {
+    results(&plant, &session, &id, "qif", "application/xml", |proof| &proof.qif).await
+}
+
+pub(super) async fn dfq(
+    State(plant): State<Shared>,
+    Extension(session): Extension<Session>,
+    Path(id): Path<String>,
+) -> Response {
+    results(&plant, &session, &id, "dfq", "text/plain; charset=utf-8", |proof| &proof.dfq).await
+}
+
+async fn results(
+    plant: &PlantPage,
+    session: &Session,
+    id: &str,
+    ending: &str,
+    kind: &'static str,
+    of: fn(&Proof) -> &Result<String, String>,
+) -> Response {
+    match proof_of(plant, id).await {
+        Ok((run, proof)) => match of(&proof) {
+            Ok(text) => file(&format!("run-{}.{ending}", run.id), kind, text.clone()),
+            Err(why) => not_made(session, why),
+        },
+        Err(why) => unmade(session, &why),
+    }
+}
+
+/// A file to be kept by a browser. Its name is of letters and digits alone.
+pub(super) fn file(name: &str, kind: &'static str, content: String) -> Response {
+    ([(CONTENT_TYPE, kind.to_owned()), (CONTENT_DISPOSITION, format!("attachment; filename=\"{name}\""))], content)
+        .into_response()
+}
+
+/// What is said of a copy of which nothing is made: one that cannot be believed.
+fn not_made(session: &Session, why: &str) -> Response {
+    let mut response = unmade(session, &Unmade::NotHere(why.to_owned()));
+    *response.status_mut() = StatusCode::UNPROCESSABLE_ENTITY;
+    response
+}

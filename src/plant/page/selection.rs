@@ -1,0 +1,224 @@
+//! Which parts are looked at: what an address narrows them to, as a condition of the views and as a form.
+
+use jiff::civil::Date;
+use jiff::tz::TimeZone;
+use jiff::{Timestamp, ToSpan};
+use maud::{Markup, html};
+use serde::Deserialize;
+
+use super::super::error::PlantError;
+use super::super::link::Link;
+use super::Unmade;
+use super::words::{encoded, shown};
+
+/// By what parts are told apart: the column of the views, which is the word in an address too, and what people call it.
+const KINDS: [(&str, &str); 6] = [
+    ("recipe", "Recipe"),
+    ("cell", "Cell"),
+    ("grinder", "Grinder"),
+    ("cmm", "CMM"),
+    ("wheel", "Wheel"),
+    ("probe", "Probe"),
+];
+/// Days that are looked back where nothing else is said.
+const DAYS: i64 = 90;
+/// Most names in a form.
+const NAMES: i64 = 5000;
+
+/// What an address says; what it does not say is chosen.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(default)]
+pub(super) struct Asked {
+    recipe: Option<String>,
+    cell: String,
+    grinder: String,
+    cmm: String,
+    wheel: String,
+    probe: String,
+    /// The first and the last day on which a run began, `2026-07-04`, UTC.
+    since: String,
+    until: String,
+    /// `real` or `simulated`.
+    parts: String,
+    /// `first` or `last`: the measurement before any correction, or the one that the part was judged by.
+    at: String,
+}
+
+/// What is looked at.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Selection {
+    /// In the order of [`KINDS`]; empty is any.
+    names: [String; 6],
+    since: Date,
+    until: Date,
+    /// Simulated parts and real ones are never counted together.
+    pub(super) simulated: bool,
+    pub(super) first: bool,
+}
+
+impl Selection {
+    /// Makes out what is looked at. Where nothing is said: real parts if there are any, the recipe of the newest, and the last days.
+    pub(super) async fn of(link: &Link, asked: &Asked) -> Result<Self, Unmade> {
+        let simulated = is_simulated(link, &asked.parts).await?;
+        let recipe = match &asked.recipe {
+            Some(recipe) => recipe.clone(),
+            None => newest_recipe(link, simulated).await?,
+        };
+        let Asked { cell, grinder, cmm, wheel, probe, since, until, at, .. } = asked.clone();
+        let today = today();
+        let until = day(&until)?.unwrap_or(today);
+        let before = until.checked_sub(DAYS.days()).unwrap_or(Date::MIN);
+        // No text in the database has a zero: such a name is no name there.
+        let names = [recipe, cell, grinder, cmm, wheel, probe].map(|name| name.replace('\0', ""));
+        Ok(Self { names, since: day(&since)?.unwrap_or(before), until, simulated, first: at == "first" })
+    }
+
+    /// The condition on the columns of a view, and its values, `$1` and on.
+    pub(super) fn condition(&self) -> (String, Vec<String>) {
+        let end = self.until.checked_add(1.day()).unwrap_or(Date::MAX);
+        let mut values = vec![format!("{} 00:00Z", self.since), format!("{end} 00:00Z")];
+        let world = if self.simulated { "simulation" } else { "NOT simulation" };
+        let mut text = format!("{world} AND began >= $1::text::timestamptz AND began < $2::text::timestamptz");
+        for ((column, _), name) in KINDS.iter().zip(&self.names).filter(|(_, name)| !name.is_empty()) {
+            values.push(name.clone());
+            text += &format!(" AND {column} = ${}", values.len());
+        }
+        (text, values)
+    }
+
+    /// The recipe; empty is any.
+    pub(super) fn recipe(&self) -> &str {
+        &self.names[0]
+    }
+
+    /// What is said in an address, so that it says the same tomorrow but for the days.
+    pub(super) fn query(&self) -> String {
+        let named = KINDS.iter().zip(&self.names).filter(|((kind, _), name)| *kind == "recipe" || !name.is_empty());
+        let mut query: Vec<String> = named.map(|((kind, _), name)| format!("{kind}={}", encoded(name))).collect();
+        query.push(format!("since={}&until={}", self.since, self.until));
+        query.push(format!("parts={}", if self.simulated { "simulated" } else { "real" }));
+        query.push(format!("at={}", if self.first { "first" } else { "last" }));
+        query.join("&")
+    }
+
+    /// What is looked at, in a sentence.
+    pub(super) fn words(&self) -> String {
+        let named = KINDS.iter().zip(&self.names).filter(|(_, name)| !name.is_empty());
+        let named: Vec<String> =
+            named.map(|((_, word), name)| format!("{} {}", word.to_lowercase(), shown(name))).collect();
+        let named = if named.is_empty() { "all parts".to_owned() } else { named.join(", ") };
+        format!("{named}, begun {} to {}", self.since, self.until)
+    }
+
+    /// The form that chooses it.
+    pub(super) async fn form(&self, link: &Link, action: &str, kinds: &[&str]) -> Result<Markup, PlantError> {
+        let rows = link.ask("SELECT kind, name FROM choice ORDER BY kind, name LIMIT $1", &[&NAMES]).await?;
+        let names: Vec<(&str, &str)> = rows.iter().map(|row| (row.get(0), row.get(1))).collect();
+        let chosen = |(kind, word): &(&str, &str), name: &String| {
+            let mut known: Vec<&str> = names.iter().filter(|(of, _)| of == kind).map(|(_, name)| *name).collect();
+            if !name.is_empty() && !known.contains(&name.as_str()) {
+                known.push(name);
+            }
+            html! {
+                label { (word) " "
+                    select name=(kind) {
+                        option value="" { "any" }
+                        @for each in known { option value=(each) selected[each == name] { (shown(each)) } }
+                    }
+                }
+            }
+        };
+        Ok(html! {
+            form .filter method="get" action=(action) {
+                @for (kind, name) in KINDS.iter().zip(&self.names).filter(|((kind, _), _)| kinds.contains(kind)) { (chosen(kind, name)) }
+                label { "Since " input type="date" name="since" value=(self.since); }
+                label { "Until " input type="date" name="until" value=(self.until); }
+                @if kinds.len() == KINDS.len() {
+                    label { "Measured " select name="at" {
+                        option value="last" { "when the part was judged last" }
+                        option value="first" selected[self.first] { "first, before any correction" }
+                    } }
+                }
+                label { "Parts " select name="parts" {
+                    option value="real" { "real" }
+                    option value="simulated" selected[self.simulated] { "simulated" }
+                } }
+                button { "Show" }
+            }
+        })
+    }
+}
+
+/// All kinds of names that a form may have.
+pub(super) const ALL_KINDS: [&str; 6] = [KINDS[0].0, KINDS[1].0, KINDS[2].0, KINDS[3].0, KINDS[4].0, KINDS[5].0];
+
+/// Whether simulated parts are looked at: as is asked, or else where no real part was ever made.
+pub(super) async fn is_simulated(link: &Link, asked: &str) -> Result<bool, PlantError> {
+    match asked {
+        "real" => Ok(false),
+        "simulated" => Ok(true),
+        _ => {
+            let rows = link.ask("SELECT NOT EXISTS (SELECT FROM part_run WHERE NOT simulation)", &[]).await?;
+            Ok(rows.first().is_some_and(|row| row.get(0)))
+        }
+    }
+}
+
+async fn newest_recipe(link: &Link, simulated: bool) -> Result<String, PlantError> {
+    let world = if simulated { "simulation" } else { "NOT simulation" };
+    let text = format!("SELECT recipe FROM part_run WHERE {world} AND recipe IS NOT NULL ORDER BY began DESC LIMIT 1");
+    let rows = link.ask(&text, &[]).await?;
+    Ok(rows.first().map_or_else(String::new, |row| row.get(0)))
+}
+
+/// The mark of what is simulated.
+pub(super) fn mark(simulated: bool) -> Markup {
+    html! { @if simulated { span .simulation { "SIMULATION" } } }
+}
+
+pub(super) fn today() -> Date {
+    Timestamp::now().to_zoned(TimeZone::UTC).date()
+}
+
+/// A day as a person writes it; none where nothing is written.
+fn day(text: &str) -> Result<Option<Date>, Unmade> {
+    let text = text.trim();
+    if text.is_empty() {
+        return Ok(None);
+    }
+    // What the database has no day for, it is not asked for.
+    let found = text.parse::<Date>().ok().filter(|day| (1970..=9000).contains(&day.year()));
+    let bad = || Unmade::Nonsense(format!("{text:?} is no day; write it as 2026-07-04"));
+    found.map(Some).ok_or_else(bad)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn selection(names: [&str; 6]) -> Selection {
+        let day = |text: &str| text.parse().unwrap();
+        let names = names.map(str::to_owned);
+        Selection { names, since: day("2026-07-01"), until: day("2026-07-04"), simulated: true, first: false }
+    }
+
+    #[test]
+    fn names_are_values_and_never_text_of_a_question() {
+        let hostile = "x' OR '1'='1";
+        let (text, values) = selection(["", hostile, "", "", "R 5", ""]).condition();
+        assert!(!text.contains(hostile) && text.ends_with("AND cell = $3 AND wheel = $4"), "{text}");
+        assert_eq!(values, ["2026-07-01 00:00Z", "2026-07-05 00:00Z", hostile, "R 5"]);
+    }
+
+    #[test]
+    fn an_address_says_what_is_looked_at() {
+        let query = selection(["a&b", "", "", "", "", ""]).query();
+        assert_eq!(query, "recipe=a%26b&since=2026-07-01&until=2026-07-04&parts=simulated&at=last");
+    }
+
+    #[test]
+    fn what_is_no_day_is_refused() {
+        assert!(matches!(day("yesterday"), Err(Unmade::Nonsense(_))) && matches!(day(" "), Ok(None)));
+        assert!(matches!(day("-9999-01-01"), Err(Unmade::Nonsense(_))));
+    }
+}

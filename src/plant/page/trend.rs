@@ -1,0 +1,133 @@
+//! `/trend`: PV and RMS of part after part, with control limits and what is allowed.
+
+use axum::Extension;
+use axum::extract::{Query, State};
+use axum::response::Response;
+use maud::{Markup, html};
+use regrind_page::Session;
+
+use super::super::error::PlantError;
+use super::super::link::Link;
+use super::control_chart::{ENOUGH, Limits, Value, individuals, moving_ranges};
+use super::selection::{ALL_KINDS, Asked, Selection, mark};
+use super::words::{shown, um};
+use super::{Made, Shared, Unmade, page};
+
+/// Most parts in a chart, and most of those that are listed as out of limits.
+const MOST: i64 = 250;
+const LISTED: usize = 20;
+
+/// A part with its two figures.
+pub(super) struct Part {
+    pub(super) pv: Value,
+    pub(super) rms: Option<Value>,
+}
+
+pub(super) async fn trend(
+    State(plant): State<Shared>,
+    Extension(session): Extension<Session>,
+    Query(asked): Query<Asked>,
+) -> Response {
+    page(&session, made(&plant, &asked)).await
+}
+
+async fn made(plant: &Shared, asked: &Asked) -> Result<Made, Unmade> {
+    let link = plant.lease().await?;
+    let selection = Selection::of(&link, asked).await?;
+    let form = selection.form(&link, "/trend", &ALL_KINDS).await?;
+    let parts = parts(&link, &selection, MOST).await?;
+    let main = html! {
+        main .list .plant {
+            h1 { "Trend " (mark(selection.simulated)) }
+            (form)
+            p .quiet { (selection.words()) ": " (parts.len()) @if parts.len() == 1 { " part" } @else { " parts" } @if parts.len() as i64 == MOST { ", the newest" } "." }
+            @if selection.recipe().is_empty() {
+                p .no { "Parts of several recipes are in one chart: limits of such a chart tell nothing. Choose a recipe." }
+            }
+            (charts(&parts))
+            p {
+                a href=(format!("/export.csv?{}", selection.query())) { "CSV" } " · "
+                a href=(format!("/trend.dfq?{}", selection.query())) { "DFQ (Q-DAS)" }
+            }
+        }
+    };
+    Ok(Made { title: "Trend".into(), again_s: None, main })
+}
+
+/// Reads the newest parts of a selection, the oldest of them first.
+pub(super) async fn parts(link: &Link, selection: &Selection, most: i64) -> Result<Vec<Part>, PlantError> {
+    let (condition, values) = selection.condition();
+    // The names of the two views differ in what is the run's number.
+    let (view, id) = if selection.first { ("cycle_figure", "run_id") } else { ("part_run", "id") };
+    let first = if selection.first { "cycle = 1 AND " } else { "" };
+    let text = format!(
+        "SELECT {id}, serial, cell, to_char(began, 'YYYY-MM-DD HH24:MI:SS'), pv_um, pv_u_um, pv_limit_um, rms_um, rms_u_um, rms_limit_um
+            FROM {view} WHERE {first}pv_um IS NOT NULL AND {condition} ORDER BY began DESC LIMIT {most}"
+    );
+    let values: Vec<_> = values.iter().map(|value| value as &(dyn super::super::ToSql + Sync)).collect();
+    let rows = link.ask(&text, &values).await?;
+    let part = |row: &super::super::Row| {
+        let value = |um: f64, k: usize| Value {
+            run: row.get(0),
+            serial: row.get(1),
+            cell: row.get(2),
+            when: row.get(3),
+            um,
+            u_um: row.get(k),
+            limit_um: row.get(k + 1),
+        };
+        let finite = |k: usize| row.get::<_, Option<f64>>(k).filter(|um| um.is_finite());
+        Some(Part { pv: value(finite(4)?, 5), rms: finite(7).map(|um| value(um, 8)) })
+    };
+    Ok(rows.iter().rev().filter_map(part).collect())
+}
+
+fn charts(parts: &[Part]) -> Markup {
+    let pv: Vec<Value> = parts.iter().map(|part| part.pv.clone()).collect();
+    let rms: Vec<Value> = parts.iter().filter_map(|part| part.rms.clone()).collect();
+    html! {
+        @if pv.len() < 2 { p { "There is too little to draw: two parts at least are needed." } }
+        @else if pv.len() < ENOUGH {
+            p .no { "Limits of " (pv.len()) " parts are preliminary: below " (ENOUGH) " they move a good deal with every further part." }
+        }
+        (figure("PV", "pv", &pv))
+        (figure("RMS", "rms", &rms))
+        p .quiet {
+            "Limits: mean ± 2.660 times the mean moving range; of the range 3.267 times its mean, of all parts that are drawn. A point that is out of them is a triangle. \
+             Where the lower limit would lie below 0 there is none. The dotted line is what the recipe allows; it does not move the limits."
+        }
+    }
+}
+
+fn figure(name: &str, class: &str, values: &[Value]) -> Markup {
+    let all: Vec<f64> = values.iter().map(|value| value.um).collect();
+    let Some(limits) = Limits::of(&all) else { return Markup::default() };
+    let out: Vec<&Value> = values.iter().rev().filter(|value| limits.is_out(value.um)).collect();
+    let over = values.iter().filter(|value| value.limit_um.is_some_and(|limit| value.um > limit)).count();
+    html! {
+        section data-figure=(name) {
+            h2 { (name) }
+            p .limits {
+                "mean " strong { (um(Some(limits.mean), 3)) } " µm, limits "
+                strong { (limits.lower.map_or("none".to_owned(), |lower| um(Some(lower), 3))) } " and " strong { (um(Some(limits.upper), 3)) }
+                " µm; mean range " (um(Some(limits.mean_range), 3)) " µm, its limit " (um(Some(limits.range_upper), 3)) " µm"
+            }
+            div .wide { (individuals(name, class, values, &limits)) }
+            div .wide { (moving_ranges(name, class, values, &limits)) }
+            p {
+                (over) " of " (values.len()) " above what is allowed; " (out.len()) " out of limits"
+                @if !out.is_empty() { ", the newest first:" } @else { "." }
+            }
+            @if !out.is_empty() {
+                ul .out {
+                    @for value in out.iter().take(LISTED) {
+                        li {
+                            a href=(format!("/runs/{}", value.run)) { (shown(&value.serial)) } " " (value.when) ", " (shown(&value.cell)) ": "
+                            (format!("{:.3}", value.um)) " µm" @if let Some(u) = value.u_um { (format!(" ± {u:.3} µm")) }
+                        }
+                    }
+                }
+            }
+        }
+    }
+}

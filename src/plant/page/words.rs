@@ -1,0 +1,93 @@
+//! How the page says things: texts of cells, times, figures, addresses.
+
+use std::fmt::Write;
+
+use regrind_document::visible;
+
+/// A text that a cell or a person gave, with what turns or hides letters shown by its number. Maud escapes the rest.
+pub(super) fn shown(text: &str) -> String {
+    visible(text)
+}
+
+/// A value in an address.
+pub(super) fn encoded(text: &str) -> String {
+    text.bytes().fold(String::new(), |mut out, byte| {
+        match byte {
+            b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'-' | b'_' | b'.' | b'~' => out.push(char::from(byte)),
+            byte => drop(write!(out, "%{byte:02X}")),
+        }
+        out
+    })
+}
+
+/// How long ago something was, as nobody wants it closer.
+pub(super) fn ago(seconds: f64) -> String {
+    match seconds {
+        s if s < 90.0 => format!("{:.0} s", s.max(0.0)),
+        s if s < 5400.0 => format!("{:.0} min", s / 60.0),
+        s if s < 129_600.0 => format!("{:.0} h", s / 3600.0),
+        s => format!("{:.0} days", s / 86_400.0),
+    }
+}
+
+/// A range of seconds.
+pub(super) fn range([least, most]: [f64; 2]) -> String {
+    let (unit, per) = match most {
+        most if most < 90.0 => ("s", 1.0),
+        most if most < 5400.0 => ("min", 60.0),
+        _ => ("h", 3600.0),
+    };
+    let digits = usize::from(unit == "h");
+    let [least, most] = [least, most].map(|seconds| format!("{:.digits$}", seconds / per));
+    if least == most { format!("{most} {unit}") } else { format!("{least} – {most} {unit}") }
+}
+
+/// A figure in micrometres; a dash where there is none.
+pub(super) fn um(value: Option<f64>, digits: usize) -> String {
+    value.filter(|value| value.is_finite()).map_or("–".to_owned(), |value| format!("{value:.digits$}"))
+}
+
+/// A share as a percentage; a dash where it is one of nothing.
+pub(super) fn share(of: i64, all: i64) -> String {
+    if all <= 0 {
+        return "–".to_owned();
+    }
+    format!("{:.0} %", 100.0 * of as f64 / all as f64)
+}
+
+/// The Wilson score interval of 95 % around a share, in words.
+pub(super) fn interval(of: i64, all: i64) -> String {
+    if all <= 0 {
+        return String::new();
+    }
+    let [low, high] = wilson(of as f64, all as f64);
+    format!("{:.0} – {:.0} %", 100.0 * low, 100.0 * high)
+}
+
+/// The Wilson score interval of 95 % around a share (E. B. Wilson, JASA 22, 1927).
+fn wilson(of: f64, all: f64) -> [f64; 2] {
+    const Z: f64 = 1.959_964;
+    let (p, z2) = (of / all, Z * Z);
+    let middle = (p + z2 / (2.0 * all)) / (1.0 + z2 / all);
+    let half = Z / (1.0 + z2 / all) * (p * (1.0 - p) / all + z2 / (4.0 * all * all)).sqrt();
+    [(middle - half).max(0.0), (middle + half).min(1.0)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_address_holds_any_text() {
+        assert_eq!(encoded("a b&c=<\u{e4}>'"), "a%20b%26c%3D%3C%C3%A4%3E%27");
+    }
+
+    #[test]
+    fn the_interval_of_a_share_is_that_of_wilson() {
+        // 8 of 10: 0.4902 to 0.9433, as tables have it.
+        let [low, high] = wilson(8.0, 10.0);
+        assert!((low - 0.4902).abs() < 1e-4 && (high - 0.9433).abs() < 1e-4, "{low} {high}");
+        assert_eq!((share(2, 3), share(0, 0), interval(0, 0)), ("67 %".into(), "–".into(), String::new()));
+        assert!(wilson(0.0, 5.0)[0] < 1e-12);
+    }
+}

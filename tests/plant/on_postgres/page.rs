@@ -1,0 +1,606 @@
+//! The page of a plant: what it says is what was planted, what comes from a cell stays words, and it changes nothing.
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+use std::time::Instant;
+
+use serde_json::Value;
+
+use super::records::made;
+use crate::Plant;
+use crate::browser::Browser;
+use crate::http::{Answer, Visitor};
+use crate::program::{PATIENCE, Running, regrind, root};
+
+/// A text that would be an element of a page, end an attribute and a text of SQL, and turn what is read.
+const HOSTILE: &str =
+    "<script>alert(1)</script>'\"><img src=x onerror=alert(2)>&\u{202e}'); DROP TABLE regrind.run; --";
+
+/// The ten values of NIST/SEMATECH e-Handbook 6.3.2.2, whose limits stand there: 45.8159 and 55.8041 about 50.81.
+const FLOW: [f64; 10] = [49.6, 47.6, 49.9, 51.3, 47.8, 51.2, 52.6, 52.4, 53.6, 52.1];
+
+/// A page of a plant, and who looks at it.
+struct Shown {
+    _page: Running,
+    url: String,
+    visitor: Visitor,
+}
+
+impl Shown {
+    fn of(plant: &Plant) -> Self {
+        if !plant.path("page.toml").is_file() {
+            plant.somebody("page", "reader");
+        }
+        let arguments = ["plant", "serve", "--plant", "page.toml", "--listen", "127.0.0.1:0"];
+        let mut page = Running::new(regrind(&arguments, plant.home.path()));
+        let line = page.line("address of the page", |line| line.starts_with("page "));
+        let url = line.trim_start_matches("page").trim().to_owned();
+        Self { _page: page, visitor: Visitor::with_key(&url), url }
+    }
+
+    /// What is shown at a path.
+    fn text(&self, path: &str) -> String {
+        let answer = self.visitor.get(path);
+        assert_eq!(answer.status, 200, "{path}: {}", answer.text());
+        body(&answer)
+    }
+}
+
+/// A body whose length is told in pieces or at once.
+fn body(answer: &Answer) -> String {
+    answer.text()
+}
+
+/// What stands between the tags, a space for each, in one line.
+fn words(html: &str) -> String {
+    let mut inside = false;
+    let text: String = html
+        .chars()
+        .filter_map(|c| {
+            let was = inside;
+            inside = (inside || c == '<') && c != '>';
+            if was || inside { (c == '<').then_some(' ') } else { Some(c) }
+        })
+        .collect();
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+fn quoted(text: &str) -> String {
+    format!("'{}'", text.replace('\'', "''"))
+}
+
+/// Makes a cell known that nobody signs in as.
+fn cell(plant: &Plant, name: &str) -> i32 {
+    let role = format!("role_{}", plant.sql("SELECT count(*) FROM cell"));
+    plant
+        .sql(&format!("INSERT INTO cell (name, role) VALUES ({}, '{role}') RETURNING id", quoted(name)))
+        .parse()
+        .unwrap()
+}
+
+/// A run as it stands when its cell has told everything of it.
+struct Planted<'a> {
+    cell: i32,
+    serial: &'a str,
+    recipe: &'a str,
+    /// Hours since it began; it took one.
+    hours: u32,
+    result: &'a str,
+    cycles: i32,
+    pv_um: f64,
+    real: bool,
+}
+
+impl Default for Planted<'_> {
+    fn default() -> Self {
+        Self {
+            cell: 1,
+            serial: "SN-1",
+            recipe: "mirror",
+            hours: 24,
+            result: "accepted",
+            cycles: 1,
+            pv_um: 4.0,
+            real: true,
+        }
+    }
+}
+
+/// Plants runs; returns the number of the first.
+fn plant_runs(plant: &Plant, runs: &[Planted]) -> i32 {
+    let row = |(k, run): (usize, &Planted)| {
+        let Planted { cell, serial, recipe, hours, result, cycles, pv_um, real } = run;
+        let [serial, recipe] = [quoted(serial), quoted(recipe)];
+        format!(
+            "({cell}, 'run-{cell}-{hours}-{k}-{result}', {serial}, {}, 'Ada', now() - interval '{hours} hours', now() - interval '{} hours', {recipe}, '00',
+              'Mirror', '{result}', 'as planted', 7, 1, 'Grinder A', 'CMM A', 'R 5.000 mm', 'R 1.500 mm', 0, {cycles}, {pv_um}, 0.4, {}, 0.03)",
+            !real,
+            hours - 1,
+            pv_um / 8.0
+        )
+    };
+    let rows: Vec<String> = runs.iter().enumerate().map(row).collect();
+    let first = plant.sql(&format!(
+        "WITH made AS (INSERT INTO run (cell, name, part, simulation, operator, began, ended, recipe, recipe_sha256, part_name, result, verdict, pv_limit_um,
+            rms_limit_um, grinder, cmm, wheel, probe, alarms, cycles, pv_um, pv_u_um, rms_um, rms_u_um) VALUES {} RETURNING id),
+         told AS (SELECT min(id) AS first FROM made) SELECT first FROM told",
+        rows.join(",")
+    ));
+    plant.sql(
+        "INSERT INTO cycle (run, cycle, verdict, reason, pv_um, pv_u_um, rms_um, rms_u_um)
+            SELECT r.id, y, 'continue', 'as planted', r.pv_um + 10 * (r.cycles - y), 0.4, r.rms_um, 0.03 FROM run r, generate_series(1, r.cycles) y
+            WHERE r.verdict = 'as planted' ON CONFLICT DO NOTHING",
+    );
+    first.parse().unwrap()
+}
+
+fn tell(plant: &Plant, cell: i32, ago: &str, run: Option<&str>, snapshot: &Value) {
+    let run = run.map_or("NULL".into(), quoted);
+    let snapshot = quoted(&snapshot.to_string());
+    plant.sql(&format!(
+        "INSERT INTO cell_state (cell, at, run, snapshot) VALUES ({cell}, now() - interval '{ago}', {run}, {snapshot})"
+    ));
+}
+
+/// What a cell tells while it grinds.
+fn grinding(serial: &str) -> Value {
+    serde_json::json!({ "state": "Execute", "words": "grinding", "simulation": false, "part": "Mirror", "serial": serial, "cycle": 2, "max_cycles": 6,
+        "progress": { "device": "Grinder", "done": 30, "total": 100, "left_s": [140.0, 210.0] }, "alarms": [] })
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn the_first_page_says_how_cells_are_and_counts_what_they_made() {
+    let plant = Plant::new();
+    let [one, two, three] = ["cell-1", "cell-2", "cell-3"].map(|name| cell(&plant, name));
+    tell(&plant, one, "1 second", Some("run"), &grinding("SN-0042"));
+    tell(&plant, two, "3 hours", Some("run"), &grinding("SN-0043"));
+    let of = |result, cycles| Planted { cell: one, result, cycles, ..Planted::default() };
+    let mut runs: Vec<Planted> = (0..5).map(|_| of("accepted", 1)).collect();
+    runs.extend((0..2).map(|_| of("accepted", 3)));
+    runs.extend([of("not accepted", 4), of("aborted", 1), of("stopped", 2)]);
+    // What is simulated, what is long ago, and what is not over is not counted with them.
+    runs.push(Planted { real: false, ..of("accepted", 1) });
+    runs.push(Planted { hours: 24 * 40, ..of("accepted", 1) });
+    runs.push(of("open", 1));
+    runs.push(Planted { cell: three, recipe: "lens", ..of("not accepted", 2) });
+    plant_runs(&plant, &runs);
+    plant.sql("INSERT INTO recipe (sha256, name, version, text) VALUES (sha256('a'), 'mirror', 3, 'a')");
+    plant.sql("INSERT INTO work (serial, recipe, due) VALUES ('SN-0099', sha256('a'), current_date - 3)");
+    plant.sql("INSERT INTO incident (cell, run, what, words) VALUES (2, 'run-7', 'a broken chain', 'record 12 does not follow')");
+
+    let shown = Shown::of(&plant);
+    let html = shown.text("/");
+    let said = words(&html);
+    assert!(said.contains("2 not heard of · 1 at work"), "{said}");
+    assert!(
+        said.contains("cell-1 grinding SN-0042 Mirror, cycle 2 of at most 6 30 of 100, 2 – 4 min left heard"),
+        "{said}"
+    );
+    assert!(
+        said.contains("cell-2 not heard of for 3 h What it does now is not known. Then it said: grinding SN-0043"),
+        "{said}"
+    );
+    assert!(said.contains("cell-3 never heard of"), "{said}");
+    // Ten ended, seven were accepted, five at once: 24 to 76 % by Wilson.
+    assert!(said.contains("mirror 10 7 70 % 50 % 24 – 76 %") && said.contains("lens 1 0 0 % 0 %"), "{said}");
+    assert!(said.contains("cell-1 10 7 70 % 50 %") && said.contains("cell-3 1 0 0 %"), "{said}");
+    assert!(html.contains("11 ended, 7 accepted, 5 at the first measurement"), "the bar of the day");
+    assert!(
+        said.contains("SN-0099 mirror v3 any")
+            && said.contains("late")
+            && said.contains("a broken chain record 12 does not follow"),
+        "{said}"
+    );
+    assert!(html.contains("http-equiv=\"refresh\"") && !said.contains("SIMULATION"), "{said}");
+    let simulated = words(&shown.text("/?parts=simulated"));
+    assert!(simulated.contains("SIMULATION") && simulated.contains("mirror 1 1 100 % 100 %"), "{simulated}");
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn trends_have_the_limits_of_the_handbook_and_other_programs_read_them() {
+    let plant = Plant::new();
+    let [one, two] = ["cell-1", "cell-2"].map(|name| cell(&plant, name));
+    let serials: Vec<String> = (0..FLOW.len()).map(|k| format!("SN-{k:02}")).collect();
+    let runs = FLOW.iter().zip(&serials).zip(0..);
+    let mut runs: Vec<Planted> = runs
+        .map(|((pv_um, serial), k)| Planted {
+            cell: one,
+            serial,
+            hours: 100 - k,
+            pv_um: *pv_um,
+            cycles: 2,
+            ..Planted::default()
+        })
+        .collect();
+    // Other parts, none of which is in the chart.
+    runs.push(Planted { cell: two, recipe: "lens", pv_um: 900.0, hours: 200, ..Planted::default() });
+    runs.push(Planted { cell: one, pv_um: 900.0, real: false, ..Planted::default() });
+    runs.push(Planted { cell: one, pv_um: 900.0, hours: 24 * 100, ..Planted::default() });
+    let first = plant_runs(&plant, &runs);
+    let shown = Shown::of(&plant);
+    let html = shown.text("/trend");
+    let said = words(&html);
+    assert!(said.contains("recipe mirror, begun") && said.contains(": 10 parts."), "{said}");
+    assert!(
+        said.contains("mean 50.810 µm, limits 45.815 and 55.805 µm; mean range 1.878 µm, its limit 6.135 µm"),
+        "{said}"
+    );
+    assert!(said.contains("10 of 10 above what is allowed; 0 out of limits") && said.contains("preliminary"), "{said}");
+    assert!(!said.contains("900.000") && html.contains(&format!("href=\"/runs/{first}\"")), "{said}");
+    // The first measurement lies 10 um above that after one correction.
+    let said = words(&shown.text("/trend?at=first&cell=cell-1&recipe=mirror"));
+    assert!(said.contains("mean 60.810 µm, limits 55.815 and 65.805 µm"), "{said}");
+    let said = words(&shown.text("/trend?recipe=lens"));
+    assert!(said.contains(": 1 part.") && said.contains("too little to draw"), "{said}");
+    let said = words(&shown.text("/trend?recipe="));
+    assert!(said.contains("Parts of several recipes"), "{said}");
+    for (name, value) in
+        [("wheel", "R%205.000%20mm"), ("probe", "R%201.500%20mm"), ("grinder", "Grinder%20A"), ("cmm", "CMM%20A")]
+    {
+        assert!(shown.text(&format!("/trend?{name}={value}")).contains("50.810"), "{name}");
+        assert!(words(&shown.text(&format!("/trend?{name}=other"))).contains(": 0 parts"), "{name}");
+    }
+    // One more part that is out.
+    plant_runs(&plant, &[Planted { cell: one, serial: "SN-OUT", hours: 2, pv_um: 80.0, ..Planted::default() }]);
+    let html = shown.text("/trend");
+    assert!(
+        html.contains("class=\"out\"") && words(&html).contains("1 out of limits, the newest first: SN-OUT"),
+        "{}",
+        words(&html)
+    );
+
+    let csv = shown.text("/export.csv?recipe=mirror");
+    let lines: Vec<&str> = csv.lines().collect();
+    assert!(lines[0].starts_with("id,cell,run,serial,") && lines.len() == 12, "{csv}");
+    assert!(lines[1].contains("\"SN-OUT\"") && lines[2].contains(",52.1,0.4,7,"), "{csv}");
+    let answer = shown.visitor.get("/trend.dfq?recipe=mirror");
+    assert!(answer.header("content-disposition")[0].contains("parts.dfq"), "{answer:?}");
+    let path = plant.path("parts.dfq");
+    fs::write(&path, &answer.body).unwrap();
+    let told = read_dfq(&path);
+    let values = told["characteristics"][0]["values"].as_array().unwrap();
+    let found: Vec<f64> = values.iter().map(|value| (1e6 * value["value"].as_f64().unwrap()).round() / 1e3).collect();
+    assert_eq!(found, [&FLOW[..], &[80.0]].concat());
+    assert_eq!((&values[0]["part"], &told["characteristics"][0]["upper"]), (&"SN-00".into(), &0.007.into()));
+    assert_eq!(told["characteristics"][1]["values"].as_array().unwrap().len(), 11);
+}
+
+fn read_dfq(path: &Path) -> Value {
+    let said = Command::new("python3").arg(root().join("tests/common/read_dfq.py")).arg(path).output().unwrap();
+    assert!(said.status.success(), "{}", String::from_utf8_lossy(&said.stderr));
+    serde_json::from_slice(&said.stdout).unwrap()
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn cells_that_differ_are_told_and_parts_are_found() {
+    let plant = Plant::new();
+    let cells = ["cell-1", "cell-2", "cell-3"].map(|name| cell(&plant, name));
+    let serials: Vec<String> = (0..120).map(|k| format!("SN-{k:03}")).collect();
+    // The parts of the third are worse by more than the spread of all.
+    let run = |k: u32| {
+        let cell = cells[(k % 3) as usize];
+        let worse = if k % 3 == 2 { 0.8 } else { 0.0 };
+        let pv_um = 3.0 + f64::from(k * 7 % 20) / 20.0 + worse;
+        Planted { cell, serial: &serials[k as usize], hours: 2 + k, pv_um, cycles: 2, ..Planted::default() }
+    };
+    let runs: Vec<Planted> = (0..120).map(run).collect();
+    plant_runs(&plant, &runs);
+    let shown = Shown::of(&plant);
+    let said = words(&shown.text("/cells"));
+    for cell in ["cell-1 40 3.4", "cell-2 40 3.4", "cell-3 40 4.2"] {
+        assert!(said.contains(cell), "{cell}: {said}");
+    }
+    let of_third = said.split("cell-3 40").nth(1).unwrap();
+    assert!(of_third.contains("2.00 more than chance (p &lt; 0.0001)"), "{said}");
+    let said = words(&shown.text("/parts?serial=SN-11"));
+    assert!(said.contains("SN-110") && said.contains("SN-119") && !said.contains("SN-109"), "{said}");
+    assert!(words(&shown.text("/parts?serial=sn-11")).contains("No part"), "small letters are others");
+    // Page by page everything comes once.
+    let found = |path: &str| -> (Vec<String>, Option<String>) {
+        let html = shown.text(path);
+        let serials = words(&html).split(' ').filter(|word| word.starts_with("SN-")).map(str::to_owned).collect();
+        (
+            serials,
+            html.split("href=\"/parts?serial=")
+                .nth(1)
+                .map(|rest| format!("/parts?serial={}", rest.split('"').next().unwrap().replace("&amp;", "&"))),
+        )
+    };
+    for begin in ["", "SN-"] {
+        let (mut all, next) = found(&format!("/parts?serial={begin}"));
+        let (rest, none) = found(&next.unwrap());
+        assert_eq!((all.len(), rest.len(), none), (100, 20, None), "{begin}");
+        all.extend(rest);
+        all.sort();
+        assert_eq!(all, serials);
+    }
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn what_a_cell_is_called_or_says_is_words_on_every_page() {
+    let plant = Plant::new();
+    let one = cell(&plant, &HOSTILE[..80]);
+    let mut told = grinding(HOSTILE);
+    for key in ["words", "part", "next"] {
+        told[key] = HOSTILE.into();
+    }
+    tell(&plant, one, "1 second", Some(HOSTILE), &told);
+    let run = |hours| Planted { cell: one, serial: HOSTILE, recipe: HOSTILE, hours, ..Planted::default() };
+    let first = plant_runs(&plant, &[run(2), run(3), run(4)]);
+    let text = quoted(HOSTILE);
+    plant.sql(&format!("UPDATE run SET part_name = {text}, verdict = {text}, grinder = {text}, cmm = {text}, wheel = {text}, probe = {text}, operator = {text}"));
+    plant.sql(&format!("UPDATE cycle SET verdict = {text}, reason = {text}, map = {text}"));
+    plant.sql(&format!(
+        "INSERT INTO incident (cell, run, what, words) VALUES (1, {text}, {}, {text})",
+        quoted(&HOSTILE[..80])
+    ));
+    plant.sql(&format!(
+        "INSERT INTO recipe (sha256, name, version, text) VALUES (sha256('a'), {}, 1, 'a')",
+        quoted(&HOSTILE[..80])
+    ));
+    plant.sql(&format!("INSERT INTO work (serial, recipe) VALUES ({text}, sha256('a'))"));
+    let shown = Shown::of(&plant);
+    let encoded: String = HOSTILE.bytes().map(|byte| format!("%{byte:02x}")).collect();
+    let pages = [
+        "/".to_owned(),
+        "/trend".to_owned(),
+        format!("/trend?recipe={encoded}&wheel={encoded}&at={encoded}"),
+        "/cells".to_owned(),
+        "/parts".to_owned(),
+        format!("/parts?serial={encoded}"),
+        format!("/runs/{first}"),
+        format!("/maps?run={first}&run={encoded}"),
+    ];
+    for path in &pages {
+        let html = shown.text(path);
+        assert!(
+            !html.contains("<script>alert") && !html.contains("<img") && !words(&html).contains('\u{202e}'),
+            "{path}: {html}"
+        );
+        assert!(!html.contains("onerror=alert(2)\"") && html.contains("&lt;script&gt;alert(1)"), "{path}: {html}");
+    }
+    for (path, status) in [
+        (format!("/trend?since={encoded}"), 400),
+        (format!("/run?cell={encoded}&name={encoded}"), 404),
+        (format!("/runs/{encoded}"), 404),
+        (format!("/{encoded}"), 404),
+        ("/parts?serial=%00".into(), 200),
+        ("/trend?recipe=%00&cell=%00".into(), 200),
+        ("/runs/2147483647".into(), 404),
+        ("/maps".into(), 400),
+    ] {
+        let answer = shown.visitor.get(&path);
+        assert_eq!(answer.status, status, "{path}: {}", answer.text());
+        assert!(!answer.text().contains("<script>alert"), "{path}: {}", answer.text());
+    }
+    let csv = shown.text("/export.csv");
+    assert!(csv.contains("<script>alert(1)</script>'\"\"><img"), "a text is itself: {csv}");
+    assert_eq!(plant.sql("SELECT count(*) FROM run"), "3");
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn a_run_is_proven_before_anything_is_made_of_it() {
+    let plant = Plant::new();
+    let (folder, name) = made(&plant);
+    plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
+    // Somebody with all rights has changed a record.
+    plant.sql("UPDATE record SET text = replace(text, 'Ada', 'Eve') WHERE seq = 1");
+    {
+        let shown = Shown::of(&plant);
+        let said = words(&until_proven(&shown, "/runs/1"));
+        assert!(said.contains("NOT PROVEN") && said.contains("record 1") && !said.contains("regrind-page-"), "{said}");
+        for made in ["report", "qif", "dfq"] {
+            assert_eq!(shown.visitor.get(&format!("/runs/1/{made}")).status, 422, "{made}");
+        }
+    }
+    plant.sql("UPDATE record SET text = replace(text, 'Eve', 'Ada') WHERE seq = 1");
+    let shown = Shown::of(&plant);
+    let answer = shown.visitor.get(&format!("/run?cell=cell-1&name={name}"));
+    assert_eq!((answer.status, answer.header("location")), (303, vec!["/runs/1"]));
+    let said = words(&until_proven(&shown, "/runs/1"));
+    let records = plant.sql("SELECT count(*) FROM record");
+    assert!(said.contains("Proven at") && said.contains(&format!("{records} records in an unbroken chain")), "{said}");
+    assert!(said.contains("by a key that the plant knows of the cell") && said.contains("SIMULATION"), "{said}");
+
+    // What is made of the copy is what is made at the cell.
+    let report = shown.visitor.get("/runs/1/report");
+    assert!(report.header("content-security-policy")[0].starts_with("default-src 'none'"), "{report:?}");
+    assert!(report.text() == fs::read_to_string(folder.join("report.html")).unwrap(), "the report of the cell itself");
+    let path = folder.display().to_string();
+    plant.does(&["report", &path, "--qif", "--dfq"]);
+    for (made, file) in [("qif", "results.qif"), ("dfq", "results.dfq")] {
+        assert_eq!(shown.text(&format!("/runs/1/{made}")), fs::read_to_string(folder.join(file)).unwrap(), "{made}");
+    }
+    let told = read_dfq(&folder.join("results.dfq"));
+    assert_eq!(told["characteristics"][0]["values"][0]["part"], "SN-0042");
+
+    let html = shown.text("/maps?run=1:1&run=1");
+    assert_eq!(html.matches("<svg").count(), 2 + html.matches("class=\"shape\"").count(), "{}", words(&html));
+    let said = words(&html);
+    assert!(said.contains("SN-0042 , cycle 1, cell-1") && said.contains("One scale for all: ±"), "{said}");
+    plant.sql("UPDATE artefact SET content = 'other' WHERE sha256 = (SELECT sha256 FROM run_artefact WHERE name = 'cycle-1/error_map.csv')");
+    let said = words(&shown.text("/maps?run=1:1"));
+    assert!(said.contains("is not what was written"), "{said}");
+}
+
+/// The page of a run when it says what came of its proof.
+fn until_proven(shown: &Shown, path: &str) -> String {
+    let began = Instant::now();
+    loop {
+        let html = shown.text(path);
+        if !html.contains("being brought together") {
+            return html;
+        }
+        assert!(began.elapsed() < PATIENCE, "never: {html}");
+        std::thread::park_timeout(std::time::Duration::from_millis(100));
+    }
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn a_database_that_goes_away_is_said_and_comes_back_by_itself() {
+    let mut plant = Plant::new();
+    let one = cell(&plant, "cell-1");
+    plant_runs(&plant, &[Planted { cell: one, ..Planted::default() }]);
+    let shown = Shown::of(&plant);
+    for _ in 0..2 {
+        assert!(shown.text("/").contains("cell-1"));
+        plant.postgres.kill();
+        for path in ["/", "/trend", "/cells", "/parts", "/runs/1", "/export.csv"] {
+            let answer = shown.visitor.get(path);
+            let said = words(&answer.text());
+            assert_eq!(answer.status, 503, "{path}: {said}");
+            assert!(
+                said.contains("The database of the plant is away") && said.contains("not known here"),
+                "{path}: {said}"
+            );
+            assert!(answer.text().contains("http-equiv=\"refresh\" content=\"5\""), "{path}");
+        }
+        plant.postgres.go_on();
+    }
+    assert!(shown.text("/").contains("cell-1"));
+    // One that began without it waits for it.
+    plant.postgres.kill();
+    let late = Shown::of(&plant);
+    assert_eq!(late.visitor.get("/").status, 503);
+    plant.postgres.go_on();
+    assert!(late.text("/").contains("cell-1"));
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn the_page_is_for_who_has_its_key_and_changes_nothing() {
+    let plant = Plant::new();
+    let one = cell(&plant, "cell-1");
+    plant_runs(&plant, &[Planted { cell: one, ..Planted::default() }]);
+    let shown = Shown::of(&plant);
+    let stranger = Visitor::stranger(&shown.url);
+    for path in [
+        "/",
+        "/trend",
+        "/trend.dfq",
+        "/cells",
+        "/parts",
+        "/export.csv",
+        "/runs/1",
+        "/runs/1/report",
+        "/maps?run=1",
+        "/plant.css",
+        "/?key=wrong",
+    ] {
+        let answer = stranger.get(path);
+        assert_eq!(answer.status, 401, "{path}");
+        assert!(!answer.text().contains("cell-1"), "{path}");
+    }
+    let other = Visitor { place: shown.visitor.place.clone(), ..shown.visitor.clone() };
+    let foreign =
+        format!("GET / HTTP/1.1\r\nHost: plant.example\r\nCookie: {}\r\nConnection: close\r\n\r\n", other.cookies);
+    assert_eq!(crate::http::raw(&other.place, foreign.as_bytes()).status, 421);
+    // There is nothing to order.
+    let origin = shown.visitor.origin();
+    for path in ["/", "/trend", "/runs/1", "/runs/1/orders", "/parts"] {
+        let token = shown.visitor.token();
+        let answer = shown.visitor.post(path, &[("Origin", &origin), ("X-Regrind-Token", &token)], b"{}");
+        assert!([404, 405].contains(&answer.status), "{path}: {answer:?}");
+    }
+    // Its role may not, whatever it asks.
+    for text in [
+        "UPDATE run SET part = 'x'",
+        "DELETE FROM record",
+        "INSERT INTO incident (what, words) VALUES ('x', 'y')",
+        "SELECT queue_work('SN', '', NULL, NULL)",
+        "SELECT tell_state(NULL, '{}')",
+        "CREATE TABLE regrind.mine (a int)",
+        "DROP VIEW choice",
+    ] {
+        assert!(plant.asked_by("page", text).is_err(), "{text}");
+    }
+    // For other computers there is no page without a certificate and users.
+    let (_, told) = plant.ends(&["plant", "serve", "--plant", "page.toml", "--listen", "0.0.0.0:0"], 2);
+    assert!(told.contains("open to other computers"), "{told}");
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn every_question_of_the_dashboard_for_grafana_has_an_answer() {
+    let plant = Plant::new();
+    let one = cell(&plant, "cell-1");
+    tell(&plant, one, "1 second", None, &grinding("SN-1"));
+    let runs: Vec<Planted> = (2..30).map(|hours| Planted { cell: one, hours, ..Planted::default() }).collect();
+    plant_runs(&plant, &runs);
+    plant.sql("INSERT INTO recipe (sha256, name, version, text) VALUES (sha256('a'), 'mirror', 1, 'a')");
+    plant.sql("INSERT INTO work (serial, recipe) VALUES ('SN-9', sha256('a')); INSERT INTO incident (what, words) VALUES ('x', 'y')");
+    plant.somebody("grafana", "reader");
+    let text = fs::read_to_string(root().join("config/plant/grafana.json")).unwrap();
+    let dashboard: Value = serde_json::from_str(&text).unwrap();
+    let panels = dashboard["panels"].as_array().unwrap().iter();
+    let of_panel = |panel: &Value| {
+        panel["targets"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|of| of["rawSql"].as_str().unwrap().to_owned())
+            .collect::<Vec<_>>()
+    };
+    let mut questions: Vec<String> = panels.flat_map(of_panel).collect();
+    let variables = dashboard["templating"]["list"].as_array().unwrap().iter().filter(|of| of["type"] == "query");
+    questions.extend(variables.map(|of| of["query"].as_str().unwrap().to_owned()));
+    assert_eq!(questions.len(), 9, "seven panels and two variables");
+    for question in questions {
+        // As Grafana does before it asks: its macros, then its variables.
+        let (from, to) = ("'2000-01-01T00:00:00Z'", "'2999-01-01T00:00:00Z'");
+        let mut asked = question.clone();
+        for column in ["began", "at"] {
+            asked = asked.replace(&format!("$__timeFilter({column})"), &format!("{column} BETWEEN {from} AND {to}"));
+        }
+        let variables = [
+            ("$__timeFrom()", from),
+            ("$__timeTo()", to),
+            ("${parts}", "real"),
+            ("${recipe:sqlstring}", "'mirror','lens'"),
+            ("${cell:sqlstring}", "'cell-1'"),
+        ];
+        for (variable, value) in variables {
+            asked = asked.replace(variable, value);
+        }
+        assert!(!asked.contains('$'), "{asked}");
+        let password = plant.password("grafana");
+        let rows = plant
+            .postgres
+            .ask_as("grafana", &password, "regrind", &asked)
+            .unwrap_or_else(|error| panic!("{asked}: {error}"));
+        assert!(!rows.is_empty(), "no row: {asked}");
+    }
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql) and a browser (Debian package chromium)"]
+fn in_a_browser_every_page_fits_a_telephone_and_fetches_nothing_from_elsewhere() {
+    let plant = Plant::new();
+    let one = cell(&plant, "cell-1");
+    tell(&plant, one, "1 second", Some("run"), &grinding("SN-0042"));
+    let runs: Vec<Planted> =
+        (2..60).map(|hours| Planted { cell: one, hours, cycles: 2, ..Planted::default() }).collect();
+    let first = plant_runs(&plant, &runs);
+    let shown = Shown::of(&plant);
+    let mut browser = Browser::start(plant.home.path());
+    let tab = browser.open(&shown.url, [390, 844]);
+    tab.until(&mut browser, "document.querySelector('.cell .left')");
+    let base = shown.url.split("?key=").next().unwrap().to_owned();
+    for path in ["", "trend", "cells", "parts?serial=SN", &format!("maps?run={first}"), &format!("runs/{first}")] {
+        tab.send(&mut browser, "Page.navigate", serde_json::json!({ "url": format!("{base}{path}") }));
+        tab.until(&mut browser, &format!("document.readyState == 'complete' && location.href == '{base}{path}'"));
+        let wide = tab.read(
+            &mut browser,
+            "(() => { const [m, d] = [document.querySelector('main'), document.documentElement]; return m.scrollWidth - m.clientWidth + d.scrollWidth - d.clientWidth; })()",
+        );
+        assert_eq!(wide, 0, "{path} is wider than the screen");
+    }
+    assert_eq!(tab.problems(&browser), Vec::<String>::new());
+}
