@@ -11,6 +11,7 @@ mod folder;
 mod form_document;
 pub mod gcode;
 mod height_map;
+mod kept_number;
 mod layout;
 mod learned;
 mod lines;
@@ -42,6 +43,7 @@ pub use figures::write_figures;
 pub use folder::{ResultFolder, ScratchFolder, finished_files, place_link, remove_link, remove_socket};
 pub use form_document::save_form;
 pub use height_map::HeightMap;
+pub use kept_number::KeptNumber;
 pub use learned::{LEARNED, Learned, LearnedError};
 pub use lines::AddedLines;
 pub use map::{

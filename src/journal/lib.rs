@@ -42,7 +42,7 @@ pub use machine::MachineLock;
 pub use open::free_bytes;
 pub use record::{Entry, Kind, Record, Records};
 pub use seal::SEALED_EVERY;
-pub use verify::{Against, Anchor, Verified, verify, verify_against};
+pub use verify::{Against, Anchor, Verified, is_driven, verify, verify_against};
 pub use write::{Header, Journal, RunLock};
 
 use std::path::Path;

@@ -193,8 +193,8 @@ fn examine(folder: &Path, anchors: &[&Anchor], trusted: &[PublicKey]) -> Result<
     })
 }
 
-/// Whether somebody holds the lock of a run folder.
-fn is_driven(folder: &Path) -> bool {
+/// Whether somebody holds the lock of a run folder: its program is there, whether it is at its beginning, at work or at its end.
+pub fn is_driven(folder: &Path) -> bool {
     let lock = fs::File::open(folder.join(LOCK));
     lock.is_ok_and(|lock| matches!(lock.try_lock_shared(), Err(fs::TryLockError::WouldBlock)))
 }

@@ -1,0 +1,66 @@
+//! A number that outlives the program which counts it.
+
+use std::fs::{File, TryLockError};
+use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::path::Path;
+
+/// A number in a file of its own, which one program has at a time.
+#[derive(Debug)]
+pub struct KeptNumber {
+    file: File,
+}
+
+impl KeptNumber {
+    /// Takes the number for this program until this is dropped; none where another program has it.
+    ///
+    /// # Errors
+    /// A file that cannot be made, written or locked.
+    pub fn take(path: &Path) -> io::Result<Option<Self>> {
+        let file = File::options().read(true).write(true).create(true).truncate(false).open(path)?;
+        match file.try_lock() {
+            Ok(()) => Ok(Some(Self { file })),
+            Err(TryLockError::WouldBlock) => Ok(None),
+            Err(TryLockError::Error(error)) => Err(error),
+        }
+    }
+
+    /// Reads the number; none where there was none yet, or what stands there is no number.
+    ///
+    /// # Errors
+    /// A file that cannot be read.
+    pub fn get(&mut self) -> io::Result<Option<u64>> {
+        let mut text = String::new();
+        self.file.seek(SeekFrom::Start(0))?;
+        match (&mut self.file).take(32).read_to_string(&mut text) {
+            Err(error) if error.kind() != io::ErrorKind::InvalidData => Err(error),
+            _ => Ok(text.trim().parse().ok()),
+        }
+    }
+
+    /// Writes another number.
+    ///
+    /// # Errors
+    /// A disk that is full.
+    pub fn set(&mut self, number: u64) -> io::Result<()> {
+        self.file.seek(SeekFrom::Start(0))?;
+        self.file.write_all(format!("{number:<20}\n").as_bytes())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_number_is_kept_and_belongs_to_one() {
+        let home = tempfile::tempdir().unwrap();
+        let path = home.path().join("number");
+        let mut number = KeptNumber::take(&path).unwrap().unwrap();
+        assert_eq!(number.get().unwrap(), None);
+        number.set(255).unwrap();
+        number.set(7).unwrap();
+        assert!(KeptNumber::take(&path).unwrap().is_none());
+        drop(number);
+        assert_eq!(KeptNumber::take(&path).unwrap().unwrap().get().unwrap(), Some(7));
+    }
+}
