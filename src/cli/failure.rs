@@ -120,6 +120,9 @@ pub(super) enum Failure {
     #[cfg(feature = "plant")]
     #[error(transparent)]
     Plant(Box<PlantError>),
+    #[cfg(feature = "plant")]
+    #[error(transparent)]
+    Live(#[from] regrind_live::LiveError),
     #[error("{}: there is no user {name:?}; `regrind users list` tells who is there", .path.display())]
     NoUser { name: String, path: PathBuf },
     #[error("the two passwords are not alike; nothing was changed")]

@@ -33,6 +33,8 @@ mod show;
 mod simulate;
 mod simulated;
 mod states;
+#[cfg(feature = "plant")]
+mod tell;
 mod users;
 mod watch;
 mod words;
@@ -88,6 +90,8 @@ enum Command {
     Work(work::Arguments),
     #[cfg(feature = "plant")]
     Study(plant::studies::Arguments),
+    #[cfg(feature = "plant")]
+    Tell(tell::Arguments),
     #[cfg(feature = "plant")]
     Plant(plant::Arguments),
     Audit(audit::Arguments),
@@ -151,6 +155,8 @@ fn run() -> ExitCode {
         Command::Work(arguments) => work::run(&arguments),
         #[cfg(feature = "plant")]
         Command::Study(arguments) => plant::studies::run(&arguments),
+        #[cfg(feature = "plant")]
+        Command::Tell(arguments) => tell::run(&arguments),
         #[cfg(feature = "plant")]
         Command::Plant(arguments) => plant::run(&arguments),
         Command::Audit(arguments) => audit::run(&arguments),

@@ -198,7 +198,7 @@ async fn tell_state(link: &Link, runs: &Path) -> Result<(), PlantError> {
 }
 
 /// Waits until nobody can write to standard input any more.
-fn end_of_input() -> tokio::sync::oneshot::Receiver<()> {
+pub(super) fn end_of_input() -> tokio::sync::oneshot::Receiver<()> {
     let (ended, end) = tokio::sync::oneshot::channel::<()>();
     // A thread of its own, which ends with the program: a read of a pipe cannot be called off.
     std::thread::spawn(move || {

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
+use regrind_live::{OpcUaSettings, SparkplugSettings};
 use regrind_plant::{Approver, ArtefactSettings, DatabaseSettings};
 use schemars::JsonSchema;
 use serde::Deserialize;
@@ -11,7 +12,7 @@ use crate::document::{Document, Problems, problem_at, read_text, schema_of, sha2
 
 static SCHEMA: LazyLock<serde_json::Value> = LazyLock::new(schema_of::<PlantFile>);
 
-/// A plant of Regrind: its database, and whose approval counts.
+/// A plant of Regrind: its database, whose approval counts, and where live values go.
 #[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 struct PlantFile {
@@ -25,6 +26,10 @@ struct PlantFile {
     approver: Vec<Approver>,
     /// Where large files of runs are kept, if not in the database.
     artefacts: Option<ArtefactSettings>,
+    /// A broker that is told how the cell is; nobody is told where it is left out.
+    sparkplug: Option<SparkplugSettings>,
+    /// A server that shows how the cell is; there is none where it is left out.
+    opcua: Option<OpcUaSettings>,
 }
 
 /// The plant, and this computer in it.
@@ -47,6 +52,10 @@ pub struct PlantConfig {
     pub approvers: Vec<Approver>,
     /// Where large files of runs are kept.
     pub artefacts: Option<ArtefactSettings>,
+    /// A broker that is told how the cell is.
+    pub sparkplug: Option<SparkplugSettings>,
+    /// A server that shows how the cell is.
+    pub opcua: Option<OpcUaSettings>,
     path: PathBuf,
     text: String,
     source_sha256: [u8; 32],
@@ -75,7 +84,7 @@ impl PlantConfig {
         document.hold_against(&SCHEMA);
         let written: Option<PlantFile> = document.as_written();
         let at = path.parent().unwrap_or(Path::new(""));
-        let found = written.map(|PlantFile { plant, database, approver, artefacts }| Self {
+        let found = written.map(|PlantFile { plant, database, approver, artefacts, sparkplug, opcua }| Self {
             cell: plant.cell,
             database: database.map(|database| DatabaseSettings {
                 password_file: beside(at, database.password_file),
@@ -84,6 +93,12 @@ impl PlantConfig {
             }),
             approvers: approver,
             artefacts: artefacts.map(|kept| ArtefactSettings { folder: at.join(kept.folder), ..kept }),
+            sparkplug: sparkplug.map(|broker| SparkplugSettings {
+                password_file: beside(at, broker.password_file),
+                certificates: beside(at, broker.certificates),
+                ..broker
+            }),
+            opcua,
             path: path.to_owned(),
             text: text.to_owned(),
             source_sha256: sha256(text),

@@ -1,6 +1,7 @@
-//! Many cells and one database: a real PostgreSQL beside the program itself, with its simulated machines, and whoever would do harm.
+//! Many cells and one database: a real PostgreSQL beside the program itself, with its simulated machines, and whoever would do harm; and the
+//! live values of a cell, as other people's programs see them.
 //!
-//! Each test asks for PostgreSQL: Debian package postgresql. Sockets in the file system and modes are Unix's.
+//! Each test says what it asks for: PostgreSQL (Debian package postgresql), mosquitto, Python. Sockets in the file system and modes are Unix's.
 #![cfg(unix)]
 
 #[path = "../common/keep.rs"]
@@ -8,16 +9,21 @@ mod keep;
 #[path = "../common/program.rs"]
 mod program;
 
+mod broker;
 #[path = "../page/browser.rs"]
 #[allow(dead_code, reason = "not every key is pressed here")]
 mod browser;
+mod held;
 #[path = "../page/http.rs"]
 #[allow(dead_code, reason = "users and orders of a cell's page are in its own tests")]
 mod http;
 mod network;
+mod on_broker;
+mod on_opcua;
 mod on_postgres;
 #[path = "../common/outlived.rs"]
 mod outlived;
+mod peers;
 mod postgres;
 
 use std::fs;

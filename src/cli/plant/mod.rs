@@ -113,14 +113,19 @@ pub(super) async fn open(config: &PlantConfig) -> Result<Link, Failure> {
 
 /// What goes on beside a run for the plant. It ends a little after the program that holds this.
 pub(super) struct Beside {
-    _shipping: super::ship::Beside,
+    _shipping: Option<super::ship::Beside>,
+    _telling: Option<super::tell::Beside>,
 }
 
 impl Beside {
-    /// Begins to ship the runs in a folder, where the plant file names a database.
+    /// Begins to ship the runs in a folder where the plant file names a database, and to tell live values where it says to whom.
     pub(super) fn begin(runs: &Path, plant: &Path) -> Result<Self, Failure> {
         // What is wrong with the file is said here, before anything opens.
-        read(plant)?;
-        Ok(Self { _shipping: super::ship::Beside::begin(runs, plant)? })
+        let config = read(plant)?;
+        let tells = config.sparkplug.is_some() || config.opcua.is_some();
+        Ok(Self {
+            _shipping: config.database.is_some().then(|| super::ship::Beside::begin(runs, plant)).transpose()?,
+            _telling: tells.then(|| super::tell::Beside::begin(runs, plant)).transpose()?,
+        })
     }
 }

@@ -1,0 +1,312 @@
+//! `regrind tell`: how this cell is, for whoever speaks Sparkplug B or OPC UA, beside whatever the cell does.
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use clap::Args;
+use regrind::config::PlantConfig;
+use regrind::drive::Request;
+use regrind::journal::is_driven;
+use regrind::report::{RunResult, RunSummary, run_summary};
+use regrind_control::OnBehalf;
+use regrind_live::{Ended, LiveError, News, Node, Notes, Now, Told, Turn, UaServer, notes};
+use serde_json::json;
+use tokio::sync::{mpsc, watch};
+use tokio::task::JoinSet;
+
+use super::failure::Failure;
+use super::{Outcome, check, control, outside, plant, ship};
+
+/// From one look for a run to the next, and for the turn of this program.
+const ROUND: Duration = Duration::from_secs(1);
+/// How long it is told behind a run that has ended how that ended.
+const LINGERS: Duration = Duration::from_secs(3);
+/// How long a farewell may take.
+const FAREWELL: Duration = Duration::from_secs(5);
+/// Most refusals that are told one by one, of those that came together.
+const ONE_BY_ONE: usize = 8;
+
+/// Tell live values of this cell to a broker (Sparkplug B) and to who asks (OPC UA)
+#[derive(Args, Debug)]
+#[command(after_help = "\
+To whom stands in the plant file, by [sparkplug] and [opcua]. It goes on until it is stopped, from run to run, whether a run is on or not. Nothing that
+comes in is an order: a value that somebody writes and a command that somebody sends are refused, told here, and recorded in the run that is on.
+`regrind run --plant` begins it by itself; docs/live.md has every value.
+
+Example:
+  regrind tell --plant plant.toml --runs /srv/runs
+
+Exit codes: 0 stopped by Ctrl-C; 2 bad arguments, or what the plant file names cannot be used.")]
+pub(super) struct Arguments {
+    /// Plant file: to whom the cell is told
+    #[arg(long, value_name = "FILE")]
+    plant: PathBuf,
+    /// Folder of the runs
+    #[arg(long, value_name = "DIR", default_value = "runs")]
+    runs: PathBuf,
+    /// Print a line of JSON for everything that happens
+    #[arg(long)]
+    json: bool,
+    /// End a little after standard input does: with the program that began this one
+    #[arg(long, hide = true)]
+    while_stdin: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
+    let config = plant::read(&arguments.plant)?;
+    let cell = cell_of(&config)?;
+    // Whatever else this computer does goes first.
+    outside::give_way();
+    super::runtime()?.block_on(async {
+        let mut endings = outside::Endings::new().map_err(Failure::Signals)?;
+        let ended = async {
+            if arguments.while_stdin {
+                return drop(ship::end_of_input().await);
+            }
+            tokio::select! {
+                _ = tokio::signal::ctrl_c() => {}
+                _ = endings.next() => {}
+            }
+        };
+        tokio::pin!(ended);
+        let turn = tokio::select! {
+            turn = turn(&config, arguments) => turn?,
+            () = &mut ended => return Ok(Outcome::Accepted),
+        };
+        tell(&config, &cell, &turn, arguments, ended).await
+    })
+}
+
+/// What the cell is called, which is told to somebody.
+fn cell_of(config: &PlantConfig) -> Result<String, Failure> {
+    let missing = |key, remedy| check::or_show(Err(config.problem(key, "is missing", "", remedy)));
+    match &config.cell {
+        _ if config.sparkplug.is_none() && config.opcua.is_none() => {
+            missing("sparkplug", "say by [sparkplug] or [opcua] to whom the cell is told")
+        }
+        Some(cell) => Ok(cell.clone()),
+        None => missing("plant.cell", "say what this cell is called"),
+    }
+}
+
+/// Waits until no other program tells this cell.
+async fn turn(config: &PlantConfig, arguments: &Arguments) -> Result<Turn, Failure> {
+    let folder = config.path().with_extension("live");
+    let mut waits = false;
+    loop {
+        if let Some(turn) = Turn::take(&folder)? {
+            return Ok(turn);
+        }
+        if !std::mem::replace(&mut waits, true) && !arguments.while_stdin {
+            eprintln!("tell: another program tells this cell already; this one waits until that has ended");
+        }
+        tokio::time::sleep(ROUND).await;
+    }
+}
+
+/// Tells the cell until it is to end.
+async fn tell(
+    config: &PlantConfig,
+    cell: &str,
+    turn: &Turn,
+    arguments: &Arguments,
+    ended: impl Future<Output = ()>,
+) -> Result<Outcome, Failure> {
+    let (to, told) = watch::channel(look(&arguments.runs, None));
+    let (notes, news) = notes();
+    let mut telling = begin(config, cell, turn, &told, &notes)?;
+    // Only those who tell hold on to the news.
+    drop((told, notes));
+    let mut hearing = tokio::spawn(hear(news, arguments.runs.clone(), arguments.json));
+    let over = tokio::select! {
+        Some(over) = telling.join_next() => Some(over),
+        never = follow(&arguments.runs, &to) => match never {},
+        () = async {
+            ended.await;
+            if arguments.while_stdin {
+                tokio::time::sleep(LINGERS).await;
+            }
+        } => None,
+    };
+    drop(to);
+    let farewell = async { while telling.join_next().await.is_some() {} };
+    // Who does not listen to a farewell finds out otherwise.
+    let _ = tokio::time::timeout(FAREWELL, farewell).await;
+    drop(telling);
+    let _ = tokio::time::timeout(FAREWELL, &mut hearing).await;
+    match over {
+        Some(over) => {
+            over.map_err(|error| Failure::Terminal(error.into()))?.map(|()| Outcome::Accepted).map_err(Failure::Live)
+        }
+        None => Ok(Outcome::Accepted),
+    }
+}
+
+/// Begins to tell all that the plant file names.
+fn begin(
+    config: &PlantConfig,
+    cell: &str,
+    turn: &Turn,
+    told: &watch::Receiver<Told>,
+    notes: &Notes,
+) -> Result<JoinSet<Result<(), LiveError>>, Failure> {
+    let mut telling = JoinSet::new();
+    if let Some(settings) = &config.sparkplug {
+        telling.spawn(Node::new(settings, cell, turn, told.clone(), notes.clone())?.run());
+    }
+    if let Some(settings) = &config.opcua {
+        telling.spawn(UaServer::new(settings, cell, turn, told.clone(), notes.clone())?.run());
+    }
+    Ok(telling)
+}
+
+// ---- what is told -------------------------------------------------------------------------------------------------------------------
+
+enum Never {}
+
+/// Tells how the cell is, from run to run.
+async fn follow(runs: &Path, to: &watch::Sender<Told>) -> Never {
+    loop {
+        if let Some(folder) = control::live_runs(runs).next() {
+            watch_run(&folder, to).await;
+        }
+        let before = to.borrow().clone();
+        let runs = runs.to_owned();
+        // A record is long, and those who tell must not wait for it.
+        let now = tokio::task::spawn_blocking(move || look(&runs, Some(before))).await;
+        if let Ok(now) = now {
+            to.send_if_modified(|told| {
+                told != &now && {
+                    *told = now;
+                    true
+                }
+            });
+        }
+        tokio::time::sleep(ROUND).await;
+    }
+}
+
+/// Tells how a run is until its program has gone.
+async fn watch_run(folder: &Path, to: &watch::Sender<Told>) {
+    let run = name(folder);
+    let Ok(mut watch) = regrind_control::watch(folder).await else { return };
+    while let Ok(Some(snapshot)) = watch.next().await {
+        let now = Now::On { run: run.clone(), snapshot: Box::new(snapshot) };
+        to.send_if_modified(|told| {
+            told.now != now && {
+                told.now = now;
+                true
+            }
+        });
+    }
+}
+
+/// Returns how the cell is while no run is watched.
+fn look(runs: &Path, before: Option<Told>) -> Told {
+    let before = before.unwrap_or_default();
+    if let Some(folder) = control::live_runs(runs).next()
+        && let Ok(reply) = regrind_control::ask(&folder, &Request::Status)
+    {
+        return Told { now: Now::On { run: name(&folder), snapshot: Box::new(reply.status) }, ..before };
+    }
+    let Some(folder) = control::newest(runs) else { return Told::default() };
+    // What is known of a run that is over, or was left, changes no more until it is on again.
+    let known = match (&before.now, &before.last) {
+        (Now::Gone { run }, _) => *run == name(&folder),
+        (Now::NoRun, Some(last)) => last.run == name(&folder),
+        _ => false,
+    };
+    // A program that is there and not heard yet, or no more, is at the beginning or the end of its run.
+    if known || is_driven(&folder) {
+        return before;
+    }
+    match run_summary(&folder) {
+        Ok(RunSummary { ended: Some(_), result, verdict, .. }) => {
+            let accepted = result == RunResult::Accepted;
+            Told { now: Now::NoRun, last: Some(Ended { run: name(&folder), verdict, accepted }) }
+        }
+        // A folder that has no record yet is no run that was left.
+        Ok(summary) if !summary.began.is_empty() => Told { now: Now::Gone { run: name(&folder) }, ..before },
+        _ => Told { now: Now::NoRun, ..before },
+    }
+}
+
+fn name(folder: &Path) -> String {
+    folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
+}
+
+// ---- what comes back ----------------------------------------------------------------------------------------------------------------
+
+/// Says what happened to those who tell, and has on record what was refused while a run was on.
+async fn hear(mut news: mpsc::Receiver<News>, runs: PathBuf, json: bool) {
+    let mut some = Vec::new();
+    while news.recv_many(&mut some, 256).await > 0 {
+        let mut refused = 0;
+        for news in some.drain(..) {
+            match news {
+                News::Tells { place } => say(json, &json!({ "tells": place }), &format!("{place} is told from now on")),
+                News::Waits { place, why } => say(
+                    json,
+                    &json!({ "waits": place, "why": why }),
+                    &format!("{place} is not told for now: {why}; the cell goes on, and it is tried again"),
+                ),
+                News::Refused { by, what } if refused < ONE_BY_ONE => {
+                    refused += 1;
+                    refuse(&runs, json, &by, &what).await;
+                }
+                News::Refused { .. } => refused += 1,
+                News::RefusedMore { times } => refused += times as usize,
+            }
+        }
+        if refused > ONE_BY_ONE {
+            let more = refused - ONE_BY_ONE;
+            refuse(&runs, json, "the same or others", &format!("{more} more of what cannot be done from there")).await;
+        }
+    }
+}
+
+/// Says what was refused, here and in the record of the run that is on.
+async fn refuse(runs: &Path, json: bool, by: &str, what: &str) {
+    say(
+        json,
+        &json!({ "refused": what, "by": by }),
+        &format!("refused to {by}: {what}; live values are only to be looked at"),
+    );
+    let runs = runs.to_owned();
+    let remark = Request::Remark { what: format!("live values: refused: {what}") };
+    let by = OnBehalf { name: None, station: by.to_owned() };
+    // A run that does not answer holds up nothing but this.
+    let recorded = tokio::task::spawn_blocking(move || {
+        let run = control::live_runs(&runs).next()?;
+        Some(regrind_control::ask_for(&run, &remark, Some(by)).is_ok_and(|reply| reply.accepted))
+    });
+    if recorded.await.ok().flatten() == Some(false) {
+        eprintln!("tell: the run did not take it on record");
+    }
+}
+
+fn say(json: bool, fields: &serde_json::Value, words: &str) {
+    eprintln!("tell: {words}");
+    if json {
+        // A reader that has gone away is no fault.
+        let _ = super::print(&format!("{fields}\n"));
+    }
+}
+
+/// Who tells live values beside a run. It ends a little after the program that holds this.
+pub(super) struct Beside {
+    _telling: Child,
+}
+
+impl Beside {
+    /// Begins to tell the runs in a folder. In a program of its own: it can neither slow the run down nor take it along.
+    pub(super) fn begin(runs: &Path, plant: &Path) -> Result<Self, Failure> {
+        let failed = Failure::Terminal;
+        let mut command = Command::new(std::env::current_exe().map_err(failed)?);
+        command.args(["tell", "--while-stdin", "--plant"]).arg(plant).arg("--runs").arg(runs);
+        outside::set_apart(&mut command);
+        let telling = command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn().map_err(failed)?;
+        Ok(Self { _telling: telling })
+    }
+}

@@ -1,0 +1,38 @@
+//! Why live values cannot be told as the plant file says, with the remedy.
+
+use std::io;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use regrind_formats::{FormatError, OpenToOthers};
+use thiserror::Error;
+
+/// Why live values cannot be told as the plant file says.
+#[derive(Debug, Error)]
+#[expect(missing_docs, reason = "the messages tell them")]
+#[non_exhaustive]
+pub enum LiveError {
+    #[error("{}: the password cannot be read: {source}; `password_file` of [sparkplug] names its file", .path.display())]
+    Password { path: PathBuf, source: io::Error },
+    #[error("{}: other users of this computer may read the password ({}); it is for its owner only: {}", .path.display(), .open.how, .open.remedy)]
+    PasswordIsOpen { path: PathBuf, open: OpenToOthers },
+    #[error("{}: no certificates in PEM can be read from it: {what}", .path.display())]
+    Certificates { path: PathBuf, what: String },
+    #[error(
+        "{broker} is another computer, and nothing says by which certificates it proves itself; name them by `certificates` of [sparkplug]"
+    )]
+    Unproven { broker: String },
+    #[error("{of} {name:?} cannot be a part of a topic: it is empty, or has one of + / #; give it another name")]
+    Topic { of: &'static str, name: String },
+    #[error("{}: what outlives the program cannot be kept there: {source}; check that the folder is there, and yours to write", .path.display())]
+    Folder { path: PathBuf, source: io::Error },
+    #[error(
+        "{listen} is open to other computers, and OPC UA is shown here without a cipher; listen at 127.0.0.1, and reach it from elsewhere \
+         through a tunnel: ssh -L 4840:127.0.0.1:4840 CELL"
+    )]
+    ForOthers { listen: SocketAddr },
+    #[error("the server of OPC UA cannot go on: {what}")]
+    Server { what: String },
+    #[error(transparent)]
+    File(#[from] FormatError),
+}

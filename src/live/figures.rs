@@ -1,0 +1,241 @@
+//! What there is to tell of a cell, one by one: what it is called, of what kind it is, and in which unit. All who tell it tell the same.
+//!
+//! What nobody knows has no value: neither 0 nor an empty text stands for it.
+
+use regrind_control::{CycleRow, JobProgress};
+
+use crate::packml::{PRODUCTION, SIMULATION, state_number};
+use crate::told::{Now, Told};
+
+/// Something that is told of a cell.
+#[derive(Clone, Copy, Debug)]
+pub struct Figure {
+    /// What it is called: a path of words, by `/`. Where PackML has a tag for it, it is that.
+    pub name: &'static str,
+    /// Of what kind its values are.
+    pub kind: FigureKind,
+    /// Their unit.
+    pub unit: Option<&'static str>,
+    /// What it is, for people.
+    pub about: &'static str,
+    of: fn(&Told) -> Option<FigureValue>,
+}
+
+/// Of what kind the values of a figure are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[expect(missing_docs, reason = "named for what they are")]
+pub enum FigureKind {
+    Whole,
+    Number,
+    Truth,
+    Text,
+}
+
+/// What is known of a figure.
+#[derive(Clone, Debug, PartialEq)]
+#[expect(missing_docs, reason = "named for what they are")]
+pub enum FigureValue {
+    Whole(u32),
+    Number(f64),
+    Truth(bool),
+    Text(String),
+}
+
+impl Figure {
+    /// Returns what is known of it; none where nobody knows.
+    pub fn of(&self, told: &Told) -> Option<FigureValue> {
+        (self.of)(told).filter(|value| !matches!(value, FigureValue::Number(number) if !number.is_finite()))
+    }
+}
+
+const fn whole(name: &'static str, about: &'static str, of: fn(&Told) -> Option<FigureValue>) -> Figure {
+    Figure { name, kind: FigureKind::Whole, unit: None, about, of }
+}
+
+const fn number(
+    name: &'static str,
+    unit: &'static str,
+    about: &'static str,
+    of: fn(&Told) -> Option<FigureValue>,
+) -> Figure {
+    Figure { name, kind: FigureKind::Number, unit: Some(unit), about, of }
+}
+
+const fn truth(name: &'static str, about: &'static str, of: fn(&Told) -> Option<FigureValue>) -> Figure {
+    Figure { name, kind: FigureKind::Truth, unit: None, about, of }
+}
+
+const fn text(name: &'static str, about: &'static str, of: fn(&Told) -> Option<FigureValue>) -> Figure {
+    Figure { name, kind: FigureKind::Text, unit: None, about, of }
+}
+
+/// All there is to tell of a cell.
+pub const FIGURES: &[Figure] = &[
+    whole("Status/StateCurrent", "Number of the state by PackML; 4 (Idle) where no run is on", |told| {
+        match &told.now {
+            Now::NoRun => Some(FigureValue::Whole(state_number(regrind_cell::StateName::Idle))),
+            Now::Gone { .. } => None,
+            Now::On { snapshot, .. } => Some(FigureValue::Whole(state_number(snapshot.state))),
+        }
+    }),
+    text("Status/StateName", "Name of the state by PackML", |told| match &told.now {
+        Now::NoRun => Some(FigureValue::Text("Idle".into())),
+        Now::Gone { .. } => None,
+        Now::On { snapshot, .. } => Some(FigureValue::Text(snapshot.state.to_string())),
+    }),
+    whole("Status/UnitModeCurrent", "Number of the mode by PackML: 1 production, 16 simulation", |told| {
+        told.snapshot().map(|now| FigureValue::Whole(if now.simulation { SIMULATION } else { PRODUCTION }))
+    }),
+    text("Status/UnitModeName", "Name of the mode", |told| {
+        told.snapshot().map(|now| in_words(if now.simulation { "Simulation" } else { "Production" }))
+    }),
+    truth("Simulation", "Whether any machine of the cell is simulated", |told| {
+        told.snapshot().map(|now| FigureValue::Truth(now.simulation))
+    }),
+    text("Message", "State and phase, for people", |told| match &told.now {
+        Now::NoRun => Some(in_words("no run is on")),
+        Now::Gone { run } => Some(FigureValue::Text(format!(
+            "the program of {run} has gone before its end: what the machines do is not known; see to them, then: regrind resume"
+        ))),
+        Now::On { snapshot, .. } => Some(in_words(&snapshot.message)),
+    }),
+    text("Next Step", "What a person does next", |told| told.snapshot().map(|now| in_words(&now.next))),
+    text("Phase", "Phase of the cycle, in which the cell is or will go on", |told| {
+        told.snapshot()?.phase.map(|phase| in_words(phase.name()))
+    }),
+    text("Run", "What the run is called", |told| told.run().map(in_words)),
+    text("Part", "What the part is called", |told| told.snapshot().and_then(|now| if_known(&now.part))),
+    text("Serial", "Serial number of the part", |told| told.snapshot().and_then(|now| if_known(&now.serial))),
+    whole("Cycle", "Number of the cycle; 0 before the first", |told| {
+        told.snapshot().map(|now| FigureValue::Whole(now.cycle))
+    }),
+    whole("Max Cycles", "How many cycles there are at most", |told| {
+        told.snapshot().map(|now| now.max_cycles).filter(|most| *most > 0).map(FigureValue::Whole)
+    }),
+    text("Job/Machine", "The machine that is at a job: cmm or grinder", |told| {
+        job(told).map(|job| in_words(job.device.name()))
+    }),
+    whole("Job/Done", "Points, or parts of the path, that are done", |told| {
+        job(told).map(|job| FigureValue::Whole(job.done))
+    }),
+    whole("Job/Total", "How many there are", |told| job(told).map(|job| FigureValue::Whole(job.total))),
+    number("Job/Progress", "%", "How far the job is", |told| {
+        job(told)
+            .filter(|job| job.total > 0)
+            .map(|job| FigureValue::Number(100.0 * f64::from(job.done) / f64::from(job.total)))
+    }),
+    number("Job/Least Time Left", "s", "Least time that the job still takes", |told| time_left_s(told, 0)),
+    number("Job/Most Time Left", "s", "Most time that the job still takes", |told| time_left_s(told, 1)),
+    whole("Figures/Cycle", "The last cycle that was measured, to which PV and RMS belong", |told| {
+        measured(told).map(|row| FigureValue::Whole(row.cycle))
+    }),
+    number("Figures/PV", "um", "Peak to valley of the form, as it is judged", |told| {
+        measured(told).map(|row| FigureValue::Number(row.judged_um()[0]))
+    }),
+    number("Figures/RMS", "um", "Root mean square of the form, as it is judged", |told| {
+        measured(told).map(|row| FigureValue::Number(row.judged_um()[1]))
+    }),
+    number("Limits/PV", "um", "Limit of PV; none where it is not limited", |told| {
+        told.snapshot()?.tolerance.map(|limits| FigureValue::Number(1e3 * limits.pv_mm))
+    }),
+    number("Limits/RMS", "um", "Limit of RMS; none where it is not limited", |told| {
+        told.snapshot()?.tolerance.map(|limits| FigureValue::Number(1e3 * limits.rms_mm))
+    }),
+    whole("Alarms/Count", "How many alarms stand", |told| {
+        told.snapshot().map(|now| FigureValue::Whole(u32::try_from(now.alarms.len()).unwrap_or(u32::MAX)))
+    }),
+    text("Alarms/Text", "What the alarms say, the first first; empty where none stands", |told| {
+        told.snapshot().map(|now| listed(now.alarms.iter().map(|alarm| &*alarm.what), "\n"))
+    }),
+    text("Unconfirmed", "Machines that have not confirmed that they stand, in a state that is taken for it", |told| {
+        told.snapshot().map(|now| listed(now.unconfirmed.iter().map(|device| device.name()), ", "))
+    }),
+    text("Last Run/Name", "The last run that came to its end", |told| {
+        told.last.as_ref().map(|last| in_words(&last.run))
+    }),
+    text("Last Run/Verdict", "How it ended", |told| told.last.as_ref().map(|last| in_words(&last.verdict))),
+    truth("Last Run/Accepted", "Whether its part is accepted", |told| {
+        told.last.as_ref().map(|last| FigureValue::Truth(last.accepted))
+    }),
+];
+
+fn in_words(words: &str) -> FigureValue {
+    FigureValue::Text(words.to_owned())
+}
+
+fn listed<'a>(words: impl Iterator<Item = &'a str>, between: &str) -> FigureValue {
+    FigureValue::Text(words.collect::<Vec<_>>().join(between))
+}
+
+fn if_known(name: &str) -> Option<FigureValue> {
+    Some(name).filter(|name| !name.is_empty()).map(in_words)
+}
+
+fn job(told: &Told) -> Option<JobProgress> {
+    told.snapshot()?.progress
+}
+
+fn time_left_s(told: &Told, which: usize) -> Option<FigureValue> {
+    job(told)?.left_s.map(|left_s| FigureValue::Number(left_s[which]))
+}
+
+fn measured(told: &Told) -> Option<&CycleRow> {
+    told.snapshot()?.cycles.last()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use regrind_control::Snapshot;
+
+    fn on(snapshot: Snapshot) -> Told {
+        Told { now: Now::On { run: "a run".into(), snapshot: Box::new(snapshot) }, last: None }
+    }
+
+    fn value(name: &str, told: &Told) -> Option<FigureValue> {
+        FIGURES.iter().find(|figure| figure.name == name).unwrap().of(told)
+    }
+
+    #[test]
+    fn every_figure_stands_in_the_book() {
+        let book = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/live.md")).unwrap();
+        for Figure { name, kind, unit, about, .. } in FIGURES {
+            let kind = match kind {
+                FigureKind::Whole => "UInt32",
+                FigureKind::Number => "Double",
+                FigureKind::Truth => "Boolean",
+                FigureKind::Text => "String",
+            };
+            let row = format!("| `{name}` | {kind} | {} | {about} |", unit.unwrap_or_default());
+            assert!(book.contains(&row), "docs/live.md lacks {row}");
+        }
+    }
+
+    #[test]
+    fn what_nobody_knows_has_no_value() {
+        let nothing = on(Snapshot::default());
+        for name in
+            ["Figures/PV", "Limits/PV", "Job/Progress", "Job/Least Time Left", "Part", "Serial", "Max Cycles", "Phase"]
+        {
+            assert_eq!(value(name, &nothing), None, "{name}");
+        }
+        let limits = regrind_cell::Tolerance {
+            pv_mm: f64::INFINITY,
+            rms_mm: 1e-3,
+            with_uncertainty: false,
+            probability: 0.975,
+            pv_of: regrind_cell::PvOf::All,
+        };
+        let told = on(Snapshot { tolerance: Some(limits), ..Snapshot::default() });
+        assert_eq!(value("Limits/PV", &told), None, "it is not limited");
+        assert_eq!(value("Limits/RMS", &told), Some(FigureValue::Number(1.0)));
+    }
+
+    #[test]
+    fn a_run_that_was_left_is_not_called_idle() {
+        let gone = Told { now: Now::Gone { run: "a run".into() }, last: None };
+        assert_eq!((value("Status/StateCurrent", &gone), value("Status/StateName", &gone)), (None, None));
+        assert_eq!(value("Status/StateCurrent", &Told::default()), Some(FigureValue::Whole(4)));
+        assert_eq!(value("Run", &gone), Some(FigureValue::Text("a run".into())));
+    }
+}

@@ -1,0 +1,98 @@
+//! What those who tell live values have to say to who began them: who was refused what, and whether anybody is there.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use regrind_document::visible;
+use tokio::sync::mpsc;
+
+/// Most news that wait to be heard.
+const WAITING: usize = 256;
+/// Longest text of somebody outside that is told.
+const LONGEST: usize = 200;
+
+/// What happened to those who tell.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[expect(missing_docs, reason = "named for what they are")]
+pub enum News {
+    /// Somebody is told from now on.
+    Tells { place: String },
+    /// Nobody is told for now; it is tried again.
+    Waits { place: String, why: String },
+    /// Somebody wanted something that is not theirs to do here.
+    Refused { by: String, what: String },
+    /// So much more was refused than could be heard.
+    RefusedMore { times: u32 },
+}
+
+/// Where news go. They never wait: what nobody hears is counted.
+#[derive(Clone, Debug)]
+pub struct Notes {
+    to: mpsc::Sender<News>,
+    missed: Arc<AtomicU32>,
+}
+
+/// Returns where news go, and where they come out.
+pub fn notes() -> (Notes, mpsc::Receiver<News>) {
+    let (to, heard) = mpsc::channel(WAITING);
+    (Notes { to, missed: Arc::default() }, heard)
+}
+
+impl Notes {
+    pub(crate) fn tells(&self, place: &str) {
+        // Nobody who listens misses it: the values themselves say so.
+        let _ = self.to.try_send(News::Tells { place: place.to_owned() });
+    }
+
+    pub(crate) fn waits(&self, place: &str, why: String) {
+        let _ = self.to.try_send(News::Waits { place: place.to_owned(), why });
+    }
+
+    pub(crate) fn refused(&self, by: String, what: &str) {
+        let times = self.missed.swap(0, Ordering::Relaxed);
+        if times > 0 && self.to.try_send(News::RefusedMore { times }).is_err() {
+            self.missed.fetch_add(times, Ordering::Relaxed);
+        }
+        if self.to.try_send(News::Refused { by: in_a_line(&by), what: in_a_line(what) }).is_err() {
+            self.missed.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+}
+
+/// The beginning of a text of somebody outside, with nothing in it that is not seen.
+fn in_a_line(text: &str) -> String {
+    let mut line: String = text.chars().take(LONGEST).collect();
+    if line.len() < text.len() {
+        line.push_str(" ...");
+    }
+    visible(&line.replace(['\n', '\t'], " "))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_nobody_hears_is_counted_and_told_later() {
+        let (notes, mut heard) = notes();
+        for k in 0..WAITING + 3 {
+            notes.refused("somebody".into(), &format!("order {k}"));
+        }
+        for _ in 0..2 {
+            heard.try_recv().unwrap();
+        }
+        notes.refused("somebody".into(), "the last");
+        let mut last = Vec::new();
+        while let Ok(news) = heard.try_recv() {
+            last.push(news);
+        }
+        let the_last = News::Refused { by: "somebody".into(), what: "the last".into() };
+        assert_eq!(last.split_off(last.len() - 2), [News::RefusedMore { times: 3 }, the_last]);
+    }
+
+    #[test]
+    fn a_text_from_outside_is_a_short_line_that_is_what_it_seems() {
+        assert_eq!(in_a_line("a\nb\u{202e}c"), "a b<U+202E>c");
+        assert_eq!(in_a_line(&"x".repeat(1000)).len(), LONGEST + 4);
+    }
+}

@@ -1,0 +1,459 @@
+//! The nodes of a cell: PackML's (OPC 30050) with its identifiers, and the figures in a namespace of their own.
+//!
+//! ```text
+//!  Objects / PackMLObjects / cell-1      PackMLBaseObjectType; notifies of events
+//!      Status                            PackMLStatusObjectType: UnitModeCurrent, StateCurrent ...
+//!      Admin                             PackMLAdminObjectType
+//!      BaseStateMachine                  CurrentState, MachineState / CurrentState, ExecuteState / CurrentState
+//!      Figures, Limits, Job, Alarms ...  a folder for each first word of a figure's name
+//! ```
+//!
+//! What nobody knows has no value and the status BadNoData.
+
+use async_trait::async_trait;
+use opcua_core::sync::RwLock;
+use opcua_nodes::{EventNotifier, ObjectBuilder, ObjectTypeBuilder, ReferenceDirection, VariableBuilder};
+use opcua_server::SubscriptionCache;
+use opcua_server::address_space::AddressSpace;
+use opcua_server::diagnostics::NamespaceMetadata;
+use opcua_server::node_manager::memory::{
+    InMemoryNodeManager, InMemoryNodeManagerImpl, InMemoryNodeManagerImplBuilder,
+};
+use opcua_server::node_manager::{RequestContext, ServerContext, WriteNode};
+use opcua_types::{
+    DataTypeId, DataValue, DateTime, EUInformation, ExtensionObject, LocalizedText, NodeId, ObjectId, ObjectTypeId,
+    QualifiedName, ReferenceTypeId, StatusCode, VariableTypeId, Variant,
+};
+use regrind_cell::StateName;
+
+use super::events::{ALL, KINDS};
+use crate::figures::{FIGURES, Figure, FigureKind, FigureValue};
+use crate::news::Notes;
+use crate::packml::state_number;
+use crate::told::{Now, Told};
+
+const PACKML: &str = "http://opcfoundation.org/UA/PackML/";
+const OWN: &str = "urn:regrind:live";
+
+/// Identifiers in the namespace of PackML.
+mod packml {
+    pub(super) const EXECUTE_STATE_MACHINE_TYPE: u32 = 1;
+    pub(super) const MACHINE_STATE_MACHINE_TYPE: u32 = 2;
+    pub(super) const BASE_STATE_MACHINE_TYPE: u32 = 3;
+    pub(super) const STATUS_OBJECT_TYPE: u32 = 4;
+    pub(super) const ADMIN_OBJECT_TYPE: u32 = 5;
+    pub(super) const BASE_OBJECT_TYPE: u32 = 6;
+    pub(super) const OBJECTS: u32 = 72;
+    pub(super) const CLEARED: u32 = 5001;
+    pub(super) const RUNNING: u32 = 75;
+}
+
+/// The number that OPC 30050 gives the state in which nothing is aborted.
+const CLEARED_NUMBER: u32 = 18;
+
+/// Where the namespaces stand in the list of the server.
+#[derive(Clone, Copy)]
+pub(super) struct Namespaces {
+    pub(super) packml: u16,
+    pub(super) own: u16,
+}
+
+/// Makes the nodes of a cell.
+pub(super) struct CellNodesBuilder {
+    pub(super) cell: String,
+    pub(super) notes: Notes,
+}
+
+/// The nodes of a cell, which nobody can write.
+pub(super) struct CellNodes {
+    pub(super) namespaces: Namespaces,
+    metadata: Vec<NamespaceMetadata>,
+    cell: String,
+    notes: Notes,
+}
+
+impl CellNodes {
+    pub(super) fn cell(&self) -> &str {
+        &self.cell
+    }
+
+    pub(super) fn cell_node(&self) -> NodeId {
+        cell_node(self.namespaces.own)
+    }
+}
+
+/// The node of the cell itself.
+pub(super) fn cell_node(own: u16) -> NodeId {
+    NodeId::new(own, "Cell")
+}
+
+impl InMemoryNodeManagerImplBuilder for CellNodesBuilder {
+    type Impl = CellNodes;
+
+    fn build(self, context: ServerContext, space: &mut AddressSpace) -> CellNodes {
+        let mut type_tree = context.type_tree.write();
+        let mut add = |uri: &str| {
+            let index = type_tree.namespaces_mut().add_namespace(uri);
+            space.add_namespace(uri, index);
+            index
+        };
+        let namespaces = Namespaces { packml: add(PACKML), own: add(OWN) };
+        let metadata = [(PACKML, namespaces.packml), (OWN, namespaces.own)].map(|(uri, index)| NamespaceMetadata {
+            namespace_uri: uri.to_owned(),
+            namespace_index: index,
+            is_namespace_subset: Some(uri == PACKML),
+            ..NamespaceMetadata::default()
+        });
+        let mut tree = Tree { space, namespaces };
+        tree.types();
+        tree.objects(&self.cell);
+        CellNodes { namespaces, metadata: metadata.into(), cell: self.cell, notes: self.notes }
+    }
+}
+
+#[async_trait]
+impl InMemoryNodeManagerImpl for CellNodes {
+    async fn init(&self, _space: &mut AddressSpace, _context: ServerContext) {}
+
+    fn name(&self) -> &str {
+        "cell"
+    }
+
+    fn namespaces(&self) -> Vec<NamespaceMetadata> {
+        self.metadata.clone()
+    }
+
+    /// Nothing is written; who wanted to is told so, and it is told here.
+    async fn write(
+        &self,
+        context: &RequestContext,
+        _space: &RwLock<AddressSpace>,
+        nodes: &mut [&mut WriteNode],
+    ) -> Result<(), StatusCode> {
+        let by = {
+            let session = context.session().read();
+            format!(
+                "the OPC UA client {} ({})",
+                session.session_name(),
+                session.application_description().application_uri
+            )
+        };
+        for node in nodes {
+            let wanted = node.value();
+            let value = wanted.value.value.as_ref().map_or_else(|| "nothing".to_owned(), |value| value.to_string());
+            self.notes.refused(by.clone(), &format!("write: {} = {value}", wanted.node_id));
+            node.set_status(StatusCode::BadNotWritable);
+        }
+        Ok(())
+    }
+}
+
+// ---- the tree -----------------------------------------------------------------------------------------------------------------------
+
+struct Tree<'a> {
+    space: &'a mut AddressSpace,
+    namespaces: Namespaces,
+}
+
+impl Tree<'_> {
+    fn packml(&self, identifier: u32) -> NodeId {
+        NodeId::new(self.namespaces.packml, identifier)
+    }
+
+    fn own(&self, path: &str) -> NodeId {
+        NodeId::new(self.namespaces.own, path)
+    }
+
+    /// The types that the objects have: by their identifiers, without what else the companion specification says of them.
+    fn types(&mut self) {
+        use packml::*;
+        let machine: NodeId = ObjectTypeId::FiniteStateMachineType.into();
+        let object: NodeId = ObjectTypeId::BaseObjectType.into();
+        for (identifier, name, above) in [
+            (EXECUTE_STATE_MACHINE_TYPE, "PackMLExecuteStateMachineType", &machine),
+            (MACHINE_STATE_MACHINE_TYPE, "PackMLMachineStateMachineType", &machine),
+            (BASE_STATE_MACHINE_TYPE, "PackMLBaseStateMachineType", &machine),
+            (STATUS_OBJECT_TYPE, "PackMLStatusObjectType", &object),
+            (ADMIN_OBJECT_TYPE, "PackMLAdminObjectType", &object),
+            (BASE_OBJECT_TYPE, "PackMLBaseObjectType", &object),
+        ] {
+            let browse_name = QualifiedName::new(self.namespaces.packml, name);
+            let builder = ObjectTypeBuilder::new(&self.packml(identifier), browse_name, name);
+            builder.subtype_of(above.clone()).insert(self.space);
+        }
+        let all = self.own(ALL);
+        ObjectTypeBuilder::new(&all, QualifiedName::new(self.namespaces.own, ALL), ALL)
+            .is_abstract(true)
+            .subtype_of(ObjectTypeId::BaseEventType)
+            .insert(self.space);
+        for kind in KINDS {
+            let node = kind.node(self.namespaces.own);
+            let browse_name = QualifiedName::new(self.namespaces.own, kind.name);
+            let builder = ObjectTypeBuilder::new(&node, browse_name, kind.name);
+            builder.subtype_of(all.clone()).insert(self.space);
+            for (field, data_type) in kind.fields {
+                let place = self.own(&format!("{}/{field}", kind.name));
+                VariableBuilder::new(&place, QualifiedName::new(self.namespaces.own, *field), *field)
+                    .data_type(*data_type)
+                    .has_type_definition(VariableTypeId::PropertyType)
+                    .has_modelling_rule(ObjectId::ModellingRule_Mandatory)
+                    .property_of(node.clone())
+                    .insert(self.space);
+            }
+        }
+    }
+
+    fn objects(&mut self, cell: &str) {
+        let objects = self.packml(packml::OBJECTS);
+        ObjectBuilder::new(&objects, QualifiedName::new(self.namespaces.packml, "PackMLObjects"), "PackMLObjects")
+            .is_folder()
+            .organized_by(ObjectId::ObjectsFolder)
+            .insert(self.space);
+        let root = cell_node(self.namespaces.own);
+        let mut builder = ObjectBuilder::new(&root, QualifiedName::new(self.namespaces.own, cell), cell)
+            .event_notifier(EventNotifier::SUBSCRIBE_TO_EVENTS)
+            .has_type_definition(self.packml(packml::BASE_OBJECT_TYPE))
+            .organized_by(objects);
+        for kind in KINDS {
+            builder = builder.reference(
+                kind.node(self.namespaces.own),
+                ReferenceTypeId::GeneratesEvent,
+                ReferenceDirection::Forward,
+            );
+        }
+        builder.insert(self.space);
+        self.object("Status", "Status", &root, packml::STATUS_OBJECT_TYPE);
+        self.object("Admin", "Admin", &root, packml::ADMIN_OBJECT_TYPE);
+        self.state_machines(&root);
+        for figure in FIGURES {
+            self.figure(figure, &root);
+        }
+        // What the specification demands and no cell has: nobody tells it.
+        let status = self.own("Status");
+        for (name, kind) in [
+            ("CurMachSpeed", DataTypeId::Float),
+            ("MachSpeed", DataTypeId::Float),
+            ("EquipmentBlocked", DataTypeId::Boolean),
+            ("EquipmentStarved", DataTypeId::Boolean),
+        ] {
+            self.variable(&format!("Status/{name}"), (self.namespaces.packml, name), kind, &status);
+        }
+    }
+
+    fn object(&mut self, path: &str, name: &str, above: &NodeId, of_type: u32) {
+        let of_type = self.packml(of_type);
+        ObjectBuilder::new(&self.own(path), QualifiedName::new(self.namespaces.packml, name), name)
+            .has_type_definition(of_type)
+            .component_of(above.clone())
+            .insert(self.space);
+    }
+
+    /// The three state machines, each within a state of the one above it.
+    fn state_machines(&mut self, root: &NodeId) {
+        let mut above = root.clone();
+        for machine in MACHINES {
+            let name = machine.path.rsplit('/').next().unwrap_or(machine.path);
+            self.object(machine.path, name, &above, machine.of_type);
+            above = self.own(machine.path);
+            let state = format!("{}/CurrentState", machine.path);
+            let node = self.own(&state);
+            VariableBuilder::new(&node, QualifiedName::new(0, "CurrentState"), "CurrentState")
+                .data_type(DataTypeId::LocalizedText)
+                .value(Variant::Empty)
+                .has_type_definition(VariableTypeId::FiniteStateVariableType)
+                .component_of(above.clone())
+                .insert(self.space);
+            for (name, kind) in [("Id", DataTypeId::NodeId), ("Number", DataTypeId::UInt32)] {
+                self.property(&format!("{state}/{name}"), name, kind, Variant::Empty, &node);
+            }
+        }
+    }
+
+    fn figure(&mut self, figure: &Figure, root: &NodeId) {
+        let (folder, name) = figure.name.rsplit_once('/').map_or(("", figure.name), |(folder, name)| (folder, name));
+        let above = if folder.is_empty() { root.clone() } else { self.own(folder) };
+        if !self.space.node_exists(&above) {
+            ObjectBuilder::new(&above, QualifiedName::new(self.namespaces.own, folder), folder)
+                .has_type_definition(ObjectTypeId::FolderType)
+                .component_of(root.clone())
+                .insert(self.space);
+        }
+        // The one that PackML has has its name there.
+        let of_packml = figure.name == "Status/UnitModeCurrent";
+        let namespace = if of_packml { self.namespaces.packml } else { self.namespaces.own };
+        let node = self.variable(figure.name, (namespace, name), kind_of(figure), &above);
+        if let Some(unit) = figure.unit {
+            let value = Variant::from(ExtensionObject::from_message(unit_of(unit)));
+            let place = format!("{}/EngineeringUnits", figure.name);
+            self.property(&place, "EngineeringUnits", DataTypeId::EUInformation, value, &node);
+        }
+    }
+
+    fn variable(&mut self, path: &str, name: (u16, &str), kind: DataTypeId, above: &NodeId) -> NodeId {
+        let node = self.own(path);
+        let about = FIGURES.iter().find(|figure| figure.name == path).map_or("", |figure| figure.about);
+        VariableBuilder::new(&node, QualifiedName::new(name.0, name.1), name.1)
+            .description(LocalizedText::new("en", about))
+            .data_type(kind)
+            .value(Variant::Empty)
+            .has_type_definition(VariableTypeId::BaseDataVariableType)
+            .component_of(above.clone())
+            .insert(self.space);
+        if let Some(opcua_nodes::NodeType::Variable(variable)) = self.space.find_mut(&node) {
+            variable.set_data_value(unknown(DateTime::now()));
+        }
+        node
+    }
+
+    fn property(&mut self, path: &str, name: &str, kind: DataTypeId, value: Variant, above: &NodeId) {
+        VariableBuilder::new(&self.own(path), QualifiedName::new(0, name), name)
+            .data_type(kind)
+            .value(value)
+            .has_type_definition(VariableTypeId::PropertyType)
+            .property_of(above.clone())
+            .insert(self.space);
+    }
+}
+
+fn kind_of(figure: &Figure) -> DataTypeId {
+    match figure.kind {
+        FigureKind::Whole => DataTypeId::UInt32,
+        FigureKind::Number => DataTypeId::Double,
+        FigureKind::Truth => DataTypeId::Boolean,
+        FigureKind::Text => DataTypeId::String,
+    }
+}
+
+/// A unit by its code in UNECE Recommendation 20, the characters of which are its number.
+fn unit_of(unit: &str) -> EUInformation {
+    let (code, name) = match unit {
+        "um" => ("4H", "micrometre"),
+        "s" => ("SEC", "second"),
+        "%" => ("P1", "per cent"),
+        _ => ("", ""),
+    };
+    EUInformation {
+        namespace_uri: "http://www.opcfoundation.org/UA/units/un/cefact".into(),
+        unit_id: code.bytes().fold(0, |number, byte| 256 * number + i32::from(byte)),
+        display_name: unit.into(),
+        description: name.into(),
+    }
+}
+
+// ---- values -------------------------------------------------------------------------------------------------------------------------
+
+/// Shows what is told otherwise than before.
+pub(super) fn set(
+    shown: &InMemoryNodeManager<CellNodes>,
+    subscriptions: &SubscriptionCache,
+    before: Option<&Told>,
+    now: &Told,
+) {
+    let then = DateTime::now();
+    let namespaces = shown.inner().namespaces;
+    let known = |value: Option<Variant>| value.map_or_else(|| unknown(then), |value| good(value, then));
+    let mut values = Vec::new();
+    for figure in FIGURES {
+        let value = figure.of(now);
+        if before.is_none_or(|before| figure.of(before) != value) {
+            values.push((NodeId::new(namespaces.own, figure.name), known(value.map(variant))));
+        }
+    }
+    if before.is_none_or(|before| state(before) != state(now)) {
+        for (path, value) in states(state(now), namespaces.packml) {
+            values.push((NodeId::new(namespaces.own, path), known(value)));
+        }
+    }
+    let all = values.iter().map(|(node, value)| (node, None, value.clone()));
+    // Each of them was made with the tree.
+    let _ = shown.set_values(subscriptions, all);
+}
+
+fn variant(value: FigureValue) -> Variant {
+    match value {
+        FigureValue::Whole(value) => value.into(),
+        FigureValue::Number(value) => value.into(),
+        FigureValue::Truth(value) => value.into(),
+        FigureValue::Text(value) => value.into(),
+    }
+}
+
+fn good(value: Variant, then: DateTime) -> DataValue {
+    DataValue {
+        value: Some(value),
+        status: Some(StatusCode::Good),
+        source_timestamp: Some(then),
+        server_timestamp: Some(then),
+        ..DataValue::default()
+    }
+}
+
+fn unknown(then: DateTime) -> DataValue {
+    DataValue { status: Some(StatusCode::BadNoData), ..good(Variant::Empty, then) }
+}
+
+/// The state of the cell; none where nobody knows.
+fn state(told: &Told) -> Option<StateName> {
+    match &told.now {
+        Now::NoRun => Some(StateName::Idle),
+        Now::Gone { .. } => None,
+        Now::On { snapshot, .. } => Some(snapshot.state),
+    }
+}
+
+/// One of the three state machines of OPC 30050.
+struct Machine {
+    path: &'static str,
+    of_type: u32,
+}
+
+const MACHINES: [Machine; 3] = [
+    Machine { path: "BaseStateMachine", of_type: packml::BASE_STATE_MACHINE_TYPE },
+    Machine { path: "BaseStateMachine/MachineState", of_type: packml::MACHINE_STATE_MACHINE_TYPE },
+    Machine { path: "BaseStateMachine/MachineState/ExecuteState", of_type: packml::EXECUTE_STATE_MACHINE_TYPE },
+];
+
+/// The current state of each machine: name, identifier and number. A machine within a state that is not the current one has none.
+fn states(state: Option<StateName>, packml: u16) -> Vec<(String, Option<Variant>)> {
+    let own = state.map(|state| (state.to_string(), identifier(state), Some(state_number(state))));
+    let cleared = Some(("Cleared".to_owned(), packml::CLEARED, Some(CLEARED_NUMBER)));
+    let running = Some(("Running".to_owned(), packml::RUNNING, None));
+    let current = match state {
+        None => [None, None, None],
+        Some(StateName::Aborting | StateName::Aborted) => [own, None, None],
+        Some(StateName::Stopping | StateName::Stopped) => [cleared, own, None],
+        Some(_) => [cleared, running, own],
+    };
+    let mut values = Vec::new();
+    for (machine, current) in MACHINES.iter().zip(current) {
+        let (name, node, number) =
+            current.map_or((None, None, None), |(name, node, number)| (Some(name), Some(node), number));
+        let place = format!("{}/CurrentState", machine.path);
+        let node = node.map(|node| NodeId::new(packml, node).into());
+        values.push((format!("{place}/Id"), node));
+        values.push((format!("{place}/Number"), number.map(Variant::from)));
+        values.push((place, name.map(|name| LocalizedText::new("en", &name).into())));
+    }
+    values
+}
+
+/// The identifier of a state in the namespace of PackML.
+fn identifier(state: StateName) -> u32 {
+    match state {
+        StateName::Idle => 28,
+        StateName::Starting => 29,
+        StateName::Suspending => 30,
+        StateName::Suspended => 31,
+        StateName::Unsuspending => 32,
+        StateName::Holding => 33,
+        StateName::Held => 34,
+        StateName::Unholding => 35,
+        StateName::Execute => 36,
+        StateName::Completing => 37,
+        StateName::Complete => 38,
+        StateName::Stopped => 53,
+        StateName::Stopping => 54,
+        StateName::Aborting => 61,
+        StateName::Aborted => 62,
+    }
+}

@@ -1,0 +1,125 @@
+//! The messages of an edge node: births, what has changed, deaths; and what a command of a host asks for.
+
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use srad_types::constants::{BDSEQ, NODE_CONTROL_REBIRTH};
+use srad_types::payload::metric::Value;
+use srad_types::payload::{DataType, Message as _, Metric, Payload, PropertySet, PropertyValue, property_value};
+
+use crate::figures::{Figure, FigureKind, FigureValue};
+
+/// What is known of each figure, in the order of the figures.
+pub(super) type Values = Vec<Option<FigureValue>>;
+
+/// Everything there is to tell, with kinds and units; its number in the sequence is 0.
+pub(super) fn birth(figures: &[Figure], values: &Values, connection: u8) -> Vec<u8> {
+    let rebirth = Metric { value: Some(Value::BooleanValue(false)), ..plain(NODE_CONTROL_REBIRTH, DataType::Boolean) };
+    let mut metrics = vec![number_of(connection), rebirth];
+    let told = figures.iter().zip(values);
+    metrics
+        .extend(told.map(|(figure, value)| Metric { properties: Some(properties(figure)), ..metric(figure, value) }));
+    encoded(metrics, Some(0))
+}
+
+/// The figures that are known otherwise than they were told; none where all are as they were.
+pub(super) fn changes(figures: &[Figure], values: &Values, told: &Values, sequence: u8) -> Option<Vec<u8>> {
+    let all = figures.iter().zip(values).zip(told);
+    let changed: Vec<_> =
+        all.filter(|((_, value), told)| value != told).map(|((figure, value), _)| metric(figure, value)).collect();
+    (!changed.is_empty()).then(|| encoded(changed, Some(sequence)))
+}
+
+/// That what was told by a connection is true no more.
+pub(super) fn death(connection: u8) -> Vec<u8> {
+    encoded(vec![number_of(connection)], None)
+}
+
+/// What a command asks for: whether it wants everything told anew, and what else, in words.
+pub(super) fn asked(payload: &[u8]) -> (bool, Vec<String>) {
+    let Ok(Payload { metrics, .. }) = Payload::decode(payload) else {
+        return (false, vec!["what is no command of Sparkplug B".into()]);
+    };
+    let wants_birth = |metric: &Metric| {
+        metric.name.as_deref() == Some(NODE_CONTROL_REBIRTH) && metric.value == Some(Value::BooleanValue(true))
+    };
+    let others: Vec<_> = metrics.iter().filter(|metric| !wants_birth(metric)).map(in_words).collect();
+    let reborn = others.len() < metrics.len();
+    let is_empty = metrics.is_empty();
+    (reborn, if is_empty { vec!["a command without a metric".into()] } else { others })
+}
+
+fn in_words(metric: &Metric) -> String {
+    let name = match (&metric.name, metric.alias) {
+        (Some(name), _) => name.clone(),
+        (None, Some(alias)) => format!("the metric {alias}"),
+        (None, None) => "a metric without a name".into(),
+    };
+    match &metric.value {
+        Some(Value::IntValue(value)) => format!("{name} = {value}"),
+        Some(Value::LongValue(value)) => format!("{name} = {value}"),
+        Some(Value::FloatValue(value)) => format!("{name} = {value}"),
+        Some(Value::DoubleValue(value)) => format!("{name} = {value}"),
+        Some(Value::BooleanValue(value)) => format!("{name} = {value}"),
+        Some(Value::StringValue(value)) => format!("{name} = {value:?}"),
+        Some(_) => format!("{name} = a value that is no number and no text"),
+        None => format!("{name} = nothing"),
+    }
+}
+
+fn number_of(connection: u8) -> Metric {
+    Metric { value: Some(Value::LongValue(connection.into())), ..plain(BDSEQ, DataType::Int64) }
+}
+
+fn metric(figure: &Figure, value: &Option<FigureValue>) -> Metric {
+    let kind = match figure.kind {
+        FigureKind::Whole => DataType::UInt32,
+        FigureKind::Number => DataType::Double,
+        FigureKind::Truth => DataType::Boolean,
+        FigureKind::Text => DataType::String,
+    };
+    let mut metric = plain(figure.name, kind);
+    metric.value = value.as_ref().map(|value| match value {
+        FigureValue::Whole(value) => Value::IntValue(*value),
+        FigureValue::Number(value) => Value::DoubleValue(*value),
+        FigureValue::Truth(value) => Value::BooleanValue(*value),
+        FigureValue::Text(value) => Value::StringValue(value.clone()),
+    });
+    metric.is_null = metric.value.is_none().then_some(true);
+    metric
+}
+
+fn plain(name: &str, kind: DataType) -> Metric {
+    let mut metric = Metric::new();
+    metric.set_name(name.to_owned()).set_datatype(kind).set_timestamp(now_ms());
+    metric
+}
+
+/// The unit and what it is, under the names by which hosts look for them.
+fn properties(figure: &Figure) -> PropertySet {
+    let text = |text: &str| {
+        let value = Some(property_value::Value::StringValue(text.to_owned()));
+        PropertyValue { r#type: Some(DataType::String as u32), is_null: None, value }
+    };
+    let read_only = PropertyValue {
+        r#type: Some(DataType::Boolean as u32),
+        is_null: None,
+        value: Some(property_value::Value::BooleanValue(true)),
+    };
+    let mut properties = PropertySet { keys: Vec::new(), values: Vec::new() };
+    let unit = figure.unit.map(|unit| ("engUnit", text(unit)));
+    for (key, value) in [("readOnly", read_only), ("documentation", text(figure.about))].into_iter().chain(unit) {
+        properties.keys.push(key.to_owned());
+        properties.values.push(value);
+    }
+    properties
+}
+
+fn encoded(metrics: Vec<Metric>, sequence: Option<u8>) -> Vec<u8> {
+    let seq = sequence.map(u64::from);
+    Payload { timestamp: Some(now_ms()), metrics, seq, uuid: None, body: None }.encode_to_vec()
+}
+
+fn now_ms() -> u64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
+}

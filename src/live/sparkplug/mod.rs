@@ -1,0 +1,312 @@
+//! A cell as an edge node of Sparkplug B.
+//!
+//! It is a node without a device: the program and the cell are alive together, so there is one birth with everything in it and one death, and
+//! nobody has to ask which of two deaths counts. Every connection is a session of its own, with its own number, subscriptions and birth:
+//! nothing is left to a client that restores a session, or sends what belonged to an earlier one.
+
+mod link;
+mod message;
+
+use std::time::Duration;
+
+use rumqttc::{
+    AsyncClient, ConnectionError, Event, EventLoop, Outgoing, Packet, Publish, QoS, SubscribeFilter,
+    SubscribeReasonCode,
+};
+use srad_types::topic::{DeviceMessage, DeviceTopic, NodeMessage, NodeTopic};
+use srad_types::utils::validate_name;
+use tokio::sync::{mpsc, watch};
+use tokio::task::JoinSet;
+use tokio::time::{Instant, sleep_until, timeout};
+
+use self::link::Way;
+use self::message::Values;
+use crate::error::LiveError;
+use crate::figures::FIGURES;
+use crate::news::Notes;
+use crate::settings::SparkplugSettings;
+use crate::told::Told;
+use crate::turn::{Births, Turn};
+
+/// Between two tries to reach the broker.
+const SHORTEST_WAIT: Duration = Duration::from_millis(500);
+const LONGEST_WAIT: Duration = Duration::from_secs(30);
+/// Least time between two births, however many hosts ask for one.
+const BETWEEN_BIRTHS: Duration = Duration::from_secs(1);
+/// A broker that takes nothing is offered it again after this time.
+const OFFERED_AGAIN: Duration = Duration::from_secs(1);
+/// How long a farewell may take.
+const FAREWELL: Duration = Duration::from_secs(2);
+/// Messages that wait for the network.
+const WAITING: usize = 16;
+
+/// An edge node that tells a cell to a broker.
+pub struct Node {
+    way: Way,
+    births: Births,
+    topics: Topics,
+    told: watch::Receiver<Told>,
+    notes: Notes,
+}
+
+struct Topics {
+    birth: String,
+    data: String,
+    death: String,
+    command: String,
+    device_commands: String,
+}
+
+impl Topics {
+    fn of(group: &str, node: &str) -> Self {
+        let topic = |message| NodeTopic::new(group, message, node).topic;
+        Self {
+            birth: topic(NodeMessage::NBirth),
+            data: topic(NodeMessage::NData),
+            death: topic(NodeMessage::NDeath),
+            command: topic(NodeMessage::NCmd),
+            device_commands: DeviceTopic::new(group, DeviceMessage::DCmd, node, "+").topic,
+        }
+    }
+}
+
+/// How a connection came to its end.
+enum Over {
+    /// Nobody has anything to tell any more.
+    Ended,
+    /// The broker has gone, or was never there; whether the connection stood before.
+    Lost { why: String, stood: bool },
+}
+
+impl Node {
+    /// A node for the cell of this name. It tells nobody anything yet.
+    ///
+    /// # Errors
+    /// Names that no topic can have; a password or certificates that cannot be read; a broker on another computer without certificates.
+    pub fn new(
+        settings: &SparkplugSettings,
+        cell: &str,
+        turn: &Turn,
+        told: watch::Receiver<Told>,
+        notes: Notes,
+    ) -> Result<Self, LiveError> {
+        for (of, name) in [("the group", &*settings.group), ("the cell", cell)] {
+            validate_name(name).map_err(|_| LiveError::Topic { of, name: name.to_owned() })?;
+        }
+        let way = Way::of(settings, &format!("regrind-{}-{cell}", settings.group))?;
+        Ok(Self { way, births: Births::of(turn)?, topics: Topics::of(&settings.group, cell), told, notes })
+    }
+
+    /// Tells the cell until nobody has anything to tell any more, whether the broker can be reached or not.
+    ///
+    /// # Errors
+    /// A number of the connection that cannot be written.
+    pub async fn run(mut self) -> Result<(), LiveError> {
+        let mut wait = SHORTEST_WAIT;
+        let mut connection = self.births.next()?;
+        loop {
+            let began = Instant::now();
+            let Over::Lost { why, stood } = self.session(connection).await else { return Ok(()) };
+            self.notes.waits(&self.way.place, why);
+            if stood {
+                connection = self.births.next()?;
+            }
+            // A connection that lasted ends the waiting; one that ends at once is no better than none.
+            wait = if began.elapsed() > LONGEST_WAIT { SHORTEST_WAIT } else { wait };
+            let until = Instant::now() + wait;
+            while Instant::now() < until {
+                tokio::select! {
+                    () = sleep_until(until) => {}
+                    changed = self.told.changed() => if changed.is_err() { return Ok(()) },
+                }
+            }
+            wait = (2 * wait).min(LONGEST_WAIT);
+        }
+    }
+
+    /// One connection, from its beginning to its end.
+    async fn session(&mut self, connection: u8) -> Over {
+        let options = self.way.with_death(&self.topics.death, message::death(connection));
+        let (client, mut broker) = AsyncClient::new(options, WAITING);
+        broker.network_options.set_tcp_nodelay(true);
+        // In a task of its own: half a message that was given up would be the end of the connection.
+        let (to, mut events) = mpsc::channel(WAITING);
+        let mut polling = JoinSet::new();
+        polling.spawn(poll(broker, to));
+        let mut session = Session {
+            node: self,
+            client,
+            connection,
+            values: None,
+            sequence: 0,
+            due: None,
+            began: Instant::now(),
+            stood: false,
+        };
+        loop {
+            let due = session.due;
+            let over = tokio::select! {
+                event = events.recv() => session.takes(event),
+                changed = session.node.told.changed() => match changed {
+                    Ok(()) => session.tell(),
+                    Err(_) => return session.farewell(&mut events).await,
+                },
+                () = sleep_until(due.unwrap_or_else(Instant::now)), if due.is_some() => session.catch_up(),
+            };
+            if let Err(over) = over {
+                return over;
+            }
+        }
+    }
+}
+
+/// What the broker says, until it says nothing more.
+async fn poll(mut broker: EventLoop, to: mpsc::Sender<Result<Event, ConnectionError>>) {
+    loop {
+        let event = broker.poll().await;
+        let is_last = event.is_err();
+        if to.send(event).await.is_err() || is_last {
+            return;
+        }
+    }
+}
+
+/// A connection that stands.
+struct Session<'a> {
+    node: &'a mut Node,
+    client: AsyncClient,
+    connection: u8,
+    /// What was told last; none before the birth.
+    values: Option<Values>,
+    sequence: u8,
+    /// When a birth, or what the broker did not take, is due.
+    due: Option<Instant>,
+    /// When the last birth was.
+    began: Instant,
+    /// Whether the broker let it in.
+    stood: bool,
+}
+
+impl Session<'_> {
+    /// Takes what the broker says.
+    fn takes(&mut self, event: Option<Result<Event, ConnectionError>>) -> Result<(), Over> {
+        self.stood |= matches!(event, Some(Ok(Event::Incoming(Packet::ConnAck(_)))));
+        let stood = self.stood;
+        let lost = |why: String| Err(Over::Lost { why, stood });
+        match event {
+            None => lost("the connection has gone".into()),
+            Some(Err(error)) => lost(in_words(&error)),
+            Some(Ok(Event::Incoming(Packet::ConnAck(_)))) => {
+                let topics = [&self.node.topics.command, &self.node.topics.device_commands];
+                let filters = topics.map(|topic| SubscribeFilter::new(topic.clone(), QoS::AtLeastOnce));
+                self.client.try_subscribe_many(filters).or_else(|error| lost(error.to_string()))
+            }
+            // Before the birth, so that no command after it is missed.
+            Some(Ok(Event::Incoming(Packet::SubAck(ack)))) => {
+                let refused = ack.return_codes.contains(&SubscribeReasonCode::Failure);
+                if refused {
+                    let why = "it lets nobody ask for a birth: the node may not subscribe to its commands".to_owned();
+                    self.node.notes.waits(&self.node.way.place, why);
+                } else {
+                    self.node.notes.tells(&self.node.way.place);
+                }
+                self.birth();
+                Ok(())
+            }
+            Some(Ok(Event::Incoming(Packet::Publish(publish)))) => {
+                self.hear(&publish);
+                Ok(())
+            }
+            Some(Ok(_)) => Ok(()),
+        }
+    }
+
+    /// Tells everything anew.
+    fn birth(&mut self) {
+        let values = current(&mut self.node.told);
+        let birth = message::birth(FIGURES, &values, self.connection);
+        if self.client.try_publish(&self.node.topics.birth, QoS::AtMostOnce, false, birth).is_err() {
+            self.due = Some(Instant::now() + OFFERED_AGAIN);
+            self.values = None;
+            return;
+        }
+        (self.values, self.sequence, self.due, self.began) = (Some(values), 0, None, Instant::now());
+    }
+
+    /// Tells what has changed since it was told.
+    fn tell(&mut self) -> Result<(), Over> {
+        let Some(told) = &self.values else { return Ok(()) };
+        let values = current(&mut self.node.told);
+        let next = self.sequence.wrapping_add(1);
+        let Some(changes) = message::changes(FIGURES, &values, told, next) else { return Ok(()) };
+        match self.client.try_publish(&self.node.topics.data, QoS::AtMostOnce, false, changes) {
+            Ok(()) => (self.values, self.sequence) = (Some(values), next),
+            // The next one has this too.
+            Err(_) => self.due = Some(self.due.unwrap_or_else(|| Instant::now() + OFFERED_AGAIN)),
+        }
+        Ok(())
+    }
+
+    /// Does what was put off.
+    fn catch_up(&mut self) -> Result<(), Over> {
+        self.due = None;
+        match self.values {
+            None => self.birth(),
+            Some(_) => self.tell()?,
+        }
+        Ok(())
+    }
+
+    /// A host may ask for a birth, and for nothing else.
+    fn hear(&mut self, publish: &Publish) {
+        let by = format!("somebody at the broker {}", self.node.way.place);
+        let (wants_birth, others) = message::asked(&publish.payload);
+        if publish.topic != self.node.topics.command {
+            let others = if wants_birth { vec!["a birth of a device".into()] } else { others };
+            return self.node.notes.refused(by, &format!("DCMD: {}", others.join(", ")));
+        }
+        if !others.is_empty() {
+            self.node.notes.refused(by, &format!("NCMD: {}", others.join(", ")));
+        }
+        if wants_birth && self.began.elapsed() >= BETWEEN_BIRTHS {
+            self.birth();
+        } else if wants_birth {
+            self.due = Some(self.began + BETWEEN_BIRTHS);
+            self.values = None;
+        }
+    }
+
+    /// Tells that what was told is true no more, and goes.
+    async fn farewell(&mut self, events: &mut mpsc::Receiver<Result<Event, ConnectionError>>) -> Over {
+        let said = async {
+            let death = message::death(self.connection);
+            self.client.publish(&self.node.topics.death, QoS::AtLeastOnce, false, death).await.ok()?;
+            while !matches!(events.recv().await?.ok()?, Event::Incoming(Packet::PubAck(_))) {}
+            self.client.disconnect().await.ok()?;
+            while !matches!(events.recv().await?.ok()?, Event::Outgoing(Outgoing::Disconnect)) {}
+            Some(())
+        };
+        // Where it cannot be said the broker says it.
+        let _ = timeout(FAREWELL, said).await;
+        Over::Ended
+    }
+}
+
+fn current(told: &mut watch::Receiver<Told>) -> Values {
+    let told = told.borrow_and_update();
+    FIGURES.iter().map(|figure| figure.of(&told)).collect()
+}
+
+/// An error of the client with what is behind it.
+fn in_words(error: &ConnectionError) -> String {
+    let mut words = error.to_string();
+    let mut behind = std::error::Error::source(error);
+    while let Some(source) = behind {
+        let more = source.to_string();
+        if !words.contains(&more) {
+            words = format!("{words}: {more}");
+        }
+        behind = source.source();
+    }
+    words
+}

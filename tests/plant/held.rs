@@ -1,0 +1,41 @@
+//! A run that stands still while it is looked at.
+
+use std::path::{Path, PathBuf};
+
+use regrind::journal::Reader;
+use serde_json::Value;
+
+use crate::program::{Running, regrind, run, small_recipe};
+
+/// A run of the small recipe, its machines so fast, that is held behind its first cycle; its folder, and how it is then.
+pub fn held_run(home: &Path, speed: f64) -> (Running, PathBuf, Value) {
+    let recipe = small_recipe(home, speed).display().to_string();
+    let mut running = Running::new(regrind(&["run", &recipe, "--cell", "sim", "--part", "SN-0042"], home));
+    let folder = running.folder(home);
+    let name = folder.display().to_string();
+    until(&mut running, &name, home, |now| now["cycles"].as_array().is_some_and(|cycles| !cycles.is_empty()));
+    let (code, out, errors) = run(&["hold", &name, "--reason", "looked at"], home);
+    assert_eq!(code, 0, "{out}{errors}");
+    let held = until(&mut running, &name, home, |now| now["state"] == "Held");
+    (running, folder, held)
+}
+
+/// Waits until it is on record that somebody was refused something; returns where they are.
+pub fn until_recorded(running: &mut Running, folder: &Path, refused: &str) -> String {
+    running.until(refused, |_| {
+        let reader = Reader::open(folder).unwrap();
+        let mut records = reader.records(1).map(Result::unwrap);
+        records
+            .find(|record| record.payload.contains("remark") && record.payload.contains(refused))
+            .map(|record| record.station)
+    })
+}
+
+/// Waits until a run is so.
+fn until(running: &mut Running, name: &str, home: &Path, is_so: impl Fn(&Value) -> bool) -> Value {
+    running.until("a state", |_| {
+        let (code, out, _) = run(&["status", name, "--json"], home);
+        let status = (code == 0).then(|| serde_json::from_str::<Value>(&out).unwrap()["status"].take())?;
+        is_so(&status).then_some(status)
+    })
+}
