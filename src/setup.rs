@@ -110,6 +110,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
     let (track_mm, scallops) = tracks(recipe, cell, &nominal, &ground)?;
     let parameters = taken_back(recipe, cell, &ground, &nominal)?;
     let datum = datum(recipe, &nominal);
+    let kind = kind(recipe, &part_identity, track_mm, targets.len());
     let programs = ground.map(|ground| programs(recipe, cell, &nominal, part_identity, (ground, track_mm)));
     if let Ok(programs) = &programs {
         let said = |source| SetupError::Dialect { recipe: recipe.path().into(), cell: cell.path().into(), source };
@@ -142,7 +143,8 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         gain: recipe.compensation.gain(),
         repeatability_mm: recipe.compensation.repeatability_um.map(Um::mm),
         learned: None,
-        setting: setting(recipe, cell, &part_identity, track_mm, targets.len()),
+        setting: setting(recipe, cell, &kind),
+        kind,
         targets,
         limits: CorrectionLimits {
             largest_depth_mm: cell.grinder.limits.largest_depth_mm,
@@ -239,13 +241,22 @@ fn map_options(recipe: &Recipe) -> MapOptions {
 }
 
 /// Says what a run has to have in common with another to learn from it: the cell, the part, and how it is ground, looked at and corrected.
-fn setting(recipe: &Recipe, cell: &CellConfig, part: &[u8; 32], track_mm: f64, targets: usize) -> String {
+fn setting(recipe: &Recipe, cell: &CellConfig, kind: &str) -> String {
+    let mut said = format!("cell {:?}, {kind}", cell.name);
+    // Another simulated world is another grinder.
+    if let Some(world) = recipe.simulation.as_ref().filter(|_| cell.simulated) {
+        let _ = write!(said, "; simulation {}", serde_json::json!(world));
+    }
+    said
+}
+
+/// Says the same without the cell: what a run of another has to have in common with one to begin with what it found.
+fn kind(recipe: &Recipe, part: &[u8; 32], track_mm: f64, targets: usize) -> String {
     let part = hex(part);
     let (grinding, measure, map) = (&recipe.grinding, &recipe.measure, &recipe.compensation);
     let mut said = format!(
-        "cell {:?}, part {part}, begin with {:?}; {:?}, feed {} mm/min, tracks {track_mm} mm, spark-out {}, depth {} mm; {targets} targets, probe {} mm, \
+        "part {part}, begin with {:?}; {:?}, feed {} mm/min, tracks {track_mm} mm, spark-out {}, depth {} mm; {targets} targets, probe {} mm, \
          held {:?}; cut-off {} mm, {:?}, gain {:?}",
-        cell.name,
         recipe.cycle.begin_with,
         grinding.wheel,
         grinding.feed_mm_min,
@@ -263,10 +274,6 @@ fn setting(recipe: &Recipe, cell: &CellConfig, part: &[u8; 32], track_mm: f64, t
     // What stands as it always did is not said, so that what was learned before still counts.
     if (map.filter_order, map.roughness) != Default::default() {
         let _ = write!(said, "; order {:?}, {:?}", map.filter_order, map.roughness);
-    }
-    // Another simulated world is another grinder.
-    if let Some(world) = recipe.simulation.as_ref().filter(|_| cell.simulated) {
-        let _ = write!(said, "; simulation {}", serde_json::json!(world));
     }
     said
 }

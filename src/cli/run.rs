@@ -8,7 +8,7 @@ use regrind::cell::{Actor, Beginning, CellPlan, Ending, TABLE_VERSION};
 use regrind::config::{BUILT_IN, CellConfig, Link};
 use regrind::device::{Line, Wire};
 use regrind::drive::Task;
-use regrind::formats::{LEARNED, Learned, LearnedError};
+use regrind::formats::{LEARNED, Learned, LearnedError, TaughtBy};
 use regrind::journal::{AuditKey, Header, Journal, free_bytes};
 use regrind::recipe::Recipe;
 use regrind::setup;
@@ -83,7 +83,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         task.setting.push_str(&format!(", seed {seed}"));
     }
     let earlier = match recipe.compensation.learn {
-        true => Some(Earlier::begun_with(&mut task, &arguments.runs)?),
+        true => Some(Earlier::begun_with(&mut task, arguments)?),
         false => None,
     };
     // A key that cannot be used is no reason to leave the record unsigned.
@@ -169,17 +169,41 @@ struct Earlier {
     learned: Option<(Learned, Vec<u8>)>,
     /// What could not be read on the way to it.
     left_alone: Vec<LearnedError>,
+    /// What is to be said of what the plant told.
+    told: Vec<String>,
 }
 
 impl Earlier {
-    /// Lets a task begin with what the newest run left that is like it.
-    fn begun_with(task: &mut Task, runs: &Path) -> Result<Self, Failure> {
-        let earlier = Self::newest(runs, &task.setting, task.simulation);
+    /// Lets a task begin with what the newest run left that is like it, or else with what other cells found.
+    fn begun_with(task: &mut Task, arguments: &Arguments) -> Result<Self, Failure> {
+        let earlier = Self::newest(&arguments.runs, &task.setting, task.simulation);
         if let Some((learned, _)) = &earlier.learned {
             let run = learned.run.clone();
             task.begin_with(learned.clone()).map_err(|source| Failure::TooMuchLearned { run, source })?;
         }
+        #[cfg(feature = "plant")]
+        if let (None, Some(plant)) = (&earlier.learned, &arguments.plant) {
+            return earlier.or_with_others(task, plant);
+        }
         Ok(earlier)
+    }
+
+    /// Lets a task begin with what other cells of the plant found, as far as that can be begun with.
+    #[cfg(feature = "plant")]
+    fn or_with_others(mut self, task: &mut Task, plant: &Path) -> Result<Self, Failure> {
+        let told = super::plant::knowledge::ask(plant, task)?;
+        self.told = told.words;
+        if let Some(learned) = told.learned {
+            // As a program reads it that goes on with the run.
+            let text = serde_json::to_vec(&learned).map_err(|error| Failure::Terminal(error.into()))?;
+            match task.begin_with(learned.clone()) {
+                Ok(()) => self.learned = Some((learned, text)),
+                Err(source) => {
+                    self.told.push(format!("what {} learned cannot be begun with: {source}", learned.run));
+                }
+            }
+        }
+        Ok(self)
     }
 
     fn newest(runs: &Path, setting: &str, simulated: bool) -> Self {
@@ -201,7 +225,9 @@ impl Earlier {
 
     fn in_words(&self, runs: &Path) -> String {
         let mut text: String = self.left_alone.iter().map(|error| format!("left alone: {error}\n")).collect();
+        text.extend(self.told.iter().map(|words| format!("{words}\n")));
         text += &match &self.learned {
+            Some((Learned { taught_by: Some(others), .. }, _)) => others_in_words(others),
             Some((learned, _)) => format!("begins with what {} found to come back in every pass\n", learned.run),
             None => format!(
                 "begins from nothing: no finished run in {} has this part, cell, wheel, gain and way of measuring\n",
@@ -209,6 +235,29 @@ impl Earlier {
             ),
         };
         text
+    }
+}
+
+/// Says what a first part begins with that other cells found.
+fn others_in_words(others: &TaughtBy) -> String {
+    let runs: Vec<String> = others.runs.iter().map(|from| format!("{} (run {})", from.cell, from.run)).collect();
+    let runs = runs.join(" and ");
+    let percent =
+        |of: fn(f64, f64) -> f64| 100.0 * others.differ.iter().map(|[_, share]| *share).reduce(of).unwrap_or(0.0);
+    let [least, most] = [percent(f64::min), percent(f64::max)];
+    match others.differ.is_empty() {
+        false => format!(
+            "begins with what {runs} taught: machines are taken to differ by {least:.0} to {most:.0} %, by {} comparison(s)\n",
+            others.comparisons
+        ),
+        true => format!(
+            "begins with what {runs} taught of the form, and without a correction: {}\n",
+            match others.comparisons {
+                0 =>
+                    "how alike the machines are nobody knows until two of them have ground the same recipe, or machines_differ of [plant] states it",
+                _ => "the machines have nothing in common",
+            }
+        ),
     }
 }
 
@@ -227,7 +276,10 @@ fn header(arguments: &Arguments, live: &Live, (task, plan): (&Task, &CellPlan), 
     let Live { recipe, cell, folder, actor, .. } = live;
     let hex = |bytes: &[u8; 32]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
     let learned_from = earlier.and_then(|earlier| earlier.learned.as_ref()).map(|(learned, _)| &learned.run);
-    let left_alone = earlier.iter().flat_map(|earlier| &earlier.left_alone);
+    let taught_by =
+        earlier.and_then(|earlier| earlier.learned.as_ref()).and_then(|(learned, _)| learned.taught_by.as_ref());
+    let left_alone = earlier.iter().flat_map(|earlier| &earlier.left_alone).map(ToString::to_string);
+    let left_alone: Vec<String> = left_alone.chain(earlier.iter().flat_map(|earlier| earlier.told.clone())).collect();
     Header {
         run: folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
         part: arguments.part.clone().unwrap_or_else(|| "unnamed".into()),
@@ -242,7 +294,7 @@ fn header(arguments: &Arguments, live: &Live, (task, plan): (&Task, &CellPlan), 
             "nominal_sha256": hex(&task.part_identity), "setting": task.setting,
             "part_name": recipe.part.name, "part_in_files": live.part, "job": live.job, "seed": arguments.seed,
             "plan": plan, "table_version": TABLE_VERSION,
-            "learned_from": learned_from, "left_alone": left_alone.map(ToString::to_string).collect::<Vec<_>>(),
+            "learned_from": learned_from, "taught_by": taught_by, "left_alone": left_alone,
         }),
     }
 }

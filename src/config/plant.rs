@@ -39,6 +39,10 @@ struct PlantTable {
     /// What this cell is called in the plant; left out on a computer that is no cell's.
     #[schemars(length(min = 1, max = 80), example = &"cell-1")]
     cell: Option<String>,
+    /// How much machines are taken to differ, where somebody knows it: the rms share of what comes back in every pass that is a machine's own. It counts as
+    /// one comparison of this cell's machine with another, beside those that recipes tell which two of them have ground.
+    #[schemars(range(min = 0.0, max = 1.0), example = 0.1)]
+    machines_differ: Option<f64>,
 }
 
 /// A plant file, checked.
@@ -46,6 +50,8 @@ struct PlantTable {
 pub struct PlantConfig {
     /// What this cell is called in the plant; none on a computer that is no cell's.
     pub cell: Option<String>,
+    /// How much machines are taken to differ, where somebody knows it.
+    pub machines_differ: Option<f64>,
     /// The database of the plant, its files found from here.
     pub database: Option<DatabaseSettings>,
     /// Who may approve recipes.
@@ -86,6 +92,7 @@ impl PlantConfig {
         let at = path.parent().unwrap_or(Path::new(""));
         let found = written.map(|PlantFile { plant, database, approver, artefacts, sparkplug, opcua }| Self {
             cell: plant.cell,
+            machines_differ: plant.machines_differ,
             database: database.map(|database| DatabaseSettings {
                 password_file: beside(at, database.password_file),
                 certificates: beside(at, database.certificates),

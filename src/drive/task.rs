@@ -6,12 +6,12 @@ use std::sync::Arc;
 use crate::cell::{Figures, PvOf, Tolerance};
 use crate::compensation::path::{PathError, Scallops, Summary, ToolPath};
 use crate::compensation::{
-    Contact, Correction, CorrectionLimits, ErrorMap, GainRule, LearningState, MapOptions, NextPassError, ParameterKind,
-    ParameterOptions, Parameters, Set, WheelTerm,
+    Alike, Contact, Correction, CorrectionLimits, ErrorMap, GainRule, LearningState, MapOptions, NextPassError,
+    ParameterKind, ParameterOptions, Parameters, Set, WheelTerm,
 };
 use crate::device::{Careful, Coordinates, CorrectionMap, Identified, Pass, Plan, Target, TargetKind};
 use crate::formats::gcode::GcodeError;
-use crate::formats::{CorrectionIdentities, FormatError, Learned, ResultFolder, write_correction};
+use crate::formats::{CellRun, CorrectionIdentities, FormatError, Learned, ResultFolder, write_correction};
 use crate::geometry::{Grid, Point, Pose, Sample, Vector};
 use crate::measuring::{self, Expansion, sphere_targets};
 use crate::model::{FIRST, Form, Hyper, Machine, Purpose, spread};
@@ -64,6 +64,8 @@ pub struct Task {
     pub learned: Option<Learned>,
     /// What a run has to have in common with another to learn from it.
     pub setting: String,
+    /// The same but for the cell: what a run of another cell has to have in common with it.
+    pub kind: String,
     /// What a correction must keep to.
     pub limits: CorrectionLimits,
     /// Which parameters of the machine are taken back; none where all is left to the map.
@@ -302,6 +304,12 @@ impl Task {
         within.map(|_| ())
     }
 
+    /// Makes what this task can begin with of what other cells found, as far as machines are alike; `None` where they tell nothing of it.
+    pub fn from_others(&self, others: &[(CellRun, Learned)], alike: &Alike) -> Option<Learned> {
+        let of_this = (self.simulation, self.setting.clone());
+        Learned::from_others(others, alike, of_this, (&self.fresh(), self.uncorrected()))
+    }
+
     /// Writes correction and program of a first pass that begins with what was learned; returns the names of the files.
     ///
     /// # Errors
@@ -354,10 +362,13 @@ impl Task {
 
     /// What is known of the grinder before the first pass.
     pub(super) fn beginning(&self) -> LearningState {
+        self.learned.as_ref().map_or_else(|| self.fresh(), |learned| learned.known.for_next_part())
+    }
+
+    fn fresh(&self) -> LearningState {
         let Pass { x_mm, y_mm, .. } = self.pass;
         let size_mm = [x_mm[1] - x_mm[0], y_mm[1] - y_mm[0]];
-        let fresh = || LearningState::new(self.gain, &self.map, size_mm, self.repeatability_mm);
-        self.learned.as_ref().map_or_else(fresh, |learned| learned.known.for_next_part())
+        LearningState::new(self.gain, &self.map, size_mm, self.repeatability_mm)
     }
 
     /// Registers points to the surface offset by a radius, and returns the options that it was done with.

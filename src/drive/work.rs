@@ -613,7 +613,11 @@ pub(super) fn learned(task: &Task, run: String, (cycle, fields): (&Cycle, Taught
     }
     let (setting, simulation) = (task.setting.clone(), task.simulation);
     let correction = cycle.correction.changed(known, cycle.set.as_deref());
-    Some(Learned::new(simulation, setting, run, correction, known.clone()).with_fields(fields))
+    Some(
+        Learned::new(simulation, setting, run, correction, known.clone())
+            .with_fields(fields)
+            .of_kind(task.kind.clone()),
+    )
 }
 
 /// Where they stand.

@@ -7,7 +7,7 @@ use thiserror::Error;
 
 use super::FormatError;
 use super::whole::read_whole;
-use regrind_core::compensation::{Correction, LearningState, Set};
+use regrind_core::compensation::{Alike, Correction, LearningState, Set, Shared};
 use regrind_core::model::Taught;
 
 /// The file in a run folder.
@@ -35,6 +35,33 @@ pub struct Learned {
     /// What this part and those before it taught of the fields of their errors; nothing in files of earlier versions.
     #[serde(default)]
     pub fields: Taught,
+    /// What other cells have to have in common with the passes to begin with what was learned; nothing in files of earlier versions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub kind: Option<String>,
+    /// Who taught it, where this is what other cells found and no run of this one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub taught_by: Option<TaughtBy>,
+}
+
+/// Where what a first part begins with comes from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TaughtBy {
+    /// The cells and the run of each.
+    pub runs: Vec<CellRun>,
+    /// For each band of wavelengths that was taken over: the waves from which it is, in millimetres, and the rms share of what comes back there that
+    /// is taken to be a machine's own.
+    pub differ: Vec<[f64; 2]>,
+    /// Comparisons of machines that tell this.
+    pub comparisons: usize,
+}
+
+/// A run of a cell.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct CellRun {
+    /// What the cell is called in the plant.
+    pub cell: String,
+    /// Its run.
+    pub run: String,
 }
 
 /// What tells whether a file is looked for at all.
@@ -60,7 +87,35 @@ pub enum LearnedError {
 impl Learned {
     /// What a run leaves to the next part.
     pub fn new(simulation: bool, setting: String, run: String, correction: Correction, known: LearningState) -> Self {
-        Self { layout: LAYOUT, simulation, setting, run, correction, known, fields: Taught::default() }
+        let (fields, kind, taught_by) = (Taught::default(), None, None);
+        Self { layout: LAYOUT, simulation, setting, run, correction, known, fields, kind, taught_by }
+    }
+
+    /// What the first part of a recipe begins with on a machine that has not ground it: what others found, as far as machines are alike. `None` where
+    /// they tell nothing of it. `fresh` and `none` are what it begins with without them.
+    ///
+    /// Another machine's wheel and setting are another machine's: what parameters took back there is in the map here.
+    pub fn from_others(
+        others: &[(CellRun, Self)],
+        alike: &Alike,
+        (simulation, setting): (bool, String),
+        (fresh, none): (&LearningState, Correction),
+    ) -> Option<Self> {
+        let known: Vec<&LearningState> = others.iter().map(|(_, other)| &other.known).collect();
+        let Shared { known, differ } = fresh.begun_with(&known, alike, none.grid)?;
+        let runs: Vec<CellRun> = others.iter().map(|(from, _)| from.clone()).collect();
+        let fields: Vec<Taught> = others.iter().map(|(_, other)| other.fields).collect();
+        let named: Vec<String> = runs.iter().map(|CellRun { cell, run }| format!("{run} of {cell}")).collect();
+        let correction = none.changed(&known, None);
+        let taught_by = Some(TaughtBy { runs, differ, comparisons: alike.comparisons() });
+        let learned = Self::new(simulation, setting, named.join(" and "), correction, known);
+        Some(Self { taught_by, ..learned.with_fields(Taught::of_machines(&fields)) })
+    }
+
+    /// The same for other cells too, that have this in common with it.
+    #[must_use]
+    pub fn of_kind(self, kind: String) -> Self {
+        Self { kind: Some(kind), ..self }
     }
 
     /// The same with what was taught of the fields.
@@ -100,6 +155,25 @@ impl Learned {
     /// Those of [`Learned::read`].
     pub fn from_file(path: &Path) -> Result<Self, LearnedError> {
         Self::of(path, &read_whole(path, MOST_BYTES)?)
+    }
+
+    /// Reads what another cell's run left, of this kind and simulation; `from` says where it came from.
+    ///
+    /// # Errors
+    /// A text that is none of ours, of another kind, or whose numbers cannot be.
+    pub fn of_another(from: &Path, text: &[u8], kind: &str, simulation: bool) -> Result<Self, LearnedError> {
+        let learned = Self::of(from, text)?;
+        let is_meant = learned.layout == LAYOUT
+            && learned.kind.as_deref() == Some(kind)
+            && learned.simulation == simulation
+            && learned.taught_by.is_none();
+        match is_meant {
+            true => Ok(learned),
+            false => Err(LearnedError::Broken {
+                path: from.to_owned(),
+                why: "it is of another kind of parts than it was given for".into(),
+            }),
+        }
     }
 
     fn of(path: &Path, text: &[u8]) -> Result<Self, LearnedError> {
@@ -190,6 +264,33 @@ mod tests {
         let first = back.first_correction(Correction::none(finer, 0.06));
         assert_eq!((first.level_mm, first.cycle, first.values_mm.len()), (0.06, 1, 63));
         assert_eq!(first.values_mm[2], back.correction.values_mm[1]);
+    }
+
+    #[test]
+    fn what_others_found_is_begun_with_and_says_where_it_came_from() {
+        let mut alike = Alike::default();
+        alike.state(0.1);
+        let of = |cell: &str| {
+            let from = CellRun { cell: cell.into(), run: format!("run-{cell}") };
+            let text = serde_json::to_vec(&learned().of_kind("such parts".into())).unwrap();
+            let read = |kind: &str, simulation| Learned::of_another(Path::new("there"), &text, kind, simulation);
+            assert!(read("other parts", true).is_err() && read("such parts", false).is_err());
+            (from, read("such parts", true).unwrap())
+        };
+        let others = [of("cell-1"), of("cell-3")];
+        let fresh = LearningState::new(GainRule::Wavelength, &MapOptions::new(1.0, 1.0), [4.0, 3.0], None);
+        let none = Correction::none(GRID, 0.05);
+        let begun = Learned::from_others(&others, &alike, (true, "mine".into()), (&fresh, none.clone())).unwrap();
+        assert_eq!(begun.run, "run-cell-1 of cell-1 and run-cell-3 of cell-3");
+        let told = begun.taught_by.as_ref().unwrap();
+        assert_eq!((told.runs.len(), told.comparisons), (2, 1));
+        // It is read back from what is kept of it, and nobody takes it for what a run has found.
+        let text = serde_json::to_vec(&begun).unwrap();
+        let back = Learned::of(Path::new("kept"), &text).unwrap();
+        assert_eq!((&back.correction, &back.taught_by), (&begun.correction, &begun.taught_by));
+        let kind = serde_json::to_vec(&begun.of_kind("such parts".into())).unwrap();
+        assert!(Learned::of_another(Path::new("there"), &kind, "such parts", true).is_err());
+        assert!(Learned::from_others(&[], &alike, (true, "mine".into()), (&fresh, none)).is_none());
     }
 
     #[test]

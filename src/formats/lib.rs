@@ -44,7 +44,7 @@ pub use folder::{ResultFolder, ScratchFolder, finished_files, place_link, remove
 pub use form_document::save_form;
 pub use height_map::HeightMap;
 pub use kept_number::KeptNumber;
-pub use learned::{LEARNED, Learned, LearnedError};
+pub use learned::{CellRun, LEARNED, Learned, LearnedError, TaughtBy};
 pub use lines::AddedLines;
 pub use map::{
     CorrectionIdentities, ErrorMapOrigin, MapNode, parse_error_map, read_error_map, write_correction, write_error_map,

@@ -6,6 +6,7 @@
 mod copy;
 mod error;
 mod hex;
+mod knowledge;
 mod link;
 mod page;
 mod recipes;
@@ -17,6 +18,7 @@ mod work;
 
 pub use copy::{PlantRun, content};
 pub use error::PlantError;
+pub use knowledge::Knowledge;
 pub use link::Link;
 pub use page::PlantPage;
 pub use recipes::{Approval, PlantRecipe};

@@ -6,12 +6,13 @@ use super::error::{PlantError, refused};
 use super::link::Link;
 
 /// Every version of the layout: what is put on top of the one before. A text that was handed out is never changed.
-const MIGRATIONS: [(i32, &str); 5] = [
+const MIGRATIONS: [(i32, &str); 6] = [
     (1, include_str!("migrations/0001_records.sql")),
     (2, include_str!("migrations/0002_work.sql")),
     (3, include_str!("migrations/0003_views.sql")),
     (4, include_str!("migrations/0004_studies.sql")),
     (5, include_str!("migrations/0005_page.sql")),
+    (6, include_str!("migrations/0006_knowledge.sql")),
 ];
 
 /// The groups of roles: what signs in is a member of one.

@@ -14,7 +14,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use regrind_formats::{ResultFolder, write_atomic};
+use regrind_formats::{LEARNED, ResultFolder, write_atomic};
 use regrind_journal::{DATABASE, Kind, Reader, Record, sha256_hex};
 use regrind_report::{RunResult, RunSummary, run_summary};
 use serde_json::{Value, json};
@@ -23,6 +23,7 @@ use tokio_postgres::types::ToSql;
 use super::copy::PlantRun;
 use super::error::{PlantError, refused};
 use super::hex::{digits, unhex};
+use super::knowledge::teach;
 use super::link::Link;
 use super::settings::ArtefactSettings;
 
@@ -133,10 +134,30 @@ impl Shipper {
         if there.records > began_with || is_over()? {
             tell_run(link, there.id, &glance(&folder)?).await?;
         }
+        if is_over && missing == 0 {
+            self.teach(link, &folder, name, there.id, shipped).await?;
+        }
         shipped.records += u64::try_from(there.records - began_with).unwrap_or(0);
         shipped.files += given;
         shipped.runs += u64::from(there.records > began_with || given > 0);
         Ok(missing == 0 && i64::from(there.records) >= last.seq as i64)
+    }
+
+    /// Has the plant know what a finished run has learned.
+    async fn teach(
+        &mut self,
+        link: &Link,
+        folder: &Path,
+        run: &str,
+        id: i32,
+        shipped: &mut Shipped,
+    ) -> Result<(), PlantError> {
+        if let Some(why) = teach(link, folder, id).await?
+            && self.told.insert((run.to_owned(), LEARNED.to_owned()))
+        {
+            shipped.differ.push((run.to_owned(), why));
+        }
+        Ok(())
     }
 
     /// Gives the contents of the files on record that the plant does not have. Returns how many went and how many could not.

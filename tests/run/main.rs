@@ -42,6 +42,7 @@ mod reports;
 mod results;
 #[path = "../common/rig.rs"]
 mod rig;
+mod shared;
 mod so_far;
 mod study;
 #[path = "../common/through.rs"]

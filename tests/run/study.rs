@@ -3,6 +3,8 @@
 
 #[path = "made.rs"]
 pub mod made;
+#[path = "others.rs"]
+pub mod others;
 #[path = "told_apart.rs"]
 pub mod told_apart;
 
@@ -79,14 +81,7 @@ impl Bench {
     /// A second part begins with what was learned from the first.
     pub fn parts(&self, seed: u64, way: Way, parts: usize, passes: u16) -> Vec<Vec<After>> {
         let spec = WorldSpec { seed, ..self.spec.clone() };
-        // The same random part of every pass, and nothing else: what the best correction would leave.
-        let alone = GrinderSpec {
-            repeatability_um: spec.grinder.repeatability_um,
-            repeatability_correlation_mm: spec.grinder.repeatability_correlation_mm,
-            error_copying: spec.grinder.error_copying,
-            ..GrinderSpec::perfect()
-        };
-        let twin = WorldSpec { grinder: alone, ..spec.clone() };
+        let twin = random_alone(&spec);
         let (world, twin) = (World::new(spec).unwrap(), World::new(twin).unwrap());
         let mut learned: Option<(Correction, LearningState)> = None;
         (0..parts)
@@ -98,6 +93,17 @@ impl Bench {
             })
             .collect()
     }
+}
+
+/// The same random part of every pass, and nothing else: what the best correction would leave.
+fn random_alone(spec: &WorldSpec) -> WorldSpec {
+    let grinder = GrinderSpec {
+        repeatability_um: spec.grinder.repeatability_um,
+        repeatability_correlation_mm: spec.grinder.repeatability_correlation_mm,
+        error_copying: spec.grinder.error_copying,
+        ..GrinderSpec::perfect()
+    };
+    WorldSpec { grinder, ..spec.clone() }
 }
 
 /// One part on its way.

@@ -207,7 +207,7 @@ pub fn corrections(after: &[After]) -> usize {
     after.iter().position(|a| a.repeatable_um.hypot(floor_um) <= AT_FLOOR * floor_um).unwrap_or(after.len())
 }
 
-fn normal(rng: &mut regrind_sim::Rng) -> f64 {
+pub fn normal(rng: &mut regrind_sim::Rng) -> f64 {
     use rand::RngExt as _;
     let [a, b]: [f64; 2] = [rng.random(), rng.random()];
     (-2.0 * (1.0 - a).ln()).sqrt() * (std::f64::consts::TAU * b).cos()

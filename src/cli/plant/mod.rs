@@ -1,6 +1,7 @@
 //! `regrind plant`: the database of many cells: who is in it, and what stands there.
 
 pub(super) mod audit;
+pub(super) mod knowledge;
 mod members;
 mod queue;
 mod recipes;

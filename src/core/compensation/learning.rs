@@ -35,12 +35,12 @@ const DRIFT_TO_NEXT_PART: f64 = 0.3;
 /// An error so many standard deviations of a mean square above what is expected is a change of the machine and not its scatter.
 const CHANGED_SIGMAS: f64 = 6.0;
 /// Scatter is correlated over longer ways than the shortest waves, so that so many of its values make one that is independent.
-const CORRELATED: f64 = 4.0;
+pub(super) const CORRELATED: f64 = 4.0;
 /// Standard uncertainty of s before anything answered, and what another part adds to it.
 const RESPONSE_SIGMA: f64 = 0.1;
 const RESPONSE_SIGMA_OF_NEXT_PART: f64 = 0.02;
 /// A response outside this is none of the correction alone, and not believed.
-const RESPONSE_LIMITS: [f64; 2] = [0.5, 1.5];
+pub(super) const RESPONSE_LIMITS: [f64; 2] = [0.5, 1.5];
 
 /// By what is chosen how much of an error is taken back.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -59,36 +59,39 @@ pub enum GainRule {
 
 /// What is known of one band of wavelengths.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-struct Band {
+pub(super) struct Band {
     /// Waves longer than this belong to it, in millimetres.
-    from_mm: f64,
+    pub(super) from_mm: f64,
     /// Variance of the mean over that of N; `None` while nothing is known.
-    belief: Option<f64>,
+    pub(super) belief: Option<f64>,
     /// Sum of what passes told of the variance of N, in square millimetres, and of how many.
-    scatter: [f64; 2],
+    pub(super) scatter: [f64; 2],
     /// The share that the newest pass has in the mean.
-    gain: f64,
+    pub(super) gain: f64,
     /// The share of the mean that is believed.
-    share: f64,
+    pub(super) share: f64,
     /// Whether the last pass was taken for that of a machine that has changed.
-    changed: bool,
+    pub(super) changed: bool,
+    /// The share that what other machines taught still has in the mean: that is no evidence of this one.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub(super) borrowed: f64,
 }
 
 /// The mean of what passes told of R, each by its share.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-struct Mean {
+pub(super) struct Mean {
     #[serde(rename = "net")]
-    grid: Grid,
-    values_mm: Vec<f64>,
+    pub(super) grid: Grid,
+    pub(super) values_mm: Vec<f64>,
 }
 
 /// An error on the grid of a correction.
-struct ErrorOnGrid {
-    grid: Grid,
-    error_mm: Vec<f64>,
-    valid: Vec<bool>,
+pub(super) struct ErrorOnGrid {
+    pub(super) grid: Grid,
+    pub(super) error_mm: Vec<f64>,
+    pub(super) valid: Vec<bool>,
     /// Mean square of the standard uncertainty of a node from the noise of the points.
-    noise_mm2: f64,
+    pub(super) noise_mm2: f64,
 }
 
 /// What is known of the error that comes back in every pass.
@@ -96,18 +99,18 @@ struct ErrorOnGrid {
 pub struct LearningState {
     rule: GainRule,
     /// Change of the surface over change of the correction, and its standard uncertainty.
-    response: [f64; 2],
+    pub(super) response: [f64; 2],
     /// From the shortest waves to the longest.
-    bands: Vec<Band>,
+    pub(super) bands: Vec<Band>,
     /// All wavelengths together: bands overlap, so that their scatters do not add up to that of the whole.
-    whole: Band,
+    pub(super) whole: Band,
     /// Passes that it was learned from.
     passes: u32,
     /// On the grid of the correction.
-    mean: Option<Mean>,
+    pub(super) mean: Option<Mean>,
     /// What the pass after the last one taken in is to be corrected by, on the grid of the correction.
     #[serde(skip)]
-    wanted_mm: Option<Vec<f64>>,
+    pub(super) wanted_mm: Option<Vec<f64>>,
 }
 
 /// What the next pass is expected to leave.
@@ -152,7 +155,7 @@ impl LearningState {
         let count = edges.len() as f64;
         let band = |from_mm: f64, share: f64, passes: f64| {
             let scatter = repeatability_mm.map_or([0.0; 2], |rms| [passes * rms * rms * share, passes]);
-            Band { from_mm, belief: None, scatter, gain: 1.0, share: 1.0, changed: false }
+            Band { from_mm, belief: None, scatter, gain: 1.0, share: 1.0, changed: false, borrowed: 0.0 }
         };
         let whole = band(map.cutoff_mm, 1.0, 1.0);
         // How it is shared out over several nobody stated: in each that counts for one of the values of which a pass has many.
@@ -260,7 +263,7 @@ impl LearningState {
         let in_common = if scatter2 > 0.0 { whole2 / scatter2 } else { 1.0 };
         let rms_mm = (rest2 + in_common * left2).sqrt();
         // The rms of m independent values scatters by 1 / sqrt(2 m); while N is a guess, so is the forecast.
-        let known = self.bands.iter().all(|band| band.scatter[1] > 0.0);
+        let known = self.bands.iter().all(|band| band.scatter[1] > 0.0 && !(band.is_guessed() && band.borrowed > 0.0));
         let relative = if known { 1.0 / (2.0 * independent).sqrt() } else { 0.5 };
         Forecast { rms_mm, sigma_mm: relative * rms_mm, floor_mm: known.then(|| (rest2 + whole2).sqrt()) }
     }
@@ -301,6 +304,7 @@ impl LearningState {
                 && b.scatter.iter().all(|v| number(*v))
                 && number(b.gain)
                 && number(b.share)
+                && (0.0..=1.0).contains(&b.borrowed)
         };
         let of_mean = |m: &Mean| {
             m.grid.is_sound() && m.values_mm.len() == m.grid.len() && m.values_mm.iter().all(|v| v.is_finite())
@@ -314,7 +318,7 @@ impl LearningState {
     }
 
     /// Splits values on the grid of an error into what each band holds of them; the parts add up to the values.
-    fn split(&self, told: &ErrorOnGrid, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
+    pub(super) fn split(&self, told: &ErrorOnGrid, mut rest: Vec<f64>) -> Vec<Vec<f64>> {
         let mut parts = Vec::with_capacity(self.bands.len());
         let whole = rest.clone();
         for longer in &self.bands[1..] {
@@ -358,7 +362,7 @@ impl ErrorOnGrid {
         Self { grid, error_mm: error.grid.resample(&error.values_mm, &grid), valid: valid.collect(), noise_mm2 }
     }
 
-    fn mean_square(&self, values: &[f64]) -> f64 {
+    pub(super) fn mean_square(&self, values: &[f64]) -> f64 {
         mean_square(&self.valid, values)
     }
 
@@ -373,7 +377,7 @@ impl ErrorOnGrid {
 }
 
 impl Band {
-    fn scatter_mm2(&self) -> Option<f64> {
+    pub(super) fn scatter_mm2(&self) -> Option<f64> {
         let [sum, count] = self.scatter;
         (count > 0.0).then(|| sum / count)
     }
@@ -396,14 +400,17 @@ impl Band {
             // Nor was it a change, if the next pass stands out as well: what was known of the scatter was too little.
             Some(belief) if stands_out => self.scatter = [news_mm2 / (1.0 + belief), 1.0],
             Some(belief) => {
-                self.scatter[0] += news_mm2 / (1.0 + belief);
-                self.scatter[1] += 1.0;
+                // How far other machines' word is off is a guess, and so is what is left for the scatter beside it.
+                let counts = (1.0 + self.borrowed * belief).powi(-2);
+                self.scatter[0] += counts * news_mm2 / (1.0 + belief);
+                self.scatter[1] += counts;
             }
             None => {}
         }
         self.changed = stands_out && !self.changed;
         self.gain = self.belief.map_or(1.0, |p| p / (1.0 + p));
         self.belief = Some(self.gain + DRIFT);
+        self.borrowed *= 1.0 - self.gain;
     }
 
     /// Chooses the share of the mean, given by its mean square, that is believed; `noise_mm2` is what the points alone scatter by.
@@ -416,7 +423,7 @@ impl Band {
     }
 
     /// Number of independent values that a map has in this band.
-    fn independent(&self, told: &ErrorOnGrid) -> f64 {
+    pub(super) fn independent(&self, told: &ErrorOnGrid) -> f64 {
         let [dx, dy] = told.grid.spacing_mm;
         let area_mm2 = dx * dy * told.valid.iter().filter(|valid| **valid).count() as f64;
         independent_values(area_mm2, self.from_mm)
@@ -437,6 +444,10 @@ fn combined([before, sigma]: [f64; 2], answer: &Response, independent: f64) -> [
     let of_answer = (answer.unexplained_mm / answer.asked_mm / independent.sqrt()).max(1e-3);
     let [w, v] = [sigma, of_answer].map(|s| 1.0 / (s * s));
     [((w * before + v * answer.slope) / (w + v)).clamp(least, most), (w + v).sqrt().recip()]
+}
+
+fn is_zero(value: &f64) -> bool {
+    *value == 0.0
 }
 
 /// Over what is valid.

@@ -24,6 +24,7 @@ pub mod path;
 mod response;
 mod robust;
 mod sampling;
+mod shared;
 mod spline;
 
 pub use correction::Correction;
@@ -38,4 +39,5 @@ pub use parameters::{
 };
 pub use response::{Response, Sense, response};
 pub use sampling::{contact_width_mm, point_spacing_mm};
+pub use shared::{Alike, Shared};
 pub use spline::{Roughness, SplineError};

@@ -59,6 +59,13 @@ impl Taught {
         *lesson = Some(Lesson::after(*lesson, hyper));
     }
 
+    /// Returns what other machines taught together, each of which counts as one part: its own may differ as theirs do.
+    #[must_use]
+    pub fn of_machines(machines: &[Self]) -> Self {
+        let of = |is_corrected| Lesson::of_machines(machines.iter().filter_map(|of| of.of(is_corrected)));
+        Self { without_correction: of(false), with_correction: of(true) }
+    }
+
     /// Whether every number is one that can be, for what was read from a file.
     pub fn is_sound(&self) -> bool {
         let number = |of: [f64; 2]| of[0].is_finite() && of[0] > 0.0 && of[1].is_finite() && of[1] >= 1.0;
@@ -88,6 +95,24 @@ impl Lesson {
             scatter_ratio: with(before.scatter_ratio, ratio),
             parts: n as u32,
         }
+    }
+
+    /// What a machine is expected to have in common with others.
+    fn of_machines(machines: impl Iterator<Item = Self>) -> Option<Self> {
+        let machines: Vec<Self> = machines.take(MOST_PARTS as usize).collect();
+        let n = machines.len() as f64;
+        let pooled = |of: fn(&Self) -> [f64; 2]| {
+            let mean = machines.iter().map(|of_one| of(of_one)[0].ln()).sum::<f64>() / n;
+            let between: f64 = machines.iter().map(|of_one| (of(of_one)[0].ln() - mean).powi(2)).sum();
+            let within = machines.iter().map(|of_one| of(of_one)[1].ln().powi(2)).sum::<f64>() / n;
+            [mean.exp(), (within + between / (n - 1.0).max(1.0)).sqrt().exp()]
+        };
+        let parts = machines.len() as u32;
+        (parts > 0).then(|| Self {
+            range_mm: pooled(|of| of.range_mm),
+            scatter_ratio: pooled(|of| of.scatter_ratio),
+            parts,
+        })
     }
 
     /// What is expected of the next part.
@@ -148,6 +173,23 @@ mod tests {
         }
         let lesson = lesson.unwrap();
         assert!((lesson.range_mm[0] / 60.0 - 1.0).abs() < 0.05, "{lesson:?}");
+    }
+
+    #[test]
+    fn machines_count_as_one_part_each_and_what_they_differ_by_widens() {
+        let machine = |range_mm: f64| {
+            let mut taught = Taught::default();
+            (0..9).for_each(|_| taught.take(true, &hyper(range_mm, 0.1)));
+            taught
+        };
+        let one = Taught::of_machines(&[machine(10.0)]);
+        assert_eq!(one.of(true).unwrap().priors(), Lesson::after(None, &hyper(10.0, 0.1)).priors());
+        assert!(one.of(false).is_none() && Taught::of_machines(&[]).of(true).is_none());
+        let two = Taught::of_machines(&[machine(10.0), machine(40.0)]).of(true).unwrap();
+        let parts = Lesson::after(Some(Lesson::after(None, &hyper(10.0, 0.1))), &hyper(40.0, 0.1));
+        assert!((two.range_mm[0] - 20.0).abs() < 1e-9 && two.parts == 2, "{two:?}");
+        assert!((two.range_mm[1] / parts.range_mm[1] - 1.0).abs() < 1e-9, "{two:?}");
+        assert!(Taught { with_correction: Some(two), without_correction: None }.is_sound());
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 mod backup;
 mod book;
+mod knowledge;
 mod layout;
 mod page;
 mod records;

@@ -69,6 +69,7 @@ fn a_cell_reads_its_own_alone_and_writes_nothing_by_hand() {
         "cell_state",
         "incident",
         "work",
+        "lesson",
     ];
     for table in tables {
         let seen = plant.asked_by("cell-2", &format!("SELECT * FROM {table}")).unwrap();

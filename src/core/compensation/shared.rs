@@ -1,0 +1,443 @@
+//! What other machines taught of a recipe, as a beginning for one that has not ground it yet.
+//!
+//! What comes back in every pass on machine j is R_j = C + D_j: C is common to all that grind the recipe alike, D_j the machine's own. Passes
+//! on K machines told means m_j of R_j with variances v_j. For each band of wavelengths by itself, with P for the power of R, the mean over
+//! the machines of |m_j|^2 - v_j, and k for the share of it that is the machine's own,
+//!
+//! ```text
+//!  t = k P      c = (1 - k) P      w_j = 1 / (t + v_j)
+//!  C^ = c sum(w m) / (1 + c sum w)           q = t + c / (1 + c sum w)
+//! ```
+//!
+//! are the best linear prediction of what comes back on a machine that has not ground it, and its variance (random effects: Henderson 1975, Robinson
+//! 1991). With k = 1 it is nothing, with k = 0 and one machine that machine's own mean by Wiener's share.
+//!
+//! **How much machines differ** is told by recipes that two of them have both ground: |m_1 - m_2|^2 - v_1 - v_2 is 2 t of that recipe. The shares k
+//! of n comparisons have a mean, and the next machine may differ by more: it is widened by 1 + 1/n. Where comparisons of this machine itself tell more,
+//! theirs counts, and so does what all waves of a comparison tell together: of one band, a few waves may agree by chance. Without any, how alike
+//! machines are is unknown, and nothing is taken over; nor is it from machines that have more of their own than in common.
+//!
+//! **Never narrower than own evidence.** What others taught counts for one pass of its own at most, and the share that it still has in a mean is kept
+//! beside it: a machine teaches by its own passes alone, else what one of them found would come back as the word of all.
+
+use super::learning::{Band, CORRELATED, ErrorOnGrid, LearningState, Mean, RESPONSE_LIMITS};
+use crate::geometry::Grid;
+
+/// Variance of the mean over that of N, at least: what one pass tells.
+const LEAST_BELIEF: f64 = 1.0;
+/// How far machines differ in their response before any tells (standard deviation), and for how many machines that counts.
+const RESPONSES_DIFFER: f64 = 0.05;
+const RESPONSES_COUNT_FOR: f64 = 2.0;
+/// Machines of which more than this share is their own have next to nothing to teach, and may be alike by chance.
+const MOST_OWN: f64 = 0.5;
+/// A mean of which others' word is more than this share tells nothing of its machine.
+const MOST_BORROWED: f64 = 0.5;
+/// Bands are the same where they begin within this share of each other.
+const SAME: f64 = 1e-9;
+
+/// How much of what comes back in every pass is a machine's own, as far as comparisons tell.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Alike {
+    comparisons: Vec<Comparison>,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+struct Comparison {
+    /// Whether the machine that is to begin is one of the two.
+    is_own: bool,
+    /// Where each band begins, in millimetres, and the share of its power that is the machine's own.
+    shares: Vec<[f64; 2]>,
+    /// The same of all of them together.
+    whole: f64,
+}
+
+/// What a machine that has not ground a recipe begins with.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Shared {
+    /// What is known of it, as after passes of its own; [`LearningState::wanted_mm`] is the correction of its first pass.
+    pub known: LearningState,
+    /// For each band that was taken over: the waves from which it is, in millimetres, and the rms share of what comes back there that is taken to be
+    /// a machine's own.
+    pub differ: Vec<[f64; 2]>,
+}
+
+/// What one machine told of a band.
+struct Told {
+    values_mm: Vec<f64>,
+    mean_mm2: f64,
+    /// Variance of the mean, and that of what a pass adds by itself.
+    variance_mm2: f64,
+    scatter_mm2: f64,
+}
+
+impl Alike {
+    /// Takes down what a person states: the rms share of what comes back in every pass that is a machine's own, in all wavelengths. It counts as one comparison.
+    pub fn state(&mut self, rms_share: f64) {
+        let share = rms_share * rms_share;
+        self.comparisons.push(Comparison { is_own: true, shares: vec![[0.0, share]], whole: share });
+    }
+
+    /// Holds what two machines found of one recipe, whichever, against each other; `is_own` where one of them is the machine that is to begin.
+    /// Returns whether they can be compared.
+    pub fn compare(&mut self, [one, other]: [&LearningState; 2], is_own: bool) -> bool {
+        let Some(grid) = one.mean.as_ref().map(|mean| mean.grid) else { return false };
+        if !has_same_bands(one, other) {
+            return false;
+        }
+        let [ones, others] = [one, other].map(|known| told(known, &grid));
+        let (mut shares, mut whole) = (Vec::new(), [0.0; 2]);
+        for ((band, a), b) in one.bands.iter().zip(ones).zip(others) {
+            let Some([own_mm2, power_mm2]) = a.zip(b).and_then(|(a, b)| own_and_power(&a, &b)) else { continue };
+            shares.push([band.from_mm, (own_mm2 / power_mm2).min(1.0)]);
+            whole = [whole[0] + own_mm2, whole[1] + power_mm2];
+        }
+        let is_compared = !shares.is_empty();
+        if is_compared {
+            self.comparisons.push(Comparison { is_own, shares, whole: (whole[0] / whole[1]).min(1.0) });
+        }
+        is_compared
+    }
+
+    /// Returns the number of comparisons, a statement among them.
+    pub fn comparisons(&self) -> usize {
+        self.comparisons.len()
+    }
+
+    /// Returns what share of the power of waves from a length on is a machine's own; `None` where nothing tells.
+    pub fn own_share(&self, from_mm: f64) -> Option<f64> {
+        let all = self.expected(from_mm, |_| true)?;
+        Some(self.expected(from_mm, |of| of.is_own).map_or(all, |own| own.max(all)))
+    }
+
+    fn expected(&self, from_mm: f64, counts: impl Fn(&Comparison) -> bool) -> Option<f64> {
+        let shares: Vec<f64> =
+            self.comparisons.iter().filter(|of| counts(of)).filter_map(|of| of.share(from_mm)).collect();
+        let n = shares.len() as f64;
+        (n > 0.0).then(|| (shares.iter().sum::<f64>() / n * (1.0 + 1.0 / n)).clamp(0.0, 1.0))
+    }
+}
+
+impl Comparison {
+    /// The share in the band that waves of this length are of: the longest band of a smaller part holds all that are longer.
+    fn share(&self, from_mm: f64) -> Option<f64> {
+        let within = self.shares.iter().rev().find(|[from, _]| *from <= from_mm * (1.0 + SAME));
+        within.map(|[_, share]| share.max(self.whole))
+    }
+}
+
+impl LearningState {
+    /// Begins with what other machines found of the same recipe, as far as machines are alike, on the grid of the correction; `None` where they tell
+    /// nothing of it. `self` is what is known without them.
+    #[must_use]
+    pub fn begun_with(&self, others: &[&Self], alike: &Alike, grid: Grid) -> Option<Shared> {
+        let others: Vec<&Self> =
+            others.iter().copied().filter(|other| other.mean.is_some() && has_same_bands(self, other)).collect();
+        if others.is_empty() {
+            return None;
+        }
+        let all: Vec<Vec<Option<Told>>> = others.iter().map(|other| told(other, &grid)).collect();
+        let mut known = self.clone();
+        let mut mean = Mean { grid, values_mm: vec![0.0; grid.len()] };
+        let (mut differ, mut variance_mm2) = (Vec::new(), 0.0);
+        let on_grid = nothing_on(grid);
+        for (k, band) in known.bands.iter_mut().enumerate() {
+            let of_band: Vec<&Told> = all.iter().filter_map(|of| of[k].as_ref()).collect();
+            let Some(share) = alike.own_share(band.from_mm).filter(|share| *share <= MOST_OWN) else { continue };
+            let Some((values_mm, q)) = predicted(&of_band, share, grid.len()) else { continue };
+            let scatter_mm2 = of_band.iter().map(|of| of.scatter_mm2).sum::<f64>() / of_band.len() as f64;
+            let counts = (CORRELATED * band.independent(&on_grid)).recip();
+            band.scatter = [counts * scatter_mm2, counts];
+            band.belief = Some((q / scatter_mm2).max(LEAST_BELIEF));
+            band.borrowed = 1.0;
+            variance_mm2 += q;
+            differ.push([band.from_mm, share.sqrt()]);
+            mean.values_mm.iter_mut().zip(values_mm).for_each(|(sum, value)| *sum += value);
+        }
+        if !differ.is_empty() {
+            known.response = response(&others, self.response);
+            known.whole = whole(&known.whole, &others, variance_mm2);
+            known.wanted_mm = Some(mean.values_mm.iter().map(|r| -r / known.response[0]).collect());
+            known.mean = Some(mean);
+        }
+        Some(Shared { known, differ })
+    }
+}
+
+fn has_same_bands(one: &LearningState, other: &LearningState) -> bool {
+    let same = |(a, b): (&Band, &Band)| (a.from_mm - b.from_mm).abs() <= SAME * a.from_mm;
+    one.bands.len() == other.bands.len() && one.bands.iter().zip(&other.bands).all(same)
+}
+
+/// An error of nothing, all over a grid.
+fn nothing_on(grid: Grid) -> ErrorOnGrid {
+    ErrorOnGrid { grid, error_mm: Vec::new(), valid: vec![true; grid.len()], noise_mm2: 0.0 }
+}
+
+/// What passes of a machine told of each band, on a grid; none where it is not known how well, or others told it to the machine.
+fn told(known: &LearningState, grid: &Grid) -> Vec<Option<Told>> {
+    let Some(mean) = &known.mean else { return known.bands.iter().map(|_| None).collect() };
+    let on_grid = nothing_on(*grid);
+    let parts = known.split(&on_grid, mean.grid.resample(&mean.values_mm, grid));
+    let of_band = |(band, values_mm): (&Band, Vec<f64>)| {
+        let (belief, scatter_mm2) = band.belief.zip(band.scatter_mm2())?;
+        let is_told = scatter_mm2 > 0.0 && band.borrowed <= MOST_BORROWED;
+        // What is its own in the mean is the rest beside what it was told: known as much less well.
+        let variance_mm2 = belief * scatter_mm2 / (1.0 - band.borrowed).powi(2);
+        let mean_mm2 = on_grid.mean_square(&values_mm);
+        is_told.then_some(Told { values_mm, mean_mm2, variance_mm2, scatter_mm2 })
+    };
+    known.bands.iter().zip(parts).map(of_band).collect()
+}
+
+/// The power in a band that is the machine's own, and all of it; `None` where no power stands out of the scatter.
+fn own_and_power(a: &Told, b: &Told) -> Option<[f64; 2]> {
+    let power_mm2 = 0.5 * [a, b].map(|of| of.mean_mm2 - of.variance_mm2).iter().sum::<f64>();
+    let apart: f64 = a.values_mm.iter().zip(&b.values_mm).map(|(a, b)| (a - b).powi(2)).sum();
+    let apart_mm2 = apart / a.values_mm.len().max(1) as f64;
+    let own_mm2 = 0.5 * (apart_mm2 - a.variance_mm2 - b.variance_mm2).max(0.0);
+    (power_mm2 > 0.0).then_some([own_mm2, power_mm2])
+}
+
+/// What comes back in a band on a machine that has not ground the recipe, with its variance; `None` where nothing does that is common.
+fn predicted(machines: &[&Told], own_share: f64, nodes: usize) -> Option<(Vec<f64>, f64)> {
+    let power = machines.iter().map(|of| of.mean_mm2 - of.variance_mm2).sum::<f64>() / machines.len().max(1) as f64;
+    let (own, common) = (own_share * power, (1.0 - own_share) * power);
+    if common.is_nan() || common <= 0.0 {
+        return None;
+    }
+    let weights: Vec<f64> = machines.iter().map(|of| 1.0 / (own + of.variance_mm2)).collect();
+    let rest = 1.0 + common * weights.iter().sum::<f64>();
+    let mut values_mm = vec![0.0; nodes];
+    for (of, weight) in machines.iter().zip(&weights) {
+        values_mm.iter_mut().zip(&of.values_mm).for_each(|(sum, value)| *sum += common * weight / rest * value);
+    }
+    Some((values_mm, own + common / rest))
+}
+
+/// What is known of all wavelengths together, where others tell how much a pass adds by itself.
+fn whole(own: &Band, others: &[&LearningState], variance_mm2: f64) -> Band {
+    let of_others: Vec<f64> = others.iter().filter_map(|other| other.whole.scatter_mm2()).collect();
+    let others_mm2 = of_others.iter().sum::<f64>() / of_others.len() as f64;
+    let scatter = if own.scatter_mm2().is_some() || of_others.is_empty() {
+        own.scatter
+    } else {
+        let counts = CORRELATED.recip();
+        [counts * others_mm2, counts]
+    };
+    let with = Band { scatter, ..*own };
+    let belief = with.scatter_mm2().filter(|n2| *n2 > 0.0).map(|n2| (variance_mm2 / n2).max(LEAST_BELIEF));
+    Band { belief, borrowed: 1.0, ..with }
+}
+
+/// What is expected of the response: that of the others, as far as machines differ in it, beside what was known before.
+fn response(others: &[&LearningState], [before, sigma]: [f64; 2]) -> [f64; 2] {
+    let n = others.len() as f64;
+    let mean = others.iter().map(|other| other.response[0]).sum::<f64>() / n;
+    let squares: f64 = others.iter().map(|other| (other.response[0] - mean).powi(2)).sum();
+    let between = (RESPONSES_COUNT_FOR * RESPONSES_DIFFER.powi(2) + squares) / (RESPONSES_COUNT_FOR + n - 1.0);
+    let each = others.iter().map(|other| other.response[1].powi(2)).sum::<f64>() / n;
+    let [w, v] = [sigma * sigma, between * (1.0 + 1.0 / n) + each / n].map(f64::recip);
+    let [least, most] = RESPONSE_LIMITS;
+    [((w * before + v * mean) / (w + v)).clamp(least, most), (w + v).sqrt().recip()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::compensation::{Correction, ErrorMap, GainRule, MapOptions, Seen};
+
+    const GRID: Grid = Grid { columns: 41, rows: 31, first_mm: [-20.0, -15.0], spacing_mm: [1.0, 1.0] };
+
+    fn fresh(rule: GainRule) -> LearningState {
+        LearningState::new(rule, &MapOptions::new(2.5, 1.0), [40.0, 30.0], None)
+    }
+
+    /// Values that look random and are the same each time, of a power of 1.
+    fn field(seed: u64) -> Vec<f64> {
+        let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15).wrapping_add(1);
+        let mut next = || {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
+        };
+        (0..GRID.len()).map(|_| 12f64.sqrt() * next()).collect()
+    }
+
+    /// A machine that knows its mean with this variance of what a pass adds.
+    fn machine(rule: GainRule, values_mm: Vec<f64>, [belief, scatter_mm2]: [f64; 2]) -> LearningState {
+        let mut known = fresh(rule);
+        for band in known.bands.iter_mut().chain([&mut known.whole]) {
+            (band.belief, band.scatter) = (Some(belief), [3.0 * scatter_mm2, 3.0]);
+        }
+        known.mean = Some(Mean { grid: GRID, values_mm });
+        known
+    }
+
+    fn stated(rms_share: f64) -> Alike {
+        let mut alike = Alike::default();
+        alike.state(rms_share);
+        alike
+    }
+
+    fn sum(parts: &[(f64, &[f64])]) -> Vec<f64> {
+        (0..GRID.len()).map(|k| parts.iter().map(|(factor, of)| factor * of[k]).sum()).collect()
+    }
+
+    fn power(values: &[f64]) -> f64 {
+        values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64
+    }
+
+    #[test]
+    fn of_two_machines_it_is_what_is_worked_out_by_hand() {
+        // One band; means of a power of 5 and 5, v = 0.5 * 2 = 1: P = 4. A share of 0.25 twice over (one comparison): k = 0.5, t = c = 2, w = 1/3,
+        // 1 + 2 * 2/3 = 7/3: each mean counts 2/3 / (7/3) = 2/7, q = 2 + 2 * 3/7 = 20/7.
+        let flat = |value: f64| machine(GainRule::Adaptive, vec![value; GRID.len()], [0.5, 2.0]);
+        let (one, two) = (flat(5f64.sqrt()), flat(-(5f64.sqrt())));
+        let begun =
+            |others: &[&LearningState]| fresh(GainRule::Adaptive).begun_with(others, &stated(0.5), GRID).unwrap();
+        let Shared { known, differ } = begun(&[&one, &one]);
+        let values = &known.mean.as_ref().unwrap().values_mm;
+        assert!(values.iter().all(|v| (v - 4.0 / 7.0 * 5f64.sqrt()).abs() < 1e-12), "{}", values[0]);
+        assert!((known.bands[0].belief.unwrap() - 10.0 / 7.0).abs() < 1e-12, "{:?}", known.bands);
+        assert!((differ[0][1] - 0.5f64.sqrt()).abs() < 1e-12 && known.is_sound());
+        for (wanted, r) in known.wanted_mm().unwrap().iter().zip(values) {
+            assert_eq!(*wanted, -r / known.response()[0]);
+        }
+        // Two that say the contrary of each other.
+        assert!(power(&begun(&[&one, &two]).known.mean.unwrap().values_mm) < 1e-24);
+    }
+
+    #[test]
+    fn machines_that_have_nothing_in_common_teach_nothing_and_machines_that_are_alike_all() {
+        for rule in [GainRule::Adaptive, GainRule::Wavelength] {
+            let other = machine(rule, field(1), [0.5, 1e-9]);
+            let begun = |alike: &Alike| fresh(rule).begun_with(&[&other], alike, GRID).unwrap();
+            for unlike in [stated(1.0), stated(0.51), Alike::default()] {
+                let Shared { known, differ } = begun(&unlike);
+                assert!(differ.is_empty() && known == fresh(rule));
+            }
+            let Shared { known, differ } = begun(&stated(0.0));
+            assert_eq!(differ.len(), known.bands.len());
+            for (a, b) in known.mean.unwrap().values_mm.iter().zip(field(1)) {
+                assert!((a - b).abs() < 1e-6, "{a} {b}");
+            }
+        }
+    }
+
+    #[test]
+    fn how_much_machines_differ_is_found_again() {
+        let (common, rule) = (field(7), GainRule::Wavelength);
+        for share in [0.0, 0.01, 0.1, 0.5, 1.0f64] {
+            let mut alike = Alike::default();
+            for pair in 0..20 {
+                let of = |seed: u64| {
+                    let (own, noise) = (field(seed), field(seed + 1000));
+                    sum(&[((1.0 - share).sqrt(), &common), (share.sqrt(), &own), (0.05, &noise)])
+                };
+                // A noise of 0.05 in all, of which each band has what the bands of white noise have.
+                let machines = [100 + 2 * pair, 101 + 2 * pair].map(|seed| {
+                    let mut known = machine(rule, of(seed), [1.0, 1.0]);
+                    let noise = known.split(&nothing_on(GRID), sum(&[(0.05, &field(seed + 1000))]));
+                    for (band, noise) in known.bands.iter_mut().zip(noise) {
+                        band.scatter = [power(&noise), 1.0];
+                    }
+                    known
+                });
+                assert!(alike.compare([&machines[0], &machines[1]], pair == 0));
+            }
+            let all = alike.expected(2.5, |_| true).unwrap();
+            assert!((all / 1.05 - share).abs() < 0.03 + 0.05 * share || all == 1.0 && share == 1.0, "{share}: {all}");
+            // The one comparison of this machine itself is widened more.
+            assert!(alike.own_share(2.5).unwrap() >= all);
+        }
+    }
+
+    #[test]
+    fn the_order_of_machines_does_not_matter() {
+        let rule = GainRule::Wavelength;
+        let machines: Vec<_> =
+            (0..4).map(|k| machine(rule, field(k), [0.3 + 0.2 * k as f64, 1e-2 * (k + 1) as f64])).collect();
+        let of = |order: [usize; 4]| {
+            let others: Vec<&LearningState> = order.iter().map(|k| &machines[*k]).collect();
+            let Shared { known, differ } = fresh(rule).begun_with(&others, &stated(0.5), GRID).unwrap();
+            (known.mean.unwrap().values_mm, known.bands, known.response, differ)
+        };
+        let (values, bands, response, differ) = of([0, 1, 2, 3]);
+        let turned = of([3, 1, 0, 2]);
+        assert!(values.iter().zip(&turned.0).all(|(a, b)| (a - b).abs() < 1e-12));
+        assert!((response[0] - turned.2[0]).abs() < 1e-15 && differ == turned.3);
+        for (a, b) in bands.iter().zip(&turned.1) {
+            assert!((a.belief.unwrap() / b.belief.unwrap() - 1.0).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn own_passes_soon_outweigh_what_others_taught() {
+        // However sure the others are.
+        let rule = GainRule::Adaptive;
+        let other = machine(rule, vec![5.0; GRID.len()], [0.02, 1e-4]);
+        let mut known = fresh(rule).begun_with(&[&other], &stated(0.01), GRID).unwrap().known;
+        let mut alone = fresh(rule);
+        let none = Correction::none(GRID, 0.0);
+        for pass in 1..=8 {
+            let values = field(40 + pass).iter().map(|noise| 4.98 + 0.01 * noise).collect();
+            let error = ErrorMap::known(GRID, values, vec![true; GRID.len()]);
+            let seen = Seen { correction: &none, error: &error, answer: None, smooth: None };
+            (known, alone) = (known.after(&seen), alone.after(&seen));
+            let [of, without] = [&known, &alone].map(|of| of.bands[0].belief.unwrap());
+            assert!(of <= without + 1e-12, "pass {pass}: {of} against {without}");
+        }
+        let [with, without] = [&known, &alone].map(|of| of.gains()[0][1]);
+        assert!((with / without - 1.0).abs() < 0.15, "{with} against {without}");
+        assert!(known.bands[0].borrowed < 0.15, "{}", known.bands[0].borrowed);
+        assert!((known.mean.as_ref().unwrap().values_mm[0] - 4.98).abs() < 0.01);
+    }
+
+    #[test]
+    fn what_a_machine_was_told_is_not_its_own_word() {
+        let rule = GainRule::Adaptive;
+        let (one, mut told) = (machine(rule, field(1), [0.1, 1e-3]), machine(rule, field(1), [0.1, 1e-3]));
+        told.bands[0].borrowed = 0.9;
+        let mut alike = Alike::default();
+        assert!(!alike.compare([&one, &told], true) && alike.comparisons() == 0);
+        let shared = fresh(rule).begun_with(&[&told], &stated(0.1), GRID).unwrap();
+        assert!(shared.differ.is_empty());
+    }
+
+    #[test]
+    fn other_grids_are_taken_and_other_bands_left_alone() {
+        let (rule, wave) = (GainRule::Wavelength, |[x, y]: [f64; 2]| (0.2 * x).sin() + 0.05 * y);
+        let on = |grid: Grid| (0..grid.len()).map(|k| wave(grid.place_mm(k))).collect::<Vec<f64>>();
+        let finer = Grid { columns: 81, rows: 61, spacing_mm: [0.5, 0.5], ..GRID };
+        let mut other = machine(rule, on(GRID), [0.1, 1e-6]);
+        other.mean = Some(Mean { grid: finer, values_mm: on(finer) });
+        let shared = fresh(rule).begun_with(&[&other], &stated(0.05), GRID).unwrap();
+        for (a, b) in shared.known.mean.unwrap().values_mm.iter().zip(on(GRID)) {
+            assert!((a - b).abs() < 0.02 * b.abs() + 0.01, "{a} {b}");
+        }
+        let mut alike = Alike::default();
+        assert!(alike.compare([&machine(rule, on(GRID), [0.1, 1e-6]), &other], false));
+        assert!(alike.own_share(2.5).unwrap() < 1e-3, "{alike:?}");
+        // Bands of another cut-off, a machine that has ground nothing, nobody at all.
+        let coarse = LearningState::new(rule, &MapOptions::new(4.0, 1.0), [40.0, 30.0], None);
+        assert!(coarse.begun_with(&[&other], &stated(0.05), GRID).is_none());
+        assert!(fresh(rule).begun_with(&[&fresh(rule)], &stated(0.05), GRID).is_none());
+        assert!(fresh(rule).begun_with(&[], &stated(0.05), GRID).is_none());
+        assert!(!alike.compare([&coarse, &other], false) && !alike.compare([&other, &coarse], false));
+    }
+
+    #[test]
+    fn waves_that_nobody_compared_are_not_taken_over() {
+        let mut alike =
+            Alike { comparisons: vec![Comparison { is_own: false, shares: vec![[5.0, 0.02]], whole: 0.01 }] };
+        assert_eq!(alike.own_share(2.5), None);
+        assert_eq!(alike.own_share(20.0), Some(0.04));
+        // This machine differs by more than the others from each other.
+        alike.comparisons.push(Comparison { is_own: true, shares: vec![[5.0, 0.3]], whole: 0.1 });
+        assert_eq!(alike.own_share(5.0), Some(0.6));
+        // One that is unlike as a whole is so in every wave, whatever a few of them say.
+        alike.comparisons.push(Comparison { is_own: true, shares: vec![[5.0, 0.0]], whole: 0.4 });
+        assert!((alike.own_share(5.0).unwrap() - 0.35 * 1.5).abs() < 1e-12);
+    }
+}

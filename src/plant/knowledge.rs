@@ -1,0 +1,134 @@
+//! What other cells have learned, for a first part: asked for by what the parts have in common, and proven here before it is used.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use regrind_formats::{CellRun, LEARNED, Learned};
+use regrind_journal::sha256_hex;
+use serde::Deserialize;
+use tokio_postgres::Row;
+use tokio_postgres::types::ToSql;
+
+use super::error::{PlantError, refused};
+use super::hex::digits;
+use super::link::Link;
+use super::settings::ArtefactSettings;
+
+/// What the plant knows that a first part of a kind can begin with.
+#[derive(Default)]
+pub struct Knowledge {
+    /// What other cells found of parts of this kind.
+    pub lessons: Vec<(CellRun, Learned)>,
+    /// What two cells found of the same kind, whichever; whether this cell is one of them.
+    pub pairs: Vec<([Learned; 2], bool)>,
+    /// What was given and cannot be believed.
+    pub left_alone: Vec<String>,
+}
+
+/// A lesson as it was given.
+struct Given {
+    kind: String,
+    is_own: bool,
+    from: CellRun,
+    learned: Learned,
+}
+
+/// What of a file says for whom it is.
+#[derive(Deserialize)]
+struct Head {
+    kind: Option<String>,
+}
+
+impl Knowledge {
+    /// Asks for what other cells found of parts of a kind, and for what tells how alike machines are.
+    ///
+    /// # Errors
+    /// A plant that cannot be reached, a role that is no cell's. What is wrong with one lesson is told in the answer and to the plant.
+    pub async fn ask(
+        link: &Link,
+        artefacts: Option<&ArtefactSettings>,
+        (kind, simulation): (&str, bool),
+    ) -> Result<Self, PlantError> {
+        let failed = refused("what other cells have learned");
+        let mut knowledge = Self::default();
+        let text = "SELECT $1::text, false, cell, run, sha256, content, place FROM lessons($1, $2)";
+        let rows = link.client().query(text, &[&kind, &simulation]).await.map_err(&failed)?;
+        let of_kind = knowledge.believed(link, artefacts, (rows, simulation)).await?;
+        knowledge.lessons = of_kind.into_iter().map(|given| (given.from, given.learned)).collect();
+        if knowledge.lessons.is_empty() {
+            return Ok(knowledge);
+        }
+        let text = "SELECT kind, is_own, cell, run, sha256, content, place FROM lessons_in_common($1)";
+        let rows = link.client().query(text, &[&simulation]).await.map_err(&failed)?;
+        let in_common = knowledge.believed(link, artefacts, (rows, simulation)).await?;
+        for (k, one) in in_common.iter().enumerate() {
+            let others = in_common[k + 1..].iter().filter(|other| other.kind == one.kind);
+            knowledge
+                .pairs
+                .extend(others.map(|other| ([one.learned.clone(), other.learned.clone()], one.is_own || other.is_own)));
+        }
+        Ok(knowledge)
+    }
+
+    /// Proves what was given, and tells the plant what cannot be believed.
+    async fn believed(
+        &mut self,
+        link: &Link,
+        artefacts: Option<&ArtefactSettings>,
+        (rows, simulation): (Vec<Row>, bool),
+    ) -> Result<Vec<Given>, PlantError> {
+        let mut believed = Vec::new();
+        for row in rows {
+            let (cell, run): (String, String) = (row.get(2), row.get(3));
+            match given(&row, artefacts, simulation) {
+                Ok(given) => believed.push(given),
+                Err(why) => {
+                    let words = format!("what {run} of {cell} is said to have learned is left alone: {why}");
+                    let values: [&(dyn ToSql + Sync); 3] = [&run, &"a lesson refused", &words];
+                    let told = link.client().query_one("SELECT complain($1, $2, $3)", &values).await;
+                    told.map_err(refused("to be told what is wrong"))?;
+                    self.left_alone.push(words);
+                }
+            }
+        }
+        Ok(believed)
+    }
+}
+
+/// Takes a lesson from a row, where it is what it is said to be.
+fn given(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool) -> Result<Given, String> {
+    let (kind, is_own): (String, bool) = (row.get(0), row.get(1));
+    let from = CellRun { cell: row.get(2), run: row.get(3) };
+    let sha256: &[u8] = row.get(4);
+    let content = match (row.get::<_, Option<Vec<u8>>>(5), artefacts) {
+        (Some(content), _) => content,
+        (None, Some(kept)) => {
+            let name = digits(sha256);
+            fs::read(kept.folder.join(&name[..2]).join(&name)).map_err(|error| error.to_string())?
+        }
+        (None, None) => return Err("its file is in a folder that this plant file does not name by [artefacts]".into()),
+    };
+    if sha256_hex(&content) != digits(sha256) {
+        return Err("it is not what was on record".into());
+    }
+    let place: PathBuf = [&from.cell, &from.run, LEARNED].iter().collect();
+    let learned = Learned::of_another(&place, &content, &kind, simulation).map_err(|error| error.to_string())?;
+    Ok(Given { kind, is_own, from, learned })
+}
+
+/// Has the plant know what a finished run of this cell has learned, all of whose files have arrived. Returns why it is refused.
+pub(crate) async fn teach(link: &Link, folder: &Path, id: i32) -> Result<Option<String>, PlantError> {
+    let failed = refused("what a run has learned");
+    let text = "SELECT a.sha256 FROM run_artefact a WHERE a.run = $1 AND a.name = $2 AND NOT EXISTS (SELECT FROM lesson l WHERE l.run = $1)";
+    let Some(row) = link.client().query_opt(text, &[&id, &LEARNED]).await.map_err(&failed)? else { return Ok(None) };
+    let sha256: &[u8] = row.get(0);
+    // A file that is not what was written has been told of, and teaches nobody.
+    let Ok(content) = fs::read(folder.join(LEARNED)) else { return Ok(None) };
+    if sha256_hex(&content) != digits(sha256) {
+        return Ok(None);
+    }
+    // Nor does one of an earlier version, which does not say for which parts it is.
+    let Ok(Head { kind: Some(kind) }) = serde_json::from_slice(&content) else { return Ok(None) };
+    let row = link.client().query_one("SELECT teach($1, $2, $3)", &[&id, &kind, &sha256]).await;
+    Ok(row.map_err(&failed)?.get(0))
+}
