@@ -134,7 +134,7 @@ impl Shipper {
         if there.records > began_with || is_over()? {
             tell_run(link, there.id, &glance(&folder)?).await?;
         }
-        if is_over && missing == 0 {
+        if missing == 0 && is_over()? {
             self.teach(link, &folder, name, there.id, shipped).await?;
         }
         shipped.records += u64::try_from(there.records - began_with).unwrap_or(0);

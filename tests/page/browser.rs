@@ -26,7 +26,7 @@ impl Browser {
         let [to, from] = ["to", "from"].map(|name| folder.join(name).display().to_string());
         assert!(Command::new("mkfifo").args([&to, &from]).status().unwrap().success());
         // The shell gives it the two pipes as the descriptors on which it listens and speaks.
-        let command = "exec chromium --headless=new --no-sandbox --remote-debugging-pipe --user-data-dir=\"$3\" --no-first-run \
+        let command = "exec chromium --headless=new --no-sandbox --remote-debugging-pipe --user-data-dir=\"$3\" --no-first-run --disable-background-networking --disable-component-update --disable-sync \
                        --disable-dev-shm-usage --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader 3<\"$1\" 4>\"$2\"";
         let child = Command::new("sh")
             .args(["-c", command, "sh", &to, &from, &folder.join("profile").display().to_string()])
@@ -114,15 +114,21 @@ impl Tab {
     pub fn until(&self, browser: &mut Browser, expression: &str) {
         let began = Instant::now();
         while self.read(browser, &format!("Boolean({expression})")) != true {
-            assert!(began.elapsed() < PATIENCE, "never: {expression}");
+            if began.elapsed() >= PATIENCE {
+                let shown = self.read(browser, "[location.href, document.readyState, document.body?.innerText]");
+                panic!("never: {expression}; shown is {shown}");
+            }
             std::thread::park_timeout(std::time::Duration::from_millis(20));
         }
     }
 
+    /// Clicks what there is as soon as it listens: what the page's scripts hang on it comes after what it shows.
     pub fn click(&self, browser: &mut Browser, selector: &str) {
         self.until(
             browser,
-            &format!("document.querySelector('{selector}') && !document.querySelector('{selector}').disabled"),
+            &format!(
+                "document.readyState == 'complete' && document.querySelector('{selector}') && !document.querySelector('{selector}').disabled"
+            ),
         );
         self.read(browser, &format!("document.querySelector('{selector}').click()"));
     }

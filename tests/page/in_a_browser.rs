@@ -179,6 +179,9 @@ fn somebody_signs_in_over_tls_and_sees_what_their_role_may_order() {
     let tab = browser.open("about:blank", SCREEN);
     // The certificate is one of the test's own making.
     tab.send(&mut browser, "Security.setIgnoreCertificateErrors", json!({ "ignore": true }));
+    // On a line on which scripts come later than what they hang on.
+    let slow = json!({ "offline": false, "latency": 150, "downloadThroughput": -1, "uploadThroughput": -1 });
+    tab.send(&mut browser, "Network.emulateNetworkConditions", slow);
     tab.send(&mut browser, "Page.navigate", json!({ "url": url }));
     let sign_in = |browser: &mut Browser, name: &str, password: &str| {
         tab.until(browser, "document.querySelector('[name=password]')");

@@ -14,10 +14,8 @@ fn worlds(differ: Differ) -> Vec<Taught> {
 
 /// Root of the mean square over all worlds, over that of what passes add by themselves.
 fn together(worlds: &[Taught], after: impl Fn(&Taught) -> After) -> f64 {
-    let [rms, floor] = worlds
-        .iter()
-        .map(|world| after(world))
-        .fold([0.0; 2], |[rms, floor], a| [rms + a.rms_um.powi(2), floor + a.floor_um.powi(2)]);
+    let [rms, floor] =
+        worlds.iter().map(after).fold([0.0; 2], |[rms, floor], a| [rms + a.rms_um.powi(2), floor + a.floor_um.powi(2)]);
     (rms / floor).sqrt()
 }
 

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
 use regrind::config::PlantConfig;
-use regrind_plant::{DatabaseSettings, Link, PlantError};
+use regrind_plant::{DatabaseSettings, Link};
 
 use super::failure::Failure;
 use super::{Outcome, check};
