@@ -135,6 +135,7 @@ impl Tab {
 
     /// Presses a key: its name, its code, and what it types.
     pub fn press(&self, browser: &mut Browser, key: &str, code: u32, text: &str) {
+        self.until(browser, "document.readyState == 'complete'");
         for kind in ["keyDown", "keyUp"] {
             let mut event = json!({ "type": kind, "key": key, "code": key, "windowsVirtualKeyCode": code });
             if kind == "keyDown" && !text.is_empty() {

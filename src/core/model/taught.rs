@@ -183,8 +183,12 @@ mod tests {
             taught
         };
         let one = Taught::of_machines(&[machine(10.0)]);
-        assert_eq!(one.of(true).unwrap().priors(), Lesson::after(None, &hyper(10.0, 0.1)).priors());
-        assert!(one.of(false).is_none() && Taught::of_machines(&[]).of(true).is_none());
+        let [one, part] = [one.of(true).unwrap(), Lesson::after(None, &hyper(10.0, 0.1))].map(|of| of.priors());
+        let numbers = |of: Priors| [of.range_mm, of.scatter_ratio].concat();
+        assert!(numbers(one).iter().zip(numbers(part)).all(|(a, b)| (a / b - 1.0).abs() < 1e-12), "{one:?} {part:?}");
+        assert!(
+            Taught::of_machines(&[machine(10.0)]).of(false).is_none() && Taught::of_machines(&[]).of(true).is_none()
+        );
         let two = Taught::of_machines(&[machine(10.0), machine(40.0)]).of(true).unwrap();
         let parts = Lesson::after(Some(Lesson::after(None, &hyper(10.0, 0.1))), &hyper(40.0, 0.1));
         assert!((two.range_mm[0] - 20.0).abs() < 1e-9 && two.parts == 2, "{two:?}");

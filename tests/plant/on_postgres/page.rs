@@ -166,8 +166,8 @@ fn the_first_page_says_how_cells_are_and_counts_what_they_made() {
     runs.push(of("open", 1));
     runs.push(Planted { cell: three, recipe: "lens", ..of("not accepted", 2) });
     plant_runs(&plant, &runs);
-    plant.sql("INSERT INTO recipe (sha256, name, version, text) VALUES (sha256('a'), 'mirror', 3, 'a')");
-    plant.sql("INSERT INTO work (serial, recipe, due) VALUES ('SN-0099', sha256('a'), current_date - 3)");
+    plant.sql("INSERT INTO recipe (sha256, name, version, text) VALUES (recipe_sha256('mirror', 3, 'a', '{}'), 'mirror', 3, 'a')");
+    plant.sql("INSERT INTO work (serial, recipe, due) SELECT 'SN-0099', sha256, current_date - 3 FROM recipe");
     plant.sql("INSERT INTO incident (cell, run, what, words) VALUES (2, 'run-7', 'a broken chain', 'record 12 does not follow')");
 
     let shown = Shown::of(&plant);
@@ -340,10 +340,10 @@ fn what_a_cell_is_called_or_says_is_words_on_every_page() {
         quoted(&HOSTILE[..80])
     ));
     plant.sql(&format!(
-        "INSERT INTO recipe (sha256, name, version, text) VALUES (sha256('a'), {}, 1, 'a')",
+        "INSERT INTO recipe (sha256, name, version, text) VALUES (recipe_sha256({0}, 1, 'a', '{{}}'), {0}, 1, 'a')",
         quoted(&HOSTILE[..80])
     ));
-    plant.sql(&format!("INSERT INTO work (serial, recipe) VALUES ({text}, sha256('a'))"));
+    plant.sql(&format!("INSERT INTO work (serial, recipe) SELECT {text}, sha256 FROM recipe"));
     let shown = Shown::of(&plant);
     let encoded: String = HOSTILE.bytes().map(|byte| format!("%{byte:02x}")).collect();
     let pages = [
@@ -534,8 +534,8 @@ fn every_question_of_the_dashboard_for_grafana_has_an_answer() {
     tell(&plant, one, "1 second", None, &grinding("SN-1"));
     let runs: Vec<Planted> = (2..30).map(|hours| Planted { cell: one, hours, ..Planted::default() }).collect();
     plant_runs(&plant, &runs);
-    plant.sql("INSERT INTO recipe (sha256, name, version, text) VALUES (sha256('a'), 'mirror', 1, 'a')");
-    plant.sql("INSERT INTO work (serial, recipe) VALUES ('SN-9', sha256('a')); INSERT INTO incident (what, words) VALUES ('x', 'y')");
+    plant.sql("INSERT INTO recipe (sha256, name, version, text) VALUES (recipe_sha256('mirror', 1, 'a', '{}'), 'mirror', 1, 'a')");
+    plant.sql("INSERT INTO work (serial, recipe) SELECT 'SN-9', sha256 FROM recipe; INSERT INTO incident (what, words) VALUES ('x', 'y')");
     plant.somebody("grafana", "reader");
     let text = fs::read_to_string(root().join("config/plant/grafana.json")).unwrap();
     let dashboard: Value = serde_json::from_str(&text).unwrap();
