@@ -1,5 +1,5 @@
-//! Cells that make parts of one queue while the network is cut, the database is killed, and they themselves are: every record is in the plant
-//! once, and no part is begun twice.
+//! Cells that make parts of one queue and tell a broker how they are, while the network is cut, database and broker are killed, and they
+//! themselves are: every record is in the plant once, no part is begun twice, and every cell is told again.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -13,6 +13,7 @@ use regrind::journal::{Kind, Reader, verify};
 
 use super::work::approves;
 use crate::Plant;
+use crate::broker::Broker;
 use crate::network::Network;
 use crate::outlived::{began_once, follow, on_serial_lines};
 use crate::program::{PATIENCE, Running, changed, regrind};
@@ -40,7 +41,7 @@ struct Cell {
 }
 
 /// A cell whose plant file leads through the network, and its machines, which outlive its programs.
-fn cell(plant: &Plant, number: usize, approvers: &str) -> (Cell, Running) {
+fn cell(plant: &Plant, number: usize, approvers: &str, broker: &Broker) -> (Cell, Running) {
     let name = format!("cell-{number}");
     let home = plant.path(&name);
     fs::create_dir(&home).unwrap();
@@ -54,7 +55,9 @@ fn cell(plant: &Plant, number: usize, approvers: &str) -> (Cell, Running) {
     let file = fs::read_to_string(plant.path(&format!("{name}.toml"))).unwrap();
     let [direct, through] = [plant.postgres.socket(), plant.path("net")].map(|path| path.display().to_string());
     assert!(file.contains(&direct));
-    fs::write(plant.path(&format!("{name}-through.toml")), file.replace(&direct, &through) + approvers).unwrap();
+    let told = format!("\n[sparkplug]\nbroker = \"127.0.0.1\"\nport = {}\ngroup = \"plant\"\n", broker.port());
+    fs::write(plant.path(&format!("{name}-through.toml")), file.replace(&direct, &through) + approvers + &told)
+        .unwrap();
     (Cell { name, home }, machines)
 }
 
@@ -154,8 +157,9 @@ fn weather(seed: u64, cells: usize, parts: usize) {
     let serials: Vec<String> = (1..=parts).map(|n| format!("SN-{n}")).collect();
     let serials: Vec<&str> = serials.iter().map(String::as_str).collect();
     plant.does(&[&["plant", "queue", "--recipe", "small", "--plant", "planner.toml"], &serials[..]].concat());
+    let mut broker = Broker::start();
     let (cells, _machines): (Vec<Cell>, Vec<Running>) =
-        (1..=cells).map(|number| cell(&plant, number, &approvers)).unzip();
+        (1..=cells).map(|number| cell(&plant, number, &approvers, &broker)).unzip();
 
     let left = AtomicUsize::new(parts);
     let deeds = std::thread::scope(|scope| {
@@ -169,7 +173,7 @@ fn weather(seed: u64, cells: usize, parts: usize) {
         while left.load(Ordering::SeqCst) > 0 {
             assert!(began.elapsed() < 12 * PATIENCE, "seed {seed}: {} parts are left", left.load(Ordering::SeqCst));
             let a_while = Duration::from_millis(chance.random_range(50..1500));
-            match chance.random_range(0..3) {
+            match chance.random_range(0..4) {
                 0 => {
                     network.cut();
                     std::thread::park_timeout(a_while);
@@ -179,6 +183,11 @@ fn weather(seed: u64, cells: usize, parts: usize) {
                     plant.postgres.kill();
                     std::thread::park_timeout(a_while);
                     plant.postgres.go_on();
+                }
+                2 => {
+                    broker.kill();
+                    std::thread::park_timeout(a_while);
+                    broker.go_on();
                 }
                 _ => {}
             }
@@ -193,6 +202,18 @@ fn weather(seed: u64, cells: usize, parts: usize) {
     network.mend();
     println!("seed {seed}: {deeds} deeds of the weather");
     is_once_and_whole(&plant, &cells, parts, seed);
+    cells.iter().for_each(|cell| is_told(cell, &broker));
+}
+
+/// A cell is born once more to the broker, whatever became of the two before.
+fn is_told(cell: &Cell, broker: &Broker) {
+    let births = || broker.log().matches(&format!("spBv1.0/plant/NBIRTH/{}'", cell.name)).count();
+    let (before, began) = (births(), Instant::now());
+    let _tells = cell.does(&["tell"]);
+    while births() == before {
+        assert!(began.elapsed() < PATIENCE, "{} is not told:\n{}", cell.name, broker.log());
+        std::thread::park_timeout(Duration::from_millis(50));
+    }
 }
 
 /// How many parts have no run that is over, by the records at the cells.
@@ -250,13 +271,13 @@ fn is_once_and_whole(plant: &Plant, cells: &[Cell], parts: usize, seed: u64) {
 }
 
 #[test]
-#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+#[ignore = "needs PostgreSQL and mosquitto (Debian packages)"]
 fn records_arrive_once_and_no_part_is_begun_twice() {
     weather(1, 2, 4);
 }
 
 #[test]
-#[ignore = "takes half an hour, for .ci/long; needs PostgreSQL (Debian package postgresql)"]
+#[ignore = "takes half an hour, for .ci/long; needs PostgreSQL and mosquitto (Debian packages)"]
 fn two_hundred_parts_of_eight_cells() {
     weather(2, 8, 200);
 }
