@@ -5,7 +5,8 @@
 //! cargo bench --features plant --bench orders -- TRIES PLANT.toml
 //! ```
 //! The time runs from before the order is written to the control socket to the command at the simulated machine. With the plant file of a cell
-//! every second round is made while `regrind ship` ships the record, and what the others took stands beside it.
+//! every second round is made while `regrind ship` ships the record and, where the file says to whom, `regrind tell` tells live values; what the
+//! others took stands beside it.
 
 #[path = "../tests/common/keep.rs"]
 mod keep;
@@ -30,21 +31,30 @@ fn main() {
     runtime.block_on(measure(tries, plant.as_deref()));
 }
 
-/// Shipping beside the runs below a folder; it ends with this.
-struct Shipping(Child);
+/// What goes on for a plant beside the runs below a folder; it ends with this.
+struct Beside(Vec<Child>);
 
-impl Shipping {
+impl Beside {
     fn begin(plant: &str, runs: &Path) -> Self {
-        let mut ship = Command::new(env!("CARGO_BIN_EXE_regrind"));
-        ship.args(["ship", "--plant", plant, "--runs"]).arg(runs).stdin(Stdio::null()).stdout(Stdio::null());
-        Self(ship.spawn().expect("a program with the feature `plant`"))
+        let file = std::fs::read_to_string(plant).expect("a plant file");
+        let tells = ["[sparkplug]", "[opcua]"].iter().any(|table| file.lines().any(|line| line == *table));
+        let programs = ["ship", "tell"].into_iter().filter(|name| *name == "ship" || tells);
+        let begun = programs.map(|name| {
+            let mut program = Command::new(env!("CARGO_BIN_EXE_regrind"));
+            program.args([name, "--plant", plant, "--runs"]).arg(runs).stdin(Stdio::null()).stdout(Stdio::null());
+            program.spawn().expect("a program with the feature `plant`")
+        });
+        Self(begun.collect())
     }
 }
 
-impl Drop for Shipping {
+impl Drop for Beside {
     fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
+        for child in &mut self.0 {
+            // It may have ended.
+            let _ = child.kill();
+            let _ = child.wait();
+        }
     }
 }
 
@@ -53,22 +63,25 @@ async fn measure(tries: usize, plant: Option<&str>) {
     let mut times: BTreeMap<String, Vec<Duration>> = BTreeMap::new();
     let mut states: BTreeMap<String, usize> = BTreeMap::new();
     let mut slowest: Vec<(Duration, &str, &str)> = Vec::new();
-    let mut shipping = None;
+    let mut beside = None;
     for k in 0..tries {
         let moment = &MOMENTS[k % MOMENTS.len()];
-        let ships = plant.filter(|_| !(k / MOMENTS.len()).is_multiple_of(2));
+        let round = k / MOMENTS.len();
+        let ships = plant.filter(|_| !round.is_multiple_of(2));
         if k % MOMENTS.len() == 0 {
-            shipping = ships.map(|plant| Shipping::begin(plant, rig.home.path()));
+            beside = ships.map(|plant| Beside::begin(plant, rig.home.path()));
         }
-        let (tried, _) = attempt(&mut rig, moment, (k / MOMENTS.len()).is_multiple_of(2)).await;
+        // With and without a plant alike.
+        let holds = if plant.is_some() { round / 2 } else { round }.is_multiple_of(2);
+        let (tried, _) = attempt(&mut rig, moment, holds).await;
         let aborts = tried.abort.iter().zip(["abort, CMM", "abort, grinder"]);
         slowest.extend(aborts.map(|(time, what)| (*time, what, moment.name)));
         slowest.extend(tried.hold.map(|time| (time, "hold", moment.name)));
         assert!(tried.after_abort.is_empty(), "{tried:?}");
         *states.entry(tried.state).or_default() += 1;
         let mut take = |what: &str, took: &mut dyn Iterator<Item = Duration>| {
-            let beside = if ships.is_some() { ", shipped" } else { "" };
-            times.entry(format!("{what}{beside}")).or_default().extend(took);
+            let with = if ships.is_some() { ", with a plant" } else { "" };
+            times.entry(format!("{what}{with}")).or_default().extend(took);
         };
         take("abort, on the wire", &mut tried.abort.iter().copied());
         take("abort, answered", &mut std::iter::once(tried.abort_answered));
@@ -77,7 +90,7 @@ async fn measure(tries: usize, plant: Option<&str>) {
         take("resume, on the wire", &mut tried.resume.into_iter());
         take("resume, answered", &mut tried.resume_answered.into_iter());
     }
-    drop(shipping);
+    drop(beside);
     println!("{tries} tries\n\n{:32}{:>6}{:>10}{:>10}{:>10}  ms", "", "n", "p50", "p99", "max");
     for (what, mut times) in times {
         times.sort_unstable();
