@@ -179,20 +179,22 @@ impl Shipping<'_> {
     }
 }
 
-/// Tells the plant how the cell is: as the run that is on says it, or that there is none.
+/// Tells the plant how the cell is: as the run that is on says it, or that there is none. Of one that does not answer nothing is told, and the
+/// plant finds that nothing is heard.
 async fn tell_state(link: &Link, runs: &Path) -> Result<(), PlantError> {
     let runs = runs.to_owned();
     // A run that does not answer holds up nothing else meanwhile.
     let asked = tokio::task::spawn_blocking(move || {
         let run = super::control::live_runs(&runs).next()?;
-        let reply = regrind_control::ask(&run, &Request::Status).ok()?;
-        Some((run, reply.status))
+        let status = regrind_control::ask(&run, &Request::Status).ok().map(|reply| reply.status);
+        Some((run, status))
     });
     match asked.await.ok().flatten() {
-        Some((run, status)) => {
+        Some((run, Some(status))) => {
             let name = run.file_name().map(|name| name.to_string_lossy().into_owned());
             link.tell_state(name.as_deref(), &serde_json::to_value(&status).unwrap_or_default()).await
         }
+        Some((_, None)) => Ok(()),
         None => link.tell_state(None, &json!({ "state": "Idle", "words": "no run is on" })).await,
     }
 }

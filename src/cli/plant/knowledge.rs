@@ -25,19 +25,31 @@ pub(in super::super) struct Told {
 /// Asks the plant what other cells have learned of parts like that of a task. A plant that cannot be reached is in nobody's way.
 pub(in super::super) fn ask(plant: &Path, task: &Task) -> Result<Told, Failure> {
     let config = super::read(plant)?;
-    let asked = async {
-        let link = super::open(&config).await?;
-        let of_this = (task.kind.as_str(), task.simulation);
-        Ok::<_, Failure>(Knowledge::ask(&link, config.artefacts.as_ref(), of_this).await?)
-    };
-    let within = async { tokio::time::timeout(PATIENCE, asked).await };
-    let knowledge = match super::super::runtime()?.block_on(within) {
+    // Who only tells live values has nobody to ask.
+    if config.database.is_none() {
+        return Ok(Told::default());
+    }
+    let machines_differ = config.machines_differ;
+    let (to, answer) = std::sync::mpsc::channel();
+    let (kind, simulation) = (task.kind.clone(), task.simulation);
+    // A thread of its own, which is left where it hangs: neither a look for a name nor a file of a share that is gone can be called off.
+    std::thread::spawn(move || {
+        let asked = super::super::runtime().and_then(|runtime| {
+            runtime.block_on(async {
+                let link = super::open(&config).await?;
+                Ok(Knowledge::ask(&link, config.artefacts.as_ref(), (&kind, simulation)).await?)
+            })
+        });
+        // The run may have begun without.
+        let _ = to.send(asked.map_err(|error| error.to_string()));
+    });
+    let knowledge = match answer.recv_timeout(PATIENCE) {
         Ok(Ok(knowledge)) => knowledge,
-        Ok(Err(error)) => return Ok(without(&error.to_string())),
+        Ok(Err(error)) => return Ok(without(&error)),
         Err(_) => return Ok(without(&format!("nothing came within {} s", PATIENCE.as_secs()))),
     };
     let mut alike = Alike::default();
-    if let Some(share) = config.machines_differ {
+    if let Some(share) = machines_differ {
         alike.state(share);
     }
     for ([one, other], is_own) in &knowledge.pairs {
