@@ -3,6 +3,8 @@
 mod accuracy;
 mod audit;
 mod blocks;
+#[cfg(feature = "plant")]
+mod cell_now;
 mod check;
 mod choice;
 mod compensate;

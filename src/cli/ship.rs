@@ -7,10 +7,11 @@ use std::time::{Duration, Instant};
 
 use clap::Args;
 use regrind::config::PlantConfig;
-use regrind::drive::Request;
+use regrind_live::{Now, Told};
 use regrind_plant::{Link, PlantError, Shipped, Shipper};
 use serde_json::json;
 
+use super::cell_now::Look;
 use super::failure::Failure;
 use super::{Outcome, outside, plant};
 
@@ -59,6 +60,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
         config,
         link: None,
         arguments,
+        look: None,
         waits: false,
     };
     super::runtime()?.block_on(async {
@@ -80,6 +82,8 @@ struct Shipping<'a> {
     shipper: Shipper,
     link: Option<Link>,
     arguments: &'a Arguments,
+    /// How the cell was found; none while somebody looks.
+    look: Option<Look>,
     /// Whether it was told that the plant is not there.
     waits: bool,
 }
@@ -137,7 +141,10 @@ impl Shipping<'_> {
         let Some(link) = &self.link else { return Ok(Shipped::default()) };
         let shipped = self.shipper.round(link).await;
         let told = match &shipped {
-            Ok(_) => tell_state(link, &self.arguments.runs).await,
+            Ok(_) => {
+                let look = self.look.take().unwrap_or_else(|| Look::new(&self.arguments.runs)).again().await;
+                tell_state(link, self.look.insert(look).told()).await
+            }
             Err(_) => Ok(()),
         };
         let shipped = match (shipped, told) {
@@ -179,23 +186,14 @@ impl Shipping<'_> {
     }
 }
 
-/// Tells the plant how the cell is: as the run that is on says it, or that there is none. Of one that does not answer nothing is told, and the
-/// plant finds that nothing is heard.
-async fn tell_state(link: &Link, runs: &Path) -> Result<(), PlantError> {
-    let runs = runs.to_owned();
-    // A run that does not answer holds up nothing else meanwhile.
-    let asked = tokio::task::spawn_blocking(move || {
-        let run = super::control::live_runs(&runs).next()?;
-        let status = regrind_control::ask(&run, &Request::Status).ok().map(|reply| reply.status);
-        Some((run, status))
-    });
-    match asked.await.ok().flatten() {
-        Some((run, Some(status))) => {
-            let name = run.file_name().map(|name| name.to_string_lossy().into_owned());
-            link.tell_state(name.as_deref(), &serde_json::to_value(&status).unwrap_or_default()).await
+/// Tells the plant how the cell is. What is not known is not told: the plant finds that nothing is heard.
+async fn tell_state(link: &Link, told: &Told) -> Result<(), PlantError> {
+    match &told.now {
+        Now::On { run, snapshot } => {
+            link.tell_state(Some(run), &serde_json::to_value(snapshot).unwrap_or_default()).await
         }
-        Some((_, None)) => Ok(()),
-        None => link.tell_state(None, &json!({ "state": "Idle", "words": "no run is on" })).await,
+        Now::NoRun => link.tell_state(None, &json!({ "state": "Idle", "words": "no run is on" })).await,
+        Now::Silent { .. } | Now::Gone { .. } => Ok(()),
     }
 }
 

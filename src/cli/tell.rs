@@ -7,14 +7,13 @@ use std::time::Duration;
 use clap::Args;
 use regrind::config::PlantConfig;
 use regrind::drive::Request;
-use regrind::journal::is_driven;
-use regrind::report::{RunResult, RunSummary, run_summary};
 use regrind_control::OnBehalf;
-use regrind_live::{Ended, LiveError, News, Node, Notes, Now, Told, Turn, UaServer, notes};
+use regrind_live::{LiveError, News, Node, Notes, Now, Told, Turn, UaServer, notes};
 use serde_json::json;
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 
+use super::cell_now::{Look, name};
 use super::failure::Failure;
 use super::{Outcome, check, control, outside, plant, ship};
 
@@ -113,7 +112,8 @@ async fn tell(
     arguments: &Arguments,
     ended: impl Future<Output = ()>,
 ) -> Result<Outcome, Failure> {
-    let (to, told) = watch::channel(look(&arguments.runs, None));
+    let mut look = Look::new(&arguments.runs);
+    let (to, told) = watch::channel(look.now().clone());
     let (notes, news) = notes();
     let mut telling = begin(config, cell, turn, &told, &notes)?;
     // Only those who tell hold on to the news.
@@ -121,7 +121,7 @@ async fn tell(
     let mut hearing = tokio::spawn(hear(news, arguments.runs.clone(), arguments.json));
     let over = tokio::select! {
         Some(over) = telling.join_next() => Some(over),
-        never = follow(&arguments.runs, &to) => match never {},
+        never = follow(look, &arguments.runs, &to) => match never {},
         () = async {
             ended.await;
             if arguments.while_stdin {
@@ -166,74 +166,33 @@ fn begin(
 enum Never {}
 
 /// Tells how the cell is, from run to run.
-async fn follow(runs: &Path, to: &watch::Sender<Told>) -> Never {
+async fn follow(mut look: Look, runs: &Path, to: &watch::Sender<Told>) -> Never {
     loop {
         if let Some(folder) = control::live_runs(runs).next() {
-            watch_run(&folder, to).await;
+            watch_run(&folder, &mut look, to).await;
         }
-        let before = to.borrow().clone();
-        let runs = runs.to_owned();
-        // A record is long, and those who tell must not wait for it.
-        let now = tokio::task::spawn_blocking(move || look(&runs, Some(before))).await;
-        if let Ok(now) = now {
-            to.send_if_modified(|told| {
-                told != &now && {
-                    *told = now;
-                    true
-                }
-            });
-        }
+        look = look.again().await;
+        tell_all(look.told(), to);
         tokio::time::sleep(ROUND).await;
     }
 }
 
-/// Tells how a run is until its program has gone.
-async fn watch_run(folder: &Path, to: &watch::Sender<Told>) {
-    let run = name(folder);
+/// Tells how a run is until nothing is heard of it any more.
+async fn watch_run(folder: &Path, look: &mut Look, to: &watch::Sender<Told>) {
     let Ok(mut watch) = regrind_control::watch(folder).await else { return };
     while let Ok(Some(snapshot)) = watch.next().await {
-        let now = Now::On { run: run.clone(), snapshot: Box::new(snapshot) };
-        to.send_if_modified(|told| {
-            told.now != now && {
-                told.now = now;
-                true
-            }
-        });
+        look.heard(Now::On { run: name(folder), snapshot: Box::new(snapshot) });
+        tell_all(look.told(), to);
     }
 }
 
-/// Returns how the cell is while no run is watched.
-fn look(runs: &Path, before: Option<Told>) -> Told {
-    let before = before.unwrap_or_default();
-    if let Some(folder) = control::live_runs(runs).next()
-        && let Ok(reply) = regrind_control::ask(&folder, &Request::Status)
-    {
-        return Told { now: Now::On { run: name(&folder), snapshot: Box::new(reply.status) }, ..before };
-    }
-    let Some(folder) = control::newest(runs) else { return Told::default() };
-    // What is known of a run that is over, or was left, changes no more until it is on again.
-    let known = match (&before.now, &before.last) {
-        (Now::Gone { run }, _) => *run == name(&folder),
-        (Now::NoRun, Some(last)) => last.run == name(&folder),
-        _ => false,
-    };
-    // A program that is there and not heard yet, or no more, is at the beginning or the end of its run.
-    if known || is_driven(&folder) {
-        return before;
-    }
-    match run_summary(&folder) {
-        Ok(RunSummary { ended: Some(_), result, verdict, .. }) => {
-            let accepted = result == RunResult::Accepted;
-            Told { now: Now::NoRun, last: Some(Ended { run: name(&folder), verdict, accepted }) }
+fn tell_all(now: &Told, to: &watch::Sender<Told>) {
+    to.send_if_modified(|told| {
+        told != now && {
+            told.clone_from(now);
+            true
         }
-        // A folder that has no record yet is no run that was left.
-        Ok(summary) if !summary.began.is_empty() => Told { now: Now::Gone { run: name(&folder) }, ..before },
-        _ => Told { now: Now::NoRun, ..before },
-    }
-}
-
-fn name(folder: &Path) -> String {
-    folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
+    });
 }
 
 // ---- what comes back ----------------------------------------------------------------------------------------------------------------

@@ -46,6 +46,7 @@ pub use verify::{Against, Anchor, Verified, is_driven, verify, verify_against};
 pub use write::{Header, Journal, RunLock};
 
 use std::path::Path;
+use std::time::SystemTime;
 
 use rusqlite::Connection;
 
@@ -55,6 +56,17 @@ pub const DATABASE: &str = "journal.sqlite";
 pub const ANCHOR: &str = "journal.anchor";
 /// The lock in a run folder.
 pub const LOCK: &str = ".lock";
+
+/// When the files that hold a record were changed last, and how long they are: another one, where something was put on it.
+pub type Stamp = [Option<(SystemTime, u64)>; 2];
+
+/// Returns the stamp of a run folder.
+pub fn stamp(folder: &Path) -> Stamp {
+    [DATABASE.to_owned(), format!("{DATABASE}-wal")].map(|name| {
+        let metadata = std::fs::metadata(folder.join(name)).ok()?;
+        Some((metadata.modified().ok()?, metadata.len()))
+    })
+}
 
 /// A journal that is only read. It may be read while another process writes it. Who writes it himself reads it by [`Journal::records`]: a
 /// process that closes a file gives back all locks that it has on it.

@@ -74,13 +74,13 @@ pub const FIGURES: &[Figure] = &[
     whole("Status/StateCurrent", "Number of the state by PackML; 4 (Idle) where no run is on", |told| {
         match &told.now {
             Now::NoRun => Some(FigureValue::Whole(state_number(regrind_cell::StateName::Idle))),
-            Now::Gone { .. } => None,
+            Now::Silent { .. } | Now::Gone { .. } => None,
             Now::On { snapshot, .. } => Some(FigureValue::Whole(state_number(snapshot.state))),
         }
     }),
     text("Status/StateName", "Name of the state by PackML", |told| match &told.now {
         Now::NoRun => Some(FigureValue::Text("Idle".into())),
-        Now::Gone { .. } => None,
+        Now::Silent { .. } | Now::Gone { .. } => None,
         Now::On { snapshot, .. } => Some(FigureValue::Text(snapshot.state.to_string())),
     }),
     whole("Status/UnitModeCurrent", "Number of the mode by PackML: 1 production, 16 simulation", |told| {
@@ -94,6 +94,9 @@ pub const FIGURES: &[Figure] = &[
     }),
     text("Message", "State and phase, for people", |told| match &told.now {
         Now::NoRun => Some(in_words("no run is on")),
+        Now::Silent { run } => Some(FigureValue::Text(format!(
+            "the program of {run} does not answer: what the machines do is not known; see to them"
+        ))),
         Now::Gone { run } => Some(FigureValue::Text(format!(
             "the program of {run} has gone before its end: what the machines do is not known; see to them, then: regrind resume"
         ))),

@@ -17,6 +17,9 @@ pub enum Now {
     /// No run is on.
     #[default]
     NoRun,
+    /// A run's program is there and does not answer: what the machines do is not known.
+    #[expect(missing_docs, reason = "named for what it is")]
+    Silent { run: String },
     /// A run has no end on record, and its program has gone: what the machines do is not known.
     #[expect(missing_docs, reason = "named for what it is")]
     Gone { run: String },
@@ -37,11 +40,11 @@ pub struct Ended {
 }
 
 impl Told {
-    /// Returns the run that is on, or whose program has gone.
+    /// Returns the run that is on, does not answer, or whose program has gone.
     pub(crate) fn run(&self) -> Option<&str> {
         match &self.now {
             Now::NoRun => None,
-            Now::Gone { run } | Now::On { run, .. } => Some(run),
+            Now::Silent { run } | Now::Gone { run } | Now::On { run, .. } => Some(run),
         }
     }
 

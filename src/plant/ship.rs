@@ -12,10 +12,9 @@
 use std::collections::{HashMap, HashSet};
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::time::SystemTime;
 
 use regrind_formats::{LEARNED, ResultFolder, write_atomic};
-use regrind_journal::{DATABASE, Kind, Reader, Record, sha256_hex};
+use regrind_journal::{DATABASE, Kind, Reader, Record, Stamp, sha256_hex, stamp};
 use regrind_report::{RunResult, RunSummary, run_summary};
 use serde_json::{Value, json};
 use tokio_postgres::types::ToSql;
@@ -44,9 +43,6 @@ pub struct Shipper {
     /// The files that cannot be, by run and name, once they were told.
     told: HashSet<(String, String)>,
 }
-
-/// When the files that hold a record were changed last, and how long they are.
-type Stamp = [Option<(SystemTime, u64)>; 2];
 
 /// What went in one round.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -227,13 +223,6 @@ impl Shipper {
         }
         Ok(None)
     }
-}
-
-fn stamp(folder: &Path) -> Stamp {
-    [DATABASE.to_owned(), format!("{DATABASE}-wal")].map(|name| {
-        let metadata = fs::metadata(folder.join(name)).ok()?;
-        Some((metadata.modified().ok()?, metadata.len()))
-    })
 }
 
 /// Puts a content into the folder of the plant, under its hash. What is there already should be the same, and is put right where it is not.

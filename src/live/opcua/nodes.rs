@@ -396,7 +396,7 @@ fn unknown(then: DateTime) -> DataValue {
 fn state(told: &Told) -> Option<StateName> {
     match &told.now {
         Now::NoRun => Some(StateName::Idle),
-        Now::Gone { .. } => None,
+        Now::Silent { .. } | Now::Gone { .. } => None,
         Now::On { snapshot, .. } => Some(snapshot.state),
     }
 }

@@ -218,6 +218,38 @@ fn a_run_is_told_beside_it_and_one_whose_program_has_gone_is_not_called_idle() {
         (&values["Figures/PV"], &values["Status/StateName"], &values["Last Run/Name"]),
         (&Value::Null, &Value::Null, &json!(name))
     );
+    // Nor after somebody has looked at another run, or made a folder.
+    let (code, _, errors) = run(&["report", &format!("runs/{name}")], told.home.path());
+    assert_eq!(code, 0, "{errors}");
+    fs::create_dir(told.home.path().join("runs/empty")).unwrap();
+    teller.signal("TERM");
+    assert_eq!(teller.end().0, 0);
+    let from = told.host.place();
+    let mut teller = told.tell();
+    let born = heard(&mut told.host, from, "NBIRTH");
+    assert!(born["nulls"].as_array().unwrap().contains(&json!("Status/StateCurrent")), "{born}");
+    assert_eq!(born["metrics"]["Run"], json!(folder.file_name().unwrap().to_str().unwrap()));
+    teller.signal("TERM");
+    assert_eq!(teller.end().0, 0);
+    no_fault(&mut told.host);
+}
+
+#[test]
+#[ignore = "needs mosquitto (Debian package), and Python with venv: see REGRIND_PYTHON"]
+fn a_run_that_answers_no_more_is_not_told_as_it_was() {
+    let mut told = Told::new();
+    let mut teller = told.tell();
+    let (running, folder, _) = held_run(told.home.path(), 200.0);
+    until_value(&mut told.host, "Status/StateCurrent", &json!(11));
+    running.signal("STOP");
+    let values = until_value(&mut told.host, "Status/StateCurrent", &Value::Null);
+    assert_eq!(values["Run"], json!(folder.file_name().unwrap().to_str().unwrap()));
+    assert!(values["Message"].as_str().unwrap().contains("does not answer"), "{values:?}");
+    let from = told.host.place();
+    running.signal("CONT");
+    told.host.until(from, "that it is held", |said| {
+        said.iter().any(|line| line["metrics"]["Status/StateCurrent"] == 11).then_some(())
+    });
     teller.signal("TERM");
     assert_eq!(teller.end().0, 0);
     no_fault(&mut told.host);

@@ -7,7 +7,7 @@ use regrind::journal::{Reader, Record, verify};
 use rusqlite::Connection;
 use serde_json::Value;
 
-use crate::program::{Running, regrind, small_recipe};
+use crate::program::{Running, regrind, run, small_recipe};
 use crate::{Plant, only_run};
 
 /// A part of the small recipe made by cell-1, signed, and shipped meanwhile.
@@ -24,6 +24,25 @@ pub fn made(plant: &Plant) -> (std::path::PathBuf, String) {
     let (code, errors) = run.end();
     assert_eq!(code, 0, "{errors}");
     only_run(&plant.path("runs"))
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn a_cell_whose_run_was_left_is_not_called_idle() {
+    let plant = Plant::new();
+    plant.cell("cell-1", &[]);
+    let told = || plant.sql("SELECT count(*) FROM cell_now WHERE told_at IS NOT NULL");
+    let (mut running, _, _) = crate::held::held_run(plant.home.path(), 200.0);
+    running.signal("KILL");
+    running.end();
+    plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
+    assert_eq!(told(), "0", "what it does is not known");
+    // Whoever made another part has seen to the machines.
+    let recipe = small_recipe(plant.home.path(), 1000.0).display().to_string();
+    let (code, out, errors) = run(&["run", &recipe, "--cell", "sim"], plant.home.path());
+    assert!(code == 0 && told() == "0", "{out}{errors}");
+    plant.does(&["ship", "--once", "--plant", "cell-1.toml"]);
+    assert_eq!(plant.sql("SELECT words FROM cell_now"), "no run is on");
 }
 
 fn records(folder: &Path) -> Vec<Record> {
