@@ -89,9 +89,11 @@ impl Cycles {
         self.0.values().rev().find(|cycle| cycle.is_judged() && cycle.known.is_some())
     }
 
-    /// Returns what earlier parts taught of the fields of errors, with the last judged pass of either kind of this one.
+    /// Returns what earlier parts taught of the fields of errors, with the last judged pass of either kind of this one. What other cells taught is
+    /// left out: it would come back to them as this one's.
     pub(super) fn taught(&self, task: &Task) -> Taught {
-        let mut taught = task.learned.as_ref().map(|learned| learned.fields).unwrap_or_default();
+        let of_this_cell = task.learned.as_ref().filter(|learned| learned.taught_by.is_none());
+        let mut taught = of_this_cell.map(|learned| learned.fields).unwrap_or_default();
         for is_corrected in [false, true] {
             let alike = |cycle: &&Cycle| cycle.is_judged() && cycle.correction.is_none() != is_corrected;
             if let Some(field) = self.0.values().filter(alike).filter_map(|cycle| cycle.field).next_back() {

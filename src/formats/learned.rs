@@ -167,12 +167,11 @@ impl Learned {
             && learned.kind.as_deref() == Some(kind)
             && learned.simulation == simulation
             && learned.taught_by.is_none();
-        match is_meant {
-            true => Ok(learned),
-            false => Err(LearnedError::Broken {
-                path: from.to_owned(),
-                why: "it is of another kind of parts than it was given for".into(),
-            }),
+        let broken = |why| Err(LearnedError::Broken { path: from.to_owned(), why });
+        match learned.known.unfit_to_teach() {
+            _ if !is_meant => broken("it is of another kind of parts than it was given for".into()),
+            Some(why) => broken(why),
+            None => Ok(learned),
         }
     }
 

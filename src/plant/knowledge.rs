@@ -1,6 +1,7 @@
 //! What other cells have learned, for a first part: asked for by what the parts have in common, and proven here before it is used.
 
 use std::fs;
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use regrind_formats::{CellRun, LEARNED, Learned};
@@ -13,6 +14,9 @@ use super::error::{PlantError, refused};
 use super::hex::digits;
 use super::link::Link;
 use super::settings::ArtefactSettings;
+
+/// The largest file that teaches: as in the database's own layout.
+const MOST_BYTES: u64 = 4 << 20;
 
 /// What the plant knows that a first part of a kind can begin with.
 #[derive(Default)]
@@ -104,7 +108,7 @@ fn given(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool) -> R
         (Some(content), _) => content,
         (None, Some(kept)) => {
             let name = digits(sha256);
-            fs::read(kept.folder.join(&name[..2]).join(&name)).map_err(|error| error.to_string())?
+            bounded(&kept.folder.join(&name[..2]).join(&name)).map_err(|error| error.to_string())?
         }
         (None, None) => return Err("its file is in a folder that this plant file does not name by [artefacts]".into()),
     };
@@ -114,6 +118,16 @@ fn given(row: &Row, artefacts: Option<&ArtefactSettings>, simulation: bool) -> R
     let place: PathBuf = [&from.cell, &from.run, LEARNED].iter().collect();
     let learned = Learned::of_another(&place, &content, &kind, simulation).map_err(|error| error.to_string())?;
     Ok(Given { kind, is_own, from, learned })
+}
+
+/// A file that is no larger than a lesson is, whatever the database says of it.
+fn bounded(path: &Path) -> io::Result<Vec<u8>> {
+    let mut content = Vec::new();
+    fs::File::open(path)?.take(MOST_BYTES + 1).read_to_end(&mut content)?;
+    match content.len() as u64 {
+        0..=MOST_BYTES => Ok(content),
+        _ => Err(io::Error::other(format!("it is larger than the {MOST_BYTES} bytes of any lesson"))),
+    }
 }
 
 /// Has the plant know what a finished run of this cell has learned, all of whose files have arrived. Returns why it is refused.

@@ -29,7 +29,6 @@ pub(in super::super) fn ask(plant: &Path, task: &Task) -> Result<Told, Failure> 
     if config.database.is_none() {
         return Ok(Told::default());
     }
-    let machines_differ = config.machines_differ;
     let (to, answer) = std::sync::mpsc::channel();
     let (kind, simulation) = (task.kind.clone(), task.simulation);
     // A thread of its own, which is left where it hangs: neither a look for a name nor a file of a share that is gone can be called off.
@@ -37,17 +36,26 @@ pub(in super::super) fn ask(plant: &Path, task: &Task) -> Result<Told, Failure> 
         let asked = super::super::runtime().and_then(|runtime| {
             runtime.block_on(async {
                 let link = super::open(&config).await?;
-                Ok(Knowledge::ask(&link, config.artefacts.as_ref(), (&kind, simulation)).await?)
+                let of_this = (kind.as_str(), simulation);
+                let knowledge = Knowledge::ask(&link, config.artefacts.as_ref(), of_this).await?;
+                let alike = alike(&knowledge, config.machines_differ);
+                Ok::<_, Failure>((knowledge, alike))
             })
         });
         // The run may have begun without.
         let _ = to.send(asked.map_err(|error| error.to_string()));
     });
-    let knowledge = match answer.recv_timeout(PATIENCE) {
-        Ok(Ok(knowledge)) => knowledge,
+    let (knowledge, alike) = match answer.recv_timeout(PATIENCE) {
+        Ok(Ok(told)) => told,
         Ok(Err(error)) => return Ok(without(&error)),
         Err(_) => return Ok(without(&format!("nothing came within {} s", PATIENCE.as_secs()))),
     };
+    let words = knowledge.left_alone;
+    Ok(Told { learned: task.from_others(&knowledge.lessons, &alike), words })
+}
+
+/// How alike machines are, by what somebody stated and by the recipes that two of them know.
+fn alike(knowledge: &Knowledge, machines_differ: Option<f64>) -> Alike {
     let mut alike = Alike::default();
     if let Some(share) = machines_differ {
         alike.state(share);
@@ -55,8 +63,7 @@ pub(in super::super) fn ask(plant: &Path, task: &Task) -> Result<Told, Failure> 
     for ([one, other], is_own) in &knowledge.pairs {
         alike.compare([&one.known, &other.known], *is_own);
     }
-    let words = knowledge.left_alone;
-    Ok(Told { learned: task.from_others(&knowledge.lessons, &alike), words })
+    alike
 }
 
 fn without(why: &str) -> Told {

@@ -32,6 +32,9 @@ const RESPONSES_COUNT_FOR: f64 = 2.0;
 const MOST_OWN: f64 = 0.5;
 /// A mean of which others' word is more than this share tells nothing of its machine.
 const MOST_BORROWED: f64 = 0.5;
+/// What comes back in every pass is less than this anywhere, and a comparison takes fewer steps, in millimetres and numbers.
+const MOST_MEAN_MM: f64 = 1.0;
+const MOST_STEPS: f64 = 1e9;
 /// Bands are the same where they begin within this share of each other.
 const SAME: f64 = 1e-9;
 
@@ -45,8 +48,8 @@ pub struct Alike {
 struct Comparison {
     /// Whether the machine that is to begin is one of the two.
     is_own: bool,
-    /// Where each band begins, in millimetres, and the share of its power that is the machine's own.
-    shares: Vec<[f64; 2]>,
+    /// Where each band begins, in millimetres, and the share of its power that is the machine's own; none where it could not be compared.
+    shares: Vec<(f64, Option<f64>)>,
     /// The same of all of them together.
     whole: f64,
 }
@@ -74,7 +77,7 @@ impl Alike {
     /// Takes down what a person states: the rms share of what comes back in every pass that is a machine's own, in all wavelengths. It counts as one comparison.
     pub fn state(&mut self, rms_share: f64) {
         let share = rms_share * rms_share;
-        self.comparisons.push(Comparison { is_own: true, shares: vec![[0.0, share]], whole: share });
+        self.comparisons.push(Comparison { is_own: true, shares: vec![(0.0, Some(share))], whole: share });
     }
 
     /// Holds what two machines found of one recipe, whichever, against each other; `is_own` where one of them is the machine that is to begin.
@@ -87,11 +90,12 @@ impl Alike {
         let [ones, others] = [one, other].map(|known| told(known, &grid));
         let (mut shares, mut whole) = (Vec::new(), [0.0; 2]);
         for ((band, a), b) in one.bands.iter().zip(ones).zip(others) {
-            let Some([own_mm2, power_mm2]) = a.zip(b).and_then(|(a, b)| own_and_power(&a, &b)) else { continue };
-            shares.push([band.from_mm, (own_mm2 / power_mm2).min(1.0)]);
+            let compared = a.zip(b).and_then(|(a, b)| own_and_power(&a, &b));
+            shares.push((band.from_mm, compared.map(|[own_mm2, power_mm2]| (own_mm2 / power_mm2).min(1.0))));
+            let [own_mm2, power_mm2] = compared.unwrap_or_default();
             whole = [whole[0] + own_mm2, whole[1] + power_mm2];
         }
-        let is_compared = !shares.is_empty();
+        let is_compared = shares.iter().any(|(_, share)| share.is_some());
         if is_compared {
             self.comparisons.push(Comparison { is_own, shares, whole: (whole[0] / whole[1]).min(1.0) });
         }
@@ -120,12 +124,31 @@ impl Alike {
 impl Comparison {
     /// The share in the band that waves of this length are of: the longest band of a smaller part holds all that are longer.
     fn share(&self, from_mm: f64) -> Option<f64> {
-        let within = self.shares.iter().rev().find(|[from, _]| *from <= from_mm * (1.0 + SAME));
-        within.map(|[_, share]| share.max(self.whole))
+        let (_, share) = self.shares.iter().rev().find(|(from, _)| *from <= from_mm * (1.0 + SAME))?;
+        share.map(|share| share.max(self.whole))
     }
 }
 
 impl LearningState {
+    /// Returns why another machine cannot begin with this, and no two be compared by it, though every number is one; `None` where they can.
+    pub fn unfit_to_teach(&self) -> Option<String> {
+        if self.bands.iter().any(|band| band.belief.is_some_and(|belief| belief <= 0.0)) {
+            return Some("a mean is said to be known without any doubt".into());
+        }
+        let Mean { grid, values_mm } = self.mean.as_ref()?;
+        let most_mm = values_mm.iter().fold(0.0, |most: f64, v| most.max(v.abs()));
+        if most_mm > MOST_MEAN_MM {
+            return Some(format!(
+                "a mean of {most_mm:.3e} mm, more than the {MOST_MEAN_MM} mm that come back in any pass"
+            ));
+        }
+        let steps = grid.len() as f64 * (grid.columns + grid.rows) as f64 * self.bands.len() as f64;
+        let (columns, rows, bands) = (grid.columns, grid.rows, self.bands.len());
+        let why =
+            || format!("{columns} x {rows} nodes in {bands} bands, {steps:.0e} steps where {MOST_STEPS:.0e} are taken");
+        (steps > MOST_STEPS).then(why)
+    }
+
     /// Begins with what other machines found of the same recipe, as far as machines are alike, on the grid of the correction; `None` where they tell
     /// nothing of it. `self` is what is known without them.
     #[must_use]
@@ -154,8 +177,11 @@ impl LearningState {
             mean.values_mm.iter_mut().zip(values_mm).for_each(|(sum, value)| *sum += value);
         }
         if !differ.is_empty() {
-            known.response = response(&others, self.response);
-            known.whole = whole(&known.whole, &others, variance_mm2);
+            // Whoever has but others' word for it tells nothing of its own machine.
+            let own = |of: &&Vec<Option<Told>>| of.iter().any(Option::is_some);
+            let tell: Vec<&Self> = others.iter().zip(&all).filter(|(_, of)| own(of)).map(|(other, _)| *other).collect();
+            known.response = response(&tell, self.response);
+            known.whole = whole(&known.whole, &tell, variance_mm2);
             known.wanted_mm = Some(mean.values_mm.iter().map(|r| -r / known.response[0]).collect());
             known.mean = Some(mean);
         }
@@ -428,16 +454,50 @@ mod tests {
     }
 
     #[test]
+    fn what_would_cost_more_than_it_tells_is_not_taught() {
+        let honest = machine(GainRule::Wavelength, field(1).iter().map(|v| 1e-3 * v).collect(), [0.3, 1e-8]);
+        assert_eq!(honest.unfit_to_teach(), None);
+        assert_eq!(fresh(GainRule::Wavelength).unfit_to_teach(), None);
+        let mut certain = honest.clone();
+        certain.bands[0].belief = Some(0.0);
+        let mut huge = honest.clone();
+        huge.mean.as_mut().unwrap().values_mm[7] = 1e200;
+        let mut long = honest.clone();
+        let grid = Grid { columns: 1_500_000, rows: 1, first_mm: [0.0; 2], spacing_mm: [1e-9, 1.0] };
+        long.mean = Some(Mean { grid, values_mm: vec![0.0; grid.len()] });
+        for (state, why) in [(certain, "without any doubt"), (huge, "1.000e200 mm"), (long, "1500000 x 1 nodes")] {
+            assert!(state.is_sound() && state.unfit_to_teach().unwrap().contains(why), "{:?}", state.unfit_to_teach());
+        }
+    }
+
+    #[test]
+    fn a_response_that_was_told_is_not_told_again() {
+        let rule = GainRule::Fixed(1.0);
+        let values: Vec<f64> = field(3).iter().map(|v| 1e-3 * v).collect();
+        let mut own = machine(rule, values.clone(), [0.3, 1e-8]);
+        own.response = [0.9, 0.02];
+        let mut borrowed = own.clone();
+        borrowed.bands.iter_mut().for_each(|band| band.borrowed = 0.9);
+        let begun =
+            |others: &[&LearningState]| fresh(rule).begun_with(others, &stated(0.1), GRID).unwrap().known.response;
+        assert_eq!(begun(&[&own, &borrowed, &borrowed]), begun(&[&own]));
+    }
+
+    #[test]
     fn waves_that_nobody_compared_are_not_taken_over() {
-        let mut alike =
-            Alike { comparisons: vec![Comparison { is_own: false, shares: vec![[5.0, 0.02]], whole: 0.01 }] };
+        let compared = |is_own, share, whole| Comparison { is_own, shares: vec![(5.0, Some(share))], whole };
+        let mut alike = Alike { comparisons: vec![compared(false, 0.02, 0.01)] };
         assert_eq!(alike.own_share(2.5), None);
+        // The longest band holds all that are longer, but no band stands for one that could not be compared.
         assert_eq!(alike.own_share(20.0), Some(0.04));
+        let shares = vec![(5.0, Some(0.02)), (10.0, None)];
+        let short = Alike { comparisons: vec![Comparison { is_own: false, shares, whole: 0.01 }] };
+        assert_eq!([5.0, 10.0, 20.0].map(|from_mm| short.own_share(from_mm)), [Some(0.04), None, None]);
         // This machine differs by more than the others from each other.
-        alike.comparisons.push(Comparison { is_own: true, shares: vec![[5.0, 0.3]], whole: 0.1 });
+        alike.comparisons.push(compared(true, 0.3, 0.1));
         assert_eq!(alike.own_share(5.0), Some(0.6));
         // One that is unlike as a whole is so in every wave, whatever a few of them say.
-        alike.comparisons.push(Comparison { is_own: true, shares: vec![[5.0, 0.0]], whole: 0.4 });
+        alike.comparisons.push(compared(true, 0.0, 0.4));
         assert!((alike.own_share(5.0).unwrap() - 0.35 * 1.5).abs() < 1e-12);
     }
 }
