@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use clap::Args;
 use regrind::config::PlantConfig;
@@ -23,8 +23,9 @@ const ROUND: Duration = Duration::from_secs(1);
 const LINGERS: Duration = Duration::from_secs(3);
 /// How long a farewell may take.
 const FAREWELL: Duration = Duration::from_secs(5);
-/// Most refusals that are told one by one, of those that came together.
+/// Most refusals that are told one by one in a minute.
 const ONE_BY_ONE: usize = 8;
+const MINUTE: Duration = Duration::from_secs(60);
 
 /// Tell live values of this cell to a broker (Sparkplug B) and to who asks (OPC UA)
 #[derive(Args, Debug)]
@@ -200,8 +201,12 @@ fn tell_all(now: &Told, to: &watch::Sender<Told>) {
 /// Says what happened to those who tell, and has on record what was refused while a run was on.
 async fn hear(mut news: mpsc::Receiver<News>, runs: PathBuf, json: bool) {
     let mut some = Vec::new();
-    while news.recv_many(&mut some, 256).await > 0 {
-        let mut refused = 0;
+    let mut quota = Quota::new(Instant::now());
+    loop {
+        let heard = match quota.untold {
+            0 => Ok(news.recv_many(&mut some, 256).await),
+            _ => tokio::time::timeout(MINUTE, news.recv_many(&mut some, 256)).await,
+        };
         for news in some.drain(..) {
             match news {
                 News::Tells { place } => say(json, &json!({ "tells": place }), &format!("{place} is told from now on")),
@@ -210,18 +215,55 @@ async fn hear(mut news: mpsc::Receiver<News>, runs: PathBuf, json: bool) {
                     &json!({ "waits": place, "why": why }),
                     &format!("{place} is not told for now: {why}; the cell goes on, and it is tried again"),
                 ),
-                News::Refused { by, what } if refused < ONE_BY_ONE => {
-                    refused += 1;
-                    refuse(&runs, json, &by, &what).await;
-                }
-                News::Refused { .. } => refused += 1,
-                News::RefusedMore { times } => refused += times as usize,
+                News::Refused { by, what } if quota.takes(Instant::now()) => refuse(&runs, json, &by, &what).await,
+                News::Refused { .. } => quota.untold += 1,
+                News::RefusedMore { times } => quota.untold += u64::from(times),
             }
         }
-        if refused > ONE_BY_ONE {
-            let more = refused - ONE_BY_ONE;
+        let over = matches!(heard, Ok(0));
+        if let Some(more) = quota.summed_up(Instant::now(), over) {
             refuse(&runs, json, "the same or others", &format!("{more} more of what cannot be done from there")).await;
         }
+        if over {
+            return;
+        }
+    }
+}
+
+/// How many refusals are told in a minute: so many one by one, and once how many there were besides. Each is a line on the record of a run.
+struct Quota {
+    since: Instant,
+    told: usize,
+    has_summed_up: bool,
+    untold: u64,
+}
+
+impl Quota {
+    fn new(now: Instant) -> Self {
+        Self { since: now, told: 0, has_summed_up: false, untold: 0 }
+    }
+
+    fn turn(&mut self, now: Instant) {
+        if now.duration_since(self.since) >= MINUTE {
+            *self = Self { untold: self.untold, ..Self::new(now) };
+        }
+    }
+
+    /// Whether one more is told.
+    fn takes(&mut self, now: Instant) -> bool {
+        self.turn(now);
+        self.told += 1;
+        self.told <= ONE_BY_ONE
+    }
+
+    /// How many are to be told together now; `over` where nothing comes any more.
+    fn summed_up(&mut self, now: Instant, over: bool) -> Option<u64> {
+        self.turn(now);
+        let is_due = self.untold > 0 && (over || !self.has_summed_up);
+        is_due.then(|| {
+            self.has_summed_up = true;
+            std::mem::take(&mut self.untold)
+        })
     }
 }
 
@@ -267,5 +309,33 @@ impl Beside {
         outside::set_apart(&mut command);
         let telling = command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn().map_err(failed)?;
         Ok(Self { _telling: telling })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_flood_of_orders_is_a_few_lines_a_minute() {
+        let began = Instant::now();
+        let mut quota = Quota::new(began);
+        let (mut lines, mut counted) = (0, 0);
+        // A thousand a second for ten minutes, heard four times a second.
+        for quarter in 0..2400 {
+            let now = began + Duration::from_millis(250 * quarter);
+            for _ in 0..250 {
+                if quota.takes(now) {
+                    (lines, counted) = (lines + 1, counted + 1);
+                } else {
+                    quota.untold += 1;
+                }
+            }
+            if let Some(more) = quota.summed_up(now, quarter == 2399) {
+                (lines, counted) = (lines + 1, counted + more);
+            }
+        }
+        assert_eq!(counted, 600_000, "each is counted");
+        assert!(lines <= 10 * (ONE_BY_ONE + 1) + 1, "{lines}");
     }
 }

@@ -179,7 +179,10 @@ pub async fn content(
             // The place is made from the hash here too: what stands in a table leads nowhere else.
             let name = digits(sha256);
             let path = kept.folder.join(&name[..2]).join(&name);
-            match fs::read(&path) {
+            // A share that is gone may hang: whoever asks goes on with others meanwhile.
+            let at = path.clone();
+            let read = tokio::task::spawn_blocking(move || fs::read(at));
+            match read.await.unwrap_or_else(|error| Err(std::io::Error::other(error))) {
                 Ok(content) => Ok(Some(content)),
                 Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
                 Err(source) => Err(PlantError::Folder { path, source }),

@@ -68,14 +68,15 @@ pub(super) struct CellEvent {
     fields: Vec<(&'static str, Variant)>,
 }
 
-/// Returns what happened between two times that the cell was told.
-pub(super) fn happened(before: &Told, now: &Told, own: u16, cell: &str) -> Vec<CellEvent> {
+/// Returns what happened between two times that the cell was told. `on` is how it was told last that a run was on: one that was left and is
+/// gone on with tells nothing twice.
+pub(super) fn happened([before, on]: [&Told; 2], now: &Told, own: u16, cell: &str) -> Vec<CellEvent> {
     let from = |kind: &EventKind, severity, message: String, values: Vec<Variant>| {
         CellEvent::new((kind, own), cell, severity, &message, values)
     };
     let mut events = Vec::new();
     if let Now::On { run, snapshot } = &now.now {
-        let earlier = before.snapshot().filter(|_| before.run() == Some(run));
+        let earlier = on.snapshot().filter(|_| on.run() == Some(run));
         for row in new_rows(earlier, snapshot) {
             let [pv_um, rms_um] = row.judged_um();
             let message = format!("cycle {}: PV {pv_um:.2} um, RMS {rms_um:.3} um", row.cycle);
@@ -118,9 +119,9 @@ fn if_known(name: &str) -> Variant {
     if name.is_empty() { Variant::Empty } else { name.into() }
 }
 
-/// The cycles that were not known before: of a run that was not seen before, all.
+/// The cycles that were not known before, or came to something else: of a run that was not seen before, all.
 fn new_rows<'a>(earlier: Option<&'a Snapshot>, now: &'a Snapshot) -> impl Iterator<Item = &'a CycleRow> {
-    let known = move |row: &CycleRow| earlier.is_some_and(|then| then.cycles.iter().any(|old| old.cycle == row.cycle));
+    let known = move |row: &CycleRow| earlier.is_some_and(|then| then.cycles.contains(row));
     now.cycles.iter().filter(move |row| !known(row))
 }
 
@@ -197,6 +198,10 @@ mod tests {
     }
 
     fn cycles(before: &Told, now: &Told) -> Vec<Variant> {
+        cycles_since([before, before], now)
+    }
+
+    fn cycles_since(before: [&Told; 2], now: &Told) -> Vec<Variant> {
         let name = [QualifiedName::new(2, "Cycle")];
         let events = happened(before, now, 2, "cell-1");
         events.iter().map(|event| event.get_value(AttributeId::Value, &NumericRange::None, &name)).collect()
@@ -208,5 +213,12 @@ mod tests {
         assert!(cycles(&on("a", 3), &on("a", 3)).is_empty());
         assert_eq!(cycles(&on("a", 3), &on("b", 1)), [Variant::UInt32(1)]);
         assert_eq!(cycles(&Told::default(), &on("b", 1)), [Variant::UInt32(1)]);
+        let gone = Told { now: Now::Gone { run: "a".into() }, last: None };
+        assert!(cycles_since([&gone, &on("a", 2)], &on("a", 2)).is_empty(), "it was left, and is gone on with");
+        // A cycle that was measured again came to something else.
+        let mut again = on("a", 1);
+        let Now::On { snapshot, .. } = &mut again.now else { unreachable!() };
+        snapshot.cycles[0].pv_um = 2.5;
+        assert_eq!(cycles(&on("a", 1), &again), [Variant::UInt32(1)]);
     }
 }

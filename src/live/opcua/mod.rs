@@ -20,7 +20,7 @@ use self::nodes::{CellNodes, CellNodesBuilder, Namespaces};
 use crate::error::LiveError;
 use crate::news::Notes;
 use crate::settings::OpcUaSettings;
-use crate::told::Told;
+use crate::told::{Now, Told};
 use crate::turn::Turn;
 
 /// Between two tries to have the port.
@@ -143,14 +143,18 @@ impl UaServer {
 async fn show(told: &mut watch::Receiver<Told>, handle: &ServerHandle, shown: &InMemoryNodeManager<CellNodes>) {
     let Namespaces { own, .. } = shown.inner().namespaces;
     let mut before: Option<Told> = None;
+    let mut on = Told::default();
     loop {
         let now = told.borrow_and_update().clone();
         nodes::set(shown, handle.subscriptions(), before.as_ref(), &now);
         if let Some(before) = &before {
-            let events = happened(before, &now, own, shown.inner().cell());
+            let events = happened([before, &on], &now, own, shown.inner().cell());
             let emitters = [shown.inner().cell_node(), opcua_types::ObjectId::Server.into()];
             let all = events.iter().flat_map(|event| emitters.iter().map(move |from| (event as _, from)));
             handle.subscriptions().notify_events(all);
+        }
+        if matches!(now.now, Now::On { .. }) {
+            on.clone_from(&now);
         }
         before = Some(now);
         if told.changed().await.is_err() {

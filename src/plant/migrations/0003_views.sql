@@ -1,14 +1,24 @@
 -- What people ask: each view is read with the rights of who reads it, by a program of the shop or by Grafana.
 
+-- What a cell tells of itself is its own word: of what is not what it should be nothing is taken, and nobody else is the worse for it.
+CREATE FUNCTION told_number(told jsonb) RETURNS double precision LANGUAGE sql IMMUTABLE AS $$
+    SELECT CASE WHEN jsonb_typeof(told) = 'number' AND abs(told::numeric) < 1e300 THEN told::numeric::double precision END
+$$;
+CREATE FUNCTION told_whole(told jsonb) RETURNS integer LANGUAGE sql IMMUTABLE AS $$
+    SELECT CASE WHEN jsonb_typeof(told) = 'number' AND told::numeric BETWEEN 0 AND 2147483647 THEN told::numeric::integer END
+$$;
+CREATE FUNCTION told_truth(told jsonb) RETURNS boolean LANGUAGE sql IMMUTABLE AS $$
+    SELECT CASE WHEN jsonb_typeof(told) = 'boolean' THEN told::boolean END
+$$;
+
 -- Every cell at a glance. Times left are of the job under way, in seconds.
 CREATE VIEW cell_now WITH (security_invoker = true) AS
 SELECT c.name AS cell, s.at AS told_at, s.run, s.snapshot ->> 'state' AS state, s.snapshot ->> 'words' AS words,
-    (s.snapshot ->> 'simulation')::boolean AS simulation, s.snapshot ->> 'part' AS part_name, s.snapshot ->> 'serial' AS serial,
-    (s.snapshot ->> 'cycle')::integer AS cycle, (s.snapshot ->> 'max_cycles')::integer AS most_cycles,
-    (s.snapshot #>> '{progress,done}')::integer AS done, (s.snapshot #>> '{progress,total}')::integer AS total,
-    (s.snapshot #>> '{progress,left_s,0}')::double precision AS left_least_s,
-    (s.snapshot #>> '{progress,left_s,1}')::double precision AS left_most_s,
-    coalesce(jsonb_array_length(s.snapshot -> 'alarms'), 0) AS alarms, s.snapshot ->> 'next' AS next, s.snapshot
+    told_truth(s.snapshot -> 'simulation') AS simulation, s.snapshot ->> 'part' AS part_name, s.snapshot ->> 'serial' AS serial,
+    told_whole(s.snapshot -> 'cycle') AS cycle, told_whole(s.snapshot -> 'max_cycles') AS most_cycles,
+    told_whole(s.snapshot #> '{progress,done}') AS done, told_whole(s.snapshot #> '{progress,total}') AS total,
+    told_number(s.snapshot #> '{progress,left_s,0}') AS left_least_s, told_number(s.snapshot #> '{progress,left_s,1}') AS left_most_s,
+    CASE jsonb_typeof(s.snapshot -> 'alarms') WHEN 'array' THEN jsonb_array_length(s.snapshot -> 'alarms') ELSE 0 END AS alarms, s.snapshot ->> 'next' AS next, s.snapshot
 FROM cell c LEFT JOIN cell_state s ON s.cell = c.id WHERE c.retired_at IS NULL;
 
 -- Every run that made or tried a part.

@@ -151,6 +151,20 @@ fn grinding(serial: &str) -> Value {
 
 #[test]
 #[ignore = "needs PostgreSQL (Debian package postgresql)"]
+fn what_one_cell_tells_amiss_leaves_the_others_alone() {
+    let plant = Plant::new();
+    let [one, two] = ["cell-1", "cell-2"].map(|name| cell(&plant, name));
+    tell(&plant, one, "1 second", Some("run"), &grinding("SN-0042"));
+    let odd = serde_json::json!({ "state": "Execute", "words": "odd", "simulation": "perhaps", "cycle": 3_000_000_000_u64, "max_cycles": -1,
+        "progress": { "done": 1e300, "total": "many", "left_s": [true, {}] }, "alarms": {} });
+    tell(&plant, two, "1 second", Some("run"), &odd);
+    let said = words(&Shown::of(&plant).text("/"));
+    assert!(said.contains("cell-1 grinding SN-0042 Mirror, cycle 2 of at most 6 30 of 100, 2 – 4 min left"), "{said}");
+    assert!(said.contains("cell-2 odd run heard"), "{said}");
+}
+
+#[test]
+#[ignore = "needs PostgreSQL (Debian package postgresql)"]
 fn the_first_page_says_how_cells_are_and_counts_what_they_made() {
     let plant = Plant::new();
     let [one, two, three] = ["cell-1", "cell-2", "cell-3"].map(|name| cell(&plant, name));
