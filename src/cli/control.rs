@@ -246,7 +246,7 @@ pub(super) fn unfinished(runs: &Path) -> Option<PathBuf> {
 }
 
 /// Returns the run folder that was made last.
-pub(super) fn newest(runs: &Path) -> Option<PathBuf> {
+fn newest(runs: &Path) -> Option<PathBuf> {
     let made = |folder: &PathBuf| std::fs::metadata(folder).and_then(|m| m.modified()).ok();
     folders(runs).max_by_key(made)
 }

@@ -1,8 +1,7 @@
 //! `regrind ship`: the records of this cell go to the plant, beside whatever the cell does.
 
 use std::io::{self, Read};
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use clap::Args;
@@ -207,21 +206,4 @@ pub(super) fn end_of_input() -> tokio::sync::oneshot::Receiver<()> {
         drop(ended);
     });
     end
-}
-
-/// The shipping beside a run. It ends a little after the program that holds this.
-pub(super) struct Beside {
-    _shipping: Child,
-}
-
-impl Beside {
-    /// Begins to ship the runs in a folder. In a program of its own: it can neither slow the run down nor take it along.
-    pub(super) fn begin(runs: &Path, plant: &Path) -> Result<Self, Failure> {
-        let failed = Failure::Terminal;
-        let mut command = Command::new(std::env::current_exe().map_err(failed)?);
-        command.args(["ship", "--while-stdin", "--plant"]).arg(plant).arg("--runs").arg(runs);
-        outside::set_apart(&mut command);
-        let shipping = command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn().map_err(failed)?;
-        Ok(Self { _shipping: shipping })
-    }
 }

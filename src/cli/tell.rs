@@ -1,7 +1,6 @@
 //! `regrind tell`: how this cell is, for whoever speaks Sparkplug B or OPC UA, beside whatever the cell does.
 
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use clap::Args;
@@ -292,23 +291,6 @@ fn say(json: bool, fields: &serde_json::Value, words: &str) {
     if json {
         // A reader that has gone away is no fault.
         let _ = super::print(&format!("{fields}\n"));
-    }
-}
-
-/// Who tells live values beside a run. It ends a little after the program that holds this.
-pub(super) struct Beside {
-    _telling: Child,
-}
-
-impl Beside {
-    /// Begins to tell the runs in a folder. In a program of its own: it can neither slow the run down nor take it along.
-    pub(super) fn begin(runs: &Path, plant: &Path) -> Result<Self, Failure> {
-        let failed = Failure::Terminal;
-        let mut command = Command::new(std::env::current_exe().map_err(failed)?);
-        command.args(["tell", "--while-stdin", "--plant"]).arg(plant).arg("--runs").arg(runs);
-        outside::set_apart(&mut command);
-        let telling = command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn().map_err(failed)?;
-        Ok(Self { _telling: telling })
     }
 }
 

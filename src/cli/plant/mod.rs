@@ -10,6 +10,7 @@ mod serve;
 pub(super) mod studies;
 
 use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
 
 use clap::{Args, Subcommand};
 use regrind::config::PlantConfig;
@@ -112,10 +113,10 @@ pub(super) async fn open(config: &PlantConfig) -> Result<Link, Failure> {
     Ok(link)
 }
 
-/// What goes on beside a run for the plant. It ends a little after the program that holds this.
+/// What goes on beside a run for the plant: programs of their own, which can neither slow the run down nor take it along. They end a little
+/// after the program that holds this, by whose end their standard input ends.
 pub(super) struct Beside {
-    _shipping: Option<super::ship::Beside>,
-    _telling: Option<super::tell::Beside>,
+    _programs: Vec<Child>,
 }
 
 impl Beside {
@@ -124,9 +125,13 @@ impl Beside {
         // What is wrong with the file is said here, before anything opens.
         let config = read(plant)?;
         let tells = config.sparkplug.is_some() || config.opcua.is_some();
-        Ok(Self {
-            _shipping: config.database.is_some().then(|| super::ship::Beside::begin(runs, plant)).transpose()?,
-            _telling: tells.then(|| super::tell::Beside::begin(runs, plant)).transpose()?,
-        })
+        let wanted = [("ship", config.database.is_some()), ("tell", tells)];
+        let begun = wanted.into_iter().filter(|(_, is_wanted)| *is_wanted).map(|(name, _)| {
+            let mut command = Command::new(std::env::current_exe()?);
+            command.args([name, "--while-stdin", "--plant"]).arg(plant).arg("--runs").arg(runs);
+            super::outside::set_apart(&mut command);
+            command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn()
+        });
+        Ok(Self { _programs: begun.collect::<Result<_, _>>().map_err(Failure::Terminal)? })
     }
 }
