@@ -2,16 +2,17 @@
 //! for it.
 //!
 //! ```text
-//! cargo run --release --example shared [WORLDS [FIRST [DIFFER]]]
+//! cargo run --release --example shared [WORLDS [FIRST [PARTS [DIFFER]]]]
 //! ```
 //! WORLDS (200) worlds from number FIRST (1) are drawn for each way in which machines differ, in turn for each recipe that ships with a truth. Both machines know
-//! one other recipe, the next of the list. DIFFER is the beginning of a line's name, where not all are wanted.
+//! one other recipe, the next of the list. The first machine has made PARTS (2) of the recipe. DIFFER is the beginning of a line's name, where not all are
+//! wanted.
 
 #[path = "../tests/run/study.rs"]
 mod study;
 
 use rayon::prelude::*;
-use study::others::{Differ, Pair, Taught};
+use study::others::{Differ, Pair, TAUGHT_BY, Taught};
 use study::{After, Bench, RECIPES};
 
 /// The first pass is to come within this factor of the floor.
@@ -20,8 +21,9 @@ const MOST: f64 = 1.3;
 fn main() {
     let number = |k: usize, otherwise: u64| std::env::args().nth(k).map_or(otherwise, |n| n.parse().expect("a number"));
     let (worlds, first) = (number(1, 200), number(2, 1));
-    let wanted = std::env::args().nth(3).unwrap_or_default();
-    let benches: Vec<Bench> = RECIPES.iter().map(|name| Bench::new(name)).collect();
+    let parts = number(3, TAUGHT_BY.into()) as u32;
+    let wanted = std::env::args().nth(4).unwrap_or_default();
+    let benches: Vec<Bench> = RECIPES.iter().map(|name| Bench::new(name).commissioned()).collect();
     let by = |share, waviness_um| Differ::By { share, waviness_um };
     let ways = [
         ("1 %, 0.05 um", by(0.01, 0.05)),
@@ -34,12 +36,12 @@ fn main() {
         "rms of the true error after the first pass over that of what it added by itself; {worlds} worlds for each line\n"
     );
     println!(
-        "machines differ by    all  median    mean   95 %  <= 1.3 | without | bands differ | with over without, pass by pass"
+        "machines differ by    all  apart  median    mean   95 %  <= 1.3 | without | bands differ | with over without, pass by pass"
     );
     for (name, differ) in ways.into_iter().filter(|(name, _)| name.starts_with(&wanted)) {
         let world = |seed: u64| {
             let k = seed as usize % benches.len();
-            Pair { taught: &benches[k], in_common: &benches[(k + 1) % benches.len()] }.world(seed, differ, 3)
+            Pair { taught: &benches[k], in_common: &benches[(k + 1) % benches.len()] }.world(seed, differ, parts, 3)
         };
         let all: Vec<Taught> = (first..first + worlds).into_par_iter().map(world).collect();
         print_line(name, &all);
@@ -70,8 +72,9 @@ fn print_line(name: &str, all: &[Taught]) {
     let near = with.iter().filter(|ratio| **ratio <= MOST).count();
     let (bands, differ) = (mean(&sorted(&|of| of.bands as f64)), at(&sorted(&|of| of.differ), 0.5));
     print!(
-        "{name:18}{:>7.2}{:>8.2}{:>8.2}{:>7.2}{:>6.0} % |{:>8.2} |{bands:>6.1}{:>7.0} % |",
+        "{name:18}{:>7.2}{:>7.2}{:>8.2}{:>8.2}{:>7.2}{:>6.0} % |{:>8.2} |{bands:>6.1}{:>7.0} % |",
         together(all, |of| &of.with[0]),
+        apart(all),
         at(&with, 0.5),
         mean(&with),
         at(&with, 0.95),
@@ -92,4 +95,11 @@ fn print_line(name: &str, all: &[Taught]) {
 fn together(all: &[Taught], after: impl Fn(&Taught) -> &After) -> f64 {
     let sum = |of: fn(&After) -> f64| all.iter().map(|world| of(after(world)).powi(2)).sum::<f64>();
     (sum(|a| a.rms_um) / sum(|a| a.floor_um)).sqrt()
+}
+
+/// What the first pass would come to where everything were known of the first machine, and that is taken for the second.
+fn apart(all: &[Taught]) -> f64 {
+    let floor2: f64 = all.iter().map(|world| world.with[0].floor_um.powi(2)).sum();
+    let apart2: f64 = all.iter().map(|world| world.apart_um.powi(2)).sum();
+    (1.0 + apart2 / floor2).sqrt()
 }

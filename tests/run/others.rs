@@ -24,10 +24,15 @@ pub struct Taught {
     /// Truth after each pass.
     pub with: Vec<After>,
     pub without: Vec<After>,
+    /// RMS by which what comes back in every pass on the two machines differs: what nobody can know of the second by the first.
+    pub apart_um: f64,
     /// In how many bands of wavelengths something was taken over, and the largest rms share that machines were taken to differ by.
     pub bands: usize,
     pub differ: f64,
 }
+
+/// How many parts the first machine has made of the recipe.
+pub const TAUGHT_BY: u32 = 2;
 
 /// Two recipes that both machines know: the one that is taught, and the one by which the machines are compared.
 pub struct Pair<'a> {
@@ -36,9 +41,9 @@ pub struct Pair<'a> {
 }
 
 impl Pair<'_> {
-    /// Both machines grind a part of the recipe in common; the first one two of the other recipe; then the second its first of it, with and
+    /// Both machines grind a part of the recipe in common; the first one `parts` of the other recipe; then the second its first of it, with and
     /// without what the first taught. Each part has so many passes.
-    pub fn world(&self, seed: u64, differ: Differ, passes: u16) -> Taught {
+    pub fn world(&self, seed: u64, differ: Differ, parts: u32, passes: u16) -> Taught {
         let [first, second] = machines(seed, differ, &self.taught.spec.grinder);
         let [a, b] = [2 * seed + 1_000_000, 2 * seed + 1_000_001];
         let mut alike = Alike::default();
@@ -47,17 +52,29 @@ impl Pair<'_> {
             found.expect("passes").1
         });
         alike.compare([&of_common[0], &of_common[1]], true);
-        let found = self.taught.ground(&first, a, None, 2, passes).1;
+        let found = self.taught.ground(&first, a, None, parts, passes).1;
         let begun = self.taught.begun_with(found.expect("passes"), &alike);
         let told = begun.taught_by.as_ref().expect("others' word");
         let (bands, largest) = (told.differ.len(), told.differ.iter().map(|of| of[1]).fold(0.0, f64::max));
         let with = self.taught.ground(&second, b, Some((begun.correction, begun.known)), 1, passes).0;
         let without = self.taught.ground(&second, b, None, 1, passes).0;
-        Taught { with, without, bands, differ: largest }
+        let apart_um = self.taught.apart_um([(&first, a), (&second, b)]);
+        Taught { with, without, apart_um, bands, differ: largest }
     }
 }
 
 impl Bench {
+    /// The same where the part lies on the CMM where the cell's file says that the fixture holds it, but for what it is off by at each loading: a recipe
+    /// that holds motions believes the fixture, and where that is off by tenths of a millimetre no machine is to blame for the form that it costs.
+    pub fn commissioned(self) -> Self {
+        let mut spec = self.spec;
+        let fixture = self.task.fixture_cmm_from_model;
+        let (x, y, z) = nalgebra::Rotation3::from_matrix_unchecked(fixture.rotation).euler_angles();
+        (spec.cmm.translation_mm, spec.cmm.rotation_deg) =
+            (fixture.translation_mm.into(), [x, y, z].map(f64::to_degrees));
+        Self { spec, ..self }
+    }
+
     /// Makes parts on a grinder; returns the truth after the passes of the last one, and what was learned.
     fn ground(
         &self,
@@ -77,6 +94,15 @@ impl Bench {
             begun = line.learned();
         }
         (after, begun)
+    }
+
+    /// RMS of the difference of the first pass on two grinders of which neither adds anything by chance, in micrometres.
+    fn apart_um(&self, machines: [(&GrinderSpec, u64); 2]) -> f64 {
+        let [first, second] = machines.map(|(grinder, seed)| {
+            let grinder = GrinderSpec { scallops: false, repeatability_um: 0.0, ..grinder.clone() };
+            World::new(WorldSpec { seed, grinder, ..self.spec.clone() }).unwrap()
+        });
+        Line::new(self, Way::Regrind(GainRule::default()), &second, &first, None, 1).pass(1).repeatable_um
     }
 
     /// What a run begins with that another machine's run has taught.
