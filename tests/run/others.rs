@@ -24,7 +24,7 @@ pub struct Taught {
     /// Truth after each pass.
     pub with: Vec<After>,
     pub without: Vec<After>,
-    /// RMS by which what comes back in every pass on the two machines differs: what nobody can know of the second by the first.
+    /// RMS by which what comes back in every pass on the two machines differs.
     pub apart_um: f64,
     /// In how many bands of wavelengths something was taken over, and the largest rms share that machines were taken to differ by.
     pub bands: usize,
