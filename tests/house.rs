@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Every room, its folder or file, and the rooms that it may name. An arrow that stands here in no line is a turned arrow.
-const ARROWS: [(&str, &str, &[&str]); 23] = [
+const ARROWS: [(&str, &str, &[&str]); 24] = [
     ("geometry", "src/core/geometry", &[]),
     ("surface", "src/core/surface", &["geometry"]),
     ("measuring", "src/core/measuring", &["geometry", "surface"]),
@@ -24,8 +24,9 @@ const ARROWS: [(&str, &str, &[&str]); 23] = [
     ("recipe", "src/recipe", &["document", "cell", "measuring", "geometry", "surface", "registration", "compensation"]),
     ("device", "src/device", &["document", "formats", "geometry"]),
     ("config", "src/config", &["device", "document", "formats", "geometry", "model"]),
-    ("live", "src/live", &["cell", "control", "document", "formats"]),
-    ("plant", "src/plant", &["document", "formats", "journal", "page", "report"]),
+    ("trust", "src/trust", &["formats"]),
+    ("live", "src/live", &["cell", "control", "document", "formats", "trust"]),
+    ("plant", "src/plant", &["document", "formats", "journal", "page", "report", "trust"]),
     ("report", "src/report", &["cell", "journal", "formats", "geometry", "registration"]),
     ("page", "src/page", &["cell", "control", "document", "formats", "report"]),
     (

@@ -4,7 +4,8 @@ use std::io;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-use regrind_formats::{FormatError, OpenToOthers};
+use regrind_formats::FormatError;
+use regrind_trust::TrustError;
 use thiserror::Error;
 
 /// Why live values cannot be told as the plant file says.
@@ -12,16 +13,8 @@ use thiserror::Error;
 #[expect(missing_docs, reason = "the messages tell them")]
 #[non_exhaustive]
 pub enum LiveError {
-    #[error("{}: the password cannot be read: {source}; `password_file` of [sparkplug] names its file", .path.display())]
-    Password { path: PathBuf, source: io::Error },
-    #[error("{}: other users of this computer may read the password ({}); it is for its owner only: {}", .path.display(), .open.how, .open.remedy)]
-    PasswordIsOpen { path: PathBuf, open: OpenToOthers },
-    #[error("{}: no certificates in PEM can be read from it: {what}", .path.display())]
-    Certificates { path: PathBuf, what: String },
-    #[error(
-        "{broker} is another computer, and nothing says by which certificates it proves itself; name them by `certificates` of [sparkplug]"
-    )]
-    Unproven { broker: String },
+    #[error(transparent)]
+    Trust(#[from] TrustError),
     #[error("{of} {name:?} cannot be a part of a topic: it is empty, or has one of + / #; give it another name")]
     Topic { of: &'static str, name: String },
     #[error("{}: what outlives the program cannot be kept there: {source}; check that the folder is there, and yours to write", .path.display())]

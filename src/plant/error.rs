@@ -3,9 +3,10 @@
 use std::io;
 use std::path::PathBuf;
 
-use regrind_formats::{FormatError, OpenToOthers};
+use regrind_formats::FormatError;
 use regrind_journal::JournalError;
 use regrind_report::ReportError;
+use regrind_trust::TrustError;
 use thiserror::Error;
 
 /// Why the plant could not be reached, or said no.
@@ -13,16 +14,8 @@ use thiserror::Error;
 #[expect(missing_docs, reason = "the messages tell them")]
 #[non_exhaustive]
 pub enum PlantError {
-    #[error("{}: the password cannot be read: {source}; `regrind plant enrol` writes it for a cell", .path.display())]
-    Password { path: PathBuf, source: io::Error },
-    #[error("{}: other users of this computer may read the password ({}); it is for its owner only: {}", .path.display(), .open.how, .open.remedy)]
-    PasswordIsOpen { path: PathBuf, open: OpenToOthers },
-    #[error("{}: no certificates in PEM can be read from it: {what}", .path.display())]
-    Certificates { path: PathBuf, what: String },
-    #[error(
-        "{host} is another computer, and nothing says by which certificates it proves itself; name them by `certificates` of [database]"
-    )]
-    Unproven { host: String },
+    #[error(transparent)]
+    Trust(#[from] TrustError),
     /// It may be there again later.
     #[error("the database at {place} cannot be reached: {what}; check that it runs and that the network is up")]
     Unreachable { place: String, what: String },

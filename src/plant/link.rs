@@ -1,15 +1,7 @@
 //! The way to the database: who signs in, by what both ends prove themselves, and how long anything may take.
 
-use std::fs;
-use std::path::Path;
-use std::sync::Arc;
 use std::time::Duration;
 
-use regrind_formats::readable_by_others;
-use rustls::crypto::ring;
-use rustls::pki_types::CertificateDer;
-use rustls::pki_types::pem::PemObject;
-use rustls::{ClientConfig, RootCertStore};
 use serde_json::Value;
 use tokio_postgres::config::SslMode;
 use tokio_postgres::types::ToSql;
@@ -39,13 +31,15 @@ impl Link {
     /// A password or certificates that cannot be read, a database on another computer without certificates, one that cannot be reached.
     pub async fn open(settings: &DatabaseSettings) -> Result<Self, PlantError> {
         let place = format!("{}:{}/{}", settings.host, settings.port, settings.name);
-        let config = config(settings)?;
+        let proof = regrind_trust::proof(&settings.host, settings.certificates.as_deref(), "[database]")?;
+        let config = config(settings, proof.is_some())?;
         let unreached = |what: String| PlantError::Unreachable { place: place.clone(), what };
         let late = |_| unreached(format!("nothing came within {} s", PATIENCE.as_secs()));
-        let client = match &settings.certificates {
-            Some(path) => {
-                let tls = MakeRustlsConnect::new(tls(path)?);
-                let opened = tokio::time::timeout(PATIENCE, config.connect(tls)).await.map_err(late)?;
+        let client = match proof {
+            Some(proof) => {
+                let opened = tokio::time::timeout(PATIENCE, config.connect(MakeRustlsConnect::new(proof)))
+                    .await
+                    .map_err(late)?;
                 let (client, connection) = opened.map_err(|error| unopened(&place, &error))?;
                 tokio::spawn(connection);
                 client
@@ -113,16 +107,11 @@ fn unopened(place: &str, error: &tokio_postgres::Error) -> PlantError {
     }
 }
 
-fn config(settings: &DatabaseSettings) -> Result<Config, PlantError> {
-    let DatabaseSettings { host, port, name, user, password_file, certificates } = settings;
-    let is_here =
-        host.starts_with('/') || host == "localhost" || host.parse().is_ok_and(|ip: std::net::IpAddr| ip.is_loopback());
-    if certificates.is_none() && !is_here {
-        return Err(PlantError::Unproven { host: host.clone() });
-    }
+fn config(settings: &DatabaseSettings, is_proven: bool) -> Result<Config, PlantError> {
+    let DatabaseSettings { host, port, name, user, password_file, .. } = settings;
     let mut config = Config::new();
     config.host(host).port(*port).dbname(name).user(user).application_name("regrind");
-    config.ssl_mode(if certificates.is_some() { SslMode::Require } else { SslMode::Disable });
+    config.ssl_mode(if is_proven { SslMode::Require } else { SslMode::Disable });
     config
         .connect_timeout(PATIENCE)
         .tcp_user_timeout(SILENCE)
@@ -134,34 +123,7 @@ fn config(settings: &DatabaseSettings) -> Result<Config, PlantError> {
         ANSWER.as_millis()
     ));
     if let Some(path) = password_file {
-        config.password(password(path)?);
+        config.password(regrind_trust::password(path)?);
     }
     Ok(config)
-}
-
-/// Reads a password that nobody else may read; the end of its line is none of it.
-fn password(path: &Path) -> Result<String, PlantError> {
-    let unread = |source| PlantError::Password { path: path.to_owned(), source };
-    if let Some(open) = readable_by_others(path).map_err(unread)? {
-        return Err(PlantError::PasswordIsOpen { path: path.to_owned(), open });
-    }
-    let text = fs::read_to_string(path).map_err(unread)?;
-    Ok(text.trim_end_matches(['\r', '\n']).to_owned())
-}
-
-fn tls(path: &Path) -> Result<ClientConfig, PlantError> {
-    let unread = |what: String| PlantError::Certificates { path: path.to_owned(), what };
-    let mut roots = RootCertStore::empty();
-    let all = CertificateDer::pem_file_iter(path).map_err(|error| unread(error.to_string()))?;
-    for certificate in all {
-        let certificate = certificate.map_err(|error| unread(error.to_string()))?;
-        roots.add(certificate).map_err(|error| unread(error.to_string()))?;
-    }
-    if roots.is_empty() {
-        return Err(unread("there is none in it".into()));
-    }
-    let config = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
-        .with_safe_default_protocol_versions()
-        .map_err(|error| unread(error.to_string()))?;
-    Ok(config.with_root_certificates(roots).with_no_client_auth())
 }

@@ -1,0 +1,131 @@
+//! By what a cell and the servers of its plant prove themselves to each other.
+//!
+//! A server on another computer proves itself by certificates, whoever signs in to it by a password that nobody else may read.
+
+use std::fs;
+use std::io;
+use std::net::IpAddr;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use regrind_formats::{OpenToOthers, readable_by_others};
+use rustls::crypto::ring;
+use rustls::pki_types::CertificateDer;
+use rustls::pki_types::pem::PemObject;
+use rustls::{ClientConfig, RootCertStore};
+use thiserror::Error;
+
+/// What is wrong with what one proves oneself by.
+#[derive(Debug, Error)]
+#[expect(missing_docs, reason = "the messages tell them")]
+pub enum TrustError {
+    #[error("{}: the password cannot be read: {source}; `password_file` names its file", .path.display())]
+    Password { path: PathBuf, source: io::Error },
+    #[error("{}: other users of this computer may read the password ({}); it is for its owner only: {}", .path.display(), .open.how, .open.remedy)]
+    PasswordIsOpen { path: PathBuf, open: OpenToOthers },
+    #[error("{}: no certificates in PEM can be read from it: {what}", .path.display())]
+    Certificates { path: PathBuf, what: String },
+    #[error(
+        "{host} is another computer, and nothing says by which certificates it proves itself; name them by `certificates` of {table}"
+    )]
+    Unproven { host: String, table: &'static str },
+}
+
+/// Says how a server proves itself: by those who sign its certificate; one on this computer need not.
+///
+/// `host` is a name, an address or the folder of a socket, `table` the one of the file that names it, for messages.
+///
+/// # Errors
+/// Certificates that cannot be read, and a server on another computer without any.
+pub fn proof(host: &str, certificates: Option<&Path>, table: &'static str) -> Result<Option<ClientConfig>, TrustError> {
+    let is_here = host.starts_with('/') || host == "localhost" || host.parse().is_ok_and(|ip: IpAddr| ip.is_loopback());
+    match certificates {
+        Some(path) => {
+            certified(path).map(Some).map_err(|what| TrustError::Certificates { path: path.to_owned(), what })
+        }
+        None if is_here => Ok(None),
+        None => Err(TrustError::Unproven { host: host.to_owned(), table }),
+    }
+}
+
+/// Reads a password that nobody else may read; the end of its line is none of it.
+///
+/// # Errors
+/// A file that cannot be read, or that others may read.
+pub fn password(path: &Path) -> Result<String, TrustError> {
+    let unread = |source| TrustError::Password { path: path.to_owned(), source };
+    if let Some(open) = readable_by_others(path).map_err(unread)? {
+        return Err(TrustError::PasswordIsOpen { path: path.to_owned(), open });
+    }
+    let text = fs::read_to_string(path).map_err(unread)?;
+    Ok(text.trim_end_matches(['\r', '\n']).to_owned())
+}
+
+fn certified(path: &Path) -> Result<ClientConfig, String> {
+    let mut signers = RootCertStore::empty();
+    for certificate in CertificateDer::pem_file_iter(path).map_err(|error| error.to_string())? {
+        signers.add(certificate.map_err(|error| error.to_string())?).map_err(|error| error.to_string())?;
+    }
+    if signers.is_empty() {
+        return Err("there is none in it".into());
+    }
+    let config = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
+        .with_safe_default_protocol_versions()
+        .map_err(|error| error.to_string())?;
+    Ok(config.with_root_certificates(signers).with_no_client_auth())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_server_here_need_not_prove_itself_and_any_other_must() {
+        for here in ["localhost", "127.0.0.1", "127.8.0.1", "::1", "/run/postgresql"] {
+            assert!(proof(here, None, "[database]").unwrap().is_none(), "{here}");
+        }
+        for other in ["plant", "localhost.example", "10.0.0.1", "::2", "0.0.0.0", ""] {
+            let refused = proof(other, None, "[database]").unwrap_err().to_string();
+            assert!(refused.starts_with(other) && refused.contains("`certificates` of [database]"), "{refused}");
+        }
+    }
+
+    #[test]
+    fn a_file_without_certificates_proves_nothing_and_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("ca.pem");
+        let missing = proof("plant", Some(&path), "[database]").unwrap_err().to_string();
+        assert!(missing.starts_with(&path.display().to_string()), "{missing}");
+        for text in ["", "no PEM", "-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n"] {
+            fs::write(&path, text).unwrap();
+            // One that is named is read, even where none were needed.
+            for host in ["plant", "localhost"] {
+                let refused = proof(host, Some(&path), "[database]").unwrap_err().to_string();
+                assert!(refused.contains("ca.pem: no certificates in PEM"), "{text:?}: {refused}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_password_is_its_line_and_nobody_elses() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("cell.password");
+        assert!(matches!(password(&path), Err(TrustError::Password { .. })));
+        for (text, read) in [("a b \r\n", "a b "), ("a\n\n", "a"), ("", ""), (" \u{e9}", " \u{e9}")] {
+            regrind_formats::write_private(&path, text.as_bytes()).unwrap();
+            assert_eq!(password(&path).unwrap(), read);
+        }
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_password_that_others_may_read_is_refused_with_the_remedy() {
+        use std::os::unix::fs::PermissionsExt;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("cell.password");
+        fs::write(&path, "secret").unwrap();
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o644)).unwrap();
+        let refused = password(&path).unwrap_err().to_string();
+        assert!(refused.contains("chmod") && !refused.contains("secret"), "{refused}");
+    }
+}
