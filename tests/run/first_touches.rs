@@ -117,8 +117,9 @@ fn file_cell(home: &Path) {
 fn measure_once(running: &mut Running, home: &Path, world: &World) {
     let outbox = home.join("exchange/cmm/out");
     let handed_over = running.until("a plan in the outbox", |_| {
-        let entries = fs::read_dir(&outbox).unwrap().map(|entry| entry.unwrap().path());
-        entries.into_iter().find(|folder| folder.join("handover.json").is_file())
+        let names = fs::read_dir(&outbox).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        // It gets its name when it is whole.
+        names.filter(|name| !name.starts_with('.')).map(|name| outbox.join(name)).next()
     });
     let told: Value = serde_json::from_slice(&fs::read(handed_over.join("plan.json")).unwrap()).unwrap();
     let rows = fs::read_to_string(handed_over.join("plan.csv")).unwrap();
