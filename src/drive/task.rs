@@ -409,6 +409,14 @@ impl Task {
         Ok((register(&self.nominal, points, &options)?, options))
     }
 
+    /// Standard uncertainties of where the fixture holds the part, where it holds it at all; 0 where nobody states them.
+    pub fn held(&self) -> Option<[f64; 6]> {
+        let [shift_mm, turn_rad] = self.datum.unwrap_or_default();
+        let of = |k: usize| if k < 3 { shift_mm } else { turn_rad };
+        let locked = self.registration.locked;
+        locked.contains(&true).then(|| std::array::from_fn(|k| if locked[k] { of(k) } else { 0.0 }))
+    }
+
     /// What is asked of the separation of parameters, for a pass that was told these.
     pub fn parameter_options(&self, told: Option<&Set>) -> ParameterOptions {
         ParameterOptions {

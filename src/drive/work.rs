@@ -266,6 +266,8 @@ fn registered(
         priors: priors(task, cycle, before),
         radius_sigma_mm: points.radius_sigma_mm,
         scale_sigma,
+        datum: task.held(),
+        is_corrected: !cycle.correction.is_none(),
         probe_scatter_mm: points.probe_scatter_mm,
         area: maps::area(task),
         ..Given::default()

@@ -221,7 +221,8 @@ pub struct RegistrationSettings {
     #[schemars(length(max = 6))]
     pub hold: Vec<Coordinate>,
     /// The expanded uncertainty (k = 2) of where the fixture holds the part along what is held; of its turns as much at the edge of the
-    /// part. Without it nothing is told of setting and tilt, which look like a part that is held elsewhere.
+    /// part. What a part held elsewhere would look like is in the ± of its figures. Without it the fixture is taken for exact, and nothing
+    /// is told of setting and tilt, which look the same.
     #[schemars(range(min = 0.0, max = 10000.0), example = 0.5)]
     pub hold_uncertainty_um: Option<Um>,
     /// Where to begin: anywhere, or where the cell's fixture holds the part.

@@ -123,7 +123,7 @@ fn budget(model: &Value) -> String {
         "<h2>What the uncertainty comes from</h2>\n<table id=\"budget\">\n<tr><th>standard uncertainty by</th>\
          <th class=\"n\">of the RMS, \u{b5}m</th><th class=\"n\">of the PV 99.8 %, \u{b5}m</th></tr>\n{}\
          <tr><th>all together</th><td class=\"n\">{}</td><td class=\"n\">{}</td></tr>\n</table>\n\
-         <p>The squares add up. What is not stated by the cell file is taken for 0.</p>\n",
+         <p>The squares add up. What neither the cell file nor the recipe states is taken for 0.</p>\n",
         rows.collect::<String>(),
         whole("rms_mm"),
         whole("pv_99_8_mm")
@@ -141,6 +141,7 @@ fn source_words(name: &str) -> &str {
         "squareness" => "squareness of the machine",
         "probe" => "probe by direction",
         "temperature" => "temperature and expansion",
+        "datum" => "where the fixture holds the part",
         other => other,
     }
 }

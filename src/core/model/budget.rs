@@ -26,6 +26,8 @@ pub(super) struct Drawn<'a> {
     pub(super) forms: &'a DMatrix<f64>,
     pub(super) places: &'a [[f64; 2]],
     pub(super) effects: &'a DMatrix<f64>,
+    /// What each of the stated effects has had ground into the part there, after its own best fit; nothing before the first correction.
+    pub(super) ground_in: Option<DMatrix<f64>>,
 }
 
 /// Parts the standard uncertainties of root mean square and peak to valley; nothing where they cannot be.
@@ -38,9 +40,12 @@ pub(super) fn parted(
     let everywhere: Vec<[f64; 2]> = observed.places.iter().chain(drawn.places).copied().collect();
     let Ok(lattice) = Lattice::over(&everywhere, &hyper.field) else { return Vec::new() };
     let Ok(model) = Sparse::fit(&lattice, observed, *hyper) else { return Vec::new() };
-    let slopes = slopes(drawn);
+    let (slopes, ground_in) = slopes(drawn);
     let of = |figure: usize| {
-        let parts = model.parted(observed, hyper, (drawn.places, slopes[figure].as_slice()))?;
+        let mut parts = model.parted(observed, hyper, (drawn.places, slopes[figure].as_slice()))?;
+        if drawn.ground_in.is_some() {
+            parts.stated.clone_from(&ground_in[figure]);
+        }
         let whole = parts.scatter + parts.form + parts.pose + parts.stated.iter().sum::<f64>();
         let share = |source: Source| match source {
             Source::Scatter => parts.scatter,
@@ -60,24 +65,35 @@ pub(super) fn parted(
     Source::ALL.iter().enumerate().map(one).collect()
 }
 
-/// By how much root mean square and peak to valley rise with each place, on the average of the forms; what a motion does to them is nothing.
-fn slopes(drawn: &Drawn) -> [DVector<f64>; 2] {
+/// By how much root mean square and peak to valley rise with each place, on the average of the forms, and by the mean of the squares with what
+/// was ground in, column by column; what a motion does to them is nothing.
+///
+/// What was ground in makes a form whether it adds to the others or not: its slope is as often up as down, and its square is not 0.
+fn slopes(drawn: &Drawn) -> ([DVector<f64>; 2], [Vec<f64>; 2]) {
     let (n, count) = drawn.forms.shape();
     let mut slopes = [DVector::zeros(n), DVector::zeros(n)];
+    let none = DMatrix::zeros(n, 0);
+    let columns = drawn.ground_in.as_ref().unwrap_or(&none);
+    let mut ground_in = [0, 1].map(|_| vec![0.0; columns.ncols()]);
     let mut order: Vec<usize> = (0..n).collect();
     let left_out = n / 1000;
     for form in drawn.forms.column_iter() {
         let rms = form.norm() / (n as f64).sqrt();
-        slopes[0].axpy(1.0 / (n as f64 * rms * count as f64).max(f64::MIN_POSITIVE), &form, 1.0);
+        let of_rms = 1.0 / (n as f64 * rms).max(f64::MIN_POSITIVE);
+        slopes[0].axpy(of_rms / count as f64, &form, 1.0);
         let nth =
             |order: &mut [usize], k: usize| *order.select_nth_unstable_by(k, |a, b| form[*a].total_cmp(&form[*b])).1;
         let [lowest, highest] = [left_out, n - 1 - left_out].map(|k| nth(&mut order, k));
         slopes[1][highest] += 1.0 / count as f64;
         slopes[1][lowest] -= 1.0 / count as f64;
+        for (k, column) in columns.column_iter().enumerate() {
+            let of = [of_rms * form.dot(&column), column[highest] - column[lowest]];
+            ground_in.iter_mut().zip(of).for_each(|(sum, of)| sum[k] += of * of / count as f64);
+        }
     }
     if drawn.effects.ncols() > 0 {
         let base = drawn.effects.clone().qr().q();
         slopes.iter_mut().for_each(|slope| *slope -= &base * base.tr_mul(slope));
     }
-    slopes
+    (slopes, ground_in)
 }

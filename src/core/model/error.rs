@@ -24,7 +24,7 @@ pub enum ModelError {
     #[error("the grid is that of a field with another smoothness or another lay")]
     OtherGrid,
     #[error(
-        "the standard uncertainty of the {what} is {value} (mm, rad or a share); it must be 0 at least and what a measuring machine can have: correct what is stated of the machine"
+        "the standard uncertainty of the {what} is {value} (mm, rad or a share); it must be 0 at least and what a machine or a fixture can have: correct what is stated of it"
     )]
     Stated { what: &'static str, value: f64 },
     #[error(

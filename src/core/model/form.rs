@@ -115,9 +115,10 @@ impl Form {
     pub fn of(registration: &Registration, given: &Given) -> Result<Self, ModelError> {
         let seen = Seen::of(registration, given, true)?;
         let drawn = Drawn::of(&seen.observed, &seen.told.likely)?;
-        let slope = seen.slope(given, &drawn);
-        let drawn = drawn.with_the_scatter(&seen.observed, &seen.told, given).after_best_fit();
-        Ok(Self { slope, ..seen.form(given, &drawn) })
+        let ground_in = seen.ground_in.as_ref().map(|ground_in| ground_in.select_rows(&drawn.chosen));
+        let slope = seen.slope(given, drawn.clone().without(ground_in.as_ref()));
+        let drawn = drawn.with_the_scatter(&seen.observed, &seen.told, given).without(ground_in.as_ref());
+        Ok(Self { slope, ..seen.form(given, &drawn.after_best_fit(), ground_in) })
     }
 
     /// Tells the parameters of the form by the points alone, whatever is expected of it beforehand: what a part teaches of those that
@@ -143,9 +144,11 @@ impl Form {
         let places: Vec<_> = thinned(places.len()).map(|k| places[k]).collect();
         let effects = seen.motions.rows(places.iter().copied());
         let drawn = Drawn::over(&seen.observed, &seen.told.likely, places.iter().map(plane).collect(), effects)?;
-        let slope = seen.slope(given, &drawn);
+        let ground_in = seen.ground_in.is_some().then(|| seen.stated.columns(places.iter().copied()));
+        let drawn = drawn.without(ground_in.as_ref());
+        let slope = seen.slope(given, drawn.clone());
         let drawn = drawn.with_what_is_narrow(&seen.told, given).after_best_fit();
-        Ok(Self { slope, ..seen.form(given, &drawn) })
+        Ok(Self { slope, ..seen.form(given, &drawn, ground_in) })
     }
 }
 
@@ -153,8 +156,10 @@ impl Form {
 struct Seen {
     motions: Motions,
     observed: Observed,
-    /// Of each of the stated effects.
-    sources: Vec<Source>,
+    /// What is stated of all points together.
+    stated: Effects,
+    /// What of that has been ground into the part, at the points: nothing before the first correction.
+    ground_in: Option<DMatrix<f64>>,
     told: Told,
     is_seen: bool,
 }
@@ -168,8 +173,10 @@ impl Seen {
         }
         let motions = Motions::of(registration, used.iter().map(|d| d.point));
         let stated = motions.stated(registration, given)?;
-        let observed =
-            Observed { stated: stated.columns(used.iter().map(|d| (d.point, d.normal))), ..motions.observed(&used) };
+        let columns = stated.columns(used.iter().map(|d| (d.point, d.normal)));
+        let (shown, ground_in) =
+            if given.is_corrected { (DMatrix::zeros(used.len(), 0), Some(columns)) } else { (columns, None) };
+        let observed = Observed { stated: shown, ..motions.observed(&used) };
         let path = if at_points && is_path(&observed.places) { path } else { Vec::new() };
         let observed = Observed { path, ..observed };
         let priors = given.priors.unwrap_or_else(|| Priors::of_size(motions.size_mm));
@@ -182,30 +189,35 @@ impl Seen {
             told.likely.extend(on_a_grid.copied());
             told.likely.iter_mut().for_each(|(_, weight)| *weight = 1.0);
         }
-        Ok(Self { motions, observed, sources: stated.sources(), told, is_seen })
+        Ok(Self { motions, observed, stated, ground_in, told, is_seen })
     }
 
     /// The slopes of what is drawn, before anything is added that has none.
-    fn slope(&self, given: &Given, drawn: &Drawn) -> Option<SlopeFigures> {
+    fn slope(&self, given: &Given, drawn: Drawn) -> Option<SlopeFigures> {
         let slopes = SlopesAt::over(&drawn.places, given.area.integration_mm)?;
-        let smooth = drawn.clone().after_best_fit();
+        let smooth = drawn.after_best_fit();
         Some(SlopeFigures::of(&slopes, &smooth.forms, (self.is_seen, given)))
     }
 
-    /// The form by what is drawn, without its slopes.
-    fn form(&self, given: &Given, drawn: &Drawn) -> Form {
-        let covariance = of_the_fit(&self.observed, &self.told.wide, &self.observed.stated);
+    /// The form by what is drawn, without its slopes; `ground_in` is what of it each of the stated effects may have made there.
+    fn form(&self, given: &Given, drawn: &Drawn, ground_in: Option<DMatrix<f64>>) -> Form {
+        let alike = self.ground_in.as_ref().unwrap_or(&self.observed.stated);
+        let covariance = of_the_fit(&self.observed, &self.told.wide, alike);
         let figures = drawn.figures(self.is_seen, given);
         let hyper = self.told.likely[0].0;
         let on_a_grid = if ON_A_GRID.contains(&hyper.field.smoothness) { hyper } else { self.told.plain };
-        let of_drawn = budget::Drawn { forms: &drawn.forms, places: &drawn.places, effects: &drawn.effects };
+        let ground_in = ground_in.map(|columns| best_fitted(columns, &drawn.effects));
+        let of_drawn = budget::Drawn { forms: &drawn.forms, places: &drawn.places, effects: &drawn.effects, ground_in };
         let uncertainties_mm = [figures.rms, figures.pv_most_points].map(|of| of.standard_mm());
+        let mut budget =
+            budget::parted((&self.observed, &self.stated.sources()), &on_a_grid, &of_drawn, uncertainties_mm);
+        budget.retain(|share| share.source != Source::Datum || given.datum.is_some());
         Form {
             hyper,
             frame_covariance: self.motions.to_twist(&covariance),
             points: drawn.points(),
             figures,
-            budget: budget::parted((&self.observed, &self.sources), &on_a_grid, &of_drawn, uncertainties_mm),
+            budget,
             iso: IsoFits::over(&drawn.places, given.area.middle_mm)
                 .map(|fits| IsoFigures::of(&fits, &drawn.forms, self.is_seen, given)),
             slope: None,
@@ -249,6 +261,13 @@ pub struct Given {
     pub radius_sigma_mm: f64,
     /// Standard uncertainty of all lengths, as a share of them: that of temperature and expansion.
     pub scale_sigma: f64,
+    /// Standard uncertainties of where the part was held, where the registration was not free to move it: along x, y and z of the model in
+    /// millimetres, and of its turns about them through the middle of the points in radians. 0 in what is taken for known, or was found.
+    /// Nothing where the registration held nothing.
+    pub datum: Option<[f64; 6]>,
+    /// Whether the part was corrected by what the same machine found of it where it is held: then all that is stated is ground into it, and the
+    /// points show it no more.
+    pub is_corrected: bool,
     /// How far the probe itself scatters, and to what share of that it is known: what points scatter by more is form, too narrow to be told
     /// otherwise. 0 where nothing tells; all of the scatter is the probe's then.
     pub probe_scatter_mm: [f64; 2],
@@ -267,6 +286,8 @@ impl Default for Given {
             machine: Machine::default(),
             radius_sigma_mm: 0.0,
             scale_sigma: 0.0,
+            datum: None,
+            is_corrected: false,
             probe_scatter_mm: [0.0; 2],
             look_risk: 0.005,
             probability: 0.975,
@@ -395,6 +416,21 @@ impl Drawn {
             let mut normals = Normals::new(4, c as u64);
             let [_, narrow_mm] = parted(told, given, &mut normals);
             form.iter_mut().for_each(|value| *value += narrow_mm * normals.next());
+        }
+        self
+    }
+
+    /// Takes off what was ground in: each column as often as a normal number says.
+    ///
+    /// A part that was corrected by what a machine found of it has the machine's errors as its form, d = (f - E t) + E t + e, and the points
+    /// show neither: t is as little known as before anything was measured.
+    fn without(mut self, ground_in: Option<&DMatrix<f64>>) -> Self {
+        let Some(columns) = ground_in.filter(|columns| columns.ncols() > 0) else { return self };
+        for (c, mut form) in self.forms.column_iter_mut().enumerate() {
+            let mut normals = Normals::new(5, c as u64);
+            for column in columns.column_iter() {
+                form.axpy(-normals.next(), &column, 1.0);
+            }
         }
         self
     }
@@ -556,11 +592,12 @@ impl Motions {
     /// What is stated of all points together, about their middle.
     pub(super) fn stated(&self, registration: &Registration, given: &Given) -> Result<Effects, ModelError> {
         let of_others = [given.radius_sigma_mm, given.scale_sigma];
-        if let Some((what, value)) = unsound(&given.machine, of_others) {
+        let datum = given.datum.unwrap_or_default();
+        if let Some((what, value)) = unsound(&given.machine, of_others, &datum) {
             return Err(ModelError::Stated { what, value });
         }
         let model_from_machine = registration.cmm_from_model.rotation.transpose();
-        Ok(Effects::new(given.machine, of_others, self.centre, model_from_machine))
+        Ok(Effects::new(given.machine, of_others, self.centre, model_from_machine).held(datum))
     }
 
     /// What a unit of each motion adds to the distance of each point from the surface.

@@ -1,4 +1,4 @@
-//! What a measuring machine does to all points together, and no point can show: its scales, its angles, its probe.
+//! What adds to all points together, and no point can show: the machine's scales, its angles, its probe, and where a fixture holds the part.
 //!
 //! Each is an effect on the deviations whose size nobody knows but whose standard uncertainty somebody states: a column of E, scaled so that its
 //! factor has the variance 1. The covariance of what was measured is K + s^2 R + E E', and the form is the field alone. So an error of the machine is
@@ -43,11 +43,13 @@ pub enum Source {
     Probe,
     /// Temperature and expansion.
     Temperature,
+    /// Where the part was held, in directions that the registration was not free to move it in.
+    Datum,
 }
 
 impl Source {
     /// All of them, as they are told.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 9] = [
         Self::Scatter,
         Self::Form,
         Self::Pose,
@@ -56,6 +58,7 @@ impl Source {
         Self::Squareness,
         Self::Probe,
         Self::Temperature,
+        Self::Datum,
     ];
 }
 
@@ -65,6 +68,7 @@ pub(super) struct Effects {
     machine: Machine,
     radius_mm: f64,
     temperature: f64,
+    datum: [f64; 6],
     centre: Point,
     model_from_machine: Matrix3<f64>,
 }
@@ -78,7 +82,12 @@ impl Effects {
         model_from_machine: Matrix3<f64>,
     ) -> Self {
         let radius_mm = radius_mm.hypot(machine.reference_sphere_mm);
-        Self { machine, radius_mm, temperature, centre, model_from_machine }
+        Self { machine, radius_mm, temperature, datum: [0.0; 6], centre, model_from_machine }
+    }
+
+    /// Beside them those of where the part was held: along the axes of the model, and of the turns about them through the middle.
+    pub(super) fn held(self, datum: [f64; 6]) -> Self {
+        Self { datum, ..self }
     }
 
     /// Which columns there are.
@@ -103,7 +112,13 @@ impl Effects {
         let probe = (0..5).map(|k| (Source::Probe, Effect::Direction(k, probe_mm)));
         let alike =
             [(Source::Radius, Effect::Radius(self.radius_mm)), (Source::Temperature, Effect::Size(self.temperature))];
-        alike.into_iter().chain(scales).chain(angles).chain(probe).filter(|(_, effect)| effect.size() > 0.0).collect()
+        let axis = |k: usize| self.model_from_machine.row(k % 3).transpose();
+        let held = self.datum.into_iter().enumerate().map(|(k, size)| {
+            let effect = if k < 3 { Effect::Shift(axis(k), size) } else { Effect::Turn(axis(k), size) };
+            (Source::Datum, effect)
+        });
+        let machine = scales.chain(angles).chain(probe);
+        alike.into_iter().chain(machine).chain(held).filter(|(_, effect)| effect.size() > 0.0).collect()
     }
 }
 
@@ -119,12 +134,21 @@ enum Effect {
     /// One of the five spherical harmonics of degree 2 of the normal. Those of degree 1 are shifts of the part. Scaled so that the sum of their
     /// squares is 1 in every direction.
     Direction(usize, f64),
+    /// The whole part along an axis.
+    Shift(Vector, f64),
+    /// The whole part about an axis through the middle.
+    Turn(Vector, f64),
 }
 
 impl Effect {
     fn size(&self) -> f64 {
         match *self {
-            Self::Radius(size) | Self::Size(size) | Self::Stretch(_, size) | Self::Direction(_, size) => size,
+            Self::Radius(size)
+            | Self::Size(size)
+            | Self::Stretch(_, size)
+            | Self::Direction(_, size)
+            | Self::Shift(_, size)
+            | Self::Turn(_, size) => size,
         }
     }
 
@@ -140,14 +164,20 @@ impl Effect {
             Self::Direction(2, _) => root * n.x * n.z,
             Self::Direction(3, _) => 0.5 * (3.0 * n.z * n.z - 1.0),
             Self::Direction(..) => 0.5 * root * (n.x * n.x - n.y * n.y),
+            Self::Shift(along, _) => along.dot(&n),
+            Self::Turn(about, _) => about.cross(&arm).dot(&n),
         };
         self.size() * of_unit
     }
 }
 
 /// Says what no standard uncertainty can be: what is negative, none, or beyond all sense.
-pub(super) fn unsound(machine: &Machine, [radius_mm, temperature]: [f64; 2]) -> Option<(&'static str, f64)> {
-    // More than a tenth of all lengths, than six degrees, than a centimetre, is no measuring machine.
+pub(super) fn unsound(
+    machine: &Machine,
+    [radius_mm, temperature]: [f64; 2],
+    datum: &[f64; 6],
+) -> Option<(&'static str, f64)> {
+    // More than a tenth of all lengths, than six degrees, than a centimetre, is no measuring machine, and more than a turn no fixture.
     let shares = machine.scale.map(|of| ("scale", of, 0.1)).into_iter();
     let angles = machine.squareness_rad.map(|of| ("squareness", of, 0.1)).into_iter();
     let others = [
@@ -156,7 +186,13 @@ pub(super) fn unsound(machine: &Machine, [radius_mm, temperature]: [f64; 2]) -> 
         ("radius of the probe", radius_mm, 10.0),
         ("temperature", temperature, 0.1),
     ];
-    shares.chain(angles).chain(others).find(|(_, of, most)| !(0.0..=*most).contains(of)).map(|(what, of, _)| (what, of))
+    let held = datum.map(|of| ("place where the part is held", of, 10.0)).into_iter();
+    shares
+        .chain(angles)
+        .chain(others)
+        .chain(held)
+        .find(|(_, of, most)| !(0.0..=*most).contains(of))
+        .map(|(what, of, _)| (what, of))
 }
 
 #[cfg(test)]
@@ -218,6 +254,19 @@ mod tests {
         let of = Effects::new(machine, [0.0; 2], Point::origin(), turned);
         let on = |normal| of.columns(std::iter::once((Point::new(10.0, 20.0, 0.0), normal)))[0];
         assert!((on(Vector::y()) - 2e-5).abs() < 1e-18 && on(Vector::x()).abs() < 1e-18);
+    }
+
+    #[test]
+    fn a_part_that_is_held_elsewhere_shows_as_its_motion_along_the_axes_of_the_model() {
+        // The machine's x axis is the model's y, its y axis the model's -x.
+        let turned = Matrix3::new(0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0);
+        let centre = Point::new(1.0, 2.0, 3.0);
+        let of = Effects::new(Machine::default(), [0.0; 2], centre, turned).held([2e-3, 0.0, 0.0, 0.0, 3e-5, 4e-5]);
+        let row = of.columns(std::iter::once((Point::new(11.0, 22.0, 33.0), Vector::new(0.6, 0.0, 0.8))));
+        // e_y x (10, 20, 30) = (30, 0, -10), e_z x (10, 20, 30) = (-20, 10, 0).
+        let by_hand = [2e-3 * 0.6, 3e-5 * (30.0 * 0.6 - 10.0 * 0.8), 4e-5 * (-20.0 * 0.6)];
+        assert_eq!(of.sources(), [Source::Datum; 3]);
+        assert!(row.iter().zip(by_hand).all(|(found, hand)| (found - hand).abs() < 1e-15), "{row}");
     }
 
     #[test]

@@ -8,7 +8,7 @@ use crate::common::{RADIUS_MM, centres, free_form, normal, placed, points, pose}
 use regrind_core::form::{IsoFits, IsoOfForm, SlopesAt};
 use regrind_core::geometry::Pose;
 use regrind_core::model::{AngleInterval, Form, Given, Interval, Machine, Share, Source};
-use regrind_core::registration::{Options, PointStatus, Registration, Start, register};
+use regrind_core::registration::{Coordinate, Options, PointStatus, Registration, Start, register};
 use regrind_sim::form::FormError;
 use regrind_sim::probe::Placement;
 use regrind_sim::shape::FreeForm;
@@ -189,6 +189,114 @@ fn what_a_machine_does_to_all_points_is_allowed_for_where_it_is_stated() {
     assert!(with >= MACHINES as u32 - 1 && with > without && wider > 1.5, "{with} {without} {wider}");
 }
 
+/// A part that a fixture holds beside its place in x, y and about z, by some standard uncertainties, registered as if it did not.
+fn held_elsewhere(seed: u64, datum: [f64; 6]) -> (FormError, Registration) {
+    let mut rng = StdRng::seed_from_u64(seed);
+    let form = FormError::with_rms(&mut regrind_sim::rng(seed), 30.0, 2e-3);
+    let mut all = centres(&FreeForm::default(), &form, [[-48.0, -28.0], [48.0, 28.0]], [26, 16]);
+    let [x_mm, y_mm, .., turn_rad] = datum.map(|of| of * normal(&mut rng));
+    for centre in &mut all {
+        let [x, y, _] = *centre;
+        let by_mm = [x_mm - turn_rad * y, y_mm + turn_rad * x, 0.0];
+        centre.iter_mut().zip(by_mm).for_each(|(v, by)| *v += by + SCATTER_MM * normal(&mut rng));
+    }
+    let locked = Coordinate::locked(&[Coordinate::X, Coordinate::Y, Coordinate::Rz]);
+    let options = Options { start: Start::Pose(Pose::identity()), locked, ..Options::new(RADIUS_MM) };
+    (form, register(&free_form(409, 249), &points(&all), &options).unwrap())
+}
+
+#[test]
+fn where_a_fixture_holds_a_part_is_in_what_is_said_of_it() {
+    const HELD: u64 = 12;
+    let datum = [5e-3, 5e-3, 0.0, 0.0, 0.0, 1e-4];
+    let given = Given { datum: Some(datum), ..Given::default() };
+    let (mut with, mut without, mut wider) = ([0; 2], [0; 2], 0.0);
+    for seed in 0..HELD {
+        let (form, found) = held_elsewhere(seed, datum);
+        // The form beside the motions that the fixture leaves.
+        let rows = &found.deviations;
+        let form = DVector::from_iterator(rows.len(), rows.iter().map(|d| form.height(d.point.x, d.point.y)));
+        let motions = DMatrix::from_fn(rows.len(), 3, |r, c| {
+            let arm = rows[r].point.coords.cross(&rows[r].normal) / 30.0;
+            [rows[r].normal.z, arm.x, arm.y][c]
+        });
+        let base = motions.qr().q();
+        let truth = figures((&form - &base * base.tr_mul(&form)).as_slice());
+        let [sure, blind] = [given, Given { datum: Some([0.0; 6]), ..given }].map(|of| Form::of(&found, &of).unwrap());
+        for (held, told) in [(&mut with, &sure), (&mut without, &blind)] {
+            held[0] += u32::from(holds(told.figures.rms, truth[0]));
+            held[1] += u32::from(holds(told.figures.pv, truth[1]));
+        }
+        let width = |form: &Form| form.figures.rms.high_mm - form.figures.rms.low_mm;
+        wider += width(&sure) / width(&blind) / HELD as f64;
+        let share = |form: &Form| *form.budget.iter().find(|s| s.source == Source::Datum).unwrap();
+        assert!(share(&sure).is_stated && share(&sure).rms_mm > 0.0);
+        assert!(!share(&blind).is_stated && share(&blind).rms_mm == 0.0);
+    }
+    println!(
+        "of {HELD} RMS and PV held in {with:?} where it is stated, in {without:?} where it is not; {wider:.1} times as wide"
+    );
+    assert!(
+        with.iter().all(|held| held + 2 >= HELD as u32) && without[0] < with[0] && wider > 1.5,
+        "{with:?} {without:?} {wider}"
+    );
+}
+
+/// A part that was corrected by a machine with errors until it looks good on it, as this measures it, and as it is.
+fn ground_by(seed: u64, machine: &Machine, datum: [f64; 6]) -> (Registration, Registration) {
+    let mut rng = StdRng::seed_from_u64(seed);
+    let seen = FormError::with_rms(&mut regrind_sim::rng(seed), 30.0, 1e-3);
+    let looks = centres(&FreeForm::default(), &seen, [[-48.0, -28.0], [48.0, 28.0]], [26, 16]);
+    let scale = machine.scale.map(|of| of * normal(&mut rng));
+    let [x_mm, y_mm, .., turn_rad] = datum.map(|of| of * normal(&mut rng));
+    let is = looks.iter().map(|&[x, y, z]| {
+        let [x, y, z] = [x * (1.0 - scale[0]), y * (1.0 - scale[1]), z * (1.0 - scale[2])];
+        [x - x_mm + turn_rad * y, y - y_mm - turn_rad * x, z]
+    });
+    let is: Vec<[f64; 3]> = is.collect();
+    let looks: Vec<[f64; 3]> = looks.iter().map(|of| of.map(|v| v + SCATTER_MM * normal(&mut rng))).collect();
+    let held = if datum == [0.0; 6] {
+        [false; 6]
+    } else {
+        Coordinate::locked(&[Coordinate::X, Coordinate::Y, Coordinate::Rz])
+    };
+    let options = Options { start: Start::Pose(Pose::identity()), locked: held, ..Options::new(RADIUS_MM) };
+    let [looks, is] = [looks, is].map(|all| register(&free_form(409, 249), &points(&all), &options).unwrap());
+    (looks, is)
+}
+
+#[test]
+fn what_a_machine_has_had_ground_into_a_part_is_in_what_is_said_of_it() {
+    const GROUND: u64 = 12;
+    let scaled = Machine { scale: [5e-5; 3], ..Machine::default() };
+    for (machine, datum) in [(scaled, [0.0; 6]), (Machine::default(), [5e-3, 5e-3, 0.0, 0.0, 0.0, 1e-4])] {
+        let (mut with, mut without) = ([0; 2], [0; 2]);
+        for seed in 0..GROUND {
+            let (looks, is) = ground_by(seed, &machine, datum);
+            let truth = figures(&is.deviations.iter().map(|d| d.deviation_mm).collect::<Vec<_>>());
+            let first = Given { machine, datum: Some(datum), ..Given::default() };
+            let [sure, blind] = [Given { is_corrected: true, ..first }, first].map(|of| Form::of(&looks, &of).unwrap());
+            for (held, told) in [(&mut with, &sure), (&mut without, &blind)] {
+                held[0] += u32::from(holds(told.figures.rms, truth[0]));
+                held[1] += u32::from(holds(told.figures.pv, truth[1]));
+            }
+            let squares = |of: fn(&Share) -> f64| sure.budget.iter().map(|s| of(s).powi(2)).sum::<f64>().sqrt();
+            assert!((squares(|s| s.rms_mm) / sure.figures.rms.standard_mm() - 1.0).abs() < 1e-9);
+        }
+        println!(
+            "of {GROUND} RMS and PV held in {with:?} of the corrected part, in {without:?} as if it were the first look"
+        );
+        assert!(with.iter().all(|held| held + 3 >= GROUND as u32) && without[0] < with[0], "{with:?} {without:?}");
+    }
+}
+
+#[test]
+fn who_held_nothing_is_told_of_no_fixture() {
+    let part = part(3, 5e-3);
+    assert!(part.model.budget.iter().all(|share| share.source != Source::Datum));
+    assert_eq!(part.model.budget.len(), Source::ALL.len() - 1);
+}
+
 #[test]
 fn what_no_uncertainty_can_be_is_refused_in_words() {
     let part = part(3, 5e-3);
@@ -200,6 +308,9 @@ fn what_no_uncertainty_can_be_is_refused_in_words() {
             let error = Form::of(&part.found, &Given { machine, ..Given::default() }).unwrap_err().to_string();
             assert!(error.contains("standard uncertainty") && error.contains(&wrong.to_string()), "{error}");
         }
+        let given = Given { datum: Some([0.0, wrong, 0.0, 0.0, 0.0, 0.0]), ..Given::default() };
+        let error = Form::of(&part.found, &given).unwrap_err().to_string();
+        assert!(error.contains("place where the part is held") && error.contains(&wrong.to_string()), "{error}");
     }
 }
 
