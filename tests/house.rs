@@ -259,10 +259,21 @@ fn the_crates_depend_on_nothing_above_them() {
             "src/page/Cargo.toml",
             &["regrind-cell", "regrind-control", "regrind-document", "regrind-formats", "regrind-report"],
         ),
-        ("src/live/Cargo.toml", &["regrind-cell", "regrind-control", "regrind-document", "regrind-formats"]),
+        ("src/trust/Cargo.toml", &["regrind-formats"]),
+        (
+            "src/live/Cargo.toml",
+            &["regrind-cell", "regrind-control", "regrind-document", "regrind-formats", "regrind-trust"],
+        ),
         (
             "src/plant/Cargo.toml",
-            &["regrind-document", "regrind-formats", "regrind-journal", "regrind-page", "regrind-report"],
+            &[
+                "regrind-document",
+                "regrind-formats",
+                "regrind-journal",
+                "regrind-page",
+                "regrind-report",
+                "regrind-trust",
+            ],
         ),
         ("src/report/Cargo.toml", &["regrind-cell", "regrind-core", "regrind-formats", "regrind-journal"]),
         ("sim/Cargo.toml", &[]),
