@@ -2,8 +2,8 @@
 //!
 //! A server on another computer proves itself by certificates, whoever signs in to it by a password that nobody else may read.
 
-use std::fs;
-use std::io;
+use std::fs::File;
+use std::io::{self, Read};
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -15,11 +15,16 @@ use rustls::pki_types::pem::PemObject;
 use rustls::{ClientConfig, RootCertStore};
 use thiserror::Error;
 
+/// The longest file of a password.
+const MOST_BYTES: u64 = 4096;
+
 /// What is wrong with what one proves oneself by.
 #[derive(Debug, Error)]
 #[expect(missing_docs, reason = "the messages tell them")]
 pub enum TrustError {
-    #[error("{}: the password cannot be read: {source}; `password_file` names its file", .path.display())]
+    #[error(
+        "{}: the password cannot be read: {source}; `password_file` names its file, and that of a database `regrind plant enrol` writes", .path.display()
+    )]
     Password { path: PathBuf, source: io::Error },
     #[error("{}: other users of this computer may read the password ({}); it is for its owner only: {}", .path.display(), .open.how, .open.remedy)]
     PasswordIsOpen { path: PathBuf, open: OpenToOthers },
@@ -51,13 +56,18 @@ pub fn proof(host: &str, certificates: Option<&Path>, table: &'static str) -> Re
 /// Reads a password that nobody else may read; the end of its line is none of it.
 ///
 /// # Errors
-/// A file that cannot be read, or that others may read.
+/// A file that cannot be read, is longer than a password, or that others may read.
 pub fn password(path: &Path) -> Result<String, TrustError> {
     let unread = |source| TrustError::Password { path: path.to_owned(), source };
     if let Some(open) = readable_by_others(path).map_err(unread)? {
         return Err(TrustError::PasswordIsOpen { path: path.to_owned(), open });
     }
-    let text = fs::read_to_string(path).map_err(unread)?;
+    let mut text = String::new();
+    File::open(path).and_then(|file| file.take(MOST_BYTES + 1).read_to_string(&mut text)).map_err(unread)?;
+    if text.len() as u64 > MOST_BYTES {
+        let why = format!("it is longer than {MOST_BYTES} bytes, which no password is");
+        return Err(unread(io::Error::new(io::ErrorKind::InvalidData, why)));
+    }
     Ok(text.trim_end_matches(['\r', '\n']).to_owned())
 }
 
@@ -77,6 +87,8 @@ fn certified(path: &Path) -> Result<ClientConfig, String> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     #[test]
@@ -115,6 +127,21 @@ mod tests {
             regrind_formats::write_private(&path, text.as_bytes()).unwrap();
             assert_eq!(password(&path).unwrap(), read);
         }
+    }
+
+    #[test]
+    fn no_more_is_read_than_a_password_can_be() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("cell.password");
+        for (bytes, is_read) in [(4095, true), (4096, true), (4097, false), (1 << 20, false)] {
+            regrind_formats::write_private(&path, &vec![b'x'; bytes]).unwrap();
+            match password(&path) {
+                Ok(read) => assert!(is_read && read.len() == bytes),
+                Err(error) => assert!(!is_read && error.to_string().contains("longer than 4096 bytes"), "{error}"),
+            }
+        }
+        regrind_formats::write_private(&path, b"\xff\xfe").unwrap();
+        assert!(password(&path).unwrap_err().to_string().contains("UTF-8"));
     }
 
     #[cfg(unix)]
