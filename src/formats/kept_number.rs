@@ -47,6 +47,13 @@ impl KeptNumber {
     }
 }
 
+impl Drop for KeptNumber {
+    fn drop(&mut self) {
+        // Closing would not do: a child that another thread has just forked shares the lock until its exec.
+        let _ = self.file.unlock();
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -59,6 +66,8 @@ mod tests {
         assert_eq!(number.get().unwrap(), None);
         number.set(255).unwrap();
         number.set(7).unwrap();
+        // What a child has between its fork and its exec.
+        let _of_a_child = number.file.try_clone().unwrap();
         assert!(KeptNumber::take(&path).unwrap().is_none());
         drop(number);
         assert_eq!(KeptNumber::take(&path).unwrap().unwrap().get().unwrap(), Some(7));

@@ -24,6 +24,7 @@ mod artefact;
 mod canonical;
 mod copy;
 mod error;
+mod held;
 mod key;
 mod machine;
 mod open;

@@ -8,13 +8,14 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use super::error::JournalError;
+use super::held::HeldFile;
 use super::{sha256_hex, system};
 
 /// A machine that no other run on this computer can take while this lives.
 #[derive(Debug)]
 pub struct MachineLock {
     /// Held, not read.
-    _file: File,
+    _file: HeldFile,
     /// Where the holder and the epoch stand.
     told: PathBuf,
     holder: String,
@@ -48,15 +49,15 @@ impl MachineLock {
         let path = folder.join(format!("{}.lock", &sha256_hex(address.as_bytes())[..16]));
         let file = opened(folder, &path)?;
         let told = system::beside_lock(&path);
-        match file.try_lock() {
-            Ok(()) => {}
+        let file = match HeldFile::take(file) {
+            Ok(file) => file,
             Err(TryLockError::WouldBlock) => {
                 let holder = fs::read_to_string(&told).unwrap_or_default();
                 let holder = holder.lines().next().unwrap_or_default().trim().to_owned();
                 return Err(JournalError::MachineTaken { address: address.to_owned(), holder });
             }
             Err(TryLockError::Error(error)) => return Err(JournalError::file(&path, "locking it")(error)),
-        }
+        };
         let kept = fs::read_to_string(&told).unwrap_or_default();
         let last_epoch = kept.lines().find_map(|line| line.strip_prefix(EPOCH)?.trim().parse().ok()).unwrap_or(0);
         let holder = format!("{}, process {}", run.display(), std::process::id());

@@ -1,7 +1,7 @@
 //! The one writer of a journal.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File, OpenOptions, TryLockError};
+use std::fs::{self, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
 
 use rusqlite::{Connection, OptionalExtension};
@@ -10,6 +10,7 @@ use serde_json::{Value, json};
 use super::artefact::{self, Artefact};
 use super::canonical::canonical_json;
 use super::error::JournalError;
+use super::held::HeldFile;
 use super::key::AuditKey;
 use super::record::{Entry, Kind, Record, Records, signed, whole};
 use super::seal::{SEALED_EVERY, Seal};
@@ -41,7 +42,7 @@ pub struct Journal {
     connection: Connection,
     folder: PathBuf,
     /// Held, not read.
-    _lock: File,
+    _lock: HeldFile,
     boot_id: String,
     run: String,
     part: String,
@@ -450,7 +451,7 @@ impl Journal {
 /// The lock of a run: while it lives no other process can go on with it.
 #[derive(Debug)]
 pub struct RunLock {
-    file: File,
+    file: HeldFile,
     folder: PathBuf,
 }
 
@@ -468,15 +469,14 @@ impl RunLock {
     }
 }
 
-fn lock(folder: &Path) -> Result<File, JournalError> {
+fn lock(folder: &Path) -> Result<HeldFile, JournalError> {
     let path = folder.join(LOCK);
     let failed = JournalError::file(&path, "creating it");
     let file = OpenOptions::new().write(true).create(true).truncate(false).open(&path).map_err(&failed)?;
-    match file.try_lock() {
-        Ok(()) => Ok(file),
-        Err(TryLockError::WouldBlock) => Err(JournalError::Busy { path: folder.to_owned() }),
-        Err(TryLockError::Error(error)) => Err(JournalError::file(&path, "locking it")(error)),
-    }
+    HeldFile::take(file).map_err(|error| match error {
+        TryLockError::WouldBlock => JournalError::Busy { path: folder.to_owned() },
+        TryLockError::Error(error) => JournalError::file(&path, "locking it")(error),
+    })
 }
 
 fn boot_id() -> String {
