@@ -94,6 +94,26 @@ impl Dense {
         observed.deviations_mm.iter().zip(&self.weights).map(|(d, w)| d * w).sum()
     }
 
+    /// Of how many independent numbers the observed points tell something by the field: the trace of what takes the observed to the field.
+    ///
+    /// With W as in [`Dense::scatters`] that is n - p - s^2 tr(R W).
+    pub(super) fn waves_seen(&self) -> f64 {
+        let (n, p) = (self.places.len(), self.found.len());
+        let inverse = self.factor.inverse();
+        let known = Mat::from_fn(p, p, |r, c| self.covariance[(r, c)]);
+        let by_effects = &self.effects * known;
+        let effects_of = |r: usize, c: usize| (0..p).map(|k| by_effects[(r, k)] * self.effects[(c, k)]).sum::<f64>();
+        let weight = |r: usize, c: usize| inverse[(r, c)] - effects_of(r, c);
+        let trace: f64 = match self.path.is_empty() {
+            true => (0..n).map(|k| weight(k, k)).sum(),
+            false => {
+                let row = |r: usize| (0..n).map(|c| shared(&self.hyper, &self.path, r, c) * weight(r, c)).sum::<f64>();
+                (0..n).map(row).sum()
+            }
+        };
+        ((n - p) as f64 - self.hyper.scatter_mm.powi(2) * trace).max(0.0)
+    }
+
     /// Returns the effects and their covariance, those that are stated behind the others: with the motions of the part as effects, where its nominal frame is, and how well
     /// that is known beside a field that nobody knows either.
     pub fn effects(&self) -> (&DVector<f64>, &DMatrix<f64>) {

@@ -114,7 +114,7 @@ impl Form {
     /// Too few points, and points that leave nothing to tell the form by.
     pub fn of(registration: &Registration, given: &Given) -> Result<Self, ModelError> {
         let seen = Seen::of(registration, given, true)?;
-        let drawn = Drawn::of(&seen.observed, &seen.told.likely)?;
+        let drawn = Drawn::of(&seen.observed, &seen.told.mixture)?;
         let ground_in = seen.ground_in.as_ref().map(|ground_in| ground_in.select_rows(&drawn.chosen));
         let slope = seen.slope(given, drawn.clone().without(ground_in.as_ref()));
         let drawn = drawn.with_the_scatter(&seen.observed, &seen.told, given).without(ground_in.as_ref());
@@ -128,7 +128,7 @@ impl Form {
     /// Those of [`Form::of`].
     pub fn alone(registration: &Registration, given: &Given, in_order: bool) -> Result<Option<Hyper>, ModelError> {
         let seen = Seen::of(registration, &Given { priors: None, ..*given }, in_order)?;
-        Ok(seen.is_seen.then(|| seen.told.likely[0].0))
+        Ok(seen.is_seen.then_some(seen.told.best))
     }
 
     /// Tells the form at places of the part that need not have been touched: points of the nominal surface with their normals, in the model
@@ -143,7 +143,7 @@ impl Form {
         let seen = Seen::of(registration, given, false)?;
         let places: Vec<_> = thinned(places.len()).map(|k| places[k]).collect();
         let effects = seen.motions.rows(places.iter().copied());
-        let drawn = Drawn::over(&seen.observed, &seen.told.likely, places.iter().map(plane).collect(), effects)?;
+        let drawn = Drawn::over(&seen.observed, &seen.told.mixture, places.iter().map(plane).collect(), effects)?;
         let ground_in = seen.ground_in.is_some().then(|| seen.stated.columns(places.iter().copied()));
         let drawn = drawn.without(ground_in.as_ref());
         let slope = seen.slope(given, drawn.clone());
@@ -181,14 +181,8 @@ impl Seen {
         let observed = Observed { path, ..observed };
         let priors = given.priors.unwrap_or_else(|| Priors::of_size(motions.size_mm));
         let is_dense = at_points && observed.places.len() <= MOST_DENSE;
-        let mut told = Hyper::told(&observed, &priors, if is_dense { &ANY } else { &ON_A_GRID })?;
+        let told = Hyper::told(&observed, &priors, if is_dense { &ANY } else { &ON_A_GRID })?;
         let is_seen = told.plain.evidence(&observed) > EVIDENCE;
-        if !is_seen {
-            // What is spoken for by next to nothing is as good as what is spoken for by a little more.
-            let on_a_grid = told.wide.iter().filter(|(wide, _)| ON_A_GRID.contains(&wide.field.smoothness));
-            told.likely.extend(on_a_grid.copied());
-            told.likely.iter_mut().for_each(|(_, weight)| *weight = 1.0);
-        }
         Ok(Self { motions, observed, stated, ground_in, told, is_seen })
     }
 
@@ -204,7 +198,7 @@ impl Seen {
         let alike = self.ground_in.as_ref().unwrap_or(&self.observed.stated);
         let covariance = of_the_fit(&self.observed, &self.told.wide, alike);
         let figures = drawn.figures(self.is_seen, given);
-        let hyper = self.told.likely[0].0;
+        let hyper = self.told.best;
         let on_a_grid = if ON_A_GRID.contains(&hyper.field.smoothness) { hyper } else { self.told.plain };
         let ground_in = ground_in.map(|columns| best_fitted(columns, &drawn.effects));
         let of_drawn = budget::Drawn { forms: &drawn.forms, places: &drawn.places, effects: &drawn.effects, ground_in };
@@ -481,7 +475,7 @@ impl Drawn {
 /// The scatter of the probe and what of the scatter is too narrow a form, each as it may be. Where nothing tells how
 /// far the probe scatters it is the scatter that was found.
 fn parted(told: &Told, given: &Given, normals: &mut Normals) -> [f64; 2] {
-    let ([probe_mm, probe_u], scatter_mm) = (given.probe_scatter_mm, told.likely[0].0.scatter_mm);
+    let ([probe_mm, probe_u], scatter_mm) = (given.probe_scatter_mm, told.best.scatter_mm);
     if probe_mm <= 0.0 {
         return [scatter_mm, 0.0];
     }
