@@ -96,7 +96,7 @@ impl Dense {
 
     /// Of how many independent numbers the observed points tell something by the field: the trace of what takes the observed to the field.
     ///
-    /// With W as in [`Dense::scatters`] that is n - p - s^2 tr(R W).
+    /// With W as in [`Dense::scatters`] that is n - p - s^2 tr(R W), where nothing is stated.
     pub(super) fn waves_seen(&self) -> f64 {
         let (n, p) = (self.places.len(), self.found.len());
         let inverse = self.factor.inverse();
@@ -111,7 +111,7 @@ impl Dense {
                 (0..n).map(row).sum()
             }
         };
-        ((n - p) as f64 - self.hyper.scatter_mm.powi(2) * trace).max(0.0)
+        (n as f64 - p as f64 - self.hyper.scatter_mm.powi(2) * trace).max(0.0)
     }
 
     /// Returns the effects and their covariance, those that are stated behind the others: with the motions of the part as effects, where its nominal frame is, and how well

@@ -8,7 +8,7 @@
 use nalgebra::DMatrix;
 use rayon::prelude::*;
 
-use super::hill::{around, climb, some_for_all};
+use super::hill::{Hill, climb, some_for_all};
 use super::profile::{Profile, best_scale};
 use super::{Dense, Field, Hyper, Lay, ModelError, Observed, Smoothness, spacing_mm};
 
@@ -56,7 +56,8 @@ const DOUBT: f64 = 2.0;
 /// How finely a drift is told, and the most that is.
 const DRIFT_STEPS: [f64; 3] = [0.12, 0.06, 0.03];
 const MOST_DRIFT: f64 = 0.97;
-/// Points that tell how much of a field can be seen at all, at most; and what is narrower than so many of the least range is told as rough.
+/// Points that tell how much of a field can be seen at all, at most. Whether what is narrower than so many of the least range is smooth nobody sees,
+/// and it would take long to draw.
 const TELLING: usize = 100;
 const SMOOTH_FROM: f64 = 2.0;
 /// Neighbours tell how far a point scatters, and what is narrow: blocks of so many at most, so many blocks at most.
@@ -208,10 +209,11 @@ impl<'a> Search<'a> {
             }
         }
         if let Some(lay) = self.lay(all[0]) {
-            // The others are as much less likely beside it as they were without it.
+            // The other tops are as much lower beside it as they were without it.
             all.iter_mut().for_each(|(shape, _)| shape.lay = lay.0.lay);
             let higher = lay.1.1 - all[0].1.1;
-            all.iter_mut().for_each(|(_, top)| top.1 += higher);
+            tops.iter_mut().for_each(|top| top.1 += higher);
+            all[1..].par_iter_mut().for_each(|(shape, top)| *top = self.climbed(&[*top], *shape));
             all[0] = lay;
         }
         Ok(Shapes { all, tops, plain })
@@ -220,8 +222,12 @@ impl<'a> Search<'a> {
     fn at(&self, of: &[Observed], [range, ratio]: [f64; 2], shape: Shape) -> Result<(Hyper, f64), ModelError> {
         let (hyper, value) = scaled(of, [range.exp(), ratio.exp()], shape, self.priors)?;
         // What a fit takes off a form is about as much as what it leaves: a field that was far stronger would be one of which the points show next to nothing.
+        Ok((hyper, value - self.beyond(&hyper)))
+    }
+
+    fn beyond(&self, hyper: &Hyper) -> f64 {
         let beyond = (hyper.field.sigma_mm / self.rms_mm.max(f64::MIN_POSITIVE)).ln().max(0.0) / STRONGER.ln();
-        Ok((hyper, value - 0.5 * beyond * beyond))
+        0.5 * beyond * beyond
     }
 
     /// What is narrower than can be told has no height.
@@ -293,7 +299,7 @@ impl<'a> Search<'a> {
         let near = tops.iter().filter(|(place, of)| top - of < NEAR && (place[0] - best[0]).abs() > APART);
         let others = near.map(|place| (shape, self.climbed(&[*place], shape)));
         let all: Vec<_> = shapes.iter().copied().chain(others).collect();
-        let mut mixture = self.mixture(&self.all, &all);
+        let mut mixture = self.mixture(&self.all, &all, self.least + SMOOTH_FROM.ln());
         if mixture.is_empty() {
             mixture.push((hyper, 1.0));
         }
@@ -301,38 +307,32 @@ impl<'a> Search<'a> {
         Ok(Told { best: hyper, mixture, plain, wide, scatter_u })
     }
 
-    /// What the parameters may be by some points, and how often: of every shape, all over its hill.
-    fn mixture(&self, of: &[Observed], tops: &[(Shape, Top)]) -> Vec<(Hyper, f64)> {
-        let counted: usize = of.iter().map(|of| of.places.len()).sum();
+    /// What the parameters may be by some points, and how often: of every shape, all over its hill; what is smooth from some range on alone.
+    fn mixture(&self, of: &[Observed], tops: &[(Shape, Top)], smooth_from: f64) -> Vec<(Hyper, f64)> {
+        let [spread, blocks] = [of[0].places.len(), of[1..].iter().map(|block| block.places.len()).sum()];
         // Points that are in a block and among those all over the part count once.
-        let once = (self.points / counted as f64).min(1.0);
-        let few = thinned(&of[0], TELLING);
+        let twice = spread as f64 * blocks as f64 / self.points;
+        let once = 1.0 - twice / (spread + blocks) as f64;
+        let there = (spread + blocks) as f64 - twice;
+        let few = Observed { stated: DMatrix::zeros(spread.min(TELLING), 0), ..thinned(&of[0], TELLING) };
         let height = |place: [f64; 2], shape: Shape| {
-            // Whether what is hardly wider than the distance of the points is smooth nobody sees, and it would take long to draw.
-            let is_narrow = place[0] < self.least + SMOOTH_FROM.ln();
-            if is_narrow && ![tops[0].0.smoothness, Smoothness::Once].contains(&shape.smoothness) {
+            let is_rough = shape.smoothness == Smoothness::Once;
+            if place[0] < self.least || !is_rough && place[0] < smooth_from {
                 return f64::NEG_INFINITY;
             }
-            let known = self.priors.log_density(place[0].exp(), place[1].exp());
-            let value = self.height(of, place, shape) - known - doubt(shape.smoothness);
-            if value == f64::NEG_INFINITY {
-                return value;
-            }
-            value * once + known + telling(&few, counted.min(self.points as usize), place, shape)
+            let Ok((hyper, value)) = self.at(of, place, shape) else { return f64::NEG_INFINITY };
+            let known = self.priors.log_density(place[0].exp(), place[1].exp()) - self.beyond(&hyper);
+            (value - known - doubt(shape.smoothness)) * once + known + telling(&few, there, place, shape)
         };
-        let mut hills: Vec<(Shape, [f64; 2], f64)> = Vec::new();
+        let mut hills: Vec<(Shape, Hill)> = Vec::new();
         for (shape, (top, _)) in tops {
-            // A top that lies among what belongs to another is none of its own.
-            let among = |axis: usize| {
-                let off = hills.iter().filter(|(of, ..)| of == shape).map(|(_, place, _)| place[axis] - top[axis]);
-                off.clone().any(|off| off <= 0.0) && off.clone().any(|off| off >= 0.0)
-            };
-            if !(among(0) && among(1)) {
-                let hill = around(*top, |place| height(place, *shape));
-                hills.extend(hill.into_iter().map(|(place, volume)| (*shape, place, volume)));
-            }
+            let top = if shape.smoothness == Smoothness::Once { *top } else { [top[0].max(smooth_from), top[1]] };
+            let before: Vec<&Hill> = hills.iter().filter(|(of, _)| of == shape).map(|(_, hill)| hill).collect();
+            let hill = Hill::around(top, &before, |place| height(place, *shape));
+            hills.push((*shape, hill));
         }
-        let some = some_for_all(&hills).into_iter();
+        let all = hills.iter().flat_map(|(shape, hill)| hill.places.iter().map(|(at, volume)| (*shape, *at, *volume)));
+        let some = some_for_all(&all.collect::<Vec<_>>()).into_iter();
         some.filter_map(|(shape, place, times)| Some((self.at(of, place, shape).ok()?.0, times))).collect()
     }
 
@@ -348,7 +348,7 @@ impl<'a> Search<'a> {
             })
         };
         let tops: Vec<_> = ANY.into_par_iter().map(of).collect();
-        let mixture = self.mixture(spread, &tops);
+        let mixture = self.mixture(spread, &tops, self.least);
         if mixture.is_empty() {
             return vec![(found, 1.0)];
         }
@@ -358,9 +358,9 @@ impl<'a> Search<'a> {
 
 /// How much a field counts of which so many points tell something or next to nothing, in the logarithm: without it what nobody could see would be
 /// taken for not there (Bernardo 1979). Some of the points stand for all.
-fn telling(some: &Observed, points: usize, [range, ratio]: [f64; 2], Shape { smoothness, lay, drift }: Shape) -> f64 {
+fn telling(some: &Observed, points: f64, [range, ratio]: [f64; 2], Shape { smoothness, lay, drift }: Shape) -> f64 {
     // As many points as there are tell as much as some do by a scatter that is smaller.
-    let less = (some.places.len() as f64 / points as f64).sqrt();
+    let less = (some.places.len() as f64 / points).sqrt();
     let field = Field { sigma_mm: 1.0, range_mm: range.exp(), smoothness, lay };
     let unit = Hyper { field, scatter_mm: ratio.exp() * less, drift };
     let seen = Dense::fit(some, unit).map_or(0.0, |model| model.waves_seen());
