@@ -14,8 +14,8 @@ const FURTHEST: i32 = 5;
 const NEAR: f64 = 0.75;
 
 /// How many places stand for all, where these spread by one or more, and at least.
-const MOST: f64 = 8.0;
-const LEAST: f64 = 2.0;
+const MOST: f64 = 10.0;
+const LEAST: f64 = 3.0;
 
 /// Climbs to the highest place of two dimensions by a simplex (Nelder and Mead 1965).
 ///
@@ -190,7 +190,8 @@ mod tests {
         let both: Vec<_> = of('a', 0.0).into_iter().chain(of('b', 3.0_f64.ln())).collect();
         let some = some_for_all(&both);
         let times = |what| some.iter().filter(|(of, ..)| *of == what).map(|(.., times)| times).sum::<f64>();
-        assert_eq!((times('a'), times('b')), (2.0, 6.0));
+        assert_eq!(times('a') + times('b'), MOST);
+        assert!((times('b') - 0.75 * MOST).abs() <= 0.5, "{}", times('b'));
         assert_eq!(some_for_all(&[('a', [1.0, 2.0], -700.0)]), [('a', [1.0, 2.0], LEAST)], "one for all");
         assert_eq!(some_for_all::<char>(&[]), []);
         assert_eq!(Hill::around([0.0, 0.0], &[], |_| f64::NEG_INFINITY).places, [], "no hill");

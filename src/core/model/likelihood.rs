@@ -314,7 +314,8 @@ impl<'a> Search<'a> {
         let twice = spread as f64 * blocks as f64 / self.points;
         let once = 1.0 - twice / (spread + blocks) as f64;
         let there = (spread + blocks) as f64 - twice;
-        let few = Observed { stated: DMatrix::zeros(spread.min(TELLING), 0), ..thinned(&of[0], TELLING) };
+        let few = thinned(&of[0], TELLING);
+        let few = Observed { stated: DMatrix::zeros(few.places.len(), 0), ..few };
         let height = |place: [f64; 2], shape: Shape| {
             let is_rough = shape.smoothness == Smoothness::Once;
             if place[0] < self.least || !is_rough && place[0] < smooth_from {
@@ -357,13 +358,13 @@ impl<'a> Search<'a> {
 }
 
 /// How much a field counts of which so many points tell something or next to nothing, in the logarithm: without it what nobody could see would be
-/// taken for not there (Bernardo 1979). Some of the points stand for all.
+/// taken for not there (Jeffreys 1946). Some of the points stand for all.
 fn telling(some: &Observed, points: f64, [range, ratio]: [f64; 2], Shape { smoothness, lay, drift }: Shape) -> f64 {
     // As many points as there are tell as much as some do by a scatter that is smaller.
     let less = (some.places.len() as f64 / points).sqrt();
     let field = Field { sigma_mm: 1.0, range_mm: range.exp(), smoothness, lay };
     let unit = Hyper { field, scatter_mm: ratio.exp() * less, drift };
-    let seen = Dense::fit(some, unit).map_or(0.0, |model| model.waves_seen());
+    let seen = Dense::fit(some, unit).map_or(0.0, |model| model.strength_seen());
     (seen / (1.0 + seen)).max(f64::MIN_POSITIVE).ln()
 }
 
