@@ -337,23 +337,26 @@ impl<'a> Search<'a> {
         some.filter_map(|(shape, place, times)| Some((self.at(of, place, shape).ok()?.0, times))).collect()
     }
 
-    /// How strong and how wide the widest waves are, by those points alone that see them.
+    /// How strong and how wide the widest waves are, by those points alone that see them, with how much speaks for each smoothness.
     fn wide(&self, shapes: &[(Shape, Top)], found: Hyper) -> Vec<(Hyper, f64)> {
         let (best, (from, _)) = shapes[0];
         let spread = &self.all[..1];
         let of = |smoothness| {
             let known = shapes.iter().find(|(shape, _)| shape.smoothness == smoothness && self.all.len() == 1);
-            known.copied().unwrap_or_else(|| {
+            let (shape, (place, top)) = known.copied().unwrap_or_else(|| {
                 let shape = Shape { smoothness, ..best };
                 (shape, climb(from, [0.3, 0.3], 0.03, |place| self.height(spread, place, shape)))
-            })
+            });
+            let (wide, _) = self.at(spread, place, shape).ok()?;
+            // Each is taken for as likely as it is: what is too careful of the three makes the mean of them careful.
+            Some((Hyper { scatter_mm: found.scatter_mm, ..wide }, top - doubt(smoothness)))
         };
-        let tops: Vec<_> = ANY.into_par_iter().map(of).collect();
-        let mixture = self.mixture(spread, &tops, self.least);
-        if mixture.is_empty() {
+        let seen: Vec<(Hyper, f64)> = ANY.into_par_iter().filter_map(of).collect();
+        let top = seen.iter().map(|(_, of)| *of).fold(f64::NEG_INFINITY, f64::max);
+        if !top.is_finite() {
             return vec![(found, 1.0)];
         }
-        mixture.into_iter().map(|(wide, times)| (Hyper { scatter_mm: found.scatter_mm, ..wide }, times)).collect()
+        seen.into_iter().map(|(wide, of)| (wide, (of - top).exp())).collect()
     }
 }
 
@@ -398,7 +401,7 @@ pub(super) struct Told {
     pub(super) mixture: Vec<(Hyper, f64)>,
     /// The most probable of the roughest without a lay: how much speaks for a form is known of these.
     pub(super) plain: Hyper,
-    /// The same by points all over the part alone: how strong and how wide its widest waves are.
+    /// By points all over the part: how strong and how wide its widest waves are, of each smoothness, with how much speaks for it.
     pub(super) wide: Vec<(Hyper, f64)>,
     /// Standard uncertainty of the logarithm of the scatter.
     pub(super) scatter_u: f64,
