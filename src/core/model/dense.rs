@@ -94,23 +94,6 @@ impl Dense {
         observed.deviations_mm.iter().zip(&self.weights).map(|(d, w)| d * w).sum()
     }
 
-    /// How well the points tell the logarithm of the strength of the field, as the root of their Fisher information: sqrt(tr(S S) / 2), where
-    /// S = I - s^2 R W takes the observed to the field, with W as in [`Dense::scatters`] and nothing stated.
-    pub(super) fn strength_seen(&self) -> f64 {
-        let (n, p) = (self.places.len(), self.found.len());
-        let scatter2 = self.hyper.scatter_mm.powi(2);
-        let known = Mat::from_fn(p, p, |r, c| self.covariance[(r, c)]);
-        let weights = self.factor.inverse() - &self.effects * known * self.effects.transpose();
-        let left = match self.path.is_empty() || self.hyper.drift == 0.0 {
-            true => weights,
-            false => Mat::from_fn(n, n, |r, c| shared(&self.hyper, &self.path, r, c)) * weights,
-        };
-        let trace: f64 = (0..n).map(|k| left[(k, k)]).sum();
-        let squares: f64 = (0..n).map(|c| (0..n).map(|r| left[(r, c)] * left[(c, r)]).sum::<f64>()).sum();
-        let of_field = n as f64 - p as f64 - 2.0 * scatter2 * trace + scatter2 * scatter2 * squares;
-        (0.5 * of_field.max(0.0)).sqrt()
-    }
-
     /// Returns the effects and their covariance, those that are stated behind the others: with the motions of the part as effects, where its nominal frame is, and how well
     /// that is known beside a field that nobody knows either.
     pub fn effects(&self) -> (&DVector<f64>, &DMatrix<f64>) {
@@ -288,27 +271,6 @@ mod tests {
     use super::*;
 
     const HYPER: Hyper = Hyper { field: Field::new(2.0, 20.0), scatter_mm: 0.5, drift: 0.0 };
-
-    #[test]
-    fn how_well_a_strength_is_seen_is_what_is_worked_out_by_hand() {
-        // Points that tell nothing of each other: S = 4 / (4 + s^2), of eight sqrt(8 S^2 / 2); and along a path without drift alike.
-        let places: Vec<[f64; 2]> = (0..8).map(|k| [1e4 * f64::from(k), 0.0]).collect();
-        for (scatter_mm, share) in [(2.0, 0.5), (0.5, 4.0 / 4.25), (1e3, 4.0 / 1_000_004.0)] {
-            let alone = Observed::without_effects(places.clone(), vec![0.0; 8]);
-            let path = Observed { path: (0..8).map(f64::from).collect(), ..alone.clone() };
-            for observed in [alone, path] {
-                let seen = Dense::fit(&observed, Hyper { scatter_mm, ..HYPER }).unwrap().strength_seen();
-                assert!((seen - 2.0 * share).abs() < 1e-6, "{scatter_mm}: {seen}");
-            }
-            // A motion of all of them takes one of the eight.
-            let moved = Observed {
-                effects: DMatrix::from_element(8, 1, 1.0),
-                ..Observed::without_effects(places.clone(), vec![0.0; 8])
-            };
-            let seen = Dense::fit(&moved, Hyper { scatter_mm, ..HYPER }).unwrap().strength_seen();
-            assert!((seen - 3.5_f64.sqrt() * share).abs() < 1e-6, "{scatter_mm}: {seen}");
-        }
-    }
 
     #[test]
     fn of_one_point_it_is_what_is_worked_out_by_hand() {

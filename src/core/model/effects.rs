@@ -38,18 +38,11 @@ impl Effects {
         let (mut values, mut squares) = (DVector::zeros(p), DMatrix::zeros(p, p));
         let mut counted = 0.0;
         for (hyper, weight) in told.wide.iter().filter(|(_, weight)| *weight > FEW * whole) {
-            // Where nothing can be told by some of them, it is by the others.
-            let model = match Dense::fit(&some, *hyper) {
-                Err(ModelError::NotDefinite) if told.wide.len() > 1 => continue,
-                model => model?,
-            };
+            let model = Dense::fit(&some, *hyper)?;
             let (found, covariance) = model.effects();
             values += found * *weight;
             squares += (covariance + found * found.transpose()) * *weight;
             counted += weight;
-        }
-        if counted == 0.0 {
-            return Err(ModelError::NotDefinite);
         }
         values /= counted;
         let covariance = squares / counted - &values * values.transpose();

@@ -94,6 +94,8 @@ pub struct Interval {
 /// Fields that are drawn, and places at which they are looked at, at most.
 const SAMPLES: usize = 1000;
 const MOST_PLACES: usize = 6000;
+/// Fewer tell nothing.
+const FEWEST_SAMPLES: usize = 30;
 /// Points whose every pair is worked with, at most; of more the grid is faster.
 const MOST_DENSE: usize = 700;
 /// By how much more a form has to be spoken for than none, in the logarithm of the likelihood: by chance it is so in one part of twenty.
@@ -112,7 +114,7 @@ impl Form {
     /// Too few points, and points that leave nothing to tell the form by.
     pub fn of(registration: &Registration, given: &Given) -> Result<Self, ModelError> {
         let seen = Seen::of(registration, given, true)?;
-        let drawn = Drawn::of(&seen.observed, &seen.told)?;
+        let drawn = Drawn::of(&seen.observed, &seen.told.likely)?;
         let ground_in = seen.ground_in.as_ref().map(|ground_in| ground_in.select_rows(&drawn.chosen));
         let slope = seen.slope(given, drawn.clone().without(ground_in.as_ref()));
         let drawn = drawn.with_the_scatter(&seen.observed, &seen.told, given).without(ground_in.as_ref());
@@ -126,7 +128,7 @@ impl Form {
     /// Those of [`Form::of`].
     pub fn alone(registration: &Registration, given: &Given, in_order: bool) -> Result<Option<Hyper>, ModelError> {
         let seen = Seen::of(registration, &Given { priors: None, ..*given }, in_order)?;
-        Ok(seen.is_seen.then_some(seen.told.best))
+        Ok(seen.is_seen.then(|| seen.told.likely[0].0))
     }
 
     /// Tells the form at places of the part that need not have been touched: points of the nominal surface with their normals, in the model
@@ -141,7 +143,7 @@ impl Form {
         let seen = Seen::of(registration, given, false)?;
         let places: Vec<_> = thinned(places.len()).map(|k| places[k]).collect();
         let effects = seen.motions.rows(places.iter().copied());
-        let drawn = Drawn::over(&seen.observed, &seen.told, places.iter().map(plane).collect(), effects)?;
+        let drawn = Drawn::over(&seen.observed, &seen.told.likely, places.iter().map(plane).collect(), effects)?;
         let ground_in = seen.ground_in.is_some().then(|| seen.stated.columns(places.iter().copied()));
         let drawn = drawn.without(ground_in.as_ref());
         let slope = seen.slope(given, drawn.clone());
@@ -179,8 +181,14 @@ impl Seen {
         let observed = Observed { path, ..observed };
         let priors = given.priors.unwrap_or_else(|| Priors::of_size(motions.size_mm));
         let is_dense = at_points && observed.places.len() <= MOST_DENSE;
-        let told = Hyper::told(&observed, &priors, if is_dense { &ANY } else { &ON_A_GRID })?;
+        let mut told = Hyper::told(&observed, &priors, if is_dense { &ANY } else { &ON_A_GRID })?;
         let is_seen = told.plain.evidence(&observed) > EVIDENCE;
+        if !is_seen {
+            // What is spoken for by next to nothing is as good as what is spoken for by a little more.
+            let on_a_grid = told.wide.iter().filter(|(wide, _)| ON_A_GRID.contains(&wide.field.smoothness));
+            told.likely.extend(on_a_grid.copied());
+            told.likely.iter_mut().for_each(|(_, weight)| *weight = 1.0);
+        }
         Ok(Self { motions, observed, stated, ground_in, told, is_seen })
     }
 
@@ -196,7 +204,7 @@ impl Seen {
         let alike = self.ground_in.as_ref().unwrap_or(&self.observed.stated);
         let covariance = of_the_fit(&self.observed, &self.told.wide, alike);
         let figures = drawn.figures(self.is_seen, given);
-        let hyper = self.told.best;
+        let hyper = self.told.likely[0].0;
         let on_a_grid = if ON_A_GRID.contains(&hyper.field.smoothness) { hyper } else { self.told.plain };
         let ground_in = ground_in.map(|columns| best_fitted(columns, &drawn.effects));
         let of_drawn = budget::Drawn { forms: &drawn.forms, places: &drawn.places, effects: &drawn.effects, ground_in };
@@ -327,8 +335,6 @@ fn of_the_fit(observed: &Observed, likely: &[(Hyper, f64)], alike: &DMatrix<f64>
 #[derive(Clone)]
 struct Drawn {
     forms: DMatrix<f64>,
-    /// By which scatter each was drawn.
-    scatters_mm: Vec<f64>,
     places: Vec<[f64; 2]>,
     effects: DMatrix<f64>,
     /// Which of the points the places are, where they are points.
@@ -339,11 +345,11 @@ struct Drawn {
 
 impl Drawn {
     /// At the points, by each of the likely parameters as many as speaks for them.
-    fn of(observed: &Observed, told: &Told) -> Result<Self, ModelError> {
+    fn of(observed: &Observed, likely: &[(Hyper, f64)]) -> Result<Self, ModelError> {
         let n = observed.places.len();
         let chosen: Vec<usize> = thinned(n).collect();
         let seen = observed.only(&chosen);
-        let (forms, scatters_mm) = mixed(chosen.len(), told, |hyper, count, seed| {
+        let forms = mixed(chosen.len(), likely, |hyper, count, seed| {
             if n <= MOST_DENSE {
                 // What was observed less scatters that may have been.
                 let scatters = Dense::fit(observed, hyper)?.scatters(count, seed)?;
@@ -357,23 +363,22 @@ impl Drawn {
             0 => spread_mm(&forms),
             _ => spread_mm(&best_fitted(forms.clone(), &seen.effects)),
         };
-        Ok(Self { smooth_sigma_mm, forms, scatters_mm, places: seen.places, effects: seen.effects, chosen })
+        Ok(Self { smooth_sigma_mm, forms, places: seen.places, effects: seen.effects, chosen })
     }
 
     /// The same at other places.
     fn over(
         observed: &Observed,
-        told: &Told,
+        likely: &[(Hyper, f64)],
         places: Vec<[f64; 2]>,
         effects: DMatrix<f64>,
     ) -> Result<Self, ModelError> {
         let everywhere: Vec<[f64; 2]> = observed.places.iter().chain(&places).copied().collect();
-        let (forms, scatters_mm) = mixed(places.len(), told, |hyper, count, seed| {
+        let forms = mixed(places.len(), likely, |hyper, count, seed| {
             let lattice = Lattice::over(&everywhere, &hyper.field)?;
             Sparse::fit(&lattice, observed, hyper)?.samples(&places, count, seed)
         })?;
-        let drawn = Self { forms, scatters_mm, places, effects, chosen: Vec::new(), smooth_sigma_mm: Vec::new() }
-            .after_best_fit();
+        let drawn = Self { forms, places, effects, chosen: Vec::new(), smooth_sigma_mm: Vec::new() }.after_best_fit();
         Ok(Self { smooth_sigma_mm: spread_mm(&drawn.forms), ..drawn })
     }
 
@@ -388,9 +393,9 @@ impl Drawn {
         // What is stated is left of the observations as well, and is no scatter.
         let seen = observed.only(&self.chosen);
         let stated = (seen.stated.ncols() > 0).then(|| seen.all_effects().qr().q());
-        for (mut form, scatter_mm) in self.forms.column_iter_mut().zip(&self.scatters_mm) {
+        for mut form in self.forms.column_iter_mut() {
             let share = (told.scatter_u * normals.next()).exp() - 1.0;
-            let [probe_mm, narrow_mm] = parted([*scatter_mm, told.scatter_u], given, &mut normals);
+            let [probe_mm, narrow_mm] = parted(told, given, &mut normals);
             let is_form = narrow_mm.powi(2) / (probe_mm.powi(2) + narrow_mm.powi(2)).max(f64::MIN_POSITIVE);
             let moved_mm = is_form.sqrt() * probe_mm;
             let left = DVector::from_fn(form.len(), |k, _| seen.deviations_mm[k] - form[k]);
@@ -407,9 +412,9 @@ impl Drawn {
 
     /// Adds what is too narrow to be told at places that were not touched: what the scatter is more than that of the probe.
     fn with_what_is_narrow(mut self, told: &Told, given: &Given) -> Self {
-        for (c, (mut form, scatter_mm)) in self.forms.column_iter_mut().zip(&self.scatters_mm).enumerate() {
+        for (c, mut form) in self.forms.column_iter_mut().enumerate() {
             let mut normals = Normals::new(4, c as u64);
-            let [_, narrow_mm] = parted([*scatter_mm, told.scatter_u], given, &mut normals);
+            let [_, narrow_mm] = parted(told, given, &mut normals);
             form.iter_mut().for_each(|value| *value += narrow_mm * normals.next());
         }
         self
@@ -475,13 +480,13 @@ impl Drawn {
 
 /// The scatter of the probe and what of the scatter is too narrow a form, each as it may be. Where nothing tells how
 /// far the probe scatters it is the scatter that was found.
-fn parted([scatter_mm, scatter_u]: [f64; 2], given: &Given, normals: &mut Normals) -> [f64; 2] {
-    let [probe_mm, probe_u] = given.probe_scatter_mm;
+fn parted(told: &Told, given: &Given, normals: &mut Normals) -> [f64; 2] {
+    let ([probe_mm, probe_u], scatter_mm) = (given.probe_scatter_mm, told.likely[0].0.scatter_mm);
     if probe_mm <= 0.0 {
         return [scatter_mm, 0.0];
     }
     let may_be = |mm: f64, share: f64, z: f64| (mm * (share * z).exp()).powi(2);
-    let found = may_be(scatter_mm, scatter_u, normals.next());
+    let found = may_be(scatter_mm, told.scatter_u, normals.next());
     let own = may_be(probe_mm, probe_u, normals.next());
     [own.min(found).sqrt(), (found - own).max(0.0).sqrt()]
 }
@@ -501,28 +506,25 @@ fn spread_mm(forms: &DMatrix<f64>) -> Vec<f64> {
     forms.row_iter().map(|row| row.variance().sqrt()).collect()
 }
 
-/// Forms drawn by all that the parameters may be, as many as each stands for, one beside the other; and by which scatter each was drawn.
-///
-/// Parameters by which nothing can be drawn, such as those of a range that is too narrow for the grid, are left out where there are others.
+/// Forms drawn by each of the likely parameters, as many as speaks for them, one beside the other.
 fn mixed(
     rows: usize,
-    told: &Told,
+    likely: &[(Hyper, f64)],
     draw: impl Fn(Hyper, usize, u64) -> Result<DMatrix<f64>, ModelError>,
-) -> Result<(DMatrix<f64>, Vec<f64>), ModelError> {
-    let whole: f64 = told.mixture.iter().map(|(_, times)| times).sum();
-    let (mut forms, mut scatters_mm) = (DMatrix::zeros(rows, 0), Vec::new());
-    for (seed, (hyper, times)) in (1..).zip(&told.mixture) {
-        let count = (SAMPLES as f64 * times / whole).round() as usize;
-        let Ok(drawn) = draw(*hyper, count, seed) else { continue };
+) -> Result<DMatrix<f64>, ModelError> {
+    let whole: f64 = likely.iter().map(|(_, weight)| weight).sum();
+    let mut forms = DMatrix::zeros(rows, 0);
+    for (seed, (hyper, weight)) in (1..).zip(likely) {
+        let count = (SAMPLES as f64 * weight / whole).round() as usize;
+        if count < FEWEST_SAMPLES {
+            continue;
+        }
+        let drawn = draw(*hyper, count, seed)?;
         let before = forms.ncols();
         forms = forms.resize(rows, before + count, 0.0);
         forms.columns_mut(before, count).copy_from(&drawn);
-        scatters_mm.resize(before + count, hyper.scatter_mm);
     }
-    if scatters_mm.is_empty() {
-        return Ok((draw(told.best, SAMPLES, 0)?, vec![told.best.scatter_mm; SAMPLES]));
-    }
-    Ok((forms, scatters_mm))
+    Ok(forms)
 }
 
 impl Interval {

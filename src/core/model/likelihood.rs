@@ -8,7 +8,7 @@
 use nalgebra::DMatrix;
 use rayon::prelude::*;
 
-use super::hill::{Hill, climb, some_for_all};
+use super::hill::climb;
 use super::profile::{Profile, best_scale};
 use super::{Dense, Field, Hyper, Lay, ModelError, Observed, Smoothness, spacing_mm};
 
@@ -56,10 +56,6 @@ const DOUBT: f64 = 2.0;
 /// How finely a drift is told, and the most that is.
 const DRIFT_STEPS: [f64; 3] = [0.12, 0.06, 0.03];
 const MOST_DRIFT: f64 = 0.97;
-/// Points that tell how much of a field can be seen at all, at most. Whether what is narrower than so many of the least range is smooth nobody sees,
-/// and it would take long to draw.
-const TELLING: usize = 100;
-const SMOOTH_FROM: f64 = 2.0;
 /// Neighbours tell how far a point scatters, and what is narrow: blocks of so many at most, so many blocks at most.
 const POINTS_A_BLOCK: usize = 48;
 const MOST_BLOCKS: usize = 40;
@@ -107,15 +103,50 @@ impl Hyper {
     /// # Errors
     /// Those of [`Dense::fit`].
     pub fn of(observed: &Observed, priors: &Priors) -> Result<Self, ModelError> {
-        let search = Search::of(observed, priors)?;
-        let (shape, (place, _)) = search.shapes(&ON_A_GRID)?.all[0];
-        Ok(search.at(&search.all, place, shape)?.0)
+        Self::told(observed, priors, &ON_A_GRID).map(|told| told.likely[0].0)
     }
 
     /// The same, with what else it might be, of fields of some smoothness.
     pub(super) fn told(observed: &Observed, priors: &Priors, smoothness: &[Smoothness]) -> Result<Told, ModelError> {
-        let search = Search::of(observed, priors)?;
-        search.told(search.shapes(smoothness)?)
+        observed.check()?;
+        priors.check()?;
+        let search = Search::of(observed, priors);
+        let rough = Shape::default();
+        let mut tops = search.tops(rough, &RATIOS);
+        let mut best = (rough, search.climbed(&tops, rough));
+        if !observed.path.is_empty()
+            && let Some(drifting) = search.drift(best.1)
+        {
+            best = drifting;
+            tops = search.tops(best.0, &RATIOS);
+        }
+        let (plain, _) = search.at(&search.all, best.1.0, best.0)?;
+        let ratio = best.1.0[1].exp();
+        let mut all = vec![best];
+        let others: Vec<_> = smoothness.iter().filter(|of| **of != best.0.smoothness).collect();
+        let climb = |smoothness: &&Smoothness| {
+            let shape = Shape { smoothness: **smoothness, ..best.0 };
+            // What is smoother is narrower, and leaves more to the scatter.
+            let seen = search.tops(shape, &[ratio, 3.0 * ratio]);
+            let top = search.climbed(&seen, shape);
+            (shape, seen, top)
+        };
+        for (shape, seen, top) in others.par_iter().map(climb).collect::<Vec<_>>() {
+            if top.1 > all[0].1.1 {
+                tops = seen;
+                all.insert(0, (shape, top));
+            } else {
+                all.push((shape, top));
+            }
+        }
+        if let Some(lay) = search.lay(all[0]) {
+            // The others are as much less likely beside it as they were without it.
+            all.iter_mut().for_each(|(shape, _)| shape.lay = lay.0.lay);
+            let higher = lay.1.1 - all[0].1.1;
+            all.iter_mut().for_each(|(_, top)| top.1 += higher);
+            all[0] = lay;
+        }
+        search.told(&all, &tops, plain)
     }
 }
 
@@ -136,16 +167,6 @@ impl Default for Shape {
 /// A place of range and ratio, by their logarithms, and how high the likelihood is there.
 type Top = ([f64; 2], f64);
 
-/// The shapes that a field may have.
-struct Shapes {
-    /// Each with the top of its hill, the best first.
-    all: Vec<(Shape, Top)>,
-    /// The tops that the hill of the best may have.
-    tops: Vec<Top>,
-    /// The most probable parameters of the roughest without a lay.
-    plain: Hyper,
-}
-
 /// The hill of the likelihood.
 struct Search<'a> {
     /// Points all over the part, and blocks of neighbours.
@@ -156,14 +177,10 @@ struct Search<'a> {
     /// The logarithms of the least range that can be told, and of how many of it the range is that is expected.
     least: f64,
     far: f64,
-    /// How many points there are.
-    points: f64,
 }
 
 impl<'a> Search<'a> {
-    fn of(observed: &Observed, priors: &'a Priors) -> Result<Self, ModelError> {
-        observed.check()?;
-        priors.check()?;
+    fn of(observed: &Observed, priors: &'a Priors) -> Self {
         let all = if observed.places.len() <= MOST_TOGETHER {
             vec![observed.clone()]
         } else {
@@ -174,60 +191,14 @@ impl<'a> Search<'a> {
         let widest_mm = priors.range_mm[0].max(size_mm(&observed.places) / 3.0);
         let squares: f64 = observed.deviations_mm.iter().map(|d| d * d).sum();
         let rms_mm = (squares / observed.places.len() as f64).sqrt();
-        let [least, far] = [least_mm, (widest_mm / least_mm).max(1.5)].map(f64::ln);
-        Ok(Self { all, priors, rms_mm, least, far, points: observed.places.len() as f64 })
-    }
-
-    /// Climbs the hill of each shape that the field may have.
-    fn shapes(&self, smoothness: &[Smoothness]) -> Result<Shapes, ModelError> {
-        let rough = Shape::default();
-        let mut tops = self.tops(rough, &RATIOS);
-        let mut best = (rough, self.climbed(&tops, rough));
-        if !self.all[0].path.is_empty()
-            && let Some(drifting) = self.drift(best.1)
-        {
-            best = drifting;
-            tops = self.tops(best.0, &RATIOS);
-        }
-        let (plain, _) = self.at(&self.all, best.1.0, best.0)?;
-        let ratio = best.1.0[1].exp();
-        let mut all = vec![best];
-        let others: Vec<_> = smoothness.iter().filter(|of| **of != best.0.smoothness).collect();
-        let climb = |smoothness: &&Smoothness| {
-            let shape = Shape { smoothness: **smoothness, ..best.0 };
-            // What is smoother is narrower, and leaves more to the scatter.
-            let seen = self.tops(shape, &[ratio, 3.0 * ratio]);
-            let top = self.climbed(&seen, shape);
-            (shape, seen, top)
-        };
-        for (shape, seen, top) in others.par_iter().map(climb).collect::<Vec<_>>() {
-            if top.1 > all[0].1.1 {
-                tops = seen;
-                all.insert(0, (shape, top));
-            } else {
-                all.push((shape, top));
-            }
-        }
-        if let Some(lay) = self.lay(all[0]) {
-            // The other tops are as much lower beside it as they were without it.
-            all.iter_mut().for_each(|(shape, _)| shape.lay = lay.0.lay);
-            let higher = lay.1.1 - all[0].1.1;
-            tops.iter_mut().for_each(|top| top.1 += higher);
-            all[1..].par_iter_mut().for_each(|(shape, top)| *top = self.climbed(&[*top], *shape));
-            all[0] = lay;
-        }
-        Ok(Shapes { all, tops, plain })
+        Self { all, priors, rms_mm, least: least_mm.ln(), far: (widest_mm / least_mm).max(1.5).ln() }
     }
 
     fn at(&self, of: &[Observed], [range, ratio]: [f64; 2], shape: Shape) -> Result<(Hyper, f64), ModelError> {
         let (hyper, value) = scaled(of, [range.exp(), ratio.exp()], shape, self.priors)?;
         // What a fit takes off a form is about as much as what it leaves: a field that was far stronger would be one of which the points show next to nothing.
-        Ok((hyper, value - self.beyond(&hyper)))
-    }
-
-    fn beyond(&self, hyper: &Hyper) -> f64 {
         let beyond = (hyper.field.sigma_mm / self.rms_mm.max(f64::MIN_POSITIVE)).ln().max(0.0) / STRONGER.ln();
-        0.5 * beyond * beyond
+        Ok((hyper, value - 0.5 * beyond * beyond))
     }
 
     /// What is narrower than can be told has no height.
@@ -285,56 +256,29 @@ impl<'a> Search<'a> {
         (top.1 > without.1 + LAY_EVIDENCE).then(|| (of(place), top))
     }
 
-    /// What the points say.
-    fn told(&self, Shapes { all: shapes, tops, plain }: Shapes) -> Result<Told, ModelError> {
+    /// The best of some shapes, with what else it might be: `tops` are those of the first.
+    fn told(&self, shapes: &[(Shape, Top)], tops: &[Top], plain: Hyper) -> Result<Told, ModelError> {
         let (shape, (best, top)) = shapes[0];
         let (hyper, _) = self.at(&self.all, best, shape)?;
+        let mut likely = vec![(hyper, 1.0)];
+        let near = tops.iter().filter(|(place, of)| top - of < NEAR && (place[0] - best[0]).abs() > APART);
+        let climbed = near.map(|(place, _)| {
+            (shape, climb(*place, [0.0, 0.3], 0.05, |[_, ratio]| self.height(&self.all, [place[0], ratio], shape)))
+        });
+        let others: Vec<_> =
+            climbed.chain(shapes[1..].iter().copied()).filter(|(_, (_, of))| top - of < NEAR).collect();
+        likely.extend(
+            others
+                .into_iter()
+                .filter_map(|(shape, (place, of))| Some((self.at(&self.all, place, shape).ok()?.0, (of - top).exp()))),
+        );
         // By the curvature of the hill along the scatter, whose scale moves with it.
         let beside = |step: f64| self.at(&self.all, [best[0], best[1] + step], shape).unwrap_or((hyper, top));
         let (below, above) = (beside(-STEP), beside(STEP));
         let moved = 0.5 * (above.0.scatter_mm / below.0.scatter_mm).ln();
         let falls = (2.0 * top - below.1 - above.1).max(f64::MIN_POSITIVE);
         let scatter_u = (moved / falls.sqrt()).abs().min(MOST_UNKNOWN);
-        // A hill may have two tops: a wide form and a narrow one.
-        let near = tops.iter().filter(|(place, of)| top - of < NEAR && (place[0] - best[0]).abs() > APART);
-        let others = near.map(|place| (shape, self.climbed(&[*place], shape)));
-        let all: Vec<_> = shapes.iter().copied().chain(others).collect();
-        let mut mixture = self.mixture(&self.all, &all, self.least + SMOOTH_FROM.ln());
-        if mixture.is_empty() {
-            mixture.push((hyper, 1.0));
-        }
-        let wide = self.wide(&shapes, hyper);
-        Ok(Told { best: hyper, mixture, plain, wide, scatter_u })
-    }
-
-    /// What the parameters may be by some points, and how often: of every shape, all over its hill; what is smooth from some range on alone.
-    fn mixture(&self, of: &[Observed], tops: &[(Shape, Top)], smooth_from: f64) -> Vec<(Hyper, f64)> {
-        let [spread, blocks] = [of[0].places.len(), of[1..].iter().map(|block| block.places.len()).sum()];
-        // Points that are in a block and among those all over the part count once.
-        let twice = spread as f64 * blocks as f64 / self.points;
-        let once = 1.0 - twice / (spread + blocks) as f64;
-        let there = (spread + blocks) as f64 - twice;
-        let few = thinned(&of[0], TELLING);
-        let few = Observed { stated: DMatrix::zeros(few.places.len(), 0), ..few };
-        let height = |place: [f64; 2], shape: Shape| {
-            let is_rough = shape.smoothness == Smoothness::Once;
-            if place[0] < self.least || !is_rough && place[0] < smooth_from {
-                return f64::NEG_INFINITY;
-            }
-            let Ok((hyper, value)) = self.at(of, place, shape) else { return f64::NEG_INFINITY };
-            let known = self.priors.log_density(place[0].exp(), place[1].exp()) - self.beyond(&hyper);
-            (value - known - doubt(shape.smoothness)) * once + known + telling(&few, there, place, shape)
-        };
-        let mut hills: Vec<(Shape, Hill)> = Vec::new();
-        for (shape, (top, _)) in tops {
-            let top = if shape.smoothness == Smoothness::Once { *top } else { [top[0].max(smooth_from), top[1]] };
-            let before: Vec<&Hill> = hills.iter().filter(|(of, _)| of == shape).map(|(_, hill)| hill).collect();
-            let hill = Hill::around(top, &before, |place| height(place, *shape));
-            hills.push((*shape, hill));
-        }
-        let all = hills.iter().flat_map(|(shape, hill)| hill.places.iter().map(|(at, volume)| (*shape, *at, *volume)));
-        let some = some_for_all(&all.collect::<Vec<_>>()).into_iter();
-        some.filter_map(|(shape, place, times)| Some((self.at(of, place, shape).ok()?.0, times))).collect()
+        Ok(Told { likely, plain, wide: self.wide(shapes, hyper), scatter_u })
     }
 
     /// How strong and how wide the widest waves are, by those points alone that see them, with how much speaks for each smoothness.
@@ -358,17 +302,6 @@ impl<'a> Search<'a> {
         }
         seen.into_iter().map(|(wide, of)| (wide, (of - top).exp())).collect()
     }
-}
-
-/// How much a field counts of which so many points tell something or next to nothing, in the logarithm: without it what nobody could see would be
-/// taken for not there (Jeffreys 1946). Some of the points stand for all.
-fn telling(some: &Observed, points: f64, [range, ratio]: [f64; 2], Shape { smoothness, lay, drift }: Shape) -> f64 {
-    // As many points as there are tell as much as some do by a scatter that is smaller.
-    let less = (some.places.len() as f64 / points).sqrt();
-    let field = Field { sigma_mm: 1.0, range_mm: range.exp(), smoothness, lay };
-    let unit = Hyper { field, scatter_mm: ratio.exp() * less, drift };
-    let seen = Dense::fit(some, unit).map_or(0.0, |model| model.strength_seen());
-    (seen / (1.0 + seen)).max(f64::MIN_POSITIVE).ln()
 }
 
 fn higher(a: Top, b: Top) -> Top {
@@ -395,10 +328,8 @@ fn told_drift(
 
 /// What speaks for which parameters.
 pub(super) struct Told {
-    /// What is spoken for most.
-    pub(super) best: Hyper,
-    /// What it may be, each with how often.
-    pub(super) mixture: Vec<(Hyper, f64)>,
+    /// The most probable first, with how much more it is spoken for than each other.
+    pub(super) likely: Vec<(Hyper, f64)>,
     /// The most probable of the roughest without a lay: how much speaks for a form is known of these.
     pub(super) plain: Hyper,
     /// By points all over the part: how strong and how wide its widest waves are, of each smoothness, with how much speaks for it.
@@ -564,7 +495,7 @@ mod tests {
         const PARTS: u32 = 6;
         for seed in 0..PARTS {
             let told = Hyper::told(&drawn(planted, u64::from(seed)), &Priors::of_size(102.0), &ANY).unwrap();
-            let found = told.best;
+            let found = told.likely[0].0;
             sigma += (found.field.sigma_mm / planted.field.sigma_mm).ln() / f64::from(PARTS);
             range += (found.field.range_mm / planted.field.range_mm).ln() / f64::from(PARTS);
             scatter += (found.scatter_mm / planted.scatter_mm).ln() / f64::from(PARTS);
