@@ -73,7 +73,7 @@ pub mod world;
 pub type Vec3 = [f64; 3];
 
 /// The generator behind every random number here: portable across machines and releases.
-pub type Rng = rand_chacha::ChaCha8Rng;
+pub type Rng = rand::rngs::ChaCha8Rng;
 
 /// Returns the generator for a seed.
 pub fn rng(seed: u64) -> Rng {

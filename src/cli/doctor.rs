@@ -1,7 +1,7 @@
 //! `regrind doctor`: does anything stand in the way of a run? Nothing is moved, and nothing is taken.
 
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use clap::Args;
 use regrind::cell::Device;
@@ -11,7 +11,7 @@ use regrind::device::{
 };
 use regrind::drive::recover::{in_short, look};
 use regrind::formats::{ResultFolder, try_writing};
-use regrind::journal::free_bytes;
+use regrind::journal::{free_bytes, utc};
 use regrind::recipe::Recipe;
 use regrind::report::run_summary;
 use regrind::setup;
@@ -130,7 +130,7 @@ fn folder(runs: &Path) -> Finding {
 fn clock(runs: &Path) -> Finding {
     /// When this was written; no clock that is right shows less.
     const LEAST: &str = "2026-01-01T00:00:00Z";
-    let now = jiff::Timestamp::now().to_string();
+    let now = utc(SystemTime::now());
     let last = control::folders(runs)
         .filter_map(|folder| run_summary(&folder).ok())
         .map(|run| run.ended.unwrap_or(run.began))

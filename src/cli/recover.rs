@@ -2,7 +2,7 @@
 
 use std::io::{self, BufRead};
 use std::path::PathBuf;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use clap::Args;
 use regrind::cell::{Actor, Device};
@@ -44,7 +44,7 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> Result<Outcome, Failure> {
     let cell = check::or_show(CellConfig::read(&arguments.cell))?;
     let actor = operator(arguments.operator.as_deref());
-    let began = jiff::Timestamp::now();
+    let began = SystemTime::now();
     let folder = free_folder(&arguments.runs, "recover", began, cell.simulated);
     let taken =
         [take(&cell.cmm.link, MachineKind::Cmm, &folder)?, take(&cell.grinder.link, MachineKind::Grinder, &folder)?];

@@ -1,6 +1,7 @@
 //! `regrind resume`: let a held cell go on, or go on with a run whose program ended in the middle of it.
 
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
 use clap::Args;
 use regrind::cell::{CellPlan, TABLE_VERSION};
@@ -84,7 +85,7 @@ fn take_up(arguments: &Arguments, folder: &Path) -> Result<Outcome, Failure> {
         let (part, actor) = (&begun.part_in_files, operator(arguments.operator.as_deref()));
         let (recipe, cell, json) = (&recipe, &cell, arguments.json);
         let live = Live { recipe, cell, part, folder, job: begun.job, actor, json };
-        let machines = live.open(epoch(jiff::Timestamp::now()))?;
+        let machines = live.open(epoch(SystemTime::now()))?;
         let journal = Journal::open_locked(lock, key).map_err(Failure::Journal)?;
         let (loaded, interrupted) = (cell.simulated, Some(interrupted));
         outcome(&live.carry_out(machines, Work { task, plan, journal, loaded, interrupted }).await?)

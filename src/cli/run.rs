@@ -2,6 +2,7 @@
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
 use clap::Args;
 use regrind::cell::{Actor, Beginning, CellPlan, Ending, TABLE_VERSION};
@@ -9,7 +10,7 @@ use regrind::config::{BUILT_IN, CellConfig, Link};
 use regrind::device::{Line, Wire};
 use regrind::drive::Task;
 use regrind::formats::{LEARNED, Learned, LearnedError, TaughtBy};
-use regrind::journal::{AuditKey, Header, Journal, free_bytes};
+use regrind::journal::{AuditKey, Header, Journal, free_bytes, utc_to_the_second};
 use regrind::recipe::Recipe;
 use regrind::setup;
 use serde_json::json;
@@ -123,7 +124,7 @@ async fn carry_out(
     key: Option<AuditKey>,
 ) -> Result<Ending, Failure> {
     let actor = operator(arguments.operator.as_deref());
-    let began = jiff::Timestamp::now();
+    let began = SystemTime::now();
     let job = epoch(began);
     // Before the record begins: a folder that is not there, or a line that is in use, is no run.
     let part = arguments.part.clone().unwrap_or_else(|| recipe_name(recipe));
@@ -158,8 +159,9 @@ async fn carry_out(
 }
 
 /// A number that rises from program to program.
-pub(super) fn epoch(now: jiff::Timestamp) -> u32 {
-    u32::try_from(now.as_second() & 0x7fff_ffff).unwrap_or(1).max(1)
+pub(super) fn epoch(now: SystemTime) -> u32 {
+    let seconds = now.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |since| since.as_secs());
+    u32::try_from(seconds & 0x7fff_ffff).unwrap_or(1).max(1)
 }
 
 /// What earlier runs left to learn from.
@@ -328,10 +330,10 @@ fn recipe_name(recipe: &Recipe) -> String {
 }
 
 /// Returns a folder for a run that began now: the recipe's name and the time, and a number if two begin in one second.
-pub(super) fn free_folder(runs: &Path, name: &str, began: jiff::Timestamp, simulated: bool) -> PathBuf {
+pub(super) fn free_folder(runs: &Path, name: &str, began: SystemTime, simulated: bool) -> PathBuf {
     // Every file in it carries the mark in its path.
     let mark = if simulated { "-SIMULATION" } else { "" };
-    let stamp = began.strftime("%Y%m%dT%H%M%SZ");
+    let stamp = utc_to_the_second(began).replace(['-', ':'], "");
     let named = |more: u32| match more {
         0 => runs.join(format!("{name}-{stamp}{mark}")),
         more => runs.join(format!("{name}-{stamp}-{more}{mark}")),

@@ -53,7 +53,7 @@ pub(super) struct Arguments {
 /// By what a page proves itself, and who is let in.
 #[derive(Args, Debug)]
 pub(super) struct Door {
-    /// Certificate of the page in PEM, with those of who signed it behind it; for other addresses than this computer's own
+    /// Certificate of the page in PEM, with those of who signed it behind it; for other addresses than this computer's own. Needs a build with `--features https`, as the packages are
     #[arg(long, value_name = "FILE", requires = "key")]
     certificate: Option<PathBuf>,
     /// Private key of the certificate in PEM, which nobody else may read

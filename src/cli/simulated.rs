@@ -2,11 +2,13 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::time::SystemTime;
 
 use regrind::compensation::path::Pattern;
 use regrind::config::{CellConfig, Link, RotaryLetter};
 use regrind::device::{Coordinates, HitLine, HitLinesWire, IppdmeWire, Line, RegisterMap, Wire, WordOrder};
 use regrind::formats::{AddedLines, FormatError, ResultFolder, ScratchFolder, place_link, remove_link};
+use regrind::journal::utc;
 use regrind::recipe::{Recipe, Wheel};
 use regrind_sim::cmm::Led;
 use regrind_sim::head::Head;
@@ -221,7 +223,7 @@ impl SimulatedCell {
             machine.with(|machine| {
                 let name = machine.name();
                 machine.witness(Box::new(move |seen| {
-                    let utc = jiff::Timestamp::now().to_string();
+                    let utc = utc(SystemTime::now());
                     lines.add(&Witnessed { utc, machine: &name, unit, seen });
                 }));
             });

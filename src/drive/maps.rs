@@ -1,5 +1,7 @@
 //! What a cycle leaves behind of the part's error: figures, the map as text, X3P and picture, and the points in colours.
 
+use std::time::SystemTime;
+
 use serde_json::{Value, json};
 
 use super::record::{Files, Unfinished, unfinished};
@@ -9,6 +11,7 @@ use crate::form::{FormOptions, TakenOut, figures, slope};
 use crate::formats::{
     ErrorMapOrigin, FormatError, write_error_map, write_error_map_x3p, write_figures, write_json_atomic,
 };
+use crate::journal::utc_to_the_second;
 use crate::model::{AreaOptions, Form};
 use crate::registration::{Deviation, Registration};
 use crate::report::{HeatMap, ReportError, save_coloured_ply};
@@ -135,7 +138,7 @@ pub(super) fn save(
 ) -> Result<(), Unfinished<String>> {
     let ground_with = (!cycle.correction.is_none()).then(|| task.map_identity(&cycle.correction));
     let origin = ErrorMapOrigin { part: task.part_identity, cycle: number, ground_with };
-    let date = jiff::Timestamp::now().strftime("%Y-%m-%dT%H:%M:%SZ").to_string();
+    let date = utc_to_the_second(SystemTime::now());
     write_error_map(&files.place("error_map.csv"), map, &origin, task.simulation)
         .and_then(|()| write_error_map_x3p(&files.place("error_map.x3p"), map, &date, task.simulation))
         .map_err(unfinished)?;

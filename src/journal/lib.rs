@@ -22,6 +22,7 @@
 
 mod artefact;
 mod canonical;
+mod clock;
 mod copy;
 mod error;
 mod held;
@@ -36,6 +37,7 @@ mod write;
 
 pub use artefact::Artefact;
 pub use canonical::{canonical_json, sha256_hex};
+pub use clock::{utc, utc_to_the_second};
 pub use copy::{restore, restore_file};
 pub use error::JournalError;
 pub use key::{AuditKey, PublicKey};

@@ -3,12 +3,14 @@
 use std::collections::BTreeMap;
 use std::fs::{self, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
 use rusqlite::{Connection, OptionalExtension};
 use serde_json::{Value, json};
 
 use super::artefact::{self, Artefact};
 use super::canonical::canonical_json;
+use super::clock::utc;
 use super::error::JournalError;
 use super::held::HeldFile;
 use super::key::AuditKey;
@@ -383,7 +385,7 @@ impl Journal {
     fn record_of(&self, entry: Entry) -> Record {
         let mut record = Record {
             seq: self.tail.seq + 1,
-            utc: jiff::Timestamp::now().to_string(),
+            utc: utc(SystemTime::now()),
             boot_id: self.boot_id.clone(),
             // What does not fit the database would not be what was hashed.
             mono_ns: entry.mono_ns.min(i64::MAX as u64),

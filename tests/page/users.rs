@@ -76,6 +76,7 @@ fn a_list_of_users_is_kept_and_says_what_is_wrong_with_it() {
 
 #[cfg(unix)]
 #[test]
+#[cfg_attr(not(feature = "https"), ignore = "needs TLS: --features https")]
 fn a_list_and_a_key_that_others_may_read_are_refused() {
     use std::os::unix::fs::PermissionsExt;
     let home = tempfile::tempdir().unwrap();
@@ -211,6 +212,7 @@ pub fn certificate(home: &Path) -> (String, String, Arc<ClientConfig>) {
 }
 
 #[test]
+#[cfg_attr(not(feature = "https"), ignore = "needs TLS: --features https")]
 fn another_computer_comes_in_by_tls_under_the_names_of_the_certificate_alone() {
     let home = tempfile::tempdir().unwrap();
     std::fs::create_dir(home.path().join("runs")).unwrap();

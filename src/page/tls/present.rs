@@ -1,11 +1,10 @@
-//! What lets other computers in: the certificate of the page, and the names that it goes by.
+//! The certificate of a page, by rustls.
 
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
-use regrind_formats::{OpenToOthers, readable_by_others};
-use thiserror::Error;
+use regrind_formats::readable_by_others;
 use tokio::net::TcpStream;
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::ServerConfig;
@@ -16,19 +15,7 @@ use tokio_rustls::rustls::version::TLS13;
 use tokio_rustls::server::TlsStream;
 use webpki::EndEntityCert;
 
-/// What is wrong with a certificate or its key.
-#[derive(Debug, Error)]
-#[expect(missing_docs, reason = "the messages tell them")]
-pub enum TlsError {
-    #[error("{}: no certificate in PEM can be read from it: {what}", .path.display())]
-    Certificate { path: PathBuf, what: String },
-    #[error("{}: no private key in PEM can be read from it: {what}", .path.display())]
-    Key { path: PathBuf, what: String },
-    #[error("{}: other users of this computer may read the key ({}); it is for its owner only: {}", .path.display(), .open.how, .open.remedy)]
-    KeyIsOpen { path: PathBuf, open: OpenToOthers },
-    #[error("the certificate {} and the key {} cannot be used: {what}", .certificate.display(), .key.display())]
-    Unfit { certificate: PathBuf, key: PathBuf, what: String },
-}
+use super::TlsError;
 
 /// The certificate of a page, ready to be shown.
 #[derive(Clone)]

@@ -1,0 +1,35 @@
+//! The time of day, as records and file names have it.
+
+use std::time::SystemTime;
+
+/// Returns a time of day in UTC by RFC 3339, always with nine digits behind the second, so that such texts sort as their times do.
+///
+/// A time before 1970, which a clock that was never set may show, is told as the beginning of 1970.
+pub fn utc(at: SystemTime) -> String {
+    humantime::format_rfc3339_nanos(at.max(SystemTime::UNIX_EPOCH)).to_string()
+}
+
+/// Returns a time of day as [`utc`] does, to the second.
+pub fn utc_to_the_second(at: SystemTime) -> String {
+    humantime::format_rfc3339_seconds(at.max(SystemTime::UNIX_EPOCH)).to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    #[test]
+    fn a_time_has_nine_digits_behind_its_second() {
+        let at = SystemTime::UNIX_EPOCH + Duration::new(1_783_166_400, 120_000_000);
+        assert_eq!(utc(at), "2026-07-04T12:00:00.120000000Z");
+        assert_eq!(utc_to_the_second(at), "2026-07-04T12:00:00Z");
+        assert!(utc(at) < utc(at + Duration::from_nanos(1)));
+    }
+
+    #[test]
+    fn a_clock_that_was_never_set_is_told_as_its_beginning() {
+        assert_eq!(utc(SystemTime::UNIX_EPOCH - Duration::from_secs(1)), "1970-01-01T00:00:00.000000000Z");
+    }
+}

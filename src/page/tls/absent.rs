@@ -1,0 +1,45 @@
+//! The certificate of a page in a program that was built without TLS: there is none.
+
+use std::io;
+use std::path::Path;
+
+use tokio::net::TcpStream;
+
+use super::TlsError;
+
+/// The certificate of a page: a program that was built without TLS has none.
+#[derive(Clone)]
+pub enum Tls {}
+
+impl Tls {
+    /// Refuses every certificate.
+    ///
+    /// # Errors
+    /// Always [`TlsError::NotBuilt`].
+    pub fn read(certificate: &Path, _key: &Path) -> Result<Self, TlsError> {
+        Err(TlsError::NotBuilt { certificate: certificate.to_owned() })
+    }
+
+    pub(crate) fn is_for(&self, _host: &str) -> bool {
+        match *self {}
+    }
+
+    pub(crate) fn name(&self) -> Option<String> {
+        match *self {}
+    }
+
+    pub(crate) async fn accept(&self, _stream: TcpStream) -> io::Result<TcpStream> {
+        match *self {}
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_certificate_is_refused_where_there_is_no_tls() {
+        let refused = Tls::read(Path::new("cell.pem"), Path::new("cell.key")).err();
+        assert!(matches!(refused, Some(TlsError::NotBuilt { certificate }) if certificate == Path::new("cell.pem")));
+    }
+}

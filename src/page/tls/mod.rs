@@ -1,0 +1,37 @@
+//! What lets other computers in: the certificate of the page, and the names that it goes by.
+//!
+//! TLS is built where the feature `https` is on. Without it no certificate is ever taken, and [`Tls`] has no value.
+
+use std::path::PathBuf;
+
+use regrind_formats::OpenToOthers;
+use thiserror::Error;
+
+#[cfg(not(feature = "https"))]
+mod absent;
+#[cfg(feature = "https")]
+mod present;
+
+#[cfg(not(feature = "https"))]
+pub use absent::Tls;
+#[cfg(feature = "https")]
+pub use present::Tls;
+
+/// What is wrong with a certificate or its key.
+#[derive(Debug, Error)]
+#[expect(missing_docs, reason = "the messages tell them")]
+pub enum TlsError {
+    #[error("{}: no certificate in PEM can be read from it: {what}", .path.display())]
+    Certificate { path: PathBuf, what: String },
+    #[error("{}: no private key in PEM can be read from it: {what}", .path.display())]
+    Key { path: PathBuf, what: String },
+    #[error("{}: other users of this computer may read the key ({}); it is for its owner only: {}", .path.display(), .open.how, .open.remedy)]
+    KeyIsOpen { path: PathBuf, open: OpenToOthers },
+    #[error("the certificate {} and the key {} cannot be used: {what}", .certificate.display(), .key.display())]
+    Unfit { certificate: PathBuf, key: PathBuf, what: String },
+    #[error(
+        "{}: this program was built without TLS and takes no certificate; the packages have it, and so has \
+         `cargo install --path . --features https`", .certificate.display()
+    )]
+    NotBuilt { certificate: PathBuf },
+}
