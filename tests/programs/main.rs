@@ -9,5 +9,7 @@ mod linuxcnc;
 mod path;
 #[path = "../common/program.rs"]
 mod program;
+#[path = "../common/sample.rs"]
+mod sample;
 mod sweep;
 mod tilt;

@@ -3,6 +3,7 @@
 //! The surface is that of the simulator's shapes, the wheel a distance of its own, the program is read back from its text.
 
 use crate::path::{Part, ProgramStep, correction, part, part_from_below, read, truth, truth_below, wheels, with};
+use crate::sample::seeds;
 use regrind::compensation::path::{PathOptions, Pattern, TrackSpacing, Wheel};
 
 const PARTS: [&str; 4] = ["freeform-mirror", "off-axis-asphere", "shallow-wave", "biconic"];
@@ -69,7 +70,7 @@ fn program(part: &Part) -> (Vec<ProgramStep>, f64) {
 pub fn places(part: &Part, track_mm: f64, beside: f64) -> Vec<[f64; 2]> {
     let [a, b] = part.half_mm;
     let rows = (2.0 * b / track_mm).round() as usize;
-    (0..80)
+    (0..seeds(24) as usize)
         .map(|k| {
             let row = (k * 7919) % rows;
             let y = -b + (row as f64 + beside) * track_mm;

@@ -9,6 +9,7 @@ use std::process::Stdio;
 use crate::outlived::{began_once, follow, on_serial_lines};
 use crate::program::{Running, changed, records_with, regrind};
 use crate::rig::{CMM, GRINDER, Rig, small};
+use crate::sample::seeds;
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
 use regrind::journal::{Kind, Reader, verify};
@@ -119,7 +120,7 @@ async fn killed(seeds: impl Iterator<Item = u64>) {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_killed_program_is_taken_up_again_and_starts_every_pass_once() {
-    killed(1..=13).await;
+    killed(1..=seeds(5)).await;
 }
 
 #[test]

@@ -42,6 +42,8 @@ mod reports;
 mod results;
 #[path = "../common/rig.rs"]
 mod rig;
+#[path = "../common/sample.rs"]
+mod sample;
 mod shared;
 mod so_far;
 mod study;

@@ -13,6 +13,8 @@ mod narrow;
 mod paper;
 mod parameters;
 mod parts;
+#[path = "../../../../tests/common/sample.rs"]
+mod sample;
 mod search;
 mod taught;
 mod touches;

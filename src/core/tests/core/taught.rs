@@ -5,6 +5,7 @@ use rand::SeedableRng;
 use rand::rngs::StdRng;
 
 use crate::common::{RADIUS_MM, free_form, normal, placed, points, pose};
+use crate::sample::seeds;
 use regrind_core::geometry::{Point, Vector};
 use regrind_core::model::{Field, Form, Given, Hyper, Interval, Lesson, Observed, Priors, Taught, spread};
 use regrind_core::registration::{Options, Registration, Start, register};
@@ -72,7 +73,7 @@ fn given(lesson: Option<Lesson>) -> Given {
 }
 
 fn parts() -> u64 {
-    std::env::var("REGRIND_PARTS").map_or(5, |parts| parts.parse().unwrap())
+    seeds(3)
 }
 
 /// Of some parts: how many RMS and PV were held, and the mean width of both in the true ones.

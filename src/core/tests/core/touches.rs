@@ -4,6 +4,7 @@ use rand::SeedableRng;
 use rand::rngs::StdRng;
 
 use crate::common::{RADIUS_MM, free_form, normal, placed, points, pose};
+use crate::sample::seeds;
 use regrind_core::geometry::{Point, Vector};
 use regrind_core::model::{
     FEWEST, FIRST, Form, Given, Interval, Look, MOST_BATCHES, Purpose, SoFar, Why, look, short_way, spread,
@@ -106,7 +107,7 @@ fn holds(interval: Interval, value: f64) -> bool {
 
 #[test]
 fn between_the_touches_the_form_is_told_with_intervals_that_hold_it() {
-    let parts = std::env::var("REGRIND_PARTS").map_or(14, |parts| parts.parse().unwrap());
+    let parts = seeds(5);
     let touches = std::env::var("REGRIND_TOUCHES").map_or(70, |touches| touches.parse().unwrap());
     let (mut rms, mut pv, mut width) = (0, 0, [0.0; 2]);
     for seed in 0..parts {
@@ -123,7 +124,8 @@ fn between_the_touches_the_form_is_told_with_intervals_that_hold_it() {
     println!(
         "of {parts} parts with {touches} touches RMS held in {rms}, PV in {pv}; intervals are {width:.2?} of them wide"
     );
-    assert!(rms + 3 >= parts as u32 && pv + 3 >= parts as u32, "{rms} {pv}");
+    let most_missed = 1 + parts as u32 / 7;
+    assert!(rms + most_missed >= parts as u32 && pv + most_missed >= parts as u32, "{rms} {pv}");
     assert!(width[0] < 0.5 && width[1] < 0.6, "{width:?}");
 }
 
