@@ -21,7 +21,7 @@ fn python() -> String {
     let has = |python: &String| {
         Command::new(python).args(["-c", "import cryptography"]).output().is_ok_and(|done| done.status.success())
     };
-    let mut all = named.into_iter().chain(["python3".to_owned()]);
+    let mut all = named.into_iter().chain(["python3", "/usr/bin/python3"].map(str::to_owned));
     all.find(has).expect("a python3 with the package cryptography")
 }
 
