@@ -131,7 +131,7 @@ async fn an_abort_goes_out_while_a_motion_is_not_over() {
     cmm.connect().await.unwrap();
     begin(&mut cmm, &plan()).await.unwrap();
     let says = |wanted: &str| heard.lock().unwrap().iter().any(|line| line.contains(wanted));
-    until(&mut cmm, |_| says("GoTo")).await.unwrap();
+    until(&mut cmm, |_| says("GoTo(")).await.unwrap();
     cmm.abort().await.unwrap();
     let status = until_still(&mut cmm).await.unwrap();
     assert_eq!(status.state, State::Aborted);
