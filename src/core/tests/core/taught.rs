@@ -73,7 +73,7 @@ fn given(lesson: Option<Lesson>) -> Given {
 }
 
 fn parts() -> u64 {
-    seeds(3)
+    seeds(5)
 }
 
 /// Of some parts: how many RMS and PV were held, and the mean width of both in the true ones.
