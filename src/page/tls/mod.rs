@@ -1,4 +1,4 @@
-//! What lets other computers in: the certificate of the page, and the names that it goes by.
+//! The certificate by which a page is served to other computers over TLS.
 //!
 //! TLS is built where the feature `https` is on. Without it no certificate is ever taken, and [`Tls`] has no value.
 
@@ -17,7 +17,7 @@ pub use absent::Tls;
 #[cfg(feature = "https")]
 pub use present::Tls;
 
-/// What is wrong with a certificate or its key.
+/// A certificate or a key that a page cannot be served with.
 #[derive(Debug, Error)]
 #[expect(missing_docs, reason = "the messages tell them")]
 pub enum TlsError {
