@@ -4,7 +4,7 @@
 pub fn seeds(few: u64) -> u64 {
     match std::env::var("REGRIND_SEEDS") {
         Ok(text) => text
-            .parse()
+            .parse::<u64>()
             .ok()
             .filter(|seeds| *seeds > 0)
             .unwrap_or_else(|| panic!("REGRIND_SEEDS is no number above 0: {text}")),
