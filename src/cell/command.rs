@@ -116,9 +116,19 @@ pub enum Ending {
     Aborted { cycle: u32, confirmed: bool, reason: String },
 }
 
+/// Spells a label as it is recorded.
+pub(super) fn spelled((name, device): (&'static str, Option<Device>)) -> String {
+    device.map_or(name.to_owned(), |device| format!("{name} {device}"))
+}
+
 impl Command {
     /// Returns the name of the command, as it is recorded, with the machine that it is for.
     pub fn name(&self) -> String {
+        spelled(self.label())
+    }
+
+    /// Returns what [`Self::name`] is made of.
+    pub(super) fn label(&self) -> (&'static str, Option<Device>) {
         let (name, device) = match self {
             Self::Connect { device } => ("connect", Some(device)),
             Self::AskToLoad => ("ask_to_load", None),
@@ -145,6 +155,6 @@ impl Command {
             Self::Refuse { .. } => ("refuse", None),
             Self::Finish(_) => ("finish", None),
         };
-        device.map_or(name.to_owned(), |device| format!("{name} {device}"))
+        (name, device.copied())
     }
 }

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::hash::Hash;
 use std::time::Duration;
 
+use super::command::{Command, spelled};
 use super::event::{
     Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Gate, GateFailure, JobResult,
     Mismatch, Occupation, Reconciliation, RecordFailure, Response, TouchOn,
@@ -40,7 +41,14 @@ pub struct Answer {
     pub commands: Vec<String>,
 }
 
+/// The next state, and the labels of the commands.
+type Labelled = (State, Vec<(&'static str, Option<Device>)>);
+
 impl Answer {
+    fn of((next, labels): Labelled) -> Self {
+        Self { next, commands: labels.into_iter().map(spelled).collect() }
+    }
+
     /// Returns whether the event did not fit.
     pub fn is_refusal(&self) -> bool {
         self.commands.iter().any(|command| command == REFUSE)
@@ -49,20 +57,24 @@ impl Answer {
 
 /// Returns the table, sorted by state and event.
 pub fn table() -> Vec<Row> {
-    let mut answers: HashMap<State, Vec<BTreeSet<Answer>>> = HashMap::new();
+    let mut answers: HashMap<State, Vec<Vec<Labelled>>> = HashMap::new();
     let mut open: VecDeque<Cell> = [Disposal::Hold, Disposal::Stop].into_iter().map(|d| Cell::new(plan(d))).collect();
     let (mut seen, mut sampled) = (HashSet::new(), HashMap::new());
     while let Some(cell) = open.pop_front() {
         let events: &Vec<Event> = sampled.entry(cell.cycle()).or_insert_with(|| samples(cell.cycle()));
-        let answers = answers.entry(cell.state()).or_insert_with(|| vec![BTreeSet::new(); events.len()]);
+        let answers = answers.entry(cell.state()).or_insert_with(|| vec![Vec::new(); events.len()]);
         // Late enough for whatever is due.
         let now = cell.next_deadline().unwrap_or(Duration::ZERO);
         let mut next = cell.clone();
         for (event, answers) in events.iter().zip(answers) {
             let answered = next.answer(now, event);
-            let refused = answered.is_err().then(|| REFUSE.to_owned());
-            let commands = next.commands.drain(..).map(|command| command.name()).chain(refused).collect();
-            answers.insert(Answer { next: next.state(), commands });
+            let state = next.state();
+            let labels = || next.commands.iter().map(Command::label).chain(answered.is_err().then_some((REFUSE, None)));
+            // Almost all of millions of answers are known.
+            if !answers.iter().any(|(then, commands)| *then == state && commands.iter().copied().eq(labels())) {
+                answers.push((state, labels().collect()));
+            }
+            next.commands.clear();
             // What does not fit at all has changed nothing: the next event finds the cell as it was.
             if answered != Err(None) {
                 if seen.insert(key(&next)) {
@@ -76,7 +88,7 @@ pub fn table() -> Vec<Row> {
     let mut rows: BTreeMap<(State, &str), BTreeSet<Answer>> = BTreeMap::new();
     for (state, answers) in answers {
         for (name, answers) in names.iter().zip(answers) {
-            rows.entry((state, name)).or_default().extend(answers);
+            rows.entry((state, name)).or_default().extend(answers.into_iter().map(Answer::of));
         }
     }
     rows.into_iter().map(|((state, event), answers)| Row { state, event: event.to_owned(), answers }).collect()

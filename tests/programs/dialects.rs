@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use crate::path::{Part, ProgramStep, correction, part, truth, wheels, with};
-use crate::sweep::{clearance, places};
+use crate::sweep::{Swept, clearance, places};
 use regrind::compensation::path::{Move, PathMode, Wheel};
 use regrind::config::read_dialect;
 use regrind::formats::gcode::Dialect;
@@ -46,6 +46,8 @@ fn every_control_reads_the_path_of_the_plan_to_half_of_the_last_digit() {
         let (program, text) = read_back(&mut part, name);
         let (path, summary) = part.programs.path(&correction(part.half_mm)).unwrap();
         assert_eq!(program.stops.len() as u64, summary.moves, "{name}");
+        // Both are read from the dialect's file: once, and not for each of a hundred thousand lines.
+        let (within_mm, longest_line) = (half_a_step_mm(name) * (1.0 + 1e-6), dialect(name).text.longest_line);
         let mut at = [f64::NAN; 3];
         for (planned, stop) in path.moves().zip(&program.stops) {
             let feed = match planned {
@@ -64,12 +66,12 @@ fn every_control_reads_the_path_of_the_plan_to_half_of_the_last_digit() {
                 }
             };
             let off = (0..3).filter(|k| !at[*k].is_nan()).map(|k| (at[k] - stop.at_mm[k]).abs()).fold(0.0, f64::max);
-            assert!(off < half_a_step_mm(name) * (1.0 + 1e-6) && stop.feed_mm_min == feed, "{name}: {at:?} {stop:?}");
+            assert!(off < within_mm && stop.feed_mm_min == feed, "{name}: {at:?} {stop:?}");
         }
         assert_eq!(program.tolerance_mm, (name != "fanuc").then_some(part.programs.path_tolerance_mm), "{name}");
         let says = |words: &str| program.comments.iter().any(|comment| comment.to_ascii_lowercase() == words);
         assert!(says(&format!("map: sha256 {}", "a5".repeat(32))) && says("simulation"), "{name}");
-        assert!(text.lines().all(|line| line.len() <= dialect(name).text.longest_line), "{name}");
+        assert!(text.lines().all(|line| line.len() <= longest_line), "{name}");
     }
 }
 
@@ -155,9 +157,10 @@ fn the_wheel_that_goes_along_arcs_leaves_the_corrected_surface() {
                 let feed = stop.feed_mm_min.is_some();
                 steps.extend(stop.in_chords(from, 1e-6).into_iter().map(|at| ProgramStep { at, feed }));
             }
+            let swept = Swept::new(steps);
             let track_mm = part.programs.path(&correction(part.half_mm)).unwrap().0.track_mm();
             for place in places(&part, track_mm, 0.0) {
-                let off = clearance(&wheel, &steps, truth(&part, 0.02, place));
+                let off = clearance(&wheel, &swept, truth(&part, 0.02, place));
                 let within = WITHIN_MM + 2.0 * half_a_step_mm(name);
                 assert!(off.abs() < within, "{name}, {wheel_name}, {place:?}: {:.3} um", 1e3 * off);
             }
@@ -174,9 +177,10 @@ fn the_wheel_that_follows_what_a_control_has_read_leaves_the_corrected_surface()
         let (program, _) = read_back(&mut part, name);
         let steps: Vec<ProgramStep> =
             program.stops.iter().map(|s| ProgramStep { at: s.at_mm, feed: s.feed_mm_min.is_some() }).collect();
+        let swept = Swept::new(steps);
         let track_mm = part.programs.path(&correction(part.half_mm)).unwrap().0.track_mm();
         for place in places(&part, track_mm, 0.0) {
-            let off = clearance(&wheel, &steps, truth(&part, 0.02, place));
+            let off = clearance(&wheel, &swept, truth(&part, 0.02, place));
             assert!(off.abs() < WITHIN_MM + 2.0 * half_a_step_mm(name), "{name}, {place:?}: {:.3} um", 1e3 * off);
         }
     }

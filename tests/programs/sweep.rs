@@ -3,7 +3,7 @@
 //! The surface is that of the simulator's shapes, the wheel a distance of its own, the program is read back from its text.
 
 use crate::path::{Part, ProgramStep, correction, part, part_from_below, read, truth, truth_below, wheels, with};
-use crate::sample::seeds;
+use crate::sample::{cases, seeds};
 use regrind::compensation::path::{PathOptions, Pattern, TrackSpacing, Wheel};
 
 const PARTS: [&str; 4] = ["freeform-mirror", "off-axis-asphere", "shallow-wave", "biconic"];
@@ -26,13 +26,49 @@ pub fn distance(wheel: &Wheel, d: [f64; 3]) -> f64 {
     }
 }
 
+/// A program as the wheel goes through it, and the boxes that so many moves one after the other stay in.
+pub struct Swept {
+    pub steps: Vec<ProgramStep>,
+    boxes: Vec<[[f64; 3]; 2]>,
+}
+
+/// Moves in a box.
+const IN_A_BOX: usize = 64;
+
+impl Swept {
+    pub fn new(steps: Vec<ProgramStep>) -> Self {
+        // Each box has the place, too, from which its first move begins.
+        let boxes = (0..steps.len()).step_by(IN_A_BOX).map(|first| {
+            let of = &steps[first..(first + IN_A_BOX + 1).min(steps.len())];
+            let mut corners = [[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]];
+            for step in of {
+                for k in 0..3 {
+                    // The first move knows no x and y: no number makes a box larger.
+                    corners[0][k] = corners[0][k].min(step.at[k]);
+                    corners[1][k] = corners[1][k].max(step.at[k]);
+                }
+            }
+            corners
+        });
+        Self { boxes: boxes.collect(), steps }
+    }
+
+    /// Returns the moves of all boxes that a wheel may touch a point from.
+    fn near(&self, q: [f64; 3], reach_mm: f64) -> impl Iterator<Item = [[f64; 3]; 2]> {
+        let is_near = move |[least, most]: &[[f64; 3]; 2]| {
+            (0..3).all(|k| q[k] >= least[k] - reach_mm && q[k] <= most[k] + reach_mm)
+        };
+        let of = |i: usize| &self.steps[i * IN_A_BOX..(i * IN_A_BOX + IN_A_BOX + 1).min(self.steps.len())];
+        let boxes = self.boxes.iter().enumerate().filter(move |(_, corners)| is_near(corners));
+        boxes.flat_map(move |(i, _)| of(i).windows(2).map(|pair| [pair[0].at, pair[1].at]))
+    }
+}
+
 /// How far a point stays from a wheel that goes through a program, rapid moves included.
-pub fn clearance(wheel: &Wheel, steps: &[ProgramStep], q: [f64; 3]) -> f64 {
+pub fn clearance(wheel: &Wheel, program: &Swept, q: [f64; 3]) -> f64 {
     let reach = wheel.reach_mm() + 0.1;
     let mut nearest = f64::INFINITY;
-    for pair in steps.windows(2) {
-        let (a, b) = (pair[0].at, pair[1].at);
-        // Tests are built unoptimised, and almost every move is far away: these are asked of each, so they are plain.
+    for [a, b] in program.near(q, reach) {
         let beyond =
             |k: usize| (q[k] < a[k] - reach && q[k] < b[k] - reach) || (q[k] > a[k] + reach && q[k] > b[k] + reach);
         if beyond(0) || beyond(1) || beyond(2) {
@@ -59,13 +95,13 @@ pub fn clearance(wheel: &Wheel, steps: &[ProgramStep], q: [f64; 3]) -> f64 {
 }
 
 /// Writes a program and reads it back.
-fn program(part: &Part) -> (Vec<ProgramStep>, f64) {
+fn program(part: &Part) -> (Swept, f64) {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("part.ngc");
     let correction = correction(part.half_mm);
     let (path, _) = part.programs.path(&correction).unwrap();
     part.programs.write(&file, &correction, [3; 32]).unwrap();
-    (read(&std::fs::read_to_string(file).unwrap()), path.track_mm())
+    (Swept::new(read(&std::fs::read_to_string(file).unwrap())), path.track_mm())
 }
 
 /// Places on some tracks of a raster, and beside them by a share of their distance.
@@ -83,6 +119,11 @@ pub fn places(part: &Part, track_mm: f64, beside: f64) -> Vec<[f64; 2]> {
         .collect()
 }
 
+/// Each wheel on each part, or every second one of these: all parts and all wheels are among them.
+fn parts_and_wheels() -> impl Iterator<Item = (&'static str, (&'static str, Wheel))> {
+    cases(PARTS.into_iter().flat_map(|name| wheels(0.8).map(|wheel| (name, wheel))), 2)
+}
+
 #[test]
 fn every_wheel_leaves_the_corrected_surface_on_its_tracks() {
     for name in PARTS {
@@ -90,9 +131,9 @@ fn every_wheel_leaves_the_corrected_surface_on_its_tracks() {
         let plain = part.programs.options;
         for (wheel_name, wheel) in wheels(0.8) {
             part.programs.options = with(&plain, wheel, 4.0);
-            let (steps, track_mm) = program(&part);
+            let (swept, track_mm) = program(&part);
             for place in places(&part, track_mm, 0.0) {
-                let off = clearance(&wheel, &steps, truth(&part, 0.02, place));
+                let off = clearance(&wheel, &swept, truth(&part, 0.02, place));
                 assert!(off.abs() < WITHIN_MM, "{name}, {wheel_name}, {place:?}: {:.3} um", 1e3 * off);
             }
         }
@@ -106,19 +147,20 @@ fn from_below_every_wheel_leaves_the_corrected_lower_side() {
         let plain = part.programs.options;
         for (wheel_name, wheel) in wheels(0.8) {
             part.programs.options = with(&plain, wheel, 4.0);
-            let (steps, track_mm) = program(&part);
+            let (swept, track_mm) = program(&part);
             // As it stands in the model frame: its spindle points the other way.
             let stands = wheel.mirrored();
             for place in places(&part, track_mm, 0.0) {
-                let off = clearance(&stands, &steps, truth_below(&part, 0.02, place));
+                let off = clearance(&stands, &swept, truth_below(&part, 0.02, place));
                 assert!(off.abs() < WITHIN_MM, "{name}, {wheel_name}, {place:?}: {:.3} um", 1e3 * off);
             }
             for place in places(&part, track_mm, 0.4) {
-                let off = clearance(&stands, &steps, truth_below(&part, 0.02, place));
+                let off = clearance(&stands, &swept, truth_below(&part, 0.02, place));
                 assert!(off > -WITHIN_MM, "{name}, {wheel_name}: {:.3} um too deep at {place:?}", -1e3 * off);
             }
             // It travels under everything that it grinds.
-            let least = |feed: bool| steps.iter().filter(|s| s.feed == feed).fold(f64::INFINITY, |z, s| z.min(s.at[2]));
+            let least =
+                |feed: bool| swept.steps.iter().filter(|s| s.feed == feed).fold(f64::INFINITY, |z, s| z.min(s.at[2]));
             assert!(least(false) < least(true), "{name}, {wheel_name}");
         }
     }
@@ -127,17 +169,15 @@ fn from_below_every_wheel_leaves_the_corrected_lower_side() {
 #[test]
 fn between_tracks_the_ridges_are_as_high_as_stated_and_nothing_is_cut_deeper() {
     let height_mm = 1e-2;
-    for (name, (wheel_name, wheel)) in
-        PARTS.into_iter().flat_map(|name| wheels(0.8).into_iter().map(move |w| (name, w)))
-    {
+    for (name, (wheel_name, wheel)) in parts_and_wheels() {
         let mut part = part(name);
         part.programs.options = with(&part.programs.options, wheel, 4.0);
         part.programs.options.spacing = TrackSpacing::Scallop { height_mm, widest_mm: 20.0 };
-        let (steps, track_mm) = program(&part);
+        let (swept, track_mm) = program(&part);
         let mut highest = f64::NEG_INFINITY;
         for beside in [0.1, 0.3, 0.5] {
             for place in places(&part, track_mm, beside) {
-                let off = clearance(&wheel, &steps, truth(&part, 0.02, place));
+                let off = clearance(&wheel, &swept, truth(&part, 0.02, place));
                 assert!(off > -WITHIN_MM, "{name}, {wheel_name}: {:.3} um too deep at {place:?}", -1e3 * off);
                 // The formula takes the ridge for a parabola; the next order is a few percent of it here.
                 assert!(
@@ -161,7 +201,7 @@ fn the_scallops_told_of_a_path_are_those_that_the_wheel_leaves() {
     ] {
         let mut part = part(name);
         part.programs.options = PathOptions { pattern, ..with(&part.programs.options, wheel, 1.0) };
-        let (steps, _) = program(&part);
+        let (swept, _) = program(&part);
         let told = part.programs.path(&correction(part.half_mm)).unwrap().0.scallops();
         // Grooves all over the part, each looked at from its one side to the other: as far as two tracks are apart, wherever that begins.
         const GROOVES: [usize; 2] = [9, 6];
@@ -179,7 +219,7 @@ fn the_scallops_told_of_a_path_are_those_that_the_wheel_leaves() {
             };
             let off: Vec<f64> = (0..PLACES)
                 .map(|i| told.track_mm * (i as f64 / PLACES as f64 - 0.5))
-                .map(|t| clearance(&wheel, &steps, truth(&part, 0.02, [0, 1].map(|i| at[i] + t * across[i]))))
+                .map(|t| clearance(&wheel, &swept, truth(&part, 0.02, [0, 1].map(|i| at[i] + t * across[i]))))
                 .collect();
             let mean = off.iter().sum::<f64>() / PLACES as f64;
             highest = off.iter().fold(highest, |most, h| most.max(*h));
@@ -200,31 +240,28 @@ fn a_spiral_leaves_ridges_within_its_distance_everywhere() {
     let wheel = Wheel::Sphere { radius_mm: 12.5 };
     part.programs.options = with(&part.programs.options, wheel, 0.4);
     part.programs.options.pattern = Pattern::Spiral;
-    let (steps, _) = program(&part);
+    let (swept, _) = program(&part);
     // h = s^2 / 8 (1 / R - k): hollow with 180 mm and more; on a slope s grows.
     let most = 0.4f64.powi(2) / 8.0 / 12.5 * 1.1;
     for k in 0..200 {
         let (r, angle) = (29.9 * (k as f64 / 200.0).sqrt(), 2.4 * k as f64);
-        let off = clearance(&wheel, &steps, truth(&part, 0.02, [r * angle.cos(), r * angle.sin()]));
+        let off = clearance(&wheel, &swept, truth(&part, 0.02, [r * angle.cos(), r * angle.sin()]));
         assert!(off > -WITHIN_MM && off < most + WITHIN_MM, "{:.3} um at {r} {angle}", 1e3 * off);
     }
 }
 
 #[test]
 fn no_spiral_cuts_deeper_anywhere() {
-    for name in PARTS {
+    for (name, (wheel_name, wheel)) in parts_and_wheels() {
         let mut part = part(name);
-        let plain = part.programs.options;
-        for (wheel_name, wheel) in wheels(0.8) {
-            part.programs.options = PathOptions { pattern: Pattern::Spiral, ..with(&plain, wheel, 3.0) };
-            let (steps, _) = program(&part);
-            let [a, b] = part.half_mm;
-            for k in 0..150 {
-                let (r, angle) = ((k as f64 / 150.0).sqrt(), 2.4 * k as f64);
-                let place = [a * r * angle.cos(), b * r * angle.sin()];
-                let off = clearance(&wheel, &steps, truth(&part, 0.02, place));
-                assert!(off > -WITHIN_MM, "{name}, {wheel_name}: {:.3} um too deep at {place:?}", -1e3 * off);
-            }
+        part.programs.options = PathOptions { pattern: Pattern::Spiral, ..with(&part.programs.options, wheel, 3.0) };
+        let (swept, _) = program(&part);
+        let [a, b] = part.half_mm;
+        for k in 0..150 {
+            let (r, angle) = ((k as f64 / 150.0).sqrt(), 2.4 * k as f64);
+            let place = [a * r * angle.cos(), b * r * angle.sin()];
+            let off = clearance(&wheel, &swept, truth(&part, 0.02, place));
+            assert!(off > -WITHIN_MM, "{name}, {wheel_name}: {:.3} um too deep at {place:?}", -1e3 * off);
         }
     }
 }
@@ -236,7 +273,7 @@ fn with_the_normals_of_the_nominal_surface_it_would_not_hold() {
     let correction = correction(part.half_mm);
     let flat = regrind::compensation::Correction { values_mm: vec![0.0; correction.grid.len()], ..correction };
     let (path, _) = part.programs.path(&flat).unwrap();
-    let steps: Vec<ProgramStep> = path
+    let steps = path
         .moves()
         .filter_map(|one| match one {
             regrind::compensation::path::Move::Feed { at, .. } => {
@@ -245,10 +282,11 @@ fn with_the_normals_of_the_nominal_surface_it_would_not_hold() {
             _ => None,
         })
         .collect();
+    let swept = Swept::new(steps);
     let wheel = part.programs.options.wheel;
     let worst = places(&part, path.track_mm(), 0.0)
         .into_iter()
-        .map(|place| clearance(&wheel, &steps, truth(&part, 0.02, place)).abs())
+        .map(|place| clearance(&wheel, &swept, truth(&part, 0.02, place)).abs())
         .fold(0.0, f64::max);
     assert!(worst > 5.0 * WITHIN_MM, "{worst}");
 }

@@ -3,14 +3,20 @@
 
 #![cfg(unix)]
 
+use crate::sample::all;
 use crate::worlds::{JOB, Ran, Setup, run, table};
 use regrind::cell::{AlarmId, Ending};
 use regrind_sim::spec::{Faults, Mirrored, Misreported};
 
 const RECIPE: &str = "freeform-mirror";
 
+/// The whole pattern tells no more of what is wrong than a quarter of it, and takes three times as long.
+fn usual() -> Setup {
+    Setup { coarse: !all(), ..Setup::new(RECIPE, 1) }
+}
+
 fn broken(faults: Faults) -> Setup {
-    Setup::new(RECIPE, 1).with(move |world| world.faults = faults.clone())
+    usual().with(move |world| world.faults = faults.clone())
 }
 
 /// The first alarm must be this one, say these words, and come after so many passes; nothing is accepted, and no further pass is begun.
@@ -46,7 +52,6 @@ fn each_is_caught<const N: usize>(cases: [Case; N], passes: usize) {
 
 #[test]
 fn machines_that_answer_wrongly_are_told_before_anything_is_written() {
-    let usual = || Setup::new(RECIPE, 1);
     let (other_order, exchanged) = (Setup { other_word_order: true, ..usual() }, Setup { exchanged: true, ..usual() });
     let order_words = &["word order", "nothing was written", "word_order in the cell file"];
     let older = &["version 1 of the register map", "lacks a beat that names its owner", "bring it up to version 2"];
@@ -128,7 +133,7 @@ fn what_is_wrong_with_a_measurement_is_told_from_it() {
 
 #[test]
 fn a_measurement_outside_its_window_of_temperature_is_not_used() {
-    let window = |least: f64, most: f64| Setup { temperature_c: Some([least, most]), ..Setup::new(RECIPE, 1) };
+    let window = |least: f64, most: f64| Setup { temperature_c: Some([least, most]), ..usual() };
     let warm = window(19.5, 20.5).with(|world| world.cmm.part_temperature_c = 23.25);
     let words = &["it was 23.25 degrees Celsius, and 19.50 to 20.50 degrees Celsius are wanted", "Let the part"];
     caught("a warm part", warm, AlarmId::Temperature, words, 1);
@@ -140,7 +145,7 @@ fn a_measurement_outside_its_window_of_temperature_is_not_used() {
 fn a_warm_part_is_judged_by_what_it_is_at_20_degrees() {
     // Ten kelvins at 8e-6 a kelvin: a curved part swells out of its own shape.
     let at = |temperature_c: f64, expansion_um_m_k: Option<f64>| {
-        let setup = Setup { expansion_um_m_k, ..Setup::new(RECIPE, 1) };
+        let setup = Setup { expansion_um_m_k, ..usual() };
         let setup = setup.with(move |world| {
             (world.cmm.part_temperature_c, world.cmm.cte_per_k, world.cmm.noise_um) = (temperature_c, 8e-6, 0.05);
             // A part that has grown is touched at other places of its scallops.
@@ -168,7 +173,7 @@ fn a_warm_part_is_judged_by_what_it_is_at_20_degrees() {
 #[test]
 fn a_probe_that_is_10_um_off_is_told_from_the_reference_sphere() {
     for error_um in [10.0, -10.0] {
-        let setup = Setup::new(RECIPE, 1).with(move |world| world.cmm.probe_radius_error_um = error_um);
+        let setup = usual().with(move |world| world.cmm.probe_radius_error_um = error_um);
         let words = ["radius of the probe", "off by", "Qualify the probe"];
         caught(&format!("{error_um} um"), setup, AlarmId::ProbeRadius, &words, 1);
     }

@@ -120,7 +120,7 @@ async fn killed(seeds: impl Iterator<Item = u64>) {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_killed_program_is_taken_up_again_and_starts_every_pass_once() {
-    killed(1..=seeds(5)).await;
+    killed(1..=seeds(3)).await;
 }
 
 #[test]
