@@ -16,8 +16,8 @@ struct Shop {
 impl Shop {
     fn new() -> Self {
         let recipe = fs::read_to_string(root().join("recipes/shallow-wave.toml")).unwrap();
-        let recipe = replaced(&recipe, "columns = 50\nrows = 40", "columns = 34\nrows = 26");
-        let recipe = replaced(&recipe, "cutoff_mm = 5.0", "cutoff_mm = 8.0\nlearn = true");
+        let recipe = replaced(&recipe, "columns = 50\nrows = 40", "columns = 25\nrows = 20");
+        let recipe = replaced(&recipe, "cutoff_mm = 5.0", "cutoff_mm = 11.0\nlearn = true");
         let recipe = replaced(&recipe, "most_cycles = 5", "most_cycles = 2");
         Self { home: tempfile::tempdir().unwrap(), recipe }
     }

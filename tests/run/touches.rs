@@ -6,6 +6,7 @@ use std::path::Path;
 use crate::killed::run_with_kills;
 use crate::outlived::{began_once, on_serial_lines};
 use crate::program::changed;
+use crate::sample::cases;
 use crate::worlds::{Ran, Setup, run, table};
 use regrind::cell::AlarmId;
 use regrind::drive::Notice;
@@ -31,7 +32,7 @@ fn batches(folder: &Path) -> Vec<u64> {
 
 #[test]
 fn a_part_is_made_with_a_sixth_of_the_touches_and_is_what_it_is_said_to_be() {
-    for (recipe, seed) in [("freeform-mirror", 1), ("biconic", 2)] {
+    for (recipe, seed) in cases([("freeform-mirror", 1), ("biconic", 2)], 2) {
         let ran = run(chosen(recipe, seed));
         assert!(ran.accepted(), "{recipe}: {}", ran.told());
         let told = document(&ran.folder.join("result.json"));
