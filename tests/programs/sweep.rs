@@ -40,15 +40,11 @@ impl Swept {
         // Each box has the place, too, from which its first move begins.
         let boxes = (0..steps.len()).step_by(IN_A_BOX).map(|first| {
             let of = &steps[first..(first + IN_A_BOX + 1).min(steps.len())];
-            let mut corners = [[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]];
-            for step in of {
-                for k in 0..3 {
-                    // The first move knows no x and y: no number makes a box larger.
-                    corners[0][k] = corners[0][k].min(step.at[k]);
-                    corners[1][k] = corners[1][k].max(step.at[k]);
-                }
-            }
-            corners
+            // The first move knows no x and y: what is no number makes no box larger.
+            let bound = |start: f64, of_two: fn(f64, f64) -> f64| {
+                [0, 1, 2].map(|k| of.iter().map(|step| step.at[k]).fold(start, of_two))
+            };
+            [bound(f64::INFINITY, f64::min), bound(f64::NEG_INFINITY, f64::max)]
         });
         Self { boxes: boxes.collect(), steps }
     }
