@@ -73,7 +73,6 @@ fn beats(rig: &Rig) -> [usize; 2] {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-#[ignore = "computes for half a minute: for .ci/run"]
 async fn beats_and_orders_stay_on_time_while_451_401_points_are_computed() {
     let mut rig = Rig::new(recipe()).await;
     let ready = rig.next(true);
