@@ -2,18 +2,19 @@
 //!
 //! A few worlds only; `cargo run --release --example convergence` draws fifty for each recipe and prints the figures.
 
+use crate::sample::seeds;
 use crate::study::{After, Bench, RECIPES, Way};
 use rayon::prelude::*;
 use regrind::compensation::GainRule;
 
-/// Worlds drawn for each recipe.
-const SEEDS: u64 = 2;
 const PASSES: u16 = 3;
 
 fn runs(way: Way, parts: usize) -> Vec<(String, Vec<Vec<After>>)> {
     let benches: Vec<Bench> = RECIPES.iter().map(|name| Bench::new(name)).collect();
-    let each = (0..benches.len() as u64 * SEEDS).into_par_iter().map(|k| {
-        let (bench, seed) = (&benches[(k / SEEDS) as usize], 1 + k % SEEDS);
+    // Worlds of each recipe.
+    let drawn = seeds(1);
+    let each = (0..benches.len() as u64 * drawn).into_par_iter().map(|k| {
+        let (bench, seed) = (&benches[(k / drawn) as usize], 1 + k % drawn);
         (format!("{}, seed {seed}", bench.name), bench.parts(seed, way, parts, PASSES))
     });
     each.collect()

@@ -39,6 +39,8 @@ struct Report {
     tolerance_um: [f64; 2],
     grinds: Vec<usize>,
     cycles: Vec<Cycle>,
+    /// The files of the first cycle that are missing.
+    missing: Vec<&'static str>,
 }
 
 /// Holds every measured cycle of a run against the truth.
@@ -59,7 +61,14 @@ fn report(seed: u64, ran: &Ran) -> Report {
     let grinds = (1..=rows.len()).map(|cycle| ran.world.grinds_begun(JOB, cycle as u16)).collect();
     let [pv, rms] = ran.tolerance_mm;
     let tolerance_um = [1e3 * pv, 1e3 * rms];
-    Report { seed, ending: ran.ending.clone(), told: ran.told(), tolerance_um, grinds, cycles }
+    let missing = missing(ran);
+    Report { seed, ending: ran.ending.clone(), told: ran.told(), tolerance_um, grinds, cycles, missing }
+}
+
+/// The files of the first cycle that are missing.
+fn missing(ran: &Ran) -> Vec<&'static str> {
+    let written = |file: &&str| ran.folder.join("cycle-1").join(file).is_file();
+    ["correction.csv", "toolpath.ngc", "toolpath_z.csv"].into_iter().filter(|file| !written(file)).collect()
 }
 
 fn compare(ran: &Ran, cycle: u32, best: &Truth, [found_pv_um, found_rms_um]: [f64; 2]) -> Cycle {
@@ -105,7 +114,7 @@ fn drawn() -> &'static [Report] {
             let mut done = Vec::new();
             loop {
                 let seed = next.fetch_add(1, Ordering::Relaxed);
-                if seed > seeds(3) {
+                if seed > seeds(2) {
                     return done;
                 }
                 done.push(report(seed, &run(Setup::new("freeform-mirror", seed))));
@@ -223,14 +232,15 @@ fn the_pose_agrees_with_the_truth_within_its_uncertainty() {
 
 #[test]
 fn every_recipe_ends_accepted() {
-    for recipe in ["freeform-mirror", "off-axis-asphere", "biconic", "shallow-wave"] {
+    let mirror = &drawn()[0];
+    assert!(matches!(mirror.ending, Ending::Accepted { .. }), "{}", mirror.told);
+    assert!(mirror.missing.is_empty(), "{:?}", mirror.missing);
+    for recipe in ["off-axis-asphere", "biconic", "shallow-wave"] {
         let ran = run(Setup::new(recipe, 1));
         let rows = ran.rows();
         println!("{recipe}\n{}", ran.told());
         assert!(ran.accepted(), "{recipe}\n{}", ran.told());
-        for file in ["correction.csv", "toolpath.ngc", "toolpath_z.csv"] {
-            assert!(ran.folder.join("cycle-1").join(file).is_file(), "{recipe}: no {file}");
-        }
+        assert!(missing(&ran).is_empty(), "{recipe}: {:?}", missing(&ran));
         for row in &rows {
             assert_eq!(ran.world.grinds_begun(JOB, row.cycle as u16), 1, "{recipe}, cycle {}", row.cycle);
         }

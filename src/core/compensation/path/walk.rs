@@ -200,7 +200,7 @@ impl<'a> Moves<'a> {
 impl Iterator for Moves<'_> {
     type Item = Move;
 
-    #[inline]
+    // Not inlined: a call is nothing beside a step along the path, and who writes the moves would compile all of this.
     fn next(&mut self) -> Option<Move> {
         let safe = self.path.travel_mm();
         let (state, given) = match self.state {
