@@ -12,7 +12,7 @@ const PASSES: u16 = 3;
 fn runs(way: Way, parts: usize) -> Vec<(String, Vec<Vec<After>>)> {
     let benches: Vec<Bench> = RECIPES.iter().map(|name| Bench::new(name)).collect();
     // Worlds of each recipe.
-    let drawn = seeds(1);
+    let drawn = seeds(2);
     let each = (0..benches.len() as u64 * drawn).into_par_iter().map(|k| {
         let (bench, seed) = (&benches[(k / drawn) as usize], 1 + k % drawn);
         (format!("{}, seed {seed}", bench.name), bench.parts(seed, way, parts, PASSES))
