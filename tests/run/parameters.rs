@@ -95,6 +95,7 @@ fn what_is_beyond_its_tolerance_is_asked_for_and_the_cell_is_shown_as_held() {
 
 /// A few worlds; `cargo run --release --example parameters` draws two hundred.
 #[test]
+#[ignore = "worlds are drawn, for .ci/long"]
 fn what_is_told_of_a_few_worlds_holds_and_saves() {
     let bench = Bench::new("freeform-mirror").held([false; 6]);
     let made: Vec<Compared> = (1..=seeds(4)).into_par_iter().map(|seed| bench.told_apart(seed, 2)).collect();

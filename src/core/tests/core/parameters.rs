@@ -178,6 +178,7 @@ fn coverage(
 }
 
 #[test]
+#[ignore = "worlds are drawn, for .ci/long"]
 fn values_are_within_what_is_stated_of_them() {
     use ParameterKind::{SettingX, SettingY, WheelRadius};
     for (free, world) in [(DATUM, [0.9, 18.0, 0.3]), (DATUM, [0.9, 8.0, 0.3]), ([true; 6], [0.9, 14.0, 0.3])] {
