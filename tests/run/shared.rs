@@ -2,7 +2,6 @@
 
 use rayon::prelude::*;
 
-
 use crate::study::others::{Differ, Pair, TAUGHT_BY, Taught};
 use crate::study::{After, Bench, RECIPES};
 
