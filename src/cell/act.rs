@@ -426,6 +426,11 @@ impl Cell {
         let Some(figures) = self.figures.take() else { return self.go(Held(Register)) };
         let Judged { verdict, mut reason } = judge::judge(&self.plan, self.previous.as_deref(), &figures, self.passes);
         let response = figures.response;
+        if verdict == Verdict::LeftOut {
+            // The figures of the part are not known yet: nothing is compared with them.
+            self.push(Command::Announce(Judgement { cycle: self.cycle, verdict, reason: reason.clone() }));
+            return self.useless(AlarmId::LeftOut, &reason);
+        }
         let distance = |of: &Figures| judge::distance(&self.plan, of);
         match &self.best {
             Some((cycle, best)) if distance(best) < distance(&figures) && *cycle != self.cycle => {
@@ -440,6 +445,7 @@ impl Cell {
         self.push(Command::Announce(Judgement { cycle: self.cycle, verdict, reason: reason.clone() }));
         match verdict {
             Verdict::Accept => self.accept(reason),
+            Verdict::LeftOut => {}
             Verdict::Continue => self.advance(Compensate),
             Verdict::MaxCycles => self.give_up(AlarmId::MaxCycles, &reason),
             Verdict::BudgetSpent => self.give_up(AlarmId::BudgetSpent, &reason),

@@ -319,6 +319,13 @@ catalogue! {
         ["Measure with more points or less noise: a smaller uncertainty decides.",
          "Another pass would take material and is not expected to help."]
     }
+    /// A part that is good but for points that were left out.
+    LeftOut {
+        "Points were left out that no neighbour agrees with, and with them the part exceeds a limit",
+        "The part is not accepted: what was touched counts until it is touched again.", Operator,
+        ["Look at the places that are named, and clean them and the probe.", "Resume to measure again.",
+         "If the same places are named again, they are on the part: stop the run and let quality decide."]
+    }
     /// Passes spent.
     MaxCycles {
         "The recipe allows no further pass", "The run ends, not in tolerance.", ProcessEngineer,

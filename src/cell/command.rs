@@ -90,6 +90,8 @@ pub enum Verdict {
     Stalled,
     /// The uncertainty reaches over a limit, and another pass would not help.
     Undecided,
+    /// In tolerance but for points that were left out: those places are to be touched again.
+    LeftOut,
     /// No pass is left.
     MaxCycles,
     /// No material is left to take off.

@@ -305,6 +305,9 @@ pub struct Figures {
     pub points: u32,
     /// Points left out as outliers.
     pub outliers: u32,
+    /// The figures with those points, and where they lie; none where there are none, and in records of earlier versions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub left_out: Option<Box<LeftOut>>,
     /// How far the part lies from where it was expected.
     #[serde(with = "super::number")]
     pub shift_mm: f64,
@@ -326,6 +329,19 @@ pub struct Figures {
     /// What is to be touched before anything is decided; none where enough is known, and where all is touched at once.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub touch_on: Option<Box<TouchOn>>,
+}
+
+/// What the figures are with the points that were left out.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LeftOut {
+    /// Peak to valley of the deviations.
+    #[serde(with = "super::number")]
+    pub pv_mm: f64,
+    /// Root mean square of the deviations.
+    #[serde(with = "super::number")]
+    pub rms_mm: f64,
+    /// Which points, where they lie and how far off they are, in words.
+    pub places: String,
 }
 
 /// More that is to be touched.

@@ -28,6 +28,8 @@ impl Figures {
             self.pv_robust_mm.unwrap_or(0.0),
             self.forecast.map_or(0.0, |f| f.rms_mm + f.sigma_mm + f.floor_mm.unwrap_or(0.0)),
             self.removed_mm.unwrap_or(0.0),
+            self.left_out.as_ref().map_or(0.0, |of| of.pv_mm),
+            self.left_out.as_ref().map_or(0.0, |of| of.rms_mm),
         ];
         let form = self.form.iter().flat_map(|form| [form.pv, form.pv_robust, form.rms]);
         all.iter().all(|figure| figure.is_finite() && *figure >= 0.0) && form.into_iter().all(|of| of.is_sound())
@@ -133,6 +135,9 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
     let figures = told(plan, now);
     let conformity = conformity(plan, now);
     if conformity == Conformity::Within {
+        if let Some(beyond) = beyond_with_left_out(plan, now) {
+            return tell(Verdict::LeftOut, format!("{beyond}; without what was left out: {figures}"));
+        }
         return tell(Verdict::Accept, format!("in tolerance: {figures}"));
     }
     let spent = now.removed_mm.filter(|removed| removed + plan.least_depth_mm > plan.removal_budget_mm);
@@ -191,6 +196,24 @@ fn go_on(plan: &CellPlan, before: Option<&Figures>, now: &Figures, conformity: C
     }
     let verdict = if undecided { Verdict::Undecided } else { Verdict::Stalled };
     tell(verdict, format!("no gain is to be expected, and {so_far}: {figures}; {expected}"))
+}
+
+/// Names the points that were left out where the part would exceed a limit with them: what was touched counts until it is touched again.
+///
+/// They add to what was found as much as they add to the figures of the points.
+fn beyond_with_left_out(plan: &CellPlan, now: &Figures) -> Option<String> {
+    let left_out = now.left_out.as_ref()?;
+    let [pv, rms] = plan.tolerance.compare(now);
+    let more = |with_mm: f64, without_mm: f64| (with_mm - without_mm).max(0.0);
+    let pv_mm = pv.found_mm + more(left_out.pv_mm, now.pv_mm);
+    let rms_mm = (rms.found_mm.powi(2) + more(left_out.rms_mm.powi(2), now.rms_mm.powi(2))).sqrt();
+    let beyond = [("PV", pv_mm, pv.limit_mm), ("RMS", rms_mm, rms.limit_mm)];
+    let beyond: Vec<String> = beyond
+        .into_iter()
+        .filter(|(_, with_mm, limit_mm)| with_mm > limit_mm)
+        .map(|(name, with_mm, limit_mm)| format!("{name} {} of {}", um(with_mm), um(limit_mm)))
+        .collect();
+    (!beyond.is_empty()).then(|| format!("{}; with what was left out: {}", left_out.places, beyond.join(", ")))
 }
 
 /// The worse of the two figures that are limited.

@@ -33,7 +33,8 @@ pub use alarm::{Alarm, AlarmId, Role};
 pub use command::{Command, Ending, Judgement, Verdict};
 pub use event::{
     Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Forecast, FormFigures, Gate,
-    GateFailure, JobResult, Mismatch, Occupation, ParameterTold, Reconciliation, RecordFailure, Response, TouchOn,
+    GateFailure, JobResult, LeftOut, Mismatch, Occupation, ParameterTold, Reconciliation, RecordFailure, Response,
+    TouchOn,
 };
 pub use figure::Interval;
 pub use judge::{Compared, Conformity};

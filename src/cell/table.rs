@@ -8,7 +8,7 @@ use std::time::Duration;
 use super::command::{Command, spelled};
 use super::event::{
     Actor, Asked, CompensationRefusal, CompensationSummary, Condition, Event, Figures, Gate, GateFailure, JobResult,
-    Mismatch, Occupation, Reconciliation, RecordFailure, Response, TouchOn,
+    LeftOut, Mismatch, Occupation, Reconciliation, RecordFailure, Response, TouchOn,
 };
 use super::memory::Cell;
 use super::plan::{Beginning, CellPlan, Deadlines, Disposal, Gates, PvOf, Tolerance};
@@ -16,7 +16,7 @@ use super::state::{Device, Phase, State};
 
 /// The version of the table. A run is gone on with by a program of the version that began it only; a change of what follows from
 /// anything is another version.
-pub const TABLE_VERSION: u32 = 7;
+pub const TABLE_VERSION: u32 = 8;
 
 /// What an event does in a state.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -261,6 +261,7 @@ fn sample_figures() -> Vec<Figures> {
         coverage: 0.99,
         points: 99,
         outliers: 0,
+        left_out: None,
         shift_mm: 0.1,
         turn_rad: 0.01,
         weak_directions: Vec::new(),
@@ -275,6 +276,12 @@ fn sample_figures() -> Vec<Figures> {
         Figures { pv_mm: 0.020, rms_mm: 0.004, ..plain.clone() },
         Figures { pv_mm: 0.060, ..plain.clone() },
         Figures { pv_mm: 0.005, rms_mm: 0.001, ..plain.clone() },
+        Figures {
+            pv_mm: 0.005,
+            rms_mm: 0.001,
+            left_out: Some(Box::new(LeftOut { pv_mm: 0.050, rms_mm: 0.002, places: String::new() })),
+            ..plain.clone()
+        },
         Figures { coverage: 0.5, ..plain.clone() },
         Figures { shift_mm: 5.0, ..plain.clone() },
         Figures { turn_rad: 3.0, ..plain.clone() },

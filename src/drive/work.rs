@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::cell::{
     CompensationRefusal, CompensationSummary, Event, Figures, Forecast, FormFigures, Gate, GateFailure, Interval,
-    ParameterTold, Response, TouchOn,
+    LeftOut, ParameterTold, Response, TouchOn,
 };
 use crate::compensation::{self, Correction, ErrorMap, LearningState, NextPassError, Seen, Sense, error_map, response};
 use crate::device::{Coordinates, Identified, Measurement, Plan, PointStatus, TargetKind};
@@ -427,6 +427,9 @@ fn figures(
         coverage: verdict.coverage,
         points: verdict.used as u32,
         outliers,
+        left_out: found
+            .with_left_out()
+            .map(|of| Box::new(LeftOut { pv_mm: of.pv_mm, rms_mm: of.rms_mm, places: of.places })),
         shift_mm: moved.translation_mm.norm(),
         turn_rad: moved.angle_rad(),
         weak_directions: verdict.weak_directions.iter().map(|w| w.words.clone()).collect(),

@@ -49,6 +49,13 @@ pub struct RegistrationDocument<'a> {
     /// Indices of the measured points, from 0.
     pub outliers: Vec<usize>,
     pub off_part: Vec<usize>,
+    /// Each point that did not take part, and why.
+    pub left_out: Vec<LeftOut>,
+    /// The figures with the outliers among them; absent where there are none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rms_with_left_out_mm: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub pv_with_left_out_mm: Option<f64>,
     pub trace: &'a [Iteration],
 }
 
@@ -75,6 +82,17 @@ pub struct NominalInput<'a> {
 #[allow(missing_docs)]
 pub struct MeasuredInput<'a> {
     pub file: &'a Path,
+}
+
+/// A point that did not take part in the fit.
+#[derive(Serialize)]
+#[allow(missing_docs)]
+pub struct LeftOut {
+    /// From 0.
+    pub index: usize,
+    pub deviation_mm: f64,
+    /// `alone`: far from the surface, and no neighbour found the same. `off_part`: its foot lies beyond the edge of the nominal surface.
+    pub reason: &'static str,
 }
 
 /// Another pose that fits about as well.
@@ -144,6 +162,9 @@ impl<'a> RegistrationDocument<'a> {
             side: registration.side,
             outliers: with(PointStatus::Outlier),
             off_part: with(PointStatus::OffPart),
+            left_out: registration.deviations.iter().enumerate().filter_map(left_out).collect(),
+            rms_with_left_out_mm: registration.with_left_out().map(|with| with.rms_mm),
+            pv_with_left_out_mm: registration.with_left_out().map(|with| with.pv_mm),
             trace: &registration.trace,
         }
     }
@@ -160,6 +181,7 @@ impl<'a> RegistrationDocument<'a> {
             ("the covariance", finite(self.covariance.as_flattened())),
             ("the condition", self.condition.is_finite()),
             ("a figure of the deviations", finite(&[self.rms_mm, self.pv_mm, self.residual_sigma_mm, self.coverage])),
+            ("a deviation that was left out", self.left_out.iter().all(|of| of.deviation_mm.is_finite())),
             ("the trace", self.trace.iter().all(step)),
             ("a weak direction", self.weak_directions.iter().all(|w| w.sigma_mm.is_none_or(f64::is_finite))),
             (
@@ -169,6 +191,15 @@ impl<'a> RegistrationDocument<'a> {
         ];
         checks.into_iter().find(|(_, finite)| !finite).map_or(Ok(()), |(what, _)| Err(what))
     }
+}
+
+fn left_out((index, deviation): (usize, &Deviation)) -> Option<LeftOut> {
+    let reason = match deviation.status {
+        PointStatus::Outlier => "alone",
+        PointStatus::OffPart => "off_part",
+        _ => return None,
+    };
+    Some(LeftOut { index, deviation_mm: deviation.deviation_mm, reason })
 }
 
 /// Writes `deviations.csv`, `deviation_uncertainty.csv` and `registration.json` into a folder; the JSON comes last, so that the

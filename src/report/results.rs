@@ -7,7 +7,7 @@ use super::form::read_figures;
 use super::story::{CycleStory, Measurement, Story};
 use super::words::{ending_words, verdict_words};
 use super::{ReportError, dfq, qif};
-use regrind_cell::{Conformity, Ending, Figures, Tolerance};
+use regrind_cell::{Conformity, Ending, Figures, Tolerance, Verdict};
 use regrind_formats::write_atomic;
 use regrind_journal::Record;
 
@@ -179,7 +179,12 @@ impl Measured {
     fn of(cycle: u32, of: &Measurement, tolerance: Option<&Tolerance>) -> Self {
         let judgement = of.judgements.last();
         let figures = of.figures.as_ref().map(|figures| figures_of(figures, tolerance, judgement.is_some()));
-        let figures = figures.unwrap_or_default();
+        let mut figures = figures.unwrap_or_default();
+        if judgement.is_some_and(|last| last.verdict == Verdict::LeftOut) {
+            // Until those places are touched again nobody knows.
+            let within = figures.iter_mut().filter(|figure| figure.standing == Standing::Within);
+            within.for_each(|figure| figure.standing = Standing::Undecided);
+        }
         Self {
             cycle,
             utc: of.utc.clone(),

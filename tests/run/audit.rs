@@ -39,6 +39,7 @@ fn figures() -> Figures {
         coverage: 0.99,
         points: 812,
         outliers: 3,
+        left_out: None,
         shift_mm: 0.1,
         turn_rad: 0.01,
         weak_directions: Vec::new(),

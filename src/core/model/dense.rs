@@ -94,6 +94,17 @@ impl Dense {
         observed.deviations_mm.iter().zip(&self.weights).map(|(d, w)| d * w).sum()
     }
 
+    /// What the field and the effects leave of each observation: the most probable scatter, N K^-1 (d - H b) without what is stated.
+    pub(super) fn residuals_mm(&self) -> Vec<f64> {
+        let scatter2 = self.hyper.scatter_mm * self.hyper.scatter_mm;
+        let (n, drifts) = (self.places.len(), self.hyper.drift > 0.0 && !self.path.is_empty());
+        let of = |r: usize| match drifts {
+            true => (0..n).map(|k| shared(&self.hyper, &self.path, r, k) * self.weights[k]).sum(),
+            false => self.weights[r],
+        };
+        (0..n).map(|r| scatter2 * of(r)).collect()
+    }
+
     /// Returns the effects and their covariance, those that are stated behind the others: with the motions of the part as effects, where its nominal frame is, and how well
     /// that is known beside a field that nobody knows either.
     pub fn effects(&self) -> (&DVector<f64>, &DMatrix<f64>) {

@@ -19,7 +19,7 @@ use super::{AreaOptions, IsoFigures, SlopeFigures};
 use super::{Dense, Hyper, Lattice, ModelError, Observed, Predicted, Priors, Sparse};
 use crate::form::{IsoFits, SlopesAt};
 use crate::geometry::{Point, Vector};
-use crate::registration::{Deviation, PointStatus, Registration};
+use crate::registration::{Deviation, LEAST_SIGMA_MM, PointStatus, Registration, robust_sigma};
 
 /// What a registered measurement says of the form of a part.
 #[derive(Clone, Debug)]
@@ -104,6 +104,10 @@ const EVIDENCE: f64 = 2.6;
 const MOST_PAIRED: usize = 1500;
 /// What is less likely than this counts for nothing.
 const FEW: f64 = 1e-3;
+/// A point further from the field than this many robust sigmas is none that scattered.
+const STANDS_OUT: f64 = 6.0;
+/// Where more than this share of the points stood out, they would not be apart from the form: it has no other.
+const MOST_APART: f64 = 0.1;
 /// A direction whose variance is less than this share of the largest was held.
 const HELD: f64 = 1e-13;
 
@@ -115,10 +119,13 @@ impl Form {
     pub fn of(registration: &Registration, given: &Given) -> Result<Self, ModelError> {
         let seen = Seen::of(registration, given, true)?;
         let drawn = Drawn::of(&seen.observed, &seen.told.likely)?;
-        let ground_in = seen.ground_in.as_ref().map(|ground_in| ground_in.select_rows(&drawn.chosen));
+        let at = |chosen: &[usize]| seen.ground_in.as_ref().map(|ground_in| ground_in.select_rows(chosen));
+        let ground_in = at(&seen.of_all(&drawn.chosen));
         let slope = seen.slope(given, drawn.clone().without(ground_in.as_ref()));
         let drawn = drawn.with_the_scatter(&seen.observed, &seen.told, given).without(ground_in.as_ref());
-        Ok(Self { slope, ..seen.form(given, &drawn.after_best_fit(), ground_in) })
+        let drawn = seen.with_those_apart(drawn, given).after_best_fit();
+        let ground_in = at(&drawn.chosen);
+        Ok(Self { slope, ..seen.form(given, &drawn, ground_in) })
     }
 
     /// Tells the parameters of the form by the points alone, whatever is expected of it beforehand: what a part teaches of those that
@@ -147,7 +154,7 @@ impl Form {
         let ground_in = seen.ground_in.is_some().then(|| seen.stated.columns(places.iter().copied()));
         let drawn = drawn.without(ground_in.as_ref());
         let slope = seen.slope(given, drawn.clone());
-        let drawn = drawn.with_what_is_narrow(&seen.told, given).after_best_fit();
+        let drawn = seen.with_those_apart(drawn.with_what_is_narrow(&seen.told, given), given).after_best_fit();
         Ok(Self { slope, ..seen.form(given, &drawn, ground_in) })
     }
 }
@@ -155,17 +162,115 @@ impl Form {
 /// A registration as the model sees it, with what speaks for which parameters.
 struct Seen {
     motions: Motions,
+    /// All points that were used, and what was observed at them.
+    used: Vec<Deviation>,
+    all: Observed,
+    /// Those of them that no field explains, ascending: what stands there is form all the same.
+    apart: Vec<usize>,
+    /// The rest of them, and what was observed at those.
+    kept: Vec<usize>,
     observed: Observed,
     /// What is stated of all points together.
     stated: Effects,
-    /// What of that has been ground into the part, at the points: nothing before the first correction.
+    /// What of that has been ground into the part, at all points: nothing before the first correction.
     ground_in: Option<DMatrix<f64>>,
     told: Told,
     is_seen: bool,
 }
 
 impl Seen {
+    /// Tells the parameters, without the points that no field explains by them.
     fn of(registration: &Registration, given: &Given, at_points: bool) -> Result<Self, ModelError> {
+        /// Each round tells the parameters anew, and without the tallest of a defect its flanks stand out.
+        const ROUNDS: usize = 3;
+        let mut seen = Self::with_all_in_the_fit(registration, given, at_points)?;
+        for _ in 0..ROUNDS {
+            let more = seen.unexplained()?;
+            let apart = seen.apart.len() + more.len();
+            if more.is_empty() || apart as f64 > MOST_APART * seen.all.places.len() as f64 {
+                break;
+            }
+            let mut apart = [&seen.apart[..], &more[..]].concat();
+            apart.sort_unstable();
+            let kept: Vec<usize> = (0..seen.used.len()).filter(|k| apart.binary_search(k).is_err()).collect();
+            let observed = seen.all.only(&kept);
+            // What is left may be too few to tell anything; then it is told with them.
+            let Ok((told, is_seen)) = told(&observed, seen.motions.size_mm, given, at_points) else { break };
+            seen = Self { apart, kept, observed, told, is_seen, ..seen };
+        }
+        Ok(seen)
+    }
+
+    /// The points that are further from the field than its scatter lets any of them be, of all that were used.
+    fn unexplained(&self) -> Result<Vec<usize>, ModelError> {
+        /// Of fewer points nobody knows what is usual.
+        const FEWEST: usize = 40;
+        let (observed, hyper) = (&self.observed, self.told.likely[0].0);
+        if observed.places.len() < FEWEST {
+            return Ok(Vec::new());
+        }
+        let residuals_mm = if observed.places.len() <= MOST_DENSE {
+            Dense::fit(observed, hyper)?.residuals_mm()
+        } else {
+            let lattice = Lattice::over(&observed.places, &hyper.field)?;
+            Sparse::fit(&lattice, observed, hyper)?.residuals_mm().to_vec()
+        };
+        let (middle_mm, sigma_mm) = robust_sigma(residuals_mm.iter().copied());
+        // Where a field goes through every point, what is left of them is no scatter.
+        let limit_mm = STANDS_OUT * sigma_mm.max(0.5 * hyper.scatter_mm).max(LEAST_SIGMA_MM);
+        let stands_out = |k: &usize| (residuals_mm[*k] - middle_mm).abs() > limit_mm;
+        Ok(self.of_all(&(0..residuals_mm.len()).filter(stands_out).collect::<Vec<_>>()))
+    }
+
+    /// The numbers among all that were used of some that were kept.
+    fn of_all(&self, chosen: &[usize]) -> Vec<usize> {
+        chosen.iter().map(|&k| self.kept[k]).collect()
+    }
+
+    /// Puts the points that no field explains into what is drawn, each with the height that was found there but for the scatter of a touch:
+    /// in their order among the points, or in place of the nearest of other places.
+    fn with_those_apart(&self, drawn: Drawn, given: &Given) -> Drawn {
+        let (rows, at_points) = (drawn.places.len(), !drawn.chosen.is_empty());
+        let chosen = self.of_all(&drawn.chosen);
+        let drawn = Drawn { chosen, ..drawn };
+        if self.apart.is_empty() {
+            return drawn;
+        }
+        // Of the points of a scan as large a share as of the others, the tallest of them.
+        let mut apart = self.apart.clone();
+        if at_points {
+            apart.sort_by(|a, b| self.all.deviations_mm[*b].abs().total_cmp(&self.all.deviations_mm[*a].abs()));
+            apart.truncate((self.apart.len() * rows).div_ceil(self.kept.len().max(1)));
+            apart.sort_unstable();
+        }
+        let found = self.touched_at(&apart, drawn.forms.ncols(), given);
+        if at_points { drawn.beside(found) } else { drawn.replaced_by(&found) }
+    }
+
+    /// What some of the points found, as often as forms are drawn.
+    fn touched_at(&self, points: &[usize], count: usize, given: &Given) -> Drawn {
+        let scatter_mm = self.told.likely[0].0.scatter_mm;
+        let of_probe_mm =
+            if given.probe_scatter_mm[0] > 0.0 { scatter_mm.min(given.probe_scatter_mm[0]) } else { scatter_mm };
+        let mut forms = DMatrix::zeros(points.len(), count);
+        for (c, mut form) in forms.column_iter_mut().enumerate() {
+            let mut normals = Normals::new(6, c as u64);
+            for (value, &k) in form.iter_mut().zip(points) {
+                *value = self.all.deviations_mm[k] - of_probe_mm * normals.next();
+            }
+        }
+        let found = Drawn {
+            forms,
+            places: points.iter().map(|&k| self.all.places[k]).collect(),
+            effects: self.all.effects.select_rows(points),
+            chosen: points.to_vec(),
+            smooth_sigma_mm: vec![scatter_mm; points.len()],
+        };
+        found.without(self.ground_in.as_ref().map(|columns| columns.select_rows(points)).as_ref())
+    }
+
+    /// Tells the parameters by the points that the pose was fitted to. The others are far from the surface, and no field.
+    fn with_all_in_the_fit(registration: &Registration, given: &Given, at_points: bool) -> Result<Self, ModelError> {
         let all = registration.deviations.iter().enumerate().filter(|(_, d)| d.status == PointStatus::Used);
         let (path, used): (Vec<f64>, Vec<&Deviation>) = all.map(|(k, d)| (k as f64, d)).unzip();
         if used.is_empty() {
@@ -179,17 +284,12 @@ impl Seen {
         let observed = Observed { stated: shown, ..motions.observed(&used) };
         let path = if at_points && is_path(&observed.places) { path } else { Vec::new() };
         let observed = Observed { path, ..observed };
-        let priors = given.priors.unwrap_or_else(|| Priors::of_size(motions.size_mm));
-        let is_dense = at_points && observed.places.len() <= MOST_DENSE;
-        let mut told = Hyper::told(&observed, &priors, if is_dense { &ANY } else { &ON_A_GRID })?;
-        let is_seen = told.plain.evidence(&observed) > EVIDENCE;
-        if !is_seen {
-            // What is spoken for by next to nothing is as good as what is spoken for by a little more.
-            let on_a_grid = told.wide.iter().filter(|(wide, _)| ON_A_GRID.contains(&wide.field.smoothness));
-            told.likely.extend(on_a_grid.copied());
-            told.likely.iter_mut().for_each(|(_, weight)| *weight = 1.0);
-        }
-        Ok(Self { motions, observed, stated, ground_in, told, is_seen })
+        let (kept, apart): (Vec<usize>, Vec<usize>) = (0..used.len()).partition(|&k| used[k].in_fit);
+        let (all, observed) =
+            if apart.is_empty() { (observed.clone(), observed) } else { (observed.clone(), observed.only(&kept)) };
+        let (told, is_seen) = told(&observed, motions.size_mm, given, at_points)?;
+        let used = used.into_iter().copied().collect();
+        Ok(Self { motions, used, all, apart, kept, observed, stated, ground_in, told, is_seen })
     }
 
     /// The slopes of what is drawn, before anything is added that has none.
@@ -201,9 +301,12 @@ impl Seen {
 
     /// The form by what is drawn, without its slopes; `ground_in` is what of it each of the stated effects may have made there.
     fn form(&self, given: &Given, drawn: &Drawn, ground_in: Option<DMatrix<f64>>) -> Form {
-        let alike = self.ground_in.as_ref().unwrap_or(&self.observed.stated);
+        let ground_into_kept = self.ground_in.as_ref().map(|columns| columns.select_rows(&self.kept));
+        let alike = ground_into_kept.as_ref().unwrap_or(&self.observed.stated);
         let covariance = of_the_fit(&self.observed, &self.told.wide, alike);
-        let figures = drawn.figures(self.is_seen, given);
+        // What stands apart is seen, whatever the rest shows.
+        let is_seen = self.is_seen || !self.apart.is_empty();
+        let figures = drawn.figures(is_seen, given);
         let hyper = self.told.likely[0].0;
         let on_a_grid = if ON_A_GRID.contains(&hyper.field.smoothness) { hyper } else { self.told.plain };
         let ground_in = ground_in.map(|columns| best_fitted(columns, &drawn.effects));
@@ -219,12 +322,27 @@ impl Seen {
             figures,
             budget,
             iso: IsoFits::over(&drawn.places, given.area.middle_mm)
-                .map(|fits| IsoFigures::of(&fits, &drawn.forms, self.is_seen, given)),
+                .map(|fits| IsoFigures::of(&fits, &drawn.forms, is_seen, given)),
             slope: None,
             known_mm: drawn.known_mm(),
-            is_seen: self.is_seen,
+            is_seen,
         }
     }
+}
+
+/// Tells which parameters the observations speak for, and whether they show a form at all.
+fn told(observed: &Observed, size_mm: f64, given: &Given, at_points: bool) -> Result<(Told, bool), ModelError> {
+    let priors = given.priors.unwrap_or_else(|| Priors::of_size(size_mm));
+    let is_dense = at_points && observed.places.len() <= MOST_DENSE;
+    let mut told = Hyper::told(observed, &priors, if is_dense { &ANY } else { &ON_A_GRID })?;
+    let is_seen = told.plain.evidence(observed) > EVIDENCE;
+    if !is_seen {
+        // What is spoken for by next to nothing is as good as what is spoken for by a little more.
+        let on_a_grid = told.wide.iter().filter(|(wide, _)| ON_A_GRID.contains(&wide.field.smoothness));
+        told.likely.extend(on_a_grid.copied());
+        told.likely.iter_mut().for_each(|(_, weight)| *weight = 1.0);
+    }
+    Ok((told, is_seen))
 }
 
 /// Whether points follow each other like those of a path that is gone along: most are near the one before.
@@ -431,6 +549,40 @@ impl Drawn {
             for column in columns.column_iter() {
                 form.axpy(-normals.next(), &column, 1.0);
             }
+        }
+        self
+    }
+
+    /// Both, in the order of the points.
+    fn beside(self, other: Self) -> Self {
+        let (rows, more) = (self.places.len(), other.places.len());
+        let [mut forms, mut effects] = [self.forms, self.effects].map(|of| of.resize_vertically(rows + more, 0.0));
+        forms.rows_mut(rows, more).copy_from(&other.forms);
+        effects.rows_mut(rows, more).copy_from(&other.effects);
+        let places = [self.places, other.places].concat();
+        let chosen = [self.chosen, other.chosen].concat();
+        let smooth_sigma_mm = [self.smooth_sigma_mm, other.smooth_sigma_mm].concat();
+        let mut order: Vec<usize> = (0..chosen.len()).collect();
+        order.sort_unstable_by_key(|&row| chosen[row]);
+        Self {
+            forms: forms.select_rows(&order),
+            effects: effects.select_rows(&order),
+            places: order.iter().map(|&row| places[row]).collect(),
+            chosen: order.iter().map(|&row| chosen[row]).collect(),
+            smooth_sigma_mm: order.iter().map(|&row| smooth_sigma_mm[row]).collect(),
+        }
+    }
+
+    /// With what others found in the rows of the places that are nearest to theirs.
+    fn replaced_by(mut self, other: &Self) -> Self {
+        let square = |a: [f64; 2], b: [f64; 2]| (a[0] - b[0]).powi(2) + (a[1] - b[1]).powi(2);
+        for (r, place) in other.places.iter().enumerate() {
+            let nearer =
+                |a: &usize, b: &usize| square(self.places[*a], *place).total_cmp(&square(self.places[*b], *place));
+            let Some(nearest) = (0..self.places.len()).min_by(nearer) else { continue };
+            self.forms.row_mut(nearest).copy_from(&other.forms.row(r));
+            self.effects.row_mut(nearest).copy_from(&other.effects.row(r));
+            self.smooth_sigma_mm[nearest] = other.smooth_sigma_mm[r];
         }
         self
     }

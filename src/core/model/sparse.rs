@@ -264,6 +264,8 @@ pub struct Sparse<'a> {
     inverse: SelectedInverse<'a>,
     /// The field at the nodes.
     mean_mm: Vec<f64>,
+    /// What field and effects leave of each observation.
+    residuals_mm: Vec<f64>,
     /// By how much the field at the nodes falls with each effect: P^-1 B'H / s^2.
     follows: Mat<f64>,
     found: DVector<f64>,
@@ -322,9 +324,10 @@ impl<'a> Sparse<'a> {
         let left = |(k, nodes): (usize, &Around)| {
             let field: f64 = nodes.iter().map(|&(node, weight)| weight * mean_mm[node]).sum();
             let moved: f64 = (0..p).map(|a| effects[(k, a)] * found[a]).sum();
-            deviations_mm[k] * (deviations_mm[k] - moved - field)
+            deviations_mm[k] - moved - field
         };
-        let squares = precision2 * around.iter().enumerate().map(left).sum::<f64>();
+        let residuals_mm: Vec<f64> = around.iter().enumerate().map(left).collect();
+        let squares = precision2 * deviations_mm.iter().zip(&residuals_mm).map(|(d, left)| d * left).sum::<f64>();
         let log_gram: f64 = 2.0 * gram.l_dirty().diagonal().iter().map(|v| v.ln()).sum::<f64>();
         let log_det = factor.log_determinant() - before - n as f64 * precision2.ln();
         Ok(Self {
@@ -332,11 +335,17 @@ impl<'a> Sparse<'a> {
             lattice,
             factor,
             mean_mm,
+            residuals_mm,
             follows,
             found,
             covariance: gram.inverse(),
             likelihood: -0.5 * (log_det + log_gram + squares + (n - vague) as f64 * std::f64::consts::TAU.ln()),
         })
+    }
+
+    /// What the field and the effects leave of each observation.
+    pub(super) fn residuals_mm(&self) -> &[f64] {
+        &self.residuals_mm
     }
 
     /// Returns the logarithm of the likelihood, as [`super::Dense::log_likelihood`] does.

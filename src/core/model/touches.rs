@@ -14,7 +14,7 @@ use super::form::Motions;
 use super::normals::Normals;
 use super::{Form, Given, Growing, ModelError, Observed, Predicted};
 use crate::geometry::{Point, Vector};
-use crate::registration::{PointStatus, Registration};
+use crate::registration::{Deviation, PointStatus, Registration};
 
 /// What a measurement is to tell.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -195,7 +195,7 @@ impl Expected {
     fn of(registration: &Registration, given: &Given, form: &Form, so_far: &SoFar) -> Result<Self, ModelError> {
         let SoFar { targets, tried, touched } = so_far;
         let all: Vec<_> = registration.deviations.iter().zip(touched.iter().copied()).collect();
-        let used = || all.iter().filter(|(d, _)| d.status == PointStatus::Used);
+        let used = || all.iter().filter(|(d, _)| d.status == PointStatus::Used && d.in_fit);
         let motions = Motions::of(registration, used().map(|(d, _)| d.point));
         let stated = motions.stated(registration, given)?;
         let last = tried.iter().flatten().max().copied().unwrap_or(0);
@@ -217,8 +217,8 @@ impl Expected {
         let is_held = before.places.len() > before.effects.ncols();
         let off = if is_held { growing.surprise(&found) } else { vec![0.0; found.places.len()] };
         growing.tell(&found)?;
-        let outliers =
-            all.iter().filter(|(d, _)| d.status == PointStatus::Outlier).map(|(_, target)| *target).collect();
+        let is_far = |d: &Deviation| d.status != PointStatus::OffPart && !d.in_fit;
+        let outliers = all.iter().filter(|(d, _)| is_far(d)).map(|(_, target)| *target).collect();
         Ok(Self { growing, last: of_targets.into_iter().zip(off).collect(), outliers })
     }
 

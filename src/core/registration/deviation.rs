@@ -15,15 +15,17 @@ pub struct Deviation {
     pub uncertainty_mm: f64,
     /// What became of the point.
     pub status: PointStatus,
+    /// Whether the pose was fitted to it: not to what is far from the surface, be it form or a touch gone wrong.
+    pub in_fit: bool,
 }
 
 /// What became of a measured point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum PointStatus {
-    /// It took part in the fit.
+    /// It counts in every figure.
     Used,
-    /// It is far from the surface and from its neighbours.
+    /// It is far from the surface, and no neighbour found the same.
     Outlier,
     /// Its foot lies beyond the edge of the nominal surface.
     OffPart,

@@ -5,7 +5,7 @@ use crate::geometry::Point;
 use super::deviation::PointStatus;
 use super::options::{Method, Options, Start};
 use super::part::Part;
-use super::result::Registration;
+use super::result::{Registration, WithLeftOut};
 use super::start::spread;
 use super::verdict::length;
 
@@ -51,7 +51,7 @@ fn of_points(found: &Registration) -> Vec<String> {
     let count = |status| found.deviations.iter().filter(|d| d.status == status).count();
     let (outliers, off_part) = (count(PointStatus::Outlier), count(PointStatus::OffPart));
     let share = |n: usize| n as f64 / points as f64;
-    let mut doubts = Vec::new();
+    let mut doubts: Vec<String> = of_left_out(found).into_iter().collect();
     if share(outliers) > MOST_OUTLIERS {
         doubts.push(format!(
             "{outliers} of {points} points ({:.0} %) are outliers and were left out: look for dirt or coolant on the part, a probe that \
@@ -76,6 +76,18 @@ fn of_points(found: &Registration) -> Vec<String> {
         ));
     }
     doubts
+}
+
+/// Names the points that were left out, and the figures with them.
+fn of_left_out(found: &Registration) -> Option<String> {
+    let WithLeftOut { points, rms_mm, pv_mm, places } = found.with_left_out()?;
+    let were = if points == 1 { "1 point was".to_owned() } else { format!("{points} points were") };
+    Some(format!(
+        "{were} left out, for no neighbour found the same: {places}; with what was left out PV is {} and RMS {}: clean the place and \
+         touch it again",
+        length(pv_mm),
+        length(rms_mm),
+    ))
 }
 
 /// Tells which other radius fits the points much better, if one does.

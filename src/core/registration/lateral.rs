@@ -167,6 +167,7 @@ mod tests {
                 deviation_mm: HEIGHT_MM * (x / WAVE_MM).sin(),
                 uncertainty_mm: 0.0,
                 status: PointStatus::Used,
+                in_fit: true,
             })
             .collect();
         if twins {

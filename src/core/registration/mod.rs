@@ -13,6 +13,7 @@
 //! Pure: no file, no clock, no randomness; the same input gives the same bits on any number of threads. Frames: measured
 //! points are in the CMM frame {W}, the nominal surface in the model frame {M}. Units: millimetres and radians.
 
+mod alone;
 mod correspond;
 mod deviation;
 mod doubt;
@@ -45,9 +46,11 @@ use iterate::{Descent, Problem};
 pub use lateral::{LateralError, MapLimits, lateral_error, weak_for_compensation};
 pub use options::{Coordinate, Method, Options, ProbeSide, Start};
 use part::Part;
-use refit::{LEAST_SIGMA_MM, trim_and_refit};
-pub use result::Registration;
+pub(crate) use refit::LEAST_SIGMA_MM;
+use refit::trim_and_refit;
+pub use result::{Registration, WithLeftOut};
 pub use robust::Loss;
+pub(crate) use robust::robust_sigma;
 use start::{InitialPose, initial_pose, mirror_image, mirrored_rms};
 pub use verdict::{Verdict, WeakDirection};
 
@@ -119,7 +122,9 @@ fn report(
     let mut verdict = verdict::judge(problem, &descent, &correspondences, initial, trace.len());
     let reporter = verdict::Reporter::new(part, &descent.scaling, &verdict, options);
     let pose = &descent.cmm_from_model;
-    let deviations = at_feet(&problem.surface, problem.measured, &correspondences, pose, &descent.scaling, &reporter);
+    let mut deviations =
+        at_feet(&problem.surface, problem.measured, &correspondences, pose, &descent.scaling, &reporter);
+    alone::count_what_agrees(&mut deviations, &mut verdict, options.outlier_sigmas);
     verdict.coverage = verdict::coverage(part.nominal, &deviations);
     Ok(Registration { cmm_from_model: descent.cmm_from_model, deviations, trace, side: initial.side, verdict })
 }

@@ -111,7 +111,7 @@ pub struct Options {
     pub locked: [bool; 6],
     /// How a distance counts.
     pub loss: Loss,
-    /// A point farther from the surface than this many robust sigmas, and from what its neighbours say, is an outlier;
+    /// A point farther from the surface than this many robust sigmas is an outlier where no neighbour found the same;
     /// infinity keeps every point.
     pub outlier_sigmas: f64,
     /// Stop when 1 - f(l+1) / f(l) falls to this: the paper's epsilon.

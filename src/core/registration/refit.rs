@@ -117,7 +117,7 @@ fn rescale(problem: &mut Problem, options: &Options, correspondences: &[Correspo
 }
 
 /// No CMM repeats better than this, and rounding in a file may be all the scatter there is.
-pub(super) const LEAST_SIGMA_MM: f64 = 1e-5;
+pub(crate) const LEAST_SIGMA_MM: f64 = 1e-5;
 
 fn sigma_of(correspondences: &[Correspondence]) -> (f64, f64) {
     // A sample tells the sigma of many points to a percent.
@@ -127,7 +127,7 @@ fn sigma_of(correspondences: &[Correspondence]) -> (f64, f64) {
     (median, sigma.max(LEAST_SIGMA_MM))
 }
 
-/// Decides which points take part; returns how many changed.
+/// Decides which points take part in the fit; returns how many changed. What does not may be form all the same: [`super::alone`].
 ///
 /// An outlier is far from the surface and from its neighbours: a smooth form error, however large, is neither noise nor a
 /// mistake of the probe. Beyond four times the limit its neighbours are no longer asked.

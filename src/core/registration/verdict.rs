@@ -21,7 +21,7 @@ use super::start::InitialPose;
 /// What to think of a registration.
 #[derive(Clone, Debug)]
 pub struct Verdict {
-    /// Number of points that took part in the fit.
+    /// Number of points that count.
     pub used: usize,
     /// Sum of the squared deviations of the points used, in mm^2; eq. (7).
     pub objective_mm2: f64,
@@ -442,6 +442,7 @@ impl Report for Reporter<'_> {
         deviation_mm: 0.0,
         uncertainty_mm: 0.0,
         status: PointStatus::Used,
+        in_fit: true,
     };
 
     #[inline(always)]
@@ -472,6 +473,7 @@ impl Report for Reporter<'_> {
                 deviation_mm: deviation.0[l],
                 uncertainty_mm: (self.variance_mm2 + variance.0[l].max(0.0)).sqrt(),
                 status: if beyond_outline { PointStatus::OffPart } else { correspondences[l].status() },
+                in_fit: correspondences[l].used,
             };
         }
         deviations

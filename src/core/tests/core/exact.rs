@@ -150,7 +150,8 @@ fn noise_gross_outliers_and_a_missing_corner() {
         // An outlier is gross if it is far from the surface, not if it slid along it.
         let far: Vec<usize> = gross.iter().copied().filter(|&k| distances[k].abs() > 0.02).collect();
         let found = register(&nominal, &measured, &Options::new(RADIUS_MM)).unwrap();
-        let dropped = |k: usize| found.deviations[k].status != PointStatus::Used;
+        // Two of them side by side may pass for form, but no pose is fitted to either.
+        let dropped = |k: usize| found.deviations[k].status != PointStatus::Used || !found.deviations[k].in_fit;
         assert!(far.iter().all(|&k| dropped(k)), "seed {seed}: an outlier was kept");
         let good_dropped = (0..measured.len()).filter(|&k| keep[k] && dropped(k)).count();
         assert!(good_dropped * 100 <= measured.len(), "seed {seed}: {good_dropped} good points dropped");

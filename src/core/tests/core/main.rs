@@ -2,6 +2,7 @@
 
 mod accuracy;
 mod common;
+mod defects;
 mod distance;
 mod doubts;
 mod exact;

@@ -1,0 +1,153 @@
+//! What is wrong with a part is in its figures, however high and however small; what is wrong with one touch is left out and named.
+
+use std::sync::OnceLock;
+
+use crate::common::{RADIUS_MM, centres, placed, points};
+use regrind_core::geometry::Point;
+use regrind_core::model::{Form, Given};
+use regrind_core::registration::{Options, PointStatus, Registration, register};
+use regrind_core::surface::{Nominal, Projection};
+use regrind_sim::form::FormError;
+use regrind_sim::probe::{Placement, add_noise};
+use regrind_sim::shape::{FreeForm, Shape};
+
+const NOISE_MM: f64 = 2e-4;
+const HALF_MM: [f64; 2] = [50.0, 30.0];
+const COUNTS: [usize; 2] = [60, 30];
+
+fn nominal() -> &'static Nominal {
+    static NOMINAL: OnceLock<Nominal> = OnceLock::new();
+    NOMINAL.get_or_init(|| {
+        let grid = FreeForm::default().grid(102.0, 62.0, 205, 125);
+        Nominal::from_points(points(&grid), Projection::Auto).unwrap()
+    })
+}
+
+/// A pattern of touches on a part that is good to a tenth of a micrometre but for what is planted: heights above the surface, by place.
+fn touched([columns, rows]: [usize; 2], noise_mm: f64, planted_mm: impl Fn(f64, f64) -> f64) -> Vec<Point> {
+    let shape = FreeForm::default();
+    let form = FormError::new(7, 30.0, 1e-4, 102.0, 62.0);
+    let mut all = centres(&shape, &form, [[-HALF_MM[0], -HALF_MM[1]], HALF_MM], [columns, rows]);
+    for (k, centre) in all.iter_mut().enumerate() {
+        let at = |k: usize, n: usize, half: f64| half * (2.0 * k as f64 / (n - 1) as f64 - 1.0);
+        let (x, y) = (at(k % columns, columns, HALF_MM[0]), at(k / columns, rows, HALF_MM[1]));
+        let (normal, height) = (shape.normal(x, y), planted_mm(x, y));
+        (0..3).for_each(|c| centre[c] += height * normal[c]);
+    }
+    let mut all = placed(&Placement::new([12.0, -8.0, 5.0], [4.0, -3.0, 20.0]), &all);
+    add_noise(&mut regrind_sim::rng(7), &mut all, noise_mm);
+    points(&all)
+}
+
+fn found(measured: &[Point]) -> Registration {
+    register(nominal(), measured, &Options::new(RADIUS_MM)).unwrap()
+}
+
+fn left_out(found: &Registration) -> Vec<usize> {
+    (0..found.deviations.len()).filter(|&k| found.deviations[k].status == PointStatus::Outlier).collect()
+}
+
+/// A height within a rectangle about a place.
+fn within(middle: [f64; 2], size: [f64; 2], height_mm: f64) -> impl Fn(f64, f64) -> f64 {
+    move |x, y| {
+        let inside = (x - middle[0]).abs() <= 0.5 * size[0] && (y - middle[1]).abs() <= 0.5 * size[1];
+        if inside { height_mm } else { 0.0 }
+    }
+}
+
+fn bump(middle: [f64; 2], width_mm: f64, height_mm: f64) -> impl Fn(f64, f64) -> f64 {
+    move |x, y| {
+        let r2 = ((x - middle[0]).powi(2) + (y - middle[1]).powi(2)) / (0.5 * width_mm).powi(2);
+        if r2 < 1.0 { height_mm * (0.5 * std::f64::consts::PI * r2.sqrt()).cos().powi(2) } else { 0.0 }
+    }
+}
+
+/// Every touch of a defect counts, and the peak to valley is the defect's.
+fn counts_whole(name: &str, height_mm: f64, planted: &dyn Fn(f64, f64) -> f64) {
+    let found = found(&touched(COUNTS, NOISE_MM, planted));
+    let pv_mm = found.verdict.pv_mm;
+    println!("{name}, {} um: PV {:.2} um, left out {:?}", 1e3 * height_mm, 1e3 * pv_mm, left_out(&found));
+    assert!(left_out(&found).is_empty(), "{name}, {height_mm} mm: left out {:?}", left_out(&found));
+    assert!(pv_mm > 0.8 * height_mm.abs(), "{name}, {height_mm} mm: PV {pv_mm}");
+    assert!(pv_mm < height_mm.abs() + 10.0 * NOISE_MM, "{name}, {height_mm} mm: PV {pv_mm}");
+}
+
+#[test]
+fn what_two_neighbouring_touches_found_is_in_the_figures_at_any_height() {
+    for height_mm in [-0.003, -0.01, -0.05, -0.5, 0.003, 0.01, 0.05, 0.5] {
+        // Neighbours are 1.7 mm apart along x and 2.1 mm along y.
+        counts_whole("chip", height_mm, &within([49.0, 3.0], [3.0, 2.1], height_mm));
+        counts_whole("corner", height_mm, &within([50.0, 30.0], [7.0, 5.0], height_mm));
+        counts_whole("pit", height_mm, &within([-20.3, 5.2], [5.0, 4.2], height_mm));
+        counts_whole("scratch along x", height_mm, &within([0.0, 1.0], [60.0, 1.0], height_mm));
+        counts_whole("scratch along y", height_mm, &within([0.8, 0.0], [1.0, 40.0], height_mm));
+        counts_whole("bump", height_mm, &bump([11.0, -6.2], 8.0, height_mm));
+    }
+}
+
+/// With a measurement that has no noise, six times the scatter is nothing: the flanks of a bump are beyond it too.
+#[test]
+fn a_clean_map_keeps_its_only_bump() {
+    let found = found(&touched([80, 45], 1e-6, bump([11.0, -6.2], 12.0, 1e-3)));
+    assert!(left_out(&found).is_empty(), "{:?}", left_out(&found));
+    assert!(found.verdict.pv_mm > 0.9e-3, "{}", found.verdict.pv_mm);
+}
+
+#[test]
+fn a_touch_that_found_what_no_neighbour_did_is_left_out_at_any_height() {
+    for height_mm in [-0.5, -0.01, 0.003, 0.01, 0.05, 5.0] {
+        for at in [[0, 0], [30, 0], [59, 29], [17, 11]] {
+            let k = at[1] * COUNTS[0] + at[0];
+            let place = [0, 1].map(|c| HALF_MM[c] * (2.0 * at[c] as f64 / (COUNTS[c] - 1) as f64 - 1.0));
+            let found = found(&touched(COUNTS, NOISE_MM, within(place, [0.1, 0.1], height_mm)));
+            assert_eq!(left_out(&found), [k], "{height_mm} mm at {at:?}");
+        }
+    }
+}
+
+/// A touch that was made twice at one place repeats its mistake.
+#[test]
+fn a_touch_and_its_repeat_are_no_two_neighbours() {
+    let mut measured = touched(COUNTS, NOISE_MM, within([0.847, 1.034], [0.5, 0.5], 0.05));
+    let twice = found(&measured);
+    let [k] = left_out(&twice)[..] else { panic!("{:?}", left_out(&twice)) };
+    measured.push(measured[k]);
+    assert_eq!(left_out(&found(&measured)), [k, COUNTS[0] * COUNTS[1]]);
+}
+
+#[test]
+fn neighbours_on_either_side_of_the_surface_do_not_agree() {
+    let (a, b) = (within([-0.847, 1.034], [0.5, 0.5], 0.05), within([0.847, 1.034], [0.5, 0.5], -0.05));
+    let found = found(&touched(COUNTS, NOISE_MM, move |x, y| a(x, y) + b(x, y)));
+    assert_eq!(left_out(&found).len(), 2);
+}
+
+/// The form has what was touched: no defect that the deviations show is smoothed away as scatter.
+#[test]
+fn the_form_is_as_high_as_what_was_touched() {
+    // Neighbours are 2.9 mm apart along x and 3.5 mm along y: two touches, six, and a dozen.
+    for (name, planted) in [
+        ("chip", Box::new(within([48.6, 1.8], [3.2, 1.0], -0.02)) as Box<dyn Fn(f64, f64) -> f64>),
+        ("corner", Box::new(within([50.0, 30.0], [12.0, 8.0], -0.05))),
+        ("bump", Box::new(bump([10.0, -5.3], 12.0, 0.02))),
+    ] {
+        let found = found(&touched([36, 18], NOISE_MM, planted));
+        let form = Form::of(&found, &Given::default()).unwrap();
+        let (pv, rms) = (form.figures.pv, form.figures.rms);
+        println!("{name}: PV {pv:.4?} of {:.4}, rms {rms:.4?} of {:.4}", found.verdict.pv_mm, found.verdict.rms_mm);
+        assert_eq!(form.points.len(), found.verdict.used, "{name}");
+        // Two touches of a peak have the scatter of both in their distance.
+        let of_two_mm = 3.0 * NOISE_MM * 2f64.sqrt();
+        assert!((pv.median_mm - found.verdict.pv_mm).abs() < of_two_mm.max(0.03 * pv.median_mm), "{name}: {pv:?}");
+        assert!(pv.low_mm <= found.verdict.pv_mm && pv.high_mm >= 0.97 * found.verdict.pv_mm, "{name}: {pv:?}");
+        assert!((rms.median_mm / found.verdict.rms_mm - 1.0).abs() < 0.15, "{name}: {rms:?}");
+        // Each point has its own place and height.
+        let used = found.deviations.iter().filter(|d| d.status == PointStatus::Used);
+        for (of, d) in form.points.iter().zip(used) {
+            assert!((of.at_mm[0] - d.point.x).abs() < 1e-12 && (of.at_mm[1] - d.point.y).abs() < 1e-12, "{name}");
+            // The form is after its own best fit, which the defect tilts, and the deviations are after one that it does not.
+            let off_mm = (of.form.mean_mm - d.deviation_mm).abs();
+            assert!(off_mm < 6.0 * NOISE_MM + 0.1 * found.verdict.pv_mm, "{name}: {of:?} of {d:?}");
+        }
+    }
+}
