@@ -5,6 +5,7 @@
 //!                                 \-> OPC UA: nodes and events --> whoever looks
 //!  News <-- what was refused, and whether somebody is there <---/
 //! ```
+#![cfg(feature = "plant")]
 
 mod error;
 mod figures;

@@ -2,6 +2,7 @@
 //!
 //! A cell never needs the plant to run, hold or accept, and the plant never commands a motion. What leaves the cell is its record; what
 //! comes in is work, and is asked for.
+#![cfg(feature = "plant")]
 
 mod copy;
 mod error;
