@@ -159,6 +159,7 @@ pub fn prepare(recipe: &Recipe, cell: &CellConfig) -> Result<(Task, CellPlan), S
         temperature_c: recipe.measure.temperature_c,
         expansion: expansion(recipe, cell),
         machine: cell.cmm.uncertainty,
+        tolerance: tolerance(recipe),
         adaptive: adaptive(recipe),
         simulation: cell.simulated,
     };

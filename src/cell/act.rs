@@ -429,7 +429,12 @@ impl Cell {
         if verdict == Verdict::LeftOut {
             // The figures of the part are not known yet: nothing is compared with them.
             self.push(Command::Announce(Judgement { cycle: self.cycle, verdict, reason: reason.clone() }));
-            return self.useless(AlarmId::LeftOut, &reason);
+            if !figures.left_out.as_ref().is_some_and(|left_out| left_out.again) {
+                return self.useless(AlarmId::LeftOut, &reason);
+            }
+            // Only the places that are named, and of the same measurement: a touch that is not made again stays as it is.
+            self.raise(AlarmId::LeftOut, &reason);
+            return self.go(Held(Measure(JobStep::Send)));
         }
         let distance = |of: &Figures| judge::distance(&self.plan, of);
         match &self.best {

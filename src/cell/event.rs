@@ -342,6 +342,9 @@ pub struct LeftOut {
     pub rms_mm: f64,
     /// Which points, where they lie and how far off they are, in words.
     pub places: String,
+    /// Whether these places can be touched again by themselves; else the whole part is measured again.
+    #[serde(default)]
+    pub again: bool,
 }
 
 /// More that is to be touched.

@@ -127,6 +127,30 @@ impl Tolerance {
         };
         [compared(if is_robust { "PV 99.8 %" } else { "PV" }, pv, self.pv_mm), compared("RMS", rms, self.rms_mm)]
     }
+
+    /// Returns whether the part is within its limits without the points that were left out, and beyond one with them.
+    pub fn left_out_decides(&self, figures: &Figures) -> bool {
+        let [pv, rms] = self.compare(figures).map(|compared| compared.conformity);
+        pv.max(rms) == Conformity::Within && self.beyond_with_left_out(figures).is_some()
+    }
+
+    /// Names the points that were left out where the part would exceed a limit with them: what was touched counts until it is touched again.
+    ///
+    /// They add to what was found as much as they add to the figures of the points.
+    fn beyond_with_left_out(&self, now: &Figures) -> Option<String> {
+        let left_out = now.left_out.as_ref()?;
+        let [pv, rms] = self.compare(now);
+        let more = |with_mm: f64, without_mm: f64| (with_mm - without_mm).max(0.0);
+        let pv_mm = pv.found_mm + more(left_out.pv_mm, now.pv_mm);
+        let rms_mm = (rms.found_mm.powi(2) + more(left_out.rms_mm.powi(2), now.rms_mm.powi(2))).sqrt();
+        let beyond = [("PV", pv_mm, pv.limit_mm), ("RMS", rms_mm, rms.limit_mm)];
+        let beyond: Vec<String> = beyond
+            .into_iter()
+            .filter(|(_, with_mm, limit_mm)| with_mm > limit_mm)
+            .map(|(name, with_mm, limit_mm)| format!("{name} {} of {}", um(with_mm), um(limit_mm)))
+            .collect();
+        (!beyond.is_empty()).then(|| format!("{}; with what was left out: {}", left_out.places, beyond.join(", ")))
+    }
 }
 
 /// Judges the figures of a cycle after `passes` passes. The order of the rules is the order of what cannot be undone.
@@ -135,7 +159,7 @@ pub(super) fn judge(plan: &CellPlan, before: Option<&Figures>, now: &Figures, pa
     let figures = told(plan, now);
     let conformity = conformity(plan, now);
     if conformity == Conformity::Within {
-        if let Some(beyond) = beyond_with_left_out(plan, now) {
+        if let Some(beyond) = plan.tolerance.beyond_with_left_out(now) {
             return tell(Verdict::LeftOut, format!("{beyond}; without what was left out: {figures}"));
         }
         return tell(Verdict::Accept, format!("in tolerance: {figures}"));
@@ -196,24 +220,6 @@ fn go_on(plan: &CellPlan, before: Option<&Figures>, now: &Figures, conformity: C
     }
     let verdict = if undecided { Verdict::Undecided } else { Verdict::Stalled };
     tell(verdict, format!("no gain is to be expected, and {so_far}: {figures}; {expected}"))
-}
-
-/// Names the points that were left out where the part would exceed a limit with them: what was touched counts until it is touched again.
-///
-/// They add to what was found as much as they add to the figures of the points.
-fn beyond_with_left_out(plan: &CellPlan, now: &Figures) -> Option<String> {
-    let left_out = now.left_out.as_ref()?;
-    let [pv, rms] = plan.tolerance.compare(now);
-    let more = |with_mm: f64, without_mm: f64| (with_mm - without_mm).max(0.0);
-    let pv_mm = pv.found_mm + more(left_out.pv_mm, now.pv_mm);
-    let rms_mm = (rms.found_mm.powi(2) + more(left_out.rms_mm.powi(2), now.rms_mm.powi(2))).sqrt();
-    let beyond = [("PV", pv_mm, pv.limit_mm), ("RMS", rms_mm, rms.limit_mm)];
-    let beyond: Vec<String> = beyond
-        .into_iter()
-        .filter(|(_, with_mm, limit_mm)| with_mm > limit_mm)
-        .map(|(name, with_mm, limit_mm)| format!("{name} {} of {}", um(with_mm), um(limit_mm)))
-        .collect();
-    (!beyond.is_empty()).then(|| format!("{}; with what was left out: {}", left_out.places, beyond.join(", ")))
 }
 
 /// The worse of the two figures that are limited.

@@ -16,7 +16,7 @@ use super::state::{Device, Phase, State};
 
 /// The version of the table. A run is gone on with by a program of the version that began it only; a change of what follows from
 /// anything is another version.
-pub const TABLE_VERSION: u32 = 8;
+pub const TABLE_VERSION: u32 = 9;
 
 /// What an event does in a state.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -279,7 +279,13 @@ fn sample_figures() -> Vec<Figures> {
         Figures {
             pv_mm: 0.005,
             rms_mm: 0.001,
-            left_out: Some(Box::new(LeftOut { pv_mm: 0.050, rms_mm: 0.002, places: String::new() })),
+            left_out: Some(Box::new(LeftOut { pv_mm: 0.050, rms_mm: 0.002, places: String::new(), again: false })),
+            ..plain.clone()
+        },
+        Figures {
+            pv_mm: 0.005,
+            rms_mm: 0.001,
+            left_out: Some(Box::new(LeftOut { pv_mm: 0.050, rms_mm: 0.002, places: String::new(), again: true })),
             ..plain.clone()
         },
         Figures { coverage: 0.5, ..plain.clone() },

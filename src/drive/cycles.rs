@@ -38,9 +38,14 @@ impl Cycles {
         let pose = judged.map_or(task.fixture_cmm_from_model, |found| found.cmm_from_model);
         let seated_anew = last.is_some_and(|cycle| cycle.plan.is_some() && !cycle.is_judged());
         let cycle = self.0.entry(number).or_insert_with(|| Cycle::new((*correction).clone()));
-        let plan = match task.adaptive {
-            None => task.plan(correction.level_mm, &pose, seated_anew),
-            Some(_) => batch(task, cycle, &pose, seated_anew),
+        let plan = match (&task.adaptive, cycle.again.clone(), &cycle.registration) {
+            (Some(_), ..) => batch(task, cycle, &pose, seated_anew),
+            (None, Some(again), Some(found)) => {
+                cycle.batch = cycle.points.as_ref().map_or(0, |points| points.rounds + 1);
+                let targets = (Vec::new(), again.targets.iter().collect());
+                task.plan_at(cycle.correction.level_mm, &found.cmm_from_model, targets, false)
+            }
+            _ => task.plan(correction.level_mm, &pose, seated_anew),
         };
         cycle.plan.insert(Arc::new(plan)).clone()
     }

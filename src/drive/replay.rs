@@ -292,6 +292,9 @@ impl<'t> Replay<'t> {
         let conditions = self.read_json::<work::Conditions>(number, work::CONDITIONS_FILE)?;
         let temperature_c = conditions.map(|told| told.temperature_c);
         let touches = self.read_json::<work::Touches>(number, work::TOUCHES_FILE)?;
+        let rounds =
+            self.read_json::<work::TouchedAgain>(number, work::TOUCHED_AGAIN_FILE)?.map_or(0, |told| told.rounds);
+        let touches = (touches, rounds);
         work::recorded_points(self.task, part, sphere, (coordinates, temperature_c), touches).map_err(|why| {
             self.differs(format!("the points of cycle {number} are not what a gate lets through: {why:?}"))
         })

@@ -90,6 +90,8 @@ pub struct Task {
     pub expansion: Option<Expansion>,
     /// What the measuring machine does to all points together, as its cell file states it.
     pub machine: Machine,
+    /// What is accepted, as the plan of the cell has it.
+    pub tolerance: Tolerance,
     /// How touches are chosen; none where all targets are touched.
     pub adaptive: Option<Adaptive>,
     /// Whether the cell is simulated; everything stored is marked so.
@@ -176,6 +178,8 @@ pub(super) struct Cycle {
     pub(super) asked: Arc<Vec<usize>>,
     /// The targets of the batch that comes next.
     pub(super) next: Option<Arc<Vec<usize>>>,
+    /// What is to be touched again, where all targets are touched at once.
+    pub(super) again: Option<Arc<Again>>,
     pub(super) points: Option<Arc<Points>>,
     pub(super) registration: Option<Arc<Registration>>,
     pub(super) form: Option<Arc<Form>>,
@@ -202,6 +206,7 @@ impl Cycle {
             batch: 0,
             asked: Arc::default(),
             next: None,
+            again: None,
             points: None,
             registration: None,
             form: None,
@@ -224,8 +229,10 @@ impl Cycle {
         match product {
             Product::Points(points) => self.points = Some(Arc::new(points)),
             Product::Registered(found) => {
-                let Registered { registration, form, field, error, known, parameters, set, figures, next } = *found;
+                let Registered { registration, form, field, error, known, parameters, set, figures, next, again } =
+                    *found;
                 self.next = next.map(Arc::new);
+                self.again = again.map(Arc::new);
                 self.registration = Some(Arc::new(registration));
                 self.form = form.map(Arc::new);
                 self.field = field;
@@ -263,6 +270,17 @@ pub(super) struct Registered {
     pub(super) figures: Figures,
     /// The targets to touch next; none where enough is known.
     pub(super) next: Option<Vec<usize>>,
+    /// What can be touched again.
+    pub(super) again: Option<Again>,
+}
+
+/// Touches that no neighbour agrees with, to be made again with a few around each.
+#[derive(Clone, Debug)]
+pub(super) struct Again {
+    /// The points whose touches are made again, by their numbers.
+    pub(super) points: Vec<usize>,
+    /// Where: a target for each of these points, and then those around.
+    pub(super) targets: Vec<measuring::Target>,
 }
 
 /// The points of a measurement that may be used.
@@ -283,6 +301,8 @@ pub(super) struct Points {
     /// Which targets were tried, batch by batch, and which each point of the part is of; empty where all are touched at once.
     pub(super) tried: Vec<Vec<usize>>,
     pub(super) of: Vec<usize>,
+    /// How often places were touched again that no neighbour agreed with.
+    pub(super) rounds: u32,
 }
 
 impl Task {
@@ -473,6 +493,18 @@ impl Task {
         (first, rest): (Vec<usize>, Vec<usize>),
         with_sphere: bool,
     ) -> Plan {
+        let [first, rest] = [first, rest].map(|of| of.iter().map(|k| &self.targets[*k]).collect());
+        self.plan_at(level_mm, cmm_from_model, (first, rest), with_sphere)
+    }
+
+    /// Does the same for targets wherever they are.
+    pub(super) fn plan_at(
+        &self,
+        level_mm: f64,
+        cmm_from_model: &Pose,
+        (first, rest): (Vec<&measuring::Target>, Vec<&measuring::Target>),
+        with_sphere: bool,
+    ) -> Plan {
         let sphere = self.sphere.iter().filter(|_| with_sphere);
         let sphere = sphere.flat_map(|s| sphere_targets(s.centre, s.radius_mm, s.points));
         let sphere = sphere.map(|t| (TargetKind::ReferenceSphere, t.point, t.normal));
@@ -480,8 +512,8 @@ impl Task {
             let point = cmm_from_model.point(&(t.point + level_mm * t.normal));
             (TargetKind::Part, point, cmm_from_model.direction(&t.normal))
         };
-        let begin = first.iter().map(|k| on_part(&self.targets[*k]));
-        let rest = rest.iter().map(|k| on_part(&self.targets[*k]));
+        let begin = first.iter().map(|t| on_part(t));
+        let rest = rest.iter().map(|t| on_part(t));
         let targets = begin.chain(sphere).chain(rest).enumerate().map(|(index, (what, point, normal))| Target {
             index: index as u32,
             what,

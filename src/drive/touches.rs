@@ -1,11 +1,13 @@
 //! A measurement whose touches are chosen: what is known after a batch, and which targets are next.
 
-use super::task::{Adaptive, Cycle, Points, Task};
+use super::task::{Adaptive, Again, Cycle, Points, Task};
 use crate::compensation::{ErrorMap, told_map};
 use crate::device::Number;
-use crate::geometry::Sample;
+use crate::geometry::{Sample, Vector};
+use crate::measuring::Target;
 use crate::model::{self, FEWEST, Form, Given, MOST_BATCHES, SoFar, Why, short_way, spread};
-use crate::registration::Registration;
+use crate::registration::{Deviation, PointStatus, Registration};
+use crate::surface::{OffsetSurface, Place, Side};
 
 // Behind the most batches comes one of all that is left, and a machine must not take it for another.
 const _: () = assert!(MOST_BATCHES < Number::BATCHES - 1);
@@ -51,6 +53,58 @@ pub(super) fn look(
             let next = (!rest.is_empty()).then_some((rest, "no model can be made of what was found"));
             Looked { form: Err(error.to_string()), next }
         }
+    }
+}
+
+/// Returns the touches that no neighbour agrees with, and a few around each, to be made again; none where the machine has no plan of ours, where
+/// there are none, and where they are too many to be touches gone wrong.
+///
+/// Those around lie on the way to the nearest other points that were touched: wherever two of them are, the probe can be between.
+pub(super) fn again(task: &Task, found: &Registration, points: &Points) -> Option<Again> {
+    const MOST: usize = 20;
+    const AROUND: usize = 4;
+    /// On the way to the neighbour.
+    const SHARE: f64 = 0.4;
+    /// So near the direction of another one a neighbour is on the same way (as a cosine).
+    const SAME_WAY: f64 = 0.7;
+    let alone: Vec<usize> = found.left_out().map(|(k, _)| k).collect();
+    if task.targets.is_empty() || alone.is_empty() || alone.len() > MOST || points.rounds + 2 >= Number::BATCHES {
+        return None;
+    }
+    let on_part: Vec<&Deviation> = found.deviations.iter().filter(|d| d.status != PointStatus::OffPart).collect();
+    // The nominal contact point: how far the touch was off is no place on the part.
+    let foot = |d: &Deviation| d.point - d.normal * d.deviation_mm;
+    let mut targets: Vec<Target> = Vec::new();
+    let mut around: Vec<Target> = Vec::new();
+    for &k in &alone {
+        let lone = &found.deviations[k];
+        let at = foot(lone);
+        targets.push(Target { point: at, normal: lone.normal });
+        let mut near: Vec<(&Deviation, Vector)> = on_part.iter().map(|d| (*d, foot(d) - at)).collect();
+        near.retain(|(d, way)| way.norm() > 0.0 && d.status == PointStatus::Used);
+        near.sort_by(|a, b| a.1.norm_squared().total_cmp(&b.1.norm_squared()));
+        let mut ways: Vec<Vector> = Vec::new();
+        for (neighbour, way) in near {
+            let unit = way.normalize();
+            if ways.len() < AROUND && ways.iter().all(|other| other.dot(&unit) < SAME_WAY) {
+                ways.push(unit);
+                let normal = lone.normal.lerp(&neighbour.normal, SHARE).normalize();
+                around.push(on_nominal(task, &Target { point: at + way * SHARE, normal }));
+            }
+        }
+    }
+    targets.append(&mut around);
+    Some(Again { points: alone, targets })
+}
+
+/// Lays a target onto the nominal surface, along its normal.
+fn on_nominal(task: &Task, near: &Target) -> Target {
+    match OffsetSurface::new(&task.nominal, 0.0, Side::Normal) {
+        Ok(surface) => {
+            let foot = surface.foot(&near.point, Place::UNKNOWN);
+            Target { point: near.point - foot.normal * foot.distance_mm, normal: near.normal }
+        }
+        Err(_) => *near,
     }
 }
 

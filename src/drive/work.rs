@@ -27,7 +27,7 @@ use crate::registration::{Options, PointStatus as Fate, Registration, Verdict, w
 
 use super::maps;
 use super::record::{Files, Unfinished, unfinished};
-use super::task::{Cycle, Points, Product, Registered, Task, readings, used};
+use super::task::{Again, Cycle, Points, Product, Registered, Task, readings, used};
 use super::touches;
 
 /// Looks whether the measurement of a cycle may be used, and writes its points.
@@ -42,20 +42,26 @@ pub(super) fn gate_cycle(
     let plan = cycle.and_then(|cycle| cycle.plan.as_deref()).map_or_else(|| Cow::Owned(unplanned()), Cow::Borrowed);
     let before = cycle.filter(|_| task.adaptive.is_some());
     let so_far = before.and_then(|cycle| cycle.points.as_deref());
+    let again = cycle.and_then(|cycle| Some((cycle.again.as_deref()?, cycle.points.as_deref()?)));
     let planned = plan.targets.iter().filter(|t| t.what == TargetKind::Part).count() as u32;
     let planned = planned + so_far.map_or(0, |points| points.tried.iter().map(Vec::len).sum::<usize>() as u32);
     let (found, usable) = match foreign(task, &plan, measurement).or_else(|| out_of_window(task, measurement)) {
         Some(failure) => (0, Err(failure)),
         None => {
-            let [part, sphere] = touched(&plan, planned, measurement);
-            let told = (measurement.coordinates, measurement.temperature_c.filter(|told| told.is_finite()));
-            let asked = before.map(|cycle| &cycle.asked[..]).unwrap_or_default();
-            let touches = Touches::and(so_far, asked, &plan, measurement);
-            let (part, sphere) = match so_far {
-                Some(points) => ([&points.part[..], &part].concat(), points.sphere.clone()),
-                None => (part, sphere),
-            };
-            (part.len() as u32, gate(task, planned, part, sphere, told, touches))
+            if let Some((again, points)) = again {
+                let (points, found) = touched_again(again, points, measurement);
+                (found, Ok(points))
+            } else {
+                let [part, sphere] = touched(&plan, planned, measurement);
+                let told = (measurement.coordinates, measurement.temperature_c.filter(|told| told.is_finite()));
+                let asked = before.map(|cycle| &cycle.asked[..]).unwrap_or_default();
+                let touches = Touches::and(so_far, asked, &plan, measurement);
+                let (part, sphere) = match so_far {
+                    Some(points) => ([&points.part[..], &part].concat(), points.sphere.clone()),
+                    None => (part, sphere),
+                };
+                (part.len() as u32, gate(task, planned, part, sphere, told, touches))
+            }
         }
     };
     let saved = usable.map_err(Unfinished::For).and_then(|points| {
@@ -72,6 +78,23 @@ pub(super) fn gate_cycle(
         Err(Unfinished::NotSaved(why)) => return (Event::NotSaved { cycle: number, why }, Product::Nothing),
     };
     (Event::Collected { cycle: number, targets: planned.max(found), found, gate }, product)
+}
+
+/// Takes touches that were made again in place of what they were, and those around beside them; returns how many were found.
+///
+/// What finds nothing leaves what was there: nothing but a touch replaces a touch.
+fn touched_again(again: &Again, points: &Points, measurement: &Measurement) -> (Points, u32) {
+    let mut all = points.clone();
+    all.rounds += 1;
+    let mut found = 0;
+    for (k, point) in measurement.points.iter().enumerate().filter(|(_, p)| p.status == PointStatus::Touched) {
+        found += 1;
+        match again.points.get(k).and_then(|&number| all.part.get_mut(number)) {
+            Some(before) => *before = point.at_mm.into(),
+            None => all.part.push(point.at_mm.into()),
+        }
+    }
+    (all, found)
 }
 
 /// Returns what was touched of the part and of the reference sphere. A machine without a plan of ours gives what the operator took.
@@ -110,7 +133,18 @@ fn gate(
     }
     let (radius_mm, radius_sigma_mm) = (ball.map(|b| b[0]), ball.map_or(0.0, |b| b[1]));
     let probe_scatter_mm = ball.map_or([0.0; 2], |[.., rms_mm]| scatter(rms_mm, sphere.len()));
-    Ok(Points { part, sphere, radius_mm, radius_sigma_mm, probe_scatter_mm, temperature_c, coordinates, tried, of })
+    Ok(Points {
+        part,
+        sphere,
+        radius_mm,
+        radius_sigma_mm,
+        probe_scatter_mm,
+        temperature_c,
+        coordinates,
+        tried,
+        of,
+        rounds: 0,
+    })
 }
 
 /// How far a probe scatters by what it found on a sphere, of which the fit took four numbers, and to what share of it that is known.
@@ -150,9 +184,10 @@ pub(super) fn recorded_points(
     part: Vec<Point>,
     sphere: Vec<Point>,
     told: (Coordinates, Option<f64>),
-    touches: Option<Touches>,
+    (touches, rounds): (Option<Touches>, u32),
 ) -> Result<Points, GateFailure> {
-    gate(task, 0, part, sphere, told, touches.unwrap_or_default())
+    let points = gate(task, 0, part, sphere, told, touches.unwrap_or_default())?;
+    Ok(Points { rounds, ..points })
 }
 
 /// Share of its stated radius by which a qualified probe may differ: more is another stylus.
@@ -260,6 +295,9 @@ fn registered(
     // The first few touches say whether it is the right part, where it should be; anything more would be guessed from them.
     let at_fixture = task.start_at_fixture || points.tried.len() == 1;
     let (mut found, options) = task.register_from(&part, probe_radius_mm, at_fixture).map_err(unfinished)?;
+    if let Some(why) = found.no_verdict() {
+        return Err(Unfinished::For(why));
+    }
     found.allow_for_radius(points.radius_sigma_mm.hypot(task.machine.reference_sphere_mm));
     let given = Given {
         machine: task.machine,
@@ -330,8 +368,19 @@ fn registered(
         figures.form = None;
     }
     let next = next.map(|(next, _)| next);
+    let again = if looked_at { None } else { touches::again(task, &found, points) };
+    if let Some(left_out) = figures.left_out.as_mut() {
+        left_out.again = again.is_some();
+    }
+    // Before anybody is called the machine looks whether it was the touch.
+    let again = again.filter(|_| task.tolerance.left_out_decides(&figures));
+    if let Some(again) = again.as_ref().filter(|_| points.rounds == 0) {
+        let targets = again.targets.len() as u32;
+        let why = "a touch stands alone: it is made again, and a few around it".to_owned();
+        figures.touch_on = Some(Box::new(TouchOn { targets, why }));
+    }
     let field = next.is_none().then(|| field_alone(&found, &given, form.as_ref().ok(), !looked_at)).flatten();
-    Ok(Registered { registration: found, form: form.ok(), field, error, known, parameters, set, figures, next })
+    Ok(Registered { registration: found, form: form.ok(), field, error, known, parameters, set, figures, next, again })
 }
 
 /// What is said of the parameters that are clear.
@@ -429,7 +478,7 @@ fn figures(
         outliers,
         left_out: found
             .with_left_out()
-            .map(|of| Box::new(LeftOut { pv_mm: of.pv_mm, rms_mm: of.rms_mm, places: of.places })),
+            .map(|of| Box::new(LeftOut { pv_mm: of.pv_mm, rms_mm: of.rms_mm, places: of.places, again: false })),
         shift_mm: moved.translation_mm.norm(),
         turn_rad: moved.angle_rad(),
         weak_directions: verdict.weak_directions.iter().map(|w| w.words.clone()).collect(),
@@ -628,6 +677,14 @@ pub(super) fn learned(task: &Task, run: String, (cycle, fields): (&Cycle, Taught
 /// Where they stand.
 pub(super) const CONDITIONS_FILE: &str = "measured.json";
 pub(super) const TOUCHES_FILE: &str = "touches.json";
+pub(super) const TOUCHED_AGAIN_FILE: &str = "touched_again.json";
+
+/// How often places of a measurement were touched again that no neighbour agreed with.
+#[derive(Serialize, Deserialize)]
+pub(super) struct TouchedAgain {
+    simulation: bool,
+    pub(super) rounds: u32,
+}
 
 /// What a measurement was made in, as far as the registration goes by it.
 #[derive(Serialize, Deserialize)]
@@ -642,6 +699,10 @@ fn save_points(task: &Task, files: &mut Files, points: &Points) -> Result<(), Fo
     if let Some(temperature_c) = points.temperature_c.filter(|_| task.expansion.is_some()) {
         let conditions = Conditions { simulation: task.simulation, temperature_c };
         write_json_atomic(files.place(CONDITIONS_FILE), &conditions)?;
+    }
+    if points.rounds > 0 {
+        let again = TouchedAgain { simulation: task.simulation, rounds: points.rounds };
+        write_json_atomic(files.place(TOUCHED_AGAIN_FILE), &again)?;
     }
     if !points.tried.is_empty() {
         let (tried, of) = (points.tried.clone(), points.of.clone());

@@ -116,6 +116,7 @@ texts! {
     // Figures.
     Convergence { "Convergence", "Konvergenz", "收敛" }
     Figures { "Figures", "Kennwerte", "数值" }
+    LeftOut { "Left out as outliers", "Als Ausreißer weggelassen", "作为离群点被排除" }
     Judged { "judged", "beurteilt", "判定" }
     Limit { "limit", "Grenze", "限值" }
     Forecast { "forecast", "Prognose", "预测" }

@@ -322,6 +322,9 @@ fn figures(cycles: &[CycleSummary], tolerance: Option<&Tolerance>, language: Lan
                 }
             }
         }
+        @for (cycle, places) in cycles.iter().filter_map(|of| Some((of.cycle, of.left_out.as_ref()?))) {
+            p { strong { (say(Text::LeftOut)) ", " (say(Text::Cycle)) " " (cycle) ": " } (places) }
+        }
         p .quiet { "U: " (say(Text::Uncertainty)) }
     }
 }

@@ -214,7 +214,7 @@ pub struct RegistrationSettings {
     pub distance: Distance,
     /// How a distance counts: as its square, or less when it is large.
     pub loss: Loss,
-    /// A point farther away than this many robust sigmas is an outlier.
+    /// A point farther away than this many robust sigmas does not move the pose; it counts in the figures unless no neighbour found the same.
     #[schemars(range(min = 3.0, max = 1000.0))]
     pub outlier_sigmas: f64,
     /// Coordinates of the model frame that stay as the fixture has them.

@@ -74,6 +74,8 @@ pub struct CycleSummary {
     pub reason: String,
     /// PV, RMS and the expanded uncertainty of each, as they were judged; none where nothing was measured.
     pub figures: Option<[[f64; 2]; 2]>,
+    /// The points that were left out of these, where they are and by how much; none where all count.
+    pub left_out: Option<String>,
     /// PV and RMS that the correction made from it is expected to leave; none where none was made.
     pub expected: Option<[f64; 2]>,
     /// Name of its error map within the run folder.
@@ -148,6 +150,7 @@ fn cycle_summary(cycle: u32, story: &CycleStory, tolerance: Option<&Tolerance>) 
         verdict: judgement.map(verdict_words),
         reason: judgement.map_or_else(unusable, |judgement| judgement.reason.clone()),
         figures,
+        left_out: last.and_then(|of| of.figures.as_ref()?.left_out.as_ref()).map(|of| of.places.clone()),
         expected: story.expected_mm.map(|figures| figures.map(|mm| 1e3 * mm)),
         map: story.map.as_ref().map(|(name, _)| name.clone()),
         deviations: story.deviations.clone(),

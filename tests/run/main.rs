@@ -3,6 +3,7 @@
 //! Signals, modes and the socket of a run are Unix's; what is tried on Windows is in .ci/windows.
 #![cfg(unix)]
 
+mod again;
 mod apart;
 mod audit;
 mod bad_cells;

@@ -3,6 +3,7 @@
 //! Pure: no file, no clock, no randomness. Lengths are millimetres, angles radians.
 
 pub mod aperture;
+mod far_off;
 pub mod grid;
 pub mod grid_order;
 mod nearest;
@@ -11,6 +12,7 @@ pub mod rigid;
 pub mod sample;
 
 pub use aperture::{Aperture, ApertureError};
+pub(crate) use far_off::far_off;
 pub use grid::{Grid, GridError};
 pub use grid_order::{GridOrder, recognise_grid};
 pub(crate) use nearest::Nearest;

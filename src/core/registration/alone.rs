@@ -49,6 +49,18 @@ pub(super) fn count_what_agrees(deviations: &mut [Deviation], verdict: &mut Verd
     verdict.rms_mm = (verdict.objective_mm2 / verdict.used as f64).sqrt();
 }
 
+/// Counts the points on the part that the pose was not fitted to although it was fitted to most of their neighbours.
+pub(super) fn contradicted(deviations: &[Deviation]) -> usize {
+    let around = Around::of(deviations, 0.0);
+    let is_left = |k: &usize| !deviations[around.of[*k]].in_fit;
+    let among_others = |&k: &usize| {
+        let near = around.tree.to(&around.feet[k], NEAREST).filter(|(n, _)| *n != k).take(ASKED);
+        let (near, left) = near.fold((0, 0), |(near, left), (n, _)| (near + 1, left + usize::from(is_left(&n))));
+        2 * left < near
+    };
+    (0..around.of.len()).into_par_iter().filter(is_left).filter(among_others).count()
+}
+
 /// The points on the part by the places of their feet: how high one is moves it to no other place.
 struct Around {
     tree: Nearest,

@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use crate::geometry::{Point, Pose, Vector};
 use crate::surface::simd::{F64x4, LANES, Real, Vector3x4};
-use crate::surface::{FourFeet, OffsetSurface, Place, side_by_side};
+use crate::surface::{Foot, FourFeet, OffsetSurface, Place, side_by_side};
 
 use super::deviation::PointStatus;
 use super::linearize::{FourSums, Scaling, Sums};
@@ -22,6 +22,9 @@ pub(crate) struct ResidualModel {
     pub(crate) loss: ScaledLoss,
 }
 
+/// A foot that many steps of the sampling beyond the edge lies on it, but for rounding.
+pub(super) const ON_PART_STEPS: f32 = 1e-3;
+
 /// What is remembered of a measured point from one iteration to the next.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Correspondence {
@@ -38,9 +41,14 @@ impl Correspondence {
     pub(crate) fn status(&self) -> PointStatus {
         match self.used {
             true => PointStatus::Used,
-            false if self.beyond_steps > 0.5 => PointStatus::OffPart,
+            false if self.is_off_part() => PointStatus::OffPart,
             false => PointStatus::Outlier,
         }
+    }
+
+    /// Whether the foot lies beyond the edge: the surface is not known there, however near it is.
+    pub(crate) fn is_off_part(&self) -> bool {
+        self.beyond_steps > ON_PART_STEPS
     }
 
     pub(crate) const NEW: Self = Self { place: Place::UNKNOWN, distance_mm: 0.0, beyond_steps: 0.0, used: true };
@@ -180,18 +188,22 @@ impl Pass<'_> {
         *last = foot.place;
         correspondence.place = foot.place;
         correspondence.distance_mm = foot.distance_mm - self.residual.subtract_mm;
-        correspondence.beyond_steps = foot.beyond_steps as f32;
-        if let Some(outline) = self.surface.nominal().outline() {
-            let contact = p - foot.normal * (foot.distance_mm + self.surface.radius_mm());
-            if !outline.contains(contact.x, contact.y) {
-                correspondence.beyond_steps = correspondence.beyond_steps.max(1.0);
-            }
-        }
+        correspondence.beyond_steps = beyond_steps(self.surface, &p, &foot);
         if correspondence.used {
             let (weight, loss) = self.residual.loss.weigh(correspondence.distance_mm);
             sums.add(&self.scaling.row(&p, &foot.normal), correspondence.distance_mm, weight, loss);
         }
     }
+}
+
+/// How far the foot of a point lies beyond the edge, in steps of the sampling; one at least beyond the outline, which ends the part before its points do.
+pub(super) fn beyond_steps(surface: &OffsetSurface, p: &Point, foot: &Foot) -> f32 {
+    let is_outside = surface.nominal().outline().is_some_and(|outline| {
+        let contact = p - foot.normal * (foot.distance_mm + surface.radius_mm());
+        !outline.contains(contact.x, contact.y)
+    });
+    let steps = foot.beyond_steps as f32;
+    if is_outside { steps.max(1.0) } else { steps }
 }
 
 /// Four points moved by a pose.

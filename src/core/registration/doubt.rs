@@ -2,7 +2,8 @@
 
 use crate::geometry::Point;
 
-use super::deviation::PointStatus;
+use super::alone::contradicted;
+use super::deviation::{Deviation, PointStatus};
 use super::options::{Method, Options, Start};
 use super::part::Part;
 use super::result::{Registration, WithLeftOut};
@@ -41,6 +42,7 @@ const LEAST_COVERAGE: f64 = 0.5;
 /// Tells in words what a person should know of the points and of the radius.
 pub(super) fn doubts(part: &Part, found: &Registration, measured: &[Point], options: &Options) -> Vec<String> {
     let mut doubts = of_points(found);
+    doubts.extend(of_nominal(part, found));
     doubts.extend(of_radius(part, found, measured, options));
     doubts
 }
@@ -52,6 +54,7 @@ fn of_points(found: &Registration) -> Vec<String> {
     let (outliers, off_part) = (count(PointStatus::Outlier), count(PointStatus::OffPart));
     let share = |n: usize| n as f64 / points as f64;
     let mut doubts: Vec<String> = of_left_out(found).into_iter().collect();
+    doubts.extend(found.no_verdict());
     if share(outliers) > MOST_OUTLIERS {
         doubts.push(format!(
             "{outliers} of {points} points ({:.0} %) are outliers and were left out: look for dirt or coolant on the part, a probe that \
@@ -59,11 +62,20 @@ fn of_points(found: &Registration) -> Vec<String> {
             100.0 * share(outliers),
         ));
     }
-    if share(off_part) > MOST_OFF_PART {
+    let in_gaps = in_gaps(found);
+    if share(off_part - in_gaps) > MOST_OFF_PART {
         doubts.push(format!(
-            "{off_part} of {points} points ({:.0} %) lie beyond the edge of the nominal surface and were left out: does the nominal \
+            "{} of {points} points ({:.0} %) lie beyond the edge of the nominal surface and were left out: does the nominal \
              surface reach as far as the part, and does the cloud belong to it?",
-            100.0 * share(off_part),
+            off_part - in_gaps,
+            100.0 * share(off_part - in_gaps),
+        ));
+    }
+    if in_gaps > 0 {
+        doubts.push(format!(
+            "{in_gaps} of {points} points ({:.0} %) lie over a gap of the nominal surface, where it has no points, and were left out: give it \
+             points there, if the part has a surface there",
+            100.0 * share(in_gaps),
         ));
     }
     let coverage = found.verdict.coverage;
@@ -76,6 +88,84 @@ fn of_points(found: &Registration) -> Vec<String> {
         ));
     }
     doubts
+}
+
+/// Counts the points off the part that have points on it all around.
+fn in_gaps(found: &Registration) -> usize {
+    /// Directions in the plane of the model frame that are looked along.
+    const SECTORS: usize = 8;
+    /// Points that are looked at, at most.
+    const MOST: usize = 2000;
+    let at = |d: &Deviation| [d.point.x, d.point.y];
+    let of = |is_off: bool| {
+        found
+            .deviations
+            .iter()
+            .filter(move |d| (d.status == PointStatus::OffPart) == is_off)
+            .map(at)
+            .collect::<Vec<_>>()
+    };
+    let (off, on) = (of(true), of(false));
+    let looked_at: Vec<&[f64; 2]> = off.iter().step_by(off.len().div_ceil(MOST).max(1)).collect();
+    let some: Vec<&[f64; 2]> = on.iter().step_by(on.len().div_ceil(MOST).max(1)).collect();
+    let is_surrounded = |place: &&&[f64; 2]| {
+        let mut seen = [false; SECTORS];
+        for other in &some {
+            let angle = (other[1] - place[1]).atan2(other[0] - place[0]);
+            let turn = (angle / std::f64::consts::TAU).rem_euclid(1.0);
+            seen[((turn * SECTORS as f64) as usize).min(SECTORS - 1)] = true;
+        }
+        seen.iter().all(|seen| *seen)
+    };
+    let surrounded = looked_at.iter().filter(is_surrounded).count();
+    (surrounded * off.len()) / looked_at.len().max(1)
+}
+
+impl Registration {
+    /// Says why nothing can be judged by these points: so many of them contradict their neighbours that nobody knows which of both is the part.
+    pub fn no_verdict(&self) -> Option<String> {
+        /// Share of the points on the part.
+        const MOST: f64 = 0.1;
+        let on_part: Vec<&Deviation> = self.deviations.iter().filter(|d| d.status != PointStatus::OffPart).collect();
+        let left = on_part.iter().filter(|d| !d.in_fit).count();
+        if left as f64 <= MOST * on_part.len() as f64 {
+            return None;
+        }
+        let contradicted = contradicted(&self.deviations);
+        if contradicted as f64 <= MOST * on_part.len() as f64 {
+            return None;
+        }
+        let figures = |some: &mut dyn Iterator<Item = f64>| {
+            let add = |(low, high, squares, n): (f64, f64, f64, usize), d: f64| {
+                (f64::min(low, d), f64::max(high, d), squares + d * d, n + 1)
+            };
+            let (low, high, squares, n) = some.fold((f64::INFINITY, f64::NEG_INFINITY, 0.0, 0), add);
+            format!("PV {} and RMS {}", length(high - low), length((squares / n.max(1) as f64).sqrt()))
+        };
+        let with = figures(&mut on_part.iter().map(|d| d.deviation_mm));
+        let without = figures(&mut on_part.iter().filter(|d| d.in_fit).map(|d| d.deviation_mm));
+        Some(format!(
+            "{contradicted} of {} points ({:.0} %) contradict their neighbours, so nothing can be judged by them: with them {with}, \
+             without them {without}; clean the part, check the probe, and measure again",
+            on_part.len(),
+            100.0 * contradicted as f64 / on_part.len() as f64,
+        ))
+    }
+}
+
+/// Tells that the nominal points scatter themselves, as far as it is in the deviations.
+fn of_nominal(part: &Part, found: &Registration) -> Option<String> {
+    /// What is less than both is of no account: a file with four digits of a millimetre scatters by 0.03 um.
+    const LEAST_MM: f64 = 1e-4;
+    const LEAST_OF_RMS: f64 = 0.1;
+    let scatter_mm = part.nominal.scatter_mm();
+    (scatter_mm > LEAST_MM.max(LEAST_OF_RMS * found.verdict.rms_mm)).then(|| {
+        format!(
+            "the nominal points scatter by {} about a smooth surface, and each deviation by about as much: give them with more digits, or \
+             the surface that they were taken from",
+            length(scatter_mm),
+        )
+    })
 }
 
 /// Names the points that were left out, and the figures with them.

@@ -30,6 +30,16 @@ pub enum RegistrationError {
     Narrow { width_mm: f64, distance_mm: f64, least_mm: f64, hold: [Coordinate; 2] },
     #[error("measured point {} is not finite; remove it or correct it", index + 1)]
     NotFinite { index: usize },
+    #[error(
+        "measured point {} at ({:.6}, {:.6}, {:.6}) mm lies {distance_mm:.6} mm from the middle of the others, as no touch does; remove it or \
+         correct it", index + 1, at[0], at[1], at[2]
+    )]
+    FarOff { index: usize, at: [f64; 3], distance_mm: f64 },
+    #[error(
+        "the nominal point at ({:.6}, {:.6}, {:.6}) mm lies {distance_mm:.6} mm from the middle of the others; remove it or correct it",
+        at[0], at[1], at[2]
+    )]
+    NominalFarOff { at: [f64; 3], distance_mm: f64 },
     #[error("all {points} measured points lie on one line; a pose needs points off it")]
     Collinear { points: usize },
     #[error(
@@ -62,6 +72,8 @@ pub enum RegistrationError {
          given; turn the normals or the side"
     )]
     WrongSide { rms_mm: f64, other_rms_mm: f64 },
-    #[error("no direction of the pose is free or visible; unlock one, or give a surface with more shape")]
+    #[error(
+        "no direction of the pose is free or visible; give the pose that is held whole, unlock a direction, or give a surface with more shape"
+    )]
     Undetermined,
 }

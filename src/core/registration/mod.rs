@@ -51,7 +51,7 @@ use refit::trim_and_refit;
 pub use result::{Registration, WithLeftOut};
 pub use robust::Loss;
 pub(crate) use robust::robust_sigma;
-use start::{InitialPose, initial_pose, mirror_image, mirrored_rms};
+use start::{InitialPose, free_rms, initial_pose, mirror_image, mirrored_rms};
 pub use verdict::{Verdict, WeakDirection};
 
 /// Registers measured points to a nominal surface.
@@ -126,7 +126,28 @@ fn report(
         at_feet(&problem.surface, problem.measured, &correspondences, pose, &descent.scaling, &reporter);
     alone::count_what_agrees(&mut deviations, &mut verdict, options.outlier_sigmas);
     verdict.coverage = verdict::coverage(part.nominal, &deviations);
+    let trace = with_the_end(trace, &verdict, options);
     Ok(Registration { cmm_from_model: descent.cmm_from_model, deviations, trace, side: initial.side, verdict })
+}
+
+/// No distance is told more exactly.
+const ROUNDING_MM: f64 = 1e-12;
+
+/// The turns of the iteration with the state that is reported as the last, whatever came to count behind them.
+fn with_the_end(mut trace: Vec<Iteration>, verdict: &Verdict, options: &Options) -> Vec<Iteration> {
+    let Verdict { objective_mm2, used, .. } = *verdict;
+    let is_told = |taken: &&Iteration| {
+        let off_mm2 = (taken.objective_mm2 - objective_mm2).abs();
+        // Sums in another order differ by rounding, which is all there is where the points lie on the surface.
+        taken.points == used && off_mm2 <= 1e-9 * objective_mm2 + used as f64 * ROUNDING_MM * ROUNDING_MM
+    };
+    let told = trace.iter().rfind(|turn| turn.taken).filter(is_told).map(|turn| turn.objective_mm2);
+    if told.is_none() || !trace.last().is_some_and(|last| last.taken) {
+        let (ball_radius, objective_mm2) =
+            (trace.last().map_or(options.ball_radius, |last| last.ball_radius), told.unwrap_or(objective_mm2));
+        trace.push(Iteration { objective_mm2, step: 0.0, ball_radius, taken: true, points: used });
+    }
+    trace
 }
 
 /// Refuses a fit that is none: a cloud of another part, or a mirror image.
@@ -135,15 +156,29 @@ fn confirm(part: &Part, found: &Registration, measured: &[Point], options: &Opti
     let rms_mm = found.verdict.rms_mm;
     let limit_mm = part.rms_limit_mm(options);
     let doubtful = rms_mm > limit_mm || rms_mm > (0.02 * part.nominal.relief_mm()).max(10.0 * LEAST_SIGMA_MM);
-    if doubtful
-        && let Some(mirrored_rms_mm) = mirrored_rms(part, measured, options, found.side)
-        && mirrored_rms_mm < 0.3 * rms_mm
+    if !doubtful {
+        return Ok(());
+    }
+    // A pose that is held does not tell a mirror image from a part that lies elsewhere: both are compared as they fit when nothing holds them.
+    let is_held = options.locked.contains(&true);
+    let free_rms_mm = if is_held { free_rms(part, measured, options, found.side).unwrap_or(rms_mm) } else { rms_mm };
+    if let Some(mirrored_rms_mm) = mirrored_rms(part, measured, options, found.side)
+        && mirrored_rms_mm < 0.3 * free_rms_mm
         && mirrored_rms_mm <= limit_mm
     {
-        return Err(RegistrationError::Mirrored { rms_mm, mirrored_rms_mm });
+        return Err(RegistrationError::Mirrored { rms_mm: free_rms_mm, mirrored_rms_mm });
     }
     if rms_mm > limit_mm {
+        let elsewhere = || {
+            (is_held && free_rms_mm <= limit_mm).then(|| {
+                format!(
+                    "with nothing held they fit to {free_rms_mm:.4} mm: the part lies elsewhere than the pose that is held; correct \
+                     that pose, or unlock more"
+                )
+            })
+        };
         let remedy = doubt::of_radius(part, found, measured, options)
+            .or_else(elsewhere)
             .unwrap_or_else(|| "check part, units and probe radius, or raise the limit".to_owned());
         return Err(RegistrationError::DoesNotFit { rms_mm, limit_mm, remedy });
     }

@@ -2,13 +2,13 @@
 
 use rayon::prelude::*;
 
-use crate::geometry::Point;
+use crate::geometry::{Point, far_off};
 use crate::surface::{Lookup, Nominal, OffsetSurface, Side};
 
 use super::correspond::{ResidualModel, middle_and_size};
 use super::error::RegistrationError;
 use super::iterate::Problem;
-use super::options::{Method, Options};
+use super::options::{Method, Options, Start};
 use super::robust::{Loss, ScaledLoss};
 
 /// The nominal surface and the sizes that limits are stated in.
@@ -33,7 +33,9 @@ impl<'a> Part<'a> {
         measured: &[Point],
         options: &Options,
     ) -> Result<Self, RegistrationError> {
-        if options.locked == [true; 6] {
+        // A pose that is held whole is given, and the deviations from it are asked for.
+        let is_held = options.locked == [true; 6];
+        if is_held && options.start == Start::Search {
             return Err(RegistrationError::Undetermined);
         }
         // One more than the free directions, or nothing is left to tell how well it fits.
@@ -44,13 +46,17 @@ impl<'a> Part<'a> {
         if let Some(index) = measured.par_iter().position_first(|p| !(p.x + p.y + p.z).is_finite()) {
             return Err(RegistrationError::NotFinite { index });
         }
-        if crate::surface::is_line(measured) {
+        if !is_held && crate::surface::is_line(measured) {
             return Err(RegistrationError::Collinear { points: measured.len() });
         }
         check_repeats(measured)?;
         let (middle, size_mm) = middle_and_size(measured);
         let nominal_mm = nominal.size_mm();
-        check_sizes(size_mm, nominal_mm)?;
+        // What does not move may be a few points beside each other, or one.
+        let size_mm = if is_held { size_mm.max(1e-3 * nominal_mm) } else { size_mm };
+        if !is_held {
+            check_sizes(size_mm, nominal_mm).map_err(|error| or_one_far_off(nominal, measured, error))?;
+        }
         let radius_mm = options.probe_radius_mm;
         let limit_mm = 0.5 * nominal_mm;
         if options.method != Method::Contact && !(radius_mm > 0.0 && radius_mm < limit_mm) {
@@ -125,6 +131,18 @@ fn check_repeats(measured: &[Point]) -> Result<(), RegistrationError> {
         return Err(RegistrationError::Repeated { doubled, points: chosen.len() });
     }
     Ok(())
+}
+
+/// Names the point far from all others that makes a size what it is, if there is one.
+fn or_one_far_off(nominal: &Nominal, measured: &[Point], error: RegistrationError) -> RegistrationError {
+    if let Some((index, distance_mm)) = far_off(measured) {
+        return RegistrationError::FarOff { index, at: measured[index].into(), distance_mm };
+    }
+    let nominal: Vec<Point> = nominal.points().copied().collect();
+    match far_off(&nominal) {
+        Some((index, distance_mm)) => RegistrationError::NominalFarOff { at: nominal[index].into(), distance_mm },
+        None => error,
+    }
 }
 
 fn check_sizes(measured_mm: f64, nominal_mm: f64) -> Result<(), RegistrationError> {

@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use crate::geometry::{Nearest, Point, Pose};
 
-use super::correspond::{Correspondence, middle_and_size};
+use super::correspond::{Correspondence, ON_PART_STEPS, beyond_steps, middle_and_size};
 use super::error::RegistrationError;
 use super::iterate::{Descent, Iteration, Problem};
 use super::options::Options;
@@ -33,12 +33,12 @@ pub(super) fn trim_and_refit(
         pose = descend_coarsely(&problem, pose, *few, if initial.near { Some(options) } else { None }, trace)?;
     }
     prefetch(&problem, correspondences, &pose);
-    let mut known = None;
+    let sums = problem.feet(correspondences, &pose, &problem.scaling_at(&pose));
+    let mut changed = find_again(&problem, correspondences, &pose);
     if initial.near {
-        let sums = problem.feet(correspondences, &pose, &problem.scaling_at(&pose));
-        let changed = screen(&problem, options, correspondences, true);
-        known = (changed == 0 && options.loss == Loss::None).then_some(sums);
+        changed += screen(&problem, options, correspondences, true);
     }
+    let mut known = (changed == 0 && options.loss == Loss::None).then_some(sums);
     let mut round = 0;
     loop {
         rescale(&mut problem, options, correspondences, round > 0 || initial.near);
@@ -49,10 +49,11 @@ pub(super) fn trim_and_refit(
         }
         pose = descent.cmm_from_model;
         round += 1;
-        let changed = screen(&problem, options, correspondences, round < BOTH_WAYS);
+        let changed = find_again(&problem, correspondences, &pose)
+            + screen(&problem, options, correspondences, round < BOTH_WAYS);
         let robust_settling = options.loss != Loss::None && round < 4;
         if (changed == 0 && !robust_settling) || round == MOST_ROUNDS {
-            return finish(descent, correspondences.len());
+            return finish(descent, correspondences.len(), options.locked == [true; 6]);
         }
     }
 }
@@ -98,11 +99,11 @@ fn descend_coarsely(
 }
 
 /// Refuses an end that hangs on too few points, or on none of the six directions.
-fn finish(descent: Descent, points: usize) -> Result<Descent, RegistrationError> {
+fn finish(descent: Descent, points: usize, is_held: bool) -> Result<Descent, RegistrationError> {
     if descent.sums.points * 2 < points {
         return Err(RegistrationError::TooFewUsed { used: descent.sums.points, points });
     }
-    if descent.rank == 0 {
+    if descent.rank == 0 && !is_held {
         return Err(RegistrationError::Undetermined);
     }
     Ok(descent)
@@ -122,9 +123,39 @@ pub(crate) const LEAST_SIGMA_MM: f64 = 1e-5;
 fn sigma_of(correspondences: &[Correspondence]) -> (f64, f64) {
     // A sample tells the sigma of many points to a percent.
     let stride = correspondences.len().div_ceil(1 << 16);
-    let on_part = correspondences.iter().step_by(stride).filter(|t| t.beyond_steps <= 0.5).map(|t| t.distance_mm);
+    let on_part = correspondences.iter().step_by(stride).filter(|t| !t.is_off_part()).map(|t| t.distance_mm);
     let (median, sigma) = robust_sigma(on_part);
     (median, sigma.max(LEAST_SIGMA_MM))
+}
+
+/// Searches anew for the feet that are too far away to be believed, and for those beyond the edge; returns how many were found elsewhere.
+///
+/// A walk over the facets ends at the edge of a gap, and may have all of the part behind that.
+fn find_again(problem: &Problem, correspondences: &mut [Correspondence], pose: &Pose) -> usize {
+    /// No touch that is on the part is as far from it, once the part is about where it should be.
+    const FAR_MM: f64 = 0.2;
+    if !correspondences.par_iter().any(|t| t.is_off_part() || t.distance_mm.abs() > FAR_MM) {
+        return 0;
+    }
+    let (median, sigma) = sigma_of(correspondences);
+    let far = |t: &Correspondence| (t.distance_mm - median).abs() > FAR_MM.max(6.0 * sigma);
+    let model_from_cmm = pose.inverse();
+    let again = |(t, p): (&mut Correspondence, &Point)| {
+        if !t.is_off_part() && !far(t) {
+            return false;
+        }
+        let p = model_from_cmm.point(p);
+        let foot = problem.surface.foot_from_anywhere(&p);
+        let distance_mm = foot.distance_mm - problem.residual.subtract_mm;
+        let beyond_steps = beyond_steps(&problem.surface, &p, &foot);
+        let is_on_part = beyond_steps <= ON_PART_STEPS;
+        let is_nearer = is_on_part && (t.is_off_part() || distance_mm.abs() < 0.5 * t.distance_mm.abs());
+        if is_nearer {
+            (t.place, t.distance_mm, t.beyond_steps) = (foot.place, distance_mm, beyond_steps);
+        }
+        is_nearer
+    };
+    correspondences.par_iter_mut().zip(problem.measured).filter_map(|both| again(both).then_some(())).count()
 }
 
 /// Decides which points take part in the fit; returns how many changed. What does not may be form all the same: [`super::alone`].
@@ -147,7 +178,7 @@ fn screen(problem: &Problem, options: &Options, correspondences: &mut [Correspon
     }
     let mut changed = 0;
     for (k, correspondence) in correspondences.iter_mut().enumerate() {
-        let fits = correspondence.beyond_steps <= 0.5 && !outlier.get(k).copied().unwrap_or(false);
+        let fits = !correspondence.is_off_part() && !outlier.get(k).copied().unwrap_or(false);
         if fits != correspondence.used && (both_ways || !fits) {
             correspondence.used = fits;
             changed += 1;

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use crate::geometry::{Point, Pose, Vector};
 use crate::surface::{Feature, OffsetSurface, Place, Side, features, principal_axes};
 
-use super::correspond::{Correspondence, middle_and_size};
+use super::correspond::{Correspondence, ON_PART_STEPS, beyond_steps, middle_and_size};
 use super::error::RegistrationError;
 use super::iterate::Problem;
 use super::options::{Options, Start};
@@ -36,6 +36,8 @@ pub(crate) struct Candidate {
     pub(crate) cmm_from_model: Pose,
     /// Root mean square of the nearest nine tenths of the distances, in millimetres.
     pub(crate) rms_mm: f64,
+    /// The same of the points on the part alone.
+    on_part_rms_mm: f64,
     /// Share of the points whose feet lie beyond the edge.
     off_part: f64,
     side: Side,
@@ -67,6 +69,9 @@ const COMPARED_AT_MOST: usize = 6;
 /// A side fits better only if its rms is this many times smaller; the part's own form error keeps the two apart by less.
 const SIDE_RATIO: f64 = 2.0;
 
+/// A side does not fit better by having more of the points off the part than this share.
+const SIDE_OFF_PART: f64 = 0.05;
+
 /// Chooses the pose to begin from and the side of the probe.
 pub(crate) fn initial_pose(
     part: &Part,
@@ -83,6 +88,12 @@ pub(crate) fn initial_pose(
 /// Returns the rms to which the mirrored cloud fits; `None` if it cannot be registered at all.
 pub(crate) fn mirrored_rms(part: &Part, measured: &[Point], options: &Options, side: Side) -> Option<f64> {
     searched_rms(part, &mirrored(measured), options, side)
+}
+
+/// Returns the rms to which the cloud fits as it was measured, with nothing held.
+pub(crate) fn free_rms(part: &Part, measured: &[Point], options: &Options, side: Side) -> Option<f64> {
+    let some: Vec<Point> = spread(measured, 4 * COMPARED).copied().collect();
+    searched_rms(part, &some, options, side)
 }
 
 /// Returns the rms of the cloud as measured and mirrored, if it fits mirrored and does not as it is.
@@ -102,9 +113,9 @@ fn mirrored(measured: &[Point]) -> Vec<Point> {
     spread(measured, 4 * COMPARED).map(|p| Point::new(-p.x, p.y, p.z)).collect()
 }
 
-/// Returns the rms to which a search over all poses fits points on one side.
+/// Returns the rms to which a search over all poses fits points on one side, with nothing held.
 fn searched_rms(part: &Part, points: &[Point], options: &Options, side: Side) -> Option<f64> {
-    let options = Options { side: side.into(), ..*options };
+    let options = Options { side: side.into(), locked: [false; 6], ..*options };
     let search = Search::new(part, points, &options);
     search.compared(&search.candidates(side), side).first().map(|c| c.rms_mm)
 }
@@ -175,7 +186,9 @@ impl<'a> Search<'a> {
             return Err(RegistrationError::Undetermined);
         };
         let (side, best, side_known) = self.choose_side(at_normal, at_opposite)?;
-        let alternatives = self.alternatives(&best, if side == Side::Normal { normal } else { opposite });
+        let all = if side == Side::Normal { normal } else { opposite };
+        let best = self.nearest_to_the_frame(best, all);
+        let alternatives = self.alternatives(&best, all);
         Ok(InitialPose { cmm_from_model: best.cmm_from_model, side, side_known, near: true, alternatives })
     }
 
@@ -187,7 +200,9 @@ impl<'a> Search<'a> {
     ) -> Result<(Side, Candidate, bool), RegistrationError> {
         // Without an offset the two sides are one surface.
         let told = |better: &Candidate, worse: &Candidate| {
-            self.part.offset_mm == 0.0 || better.rms_mm * SIDE_RATIO < worse.rms_mm
+            // How far points lie beyond the edge tells nothing of the side.
+            let is_nearer = better.on_part_rms_mm * SIDE_RATIO < worse.on_part_rms_mm;
+            self.part.offset_mm == 0.0 || is_nearer && better.off_part <= worse.off_part + SIDE_OFF_PART
         };
         match self.options.side.given() {
             None if self.part.offset_mm > 0.0 && told(&opposite, &normal) => Ok((Side::Opposite, opposite, true)),
@@ -271,19 +286,26 @@ impl<'a> Search<'a> {
         (sum / points.len() as f64).sqrt()
     }
 
-    /// Root mean square distance of the nearest nine tenths of the points, which outliers in the rest do not spoil, and the
-    /// share of the points off the part.
-    fn trimmed_rms(&self, surface: &OffsetSurface, cmm_from_model: &Pose, points: &[Point]) -> (f64, f64) {
+    /// Looks how well points fit under a pose: by the nearest nine tenths of them, which outliers in the rest do not spoil.
+    fn looked_at(&self, surface: &OffsetSurface, cmm_from_model: Pose, points: &[Point]) -> Candidate {
         let inverse = cmm_from_model.inverse();
-        let feet = points.iter().map(|p| surface.foot(&inverse.point(p), Place::UNKNOWN));
-        let (mut squares, mut off) = (Vec::with_capacity(points.len()), 0);
-        for foot in feet {
-            squares.push((foot.distance_mm - self.part.subtract_mm).powi(2) + foot.beyond_mm.powi(2));
-            off += usize::from(foot.beyond_steps > 0.5);
+        let (mut all, mut on_part) = (Vec::with_capacity(points.len()), Vec::with_capacity(points.len()));
+        for p in points.iter().map(|p| inverse.point(p)) {
+            let foot = surface.foot(&p, Place::UNKNOWN);
+            let square = (foot.distance_mm - self.part.subtract_mm).powi(2);
+            all.push(square + foot.beyond_mm.powi(2));
+            if beyond_steps(surface, &p, &foot) <= ON_PART_STEPS {
+                on_part.push(square);
+            }
         }
-        squares.sort_unstable_by(f64::total_cmp);
-        let kept = &squares[..(points.len() * 9).div_ceil(10)];
-        ((kept.iter().sum::<f64>() / kept.len() as f64).sqrt(), off as f64 / points.len() as f64)
+        let off_part = 1.0 - on_part.len() as f64 / points.len() as f64;
+        let trimmed_rms_mm = |mut squares: Vec<f64>| {
+            squares.sort_unstable_by(f64::total_cmp);
+            let kept = &squares[..(squares.len() * 9).div_ceil(10)];
+            (kept.iter().sum::<f64>() / kept.len().max(1) as f64).sqrt()
+        };
+        let (rms_mm, on_part_rms_mm) = (trimmed_rms_mm(all), trimmed_rms_mm(on_part));
+        Candidate { cmm_from_model, rms_mm, on_part_rms_mm, off_part, side: surface.side() }
     }
 
     /// Squared distances from the part itself, what lies beyond its edge included.
@@ -319,14 +341,37 @@ impl<'a> Search<'a> {
             if round > 0 {
                 let (_, sigma) = robust_sigma(correspondences.iter().map(|t| t.distance_mm));
                 problem.residual.loss = ScaledLoss::new(Loss::Tukey, sigma.max(1e-4));
+                leave_out_what_is_off_the_part(&mut correspondences);
             }
             match problem.descend(pose, None, &mut correspondences, &mut trace) {
                 Ok(descent) => pose = descent.cmm_from_model,
                 Err(_) => break,
             }
         }
-        let (rms_mm, off_part) = self.trimmed_rms(&problem.surface, &pose, points);
-        Candidate { cmm_from_model: pose, rms_mm, off_part, side }
+        self.looked_at(&problem.surface, pose, points)
+    }
+
+    /// Returns the pose that is turned least from the frame of the file, of those that fit as well as the best: where the surface does not tell
+    /// how it lies, nothing but that frame does.
+    fn nearest_to_the_frame(&self, best: Candidate, all: &[Candidate]) -> Candidate {
+        /// By how much a fit may be worse by chance.
+        const ALIKE: f64 = 1.1;
+        /// No two fits are told apart by less.
+        const LEAST_MM: f64 = 1e-5;
+        let nominal = self.part.nominal.sample(REFINED);
+        let middle_of = |points: &[Point]| points.iter().map(|p| p.coords).sum::<Vector>() / points.len().max(1) as f64;
+        let offset = self.part.nominal.mean_normal() * (best.side.sign() * self.part.offset_mm);
+        let centred = middle_of(&self.many) - middle_of(&nominal) - offset;
+        let as_filed = [Vector::zeros(), centred].map(|translation_mm| {
+            let start = Pose { translation_mm, ..Pose::identity() };
+            self.refine(start, best.side, &self.many, 4, 10)
+        });
+        let fits_as_well = |c: &&Candidate| {
+            c.side == best.side && c.rms_mm <= ALIKE * best.rms_mm + LEAST_MM && c.off_part <= best.off_part
+        };
+        let turn = |c: &Candidate| c.cmm_from_model.angle_rad();
+        let least = as_filed.iter().chain(all).filter(fits_as_well).min_by(|a, b| turn(a).total_cmp(&turn(b)));
+        least.filter(|c| self.apart(&c.cmm_from_model, &best.cmm_from_model) > 0.01).copied().unwrap_or(best)
     }
 
     /// Other poses that fit nearly as well as the best.
@@ -378,6 +423,13 @@ impl<'a> Search<'a> {
         let measured = most_telling(features(&sample, None));
         measured.iter().flat_map(|m| [*m, m.turned_over()]).flat_map(|m| laid_on(&m, &offset)).collect()
     }
+}
+
+/// Leaves out the points beyond the edge, unless the pose is so far off that most of them are.
+fn leave_out_what_is_off_the_part(correspondences: &mut [Correspondence]) {
+    let off = correspondences.iter().filter(|t| t.is_off_part()).count();
+    let may_be = 2 * off < correspondences.len();
+    correspondences.iter_mut().for_each(|t| t.used = !(may_be && t.is_off_part()));
 }
 
 /// The features whose two curvatures differ most, so that their directions are sure; half of them, spread over all.

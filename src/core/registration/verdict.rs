@@ -36,7 +36,7 @@ pub struct Verdict {
     ///
     /// Equation: s^2 (A^T A)^-1 with s^2 the residual variance (GUM, F.1; Golub and Van Loan, 5.5).
     pub covariance: Matrix6<f64>,
-    /// Largest singular value of A over the least that is free, with lengths in units of the cloud's rms size.
+    /// Largest singular value of A over the least that is free, with lengths in units of the cloud's rms size; 1 where none is free.
     pub condition: f64,
     /// Directions that the surface cannot see, and those it sees worse than a single point is measured.
     pub weak_directions: Vec<WeakDirection>,
@@ -94,7 +94,7 @@ pub(crate) fn judge(
         pv_mm: high_mm - low_mm,
         residual_sigma_mm: residual2.sqrt(),
         covariance: to_twist * scaled * to_twist.transpose(),
-        condition: (spectrum.squares[0] / spectrum.squares[rank - 1]).sqrt(),
+        condition: rank.checked_sub(1).map_or(1.0, |last| (spectrum.squares[0] / spectrum.squares[last]).sqrt()),
         weak_directions,
         coverage: 0.0,
         warnings: warnings(problem, initial, &alternatives, (objective_mm2 / n as f64).sqrt()),

@@ -19,9 +19,13 @@ use super::normals::tangents;
 use super::offset::{Distance, OffsetSurface, Place};
 use super::projection::{Map, Projection, is_line};
 
-/// The spacings of the two coarser samplings in spacings of the whole one: of a grid, and of scattered points.
+/// The spacings of the two coarser samplings of a grid, in spacings of the whole one.
 const OF_GRID: [usize; 2] = [3, 6];
-const OF_SCATTERED: [usize; 2] = [2, 4];
+
+/// One of so many scattered points is kept in the two coarser samplings: of many points, and of fewer than so many.
+const OF_SCATTERED: [usize; 2] = [4, 16];
+const OF_FEW: [usize; 2] = [2, 4];
+const FEW: usize = 600;
 
 /// The order that is believed of an observed one: below, something else than the spacing makes the error.
 const ORDERS: [f64; 2] = [1.5, 4.5];
@@ -146,28 +150,37 @@ impl Estimate {
 /// # Errors
 /// Points that make no surface, and fewer than it takes to leave most of them out.
 pub fn accuracy(samples: Samples) -> Result<Accuracy, SurfaceError> {
-    let (points, factor, [fine, coarse]) = match samples {
+    let (points, [factor, coarsest], [mut fine, mut coarse]) = match samples {
         Samples::Grid { columns, rows, points, normals } => {
             check_grid(columns, rows, points.len().min(normals.len()))?;
             let level = |stride| defined_grid_level(columns, rows, points, normals, stride);
-            (points, OF_GRID[0], [level(OF_GRID[0])?, level(OF_GRID[1])?])
+            (points, OF_GRID.map(|stride| stride as f64), [level(OF_GRID[0])?, level(OF_GRID[1])?])
         }
         Samples::Points { points, projection } => {
             // Whatever is wrong with the points is said of all of them, not of those that happen to be kept.
             if let Some(index) = points.iter().position(|p| !(p.x + p.y + p.z).is_finite()) {
                 return Err(SurfaceError::NotFinite { index });
             }
-            let (factor, kept) = kept_of_points(points, projection)?;
-            (points, factor, [kept_level(points, &kept[0], projection)?, kept_level(points, &kept[1], projection)?])
+            let (factors, kept) = kept_of_points(points, projection)?;
+            (points, factors, [kept_level(points, &kept[0], projection)?, kept_level(points, &kept[1], projection)?])
         }
     };
     let count = points.iter().filter(|p| p.x.is_finite()).count();
     let least = count.max(1).saturating_mul(4);
+    let is_border = [&fine, &coarse].iter().any(|errors| errors.inside.len() < LEAST_INSIDE);
+    if is_border {
+        // Of a few points the border is all there is: what is told is told of it.
+        [&mut fine, &mut coarse].into_iter().for_each(Errors::take_the_border_in);
+    }
     if [&fine, &coarse].iter().any(|errors| errors.inside.len() < LEAST_INSIDE) {
         return Err(SurfaceError::TooFewPoints { points: count, least });
     }
-    let spacing_mm = fine.spacing_mm / factor as f64;
-    let [flat, curved] = [0, 1].map(|kind| estimate(&fine, &coarse, kind, factor as f64, spacing_mm));
+    let spacing_mm = fine.spacing_mm / factor;
+    let [flat, curved] = [0, 1].map(|kind| {
+        let told = estimate(&fine, &coarse, kind, [factor, coarsest / factor], spacing_mm);
+        let trust = if is_border && told.trust == Trust::Extrapolated { Trust::TooCoarse } else { told.trust };
+        Estimate { trust, ..told }
+    });
     Ok(Accuracy { points: count, spacing_mm, flat, curved })
 }
 
@@ -177,6 +190,12 @@ struct Errors {
     border: Vec<Measured>,
     /// Mean spacing of the coarser sampling, in millimetres.
     spacing_mm: f64,
+}
+
+impl Errors {
+    fn take_the_border_in(&mut self) {
+        self.inside.append(&mut self.border);
+    }
 }
 
 /// A point left out: its error by the flat and by the curved distance.
@@ -208,15 +227,15 @@ fn coarse_nodes(columns: usize, rows: usize, stride: usize) -> impl Iterator<Ite
     (0..rows).step_by(stride).flat_map(move |j| (0..columns).step_by(stride).map(move |i| j * columns + i))
 }
 
-/// Chooses what to keep for the two coarser samplings; returns the spacing of the finer of them in spacings of the whole sampling.
-fn kept_of_points(points: &[Point], projection: Projection) -> Result<(usize, [Vec<u32>; 2]), SurfaceError> {
+/// Chooses what to keep for the two coarser samplings; returns their spacings in spacings of the whole sampling.
+fn kept_of_points(points: &[Point], projection: Projection) -> Result<([f64; 2], [Vec<u32>; 2]), SurfaceError> {
     let on_plane = matches!(projection, Projection::Auto | Projection::Xy);
     if let Some(order) = recognise_grid(points).filter(|_| on_plane) {
         let kept = OF_GRID.map(|stride| {
             let nodes = coarse_nodes(order.columns, order.rows, stride).map(|node| order.point_at[node]);
             nodes.filter(|&point| point != NO_POINT).collect()
         });
-        return Ok((OF_GRID[0], kept));
+        return Ok((OF_GRID.map(|stride| stride as f64), kept));
     }
     if points.len() < 9 {
         return Err(SurfaceError::TooFewPoints { points: points.len(), least: 9 });
@@ -226,8 +245,9 @@ fn kept_of_points(points: &[Point], projection: Projection) -> Result<(usize, [V
     }
     let (_, map) = projection.prepare(points)?;
     let order = along_the_plane(points, &map);
-    let every = |stride: usize| order.iter().copied().skip(stride / 2).step_by(stride * stride).collect();
-    Ok((OF_SCATTERED[0], OF_SCATTERED.map(every)))
+    let of = if points.len() < FEW { OF_FEW } else { OF_SCATTERED };
+    let every = |one_of: usize| order.iter().copied().skip(one_of.isqrt() / 2).step_by(one_of).collect();
+    Ok((of.map(|one_of| (one_of as f64).sqrt()), of.map(every)))
 }
 
 /// Puts points in the order of Morton's curve through the plane of a projection: neighbours in it are neighbours there, so
@@ -286,15 +306,15 @@ fn measure(coarse: &Nominal, points: &[Point], left_out: &[bool]) -> Errors {
 }
 
 /// Extrapolates from two coarser samplings to the whole one.
-fn estimate(fine: &Errors, coarse: &Errors, kind: usize, factor: f64, spacing_mm: f64) -> Estimate {
+fn estimate(fine: &Errors, coarse: &Errors, kind: usize, [factor, step]: [f64; 2], spacing_mm: f64) -> Estimate {
     let [inside_fine, inside_coarse] = [fine, coarse].map(|errors| figures(&errors.inside, kind));
     let [border_fine, border_coarse] = [fine, coarse].map(|errors| figures(&errors.border, kind));
-    let observed_order = observed(&inside_fine, &inside_coarse);
+    let observed_order = observed(&inside_fine, &inside_coarse, step);
     let trust = trust(observed_order, LEAST_ORDER[kind], inside_fine.rms_mm, spacing_mm);
     let order = observed_order.clamp(ORDERS[0], ORDERS[1]);
     let scale = |order: f64| if trust == Trust::Rounding { 1.0 } else { factor.powf(-order) };
     let (inside_scale, border_scale) =
-        (scale(order), scale(observed(&border_fine, &border_coarse).clamp(ORDERS[0], ORDERS[1])));
+        (scale(order), scale(observed(&border_fine, &border_coarse, step).clamp(ORDERS[0], ORDERS[1])));
     let worst = |set: &[Measured], scale: f64, near_border: bool| {
         let largest = set.iter().max_by(|a, b| a.errors_mm[kind].abs().total_cmp(&b.errors_mm[kind].abs()));
         largest.map(|m| Worst { at: m.at, error_mm: m.errors_mm[kind] * scale, near_border })
@@ -316,10 +336,10 @@ fn estimate(fine: &Errors, coarse: &Errors, kind: usize, factor: f64, spacing_mm
     }
 }
 
-/// The order at which the error fell from one sampling to the next, whose spacing is half as large.
-fn observed(fine: &Figures, coarse: &Figures) -> f64 {
+/// The order at which the error fell from one sampling to the next, whose spacing is so many times as small.
+fn observed(fine: &Figures, coarse: &Figures, step: f64) -> f64 {
     let ratio = coarse.rms_mm / fine.rms_mm;
-    if ratio > 0.0 && ratio.is_finite() { ratio.log2() } else { ORDERS[0] }
+    if ratio > 0.0 && ratio.is_finite() { ratio.log2() / step.log2() } else { ORDERS[0] }
 }
 
 fn trust(observed_order: f64, least: f64, rms_mm: f64, spacing_mm: f64) -> Trust {

@@ -1,8 +1,10 @@
 //! Triangulation of scattered points in the plane of their projection.
 
+use std::collections::{HashMap, HashSet};
+
 use rayon::prelude::*;
 
-use crate::geometry::{Point, bounds};
+use crate::geometry::{Point, bounds, far_off};
 
 use super::edges::{SortedSites, Triangulation};
 use super::error::SurfaceError;
@@ -20,6 +22,12 @@ const NEEDLE: f64 = 0.05;
 
 /// A triangle whose longest edge is this many times what is usual around its corners bridges a hole.
 const BRIDGE: f64 = 6.0;
+
+/// Points that reach farther than so many sides of a square of as many of them are looked at for one that is none of them.
+const WIDE: f64 = 100.0;
+
+/// Two points nearer than this share of what is usual are twins.
+const TWINS: f64 = 1e-4;
 
 /// Coordinates beyond this (2^201) are refused: their fourth powers would leave what a number can hold.
 const LARGEST: f64 = 3.2e60;
@@ -46,7 +54,21 @@ pub(crate) fn triangulate(points: &[Point], map: &Map) -> Result<(Vec<Point>, Tr
     if corners.is_empty() {
         return Err(SurfaceError::Collinear { points: points.len() });
     }
-    let triangles = without_bridges_and_needles(Triangles { corners, neighbours }, &ordered);
+    let triangles = Triangles { corners, neighbours };
+    let lengths = Lengths::of(&triangles, &ordered);
+    if let Some(twins) = twins(&triangles, &lengths, &ordered) {
+        let [first, second] = twins.map(|k| along[k as usize].1 as usize);
+        let apart_mm = (points[first] - points[second]).norm();
+        let (first, second) = (first.min(second), first.max(second));
+        return Err(SurfaceError::NearDuplicates { first, second, at: points[first].into(), apart_mm });
+    }
+    let [low, high] = bounds(ordered.iter().copied());
+    if (high[0] - low[0]).max(high[1] - low[1]) > WIDE * lengths.usual * (points.len() as f64).sqrt()
+        && let Some((index, distance_mm)) = far_off(points)
+    {
+        return Err(SurfaceError::FarOff { index, at: points[index].into(), distance_mm });
+    }
+    let triangles = without_bridges_and_needles(triangles, &lengths, &ordered);
     Ok((along.par_iter().map(|(_, index)| points[*index as usize]).collect(), triangles))
 }
 
@@ -94,10 +116,38 @@ fn first_duplicate(points: &[Point], places: &[[f64; 2]]) -> SurfaceError {
     SurfaceError::DuplicatePoints { first: pair.0, second: pair.1, at: points[pair.0].into() }
 }
 
-fn without_bridges_and_needles(mut t: Triangles, places: &[[f64; 2]]) -> Triangles {
+/// The shortest and the longest edge of each triangle, and the median of the longest.
+struct Lengths {
+    shortest: Vec<f64>,
+    longest: Vec<f64>,
+    usual: f64,
+}
+
+impl Lengths {
+    fn of(t: &Triangles, places: &[[f64; 2]]) -> Self {
+        let of = |corners: &[u32; 3]| {
+            let [a, b, c] = squared_lengths(corners, places);
+            (a.min(b).min(c).sqrt(), a.max(b).max(c).sqrt())
+        };
+        let (shortest, longest): (Vec<f64>, Vec<f64>) = t.corners.par_iter().map(of).unzip();
+        Self { usual: median(&longest), shortest, longest }
+    }
+}
+
+/// Finds two points so near each other that the surface between them is made of rounding.
+fn twins(t: &Triangles, lengths: &Lengths, places: &[[f64; 2]]) -> Option<[u32; 2]> {
+    let least = TWINS * lengths.usual;
+    let facet = lengths.shortest.par_iter().position_first(|shortest| *shortest < least)?;
+    let corners = t.corners[facet];
+    let squared = squared_lengths(&corners, places);
+    let across = (0..3).min_by(|&a, &b| squared[a].total_cmp(&squared[b]))?;
+    Some([corners[(across + 1) % 3], corners[(across + 2) % 3]])
+}
+
+fn without_bridges_and_needles(mut t: Triangles, lengths: &Lengths, places: &[[f64; 2]]) -> Triangles {
     let mut dropped = vec![false; t.corners.len()];
     let mut open: Vec<u32> = Vec::new();
-    for facet in bridges(&t, places) {
+    for facet in bridges(&t, lengths) {
         drop_facet(&mut t, &mut dropped, facet, &mut open);
     }
     let at_border = |f: &u32| t.neighbours[*f as usize].contains(&BORDER);
@@ -132,46 +182,61 @@ fn squared_lengths(corners: &[u32; 3], places: &[[f64; 2]]) -> [f64; 3] {
 }
 
 /// Finds triangles far longer than is usual around their corners.
-fn bridges(t: &Triangles, places: &[[f64; 2]]) -> Vec<u32> {
-    let longest: Vec<f64> =
-        t.corners.par_iter().map(|c| squared_lengths(c, places).into_iter().fold(0.0, f64::max).sqrt()).collect();
-    let usual_everywhere = median(&longest);
+fn bridges(t: &Triangles, lengths: &Lengths) -> Vec<u32> {
     let suspects: Vec<u32> = (0..t.corners.len() as u32)
         .into_par_iter()
-        .filter(|&f| longest[f as usize] > BRIDGE * usual_everywhere)
+        .filter(|&f| lengths.longest[f as usize] > BRIDGE * lengths.usual)
         .collect();
     if suspects.is_empty() {
         return suspects;
     }
-    let usual = usual_around(t, &longest, places.len(), &suspects);
+    let usual = usual_around(t, lengths, &suspects);
     suspects
         .into_iter()
         .filter(|&f| {
-            let least = t.corners[f as usize].iter().map(|&c| usual[c as usize]).fold(f64::INFINITY, f64::min);
-            longest[f as usize] > BRIDGE * least.max(usual_everywhere)
+            let most = t.corners[f as usize].iter().map(|c| usual[c]).fold(0.0, f64::max);
+            lengths.longest[f as usize] > BRIDGE * most.max(lengths.usual)
         })
         .collect()
 }
 
-/// Returns what is usual at the vertices of some triangles: the lower quartile of the longest edges around each, since at the
-/// rim of a hole half of its triangles may be bridges. Zero at all other vertices.
-fn usual_around(t: &Triangles, longest: &[f64], vertices: usize, suspects: &[u32]) -> Vec<f64> {
-    let mut asked = vec![false; vertices];
-    for c in suspects.iter().flat_map(|&f| t.corners[f as usize]) {
-        asked[c as usize] = true;
-    }
-    let mut around: Vec<(u32, f64)> = t
-        .corners
-        .par_iter()
-        .zip(longest)
-        .flat_map_iter(|(c, &l)| c.iter().filter(|&&c| asked[c as usize]).map(move |&c| (c, l)))
-        .collect();
-    around.par_sort_unstable_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)));
-    let mut usual = vec![0.0; vertices];
-    for at_vertex in around.chunk_by(|a, b| a.0 == b.0) {
-        usual[at_vertex[0].0 as usize] = at_vertex[(at_vertex.len() - 1) / 4].1;
-    }
-    usual
+/// Returns what is usual at the corners of some triangles: the lower quartile of the longest edges around each, since at the
+/// rim of a hole half of its triangles may be bridges.
+///
+/// Where the points change from dense to sparse, the triangles between are as long as is usual on the sparse side. So the largest of the corners
+/// counts. A stray point would speak for its own bridges: a corner counts for no more than the second largest of its neighbours.
+fn usual_around(t: &Triangles, lengths: &Lengths, suspects: &[u32]) -> HashMap<u32, f64> {
+    let corners: HashSet<u32> = suspects.iter().flat_map(|&f| t.corners[f as usize]).collect();
+    let neighbours = triangles_at(t, &corners);
+    let beside: HashSet<u32> = neighbours.values().flatten().flat_map(|&f| t.corners[f as usize]).collect();
+    let around = triangles_at(t, &beside);
+    let quartile = |facets: &Vec<u32>| {
+        let mut longest: Vec<f64> = facets.iter().map(|&f| lengths.longest[f as usize]).collect();
+        longest.sort_unstable_by(f64::total_cmp);
+        longest[(longest.len() - 1) / 4]
+    };
+    let own: HashMap<u32, f64> = around.iter().map(|(&c, facets)| (c, quartile(facets))).collect();
+    let confirmed = |(&c, facets): (&u32, &Vec<u32>)| {
+        let mut others: Vec<u32> = facets.iter().flat_map(|&f| t.corners[f as usize]).filter(|&o| o != c).collect();
+        others.sort_unstable();
+        others.dedup();
+        let mut usual: Vec<f64> = others.iter().map(|o| own[o]).collect();
+        usual.sort_unstable_by(|a, b| b.total_cmp(a));
+        (c, own[&c].min(usual.get(1).copied().unwrap_or(0.0)))
+    };
+    neighbours.iter().map(confirmed).collect()
+}
+
+/// The triangles at some vertices.
+fn triangles_at(t: &Triangles, vertices: &HashSet<u32>) -> HashMap<u32, Vec<u32>> {
+    let at = |(f, corners): (usize, &[u32; 3])| {
+        let wanted = corners.iter().filter(|c| vertices.contains(c)).copied().collect::<Vec<_>>();
+        wanted.into_iter().map(move |c| (c, f as u32))
+    };
+    let found: Vec<(u32, u32)> = t.corners.par_iter().enumerate().flat_map_iter(at).collect();
+    let mut of: HashMap<u32, Vec<u32>> = HashMap::new();
+    found.into_iter().for_each(|(c, f)| of.entry(c).or_default().push(f));
+    of
 }
 
 fn is_needle(t: &Triangles, places: &[[f64; 2]], facet: u32) -> bool {

@@ -11,6 +11,11 @@ pub enum SurfaceError {
     TooFewPoints { points: usize, least: usize },
     #[error("nominal point {} is not finite; remove it or correct it", index + 1)]
     NotFinite { index: usize },
+    #[error(
+        "nominal point {} at ({:.6}, {:.6}, {:.6}) mm lies {distance_mm:.6} mm from the middle of the others; remove it or correct it",
+        index + 1, at[0], at[1], at[2]
+    )]
+    FarOff { index: usize, at: [f64; 3], distance_mm: f64 },
     #[error("all {points} nominal points lie on one line; a surface needs points off it")]
     Collinear { points: usize },
     #[error(
@@ -18,6 +23,11 @@ pub enum SurfaceError {
         first + 1, second + 1, at[0], at[1], at[2]
     )]
     DuplicatePoints { first: usize, second: usize, at: [f64; 3] },
+    #[error(
+        "nominal points {} and {} at ({:.6}, {:.6}, {:.6}) mm are near-duplicates, {apart_mm:e} mm apart: what runs between them is rounding; \
+         remove one of them", first + 1, second + 1, at[0], at[1], at[2]
+    )]
+    NearDuplicates { first: usize, second: usize, at: [f64; 3], apart_mm: f64 },
     #[error(
         "no projection of the nominal points is one-to-one: {tried}; divide the surface into patches, or give a mesh"
     )]

@@ -64,6 +64,9 @@ pub(crate) trait Facets: Sync {
     /// Returns the facet to look at next for a point with these barycentric weights; `None` where the surface ends.
     fn advance(&self, facet: u32, weights: &[f64; 3]) -> Option<u32>;
 
+    /// Whether the surface ends at the edge of a facet that lies opposite to a corner.
+    fn ends_at(&self, facet: u32, corner: usize) -> bool;
+
     /// Returns a facet to start from.
     fn start(&self, p: &Point) -> u32;
 }

@@ -85,6 +85,21 @@ impl GridLattice {
         self.present.is_empty() || self.present[node]
     }
 
+    /// Returns the other nodes of the block that reaches so many nodes to all sides of one.
+    pub(crate) fn block_around(&self, node: u32, reach: u32) -> Vec<u32> {
+        let (i, j) = (node % self.columns, node / self.columns);
+        let within = |k: u32, count: u32| k.saturating_sub(reach)..(k + reach + 1).min(count);
+        let nodes = within(j, self.rows).flat_map(|j| within(i, self.columns).map(move |i| j * self.columns + i));
+        nodes.filter(|&k| k != node && self.is_present(k as usize)).collect()
+    }
+
+    /// Returns a facet at a node, or of the nearest whole cell.
+    pub(crate) fn facet_near(&self, node: u32) -> u32 {
+        let (i, j) = (node % self.columns, node / self.columns);
+        let (i, j) = self.nearest_whole_cell(i.min(self.columns - 2), j.min(self.rows - 2));
+        self.facet_at(i, j, 0)
+    }
+
     fn cell_is_whole(&self, i: u32, j: u32) -> bool {
         let node = (j * self.columns + i) as usize;
         let above = node + self.columns as usize;
@@ -155,6 +170,21 @@ impl Facets for GridLattice {
         let (du, dv) = (u + f64::from(here.0) - f64::from(cell.0), v + f64::from(here.1) - f64::from(cell.1));
         let next = self.facet_at(cell.0, cell.1, u32::from(dv > du));
         (next != facet).then_some(next)
+    }
+
+    fn ends_at(&self, facet: u32, corner: usize) -> bool {
+        let (i, j) = self.cell_of(facet);
+        let is_whole = |i: Option<u32>, j: Option<u32>| {
+            i.zip(j).is_some_and(|(i, j)| i + 1 < self.columns && j + 1 < self.rows && self.cell_is_whole(i, j))
+        };
+        match (facet & 1, corner) {
+            (0, 0) => !is_whole(Some(i + 1), Some(j)),
+            (0, 2) => !is_whole(Some(i), j.checked_sub(1)),
+            (1, 0) => !is_whole(Some(i), Some(j + 1)),
+            (1, 1) => !is_whole(i.checked_sub(1), Some(j)),
+            // The diagonal of the cell.
+            _ => false,
+        }
     }
 
     fn start(&self, p: &Point) -> u32 {

@@ -172,6 +172,10 @@ impl Facets for MeshLattice {
             .map(|k| across[k])
     }
 
+    fn ends_at(&self, facet: u32, corner: usize) -> bool {
+        self.neighbours[facet as usize][corner] == BORDER
+    }
+
     fn start(&self, p: &Point) -> u32 {
         let nearest = self.starts.to(p, 1).next();
         nearest.map_or(0, |(k, _)| self.start_facets[k])

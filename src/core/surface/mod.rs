@@ -28,6 +28,7 @@ mod offset;
 mod patch;
 mod prefetch;
 mod projection;
+mod roughness;
 pub(crate) mod simd;
 
 pub use analytic::{AnalyticSurface, DefinedSurface, DefinitionError, SampledSurface, Sampling, SurfaceDefinition};

@@ -5,7 +5,7 @@ use std::sync::OnceLock;
 use rayon::prelude::*;
 
 use crate::geometry::grid_order::grid_in_order;
-use crate::geometry::{Aperture, Point, Vector, recognise_grid};
+use crate::geometry::{Aperture, Nearest, Point, Vector, recognise_grid};
 
 use super::delaunay;
 use super::error::SurfaceError;
@@ -14,8 +14,10 @@ use super::feature::{Feature, features};
 use super::grid::{GridLattice, grid_nodes, in_grid_order};
 use super::mesh::MeshLattice;
 use super::normals;
+use super::offset::Place;
 use super::patch::{Lattice, Patch};
 use super::projection::{Projection, is_line, principal_axes};
+use super::roughness;
 
 /// A nominal surface: one or several patches of points with normals, ready for distances.
 #[derive(Debug)]
@@ -27,6 +29,8 @@ pub struct Nominal {
     features: OnceLock<Vec<Feature>>,
     /// Rms distances of its points from their middle and from their best plane.
     extent_mm: OnceLock<[f64; 2]>,
+    /// Some of its points and a facet at each, made when a search for a foot is begun anew.
+    starts: OnceLock<(Nearest, Vec<Place>)>,
 }
 
 /// What a nominal surface was made from.
@@ -144,7 +148,14 @@ impl Nominal {
             return Err(SurfaceError::NoPatches);
         }
         let kind = NominalKind::Patches { count: patches.len() };
-        Ok(Self { patches, kind, outline: None, features: OnceLock::new(), extent_mm: OnceLock::new() })
+        Ok(Self {
+            patches,
+            kind,
+            outline: None,
+            features: OnceLock::new(),
+            extent_mm: OnceLock::new(),
+            starts: OnceLock::new(),
+        })
     }
 
     /// States the outline of the part in xy: a point whose foot lies outside it is off the part.
@@ -158,7 +169,14 @@ impl Nominal {
     }
 
     fn of(patch: Patch, kind: NominalKind) -> Self {
-        Self { patches: vec![patch], kind, outline: None, features: OnceLock::new(), extent_mm: OnceLock::new() }
+        Self {
+            patches: vec![patch],
+            kind,
+            outline: None,
+            features: OnceLock::new(),
+            extent_mm: OnceLock::new(),
+            starts: OnceLock::new(),
+        }
     }
 
     /// Returns what the surface was made from.
@@ -263,6 +281,28 @@ impl Nominal {
             }
         }
         if count == 0 { 0.0 } else { (sum / f64::from(count)).sqrt() }
+    }
+
+    /// Returns the standard deviation by which its points scatter along the normal about a smooth surface, in millimetres; 0 where they tell of none.
+    pub(crate) fn scatter_mm(&self) -> f64 {
+        roughness::scatter_mm(&self.patches)
+    }
+
+    /// Returns facets at the points of the surface that lie nearest to a place, in space and not along any projection.
+    pub(crate) fn places_near(&self, p: &Point) -> impl Iterator<Item = Place> {
+        /// Points that are kept for it, and how many of them are told.
+        const KEPT: usize = 20_000;
+        const TOLD: u32 = 3;
+        let (nearest, places) = self.starts.get_or_init(|| {
+            let share = (KEPT / self.patches.len()).max(1);
+            let of_patch = |(number, patch): (usize, &Patch)| {
+                let place = move |vertex| (*patch.point(vertex), Place::on(number as u32, patch.facet_at(vertex)));
+                patch.sample(share).map(place).collect::<Vec<_>>()
+            };
+            let (points, places): (Vec<Point>, Vec<Place>) = self.patches.iter().enumerate().flat_map(of_patch).unzip();
+            (Nearest::of(points.into_iter()), places)
+        });
+        nearest.to(p, TOLD).map(|(k, _)| places[k])
     }
 
     /// Returns the surface by every second node of its grid; none where it is not one grid, or one of too few nodes.

@@ -305,6 +305,13 @@ fn substitute<const N: usize>(l: &[[f64; N]; N], inverse_pivots: &[f64; N], x: &
     }
 }
 
+/// Returns at least so many neighbours of a vertex, ring by ring; fewer where there are no more, and no more than a fit takes in.
+pub(super) fn ring_around(mesh: &MeshLattice, vertex: u32, wanted: usize) -> Vec<u32> {
+    let mut ring = [0; MOST];
+    let found = neighbours(mesh, vertex, wanted, &mut ring);
+    ring[..found].to_vec()
+}
+
 /// Collects whole rings of neighbours round a vertex until there are as many as wanted; returns how many.
 fn neighbours(mesh: &MeshLattice, vertex: u32, wanted: usize, ring: &mut [u32; MOST]) -> usize {
     let (mut begin, mut count) = match mesh.two_rings(vertex, ring) {

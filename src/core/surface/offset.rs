@@ -52,6 +52,11 @@ impl Place {
     /// Nothing known yet.
     pub const UNKNOWN: Self = Self { patch: 0, facet: u32::MAX };
 
+    /// A facet of a patch.
+    pub(crate) fn on(patch: u32, facet: u32) -> Self {
+        Self { patch, facet }
+    }
+
     /// A facet of a surface of one patch.
     pub(crate) fn on_first_patch(facet: u32) -> Self {
         Self { patch: 0, facet }
@@ -79,6 +84,13 @@ pub struct Foot {
     pub beyond_mm: f64,
     /// How far that is in steps of the nominal sampling.
     pub beyond_steps: f64,
+}
+
+impl Foot {
+    /// The one that is least beyond an edge first; of those on the part the nearest.
+    fn by_nearness(&self, other: &Self) -> std::cmp::Ordering {
+        self.beyond_mm.total_cmp(&other.beyond_mm).then(self.distance_mm.abs().total_cmp(&other.distance_mm.abs()))
+    }
 }
 
 /// A foot this many steps of the sampling beyond the edge is still on the part: the curved facet continues that far.
@@ -157,20 +169,35 @@ impl<'a> OffsetSurface<'a> {
     }
 
     /// The foot on the patch that a point belongs to: the nearest one that has it inside, else the one it is least beyond.
+    ///
+    /// Where patches only touch, their offsets leave a gap over a convex seam: a foot that is a little beyond two of them at one height lies in it,
+    /// and on the part.
     fn nearest_foot(&self, patches: &[Patch], p: &Point, start: Place) -> Foot {
-        let rank = |f: &Foot| {
-            let beyond = if f.beyond_steps <= EDGE_REACH { 0.0 } else { f.beyond_mm };
-            (beyond, f.distance_mm.abs())
+        let feet: Vec<Foot> =
+            patches.iter().enumerate().map(|(k, patch)| self.foot_on(patch, k as u32, p, start)).collect();
+        let best = feet.iter().copied().min_by(Foot::by_nearness).expect("a nominal surface has at least one patch");
+        let is_at_seam = |other: &Foot| {
+            let apart_mm = (other.distance_mm - best.distance_mm).abs();
+            other.place.patch != best.place.patch
+                && other.beyond_steps <= EDGE_REACH
+                && apart_mm <= EDGE_REACH * self.spacing_mm(best.place)
         };
-        patches
-            .iter()
-            .enumerate()
-            .map(|(k, patch)| self.foot_on(patch, k as u32, p, start))
-            .min_by(|a, b| {
-                let (a, b) = (rank(a), rank(b));
-                a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1))
-            })
-            .expect("a nominal surface has at least one patch")
+        if best.beyond_steps > 0.0 && best.beyond_steps <= EDGE_REACH && feet.iter().any(is_at_seam) {
+            return Foot { beyond_mm: 0.0, beyond_steps: 0.0, ..best };
+        }
+        best
+    }
+
+    /// Searches for the foot of a point anew, from the places of the surface nearest to it, and returns the nearest one that is found.
+    ///
+    /// A search walks downhill, and in a gutter from the wrong wall: it ends where no neighbour is nearer, at a foot on the other side.
+    #[cold]
+    pub(crate) fn foot_from_anywhere(&self, p: &Point) -> Foot {
+        let found = self
+            .nominal
+            .places_near(p)
+            .map(|start| self.foot_on(&self.nominal.patches()[start.patch as usize], start.patch, p, start));
+        found.min_by(Foot::by_nearness).unwrap_or_else(|| self.foot(p, Place::UNKNOWN))
     }
 
     #[inline]
@@ -230,7 +257,12 @@ impl<'a> OffsetSurface<'a> {
                     before = facet;
                     facet = next;
                 }
-                _ => return self.foot_in(&here, p, weights, inside || next.is_some(), Place { patch: number, facet }),
+                _ => {
+                    // Two that point at each other at the border have the foot between them only along it.
+                    let is_beyond = |k: usize| weights[k] < INSIDE && facets.ends_at(facet, k);
+                    let inside = inside || next.is_some() && !(0..3).any(is_beyond);
+                    return self.foot_in(&here, p, weights, inside, Place { patch: number, facet });
+                }
             }
         }
         let here = self.facet(patch, facets.corners(facet));

@@ -103,6 +103,14 @@ impl Patch {
     }
 
     /// Whether normals were given or exact rather than fitted to scattered neighbours.
+    /// Returns a facet at a vertex, or next to one at which there is none.
+    pub(crate) fn facet_at(&self, vertex: u32) -> u32 {
+        match &self.lattice {
+            Lattice::Grid(grid) => grid.facet_near(vertex),
+            Lattice::Mesh(mesh) => mesh.start(self.point(vertex)),
+        }
+    }
+
     pub(crate) fn has_scattered_normals(&self) -> bool {
         matches!(self.vertices, Vertices::WhenTouched(..))
     }

@@ -19,3 +19,4 @@ mod sample;
 mod search;
 mod taught;
 mod touches;
+mod unknown;

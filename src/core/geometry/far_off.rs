@@ -1,0 +1,42 @@
+//! A point that is no part of what the others are of.
+
+use super::Point;
+
+/// In distances that half of the points keep from their middle.
+const FAR: f64 = 50.0;
+
+/// Returns the point that is farthest from the middle of all, and how far, where it is many times as far as half of them are.
+///
+/// Units: millimetres. None of fewer than three points, or where half of them lie at one place.
+pub(crate) fn far_off(points: &[Point]) -> Option<(usize, f64)> {
+    if points.len() < 3 {
+        return None;
+    }
+    let median = |mut values: Vec<f64>| {
+        let middle = values.len() / 2;
+        *values.select_nth_unstable_by(middle, f64::total_cmp).1
+    };
+    let [x, y, z] = [0, 1, 2].map(|k| median(points.iter().map(|p| p[k]).collect()));
+    let middle = Point::new(x, y, z);
+    let apart: Vec<f64> = points.iter().map(|p| (p - middle).norm()).collect();
+    let usual_mm = median(apart.clone());
+    let far = (0..apart.len()).max_by(|&a, &b| apart[a].total_cmp(&apart[b]))?;
+    (usual_mm > 0.0 && apart[far] > FAR * usual_mm).then_some((far, apart[far]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_of_many_is_named_and_none_of_a_spread_cloud() {
+        let mut points: Vec<Point> = (0..100).map(|k| Point::new(f64::from(k % 10), f64::from(k / 10), 0.0)).collect();
+        assert_eq!(far_off(&points), None);
+        points[17] = Point::new(1e6, 0.0, 0.0);
+        let (index, distance_mm) = far_off(&points).unwrap();
+        assert_eq!(index, 17);
+        assert!((distance_mm - 1e6).abs() < 10.0, "{distance_mm}");
+        assert_eq!(far_off(&[Point::origin(); 5]), None);
+        assert_eq!(far_off(&points[16..18]), None);
+    }
+}

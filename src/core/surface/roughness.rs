@@ -1,0 +1,111 @@
+//! How far the points of a nominal surface scatter about a smooth one.
+//!
+//! A cubic is fitted to a few neighbours of a point and to twice as many. What it leaves of a smooth surface grows with the fourth power of
+//! the distance; what it leaves of points that scatter is the same both times.
+
+use nalgebra::{DMatrix, DVector};
+
+use super::normals::{NEIGHBOURS, ring_around, tangents};
+use super::patch::{Lattice, Patch};
+use crate::geometry::Point;
+
+/// Terms of a cubic in two variables.
+const TERMS: usize = 10;
+/// Points that are looked at.
+const LOOKED_AT: usize = 200;
+/// What grows by more than this factor from the few neighbours to the many is the surface itself.
+const GROWS: f64 = 2.0;
+
+/// Returns the standard deviation by which the points scatter along the normal, in millimetres; 0 where the surface is smooth as far as its
+/// points tell.
+pub(super) fn scatter_mm(patches: &[Patch]) -> f64 {
+    let mut left: [Vec<f64>; 2] = Default::default();
+    for patch in patches {
+        for vertex in patch.sample((LOOKED_AT / patches.len()).max(1)) {
+            let around = around(patch, vertex);
+            let of = |count: usize| around.get(..count).and_then(|some| left_by_a_cubic(some));
+            // With the point itself the fewest that leave a few degrees of freedom.
+            if let Some(few) = of(NEIGHBOURS + 3)
+                && let Some(many) = of(2 * NEIGHBOURS + 3)
+            {
+                left[0].push(few);
+                left[1].push(many);
+            }
+        }
+    }
+    if left[0].is_empty() {
+        return 0.0;
+    }
+    let [few, many] = left.map(|squares| (squares.iter().sum::<f64>() / squares.len() as f64).sqrt());
+    if many > GROWS * few { 0.0 } else { many }
+}
+
+/// A point and its neighbours along two tangents and the normal, the nearest first.
+fn around(patch: &Patch, vertex: u32) -> Vec<[f64; 3]> {
+    let wanted = 2 * NEIGHBOURS + 3;
+    let others: Vec<u32> = match &patch.lattice {
+        Lattice::Mesh(mesh) => ring_around(mesh, vertex, wanted),
+        Lattice::Grid(grid) => grid.block_around(vertex, 3),
+    };
+    let (at, normal) = (*patch.point(vertex), patch.normal(vertex));
+    let [tu, tv] = tangents(&normal);
+    let local = |p: &Point| {
+        let d = p - at;
+        [d.dot(&tu), d.dot(&tv), d.dot(&normal)]
+    };
+    let mut around: Vec<[f64; 3]> = others.iter().map(|&k| local(patch.point(k))).chain([[0.0; 3]]).collect();
+    around.sort_by(|a, b| a[0].hypot(a[1]).total_cmp(&b[0].hypot(b[1])));
+    around
+}
+
+/// Returns the mean square that the best cubic leaves, by its degrees of freedom; none where the places do not determine one.
+fn left_by_a_cubic(places: &[[f64; 3]]) -> Option<f64> {
+    let size = places.last().map(|[u, v, _]| u.hypot(*v)).filter(|size| *size > 0.0)?;
+    let rows = DMatrix::from_fn(places.len(), TERMS, |r, c| {
+        let [u, v] = [places[r][0] / size, places[r][1] / size];
+        [1.0, u, v, u * u, u * v, v * v, u * u * u, u * u * v, u * v * v, v * v * v][c]
+    });
+    let right = DVector::from_fn(places.len(), |r, _| places[r][2]);
+    let qr = rows.qr();
+    let diagonal = qr.r().diagonal().abs();
+    let freedom = places.len().checked_sub(TERMS).filter(|freedom| *freedom > 0)?;
+    if diagonal.min() < 1e-9 * diagonal.max() {
+        return None;
+    }
+    let q = qr.q();
+    let left = &right - &q * q.tr_mul(&right);
+    Some(left.norm_squared() / freedom as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::geometry::Point;
+    use crate::surface::{Nominal, Projection};
+
+    /// Points 1 mm apart, jittered so that they are no grid or not, on a wave, with a scatter of so much.
+    fn nominal(jitter_mm: f64, scatter_mm: f64) -> Nominal {
+        let mut state = 1u64;
+        let mut uniform = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 11) as f64 / (1u64 << 53) as f64 - 0.5
+        };
+        let points = (0..60 * 40).map(|k| {
+            let [x, y] = [(k % 60) as f64 + jitter_mm * uniform(), (k / 60) as f64 + jitter_mm * uniform()];
+            // Uniform from -sqrt 3 to sqrt 3 has a standard deviation of 1.
+            Point::new(x, y, (0.1 * x).sin() + 0.01 * y * y + scatter_mm * 12f64.sqrt() * uniform())
+        });
+        Nominal::from_points(points.collect(), Projection::Xy).unwrap()
+    }
+
+    #[test]
+    fn what_was_planted_is_found_on_grids_and_on_scattered_points() {
+        for jitter_mm in [0.0, 0.5] {
+            for scatter_mm in [1e-3, 1e-2] {
+                let found_mm = nominal(jitter_mm, scatter_mm).scatter_mm();
+                assert!((found_mm / scatter_mm - 1.0).abs() < 0.2, "{jitter_mm}: {found_mm} of {scatter_mm}");
+            }
+            let smooth_mm = nominal(jitter_mm, 0.0).scatter_mm();
+            assert!(smooth_mm < 5e-5, "{jitter_mm}: {smooth_mm}");
+        }
+    }
+}
