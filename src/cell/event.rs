@@ -326,6 +326,9 @@ pub struct Figures {
     /// The most that was taken off anywhere since the run began; none where nobody knows.
     #[serde(default, with = "super::number::optional")]
     pub removed_mm: Option<f64>,
+    /// How many contributions to the uncertainty nobody states, and of how many: they are taken for 0. None where nothing is told of them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unstated: Option<[u32; 2]>,
     /// What is to be touched before anything is decided; none where enough is known, and where all is touched at once.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub touch_on: Option<Box<TouchOn>>,

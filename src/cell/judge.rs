@@ -278,7 +278,13 @@ fn told(plan: &CellPlan, now: &Figures) -> String {
     let [pv, rms] = plan.tolerance.compare(now).map(of);
     let Tolerance { with_uncertainty, probability, .. } = plan.tolerance;
     let counts = if with_uncertainty {
-        format!("{} is asked for", percent(probability))
+        let unstated = match now.unstated {
+            Some([some, all]) if some > 0 => {
+                format!("; {some} of {all} contributions to the uncertainty are not stated and count as 0")
+            }
+            _ => String::new(),
+        };
+        format!("{} is asked for{unstated}", percent(probability))
     } else {
         "without the uncertainty".into()
     };

@@ -269,6 +269,7 @@ fn sample_figures() -> Vec<Figures> {
         response: None,
         forecast: None,
         removed_mm: Some(0.1),
+        unstated: None,
         touch_on: None,
     };
     let mut all = vec![

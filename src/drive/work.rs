@@ -490,8 +490,18 @@ fn figures(
             floor_mm: f.floor_mm.map(bare),
         }),
         removed_mm: Some(task.limits.allowance_mm - cycle.correction.level_mm),
+        unstated: form.and_then(|form| unstated(task, form)),
         touch_on: None,
     }
+}
+
+/// Counts what nobody states of what the uncertainty is made of; where nothing is held its place is no contribution.
+fn unstated(task: &Task, form: &Form) -> Option<[u32; 2]> {
+    let counts =
+        |share: &&model::Share| share.is_stated || share.source != model::Source::Datum || task.held().is_some();
+    let all: Vec<_> = form.budget.iter().filter(counts).collect();
+    let some = all.iter().filter(|share| !share.is_stated).count();
+    (!all.is_empty()).then_some([some as u32, all.len() as u32])
 }
 
 /// What is left of an rms when that of something independent is taken off.

@@ -48,6 +48,7 @@ fn figures() -> Figures {
         pv_robust_mm: None,
         response: None,
         removed_mm: Some(0.1),
+        unstated: None,
         touch_on: None,
     }
 }

@@ -60,6 +60,7 @@ fn figures(pv_um: f64, rms_um: f64) -> Figures {
         pv_robust_mm: None,
         response: None,
         removed_mm: Some(0.1),
+        unstated: None,
         touch_on: None,
     }
 }
@@ -481,6 +482,13 @@ fn a_figure_is_in_tolerance_out_of_it_or_neither() {
         "beyond its limit for certain, and no gain is to be expected"
     );
     assert_eq!(judged(6.71, 0.96, 0.5), Verdict::Continue, "what is undecided is ground again where that is worth it");
+    // What nobody states is taken for 0, and that is said beside the verdict.
+    let mut run = Run::new(plan(), |_| Figures { unstated: Some([4, 8]), ..figures(5.0, 0.5) });
+    run.start().go_on();
+    let said = |words: &str| {
+        run.all.iter().any(|c| matches!(c, Command::Announce(judgement) if judgement.reason.contains(words)))
+    };
+    assert!(said("4 of 8 contributions to the uncertainty are not stated and count as 0"));
     // By the figure alone, where the recipe says so.
     let alone = CellPlan { tolerance: Tolerance { with_uncertainty: false, ..plan().tolerance }, ..plan() };
     let mut run = Run::new(alone, |_| figures(6.99, 0.99));

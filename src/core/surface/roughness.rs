@@ -23,7 +23,7 @@ pub(super) fn scatter_mm(patches: &[Patch]) -> f64 {
     for patch in patches {
         for vertex in patch.sample((LOOKED_AT / patches.len()).max(1)) {
             let around = around(patch, vertex);
-            let of = |count: usize| around.get(..count).and_then(|some| left_by_a_cubic(some));
+            let of = |count: usize| around.get(..count).and_then(left_by_a_cubic);
             // With the point itself the fewest that leave a few degrees of freedom.
             if let Some(few) = of(NEIGHBOURS + 3)
                 && let Some(many) = of(2 * NEIGHBOURS + 3)
