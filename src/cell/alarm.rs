@@ -323,7 +323,7 @@ catalogue! {
     LeftOut {
         "Points were left out that no neighbour agrees with, and with them the part exceeds a limit",
         "The part is not accepted: what was touched counts until it is touched again.", Operator,
-        ["Look at the places that are named, and clean them and the probe.",
+        ["Look at the places that are named, and clean them and the probe without moving the part.",
          "Resume to touch them again, with a few places around; what cannot be touched by itself is measured as a whole.",
          "If the same places are named again, they are on the part: stop the run and let quality decide."]
     }

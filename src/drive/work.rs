@@ -49,8 +49,13 @@ pub(super) fn gate_cycle(
         Some(failure) => (0, Err(failure)),
         None => {
             if let Some((again, points)) = again {
-                let (points, found) = touched_again(again, points, measurement);
-                (found, Ok(points))
+                if measurement.coordinates == points.coordinates {
+                    let (points, found) = touched_again(again, points, measurement);
+                    (found, Ok(points))
+                } else {
+                    let message = "probe centres and contact points cannot be parts of one measurement; measure again";
+                    (0, Err(GateFailure::Broken(message.to_owned())))
+                }
             } else {
                 let [part, sphere] = touched(&plan, planned, measurement);
                 let told = (measurement.coordinates, measurement.temperature_c.filter(|told| told.is_finite()));

@@ -259,7 +259,7 @@ catalogue! { german:
     LeftOut {
         "Es wurden Punkte ausgelassen, mit denen kein Nachbar übereinstimmt, und mit ihnen überschreitet das Teil eine Grenze",
         "Das Teil wird nicht angenommen: was angetastet wurde, zählt, bis es neu angetastet ist.",
-        ["Die genannten Stellen ansehen und reinigen, und den Taster auch.", "RESUME tastet sie noch einmal an, und einige Stellen um sie; was sich nicht einzeln antasten lässt, wird ganz gemessen.",
+        ["Die genannten Stellen ansehen und reinigen, und den Taster auch, ohne das Teil zu bewegen.", "RESUME tastet sie noch einmal an, und einige Stellen um sie; was sich nicht einzeln antasten lässt, wird ganz gemessen.",
          "Werden dieselben Stellen wieder genannt, sind sie am Teil: den Lauf beenden und die Qualitätsstelle entscheiden lassen."]
     }
     MaxCycles {
@@ -338,7 +338,7 @@ catalogue! { chinese:
     Diverging { "工件正在变差", "第二个更差的循环之后，按配方处理：保持或结束。", ["比较最近几个循环的误差图。", "检查砂轮磨损、夹紧松动、温度变化。", "如对下一次磨削有疑问，请保持运行。"] }
     Stalled { "工件不再变好", "按配方处理：保持或结束。", ["将剩余误差与测量不确定度和磨床的重复性比较。", "按 RESUME 再磨一次，或结束运行。"] }
     Undecided { "测量既不能证明工件合格，也不能证明不合格", "按配方处理：保持或结束。", ["用更多的点或更小的噪声测量：更小的不确定度才能判定。", "再磨一次会去除材料，且预计没有帮助。"] }
-    LeftOut { "有测点因与相邻测点不一致而被排除，计入它们后工件超出限值", "不接受该工件：已测到的都算数，直到重新测量。", ["查看并清洁所列位置和测头。", "按 RESUME 重新测量这些位置及其周围；无法单独测量时将重新测量整个工件。", "如果再次列出相同位置，则缺陷在工件上：结束运行，由质量部门决定。"] }
+    LeftOut { "有测点因与相邻测点不一致而被排除，计入它们后工件超出限值", "不接受该工件：已测到的都算数，直到重新测量。", ["查看并清洁所列位置和测头，不要移动工件。", "按 RESUME 重新测量这些位置及其周围；无法单独测量时将重新测量整个工件。", "如果再次列出相同位置，则缺陷在工件上：结束运行，由质量部门决定。"] }
     MaxCycles { "配方不允许再次磨削", "运行结束，未达到公差。", ["查看各循环的数值。", "如果数值仍在下降，请在配方中允许更多次数，并开始以测量为起点的运行。"] }
     BudgetSpent { "允许去除的材料已用完", "不再磨削；运行结束，未达到公差。", ["由质量部门决定该工件：已磨去的无法恢复。", "下一个工件请留更多余量。"] }
     JournalUnwritable { "无法写入运行记录", "不开始新的动作：没有记录的就不做。", ["检查运行文件夹：权限、网络驱动器、磁盘。", "按 RESUME。"] }

@@ -482,7 +482,7 @@ fn a_figure_is_in_tolerance_out_of_it_or_neither() {
         "beyond its limit for certain, and no gain is to be expected"
     );
     assert_eq!(judged(6.71, 0.96, 0.5), Verdict::Continue, "what is undecided is ground again where that is worth it");
-    // What nobody states is taken for 0, and that is said beside the verdict.
+    // A contribution that is not stated counts as 0, and the verdict says so.
     let mut run = Run::new(plan(), |_| Figures { unstated: Some([4, 8]), ..figures(5.0, 0.5) });
     run.start().go_on();
     let said = |words: &str| {
@@ -522,7 +522,7 @@ fn what_was_left_out_counts_until_it_is_touched_again() {
         assert_eq!(run.verdicts(), [Verdict::LeftOut, Verdict::Accept]);
         assert_eq!(run.starts(), [(Device::Grinder, 1), (Device::Cmm, 1), (Device::Cmm, 2)]);
     }
-    // Where the places can be touched again by themselves, the same measurement goes on with them, as often as somebody resumes.
+    // The same measurement goes on with the places that can be touched again by themselves, as often as somebody resumes.
     let mut run = Run::new(plan(), |_| Figures { left_out: again(left_out(50.0, 1.2)), ..figures(5.0, 0.5) });
     run.start().go_on();
     for times in 1..=3 {

@@ -155,7 +155,7 @@ impl Registration {
 
 /// Tells that the nominal points scatter themselves, as far as it is in the deviations.
 fn of_nominal(part: &Part, found: &Registration) -> Option<String> {
-    /// What is less than both is of no account: a file with four digits of a millimetre scatters by 0.03 um.
+    /// A smaller scatter than both is not told: a file with four digits of a millimetre scatters by 0.03 um.
     const LEAST_MM: f64 = 1e-4;
     const LEAST_OF_RMS: f64 = 0.1;
     let scatter_mm = part.nominal.scatter_mm();

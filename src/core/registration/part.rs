@@ -52,7 +52,7 @@ impl<'a> Part<'a> {
         check_repeats(measured)?;
         let (middle, size_mm) = middle_and_size(measured);
         let nominal_mm = nominal.size_mm();
-        // What does not move may be a few points beside each other, or one.
+        // A pose that is held needs no more than one point, and one point has no size.
         let size_mm = if is_held { size_mm.max(1e-3 * nominal_mm) } else { size_mm };
         if !is_held {
             check_sizes(size_mm, nominal_mm).map_err(|error| or_one_far_off(nominal, measured, error))?;

@@ -169,7 +169,7 @@ pub fn accuracy(samples: Samples) -> Result<Accuracy, SurfaceError> {
     let least = count.max(1).saturating_mul(4);
     let is_border = [&fine, &coarse].iter().any(|errors| errors.inside.len() < LEAST_INSIDE);
     if is_border {
-        // Of a few points the border is all there is: what is told is told of it.
+        // A few points are all near the border, so the estimate takes the border in.
         [&mut fine, &mut coarse].into_iter().for_each(Errors::take_the_border_in);
     }
     if [&fine, &coarse].iter().any(|errors| errors.inside.len() < LEAST_INSIDE) {

@@ -203,7 +203,7 @@ fn bridges(t: &Triangles, lengths: &Lengths) -> Vec<u32> {
 /// Returns what is usual at the corners of some triangles: the lower quartile of the longest edges around each, since at the
 /// rim of a hole half of its triangles may be bridges.
 ///
-/// Where the points change from dense to sparse, the triangles between are as long as is usual on the sparse side. So the largest of the corners
+/// Triangles between a dense and a sparse side are as long as is usual on the sparse side. So the largest of the corners
 /// counts. A stray point would speak for its own bridges: a corner counts for no more than the second largest of its neighbours.
 fn usual_around(t: &Triangles, lengths: &Lengths, suspects: &[u32]) -> HashMap<u32, f64> {
     let corners: HashSet<u32> = suspects.iter().flat_map(|&f| t.corners[f as usize]).collect();

@@ -170,8 +170,8 @@ impl<'a> OffsetSurface<'a> {
 
     /// The foot on the patch that a point belongs to: the nearest one that has it inside, else the one it is least beyond.
     ///
-    /// Where patches only touch, their offsets leave a gap over a convex seam: a foot that is a little beyond two of them at one height lies in it,
-    /// and on the part.
+    /// The offsets of patches that only touch leave a gap over a convex seam. A foot that is a little beyond two of them at one height lies in that
+    /// gap, and on the part.
     fn nearest_foot(&self, patches: &[Patch], p: &Point, start: Place) -> Foot {
         let feet: Vec<Foot> =
             patches.iter().enumerate().map(|(k, patch)| self.foot_on(patch, k as u32, p, start)).collect();

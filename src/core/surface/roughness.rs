@@ -13,7 +13,7 @@ use crate::geometry::Point;
 const TERMS: usize = 10;
 /// Points that are looked at.
 const LOOKED_AT: usize = 200;
-/// What grows by more than this factor from the few neighbours to the many is the surface itself.
+/// The surface itself leaves more than this factor more beside many neighbours than beside few.
 const GROWS: f64 = 2.0;
 
 /// Returns the standard deviation by which the points scatter along the normal, in millimetres; 0 where the surface is smooth as far as its
