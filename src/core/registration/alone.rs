@@ -8,6 +8,7 @@ use rayon::prelude::*;
 use crate::geometry::{Nearest, Point};
 
 use super::deviation::{Deviation, PointStatus};
+use super::doubt::Counts;
 use super::refit::LEAST_SIGMA_MM;
 use super::robust::robust_sigma;
 use super::verdict::Verdict;
@@ -26,11 +27,11 @@ const LEAST_SHARE_OF_ALL: f64 = 0.25;
 
 /// Has the points count that were left out of the fit and are not alone: in the number of points used, the objective, RMS and PV.
 pub(super) fn count_what_agrees(deviations: &mut [Deviation], verdict: &mut Verdict, outlier_sigmas: f64) {
-    let left_out: Vec<usize> =
-        (0..deviations.len()).filter(|&k| deviations[k].status == PointStatus::Outlier).collect();
-    if left_out.is_empty() {
+    if Counts::of(deviations).outliers == 0 {
         return;
     }
+    let left_out: Vec<usize> =
+        (0..deviations.len()).filter(|&k| deviations[k].status == PointStatus::Outlier).collect();
     let around = Around::of(deviations, outlier_sigmas);
     let form: Vec<usize> = left_out.into_par_iter().filter(|&k| !around.is_alone(k)).collect();
     if form.is_empty() {

@@ -1,5 +1,7 @@
 //! What makes a fit doubtful that was found all the same: a radius that is not the ball's, and points that are not enough.
 
+use rayon::prelude::*;
+
 use crate::geometry::Point;
 
 use super::alone::contradicted;
@@ -50,8 +52,7 @@ pub(super) fn doubts(part: &Part, found: &Registration, measured: &[Point], opti
 /// Tells that many points were left out, or that they cover little of the surface.
 fn of_points(found: &Registration) -> Vec<String> {
     let points = found.deviations.len();
-    let count = |status| found.deviations.iter().filter(|d| d.status == status).count();
-    let (outliers, off_part) = (count(PointStatus::Outlier), count(PointStatus::OffPart));
+    let Counts { outliers, off_part, .. } = Counts::of(&found.deviations);
     let share = |n: usize| n as f64 / points as f64;
     let mut doubts: Vec<String> = of_left_out(found).into_iter().collect();
     doubts.extend(found.no_verdict());
@@ -62,7 +63,7 @@ fn of_points(found: &Registration) -> Vec<String> {
             100.0 * share(outliers),
         ));
     }
-    let in_gaps = in_gaps(found);
+    let in_gaps = if off_part > 0 { in_gaps(found, off_part) } else { 0 };
     if share(off_part - in_gaps) > MOST_OFF_PART {
         doubts.push(format!(
             "{} of {points} points ({:.0} %) lie beyond the edge of the nominal surface and were left out: does the nominal \
@@ -90,25 +91,45 @@ fn of_points(found: &Registration) -> Vec<String> {
     doubts
 }
 
+/// How many points became what.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Counts {
+    pub(super) outliers: usize,
+    pub(super) off_part: usize,
+    /// Points on the part that the pose was not fitted to.
+    pub(super) left: usize,
+}
+
+impl Counts {
+    /// Counts on all threads: of many points most of the time is taken by memory.
+    pub(super) fn of(deviations: &[Deviation]) -> Self {
+        let of_one = |d: &Deviation| Self {
+            outliers: usize::from(d.status == PointStatus::Outlier),
+            off_part: usize::from(d.status == PointStatus::OffPart),
+            left: usize::from(d.status != PointStatus::OffPart && !d.in_fit),
+        };
+        let add = |a: Self, b: Self| Self {
+            outliers: a.outliers + b.outliers,
+            off_part: a.off_part + b.off_part,
+            left: a.left + b.left,
+        };
+        let of_some = |some: &[Deviation]| some.iter().map(of_one).fold(Self::default(), add);
+        deviations.par_chunks(1 << 14).map(of_some).reduce(Self::default, add)
+    }
+}
+
 /// Counts the points off the part that have points on it all around.
-fn in_gaps(found: &Registration) -> usize {
+fn in_gaps(found: &Registration, off_part: usize) -> usize {
     /// Directions in the plane of the model frame that are looked along.
     const SECTORS: usize = 8;
     /// Points that are looked at, at most.
     const MOST: usize = 2000;
-    let at = |d: &Deviation| [d.point.x, d.point.y];
-    let of = |is_off: bool| {
-        found
-            .deviations
-            .iter()
-            .filter(move |d| (d.status == PointStatus::OffPart) == is_off)
-            .map(at)
-            .collect::<Vec<_>>()
+    let some_of = |is_off: bool, count: usize| -> Vec<[f64; 2]> {
+        let of = found.deviations.iter().filter(|d| (d.status == PointStatus::OffPart) == is_off);
+        of.step_by(count.div_ceil(MOST).max(1)).map(|d| [d.point.x, d.point.y]).collect()
     };
-    let (off, on) = (of(true), of(false));
-    let looked_at: Vec<&[f64; 2]> = off.iter().step_by(off.len().div_ceil(MOST).max(1)).collect();
-    let some: Vec<&[f64; 2]> = on.iter().step_by(on.len().div_ceil(MOST).max(1)).collect();
-    let is_surrounded = |place: &&&[f64; 2]| {
+    let (looked_at, some) = (some_of(true, off_part), some_of(false, found.deviations.len() - off_part));
+    let is_surrounded = |place: &&[f64; 2]| {
         let mut seen = [false; SECTORS];
         for other in &some {
             let angle = (other[1] - place[1]).atan2(other[0] - place[0]);
@@ -118,7 +139,7 @@ fn in_gaps(found: &Registration) -> usize {
         seen.iter().all(|seen| *seen)
     };
     let surrounded = looked_at.iter().filter(is_surrounded).count();
-    (surrounded * off.len()) / looked_at.len().max(1)
+    (surrounded * off_part) / looked_at.len().max(1)
 }
 
 impl Registration {
@@ -126,11 +147,11 @@ impl Registration {
     pub fn no_verdict(&self) -> Option<String> {
         /// Share of the points on the part.
         const MOST: f64 = 0.1;
-        let on_part: Vec<&Deviation> = self.deviations.iter().filter(|d| d.status != PointStatus::OffPart).collect();
-        let left = on_part.iter().filter(|d| !d.in_fit).count();
-        if left as f64 <= MOST * on_part.len() as f64 {
+        let Counts { off_part, left, .. } = Counts::of(&self.deviations);
+        if left as f64 <= MOST * (self.deviations.len() - off_part) as f64 {
             return None;
         }
+        let on_part: Vec<&Deviation> = self.deviations.iter().filter(|d| d.status != PointStatus::OffPart).collect();
         let contradicted = contradicted(&self.deviations);
         if contradicted as f64 <= MOST * on_part.len() as f64 {
             return None;

@@ -134,7 +134,8 @@ fn sigma_of(correspondences: &[Correspondence]) -> (f64, f64) {
 fn find_again(problem: &Problem, correspondences: &mut [Correspondence], pose: &Pose) -> usize {
     /// No touch that is on the part is as far from it, once the part is about where it should be.
     const FAR_MM: f64 = 0.2;
-    if !correspondences.par_iter().any(|t| t.is_off_part() || t.distance_mm.abs() > FAR_MM) {
+    let may_be = |t: &Correspondence| t.is_off_part() || t.distance_mm.abs() > FAR_MM;
+    if !correspondences.par_chunks(1 << 13).any(|some| some.iter().any(may_be)) {
         return 0;
     }
     let (median, sigma) = sigma_of(correspondences);

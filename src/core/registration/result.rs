@@ -4,6 +4,7 @@ use crate::geometry::Pose;
 use crate::surface::Side;
 
 use super::deviation::{Deviation, PointStatus};
+use super::doubt::Counts;
 use super::iterate::Iteration;
 use super::verdict::Verdict;
 
@@ -46,7 +47,10 @@ impl Registration {
 
     /// Returns the figures with the outliers; none where there are none.
     pub fn with_left_out(&self) -> Option<WithLeftOut> {
-        let points = self.left_out().count();
+        let points = Counts::of(&self.deviations).outliers;
+        if points == 0 {
+            return None;
+        }
         let named = self.left_out().take(NAMED).map(|(k, d)| {
             format!("point {k} at ({:.1}, {:.1}) mm by {:+.1} um", d.point.x, d.point.y, 1e3 * d.deviation_mm)
         });
@@ -56,6 +60,6 @@ impl Registration {
         let add =
             |(low, high, squares, n): (f64, f64, f64, usize), d: f64| (low.min(d), high.max(d), squares + d * d, n + 1);
         let (low, high, squares, n) = on_part.fold((f64::INFINITY, f64::NEG_INFINITY, 0.0, 0), add);
-        (points > 0).then(|| WithLeftOut { points, rms_mm: (squares / n as f64).sqrt(), pv_mm: high - low, places })
+        Some(WithLeftOut { points, rms_mm: (squares / n as f64).sqrt(), pv_mm: high - low, places })
     }
 }

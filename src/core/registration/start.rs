@@ -358,20 +358,30 @@ impl<'a> Search<'a> {
         const ALIKE: f64 = 1.1;
         /// No two fits are told apart by less.
         const LEAST_MM: f64 = 1e-5;
+        /// The same of a fit that is not at its end.
+        const AT_MOST: f64 = 3.0;
+        /// Poses less apart are one.
+        const APART: f64 = 0.01;
         let nominal = self.part.nominal.sample(REFINED);
         let middle_of = |points: &[Point]| points.iter().map(|p| p.coords).sum::<Vector>() / points.len().max(1) as f64;
         let offset = self.part.nominal.mean_normal() * (best.side.sign() * self.part.offset_mm);
         let centred = middle_of(&self.many) - middle_of(&nominal) - offset;
-        let as_filed = [Vector::zeros(), centred].map(|translation_mm| {
+        // Mostly these starts lead to nothing, or to the best pose: a few points tell.
+        let refined = |translation_mm: Vector| {
             let start = Pose { translation_mm, ..Pose::identity() };
-            self.refine(start, best.side, &self.many, 4, 10)
-        });
+            let glanced = self.refine(start, best.side, &self.some, 2, 6);
+            let may_be = glanced.rms_mm <= AT_MOST * best.rms_mm + LEAST_MM
+                && self.apart(&glanced.cmm_from_model, &best.cmm_from_model) > APART;
+            may_be.then(|| self.refine(glanced.cmm_from_model, best.side, &self.many, 4, 10))
+        };
+        let as_filed = rayon::join(|| refined(Vector::zeros()), || refined(centred));
+        let as_filed = [as_filed.0, as_filed.1].into_iter().flatten().collect::<Vec<_>>();
         let fits_as_well = |c: &&Candidate| {
             c.side == best.side && c.rms_mm <= ALIKE * best.rms_mm + LEAST_MM && c.off_part <= best.off_part
         };
         let turn = |c: &Candidate| c.cmm_from_model.angle_rad();
         let least = as_filed.iter().chain(all).filter(fits_as_well).min_by(|a, b| turn(a).total_cmp(&turn(b)));
-        least.filter(|c| self.apart(&c.cmm_from_model, &best.cmm_from_model) > 0.01).copied().unwrap_or(best)
+        least.filter(|c| self.apart(&c.cmm_from_model, &best.cmm_from_model) > APART).copied().unwrap_or(best)
     }
 
     /// Other poses that fit nearly as well as the best.

@@ -1,6 +1,6 @@
 //! Triangulation of scattered points in the plane of their projection.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 
 use rayon::prelude::*;
 
@@ -206,10 +206,8 @@ fn bridges(t: &Triangles, lengths: &Lengths) -> Vec<u32> {
 /// Triangles between a dense and a sparse side are as long as is usual on the sparse side. So the largest of the corners
 /// counts. A stray point would speak for its own bridges: a corner counts for no more than the second largest of its neighbours.
 fn usual_around(t: &Triangles, lengths: &Lengths, suspects: &[u32]) -> HashMap<u32, f64> {
-    let corners: HashSet<u32> = suspects.iter().flat_map(|&f| t.corners[f as usize]).collect();
-    let neighbours = triangles_at(t, &corners);
-    let beside: HashSet<u32> = neighbours.values().flatten().flat_map(|&f| t.corners[f as usize]).collect();
-    let around = triangles_at(t, &beside);
+    let neighbours = triangles_at(t, suspects.iter().flat_map(|&f| t.corners[f as usize]));
+    let around = triangles_at(t, neighbours.values().flatten().flat_map(|&f| t.corners[f as usize]));
     let quartile = |facets: &Vec<u32>| {
         let mut longest: Vec<f64> = facets.iter().map(|&f| lengths.longest[f as usize]).collect();
         longest.sort_unstable_by(f64::total_cmp);
@@ -228,10 +226,12 @@ fn usual_around(t: &Triangles, lengths: &Lengths, suspects: &[u32]) -> HashMap<u
 }
 
 /// The triangles at some vertices.
-fn triangles_at(t: &Triangles, vertices: &HashSet<u32>) -> HashMap<u32, Vec<u32>> {
+fn triangles_at(t: &Triangles, vertices: impl Iterator<Item = u32>) -> HashMap<u32, Vec<u32>> {
+    let mut is_wanted = vec![false; t.corners.par_iter().flatten_iter().max().map_or(0, |most| *most as usize + 1)];
+    vertices.for_each(|c| is_wanted[c as usize] = true);
     let at = |(f, corners): (usize, &[u32; 3])| {
-        let wanted = corners.iter().filter(|c| vertices.contains(c)).copied().collect::<Vec<_>>();
-        wanted.into_iter().map(move |c| (c, f as u32))
+        let wanted = corners.map(|c| is_wanted[c as usize].then_some((c, f as u32)));
+        wanted.into_iter().flatten()
     };
     let found: Vec<(u32, u32)> = t.corners.par_iter().enumerate().flat_map_iter(at).collect();
     let mut of: HashMap<u32, Vec<u32>> = HashMap::new();

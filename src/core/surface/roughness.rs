@@ -3,7 +3,8 @@
 //! A cubic is fitted to a few neighbours of a point and to twice as many. What it leaves of a smooth surface grows with the fourth power of
 //! the distance; what it leaves of points that scatter is the same both times.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{SMatrix, SVector};
+use rayon::prelude::*;
 
 use super::normals::{NEIGHBOURS, ring_around, tangents};
 use super::patch::{Lattice, Patch};
@@ -12,32 +13,29 @@ use crate::geometry::Point;
 /// Terms of a cubic in two variables.
 const TERMS: usize = 10;
 /// Points that are looked at.
-const LOOKED_AT: usize = 200;
+const LOOKED_AT: usize = 100;
 /// The surface itself leaves more than this factor more beside many neighbours than beside few.
 const GROWS: f64 = 2.0;
 
 /// Returns the standard deviation by which the points scatter along the normal, in millimetres; 0 where the surface is smooth as far as its
 /// points tell.
 pub(super) fn scatter_mm(patches: &[Patch]) -> f64 {
-    let mut left: [Vec<f64>; 2] = Default::default();
-    for patch in patches {
-        for vertex in patch.sample((LOOKED_AT / patches.len()).max(1)) {
-            let around = around(patch, vertex);
-            let of = |count: usize| around.get(..count).and_then(left_by_a_cubic);
-            // With the point itself the fewest that leave a few degrees of freedom.
-            if let Some(few) = of(NEIGHBOURS + 3)
-                && let Some(many) = of(2 * NEIGHBOURS + 3)
-            {
-                left[0].push(few);
-                left[1].push(many);
-            }
-        }
-    }
-    if left[0].is_empty() {
+    let some = |patch| Patch::sample(patch, (LOOKED_AT / patches.len()).max(1)).map(move |vertex| (patch, vertex));
+    let vertices: Vec<(&Patch, u32)> = patches.iter().flat_map(some).collect();
+    let left: Vec<[f64; 2]> = vertices.into_par_iter().filter_map(|(patch, vertex)| left_at(patch, vertex)).collect();
+    if left.is_empty() {
         return 0.0;
     }
-    let [few, many] = left.map(|squares| (squares.iter().sum::<f64>() / squares.len() as f64).sqrt());
+    let [few, many] = [0, 1].map(|k| (left.iter().map(|squares| squares[k]).sum::<f64>() / left.len() as f64).sqrt());
     if many > GROWS * few { 0.0 } else { many }
+}
+
+/// Returns the mean squares that cubics leave of few neighbours and of many.
+fn left_at(patch: &Patch, vertex: u32) -> Option<[f64; 2]> {
+    let around = around(patch, vertex);
+    // With the point itself the fewest that leave a few degrees of freedom.
+    let of = |count: usize| around.get(..count).and_then(left_by_a_cubic);
+    Some([of(NEIGHBOURS + 3)?, of(2 * NEIGHBOURS + 3)?])
 }
 
 /// A point and its neighbours along two tangents and the normal, the nearest first.
@@ -54,27 +52,33 @@ fn around(patch: &Patch, vertex: u32) -> Vec<[f64; 3]> {
         [d.dot(&tu), d.dot(&tv), d.dot(&normal)]
     };
     let mut around: Vec<[f64; 3]> = others.iter().map(|&k| local(patch.point(k))).chain([[0.0; 3]]).collect();
-    around.sort_by(|a, b| a[0].hypot(a[1]).total_cmp(&b[0].hypot(b[1])));
+    around.sort_by(|a, b| (a[0] * a[0] + a[1] * a[1]).total_cmp(&(b[0] * b[0] + b[1] * b[1])));
     around
 }
 
 /// Returns the mean square that the best cubic leaves, by its degrees of freedom; none where the places do not determine one.
 fn left_by_a_cubic(places: &[[f64; 3]]) -> Option<f64> {
     let size = places.last().map(|[u, v, _]| u.hypot(*v)).filter(|size| *size > 0.0)?;
-    let rows = DMatrix::from_fn(places.len(), TERMS, |r, c| {
-        let [u, v] = [places[r][0] / size, places[r][1] / size];
-        [1.0, u, v, u * u, u * v, v * v, u * u * u, u * u * v, u * v * v, v * v * v][c]
-    });
-    let right = DVector::from_fn(places.len(), |r, _| places[r][2]);
-    let qr = rows.qr();
-    let diagonal = qr.r().diagonal().abs();
+    let mut normal = SMatrix::<f64, TERMS, TERMS>::zeros();
+    let mut right = SVector::<f64, TERMS>::zeros();
+    let row = |[u, v, _]: [f64; 3]| {
+        let [u, v] = [u / size, v / size];
+        SVector::<f64, TERMS>::from([1.0, u, v, u * u, u * v, v * v, u * u * u, u * u * v, u * v * v, v * v * v])
+    };
+    for place in places {
+        let row = row(*place);
+        normal.ger(1.0, &row, &row, 1.0);
+        right.axpy(place[2], &row, 1.0);
+    }
     let freedom = places.len().checked_sub(TERMS).filter(|freedom| *freedom > 0)?;
-    if diagonal.min() < 1e-9 * diagonal.max() {
+    let factor = normal.cholesky()?;
+    let diagonal = factor.l_dirty().diagonal();
+    if diagonal.min() < 1e-6 * diagonal.max() {
         return None;
     }
-    let q = qr.q();
-    let left = &right - &q * q.tr_mul(&right);
-    Some(left.norm_squared() / freedom as f64)
+    let cubic = factor.solve(&right);
+    let left: f64 = places.iter().map(|place| (place[2] - row(*place).dot(&cubic)).powi(2)).sum();
+    Some(left / freedom as f64)
 }
 
 #[cfg(test)]
