@@ -7,8 +7,7 @@ use rayon::prelude::*;
 
 use crate::geometry::{Nearest, Point};
 
-use super::deviation::{Deviation, PointStatus};
-use super::doubt::Counts;
+use super::deviation::{Counts, Deviation, PointStatus};
 use super::refit::LEAST_SIGMA_MM;
 use super::robust::robust_sigma;
 use super::verdict::Verdict;

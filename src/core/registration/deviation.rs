@@ -1,5 +1,7 @@
 //! What is found of one measured point.
 
+use rayon::prelude::*;
+
 use crate::geometry::{Point, Vector};
 
 /// One measured point against the nominal surface.
@@ -29,4 +31,31 @@ pub enum PointStatus {
     Outlier,
     /// Its foot lies beyond the edge of the nominal surface.
     OffPart,
+}
+
+/// How many points became what.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Counts {
+    pub(super) outliers: usize,
+    pub(super) off_part: usize,
+    /// Points on the part that the pose was not fitted to.
+    pub(super) left: usize,
+}
+
+impl Counts {
+    /// Counts on all threads: of many points most of the time is taken by memory.
+    pub(super) fn of(deviations: &[Deviation]) -> Self {
+        let of_one = |d: &Deviation| Self {
+            outliers: usize::from(d.status == PointStatus::Outlier),
+            off_part: usize::from(d.status == PointStatus::OffPart),
+            left: usize::from(d.status != PointStatus::OffPart && !d.in_fit),
+        };
+        let add = |a: Self, b: Self| Self {
+            outliers: a.outliers + b.outliers,
+            off_part: a.off_part + b.off_part,
+            left: a.left + b.left,
+        };
+        let of_some = |some: &[Deviation]| some.iter().map(of_one).fold(Self::default(), add);
+        deviations.par_chunks(1 << 14).map(of_some).reduce(Self::default, add)
+    }
 }

@@ -1,11 +1,9 @@
 //! What makes a fit doubtful that was found all the same: a radius that is not the ball's, and points that are not enough.
 
-use rayon::prelude::*;
-
 use crate::geometry::Point;
 
 use super::alone::contradicted;
-use super::deviation::{Deviation, PointStatus};
+use super::deviation::{Counts, Deviation, PointStatus};
 use super::options::{Method, Options, Start};
 use super::part::Part;
 use super::result::{Registration, WithLeftOut};
@@ -89,33 +87,6 @@ fn of_points(found: &Registration) -> Vec<String> {
         ));
     }
     doubts
-}
-
-/// How many points became what.
-#[derive(Clone, Copy, Default)]
-pub(super) struct Counts {
-    pub(super) outliers: usize,
-    pub(super) off_part: usize,
-    /// Points on the part that the pose was not fitted to.
-    pub(super) left: usize,
-}
-
-impl Counts {
-    /// Counts on all threads: of many points most of the time is taken by memory.
-    pub(super) fn of(deviations: &[Deviation]) -> Self {
-        let of_one = |d: &Deviation| Self {
-            outliers: usize::from(d.status == PointStatus::Outlier),
-            off_part: usize::from(d.status == PointStatus::OffPart),
-            left: usize::from(d.status != PointStatus::OffPart && !d.in_fit),
-        };
-        let add = |a: Self, b: Self| Self {
-            outliers: a.outliers + b.outliers,
-            off_part: a.off_part + b.off_part,
-            left: a.left + b.left,
-        };
-        let of_some = |some: &[Deviation]| some.iter().map(of_one).fold(Self::default(), add);
-        deviations.par_chunks(1 << 14).map(of_some).reduce(Self::default, add)
-    }
 }
 
 /// Counts the points off the part that have points on it all around.

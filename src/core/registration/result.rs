@@ -3,8 +3,7 @@
 use crate::geometry::Pose;
 use crate::surface::Side;
 
-use super::deviation::{Deviation, PointStatus};
-use super::doubt::Counts;
+use super::deviation::{Counts, Deviation, PointStatus};
 use super::iterate::Iteration;
 use super::verdict::Verdict;
 
